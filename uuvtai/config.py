@@ -1,0 +1,497 @@
+"""Configuration: one frozen section per stage noun. Unknown keys, wrong types, NaN and nonsense sizes are errors.
+
+Units stand in the names: ``_m``, ``_s``, ``_m_s``, ``_rad`` and so on; angles that a person types end in ``_deg``. Numbers with neither a source
+nor a design page are engineering choices (EC). YAML in and out, and presets, live in ``presets.py``.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+Count = Annotated[int, Field(ge=0)]
+PositiveCount = Annotated[int, Field(ge=1)]
+Interval = tuple[float, float]
+Vector3 = tuple[float, float, float]
+Vector6 = tuple[float, float, float, float, float, float]
+
+
+class Section(BaseModel):
+    """Base of every section: immutable, closed, finite."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=False)
+
+
+# --------------------------------------------------------------------------------------------------------------------- world
+
+
+class TankConfig(Section):
+    """Known bounds of the water."""
+
+    shape: Literal["rectangle", "circle"] = "rectangle"
+    x_m: Interval = (0.0, 20.0)
+    y_m: Interval = (0.0, 6.0)
+    z_m: Interval = (-1.6, 0.0)
+    """floor and surface"""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> TankConfig:
+        for name in ("x_m", "y_m", "z_m"):
+            low, high = getattr(self, name)
+            if not low < high:
+                raise ValueError(f"{name} must be (low, high) with low < high, got {getattr(self, name)}")
+        return self
+
+    @property
+    def radius_m(self) -> float:
+        """Radius of the inscribed circle (the wall of a circular tank)."""
+        return 0.5 * min(self.x_m[1] - self.x_m[0], self.y_m[1] - self.y_m[0])
+
+
+class StaticObstacles(Section):
+    """Random static obstacles: vertical cylinders and boxes through the full water column."""
+
+    radius_m: Interval = (0.2, 0.4)
+    half_extent_m: Interval = (0.2, 0.5)
+    box_fraction: Fraction = 0.5
+    gap_m: NonNegative = 0.9
+    """between surfaces"""
+    endpoint_gap_m: NonNegative = 0.8
+    """from start and goal to the surface"""
+    joined_clearance_m: NonNegative = 0.45
+    """start and goal must be joined by free space with this clearance, else the layout is drawn again"""
+
+
+class DynamicObstacles(Section):
+    """Random moving obstacles."""
+
+    radius_m: Interval = (0.15, 0.25)
+    height_m: Interval = (0.3, 0.5)
+    z_m: Interval = (-1.2, -0.4)
+    cylinder_fraction: Fraction = 0.5
+    full_column_fraction: Fraction = 0.0
+    """share of the moving bodies that are cylinders through the full water column (counted within cylinder_fraction)"""
+    motion: Literal["line_circle", "waypoints"] = "line_circle"
+    circle_fraction: Fraction = 0.5
+    line_length_m: Interval = (2.0, 6.0)
+    circle_radius_m: Interval = (0.5, 2.0)
+    corners: tuple[int, int] = (3, 5)
+    corner_gap_m: NonNegative = 2.0
+    keep_clear_draws: Count = 16
+    """draws of a path that keeps clear of static obstacles and walls before the last one is taken as it is"""
+    start_gap_m: NonNegative = 1.5
+    """horizontal, centre to centre, at t = 0"""
+
+
+class Waypoint(Section):
+    """One corner of an explicit obstacle's closed path."""
+
+    x_m: float
+    y_m: float
+
+
+class FixedObstacle(Section):
+    """An obstacle that is always there, given explicitly; with ``path`` it moves along the closed polyline."""
+
+    kind: Literal["sphere", "cylinder", "box"]
+    x_m: float
+    y_m: float
+    z_m: float | None = None
+    """centre; default: middle of the water column"""
+    radius_m: Positive | None = None
+    half_extents_m: tuple[Positive, Positive] | None = None
+    height_m: Positive | None = None
+    """default: the full water column"""
+    yaw_deg: float = 0.0
+    path: tuple[Waypoint, ...] = ()
+    speed_m_s: NonNegative | None = None
+    """default: the scenario's v"""
+
+    @model_validator(mode="after")
+    def _complete(self) -> FixedObstacle:
+        if self.kind == "box" and self.half_extents_m is None:
+            raise ValueError("a box needs half_extents_m: [x, y]")
+        if self.kind != "box" and self.radius_m is None:
+            raise ValueError(f"a {self.kind} needs radius_m")
+        if len(self.path) not in (0, 2, 3, 4, 5):
+            raise ValueError("path must have 2 to 5 waypoints (2 = back and forth)")
+        return self
+
+
+class WorldConfig(Section):
+    """Tank, spawn ranges and obstacles: with (seed, episode) it defines a scenario completely."""
+
+    tank: TankConfig = TankConfig()
+    spawn_x_m: Interval = (2.0, 18.0)
+    spawn_y_m: Interval = (1.2, 4.8)
+    spawn_z_m: Interval = (-1.2, -0.4)
+    start_goal_gap_m: NonNegative = 3.0
+    n_static: Count = 8
+    """S"""
+    n_dynamic: Count = 6
+    """D"""
+    dynamic_speed_m_s: NonNegative = 0.6
+    """v"""
+    static_capacity: Count | None = None
+    """slots kept for static obstacles, so that S can vary without recompilation; default n_static"""
+    dynamic_capacity: Count | None = None
+    static: StaticObstacles = StaticObstacles()
+    dynamic: DynamicObstacles = DynamicObstacles()
+    fixed: tuple[FixedObstacle, ...] = ()
+
+
+# ------------------------------------------------------------------------------------------------------------------- vehicle
+
+_S = 0.7071067811865476
+
+
+class Thruster(Section):
+    """One thruster: where it sits and which way positive thrust pushes."""
+
+    position_m: Vector3
+    direction: Vector3
+
+
+_BLUEROV2_THRUSTERS = (
+    Thruster(position_m=(0.1355, -0.1, -0.0725), direction=(_S, _S, 0.0)),
+    Thruster(position_m=(0.1355, 0.1, -0.0725), direction=(_S, -_S, 0.0)),
+    Thruster(position_m=(-0.1475, -0.1, -0.0725), direction=(-_S, _S, 0.0)),
+    Thruster(position_m=(-0.1475, 0.1, -0.0725), direction=(-_S, -_S, 0.0)),
+    Thruster(position_m=(0.0025, -0.1105, -0.005), direction=(0.0, 0.0, 1.0)),
+    Thruster(position_m=(0.0025, 0.1105, -0.005), direction=(0.0, 0.0, 1.0)),
+)
+
+
+class VehicleConfig(Section):
+    """Rigid body, hydrodynamics and thrusters (MarineGym BlueROV asset; Wu 2018 coefficients). Origin = centre of mass."""
+
+    mass_kg: Positive = 11.26
+    inertia_kg_m2: Vector3 = (0.30375, 0.626, 0.5769)
+    water_density_kg_m3: Positive = 997.0
+    gravity_m_s2: Positive = 9.81
+    volume_m3: Positive = 0.0113459
+    buoyancy_height_m: float = 0.01
+    added_mass: Vector6 = (5.5, 12.7, 14.57, 0.12, 0.12, 0.12)
+    linear_damping: Vector6 = (4.03, 6.22, 5.18, 0.07, 0.07, 0.07)
+    quadratic_damping: Vector6 = (18.18, 21.66, 36.99, 1.55, 1.55, 1.55)
+    thrusters: tuple[Thruster, ...] = _BLUEROV2_THRUSTERS
+    rotor_tau_s: Positive = 0.01
+    rotor_max_rpm: Positive = 3900.0
+    thrust_forward: Vector3 = (4.7368e-7, -1.9275e-4, 8.4452e-2)
+    """[kgf] quadratic in rpm for n > 0"""
+    thrust_reverse: Vector3 = (-3.8442e-7, -1.6186e-4, -3.9139e-2)
+    """[kgf] quadratic in rpm for n < 0"""
+    thrust_scale: Positive = 1.0
+    """the paper's K_F / 4.4e-7"""
+    attitude_hold: Literal["ideal", "thrusters", "none"] = "ideal"
+    hull_radius_m: Positive = 0.17
+    hull_half_length_m: NonNegative = 0.10
+    max_surge_m_s: Positive = 0.6
+    max_sway_m_s: Positive = 0.6
+    max_heave_m_s: Positive = 0.4
+    max_yaw_rate_rad_s: Positive = 1.0
+
+
+class ActuationConfig(Section):
+    """Inner loop: commanded body velocity and yaw rate to wrench, allocation, rotors (gains EC)."""
+
+    velocity_gain: Vector3 = (60.0, 60.0, 60.0)
+    """[N s/m]"""
+    velocity_integral: Vector3 = (30.0, 30.0, 30.0)
+    """[N/m]"""
+    yaw_rate_gain: NonNegative = 4.0
+    """[N m s]"""
+    yaw_rate_integral: NonNegative = 4.0
+    """[N m]"""
+    max_force_n: Vector3 = (45.0, 45.0, 45.0)
+    max_moment_n_m: Positive = 8.0
+    hold_gain_n_m: NonNegative = 6.0
+    """[N m/rad] roll and pitch"""
+    hold_damping: NonNegative = 2.0
+    """[N m s]"""
+    hold_limit_n_m: NonNegative = 5.0
+    """bound of the ideal stabilising moment"""
+
+
+class DisturbanceConfig(Section):
+    """What the paper leaves out; all off by default. Each is a sweep axis."""
+
+    current_m_s: Vector3 = (0.0, 0.0, 0.0)
+    current_sigma_m_s: NonNegative = 0.0
+    """standard deviation of the Gauss-Markov part, per horizontal axis"""
+    current_tau_s: Positive = 20.0
+    thruster_delay_s: NonNegative = 0.0
+    thruster_gain_loss: Fraction = 0.0
+    """each thruster's gain is drawn from [1 - loss, 1]"""
+    dead_thruster: int | None = None
+    """index of a thruster that gives nothing"""
+    mass_spread: Fraction = 0.0
+    """each parameter is scaled by a factor drawn from [1 - spread, 1 + spread] per episode; buoyancy follows the mass"""
+    damping_spread: Fraction = 0.0
+    added_mass_spread: Fraction = 0.0
+
+
+# ------------------------------------------------------------------------------------------------------------------- sensors
+
+
+class SonarConfig(Section):
+    """Horizontal ring of beams, fixed to the yaw, always level."""
+
+    n_ray: Annotated[int, Field(ge=16, multiple_of=16)] = 256
+    max_range_m: Positive = 12.0
+    vertical_half_aperture_deg: Annotated[float, Field(ge=0, lt=80)] = 10.0
+    period_steps: PositiveCount = 1
+    """control steps between pings"""
+    latency_steps: Count = 0
+    range_sigma_m: NonNegative = 0.0
+    range_sigma_slope: NonNegative = 0.0
+    """[m/m]"""
+    range_quantum_m: NonNegative = 0.0
+    range_jitter_m: NonNegative = 0.0
+    """mean of a positive exponential error"""
+    missed_return: Fraction = 0.0
+    false_return: Fraction = 0.0
+    bubble_clouds_per_s: NonNegative = 0.0
+    bubble_beams: tuple[int, int] = (3, 8)
+    bubble_s: Interval = (1.0, 3.0)
+    ghost: Fraction = 0.0
+    """probability per beam that a specular bounce replaces the direct return"""
+    grazing_cosine: Fraction = 0.0
+    """a return is lost below this cosine of incidence"""
+    doppler_sigma_m_s: NonNegative = 0.0
+    doppler_outlier: Fraction = 0.0
+
+
+class DepthConfig(Section):
+    """Forward camera."""
+
+    rows: PositiveCount = 72
+    cols: Annotated[int, Field(ge=16, multiple_of=16)] = 128
+    fov_deg: Annotated[float, Field(gt=0, lt=170)] = 90.0
+    """horizontal"""
+    offset_b_m: Vector3 = (0.2, 0.0, 0.0)
+    max_range_m: Positive = 10.0
+    period_steps: PositiveCount = 5
+    sigma_m: NonNegative = 0.0
+    sigma_slope: NonNegative = 0.0
+
+
+class DvlConfig(Section):
+    sigma_m_s: NonNegative = 0.0
+    scale_error: NonNegative = 0.0
+    """standard deviation of the scale factor, drawn per episode"""
+    period_steps: PositiveCount = 1
+    dropout: Fraction = 0.0
+    """probability per reading that the bottom is lost"""
+    dropout_s: Interval = (0.0, 0.0)
+    """how long it then stays lost"""
+
+
+class ImuConfig(Section):
+    gyro_noise_rad_s_rthz: NonNegative = 0.0
+    heading_drift_rad_s: NonNegative = 0.0
+    """standard deviation of the constant drift rate, drawn per episode"""
+    accel_sigma_m_s2: NonNegative = 0.0
+    attitude_sigma_rad: NonNegative = 0.0
+
+
+class PressureConfig(Section):
+    bias_m: NonNegative = 0.0
+    """drawn uniformly from +- this, per episode"""
+    sigma_m: NonNegative = 0.0
+
+
+class SensorsConfig(Section):
+    sonar: SonarConfig = SonarConfig()
+    depth: DepthConfig = DepthConfig()
+    dvl: DvlConfig = DvlConfig()
+    imu: ImuConfig = ImuConfig()
+    pressure: PressureConfig = PressureConfig()
+    localization: Literal["truth", "dead_reckoning"] = "truth"
+
+
+# ---------------------------------------------------------------------------------------------------- perception and planning
+
+
+class TrackingConfig(Section):
+    """Clusters of beams to tracks of moving bodies, and their forecast."""
+
+    n_track: PositiveCount = 24
+    n_cluster: PositiveCount = 48
+    split_m: NonNegative = 0.18
+    split_slope: NonNegative = 0.03
+    wall_margin_m: NonNegative = 0.15
+    """returns this close to a known wall are dropped"""
+    max_width_m: Positive = 0.75
+    moving_speed_m_s: NonNegative = 0.08
+    moving_doppler_m_s: NonNegative = 0.03
+    max_misses: PositiveCount = 8
+    """in units of nominal 10 Hz scans"""
+    horizon_s: Positive = 2.5
+    forecast_dt_s: Positive = 0.1
+
+
+class MappingConfig(Section):
+    """Two-layer occupancy map. Gains are per scan at 10 Hz; at another scan rate they are scaled so that gain per second is kept."""
+
+    cell_m: Positive = 0.1
+    static_hit: Fraction = 0.15
+    """eta_occ"""
+    static_free: Fraction = 0.08
+    """eta_free"""
+    static_decay: Fraction = 0.002
+    """lambda_s"""
+    depth_hit: Fraction = 0.10
+    """eta_depth"""
+    dynamic_hit: Fraction = 0.6
+    """eta_dyn"""
+    dynamic_free: Fraction = 0.3
+    """eta_dyn,free"""
+    dynamic_decay: Fraction = 0.1
+    """lambda_d"""
+    stamp: Fraction = 0.0
+    """eta_stamp: gain of the simulator-side debugging stamp; must stay 0 in every preset"""
+    doppler_evidence_m_s: NonNegative = 0.15
+    free_confident_s: NonNegative = 0.5
+    """a hit in a cell seen free for this long is dynamic evidence"""
+    promote_s: Positive = 2.0
+    """dynamic evidence that stays this long in one cell becomes static"""
+    depth_gate_m: Positive = 0.3
+    """depth pixels count when their point lies within this of the vehicle's own depth"""
+    occupied: Fraction = 0.5
+    """tau_occ"""
+
+
+class ClearanceConfig(Section):
+    """Distance transform and risk."""
+
+    max_m: Positive = 2.0
+    """distances are exact up to here"""
+    period_steps: PositiveCount = 5
+    risk_static: NonNegative = 1.0
+    """alpha_m"""
+    risk_dynamic: NonNegative = 1.0
+    """alpha_d"""
+    risk_clearance: NonNegative = 0.1
+    """alpha_delta [m]"""
+    risk_epsilon_m: Positive = 0.1
+
+
+class VoronoiConfig(Section):
+    """Global planner on the medial axis."""
+
+    site_gap_cells: Positive = 3.0
+    min_clearance_m: NonNegative = 0.35
+    """d_min"""
+    cost_epsilon_m: Positive = 0.1
+    """eps_r"""
+    max_pops: PositiveCount = 20000
+    """budget of the search"""
+    use: Literal["static", "fused"] = "static"
+    """which occupancy the route must avoid"""
+
+
+class RouteConfig(Section):
+    """Route, triggers, look-ahead and the RRT fallback."""
+
+    n_way: PositiveCount = 256
+    spacing_m: Positive = 0.2
+    lookahead_m: Positive = 1.0
+    risk_horizon_m: Positive = 3.0
+    """length of the look-ahead segment for path risk and for the intersection trigger"""
+    stuck_speed_m_s: NonNegative = 0.08
+    stuck_s: Positive = 3.0
+    safety_range_m: NonNegative = 0.5
+    safety_ttc_s: NonNegative = 1.0
+    forecast_clearance_m: NonNegative = 0.35
+    """a forecast closer than this to the look-ahead path is an intersection"""
+    min_replan_s: NonNegative = 0.4
+    """the same trigger does not fire again within this"""
+    rrt_clearance_m: NonNegative = 0.1
+    """overlay clearance floor of the paper: what the fallback may still cross"""
+    rrt_budget_s: Positive = 0.02
+    """iterations are bounded too, so that results do not depend on the machine"""
+    rrt_iterations: PositiveCount = 4000
+    rrt_range_m: Positive = 1.0
+
+
+class FeaturesConfig(Section):
+    """Sectors of the sonar features."""
+
+    n_sector: PositiveCount = 12
+    ttc_cap_s: Positive = 10.0
+
+
+class TeacherConfig(Section):
+    """Behaviour tree's leaves."""
+
+    cruise_m_s: Positive = 0.6
+    horizon_s: Positive = 2.5
+    decide_period_steps: PositiveCount = 5
+    n_heading: PositiveCount = 24
+    n_speed: PositiveCount = 4
+    margin_m: NonNegative = 0.25
+    """wanted clearance from a forecast body"""
+    margin_growth_m_s: NonNegative = 0.1
+    """the margin grows with prediction time"""
+    closing_s: NonNegative = 0.25
+    """effective clearance is reduced by this times the closing speed"""
+    emergency_ttc_s: NonNegative = 0.6
+    emergency_range_m: NonNegative = 0.15
+    max_node: PositiveCount = 64
+
+
+class RewardConfig(Section):
+    """Weights of the paper's reward (values EC: not given there)."""
+
+    alive: float = 0.01
+    progress: float = 1.0
+    path_distance: float = 0.02
+    cross_track: float = 0.02
+    clearance: float = 0.1
+    ttc: float = 0.1
+    overspeed: float = 0.1
+    upright: float = 0.005
+    heading: float = 0.01
+    success: float = 20.0
+    failure: float = 20.0
+    tilt: float = 0.02
+    effort: float = 0.005
+    soft_clearance_m: NonNegative = 0.4
+    soft_ttc_s: NonNegative = 2.0
+    safe_speed_m_s: Positive = 0.6
+
+
+class EpisodeConfig(Section):
+    """Clock and the referee's rules."""
+
+    control_dt_s: Positive = 0.02
+    substeps: PositiveCount = 2
+    horizon_steps: Annotated[int, Field(ge=1, le=30000)] = 3000
+    goal_radius_m: Positive = 1.0
+    collision_clearance_m: NonNegative = 0.1
+    ttc_s: NonNegative = 0.18
+    ttc_closing_m_s: NonNegative = 0.05
+
+
+class Config(Section):
+    """Everything a run needs; immutable."""
+
+    world: WorldConfig = WorldConfig()
+    vehicle: VehicleConfig = VehicleConfig()
+    actuation: ActuationConfig = ActuationConfig()
+    disturbance: DisturbanceConfig = DisturbanceConfig()
+    sensors: SensorsConfig = SensorsConfig()
+    tracking: TrackingConfig = TrackingConfig()
+    mapping: MappingConfig = MappingConfig()
+    clearance: ClearanceConfig = ClearanceConfig()
+    voronoi: VoronoiConfig = VoronoiConfig()
+    route: RouteConfig = RouteConfig()
+    features: FeaturesConfig = FeaturesConfig()
+    teacher: TeacherConfig = TeacherConfig()
+    reward: RewardConfig = RewardConfig()
+    episode: EpisodeConfig = EpisodeConfig()

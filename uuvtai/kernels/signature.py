@@ -1,0 +1,43 @@
+"""Markers for kernel parameters, and the loop helper every per-env kernel uses.
+
+A kernel says what it reads and what it writes: ``In[Struct]``, ``Out[Struct]``, ``Const[Section]`` (a frozen config section whose
+numbers become constants of the compiled kernel). For the type checker they are the plain classes; for Taichi they are
+``ti.template()``. ``tests/test_architecture.py`` reads them to prove who sees what.
+"""
+
+from typing import TYPE_CHECKING, Annotated, TypeVar
+
+import taichi as ti
+
+_T = TypeVar("_T")
+
+if TYPE_CHECKING:
+    In = Annotated[_T, "read only"]
+    Out = Annotated[_T, "read and written"]
+    Const = Annotated[_T, "compile-time constant"]
+else:
+
+    class _Marker:
+        def __class_getitem__(cls, _item):
+            return ti.template()
+
+    class In(_Marker):
+        """A struct that the kernel only reads."""
+
+    class Out(_Marker):
+        """A struct that the kernel writes (and may read)."""
+
+    class Const(_Marker):
+        """A frozen config section: its values are constants of the compiled kernel."""
+
+
+_CPU_BLOCK = 512
+"""Taichi's CPU scheduler never splits a loop into blocks of fewer items than this (measured on 1.7.4)."""
+
+_BLOCKS = 16
+"""Blocks wanted per loop, so that two to sixteen cores share unequal work evenly."""
+
+
+def spread(n_env: int) -> int:
+    """Loop items per env that make ``ti.ndrange(n_env, spread(n_env))`` fill every core; use only the items with ``pad == 0``."""
+    return max(1, min(_CPU_BLOCK, -(-_CPU_BLOCK * _BLOCKS // n_env)))

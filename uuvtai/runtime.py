@@ -1,0 +1,66 @@
+"""Start Taichi once per process. Only this module calls ``ti.init``."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+
+import taichi as ti
+
+
+@dataclass(frozen=True)
+class Runtime:
+    """How Taichi was started."""
+
+    device: str
+    """'cpu' or 'cuda'"""
+    precision: str
+    """'f32' or 'f64': dtype of continuous quantities"""
+
+    @property
+    def real(self):
+        """Taichi dtype of continuous quantities."""
+        return ti.f64 if self.precision == "f64" else ti.f32
+
+
+_started: list[Runtime] = []
+
+
+def start_taichi(device: str = "cpu", precision: str = "f32", fast_math: bool = False) -> Runtime:
+    """Start Taichi on ``device`` ('auto', 'cpu' or 'cuda'), or return the runtime that is already up.
+
+    A second ``ti.init`` would destroy every field, so a process has one runtime; asking for another kind is an error.
+    ``UUV_NUM_THREADS`` bounds the CPU threads. Raises RuntimeError where the device is missing.
+    """
+    wanted = Runtime(_resolved(device), precision)
+    if _started:
+        if _started[0] != wanted:
+            raise RuntimeError(f"Taichi already runs as {_started[0]}; start a new process for {wanted}")
+        return wanted
+    options = {}
+    if threads := os.environ.get("UUV_NUM_THREADS"):
+        options["cpu_max_num_threads"] = int(threads)
+    ti.init(
+        arch=ti.cuda if wanted.device == "cuda" else ti.cpu,
+        default_fp=wanted.real,
+        fast_math=fast_math,
+        offline_cache=True,
+        log_level=ti.WARN,
+        **options,
+    )
+    _started.append(wanted)
+    return wanted
+
+
+def _resolved(device: str) -> str:
+    if device == "cpu":
+        return "cpu"
+    import torch
+
+    if device == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if device == "cuda":
+        if not torch.cuda.is_available():
+            raise RuntimeError("--device cuda: torch sees no CUDA device here; use --device cpu")
+        return "cuda"
+    raise ValueError(f"unknown device {device!r}: use auto, cpu or cuda")
