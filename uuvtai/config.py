@@ -1,7 +1,7 @@
 """Configuration: one frozen section per stage noun. Unknown keys, wrong types, NaN and nonsense sizes are errors.
 
-Units stand in the names: ``_m``, ``_s``, ``_m_s``, ``_rad`` and so on; angles that a person types end in ``_deg``. Numbers with neither a source
-nor a design page are engineering choices (EC). YAML in and out, and presets, live in ``presets.py``.
+Units stand in the names: ``_m``, ``_s``, ``_m_s``, ``_rad`` and so on; angles that a person types end in ``_deg``. Numbers with neither a
+source nor a design page behind them are engineering choices (EC). YAML in and out, and presets, live in ``loader.py``.
 """
 
 from __future__ import annotations

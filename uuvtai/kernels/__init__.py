@@ -1,1 +1,1 @@
-"""Taichi kernels, one file per stage. Stages never import each other; all of them may import the floor (signature, geometry, noise, lanes)."""
+"""Taichi kernels, one file per stage. Stages never import each other; all of them may import the floor."""
