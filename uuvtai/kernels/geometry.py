@@ -3,9 +3,6 @@
 World is z-up, body is FLU, quaternions are (w, x, y, z) and rotate body into world.
 """
 
-World is z-up, body is FLU, quaternions are (w, x, y, z) and rotate body into world.
-"""
-
 import taichi as ti
 
 # kinds of a body in the per-env list
