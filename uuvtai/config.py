@@ -13,11 +13,14 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
+Spread = Annotated[float, Field(ge=0, le=0.9)]
+"""half width of a factor around 1 that must stay positive"""
 Count = Annotated[int, Field(ge=0)]
 PositiveCount = Annotated[int, Field(ge=1)]
 Interval = tuple[float, float]
 Vector3 = tuple[float, float, float]
 Vector6 = tuple[float, float, float, float, float, float]
+NonNegative6 = tuple[NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative]
 
 
 class Section(BaseModel):
@@ -170,21 +173,23 @@ class VehicleConfig(Section):
     """Rigid body, hydrodynamics and thrusters (MarineGym BlueROV asset; Wu 2018 coefficients). Origin = centre of mass."""
 
     mass_kg: Positive = 11.26
-    inertia_kg_m2: Vector3 = (0.30375, 0.626, 0.5769)
+    inertia_kg_m2: tuple[Positive, Positive, Positive] = (0.30375, 0.626, 0.5769)
     water_density_kg_m3: Positive = 997.0
     gravity_m_s2: Positive = 9.81
     volume_m3: Positive = 0.0113459
     buoyancy_height_m: float = 0.01
-    added_mass: Vector6 = (5.5, 12.7, 14.57, 0.12, 0.12, 0.12)
-    linear_damping: Vector6 = (4.03, 6.22, 5.18, 0.07, 0.07, 0.07)
-    quadratic_damping: Vector6 = (18.18, 21.66, 36.99, 1.55, 1.55, 1.55)
-    thrusters: tuple[Thruster, ...] = _BLUEROV2_THRUSTERS
+    added_mass: NonNegative6 = (5.5, 12.7, 14.57, 0.12, 0.12, 0.12)
+    linear_damping: NonNegative6 = (4.03, 6.22, 5.18, 0.07, 0.07, 0.07)
+    quadratic_damping: NonNegative6 = (18.18, 21.66, 36.99, 1.55, 1.55, 1.55)
+    thrusters: Annotated[tuple[Thruster, ...], Field(min_length=1)] = _BLUEROV2_THRUSTERS
     rotor_tau_s: Positive = 0.01
     rotor_max_rpm: Positive = 3900.0
     thrust_forward: Vector3 = (4.7368e-7, -1.9275e-4, 8.4452e-2)
     """[kgf] quadratic in rpm for n > 0"""
     thrust_reverse: Vector3 = (-3.8442e-7, -1.6186e-4, -3.9139e-2)
     """[kgf] quadratic in rpm for n < 0"""
+    dead_band_rpm: tuple[NonNegative, NonNegative] = (619.7, 695.6)
+    """no thrust below this speed, forward and reverse (MarineGym's T200: throttle within +-0.075 of 3659.9 x + 345.21, 3494.4 x - 433.5)"""
     thrust_scale: Positive = 1.0
     """the paper's K_F / 4.4e-7"""
     attitude_hold: Literal["ideal", "thrusters", "none"] = "ideal"
@@ -195,26 +200,47 @@ class VehicleConfig(Section):
     max_heave_m_s: Positive = 0.4
     max_yaw_rate_rad_s: Positive = 1.0
 
+    @model_validator(mode="after")
+    def _thrust_grows(self) -> VehicleConfig:
+        for name, curve, dead, sign in (
+            ("thrust_forward", self.thrust_forward, self.dead_band_rpm[0], 1.0),
+            ("thrust_reverse", self.thrust_reverse, self.dead_band_rpm[1], -1.0),
+        ):
+            edge = sign * max(dead, -sign * curve[1] / (2 * curve[0])) if sign * curve[0] > 0 else 0.0
+            if sign * curve[0] <= 0 or sign * (curve[0] * edge**2 + curve[1] * edge + curve[2]) < 0:
+                raise ValueError(f"{name} must push its own way and harder with speed outside the dead band, got {curve}")
+            if abs(edge) >= self.rotor_max_rpm:
+                raise ValueError(f"rotor_max_rpm must exceed the dead band of {name} ({abs(edge):.0f} rpm), got {self.rotor_max_rpm}")
+        return self
+
 
 class ActuationConfig(Section):
     """Inner loop: commanded body velocity and yaw rate to wrench, allocation, rotors (gains EC)."""
 
-    velocity_gain: Vector3 = (60.0, 60.0, 60.0)
+    velocity_gain: tuple[NonNegative, NonNegative, NonNegative] = (60.0, 60.0, 60.0)
     """[N s/m]"""
-    velocity_integral: Vector3 = (30.0, 30.0, 30.0)
+    velocity_integral: tuple[NonNegative, NonNegative, NonNegative] = (40.0, 40.0, 40.0)
     """[N/m]"""
+    integral_error_m_s: Positive = 0.1
+    """larger errors integrate as this: a step command must not overshoot by what piles up on its way"""
     yaw_rate_gain: NonNegative = 4.0
     """[N m s]"""
     yaw_rate_integral: NonNegative = 4.0
     """[N m]"""
-    max_force_n: Vector3 = (45.0, 45.0, 45.0)
+    integral_error_rad_s: Positive = 0.1
+    max_force_n: tuple[Positive, Positive, Positive] = (90.0, 90.0, 80.0)
+    """covers the drag at full speed of every published BlueROV2 parameter set (59, 78 and 44 N)"""
     max_moment_n_m: Positive = 8.0
-    hold_gain_n_m: NonNegative = 6.0
-    """[N m/rad] roll and pitch"""
-    hold_damping: NonNegative = 2.0
-    """[N m s]"""
+    hold_gain_n_m: NonNegative = 60.0
+    """[N m/rad] roll and pitch, ideal hold"""
+    hold_damping: NonNegative = 8.0
+    """[N m s] ideal hold"""
     hold_limit_n_m: NonNegative = 5.0
-    """bound of the ideal stabilising moment"""
+    """bound of the stabilising moment"""
+    thruster_hold_gain_n_m: NonNegative = 20.0
+    """[N m/rad] roll and pitch, hold by thrusters: lower, since it acts one control step and a rotor lag late"""
+    thruster_hold_damping: NonNegative = 5.0
+    """[N m s] hold by thrusters"""
 
 
 class DisturbanceConfig(Section):
@@ -227,12 +253,12 @@ class DisturbanceConfig(Section):
     thruster_delay_s: NonNegative = 0.0
     thruster_gain_loss: Fraction = 0.0
     """each thruster's gain is drawn from [1 - loss, 1]"""
-    dead_thruster: int | None = None
+    dead_thruster: Count | None = None
     """index of a thruster that gives nothing"""
-    mass_spread: Fraction = 0.0
-    """each parameter is scaled by a factor drawn from [1 - spread, 1 + spread] per episode; buoyancy follows the mass"""
-    damping_spread: Fraction = 0.0
-    added_mass_spread: Fraction = 0.0
+    mass_spread: Spread = 0.0
+    """each parameter is scaled by a factor drawn from [1 - spread, 1 + spread] per episode; inertia and buoyancy follow the mass"""
+    damping_spread: Spread = 0.0
+    added_mass_spread: Spread = 0.0
 
 
 # ------------------------------------------------------------------------------------------------------------------- sensors
@@ -362,6 +388,10 @@ class MappingConfig(Section):
     """dynamic evidence that stays this long in one cell becomes static"""
     depth_gate_m: Positive = 0.3
     """depth pixels count when their point lies within this of the vehicle's own depth"""
+    free_range_m: Positive = 6.0
+    """a beam without return clears no farther: a missed return looks the same, and far out no second beam sees the cell (EC)"""
+    wall_margin_m: NonNegative = 0.15
+    """returns this close to a known wall are not mapped: the wall is the boundary term already, and no hull fits in between (EC)"""
     occupied: Fraction = 0.5
     """tau_occ"""
 

@@ -438,8 +438,10 @@ class MapState:
     """[0, 1] persistent layer M^s"""
     dynamic_occ: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.f32)
     """[0, 1] layer M^d of what moves"""
+    free_mark: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.u8)
+    """scratch of one scan: 1 = a beam passed through (a plane of its own, so that any thread may write it in any order)"""
     evidence: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.u8)
-    """scratch of one scan: bits FREE, STATIC_HIT, DYNAMIC_HIT, DEPTH_HIT (mapping.py)"""
+    """scratch until the next scan is merged: bits STATIC_HIT, DYNAMIC_HIT, DEPTH_HIT (mapping.py)"""
     seen_step: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.i16)
     """episode step at which the cell was last observed, -1 = never"""
     free_scans: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.u8)
@@ -458,8 +460,8 @@ class ClearanceState:
     """row of the nearest site, -1 = none within clearance.max_m"""
     site_col: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.i16)
     """column of the nearest site"""
-    column_site: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.i16)
-    """scratch: row of the nearest site in the same column"""
+    column_key: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.i32)
+    """scratch: key of the nearest site in the same column (clearance.py)"""
     fresh: ti.Field = array("n_env", dtype=ti.i32)
     """1 = computed in this very step"""
 
@@ -543,9 +545,11 @@ class FeatureState:
     sector_range_m: ti.Field = array("n_env", "n_sector")
     """[m] smallest range in the sector"""
     sector_ttc_s: ti.Field = array("n_env", "n_sector")
-    """[s] smallest range / closing speed in the sector, capped"""
+    """[s] smallest range / closing speed of a beam in the sector, capped"""
     sector_closing_m_s: ti.Field = array("n_env", "n_sector")
-    """[m/s] largest closing speed in the sector, ego motion included"""
+    """[m/s] largest closing speed in the sector, ego motion included; 0 where nothing returned"""
+    sector_valid: ti.Field = array("n_env", "n_sector", dtype=ti.i32)
+    """1 = at least one beam of the sector returned"""
 
 
 @dataclass(frozen=True, eq=False)
