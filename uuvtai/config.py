@@ -282,6 +282,7 @@ class SonarConfig(Section):
     missed_return: Fraction = 0.0
     false_return: Fraction = 0.0
     bubble_clouds_per_s: NonNegative = 0.0
+    """mean rate at which bubble clouds form; each hides a run of beams at one range and bearing"""
     bubble_beams: tuple[int, int] = (3, 8)
     bubble_s: Interval = (1.0, 3.0)
     ghost: Fraction = 0.0
@@ -290,6 +291,9 @@ class SonarConfig(Section):
     """a return is lost below this cosine of incidence"""
     doppler_sigma_m_s: NonNegative = 0.0
     doppler_outlier: Fraction = 0.0
+    """probability per beam that the Doppler is worthless"""
+    doppler_outlier_m_s: NonNegative = 2.0
+    """worthless = uniform within +- this (EC)"""
 
 
 class DepthConfig(Section):
@@ -344,21 +348,47 @@ class SensorsConfig(Section):
 
 
 class TrackingConfig(Section):
-    """Clusters of beams to tracks of moving bodies, and their forecast."""
+    """Clusters of beams to tracks of moving bodies, and their forecast. Every constant is in seconds, not in scans (values EC, tuned)."""
 
     n_track: PositiveCount = 24
     n_cluster: PositiveCount = 48
+    period_steps: PositiveCount = 3
+    """control steps between tracked scans, at least; scans in between are left out"""
     split_m: NonNegative = 0.18
     split_slope: NonNegative = 0.03
+    split_doppler_m_s: Positive = 0.3
+    """neighbouring beams whose Doppler differs by more (plus 6 sigma) belong to different bodies"""
     wall_margin_m: NonNegative = 0.15
-    """returns this close to a known wall are dropped"""
+    """returns this close (plus 2 sigma of range) to a known wall are dropped"""
     max_width_m: Positive = 0.75
+    min_radius_m: Positive = 0.1
+    own_speed_sigma_m_s: Positive = 0.05
+    """trust in the own measured velocity, which the Doppler of the known walls corrects"""
+    birth_speed_sigma_m_s: Positive = 1.0
+    """across the bearing, where the first Doppler says nothing"""
+    accel_density: NonNegative = 0.02
+    """[m^2/s^3] spectral density of a body's acceleration"""
+    gate_m: Positive = 0.3
+    """a cluster this close to a prediction (plus one scan of its speed) may always match, however sure the filter is"""
+    turn_gate: Positive = 16.0
+    """squared normalised innovation (3 values) beyond which a body is taken to have turned"""
     moving_speed_m_s: NonNegative = 0.08
     moving_doppler_m_s: NonNegative = 0.03
+    moving_shift_m: NonNegative = 0.12
+    """displacement (forgotten over shift_memory_s) that shows motion across the beams"""
+    shift_memory_s: Positive = 2.0
+    doppler_memory_s: Positive = 0.5
     max_misses: PositiveCount = 8
     """in units of nominal 10 Hz scans"""
+    see_through_s: NonNegative = 0.15
+    """an older track that beams see through dies when it has been unseen this long"""
+    hidden_s: NonNegative = 2.0
+    """a track behind a nearer return is kept this long"""
     horizon_s: Positive = 2.5
     forecast_dt_s: Positive = 0.1
+    growth_sigmas: NonNegative = 1.0
+    """a forecast's radius grows by this many standard deviations of the predicted position"""
+    max_growth_m: NonNegative = 0.5
 
 
 class MappingConfig(Section):
@@ -423,12 +453,15 @@ class VoronoiConfig(Section):
     """budget of the search"""
     use: Literal["static", "fused"] = "static"
     """which occupancy the route must avoid"""
+    avoid_forecast: bool = False
+    """plan around the forecast of moving bodies too (no gain found in trials)"""
 
 
 class RouteConfig(Section):
     """Route, triggers, look-ahead and the RRT fallback."""
 
-    n_way: PositiveCount = 256
+    n_way: PositiveCount = 512
+    """waypoints kept; a longer route is spaced wider"""
     spacing_m: Positive = 0.2
     lookahead_m: Positive = 1.0
     risk_horizon_m: Positive = 3.0
@@ -439,13 +472,16 @@ class RouteConfig(Section):
     safety_ttc_s: NonNegative = 1.0
     forecast_clearance_m: NonNegative = 0.35
     """a forecast closer than this to the look-ahead path is an intersection"""
+    reach_speed_m_s: NonNegative = 0.6
+    """the vehicle can be anywhere up to this times t along the path when a forecast body is there"""
+    progress_window_m: Positive = 1.5
+    """how far ahead of the last foot the new one is looked for"""
     min_replan_s: NonNegative = 0.4
     """the same trigger does not fire again within this"""
     rrt_clearance_m: NonNegative = 0.1
     """overlay clearance floor of the paper: what the fallback may still cross"""
-    rrt_budget_s: Positive = 0.02
-    """iterations are bounded too, so that results do not depend on the machine"""
     rrt_iterations: PositiveCount = 4000
+    """budget of the fallback; never wall time, so that results do not depend on the machine"""
     rrt_range_m: Positive = 1.0
 
 
@@ -457,22 +493,87 @@ class FeaturesConfig(Section):
 
 
 class TeacherConfig(Section):
-    """Behaviour tree's leaves."""
+    """Behaviour tree's leaves: assessment of threats, evasion and driving. Ports of a tree override the numbers that are a leaf's own."""
 
     cruise_m_s: Positive = 0.6
-    horizon_s: Positive = 2.5
     decide_period_steps: PositiveCount = 5
+    """control steps between decisions of the evasion (10 Hz: more made no difference in a trial)"""
+    lag_s: Positive = 0.35
+    """time constant from commanded to driven velocity, for roll-outs"""
+    horizon_s: Positive = 2.5
+    """of roll-outs (1.5 s cost 7 points in a trial)"""
+
     n_heading: PositiveCount = 24
     n_speed: PositiveCount = 4
+    evade_m_s: Positive = 0.85
+    """fastest candidate; the limits of surge and sway are separate, so diagonals of the body are faster than its axes"""
+
+    hull_reach_m: NonNegative = 0.22
+    """hull centre to surface: between 0.17 abeam and 0.27 ahead"""
+    contact_m: NonNegative = 0.1
+    """clearance that the referee calls a collision"""
     margin_m: NonNegative = 0.25
-    """wanted clearance from a forecast body"""
+    """wanted clearance beyond contact from a forecast body"""
     margin_growth_m_s: NonNegative = 0.1
     """the margin grows with prediction time"""
     closing_s: NonNegative = 0.25
-    """effective clearance is reduced by this times the closing speed"""
-    emergency_ttc_s: NonNegative = 0.6
-    emergency_range_m: NonNegative = 0.15
+    """effective clearance is reduced by this times the closing speed (the referee stops at 0.18 s)"""
+    static_margin_m: NonNegative = 0.1
+    """wanted clearance beyond contact from mapped obstacles and walls"""
+    static_horizon_s: Positive = 1.5
+    static_dt_s: Positive = 0.25
+
+    weight_peak: NonNegative = 6.0
+    """[1/m] largest depth of violation of the wanted clearance"""
+    weight_mean: NonNegative = 6.0
+    """[1/m] depth of violation averaged over the horizon, summed over bodies"""
+    weight_contact: NonNegative = 12.0
+    """[1/m] largest depth below contact"""
+    weight_static: NonNegative = 12.0
+    """[1/m] mean depth of violation of the static clearance"""
+    weight_static_contact: NonNegative = 30.0
+    """[1/m] largest depth below static contact"""
+    weight_deviation: NonNegative = 1.0
+    """per cruise speed of difference from the follow velocity"""
+    weight_change: NonNegative = 0.3
+    """per cruise speed of difference from the last command"""
+    softness: Positive = 0.05
+    """temperature of the cost-softmax mean over candidates"""
+
+    calm_s: NonNegative = 0.5
+    """evasion goes on for this long after the last predicted conflict"""
+    conflict_within_s: NonNegative = 2.5
+    emergency_ttc_s: NonNegative = 0.35
+    emergency_range_m: NonNegative = 0.12
+    emergency_closing_m_s: NonNegative = 0.15
+    """slower approach is no emergency"""
+    back_off_m_s: Positive = 0.85
+    blocked_clearance_m: NonNegative = 0.25
+    """the way to the look-ahead point is blocked below this static clearance"""
+    goal_near_m: Positive = 1.5
+    stuck_s: Positive = 4.0
+    unstick_s: Positive = 1.5
+    unstick_m_s: Positive = 0.3
+    slow_clearance_m: Positive = 0.6
+    """speed falls below cruise where the static clearance is smaller than this"""
+    slow_fraction: Fraction = 0.5
+    """share of cruise speed left at contact"""
+    depth_policy: Fraction = 0.0
+    """depth that travel keeps: 0 = the goal's, 1 = near the surface or the floor, whichever is closer to the goal"""
+    edge_gap_m: NonNegative = 0.26
+    """hull centre to surface or floor when keeping near it"""
+    depth_gain: Positive = 1.0
+    """[1/s] heave per metre of depth error"""
+    heave_clear_m: NonNegative = 1.2
+    """depth is changed only with no moving body closer than this"""
+    yaw_gain: Positive = 1.5
+    """[1/s]"""
     max_node: PositiveCount = 64
+
+    @property
+    def n_candidate(self) -> int:
+        """Evasive velocities tried: headings times speeds, stop, last command, follow; padded to whole packets of 16."""
+        return 16 * -(-(self.n_heading * self.n_speed + 3) // 16)
 
 
 class RewardConfig(Section):

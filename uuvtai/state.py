@@ -336,7 +336,7 @@ class SonarMemory:
     vel_b: ti.Field = array("n_env", "n_latency", vec=3)
     """[m/s]"""
     cloud_beam: ti.Field = array("n_env", "n_cloud", dtype=ti.i32)
-    """first beam of a bubble cloud"""
+    """first beam of a bubble cloud, counted from the world's x axis"""
     cloud_width: ti.Field = array("n_env", "n_cloud", dtype=ti.i32)
     """beams it covers"""
     cloud_range_m: ti.Field = array("n_env", "n_cloud")
@@ -378,38 +378,66 @@ class TrackState:
     """[m] depth plane in which it was last seen (the vehicle's own z then)"""
     radius_m: ti.Field = array("n_env", "n_track")
     """[m] horizontal radius"""
+    radius_var: ti.Field = array("n_env", "n_track")
+    """[m^2] variance of the radius"""
     turn_rate: ti.Field = array("n_env", "n_track")
-    """[rad/s] 0 until turns are estimated"""
+    """[rad/s] rate at which the velocity turns, smoothed; 0 = straight or unknown"""
+    doppler_m_s: ti.Field = array("n_env", "n_track")
+    """[m/s] fading mean of the compensated Doppler"""
+    doppler_var: ti.Field = array("n_env", "n_track")
+    """[m^2/s^2] variance of that mean"""
+    shift_w: ti.Field = array("n_env", "n_track", vec=2)
+    """[m] fading displacement since birth"""
     age: ti.Field = array("n_env", "n_track", dtype=ti.i32)
     """scans since birth"""
     misses: ti.Field = array("n_env", "n_track", dtype=ti.i32)
     """scans in a row without a matching cluster"""
     seen_step: ti.Field = array("n_env", "n_track", dtype=ti.i32)
     """episode step of the last match"""
+    scan_step: ti.Field = array("n_env", dtype=ti.i32)
+    """episode step of the ping that the states refer to, -1 = no scan yet"""
     beam_track: ti.Field = array("n_env", "n_ray", dtype=ti.i32)
-    """track that explains this beam of the newest scan, -1 = none"""
+    """track that explains this beam of the newest tracked scan (ping_step = scan_step), -1 = none"""
 
 
 @dataclass(frozen=True, eq=False)
 class ClusterState:
     """Scratch of one scan: runs of neighbouring beams that belong together."""
 
+    fresh: ti.Field = array("n_env", dtype=ti.i32)
+    """1 = clustered in this very step"""
+    scan_step: ti.Field = array("n_env", dtype=ti.i32)
+    """episode step of the ping that was clustered last, -1 = none yet"""
     count: ti.Field = array("n_env", dtype=ti.i32)
     """clusters found"""
     pos_w: ti.Field = array("n_env", "n_cluster", vec=2)
     """[m] centre of the body"""
     radius_m: ti.Field = array("n_env", "n_cluster")
-    """[m]"""
+    """[m] from the half-angle"""
+    range_m: ti.Field = array("n_env", "n_cluster")
+    """[m] mean range of its beams"""
+    range_var: ti.Field = array("n_env", "n_cluster")
+    """[m^2] variance of that mean"""
     doppler_m_s: ti.Field = array("n_env", "n_cluster")
     """[m/s] mean, compensated for own motion"""
+    doppler_var: ti.Field = array("n_env", "n_cluster")
+    """[m^2/s^2] variance of that mean"""
     bearing_w: ti.Field = array("n_env", "n_cluster")
-    """[rad]"""
+    """[rad] of the middle of what is seen"""
     first_beam: ti.Field = array("n_env", "n_cluster", dtype=ti.i32)
     """first beam"""
+    span: ti.Field = array("n_env", "n_cluster", dtype=ti.i32)
+    """beams from the first to the last, missed ones included"""
     n_beam: ti.Field = array("n_env", "n_cluster", dtype=ti.i32)
-    """number of beams"""
+    """number of beams that hit it"""
+    hidden: ti.Field = array("n_env", "n_cluster", dtype=ti.i32)
+    """edges beyond which it may go on unseen: 1 = first, 2 = last, 3 = both"""
     match: ti.Field = array("n_env", "n_cluster", dtype=ti.i32)
     """track it was matched to, -1 = none"""
+    beam_cluster: ti.Field = array("n_env", "n_ray", dtype=ti.i32)
+    """cluster of this beam, -1 = none"""
+    beam_doppler: ti.Field = array("n_env", "n_ray")
+    """[m/s] Doppler of this beam, compensated with the own measured velocity"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -471,20 +499,26 @@ class ClearanceState:
 
 @dataclass(frozen=True, eq=False)
 class VoronoiState:
-    """Scratch of the global planner, one slot per env."""
+    """Scratch of the global planner. Slots are shared by the queue (slot s plans its items s, s + n_plan, ...): few serve many envs."""
 
-    ridge: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.u8)
-    """1 = cell of the Voronoi skeleton"""
-    cost: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.f32)
-    """cost-to-come of the search"""
-    parent: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.i32)
-    """cell from which it was reached (row * n_col + col), -1 = none"""
-    heap_cell: ti.Field = array("n_env", "n_heap", dtype=ti.i32)
-    """binary heap of open cells"""
-    heap_key: ti.Field = array("n_env", "n_heap", dtype=ti.f32)
-    """their costs"""
-    failure: ti.Field = array("n_env", dtype=ti.i32)
-    """voronoi.* code of why no route was found, 0 = found"""
+    weight: ti.Field = array("n_plan", "n_row", "n_col", dtype=ti.f32)
+    """[1/m] 1 / max(clearance, eps_r) of a traversable cell, 0 = not traversable"""
+    cost: ti.Field = array("n_plan", "n_row", "n_col", dtype=ti.f32)
+    """cost-to-go of the cells reached by the search"""
+    cell: ti.Field = array("n_plan", "n_row", "n_col", dtype=ti.u8)
+    """bits of voronoi.py: on the skeleton or not (filled on demand), reached, direction of the next cell towards the goal"""
+    heap_cell: ti.Field = array("n_plan", "n_heap", dtype=ti.i32)
+    """binary heap of open cells (row * n_col + col)"""
+    heap_key: ti.Field = array("n_plan", "n_heap", dtype=ti.f32)
+    """their estimated total costs"""
+    path_cell: ti.Field = array("n_plan", "n_path", dtype=ti.i32)
+    """cells of the path found, from start to goal"""
+    node_cost: ti.Field = array("n_plan", "n_path", dtype=ti.f32)
+    """shortcutting: cost-to-go of every few path cells"""
+    node_next: ti.Field = array("n_plan", "n_path", dtype=ti.i32)
+    """shortcutting: how many nodes the best chord from here spans, 0 = along the cells to the next node"""
+    pops: ti.Field = array("n_env", dtype=ti.i32)
+    """cells taken from the heap by the newest plan of this env"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -495,6 +529,8 @@ class RouteState:
     """waypoints in use; 0 = no route yet"""
     way_w: ti.Field = array("n_env", "n_way", vec=2)
     """[m] waypoints at most route.spacing_m apart, first = where it was planned, last = goal"""
+    way_left_m: ti.Field = array("n_env", "n_way")
+    """[m] route length from this waypoint to the last"""
     cost: ti.Field = array("n_env")
     """sum |dp| / max(clearance, eps) of the route when it was planned"""
     planner: ti.Field = array("n_env", dtype=ti.i32)
@@ -511,6 +547,10 @@ class RouteState:
     """env ids that plan in this step"""
     n_queue: ti.Field = array(dtype=ti.i32)
     """length of the queue"""
+    failed: ti.Field = array("n_env", dtype=ti.i32)
+    """env ids whose Voronoi plan failed in this step: the host's RRT takes them"""
+    n_failed: ti.Field = array(dtype=ti.i32)
+    """length of that list"""
     plan_step: ti.Field = array("n_env", dtype=ti.i32)
     """episode step of the newest route"""
     replans: ti.Field = array("n_env", "n_trigger", dtype=ti.i32)
@@ -518,7 +558,17 @@ class RouteState:
     planned_by: ti.Field = array("n_env", "n_planner", dtype=ti.i32)
     """routes of the episode by planner: voronoi, rrt"""
     fallbacks: ti.Field = array("n_env", "n_reason", dtype=ti.i32)
-    """fallbacks of the episode by reason"""
+    """fallbacks of the episode by reason: voronoi.* code - 1"""
+    kept: ti.Field = array("n_env", dtype=ti.i32)
+    """replans of the episode in which both planners failed and the old route (if any) stayed"""
+    second_passes: ti.Field = array("n_env", dtype=ti.i32)
+    """plans of the episode that left the skeleton and searched all traversable cells"""
+    served_step: ti.Field = array("n_env", "n_trigger", dtype=ti.i32)
+    """episode step at which this trigger was last answered by a replan"""
+    ahead_w: ti.Field = array("n_env", "n_ahead", vec=2)
+    """[m] points of the look-ahead segment, one cell apart, from the foot on"""
+    n_ahead: ti.Field = array("n_env", dtype=ti.i32)
+    """points in use"""
     arc: ti.Field = array("n_env")
     """[waypoint index, fractional] foot of the vehicle on the route"""
     lookahead_w: ti.Field = array("n_env", vec=3)
@@ -557,9 +607,13 @@ class TeacherState:
     """The behaviour tree: blackboard, statuses and action."""
 
     status: ti.Field = array("n_env", "n_node", dtype=ti.i32)
-    """status of every node in the newest tick (tree codes)"""
+    """status of every node after the newest tick (tree_tick codes)"""
     running_child: ti.Field = array("n_env", "n_node", dtype=ti.i32)
-    """child index that a node with memory goes on with"""
+    """child (preorder index) that a node with memory goes on with"""
+    result: ti.Field = array("n_env", "n_node", dtype=ti.i32)
+    """scratch of one tick: what each leaf answers when it is ticked"""
+    since_step: ti.Field = array("n_env", "n_node", dtype=ti.i32)
+    """episode step at which a leaf that is running began"""
     ticks: ti.Field = array("n_env", "n_node", dtype=ti.i32)
     """ticks of every node in the episode"""
     acted: ti.Field = array("n_env", "n_node", dtype=ti.i32)
@@ -567,21 +621,37 @@ class TeacherState:
     action: ti.Field = array("n_env", vec=4)
     """[-1, 1] surge, sway, heave, yaw rate of the tree"""
     leaf: ti.Field = array("n_env", dtype=ti.i32)
-    """node that set the action"""
+    """node that set the action, -1 = none (then the vehicle is told to stop)"""
     follow_vel_w: ti.Field = array("n_env", vec=3)
-    """[m/s] velocity that following the route asks for"""
+    """[m/s] velocity that following the route asks for (level)"""
     evade_vel_w: ti.Field = array("n_env", vec=3)
     """[m/s] best evasive velocity found"""
     evade_cost: ti.Field = array("n_env")
-    """cost of that candidate"""
+    """cost of that velocity"""
+    candidate_cost: ti.Field = array("n_env", "n_candidate")
+    """cost of every candidate of the newest decision"""
+    want_evade: ti.Field = array("n_env", dtype=ti.i32)
+    """1 = plan an evasion in this step"""
     ttc_s: ti.Field = array("n_env")
-    """[s] smallest sensed time to collision"""
+    """[s] smallest sensed time to contact, geometry.FAR_M = none"""
+    threat_bearing: ti.Field = array("n_env")
+    """[rad] its bearing in the body frame"""
     nearest_m: ti.Field = array("n_env")
     """[m] smallest sensed distance from the hull"""
     nearest_bearing: ti.Field = array("n_env")
     """[rad] its bearing in the body frame"""
+    clearance_m: ti.Field = array("n_env")
+    """[m] mapped static clearance of the own position"""
+    away_w: ti.Field = array("n_env", vec=2)
+    """unit vector away from the nearest mapped obstacle, zero = none near"""
+    path_clearance_m: ti.Field = array("n_env")
+    """[m] smallest mapped clearance on the straight way to the look-ahead point"""
     conflict_s: ti.Field = array("n_env")
-    """[s] time of the first predicted conflict of following the route, large = none"""
+    """[s] time of the first predicted conflict of following the route, geometry.FAR_M = none"""
+    body_near_m: ti.Field = array("n_env")
+    """[m] distance to the nearest forecast body now, hull to surface"""
+    calm_steps: ti.Field = array("n_env", dtype=ti.i32)
+    """control steps since a conflict was last predicted"""
     evading_steps: ti.Field = array("n_env", dtype=ti.i32)
     """control steps since the tree began to evade, 0 = not evading"""
     last_vel_w: ti.Field = array("n_env", vec=3)
@@ -595,9 +665,11 @@ class TreeTable:
     n_node: ti.Field = array(dtype=ti.i32)
     """nodes in use"""
     kind: ti.Field = array("n_node", dtype=ti.i32)
-    """kind of node (tree codes)"""
+    """kind of node (tree_tick codes)"""
     end: ti.Field = array("n_node", dtype=ti.i32)
     """one past the last descendant in preorder"""
+    parent: ti.Field = array("n_node", dtype=ti.i32)
+    """preorder index of the parent, -1 = root"""
     leaf: ti.Field = array("n_node", dtype=ti.i32)
     """which condition or action a leaf is"""
     param: ti.Field = array("n_node", vec=4)
