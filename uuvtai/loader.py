@@ -1,37 +1,220 @@
-"""Presets and YAML: load a config from named or user-given files, apply overrides, and say clearly what is wrong."""
+"""Presets and YAML: load a config from named or user-given files, apply overrides, and say precisely what is wrong and where.
+
+A preset is a YAML file that states differences only. Its top-level keys are config sections, plus ``extends`` (another preset of the same
+kind) and, in a world, ``sensors: NAME`` or ``vehicle: NAME`` in place of a section. Loading never executes code: safe YAML, no tags, no
+aliases, no duplicate keys, at most 1 MiB.
+"""
 
 from __future__ import annotations
 
+import difflib
+import json
+import re
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_origin
 
 import yaml
+from pydantic import BaseModel, ValidationError
 
 from uuvtai.config import Config
 
 PRESET_DIR = Path(__file__).parent / "presets"
+KINDS = {"world": "worlds", "sensors": "sensors", "vehicle": "vehicles", "tree": "trees"}
+_MAX_BYTES = 1 << 20
+_MAX_EXTENDS = 8
+
+
+class ConfigError(ValueError):
+    """What is wrong, where, why, and what to type next."""
+
+
+@dataclass
+class _Layer:
+    """One nested dict of settings, remembering where each dotted key was written."""
+
+    tree: dict[str, Any] = field(default_factory=dict)
+    origin: dict[str, str] = field(default_factory=dict)
+
+    def merge(self, other: _Layer) -> None:
+        _merge(self.tree, other.tree)
+        self.origin.update(other.origin)
 
 
 def load_config(
     world: str = "pool",
     sensors: str | None = None,
     vehicle: str | None = None,
-    overrides: dict[str, Any] | None = None,
+    overrides: dict[str, Any] | list[str] | None = None,
 ) -> Config:
-    """Config of a world preset (name or path), with a sensor and a vehicle preset on top, then dotted overrides."""
-    tree: dict[str, Any] = {}
-    for kind, name in (("worlds", world), ("sensors", sensors), ("vehicles", vehicle)):
-        if name is None:
-            continue
-        path = Path(name) if name.endswith((".yaml", ".yml")) else PRESET_DIR / kind / f"{name}.yaml"
-        _merge(tree, yaml.safe_load(path.read_text()) or {})
-    for key, value in (overrides or {}).items():
+    """Config of a world (preset name or path) with a sensor and a vehicle preset on top, then overrides.
+
+    ``overrides`` maps dotted keys to values, or lists ``key.sub=value`` strings as typed on the command line. Without ``sensors`` the
+    world's own choice counts, else ``paper``. Raises ConfigError.
+    """
+    layer = _read_preset("world", world)
+    named = {kind: layer.tree.pop(kind) for kind in ("sensors", "vehicle") if isinstance(layer.tree.get(kind), str)}
+    merged = _read_preset("sensors", sensors or named.get("sensors", "paper"))
+    if chosen := vehicle or named.get("vehicle"):
+        merged.merge(_read_preset("vehicle", chosen))
+    if sensors is not None:
+        layer.tree.pop("sensors", None)
+    merged.merge(layer)
+    merged.merge(_overrides(overrides or {}))
+    return validated(merged.tree, merged.origin)
+
+
+def validated(tree: dict[str, Any], origin: dict[str, str] | None = None) -> Config:
+    """Config from a nested dict; ConfigError names the key, its origin, the reason and the nearest known name."""
+    try:
+        return Config.model_validate_json(json.dumps(tree), strict=True)
+    except ValidationError as error:
+        raise ConfigError(_explained(error, origin or {})) from None
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"config: {error}; values are numbers, strings, lists and mappings") from None
+
+
+def load_resolved(path: Path) -> Config:
+    """Config from a run folder's ``config.yaml`` (complete, no presets)."""
+    layer = _read_yaml(path)
+    return validated(layer.tree, layer.origin)
+
+
+def to_yaml(config: Config) -> str:
+    """Complete YAML of a config; ``load_resolved`` reads it back."""
+    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, width=120)
+
+
+def preset_names(kind: str) -> list[str]:
+    """Names of the shipped presets of a kind: world, sensors, vehicle or tree."""
+    return sorted(path.stem for path in (PRESET_DIR / KINDS[kind]).iterdir() if path.suffix in (".yaml", ".xml"))
+
+
+def preset_path(kind: str, name: str) -> Path:
+    """File of a preset given by name or path; ConfigError lists the names there are."""
+    suffix = ".xml" if kind == "tree" else ".yaml"
+    if name.endswith((suffix, ".yml")) or "/" in name:
+        path = Path(name)
+        if not path.is_file():
+            raise ConfigError(f"{kind} {name!r}: no such file; give a {suffix} file or one of: {', '.join(preset_names(kind))}")
+        return path
+    if name not in preset_names(kind):
+        raise ConfigError(
+            f"{kind} {name!r} is no preset{_nearest(name, preset_names(kind))}; there are: {', '.join(preset_names(kind))} "
+            f"(see 'uuv presets'), or give the path of a {suffix} file"
+        )
+    return PRESET_DIR / KINDS[kind] / f"{name}{suffix}"
+
+
+def _read_preset(kind: str, name: str, depth: int = 0) -> _Layer:
+    if depth > _MAX_EXTENDS:
+        raise ConfigError(f"{kind} {name!r}: 'extends' is nested more than {_MAX_EXTENDS} deep; is it a circle?")
+    path = preset_path(kind, name)
+    own = _read_yaml(path)
+    base = own.tree.pop("extends", None)
+    if base is None:
+        return own
+    if not isinstance(base, str):
+        raise ConfigError(f"{path}: 'extends' must be the name or path of a {kind} preset, got {base!r}")
+    beside = path.parent / base
+    layer = _read_preset(kind, str(beside) if beside.is_file() else base, depth + 1)
+    layer.merge(own)
+    return layer
+
+
+# ------------------------------------------------------------------------------------------------------------------- YAML
+
+
+class _SafeLoader(yaml.SafeLoader):
+    """Safe YAML that reads 3e-4 as a number and refuses aliases and duplicate keys."""
+
+    def compose_node(self, parent, index):  # type: ignore[override]
+        if self.check_event(yaml.events.AliasEvent):
+            event = self.peek_event()
+            raise yaml.MarkedYAMLError(problem="aliases (*name) are not allowed here", problem_mark=event.start_mark)
+        return super().compose_node(parent, index)
+
+    def construct_mapping(self, node, deep=False):  # type: ignore[override]
+        seen: set[Any] = set()
+        for key_node, _ in node.value:
+            key = self.construct_object(key_node, deep=True)
+            if not isinstance(key, str):
+                raise yaml.MarkedYAMLError(problem=f"key {key!r} is not a name", problem_mark=key_node.start_mark)
+            if key in seen:
+                raise yaml.MarkedYAMLError(problem=f"key {key!r} is given twice", problem_mark=key_node.start_mark)
+            seen.add(key)
+        return super().construct_mapping(node, deep)
+
+
+_SafeLoader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+0123456789.")
+)
+
+
+def parsed_yaml(text: str, where: str) -> Any:
+    """Python value of a YAML text; ConfigError names ``where`` and the line."""
+    try:
+        return yaml.load(text, Loader=_SafeLoader)  # noqa: S506 - subclass of SafeLoader
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        line = f":{mark.line + 1}" if mark else ""
+        raise ConfigError(f"{where}{line}: not valid YAML: {error.problem}; mend that line") from None
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        raise ConfigError(f"{where}: not valid YAML: {error}") from None
+
+
+def _read_yaml(path: Path) -> _Layer:
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise ConfigError(f"{path}: larger than 1 MiB; a config is a small text file")
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from None
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path}: is not UTF-8 text; give a YAML file") from None
+    tree = parsed_yaml(text, str(path)) or {}
+    if not isinstance(tree, dict):
+        raise ConfigError(f"{path}: must be a mapping of sections such as 'world:', got {type(tree).__name__}")
+    node = yaml.compose(text, Loader=_SafeLoader)
+    return _Layer(tree, dict(_lines(node, str(path), ())) if node is not None else {})
+
+
+def _lines(node: yaml.Node, file: str, prefix: tuple[str, ...]):
+    if isinstance(node, yaml.MappingNode):
+        for key_node, value_node in node.value:
+            dotted = (*prefix, str(key_node.value))
+            yield ".".join(dotted), f"{file}:{key_node.start_mark.line + 1}"
+            yield from _lines(value_node, file, dotted)
+    elif isinstance(node, yaml.SequenceNode):
+        for index, item in enumerate(node.value):
+            dotted = (*prefix, str(index))
+            yield ".".join(dotted), f"{file}:{item.start_mark.line + 1}"
+            yield from _lines(item, file, dotted)
+
+
+# --------------------------------------------------------------------------------------------------------------- overrides
+
+
+def _overrides(overrides: dict[str, Any] | list[str]) -> _Layer:
+    layer = _Layer()
+    pairs = overrides.items() if isinstance(overrides, dict) else [_split(text) for text in overrides]
+    for key, value in pairs:
         *parents, leaf = key.split(".")
-        node = tree
+        node = layer.tree
         for parent in parents:
             node = node.setdefault(parent, {})
+            if not isinstance(node, dict):
+                raise ConfigError(f"--set {key}: '{parent}' was already set to a plain value; set its keys one by one")
         node[leaf] = value
-    return Config.model_validate(tree)
+        layer.origin[key] = f"--set {key}"
+    return layer
+
+
+def _split(text: str) -> tuple[str, Any]:
+    key, equals, value = text.partition("=")
+    if not equals or not key.strip():
+        raise ConfigError(f"--set {text!r}: write key.sub=value, for example --set world.n_dynamic=9")
+    return key.strip(), parsed_yaml(value, f"--set {key.strip()}")
 
 
 def _merge(into: dict[str, Any], other: dict[str, Any]) -> None:
@@ -40,3 +223,52 @@ def _merge(into: dict[str, Any], other: dict[str, Any]) -> None:
             _merge(into[key], value)
         else:
             into[key] = value
+
+
+# ----------------------------------------------------------------------------------------------------------------- messages
+
+
+def _explained(error: ValidationError, origin: dict[str, str]) -> str:
+    lines = []
+    for problem in error.errors():
+        dotted = ".".join(str(part) for part in problem["loc"])
+        where = _origin_of(dotted, origin)
+        if problem["type"] == "extra_forbidden":
+            lines.append(f"{where}unknown key '{dotted}'{_nearest(dotted.rsplit('.', 1)[-1], _siblings(problem['loc']))}")
+        else:
+            got = problem.get("input")
+            lines.append(f"{where}{dotted}: {problem['msg']} (got {got!r})")
+    return "\n".join(lines) + "\n'uuv presets show NAME' prints every key with its default"
+
+
+def _origin_of(dotted: str, origin: dict[str, str]) -> str:
+    inner = next((key for key in reversed(origin) if key.startswith(dotted + ".")), None)
+    while dotted:
+        if dotted in origin and not (inner and origin[inner].startswith("--set")):
+            return f"{origin[dotted]}: "
+        if inner:
+            return f"{origin[inner]}: "
+        dotted = dotted.rpartition(".")[0]
+    return ""
+
+
+def _siblings(location: tuple[Any, ...]) -> list[str]:
+    model: Any = Config
+    for part in location[:-1]:
+        model = _inner_model(model.model_fields[part].annotation) if isinstance(part, str) and part in model.model_fields else model
+        if model is None:
+            return []
+    return list(model.model_fields)
+
+
+def _inner_model(annotation: Any) -> type[BaseModel] | None:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    if get_origin(annotation) is not None:
+        return next((found for arg in get_args(annotation) if (found := _inner_model(arg))), None)
+    return None
+
+
+def _nearest(name: str, names: list[str]) -> str:
+    close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+    return f"; did you mean '{close[0]}'?" if close else ""

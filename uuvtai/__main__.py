@@ -1,0 +1,5 @@
+"""``python -m uuvtai`` is ``uuv``."""
+
+from uuvtai.cli import main
+
+main()

@@ -1,0 +1,538 @@
+"""The command line ``uuv``: parse, load the preset, call one function, print.
+
+Results go to stdout, progress and messages to stderr. Exit codes: 0 ok, 1 runtime failure, 2 usage or config, 3 a gate was not met,
+130 interrupted. Heavy packages are imported inside the commands, so that ``uuv --help`` is quick.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from uuvtai import __version__
+
+OK, FAILED, USAGE, GATE, INTERRUPTED = 0, 1, 2, 3, 130
+
+UsageError: Any = typer.BadParameter.__base__
+"""Typer carries its own copy of click from 0.26 on, so the class is taken from what Typer exports."""
+
+app = typer.Typer(
+    name="uuv",
+    help="Train, measure and inspect observation-only navigation for underwater vehicles.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+log_app = typer.Typer(help="Look into recorded episodes (MCAP).", no_args_is_help=True)
+app.add_typer(log_app, name="log")
+
+World = Annotated[str, typer.Option("--world", help="World preset or path of a YAML file.")]
+Sensors = Annotated[str | None, typer.Option("--sensors", help="Sensor preset or path [default: the world's own, else paper].")]
+Vehicle = Annotated[str | None, typer.Option("--vehicle", help="Vehicle preset or path.")]
+Static = Annotated[int | None, typer.Option("-S", help="Static obstacles.")]
+Dynamic = Annotated[int | None, typer.Option("-D", help="Moving obstacles.")]
+Speed = Annotated[float | None, typer.Option("-v", help="Speed of the moving obstacles [m/s].")]
+Set = Annotated[list[str] | None, typer.Option("--set", help="Override a config key: key.sub=value (repeatable).")]
+Device = Annotated[str, typer.Option("--device", help="auto, cpu or cuda.")]
+RunDir = Annotated[Path | None, typer.Option("--run-dir", help="The run's folder [default: runs/<time>_<preset>].")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else on stdout.")]
+
+
+# -------------------------------------------------------------------------------------------------------------------- eval
+
+
+@app.command("eval")
+def evaluate(
+    controller: Annotated[
+        list[str] | None, typer.Option("--controller", help="straight, planner, bt or a tree's XML (repeatable) [default: all three].")
+    ] = None,
+    world: World = "pool",
+    sensors: Sensors = None,
+    vehicle: Vehicle = None,
+    episodes: Annotated[int, typer.Option("--episodes", help="Episodes per seed.")] = 64,
+    seeds: Annotated[str, typer.Option("--seeds", "--seed", help="Seeds, separated by commas.")] = "0",
+    n_static: Static = None,
+    n_dynamic: Dynamic = None,
+    speed: Speed = None,
+    num_envs: Annotated[int | None, typer.Option("--num-envs", help="Episodes played together [default: as many as sensible].")] = None,
+    record: Annotated[int, typer.Option("--record", help="Record the first K episodes of every method as MCAP with a picture.")] = 0,
+    video: Annotated[bool, typer.Option("--video", help="Also a top-down video of every recorded episode.")] = False,
+    depth_images: Annotated[bool, typer.Option("--depth-images", help="Also record the depth camera (2 Hz).")] = False,
+    device: Device = "auto",
+    overrides: Set = None,
+    run_dir: RunDir = None,
+    as_json: AsJson = False,
+) -> None:
+    """Play the same episodes with every controller and print the table of methods."""
+    seed_list = _seeds(seeds)
+    _at_least("--episodes", episodes, 1)
+    _at_least("--record", record, 0)
+    config = _config(world, sensors, vehicle, n_static, n_dynamic, speed, overrides)
+    names = [name for item in controller or ["straight", "planner", "bt"] for name in item.split(",") if name]
+    if not names:
+        raise UsageError("--controller: name at least one of straight, planner, bt or a tree's XML")
+
+    from uuvtai.measure.compare import Request, compare
+
+    request = Request(
+        config=config,
+        world=world,
+        sensors=sensors or "the world's own",
+        controllers=names,
+        seeds=seed_list,
+        episodes=episodes,
+        num_envs=num_envs,
+        record=record,
+        video=video,
+        depth_images=depth_images,
+        device=device,
+        run_dir=run_dir,
+    )
+    result, folder = compare(request, _Progress())
+    if as_json:
+        _print_json(result)
+    else:
+        _print_methods(result)
+        _say(f"run folder: {folder}")
+
+
+def _print_methods(result: dict[str, Any]) -> None:
+    speed = f"v = {result['v_m_s']} m/s, " if result["D"] else ""
+    table = Table(
+        title=f"{result['world']}: S = {result['S']}, D = {result['D']}, {speed}{result['sensors']} sensing, "
+        f"{len(result['seeds'])} seed(s) x {result['episodes_per_seed']} episodes",
+        title_justify="left",
+    )
+    for head in ("method", "success [95 %]", "collision [95 %]", "contact/ttc/out/timeout", "time to goal s", "TTS s", "replans", "steps/s"):
+        table.add_column(head, justify="left" if head == "method" else "right")
+    for m in result["methods"]:
+        o = m["outcomes"]
+        collided = o["collision"] + o["ttc"] + o["out_of_tank"]
+        table.add_row(
+            m["name"],
+            _rate(o["success"], m["episodes"], m["success_ci95"]),
+            _rate(collided, m["episodes"], m["collision_ci95"]),
+            f"{o['collision']}/{o['ttc']}/{o['out_of_tank']}/{o['timeout']}",
+            _number(m["time_to_success_mean_s"]),
+            _number(m["tts_s"]),
+            _number(m["replans_per_episode"]),
+            f"{m['env_steps_per_s']:,.0f}",
+        )
+    _stdout().print(table)
+
+
+def _rate(k: int, n: int, interval: list[float] | None) -> str:
+    bounds = f" [{100 * interval[0]:.0f}, {100 * interval[1]:.0f}]" if interval else ""
+    return f"{k}/{n} = {100 * k / n:.1f} %{bounds}" if n else "-"
+
+
+def _number(value: float | None, digits: int = 1) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+# ---------------------------------------------------------------------------------------------------------------- simulate
+
+
+@app.command()
+def simulate(
+    seconds: Annotated[float, typer.Option("--seconds", help="Duration [s].")],
+    vehicle: Annotated[str, typer.Option("--vehicle", help="Vehicle preset or path.")] = "bluerov2",
+    attitude_hold: Annotated[str | None, typer.Option("--attitude-hold", help="ideal, thrusters or none [default: the vehicle's].")] = None,
+    wrench: Annotated[str | None, typer.Option("--wrench", help="Constant body wrench fx,fy,fz,mx,my,mz [N, N m].")] = None,
+    command: Annotated[str | None, typer.Option("--command", help="Body velocity command u,v,w,r [m/s, rad/s] for the inner loop.")] = None,
+    current: Annotated[str | None, typer.Option("--current", help="Water velocity x,y,z [m/s].")] = None,
+    initial_rpy_deg: Annotated[str | None, typer.Option("--initial-rpy-deg", help="Roll, pitch, yaw [deg].")] = None,
+    initial_velocity: Annotated[str | None, typer.Option("--initial-velocity", help="u,v,w,p,q,r [m/s, rad/s].")] = None,
+    neutral: Annotated[bool, typer.Option("--neutral", help="Buoyancy equal to weight.")] = False,
+    dt: Annotated[float, typer.Option("--dt", help="Dynamics substep [s].")] = 0.01,
+    overrides: Set = None,
+    as_json: AsJson = False,
+) -> None:
+    """Open-loop physics in open water, to validate a vehicle against theory or data."""
+    extra = [f"vehicle.attitude_hold={attitude_hold}"] if attitude_hold else []
+    config = _config("open", "clean", vehicle, None, None, None, [*(overrides or []), *extra])
+
+    from uuvtai.measure.simulate import simulate as run
+
+    result = run(
+        config,
+        wrench=_numbers("--wrench", wrench, 6),
+        command=_numbers("--command", command, 4),
+        current=_numbers("--current", current, 3),
+        initial_rpy_deg=_numbers("--initial-rpy-deg", initial_rpy_deg, 3),
+        initial_velocity=_numbers("--initial-velocity", initial_velocity, 6),
+        neutral=neutral,
+        dt=dt,
+        seconds=seconds,
+    )
+    if as_json:
+        _print_json(result)
+        return
+    table = Table(title=f"{vehicle}: {seconds:g} s, substep {dt:g} s", title_justify="left")
+    for head in ("t s", "x m", "y m", "z m", "roll deg", "pitch deg", "yaw deg", "u m/s", "v m/s", "w m/s", "p", "q", "r rad/s"):
+        table.add_column(head, justify="right")
+    for i in _picked(len(result["t"]), 12):
+        values = [result["t"][i], *result["position"][i], *result["rpy_deg"][i], *result["nu"][i]]
+        table.add_row(*[f"{value:.3f}" for value in values])
+    _stdout().print(table)
+
+
+def _picked(n: int, wanted: int) -> list[int]:
+    return sorted({round(i * (n - 1) / max(1, wanted - 1)) for i in range(wanted)}) if n else []
+
+
+# ----------------------------------------------------------------------------------------------------------------- profile
+
+
+@app.command()
+def profile(
+    num_envs: Annotated[str, typer.Option("--num-envs", help="Batch sizes, separated by commas.")] = "1,64,1024",
+    controller: Annotated[str, typer.Option("--controller", help="Tree that is ticked.")] = "bt",
+    world: World = "pool",
+    sensors: Sensors = None,
+    n_static: Static = None,
+    n_dynamic: Dynamic = None,
+    speed: Speed = None,
+    seconds: Annotated[float, typer.Option("--seconds", help="Measured time per batch size [s].")] = 10.0,
+    density: Annotated[bool, typer.Option("--density", help="Also loop time against D.")] = False,
+    device: Device = "auto",
+    overrides: Set = None,
+    as_json: AsJson = False,
+) -> None:
+    """Time per stage, env-steps per second and memory, for several batch sizes."""
+    sizes = [_integer("--num-envs", text) for text in num_envs.split(",")]
+    if not math.isfinite(seconds) or seconds <= 0:
+        raise UsageError(f"--seconds {seconds}: must be a positive number, for example --seconds 10")
+    config = _config(world, sensors, None, n_static, n_dynamic, speed, overrides)
+
+    from uuvtai.measure.profiling import profile as run
+
+    result = run(config, sizes, controller, device, seconds, density, _say)
+    if as_json:
+        _print_json(result)
+    else:
+        _print_profile(result)
+
+
+def _print_profile(result: dict[str, Any]) -> None:
+    table = Table(title=f"{result['machine']['cpu']}, {result['machine']['cores']} cores, {result['machine']['device']}", title_justify="left")
+    table.add_column("us per env-step")
+    for row in result["rows"]:
+        table.add_column(f"{row['num_envs']} env", justify="right")
+    for stage in result["rows"][0]["stages_us_per_env_step"]:
+        table.add_row(stage, *[f"{row['stages_us_per_env_step'][stage]:.2f}" for row in result["rows"]])
+    table.add_section()
+    table.add_row("env-steps/s", *[f"{row['env_steps_per_s']['step']:,.0f}" for row in result["rows"]])
+    table.add_row("memory MB", *[f"{row['memory_mb']:,.0f}" for row in result["rows"]])
+    table.add_row("compile s", *[f"{row['compile_s']:.1f}" for row in result["rows"]])
+    _stdout().print(table)
+    if result["paper_latency"]:
+        paper = Table(title="beside the paper's timing table (one env)", title_justify="left")
+        for head in ("component", "mean ms", "max ms", "paper mean ms", "paper max ms"):
+            paper.add_column(head, justify="left" if head == "component" else "right")
+        for row in result["paper_latency"]:
+            values = (row["mean_ms"], row["max_ms"], row["paper_mean_ms"], row["paper_max_ms"])
+            paper.add_row(row["component"], *[_number(value, 3) for value in values])
+        _stdout().print(paper)
+
+
+# --------------------------------------------------------------------------------------------------------- presets, doctor
+
+
+@app.command()
+def presets(
+    action: Annotated[str | None, typer.Argument(help="'show' to print one preset, resolved.")] = None,
+    name: Annotated[str | None, typer.Argument(help="Preset to show.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """List the shipped presets, or show one with every key."""
+    from uuvtai import loader
+
+    if action is None:
+        found = {kind: loader.preset_names(kind) for kind in loader.KINDS}
+        if as_json:
+            _print_json(found)
+            return
+        for kind, names in found.items():
+            _stdout().print(f"[bold]{kind}[/bold]  {', '.join(names)}")
+        return
+    if action != "show" or not name:
+        raise UsageError("write 'uuv presets' or 'uuv presets show NAME'")
+    kinds = [kind for kind in loader.KINDS if name in loader.preset_names(kind)]
+    if kinds == ["tree"]:
+        typer.echo(loader.preset_path("tree", name).read_text())
+        return
+    kind = kinds[0] if kinds else "world"
+    config = loader.load_config(**{"world": "pool", kind: name})
+    if as_json:
+        _print_json(config.model_dump(mode="json"))
+    else:
+        typer.echo(loader.to_yaml(config))
+
+
+@app.command()
+def doctor(as_json: AsJson = False) -> None:
+    """Check that everything uuv needs is here and works."""
+    from uuvtai.doctor import checks
+
+    found = checks()
+    if as_json:
+        _print_json({"ok": all(c["ok"] for c in found), "checks": found})
+    else:
+        for c in found:
+            _stdout().print(f"[{'green' if c['ok'] else 'red'}]{'ok ' if c['ok'] else 'BAD'}[/] {c['name']}: {c['detail']}", highlight=False)
+    if not all(c["ok"] for c in found):
+        raise typer.Exit(FAILED)
+
+
+# -------------------------------------------------------------------------------------------------------------- tree, log
+
+
+@app.command()
+def tree(
+    run: Annotated[Path | None, typer.Argument(help="Run folder of an evaluation; without one, the tree alone.")] = None,
+    controller: Annotated[str, typer.Option("--controller", help="straight, planner, bt or a tree's XML.")] = "bt",
+    dot: Annotated[bool, typer.Option("--dot", help="Print Graphviz DOT instead.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Print a behaviour tree, with the share of episodes and ticks per node after an evaluation."""
+    from uuvtai.measure.tree_report import tree_report
+
+    report = tree_report(controller, run)
+    if as_json:
+        _print_json(report.document)
+    else:
+        typer.echo(report.dot if dot else report.text)
+
+
+LogFile = Annotated[Path, typer.Argument(help="An .mcap file.")]
+
+
+@log_app.command("info")
+def log_info(file: LogFile, as_json: AsJson = False) -> None:
+    """Topics, counts, rates, metadata and outcome of a log."""
+    from uuvtai.logs import reader
+
+    found = reader.info(file)
+    if as_json:
+        _print_json(found)
+        return
+    table = Table(title=str(file), title_justify="left")
+    for head in ("topic", "schema", "messages", "Hz"):
+        table.add_column(head, justify="right" if head in ("messages", "Hz") else "left")
+    for topic in found["topics"]:
+        table.add_row(topic["topic"], topic["schema"], str(topic["messages"]), _number(topic["rate_hz"]))
+    _stdout().print(table)
+    for key in ("duration_s", "outcome"):
+        _stdout().print(f"{key}: {found[key]}")
+
+
+@log_app.command("export")
+def log_export(
+    file: LogFile,
+    out: Annotated[Path, typer.Option("--out", help="Folder for the exported files.")],
+    topic: Annotated[list[str] | None, typer.Option("--topic", help="Only these topics (repeatable).")] = None,
+) -> None:
+    """Write every topic as JSON lines and the attachments as files."""
+    from uuvtai.logs import export
+
+    for path in export.export(file, out, topic):
+        typer.echo(str(path))
+
+
+@log_app.command("repair")
+def log_repair(
+    file: LogFile, out: Annotated[Path | None, typer.Option("--out", help="Repaired file [default: NAME.repaired.mcap].")] = None
+) -> None:
+    """Recover the messages of a log whose writing was cut off."""
+    from uuvtai.logs import repair
+
+    target = out or file.with_name(file.name.removesuffix(".part").removesuffix(".mcap") + ".repaired.mcap")
+    found = repair.repair(file, target)
+    typer.echo(f"{target}: {found.messages} messages recovered")
+
+
+@log_app.command("video")
+def log_video(
+    file: LogFile, out: Annotated[Path | None, typer.Option("--out", help="WebM file [default: beside the log].")] = None
+) -> None:
+    """Render a top-down video of a recorded episode."""
+    from uuvtai.logs import picture
+
+    target = out or file.with_suffix(".webm")
+    picture.video(file, target)
+    typer.echo(str(target))
+
+
+@log_app.command("picture")
+def log_picture(
+    file: Annotated[list[Path], typer.Argument(help="Logs of the same episode; trajectories are overlaid.")],
+    out: Annotated[Path | None, typer.Option("--out", help="PNG file [default: beside the first log].")] = None,
+    clearance: Annotated[bool, typer.Option("--clearance", help="Colour the clearance field.")] = False,
+) -> None:
+    """Draw a recorded episode: occupancy, trajectories, goal."""
+    from uuvtai.logs import picture
+
+    target = out or file[0].with_suffix(".png")
+    picture.picture(file, target, clearance=clearance)
+    typer.echo(str(target))
+
+
+# ------------------------------------------------------------------------------------------------------- parsing and output
+
+
+def _config(world, sensors, vehicle, n_static, n_dynamic, speed, overrides):
+    from uuvtai.loader import load_config
+
+    flags = {"n_static": n_static, "n_dynamic": n_dynamic, "dynamic_speed_m_s": speed}
+    typed = [f"world.{key}={value}" for key, value in flags.items() if value is not None]
+    return load_config(world, sensors, vehicle, [*typed, *(overrides or [])])
+
+
+def _seeds(text: str) -> list[int]:
+    return [_integer("--seeds", item) for item in text.split(",")]
+
+
+def _integer(option: str, text: str) -> int:
+    try:
+        value = int(text)
+    except ValueError:
+        raise UsageError(f"{option} {text!r}: whole numbers separated by commas, for example {option} 0,1,2") from None
+    if not -(2**31) <= value < 2**31:
+        raise UsageError(f"{option} {text}: must fit 32 bits")
+    return value
+
+
+def _numbers(option: str, text: str | None, count: int) -> list[float] | None:
+    if text is None:
+        return None
+    try:
+        values = [float(item) for item in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != count or not all(math.isfinite(value) for value in values):
+        raise UsageError(f"{option} {text!r}: give {count} finite numbers separated by commas, without spaces")
+    return values
+
+
+def _at_least(option: str, value: int, least: int) -> None:
+    if value < least:
+        raise UsageError(f"{option} {value}: must be at least {least}")
+
+
+def _print_json(document: Any) -> None:
+    typer.echo(json.dumps(document, allow_nan=False))
+
+
+def _stdout() -> Console:
+    # a pipe has no width: wide enough that no column is cut
+    return Console(width=None if sys.stdout.isatty() else 160)
+
+
+def _say(text: str) -> None:
+    typer.echo(text, err=True)
+
+
+class _Progress:
+    """Rich progress with ETA on a terminal, one plain line every few seconds otherwise."""
+
+    _PERIOD_S = 5.0
+
+    def __init__(self) -> None:
+        self._bar = None
+        self._last = 0.0
+
+    def start(self, name: str, total: int) -> None:
+        """A method with ``total`` episodes begins."""
+        import time
+
+        self._name, self._total, self._begun = name, total, time.perf_counter()
+        self._last = self._begun
+        if sys.stderr.isatty():
+            from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+            self._bar = Progress(
+                TextColumn("{task.description}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TimeElapsedColumn(),
+                TextColumn("ETA"),
+                TimeRemainingColumn(),
+                TextColumn("{task.fields[rate]}"),
+                console=Console(stderr=True),
+                transient=True,
+            )
+            self._bar.start()
+            self._task = self._bar.add_task(name, total=total, rate="")
+
+    def note(self, text: str) -> None:
+        """A message for the person who waits."""
+        _say(text)
+
+    def update(self, done: int, total: int, env_steps: int) -> None:
+        """``done`` of ``total`` episodes are over after ``env_steps`` env steps."""
+        import time
+
+        now = time.perf_counter()
+        speed = env_steps / max(1e-9, now - self._begun)
+        if self._bar is not None:
+            self._bar.update(self._task, completed=done, rate=f"{speed:,.0f} env-steps/s")
+        elif now - self._last >= self._PERIOD_S:
+            self._last = now
+            eta = (now - self._begun) / max(1, done) * (total - done)
+            _say(f"{self._name}: {done}/{total} episodes, {speed:,.0f} env-steps/s, ETA {eta:.0f} s")
+
+    def stop(self) -> None:
+        """The method is done."""
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
+
+
+@app.callback(invoke_without_command=True)
+def _root(version: Annotated[bool, typer.Option("--version", help="Print the version and leave.")] = False) -> None:
+    if version:
+        typer.echo(__version__)
+        raise typer.Exit
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point: run a command and turn errors into one message and an exit code."""
+    sys.exit(_guarded(lambda: app(args=arguments, prog_name="uuv", standalone_mode=False)))
+
+
+def _guarded(run: Callable[[], Any]) -> int:
+    try:
+        code = run()
+        return code if isinstance(code, int) else OK
+    except UsageError.__base__ as error:
+        error.show()
+        return USAGE
+    except (KeyboardInterrupt, typer.Abort):
+        return _told("interrupted", INTERRUPTED)
+    except BrokenPipeError:
+        # the reader of our output has gone (| head): not an error of ours
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return OK
+    except (ValueError, MemoryError) as error:
+        return _told(f"uuv: {error}", USAGE)
+    except (RuntimeError, OSError) as error:
+        return _told(f"uuv: {error}", FAILED)
+
+
+def _told(text: str, code: int) -> int:
+    _say(text)
+    return code
+
+
+if __name__ == "__main__":
+    main()

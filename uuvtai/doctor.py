@@ -1,0 +1,119 @@
+"""Is everything here that uuv needs, and does it work? Each check is a small job of the real thing."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import platform
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+
+def checks() -> list[dict[str, Any]]:
+    """One entry per check: name, ok, detail (what was found, or what is wrong and what to do)."""
+    jobs: dict[str, Callable[[], str]] = {
+        "python": _python,
+        "taichi": _taichi,
+        "torch": _torch,
+        "ompl": _ompl,
+        "opencv": _opencv,
+        "mcap": _mcap,
+        "cuda": _cuda,
+        "kernel cache": _cache,
+        "memory": _memory,
+        "run folder": _runs,
+    }
+    return [_done(name, job) for name, job in jobs.items()]
+
+
+def _done(name: str, job: Callable[[], str]) -> dict[str, Any]:
+    try:
+        return {"name": name, "ok": True, "detail": job()}
+    except Exception as error:  # a check reports whatever goes wrong
+        return {"name": name, "ok": False, "detail": f"{type(error).__name__}: {error}"}
+
+
+def _python() -> str:
+    if not (3, 10) <= sys.version_info[:2] <= (3, 13):
+        raise RuntimeError(f"{platform.python_version()} is not supported; use CPython 3.10 to 3.13")
+    return f"{platform.python_version()} on {platform.platform()}"
+
+
+def _taichi() -> str:
+    import taichi as ti
+
+    from uuvtai.runtime import start_taichi
+
+    runtime = start_taichi("cpu")
+    field = ti.field(ti.f32, 16)
+    field.fill(2.0)
+    if float(field.to_numpy().sum()) != 32.0:
+        raise RuntimeError("a kernel gave a wrong sum; reinstall taichi")
+    return f"{'.'.join(map(str, ti.__version__))}, {runtime.device}, {os.environ.get('UUV_NUM_THREADS', os.cpu_count())} threads"
+
+
+def _torch() -> str:
+    import torch
+
+    if float(torch.ones(4).sum()) != 4.0:
+        raise RuntimeError("a tensor gave a wrong sum; reinstall torch")
+    return torch.__version__
+
+
+def _ompl() -> str:
+    importlib.import_module("ompl.geometric")
+    return "RRT fallback available"
+
+
+def _opencv() -> str:
+    import cv2
+    import numpy as np
+
+    with tempfile.TemporaryDirectory() as folder:
+        target = str(Path(folder) / "test.webm")
+        writer = cv2.VideoWriter(target, cv2.VideoWriter.fourcc(*"VP80"), 10, (64, 64))
+        for _ in range(3):
+            writer.write(np.zeros((64, 64, 3), np.uint8))
+        writer.release()
+        if not Path(target).exists() or Path(target).stat().st_size == 0:
+            raise RuntimeError("cannot write WebM video; reinstall opencv-python-headless")
+    return f"{cv2.__version__}, WebM video works"
+
+
+def _mcap() -> str:
+    for name in ("mcap.writer", "zstandard"):
+        importlib.import_module(name)
+    return "logs can be written"
+
+
+def _cuda() -> str:
+    import torch
+
+    return torch.cuda.get_device_name(0) if torch.cuda.is_available() else "no CUDA device: everything runs on the CPU"
+
+
+def _cache() -> str:
+    from taichi.lang.impl import default_cfg
+
+    path = Path(default_cfg().offline_cache_file_path)
+    size = sum(f.stat().st_size for f in path.rglob("*") if f.is_file()) if path.exists() else 0
+    return f"{path}, {size / 2**20:.1f} MB (empty = the next run compiles for about a minute)"
+
+
+def _memory() -> str:
+    from uuvtai.loader import load_config
+    from uuvtai.sizes import free_memory_bytes, memory_bytes
+
+    per_env = memory_bytes(load_config("pool"), 1024) / 1024
+    free = free_memory_bytes("cpu")
+    room = f"; {free / 2**30:.1f} GiB free, room for about {int(0.9 * free / per_env):,} envs" if free else ""
+    return f"{per_env / 1e6:.2f} MB per env in pool{room}"
+
+
+def _runs() -> str:
+    with tempfile.TemporaryFile(dir=Path.cwd()):
+        pass
+    return f"{Path.cwd() / 'runs'} can be written"

@@ -1,0 +1,115 @@
+"""Compare controllers on paired scenarios in one run folder: results, logs, pictures, videos."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from uuvtai.config import Config
+from uuvtai.loader import ConfigError
+from uuvtai.run_folder import RunFolder, default_run_dir
+
+_BATCH = 256
+"""Episodes played together by default: enough to fill the cores, few enough that the last stragglers cost little."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """What ``uuv eval`` was asked for."""
+
+    config: Config
+    world: str
+    sensors: str
+    controllers: list[str]
+    seeds: list[int]
+    episodes: int
+    num_envs: int | None = None
+    record: int = 0
+    video: bool = False
+    depth_images: bool = False
+    device: str = "auto"
+    run_dir: Path | None = None
+
+
+class Watch(Protocol):
+    """Shows how far a comparison is."""
+
+    def start(self, name: str, total: int) -> None: ...
+    def note(self, text: str) -> None: ...
+    def update(self, done: int, total: int, env_steps: int) -> None: ...
+    def stop(self) -> None: ...
+
+
+def compare(request: Request, watch: Watch) -> tuple[dict[str, Any], Path]:
+    """Play every controller's episodes; the ``uuv eval --json`` document and the run folder.
+
+    Everything that can be refused is refused before anything is written. Raises ConfigError, ValueError, MemoryError, RunFolderError.
+    """
+    from uuvtai.measure.evaluate import document, jobs_of, run_episodes, summary, tree_use
+    from uuvtai.measure.recording import EpisodeRecorder
+    from uuvtai.sim import Sim
+    from uuvtai.tree import read_tree
+
+    if request.num_envs is not None and request.num_envs < 1:
+        raise ValueError(f"--num-envs {request.num_envs}: at least 1 env is needed, for example --num-envs 64")
+    if len(set(request.seeds)) != len(request.seeds):
+        raise ConfigError(f"--seeds {','.join(map(str, request.seeds))}: a seed is given twice; its episodes would be the same")
+    jobs = jobs_of(request.seeds, request.episodes)
+    trees = {_label(name): read_tree(name, request.config.teacher.max_node) for name in request.controllers}
+    num_envs = request.num_envs or min(len(jobs), _BATCH)
+    watch.note(f"starting {num_envs} envs (the first run on a machine compiles its kernels, about a minute)")
+    sim = Sim(request.config, num_envs, next(iter(trees.values())), request.device)
+    folder = RunFolder(request.run_dir or default_run_dir(request.world), request.config, request.seeds)
+    methods, use, logs = [], {}, []
+    status, code = "failed", 1
+    try:
+        for label, tree in trees.items():
+            sim.use_tree(tree)
+            recorder = EpisodeRecorder(request, folder.path, label, jobs[: request.record]) if request.record else None
+            watch.start(label, len(jobs))
+            begun = time.perf_counter()
+            results, env_steps = run_episodes(sim, jobs, recorder, watch.update)
+            methods.append(summary(label, results, env_steps, time.perf_counter() - begun))
+            watch.stop()
+            use[label] = tree_use(sim, results)
+            if recorder:
+                logs.append(recorder.paths)
+        result = document(request.config, request.world, request.sensors, request.seeds, request.episodes, methods)
+        folder.write_json("eval/result.json", result)
+        folder.write_json("eval/tree.json", {"schema": 1, "controllers": {n: str(p) for n, p in _files(request).items()}, "use": use})
+        _draw(request, folder.path, logs, watch)
+        status, code = "finished", 0
+    except KeyboardInterrupt:
+        status, code = "interrupted", 130
+        raise
+    finally:
+        watch.stop()
+        folder.finish(status, code)
+    return result, folder.path
+
+
+def _label(name: str) -> str:
+    return Path(name).stem if name.endswith(".xml") else name
+
+
+def _files(request: Request) -> dict[str, str]:
+    return {_label(name): name for name in request.controllers}
+
+
+def _draw(request: Request, folder: Path, logs: list[dict[Any, Path]], watch: Watch) -> None:
+    """One picture per recorded episode with every method's trajectory, and the videos."""
+    if not logs:
+        return
+    from uuvtai.logs.picture import picture, video
+
+    for job in logs[0]:
+        files = [paths[job] for paths in logs]
+        picture(files, folder / "pictures" / f"seed{job.seed}_episode{job.episode}.png")
+        picture(files, folder / "pictures" / f"seed{job.seed}_episode{job.episode}_clearance.png", clearance=True)
+        for file in files if request.video else []:
+            watch.note(f"drawing {file.stem}.webm")
+            video(file, folder / "videos" / f"{file.stem}.webm")
+
+

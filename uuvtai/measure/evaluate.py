@@ -1,0 +1,256 @@
+"""Evaluate controllers on fixed scenarios: every method meets exactly the same episodes, whatever the batch size or order."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+
+from uuvtai.config import Config
+from uuvtai.kernels.episode import OUTCOMES, RUNNING
+from uuvtai.kernels.route import PLANNERS, REASONS, TRIGGERS
+from uuvtai.measure.statistics import mean, rate, time_to_success_s, wilson_interval
+from uuvtai.sim import Sim
+
+_REFILL_SHARE = 16
+"""Ended rows wait until this part of the batch can be reset together, or until nothing runs: fewer reset passes, same results."""
+
+COLLIDED = ("collision", "ttc", "out_of_tank")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One episode to play."""
+
+    seed: int
+    episode: int
+
+
+@dataclass(frozen=True)
+class EpisodeResult:
+    """How one episode ended."""
+
+    seed: int
+    episode: int
+    outcome: str
+    time_s: float
+    episode_return: float
+    min_clearance_m: float
+    path_length_m: float
+    replans: dict[str, int]
+    planned_by: dict[str, int]
+    fallbacks: dict[str, int]
+    ticks: np.ndarray
+    acted: np.ndarray
+
+
+class Recorder(Protocol):
+    """Watches chosen episodes as they run."""
+
+    def begin(self, sim: Sim, row: int, job: Job) -> None:
+        """An episode has just been reset in this row."""
+
+    def step(self, sim: Sim) -> None:
+        """A control step has been done."""
+
+    def end(self, sim: Sim, row: int, result: EpisodeResult) -> None:
+        """The episode of this row is over."""
+
+
+Progress = Callable[[int, int, int], None]
+"""Called with (episodes done, episodes in all, env steps done)."""
+
+
+def jobs_of(seeds: Iterable[int], episodes: int) -> list[Job]:
+    """Episodes 0 .. episodes - 1 of every seed."""
+    return [Job(seed, episode) for seed in seeds for episode in range(episodes)]
+
+
+def run_episodes(
+    sim: Sim, jobs: list[Job], recorder: Recorder | None = None, progress: Progress | None = None
+) -> tuple[list[EpisodeResult], int]:
+    """Play every job with the simulator's current tree; results in the order of ``jobs``, and the env steps it took."""
+    waiting = list(enumerate(jobs))[::-1]
+    playing: dict[int, int] = {}
+    results: dict[int, EpisodeResult] = {}
+    free = list(range(sim.num_envs))[::-1]
+    env_steps = 0
+    while waiting or playing:
+        if waiting and free and (len(free) * _REFILL_SHARE >= sim.num_envs or not playing):
+            _refill(sim, jobs, waiting, free, playing, recorder)
+        env_steps += len(playing)
+        sim.step()
+        if recorder:
+            recorder.step(sim)
+        outcome = sim.rows(sim.s.referee.outcome)
+        ended = [row for row in sorted(playing) if outcome[row] != RUNNING]
+        if not ended:
+            continue
+        for row, result in zip(ended, _results(sim, ended, [jobs[playing[row]] for row in ended]), strict=True):
+            results[playing.pop(row)] = result
+            free.append(row)
+            if recorder:
+                recorder.end(sim, row, result)
+        sim.sleep_ended()
+        if progress:
+            progress(len(results), len(jobs), env_steps)
+    return [results[i] for i in range(len(jobs))], env_steps
+
+
+def _refill(sim: Sim, jobs: list[Job], waiting: list, free: list[int], playing: dict[int, int], recorder: Recorder | None) -> None:
+    mask, seed, number = (torch.zeros(sim.num_envs, dtype=torch.int32) for _ in range(3))
+    begun = []
+    while waiting and free:
+        index, job = waiting.pop()
+        row = free.pop()
+        playing[row] = index
+        mask[row], seed[row], number[row] = 1, job.seed, job.episode
+        begun.append((row, job))
+    sim.reset(mask.to(sim.device), seed.to(sim.device), number.to(sim.device))
+    if recorder:
+        for row, job in begun:
+            recorder.begin(sim, row, job)
+
+
+def _results(sim: Sim, rows: list[int], jobs: list[Job]) -> list[EpisodeResult]:
+    s, dt = sim.s, sim.config.episode.control_dt_s
+    read = {
+        name: sim.rows(field, rows)
+        for name, field in {
+            "outcome": s.referee.outcome,
+            "step": s.clock.step,
+            "return": s.reward.episode_return,
+            "clearance": s.referee.min_clearance_m,
+            "length": s.referee.path_length_m,
+            "replans": s.route.replans,
+            "planned_by": s.route.planned_by,
+            "fallbacks": s.route.fallbacks,
+            "ticks": s.teacher.ticks,
+            "acted": s.teacher.acted,
+        }.items()
+    }
+    return [
+        EpisodeResult(
+            seed=job.seed,
+            episode=job.episode,
+            outcome=OUTCOMES[int(read["outcome"][i])],
+            time_s=round(int(read["step"][i]) * dt, 6),
+            episode_return=float(read["return"][i]),
+            min_clearance_m=float(read["clearance"][i]),
+            path_length_m=float(read["length"][i]),
+            replans=_named(TRIGGERS, read["replans"][i]),
+            planned_by=_named(PLANNERS, read["planned_by"][i]),
+            fallbacks=_named(REASONS, read["fallbacks"][i]),
+            ticks=read["ticks"][i][: len(sim.tree.names)].copy(),
+            acted=read["acted"][i][: len(sim.tree.names)].copy(),
+        )
+        for i, job in enumerate(jobs)
+    ]
+
+
+def _named(names: tuple[str, ...], counts: np.ndarray) -> dict[str, int]:
+    return {name: int(count) for name, count in zip(names, counts, strict=True)}
+
+
+# ------------------------------------------------------------------------------------------------------------------ summary
+
+
+def summary(name: str, results: list[EpisodeResult], env_steps: int, wall_s: float) -> dict[str, Any]:
+    """One method's entry of ``uuv eval --json`` (docs: interfaces); rates without episodes are None, never NaN."""
+    n = len(results)
+    outcomes = {outcome: sum(r.outcome == outcome for r in results) for outcome in ("success", *COLLIDED, "timeout")}
+    collided = sum(outcomes[o] for o in COLLIDED)
+    time_mean = mean([r.time_s for r in results])
+    return {
+        "name": name,
+        "episodes": n,
+        "outcomes": outcomes,
+        "success_rate": rate(outcomes["success"], n),
+        "success_ci95": _interval(outcomes["success"], n),
+        "collision_rate": rate(collided, n),
+        "collision_ci95": _interval(collided, n),
+        "return_mean": mean([r.episode_return for r in results]),
+        "time_mean_s": time_mean,
+        "tts_s": time_to_success_s(time_mean, rate(outcomes["success"], n)),
+        "time_to_success_mean_s": mean([r.time_s for r in results if r.outcome == "success"]),
+        "min_clearance_mean_m": mean([r.min_clearance_m for r in results]),
+        "path_length_mean_m": mean([r.path_length_m for r in results]),
+        "replans_per_episode": mean([float(sum(r.replans.values())) for r in results]),
+        "replans_by_trigger": _summed(TRIGGERS, [r.replans for r in results]),
+        "planned_by": _summed(PLANNERS, [r.planned_by for r in results]),
+        "fallbacks_by_reason": _summed(REASONS, [r.fallbacks for r in results]),
+        "env_steps": env_steps,
+        "wall_s": round(wall_s, 3),
+        "env_steps_per_s": round(env_steps / wall_s, 1) if wall_s > 0 else None,
+        "episodes_detail": [
+            {
+                "seed": r.seed,
+                "episode": r.episode,
+                "outcome": r.outcome,
+                "time_s": r.time_s,
+                "return": r.episode_return,
+                "min_clearance_m": r.min_clearance_m,
+                "path_length_m": r.path_length_m,
+                "replans": sum(r.replans.values()),
+            }
+            for r in results
+        ],
+    }
+
+
+def tree_use(sim: Sim, results: list[EpisodeResult]) -> list[dict[str, Any]]:
+    """Per node of the tree: in how many episodes it was ticked, its ticks, and the control steps in which it set the action."""
+    ticks, acted = (np.stack([getattr(r, which) for r in results]).astype(np.int64) for which in ("ticks", "acted"))
+    return [
+        {
+            "node": name,
+            "episodes": int((ticks[:, i] > 0).sum()),
+            "share_of_episodes": float((ticks[:, i] > 0).mean()),
+            "ticks": int(ticks[:, i].sum()),
+            "acted": int(acted[:, i].sum()),
+        }
+        for i, name in enumerate(sim.tree.names)
+    ]
+
+
+def document(config: Config, world: str, sensors: str, seeds: list[int], episodes: int, methods: list[dict[str, Any]]) -> dict[str, Any]:
+    """The whole ``uuv eval --json`` document."""
+    return {
+        "schema": 1,
+        "world": world,
+        "S": config.world.n_static,
+        "D": config.world.n_dynamic,
+        "v_m_s": config.world.dynamic_speed_m_s if config.world.n_dynamic else None,
+        "sensors": sensors,
+        "seeds": seeds,
+        "episodes_per_seed": episodes,
+        "methods": methods,
+    }
+
+
+def _interval(k: int, n: int) -> list[float] | None:
+    interval = wilson_interval(k, n)
+    return None if interval is None else list(interval)
+
+
+def _summed(names: tuple[str, ...], counts: list[dict[str, int]]) -> dict[str, int]:
+    return {name: sum(c[name] for c in counts) for name in names}
+
+
+@dataclass
+class Stopwatch:
+    """Wall time since it was made."""
+
+    begun: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.begun = time.perf_counter()
+
+    @property
+    def seconds(self) -> float:
+        """Seconds so far."""
+        return time.perf_counter() - self.begun

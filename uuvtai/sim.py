@@ -1,0 +1,279 @@
+"""The simulator: allocates every struct and runs the stages in order. ``Sim.step`` is the page to read first.
+
+Data goes one way: action -> actuation -> dynamics -> world -> referee -> sensing -> tracking -> mapping -> clearance -> planning ->
+features -> teacher -> reward. A pass works on the rows whose ``clock.awake`` is 1: all running rows in a step, only the rows being reset
+in a reset.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+
+import numpy as np
+import taichi as ti
+import torch
+
+from uuvtai import state
+from uuvtai.allocation import allocation_matrices
+from uuvtai.config import Config
+from uuvtai.kernels import (
+    actuation,
+    clearance,
+    debug_stamp,
+    depth,
+    dynamics,
+    episode,
+    features,
+    mapping,
+    proprioception,
+    reward,
+    route,
+    sonar,
+    teacher,
+    tracking,
+    voronoi,
+    world,
+)
+from uuvtai.kernels.grid import outside_cells
+from uuvtai.kernels.recording import copy_rows
+from uuvtai.rrt import RouteFallback
+from uuvtai.runtime import start_taichi
+from uuvtai.scenario import load_fixed
+from uuvtai.sizes import array_sizes, check_size
+from uuvtai.tree import FlatTree, load_tree
+
+STAGES = (
+    "dynamics",
+    "world",
+    "proprioception",
+    "sonar",
+    "depth",
+    "tracking",
+    "mapping",
+    "clearance",
+    "planning",
+    "features",
+    "teacher",
+    "reward",
+)
+
+
+@dataclass(frozen=True)
+class SimState:
+    """Every struct of the simulator, by the noun of its stage."""
+
+    clock: state.ClockState
+    episode: state.EpisodeState
+    vehicle: state.VehicleState
+    params: state.VehicleParams
+    actuation: state.ActuationState
+    allocation: state.Allocation
+    current: state.CurrentState
+    scene: state.SceneState
+    world: state.WorldState
+    path: state.PathState
+    fixed: state.FixedTable
+    scratch: state.ScenarioScratch
+    mission: state.MissionState
+    referee: state.RefereeState
+    ego: state.Proprioception
+    ego_memory: state.ProprioceptionMemory
+    scan: state.SonarScan
+    sonar_memory: state.SonarMemory
+    image: state.DepthImage
+    tracks: state.TrackState
+    clusters: state.ClusterState
+    forecast: state.ForecastState
+    mask: state.GridMask
+    grid_map: state.MapState
+    clearance: state.ClearanceState
+    voronoi: state.VoronoiState
+    route: state.RouteState
+    features: state.FeatureState
+    teacher: state.TeacherState
+    table: state.TreeTable
+    reward: state.RewardState
+
+
+class Sim:
+    """Thousands of vehicles in their worlds, stepped together.
+
+    ``action`` is a torch tensor (n_env, 4) in [-1, 1] on the simulator's device: the behaviour tree writes its choice there, the next
+    ``step`` reads it; overwrite it to drive otherwise.
+    """
+
+    def __init__(self, config: Config, num_envs: int, tree: FlatTree, device: str = "cpu") -> None:
+        """Raises ValueError or MemoryError for sizes that cannot work, RuntimeError for a missing device."""
+        self.config, self.num_envs = config, num_envs
+        runtime = start_taichi(device)
+        self.device = torch.device(runtime.device)
+        check_size(config, num_envs, runtime.device)
+        sizes = array_sizes(config, num_envs)
+        self.s = SimState(**{f.name: state.allocate(getattr(state, str(f.type).rpartition(".")[2]), sizes) for f in fields(SimState)})
+        self.action = torch.zeros(num_envs, 4, device=self.device)
+        self.reward = torch.zeros(num_envs, device=self.device)
+        self.terminated = torch.zeros(num_envs, dtype=torch.int32, device=self.device)
+        self.truncated = torch.zeros(num_envs, dtype=torch.int32, device=self.device)
+        self.fallback = RouteFallback(config)
+        self.stage_s: dict[str, float] | None = None
+        self.use_tree(tree)
+        self._fill_constants()
+
+    # ------------------------------------------------------------------------------------------------------------ set-up
+
+    def use_tree(self, tree: FlatTree) -> None:
+        """Drive by another behaviour tree from the next tick on (trees are data: nothing is compiled again)."""
+        self.tree = tree
+        load_tree(self.s.table, tree)
+
+    def set_scene(self, n_static: int, n_dynamic: int, speed_m_s: float) -> None:
+        """S, D and v of every env's next scenario; S and D must fit the slots that were allocated."""
+        self.s.scene.n_static.fill(n_static)
+        self.s.scene.n_dynamic.fill(n_dynamic)
+        self.s.scene.speed_m_s.fill(speed_m_s)
+
+    def _fill_constants(self) -> None:
+        world_cfg = self.config.world
+        self.set_scene(world_cfg.n_static, world_cfg.n_dynamic, world_cfg.dynamic_speed_m_s)
+        load_fixed(self.s.fixed, world_cfg)
+        outside = outside_cells(world_cfg.tank, self.config.mapping.cell_m)
+        self.s.mask.outside.from_numpy(np.array(outside, dtype=np.int32))
+        wrench_of_thrust, thrust_of_wrench = allocation_matrices(self.config.vehicle)
+        self.s.allocation.wrench_of_thrust.from_numpy(wrench_of_thrust.astype(np.float32))
+        self.s.allocation.thrust_of_wrench.from_numpy(thrust_of_wrench.astype(np.float32))
+
+    # -------------------------------------------------------------------------------------------------------------- step
+
+    def step(self, action: torch.Tensor | None = None) -> None:
+        """One control step of every running env, driven by ``action`` (default: what the tree chose)."""
+        if action is not None:
+            self.action.copy_(action)
+        self._move()
+        self._perceive()
+        self._reward()
+
+    def reset(self, mask: torch.Tensor, seed: torch.Tensor, number: torch.Tensor) -> None:
+        """Begin episode ``number`` of ``seed`` in the rows where ``mask`` is 1 (all int32, shape (n_env,)), up to the first observation."""
+        c, s = self.config, self.s
+        episode.begin_episodes(mask, seed, number, s.clock, s.episode)
+        with self._stage("world"):
+            world.generate_scenarios(s.world, s.path, s.mission, s.scratch, s.scene, s.fixed, s.episode, s.clock, c.world)
+            world.move_obstacles(s.world, s.path, s.clock, c.world, c.episode)
+        dynamics.reset_vehicle(s.vehicle, s.params, s.current, s.mission, s.episode, s.clock, c.vehicle, c.disturbance, c.episode)
+        actuation.reset_actuation(s.actuation, s.clock)
+        proprioception.reset_proprioception(s.ego, s.ego_memory, s.vehicle, s.episode, s.clock, c.sensors)
+        sonar.reset_sonar(s.scan, s.sonar_memory, s.clock)
+        depth.reset_depth(s.image, s.clock)
+        tracking.reset_tracks(s.tracks, s.clusters, s.forecast, s.clock)
+        mapping.reset_map(s.grid_map, s.clock)
+        route.reset_route(s.route, s.clock)
+        teacher.reset_teacher(s.teacher, s.clock)
+        reward.reset_reward(s.reward, s.clock)
+        episode.reset_referee(s.referee, s.clock, s.vehicle, s.world, c.vehicle, c.world.tank, c.episode)
+        self._perceive()
+        episode.wake(s.clock)
+
+    def sleep_ended(self) -> None:
+        """Put the rows whose episode has ended to sleep; they cost nothing until their next reset."""
+        episode.sleep_ended(self.s.clock, self.s.referee)
+
+    def _move(self) -> None:
+        c, s = self.config, self.s
+        with self._stage("dynamics"):
+            actuation.command_thrusters(
+                self.action, s.actuation, s.params, s.allocation, s.ego, s.clock, c.vehicle, c.actuation, c.disturbance, c.episode
+            )
+            dynamics.move_vehicle(
+                s.vehicle,
+                s.actuation,
+                s.current,
+                s.params,
+                s.allocation,
+                s.episode,
+                s.clock,
+                c.vehicle,
+                c.actuation,
+                c.disturbance,
+                c.episode.control_dt_s,
+                c.episode.substeps,
+            )
+        with self._stage("world"):
+            episode.advance_clock(s.clock)
+            world.move_obstacles(s.world, s.path, s.clock, c.world, c.episode)
+            episode.judge(s.referee, s.clock, s.vehicle, s.world, s.mission, c.vehicle, c.world.tank, c.episode)
+
+    def _perceive(self) -> None:
+        """Sensing to teacher for the rows that are awake."""
+        c, s = self.config, self.s
+        with self._stage("proprioception"):
+            proprioception.sense_proprioception(
+                s.ego, s.ego_memory, s.vehicle, s.episode, s.clock, c.sensors, c.vehicle, c.episode
+            )
+        with self._stage("sonar"):
+            sonar.cast_sonar(
+                s.scan, s.sonar_memory, s.ego, s.vehicle, s.world, s.episode, s.clock, c.sensors.sonar, c.world.tank, c.episode
+            )
+        with self._stage("depth"):
+            depth.cast_depth(s.image, s.ego, s.vehicle, s.world, s.episode, s.clock, c.sensors.depth, c.world.tank)
+        with self._stage("tracking"):
+            tracking.track_bodies(s.tracks, s.clusters, s.scan, s.clock, c.tracking, c.sensors.sonar, c.world.tank, c.episode)
+            tracking.forecast_tracks(s.forecast, s.tracks, s.scan, s.clock, c.tracking, c.episode)
+        with self._stage("mapping"):
+            mapping.update_map(
+                s.grid_map, s.scan, s.image, s.tracks, s.mask, s.clock, c.mapping, c.sensors.sonar, c.sensors.depth, c.world.tank, c.episode
+            )
+            if c.mapping.stamp > 0:
+                debug_stamp.stamp_truth(s.grid_map, s.world, s.clock, c.mapping, c.world.tank)
+        with self._stage("clearance"):
+            clearance.compute_clearance(s.clearance, s.grid_map, s.mask, s.clock, c.clearance, c.mapping, c.voronoi)
+        with self._stage("features"):
+            features.sense_sectors(s.features, s.scan, s.clock, c.features, c.sensors.sonar)
+        with self._stage("planning"):
+            self._plan()
+        with self._stage("teacher"):
+            self._teach()
+
+    def _plan(self) -> None:
+        c, s = self.config, self.s
+        raise NotImplementedError
+
+    def _teach(self) -> None:
+        raise NotImplementedError
+
+    def _reward(self) -> None:
+        raise NotImplementedError
+
+    # ------------------------------------------------------------------------------------------------------ observation
+
+    def rows(self, field: ti.Field, envs: list[int] | None = None) -> np.ndarray:
+        """Host copy of a field's rows, shape (len(envs), ...) (default: all envs); only these rows are copied."""
+        chosen = torch.tensor(range(self.num_envs) if envs is None else envs, dtype=torch.int32, device=self.device)
+        inner = (field.n,) if hasattr(field, "n") else ()
+        out = torch.empty((len(chosen), *field.shape[1:], *inner), dtype=_TORCH_DTYPE[field.dtype], device=self.device)
+        copy_rows(field, chosen, out)
+        return out.cpu().numpy()
+
+    @contextlib.contextmanager
+    def _stage(self, name: str) -> Iterator[None]:
+        """Time a stage when somebody asked for it (``stage_s`` is a dict); costs nothing otherwise."""
+        if self.stage_s is None:
+            yield
+            return
+        ti.sync()
+        begin = time.perf_counter()
+        yield
+        ti.sync()
+        self.stage_s[name] = self.stage_s.get(name, 0.0) + time.perf_counter() - begin
+
+
+_TORCH_DTYPE = {
+    ti.f32: torch.float32,
+    ti.i32: torch.int32,
+    ti.i16: torch.int16,
+    ti.u8: torch.uint8,
+    ti.i8: torch.int8,
+    ti.u32: torch.uint32,
+}

@@ -1,0 +1,94 @@
+"""How long every array axis is, and how much memory a simulator of that size takes: known before anything is allocated."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+
+from uuvtai import state
+from uuvtai.config import Config
+from uuvtai.kernels.grid import grid_shape
+from uuvtai.kernels.reward import TERMS
+from uuvtai.kernels.route import N_PLANNER, N_REASON, N_TRIGGER
+from uuvtai.scenario import body_slots
+
+_MAX_ENVS = 1 << 20
+_N_CORNER = 5
+_COARSE_M = 0.2
+"""Cell of the grid on which a scenario is checked for a way from start to goal."""
+
+
+def array_sizes(config: Config, n_env: int) -> dict[str, int]:
+    """Length of every named axis in ``state``."""
+    tank, sensors = config.world.tank, config.sensors
+    n_row, n_col = grid_shape(tank, config.mapping.cell_m)
+    slots = body_slots(config.world)
+    return {
+        "n_env": n_env,
+        "n_thruster": len(config.vehicle.thrusters),
+        "n_wrench": 6,
+        "n_delay": 1 + round(config.disturbance.thruster_delay_s / config.episode.control_dt_s),
+        "n_body": slots.n_body,
+        "n_dynamic": slots.n_dynamic,
+        "n_fixed": max(1, len(config.world.fixed)),
+        "n_corner": _N_CORNER,
+        "n_coarse_row": round((tank.y_m[1] - tank.y_m[0]) / _COARSE_M),
+        "n_coarse_col": round((tank.x_m[1] - tank.x_m[0]) / _COARSE_M),
+        "n_ray": sensors.sonar.n_ray,
+        "n_latency": sensors.sonar.latency_steps // sensors.sonar.period_steps + 2,
+        "n_cloud": 8,
+        "n_pixel_row": sensors.depth.rows,
+        "n_pixel_col": sensors.depth.cols,
+        "n_track": config.tracking.n_track,
+        "n_cluster": config.tracking.n_cluster,
+        "n_forecast": round(config.tracking.horizon_s / config.tracking.forecast_dt_s) + 1,
+        "n_row": n_row,
+        "n_col": n_col,
+        "n_heap": n_row * n_col,
+        "n_way": config.route.n_way,
+        "n_trigger": N_TRIGGER,
+        "n_planner": N_PLANNER,
+        "n_reason": N_REASON,
+        "n_sector": config.features.n_sector,
+        "n_node": config.teacher.max_node,
+        "n_term": len(TERMS),
+    }
+
+
+def memory_bytes(config: Config, n_env: int) -> int:
+    """Memory that the simulator's arrays take [bytes]."""
+    sizes = array_sizes(config, n_env)
+    structs = (s for s in vars(state).values() if isinstance(s, type) and dataclasses.is_dataclass(s))
+    return sum(state.bytes_of(struct, sizes) for struct in structs)
+
+
+def check_size(config: Config, n_env: int, device: str) -> None:
+    """Refuse sizes that cannot work before anything is allocated: ValueError or MemoryError with the estimate and what to type."""
+    if n_env < 1:
+        raise ValueError(f"--num-envs {n_env}: at least 1 env is needed, for example --num-envs 64")
+    if n_env > _MAX_ENVS:
+        raise MemoryError(f"--num-envs {n_env}: more than {_MAX_ENVS} envs are not supported; use a smaller number")
+    needed, free = memory_bytes(config, n_env), free_memory_bytes(device)
+    if free is not None and needed > 0.9 * free:
+        fitting = max(1, int(n_env * 0.9 * free / needed))
+        raise MemoryError(
+            f"--num-envs {n_env} needs about {needed / 2**30:.1f} GiB, {free / 2**30:.1f} GiB are free on {device}: "
+            f"use --num-envs {fitting} or fewer"
+        )
+
+
+def free_memory_bytes(device: str) -> int | None:
+    """Free memory of the device [bytes]; None where it cannot be told."""
+    if device == "cuda":
+        import torch
+
+        return torch.cuda.mem_get_info()[0]
+    meminfo = Path("/proc/meminfo")
+    if meminfo.exists():
+        for line in meminfo.read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) * 1024
+    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return None
