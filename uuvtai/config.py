@@ -188,8 +188,9 @@ class VehicleConfig(Section):
     """[kgf] quadratic in rpm for n > 0"""
     thrust_reverse: Vector3 = (-3.8442e-7, -1.6186e-4, -3.9139e-2)
     """[kgf] quadratic in rpm for n < 0"""
-    dead_band_rpm: tuple[NonNegative, NonNegative] = (619.7, 695.6)
-    """no thrust below this speed, forward and reverse (MarineGym's T200: throttle within +-0.075 of 3659.9 x + 345.21, 3494.4 x - 433.5)"""
+    dead_band_rpm: tuple[NonNegative, NonNegative] = (203.5, 210.5)
+    """no thrust below this speed, forward and reverse: where the quadratic fit turns round. MarineGym's throttle dead band of 7.5 % would be
+    (620, 696): possible here too, slow motion then becomes a limit cycle of about 1 cm/s"""
     thrust_scale: Positive = 1.0
     """the paper's K_F / 4.4e-7"""
     attitude_hold: Literal["ideal", "thrusters", "none"] = "ideal"
