@@ -112,7 +112,16 @@ def _print_methods(result: dict[str, Any]) -> None:
         f"{len(result['seeds'])} seed(s) x {result['episodes_per_seed']} episodes",
         title_justify="left",
     )
-    for head in ("method", "success [95 %]", "collision [95 %]", "contact/ttc/out/timeout", "time to goal s", "TTS s", "replans", "steps/s"):
+    for head in (
+        "method",
+        "success [95 %]",
+        "collision [95 %]",
+        "contact/ttc/out/timeout",
+        "time to goal s",
+        "TTS s",
+        "replans",
+        "steps/s",
+    ):
         table.add_column(head, justify="left" if head == "method" else "right")
     for m in result["methods"]:
         o = m["outcomes"]
@@ -224,7 +233,9 @@ def profile(
 
 
 def _print_profile(result: dict[str, Any]) -> None:
-    table = Table(title=f"{result['machine']['cpu']}, {result['machine']['cores']} cores, {result['machine']['device']}", title_justify="left")
+    table = Table(
+        title=f"{result['machine']['cpu']}, {result['machine']['cores']} cores, {result['machine']['device']}", title_justify="left"
+    )
     table.add_column("us per env-step")
     for row in result["rows"]:
         table.add_column(f"{row['num_envs']} env", justify="right")
@@ -289,7 +300,9 @@ def doctor(as_json: AsJson = False) -> None:
         _print_json({"ok": all(c["ok"] for c in found), "checks": found})
     else:
         for c in found:
-            _stdout().print(f"[{'green' if c['ok'] else 'red'}]{'ok ' if c['ok'] else 'BAD'}[/] {c['name']}: {c['detail']}", highlight=False)
+            _stdout().print(
+                f"[{'green' if c['ok'] else 'red'}]{'ok ' if c['ok'] else 'BAD'}[/] {c['name']}: {c['detail']}", highlight=False
+            )
     if not all(c["ok"] for c in found):
         raise typer.Exit(FAILED)
 

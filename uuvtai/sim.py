@@ -209,9 +209,7 @@ class Sim:
         """Sensing to teacher for the rows that are awake."""
         c, s = self.config, self.s
         with self._stage("proprioception"):
-            proprioception.sense_proprioception(
-                s.ego, s.ego_memory, s.vehicle, s.episode, s.clock, c.sensors, c.vehicle, c.episode
-            )
+            proprioception.sense_proprioception(s.ego, s.ego_memory, s.vehicle, s.episode, s.clock, c.sensors, c.vehicle, c.episode)
         with self._stage("sonar"):
             sonar.cast_sonar(
                 s.scan, s.sonar_memory, s.ego, s.vehicle, s.world, s.episode, s.clock, c.sensors.sonar, c.world.tank, c.episode

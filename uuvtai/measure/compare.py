@@ -111,5 +111,3 @@ def _draw(request: Request, folder: Path, logs: list[dict[Any, Path]], watch: Wa
         for file in files if request.video else []:
             watch.note(f"drawing {file.stem}.webm")
             video(file, folder / "videos" / f"{file.stem}.webm")
-
-

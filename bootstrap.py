@@ -1,0 +1,93 @@
+"""One line from a fresh checkout to a result: ``python3 bootstrap.py demo`` or ``python3 bootstrap.py test``.
+
+Needs CPython 3.10 to 3.13 and nothing else; makes its own environment in .venv and works from any folder.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent
+VENV = ROOT / ".venv"
+BIN = VENV / ("Scripts" if os.name == "nt" else "bin")
+JS = ROOT / "tests" / "js"
+
+DEMO = ["eval", "--world", "pool", "--record", "2", "--video"]
+
+
+def main() -> int:
+    """Run the job named on the command line; its exit code."""
+    jobs = {"demo": demo, "test": test, "setup": setup}
+    name = sys.argv[1] if len(sys.argv) > 1 else ""
+    if name not in jobs:
+        print(f"usage: python3 bootstrap.py {' | '.join(jobs)}", file=sys.stderr)
+        return 2
+    if not (3, 10) <= sys.version_info[:2] <= (3, 13):
+        print(f"CPython 3.10 to 3.13 is needed (Taichi has no wheels for {sys.version.split()[0]})", file=sys.stderr)
+        return 2
+    return jobs[name](sys.argv[2:])
+
+
+def demo(arguments: list[str]) -> int:
+    """Evaluate the three controllers in the pool, record two episodes, draw pictures and videos."""
+    install(".")
+    return run([str(BIN / "uuv"), *DEMO, *arguments])
+
+
+def test(arguments: list[str]) -> int:
+    """Lint, types, import contracts, then the tests with coverage; the first failure decides the exit code."""
+    install(".[dev]")
+    _install_js()
+    python = str(BIN / "python")
+    checks = [
+        [str(BIN / "ruff"), "check", "."],
+        [str(BIN / "ruff"), "format", "--check", "."],
+        [str(BIN / "pyright")],
+        [str(BIN / "lint-imports")],
+        [python, "-m", "pytest", *(arguments or ["--cov", "--cov-report=term:skip-covered"])],
+    ]
+    return next((code for command in checks if (code := run(command))), 0)
+
+
+def setup(_arguments: list[str]) -> int:
+    """Make the environment with everything a developer needs."""
+    install(".[dev]")
+    _install_js()
+    return 0
+
+
+def install(what: str) -> None:
+    """Make .venv if it is missing and install the package into it, editable; quick when nothing has changed."""
+    stamp = VENV / f".installed-{'dev' if 'dev' in what else 'run'}"
+    project = (ROOT / "pyproject.toml").read_text()
+    if stamp.exists() and stamp.read_text() == project:
+        return
+    if not BIN.exists():
+        print("making .venv", file=sys.stderr)
+        subprocess.run([sys.executable, "-m", "venv", str(VENV)], check=True)
+    print("installing packages (first run only)", file=sys.stderr)
+    subprocess.run([str(BIN / "python"), "-m", "pip", "install", "--quiet", "--editable", what], cwd=ROOT, check=True)
+    stamp.write_text(project)
+
+
+def _install_js() -> None:
+    """The independent log reader of the tests; without npm its test says that it was skipped."""
+    if (JS / "package.json").exists() and not (JS / "node_modules").exists():
+        npm = BIN / "npm"
+        try:
+            subprocess.run([str(npm) if npm.exists() else "npm", "ci", "--silent"], cwd=JS, check=True)
+        except (OSError, subprocess.CalledProcessError) as error:
+            print(f"npm ci failed ({error}); the test of the JavaScript log reader will be skipped", file=sys.stderr)
+
+
+def run(command: list[str]) -> int:
+    """Run a command in the checkout, shown first; its exit code."""
+    print("+", " ".join(command), file=sys.stderr, flush=True)
+    return subprocess.run(command, cwd=ROOT, check=False).returncode
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,175 @@
+"""Time per stage, env-steps per second and memory, warm-up and compile time apart."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from uuvtai.config import Config
+from uuvtai.kernels.episode import RUNNING
+from uuvtai.run_folder import hardware, versions
+from uuvtai.sim import STAGES, Sim
+from uuvtai.sizes import memory_bytes
+
+_WARM_STEPS = 60
+"""More than every divider's period, so that each stage has run several times before the clock starts."""
+_MAX_STEPS = 100_000
+_DENSITY = (0, 3, 6, 9, 15)
+
+# the paper's table "Workstation deployability timing" and "Runtime versus dynamic-obstacle density", as printed
+_PAPER_LATENCY = {"Mapping update": (3.33, 6.17), "Global planner": (5.22, 9.89), "Full loop": (28.63, 39.88)}
+_PAPER_DENSITY = {0: (19.7, 51.9), 3: (25.2, 62.7), 6: (28.6, 54.4), 9: (31.6, 48.8), 15: (38.0, 42.7)}
+
+
+@dataclass
+class _Batch:
+    """A simulator kept running: ended rows begin their next episode at once."""
+
+    sim: Sim
+    env_steps: int = 0
+    replans: int = 0
+    episodes: int = 0
+
+    def __post_init__(self) -> None:
+        n, device = self.sim.num_envs, self.sim.device
+        self._number = torch.arange(n, dtype=torch.int32, device=device)
+        self._seed = torch.zeros(n, dtype=torch.int32, device=device)
+        self.sim.reset(torch.ones(n, dtype=torch.int32, device=device), self._seed, self._number)
+
+    def step(self, action: torch.Tensor | None = None) -> None:
+        """One step of every env, resets included."""
+        self.sim.step(action)
+        self.env_steps += self.sim.num_envs
+        ended = torch.from_numpy((self.sim.rows(self.sim.s.referee.outcome) != RUNNING).astype("int32")).to(self.sim.device)
+        if bool(ended.any()):
+            rows = ended.nonzero().flatten().tolist()
+            self.replans += int(self.sim.rows(self.sim.s.route.replans, rows).sum())
+            self.episodes += len(rows)
+            self._number += ended * self.sim.num_envs
+            self.sim.reset(ended, self._seed, self._number)
+
+
+def profile(
+    config: Config, sizes: list[int], controller: str, device: str, seconds: float, density: bool, say: Callable[[str], None]
+) -> dict[str, Any]:
+    """The ``uuv profile --json`` document; raises ValueError or MemoryError for sizes that cannot work, before anything runs."""
+    from uuvtai.tree import read_tree
+
+    tree = read_tree(controller, config.teacher.max_node)
+    rows, latency = [], []
+    for n in sizes:
+        say(f"{n} env(s): starting")
+        begun = time.perf_counter()
+        sim = Sim(config, n, tree, device)
+        batch = _Batch(sim)
+        for _ in range(_WARM_STEPS):
+            batch.step()
+        compile_s = time.perf_counter() - begun
+        rows.append(_row(config, batch, controller, seconds, compile_s))
+        if n == 1:
+            latency = _latency(batch, seconds)
+    document = {
+        "schema": 1,
+        "machine": {**hardware(), "device": sim.device.type, "versions": versions()},
+        "rows": rows,
+        "paper_latency": latency,
+        "paper_density": _density(config, tree, device, seconds, say) if density else [],
+    }
+    return document
+
+
+def _row(config: Config, batch: _Batch, controller: str, seconds: float, compile_s: float) -> dict[str, Any]:
+    sim = batch.sim
+    step = _rate(batch, seconds, lambda: 2 * torch.rand(sim.num_envs, 4, device=sim.device) - 1)
+    driven = _rate(batch, seconds, lambda: None)
+    sim.stage_s = {}
+    _rate(batch, seconds, lambda: None)
+    stages, steps = sim.stage_s, batch.env_steps
+    sim.stage_s = None
+    return {
+        "num_envs": sim.num_envs,
+        "controller": controller,
+        "S": config.world.n_static,
+        "D": config.world.n_dynamic,
+        "depth_every": config.sensors.depth.period_steps,
+        "env_steps_per_s": {"step": step, "step_inference": driven, "train": None},
+        "compile_s": compile_s,
+        "memory_mb": memory_bytes(config, sim.num_envs) / 1e6,
+        "memory_kb_per_env": memory_bytes(config, sim.num_envs) / 1e3 / sim.num_envs,
+        "stages_us_per_env_step": {name: 1e6 * stages.get(name, 0.0) / steps for name in STAGES},
+    }
+
+
+def _rate(batch: _Batch, seconds: float, action: Callable[[], torch.Tensor | None]) -> float:
+    """Env-steps per second over about ``seconds``."""
+    batch.env_steps = 0
+    begun = time.perf_counter()
+    for _ in range(_MAX_STEPS):
+        batch.step(action())
+        elapsed = time.perf_counter() - begun
+        if elapsed >= seconds:
+            break
+    return batch.env_steps / elapsed
+
+
+def _latency(batch: _Batch, seconds: float) -> list[dict[str, Any]]:
+    """Rows of the paper's timing table that this stack has, one env, mean and max per step."""
+    sim, dt = batch.sim, batch.sim.config.episode.control_dt_s
+    samples: dict[str, list[float]] = {name: [] for name in _PAPER_LATENCY}
+    batch.replans = batch.episodes = batch.env_steps = 0
+    end = time.perf_counter() + seconds
+    while time.perf_counter() < end:
+        sim.stage_s = {}
+        begun = time.perf_counter()
+        sim.step()
+        samples["Full loop"].append(time.perf_counter() - begun)
+        samples["Mapping update"].append(sum(sim.stage_s[name] for name in ("mapping", "clearance")))
+        samples["Global planner"].append(sim.stage_s["planning"])
+        sim.stage_s = None
+        batch.step()
+    rows = [
+        {
+            "component": name,
+            "mean_ms": 1e3 * sum(values) / len(values),
+            "max_ms": 1e3 * max(values),
+            "paper_mean_ms": _PAPER_LATENCY[name][0],
+            "paper_max_ms": _PAPER_LATENCY[name][1],
+        }
+        for name, values in samples.items()
+    ]
+    if batch.episodes:
+        per_episode = batch.replans / batch.episodes
+        rate = batch.replans / (2 * batch.env_steps * dt)
+        rows.append({"component": "Replanning rate", "replans_per_episode": per_episode, "hz": rate, "mean_ms": None, "max_ms": None,
+                     "paper_mean_ms": None, "paper_max_ms": None, "paper_hz": 6.21, "paper_replans_per_episode": 52.1})  # fmt: skip
+    return rows
+
+
+def _density(config: Config, tree: Any, device: str, seconds: float, say: Callable[[str], None]) -> list[dict[str, Any]]:
+    """Loop time of one env and replans per episode against D: one simulator, D as data."""
+    room = config.world.model_copy(update={"dynamic_capacity": max(_DENSITY)})
+    sim = Sim(config.model_copy(update={"world": room}), 1, tree, device)
+    rows = []
+    for n_dynamic in _DENSITY:
+        say(f"D = {n_dynamic}")
+        sim.set_scene(config.world.n_static, n_dynamic, config.world.dynamic_speed_m_s)
+        batch = _Batch(sim)
+        for _ in range(_WARM_STEPS):
+            batch.step()
+        batch.replans = batch.episodes = 0
+        rate = _rate(batch, seconds, lambda: None)
+        loop, replans = _PAPER_DENSITY[n_dynamic]
+        rows.append(
+            {
+                "D": n_dynamic,
+                "loop_ms": 1e3 / rate,
+                "replans_per_episode": batch.replans / batch.episodes if batch.episodes else None,
+                "paper_loop_ms": loop,
+                "paper_replans": replans,
+            }
+        )
+    return rows

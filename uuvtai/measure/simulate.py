@@ -1,0 +1,184 @@
+"""Open-loop physics in endless water: what ``uuv simulate`` runs, to hold a vehicle against theory or one's own data."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from uuvtai.config import Config
+from uuvtai.plant import Plant
+from uuvtai.runtime import Runtime, start_taichi
+
+CONTROL_DT_S = 0.02
+"""Samples are this far apart, or one substep where that is longer."""
+
+_MAX_STEPS = 10_000_000
+_MAX_COMPONENT = 1e6
+_WHAT = {
+    "wrench": ("fx,fy,fz,mx,my,mz in N and N m", 6),
+    "command": ("surge,sway,heave,yaw rate in m/s and rad/s", 4),
+    "current": ("x,y,z in m/s", 3),
+    "initial_rpy_deg": ("roll,pitch,yaw in degrees", 3),
+    "initial_velocity": ("u,v,w,p,q,r in m/s and rad/s", 6),
+}
+
+
+def simulate(
+    config: Config,
+    *,
+    seconds: float,
+    wrench: Sequence[float] | None = None,
+    command: Sequence[float] | None = None,
+    current: Sequence[float] | None = None,
+    initial_rpy_deg: Sequence[float] | None = None,
+    initial_velocity: Sequence[float] | None = None,
+    neutral: bool = False,
+    dt: float = 0.01,
+    runtime: Runtime | None = None,
+) -> dict[str, list]:
+    """Trajectory of one vehicle that starts at the origin, sampled at every control step, the initial state first.
+
+    ``wrench`` is a constant body-frame force and moment on top of the thrusters, which are off unless ``command`` (body velocity and yaw
+    rate) drives them through the inner loop; ``dt`` is the substep; ``neutral`` sets buoyancy equal to weight. Starts Taichi in double
+    precision unless ``runtime`` says what is running. Returns {"t" [s], "position" [m], "rpy_deg", "nu" [m/s, rad/s], "rpm"}.
+    Raises ValueError for input that makes no sense, FloatingPointError where the integration diverges.
+    """
+    given = {
+        "wrench": wrench,
+        "command": command,
+        "current": current,
+        "initial_rpy_deg": initial_rpy_deg,
+        "initial_velocity": initial_velocity,
+    }
+    vectors = {name: checked_vector(name, value) for name, value in given.items() if value is not None}
+    substeps, control_dt = control_step(dt)
+    n_step = checked_steps(seconds, control_dt, substeps)
+    config = _experiment(config, vectors, neutral, control_dt, substeps)
+    action = None if command is None else _action(config, vectors["command"])
+    plant = Plant(config, runtime or start_taichi(precision="f64"))
+    plant.reset()
+    _set_start(plant, vectors)
+    samples = [_sample(plant, 0.0)]
+    for k in range(1, n_step + 1):
+        plant.step(action)
+        samples.append(_sample(plant, k * control_dt))
+        if not math.isfinite(sum(samples[-1]["nu"])):
+            raise FloatingPointError(f"the integration diverged at t = {k * control_dt:.2f} s: use a smaller substep, --dt {dt / 4:g}")
+    return {key: [s[key] for s in samples] for key in samples[0]}
+
+
+# --------------------------------------------------------------------------------------------------------------------- input
+
+
+def checked_vector(name: str, value: Sequence[float]) -> np.ndarray:
+    """``value`` as float64; ValueError unless it has the right number of finite, sane components."""
+    what, length = _WHAT[name]
+    flag = "--" + name.replace("_", "-")
+    try:
+        vector = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{flag} must be {length} numbers ({what}), got {value!r}") from None
+    example = ",".join(["0.1"] + ["0"] * (length - 1))
+    if vector.shape != (length,):
+        raise ValueError(f"{flag} must be {length} numbers ({what}), got {vector.size}: for example {flag} {example}")
+    if not np.isfinite(vector).all() or np.abs(vector).max() > _MAX_COMPONENT:
+        raise ValueError(f"{flag} must be finite numbers below {_MAX_COMPONENT:g} ({what}), got {value!r}: for example {flag} {example}")
+    return vector
+
+
+def control_step(dt: float) -> tuple[int, float]:
+    """(substeps, control step [s]) for a substep of ``dt``: 0.02 s where dt divides it, else the next multiple of dt."""
+    if not (isinstance(dt, (int, float)) and math.isfinite(dt) and dt > 0):
+        raise ValueError(f"--dt must be a positive number of seconds, got {dt!r}: for example --dt 0.01")
+    ratio = CONTROL_DT_S / dt
+    substeps = max(1, math.ceil(ratio - 1e-9))
+    if abs(ratio - substeps) < 1e-6:
+        return substeps, CONTROL_DT_S
+    return substeps, substeps * dt
+
+
+def checked_steps(seconds: float, control_dt: float, substeps: int) -> int:
+    """Control steps that cover ``seconds``; ValueError where that is nothing or far too many."""
+    if not (isinstance(seconds, (int, float)) and math.isfinite(seconds) and seconds > 0):
+        raise ValueError(f"--seconds must be a positive number, got {seconds!r}: for example --seconds 10")
+    if seconds / control_dt * substeps > _MAX_STEPS:
+        raise ValueError(
+            f"--seconds {seconds:g} at --dt {control_dt / substeps:g} is more than {_MAX_STEPS} substeps: use fewer seconds or larger --dt"
+        )
+    return max(1, math.ceil(seconds / control_dt - 1e-6))
+
+
+def _action(config: Config, command: np.ndarray) -> np.ndarray:
+    vehicle = config.vehicle
+    names = ("max_surge_m_s", "max_sway_m_s", "max_heave_m_s", "max_yaw_rate_rad_s")
+    limits = np.array([getattr(vehicle, name) for name in names])
+    for name, value, limit in zip(names, command, limits, strict=True):
+        if abs(value) > limit * (1 + 1e-9):
+            raise ValueError(
+                f"--command asks for {value:g}, above vehicle.{name} = {limit:g}: ask for less, or --set vehicle.{name}={abs(value):g}"
+            )
+    return (command / limits).astype(np.float32)[None, :]
+
+
+def _experiment(config: Config, vectors: dict[str, np.ndarray], neutral: bool, control_dt: float, substeps: int) -> Config:
+    """The config with the experiment's settings in it."""
+    vehicle, disturbance = config.vehicle, config.disturbance
+    if neutral:
+        vehicle = vehicle.model_copy(update={"volume_m3": vehicle.mass_kg / vehicle.water_density_kg_m3})
+    if "current" in vectors:
+        disturbance = disturbance.model_copy(update={"current_m_s": tuple(float(x) for x in vectors["current"])})
+    episode = config.episode.model_copy(update={"control_dt_s": control_dt, "substeps": substeps})
+    return config.model_copy(update={"vehicle": vehicle, "disturbance": disturbance, "episode": episode})
+
+
+# ----------------------------------------------------------------------------------------------------------------- trajectory
+
+
+def _set_start(plant: Plant, vectors: dict[str, np.ndarray]) -> None:
+    if "initial_rpy_deg" in vectors:
+        plant.write(plant.vehicle.quat_wb, quaternion(*np.radians(vectors["initial_rpy_deg"])))
+    if "initial_velocity" in vectors:
+        plant.write(plant.vehicle.vel_b, vectors["initial_velocity"][:3])
+        plant.write(plant.vehicle.rate_b, vectors["initial_velocity"][3:])
+    if "wrench" in vectors:
+        plant.write(plant.actuation.external_wrench_b, vectors["wrench"])
+
+
+def _sample(plant: Plant, time_s: float) -> dict[str, Any]:
+    v = plant.vehicle
+    position, q, vel, rate = (field.to_numpy()[0].astype(float) for field in (v.pos_w, v.quat_wb, v.vel_b, v.rate_b))
+    return {
+        "t": time_s,
+        "position": position.tolist(),
+        "rpy_deg": np.degrees(roll_pitch_yaw(q)).tolist(),
+        "nu": [*vel.tolist(), *rate.tolist()],
+        "rpm": v.rpm.to_numpy()[0].astype(float).tolist(),
+    }
+
+
+def quaternion(roll: float, pitch: float, yaw: float) -> np.ndarray:
+    """(w, x, y, z) of yaw-pitch-roll angles [rad]."""
+    cr, sr, cp, sp, cy, sy = (f(0.5 * a) for a in (roll, pitch, yaw) for f in (math.cos, math.sin))
+    return np.array(
+        [
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ]
+    )
+
+
+def roll_pitch_yaw(q: np.ndarray) -> np.ndarray:
+    """Angles [rad] of a unit quaternion (w, x, y, z)."""
+    w, x, y, z = q
+    return np.array(
+        [
+            math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+            math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x)))),
+            math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+        ]
+    )
