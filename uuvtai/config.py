@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
@@ -18,6 +18,16 @@ Spread = Annotated[float, Field(ge=0, le=0.9)]
 Count = Annotated[int, Field(ge=0)]
 PositiveCount = Annotated[int, Field(ge=1)]
 Interval = tuple[float, float]
+
+
+def _ordered_interval(value: Interval) -> Interval:
+    if value[0] > value[1]:
+        raise ValueError(f"must be (low, high) with low <= high, got {value}")
+    return value
+
+
+OrderedInterval = Annotated[Interval, AfterValidator(_ordered_interval)]
+PositiveInterval = Annotated[tuple[Positive, Positive], AfterValidator(_ordered_interval)]
 Vector3 = tuple[float, float, float]
 Vector6 = tuple[float, float, float, float, float, float]
 NonNegative6 = tuple[NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative]
@@ -56,11 +66,12 @@ class TankConfig(Section):
 
 
 class StaticObstacles(Section):
-    """Random static obstacles: vertical cylinders and boxes through the full water column."""
+    """Random static obstacles: vertical cylinders and boxes through the full water column, anywhere within the side walls."""
 
-    radius_m: Interval = (0.2, 0.4)
-    half_extent_m: Interval = (0.2, 0.5)
+    radius_m: PositiveInterval = (0.2, 0.4)
+    half_extent_m: PositiveInterval = (0.2, 0.5)
     box_fraction: Fraction = 0.5
+    """by index, so that half are exactly half of an even number"""
     gap_m: NonNegative = 0.9
     """between surfaces"""
     endpoint_gap_m: NonNegative = 0.8
@@ -72,22 +83,34 @@ class StaticObstacles(Section):
 class DynamicObstacles(Section):
     """Random moving obstacles."""
 
-    radius_m: Interval = (0.15, 0.25)
-    height_m: Interval = (0.3, 0.5)
-    z_m: Interval = (-1.2, -0.4)
+    radius_m: PositiveInterval = (0.15, 0.25)
+    height_m: PositiveInterval = (0.3, 0.5)
+    z_m: OrderedInterval = (-1.2, -0.4)
     cylinder_fraction: Fraction = 0.5
+    """the others are spheres"""
     full_column_fraction: Fraction = 0.0
     """share of the moving bodies that are cylinders through the full water column (counted within cylinder_fraction)"""
     motion: Literal["line_circle", "waypoints"] = "line_circle"
     circle_fraction: Fraction = 0.5
-    line_length_m: Interval = (2.0, 6.0)
-    circle_radius_m: Interval = (0.5, 2.0)
+    """the others go back and forth on a line"""
+    line_length_m: PositiveInterval = (2.0, 6.0)
+    circle_radius_m: PositiveInterval = (0.5, 2.0)
     corners: tuple[int, int] = (3, 5)
     corner_gap_m: NonNegative = 2.0
+    """between any two corners of one path"""
     keep_clear_draws: Count = 16
-    """draws of a path that keeps clear of static obstacles and walls before the last one is taken as it is"""
+    """draws of a path that keeps clear of static obstacles before the last one is taken as it is (0: the first); walls are always kept"""
     start_gap_m: NonNegative = 1.5
-    """horizontal, centre to centre, at t = 0"""
+    """horizontal, centre to centre, at t = 0; always kept"""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> DynamicObstacles:
+        low, high = self.corners
+        if not 2 <= low <= high <= 5:
+            raise ValueError(f"corners must be (low, high) within 2 to 5, got {self.corners}")
+        if self.full_column_fraction > self.cylinder_fraction:
+            raise ValueError("full_column_fraction counts within cylinder_fraction and cannot exceed it")
+        return self
 
 
 class Waypoint(Section):
@@ -122,6 +145,8 @@ class FixedObstacle(Section):
             raise ValueError(f"a {self.kind} needs radius_m")
         if len(self.path) not in (0, 2, 3, 4, 5):
             raise ValueError("path must have 2 to 5 waypoints (2 = back and forth)")
+        if any((a.x_m, a.y_m) == (b.x_m, b.y_m) for a, b in zip(self.path, self.path[1:], strict=False)):
+            raise ValueError("neighbouring waypoints of a path must differ")
         return self
 
 
@@ -129,10 +154,11 @@ class WorldConfig(Section):
     """Tank, spawn ranges and obstacles: with (seed, episode) it defines a scenario completely."""
 
     tank: TankConfig = TankConfig()
-    spawn_x_m: Interval = (2.0, 18.0)
-    spawn_y_m: Interval = (1.2, 4.8)
-    spawn_z_m: Interval = (-1.2, -0.4)
+    spawn_x_m: OrderedInterval = (2.0, 18.0)
+    spawn_y_m: OrderedInterval = (1.2, 4.8)
+    spawn_z_m: OrderedInterval = (-1.2, -0.4)
     start_goal_gap_m: NonNegative = 3.0
+    """horizontal, so the 3-D distance is never less"""
     n_static: Count = 8
     """S"""
     n_dynamic: Count = 6
@@ -145,6 +171,38 @@ class WorldConfig(Section):
     static: StaticObstacles = StaticObstacles()
     dynamic: DynamicObstacles = DynamicObstacles()
     fixed: tuple[FixedObstacle, ...] = ()
+
+    @model_validator(mode="after")
+    def _fits(self) -> WorldConfig:
+        for wanted, slots in (("n_static", "static_capacity"), ("n_dynamic", "dynamic_capacity")):
+            capacity = getattr(self, slots)
+            if capacity is not None and capacity < getattr(self, wanted):
+                raise ValueError(f"{slots} {capacity} is less than {wanted} {getattr(self, wanted)}")
+        for axis in ("x", "y", "z"):
+            (low, high), (start, end) = getattr(self.tank, f"{axis}_m"), getattr(self, f"spawn_{axis}_m")
+            if start < low or end > high:
+                raise ValueError(f"spawn_{axis}_m ({start}, {end}) reaches out of tank.{axis}_m ({low}, {high})")
+        return self
+
+    @property
+    def static_slots(self) -> int:
+        """Slots kept for random static obstacles."""
+        return self.n_static if self.static_capacity is None else self.static_capacity
+
+    @property
+    def dynamic_slots(self) -> int:
+        """Slots kept for random moving obstacles."""
+        return self.n_dynamic if self.dynamic_capacity is None else self.dynamic_capacity
+
+    @property
+    def n_fixed_static(self) -> int:
+        """Explicit obstacles that stand still."""
+        return sum(not obstacle.path for obstacle in self.fixed)
+
+    @property
+    def n_fixed_moving(self) -> int:
+        """Explicit obstacles that move."""
+        return sum(bool(obstacle.path) for obstacle in self.fixed)
 
 
 # ------------------------------------------------------------------------------------------------------------------- vehicle
@@ -189,7 +247,7 @@ class VehicleConfig(Section):
     thrust_reverse: Vector3 = (-3.8442e-7, -1.6186e-4, -3.9139e-2)
     """[kgf] quadratic in rpm for n < 0"""
     dead_band_rpm: tuple[NonNegative, NonNegative] = (203.5, 210.5)
-    """no thrust below this speed, forward and reverse: where the quadratic fit turns round. MarineGym's throttle dead band of 7.5 % would be
+    """no thrust below this speed, forward and reverse: where the quadratic fit turns round. MarineGym's throttle dead band of 7.5 % is
     (620, 696): possible here too, slow motion then becomes a limit cycle of about 1 cm/s"""
     thrust_scale: Positive = 1.0
     """the paper's K_F / 4.4e-7"""
@@ -578,24 +636,43 @@ class TeacherConfig(Section):
 
 
 class RewardConfig(Section):
-    """Weights of the paper's reward (values EC: not given there)."""
+    """Weights of the paper's r_t, one per term and named like it (the paper gives no values: EC), and the bounds of the soft terms.
+
+    Scale: driving at 0.6 m/s along the route earns about 0.015 a step, 20 over a typical episode: as much as one success.
+    """
 
     alive: float = 0.01
+    """r_alive; less than path_distance takes at the usual look-ahead of 1 m, so that waiting does not pay"""
     progress: float = 1.0
+    """w_p [1/m]"""
     path_distance: float = 0.02
+    """w_d [1/m]"""
     cross_track: float = 0.02
+    """w_ct [1/m]"""
     clearance: float = 0.1
+    """w_c; touching costs five times what full speed earns"""
     ttc: float = 0.1
+    """w_ttc"""
     overspeed: float = 0.1
+    """w_v [s^2/m^2]"""
     upright: float = 0.005
+    """w_u"""
     heading: float = 0.01
+    """w_h; about as much as progress at full speed, so that the vehicle looks where it goes"""
     success: float = 20.0
+    """w_s"""
     failure: float = 20.0
+    """w_f"""
     tilt: float = 0.02
+    """w_tilt [1/rad]"""
     effort: float = 0.005
-    soft_clearance_m: NonNegative = 0.4
-    soft_ttc_s: NonNegative = 2.0
+    """w_eff"""
+    soft_clearance_m: Positive = 0.4
+    """C_t grows linearly from 0 here to 1 at contact"""
+    soft_ttc_s: Positive = 2.0
+    """T_t grows linearly from 0 here to 1 at impact"""
     safe_speed_m_s: Positive = 0.6
+    """beyond this speed is overspeed (Table app_repro: 0.6 m/s)"""
 
 
 class EpisodeConfig(Section):

@@ -1,0 +1,174 @@
+"""Inner loop: commanded body velocity and yaw rate -> wrench -> thrusts -> rotor commands, from measured motion only.
+
+The vehicle knows its nominal parameters (vehicle section): drag, Coriolis and net buoyancy are fed forward, PI feedback does the rest.
+"""
+
+import taichi as ti
+
+from uuvtai.config import ActuationConfig, EpisodeConfig, VehicleConfig
+from uuvtai.kernels.rotor import rpm_of_thrust, thrust_limits
+from uuvtai.kernels.signature import Const, In, Out, spread
+from uuvtai.state import ActuationState, Allocation, ClockState, Proprioception, VehicleParams
+
+
+@ti.kernel
+def command_thrusters(
+    action: ti.types.ndarray(dtype=ti.f32, ndim=2),  # type: ignore[valid-type]
+    actuation: Out[ActuationState],
+    params: In[VehicleParams],
+    allocation: In[Allocation],
+    ego: In[Proprioception],
+    clock: In[ClockState],
+    vehicle_cfg: Const[VehicleConfig],
+    actuation_cfg: Const[ActuationConfig],
+    episode_cfg: Const[EpisodeConfig],
+):
+    """action (n_env, 4): surge, sway, heave, yaw rate in [-1, 1] of the vehicle's limits -> actuation.rpm_command."""
+    n = ti.static(clock.awake.shape[0])
+    for env, pad in ti.ndrange(n, ti.static(spread(n))):
+        if pad == 0 and clock.awake[env] == 1:
+            raw = ti.Vector([action[env, 0], action[env, 1], action[env, 2], action[env, 3]])
+            actuation.command[env] = scaled_command(raw, vehicle_cfg)
+            _drive(env, actuation, allocation, ego, clock, vehicle_cfg, actuation_cfg, episode_cfg)
+            _send(env, actuation, params, clock)
+
+
+@ti.kernel
+def reset_actuation(actuation: Out[ActuationState], clock: In[ClockState]):
+    """Nothing commanded, nothing under way."""
+    n = ti.static(clock.awake.shape[0])
+    for env, pad in ti.ndrange(n, ti.static(spread(n))):
+        if pad == 0 and clock.awake[env] == 1:
+            actuation.command[env] = 0.0
+            actuation.integral[env] = 0.0
+            actuation.hold_moment_b[env] = 0.0
+            actuation.external_wrench_b[env] = 0.0
+            for i in range(ti.static(actuation.rpm_command.shape[1])):
+                actuation.rpm_command[env, i] = 0.0
+                actuation.thrust_n[env, i] = 0.0
+                for slot in range(ti.static(actuation.rpm_queue.shape[1])):
+                    actuation.rpm_queue[env, slot, i] = 0.0
+
+
+@ti.func
+def scaled_command(action, cfg: Const[VehicleConfig]):
+    """[m/s, m/s, m/s, rad/s] of an action, clamped to [-1, 1]; NaN asks for nothing."""
+    limits = ti.Vector([cfg.max_surge_m_s, cfg.max_sway_m_s, cfg.max_heave_m_s, cfg.max_yaw_rate_rad_s])
+    out = ti.Vector([0.0] * 4)
+    for axis in ti.static(range(4)):
+        if action[axis] >= 1.0:
+            out[axis] = limits[axis]
+        elif action[axis] <= -1.0:
+            out[axis] = -limits[axis]
+        elif action[axis] > -1.0 and action[axis] < 1.0:  # false for NaN
+            out[axis] = action[axis] * limits[axis]
+    return out
+
+
+@ti.func
+def _drive(
+    env,
+    actuation: Out[ActuationState],
+    allocation: In[Allocation],
+    ego: In[Proprioception],
+    clock: In[ClockState],
+    vehicle_cfg: Const[VehicleConfig],
+    actuation_cfg: Const[ActuationConfig],
+    episode_cfg: Const[EpisodeConfig],
+):
+    """Wrench of the velocity loop, allocated to the thrusters; their speeds go into this step's slot of the queue."""
+    command, rate = actuation.command[env], ego.rate_b[env]
+    # a lost DVL holds an old velocity: feeding that back would run away, so the feed-forward drives alone until it is back
+    seen = ego.vel_valid[env] == 1
+    vel = ego.vel_b[env] if seen else ti.Vector([command[0], command[1], command[2]])
+    error = ti.Vector([command[0] - vel[0], command[1] - vel[1], command[2] - vel[2], command[3] - rate[2]])
+    up = _up_b(ego.rpy[env])
+    force, moment = feed_forward(command, vel, rate, up, vehicle_cfg)
+    ahead = ti.Vector([force[0], force[1], force[2], moment[2]])
+    gain, integral_gain, limit, error_limit = _gains(actuation_cfg)
+    asked = ahead + gain * error + actuation.integral[env]
+    given = ti.Vector([ti.math.clamp(asked[i], -limit[i], limit[i]) for i in ti.static(range(4))])
+    roll_moment, pitch_moment = 0.0, 0.0
+    if ti.static(vehicle_cfg.attitude_hold == "thrusters"):
+        roll_moment, pitch_moment = stabilising_moment(up, rate, moment, actuation_cfg)
+    wrench = ti.Vector([given[0], given[1], given[2], roll_moment, pitch_moment, given[3]])
+    share = _allocate(env, wrench, actuation, allocation, clock, vehicle_cfg)
+    for axis in ti.static(range(4)):
+        # no wind-up: where the actuators give less than asked, the integral may only shrink
+        starved = share < 1.0 or given[axis] != asked[axis]
+        if (seen or axis == 3) and (not starved or error[axis] * actuation.integral[env][axis] < 0.0):
+            step = integral_gain[axis] * ti.math.clamp(error[axis], -error_limit[axis], error_limit[axis]) * episode_cfg.control_dt_s
+            actuation.integral[env][axis] = ti.math.clamp(actuation.integral[env][axis] + step, -limit[axis], limit[axis])
+
+
+@ti.func
+def _gains(cfg: Const[ActuationConfig]):
+    """Proportional gain, integral gain, limit and integrated error of the four commanded axes."""
+    p, i, f = ti.static(cfg.velocity_gain, cfg.velocity_integral, cfg.max_force_n)
+    return (
+        ti.Vector([p[0], p[1], p[2], cfg.yaw_rate_gain]),
+        ti.Vector([i[0], i[1], i[2], cfg.yaw_rate_integral]),
+        ti.Vector([f[0], f[1], f[2], cfg.max_moment_n_m]),
+        ti.Vector([cfg.integral_error_m_s, cfg.integral_error_m_s, cfg.integral_error_m_s, cfg.integral_error_rad_s]),
+    )
+
+
+@ti.func
+def feed_forward(command, vel, rate, up, cfg: Const[VehicleConfig]):
+    """Force and moment that hold the commanded velocity in still water: drag of the command, Coriolis of the motion, net buoyancy."""
+    mass, added, linear, quadratic = ti.static(cfg.mass_kg, cfg.added_mass, cfg.linear_damping, cfg.quadratic_damping)
+    momentum = ti.Vector([(mass + added[0]) * vel[0], (mass + added[1]) * vel[1], (mass + added[2]) * vel[2]])
+    spin = ti.Vector([(cfg.inertia_kg_m2[i] + added[3 + i]) * rate[i] for i in ti.static(range(3))])
+    force = rate.cross(momentum)
+    moment = rate.cross(spin) + vel.cross(momentum)
+    for axis in ti.static(range(3)):
+        force[axis] += (linear[axis] + quadratic[axis] * abs(command[axis])) * command[axis]
+    moment[2] += (linear[5] + quadratic[5] * abs(command[3])) * command[3]
+    net = ti.static(cfg.gravity_m_s2 * (cfg.water_density_kg_m3 * cfg.volume_m3 - cfg.mass_kg))
+    return force - net * up, moment
+
+
+@ti.func
+def stabilising_moment(up, rate, coriolis, cfg: Const[ActuationConfig]):
+    """[N m] roll and pitch moment of the hold by thrusters: upright, damped, Munk moment fed forward, bounded."""
+    k, d = cfg.thruster_hold_gain_n_m, cfg.thruster_hold_damping
+    roll, pitch = coriolis[0] - k * up[1] - d * rate[0], coriolis[1] + k * up[0] - d * rate[1]
+    share = ti.min(1.0, cfg.hold_limit_n_m / ti.max(ti.sqrt(roll * roll + pitch * pitch), 1e-6))
+    return share * roll, share * pitch
+
+
+@ti.func
+def _up_b(rpy):
+    """World z axis seen in body axes."""
+    return ti.Vector([-ti.sin(rpy[1]), ti.sin(rpy[0]) * ti.cos(rpy[1]), ti.cos(rpy[0]) * ti.cos(rpy[1])])
+
+
+@ti.func
+def _allocate(env, wrench, actuation: Out[ActuationState], allocation: In[Allocation], clock: In[ClockState], cfg: Const[VehicleConfig]):
+    """Least-squares thrusts to rotor speeds; returns the share <= 1 by which all thrusts are scaled so that none exceeds its limit.
+
+    One factor for all keeps the wrench's direction: a vehicle that clips single thrusters turns and drifts where it should only be slower.
+    """
+    forward, reverse = ti.static(thrust_limits(cfg))
+    thrust = ti.Vector([0.0] * ti.static(len(cfg.thrusters)))
+    share = 1.0
+    for i in ti.static(range(len(cfg.thrusters))):
+        for axis in ti.static(range(6)):
+            thrust[i] += allocation.thrust_of_wrench[i, axis] * wrench[axis]
+        if thrust[i] > 0.0:
+            share = ti.min(share, forward / thrust[i])
+        elif thrust[i] < 0.0:
+            share = ti.min(share, reverse / thrust[i])
+    slot = clock.step[env] % ti.static(actuation.rpm_queue.shape[1])
+    for i in ti.static(range(len(cfg.thrusters))):
+        actuation.rpm_queue[env, slot, i] = rpm_of_thrust(share * thrust[i], cfg)
+    return share
+
+
+@ti.func
+def _send(env, actuation: Out[ActuationState], params: In[VehicleParams], clock: In[ClockState]):
+    """What left the queue's tail reaches the rotors: the command of delay_steps control steps ago."""
+    n_slot = ti.static(actuation.rpm_queue.shape[1])
+    slot = (clock.step[env] - params.delay_steps[env]) % n_slot
+    for i in range(ti.static(actuation.rpm_command.shape[1])):
+        actuation.rpm_command[env, i] = actuation.rpm_queue[env, slot, i]

@@ -1,0 +1,111 @@
+"""The vehicle alone: actuation and dynamics in endless water, for experiments on the physics. No world, no sensors."""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+import numpy as np
+
+from uuvtai import state
+from uuvtai.allocation import allocation_matrices
+from uuvtai.config import Config
+from uuvtai.kernels import actuation, dynamics
+from uuvtai.runtime import Runtime
+
+_T = TypeVar("_T")
+
+
+class Plant:
+    """``n_env`` vehicles of one config, moved step by step. Taichi must be running as ``runtime``."""
+
+    def __init__(self, config: Config, runtime: Runtime, n_env: int = 1) -> None:
+        check_thruster_index(config)
+        self.config, self.n_env, self.real = config, n_env, runtime.real
+        self._sizes = {
+            "n_env": n_env,
+            "n_thruster": len(config.vehicle.thrusters),
+            "n_wrench": 6,
+            "n_delay": 1 + round(config.disturbance.thruster_delay_s / config.episode.control_dt_s),
+        }
+        self.clock = self._allocated(state.ClockState)
+        self.episode = self._allocated(state.EpisodeState)
+        self.mission = self._allocated(state.MissionState)
+        self.vehicle = self._allocated(state.VehicleState)
+        self.params = self._allocated(state.VehicleParams)
+        self.actuation = self._allocated(state.ActuationState)
+        self.allocation = self._allocated(state.Allocation)
+        self.current = self._allocated(state.CurrentState)
+        self.ego = self._allocated(state.Proprioception)
+        wrench_of_thrust, thrust_of_wrench = allocation_matrices(config.vehicle)
+        self.write(self.allocation.wrench_of_thrust, wrench_of_thrust)
+        self.write(self.allocation.thrust_of_wrench, thrust_of_wrench)
+        self.steps = 0
+
+    def _allocated(self, struct: type[_T]) -> _T:
+        return state.allocate(struct, self._sizes, self.real)
+
+    def write(self, field: Any, value: Any) -> None:
+        """Fill a field of continuous values from anything that broadcasts to (field shape, vector length)."""
+        shape = (*field.shape, field.n) if hasattr(field, "n") else field.shape
+        dtype = np.float64 if self.real is state.ti.f64 else np.float32
+        field.from_numpy(np.ascontiguousarray(np.broadcast_to(np.asarray(value, dtype=dtype), shape)))
+
+    def reset(self, keys: np.ndarray | None = None) -> None:
+        """All vehicles at rest at the origin; ``keys`` (n_env) are the episodes' random keys (default: 0, 1, 2, ..)."""
+        c = self.config
+        self.clock.active.fill(1)
+        self.clock.awake.fill(1)
+        self._set_time(0)
+        self.episode.key.from_numpy((np.arange(self.n_env) if keys is None else keys).astype(np.uint32))
+        dynamics.reset_vehicle(
+            self.vehicle, self.params, self.current, self.mission, self.episode, self.clock, c.vehicle, c.disturbance, c.episode
+        )
+        actuation.reset_actuation(self.actuation, self.clock)
+
+    def step(self, action: np.ndarray | None = None, substeps: int | None = None, dt_s: float | None = None) -> None:
+        """One control step, driven by the inner loop on exact measurements where ``action`` (n_env, 4) is given."""
+        c, e = self.config, self.config.episode
+        if action is not None:
+            dynamics.sense_exactly(self.ego, self.vehicle, self.clock)
+            self.command(action)
+        dynamics.move_vehicle(
+            self.vehicle,
+            self.actuation,
+            self.current,
+            self.params,
+            self.allocation,
+            self.episode,
+            self.clock,
+            c.vehicle,
+            c.actuation,
+            c.disturbance,
+            e.control_dt_s if dt_s is None else dt_s,
+            e.substeps if substeps is None else substeps,
+        )
+        self._set_time(self.steps + 1)
+
+    def _set_time(self, steps: int) -> None:
+        self.steps = steps
+        self.clock.step.from_numpy(np.full(self.n_env, steps, dtype=np.int32))  # fill() would compile a kernel for every value
+
+    def command(self, action: np.ndarray) -> None:
+        """The inner loop alone, on whatever ``ego`` holds."""
+        c = self.config
+        actuation.command_thrusters(
+            np.ascontiguousarray(action, dtype=np.float32),
+            self.actuation,
+            self.params,
+            self.allocation,
+            self.ego,
+            self.clock,
+            c.vehicle,
+            c.actuation,
+            c.episode,
+        )
+
+
+def check_thruster_index(config: Config) -> None:
+    """ValueError where ``disturbance.dead_thruster`` names a thruster that the vehicle does not have."""
+    dead, count = config.disturbance.dead_thruster, len(config.vehicle.thrusters)
+    if dead is not None and dead >= count:
+        raise ValueError(f"disturbance.dead_thruster is {dead}, but the vehicle has thrusters 0 to {count - 1}")
