@@ -1,0 +1,131 @@
+"""Roll-outs of sixteen commanded velocities at once against forecast bodies and the mapped clearance.
+
+A commanded velocity c is reached with a first-order lag tau, so from velocity v0 the vehicle drives
+x(t) = x0 + v0 A(t) + c B(t), A(t) = tau (1 - exp(-t / tau)), B(t) = t - A(t): linear in c, which is all the lanes differ in.
+"""
+
+import taichi as ti
+
+from uuvtai.config import MappingConfig, TankConfig, TeacherConfig, TrackingConfig
+from uuvtai.kernels.geometry import FAR_M
+from uuvtai.kernels.grid import grid_origin
+from uuvtai.kernels.lanes import LANES, f16x
+from uuvtai.kernels.signature import Const, In
+from uuvtai.state import ClearanceState, ForecastState
+
+
+@ti.func
+def body_depths(
+    env,
+    cx,
+    cy,
+    pos,
+    vel,
+    forecast: In[ForecastState],
+    teacher_cfg: Const[TeacherConfig],
+    tracking_cfg: Const[TrackingConfig],
+):
+    """How deep each commanded velocity (lanes cx, cy [m/s]) violates the wanted clearance from the forecast bodies.
+
+    ``pos``, ``vel``: own position [m] and velocity [m/s] now, world, horizontal. Returns lanes: largest depth [m]; depth averaged over the
+    horizon and summed over bodies [m]; largest depth below contact [m]; time of the first violation [s], FAR_M = none.
+    The clearance is reduced by closing_s times the closing speed, as the referee also stops at a small time to collision.
+    """
+    n_track, n_sample = ti.static(forecast.radius_m.shape[1], _samples(forecast.radius_m.shape[2], teacher_cfg, tracking_cfg))
+    dt = ti.static(tracking_cfg.forecast_dt_s)
+    peak, mean, contact, first = f16x(0.0), f16x(0.0), f16x(0.0), f16x(FAR_M)
+    reach_speed = vel.norm() + ti.static(teacher_cfg.evade_m_s)
+    for track in range(n_track):
+        if forecast.radius_m[env, track, 0] >= 0:
+            decay = 1.0
+            for k in range(1, n_sample):
+                decay *= ti.static(_decay(tracking_cfg.forecast_dt_s, teacher_cfg.lag_s))
+                time = k * dt
+                settle = ti.static(teacher_cfg.lag_s) * (1.0 - decay)
+                body = forecast.pos_w[env, track, k]
+                body_vel = (body - forecast.pos_w[env, track, k - 1]) / dt
+                start = pos + vel * settle - body
+                drift = vel * decay - body_vel
+                wanted = ti.static(teacher_cfg.contact_m + teacher_cfg.margin_m) + ti.static(teacher_cfg.margin_growth_m_s) * time
+                touch = forecast.radius_m[env, track, k] + ti.static(teacher_cfg.hull_reach_m)
+                bound = touch + wanted + ti.static(teacher_cfg.evade_m_s) * (time - settle)
+                bound += ti.static(teacher_cfg.closing_s) * (reach_speed + body_vel.norm())
+                if forecast.radius_m[env, track, k] >= 0 and start.norm_sqr() < bound * bound:
+                    free = _free_lanes(cx, cy, start, drift, time - settle, 1.0 - decay, touch, teacher_cfg)
+                    for i in ti.static(range(LANES)):
+                        depth = ti.max(wanted - free[i], 0.0)
+                        peak[i] = ti.max(peak[i], depth)
+                        mean[i] += depth * ti.static(1.0 / (_samples(forecast.radius_m.shape[2], teacher_cfg, tracking_cfg) - 1))
+                        contact[i] = ti.max(contact[i], ti.static(teacher_cfg.contact_m) - free[i])
+                        first[i] = ti.min(first[i], ti.select(depth > 0.0, time, FAR_M))
+    return peak, mean, contact, first
+
+
+@ti.func
+def _free_lanes(cx, cy, start, drift, gain, share, touch, teacher_cfg: Const[TeacherConfig]):
+    """Surface-to-surface distance less closing_s times the closing speed, per lane.
+
+    Position relative to the body is start + c gain, relative velocity drift + c share.
+    """
+    dx = cx * gain + start[0]
+    dy = cy * gain + start[1]
+    square = dx * dx + dy * dy + 1.0e-8
+    distance = ti.sqrt(square)
+    approach = -(dx * (cx * share + drift[0]) + dy * (cy * share + drift[1])) / distance
+    closing = ti.max(approach, 0.0)
+    return distance - touch - ti.static(teacher_cfg.closing_s) * closing
+
+
+@ti.func
+def static_depths(
+    env,
+    cx,
+    cy,
+    pos,
+    vel,
+    clearance: In[ClearanceState],
+    teacher_cfg: Const[TeacherConfig],
+    tank_cfg: Const[TankConfig],
+    mapping_cfg: Const[MappingConfig],
+):
+    """How deep each commanded velocity violates the wanted static clearance: lanes mean depth and largest depth below contact [m]."""
+    mean, contact = f16x(0.0), f16x(0.0)
+    n_sample = ti.static(max(1, round(teacher_cfg.static_horizon_s / teacher_cfg.static_dt_s)))
+    touch = ti.static(teacher_cfg.hull_reach_m + teacher_cfg.contact_m)
+    decay = 1.0
+    for k in range(1, n_sample + 1):
+        decay *= ti.static(_decay(teacher_cfg.static_dt_s, teacher_cfg.lag_s))
+        settle = ti.static(teacher_cfg.lag_s) * (1.0 - decay)
+        gain = k * ti.static(teacher_cfg.static_dt_s) - settle
+        free = clearance_lanes(
+            env, cx * gain + (pos[0] + vel[0] * settle), cy * gain + (pos[1] + vel[1] * settle), clearance, tank_cfg, mapping_cfg
+        )
+        for i in ti.static(range(LANES)):
+            below = touch - free[i]
+            mean[i] += ti.max(below + ti.static(teacher_cfg.static_margin_m), 0.0) / n_sample
+            contact[i] = ti.max(contact[i], below)
+    return mean, contact
+
+
+@ti.func
+def clearance_lanes(env, x, y, clearance: In[ClearanceState], tank_cfg: Const[TankConfig], mapping_cfg: Const[MappingConfig]):
+    """Mapped clearance [m] of the cells that hold the lanes' positions; positions off the grid take its border, which is 0."""
+    x0, y0 = ti.static(grid_origin(tank_cfg, mapping_cfg.cell_m))
+    n_row, n_col = ti.static(clearance.clearance_m.shape[1], clearance.clearance_m.shape[2])
+    at_col = (x - x0) * ti.static(1.0 / mapping_cfg.cell_m)
+    at_row = (y - y0) * ti.static(1.0 / mapping_cfg.cell_m)
+    out = f16x(0.0)
+    for i in ti.static(range(LANES)):
+        row = ti.math.clamp(ti.cast(ti.floor(at_row[i]), ti.i32), 0, n_row - 1)
+        col = ti.math.clamp(ti.cast(ti.floor(at_col[i]), ti.i32), 0, n_col - 1)
+        out[i] = clearance.clearance_m[env, row, col]
+    return out
+
+
+def _decay(dt_s, lag_s):
+    return 2.718281828459045 ** (-dt_s / lag_s)
+
+
+def _samples(n_forecast, teacher_cfg, tracking_cfg):
+    """Forecast samples used: the horizon, or what there is."""
+    return min(n_forecast, round(teacher_cfg.horizon_s / tracking_cfg.forecast_dt_s) + 1)

@@ -1,0 +1,142 @@
+"""Tick of a behaviour tree stored as preorder arrays, for one env, without recursion.
+
+Returned statuses and ticked leaves follow BehaviorTree.CPP 4: ``Sequence`` and ``Fallback`` go on with the child that was running, their
+``Reactive`` forms begin at the first child in every tick and halt the siblings after the one that decides. Kept statuses follow py_trees
+(2.x), node by node: a finished node keeps its status until its parent enters it anew or a sibling halts it, where BehaviorTree.CPP resets
+the children of a finished node to IDLE at once. The kept form shows in a log what the newest tick found.
+"""
+
+import taichi as ti
+
+from uuvtai.kernels.signature import In, Out
+from uuvtai.state import TeacherState, TreeTable
+
+# statuses, numbered as in BehaviorTree.CPP
+IDLE = 0
+RUNNING = 1
+SUCCESS = 2
+FAILURE = 3
+
+# kinds of nodes: sequences, fallbacks, decorators, leaves
+SEQUENCE = 0
+REACTIVE_SEQUENCE = 1
+FALLBACK = 2
+REACTIVE_FALLBACK = 3
+INVERTER = 4
+FORCE_SUCCESS = 5
+FORCE_FAILURE = 6
+CONDITION = 7
+ACTION = 8
+
+# leaves: conditions, then actions
+EMERGENCY_TTC = 0
+PREDICTED_CONFLICT = 1
+ROUTE_BLOCKED = 2
+STUCK = 3
+HAS_ROUTE = 4
+GOAL_NEAR = 5
+BACK_OFF = 16
+EVADE = 17
+HOLD = 18
+UNSTICK = 19
+FOLLOW_ROUTE = 20
+DRIVE_STRAIGHT = 21
+
+
+@ti.func
+def tick_nodes(env, teacher: Out[TeacherState], table: In[TreeTable]):
+    """Tick the tree once; leaves answer ``teacher.result``. Returns the last action that was ticked and did not fail, -1 if none."""
+    node = 0
+    entering = 1
+    acting = -1
+    while node >= 0:
+        if entering == 1:
+            teacher.ticks[env, node] += 1
+            kind = table.kind[node]
+            if kind >= CONDITION:
+                answer = teacher.result[env, node]
+                teacher.status[env, node] = answer
+                if kind == ACTION and answer != FAILURE:
+                    acting = node
+                entering = 0
+            else:
+                node = _first_child(env, node, teacher, table)
+        else:
+            following = _next_child(env, node, teacher, table)
+            if following >= 0:
+                node = following
+                entering = 1
+            else:
+                node = table.parent[node]
+    return acting
+
+
+@ti.func
+def _halt(env, first, end, teacher: Out[TeacherState]):
+    for node in range(first, end):
+        teacher.status[env, node] = IDLE
+
+
+@ti.func
+def _first_child(env, node, teacher: Out[TeacherState], table: In[TreeTable]):
+    """Child with which a tick of an inner node begins."""
+    kind = table.kind[node]
+    child = node + 1
+    if teacher.status[env, node] == RUNNING:
+        if kind == SEQUENCE:
+            child = teacher.running_child[env, node]
+        if kind == FALLBACK:
+            child = teacher.running_child[env, node]
+            _halt(env, node + 1, child, teacher)
+    else:
+        teacher.running_child[env, node] = child
+        if kind <= REACTIVE_SEQUENCE:
+            _halt(env, child, table.end[node], teacher)
+    return child
+
+
+@ti.func
+def _next_child(env, child, teacher: Out[TeacherState], table: In[TreeTable]):
+    """Sibling to tick after ``child`` answered, or -1 when that decides its parent, whose status is then set."""
+    parent = table.parent[child]
+    following = -1
+    if parent >= 0:
+        kind = table.kind[parent]
+        answer = teacher.status[env, child]
+        is_sequence = kind <= REACTIVE_SEQUENCE
+        is_fallback = kind >= FALLBACK and kind <= REACTIVE_FALLBACK
+        goes_on = (is_sequence and answer == SUCCESS) or (is_fallback and answer == FAILURE)
+        if goes_on and table.end[child] < table.end[parent]:
+            following = table.end[child]
+            if is_sequence:
+                teacher.running_child[env, parent] = following
+        else:
+            if not goes_on:
+                if kind == REACTIVE_SEQUENCE or (is_fallback and teacher.running_child[env, parent] != child):
+                    _halt(env, table.end[child], table.end[parent], teacher)
+                if is_fallback:
+                    teacher.running_child[env, parent] = child
+            teacher.status[env, parent] = _decorated(kind, answer)
+    return following
+
+
+@ti.func
+def _decorated(kind, answer):
+    """Status of a parent whose child decided it."""
+    status = answer
+    if kind == INVERTER and answer != RUNNING:
+        status = SUCCESS + FAILURE - answer
+    if kind == FORCE_SUCCESS and answer != RUNNING:
+        status = SUCCESS
+    if kind == FORCE_FAILURE and answer != RUNNING:
+        status = FAILURE
+    return status
+
+
+@ti.kernel
+def tick_with_given_statuses(result: ti.types.ndarray(), teacher: Out[TeacherState], table: In[TreeTable]):  # pyright: ignore
+    """Tick every env with leaf answers given from outside, result[env, node]: for tests of the engine against another one."""
+    for env in range(ti.static(teacher.leaf.shape[0])):
+        for node in range(table.n_node[None]):
+            teacher.result[env, node] = result[env, node]
+        teacher.leaf[env] = tick_nodes(env, teacher, table)
