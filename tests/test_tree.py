@@ -1,0 +1,302 @@
+"""Behaviour trees: reading, flattening, showing, and the tick engine against py_trees."""
+
+import xml.etree.ElementTree as ET
+from itertools import pairwise
+
+import numpy as np
+import py_trees
+import pytest
+from py_trees.common import Status
+
+from uuvtai import state
+from uuvtai.config import TeacherConfig
+from uuvtai.kernels import tree_tick as codes
+from uuvtai.loader import ConfigError, preset_names, preset_path
+from uuvtai.tree import CONTROLS, DECORATORS, LEAVES, FlatTree, TreeError, load_tree, node_use, parse_tree, read_tree, tree_dot, tree_text
+
+N_BOARD = 20
+"""Random blackboards per tree: one env each."""
+N_TREE = 250
+N_TICK = 6
+MAX_NODE = 40
+PRESETS = ("straight", "planner", "bt")
+
+
+def xml(body: str, extra: str = "") -> str:
+    return f'<root BTCPP_format="4" main_tree_to_execute="main"><BehaviorTree ID="main">{body}</BehaviorTree>{extra}</root>'
+
+
+# ------------------------------------------------------------------------------------------------------------------- reading
+
+
+def test_flattening_is_preorder_with_ends_and_parents():
+    flat = parse_tree(
+        xml('<Fallback name="top"><Sequence><HasRoute/><FollowRoute speed_m_s="0.4"/></Sequence><Inverter><Hold/></Inverter></Fallback>')
+    )
+    assert flat.types == ("Fallback", "Sequence", "HasRoute", "FollowRoute", "Inverter", "Hold")
+    assert flat.names[0] == "top" and flat.names[1] == "Sequence"
+    assert flat.end == (6, 4, 3, 4, 6, 6)
+    assert flat.parent == (-1, 0, 1, 1, 0, 4)
+    assert flat.depth == (0, 1, 2, 2, 1, 2)
+    assert flat.param[3] == (0.4, -1.0, -1.0, -1.0)
+    assert flat.kind[2:4] == (codes.CONDITION, codes.ACTION)
+
+
+def test_subtrees_are_put_in_place():
+    flat = parse_tree(
+        xml('<Sequence><SubTree ID="go" _autoremap="true"/><SubTree ID="go"/></Sequence>', '<BehaviorTree ID="go"><Hold/></BehaviorTree>')
+    )
+    assert flat.types == ("Sequence", "Hold", "Hold")
+
+
+def test_explicit_elements_are_the_same_as_compact_ones():
+    compact = parse_tree(xml('<Sequence><Stuck seconds="2"/><Unstick/></Sequence>'))
+    explicit = parse_tree(xml('<Control ID="Sequence"><Condition ID="Stuck" seconds="2"/><Action ID="Unstick"/></Control>'))
+    assert compact == explicit
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (xml("<Sequence>\n<Evad/></Sequence>"), ("t.xml:2", "Evad", "did you mean 'Evade'")),
+        (xml('<Hold name="stay"><Hold/></Hold>'), ("stay", "leaf")),
+        (xml("<Sequence/>"), ("at least one child",)),
+        (xml("<Inverter><Hold/><Hold/></Inverter>"), ("exactly one child",)),
+        (xml("<Hold/><Hold/>"), ("exactly one node",)),
+        (xml('<Stuck secs="1"/>'), ("unknown port 'secs'", "seconds")),
+        (xml('<Stuck seconds="{t}"/>'), ("must be a number",)),
+        (xml('<Stuck seconds="nan"/>'), ("must be a number",)),
+        (xml('<Stuck seconds="-1"/>'), ("must be a number",)),
+        (xml('<Sequence _skipIf="x"><Hold/></Sequence>'), ("_skipIf", "scripts")),
+        (xml('<Condition ID="Hold"/>'), ("Action",)),
+        (xml('<SubTree ID="man"/>'), ("did you mean 'main'",)),
+        (xml('<SubTree ID="main"/>'), ("contains itself",)),
+        (xml("<Sequence>text<Hold/></Sequence>"), ("text",)),
+        (xml("<Sequence>" + "<Hold/>" * 70 + "</Sequence>"), ("more than 64 nodes",)),
+        (xml("<Inverter>" * 70 + "<Hold/>" + "</Inverter>" * 70), ("nested",)),
+        ("<root><BehaviorTree ID='a'><Hold/></BehaviorTree></root>", ("BTCPP_format",)),
+        ("<tree/>", ("outermost",)),
+        ('<root BTCPP_format="4"/>', ("no <BehaviorTree>",)),
+        ('<root BTCPP_format="4"><include path="a.xml"/></root>', ("not included",)),
+        (
+            '<root BTCPP_format="4"><BehaviorTree ID="a"><Hold/></BehaviorTree><BehaviorTree ID="b"><Hold/></BehaviorTree></root>',
+            ("main_tree",),
+        ),
+        ('<root BTCPP_format="4" main_tree_to_execute="z"><BehaviorTree ID="a"><Hold/></BehaviorTree></root>', ("'z'",)),
+        (
+            '<root BTCPP_format="4"><BehaviorTree ID="a"><Hold/></BehaviorTree><BehaviorTree ID="a"><Hold/></BehaviorTree></root>',
+            ("twice",),
+        ),
+        ('<!DOCTYPE r [<!ENTITY a "b">]>' + xml("<Hold/>"), ("DTD",)),
+        ("<root", ("t.xml:1", "not well-formed")),
+        ("", ("not well-formed",)),
+        ("<a>" + " " * (1 << 20), ("larger",)),
+    ],
+)
+def test_bad_trees_are_refused_with_the_place_and_the_reason(text, words):
+    with pytest.raises(TreeError) as error:
+        parse_tree(text, "t.xml")
+    for word in words:
+        assert word in str(error.value)
+
+
+def test_unknown_or_missing_files_are_refused(tmp_path):
+    with pytest.raises(ConfigError, match="bt"):
+        read_tree("bt2")
+    with pytest.raises(ConfigError, match="no such file"):
+        read_tree(str(tmp_path / "gone.xml"))
+    path = tmp_path / "mine.xml"
+    path.write_text(xml("<Hold/>"))
+    assert read_tree(str(path)).types == ("Hold",)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_open_in_groot(name):
+    """Groot 2 needs format 4, a main tree that exists, and every custom leaf in the palette with its kind and ports."""
+    assert set(preset_names("tree")) >= set(PRESETS)
+    root = ET.parse(preset_path("tree", name)).getroot()
+    assert root.attrib["BTCPP_format"] == "4"
+    assert root.attrib["main_tree_to_execute"] in {tree.attrib["ID"] for tree in root.findall("BehaviorTree")}
+    palette = {(entry.attrib["ID"], entry.tag, tuple(port.attrib["name"] for port in entry)) for entry in root.find("TreeNodesModel")}
+    wanted = {(leaf, "Action" if spec.kind == codes.ACTION else "Condition", spec.ports) for leaf, spec in LEAVES.items()}
+    assert palette == wanted
+    used = {node.tag for tree in root.findall("BehaviorTree") for node in tree.iter()} - {"BehaviorTree"}
+    assert used <= {*LEAVES, *CONTROLS, *DECORATORS}
+    assert len(read_tree(name, TeacherConfig().max_node).kind) <= TeacherConfig().max_node
+
+
+def test_text_and_dot_name_every_node_and_its_use():
+    flat = read_tree("bt")
+    ticks = np.zeros((4, 64), int)
+    ticks[:, 0], ticks[:1, 1] = 10, 7
+    acted = np.zeros((4, 64), int)
+    acted[0, flat.types.index("FollowRoute")] = 5
+    use = node_use(ticks, acted, len(flat.kind))
+    assert use[0].share == 1.0 and use[1].share == 0.25 and use[1].ticks == 7
+    text, dot = tree_text(flat, use), tree_dot(flat, use)
+    assert len(text.splitlines()) == len(flat.kind) + 1
+    for node in (*flat.names, "25.0%", "100.0%"):
+        assert node in text
+    assert dot.count("->") >= len(flat.kind) - 1 and "25.0 %" in dot
+    assert len(tree_text(flat).splitlines()) == len(flat.kind)
+    assert node_use(np.zeros((0, 64)), np.zeros((0, 64)), 2)[1].ticks == 0
+    quoted = parse_tree(xml("<Hold name='a \"b\"'/>"))
+    assert '\\"b\\"' in tree_dot(quoted)
+
+
+# -------------------------------------------------------------------------------------------------------------------- engine
+
+
+@pytest.fixture(scope="module")
+def engine():
+    sizes = {"n_env": N_BOARD, "n_node": MAX_NODE, "n_candidate": 16}
+    return state.allocate(state.TeacherState, sizes), state.allocate(state.TreeTable, sizes)
+
+
+def begin(engine, flat):
+    teacher, table = engine
+    load_tree(table, flat)
+    for array in (teacher.status, teacher.running_child, teacher.ticks):
+        array.fill(0)
+
+
+def tick(engine, answers):
+    """Statuses [env, node] after a tick with the given leaf answers, and the acting node."""
+    teacher, table = engine
+    codes.tick_with_given_statuses(np.ascontiguousarray(answers, np.int32), teacher, table)
+    return teacher.status.to_numpy(), teacher.leaf.to_numpy()
+
+
+def random_tree(rng) -> FlatTree:
+    """A tree of at most MAX_NODE nodes, made as nested lists and flattened here, without the reader."""
+    kind, end, parent = [], [], []
+
+    def grow(above, depth):
+        here = len(kind)
+        leaf = depth >= 5 or len(kind) > MAX_NODE - 14 or (depth > 0 and rng.random() < 0.35)
+        kind.append(int(rng.integers(codes.CONDITION, codes.ACTION + 1) if leaf else rng.integers(0, codes.CONDITION)))
+        parent.append(above)
+        end.append(0)
+        if not leaf:
+            for _ in range(1 if kind[here] >= codes.INVERTER else int(rng.integers(1, 4))):
+                if len(kind) < MAX_NODE - 6:
+                    grow(here, depth + 1)
+            if len(kind) == here + 1:
+                grow(here, 9)
+        end[here] = len(kind)
+
+    grow(-1, 0)
+    n = len(kind)
+    return FlatTree(("",) * n, ("",) * n, tuple(kind), tuple(end), tuple(parent), (-1,) * n, ((-1.0,) * 4,) * n)
+
+
+class Given(py_trees.behaviour.Behaviour):
+    """A leaf that answers what the blackboard says."""
+
+    def __init__(self, node, board):
+        super().__init__(str(node))
+        self.node, self.board = node, board
+
+    def update(self):
+        self.board["ticked"].append(self.node)
+        return self.board["answers"][self.node]
+
+
+def as_py_tree(flat, board):
+    """The same tree in py_trees, as a list by preorder index."""
+    nodes = {}
+
+    def build(node):
+        kind = flat.kind[node]
+        children = [build(child) for child in range(node + 1, flat.end[node]) if flat.parent[child] == node]
+        if kind >= codes.CONDITION:
+            made = Given(node, board)
+        elif kind in (codes.SEQUENCE, codes.REACTIVE_SEQUENCE):
+            made = py_trees.composites.Sequence(str(node), memory=kind == codes.SEQUENCE, children=children)
+        elif kind in (codes.FALLBACK, codes.REACTIVE_FALLBACK):
+            made = py_trees.composites.Selector(str(node), memory=kind == codes.FALLBACK, children=children)
+        else:
+            decorator = {
+                codes.INVERTER: py_trees.decorators.Inverter,
+                codes.FORCE_SUCCESS: py_trees.decorators.FailureIsSuccess,
+                codes.FORCE_FAILURE: py_trees.decorators.SuccessIsFailure,
+            }[kind]
+            made = decorator(str(node), children[0])
+        nodes[node] = made
+        return made
+
+    build(0)
+    return [nodes[i] for i in range(len(flat.kind))]
+
+
+CODE = {Status.INVALID: codes.IDLE, Status.RUNNING: codes.RUNNING, Status.SUCCESS: codes.SUCCESS, Status.FAILURE: codes.FAILURE}
+STATUS = {code: status for status, code in CODE.items()}
+
+
+def test_engine_equals_py_trees_node_by_node(engine):
+    """250 random trees x 20 blackboards x 6 ticks: every node's status, every tick count and the acting leaf are equal."""
+    rng = np.random.default_rng(7)
+    compared = 0
+    for _ in range(N_TREE):
+        flat = random_tree(rng)
+        n = len(flat.kind)
+        begin(engine, flat)
+        boards = [{"ticked": [], "answers": None} for _ in range(N_BOARD)]
+        trees = [as_py_tree(flat, board) for board in boards]
+        counts = np.zeros((N_BOARD, n), int)
+        for _ in range(N_TICK):
+            answers = rng.integers(codes.RUNNING, codes.FAILURE + 1, (N_BOARD, n))
+            found, acting = tick(engine, answers)
+            for env, (board, nodes) in enumerate(zip(boards, trees, strict=True)):
+                board["answers"], board["ticked"] = [STATUS[a] for a in answers[env]], []
+                for visited in nodes[0].tick():
+                    counts[env, int(visited.name)] += 1
+                assert [CODE[node.status] for node in nodes] == found[env, :n].tolist(), (flat, answers[env])
+                did = [i for i in board["ticked"] if flat.kind[i] == codes.ACTION and answers[env, i] != codes.FAILURE]
+                assert acting[env] == (did[-1] if did else -1)
+                compared += n
+        np.testing.assert_array_equal(engine[0].ticks.to_numpy()[:, :n], counts)
+    assert compared > 100_000
+
+
+def walk(engine, body, answers_by_type):
+    """Statuses of env 0 after each tick; answers by leaf type."""
+    flat = parse_tree(xml(body))
+    begin(engine, flat)
+    rows = []
+    for answers in answers_by_type:
+        given = np.zeros((N_BOARD, len(flat.kind)), np.int32)
+        for node, name in enumerate(flat.types):
+            given[:, node] = answers.get(name, 0)
+        found, acting = tick(engine, given)
+        rows.append((found[0, : len(flat.kind)].tolist(), flat.types[acting[0]] if acting[0] >= 0 else None))
+    return rows
+
+
+R, S, F, IDLE = codes.RUNNING, codes.SUCCESS, codes.FAILURE, codes.IDLE
+
+
+def test_memory_goes_on_and_reactive_begins_anew(engine):
+    ticks = [{"Stuck": S, "Unstick": R}, {"Stuck": F, "Unstick": R}]
+    assert walk(engine, "<Sequence><Stuck/><Unstick/></Sequence>", ticks)[1] == ([R, S, R], "Unstick")
+    assert walk(engine, "<ReactiveSequence><Stuck/><Unstick/></ReactiveSequence>", ticks)[1] == ([F, F, IDLE], None)
+
+
+def test_priority_halts_what_ran_below(engine):
+    emergency = "<ReactiveSequence><EmergencyTtc/><BackOff/></ReactiveSequence>"
+    body = f"<ReactiveFallback>{emergency}<Sequence><Stuck/><Unstick/></Sequence></ReactiveFallback>"
+    calm = {"EmergencyTtc": F, "Stuck": S, "Unstick": R}
+    rows = walk(engine, body, [calm, {**calm, "EmergencyTtc": S, "BackOff": R}, {**calm, "Stuck": F}])
+    assert rows[0] == ([R, F, F, IDLE, R, S, R], "Unstick")
+    assert rows[1] == ([R, R, S, R, IDLE, IDLE, IDLE], "BackOff")
+    assert rows[2] == ([F, F, F, IDLE, F, F, IDLE], None)  # the interrupted sequence began anew
+
+
+def test_tree_that_does_not_fit_is_refused(engine):
+    with pytest.raises(TreeError, match="do not fit"):
+        load_tree(engine[1], parse_tree(xml("<Sequence>" + "<Hold/>" * (MAX_NODE + 1) + "</Sequence>")))
+
+
+def test_leaf_codes_are_distinct():
+    used = sorted(leaf.code for leaf in LEAVES.values())
+    assert all(a < b for a, b in pairwise(used))
