@@ -26,6 +26,7 @@ from uuvtai.kernels import (
     depth,
     dynamics,
     episode,
+    evasion,
     features,
     mapping,
     proprioception,
@@ -33,15 +34,15 @@ from uuvtai.kernels import (
     route,
     sonar,
     teacher,
+    threats,
     tracking,
-    voronoi,
     world,
 )
 from uuvtai.kernels.grid import outside_cells
 from uuvtai.kernels.recording import copy_rows
 from uuvtai.rrt import RouteFallback
 from uuvtai.runtime import start_taichi
-from uuvtai.scenario import load_fixed
+from uuvtai.scenario import load_fixed, set_scene
 from uuvtai.sizes import array_sizes, check_size
 from uuvtai.tree import FlatTree, load_tree
 
@@ -131,9 +132,7 @@ class Sim:
 
     def set_scene(self, n_static: int, n_dynamic: int, speed_m_s: float) -> None:
         """S, D and v of every env's next scenario; S and D must fit the slots that were allocated."""
-        self.s.scene.n_static.fill(n_static)
-        self.s.scene.n_dynamic.fill(n_dynamic)
-        self.s.scene.speed_m_s.fill(speed_m_s)
+        set_scene(self.s.scene, self.config.world, n_static, n_dynamic, speed_m_s)
 
     def _fill_constants(self) -> None:
         world_cfg = self.config.world
@@ -161,7 +160,7 @@ class Sim:
         episode.begin_episodes(mask, seed, number, s.clock, s.episode)
         with self._stage("world"):
             world.generate_scenarios(s.world, s.path, s.mission, s.scratch, s.scene, s.fixed, s.episode, s.clock, c.world)
-            world.move_obstacles(s.world, s.path, s.clock, c.world, c.episode)
+            world.move_obstacles(s.world, s.path, s.clock, c.episode)
         dynamics.reset_vehicle(s.vehicle, s.params, s.current, s.mission, s.episode, s.clock, c.vehicle, c.disturbance, c.episode)
         actuation.reset_actuation(s.actuation, s.clock)
         proprioception.reset_proprioception(s.ego, s.ego_memory, s.vehicle, s.episode, s.clock, c.sensors)
@@ -183,9 +182,7 @@ class Sim:
     def _move(self) -> None:
         c, s = self.config, self.s
         with self._stage("dynamics"):
-            actuation.command_thrusters(
-                self.action, s.actuation, s.params, s.allocation, s.ego, s.clock, c.vehicle, c.actuation, c.disturbance, c.episode
-            )
+            actuation.command_thrusters(self.action, s.actuation, s.params, s.allocation, s.ego, s.clock, c.vehicle, c.actuation, c.episode)
             dynamics.move_vehicle(
                 s.vehicle,
                 s.actuation,
@@ -202,7 +199,7 @@ class Sim:
             )
         with self._stage("world"):
             episode.advance_clock(s.clock)
-            world.move_obstacles(s.world, s.path, s.clock, c.world, c.episode)
+            world.move_obstacles(s.world, s.path, s.clock, c.episode)
             episode.judge(s.referee, s.clock, s.vehicle, s.world, s.mission, c.vehicle, c.world.tank, c.episode)
 
     def _perceive(self) -> None:
@@ -218,7 +215,7 @@ class Sim:
             depth.cast_depth(s.image, s.ego, s.vehicle, s.world, s.episode, s.clock, c.sensors.depth, c.world.tank)
         with self._stage("tracking"):
             tracking.track_bodies(s.tracks, s.clusters, s.scan, s.clock, c.tracking, c.sensors.sonar, c.world.tank, c.episode)
-            tracking.forecast_tracks(s.forecast, s.tracks, s.scan, s.clock, c.tracking, c.episode)
+            tracking.forecast_tracks(s.forecast, s.tracks, s.clock, c.tracking, c.episode)
         with self._stage("mapping"):
             mapping.update_map(
                 s.grid_map, s.scan, s.image, s.tracks, s.mask, s.clock, c.mapping, c.sensors.sonar, c.sensors.depth, c.world.tank, c.episode
@@ -228,21 +225,42 @@ class Sim:
         with self._stage("clearance"):
             clearance.compute_clearance(s.clearance, s.grid_map, s.mask, s.clock, c.clearance, c.mapping, c.voronoi)
         with self._stage("features"):
-            features.sense_sectors(s.features, s.scan, s.clock, c.features, c.sensors.sonar)
+            features.sense_sectors(s.features, s.scan, s.ego, s.clock, c.features, c.sensors.sonar)
         with self._stage("planning"):
             self._plan()
         with self._stage("teacher"):
             self._teach()
 
     def _plan(self) -> None:
-        c, s = self.config, self.s
         raise NotImplementedError
 
     def _teach(self) -> None:
-        raise NotImplementedError
+        c, s = self.config, self.s
+        threats.assess_threats(
+            s.teacher, s.route, s.forecast, s.scan, s.clearance, s.ego, s.clock, c.teacher, c.tracking, c.world.tank, c.mapping, c.episode
+        )
+        evasion.plan_evasion(s.teacher, s.forecast, s.clearance, s.ego, s.clock, c.teacher, c.vehicle, c.tracking, c.world.tank, c.mapping)
+        teacher.tick_tree(
+            s.teacher, self.action, s.table, s.route, s.ego, s.mission, s.clock, c.teacher, c.vehicle, c.world.tank, c.episode
+        )
 
     def _reward(self) -> None:
-        raise NotImplementedError
+        c, s = self.config, self.s
+        with self._stage("reward"):
+            reward.compute_reward(
+                self.reward,
+                self.terminated,
+                self.truncated,
+                s.reward,
+                s.referee,
+                s.vehicle,
+                s.route,
+                s.actuation,
+                s.clock,
+                c.reward,
+                c.vehicle,
+                c.episode,
+            )
 
     # ------------------------------------------------------------------------------------------------------ observation
 

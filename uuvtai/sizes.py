@@ -9,32 +9,23 @@ from pathlib import Path
 from uuvtai import state
 from uuvtai.config import Config
 from uuvtai.kernels.grid import grid_shape
+from uuvtai.kernels.plan_codes import N_PLANNER, N_REASON, N_TRIGGER
 from uuvtai.kernels.reward import TERMS
-from uuvtai.kernels.route import N_PLANNER, N_REASON, N_TRIGGER
-from uuvtai.scenario import body_slots
+from uuvtai.scenario import scenario_sizes
 
 _MAX_ENVS = 1 << 20
-_N_CORNER = 5
-_COARSE_M = 0.2
-"""Cell of the grid on which a scenario is checked for a way from start to goal."""
 
 
 def array_sizes(config: Config, n_env: int) -> dict[str, int]:
     """Length of every named axis in ``state``."""
     tank, sensors = config.world.tank, config.sensors
     n_row, n_col = grid_shape(tank, config.mapping.cell_m)
-    slots = body_slots(config.world)
     return {
         "n_env": n_env,
         "n_thruster": len(config.vehicle.thrusters),
         "n_wrench": 6,
         "n_delay": 1 + round(config.disturbance.thruster_delay_s / config.episode.control_dt_s),
-        "n_body": slots.n_body,
-        "n_dynamic": slots.n_dynamic,
-        "n_fixed": max(1, len(config.world.fixed)),
-        "n_corner": _N_CORNER,
-        "n_coarse_row": round((tank.y_m[1] - tank.y_m[0]) / _COARSE_M),
-        "n_coarse_col": round((tank.x_m[1] - tank.x_m[0]) / _COARSE_M),
+        **scenario_sizes(config.world),
         "n_ray": sensors.sonar.n_ray,
         "n_latency": sensors.sonar.latency_steps // sensors.sonar.period_steps + 2,
         "n_cloud": 8,

@@ -48,7 +48,6 @@ def compare(request: Request, watch: Watch) -> tuple[dict[str, Any], Path]:
     Everything that can be refused is refused before anything is written. Raises ConfigError, ValueError, MemoryError, RunFolderError.
     """
     from uuvtai.measure.evaluate import document, jobs_of, run_episodes, summary, tree_use
-    from uuvtai.measure.recording import EpisodeRecorder
     from uuvtai.sim import Sim
     from uuvtai.tree import read_tree
 
@@ -67,7 +66,7 @@ def compare(request: Request, watch: Watch) -> tuple[dict[str, Any], Path]:
     try:
         for label, tree in trees.items():
             sim.use_tree(tree)
-            recorder = EpisodeRecorder(request, folder.path, label, jobs[: request.record]) if request.record else None
+            recorder = _recorder(request, folder.path, label, jobs)
             watch.start(label, len(jobs))
             begun = time.perf_counter()
             results, env_steps = run_episodes(sim, jobs, recorder, watch.update)
@@ -78,7 +77,9 @@ def compare(request: Request, watch: Watch) -> tuple[dict[str, Any], Path]:
                 logs.append(recorder.paths)
         result = document(request.config, request.world, request.sensors, request.seeds, request.episodes, methods)
         folder.write_json("eval/result.json", result)
-        folder.write_json("eval/tree.json", {"schema": 1, "controllers": {n: str(p) for n, p in _files(request).items()}, "use": use})
+        for label, tree in trees.items():
+            folder.write(f"eval/trees/{label}.xml", Path(tree.source).read_text())
+        folder.write_json("eval/tree.json", {"schema": 1, "use": use})
         _draw(request, folder.path, logs, watch)
         status, code = "finished", 0
     except KeyboardInterrupt:
@@ -90,12 +91,16 @@ def compare(request: Request, watch: Watch) -> tuple[dict[str, Any], Path]:
     return result, folder.path
 
 
+def _recorder(request: Request, folder: Path, label: str, jobs: list) -> Any:
+    from uuvtai.measure.recording import EpisodeRecorder
+
+    if not request.record:
+        return None
+    return EpisodeRecorder(folder / "logs", Path(request.world).stem, label, jobs[: request.record], request.depth_images)
+
+
 def _label(name: str) -> str:
     return Path(name).stem if name.endswith(".xml") else name
-
-
-def _files(request: Request) -> dict[str, str]:
-    return {_label(name): name for name in request.controllers}
 
 
 def _draw(request: Request, folder: Path, logs: list[dict[Any, Path]], watch: Watch) -> None:

@@ -11,10 +11,11 @@ import numpy as np
 import torch
 
 from uuvtai.config import Config
-from uuvtai.kernels.episode import OUTCOMES, RUNNING
-from uuvtai.kernels.route import PLANNERS, REASONS, TRIGGERS
+from uuvtai.kernels.outcome import OUTCOMES, RUNNING
+from uuvtai.kernels.plan_codes import PLANNERS, REASONS, TRIGGERS
 from uuvtai.measure.statistics import mean, rate, time_to_success_s, wilson_interval
 from uuvtai.sim import Sim
+from uuvtai.tree import node_use
 
 _REFILL_SHARE = 16
 """Ended rows wait until this part of the batch can be reset together, or until nothing runs: fewer reset passes, same results."""
@@ -203,18 +204,9 @@ def summary(name: str, results: list[EpisodeResult], env_steps: int, wall_s: flo
 
 
 def tree_use(sim: Sim, results: list[EpisodeResult]) -> list[dict[str, Any]]:
-    """Per node of the tree: in how many episodes it was ticked, its ticks, and the control steps in which it set the action."""
+    """Per node of the tree: the share of episodes that ticked it, its ticks, and the control steps in which it set the action."""
     ticks, acted = (np.stack([getattr(r, which) for r in results]).astype(np.int64) for which in ("ticks", "acted"))
-    return [
-        {
-            "node": name,
-            "episodes": int((ticks[:, i] > 0).sum()),
-            "share_of_episodes": float((ticks[:, i] > 0).mean()),
-            "ticks": int(ticks[:, i].sum()),
-            "acted": int(acted[:, i].sum()),
-        }
-        for i, name in enumerate(sim.tree.names)
-    ]
+    return [vars(use) for use in node_use(ticks, acted, len(sim.tree.names))]
 
 
 def document(config: Config, world: str, sensors: str, seeds: list[int], episodes: int, methods: list[dict[str, Any]]) -> dict[str, Any]:
@@ -224,7 +216,7 @@ def document(config: Config, world: str, sensors: str, seeds: list[int], episode
         "world": world,
         "S": config.world.n_static,
         "D": config.world.n_dynamic,
-        "v_m_s": config.world.dynamic_speed_m_s if config.world.n_dynamic else None,
+        "v_m_s": config.world.dynamic_speed_m_s,
         "sensors": sensors,
         "seeds": seeds,
         "episodes_per_seed": episodes,

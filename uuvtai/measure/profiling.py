@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from uuvtai.config import Config
-from uuvtai.kernels.episode import RUNNING
+from uuvtai.kernels.outcome import RUNNING
 from uuvtai.run_folder import hardware, versions
 from uuvtai.sim import STAGES, Sim
 from uuvtai.sizes import memory_bytes

@@ -1,0 +1,203 @@
+"""Record chosen episodes: read their rows from the simulator after every step and hand them to the log writer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from uuvtai.config import Config
+from uuvtai.kernels.grid import grid_origin
+from uuvtai.kernels.outcome import OUTCOMES, RUNNING
+from uuvtai.kernels.plan_codes import PLANNERS, REASONS, TRIGGERS
+from uuvtai.kernels.reward import TERMS
+from uuvtai.loader import to_yaml
+from uuvtai.logs.mcap_log import Due, McapEpisodeLog
+from uuvtai.logs.scenario import scenario_document
+from uuvtai.measure.evaluate import EpisodeResult, Job
+from uuvtai.run_folder import git_sha
+from uuvtai.scenario import describe_scenario
+from uuvtai.sim import Sim
+from uuvtai.snapshot import EpisodeHeader, EpisodeSnapshot, MapLayers
+from uuvtai.snapshot import EpisodeResult as LoggedResult
+
+_STEP_FIELDS = {
+    "clock": ("step",),
+    "referee": ("outcome", "clearance_m", "ttc_s"),
+    "vehicle": ("pos_w", "quat_wb", "vel_b", "rate_b", "rpm"),
+    "current": ("vel_w",),
+    "actuation": ("thrust_n",),
+    "world": ("kind", "pos_w", "vel_w", "size", "yaw"),
+    "ego": ("pos_w", "rpy", "vel_b", "vel_valid", "rate_b", "depth_m"),
+    "scan": ("fresh", "ping_step", "ping_vel_b", "range_m", "doppler_m_s", "intensity", "hit"),
+    "route": ("n_way", "way_w", "plan_step", "planner", "fallback_reason", "trigger", "lookahead_w", "path_risk"),
+    "tracks": ("alive", "moving", "state", "z_m", "radius_m", "beam_track"),
+    "teacher": ("status", "leaf", "action"),
+    "reward": ("term",),
+    "image": ("fresh",),
+}
+"""What a log needs of every step, by struct."""
+
+_MAP_FIELDS = {"grid_map": ("static_occ", "dynamic_occ"), "clearance": ("clearance_m",)}
+
+
+class EpisodeRecorder:
+    """Writes one MCAP file per recorded job; ``paths`` maps each to its file."""
+
+    def __init__(self, folder: Path, world: str, controller: str, jobs: list[Job], depth_images: bool = False) -> None:
+        self._world, self._controller, self._wanted, self._depth = world, controller, set(jobs), depth_images
+        self._logs: dict[int, McapEpisodeLog] = {}
+        self._applied: dict[int, np.ndarray] = {}
+        self.paths = {job: folder / f"{controller}_seed{job.seed}_episode{job.episode}.mcap" for job in jobs}
+
+    def begin(self, sim: Sim, row: int, job: Job) -> None:
+        """Open the log of an episode that was just reset, and write its first snapshot."""
+        if job not in self._wanted:
+            return
+        self._logs[row] = McapEpisodeLog(self.paths[job], self._header(sim, row, job), self._depth)
+        self._applied[row] = np.zeros(4, np.float32)
+        self._write(sim, [row])
+
+    def step(self, sim: Sim) -> None:
+        """Write a snapshot of every recorded row."""
+        if self._logs:
+            self._write(sim, sorted(self._logs))
+
+    def end(self, sim: Sim, row: int, result: EpisodeResult) -> None:
+        """Close the log with the episode's result."""
+        if row in self._logs:
+            self._logs.pop(row).close(
+                LoggedResult(
+                    outcome=result.outcome,
+                    episode_return=result.episode_return,
+                    time_s=result.time_s,
+                    min_clearance_m=result.min_clearance_m,
+                    replans=result.replans,
+                    planned_by=result.planned_by,
+                )
+            )
+
+    def abort(self) -> None:
+        """Leave the unfinished logs as they are (``.part``); ``uuv log repair`` reads them."""
+        for log in self._logs.values():
+            log.abandon()
+        self._logs.clear()
+
+    def _header(self, sim: Sim, row: int, job: Job) -> EpisodeHeader:
+        s, c = sim.s, sim.config
+        scenario = describe_scenario(lambda field: sim.rows(field, [row])[0], s.world, s.path, s.mission)
+        return EpisodeHeader(
+            controller=self._controller,
+            config_yaml=to_yaml(c),
+            scenario=scenario_document(c, scenario, self._world, job.seed, job.episode),
+            control_dt_s=c.episode.control_dt_s,
+            sonar_max_range_m=c.sensors.sonar.max_range_m,
+            camera_offset_b_m=c.sensors.depth.offset_b_m,
+            reward_terms=TERMS,
+            tree_nodes=sim.tree.names,
+            git_sha=git_sha() or "unknown",
+        )
+
+    def _write(self, sim: Sim, rows: list[int]) -> None:
+        read = _read(sim, _STEP_FIELDS, rows)
+        due = {row: self._due(row, {name: values[i] for name, values in read.items()}) for i, row in enumerate(rows)}
+        maps = _read_rows(sim, _MAP_FIELDS, [row for row in rows if due[row].maps])
+        images = _read_rows(sim, {"image": ("depth_m",)}, [row for row in rows if due[row].depth_image])
+        for i, row in enumerate(rows):
+            layers = _layers(sim.config, maps[row]) if row in maps else None
+            image = images[row]["image.depth_m"] if row in images else None
+            snapshot = _snapshot(sim, {name: values[i] for name, values in read.items()}, self._applied[row], layers, image)
+            self._logs[row].write(snapshot)
+            self._applied[row] = read["teacher.action"][i]
+
+    def _due(self, row: int, r: dict[str, Any]) -> Due:
+        due = self._logs[row].due(int(r["clock.step"]), _is_fresh(r), int(r["referee.outcome"]) != RUNNING)
+        return Due(due.maps, due.depth_image and bool(r["image.fresh"]))
+
+
+def _read(sim: Sim, fields: dict[str, tuple[str, ...]], rows: list[int]) -> dict[str, np.ndarray]:
+    return {f"{struct}.{name}": sim.rows(getattr(getattr(sim.s, struct), name), rows) for struct, names in fields.items() for name in names}
+
+
+def _read_rows(sim: Sim, fields: dict[str, tuple[str, ...]], rows: list[int]) -> dict[int, dict[str, np.ndarray]]:
+    read = _read(sim, fields, rows) if rows else {}
+    return {row: {name: values[i] for name, values in read.items()} for i, row in enumerate(rows)}
+
+
+def _is_fresh(r: dict[str, Any]) -> bool:
+    return bool(r["route.n_way"] > 0 and r["route.plan_step"] == r["clock.step"])
+
+
+def _layers(config: Config, maps: dict[str, np.ndarray]) -> MapLayers:
+    static, dynamic, clearance = maps["grid_map.static_occ"], maps["grid_map.dynamic_occ"], maps["clearance.clearance_m"]
+    c = config.clearance
+    return MapLayers(
+        origin_m=grid_origin(config.world.tank, config.mapping.cell_m),
+        cell_m=config.mapping.cell_m,
+        static=static,
+        dynamic=dynamic,
+        clearance_m=clearance,
+        risk=c.risk_static * static + c.risk_dynamic * dynamic + c.risk_clearance / (clearance + c.risk_epsilon_m),
+    )
+
+
+def _snapshot(sim: Sim, r: dict[str, Any], applied: np.ndarray, maps: MapLayers | None, image: np.ndarray | None) -> EpisodeSnapshot:
+    """``r`` maps 'struct.field' to this env's row."""
+    n_way, n_node = int(r["route.n_way"]), len(sim.tree.names)
+    moving = (r["tracks.alive"] == 1) & (r["tracks.moving"] == 1)
+    state = r["tracks.state"][moving]
+    explained = r["tracks.beam_track"]
+    reason = int(r["route.fallback_reason"])
+    return EpisodeSnapshot(
+        step=int(r["clock.step"]),
+        outcome=OUTCOMES[int(r["referee.outcome"])],
+        pos_w=r["vehicle.pos_w"],
+        quat_wb=r["vehicle.quat_wb"],
+        vel_b=r["vehicle.vel_b"],
+        rate_b=r["vehicle.rate_b"],
+        current_w=r["current.vel_w"],
+        rpm=r["vehicle.rpm"],
+        thrust_n=r["actuation.thrust_n"],
+        clearance_m=float(r["referee.clearance_m"]),
+        ttc_s=float(r["referee.ttc_s"]),
+        obstacle_kind=r["world.kind"],
+        obstacle_pos_w=r["world.pos_w"],
+        obstacle_vel_w=r["world.vel_w"],
+        obstacle_size=r["world.size"],
+        obstacle_yaw=r["world.yaw"],
+        estimate_pos_w=r["ego.pos_w"],
+        estimate_rpy=r["ego.rpy"],
+        measured_vel_b=r["ego.vel_b"],
+        measured_vel_valid=bool(r["ego.vel_valid"]),
+        measured_rate_b=r["ego.rate_b"],
+        depth_m=float(r["ego.depth_m"]),
+        sonar_fresh=bool(r["scan.fresh"]),
+        sonar_ping_step=int(r["scan.ping_step"]),
+        sonar_range_m=r["scan.range_m"],
+        sonar_doppler_m_s=r["scan.doppler_m_s"],
+        sonar_intensity=r["scan.intensity"],
+        sonar_hit=r["scan.hit"],
+        sonar_ping_vel_b=r["scan.ping_vel_b"],
+        action_applied=applied,
+        action_teacher=r["teacher.action"],
+        route_w=r["route.way_w"][:n_way],
+        route_fresh=_is_fresh(r),
+        route_planner=_code_name(PLANNERS, int(r["route.planner"])),
+        route_fallback=_code_name(REASONS, reason) if reason else "",
+        replan_trigger=_code_name(TRIGGERS, int(r["route.trigger"])),
+        lookahead_w=r["route.lookahead_w"],
+        path_risk=float(r["route.path_risk"]),
+        tracks=np.column_stack([state[:, :2], r["tracks.z_m"][moving], state[:, 2:], r["tracks.radius_m"][moving]]),
+        track_beams=np.flatnonzero((explained >= 0) & moving[np.maximum(explained, 0)]),
+        tree_status=r["teacher.status"][:n_node],
+        tree_leaf=int(r["teacher.leaf"]),
+        reward=r["reward.term"],
+        depth_image_m=image,
+        maps=maps,
+    )
+
+
+def _code_name(names: tuple[str, ...], code: int) -> str:
+    """Name of a code that counts from 1; 0 = none."""
+    return names[code - 1] if code > 0 else "none"

@@ -1,0 +1,58 @@
+"""``uuv tree``: a behaviour tree as text, DOT or JSON, with how it was used in an evaluation."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from uuvtai.loader import ConfigError
+from uuvtai.tree import FlatTree, NodeUse, read_tree, tree_dot, tree_text
+
+
+@dataclass(frozen=True)
+class TreeReport:
+    """The same tree three ways."""
+
+    text: str
+    dot: str
+    document: dict[str, Any]
+
+
+def tree_report(controller: str, run: Path | None) -> TreeReport:
+    """Report of a controller's tree; with a run folder, the use of its nodes there. Raises ConfigError."""
+    use = None
+    if run is not None:
+        record = _record(run)
+        if controller not in record["use"]:
+            raise ConfigError(f"{run}: has no controller {controller!r}; there are: {', '.join(record['use'])} (--controller NAME)")
+        tree = read_tree(str(run / "eval" / "trees" / f"{controller}.xml"))
+        use = [NodeUse(**node) for node in record["use"][controller]]
+        if len(use) != len(tree.names):
+            raise ConfigError(f"{run}: the tree {controller!r} has changed since that evaluation; run it again with 'uuv eval'")
+    else:
+        tree = read_tree(controller)
+    return TreeReport(tree_text(tree, use), tree_dot(tree, use), _document(controller, tree, use))
+
+
+def _record(run: Path) -> dict[str, Any]:
+    path = run / "eval" / "tree.json"
+    try:
+        return json.loads(path.read_text())
+    except OSError as error:
+        raise ConfigError(
+            f"{path}: cannot be read ({error.strerror}); give the run folder of an evaluation ('uuv eval' prints it)"
+        ) from None
+    except json.JSONDecodeError as error:
+        raise ConfigError(f"{path}: is not valid JSON ({error}); run the evaluation again with 'uuv eval'") from None
+
+
+def _document(controller: str, tree: FlatTree, use: list[NodeUse] | None) -> dict[str, Any]:
+    nodes = []
+    for i, name in enumerate(tree.names):
+        node: dict[str, Any] = {"id": i, "name": name, "type": tree.types[i], "parent": tree.parent[i]}
+        if use is not None:
+            node |= vars(use[i])
+        nodes.append(node)
+    return {"schema": 1, "controller": controller, "source": tree.source, "nodes": nodes}
