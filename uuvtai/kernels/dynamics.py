@@ -6,12 +6,14 @@ Origin at the centre of mass and diagonal added mass make the full mass matrix d
 filtered (that is unstable when M_A > M_RB). Each substep is one explicit midpoint step, second order in dt.
 """
 
+from typing import Any
+
 import taichi as ti
 
 from uuvtai.config import ActuationConfig, DisturbanceConfig, EpisodeConfig, VehicleConfig
 from uuvtai.kernels.geometry import quaternion_wb, roll_pitch_yaw, rotation_wb
 from uuvtai.kernels.noise import STREAM_CURRENT, STREAM_THRUSTER, STREAM_VEHICLE, normal, stream_key, uniform_in
-from uuvtai.kernels.rotor import rotor_after, thrust_of_rpm
+from uuvtai.kernels.rotor import lag_kept, thrust_of_rpm
 from uuvtai.kernels.signature import Const, In, Out, spread
 from uuvtai.state import (
     ActuationState,
@@ -114,8 +116,9 @@ def _move(
     current_w = current.vel_w[env]
     pos, q, v, w = vehicle.pos_w[env], vehicle.quat_wb[env], vehicle.vel_b[env], vehicle.rate_b[env]
     acc = 0.0 * v
+    kept = lag_kept(0.5 * dt, vehicle_cfg.rotor_tau_s)
     for _ in range(n_substep):
-        force, moment = _rotor_wrench(env, vehicle, actuation, params, allocation, vehicle_cfg, dt)
+        force, moment = _rotor_wrench(env, vehicle, actuation, params, allocation, vehicle_cfg, kept)
         dv, dw = acceleration(q, v, w, force, moment, current_w, body, vehicle_cfg, actuation_cfg)
         q_mid = turned(q, w, 0.5 * dt)
         v_mid, w_mid = v + 0.5 * dt * dv, w + 0.5 * dt * dw
@@ -139,18 +142,19 @@ def _rotor_wrench(
     params: In[VehicleParams],
     allocation: In[Allocation],
     cfg: Const[VehicleConfig],
-    dt,
+    kept,
 ):
-    """Force and moment of all thrusters at the middle of the substep, plus what acts from outside; the rotors move on by dt.
+    """Force and moment of all thrusters at the middle of the substep, plus what acts from outside; the rotors move on by a substep.
 
-    The middle value keeps the midpoint rule second order although the lag is as short as a substep.
+    ``kept`` is what the lag leaves of the distance to the command after half a substep. The middle value keeps the midpoint rule second
+    order although the lag is as short as a substep.
     """
     outside = actuation.external_wrench_b[env]
     force, moment = ti.Vector([outside[0], outside[1], outside[2]]), ti.Vector([outside[3], outside[4], outside[5]])
     for i in ti.static(range(vehicle.rpm.shape[1])):
         command = actuation.rpm_command[env, i]
-        middle = rotor_after(vehicle.rpm[env, i], command, 0.5 * dt, cfg.rotor_tau_s)
-        vehicle.rpm[env, i] = rotor_after(middle, command, 0.5 * dt, cfg.rotor_tau_s)
+        middle = command + kept * (vehicle.rpm[env, i] - command)
+        vehicle.rpm[env, i] = command + kept * (middle - command)
         thrust = params.thruster_gain[env, i] * thrust_of_rpm(middle, cfg)
         actuation.thrust_n[env, i] = thrust
         for axis in ti.static(range(3)):
@@ -178,12 +182,14 @@ def body_of(env, params: In[VehicleParams], cfg: Const[VehicleConfig]):
         weight=params.mass_kg[env] * cfg.gravity_m_s2,
         buoyancy=params.buoyancy_n[env],
         height=params.buoyancy_height_m[env],
+        per_mass_v=1.0 / (params.mass_kg[env] + ti.Vector([added[0], added[1], added[2]])),
+        per_mass_w=1.0 / (params.inertia[env] + ti.Vector([added[3], added[4], added[5]])),
     )
 
 
 @ti.func
 def acceleration(
-    q, v, w, force, moment, current_w, body: In[ti.Struct], vehicle_cfg: Const[VehicleConfig], actuation_cfg: Const[ActuationConfig]
+    q, v, w, force, moment, current_w, body: In[Any], vehicle_cfg: Const[VehicleConfig], actuation_cfg: Const[ActuationConfig]
 ):
     """(dv/dt, dw/dt) in body axes [m/s^2, rad/s^2]: Fossen's equation solved for the derivative of nu."""
     up = up_b(q)
@@ -197,7 +203,7 @@ def acceleration(
     tau_w -= (body.linear_w + body.quadratic_w * abs(w)) * w
     if ti.static(vehicle_cfg.attitude_hold == "ideal"):
         tau_w += hold_moment(up, w, actuation_cfg)
-    return tau_v / (body.mass + body.added_v), tau_w / (body.inertia + body.added_w)
+    return body.per_mass_v * tau_v, body.per_mass_w * tau_w
 
 
 @ti.func

@@ -31,9 +31,9 @@ def thrust_limits(cfg):
 
 
 @ti.func
-def rotor_after(rpm, command, dt_s, tau_s):
-    """Rotor speed [rpm] after dt of a first-order lag (exact for a constant command)."""
-    return command + (rpm - command) * ti.exp(-dt_s / tau_s)
+def lag_kept(dt_s, tau_s):
+    """Share of the distance to a constant command that a first-order lag still has to go after dt (exact)."""
+    return ti.exp(-dt_s / tau_s)
 
 
 @ti.func

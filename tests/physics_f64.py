@@ -1,0 +1,51 @@
+"""Run the plant in double precision (a process has one Taichi precision, the tests' is single) and print what it did as JSON.
+
+stdin: {"substeps": [..], "n_sample", "cases": [{"wrench", "current", "rpy_deg", "nu", "neutral"}, ..]}; the cases are the envs of one plant.
+stdout: {"<substeps>": {"position": [sample][case][3], "rpy_deg": .., "nu": ..}}, sampled every tenth control step.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import numpy as np
+
+from uuvtai.config import Config, VehicleConfig
+from uuvtai.measure.simulate import quaternion, roll_pitch_yaw
+from uuvtai.plant import Plant
+from uuvtai.runtime import start_taichi
+
+
+def main() -> None:
+    """One plant, all cases, every substep count."""
+    job = json.load(sys.stdin)
+    cases = job["cases"]
+    config = Config(vehicle=VehicleConfig(attitude_hold=job.get("attitude_hold", "none")))
+    plant = Plant(config, start_taichi(precision="f64"), n_env=len(cases))
+    out = {str(n): run(plant, cases, n, job["n_sample"]) for n in job["substeps"]}
+    json.dump(out, sys.stdout)
+
+
+def run(plant: Plant, cases: list[dict], substeps: int, n_sample: int) -> dict:
+    """Trajectories of all cases at one substep."""
+    plant.reset()
+    v = plant.vehicle
+    plant.write(plant.actuation.external_wrench_b, [c.get("wrench", [0] * 6) for c in cases])
+    plant.write(plant.current.vel_w, [c.get("current", [0] * 3) for c in cases])
+    plant.write(v.quat_wb, [quaternion(*np.radians(c.get("rpy_deg", [0] * 3))) for c in cases])
+    nu = np.array([c.get("nu", [0] * 6) for c in cases], dtype=float)
+    plant.write(v.vel_b, nu[:, :3])
+    plant.write(v.rate_b, nu[:, 3:])
+    buoyancy, weight = plant.params.buoyancy_n.to_numpy(), plant.params.mass_kg.to_numpy() * plant.config.vehicle.gravity_m_s2
+    plant.write(plant.params.buoyancy_n, np.where([c.get("neutral", False) for c in cases], weight, buoyancy))
+    samples = []
+    for _ in range(n_sample):
+        q = v.quat_wb.to_numpy()
+        samples.append((v.pos_w.to_numpy(), np.degrees([roll_pitch_yaw(x) for x in q]), np.c_[v.vel_b.to_numpy(), v.rate_b.to_numpy()]))
+        for _ in range(10):
+            plant.step(substeps=substeps, dt_s=0.02)
+    return {name: [s[i].tolist() for s in samples] for i, name in enumerate(("position", "rpy_deg", "nu"))}
+
+
+main()
