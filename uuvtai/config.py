@@ -436,6 +436,8 @@ class TrackingConfig(Section):
     moving_shift_m: NonNegative = 0.12
     """displacement (forgotten over shift_memory_s) that shows motion across the beams"""
     shift_memory_s: Positive = 2.0
+    shift_s: NonNegative = 0.5
+    """displacement counts from this age on"""
     doppler_memory_s: Positive = 0.5
     max_misses: PositiveCount = 8
     """in units of nominal 10 Hz scans"""

@@ -191,6 +191,10 @@ class WorldState:
     """[rad]"""
     draws: ti.Field = array("n_env", dtype=ti.i32)
     """how many layouts were drawn until start and goal were joined by free space"""
+    unclear_paths: ti.Field = array("n_env", dtype=ti.i32)
+    """paths of moving obstacles taken as they were: no draw kept clear of static obstacles"""
+    faults: ti.Field = array("n_env", dtype=ti.i32)
+    """0 = the scenario is as asked; else a bit set of scenario.FAULTS: draws ran out, the world cannot be placed"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,6 +207,8 @@ class PathState:
     """[m] waypoints; of a circle, way 0 is the centre"""
     radius_m: ti.Field = array("n_env", "n_dynamic")
     """[m] of a circle; positive = counter-clockwise, negative = clockwise"""
+    length_m: ti.Field = array("n_env", "n_dynamic")
+    """[m] once around the closed path"""
     phase_m: ti.Field = array("n_env", "n_dynamic")
     """[m] arc length along the closed path at t = 0"""
     speed_m_s: ti.Field = array("n_env", "n_dynamic")
@@ -388,6 +394,10 @@ class TrackState:
     """[m^2/s^2] variance of that mean"""
     shift_w: ti.Field = array("n_env", "n_track", vec=2)
     """[m] fading displacement since birth"""
+    sight_w: ti.Field = array("n_env", "n_track")
+    """[rad] bearing under which it was last seen"""
+    sweep: ti.Field = array("n_env", "n_track")
+    """[rad] fading change of that bearing since birth: how far the view of its faces has turned"""
     age: ti.Field = array("n_env", "n_track", dtype=ti.i32)
     """scans since birth"""
     misses: ti.Field = array("n_env", "n_track", dtype=ti.i32)
@@ -398,6 +408,10 @@ class TrackState:
     """episode step of the ping that the states refer to, -1 = no scan yet"""
     beam_track: ti.Field = array("n_env", "n_ray", dtype=ti.i32)
     """track that explains this beam of the newest tracked scan (ping_step = scan_step), -1 = none"""
+    pick: ti.Field = array("n_env", "n_track", dtype=ti.i32)
+    """scratch of one scan: cluster matched to this track, -1 = none"""
+    pick_cost: ti.Field = array("n_env", "n_track")
+    """scratch of one scan: cost of that match (-2 log likelihood)"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -688,6 +702,8 @@ class RewardState:
     """reward of the step"""
     episode_return: ti.Field = array("n_env")
     """sum of rewards over the episode"""
+    last_remaining_m: ti.Field = array("n_env")
+    """[m] route length that was still ahead in the last step, negative = unknown"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -695,7 +711,7 @@ class RefereeState:
     """How each episode stands, judged from the truth. Never an input of mapping, planning, teacher or policy."""
 
     outcome: ti.Field = array("n_env", dtype=ti.i32)
-    """episode.RUNNING, OUT_OF_TANK, COLLISION, TTC, SUCCESS or TIMEOUT"""
+    """episode.RUNNING, SUCCESS, COLLISION, TTC, OUT_OF_TANK or TIMEOUT"""
     clearance_m: ti.Field = array("n_env")
     """[m] hull to nearest obstacle or side wall, now"""
     ttc_s: ti.Field = array("n_env")
