@@ -1,0 +1,5 @@
+"""What can be wrong with a log file."""
+
+
+class LogError(RuntimeError):
+    """A log that cannot be written, read or drawn: the message says what, where, why and what to type next."""

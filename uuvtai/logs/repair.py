@@ -1,0 +1,104 @@
+"""Make a readable log of one whose writing was cut off or that was damaged later."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mcap.records import Attachment, Channel, Message, Metadata, Schema
+
+from uuvtai.logs.container import McapFile
+from uuvtai.logs.errors import LogError
+from uuvtai.logs.reader import DamageError, Scanner, opened
+
+
+@dataclass(frozen=True)
+class Repair:
+    """What was saved."""
+
+    path: Path
+    messages: int
+    last_time_s: float
+    complete: bool
+    """nothing was wrong with the file"""
+    damages: tuple[str, ...]
+    """what was wrong, with the byte"""
+
+
+def repair(path: Path, out: Path | None = None) -> Repair:
+    """Write every message that can still be read to ``out``, with indexes and summary; the input is never changed.
+
+    Default for ``out``: NAME.repaired.mcap. The new file says in its metadata ``uuv.repair`` what was found. Raises LogError, also where
+    ``out`` exists or nothing at all can be recovered.
+    """
+    path = Path(path)
+    out = path.with_name(path.name.removesuffix(".part").removesuffix(".mcap") + ".repaired.mcap") if out is None else Path(out)
+    with opened(path) as source:
+        if out.exists():
+            raise LogError(f"{out}: is already there; nothing was written. Give another name: uuv log repair {path} --out FILE")
+        try:
+            return _copied(path, Scanner(source), out)
+        except OSError as error:
+            raise LogError(f"{out}: cannot write the repaired log ({error.strerror}); choose another place with --out FILE") from error
+
+
+def _copied(path: Path, scanner: Scanner, out: Path) -> Repair:
+    damages: list[str] = []
+    copy = _Copy(McapFile(out, ".repairing"))  # not .part: that may be the input
+    try:
+        for record in _recovered(scanner, damages):
+            copy.add(record)
+        if not copy.messages:
+            reason = damages[0] if damages else "it holds no messages"
+            raise LogError(f"{path}: nothing can be recovered: {reason}; record the episode again with uuv eval --record")
+        if damages:
+            copy.file.add_metadata("uuv.repair", {"messages": str(copy.messages), "damages": json.dumps(damages)})
+        copy.file.finish()
+    except BaseException:
+        copy.file.discard()
+        raise
+    return Repair(out, copy.messages, copy.last_ns / 1e9, not damages, tuple(damages))
+
+
+def _recovered(scanner: Scanner, damages: list[str]) -> Iterator[Any]:
+    """Every record that can be read; what was wrong is added to ``damages``."""
+    going = True
+    while going:
+        going = False
+        try:
+            yield from scanner.records()
+        except DamageError as damage:
+            damages.append(f"{damage.reason} (byte {scanner.at})")
+            yield from damage.records
+            going = damage.can_go_on
+    if not scanner.finished and not damages:
+        damages.append(f"no end mark (byte {scanner.at})")
+
+
+class _Copy:
+    """Records on their way into a new file, where their ids may be others."""
+
+    def __init__(self, file: McapFile) -> None:
+        self.file = file
+        self.messages, self.last_ns = 0, 0
+        self._schemas: dict[int, int] = {0: 0}
+        self._channels: dict[int, int] = {}
+
+    def add(self, record: Any) -> None:
+        if isinstance(record, Metadata):
+            self.file.add_metadata(record.name, record.metadata)
+        elif isinstance(record, Attachment):
+            self.file.add_attachment(record.name, record.media_type, record.data)
+        elif isinstance(record, Schema) and record.id not in self._schemas:
+            self._schemas[record.id] = self.file.add_schema(record.name, record.encoding, record.data)
+        elif isinstance(record, Channel) and record.id not in self._channels:
+            schema = self._schemas.get(record.schema_id, 0)
+            self._channels[record.id] = self.file.add_channel(record.topic, schema, record.message_encoding, record.metadata)
+        elif isinstance(record, Message) and record.channel_id in self._channels:
+            channel = self._channels[record.channel_id]
+            self.file.add_message(channel, record.log_time, record.data, record.publish_time, record.sequence)
+            self.messages += 1
+            self.last_ns = max(self.last_ns, record.log_time)

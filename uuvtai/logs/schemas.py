@@ -1,0 +1,297 @@
+"""JSON schemas of every topic: the Foxglove messages that viewers know, and our own ``uuv.*``.
+
+The Foxglove messages follow https://docs.foxglove.dev/docs/sdk/schemas field by field, so that Foxglove, Lichtblick and PlotJuggler
+show them without a plug-in. Times are {sec, nsec} of simulation time; byte fields are base64.
+
+Our own keep to what those viewers' JSON schema parsers accept: below ``properties`` every field has one plain type and lists hold numbers,
+strings or objects. A field that may be null has no plain type, so it stands under ``patternProperties``, which validators honour and
+viewers skip: they still show it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+Schema = dict[str, Any]
+
+NUMBER: Schema = {"type": "number"}
+STRING: Schema = {"type": "string"}
+BOOLEAN: Schema = {"type": "boolean"}
+BASE64: Schema = {"type": "string", "contentEncoding": "base64"}
+UINT: Schema = {"type": "integer", "minimum": 0}
+_NSEC: Schema = {"type": "integer", "minimum": 0, "maximum": 999_999_999}
+
+
+def record(title: str, description: str = "", nullable: Mapping[str, Schema] | None = None, /, **properties: Schema) -> Schema:
+    """Schema of an object that has all these properties, and perhaps more; those in ``nullable`` may be null."""
+    schema: Schema = {"title": title, "type": "object", "properties": properties, "required": [*properties, *(nullable or {})]}
+    if nullable:
+        schema["patternProperties"] = {f"^{name}$": {"anyOf": [inner, {"type": "null"}]} for name, inner in nullable.items()}
+    return {**schema, "description": description} if description else schema
+
+
+def array_of(items: Schema, length: int | None = None) -> Schema:
+    """Schema of a list, of fixed length where one is given."""
+    return {"type": "array", "items": items} | ({} if length is None else {"minItems": length, "maxItems": length})
+
+
+def described(schema: Schema, text: str) -> Schema:
+    """The same with a description."""
+    return {**schema, "description": text}
+
+
+def _choice(title: str, **names: int) -> Schema:
+    return {"title": title, "oneOf": [{"title": name, "const": value} for name, value in names.items()]}
+
+
+# -------------------------------------------------------------------------------------------------------------- Foxglove
+
+TIME: Schema = {"type": "object", "title": "time", "properties": {"sec": UINT, "nsec": _NSEC}}
+DURATION: Schema = {"type": "object", "title": "duration", "properties": {"sec": {"type": "integer"}, "nsec": _NSEC}}
+VECTOR2 = record("foxglove.Vector2", x=NUMBER, y=NUMBER)
+VECTOR3 = record("foxglove.Vector3", x=NUMBER, y=NUMBER, z=NUMBER)
+POINT3 = record("foxglove.Point3", x=NUMBER, y=NUMBER, z=NUMBER)
+QUATERNION = record("foxglove.Quaternion", x=NUMBER, y=NUMBER, z=NUMBER, w=NUMBER)
+COLOR = record("foxglove.Color", r=NUMBER, g=NUMBER, b=NUMBER, a=NUMBER)
+POSE = record("foxglove.Pose", position=VECTOR3, orientation=QUATERNION)
+
+FRAME_TRANSFORM = record(
+    "foxglove.FrameTransform",
+    timestamp=TIME,
+    parent_frame_id=STRING,
+    child_frame_id=STRING,
+    translation=VECTOR3,
+    rotation=QUATERNION,
+)
+FRAME_TRANSFORMS = record("foxglove.FrameTransforms", transforms=array_of(FRAME_TRANSFORM))
+POSE_IN_FRAME = record("foxglove.PoseInFrame", timestamp=TIME, frame_id=STRING, pose=POSE)
+
+LASER_SCAN = record(
+    "foxglove.LaserScan",
+    timestamp=described(TIME, "when the ping was taken; the message is logged when it is delivered"),
+    frame_id=STRING,
+    pose=POSE,
+    start_angle=described(NUMBER, "[rad] bearing of the first beam, counter-clockwise from ahead"),
+    end_angle=described(NUMBER, "[rad] bearing of the last beam"),
+    ranges=described(array_of(NUMBER), "[m] as sensed; no return = maximum range"),
+    intensities=described(array_of(NUMBER), "[0, 1]; 0 = no return"),
+)
+
+COMPRESSED_IMAGE = record(
+    "foxglove.CompressedImage",
+    timestamp=TIME,
+    frame_id=STRING,
+    data=described(BASE64, "16-bit PNG of the z-depth [mm]; maximum range = no return"),
+    format=STRING,
+)
+
+UINT8, FLOAT32 = 1, 7
+"""numeric types of packed fields"""
+PACKED_FIELD = record(
+    "foxglove.PackedElementField",
+    name=STRING,
+    offset=UINT,
+    type=_choice("foxglove.NumericType", UNKNOWN=0, UINT8=1, INT8=2, UINT16=3, INT16=4, UINT32=5, INT32=6, FLOAT32=7, FLOAT64=8),
+)
+GRID = record(
+    "foxglove.Grid",
+    timestamp=TIME,
+    frame_id=STRING,
+    pose=described(POSE, "outer corner of cell (0, 0)"),
+    column_count=UINT,
+    cell_size=VECTOR2,
+    row_stride=UINT,
+    cell_stride=UINT,
+    fields=array_of(PACKED_FIELD),
+    data=described(BASE64, "rows along y, cells of a row along x"),
+)
+
+DEBUG, INFO, WARNING, ERROR = 1, 2, 3, 4
+"""levels of foxglove.Log"""
+LOG = record(
+    "foxglove.Log",
+    timestamp=TIME,
+    level=_choice("foxglove.LogLevel", UNKNOWN=0, DEBUG=1, INFO=2, WARNING=3, ERROR=4, FATAL=5),
+    message=STRING,
+    name=STRING,
+    file=STRING,
+    line=UINT,
+)
+
+LINE_STRIP, LINE_LOOP = 0, 1
+"""types of foxglove.LinePrimitive"""
+_LINE = record(
+    "foxglove.LinePrimitive",
+    type=_choice("foxglove.LineType", LINE_STRIP=0, LINE_LOOP=1, LINE_LIST=2),
+    pose=POSE,
+    thickness=NUMBER,
+    scale_invariant=BOOLEAN,
+    points=array_of(POINT3),
+    color=COLOR,
+    colors=array_of(COLOR),
+    indices=array_of(UINT),
+)
+_ARROW = record(
+    "foxglove.ArrowPrimitive",
+    pose=POSE,
+    shaft_length=NUMBER,
+    shaft_diameter=NUMBER,
+    head_length=NUMBER,
+    head_diameter=NUMBER,
+    color=COLOR,
+)
+_CUBE = record("foxglove.CubePrimitive", pose=POSE, size=VECTOR3, color=COLOR)
+_SPHERE = record("foxglove.SpherePrimitive", pose=POSE, size=VECTOR3, color=COLOR)
+_CYLINDER = record("foxglove.CylinderPrimitive", pose=POSE, size=VECTOR3, bottom_scale=NUMBER, top_scale=NUMBER, color=COLOR)
+_TRIANGLES = record(
+    "foxglove.TriangleListPrimitive",
+    pose=POSE,
+    points=array_of(POINT3),
+    color=COLOR,
+    colors=array_of(COLOR),
+    indices=array_of(UINT),
+)
+_TEXT = record(
+    "foxglove.TextPrimitive",
+    pose=POSE,
+    billboard=BOOLEAN,
+    font_size=NUMBER,
+    scale_invariant=BOOLEAN,
+    color=COLOR,
+    text=STRING,
+)
+_MODEL = record(
+    "foxglove.ModelPrimitive",
+    pose=POSE,
+    scale=VECTOR3,
+    color=COLOR,
+    override_color=BOOLEAN,
+    url=STRING,
+    media_type=STRING,
+    data=BASE64,
+)
+SCENE_ENTITY = record(
+    "foxglove.SceneEntity",
+    timestamp=TIME,
+    frame_id=STRING,
+    id=STRING,
+    lifetime=DURATION,
+    frame_locked=BOOLEAN,
+    metadata=array_of(record("foxglove.KeyValuePair", key=STRING, value=STRING)),
+    arrows=array_of(_ARROW),
+    cubes=array_of(_CUBE),
+    spheres=array_of(_SPHERE),
+    cylinders=array_of(_CYLINDER),
+    lines=array_of(_LINE),
+    triangles=array_of(_TRIANGLES),
+    texts=array_of(_TEXT),
+    models=array_of(_MODEL),
+)
+SCENE_UPDATE = record(
+    "foxglove.SceneUpdate",
+    deletions=array_of(
+        record(
+            "foxglove.SceneEntityDeletion",
+            timestamp=TIME,
+            type=_choice("foxglove.SceneEntityDeletionType", MATCHING_ID=0, ALL=1),
+            id=STRING,
+        )
+    ),
+    entities=array_of(SCENE_ENTITY),
+)
+
+# ------------------------------------------------------------------------------------------------------------------- ours
+
+_THREE = array_of(NUMBER, 3)
+_FOUR = array_of(NUMBER, 4)
+
+SONAR_DOPPLER = record(
+    "uuv.SonarDoppler",
+    timestamp=described(TIME, "when the ping was taken"),
+    velocity=described(array_of(NUMBER), "[m/s] rate of change of each beam's range, own motion included; 0 where nothing returned"),
+    own_velocity=described(_THREE, "[m/s] own velocity in the body frame as measured when the ping was taken"),
+)
+PLAN = record(
+    "uuv.Plan",
+    points=described(array_of(POINT3), "[m] waypoints in the world frame"),
+    planner=described(STRING, "who planned: voronoi or rrt; none = both failed"),
+    trigger=described(STRING, "why: initial, stuck, safety or intersection"),
+    fallback=described(STRING, "why the Voronoi planner failed, empty = it did not"),
+)
+_OBSTACLE: Schema = {
+    "title": "uuv.Obstacle",
+    "type": "object",
+    "properties": {
+        "kind": {"type": "string", "enum": ["sphere", "cylinder", "box"]},
+        "x": NUMBER,
+        "y": NUMBER,
+        "z": described(NUMBER, "[m] centre"),
+        "radius": described(NUMBER, "[m] of a sphere or a vertical cylinder"),
+        "half_height": described(NUMBER, "[m] of a cylinder"),
+        "half_extents": described(_THREE, "[m] of a box, before it is turned by yaw"),
+        "yaw": described(NUMBER, "[rad]"),
+        "vx": NUMBER,
+        "vy": NUMBER,
+        "vz": described(NUMBER, "[m/s]"),
+    },
+    "required": ["kind", "x", "y", "z", "yaw", "vx", "vy", "vz"],
+    "oneOf": [{"required": ["radius"]}, {"required": ["half_extents"]}],
+}
+OBSTACLES = record("uuv.Obstacles", "Truth. In the order of scenario.json.", obstacles=array_of(_OBSTACLE))
+TRACKS = record(
+    "uuv.Tracks",
+    "Moving bodies that the vehicle believes in.",
+    tracks=array_of(record("uuv.Track", x=NUMBER, y=NUMBER, z=NUMBER, vx=NUMBER, vy=NUMBER, radius=NUMBER)),
+    beams=described(array_of(UINT), "beams of the newest scan that a moving body explains"),
+)
+STATE = record(
+    "uuv.State",
+    "Truth, and under `measured` what the instruments say.",
+    position=described(_THREE, "[m] world"),
+    orientation=described(_FOUR, "unit quaternion w, x, y, z, body to world"),
+    velocity=described(_THREE, "[m/s] over ground, body frame"),
+    rates=described(_THREE, "[rad/s] body frame"),
+    current=described(_THREE, "[m/s] of the water, world frame"),
+    rpm=described(array_of(NUMBER), "of each thruster"),
+    measured=record(
+        "uuv.Measured",
+        velocity=described(_THREE, "[m/s] DVL, body frame; the last reading where invalid"),
+        velocity_valid=BOOLEAN,
+        rates=described(_THREE, "[rad/s] gyro"),
+        depth_m=described(NUMBER, "pressure depth, positive down"),
+    ),
+)
+ACTION = record(
+    "uuv.Action",
+    "Surge, sway, heave and yaw rate, each in [-1, 1].",
+    {"policy": _FOUR, "teacher": _FOUR},
+    applied=described(_FOUR, "what drove the step that led here"),
+    thrust=described(array_of(NUMBER), "[N] of each thruster"),
+    leaf=described(STRING, "node of the tree that sets the teacher's action"),
+)
+SAFETY = record(
+    "uuv.Safety",
+    "As the referee judges it, from the truth; path_risk and replan_trigger are the vehicle's own.",
+    {"ttc_s": described(NUMBER, "null = nothing closes in")},
+    clearance_m=described(NUMBER, "hull to the nearest obstacle or wall"),
+    path_risk=NUMBER,
+    replan_trigger=described(STRING, "none, initial, stuck, safety or intersection"),
+)
+
+
+def policy_schema(reward_terms: Sequence[str]) -> Schema:
+    """Schema of /policy: value and spread of the policy, every reward term under its own name."""
+    return record(
+        "uuv.Policy",
+        "Null where there is no policy or world model. Reward terms are weighted; `reward` is their sum.",
+        {"value": NUMBER, "std": _FOUR, "lambda": NUMBER, "wm_residual": NUMBER, "wm_uncertainty": NUMBER},
+        reward=NUMBER,
+        **dict.fromkeys(reward_terms, NUMBER),
+    )
+
+
+def tree_schema(nodes: Sequence[str], statuses: Sequence[str]) -> Schema:
+    """Schema of /tree: the status of every node of the behaviour tree by its name."""
+    status: Schema = {"type": "string", "enum": list(statuses)}
+    return record("uuv.Tree", "The behaviour tree's tick.", **dict.fromkeys(nodes, status))
