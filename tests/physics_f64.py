@@ -1,6 +1,6 @@
 """Run the plant in double precision (a process has one Taichi precision, the tests' is single) and print what it did as JSON.
 
-stdin: {"substeps": [..], "n_sample", "cases": [{"wrench", "current", "rpy_deg", "nu", "neutral"}, ..]}; the cases are the envs of one plant.
+stdin: {"substeps": [..], "n_sample", "cases": [{"wrench", "current", "rpy_deg", "nu", "neutral"}, ..]}; cases are the envs of a plant.
 stdout: {"<substeps>": {"position": [sample][case][3], "rpy_deg": .., "nu": ..}}, sampled every tenth control step.
 """
 
