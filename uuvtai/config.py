@@ -280,13 +280,16 @@ class ActuationConfig(Section):
     """[N s/m]"""
     velocity_integral: tuple[NonNegative, NonNegative, NonNegative] = (40.0, 40.0, 40.0)
     """[N/m]"""
-    integral_error_m_s: Positive = 0.1
-    """larger errors integrate as this: a step command must not overshoot by what piles up on its way"""
+    integral_band_m_s: Positive = 0.3
+    """errors beyond this do not build up the integral: they are a step under way or a blocked vehicle, and both would overshoot later"""
     yaw_rate_gain: NonNegative = 4.0
     """[N m s]"""
     yaw_rate_integral: NonNegative = 4.0
     """[N m]"""
-    integral_error_rad_s: Positive = 0.1
+    integral_band_rad_s: Positive = 0.5
+    max_integral_n: NonNegative = 40.0
+    """what a current, lost gain or wrong parameters may take"""
+    max_integral_n_m: NonNegative = 4.0
     max_force_n: tuple[Positive, Positive, Positive] = (90.0, 90.0, 80.0)
     """covers the drag at full speed of every published BlueROV2 parameter set (59, 78 and 44 N)"""
     max_moment_n_m: Positive = 8.0
@@ -425,11 +428,11 @@ class TrackingConfig(Section):
     """trust in the own measured velocity, which the Doppler of the known walls corrects"""
     birth_speed_sigma_m_s: Positive = 1.0
     """across the bearing, where the first Doppler says nothing"""
-    accel_density: NonNegative = 0.02
+    accel_density: NonNegative = 0.03
     """[m^2/s^3] spectral density of a body's acceleration"""
     gate_m: Positive = 0.3
     """a cluster this close to a prediction (plus one scan of its speed) may always match, however sure the filter is"""
-    turn_gate: Positive = 16.0
+    turn_gate: Positive = 20.0
     """squared normalised innovation (3 values) beyond which a body is taken to have turned"""
     moving_speed_m_s: NonNegative = 0.08
     moving_doppler_m_s: NonNegative = 0.03
@@ -456,6 +459,9 @@ class MappingConfig(Section):
     """Two-layer occupancy map. Gains are per scan at 10 Hz; at another scan rate they are scaled so that gain per second is kept."""
 
     cell_m: Positive = 0.1
+    period_steps: PositiveCount = 5
+    """control steps between mapped scans, at least; scans in between are left out (10 Hz, for which the gains were chosen; the clearance and
+    so the route follow at that rate anyway, and reaction to what moves uses scans and tracks)"""
     static_hit: Fraction = 0.15
     """eta_occ"""
     static_free: Fraction = 0.08
@@ -511,7 +517,7 @@ class VoronoiConfig(Section):
     cost_epsilon_m: Positive = 0.1
     """eps_r"""
     max_pops: PositiveCount = 20000
-    """budget of the search"""
+    """budget of each pass of the search"""
     use: Literal["static", "fused"] = "static"
     """which occupancy the route must avoid"""
     avoid_forecast: bool = False

@@ -241,6 +241,8 @@ class ScenarioScratch:
 
     reach: ti.Field = array("n_env", "n_coarse_row", "n_coarse_col", dtype=ti.u8)
     """0 = free, 1 = blocked, 2 = reached from the start"""
+    footprint: ti.Field = array("n_env", "n_body", vec=7)
+    """plan view of the bodies at rest (footprint.py)"""
 
 
 # ------------------------------------------------------------------------------------------------------------------- mission
@@ -480,16 +482,16 @@ class MapState:
     """[0, 1] persistent layer M^s"""
     dynamic_occ: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.f32)
     """[0, 1] layer M^d of what moves"""
-    free_mark: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.u8)
-    """scratch of one scan: 1 = a beam passed through (a plane of its own, so that any thread may write it in any order)"""
     evidence: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.u8)
     """scratch until the next scan is merged: bits STATIC_HIT, DYNAMIC_HIT, DEPTH_HIT (mapping.py)"""
     seen_step: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.i16)
-    """episode step at which the cell was last observed, -1 = never"""
+    """episode step at which the cell was last observed, -1 = never (while a scan is merged: its step = a beam passed through)"""
     free_scans: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.u8)
     """scans in a row that saw it free (saturating): how confidently it is free"""
     dynamic_scans: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.u8)
     """scans in a row with dynamic evidence (saturating): promotion to static"""
+    map_step: ti.Field = array("n_env", dtype=ti.i32)
+    """episode step of the newest scan in the map; far below 0 = none yet"""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,67 @@
+"""A small NumPy sonar for scenes of the tracking tests: horizontal plane only, circles, yawed boxes and the walls of a rectangular tank.
+
+Written apart from the product's sonar. All arrays lead with the env: positions (E, 2), bodies (E, B, ...). Radius 0 = box.
+"""
+
+import numpy as np
+
+N_RAY = 256
+MAX_RANGE_M = 12.0
+
+
+def cast(pos, yaw, vel_w, centre, body_vel, radius, half, body_yaw, tank):
+    """Ranges, Doppler (receding positive, own motion included), hit flags and index of the body hit (-1 = wall or nothing), each (E, 256)."""
+    bearing = yaw[:, None] + np.arange(N_RAY) * (2 * np.pi / N_RAY)
+    u = np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
+    to_body = np.stack([_circle(pos, u, centre, radius), _box(pos, u, centre, half, body_yaw)])
+    to_body = np.where(radius[:, None, :] > 0, to_body[0], to_body[1])
+    nearest = to_body.argmin(axis=-1)
+    to_nearest = np.take_along_axis(to_body, nearest[..., None], -1)[..., 0]
+    to_wall = _walls(pos, u, tank)
+    body = np.where(to_nearest < to_wall, nearest, -1)
+    reach = np.minimum(to_nearest, to_wall)
+    surface_vel = np.where((body >= 0)[..., None], np.take_along_axis(body_vel, nearest[..., None], 1), 0.0)
+    doppler = ((surface_vel - vel_w[:, None, :]) * u).sum(-1)
+    hit = reach < MAX_RANGE_M
+    return np.where(hit, reach, MAX_RANGE_M), np.where(hit, doppler, 0.0), hit.astype(np.int32), np.where(hit, body, -1)
+
+
+def noisy(range_m, doppler, hit, rng, sonar):
+    """The errors of a SonarConfig that matter to tracking: range, Doppler with outliers, missed and false returns."""
+    sigma = sonar.range_sigma_m + sonar.range_sigma_slope * range_m
+    told = range_m + sigma * rng.standard_normal(range_m.shape) + rng.exponential(sonar.range_jitter_m, range_m.shape)
+    rate = doppler + sonar.doppler_sigma_m_s * rng.standard_normal(range_m.shape)
+    wild = rng.uniform(size=range_m.shape) < sonar.doppler_outlier
+    rate = np.where(wild, rng.uniform(-sonar.doppler_outlier_m_s, sonar.doppler_outlier_m_s, range_m.shape), rate)
+    seen = hit * (rng.uniform(size=range_m.shape) >= sonar.missed_return)
+    false = rng.uniform(size=range_m.shape) < sonar.false_return
+    told = np.where(false, rng.uniform(0, MAX_RANGE_M, range_m.shape), told)
+    seen = np.where(false, 1, seen) * (told < MAX_RANGE_M)
+    return np.where(seen, np.maximum(told, 0), MAX_RANGE_M), np.where(seen, rate, 0.0), seen.astype(np.int32)
+
+
+def _circle(pos, u, centre, radius):
+    d = centre - pos[:, None, :]
+    along = np.einsum("erk,ebk->erb", u, d)
+    gap = (d**2).sum(-1)[:, None, :] - along**2
+    chord = radius[:, None, :] ** 2 - gap
+    out = along - np.sqrt(np.maximum(chord, 0))
+    return np.where((chord > 0) & (out > 0), out, np.inf)
+
+
+def _box(pos, u, centre, half, body_yaw):
+    c, s = np.cos(body_yaw), np.sin(body_yaw)
+    axes = np.stack([np.stack([c, s], -1), np.stack([-s, c], -1)], -2)
+    origin = np.einsum("ebkl,ebl->ebk", axes, pos[:, None, :] - centre)[:, None]
+    way = np.einsum("ebkl,erl->erbk", axes, u)
+    way = np.where(np.abs(way) < 1e-12, 1e-12, way)
+    a, b = (-half[:, None] - origin) / way, (half[:, None] - origin) / way
+    enter, leave = np.minimum(a, b).max(-1), np.maximum(a, b).min(-1)
+    return np.where((enter < leave) & (enter > 0), enter, np.inf)
+
+
+def _walls(pos, u, tank):
+    low, high = np.array([tank.x_m[0], tank.y_m[0]]), np.array([tank.x_m[1], tank.y_m[1]])
+    edge = np.where(u > 0, high, low)
+    safe = np.where(np.abs(u) < 1e-12, 1e-12, u)
+    return ((edge - pos[:, None, :]) / safe).min(-1)
