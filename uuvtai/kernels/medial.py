@@ -16,7 +16,9 @@ from uuvtai.state import ClearanceState, VoronoiState
 KNOWN = 1
 SKELETON = 2
 REACHED = 4
-_NEXT_SHIFT = 3
+JOINED = 8
+"""off the skeleton, but on a way from the start or the goal to it"""
+_NEXT_SHIFT = 4
 
 FOUND = 1
 NOT_FOUND = 0
@@ -45,11 +47,6 @@ def bits_at(voronoi: In[VoronoiState], slot, row, col):
 def next_direction(voronoi: In[VoronoiState], slot, row, col):
     """Direction of the next cell towards the goal."""
     return bits_at(voronoi, slot, row, col) >> _NEXT_SHIFT
-
-
-@ti.func
-def put_on_skeleton(voronoi: Out[VoronoiState], slot, row, col):
-    voronoi.cell[slot, row, col] = ti.cast(bits_at(voronoi, slot, row, col) | KNOWN | SKELETON, ti.u8)
 
 
 @ti.func
@@ -99,7 +96,7 @@ def _step_is_open(voronoi: In[VoronoiState], slot, row, col, step):
 
 
 @ti.func
-def climb_to_skeleton(
+def join_skeleton(
     voronoi: Out[VoronoiState],
     clearance: In[ClearanceState],
     slot,
@@ -109,25 +106,35 @@ def climb_to_skeleton(
     cfg: Const[VoronoiConfig],
     clearance_cfg: Const[ClearanceConfig],
 ):
-    """Join a cell to the skeleton by walking uphill in clearance; every cell on the way becomes part of it."""
-    row, col = row0, col0
-    climbing = not on_skeleton(voronoi, clearance, slot, env, row, col, cfg, clearance_cfg)
-    put_on_skeleton(voronoi, slot, row, col)
-    while climbing:
-        best, best_m = -1, clearance.clearance_m[env, row, col]
-        for k in range(8):
-            step = step_of(k)
-            higher = clearance.clearance_m[env, row + step[0], col + step[1]]
-            if higher > best_m and _step_is_open(voronoi, slot, row, col, step):
-                best, best_m = k, higher
-        if best < 0:
-            climbing = False
-        else:
-            chosen = step_of(best)
-            row += chosen[0]
-            col += chosen[1]
-            climbing = not on_skeleton(voronoi, clearance, slot, env, row, col, cfg, clearance_cfg)
-            put_on_skeleton(voronoi, slot, row, col)
+    """Join a cell to the skeleton: one way uphill in clearance, and eight straight ways, so that the search may choose which side to leave."""
+    for way in range(9):
+        row, col = row0, col0
+        walking = True
+        while walking:
+            voronoi.cell[slot, row, col] = ti.cast(bits_at(voronoi, slot, row, col) | JOINED, ti.u8)
+            direction = way
+            if way == 8:
+                direction = _uphill(voronoi, clearance, slot, env, row, col)
+            walking = direction >= 0
+            if walking:
+                step = step_of(direction)
+                walking = _step_is_open(voronoi, slot, row, col, step)
+                row += step[0]
+                col += step[1]
+                if walking:
+                    walking = not on_skeleton(voronoi, clearance, slot, env, row, col, cfg, clearance_cfg)
+
+
+@ti.func
+def _uphill(voronoi: In[VoronoiState], clearance: In[ClearanceState], slot, env, row, col):
+    """Direction of the open neighbour with the largest clearance, -1 on a summit."""
+    best, best_m = -1, clearance.clearance_m[env, row, col]
+    for k in range(8):
+        step = step_of(k)
+        higher = clearance.clearance_m[env, row + step[0], col + step[1]]
+        if higher > best_m and _step_is_open(voronoi, slot, row, col, step):
+            best, best_m = k, higher
+    return best
 
 
 @ti.func
@@ -157,7 +164,7 @@ def search_cells(
     """
     n_col = ti.static(voronoi.cost.shape[2])
     floor_weight = ti.static(_TIE / max(clearance_cfg.max_m, cfg.cost_epsilon_m))
-    size, status = 0, NOT_FOUND
+    size, status, budget = 0, NOT_FOUND, voronoi.pops[env] + ti.static(cfg.max_pops)
     if voronoi.weight[slot, goal[0], goal[1]] > 0:
         voronoi.cost[slot, goal[0], goal[1]] = 0.0
         voronoi.cell[slot, goal[0], goal[1]] = ti.cast(bits_at(voronoi, slot, goal[0], goal[1]) | REACHED, ti.u8)
@@ -170,7 +177,7 @@ def search_cells(
         voronoi.pops[env] += 1
         if row == start[0] and col == start[1]:
             status = FOUND
-        elif voronoi.pops[env] > ti.static(cfg.max_pops) or size + 8 > ti.static(voronoi.heap_cell.shape[1]):
+        elif voronoi.pops[env] > budget or size + 8 > ti.static(voronoi.heap_cell.shape[1]):
             status = OUT_OF_BUDGET
         elif key <= _estimate(voronoi.cost[slot, row, col], row, col, start[0], start[1], floor_weight):
             size = _size_after_expansion(
@@ -204,11 +211,12 @@ def _size_after_expansion(
         length = ti.select(step[0] != 0 and step[1] != 0, 1.41421356, 1.0)
         offer = ti.cast(here + 0.5 * length * (weight + voronoi.weight[slot, to_row, to_col]), ti.f32)
         if _step_is_open(voronoi, slot, row, col, step):
-            if everywhere > 0 or on_skeleton(voronoi, clearance, slot, env, to_row, to_col, cfg, clearance_cfg):
-                bits = bits_at(voronoi, slot, to_row, to_col)
+            medial = on_skeleton(voronoi, clearance, slot, env, to_row, to_col, cfg, clearance_cfg)
+            bits = bits_at(voronoi, slot, to_row, to_col)
+            if everywhere > 0 or medial or bits & JOINED != 0:
                 if bits & REACHED == 0 or offer < voronoi.cost[slot, to_row, to_col]:
                     voronoi.cost[slot, to_row, to_col] = offer
-                    kept = bits & (KNOWN | SKELETON)
+                    kept = bits & (KNOWN | SKELETON | JOINED)
                     voronoi.cell[slot, to_row, to_col] = ti.cast(kept | REACHED | ((7 - k) << _NEXT_SHIFT), ti.u8)
                     key = _estimate(offer, to_row, to_col, start[0], start[1], floor_weight)
                     new_size = heap_after_push(voronoi, slot, new_size, to_row * n_col + to_col, key)

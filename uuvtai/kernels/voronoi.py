@@ -10,7 +10,7 @@ import taichi as ti
 from uuvtai.config import ClearanceConfig, MappingConfig, RouteConfig, TankConfig, VoronoiConfig
 from uuvtai.kernels.chord import count_of_waypoints, path_cells, straightened_cost
 from uuvtai.kernels.grid import centre_of, grid_origin
-from uuvtai.kernels.medial import FOUND, NOT_FOUND, climb_to_skeleton, search_cells
+from uuvtai.kernels.medial import FOUND, NOT_FOUND, join_skeleton, search_cells
 from uuvtai.kernels.plan_codes import (
     FAIL_BUDGET,
     FAIL_DISCONNECTED,
@@ -192,8 +192,8 @@ def _search_reason(
     status, attempt, attempts, reason = NOT_FOUND, 0, ti.static(3 if cfg.avoid_forecast else 2), FAIL_NONE
     while status == NOT_FOUND and attempt < attempts:
         if attempt == 0:
-            climb_to_skeleton(voronoi, clearance, slot, env, start[0], start[1], cfg, clearance_cfg)
-            climb_to_skeleton(voronoi, clearance, slot, env, goal[0], goal[1], cfg, clearance_cfg)
+            join_skeleton(voronoi, clearance, slot, env, start[0], start[1], cfg, clearance_cfg)
+            join_skeleton(voronoi, clearance, slot, env, goal[0], goal[1], cfg, clearance_cfg)
         elif attempt == 1:
             route.second_passes[env] += 1
             _forget_search(voronoi, slot)
