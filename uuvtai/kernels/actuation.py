@@ -3,6 +3,8 @@
 The vehicle knows its nominal parameters (vehicle section): drag, Coriolis and net buoyancy are fed forward, PI feedback does the rest.
 """
 
+from typing import NamedTuple
+
 import taichi as ti
 
 from uuvtai.config import ActuationConfig, EpisodeConfig, VehicleConfig
@@ -50,6 +52,26 @@ def reset_actuation(actuation: Out[ActuationState], clock: In[ClockState]):
                     actuation.rpm_queue[env, slot, i] = 0.0
 
 
+class AxisLoop(NamedTuple):
+    """PI loop of one commanded axis."""
+
+    gain: float
+    integral_gain: float
+    band: float
+    """[m/s or rad/s] errors beyond it do not build up the integral"""
+    bound: float
+    """[N or N m] of the integral"""
+    limit: float
+    """[N or N m] of the whole"""
+
+
+def axis_loops(cfg):
+    """Loops of surge, sway, heave and yaw rate; plain Python, constants of the kernel."""
+    linear = zip(cfg.velocity_gain, cfg.velocity_integral, cfg.max_force_n, strict=True)
+    yaw = AxisLoop(cfg.yaw_rate_gain, cfg.yaw_rate_integral, cfg.integral_band_rad_s, cfg.max_integral_n_m, cfg.max_moment_n_m)
+    return (*(AxisLoop(p, i, cfg.integral_band_m_s, cfg.max_integral_n, limit) for p, i, limit in linear), yaw)
+
+
 @ti.func
 def scaled_command(action, cfg: Const[VehicleConfig]):
     """[m/s, m/s, m/s, rad/s] of an action, clamped to [-1, 1]; NaN asks for nothing."""
@@ -85,32 +107,35 @@ def _drive(
     up = _up_b(ego.rpy[env])
     force, moment = feed_forward(command, vel, rate, up, vehicle_cfg)
     ahead = ti.Vector([force[0], force[1], force[2], moment[2]])
-    gain, integral_gain, limit, error_limit = _gains(actuation_cfg)
-    asked = ahead + gain * error + actuation.integral[env]
-    given = ti.Vector([ti.math.clamp(asked[i], -limit[i], limit[i]) for i in ti.static(range(4))])
+    loops = ti.static(axis_loops(actuation_cfg))
+    asked = ahead + actuation.integral[env]
+    given = ti.Vector([0.0] * 4)
+    for axis in ti.static(range(4)):
+        asked[axis] += loops[axis].gain * error[axis]
+        given[axis] = ti.math.clamp(asked[axis], -loops[axis].limit, loops[axis].limit)
     roll_moment, pitch_moment = 0.0, 0.0
     if ti.static(vehicle_cfg.attitude_hold == "thrusters"):
         roll_moment, pitch_moment = stabilising_moment(up, rate, moment, actuation_cfg)
     wrench = ti.Vector([given[0], given[1], given[2], roll_moment, pitch_moment, given[3]])
     share = _allocate(env, wrench, actuation, allocation, clock, vehicle_cfg)
     for axis in ti.static(range(4)):
-        # no wind-up: where the actuators give less than asked, the integral may only shrink
-        starved = share < 1.0 or given[axis] != asked[axis]
-        if (seen or axis == 3) and (not starved or error[axis] * actuation.integral[env][axis] < 0.0):
-            step = integral_gain[axis] * ti.math.clamp(error[axis], -error_limit[axis], error_limit[axis]) * episode_cfg.control_dt_s
-            actuation.integral[env][axis] = ti.math.clamp(actuation.integral[env][axis] + step, -limit[axis], limit[axis])
+        if seen or axis == 3:
+            starved = share < 1.0 or given[axis] != asked[axis]
+            per_step = loops[axis].integral_gain * episode_cfg.control_dt_s
+            before = actuation.integral[env][axis]
+            actuation.integral[env][axis] = integrated(before, error[axis], starved, per_step, loops[axis].band, loops[axis].bound)
 
 
 @ti.func
-def _gains(cfg: Const[ActuationConfig]):
-    """Proportional gain, integral gain, limit and integrated error of the four commanded axes."""
-    p, i, f = ti.static(cfg.velocity_gain, cfg.velocity_integral, cfg.max_force_n)
-    return (
-        ti.Vector([p[0], p[1], p[2], cfg.yaw_rate_gain]),
-        ti.Vector([i[0], i[1], i[2], cfg.yaw_rate_integral]),
-        ti.Vector([f[0], f[1], f[2], cfg.max_moment_n_m]),
-        ti.Vector([cfg.integral_error_m_s, cfg.integral_error_m_s, cfg.integral_error_m_s, cfg.integral_error_rad_s]),
-    )
+def integrated(integral, error, starved, gain, band, bound):
+    """Integral part [N or N m] after one control step; ``gain`` is per step. It never winds up:
+
+    it shrinks freely, but grows only on errors smaller than ``band`` that the actuators can serve (``starved``: they give less than asked).
+    """
+    share = 0.0 if starved else ti.max(0.0, 1.0 - abs(error) / band)
+    if error * integral < 0.0:
+        share = 1.0
+    return ti.math.clamp(integral + gain * share * error, -bound, bound)
 
 
 @ti.func
