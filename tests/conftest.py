@@ -1,6 +1,7 @@
-"""Fixtures shared by the tests. Taichi is started once per session; structs are allocated per module."""
+"""Fixtures shared by the tests. Taichi is started once per session; one small simulator serves every test of the whole stack."""
 
 import pytest
+import torch
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -9,3 +10,36 @@ def taichi_runtime():
     from uuvtai.runtime import start_taichi
 
     start_taichi("cpu")
+
+
+class SmallSim:
+    """A simulator whose kernels are compiled once for the session, and what tests do with it."""
+
+    N = 8
+
+    def __init__(self):
+        from uuvtai.loader import load_config
+        from uuvtai.sim import Sim
+        from uuvtai.tree import read_tree
+
+        self.config = load_config("pool", "paper", overrides={"world.dynamic_capacity": 9})
+        self.trees = {name: read_tree(name) for name in ("straight", "planner", "bt")}
+        self.sim = Sim(self.config, self.N, self.trees["bt"])
+
+    def begin(self, episodes, seed=0, rows=None):
+        """Reset ``rows`` (default: the first ones) to these episode numbers."""
+        rows = list(range(len(episodes))) if rows is None else rows
+        mask, seeds, numbers = (torch.zeros(self.N, dtype=torch.int32) for _ in range(3))
+        for row, number in zip(rows, episodes, strict=True):
+            mask[row], seeds[row], numbers[row] = 1, seed, number
+        self.sim.reset(mask, seeds, numbers)
+
+    def arrays(self, *nouns):
+        """NumPy copies of every array of these structs, by 'struct.field'."""
+        return {f"{noun}.{name}": field.to_numpy() for noun in nouns for name, field in vars(getattr(self.sim.s, noun)).items()}
+
+
+@pytest.fixture(scope="session")
+def small(taichi_runtime):
+    """The session's simulator."""
+    return SmallSim()

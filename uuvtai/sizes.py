@@ -43,6 +43,7 @@ def array_sizes(config: Config, n_env: int) -> dict[str, int]:
         "n_reason": N_REASON,
         "n_sector": config.features.n_sector,
         "n_node": config.teacher.max_node,
+        "n_candidate": config.teacher.n_candidate,
         "n_term": len(TERMS),
     }
 

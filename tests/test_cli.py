@@ -1,0 +1,185 @@
+"""The command line as a newcomer meets it: results, exit codes, and one clear message for everything wrong."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from uuvtai.cli import main
+
+
+def uuv(capfd, *arguments):
+    """(exit code, stdout, stderr) of one command in this process."""
+    with pytest.raises(SystemExit) as left:
+        main(list(arguments))
+    out, err = capfd.readouterr()
+    return left.value.code, out, err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["evl"], "Did you mean 'eval'?"),
+        (["eval", "--episodes", "x"], "valid integer"),
+        (["eval", "--episodes", "0"], "--episodes 0: must be at least 1"),
+        (["eval", "--episodes", "-3"], "must be at least 1"),
+        (["eval", "--record", "-1"], "--record -1"),
+        (["eval", "--seeds", "1,a"], "whole numbers separated by commas"),
+        (["eval", "--seeds", "99999999999"], "32 bits"),
+        (["eval", "--seeds", "1,1"], "given twice"),
+        (["eval", "--num-envs", "0"], "at least 1 env"),
+        (["eval", "--num-envs", "-5"], "at least 1 env"),
+        (["eval", "--num-envs", "900000"], "GiB"),
+        (["eval", "--world", "pol"], "did you mean 'pool'"),
+        (["eval", "--sensors", "nominl"], "did you mean 'nominal'"),
+        (["eval", "--controller", "btt"], "did you mean 'bt'"),
+        (["eval", "--controller", "nowhere.xml"], "no such file"),
+        (["eval", "--set", "world.n_dynmic=1"], "did you mean 'n_dynamic'"),
+        (["eval", "--set", "mapping.static_hit=.nan"], "finite"),
+        (["eval", "-S", "-1"], "greater than or equal to 0"),
+        (["eval", "-v", "nan"], "finite"),
+        (["eval", "--device", "tpu"], "use auto, cpu or cuda"),
+        (["simulate", "--seconds", "nan"], "seconds"),
+        (["simulate", "--seconds", "-1"], "seconds"),
+        (["simulate", "--seconds", "1", "--wrench", "1,2"], "give 6 finite numbers"),
+        (["simulate", "--seconds", "1", "--wrench", "1,2,3,4,5,inf"], "give 6 finite numbers"),
+        (["simulate", "--seconds", "1", "--dt", "0"], "dt"),
+        (["simulate", "--seconds", "1", "--attitude-hold", "ideel"], "attitude_hold"),
+        (["simulate", "--seconds", "1", "--vehicle", "bluerov9"], "did you mean"),
+        (["profile", "--num-envs", "1,x"], "whole numbers"),
+        (["profile", "--num-envs", "0"], "at least 1 env"),
+        (["profile", "--seconds", "0"], "positive"),
+        (["presets", "show"], "uuv presets show NAME"),
+        (["presets", "show", "nothing"], "is no preset"),
+        (["tree", "no/such/run"], "cannot be read"),
+    ],
+)
+def test_bad_usage_is_one_message_and_exit_2(capfd, tmp_path, monkeypatch, arguments, says):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = uuv(capfd, *arguments)
+    assert code == 2, err
+    assert says in err
+    assert "Traceback" not in err
+    assert out == ""
+    assert not list(tmp_path.iterdir()), "nothing may be left behind"
+
+
+@pytest.mark.parametrize("command", ["info", "repair", "video", "picture"])
+@pytest.mark.parametrize("content", [None, b"", b"not a log", b"\x89MCAP0\r\n" + b"\x00" * 40])
+def test_missing_and_corrupt_logs_are_exit_1(capfd, tmp_path, command, content):
+    log = tmp_path / "broken.mcap"
+    if content is not None:
+        log.write_bytes(content)
+    code, _out, err = uuv(capfd, "log", command, str(log))
+    assert code == 1, err
+    assert "broken.mcap" in err
+    assert "Traceback" not in err
+    assert {p.name for p in tmp_path.iterdir()} <= {"broken.mcap"}
+
+
+def test_presets_are_listed_and_shown(capfd):
+    code, out, _ = uuv(capfd, "presets", "--json")
+    listed = json.loads(out)
+    assert code == 0
+    assert {"pool", "gauntlet", "maze", "netpen", "transfer", "open"} <= set(listed["world"])
+    assert {"clean", "paper", "nominal", "harsh"} == set(listed["sensors"])
+    code, out, _ = uuv(capfd, "presets", "show", "gauntlet")
+    assert code == 0
+    assert "n_dynamic: 6" in out
+
+
+def test_doctor_finds_everything(capfd, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, out, _ = uuv(capfd, "doctor", "--json")
+    found = json.loads(out)
+    assert code == 0, found
+    assert found["ok"]
+    assert all(check["detail"] for check in found["checks"])
+
+
+def test_tree_is_printed_and_drawn(capfd):
+    code, out, _ = uuv(capfd, "tree")
+    assert code == 0
+    assert "FollowRoute" in out
+    code, out, _ = uuv(capfd, "tree", "--dot", "--controller", "straight")
+    assert code == 0
+    assert out.startswith("digraph")
+
+
+def test_help_is_quick_because_it_imports_nothing_heavy():
+    done = subprocess.run(
+        [sys.executable, "-c", "import sys, uuvtai.cli; print([m for m in ('taichi', 'torch', 'cv2', 'ompl', 'numpy') if m in sys.modules])"],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.fixture(scope="module")
+def evaluation(tmp_path_factory):
+    """One real evaluation in a process of its own: two controllers, recorded, as JSON."""
+    folder = tmp_path_factory.mktemp("eval") / "run"
+    command = [
+        sys.executable, "-m", "uuvtai", "eval", "--controller", "straight,bt", "--episodes", "4", "--seeds", "3", "--num-envs", "4",
+        "--record", "1", "--video", "--set", "episode.horizon_steps=400", "--run-dir", str(folder), "--json", "--device", "cpu",
+    ]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ, "NO_COLOR": "1"})
+    assert done.returncode == 0, done.stderr
+    return folder, json.loads(done.stdout), done.stderr
+
+
+def test_eval_prints_one_document_with_every_documented_key(evaluation):
+    _, document, _ = evaluation
+    assert {"schema", "world", "S", "D", "v_m_s", "sensors", "seeds", "episodes_per_seed", "methods"} <= set(document)
+    assert [m["name"] for m in document["methods"]] == ["straight", "bt"]
+    for method in document["methods"]:
+        assert {
+            "name", "episodes", "outcomes", "success_rate", "success_ci95", "collision_rate", "collision_ci95", "return_mean", "time_mean_s",
+            "tts_s", "time_to_success_mean_s", "min_clearance_mean_m", "path_length_mean_m", "replans_per_episode", "replans_by_trigger",
+            "planned_by", "env_steps", "wall_s", "env_steps_per_s", "episodes_detail",
+        } <= set(method)  # fmt: skip
+        assert sum(method["outcomes"].values()) == method["episodes"] == 4
+        assert set(method["outcomes"]) == {"success", "collision", "ttc", "out_of_tank", "timeout"}
+        assert [d["episode"] for d in method["episodes_detail"]] == [0, 1, 2, 3]
+        assert method["env_steps"] == sum(round(d["time_s"] / 0.02) for d in method["episodes_detail"])
+
+
+def test_eval_leaves_a_complete_run_folder(evaluation):
+    folder, document, _ = evaluation
+    names = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
+    assert {
+        "config.yaml", "run.json", "eval/result.json", "eval/tree.json", "eval/trees/bt.xml", "logs/bt_seed3_episode0.mcap",
+        "logs/straight_seed3_episode0.mcap", "pictures/seed3_episode0.png", "videos/bt_seed3_episode0.webm",
+    } <= names  # fmt: skip
+    assert not [n for n in names if n.endswith((".tmp", ".part"))]
+    run = json.loads((folder / "run.json").read_text())
+    assert (run["status"], run["exit"]) == ("finished", 0)
+    assert json.loads((folder / "eval/result.json").read_text()) == document
+
+
+def test_tree_shows_the_use_of_every_node(evaluation, capfd):
+    folder, document, _ = evaluation
+    code, out, _ = uuv(capfd, "tree", str(folder), "--json")
+    assert code == 0
+    nodes = json.loads(out)["nodes"]
+    assert nodes[0]["share"] == 1.0
+    bt = document["methods"][1]
+    # the tree is ticked once when the episode begins and after every step
+    assert nodes[0]["ticks"] == bt["env_steps"] + bt["episodes"]
+    assert sum(n["acted"] for n in nodes) <= nodes[0]["ticks"]
+    code, _, err = uuv(capfd, "tree", str(folder), "--controller", "planner")
+    assert code == 2
+    assert "has no controller 'planner'" in err
+
+
+def test_an_existing_run_folder_is_never_overwritten(evaluation, capfd):
+    folder, _, _ = evaluation
+    before = (folder / "run.json").read_text()
+    done = subprocess.run(
+        [sys.executable, "-m", "uuvtai", "eval", "--episodes", "1", "--num-envs", "4", "--run-dir", str(folder), "--device", "cpu"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert "already there and not empty" in done.stderr
+    assert (folder / "run.json").read_text() == before

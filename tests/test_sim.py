@@ -1,0 +1,152 @@
+"""The whole step: determinism, independence of envs, observation-only behaviour, zero copy."""
+
+import numpy as np
+import pytest
+import torch
+
+from uuvtai.loader import load_config
+from uuvtai.measure.evaluate import jobs_of, run_episodes
+
+SENSED = ("ego", "scan", "image", "tracks", "clusters", "forecast", "grid_map", "clearance", "route", "features", "teacher")
+"""Structs of what the vehicle senses, remembers and decides."""
+
+
+def equal(a, b, rows_a, rows_b):
+    """Names of the arrays whose rows differ in any bit."""
+    return [
+        name
+        for name in a
+        if a[name].ndim and a[name].shape[0] == 8 and not np.array_equal(a[name][rows_a], b[name][rows_b], equal_nan=True)
+    ]
+
+
+def test_an_episode_is_the_same_in_any_row_and_company(small):
+    small.begin([0, 1, 2, 3])
+    for _ in range(120):
+        small.sim.step()
+    first = small.arrays(*SENSED, "vehicle", "world", "referee")
+    small.begin([5, 3, 6, 7, 1, 2, 0], rows=[0, 1, 2, 3, 4, 5, 6])
+    for _ in range(120):
+        small.sim.step()
+    again = small.arrays(*SENSED, "vehicle", "world", "referee")
+    assert equal(first, again, [0, 1, 2, 3], [6, 4, 5, 1]) == []
+    assert equal(first, again, [0], [0]) != [], "another episode must differ"
+
+
+def test_a_reset_touches_only_its_rows(small):
+    small.begin(list(range(8)))
+    for _ in range(40):
+        small.sim.step()
+    before = small.arrays(*SENSED, "vehicle", "world", "referee", "episode")
+    small.begin([40, 41], rows=[2, 5])
+    after = small.arrays(*SENSED, "vehicle", "world", "referee", "episode")
+    rest = [0, 1, 3, 4, 6, 7]
+    assert equal(before, after, rest, rest) == []
+    assert equal(before, after, [2], [2]) != []
+
+
+def test_what_no_sensor_can_see_changes_nothing(small):
+    """Move an obstacle far outside every sensor's reach and change hidden truth: actions, maps and routes stay bit-identical."""
+
+    def run(hidden):
+        small.begin([4])
+        world, actions = small.sim.s.world, []
+        slot = int(np.flatnonzero(world.kind.to_numpy()[0] == 0)[0])
+        for _ in range(200):
+            if hidden:
+                # an empty slot becomes a sphere 40 m away (sonar reaches 12 m, camera 10 m), wobbling
+                world.kind[0, slot] = 1
+                world.pos_w[0, slot] = [60.0 + np.random.default_rng(0).random(), 40.0, -0.8]
+                world.size[0, slot] = [0.2, 0.2, 0.2]
+                world.vel_w[0, slot] = [0.3, 0.1, 0.0]
+            small.sim.step()
+            actions.append(small.sim.action[0].clone())
+        world.kind[0, slot] = 0
+        return torch.stack(actions), small.arrays(*SENSED)
+
+    actions, seen = run(hidden=False)
+    actions_hidden, seen_hidden = run(hidden=True)
+    assert torch.equal(actions, actions_hidden)
+    assert equal(seen, seen_hidden, [0], [0]) == []
+
+
+def test_hiding_what_is_seen_does_change_something(small):
+    """The counterpart: the test above can fail."""
+
+    def actions_with(kinds_off):
+        small.begin([4])
+        taken = []
+        for _ in range(200):
+            if kinds_off:
+                for slot in range(small.sim.s.world.kind.shape[1]):
+                    small.sim.s.world.kind[0, slot] = 0
+            small.sim.step()
+            taken.append(small.sim.action[0].clone())
+        return torch.stack(taken)
+
+    assert not torch.equal(actions_with(False), actions_with(True))
+
+
+def test_tensors_are_shared_not_copied(small):
+    sim = small.sim
+    pointers = [t.data_ptr() for t in (sim.action, sim.reward, sim.terminated, sim.truncated)]
+    small.begin(list(range(8)))
+    before = sim.reward.clone()
+    sim.step(torch.full((8, 4), 0.25))
+    assert [t.data_ptr() for t in (sim.action, sim.reward, sim.terminated, sim.truncated)] == pointers
+    assert not torch.equal(before, sim.reward), "the kernel writes torch's own memory"
+
+
+@pytest.mark.parametrize("order", ["forward", "backward"])
+def test_outcomes_do_not_depend_on_order_or_batch(small, order):
+    """Ten episodes through eight rows, both ways round: the same list of results."""
+    sim = small.sim
+    sim.use_tree(small.trees["straight"])
+    jobs = jobs_of([7], 10)
+    results, steps = run_episodes(sim, jobs if order == "forward" else jobs[::-1])
+    found = [(r.episode, r.outcome, r.time_s, r.min_clearance_m) for r in results]
+    alone = []
+    for job in jobs:
+        result, _ = run_episodes(sim, [job])
+        alone.append((job.episode, result[0].outcome, result[0].time_s, result[0].min_clearance_m))
+    sim.use_tree(small.trees["bt"])
+    assert (found if order == "forward" else found[::-1]) == alone
+    assert steps == sum(round(r.time_s / small.config.episode.control_dt_s) for r in results)
+
+
+def test_scene_is_data(small):
+    """S, D and v change without another simulator, and what does not fit is refused."""
+    sim = small.sim
+    sim.set_scene(3, 9, 1.5)
+    small.begin([0])
+    kinds = sim.s.world.kind.to_numpy()[0]
+    slots = len(kinds) - 9
+    assert (kinds[:slots] != 0).sum() == 3
+    assert (kinds[slots:] != 0).sum() == 9
+    moving = np.linalg.norm(sim.s.world.vel_w.to_numpy()[0, slots:], axis=1)
+    np.testing.assert_allclose(moving, 1.5, rtol=1e-4)
+    with pytest.raises(ValueError, match="dynamic_capacity"):
+        sim.set_scene(3, 10, 1.5)
+    sim.set_scene(8, 6, 0.6)
+
+
+def test_another_kind_of_runtime_in_one_process_is_refused():
+    from uuvtai.runtime import start_taichi
+
+    with pytest.raises(RuntimeError, match="already runs"):
+        start_taichi("cpu", precision="f64")
+    with pytest.raises(ValueError, match="unknown device"):
+        start_taichi("tpu")
+
+
+def test_absurd_sizes_are_refused_before_anything_is_allocated():
+    from uuvtai.sizes import check_size, memory_bytes
+
+    config = load_config("pool")
+    with pytest.raises(ValueError, match="at least 1 env"):
+        check_size(config, 0, "cpu")
+    with pytest.raises(MemoryError, match=r"GiB.*use --num-envs \d+ or fewer"):
+        check_size(config, 900_000, "cpu")
+    with pytest.raises(MemoryError, match="not supported"):
+        check_size(config, 10**9, "cpu")
+    assert memory_bytes(config, 20) < 2.1 * memory_bytes(config, 10)
