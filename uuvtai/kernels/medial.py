@@ -101,14 +101,15 @@ def join_skeleton(
     clearance: In[ClearanceState],
     slot,
     env,
-    row0,
-    col0,
+    start,
+    goal,
     cfg: Const[VoronoiConfig],
     clearance_cfg: Const[ClearanceConfig],
 ):
-    """Join a cell to the skeleton: one way uphill in clearance, and eight straight ways, so that the search may choose which side to leave."""
-    for way in range(9):
-        row, col = row0, col0
+    """Join both ends to the skeleton: one way uphill in clearance, and eight straight ways, so that the search chooses which side to leave."""
+    for joint in range(18):
+        way = joint % 9
+        row, col = ti.select(joint < 9, start[0], goal[0]), ti.select(joint < 9, start[1], goal[1])
         walking = True
         while walking:
             voronoi.cell[slot, row, col] = ti.cast(bits_at(voronoi, slot, row, col) | JOINED, ti.u8)

@@ -192,8 +192,7 @@ def _search_reason(
     status, attempt, attempts, reason = NOT_FOUND, 0, ti.static(3 if cfg.avoid_forecast else 2), FAIL_NONE
     while status == NOT_FOUND and attempt < attempts:
         if attempt == 0:
-            join_skeleton(voronoi, clearance, slot, env, start[0], start[1], cfg, clearance_cfg)
-            join_skeleton(voronoi, clearance, slot, env, goal[0], goal[1], cfg, clearance_cfg)
+            join_skeleton(voronoi, clearance, slot, env, start, goal, cfg, clearance_cfg)
         elif attempt == 1:
             route.second_passes[env] += 1
             _forget_search(voronoi, slot)
@@ -236,20 +235,20 @@ def _write_reason(
     start_at, goal_at = _grid_position(start_w, tank_cfg, mapping_cfg), _grid_position(goal_w, tank_cfg, mapping_cfg)
     start, goal = _cell(start_w, tank_cfg, mapping_cfg), _cell(goal_w, tank_cfg, mapping_cfg)
     n_cell = path_cells(voronoi, slot, start, goal)
-    spacing, count, tries = ti.cast(ti.static(route_cfg.spacing_m), ti.f32), room + 1, 0
+    spacing, writing, tries, reason = ti.cast(ti.static(route_cfg.spacing_m), ti.f32), 0, 0, FAIL_BUDGET
     cost = 0.0
     if n_cell > 0:
         cost = straightened_cost(voronoi, slot, n_cell, start_at, goal_at) * cell_m
-        count = count_of_waypoints(route, voronoi, slot, env, n_cell, start_at, goal_at, origin, cell_m, spacing, 0)
-        while count > room and tries < MAX_WIDENINGS:
+    while n_cell > 0 and tries < MAX_WIDENINGS:  # count, widen the spacing until it fits, then write
+        count = count_of_waypoints(route, voronoi, slot, env, n_cell, start_at, goal_at, origin, cell_m, spacing, writing)
+        tries += 1
+        if writing == 1:
+            install_route(route, clock, env, count, cost, PLANNER_VORONOI)
+            reason, tries = FAIL_NONE, MAX_WIDENINGS
+        elif count <= room:
+            writing = 1
+        else:
             spacing *= WIDENING
-            tries += 1
-            count = count_of_waypoints(route, voronoi, slot, env, n_cell, start_at, goal_at, origin, cell_m, spacing, 0)
-    reason = FAIL_BUDGET
-    if count <= room:
-        count = count_of_waypoints(route, voronoi, slot, env, n_cell, start_at, goal_at, origin, cell_m, spacing, 1)
-        install_route(route, clock, env, count, cost, PLANNER_VORONOI)
-        reason = FAIL_NONE
     return reason
 
 
