@@ -1,0 +1,182 @@
+"""Scenarios seen from the host: body slots, the table of explicit obstacles, faults, and one scenario in plain Python for logs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import taichi as ti
+
+from uuvtai.config import FixedObstacle, WorldConfig
+from uuvtai.kernels.geometry import BOX, CYLINDER, NONE, SPHERE
+from uuvtai.kernels.layout import COARSE_M, FAULT_ENDPOINTS, FAULT_JOINED, FAULT_STATIC
+from uuvtai.kernels.paths import FAULT_MOVING
+from uuvtai.state import FixedTable, MissionState, PathState, SceneState, WorldState
+
+N_CORNER = 5
+"""Most waypoints of one path."""
+
+KIND_NAMES = {SPHERE: "sphere", CYLINDER: "cylinder", BOX: "box"}
+_KINDS = {name: kind for kind, name in KIND_NAMES.items()}
+
+FAULTS = {
+    FAULT_ENDPOINTS: "start and goal find no place with their gaps: widen spawn_*_m or shrink start_goal_gap_m",
+    FAULT_STATIC: "the static obstacles find no place with their gaps: ask for fewer or smaller ones, or a smaller static.gap_m",
+    FAULT_JOINED: "no layout joins start and goal by free space: ask for fewer static obstacles or a smaller static.joined_clearance_m",
+    FAULT_MOVING: "a moving obstacle finds no path within the walls and away from the start: shrink its size, path or start_gap_m",
+}
+
+
+@dataclass(frozen=True)
+class BodySlots:
+    """Layout of a body list: explicit obstacles at rest, random static ones, explicit moving ones, random moving ones."""
+
+    n_fixed_static: int
+    n_static: int
+    n_fixed_moving: int
+    n_random_moving: int
+
+    @property
+    def n_dynamic(self) -> int:
+        """Moving slots; at least one (empty) slot, because arrays cannot be empty."""
+        return max(1, self.n_fixed_moving + self.n_random_moving)
+
+    @property
+    def first_dynamic(self) -> int:
+        return self.n_fixed_static + self.n_static
+
+    @property
+    def n_body(self) -> int:
+        return self.first_dynamic + self.n_dynamic
+
+
+def body_slots(world: WorldConfig) -> BodySlots:
+    """Slots of every env's body list."""
+    return BodySlots(world.n_fixed_static, world.static_slots, world.n_fixed_moving, world.dynamic_slots)
+
+
+def scenario_sizes(world: WorldConfig) -> dict[str, int]:
+    """Lengths of the array axes that the world decides."""
+    slots, tank = body_slots(world), world.tank
+    return {
+        "n_body": slots.n_body,
+        "n_dynamic": slots.n_dynamic,
+        "n_fixed": max(1, len(world.fixed)),
+        "n_corner": N_CORNER,
+        "n_coarse_row": math.ceil((tank.y_m[1] - tank.y_m[0]) / COARSE_M - 1e-9),
+        "n_coarse_col": math.ceil((tank.x_m[1] - tank.x_m[0]) / COARSE_M - 1e-9),
+    }
+
+
+def load_fixed(table: FixedTable, world: WorldConfig) -> None:
+    """Fill the table of explicit obstacles: those at rest first, then those with a path."""
+    at_rest = [obstacle for obstacle in world.fixed if not obstacle.path]
+    moving = [obstacle for obstacle in world.fixed if obstacle.path]
+    for i, obstacle in enumerate(at_rest + moving):
+        z, size = _center_and_size(obstacle, world)
+        table.kind[i] = _KINDS[obstacle.kind]
+        table.pos_w[i] = (obstacle.x_m, obstacle.y_m, z)
+        table.size[i] = size
+        table.yaw[i] = math.radians(obstacle.yaw_deg)
+        table.n_way[i] = len(obstacle.path)
+        table.speed_m_s[i] = -1.0 if obstacle.speed_m_s is None else obstacle.speed_m_s
+        for j, way in enumerate(obstacle.path):
+            table.way_w[i, j] = (way.x_m, way.y_m)
+
+
+def _center_and_size(obstacle: FixedObstacle, world: WorldConfig) -> tuple[float, tuple[float, float, float]]:
+    floor, surface = world.tank.z_m
+    z = 0.5 * (floor + surface) if obstacle.z_m is None else obstacle.z_m
+    half_height = 0.5 * (surface - floor if obstacle.height_m is None else obstacle.height_m)
+    radius = obstacle.radius_m or 0.0
+    if obstacle.kind == "sphere":
+        return z, (radius, radius, radius)
+    if obstacle.kind == "cylinder":
+        return z, (radius, radius, half_height)
+    extent_x, extent_y = obstacle.half_extents_m or (0.0, 0.0)
+    return z, (extent_x, extent_y, half_height)
+
+
+def set_scene(scene: SceneState, world: WorldConfig, n_static: int, n_dynamic: int, speed_m_s: float) -> None:
+    """S, D and v of every env's next scenario. Raises ValueError where they do not fit the slots of ``world``."""
+    for name, wanted, slots in (("static", n_static, world.static_slots), ("dynamic", n_dynamic, world.dynamic_slots)):
+        if not 0 <= wanted <= slots:
+            raise ValueError(f"{wanted} {name} obstacles do not fit {slots} slots: set world.{name}_capacity to at least {wanted}")
+    if not (math.isfinite(speed_m_s) and speed_m_s >= 0):
+        raise ValueError(f"the obstacles' speed must be finite and not negative, got {speed_m_s}")
+    scene.n_static.fill(n_static)
+    scene.n_dynamic.fill(n_dynamic)
+    scene.speed_m_s.fill(speed_m_s)
+
+
+def check_scenarios(faults: np.ndarray) -> None:
+    """Raise RuntimeError where a scenario could not be placed as asked; ``faults`` is ``WorldState.faults`` of the rows just drawn."""
+    bad = np.flatnonzero(faults)
+    if len(bad) == 0:
+        return
+    reasons = [text for bit, text in FAULTS.items() if np.any(faults & bit)]
+    raise RuntimeError(f"{len(bad)} of {len(faults)} scenarios cannot be placed: " + "; ".join(reasons))
+
+
+Read = Callable[[ti.Field], np.ndarray]
+"""Reads one env's row of a field."""
+
+
+def describe_scenario(read: Read, world: WorldState, path: PathState, mission: MissionState) -> dict[str, Any]:
+    """One scenario in closed form: where every body is at any time follows from this (see ``path_position``).
+
+    ``read(field)`` gives the env's row of a field. Positions [m] in the world frame, angles [rad], times from the episode's start.
+    """
+    kind, pos, size, yaw = read(world.kind), read(world.pos_w), read(world.size), read(world.yaw)
+    first_dynamic = len(kind) - path.n_way.shape[1]
+    paths = {name: read(getattr(path, name)) for name in ("n_way", "way_w", "radius_m", "length_m", "phase_m", "speed_m_s")}
+    bodies = []
+    for slot in np.flatnonzero(kind != NONE):
+        body: dict[str, Any] = {
+            "slot": int(slot),
+            "kind": KIND_NAMES[int(kind[slot])],
+            "position": [float(v) for v in pos[slot]],
+            "size": [float(v) for v in size[slot]],
+            "yaw": float(yaw[slot]),
+            "path": None,
+        }
+        if slot >= first_dynamic:
+            body["path"] = _path_document({name: values[slot - first_dynamic] for name, values in paths.items()})
+        bodies.append(body)
+    return {
+        "start": [float(v) for v in read(mission.start_w)],
+        "start_yaw": float(read(mission.start_yaw)),
+        "goal": [float(v) for v in read(mission.goal_w)],
+        "layout_draws": int(read(world.draws)),
+        "unclear_paths": int(read(world.unclear_paths)),
+        "faults": int(read(world.faults)),
+        "bodies": bodies,
+    }
+
+
+def _path_document(row: dict[str, Any]) -> dict[str, Any]:
+    common = {key: float(row[key]) for key in ("length_m", "phase_m", "speed_m_s")}
+    if row["n_way"] == 0:
+        return {"shape": "circle", "center": [float(v) for v in row["way_w"][0]], "radius_m": float(row["radius_m"]), **common}
+    corners = [[float(v) for v in way] for way in row["way_w"][: int(row["n_way"])]]
+    return {"shape": "polyline", "corners": corners, **common}
+
+
+def path_position(path: dict[str, Any], time_s: float) -> tuple[float, float]:
+    """(x, y) [m] of a moving body at a time, from ``describe_scenario``'s path (float64)."""
+    arc = (path["phase_m"] + path["speed_m_s"] * time_s) % path["length_m"]
+    if path["shape"] == "circle":
+        angle = arc / path["radius_m"]
+        x, y = path["center"]
+        return x + abs(path["radius_m"]) * math.cos(angle), y + abs(path["radius_m"]) * math.sin(angle)
+    corners = path["corners"]
+    i = 0
+    while i < len(corners) - 1 and arc > (leg := math.dist(corners[i], corners[i + 1])):
+        arc -= leg
+        i += 1
+    a, b = corners[i], corners[(i + 1) % len(corners)]
+    share = min(1.0, arc / math.dist(a, b))
+    return a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1])
