@@ -26,6 +26,9 @@ PRINTED = 0.5e-3
 F32_ACCELERATION = 2e-4
 """[m/s^2, rad/s^2] single precision: forces of 100 N cancel to some 1e-5 N, divided by inertias of 0.4 kg m^2."""
 
+F32_DRIFT_M = 2e-3
+"""500 substeps of single precision over metres, and the second-order error of turning the current."""
+
 ORDER_TWO = 3.5
 """A second-order method divides the error by 4 when dt is halved; 2 is what the design demands."""
 
@@ -238,6 +241,21 @@ def test_frictionless_body_keeps_its_energy(plant):
     for _ in range(50):
         plant.step(substeps=8)
     assert np.abs(kinetic() / before - 1).max() < 1e-3  # second-order error of 400 substeps of 2.5 ms at rates of 1 rad/s
+
+
+def test_added_mass_that_follows_the_water_knows_no_uniform_current():
+    """Galilei: in a uniform current everything is as in still water, plus the drift."""
+    current = np.array([0.3, -0.2, 0.0], np.float32)
+    plant = Plant(Config(vehicle=VehicleConfig(attitude_hold="none", added_mass_follows="water")), start_taichi("cpu"), n_env=2)
+    plant.reset()
+    plant.write(plant.actuation.external_wrench_b, [4, 1, 0, 0, 0, 0.4])
+    plant.write(plant.current.vel_w, [current, 0 * current])
+    plant.write(plant.vehicle.vel_b, [current, 0 * current])  # heading 0: body axes are world axes at the start
+    for _ in range(250):
+        plant.step()
+    assert np.abs(plant.vehicle.rate_b.to_numpy()[1, 2]) > 0.3  # it does turn
+    assert np.abs(plant.vehicle.pos_w.to_numpy()[0] - plant.vehicle.pos_w.to_numpy()[1] - 5.0 * current).max() < F32_DRIFT_M
+    assert np.abs(plant.vehicle.rate_b.to_numpy()[0] - plant.vehicle.rate_b.to_numpy()[1]).max() < F32_DRIFT_M
 
 
 def test_coriolis_matrix_is_skew_and_mass_matrix_positive():

@@ -237,6 +237,9 @@ class VehicleConfig(Section):
     volume_m3: Positive = 0.0113459
     buoyancy_height_m: float = 0.01
     added_mass: NonNegative6 = (5.5, 12.7, 14.57, 0.12, 0.12, 0.12)
+    added_mass_follows: Literal["ground", "water"] = "ground"
+    """whose acceleration the added mass resists: "ground" is M_A dnu/dt, the design's equation; "water" is M_A dnu_r/dt (Fossen 2011),
+    which makes motion in a uniform current equal to motion in still water plus drift. They differ only where it turns in a current"""
     linear_damping: NonNegative6 = (4.03, 6.22, 5.18, 0.07, 0.07, 0.07)
     quadratic_damping: NonNegative6 = (18.18, 21.66, 36.99, 1.55, 1.55, 1.55)
     thrusters: Annotated[tuple[Thruster, ...], Field(min_length=1)] = _BLUEROV2_THRUSTERS

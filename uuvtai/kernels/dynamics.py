@@ -193,10 +193,13 @@ def acceleration(
 ):
     """(dv/dt, dw/dt) in body axes [m/s^2, rad/s^2]: Fossen's equation solved for the derivative of nu."""
     up = up_b(q)
-    v_r = v - rotation_wb(q).transpose() @ current_w
+    current_b = rotation_wb(q).transpose() @ current_w
+    v_r = v - current_b
     momentum = body.added_v * v_r
     tau_v = force + (body.buoyancy - body.weight) * up
     tau_v -= body.mass * w.cross(v) + w.cross(momentum)
+    if ti.static(vehicle_cfg.added_mass_follows == "water"):
+        tau_v -= body.added_v * w.cross(current_b)  # dnu_r/dt = dnu/dt + w x current_b in a uniform current
     tau_v -= (body.linear_v + body.quadratic_v * abs(v_r)) * v_r
     tau_w = moment + body.height * body.buoyancy * ti.Vector([-up[1], up[0], 0.0])
     tau_w -= w.cross((body.inertia + body.added_w) * w) + v_r.cross(momentum)
