@@ -1,0 +1,181 @@
+"""One picture per episode: what the vehicle mapped, every method's trajectory, the goal, the truth as thin lines."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from uuvtai.logs.canvas import DYNAMIC, GREY, INK, METHODS, MOVER, PAPER, STATIC, WATER, Canvas, Color
+from uuvtai.logs.errors import LogError
+from uuvtai.logs.painting import map_canvas, mixed, paint_layers, paint_ruler, paint_truth, paint_walls, paint_water
+from uuvtai.logs.recording import PICTURE_TOPICS, Recording, load_recording
+from uuvtai.logs.video import video
+
+__all__ = ["draw_picture", "picture", "video"]
+
+_LEFT, _RIGHT, _TOP, _BOTTOM = 62, 44, 96, 62
+_ROW = 30
+"""[px] per line of the legend"""
+
+
+def picture(paths: Path | Sequence[Path], out: Path, clearance: bool = False, obstacles: bool = True, width_px: int = 1600) -> Path:
+    """Draw logs of the same episode into one PNG: trajectories overlaid, one colour per method.
+
+    ``clearance`` shows the distance to mapped obstacles as colours; ``obstacles`` the true bodies and their paths as thin lines.
+    Raises LogError; the file appears whole or not at all.
+    """
+    found = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
+    if not found:
+        raise LogError("uuv log picture: give at least one log")
+    recordings = [load_recording(path, PICTURE_TOPICS) for path in found]
+    check_same_episode(recordings)
+    return save_image(draw_picture(recordings, clearance, obstacles, width_px), Path(out))
+
+
+def check_same_episode(recordings: list[Recording]) -> None:
+    """Raises LogError where trajectories would be overlaid that do not belong together."""
+    names = ("world", "seed", "episode")
+    first = recordings[0]
+    for other in recordings[1:]:
+        if any(first.scenario.get(name) != other.scenario.get(name) for name in names):
+            raise LogError(f"{other.path}: is another episode than {first.path}; give logs of one episode, or draw one picture each")
+
+
+def save_image(image: np.ndarray, out: Path) -> Path:
+    """Write a PNG atomically. Raises LogError."""
+    part = out.with_name(f".{out.name}.{os.getpid()}.part")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        part.write_bytes(cv2.imencode(".png", image)[1].tobytes())
+        os.replace(part, out)
+    except OSError as error:
+        part.unlink(missing_ok=True) if part.parent.is_dir() else None
+        raise LogError(f"{out}: cannot write the picture ({error.strerror}); choose another place with --out FILE") from error
+    return out
+
+
+def draw_picture(recordings: list[Recording], clearance: bool = False, obstacles: bool = True, width_px: int = 1600) -> np.ndarray:
+    """The picture as an image (height, width, 3), blue green red."""
+    tank = recordings[0].scenario["tank"]
+    rows = len(recordings)
+    side = 92 if clearance else 0
+    canvas = map_canvas(tank, width_px, (_LEFT, _RIGHT + side, _TOP, _BOTTOM + _ROW * max(rows, 3)))
+    paint_water(canvas, tank)
+    if clearance:
+        _paint_clearance(canvas, recordings, side)
+    _paint_occupancy(canvas, recordings[0], trace=not clearance)
+    if obstacles:
+        paint_truth(canvas, recordings[0].scenario, max(recording.duration_s for recording in recordings))
+    paint_walls(canvas, tank)
+    for i, recording in enumerate(recordings):
+        _paint_trajectory(canvas, recording, METHODS[i % len(METHODS)])
+    _paint_ends(canvas, recordings)
+    _paint_frame(canvas, recordings)
+    return canvas.image
+
+
+# ------------------------------------------------------------------------------------------------------------------- parts
+
+
+def _paint_occupancy(canvas: Canvas, recording: Recording, trace: bool) -> None:
+    """The last map; ``trace`` adds in pink where anything moving was ever mapped."""
+    static, dynamic = recording.layers.get("static"), recording.layers.get("dynamic")
+    if static and dynamic:
+        ever = np.max([layer.values for layer in dynamic.values], axis=0) if trace else None
+        paint_layers(canvas, static.values[-1], dynamic.values[-1], ever)
+
+
+def _paint_clearance(canvas: Canvas, recordings: list[Recording], side: int) -> None:
+    series = recordings[0].layers.get("clearance")
+    if not series:
+        return
+    layer = series.values[-1]
+    top = max(float(layer.values.max()), 1e-6)
+    colors = cv2.applyColorMap((np.clip(layer.values / top, 0, 1) * 255).astype(np.uint8), cv2.COLORMAP_VIRIDIS)
+    canvas.cells(colors, np.full(layer.values.shape, 0.85), layer.origin_m, layer.cell_m)
+    _paint_color_bar(canvas, top)
+
+
+def _paint_color_bar(canvas: Canvas, top_m: float) -> None:
+    (x, y0), (_, y1) = canvas.pixels([(canvas.x_m[1], canvas.y_m[1]), (canvas.x_m[1], canvas.y_m[0])]).round().astype(int)
+    ramp = cv2.applyColorMap(np.linspace(255, 0, y1 - y0).astype(np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)
+    canvas.image[y0:y1, x + 26 : x + 44] = ramp
+    cv2.rectangle(canvas.image, (x + 26, y0), (x + 43, y1 - 1), GREY, 1)
+    for share in (0.0, 0.5, 1.0):
+        canvas.text((x + 50, y1 - share * (y1 - y0) + (4 if share < 1 else 14)), f"{share * top_m:.1f} m", 15, GREY)
+    canvas.text((x + 26, y0 - 12), "clearance", 15, GREY)
+
+
+def _paint_trajectory(canvas: Canvas, recording: Recording, color: Color) -> None:
+    path = recording.positions[:, :2]
+    canvas.line(path, PAPER, 6)
+    canvas.line(path, color, 3)
+
+
+def _paint_ends(canvas: Canvas, recordings: list[Recording]) -> None:
+    scenario = recordings[0].scenario
+    goal, start = scenario["goal"], scenario["start"]
+    canvas.dashes(np.array(goal[:2]) + scenario["goal_radius_m"] * _ring(90), INK, 1)
+    canvas.disc(start, 8, PAPER)
+    canvas.disc(start, 7, INK, 2)
+    for i, recording in enumerate(recordings):
+        canvas.vehicle(recording.positions[-1], METHODS[i % len(METHODS)])
+    canvas.star(goal, 17)
+    for i, recording in enumerate(recordings):
+        if recording.outcome in ("collision", "ttc", "out_of_tank"):
+            canvas.cross(recording.positions[-1][:2], 9, METHODS[i % len(METHODS)])
+
+
+def _paint_frame(canvas: Canvas, recordings: list[Recording]) -> None:
+    scenario = recordings[0].scenario
+    canvas.text((_LEFT - 2, 40), f"{scenario['world']} · seed {scenario['seed']} · episode {scenario['episode']}", 27, INK, bold=True)
+    moving = f", {scenario['D']} moving at {scenario['v_m_s']:g} m/s" if scenario["D"] else ""
+    canvas.text((_LEFT - 2, 70), f"{scenario['S']} resting obstacles{moving}; map of {recordings[0].method}", 18, GREY)
+    paint_ruler(canvas)
+    base = canvas.pixels([(canvas.x_m[0], canvas.y_m[0])])[0][1] + 62
+    for i, recording in enumerate(recordings):
+        _legend_row(canvas, base + i * _ROW, recording, METHODS[i % len(METHODS)])
+    _legend_symbols(canvas, base)
+
+
+def _legend_row(canvas: Canvas, y: float, recording: Recording, color: Color) -> None:
+    canvas.filled(np.array([(_LEFT, y - 8), (_LEFT + 34, y - 8), (_LEFT + 34, y - 3), (_LEFT, y - 3)]), color)
+    width = canvas.text((_LEFT + 46, y), recording.method, 19, INK, bold=True)
+    closest = "" if recording.min_clearance_m is None else f", closest {recording.min_clearance_m:.2f} m"
+    told = f"{recording.outcome.replace('_', ' ')} after {recording.duration_s:.1f} s{closest}"
+    canvas.text((_LEFT + 46 + max(width, 90) + 14, y), told, 18, GREY)
+
+
+def _legend_symbols(canvas: Canvas, base: float) -> None:
+    x, width = canvas.image.shape[1] - _RIGHT - 430, 15
+    swatches = (
+        (STATIC, "static occupancy", 0, 0),
+        (DYNAMIC, "dynamic occupancy", 0, 1),
+        (mixed(DYNAMIC, WATER, 0.22), "dynamic earlier", 0, 2),
+    )
+    for color, label, column, row in swatches:
+        left, y = x + column * 200, base + row * _ROW
+        canvas.filled(np.array([(left, y - 13), (left + width, y - 13), (left + width, y + 2), (left, y + 2)]), color)
+        canvas.text((left + 26, y), label, 17, GREY)
+    left = x + 210
+    world = (np.array([left + 8, base - 6]) - np.array(canvas.corner)) / canvas.scale
+    goal = (canvas.x_m[0] + world[0], canvas.y_m[1] - world[1])
+    canvas.star(goal, 11)
+    canvas.text((left + 26, base), "goal", 17, GREY)
+    down = _ROW / canvas.scale
+    canvas.disc((goal[0], goal[1] - down), 6, INK, 2)
+    canvas.text((left + 26, base + _ROW), "start", 17, GREY)
+    ring = np.array([goal[0], goal[1] - 2 * down]) + 7 / canvas.scale * _ring(32)
+    canvas.line(ring, GREY, 1, closed=True)
+    canvas.line(ring + np.array([18 / canvas.scale, 0]), MOVER, 1, closed=True)
+    canvas.text((left + 44, base + 2 * _ROW), "true, resting / moving", 17, GREY)
+
+
+def _ring(corners: int) -> np.ndarray:
+    """(corners, 2) unit circle, closed."""
+    angles = np.linspace(0, 2 * np.pi, corners)
+    return np.column_stack([np.cos(angles), np.sin(angles)])

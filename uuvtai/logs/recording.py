@@ -1,0 +1,138 @@
+"""A log as arrays, ready to be drawn."""
+
+from __future__ import annotations
+
+import bisect
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from uuvtai.logs.errors import LogError
+from uuvtai.logs.export import grid_values
+from uuvtai.logs.reader import LogHead, LogMessage, read_head, read_messages
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One map of the vehicle."""
+
+    time_s: float
+    values: np.ndarray
+    origin_m: tuple[float, float]
+    cell_m: float
+
+
+@dataclass
+class Series:
+    """Values by time, looked up as of a moment."""
+
+    times: list[float] = field(default_factory=list)
+    values: list[Any] = field(default_factory=list)
+
+    def add(self, time_s: float, value: Any) -> None:
+        self.times.append(time_s)
+        self.values.append(value)
+
+    def at(self, time_s: float) -> Any | None:
+        """Newest value at this time, None before the first."""
+        i = bisect.bisect_right(self.times, time_s + 1e-9)
+        return self.values[i - 1] if i else None
+
+
+@dataclass
+class Recording:
+    """What is drawn of an episode."""
+
+    path: Path
+    head: LogHead
+    scenario: dict[str, Any]
+    pose: Series = field(default_factory=Series)
+    """(x, y, z, yaw)"""
+    layers: dict[str, Series] = field(default_factory=dict)
+    """Layer by 'static', 'dynamic', 'clearance', 'risk'"""
+    scan: Series = field(default_factory=Series)
+    """(ranges (n,), hit (n,), when it was taken)"""
+    route: Series = field(default_factory=Series)
+    """(n, 2) points"""
+    lookahead: Series = field(default_factory=Series)
+    safety: Series = field(default_factory=Series)
+    """(clearance_m, ttc_s or None, replan trigger)"""
+    speed: Series = field(default_factory=Series)
+    leaf: Series = field(default_factory=Series)
+    tracks: Series = field(default_factory=Series)
+    """(n, 3) x, y, radius"""
+    replans: list[tuple[float, str]] = field(default_factory=list)
+    """when and why"""
+
+    @property
+    def method(self) -> str:
+        return self.head.metadata.get("uuv.run", {}).get("controller", "?")
+
+    @property
+    def outcome(self) -> str:
+        return self.head.metadata.get("uuv.result", {}).get("outcome", "cut off")
+
+    @property
+    def duration_s(self) -> float:
+        return self.pose.times[-1]
+
+    @property
+    def positions(self) -> np.ndarray:
+        """(n, 4) x, y, z, yaw at every control step."""
+        return np.array(self.pose.values)
+
+    @property
+    def min_clearance_m(self) -> float | None:
+        return min((value[0] for value in self.safety.values), default=None)
+
+
+PICTURE_TOPICS = ("/pose", "/safety", "/map/static", "/map/dynamic", "/map/clearance", "/plan/info")
+VIDEO_TOPICS = (*PICTURE_TOPICS, "/sonar/scan", "/plan/lookahead", "/state", "/action", "/tracks")
+
+
+def load_recording(path: Path, topics: tuple[str, ...] = VIDEO_TOPICS) -> Recording:
+    """Read a log. Raises LogError, also for a log without poses."""
+    path = Path(path)
+    head = read_head(path)
+    found = Recording(path, head, head.scenario)
+    try:
+        for message in read_messages(path, topics):
+            _take(found, message)
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise LogError(f"{path}: a message is not as its schema says ({error!r}); see what is in it with: uuv log info {path}") from error
+    if not found.pose.times:
+        raise LogError(f"{path}: the log has no messages on /pose, so there is nothing to draw; see uuv log info {path}")
+    return found
+
+
+def _take(found: Recording, message: LogMessage) -> None:
+    time_s, data = message.time_s, message.data
+    match message.topic:
+        case "/pose":
+            place, q = data["pose"]["position"], data["pose"]["orientation"]
+            yaw = math.atan2(2 * (q["w"] * q["z"] + q["x"] * q["y"]), 1 - 2 * (q["y"] ** 2 + q["z"] ** 2))
+            found.pose.add(time_s, (place["x"], place["y"], place["z"], yaw))
+        case "/sonar/scan":
+            ping_s = data["timestamp"]["sec"] + data["timestamp"]["nsec"] / 1e9
+            found.scan.add(time_s, (np.array(data["ranges"]), np.array(data["intensities"]) > 0, ping_s))
+        case "/plan/info":
+            found.route.add(time_s, np.array([(point["x"], point["y"]) for point in data["points"]]).reshape(-1, 2))
+            found.replans.append((time_s, data["trigger"]))
+        case "/plan/lookahead":
+            place = data["pose"]["position"]
+            found.lookahead.add(time_s, (place["x"], place["y"]))
+        case "/safety":
+            found.safety.add(time_s, (data["clearance_m"], data["ttc_s"], data["replan_trigger"]))
+        case "/state":
+            found.speed.add(time_s, math.hypot(*data["velocity"]))
+        case "/action":
+            found.leaf.add(time_s, data.get("leaf", ""))
+        case "/tracks":
+            found.tracks.add(time_s, np.array([(t["x"], t["y"], t["radius"]) for t in data["tracks"]]).reshape(-1, 3))
+        case topic:
+            origin = data["pose"]["position"]
+            layer = Layer(time_s, grid_values(data), (origin["x"], origin["y"]), data["cell_size"]["x"])
+            found.layers.setdefault(topic.rpartition("/")[2], Series()).add(time_s, layer)

@@ -1,0 +1,252 @@
+"""Top-down video of an episode: what the vehicle senses, maps, plans and does, with the truth as thin lines."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from uuvtai.logs.canvas import DYNAMIC, FAINT, GREY, INK, METHODS, MOVER, PAPER, ROUTE, Color, bgr
+from uuvtai.logs.errors import LogError
+from uuvtai.logs.painting import (
+    map_canvas,
+    mixed,
+    paint_layers,
+    paint_ruler,
+    paint_truth,
+    paint_walls,
+    paint_water,
+)
+from uuvtai.logs.recording import Recording, load_recording
+
+_MARGINS = (52, 28, 84, 212)
+"""[px] left, right, top, bottom"""
+_PANEL = 160
+"""[px] height of the panel below the map"""
+_ECHO, _GOOD, _BAD = bgr("#0b7a75"), bgr("#2b8a3e"), bgr("#c92a2a")
+_TRIGGER_COLORS = {"initial": GREY, "stuck": bgr("#ae3ec9"), "safety": bgr("#e8590c"), "intersection": bgr("#1971c2")}
+_HOLD_S = 1.0
+"""The last frame stays this long."""
+_CODECS = ("VP80", "VP90")
+"""VP8 first: a fifth of the time for the same size."""
+
+Progress = Callable[[int, int], None]
+"""Called with (frames done, frames in all)."""
+
+
+def video(path: Path, out: Path, width_px: int = 1280, fps: float = 15.0, speed: float = 1.0, progress: Progress | None = None) -> Path:
+    """Render a log as WebM; ``speed`` 2 shows it twice as fast as it was. Raises LogError; the file appears whole or not at all."""
+    recording, out = load_recording(path), Path(out)
+    artist = FrameArtist(recording, width_px)
+    times = np.arange(0.0, recording.duration_s, speed / fps)
+    times = np.concatenate([times, np.full(1 + round(_HOLD_S * fps), recording.duration_s)])
+    part = out.with_name(f".{out.stem}.{os.getpid()}.part.webm")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        part.touch()
+        height, width = artist.frame(0.0).shape[:2]
+        with _webm_writer(part, (width, height), fps) as writer:
+            for i, time_s in enumerate(times):
+                writer.write(artist.frame(float(time_s)))
+                if progress:
+                    progress(i + 1, len(times))
+        _check_whole(part, out)
+        os.replace(part, out)
+    except OSError as error:
+        raise LogError(f"{out}: cannot write the video ({error.strerror}); choose another place with --out FILE") from error
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+    return out
+
+
+@contextlib.contextmanager
+def _webm_writer(part: Path, size: tuple[int, int], fps: float) -> Iterator[cv2.VideoWriter]:
+    with _quiet_stderr():
+        writer = cv2.VideoWriter()
+        opened = any(writer.open(str(part), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*codec), fps, size) for codec in _CODECS)  # type: ignore[attr-defined]
+    if not opened:
+        raise LogError(f"{part.parent}: OpenCV cannot write WebM here (neither VP8 nor VP9); install opencv-python-headless from PyPI")
+    try:
+        yield writer
+    finally:
+        writer.release()
+
+
+@contextlib.contextmanager
+def _quiet_stderr() -> Iterator[None]:
+    """FFmpeg prints a harmless note about the codec's tag straight to the process's stderr."""
+    kept, nothing = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nothing, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nothing)
+
+
+def _check_whole(part: Path, out: Path) -> None:
+    """A full disk shows neither in ``write`` nor in ``release``: read the end of the file back."""
+    reader = cv2.VideoCapture(str(part))
+    readable = reader.isOpened() and reader.read()[0]
+    reader.release()
+    if not readable:
+        raise LogError(f"{out}: the video could not be written whole; is the disk full? Make room or choose another place with --out FILE")
+    handle = os.open(part, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+class FrameArtist:
+    """Draws the frame of any moment of a recording; what stays between two maps is drawn once."""
+
+    def __init__(self, recording: Recording, width_px: int = 1280) -> None:
+        self.recording = recording
+        self._canvas = map_canvas(recording.scenario["tank"], width_px - width_px % 2, _MARGINS)
+        self._base_time: float | None = None
+        self._base = self._canvas.image
+        self._track = recording.positions
+        self._times = np.array(recording.pose.times)
+        self._clearance = np.array([value[0] for value in recording.safety.values])
+
+    def frame(self, time_s: float) -> np.ndarray:
+        """Image (height, width, 3), blue green red."""
+        canvas, recording = self._canvas, self.recording
+        canvas.image = self._background(time_s).copy()
+        i = max(int(np.searchsorted(self._times, time_s + 1e-9)) - 1, 0)
+        pose = self._track[i]
+        paint_truth(canvas, recording.scenario, time_s)
+        self._paint_plan(time_s)
+        canvas.line(self._track[: i + 1, :2], METHODS[0], 2)
+        self._paint_echoes(time_s)
+        tracks = recording.tracks.at(time_s)
+        for x, y, radius in () if tracks is None else tracks:
+            canvas.disc((x, y), (radius + 0.06) * canvas.scale, DYNAMIC, 2)
+        self._paint_goal()
+        canvas.vehicle(pose, METHODS[0])
+        self._paint_head(time_s)
+        self._paint_panel(time_s, i)
+        return canvas.image
+
+    def _background(self, time_s: float) -> np.ndarray:
+        layers = [series.at(time_s) for name in ("static", "dynamic") if (series := self.recording.layers.get(name))]
+        static, dynamic = layers if len(layers) == 2 else (None, None)
+        key = static.time_s if static else -1.0
+        if key != self._base_time:
+            canvas = self._canvas
+            canvas.image = np.full_like(canvas.image, PAPER)
+            paint_water(canvas, self.recording.scenario["tank"])
+            if static and dynamic:
+                paint_layers(canvas, static, dynamic)
+            paint_walls(canvas, self.recording.scenario["tank"])
+            paint_ruler(canvas)
+            self._base, self._base_time = canvas.image, key
+        return self._base
+
+    def _paint_plan(self, time_s: float) -> None:
+        canvas, route, ahead = self._canvas, self.recording.route.at(time_s), self.recording.lookahead.at(time_s)
+        if route is not None and len(route) > 1:
+            canvas.line(route, PAPER, 5)
+            canvas.line(route, ROUTE, 2)
+        if ahead is not None:
+            canvas.disc(ahead, 7, PAPER)
+            canvas.disc(ahead, 5, ROUTE)
+
+    def _paint_echoes(self, time_s: float) -> None:
+        """Returns of the newest scan, seen from where it was taken."""
+        scan = self.recording.scan.at(time_s)
+        if scan is None:
+            return
+        ranges, hit, ping_s = scan
+        x, y, _, yaw = self.recording.pose.at(ping_s) or self._track[0]
+        bearing = yaw + 2 * np.pi * np.arange(len(ranges)) / len(ranges)
+        for echo in (np.array([x, y]) + ranges[:, None] * np.column_stack([np.cos(bearing), np.sin(bearing)]))[hit]:
+            self._canvas.disc(echo, 2.4, _ECHO)
+
+    def _paint_goal(self) -> None:
+        canvas, goal, radius = self._canvas, self.recording.scenario["goal"], self.recording.scenario["goal_radius_m"]
+        angles = np.linspace(0, 2 * np.pi, 72)
+        canvas.dashes(np.array(goal[:2]) + radius * np.column_stack([np.cos(angles), np.sin(angles)]), INK, 1)
+        canvas.star(goal, 14)
+
+    def _paint_head(self, time_s: float) -> None:
+        canvas, recording, scenario = self._canvas, self.recording, self.recording.scenario
+        width = canvas.image.shape[1]
+        title = f"{recording.method} · {scenario['world']} · seed {scenario['seed']} · episode {scenario['episode']}"
+        canvas.text((24, 34), title, 22, INK, bold=True)
+        moving = f", {scenario['D']} moving at {scenario['v_m_s']:g} m/s" if scenario["D"] else ""
+        canvas.text((24, 60), f"{scenario['S']} resting obstacles{moving}", 16, GREY)
+        canvas.text((width - 28, 36), f"{time_s:5.1f} s", 26, INK, bold=True, align="right")
+        if time_s >= recording.duration_s:
+            good = recording.outcome == "success"
+            canvas.text((width - 150, 36), recording.outcome.replace("_", " "), 24, _GOOD if good else _BAD, bold=True, align="right")
+
+    # --------------------------------------------------------------------------------------------------------- panel below
+
+    def _paint_panel(self, time_s: float, i: int) -> None:
+        canvas, recording = self._canvas, self.recording
+        top = canvas.image.shape[0] - _PANEL
+        safety, leaf = recording.safety.at(time_s), recording.leaf.at(time_s)
+        speed = recording.speed.at(time_s)
+        clearance = None if safety is None else safety[0]
+        near = clearance is not None and clearance < 0.3
+        self._figure(24, top, "clearance", "-" if clearance is None else f"{clearance:.2f} m", _BAD if near else INK)
+        self._figure(164, top, "time to collision", "-" if not safety or safety[1] is None else f"{safety[1]:.1f} s", INK)
+        self._figure(320, top, "speed", "-" if speed is None else f"{speed:.2f} m/s", INK)
+        canvas.text((24, top + 86), "tree", 15, GREY)
+        canvas.text((24, top + 112), leaf or "-", 21, METHODS[0], bold=True)
+        self._paint_legend(24, top + 138)
+        self._paint_curve(time_s, i, top)
+
+    def _figure(self, x: int, top: int, label: str, value: str, color: Color) -> None:
+        self._canvas.text((x, top + 24), label, 15, GREY)
+        self._canvas.text((x, top + 54), value, 25, color, bold=True)
+
+    def _paint_legend(self, x: float, y: float) -> None:
+        canvas = self._canvas
+        for color, label in ((ROUTE, "route"), (_ECHO, "sonar"), (DYNAMIC, "tracked"), (MOVER, "true, moving"), (GREY, "true, resting")):
+            square = np.array([(0, -9), (9, -9), (9, 0), (0, 0)]) + np.array([x, y])
+            canvas.filled(square, color)
+            x += 16 + canvas.text((x + 14, y), label, 14, GREY) + 14
+
+    def _paint_curve(self, time_s: float, i: int, top: int) -> None:
+        """Clearance over the episode; replans as ticks in the colour of their trigger."""
+        canvas, recording = self._canvas, self.recording
+        left, right, low, high = 560, canvas.image.shape[1] - 28, top + 122, top + 26
+        most = max(1.0, float(np.ceil(self._clearance.max(initial=0.0))))
+
+        def place(times: np.ndarray, values: np.ndarray) -> np.ndarray:
+            across = left + (right - left) * times / max(recording.duration_s, 1e-6)
+            return np.column_stack([across, low - (low - high) * np.clip(values, 0, most) / most])
+
+        for value in (0.0, most):
+            y = round(float(place(np.zeros(1), np.array([value]))[0, 1]))
+            cv2.line(canvas.image, (left, y), (right, y), FAINT, 1)
+            canvas.text((left - 8, y + 5), f"{value:g}", 13, GREY, align="right")
+        canvas.text((left, top + 12), "clearance [m]", 14, GREY)
+        self._paint_replans(place, time_s, low)
+        curve = place(np.array(recording.safety.times), self._clearance)
+        canvas.strip(curve, mixed(METHODS[0], PAPER, 0.25), 2)
+        if i > 0:
+            canvas.strip(curve[: i + 1], METHODS[0], 2)
+        if len(curve):
+            canvas.dot(curve[min(i, len(curve) - 1)], 4, METHODS[0])
+
+    def _paint_replans(self, place: Callable[[np.ndarray, np.ndarray], np.ndarray], time_s: float, low: int) -> None:
+        canvas, x = self._canvas, 700.0
+        for name, color in _TRIGGER_COLORS.items():
+            count = sum(trigger == name and at <= time_s for at, trigger in self.recording.replans)
+            label = f"{name} {count}"
+            x += 14 + canvas.text((x, low + 22), label, 14, color, bold=True) + 10
+        canvas.text((560, low + 22), "replans by trigger:", 14, GREY)
+        for at, trigger in self.recording.replans:
+            if at <= time_s:
+                px = round(float(place(np.array([at]), np.zeros(1))[0, 0]))
+                cv2.line(canvas.image, (px, low), (px, low - 12), _TRIGGER_COLORS.get(trigger, GREY), 2, cv2.LINE_AA)
