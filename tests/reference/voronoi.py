@@ -1,5 +1,7 @@
 """NumPy / SciPy float64 oracles of the planner: clearance with sites, the traversable set, exact least cost on the full grid."""
 
+from itertools import pairwise
+
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse import csr_matrix
@@ -45,7 +47,7 @@ def least_cost(omega, clearance_m, epsilon_m, cell_m, start, goal):
 def line_points(way_w, step_m):
     """Points along a polyline at most ``step_m`` apart, and the length that each stands for."""
     points, lengths = [], []
-    for a, b in zip(way_w[:-1], way_w[1:], strict=True):
+    for a, b in pairwise(way_w):
         n = max(1, int(np.ceil(np.linalg.norm(b - a) / step_m)))
         points.append(a + (b - a) * ((np.arange(n) + 0.5) / n)[:, None])
         lengths.append(np.full(n, np.linalg.norm(b - a) / n))
@@ -62,7 +64,7 @@ def line_cost(way_w, clearance_m, epsilon_m, origin, cell_m, step_m=0.005):
 def hopped_cost(way_w, clearance_m, epsilon_m, origin, cell_m):
     """The paper's sum as written: segments (here bounded by the cell), each with the clearance at its first point."""
     total = 0.0
-    for a, b in zip(way_w[:-1], way_w[1:], strict=True):
+    for a, b in pairwise(way_w):
         n = max(1, int(np.ceil(np.linalg.norm(b - a) / cell_m)))
         for i in range(n):
             col, row = np.floor((a + (b - a) * i / n - origin) / cell_m).astype(int)

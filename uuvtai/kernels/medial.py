@@ -12,20 +12,25 @@ from uuvtai.kernels.heap import heap_after_pop, heap_after_push
 from uuvtai.kernels.signature import Const, In, Out
 from uuvtai.state import ClearanceState, VoronoiState
 
-# bits of VoronoiState.cell; the direction of the next cell towards the goal lies above them
+# bits of VoronoiState.cell; bits 4 to 6 hold the direction of the next cell towards the goal
 KNOWN = 1
 SKELETON = 2
 REACHED = 4
 JOINED = 8
 """off the skeleton, but on a way from the start or the goal to it"""
+CLOSED = 128
+"""taken from the heap: its cost is final (the stretched estimate could reopen cells again and again)"""
 _NEXT_SHIFT = 4
 
 FOUND = 1
 NOT_FOUND = 0
 OUT_OF_BUDGET = -1
 
-_TIE = 1.001
-"""The estimate is stretched by this, so that of the many equally short ways over open water only one is followed up (cost + 0.1 %)."""
+_STRETCH = 1.02
+"""The estimate is stretched by this, so that of the many nearly equal ways over open water few are followed up (cost at most + 2 %)."""
+
+_BETTER = 1.0 - 1.0e-6
+"""A way must be cheaper by more than rounding to replace another: equal ways would fill the heap."""
 
 _FLAT_M = 1.0e-4
 """Clearances within this of clearance.max_m are saturated."""
@@ -46,7 +51,7 @@ def bits_at(voronoi: In[VoronoiState], slot, row, col):
 @ti.func
 def next_direction(voronoi: In[VoronoiState], slot, row, col):
     """Direction of the next cell towards the goal."""
-    return bits_at(voronoi, slot, row, col) >> _NEXT_SHIFT
+    return bits_at(voronoi, slot, row, col) >> _NEXT_SHIFT & 7
 
 
 @ti.func
@@ -106,7 +111,7 @@ def join_skeleton(
     cfg: Const[VoronoiConfig],
     clearance_cfg: Const[ClearanceConfig],
 ):
-    """Join both ends to the skeleton: one way uphill in clearance, and eight straight ways, so that the search chooses which side to leave."""
+    """Join both ends to the skeleton: one way uphill in clearance, and eight straight ways, so that the search chooses the side."""
     for joint in range(18):
         way = joint % 9
         row, col = ti.select(joint < 9, start[0], goal[0]), ti.select(joint < 9, start[1], goal[1])
@@ -140,7 +145,7 @@ def _uphill(voronoi: In[VoronoiState], clearance: In[ClearanceState], slot, env,
 
 @ti.func
 def _estimate(cost, row, col, start_row, start_col, floor_weight):
-    """Cost-to-go plus the least cost from the start: octile distance through the widest water. float32 like the keys it is compared to."""
+    """Cost-to-go plus the least cost from the start: octile distance through the widest water."""
     d_row, d_col = ti.abs(row - start_row), ti.abs(col - start_col)
     octile = ti.max(d_row, d_col) + 0.41421356 * ti.min(d_row, d_col)
     return ti.cast(cost + floor_weight * octile, ti.f32)
@@ -164,7 +169,7 @@ def search_cells(
     Returns FOUND, NOT_FOUND or OUT_OF_BUDGET.
     """
     n_col = ti.static(voronoi.cost.shape[2])
-    floor_weight = ti.static(_TIE / max(clearance_cfg.max_m, cfg.cost_epsilon_m))
+    floor_weight = ti.static(_STRETCH / max(clearance_cfg.max_m, cfg.cost_epsilon_m))
     size, status, budget = 0, NOT_FOUND, voronoi.pops[env] + ti.static(cfg.max_pops)
     if voronoi.weight[slot, goal[0], goal[1]] > 0:
         voronoi.cost[slot, goal[0], goal[1]] = 0.0
@@ -172,18 +177,16 @@ def search_cells(
         key = _estimate(0.0, goal[0], goal[1], start[0], start[1], floor_weight)
         size = heap_after_push(voronoi, slot, size, goal[0] * n_col + goal[1], key)
     while size > 0 and status == NOT_FOUND:
-        key = voronoi.heap_key[slot, 0]
         row, col = voronoi.heap_cell[slot, 0] // n_col, voronoi.heap_cell[slot, 0] % n_col
         size = heap_after_pop(voronoi, slot, size)
-        voronoi.pops[env] += 1
         if row == start[0] and col == start[1]:
             status = FOUND
         elif voronoi.pops[env] > budget or size + 8 > ti.static(voronoi.heap_cell.shape[1]):
             status = OUT_OF_BUDGET
-        elif key <= _estimate(voronoi.cost[slot, row, col], row, col, start[0], start[1], floor_weight):
-            size = _size_after_expansion(
-                voronoi, clearance, slot, env, size, row, col, start, everywhere, floor_weight, cfg, clearance_cfg
-            )
+        elif bits_at(voronoi, slot, row, col) & CLOSED == 0:
+            voronoi.cell[slot, row, col] = ti.cast(bits_at(voronoi, slot, row, col) | CLOSED, ti.u8)
+            voronoi.pops[env] += 1
+            size = _size_after_expansion(voronoi, clearance, slot, env, size, row, col, start, everywhere, floor_weight, cfg, clearance_cfg)
     return status
 
 
@@ -214,8 +217,8 @@ def _size_after_expansion(
         if _step_is_open(voronoi, slot, row, col, step):
             medial = on_skeleton(voronoi, clearance, slot, env, to_row, to_col, cfg, clearance_cfg)
             bits = bits_at(voronoi, slot, to_row, to_col)
-            if everywhere > 0 or medial or bits & JOINED != 0:
-                if bits & REACHED == 0 or offer < voronoi.cost[slot, to_row, to_col]:
+            if bits & CLOSED == 0 and (everywhere > 0 or medial or bits & JOINED != 0):
+                if bits & REACHED == 0 or offer < _BETTER * voronoi.cost[slot, to_row, to_col]:
                     voronoi.cost[slot, to_row, to_col] = offer
                     kept = bits & (KNOWN | SKELETON | JOINED)
                     voronoi.cell[slot, to_row, to_col] = ti.cast(kept | REACHED | ((7 - k) << _NEXT_SHIFT), ti.u8)

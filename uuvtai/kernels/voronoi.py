@@ -123,9 +123,7 @@ def _weigh_cells(
 
 
 @ti.func
-def _endpoint_reason(
-    voronoi: In[VoronoiState], slot, start_w, goal_w, tank_cfg: Const[TankConfig], mapping_cfg: Const[MappingConfig]
-):
+def _endpoint_reason(voronoi: In[VoronoiState], slot, start_w, goal_w, tank_cfg: Const[TankConfig], mapping_cfg: Const[MappingConfig]):
     """FAIL_NONE where both ends are traversable."""
     reason = FAIL_NONE
     if _weight_at(voronoi, slot, _cell(start_w, tank_cfg, mapping_cfg)) <= 0:
@@ -168,7 +166,8 @@ def _block_forecast(
                 low, high = _cell(pos_w - reach, tank_cfg, mapping_cfg), _cell(pos_w + reach, tank_cfg, mapping_cfg)
                 for row in range(ti.max(low[0], 0), ti.min(high[0] + 1, n_row)):
                     for col in range(ti.max(low[1], 0), ti.min(high[1] + 1, n_col)):
-                        if (centre_of(row, col, tank_cfg, mapping_cfg.cell_m) - pos_w).norm() < reach:
+                        away = centre_of(row, col, tank_cfg, mapping_cfg.cell_m) - pos_w
+                        if away.dot(away) < reach**2:
                             voronoi.weight[slot, row, col] = 0.0
     voronoi.weight[slot, own[0], own[1]] = own_weight
 
@@ -258,8 +257,8 @@ def overlay_clearance(
     grid_map: In[MapState],
     mask: In[GridMask],
     forecast: In[ForecastState],
-    out: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    env: ti.i32,
+    out: ti.types.ndarray(dtype=ti.f32, ndim=2),  # type: ignore[valid-type]
+    env: int,
     cfg: Const[VoronoiConfig],
     mapping_cfg: Const[MappingConfig],
     tank_cfg: Const[TankConfig],
