@@ -20,10 +20,10 @@ FAULT_ENDPOINTS = 1
 FAULT_STATIC = 2
 FAULT_JOINED = 4
 
-_LAYOUTS = 32
+_LAYOUTS = 16
 """Static layouts drawn for one pair of start and goal."""
-_PAIRS = 8
-"""Pairs of start and goal that are tried."""
+_PAIRS = 32
+"""Pairs of start and goal that are tried: where a wall parts the water, half of them cannot be joined."""
 _PAIR_DRAWS = 64
 _PLACE_DRAWS = 64
 _SWEEPS = 64
@@ -51,10 +51,12 @@ def draw_layout(
             pair = draws // _LAYOUTS
             fault = draw_endpoints(env, pair, mission, scratch, episode, world_cfg)
         layout_fault = fault
-        if draw_static_bodies(env, draws, world, mission, scratch, scene, episode, world_cfg) == 0:
-            layout_fault |= FAULT_STATIC
-        elif is_joined(env, world, mission, scratch, world_cfg) == 0:
-            layout_fault |= FAULT_JOINED
+        if ti.static(world_cfg.static_slots > 0):
+            if draw_static_bodies(env, draws, world, mission, scratch, scene, episode, world_cfg) == 0:
+                layout_fault |= FAULT_STATIC
+        if ti.static(world_cfg.n_fixed_static + world_cfg.static_slots > 0):
+            if layout_fault == 0 and is_joined(env, world, mission, scratch, world_cfg) == 0:
+                layout_fault |= FAULT_JOINED
         joined = ti.cast(layout_fault == 0, ti.i32)
         world.faults[env] = layout_fault
         draws += 1

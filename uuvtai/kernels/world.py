@@ -36,9 +36,10 @@ def generate_scenarios(
             clear_bodies(env, world)
             place_fixed(env, world, path, scratch, scene, fixed, world_cfg)
             draw_layout(env, world, mission, scratch, scene, episode, world_cfg)
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):  # a loop of its own compiles in half the time
-        if pad == 0 and clock.awake[env] == 1:
-            draw_moving_bodies(env, world, path, mission, scratch, scene, episode, world_cfg)
+    if ti.static(world_cfg.dynamic_slots > 0):
+        for env, pad in ti.ndrange(n, ti.static(spread(n))):  # a loop of its own compiles in half the time
+            if pad == 0 and clock.awake[env] == 1:
+                draw_moving_bodies(env, world, path, mission, scratch, scene, episode, world_cfg)
 
 
 @ti.func

@@ -1,0 +1,66 @@
+"""Independent float64 checks of scenarios: gaps between plan views, free space on a fine grid, positions along paths."""
+
+from itertools import pairwise
+
+import numpy as np
+from scipy import ndimage
+
+SPHERE, CYLINDER, BOX = 1, 2, 3
+GRID_M = 0.05
+
+
+def outline(kind, pos, size, yaw, spacing=0.005):
+    """Points on the outline of a body's plan view (n, 2), corners included."""
+    if kind != BOX:
+        angle = np.linspace(0, 2 * np.pi, max(8, int(2 * np.pi * size[0] / spacing)), endpoint=False)
+        return np.asarray(pos[:2]) + size[0] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1], [1, 1]]) * size[:2]
+    sides = [np.linspace(a, b, max(2, int(np.hypot(*(b - a)) / spacing))) for a, b in pairwise(corners)]
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.asarray(pos[:2]) + np.concatenate(sides) @ np.array([[c, s], [-s, c]])
+
+
+def plan_distances(points, kind, pos, size, yaw):
+    """Distances [m] of points (..., 2) to a body's plan view; 0 inside a box, negative inside a disc."""
+    q = np.asarray(points, float) - np.asarray(pos[:2])
+    if kind != BOX:
+        return np.linalg.norm(q, axis=-1) - size[0]
+    c, s = np.cos(yaw), np.sin(yaw)
+    local = np.stack([c * q[..., 0] + s * q[..., 1], c * q[..., 1] - s * q[..., 0]], axis=-1)
+    return np.linalg.norm(np.maximum(np.abs(local) - size[:2], 0.0), axis=-1)
+
+
+def gap(a, b):
+    """Smallest distance between the plan views of two bodies (kind, pos, size, yaw) [m], within 1 mm above the exact one."""
+    return float(min(plan_distances(outline(*a), *b).min(), plan_distances(outline(*b), *a).min()))
+
+
+def wall_distances(points, tank):
+    """Distances [m] of points (..., 2) to the side walls, negative outside."""
+    x, y = points[..., 0], points[..., 1]
+    if tank.shape == "circle":
+        return tank.radius_m - np.hypot(x - 0.5 * sum(tank.x_m), y - 0.5 * sum(tank.y_m))
+    return np.min([x - tank.x_m[0], tank.x_m[1] - x, y - tank.y_m[0], tank.y_m[1] - y], axis=0)
+
+
+def is_joined(start, goal, bodies, tank, clearance):
+    """Whether start and goal lie in one region of cells (8 neighbours) whose centre has the clearance, less half a cell's diagonal."""
+    cols = np.arange(tank.x_m[0] + GRID_M / 2, tank.x_m[1], GRID_M)
+    rows = np.arange(tank.y_m[0] + GRID_M / 2, tank.y_m[1], GRID_M)
+    points = np.stack(np.meshgrid(cols, rows), axis=-1)
+    free = wall_distances(points, tank)
+    for body in bodies:
+        free = np.minimum(free, plan_distances(points, *body))
+    label, _ = ndimage.label(free >= clearance - GRID_M * np.sqrt(0.5), np.ones((3, 3)))
+    cells = [label[int((p[1] - tank.y_m[0]) / GRID_M), int((p[0] - tank.x_m[0]) / GRID_M)] for p in (start, goal)]
+    return cells[0] == cells[1] > 0
+
+
+def path_points(n_way, way, radius, length, spacing=0.02):
+    """Points (n, 2) all along a path."""
+    if n_way == 0:
+        angle = np.linspace(0, 2 * np.pi, int(length / spacing) + 2)
+        return way[0] + abs(radius) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    closed = [*way[:n_way], way[0]]
+    legs = [np.linspace(a, b, int(np.hypot(*(b - a)) / spacing) + 2) for a, b in pairwise(closed)]
+    return np.concatenate(legs)
