@@ -19,9 +19,16 @@ REAL = "real"
 _T = TypeVar("_T")
 
 
-def array(*shape: str, vec: int = 0, dtype: Any = REAL) -> Any:
-    """Declare one array of a struct: named sizes, optional vector length, dtype (default: the run's real type)."""
-    return dataclasses.field(metadata={"shape": shape, "vec": vec, "dtype": dtype})
+PACKET = 16
+"""Lanes of a packed array (lanes.LANES)."""
+
+
+def array(*shape: str, vec: int = 0, dtype: Any = REAL, packed: bool = False) -> Any:
+    """Declare one array of a struct: named sizes, optional vector length, dtype (default: the run's real type).
+
+    ``packed`` groups the last axis into vectors of sixteen neighbours: one packet is one index, which Taichi loads as a whole.
+    """
+    return dataclasses.field(metadata={"shape": shape, "vec": vec, "dtype": dtype, "packed": packed})
 
 
 def allocate(struct: type[_T], sizes: dict[str, int], real: Any = ti.f32) -> _T:
@@ -32,6 +39,8 @@ def allocate(struct: type[_T], sizes: dict[str, int], real: Any = ti.f32) -> _T:
 def _field(declared: dataclasses.Field, sizes: dict[str, int], real: Any) -> Any:
     shape = tuple(sizes[name] for name in declared.metadata["shape"])
     dtype = real if declared.metadata["dtype"] is REAL else declared.metadata["dtype"]
+    if declared.metadata["packed"]:
+        return ti.Vector.field(PACKET, dtype, shape=(*shape[:-1], shape[-1] // PACKET), layout=ti.Layout.AOS)
     if declared.metadata["vec"]:
         return ti.Vector.field(declared.metadata["vec"], dtype, shape=shape, layout=ti.Layout.SOA)
     return ti.field(dtype, shape=shape)
@@ -424,6 +433,8 @@ class ClusterState:
     """1 = clustered in this very step"""
     scan_step: ti.Field = array("n_env", dtype=ti.i32)
     """episode step of the ping that was clustered last, -1 = none yet"""
+    slip_w: ti.Field = array("n_env", vec=2)
+    """[m/s] error of the own measured velocity, as the known walls show it"""
     count: ti.Field = array("n_env", dtype=ti.i32)
     """clusters found"""
     pos_w: ti.Field = array("n_env", "n_cluster", vec=2)
@@ -504,8 +515,8 @@ class ClearanceState:
     """row of the nearest site, -1 = none within clearance.max_m"""
     site_col: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.i16)
     """column of the nearest site"""
-    column_key: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.i32)
-    """scratch: key of the nearest site in the same column (clearance.py)"""
+    row_key: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.i32, packed=True)
+    """scratch: key of the nearest site in the same row (clearance.py)"""
     fresh: ti.Field = array("n_env", dtype=ti.i32)
     """1 = computed in this very step"""
 
@@ -534,7 +545,7 @@ class VoronoiState:
     node_next: ti.Field = array("n_plan", "n_path", dtype=ti.i32)
     """shortcutting: how many nodes the best chord from here spans, 0 = along the cells to the next node"""
     pops: ti.Field = array("n_env", dtype=ti.i32)
-    """cells taken from the heap by the newest plan of this env"""
+    """cells expanded by the newest plan of this env"""
 
 
 @dataclass(frozen=True, eq=False)
