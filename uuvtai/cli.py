@@ -81,12 +81,13 @@ def evaluate(
     if not names:
         raise UsageError("--controller: name at least one of straight, planner, bt or a tree's XML")
 
+    from uuvtai.loader import sensors_of
     from uuvtai.measure.compare import Request, compare
 
     request = Request(
         config=config,
         world=world,
-        sensors=sensors or "the world's own",
+        sensors=sensors_of(world, sensors),
         controllers=names,
         seeds=seed_list,
         episodes=episodes,
@@ -345,8 +346,7 @@ def log_info(file: LogFile, as_json: AsJson = False) -> None:
     for topic in found["topics"]:
         table.add_row(topic["topic"], topic["schema"], str(topic["messages"]), _number(topic["rate_hz"]))
     _stdout().print(table)
-    for key in ("duration_s", "outcome"):
-        _stdout().print(f"{key}: {found[key]}")
+    _stdout().print(f"duration {found['duration_s']:.2f} s, outcome {found['outcome'] or 'none: the log was cut off'}", highlight=False)
 
 
 @log_app.command("export")
@@ -369,9 +369,10 @@ def log_repair(
     """Recover the messages of a log whose writing was cut off."""
     from uuvtai.logs import repair
 
-    target = out or file.with_name(file.name.removesuffix(".part").removesuffix(".mcap") + ".repaired.mcap")
-    found = repair.repair(file, target)
-    typer.echo(f"{target}: {found.messages} messages recovered")
+    found = repair.repair(file, out)
+    for damage in found.damages:
+        _say(damage)
+    typer.echo(f"{found.path}: {found.messages} messages recovered, the last at {found.last_time_s:.2f} s")
 
 
 @log_app.command("video")
@@ -379,10 +380,10 @@ def log_video(
     file: LogFile, out: Annotated[Path | None, typer.Option("--out", help="WebM file [default: beside the log].")] = None
 ) -> None:
     """Render a top-down video of a recorded episode."""
-    from uuvtai.logs import picture
+    from uuvtai.logs import video
 
     target = out or file.with_suffix(".webm")
-    picture.video(file, target)
+    video.video(file, target)
     typer.echo(str(target))
 
 

@@ -21,6 +21,7 @@ from uuvtai.config import Config
 
 PRESET_DIR = Path(__file__).parent / "presets"
 KINDS = {"world": "worlds", "sensors": "sensors", "vehicle": "vehicles", "tree": "trees"}
+DEFAULT_SENSORS = "paper"
 _MAX_BYTES = 1 << 20
 _MAX_EXTENDS = 8
 
@@ -54,7 +55,7 @@ def load_config(
     """
     layer = _read_preset("world", world)
     named = {kind: layer.tree.pop(kind) for kind in ("sensors", "vehicle") if isinstance(layer.tree.get(kind), str)}
-    merged = _read_preset("sensors", sensors or named.get("sensors", "paper"))
+    merged = _read_preset("sensors", sensors or named.get("sensors", DEFAULT_SENSORS))
     if chosen := vehicle or named.get("vehicle"):
         merged.merge(_read_preset("vehicle", chosen))
     if sensors is not None:
@@ -62,6 +63,12 @@ def load_config(
     merged.merge(layer)
     merged.merge(_overrides(overrides or {}))
     return validated(merged.tree, merged.origin)
+
+
+def sensors_of(world: str, sensors: str | None) -> str:
+    """Name of the sensor preset that ``load_config`` takes: the one given, else the world's own, else ``paper``."""
+    own = _read_preset("world", world).tree.get("sensors")
+    return sensors or (own if isinstance(own, str) else DEFAULT_SENSORS)
 
 
 def validated(tree: dict[str, Any], origin: dict[str, str] | None = None) -> Config:
@@ -152,7 +159,7 @@ _SafeLoader.add_implicit_resolver("tag:yaml.org,2002:float", re.compile(r"^[-+]?
 def parsed_yaml(text: str, where: str) -> Any:
     """Python value of a YAML text; ConfigError names ``where`` and the line."""
     try:
-        return yaml.load(text, Loader=_SafeLoader)  # noqa: S506 - subclass of SafeLoader
+        return yaml.load(text, Loader=_SafeLoader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         line = f":{mark.line + 1}" if mark else ""

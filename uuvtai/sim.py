@@ -36,13 +36,15 @@ from uuvtai.kernels import (
     teacher,
     threats,
     tracking,
+    triggers,
+    voronoi,
     world,
 )
 from uuvtai.kernels.grid import outside_cells
 from uuvtai.kernels.recording import copy_rows
 from uuvtai.rrt import RouteFallback
 from uuvtai.runtime import start_taichi
-from uuvtai.scenario import load_fixed, set_scene
+from uuvtai.scenario import check_scenarios, load_fixed, set_scene
 from uuvtai.sizes import array_sizes, check_size
 from uuvtai.tree import FlatTree, load_tree
 
@@ -161,6 +163,7 @@ class Sim:
         with self._stage("world"):
             world.generate_scenarios(s.world, s.path, s.mission, s.scratch, s.scene, s.fixed, s.episode, s.clock, c.world)
             world.move_obstacles(s.world, s.path, s.clock, c.episode)
+        check_scenarios(self.rows(s.world.faults)[mask.cpu().numpy() == 1])
         dynamics.reset_vehicle(s.vehicle, s.params, s.current, s.mission, s.episode, s.clock, c.vehicle, c.disturbance, c.episode)
         actuation.reset_actuation(s.actuation, s.clock)
         proprioception.reset_proprioception(s.ego, s.ego_memory, s.vehicle, s.episode, s.clock, c.sensors)
@@ -232,7 +235,47 @@ class Sim:
             self._teach()
 
     def _plan(self) -> None:
-        raise NotImplementedError
+        c, s = self.config, self.s
+        tank = c.world.tank
+        triggers.fire_triggers(
+            s.route,
+            s.clearance,
+            s.grid_map,
+            s.mask,
+            s.forecast,
+            s.scan,
+            s.ego,
+            s.mission,
+            s.clock,
+            c.route,
+            c.voronoi,
+            c.tracking,
+            c.mapping,
+            tank,
+            c.episode,
+        )
+        voronoi.plan_routes(
+            s.voronoi,
+            s.route,
+            s.clearance,
+            s.grid_map,
+            s.mask,
+            s.mission,
+            s.ego,
+            s.forecast,
+            s.clock,
+            c.voronoi,
+            c.route,
+            c.clearance,
+            c.mapping,
+            tank,
+        )
+        self.fallback.serve(s.route, s.clearance, s.grid_map, s.mask, s.forecast, s.mission, s.ego, s.clock, self._plan_seed)
+        route.follow_route(s.route, s.clearance, s.grid_map, s.ego, s.mission, s.clock, c.route, c.clearance, c.mapping, tank)
+
+    def _plan_seed(self, env: int) -> int:
+        """Seed of the fallback planner's random numbers: a function of the episode's key and step alone."""
+        return (int(self.s.episode.key[env]) + 0x9E3779B1 * int(self.s.clock.step[env])) & 0x7FFFFFFF
 
     def _teach(self) -> None:
         c, s = self.config, self.s

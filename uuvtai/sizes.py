@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 from pathlib import Path
 
@@ -14,6 +15,8 @@ from uuvtai.kernels.reward import TERMS
 from uuvtai.scenario import scenario_sizes
 
 _MAX_ENVS = 1 << 20
+_PLAN_SLOTS = 64
+"""Plans under way at once: far more than a CPU has cores, and the planner's scratch stays small."""
 
 
 def array_sizes(config: Config, n_env: int) -> dict[str, int]:
@@ -36,7 +39,10 @@ def array_sizes(config: Config, n_env: int) -> dict[str, int]:
         "n_forecast": round(config.tracking.horizon_s / config.tracking.forecast_dt_s) + 1,
         "n_row": n_row,
         "n_col": n_col,
+        "n_plan": min(n_env, _PLAN_SLOTS),
         "n_heap": n_row * n_col,
+        "n_path": 2048,
+        "n_ahead": math.ceil(config.route.risk_horizon_m / config.mapping.cell_m) + 2,
         "n_way": config.route.n_way,
         "n_trigger": N_TRIGGER,
         "n_planner": N_PLANNER,

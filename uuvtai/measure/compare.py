@@ -107,7 +107,8 @@ def _draw(request: Request, folder: Path, logs: list[dict[Any, Path]], watch: Wa
     """One picture per recorded episode with every method's trajectory, and the videos."""
     if not logs:
         return
-    from uuvtai.logs.picture import picture, video
+    from uuvtai.logs.picture import picture
+    from uuvtai.logs.video import video
 
     for job in logs[0]:
         files = [paths[job] for paths in logs]
