@@ -24,7 +24,7 @@ GRAZING_RAD = 2.0e-5
 """A pixel whose answer changes when its ray is turned by this may give either answer: float32 places the camera to about 2e-6 m (an offset
 through the attitude, coordinates up to 20 m), which 0.1 m away is 2e-5 rad."""
 
-GRAZING_SHARE = 2.0e-3
+GRAZING_SHARE = 1.0e-4
 """At most this share of the pixels may need that allowance."""
 
 TANK, ROUND_TANK = TankConfig(), TankConfig(shape="circle", x_m=(0.0, 16.0), y_m=(0.0, 16.0))

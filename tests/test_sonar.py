@@ -24,7 +24,7 @@ GRAZING_RAD = 5.0e-6
 """A beam whose answer changes when it is turned by this may give either answer: float32 holds directions to about 2e-7 and positions to
 1e-6 m at 20 m, which 0.2 m away is 5e-6 rad."""
 
-GRAZING_SHARE = 2.0e-3
+GRAZING_SHARE = 1.0e-4
 """At most this share of the beams may need that allowance."""
 
 DOPPLER_TOLERANCE_M_S = 1.0e-4
