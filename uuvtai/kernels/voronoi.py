@@ -167,7 +167,7 @@ def _block_forecast(
                 for row in range(ti.max(low[0], 0), ti.min(high[0] + 1, n_row)):
                     for col in range(ti.max(low[1], 0), ti.min(high[1] + 1, n_col)):
                         away = centre_of(row, col, tank_cfg, mapping_cfg.cell_m) - pos_w
-                        if away.dot(away) < reach**2:
+                        if away.dot(away) < reach**2:  # type: ignore[misc]
                             voronoi.weight[slot, row, col] = 0.0
     voronoi.weight[slot, own[0], own[1]] = own_weight
 
