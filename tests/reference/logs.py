@@ -192,6 +192,7 @@ def _mark(static, dynamic, pos, yaw, ranges, hit, which) -> None:
 
 def _pose(share: float, sway: float) -> tuple[np.ndarray, float]:
     start, goal = np.array(START), np.array(GOAL)
+    share *= 0.94  # it arrives where the goal's radius begins
     pos = start + share * (goal - start)
     pos[1] += sway * math.sin(2 * math.pi * share)
     slope = (goal[1] - start[1]) + sway * 2 * math.pi * math.cos(2 * math.pi * share)

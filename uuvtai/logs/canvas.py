@@ -68,25 +68,17 @@ class Canvas:
             piece = np.column_stack([np.interp(at, along, path[:, axis]) for axis in (0, 1)])
             cv2.polylines(self.image, [_fixed(piece)], False, color, width, cv2.LINE_AA, _SHIFT)
 
-    def area(self, points: Any, color: Color, opacity: float = 1.0) -> None:
+    def area(self, points: Any, color: Color) -> None:
         """Filled polygon in the world."""
-        self.filled(self.pixels(points), color, opacity)
+        self.filled(self.pixels(points), color)
 
     def area_between(self, outer: Any, inner: Any, color: Color) -> None:
         """What lies inside one polygon and outside another."""
         cv2.fillPoly(self.image, [_fixed(self.pixels(outer)), _fixed(self.pixels(inner))], color, cv2.LINE_AA, _SHIFT)
 
-    def filled(self, pixels: np.ndarray, color: Color, opacity: float = 1.0) -> None:
+    def filled(self, pixels: np.ndarray, color: Color) -> None:
         """Filled polygon in pixels."""
-        if opacity >= 1:
-            cv2.fillPoly(self.image, [_fixed(pixels)], color, cv2.LINE_AA, _SHIFT)
-            return
-        low = np.clip(np.floor(pixels.min(axis=0)).astype(int) - 2, 0, None)
-        high = np.ceil(pixels.max(axis=0)).astype(int) + 3
-        part = self.image[low[1] : high[1], low[0] : high[0]]
-        over = part.copy()
-        cv2.fillPoly(over, [_fixed(pixels - low)], color, cv2.LINE_AA, _SHIFT)
-        cv2.addWeighted(over, opacity, part, 1 - opacity, 0, part)
+        cv2.fillPoly(self.image, [_fixed(pixels)], color, cv2.LINE_AA, _SHIFT)
 
     def disc(self, center: Sequence[float], radius_px: float, color: Color, width: int = -1) -> None:
         """Circle around a world point; width -1 fills it."""

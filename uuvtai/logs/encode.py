@@ -75,7 +75,10 @@ def time_text(time_ns: int) -> str:
 
 def dumped(message: dict[str, Any]) -> bytes:
     """A message given as a dict."""
-    return json.dumps(message, separators=(",", ":"), allow_nan=False).encode()
+    try:
+        return json.dumps(message, separators=(",", ":"), allow_nan=False).encode()
+    except ValueError:
+        raise ValueError(f"a number that is not finite: {str(message)[:200]}") from None
 
 
 # ------------------------------------------------------------------------------------------------------------------- poses

@@ -27,6 +27,7 @@ MAX_CHUNK = 64 << 20
 """[bytes] most that a chunk may unpack to: 256 times what we write, far below what would fill a memory"""
 
 _READ = 64 * 1024
+_MESSAGE_HEAD = struct.Struct("<HIQQ")
 _PARSED: dict[int, Callable[[ReadDataStream], Any]] = {
     Opcode.SCHEMA: Schema.read,
     Opcode.CHANNEL: Channel.read,
@@ -97,7 +98,7 @@ def json_attachment(head: LogHead, name: str) -> Any:
         raise LogError(f"the log has no attachment {name}: it was not written by uuv eval --record")
     try:
         return json.loads(head.attachments[name])
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise LogError(f"the log's attachment {name} is not JSON ({error})") from None
 
 
@@ -198,7 +199,7 @@ class Scanner:
                 yield from found
             elif length > rest:
                 raise DamageError(f"a record of {length} bytes is cut off after {rest}")
-            elif opcode in _PARSED:
+            elif opcode in _PARSED or opcode == Opcode.MESSAGE:
                 record = self._parsed(opcode, length)
                 self.at += 9 + length
                 yield record
@@ -210,8 +211,9 @@ class Scanner:
     def _parsed(self, opcode: int, length: int) -> Any:
         if length > MAX_RECORD:
             raise DamageError(f"a record of {length} bytes is longer than any we write")
+        body = self._file.read(length)
         try:
-            return _PARSED[opcode](ReadDataStream(io.BytesIO(self._file.read(length))))
+            return _message(body) if opcode == Opcode.MESSAGE else _PARSED[opcode](ReadDataStream(io.BytesIO(body)))
         except (EndOfFile, struct.error, UnicodeDecodeError) as error:
             raise self._behind(length, f"a record cannot be read ({error or type(error).__name__})") from None
 
@@ -266,6 +268,11 @@ def unpacked(data: bytes, compression: str) -> tuple[bytes, str | None]:
             pieces.append(piece)
 
 
+def _message(body: bytes) -> Message:
+    channel, sequence, log_time, publish_time = _MESSAGE_HEAD.unpack_from(body)
+    return Message(channel, log_time, body[_MESSAGE_HEAD.size :], publish_time, sequence)
+
+
 def split_records(plain: bytes) -> tuple[list[Any], int]:
     """(whole records of a chunk's content, bytes they take)."""
     found: list[Any] = []
@@ -275,9 +282,8 @@ def split_records(plain: bytes) -> tuple[list[Any], int]:
         if at + 9 + length > len(plain):
             break
         body = plain[at + 9 : at + 9 + length]
-        if opcode == Opcode.MESSAGE and length >= 22:
-            channel, sequence, log_time, publish_time = struct.unpack_from("<HIQQ", body)
-            found.append(Message(channel, log_time, body[22:], publish_time, sequence))
+        if opcode == Opcode.MESSAGE and length >= _MESSAGE_HEAD.size:
+            found.append(_message(body))
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             try:
                 found.append(_PARSED[opcode](ReadDataStream(io.BytesIO(body))))
@@ -290,7 +296,7 @@ def split_records(plain: bytes) -> tuple[list[Any], int]:
 def _decoded(path: Path, topic: str, data: bytes) -> dict[str, Any]:
     try:
         return json.loads(data)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise _unreadable(path, f"a message on {topic} is not JSON ({error})") from None
 
 

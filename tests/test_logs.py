@@ -1,0 +1,699 @@
+"""Episode logs: every message against its schema with independent readers, what survives a kill, hostile files, export."""
+
+import base64
+import dataclasses
+import functools
+import hashlib
+import json
+import math
+import os
+import shutil
+import signal
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+import zstandard
+from mcap.reader import make_reader
+from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
+
+from tests.reference import logs as episode
+from uuvtai.kernels import geometry
+from uuvtai.logs.container import CHUNK_MAX, CHUNK_MIN, McapFile
+from uuvtai.logs.errors import LogError
+from uuvtai.logs.export import depth_image, export, file_name, grid_values
+from uuvtai.logs.mcap_log import McapEpisodeLog, unique_names
+from uuvtai.logs.reader import info, read_head, read_messages
+from uuvtai.logs.recording import load_recording
+from uuvtai.logs.repair import repair
+from uuvtai.logs.scenario import body_positions
+from uuvtai.snapshot import KINDS
+
+N_STEP = 210
+DEPTH_ROUNDING_MM = 0.5 + 1e-3
+"""a depth image has whole millimetres"""
+CLOSED_FORM_M = 2e-6
+"""float32 rounding of positions up to 20 m"""
+
+SCHEMAS = {
+    "/tf": "foxglove.FrameTransforms",
+    "/pose": "foxglove.PoseInFrame",
+    "/pose_estimate": "foxglove.PoseInFrame",
+    "/sonar/scan": "foxglove.LaserScan",
+    "/sonar/doppler": "uuv.SonarDoppler",
+    "/camera/depth": "foxglove.CompressedImage",
+    "/map/static": "foxglove.Grid",
+    "/map/dynamic": "foxglove.Grid",
+    "/map/clearance": "foxglove.Grid",
+    "/map/risk": "foxglove.Grid",
+    "/plan": "foxglove.SceneUpdate",
+    "/plan/info": "uuv.Plan",
+    "/goal": "foxglove.SceneUpdate",
+    "/obstacles": "foxglove.SceneUpdate",
+    "/obstacles/truth": "uuv.Obstacles",
+    "/state": "uuv.State",
+    "/action": "uuv.Action",
+    "/policy": "uuv.Policy",
+    "/safety": "uuv.Safety",
+    "/tree": "uuv.Tree",
+    "/log": "foxglove.Log",
+}
+
+
+@pytest.fixture(scope="module")
+def snaps():
+    return list(episode.snapshots(N_STEP, depth=True))
+
+
+@pytest.fixture(scope="module")
+def log_path(tmp_path_factory, snaps):
+    path = tmp_path_factory.mktemp("logs") / "bt_seed7_episode3.mcap"
+    with McapEpisodeLog(path, episode.header(), depth_images=True) as log:
+        for snap in snaps:
+            log.write(snap)
+        log.close(episode.result(N_STEP))
+    return path
+
+
+def strict_json(text):
+    def refuse(name):
+        raise AssertionError(f"{name} is not JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def messages(path):
+    """[(topic, schema, time_ns, publish_ns, data)] as the official Python reader sees them, checksums verified."""
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        return [(c.topic, s, m.log_time, m.publish_time, m.data) for s, c, m in reader.iter_messages(log_time_order=False)]
+
+
+def by_topic(path, topic):
+    return [m.data for m in read_messages(path, [topic])]
+
+
+# ------------------------------------------------------------------------------------------------------------------ content
+
+
+def test_every_topic_has_its_schema_and_every_message_fits_it(log_path):
+    seen, validators = {}, {}
+    for topic, schema, _, _, data in messages(log_path):
+        if topic not in validators:
+            parsed = strict_json(schema.data)
+            jsonschema.Draft202012Validator.check_schema(parsed)
+            validators[topic] = jsonschema.Draft202012Validator(parsed)
+            assert schema.encoding == "jsonschema"
+        validators[topic].validate(strict_json(data))
+        seen[topic] = schema.name
+    assert SCHEMAS.items() <= seen.items()
+    assert seen.keys() - SCHEMAS.keys() == {"/tracks", "/plan/lookahead"}
+
+
+def test_rates(log_path):
+    counts = {entry["topic"]: entry["messages"] for entry in info(log_path)["topics"]}
+    every_step = ["/tf", "/pose", "/pose_estimate", "/sonar/scan", "/sonar/doppler", "/state", "/action", "/policy", "/safety", "/tree"]
+    assert {counts[topic] for topic in every_step} == {N_STEP + 1}
+    assert {counts[topic] for topic in ("/obstacles", "/obstacles/truth", "/goal")} == {N_STEP // 5 + 1}
+    assert counts["/map/static"] == N_STEP // 25 + 2  # step 0, then 2 Hz, and the last step
+    assert counts["/camera/depth"] == N_STEP // 25 + 1
+    assert counts["/plan"] == counts["/plan/info"] == 2
+    assert counts["/log"] == 3
+
+
+def test_the_final_step_shows_the_obstacles_even_off_their_rate(tmp_path):
+    with McapEpisodeLog(tmp_path / "a.mcap", episode.header()) as log:
+        for snap in episode.snapshots(13, maps=False):
+            log.write(snap)
+        log.close(episode.result(13))
+    times = [m.time_s for m in read_messages(tmp_path / "a.mcap", ["/obstacles/truth"])]
+    assert times == pytest.approx([0.0, 0.1, 0.2, 0.26])
+
+
+def test_times_are_simulation_time_from_zero(log_path):
+    stamps = {}
+    for topic, _, log_time, publish_time, _ in messages(log_path):
+        assert log_time == publish_time
+        stamps.setdefault(topic, []).append(log_time)
+    assert stamps["/pose"] == [round(step * episode.DT * 1e9) for step in range(N_STEP + 1)]
+
+
+def test_metadata_and_attachments_come_first_and_the_result_last(log_path):
+    with log_path.open("rb") as file:
+        kinds = [type(record) for record in StreamReader(file, emit_chunks=True).records]
+    data = kinds[: kinds.index(Chunk)]
+    assert [kind for kind in data if kind in (Metadata, Attachment)] == [Metadata, Attachment, Attachment]
+    assert data.index(Metadata) < min(data.index(Schema), data.index(Channel))
+    behind = kinds[len(kinds) - kinds[::-1].index(Chunk) :]
+    assert Metadata in behind and Attachment not in behind
+    head = read_head(log_path)
+    run, result = head.metadata["uuv.run"], head.metadata["uuv.result"]
+    assert {"version", "git_sha", "seed", "episode", "config_sha256", "checkpoint_sha256", "frames"} <= run.keys()
+    assert run["config_sha256"] == hashlib.sha256(head.attachments["config.yaml"]).hexdigest()
+    assert {"outcome", "return", "time_s", "min_clearance_m", "replans"} <= result.keys()
+    assert (result["outcome"], result["replans"], float(result["return"])) == ("success", "3", 12.5)
+    assert json.loads(head.attachments["scenario.json"]) == episode.scenario()
+
+
+def test_chunks_are_zstd_of_64_to_256_kib(log_path):
+    with log_path.open("rb") as file:
+        chunks = make_reader(file).get_summary().chunk_indexes
+    assert {chunk.compression for chunk in chunks} == {"zstd"}
+    assert len(chunks) > 10
+    assert all(CHUNK_MIN <= chunk.uncompressed_size <= CHUNK_MAX for chunk in chunks[:-1])
+    assert chunks[-1].uncompressed_size <= CHUNK_MAX
+
+
+def test_sonar_is_logged_as_sensed(log_path, snaps):
+    scans, dopplers = by_topic(log_path, "/sonar/scan"), by_topic(log_path, "/sonar/doppler")
+    snap, scan, doppler = snaps[10], scans[10], dopplers[10]
+    hit = snap.sonar_hit == 1
+    ranges = np.array(scan["ranges"], np.float32)
+    assert hit.any() and not hit.all()
+    np.testing.assert_array_equal(ranges[hit], snap.sonar_range_m[hit])
+    assert (ranges[~hit] == episode.MAX_RANGE_M).all()
+    np.testing.assert_array_equal(np.array(scan["intensities"]) > 0, hit)
+    assert scan["start_angle"] == 0 and scan["end_angle"] == pytest.approx(2 * math.pi * 255 / 256, abs=1e-15)
+    np.testing.assert_array_equal(np.array(doppler["velocity"], np.float32)[hit], snap.sonar_doppler_m_s[hit])
+
+
+def test_a_late_scan_carries_the_time_of_its_ping(tmp_path, snaps):
+    late = dataclasses.replace(snaps[40], sonar_ping_step=35)
+    with McapEpisodeLog(tmp_path / "a.mcap", episode.header()) as log:
+        log.write(late)
+        log.write(dataclasses.replace(snaps[41], sonar_fresh=False))
+        log.close(episode.result(41))
+    (scan,) = read_messages(tmp_path / "a.mcap", ["/sonar/scan"])
+    assert scan.time_s == pytest.approx(0.8)
+    assert scan.data["timestamp"] == {"sec": 0, "nsec": 700_000_000}
+
+
+def test_maps_keep_exact_values_and_the_corner_of_their_first_cell(log_path, snaps):
+    for topic, name in (("/map/static", "static"), ("/map/dynamic", "dynamic"), ("/map/clearance", "clearance_m"), ("/map/risk", "risk")):
+        grid = by_topic(log_path, topic)[-1]
+        np.testing.assert_array_equal(grid_values(grid), getattr(snaps[-1].maps, name))
+        assert (grid["pose"]["position"]["x"], grid["pose"]["position"]["y"]) == episode.ORIGIN
+        assert [(f["name"], f["offset"], f["type"]) for f in grid["fields"]] == [
+            ("red", 0, 1),
+            ("green", 1, 1),
+            ("blue", 2, 1),
+            ("alpha", 3, 1),
+            ("value", 4, 7),
+        ]
+        assert grid["row_stride"] == grid["column_count"] * grid["cell_stride"]
+    red = np.frombuffer(base64.b64decode(by_topic(log_path, "/map/dynamic")[-1]["data"]), np.uint8).reshape(*episode.SHAPE, 8)
+    peak = np.unravel_index(snaps[-1].maps.dynamic.argmax(), episode.SHAPE)
+    assert red[peak][0] > 200 and red[peak][3] > 100
+
+
+def test_depth_images_are_millimetres(log_path, snaps):
+    image = depth_image(by_topic(log_path, "/camera/depth")[2])
+    assert image.dtype == np.uint16
+    np.testing.assert_allclose(image, snaps[50].depth_image_m * 1000.0, atol=DEPTH_ROUNDING_MM)
+
+
+def test_frames_chain_from_the_world_to_a_level_sonar_and_an_optical_camera(log_path, snaps):
+    transforms = {t["child_frame_id"]: t for t in by_topic(log_path, "/tf")[77]["transforms"]}
+    assert {name: t["parent_frame_id"] for name, t in transforms.items()} == {"base": "world", "sonar": "base", "camera": "base"}
+    rotation = {name: _matrix(t["rotation"]) for name, t in transforms.items()}
+    yaw = snaps[77].estimate_rpy[2]
+    level = np.array([[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]])
+    np.testing.assert_allclose(rotation["base"] @ rotation["sonar"], level, atol=1e-6)
+    np.testing.assert_allclose(rotation["camera"] @ [0, 0, 1], [1, 0, 0], atol=1e-12)  # depth along body x
+    np.testing.assert_allclose(rotation["camera"] @ [1, 0, 0], [0, -1, 0], atol=1e-12)  # image right = body right
+
+
+def _matrix(q):
+    w, x, y, z = (q[name] for name in "wxyz")
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def test_the_scenario_gives_every_obstacle_at_any_time(log_path):
+    from uuvtai.scenario import path_position
+
+    scenario = read_head(log_path).scenario
+    for message in read_messages(log_path, ["/obstacles/truth"]):
+        for body, seen in zip(scenario["bodies"], message.data["obstacles"], strict=True):
+            at = body_positions(body, np.array([message.time_s]))[0]
+            np.testing.assert_allclose([seen["x"], seen["y"], seen["z"]], at, atol=CLOSED_FORM_M)
+            assert seen["kind"] == body["kind"]
+            if body["path"]:
+                np.testing.assert_allclose(at[:2], path_position(body["path"], message.time_s), atol=1e-12)
+                assert math.hypot(seen["vx"], seen["vy"]) == pytest.approx(body["path"]["speed_m_s"], abs=2e-3)
+
+
+def test_null_stands_only_where_something_does_not_exist(log_path):
+    safety, policy, action = (by_topic(log_path, topic) for topic in ("/safety", "/policy", "/action"))
+    assert safety[0]["ttc_s"] == pytest.approx(2.3) and safety[1]["ttc_s"] is None
+    assert policy[0]["value"] is None and policy[0]["alive"] == pytest.approx(0.01)
+    assert policy[0]["reward"] == pytest.approx(sum(policy[0][name] for name in episode.TERMS))
+    assert action[0]["policy"] is None and action[0]["teacher"] == pytest.approx([0.8, 0.0, 0.1, -0.2])
+    assert action[75]["leaf"] == "Evade"
+
+
+def test_far_time_to_collision_is_null(tmp_path, snaps):
+    with McapEpisodeLog(tmp_path / "a.mcap", episode.header()) as log:
+        log.write(dataclasses.replace(snaps[0], ttc_s=1e6))
+        log.close(episode.result(0))
+    assert by_topic(tmp_path / "a.mcap", "/safety")[0]["ttc_s"] is None
+
+
+def test_replans_say_who_planned_and_why(log_path):
+    first, second = by_topic(log_path, "/plan/info")
+    assert (first["planner"], first["trigger"], first["fallback"]) == ("voronoi", "initial", "")
+    assert (second["planner"], second["trigger"], second["fallback"]) == ("rrt", "stuck", "no_path")
+    lines = [entry["message"] for entry in by_topic(log_path, "/log")]
+    assert "stuck" in lines[1] and "rrt" in lines[1] and lines[-1] == "outcome: success"
+
+
+def test_tree_names_stay_apart(log_path):
+    assert unique_names(("A", "B", "A")) == ("A", "B", "A#2")
+    assert by_topic(log_path, "/tree")[0] == {
+        "Root": "SUCCESS",
+        "Emergency": "FAILURE",
+        "Back off": "IDLE",
+        "Evade": "FAILURE",
+        "Follow": "SUCCESS",
+        "Follow#5": "IDLE",
+    }
+
+
+def test_kinds_are_those_of_the_simulator():
+    assert KINDS == {geometry.SPHERE: "sphere", geometry.CYLINDER: "cylinder", geometry.BOX: "box"}
+
+
+@pytest.mark.parametrize("field", ["pos_w", "estimate_pos_w", "sonar_range_m", "rpm", "obstacle_pos_w", "tracks", "clearance_m"])
+@pytest.mark.parametrize("bad", [np.nan, -np.inf])
+def test_numbers_that_are_not_finite_are_refused(tmp_path, snaps, field, bad):
+    good = getattr(snaps[0], field)
+    spoiled = bad if isinstance(good, float) else np.full_like(good, bad)
+    with McapEpisodeLog(tmp_path / "a.mcap", episode.header()) as log, pytest.raises(ValueError, match="not finite"):
+        log.write(dataclasses.replace(snaps[0], **{field: spoiled}))
+
+
+def test_maps_that_are_not_finite_are_refused(tmp_path, snaps):
+    maps = dataclasses.replace(snaps[0].maps, static=np.full(episode.SHAPE, np.nan, np.float32))
+    with McapEpisodeLog(tmp_path / "a.mcap", episode.header()) as log, pytest.raises(ValueError, match="not finite"):
+        log.write(dataclasses.replace(snaps[0], maps=maps))
+
+
+def test_due_asks_for_maps_at_2_hz_on_replans_and_at_the_end(tmp_path, snaps):
+    with McapEpisodeLog(tmp_path / "a.mcap", episode.header(), depth_images=True) as log:
+        asked = []
+        for snap in snaps[:60]:
+            due = log.due(snap.step)
+            asked += [snap.step] if due.maps else []
+            log.write(dataclasses.replace(snap, maps=snaps[0].maps if due.maps else None))
+        assert asked == [0, 25, 50]
+        assert log.due(60, replanned=True).maps and log.due(60, final=True).maps and not log.due(60).maps
+        assert log.due(75).depth_image and not log.due(74).depth_image
+    with McapEpisodeLog(tmp_path / "b.mcap", episode.header()) as log:
+        assert not log.due(0).depth_image
+
+
+# ------------------------------------------------------------------------------------------------------------------ viewers
+
+
+def test_schemas_keep_to_what_the_viewers_parse(log_path):
+    """Lichtblick's parser: one plain type per property, or a choice of numbers; lists of numbers, strings, booleans or objects."""
+
+    def check(schema, where):
+        assert schema["type"] == "object", where
+        for name, inner in schema["properties"].items():
+            if "oneOf" in inner:
+                assert all(isinstance(choice["const"], int) for choice in inner["oneOf"]), (where, name)
+                continue
+            assert inner["type"] in ("boolean", "string", "number", "integer", "object", "array"), (where, name)
+            if inner["type"] == "object":
+                check(inner, f"{where}.{name}")
+            if inner["type"] == "array":
+                assert inner["items"]["type"] in ("boolean", "string", "number", "integer", "object"), (where, name)
+                if inner["items"]["type"] == "object":
+                    check(inner["items"], f"{where}.{name}")
+
+    with log_path.open("rb") as file:
+        schemas = make_reader(file).get_summary().schemas.values()
+    assert len(schemas) == 16
+    for schema in schemas:
+        check(json.loads(schema.data), schema.name)
+
+
+def test_the_viewers_own_reader_decodes_everything(log_path):
+    """@mcap/core with its decompressor, ajv and the official Foxglove schemas."""
+    folder = Path(__file__).parent / "js"
+    node = shutil.which("node")
+    if node is None or not (folder / "node_modules").is_dir():
+        pytest.skip("needs node and `npm ci` in tests/js (bootstrap.py does it)")
+    done = subprocess.run([node, "read_log.mjs", str(log_path)], cwd=folder, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["unlikeOfficial"] == []
+    assert found["counts"] == {entry["topic"]: entry["messages"] for entry in info(log_path)["topics"]}
+    assert found["metadata"] == ["uuv.run", "uuv.result"] and found["attachments"] == ["config.yaml", "scenario.json"]
+
+
+def test_the_layout_shows_only_topics_that_exist():
+    layout = json.loads((Path(sys.modules["uuvtai"].__file__).parent / "presets/layout/navigation.json").read_text())
+    panels = layout["configById"]
+    topics = set(panels["3D!scene"]["topics"])
+    for panel in panels.values():
+        topics |= {path["value"].partition(".")[0] for path in panel.get("paths", [])}
+    topics.add(panels["RawMessages!tree"]["topicPath"])
+    assert topics <= {*SCHEMAS, "/plan/lookahead"}
+    assert _leaves(layout["layout"]) == set(panels)
+
+
+def _leaves(node):
+    return {node} if isinstance(node, str) else _leaves(node["first"]) | _leaves(node["second"])
+
+
+# ------------------------------------------------------------------------------------------------------- kills and failures
+
+
+def test_the_file_gets_its_name_only_when_it_is_complete(tmp_path, snaps):
+    path, part = tmp_path / "new" / "a.mcap", tmp_path / "new" / "a.mcap.part"
+    log = McapEpisodeLog(path, episode.header())
+    log.write(snaps[0])
+    assert part.exists() and not path.exists()
+    log.close(episode.result(0))
+    assert path.exists() and not part.exists()
+
+
+def test_an_abandoned_log_stays_as_part_and_can_be_repaired(tmp_path, snaps):
+    path = tmp_path / "a.mcap"
+    with pytest.raises(KeyboardInterrupt), McapEpisodeLog(path, episode.header()) as log:
+        for snap in snaps[:30]:
+            log.write(snap)
+        raise KeyboardInterrupt
+    assert not path.exists()
+    saved = repair(tmp_path / "a.mcap.part", path)  # the natural name, whose .part is the input
+    assert (tmp_path / "a.mcap.part").exists()
+    assert saved.last_time_s == pytest.approx(29 * episode.DT) and not saved.complete
+    assert len(by_topic(path, "/pose")) == 30
+
+
+CHILD = """
+import sys
+from pathlib import Path
+from tests.reference import logs as episode
+from uuvtai.logs import container
+from uuvtai.logs.mcap_log import McapEpisodeLog
+sent, add = 0, container.McapFile.add_message
+def counted(self, *arguments):
+    global sent
+    sent += 1
+    print(sent, flush=True)
+    add(self, *arguments)
+container.McapFile.add_message = counted
+with McapEpisodeLog(Path(sys.argv[1]), episode.header()) as log:
+    for snap in episode.snapshots(3000, maps=sys.argv[2] == "maps"):
+        log.write(snap)
+"""
+
+
+@pytest.mark.parametrize(("maps", "kill_at"), [("none", 1500), ("none", 6001), ("maps", 3333)])
+def test_sigkill_loses_at_most_two_percent(tmp_path, maps, kill_at):
+    path = tmp_path / "a.mcap"
+    root = Path(__file__).parent.parent
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    with subprocess.Popen([sys.executable, "-c", CHILD, str(path), maps], cwd=root, env=environment, stdout=subprocess.PIPE) as child:
+        for line in child.stdout:
+            if int(line) >= kill_at:
+                child.send_signal(signal.SIGKILL)
+                break
+        sent = int((child.stdout.read().split() or [kill_at])[-1])
+    part = tmp_path / "a.mcap.part"
+    before = part.read_bytes()
+    saved = repair(part)
+    assert saved.path == tmp_path / "a.repaired.mcap"
+    assert part.read_bytes() == before
+    assert saved.messages >= 0.98 * sent
+    assert len(messages(saved.path)) == saved.messages  # the official reader agrees, with indexes and checksums
+    head = read_head(saved.path)
+    assert next(iter(head.metadata)) == "uuv.run" and "uuv.result" not in head.metadata
+    assert head.metadata["uuv.repair"]["messages"] == str(saved.messages)
+    assert info(saved.path)["outcome"] is None
+
+
+def test_a_file_cut_anywhere_gives_back_a_prefix(log_path, tmp_path):
+    """At least every chunk that is whole, and never anything that was not there."""
+    whole, data = log_path.read_bytes(), [m[4] for m in messages(log_path)]
+    with log_path.open("rb") as file:
+        ends = [(index.chunk_start_offset + index.chunk_length) for index in make_reader(file).get_summary().chunk_indexes]
+    with log_path.open("rb") as file:
+        sizes = [len(breakup_chunk(record)) for record in StreamReader(file, emit_chunks=True).records if isinstance(record, Chunk)]
+    recovered = []
+    for i, cut in enumerate(np.linspace(ends[0], len(whole), 25).astype(int)):
+        path = tmp_path / f"{i}.mcap"
+        path.write_bytes(whole[:cut])
+        saved = repair(path, tmp_path / f"{i}.out.mcap")
+        assert [m[4] for m in messages(saved.path)] == data[: saved.messages]
+        assert saved.messages >= sum(size for size, end in zip(sizes, ends, strict=True) if end <= cut)
+        assert saved.complete == (cut == len(whole))
+        recovered.append(saved.messages)
+    assert recovered == sorted(recovered) and recovered[-1] == len(data)
+
+
+def test_a_damaged_chunk_costs_only_itself(log_path, tmp_path):
+    with log_path.open("rb") as file:
+        index = make_reader(file).get_summary().chunk_indexes[4]
+    spoiled = bytearray(log_path.read_bytes())
+    middle = index.chunk_start_offset + index.chunk_length // 2
+    spoiled[middle : middle + 8] = b"\xff" * 8
+    (tmp_path / "a.mcap").write_bytes(spoiled)
+    with pytest.raises(LogError, match="uuv log repair"):
+        info(tmp_path / "a.mcap")
+    saved = repair(tmp_path / "a.mcap")
+    original = {(m[0], m[2], m[4]) for m in messages(log_path)}
+    kept = {(m[0], m[2], m[4]) for m in messages(saved.path)}
+    assert kept < original and len(saved.damages) == 1
+    lost = {time for _, time, _ in original - kept}
+    assert min(lost) >= index.message_start_time and max(lost) <= index.message_end_time
+    assert read_head(saved.path).metadata["uuv.result"]["outcome"] == "success"
+
+
+def test_a_whole_file_is_copied_completely(log_path, tmp_path):
+    saved = repair(log_path, tmp_path / "b.mcap")
+    assert saved.complete and saved.damages == ()
+    assert [m[4] for m in messages(saved.path)] == [m[4] for m in messages(log_path)]
+    assert "uuv.repair" not in read_head(saved.path).metadata
+
+
+def test_repair_never_overwrites(log_path, tmp_path):
+    (tmp_path / "b.mcap").write_text("mine")
+    with pytest.raises(LogError, match="already there"):
+        repair(log_path, tmp_path / "b.mcap")
+    with pytest.raises(LogError, match="already there"):
+        repair(log_path, log_path)
+    assert (tmp_path / "b.mcap").read_text() == "mine"
+
+
+@pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r\n", b"not a log at all", b"\x89MCAP0\r\n" + b"\x07" * 300])
+def test_files_without_anything_in_them(tmp_path, content):
+    (tmp_path / "a.mcap").write_bytes(content)
+    with pytest.raises(LogError, match=r"a\.mcap"):
+        info(tmp_path / "a.mcap")
+    with pytest.raises(LogError, match="nothing can be recovered"):
+        repair(tmp_path / "a.mcap", tmp_path / "out.mcap")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a.mcap"]
+
+
+@pytest.mark.parametrize("tool", [info, repair, lambda path: export(path, path.parent / "out"), lambda path: list(read_messages(path))])
+def test_a_missing_file_is_named(tmp_path, tool):
+    with pytest.raises(LogError, match=r"nowhere\.mcap.*cannot open"):
+        tool(tmp_path / "nowhere.mcap")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_leaves_nothing(tmp_path, snaps):
+    """/dev/full takes the part file's place."""
+    path = tmp_path / "a.mcap"
+    (tmp_path / "a.mcap.part").symlink_to("/dev/full")
+    with pytest.raises(LogError, match=r"a\.mcap: cannot write the log \(No space left"), McapEpisodeLog(path, episode.header()) as log:
+        for snap in snaps:
+            log.write(snap)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_during_repair_leaves_nothing(log_path, tmp_path):
+    (tmp_path / "b.mcap.repairing").symlink_to("/dev/full")
+    with pytest.raises(LogError, match="cannot write the repaired log"):
+        repair(log_path, tmp_path / "b.mcap")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_cannot_be_made(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(LogError, match="cannot write the log"):
+        McapEpisodeLog(tmp_path / "file" / "logs" / "a.mcap", episode.header())
+
+
+# ------------------------------------------------------------------------------------------------------------- hostile files
+
+
+def chunk_record(data, unpacked_size, compression=b"zstd"):
+    content = struct.pack("<QQQII", 0, 0, unpacked_size, 0, len(compression)) + compression + struct.pack("<Q", len(data)) + data
+    return struct.pack("<BQ", 6, len(content)) + content
+
+
+@pytest.mark.parametrize("claimed", [1000, 1 << 40])
+def test_a_decompression_bomb_is_not_unpacked(tmp_path, claimed):
+    bomb = zstandard.ZstdCompressor().compress(bytes(200 << 20))
+    assert len(bomb) < 100_000
+    (tmp_path / "a.mcap").write_bytes(b"\x89MCAP0\r\n" + chunk_record(bomb, claimed))
+    with pytest.raises(LogError, match="unpack"):
+        info(tmp_path / "a.mcap")
+
+
+def test_a_record_longer_than_the_file_is_not_believed(tmp_path):
+    (tmp_path / "a.mcap").write_bytes(b"\x89MCAP0\r\n" + struct.pack("<BQ", 9, 1 << 60) + b"abc")
+    with pytest.raises(LogError, match="cut off"):
+        info(tmp_path / "a.mcap")
+
+
+def test_an_unknown_compression_is_named(tmp_path):
+    (tmp_path / "a.mcap").write_bytes(b"\x89MCAP0\r\n" + chunk_record(b"abc", 3, b"brot"))
+    with pytest.raises(LogError, match="brot"):
+        info(tmp_path / "a.mcap")
+
+
+def test_no_damage_ends_in_anything_but_a_clear_error(tmp_path):
+    """Random bytes in random places: every tool either works or raises LogError."""
+    path = tmp_path / "a.mcap"
+    with McapEpisodeLog(path, episode.header()) as log:
+        for snap in episode.snapshots(12):
+            log.write(snap)
+        log.close(episode.result(12))
+    whole, rng, failed = path.read_bytes(), np.random.default_rng(5), 0
+    for trial in range(120):
+        spoiled = bytearray(whole)
+        begin = int(rng.integers(8, len(whole))) if trial % 2 else int(rng.integers(8, 60_000) % len(whole))
+        spoiled[begin : begin + int(rng.integers(1, 12))] = rng.bytes(int(rng.integers(1, 12)))
+        path.write_bytes(spoiled)
+        for tool in (info, load_recording, functools.partial(repair, out=tmp_path / f"{trial}.mcap")):
+            try:
+                tool(path)
+            except LogError:
+                failed += 1
+    assert failed > 100
+
+
+def test_a_message_of_an_undeclared_channel(tmp_path):
+    file = McapFile(tmp_path / "a.mcap")
+    file._counts[9] = 0
+    file.add_message(9, 0, b"{}")
+    file.finish()
+    with pytest.raises(LogError, match="channel 9"):
+        list(read_messages(tmp_path / "a.mcap"))
+
+
+def test_records_of_other_writers_are_read(tmp_path):
+    """No chunks at all, as other tools may write."""
+    from mcap.writer import Writer
+
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file, use_chunking=False)
+        writer.start()
+        schema = writer.register_schema("uuv.Safety", "jsonschema", b"{}")
+        channel = writer.register_channel("/safety", "json", schema)
+        writer.add_message(channel, 5, b'{"clearance_m":1}', 5)
+        writer.finish()
+    assert info(tmp_path / "a.mcap")["messages"] == 1
+
+
+# ------------------------------------------------------------------------------------------------------------------- export
+
+
+def test_export_as_json_lines(log_path, tmp_path):
+    files = {path.name: path for path in export(log_path, tmp_path / "out")}
+    lines = [json.loads(line) for line in files["safety.jsonl"].read_text().splitlines()]
+    expected = [{"t": m.time_s, **m.data} for m in read_messages(log_path, ["/safety"])]
+    assert lines == expected
+    assert {"config.yaml", "scenario.json", "metadata.json", "map_static.jsonl"} <= files.keys()
+    assert files["config.yaml"].read_bytes() == episode.header().config_yaml.encode()
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(files)
+
+
+def test_export_as_csv(log_path, tmp_path):
+    files = {path.name: path for path in export(log_path, tmp_path / "out", ["/state", "/safety"], fmt="csv")}
+    head, first, second = files["safety.csv"].read_text().splitlines()[:3]
+    assert head == "t,clearance_m,ttc_s,path_risk,replan_trigger"
+    assert first.split(",")[2] == "2.29999995" and second.split(",")[2] == ""  # null is empty
+    table = np.genfromtxt(files["state.csv"], delimiter=",", names=True)
+    assert len(table) == N_STEP + 1 and table["position0"][0] == pytest.approx(episode.START[0])
+
+
+def test_export_as_arrays(log_path, tmp_path, snaps):
+    topics = ["/sonar/scan", "/map/static", "/camera/depth", "/log", "/safety"]
+    files = {path.name: path for path in export(log_path, tmp_path / "out", topics, fmt="npz")}
+    scan, grid, image, events, safety = (
+        np.load(files[f"{name}.npz"]) for name in ("sonar_scan", "map_static", "camera_depth", "log", "safety")
+    )
+    assert scan["ranges"].shape == (N_STEP + 1, episode.N_RAY)
+    np.testing.assert_array_equal(grid["value"][-1], snaps[-1].maps.static)
+    assert image["depth_mm"].shape[1:] == (72, 128)
+    assert events["file"].shape == (3,)
+    assert np.isnan(safety["ttc_s"][1])
+
+
+def test_export_of_an_unknown_topic_or_format(log_path, tmp_path):
+    with pytest.raises(LogError, match=r"/nothing; it has .*/pose"):
+        export(log_path, tmp_path / "out", ["/nothing"])
+    with pytest.raises(LogError, match="jsonl, csv, npz"):
+        export(log_path, tmp_path / "out", fmt="xls")
+    assert not (tmp_path / "out").exists()
+
+
+def test_export_where_nothing_can_be_written(log_path, tmp_path):
+    (tmp_path / "out").write_text("in the way")
+    with pytest.raises(LogError, match="cannot write the export"):
+        export(log_path, tmp_path / "out")
+    assert (tmp_path / "out").read_text() == "in the way"
+
+
+def hostile_log(path, topic="/a", data=b'{"x":1}', names=()):
+    file = McapFile(path)
+    for name in names:
+        file.add_attachment(name, "text/plain", name.encode())
+    file.add_message(file.add_channel(topic, file.add_schema("s", "jsonschema", b"{}")), 0, data)
+    file.finish()
+    return path
+
+
+def test_names_in_a_log_cannot_leave_the_folder(tmp_path):
+    names = ["../../evil", "/etc/evil", "..\\evil", "..", "a/b", ".hidden", "x" * 300, "metadata.json"]
+    path = hostile_log(tmp_path / "a.mcap", topic="/../../outside", names=names)
+    out = tmp_path / "deep" / "out"
+    files = export(path, out)
+    assert len(files) == len(names) + 2
+    assert {file.parent for file in files} == {out}
+    assert all(file.is_file() and not file.name.startswith(".") for file in files)
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["a.mcap", "deep"]
+    assert file_name("..") == file_name("/") == file_name("") == "unnamed"
+
+
+@pytest.mark.parametrize("data", [b"not json", b'{"cell_stride":8}', b'{"format":"png","data":"AAAA"}'])
+def test_messages_unlike_their_schema_are_reported(tmp_path, data):
+    path = hostile_log(tmp_path / "a.mcap", data=data)
+    with pytest.raises(LogError):
+        export(path, tmp_path / "out", fmt="npz")
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_info_counts_what_is_there(log_path):
+    found = info(log_path)
+    assert found["messages"] == len(messages(log_path)) == sum(entry["messages"] for entry in found["topics"])
+    assert found["duration_s"] == pytest.approx(N_STEP * episode.DT) and found["outcome"] == "success"
+    assert found["bytes"] == log_path.stat().st_size
+    json.dumps(found, allow_nan=False)
