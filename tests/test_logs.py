@@ -211,6 +211,15 @@ def test_maps_keep_exact_values_and_the_corner_of_their_first_cell(log_path, sna
     assert red[peak][0] > 200 and red[peak][3] > 100
 
 
+def test_clearance_carries_the_time_of_its_map(tmp_path, snaps):
+    maps = dataclasses.replace(snaps[0].maps, clearance_step=30)
+    with McapEpisodeLog(tmp_path / "a.mcap", episode.header()) as log:
+        log.write(dataclasses.replace(snaps[33], maps=maps))
+        log.close(episode.result(33))
+    stamps = {topic: by_topic(tmp_path / "a.mcap", f"/map/{topic}")[0]["timestamp"]["nsec"] for topic in ("static", "clearance", "risk")}
+    assert stamps == {"static": 660_000_000, "clearance": 600_000_000, "risk": 600_000_000}
+
+
 def test_depth_images_are_millimetres(log_path, snaps):
     image = depth_image(by_topic(log_path, "/camera/depth")[2])
     assert image.dtype == np.uint16

@@ -59,6 +59,8 @@ class MapLayers:
     clearance_m: np.ndarray
     """[m]"""
     risk: np.ndarray | None = None
+    clearance_step: int | None = None
+    """step whose map clearance and risk were computed from; None = this one"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,9 +188,3 @@ class EpisodeResult:
     """by trigger"""
     planned_by: dict[str, int] = field(default_factory=dict)
     """routes by planner"""
-
-
-def risk_of(static: np.ndarray, dynamic: np.ndarray, clearance_m: np.ndarray, clearance_cfg: Any) -> np.ndarray:
-    """Risk map of the paper, alpha_m M^s + alpha_d M^d + alpha_delta / (delta + epsilon); ``clearance_cfg`` = the config's section."""
-    near = clearance_cfg.risk_clearance / (clearance_m + clearance_cfg.risk_epsilon_m)
-    return (clearance_cfg.risk_static * static + clearance_cfg.risk_dynamic * dynamic + near).astype(np.float32)

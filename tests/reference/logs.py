@@ -9,7 +9,7 @@ import numpy as np
 
 from uuvtai.config import Config
 from uuvtai.logs.scenario import body_positions, scenario_document
-from uuvtai.snapshot import EpisodeHeader, EpisodeResult, EpisodeSnapshot, MapLayers, risk_of
+from uuvtai.snapshot import EpisodeHeader, EpisodeResult, EpisodeSnapshot, MapLayers
 
 DT = 0.02
 N_RAY = 256
@@ -158,7 +158,8 @@ def layers(static: np.ndarray, dynamic: np.ndarray) -> MapLayers:
             source = np.roll(occupied, (dr, dc), (0, 1))
             clearance = np.where(source, np.minimum(clearance, CELL_M * math.hypot(dr, dc)), clearance)
     clearance = clearance.astype(np.float32)
-    return MapLayers(ORIGIN, CELL_M, static.copy(), dynamic.copy(), clearance, risk_of(static, dynamic, clearance, config().clearance))
+    risk = (static + dynamic + 0.1 / (clearance + 0.1)).astype(np.float32)
+    return MapLayers(ORIGIN, CELL_M, static.copy(), dynamic.copy(), clearance, risk)
 
 
 def cast(pos: np.ndarray, yaw: float, bodies: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

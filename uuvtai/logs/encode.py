@@ -162,8 +162,9 @@ _FIELDS = [{"name": name, "offset": i, "type": schemas.UINT8} for i, name in enu
 _FIELDS.append({"name": "value", "offset": 4, "type": schemas.FLOAT32})
 
 
-def grids(stamp: str, maps: MapLayers) -> dict[str, bytes]:
-    """Messages by topic. Colours are for viewers, ``value`` is what the vehicle has."""
+def grids(stamp: str, clearance_stamp: str, maps: MapLayers) -> dict[str, bytes]:
+    """Messages by topic. Colours are for viewers, ``value`` is what the vehicle has; ``clearance_stamp`` = time of the map that clearance
+    and risk were computed from."""
     layers: dict[str, tuple[np.ndarray, Paint]] = {
         "/map/static": (maps.static, _static_colors),
         "/map/dynamic": (maps.dynamic, _dynamic_colors),
@@ -171,7 +172,11 @@ def grids(stamp: str, maps: MapLayers) -> dict[str, bytes]:
     layers["/map/clearance"] = (maps.clearance_m, _clearance_colors)
     if maps.risk is not None:
         layers["/map/risk"] = (maps.risk, _risk_colors)
-    return {topic: _grid(stamp, maps, np.asarray(values, np.float32), paint) for topic, (values, paint) in layers.items()}
+    stamps = {"/map/static": stamp, "/map/dynamic": stamp}
+    return {
+        topic: _grid(stamps.get(topic, clearance_stamp), maps, np.asarray(values, np.float32), paint)
+        for topic, (values, paint) in layers.items()
+    }
 
 
 def _grid(stamp: str, maps: MapLayers, values: np.ndarray, paint: Paint) -> bytes:

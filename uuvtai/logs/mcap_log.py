@@ -151,7 +151,8 @@ class McapEpisodeLog:
         if snap.route_fresh:
             self._write_route(stamp, snap)
         if snap.maps is not None:
-            for topic, data in encode.grids(stamp, snap.maps).items():
+            computed = snap.step if snap.maps.clearance_step is None else snap.maps.clearance_step
+            for topic, data in encode.grids(stamp, self._stamp(computed), snap.maps).items():
                 self._put(topic, data)
         ended = snap.outcome != RUNNING
         if ended or self._elapsed("/obstacles", self._time_s, OBSTACLE_HZ):
@@ -177,7 +178,7 @@ class McapEpisodeLog:
         self._put("/pose_estimate", encode.pose_in_frame(stamp, snap.estimate_pos_w, encode.quaternion_of(snap.estimate_rpy)))
 
     def _write_sonar(self, snap: EpisodeSnapshot) -> None:
-        stamp = encode.time_text(round(snap.sonar_ping_step * self.header.control_dt_s * 1e9))
+        stamp = self._stamp(snap.sonar_ping_step)
         self._put("/sonar/scan", encode.laser_scan(stamp, snap, self.header.sonar_max_range_m))
         self._put("/sonar/doppler", encode.sonar_doppler(stamp, snap))
         if snap.tracks is not None or snap.track_beams is not None:
@@ -255,6 +256,9 @@ class McapEpisodeLog:
             names = (self.header.tree_statuses[int(code)] for code in status)
             self._tree_text[key] = encode.dumped(dict(zip(self._nodes, names, strict=True)))
         return self._tree_text[key]
+
+    def _stamp(self, step: int) -> str:
+        return encode.time_text(round(step * self.header.control_dt_s * 1e9))
 
     def _put(self, topic: str, data: bytes) -> None:
         self._written[topic] = self._time_s
