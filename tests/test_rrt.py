@@ -170,6 +170,21 @@ def test_both_fail_keeps_the_last_route_and_never_draws_a_straight_line():
     assert [s.route.kept[env] for env in (0, 1)] == [1, 1]
 
 
+def test_without_ompl_the_last_route_is_kept_with_a_warning(monkeypatch):
+    s = clean()
+    plan([0])
+    before = way_of(0)
+    put_ends([(2.0, 0.2)] * N_ENV, [(18.0, 3.0)] * N_ENV)
+    plan([0])
+    rrt._has_ompl.cache_clear()
+    monkeypatch.setattr(rrt.importlib.util, "find_spec", lambda name: None)
+    with pytest.warns(UserWarning, match="OMPL is not installed"):
+        assert serve(s) == 1
+    monkeypatch.undo()
+    rrt._has_ompl.cache_clear()
+    assert s.route.kept[0] == 1 and np.array_equal(way_of(0), before)
+
+
 def test_the_fallback_of_an_env_does_not_depend_on_its_company():
     occ, start, goal, _ = CASES["disconnected"]
     ways = []

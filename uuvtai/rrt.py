@@ -8,7 +8,10 @@ OMPL is imported lazily: it has no Windows wheel.
 
 from __future__ import annotations
 
+import importlib.util
+import warnings
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -172,6 +175,14 @@ def _straightened(path: np.ndarray, grid: ClearanceGrid, epsilon_m: float) -> np
     return path[corners]
 
 
+@lru_cache(maxsize=1)
+def _has_ompl() -> bool:
+    if importlib.util.find_spec("ompl") is None:
+        warnings.warn("OMPL is not installed: where the Voronoi planner fails, the last route is kept", stacklevel=2)
+        return False
+    return True
+
+
 class RouteFallback:
     """Serves the envs whose Voronoi plan failed: fetch one clearance grid, run RRT, load the route or keep the old one."""
 
@@ -211,7 +222,9 @@ class RouteFallback:
         return n_failed
 
     def plan(self, start_xy: Point, goal_xy: Point, seed: int) -> np.ndarray | None:
-        """RRT on ``self.overlay`` with the config's floor and budget."""
+        """RRT on ``self.overlay`` with the config's floor and budget; None (with one warning) where OMPL is not installed."""
         r = self.config.route
+        if not _has_ompl():
+            return None
         grid = ClearanceGrid(self.overlay, self.origin, self.config.mapping.cell_m, r.rrt_clearance_m, start_xy)
         return plan_rrt(start_xy, goal_xy, grid, r.rrt_iterations, seed, r.rrt_range_m, self.config.voronoi.cost_epsilon_m)
