@@ -111,7 +111,7 @@ def _draw(request: Request, folder: Path, logs: list[dict[Any, Path]], watch: Wa
     from uuvtai.logs.video import video
 
     for job in logs[0]:
-        files = [paths[job] for paths in logs]
+        files = [paths[job] for paths in reversed(logs)]  # the map drawn is that of the last method
         picture(files, folder / "pictures" / f"seed{job.seed}_episode{job.episode}.png")
         picture(files, folder / "pictures" / f"seed{job.seed}_episode{job.episode}_clearance.png", clearance=True)
         for file in files if request.video else []:

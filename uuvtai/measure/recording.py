@@ -105,7 +105,7 @@ class EpisodeRecorder:
         maps = _read_rows(sim, _MAP_FIELDS, [row for row in rows if due[row].maps])
         images = _read_rows(sim, {"image": ("depth_m",)}, [row for row in rows if due[row].depth_image])
         for i, row in enumerate(rows):
-            layers = _layers(sim.config, maps[row]) if row in maps else None
+            layers = _layers(sim.config, maps[row], int(read["clock.step"][i])) if row in maps else None
             image = images[row]["image.depth_m"] if row in images else None
             snapshot = _snapshot(sim, {name: values[i] for name, values in read.items()}, self._applied[row], layers, image)
             self._logs[row].write(snapshot)
@@ -129,7 +129,7 @@ def _is_fresh(r: dict[str, Any]) -> bool:
     return bool(r["route.n_way"] > 0 and r["route.plan_step"] == r["clock.step"])
 
 
-def _layers(config: Config, maps: dict[str, np.ndarray]) -> MapLayers:
+def _layers(config: Config, maps: dict[str, np.ndarray], step: int) -> MapLayers:
     static, dynamic, clearance = maps["grid_map.static_occ"], maps["grid_map.dynamic_occ"], maps["clearance.clearance_m"]
     c = config.clearance
     return MapLayers(
@@ -138,6 +138,7 @@ def _layers(config: Config, maps: dict[str, np.ndarray]) -> MapLayers:
         static=static,
         dynamic=dynamic,
         clearance_m=clearance,
+        clearance_step=step - step % c.period_steps,
         risk=c.risk_static * static + c.risk_dynamic * dynamic + c.risk_clearance / (clearance + c.risk_epsilon_m),
     )
 
