@@ -418,7 +418,7 @@ class TrackState:
     scan_step: ti.Field = array("n_env", dtype=ti.i32)
     """episode step of the ping that the states refer to, -1 = no scan yet"""
     beam_track: ti.Field = array("n_env", "n_ray", dtype=ti.i32)
-    """track that explains this beam of the newest tracked scan (ping_step = scan_step), -1 = none"""
+    """track that explains this beam of the newest scan, -1 = none (carried over by bearing where that scan was not tracked)"""
     pick: ti.Field = array("n_env", "n_track", dtype=ti.i32)
     """scratch of one scan: cluster matched to this track, -1 = none"""
     pick_cost: ti.Field = array("n_env", "n_track")
@@ -433,6 +433,8 @@ class ClusterState:
     """1 = clustered in this very step"""
     scan_step: ti.Field = array("n_env", dtype=ti.i32)
     """episode step of the ping that was clustered last, -1 = none yet"""
+    scan_yaw: ti.Field = array("n_env")
+    """[rad] own yaw at that ping"""
     slip_w: ti.Field = array("n_env", vec=2)
     """[m/s] error of the own measured velocity, as the known walls show it"""
     count: ti.Field = array("n_env", dtype=ti.i32)

@@ -10,11 +10,13 @@ MAX_RANGE_M = 12.0
 
 
 def cast(pos, yaw, vel_w, centre, body_vel, radius, half, body_yaw, tank):
-    """Ranges, Doppler (receding positive, own motion included), hit flags and index of the body hit (-1 = wall or nothing), each (E, 256)."""
+    """Ranges, Doppler (receding positive, own motion included), hit flags and body hit (-1 = wall or nothing), each (E, 256)."""
     bearing = yaw[:, None] + np.arange(N_RAY) * (2 * np.pi / N_RAY)
     u = np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
     to_body = np.stack([_circle(pos, u, centre, radius), _box(pos, u, centre, half, body_yaw)])
     to_body = np.where(radius[:, None, :] > 0, to_body[0], to_body[1])
+    none = np.full((*to_body.shape[:2], 1), np.inf)  # a body that is never hit, so that there may be none
+    to_body, body_vel = np.concatenate([to_body, none], -1), np.concatenate([body_vel, np.zeros((len(pos), 1, 2))], 1)
     nearest = to_body.argmin(axis=-1)
     to_nearest = np.take_along_axis(to_body, nearest[..., None], -1)[..., 0]
     to_wall = _walls(pos, u, tank)
@@ -63,5 +65,5 @@ def _box(pos, u, centre, half, body_yaw):
 def _walls(pos, u, tank):
     low, high = np.array([tank.x_m[0], tank.y_m[0]]), np.array([tank.x_m[1], tank.y_m[1]])
     edge = np.where(u > 0, high, low)
-    safe = np.where(np.abs(u) < 1e-12, 1e-12, u)
-    return ((edge - pos[:, None, :]) / safe).min(-1)
+    along = np.abs(u) < 1e-12
+    return np.where(along, np.inf, (edge - pos[:, None, :]) / np.where(along, 1.0, u)).min(-1)

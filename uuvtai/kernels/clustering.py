@@ -1,7 +1,7 @@
 """From one sonar scan to clusters: runs of neighbouring beams that hit the same body (part of the tracking stage).
 
-Returns from the known walls are left out, runs split at jumps of range or Doppler, a missed or false beam inside a body is bridged, and runs
-wider than a body is expected to be are dropped. A body's outline is taken for a circle: its half-angle a gives the radius R = d sin a,
+Returns from the known walls are left out, runs split at jumps of range or Doppler, a missed or false beam inside a body is bridged, and
+runs wider than a body is expected to be are dropped. A body's outline is taken for a circle: its half-angle a gives the radius R = d sin a,
 and the mean range of the visible arc, d - (pi / 4) R for small angles, gives the centre at the distance d.
 """
 
@@ -45,16 +45,15 @@ def split_distance(range_m, tracking: Const[TrackingConfig], sonar: Const[SonarC
 
 
 @ti.func
-def find_clusters(env, clusters: Out[ClusterState], scan: In[SonarScan], tracking: Const[TrackingConfig], sonar: Const[SonarConfig], tank: Const[TankConfig]):
-    """Fill ``clusters`` from the newest scan of this env."""
-    slip_w = velocity_slip(label_beams(env, clusters, scan, tracking, sonar, tank), tracking, sonar)
+def find_clusters(env, clusters: Out[ClusterState], scan: In[SonarScan], tracking: Const[TrackingConfig], sonar: Const[SonarConfig]):
+    """Fill ``clusters`` from the labelled beams of this env (``label_beams`` first)."""
     start = quiet_beam(env, clusters, scan, tracking, sonar)
     clusters.count[env] = 0
     k = 0
     while k < sonar.n_ray:
         if clusters.beam_cluster[env, (start + k) % sonar.n_ray] == _CANDIDATE:
             last, sums = walk_run(env, start, k, clusters, scan, tracking, sonar)
-            store_run(env, start, k, last, sums, slip_w, clusters, scan, tracking, sonar)
+            store_run(env, start, k, last, sums, clusters, scan, tracking, sonar)
             k = last
         k += 1
 
@@ -63,14 +62,21 @@ def find_clusters(env, clusters: Out[ClusterState], scan: In[SonarScan], trackin
 
 
 @ti.func
-def label_beams(env, clusters: Out[ClusterState], scan: In[SonarScan], tracking: Const[TrackingConfig], sonar: Const[SonarConfig], tank: Const[TankConfig]):
-    """Label every beam _CANDIDATE or -1 and compensate its Doppler; returns the normal equations of the own velocity's error from the walls.
+def label_beams(
+    env,
+    clusters: Out[ClusterState],
+    scan: In[SonarScan],
+    tracking: Const[TrackingConfig],
+    sonar: Const[SonarConfig],
+    tank: Const[TankConfig],
+):
+    """Label every beam _CANDIDATE or -1, compensate its Doppler, and learn the own velocity's error from the walls: they do not move.
 
-    Those are (sum ux ux, sum ux uy, sum uy uy, sum ux e, sum uy e) over the wall's beams, u = beam, e = compensated Doppler, which a wall has not.
+    ``normal`` = (sum ux ux, sum ux uy, sum uy uy, sum ux e, sum uy e) over the walls' beams, u = beam, e = compensated Doppler.
     """
     pos, yaw = scan.ping_pos_w[env], scan.ping_yaw[env]
     vel = turned_z(scan.ping_vel_b[env], yaw)
-    normal = ti.Vector([0.0] * 5)
+    normal = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0])
     for packet in range(sonar.n_ray // LANES):
         ux, uy = packet_directions(yaw + packet * ti.static(LANES * TWO_PI / sonar.n_ray), sonar)
         range_m, doppler, hit = f16x(0.0), f16x(0.0), f16x(0.0)
@@ -84,13 +90,14 @@ def label_beams(env, clusters: Out[ClusterState], scan: In[SonarScan], tracking:
         free = wall_distance(pos[0] + range_m * ux, pos[1] + range_m * uy, tank) - margin
         wall = ti.select(free < 0.0, hit, f16x(0.0))
         error = wall * still
+        body = hit - wall
         wx = wall * ux
         wy = wall * uy
         normal += ti.Vector([(wx * ux).sum(), (wx * uy).sum(), (wy * uy).sum(), (error * ux).sum(), (error * uy).sum()])
         for i in ti.static(range(LANES)):
             clusters.beam_doppler[env, packet * LANES + i] = still[i]
-            clusters.beam_cluster[env, packet * LANES + i] = ti.select(hit[i] - wall[i] > 0.5, _CANDIDATE, -1)
-    return normal
+            clusters.beam_cluster[env, packet * LANES + i] = ti.select(body[i] > 0.5, _CANDIDATE, -1)
+    clusters.slip_w[env] = velocity_slip(normal, tracking, sonar)
 
 
 @ti.func
@@ -146,13 +153,12 @@ def next_beam(env, beam, clusters: In[ClusterState], scan: In[SonarScan], tracki
     """Beams from this one to the next of the same run, 0 = the run ends here."""
     n = ti.static(sonar.n_ray)
     out = 0
-    if joined(env, beam, (beam + 1) % n, clusters, scan, tracking, sonar):
-        out = 1
-    elif joined(env, beam, (beam + 2) % n, clusters, scan, tracking, sonar):
-        out = 2
-    elif scan.hit[env, (beam + 1) % n] + scan.hit[env, (beam + 2) % n] == 0:
-        if joined(env, beam, (beam + 3) % n, clusters, scan, tracking, sonar):
-            out = 3
+    step = 1
+    last = ti.select(scan.hit[env, (beam + 1) % n] + scan.hit[env, (beam + 2) % n] == 0, _BRIDGE, 2)
+    while out == 0 and step <= last:
+        if joined(env, beam, (beam + step) % n, clusters, scan, tracking, sonar):
+            out = step
+        step += 1
     return out
 
 
@@ -175,7 +181,9 @@ def quiet_beam(env, clusters: In[ClusterState], scan: In[SonarScan], tracking: C
 
 
 @ti.func
-def walk_run(env, start, first, clusters: Out[ClusterState], scan: In[SonarScan], tracking: Const[TrackingConfig], sonar: Const[SonarConfig]):
+def walk_run(
+    env, start, first, clusters: Out[ClusterState], scan: In[SonarScan], tracking: Const[TrackingConfig], sonar: Const[SonarConfig]
+):
     """Follow a run from offset ``first``; returns its last offset and (beams, sum of range, sum of Doppler). Labels its beams."""
     label = clusters.count[env]
     k = first
@@ -196,7 +204,15 @@ def walk_run(env, start, first, clusters: Out[ClusterState], scan: In[SonarScan]
 
 @ti.func
 def store_run(
-    env, start, first, last, sums, slip_w, clusters: Out[ClusterState], scan: In[SonarScan], tracking: Const[TrackingConfig], sonar: Const[SonarConfig]
+    env,
+    start,
+    first,
+    last,
+    sums,
+    clusters: Out[ClusterState],
+    scan: In[SonarScan],
+    tracking: Const[TrackingConfig],
+    sonar: Const[SonarConfig],
 ):
     """Keep a run as a cluster if it can be a body; else take the label off its beams."""
     c = clusters.count[env]
@@ -211,7 +227,7 @@ def store_run(
         clusters.hidden[env, c] = hidden
         clusters.match[env, c] = -1
         place_cluster(env, c, range_m, clusters, scan, tracking, sonar)
-        weigh_doppler(env, c, sums, slip_w, clusters, sonar)
+        weigh_doppler(env, c, sums, clusters, sonar)
         clusters.count[env] = c + 1
     else:
         for k in range(first, last + 1):
@@ -249,7 +265,9 @@ def edge_open(env, edge, way, clusters: In[ClusterState], scan: In[SonarScan], t
 
 
 @ti.func
-def place_cluster(env, c, range_m, clusters: Out[ClusterState], scan: In[SonarScan], tracking: Const[TrackingConfig], sonar: Const[SonarConfig]):
+def place_cluster(
+    env, c, range_m, clusters: Out[ClusterState], scan: In[SonarScan], tracking: Const[TrackingConfig], sonar: Const[SonarConfig]
+):
     """Circle through the visible arc: bearing, radius, centre, and the variance of the mean range."""
     step = ti.static(TWO_PI / sonar.n_ray)
     half = 0.5 * step * clusters.span[env, c]
@@ -265,13 +283,13 @@ def place_cluster(env, c, range_m, clusters: Out[ClusterState], scan: In[SonarSc
 
 
 @ti.func
-def weigh_doppler(env, c, sums, slip_w, clusters: Out[ClusterState], sonar: Const[SonarConfig]):
+def weigh_doppler(env, c, sums, clusters: Out[ClusterState], sonar: Const[SonarConfig]):
     """Mean compensated Doppler of a cluster, outliers pulled in where the sonar is known to have them, and its variance."""
     mean = sums[2] / sums[0]
     spread_m_s = ti.static(max(sonar.doppler_sigma_m_s, 0.01))
     if ti.static(sonar.doppler_outlier > 0):
         mean = clipped_mean(env, c, mean, 3.0 * spread_m_s, clusters, sonar)
-    bearing = clusters.bearing_w[env, c]
+    bearing, slip_w = clusters.bearing_w[env, c], clusters.slip_w[env]
     clusters.doppler_m_s[env, c] = mean - (slip_w[0] * ti.cos(bearing) + slip_w[1] * ti.sin(bearing))
     wild = ti.static(sonar.doppler_outlier * (3.0 * max(sonar.doppler_sigma_m_s, 0.01)) ** 2)
     clusters.doppler_var[env, c] = (spread_m_s**2 + wild) / sums[0] + ti.static(_SLIP_SIGMA_M_S**2)

@@ -1,7 +1,7 @@
 """Kalman filter of a planar body: mean (x, y, vx, vy), covariance as its upper triangle row by row, measurements one number at a time.
 
-The covariance is symmetric by storage. A measurement of one number needs no inverse; its update P - (Ph)(Ph)' / s equals Joseph's form for the
-optimal gain. Variances are kept above a floor: float32 rounds P to 1e-7 of itself, far below the smallest measurement variance in use (1e-4).
+The covariance is symmetric by storage. A measurement of one number needs no inverse; its update P - (Ph)(Ph)' / s equals Joseph's form for
+the optimal gain. Variances are kept above a floor: float32 rounds P to 1e-7 of itself, far below the least measurement variance (1e-4).
 """
 
 import taichi as ti
