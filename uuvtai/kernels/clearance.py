@@ -93,13 +93,13 @@ def scan_row(
 
 
 @ti.func
-def nearer_keys(env, row, packet, offset, clearance: In[ClearanceState], cfg: Const[ClearanceConfig], mapping: Const[MappingConfig]):
-    """Smaller keys of the rows ``offset`` below and above; beyond the grid its last row stands in, taken for farther than it is."""
+def keys_at(env, row, packet, offset, clearance: In[ClearanceState], cfg: Const[ClearanceConfig], mapping: Const[MappingConfig]):
+    """Keys of the rows ``offset`` below and above; beyond the grid its last row stands in, taken for farther than it is."""
     last = ti.static(clearance.clearance_m.shape[1] - 1)
     farther = 2 * offset * offset << ti.static(offset_bits(cfg, mapping))
     below = clearance.row_key[env, ti.max(row - offset, 0), packet] + (farther - offset)
     above = clearance.row_key[env, ti.min(row + offset, last), packet] + (farther + offset)
-    return ti.min(below, above)
+    return below, above
 
 
 @ti.func
@@ -111,9 +111,9 @@ def best_keys(env, row, packet, clearance: In[ClearanceState], cfg: Const[Cleara
     offset = 1
     while offset <= reach and 2 * offset * offset << bits <= worst:
         for more in ti.static(range(_OFFSETS_PER_CHECK)):
-            keys = nearer_keys(env, row, packet, ti.min(offset + more, reach), clearance, cfg, mapping)
+            below, above = keys_at(env, row, packet, ti.min(offset + more, reach), clearance, cfg, mapping)
             for i in ti.static(range(LANES)):
-                best[i] = ti.min(best[i], keys[i])
+                best[i] = ti.min(best[i], below[i], above[i])
         worst = best.max()
         offset += _OFFSETS_PER_CHECK
     return best
@@ -128,9 +128,9 @@ def write_packet(env, row, packet, clearance: Out[ClearanceState], cfg: Const[Cl
     rows = (key & ti.static((1 << bits) - 1)) - reach
     cols = ti.cast(ti.sqrt(ti.cast(squared - rows * rows, ti.f32)), ti.i32)
     signed_cols = cols * (2 * ((key >> bits) & 1) - 1)
-    distance = ti.sqrt(ti.cast(squared, ti.f32)) * mapping.cell_m
     for i in ti.static(range(LANES)):
-        clearance.clearance_m[env, row, packet * LANES + i] = ti.select(squared[i] <= limit, distance[i], cfg.max_m)
+        distance = ti.sqrt(ti.cast(squared[i], ti.f32)) * mapping.cell_m
+        clearance.clearance_m[env, row, packet * LANES + i] = ti.select(squared[i] <= limit, distance, cfg.max_m)
     for i in ti.static(range(LANES)):
         clearance.site_row[env, row, packet * LANES + i] = ti.cast(ti.select(squared[i] <= limit, row + rows[i], -1), ti.i16)
     for i in ti.static(range(LANES)):

@@ -106,10 +106,14 @@ def mark_free(env, pos, unit, enter, end, step, grid_map: Out[MapState], tank: C
     first = 0.5
     step16 = ti.cast(step, ti.i16)
     while first <= last:
-        # lanes past the end repeat the last sample
-        sample = ti.min(ramp_lanes(first), last)
-        cols = ti.cast(col0 + unit[0] * sample, ti.i32)
-        rows = ti.cast(row0 + unit[1] * sample, ti.i32)
+        sample = f16x(0.0)
+        for i in ti.static(range(LANES)):
+            # lanes past the end repeat the last sample
+            sample[i] = ti.min(first + i, last)
+        rows, cols = i16x(0), i16x(0)
+        for i in ti.static(range(LANES)):
+            rows[i] = ti.cast(row0 + unit[1] * sample[i], ti.i32)
+            cols[i] = ti.cast(col0 + unit[0] * sample[i], ti.i32)
         for i in ti.static(range(LANES)):
             grid_map.seen_step[env, rows[i], cols[i]] = step16
         first += float(LANES)

@@ -128,18 +128,20 @@ def merge_quiet_cells(env, row, first_col, step, grid_map: Out[MapState], mappin
         free_scans[i] = ti.cast(grid_map.free_scans[env, row, first_col + i], ti.i32)
         static_old[i] = grid_map.static_occ[env, row, first_col + i]
         dynamic_old[i] = grid_map.dynamic_occ[env, row, first_col + i]
-    free = ti.select(seen == step, 1.0, 0.0)
+    free = f16x(0.0)
+    for i in ti.static(range(LANES)):
+        free[i] = ti.select(seen[i] == step, 1.0, 0.0)
     static_new = ti.static(1.0 - decay_per_scan(mapping.static_decay, scan_s)) * static_old
     static_freed = static_new - ti.static(per_scan(mapping.static_free, scan_s)) * free
     dynamic_new = ti.static(1.0 - decay_per_scan(mapping.dynamic_decay, scan_s)) * dynamic_old
     dynamic_freed = dynamic_new - ti.static(per_scan(mapping.dynamic_free, scan_s)) * free
-    static_clipped = ti.select(static_freed < VANISHED, 0.0, static_freed)
-    dynamic_clipped = ti.select(dynamic_freed < VANISHED, 0.0, dynamic_freed)
-    raised = ti.min(free_scans + ti.cast(free, ti.i32), COUNTER_MAX)
     for i in ti.static(range(LANES)):
-        grid_map.static_occ[env, row, first_col + i] = static_clipped[i]
-        grid_map.dynamic_occ[env, row, first_col + i] = dynamic_clipped[i]
-        grid_map.free_scans[env, row, first_col + i] = ti.cast(raised[i], ti.u8)
+        grid_map.static_occ[env, row, first_col + i] = clipped(static_freed[i])
+    for i in ti.static(range(LANES)):
+        grid_map.dynamic_occ[env, row, first_col + i] = clipped(dynamic_freed[i])
+    for i in ti.static(range(LANES)):
+        raised = ti.min(free_scans[i] + ti.cast(free[i], ti.i32), COUNTER_MAX)
+        grid_map.free_scans[env, row, first_col + i] = ti.cast(raised, ti.u8)
 
 
 @ti.func
