@@ -1,0 +1,261 @@
+"""Clearance against scipy's exact transform, its sites and ties, what must hold for any map, and the funcs that others read it with."""
+
+import hashlib
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import taichi as ti
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.reference.clearance import clearance_of, sites_of
+from uuvtai.config import ClearanceConfig, MappingConfig, TankConfig, VoronoiConfig
+from uuvtai.kernels import clearance, field
+from uuvtai.kernels.grid import grid_origin, grid_shape, outside_cells
+from uuvtai.kernels.lanes import LANES
+from uuvtai.kernels.signature import Const, In
+from uuvtai.state import PACKET, ClearanceState, ClockState, GridMask, MapState, allocate
+
+N_ENV = 8
+TANK = TankConfig(x_m=(0.0, 7.0), y_m=(0.0, 5.0))
+POND = TankConfig(shape="circle", x_m=(0.0, 7.0), y_m=(0.0, 5.0))
+MAP, CFG, VORONOI = MappingConfig(), ClearanceConfig(), VoronoiConfig()
+FUSED = VoronoiConfig(use="fused")
+SHORT = ClearanceConfig(max_m=0.75)
+"""not a multiple of the cell"""
+SHAPE = grid_shape(TANK, MAP.cell_m)
+
+ROUNDING_M = 5e-7
+"""float32 square root and product of numbers up to 2 m"""
+
+
+class Stage:
+    """The structs of clearance."""
+
+    def __init__(self, n_env=N_ENV):
+        sizes = {"n_env": n_env, "n_row": SHAPE[0], "n_col": SHAPE[1]}
+        self.clearance, self.grid_map = allocate(ClearanceState, sizes), allocate(MapState, sizes)
+        self.mask, self.clock = allocate(GridMask, sizes), allocate(ClockState, sizes)
+        self.clock.awake.fill(1)
+        self.set_outside(np.array(outside_cells(TANK, MAP.cell_m)))
+
+    def set_outside(self, outside):
+        self.outside = outside
+        self.mask.outside.from_numpy(outside.astype(np.int32))
+
+    def compute(self, static, dynamic=None, cfg=CFG, voronoi=VORONOI):
+        """(clearance, site_row, site_col) of these layers [n_env, row, col]."""
+        self.grid_map.static_occ.from_numpy(static.astype(np.float32))
+        self.grid_map.dynamic_occ.from_numpy((np.zeros_like(static) if dynamic is None else dynamic).astype(np.float32))
+        return self.launch(cfg, voronoi)
+
+    def launch(self, cfg=CFG, voronoi=VORONOI):
+        clearance.compute_clearance(self.clearance, self.grid_map, self.mask, self.clock, cfg, MAP, voronoi)
+        return tuple(f.to_numpy() for f in (self.clearance.clearance_m, self.clearance.site_row, self.clearance.site_col))
+
+
+@pytest.fixture(scope="module")
+def stage():
+    return Stage()
+
+
+@pytest.fixture(autouse=True)
+def _fresh_clock(stage):
+    stage.clock.awake.fill(1)
+    stage.clock.step.fill(0)
+    stage.set_outside(np.array(outside_cells(TANK, MAP.cell_m)))
+
+
+def maps_of(seed):
+    """Eight kinds of maps: empty, one cell, sparse, dense, full, blobs, baffles with gaps, random corridors."""
+    rng = np.random.default_rng(seed)
+    n_row, n_col = SHAPE
+    maps = np.zeros((N_ENV, n_row, n_col))
+    maps[1, rng.integers(n_row), rng.integers(n_col)] = 1
+    maps[2][rng.random(SHAPE) < 0.003] = 1
+    maps[3][rng.random(SHAPE) < 0.3] = 1
+    maps[4] = 1
+    row, col = np.ogrid[:n_row, :n_col]
+    for _ in range(4):
+        r, c, radius = rng.integers(n_row), rng.integers(n_col), rng.uniform(1, 5)
+        maps[5][(row - r) ** 2 + (col - c) ** 2 < radius**2] = 1
+    for k, c in enumerate(range(12, n_col - 8, 14)):
+        maps[6][(slice(14, None) if k % 2 else slice(0, n_row - 14)), c] = 1
+    corridors = np.kron(rng.random((-(-n_row // 6), -(-n_col // 6))) < 0.5, np.ones((6, 6)))
+    maps[7] = corridors[:n_row, :n_col] * (rng.random(SHAPE) < 0.97)
+    # values around the threshold instead of 0 and 1
+    return np.where(maps > 0, rng.uniform(0.5, 1.0, maps.shape), rng.uniform(0.0, 0.499, maps.shape))
+
+
+def check(found, sites, cfg):
+    """Distance equals scipy's, and the site given is one and lies that far away."""
+    distance, site_row, site_col = found
+    expected, near = clearance_of(sites, MAP.cell_m, cfg.max_m)
+    assert np.abs(distance - expected).max() <= ROUNDING_M
+    np.testing.assert_array_equal(site_row >= 0, near)
+    np.testing.assert_array_equal(site_col >= 0, near)
+    assert (distance[~near] == np.float32(cfg.max_m)).all()
+    rows, cols = np.nonzero(near)
+    assert sites[site_row[near], site_col[near]].all()
+    reach = np.hypot(site_row[near] - rows, site_col[near] - cols) * MAP.cell_m
+    assert np.abs(reach - distance[near]).max(initial=0) <= ROUNDING_M
+
+
+# ------------------------------------------------------------------------------------------------------------------- oracle
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_equals_the_exact_transform(stage, seed):
+    static = maps_of(seed)
+    found = stage.compute(static)
+    for env in range(N_ENV):
+        check([f[env] for f in found], sites_of(static[env], 0, stage.outside, MAP.occupied, "static"), CFG)
+
+
+def test_fused_layer_and_odd_limit(stage):
+    static, dynamic = maps_of(3), maps_of(4)[::-1]
+    for cfg, voronoi in ((SHORT, VORONOI), (CFG, FUSED)):
+        found = stage.compute(static, dynamic, cfg, voronoi)
+        for env in range(N_ENV):
+            sites = sites_of(static[env], dynamic[env], stage.outside, MAP.occupied, voronoi.use)
+            check([f[env] for f in found], sites, cfg)
+
+
+def test_grid_without_a_border_of_sites(stage):
+    """The window must not rely on the border: cells at the grid's edge, and a grid without any site."""
+    stage.set_outside(np.zeros(SHAPE, bool))
+    static = maps_of(5)
+    static[0] = 0
+    found = stage.compute(static)
+    assert (found[0][0] == CFG.max_m).all() and (found[1][0] == -1).all()
+    for env in range(1, N_ENV):
+        check([f[env] for f in found], static[env] >= MAP.occupied, CFG)
+
+
+def test_round_tank(stage):
+    stage.set_outside(np.array(outside_cells(POND, MAP.cell_m)))
+    static = maps_of(6)
+    found = stage.compute(static)
+    for env in range(N_ENV):
+        check([f[env] for f in found], sites_of(static[env], 0, stage.outside, MAP.occupied, "static"), CFG)
+
+
+def test_ties_go_left_then_to_the_lower_row(stage):
+    stage.set_outside(np.zeros(SHAPE, bool))
+    static = np.zeros((N_ENV, *SHAPE))
+    static[0, 20, [30, 34]] = 1  # left and right of column 32
+    static[1, [18, 22], 32] = 1  # below and above row 20
+    static[2, [18, 22], 30] = 1  # two on the left
+    static[3, [18, 22], 34] = 1  # two on the right
+    static[4, 18, 34] = static[4, 22, 30] = 1  # lower right, upper left
+    _, site_row, site_col = stage.compute(static)
+    found = [(int(site_row[env, 20, 32]), int(site_col[env, 20, 32])) for env in range(5)]
+    assert found == [(20, 30), (18, 32), (18, 30), (18, 34), (22, 30)]
+
+
+def test_limits_of_the_keys():
+    assert clearance.squared_limit(CFG, MAP) == 400 and clearance.window_reach(CFG, MAP) == 20
+    assert clearance.squared_limit(SHORT, MAP) == 56 and clearance.window_reach(SHORT, MAP) == 7
+    assert 1 << clearance.offset_bits(CFG, MAP) > 2 * clearance.window_reach(CFG, MAP)
+    with pytest.raises(ValueError, match="max_m"):
+        clearance.offset_bits(ClearanceConfig(max_m=60.0), MAP)
+    assert PACKET == LANES
+
+
+# --------------------------------------------------------------------------------------------------------------- properties
+
+
+@st.composite
+def occupancies(draw):
+    rng = np.random.default_rng(draw(st.integers(0, 10**6)))
+    return rng.random((N_ENV, *SHAPE)) < draw(st.sampled_from([0.001, 0.01, 0.1, 0.5]))
+
+
+@settings(max_examples=10, deadline=None, derandomize=True)
+@given(static=occupancies())
+def test_clearance_is_lipschitz_and_zero_exactly_at_sites(stage, static):
+    distance, _, _ = stage.compute(static)
+    for axis in (1, 2):
+        assert np.abs(np.diff(distance, axis=axis)).max() <= MAP.cell_m + ROUNDING_M
+    np.testing.assert_array_equal(distance == 0, static | stage.outside)
+    assert distance.max() <= CFG.max_m
+
+
+@settings(max_examples=5, deadline=None, derandomize=True)
+@given(static=occupancies(), order=st.permutations(range(N_ENV)), changed=st.integers(0, N_ENV - 1))
+def test_envs_are_independent(stage, static, order, changed):
+    plain, permuted = stage.compute(static), stage.compute(static[list(order)])
+    twisted = stage.compute(np.where(np.arange(N_ENV)[:, None, None] == changed, ~static, static))
+    others = [env for env in range(N_ENV) if env != changed]
+    for a, b, c in zip(plain, permuted, twisted, strict=True):
+        np.testing.assert_array_equal(b, a[list(order)])
+        np.testing.assert_array_equal(c[others], a[others])
+    assert (twisted[0][changed] != plain[0][changed]).any()
+
+
+def test_only_awake_rows_whose_step_is_due_are_computed(stage):
+    before = stage.compute(maps_of(8))[0]
+    stage.clearance.fresh.from_numpy(np.array([0, 1, 0, 1, 0, 1, 0, 1], np.int32))
+    stage.clock.awake.from_numpy(np.array([1, 1, 0, 0, 1, 1, 0, 0], np.int32))
+    stage.clock.step.from_numpy(np.array([0, 1, 0, 1, 5, 4, 10, 11], np.int32))
+    after = stage.compute(maps_of(9)[::-1])[0]
+    changed = (before != after).any(axis=(1, 2))
+    np.testing.assert_array_equal(changed, [True, False, False, False, True, False, False, False])
+    # sleeping rows keep their flag too
+    np.testing.assert_array_equal(stage.clearance.fresh.to_numpy(), [1, 0, 0, 1, 1, 0, 0, 1])
+
+
+def digest_of_a_batch():
+    """Digest of the clearance of 64 random maps (enough loop items for several threads)."""
+    static = np.concatenate([maps_of(seed) for seed in range(8)])
+    return hashlib.sha256(b"".join(f.tobytes() for f in Stage(64).compute(static))).hexdigest()
+
+
+def test_thread_count_changes_nothing():
+    program = "from uuvtai.runtime import start_taichi; start_taichi('cpu'); import tests.test_clearance as t; print(t.digest_of_a_batch())"
+    runs = [
+        subprocess.run(
+            [sys.executable, "-c", program], env={**os.environ, "UUV_NUM_THREADS": n}, capture_output=True, text=True, check=True
+        )
+        for n in ("1", "2")
+    ]
+    digests = [run.stdout.split()[-1] for run in runs]
+    assert len(digests[0]) == 64 and digests[0] == digests[1]
+
+
+# --------------------------------------------------------------------------------------------------------------------- field
+
+
+@ti.kernel
+def read_field(
+    grid_map: In[MapState],
+    clear: In[ClearanceState],
+    out: ti.template(),
+    cfg: Const[ClearanceConfig],
+    tank: Const[TankConfig],
+    x: float,
+    y: float,
+):
+    """Everything that others may ask, in env 0."""
+    for _ in range(1):
+        out[0] = field.risk_at(0, 20, 30, grid_map, clear, cfg)
+        out[1] = field.occupancy_at(0, 20, 30, grid_map)
+        out[2] = field.is_occupied(0, 20, 30, grid_map, 0.5)
+        out[3] = field.clearance_at(0, ti.Vector([x, y, -0.5]), clear, tank, 0.1)
+
+
+def test_what_others_read(stage):
+    static, dynamic = np.zeros((N_ENV, *SHAPE)), np.zeros((N_ENV, *SHAPE))
+    static[0, 20, 34], static[0, 20, 30], dynamic[0, 20, 30] = 1.0, 0.3, 0.45
+    stage.compute(static, dynamic)
+    cfg = ClearanceConfig(risk_static=2.0, risk_dynamic=3.0, risk_clearance=0.2, risk_epsilon_m=0.05)
+    out = ti.field(ti.f32, 4)
+    x0, y0 = grid_origin(TANK, MAP.cell_m)
+    read_field(stage.grid_map, stage.clearance, out, cfg, TANK, x0 + 3.29, y0 + 2.01)
+    risk = 2 * 0.3 + 3 * 0.45 + 0.2 / (0.4 + 0.05)
+    np.testing.assert_allclose(out.to_numpy(), [risk, 0.45, 0, 0.2], atol=1e-6)
+    read_field(stage.grid_map, stage.clearance, out, cfg, TANK, -5.0, 2.0)
+    assert out[3] == 0
