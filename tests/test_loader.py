@@ -64,7 +64,7 @@ def test_extends_a_preset_and_a_neighbour(tmp_path):
         ("world.n_static=-1", "greater than or equal to 0"),
         ("world.n_static=true", "valid integer"),
         ("mapping.static_hit=.nan", "finite"),
-        ("mapping.static_hit=.inf", "less than or equal to 1"),
+        ("mapping.static_hit=.inf", "finite"),
         ("episode.control_dt_s='0.02'", "valid number"),
         ("world.tank.x_m=[3,1]", "low < high"),
         ("world.tank.x_m=[1,2", "not valid YAML"),

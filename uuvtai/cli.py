@@ -408,7 +408,7 @@ def _config(world, sensors, vehicle, n_static, n_dynamic, speed, overrides):
     from uuvtai.loader import load_config
 
     flags = {"n_static": n_static, "n_dynamic": n_dynamic, "dynamic_speed_m_s": speed}
-    typed = [f"world.{key}={value}" for key, value in flags.items() if value is not None]
+    typed = [(f"world.{key}", value) for key, value in flags.items() if value is not None]
     return load_config(world, sensors, vehicle, [*typed, *(overrides or [])])
 
 

@@ -26,6 +26,9 @@ _MAX_BYTES = 1 << 20
 _MAX_EXTENDS = 8
 
 
+Overrides = dict[str, Any] | list[str | tuple[str, Any]]
+
+
 class ConfigError(ValueError):
     """What is wrong, where, why, and what to type next."""
 
@@ -46,11 +49,11 @@ def load_config(
     world: str = "pool",
     sensors: str | None = None,
     vehicle: str | None = None,
-    overrides: dict[str, Any] | list[str] | None = None,
+    overrides: Overrides | None = None,
 ) -> Config:
     """Config of a world (preset name or path) with a sensor and a vehicle preset on top, then overrides.
 
-    ``overrides`` maps dotted keys to values, or lists ``key.sub=value`` strings as typed on the command line. Without ``sensors`` the
+    ``overrides`` maps dotted keys to values, or lists (key, value) pairs and ``key.sub=value`` texts as typed on the command line. Without ``sensors`` the
     world's own choice counts, else ``paper``. Raises ConfigError.
     """
     layer = _read_preset("world", world)
@@ -200,9 +203,10 @@ def _lines(node: yaml.Node, file: str, prefix: tuple[str, ...]):
 # --------------------------------------------------------------------------------------------------------------- overrides
 
 
-def _overrides(overrides: dict[str, Any] | list[str]) -> _Layer:
+def _overrides(overrides: Overrides) -> _Layer:
     layer = _Layer()
-    pairs = overrides.items() if isinstance(overrides, dict) else [_split(text) for text in overrides]
+    given = overrides.items() if isinstance(overrides, dict) else overrides
+    pairs = [_split(item) if isinstance(item, str) else item for item in given]
     for key, value in pairs:
         *parents, leaf = key.split(".")
         node = layer.tree

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import sys
 from dataclasses import dataclass
 
 import taichi as ti
@@ -40,14 +42,15 @@ def start_taichi(device: str = "cpu", precision: str = "f32", fast_math: bool = 
     options = {}
     if threads := os.environ.get("UUV_NUM_THREADS"):
         options["cpu_max_num_threads"] = int(threads)
-    ti.init(
-        arch=ti.cuda if wanted.device == "cuda" else ti.cpu,
-        default_fp=wanted.real,
-        fast_math=fast_math,
-        offline_cache=True,
-        log_level=ti.WARN,
-        **options,
-    )
+    with contextlib.redirect_stdout(sys.stderr):  # Taichi greets on stdout, which belongs to results
+        ti.init(
+            arch=ti.cuda if wanted.device == "cuda" else ti.cpu,
+            default_fp=wanted.real,
+            fast_math=fast_math,
+            offline_cache=True,
+            log_level=ti.WARN,
+            **options,
+        )
     _started.append(wanted)
     return wanted
 
