@@ -20,8 +20,9 @@ from uuvtai.state import ClockState, DepthImage, GridMask, MapState, SonarScan, 
 N_ENV = 6
 TANK = TankConfig(x_m=(0.0, 6.0), y_m=(0.0, 4.0))
 POND = TankConfig(shape="circle", x_m=(0.0, 6.0), y_m=(0.0, 4.0))
-MAP = MappingConfig(period_steps=2, free_range_m=2.5)
-"""25 Hz, so that the rated gains (10 Hz) are scaled by 0.4; a small tank needs a short free range to show it"""
+MAP = MappingConfig(period_steps=2, free_range_m=2.5, wall_margin_m=0.03)
+"""25 Hz, so that the rated gains (10 Hz) are scaled by 0.4; a small tank needs a short free range to show it, and range errors
+reach deeper than this wall margin"""
 SONAR = SonarConfig(n_ray=64, range_sigma_m=0.01, range_sigma_slope=0.005, range_quantum_m=0.01, doppler_sigma_m_s=0.04)
 DEPTH_CAMERA = DepthConfig(rows=6, cols=16, period_steps=4)
 EPISODE = EpisodeConfig()
