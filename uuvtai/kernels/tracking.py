@@ -32,6 +32,8 @@ def reset_tracks(tracks: Out[TrackState], clusters: Out[ClusterState], forecast:
             for track in range(tracks.alive.shape[1]):
                 clear_track(env, track, tracks)
                 clear_forecast(env, track, forecast)
+                for k in range(forecast.pos_w.shape[2]):
+                    forecast.pos_w[env, track, k] = ti.Vector([0.0, 0.0])
             for ray in range(tracks.beam_track.shape[1]):
                 tracks.beam_track[env, ray] = -1
 
