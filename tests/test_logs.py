@@ -46,6 +46,7 @@ SCHEMAS = {
     "/pose_estimate": "foxglove.PoseInFrame",
     "/sonar/scan": "foxglove.LaserScan",
     "/sonar/doppler": "uuv.SonarDoppler",
+    "/camera/line": "uuv.DepthLine",
     "/camera/depth": "foxglove.CompressedImage",
     "/map/static": "foxglove.Grid",
     "/map/dynamic": "foxglove.Grid",
@@ -119,7 +120,7 @@ def test_rates(log_path):
     counts = {entry["topic"]: entry["messages"] for entry in info(log_path)["topics"]}
     every_step = ["/tf", "/pose", "/pose_estimate", "/sonar/scan", "/sonar/doppler", "/state", "/action", "/policy", "/safety", "/tree"]
     assert {counts[topic] for topic in every_step} == {N_STEP + 1}
-    assert {counts[topic] for topic in ("/obstacles", "/obstacles/truth", "/goal")} == {N_STEP // 5 + 1}
+    assert {counts[topic] for topic in ("/obstacles", "/obstacles/truth", "/goal", "/camera/line")} == {N_STEP // 5 + 1}
     assert counts["/map/static"] == N_STEP // 25 + 2  # step 0, then 2 Hz, and the last step
     assert counts["/camera/depth"] == N_STEP // 25 + 1
     assert counts["/plan"] == counts["/plan/info"] == 2
@@ -353,7 +354,7 @@ def test_schemas_keep_to_what_the_viewers_parse(log_path):
 
     with log_path.open("rb") as file:
         schemas = make_reader(file).get_summary().schemas.values()
-    assert len(schemas) == 16
+    assert len(schemas) == 17
     for schema in schemas:
         check(json.loads(schema.data), schema.name)
 

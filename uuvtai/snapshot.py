@@ -64,6 +64,18 @@ class MapLayers:
 
 
 @dataclass(frozen=True, eq=False)
+class DepthLine:
+    """What the map takes from a depth image: of every column that has one, the nearest pixel at the vehicle's own depth."""
+
+    column: np.ndarray
+    """(n,)"""
+    row: np.ndarray
+    """(n,)"""
+    depth_m: np.ndarray
+    """(n,) z-depth"""
+
+
+@dataclass(frozen=True, eq=False)
 class EpisodeSnapshot:
     """One env at one control step, the reset (step 0) included."""
 
@@ -169,6 +181,9 @@ class EpisodeSnapshot:
     distill_lambda: float | None = None
     wm_residual: float | None = None
     wm_uncertainty: float | None = None
+
+    depth_line: DepthLine | None = None
+    """of a depth image taken in this step; None = none was"""
 
     # big ones: only where ``McapEpisodeLog.due`` asked for them
     depth_image_m: np.ndarray | None = None

@@ -9,10 +9,12 @@ import numpy as np
 
 from uuvtai.config import Config
 from uuvtai.logs.scenario import body_positions, scenario_document
-from uuvtai.snapshot import EpisodeHeader, EpisodeResult, EpisodeSnapshot, MapLayers
+from uuvtai.snapshot import DepthLine, EpisodeHeader, EpisodeResult, EpisodeSnapshot, MapLayers
 
 DT = 0.02
 N_RAY = 256
+COLUMNS = np.arange(3, 128, 2)
+"""columns of the camera that see something at the vehicle's depth"""
 MAX_RANGE_M = 12.0
 CELL_M, ORIGIN, SHAPE = 0.1, (-0.4, -0.2), (64, 208)
 TERMS = ("alive", "progress", "clearance", "ttc")
@@ -137,6 +139,7 @@ def snapshots(
             tree_status=np.array([2, 3, 0, 3, 2, 0] if step % 100 < 70 else [1, 3, 0, 1, 0, 0], np.int32),
             tree_leaf=4 if step % 100 < 70 else 3,
             reward=np.array([0.01, 0.02, -0.001, 0.0], np.float32),
+            depth_line=DepthLine(COLUMNS, COLUMNS // 4, 1.0 + COLUMNS / np.float32(64)) if step % 5 == 0 else None,
             depth_image_m=rng.uniform(0.5, 10, (72, 128)).astype(np.float32) if depth and step % 25 == 0 else None,
             maps=layers(static, dynamic) if big else None,
         )

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from uuvtai.logs import schemas
-from uuvtai.snapshot import KINDS, EpisodeSnapshot, MapLayers
+from uuvtai.snapshot import KINDS, DepthLine, EpisodeSnapshot, MapLayers
 
 Vector = Sequence[float] | np.ndarray
 
@@ -143,6 +143,12 @@ def sonar_doppler(stamp: str, snap: EpisodeSnapshot) -> bytes:
     """Doppler of every beam and the own velocity it has to be compensated with."""
     velocity = np.where(snap.sonar_hit != 0, snap.sonar_doppler_m_s, np.float32(0))
     return f'{{"timestamp":{stamp},"velocity":{numbers(velocity)},"own_velocity":{numbers(snap.sonar_ping_vel_b)}}}'.encode()
+
+
+def depth_line(stamp: str, line: DepthLine) -> bytes:
+    """The part of a depth image that the map takes."""
+    columns, rows = (",".join(map(str, indices.tolist())) for indices in (line.column, line.row))
+    return f'{{"timestamp":{stamp},"column":[{columns}],"row":[{rows}],"depth":{numbers(line.depth_m)}}}'.encode()
 
 
 def depth_png(stamp: str, depth_m: np.ndarray) -> bytes:

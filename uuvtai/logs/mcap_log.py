@@ -109,6 +109,7 @@ class McapEpisodeLog:
             "/pose_estimate": schemas.POSE_IN_FRAME,
             "/sonar/scan": schemas.LASER_SCAN,
             "/sonar/doppler": schemas.SONAR_DOPPLER,
+            "/camera/line": schemas.DEPTH_LINE,
             "/camera/depth": schemas.COMPRESSED_IMAGE,
             "/map/static": schemas.GRID,
             "/map/dynamic": schemas.GRID,
@@ -146,6 +147,8 @@ class McapEpisodeLog:
         self._write_motion(stamp, snap)
         if snap.sonar_fresh:
             self._write_sonar(snap)
+        if snap.depth_line is not None:
+            self._put("/camera/line", encode.depth_line(stamp, snap.depth_line))
         if snap.depth_image_m is not None and self._depth_images:
             self._put("/camera/depth", encode.depth_png(stamp, snap.depth_image_m))
         if snap.route_fresh:

@@ -28,8 +28,9 @@ FORMULAS = {
         "Beam i of n looks along the true yaw + 2 pi i / n in the horizontal plane of the true position at the scan's own "
         "timestamp. A body is met where the beam enters its horizontal outline (of a sphere: the circle of radius sqrt(r^2 - "
         "g^2), g = max(|dz| - d tan(a), 0), d = horizontal distance of its centre) if the vertical gap is at most range * "
-        "tan(a); a = sensors.sonar.vertical_half_aperture_deg. Side walls are always met, floor and surface never. Doppler = "
-        "rate of change of that range. Errors as in sensors.sonar."
+        "tan(a); a = sensors.sonar.vertical_half_aperture_deg. Side walls are always met, floor and surface never; nothing beyond "
+        "sensors.sonar.max_range_m returns. Doppler = (velocity of the body or wall that is met - own velocity) . beam: how fast "
+        "that piece of surface recedes. Errors as in sensors.sonar."
     ),
     "clearance": (
         "Hull = capsule about the vehicle's x axis (vehicle.hull_half_length_m either side of the origin, "
@@ -45,10 +46,38 @@ FORMULAS = {
         "goal at most episode.goal_radius_m), timeout (episode.horizon_steps)."
     ),
     "map": (
-        "Per scan, gains of `mapping` scaled from 10 Hz to the scan rate: static = clip((1 - static_decay) static + static_hit "
-        "[hit] - static_free [free] + depth_hit [depth], 0, 1); dynamic = clip((1 - dynamic_decay) dynamic + dynamic_hit "
-        "[moving] - dynamic_free [free], 0, 1). Scans in /sonar/scan and /sonar/doppler, own pose in /pose_estimate at the "
-        "scan's timestamp, own velocity in /sonar/doppler, beams of tracked moving bodies in /tracks."
+        "Per mapped scan and cell, with indicators of 0 or 1: static = clip((1 - l_s) static + g_hit [static return] - g_free "
+        "[free] + g_depth [depth], 0, 1); dynamic = clip((1 - l_d) dynamic + d_hit [moving return] - d_free [free], 0, 1); what "
+        "falls below 1e-6 is 0. Both start at 0. Gains of `mapping` hold at 10 Hz: per scan min(1, 10 P gain), decays 1 - (1 - "
+        "decay)^(10 P). P = control_dt_s * sonar.period_steps * ceil(mapping.period_steps / sonar.period_steps); for depth_hit "
+        "the longer of P and control_dt_s * depth.period_steps. A scan is mapped at its log time if the last mapped one is at "
+        "least mapping.period_steps steps older. Own position and yaw: /pose_estimate at the scan's timestamp. The layers of a "
+        "log time include that step's scan."
+    ),
+    "map_free": (
+        "[free]: cells under the points (k + 0.5) cell_m along a beam, k = 0, 1, .., up to min(reach, wall - 0.001 m), that have "
+        "no return in this scan. reach = range - cell_m - sigma for a return, sigma = range_sigma_m + range_sigma_slope * range; "
+        "min(free_range_m, max_range_m) without one. wall = distance of the known side wall along the beam."
+    ),
+    "map_returns": (
+        "A return counts in the cell of its point, but not within wall_margin_m of a side wall or beyond, nor where range > wall "
+        "- error; error = 3 (sigma + range_jitter_m) + range_quantum_m. It is a moving one if |velocity + own_velocity . beam| "
+        "(/sonar/doppler, beam in body axes) > max(doppler_evidence_m_s, 3 doppler_sigma_m_s), or if the beam is listed in "
+        "/tracks, or if the cell speaks against a body at rest: (free_scans >= ceil(free_confident_s / P) or 0 < dynamic_scans "
+        "< ceil(promote_s / P)) and no cell within m rows and columns has static >= occupied, m = min(4, 1 + floor((2 pi / n * "
+        "range + error) / cell_m)). All of this as of before the scan. Counters of a cell, to 255: free: free_scans + 1, "
+        "dynamic_scans = 0; any return: free_scans = 0; a moving one: dynamic_scans + 1."
+    ),
+    "map_depth": (
+        "/camera/line has, per image column, the nearest pixel that sees something within mapping.depth_gate_m of the vehicle's "
+        "own depth. Its point is p + R (offset_b_m + depth (1, (cols / 2 - 0.5 - column) / f, (rows / 2 - 0.5 - row) / f)), f = "
+        "cols / 2 / tan(fov_deg / 2), p and R of /pose_estimate at its timestamp. [depth] holds in the cell of such a point at "
+        "the next mapped scan (the same step's included) if the cell is not free, has no moving return and dynamic < occupied, "
+        "and if it has a static return or static > 0 already."
+    ),
+    "map_risk": (
+        "risk_static * static + risk_dynamic * dynamic + risk_clearance / (clearance + risk_epsilon_m) of the layers with the same "
+        "log time; names are keys of `clearance`."
     ),
     "map_clearance": (
         "Distance between the centre of a cell and the centre of the nearest cell that is occupied (>= mapping.occupied in the "

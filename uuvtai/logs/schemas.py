@@ -209,8 +209,16 @@ _FOUR = array_of(NUMBER, 4)
 SONAR_DOPPLER = record(
     "uuv.SonarDoppler",
     timestamp=described(TIME, "when the ping was taken"),
-    velocity=described(array_of(NUMBER), "[m/s] rate of change of each beam's range, own motion included; 0 where nothing returned"),
+    velocity=described(array_of(NUMBER), "[m/s] how fast what a beam met recedes, own motion included; 0 where nothing returned"),
     own_velocity=described(_THREE, "[m/s] own velocity in the body frame as measured when the ping was taken"),
+)
+DEPTH_LINE = record(
+    "uuv.DepthLine",
+    "What the camera tells the map: per image column the nearest pixel at the vehicle's own depth; columns without one are left out.",
+    timestamp=described(TIME, "when the image was taken"),
+    column=described(array_of(UINT), "0 = left"),
+    row=described(array_of(UINT), "0 = top"),
+    depth=described(array_of(NUMBER), "[m] along the camera's axis"),
 )
 PLAN = record(
     "uuv.Plan",

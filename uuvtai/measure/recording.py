@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from uuvtai.kernels.reward import TERMS
 from uuvtai.loader import to_yaml
 from uuvtai.logs.mcap_log import Due, McapEpisodeLog
 from uuvtai.logs.scenario import scenario_document
+from uuvtai.measure.depth_line import depth_line
 from uuvtai.measure.evaluate import EpisodeResult, Job
 from uuvtai.run_folder import git_sha
 from uuvtai.scenario import describe_scenario
@@ -103,11 +105,12 @@ class EpisodeRecorder:
         read = _read(sim, _STEP_FIELDS, rows)
         due = {row: self._due(row, {name: values[i] for name, values in read.items()}) for i, row in enumerate(rows)}
         maps = _read_rows(sim, _MAP_FIELDS, [row for row in rows if due[row].maps])
-        images = _read_rows(sim, {"image": ("depth_m",)}, [row for row in rows if due[row].depth_image])
+        images = _read_rows(sim, {"image": ("depth_m", "shot_rpy")}, [row for i, row in enumerate(rows) if read["image.fresh"][i]])
         for i, row in enumerate(rows):
             layers = _layers(sim.config, maps[row], int(read["clock.step"][i])) if row in maps else None
-            image = images[row]["image.depth_m"] if row in images else None
-            snapshot = _snapshot(sim, {name: values[i] for name, values in read.items()}, self._applied[row], layers, image)
+            snapshot = _snapshot(sim, {name: values[i] for name, values in read.items()}, self._applied[row], layers)
+            if row in images:
+                snapshot = _with_image(sim.config, snapshot, images[row], due[row].depth_image)
             self._logs[row].write(snapshot)
             self._applied[row] = read["teacher.action"][i]
 
@@ -143,7 +146,13 @@ def _layers(config: Config, maps: dict[str, np.ndarray], step: int) -> MapLayers
     )
 
 
-def _snapshot(sim: Sim, r: dict[str, Any], applied: np.ndarray, maps: MapLayers | None, image: np.ndarray | None) -> EpisodeSnapshot:
+def _with_image(config: Config, snapshot: EpisodeSnapshot, image: dict[str, np.ndarray], whole: bool) -> EpisodeSnapshot:
+    depth_m = image["image.depth_m"]
+    line = depth_line(depth_m, image["image.shot_rpy"], config.sensors.depth, config.mapping)
+    return replace(snapshot, depth_line=line, depth_image_m=depth_m if whole else None)
+
+
+def _snapshot(sim: Sim, r: dict[str, Any], applied: np.ndarray, maps: MapLayers | None) -> EpisodeSnapshot:
     """``r`` maps 'struct.field' to this env's row."""
     n_way, n_node = int(r["route.n_way"]), len(sim.tree.names)
     moving = (r["tracks.alive"] == 1) & (r["tracks.moving"] == 1)
@@ -194,7 +203,6 @@ def _snapshot(sim: Sim, r: dict[str, Any], applied: np.ndarray, maps: MapLayers 
         tree_status=r["teacher.status"][:n_node],
         tree_leaf=int(r["teacher.leaf"]),
         reward=r["reward.term"],
-        depth_image_m=image,
         maps=maps,
     )
 
