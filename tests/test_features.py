@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+import torch
 
 from tests.reference import features as oracle
 from uuvtai.config import FeaturesConfig, SonarConfig
-from uuvtai.kernels.features import sense_sectors
-from uuvtai.state import ClockState, FeatureState, Proprioception, SonarScan, allocate
+from uuvtai.kernels.features import COLUMNS, observation_width, placed_columns, sense_sectors, write_observation
+from uuvtai.state import ClockState, FeatureState, MissionState, Proprioception, RouteState, SonarScan, allocate
 
 N_ENV, N_RAY, N_SECTOR = 20, 256, 12
 FEATURES, SONAR = FeaturesConfig(), SonarConfig()
@@ -85,3 +86,54 @@ def test_sleeping_rows_keep_their_features(stage):
     second = stage.run(*random_scan(3), quiet, quiet, awake=awake)
     assert np.array_equal(second[:, ~awake], first[:, ~awake])
     assert (second[:, awake] != first[:, awake]).any(axis=(0, 2)).all()
+
+
+# -------------------------------------------------------------------------------------------------------------- observation
+
+OBSERVATION_ROUNDING = 1e-5
+"""Single precision of a rotation of positions of about 10 m."""
+
+
+@pytest.fixture(scope="module")
+def observed(stage):
+    """(observation (n_env, n_obs), arrays it was made of, rows awake) for random states; -7 was there before."""
+    sizes = {"n_env": N_ENV, "n_way": 2, "n_ahead": 2, "n_trigger": 4, "n_planner": 2, "n_reason": 4}
+    route, mission = allocate(RouteState, sizes), allocate(MissionState, sizes)
+    rng, arrays = np.random.default_rng(0), {}
+    for struct, names in {
+        route: ("lookahead_w", "heading_error", "cross_track_m", "remaining_m", "path_risk"),
+        mission: ("goal_w",),
+        stage.ego: ("pos_w", "rpy", "vel_b", "rate_b", "depth_m"),
+        stage.features: ("sector_range_m", "sector_ttc_s", "sector_closing_m_s"),
+    }.items():
+        for name in names:
+            field = getattr(struct, name)
+            arrays[name] = rng.uniform(-3, 3, field.to_numpy().shape).astype(np.float32)
+            field.from_numpy(arrays[name])
+    awake = np.arange(N_ENV) % 4 != 1
+    stage.clock.awake.from_numpy(awake.astype(np.int32))
+    obs = torch.full((N_ENV, observation_width(N_SECTOR)), -7.0)
+    write_observation(obs, stage.features, route, stage.ego, mission, stage.clock)
+    return obs.numpy(), arrays, awake
+
+
+def test_observation_equals_the_oracle_in_every_column(observed):
+    obs, arrays, awake = observed
+    for env in np.flatnonzero(awake):
+        want = oracle.observation({name: np.float64(a[env]) for name, a in arrays.items()})
+        assert list(want) == [c.name for c in COLUMNS]
+        for column, first, width in placed_columns(N_SECTOR):
+            got = obs[env, first : first + width]
+            np.testing.assert_allclose(got, np.broadcast_to(want[column.name], width), atol=OBSERVATION_ROUNDING, err_msg=column.name)
+
+
+def test_sleeping_rows_keep_their_observation(observed):
+    obs, _arrays, awake = observed
+    assert (obs[~awake] == -7).all()
+
+
+def test_first_columns_are_the_papers_targets_of_the_world_model():
+    """3 goal errors, sine and cosine of the heading error, 3 velocities, yaw rate, depth, roll and pitch, 12 ranges: 24."""
+    names = [column.name for column, _first, width in placed_columns(12) for _ in range(width)]
+    paper = {"goal": 3, "heading_error": 2, "velocity": 3, "yaw_rate": 1, "depth": 1, "tilt": 2, "sector_range": 12}
+    assert names[:24] == [name for name, width in paper.items() for _ in range(width)]

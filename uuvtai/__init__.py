@@ -1,3 +1,44 @@
 """uuvtai: train, measure and inspect observation-only navigation for underwater vehicles."""
 
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from uuvtai.env import VectorEnv
+
 __version__ = "0.1.0"
+
+# Taichi prints a banner to stdout when it is imported; stdout belongs to results
+os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+
+
+def make(
+    world: str = "pool",
+    num_envs: int = 1024,
+    seed: int = 0,
+    device: str = "cpu",
+    overrides: dict[str, Any] | None = None,
+    sensors: str | None = None,
+    vehicle: str | None = None,
+    teacher: str = "bt",
+    check_actions: bool | None = None,
+) -> VectorEnv:
+    """Torch-native batch of ``num_envs`` vehicles in a world; presets are names or paths of files (see ``uuv presets``).
+
+    ``overrides`` maps dotted config keys to values, ``{"world.n_dynamic": 9}``; ``teacher`` is the behaviour tree behind
+    ``info["teacher_action"]``; ``device`` is 'cpu', 'cuda' or 'auto'. Raises ConfigError, a ValueError, for presets, keys and values
+    that do not exist or fit, ValueError or MemoryError for impossible sizes, RuntimeError for a missing device. The rest is told at
+    ``uuvtai.env.VectorEnv``.
+    """
+    from uuvtai.env import VectorEnv, checked_seed
+    from uuvtai.loader import load_config
+    from uuvtai.sim import Sim
+    from uuvtai.tree import read_tree
+
+    if type(num_envs) is not int:
+        raise TypeError(f"num_envs must be an int, got {num_envs!r}")
+    checked_seed(seed)
+    config = load_config(world, sensors, vehicle, overrides)
+    return VectorEnv(Sim(config, num_envs, read_tree(teacher, config.teacher.max_node), device), seed, check_actions)

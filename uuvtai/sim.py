@@ -105,7 +105,7 @@ class Sim:
     """Thousands of vehicles in their worlds, stepped together.
 
     ``action`` is a torch tensor (n_env, 4) in [-1, 1] on the simulator's device: the behaviour tree writes its choice there, the next
-    ``step`` reads it; overwrite it to drive otherwise.
+    ``step`` reads it; overwrite it to drive otherwise. ``observation`` is None until somebody asks by ``observe``.
     """
 
     def __init__(self, config: Config, num_envs: int, tree: FlatTree, device: str = "cpu") -> None:
@@ -120,6 +120,8 @@ class Sim:
         self.reward = torch.zeros(num_envs, device=self.device)
         self.terminated = torch.zeros(num_envs, dtype=torch.int32, device=self.device)
         self.truncated = torch.zeros(num_envs, dtype=torch.int32, device=self.device)
+        self.observation: torch.Tensor | None = None
+        self._every_row = torch.arange(num_envs, dtype=torch.int32, device=self.device)
         self.fallback = RouteFallback(config)
         self.stage_s: dict[str, float] | None = None
         self.use_tree(tree)
@@ -135,6 +137,13 @@ class Sim:
     def set_scene(self, n_static: int, n_dynamic: int, speed_m_s: float) -> None:
         """S, D and v of every env's next scenario; S and D must fit the slots that were allocated."""
         set_scene(self.s.scene, self.config.world, n_static, n_dynamic, speed_m_s)
+
+    def observe(self) -> torch.Tensor:
+        """From the next pass on, write every awake row's observation into the tensor returned, (n_env, n_obs) (``features.COLUMNS``)."""
+        if self.observation is None:
+            width = features.observation_width(self.config.features.n_sector)
+            self.observation = torch.zeros(self.num_envs, width, device=self.device)
+        return self.observation
 
     def _fill_constants(self) -> None:
         world_cfg = self.config.world
@@ -233,6 +242,9 @@ class Sim:
             self._plan()
         with self._stage("teacher"):
             self._teach()
+        if self.observation is not None:
+            with self._stage("features"):
+                features.write_observation(self.observation, s.features, s.route, s.ego, s.mission, s.clock)
 
     def _plan(self) -> None:
         c, s = self.config, self.s
@@ -314,6 +326,10 @@ class Sim:
         out = torch.empty((len(chosen), *field.shape[1:], *inner), dtype=_TORCH_DTYPE[field.dtype], device=self.device)
         copy_rows(field, chosen, out)
         return out.cpu().numpy()
+
+    def read_into(self, field: ti.Field, out: torch.Tensor) -> None:
+        """Copy a whole field into ``out`` on the device, without a wait or a copy through the host."""
+        copy_rows(field, self._every_row, out)
 
     @contextlib.contextmanager
     def _stage(self, name: str) -> Iterator[None]:

@@ -1,11 +1,16 @@
-"""Sector features of the newest sonar scan: nearest range, fastest approach, smallest time to collision."""
+"""Sector features of the newest sonar scan (nearest range, fastest approach, smallest time to collision), and the policy's observation.
+
+``COLUMNS`` declares the observation once: the kernel writes by it and the environment's table is read off it.
+"""
+
+from typing import Any, NamedTuple
 
 import taichi as ti
 
 from uuvtai.config import FeaturesConfig, SonarConfig
-from uuvtai.kernels.geometry import TWO_PI
-from uuvtai.kernels.signature import Const, In, Out
-from uuvtai.state import ClockState, FeatureState, Proprioception, SonarScan
+from uuvtai.kernels.geometry import TWO_PI, quaternion_wb, rotation_wb
+from uuvtai.kernels.signature import Const, In, Out, spread
+from uuvtai.state import ClockState, FeatureState, MissionState, Proprioception, RouteState, SonarScan
 
 
 @ti.kernel
@@ -62,3 +67,159 @@ def sector_beams(sector, turned, n_sector, n_ray):
     first = ti.ceil((sector - 0.5 + shift) * per_sector)
     last = ti.ceil((sector + 0.5 + shift) * per_sector)
     return ti.cast(first, ti.i32), ti.cast(last, ti.i32)
+
+
+# -------------------------------------------------------------------------------------------------------------- observation
+
+
+@ti.func
+def _in_body(vector_w, rpy):
+    """World vector in the body frame of the measured attitude."""
+    return rotation_wb(quaternion_wb(rpy[0], rpy[1], rpy[2])).transpose() @ vector_w
+
+
+@ti.func
+def _goal(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
+    return _in_body(mission.goal_w[env] - ego.pos_w[env], ego.rpy[env])
+
+
+@ti.func
+def _heading_error(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
+    return ti.Vector([ti.sin(route.heading_error[env]), ti.cos(route.heading_error[env])])
+
+
+@ti.func
+def _velocity(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
+    return ego.vel_b[env]
+
+
+@ti.func
+def _yaw_rate(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
+    return ti.Vector([ego.rate_b[env][2]])
+
+
+@ti.func
+def _depth(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
+    return ti.Vector([ego.depth_m[env]])
+
+
+@ti.func
+def _tilt(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
+    return ti.Vector([ego.rpy[env][0], ego.rpy[env][1]])
+
+
+@ti.func
+def _lookahead(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
+    return _in_body(route.lookahead_w[env] - ego.pos_w[env], ego.rpy[env])
+
+
+@ti.func
+def _cross_track(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
+    return ti.Vector([route.cross_track_m[env]])
+
+
+@ti.func
+def _remaining(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
+    return ti.Vector([route.remaining_m[env]])
+
+
+@ti.func
+def _path_risk(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
+    return ti.Vector([route.path_risk[env]])
+
+
+@ti.func
+def _tilt_rate(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
+    return ti.Vector([ego.rate_b[env][0], ego.rate_b[env][1]])
+
+
+@ti.func
+def _sector_range(env, sector, features: In[FeatureState]):
+    return features.sector_range_m[env, sector]
+
+
+@ti.func
+def _sector_ttc(env, sector, features: In[FeatureState]):
+    return features.sector_ttc_s[env, sector]
+
+
+@ti.func
+def _sector_closing(env, sector, features: In[FeatureState]):
+    return features.sector_closing_m_s[env, sector]
+
+
+PER_SECTOR = 0
+"""Width of a column group that has one column per sector."""
+
+
+class Column(NamedTuple):
+    """A group of neighbouring columns of the observation, all of one quantity."""
+
+    name: str
+    width: int
+    unit: str
+    frame: str
+    meaning: str
+    source: Any
+    """func that returns the values of one env, or the value of one of its sectors"""
+
+
+COLUMNS = (
+    Column("goal", 3, "m", "body", "from the position estimate to the goal", _goal),
+    Column("heading_error", 2, "1", "level", "sine, cosine of the look-ahead point's bearing, left positive", _heading_error),
+    Column("velocity", 3, "m/s", "body", "over ground, as the DVL measured it last", _velocity),
+    Column("yaw_rate", 1, "rad/s", "body", "of the gyro", _yaw_rate),
+    Column("depth", 1, "m", "world", "pressure depth, positive down", _depth),
+    Column("tilt", 2, "rad", "level", "roll, pitch of the IMU", _tilt),
+    Column("sector_range", PER_SECTOR, "m", "body", "smallest range; maximum range where nothing returned", _sector_range),
+    Column("lookahead", 3, "m", "body", "to the look-ahead point of the route; zero without a route", _lookahead),
+    Column("cross_track", 1, "m", "route", "distance from the route, positive = left of it", _cross_track),
+    Column("remaining", 1, "m", "route", "route length still ahead; the straight distance without a route", _remaining),
+    Column("path_risk", 1, "1", "route", "mean risk over the look-ahead segment", _path_risk),
+    Column("tilt_rate", 2, "rad/s", "body", "roll rate, pitch rate of the gyro", _tilt_rate),
+    Column("sector_ttc", PER_SECTOR, "s", "body", "smallest time to collision, capped", _sector_ttc),
+    Column("sector_closing", PER_SECTOR, "m/s", "body", "largest closing speed, own motion included; 0 = no return", _sector_closing),
+)
+"""The observation, in order: the paper's phi and what it names as the world model's targets, which are the first 24 (with 12 sectors)."""
+
+
+def placed_columns(n_sector: int) -> list[tuple[Column, int, int]]:
+    """(group, first column, number of columns) of every group."""
+    out, first = [], 0
+    for column in COLUMNS:
+        width = n_sector if column.width == PER_SECTOR else column.width
+        out.append((column, first, width))
+        first += width
+    return out
+
+
+def observation_width(n_sector: int) -> int:
+    """Columns of the observation."""
+    return sum(width for _column, _first, width in placed_columns(n_sector))
+
+
+def _sources(n_sector, of_sectors):
+    """(source, first column, width) of the groups that are, or are not, per sector; plain Python, unrolled by the kernel."""
+    return [(c.source, first, width) for c, first, width in placed_columns(n_sector) if (c.width == PER_SECTOR) == of_sectors]
+
+
+@ti.kernel
+def write_observation(
+    obs: ti.types.ndarray(dtype=ti.f32, ndim=2),  # type: ignore[valid-type]
+    features: In[FeatureState],
+    route: In[RouteState],
+    ego: In[Proprioception],
+    mission: In[MissionState],
+    clock: In[ClockState],
+):
+    """Observation (n_env, n_obs) of the awake rows, raw SI units, in the order of ``COLUMNS``."""
+    n, n_sector = ti.static(features.sector_range_m.shape[0], features.sector_range_m.shape[1])
+    for env, pad in ti.ndrange(n, ti.static(spread(n))):
+        if pad == 0 and clock.awake[env] == 1:
+            for source, first, width in ti.static(_sources(n_sector, False)):
+                value = source(env, route, ego, mission)
+                for i in ti.static(range(width)):
+                    obs[env, first + i] = ti.cast(value[i], ti.f32)
+            for sector in range(n_sector):
+                for source, first, _width in ti.static(_sources(n_sector, True)):
+                    obs[env, first + sector] = ti.cast(source(env, sector, features), ti.f32)

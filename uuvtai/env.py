@@ -1,0 +1,181 @@
+"""Vectorised environment on top of the simulator: reset and step, automatic resets, the table of the observation.
+
+Every tensor is torch's own memory, written by the kernels: nothing is copied, and the same tensors come back from every call. Clone what
+must outlive the next ``step`` or ``reset``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from uuvtai.kernels.features import placed_columns
+from uuvtai.sim import Sim
+
+NUM_ACTIONS = 4
+"""surge, sway, heave, yaw rate"""
+
+_MAX_SEED = 2**31 - 1
+
+Slice = slice
+
+
+@dataclass(frozen=True)
+class ObservationColumn:
+    """Neighbouring columns of the observation that hold one quantity."""
+
+    name: str
+    slice: Slice
+    unit: str
+    frame: str
+    meaning: str
+
+
+class VectorEnv:
+    """``num_envs`` episodes side by side; an env whose episode ends begins its next one in the same step.
+
+    Env i plays the episodes i, i + num_envs, i + 2 num_envs, ... of its seed, the same scenarios whatever is done in them. Actions are
+    float32 (num_envs, 4): surge, sway, heave, yaw rate in parts of the vehicle's limits, body frame; beyond [-1, 1] they are clamped.
+    Observations are float32 (num_envs, num_obs) in raw SI units, as ``observation_table`` says: scaling is the policy's business.
+
+    ``sim`` may be shared, for example with an evaluation: whoever else has reset it, call ``reset`` before the next ``step``.
+    """
+
+    def __init__(self, sim: Sim, seed: int = 0, check_actions: bool | None = None) -> None:
+        """``check_actions``: refuse actions that are not finite (default: on the CPU; a GPU would wait). Unchecked, NaN = stop."""
+        self.sim, self.num_envs, self.device = sim, sim.num_envs, sim.device
+        self.config = sim.config
+        self.check_actions = sim.device.type == "cpu" if check_actions is None else check_actions
+        self.observation_table = tuple(
+            ObservationColumn(column.name, slice(first, first + width), column.unit, column.frame, column.meaning)
+            for column, first, width in placed_columns(sim.config.features.n_sector)
+        )
+        self.num_obs, self.num_actions = self.observation_table[-1].slice.stop, NUM_ACTIONS
+        self._obs = torch.zeros(self.num_envs, self.num_obs, device=self.device)
+        self._first_number = torch.arange(self.num_envs, dtype=torch.int32, device=self.device)
+        self._seed = torch.full_like(self._first_number, checked_seed(seed))
+        self._number = self._first_number.clone()
+        self._terminated, self._truncated = (torch.zeros(self.num_envs, dtype=torch.bool, device=self.device) for _ in range(2))
+        self._return = torch.zeros(self.num_envs, device=self.device)
+        self._info = {
+            "teacher_action": sim.action,
+            "seed": self._seed,
+            "episode": self._number,
+            "final_obs": torch.zeros_like(self._obs),
+            "outcome": torch.zeros_like(self._number),
+            "episode_return": torch.zeros_like(self._return),
+            "episode_steps": torch.zeros_like(self._number),
+        }
+        self._begun = self._closed = False
+
+    def reset(self, seed: int | None = None, mask: torch.Tensor | None = None) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Begin an episode in every env, or in those where ``mask`` (num_envs,) is true; returns (obs, info) as ``step`` does.
+
+        With a ``seed``, env i begins at episode i of it. Without, the first reset begins at episode i of the constructor's seed, later
+        ones go on with each env's next episode.
+        """
+        self._require_open()
+        rows = self._rows_of(mask)
+        if not self._begun and not bool(rows.all()):
+            raise RuntimeError("the first reset must begin every env: call reset() without a mask first")
+        if seed is not None:
+            self._seed.masked_fill_(rows, checked_seed(seed))
+            torch.where(rows, self._first_number, self._number, out=self._number)
+        elif self._begun:
+            self._number += self.num_envs * rows
+        self.sim.observation = self._obs
+        self._begin(rows)
+        self._begun = True
+        for name in ("outcome", "episode_return", "episode_steps"):
+            self._info[name].masked_fill_(rows, 0)
+        torch.where(rows[:, None], self._obs, self._info["final_obs"], out=self._info["final_obs"])
+        return self._obs, dict(self._info)
+
+    def step(self, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
+        """Apply ``action`` for one control step: (obs, reward, terminated, truncated, info).
+
+        terminated: success, or a stop by the referee; truncated: the horizon was reached; both bool (num_envs,). Envs that ended have
+        already begun their next episode: obs, ``info["teacher_action"]`` (what the behaviour tree would do now), ``info["seed"]`` and
+        ``info["episode"]`` belong to it. To the step itself belong reward and ``info["final_obs"]`` (the observation the step led to, of
+        every env: the next state to bootstrap from), ``info["outcome"]`` (index into ``kernels.outcome.OUTCOMES``),
+        ``info["episode_return"]`` and ``info["episode_steps"]`` (of the episode so far, whole where it ended).
+        """
+        self._require_open()
+        if not self._begun:
+            raise RuntimeError("step before reset: call reset() first")
+        self._check_action(action)
+        sim, info = self.sim, self._info
+        sim.observation = self._obs
+        sim.step(action.detach())
+        info["final_obs"].copy_(self._obs)
+        sim.read_into(sim.s.referee.outcome, info["outcome"])
+        sim.read_into(sim.s.clock.step, info["episode_steps"])
+        self._return += sim.reward
+        info["episode_return"].copy_(self._return)
+        torch.ne(sim.terminated, 0, out=self._terminated)
+        torch.ne(sim.truncated, 0, out=self._truncated)
+        ended = self._terminated | self._truncated
+        if bool(ended.any()):
+            self._number += self.num_envs * ended
+            self._begin(ended)
+        return self._obs, sim.reward, self._terminated, self._truncated, dict(info)
+
+    def close(self) -> None:
+        """Stop asking the simulator for observations; may be called again."""
+        if self.sim.observation is self._obs:
+            self.sim.observation = None
+        self._closed = True
+
+    def __enter__(self) -> VectorEnv:
+        """The environment itself."""
+        return self
+
+    def __exit__(self, *_error: Any) -> None:
+        """Close."""
+        self.close()
+
+    def _begin(self, rows: torch.Tensor) -> None:
+        self._return.masked_fill_(rows, 0.0)
+        self.sim.reset(rows.to(torch.int32), self._seed, self._number)
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise RuntimeError("this environment is closed; make another one")
+
+    def _rows_of(self, mask: torch.Tensor | None) -> torch.Tensor:
+        """Rows to reset as bool; raises TypeError or ValueError for a mask that does not fit."""
+        if mask is None:
+            return torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        if not isinstance(mask, torch.Tensor) or mask.dtype not in (torch.bool, torch.int32):
+            raise TypeError(f"mask must be a torch tensor of bool or int32, got {_described(mask)}")
+        if mask.shape != (self.num_envs,) or mask.device.type != self.device.type:
+            raise ValueError(f"mask must have shape ({self.num_envs},) on {self.device}, got {_described(mask)}")
+        return mask != 0
+
+    def _check_action(self, action: torch.Tensor) -> None:
+        if not isinstance(action, torch.Tensor) or action.dtype != torch.float32:
+            raise TypeError(f"action must be a float32 torch tensor, got {_described(action)}; use torch.as_tensor(action).float()")
+        if action.shape != (self.num_envs, NUM_ACTIONS):
+            raise ValueError(f"action must have shape ({self.num_envs}, {NUM_ACTIONS}), got {_described(action)}")
+        if action.device.type != self.device.type:
+            raise ValueError(f"action must be on {self.device}, got {_described(action)}; use action.to(env.device)")
+        if self.check_actions and not bool(torch.isfinite(action).all()):
+            bad = (~torch.isfinite(action).all(dim=1)).nonzero().flatten().tolist()
+            raise ValueError(f"action is not finite in env {', '.join(map(str, bad[:8]))}{' ...' if len(bad) > 8 else ''}")
+
+
+def _described(value: Any) -> str:
+    if isinstance(value, torch.Tensor):
+        return f"a {value.dtype} tensor of shape {tuple(value.shape)} on {value.device}"
+    return f"a {type(value).__name__}"
+
+
+def checked_seed(seed: int) -> int:
+    """The seed itself; TypeError or ValueError where it cannot be one."""
+    if type(seed) is not int:
+        raise TypeError(f"seed must be an int, got a {type(seed).__name__}")
+    if not 0 <= seed <= _MAX_SEED:
+        raise ValueError(f"seed {seed} is not in 0 .. {_MAX_SEED}")
+    return seed
