@@ -101,8 +101,9 @@ def test_the_horizon_truncates(env):
     assert [OUTCOMES[o] for o in info["outcome"]] == ["timeout" if i in (2, 5) else "running" for i in range(N)]
     assert info["episode"].tolist() == [i + N if i in (2, 5) else i for i in range(N)]
     assert not torch.equal(info["final_obs"][2], obs[2])
-    *_rest, truncated, info = env.step(full([0, 0, 0, 0]))
+    _obs, reward, _terminated, truncated, info = env.step(full([0, 0, 0, 0]))
     assert not truncated.any() and (info["outcome"] == 0).all(), "an end is told once"
+    assert torch.equal(info["episode_return"][[2, 5]], reward[[2, 5]]), "a new episode's return begins at 0"
 
 
 def test_every_row_goes_on_through_its_own_episodes(env):
