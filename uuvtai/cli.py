@@ -284,7 +284,8 @@ def presets(
         typer.echo(loader.preset_path("tree", name).read_text())
         return
     kind = kinds[0] if kinds else "world"
-    config = loader.load_config(**{"world": "pool", kind: name})
+    chosen = {"world": "pool", kind: name}
+    config = loader.load_config(chosen["world"], chosen.get("sensors"), chosen.get("vehicle"))
     if as_json:
         _print_json(config.model_dump(mode="json"))
     else:
