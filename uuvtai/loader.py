@@ -53,8 +53,8 @@ def load_config(
 ) -> Config:
     """Config of a world (preset name or path) with a sensor and a vehicle preset on top, then overrides.
 
-    ``overrides`` maps dotted keys to values, or lists (key, value) pairs and ``key.sub=value`` texts as typed on the command line. Without ``sensors`` the
-    world's own choice counts, else ``paper``. Raises ConfigError.
+    ``overrides`` maps dotted keys to values, or lists (key, value) pairs and ``key.sub=value`` texts as typed on the command line.
+    Without ``sensors`` the world's own choice counts, else ``paper``. Raises ConfigError.
     """
     layer = _read_preset("world", world)
     named = {kind: layer.tree.pop(kind) for kind in ("sensors", "vehicle") if isinstance(layer.tree.get(kind), str)}
