@@ -139,7 +139,8 @@ def test_eval_prints_one_document_with_every_documented_key(evaluation):
     for method in document["methods"]:
         assert {
             "name", "episodes", "outcomes", "success_rate", "success_ci95", "collision_rate", "collision_ci95", "return_mean",
-            "time_mean_s", "tts_s", "time_to_success_mean_s", "min_clearance_mean_m", "path_length_mean_m", "replans_per_episode", "replans_by_trigger",
+            "time_mean_s", "tts_s", "time_to_success_mean_s", "min_clearance_mean_m", "path_length_mean_m",
+            "replans_per_episode", "replans_by_trigger",
             "planned_by", "env_steps", "wall_s", "env_steps_per_s", "episodes_detail",
         } <= set(method)  # fmt: skip
         assert sum(method["outcomes"].values()) == method["episodes"] == 4
