@@ -47,7 +47,7 @@ def test(arguments: list[str]) -> int:
     checks = [
         [str(BIN / "ruff"), "check", "."],
         [str(BIN / "ruff"), "format", "--check", "."],
-        [str(BIN / "pyright")],
+        [str(BIN / "pyright"), "--pythonpath", python],
         [str(BIN / "lint-imports")],
         [python, "-m", "pytest", *(arguments or ["--cov", "--cov-report=term:skip-covered"])],
     ]
