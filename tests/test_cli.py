@@ -2,8 +2,10 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 
 import pytest
 
@@ -187,3 +189,37 @@ def test_an_existing_run_folder_is_never_overwritten(evaluation, capfd):
     assert done.returncode == 1
     assert "already there and not empty" in done.stderr
     assert (folder / "run.json").read_text() == before
+
+
+@pytest.mark.parametrize("place", ["file/run", "/proc/nowhere/run"])
+def test_a_run_folder_that_cannot_be_written_is_exit_1(tmp_path, place):
+    (tmp_path / "file").write_text("mine")
+    done = subprocess.run(
+        [sys.executable, "-m", "uuvtai", "eval", "--episodes", "1", "--num-envs", "4", "--run-dir", place, "--device", "cpu"],
+        capture_output=True, text=True, check=False, cwd=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert "give a folder that can be written: --run-dir DIR" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_interrupt_leaves_a_marked_run_and_repairable_logs(tmp_path):
+    folder = tmp_path / "run"
+    process = subprocess.Popen(
+        [sys.executable, "-m", "uuvtai", "eval", "--controller", "bt", "--episodes", "4", "--seeds", "3", "--num-envs", "4",
+         "--record", "1", "--run-dir", str(folder), "--device", "cpu"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    part = folder / "logs" / "bt_seed3_episode0.mcap.part"
+    deadline = time.monotonic() + 300
+    while not (part.exists() and part.stat().st_size > 200_000) and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert "interrupted" in err
+    assert "Traceback" not in err
+    assert json.loads((folder / "run.json").read_text())["status"] == "interrupted"
+    done = subprocess.run([sys.executable, "-m", "uuvtai", "log", "repair", str(part)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "messages recovered" in done.stdout

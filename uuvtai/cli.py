@@ -528,6 +528,8 @@ def main(arguments: list[str] | None = None) -> None:
 def _guarded(run: Callable[[], Any]) -> int:
     try:
         code = run()
+        if code == INTERRUPTED:  # Typer turns Ctrl-C into this
+            _say("interrupted")
         return code if isinstance(code, int) else OK
     except UsageError.__base__ as error:
         error.show()

@@ -62,7 +62,7 @@ def compare(request: Request, watch: Watch) -> tuple[dict[str, Any], Path]:
     sim = Sim(request.config, num_envs, next(iter(trees.values())), request.device)
     folder = RunFolder(request.run_dir or default_run_dir(request.world), request.config, request.seeds)
     methods, use, logs = [], {}, []
-    status, code = "failed", 1
+    status, code, recorder = "failed", 1, None
     try:
         for label, tree in trees.items():
             sim.use_tree(tree)
@@ -87,6 +87,8 @@ def compare(request: Request, watch: Watch) -> tuple[dict[str, Any], Path]:
         raise
     finally:
         watch.stop()
+        if recorder:
+            recorder.abort()
         folder.finish(status, code)
     return result, folder.path
 
