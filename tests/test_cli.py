@@ -151,6 +151,16 @@ def test_eval_prints_one_document_with_every_documented_key(evaluation):
         assert method["env_steps"] == sum(round(d["time_s"] / 0.02) for d in method["episodes_detail"])
 
 
+def test_one_thread_gives_the_same_episodes_to_the_last_digit(evaluation, tmp_path):
+    _, document, _ = evaluation
+    command = [
+        sys.executable, "-m", "uuvtai", "eval", "--controller", "bt", "--episodes", "4", "--seeds", "3", "--num-envs", "4",
+        "--set", "episode.horizon_steps=400", "--run-dir", str(tmp_path / "run"), "--json", "--device", "cpu",
+    ]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env={**os.environ, "UUV_NUM_THREADS": "1"})
+    assert json.loads(done.stdout)["methods"][0]["episodes_detail"] == document["methods"][1]["episodes_detail"]
+
+
 def test_eval_leaves_a_complete_run_folder(evaluation):
     folder, document, _ = evaluation
     names = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
