@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -231,18 +230,3 @@ def _interval(k: int, n: int) -> list[float] | None:
 
 def _summed(names: tuple[str, ...], counts: list[dict[str, int]]) -> dict[str, int]:
     return {name: sum(c[name] for c in counts) for name in names}
-
-
-@dataclass
-class Stopwatch:
-    """Wall time since it was made."""
-
-    begun: float = 0.0
-
-    def __post_init__(self) -> None:
-        self.begun = time.perf_counter()
-
-    @property
-    def seconds(self) -> float:
-        """Seconds so far."""
-        return time.perf_counter() - self.begun
