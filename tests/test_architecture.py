@@ -15,8 +15,8 @@ PACKAGE = ROOT / "uuvtai"
 KERNELS = sorted((PACKAGE / "kernels").glob("*.py"))
 
 STAGES = {
-    "actuation", "clearance", "debug_stamp", "depth", "dynamics", "episode", "evasion", "features", "mapping", "proprioception", "reward",
-    "route", "sonar", "teacher", "threats", "tracking", "triggers", "voronoi", "world",
+    "actuation", "clearance", "debug_stamp", "depth", "dynamics", "episode", "evasion", "features", "forecast", "mapping", "proprioception",
+    "reward", "route", "sonar", "teacher", "threats", "tracking", "triggers", "voronoi", "world",
 }  # fmt: skip
 FLOOR = {p.stem for p in KERNELS} - STAGES
 """Kernel files that stages may import: all that are no stage themselves."""

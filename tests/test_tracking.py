@@ -10,7 +10,7 @@ from tests.reference import small_sonar
 from tests.reference import tracking as oracle
 from uuvtai.config import EpisodeConfig, SonarConfig, TankConfig, TrackingConfig
 from uuvtai.kernels import kalman, tracking
-from uuvtai.state import ClockState, ClusterState, ForecastState, SonarScan, TrackState, allocate
+from uuvtai.state import ClockState, ClusterState, SonarScan, TrackState, allocate
 
 N_ENV = 16
 DT_S = 0.02
@@ -27,7 +27,6 @@ SIZES = {
     "n_ray": PAPER.n_ray,
     "n_track": CONFIG.n_track,
     "n_cluster": CONFIG.n_cluster,
-    "n_forecast": round(CONFIG.horizon_s / CONFIG.forecast_dt_s) + 1,
 }
 
 STATE_TOLERANCE = 2e-4
@@ -47,14 +46,14 @@ class Lab:
 
     def __init__(self, sonar):
         self.sonar = sonar
-        self.tracks, self.clusters, self.scan, self.clock, self.forecast = (
-            allocate(struct, SIZES) for struct in (TrackState, ClusterState, SonarScan, ClockState, ForecastState)
+        self.tracks, self.clusters, self.scan, self.clock = (
+            allocate(struct, SIZES) for struct in (TrackState, ClusterState, SonarScan, ClockState)
         )
 
     def begin(self, seed=0):
         self.rng = np.random.default_rng(seed)
         self.clock.awake.fill(1)
-        tracking.reset_tracks(self.tracks, self.clusters, self.forecast, self.clock)
+        tracking.reset_tracks(self.tracks, self.clusters, self.clock)
         return self
 
     def feed(self, step, pos, yaw, vel_w, range_m, doppler, hit, late=0):
@@ -73,9 +72,6 @@ class Lab:
 
     def track(self):
         tracking.track_bodies(self.tracks, self.clusters, self.scan, self.clock, CONFIG, self.sonar, TANK, RULES)
-
-    def predict(self):
-        tracking.forecast_tracks(self.forecast, self.tracks, self.clock, CONFIG, RULES)
 
     def sense(self, step, pos, yaw, vel_w, bodies, clean=False):
         """Cast, spoil and track one scan of ``bodies`` = (centre, vel, radius, half, yaw); returns the true body of each beam."""
@@ -346,15 +342,15 @@ def test_velocity_and_position_of_movers(paper, v, paths):
 def test_static_scene_is_not_moving(paper):
     rng = np.random.default_rng(6)
     lab, drive, still = paper.begin(3), Drive(rng, yaw_rate=0.8), resting(rng, 12)
-    false, total, forecasts = 0, 0, 0
+    false, total, called = 0, 0, 0
     for k in range(100):
         body = lab.sense(k * CONFIG.period_steps, drive.pos, drive.yaw, drive.vel, still)
         beam_track, moving = lab.read("beam_track"), lab.read("moving")
         false += ((beam_track >= 0) & (np.take_along_axis(moving, np.maximum(beam_track, 0), 1) == 1)).sum()
-        total, forecasts = total + (body >= 0).sum(), forecasts + moving.sum()
+        total, called = total + (body >= 0).sum(), called + moving.sum()
         drive.advance(PERIOD_S)
     assert false <= 0.01 * total
-    assert forecasts <= 0.05 * 100 * N_ENV
+    assert called <= 0.05 * 100 * N_ENV
 
 
 def test_slow_mover_recognised_within_a_second(paper):
@@ -498,8 +494,6 @@ def test_empty_scan_and_walls_only(paper):
     lab.sense(3, pos, yaw, own, no_bodies())
     assert not lab.read("alive").any()
     assert (lab.read("beam_track") == -1).all()
-    lab.predict()
-    assert (lab.forecast.radius_m.to_numpy() < 0).all()
 
 
 def test_clutter_everywhere_stays_bounded(harsh):
@@ -546,8 +540,7 @@ def busy_run(lab, order, awake=None, n_scan=12):
             lab.clock.awake.from_numpy(awake[place].astype(np.int32))
         lab.feed(3 * k, *(v[place] for v in (drive.pos, drive.yaw, drive.vel, *seen)))
         drive.advance(PERIOD_S)
-    lab.predict()
-    return {**{n: v[order] for n, v in lab.everything().items()}, "forecast": lab.forecast.radius_m.to_numpy()[order]}
+    return {n: v[order] for n, v in lab.everything().items()}
 
 
 def assert_same(a, b, rows=slice(None)):
@@ -570,10 +563,10 @@ def test_only_awake_rows_change(paper):
     assert not half["alive"][awake == 0].any()
     paper.clock.awake.from_numpy((1 - awake).astype(np.int32))
     before = paper.everything()
-    tracking.reset_tracks(paper.tracks, paper.clusters, paper.forecast, paper.clock)
+    tracking.reset_tracks(paper.tracks, paper.clusters, paper.clock)
     assert_same(before, paper.everything(), awake == 1)
     paper.clock.awake.fill(1)
-    tracking.reset_tracks(paper.tracks, paper.clusters, paper.forecast, paper.clock)
+    tracking.reset_tracks(paper.tracks, paper.clusters, paper.clock)
     assert not paper.read("alive").any()
     assert (paper.read("beam_track") == -1).all()
     assert (paper.read("scan_step") == -1).all()
@@ -597,36 +590,6 @@ def test_scans_between_periods_and_stale_scans_are_left_out(paper):
     before = lab.everything()
     lab.track()
     assert_same(before, lab.everything())
-
-
-def test_forecast_is_straight_and_starts_now(paper):
-    """A body at 0.8 m/s, the scan two steps late: sample k lies at state + v (0.04 + 0.1 k), its radius grows, within bounds."""
-    lab, (pos, yaw, own) = paper.begin(18), at_rest(5.0, 3.0)
-    for k in range(20):
-        lab.sense(3 * k, pos, yaw, own, one_circle([9.0 - 0.8 * k * PERIOD_S, 3.4], [-0.8, 0.0]))
-    lab.clock.step.fill(3 * k + 2)
-    lab.predict()
-    track = only_track(lab)
-    state = lab.read("state")[np.arange(N_ENV), track]
-    ahead = 2 * DT_S + CONFIG.forecast_dt_s * np.arange(SIZES["n_forecast"])
-    where = lab.forecast.pos_w.to_numpy()[np.arange(N_ENV), track]
-    np.testing.assert_allclose(where, state[:, None, :2] + ahead[None, :, None] * state[:, None, 2:], atol=1e-5)
-    truth = np.stack([9.0 - 0.8 * (k * PERIOD_S + ahead), np.full_like(ahead, 3.4)], -1)
-    assert np.median(np.hypot(*np.moveaxis(where - truth, -1, 0))[:, -1]) < 0.15
-    size = lab.forecast.radius_m.to_numpy()
-    body = lab.read("radius_m")[np.arange(N_ENV), track]
-    grown = size[np.arange(N_ENV), track] - body[:, None]
-    P = lab.read("cov")[np.arange(N_ENV), track].astype(float)
-    for env in range(N_ENV):
-        full = np.zeros((4, 4))
-        full[np.triu_indices(4)] = P[env]
-        full = full + np.triu(full, 1).T
-        for j in (0, 10, 25):
-            F = np.hstack([np.eye(2), ahead[j] * np.eye(2)])
-            wanted = min(np.sqrt(np.linalg.eigvalsh(F @ full @ F.T)[-1]), CONFIG.max_growth_m)
-            np.testing.assert_allclose(grown[env, j], wanted, atol=1e-4)
-    size[np.arange(N_ENV), track] = -1
-    assert (size < 0).all()
 
 
 def test_turn_rate_of_a_circle_is_learnt(paper):

@@ -458,6 +458,13 @@ class TrackingConfig(Section):
     max_growth_m: NonNegative = 0.5
 
 
+class ForecastConfig(Section):
+    """What forecasts of moving bodies know of how bodies move. Each switch is one row of an ablation."""
+
+    use_turn_rate: bool = True
+    """bodies keep their turn rate; off: straight ahead"""
+
+
 class MappingConfig(Section):
     """Two-layer occupancy map. Gains are per scan at 10 Hz; at another scan rate they are scaled so that gain per second is kept."""
 
@@ -707,6 +714,7 @@ class Config(Section):
     disturbance: DisturbanceConfig = DisturbanceConfig()
     sensors: SensorsConfig = SensorsConfig()
     tracking: TrackingConfig = TrackingConfig()
+    forecast: ForecastConfig = ForecastConfig()
     mapping: MappingConfig = MappingConfig()
     clearance: ClearanceConfig = ClearanceConfig()
     voronoi: VoronoiConfig = VoronoiConfig()

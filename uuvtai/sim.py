@@ -28,6 +28,7 @@ from uuvtai.kernels import (
     episode,
     evasion,
     features,
+    forecast,
     mapping,
     proprioception,
     reward,
@@ -178,7 +179,8 @@ class Sim:
         proprioception.reset_proprioception(s.ego, s.ego_memory, s.vehicle, s.episode, s.clock, c.sensors)
         sonar.reset_sonar(s.scan, s.sonar_memory, s.clock)
         depth.reset_depth(s.image, s.clock)
-        tracking.reset_tracks(s.tracks, s.clusters, s.forecast, s.clock)
+        tracking.reset_tracks(s.tracks, s.clusters, s.clock)
+        forecast.reset_forecast(s.forecast, s.clock)
         mapping.reset_map(s.grid_map, s.clock)
         route.reset_route(s.route, s.clock)
         teacher.reset_teacher(s.teacher, s.clock)
@@ -227,7 +229,7 @@ class Sim:
             depth.cast_depth(s.image, s.ego, s.vehicle, s.world, s.episode, s.clock, c.sensors.depth, c.world.tank)
         with self._stage("tracking"):
             tracking.track_bodies(s.tracks, s.clusters, s.scan, s.clock, c.tracking, c.sensors.sonar, c.world.tank, c.episode)
-            tracking.forecast_tracks(s.forecast, s.tracks, s.clock, c.tracking, c.episode)
+            forecast.forecast_tracks(s.forecast, s.tracks, s.clock, c.forecast, c.tracking, c.episode)
         with self._stage("mapping"):
             mapping.update_map(
                 s.grid_map, s.scan, s.image, s.tracks, s.mask, s.clock, c.mapping, c.sensors.sonar, c.sensors.depth, c.world.tank, c.episode

@@ -1,4 +1,4 @@
-"""Tracking: from clusters of beams to tracks of moving bodies, and where they will be. Sees sensor data and its own memory only.
+"""Tracking: from clusters of beams to tracks of moving bodies. Sees sensor data and its own memory only.
 
 One scan: label beams - find clusters - predict - associate - update - prune - spawn - name beams. One Kalman filter per track on position
 and mean Doppler; all states refer to the ping of the newest tracked scan (``scan_step``). Static obstacles get tracks too, which must never
@@ -11,15 +11,15 @@ from uuvtai.config import EpisodeConfig, SonarConfig, TankConfig, TrackingConfig
 from uuvtai.kernels.association import associate
 from uuvtai.kernels.clustering import find_clusters, label_beams
 from uuvtai.kernels.geometry import turned_z
-from uuvtai.kernels.kalman import largest_position_variance, predicted
+from uuvtai.kernels.kalman import predicted
 from uuvtai.kernels.signature import Const, In, Out, spread
 from uuvtai.kernels.track_slots import carry_names, clear_track, name_beams, prune_tracks, spawn_tracks
 from uuvtai.kernels.track_update import update_tracks
-from uuvtai.state import ClockState, ClusterState, ForecastState, SonarScan, TrackState
+from uuvtai.state import ClockState, ClusterState, SonarScan, TrackState
 
 
 @ti.kernel
-def reset_tracks(tracks: Out[TrackState], clusters: Out[ClusterState], forecast: Out[ForecastState], clock: In[ClockState]):
+def reset_tracks(tracks: Out[TrackState], clusters: Out[ClusterState], clock: In[ClockState]):
     """Forget everything about the awake rows."""
     n = ti.static(clock.awake.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
@@ -31,9 +31,6 @@ def reset_tracks(tracks: Out[TrackState], clusters: Out[ClusterState], forecast:
             clusters.count[env] = 0
             for track in range(tracks.alive.shape[1]):
                 clear_track(env, track, tracks)
-                clear_forecast(env, track, forecast)
-                for k in range(forecast.pos_w.shape[2]):
-                    forecast.pos_w[env, track, k] = ti.Vector([0.0, 0.0])
             for ray in range(tracks.beam_track.shape[1]):
                 tracks.beam_track[env, ray] = -1
 
@@ -129,30 +126,7 @@ def keep_slots(
             carry_names(env, tracks, clusters, scan, tracking, sonar)
 
 
-@ti.kernel
-def forecast_tracks(
-    forecast: Out[ForecastState],
-    tracks: In[TrackState],
-    clock: In[ClockState],
-    tracking: Const[TrackingConfig],
-    rules: Const[EpisodeConfig],
-):
-    """Constant velocity from now to the horizon, for the moving tracks of the awake rows; the others get a negative radius.
-
-    The radius grows by ``growth_sigmas`` standard deviations of the predicted position along its worst axis, as the filter knows it today:
-    turns to come are not in it (the planner's own growing margin is for them). At most ``max_growth_m``.
-    """
-    n = ti.static(clock.awake.shape[0])
-    n_track = ti.static(tracks.alive.shape[1])
-    for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n * n_track))):
-        if pad == 0 and clock.awake[env] == 1:
-            if tracks.alive[env, track] * tracks.moving[env, track] == 1:
-                extrapolate(env, track, forecast, tracks, clock, tracking, rules)
-            elif forecast.radius_m[env, track, 0] >= 0:
-                clear_forecast(env, track, forecast)
-
-
-# ---------------------------------------------------------------------------------------------------------- clock and forgetting
+# --------------------------------------------------------------------------------------------------------------------- clock
 
 
 @ti.func
@@ -160,31 +134,6 @@ def is_due(env, clusters: In[ClusterState], scan: In[SonarScan], tracking: Const
     """1 where a scan has come that is to be tracked."""
     last = clusters.scan_step[env]
     return ti.cast(scan.fresh[env] == 1 and (last < 0 or scan.ping_step[env] - last >= tracking.period_steps), ti.i32)
-
-
-@ti.func
-def clear_forecast(env, track, forecast: Out[ForecastState]):
-    for k in range(forecast.radius_m.shape[2]):
-        forecast.radius_m[env, track, k] = -1.0
-
-
-@ti.func
-def extrapolate(
-    env,
-    track,
-    forecast: Out[ForecastState],
-    tracks: In[TrackState],
-    clock: In[ClockState],
-    tracking: Const[TrackingConfig],
-    rules: Const[EpisodeConfig],
-):
-    mean, cov = tracks.state[env, track], tracks.cov[env, track]
-    late = (clock.step[env] - tracks.scan_step[env]) * rules.control_dt_s
-    for k in range(forecast.radius_m.shape[2]):
-        ahead = late + k * tracking.forecast_dt_s
-        growth = tracking.growth_sigmas * ti.sqrt(largest_position_variance(cov, ahead))
-        forecast.pos_w[env, track, k] = ti.Vector([mean[0] + ahead * mean[2], mean[1] + ahead * mean[3]])
-        forecast.radius_m[env, track, k] = tracks.radius_m[env, track] + ti.min(growth, tracking.max_growth_m)
 
 
 # ------------------------------------------------------------------------------------------------------------------- predict

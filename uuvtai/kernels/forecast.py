@@ -1,0 +1,88 @@
+"""Forecast: where every moving track will be from now to the horizon, and how surely. Sees tracks only, never the truth."""
+
+import taichi as ti
+
+from uuvtai.config import EpisodeConfig, ForecastConfig, TrackingConfig
+from uuvtai.kernels.geometry import turned_z
+from uuvtai.kernels.kalman import largest_position_variance
+from uuvtai.kernels.signature import Const, In, Out, spread
+from uuvtai.state import ClockState, ForecastState, TrackState
+
+
+@ti.kernel
+def reset_forecast(forecast: Out[ForecastState], clock: In[ClockState]):
+    """Expect nothing in the awake rows."""
+    n = ti.static(clock.awake.shape[0])
+    for env, pad in ti.ndrange(n, ti.static(spread(n))):
+        if pad == 0 and clock.awake[env] == 1:
+            for track in range(forecast.radius_m.shape[1]):
+                clear_forecast(env, track, forecast)
+                for k in range(forecast.pos_w.shape[2]):
+                    forecast.pos_w[env, track, k] = ti.Vector([0.0, 0.0])
+
+
+@ti.kernel
+def forecast_tracks(
+    forecast: Out[ForecastState],
+    tracks: In[TrackState],
+    clock: In[ClockState],
+    forecast_cfg: Const[ForecastConfig],
+    tracking: Const[TrackingConfig],
+    rules: Const[EpisodeConfig],
+):
+    """From now to the horizon, for the moving tracks of the awake rows; the others get a negative radius.
+
+    The radius grows by ``growth_sigmas`` standard deviations of the predicted position along its worst axis, as the filter knows it today:
+    turns to come are not in it (the planner's own growing margin is for them). At most ``max_growth_m``.
+    """
+    n = ti.static(clock.awake.shape[0])
+    n_track = ti.static(tracks.alive.shape[1])
+    for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n * n_track))):
+        if pad == 0 and clock.awake[env] == 1:
+            if tracks.alive[env, track] * tracks.moving[env, track] == 1:
+                extrapolate(env, track, forecast, tracks, clock, forecast_cfg, tracking, rules)
+            elif forecast.radius_m[env, track, 0] >= 0:
+                clear_forecast(env, track, forecast)
+
+
+@ti.func
+def clear_forecast(env, track, forecast: Out[ForecastState]):
+    for k in range(forecast.radius_m.shape[2]):
+        forecast.radius_m[env, track, k] = -1.0
+
+
+@ti.func
+def extrapolate(
+    env,
+    track,
+    forecast: Out[ForecastState],
+    tracks: In[TrackState],
+    clock: In[ClockState],
+    forecast_cfg: Const[ForecastConfig],
+    tracking: Const[TrackingConfig],
+    rules: Const[EpisodeConfig],
+):
+    """Constant speed and turn rate: steps along the chords of the arc."""
+    mean, cov = tracks.state[env, track], tracks.cov[env, track]
+    late = (clock.step[env] - tracks.scan_step[env]) * rules.control_dt_s
+    rate = 0.0
+    if ti.static(forecast_cfg.use_turn_rate):
+        rate = tracks.turn_rate[env, track]
+    vel = ti.Vector([mean[2], mean[3]])
+    pos = ti.Vector([mean[0], mean[1]]) + late * chord(rate * late) * turned_z(vel, 0.5 * rate * late)
+    vel = turned_z(vel, rate * late)
+    step = ti.static(tracking.forecast_dt_s) * chord(rate * tracking.forecast_dt_s)
+    for k in range(forecast.radius_m.shape[2]):
+        ahead = late + k * tracking.forecast_dt_s
+        growth = tracking.growth_sigmas * ti.sqrt(largest_position_variance(cov, ahead))
+        forecast.pos_w[env, track, k] = pos
+        forecast.radius_m[env, track, k] = tracks.radius_m[env, track] + ti.min(growth, tracking.max_growth_m)
+        pos += step * turned_z(vel, 0.5 * rate * tracking.forecast_dt_s)
+        vel = turned_z(vel, rate * tracking.forecast_dt_s)
+
+
+@ti.func
+def chord(angle):
+    """Length of the chord over that of its arc of less than a turn: sin(a / 2) / (a / 2), by its series."""
+    square = 0.25 * angle * angle
+    return 1.0 - square / 6.0 * (1.0 - square / 20.0)
