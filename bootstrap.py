@@ -16,6 +16,9 @@ VENV = ROOT / ".venv"
 BIN = VENV / ("Scripts" if os.name == "nt" else "bin")
 JS = ROOT / "tests" / "js"
 
+IN_FULL = ["-n", "2", "--dist", "worksteal", "--cov", "--cov-report=term:skip-covered"]
+"""Two processes: what takes long is compiling kernels, which one process does on one thread."""
+
 DEMO = ["eval", "--world", "pool", "--record", "2", "--video"]
 
 
@@ -49,7 +52,7 @@ def test(arguments: list[str]) -> int:
         [str(BIN / "ruff"), "format", "--check", "."],
         [str(BIN / "pyright"), "--pythonpath", python],
         [str(BIN / "lint-imports")],
-        [python, "-m", "pytest", *(arguments or ["--cov", "--cov-report=term:skip-covered"])],
+        [python, "-m", "pytest", *(arguments or IN_FULL)],
     ]
     return next((code for command in checks if (code := run(command))), 0)
 
