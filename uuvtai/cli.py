@@ -67,6 +67,13 @@ def evaluate(
     record: Annotated[int, typer.Option("--record", help="Record the first K episodes of every method as MCAP with a picture.")] = 0,
     video: Annotated[bool, typer.Option("--video", help="Also a top-down video of every recorded episode.")] = False,
     depth_images: Annotated[bool, typer.Option("--depth-images", help="Also record the depth camera (2 Hz).")] = False,
+    explain: Annotated[
+        bool, typer.Option("--explain", help="Label the cause of every failure, judged from the truth: which sense or decision failed.")
+    ] = False,
+    explain_record: Annotated[
+        int | None,
+        typer.Option("--explain-record", help="With --explain: log, picture and video of N of the worst failures per method [default: 3]."),
+    ] = None,
     device: Device = "auto",
     overrides: Set = None,
     run_dir: RunDir = None,
@@ -76,6 +83,10 @@ def evaluate(
     seed_list = _seeds(seeds)
     _at_least("--episodes", episodes, 1)
     _at_least("--record", record, 0)
+    if explain_record is not None:
+        _at_least("--explain-record", explain_record, 0)
+        if not explain:
+            raise UsageError("--explain-record: give --explain too, it says which episodes to record")
     config = _config(world, sensors, vehicle, n_static, n_dynamic, speed, overrides)
     names = [name for item in controller or ["straight", "planner", "bt"] for name in item.split(",") if name]
     if not names:
@@ -95,6 +106,8 @@ def evaluate(
         record=record,
         video=video,
         depth_images=depth_images,
+        explain=explain,
+        explain_record=3 if explain_record is None else explain_record,
         device=device,
         run_dir=run_dir,
     )
@@ -103,6 +116,8 @@ def evaluate(
         _print_json(result)
     else:
         _print_methods(result)
+        if explain:
+            _print_causes(result)
         _say(f"run folder: {folder}")
 
 
@@ -138,6 +153,21 @@ def _print_methods(result: dict[str, Any]) -> None:
             f"{m['env_steps_per_s']:,.0f}",
         )
     _stdout().print(table)
+
+
+def _print_causes(result: dict[str, Any]) -> None:
+    for m in result["methods"]:
+        failed = len(m["explain"])
+        if not failed:
+            _stdout().print(f"{m['name']}: no episode failed, nothing to explain", highlight=False)
+            continue
+        table = Table(title=f"{m['name']}: why {failed} of {m['episodes']} episodes failed", title_justify="left")
+        for head in ("cause", "episodes", "share", "meaning", "worst (seed:episode)"):
+            table.add_column(head, justify="right" if head in ("episodes", "share") else "left")
+        for cause in m["causes"]:
+            examples = ", ".join(f"{seed}:{episode}" for seed, episode in cause["examples"])
+            table.add_row(cause["label"], str(cause["count"]), f"{100 * cause['share']:.0f} %", cause["meaning"], examples)
+        _stdout().print(table)
 
 
 def _rate(k: int, n: int, interval: list[float] | None) -> str:

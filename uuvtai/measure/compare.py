@@ -29,6 +29,8 @@ class Request:
     record: int = 0
     video: bool = False
     depth_images: bool = False
+    explain: bool = False
+    explain_record: int = 3
     device: str = "auto"
     run_dir: Path | None = None
 
@@ -47,7 +49,7 @@ def compare(request: Request, watch: Watch) -> tuple[dict[str, Any], Path]:
 
     Everything that can be refused is refused before anything is written. Raises ConfigError, ValueError, MemoryError, RunFolderError.
     """
-    from uuvtai.measure.evaluate import document, jobs_of, run_episodes, summary, tree_use
+    from uuvtai.measure.evaluate import EpisodeResult, document, jobs_of, run_episodes, summary, tree_use
     from uuvtai.sim import Sim
     from uuvtai.tree import read_tree
 
@@ -62,6 +64,7 @@ def compare(request: Request, watch: Watch) -> tuple[dict[str, Any], Path]:
     sim = Sim(request.config, num_envs, next(iter(trees.values())), request.device)
     folder = RunFolder(request.run_dir or default_run_dir(request.world), request.config, request.seeds)
     methods, use, logs = [], {}, []
+    played: dict[str, list[EpisodeResult]] = {}
     status, code, recorder = "failed", 1, None
     try:
         for label, tree in trees.items():
@@ -72,6 +75,7 @@ def compare(request: Request, watch: Watch) -> tuple[dict[str, Any], Path]:
             results, env_steps = run_episodes(sim, jobs, recorder, watch.update)
             methods.append(summary(label, results, env_steps, time.perf_counter() - begun))
             watch.stop()
+            played[label] = results
             use[label] = tree_use(sim, results)
             if recorder:
                 logs.append(recorder.paths)
@@ -80,6 +84,8 @@ def compare(request: Request, watch: Watch) -> tuple[dict[str, Any], Path]:
         for label, tree in trees.items():
             folder.write(f"eval/trees/{label}.xml", Path(tree.source).read_text())
         folder.write_json("eval/tree.json", {"schema": 1, "use": use})
+        if request.explain:
+            _explain(request, sim, trees, played, result, folder, watch)
         _draw(request, folder.path, logs, watch)
         status, code = "finished", 0
     except KeyboardInterrupt:
@@ -91,6 +97,26 @@ def compare(request: Request, watch: Watch) -> tuple[dict[str, Any], Path]:
             recorder.abort()
         folder.finish(status, code)
     return result, folder.path
+
+
+def _explain(request: Request, sim: Any, trees: dict, played: dict, result: dict[str, Any], folder: RunFolder, watch: Watch) -> None:
+    """Replay what failed, add the causes to the document, write them, record the worst; what was measured is on disk already."""
+    from uuvtai.measure.explain import chosen_for_recording, explain_failures, failures, record_worst, table_of
+
+    chosen = {}
+    for method in result["methods"]:
+        label = method["name"]
+        watch.start(f"{label}: replaying failures", len(failures(played[label])))
+        rows = explain_failures(sim, trees[label], played[label], watch.update)
+        watch.stop()
+        method["causes"] = table_of(rows)
+        method["explain"] = [row.document() for row in rows]
+        chosen[label] = chosen_for_recording(rows, request.explain_record)
+    folder.write_json("eval/result.json", result)
+    causes = [{"name": m["name"], "causes": m["causes"], "explain": m["explain"]} for m in result["methods"]]
+    folder.write_json("eval/explain.json", {"schema": 1, "methods": causes})
+    for label, rows in chosen.items():
+        record_worst(sim, trees[label], rows, folder.path / "explain", request.world, label, watch.note)
 
 
 def _recorder(request: Request, folder: Path, label: str, jobs: list) -> Any:

@@ -1,0 +1,241 @@
+"""Explain failed episodes: play them again, keep the truth and the vehicle's beliefs of their last seconds, label each (``causes.py``).
+
+An episode is the same in any batch, so only the failed ones are replayed, and their ends are known beforehand: nothing is kept of the
+time before the last ``causes.WINDOW_S`` but a coarse diary.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from uuvtai.config import Config
+from uuvtai.measure import causes
+from uuvtai.measure.causes import Bodies, Diary, Explanation, History
+from uuvtai.measure.evaluate import EpisodeResult, Job, Progress, run_episodes
+from uuvtai.scenario import body_slots
+from uuvtai.sim import Sim
+from uuvtai.tree import FlatTree
+
+EXAMPLES = 3
+"""Episodes named per label in the table."""
+
+_DENSE_S, _SPARSE_S, _DIARY_S = 0.5, 0.1, 0.5
+"""Every step is kept for the last half second, ten samples a second before that, and two diary entries a second."""
+
+_WINDOW_FIELDS = {
+    "vehicle": ("pos_w", "quat_wb", "vel_b", "rate_b"),
+    "world": ("pos_w", "vel_w"),
+    "scan": ("ping_step", "range_m"),
+    "tracks": ("alive", "moving", "state"),
+    "forecast": ("pos_w", "radius_m"),
+    "teacher": ("leaf", "conflict_s", "action", "clearance_m"),
+}
+_DIARY_FIELDS = {"vehicle": ("pos_w",), "mission": ("goal_w",), "route": ("n_way",), "teacher": ("leaf",)}
+_BODY_FIELDS = {"world": ("kind", "size", "yaw"), "path": ("n_way", "radius_m", "speed_m_s")}
+
+_FORESEEN_S = 1.0e3
+"""A predicted conflict; beyond = none (geometry.FAR_M)."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A failed episode with its explanation."""
+
+    result: EpisodeResult
+    explanation: Explanation
+
+    def document(self) -> dict[str, Any]:
+        """One entry of ``explain`` in ``uuv eval --json``."""
+        r, e = self.result, self.explanation
+        return {"seed": r.seed, "episode": r.episode, "outcome": r.outcome, "label": e.label, "killer": vars(e.killer), **e.facts}
+
+
+@dataclass
+class _Watched:
+    """What is kept of one running episode."""
+
+    end_step: int
+    step: int = 0
+    bodies: Bodies | None = None
+    window: list[dict[str, np.ndarray]] = field(default_factory=list)
+    diary: list[dict[str, np.ndarray]] = field(default_factory=list)
+
+
+class Coroner:
+    """Recorder that watches failed episodes as they are replayed; ``found`` maps each job to its explanation."""
+
+    def __init__(self, config: Config, tree: FlatTree, failed: list[EpisodeResult]) -> None:
+        self._config, self._tree = config, tree
+        self._dt = config.episode.control_dt_s
+        self._expected = {Job(r.seed, r.episode): r for r in failed}
+        self._rows: dict[int, _Watched] = {}
+        self.found: dict[Job, Explanation] = {}
+
+    def begin(self, sim: Sim, row: int, job: Job) -> None:
+        """An episode has just been reset in this row."""
+        self._rows[row] = _Watched(round(self._expected[job].time_s / self._dt))
+
+    def step(self, sim: Sim) -> None:
+        """A control step has been done: read the rows that are due, all together."""
+        for watched in self._rows.values():
+            watched.step += 1
+        new = [row for row, watched in self._rows.items() if watched.step == 1]
+        for row, read in _read_rows(sim, _BODY_FIELDS, new).items():
+            self._rows[row].bodies = _bodies(sim.config, read)
+        for row, read in _read_rows(sim, _WINDOW_FIELDS, self._due(self._is_in_window)).items():
+            self._rows[row].window.append(read | {"step": np.array(self._rows[row].step)})
+        for row, read in _read_rows(sim, _DIARY_FIELDS, self._due(self._is_diary_due)).items():
+            self._rows[row].diary.append(read | {"step": np.array(self._rows[row].step)})
+
+    def end(self, sim: Sim, row: int, result: EpisodeResult) -> None:
+        """Explain the episode and forget its history. Raises RuntimeError where the replay ended differently."""
+        job, watched = Job(result.seed, result.episode), self._rows.pop(row)
+        expected = self._expected[job]
+        if (result.outcome, result.time_s) != (expected.outcome, expected.time_s):
+            raise RuntimeError(
+                f"replay of seed {job.seed} episode {job.episode} ended with {result.outcome} at {result.time_s} s instead of "
+                f"{expected.outcome} at {expected.time_s} s: episodes must be the same in any batch, please report this"
+            )
+        assert watched.bodies is not None  # read after the first step
+        self.found[job] = causes.explain(result.outcome, self._history(watched), watched.bodies, self._config)
+
+    def _due(self, is_due: Callable[[_Watched], bool]) -> list[int]:
+        return [row for row, watched in self._rows.items() if is_due(watched)]
+
+    def _is_in_window(self, watched: _Watched) -> bool:
+        left = watched.end_step - watched.step
+        sparse = max(1, round(_SPARSE_S / self._dt))
+        return left * self._dt <= _DENSE_S or (left * self._dt <= causes.WINDOW_S and left % sparse == 0)
+
+    def _is_diary_due(self, watched: _Watched) -> bool:
+        left = watched.end_step - watched.step
+        return left == 0 or watched.step == 1 or watched.step % max(1, round(_DIARY_S / self._dt)) == 0
+
+    def _history(self, watched: _Watched) -> History:
+        w, d = _stacked(watched.window), _stacked(watched.diary)
+        state = w["tracks.state"]
+        return History(
+            t_s=w["step"] * self._dt,
+            pos_w=w["vehicle.pos_w"].astype(float),
+            quat_wb=w["vehicle.quat_wb"].astype(float),
+            vel_b=w["vehicle.vel_b"].astype(float),
+            rate_b=w["vehicle.rate_b"].astype(float),
+            body_w=w["world.pos_w"].astype(float),
+            body_vel_w=w["world.vel_w"].astype(float),
+            ping_age_s=(w["step"] - w["scan.ping_step"]) * self._dt,
+            range_m=w["scan.range_m"].astype(float),
+            track_moving=np.where(w["tracks.alive"] == 1, w["tracks.moving"], -1),
+            track_w=state[:, :, :2].astype(float),
+            forecast_w=w["forecast.pos_w"].astype(float),
+            forecast_m=w["forecast.radius_m"][:, :, 0].astype(float),
+            conflict=w["teacher.conflict_s"] < _FORESEEN_S,
+            leaf=self._leaves(w["teacher.leaf"]),
+            action=w["teacher.action"].astype(float),
+            map_clearance_m=w["teacher.clearance_m"].astype(float),
+            diary=Diary(
+                t_s=d["step"] * self._dt,
+                pos_w=d["vehicle.pos_w"].astype(float),
+                goal_m=np.linalg.norm(d["mission.goal_w"] - d["vehicle.pos_w"], axis=1),
+                has_route=d["route.n_way"] > 0,
+                leaf=self._leaves(d["teacher.leaf"]),
+            ),
+        )
+
+    def _leaves(self, nodes: np.ndarray) -> list[str]:
+        return [self._tree.types[node] if node >= 0 else "" for node in nodes]
+
+
+def explain_failures(sim: Sim, tree: FlatTree, results: list[EpisodeResult], progress: Progress | None = None) -> list[Row]:
+    """Replay the failed episodes of one method and explain them; in the order of ``results``. Raises RuntimeError (see ``Coroner.end``)."""
+    failed = failures(results)
+    if not failed:
+        return []
+    sim.use_tree(tree)
+    coroner = Coroner(sim.config, tree, failed)
+    run_episodes(sim, [Job(r.seed, r.episode) for r in failed], coroner, progress)
+    return [Row(r, coroner.found[Job(r.seed, r.episode)]) for r in failed]
+
+
+def failures(results: list[EpisodeResult]) -> list[EpisodeResult]:
+    """Everything that is no success."""
+    return [r for r in results if r.outcome != "success"]
+
+
+def table_of(rows: list[Row]) -> list[dict[str, Any]]:
+    """Per label, most frequent first: count, share of the failures, meaning and the worst episodes."""
+    counts = Counter(row.explanation.label for row in rows)
+    order = list(causes.CAUSES)
+    return [
+        {
+            "label": label,
+            "count": counts[label],
+            "share": counts[label] / len(rows),
+            "meaning": causes.CAUSES[label],
+            "examples": [[row.result.seed, row.result.episode] for row in worst_of(rows, label)[:EXAMPLES]],
+        }
+        for label in sorted(counts, key=lambda label: (-counts[label], order.index(label)))
+    ]
+
+
+def worst_of(rows: list[Row], label: str) -> list[Row]:
+    """Episodes of a label, the worst first: the hardest hits, of timeouts those that ended farthest from the goal."""
+
+    def badness(row: Row) -> tuple[float, float]:
+        return (row.explanation.killer.closing_m_s or 0.0, row.explanation.facts.get("goal_m", 0.0))
+
+    return sorted((row for row in rows if row.explanation.label == label), key=badness, reverse=True)
+
+
+def chosen_for_recording(rows: list[Row], wanted: int) -> list[Row]:
+    """The worst episode of the most frequent label, then of the second, ...; after the last label the next worst of the first."""
+    queues = [worst_of(rows, entry["label"]) for entry in table_of(rows)]
+    rounds = [queue[i] for i in range(max(map(len, queues), default=0)) for queue in queues if i < len(queue)]
+    return rounds[:wanted]
+
+
+def record_worst(sim: Sim, tree: FlatTree, rows: list[Row], folder: Path, world: str, method: str, note: Callable[[str], None]) -> None:
+    """Play these episodes once more into MCAP logs with a picture and a video each, under ``folder``."""
+    from uuvtai.logs.picture import picture
+    from uuvtai.logs.video import video
+    from uuvtai.measure.recording import EpisodeRecorder
+
+    if not rows:
+        return
+    jobs = [Job(row.result.seed, row.result.episode) for row in rows]
+    sim.use_tree(tree)
+    recorder = EpisodeRecorder(folder, Path(world).stem, method, jobs)
+    try:
+        run_episodes(sim, jobs, recorder)
+    finally:
+        recorder.abort()
+    for path in recorder.paths.values():
+        note(f"drawing {path.stem}")
+        picture(path, path.with_suffix(".png"))
+        video(path, path.with_suffix(".webm"))
+
+
+def _read_rows(sim: Sim, fields: dict[str, tuple[str, ...]], rows: list[int]) -> dict[int, dict[str, np.ndarray]]:
+    """Row -> 'struct.field' -> its values."""
+    if not rows:
+        return {}
+    read = {f"{struct}.{name}": sim.rows(getattr(getattr(sim.s, struct), name), rows) for struct, names in fields.items() for name in names}
+    return {row: {name: values[i].copy() for name, values in read.items()} for i, row in enumerate(rows)}
+
+
+def _stacked(samples: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    return {name: np.stack([sample[name] for sample in samples]) for name in samples[0]}
+
+
+def _bodies(config: Config, read: dict[str, np.ndarray]) -> Bodies:
+    """Path facts are per moving slot; bodies at rest get zeros."""
+    kind, first = read["world.kind"], body_slots(config.world).first_dynamic
+    speed, circle = np.zeros(len(kind)), np.zeros(len(kind))
+    speed[first:] = np.where(kind[first:] > 0, read["path.speed_m_s"], 0.0)
+    circle[first:] = np.where((kind[first:] > 0) & (read["path.n_way"] == 0), read["path.radius_m"], 0.0)
+    return Bodies(kind, read["world.size"].astype(float), read["world.yaw"].astype(float), speed, circle)
