@@ -8,7 +8,7 @@ import taichi as ti
 
 from tests.reference import small_sonar
 from tests.reference import tracking as oracle
-from uuvtai.config import EpisodeConfig, SonarConfig, TankConfig, TrackingConfig
+from uuvtai.config import ElevationConfig, EpisodeConfig, SonarConfig, TankConfig, TrackingConfig
 from uuvtai.kernels import kalman, tracking
 from uuvtai.state import ClockState, ClusterState, SonarScan, TrackState, allocate
 
@@ -17,6 +17,7 @@ DT_S = 0.02
 TANK = TankConfig()
 RULES = EpisodeConfig()
 CONFIG = TrackingConfig()
+ELEVATION = ElevationConfig(memory_s=0.0)
 PAPER = SonarConfig(range_sigma_m=0.02, doppler_sigma_m_s=0.05)
 HARSH = SonarConfig(
     period_steps=5, latency_steps=2, range_sigma_m=0.10, range_sigma_slope=0.01, range_quantum_m=0.024, range_jitter_m=0.10,
@@ -27,6 +28,7 @@ SIZES = {
     "n_ray": PAPER.n_ray,
     "n_track": CONFIG.n_track,
     "n_cluster": CONFIG.n_cluster,
+    "n_height": 16,
 }
 
 STATE_TOLERANCE = 2e-4
@@ -71,7 +73,7 @@ class Lab:
         self.track()
 
     def track(self):
-        tracking.track_bodies(self.tracks, self.clusters, self.scan, self.clock, CONFIG, self.sonar, TANK, RULES)
+        tracking.track_bodies(self.tracks, self.clusters, self.scan, self.clock, CONFIG, ELEVATION, self.sonar, TANK, RULES)
 
     def sense(self, step, pos, yaw, vel_w, bodies, clean=False):
         """Cast, spoil and track one scan of ``bodies`` = (centre, vel, radius, half, yaw); returns the true body of each beam."""

@@ -465,6 +465,26 @@ class ForecastConfig(Section):
     """bodies keep their turn rate; off: straight ahead"""
 
 
+class ElevationConfig(Section):
+    """Memory in 3-D of bodies that left the sonar's fan (values EC, tuned)."""
+
+    memory_s: NonNegative = 8.0
+    """time constant with which an unseen body is forgotten; 0 = a body that beams see through is forgotten at once"""
+    half_height_m: NonNegative = 0.2
+    """least half height assumed of a body"""
+    column_share: Fraction = 0.05
+    """share of moving bodies expected to go through the full water column"""
+    edge_m: Positive = 0.06
+    """half width of the soft edge of the fan"""
+    hit_share: Fraction = 0.9
+    """probability that a body in the fan is hit, where its place is known exactly"""
+    gone_share: Fraction = 0.25
+    """below this probability of being where it is expected, a body is forgotten"""
+    tail_share: Fraction = 0.02
+    """heights that are less likely than this are taken to be free"""
+    column_tail_share: Fraction = 0.15
+
+
 class MappingConfig(Section):
     """Two-layer occupancy map. Gains are per scan at 10 Hz; at another scan rate they are scaled so that gain per second is kept."""
 
@@ -715,6 +735,7 @@ class Config(Section):
     sensors: SensorsConfig = SensorsConfig()
     tracking: TrackingConfig = TrackingConfig()
     forecast: ForecastConfig = ForecastConfig()
+    elevation: ElevationConfig = ElevationConfig()
     mapping: MappingConfig = MappingConfig()
     clearance: ClearanceConfig = ClearanceConfig()
     voronoi: VoronoiConfig = VoronoiConfig()

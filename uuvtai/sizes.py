@@ -10,6 +10,7 @@ from pathlib import Path
 from uuvtai import state
 from uuvtai.config import Config
 from uuvtai.kernels.grid import grid_shape
+from uuvtai.kernels.lanes import LANES
 from uuvtai.kernels.plan_codes import N_PLANNER, N_REASON, N_TRIGGER
 from uuvtai.kernels.reward import TERMS
 from uuvtai.scenario import scenario_sizes
@@ -36,6 +37,7 @@ def array_sizes(config: Config, n_env: int) -> dict[str, int]:
         "n_pixel_col": sensors.depth.cols,
         "n_track": config.tracking.n_track,
         "n_cluster": config.tracking.n_cluster,
+        "n_height": LANES,
         "n_forecast": round(config.tracking.horizon_s / config.tracking.forecast_dt_s) + 1,
         "n_row": n_row,
         "n_col": n_col,

@@ -415,6 +415,10 @@ class TrackState:
     """scans in a row without a matching cluster"""
     seen_step: ti.Field = array("n_env", "n_track", dtype=ti.i32)
     """episode step of the last match"""
+    height: ti.Field = array("n_env", "n_track", "n_height", packed=True)
+    """share of each height hypothesis (elevation.heights), summing to 1"""
+    present: ti.Field = array("n_env", "n_track")
+    """probability that the body is where it is expected"""
     scan_step: ti.Field = array("n_env", dtype=ti.i32)
     """episode step of the ping that the states refer to, -1 = no scan yet"""
     beam_track: ti.Field = array("n_env", "n_ray", dtype=ti.i32)
@@ -477,6 +481,10 @@ class ForecastState:
     """[m]"""
     radius_m: ti.Field = array("n_env", "n_track", "n_forecast")
     """[m] body radius plus what the uncertainty adds"""
+    above_w: ti.Field = array("n_env", "n_track")
+    """[m] world z of the lowest edge of what may be above the own height; the own height where the body may be level with the vehicle"""
+    below_w: ti.Field = array("n_env", "n_track")
+    """[m] world z of the highest edge of what may be below"""
 
 
 @dataclass(frozen=True, eq=False)

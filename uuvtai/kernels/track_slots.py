@@ -2,10 +2,12 @@
 
 import taichi as ti
 
-from uuvtai.config import EpisodeConfig, SonarConfig, TrackingConfig
+from uuvtai.config import ElevationConfig, EpisodeConfig, SonarConfig, TankConfig, TrackingConfig
 from uuvtai.kernels.clustering import split_distance
+from uuvtai.kernels.elevation import begin_height, weigh_seen, weigh_unseen
 from uuvtai.kernels.geometry import FAR_M, TWO_PI, wrapped_angle
 from uuvtai.kernels.kalman import born
+from uuvtai.kernels.lanes import f16x
 from uuvtai.kernels.sighting import bearing_vector, centre_sight, centre_variances, radius_variance
 from uuvtai.kernels.signature import Const, In, Out
 from uuvtai.kernels.track_update import CONFIRMED, DOPPLER_SIGMAS
@@ -41,6 +43,8 @@ def clear_track(env, track, tracks: Out[TrackState]):
     tracks.seen_step[env, track] = 0
     tracks.pick[env, track] = -1
     tracks.pick_cost[env, track] = 0.0
+    tracks.height[env, track, 0] = f16x(0.0)
+    tracks.present[env, track] = 0.0
 
 
 # --------------------------------------------------------------------------------------------------------------------- prune
@@ -49,21 +53,61 @@ def clear_track(env, track, tracks: Out[TrackState]):
 @ti.func
 def prune_tracks(
     env,
+    dt,
     tracks: Out[TrackState],
     scan: In[SonarScan],
     tracking: Const[TrackingConfig],
+    elevation: Const[ElevationConfig],
     sonar: Const[SonarConfig],
+    tank: Const[TankConfig],
     rules: Const[EpisodeConfig],
 ):
-    """End unmatched tracks that are seen through, that doubled a matched one, or that were lost for too long (longer where hidden)."""
+    """Weigh how high moving bodies may be, and end unmatched tracks that are not where they are expected, or doubled a matched one."""
     for track in range(tracks.alive.shape[1]):
-        if tracks.alive[env, track] == 1 and tracks.misses[env, track] > 0:
-            unseen = (scan.ping_step[env] - tracks.seen_step[env, track]) * rules.control_dt_s
-            sight = sight_of(env, track, tracks, scan, tracking, sonar)
-            longest = ti.select(sight == BLOCKED, tracking.hidden_s, ti.static(tracking.max_misses * _MISS_S))
-            gone = sight == SEEN_THROUGH and (tracks.age[env, track] < CONFIRMED or unseen >= tracking.see_through_s)
-            if gone or unseen > longest or is_double(env, track, tracks):
+        if tracks.alive[env, track] == 1:
+            remembered = ti.static(elevation.memory_s > 0) and tracks.moving[env, track] == 1
+            if tracks.misses[env, track] == 0:
+                if remembered:
+                    weigh_seen(env, track, scan.ping_pos_w[env], tracks, elevation, sonar, tank)
+            elif is_double(env, track, tracks):
                 clear_track(env, track, tracks)
+            else:
+                sight = sight_of(env, track, tracks, scan, tracking, sonar)
+                gone = 0
+                if remembered:
+                    gone = is_forgotten(env, track, sight, dt, tracks, scan, elevation, sonar, tank)
+                else:
+                    gone = is_lost(env, track, sight, tracks, scan, tracking, rules)
+                if gone == 1:
+                    clear_track(env, track, tracks)
+
+
+@ti.func
+def is_forgotten(
+    env,
+    track,
+    sight,
+    dt,
+    tracks: Out[TrackState],
+    scan: In[SonarScan],
+    elevation: Const[ElevationConfig],
+    sonar: Const[SonarConfig],
+    tank: Const[TankConfig],
+):
+    """1 where a moving body is hardly where it is expected any more: seen through within the fan, or unseen for long."""
+    if sight == SEEN_THROUGH:
+        weigh_unseen(env, track, scan.ping_pos_w[env], tracks, elevation, sonar, tank)
+    tracks.present[env, track] *= ti.exp(-dt * ti.static(1.0 / max(elevation.memory_s, 1e-3)))
+    return ti.cast(tracks.present[env, track] < elevation.gone_share, ti.i32)
+
+
+@ti.func
+def is_lost(env, track, sight, tracks: In[TrackState], scan: In[SonarScan], tracking: Const[TrackingConfig], rules: Const[EpisodeConfig]):
+    """1 where an unmatched track is seen through, or was unseen for too long (longer where hidden)."""
+    unseen = (scan.ping_step[env] - tracks.seen_step[env, track]) * rules.control_dt_s
+    longest = ti.select(sight == BLOCKED, tracking.hidden_s, ti.static(tracking.max_misses * _MISS_S))
+    through = sight == SEEN_THROUGH and (tracks.age[env, track] < CONFIRMED or unseen >= tracking.see_through_s)
+    return ti.cast(through or unseen > longest, ti.i32)
 
 
 @ti.func
@@ -108,6 +152,7 @@ def spawn_tracks(
     clusters: Out[ClusterState],
     scan: In[SonarScan],
     tracking: Const[TrackingConfig],
+    elevation: Const[ElevationConfig],
     sonar: Const[SonarConfig],
 ):
     """Begin a track for every unmatched cluster, unless it is a splinter of a body that is tracked already."""
@@ -117,7 +162,7 @@ def spawn_tracks(
             if owner < 0:
                 owner = free_slot(env, c, tracks, clusters, scan, tracking)
                 if owner >= 0:
-                    begin_track(env, owner, c, tracks, clusters, scan, tracking, sonar)
+                    begin_track(env, owner, c, tracks, clusters, scan, tracking, elevation, sonar)
             clusters.match[env, c] = owner
 
 
@@ -168,6 +213,7 @@ def begin_track(
     clusters: Out[ClusterState],
     scan: In[SonarScan],
     tracking: Const[TrackingConfig],
+    elevation: Const[ElevationConfig],
     sonar: Const[SonarConfig],
 ):
     """A new track from one cluster: velocity along the bearing from the Doppler, unknown across. Displaces whoever had the slot."""
@@ -193,6 +239,7 @@ def begin_track(
     tracks.doppler_m_s[env, track] = clusters.doppler_m_s[env, c]
     tracks.doppler_var[env, track] = clusters.doppler_var[env, c]
     tracks.seen_step[env, track] = scan.ping_step[env]
+    begin_height(env, track, tracks, elevation)
 
 
 @ti.func

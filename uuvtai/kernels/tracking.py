@@ -5,9 +5,11 @@ and mean Doppler; all states refer to the ping of the newest tracked scan (``sca
 be called moving: motion needs a speed and, as evidence, Doppler averaged over beams and time or a displacement seen between unhidden edges.
 """
 
+import math
+
 import taichi as ti
 
-from uuvtai.config import EpisodeConfig, SonarConfig, TankConfig, TrackingConfig
+from uuvtai.config import ElevationConfig, EpisodeConfig, SonarConfig, TankConfig, TrackingConfig
 from uuvtai.kernels.association import associate
 from uuvtai.kernels.clustering import find_clusters, label_beams
 from uuvtai.kernels.geometry import turned_z
@@ -35,12 +37,18 @@ def reset_tracks(tracks: Out[TrackState], clusters: Out[ClusterState], clock: In
                 tracks.beam_track[env, ray] = -1
 
 
+def tracked_period_s(tracking, sonar, rules):
+    """[s] between two tracked scans: the first multiple of the sonar's period that is no shorter than the tracking's own."""
+    return sonar.period_steps * math.ceil(tracking.period_steps / sonar.period_steps) * rules.control_dt_s
+
+
 def track_bodies(
     tracks: TrackState,
     clusters: ClusterState,
     scan: SonarScan,
     clock: ClockState,
     tracking: TrackingConfig,
+    elevation: ElevationConfig,
     sonar: SonarConfig,
     tank: TankConfig,
     rules: EpisodeConfig,
@@ -52,7 +60,7 @@ def track_bodies(
     take_scan(clusters, scan, clock, tracking, sonar, tank)
     cluster_beams(clusters, scan, clock, tracking, sonar)
     follow_bodies(tracks, clusters, scan, clock, tracking, sonar, rules)
-    keep_slots(tracks, clusters, scan, clock, tracking, sonar, rules)
+    keep_slots(tracks, clusters, scan, clock, tracking, elevation, sonar, tank, rules)
 
 
 @ti.kernel
@@ -112,15 +120,17 @@ def keep_slots(
     scan: In[SonarScan],
     clock: In[ClockState],
     tracking: Const[TrackingConfig],
+    elevation: Const[ElevationConfig],
     sonar: Const[SonarConfig],
+    tank: Const[TankConfig],
     rules: Const[EpisodeConfig],
 ):
     """End lost tracks, begin new ones, and name the beams."""
     n = ti.static(clock.awake.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
         if pad == 0 and clock.awake[env] == 1 and clusters.fresh[env] == 1:
-            prune_tracks(env, tracks, scan, tracking, sonar, rules)
-            spawn_tracks(env, tracks, clusters, scan, tracking, sonar)
+            prune_tracks(env, ti.static(tracked_period_s(tracking, sonar, rules)), tracks, scan, tracking, elevation, sonar, tank, rules)
+            spawn_tracks(env, tracks, clusters, scan, tracking, elevation, sonar)
             name_beams(env, tracks, clusters)
         if pad == 0 and clock.awake[env] == 1 and clusters.fresh[env] == 0 and scan.fresh[env] == 1:
             carry_names(env, tracks, clusters, scan, tracking, sonar)
