@@ -161,13 +161,37 @@ def _print_causes(result: dict[str, Any]) -> None:
         if not failed:
             _stdout().print(f"{m['name']}: no episode failed, nothing to explain", highlight=False)
             continue
-        table = Table(title=f"{m['name']}: why {failed} of {m['episodes']} episodes failed", title_justify="left")
-        for head in ("cause", "episodes", "share", "meaning", "worst (seed:episode)"):
-            table.add_column(head, justify="right" if head in ("episodes", "share") else "left")
-        for cause in m["causes"]:
-            examples = ", ".join(f"{seed}:{episode}" for seed, episode in cause["examples"])
-            table.add_row(cause["label"], str(cause["count"]), f"{100 * cause['share']:.0f} %", cause["meaning"], examples)
+        table = Table(
+            title=f"{m['name']}: why {failed} of {m['episodes']} episodes failed",
+            caption="knew: share with a right forecast of the killer 1 s before the end; escapable: share in which some velocity held from "
+            "then on, would have passed everything; unseen, evading: median time before the end since a beam last met the killer, and "
+            "since evasion began; worst: seed:episode",
+            title_justify="left",
+            caption_justify="left",
+        )
+        for head in ("cause", "n", "share", "meaning", "knew", "escapable", "unseen", "evading", "worst"):
+            table.add_column(head, justify="left" if head in ("cause", "meaning", "worst") else "right", no_wrap=head in ("cause", "n"))
+        for c in m["causes"]:
+            table.add_row(
+                c["label"],
+                str(c["count"]),
+                _percent(c["share"]),
+                c["meaning"],
+                _percent(c["knew_share"]),
+                _percent(c["escapable_share"]),
+                _seconds(c["unseen_median_s"]),
+                _seconds(c["evading_median_s"]),
+                ", ".join(f"{seed}:{episode}" for seed, episode in c["examples"]),
+            )
         _stdout().print(table)
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100 * share:.0f} %"
+
+
+def _seconds(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1f} s"
 
 
 def _rate(k: int, n: int, interval: list[float] | None) -> str:

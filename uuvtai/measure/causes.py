@@ -18,6 +18,8 @@ import numpy as np
 from uuvtai.config import Config
 from uuvtai.kernels.geometry import BOX, NONE
 from uuvtai.measure import hindsight
+from uuvtai.measure.escape import escapes
+from uuvtai.measure.history import Bodies, Diary, History
 from uuvtai.scenario import KIND_NAMES
 
 Array = np.ndarray
@@ -29,15 +31,16 @@ START_S = 2.0
 UNSEEN_S = 0.3
 """Unseen: out of the sonar's vertical fan all through this time before the end (the design's measure: no track 0.3 s before)."""
 TURN_S = 1.2
-"""An unannounced turn lies within this before the end (7-methods.md)."""
+"""An unannounced turn lies within this before the end (7-methods.md), and the forecast made just before it was off by more than
+MISS_M at the end, or there was none."""
 TURN_RAD = math.radians(30.0)
 """A corner: the body's course changes by more between two samples."""
-HIDDEN_S = (1.5, 0.5)
-"""Hidden: within the fan, but behind something nearer in most samples of this interval before the end."""
-TRACK_S = 0.5
-"""Untracked: no belief this long before the end. Half a second is what the vehicle needs to get out of a body's way."""
 LEAD_S = 1.0
-"""Forecasts are judged by what they said this long before the end (or TRACK_S, where there was none yet)."""
+"""Forecasts are judged by what they said this long before the end: half a second to react, half a second to get out of the way."""
+SIGHT_S = (1.5, 0.5)
+"""Without a forecast LEAD_S before the end, this interval tells why: mostly out of the fan, mostly hidden, or seen but not tracked."""
+BEFORE_TURN_S = 0.1
+"""The forecast that a turn is judged by was made this long before it."""
 BELIEF_M = 0.5
 """A forecast or track belongs to a body when its present position is this close to the truth, in the plane."""
 MISS_M = 0.35
@@ -52,6 +55,8 @@ NEAR_M = 1.0
 NEAR_S = 1.5
 REACT_S = 1.0
 """Late: evasion began less than this before the end, or never."""
+AFTER_S = 0.5
+"""An escape (``escape.py``) keeps clear up to this after the end."""
 BREAK_S = 0.3
 """A leaf that lost charge for no longer than this still counts as in charge."""
 BEAM_M = 0.1
@@ -73,22 +78,24 @@ CAUSES: dict[str, str] = {
     "out_of_tank": "left the tank",
     "hit_floor": "touched the floor",
     "hit_surface": "touched the surface",
-    "hit_static": "touched a static obstacle with no moving body near",
-    "hit_wall": "touched a side wall with no moving body near",
     "pushed_into_static": f"touched a static or wall while evading, or with a moving body within {NEAR_M:g} m",
+    "hit_static": "touched a static obstacle, no moving body near",
+    "hit_wall": "touched a side wall, no moving body near",
     "start_in_danger": f"killed in the first {START_S:g} s",
     "unseen_above": f"killer above the sonar's fan all through the last {UNSEEN_S:g} s",
     "unseen_below": f"killer below the sonar's fan all through the last {UNSEEN_S:g} s",
-    "unannounced_turn": f"killer turned a corner (> {math.degrees(TURN_RAD):.0f} deg) in the last {TURN_S:g} s",
-    "hidden": f"killer was behind something else until {HIDDEN_S[1]:g} s before the end",
-    "untracked": f"killer within the fan, but no forecast of it {TRACK_S:g} s before the end",
-    "curving": f"killer on a circle, and the forecast {LEAD_S:g} s before missed by > {MISS_M:g} m",
-    "forecast_missed": f"the forecast {LEAD_S:g} s before missed by > {MISS_M:g} m without a turn",
-    "squeezed_by_static": f"forecast right, but a static or wall within {REACH_M:g} m left no room",
-    "crowded": f"forecast right, but a second moving body came within {CROWD_M:g} m",
-    "late": f"forecast right and room, but evasion began < {REACT_S:g} s before the end, or never",
-    "fast_crossing": "forecast right and evading in time, but it closed in faster than the vehicle can go",
-    "caught_evading": "forecast right, evading in time, killer slow: the evasion chose badly",
+    "unannounced_turn": f"killer turned a corner in the last {TURN_S:g} s and the forecast before it was wrong",
+    "seen_late": f"killer came into the sonar's fan less than {LEAD_S:g} s before the end",
+    "hidden": f"killer was behind something else until {LEAD_S:g} s before the end",
+    "untracked": f"killer seen, but no forecast of it {LEAD_S:g} s before the end",
+    "curving": f"killer on a circle, forecast off by > {MISS_M:g} m",
+    "forecast_missed": f"killer on a straight course, forecast off by > {MISS_M:g} m",
+    "late": f"forecast right, escape open, but evasion began < {REACT_S:g} s before the end, or never",
+    "wrong_evasion": "forecast right, escape open, evading in time: it chose the wrong way",
+    "needs_heave": "forecast right, but only a change of depth would have escaped",
+    "squeezed_by_static": f"forecast right, no way out: static or wall within {REACH_M:g} m",
+    "crowded": f"forecast right, no way out: a second moving body within {CROWD_M:g} m",
+    "fast_crossing": "forecast right, no way out: the killer is too fast to give way to",
     "no_route": f"timeout: no route in most of the last {LAST_S:g} s",
     "too_slow": f"timeout: still came > {PROGRESS_M:g} m nearer to the goal in the last {LAST_S:g} s",
     "waiting": f"timeout: waited on purpose in most of the last {LAST_S:g} s",
@@ -96,73 +103,7 @@ CAUSES: dict[str, str] = {
     "stuck": f"timeout: drove < {STUCK_M:g} m in the last {LAST_S:g} s",
     "circling": f"timeout: drove on without coming nearer in the last {LAST_S:g} s",
 }
-"""Every label with its meaning, in order of precedence."""
-
-
-@dataclass(frozen=True)
-class Bodies:
-    """What stays the same over an episode: its bodies. Arrays have one entry per slot."""
-
-    kind: Array
-    size: Array
-    yaw: Array
-    speed_m_s: Array
-    """nominal; 0 = at rest"""
-    circle_m: Array
-    """radius of the circle it drives on; 0 = a polyline or at rest"""
-
-    @property
-    def moving(self) -> Array:
-        """Slots with a body that moves."""
-        return (self.kind != NONE) & (self.speed_m_s > 0.01)
-
-
-@dataclass(frozen=True)
-class History:
-    """The last seconds of an episode, oldest sample first, the end last; ``diary`` is a coarse account of all of it."""
-
-    t_s: Array
-    """(n,) since the start"""
-    pos_w: Array
-    quat_wb: Array
-    vel_b: Array
-    rate_b: Array
-    body_w: Array
-    """(n, nb, 3)"""
-    body_vel_w: Array
-    ping_age_s: Array
-    """(n,) age of the newest delivered scan"""
-    range_m: Array
-    """(n, n_ray) that scan; no return = maximum range"""
-    track_moving: Array
-    """(n, n_track) 1 = confirmed, 0 = taken to be static, -1 = empty slot"""
-    track_w: Array
-    """(n, n_track, 2)"""
-    forecast_w: Array
-    """(n, n_track, n_forecast, 2)"""
-    forecast_m: Array
-    """(n, n_track) present radius, negative = no forecast"""
-    conflict: Array
-    """(n,) bool: the pilot foresees a conflict"""
-    leaf: list[str]
-    """type of the leaf in charge, "" = none"""
-    action: Array
-    """(n, 4)"""
-    map_clearance_m: Array
-    """(n,) what the vehicle's own map says"""
-    diary: Diary
-
-
-@dataclass(frozen=True)
-class Diary:
-    """The whole episode at a coarse rate."""
-
-    t_s: Array
-    pos_w: Array
-    goal_m: Array
-    """3-D distance to the goal"""
-    has_route: Array
-    leaf: list[str]
+"""Every label with its meaning, in order of precedence (forecasts are judged LEAD_S before the end, escapes too)."""
 
 
 @dataclass
@@ -195,15 +136,17 @@ def explain(outcome: str, history: History, bodies: Bodies, config: Config) -> E
     killer = scene.killer(outcome)
     facts = scene.facts(killer)
     if killer.moving and killer.slot is not None:
-        facts |= _sight_facts(history, bodies, killer.slot, config) | _belief_facts(history, killer.slot, config)
-        facts |= _course_facts(history, bodies, killer.slot)
-    return Explanation(label_of(outcome, killer, facts, config), killer, facts)
+        course = _course_facts(history, bodies, killer.slot, config)
+        facts |= _sight_facts(history, bodies, killer.slot, config) | course
+        facts |= _belief_facts(history, killer.slot, course["turned_ago_s"], config)
+        facts |= escapes(history, bodies, config, LEAD_S, AFTER_S)
+    return Explanation(label_of(outcome, killer, facts), killer, facts)
 
 
 # -------------------------------------------------------------------------------------------------------------------- labels
 
 
-def label_of(outcome: str, killer: Killer, facts: dict[str, Any], config: Config) -> str:
+def label_of(outcome: str, killer: Killer, facts: dict[str, Any]) -> str:
     """The first cause that holds; its order and meaning are ``CAUSES``."""
     if outcome == "out_of_tank":
         return "out_of_tank"
@@ -212,7 +155,7 @@ def label_of(outcome: str, killer: Killer, facts: dict[str, Any], config: Config
     if not killer.moving:
         pushed = facts["evading_s"] > 0 or _within(facts["moving_near_m"], NEAR_M)
         return "pushed_into_static" if pushed else "hit_wall" if killer.name == "wall" else "hit_static"
-    return _knowledge_label(facts) or _pilot_label(killer, facts, config)
+    return _knowledge_label(facts) or _pilot_label(facts)
 
 
 def _knowledge_label(facts: dict[str, Any]) -> str | None:
@@ -221,26 +164,24 @@ def _knowledge_label(facts: dict[str, Any]) -> str | None:
         return "start_in_danger"
     if facts["fan_ago_s"] is None or facts["fan_ago_s"] >= UNSEEN_S:
         return "unseen_above" if facts["vertical_gap_m"] > 0 else "unseen_below"
-    if _within(facts["turned_ago_s"], TURN_S):
+    if _within(facts["turned_ago_s"], TURN_S) and not _within(facts["turn_error_m"], MISS_M):
         return "unannounced_turn"
-    if facts["hidden_share"] > 0.5:
-        return "hidden"
     if facts["forecast_error_m"] is None:
-        return "untracked"
+        return "seen_late" if facts["fan_share"] < 0.5 else "hidden" if facts["seen_share"] < 0.5 else "untracked"
     if facts["forecast_error_m"] > MISS_M:
         return "curving" if facts["circle_m"] else "forecast_missed"
     return None
 
 
-def _pilot_label(killer: Killer, facts: dict[str, Any], config: Config) -> str:
-    """What the pilot made of what it knew."""
+def _pilot_label(facts: dict[str, Any]) -> str:
+    """What the pilot made of what it knew; where nothing could be made of it, what stood in the way."""
+    if facts["escapes"]:
+        return "late" if facts["evading_s"] < REACT_S else "wrong_evasion"
+    if facts["escapes_by_heave"]:
+        return "needs_heave"
     if facts["static_near_m"] < REACH_M:
         return "squeezed_by_static"
-    if _within(facts["second_body_m"], CROWD_M):
-        return "crowded"
-    if facts["evading_s"] < REACT_S:
-        return "late"
-    return "fast_crossing" if (killer.closing_m_s or 0.0) > config.teacher.evade_m_s else "caught_evading"
+    return "crowded" if _within(facts["second_body_m"], CROWD_M) else "fast_crossing"
 
 
 def timeout_label(facts: dict[str, Any]) -> str:
@@ -344,12 +285,13 @@ def _sight_facts(h: History, bodies: Bodies, slot: int, config: Config) -> dict[
     reached = np.isfinite(entry)
     tolerance = BEAM_M + 4 * (sonar.range_sigma_m + sonar.range_sigma_slope * np.where(reached, entry, 0.0)) + sonar.range_jitter_m
     met = reached & (np.abs(h.range_m - np.where(reached, entry, 0.0)) < tolerance)
-    in_fan, seen = reached.any(1), met.any(1)
-    before = (ago <= HIDDEN_S[0]) & (ago >= HIDDEN_S[1])
+    in_fan, seen = np.asarray(reached.any(1)), np.asarray(met.any(1))
+    before = (ago <= SIGHT_S[0]) & (ago >= SIGHT_S[1])
     return {
         "fan_ago_s": _last_ago(ago, in_fan),
         "seen_ago_s": _last_ago(ago, seen),
-        "hidden_share": _round((in_fan & ~seen)[before].mean() if before.any() else 0.0),
+        "fan_share": _round(in_fan[before].mean()) if before.any() else None,
+        "seen_share": _round(seen[before].sum() / max(1, in_fan[before].sum())),
         "vertical_gap_m": _round(hindsight.vertical_gap(h.pos_w[-1:], kind, h.body_w[-1:, slot], size)[0]),
         "killer_speed_m_s": _round(np.linalg.norm(h.body_vel_w[-1, slot])),
         "killer_radius_m": _round(size[0]),
@@ -358,43 +300,58 @@ def _sight_facts(h: History, bodies: Bodies, slot: int, config: Config) -> dict[
     }
 
 
-def _belief_facts(h: History, slot: int, config: Config) -> dict[str, Any]:
+def _belief_facts(h: History, slot: int, turned_ago_s: float | None, config: Config) -> dict[str, Any]:
     """What the vehicle believed about the killer."""
     ago = h.t_s[-1] - h.t_s
     truth = h.body_w[:, slot, :2]
     away = np.where(h.forecast_m >= 0, np.linalg.norm(h.forecast_w[:, :, 0] - truth[:, None], axis=-1), np.inf)
     belief, distance = away.argmin(1), away.min(1)
     believed = distance <= BELIEF_M
-    tracked = np.where(h.track_moving >= 0, np.linalg.norm(h.track_w - truth[:, None], axis=-1), np.inf)
-    still = (np.where(h.track_moving == 0, tracked, np.inf) <= BELIEF_M).any(1)
-    error, lead = None, None
-    for back in (LEAD_S, TRACK_S):
-        at = int(np.abs(ago - back).argmin())
-        if believed[at]:
-            lead = float(ago[at])
-            error = float(np.linalg.norm(_foreseen(h.forecast_w[at, belief[at]], lead, config.tracking.forecast_dt_s) - truth[-1]))
-            break
+    tracked = np.linalg.norm(h.track_w - truth[:, None], axis=-1)
+    at_rest = (np.where(h.track_moving == 0, tracked, np.inf) <= BELIEF_M).any(1)
+
+    def error_of(back_s: float) -> float | None:
+        """Error at the end of the forecast made ``back_s`` before it."""
+        at = int(np.abs(ago - back_s).argmin())
+        if not believed[at]:
+            return None
+        foreseen = _foreseen(h.forecast_w[at, belief[at]], float(ago[at]), config.tracking.forecast_dt_s)
+        return _round(np.linalg.norm(foreseen - truth[-1]))
+
     return {
         "believed_ago_s": _last_ago(ago, believed),
         "belief_error_m": _round(distance[-1]) if believed[-1] else None,
-        "forecast_lead_s": _round(lead),
-        "forecast_error_m": _round(error),
-        "taken_as_static_ago_s": _last_ago(ago, still & ~believed),
+        "forecast_error_m": error_of(LEAD_S),
+        "turn_error_m": None if turned_ago_s is None else error_of(turned_ago_s + BEFORE_TURN_S),
+        "taken_as_static_ago_s": _last_ago(ago, at_rest & ~believed),
     }
 
 
 def _foreseen(forecast_w: Array, lead_s: float, dt_s: float) -> Array:
-    """Position (2,) that a forecast (n_forecast, 2) gave for ``lead_s`` after it was made."""
+    """Position (2,) that a forecast (n_forecast, 2) gave for ``lead_s`` after it was made (at most its horizon)."""
     steps = np.arange(len(forecast_w)) * dt_s
     return np.array([np.interp(lead_s, steps, forecast_w[:, axis]) for axis in range(2)])
 
 
-def _course_facts(h: History, bodies: Bodies, slot: int) -> dict[str, Any]:
-    """When the killer last turned a corner; a circle has none."""
+def _course_facts(h: History, bodies: Bodies, slot: int, config: Config) -> dict[str, Any]:
+    """When the killer last turned a corner (a circle has none), and how often it had turned there before within the sonar's reach."""
     vel = h.body_vel_w[:, slot, :2]
     turn = np.abs(np.angle(np.exp(1j * np.diff(np.arctan2(vel[:, 1], vel[:, 0])))))
     corner = (turn > TURN_RAD) & (bodies.circle_m[slot] == 0)
-    return {"turned_ago_s": _last_ago(h.t_s[-1] - h.t_s[1:], corner)}
+    ago = _last_ago(h.t_s[-1] - h.t_s[1:], corner)
+    return {"turned_ago_s": ago, "turns_in_reach_before": None if ago is None else _turns_in_reach(h, bodies, slot, ago, config)}
+
+
+def _turns_in_reach(h: History, bodies: Bodies, slot: int, ago_s: float, config: Config) -> int:
+    """Earlier passes of the corner turned ``ago_s`` before the end that lay within the sonar's fan: could it have been learnt?"""
+    turned_s = float(h.t_s[-1]) - ago_s
+    place = h.body_w[int(np.abs(h.t_s - turned_s).argmin()), slot]
+    passes = np.arange(turned_s - bodies.lap_s[slot], 0.0, -bodies.lap_s[slot])
+    here = np.stack([np.interp(passes, h.diary.t_s, h.diary.pos_w[:, axis]) for axis in range(3)], -1)
+    gap = np.abs(hindsight.vertical_gap(here, int(bodies.kind[slot]), np.broadcast_to(place, here.shape), bodies.size[slot]))
+    away = np.linalg.norm(here[:, :2] - place[:2], axis=1)
+    sonar = config.sensors.sonar
+    return int(((away <= sonar.max_range_m) & (gap <= away * math.tan(math.radians(sonar.vertical_half_aperture_deg)))).sum())
 
 
 def _timeout_facts(diary: Diary) -> dict[str, Any]:

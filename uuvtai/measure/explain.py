@@ -16,8 +16,10 @@ import numpy as np
 
 from uuvtai.config import Config
 from uuvtai.measure import causes
-from uuvtai.measure.causes import Bodies, Diary, Explanation, History
+from uuvtai.measure.causes import Explanation
 from uuvtai.measure.evaluate import EpisodeResult, Job, Progress, run_episodes
+from uuvtai.measure.history import Bodies, Diary, History
+from uuvtai.measure.statistics import mean
 from uuvtai.scenario import body_slots
 from uuvtai.sim import Sim
 from uuvtai.tree import FlatTree
@@ -37,7 +39,7 @@ _WINDOW_FIELDS = {
     "teacher": ("leaf", "conflict_s", "action", "clearance_m"),
 }
 _DIARY_FIELDS = {"vehicle": ("pos_w",), "mission": ("goal_w",), "route": ("n_way",), "teacher": ("leaf",)}
-_BODY_FIELDS = {"world": ("kind", "size", "yaw"), "path": ("n_way", "radius_m", "speed_m_s")}
+_BODY_FIELDS = {"world": ("kind", "size", "yaw"), "path": ("n_way", "radius_m", "length_m", "speed_m_s")}
 
 _FORESEEN_S = 1.0e3
 """A predicted conflict; beyond = none (geometry.FAR_M)."""
@@ -177,10 +179,25 @@ def table_of(rows: list[Row]) -> list[dict[str, Any]]:
             "count": counts[label],
             "share": counts[label] / len(rows),
             "meaning": causes.CAUSES[label],
+            **_typical([row.explanation.facts for row in rows if row.explanation.label == label]),
             "examples": [[row.result.seed, row.result.episode] for row in worst_of(rows, label)[:EXAMPLES]],
         }
         for label in sorted(counts, key=lambda label: (-counts[label], order.index(label)))
     ]
+
+
+def _typical(facts: list[dict[str, Any]]) -> dict[str, float | None]:
+    """What a label's episodes have in common: shares of those that have such a fact, and medians."""
+    error = [f["forecast_error_m"] for f in facts if "forecast_error_m" in f]
+    ways = [f["escapes"] + f["escapes_by_heave"] for f in facts if "escapes" in f]
+    unseen = [causes.WINDOW_S if f["seen_ago_s"] is None else f["seen_ago_s"] for f in facts if "seen_ago_s" in f]
+    evading = [f["evading_s"] for f in facts if "evading_s" in f]
+    return {
+        "knew_share": mean([float(e is not None and e <= causes.MISS_M) for e in error]),
+        "escapable_share": mean([float(n > 0) for n in ways]),
+        "unseen_median_s": float(np.median(unseen)) if unseen else None,
+        "evading_median_s": float(np.median(evading)) if evading else None,
+    }
 
 
 def worst_of(rows: list[Row], label: str) -> list[Row]:
@@ -235,7 +252,10 @@ def _stacked(samples: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
 def _bodies(config: Config, read: dict[str, np.ndarray]) -> Bodies:
     """Path facts are per moving slot; bodies at rest get zeros."""
     kind, first = read["world.kind"], body_slots(config.world).first_dynamic
-    speed, circle = np.zeros(len(kind)), np.zeros(len(kind))
-    speed[first:] = np.where(kind[first:] > 0, read["path.speed_m_s"], 0.0)
-    circle[first:] = np.where((kind[first:] > 0) & (read["path.n_way"] == 0), read["path.radius_m"], 0.0)
-    return Bodies(kind, read["world.size"].astype(float), read["world.yaw"].astype(float), speed, circle)
+    used, path_speed = kind[first:] > 0, read["path.speed_m_s"].astype(float)
+    speed, circle, lap = np.zeros(len(kind)), np.zeros(len(kind)), np.full(len(kind), np.inf)
+    speed[first:] = np.where(used, path_speed, 0.0)
+    circle[first:] = np.where(used & (read["path.n_way"] == 0), read["path.radius_m"], 0.0)
+    moves = used & (path_speed > 0)
+    lap[first:][moves] = read["path.length_m"][moves] / path_speed[moves]
+    return Bodies(kind, read["world.size"].astype(float), read["world.yaw"].astype(float), speed, circle, lap)

@@ -15,8 +15,8 @@ from uuvtai.kernels.geometry import BOX, CYLINDER, NONE, SPHERE
 
 Array = np.ndarray
 
-_AXIS_SAMPLES = 41
-"""Points along the hull's axis: 5 mm apart, which misses the nearest point by less than 0.1 mm of clearance at 0.1 m."""
+_AXIS_SAMPLES = 9
+"""Points along the hull's axis: 25 mm apart, which overestimates the clearance by less than 1 mm (0.0125^2 / (2 x 0.27 m + clearance))."""
 
 
 def rotation(quat_wb: Array) -> Array:
@@ -85,10 +85,10 @@ def floor_and_surface_gaps(pos_w: Array, axis_w: Array, tank: TankConfig, radius
 
 
 def vertical_gap(pos_w: Array, kind: int, body_w: Array, size: Array) -> Array:
-    """(n,) signed gap [m] between the sonar's plane and a body's vertical extent: positive = the body is above, 0 = it crosses the plane."""
+    """(n,) signed gap [m] from the sonar's plane to a body's vertical extent: positive = the body is above, 0 = it crosses the plane."""
     rise = body_w[:, 2] - pos_w[:, 2]
     half = size[0] if kind == SPHERE else size[2]
-    return np.sign(rise) * np.maximum(np.abs(rise) - half, 0.0)
+    return np.where(np.abs(rise) > half, rise - np.sign(rise) * half, 0.0)
 
 
 def beam_entries(pos_w: Array, yaw: Array, kind: int, body_w: Array, size: Array, body_yaw: float, sonar: SonarConfig) -> Array:
