@@ -476,8 +476,14 @@ class ElevationConfig(Section):
     """share of moving bodies expected to go through the full water column"""
     edge_m: Positive = 0.06
     """half width of the soft edge of the fan"""
+    evidence_s: Positive = 0.15
+    """scans closer together than this are not independent evidence"""
     hit_share: Fraction = 0.9
     """probability that a body in the fan is hit, where its place is known exactly"""
+    use_camera: bool = True
+    """let the camera's image tell heights too"""
+    camera_hit_share: Annotated[float, Field(ge=0, lt=1)] = 0.5
+    """probability that a body in the image and at a free distance shows in the column through its middle"""
     gone_share: Fraction = 0.25
     """below this probability of being where it is expected, a body is forgotten"""
     tail_share: Fraction = 0.02
@@ -605,6 +611,11 @@ class TeacherConfig(Section):
     evade_m_s: Positive = 0.85
     """fastest candidate; the limits of surge and sway are separate, so diagonals of the body are faster than its axes"""
 
+    heave_m_s: NonNegative = 0.4
+    """vertical speed of the candidates that dive or climb; 0 = evade level only"""
+    n_heave_heading: PositiveCount = 12
+    """headings of the candidates that dive or climb"""
+
     hull_reach_m: NonNegative = 0.22
     """hull centre to surface: between 0.17 abeam and 0.27 ahead"""
     contact_m: NonNegative = 0.1
@@ -615,6 +626,10 @@ class TeacherConfig(Section):
     """the margin grows with prediction time"""
     closing_s: NonNegative = 0.25
     """effective clearance is reduced by this times the closing speed (the referee stops at 0.18 s)"""
+    vertical_weight: Positive = 1.5
+    """free water above or below a body counts this many times: the hull is slimmer upwards (0.17 m) and heights carry their own margin"""
+    caution: Positive = 1.0
+    """factor of both margins from moving bodies: more trades time and success for fewer collisions"""
     static_margin_m: NonNegative = 0.1
     """wanted clearance beyond contact from mapped obstacles and walls"""
     static_horizon_s: Positive = 1.5
@@ -655,22 +670,23 @@ class TeacherConfig(Section):
     """speed falls below cruise where the static clearance is smaller than this"""
     slow_fraction: Fraction = 0.5
     """share of cruise speed left at contact"""
-    depth_policy: Fraction = 0.0
-    """depth that travel keeps: 0 = the goal's, 1 = near the surface or the floor, whichever is closer to the goal"""
     edge_gap_m: NonNegative = 0.26
-    """hull centre to surface or floor when keeping near it"""
+    """hull centre to surface or floor, at least"""
     depth_gain: Positive = 1.0
     """[1/s] heave per metre of depth error"""
-    heave_clear_m: NonNegative = 1.2
-    """depth is changed only with no moving body closer than this"""
     yaw_gain: Positive = 1.5
     """[1/s]"""
     max_node: PositiveCount = 64
 
     @property
+    def n_tried(self) -> int:
+        """Evasive velocities tried: level headings times speeds; stop, last command, follow; diving and climbing ones."""
+        return self.n_heading * self.n_speed + 3 + (2 * self.n_heave_heading + 2 if self.heave_m_s > 0 else 0)
+
+    @property
     def n_candidate(self) -> int:
-        """Evasive velocities tried: headings times speeds, stop, last command, follow; padded to whole packets of 16."""
-        return 16 * -(-(self.n_heading * self.n_speed + 3) // 16)
+        """``n_tried`` padded to whole packets of 16."""
+        return 16 * -(-self.n_tried // 16)
 
 
 class RewardConfig(Section):

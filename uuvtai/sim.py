@@ -25,10 +25,12 @@ from uuvtai.kernels import (
     debug_stamp,
     depth,
     dynamics,
+    elevation,
     episode,
     evasion,
     features,
     forecast,
+    look,
     mapping,
     proprioception,
     reward,
@@ -231,7 +233,10 @@ class Sim:
             tracking.track_bodies(
                 s.tracks, s.clusters, s.scan, s.clock, c.tracking, c.elevation, c.sensors.sonar, c.world.tank, c.episode
             )
+            if c.elevation.use_camera:
+                look.look_at_bodies(s.tracks, s.image, s.clock, c.elevation, c.sensors.depth, c.world.tank, c.episode)
             forecast.forecast_tracks(s.forecast, s.tracks, s.clock, c.forecast, c.tracking, c.episode)
+            elevation.bound_heights(s.forecast, s.tracks, s.ego, s.clock, c.elevation, c.world.tank)
         with self._stage("mapping"):
             mapping.update_map(
                 s.grid_map, s.scan, s.image, s.tracks, s.mask, s.clock, c.mapping, c.sensors.sonar, c.sensors.depth, c.world.tank, c.episode
@@ -296,7 +301,20 @@ class Sim:
     def _teach(self) -> None:
         c, s = self.config, self.s
         threats.assess_threats(
-            s.teacher, s.route, s.forecast, s.scan, s.clearance, s.ego, s.clock, c.teacher, c.tracking, c.world.tank, c.mapping, c.episode
+            s.teacher,
+            s.route,
+            s.forecast,
+            s.scan,
+            s.clearance,
+            s.ego,
+            s.mission,
+            s.clock,
+            c.teacher,
+            c.vehicle,
+            c.tracking,
+            c.world.tank,
+            c.mapping,
+            c.episode,
         )
         evasion.plan_evasion(s.teacher, s.forecast, s.clearance, s.ego, s.clock, c.teacher, c.vehicle, c.tracking, c.world.tank, c.mapping)
         teacher.tick_tree(

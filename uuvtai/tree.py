@@ -60,7 +60,7 @@ LEAVES = {
     "Evade": _action(codes.EVADE, "", "drive the evasive velocity of least cost"),
     "Hold": _action(codes.HOLD, "", "stay in place, away from mapped obstacles"),
     "Unstick": _action(codes.UNSTICK, "seconds speed_m_s", "creep away from the nearest mapped obstacle"),
-    "FollowRoute": _action(codes.FOLLOW_ROUTE, "speed_m_s depth_policy", "pursue the look-ahead point; fails without a route"),
+    "FollowRoute": _action(codes.FOLLOW_ROUTE, "speed_m_s depth_guard", "pursue the look-ahead point; fails without a route"),
     "DriveStraight": _action(codes.DRIVE_STRAIGHT, "speed_m_s", "drive at the goal, blind"),
 }
 

@@ -53,12 +53,15 @@ def half_height(env, track, tracks: In[TrackState], cfg: Const[ElevationConfig])
 
 
 @ti.func
-def in_fan(env, track, own, tracks: In[TrackState], cfg: Const[ElevationConfig], sonar: Const[SonarConfig], tank: Const[TankConfig]):
-    """Per hypothesis the probability that a beam from ``own`` [m, world] hits the body where it is expected; soft at the fan's edge."""
+def in_fan(env, track, own, bias, tracks: In[TrackState], cfg: Const[ElevationConfig], sonar: Const[SonarConfig], tank: Const[TankConfig]):
+    """Per hypothesis the probability that a beam from ``own`` [m, world] hits the body where it is expected.
+
+    Soft at the fan's edge, which ``bias`` [m] shifts outwards: sizes are guessed, so hits are judged generously and misses strictly.
+    """
     mean = tracks.state[env, track]
     away = ti.Vector([mean[0] - own[0], mean[1] - own[1]]).norm()
     opening = ti.static(math.tan(math.radians(sonar.vertical_half_aperture_deg)))
-    reach = opening * ti.max(away - 0.5 * tracks.radius_m[env, track], 0.0) + half_height(env, track, tracks, cfg)
+    reach = bias + opening * ti.max(away - 0.5 * tracks.radius_m[env, track], 0.0) + half_height(env, track, tracks, cfg)
     at = heights(tank)
     out = f16x(0.0)
     for i in ti.static(range(LANES)):
@@ -70,27 +73,42 @@ def in_fan(env, track, own, tracks: In[TrackState], cfg: Const[ElevationConfig],
 @ti.func
 def weigh_seen(env, track, own, tracks: Out[TrackState], cfg: Const[ElevationConfig], sonar: Const[SonarConfig], tank: Const[TankConfig]):
     """The sonar at ``own`` hit it: it is there, and within the fan."""
-    likely = in_fan(env, track, own, tracks, cfg, sonar, tank)
+    likely = in_fan(env, track, own, cfg.edge_m, tracks, cfg, sonar, tank)
     weighed = tracks.height[env, track, 0] * ti.max(likely, _LEAST)
     tracks.height[env, track, 0] = weighed / weighed.sum()
     tracks.present[env, track] = _WELL_THERE
 
 
 @ti.func
-def weigh_unseen(env, track, own, tracks: Out[TrackState], cfg: Const[ElevationConfig], sonar: Const[SonarConfig], tank: Const[TankConfig]):
+def weigh_unseen(
+    env, track, own, dt, tracks: Out[TrackState], cfg: Const[ElevationConfig], sonar: Const[SonarConfig], tank: Const[TankConfig]
+):
     """Beams from ``own`` went through where it is expected: it is above or below the fan, or elsewhere.
 
-    The less surely the filter knows where it is, the less it says that beams through the middle of that place met nothing.
+    The less surely the filter knows where it is, the less it says that beams through the middle of that place met nothing; and neighbouring
+    scans say the same again, so only one in ``evidence_s`` counts in full.
     """
     radius = tracks.radius_m[env, track]
     spread_var = largest_position_variance(tracks.cov[env, track], 0.0)
     sure = ti.static(cfg.hit_share) * radius * radius / (radius * radius + spread_var)
-    likely = in_fan(env, track, own, tracks, cfg, sonar, tank)
-    weighed = tracks.height[env, track, 0] * ti.max(1.0 - likely * sure, _LEAST)
+    hit = 1.0 - (1.0 - sure) ** ti.min(dt * ti.static(1.0 / cfg.evidence_s), 1.0)
+    likely = in_fan(env, track, own, -cfg.edge_m, tracks, cfg, sonar, tank)
+    weighed = tracks.height[env, track, 0] * ti.max(1.0 - likely * hit, _LEAST)
     total = weighed.sum()
     tracks.height[env, track, 0] = weighed / total
     there = tracks.present[env, track] * total
     tracks.present[env, track] = there / (there + 1.0 - tracks.present[env, track])
+
+
+@ti.func
+def weigh_camera(env, track, likely, missing, tracks: Out[TrackState]):
+    """An image's likelihood per hypothesis; where it shows no body (``missing`` 1) the body is also less surely where it is expected."""
+    weighed = tracks.height[env, track, 0] * likely
+    total = weighed.sum()
+    tracks.height[env, track, 0] = weighed / total
+    if missing == 1:
+        there = tracks.present[env, track] * total
+        tracks.present[env, track] = there / (there + 1.0 - tracks.present[env, track])
 
 
 @ti.kernel

@@ -3,9 +3,9 @@
 import taichi as ti
 
 from uuvtai.config import MappingConfig, TankConfig, TeacherConfig, TrackingConfig, VehicleConfig
-from uuvtai.kernels.geometry import FAR_M, TWO_PI, turned_z
+from uuvtai.kernels.geometry import FAR_M, TWO_PI, turned_z3
 from uuvtai.kernels.lanes import LANES, f16x
-from uuvtai.kernels.rollout import body_depths, static_depths
+from uuvtai.kernels.rollout import body_depths, depth_band, static_depths
 from uuvtai.kernels.signature import Const, In, Out, spread
 from uuvtai.state import ClearanceState, ClockState, ForecastState, Proprioception, TeacherState
 
@@ -27,51 +27,96 @@ def plan_evasion(
     n, n_packet = ti.static(clock.awake.shape[0], teacher.candidate_cost.shape[1] // LANES)
     for env, packet in ti.ndrange(n, n_packet):
         if clock.awake[env] == 1 and teacher.want_evade[env] == 1:
-            cx, cy = candidate_lanes(env, packet * LANES, teacher, ego, teacher_cfg, vehicle_cfg)
-            cost = cost_lanes(env, cx, cy, teacher, forecast, clearance, ego, teacher_cfg, tracking_cfg, tank_cfg, mapping_cfg)
+            cx, cy, cz = candidate_lanes(env, packet * LANES, teacher, ego, teacher_cfg, vehicle_cfg, tank_cfg)
+            cost = cost_lanes(env, cx, cy, cz, teacher, forecast, clearance, ego, teacher_cfg, tracking_cfg, tank_cfg, mapping_cfg)
             for i in ti.static(range(LANES)):
                 teacher.candidate_cost[env, packet * LANES + i] = cost[i]
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
         if pad == 0 and clock.awake[env] == 1 and teacher.want_evade[env] == 1:
-            best_x, best_y, mean_x, mean_y = _chosen(env, teacher, ego, teacher_cfg, vehicle_cfg)
-            cx, cy = f16x(best_x), f16x(best_y)
-            cx[1], cy[1] = mean_x, mean_y
-            cost = cost_lanes(env, cx, cy, teacher, forecast, clearance, ego, teacher_cfg, tracking_cfg, tank_cfg, mapping_cfg)
+            best, mean = _chosen(env, teacher, ego, teacher_cfg, vehicle_cfg, tank_cfg)
+            cx, cy, cz = f16x(best[0]), f16x(best[1]), f16x(best[2])
+            cx[1], cy[1], cz[1] = mean[0], mean[1], mean[2]
+            cost = cost_lanes(env, cx, cy, cz, teacher, forecast, clearance, ego, teacher_cfg, tracking_cfg, tank_cfg, mapping_cfg)
             good = cost[1] <= cost[0] + ti.static(teacher_cfg.softness)
-            teacher.evade_vel_w[env] = ti.Vector([ti.select(good, mean_x, best_x), ti.select(good, mean_y, best_y), 0.0])
+            teacher.evade_vel_w[env] = ti.select(good, mean, best)
             teacher.evade_cost[env] = ti.select(good, cost[1], cost[0])
 
 
 @ti.func
 def candidate_lanes(
-    env, first, teacher: In[TeacherState], ego: In[Proprioception], teacher_cfg: Const[TeacherConfig], vehicle_cfg: Const[VehicleConfig]
+    env,
+    first,
+    teacher: In[TeacherState],
+    ego: In[Proprioception],
+    teacher_cfg: Const[TeacherConfig],
+    vehicle_cfg: Const[VehicleConfig],
+    tank_cfg: Const[TankConfig],
 ):
-    """World velocities (lanes x, y [m/s]) of candidates first .. first + 15."""
-    cx, cy = f16x(0.0), f16x(0.0)
+    """World velocities (lanes x, y, z [m/s]) of candidates first .. first + 15."""
+    cx, cy, cz = f16x(0.0), f16x(0.0), f16x(0.0)
     for i in ti.static(range(LANES)):
-        velocity = candidate(env, first + i, teacher, ego, teacher_cfg, vehicle_cfg)
-        cx[i], cy[i] = velocity[0], velocity[1]
-    return cx, cy
+        velocity = candidate(env, first + i, teacher, ego, teacher_cfg, vehicle_cfg, tank_cfg)
+        cx[i], cy[i], cz[i] = velocity[0], velocity[1], velocity[2]
+    return cx, cy, cz
 
 
 @ti.func
 def candidate(
-    env, index, teacher: In[TeacherState], ego: In[Proprioception], teacher_cfg: Const[TeacherConfig], vehicle_cfg: Const[VehicleConfig]
+    env,
+    index,
+    teacher: In[TeacherState],
+    ego: In[Proprioception],
+    teacher_cfg: Const[TeacherConfig],
+    vehicle_cfg: Const[VehicleConfig],
+    tank_cfg: Const[TankConfig],
 ):
-    """World velocity of one candidate. Heading 0 is the follow direction, so that slowing down on the route is among them."""
-    n_heading, n_speed = ti.static(teacher_cfg.n_heading, teacher_cfg.n_speed)
-    follow, last = teacher.follow_vel_w[env], teacher.last_vel_w[env]
-    out = ti.Vector([0.0, 0.0])
-    if index < n_heading * n_speed:
-        heading = ti.atan2(follow[1], follow[0]) + TWO_PI * (index % n_heading) / n_heading
-        top = ti.min(ti.static(teacher_cfg.evade_m_s), speed_limit(heading - ego.rpy[env][2], vehicle_cfg))
-        speed = top * (index // n_heading + 1) / n_speed
-        out = ti.Vector([ti.cos(heading), ti.sin(heading)]) * speed
-    elif index == n_heading * n_speed + 1:
-        out = ti.Vector([last[0], last[1]])
-    elif index == n_heading * n_speed + 2:
-        out = ti.Vector([follow[0], follow[1]])
+    """World velocity of one candidate. Heading 0 is the follow direction, so that slowing down on the route is among them.
+
+    First the level ones (they keep the heave of following), then stop, last command and follow, then those that climb and those that dive.
+    """
+    n_level, n_heave = ti.static(teacher_cfg.n_heading * teacher_cfg.n_speed, teacher_cfg.n_heave_heading + 1)
+    follow = teacher.follow_vel_w[env]
+    out = ti.Vector([0.0, 0.0, 0.0])
+    if index < n_level:
+        speed = 1.0 / ti.static(teacher_cfg.n_speed) * (index // ti.static(teacher_cfg.n_heading) + 1)
+        turn = ti.static(TWO_PI / teacher_cfg.n_heading) * (index % ti.static(teacher_cfg.n_heading))
+        out = _towards(env, turn, speed, follow[2], teacher, ego, teacher_cfg, vehicle_cfg)
+    elif index == n_level + 1:
+        out = teacher.last_vel_w[env]
+    elif index == n_level + 2:
+        out = follow
+    elif index > n_level + 2:
+        nth = index - n_level - 3
+        heave = edge_limited(ti.select(nth < n_heave, 1.0, -1.0) * teacher_cfg.heave_m_s, ego.pos_w[env][2], teacher_cfg, tank_cfg)
+        nth = nth % n_heave
+        speed = ti.select(nth == n_heave - 1, 0.0, 1.0)
+        out = _towards(env, ti.static(TWO_PI / teacher_cfg.n_heave_heading) * nth, speed, heave, teacher, ego, teacher_cfg, vehicle_cfg)
     return out
+
+
+@ti.func
+def _towards(
+    env,
+    turn,
+    share,
+    heave,
+    teacher: In[TeacherState],
+    ego: In[Proprioception],
+    teacher_cfg: Const[TeacherConfig],
+    vehicle_cfg: Const[VehicleConfig],
+):
+    """World velocity at an angle from the follow direction, at a share of the speed possible there."""
+    follow = teacher.follow_vel_w[env]
+    heading = ti.atan2(follow[1], follow[0]) + turn
+    speed = share * ti.min(ti.static(teacher_cfg.evade_m_s), speed_limit(heading - ego.rpy[env][2], vehicle_cfg))
+    return ti.Vector([ti.cos(heading) * speed, ti.sin(heading) * speed, heave])
+
+
+@ti.func
+def edge_limited(heave, own_z, teacher_cfg: Const[TeacherConfig], tank_cfg: Const[TankConfig]):
+    """Heave [m/s] that stops at the band's edges instead of running into floor or surface."""
+    low, high = ti.static(depth_band(tank_cfg, teacher_cfg))
+    return ti.math.clamp(heave, ti.min(low - own_z, 0.0), ti.max(high - own_z, 0.0))
 
 
 @ti.func
@@ -87,6 +132,7 @@ def cost_lanes(
     env,
     cx,
     cy,
+    cz,
     teacher: In[TeacherState],
     forecast: In[ForecastState],
     clearance: In[ClearanceState],
@@ -97,41 +143,46 @@ def cost_lanes(
     mapping_cfg: Const[MappingConfig],
 ):
     """Cost of sixteen commanded velocities. Violations count by depth: a flat penalty drives straight on when every candidate is bad."""
-    pos = ti.Vector([ego.pos_w[env][0], ego.pos_w[env][1]])
-    vel = turned_z(ti.Vector([ego.vel_b[env][0], ego.vel_b[env][1]]), ego.rpy[env][2])
-    peak, mean, contact, _ = body_depths(env, cx, cy, pos, vel, forecast, teacher_cfg, tracking_cfg)
-    static_mean, static_contact = static_depths(env, cx, cy, pos, vel, clearance, teacher_cfg, tank_cfg, mapping_cfg)
-    off = _distance_lanes(cx, cy, teacher.follow_vel_w[env]) * ti.static(teacher_cfg.weight_deviation / teacher_cfg.cruise_m_s)
-    change = _distance_lanes(cx, cy, teacher.last_vel_w[env]) * ti.static(teacher_cfg.weight_change / teacher_cfg.cruise_m_s)
+    pos, vel = ego.pos_w[env], turned_z3(ego.vel_b[env], ego.rpy[env][2])
+    level, level_vel = ti.Vector([pos[0], pos[1]]), ti.Vector([vel[0], vel[1]])
+    peak, mean, contact, _ = body_depths(env, cx, cy, cz, pos, vel, forecast, teacher_cfg, tracking_cfg, tank_cfg)
+    static_mean, static_contact = static_depths(env, cx, cy, level, level_vel, clearance, teacher_cfg, tank_cfg, mapping_cfg)
+    off = _distance_lanes(cx, cy, cz, teacher.follow_vel_w[env]) * ti.static(teacher_cfg.weight_deviation / teacher_cfg.cruise_m_s)
+    change = _distance_lanes(cx, cy, cz, teacher.last_vel_w[env]) * ti.static(teacher_cfg.weight_change / teacher_cfg.cruise_m_s)
     moving = peak * ti.static(teacher_cfg.weight_peak) + mean * ti.static(teacher_cfg.weight_mean)
     touching = contact * ti.static(teacher_cfg.weight_contact) + static_contact * ti.static(teacher_cfg.weight_static_contact)
     return moving + touching + static_mean * ti.static(teacher_cfg.weight_static) + off + change
 
 
 @ti.func
-def _distance_lanes(cx, cy, velocity):
+def _distance_lanes(cx, cy, cz, velocity):
     dx = cx - velocity[0]
     dy = cy - velocity[1]
-    return ti.sqrt(dx * dx + dy * dy)
+    dz = cz - velocity[2]
+    return ti.sqrt(dx * dx + dy * dy + dz * dz)
 
 
 @ti.func
-def _chosen(env, teacher: In[TeacherState], ego: In[Proprioception], teacher_cfg: Const[TeacherConfig], vehicle_cfg: Const[VehicleConfig]):
+def _chosen(
+    env,
+    teacher: In[TeacherState],
+    ego: In[Proprioception],
+    teacher_cfg: Const[TeacherConfig],
+    vehicle_cfg: Const[VehicleConfig],
+    tank_cfg: Const[TankConfig],
+):
     """Candidate of least cost (first of equals), and the mean of the candidates weighted by exp(-cost / softness)."""
-    n_used = ti.static(teacher_cfg.n_heading * teacher_cfg.n_speed + 3)
+    n_used = ti.static(teacher_cfg.n_tried)
     best_cost, best = FAR_M, 0
     for index in range(n_used):
         if teacher.candidate_cost[env, index] < best_cost:
             best_cost = teacher.candidate_cost[env, index]
             best = index
-    total, mean_x, mean_y = 0.0, 0.0, 0.0
+    total, mean = 0.0, ti.Vector([0.0, 0.0, 0.0])
     for index in range(n_used):
         excess = (teacher.candidate_cost[env, index] - best_cost) * ti.static(1.0 / teacher_cfg.softness)
         if excess < 12.0:
             weight = ti.exp(-excess)
-            velocity = candidate(env, index, teacher, ego, teacher_cfg, vehicle_cfg)
             total += weight
-            mean_x += weight * velocity[0]
-            mean_y += weight * velocity[1]
-    chosen = candidate(env, best, teacher, ego, teacher_cfg, vehicle_cfg)
-    return chosen[0], chosen[1], mean_x / total, mean_y / total
+            mean += weight * candidate(env, index, teacher, ego, teacher_cfg, vehicle_cfg, tank_cfg)
+    return candidate(env, best, teacher, ego, teacher_cfg, vehicle_cfg, tank_cfg), mean / total

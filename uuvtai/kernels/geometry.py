@@ -69,3 +69,10 @@ def turned_z(v, yaw):
     """Two-vector turned by yaw about z."""
     c, s = ti.cos(yaw), ti.sin(yaw)
     return ti.Vector([c * v[0] - s * v[1], s * v[0] + c * v[1]])
+
+
+@ti.func
+def turned_z3(v, yaw):
+    """Three-vector turned by yaw about z."""
+    level = turned_z(ti.Vector([v[0], v[1]]), yaw)
+    return ti.Vector([level[0], level[1], v[2]])

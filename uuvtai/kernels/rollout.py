@@ -6,7 +6,7 @@ x(t) = x0 + v0 A(t) + c B(t), A(t) = tau (1 - exp(-t / tau)), B(t) = t - A(t): l
 
 import taichi as ti
 
-from uuvtai.config import MappingConfig, TankConfig, TeacherConfig, TrackingConfig
+from uuvtai.config import MappingConfig, TankConfig, TeacherConfig, TrackingConfig, VehicleConfig
 from uuvtai.kernels.geometry import FAR_M
 from uuvtai.kernels.grid import grid_origin
 from uuvtai.kernels.lanes import LANES, f16x
@@ -19,24 +19,30 @@ def body_depths(
     env,
     cx,
     cy,
+    cz,
     pos,
     vel,
     forecast: In[ForecastState],
     teacher_cfg: Const[TeacherConfig],
     tracking_cfg: Const[TrackingConfig],
+    tank_cfg: Const[TankConfig],
 ):
-    """How deep each commanded velocity (lanes cx, cy [m/s]) violates the wanted clearance from the forecast bodies.
+    """How deep each commanded velocity (lanes cx, cy, cz [m/s]) violates the wanted clearance from the forecast bodies.
 
-    ``pos``, ``vel``: own position [m] and velocity [m/s] now, world, horizontal. Returns lanes: largest depth [m]; depth averaged over the
+    ``pos``, ``vel``: own position [m] and velocity [m/s] now, world. Returns lanes: largest depth [m]; depth averaged over the
     horizon and summed over bodies [m]; largest depth below contact [m]; time of the first violation [s], FAR_M = none.
-    The clearance is reduced by closing_s times the closing speed, as the referee also stops at a small time to collision.
+    The clearance is reduced by closing_s times the closing speed, as the referee also stops at a small time to collision. Bodies are
+    upright cylinders; water known to be free above or below them (``above_w``, ``below_w``) adds to the distance.
     """
     n_track, n_sample = ti.static(forecast.radius_m.shape[1], _samples(forecast.radius_m.shape[2], teacher_cfg, tracking_cfg))
     dt = ti.static(tracking_cfg.forecast_dt_s)
+    low, high = ti.static(depth_band(tank_cfg, teacher_cfg))
     peak, mean, contact, first = f16x(0.0), f16x(0.0), f16x(0.0), f16x(FAR_M)
-    reach_speed = vel.norm() + ti.static(teacher_cfg.evade_m_s)
+    level, level_vel = ti.Vector([pos[0], pos[1]]), ti.Vector([vel[0], vel[1]])
+    reach_speed = level_vel.norm() + ti.static(teacher_cfg.evade_m_s)
     for track in range(n_track):
         if forecast.radius_m[env, track, 0] >= 0:
+            above, below = forecast.above_w[env, track], forecast.below_w[env, track]
             decay = 1.0
             for k in range(1, n_sample):
                 decay *= ti.static(_decay(tracking_cfg.forecast_dt_s, teacher_cfg.lag_s))
@@ -44,14 +50,17 @@ def body_depths(
                 settle = ti.static(teacher_cfg.lag_s) * (1.0 - decay)
                 body = forecast.pos_w[env, track, k]
                 body_vel = (body - forecast.pos_w[env, track, k - 1]) / dt
-                start = pos + vel * settle - body
-                drift = vel * decay - body_vel
-                wanted = ti.static(teacher_cfg.contact_m + teacher_cfg.margin_m) + ti.static(teacher_cfg.margin_growth_m_s) * time
-                touch = forecast.radius_m[env, track, k] + ti.static(teacher_cfg.hull_reach_m)
-                bound = touch + wanted + ti.static(teacher_cfg.evade_m_s) * (time - settle)
+                start = level + level_vel * settle - body
+                drift = level_vel * decay - body_vel
+                margin = teacher_cfg.margin_m + teacher_cfg.margin_growth_m_s * time
+                wanted = teacher_cfg.contact_m + teacher_cfg.caution * margin
+                radius = forecast.radius_m[env, track, k]
+                bound = radius + ti.static(teacher_cfg.hull_reach_m) + wanted + ti.static(teacher_cfg.evade_m_s) * (time - settle)
                 bound += ti.static(teacher_cfg.closing_s) * (reach_speed + body_vel.norm())
-                if forecast.radius_m[env, track, k] >= 0 and start.norm_sqr() < bound * bound:
-                    free = _free_lanes(cx, cy, start, drift, time - settle, 1.0 - decay, touch, teacher_cfg)
+                if radius >= 0 and start.norm_sqr() < bound * bound:
+                    z = ti.math.clamp(cz * (time - settle) + (pos[2] + vel[2] * settle), low, high)
+                    gap = ti.max(ti.min(above - z, z - below), 0.0) * ti.static(teacher_cfg.vertical_weight)
+                    free = _free_lanes(cx, cy, gap, start, drift, time - settle, 1.0 - decay, radius, teacher_cfg)
                     for i in ti.static(range(LANES)):
                         depth = ti.max(wanted - free[i], 0.0)
                         peak[i] = ti.max(peak[i], depth)
@@ -62,18 +71,21 @@ def body_depths(
 
 
 @ti.func
-def _free_lanes(cx, cy, start, drift, gain, share, touch, teacher_cfg: Const[TeacherConfig]):
-    """Surface-to-surface distance less closing_s times the closing speed, per lane.
+def _free_lanes(cx, cy, gap, start, drift, gain, share, radius, teacher_cfg: Const[TeacherConfig]):
+    """Surface-to-surface distance less closing_s times the closing speed, per lane; ``gap`` = weighted free water above or below.
 
-    Position relative to the body is start + c gain, relative velocity drift + c share.
+    Position relative to the body is start + c gain, relative velocity drift + c share. Level with the body (gap 0) the distance goes on
+    below zero inside its radius, so that deeper is worse.
     """
     dx = cx * gain + start[0]
     dy = cy * gain + start[1]
-    square = dx * dx + dy * dy + 1.0e-8
-    distance = ti.sqrt(square)
-    approach = -(dx * (cx * share + drift[0]) + dy * (cy * share + drift[1])) / distance
-    closing = ti.max(approach, 0.0)
-    return distance - touch - ti.static(teacher_cfg.closing_s) * closing
+    middle = ti.sqrt(dx * dx + dy * dy + 1.0e-8)
+    beyond = ti.max(middle - radius, 0.0)
+    within = ti.select(gap > 0.0, 0.0, ti.min(middle - radius, 0.0))
+    distance = ti.sqrt(beyond * beyond + gap * gap + 1.0e-8)
+    approach = -(dx * (cx * share + drift[0]) + dy * (cy * share + drift[1])) / middle
+    closing = ti.max(approach, 0.0) * ti.select(gap > 0.0, beyond / distance, 1.0)
+    return distance + within - ti.static(teacher_cfg.hull_reach_m) - ti.static(teacher_cfg.closing_s) * closing
 
 
 @ti.func
@@ -120,6 +132,18 @@ def clearance_lanes(env, x, y, clearance: In[ClearanceState], tank_cfg: Const[Ta
         col = ti.math.clamp(ti.cast(ti.floor(at_col[i]), ti.i32), 0, n_col - 1)
         out[i] = clearance.clearance_m[env, row, col]
     return out
+
+
+@ti.func
+def held_heave(error_m, cfg: Const[TeacherConfig], vehicle_cfg: Const[VehicleConfig]):
+    """Vertical speed [m/s] that corrects a depth error [m]."""
+    top = ti.static(vehicle_cfg.max_heave_m_s)
+    return ti.math.clamp(error_m * ti.static(cfg.depth_gain), -top, top)
+
+
+def depth_band(tank_cfg, teacher_cfg):
+    """(lowest, highest) own z [m] that the teacher steers for."""
+    return tank_cfg.z_m[0] + teacher_cfg.edge_gap_m, tank_cfg.z_m[1] - teacher_cfg.edge_gap_m
 
 
 def _decay(dt_s, lag_s):

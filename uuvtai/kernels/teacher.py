@@ -5,6 +5,7 @@ import taichi as ti
 from uuvtai.config import EpisodeConfig, TankConfig, TeacherConfig, VehicleConfig
 from uuvtai.kernels import tree_tick as codes
 from uuvtai.kernels.geometry import FAR_M, PI, quaternion_wb, rotation_wb, turned_z, wrapped_angle
+from uuvtai.kernels.rollout import held_heave
 from uuvtai.kernels.signature import Const, In, Out, spread
 from uuvtai.kernels.tree_tick import tick_nodes
 from uuvtai.state import ClockState, MissionState, Proprioception, RouteState, TeacherState, TreeTable
@@ -153,10 +154,11 @@ def _wanted_velocity(
     away = teacher.away_w[env]
     if leaf == codes.FOLLOW_ROUTE:
         out = teacher.follow_vel_w[env] * (_port(node, 0, ti.static(cfg.cruise_m_s), table) / ti.static(cfg.cruise_m_s))
-        out[2] = _heave(env, _port(node, 1, ti.static(cfg.depth_policy), table), teacher, ego, mission, cfg, vehicle_cfg, tank_cfg)
+        out[2] = teacher.follow_vel_w[env][2]
+        if _port(node, 1, 1.0, table) < 0.5:
+            out[2] = held_heave(mission.goal_w[env][2] - ego.pos_w[env][2], cfg, vehicle_cfg)
     elif leaf == codes.EVADE:
         out = teacher.evade_vel_w[env]
-        out[2] = _heave(env, ti.static(cfg.depth_policy), teacher, ego, mission, cfg, vehicle_cfg, tank_cfg)
     elif leaf == codes.BACK_OFF:
         back = turned_z(ti.Vector([-1.0, 0.0]), teacher.threat_bearing[env] + ego.rpy[env][2])
         out = _retreat(back, away, teacher.clearance_m[env], cfg) * _port(node, 0, ti.static(cfg.back_off_m_s), table)
@@ -169,7 +171,7 @@ def _wanted_velocity(
         ahead = mission.goal_w[env] - ego.pos_w[env]
         level = ti.Vector([ahead[0], ahead[1]])
         speed = _port(node, 0, ti.static(cfg.cruise_m_s), table) / ti.max(level.norm(), 1.0e-6)
-        out = ti.Vector([level[0] * speed, level[1] * speed, _held_heave(ahead[2], cfg, vehicle_cfg)])
+        out = ti.Vector([level[0] * speed, level[1] * speed, held_heave(ahead[2], cfg, vehicle_cfg)])
     return out
 
 
@@ -181,33 +183,6 @@ def _retreat(back, away, clearance_m, cfg: Const[TeacherConfig]):
     slid = back - ti.select(near, into, 0.0) * away
     unit = slid / ti.max(slid.norm(), 1.0e-3)
     return ti.Vector([unit[0], unit[1], 0.0])
-
-
-@ti.func
-def _heave(
-    env,
-    policy,
-    teacher: In[TeacherState],
-    ego: In[Proprioception],
-    mission: In[MissionState],
-    cfg: Const[TeacherConfig],
-    vehicle_cfg: Const[VehicleConfig],
-    tank_cfg: Const[TankConfig],
-):
-    """Vertical speed towards the depth to keep; none while a moving body is near, for the sonar is blind above and below."""
-    floor, surface = ti.static(tank_cfg.z_m)
-    low, high = floor + ti.static(cfg.edge_gap_m), surface - ti.static(cfg.edge_gap_m)
-    goal = mission.goal_w[env][2]
-    edge = ti.select(goal - low < high - goal, low, high)
-    wanted = ti.math.clamp(ti.select(policy >= 0.5, edge, goal), low, high)
-    safe = teacher.body_near_m[env] > ti.static(cfg.heave_clear_m)
-    return ti.select(safe, _held_heave(wanted - ego.pos_w[env][2], cfg, vehicle_cfg), 0.0)
-
-
-@ti.func
-def _held_heave(error_m, cfg: Const[TeacherConfig], vehicle_cfg: Const[VehicleConfig]):
-    top = ti.static(vehicle_cfg.max_heave_m_s)
-    return ti.math.clamp(error_m * ti.static(cfg.depth_gain), -top, top)
 
 
 @ti.func

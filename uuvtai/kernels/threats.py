@@ -2,13 +2,13 @@
 
 import taichi as ti
 
-from uuvtai.config import EpisodeConfig, MappingConfig, TankConfig, TeacherConfig, TrackingConfig
-from uuvtai.kernels.geometry import FAR_M, TWO_PI, turned_z, wrapped_angle
+from uuvtai.config import EpisodeConfig, MappingConfig, TankConfig, TeacherConfig, TrackingConfig, VehicleConfig
+from uuvtai.kernels.geometry import FAR_M, TWO_PI, turned_z3, wrapped_angle
 from uuvtai.kernels.grid import cell_of, centre_of
 from uuvtai.kernels.lanes import f16x
-from uuvtai.kernels.rollout import body_depths
+from uuvtai.kernels.rollout import body_depths, depth_band, held_heave
 from uuvtai.kernels.signature import Const, In, Out, spread
-from uuvtai.state import ClearanceState, ClockState, ForecastState, Proprioception, RouteState, SonarScan, TeacherState
+from uuvtai.state import ClearanceState, ClockState, ForecastState, MissionState, Proprioception, RouteState, SonarScan, TeacherState
 
 _PATH_SAMPLES = 8
 
@@ -21,8 +21,10 @@ def assess_threats(
     scan: In[SonarScan],
     clearance: In[ClearanceState],
     ego: In[Proprioception],
+    mission: In[MissionState],
     clock: In[ClockState],
     teacher_cfg: Const[TeacherConfig],
+    vehicle_cfg: Const[VehicleConfig],
     tracking_cfg: Const[TrackingConfig],
     tank_cfg: Const[TankConfig],
     mapping_cfg: Const[MappingConfig],
@@ -36,7 +38,7 @@ def assess_threats(
                 _sense_contact(env, teacher, scan, ego, teacher_cfg)
             _read_clearance(env, teacher, route, clearance, ego, teacher_cfg, tank_cfg, mapping_cfg)
             _follow_velocity(env, teacher, route, ego, teacher_cfg)
-            _foresee_conflict(env, teacher, forecast, ego, clock, teacher_cfg, tracking_cfg, episode_cfg)
+            _foresee_conflict(env, teacher, forecast, ego, mission, clock, teacher_cfg, vehicle_cfg, tracking_cfg, tank_cfg, episode_cfg)
 
 
 @ti.func
@@ -128,7 +130,7 @@ def _follow_velocity(env, teacher: Out[TeacherState], route: In[RouteState], ego
     share = ti.static(cfg.slow_fraction) + ti.static(1.0 - cfg.slow_fraction) * ti.math.clamp(room, 0.0, 1.0)
     speed = ti.select(route.n_way[env] > 0, ti.static(cfg.cruise_m_s) * share, 0.0)
     wanted = _unit(level) * speed
-    teacher.follow_vel_w[env] = ti.Vector([wanted[0], wanted[1], 0.0])
+    teacher.follow_vel_w[env] = ti.Vector([wanted[0], wanted[1], teacher.follow_vel_w[env][2]])
 
 
 @ti.func
@@ -137,26 +139,37 @@ def _foresee_conflict(
     teacher: Out[TeacherState],
     forecast: In[ForecastState],
     ego: In[Proprioception],
+    mission: In[MissionState],
     clock: In[ClockState],
     teacher_cfg: Const[TeacherConfig],
+    vehicle_cfg: Const[VehicleConfig],
     tracking_cfg: Const[TrackingConfig],
+    tank_cfg: Const[TankConfig],
     episode_cfg: Const[EpisodeConfig],
 ):
-    """Roll the follow velocity out against the forecasts, in decision steps only."""
+    """Roll the follow velocity out against the forecasts, in decision steps only, with and without a change of depth.
+
+    Depth is changed towards the goal's only where that comes no nearer to any body: what is above or below is easily forgotten.
+    """
     teacher.want_evade[env] = 0
     teacher.calm_steps[env] += 1
     if clock.step[env] % ti.static(teacher_cfg.decide_period_steps) == 0:
-        pos = ti.Vector([ego.pos_w[env][0], ego.pos_w[env][1]])
-        vel = turned_z(ti.Vector([ego.vel_b[env][0], ego.vel_b[env][1]]), ego.rpy[env][2])
+        pos, vel = ego.pos_w[env], turned_z3(ego.vel_b[env], ego.rpy[env][2])
         follow = teacher.follow_vel_w[env]
-        _, _, _, first = body_depths(env, f16x(follow[0]), f16x(follow[1]), pos, vel, forecast, teacher_cfg, tracking_cfg)
-        teacher.conflict_s[env] = first[0]
-        teacher.body_near_m[env] = _nearest_body(env, pos, forecast, teacher_cfg)
-        if first[0] < FAR_M:
+        low, high = ti.static(depth_band(tank_cfg, teacher_cfg))
+        heave = held_heave(ti.math.clamp(mission.goal_w[env][2], low, high) - pos[2], teacher_cfg, vehicle_cfg)
+        cz = f16x(0.0)
+        cz[1] = heave
+        peak, _, _, first = body_depths(env, f16x(follow[0]), f16x(follow[1]), cz, pos, vel, forecast, teacher_cfg, tracking_cfg, tank_cfg)
+        climbs = peak[1] <= peak[0] + 1.0e-3
+        teacher.follow_vel_w[env][2] = ti.select(climbs, heave, 0.0)
+        teacher.conflict_s[env] = ti.select(climbs, first[1], first[0])
+        teacher.body_near_m[env] = _nearest_body(env, ti.Vector([pos[0], pos[1]]), forecast, teacher_cfg)
+        if teacher.conflict_s[env] < FAR_M:
             teacher.calm_steps[env] = 0
         calm = teacher.calm_steps[env] * ti.static(episode_cfg.control_dt_s)
         urgent = teacher.ttc_s[env] < ti.static(teacher_cfg.emergency_ttc_s)
-        if first[0] < FAR_M or urgent or (teacher.evading_steps[env] > 0 and calm <= ti.static(teacher_cfg.calm_s + 0.2)):
+        if teacher.conflict_s[env] < FAR_M or urgent or (teacher.evading_steps[env] > 0 and calm <= ti.static(teacher_cfg.calm_s + 0.2)):
             teacher.want_evade[env] = 1
 
 

@@ -96,7 +96,7 @@ def is_forgotten(
 ):
     """1 where a moving body is hardly where it is expected any more: seen through within the fan, or unseen for long."""
     if sight == SEEN_THROUGH:
-        weigh_unseen(env, track, scan.ping_pos_w[env], tracks, elevation, sonar, tank)
+        weigh_unseen(env, track, scan.ping_pos_w[env], dt, tracks, elevation, sonar, tank)
     tracks.present[env, track] *= ti.exp(-dt * ti.static(1.0 / max(elevation.memory_s, 1e-3)))
     return ti.cast(tracks.present[env, track] < elevation.gone_share, ti.i32)
 

@@ -1,0 +1,124 @@
+"""What the camera says about the height of a tracked body: the column of pixels through its middle shows where it begins and ends.
+
+Only what lies in the image and at the body's distance counts; a body cut by the image's edge tells one end, a column through which the camera
+sees farther tells where no body is. Feeds the height hypotheses of ``elevation.py``; sees the image and tracks only.
+"""
+
+import taichi as ti
+
+from uuvtai.config import DepthConfig, ElevationConfig, EpisodeConfig, TankConfig
+from uuvtai.kernels.elevation import COLUMN, heights, weigh_camera
+from uuvtai.kernels.evidence import pinhole
+from uuvtai.kernels.geometry import FAR_M, quaternion_wb, rotation_wb
+from uuvtai.kernels.lanes import LANES, f16x
+from uuvtai.kernels.signature import Const, In, Out, spread
+from uuvtai.state import ClockState, DepthImage, TrackState
+
+_DEPTH_SLACK_M = 0.25
+"""A pixel this close to the body's expected distance shows the body (track errors and the size's)."""
+
+_TRUNCATED_M = 0.4
+"""[m] farthest that the middle of a body may be from its one visible end."""
+
+_EDGE_M = 0.1
+"""[m] a column through the full water column must reach this close to floor and surface, and a middle is known this well."""
+
+_LEAST = 0.05
+"""Likelihood of a height that the image contradicts."""
+
+
+@ti.kernel
+def look_at_bodies(
+    tracks: Out[TrackState],
+    image: In[DepthImage],
+    clock: In[ClockState],
+    cfg: Const[ElevationConfig],
+    depth: Const[DepthConfig],
+    tank: Const[TankConfig],
+    rules: Const[EpisodeConfig],
+):
+    """Weigh the heights of every moving track in the view of a fresh image."""
+    n, n_track = ti.static(tracks.alive.shape[0], tracks.alive.shape[1])
+    for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n * n_track))):
+        if pad == 0 and clock.awake[env] == 1 and image.fresh[env] == 1 and tracks.alive[env, track] * tracks.moving[env, track] == 1:
+            late = (clock.step[env] - tracks.scan_step[env]) * rules.control_dt_s
+            mean = tracks.state[env, track]
+            at = ti.Vector([mean[0] + late * mean[2], mean[1] + late * mean[3]])
+            look_at(env, track, at, tracks, image, cfg, depth, tank)
+
+
+@ti.func
+def look_at(
+    env,
+    track,
+    at,
+    tracks: Out[TrackState],
+    image: In[DepthImage],
+    cfg: Const[ElevationConfig],
+    depth: Const[DepthConfig],
+    tank: Const[TankConfig],
+):
+    """One track, expected at ``at`` [m, world, horizontal]."""
+    focal, middle_row, middle_col = ti.static(pinhole(depth))
+    rpy = image.shot_rpy[env]
+    R_wb = rotation_wb(quaternion_wb(rpy[0], rpy[1], rpy[2]))
+    eye = image.shot_pos_w[env] + R_wb @ ti.Vector([depth.offset_b_m[0], depth.offset_b_m[1], depth.offset_b_m[2]])
+    yaw_c, yaw_s = ti.cos(rpy[2]), ti.sin(rpy[2])
+    off = at - ti.Vector([eye[0], eye[1]])
+    ahead, left = yaw_c * off[0] + yaw_s * off[1], yaw_c * off[1] - yaw_s * off[0]
+    radius = tracks.radius_m[env, track]
+    col = ti.cast(ti.floor(middle_col - focal * left / ti.max(ahead, 1e-3) + 0.5), ti.i32)
+    if ahead > radius + ti.static(_DEPTH_SLACK_M) and ahead < depth.max_range_m - _DEPTH_SLACK_M and col >= 0 and col < ti.static(depth.cols):
+        ends = column_ends(env, col, ahead, radius, eye[2], image, R_wb, focal, middle_row, middle_col, depth)
+        if ends[0] <= ends[1]:
+            weigh_camera(env, track, shown_heights(ends, cfg, tank), 0, tracks)
+        elif ends[2] <= ends[3]:
+            weigh_camera(env, track, missing_heights(ends, cfg, tank), 1, tracks)
+
+
+@ti.func
+def column_ends(env, col, ahead, radius, eye_z, image: In[DepthImage], R_wb, focal, middle_row, middle_col, depth: Const[DepthConfig]):
+    """(lowest, highest) z of the body's pixels in one column, (lowest, highest) z at its distance of the pixels that show it or see past
+    it; low > high where there are none."""
+    left = (middle_col - col) / focal
+    low, high, free_low, free_high = FAR_M, -FAR_M, FAR_M, -FAR_M
+    for row in range(ti.static(depth.rows)):
+        away = image.depth_m[env, row, col]
+        climb = R_wb[2, 0] + R_wb[2, 2] * (middle_row - row) / focal + R_wb[2, 1] * left
+        if away > ahead - radius - _DEPTH_SLACK_M:
+            z = eye_z + climb * (ahead - 0.5 * radius)
+            free_low, free_high = ti.min(free_low, z), ti.max(free_high, z)
+        if ti.abs(away - ahead + 0.5 * radius) < 0.5 * radius + _DEPTH_SLACK_M:
+            z = eye_z + climb * away
+            low, high = ti.min(low, z), ti.max(high, z)
+    return ti.Vector([low, high, free_low, free_high])
+
+
+@ti.func
+def shown_heights(ends, cfg: Const[ElevationConfig], tank: Const[TankConfig]):
+    """Likelihood per hypothesis of a body that shows between ends[0] and ends[1], where ends[2] to ends[3] could be seen."""
+    step = ti.static((tank.z_m[1] - tank.z_m[0]) / COLUMN)
+    cut_low, cut_high = ends[0] <= ends[2] + 0.02, ends[1] >= ends[3] - 0.02
+    middle = 0.5 * (ends[0] + ends[1])
+    first = ti.select(cut_low, ti.select(cut_high, ends[0], ends[1] - _TRUNCATED_M), middle) - _EDGE_M
+    last = ti.select(cut_high, ti.select(cut_low, ends[1], ends[0] + _TRUNCATED_M), middle) + _EDGE_M
+    at = heights(tank)
+    out = f16x(_LEAST)
+    for i in ti.static(range(LANES)):
+        if at[i] >= first - 0.5 * step and at[i] <= last + 0.5 * step:
+            out[i] = 1.0
+    full = (cut_low or ends[0] < ti.static(tank.z_m[0] + 2.0 * _EDGE_M)) and (cut_high or ends[1] > ti.static(tank.z_m[1] - 2.0 * _EDGE_M))
+    out[COLUMN] = ti.select(full, 1.0, _LEAST)
+    return out
+
+
+@ti.func
+def missing_heights(ends, cfg: Const[ElevationConfig], tank: Const[TankConfig]):
+    """Likelihood per hypothesis of a body that does not show between ends[2] and ends[3]."""
+    at = heights(tank)
+    out = f16x(1.0)
+    for i in ti.static(range(LANES)):
+        if at[i] > ends[2] and at[i] < ends[3]:
+            out[i] = 1.0 - cfg.camera_hit_share
+    out[COLUMN] = 1.0 - cfg.camera_hit_share
+    return out
