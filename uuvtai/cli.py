@@ -161,29 +161,32 @@ def _print_causes(result: dict[str, Any]) -> None:
         if not failed:
             _stdout().print(f"{m['name']}: no episode failed, nothing to explain", highlight=False)
             continue
-        table = Table(
-            title=f"{m['name']}: why {failed} of {m['episodes']} episodes failed",
-            caption="knew: share with a right forecast of the killer 1 s before the end; escapable: share in which some velocity held from "
-            "then on, would have passed everything; unseen, evading: median time before the end since a beam last met the killer, and "
-            "since evasion began; worst: seed:episode",
-            title_justify="left",
-            caption_justify="left",
-        )
-        for head in ("cause", "n", "share", "meaning", "knew", "escapable", "unseen", "evading", "worst"):
-            table.add_column(head, justify="left" if head in ("cause", "meaning", "worst") else "right", no_wrap=head in ("cause", "n"))
+        table = Table(title=f"{m['name']}: why {failed} of {m['episodes']} episodes failed", caption=_CAUSES_LEGEND, **_LEFT)
+        for head in ("cause", "n", "share", "meaning, and what came with it", "knew", "unseen", "evading", "chance", "worst"):
+            left = head in ("cause", "worst") or head.startswith("meaning")
+            table.add_column(head, justify="left" if left else "right", no_wrap=head in ("cause", "n"))
         for c in m["causes"]:
+            remarks = ", ".join(f"{count} {remark}" for remark, count in c["remarks"].items())
             table.add_row(
                 c["label"],
                 str(c["count"]),
                 _percent(c["share"]),
-                c["meaning"],
+                c["meaning"] + (f"\n[dim]{remarks}[/dim]" if remarks else ""),
                 _percent(c["knew_share"]),
-                _percent(c["escapable_share"]),
                 _seconds(c["unseen_median_s"]),
                 _seconds(c["evading_median_s"]),
+                _seconds(c["last_chance_median_s"]),
                 ", ".join(f"{seed}:{episode}" for seed, episode in c["examples"]),
             )
         _stdout().print(table)
+
+
+_LEFT: Any = {"title_justify": "left", "caption_justify": "left"}
+
+_CAUSES_LEGEND = (
+    "knew: share whose forecast of the killer, made 1 s before the end, was right. Medians before the end: unseen = since a beam "
+    "last met the killer; evading = since evasion began; chance = until when some velocity still escaped. worst: seed:episode"
+)
 
 
 def _percent(share: float | None) -> str:

@@ -1,7 +1,7 @@
 """Explain failed episodes: play them again, keep the truth and the vehicle's beliefs of their last seconds, label each (``causes.py``).
 
 An episode is the same in any batch, so only the failed ones are replayed, and their ends are known beforehand: nothing is kept of the
-time before the last ``causes.WINDOW_S`` but a coarse diary.
+time before the last ``facts.WINDOW_S`` but a coarse diary.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from uuvtai.config import Config
-from uuvtai.measure import causes
+from uuvtai.measure import causes, facts
 from uuvtai.measure.causes import Explanation
 from uuvtai.measure.evaluate import EpisodeResult, Job, Progress, run_episodes
 from uuvtai.measure.history import Bodies, Diary, History
@@ -35,7 +35,7 @@ _WINDOW_FIELDS = {
     "world": ("pos_w", "vel_w"),
     "scan": ("ping_step", "range_m"),
     "tracks": ("alive", "moving", "state"),
-    "forecast": ("pos_w", "radius_m"),
+    "forecast": ("pos_w", "radius_m", "above_w", "below_w"),
     "teacher": ("leaf", "conflict_s", "action", "clearance_m"),
 }
 _DIARY_FIELDS = {"vehicle": ("pos_w",), "mission": ("goal_w",), "route": ("n_way",), "teacher": ("leaf",)}
@@ -55,7 +55,8 @@ class Row:
     def document(self) -> dict[str, Any]:
         """One entry of ``explain`` in ``uuv eval --json``."""
         r, e = self.result, self.explanation
-        return {"seed": r.seed, "episode": r.episode, "outcome": r.outcome, "label": e.label, "killer": vars(e.killer), **e.facts}
+        told = {"seed": r.seed, "episode": r.episode, "outcome": r.outcome, "label": e.label, "remarks": e.remarks}
+        return told | {"killer": vars(e.killer)} | e.facts
 
 
 @dataclass
@@ -113,7 +114,7 @@ class Coroner:
     def _is_in_window(self, watched: _Watched) -> bool:
         left = watched.end_step - watched.step
         sparse = max(1, round(_SPARSE_S / self._dt))
-        return left * self._dt <= _DENSE_S or (left * self._dt <= causes.WINDOW_S and left % sparse == 0)
+        return left * self._dt <= _DENSE_S or (left * self._dt <= facts.WINDOW_S and left % sparse == 0)
 
     def _is_diary_due(self, watched: _Watched) -> bool:
         left = watched.end_step - watched.step
@@ -136,6 +137,8 @@ class Coroner:
             track_w=state[:, :, :2].astype(float),
             forecast_w=w["forecast.pos_w"].astype(float),
             forecast_m=w["forecast.radius_m"][:, :, 0].astype(float),
+            forecast_above_w=w["forecast.above_w"].astype(float),
+            forecast_below_w=w["forecast.below_w"].astype(float),
             conflict=w["teacher.conflict_s"] < _FORESEEN_S,
             leaf=self._leaves(w["teacher.leaf"]),
             action=w["teacher.action"].astype(float),
@@ -179,25 +182,29 @@ def table_of(rows: list[Row]) -> list[dict[str, Any]]:
             "count": counts[label],
             "share": counts[label] / len(rows),
             "meaning": causes.CAUSES[label],
-            **_typical([row.explanation.facts for row in rows if row.explanation.label == label]),
+            **_typical([row.explanation for row in rows if row.explanation.label == label]),
             "examples": [[row.result.seed, row.result.episode] for row in worst_of(rows, label)[:EXAMPLES]],
         }
         for label in sorted(counts, key=lambda label: (-counts[label], order.index(label)))
     ]
 
 
-def _typical(facts: list[dict[str, Any]]) -> dict[str, float | None]:
-    """What a label's episodes have in common: shares of those that have such a fact, and medians."""
-    error = [f["forecast_error_m"] for f in facts if "forecast_error_m" in f]
-    ways = [f["escapes"] + f["escapes_by_heave"] for f in facts if "escapes" in f]
-    unseen = [causes.WINDOW_S if f["seen_ago_s"] is None else f["seen_ago_s"] for f in facts if "seen_ago_s" in f]
-    evading = [f["evading_s"] for f in facts if "evading_s" in f]
+def _typical(found: list[Explanation]) -> dict[str, Any]:
+    """What a label's episodes have in common; None where a label has no such fact."""
+    errors = [e.facts["forecast_error_m"] for e in found if "forecast_error_m" in e.facts]
     return {
-        "knew_share": mean([float(e is not None and e <= causes.MISS_M) for e in error]),
-        "escapable_share": mean([float(n > 0) for n in ways]),
-        "unseen_median_s": float(np.median(unseen)) if unseen else None,
-        "evading_median_s": float(np.median(evading)) if evading else None,
+        "remarks": dict(Counter(remark for e in found for remark in e.remarks).most_common()),
+        "knew_share": mean([float(error is not None and error <= causes.MISS_M) for error in errors]),
+        "unseen_median_s": _median(found, "seen_ago_s", facts.WINDOW_S),
+        "evading_median_s": _median(found, "evading_s", 0.0),
+        "last_chance_median_s": _median(found, "last_chance_s", facts.CHANCES_S[-1]),
     }
+
+
+def _median(found: list[Explanation], name: str, beyond: float) -> float | None:
+    """Median of the episodes that have the fact; ``beyond`` stands for farther back than was looked."""
+    values = [beyond if e.facts[name] is None else e.facts[name] for e in found if name in e.facts]
+    return float(np.median(values)) if values else None
 
 
 def worst_of(rows: list[Row], label: str) -> list[Row]:

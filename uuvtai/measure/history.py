@@ -68,6 +68,10 @@ class History:
     """(n, n_track, n_forecast, 2)"""
     forecast_m: Array
     """(n, n_track) present radius, negative = no forecast"""
+    forecast_above_w: Array
+    """(n, n_track) z of the lowest edge of what it may hold above the vehicle; the vehicle's own z where it may be level with it"""
+    forecast_below_w: Array
+    """(n, n_track) z of the highest edge of what it may hold below"""
     conflict: Array
     """(n,) bool: the pilot foresees a conflict"""
     leaf: list[str]
