@@ -27,8 +27,8 @@ from uuvtai.tree import FlatTree
 EXAMPLES = 3
 """Episodes named per label in the table."""
 
-_DENSE_S, _SPARSE_S, _DIARY_S = 0.5, 0.1, 0.5
-"""Every step is kept for the last half second, ten samples a second before that, and two diary entries a second."""
+_SAMPLE_S, _DIARY_S = 0.1, 0.5
+"""Time between samples of the window and between entries of the diary; counted from the start, so that rows are read together."""
 
 _WINDOW_FIELDS = {
     "vehicle": ("pos_w", "quat_wb", "vel_b", "rate_b"),
@@ -113,12 +113,13 @@ class Coroner:
 
     def _is_in_window(self, watched: _Watched) -> bool:
         left = watched.end_step - watched.step
-        sparse = max(1, round(_SPARSE_S / self._dt))
-        return left * self._dt <= _DENSE_S or (left * self._dt <= facts.WINDOW_S and left % sparse == 0)
+        return left == 0 or (left * self._dt <= facts.WINDOW_S and self._is_multiple(watched.step, _SAMPLE_S))
 
     def _is_diary_due(self, watched: _Watched) -> bool:
-        left = watched.end_step - watched.step
-        return left == 0 or watched.step == 1 or watched.step % max(1, round(_DIARY_S / self._dt)) == 0
+        return watched.step in (1, watched.end_step) or self._is_multiple(watched.step, _DIARY_S)
+
+    def _is_multiple(self, step: int, period_s: float) -> bool:
+        return step % max(1, round(period_s / self._dt)) == 0
 
     def _history(self, watched: _Watched) -> History:
         w, d = _stacked(watched.window), _stacked(watched.diary)
