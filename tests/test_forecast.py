@@ -6,6 +6,7 @@ import pytest
 from tests.reference import forecast as oracle
 from uuvtai.config import EpisodeConfig, ForecastConfig, TrackingConfig
 from uuvtai.kernels import forecast
+from uuvtai.kernels.lanes import LANES
 from uuvtai.state import ClockState, ForecastState, TrackState, allocate
 
 N_ENV, N_TRACK = 6, 5
@@ -14,6 +15,7 @@ SIZES = {
     "n_env": N_ENV,
     "n_ray": 16,
     "n_track": N_TRACK,
+    "n_height": LANES,
     "n_forecast": round(TRACKING.horizon_s / TRACKING.forecast_dt_s) + 1,
 }
 AHEAD = TRACKING.forecast_dt_s * np.arange(SIZES["n_forecast"])
@@ -27,7 +29,7 @@ GROWTH_TOLERANCE = 2e-4
 
 class Stage:
     def __init__(self):
-        self.tracks, self.clock, self.forecast = (allocate(s, SIZES) for s in (TrackState, ClockState, ForecastState))
+        self.tracks, self.clock, self.forecast = allocate(TrackState, SIZES), allocate(ClockState, SIZES), allocate(ForecastState, SIZES)
 
     def begin(self, cfg=None):
         self.cfg = cfg or ForecastConfig()
@@ -54,7 +56,7 @@ def stage():
 
 
 def random_tracks(seed):
-    """Moving tracks in every slot: states, covariances (4 x 4), radii, turn rates up to 4 rad/s (and some 0)."""
+    """Moving tracks in every slot: states, covariances (4 x 4), radii, turn rates up to 4 rad/s (and some 0) with their variances."""
     rng = np.random.default_rng(seed)
     size = (N_ENV, N_TRACK)
     course, speed = rng.uniform(-np.pi, np.pi, size), rng.uniform(0.1, 3.0, size)
@@ -63,26 +65,32 @@ def random_tracks(seed):
     root = rng.normal(0, 0.1, (*size, 4, 4))
     cov = (root @ np.swapaxes(root, -1, -2)).astype(np.float32)
     rate = np.where(rng.random(size) < 0.3, 0.0, rng.uniform(-4, 4, size)).astype(np.float32)
-    return state, cov, rng.uniform(0.1, 0.4, size).astype(np.float32), rate
+    sigma = rng.uniform(0.02, 4, size)
+    return state, cov, rng.uniform(0.1, 0.4, size).astype(np.float32), rate, sigma
 
 
-def lay_out(stage, state, cov, radius, rate):
+def lay_out(stage, state, cov, radius, rate, sigma):
     row, col = np.triu_indices(4)
     ones = np.ones((N_ENV, N_TRACK))
-    stage.put(alive=ones, moving=ones, state=state, cov=cov[..., row, col], radius_m=radius, turn_rate=rate)
+    turn_cov = np.zeros((N_ENV, N_TRACK, 5))
+    turn_cov[..., 4] = sigma**2
+    stage.put(alive=ones, moving=ones, state=state, cov=cov[..., row, col], radius_m=radius, turn_rate=rate, turn_cov=turn_cov)
 
 
 @pytest.mark.parametrize("use_turn_rate", [True, False])
 def test_forecast_equals_the_arc(stage, use_turn_rate):
-    """The scan is two steps old: sample k lies 0.04 + 0.1 k seconds along the arc (along the tangent where the switch is off)."""
+    """The scan is two steps old: sample k lies 0.04 + 0.1 k seconds along the arc (along the tangent where the switch is off, and where
+    the turn rate does not stand out of its noise)."""
     stage.begin(ForecastConfig(use_turn_rate=use_turn_rate))
-    state, cov, radius, rate = random_tracks(1)
-    lay_out(stage, state, cov, radius, rate)
+    state, cov, radius, rate, sigma = random_tracks(1)
+    lay_out(stage, state, cov, radius, rate, sigma)
     stage.clock.step.fill(2)
     pos, size = stage.predict()
+    assert 5 < (np.abs(rate) > sigma).sum() < N_ENV * N_TRACK - 5
     for env, track in np.ndindex(N_ENV, N_TRACK):
         x = state[env, track].astype(float)
-        turn = float(rate[env, track]) if use_turn_rate else 0.0
+        clear = use_turn_rate and abs(rate[env, track]) > stage.cfg.straight_sigmas * sigma[env, track]
+        turn = float(rate[env, track]) if clear else 0.0
         for k, t in enumerate(AHEAD + 2 * RULES.control_dt_s):
             np.testing.assert_allclose(pos[env, track, k], oracle.arc(x[:2], x[2:], turn, t), atol=POSITION_TOLERANCE)
             grown = radius[env, track] + oracle.growth(cov[env, track].astype(float), t, TRACKING)

@@ -433,6 +433,10 @@ class TrackingConfig(Section):
     """across the bearing, where the first Doppler says nothing"""
     accel_density: NonNegative = 0.03
     """[m^2/s^3] spectral density of a body's acceleration"""
+    turn_rate_sigma_rad_s: NonNegative = 1.0
+    """prior of a moving body's turn rate around 0; 0 = bodies are taken to go straight"""
+    turn_density: NonNegative = 0.005
+    """[rad^2/s^3] spectral density of the turn rate's changes"""
     gate_m: Positive = 0.3
     """a cluster this close to a prediction (plus one scan of its speed) may always match, however sure the filter is"""
     turn_gate: Positive = 20.0
@@ -463,6 +467,8 @@ class ForecastConfig(Section):
 
     use_turn_rate: bool = True
     """bodies keep their turn rate; off: straight ahead"""
+    straight_sigmas: NonNegative = 1.0
+    """a turn rate of less than this many of its standard deviations is taken for 0"""
 
 
 class ElevationConfig(Section):

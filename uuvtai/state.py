@@ -398,7 +398,9 @@ class TrackState:
     radius_var: ti.Field = array("n_env", "n_track")
     """[m^2] variance of the radius"""
     turn_rate: ti.Field = array("n_env", "n_track")
-    """[rad/s] rate at which the velocity turns, smoothed; 0 = straight or unknown"""
+    """[rad/s] rate at which the velocity turns; 0 = unknown"""
+    turn_cov: ti.Field = array("n_env", "n_track", vec=5)
+    """covariance of the turn rate with x, y, vx, vy, and its own variance [rad^2/s^2]; 0 = not estimated"""
     doppler_m_s: ti.Field = array("n_env", "n_track")
     """[m/s] fading mean of the compensated Doppler"""
     doppler_var: ti.Field = array("n_env", "n_track")

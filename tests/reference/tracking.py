@@ -1,4 +1,5 @@
-"""NumPy float64 oracle of the tracking stage, one env at a time: full 4 x 4 covariances in Joseph's form, greedy pairs by sorting.
+"""NumPy float64 oracle of the tracking stage, one env at a time: full 5 x 5 covariances (x, y, vx, vy, turn rate) in Joseph's form,
+Jacobians by differences, greedy pairs by sorting.
 
 Written from the description of the method, with the product's constants passed in or restated here.
 """
@@ -50,7 +51,6 @@ class Track:
     sight: float
     seen: int
     moving: int = 0
-    turn_rate: float = 0.0
     shift: np.ndarray = field(default_factory=lambda: np.zeros(2))
     sweep: float = 0.0
     age: int = 0
@@ -162,23 +162,33 @@ def cluster_from(beams, steps, scan, still, slip, cfg, sonar):
 # -------------------------------------------------------------------------------------------------------------------- filter
 
 
-def predicted(x, P, dt, density):
-    F = np.eye(4)
-    F[0, 2] = F[1, 3] = dt
-    Q = density * np.kron(np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]), np.eye(2))
-    return F @ x, F @ P @ F.T + Q
+def arc(x, dt):
+    """State (x, y, vx, vy, turn rate) after dt: along the chord of the middle course, then with the velocity turned."""
+    mid, late = turned(x[2:4], 0.5 * dt * x[4]), turned(x[2:4], dt * x[4])
+    return np.array([x[0] + dt * mid[0], x[1] + dt * mid[1], *late, x[4]])
+
+
+def predicted(x, P, dt, density, rate_density):
+    """Mean and covariance after dt; the turn rate takes noise only where it is estimated."""
+    step = 1e-6
+    F = np.stack([(arc(x + step * e, dt) - arc(x - step * e, dt)) / (2 * step) for e in np.eye(5)], 1)
+    Q = np.zeros((5, 5))
+    Q[:4, :4] = density * np.kron(np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]), np.eye(2))
+    Q[4, 4] = rate_density * dt if P[4, 4] > 0 else 0.0
+    return arc(x, dt), F @ P @ F.T + Q
 
 
 def corrected(x, P, h, residual, variance):
-    """Joseph's form."""
+    """Joseph's form; h measures (x, y, vx, vy)."""
+    h = np.append(h, 0.0)
     K = P @ h / (h @ P @ h + variance)
-    A = np.eye(4) - np.outer(K, h)
+    A = np.eye(5) - np.outer(K, h)
     return x + K * residual, A @ P @ A.T + variance * np.outer(K, K)
 
 
-def turned(x, angle):
+def turned(v, angle):
     c, s = np.cos(angle), np.sin(angle)
-    return np.array([x[0], x[1], c * x[2] - s * x[3], s * x[2] + c * x[3]])
+    return np.array([c * v[0] - s * v[1], s * v[0] + c * v[1]])
 
 
 def centre_variances(c, radius, radius_var, sonar):
@@ -193,9 +203,9 @@ def surprise_of(track, c, along, centre, sonar):
     across = np.array([-along[1], along[0]])
     radial_var, cross_var = centre_variances(c, track.radius, track.radius_var, sonar)
     s = np.array([along @ track.P[:2, :2] @ along + radial_var, across @ track.P[:2, :2] @ across + cross_var])
-    s = np.append(s, along @ track.P[2:, 2:] @ along + c.doppler_var)
+    s = np.append(s, along @ track.P[2:4, 2:4] @ along + c.doppler_var)
     offset = centre - track.x[:2]
-    e = np.array([offset @ along, offset @ across, c.doppler - along @ track.x[2:]])
+    e = np.array([offset @ along, offset @ across, c.doppler - along @ track.x[2:4]])
     return e**2 / s, s
 
 
@@ -219,7 +229,7 @@ def associate(tracks, clusters, dt, cfg, sonar):
             if gap >= 2.0:
                 continue
             parts, s = surprise_of(track, c, unit(c.bearing), c.pos, sonar)
-            if parts[0] + parts[1] < cfg.turn_gate or gap < cfg.gate_m + dt * np.hypot(*track.x[2:]):
+            if parts[0] + parts[1] < cfg.turn_gate or gap < cfg.gate_m + dt * np.hypot(*track.x[2:4]):
                 pairs.append((parts.sum() + np.log(s.prod()), t, k))
     out = {}
     for _, t, k in sorted(pairs):
@@ -244,18 +254,18 @@ def update(track, c, dt, scan, cfg, sonar):
     parts, _ = surprise_of(track, c, unit(c.bearing), centre, sonar)
     P, x = track.P.copy(), track.x
     if parts.sum() > cfg.turn_gate:
-        P[2:, 2:] += max(np.hypot(*x[2:]), 0.5) ** 2 * np.eye(2)
+        P[2:4, 2:4] += max(np.hypot(*x[2:4]), 0.5) ** 2 * np.eye(2)
     for h, z, v in (
         (np.append(along, [0, 0]), centre @ along, radial_var),
         (np.append(across, [0, 0]), centre @ across, cross_var),
         (np.append([0, 0], (1 - half**2 / 6) * along), c.doppler, c.doppler_var),
     ):
-        x, P = corrected(x, P, h, z - h @ x, v)
+        x, P = corrected(x, P, h, z - h @ x[:4], v)
     track.x, track.P = x, P
     evidence(track, c, dt, before, cfg, sonar)
     track.z, track.seen, track.misses = scan.pos[2], scan.step, 0
     track.moving = is_moving(track, c, dt, cfg, sonar)
-    turn(track, dt, before)
+    turn(track, before, cfg)
 
 
 def evidence(track, c, dt, before, cfg, sonar):
@@ -264,14 +274,14 @@ def evidence(track, c, dt, before, cfg, sonar):
     track.doppler_var = 1 / (known + new)
     track.shift = track.shift / (1 + dt / cfg.shift_memory_s)
     if not c.hidden:
-        track.shift = track.shift + track.x[:2] - before[:2] + dt * before[2:]
+        track.shift = track.shift + track.x[:2] - before[:2] + dt * before[2:4]
     swing = (c.bearing - track.sight + np.pi) % (2 * np.pi) - np.pi
     track.sweep = track.sweep / (1 + dt / cfg.shift_memory_s) + swing
     track.sight = c.bearing
 
 
 def is_moving(track, c, dt, cfg, sonar):
-    v = track.x[2:]
+    v = track.x[2:4]
     fast = np.hypot(*v) > cfg.moving_speed_m_s
     shown = abs(track.doppler) > max(cfg.moving_doppler_m_s, 4 * np.sqrt(track.doppler_var))
     noise = np.sqrt(np.linalg.eigvalsh(track.P[:2, :2])[-1] + centre_variances(c, track.radius, track.radius_var, sonar)[1])
@@ -281,14 +291,15 @@ def is_moving(track, c, dt, cfg, sonar):
     return int((fast and shown and track.age >= CONFIRMED - 1) or (track.moving and (fast or shown)))
 
 
-def turn(track, dt, before):
-    v, old = track.x[2:], before[2:]
+def turn(track, before, cfg):
+    v, old = track.x[2:4], before[2:4]
     unsettled = (track.P[2, 2] + track.P[3, 3]) / (0.2 * (v @ v))
     angle = np.arctan2(old[0] * v[1] - old[1] * v[0], old @ v)
-    if track.moving and unsettled < 1 and abs(angle) < 0.5:
-        track.turn_rate = np.clip(track.turn_rate + (1 - unsettled) * angle / (0.5 + dt), -4, 4)
-    else:
-        track.turn_rate = 0.0
+    if not track.moving or unsettled >= 1 or abs(angle) >= 0.5:
+        track.x[4], track.P[4, :], track.P[:, 4] = 0.0, 0.0, 0.0
+    elif track.P[4, 4] == 0:
+        track.P[4, 4] = cfg.turn_rate_sigma_rad_s**2
+    track.x[4] = np.clip(track.x[4], -4, 4)
 
 
 def sight_of(track, scan, cfg, sonar):
@@ -355,10 +366,10 @@ def begun(c, scan, cfg, sonar):
     bearing, distance, _ = sight_of_centre(c, radius, sonar)
     along = unit(bearing)
     turn_in = np.array([[along[0], -along[1]], [along[1], along[0]]])
-    P = np.zeros((4, 4))
+    P = np.zeros((5, 5))
     P[:2, :2] = turn_in @ np.diag(centre_variances(c, radius, radius_var, sonar)) @ turn_in.T
-    P[2:, 2:] = turn_in @ np.diag([c.doppler_var, cfg.birth_speed_sigma_m_s**2]) @ turn_in.T
-    x = np.concatenate([scan.pos[:2] + distance * along, c.doppler * along])
+    P[2:4, 2:4] = turn_in @ np.diag([c.doppler_var, cfg.birth_speed_sigma_m_s**2]) @ turn_in.T
+    x = np.concatenate([scan.pos[:2] + distance * along, c.doppler * along, [0.0]])
     return Track(x, P, radius, radius_var, scan.pos[2], c.doppler, c.doppler_var, c.bearing, scan.step)
 
 
@@ -367,9 +378,7 @@ def step(tracks, last_step, scan, cfg, sonar, tank, dt_s):
     clusters = clusters_of(scan, cfg, sonar, tank)
     dt = (scan.step - last_step) * dt_s if last_step >= 0 else 0.0
     for track in tracks.values():
-        half_turn = 0.5 * dt * track.turn_rate
-        track.x, track.P = predicted(turned(track.x, half_turn), track.P, dt, cfg.accel_density)
-        track.x = turned(track.x, half_turn)
+        track.x, track.P = predicted(track.x, track.P, dt, cfg.accel_density, cfg.turn_density)
         track.age += 1
         track.misses += 1
     matched = associate(tracks, clusters, dt, cfg, sonar)

@@ -65,9 +65,7 @@ def extrapolate(
     """Constant speed and turn rate: steps along the chords of the arc."""
     mean, cov = tracks.state[env, track], tracks.cov[env, track]
     late = (clock.step[env] - tracks.scan_step[env]) * rules.control_dt_s
-    rate = 0.0
-    if ti.static(forecast_cfg.use_turn_rate):
-        rate = tracks.turn_rate[env, track]
+    rate = expected_turn_rate(env, track, tracks, forecast_cfg)
     vel = ti.Vector([mean[2], mean[3]])
     pos = ti.Vector([mean[0], mean[1]]) + late * chord(rate * late) * turned_z(vel, 0.5 * rate * late)
     vel = turned_z(vel, rate * late)
@@ -79,6 +77,17 @@ def extrapolate(
         forecast.radius_m[env, track, k] = tracks.radius_m[env, track] + ti.min(growth, tracking.max_growth_m)
         pos += step * turned_z(vel, 0.5 * rate * tracking.forecast_dt_s)
         vel = turned_z(vel, rate * tracking.forecast_dt_s)
+
+
+@ti.func
+def expected_turn_rate(env, track, tracks: In[TrackState], cfg: Const[ForecastConfig]):
+    """[rad/s] the filter's turn rate where it stands out of its noise: most bodies go straight."""
+    rate = 0.0
+    if ti.static(cfg.use_turn_rate):
+        known = tracks.turn_rate[env, track]
+        if known * known > ti.static(cfg.straight_sigmas**2) * tracks.turn_cov[env, track][4]:
+            rate = known
+    return rate
 
 
 @ti.func

@@ -33,6 +33,7 @@ def clear_track(env, track, tracks: Out[TrackState]):
     tracks.radius_m[env, track] = 0.0
     tracks.radius_var[env, track] = 0.0
     tracks.turn_rate[env, track] = 0.0
+    tracks.turn_cov[env, track] = ti.zero(tracks.turn_cov[env, track])
     tracks.doppler_m_s[env, track] = 0.0
     tracks.doppler_var[env, track] = 0.0
     tracks.shift_w[env, track] = ti.zero(tracks.shift_w[env, track])

@@ -18,10 +18,8 @@ _RADIUS_DRIFT = 4.0e-4
 DOPPLER_SIGMAS = 4.0
 """A mean Doppler of this many standard deviations is motion."""
 
-_TURN_MEMORY_S = 0.5
-
 _SETTLED = 0.2
-"""A turn rate is learnt where the velocity's variance is below this share of its square."""
+"""A turn rate is estimated where the velocity's variance is below this share of its square."""
 
 _CORNER = 0.5
 """[rad] a larger change of course within one scan is a corner"""
@@ -53,7 +51,7 @@ def update_tracks(
             tracks.seen_step[env, track] = scan.ping_step[env]
             tracks.misses[env, track] = 0
             tracks.moving[env, track] = is_moving(env, track, c, dt, tracks, clusters, tracking, sonar)
-            update_turn_rate(env, track, dt, before, tracks)
+            update_turn_rate(env, track, before, tracks, tracking)
 
 
 @ti.func
@@ -97,16 +95,20 @@ def update_filter(
         cov[7] += ti.max(speed, 0.5) ** 2
         cov[9] += ti.max(speed, 0.5) ** 2
     h = ti.Vector([along[0], along[1], 0.0, 0.0])
-    mean_r, cov_r = corrected(mean, cov, h, offset.dot(along), radial_var)
+    rate, link = tracks.turn_rate[env, track], tracks.turn_cov[env, track]
+    h = ti.Vector([along[0], along[1], 0.0, 0.0])
+    mean_r, cov_r, rate_r, link_r = corrected(mean, cov, rate, link, h, offset.dot(along), radial_var)
     left = centre - ti.Vector([mean_r[0], mean_r[1]])
     h_cross = ti.Vector([across[0], across[1], 0.0, 0.0])
-    mean_c, cov_c = corrected(mean_r, cov_r, h_cross, left.dot(across), cross_var)
+    mean_c, cov_c, rate_c, link_c = corrected(mean_r, cov_r, rate_r, link_r, h_cross, left.dot(across), cross_var)
     shrink = 1.0 - half * half / 6.0
     h_doppler = ti.Vector([0.0, 0.0, shrink * along[0], shrink * along[1]])
     swing = clusters.doppler_m_s[env, c] - shrink * (mean_c[2] * along[0] + mean_c[3] * along[1])
-    mean_d, cov_d = corrected(mean_c, cov_c, h_doppler, swing, clusters.doppler_var[env, c])
+    mean_d, cov_d, rate_d, link_d = corrected(mean_c, cov_c, rate_c, link_c, h_doppler, swing, clusters.doppler_var[env, c])
     tracks.state[env, track] = mean_d
     tracks.cov[env, track] = cov_d
+    tracks.turn_rate[env, track] = rate_d
+    tracks.turn_cov[env, track] = link_d
 
 
 @ti.func
@@ -159,16 +161,17 @@ def has_shifted(
 
 
 @ti.func
-def update_turn_rate(env, track, dt, before, tracks: Out[TrackState]):
-    """Learn the turn rate from what the filter turns the velocity beyond the prediction, as far as the velocity is settled.
+def update_turn_rate(env, track, before, tracks: Out[TrackState], tracking: Const[TrackingConfig]):
+    """Estimate the turn rate of a moving body from when its velocity is settled until that jumps: corners tell nothing about it.
 
-    Without it the filter lags behind bodies on circles by a third of their speed. Corners and reversals reset it.
+    Without it the filter lags behind bodies on circles by a third of their speed.
     """
     after, cov = tracks.state[env, track], tracks.cov[env, track]
     unsettled = (cov[7] + cov[9]) / (_SETTLED * (after[2] * after[2] + after[3] * after[3]))
     turned = ti.atan2(before[2] * after[3] - before[3] * after[2], before[2] * after[2] + before[3] * after[3])
-    if tracks.moving[env, track] == 1 and unsettled < 1.0 and ti.abs(turned) < _CORNER:
-        rate = tracks.turn_rate[env, track] + (1.0 - unsettled) * turned / (_TURN_MEMORY_S + dt)
-        tracks.turn_rate[env, track] = ti.math.clamp(rate, -_FASTEST_TURN, _FASTEST_TURN)
-    else:
+    if tracks.moving[env, track] == 0 or unsettled >= 1.0 or ti.abs(turned) >= _CORNER:
         tracks.turn_rate[env, track] = 0.0
+        tracks.turn_cov[env, track] = ti.zero(tracks.turn_cov[env, track])
+    elif tracks.turn_cov[env, track][4] == 0.0:
+        tracks.turn_cov[env, track] = ti.Vector([0.0, 0.0, 0.0, 0.0, ti.static(tracking.turn_rate_sigma_rad_s**2)])
+    tracks.turn_rate[env, track] = ti.math.clamp(tracks.turn_rate[env, track], -_FASTEST_TURN, _FASTEST_TURN)

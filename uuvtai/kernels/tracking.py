@@ -12,7 +12,6 @@ import taichi as ti
 from uuvtai.config import ElevationConfig, EpisodeConfig, SonarConfig, TankConfig, TrackingConfig
 from uuvtai.kernels.association import associate
 from uuvtai.kernels.clustering import find_clusters, label_beams
-from uuvtai.kernels.geometry import turned_z
 from uuvtai.kernels.kalman import predicted
 from uuvtai.kernels.signature import Const, In, Out, spread
 from uuvtai.kernels.track_slots import carry_names, clear_track, name_beams, prune_tracks, spawn_tracks
@@ -159,20 +158,18 @@ def predict_tracks(env, tracks: Out[TrackState], clusters: In[ClusterState], tra
     for track in range(tracks.alive.shape[1]):
         tracks.pick[env, track] = -1
         if tracks.alive[env, track] == 1:
-            course = turned_course(tracks.state[env, track], 0.5 * dt * tracks.turn_rate[env, track])
-            mean, cov = predicted(course, tracks.cov[env, track], dt, tracking.accel_density)
-            tracks.state[env, track] = turned_course(mean, 0.5 * dt * tracks.turn_rate[env, track])
+            mean, cov, link = predicted(
+                tracks.state[env, track],
+                tracks.cov[env, track],
+                tracks.turn_rate[env, track],
+                tracks.turn_cov[env, track],
+                dt,
+                tracking.accel_density,
+                tracking.turn_density,
+            )
+            tracks.state[env, track] = mean
             tracks.cov[env, track] = cov
+            tracks.turn_cov[env, track] = link
             tracks.age[env, track] += 1
             tracks.misses[env, track] += 1
     return dt
-
-
-@ti.func
-def turned_course(mean, angle):
-    """Mean with its velocity turned."""
-    out = mean
-    if angle != 0.0:
-        vel = turned_z(ti.Vector([mean[2], mean[3]]), angle)
-        out = ti.Vector([mean[0], mean[1], vel[0], vel[1]])
-    return out
