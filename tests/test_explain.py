@@ -267,18 +267,20 @@ REMARKABLE = {
     "static near": lambda: corridor(Story()),
     "turned lately": lambda: Story().turn(2.4),
     "corner passed in reach before": lambda: Story().turn(1.1),
-    "forecast to the end": Story,
+    "remembered to the end": lambda: below(0.35),
+    "remembered clear of the own depth": lambda: change(below(0.35), believed_gap=0.2),
     "taken as static": lambda: lately(Story(), 2.0, "believes", False),
     "backed off before the last chance": lambda: change(Story(), leaf=["BackOff"] * 41),
-    "only heave escaped": STORIES["needs_heave"][0],
+    "only heave escaped": lambda: change(STORIES["needs_heave"][0](), foreseen_vel=np.tile([-2.0, 0.5], (41, 1))),
 }
 
 
 def test_every_remark_has_its_story_and_a_plain_one_has_none():
     assert set(REMARKABLE) == set(REMARKS)
-    assert Story().explained().remarks == ["forecast to the end"]
+    assert Story().explained().remarks == []
     for remark, make in REMARKABLE.items():
         assert remark in make().explained().remarks, remark
+    assert "turned lately" not in Story().turn(1.1).explained().remarks  # the label says so already
 
 
 def test_a_start_in_danger_says_what_it_would_be_otherwise():
@@ -602,3 +604,13 @@ def test_the_table_is_printed_and_no_failure_is_said(capfd):
     assert "bt: why 1 of 9 episodes failed" in out
     assert "late" in out and "1:0" in out and "100 %" in out
     assert "calm: no episode failed, nothing to explain" in out
+
+
+def test_help_names_the_default_that_markup_would_swallow(capfd):
+    from uuvtai.cli import main
+
+    with pytest.raises(SystemExit):
+        main(["eval", "--help"])
+    out = capfd.readouterr().out
+    assert "[default: 3]" in out
+    assert "\\" not in out

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
@@ -36,14 +37,14 @@ log_app = typer.Typer(help="Look into recorded episodes (MCAP).", no_args_is_hel
 app.add_typer(log_app, name="log")
 
 World = Annotated[str, typer.Option("--world", help="World preset or path of a YAML file.")]
-Sensors = Annotated[str | None, typer.Option("--sensors", help="Sensor preset or path [default: the world's own, else paper].")]
+Sensors = Annotated[str | None, typer.Option("--sensors", help="Sensor preset or path \\[default: the world's own, else paper].")]
 Vehicle = Annotated[str | None, typer.Option("--vehicle", help="Vehicle preset or path.")]
 Static = Annotated[int | None, typer.Option("-S", help="Static obstacles.")]
 Dynamic = Annotated[int | None, typer.Option("-D", help="Moving obstacles.")]
-Speed = Annotated[float | None, typer.Option("-v", help="Speed of the moving obstacles [m/s].")]
+Speed = Annotated[float | None, typer.Option("-v", help="Speed of the moving obstacles \\[m/s].")]
 Set = Annotated[list[str] | None, typer.Option("--set", help="Override a config key: key.sub=value (repeatable).")]
 Device = Annotated[str, typer.Option("--device", help="auto, cpu or cuda.")]
-RunDir = Annotated[Path | None, typer.Option("--run-dir", help="The run's folder [default: runs/<time>_<preset>].")]
+RunDir = Annotated[Path | None, typer.Option("--run-dir", help="The run's folder \\[default: runs/<time>_<preset>].")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else on stdout.")]
 
 
@@ -53,7 +54,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document an
 @app.command("eval")
 def evaluate(
     controller: Annotated[
-        list[str] | None, typer.Option("--controller", help="straight, planner, bt or a tree's XML (repeatable) [default: all three].")
+        list[str] | None, typer.Option("--controller", help="straight, planner, bt or a tree's XML (repeatable) \\[default: all three].")
     ] = None,
     world: World = "pool",
     sensors: Sensors = None,
@@ -63,7 +64,7 @@ def evaluate(
     n_static: Static = None,
     n_dynamic: Dynamic = None,
     speed: Speed = None,
-    num_envs: Annotated[int | None, typer.Option("--num-envs", help="Episodes played together [default: as many as sensible].")] = None,
+    num_envs: Annotated[int | None, typer.Option("--num-envs", help="Episodes played together \\[default: as many as sensible].")] = None,
     record: Annotated[int, typer.Option("--record", help="Record the first K episodes of every method as MCAP with a picture.")] = 0,
     video: Annotated[bool, typer.Option("--video", help="Also a top-down video of every recorded episode.")] = False,
     depth_images: Annotated[bool, typer.Option("--depth-images", help="Also record the depth camera (2 Hz).")] = False,
@@ -72,7 +73,7 @@ def evaluate(
     ] = False,
     explain_record: Annotated[
         int | None,
-        typer.Option("--explain-record", help="With --explain: log, picture and video of N of the worst failures per method [default: 3]."),
+        typer.Option("--explain-record", help="With --explain: log, picture, video of N of the worst failures per method \\[default: 3]."),
     ] = None,
     device: Device = "auto",
     overrides: Set = None,
@@ -118,6 +119,7 @@ def evaluate(
         _print_methods(result)
         if explain:
             _print_causes(result)
+            _say(f"every failure with its facts: {folder / 'eval/explain.json'}")
         _say(f"run folder: {folder}")
 
 
@@ -161,31 +163,27 @@ def _print_causes(result: dict[str, Any]) -> None:
         if not failed:
             _stdout().print(f"{m['name']}: no episode failed, nothing to explain", highlight=False)
             continue
-        table = Table(title=f"{m['name']}: why {failed} of {m['episodes']} episodes failed", caption=_CAUSES_LEGEND, **_LEFT)
-        for head in ("cause", "n", "share", "meaning, and what came with it", "knew", "unseen", "evading", "chance", "worst"):
-            left = head in ("cause", "worst") or head.startswith("meaning")
-            table.add_column(head, justify="left" if left else "right", no_wrap=head in ("cause", "n"))
+        title = f"{m['name']}: why {failed} of {m['episodes']} episodes failed"
+        table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+        for head in ("cause", "n", "share", "knew", "unseen", "evading", "chance", "worst"):
+            table.add_column(head, justify="left" if head in ("cause", "worst") else "right", no_wrap=True)
         for c in m["causes"]:
-            remarks = ", ".join(f"{count} {remark}" for remark, count in c["remarks"].items())
-            table.add_row(
-                c["label"],
-                str(c["count"]),
-                _percent(c["share"]),
-                c["meaning"] + (f"\n[dim]{remarks}[/dim]" if remarks else ""),
-                _percent(c["knew_share"]),
-                _seconds(c["unseen_median_s"]),
-                _seconds(c["evading_median_s"]),
-                _seconds(c["last_chance_median_s"]),
-                ", ".join(f"{seed}:{episode}" for seed, episode in c["examples"]),
-            )
+            medians = (c["unseen_median_s"], c["evading_median_s"], c["last_chance_median_s"])
+            worst = ":".join(map(str, c["examples"][0]))
+            table.add_row(c["label"], str(c["count"]), _percent(c["share"]), _percent(c["knew_share"]), *map(_seconds, medians), worst)
         _stdout().print(table)
+        for c in m["causes"]:
+            remarks = ", ".join(f"{k} {remark}" for remark, k in c["remarks"].items() if k >= _REMARKABLE_SHARE * c["count"])
+            _stdout().print(f"[bold]{c['label']}[/bold]: {c['meaning']}{f' [dim]({remarks})[/dim]' if remarks else ''}", highlight=False)
+        _stdout().print(f"[dim]{_CAUSES_LEGEND}[/dim]", highlight=False)
 
 
-_LEFT: Any = {"title_justify": "left", "caption_justify": "left"}
+_REMARKABLE_SHARE = 0.2
+"""Remarks on fewer of a cause's episodes are left to the JSON."""
 
 _CAUSES_LEGEND = (
-    "knew: share whose forecast of the killer, made 1 s before the end, was right. Medians before the end: unseen = since a beam "
-    "last met the killer; evading = since evasion began; chance = until when some velocity still escaped. worst: seed:episode"
+    "knew: share whose forecast of the killer, made 1 s before the end, was right. Medians before the end: unseen = since a beam last met "
+    "the killer, evading = since evasion began, chance = until when some velocity still escaped. worst: seed:episode of the hardest hit"
 )
 
 
@@ -211,16 +209,18 @@ def _number(value: float | None, digits: int = 1) -> str:
 
 @app.command()
 def simulate(
-    seconds: Annotated[float, typer.Option("--seconds", help="Duration [s].")],
+    seconds: Annotated[float, typer.Option("--seconds", help="Duration \\[s].")],
     vehicle: Annotated[str, typer.Option("--vehicle", help="Vehicle preset or path.")] = "bluerov2",
-    attitude_hold: Annotated[str | None, typer.Option("--attitude-hold", help="ideal, thrusters or none [default: the vehicle's].")] = None,
+    attitude_hold: Annotated[str | None, typer.Option("--attitude-hold", help="ideal, thrusters, none \\[default: the vehicle's].")] = None,
     wrench: Annotated[str | None, typer.Option("--wrench", help="Constant body wrench fx,fy,fz,mx,my,mz [N, N m].")] = None,
-    command: Annotated[str | None, typer.Option("--command", help="Body velocity command u,v,w,r [m/s, rad/s] for the inner loop.")] = None,
-    current: Annotated[str | None, typer.Option("--current", help="Water velocity x,y,z [m/s].")] = None,
-    initial_rpy_deg: Annotated[str | None, typer.Option("--initial-rpy-deg", help="Roll, pitch, yaw [deg].")] = None,
-    initial_velocity: Annotated[str | None, typer.Option("--initial-velocity", help="u,v,w,p,q,r [m/s, rad/s].")] = None,
+    command: Annotated[
+        str | None, typer.Option("--command", help="Body velocity command u,v,w,r \\[m/s, rad/s] for the inner loop.")
+    ] = None,
+    current: Annotated[str | None, typer.Option("--current", help="Water velocity x,y,z \\[m/s].")] = None,
+    initial_rpy_deg: Annotated[str | None, typer.Option("--initial-rpy-deg", help="Roll, pitch, yaw \\[deg].")] = None,
+    initial_velocity: Annotated[str | None, typer.Option("--initial-velocity", help="u,v,w,p,q,r \\[m/s, rad/s].")] = None,
     neutral: Annotated[bool, typer.Option("--neutral", help="Buoyancy equal to weight.")] = False,
-    dt: Annotated[float, typer.Option("--dt", help="Dynamics substep [s].")] = 0.01,
+    dt: Annotated[float, typer.Option("--dt", help="Dynamics substep \\[s].")] = 0.01,
     overrides: Set = None,
     as_json: AsJson = False,
 ) -> None:
@@ -269,7 +269,7 @@ def profile(
     n_static: Static = None,
     n_dynamic: Dynamic = None,
     speed: Speed = None,
-    seconds: Annotated[float, typer.Option("--seconds", help="Measured time per batch size [s].")] = 10.0,
+    seconds: Annotated[float, typer.Option("--seconds", help="Measured time per batch size \\[s].")] = 10.0,
     density: Annotated[bool, typer.Option("--density", help="Also loop time against D.")] = False,
     device: Device = "auto",
     overrides: Set = None,
@@ -428,7 +428,7 @@ def log_export(
 
 @log_app.command("repair")
 def log_repair(
-    file: LogFile, out: Annotated[Path | None, typer.Option("--out", help="Repaired file [default: NAME.repaired.mcap].")] = None
+    file: LogFile, out: Annotated[Path | None, typer.Option("--out", help="Repaired file \\[default: NAME.repaired.mcap].")] = None
 ) -> None:
     """Recover the messages of a log whose writing was cut off."""
     from uuvtai.logs import repair
@@ -441,7 +441,7 @@ def log_repair(
 
 @log_app.command("video")
 def log_video(
-    file: LogFile, out: Annotated[Path | None, typer.Option("--out", help="WebM file [default: beside the log].")] = None
+    file: LogFile, out: Annotated[Path | None, typer.Option("--out", help="WebM file \\[default: beside the log].")] = None
 ) -> None:
     """Render a top-down video of a recorded episode."""
     from uuvtai.logs import video
@@ -454,7 +454,7 @@ def log_video(
 @log_app.command("picture")
 def log_picture(
     file: Annotated[list[Path], typer.Argument(help="Logs of the same episode; trajectories are overlaid.")],
-    out: Annotated[Path | None, typer.Option("--out", help="PNG file [default: beside the first log].")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="PNG file \\[default: beside the first log].")] = None,
     clearance: Annotated[bool, typer.Option("--clearance", help="Colour the clearance field.")] = False,
 ) -> None:
     """Draw a recorded episode: occupancy, trajectories, goal."""

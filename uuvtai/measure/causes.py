@@ -22,6 +22,8 @@ UNSEEN_S = 0.3
 TURN_S = 1.2
 """An unannounced turn lies within this before the end (7-methods.md), and the forecast made just before it was off by more than
 MISS_M at the end, or there was none."""
+CLEAR_M = 0.1
+"""A body that is remembered farther above or below than this counts as clear of the own depth (what the referee calls contact)."""
 LATELY_S = 2.5
 """Remarks look back this far."""
 MISS_M = 0.35
@@ -76,12 +78,21 @@ REMARKS: dict[str, Callable[[Fact], bool]] = {
     "static near": lambda f: f["static_near_m"] < REACH_M,
     "turned lately": lambda f: _within(f["turned_ago_s"], LATELY_S),
     "corner passed in reach before": lambda f: _within(f["turned_ago_s"], TURN_S) and bool(f["turns_in_reach_before"]),
-    "forecast to the end": lambda f: f["belief_error_m"] is not None,
+    "remembered to the end": lambda f: _is_unseen(f) and f["belief_error_m"] is not None,
+    "remembered clear of the own depth": lambda f: _is_unseen(f) and (f["believed_gap_m"] or 0.0) > CLEAR_M,
     "taken as static": lambda f: _within(f["taken_as_static_ago_s"], LATELY_S),
     "backed off before the last chance": lambda f: f["leaf"] == "BackOff" and f["leaf_s"] > (f["last_chance_s"] or 0.0),
     "only heave escaped": lambda f: not f["escapes"] and bool(f["escapes_by_heave"]),
 }
 """What may have contributed, where the killer moves. "Corner passed in reach before": the turn could have been learnt."""
+
+_IMPLIED = {
+    ("unannounced_turn", "turned lately"),
+    ("needs_heave", "only heave escaped"),
+    ("squeezed_by_static", "static near"),
+    ("crowded", "second body near"),
+}
+"""Remarks that a label says already."""
 
 
 @dataclass
@@ -104,8 +115,9 @@ def explain(outcome: str, history: History, bodies: Bodies, config: Config) -> E
     facts, remarks = scene.facts(killer), []
     if killer.moving and killer.slot is not None:
         facts |= killer_facts(history, bodies, killer.slot, config)
-        remarks = [name for name, holds in REMARKS.items() if holds(facts)]
     label = label_of(outcome, killer, facts)
+    if killer.moving:
+        remarks = [name for name, holds in REMARKS.items() if holds(facts) and (label, name) not in _IMPLIED]
     if label == "start_in_danger":
         remarks.insert(0, f"else {label_of(outcome, killer, facts | {'age_s': START_S})}")
     return Explanation(label, killer, facts, remarks)
@@ -130,7 +142,7 @@ def _knowledge_label(facts: Fact) -> str | None:
     """What kept the vehicle from knowing where the killer would be; None = it knew."""
     if facts["age_s"] < START_S:
         return "start_in_danger"
-    if facts["fan_ago_s"] is None or facts["fan_ago_s"] >= UNSEEN_S:
+    if _is_unseen(facts):
         return "unseen_above" if facts["vertical_gap_m"] > 0 else "unseen_below"
     if _within(facts["turned_ago_s"], TURN_S) and not _within(facts["turn_error_m"], MISS_M):
         return "unannounced_turn"
@@ -163,6 +175,10 @@ def timeout_label(facts: Fact) -> str:
     if facts["evading_share"] > 0.5:
         return "kept_away"
     return "stuck" if facts["driven_m"] < STUCK_M else "circling"
+
+
+def _is_unseen(facts: Fact) -> bool:
+    return facts["fan_ago_s"] is None or facts["fan_ago_s"] >= UNSEEN_S
 
 
 def _within(value: float | None, limit: float) -> bool:
