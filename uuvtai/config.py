@@ -619,8 +619,10 @@ class TeacherConfig(Section):
 
     heave_m_s: NonNegative = 0.4
     """vertical speed of the candidates that dive or climb; 0 = evade level only"""
-    n_heave_heading: PositiveCount = 12
+    n_heave_heading: PositiveCount = 13
     """headings of the candidates that dive or climb"""
+    burst_s: NonNegative = 0.8
+    """the candidates that are a short dash last so long, then they stop; 0 = none"""
 
     hull_reach_m: NonNegative = 0.22
     """hull centre to surface: between 0.17 abeam and 0.27 ahead"""
@@ -685,14 +687,19 @@ class TeacherConfig(Section):
     max_node: PositiveCount = 64
 
     @property
-    def n_tried(self) -> int:
-        """Evasive velocities tried: level headings times speeds; stop, last command, follow; diving and climbing ones."""
+    def n_held(self) -> int:
+        """Evasive velocities to be held: level headings times speeds; stop, last command, follow; diving and climbing ones."""
         return self.n_heading * self.n_speed + 3 + (2 * self.n_heave_heading + 2 if self.heave_m_s > 0 else 0)
 
     @property
+    def first_burst(self) -> int:
+        """Index of the first dash: ``n_held`` padded to whole packets of 16."""
+        return 16 * -(-self.n_held // 16)
+
+    @property
     def n_candidate(self) -> int:
-        """``n_tried`` padded to whole packets of 16."""
-        return 16 * -(-self.n_tried // 16)
+        """Evasive velocities in all, padding included: the dashes go in two packets of 16 headings."""
+        return self.first_burst + (32 if self.burst_s > 0 else 0)
 
 
 class RewardConfig(Section):

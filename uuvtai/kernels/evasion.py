@@ -28,18 +28,31 @@ def plan_evasion(
     for env, packet in ti.ndrange(n, n_packet):
         if clock.awake[env] == 1 and teacher.want_evade[env] == 1:
             cx, cy, cz = candidate_lanes(env, packet * LANES, teacher, ego, teacher_cfg, vehicle_cfg, tank_cfg)
-            cost = cost_lanes(env, cx, cy, cz, teacher, forecast, clearance, ego, teacher_cfg, tracking_cfg, tank_cfg, mapping_cfg)
+            burst_s = ti.select(packet * LANES >= teacher_cfg.first_burst, teacher_cfg.burst_s, FAR_M)
+            cost = cost_lanes(env, cx, cy, cz, burst_s, teacher, forecast, clearance, ego, teacher_cfg, tracking_cfg, tank_cfg, mapping_cfg)
             for i in ti.static(range(LANES)):
                 teacher.candidate_cost[env, packet * LANES + i] = cost[i]
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
         if pad == 0 and clock.awake[env] == 1 and teacher.want_evade[env] == 1:
-            best, mean = _chosen(env, teacher, ego, teacher_cfg, vehicle_cfg, tank_cfg)
-            cx, cy, cz = f16x(best[0]), f16x(best[1]), f16x(best[2])
-            cx[1], cy[1], cz[1] = mean[0], mean[1], mean[2]
-            cost = cost_lanes(env, cx, cy, cz, teacher, forecast, clearance, ego, teacher_cfg, tracking_cfg, tank_cfg, mapping_cfg)
-            good = cost[1] <= cost[0] + ti.static(teacher_cfg.softness)
+            best, best_cost, mean = _chosen(env, teacher, ego, teacher_cfg, vehicle_cfg, tank_cfg)
+            cost = cost_lanes(
+                env,
+                f16x(mean[0]),
+                f16x(mean[1]),
+                f16x(mean[2]),
+                FAR_M,
+                teacher,
+                forecast,
+                clearance,
+                ego,
+                teacher_cfg,
+                tracking_cfg,
+                tank_cfg,
+                mapping_cfg,
+            )
+            good = cost[0] <= best_cost + ti.static(teacher_cfg.softness)
             teacher.evade_vel_w[env] = ti.select(good, mean, best)
-            teacher.evade_cost[env] = ti.select(good, cost[1], cost[0])
+            teacher.evade_cost[env] = ti.select(good, cost[0], best_cost)
 
 
 @ti.func
@@ -72,12 +85,16 @@ def candidate(
 ):
     """World velocity of one candidate. Heading 0 is the follow direction, so that slowing down on the route is among them.
 
-    First the level ones (they keep the heave of following), then stop, last command and follow, then those that climb and those that dive.
+    First the level ones (they keep the heave of following), then stop, last command and follow, then those that climb and those that dive,
+    and from ``first_burst`` on the level dashes, which last ``burst_s`` only. Padding repeats standing still.
     """
-    n_level, n_heave = ti.static(teacher_cfg.n_heading * teacher_cfg.n_speed, teacher_cfg.n_heave_heading + 1)
+    n_level, n_heave = ti.static(teacher_cfg.n_heading * teacher_cfg.n_speed, teacher_cfg.n_heave_heading)
     follow = teacher.follow_vel_w[env]
     out = ti.Vector([0.0, 0.0, 0.0])
-    if index < n_level:
+    if index >= ti.static(teacher_cfg.first_burst):
+        turn = ti.static(TWO_PI / 32) * (index - ti.static(teacher_cfg.first_burst))
+        out = _towards(env, turn, 1.0, follow[2], teacher, ego, teacher_cfg, vehicle_cfg)
+    elif index < n_level:
         speed = 1.0 / ti.static(teacher_cfg.n_speed) * (index // ti.static(teacher_cfg.n_heading) + 1)
         turn = ti.static(TWO_PI / teacher_cfg.n_heading) * (index % ti.static(teacher_cfg.n_heading))
         out = _towards(env, turn, speed, follow[2], teacher, ego, teacher_cfg, vehicle_cfg)
@@ -85,12 +102,11 @@ def candidate(
         out = teacher.last_vel_w[env]
     elif index == n_level + 2:
         out = follow
-    elif index > n_level + 2:
+    elif index > n_level + 2 and index < ti.static(teacher_cfg.n_held):
         nth = index - n_level - 3
-        heave = edge_limited(ti.select(nth < n_heave, 1.0, -1.0) * teacher_cfg.heave_m_s, ego.pos_w[env][2], teacher_cfg, tank_cfg)
-        nth = nth % n_heave
-        speed = ti.select(nth == n_heave - 1, 0.0, 1.0)
-        out = _towards(env, ti.static(TWO_PI / teacher_cfg.n_heave_heading) * nth, speed, heave, teacher, ego, teacher_cfg, vehicle_cfg)
+        heave = edge_limited(ti.select(nth % 2 == 0, 1.0, -1.0) * teacher_cfg.heave_m_s, ego.pos_w[env][2], teacher_cfg, tank_cfg)
+        turn = ti.static(TWO_PI / teacher_cfg.n_heave_heading) * (nth // 2)
+        out = _towards(env, turn, ti.select(nth >= 2 * n_heave, 0.0, 1.0), heave, teacher, ego, teacher_cfg, vehicle_cfg)
     return out
 
 
@@ -133,6 +149,7 @@ def cost_lanes(
     cx,
     cy,
     cz,
+    burst_s,
     teacher: In[TeacherState],
     forecast: In[ForecastState],
     clearance: In[ClearanceState],
@@ -145,8 +162,8 @@ def cost_lanes(
     """Cost of sixteen commanded velocities. Violations count by depth: a flat penalty drives straight on when every candidate is bad."""
     pos, vel = ego.pos_w[env], turned_z3(ego.vel_b[env], ego.rpy[env][2])
     level, level_vel = ti.Vector([pos[0], pos[1]]), ti.Vector([vel[0], vel[1]])
-    peak, mean, contact, _ = body_depths(env, cx, cy, cz, pos, vel, forecast, teacher_cfg, tracking_cfg, tank_cfg)
-    static_mean, static_contact = static_depths(env, cx, cy, level, level_vel, clearance, teacher_cfg, tank_cfg, mapping_cfg)
+    peak, mean, contact, _ = body_depths(env, cx, cy, cz, burst_s, pos, vel, forecast, teacher_cfg, tracking_cfg, tank_cfg)
+    static_mean, static_contact = static_depths(env, cx, cy, burst_s, level, level_vel, clearance, teacher_cfg, tank_cfg, mapping_cfg)
     off = _distance_lanes(cx, cy, cz, teacher.follow_vel_w[env]) * ti.static(teacher_cfg.weight_deviation / teacher_cfg.cruise_m_s)
     change = _distance_lanes(cx, cy, cz, teacher.last_vel_w[env]) * ti.static(teacher_cfg.weight_change / teacher_cfg.cruise_m_s)
     moving = peak * ti.static(teacher_cfg.weight_peak) + mean * ti.static(teacher_cfg.weight_mean)
@@ -172,7 +189,7 @@ def _chosen(
     tank_cfg: Const[TankConfig],
 ):
     """Candidate of least cost (first of equals), and the mean of the candidates weighted by exp(-cost / softness)."""
-    n_used = ti.static(teacher_cfg.n_tried)
+    n_used = ti.static(teacher_cfg.n_candidate)
     best_cost, best = FAR_M, 0
     for index in range(n_used):
         if teacher.candidate_cost[env, index] < best_cost:
@@ -185,4 +202,4 @@ def _chosen(
             weight = ti.exp(-excess)
             total += weight
             mean += weight * candidate(env, index, teacher, ego, teacher_cfg, vehicle_cfg, tank_cfg)
-    return candidate(env, best, teacher, ego, teacher_cfg, vehicle_cfg, tank_cfg), mean / total
+    return candidate(env, best, teacher, ego, teacher_cfg, vehicle_cfg, tank_cfg), best_cost, mean / total

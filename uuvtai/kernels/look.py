@@ -1,7 +1,7 @@
 """What the camera says about the height of a tracked body: the column of pixels through its middle shows where it begins and ends.
 
-Only what lies in the image and at the body's distance counts; a body cut by the image's edge tells one end, a column through which the camera
-sees farther tells where no body is. Feeds the height hypotheses of ``elevation.py``; sees the image and tracks only.
+Only what lies in the image and at the body's distance counts; a body cut by the image's edge tells one end, a column through which the
+camera sees farther tells where no body is. Feeds the height hypotheses of ``elevation.py``; sees the image and tracks only.
 """
 
 import taichi as ti
@@ -68,7 +68,12 @@ def look_at(
     ahead, left = yaw_c * off[0] + yaw_s * off[1], yaw_c * off[1] - yaw_s * off[0]
     radius = tracks.radius_m[env, track]
     col = ti.cast(ti.floor(middle_col - focal * left / ti.max(ahead, 1e-3) + 0.5), ti.i32)
-    if ahead > radius + ti.static(_DEPTH_SLACK_M) and ahead < depth.max_range_m - _DEPTH_SLACK_M and col >= 0 and col < ti.static(depth.cols):
+    if (
+        ahead > radius + ti.static(_DEPTH_SLACK_M)
+        and ahead < depth.max_range_m - _DEPTH_SLACK_M
+        and col >= 0
+        and col < ti.static(depth.cols)
+    ):
         ends = column_ends(env, col, ahead, radius, eye[2], image, R_wb, focal, middle_row, middle_col, depth)
         if ends[0] <= ends[1]:
             weigh_camera(env, track, shown_heights(ends, cfg, tank), 0, tracks)

@@ -2,6 +2,7 @@
 
 A commanded velocity c is reached with a first-order lag tau, so from velocity v0 the vehicle drives
 x(t) = x0 + v0 A(t) + c B(t), A(t) = tau (1 - exp(-t / tau)), B(t) = t - A(t): linear in c, which is all the lanes differ in.
+A burst that ends after T commands -c on top from then on: c (B(t) - B(t - T)).
 """
 
 import taichi as ti
@@ -20,6 +21,7 @@ def body_depths(
     cx,
     cy,
     cz,
+    burst_s,
     pos,
     vel,
     forecast: In[ForecastState],
@@ -29,10 +31,11 @@ def body_depths(
 ):
     """How deep each commanded velocity (lanes cx, cy, cz [m/s]) violates the wanted clearance from the forecast bodies.
 
-    ``pos``, ``vel``: own position [m] and velocity [m/s] now, world. Returns lanes: largest depth [m]; depth averaged over the
-    horizon and summed over bodies [m]; largest depth below contact [m]; time of the first violation [s], FAR_M = none.
-    The clearance is reduced by closing_s times the closing speed, as the referee also stops at a small time to collision. Bodies are
-    upright cylinders; water known to be free above or below them (``above_w``, ``below_w``) adds to the distance.
+    The velocities are commanded for ``burst_s`` [s], then stop. ``pos``, ``vel``: own position [m] and velocity [m/s] now, world.
+    Returns lanes: largest depth [m]; depth averaged over the horizon and summed over bodies [m]; largest depth below contact [m]; time of
+    the first violation [s], FAR_M = none. The clearance is reduced by closing_s times the closing speed, as the referee also stops at a
+    small time to collision. Bodies are upright cylinders; water known to be free above or below them (``above_w``, ``below_w``) adds to
+    the distance.
     """
     n_track, n_sample = ti.static(forecast.radius_m.shape[1], _samples(forecast.radius_m.shape[2], teacher_cfg, tracking_cfg))
     dt = ti.static(tracking_cfg.forecast_dt_s)
@@ -43,11 +46,14 @@ def body_depths(
     for track in range(n_track):
         if forecast.radius_m[env, track, 0] >= 0:
             above, below = forecast.above_w[env, track], forecast.below_w[env, track]
-            decay = 1.0
+            decay, rest = 1.0, 1.0
             for k in range(1, n_sample):
                 decay *= ti.static(_decay(tracking_cfg.forecast_dt_s, teacher_cfg.lag_s))
                 time = k * dt
+                over = ti.max(time - burst_s, 0.0)
+                rest *= ti.select(over > 0.0, ti.static(_decay(tracking_cfg.forecast_dt_s, teacher_cfg.lag_s)), 1.0)
                 settle = ti.static(teacher_cfg.lag_s) * (1.0 - decay)
+                gain = time - settle - over + ti.static(teacher_cfg.lag_s) * (1.0 - rest)
                 body = forecast.pos_w[env, track, k]
                 body_vel = (body - forecast.pos_w[env, track, k - 1]) / dt
                 start = level + level_vel * settle - body
@@ -55,12 +61,12 @@ def body_depths(
                 margin = teacher_cfg.margin_m + teacher_cfg.margin_growth_m_s * time
                 wanted = teacher_cfg.contact_m + teacher_cfg.caution * margin
                 radius = forecast.radius_m[env, track, k]
-                bound = radius + ti.static(teacher_cfg.hull_reach_m) + wanted + ti.static(teacher_cfg.evade_m_s) * (time - settle)
+                bound = radius + ti.static(teacher_cfg.hull_reach_m) + wanted + ti.static(teacher_cfg.evade_m_s) * gain
                 bound += ti.static(teacher_cfg.closing_s) * (reach_speed + body_vel.norm())
                 if radius >= 0 and start.norm_sqr() < bound * bound:
-                    z = ti.math.clamp(cz * (time - settle) + (pos[2] + vel[2] * settle), low, high)
+                    z = ti.math.clamp(cz * gain + (pos[2] + vel[2] * settle), low, high)
                     gap = ti.max(ti.min(above - z, z - below), 0.0) * ti.static(teacher_cfg.vertical_weight)
-                    free = _free_lanes(cx, cy, gap, start, drift, time - settle, 1.0 - decay, radius, teacher_cfg)
+                    free = _free_lanes(cx, cy, gap, start, drift, gain, rest - decay, radius, teacher_cfg)
                     for i in ti.static(range(LANES)):
                         depth = ti.max(wanted - free[i], 0.0)
                         peak[i] = ti.max(peak[i], depth)
@@ -93,6 +99,7 @@ def static_depths(
     env,
     cx,
     cy,
+    burst_s,
     pos,
     vel,
     clearance: In[ClearanceState],
@@ -104,11 +111,11 @@ def static_depths(
     mean, contact = f16x(0.0), f16x(0.0)
     n_sample = ti.static(max(1, round(teacher_cfg.static_horizon_s / teacher_cfg.static_dt_s)))
     touch = ti.static(teacher_cfg.hull_reach_m + teacher_cfg.contact_m)
-    decay = 1.0
     for k in range(1, n_sample + 1):
-        decay *= ti.static(_decay(teacher_cfg.static_dt_s, teacher_cfg.lag_s))
-        settle = ti.static(teacher_cfg.lag_s) * (1.0 - decay)
-        gain = k * ti.static(teacher_cfg.static_dt_s) - settle
+        time = k * ti.static(teacher_cfg.static_dt_s)
+        settle = settling(time, teacher_cfg)
+        over = ti.max(time - burst_s, 0.0)
+        gain = time - settle - over + settling(over, teacher_cfg)
         free = clearance_lanes(
             env, cx * gain + (pos[0] + vel[0] * settle), cy * gain + (pos[1] + vel[1] * settle), clearance, tank_cfg, mapping_cfg
         )
@@ -117,6 +124,12 @@ def static_depths(
             mean[i] += ti.max(below + ti.static(teacher_cfg.static_margin_m), 0.0) / n_sample
             contact[i] = ti.max(contact[i], below)
     return mean, contact
+
+
+@ti.func
+def settling(time, cfg: Const[TeacherConfig]):
+    """A(t) [s] of the module's text."""
+    return ti.static(cfg.lag_s) * (1.0 - ti.exp(-time * ti.static(1.0 / cfg.lag_s)))
 
 
 @ti.func

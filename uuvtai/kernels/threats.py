@@ -160,7 +160,9 @@ def _foresee_conflict(
         heave = held_heave(ti.math.clamp(mission.goal_w[env][2], low, high) - pos[2], teacher_cfg, vehicle_cfg)
         cz = f16x(0.0)
         cz[1] = heave
-        peak, _, _, first = body_depths(env, f16x(follow[0]), f16x(follow[1]), cz, pos, vel, forecast, teacher_cfg, tracking_cfg, tank_cfg)
+        peak, _, _, first = body_depths(
+            env, f16x(follow[0]), f16x(follow[1]), cz, FAR_M, pos, vel, forecast, teacher_cfg, tracking_cfg, tank_cfg
+        )
         climbs = peak[1] <= peak[0] + 1.0e-3
         teacher.follow_vel_w[env][2] = ti.select(climbs, heave, 0.0)
         teacher.conflict_s[env] = ti.select(climbs, first[1], first[0])
