@@ -517,9 +517,10 @@ def test_the_worst_are_recorded_with_picture_and_video(played, tmp_path):
     small, _, rows = played
     shortest = min(rows, key=lambda row: row.result.time_s)
     notes = []
-    record_worst(small.sim, small.trees["straight"], [shortest], tmp_path, "pool", "straight", notes.append)
-    stem = f"straight_seed{shortest.result.seed}_episode{shortest.result.episode}"
+    paths = record_worst(small.sim, small.trees["straight"], [shortest], tmp_path, "pool", "straight", notes.append)
+    stem = f"{shortest.explanation.label}_straight_seed{shortest.result.seed}_episode{shortest.result.episode}"
     assert sorted(path.name for path in tmp_path.iterdir()) == [f"{stem}.mcap", f"{stem}.png", f"{stem}.webm"]
+    assert paths == [tmp_path / f"{stem}.mcap"]
     assert notes
 
 
@@ -548,12 +549,13 @@ def request_of(small, tmp_path, monkeypatch):
 def test_a_comparison_carries_its_causes(request_of):
     from uuvtai.measure.compare import compare
 
-    result, folder = compare(request_of(), _Silent())
+    result, folder = compare(request_of(explain_record=1), _Silent())
     method = result["methods"][0]
     failed = [d for d in method["episodes_detail"] if d["outcome"] != "success"]
     assert failed
     assert [(e["seed"], e["episode"], e["outcome"]) for e in method["explain"]] == [(d["seed"], d["episode"], d["outcome"]) for d in failed]
     assert sum(cause["count"] for cause in method["causes"]) == len(failed)
+    assert [(folder / e["log"]).is_file() for e in method["explain"] if e["log"]] == [True]
     assert json.loads((folder / "eval/result.json").read_text()) == result
     written = json.loads((folder / "eval/explain.json").read_text())
     assert written["methods"] == [{"name": "straight", "causes": method["causes"], "explain": method["explain"]}]

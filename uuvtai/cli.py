@@ -119,7 +119,7 @@ def evaluate(
         _print_methods(result)
         if explain:
             _print_causes(result)
-            _say(f"every failure with its facts: {folder / 'eval/explain.json'}")
+            _say(f"facts of every failure, and which of them are recorded: {folder / 'eval/explain.json'}")
         _say(f"run folder: {folder}")
 
 

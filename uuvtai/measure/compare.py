@@ -100,23 +100,31 @@ def compare(request: Request, watch: Watch) -> tuple[dict[str, Any], Path]:
 
 
 def _explain(request: Request, sim: Any, trees: dict, played: dict, result: dict[str, Any], folder: RunFolder, watch: Watch) -> None:
-    """Replay what failed, add the causes to the document, write them, record the worst; what was measured is on disk already."""
+    """Replay what failed, add the causes to the document, record the worst. What is known is written before the next long step begins."""
     from uuvtai.measure.explain import chosen_for_recording, explain_failures, failures, record_worst, table_of
 
-    chosen = {}
+    explained = {}
     for method in result["methods"]:
         label = method["name"]
         watch.start(f"{label}: replaying failures", len(failures(played[label])))
-        rows = explain_failures(sim, trees[label], played[label], watch.update)
+        explained[label] = explain_failures(sim, trees[label], played[label], watch.update)
         watch.stop()
-        method["causes"] = table_of(rows)
-        method["explain"] = [row.document() for row in rows]
-        chosen[label] = chosen_for_recording(rows, request.explain_record)
+        method["causes"] = table_of(explained[label])
+        method["explain"] = [row.document() for row in explained[label]]
+    _write_causes(folder, result)
+    for method in result["methods"]:
+        label = method["name"]
+        chosen = chosen_for_recording(explained[label], request.explain_record)
+        paths = record_worst(sim, trees[label], chosen, folder.path / "explain", request.world, label, watch.note)
+        for row, path in zip(chosen, paths, strict=True):
+            method["explain"][explained[label].index(row)]["log"] = str(path.relative_to(folder.path))
+    _write_causes(folder, result)
+
+
+def _write_causes(folder: RunFolder, result: dict[str, Any]) -> None:
     folder.write_json("eval/result.json", result)
-    causes = [{"name": m["name"], "causes": m["causes"], "explain": m["explain"]} for m in result["methods"]]
-    folder.write_json("eval/explain.json", {"schema": 1, "methods": causes})
-    for label, rows in chosen.items():
-        record_worst(sim, trees[label], rows, folder.path / "explain", request.world, label, watch.note)
+    methods = [{"name": m["name"], "causes": m["causes"], "explain": m["explain"]} for m in result["methods"]]
+    folder.write_json("eval/explain.json", {"schema": 1, "methods": methods})
 
 
 def _recorder(request: Request, folder: Path, label: str, jobs: list) -> Any:

@@ -45,7 +45,7 @@ _FORESEEN_S = 1.0e3
 """A predicted conflict; beyond = none (geometry.FAR_M)."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Row:
     """A failed episode with its explanation."""
 
@@ -55,7 +55,7 @@ class Row:
     def document(self) -> dict[str, Any]:
         """One entry of ``explain`` in ``uuv eval --json``."""
         r, e = self.result, self.explanation
-        told = {"seed": r.seed, "episode": r.episode, "outcome": r.outcome, "label": e.label, "remarks": e.remarks}
+        told = {"seed": r.seed, "episode": r.episode, "outcome": r.outcome, "label": e.label, "remarks": e.remarks, "log": None}
         return told | {"killer": vars(e.killer)} | e.facts
 
 
@@ -224,14 +224,16 @@ def chosen_for_recording(rows: list[Row], wanted: int) -> list[Row]:
     return rounds[:wanted]
 
 
-def record_worst(sim: Sim, tree: FlatTree, rows: list[Row], folder: Path, world: str, method: str, note: Callable[[str], None]) -> None:
-    """Play these episodes once more into MCAP logs with a picture and a video each, under ``folder``."""
+def record_worst(
+    sim: Sim, tree: FlatTree, rows: list[Row], folder: Path, world: str, method: str, note: Callable[[str], None]
+) -> list[Path]:
+    """Play these episodes once more into ``folder``: an MCAP log each, named after the cause, with a picture and a video beside it."""
     from uuvtai.logs.picture import picture
     from uuvtai.logs.video import video
     from uuvtai.measure.recording import EpisodeRecorder
 
     if not rows:
-        return
+        return []
     jobs = [Job(row.result.seed, row.result.episode) for row in rows]
     sim.use_tree(tree)
     recorder = EpisodeRecorder(folder, Path(world).stem, method, jobs)
@@ -239,10 +241,16 @@ def record_worst(sim: Sim, tree: FlatTree, rows: list[Row], folder: Path, world:
         run_episodes(sim, jobs, recorder)
     finally:
         recorder.abort()
-    for path in recorder.paths.values():
+    paths = [_renamed(recorder.paths[job], row.explanation.label) for job, row in zip(jobs, rows, strict=True)]
+    for path in paths:
         note(f"drawing {path.stem}")
         picture(path, path.with_suffix(".png"))
         video(path, path.with_suffix(".webm"))
+    return paths
+
+
+def _renamed(path: Path, label: str) -> Path:
+    return path.rename(path.with_name(f"{label}_{path.name}"))
 
 
 def _read_rows(sim: Sim, fields: dict[str, tuple[str, ...]], rows: list[int]) -> dict[int, dict[str, np.ndarray]]:
