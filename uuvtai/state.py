@@ -42,7 +42,9 @@ def _field(declared: dataclasses.Field, sizes: dict[str, int], real: Any) -> Any
     if declared.metadata["packed"]:
         return ti.Vector.field(PACKET, dtype, shape=(*shape[:-1], shape[-1] // PACKET), layout=ti.Layout.AOS)
     if declared.metadata["vec"]:
-        return ti.Vector.field(declared.metadata["vec"], dtype, shape=shape, layout=ti.Layout.SOA)
+        # a vector's components stay together: apart, they would lie a whole array from each other, which for a power of two of envs is the
+        # same cache set for every component of every array
+        return ti.Vector.field(declared.metadata["vec"], dtype, shape=shape, layout=ti.Layout.AOS)
     return ti.field(dtype, shape=shape)
 
 
