@@ -315,6 +315,29 @@ def test_a_ttc_stop_names_the_body_that_closes_in_and_not_the_nearest():
     assert story.explained("collision").killer.slot == STATIC
 
 
+def test_a_ttc_stop_never_names_a_body_that_moves_away():
+    story = with_second(Story(speed=3.0, gap=0.4), y=0.5)
+    story.vel[:, SECOND] = [0.0, 2.0, 0.0]
+    found = story.explained("ttc")
+    assert found.facts["second_body_m"] < found.killer.gap_m
+    assert found.killer.slot == KILLER
+
+
+def test_a_second_body_that_passed_earlier_is_not_near():
+    story = with_second(Story())
+    story.body[story.ago < 1.0, SECOND] += [0.0, 2.0, 0.0]
+    assert story.explained().facts["second_body_m"] > 2.0
+
+
+def test_a_scan_is_compared_with_the_moment_of_its_ping():
+    """Delivered 0.2 s late: the killer is 0.2 m nearer by then, twice the tolerance."""
+    story = Story()
+    late = replace(story.history(), ping_age_s=np.full(story.n, 0.2), range_m=story.scan() + 0.2 * (np.arange(256) == 0))
+    assert explain("collision", late, story.bodies(), CONFIG).facts["seen_ago_s"] == 0.0
+    unchanged = replace(late, ping_age_s=np.zeros(story.n))
+    assert explain("collision", unchanged, story.bodies(), CONFIG).facts["seen_ago_s"] is None
+
+
 def test_timeout_facts_from_a_diary():
     t = np.arange(0.0, 60.1, 0.5)
     pos = np.stack([0.05 * t, 0 * t, 0 * t - 1], -1)
