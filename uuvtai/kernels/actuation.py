@@ -1,13 +1,15 @@
 """Inner loop: commanded body velocity and yaw rate -> wrench -> thrusts -> rotor commands, from measured motion only.
 
 The vehicle knows its nominal parameters (vehicle section): drag, Coriolis and net buoyancy are fed forward, PI feedback does the rest.
+Vehicles are driven in packets of neighbouring rows (lanes.py, second way).
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import taichi as ti
 
 from uuvtai.config import ActuationConfig, EpisodeConfig, VehicleConfig
+from uuvtai.kernels.lanes import column, is_awake, n_awake, n_column, put_column
 from uuvtai.kernels.rotor import rpm_of_thrust, thrust_limits
 from uuvtai.kernels.signature import Const, In, Out, spread
 from uuvtai.state import ActuationState, Allocation, ClockState, Proprioception, VehicleParams
@@ -26,13 +28,15 @@ def command_thrusters(
     episode_cfg: Const[EpisodeConfig],
 ):
     """action (n_env, 4): surge, sway, heave, yaw rate in [-1, 1] of the vehicle's limits -> actuation.rpm_command."""
-    n = ti.static(clock.awake.shape[0])
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and clock.awake[env] == 1:
-            raw = ti.Vector([action[env, 0], action[env, 1], action[env, 2], action[env, 3]])
-            actuation.command[env] = scaled_command(raw, vehicle_cfg)
-            _drive(env, actuation, allocation, ego, clock, vehicle_cfg, actuation_cfg, episode_cfg)
-            _send(env, actuation, params, clock)
+    n, lanes = ti.static(clock.awake.shape[0], n_column())
+    n_packet = ti.static(-(-n // lanes))
+    for packet, pad in ti.ndrange(n_packet, ti.static(spread(n_packet))):
+        if pad == 0 and n_awake(packet * lanes, lanes, clock) > 0:
+            for env in range(packet * lanes, (packet + 1) * lanes):
+                if is_awake(env, clock):
+                    raw = ti.Vector([action[env, 0], action[env, 1], action[env, 2], action[env, 3]])
+                    actuation.command[env] = scaled_command(raw, vehicle_cfg)
+            _drive(packet * lanes, lanes, actuation, params, allocation, ego, clock, vehicle_cfg, actuation_cfg, episode_cfg)
 
 
 @ti.kernel
@@ -89,8 +93,10 @@ def scaled_command(action, cfg: Const[VehicleConfig]):
 
 @ti.func
 def _drive(
-    env,
+    first,
+    lanes: Const[int],
     actuation: Out[ActuationState],
+    params: In[VehicleParams],
     allocation: In[Allocation],
     ego: In[Proprioception],
     clock: In[ClockState],
@@ -98,17 +104,72 @@ def _drive(
     actuation_cfg: Const[ActuationConfig],
     episode_cfg: Const[EpisodeConfig],
 ):
-    """Wrench of the velocity loop, allocated to the thrusters; their speeds go into this step's slot of the queue."""
-    command, rate = actuation.command[env], ego.rate_b[env]
+    """Rotor speeds of the velocity loop for the packet of vehicles that begins with ``first``, into this step's slot of the queue."""
+    n, n_thruster = ti.static(actuation.rpm_command.shape[0], actuation.rpm_command.shape[1])
+    fleet = ti.Struct(
+        command=ti.Matrix([[0.0] * lanes for _ in range(4)]),
+        vel=ti.Matrix([[0.0] * lanes for _ in range(3)]),
+        rate=ti.Matrix([[0.0] * lanes for _ in range(3)]),
+        up=ti.Matrix([[0.0] * lanes for _ in range(3)]),
+        integral=ti.Matrix([[0.0] * lanes for _ in range(4)]),
+        seen=ti.Matrix([[0.0] * lanes for _ in range(1)]),
+        rpm=ti.Matrix([[0.0] * lanes for _ in range(n_thruster)]),
+    )
+    for lane in range(lanes):
+        _embark(lane, ti.min(first + lane, n - 1), fleet, actuation, ego)
+    inverse = ti.Matrix([[allocation.thrust_of_wrench[i, axis] for axis in range(6)] for i in range(n_thruster)])
+    for lane in range(lanes):
+        _control(lane, fleet, inverse, vehicle_cfg, actuation_cfg, episode_cfg)
+    for lane in range(lanes):
+        if is_awake(first + lane, clock):
+            _disembark(lane, first + lane, fleet, actuation, params, clock)
+
+
+@ti.func
+def _embark(lane, env, fleet: Out[Any], actuation: In[ActuationState], ego: In[Proprioception]):
+    """Copy what one vehicle wants and senses into its column."""
+    command, vel = actuation.command[env], ego.vel_b[env]
     # a lost DVL holds an old velocity: feeding that back would run away, so the feed-forward drives alone until it is back
     seen = ego.vel_valid[env] == 1
-    vel = ego.vel_b[env] if seen else ti.Vector([command[0], command[1], command[2]])
+    for axis in ti.static(range(3)):
+        fleet.vel[axis, lane] = ti.select(seen, vel[axis], command[axis])
+    fleet.seen[0, lane] = ti.select(seen, 1.0, 0.0)
+    put_column(fleet.command, lane, command)
+    put_column(fleet.rate, lane, ego.rate_b[env])
+    put_column(fleet.up, lane, _up_b(ego.rpy[env]))
+    put_column(fleet.integral, lane, actuation.integral[env])
+
+
+@ti.func
+def _disembark(lane, env, fleet: In[Any], actuation: Out[ActuationState], params: In[VehicleParams], clock: In[ClockState]):
+    """Copy one vehicle's column back. What left the queue's tail reaches the rotors: the command of delay_steps control steps ago."""
+    actuation.integral[env] = column(fleet.integral, lane)
+    n_slot = ti.static(actuation.rpm_queue.shape[1])
+    slot = clock.step[env] % n_slot
+    due = (clock.step[env] - params.delay_steps[env]) % n_slot
+    for i in ti.static(range(actuation.rpm_command.shape[1])):
+        actuation.rpm_queue[env, slot, i] = fleet.rpm[i, lane]
+    for i in ti.static(range(actuation.rpm_command.shape[1])):
+        actuation.rpm_command[env, i] = actuation.rpm_queue[env, due, i]
+
+
+@ti.func
+def _control(
+    lane,
+    fleet: Out[Any],
+    inverse: In[Any],
+    vehicle_cfg: Const[VehicleConfig],
+    actuation_cfg: Const[ActuationConfig],
+    episode_cfg: Const[EpisodeConfig],
+):
+    """Velocity loop of one column. It touches local variables only, so that the loop over columns becomes vector code."""
+    command, vel, rate = column(fleet.command, lane), column(fleet.vel, lane), column(fleet.rate, lane)
+    integral, up = column(fleet.integral, lane), column(fleet.up, lane)
     error = ti.Vector([command[0] - vel[0], command[1] - vel[1], command[2] - vel[2], command[3] - rate[2]])
-    up = _up_b(ego.rpy[env])
     force, moment = feed_forward(command, vel, rate, up, vehicle_cfg)
     ahead = ti.Vector([force[0], force[1], force[2], moment[2]])
     loops = ti.static(axis_loops(actuation_cfg))
-    asked = ahead + actuation.integral[env]
+    asked = ahead + integral
     given = ti.Vector([0.0] * 4)
     for axis in ti.static(range(4)):
         asked[axis] += loops[axis].gain * error[axis]
@@ -117,13 +178,12 @@ def _drive(
     if ti.static(vehicle_cfg.attitude_hold == "thrusters"):
         roll_moment, pitch_moment = stabilising_moment(up, rate, moment, actuation_cfg)
     wrench = ti.Vector([given[0], given[1], given[2], roll_moment, pitch_moment, given[3]])
-    share = _allocate(env, wrench, actuation, allocation, clock, vehicle_cfg)
+    share = _allocate(lane, wrench, fleet, inverse, vehicle_cfg)
     for axis in ti.static(range(4)):
-        if seen or axis == 3:
-            starved = share < 1.0 or given[axis] != asked[axis]
-            per_step = loops[axis].integral_gain * episode_cfg.control_dt_s
-            before = actuation.integral[env][axis]
-            actuation.integral[env][axis] = integrated(before, error[axis], starved, per_step, loops[axis].band, loops[axis].bound)
+        starved = share < 1.0 or given[axis] != asked[axis]
+        per_step = loops[axis].integral_gain * episode_cfg.control_dt_s
+        after = integrated(integral[axis], error[axis], starved, per_step, loops[axis].band, loops[axis].bound)
+        fleet.integral[axis, lane] = ti.select(fleet.seen[0, lane] == 1.0 or axis == 3, after, integral[axis])
 
 
 @ti.func
@@ -169,7 +229,7 @@ def _up_b(rpy):
 
 
 @ti.func
-def _allocate(env, wrench, actuation: Out[ActuationState], allocation: In[Allocation], clock: In[ClockState], cfg: Const[VehicleConfig]):
+def _allocate(lane, wrench, fleet: Out[Any], inverse: In[Any], cfg: Const[VehicleConfig]):
     """Least-squares thrusts to rotor speeds; returns the share <= 1 by which all thrusts are scaled so that none exceeds its limit.
 
     One factor for all keeps the wrench's direction: a vehicle that clips single thrusters turns and drifts where it should only be slower.
@@ -179,21 +239,11 @@ def _allocate(env, wrench, actuation: Out[ActuationState], allocation: In[Alloca
     share = 1.0
     for i in ti.static(range(len(cfg.thrusters))):
         for axis in ti.static(range(6)):
-            thrust[i] += allocation.thrust_of_wrench[i, axis] * wrench[axis]
+            thrust[i] += inverse[i, axis] * wrench[axis]
         if thrust[i] > 0.0:
             share = ti.min(share, forward / thrust[i])
         elif thrust[i] < 0.0:
             share = ti.min(share, reverse / thrust[i])
-    slot = clock.step[env] % ti.static(actuation.rpm_queue.shape[1])
     for i in ti.static(range(len(cfg.thrusters))):
-        actuation.rpm_queue[env, slot, i] = rpm_of_thrust(share * thrust[i], cfg)
+        fleet.rpm[i, lane] = rpm_of_thrust(share * thrust[i], cfg)
     return share
-
-
-@ti.func
-def _send(env, actuation: Out[ActuationState], params: In[VehicleParams], clock: In[ClockState]):
-    """What left the queue's tail reaches the rotors: the command of delay_steps control steps ago."""
-    n_slot = ti.static(actuation.rpm_queue.shape[1])
-    slot = (clock.step[env] - params.delay_steps[env]) % n_slot
-    for i in range(ti.static(actuation.rpm_command.shape[1])):
-        actuation.rpm_command[env, i] = actuation.rpm_queue[env, slot, i]

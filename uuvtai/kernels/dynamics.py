@@ -4,6 +4,9 @@
 
 Origin at the centre of mass and diagonal added mass make the full mass matrix diagonal, so it is solved exactly; the acceleration is never
 filtered (that is unstable when M_A > M_RB). Each substep is one explicit midpoint step, second order in dt.
+
+Vehicles move in packets of neighbouring rows (lanes.py, second way): a packet is copied into a local ``fleet``, whose matrices have a
+column per vehicle, moved by a loop over the columns that touches nothing else, and copied back.
 """
 
 from typing import Any
@@ -12,6 +15,7 @@ import taichi as ti
 
 from uuvtai.config import ActuationConfig, DisturbanceConfig, EpisodeConfig, VehicleConfig
 from uuvtai.kernels.geometry import quaternion_wb, roll_pitch_yaw, rotation_wb
+from uuvtai.kernels.lanes import column, is_awake, n_awake, n_column, put_column
 from uuvtai.kernels.noise import STREAM_CURRENT, STREAM_THRUSTER, STREAM_VEHICLE, normal, stream_key, uniform_in
 from uuvtai.kernels.rotor import lag_kept, thrust_of_rpm
 from uuvtai.kernels.signature import Const, In, Out, spread
@@ -50,13 +54,29 @@ def move_vehicle(
     n_substep: int,
 ):
     """One control step of dt_s [s] in n_substep substeps; then the current moves on to the end of the step."""
-    n = ti.static(clock.awake.shape[0])
-    for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and clock.awake[env] == 1:
-            _move(env, vehicle, actuation, current, params, allocation, vehicle_cfg, actuation_cfg, dt_s / n_substep, n_substep)
+    n, lanes = ti.static(clock.awake.shape[0], n_column())
+    n_packet = ti.static(-(-n // lanes))
+    for packet, pad in ti.ndrange(n_packet, ti.static(spread(n_packet))):
+        if pad == 0 and n_awake(packet * lanes, lanes, clock) > 0:
+            _move(
+                packet * lanes,
+                lanes,
+                vehicle,
+                actuation,
+                current,
+                params,
+                allocation,
+                clock,
+                vehicle_cfg,
+                actuation_cfg,
+                dt_s / n_substep,
+                n_substep,
+            )
             if ti.static(disturbance_cfg.current_sigma_m_s > 0):
-                key = stream_key(episode.key[env], clock.step[env], STREAM_CURRENT)
-                current.vel_w[env] = current_after(current.mean_w[env], current.vel_w[env], key, disturbance_cfg, dt_s)
+                for env in range(packet * lanes, (packet + 1) * lanes):
+                    if is_awake(env, clock):
+                        key = stream_key(episode.key[env], clock.step[env], STREAM_CURRENT)
+                        current.vel_w[env] = current_after(current.mean_w[env], current.vel_w[env], key, disturbance_cfg, dt_s)
 
 
 @ti.kernel
@@ -100,66 +120,147 @@ def sense_exactly(ego: Out[Proprioception], vehicle: In[VehicleState], clock: In
 
 @ti.func
 def _move(
-    env,
+    first,
+    lanes: Const[int],
     vehicle: Out[VehicleState],
     actuation: Out[ActuationState],
     current: In[CurrentState],
     params: In[VehicleParams],
     allocation: In[Allocation],
+    clock: In[ClockState],
     vehicle_cfg: Const[VehicleConfig],
     actuation_cfg: Const[ActuationConfig],
     dt,
     n_substep,
 ):
-    """n_substep midpoint steps of one vehicle."""
-    body = body_of(env, params, vehicle_cfg)
-    current_w = current.vel_w[env]
-    pos, q, v, w = vehicle.pos_w[env], vehicle.quat_wb[env], vehicle.vel_b[env], vehicle.rate_b[env]
-    acc = 0.0 * v
+    """n_substep midpoint steps of the packet of vehicles that begins with ``first``."""
+    n, n_thruster = ti.static(vehicle.rpm.shape[0], vehicle.rpm.shape[1])
+    fleet = ti.Struct(
+        pos=ti.Matrix([[0.0] * lanes for _ in range(3)]),
+        quat=ti.Matrix([[0.0] * lanes for _ in range(4)]),
+        vel=ti.Matrix([[0.0] * lanes for _ in range(3)]),
+        rate=ti.Matrix([[0.0] * lanes for _ in range(3)]),
+        acc=ti.Matrix([[0.0] * lanes for _ in range(3)]),
+        hold=ti.Matrix([[0.0] * lanes for _ in range(3)]),
+        rpm=ti.Matrix([[0.0] * lanes for _ in range(n_thruster)]),
+        thrust=ti.Matrix([[0.0] * lanes for _ in range(n_thruster)]),
+        # from here on read only
+        command=ti.Matrix([[0.0] * lanes for _ in range(n_thruster)]),
+        gain=ti.Matrix([[0.0] * lanes for _ in range(n_thruster)]),
+        outside=ti.Matrix([[0.0] * lanes for _ in range(6)]),
+        current=ti.Matrix([[0.0] * lanes for _ in range(3)]),
+        mass=ti.Matrix([[0.0] * lanes for _ in range(6)]),
+        added=ti.Matrix([[0.0] * lanes for _ in range(6)]),
+        linear=ti.Matrix([[0.0] * lanes for _ in range(6)]),
+        quadratic=ti.Matrix([[0.0] * lanes for _ in range(6)]),
+        lift=ti.Matrix([[0.0] * lanes for _ in range(2)]),
+    )
+    for lane in range(lanes):
+        _embark(lane, ti.min(first + lane, n - 1), fleet, vehicle, actuation, current, params)
+    geometry = ti.Matrix([[allocation.wrench_of_thrust[axis, i] for i in range(n_thruster)] for axis in range(6)])
     kept = lag_kept(0.5 * dt, vehicle_cfg.rotor_tau_s)
     for _ in range(n_substep):
-        force, moment = _rotor_wrench(env, vehicle, actuation, params, allocation, vehicle_cfg, kept)
-        dv, dw = acceleration(q, v, w, force, moment, current_w, body, vehicle_cfg, actuation_cfg)
-        q_mid = turned(q, w, 0.5 * dt)
-        v_mid, w_mid = v + 0.5 * dt * dv, w + 0.5 * dt * dw
-        dv_mid, dw_mid = acceleration(q_mid, v_mid, w_mid, force, moment, current_w, body, vehicle_cfg, actuation_cfg)
-        pos += dt * (rotation_wb(q_mid) @ v_mid)
-        q = (q + 0.5 * dt * quaternion_product_pure(q_mid, w_mid)).normalized()
-        v += dt * dv_mid
-        w += dt * dw_mid
-        acc = dv_mid + w_mid.cross(v_mid)
-    vehicle.pos_w[env], vehicle.quat_wb[env], vehicle.vel_b[env], vehicle.rate_b[env] = pos, q, v, w
-    vehicle.acc_b[env] = acc
-    if ti.static(vehicle_cfg.attitude_hold == "ideal"):
-        actuation.hold_moment_b[env] = hold_moment(up_b(q), w, actuation_cfg)
+        for lane in range(lanes):
+            _advance(lane, fleet, geometry, kept, dt, vehicle_cfg, actuation_cfg)
+    for lane in range(lanes):
+        if is_awake(first + lane, clock):
+            _disembark(lane, first + lane, fleet, vehicle, actuation, vehicle_cfg)
 
 
 @ti.func
-def _rotor_wrench(
+def _embark(
+    lane,
     env,
-    vehicle: Out[VehicleState],
-    actuation: Out[ActuationState],
+    fleet: Out[Any],
+    vehicle: In[VehicleState],
+    actuation: In[ActuationState],
+    current: In[CurrentState],
     params: In[VehicleParams],
-    allocation: In[Allocation],
-    cfg: Const[VehicleConfig],
-    kept,
 ):
+    """Copy what moves one vehicle into its column."""
+    put_column(fleet.pos, lane, vehicle.pos_w[env])
+    put_column(fleet.quat, lane, vehicle.quat_wb[env])
+    put_column(fleet.vel, lane, vehicle.vel_b[env])
+    put_column(fleet.rate, lane, vehicle.rate_b[env])
+    put_column(fleet.outside, lane, actuation.external_wrench_b[env])
+    put_column(fleet.current, lane, current.vel_w[env])
+    put_column(fleet.added, lane, params.added_mass[env])
+    put_column(fleet.linear, lane, params.linear_damping[env])
+    put_column(fleet.quadratic, lane, params.quadratic_damping[env])
+    for axis in ti.static(range(3)):
+        fleet.mass[axis, lane] = params.mass_kg[env]
+        fleet.mass[axis + 3, lane] = params.inertia[env][axis]
+    fleet.lift[0, lane] = params.buoyancy_n[env]
+    fleet.lift[1, lane] = params.buoyancy_height_m[env]
+    for i in ti.static(range(vehicle.rpm.shape[1])):
+        fleet.rpm[i, lane] = vehicle.rpm[env, i]
+        fleet.command[i, lane] = actuation.rpm_command[env, i]
+        fleet.gain[i, lane] = params.thruster_gain[env, i]
+
+
+@ti.func
+def _disembark(lane, env, fleet: In[Any], vehicle: Out[VehicleState], actuation: Out[ActuationState], cfg: Const[VehicleConfig]):
+    """Copy one vehicle's column back."""
+    vehicle.pos_w[env] = column(fleet.pos, lane)
+    vehicle.quat_wb[env] = column(fleet.quat, lane)
+    vehicle.vel_b[env] = column(fleet.vel, lane)
+    vehicle.rate_b[env] = column(fleet.rate, lane)
+    vehicle.acc_b[env] = column(fleet.acc, lane)
+    if ti.static(cfg.attitude_hold == "ideal"):
+        actuation.hold_moment_b[env] = column(fleet.hold, lane)
+    for i in ti.static(range(vehicle.rpm.shape[1])):
+        vehicle.rpm[env, i] = fleet.rpm[i, lane]
+        actuation.thrust_n[env, i] = fleet.thrust[i, lane]
+
+
+@ti.func
+def _advance(
+    lane,
+    fleet: Out[Any],
+    geometry: In[Any],
+    kept,
+    dt,
+    vehicle_cfg: Const[VehicleConfig],
+    actuation_cfg: Const[ActuationConfig],
+):
+    """One midpoint step of one column. It touches local variables only, so that the loop over columns becomes vector code."""
+    body = body_of(lane, fleet, vehicle_cfg)
+    current_w = column(fleet.current, lane)
+    force, moment = _rotor_wrench(lane, fleet, geometry, vehicle_cfg, kept)
+    pos, q, v, w = column(fleet.pos, lane), column(fleet.quat, lane), column(fleet.vel, lane), column(fleet.rate, lane)
+    dv, dw = acceleration(q, v, w, force, moment, current_w, body, vehicle_cfg, actuation_cfg)
+    q_mid = turned(q, w, 0.5 * dt)
+    v_mid, w_mid = v + 0.5 * dt * dv, w + 0.5 * dt * dw
+    dv_mid, dw_mid = acceleration(q_mid, v_mid, w_mid, force, moment, current_w, body, vehicle_cfg, actuation_cfg)
+    q_end = (q + 0.5 * dt * quaternion_product_pure(q_mid, w_mid)).normalized()
+    w_end = w + dt * dw_mid
+    put_column(fleet.pos, lane, pos + dt * (rotation_wb(q_mid) @ v_mid))
+    put_column(fleet.quat, lane, q_end)
+    put_column(fleet.vel, lane, v + dt * dv_mid)
+    put_column(fleet.rate, lane, w_end)
+    put_column(fleet.acc, lane, dv_mid + w_mid.cross(v_mid))
+    if ti.static(vehicle_cfg.attitude_hold == "ideal"):
+        put_column(fleet.hold, lane, hold_moment(up_b(q_end), w_end, actuation_cfg))
+
+
+@ti.func
+def _rotor_wrench(lane, fleet: Out[Any], geometry: In[Any], cfg: Const[VehicleConfig], kept):
     """Force and moment of all thrusters at the middle of the substep, plus what acts from outside; the rotors move on by a substep.
 
     ``kept`` is what the lag leaves of the distance to the command after half a substep. The middle value keeps the midpoint rule second
     order although the lag is as short as a substep.
     """
-    outside = actuation.external_wrench_b[env]
-    force, moment = ti.Vector([outside[0], outside[1], outside[2]]), ti.Vector([outside[3], outside[4], outside[5]])
-    for i in ti.static(range(vehicle.rpm.shape[1])):
-        command = actuation.rpm_command[env, i]
-        middle = command + kept * (vehicle.rpm[env, i] - command)
-        vehicle.rpm[env, i] = command + kept * (middle - command)
-        thrust = params.thruster_gain[env, i] * thrust_of_rpm(middle, cfg)
-        actuation.thrust_n[env, i] = thrust
+    force = ti.Vector([fleet.outside[0, lane], fleet.outside[1, lane], fleet.outside[2, lane]])
+    moment = ti.Vector([fleet.outside[3, lane], fleet.outside[4, lane], fleet.outside[5, lane]])
+    for i in ti.static(range(fleet.rpm.n)):
+        command = fleet.command[i, lane]
+        middle = command + kept * (fleet.rpm[i, lane] - command)
+        fleet.rpm[i, lane] = command + kept * (middle - command)
+        thrust = fleet.gain[i, lane] * thrust_of_rpm(middle, cfg)
+        fleet.thrust[i, lane] = thrust
         for axis in ti.static(range(3)):
-            force[axis] += allocation.wrench_of_thrust[axis, i] * thrust
-            moment[axis] += allocation.wrench_of_thrust[axis + 3, i] * thrust
+            force[axis] += geometry[axis, i] * thrust
+            moment[axis] += geometry[axis + 3, i] * thrust
     return force, moment
 
 
@@ -167,23 +268,28 @@ def _rotor_wrench(
 
 
 @ti.func
-def body_of(env, params: In[VehicleParams], cfg: Const[VehicleConfig]):
+def body_of(lane, fleet: In[Any], cfg: Const[VehicleConfig]):
     """Parameters of one vehicle in local variables, linear and angular parts apart."""
-    added, linear, quadratic = params.added_mass[env], params.linear_damping[env], params.quadratic_damping[env]
+    added, linear, quadratic, inert = (
+        column(fleet.added, lane),
+        column(fleet.linear, lane),
+        column(fleet.quadratic, lane),
+        column(fleet.mass, lane),
+    )
     return ti.Struct(
-        mass=params.mass_kg[env],
-        inertia=params.inertia[env],
+        mass=inert[0],
+        inertia=ti.Vector([inert[3], inert[4], inert[5]]),
         added_v=ti.Vector([added[0], added[1], added[2]]),
         added_w=ti.Vector([added[3], added[4], added[5]]),
         linear_v=ti.Vector([linear[0], linear[1], linear[2]]),
         linear_w=ti.Vector([linear[3], linear[4], linear[5]]),
         quadratic_v=ti.Vector([quadratic[0], quadratic[1], quadratic[2]]),
         quadratic_w=ti.Vector([quadratic[3], quadratic[4], quadratic[5]]),
-        weight=params.mass_kg[env] * cfg.gravity_m_s2,
-        buoyancy=params.buoyancy_n[env],
-        height=params.buoyancy_height_m[env],
-        per_mass_v=1.0 / (params.mass_kg[env] + ti.Vector([added[0], added[1], added[2]])),
-        per_mass_w=1.0 / (params.inertia[env] + ti.Vector([added[3], added[4], added[5]])),
+        weight=inert[0] * cfg.gravity_m_s2,
+        buoyancy=fleet.lift[0, lane],
+        height=fleet.lift[1, lane],
+        per_mass_v=1.0 / (inert[0] + ti.Vector([added[0], added[1], added[2]])),
+        per_mass_w=1.0 / ti.Vector([inert[3] + added[3], inert[4] + added[4], inert[5] + added[5]]),
     )
 
 
