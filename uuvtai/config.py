@@ -477,7 +477,9 @@ class ElevationConfig(Section):
     memory_s: NonNegative = 8.0
     """time constant with which an unseen body is forgotten; 0 = a body that beams see through is forgotten at once"""
     half_height_m: NonNegative = 0.2
-    """least half height assumed of a body"""
+    """half height assumed of a body that is no wider"""
+    least_half_height_m: NonNegative = 0.1
+    """half height assumed where a body is not seen: the flattest one that would hide so"""
     column_share: Fraction = 0.05
     """share of moving bodies expected to go through the full water column"""
     edge_m: Positive = 0.06

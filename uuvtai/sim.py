@@ -230,9 +230,7 @@ class Sim:
         with self._stage("depth"):
             depth.cast_depth(s.image, s.ego, s.vehicle, s.world, s.episode, s.clock, c.sensors.depth, c.world.tank)
         with self._stage("tracking"):
-            tracking.track_bodies(
-                s.tracks, s.clusters, s.scan, s.clock, c.tracking, c.elevation, c.sensors.sonar, c.world.tank, c.episode
-            )
+            tracking.track_bodies(s.tracks, s.clusters, s.scan, s.clock, c.tracking, c.elevation, c.sensors.sonar, c.world.tank, c.episode)
             if c.elevation.use_camera:
                 look.look_at_bodies(s.tracks, s.image, s.clock, c.elevation, c.sensors.depth, c.world.tank, c.episode)
             forecast.forecast_tracks(s.forecast, s.tracks, s.clock, c.forecast, c.tracking, c.episode)

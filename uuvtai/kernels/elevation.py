@@ -48,20 +48,21 @@ def begin_height(env, track, tracks: Out[TrackState], cfg: Const[ElevationConfig
 
 @ti.func
 def half_height(env, track, tracks: In[TrackState], cfg: Const[ElevationConfig]):
-    """[m] half height of a body that is no column: that of a ball of the tracked radius, or the configured least."""
+    """[m] half height of a body that is no column: that of a ball of the tracked radius, or the configured usual one."""
     return ti.max(tracks.radius_m[env, track], ti.static(cfg.half_height_m))
 
 
 @ti.func
-def in_fan(env, track, own, bias, tracks: In[TrackState], cfg: Const[ElevationConfig], sonar: Const[SonarConfig], tank: Const[TankConfig]):
+def in_fan(env, track, own, half, tracks: In[TrackState], cfg: Const[ElevationConfig], sonar: Const[SonarConfig], tank: Const[TankConfig]):
     """Per hypothesis the probability that a beam from ``own`` [m, world] hits the body where it is expected.
 
-    Soft at the fan's edge, which ``bias`` [m] shifts outwards: sizes are guessed, so hits are judged generously and misses strictly.
+    ``half`` = its half height [m], guessed: large for hits and small for misses, so that neither says more than it knows. Soft at the fan's
+    edge.
     """
     mean = tracks.state[env, track]
     away = ti.Vector([mean[0] - own[0], mean[1] - own[1]]).norm()
     opening = ti.static(math.tan(math.radians(sonar.vertical_half_aperture_deg)))
-    reach = bias + opening * ti.max(away - 0.5 * tracks.radius_m[env, track], 0.0) + half_height(env, track, tracks, cfg)
+    reach = half + opening * ti.max(away - 0.5 * tracks.radius_m[env, track], 0.0)
     at = heights(tank)
     out = f16x(0.0)
     for i in ti.static(range(LANES)):
@@ -73,7 +74,7 @@ def in_fan(env, track, own, bias, tracks: In[TrackState], cfg: Const[ElevationCo
 @ti.func
 def weigh_seen(env, track, own, tracks: Out[TrackState], cfg: Const[ElevationConfig], sonar: Const[SonarConfig], tank: Const[TankConfig]):
     """The sonar at ``own`` hit it: it is there, and within the fan."""
-    likely = in_fan(env, track, own, cfg.edge_m, tracks, cfg, sonar, tank)
+    likely = in_fan(env, track, own, half_height(env, track, tracks, cfg) + cfg.edge_m, tracks, cfg, sonar, tank)
     weighed = tracks.height[env, track, 0] * ti.max(likely, _LEAST)
     tracks.height[env, track, 0] = weighed / weighed.sum()
     tracks.present[env, track] = _WELL_THERE
@@ -92,7 +93,7 @@ def weigh_unseen(
     spread_var = largest_position_variance(tracks.cov[env, track], 0.0)
     sure = ti.static(cfg.hit_share) * radius * radius / (radius * radius + spread_var)
     hit = 1.0 - (1.0 - sure) ** ti.min(dt * ti.static(1.0 / cfg.evidence_s), 1.0)
-    likely = in_fan(env, track, own, -cfg.edge_m, tracks, cfg, sonar, tank)
+    likely = in_fan(env, track, own, cfg.least_half_height_m - cfg.edge_m, tracks, cfg, sonar, tank)
     weighed = tracks.height[env, track, 0] * ti.max(1.0 - likely * hit, _LEAST)
     total = weighed.sum()
     tracks.height[env, track, 0] = weighed / total

@@ -59,7 +59,7 @@ def look_at(
     tank: Const[TankConfig],
 ):
     """One track, expected at ``at`` [m, world, horizontal]."""
-    focal, middle_row, middle_col = ti.static(pinhole(depth))
+    focal, _, middle_col = ti.static(pinhole(depth))
     rpy = image.shot_rpy[env]
     R_wb = rotation_wb(quaternion_wb(rpy[0], rpy[1], rpy[2]))
     eye = image.shot_pos_w[env] + R_wb @ ti.Vector([depth.offset_b_m[0], depth.offset_b_m[1], depth.offset_b_m[2]])
@@ -74,19 +74,24 @@ def look_at(
         and col >= 0
         and col < ti.static(depth.cols)
     ):
-        ends = column_ends(env, col, ahead, radius, eye[2], image, R_wb, focal, middle_row, middle_col, depth)
+        ends, cut = column_ends(env, col, ahead, radius, eye[2], image, R_wb, depth)
         if ends[0] <= ends[1]:
-            weigh_camera(env, track, shown_heights(ends, cfg, tank), 0, tracks)
+            weigh_camera(env, track, shown_heights(ends, cut, tank), 0, tracks)
         elif ends[2] <= ends[3]:
             weigh_camera(env, track, missing_heights(ends, cfg, tank), 1, tracks)
 
 
 @ti.func
-def column_ends(env, col, ahead, radius, eye_z, image: In[DepthImage], R_wb, focal, middle_row, middle_col, depth: Const[DepthConfig]):
-    """(lowest, highest) z of the body's pixels in one column, (lowest, highest) z at its distance of the pixels that show it or see past
-    it; low > high where there are none."""
+def column_ends(env, col, ahead, radius, eye_z, image: In[DepthImage], R_wb, depth: Const[DepthConfig]):
+    """What one column of pixels shows of a body ``ahead`` [m] of the camera.
+
+    (lowest, highest) z of its pixels, (lowest, highest) z at its distance of the pixels that show it or see past it, low > high where there
+    are none; and whether it goes on beyond the image's (lower, upper) edge.
+    """
+    focal, middle_row, middle_col = ti.static(pinhole(depth))
     left = (middle_col - col) / focal
     low, high, free_low, free_high = FAR_M, -FAR_M, FAR_M, -FAR_M
+    cut = ti.Vector([0, 0])
     for row in range(ti.static(depth.rows)):
         away = image.depth_m[env, row, col]
         climb = R_wb[2, 0] + R_wb[2, 2] * (middle_row - row) / focal + R_wb[2, 1] * left
@@ -96,24 +101,32 @@ def column_ends(env, col, ahead, radius, eye_z, image: In[DepthImage], R_wb, foc
         if ti.abs(away - ahead + 0.5 * radius) < 0.5 * radius + _DEPTH_SLACK_M:
             z = eye_z + climb * away
             low, high = ti.min(low, z), ti.max(high, z)
-    return ti.Vector([low, high, free_low, free_high])
+            cut[1] = ti.select(row == 0, 1, cut[1])
+            cut[0] = ti.select(row == ti.static(depth.rows) - 1, 1, cut[0])
+    return ti.Vector([low, high, free_low, free_high]), cut
 
 
 @ti.func
-def shown_heights(ends, cfg: Const[ElevationConfig], tank: Const[TankConfig]):
-    """Likelihood per hypothesis of a body that shows between ends[0] and ends[1], where ends[2] to ends[3] could be seen."""
+def shown_heights(ends, cut, tank: Const[TankConfig]):
+    """Likelihood per hypothesis of a body that shows between ends[0] and ends[1] and goes on beyond an edge where ``cut``."""
     step = ti.static((tank.z_m[1] - tank.z_m[0]) / COLUMN)
-    cut_low, cut_high = ends[0] <= ends[2] + 0.02, ends[1] >= ends[3] - 0.02
     middle = 0.5 * (ends[0] + ends[1])
-    first = ti.select(cut_low, ti.select(cut_high, ends[0], ends[1] - _TRUNCATED_M), middle) - _EDGE_M
-    last = ti.select(cut_high, ti.select(cut_low, ends[1], ends[0] + _TRUNCATED_M), middle) + _EDGE_M
+    first, last = middle, middle
+    if cut[0] == 1 and cut[1] == 1:
+        first, last = ends[0], ends[1]
+    elif cut[0] == 1:
+        first = ends[1] - _TRUNCATED_M
+    elif cut[1] == 1:
+        last = ends[0] + _TRUNCATED_M
+    reach = _EDGE_M + 0.5 * step
     at = heights(tank)
     out = f16x(_LEAST)
     for i in ti.static(range(LANES)):
-        if at[i] >= first - 0.5 * step and at[i] <= last + 0.5 * step:
+        if at[i] >= first - reach and at[i] <= last + reach:
             out[i] = 1.0
-    full = (cut_low or ends[0] < ti.static(tank.z_m[0] + 2.0 * _EDGE_M)) and (cut_high or ends[1] > ti.static(tank.z_m[1] - 2.0 * _EDGE_M))
-    out[COLUMN] = ti.select(full, 1.0, _LEAST)
+    bottom = cut[0] == 1 or ends[0] < ti.static(tank.z_m[0] + 2.0 * _EDGE_M)
+    top = cut[1] == 1 or ends[1] > ti.static(tank.z_m[1] - 2.0 * _EDGE_M)
+    out[COLUMN] = ti.select(bottom and top, 1.0, _LEAST)
     return out
 
 
