@@ -1,0 +1,1 @@
+"""The other side of each comparison: equations and engines written on other libraries, as their users would."""

@@ -1,0 +1,225 @@
+"""Run benchmarks, print a table, keep results/<date>_<device>_<what>.json with machine, versions, commit and command.
+
+python benchmarks/run.py                          all of them
+python benchmarks/run.py dynamics tick            some
+python benchmarks/run.py --quick                  small sizes and short times: does everything run?
+python benchmarks/run.py scale --device cuda --num-envs 1024,4096,16384,65536
+
+Every benchmark runs in a process of its own. Exit code: 0 when all of them ran (floors that were not met are marked, not errors), 1 when
+one failed, 2 for unknown names.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).resolve().parent
+if sys.path[0] == str(HERE):
+    sys.path[0] = str(HERE.parent)  # modules here are benchmarks.*: their names must not hide others
+
+from benchmarks.common import Job, Row  # noqa: E402
+
+NOT_BENCHMARKS = ("__init__", "common", "run")
+PEERS = ("mujoco", "opencv-python-headless", "scipy", "ompl", "py_trees", "numpy", "torch")
+_LONGEST_S = 600
+_THREAD_VARIABLES = ("UUV_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+
+
+def main() -> int:
+    """Parse, run each benchmark in its own process, print and keep the rows."""
+    names = sorted(path.stem for path in HERE.glob("*.py") if path.stem not in NOT_BENCHMARKS)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", nargs="*", help=f"benchmarks to run (default: all): {', '.join(names)}")
+    parser.add_argument("--quick", action="store_true", help="small sizes, short times; nothing is kept unless --out is given")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    parser.add_argument("--num-envs", default="", help="batch sizes for scale and growth, separated by commas")
+    parser.add_argument("--seconds", type=float, help="measured time per side of a comparison [s] (default 6)")
+    parser.add_argument("--out", type=Path, help="folder of the results (default benchmarks/results)")
+    parser.add_argument("--worker", help=argparse.SUPPRESS)
+    chosen = parser.parse_args()
+    if unknown := sorted(set(chosen.what) - set(names)):
+        print(f"unknown: {', '.join(unknown)}; there are: {', '.join(names)}", file=sys.stderr)
+        return 2
+    if chosen.worker:
+        return _work(chosen)
+    failed, started = [], time.perf_counter()
+    for name in chosen.what or names:
+        devices, threads = _traits(name)
+        if chosen.device not in devices:
+            if chosen.what:
+                print(f"{name}: runs on {', '.join(devices)} only", file=sys.stderr)
+                failed.append(name)
+            continue
+        print(f"{name} ...", file=sys.stderr, flush=True)
+        document, error = _measured(name, threads)
+        if document is None:
+            print(f"{name}: failed\n{error}", file=sys.stderr)
+            failed.append(name)
+            continue
+        _show(name, document)
+        if chosen.out or not chosen.quick:
+            print(_kept(name, chosen, document))
+        print(flush=True)
+    print(f"{time.perf_counter() - started:.0f} s" + (f"; failed: {', '.join(failed)}" if failed else ""))
+    return 1 if failed else 0
+
+
+def _traits(name: str) -> tuple[tuple[str, ...], int | None]:
+    """DEVICES and THREADS of a benchmark, read from its source: importing it could start what it measures."""
+    devices: tuple[str, ...] = ("cpu",)
+    threads = None
+    for line in (HERE / f"{name}.py").read_text().splitlines():
+        if line.startswith("DEVICES = "):
+            devices = tuple(part.strip("\"' ") for part in line.partition("=")[2].strip(" ()").split(",") if part.strip("\"' )"))
+        if line.startswith("THREADS = "):
+            threads = int(line.partition("=")[2])
+    return devices, threads
+
+
+# ------------------------------------------------------------------------------------------------------- one process for each
+
+
+def _measured(name: str, threads: int | None) -> tuple[dict[str, Any] | None, str]:
+    """(what the worker found, '') or (None, what went wrong)."""
+    environment = dict(os.environ)
+    if threads:
+        environment |= {variable: str(threads) for variable in _THREAD_VARIABLES}
+    with tempfile.TemporaryDirectory() as folder:
+        target = Path(folder) / "rows.json"
+        command = [sys.executable, str(HERE / "run.py"), *sys.argv[1:], "--worker", f"{name}:{target}"]
+        try:
+            done = subprocess.run(command, env=environment, stdout=sys.stderr, check=False, timeout=_LONGEST_S)
+        except subprocess.TimeoutExpired:
+            return None, f"not done after {_LONGEST_S} s"
+        if done.returncode or not target.exists():
+            return None, f"exit code {done.returncode} (its message is above)"
+        return json.loads(target.read_text()), ""
+
+
+def _work(chosen: argparse.Namespace) -> int:
+    """Measure one benchmark; its rows go to the file named by ``--worker name:file``."""
+    name, _, target = chosen.worker.partition(":")
+    sizes = tuple(int(n) for n in chosen.num_envs.split(",") if n)
+    seconds = chosen.seconds or (0.3 if chosen.quick else 6.0)
+    job = Job(chosen.device, chosen.quick, sizes, seconds, say=lambda text: print(f"  {text}", file=sys.stderr, flush=True))
+    module = importlib.import_module(f"benchmarks.{name}")
+    begun = time.perf_counter()
+    rows: list[Row] = module.measure(job)
+    document = {"about": (module.__doc__ or "").splitlines()[0], "machine": _machine(chosen.device), "seconds": time.perf_counter() - begun}
+    Path(target).write_text(json.dumps({**document, "rows": [row.document() for row in rows]}))
+    return 0
+
+
+def _machine(device: str) -> dict[str, Any]:
+    from uuvtai.run_folder import hardware, versions
+
+    found = {**versions()}
+    for name in PEERS:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = "missing"
+    out = {**hardware(), "device": device, "memory_gib": _memory_gib(), "versions": found}
+    out["threads"] = os.environ.get("UUV_NUM_THREADS", "all")
+    if device == "cuda":
+        import torch
+
+        out["gpu"] = torch.cuda.get_device_name(0)
+    return out
+
+
+def _memory_gib() -> float | None:
+    try:
+        return round(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**30, 1)
+    except (AttributeError, ValueError, OSError):
+        return None
+
+
+def _commit() -> str | None:
+    """Commit of the checkout, with '+' where files of the package or the benchmarks differ from it."""
+    from uuvtai.run_folder import git_sha
+
+    sha = git_sha()
+    if sha is None:
+        return None
+    changed = subprocess.run(
+        ["git", "-C", str(HERE.parent), "status", "--porcelain", "--untracked-files=no", "uuvtai", "benchmarks/*.py"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return sha + ("+" if changed.stdout.strip() else "")
+
+
+# ------------------------------------------------------------------------------------------------------------ show and keep
+
+
+def _kept(name: str, chosen: argparse.Namespace, document: dict[str, Any]) -> Path:
+    folder = chosen.out or HERE / "results"
+    folder.mkdir(parents=True, exist_ok=True)
+    target = folder / f"{time.strftime('%Y-%m-%d')}_{chosen.device}_{name}.json"
+    head = {
+        "schema": 1,
+        "command": " ".join(["python", "benchmarks/run.py", *sys.argv[1:]]),
+        "date": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+        "commit": _commit(),
+    }
+    target.write_text(json.dumps({**head, **document}, indent=1) + "\n")
+    return target
+
+
+def _show(name: str, document: dict[str, Any]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(width=None if sys.stdout.isatty() else 150)
+    table = Table(title=f"{name}: {document['about']}", title_justify="left", caption_justify="left")
+    for head in ("what", "ours", "peer", "ratio", "unit", "floor", ""):
+        table.add_column(head, justify="left" if head in ("what", "unit", "") else "right")
+    for row in document["rows"]:
+        peer = f"{_number(row['peer'])} {row['peer_name']}" if row["peer"] is not None else ""
+        ratio = f"{row['ratio']:.3g} x" if row["ratio"] is not None else ""
+        mark = {None: "", True: "met", False: "[bold red]NOT MET[/]"}[row["met"]]
+        table.add_row(row["what"], _number(row["ours"]), peer, ratio, row["unit"], _floor(row), " ".join(filter(None, (mark, row["note"]))))
+    console.print(table)
+    for row in document["rows"]:
+        if columns := row["details"].get("table"):
+            console.print(_details(row["what"], columns, Table))
+
+
+def _details(what: str, columns: dict[str, dict[str, float]], table_class: Any) -> Any:
+    table = table_class(title=what, title_justify="left")
+    table.add_column("")
+    for head in columns:
+        table.add_column(head, justify="right")
+    for line in next(iter(columns.values())):
+        table.add_row(line, *[_number(column.get(line)) for column in columns.values()])
+    return table
+
+
+def _number(value: float | None) -> str:
+    if value is None:
+        return ""
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+
+
+def _floor(row: dict[str, Any]) -> str:
+    if row["floor"] is None:
+        return ""
+    if row["floor_on"] == "ratio":
+        return f">= {_number(row['floor'])} x"
+    return f"{'<=' if row['less_is_better'] else '>='} {_number(row['floor'])}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

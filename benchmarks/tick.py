@@ -1,0 +1,69 @@
+"""Tick of the behaviour tree ``bt`` with the statuses of all nodes kept, against py_trees on the same tree and the same leaf answers."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from benchmarks.common import Job, Row, seconds_per_call
+from benchmarks.peers.tick_py_trees import PyTree
+from uuvtai import state
+from uuvtai.config import Config
+from uuvtai.kernels import tree_tick
+from uuvtai.runtime import start_taichi
+from uuvtai.sizes import array_sizes
+from uuvtai.tree import load_tree, read_tree
+
+THREADS = 1
+FLOOR = 200.0
+_BLACKBOARDS = 64
+"""Different leaf answers that py_trees ticks in turn, the first envs of ours."""
+
+
+def measure(job: Job) -> list[Row]:
+    """Ticks per second of one core."""
+    n_env = 256 if job.quick else 16_384
+    start_taichi(job.device)
+    tree, config = read_tree("bt"), Config()
+    sizes = array_sizes(config, n_env)
+    teacher, table = state.allocate(state.TeacherState, sizes), state.allocate(state.TreeTable, sizes)
+    load_tree(table, tree)
+    rng = np.random.default_rng(0)
+    answers = rng.integers(tree_tick.RUNNING, tree_tick.FAILURE + 1, (4, n_env, config.teacher.max_node), dtype=np.int32)
+    given = [torch.from_numpy(a) for a in answers]
+    n_node = len(tree.kind)
+    peers = [PyTree(tree) for _ in range(_BLACKBOARDS)]
+
+    for turn in range(len(given)):  # agreement first: statuses of every node, tick by tick, memories included
+        tree_tick.tick_with_given_statuses(given[turn], teacher, table)
+        found = teacher.status.to_numpy()[:_BLACKBOARDS, :n_node]
+        expected = [peer.tick(answers[turn, i, :n_node]) for i, peer in enumerate(peers)]
+        np.testing.assert_array_equal(found, expected)
+
+    turns = {"ours": 0, "peer": 0}
+
+    def ours():
+        turns["ours"] += 1
+        tree_tick.tick_with_given_statuses(given[turns["ours"] % len(given)], teacher, table)
+
+    peer_answers = [[peers[0].prepared(row[:n_node]) for row in a[:_BLACKBOARDS]] for a in answers]
+
+    def theirs():
+        turns["peer"] += 1
+        for peer, prepared in zip(peers, peer_answers[turns["peer"] % len(given)], strict=True):
+            peer.tick_prepared(prepared)
+
+    cost = seconds_per_call({"ours": ours, "peer": theirs}, job.seconds)
+    return [
+        Row(
+            what=f"tree ticks, {n_node} nodes",
+            ours=n_env / cost["ours"],
+            peer=_BLACKBOARDS / cost["peer"],
+            peer_name="py_trees",
+            unit="ticks/s per core",
+            floor=FLOOR,
+            floor_on="ratio",
+            note=f"{1e9 * cost['ours'] / n_env:.0f} ns against {1e6 * cost['peer'] / _BLACKBOARDS:.1f} us a tick",
+            details={"num_envs": n_env},
+        )
+    ]
