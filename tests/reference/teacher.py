@@ -3,44 +3,81 @@
 import numpy as np
 
 
-def rolled_out(pos, vel, command, lag_s, dt_s, n):
-    """Positions and velocities [n + 1, 2] of a vehicle that follows ``command`` with a first-order lag, by exact steps of ``dt_s``."""
-    keep = np.exp(-dt_s / lag_s)
-    positions, velocities = [np.array(pos, float)], [np.array(vel, float)]
-    for _ in range(n):
-        off = velocities[-1] - command
-        positions.append(positions[-1] + command * dt_s + off * lag_s * (1 - keep))
-        velocities.append(command + off * keep)
-    return np.array(positions), np.array(velocities)
+def rolled_out(pos, vel, command, lag_s, dt_s, n, burst_s=np.inf):
+    """Positions and velocities [n + 1, axes] of a vehicle that follows ``command`` until ``burst_s`` and then 0, with a first-order lag.
+
+    The equation of motion is solved exactly over every step, in two pieces where the command ends within it.
+    """
+
+    def piece(pos, vel, wanted, dt):
+        keep = np.exp(-dt / lag_s)
+        return pos + wanted * dt + (vel - wanted) * lag_s * (1 - keep), wanted + (vel - wanted) * keep
+
+    at, moving = [np.array(pos, float)], [np.array(vel, float)]
+    command = np.array(command, float)
+    for k in range(n):
+        held = min(max(burst_s - k * dt_s, 0.0), dt_s)
+        here = piece(*piece(at[-1], moving[-1], command, held), 0 * command, dt_s - held)
+        at.append(here[0])
+        moving.append(here[1])
+    return np.array(at), np.array(moving)
 
 
-def body_depths(pos, vel, command, bodies, radii, cfg, dt_s):
-    """(peak, mean, contact, first) of one command; bodies [track, k, 2], radii [track, k], negative = nothing."""
+def depth_band(tank, cfg):
+    """Lowest and highest z that the teacher steers for."""
+    return tank.z_m[0] + cfg.edge_gap_m, tank.z_m[1] - cfg.edge_gap_m
+
+
+def distance_to(body, radius, above, below, at, cfg):
+    """(distance [m] of a point to an upright cylinder, its slope along the level direction away from the axis, doubt [m]).
+
+    Between ``below`` and ``above`` the water is free: the cylinder may be anywhere above or anywhere below that slab, whichever is nearer.
+    Level with it, a point inside is as far below zero as it is from the mantle. ``doubt`` is how near the case is to flipping.
+    """
+    level = np.hypot(*(at[:2] - body)) - radius
+    room = min(above - at[2], at[2] - below)
+    doubt = abs(room) if level < 0.001 else np.inf
+    if room <= 0:
+        return level, 1.0, doubt
+    upright = cfg.vertical_weight * room
+    beside = max(level, 0.0)
+    return np.hypot(beside, upright), beside / np.hypot(beside, upright), doubt
+
+
+def body_depths(pos, vel, command, forecast, cfg, tank, dt_s, burst_s=np.inf):
+    """(peak, mean, contact, first, doubt) of one command [m/s, 3].
+
+    ``forecast`` = (places [track, k, 2], radii [track, k], negative = nothing, above [track], below [track]); ``doubt`` [m] = how near any
+    sample is to a case that float32 may decide otherwise.
+    """
     n = round(cfg.horizon_s / dt_s)
-    at, moving = rolled_out(pos, vel, command, cfg.lag_s, dt_s, n)
-    peak, mean, contact, first = 0.0, 0.0, 0.0, np.inf
-    for body, radius in zip(bodies, radii, strict=True):
+    at, moving = rolled_out(pos, vel, command, cfg.lag_s, dt_s, n, burst_s)
+    at[:, 2] = np.clip(at[:, 2], *depth_band(tank, cfg))
+    peak, mean, contact, first, doubt = 0.0, 0.0, 0.0, np.inf, np.inf
+    for body, radius, above, below in zip(*forecast, strict=True):
         if radius[0] < 0:
             continue
         for k in range(1, n + 1):
-            away = at[k] - body[k]
-            distance = np.hypot(*away)
-            closing = max(0.0, -(moving[k] - (body[k] - body[k - 1]) / dt_s) @ away / distance)
-            free = distance - radius[k] - cfg.hull_reach_m - cfg.closing_s * closing
-            depth = max(0.0, cfg.contact_m + cfg.margin_m + cfg.margin_growth_m_s * k * dt_s - free)
+            distance, slope, unsure = distance_to(body[k], radius[k], above, below, at[k], cfg)
+            outward = (at[k, :2] - body[k]) / np.hypot(*(at[k, :2] - body[k]))
+            closing = max(0.0, -(moving[k, :2] - (body[k] - body[k - 1]) / dt_s) @ outward)
+            free = distance - cfg.hull_reach_m - cfg.closing_s * closing * slope
+            wanted = cfg.contact_m + cfg.caution * (cfg.margin_m + cfg.margin_growth_m_s * k * dt_s)
+            depth = max(0.0, wanted - free)
             peak, contact = max(peak, depth), max(contact, cfg.contact_m - free)
             mean += depth / n
+            doubt = min(doubt, unsure)
             if depth > 0:
                 first = min(first, k * dt_s)
-    return peak, mean, contact, first
+    return peak, mean, contact, first, doubt
 
 
-def static_depths(pos, vel, command, clearance, origin, cell_m, cfg):
+def static_depths(pos, vel, command, clearance, origin, cell_m, cfg, burst_s=np.inf):
     """(mean, contact, nearest cell border [m]) of one command on a clearance grid [row, col]."""
     n = max(1, round(cfg.static_horizon_s / cfg.static_dt_s))
-    at, _ = rolled_out(pos, vel, command, cfg.lag_s, cfg.static_dt_s, n)
+    at, _ = rolled_out(pos, vel, command, cfg.lag_s, cfg.static_dt_s, n, burst_s)
     mean, contact, border = 0.0, 0.0, np.inf
-    for x, y in at[1:]:
+    for x, y, _ in at[1:]:
         cells = np.array([(y - origin[1]) / cell_m, (x - origin[0]) / cell_m])
         row, col = np.clip(np.floor(cells).astype(int), 0, np.array(clearance.shape) - 1)
         below = cfg.hull_reach_m + cfg.contact_m - clearance[row, col]
@@ -50,23 +87,48 @@ def static_depths(pos, vel, command, clearance, origin, cell_m, cfg):
     return mean, contact, border
 
 
-def candidates(follow, last, yaw, cfg, vehicle):
-    """Candidate velocities [n, 2] in their order, without padding."""
-    out = []
-    for s in range(cfg.n_speed):
-        for h in range(cfg.n_heading):
-            angle = np.arctan2(follow[1], follow[0]) + 2 * np.pi * h / cfg.n_heading
-            body = np.array([np.cos(angle - yaw) / vehicle.max_surge_m_s, np.sin(angle - yaw) / vehicle.max_sway_m_s])
-            top = min(cfg.evade_m_s, 1 / np.abs(body).max())
-            out.append(top * (s + 1) / cfg.n_speed * np.array([np.cos(angle), np.sin(angle)]))
-    return np.array([*out, np.zeros(2), last, follow])
+def level_velocity(angle, share, yaw, cfg, vehicle):
+    """(x, y) [m/s] towards a world bearing at a share of the speed that surge and sway, limited one by one, allow there."""
+    body = np.array([np.cos(angle - yaw) / vehicle.max_surge_m_s, np.sin(angle - yaw) / vehicle.max_sway_m_s])
+    top = min(cfg.evade_m_s, 1 / np.abs(body).max())
+    return top * share * np.array([np.cos(angle), np.sin(angle)])
 
 
-def cost(pos, vel, command, follow, last, bodies, radii, clearance, origin, cell_m, cfg, dt_s):
-    """(cost of one command, distance of its samples to the nearest cell border [m])."""
-    peak, mean, contact, _ = body_depths(pos, vel, command, bodies, radii, cfg, dt_s)
-    static_mean, static_contact, border = static_depths(pos, vel, command, clearance, origin, cell_m, cfg)
+def candidates(follow, last, yaw, own_z, cfg, vehicle, tank):
+    """(velocities [n, 3], durations [n]) in their order: level, stop, last, follow, climbing and diving, padding, dashes."""
+    ahead, heave = np.arctan2(follow[1], follow[0]), follow[2]
+    low, high = depth_band(tank, cfg)
+    up, down = min(cfg.heave_m_s, max(high - own_z, 0.0)), max(-cfg.heave_m_s, min(low - own_z, 0.0))
+    held = [
+        (*level_velocity(ahead + 2 * np.pi * h / cfg.n_heading, (s + 1) / cfg.n_speed, yaw, cfg, vehicle), heave)
+        for s in range(cfg.n_speed)
+        for h in range(cfg.n_heading)
+    ]
+    held += [(0.0, 0.0, 0.0), tuple(last), tuple(follow)]
+    if cfg.heave_m_s > 0:
+        for h in range(cfg.n_heave_heading):
+            way = level_velocity(ahead + 2 * np.pi * h / cfg.n_heave_heading, 1.0, yaw, cfg, vehicle)
+            held += [(*way, up), (*way, down)]
+        held += [(0.0, 0.0, up), (0.0, 0.0, down)]
+    held += [(0.0, 0.0, 0.0)] * (-len(held) % 16)
+    dashes = []
+    if cfg.burst_s > 0:
+        dashes = [(*level_velocity(ahead + 2 * np.pi * h / 32, 1.0, yaw, cfg, vehicle), heave) for h in range(32)]
+    return np.array(held + dashes), np.array([np.inf] * len(held) + [cfg.burst_s] * len(dashes))
+
+
+def cost(pos, vel, command, burst_s, follow, last, forecast, clearance, origin, cell_m, cfg, tank, dt_s):
+    """(cost of one command, how near any of its samples is to a case or cell that float32 may decide otherwise [m])."""
+    peak, mean, contact, _, doubt = body_depths(pos, vel, command, forecast, cfg, tank, dt_s, burst_s)
+    static_mean, static_contact, border = static_depths(pos, vel, command, clearance, origin, cell_m, cfg, burst_s)
     total = cfg.weight_peak * peak + cfg.weight_mean * mean + cfg.weight_contact * contact
     total += cfg.weight_static * static_mean + cfg.weight_static_contact * static_contact
-    total += cfg.weight_deviation * np.hypot(*(command - follow)) / cfg.cruise_m_s
-    return total + cfg.weight_change * np.hypot(*(command - last)) / cfg.cruise_m_s, border
+    total += cfg.weight_deviation * np.linalg.norm(command - follow) / cfg.cruise_m_s
+    return total + cfg.weight_change * np.linalg.norm(command - last) / cfg.cruise_m_s, min(doubt, border)
+
+
+def mean_velocity(velocities, costs, softness):
+    """Mean of the velocities weighted by exp(-cost / softness); what weighs less than exp(-12) is left out."""
+    excess = (costs - costs.min()) / softness
+    weight = np.where(excess < 12, np.exp(-excess), 0.0)
+    return weight @ velocities / weight.sum()

@@ -51,7 +51,8 @@ def body_depths(
                 decay *= ti.static(_decay(tracking_cfg.forecast_dt_s, teacher_cfg.lag_s))
                 time = k * dt
                 over = ti.max(time - burst_s, 0.0)
-                rest *= ti.select(over > 0.0, ti.static(_decay(tracking_cfg.forecast_dt_s, teacher_cfg.lag_s)), 1.0)
+                if over > 0.0:
+                    rest = ti.exp(over * ti.static(-1.0 / teacher_cfg.lag_s))
                 settle = ti.static(teacher_cfg.lag_s) * (1.0 - decay)
                 gain = time - settle - over + ti.static(teacher_cfg.lag_s) * (1.0 - rest)
                 body = forecast.pos_w[env, track, k]
