@@ -1,62 +1,60 @@
-"""Env-steps per second against the number of envs, on the CPU or a GPU; the result is kept with machine, date and command.
-
-python benchmarks/scale.py --device cpu  --num-envs 64,256,1024
-python benchmarks/scale.py --device cuda --num-envs 1024,4096,16384,65536
-"""
+"""The whole stack, driven by its tree: env-steps per second, time per stage and memory (pool, S = 8, D = 6, depth each 5th step, resets on)."""
 
 from __future__ import annotations
 
-import argparse
-import json
-import subprocess
-import sys
 import time
-from pathlib import Path
 
-HERE = Path(__file__).resolve().parent
+from benchmarks.common import Job, Row
+from uuvtai.loader import load_config
+from uuvtai.measure.profiling import WARM_STEPS, Batch, env_steps_per_s
+from uuvtai.sim import STAGES, Sim
+from uuvtai.sizes import memory_bytes
+from uuvtai.tree import read_tree
+
+DEVICES = ("cpu", "cuda")
+FLOORS = {"paper": 15_000.0, "nominal": 30_000.0}
+"""[env-steps/s] at 1,024 envs on two CPU cores"""
+_FLOOR_ENVS = 1024
+_SENSING = {"paper": "sonar and map each step", "nominal": "at 10 Hz"}
 
 
-def main() -> int:
-    """Run ``uuv profile`` once per size in a process of its own, print a table, write results/<date>_<device>_scale.json."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
-    parser.add_argument("--num-envs", default="64,256,1024")
-    parser.add_argument("--world", default="pool")
-    parser.add_argument("--sensors", default="paper")
-    parser.add_argument("--seconds", type=float, default=10.0)
-    chosen = parser.parse_args()
-    rows, machine = [], {}
-    for n in chosen.num_envs.split(","):
-        command = [
-            sys.executable, "-m", "uuvtai", "profile", "--num-envs", n, "--world", chosen.world, "--sensors", chosen.sensors,
-            "--seconds", str(chosen.seconds), "--device", chosen.device, "--json",
-        ]  # fmt: skip
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode:
-            print(done.stderr, file=sys.stderr)
-            return done.returncode
-        document = json.loads(done.stdout)
-        machine = document["machine"]
-        if chosen.device == "cuda":
-            import torch
+def measure(job: Job) -> list[Row]:
+    """One row per sensing preset and batch size; the paper's stack does about 280 env-steps/s on an RTX 5090."""
+    sizes = job.num_envs or ((8,) if job.quick else (1024,))
+    return [_row(job, sensors, n) for sensors in FLOORS for n in sizes]
 
-            machine["gpu"] = torch.cuda.get_device_name(0)
-        row = document["rows"][0]
-        rows.append(row)
-        speed = row["env_steps_per_s"]
-        print(
-            f"{row['num_envs']:>7} envs  {speed['step']:>12,.0f} env-steps/s random  {speed['step_inference']:>12,.0f} tree-driven  "
-            f"{row['memory_kb_per_env']:,.0f} kB/env  start {row['compile_s']:.0f} s"
-        )
-    name = f"{time.strftime('%Y-%m-%d')}_{chosen.device}_scale.json"
-    target = HERE / "results" / name
-    target.parent.mkdir(exist_ok=True)
-    target.write_text(
-        json.dumps({"command": " ".join(["python", "benchmarks/scale.py", *sys.argv[1:]]), "machine": machine, "rows": rows}, indent=1)
+
+def _row(job: Job, sensors: str, n_env: int) -> Row:
+    job.say(f"{n_env} envs, {sensors} sensing")
+    config = load_config("pool", sensors)
+    begun = time.perf_counter()
+    sim = Sim(config, n_env, read_tree("bt", config.teacher.max_node), job.device)
+    batch = Batch(sim)
+    for _ in range(WARM_STEPS):
+        batch.step()
+    start_s = time.perf_counter() - begun
+    cpu = time.process_time()
+    speed = env_steps_per_s(batch, 2 * job.seconds, lambda: None)
+    cpu_us = 1e6 * (time.process_time() - cpu) / batch.env_steps
+    steps, episodes = batch.env_steps // n_env, batch.episodes
+    sim.stage_s = {}
+    env_steps_per_s(batch, job.seconds, lambda: None)
+    stages = {name: 1e6 * sim.stage_s.get(name, 0.0) / batch.env_steps for name in STAGES}
+    memory = memory_bytes(config, n_env) / 1e3 / n_env
+    bounded = n_env == _FLOOR_ENVS and job.device == "cpu"
+    return Row(
+        what=f"{sensors} sensing ({_SENSING[sensors]}), {n_env:,} envs",
+        ours=speed,
+        unit="env-steps/s",
+        floor=FLOORS[sensors] if bounded else None,
+        note=f"{cpu_us:.1f} us of CPU time a step, {memory:,.0f} kB/env, start {start_s:.0f} s",
+        details={
+            "num_envs": n_env,
+            "cpu_us_per_env_step": cpu_us,
+            "memory_kb_per_env": memory,
+            "start_s": start_s,
+            "steps_measured": steps,
+            "episodes_ended": episodes,
+            "table": {"us per env-step": {**stages, "sum": sum(stages.values())}},
+        },
     )
-    print(target)
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

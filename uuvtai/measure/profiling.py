@@ -15,28 +15,30 @@ from uuvtai.run_folder import hardware, versions
 from uuvtai.sim import STAGES, Sim
 from uuvtai.sizes import memory_bytes
 
-_WARM_STEPS = 60
+WARM_STEPS = 60
 """More than every divider's period, so that each stage has run several times before the clock starts."""
 _MAX_STEPS = 100_000
 _DENSITY = (0, 3, 6, 9, 15)
 
 # the paper's table "Workstation deployability timing" and "Runtime versus dynamic-obstacle density", as printed
 _PAPER_LATENCY = {"Mapping update": (3.33, 6.17), "Global planner": (5.22, 9.89), "Full loop": (28.63, 39.88)}
-_PAPER_DENSITY = {0: (19.7, 51.9), 3: (25.2, 62.7), 6: (28.6, 54.4), 9: (31.6, 48.8), 15: (38.0, 42.7)}
+PAPER_DENSITY = {0: (19.7, 51.9), 3: (25.2, 62.7), 6: (28.6, 54.4), 9: (31.6, 48.8), 15: (38.0, 42.7)}
 
 
 @dataclass
-class _Batch:
+class Batch:
     """A simulator kept running: ended rows begin their next episode at once."""
 
     sim: Sim
+    first_episode: int = 0
+    """number of row 0's first episode; the other rows begin with the numbers after it"""
     env_steps: int = 0
     replans: int = 0
     episodes: int = 0
 
     def __post_init__(self) -> None:
         n, device = self.sim.num_envs, self.sim.device
-        self._number = torch.arange(n, dtype=torch.int32, device=device)
+        self._number = torch.arange(n, dtype=torch.int32, device=device) + self.first_episode
         self._seed = torch.zeros(n, dtype=torch.int32, device=device)
         self.sim.reset(torch.ones(n, dtype=torch.int32, device=device), self._seed, self._number)
 
@@ -44,6 +46,10 @@ class _Batch:
         """One step of every env, resets included."""
         self.sim.step(action)
         self.env_steps += self.sim.num_envs
+        self.renew()
+
+    def renew(self) -> None:
+        """Begin the next episode of every row whose episode has ended."""
         ended = torch.from_numpy((self.sim.rows(self.sim.s.referee.outcome) != RUNNING).astype("int32")).to(self.sim.device)
         if bool(ended.any()):
             rows = ended.nonzero().flatten().tolist()
@@ -66,8 +72,8 @@ def profile(
         begun = time.perf_counter()
         sim = Sim(config, n, tree, device)
         device_used = sim.device.type
-        batch = _Batch(sim)
-        for _ in range(_WARM_STEPS):
+        batch = Batch(sim)
+        for _ in range(WARM_STEPS):
             batch.step()
         compile_s = time.perf_counter() - begun
         rows.append(_row(config, batch, controller, seconds, compile_s))
@@ -83,12 +89,12 @@ def profile(
     return document
 
 
-def _row(config: Config, batch: _Batch, controller: str, seconds: float, compile_s: float) -> dict[str, Any]:
+def _row(config: Config, batch: Batch, controller: str, seconds: float, compile_s: float) -> dict[str, Any]:
     sim = batch.sim
-    step = _rate(batch, seconds, lambda: 2 * torch.rand(sim.num_envs, 4, device=sim.device) - 1)
-    driven = _rate(batch, seconds, lambda: None)
+    step = env_steps_per_s(batch, seconds, lambda: 2 * torch.rand(sim.num_envs, 4, device=sim.device) - 1)
+    driven = env_steps_per_s(batch, seconds, lambda: None)
     sim.stage_s = {}
-    _rate(batch, seconds, lambda: None)
+    env_steps_per_s(batch, seconds, lambda: None)
     stages, steps = sim.stage_s, batch.env_steps
     sim.stage_s = None
     return {
@@ -105,7 +111,7 @@ def _row(config: Config, batch: _Batch, controller: str, seconds: float, compile
     }
 
 
-def _rate(batch: _Batch, seconds: float, action: Callable[[], torch.Tensor | None]) -> float:
+def env_steps_per_s(batch: Batch, seconds: float, action: Callable[[], torch.Tensor | None]) -> float:
     """Env-steps per second over about ``seconds``."""
     batch.env_steps, elapsed = 0, 0.0
     begun = time.perf_counter()
@@ -117,7 +123,7 @@ def _rate(batch: _Batch, seconds: float, action: Callable[[], torch.Tensor | Non
     return batch.env_steps / elapsed
 
 
-def _latency(batch: _Batch, seconds: float) -> list[dict[str, Any]]:
+def _latency(batch: Batch, seconds: float) -> list[dict[str, Any]]:
     """Rows of the paper's timing table that this stack has, one env, mean and max per step."""
     sim, dt = batch.sim, batch.sim.config.episode.control_dt_s
     samples: dict[str, list[float]] = {name: [] for name in _PAPER_LATENCY}
@@ -158,12 +164,12 @@ def _density(config: Config, tree: Any, device: str, seconds: float, say: Callab
     for n_dynamic in _DENSITY:
         say(f"D = {n_dynamic}")
         sim.set_scene(config.world.n_static, n_dynamic, config.world.dynamic_speed_m_s)
-        batch = _Batch(sim)
-        for _ in range(_WARM_STEPS):
+        batch = Batch(sim)
+        for _ in range(WARM_STEPS):
             batch.step()
         batch.replans = batch.episodes = 0
-        rate = _rate(batch, seconds, lambda: None)
-        loop, replans = _PAPER_DENSITY[n_dynamic]
+        rate = env_steps_per_s(batch, seconds, lambda: None)
+        loop, replans = PAPER_DENSITY[n_dynamic]
         rows.append(
             {
                 "D": n_dynamic,
