@@ -498,6 +498,15 @@ class ElevationConfig(Section):
     """heights that are less likely than this are taken to be free"""
     column_tail_share: Fraction = 0.15
 
+    @model_validator(mode="after")
+    def _is_somewhere(self) -> ElevationConfig:
+        if 15 * self.tail_share + self.column_tail_share >= 1:
+            raise ValueError(
+                f"tail_share {self.tail_share} of 15 heights and column_tail_share {self.column_tail_share} must sum to less than 1: "
+                "else a body could be taken to be nowhere"
+            )
+        return self
+
 
 class MappingConfig(Section):
     """Two-layer occupancy map. Gains are per scan at 10 Hz; at another scan rate they are scaled so that gain per second is kept."""
