@@ -1,7 +1,8 @@
 """What the camera says about the height of a tracked body: the column of pixels through its middle shows where it begins and ends.
 
-Only what lies in the image and at the body's distance counts; a body cut by the image's edge tells one end, a column through which the
-camera sees farther tells where no body is. Feeds the height hypotheses of ``elevation.py``; sees the image and tracks only.
+Only what lies in the image and at the body's distance counts; a body cut by the image's edge or by something nearer tells one end, a
+column through which the camera sees farther tells where no body is. Feeds the height hypotheses of ``elevation.py``; sees the image and
+tracks only.
 """
 
 import taichi as ti
@@ -25,6 +26,11 @@ _EDGE_M = 0.1
 
 _LEAST = 0.05
 """Likelihood of a height that the image contradicts."""
+
+# what a pixel of the column shows: something nearer than the body (or the image's edge), the body, something beyond it
+_HIDES = 0
+_BODY = 1
+_PAST = 2
 
 
 @ti.kernel
@@ -77,33 +83,42 @@ def look_at(
         ends, cut = column_ends(env, col, ahead, radius, eye[2], image, R_wb, depth)
         if ends[0] <= ends[1]:
             weigh_camera(env, track, shown_heights(ends, cut, tank), 0, tracks)
-        elif ends[2] <= ends[3]:
-            weigh_camera(env, track, missing_heights(ends, cfg, tank), 1, tracks)
+        else:
+            likely = missing_heights(env, col, ahead, radius, eye[2], image, R_wb, cfg, depth, tank)
+            if likely[COLUMN] < 1.0:
+                weigh_camera(env, track, likely, 1, tracks)
 
 
 @ti.func
 def column_ends(env, col, ahead, radius, eye_z, image: In[DepthImage], R_wb, depth: Const[DepthConfig]):
     """What one column of pixels shows of a body ``ahead`` [m] of the camera.
 
-    (lowest, highest) z of its pixels, (lowest, highest) z at its distance of the pixels that show it or see past it, low > high where there
-    are none; and whether it goes on beyond the image's (lower, upper) edge.
+    (lowest, highest) z of its pixels, low > high where there are none; and whether it goes on unseen at its (lower, upper) end: beyond the
+    image's edge or behind something nearer.
     """
     focal, middle_row, middle_col = ti.static(pinhole(depth))
     left = (middle_col - col) / focal
-    low, high, free_low, free_high = FAR_M, -FAR_M, FAR_M, -FAR_M
+    low, high = FAR_M, -FAR_M
     cut = ti.Vector([0, 0])
+    before = _HIDES
     for row in range(ti.static(depth.rows)):
         away = image.depth_m[env, row, col]
-        climb = R_wb[2, 0] + R_wb[2, 2] * (middle_row - row) / focal + R_wb[2, 1] * left
-        if away > ahead - radius - _DEPTH_SLACK_M:
-            z = eye_z + climb * (ahead - 0.5 * radius)
-            free_low, free_high = ti.min(free_low, z), ti.max(free_high, z)
-        if ti.abs(away - ahead + 0.5 * radius) < 0.5 * radius + _DEPTH_SLACK_M:
-            z = eye_z + climb * away
+        shown = _PAST
+        if away <= ahead - radius - _DEPTH_SLACK_M:
+            shown = _HIDES
+        elif away < ahead + _DEPTH_SLACK_M:
+            shown = _BODY
+        if shown == _BODY:
+            z = eye_z + (R_wb[2, 0] + R_wb[2, 2] * (middle_row - row) / focal + R_wb[2, 1] * left) * away
             low, high = ti.min(low, z), ti.max(high, z)
-            cut[1] = ti.select(row == 0, 1, cut[1])
-            cut[0] = ti.select(row == ti.static(depth.rows) - 1, 1, cut[0])
-    return ti.Vector([low, high, free_low, free_high]), cut
+        if shown == _BODY and before == _HIDES:
+            cut[1] = 1
+        if before == _BODY and shown == _HIDES:
+            cut[0] = 1
+        before = shown
+    if before == _BODY:
+        cut[0] = 1
+    return ti.Vector([low, high]), cut
 
 
 @ti.func
@@ -131,12 +146,29 @@ def shown_heights(ends, cut, tank: Const[TankConfig]):
 
 
 @ti.func
-def missing_heights(ends, cfg: Const[ElevationConfig], tank: Const[TankConfig]):
-    """Likelihood per hypothesis of a body that does not show between ends[2] and ends[3]."""
+def missing_heights(
+    env,
+    col,
+    ahead,
+    radius,
+    eye_z,
+    image: In[DepthImage],
+    R_wb,
+    cfg: Const[ElevationConfig],
+    depth: Const[DepthConfig],
+    tank: Const[TankConfig],
+):
+    """Likelihood per hypothesis of a body that does not show: less where the camera sees past the place of its middle."""
+    focal, middle_row, middle_col = ti.static(pinhole(depth))
+    tilt = R_wb[2, 0] + R_wb[2, 1] * (middle_col - col) / focal
+    front = ahead - 0.5 * radius
     at = heights(tank)
     out = f16x(1.0)
-    for i in ti.static(range(LANES)):
-        if at[i] > ends[2] and at[i] < ends[3]:
+    for i in ti.static(range(COLUMN)):
+        up = ((at[i] - eye_z) / front - tilt) / R_wb[2, 2]
+        row = ti.cast(ti.floor(middle_row - focal * up + 0.5), ti.i32)
+        held = ti.math.clamp(row, 0, depth.rows - 1)
+        if row == held and image.depth_m[env, held, col] > ahead - radius - _DEPTH_SLACK_M:
             out[i] = 1.0 - cfg.camera_hit_share
-    out[COLUMN] = 1.0 - cfg.camera_hit_share
+            out[COLUMN] = 1.0 - cfg.camera_hit_share
     return out
