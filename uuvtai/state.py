@@ -8,6 +8,7 @@ Truth (what the simulator knows) and sensed or remembered data (what the vehicle
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -23,12 +24,14 @@ PACKET = 16
 """Lanes of a packed array (lanes.LANES)."""
 
 
-def array(*shape: str, vec: int = 0, dtype: Any = REAL, packed: bool = False) -> Any:
+def array(*shape: str, vec: int = 0, dtype: Any = REAL, packed: bool = False, lanes: bool = False) -> Any:
     """Declare one array of a struct: named sizes, optional vector length, dtype (default: the run's real type).
 
     ``packed`` groups the last axis into vectors of sixteen neighbours: one packet is one index, which Taichi loads as a whole.
+    ``lanes`` keeps single elements as indices, but lays the last axis (padded to whole packets) out in groups of sixteen, so that the
+    compiler sees that a loop over ``packet * 16 + i`` with static i meets neighbours: it then loads, computes and stores whole vectors.
     """
-    return dataclasses.field(metadata={"shape": shape, "vec": vec, "dtype": dtype, "packed": packed})
+    return dataclasses.field(metadata={"shape": shape, "vec": vec, "dtype": dtype, "packed": packed, "lanes": lanes})
 
 
 def allocate(struct: type[_T], sizes: dict[str, int], real: Any = ti.f32) -> _T:
@@ -41,6 +44,8 @@ def _field(declared: dataclasses.Field, sizes: dict[str, int], real: Any) -> Any
     dtype = real if declared.metadata["dtype"] is REAL else declared.metadata["dtype"]
     if declared.metadata["packed"]:
         return ti.Vector.field(PACKET, dtype, shape=(*shape[:-1], shape[-1] // PACKET), layout=ti.Layout.AOS)
+    if declared.metadata["lanes"]:
+        return _field_in_lanes(shape, dtype)
     if declared.metadata["vec"]:
         # a vector's components stay together: apart, they would lie a whole array from each other, which for a power of two of envs is the
         # same cache set for every component of every array
@@ -48,13 +53,28 @@ def _field(declared: dataclasses.Field, sizes: dict[str, int], real: Any) -> Any
     return ti.field(dtype, shape=shape)
 
 
+def _field_in_lanes(shape: tuple[int, ...], dtype: Any) -> Any:
+    """A scalar field whose last axis is split in two levels, the inner one of sixteen; in memory and in use it is like any other."""
+    field, axes, node = ti.field(dtype), (ti.i, ti.j, ti.k, ti.l)[: len(shape)], ti.root
+    for axis, length in zip(axes[:-1], shape[:-1], strict=True):
+        node = node.dense(axis, length)
+    node.dense(axes[-1], _packets(shape[-1])).dense(axes[-1], PACKET).place(field)
+    return field
+
+
+def _packets(length: int) -> int:
+    return -(-length // PACKET)
+
+
 def bytes_of(struct: type, sizes: dict[str, int], real_bytes: int = 4) -> int:
     """Memory that ``allocate`` would take [bytes], known before anything is allocated."""
     total = 0
     for declared in dataclasses.fields(struct):
         count = max(1, declared.metadata["vec"])
-        for name in declared.metadata["shape"]:
-            count *= sizes[name]
+        shape = [sizes[name] for name in declared.metadata["shape"]]
+        if declared.metadata["lanes"]:
+            shape[-1] = PACKET * _packets(shape[-1])
+        count *= math.prod(shape)
         total += count * (real_bytes if declared.metadata["dtype"] is REAL else _DTYPE_BYTES[declared.metadata["dtype"]])
     return total
 
@@ -314,13 +334,13 @@ class ProprioceptionMemory:
 class SonarScan:
     """Sensed: the newest delivered sonar scan. Beam 0 ahead, counter-clockwise, horizontal."""
 
-    range_m: ti.Field = array("n_env", "n_ray")
+    range_m: ti.Field = array("n_env", "n_ray", lanes=True)
     """[m] no return = maximum range"""
-    doppler_m_s: ti.Field = array("n_env", "n_ray")
+    doppler_m_s: ti.Field = array("n_env", "n_ray", lanes=True)
     """[m/s] rate of change of the distance to what the beam hit, positive = receding, ego motion included"""
-    intensity: ti.Field = array("n_env", "n_ray")
+    intensity: ti.Field = array("n_env", "n_ray", lanes=True)
     """[0, 1]"""
-    hit: ti.Field = array("n_env", "n_ray", dtype=ti.i32)
+    hit: ti.Field = array("n_env", "n_ray", lanes=True, dtype=ti.i32)
     """1 = return"""
     fresh: ti.Field = array("n_env", dtype=ti.i32)
     """1 = delivered in this very step"""
@@ -338,13 +358,13 @@ class SonarScan:
 class SonarMemory:
     """Hidden state of the sonar (simulator side): scans under way and bubble clouds."""
 
-    range_m: ti.Field = array("n_env", "n_latency", "n_ray")
+    range_m: ti.Field = array("n_env", "n_latency", "n_ray", lanes=True)
     """[m] ring of scans taken and not yet delivered"""
-    doppler_m_s: ti.Field = array("n_env", "n_latency", "n_ray")
+    doppler_m_s: ti.Field = array("n_env", "n_latency", "n_ray", lanes=True)
     """[m/s]"""
-    intensity: ti.Field = array("n_env", "n_latency", "n_ray")
+    intensity: ti.Field = array("n_env", "n_latency", "n_ray", lanes=True)
     """[0, 1]"""
-    hit: ti.Field = array("n_env", "n_latency", "n_ray", dtype=ti.i32)
+    hit: ti.Field = array("n_env", "n_latency", "n_ray", lanes=True, dtype=ti.i32)
     """1 = return"""
     step: ti.Field = array("n_env", "n_latency", dtype=ti.i32)
     """step at which it was taken, -1 = empty"""
@@ -354,6 +374,18 @@ class SonarMemory:
     """[rad]"""
     vel_b: ti.Field = array("n_env", "n_latency", vec=3)
     """[m/s]"""
+    mount_w: ti.Field = array("n_env", vec=3)
+    """[m] scratch of one ping: true position of the sonar"""
+    mount_vel_w: ti.Field = array("n_env", vec=2)
+    """[m/s] its true horizontal velocity"""
+    heading_w: ti.Field = array("n_env", vec=2)
+    """unit vector along beam 0"""
+    body_x_m: ti.Field = array("n_env", "n_body", lanes=True)
+    """[m] scratch of one ping: centre of a body's outline from the sensor, along x of the world"""
+    body_y_m: ti.Field = array("n_env", "n_body", lanes=True)
+    """[m] along y"""
+    body_reach_m: ti.Field = array("n_env", "n_body", lanes=True)
+    """[m] radius around it that holds the outline, far below 0 = empty slot"""
     cloud_beam: ti.Field = array("n_env", "n_cloud", dtype=ti.i32)
     """first beam of a bubble cloud, counted from the world's x axis"""
     cloud_width: ti.Field = array("n_env", "n_cloud", dtype=ti.i32)
@@ -368,7 +400,7 @@ class SonarMemory:
 class DepthImage:
     """Sensed: forward depth camera, row 0 at the top, column 0 at the left."""
 
-    depth_m: ti.Field = array("n_env", "n_pixel_row", "n_pixel_col", dtype=ti.f32)
+    depth_m: ti.Field = array("n_env", "n_pixel_row", "n_pixel_col", lanes=True, dtype=ti.f32)
     """[m] z-depth along the optical axis; no return = maximum range"""
     fresh: ti.Field = array("n_env", dtype=ti.i32)
     """1 = taken in this very step"""

@@ -8,9 +8,9 @@ import taichi as ti
 
 from uuvtai.config import TankConfig
 from uuvtai.kernels.geometry import BOX, FAR_M, NONE, SPHERE
-from uuvtai.kernels.lanes import f16x
-from uuvtai.kernels.signature import Const, In
-from uuvtai.state import WorldState
+from uuvtai.kernels.lanes import LANES, f16x
+from uuvtai.kernels.signature import Const, In, Out
+from uuvtai.state import SonarMemory, WorldState
 
 _TINY = 1.0e-9
 """Below this a direction component counts as parallel."""
@@ -79,50 +79,102 @@ def rim_distance(x, y, dx, dy, radius):
 
 
 @ti.func
-def nearest_echo(env, x, y, z, ux, uy, travelled, slope, wedge, cull: Const[bool], world: In[WorldState], tank: Const[TankConfig]):
+def place_bodies(env, x, y, world: In[WorldState], memory: Out[SonarMemory]):
+    """Write centre and reach of every body's outline, as seen from (x, y), for ``bodies_in_wedge``; an empty slot reaches nowhere."""
+    n_body = ti.static(world.kind.shape[1])
+    for slot in range(memory.body_reach_m.shape[1]):
+        reach = -FAR_M
+        if slot < n_body:
+            kind = world.kind[env, slot]
+            if kind != NONE:
+                size = world.size[env, slot]
+                memory.body_x_m[env, slot] = world.pos_w[env, slot][0] - x
+                memory.body_y_m[env, slot] = world.pos_w[env, slot][1] - y
+                reach = ti.cast(size[0] + ti.select(kind == BOX, size[1], 0.0), ti.f32)  # no less than half a box's diagonal
+        memory.body_reach_m[env, slot] = reach
+
+
+@ti.func
+def bodies_in_wedge(env, first, wedge, memory: In[SonarMemory]):
+    """Bit set of those among sixteen bodies whose outline may reach into a wedge at the sensor (conservative).
+
+    ``wedge`` = (x, y) of its middle direction, then (cos, sin) of its half angle.
+    """
+    x, y, reach = f16x(0.0), f16x(0.0), f16x(0.0)
+    for i in ti.static(range(LANES)):
+        x[i], y[i], reach[i] = memory.body_x_m[env, first + i], memory.body_y_m[env, first + i], memory.body_reach_m[env, first + i]
+    along = x * wedge[0] + y * wedge[1]
+    across = ti.abs(x * wedge[1] - y * wedge[0])
+    return lane_bits(across * wedge[2] - along * wedge[3] <= reach)
+
+
+@ti.func
+def bodies_there(env, first, memory: In[SonarMemory]):
+    """Bit set of the slots in use among sixteen."""
+    reach = f16x(0.0)
+    for i in ti.static(range(LANES)):
+        reach[i] = memory.body_reach_m[env, first + i]
+    return lane_bits(reach >= 0.0)
+
+
+@ti.func
+def lane_bits(condition):
+    """Bit i is 1 where the condition holds in lane i."""
+    weights = ti.Vector(ti.static([1 << i for i in range(LANES)]))
+    return ti.select(condition, weights, 0).sum()  # type: ignore[misc]
+
+
+@ti.func
+def nearest_echo(
+    env,
+    x,
+    y,
+    z,
+    ux,
+    uy,
+    travelled,
+    slope,
+    wedge,
+    direct: Const[bool],
+    memory: In[SonarMemory],
+    world: In[WorldState],
+    tank: Const[TankConfig],
+):
     """Nearest surface along level rays (ux, uy) from (x, y) in the plane z, after a path already ``travelled`` [m].
 
     A body counts where its vertical gap is at most slope x path. (x, y) and ``travelled`` are scalars, or lanes after a bounce.
-    With ``cull`` (scalar start only) bodies outside ``wedge`` are not tested.
+    ``direct`` rays start at the sensor, where only bodies in their ``wedge`` need a test.
     """
     echo = wall_echo(x, y, ux, uy, tank)
-    for body in range(world.kind.shape[1]):
-        kind = world.kind[env, body]
-        if kind != NONE:
-            pos = world.pos_w[env, body].cast(ti.f32)
-            size = world.size[env, body].cast(ti.f32)
-            sx, sy = x - pos[0], y - pos[1]
-            reached = True
-            if ti.static(cull):
-                reached = reaches_wedge(sx, sy, outline_radius(kind, size), wedge)
-            if reached:
-                enter, normal_x, normal_y = outline_entry(env, body, kind, size, pos[2] - z, sx, sy, ux, uy, travelled, slope, world)
-                gap = ti.select(kind == SPHERE, 0.0, ti.max(ti.abs(pos[2] - z) - size[2], 0.0))
-                nearer = (enter > _SKIN_M) & (enter < echo.range_m) & ((enter + travelled) * slope >= gap)
-                vel = world.vel_w[env, body].cast(ti.f32)
-                echo.range_m = ti.select(nearer, enter, echo.range_m)
-                echo.normal_x = ti.select(nearer, normal_x, echo.normal_x)
-                echo.normal_y = ti.select(nearer, normal_y, echo.normal_y)
-                echo.vel_x = ti.select(nearer, vel[0], echo.vel_x)
-                echo.vel_y = ti.select(nearer, vel[1], echo.vel_y)
+    for group in range(ti.static(memory.body_reach_m.shape[1] // LANES)):
+        waiting = 0
+        if ti.static(direct):
+            waiting = bodies_in_wedge(env, group * LANES, wedge, memory)
+        else:
+            waiting = bodies_there(env, group * LANES, memory)
+        while waiting != 0:
+            body = group * LANES + 31 - ti.math.clz(waiting & -waiting)  # the lowest bit
+            waiting &= waiting - 1
+            echo = nearer_echo(env, body, echo, x, y, z, ux, uy, travelled, slope, world)
     return echo
 
 
 @ti.func
-def outline_radius(kind, size):
-    """Radius of a circle around the horizontal outline [m]."""
-    return ti.select(kind == BOX, ti.sqrt(size[0] * size[0] + size[1] * size[1]), size[0])
-
-
-@ti.func
-def reaches_wedge(sx, sy, radius, wedge):
-    """Whether a circle of this radius around -(sx, sy) reaches into the wedge at the origin (conservative).
-
-    ``wedge`` = (x, y) of its middle direction, then (cos, sin) of its half angle.
-    """
-    along = -(sx * wedge[0] + sy * wedge[1])
-    across = ti.abs(sx * wedge[1] - sy * wedge[0])
-    return across * wedge[2] - along * wedge[3] <= radius
+def nearer_echo(env, body, echo, x, y, z, ux, uy, travelled, slope, world: In[WorldState]):
+    """The echo, or a body's where that is nearer."""
+    out = echo
+    kind = world.kind[env, body]
+    pos, size = world.pos_w[env, body].cast(ti.f32), world.size[env, body].cast(ti.f32)
+    enter, normal_x, normal_y = outline_entry(env, body, kind, size, pos[2] - z, x - pos[0], y - pos[1], ux, uy, travelled, slope, world)
+    gap = ti.select(kind == SPHERE, 0.0, ti.max(ti.abs(pos[2] - z) - size[2], 0.0))
+    nearer = (enter > _SKIN_M) & (enter < echo.range_m) & ((enter + travelled) * slope >= gap)
+    vel = world.vel_w[env, body].cast(ti.f32)
+    out.range_m = ti.select(nearer, enter, echo.range_m)
+    out.normal_x = ti.select(nearer, normal_x, echo.normal_x)
+    out.normal_y = ti.select(nearer, normal_y, echo.normal_y)
+    out.vel_x = ti.select(nearer, vel[0], echo.vel_x)
+    out.vel_y = ti.select(nearer, vel[1], echo.vel_y)
+    return out
 
 
 @ti.func

@@ -10,9 +10,9 @@ import math
 import taichi as ti
 
 from uuvtai.config import EpisodeConfig, SonarConfig, TankConfig
-from uuvtai.kernels.geometry import FAR_M, rotation_wb, turned_z
+from uuvtai.kernels.geometry import FAR_M, rotation_wb
 from uuvtai.kernels.lanes import LANES, f16x
-from uuvtai.kernels.raycast import nearest_echo
+from uuvtai.kernels.raycast import nearest_echo, place_bodies
 from uuvtai.kernels.signature import Const, In, Out, spread
 from uuvtai.kernels.sonar_error import (
     cloud_covered,
@@ -89,15 +89,16 @@ def cast_sonar(
     """
     n = ti.static(clock.awake.shape[0])
     n_packet = ti.static(sonar.n_ray // LANES)
-    if ti.static(sonar.bubble_clouds_per_s > 0):
-        for env, pad in ti.ndrange(n, ti.static(spread(n))):
-            if pad == 0 and clock.awake[env] == 1 and clock.step[env] % sonar.period_steps == 0:
+    for env, pad in ti.ndrange(n, ti.static(spread(n))):
+        if pad == 0 and clock.awake[env] == 1 and clock.step[env] % sonar.period_steps == 0:
+            place_sonar(env, memory, vehicle, world)
+            if ti.static(sonar.bubble_clouds_per_s > 0):
                 start_cloud(env, memory, episode, clock, sonar, rules)
     for env, packet, pad in ti.ndrange(n, n_packet, ti.static(spread(n * n_packet))):
         if pad == 0 and clock.awake[env] == 1:
             step = clock.step[env]
             if step % sonar.period_steps == 0:
-                ping(env, packet, step, scan, memory, ego, vehicle, world, episode, sonar, tank)
+                ping(env, packet, step, scan, memory, ego, world, episode, sonar, tank)
             deliver(env, packet, step, scan, memory, sonar)
 
 
@@ -109,14 +110,13 @@ def ping(
     scan: Out[SonarScan],
     memory: Out[SonarMemory],
     ego: In[Proprioception],
-    vehicle: In[VehicleState],
     world: In[WorldState],
     episode: In[EpisodeState],
     sonar: Const[SonarConfig],
     tank: Const[TankConfig],
 ):
     """Sixteen beams: without latency straight into the scan, else into the ring."""
-    range_m, doppler, intensity = measured(env, packet, step, memory, vehicle, world, episode, sonar, tank)
+    range_m, doppler, intensity = measured(env, packet, step, memory, world, episode, sonar, tank)
     if ti.static(sonar.latency_steps == 0):
         show(env, packet, step, range_m, doppler, intensity, scan, ego, sonar)
     else:
@@ -198,22 +198,21 @@ def measured(
     packet,
     step,
     memory: In[SonarMemory],
-    vehicle: In[VehicleState],
     world: In[WorldState],
     episode: In[EpisodeState],
     sonar: Const[SonarConfig],
     tank: Const[TankConfig],
 ):
     """(range, Doppler, intensity) of sixteen beams as the sensor reports them; range FAR_M = no return."""
-    mount = sonar_mount(env, vehicle)
+    mount = sonar_mount(env, memory)
     ux, uy = beam_directions(packet, mount.heading, sonar)
     wedge = packet_wedge(packet, mount.heading, sonar)
     slope = ti.static(math.tan(math.radians(sonar.vertical_half_aperture_deg)))
-    echo = nearest_echo(env, mount.pos[0], mount.pos[1], mount.pos[2], ux, uy, 0.0, slope, wedge, True, world, tank)
+    echo = nearest_echo(env, mount.pos[0], mount.pos[1], mount.pos[2], ux, uy, 0.0, slope, wedge, True, memory, world, tank)
     cosine = -(ux * echo.normal_x + uy * echo.normal_y)
     own = ux * mount.vel[0] + uy * mount.vel[1]
     key, ray = episode.key[env], packet * LANES
-    bounced, away = ghosted(env, echo, cosine, ux, uy, mount.pos, slope, wedge, key, step, ray, world, sonar, tank)
+    bounced, away = ghosted(env, echo, cosine, ux, uy, mount.pos, slope, wedge, key, step, ray, memory, world, sonar, tank)
     clear = grazing_lost(bounced, cosine, sonar)
     clouded, still, bright = cloud_covered(env, clear, away, cosine, mount.heading, ray, step, memory, sonar)
     heard = missed(clouded, key, step, ray, sonar)
@@ -226,36 +225,58 @@ def measured(
 
 
 @ti.func
-def sonar_mount(env, vehicle: In[VehicleState]):
-    """Where the sonar is, how it moves and where it looks: roll and pitch do not matter."""
+def place_sonar(env, memory: Out[SonarMemory], vehicle: In[VehicleState], world: In[WorldState]):
+    """Truth of a ping that all its beams share, once per ping: roll and pitch do not matter."""
     R_wb = rotation_wb(vehicle.quat_wb[env])
     vel_w = R_wb @ vehicle.vel_b[env]
     ahead = ti.Vector([R_wb[0, 0], R_wb[1, 0]])
     heading = ahead / ti.max(ahead.norm(), 1.0e-6)
-    return Mount(
-        pos=vehicle.pos_w[env].cast(ti.f32),
-        vel=ti.cast(ti.Vector([vel_w[0], vel_w[1]]), ti.f32),
-        heading=ti.cast(heading, ti.f32),
-    )
+    memory.mount_w[env] = vehicle.pos_w[env]
+    memory.mount_vel_w[env] = ti.Vector([vel_w[0], vel_w[1]])
+    memory.heading_w[env] = heading
+    place_bodies(env, vehicle.pos_w[env][0], vehicle.pos_w[env][1], world, memory)
+
+
+@ti.func
+def sonar_mount(env, memory: In[SonarMemory]):
+    """Where the sonar is, how it moves and where it looks."""
+    return Mount(pos=memory.mount_w[env].cast(ti.f32), vel=memory.mount_vel_w[env].cast(ti.f32), heading=memory.heading_w[env].cast(ti.f32))
+
+
+@ti.func
+def direction_before(packet, heading, sonar: Const[SonarConfig]):
+    """Direction (x, y) one beam before a packet's first, where no cosine or sine of a lane's turn is 0 or 1, so that all lanes stay alike.
+
+    The packet's turn comes from a table of constants.
+    """
+    c, s = 0.0, 0.0
+    for k in ti.static(range(sonar.n_ray // LANES)):
+        if packet == k:
+            turn = ti.static(2.0 * math.pi * (LANES * k - 1) / sonar.n_ray)
+            cosine, sine = ti.static(math.cos(turn), math.sin(turn))
+            c, s = cosine, sine
+    return ti.Vector([c * heading[0] - s * heading[1], s * heading[0] + c * heading[1]])
 
 
 @ti.func
 def beam_directions(packet, heading, sonar: Const[SonarConfig]):
     """Horizontal unit vectors (x, y) of a packet's beams."""
-    step_rad = ti.static(2.0 * math.pi / sonar.n_ray)
-    first = turned_z(heading, packet * (LANES * step_rad))
+    before = direction_before(packet, heading, sonar)
     ux, uy = f16x(0.0), f16x(0.0)
     for i in ti.static(range(LANES)):
-        c, s = ti.static(math.cos(i * step_rad), math.sin(i * step_rad))
-        ux[i] = first[0] * c - first[1] * s
-        uy[i] = first[0] * s + first[1] * c
+        turn = ti.static(2.0 * math.pi * (i + 1) / sonar.n_ray)
+        c, s = ti.static(math.cos(turn), math.sin(turn))
+        ux[i] = before[0] * c - before[1] * s
+        uy[i] = before[0] * s + before[1] * c
     return ux, uy
 
 
 @ti.func
 def packet_wedge(packet, heading, sonar: Const[SonarConfig]):
     """(x, y) of the middle direction of a packet's beams, then (cos, sin) of the half angle between its outermost beams."""
-    step_rad = ti.static(2.0 * math.pi / sonar.n_ray)
-    middle = turned_z(heading, (packet * LANES + 0.5 * (LANES - 1)) * step_rad)
-    c, s = ti.static(math.cos(0.5 * (LANES - 1) * step_rad), math.sin(0.5 * (LANES - 1) * step_rad))
-    return ti.Vector([middle[0], middle[1], c, s])
+    half = ti.static((LANES - 1) * math.pi / sonar.n_ray)
+    middle = ti.static(half + 2.0 * math.pi / sonar.n_ray)
+    c, s = ti.static(math.cos(middle), math.sin(middle))
+    before = direction_before(packet, heading, sonar)
+    x, y = c * before[0] - s * before[1], s * before[0] + c * before[1]
+    return ti.Vector([x, y, ti.static(math.cos(half)), ti.static(math.sin(half))])

@@ -10,8 +10,9 @@ from uuvtai.kernels.noise import (
     STREAM_SONAR_DOPPLER,
     STREAM_SONAR_DROP,
     STREAM_SONAR_GHOST,
+    STREAM_SONAR_NORMAL,
     STREAM_SONAR_RANGE,
-    normal_lanes,
+    normal_pair_lanes,
     stream_key,
     uniform,
     uniform_in,
@@ -41,6 +42,7 @@ def ghosted(
     key,
     step,
     ray,
+    memory: In[SonarMemory],
     world: In[WorldState],
     sonar: Const[SonarConfig],
     tank: Const[TankConfig],
@@ -57,7 +59,7 @@ def ghosted(
         if any_lane(chosen):
             mx, my = ux + 2.0 * cosine * echo.normal_x, uy + 2.0 * cosine * echo.normal_y
             x, y = pos[0] + range_m * ux, pos[1] + range_m * uy
-            second = nearest_echo(env, x, y, pos[2], mx, my, range_m, slope, wedge, False, world, tank)
+            second = nearest_echo(env, x, y, pos[2], mx, my, range_m, slope, wedge, False, memory, world, tank)
             path = range_m + second.range_m
             heard = chosen & (path <= sonar.max_range_m)
             extra = mx * (second.vel_x - echo.vel_x) + my * (second.vel_y - echo.vel_y)
@@ -133,11 +135,12 @@ def missed(range_m, key, step, ray, sonar: Const[SonarConfig]):
 
 @ti.func
 def range_noisy(range_m, key, step, ray, sonar: Const[SonarConfig]):
-    """Range with its near-normal error (sigma = a + b r) and its positive exponential jitter."""
+    """Range with its normal error (sigma = a + b r) and its positive exponential jitter."""
     out = range_m + 0.0
     stream = stream_key(key, step, STREAM_SONAR_RANGE)
     if ti.static(sonar.range_sigma_m > 0 or sonar.range_sigma_slope > 0):
-        out += (sonar.range_sigma_m + sonar.range_sigma_slope * range_m) * normal_lanes(stream, ray)
+        error, _of_doppler = normal_pair_lanes(stream_key(key, step, STREAM_SONAR_NORMAL), ray)
+        out += (sonar.range_sigma_m + sonar.range_sigma_slope * range_m) * error
     if ti.static(sonar.range_jitter_m > 0):
         out -= sonar.range_jitter_m * ti.log(1.0 - uniform_lanes(stream, sonar.n_ray + ray))
     return out
@@ -167,11 +170,12 @@ def cut_off(range_m, sonar: Const[SonarConfig]):
 
 @ti.func
 def doppler_noisy(doppler, key, step, ray, sonar: Const[SonarConfig]):
-    """Doppler with its near-normal error; an outlier is uniform within +- doppler_outlier_m_s."""
+    """Doppler with its normal error, the other of the range's pair (one draw serves both); an outlier is uniform within +- a limit."""
     out = doppler + 0.0
     stream = stream_key(key, step, STREAM_SONAR_DOPPLER)
     if ti.static(sonar.doppler_sigma_m_s > 0):
-        out += sonar.doppler_sigma_m_s * normal_lanes(stream, ray)
+        _of_range, error = normal_pair_lanes(stream_key(key, step, STREAM_SONAR_NORMAL), ray)
+        out += sonar.doppler_sigma_m_s * error
     noisy = out + 0.0
     if ti.static(sonar.doppler_outlier > 0):
         chosen = uniform_lanes(stream, sonar.n_ray + ray) < sonar.doppler_outlier

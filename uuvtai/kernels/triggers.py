@@ -47,34 +47,32 @@ def fire_triggers(
     """Move the foot along the route, find the triggers that hold, and queue the envs that plan in this step in the order of their ids."""
     n = ti.static(clock.awake.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0:
-            route.want_plan[env] = 0
-            if clock.awake[env] == 1:
-                if route.n_way[env] > 0:
-                    route.arc[env] = advanced_arc(route, env, level(ego.pos_w[env]), cfg)
-                look_along(route, env, level(ego.pos_w[env]), cfg, mapping_cfg)
-                _count_stuck(env, route, ego, mission, cfg, episode_cfg)
-                holding = _held_triggers(
-                    env,
-                    route,
-                    clearance,
-                    grid_map,
-                    mask,
-                    forecast,
-                    scan,
-                    clock,
-                    cfg,
-                    voronoi_cfg,
-                    tracking_cfg,
-                    mapping_cfg,
-                    tank_cfg,
-                    episode_cfg,
-                )
-                _serve(env, holding, route, clock)
+        if pad == 0 and clock.awake[env] == 1:
+            if route.n_way[env] > 0:
+                route.arc[env] = advanced_arc(route, env, level(ego.pos_w[env]), cfg)
+            look_along(route, env, level(ego.pos_w[env]), cfg, mapping_cfg)
+            _count_stuck(env, route, ego, mission, cfg, episode_cfg)
+            holding = _held_triggers(
+                env,
+                route,
+                clearance,
+                grid_map,
+                mask,
+                forecast,
+                scan,
+                clock,
+                cfg,
+                voronoi_cfg,
+                tracking_cfg,
+                mapping_cfg,
+                tank_cfg,
+                episode_cfg,
+            )
+            _serve(env, holding, route, clock)
     for _ in range(1):
         count = 0
         for env in range(n):
-            if route.want_plan[env] == 1:
+            if clock.awake[env] == 1 and route.want_plan[env] == 1:
                 route.queue[count] = env
                 count += 1
         route.n_queue[None] = count
