@@ -278,7 +278,7 @@ def test_a_likely_column_leaves_no_free_water(stage):
 
 
 def test_without_memory_every_body_is_level(stage):
-    """And what does not move, is not there or sleeps gets no bounds at all."""
+    """And so is what does not move or is not there, with memory too (no trace is left of who had the slot before); who sleeps sleeps."""
     share = np.zeros((N_ENV, N_TRACK, LANES))
     share[:, :, near(-0.2)] = 1
     stage.set_share(share)
@@ -287,11 +287,13 @@ def test_without_memory_every_body_is_level(stage):
     stage.put(stage.tracks, moving=moving, alive=alive)
     stage.put(stage.clock, awake=awake)
     above, below = stage.bound(FORGETFUL)
-    bounded = (moving * alive * awake[:, None]).astype(bool)
-    np.testing.assert_allclose((above[bounded], below[bounded]), -0.8, atol=BOUND_TOLERANCE)
-    np.testing.assert_array_equal((above[~bounded], below[~bounded]), -9.0)
+    np.testing.assert_allclose((above[awake == 1], below[awake == 1]), -0.8, atol=BOUND_TOLERANCE)
+    np.testing.assert_array_equal((above[1], below[1]), -9.0)
     above, below = stage.bound()
+    bounded = (moving * alive * awake[:, None]).astype(bool)
     assert (above[bounded] > -0.5).all() and (below[bounded] < -100).all()
+    np.testing.assert_allclose((above[0, 1:3], below[0, 1:3]), -0.8, atol=BOUND_TOLERANCE)
+    np.testing.assert_array_equal((above[1], below[1]), -9.0)
 
 
 def test_no_body_is_in_water_called_free(stage):

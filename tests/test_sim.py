@@ -46,6 +46,22 @@ def test_a_reset_touches_only_its_rows(small):
     assert equal(before, after, [2], [2]) != []
 
 
+def test_the_camera_is_asked_about_heights_only_if_the_config_says_so(small, monkeypatch):
+    """The kernels that read this section of the config are left out: nothing is compiled again for the switch."""
+    asked, sim = [], small.sim
+    small.begin([0])
+    monkeypatch.setattr("uuvtai.sim.tracking.track_bodies", lambda *_: None)
+    monkeypatch.setattr("uuvtai.sim.elevation.bound_heights", lambda *_: None)
+    monkeypatch.setattr("uuvtai.sim.look.look_at_bodies", lambda *_: asked.append(1))
+    for use, calls in ((True, 3), (False, 0)):
+        changed = small.config.elevation.model_copy(update={"use_camera": use})
+        monkeypatch.setattr(sim, "config", small.config.model_copy(update={"elevation": changed}))
+        for _ in range(3):
+            sim.step()
+        assert len(asked) == calls
+        asked.clear()
+
+
 def test_what_no_sensor_can_see_changes_nothing(small):
     """Move an obstacle far outside every sensor's reach and change hidden truth: actions, maps and routes stay bit-identical."""
 

@@ -121,14 +121,15 @@ def bound_heights(
     cfg: Const[ElevationConfig],
     tank: Const[TankConfig],
 ):
-    """Free water above and below the own height for every moving track: ``above_w`` is the lowest edge of what may be above, ``below_w``
-    the highest edge of what may be below; both are the own height where the body may be level with the vehicle."""
+    """Free water above and below the own height: ``above_w`` is the lowest edge of what may be above, ``below_w`` the highest edge of what
+    may be below; both are the own height where the body may be level with the vehicle, and for tracks that do not move.
+    """
     n, n_track = ti.static(tracks.alive.shape[0], tracks.alive.shape[1])
     for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n * n_track))):
-        if pad == 0 and clock.awake[env] == 1 and tracks.alive[env, track] * tracks.moving[env, track] == 1:
+        if pad == 0 and clock.awake[env] == 1:
             own_z = ego.pos_w[env][2]
             above, below = own_z, own_z
-            if ti.static(cfg.memory_s > 0):
+            if ti.static(cfg.memory_s > 0) and tracks.alive[env, track] * tracks.moving[env, track] == 1:
                 above, below = free_water(env, track, own_z, tracks, cfg, tank)
             forecast.above_w[env, track] = above
             forecast.below_w[env, track] = below
