@@ -112,14 +112,14 @@ def plan_rrt(
     is_valid = grid.checker((start, goal))
     if not (is_valid(start) and is_valid(goal)):
         return None
-    path = _solve(start, goal, grid, is_valid, iterations, seed, range_m)
+    path = solve_rrt(start, goal, grid, is_valid, iterations, seed, range_m)
     return None if path is None else _straightened(path, grid, epsilon_m)
 
 
-def _solve(
+def solve_rrt(
     start: Point, goal: Point, grid: ClearanceGrid, is_valid: Callable, iterations: int, seed: int, range_m: float
 ) -> np.ndarray | None:
-    """OMPL's RRT from a fresh state of its random numbers."""
+    """OMPL's RRT from a fresh state of its random numbers: its path (n, 2) [m] as it is, or None."""
     from ompl import base, geometric, util
 
     util.setLogLevel(util.LogLevel.LOG_NONE)

@@ -1,0 +1,125 @@
+"""Plans of the Voronoi route against OMPL's RRT on the same maps, with the same traversable cells."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from benchmarks.common import Job, Row, seconds_per_call
+from tests import planning_maps as maps
+from tests.reference.voronoi import clearance_of
+from uuvtai import rrt, state
+from uuvtai.config import Config
+from uuvtai.kernels import route, voronoi
+from uuvtai.kernels.plan_codes import FAIL_NONE, N_PLANNER, N_REASON, N_TRIGGER
+from uuvtai.runtime import start_taichi
+
+THREADS = 1
+FLOOR = 4.0
+_START, _GOAL, _Z_M = (1.55, 3.05), (18.45, 3.05), -0.8
+"""[m] along the tank, as the missions of ``pool``"""
+_N_BODY = 14
+
+
+def measure(job: Job) -> list[Row]:
+    """Plans per second of one core, both from a clearance map that is there already."""
+    n_env = 16 if job.quick else 256
+    start_taichi(job.device)
+    config = Config()
+    found = _maps(n_env, config)
+    s = _structs(n_env, config, found)
+
+    def ours():
+        voronoi.plan_routes(
+            s["voronoi"], s["route"], s["clearance"], s["grid_map"], s["mask"], s["mission"], s["ego"], s["forecast"], s["clock"],
+            config.voronoi, config.route, config.clearance, config.mapping, config.world.tank,
+        )  # fmt: skip
+
+    floor_m, origin = config.voronoi.min_clearance_m, (float(maps.ORIGIN[0]), float(maps.ORIGIN[1]))
+    grids = [rrt.ClearanceGrid(clearance, origin, maps.CELL_M, floor_m, _START) for _occ, clearance, _row, _col in found]
+    checkers = [grid.checker((_START, _GOAL)) for grid in grids]
+
+    def theirs():
+        return [
+            rrt.solve_rrt(_START, _GOAL, grid, check, 20_000, i, 1.0) for i, (grid, check) in enumerate(zip(grids, checkers, strict=True))
+        ]
+
+    ours()
+    paths = theirs()
+    failed = sum(s["route"].fallback_reason.to_numpy() != FAIL_NONE)
+    if failed or any(path is None for path in paths):
+        raise RuntimeError(f"{failed} maps without our route, {sum(path is None for path in paths)} without OMPL's; all of them have one")
+    ways, counts = s["route"].way_w.to_numpy(), s["route"].n_way.to_numpy()
+    mine = [_cost(ways[i, : counts[i]], grid) for i, grid in enumerate(grids)]
+    others = [_cost(path, grid) for path, grid in zip(paths, grids, strict=True)]
+    cost = seconds_per_call({"ours": ours, "peer": theirs}, job.seconds)
+    return [
+        Row(
+            what=f"plans over {_N_BODY} bodies, grid {maps.SHAPE[1]} x {maps.SHAPE[0]}",
+            ours=n_env / cost["ours"],
+            peer=n_env / cost["peer"],
+            peer_name="OMPL RRT",
+            unit="plans/s per core",
+            floor=FLOOR,
+            floor_on="ratio",
+            note=f"{1e6 * cost['ours'] / n_env:.0f} against {1e6 * cost['peer'] / n_env:.0f} us a plan; "
+            f"cost of the way {np.mean(mine):.0f} against {np.mean(others):.0f}",
+            details={"num_envs": n_env, "way_cost": float(np.mean(mine)), "peer_way_cost": float(np.mean(others))},
+        )
+    ]
+
+
+def _maps(n: int, config: Config) -> list[tuple]:
+    """(occupied, clearance [m], site row, site col) of maps in which start and goal are joined by traversable cells."""
+    from scipy.ndimage import label
+
+    out, rng = [], np.random.default_rng(0)
+    while len(out) < n:
+        occ = maps.scene(rng, _N_BODY)
+        found = clearance_of(occ | maps.OUTSIDE, maps.CELL_M, config.clearance.max_m)
+        regions, _count = label((found[0] >= config.voronoi.min_clearance_m - 1e-5) & ~occ)  # type: ignore[misc]
+        ends = regions[maps.cell_of(_START)], regions[maps.cell_of(_GOAL)]
+        if ends[0] == ends[1] != 0:
+            out.append((occ, *found))
+    return out
+
+
+def _structs(n_env: int, config: Config, found: list[tuple]) -> dict:
+    names = {
+        "voronoi": "VoronoiState", "route": "RouteState", "clearance": "ClearanceState", "grid_map": "MapState", "mask": "GridMask",
+        "mission": "MissionState", "ego": "Proprioception", "forecast": "ForecastState", "clock": "ClockState",
+    }  # fmt: skip
+    n_row, n_col = maps.SHAPE
+    sizes = {
+        "n_env": n_env, "n_plan": min(n_env, 64), "n_row": n_row, "n_col": n_col, "n_heap": n_row * n_col, "n_path": 2048,
+        "n_way": config.route.n_way, "n_ahead": 32, "n_trigger": N_TRIGGER, "n_planner": N_PLANNER, "n_reason": N_REASON,
+        "n_track": 2, "n_forecast": 2,
+    }  # fmt: skip
+    s = {name: state.allocate(getattr(state, struct), sizes) for name, struct in names.items()}
+    s["mask"].outside.from_numpy(maps.OUTSIDE.astype(np.int32))
+    s["clock"].awake.fill(1)
+    route.reset_route(s["route"], s["clock"])
+    for field, i, dtype in (
+        (s["grid_map"].static_occ, 0, np.float32), (s["clearance"].clearance_m, 1, np.float32),
+        (s["clearance"].site_row, 2, np.int16), (s["clearance"].site_col, 3, np.int16),
+    ):  # fmt: skip
+        field.from_numpy(np.array([f[i] for f in found], dtype))
+    s["forecast"].radius_m.fill(-1.0)
+    s["ego"].pos_w.from_numpy(np.tile(np.array([*_START, _Z_M], np.float32), (n_env, 1)))
+    s["mission"].goal_w.from_numpy(np.tile(np.array([*_GOAL, _Z_M], np.float32), (n_env, 1)))
+    s["route"].queue.from_numpy(np.arange(n_env, dtype=np.int32))
+    s["route"].n_queue[None] = n_env
+    return s
+
+
+def _cost(way: np.ndarray, grid: rrt.ClearanceGrid) -> float:
+    """Length over clearance, summed along a way at a twentieth of a metre."""
+    total = 0.0
+    for a, b in pairwise(way):
+        length = float(np.hypot(*(b - a)))
+        pieces = max(1, int(np.ceil(length / 0.05)))
+        at = a + (b - a) * ((np.arange(pieces) + 0.5) / pieces)[:, None]
+        room = [max(grid.clearance_m[grid.cell_of((p[0], p[1]))], 0.1) for p in at]
+        total += length / pieces * float(np.sum(1.0 / np.array(room)))
+    return total
