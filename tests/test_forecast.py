@@ -4,24 +4,29 @@ import numpy as np
 import pytest
 
 from tests.reference import forecast as oracle
-from uuvtai.config import EpisodeConfig, ForecastConfig, TrackingConfig
+from tests.reference import habits as habit_oracle
+from uuvtai.config import EpisodeConfig, ForecastConfig, TankConfig, TrackingConfig
 from uuvtai.kernels import forecast
 from uuvtai.kernels.lanes import LANES
-from uuvtai.state import ClockState, ForecastState, TrackState, allocate
+from uuvtai.state import ClockState, ForecastState, HabitState, TrackState, allocate
 
 N_ENV, N_TRACK = 6, 5
-TRACKING, RULES = TrackingConfig(), EpisodeConfig()
+TRACKING, RULES, TANK = TrackingConfig(), EpisodeConfig(), TankConfig()
 SIZES = {
     "n_env": N_ENV,
     "n_ray": 16,
     "n_track": N_TRACK,
     "n_height": LANES,
+    "n_turn": 16,
     "n_forecast": round(TRACKING.horizon_s / TRACKING.forecast_dt_s) + 1,
 }
 AHEAD = TRACKING.forecast_dt_s * np.arange(SIZES["n_forecast"])
 
 POSITION_TOLERANCE = 1e-4
 """[m] 26 steps of at most 0.3 m at positions up to 20 m in float32 (1e-6 m each), and a series of the chord good to 2e-6 of 7.5 m."""
+
+WALK_TOLERANCE = 2e-3
+"""[m] six turns: each place is good to 1e-5 m in float32, and a course that meets a wall at a small angle makes up to a hundred of that."""
 
 GROWTH_TOLERANCE = 2e-4
 """[m] a square root of a variance that float32 forms from terms up to 100 times as large."""
@@ -30,6 +35,7 @@ GROWTH_TOLERANCE = 2e-4
 class Stage:
     def __init__(self):
         self.tracks, self.clock, self.forecast = allocate(TrackState, SIZES), allocate(ClockState, SIZES), allocate(ForecastState, SIZES)
+        self.habits = allocate(HabitState, SIZES)
 
     def begin(self, cfg=None):
         self.cfg = cfg or ForecastConfig()
@@ -37,7 +43,7 @@ class Stage:
             for field in vars(struct).values():
                 field.fill(0)
         self.clock.awake.fill(1)
-        forecast.reset_forecast(self.forecast, self.clock)
+        forecast.reset_forecast(self.forecast, self.habits, self.clock)
         return self
 
     def put(self, **fields):
@@ -46,7 +52,7 @@ class Stage:
             field.from_numpy(np.asarray(value).astype(field.to_numpy().dtype))
 
     def predict(self):
-        forecast.forecast_tracks(self.forecast, self.tracks, self.clock, self.cfg, TRACKING, RULES)
+        forecast.forecast_tracks(self.forecast, self.tracks, self.habits, self.clock, self.cfg, TRACKING, TANK, RULES)
         return self.forecast.pos_w.to_numpy().astype(float), self.forecast.radius_m.to_numpy().astype(float)
 
 
@@ -81,7 +87,7 @@ def lay_out(stage, state, cov, radius, rate, sigma):
 def test_forecast_equals_the_arc(stage, use_turn_rate):
     """The scan is two steps old: sample k lies 0.04 + 0.1 k seconds along the arc (along the tangent where the switch is off, and where
     the turn rate does not stand out of its noise)."""
-    stage.begin(ForecastConfig(use_turn_rate=use_turn_rate))
+    stage.begin(ForecastConfig(use_turn_rate=use_turn_rate, use_reflection=False))
     state, cov, radius, rate, sigma = random_tracks(1)
     lay_out(stage, state, cov, radius, rate, sigma)
     stage.clock.step.fill(2)
@@ -115,6 +121,35 @@ def test_only_moving_tracks_of_awake_rows_are_forecast(stage):
     assert (then[awake == 1][:, [0, 3, 4]] > 0).all()
     np.testing.assert_array_equal(then[awake == 0], first[awake == 0])
     stage.clock.awake.fill(1)
-    forecast.reset_forecast(stage.forecast, stage.clock)
+    forecast.reset_forecast(stage.forecast, stage.habits, stage.clock)
     assert (stage.forecast.radius_m.to_numpy() < 0).all()
     assert (stage.forecast.pos_w.to_numpy() == 0).all()
+
+
+@pytest.mark.parametrize("switches", [(True, True), (True, False), (False, True)])
+def test_forecast_equals_the_walk_from_turn_to_turn(stage, switches):
+    """Bodies on straight courses, with turns remembered on the way of most: the oracle's walk, in leaps of the forecast's samples."""
+    stage.begin(ForecastConfig(n_turn=SIZES["n_turn"], use_habits=switches[0], use_reflection=switches[1]))
+    state, cov, radius, _, sigma = random_tracks(3)
+    lay_out(stage, state, cov, radius, np.zeros_like(sigma), sigma)
+    rng = np.random.default_rng(4)
+    turns = [[habit_oracle.Turn(np.zeros(2), np.ones(2), np.ones(2), 0.0) for _ in range(SIZES["n_turn"])] for _ in range(N_ENV)]
+    for env, i in np.ndindex(N_ENV, 10):
+        x = state[env, i % N_TRACK].astype(float)
+        course, after = np.arctan2(x[3], x[2]) + rng.normal(0, 0.1), rng.uniform(-np.pi, np.pi)
+        came, went = np.array([np.cos(course), np.sin(course)]), np.array([np.cos(after), np.sin(after)])
+        place = (x[:2] + rng.uniform(0.2, 2) * came + rng.normal(0, 0.1, 2)).astype(np.float32)
+        turns[env][i] = habit_oracle.Turn(place.astype(float), came, went, 1.0)
+    columns = np.array([[[*t.pos, *t.came, *t.went, t.weight] for t in row] for row in turns])
+    for j, name in enumerate(("turn_x", "turn_y", "in_x", "in_y", "out_x", "out_y", "weight")):
+        getattr(stage.habits, name).from_numpy(columns[..., j].reshape(N_ENV, -1, LANES).astype(np.float32))
+    stage.clock.step.fill(2)
+    pos, _ = stage.predict()
+    turned = 0
+    for env, track in np.ndindex(N_ENV, N_TRACK):
+        x = state[env, track].astype(float)
+        times = AHEAD + 2 * RULES.control_dt_s
+        where, last = habit_oracle.walk(turns[env], x, float(radius[env, track]), times, stage.cfg, TANK, forecast.MOST_LEGS)
+        np.testing.assert_allclose(pos[env, track], where, atol=WALK_TOLERANCE)
+        turned += last @ habit_oracle.unit(x[2:]) < 0.9
+    assert turned > 10, turned

@@ -8,9 +8,9 @@ import taichi as ti
 
 from tests.reference import small_sonar
 from tests.reference import tracking as oracle
-from uuvtai.config import ElevationConfig, EpisodeConfig, SonarConfig, TankConfig, TrackingConfig
+from uuvtai.config import ElevationConfig, EpisodeConfig, ForecastConfig, SonarConfig, TankConfig, TrackingConfig
 from uuvtai.kernels import kalman, tracking
-from uuvtai.state import ClockState, ClusterState, SonarScan, TrackState, allocate
+from uuvtai.state import ClockState, ClusterState, HabitState, SonarScan, TrackState, allocate
 
 N_ENV = 16
 DT_S = 0.02
@@ -18,6 +18,7 @@ TANK = TankConfig()
 RULES = EpisodeConfig()
 CONFIG = TrackingConfig()
 ELEVATION = ElevationConfig(memory_s=0.0)
+FORECAST = ForecastConfig(use_coasting=False)
 PAPER = SonarConfig(range_sigma_m=0.02, doppler_sigma_m_s=0.05)
 HARSH = SonarConfig(
     period_steps=5, latency_steps=2, range_sigma_m=0.10, range_sigma_slope=0.01, range_quantum_m=0.024, range_jitter_m=0.10,
@@ -29,6 +30,7 @@ SIZES = {
     "n_track": CONFIG.n_track,
     "n_cluster": CONFIG.n_cluster,
     "n_height": 16,
+    "n_turn": FORECAST.n_turn,
 }
 
 STATE_TOLERANCE = 2e-4
@@ -54,6 +56,7 @@ class Lab:
         self.tracks, self.clusters, self.scan, self.clock = (
             allocate(struct, SIZES) for struct in (TrackState, ClusterState, SonarScan, ClockState)
         )
+        self.habits = allocate(HabitState, SIZES)
 
     def begin(self, seed=0):
         self.rng = np.random.default_rng(seed)
@@ -76,7 +79,9 @@ class Lab:
         self.track()
 
     def track(self):
-        tracking.track_bodies(self.tracks, self.clusters, self.scan, self.clock, CONFIG, ELEVATION, self.sonar, TANK, RULES)
+        tracking.track_bodies(
+            self.tracks, self.clusters, self.habits, self.scan, self.clock, CONFIG, FORECAST, ELEVATION, self.sonar, TANK, RULES
+        )
 
     def sense(self, step, pos, yaw, vel_w, bodies, clean=False):
         """Cast, spoil and track one scan of ``bodies`` = (centre, vel, radius, half, yaw); returns the true body of each beam."""

@@ -469,6 +469,22 @@ class ForecastConfig(Section):
     """bodies keep their turn rate; off: straight ahead"""
     straight_sigmas: NonNegative = 1.0
     """a turn rate of less than this many of its standard deviations is taken for 0"""
+    use_habits: bool = True
+    """bodies turn where one was seen to turn"""
+    n_turn: Annotated[int, Field(ge=16, multiple_of=16)] = 48
+    """turns remembered"""
+    across_m: Positive = 0.25
+    """a course that passes a remembered turn within this leads to it,"""
+    across_slope: NonNegative = 0.1
+    """and within this more per metre ahead"""
+    overdue_m: NonNegative = 0.15
+    """a turn this far behind may still come: the filter lags"""
+    passed_m: Positive = 0.5
+    """a turn this far behind did not come"""
+    use_reflection: bool = True
+    """bodies turn back at the tank's walls"""
+    use_coasting: bool = True
+    """unseen bodies go on by their habits; off: straight on, or along their arc"""
 
 
 class ElevationConfig(Section):

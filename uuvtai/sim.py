@@ -92,6 +92,7 @@ class SimState:
     image: state.DepthImage
     tracks: state.TrackState
     clusters: state.ClusterState
+    habits: state.HabitState
     forecast: state.ForecastState
     mask: state.GridMask
     grid_map: state.MapState
@@ -182,7 +183,7 @@ class Sim:
         sonar.reset_sonar(s.scan, s.sonar_memory, s.clock)
         depth.reset_depth(s.image, s.clock)
         tracking.reset_tracks(s.tracks, s.clusters, s.clock)
-        forecast.reset_forecast(s.forecast, s.clock)
+        forecast.reset_forecast(s.forecast, s.habits, s.clock)
         mapping.reset_map(s.grid_map, s.clock)
         route.reset_route(s.route, s.clock)
         teacher.reset_teacher(s.teacher, s.clock)
@@ -230,10 +231,23 @@ class Sim:
         with self._stage("depth"):
             depth.cast_depth(s.image, s.ego, s.vehicle, s.world, s.episode, s.clock, c.sensors.depth, c.world.tank)
         with self._stage("tracking"):
-            tracking.track_bodies(s.tracks, s.clusters, s.scan, s.clock, c.tracking, c.elevation, c.sensors.sonar, c.world.tank, c.episode)
+            tracking.track_bodies(
+                s.tracks,
+                s.clusters,
+                s.habits,
+                s.scan,
+                s.clock,
+                c.tracking,
+                c.forecast,
+                c.elevation,
+                c.sensors.sonar,
+                c.world.tank,
+                c.episode,
+            )
             if c.elevation.use_camera:
                 look.look_at_bodies(s.tracks, s.image, s.clock, c.elevation, c.sensors.depth, c.world.tank, c.episode)
-            forecast.forecast_tracks(s.forecast, s.tracks, s.clock, c.forecast, c.tracking, c.episode)
+            forecast.learn_habits(s.habits, s.tracks, s.clusters, s.clock, c.forecast, c.episode)
+            forecast.forecast_tracks(s.forecast, s.tracks, s.habits, s.clock, c.forecast, c.tracking, c.world.tank, c.episode)
             elevation.bound_heights(s.forecast, s.tracks, s.ego, s.clock, c.elevation, c.world.tank)
         with self._stage("mapping"):
             mapping.update_map(

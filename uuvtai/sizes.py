@@ -38,6 +38,7 @@ def array_sizes(config: Config, n_env: int) -> dict[str, int]:
         "n_track": config.tracking.n_track,
         "n_cluster": config.tracking.n_cluster,
         "n_height": LANES,
+        "n_turn": config.forecast.n_turn,
         "n_forecast": round(config.tracking.horizon_s / config.tracking.forecast_dt_s) + 1,
         "n_row": n_row,
         "n_col": n_col,

@@ -510,6 +510,32 @@ class ClusterState:
 
 
 @dataclass(frozen=True, eq=False)
+class HabitState:
+    """Remembered: places where moving bodies turned in this episode, of whichever track; and each track's last straight leg."""
+
+    turn_x: ti.Field = array("n_env", "n_turn", packed=True)
+    """[m] place of the turn, world"""
+    turn_y: ti.Field = array("n_env", "n_turn", packed=True)
+    """[m]"""
+    in_x: ti.Field = array("n_env", "n_turn", packed=True)
+    """unit course before the turn"""
+    in_y: ti.Field = array("n_env", "n_turn", packed=True)
+    """unit course before the turn"""
+    out_x: ti.Field = array("n_env", "n_turn", packed=True)
+    """unit course after it"""
+    out_y: ti.Field = array("n_env", "n_turn", packed=True)
+    """unit course after it"""
+    weight: ti.Field = array("n_env", "n_turn", packed=True)
+    """times seen, less times that it did not come; not above 0 = empty"""
+    next_slot: ti.Field = array("n_env", dtype=ti.i32)
+    """slot that the next new turn takes"""
+    leg: ti.Field = array("n_env", "n_track", vec=4)
+    """[m, m, m/s, m/s] state of the track when it was last on a straight leg"""
+    leg_step: ti.Field = array("n_env", "n_track", dtype=ti.i32)
+    """episode step of that, -1 = never"""
+
+
+@dataclass(frozen=True, eq=False)
 class ForecastState:
     """Where each moving track is expected, at equal steps from now to the horizon."""
 
@@ -679,11 +705,11 @@ class FeatureState:
 class TeacherState:
     """The behaviour tree: blackboard, statuses and action."""
 
-    status: ti.Field = array("n_env", "n_node", dtype=ti.i32)
+    status: ti.Field = array("n_env", "n_node", dtype=ti.i8)
     """status of every node after the newest tick (tree_tick codes)"""
-    running_child: ti.Field = array("n_env", "n_node", dtype=ti.i32)
+    running_child: ti.Field = array("n_env", "n_node", dtype=ti.i16)
     """child (preorder index) that a node with memory goes on with"""
-    result: ti.Field = array("n_env", "n_node", dtype=ti.i32)
+    result: ti.Field = array("n_env", "n_node", dtype=ti.i8)
     """scratch of one tick: what each leaf answers when it is ticked"""
     since_step: ti.Field = array("n_env", "n_node", dtype=ti.i32)
     """episode step at which a leaf that is running began"""

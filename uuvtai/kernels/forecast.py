@@ -2,19 +2,24 @@
 
 import taichi as ti
 
-from uuvtai.config import EpisodeConfig, ForecastConfig, TrackingConfig
+from uuvtai.config import EpisodeConfig, ForecastConfig, TankConfig, TrackingConfig
 from uuvtai.kernels.geometry import turned_z
+from uuvtai.kernels.habits import expected_turn_rate, forget_habits, learn_habit, next_event
 from uuvtai.kernels.kalman import largest_position_variance
 from uuvtai.kernels.signature import Const, In, Out, spread
-from uuvtai.state import ClockState, ForecastState, TrackState
+from uuvtai.state import ClockState, ClusterState, ForecastState, HabitState, TrackState
+
+MOST_LEGS = 6
+"""Turns within one forecast; beyond them a body goes straight on."""
 
 
 @ti.kernel
-def reset_forecast(forecast: Out[ForecastState], clock: In[ClockState]):
-    """Expect nothing in the awake rows."""
+def reset_forecast(forecast: Out[ForecastState], habits: Out[HabitState], clock: In[ClockState]):
+    """Know no habits and expect nothing in the awake rows."""
     n = ti.static(clock.awake.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
         if pad == 0 and clock.awake[env] == 1:
+            forget_habits(env, habits)
             for track in range(forecast.radius_m.shape[1]):
                 clear_forecast(env, track, forecast)
                 for k in range(forecast.pos_w.shape[2]):
@@ -22,12 +27,31 @@ def reset_forecast(forecast: Out[ForecastState], clock: In[ClockState]):
 
 
 @ti.kernel
+def learn_habits(
+    habits: Out[HabitState],
+    tracks: In[TrackState],
+    clusters: In[ClusterState],
+    clock: In[ClockState],
+    forecast_cfg: Const[ForecastConfig],
+    rules: Const[EpisodeConfig],
+):
+    """Watch how the tracks move, after each tracked scan."""
+    n = ti.static(clock.awake.shape[0])
+    for env, pad in ti.ndrange(n, ti.static(spread(n))):
+        if pad == 0 and clock.awake[env] == 1 and clusters.fresh[env] == 1:
+            for track in range(tracks.alive.shape[1]):
+                learn_habit(env, track, habits, tracks, forecast_cfg, rules)
+
+
+@ti.kernel
 def forecast_tracks(
     forecast: Out[ForecastState],
     tracks: In[TrackState],
+    habits: In[HabitState],
     clock: In[ClockState],
     forecast_cfg: Const[ForecastConfig],
     tracking: Const[TrackingConfig],
+    tank: Const[TankConfig],
     rules: Const[EpisodeConfig],
 ):
     """From now to the horizon, for the moving tracks of the awake rows; the others get a negative radius.
@@ -40,7 +64,10 @@ def forecast_tracks(
     for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n * n_track))):
         if pad == 0 and clock.awake[env] == 1:
             if tracks.alive[env, track] * tracks.moving[env, track] == 1:
-                extrapolate(env, track, forecast, tracks, clock, forecast_cfg, tracking, rules)
+                if expected_turn_rate(env, track, tracks, forecast_cfg) != 0.0:
+                    follow_arc(env, track, forecast, tracks, clock, forecast_cfg, tracking, rules)
+                else:
+                    follow_legs(env, track, forecast, tracks, habits, clock, forecast_cfg, tracking, tank, rules)
             elif forecast.radius_m[env, track, 0] >= 0:
                 clear_forecast(env, track, forecast)
 
@@ -52,7 +79,7 @@ def clear_forecast(env, track, forecast: Out[ForecastState]):
 
 
 @ti.func
-def extrapolate(
+def follow_arc(
     env,
     track,
     forecast: Out[ForecastState],
@@ -80,14 +107,40 @@ def extrapolate(
 
 
 @ti.func
-def expected_turn_rate(env, track, tracks: In[TrackState], cfg: Const[ForecastConfig]):
-    """[rad/s] the filter's turn rate where it stands out of its noise: most bodies go straight."""
-    rate = 0.0
-    if ti.static(cfg.use_turn_rate):
-        known = tracks.turn_rate[env, track]
-        if known * known > ti.static(cfg.straight_sigmas**2) * tracks.turn_cov[env, track][4]:
-            rate = known
-    return rate
+def follow_legs(
+    env,
+    track,
+    forecast: Out[ForecastState],
+    tracks: In[TrackState],
+    habits: In[HabitState],
+    clock: In[ClockState],
+    forecast_cfg: Const[ForecastConfig],
+    tracking: Const[TrackingConfig],
+    tank: Const[TankConfig],
+    rules: Const[EpisodeConfig],
+):
+    """Constant speed on straight legs, from turn to turn."""
+    mean, cov, radius = tracks.state[env, track], tracks.cov[env, track], tracks.radius_m[env, track]
+    pos, speed = ti.Vector([mean[0], mean[1]]), ti.max(ti.sqrt(mean[2] * mean[2] + mean[3] * mean[3]), 1e-6)
+    course = ti.Vector([mean[2], mean[3]]) / speed
+    gap, out = next_event(env, pos, course, radius, habits, forecast_cfg, tank)
+    legs = 0
+    ahead = (clock.step[env] - tracks.scan_step[env]) * rules.control_dt_s
+    way = speed * ahead
+    for k in range(forecast.radius_m.shape[2]):
+        while way > gap and legs < MOST_LEGS:
+            pos += gap * course
+            way -= gap
+            course = out
+            gap, out = next_event(env, pos, course, radius, habits, forecast_cfg, tank)
+            legs += 1
+        pos += way * course
+        gap -= way
+        growth = tracking.growth_sigmas * ti.sqrt(largest_position_variance(cov, ahead))
+        forecast.pos_w[env, track, k] = pos
+        forecast.radius_m[env, track, k] = radius + ti.min(growth, tracking.max_growth_m)
+        way = speed * tracking.forecast_dt_s
+        ahead += tracking.forecast_dt_s
 
 
 @ti.func

@@ -9,14 +9,15 @@ import math
 
 import taichi as ti
 
-from uuvtai.config import ElevationConfig, EpisodeConfig, SonarConfig, TankConfig, TrackingConfig
+from uuvtai.config import ElevationConfig, EpisodeConfig, ForecastConfig, SonarConfig, TankConfig, TrackingConfig
 from uuvtai.kernels.association import associate
 from uuvtai.kernels.clustering import find_clusters, label_beams
+from uuvtai.kernels.habits import coasted, expected_turn_rate
 from uuvtai.kernels.kalman import predicted
 from uuvtai.kernels.signature import Const, In, Out, spread
 from uuvtai.kernels.track_slots import carry_names, clear_track, name_beams, prune_tracks, spawn_tracks
 from uuvtai.kernels.track_update import update_tracks
-from uuvtai.state import ClockState, ClusterState, SonarScan, TrackState
+from uuvtai.state import ClockState, ClusterState, HabitState, SonarScan, TrackState
 
 
 @ti.kernel
@@ -44,9 +45,11 @@ def tracked_period_s(tracking, sonar, rules):
 def track_bodies(
     tracks: TrackState,
     clusters: ClusterState,
+    habits: HabitState,
     scan: SonarScan,
     clock: ClockState,
     tracking: TrackingConfig,
+    forecast_cfg: ForecastConfig,
     elevation: ElevationConfig,
     sonar: SonarConfig,
     tank: TankConfig,
@@ -58,7 +61,7 @@ def track_bodies(
     """
     take_scan(clusters, scan, clock, tracking, sonar, tank)
     cluster_beams(clusters, scan, clock, tracking, sonar)
-    follow_bodies(tracks, clusters, scan, clock, tracking, sonar, rules)
+    follow_bodies(tracks, clusters, habits, scan, clock, tracking, forecast_cfg, sonar, tank, rules)
     keep_slots(tracks, clusters, scan, clock, tracking, elevation, sonar, tank, rules)
 
 
@@ -97,17 +100,20 @@ def cluster_beams(
 def follow_bodies(
     tracks: Out[TrackState],
     clusters: Out[ClusterState],
+    habits: In[HabitState],
     scan: In[SonarScan],
     clock: In[ClockState],
     tracking: Const[TrackingConfig],
+    forecast_cfg: Const[ForecastConfig],
     sonar: Const[SonarConfig],
+    tank: Const[TankConfig],
     rules: Const[EpisodeConfig],
 ):
     """Predict the tracks to the new ping, match them with clusters and correct them."""
     n = ti.static(clock.awake.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
         if pad == 0 and clock.awake[env] == 1 and clusters.fresh[env] == 1:
-            dt = predict_tracks(env, tracks, clusters, tracking, rules)
+            dt = predict_tracks(env, tracks, clusters, habits, tracking, forecast_cfg, tank, rules)
             associate(env, dt, tracks, clusters, tracking, sonar)
             update_tracks(env, dt, tracks, clusters, scan, tracking, sonar, rules)
 
@@ -149,7 +155,16 @@ def is_due(env, clusters: In[ClusterState], scan: In[SonarScan], tracking: Const
 
 
 @ti.func
-def predict_tracks(env, tracks: Out[TrackState], clusters: In[ClusterState], tracking: Const[TrackingConfig], rules: Const[EpisodeConfig]):
+def predict_tracks(
+    env,
+    tracks: Out[TrackState],
+    clusters: In[ClusterState],
+    habits: In[HabitState],
+    tracking: Const[TrackingConfig],
+    forecast_cfg: Const[ForecastConfig],
+    tank: Const[TankConfig],
+    rules: Const[EpisodeConfig],
+):
     """Move every track to the time of the new ping; returns the time since the last one [s]."""
     dt = 0.0
     if tracks.scan_step[env] >= 0:
@@ -167,6 +182,10 @@ def predict_tracks(env, tracks: Out[TrackState], clusters: In[ClusterState], tra
                 tracking.accel_density,
                 tracking.turn_density,
             )
+            if ti.static(forecast_cfg.use_coasting):
+                unseen = tracks.moving[env, track] == 1 and tracks.misses[env, track] > 0
+                if unseen and expected_turn_rate(env, track, tracks, forecast_cfg) == 0.0:
+                    mean = coasted(env, track, tracks.state[env, track], dt, habits, tracks, forecast_cfg, tank)
             tracks.state[env, track] = mean
             tracks.cov[env, track] = cov
             tracks.turn_cov[env, track] = link
