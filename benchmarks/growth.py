@@ -15,7 +15,7 @@ from uuvtai.tree import read_tree
 DEVICES = ("cpu", "cuda")
 FLOOR = 1.10
 """Cost per env-step at the biggest size may be at most this times that at the smallest"""
-_WARM, _TURNS, _TURN_STEPS = 20, 4, 15
+_WARM, _TURNS, _TURN_STEPS = 10, 4, 10
 """Control steps: before the clock starts; turns that the sizes take; steps of each turn"""
 
 

@@ -65,7 +65,8 @@ def tick_tree(
         if pad == 0 and clock.awake[env] == 1:
             for node in range(table.n_node[None]):
                 if table.kind[node] >= codes.CONDITION:
-                    teacher.result[env, node] = _answer(env, node, teacher, table, route, ego, mission, clock, teacher_cfg, episode_cfg)
+                    answer = _answer(env, node, teacher, table, route, ego, mission, clock, teacher_cfg, episode_cfg)
+                    teacher.result[env, node] = ti.cast(answer, ti.i8)
             acting = tick_nodes(env, teacher, table)
             leaf = -1
             if acting >= 0:

@@ -47,77 +47,71 @@ DRIVE_STRAIGHT = 21
 def tick_nodes(env, teacher: Out[TeacherState], table: In[TreeTable]):
     """Tick the tree once; leaves answer ``teacher.result``. Returns the last action that was ticked and did not fail, -1 if none."""
     node = 0
-    entering = 1
     acting = -1
     while node >= 0:
-        if entering == 1:
+        kind = table.kind[node]
+        while kind < CONDITION:  # down to the leaf with which the tick goes on
             teacher.ticks[env, node] += 1
+            node = _first_child(env, node, kind, teacher, table)
             kind = table.kind[node]
-            if kind >= CONDITION:
-                answer = teacher.result[env, node]
-                teacher.status[env, node] = answer
-                if kind == ACTION and answer != FAILURE:
-                    acting = node
-                entering = 0
-            else:
-                node = _first_child(env, node, teacher, table)
-        else:
-            following = _next_child(env, node, teacher, table)
-            if following >= 0:
-                node = following
-                entering = 1
-            else:
-                node = table.parent[node]
+        teacher.ticks[env, node] += 1
+        answer = ti.cast(teacher.result[env, node], ti.i32)
+        teacher.status[env, node] = ti.cast(answer, ti.i8)
+        acting = ti.select(kind == ACTION and answer != FAILURE, node, acting)
+        following = -1
+        while node >= 0 and following < 0:  # up until a parent has another child to tick
+            parent = table.parent[node]
+            if parent >= 0:
+                following, answer = _next_child(env, node, parent, answer, teacher, table)
+            node = parent
+        node = following
     return acting
 
 
 @ti.func
 def _halt(env, first, end, teacher: Out[TeacherState]):
     for node in range(first, end):
-        teacher.status[env, node] = IDLE
+        teacher.status[env, node] = ti.cast(IDLE, ti.i8)
 
 
 @ti.func
-def _first_child(env, node, teacher: Out[TeacherState], table: In[TreeTable]):
+def _first_child(env, node, kind, teacher: Out[TeacherState], table: In[TreeTable]):
     """Child with which a tick of an inner node begins."""
-    kind = table.kind[node]
     child = node + 1
     if teacher.status[env, node] == RUNNING:
         if kind == SEQUENCE:
-            child = teacher.running_child[env, node]
+            child = ti.cast(teacher.running_child[env, node], ti.i32)
         if kind == FALLBACK:
-            child = teacher.running_child[env, node]
+            child = ti.cast(teacher.running_child[env, node], ti.i32)
             _halt(env, node + 1, child, teacher)
     else:
-        teacher.running_child[env, node] = child
+        teacher.running_child[env, node] = ti.cast(child, ti.i16)
         if kind <= REACTIVE_SEQUENCE:
             _halt(env, child, table.end[node], teacher)
     return child
 
 
 @ti.func
-def _next_child(env, child, teacher: Out[TeacherState], table: In[TreeTable]):
-    """Sibling to tick after ``child`` answered, or -1 when that decides its parent, whose status is then set."""
-    parent = table.parent[child]
-    following = -1
-    if parent >= 0:
-        kind = table.kind[parent]
-        answer = teacher.status[env, child]
-        is_sequence = kind <= REACTIVE_SEQUENCE
-        is_fallback = kind >= FALLBACK and kind <= REACTIVE_FALLBACK
-        goes_on = (is_sequence and answer == SUCCESS) or (is_fallback and answer == FAILURE)
-        if goes_on and table.end[child] < table.end[parent]:
-            following = table.end[child]
-            if is_sequence:
-                teacher.running_child[env, parent] = following
-        else:
-            if not goes_on:
-                if kind == REACTIVE_SEQUENCE or (is_fallback and teacher.running_child[env, parent] != child):
-                    _halt(env, table.end[child], table.end[parent], teacher)
-                if is_fallback:
-                    teacher.running_child[env, parent] = child
-            teacher.status[env, parent] = _decorated(kind, answer)
-    return following
+def _next_child(env, child, parent, answer, teacher: Out[TeacherState], table: In[TreeTable]):
+    """(sibling to tick after ``child`` answered, or -1 when that decides its parent, status of the parent, which is then set)."""
+    following, decided = -1, answer
+    kind, end = table.kind[parent], table.end[child]
+    is_sequence = kind <= REACTIVE_SEQUENCE
+    is_fallback = kind >= FALLBACK and kind <= REACTIVE_FALLBACK
+    goes_on = (is_sequence and answer == SUCCESS) or (is_fallback and answer == FAILURE)
+    if goes_on and end < table.end[parent]:
+        following = end
+        if is_sequence:
+            teacher.running_child[env, parent] = ti.cast(following, ti.i16)
+    else:
+        if not goes_on:
+            if kind == REACTIVE_SEQUENCE or (is_fallback and teacher.running_child[env, parent] != child):
+                _halt(env, end, table.end[parent], teacher)
+            if is_fallback:
+                teacher.running_child[env, parent] = ti.cast(child, ti.i16)
+        decided = _decorated(kind, answer)
+        teacher.status[env, parent] = ti.cast(decided, ti.i8)
+    return following, decided
 
 
 @ti.func
@@ -138,5 +132,5 @@ def tick_with_given_statuses(result: ti.types.ndarray(), teacher: Out[TeacherSta
     """Tick every env with leaf answers given from outside, result[env, node]: for tests of the engine against another one."""
     for env in range(ti.static(teacher.leaf.shape[0])):
         for node in range(table.n_node[None]):
-            teacher.result[env, node] = result[env, node]
+            teacher.result[env, node] = ti.cast(result[env, node], ti.i8)
         teacher.leaf[env] = tick_nodes(env, teacher, table)
