@@ -52,7 +52,7 @@ def measure(job: Job) -> list[Row]:
         raise RuntimeError(f"{failed} maps without our route, {sum(path is None for path in paths)} without OMPL's; all of them have one")
     ways, counts = s["route"].way_w.to_numpy(), s["route"].n_way.to_numpy()
     mine = [_cost(ways[i, : counts[i]], grid) for i, grid in enumerate(grids)]
-    others = [_cost(path, grid) for path, grid in zip(paths, grids, strict=True)]
+    others = [_cost(path, grid) for path, grid in zip(paths, grids, strict=True) if path is not None]
     cost = seconds_per_call({"ours": ours, "peer": theirs}, job.seconds)
     return [
         Row(

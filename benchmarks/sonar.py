@@ -63,7 +63,7 @@ def measure(job: Job) -> list[Row]:
     peer = Rays(scene, flat.n_ray, flat.max_range_m)
 
     def ours(config: SonarConfig):
-        return lambda: sonar.cast_sonar(*structs, config, TankConfig(), EpisodeConfig())
+        return lambda: sonar.cast_sonar(*structs, config, TankConfig(), EpisodeConfig())  # type: ignore[call-arg]
 
     ours(flat)()
     ranges, hits = scan.range_m.to_numpy()[:_MODELS], scan.hit.to_numpy()[:_MODELS]

@@ -12,19 +12,25 @@ import taichi as ti
 from uuvtai.config import DepthConfig, TankConfig
 from uuvtai.kernels.geometry import BOX, FAR_M, NONE, SPHERE, rotation_wb
 from uuvtai.kernels.lanes import LANES, f16x, ramp_lanes
-from uuvtai.kernels.noise import STREAM_DEPTH, normal_lanes, stream_key
-from uuvtai.kernels.raycast import ball_span, disc_span, plane_distance, rim_distance, slab_span
+from uuvtai.kernels.noise import STREAM_DEPTH, normal_pair_lanes, stream_key
+from uuvtai.kernels.raycast import ball_span, disc_span, rim_distance, slab_span
 from uuvtai.kernels.signature import Const, In, Out, spread
 from uuvtai.state import ClockState, DepthImage, EpisodeState, Proprioception, VehicleState, WorldState
 
-_BLOCK = 4
-"""Image rows per loop item: enough items for every core, few enough that projecting the bodies once per item is cheap."""
+_BLOCK = 36
+"""Image rows per loop item on a CPU: bodies are projected once per item."""
+
+_BLOCK_GPU = 4
+"""Rows per loop item where items are threads and thousands of them must be there."""
 
 _NEAR_M = 0.02
 """A bounding corner nearer than this to the camera's plane is not projected: the body is then tested in the whole image."""
 
 _MARGIN = 0.01
 """[pixel] added around the bounding rectangle against rounding."""
+
+_POKED_M = 1.0e-6
+"""A camera nearer to a wall than this pokes through it."""
 
 Eye = ti.types.struct(pos=ti.math.vec3, R_wb=ti.math.mat3)
 """Truth of the camera as float32: world position [m], body to world."""
@@ -57,15 +63,21 @@ def cast_depth(
 ):
     """New image in the rows whose step is a multiple of period_steps (step 0 included); the others keep theirs with ``fresh`` = 0."""
     n = ti.static(clock.awake.shape[0])
-    n_block = ti.static(-(-depth.rows // _BLOCK))
+    block_rows = ti.static(rows_per_item())
+    n_block = ti.static(-(-depth.rows // block_rows))
     for env, block, pad in ti.ndrange(n, n_block, ti.static(spread(n * n_block))):
         if pad == 0 and clock.awake[env] == 1:
             due = clock.step[env] % depth.period_steps == 0
             if block == 0:
                 label_image(env, due, image, ego)
             if due:
-                fill_block(env, block * _BLOCK, image, vehicle, world, depth, tank)
-                disturb_block(env, block * _BLOCK, clock.step[env], image, episode, depth)
+                fill_block(env, block * block_rows, image, vehicle, world, depth, tank)
+                disturb_block(env, block * block_rows, clock.step[env], image, episode, depth)
+
+
+def rows_per_item() -> int:
+    """Image rows of one loop item."""
+    return _BLOCK_GPU if ti.cfg.arch == ti.cuda else _BLOCK  # type: ignore[union-attr]
 
 
 @ti.func
@@ -91,7 +103,7 @@ def fill_block(
     R_wb = rotation_wb(vehicle.quat_wb[env]).cast(ti.f32)
     offset_b = ti.Vector([depth.offset_b_m[0], depth.offset_b_m[1], depth.offset_b_m[2]], ti.f32)
     eye = Eye(pos=vehicle.pos_w[env].cast(ti.f32) + R_wb @ offset_b, R_wb=R_wb)
-    last_row = ti.min(first_row + _BLOCK, depth.rows)
+    last_row = ti.min(first_row + ti.static(rows_per_item()), depth.rows)
     for row in range(first_row, last_row):
         for packet in range(ti.static(depth.cols // LANES)):
             dx, dy, _dz = ray_directions(row, packet * LANES, eye.R_wb, depth)
@@ -113,8 +125,8 @@ def paint(env, row, first_col, seen, image: Out[DepthImage]):
 def paint_nearer(env, row, first_col, enter, image: Out[DepthImage]):
     """Write those of sixteen pixels in which ``enter`` lies before the camera and nearer than what is there."""
     for i in ti.static(range(LANES)):
-        if enter[i] > 0.0 and enter[i] < image.depth_m[env, row, first_col + i]:
-            image.depth_m[env, row, first_col + i] = enter[i]
+        behind = image.depth_m[env, row, first_col + i]
+        image.depth_m[env, row, first_col + i] = ti.select((enter[i] > 0.0) & (enter[i] < behind), enter[i], behind)
 
 
 @ti.func
@@ -138,10 +150,19 @@ def wall_depth(eye, dx, dy, tank: Const[TankConfig]):
         y = eye.pos[1] - ti.static(0.5 * (tank.y_m[0] + tank.y_m[1]))
         seen = rim_distance(x, y, dx, dy, tank.radius_m)
     else:
-        to_x = plane_distance(eye.pos[0], dx, tank.x_m[0], tank.x_m[1])
-        to_y = plane_distance(eye.pos[1], dy, tank.y_m[0], tank.y_m[1])
-        seen = ti.min(to_x, to_y)
+        nearness_x = nearness(dx, tank.x_m[0] - eye.pos[0], tank.x_m[1] - eye.pos[0])
+        nearness_y = nearness(dy, tank.y_m[0] - eye.pos[1], tank.y_m[1] - eye.pos[1])
+        seen = 1.0 / ti.max(nearness_x, nearness_y, ti.static(1.0 / FAR_M))
     return seen
+
+
+@ti.func
+def nearness(direction, low, high):
+    """Inverse of the ray parameter at which a coordinate between two walls, ``low`` < 0 and ``high`` > 0 away, meets the one ahead of it.
+
+    Division by a scalar once instead of by every lane. Beyond a wall that lies ahead: larger than any that matters.
+    """
+    return ti.max(direction * (1.0 / ti.max(high, _POKED_M)), direction * (1.0 / ti.min(low, -_POKED_M)))
 
 
 @ti.func
@@ -239,12 +260,16 @@ def body_entry(kind, size, c, s, offset, dx, dy, dz):
 
 @ti.func
 def disturb_block(env, first_row, step, image: Out[DepthImage], episode: In[EpisodeState], depth: Const[DepthConfig]):
-    """Near-normal error, sigma = a + b depth, on every return; what then lies beyond the range is no return."""
+    """Normal error, sigma = a + b depth, on every return; what then lies beyond the range is no return."""
     if ti.static(depth.sigma_m > 0 or depth.sigma_slope > 0):
         key = stream_key(episode.key[env], step, STREAM_DEPTH)
-        for row in range(first_row, ti.min(first_row + _BLOCK, depth.rows)):
-            for packet in range(ti.static(depth.cols // LANES)):
-                paint_noisy(env, row, packet * LANES, normal_lanes(key, row * depth.cols + packet * LANES), image, depth)
+        n_packet = ti.static(depth.cols // LANES)
+        for row in range(first_row, ti.min(first_row + ti.static(rows_per_item()), depth.rows)):
+            for pair in range(ti.static(-(-n_packet // 2))):  # the two normals of a draw go to neighbouring packets
+                one, other = normal_pair_lanes(key, row * depth.cols + pair * LANES)
+                paint_noisy(env, row, 2 * pair * LANES, one, image, depth)
+                if ti.static(n_packet % 2 == 0) or 2 * pair + 1 < n_packet:
+                    paint_noisy(env, row, (2 * pair + 1) * LANES, other, image, depth)
 
 
 @ti.func
@@ -252,6 +277,6 @@ def paint_noisy(env, row, first_col, error, image: Out[DepthImage], depth: Const
     """Add ``error`` standard deviations to sixteen pixels where they show a return."""
     for i in ti.static(range(LANES)):
         true_m = image.depth_m[env, row, first_col + i]
-        if true_m < depth.max_range_m:
-            noisy = true_m + (depth.sigma_m + depth.sigma_slope * true_m) * error[i]
-            image.depth_m[env, row, first_col + i] = ti.math.clamp(noisy, 0.0, depth.max_range_m)
+        noisy = true_m + (depth.sigma_m + depth.sigma_slope * true_m) * error[i]
+        told = ti.min(ti.max(noisy, 0.0), depth.max_range_m)
+        image.depth_m[env, row, first_col + i] = ti.select(true_m < depth.max_range_m, told, true_m)
