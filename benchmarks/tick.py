@@ -22,14 +22,14 @@ _BLACKBOARDS = 64
 
 def measure(job: Job) -> list[Row]:
     """Ticks per second of one core."""
-    n_env = 256 if job.quick else 16_384
+    n_env = 256 if job.quick else 4096
     start_taichi(job.device)
     tree, config = read_tree("bt"), Config()
     sizes = array_sizes(config, n_env)
     teacher, table = state.allocate(state.TeacherState, sizes), state.allocate(state.TreeTable, sizes)
     load_tree(table, tree)
     rng = np.random.default_rng(0)
-    answers = rng.integers(tree_tick.RUNNING, tree_tick.FAILURE + 1, (4, n_env, config.teacher.max_node), dtype=np.int32)
+    answers = rng.integers(tree_tick.RUNNING, tree_tick.FAILURE + 1, (4, n_env, config.teacher.max_node), dtype=np.int8)
     given = [torch.from_numpy(a) for a in answers]
     n_node = len(tree.kind)
     peers = [PyTree(tree) for _ in range(_BLACKBOARDS)]
