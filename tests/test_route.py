@@ -171,9 +171,10 @@ def test_intersection_with_the_map_before_the_clearance_is_renewed():
 def put_body(env, when, at, radius=0.2):
     s = stage()
     radii, pos = s.forecast.radius_m.to_numpy(), s.forecast.pos_w.to_numpy()
+    radii[env, 1], pos[env, 1] = radius, (-50.0, 3.0)  # forecast at all steps, far away at the others
     for k in range(radii.shape[2]):
         if when[0] <= k * CONFIG.tracking.forecast_dt_s <= when[1]:
-            radii[env, 1, k], pos[env, 1, k] = radius, at
+            pos[env, 1, k] = at
     s.forecast.radius_m.from_numpy(radii)
     s.forecast.pos_w.from_numpy(pos)
 

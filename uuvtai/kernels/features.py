@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import taichi as ti
 
 from uuvtai.config import FeaturesConfig, SonarConfig
-from uuvtai.kernels.geometry import TWO_PI, quaternion_wb, rotation_wb
+from uuvtai.kernels.geometry import FAR_M, TWO_PI, quaternion_wb, rotation_wb
 from uuvtai.kernels.signature import Const, In, Out, spread
 from uuvtai.state import ClockState, FeatureState, MissionState, Proprioception, RouteState, SonarScan
 
@@ -43,19 +43,19 @@ def _summarise(
 ):
     """Doppler already holds the own motion, so a beam's time to collision is its range over its closing speed."""
     n_ray = ti.static(scan.range_m.shape[1])
-    nearest, ttc, closing, hits = 0.0 + sonar_cfg.max_range_m, 0.0 + features_cfg.ttc_cap_s, 0.0, 0
-    for i in range(first, last):
-        beam = i % n_ray
-        if scan.hit[env, beam] == 1:
-            rate = -scan.doppler_m_s[env, beam]
-            closing = ti.select(hits == 0, rate, ti.max(closing, rate))
-            hits += 1
-            nearest = ti.min(nearest, scan.range_m[env, beam])
-            if rate > 0:
-                ttc = ti.min(ttc, scan.range_m[env, beam] / rate)
+    nearest, ttc, closing, hits = 0.0 + sonar_cfg.max_range_m, 0.0 + features_cfg.ttc_cap_s, -FAR_M, 0
+    begin = first % n_ray
+    for i in range(last - first):  # no branches: signs of noisy rates cannot be predicted
+        beam = begin + i
+        beam -= ti.select(beam >= n_ray, n_ray, 0)
+        hit, gap, rate = scan.hit[env, beam] == 1, scan.range_m[env, beam], -scan.doppler_m_s[env, beam]
+        hits += ti.cast(hit, ti.i32)
+        closing = ti.max(closing, ti.select(hit, rate, -FAR_M))
+        nearest = ti.min(nearest, ti.select(hit, gap, sonar_cfg.max_range_m))
+        ttc = ti.min(ttc, ti.select(hit & (rate > 0.0), gap / rate, features_cfg.ttc_cap_s))
     features.sector_range_m[env, sector] = nearest
     features.sector_ttc_s[env, sector] = ttc
-    features.sector_closing_m_s[env, sector] = closing
+    features.sector_closing_m_s[env, sector] = ti.select(hits > 0, closing, 0.0)
     features.sector_valid[env, sector] = ti.cast(hits > 0, ti.i32)
 
 

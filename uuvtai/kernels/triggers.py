@@ -12,6 +12,7 @@ import taichi as ti
 from uuvtai.config import EpisodeConfig, MappingConfig, RouteConfig, TankConfig, TrackingConfig, VoronoiConfig
 from uuvtai.kernels.along import advanced_arc, level, look_along
 from uuvtai.kernels.grid import cell_of
+from uuvtai.kernels.lanes import LANES, i16x
 from uuvtai.kernels.plan_codes import (
     FAIL_NONE,
     N_TRIGGER,
@@ -135,10 +136,14 @@ def _held_triggers(
 def _feels_near(env, scan: In[SonarScan], cfg: Const[RouteConfig]):
     """True where a return is near or will soon be reached."""
     near = 0
-    for beam in range(scan.range_m.shape[1]):
-        gap = scan.range_m[env, beam]
-        soon = -scan.doppler_m_s[env, beam] * ti.static(cfg.safety_ttc_s) > gap
-        near |= ti.cast(scan.hit[env, beam] == 1 and (soon or gap < ti.static(cfg.safety_range_m)), ti.i32)
+    for packet in range(ti.static(scan.range_m.shape[1] // LANES)):
+        urgent = i16x(0)
+        for i in ti.static(range(LANES)):
+            beam = packet * LANES + i
+            gap = scan.range_m[env, beam]
+            soon = -scan.doppler_m_s[env, beam] * ti.static(cfg.safety_ttc_s) > gap
+            urgent[i] = ti.cast((scan.hit[env, beam] == 1) & (soon | (gap < ti.static(cfg.safety_range_m))), ti.i32)
+        near |= urgent.max()
     return near == 1
 
 
@@ -177,10 +182,9 @@ def _path_meets_forecast(
     meets = False
     per_step = ti.static(cfg.reach_speed_m_s * tracking_cfg.forecast_dt_s)
     for track in range(forecast.radius_m.shape[1]):
-        for k in range(forecast.radius_m.shape[2]):
-            radius = forecast.radius_m[env, track, k]
-            if radius >= 0 and not meets:
-                limit = radius + ti.static(cfg.forecast_clearance_m)
+        if forecast.radius_m[env, track, 0] >= 0 and not meets:  # a track is forecast at all steps or at none
+            for k in range(forecast.radius_m.shape[2]):
+                limit = forecast.radius_m[env, track, k] + ti.static(cfg.forecast_clearance_m)
                 body = forecast.pos_w[env, track, k]
                 reach = k * per_step
                 if (body - route.ahead_w[env, 0]).norm() < reach + ti.static(mapping_cfg.cell_m) + limit:

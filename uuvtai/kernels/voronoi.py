@@ -159,8 +159,8 @@ def _block_forecast(
     own_weight = voronoi.weight[slot, own[0], own[1]]
     n_row, n_col = ti.static(voronoi.weight.shape[1:])
     for track in range(forecast.radius_m.shape[1]):
-        for k in range(forecast.radius_m.shape[2]):
-            if forecast.radius_m[env, track, k] >= 0:
+        if forecast.radius_m[env, track, 0] >= 0:  # a track is forecast at all steps or at none
+            for k in range(forecast.radius_m.shape[2]):
                 pos_w = ti.cast(forecast.pos_w[env, track, k], ti.f32)
                 reach = forecast.radius_m[env, track, k] + ti.static(cfg.min_clearance_m)
                 low, high = _cell(pos_w - reach, tank_cfg, mapping_cfg), _cell(pos_w + reach, tank_cfg, mapping_cfg)
