@@ -1,0 +1,88 @@
+"""Benchmarks: what their rows say, that each is found and described, and that kernels and peers agree where that is cheap to check."""
+
+import ast
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks import dynamics, run, tick
+from benchmarks.common import Job, Row, seconds_per_call
+from benchmarks.peers.vehicle_arrays import Vehicles
+from uuvtai.config import Config
+from uuvtai.plant import Plant
+from uuvtai.runtime import start_taichi
+
+FOLDER = Path(run.__file__).parent
+NAMES = sorted(path.stem for path in FOLDER.glob("*.py") if path.stem not in run.NOT_BENCHMARKS)
+TINY = Job(quick=True, seconds=0.02)
+
+
+def test_ratio_and_floor_know_which_way_is_better():
+    rate = Row("", 30.0, "1/s", peer=10.0, floor=2.5, floor_on="ratio")
+    assert rate.ratio == 3.0 and rate.met
+    assert Row("", 2.0, "ms", peer=10.0, less_is_better=True).ratio == 5.0
+    assert Row("", 2.0, "ms", less_is_better=True, floor=3.0).met and not Row("", 4.0, "ms", less_is_better=True, floor=3.0).met
+    assert not Row("", 2.0, "1/s", floor=3.0).met
+    assert Row("", 2.0, "ms", peer=10.0, less_is_better=True, floor=6.0, floor_on="ratio").met is False
+    assert Row("", None, "ms", floor=3.0).met is False and Row("", 1.0, "ms").met is None
+
+
+def test_stopwatch_takes_turns_and_gives_the_median():
+    now, order = [0.0], []
+
+    def call(name, took):
+        def work():
+            order.append(name)
+            now[0] += took.pop(0)
+
+        return work
+
+    sides = {"slow": call("slow", [9.0, 3.0, 3.0, 50.0, 2.0]), "fast": call("fast", [9.0, 1.0, 1.0, 1.0, 0.5])}
+    assert seconds_per_call(sides, 3.0, lambda: now[0], rounds=3) == {"slow": 3.0, "fast": 1.0}
+    assert order == ["slow", "slow", "fast", "fast", *["slow", "fast"] * 3]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_benchmark_measures_and_says_what(name):
+    module = ast.parse((FOLDER / f"{name}.py").read_text())
+    measure = [node for node in module.body if isinstance(node, ast.FunctionDef) and node.name == "measure"]
+    assert [argument.arg for argument in measure[0].args.args] == ["job"]
+    assert len((ast.get_docstring(module) or "").splitlines()[0]) > 40
+    devices, threads = run._traits(name)
+    assert set(devices) <= {"cpu", "cuda"} and threads in (None, 1)
+    assert f"`{name}`" in (FOLDER / "README.md").read_text()
+
+
+def test_rows_have_figures_beside_peers():
+    """measure raises where the kernel and py_trees disagree."""
+    for row in tick.measure(TINY):
+        assert row.ours > 0 and row.peer > 0 and math.isfinite(row.ratio)
+        assert row.what and row.unit and row.peer_name
+        assert row.document()["ratio"] == row.ratio
+
+
+def test_peers_of_dynamics_agree_and_a_wrong_one_is_seen():
+    """The check before the clock starts sees drag that is off by a thousandth."""
+    config, n_env = Config(), 16
+    plant = Plant(config, start_taichi("cpu"), n_env)
+    actions = np.random.default_rng(1).uniform(-1, 1, (n_env, 4)).astype(np.float32)
+    columns = np.ascontiguousarray(actions.T)
+
+    def apart(xp, factor):
+        plant.reset()
+        peer = Vehicles(config, n_env, xp)
+        peer.quadratic *= factor
+        return dynamics.disagreement(plant, {"peer": peer}, actions, {"peer": columns if xp is np else torch.from_numpy(columns)})
+
+    assert apart(np, 1.0) < dynamics.AGREEMENT and apart(torch, 1.0) < dynamics.AGREEMENT < apart(torch, 1.001)
+    assert np.abs(plant.vehicle.vel_b.to_numpy()).max() > 0.2, "nothing moved"
+
+
+def test_unknown_names_are_refused():
+    done = subprocess.run([sys.executable, str(FOLDER / "run.py"), "sonra"], capture_output=True, text=True, check=False)
+    assert done.returncode == 2 and "sonra" in done.stderr and "tick" in done.stderr
