@@ -11,13 +11,14 @@ import taichi as ti
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.map_bits import put_layers
 from tests.reference.clearance import clearance_of, sites_of
 from uuvtai.config import ClearanceConfig, MappingConfig, TankConfig, VoronoiConfig
-from uuvtai.kernels import clearance, field
+from uuvtai.kernels import clearance, field, mapping
 from uuvtai.kernels.grid import grid_origin, grid_shape, outside_cells
 from uuvtai.kernels.lanes import LANES
 from uuvtai.kernels.signature import Const, In
-from uuvtai.state import PACKET, ClearanceState, ClockState, GridMask, MapState, allocate
+from uuvtai.state import PACKET, ClearanceMemory, ClearanceState, ClockState, GridMask, MapState, allocate
 
 N_ENV = 8
 TANK = TankConfig(x_m=(0.0, 7.0), y_m=(0.0, 5.0))
@@ -36,8 +37,9 @@ class Stage:
     """The structs of clearance."""
 
     def __init__(self, n_env=N_ENV):
-        sizes = {"n_env": n_env, "n_row": SHAPE[0], "n_col": SHAPE[1]}
+        sizes = {"n_env": n_env, "n_row": SHAPE[0], "n_col": SHAPE[1], "n_packet": SHAPE[1] // LANES, "n_slot": 4}
         self.clearance, self.grid_map = allocate(ClearanceState, sizes), allocate(MapState, sizes)
+        self.memory = allocate(ClearanceMemory, sizes)
         self.mask, self.clock = allocate(GridMask, sizes), allocate(ClockState, sizes)
         self.clock.awake.fill(1)
         self.set_outside(np.array(outside_cells(TANK, MAP.cell_m)))
@@ -45,15 +47,16 @@ class Stage:
     def set_outside(self, outside):
         self.outside = outside
         self.mask.outside.from_numpy(outside.astype(np.int32))
+        mapping.pack_mask(self.mask)
 
     def compute(self, static, dynamic=None, cfg=CFG, voronoi=VORONOI):
         """(clearance, site_row, site_col) of these layers [n_env, row, col]."""
-        self.grid_map.static_occ.from_numpy(static.astype(np.float32))
-        self.grid_map.dynamic_occ.from_numpy((np.zeros_like(static) if dynamic is None else dynamic).astype(np.float32))
+        static32 = static.astype(np.float32)
+        put_layers(self.grid_map, static32, np.zeros_like(static32) if dynamic is None else dynamic.astype(np.float32), MAP.occupied)
         return self.launch(cfg, voronoi)
 
     def launch(self, cfg=CFG, voronoi=VORONOI):
-        clearance.compute_clearance(self.clearance, self.grid_map, self.mask, self.clock, cfg, MAP, voronoi)
+        clearance.compute_clearance(self.clearance, self.memory, self.grid_map, self.mask, self.clock, cfg, MAP, voronoi)
         return tuple(f.to_numpy() for f in (self.clearance.clearance_m, self.clearance.site_row, self.clearance.site_col))
 
 
@@ -154,6 +157,35 @@ def test_ties_go_left_then_to_the_lower_row(stage):
     _, site_row, site_col = stage.compute(static)
     found = [(int(site_row[env, 20, 32]), int(site_col[env, 20, 32])) for env in range(5)]
     assert found == [(20, 30), (18, 32), (18, 30), (18, 34), (22, 30)]
+
+
+def test_what_changed_is_redone_and_nothing_else_differs(stage):
+    """A map that changes bit by bit, by blocks and at random: the same arrays as computed anew."""
+    rng, static = np.random.default_rng(1), maps_of(2)
+    for _ in range(12):
+        for env in range(N_ENV):
+            row, col = rng.integers(SHAPE[0]), rng.integers(SHAPE[1])
+            kind = rng.integers(4)
+            if kind == 0:
+                static[env, row, col] = 1 - static[env, row, col]
+            elif kind == 1:
+                static[env, row : row + 3, col : col + 2] = rng.integers(2)
+            elif kind == 2:
+                static[env][rng.random(SHAPE) < 0.01] = rng.random()
+        partly = stage.compute(static)
+        clearance.forget_clearance(stage.memory)
+        for a, b in zip(partly, stage.compute(static), strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_what_did_not_change_is_left_alone(stage):
+    static = np.zeros((N_ENV, *SHAPE))
+    stage.compute(static)
+    stage.clearance.clearance_m.fill(9.0)
+    static[0, 20, 30] = 1
+    found = stage.compute(static)[0]
+    assert (found[1:] == 9).all()
+    assert found[0, 20, 30] == 0 and (found[0, :, 64:] == 9).all()
 
 
 def test_limits_of_the_keys():

@@ -96,7 +96,9 @@ class SimState:
     forecast: state.ForecastState
     mask: state.GridMask
     grid_map: state.MapState
+    map_scratch: state.MapScratch
     clearance: state.ClearanceState
+    clearance_memory: state.ClearanceMemory
     voronoi: state.VoronoiState
     route: state.RouteState
     features: state.FeatureState
@@ -118,7 +120,7 @@ class Sim:
         runtime = start_taichi(device)
         self.device = torch.device(runtime.device)
         check_size(config, num_envs, runtime.device)
-        sizes = array_sizes(config, num_envs)
+        sizes = array_sizes(config, num_envs, runtime.device)
         self.s = SimState(**{f.name: state.allocate(getattr(state, str(f.type).rpartition(".")[2]), sizes) for f in fields(SimState)})
         self.action = torch.zeros(num_envs, 4, device=self.device)
         self.reward = torch.zeros(num_envs, device=self.device)
@@ -155,6 +157,7 @@ class Sim:
         load_fixed(self.s.fixed, world_cfg)
         outside = outside_cells(world_cfg.tank, self.config.mapping.cell_m)
         self.s.mask.outside.from_numpy(np.array(outside, dtype=np.int32))
+        mapping.pack_mask(self.s.mask)
         wrench_of_thrust, thrust_of_wrench = allocation_matrices(self.config.vehicle)
         self.s.allocation.wrench_of_thrust.from_numpy(wrench_of_thrust.astype(np.float32))
         self.s.allocation.thrust_of_wrench.from_numpy(thrust_of_wrench.astype(np.float32))
@@ -251,12 +254,25 @@ class Sim:
             elevation.bound_heights(s.forecast, s.tracks, s.ego, s.clock, c.elevation, c.world.tank)
         with self._stage("mapping"):
             mapping.update_map(
-                s.grid_map, s.scan, s.image, s.tracks, s.mask, s.clock, c.mapping, c.sensors.sonar, c.sensors.depth, c.world.tank, c.episode
+                s.grid_map,
+                s.map_scratch,
+                s.scan,
+                s.image,
+                s.tracks,
+                s.mask,
+                s.clock,
+                c.mapping,
+                c.sensors.sonar,
+                c.sensors.depth,
+                c.world.tank,
+                c.episode,
             )
             if c.mapping.stamp > 0:
                 debug_stamp.stamp_truth(s.grid_map, s.world, s.clock, c.mapping, c.world.tank)
         with self._stage("clearance"):
-            clearance.compute_clearance(s.clearance, s.grid_map, s.mask, s.clock, c.clearance, c.mapping, c.voronoi)
+            clearance.compute_clearance(
+                s.clearance, s.clearance_memory, s.grid_map, s.mask, s.clock, c.clearance, c.mapping, c.voronoi
+            )
         with self._stage("features"):
             features.sense_sectors(s.features, s.scan, s.ego, s.clock, c.features, c.sensors.sonar)
         with self._stage("planning"):

@@ -18,9 +18,11 @@ from uuvtai.scenario import scenario_sizes
 _MAX_ENVS = 1 << 20
 _PLAN_SLOTS = 64
 """Plans under way at once: far more than a CPU has cores, and the planner's scratch stays small."""
+_MAP_SLOTS = 64
+"""Maps under way at once on a CPU: more than it has cores, and their scratch stays in its caches. On a GPU every env has its own."""
 
 
-def array_sizes(config: Config, n_env: int) -> dict[str, int]:
+def array_sizes(config: Config, n_env: int, device: str = "cpu") -> dict[str, int]:
     """Length of every named axis in ``state``."""
     tank, sensors = config.world.tank, config.sensors
     n_row, n_col = grid_shape(tank, config.mapping.cell_m)
@@ -42,6 +44,8 @@ def array_sizes(config: Config, n_env: int) -> dict[str, int]:
         "n_forecast": round(config.tracking.horizon_s / config.tracking.forecast_dt_s) + 1,
         "n_row": n_row,
         "n_col": n_col,
+        "n_packet": n_col // LANES,
+        "n_slot": n_env if device == "cuda" else min(n_env, _MAP_SLOTS),
         "n_plan": min(n_env, _PLAN_SLOTS),
         "n_heap": n_row * n_col,
         "n_path": 2048,
@@ -57,9 +61,9 @@ def array_sizes(config: Config, n_env: int) -> dict[str, int]:
     }
 
 
-def memory_bytes(config: Config, n_env: int) -> int:
+def memory_bytes(config: Config, n_env: int, device: str = "cpu") -> int:
     """Memory that the simulator's arrays take [bytes]."""
-    sizes = array_sizes(config, n_env)
+    sizes = array_sizes(config, n_env, device)
     structs = (s for s in vars(state).values() if isinstance(s, type) and dataclasses.is_dataclass(s))
     return sum(state.bytes_of(struct, sizes) for struct in structs)
 
@@ -70,7 +74,7 @@ def check_size(config: Config, n_env: int, device: str) -> None:
         raise ValueError(f"--num-envs {n_env}: at least 1 env is needed, for example --num-envs 64")
     if n_env > _MAX_ENVS:
         raise MemoryError(f"--num-envs {n_env}: more than {_MAX_ENVS} envs are not supported; use a smaller number")
-    needed, free = memory_bytes(config, n_env), free_memory_bytes(device)
+    needed, free = memory_bytes(config, n_env, device), free_memory_bytes(device)
     if free is not None and needed > 0.9 * free:
         fitting = max(1, int(n_env * 0.9 * free / needed))
         raise MemoryError(

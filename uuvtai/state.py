@@ -22,26 +22,55 @@ _T = TypeVar("_T")
 
 PACKET = 16
 """Lanes of a packed array (lanes.LANES)."""
+WORD = 64
+"""Bits of a word of a bit array (bits.WORD)."""
 
 
-def array(*shape: str, vec: int = 0, dtype: Any = REAL, packed: bool = False, lanes: bool = False) -> Any:
+def array(
+    *shape: str, vec: int = 0, dtype: Any = REAL, packed: bool = False, lanes: bool = False, bits: bool = False, beside: str = ""
+) -> Any:
     """Declare one array of a struct: named sizes, optional vector length, dtype (default: the run's real type).
 
     ``packed`` groups the last axis into vectors of sixteen neighbours: one packet is one index, which Taichi loads as a whole.
     ``lanes`` keeps single elements as indices, but lays the last axis (padded to whole packets) out in groups of sixteen, so that the
     compiler sees that a loop over ``packet * 16 + i`` with static i meets neighbours: it then loads, computes and stores whole vectors.
+    ``bits`` keeps sixty-four neighbours on the last axis as the bits of one word (uint64), the first in the lowest.
+    Arrays of one shape with the same word in ``beside`` lie side by side, element by element: what is touched together is fetched together.
     """
-    return dataclasses.field(metadata={"shape": shape, "vec": vec, "dtype": dtype, "packed": packed, "lanes": lanes})
+    metadata = {"shape": shape, "vec": vec, "dtype": ti.u64 if bits else dtype, "packed": packed, "lanes": lanes, "bits": bits}
+    return dataclasses.field(metadata=metadata | {"beside": beside})
 
 
 def allocate(struct: type[_T], sizes: dict[str, int], real: Any = ti.f32) -> _T:
     """Build every array of ``struct``; ``sizes`` maps each name of a shape to its length. Taichi must be running."""
-    return struct(**{f.name: _field(f, sizes, real) for f in dataclasses.fields(struct)})  # type: ignore[arg-type]
+    built: dict[str, Any] = {}
+    for declared in dataclasses.fields(struct):  # type: ignore[arg-type]
+        if declared.metadata["beside"]:
+            built |= {} if declared.name in built else _side_by_side(struct, declared.metadata["beside"], sizes, real)
+        else:
+            built[declared.name] = _field(declared, sizes, real)
+    return struct(**built)
+
+
+def _side_by_side(struct: type, group: str, sizes: dict[str, int], real: Any) -> dict[str, Any]:
+    together = [f for f in dataclasses.fields(struct) if f.metadata["beside"] == group]  # type: ignore[arg-type]
+    shape = _shape(together[0], sizes)
+    built = {f.name: ti.field(_dtype(f, real)) for f in together}
+    ti.root.dense((ti.i, ti.ij, ti.ijk, ti.ijkl)[len(shape) - 1], shape).place(*built.values())
+    return built
+
+
+def _dtype(declared: dataclasses.Field, real: Any) -> Any:
+    return real if declared.metadata["dtype"] is REAL else declared.metadata["dtype"]
+
+
+def _shape(declared: dataclasses.Field, sizes: dict[str, int]) -> tuple[int, ...]:
+    shape = tuple(sizes[name] for name in declared.metadata["shape"])
+    return (*shape[:-1], -(-shape[-1] // WORD)) if declared.metadata["bits"] else shape
 
 
 def _field(declared: dataclasses.Field, sizes: dict[str, int], real: Any) -> Any:
-    shape = tuple(sizes[name] for name in declared.metadata["shape"])
-    dtype = real if declared.metadata["dtype"] is REAL else declared.metadata["dtype"]
+    shape, dtype = _shape(declared, sizes), _dtype(declared, real)
     if declared.metadata["packed"]:
         return ti.Vector.field(PACKET, dtype, shape=(*shape[:-1], shape[-1] // PACKET), layout=ti.Layout.AOS)
     if declared.metadata["lanes"]:
@@ -71,15 +100,15 @@ def bytes_of(struct: type, sizes: dict[str, int], real_bytes: int = 4) -> int:
     total = 0
     for declared in dataclasses.fields(struct):
         count = max(1, declared.metadata["vec"])
-        shape = [sizes[name] for name in declared.metadata["shape"]]
+        shape = _shape(declared, sizes)
         if declared.metadata["lanes"]:
-            shape[-1] = PACKET * _packets(shape[-1])
+            shape = (*shape[:-1], PACKET * _packets(shape[-1]))
         count *= math.prod(shape)
         total += count * (real_bytes if declared.metadata["dtype"] is REAL else _DTYPE_BYTES[declared.metadata["dtype"]])
     return total
 
 
-_DTYPE_BYTES = {ti.f32: 4, ti.f64: 8, ti.i32: 4, ti.u32: 4, ti.i16: 2, ti.u16: 2, ti.i8: 1, ti.u8: 1}
+_DTYPE_BYTES = {ti.f32: 4, ti.f64: 8, ti.i32: 4, ti.u32: 4, ti.i16: 2, ti.u16: 2, ti.i8: 1, ti.u8: 1, ti.u64: 8}
 
 
 # --------------------------------------------------------------------------------------------------------------------- clock
@@ -555,26 +584,52 @@ class GridMask:
 
     outside: ti.Field = array("n_row", "n_col", dtype=ti.i32)
     """1 = outside the tank (the grid has a border of such cells)"""
+    outside_bits: ti.Field = array("n_row", "n_col", bits=True)
+    """the same, one bit a cell"""
 
 
 @dataclass(frozen=True, eq=False)
 class MapState:
-    """Remembered: the two-layer occupancy map. Row = y, column = x."""
+    """Remembered: the two-layer occupancy map. Row = y, column = x. What is asked of many cells at once is kept in bits."""
 
-    static_occ: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.f32)
+    static_occ: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.f32, beside="layers")
     """[0, 1] persistent layer M^s"""
-    dynamic_occ: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.f32)
+    dynamic_occ: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.f32, beside="layers")
     """[0, 1] layer M^d of what moves"""
-    evidence: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.u8)
-    """scratch until the next scan is merged: bits STATIC_HIT, DYNAMIC_HIT, DEPTH_HIT (mapping.py)"""
-    seen_step: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.i16)
-    """episode step at which the cell was last observed, -1 = never (while a scan is merged: its step = a beam passed through)"""
-    free_scans: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.u8)
-    """scans in a row that saw it free (saturating): how confidently it is free"""
     dynamic_scans: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.u8)
-    """scans in a row with dynamic evidence (saturating): promotion to static"""
+    """scans with dynamic evidence since the cell was last seen free (saturating): promotion to static"""
+    free_scans: ti.Field = array("n_env", "n_row", "n_col", vec=8, bits=True)
+    """scans that saw the cell free since its last return, up to what makes it confident: a number of eight bits, one word for each"""
+    confident: ti.Field = array("n_env", "n_row", "n_col", bits=True, beside="words")
+    """seen free long enough that a return is a surprise"""
+    held: ti.Field = array("n_env", "n_row", "n_col", bits=True, beside="words")
+    """dynamic_scans is not 0"""
+    alive: ti.Field = array("n_env", "n_row", "n_col", bits=True, beside="words")
+    """a layer is not 0"""
+    seen: ti.Field = array("n_env", "n_row", "n_col", bits=True, beside="words")
+    """observed at least once: everything else is unknown"""
+    static_occupied: ti.Field = array("n_env", "n_row", "n_col", bits=True, beside="words")
+    """M^s reaches tau_occ"""
+    dynamic_occupied: ti.Field = array("n_env", "n_row", "n_col", bits=True, beside="words")
+    """M^d reaches tau_occ"""
+    depth_hit: ti.Field = array("n_env", "n_row", "n_col", bits=True)
+    """points seen by the camera since the newest scan"""
+    depth_waits: ti.Field = array("n_env", dtype=ti.i32)
+    """1 = there may be such points"""
     map_step: ti.Field = array("n_env", dtype=ti.i32)
     """episode step of the newest scan in the map; far below 0 = none yet"""
+
+
+@dataclass(frozen=True, eq=False)
+class MapScratch:
+    """Scratch: what one env's scan says about the cells. Slots are shared by all envs: few serve many and stay in the cache."""
+
+    static_hit: ti.Field = array("n_slot", "n_row", "n_col", bits=True, beside="marks")
+    """static returns"""
+    dynamic_hit: ti.Field = array("n_slot", "n_row", "n_col", bits=True, beside="marks")
+    """returns of what moves"""
+    fan_edge: ti.Field = array("n_slot", "n_row", "n_col", bits=True, beside="marks")
+    """cells at which a column enters or leaves the fan of free water (fan.py)"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -587,10 +642,28 @@ class ClearanceState:
     """row of the nearest site, -1 = none within clearance.max_m"""
     site_col: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.i16)
     """column of the nearest site"""
-    row_key: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.i32, packed=True)
-    """scratch: key of the nearest site in the same row (clearance.py)"""
     fresh: ti.Field = array("n_env", dtype=ti.i32)
     """1 = computed in this very step"""
+
+
+@dataclass(frozen=True, eq=False)
+class ClearanceMemory:
+    """What the newest clearance was computed from: the next one redoes only what changed. And scratch, its slots shared by all envs."""
+
+    sites: ti.Field = array("n_env", "n_row", "n_col", bits=True)
+    """occupied cells and cells outside"""
+    farthest: ti.Field = array("n_env", "n_row", "n_packet", dtype=ti.i32)
+    """[cells^2] largest squared distance among sixteen neighbours in a row"""
+    limit: ti.Field = array("n_env", dtype=ti.i32)
+    """[cells^2] limit of the distances, 0 = nothing computed yet"""
+    row_key: ti.Field = array("n_slot", "n_row", "n_col", dtype=ti.i32, packed=True)
+    """scratch: key of the nearest site in the same row (clearance.py)"""
+    near_up: ti.Field = array("n_slot", "n_packet", "n_row", bits=True)
+    """scratch: rows of a packet's columns that have a site in reach, lowest row first"""
+    near_down: ti.Field = array("n_slot", "n_packet", "n_row", bits=True)
+    """scratch: the same, highest row first"""
+    stale: ti.Field = array("n_slot", "n_packet", "n_row", bits=True)
+    """scratch: rows of a packet's columns that must be redone"""
 
 
 # ------------------------------------------------------------------------------------------------------------------ planning

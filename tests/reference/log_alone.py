@@ -299,13 +299,15 @@ class Mapper:
 
     def free_water(self, b):
         silent = min(self.m["free_range_m"], self.sonar["max_range_m"])
-        end = np.minimum(np.where(b.hit, b.range - self.cell - b.sigma, silent), b.wall - 1e-3)
-        along = (np.arange(math.ceil(end.max() / self.cell) + 1) + 0.5) * self.cell
-        beam, k = np.nonzero(along <= end[:, None])
-        row, col, counts = self.cells(b.x + along[k] * b.ux[beam], b.y + along[k] * b.uy[beam])
-        free = np.zeros_like(self.outside)
-        free[row[counts], col[counts]] = True
-        return free
+        reach = np.maximum(np.where(b.hit, b.range - self.cell - b.sigma, silent), 0)
+        legs, between = np.minimum(reach, np.roll(reach, -1)), 2 * np.pi / len(reach)
+        y, x = ((np.arange(n) + 0.5) * self.cell + low for n, low in zip(self.outside.shape, self.origin[::-1], strict=True))
+        dx, dy = np.broadcast_arrays(x[None, :] - b.x, y[:, None] - b.y)
+        beam = np.floor((np.arctan2(dy, dx) - math.atan2(b.uy[0], b.ux[0])) / between).astype(int) % len(reach)
+        after = (beam + 1) % len(reach)
+        # the far side of the triangle is at right angles to the line halfway between its beams
+        ahead = (dx * (b.ux[beam] + b.ux[after]) + dy * (b.uy[beam] + b.uy[after])) / 2
+        return (ahead < legs[beam] * math.cos(between / 2) ** 2) & ~self.outside
 
     def returns(self, b):
         """(cells with a return of what rests, cells with a return of what moves)."""

@@ -1,4 +1,4 @@
-"""NumPy float64 oracle of one map update: the same walk over cells and the paper's equations, one beam and one sample after another.
+"""NumPy float64 oracle of one map update: sectors between beams, returns beam by beam, and the paper's equations.
 
 Where float32 may rightly land in the other cell (a point within ``DOUBT`` of a cell's edge, a comparison within ``DOUBT`` of its
 threshold), the cells concerned are reported as doubtful, so that a test can leave out exactly those.
@@ -60,18 +60,32 @@ class MapOracle:
 
     # -- evidence
 
-    def free_cells(self, pos, unit, r, hit, doubtful):
-        """Set of cells that a beam passes through."""
+    def reach(self, r, hit):
+        """[cells] up to which a beam proves free water."""
         s = self.sonar
-        reach = r - self.cell - (s.range_sigma_m + s.range_sigma_slope * r) if hit else min(self.m.free_range_m, s.max_range_m)
-        end = min(reach, self.wall_range(pos, unit) - 1e-3)
-        cells, k = set(), 0
-        while (k + 0.5) * self.cell <= end + DOUBT * self.cell:
-            cell, options = self.cells(pos[:2] + (k + 0.5) * self.cell * unit)
-            certain = (k + 0.5) * self.cell <= end - DOUBT * self.cell and len(options) == 1
-            (cells if certain else doubtful).update({cell} if certain else options)
-            k += 1
-        return cells
+        proved = r - self.cell - (s.range_sigma_m + s.range_sigma_slope * r) if hit else min(self.m.free_range_m, s.max_range_m)
+        return max(proved, 0.0) / self.cell
+
+    def free_water(self, pos, yaw, scan, doubtful):
+        """Cells whose centre lies in the triangle between two neighbouring beams, both as long as the smaller of their reaches."""
+        reach = np.array([self.reach(float(r), hit) for r, hit in zip(scan["range"], scan["hit"], strict=True)])
+        legs, between = np.minimum(reach, np.roll(reach, -1)), 2 * math.pi / self.sonar.n_ray
+        row, col = np.indices(self.outside.shape)
+        x, y = (index + 0.5 - (pos[axis] - self.origin[axis]) / self.cell for axis, index in ((0, col), (1, row)))
+        sector = (np.arctan2(y, x) - yaw) / between
+        slack = DOUBT / np.maximum(np.hypot(x, y), 1e-9) / between
+
+        def depth(of):
+            """How far inside its triangle's far side each centre lies."""
+            number = np.floor(of).astype(int)
+            middle = yaw + (number + 0.5) * between
+            return legs[number % len(legs)] * math.cos(between / 2) - (x * np.cos(middle) + y * np.sin(middle))
+
+        free = depth(sector) > 0
+        for shifted in (sector - slack, sector, sector + slack):
+            unsure = (np.abs(depth(shifted)) < DOUBT) | ((depth(shifted) > 0) != free)
+            doubtful.update((int(r), int(c)) for r, c in np.argwhere(unsure))
+        return free & ~self.outside
 
     def near_static(self, static, cell, r):
         """(whether a statically occupied cell is within reach of this return, whether the reach is doubtful)."""
@@ -128,16 +142,13 @@ class MapOracle:
 
     # -- update
 
-    def update(self, state, scan, step, image=None):
+    def update(self, state, scan, image=None):
         """(new state, doubtful mask) after one fresh scan, and an image that arrived with it."""
         shape, doubtful = state["static"].shape, set()
-        free, bits = np.zeros(shape, bool), state["evidence"].astype(int)
+        bits = state["depth_hit"] * DEPTH
         pos, yaw = scan["pos"].astype(float), float(scan["yaw"])
+        free = self.free_water(pos[:2], yaw, scan, doubtful)
         for ray in range(self.sonar.n_ray):
-            angle = yaw + 2 * math.pi * ray / self.sonar.n_ray
-            unit = np.array([math.cos(angle), math.sin(angle)])
-            for cell in self.free_cells(pos[:2], unit, float(scan["range"][ray]), scan["hit"][ray], doubtful):
-                free[cell] = True
             if scan["hit"][ray]:
                 found = self.hit_of(pos, yaw, ray, scan, scan["tracked"][ray], state, doubtful)
                 if found:
@@ -149,9 +160,9 @@ class MapOracle:
         for cell in doubtful:
             if 0 <= cell[0] < shape[0] and 0 <= cell[1] < shape[1]:
                 mask[cell] = True
-        return self.merged(state, free, bits, step), mask
+        return self.merged(state, free, bits), mask
 
-    def merged(self, state, free, bits, step):
+    def merged(self, state, free, bits):
         """The paper's two equations, and the counters."""
         m = self.m
         s_hit, d_hit = (bits & STATIC) > 0, (bits & DYNAMIC) > 0
@@ -172,9 +183,9 @@ class MapOracle:
         return {
             "static": np.clip(static, 0, 1),
             "dynamic": np.clip(dynamic, 0, 1),
-            "evidence": np.zeros_like(bits),
-            "seen_step": np.where(free | (bits > 0), step, state["seen_step"]),
-            "free_scans": np.where(hit, 0, np.minimum(255, state["free_scans"].astype(int) + free)),
+            "depth_hit": np.zeros(free.shape, bool),
+            "seen": state["seen"] | free | (bits > 0),
+            "free_scans": np.where(hit, 0, np.minimum(self.confident, state["free_scans"].astype(int) + free)),
             "dynamic_scans": np.where(free, 0, np.minimum(255, state["dynamic_scans"].astype(int) + d_hit)),
         }
 

@@ -6,6 +6,7 @@ Launched only where ``mapping.stamp`` > 0 (default 0).
 import taichi as ti
 
 from uuvtai.config import MappingConfig, TankConfig
+from uuvtai.kernels.bits import put_bit
 from uuvtai.kernels.geometry import BOX, NONE, turned_z
 from uuvtai.kernels.grid import centre_of
 from uuvtai.kernels.signature import Const, In, Out
@@ -39,4 +40,8 @@ def stamp_truth(
                     if covers(env, body, centre_of(row, col, tank, mapping.cell_m), world):
                         stamped = 1
                 if stamped == 1:
-                    grid_map.dynamic_occ[env, row, col] = ti.min(1.0, grid_map.dynamic_occ[env, row, col] + mapping.stamp)
+                    stamped_occ = ti.min(1.0, grid_map.dynamic_occ[env, row, col] + mapping.stamp)
+                    grid_map.dynamic_occ[env, row, col] = stamped_occ
+                    put_bit(grid_map.alive, env, row, col)
+                    if stamped_occ >= mapping.occupied:
+                        put_bit(grid_map.dynamic_occupied, env, row, col)

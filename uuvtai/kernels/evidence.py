@@ -1,7 +1,7 @@
-"""What a scan and a depth image say about the cells of the map: free water, a return that stays or moves, a point seen by the camera.
+"""What a scan and a depth image say about the cells of the map: a return that stays or moves, a point seen by the camera.
 
-Free water is written as the scan's step into ``seen_step`` (any thread, any order: all write the same number); returns are bits of
-``evidence``, or-ed by the one thread that has all of an env's returns. ``mapping.py`` merges both into the two layers.
+Each is a bit per cell, set by the one thread that has all of an env's returns; ``fan.py`` adds free water, ``mapping.py`` merges all of
+it into the two layers.
 """
 
 import math
@@ -9,15 +9,13 @@ import math
 import taichi as ti
 
 from uuvtai.config import DepthConfig, MappingConfig, SonarConfig, TankConfig
-from uuvtai.kernels.geometry import FAR_M, TWO_PI, quaternion_wb, rotation_wb, turned_z
-from uuvtai.kernels.grid import cell_of, grid_origin
+from uuvtai.kernels.bits import WORD, bit_of, cell_bit, put_bit
+from uuvtai.kernels.fan import beam_lanes
+from uuvtai.kernels.geometry import FAR_M, TWO_PI, quaternion_wb, rotation_wb
+from uuvtai.kernels.grid import cell_of, grid_origin, grid_shape
 from uuvtai.kernels.lanes import LANES, f16x, i16x, ramp_lanes
 from uuvtai.kernels.signature import Const, In, Out
-from uuvtai.state import DepthImage, GridMask, MapState, SonarScan, TrackState
-
-STATIC_HIT = 1
-DYNAMIC_HIT = 2
-DEPTH_HIT = 4
+from uuvtai.state import DepthImage, MapScratch, MapState, SonarScan, TrackState
 
 _MAX_REACH = 4
 """[cells] farthest neighbour that may explain a surprising return as the edge of a static body."""
@@ -36,7 +34,7 @@ def pinhole(depth):
     return 0.5 * depth.cols / math.tan(math.radians(0.5 * depth.fov_deg)), 0.5 * depth.rows - 0.5, 0.5 * depth.cols - 0.5
 
 
-# ------------------------------------------------------------------------------------------------------------------------ beams
+# ------------------------------------------------------------------------------------------------------------------------ walls
 
 
 @ti.func
@@ -46,110 +44,41 @@ def range_error(range_m, sonar: Const[SonarConfig]):
 
 
 @ti.func
-def beam_dir(yaw, ray, n_ray):
-    """Horizontal unit vector of a beam (``yaw`` 0: in the body's frame)."""
-    bearing = yaw + TWO_PI / n_ray * ray
-    return ti.Vector([ti.cos(bearing), ti.sin(bearing)])
-
-
-@ti.func
-def wall_span(pos, unit, tank: Const[TankConfig]):
-    """(enter, leave) [m] along a horizontal beam between the known side walls; leave < enter where it misses the tank."""
-    span = ti.Vector([0.0, FAR_M])
+def wall_lanes(pos, unit_x, unit_y, tank: Const[TankConfig]):
+    """[m] along sixteen horizontal beams to the known side wall through which each leaves the tank; negative where it misses the tank."""
+    leave = f16x(0.0)
     if ti.static(tank.shape == "circle"):
         off = pos - ti.Vector([0.5 * (tank.x_m[0] + tank.x_m[1]), 0.5 * (tank.y_m[0] + tank.y_m[1])])
-        along = off.dot(unit)
+        along = unit_x * off[0] + unit_y * off[1]
         # distance of the line from the centre by a cross product: along^2 - off^2 would cancel badly
-        inside = ti.static(tank.radius_m**2) - (off[0] * unit[1] - off[1] * unit[0]) ** 2
-        half = ti.sqrt(ti.max(inside, 0.0))
-        span = ti.Vector([ti.max(-along - half, 0.0), -along + half])
-        if inside < 0.0:
-            span = ti.Vector([0.0, -1.0])
+        across = unit_y * off[0] - unit_x * off[1]
+        inside = ti.static(tank.radius_m**2) - across * across
+        for i in ti.static(range(LANES)):
+            leave[i] = ti.select(inside[i] < 0.0, -1.0, ti.sqrt(ti.max(inside[i], 0.0)) - along[i])
     else:
-        for axis in ti.static(range(2)):
-            low, high = ti.static((tank.x_m, tank.y_m)[axis])
-            inverse = 1.0 / (unit[axis] if ti.abs(unit[axis]) > 1e-9 else 1e-9)
-            a, b = (low - pos[axis]) * inverse, (high - pos[axis]) * inverse
-            span = ti.Vector([ti.max(span[0], ti.min(a, b)), ti.min(span[1], ti.max(a, b))])
-    return span
+        for i in ti.static(range(LANES)):
+            to_x = ti.select(unit_x[i] > 0.0, tank.x_m[1] - pos[0], pos[0] - tank.x_m[0])
+            to_y = ti.select(unit_y[i] > 0.0, tank.y_m[1] - pos[1], pos[1] - tank.y_m[0])
+            leave[i] = ti.min(to_x / ti.max(ti.abs(unit_x[i]), 1e-9), to_y / ti.max(ti.abs(unit_y[i]), 1e-9))
+    return leave
 
 
 @ti.func
-def wall_gap(pos, tank: Const[TankConfig]):
-    """[m] from a point to the nearest side wall, negative outside."""
-    gap = 0.0
+def wall_gaps(x, y, tank: Const[TankConfig]):
+    """[m] from sixteen points to the nearest side wall, negative outside."""
+    gap = f16x(0.0)
     if ti.static(tank.shape == "circle"):
-        off = pos - ti.Vector([0.5 * (tank.x_m[0] + tank.x_m[1]), 0.5 * (tank.y_m[0] + tank.y_m[1])])
-        gap = ti.static(tank.radius_m) - off.norm()
+        off_x, off_y = x - 0.5 * (tank.x_m[0] + tank.x_m[1]), y - 0.5 * (tank.y_m[0] + tank.y_m[1])
+        squared = off_x * off_x + off_y * off_y
+        for i in ti.static(range(LANES)):
+            gap[i] = ti.static(tank.radius_m) - ti.sqrt(squared[i])
     else:
-        gap = ti.min(pos[0] - tank.x_m[0], tank.x_m[1] - pos[0], pos[1] - tank.y_m[0], tank.y_m[1] - pos[1])
+        for i in ti.static(range(LANES)):
+            gap[i] = ti.min(x[i] - tank.x_m[0], tank.x_m[1] - x[i], y[i] - tank.y_m[0], tank.y_m[1] - y[i])
     return gap
 
 
-# ------------------------------------------------------------------------------------------------------------------- free space
-
-
-@ti.func
-def free_reach(range_m, hit, sonar: Const[SonarConfig], mapping: Const[MappingConfig]):
-    """[m] up to which a beam proves free water: one cell and one sigma before its return, ``free_range_m`` without one."""
-    before = range_m - mapping.cell_m - (sonar.range_sigma_m + sonar.range_sigma_slope * range_m)
-    return ti.select(hit == 1, before, ti.min(mapping.free_range_m, sonar.max_range_m))
-
-
-@ti.func
-def mark_free(env, pos, unit, enter, end, step, grid_map: Out[MapState], tank: Const[TankConfig], cell_m: Const[float]):
-    """Free water along a beam: the cells under its samples enter + (k + 0.5) cell <= end, k = 0, 1, .., sixteen at a time."""
-    x0, y0 = ti.static(grid_origin(tank, cell_m))
-    col0 = (pos[0] - x0) / cell_m + unit[0] * (enter / cell_m)
-    row0 = (pos[1] - y0) / cell_m + unit[1] * (enter / cell_m)
-    last = ti.floor((end - enter) / cell_m - 0.5) + 0.5
-    first = 0.5
-    step16 = ti.cast(step, ti.i16)
-    while first <= last:
-        sample = f16x(0.0)
-        for i in ti.static(range(LANES)):
-            # lanes past the end repeat the last sample
-            sample[i] = ti.min(first + i, last)
-        rows, cols = i16x(0), i16x(0)
-        for i in ti.static(range(LANES)):
-            rows[i] = ti.cast(row0 + unit[1] * sample[i], ti.i32)
-            cols[i] = ti.cast(col0 + unit[0] * sample[i], ti.i32)
-        for i in ti.static(range(LANES)):
-            grid_map.seen_step[env, rows[i], cols[i]] = step16
-        first += float(LANES)
-
-
-@ti.func
-def mark_free_beams(
-    env,
-    group,
-    step,
-    grid_map: Out[MapState],
-    scan: In[SonarScan],
-    mapping: Const[MappingConfig],
-    sonar: Const[SonarConfig],
-    tank: Const[TankConfig],
-):
-    """Free space of sixteen neighbouring beams."""
-    n_ray = ti.static(scan.range_m.shape[1])
-    pos = ti.Vector([scan.ping_pos_w[env][0], scan.ping_pos_w[env][1]])
-    for ray in range(group * LANES, (group + 1) * LANES):
-        unit = beam_dir(scan.ping_yaw[env], ray, n_ray)
-        span = wall_span(pos, unit, tank)
-        reach = free_reach(scan.range_m[env, ray], scan.hit[env, ray], sonar, mapping)
-        # a millimetre short of the wall, so that rounding cannot leave the tank's own cells
-        mark_free(env, pos, unit, span[0], ti.min(reach, span[1] - 1e-3), step, grid_map, tank, mapping.cell_m)
-
-
 # ------------------------------------------------------------------------------------------------------------------------- hits
-
-
-@ti.func
-def moves_by_doppler(env, ray, unit_b, scan: In[SonarScan], threshold: Const[float]):
-    """1 where the return moves through the water along the beam: measured rate of range plus own velocity along the beam."""
-    vel = scan.ping_vel_b[env]
-    through_water = scan.doppler_m_s[env, ray] + vel[0] * unit_b[0] + vel[1] * unit_b[1]
-    return ti.cast(ti.abs(through_water) > threshold, ti.i32)
 
 
 @ti.func
@@ -163,15 +92,18 @@ def moves_by_track(env, ray, tracks: In[TrackState]):
 
 
 @ti.func
-def edge_of_static(env, row, col, reach, grid_map: In[MapState], occupied: Const[float]):
+def edge_of_static(env, row, col, reach, grid_map: In[MapState]):
     """1 where a cell within ``reach`` cells (square) is statically occupied."""
-    n_row, n_col = ti.static(grid_map.static_occ.shape[1:])
-    found = 0
+    n_row, n_word = ti.static(grid_map.static_occupied.shape[1:])
+    first_col = ti.max(col - reach, 0)
+    word, shift = first_col // WORD, ti.cast(first_col % WORD, ti.u64)
+    window = cell_bit(col + reach + 1 - first_col) - ti.cast(1, ti.u64)
+    found = ti.cast(0, ti.u64)
     for r in range(ti.max(row - reach, 0), ti.min(row + reach + 1, n_row)):
-        for c in range(ti.max(col - reach, 0), ti.min(col + reach + 1, n_col)):
-            if grid_map.static_occ[env, r, c] >= occupied:
-                found = 1
-    return found
+        found |= (grid_map.static_occupied[env, r, word] >> shift) & window
+        if shift > 0 and word + 1 < n_word:
+            found |= (grid_map.static_occupied[env, r, word + 1] << (ti.cast(WORD, ti.u64) - shift)) & window
+    return ti.cast(found != 0, ti.i32)
 
 
 @ti.func
@@ -183,7 +115,6 @@ def is_inconsistent(
     grid_map: In[MapState],
     mapping: Const[MappingConfig],
     sonar: Const[SonarConfig],
-    confident_scans: Const[int],
     promote_scans: Const[int],
 ):
     """1 where a return contradicts a cell that was confidently free, or one that such evidence holds and has not yet promoted.
@@ -191,57 +122,73 @@ def is_inconsistent(
     The edge of a static body does this too: range noise and the gap between beams move its returns into cells that other beams
     cleared. So nothing counts near a statically occupied cell: within one cell plus beam spacing plus range error.
     """
-    confident = ti.cast(grid_map.free_scans[env, row, col], ti.i32) >= confident_scans
-    held = ti.cast(grid_map.dynamic_scans[env, row, col], ti.i32)
+    confident = bit_of(grid_map.confident[env, row, col // WORD], col % WORD)
+    held = bit_of(grid_map.held[env, row, col // WORD], col % WORD)
     inconsistent = 0
-    if confident or (held > 0 and held < promote_scans):
+    if confident == 1 or (held == 1 and ti.cast(grid_map.dynamic_scans[env, row, col], ti.i32) < promote_scans):
         spacing = ti.static(TWO_PI / sonar.n_ray) * range_m
         reach = 1 + ti.cast((spacing + range_error(range_m, sonar)) / mapping.cell_m, ti.i32)
-        inconsistent = 1 - edge_of_static(env, row, col, ti.min(reach, _MAX_REACH), grid_map, mapping.occupied)
+        inconsistent = 1 - edge_of_static(env, row, col, ti.min(reach, _MAX_REACH), grid_map)
     return inconsistent
+
+
+@ti.func
+def mapped_lanes(
+    env, first_ray, pos, scan: In[SonarScan], mapping: Const[MappingConfig], sonar: Const[SonarConfig], tank: Const[TankConfig]
+):
+    """Of sixteen beams: kind of return (0 = none or from a known wall, 1 = at rest, 2 = moving by its Doppler), row, column, range [m]."""
+    n_row, n_col = ti.static(grid_shape(tank, mapping.cell_m))
+    x0, y0 = ti.static(grid_origin(tank, mapping.cell_m))
+    range_m, doppler, hit = f16x(0.0), f16x(0.0), i16x(0)
+    for i in ti.static(range(LANES)):
+        range_m[i] = scan.range_m[env, first_ray + i]
+        doppler[i] = scan.doppler_m_s[env, first_ray + i]
+        hit[i] = scan.hit[env, first_ray + i]
+    unit_x, unit_y = beam_lanes(scan.ping_yaw[env], first_ray, sonar.n_ray)
+    ahead_x, ahead_y = beam_lanes(0.0, first_ray, sonar.n_ray)
+    x, y = pos[0] + unit_x * range_m, pos[1] + unit_y * range_m
+    # noise along a slanting beam reaches deeper into the tank than the margin
+    gap, short = wall_gaps(x, y, tank), wall_lanes(pos, unit_x, unit_y, tank) - range_error(range_m, sonar) - range_m
+    # measured rate of range plus own velocity along the beam: motion through the water
+    moves = doppler + ahead_x * scan.ping_vel_b[env][0] + ahead_y * scan.ping_vel_b[env][1]
+    kind, row, col = i16x(0), i16x(0), i16x(0)
+    for i in ti.static(range(LANES)):
+        row[i] = ti.cast(ti.floor((y[i] - y0) / mapping.cell_m), ti.i32)
+        col[i] = ti.cast(ti.floor((x[i] - x0) / mapping.cell_m), ti.i32)
+    for i in ti.static(range(LANES)):
+        known = (gap[i] < mapping.wall_margin_m) | (short[i] < 0.0)
+        off = (row[i] < 0) | (row[i] >= n_row) | (col[i] < 0) | (col[i] >= n_col)
+        moving = ti.abs(moves[i]) > ti.static(doppler_threshold(mapping, sonar))
+        kind[i] = ti.select((hit[i] == 0) | known | off, 0, ti.select(moving, 2, 1))
+    return kind, row, col, range_m
 
 
 @ti.func
 def mark_hits(
     env,
-    grid_map: Out[MapState],
+    slot,
+    scratch: Out[MapScratch],
+    grid_map: In[MapState],
     scan: In[SonarScan],
     tracks: In[TrackState],
-    mask: In[GridMask],
     mapping: Const[MappingConfig],
     sonar: Const[SonarConfig],
     tank: Const[TankConfig],
-    confident_scans: Const[int],
     promote_scans: Const[int],
 ):
-    """Bit of every return's cell: what moves is DYNAMIC_HIT only, the rest STATIC_HIT; returns from known walls are left out."""
-    n_ray = ti.static(scan.range_m.shape[1])
-    threshold = ti.static(doppler_threshold(mapping, sonar))
+    """Bit of every return's cell: what moves is a dynamic hit only, the rest static hits; returns from known walls are left out."""
     pos = ti.Vector([scan.ping_pos_w[env][0], scan.ping_pos_w[env][1]])
-    for ray in range(n_ray):
-        if scan.hit[env, ray] == 1:
-            range_m = scan.range_m[env, ray]
-            unit_b = beam_dir(0.0, ray, n_ray)
-            unit = turned_z(unit_b, scan.ping_yaw[env])
-            point = pos + unit * range_m
-            if wall_gap(point, tank) >= mapping.wall_margin_m:
-                # noise along a slanting beam reaches deeper into the tank than the margin
-                if range_m <= wall_span(pos, unit, tank)[1] - range_error(range_m, sonar):
-                    cell = cell_of(point, tank, mapping.cell_m)
-                    moves = moves_by_doppler(env, ray, unit_b, scan, threshold) | moves_by_track(env, ray, tracks)
-                    if moves == 0:
-                        moves = is_inconsistent(env, cell[0], cell[1], range_m, grid_map, mapping, sonar, confident_scans, promote_scans)
-                    mark_bit(env, cell, ti.select(moves == 1, DYNAMIC_HIT, STATIC_HIT), grid_map, mask)
-
-
-@ti.func
-def mark_bit(env, cell, bit, grid_map: Out[MapState], mask: In[GridMask]):
-    """Set a bit of a cell's evidence, unless the cell is outside the tank or off the grid."""
-    n_row, n_col = ti.static(grid_map.evidence.shape[1:])
-    if cell[0] >= 0 and cell[0] < n_row and cell[1] >= 0 and cell[1] < n_col:
-        if mask.outside[cell[0], cell[1]] == 0:
-            old = ti.cast(grid_map.evidence[env, cell[0], cell[1]], ti.i32)
-            grid_map.evidence[env, cell[0], cell[1]] = ti.cast(old | bit, ti.u8)
+    for packet in range(ti.static(sonar.n_ray // LANES)):
+        kind, row, col, range_m = mapped_lanes(env, packet * LANES, pos, scan, mapping, sonar, tank)
+        for i in range(LANES):
+            if kind[i] != 0:
+                moves = ti.cast(kind[i] == 2, ti.i32) | moves_by_track(env, packet * LANES + i, tracks)
+                if moves == 0:
+                    moves = is_inconsistent(env, row[i], col[i], range_m[i], grid_map, mapping, sonar, promote_scans)
+                if moves == 1:
+                    put_bit(scratch.dynamic_hit, slot, row[i], col[i])
+                else:
+                    put_bit(scratch.static_hit, slot, row[i], col[i])
 
 
 # ------------------------------------------------------------------------------------------------------------------------ depth
@@ -273,13 +220,13 @@ def mark_depth(
     env,
     grid_map: Out[MapState],
     image: In[DepthImage],
-    mask: In[GridMask],
     mapping: Const[MappingConfig],
     depth: Const[DepthConfig],
     tank: Const[TankConfig],
 ):
-    """DEPTH_HIT in the cell of the nearest point at the vehicle's own depth, per image column; it waits there for the next merge."""
+    """Depth hit in the cell of the nearest point at the vehicle's own depth, per image column; it waits there for the next merge."""
     focal, middle_row, middle_col = ti.static(pinhole(depth))
+    n_row, n_col = ti.static(grid_shape(tank, mapping.cell_m))
     rpy = image.shot_rpy[env]
     R_wb = rotation_wb(quaternion_wb(rpy[0], rpy[1], rpy[2]))
     offset = ti.Vector([depth.offset_b_m[0], depth.offset_b_m[1], depth.offset_b_m[2]])
@@ -289,4 +236,6 @@ def mark_depth(
             if nearest[i] < FAR_M:
                 ray_b = ti.Vector([1.0, (middle_col - packet * LANES - i) / focal, (middle_row - nearest_row[i]) / focal])
                 point = image.shot_pos_w[env] + R_wb @ (offset + nearest[i] * ray_b)
-                mark_bit(env, cell_of(point, tank, mapping.cell_m), DEPTH_HIT, grid_map, mask)
+                cell = cell_of(point, tank, mapping.cell_m)
+                if cell[0] >= 0 and cell[0] < n_row and cell[1] >= 0 and cell[1] < n_col:
+                    put_bit(grid_map.depth_hit, env, cell[0], cell[1])

@@ -55,13 +55,15 @@ FORMULAS = {
         "log time include that step's scan."
     ),
     "map_free": (
-        "[free]: cells under the points (k + 0.5) cell_m along a beam, k = 0, 1, .., up to min(reach, wall - 0.001 m), that have "
-        "no return in this scan. reach = range - cell_m - sigma for a return, sigma = range_sigma_m + range_sigma_slope * range; "
-        "min(free_range_m, max_range_m) without one. wall = distance of the known side wall along the beam."
+        "[free]: cells of the tank that have no return in this scan and whose centre lies in the triangle between two "
+        "neighbouring beams, its two sides along them both as long as the smaller of their reaches. reach = range - cell_m - "
+        "sigma for a return, sigma = range_sigma_m + range_sigma_slope * range; min(free_range_m, max_range_m) without one; at "
+        "least 0."
     ),
     "map_returns": (
         "A return counts in the cell of its point, but not within wall_margin_m of a side wall or beyond, nor where range > wall "
-        "- error; error = 3 (sigma + range_jitter_m) + range_quantum_m. It is a moving one if |velocity + own_velocity . beam| "
+        "- error; error = 3 (sigma + range_jitter_m) + range_quantum_m, wall = range of the known side wall along the beam. It is "
+        "a moving one if |velocity + own_velocity . beam| "
         "(/sonar/doppler, beam in body axes) > max(doppler_evidence_m_s, 3 doppler_sigma_m_s), or if the beam is listed in "
         "/tracks, or if the cell speaks against a body at rest: (free_scans >= ceil(free_confident_s / P) or 0 < dynamic_scans "
         "< ceil(promote_s / P)) and no cell within m rows and columns has static >= occupied, m = min(4, 1 + floor((2 pi / n * "

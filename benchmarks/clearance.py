@@ -1,0 +1,127 @@
+"""Clearance with the nearest site, whole maps computed anew, against OpenCV's and SciPy's exact distance transforms of the same maps."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from benchmarks.common import Job, Row, seconds_per_call
+from tests.map_bits import put_layers
+from uuvtai import state
+from uuvtai.config import ClearanceConfig
+from uuvtai.kernels import clearance, mapping
+from uuvtai.kernels.grid import outside_cells
+from uuvtai.kernels.lanes import LANES
+from uuvtai.loader import load_config
+from uuvtai.runtime import start_taichi
+
+THREADS = 1
+FLOOR = 1.0
+_MAPS = 64
+"""Maps of a kind: small batches stay in the cache for the peers, too."""
+_TOLERANCE_M = 1e-5
+_WHOLE_M = 3.2
+"""More than half of a pool's width: every cell of it has a site within this, so that nothing is cut off."""
+
+
+def occupancies(rng: np.random.Generator, shape: tuple[int, int]) -> dict[str, np.ndarray]:
+    """Maps (n_map, n_row, n_col) by kind, True where occupied."""
+    row, col = np.indices(shape)
+    bodies = np.zeros((_MAPS, *shape), bool)
+    for i in range(8 * _MAPS):
+        away = np.hypot(row - rng.uniform(0, shape[0]), col - rng.uniform(0, shape[1]))
+        bodies[i % _MAPS] |= np.abs(away - rng.uniform(2, 6)) < 0.7
+    return {
+        "empty": np.zeros((_MAPS, *shape), bool),
+        "8 bodies": bodies,
+        "2 % at random": rng.random((_MAPS, *shape)) < 0.02,
+        "20 % at random": rng.random((_MAPS, *shape)) < 0.2,
+    }
+
+
+class Maps:
+    """Our clearance of some worlds' maps, and the peers' of the same cells."""
+
+    def __init__(self, world: str) -> None:
+        config = load_config(world)
+        self.config, self.cell_m = config, config.mapping.cell_m
+        self.outside = np.array(outside_cells(config.world.tank, self.cell_m))
+        n_row, n_col = self.outside.shape
+        sizes = {"n_env": _MAPS, "n_row": n_row, "n_col": n_col, "n_packet": n_col // LANES, "n_slot": _MAPS}
+        names = ("ClearanceState", "ClearanceMemory", "MapState", "GridMask", "ClockState")
+        self.structs = [state.allocate(getattr(state, name), sizes) for name in names]
+        self.clearance, self.memory, self.grid_map, self.mask, clock = self.structs
+        clock.awake.fill(1)
+        self.mask.outside.from_numpy(self.outside.astype(np.int32))
+        mapping.pack_mask(self.mask)
+
+    def put(self, occupied: np.ndarray) -> None:
+        """Take these maps."""
+        put_layers(self.grid_map, occupied, np.zeros_like(occupied), self.config.mapping.occupied)
+        self.images = [np.where(one | self.outside, 0, 255).astype(np.uint8) for one in occupied]
+
+    def ours(self, cfg: ClearanceConfig):
+        """One call computes every map anew."""
+
+        def call() -> None:
+            clearance.forget_clearance(self.memory)
+            clearance.compute_clearance(*self.structs, cfg, self.config.mapping, self.config.voronoi)  # type: ignore[call-arg]
+
+        return call
+
+    def opencv(self) -> None:
+        """Distances only."""
+        for image in self.images:
+            cv2.distanceTransform(image, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+
+    def scipy(self) -> None:
+        """Distances and sites."""
+        for image in self.images:
+            distance_transform_edt(image, return_indices=True)
+
+    def check(self, cfg: ClearanceConfig) -> None:
+        """Raise RuntimeError unless all three agree and our sites lie where they are said to."""
+        self.ours(cfg)()
+        found = self.clearance.clearance_m.to_numpy()
+        rows, cols = self.clearance.site_row.to_numpy().astype(int), self.clearance.site_col.to_numpy().astype(int)
+        row, col = np.indices(self.outside.shape)
+        for i, image in enumerate(self.images):
+            exact = np.minimum(distance_transform_edt(image) * self.cell_m, cfg.max_m)
+            precise = np.minimum(cv2.distanceTransform(image, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * self.cell_m, cfg.max_m)
+            near = rows[i] >= 0
+            reach = np.hypot(rows[i] - row, cols[i] - col)[near] * self.cell_m
+            worst = max(np.abs(found[i] - exact).max(), np.abs(found[i] - precise).max(), np.abs(reach - found[i][near]).max(initial=0))
+            if worst > _TOLERANCE_M or image[rows[i][near], cols[i][near]].any():
+                raise RuntimeError(f"map {i}: {worst} m apart")
+
+
+def measure(job: Job) -> list[Row]:
+    """Maps per second of one core, of the pool and of the maze, empty and full."""
+    start_taichi(job.device)
+    cv2.setNumThreads(1)
+    rows = []
+    for world, cfgs in (("pool", (ClearanceConfig(), ClearanceConfig(max_m=_WHOLE_M))), ("maze", (ClearanceConfig(),))):
+        maps = Maps(world)
+        n_row, n_col = maps.outside.shape
+        for kind, occupied in occupancies(np.random.default_rng(0), (n_row, n_col)).items():
+            maps.put(occupied)
+            for cfg in cfgs:
+                job.say(f"{world}, {kind}, to {cfg.max_m} m")
+                maps.check(cfg)
+                cost = seconds_per_call({"ours": maps.ours(cfg), "opencv": maps.opencv, "scipy": maps.scipy}, job.seconds / 3)
+                us = {side: 1e6 * seconds / _MAPS for side, seconds in cost.items()}
+                rows.append(
+                    Row(
+                        what=f"{world} {n_col} x {n_row}, {kind}, to {cfg.max_m:g} m",
+                        ours=1e6 / us["ours"],
+                        peer=1e6 / us["opencv"],
+                        peer_name="cv2.distanceTransform",
+                        unit="maps/s per core",
+                        floor=FLOOR,
+                        floor_on="ratio",
+                        note=f"{us['ours']:.1f} us with sites; OpenCV {us['opencv']:.1f} without; SciPy {us['scipy']:.1f} with",
+                        details={"us": us, "whole": cfg.max_m == _WHOLE_M},
+                    )
+                )
+    return rows
