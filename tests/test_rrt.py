@@ -98,7 +98,7 @@ def test_straightening_never_costs_more():
     start, goal = (1.0, 3.0), (19.0, 3.0)
     grid = grid_of(occ, start)
     is_valid = grid.checker((start, goal))
-    raw = rrt._solve(start, goal, grid, is_valid, 4000, 11, 1.0)
+    raw = rrt.solve_rrt(start, goal, grid, is_valid, 4000, 11, 1.0)
     assert raw is not None
     own = [sum(grid.line_cost(a, b, 0.1) for a, b in pairwise(p)) for p in (raw, rrt._straightened(raw, grid, 0.1))]
     assert own[1] <= own[0] and len(rrt._straightened(raw, grid, 0.1)) < len(raw)
