@@ -18,9 +18,9 @@ def reset_teacher(teacher: Out[TeacherState], clock: In[ClockState]):
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
         if pad == 0 and clock.awake[env] == 1:
             for node in range(ti.static(teacher.status.shape[1])):
-                teacher.status[env, node] = codes.IDLE
-                teacher.running_child[env, node] = 0
-                teacher.result[env, node] = codes.IDLE
+                teacher.status[env, node] = ti.cast(codes.IDLE, ti.i8)
+                teacher.running_child[env, node] = ti.cast(0, ti.i16)
+                teacher.result[env, node] = ti.cast(codes.IDLE, ti.i8)
                 teacher.since_step[env, node] = 0
                 teacher.ticks[env, node] = 0
                 teacher.acted[env, node] = 0
