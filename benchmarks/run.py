@@ -31,7 +31,7 @@ from benchmarks.common import Job, Row  # noqa: E402
 
 NOT_BENCHMARKS = ("__init__", "common", "run")
 PEERS = ("mujoco", "opencv-python-headless", "scipy", "ompl", "py_trees", "numpy", "torch")
-_LONGEST_S = 600
+_LONGEST_S = 1200
 _THREAD_VARIABLES = ("UUV_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 
