@@ -6,7 +6,7 @@ source nor a design page behind them are engineering choices (EC). YAML in and o
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
@@ -37,6 +37,12 @@ class Section(BaseModel):
     """Base of every section: immutable, closed, finite."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=False)
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name):
+            # Taichi asks every argument of every launch for an attribute that no section has: pydantic takes five times as long to say so
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
 
 # --------------------------------------------------------------------------------------------------------------------- world
