@@ -27,6 +27,8 @@ MAP, CFG, VORONOI = MappingConfig(), ClearanceConfig(), VoronoiConfig()
 FUSED = VoronoiConfig(use="fused")
 SHORT = ClearanceConfig(max_m=0.75)
 """not a multiple of the cell"""
+WIDE = ClearanceConfig(max_m=4.5)
+"""reaches farther than half a word of rows"""
 SHAPE = grid_shape(TANK, MAP.cell_m)
 
 ROUNDING_M = 5e-7
@@ -120,7 +122,7 @@ def test_equals_the_exact_transform(stage, seed):
 
 def test_fused_layer_and_odd_limit(stage):
     static, dynamic = maps_of(3), maps_of(4)[::-1]
-    for cfg, voronoi in ((SHORT, VORONOI), (CFG, FUSED)):
+    for cfg, voronoi in ((SHORT, VORONOI), (WIDE, VORONOI), (CFG, FUSED)):
         found = stage.compute(static, dynamic, cfg, voronoi)
         for env in range(N_ENV):
             sites = sites_of(static[env], dynamic[env], stage.outside, MAP.occupied, voronoi.use)
@@ -185,6 +187,7 @@ def test_what_did_not_change_is_left_alone(stage):
     static[0, 20, 30] = 1
     found = stage.compute(static)[0]
     assert (found[1:] == 9).all()
+    clearance.forget_clearance(stage.memory)
     assert found[0, 20, 30] == 0 and (found[0, :, 64:] == 9).all()
 
 

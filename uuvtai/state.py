@@ -636,11 +636,11 @@ class MapScratch:
 class ClearanceState:
     """Distance to the nearest occupied or outside cell, centre to centre, with that cell."""
 
-    clearance_m: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.f32)
+    clearance_m: ti.Field = array("n_env", "n_row", "n_col", lanes=True, dtype=ti.f32)
     """[m] exact up to clearance.max_m, which stands for "at least" """
-    site_row: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.i16)
+    site_row: ti.Field = array("n_env", "n_row", "n_col", lanes=True, dtype=ti.i16)
     """row of the nearest site, -1 = none within clearance.max_m"""
-    site_col: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.i16)
+    site_col: ti.Field = array("n_env", "n_row", "n_col", lanes=True, dtype=ti.i16)
     """column of the nearest site"""
     fresh: ti.Field = array("n_env", dtype=ti.i32)
     """1 = computed in this very step"""

@@ -187,7 +187,7 @@ def best_keys(slot, row, packet, memory: In[ClearanceMemory], cfg: Const[Clearan
     n_row = ti.static(memory.farthest.shape[1])
     reach, bits = ti.static(window_reach(cfg, mapping), offset_bits(cfg, mapping))
     offsets = bits_from(memory.near_up, slot, packet, row) | bits_from(memory.near_down, slot, packet, n_row - 1 - row)
-    offsets &= ti.static((2 << reach) - 2)
+    offsets &= (ti.cast(2, ti.u64) << ti.cast(reach, ti.u64)) - ti.cast(2, ti.u64)
     best = memory.row_key[slot, row, packet]
     worst = best.max()
     while offsets != 0:
