@@ -15,6 +15,8 @@ DEVICES = ("cpu", "cuda")
 FLOORS = {"paper": 15_000.0, "nominal": 30_000.0}
 """[env-steps/s] at 1,024 envs on two CPU cores"""
 _FLOOR_ENVS = 1024
+_WINDOWS = 3
+"""Windows of equal length: does the cost change while maps fill and episodes end?"""
 _SENSING = {"paper": "sonar and map each step", "nominal": "at 10 Hz"}
 
 
@@ -33,10 +35,12 @@ def _row(job: Job, sensors: str, n_env: int) -> Row:
     for _ in range(WARM_STEPS):
         batch.step()
     start_s = time.perf_counter() - begun
-    cpu = time.process_time()
-    speed = env_steps_per_s(batch, 2 * job.seconds, lambda: None)
-    cpu_us = 1e6 * (time.process_time() - cpu) / batch.env_steps
-    steps, episodes = batch.env_steps // n_env, batch.episodes
+    cpu, env_steps, speeds = time.process_time(), 0, []
+    for _ in range(_WINDOWS):
+        speeds.append(env_steps_per_s(batch, 5 * job.seconds / _WINDOWS, lambda: None))
+        env_steps += batch.env_steps
+    cpu_us = 1e6 * (time.process_time() - cpu) / env_steps
+    speed, steps, episodes = sum(speeds) / _WINDOWS, env_steps // n_env, batch.episodes
     sim.stage_s = {}
     env_steps_per_s(batch, job.seconds, lambda: None)
     stages = {name: 1e6 * sim.stage_s.get(name, 0.0) / batch.env_steps for name in STAGES}
@@ -53,6 +57,7 @@ def _row(job: Job, sensors: str, n_env: int) -> Row:
             "cpu_us_per_env_step": cpu_us,
             "memory_kb_per_env": memory,
             "start_s": start_s,
+            "env_steps_per_s_by_window": speeds,
             "steps_measured": steps,
             "episodes_ended": episodes,
             "table": {"us per env-step": {**stages, "sum": sum(stages.values())}},
