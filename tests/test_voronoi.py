@@ -254,11 +254,11 @@ def sorted_by_heap(voronoi: Out[VoronoiState], key: ti.types.ndarray(dtype=ti.f3
         for i in range(key.shape[0]):
             size = heap.heap_after_push(voronoi, 0, size, i, key[i])
             if i % 2 == 1:
-                out[taken] = voronoi.heap_cell[0, 0]
+                out[taken] = heap.top_cell(voronoi, 0)
                 size = heap.heap_after_pop(voronoi, 0, size)
                 taken += 1
         while size > 0:
-            out[taken] = voronoi.heap_cell[0, 0]
+            out[taken] = heap.top_cell(voronoi, 0)
             size = heap.heap_after_pop(voronoi, 0, size)
             taken += 1
 

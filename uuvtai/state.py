@@ -679,10 +679,8 @@ class VoronoiState:
     """cost-to-go of the cells reached by the search"""
     cell: ti.Field = array("n_plan", "n_row", "n_col", dtype=ti.u8)
     """bits of voronoi.py: on the skeleton or not (filled on demand), reached, direction of the next cell towards the goal"""
-    heap_cell: ti.Field = array("n_plan", "n_heap", dtype=ti.i32)
-    """binary heap of open cells (row * n_col + col)"""
-    heap_key: ti.Field = array("n_plan", "n_heap", dtype=ti.f32)
-    """their estimated total costs"""
+    heap: ti.Field = array("n_plan", "n_heap", dtype=ti.u64)
+    """binary heap of open cells: bits of the estimated total cost, then the cell (row * n_col + col)"""
     path_cell: ti.Field = array("n_plan", "n_path", dtype=ti.i32)
     """cells of the path found, from start to goal"""
     node_cost: ti.Field = array("n_plan", "n_path", dtype=ti.f32)

@@ -8,7 +8,7 @@ plateaus that belong to the skeleton. Neighbours are the eight around a cell; a 
 import taichi as ti
 
 from uuvtai.config import ClearanceConfig, VoronoiConfig
-from uuvtai.kernels.heap import heap_after_pop, heap_after_push
+from uuvtai.kernels.heap import heap_after_pop, heap_after_push, top_cell
 from uuvtai.kernels.signature import Const, In, Out
 from uuvtai.state import ClearanceState, VoronoiState
 
@@ -177,11 +177,12 @@ def search_cells(
         key = _estimate(0.0, goal[0], goal[1], start[0], start[1], floor_weight)
         size = heap_after_push(voronoi, slot, size, goal[0] * n_col + goal[1], key)
     while size > 0 and status == NOT_FOUND:
-        row, col = voronoi.heap_cell[slot, 0] // n_col, voronoi.heap_cell[slot, 0] % n_col
+        top = top_cell(voronoi, slot)
+        row, col = top // n_col, top % n_col
         size = heap_after_pop(voronoi, slot, size)
         if row == start[0] and col == start[1]:
             status = FOUND
-        elif voronoi.pops[env] > budget or size + 8 > ti.static(voronoi.heap_cell.shape[1]):
+        elif voronoi.pops[env] > budget or size + 8 > ti.static(voronoi.heap.shape[1]):
             status = OUT_OF_BUDGET
         elif bits_at(voronoi, slot, row, col) & CLOSED == 0:
             voronoi.cell[slot, row, col] = ti.cast(bits_at(voronoi, slot, row, col) | CLOSED, ti.u8)
@@ -212,16 +213,18 @@ def _size_after_expansion(
     for k in range(8):
         step = step_of(k)
         to_row, to_col = row + step[0], col + step[1]
-        length = ti.select(step[0] != 0 and step[1] != 0, 1.41421356, 1.0)
-        offer = ti.cast(here + 0.5 * length * (weight + voronoi.weight[slot, to_row, to_col]), ti.f32)
-        if _step_is_open(voronoi, slot, row, col, step):
-            medial = on_skeleton(voronoi, clearance, slot, env, to_row, to_col, cfg, clearance_cfg)
-            bits = bits_at(voronoi, slot, to_row, to_col)
-            if bits & CLOSED == 0 and (everywhere > 0 or medial or bits & JOINED != 0):
-                if bits & REACHED == 0 or offer < _BETTER * voronoi.cost[slot, to_row, to_col]:
-                    voronoi.cost[slot, to_row, to_col] = offer
-                    kept = bits & (KNOWN | SKELETON | JOINED)
-                    voronoi.cell[slot, to_row, to_col] = ti.cast(kept | REACHED | ((7 - k) << _NEXT_SHIFT), ti.u8)
-                    key = _estimate(offer, to_row, to_col, start[0], start[1], floor_weight)
-                    new_size = heap_after_push(voronoi, slot, new_size, to_row * n_col + to_col, key)
+        known = bits_at(voronoi, slot, to_row, to_col)
+        if known & CLOSED == 0 and (known & KNOWN == 0 or everywhere > 0 or known & (SKELETON | JOINED) != 0):
+            if _step_is_open(voronoi, slot, row, col, step):
+                medial = on_skeleton(voronoi, clearance, slot, env, to_row, to_col, cfg, clearance_cfg)
+                bits = bits_at(voronoi, slot, to_row, to_col)
+                length = ti.select(step[0] != 0 and step[1] != 0, 1.41421356, 1.0)
+                offer = ti.cast(here + 0.5 * length * (weight + voronoi.weight[slot, to_row, to_col]), ti.f32)
+                if everywhere > 0 or medial or bits & JOINED != 0:
+                    if bits & REACHED == 0 or offer < _BETTER * voronoi.cost[slot, to_row, to_col]:
+                        voronoi.cost[slot, to_row, to_col] = offer
+                        kept = bits & (KNOWN | SKELETON | JOINED)
+                        voronoi.cell[slot, to_row, to_col] = ti.cast(kept | REACHED | ((7 - k) << _NEXT_SHIFT), ti.u8)
+                        key = _estimate(offer, to_row, to_col, start[0], start[1], floor_weight)
+                        new_size = heap_after_push(voronoi, slot, new_size, to_row * n_col + to_col, key)
     return new_size
