@@ -630,6 +630,8 @@ class MapScratch:
     """returns of what moves"""
     fan_edge: ti.Field = array("n_slot", "n_row", "n_col", bits=True, beside="marks")
     """cells at which a column enters or leaves the fan of free water (fan.py)"""
+    fetched: ti.Field = array("n_slot", dtype=ti.f32)
+    """see mapping.fetch_cells"""
 
 
 @dataclass(frozen=True, eq=False)

@@ -201,6 +201,18 @@ def fold_cells(
 
 
 @ti.func
+def fetch_cells(env, slot, scratch: Out[MapScratch], grid_map: In[MapState]):
+    """Read one number of every word that holds something, so that memory answers many of them at once and not one after another."""
+    fetched = 0.0
+    for row in range(ti.static(grid_map.alive.shape[1])):
+        for word in range(ti.static(grid_map.alive.shape[2])):
+            alive = grid_map.alive[env, row, word]
+            if alive != 0:
+                fetched += grid_map.static_occ[env, row, word * WORD + lowest_bit(alive)]
+    scratch.fetched[slot] = fetched
+
+
+@ti.func
 def merge_scan(
     env,
     slot,
@@ -266,6 +278,7 @@ def update_map(
                     mark_depth(env, grid_map, image, mapping, depth, tank)
                     grid_map.depth_waits[env] = 1
                 if is_due(env, scan, clock, grid_map, mapping) == 1:
+                    fetch_cells(env, slot, scratch, grid_map)
                     mark_fan(env, slot, scratch, scan, mapping, sonar, tank)
                     mark_hits(env, slot, scratch, grid_map, scan, tracks, mapping, sonar, tank, promote)
                     merge_scan(env, slot, scratch, grid_map, mask, mapping, scan_s, depth_s, confident)
