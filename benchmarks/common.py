@@ -19,7 +19,7 @@ class Job:
     """small sizes and short times: does everything run?"""
     num_envs: tuple[int, ...] = ()
     """batch sizes asked for by ``--num-envs``; empty: the benchmark's own"""
-    seconds: float = 6.0
+    seconds: float = 4.0
     """measured time per side of a comparison"""
     say: Callable[[str], None] = print
     """shows progress"""

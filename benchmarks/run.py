@@ -43,7 +43,7 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="small sizes, short times; nothing is kept unless --out is given")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--num-envs", default="", help="batch sizes for scale and growth, separated by commas")
-    parser.add_argument("--seconds", type=float, help="measured time per side of a comparison [s] (default 6)")
+    parser.add_argument("--seconds", type=float, help="measured time per side of a comparison [s] (default 4)")
     parser.add_argument("--out", type=Path, help="folder of the results (default benchmarks/results)")
     parser.add_argument("--worker", help=argparse.SUPPRESS)
     chosen = parser.parse_args()
@@ -110,7 +110,7 @@ def _work(chosen: argparse.Namespace) -> int:
     """Measure one benchmark; its rows go to the file named by ``--worker name:file``."""
     name, _, target = chosen.worker.partition(":")
     sizes = tuple(int(n) for n in chosen.num_envs.split(",") if n)
-    seconds = chosen.seconds or (0.3 if chosen.quick else 6.0)
+    seconds = chosen.seconds or (0.3 if chosen.quick else 4.0)
     job = Job(chosen.device, chosen.quick, sizes, seconds, say=lambda text: print(f"  {text}", file=sys.stderr, flush=True))
     module = importlib.import_module(f"benchmarks.{name}")
     begun = time.perf_counter()

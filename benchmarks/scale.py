@@ -37,7 +37,7 @@ def _row(job: Job, sensors: str, n_env: int) -> Row:
     start_s = time.perf_counter() - begun
     cpu, env_steps, speeds = time.process_time(), 0, []
     for _ in range(_WINDOWS):
-        speeds.append(env_steps_per_s(batch, 5 * job.seconds / _WINDOWS, lambda: None))
+        speeds.append(env_steps_per_s(batch, 6 * job.seconds / _WINDOWS, lambda: None))
         env_steps += batch.env_steps
     cpu_us = 1e6 * (time.process_time() - cpu) / env_steps
     speed, steps, episodes = sum(speeds) / _WINDOWS, env_steps // n_env, batch.episodes
