@@ -473,8 +473,8 @@ class ForecastConfig(Section):
 
     use_turn_rate: bool = True
     """bodies keep their turn rate; off: straight ahead"""
-    straight_sigmas: NonNegative = 1.0
-    """a turn rate of less than this many of its standard deviations is taken for 0"""
+    straight_odds: Positive = 4.0
+    """prior odds that a body goes straight: a turn rate is used where its evidence against 0 outweighs them"""
     use_habits: bool = True
     """bodies turn where one was seen to turn"""
     n_turn: Annotated[int, Field(ge=16, multiple_of=16)] = 48

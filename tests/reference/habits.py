@@ -21,13 +21,18 @@ def unit(v):
     return v / np.hypot(*v)
 
 
-def expected_turn_rate(rate, rate_var, cfg):
-    return rate if cfg.use_turn_rate and abs(rate) > cfg.straight_sigmas * np.sqrt(rate_var) else 0.0
+def expected_turn_rate(rate, rate_var, cfg, tracking):
+    """Two models of one track: no turn rate, or one from the filter's prior; by Bayes' rule with the densities of 0."""
+    if not cfg.use_turn_rate or rate_var == 0:
+        return 0.0
+    prior = np.exp(0.0) / tracking.turn_rate_sigma_rad_s
+    posterior = np.exp(-0.5 * rate**2 / rate_var) / np.sqrt(rate_var)
+    return rate if prior > cfg.straight_odds * posterior and rate != 0 else 0.0
 
 
-def is_straight(x, P, rate, rate_var, cfg):
+def is_straight(x, P, rate, rate_var):
     """P: 4 x 4."""
-    quiet = abs(rate) <= cfg.straight_sigmas * np.sqrt(rate_var)
+    quiet = abs(rate) <= np.sqrt(rate_var)
     return 0 < rate_var < STRAIGHT_SIGMA**2 and quiet and P[2, 2] + P[3, 3] < SETTLED * (x[2:] @ x[2:])
 
 

@@ -64,7 +64,7 @@ def forecast_tracks(
     for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n * n_track))):
         if pad == 0 and clock.awake[env] == 1:
             if tracks.alive[env, track] * tracks.moving[env, track] == 1:
-                if expected_turn_rate(env, track, tracks, forecast_cfg) != 0.0:
+                if expected_turn_rate(env, track, tracks, forecast_cfg, tracking) != 0.0:
                     follow_arc(env, track, forecast, tracks, clock, forecast_cfg, tracking, rules)
                 else:
                     follow_legs(env, track, forecast, tracks, habits, clock, forecast_cfg, tracking, tank, rules)
@@ -92,7 +92,7 @@ def follow_arc(
     """Constant speed and turn rate: steps along the chords of the arc."""
     mean, cov = tracks.state[env, track], tracks.cov[env, track]
     late = (clock.step[env] - tracks.scan_step[env]) * rules.control_dt_s
-    rate = expected_turn_rate(env, track, tracks, forecast_cfg)
+    rate = expected_turn_rate(env, track, tracks, forecast_cfg, tracking)
     vel = ti.Vector([mean[2], mean[3]])
     pos = ti.Vector([mean[0], mean[1]]) + late * chord(rate * late) * turned_z(vel, 0.5 * rate * late)
     vel = turned_z(vel, rate * late)

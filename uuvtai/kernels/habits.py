@@ -9,16 +9,18 @@ give the corner p0 + a d0 = p1 - b d1 by least squares along d0 - d1 under a + b
 a reversal, where both legs lie on one line.
 """
 
+import math
+
 import taichi as ti
 
-from uuvtai.config import EpisodeConfig, ForecastConfig, TankConfig
+from uuvtai.config import EpisodeConfig, ForecastConfig, TankConfig, TrackingConfig
 from uuvtai.kernels.geometry import FAR_M
 from uuvtai.kernels.lanes import LANES, f16x
 from uuvtai.kernels.signature import Const, In, Out
 from uuvtai.state import HabitState, TrackState
 
 _STRAIGHT_SIGMA = 0.4
-"""[rad/s] a body is on a straight leg where its turn rate is known to this and does not stand out of its noise."""
+"""[rad/s] a body is on a straight leg where its turn rate is known to this and less than its standard deviation."""
 
 _SETTLED = 0.05
 """... and where its velocity's variance is below this share of its square."""
@@ -46,8 +48,15 @@ _MOST_WEIGHT = 4.0
 def forget_habits(env, habits: Out[HabitState]):
     habits.next_slot[env] = 0
     for packet in range(habits.weight.shape[1]):
+        habits.turn_x[env, packet] = ti.zero(habits.turn_x[env, packet])
+        habits.turn_y[env, packet] = ti.zero(habits.turn_y[env, packet])
+        habits.in_x[env, packet] = ti.zero(habits.in_x[env, packet])
+        habits.in_y[env, packet] = ti.zero(habits.in_y[env, packet])
+        habits.out_x[env, packet] = ti.zero(habits.out_x[env, packet])
+        habits.out_y[env, packet] = ti.zero(habits.out_y[env, packet])
         habits.weight[env, packet] = ti.zero(habits.weight[env, packet])
     for track in range(habits.leg_step.shape[1]):
+        habits.leg[env, track] = ti.zero(habits.leg[env, track])
         habits.leg_step[env, track] = -1
 
 
@@ -59,7 +68,7 @@ def learn_habit(env, track, habits: Out[HabitState], tracks: In[TrackState], cfg
     """Where a track is on a straight leg: remember the turn since its last one, and forget a turn that it went past."""
     if tracks.alive[env, track] == 0 or tracks.age[env, track] == 0:
         habits.leg_step[env, track] = -1
-    elif tracks.moving[env, track] == 1 and tracks.misses[env, track] == 0 and on_straight_leg(env, track, tracks, cfg):
+    elif tracks.moving[env, track] == 1 and tracks.misses[env, track] == 0 and on_straight_leg(env, track, tracks):
         now, leg = tracks.state[env, track], habits.leg[env, track]
         time = (tracks.scan_step[env] - habits.leg_step[env, track]) * rules.control_dt_s
         if habits.leg_step[env, track] >= 0 and time < _LONGEST_S:
@@ -75,12 +84,12 @@ def learn_habit(env, track, habits: Out[HabitState], tracks: In[TrackState], cfg
 
 
 @ti.func
-def on_straight_leg(env, track, tracks: In[TrackState], cfg: Const[ForecastConfig]):
+def on_straight_leg(env, track, tracks: In[TrackState]):
     """Whether course and speed are known well and the course does not turn."""
     mean, cov = tracks.state[env, track], tracks.cov[env, track]
     rate, rate_var = tracks.turn_rate[env, track], tracks.turn_cov[env, track][4]
-    straight = rate * rate <= ti.static(cfg.straight_sigmas**2) * rate_var and rate_var < ti.static(_STRAIGHT_SIGMA**2)
-    return rate_var > 0.0 and straight and cov[7] + cov[9] < _SETTLED * (mean[2] ** 2 + mean[3] ** 2)
+    known = 0.0 < rate_var < ti.static(_STRAIGHT_SIGMA**2)
+    return known and rate * rate <= rate_var and cov[7] + cov[9] < _SETTLED * (mean[2] ** 2 + mean[3] ** 2)
 
 
 @ti.func
@@ -207,12 +216,17 @@ def next_event(env, pos, course, radius, habits: In[HabitState], cfg: Const[Fore
 
 
 @ti.func
-def expected_turn_rate(env, track, tracks: In[TrackState], cfg: Const[ForecastConfig]):
-    """[rad/s] the filter's turn rate where it stands out of its noise: most bodies go straight."""
+def expected_turn_rate(env, track, tracks: In[TrackState], cfg: Const[ForecastConfig], tracking: Const[TrackingConfig]):
+    """[rad/s] the filter's turn rate, where that explains the track better than none: most bodies go straight.
+
+    Odds for a turn = density of rate 0 in the prior over that in the posterior (Savage-Dickey): an uncertain rate must stand out of its
+    noise by little, a well known one by more, for a prior as wide as this one makes small rates unlikely.
+    """
     rate = 0.0
-    if ti.static(cfg.use_turn_rate):
-        known = tracks.turn_rate[env, track]
-        if known * known > ti.static(cfg.straight_sigmas**2) * tracks.turn_cov[env, track][4]:
+    if ti.static(cfg.use_turn_rate and tracking.turn_rate_sigma_rad_s > 0):
+        known, var = tracks.turn_rate[env, track], tracks.turn_cov[env, track][4]
+        bar = ti.log(ti.static(tracking.turn_rate_sigma_rad_s**2) / ti.max(var, 1e-9)) + ti.static(2.0 * math.log(cfg.straight_odds))
+        if var > 0.0 and known * known > var * ti.max(bar, 0.0):
             rate = known
     return rate
 

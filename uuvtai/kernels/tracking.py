@@ -184,7 +184,7 @@ def predict_tracks(
             )
             if ti.static(forecast_cfg.use_coasting):
                 unseen = tracks.moving[env, track] == 1 and tracks.misses[env, track] > 0
-                if unseen and expected_turn_rate(env, track, tracks, forecast_cfg) == 0.0:
+                if unseen and expected_turn_rate(env, track, tracks, forecast_cfg, tracking) == 0.0:
                     mean = coasted(env, track, tracks.state[env, track], dt, habits, tracks, forecast_cfg, tank)
             tracks.state[env, track] = mean
             tracks.cov[env, track] = cov
