@@ -87,7 +87,7 @@ class Maps:
         rows, cols = self.clearance.site_row.to_numpy().astype(int), self.clearance.site_col.to_numpy().astype(int)
         row, col = np.indices(self.outside.shape)
         for i, image in enumerate(self.images):
-            exact = np.minimum(distance_transform_edt(image) * self.cell_m, cfg.max_m)
+            exact = np.minimum(np.asarray(distance_transform_edt(image)) * self.cell_m, cfg.max_m)
             precise = np.minimum(cv2.distanceTransform(image, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * self.cell_m, cfg.max_m)
             near = rows[i] >= 0
             reach = np.hypot(rows[i] - row, cols[i] - col)[near] * self.cell_m

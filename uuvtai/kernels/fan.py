@@ -15,7 +15,7 @@ from uuvtai.config import MappingConfig, SonarConfig, TankConfig
 from uuvtai.kernels.bits import WORD, cell_bit
 from uuvtai.kernels.geometry import TWO_PI
 from uuvtai.kernels.grid import grid_origin, grid_shape
-from uuvtai.kernels.lanes import LANES, f16x
+from uuvtai.kernels.lanes import LANES, f16x, i16x
 from uuvtai.kernels.signature import Const, In, Out
 from uuvtai.state import MapScratch, SonarScan
 
@@ -92,7 +92,10 @@ def mark_fan(
         legs = triangle_legs(env, packet * LANES, scan, sonar, mapping)
         begin_x, begin_y = ping[0] + legs * unit_x, ping[1] + legs * unit_y
         end_x, end_y = ping[0] + legs * next_x, ping[1] + legs * next_y
-        begin_col, end_col = ti.cast(ti.ceil(begin_x), ti.i32), ti.cast(ti.ceil(end_x), ti.i32)
+        begin_col, end_col = i16x(0), i16x(0)
+        for i in ti.static(range(LANES)):
+            begin_col[i] = ti.cast(ti.ceil(begin_x[i]), ti.i32)
+            end_col[i] = ti.cast(ti.ceil(end_x[i]), ti.i32)
         if packet == 0:
             first = ti.Vector([begin_x[0], begin_y[0]])
             first_col = begin_col[0]
