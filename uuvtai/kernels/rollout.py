@@ -42,7 +42,7 @@ def body_depths(
     low, high = ti.static(depth_band(tank_cfg, teacher_cfg))
     peak, mean, contact, first = f16x(0.0), f16x(0.0), f16x(0.0), f16x(FAR_M)
     level, level_vel = ti.Vector([pos[0], pos[1]]), ti.Vector([vel[0], vel[1]])
-    reach_speed = level_vel.norm() + ti.static(teacher_cfg.evade_m_s)
+    reach_speed = level_vel.norm() + ti.static(_fastest(teacher_cfg))
     for track in range(n_track):
         if forecast.radius_m[env, track, 0] >= 0:
             above, below = forecast.above_w[env, track], forecast.below_w[env, track]
@@ -62,7 +62,7 @@ def body_depths(
                 margin = teacher_cfg.margin_m + teacher_cfg.margin_growth_m_s * time
                 wanted = teacher_cfg.contact_m + teacher_cfg.caution * margin
                 radius = forecast.radius_m[env, track, k]
-                bound = radius + ti.static(teacher_cfg.hull_reach_m) + wanted + ti.static(teacher_cfg.evade_m_s) * gain
+                bound = radius + ti.static(teacher_cfg.hull_reach_m) + wanted + ti.static(_fastest(teacher_cfg)) * gain
                 bound += ti.static(teacher_cfg.closing_s) * (reach_speed + body_vel.norm())
                 if radius >= 0 and start.norm_sqr() < bound * bound:
                     z = ti.math.clamp(cz * gain + (pos[2] + vel[2] * settle), low, high)
@@ -162,6 +162,11 @@ def depth_band(tank_cfg, teacher_cfg):
 
 def _decay(dt_s, lag_s):
     return 2.718281828459045 ** (-dt_s / lag_s)
+
+
+def _fastest(teacher_cfg):
+    """[m/s] no level velocity that is ever rolled out is faster."""
+    return max(teacher_cfg.evade_m_s, teacher_cfg.cruise_m_s, teacher_cfg.back_off_m_s, teacher_cfg.unstick_m_s)
 
 
 def _samples(n_forecast, teacher_cfg, tracking_cfg):
