@@ -7,7 +7,7 @@ import torch
 from uuvtai.loader import load_config
 from uuvtai.measure.evaluate import jobs_of, run_episodes
 
-SENSED = ("ego", "scan", "image", "tracks", "forecast", "grid_map", "clearance", "route", "features", "teacher")
+SENSED = ("ego", "scan", "image", "tracks", "habits", "forecast", "grid_map", "clearance", "route", "features", "teacher")
 """Structs of what the vehicle senses, remembers and decides (clusters are scratch of one scan: slots beyond their count are stale)."""
 
 

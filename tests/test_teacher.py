@@ -290,7 +290,8 @@ def test_follow_changes_depth_only_where_that_comes_no_nearer(scene):
     for _ in range(8):
         random_scene(scene, rng)
         assess(scene)
-        follow, conflict = (getattr(scene.t, name).to_numpy().astype(float) for name in ("follow_vel_w", "conflict_s"))
+        found = (getattr(scene.t, name).to_numpy().astype(float) for name in ("follow_vel_w", "conflict_s", "hold_conflict_s"))
+        follow, conflict, staying = found
         for env in range(N_ENV):
             view = View(scene, env)
             error = np.clip(scene.mission.goal_w.to_numpy()[env, 2], low, high) - view.pos[2]
@@ -298,6 +299,8 @@ def test_follow_changes_depth_only_where_that_comes_no_nearer(scene):
             level, changing = view.depths((*follow[env, :2], 0.0)), view.depths((*follow[env, :2], heave))
             if min(level[4], changing[4]) < CLOSE_M or 5e-4 < changing[0] - level[0] < 2e-3:
                 continue
+            stop = view.depths((0.0, 0.0, 0.0))
+            assert stop[4] < CLOSE_M or staying[env] == (pytest.approx(stop[3], abs=1e-3) if np.isfinite(stop[3]) else FAR_M)
             taken = changing if changing[0] <= level[0] + 1e-3 else level
             assert follow[env, 2] == pytest.approx(heave if taken is changing else 0.0, abs=1e-5)
             assert conflict[env] == (pytest.approx(taken[3], abs=1e-3) if np.isfinite(taken[3]) else FAR_M)
@@ -494,6 +497,20 @@ def test_what_is_far_enough_below_is_no_conflict(scene):
     conflict = scene.t.conflict_s.to_numpy()
     assert acting(scene)[:3] == ["Evade", "Evade", "FollowRoute"]
     assert conflict[0] <= conflict[1] < conflict[2] == FAR_M
+
+
+def test_stopping_is_safe_beside_the_path_of_a_body(scene):
+    """Something passes ahead: stop. It comes here: stopping helps nothing. A tree may ask for the next second only."""
+    body(scene, 0, 0, (6.3, 5.0), (0.0, -0.9))
+    body(scene, 1, 0, (6.6, 3.0), (-0.9, 0.0))
+    body(scene, 2, 0, (7.6, 3.0), (-0.9, 0.0))
+    for port, waiting in (("", ("Hold", None, None)), (' within_s="1"', ("Hold", None, "Hold"))):
+        text = f"<ReactiveSequence><SafeHere{port}/><Hold/></ReactiveSequence>"
+        scene.tree = parse_tree(f'<root BTCPP_format="4"><BehaviorTree ID="main">{text}</BehaviorTree></root>')
+        load_tree(scene.table, scene.tree)
+        decide(scene)
+        assert acting(scene) == [*waiting, *["Hold"] * (N_ENV - 3)]
+    assert scene.t.conflict_s.to_numpy()[0] < FAR_M == scene.t.hold_conflict_s.to_numpy()[0]
 
 
 def test_conflicts_are_foreseen_at_cruise_speed_even_if_evasion_is_slower(scene):

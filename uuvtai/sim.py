@@ -270,9 +270,7 @@ class Sim:
             if c.mapping.stamp > 0:
                 debug_stamp.stamp_truth(s.grid_map, s.world, s.clock, c.mapping, c.world.tank)
         with self._stage("clearance"):
-            clearance.compute_clearance(
-                s.clearance, s.clearance_memory, s.grid_map, s.mask, s.clock, c.clearance, c.mapping, c.voronoi
-            )
+            clearance.compute_clearance(s.clearance, s.clearance_memory, s.grid_map, s.mask, s.clock, c.clearance, c.mapping, c.voronoi)
         with self._stage("features"):
             features.sense_sectors(s.features, s.scan, s.ego, s.clock, c.features, c.sensors.sonar)
         with self._stage("planning"):

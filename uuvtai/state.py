@@ -820,6 +820,8 @@ class TeacherState:
     """[m] smallest mapped clearance on the straight way to the look-ahead point"""
     conflict_s: ti.Field = array("n_env")
     """[s] time of the first predicted conflict of following the route, geometry.FAR_M = none"""
+    hold_conflict_s: ti.Field = array("n_env")
+    """[s] time of the first predicted conflict of stopping here, geometry.FAR_M = none"""
     body_near_m: ti.Field = array("n_env")
     """[m] distance to the nearest forecast body now, hull to surface"""
     calm_steps: ti.Field = array("n_env", dtype=ti.i32)

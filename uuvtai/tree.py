@@ -56,6 +56,7 @@ LEAVES = {
     "Stuck": _condition(codes.STUCK, "seconds", "hardly any motion for this long, away from the goal"),
     "HasRoute": _condition(codes.HAS_ROUTE, "", "a route exists"),
     "GoalNear": _condition(codes.GOAL_NEAR, "distance_m", "the goal is closer than distance_m"),
+    "SafeHere": _condition(codes.SAFE_HERE, "within_s", "stopping here conflicts with no forecast body within within_s, or at all"),
     "BackOff": _action(codes.BACK_OFF, "speed_m_s", "retreat from the sensed threat"),
     "Evade": _action(codes.EVADE, "", "drive the evasive velocity of least cost"),
     "Hold": _action(codes.HOLD, "", "stay in place, away from mapped obstacles"),

@@ -169,7 +169,7 @@ def _control(
     force, moment = feed_forward(command, vel, rate, up, vehicle_cfg)
     ahead = ti.Vector([force[0], force[1], force[2], moment[2]])
     loops = ti.static(axis_loops(actuation_cfg))
-    asked = ahead + integral
+    asked = ti.Vector([ahead[axis] + integral[axis] for axis in range(4)])
     given = ti.Vector([0.0] * 4)
     for axis in ti.static(range(4)):
         asked[axis] += loops[axis].gain * error[axis]

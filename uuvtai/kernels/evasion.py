@@ -4,7 +4,7 @@ import taichi as ti
 
 from uuvtai.config import MappingConfig, TankConfig, TeacherConfig, TrackingConfig, VehicleConfig
 from uuvtai.kernels.geometry import FAR_M, TWO_PI, turned_z3
-from uuvtai.kernels.lanes import LANES, f16x
+from uuvtai.kernels.lanes import LANES, f16x, put_column
 from uuvtai.kernels.rollout import body_depths, depth_band, static_depths
 from uuvtai.kernels.signature import Const, In, Out, spread
 from uuvtai.state import ClearanceState, ClockState, ForecastState, Proprioception, TeacherState
@@ -35,11 +35,14 @@ def plan_evasion(
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
         if pad == 0 and clock.awake[env] == 1 and teacher.want_evade[env] == 1:
             best, best_cost, mean = _chosen(env, teacher, ego, teacher_cfg, vehicle_cfg, tank_cfg)
+            cx, cy, cz = f16x(0.0), f16x(0.0), f16x(0.0)
+            for i in ti.static(range(LANES)):
+                cx[i], cy[i], cz[i] = mean[0], mean[1], mean[2]
             cost = cost_lanes(
                 env,
-                f16x(mean[0]),
-                f16x(mean[1]),
-                f16x(mean[2]),
+                cx,
+                cy,
+                cz,
                 FAR_M,
                 teacher,
                 forecast,
@@ -67,9 +70,11 @@ def candidate_lanes(
 ):
     """World velocities (lanes x, y, z [m/s]) of candidates first .. first + 15."""
     cx, cy, cz = f16x(0.0), f16x(0.0), f16x(0.0)
+    velocities = ti.Matrix.zero(ti.f32, 3, LANES)
+    for lane in range(LANES):
+        put_column(velocities, lane, candidate(env, first + lane, teacher, ego, teacher_cfg, vehicle_cfg, tank_cfg))
     for i in ti.static(range(LANES)):
-        velocity = candidate(env, first + i, teacher, ego, teacher_cfg, vehicle_cfg, tank_cfg)
-        cx[i], cy[i], cz[i] = velocity[0], velocity[1], velocity[2]
+        cx[i], cy[i], cz[i] = velocities[0, i], velocities[1, i], velocities[2, i]
     return cx, cy, cz
 
 
@@ -202,4 +207,5 @@ def _chosen(
             weight = ti.exp(-excess)
             total += weight
             mean += weight * candidate(env, index, teacher, ego, teacher_cfg, vehicle_cfg, tank_cfg)
-    return candidate(env, best, teacher, ego, teacher_cfg, vehicle_cfg, tank_cfg), best_cost, mean / total
+    average = ti.Vector([mean[i] / total for i in range(3)])
+    return candidate(env, best, teacher, ego, teacher_cfg, vehicle_cfg, tank_cfg), best_cost, average

@@ -31,7 +31,7 @@ _COLUMNS = 8
 
 def n_column() -> int:
     """Rows that one loop item takes together; one on a GPU, whose threads are lanes already. Plain Python."""
-    return 1 if ti.cfg.arch == ti.cuda else _COLUMNS
+    return 1 if ti.cfg.arch == ti.cuda else _COLUMNS  # pyright: ignore[reportOptionalMemberAccess]
 
 
 @ti.func

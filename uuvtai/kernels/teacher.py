@@ -41,7 +41,7 @@ def _reset_blackboard(env, teacher: Out[TeacherState]):
     teacher.threat_bearing[env], teacher.nearest_bearing[env] = 0.0, 0.0
     teacher.clearance_m[env], teacher.path_clearance_m[env] = 0.0, 0.0
     teacher.away_w[env] = ti.Vector([0.0, 0.0])
-    teacher.conflict_s[env], teacher.body_near_m[env] = FAR_M, FAR_M
+    teacher.conflict_s[env], teacher.hold_conflict_s[env], teacher.body_near_m[env] = FAR_M, FAR_M, FAR_M
     teacher.calm_steps[env], teacher.evading_steps[env] = 0, 0
 
 
@@ -120,6 +120,8 @@ def _answer(
         holds = ti.cast(route.stuck_steps[env] * dt >= _port(node, 0, ti.static(cfg.stuck_s), table), ti.i32)
     elif leaf == codes.HAS_ROUTE:
         holds = ti.cast(route.n_way[env] > 0, ti.i32)
+    elif leaf == codes.SAFE_HERE:
+        holds = ti.cast(teacher.hold_conflict_s[env] >= _port(node, 0, FAR_M, table), ti.i32)
     elif leaf == codes.GOAL_NEAR:
         away = (mission.goal_w[env] - ego.pos_w[env]).norm()
         holds = ti.cast(away <= _port(node, 0, ti.static(cfg.goal_near_m), table), ti.i32)

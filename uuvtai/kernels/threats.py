@@ -147,7 +147,7 @@ def _foresee_conflict(
     tank_cfg: Const[TankConfig],
     episode_cfg: Const[EpisodeConfig],
 ):
-    """Roll the follow velocity out against the forecasts, in decision steps only, with and without a change of depth.
+    """Roll the follow velocity out against the forecasts, in decision steps only, with and without a change of depth; and a stop.
 
     Depth is changed towards the goal's only where that comes no nearer to any body: what is above or below is easily forgotten.
     """
@@ -160,12 +160,13 @@ def _foresee_conflict(
         heave = held_heave(ti.math.clamp(mission.goal_w[env][2], low, high) - pos[2], teacher_cfg, vehicle_cfg)
         cz = f16x(0.0)
         cz[1] = heave
-        peak, _, _, first = body_depths(
-            env, f16x(follow[0]), f16x(follow[1]), cz, FAR_M, pos, vel, forecast, teacher_cfg, tracking_cfg, tank_cfg
-        )
+        cx, cy = f16x(follow[0]), f16x(follow[1])
+        cx[2], cy[2] = 0.0, 0.0
+        peak, _, _, first = body_depths(env, cx, cy, cz, FAR_M, pos, vel, forecast, teacher_cfg, tracking_cfg, tank_cfg)
         climbs = peak[1] <= peak[0] + 1.0e-3
         teacher.follow_vel_w[env][2] = ti.select(climbs, heave, 0.0)
         teacher.conflict_s[env] = ti.select(climbs, first[1], first[0])
+        teacher.hold_conflict_s[env] = first[2]
         teacher.body_near_m[env] = _nearest_body(env, ti.Vector([pos[0], pos[1]]), forecast, teacher_cfg)
         if teacher.conflict_s[env] < FAR_M:
             teacher.calm_steps[env] = 0
