@@ -4,10 +4,9 @@ import xml.etree.ElementTree as ET
 from itertools import pairwise
 
 import numpy as np
-import py_trees
 import pytest
-from py_trees.common import Status
 
+from benchmarks.peers.tick_py_trees import PyTree
 from uuvtai import state
 from uuvtai.config import TeacherConfig
 from uuvtai.kernels import tree_tick as codes
@@ -190,49 +189,6 @@ def random_tree(rng) -> FlatTree:
     return FlatTree(("",) * n, ("",) * n, tuple(kind), tuple(end), tuple(parent), (-1,) * n, ((-1.0,) * 4,) * n)
 
 
-class Given(py_trees.behaviour.Behaviour):
-    """A leaf that answers what the blackboard says."""
-
-    def __init__(self, node, board):
-        super().__init__(str(node))
-        self.node, self.board = node, board
-
-    def update(self):
-        self.board["ticked"].append(self.node)
-        return self.board["answers"][self.node]
-
-
-def as_py_tree(flat, board):
-    """The same tree in py_trees, as a list by preorder index."""
-    nodes = {}
-
-    def build(node):
-        kind = flat.kind[node]
-        children = [build(child) for child in range(node + 1, flat.end[node]) if flat.parent[child] == node]
-        if kind >= codes.CONDITION:
-            made = Given(node, board)
-        elif kind in (codes.SEQUENCE, codes.REACTIVE_SEQUENCE):
-            made = py_trees.composites.Sequence(str(node), memory=kind == codes.SEQUENCE, children=children)
-        elif kind in (codes.FALLBACK, codes.REACTIVE_FALLBACK):
-            made = py_trees.composites.Selector(str(node), memory=kind == codes.FALLBACK, children=children)
-        else:
-            decorator = {
-                codes.INVERTER: py_trees.decorators.Inverter,
-                codes.FORCE_SUCCESS: py_trees.decorators.FailureIsSuccess,
-                codes.FORCE_FAILURE: py_trees.decorators.SuccessIsFailure,
-            }[kind]
-            made = decorator(str(node), children[0])
-        nodes[node] = made
-        return made
-
-    build(0)
-    return [nodes[i] for i in range(len(flat.kind))]
-
-
-CODE = {Status.INVALID: codes.IDLE, Status.RUNNING: codes.RUNNING, Status.SUCCESS: codes.SUCCESS, Status.FAILURE: codes.FAILURE}
-STATUS = {code: status for status, code in CODE.items()}
-
-
 def test_engine_equals_py_trees_node_by_node(engine):
     """250 random trees x 20 blackboards x 6 ticks: every node's status, every tick count and the acting leaf are equal."""
     rng = np.random.default_rng(7)
@@ -241,18 +197,17 @@ def test_engine_equals_py_trees_node_by_node(engine):
         flat = random_tree(rng)
         n = len(flat.kind)
         begin(engine, flat)
-        boards = [{"ticked": [], "answers": None} for _ in range(N_BOARD)]
-        trees = [as_py_tree(flat, board) for board in boards]
+        trees = [PyTree(flat) for _ in range(N_BOARD)]
         counts = np.zeros((N_BOARD, n), int)
         for _ in range(N_TICK):
             answers = rng.integers(codes.RUNNING, codes.FAILURE + 1, (N_BOARD, n))
             found, acting = tick(engine, answers)
-            for env, (board, nodes) in enumerate(zip(boards, trees, strict=True)):
-                board["answers"], board["ticked"] = [STATUS[a] for a in answers[env]], []
-                for visited in nodes[0].tick():
-                    counts[env, int(visited.name)] += 1
-                assert [CODE[node.status] for node in nodes] == found[env, :n].tolist(), (flat, answers[env])
-                did = [i for i in board["ticked"] if flat.kind[i] == codes.ACTION and answers[env, i] != codes.FAILURE]
+            for env, tree in enumerate(trees):
+                visited = tree.visited(answers[env])
+                for node in visited:
+                    counts[env, node] += 1
+                assert tree.statuses() == found[env, :n].tolist(), (flat, answers[env])
+                did = [i for i in visited if flat.kind[i] == codes.ACTION and answers[env, i] != codes.FAILURE]
                 assert acting[env] == (did[-1] if did else -1)
                 compared += n
         np.testing.assert_array_equal(engine[0].ticks.to_numpy()[:, :n], counts)

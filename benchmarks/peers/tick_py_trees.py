@@ -66,4 +66,13 @@ class PyTree:
     def tick(self, answers: Sequence[int]) -> list[int]:
         """One tick; the status of every node, coded as in ``tree_tick``."""
         self.tick_prepared(self.prepared(answers))
+        return self.statuses()
+
+    def visited(self, answers: Sequence[int]) -> list[int]:
+        """One tick; the nodes that it came to, children before parents."""
+        self.answers = self.prepared(answers)
+        return [int(node.name) for node in self.root.tick()]
+
+    def statuses(self) -> list[int]:
+        """Status of every node, coded as in ``tree_tick``."""
         return [_CODE[node.status] for node in self.nodes]
