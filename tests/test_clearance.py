@@ -7,17 +7,15 @@ import sys
 
 import numpy as np
 import pytest
-import taichi as ti
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.map_bits import put_layers
 from tests.reference.clearance import clearance_of, sites_of
 from uuvtai.config import ClearanceConfig, MappingConfig, TankConfig, VoronoiConfig
-from uuvtai.kernels import clearance, field, mapping
-from uuvtai.kernels.grid import grid_origin, grid_shape, outside_cells
+from uuvtai.kernels import clearance, mapping
+from uuvtai.kernels.grid import grid_shape, outside_cells
 from uuvtai.kernels.lanes import LANES
-from uuvtai.kernels.signature import Const, In
 from uuvtai.state import PACKET, ClearanceMemory, ClearanceState, ClockState, GridMask, MapState, allocate
 
 N_ENV = 8
@@ -259,38 +257,3 @@ def test_thread_count_changes_nothing():
     ]
     digests = [run.stdout.split()[-1] for run in runs]
     assert len(digests[0]) == 64 and digests[0] == digests[1]
-
-
-# --------------------------------------------------------------------------------------------------------------------- field
-
-
-@ti.kernel
-def read_field(
-    grid_map: In[MapState],
-    clear: In[ClearanceState],
-    out: ti.template(),
-    cfg: Const[ClearanceConfig],
-    tank: Const[TankConfig],
-    x: float,
-    y: float,
-):
-    """Everything that others may ask, in env 0."""
-    for _ in range(1):
-        out[0] = field.risk_at(0, 20, 30, grid_map, clear, cfg)
-        out[1] = field.occupancy_at(0, 20, 30, grid_map)
-        out[2] = field.is_occupied(0, 20, 30, grid_map, 0.5)
-        out[3] = field.clearance_at(0, ti.Vector([x, y, -0.5]), clear, tank, 0.1)
-
-
-def test_what_others_read(stage):
-    static, dynamic = np.zeros((N_ENV, *SHAPE)), np.zeros((N_ENV, *SHAPE))
-    static[0, 20, 34], static[0, 20, 30], dynamic[0, 20, 30] = 1.0, 0.3, 0.45
-    stage.compute(static, dynamic)
-    cfg = ClearanceConfig(risk_static=2.0, risk_dynamic=3.0, risk_clearance=0.2, risk_epsilon_m=0.05)
-    out = ti.field(ti.f32, 4)
-    x0, y0 = grid_origin(TANK, MAP.cell_m)
-    read_field(stage.grid_map, stage.clearance, out, cfg, TANK, x0 + 3.29, y0 + 2.01)
-    risk = 2 * 0.3 + 3 * 0.45 + 0.2 / (0.4 + 0.05)
-    np.testing.assert_allclose(out.to_numpy(), [risk, 0.45, 0, 0.2], atol=1e-6)
-    read_field(stage.grid_map, stage.clearance, out, cfg, TANK, -5.0, 2.0)
-    assert out[3] == 0

@@ -35,7 +35,7 @@ def draw_lanes(word: ti.template(), unit: ti.template(), gauss: ti.template(), a
     for packet in range(ti.static(N // LANES)):
         words = noise.bits_lanes(key, packet * LANES)
         units = noise.uniform_lanes(key, packet * LANES)
-        normals = noise.normal_lanes(key, packet * LANES)
+        normals, _ = noise.normal_pair_lanes(key, packet * LANES)
         for lane in ti.static(range(LANES)):
             word[packet * LANES + lane] = words[lane]
             unit[packet * LANES + lane] = units[lane]

@@ -147,10 +147,3 @@ def normal_pair_lanes(key, first_index):
     sine = half * polynomial(square, _SINE)
     cosine = polynomial(square, _COSINE)
     return radius * (1.0 - 2.0 * sine * sine), radius * (2.0 * sine * cosine)
-
-
-@ti.func
-def normal_lanes(key, first_index):
-    """Standard normal per lane: the first of ``normal_pair_lanes``."""
-    one, _other = normal_pair_lanes(key, first_index)
-    return one
