@@ -1,0 +1,69 @@
+"""Configuration: one frozen section per stage noun. Unknown keys, wrong types, NaN and nonsense sizes are errors.
+
+YAML in and out, and presets, live in ``loader.py``; what training adds is in ``config/learning.py``.
+"""
+
+from __future__ import annotations
+
+from uuvtai.config.perception import ElevationConfig, ForecastConfig, MappingConfig, TrackingConfig
+from uuvtai.config.planning import ClearanceConfig, FeaturesConfig, RouteConfig, VoronoiConfig
+from uuvtai.config.section import Section
+from uuvtai.config.sensors import DepthConfig, DvlConfig, ImuConfig, PressureConfig, SensorsConfig, SonarConfig
+from uuvtai.config.task import EpisodeConfig, RewardConfig
+from uuvtai.config.teacher import TeacherConfig
+from uuvtai.config.vehicle import ActuationConfig, DisturbanceConfig, Thruster, VehicleConfig
+from uuvtai.config.world import DynamicObstacles, FixedObstacle, StaticObstacles, TankConfig, Waypoint, WorldConfig
+
+
+class Config(Section):
+    """Everything a run needs; immutable."""
+
+    world: WorldConfig = WorldConfig()
+    vehicle: VehicleConfig = VehicleConfig()
+    actuation: ActuationConfig = ActuationConfig()
+    disturbance: DisturbanceConfig = DisturbanceConfig()
+    sensors: SensorsConfig = SensorsConfig()
+    tracking: TrackingConfig = TrackingConfig()
+    forecast: ForecastConfig = ForecastConfig()
+    elevation: ElevationConfig = ElevationConfig()
+    mapping: MappingConfig = MappingConfig()
+    clearance: ClearanceConfig = ClearanceConfig()
+    voronoi: VoronoiConfig = VoronoiConfig()
+    route: RouteConfig = RouteConfig()
+    features: FeaturesConfig = FeaturesConfig()
+    teacher: TeacherConfig = TeacherConfig()
+    reward: RewardConfig = RewardConfig()
+    episode: EpisodeConfig = EpisodeConfig()
+
+
+__all__ = [
+    "ActuationConfig",
+    "ClearanceConfig",
+    "Config",
+    "DepthConfig",
+    "DisturbanceConfig",
+    "DvlConfig",
+    "DynamicObstacles",
+    "ElevationConfig",
+    "EpisodeConfig",
+    "FeaturesConfig",
+    "FixedObstacle",
+    "ForecastConfig",
+    "ImuConfig",
+    "MappingConfig",
+    "PressureConfig",
+    "RewardConfig",
+    "RouteConfig",
+    "Section",
+    "SensorsConfig",
+    "SonarConfig",
+    "StaticObstacles",
+    "TankConfig",
+    "TeacherConfig",
+    "Thruster",
+    "TrackingConfig",
+    "VehicleConfig",
+    "VoronoiConfig",
+    "Waypoint",
+    "WorldConfig",
+]

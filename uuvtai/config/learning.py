@@ -1,0 +1,167 @@
+"""What training adds to a run: policy, PPO, distillation, world model, risk and the schedule of the run itself.
+
+Defaults are Table app_repro of the paper where it gives a number; the rest says why. Presets (``presets/train``) state differences only.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import Annotated, Literal
+
+from pydantic import Field, field_validator
+
+from uuvtai.config import Config
+from uuvtai.config.section import Count, Fraction, NonNegative, Positive, PositiveCount, Section
+
+Points = tuple[tuple[NonNegative, NonNegative], ...]
+"""(share of the run, value): linear in between, constant outside; two points at the same share are a jump"""
+
+
+class PolicyConfig(Section):
+    """Actor and critic."""
+
+    hidden: tuple[PositiveCount, ...] = (256, 256)
+    """widths of both networks' layers (Table app_repro)"""
+    activation: Literal["elu", "tanh", "relu"] = "elu"
+    initial_std: Positive = 0.6
+    """of the action, in parts of the vehicle's limits (EC)"""
+    min_std: Positive = 0.05
+    """floor: the policy never stops exploring altogether (EC)"""
+    residual: bool = False
+    """the mean is the tree's action plus what the network adds; needs ``features.teacher``"""
+    residual_limit: Positive = 0.5
+    """largest addition, in parts of the vehicle's limits"""
+    clip_observation: Positive = 10.0
+    """standard deviations beyond which an observation is cut off"""
+
+
+class PpoConfig(Section):
+    """Proximal policy optimisation (Table app_repro)."""
+
+    rollout_steps: PositiveCount = 64
+    learning_rate: Positive = 3e-4
+    epochs: PositiveCount = 6
+    minibatches: PositiveCount = 4
+    clip: Positive = 0.2
+    gamma: Fraction = 0.99
+    gae_lambda: Fraction = 0.95
+    entropy_weight: NonNegative = 0.003
+    value_weight: NonNegative = 1.5
+    max_grad_norm: Positive = 1.0
+    clip_value: bool = False
+    """also clip the value's change, as some implementations do"""
+    target_kl: NonNegative = 0.0
+    """0 = fixed learning rate; else the rate follows the KL divergence of every update (as rsl_rl does)"""
+    shuffle: bool = False
+    """draw minibatches at random instead of as contiguous blocks of envs"""
+    normalise_observations: bool = True
+    normalise_values: bool = True
+
+
+class DistillConfig(Section):
+    """Supervision by the behaviour tree."""
+
+    schedule: Points = ((0.0, 1.0), (2 / 3, 1.0), (2 / 3, 0.2), (4 / 3, 0.0))
+    """lambda over the share of the run; the paper's breakpoints 800 and 1600 of 1200 iterations"""
+    batch: PositiveCount = 1024
+    steps: Count = 2
+    """gradient steps on teacher batches after every update; 0 = none"""
+    learning_rate: Positive = 1.5e-4
+    critic_warmup_iterations: Count = 0
+    """iterations in which only critic and distillation learn: an untrained critic destroys a distilled policy"""
+    weighting: Literal["none", "uncertainty", "risk"] = "none"
+    """weight of a sample: equal, or by the world model's uncertainty, or by the predicted risk (mean one)"""
+
+    @field_validator("schedule")
+    @classmethod
+    def _in_order(cls, value: Points) -> Points:
+        if not value or any(a[0] > b[0] for a, b in itertools.pairwise(value)):
+            raise ValueError("needs at least one (share, value) point, shares not falling, for example [[0, 1], [1, 0]]")
+        return value
+
+
+class UncertaintyConfig(Section):
+    """Scale of the distillation by the world model's uncertainty (Table app_repro)."""
+
+    ema: Annotated[float, Field(gt=0, le=1)] = 0.05
+    """rho: weight of the newest uncertainty in the running mean"""
+    gain: NonNegative = 0.8
+    """alpha; 0 = no scaling (ablation 'LWM risk')"""
+    max_scale: Annotated[float, Field(ge=1)] = 2.0
+
+
+class WorldModelConfig(Section):
+    """Latent one-step predictor (Table app_repro)."""
+
+    enabled: bool = True
+    as_features: bool = True
+    """its residual and uncertainty are part of the policy's input; false feeds zeros (ablation 'LWM')"""
+    latent: PositiveCount = 64
+    hidden: tuple[PositiveCount, ...] = (128, 128)
+    batch: PositiveCount = 2048
+    steps: PositiveCount = 2
+    """gradient steps per iteration"""
+    learning_rate: Positive = 3e-4
+    reconstruction_weight: NonNegative = 1.0
+    dynamics_weight: NonNegative = 0.2
+    """beta"""
+    likelihood: bool = True
+    """Gaussian negative log-likelihood; false = mean squared error"""
+    beta_nll: Fraction = 0.5
+    """weight of each term by its variance to this power (Seitzer 2022); 0 = plain likelihood"""
+    normalise_targets: bool = True
+    """metres, radians and m/s do not average: targets by their running mean and deviation"""
+    stop_target_gradient: bool = True
+    """no gradient through the encoding of the next observation, or the latent collapses"""
+
+
+class RiskConfig(Section):
+    """Head that predicts the probability of a collision or TTC stop soon."""
+
+    enabled: bool = False
+    horizon_s: Positive = 2.0
+    hidden: tuple[PositiveCount, ...] = (64, 64)
+    batch: PositiveCount = 2048
+    steps: PositiveCount = 4
+    """gradient steps per iteration"""
+    learning_rate: Positive = 3e-4
+    bins: PositiveCount = 10
+    """of the reliability diagram"""
+    miss_rate: Annotated[float, Field(gt=0, lt=1)] = 0.05
+    """share of dangerous moments that the conformal threshold may miss"""
+
+
+class TrainConfig(Section):
+    """The run."""
+
+    iterations: PositiveCount = 1200
+    num_envs: PositiveCount = 8
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    checkpoint_every: PositiveCount = 50
+    """iterations between checkpoints"""
+    keep_checkpoints: PositiveCount = 3
+    """newest ones kept, beside the best"""
+    evaluate_every: Count = 0
+    """iterations between evaluations without exploration noise; 0 = none"""
+    evaluate_episodes: PositiveCount = 64
+    evaluate_seed: Annotated[int, Field(ge=0, lt=2**31)] = 500_000
+    """scenarios of these evaluations; training never meets them"""
+
+    @field_validator("evaluate_seed")
+    @classmethod
+    def _apart(cls, value: int, info) -> int:
+        if value == info.data.get("seed"):
+            raise ValueError("must differ from train.seed: an evaluation on training scenarios proves nothing")
+        return value
+
+
+class LearningConfig(Config):
+    """A run's config with what training adds."""
+
+    policy: PolicyConfig = PolicyConfig()
+    ppo: PpoConfig = PpoConfig()
+    distill: DistillConfig = DistillConfig()
+    uncertainty: UncertaintyConfig = UncertaintyConfig()
+    world_model: WorldModelConfig = WorldModelConfig()
+    risk: RiskConfig = RiskConfig()
+    train: TrainConfig = TrainConfig()

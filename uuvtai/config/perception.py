@@ -1,0 +1,159 @@
+"""Moving bodies, their forecast and height, and the map."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from uuvtai.config.section import Fraction, NonNegative, Positive, PositiveCount, Section
+
+
+class TrackingConfig(Section):
+    """Clusters of beams to tracks of moving bodies, and their forecast. Every constant is in seconds, not in scans (values EC, tuned)."""
+
+    n_track: PositiveCount = 24
+    n_cluster: PositiveCount = 48
+    period_steps: PositiveCount = 3
+    """control steps between tracked scans, at least; scans in between are left out"""
+    split_m: NonNegative = 0.18
+    split_slope: NonNegative = 0.03
+    split_doppler_m_s: Positive = 0.3
+    """neighbouring beams whose Doppler differs by more (plus 6 sigma) belong to different bodies"""
+    wall_margin_m: NonNegative = 0.15
+    """returns this close (plus 2 sigma of range) to a known wall are dropped"""
+    max_width_m: Positive = 0.75
+    min_radius_m: Positive = 0.1
+    own_speed_sigma_m_s: Positive = 0.05
+    """trust in the own measured velocity, which the Doppler of the known walls corrects"""
+    birth_speed_sigma_m_s: Positive = 1.0
+    """across the bearing, where the first Doppler says nothing"""
+    accel_density: NonNegative = 0.03
+    """[m^2/s^3] spectral density of a body's acceleration"""
+    turn_rate_sigma_rad_s: NonNegative = 1.0
+    """prior of a moving body's turn rate around 0; 0 = bodies are taken to go straight"""
+    turn_density: NonNegative = 0.005
+    """[rad^2/s^3] spectral density of the turn rate's changes"""
+    gate_m: Positive = 0.3
+    """a cluster this close to a prediction (plus one scan of its speed) may always match, however sure the filter is"""
+    turn_gate: Positive = 20.0
+    """squared normalised innovation (3 values) beyond which a body is taken to have turned"""
+    moving_speed_m_s: NonNegative = 0.08
+    moving_doppler_m_s: NonNegative = 0.03
+    moving_shift_m: NonNegative = 0.12
+    """displacement (forgotten over shift_memory_s) that shows motion across the beams"""
+    shift_memory_s: Positive = 2.0
+    shift_s: NonNegative = 0.5
+    """displacement counts from this age on"""
+    doppler_memory_s: Positive = 0.5
+    max_misses: PositiveCount = 8
+    """in units of nominal 10 Hz scans"""
+    see_through_s: NonNegative = 0.15
+    """an older track that beams see through dies when it has been unseen this long"""
+    hidden_s: NonNegative = 2.0
+    """a track behind a nearer return is kept this long"""
+    horizon_s: Positive = 2.5
+    forecast_dt_s: Positive = 0.1
+    growth_sigmas: NonNegative = 1.0
+    """a forecast's radius grows by this many standard deviations of the predicted position"""
+    max_growth_m: NonNegative = 0.5
+
+
+class ForecastConfig(Section):
+    """What forecasts of moving bodies know of how bodies move. Each switch is one row of an ablation."""
+
+    use_turn_rate: bool = True
+    """bodies keep their turn rate; off: straight ahead"""
+    straight_odds: Positive = 4.0
+    """prior odds that a body goes straight: a turn rate is used where its evidence against 0 outweighs them"""
+    use_habits: bool = True
+    """bodies turn where one was seen to turn"""
+    n_turn: Annotated[int, Field(ge=16, multiple_of=16)] = 48
+    """turns remembered"""
+    across_m: Positive = 0.25
+    """a course that passes a remembered turn within this leads to it,"""
+    across_slope: NonNegative = 0.1
+    """and within this more per metre ahead"""
+    overdue_m: NonNegative = 0.15
+    """a turn this far behind may still come: the filter lags"""
+    passed_m: Positive = 0.5
+    """a turn this far behind did not come"""
+    use_reflection: bool = True
+    """bodies turn back at the tank's walls"""
+    use_coasting: bool = True
+    """unseen bodies go on by their habits; off: straight on, or along their arc"""
+
+
+class ElevationConfig(Section):
+    """Memory in 3-D of bodies that left the sonar's fan (values EC, tuned)."""
+
+    memory_s: NonNegative = 8.0
+    """time constant with which an unseen body is forgotten; 0 = a body that beams see through is forgotten at once"""
+    half_height_m: NonNegative = 0.2
+    """half height assumed of a body that is no wider"""
+    least_half_height_m: NonNegative = 0.1
+    """half height assumed where a body is not seen: the flattest one that would hide so"""
+    column_share: Fraction = 0.05
+    """share of moving bodies expected to go through the full water column"""
+    edge_m: Positive = 0.06
+    """half width of the soft edge of the fan"""
+    evidence_s: Positive = 0.15
+    """scans closer together than this are not independent evidence"""
+    hit_share: Fraction = 0.9
+    """probability that a body in the fan is hit, where its place is known exactly"""
+    use_camera: bool = True
+    """let the camera's image tell heights too"""
+    camera_hit_share: Annotated[float, Field(ge=0, lt=1)] = 0.5
+    """probability that a body in the image and at a free distance shows in the column through its middle"""
+    gone_share: Fraction = 0.25
+    """below this probability of being where it is expected, a body is forgotten"""
+    tail_share: Fraction = 0.02
+    """heights that are less likely than this are taken to be free"""
+    column_tail_share: Fraction = 0.15
+
+    @model_validator(mode="after")
+    def _is_somewhere(self) -> ElevationConfig:
+        if 15 * self.tail_share + self.column_tail_share >= 1:
+            raise ValueError(
+                f"tail_share {self.tail_share} of 15 heights and column_tail_share {self.column_tail_share} must sum to less than 1: "
+                "else a body could be taken to be nowhere"
+            )
+        return self
+
+
+class MappingConfig(Section):
+    """Two-layer occupancy map. Gains are per scan at 10 Hz; at another scan rate they are scaled so that gain per second is kept."""
+
+    cell_m: Positive = 0.1
+    period_steps: PositiveCount = 1
+    """control steps between mapped scans, at least: 1 maps every scan, as in the paper; 5 (10 Hz, for which the gains were chosen) costs a
+    fifth and drives as well"""
+    static_hit: Fraction = 0.15
+    """eta_occ"""
+    static_free: Fraction = 0.08
+    """eta_free"""
+    static_decay: Fraction = 0.002
+    """lambda_s"""
+    depth_hit: Fraction = 0.10
+    """eta_depth"""
+    dynamic_hit: Fraction = 0.6
+    """eta_dyn"""
+    dynamic_free: Fraction = 0.3
+    """eta_dyn,free"""
+    dynamic_decay: Fraction = 0.1
+    """lambda_d"""
+    stamp: Fraction = 0.0
+    """eta_stamp: gain of the simulator-side debugging stamp; must stay 0 in every preset"""
+    doppler_evidence_m_s: NonNegative = 0.15
+    free_confident_s: NonNegative = 0.5
+    """a hit in a cell seen free for this long is dynamic evidence"""
+    promote_s: Positive = 2.0
+    """dynamic evidence that stays this long in one cell becomes static"""
+    depth_gate_m: Positive = 0.3
+    """depth pixels count when their point lies within this of the vehicle's own depth"""
+    free_range_m: Positive = 6.0
+    """a beam without return clears no farther: a missed return looks the same, and far out no second beam sees the cell (EC)"""
+    wall_margin_m: NonNegative = 0.15
+    """returns this close to a known wall are not mapped: the wall is the boundary term already, and no hull fits in between (EC)"""
+    occupied: Fraction = 0.5
+    """tau_occ"""

@@ -1,0 +1,73 @@
+"""Clearance, Voronoi planner, route and features."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from uuvtai.config.section import NonNegative, Positive, PositiveCount, Section
+
+
+class ClearanceConfig(Section):
+    """Distance transform and risk."""
+
+    max_m: Positive = 2.0
+    """distances are exact up to here"""
+    period_steps: PositiveCount = 5
+    risk_static: NonNegative = 1.0
+    """alpha_m"""
+    risk_dynamic: NonNegative = 1.0
+    """alpha_d"""
+    risk_clearance: NonNegative = 0.1
+    """alpha_delta [m]"""
+    risk_epsilon_m: Positive = 0.1
+
+
+class VoronoiConfig(Section):
+    """Global planner on the medial axis."""
+
+    site_gap_cells: Positive = 3.0
+    min_clearance_m: NonNegative = 0.35
+    """d_min"""
+    cost_epsilon_m: Positive = 0.1
+    """eps_r"""
+    max_pops: PositiveCount = 20000
+    """budget of each pass of the search"""
+    use: Literal["static", "fused"] = "static"
+    """which occupancy the route must avoid"""
+    avoid_forecast: bool = False
+    """plan around the forecast of moving bodies too (no gain found in trials)"""
+
+
+class RouteConfig(Section):
+    """Route, triggers, look-ahead and the RRT fallback."""
+
+    n_way: PositiveCount = 512
+    """waypoints kept; a longer route is spaced wider"""
+    spacing_m: Positive = 0.2
+    lookahead_m: Positive = 1.0
+    risk_horizon_m: Positive = 3.0
+    """length of the look-ahead segment for path risk and for the intersection trigger"""
+    stuck_speed_m_s: NonNegative = 0.08
+    stuck_s: Positive = 3.0
+    safety_range_m: NonNegative = 0.5
+    safety_ttc_s: NonNegative = 1.0
+    forecast_clearance_m: NonNegative = 0.35
+    """a forecast closer than this to the look-ahead path is an intersection"""
+    reach_speed_m_s: NonNegative = 0.6
+    """the vehicle can be anywhere up to this times t along the path when a forecast body is there"""
+    progress_window_m: Positive = 1.5
+    """how far ahead of the last foot the new one is looked for"""
+    min_replan_s: NonNegative = 0.4
+    """the same trigger does not fire again within this"""
+    rrt_clearance_m: NonNegative = 0.1
+    """overlay clearance floor of the paper: what the fallback may still cross"""
+    rrt_iterations: PositiveCount = 4000
+    """budget of the fallback; never wall time, so that results do not depend on the machine"""
+    rrt_range_m: Positive = 1.0
+
+
+class FeaturesConfig(Section):
+    """Sectors of the sonar features."""
+
+    n_sector: PositiveCount = 12
+    ttc_cap_s: Positive = 10.0

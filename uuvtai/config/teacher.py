@@ -1,0 +1,106 @@
+"""The behaviour tree's leaves."""
+
+from __future__ import annotations
+
+from uuvtai.config.section import Fraction, NonNegative, Positive, PositiveCount, Section
+
+
+class TeacherConfig(Section):
+    """Behaviour tree's leaves: assessment of threats, evasion and driving. Ports of a tree override the numbers that are a leaf's own."""
+
+    cruise_m_s: Positive = 0.6
+    decide_period_steps: PositiveCount = 5
+    """control steps between decisions of the evasion (10 Hz: more made no difference in a trial)"""
+    lag_s: Positive = 0.35
+    """time constant from commanded to driven velocity, for roll-outs"""
+    horizon_s: Positive = 2.5
+    """of roll-outs (1.5 s cost 7 points in a trial)"""
+
+    n_heading: PositiveCount = 24
+    n_speed: PositiveCount = 4
+    evade_m_s: Positive = 0.85
+    """fastest candidate; the limits of surge and sway are separate, so diagonals of the body are faster than its axes"""
+
+    heave_m_s: NonNegative = 0.4
+    """vertical speed of the candidates that dive or climb; 0 = evade level only"""
+    n_heave_heading: PositiveCount = 13
+    """headings of the candidates that dive or climb"""
+    burst_s: NonNegative = 0.8
+    """the candidates that are a short dash last so long, then they stop; 0 = none"""
+
+    hull_reach_m: NonNegative = 0.22
+    """hull centre to surface: between 0.17 abeam and 0.27 ahead"""
+    contact_m: NonNegative = 0.1
+    """clearance that the referee calls a collision"""
+    margin_m: NonNegative = 0.25
+    """wanted clearance beyond contact from a forecast body"""
+    margin_growth_m_s: NonNegative = 0.1
+    """the margin grows with prediction time"""
+    closing_s: NonNegative = 0.25
+    """effective clearance is reduced by this times the closing speed (the referee stops at 0.18 s)"""
+    vertical_weight: Positive = 1.5
+    """free water above or below a body counts this many times: the hull is slimmer upwards (0.17 m) and heights carry their own margin"""
+    caution: Positive = 1.0
+    """factor of both margins from moving bodies: more trades time and success for fewer collisions"""
+    static_margin_m: NonNegative = 0.1
+    """wanted clearance beyond contact from mapped obstacles and walls"""
+    static_horizon_s: Positive = 1.5
+    static_dt_s: Positive = 0.25
+
+    weight_peak: NonNegative = 6.0
+    """[1/m] largest depth of violation of the wanted clearance"""
+    weight_mean: NonNegative = 6.0
+    """[1/m] depth of violation averaged over the horizon, summed over bodies"""
+    weight_contact: NonNegative = 12.0
+    """[1/m] largest depth below contact"""
+    weight_static: NonNegative = 12.0
+    """[1/m] mean depth of violation of the static clearance"""
+    weight_static_contact: NonNegative = 30.0
+    """[1/m] largest depth below static contact"""
+    weight_deviation: NonNegative = 1.0
+    """per cruise speed of difference from the follow velocity"""
+    weight_change: NonNegative = 0.3
+    """per cruise speed of difference from the last command"""
+    softness: Positive = 0.05
+    """temperature of the cost-softmax mean over candidates"""
+
+    calm_s: NonNegative = 0.5
+    """evasion goes on for this long after the last predicted conflict"""
+    conflict_within_s: NonNegative = 2.5
+    emergency_ttc_s: NonNegative = 0.35
+    emergency_range_m: NonNegative = 0.12
+    emergency_closing_m_s: NonNegative = 0.15
+    """slower approach is no emergency"""
+    back_off_m_s: Positive = 0.85
+    blocked_clearance_m: NonNegative = 0.25
+    """the way to the look-ahead point is blocked below this static clearance"""
+    goal_near_m: Positive = 1.5
+    stuck_s: Positive = 4.0
+    unstick_s: Positive = 1.5
+    unstick_m_s: Positive = 0.3
+    slow_clearance_m: Positive = 0.6
+    """speed falls below cruise where the static clearance is smaller than this"""
+    slow_fraction: Fraction = 0.5
+    """share of cruise speed left at contact"""
+    edge_gap_m: NonNegative = 0.26
+    """hull centre to surface or floor, at least"""
+    depth_gain: Positive = 1.0
+    """[1/s] heave per metre of depth error"""
+    yaw_gain: Positive = 1.5
+    """[1/s]"""
+    max_node: PositiveCount = 64
+
+    @property
+    def n_held(self) -> int:
+        """Evasive velocities to be held: level headings times speeds; stop, last command, follow; diving and climbing ones."""
+        return self.n_heading * self.n_speed + 3 + (2 * self.n_heave_heading + 2 if self.heave_m_s > 0 else 0)
+
+    @property
+    def first_burst(self) -> int:
+        """Index of the first dash: ``n_held`` padded to whole packets of 16."""
+        return 16 * -(-self.n_held // 16)
+
+    @property
+    def n_candidate(self) -> int:
+        """Evasive velocities in all, padding included: the dashes go in two packets of 16 headings."""
+        return self.first_burst + (32 if self.burst_s > 0 else 0)

@@ -1,0 +1,127 @@
+"""The vehicle, its thrusters and inner loop, and what disturbs it."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from uuvtai.config.section import Count, Fraction, NonNegative, NonNegative6, Positive, Section, Spread, Vector3
+
+_S = 0.7071067811865476
+
+
+class Thruster(Section):
+    """One thruster: where it sits and which way positive thrust pushes."""
+
+    position_m: Vector3
+    direction: Vector3
+
+
+_BLUEROV2_THRUSTERS = (
+    Thruster(position_m=(0.1355, -0.1, -0.0725), direction=(_S, _S, 0.0)),
+    Thruster(position_m=(0.1355, 0.1, -0.0725), direction=(_S, -_S, 0.0)),
+    Thruster(position_m=(-0.1475, -0.1, -0.0725), direction=(-_S, _S, 0.0)),
+    Thruster(position_m=(-0.1475, 0.1, -0.0725), direction=(-_S, -_S, 0.0)),
+    Thruster(position_m=(0.0025, -0.1105, -0.005), direction=(0.0, 0.0, 1.0)),
+    Thruster(position_m=(0.0025, 0.1105, -0.005), direction=(0.0, 0.0, 1.0)),
+)
+
+
+class VehicleConfig(Section):
+    """Rigid body, hydrodynamics and thrusters (MarineGym BlueROV asset; Wu 2018 coefficients). Origin = centre of mass."""
+
+    mass_kg: Positive = 11.26
+    inertia_kg_m2: tuple[Positive, Positive, Positive] = (0.30375, 0.626, 0.5769)
+    water_density_kg_m3: Positive = 997.0
+    gravity_m_s2: Positive = 9.81
+    volume_m3: Positive = 0.0113459
+    buoyancy_height_m: float = 0.01
+    added_mass: NonNegative6 = (5.5, 12.7, 14.57, 0.12, 0.12, 0.12)
+    added_mass_follows: Literal["ground", "water"] = "ground"
+    """whose acceleration the added mass resists: "ground" is M_A dnu/dt, the design's equation; "water" is M_A dnu_r/dt (Fossen 2011),
+    which makes motion in a uniform current equal to motion in still water plus drift. They differ only where it turns in a current"""
+    linear_damping: NonNegative6 = (4.03, 6.22, 5.18, 0.07, 0.07, 0.07)
+    quadratic_damping: NonNegative6 = (18.18, 21.66, 36.99, 1.55, 1.55, 1.55)
+    thrusters: Annotated[tuple[Thruster, ...], Field(min_length=1)] = _BLUEROV2_THRUSTERS
+    rotor_tau_s: Positive = 0.01
+    rotor_max_rpm: Positive = 3900.0
+    thrust_forward: Vector3 = (4.7368e-7, -1.9275e-4, 8.4452e-2)
+    """[kgf] quadratic in rpm for n > 0"""
+    thrust_reverse: Vector3 = (-3.8442e-7, -1.6186e-4, -3.9139e-2)
+    """[kgf] quadratic in rpm for n < 0"""
+    dead_band_rpm: tuple[NonNegative, NonNegative] = (203.5, 210.5)
+    """no thrust below this speed, forward and reverse: where the quadratic fit turns round. MarineGym's throttle dead band of 7.5 % is
+    (620, 696): possible here too, slow motion then becomes a limit cycle of about 1 cm/s"""
+    thrust_scale: Positive = 1.0
+    """the paper's K_F / 4.4e-7"""
+    attitude_hold: Literal["ideal", "thrusters", "none"] = "ideal"
+    hull_radius_m: Positive = 0.17
+    hull_half_length_m: NonNegative = 0.10
+    max_surge_m_s: Positive = 0.6
+    max_sway_m_s: Positive = 0.6
+    max_heave_m_s: Positive = 0.4
+    max_yaw_rate_rad_s: Positive = 1.0
+
+    @model_validator(mode="after")
+    def _thrust_grows(self) -> VehicleConfig:
+        for name, curve, dead, sign in (
+            ("thrust_forward", self.thrust_forward, self.dead_band_rpm[0], 1.0),
+            ("thrust_reverse", self.thrust_reverse, self.dead_band_rpm[1], -1.0),
+        ):
+            edge = sign * max(dead, -sign * curve[1] / (2 * curve[0])) if sign * curve[0] > 0 else 0.0
+            if sign * curve[0] <= 0 or sign * (curve[0] * edge**2 + curve[1] * edge + curve[2]) < 0:
+                raise ValueError(f"{name} must push its own way and harder with speed outside the dead band, got {curve}")
+            if abs(edge) >= self.rotor_max_rpm:
+                raise ValueError(f"rotor_max_rpm must exceed the dead band of {name} ({abs(edge):.0f} rpm), got {self.rotor_max_rpm}")
+        return self
+
+
+class ActuationConfig(Section):
+    """Inner loop: commanded body velocity and yaw rate to wrench, allocation, rotors (gains EC)."""
+
+    velocity_gain: tuple[NonNegative, NonNegative, NonNegative] = (60.0, 60.0, 60.0)
+    """[N s/m]"""
+    velocity_integral: tuple[NonNegative, NonNegative, NonNegative] = (40.0, 40.0, 40.0)
+    """[N/m]"""
+    integral_band_m_s: Positive = 0.3
+    """errors beyond this do not build up the integral: they are a step under way or a blocked vehicle, and both would overshoot later"""
+    yaw_rate_gain: NonNegative = 4.0
+    """[N m s]"""
+    yaw_rate_integral: NonNegative = 4.0
+    """[N m]"""
+    integral_band_rad_s: Positive = 0.5
+    max_integral_n: NonNegative = 40.0
+    """what a current, lost gain or wrong parameters may take"""
+    max_integral_n_m: NonNegative = 4.0
+    max_force_n: tuple[Positive, Positive, Positive] = (90.0, 90.0, 80.0)
+    """covers the drag at full speed of every published BlueROV2 parameter set (59, 78 and 44 N)"""
+    max_moment_n_m: Positive = 8.0
+    hold_gain_n_m: NonNegative = 60.0
+    """[N m/rad] roll and pitch, ideal hold"""
+    hold_damping: NonNegative = 8.0
+    """[N m s] ideal hold"""
+    hold_limit_n_m: NonNegative = 5.0
+    """bound of the stabilising moment"""
+    thruster_hold_gain_n_m: NonNegative = 20.0
+    """[N m/rad] roll and pitch, hold by thrusters: lower, since it acts one control step and a rotor lag late"""
+    thruster_hold_damping: NonNegative = 5.0
+    """[N m s] hold by thrusters"""
+
+
+class DisturbanceConfig(Section):
+    """What the paper leaves out; all off by default. Each is a sweep axis."""
+
+    current_m_s: Vector3 = (0.0, 0.0, 0.0)
+    current_sigma_m_s: NonNegative = 0.0
+    """standard deviation of the Gauss-Markov part, per horizontal axis"""
+    current_tau_s: Positive = 20.0
+    thruster_delay_s: NonNegative = 0.0
+    thruster_gain_loss: Fraction = 0.0
+    """each thruster's gain is drawn from [1 - loss, 1]"""
+    dead_thruster: Count | None = None
+    """index of a thruster that gives nothing"""
+    mass_spread: Spread = 0.0
+    """each parameter is scaled by a factor drawn from [1 - spread, 1 + spread] per episode; inertia and buoyancy follow the mass"""
+    damping_spread: Spread = 0.0
+    added_mass_spread: Spread = 0.0

@@ -1,0 +1,172 @@
+"""The water, what stands and moves in it."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import model_validator
+
+from uuvtai.config.section import Count, Fraction, Interval, NonNegative, OrderedInterval, Positive, PositiveInterval, Section
+
+
+class TankConfig(Section):
+    """Known bounds of the water."""
+
+    shape: Literal["rectangle", "circle"] = "rectangle"
+    x_m: Interval = (0.0, 20.0)
+    y_m: Interval = (0.0, 6.0)
+    z_m: Interval = (-1.6, 0.0)
+    """floor and surface"""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> TankConfig:
+        for name in ("x_m", "y_m", "z_m"):
+            low, high = getattr(self, name)
+            if not low < high:
+                raise ValueError(f"{name} must be (low, high) with low < high, got {getattr(self, name)}")
+        return self
+
+    @property
+    def radius_m(self) -> float:
+        """Radius of the inscribed circle (the wall of a circular tank)."""
+        return 0.5 * min(self.x_m[1] - self.x_m[0], self.y_m[1] - self.y_m[0])
+
+
+class StaticObstacles(Section):
+    """Random static obstacles: vertical cylinders and boxes through the full water column, anywhere within the side walls."""
+
+    radius_m: PositiveInterval = (0.2, 0.4)
+    half_extent_m: PositiveInterval = (0.2, 0.5)
+    box_fraction: Fraction = 0.5
+    """by index, so that half are exactly half of an even number"""
+    gap_m: NonNegative = 0.9
+    """between surfaces"""
+    endpoint_gap_m: NonNegative = 0.8
+    """from start and goal to the surface"""
+    joined_clearance_m: NonNegative = 0.45
+    """start and goal must be joined by free space with this clearance, else the layout is drawn again"""
+
+
+class DynamicObstacles(Section):
+    """Random moving obstacles."""
+
+    radius_m: PositiveInterval = (0.15, 0.25)
+    height_m: PositiveInterval = (0.3, 0.5)
+    z_m: OrderedInterval = (-1.2, -0.4)
+    cylinder_fraction: Fraction = 0.5
+    """the others are spheres"""
+    full_column_fraction: Fraction = 0.0
+    """share of the moving bodies that are cylinders through the full water column (counted within cylinder_fraction)"""
+    motion: Literal["line_circle", "waypoints"] = "line_circle"
+    circle_fraction: Fraction = 0.5
+    """the others go back and forth on a line"""
+    line_length_m: PositiveInterval = (2.0, 6.0)
+    circle_radius_m: PositiveInterval = (0.5, 2.0)
+    corners: tuple[int, int] = (3, 5)
+    corner_gap_m: NonNegative = 2.0
+    """between any two corners of one path"""
+    keep_clear_draws: Count = 16
+    """draws of a path that keeps clear of static obstacles before the last one is taken as it is (0: the first); walls are always kept"""
+    start_gap_m: NonNegative = 1.5
+    """horizontal, centre to centre, at t = 0; always kept"""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> DynamicObstacles:
+        low, high = self.corners
+        if not 2 <= low <= high <= 5:
+            raise ValueError(f"corners must be (low, high) within 2 to 5, got {self.corners}")
+        if self.full_column_fraction > self.cylinder_fraction:
+            raise ValueError("full_column_fraction counts within cylinder_fraction and cannot exceed it")
+        return self
+
+
+class Waypoint(Section):
+    """One corner of an explicit obstacle's closed path."""
+
+    x_m: float
+    y_m: float
+
+
+class FixedObstacle(Section):
+    """An obstacle that is always there, given explicitly; with ``path`` it moves along the closed polyline."""
+
+    kind: Literal["sphere", "cylinder", "box"]
+    x_m: float
+    y_m: float
+    z_m: float | None = None
+    """centre; default: middle of the water column"""
+    radius_m: Positive | None = None
+    half_extents_m: tuple[Positive, Positive] | None = None
+    height_m: Positive | None = None
+    """default: the full water column"""
+    yaw_deg: float = 0.0
+    path: tuple[Waypoint, ...] = ()
+    speed_m_s: NonNegative | None = None
+    """default: the scenario's v"""
+
+    @model_validator(mode="after")
+    def _complete(self) -> FixedObstacle:
+        if self.kind == "box" and self.half_extents_m is None:
+            raise ValueError("a box needs half_extents_m: [x, y]")
+        if self.kind != "box" and self.radius_m is None:
+            raise ValueError(f"a {self.kind} needs radius_m")
+        if len(self.path) not in (0, 2, 3, 4, 5):
+            raise ValueError("path must have 2 to 5 waypoints (2 = back and forth)")
+        if any((a.x_m, a.y_m) == (b.x_m, b.y_m) for a, b in zip(self.path, self.path[1:], strict=False)):
+            raise ValueError("neighbouring waypoints of a path must differ")
+        return self
+
+
+class WorldConfig(Section):
+    """Tank, spawn ranges and obstacles: with (seed, episode) it defines a scenario completely."""
+
+    tank: TankConfig = TankConfig()
+    spawn_x_m: OrderedInterval = (2.0, 18.0)
+    spawn_y_m: OrderedInterval = (1.2, 4.8)
+    spawn_z_m: OrderedInterval = (-1.2, -0.4)
+    start_goal_gap_m: NonNegative = 3.0
+    """horizontal, so the 3-D distance is never less"""
+    n_static: Count = 8
+    """S"""
+    n_dynamic: Count = 6
+    """D"""
+    dynamic_speed_m_s: NonNegative = 0.6
+    """v"""
+    static_capacity: Count | None = None
+    """slots kept for static obstacles, so that S can vary without recompilation; default n_static"""
+    dynamic_capacity: Count | None = None
+    static: StaticObstacles = StaticObstacles()
+    dynamic: DynamicObstacles = DynamicObstacles()
+    fixed: tuple[FixedObstacle, ...] = ()
+
+    @model_validator(mode="after")
+    def _fits(self) -> WorldConfig:
+        for wanted, slots in (("n_static", "static_capacity"), ("n_dynamic", "dynamic_capacity")):
+            capacity = getattr(self, slots)
+            if capacity is not None and capacity < getattr(self, wanted):
+                raise ValueError(f"{slots} {capacity} is less than {wanted} {getattr(self, wanted)}")
+        for axis in ("x", "y", "z"):
+            (low, high), (start, end) = getattr(self.tank, f"{axis}_m"), getattr(self, f"spawn_{axis}_m")
+            if start < low or end > high:
+                raise ValueError(f"spawn_{axis}_m ({start}, {end}) reaches out of tank.{axis}_m ({low}, {high})")
+        return self
+
+    @property
+    def static_slots(self) -> int:
+        """Slots kept for random static obstacles."""
+        return self.n_static if self.static_capacity is None else self.static_capacity
+
+    @property
+    def dynamic_slots(self) -> int:
+        """Slots kept for random moving obstacles."""
+        return self.n_dynamic if self.dynamic_capacity is None else self.dynamic_capacity
+
+    @property
+    def n_fixed_static(self) -> int:
+        """Explicit obstacles that stand still."""
+        return sum(not obstacle.path for obstacle in self.fixed)
+
+    @property
+    def n_fixed_moving(self) -> int:
+        """Explicit obstacles that move."""
+        return sum(bool(obstacle.path) for obstacle in self.fixed)
