@@ -78,7 +78,7 @@ def test_there_are_observation_only_stages_to_check():
     assert {"tracking", "forecast", "elevation", "look", "mapping", "clearance", "voronoi", "route", "features"} <= OBSERVATION_ONLY
     assert {"threats", "evasion", "rollout", "teacher", "tree_tick"} <= OBSERVATION_ONLY
     assert present >= SIMULATOR_SIDE, f"gone: {SIMULATOR_SIDE - present}"
-    assert {"WorldState", "VehicleState"} <= {n for n, s in vars(state).items() if dataclasses.is_dataclass(s)}
+    assert {"WorldState", "VehicleState"} <= {struct.__name__ for struct in structs()}
 
 
 @pytest.mark.parametrize("path", [p for p in KERNELS if p.stem in OBSERVATION_ONLY], ids=lambda p: p.stem)
@@ -162,15 +162,23 @@ def test_only_sim_plant_and_the_fallback_launch_kernels():
         assert not (launched and imported), f"{path.name} launches {launched}"
 
 
+def structs():
+    return [s for s in vars(state).values() if isinstance(s, type) and dataclasses.is_dataclass(s)]
+
+
 def test_every_array_has_a_unit_or_a_meaning():
-    source = (PACKAGE / "state.py").read_text().splitlines()
-    for number, line in enumerate(source):
-        if " = array(" in line:
-            assert source[number + 1].strip().startswith('"""'), f"state.py:{number + 1} has no docstring line"
+    declared = 0
+    for path in (PACKAGE / "state").glob("*.py"):
+        source = path.read_text().splitlines()
+        for number, line in enumerate(source):
+            if " = array(" in line:
+                declared += 1
+                assert source[number + 1].strip().startswith('"""'), f"{path.name}:{number + 1} has no docstring line"
+    assert declared == sum(len(dataclasses.fields(struct)) for struct in structs())
 
 
 def test_structs_hold_arrays_only():
-    for struct in (s for s in vars(state).values() if isinstance(s, type) and dataclasses.is_dataclass(s)):
+    for struct in structs():
         for declared in dataclasses.fields(struct):
             assert "shape" in declared.metadata, f"{struct.__name__}.{declared.name} is not an array"
 

@@ -1,6 +1,6 @@
 """One env at one control step as plain NumPy arrays: what the simulator hands to whoever records it.
 
-Nothing here knows Taichi, torch or files. Arrays are copies of one env's rows, SI units, frames as in ``state.py`` (``_w`` world, ``_b``
+Nothing here knows Taichi, torch or files. Arrays are copies of one env's rows, SI units, frames as in ``state`` (``_w`` world, ``_b``
 body). A value that does not exist (no policy, no depth image in this step) is None.
 """
 

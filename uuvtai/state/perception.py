@@ -1,0 +1,201 @@
+"""Moving bodies, where they will be, and the map: what is remembered of what was sensed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import taichi as ti
+
+from uuvtai.state.arrays import array
+
+
+@dataclass(frozen=True, eq=False)
+class TrackState:
+    """Remembered: moving (and candidate) bodies seen by the sonar, one Kalman filter each."""
+
+    alive: ti.Field = array("n_env", "n_track", dtype=ti.i32)
+    """1 = slot in use"""
+    moving: ti.Field = array("n_env", "n_track", dtype=ti.i32)
+    """1 = confirmed as moving"""
+    state: ti.Field = array("n_env", "n_track", vec=4)
+    """[m, m, m/s, m/s] x, y, vx, vy in the world frame"""
+    cov: ti.Field = array("n_env", "n_track", vec=10)
+    """upper triangle of the 4 x 4 covariance, row by row"""
+    z_m: ti.Field = array("n_env", "n_track")
+    """[m] depth plane in which it was last seen (the vehicle's own z then)"""
+    radius_m: ti.Field = array("n_env", "n_track")
+    """[m] horizontal radius"""
+    radius_var: ti.Field = array("n_env", "n_track")
+    """[m^2] variance of the radius"""
+    turn_rate: ti.Field = array("n_env", "n_track")
+    """[rad/s] rate at which the velocity turns; 0 = unknown"""
+    turn_cov: ti.Field = array("n_env", "n_track", vec=5)
+    """covariance of the turn rate with x, y, vx, vy, and its own variance [rad^2/s^2]; 0 = not estimated"""
+    doppler_m_s: ti.Field = array("n_env", "n_track")
+    """[m/s] fading mean of the compensated Doppler"""
+    doppler_var: ti.Field = array("n_env", "n_track")
+    """[m^2/s^2] variance of that mean"""
+    shift_w: ti.Field = array("n_env", "n_track", vec=2)
+    """[m] fading displacement since birth"""
+    sight_w: ti.Field = array("n_env", "n_track")
+    """[rad] bearing under which it was last seen"""
+    sweep: ti.Field = array("n_env", "n_track")
+    """[rad] fading change of that bearing since birth: how far the view of its faces has turned"""
+    age: ti.Field = array("n_env", "n_track", dtype=ti.i32)
+    """scans since birth"""
+    misses: ti.Field = array("n_env", "n_track", dtype=ti.i32)
+    """scans in a row without a matching cluster"""
+    seen_step: ti.Field = array("n_env", "n_track", dtype=ti.i32)
+    """episode step of the last match"""
+    height: ti.Field = array("n_env", "n_track", "n_height", packed=True)
+    """share of each height hypothesis (elevation.heights), summing to 1"""
+    present: ti.Field = array("n_env", "n_track")
+    """probability that the body is where it is expected"""
+    scan_step: ti.Field = array("n_env", dtype=ti.i32)
+    """episode step of the ping that the states refer to, -1 = no scan yet"""
+    beam_track: ti.Field = array("n_env", "n_ray", dtype=ti.i32)
+    """track that explains this beam of the newest scan, -1 = none (carried over by bearing where that scan was not tracked)"""
+    pick: ti.Field = array("n_env", "n_track", dtype=ti.i32)
+    """scratch of one scan: cluster matched to this track, -1 = none"""
+    pick_cost: ti.Field = array("n_env", "n_track")
+    """scratch of one scan: cost of that match (-2 log likelihood)"""
+
+
+@dataclass(frozen=True, eq=False)
+class ClusterState:
+    """Scratch of one scan: runs of neighbouring beams that belong together."""
+
+    fresh: ti.Field = array("n_env", dtype=ti.i32)
+    """1 = clustered in this very step"""
+    scan_step: ti.Field = array("n_env", dtype=ti.i32)
+    """episode step of the ping that was clustered last, -1 = none yet"""
+    scan_yaw: ti.Field = array("n_env")
+    """[rad] own yaw at that ping"""
+    slip_w: ti.Field = array("n_env", vec=2)
+    """[m/s] error of the own measured velocity, as the known walls show it"""
+    count: ti.Field = array("n_env", dtype=ti.i32)
+    """clusters found"""
+    pos_w: ti.Field = array("n_env", "n_cluster", vec=2)
+    """[m] centre of the body"""
+    radius_m: ti.Field = array("n_env", "n_cluster")
+    """[m] from the half-angle"""
+    range_m: ti.Field = array("n_env", "n_cluster")
+    """[m] mean range of its beams"""
+    range_var: ti.Field = array("n_env", "n_cluster")
+    """[m^2] variance of that mean"""
+    doppler_m_s: ti.Field = array("n_env", "n_cluster")
+    """[m/s] mean, compensated for own motion"""
+    doppler_var: ti.Field = array("n_env", "n_cluster")
+    """[m^2/s^2] variance of that mean"""
+    bearing_w: ti.Field = array("n_env", "n_cluster")
+    """[rad] of the middle of what is seen"""
+    first_beam: ti.Field = array("n_env", "n_cluster", dtype=ti.i32)
+    """first beam"""
+    span: ti.Field = array("n_env", "n_cluster", dtype=ti.i32)
+    """beams from the first to the last, missed ones included"""
+    n_beam: ti.Field = array("n_env", "n_cluster", dtype=ti.i32)
+    """number of beams that hit it"""
+    hidden: ti.Field = array("n_env", "n_cluster", dtype=ti.i32)
+    """edges beyond which it may go on unseen: 1 = first, 2 = last, 3 = both"""
+    match: ti.Field = array("n_env", "n_cluster", dtype=ti.i32)
+    """track it was matched to, -1 = none"""
+    beam_cluster: ti.Field = array("n_env", "n_ray", dtype=ti.i32)
+    """cluster of this beam, -1 = none"""
+    beam_doppler: ti.Field = array("n_env", "n_ray")
+    """[m/s] Doppler of this beam, compensated with the own measured velocity"""
+
+
+@dataclass(frozen=True, eq=False)
+class HabitState:
+    """Remembered: places where moving bodies turned in this episode, of whichever track; and each track's last straight leg."""
+
+    turn_x: ti.Field = array("n_env", "n_turn", packed=True)
+    """[m] place of the turn, world"""
+    turn_y: ti.Field = array("n_env", "n_turn", packed=True)
+    """[m]"""
+    in_x: ti.Field = array("n_env", "n_turn", packed=True)
+    """unit course before the turn"""
+    in_y: ti.Field = array("n_env", "n_turn", packed=True)
+    """unit course before the turn"""
+    out_x: ti.Field = array("n_env", "n_turn", packed=True)
+    """unit course after it"""
+    out_y: ti.Field = array("n_env", "n_turn", packed=True)
+    """unit course after it"""
+    weight: ti.Field = array("n_env", "n_turn", packed=True)
+    """times seen, less times that it did not come; not above 0 = empty"""
+    next_slot: ti.Field = array("n_env", dtype=ti.i32)
+    """slot that the next new turn takes"""
+    leg: ti.Field = array("n_env", "n_track", vec=4)
+    """[m, m, m/s, m/s] state of the track when it was last on a straight leg"""
+    leg_step: ti.Field = array("n_env", "n_track", dtype=ti.i32)
+    """episode step of that, -1 = never"""
+
+
+@dataclass(frozen=True, eq=False)
+class ForecastState:
+    """Where each moving track is expected, at equal steps from now to the horizon."""
+
+    pos_w: ti.Field = array("n_env", "n_track", "n_forecast", vec=2)
+    """[m]"""
+    radius_m: ti.Field = array("n_env", "n_track", "n_forecast")
+    """[m] body radius plus what the uncertainty adds"""
+    above_w: ti.Field = array("n_env", "n_track")
+    """[m] world z of the lowest edge of what may be above the own height; the own height where the body may be level with the vehicle"""
+    below_w: ti.Field = array("n_env", "n_track")
+    """[m] world z of the highest edge of what may be below"""
+
+
+@dataclass(frozen=True, eq=False)
+class GridMask:
+    """The known bounds on the grid, the same for all envs. Cell [row, col] has its centre at origin + (col + 0.5, row + 0.5) * cell."""
+
+    outside: ti.Field = array("n_row", "n_col", dtype=ti.i32)
+    """1 = outside the tank (the grid has a border of such cells)"""
+    outside_bits: ti.Field = array("n_row", "n_col", bits=True)
+    """the same, one bit a cell"""
+
+
+@dataclass(frozen=True, eq=False)
+class MapState:
+    """Remembered: the two-layer occupancy map. Row = y, column = x. What is asked of many cells at once is kept in bits."""
+
+    static_occ: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.f32, beside="layers")
+    """[0, 1] persistent layer M^s"""
+    dynamic_occ: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.f32, beside="layers")
+    """[0, 1] layer M^d of what moves"""
+    dynamic_scans: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.u8)
+    """scans with dynamic evidence since the cell was last seen free (saturating): promotion to static"""
+    free_scans: ti.Field = array("n_env", "n_row", "n_col", vec=8, bits=True)
+    """scans that saw the cell free since its last return, up to what makes it confident: a number of eight bits, one word for each"""
+    confident: ti.Field = array("n_env", "n_row", "n_col", bits=True, beside="words")
+    """seen free long enough that a return is a surprise"""
+    held: ti.Field = array("n_env", "n_row", "n_col", bits=True, beside="words")
+    """dynamic_scans is not 0"""
+    alive: ti.Field = array("n_env", "n_row", "n_col", bits=True, beside="words")
+    """a layer is not 0"""
+    seen: ti.Field = array("n_env", "n_row", "n_col", bits=True, beside="words")
+    """observed at least once: everything else is unknown"""
+    static_occupied: ti.Field = array("n_env", "n_row", "n_col", bits=True, beside="words")
+    """M^s reaches tau_occ"""
+    dynamic_occupied: ti.Field = array("n_env", "n_row", "n_col", bits=True, beside="words")
+    """M^d reaches tau_occ"""
+    depth_hit: ti.Field = array("n_env", "n_row", "n_col", bits=True)
+    """points seen by the camera since the newest scan"""
+    depth_waits: ti.Field = array("n_env", dtype=ti.i32)
+    """1 = there may be such points"""
+    map_step: ti.Field = array("n_env", dtype=ti.i32)
+    """episode step of the newest scan in the map; far below 0 = none yet"""
+
+
+@dataclass(frozen=True, eq=False)
+class MapScratch:
+    """Scratch: what one env's scan says about the cells. Slots are shared by all envs: few serve many and stay in the cache."""
+
+    static_hit: ti.Field = array("n_slot", "n_row", "n_col", bits=True, beside="marks")
+    """static returns"""
+    dynamic_hit: ti.Field = array("n_slot", "n_row", "n_col", bits=True, beside="marks")
+    """returns of what moves"""
+    fan_edge: ti.Field = array("n_slot", "n_row", "n_col", bits=True, beside="marks")
+    """cells at which a column enters or leaves the fan of free water (fan.py)"""
+    fetched: ti.Field = array("n_slot", dtype=ti.f32)
+    """see mapping.fetch_cells"""

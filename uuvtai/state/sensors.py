@@ -1,0 +1,125 @@
+"""What the sensors deliver, and their hidden state."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import taichi as ti
+
+from uuvtai.state.arrays import array
+
+
+@dataclass(frozen=True, eq=False)
+class Proprioception:
+    """Sensed: DVL, IMU, pressure and the pose estimate. Values hold their last reading where the flag says invalid."""
+
+    vel_b: ti.Field = array("n_env", vec=3)
+    """[m/s] DVL"""
+    vel_valid: ti.Field = array("n_env", dtype=ti.i32)
+    """1 = the DVL has a reading no older than its own period"""
+    rpy: ti.Field = array("n_env", vec=3)
+    """[rad] roll, pitch, yaw of the IMU"""
+    rate_b: ti.Field = array("n_env", vec=3)
+    """[rad/s] gyro"""
+    specific_force_b: ti.Field = array("n_env", vec=3)
+    """[m/s^2] accelerometer: acceleration minus gravity, in body axes"""
+    depth_m: ti.Field = array("n_env")
+    """[m] pressure depth, positive down"""
+    pos_w: ti.Field = array("n_env", vec=3)
+    """[m] position estimate (truth or dead reckoning; z from pressure in dead reckoning)"""
+
+
+@dataclass(frozen=True, eq=False)
+class ProprioceptionMemory:
+    """Hidden state of the proprioceptive sensors (simulator side)."""
+
+    pressure_bias_m: ti.Field = array("n_env")
+    """[m] constant over an episode"""
+    dvl_scale: ti.Field = array("n_env")
+    """1 + scale error, constant over an episode"""
+    heading_error: ti.Field = array("n_env")
+    """[rad] integrated heading drift"""
+    heading_rate: ti.Field = array("n_env")
+    """[rad/s] drift rate of the episode"""
+    dropout_until: ti.Field = array("n_env", dtype=ti.i32)
+    """step until which the DVL has lost the bottom"""
+
+
+@dataclass(frozen=True, eq=False)
+class SonarScan:
+    """Sensed: the newest delivered sonar scan. Beam 0 ahead, counter-clockwise, horizontal."""
+
+    range_m: ti.Field = array("n_env", "n_ray", lanes=True)
+    """[m] no return = maximum range"""
+    doppler_m_s: ti.Field = array("n_env", "n_ray", lanes=True)
+    """[m/s] rate of change of the distance to what the beam hit, positive = receding, ego motion included"""
+    intensity: ti.Field = array("n_env", "n_ray", lanes=True)
+    """[0, 1]"""
+    hit: ti.Field = array("n_env", "n_ray", lanes=True, dtype=ti.i32)
+    """1 = return"""
+    fresh: ti.Field = array("n_env", dtype=ti.i32)
+    """1 = delivered in this very step"""
+    ping_step: ti.Field = array("n_env", dtype=ti.i32)
+    """episode step at which it was taken"""
+    ping_pos_w: ti.Field = array("n_env", vec=3)
+    """[m] own position estimate when it was taken"""
+    ping_yaw: ti.Field = array("n_env")
+    """[rad] own yaw estimate when it was taken"""
+    ping_vel_b: ti.Field = array("n_env", vec=3)
+    """[m/s] own measured velocity when it was taken"""
+
+
+@dataclass(frozen=True, eq=False)
+class SonarMemory:
+    """Hidden state of the sonar (simulator side): scans under way and bubble clouds."""
+
+    range_m: ti.Field = array("n_env", "n_latency", "n_ray", lanes=True)
+    """[m] ring of scans taken and not yet delivered"""
+    doppler_m_s: ti.Field = array("n_env", "n_latency", "n_ray", lanes=True)
+    """[m/s]"""
+    intensity: ti.Field = array("n_env", "n_latency", "n_ray", lanes=True)
+    """[0, 1]"""
+    hit: ti.Field = array("n_env", "n_latency", "n_ray", lanes=True, dtype=ti.i32)
+    """1 = return"""
+    step: ti.Field = array("n_env", "n_latency", dtype=ti.i32)
+    """step at which it was taken, -1 = empty"""
+    pos_w: ti.Field = array("n_env", "n_latency", vec=3)
+    """[m] own position estimate then"""
+    yaw: ti.Field = array("n_env", "n_latency")
+    """[rad]"""
+    vel_b: ti.Field = array("n_env", "n_latency", vec=3)
+    """[m/s]"""
+    mount_w: ti.Field = array("n_env", vec=3)
+    """[m] scratch of one ping: true position of the sonar"""
+    mount_vel_w: ti.Field = array("n_env", vec=2)
+    """[m/s] its true horizontal velocity"""
+    heading_w: ti.Field = array("n_env", vec=2)
+    """unit vector along beam 0"""
+    body_x_m: ti.Field = array("n_env", "n_body", lanes=True)
+    """[m] scratch of one ping: centre of a body's outline from the sensor, along x of the world"""
+    body_y_m: ti.Field = array("n_env", "n_body", lanes=True)
+    """[m] along y"""
+    body_reach_m: ti.Field = array("n_env", "n_body", lanes=True)
+    """[m] radius around it that holds the outline, far below 0 = empty slot"""
+    cloud_beam: ti.Field = array("n_env", "n_cloud", dtype=ti.i32)
+    """first beam of a bubble cloud, counted from the world's x axis"""
+    cloud_width: ti.Field = array("n_env", "n_cloud", dtype=ti.i32)
+    """beams it covers"""
+    cloud_range_m: ti.Field = array("n_env", "n_cloud")
+    """[m]"""
+    cloud_until: ti.Field = array("n_env", "n_cloud", dtype=ti.i32)
+    """step at which it is gone"""
+
+
+@dataclass(frozen=True, eq=False)
+class DepthImage:
+    """Sensed: forward depth camera, row 0 at the top, column 0 at the left."""
+
+    depth_m: ti.Field = array("n_env", "n_pixel_row", "n_pixel_col", lanes=True, dtype=ti.f32)
+    """[m] z-depth along the optical axis; no return = maximum range"""
+    fresh: ti.Field = array("n_env", dtype=ti.i32)
+    """1 = taken in this very step"""
+    shot_pos_w: ti.Field = array("n_env", vec=3)
+    """[m] own position estimate when it was taken"""
+    shot_rpy: ti.Field = array("n_env", vec=3)
+    """[rad] own attitude estimate when it was taken"""

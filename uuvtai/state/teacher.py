@@ -1,0 +1,85 @@
+"""The behaviour tree: blackboard, statuses and action, and the tree itself as arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import taichi as ti
+
+from uuvtai.state.arrays import array
+
+
+@dataclass(frozen=True, eq=False)
+class TeacherState:
+    """The behaviour tree: blackboard, statuses and action."""
+
+    status: ti.Field = array("n_env", "n_node", dtype=ti.i8)
+    """status of every node after the newest tick (tree_tick codes)"""
+    running_child: ti.Field = array("n_env", "n_node", dtype=ti.i16)
+    """child (preorder index) that a node with memory goes on with"""
+    result: ti.Field = array("n_env", "n_node", dtype=ti.i8)
+    """scratch of one tick: what each leaf answers when it is ticked"""
+    since_step: ti.Field = array("n_env", "n_node", dtype=ti.i32)
+    """episode step at which a leaf that is running began"""
+    ticks: ti.Field = array("n_env", "n_node", dtype=ti.i32)
+    """ticks of every node in the episode"""
+    acted: ti.Field = array("n_env", "n_node", dtype=ti.i32)
+    """control steps of the episode in which this leaf set the action"""
+    action: ti.Field = array("n_env", vec=4)
+    """[-1, 1] surge, sway, heave, yaw rate of the tree"""
+    leaf: ti.Field = array("n_env", dtype=ti.i32)
+    """node that set the action, -1 = none (then the vehicle is told to stop)"""
+    follow_vel_w: ti.Field = array("n_env", vec=3)
+    """[m/s] velocity that following the route asks for (level)"""
+    evade_vel_w: ti.Field = array("n_env", vec=3)
+    """[m/s] best evasive velocity found"""
+    evade_cost: ti.Field = array("n_env")
+    """cost of that velocity"""
+    candidate_cost: ti.Field = array("n_env", "n_candidate")
+    """cost of every candidate of the newest decision"""
+    want_evade: ti.Field = array("n_env", dtype=ti.i32)
+    """1 = plan an evasion in this step"""
+    ttc_s: ti.Field = array("n_env")
+    """[s] smallest sensed time to contact, geometry.FAR_M = none"""
+    threat_bearing: ti.Field = array("n_env")
+    """[rad] its bearing in the body frame"""
+    nearest_m: ti.Field = array("n_env")
+    """[m] smallest sensed distance from the hull"""
+    nearest_bearing: ti.Field = array("n_env")
+    """[rad] its bearing in the body frame"""
+    clearance_m: ti.Field = array("n_env")
+    """[m] mapped static clearance of the own position"""
+    away_w: ti.Field = array("n_env", vec=2)
+    """unit vector away from the nearest mapped obstacle, zero = none near"""
+    path_clearance_m: ti.Field = array("n_env")
+    """[m] smallest mapped clearance on the straight way to the look-ahead point"""
+    conflict_s: ti.Field = array("n_env")
+    """[s] time of the first predicted conflict of following the route, geometry.FAR_M = none"""
+    hold_conflict_s: ti.Field = array("n_env")
+    """[s] time of the first predicted conflict of stopping here, geometry.FAR_M = none"""
+    body_near_m: ti.Field = array("n_env")
+    """[m] distance to the nearest forecast body now, hull to surface"""
+    calm_steps: ti.Field = array("n_env", dtype=ti.i32)
+    """control steps since a conflict was last predicted"""
+    evading_steps: ti.Field = array("n_env", dtype=ti.i32)
+    """control steps since the tree began to evade, 0 = not evading"""
+    last_vel_w: ti.Field = array("n_env", vec=3)
+    """[m/s] velocity asked for in the last step"""
+
+
+@dataclass(frozen=True, eq=False)
+class TreeTable:
+    """A behaviour tree flattened to preorder arrays, the same for all envs: trees are data, no tree needs a recompilation."""
+
+    n_node: ti.Field = array(dtype=ti.i32)
+    """nodes in use"""
+    kind: ti.Field = array("n_node", dtype=ti.i32)
+    """kind of node (tree_tick codes)"""
+    end: ti.Field = array("n_node", dtype=ti.i32)
+    """one past the last descendant in preorder"""
+    parent: ti.Field = array("n_node", dtype=ti.i32)
+    """preorder index of the parent, -1 = root"""
+    leaf: ti.Field = array("n_node", dtype=ti.i32)
+    """which condition or action a leaf is"""
+    param: ti.Field = array("n_node", vec=4)
+    """numbers from the leaf's ports"""
