@@ -1,0 +1,131 @@
+"""Distillation: loss, weights and errors on hand-computed numbers; teacher batches teach by their strength and skip what is not finite."""
+
+import math
+
+import pytest
+import torch
+from torch import nn
+
+from uuvtai.config.learning import DistillConfig
+from uuvtai.learn.distill import MAX_WEIGHT_RATIO, LeafErrors, TeacherBatches, distillation_loss, imitation_error, sample_weight, weights_of
+
+FLOAT32 = 1e-6
+"""a handful of float32 operations on numbers near one"""
+
+
+class LinearPolicy(nn.Module):
+    """Smallest thing with a mean: four actions linear in two inputs, and a critic that distillation must not touch."""
+
+    def __init__(self):
+        super().__init__()
+        self.actor, self.critic = nn.Linear(2, 4), nn.Linear(2, 1)
+        for layer in (self.actor, self.critic):
+            nn.init.constant_(layer.weight, 0.1)
+            nn.init.zeros_(layer.bias)
+
+    def distribution(self, x):
+        return self.actor(x), torch.zeros(4)
+
+
+@pytest.fixture
+def lesson():
+    generator = torch.Generator().manual_seed(3)
+    x = torch.randn(500, 2, generator=generator)
+    return x, x @ torch.tensor([[0.5, -0.5, 0.2, 0.0], [0.1, 0.3, -0.4, 0.6]]), torch.ones(500), generator
+
+
+def test_the_error_is_the_squared_norm_over_the_four_actions():
+    mean = torch.tensor([[1.0, 2.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.5]])
+    teacher = torch.tensor([[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, -0.5]])
+    assert imitation_error(mean, teacher).tolist() == [5.0, 1.0]
+    assert float(distillation_loss(mean, teacher, torch.tensor([0.5, 1.5]))) == pytest.approx((0.5 * 5 + 1.5 * 1) / 2)
+
+
+def test_weights_have_mean_one_and_bounds():
+    signal = torch.tensor([1.0, 2.0, 3.0])
+    assert torch.allclose(sample_weight(signal), torch.tensor([0.5, 1.0, 1.5]), atol=FLOAT32)
+    wild = torch.cat([torch.full((999,), 1e-3), torch.tensor([1e9])])
+    weight = sample_weight(wild)
+    assert float(weight.mean()) == pytest.approx(1.0, abs=1e-5)
+    assert float(weight.max() / weight.min()) == pytest.approx(MAX_WEIGHT_RATIO**2)
+
+
+def test_weights_survive_zeros_and_what_is_not_finite():
+    assert sample_weight(torch.zeros(4)).tolist() == [1.0] * 4
+    weight = sample_weight(torch.tensor([1.0, math.nan, 3.0, math.inf]))
+    assert torch.isfinite(weight).all()
+    assert weight[1] == weight[3] and weight[0] < weight[1] < weight[2]
+
+
+def test_weighting_by_name():
+    uncertainty, risk = torch.tensor([1.0, 3.0]), torch.tensor([3.0, 1.0])
+    assert weights_of("none", uncertainty, risk).tolist() == [1.0, 1.0]
+    assert weights_of("uncertainty", uncertainty, risk).tolist() == [0.5, 1.5]
+    assert weights_of("risk", uncertainty, risk).tolist() == [1.5, 0.5]
+    with pytest.raises(ValueError, match=r"risk\.enabled=true"):
+        weights_of("risk", uncertainty, None)
+
+
+def test_teacher_batches_teach_the_mean_and_leave_the_critic(lesson):
+    x, teacher, weight, generator = lesson
+    policy = LinearPolicy()
+    critic = policy.critic.weight.clone()
+    policy.critic(x).sum().backward()  # a gradient that PPO left behind
+    batches = TeacherBatches(policy, DistillConfig(batch=64, steps=300, learning_rate=1e-2))
+    before = imitation_error(policy.distribution(x)[0], teacher).mean()
+    batches.update(x, teacher, weight, 1.0, generator)
+    after = imitation_error(policy.distribution(x)[0], teacher).mean()
+    assert after < 0.01 * before
+    assert torch.equal(policy.critic.weight, critic)
+
+
+def test_strength_scales_the_step_and_zero_draws_nothing(lesson):
+    x, teacher, weight, generator = lesson
+
+    def moved(strength):
+        policy = LinearPolicy()
+        TeacherBatches(policy, DistillConfig(batch=64, steps=1)).update(x, teacher, weight, strength, torch.Generator().manual_seed(0))
+        return (policy.actor.weight - 0.1).detach()
+
+    # the weight is kept near 0.1: a step of 3e-5 is known to one part in a thousand
+    assert torch.allclose(moved(0.2), 0.2 * moved(1.0), rtol=1e-2, atol=1e-9)
+    state = generator.get_state()
+    policy = LinearPolicy()
+    TeacherBatches(policy, DistillConfig()).update(x, teacher, weight, 0.0, generator)
+    assert torch.equal(generator.get_state(), state)
+    assert torch.equal(policy.actor.weight, torch.full((4, 2), 0.1))
+
+
+def test_a_batch_that_is_not_finite_changes_nothing_and_is_counted(lesson):
+    x, _teacher, weight, generator = lesson
+    policy = LinearPolicy()
+    batches = TeacherBatches(policy, DistillConfig(batch=64, steps=2))
+    batches.update(x, torch.full((500, 4), math.nan), weight, 1.0, generator)
+    assert batches.skipped == 2
+    assert torch.equal(policy.actor.weight, torch.full((4, 2), 0.1))
+
+
+def test_teacher_batches_go_on_from_their_state(lesson):
+    x, teacher, weight, _generator = lesson
+
+    def run(parts):
+        policy, generator = LinearPolicy(), torch.Generator().manual_seed(7)
+        state = None
+        for _ in range(parts):
+            batches = TeacherBatches(policy, DistillConfig(batch=32, steps=4 // parts))
+            if state is not None:
+                batches.load_state_dict(state)
+            batches.update(x, teacher, weight, 0.7, generator)
+            state = batches.state_dict()
+        return policy.actor.weight
+
+    assert torch.equal(run(1), run(2))
+
+
+def test_errors_by_leaf():
+    errors = LeafErrors(("Root", "Evade", "Follow", "Evade"), torch.device("cpu"))
+    errors.add(torch.tensor([1.0, 2.0, 3.0, 6.0]), torch.tensor([1, 2, 3, -1], dtype=torch.int32))
+    errors.add(torch.tensor([4.0, math.nan]), torch.tensor([2, 2], dtype=torch.int32))
+    found = errors.take()
+    assert found == {"distill/leaf/Evade": 2.0, "distill/leaf/Follow": 3.0, "distill/loss": 16.0 / 5}
+    assert errors.take() == {}
