@@ -146,6 +146,8 @@ class TrainConfig(Section):
     evaluate_episodes: PositiveCount = 64
     evaluate_seed: Annotated[int, Field(ge=0, lt=2**31)] = 500_000
     """scenarios of these evaluations; training never meets them"""
+    patience: PositiveCount = 10
+    """iterations in a row with values that are not finite before the run stops with an error (EC)"""
 
     @field_validator("evaluate_seed")
     @classmethod
