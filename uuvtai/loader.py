@@ -1,8 +1,9 @@
 """Presets and YAML: load a config from named or user-given files, apply overrides, and say precisely what is wrong and where.
 
 A preset is a YAML file that states differences only. Its top-level keys are config sections, plus ``extends`` (another preset of the same
-kind) and, in a world, ``sensors: NAME`` or ``vehicle: NAME`` in place of a section. Loading never executes code: safe YAML, no tags, no
-aliases, no duplicate keys, at most 1 MiB.
+kind) and, in a world, ``sensors: NAME`` or ``vehicle: NAME`` in place of a section. A training preset may name all three, ``world: NAME``
+or, to change something in it, ``world: {preset: NAME, ...}``. Loading never executes code: safe YAML, no tags, no aliases, no duplicate
+keys, at most 1 MiB.
 """
 
 from __future__ import annotations
@@ -12,21 +13,25 @@ import json
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, get_args, get_origin
+from typing import Any, TypeVar, get_args, get_origin
 
 import yaml
 from pydantic import BaseModel, ValidationError
 
 from uuvtai.config import Config
+from uuvtai.config.learning import LearningConfig
 
 PRESET_DIR = Path(__file__).parent / "presets"
-KINDS = {"world": "worlds", "sensors": "sensors", "vehicle": "vehicles", "tree": "trees"}
-DEFAULT_SENSORS = "paper"
+KINDS = {"world": "worlds", "sensors": "sensors", "vehicle": "vehicles", "tree": "trees", "train": "train"}
+DEFAULT_WORLD, DEFAULT_SENSORS = "pool", "paper"
+_SCENE_KINDS = ("world", "sensors", "vehicle")
+_LEARNING_SECTIONS = LearningConfig.model_fields.keys() - Config.model_fields.keys()
 _MAX_BYTES = 1 << 20
 _MAX_EXTENDS = 8
 
 
 Overrides = dict[str, Any] | list[str | tuple[str, Any]]
+AnyConfig = TypeVar("AnyConfig", bound=Config)
 
 
 class ConfigError(ValueError):
@@ -56,6 +61,44 @@ def load_config(
     ``overrides`` maps dotted keys to values, or lists (key, value) pairs and ``key.sub=value`` texts as typed on the command line.
     Without ``sensors`` the world's own choice counts, else ``paper``. Raises ConfigError.
     """
+    merged = _scene(world, sensors, vehicle)
+    merged.merge(_overrides(overrides or {}))
+    return validated(merged.tree, merged.origin)
+
+
+def load_training(
+    preset: str = "best",
+    overrides: Overrides | None = None,
+    world: str | None = None,
+    sensors: str | None = None,
+    vehicle: str | None = None,
+) -> LearningConfig:
+    """Config of a training preset (name or path), then overrides as for ``load_config``; raises ConfigError.
+
+    ``world``, ``sensors`` and ``vehicle`` replace the presets that the training preset names; what it changes in those sections stays.
+    """
+    layer = _read_preset("train", preset)
+    named = {kind: layer.tree[kind].pop("preset", None) for kind in _SCENE_KINDS if isinstance(layer.tree.get(kind), dict)}
+    for kind, name in named.items():
+        if name is not None and not isinstance(name, str):
+            raise ConfigError(
+                f"{layer.origin.get(f'{kind}.preset', preset)}: {kind}.preset must be the name or path of a preset, got {name!r}"
+            )
+    chosen_world = world or named.get("world") or DEFAULT_WORLD
+    merged = _scene(chosen_world, sensors or named.get("sensors"), vehicle or named.get("vehicle"))
+    merged.merge(layer)
+    merged.merge(_overrides(overrides or {}))
+    return _checked(LearningConfig, merged.tree, merged.origin)
+
+
+def scene_of(preset: str) -> dict[str, str | None]:
+    """Names of the world, sensors and vehicle presets that a training preset names; None = it names none."""
+    tree = _read_preset("train", preset).tree
+    return {kind: tree.get(kind, {}).get("preset") for kind in _SCENE_KINDS}
+
+
+def _scene(world: str, sensors: str | None, vehicle: str | None) -> _Layer:
+    """A world with its sensors and its vehicle, the ones given before the ones that it names itself."""
     layer = _read_preset("world", world)
     named = {kind: layer.tree.pop(kind) for kind in ("sensors", "vehicle") if isinstance(layer.tree.get(kind), str)}
     merged = _read_preset("sensors", sensors or named.get("sensors", DEFAULT_SENSORS))
@@ -64,8 +107,7 @@ def load_config(
     if sensors is not None:
         layer.tree.pop("sensors", None)
     merged.merge(layer)
-    merged.merge(_overrides(overrides or {}))
-    return validated(merged.tree, merged.origin)
+    return merged
 
 
 def sensors_of(world: str, sensors: str | None) -> str:
@@ -76,18 +118,22 @@ def sensors_of(world: str, sensors: str | None) -> str:
 
 def validated(tree: dict[str, Any], origin: dict[str, str] | None = None) -> Config:
     """Config from a nested dict; ConfigError names the key, its origin, the reason and the nearest known name."""
+    return _checked(Config, tree, origin or {})
+
+
+def _checked(model: type[AnyConfig], tree: dict[str, Any], origin: dict[str, str]) -> AnyConfig:
     try:
-        return Config.model_validate_json(json.dumps(tree), strict=True)
+        return model.model_validate_json(json.dumps(tree), strict=True)
     except ValidationError as error:
-        raise ConfigError(_explained(error, origin or {})) from None
+        raise ConfigError(_explained(error, origin, model)) from None
     except (TypeError, ValueError) as error:
         raise ConfigError(f"config: {error}; values are numbers, strings, lists and mappings") from None
 
 
 def load_resolved(path: Path) -> Config:
-    """Config from a run folder's ``config.yaml`` (complete, no presets)."""
+    """Config from a run folder's ``config.yaml`` (complete, no presets); of a training run, a LearningConfig."""
     layer = _read_yaml(path)
-    return validated(layer.tree, layer.origin)
+    return _checked(LearningConfig if _LEARNING_SECTIONS & layer.tree.keys() else Config, layer.tree, layer.origin)
 
 
 def to_yaml(config: Config) -> str:
@@ -96,7 +142,7 @@ def to_yaml(config: Config) -> str:
 
 
 def preset_names(kind: str) -> list[str]:
-    """Names of the shipped presets of a kind: world, sensors, vehicle or tree."""
+    """Names of the shipped presets of a kind (``KINDS``)."""
     return sorted(path.stem for path in (PRESET_DIR / KINDS[kind]).iterdir() if path.suffix in (".yaml", ".xml"))
 
 
@@ -121,6 +167,8 @@ def _read_preset(kind: str, name: str, depth: int = 0) -> _Layer:
         raise ConfigError(f"{kind} {name!r}: 'extends' is nested more than {_MAX_EXTENDS} deep; is it a circle?")
     path = preset_path(kind, name)
     own = _read_yaml(path)
+    if kind == "train":
+        _spell_out(own)
     base = own.tree.pop("extends", None)
     if base is None:
         return own
@@ -130,6 +178,14 @@ def _read_preset(kind: str, name: str, depth: int = 0) -> _Layer:
     layer = _read_preset(kind, str(beside) if beside.is_file() else base, depth + 1)
     layer.merge(own)
     return layer
+
+
+def _spell_out(layer: _Layer) -> None:
+    """``world: NAME`` as ``world: {preset: NAME}``: a preset that extends this one can change the section without losing the name."""
+    for kind in _SCENE_KINDS:
+        if isinstance(layer.tree.get(kind), str):
+            layer.tree[kind] = {"preset": layer.tree[kind]}
+            layer.origin[f"{kind}.preset"] = layer.origin[kind]
 
 
 # ------------------------------------------------------------------------------------------------------------------- YAML
@@ -237,13 +293,13 @@ def _merge(into: dict[str, Any], other: dict[str, Any]) -> None:
 # ----------------------------------------------------------------------------------------------------------------- messages
 
 
-def _explained(error: ValidationError, origin: dict[str, str]) -> str:
+def _explained(error: ValidationError, origin: dict[str, str], model: type[BaseModel]) -> str:
     lines = []
     for problem in error.errors():
         dotted = ".".join(str(part) for part in problem["loc"])
         where = _origin_of(dotted, origin)
         if problem["type"] == "extra_forbidden":
-            lines.append(f"{where}unknown key '{dotted}'{_nearest(dotted.rsplit('.', 1)[-1], _siblings(problem['loc']))}")
+            lines.append(f"{where}unknown key '{dotted}'{_nearest(dotted.rsplit('.', 1)[-1], _siblings(problem['loc'], model))}")
         else:
             got = problem.get("input")
             lines.append(f"{where}{dotted}: {problem['msg']} (got {got!r})")
@@ -261,8 +317,8 @@ def _origin_of(dotted: str, origin: dict[str, str]) -> str:
     return ""
 
 
-def _siblings(location: tuple[Any, ...]) -> list[str]:
-    model: Any = Config
+def _siblings(location: tuple[Any, ...], root: type[BaseModel]) -> list[str]:
+    model: Any = root
     for part in location[:-1]:
         model = _inner_model(model.model_fields[part].annotation) if isinstance(part, str) and part in model.model_fields else model
         if model is None:

@@ -1,0 +1,308 @@
+"""Checkpoints: safetensors and a JSON manifest, whole or not at all, verified before anything is used; opening one executes nothing.
+
+``checkpoints/step_000050/`` holds ``manifest.json`` (what it is, for which observation and action, sha256 of every file),
+``model.safetensors`` (the networks with their normalisers: all that driving needs), ``training.safetensors`` (optimisers, generators,
+counters) and ``simulator.zst`` (the envs themselves, large, so only beside the newest ones). A shipped policy is the same folder without
+the last two. The folder is written under another name, flushed to disk and renamed: a process killed at any moment leaves the newest
+verified one usable.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import safetensors.torch
+import torch
+
+from uuvtai import __version__
+from uuvtai.config.learning import LearningConfig
+from uuvtai.learn.manifest import (
+    MANIFEST,
+    MODEL,
+    OPTIONAL,
+    SCHEMA,
+    SIMULATOR,
+    TRAINING,
+    CheckpointError,
+    Column,
+    FileEntry,
+    Manifest,
+    action_rows,
+    config_sha256,
+    difference,
+    finite,
+    manifest_content,
+    parsed,
+    refused,
+    sha256_of,
+    table_rows,
+    verify,
+)
+from uuvtai.learn.packing import PackingError, layout_of, pack, read_stream, unpack, write_stream
+
+MODEL_PARTS = ("policy", "world_model", "risk")
+"""parts of a trainer's state that go into model.safetensors"""
+SIMULATOR_PART = "env"
+"""part of a trainer's state that goes into simulator.zst"""
+
+_KEEP_SIMULATORS = 2
+"""newest checkpoints that keep the simulator's state: the last one, and one in case the disk damages it"""
+_STEP, _PARTIAL = "step_", ".partial-"
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A verified checkpoint."""
+
+    path: Path
+    manifest: Manifest
+    config: LearningConfig
+    sha256: str
+    """of the manifest, which holds the sha256 of everything else"""
+
+    @property
+    def step(self) -> int:
+        """Training iterations done."""
+        return self.manifest.step
+
+    @property
+    def is_resumable(self) -> bool:
+        """Everything that training needs to go on is there."""
+        return all((self.path / name).is_file() for name in OPTIONAL)
+
+    def model(self) -> dict[str, Any]:
+        """State of the networks, by the names of MODEL_PARTS that were saved. Raises CheckpointError."""
+        return self._part(MODEL, self.manifest.model)
+
+    def state(self, like: Mapping[str, Any]) -> dict[str, Any]:
+        """The trainer's whole state. ``like`` is the state of the trainer it is meant for: a simulator of another size is refused."""
+        if not self.is_resumable:
+            raise CheckpointError(f"{self.path}: has networks only and cannot be trained on; resume the run's newest checkpoint")
+        state = self.model() | self._part(TRAINING, self.manifest.training)
+        plain, expected = pack(like[SIMULATOR_PART], SIMULATOR_PART)
+        layout = self.manifest.simulator_layout
+        if _structure(plain) != _structure(self.manifest.simulator) or layout != layout_of(expected):
+            raise CheckpointError(
+                f"{self.path}: the simulator's state has other arrays than this simulator; resume with the run's own config, number of "
+                "envs and version of uuvtai"
+            )
+        with refused(self.path / SIMULATOR):
+            state[SIMULATOR_PART] = unpack(self.manifest.simulator, read_stream(self.path / SIMULATOR, layout_of(expected)))
+        return state
+
+    def check_table(self, table: Sequence[Column], config: Any) -> None:
+        """Raise CheckpointError where an environment's observation or action is not what the policy was trained for."""
+        for what, own, theirs in (
+            ("observation", self.manifest.observation_table, table_rows(table)),
+            ("action", self.manifest.action, action_rows(config)),
+        ):
+            if own != theirs:
+                raise CheckpointError(f"{self.path}: made for another {what} table: {difference(own, theirs)}")
+
+    def _part(self, name: str, plain: Any) -> dict[str, Any]:
+        with refused(self.path / name):
+            content = (self.path / name).read_bytes()
+            if hashlib.sha256(content).hexdigest() != self.manifest.files[name].sha256:
+                raise PackingError("has changed since it was verified")
+            return unpack(plain, safetensors.torch.load(content))
+
+
+# ------------------------------------------------------------------------------------------------------------------ writing
+
+
+def save(
+    checkpoints: Path,
+    step: int,
+    state: Mapping[str, Any],
+    config: LearningConfig,
+    table: Sequence[Column],
+    metrics: Mapping[str, Any] | None = None,
+    score: float | None = None,
+) -> Path:
+    """Write ``checkpoints/step_N`` and thin out older ones (newest ``train.keep_checkpoints`` and the best stay).
+
+    ``state`` is what ``Trainer.state`` gives: MODEL_PARTS, SIMULATOR_PART and whatever else training needs, nested. ``score``: higher is
+    better. Raises CheckpointError where the disk refuses; then nothing half-written is taken for a checkpoint.
+    """
+    target = checkpoints / f"{_STEP}{step:06d}"
+    try:
+        checkpoints.mkdir(parents=True, exist_ok=True)
+        sweep(checkpoints)
+        partial = checkpoints / f"{_PARTIAL}{target.name}.{os.getpid()}"
+        partial.mkdir()
+        described = _write_parts(partial, state)
+        manifest = Manifest(
+            version=__version__,
+            created=time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+            step=step,
+            score=score,
+            metrics=finite(metrics or {}),
+            config=config.model_dump(mode="json"),
+            config_sha256=config_sha256(config),
+            observation_table=table_rows(table),
+            action=action_rows(config),
+            files={path.name: _entry(path) for path in sorted(partial.iterdir())},
+            **described,
+        )
+        _publish(partial, target, manifest)
+        _thin(checkpoints, config.train.keep_checkpoints)
+    except OSError as error:
+        sweep(checkpoints)
+        raise CheckpointError(f"{target}: cannot be written ({error.strerror}); make room or mend the folder, then: --resume") from None
+    return target
+
+
+def ship(checkpoint: Checkpoint, target: Path) -> None:
+    """Copy the networks of a checkpoint into a new folder ``target``: a policy that drives but cannot be trained on."""
+    partial = target.with_name(f"{_PARTIAL}{target.name}")
+    partial.mkdir(parents=True)
+    shutil.copyfile(checkpoint.path / MODEL, partial / MODEL)
+    kept = {"training": None, "simulator": None, "simulator_layout": None, "files": {MODEL: checkpoint.manifest.files[MODEL]}}
+    _publish(partial, target, checkpoint.manifest.model_copy(update=kept))
+
+
+def sweep(checkpoints: Path) -> None:
+    """Remove what a killed process left half-written or half-removed."""
+    for left in checkpoints.glob(f"{_PARTIAL}*"):
+        shutil.rmtree(left, ignore_errors=True)
+
+
+def _write_parts(folder: Path, state: Mapping[str, Any]) -> dict[str, Any]:
+    """Write the files of ``state``; what the manifest says of them."""
+    model, tensors = pack({name: state[name] for name in MODEL_PARTS if state.get(name) is not None}, "")
+    _write(folder / MODEL, safetensors.torch.save(_named(tensors)))
+    rest = {name: part for name, part in state.items() if name not in (*MODEL_PARTS, SIMULATOR_PART)}
+    training, tensors = pack(rest, "")
+    _write(folder / TRAINING, safetensors.torch.save(_named(tensors)))
+    described: dict[str, Any] = {"schema": SCHEMA, "model": model, "training": training}
+    if SIMULATOR_PART in state:
+        described["simulator"], tensors = pack(state[SIMULATOR_PART], SIMULATOR_PART)
+        described["simulator_layout"] = layout_of(tensors)
+        write_stream(folder / SIMULATOR, tensors)
+    return described
+
+
+def _named(tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    return tensors or {"nothing": torch.zeros(0)}  # safetensors has no empty file
+
+
+def _publish(partial: Path, target: Path, manifest: Manifest) -> None:
+    """Flush everything to disk, then give the folder its name."""
+    text = json.dumps(manifest.model_dump(mode="json", by_alias=True), indent=1, allow_nan=False)
+    _write(partial / MANIFEST, text.encode())
+    for path in partial.iterdir():
+        _flush(path)
+    _flush(partial)
+    if target.exists():
+        _remove(target)
+    partial.rename(target)
+    _flush(target.parent)
+
+
+def _thin(checkpoints: Path, keep: int) -> None:
+    """Remove all but the newest ``keep`` and the best, and the simulator's state of all but the newest."""
+    newest = _folders(checkpoints)
+    for path in newest[_KEEP_SIMULATORS:]:
+        (path / SIMULATOR).unlink(missing_ok=True)
+    best = _best_folder(newest)
+    for path in newest[keep:]:
+        if path != best:
+            _remove(path)
+
+
+def _remove(folder: Path) -> None:
+    """Under another name first: half a folder must never be taken for a checkpoint."""
+    doomed = folder.with_name(f"{_PARTIAL}{folder.name}.old.{os.getpid()}")
+    folder.rename(doomed)
+    shutil.rmtree(doomed)
+
+
+def _write(path: Path, content: bytes) -> None:
+    with path.open("xb") as file:
+        file.write(content)
+
+
+def _flush(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _entry(path: Path) -> FileEntry:
+    return FileEntry(bytes=path.stat().st_size, sha256=sha256_of(path))
+
+
+# ------------------------------------------------------------------------------------------------------------------ reading
+
+
+def open_checkpoint(path: Path) -> Checkpoint:
+    """Read a checkpoint's manifest and verify every file. Raises CheckpointError."""
+    content = manifest_content(path)
+    with refused(path / MANIFEST):
+        manifest = parsed(content)
+        config = LearningConfig.model_validate_json(json.dumps(manifest.config), strict=True)
+        if config_sha256(config) != manifest.config_sha256:
+            raise PackingError("its config does not have the sha256 that it states")
+    for name in manifest.files:
+        if name not in (MODEL, *OPTIONAL):
+            raise CheckpointError(f"{path / MANIFEST}: lists the file {name!r}, which no checkpoint has; it was not written by uuvtai")
+    for name in (MODEL, *OPTIONAL):
+        verify(path / name, manifest.files.get(name), name in OPTIONAL)
+    return Checkpoint(path, manifest, config, hashlib.sha256(content).hexdigest())
+
+
+def newest(run: Path, note: Callable[[str], None] = lambda _text: None, resumable: bool = False) -> Checkpoint:
+    """Newest checkpoint of a run folder that passes verification; ``note`` is told of newer ones that do not. Raises CheckpointError."""
+    checkpoints = run / "checkpoints"
+    for path in _folders(checkpoints):
+        try:
+            found = open_checkpoint(path)
+        except CheckpointError as error:
+            note(f"left out: {error}")
+            continue
+        if not resumable or found.is_resumable:
+            return found
+        note(f"left out: {path} has no simulator state to go on from")
+    raise CheckpointError(f"{checkpoints}: holds no usable checkpoint; give the folder of a run that 'uuv train' has written")
+
+
+def best(run: Path, note: Callable[[str], None] = lambda _text: None) -> Checkpoint:
+    """The checkpoint with the highest score, else the newest one. Raises CheckpointError."""
+    found = _best_folder(_folders(run / "checkpoints"))
+    if found is not None:
+        try:
+            return open_checkpoint(found)
+        except CheckpointError as error:
+            note(f"left out: {error}")
+    return newest(run, note)
+
+
+def _folders(checkpoints: Path) -> list[Path]:
+    """Folders that claim to be checkpoints, newest first."""
+    found = [path for path in checkpoints.glob(f"{_STEP}*") if path.name.removeprefix(_STEP).isdecimal()]
+    return sorted(found, key=lambda path: int(path.name.removeprefix(_STEP)), reverse=True)
+
+
+def _best_folder(folders: list[Path]) -> Path | None:
+    """Highest score, the newest of equals; None where nothing was scored."""
+    scored = []
+    for path in folders:
+        with contextlib.suppress(CheckpointError, PackingError, ValueError, RecursionError):
+            score = parsed(manifest_content(path)).score
+            scored += [] if score is None else [(score, path)]
+    return max(scored, key=lambda pair: pair[0])[1] if scored else None
+
+
+def _structure(plain: Any) -> str:
+    return json.dumps(plain, sort_keys=True)
