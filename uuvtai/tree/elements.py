@@ -1,0 +1,62 @@
+"""Reading XML strictly and safely: no DTD, no entities, no loose text, bounded size and depth; every error names file and line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NoReturn
+from xml.parsers import expat
+
+from uuvtai.loader import ConfigError
+
+_MAX_BYTES = 1 << 20
+_MAX_DEPTH = 64
+
+
+class TreeError(ConfigError):
+    """A behaviour tree that cannot be used: file, line, node, reason."""
+
+
+@dataclass
+class Element:
+    tag: str
+    attributes: dict[str, str]
+    line: int
+    children: list[Element] = field(default_factory=list)
+
+
+def read_elements(text: bytes, source: str) -> Element:
+    """Element tree with line numbers; DTDs and entities are refused."""
+    if len(text) > _MAX_BYTES:
+        raise TreeError(f"{source}: larger than {_MAX_BYTES} bytes")
+    parser = expat.ParserCreate()
+    holder = Element("", {}, 0)
+    stack = [holder]
+
+    def begin(tag: str, attributes: dict[str, str]) -> None:
+        if len(stack) > _MAX_DEPTH:
+            raise TreeError(f"{source}:{parser.CurrentLineNumber}: <{tag}> is nested more than {_MAX_DEPTH} deep")
+        element = Element(tag, attributes, parser.CurrentLineNumber)
+        stack[-1].children.append(element)
+        stack.append(element)
+
+    def refuse(*_: object) -> NoReturn:
+        raise TreeError(f"{source}:{parser.CurrentLineNumber}: DTDs and entities are not allowed in a tree")
+
+    def words(data: str) -> None:
+        if data.strip() and not _described(stack):
+            raise TreeError(f"{source}:{parser.CurrentLineNumber}: text {data.strip()[:20]!r} inside <{stack[-1].tag}>")
+
+    parser.StartElementHandler = begin
+    parser.EndElementHandler = lambda _: stack.pop()
+    parser.CharacterDataHandler = words
+    parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = refuse
+    try:
+        parser.Parse(text, True)
+    except expat.ExpatError as error:
+        raise TreeError(f"{source}:{error.lineno}: not well-formed XML: {expat.errors.messages[error.code]}") from None
+    return holder.children[0]
+
+
+def _described(stack: list[Element]) -> bool:
+    """Whether the innermost element is part of the editor's palette, which may hold descriptions."""
+    return any(element.tag == "TreeNodesModel" for element in stack)

@@ -1,0 +1,54 @@
+"""A tree as flat preorder arrays, and the way into the kernels' table."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from uuvtai.state import TreeTable
+from uuvtai.tree.elements import TreeError
+from uuvtai.tree.nodes import MAX_PORTS
+
+UNSET = -1.0
+"""Value of a port that is not given: the leaf takes the number of the config's teacher section."""
+
+
+@dataclass(frozen=True)
+class FlatTree:
+    """A tree in preorder; one entry per node everywhere."""
+
+    names: tuple[str, ...]
+    """what the author calls the node, else its type"""
+    types: tuple[str, ...]
+    """Sequence, Evade, ..."""
+    kind: tuple[int, ...]
+    end: tuple[int, ...]
+    parent: tuple[int, ...]
+    leaf: tuple[int, ...]
+    param: tuple[tuple[float, ...], ...]
+    source: str = ""
+    """file it was read from"""
+
+    @property
+    def depth(self) -> tuple[int, ...]:
+        """Distance of each node from the root."""
+        found: list[int] = []
+        for parent in self.parent:
+            found.append(0 if parent < 0 else found[parent] + 1)
+        return tuple(found)
+
+
+def load_tree(table: TreeTable, flat: FlatTree) -> None:
+    """Copy a flat tree into the simulator's table. Raises TreeError when it does not fit."""
+    n, capacity = len(flat.kind), table.kind.shape[0]
+    if n > capacity:
+        raise TreeError(f"{flat.source}: {n} nodes do not fit the {capacity} that were allocated (teacher.max_node)")
+    for array, values in ((table.kind, flat.kind), (table.end, flat.end), (table.parent, flat.parent), (table.leaf, flat.leaf)):
+        padded = np.zeros(capacity, np.int32)
+        padded[:n] = values
+        array.from_numpy(padded)
+    param = np.full((capacity, MAX_PORTS), UNSET, np.float32)
+    param[:n] = flat.param
+    table.param.from_numpy(param)
+    table.n_node[None] = n

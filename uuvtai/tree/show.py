@@ -1,0 +1,95 @@
+"""Trees as text and Graphviz DOT, with what their nodes did in an evaluation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from uuvtai.kernels import tree_tick as codes
+from uuvtai.tree.flat import UNSET, FlatTree
+from uuvtai.tree.nodes import LEAVES
+
+_SYMBOLS = {
+    "Sequence": "->",
+    "Fallback": "?",
+    "ReactiveSequence": "=>",
+    "ReactiveFallback": "??",
+    "Inverter": "!",
+    "ForceSuccess": "+",
+    "ForceFailure": "-",
+}
+
+
+@dataclass(frozen=True)
+class NodeUse:
+    """What a node did over an evaluation."""
+
+    share: float
+    """of the episodes (or envs) that ticked it"""
+    ticks: int
+    acted: int
+    """control steps in which it set the action"""
+
+
+def node_use(ticks: np.ndarray, acted: np.ndarray, n_node: int) -> list[NodeUse]:
+    """Use of every node from counts of shape (n_episode, >= n_node)."""
+    if not len(ticks):
+        return [NodeUse(0.0, 0, 0)] * n_node
+    return [NodeUse(float((ticks[:, i] > 0).mean()), int(ticks[:, i].sum()), int(acted[:, i].sum())) for i in range(n_node)]
+
+
+def tree_text(flat: FlatTree, use: Sequence[NodeUse] | None = None) -> str:
+    """The tree as indented text; with ``use`` also the share of episodes, ticks and steps acted of every node."""
+    lines = [f"{branch}{_label(flat, i)}" for i, branch in enumerate(_branches(flat))]
+    if use is None:
+        return "\n".join(lines)
+    width = max(map(len, lines))
+    head = f"{'node':{width}}  {'episodes':>8}  {'ticks':>10}  {'acted':>8}  {'acted %':>7}"
+    total = max(1, sum(u.acted for u in use))
+    rows = [
+        f"{line:{width}}  {100 * u.share:7.1f}%  {u.ticks:10d}  {_acted(flat, i, u, total)}"
+        for i, (line, u) in enumerate(zip(lines, use, strict=True))
+    ]
+    return "\n".join([head, *(row.rstrip() for row in rows)])
+
+
+def _acted(flat: FlatTree, node: int, use: NodeUse, total: int) -> str:
+    return f"{use.acted:8d}  {100 * use.acted / total:6.1f}%" if flat.kind[node] == codes.ACTION else ""
+
+
+def _label(flat: FlatTree, node: int) -> str:
+    kind = flat.types[node]
+    given = zip(LEAVES[kind].ports, flat.param[node], strict=False) if kind in LEAVES else ()
+    ports = ", ".join(f"{port}={value:g}" for port, value in given if value != UNSET)
+    text = f"{_SYMBOLS.get(kind, '')} {kind}".strip() + (f"({ports})" if ports else "")
+    return text if flat.names[node] == kind else f"{flat.names[node]}: {text}"
+
+
+def _branches(flat: FlatTree) -> list[str]:
+    """Line art before every node."""
+    arts: list[str] = []
+    stems: list[str] = []
+    for node, parent in enumerate(flat.parent):
+        if parent < 0:
+            arts.append("")
+            stems.append("")
+            continue
+        last = flat.end[node] == flat.end[parent]
+        arts.append(stems[parent] + ("└─ " if last else "├─ "))
+        stems.append(stems[parent] + ("   " if last else "│  "))
+    return arts
+
+
+def tree_dot(flat: FlatTree, use: Sequence[NodeUse] | None = None) -> str:
+    """The tree as Graphviz DOT; with ``use`` nodes carry the share of episodes that ticked them."""
+    shape: Callable[[int], str] = lambda kind: {codes.CONDITION: "ellipse", codes.ACTION: "box"}.get(kind, "plaintext")  # noqa: E731
+    lines = ["digraph tree {", "  ordering=out; node [fontname=sans];"]
+    for node, kind in enumerate(flat.kind):
+        share = f"\\n{100 * use[node].share:.1f} %" if use else ""
+        label = _label(flat, node).replace("\\", "\\\\").replace('"', '\\"')
+        lines.append(f'  n{node} [label="{label}{share}", shape={shape(kind)}];')
+        if flat.parent[node] >= 0:
+            lines.append(f"  n{flat.parent[node]} -> n{node};")
+    return "\n".join([*lines, "}"])
