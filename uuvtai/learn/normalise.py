@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import torch
 from torch import nn
 
+_ROWS_AT_ONCE = 2048
+"""a float64 copy of a whole rollout would not fit the caches"""
 MIN_STD = 1e-2
 """a column's deviation counts as at least this much (in its own unit): a constant column must not become noise"""
 
 
-class Moments(NamedTuple):
+@dataclass(frozen=True)
+class Moments:
     """Moments of samples of ``width`` columns, float64."""
 
     mean: torch.Tensor
     """(width,)"""
     m2: torch.Tensor
     """(width,), sum of squared differences from the mean"""
-    samples: torch.Tensor
-    """(), how many"""
+    count: torch.Tensor
+    """(), number of samples"""
 
 
 def moments_of(x: torch.Tensor) -> Moments:
@@ -29,12 +32,12 @@ def moments_of(x: torch.Tensor) -> Moments:
     kept = torch.isfinite(rows.sum(dim=1))
     if not bool(kept.all()):
         rows = rows[kept]
-    count = torch.tensor(float(len(rows)), dtype=torch.float64, device=x.device)
-    mean, m2 = (torch.zeros(x.shape[-1], dtype=torch.float64, device=x.device) for _ in range(2))
-    for part in rows.split(_ROWS_AT_ONCE):  # a float64 copy of a whole rollout would not fit the caches
-        merged = combined(Moments(mean, m2, count.new_tensor(0.0)), _moments_of_part(part.double()))
-        mean, m2 = merged.mean, merged.m2
-    return Moments(mean, m2, count)
+    width = rows.shape[1]
+    zeros = torch.zeros(2 * width + 1, dtype=torch.float64, device=x.device)
+    total = Moments(zeros[:width], zeros[width:-1], zeros[-1])
+    for first in range(0, len(rows), _ROWS_AT_ONCE):
+        total = combined(total, _moments_of_part(rows[first : first + _ROWS_AT_ONCE].double()))
+    return total
 
 
 def _moments_of_part(rows: torch.Tensor) -> Moments:
@@ -42,15 +45,12 @@ def _moments_of_part(rows: torch.Tensor) -> Moments:
     return Moments(mean, (rows - mean).square().sum(dim=0), rows.new_tensor(float(len(rows))))
 
 
-_ROWS_AT_ONCE = 2048
-
-
 def combined(a: Moments, b: Moments) -> Moments:
     """Moments of the samples of both, as if they had been taken together (Chan et al., equation 1.5)."""
-    samples = a.samples + b.samples
-    share = b.samples / samples.clamp(min=1.0)
+    count = a.count + b.count
+    share = b.count / count.clamp(min=1.0)
     difference = b.mean - a.mean
-    return Moments(a.mean + share * difference, a.m2 + b.m2 + difference.square() * (a.samples * share), samples)
+    return Moments(a.mean + share * difference, a.m2 + b.m2 + difference.square() * (a.count * share), count)
 
 
 class RunningNorm(nn.Module):
@@ -79,8 +79,10 @@ class RunningNorm(nn.Module):
 
     def merge(self, other: Moments) -> None:
         """Add samples whose moments are known, for example those of all processes together."""
-        for buffer, value in zip(self.moments, combined(self.moments, other), strict=True):
-            buffer.copy_(value)
+        united = combined(self.moments, other)
+        self.mean.copy_(united.mean)
+        self.m2.copy_(united.m2)
+        self.count.copy_(united.count)
 
     def std(self) -> torch.Tensor:
         """(width,) deviation, float64, at least ``MIN_STD``; 1 before the first sample."""
