@@ -18,6 +18,7 @@ import torch
 
 from uuvtai import state
 from uuvtai.allocation import allocation_matrices
+from uuvtai.capture import Memory
 from uuvtai.config import Config
 from uuvtai.kernels import (
     actuation,
@@ -44,7 +45,7 @@ from uuvtai.kernels import (
     world,
 )
 from uuvtai.kernels.grid import outside_cells
-from uuvtai.kernels.recording import copy_rows
+from uuvtai.kernels.recording import copy_rows, tell_address
 from uuvtai.rrt import RouteFallback
 from uuvtai.runtime import start_taichi
 from uuvtai.scenario import check_scenarios, load_fixed, set_scene
@@ -378,6 +379,13 @@ class Sim:
     def read_into(self, field: ti.Field, out: torch.Tensor) -> None:
         """Copy a whole field into ``out`` on the device, without a wait or a copy through the host."""
         copy_rows(field, self._every_row, out)
+
+    def memory(self) -> Memory:
+        """Where every array lies, when all kernels are done: for a capture."""
+        anchor, address = self.s.clock.active, torch.zeros(1, dtype=torch.int64, device=self.device)
+        tell_address(anchor, address)
+        ti.sync()
+        return Memory(self.s, anchor, int(address[0]), self.device)
 
     @contextlib.contextmanager
     def _stage(self, name: str) -> Iterator[None]:

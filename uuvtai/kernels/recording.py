@@ -45,3 +45,9 @@ def _copy_cell_3(field: In[ti.Field], out: In[ti.Field], env, i, j, k):
             out[i, j, k, c] = field[env, j, k][c]
     else:
         out[i, j, k] = field[env, j, k]
+
+
+@ti.kernel
+def tell_address(field: In[ti.Field], out: ti.types.ndarray(dtype=ti.i64, ndim=1)):  # type: ignore[valid-type]
+    """out[0] = address in memory of the first element of a field of rank 1."""
+    out[0] = ti.cast(ti.get_addr(field, 0), ti.i64)

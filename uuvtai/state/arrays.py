@@ -20,7 +20,14 @@ _T = TypeVar("_T")
 
 
 def array(
-    *shape: str, vec: int = 0, dtype: Any = REAL, packed: bool = False, lanes: bool = False, bits: bool = False, beside: str = ""
+    *shape: str,
+    vec: int = 0,
+    dtype: Any = REAL,
+    packed: bool = False,
+    lanes: bool = False,
+    bits: bool = False,
+    beside: str = "",
+    scratch: bool = False,
 ) -> Any:
     """Declare one array of a struct: named sizes, optional vector length, dtype (default: the run's real type).
 
@@ -29,9 +36,10 @@ def array(
     compiler sees that a loop over ``packet * 16 + i`` with static i meets neighbours: it then loads, computes and stores whole vectors.
     ``bits`` keeps sixty-four neighbours on the last axis as the bits of one word (uint64), the first in the lowest.
     Arrays of one shape with the same word in ``beside`` lie side by side, element by element: what is touched together is fetched together.
+    ``scratch``: no step reads what an earlier one left in it, so a capture leaves it out (capture.py).
     """
     metadata = {"shape": shape, "vec": vec, "dtype": ti.u64 if bits else dtype, "packed": packed, "lanes": lanes, "bits": bits}
-    return dataclasses.field(metadata=metadata | {"beside": beside})
+    return dataclasses.field(metadata=metadata | {"beside": beside, "scratch": scratch})
 
 
 def allocate(struct: type[_T], sizes: dict[str, int], real: Any = ti.f32) -> _T:

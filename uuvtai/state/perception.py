@@ -55,9 +55,9 @@ class TrackState:
     """episode step of the ping that the states refer to, -1 = no scan yet"""
     beam_track: ti.Field = array("n_env", "n_ray", dtype=ti.i32)
     """track that explains this beam of the newest scan, -1 = none (carried over by bearing where that scan was not tracked)"""
-    pick: ti.Field = array("n_env", "n_track", dtype=ti.i32)
+    pick: ti.Field = array("n_env", "n_track", dtype=ti.i32, scratch=True)
     """scratch of one scan: cluster matched to this track, -1 = none"""
-    pick_cost: ti.Field = array("n_env", "n_track")
+    pick_cost: ti.Field = array("n_env", "n_track", scratch=True)
     """scratch of one scan: cost of that match (-2 log likelihood)"""
 
 
@@ -189,7 +189,10 @@ class MapState:
 
 @dataclass(frozen=True, eq=False)
 class MapScratch:
-    """Scratch: what one env's scan says about the cells. Slots are shared by all envs: few serve many and stay in the cache."""
+    """Scratch: what one env's scan says about the cells. Slots are shared by all envs: few serve many and stay in the cache.
+
+    Marks are taken back as they are read: between two scans there are none.
+    """
 
     static_hit: ti.Field = array("n_slot", "n_row", "n_col", bits=True, beside="marks")
     """static returns"""
@@ -197,5 +200,5 @@ class MapScratch:
     """returns of what moves"""
     fan_edge: ti.Field = array("n_slot", "n_row", "n_col", bits=True, beside="marks")
     """cells at which a column enters or leaves the fan of free water (fan.py)"""
-    fetched: ti.Field = array("n_slot", dtype=ti.f32)
+    fetched: ti.Field = array("n_slot", dtype=ti.f32, scratch=True)
     """see mapping.fetch_cells"""

@@ -33,13 +33,13 @@ class ClearanceMemory:
     """[cells^2] largest squared distance among sixteen neighbours in a row"""
     limit: ti.Field = array("n_env", dtype=ti.i32)
     """[cells^2] limit of the distances, 0 = nothing computed yet"""
-    row_key: ti.Field = array("n_slot", "n_row", "n_col", dtype=ti.i32, packed=True)
+    row_key: ti.Field = array("n_slot", "n_row", "n_col", dtype=ti.i32, packed=True, scratch=True)
     """scratch: key of the nearest site in the same row (clearance.py)"""
-    near_up: ti.Field = array("n_slot", "n_packet", "n_row", bits=True)
+    near_up: ti.Field = array("n_slot", "n_packet", "n_row", bits=True, scratch=True)
     """scratch: rows of a packet's columns that have a site in reach, lowest row first"""
-    near_down: ti.Field = array("n_slot", "n_packet", "n_row", bits=True)
+    near_down: ti.Field = array("n_slot", "n_packet", "n_row", bits=True, scratch=True)
     """scratch: the same, highest row first"""
-    stale: ti.Field = array("n_slot", "n_packet", "n_row", bits=True)
+    stale: ti.Field = array("n_slot", "n_packet", "n_row", bits=True, scratch=True)
     """scratch: rows of a packet's columns that must be redone"""
 
 
@@ -47,21 +47,21 @@ class ClearanceMemory:
 class VoronoiState:
     """Scratch of the global planner. Slots are shared by the queue (slot s plans its items s, s + n_plan, ...): few serve many envs."""
 
-    weight: ti.Field = array("n_plan", "n_row", "n_col", dtype=ti.f32)
+    weight: ti.Field = array("n_plan", "n_row", "n_col", dtype=ti.f32, scratch=True)
     """[1/m] 1 / max(clearance, eps_r) of a traversable cell, 0 = not traversable"""
-    cost: ti.Field = array("n_plan", "n_row", "n_col", dtype=ti.f32)
+    cost: ti.Field = array("n_plan", "n_row", "n_col", dtype=ti.f32, scratch=True)
     """cost-to-go of the cells reached by the search"""
-    cell: ti.Field = array("n_plan", "n_row", "n_col", dtype=ti.u8)
+    cell: ti.Field = array("n_plan", "n_row", "n_col", dtype=ti.u8, scratch=True)
     """bits of voronoi.py: on the skeleton or not (filled on demand), reached, direction of the next cell towards the goal"""
-    heap: ti.Field = array("n_plan", "n_heap", dtype=ti.u64)
+    heap: ti.Field = array("n_plan", "n_heap", dtype=ti.u64, scratch=True)
     """binary heap of open cells: bits of the estimated total cost, then the cell (row * n_col + col)"""
-    path_cell: ti.Field = array("n_plan", "n_path", dtype=ti.i32)
+    path_cell: ti.Field = array("n_plan", "n_path", dtype=ti.i32, scratch=True)
     """cells of the path found, from start to goal"""
-    node_cost: ti.Field = array("n_plan", "n_path", dtype=ti.f32)
+    node_cost: ti.Field = array("n_plan", "n_path", dtype=ti.f32, scratch=True)
     """shortcutting: cost-to-go of every few path cells"""
-    node_next: ti.Field = array("n_plan", "n_path", dtype=ti.i32)
+    node_next: ti.Field = array("n_plan", "n_path", dtype=ti.i32, scratch=True)
     """shortcutting: how many nodes the best chord from here spans, 0 = along the cells to the next node"""
-    pops: ti.Field = array("n_env", dtype=ti.i32)
+    pops: ti.Field = array("n_env", dtype=ti.i32, scratch=True)
     """cells expanded by the newest plan of this env"""
 
 
@@ -83,17 +83,17 @@ class RouteState:
     """trigger of this step's replan, route.TRIGGER_NONE if none (a bit set of the triggers that fired in `fired`)"""
     fired: ti.Field = array("n_env", dtype=ti.i32)
     """bit set of every trigger that holds in this step"""
-    want_plan: ti.Field = array("n_env", dtype=ti.i32)
+    want_plan: ti.Field = array("n_env", dtype=ti.i32, scratch=True)
     """1 = plan in this step"""
     fallback_reason: ti.Field = array("n_env", dtype=ti.i32)
     """why Voronoi failed in this step (voronoi.* code), 0 = it did not"""
-    queue: ti.Field = array("n_env", dtype=ti.i32)
+    queue: ti.Field = array("n_env", dtype=ti.i32, scratch=True)
     """env ids that plan in this step"""
-    n_queue: ti.Field = array(dtype=ti.i32)
+    n_queue: ti.Field = array(dtype=ti.i32, scratch=True)
     """length of the queue"""
-    failed: ti.Field = array("n_env", dtype=ti.i32)
+    failed: ti.Field = array("n_env", dtype=ti.i32, scratch=True)
     """env ids whose Voronoi plan failed in this step: the host's RRT takes them"""
-    n_failed: ti.Field = array(dtype=ti.i32)
+    n_failed: ti.Field = array(dtype=ti.i32, scratch=True)
     """length of that list"""
     plan_step: ti.Field = array("n_env", dtype=ti.i32)
     """episode step of the newest route"""

@@ -89,17 +89,17 @@ class SonarMemory:
     """[rad]"""
     vel_b: ti.Field = array("n_env", "n_latency", vec=3)
     """[m/s]"""
-    mount_w: ti.Field = array("n_env", vec=3)
+    mount_w: ti.Field = array("n_env", vec=3, scratch=True)
     """[m] scratch of one ping: true position of the sonar"""
-    mount_vel_w: ti.Field = array("n_env", vec=2)
+    mount_vel_w: ti.Field = array("n_env", vec=2, scratch=True)
     """[m/s] its true horizontal velocity"""
-    heading_w: ti.Field = array("n_env", vec=2)
+    heading_w: ti.Field = array("n_env", vec=2, scratch=True)
     """unit vector along beam 0"""
-    body_x_m: ti.Field = array("n_env", "n_body", lanes=True)
+    body_x_m: ti.Field = array("n_env", "n_body", lanes=True, scratch=True)
     """[m] scratch of one ping: centre of a body's outline from the sensor, along x of the world"""
-    body_y_m: ti.Field = array("n_env", "n_body", lanes=True)
+    body_y_m: ti.Field = array("n_env", "n_body", lanes=True, scratch=True)
     """[m] along y"""
-    body_reach_m: ti.Field = array("n_env", "n_body", lanes=True)
+    body_reach_m: ti.Field = array("n_env", "n_body", lanes=True, scratch=True)
     """[m] radius around it that holds the outline, far below 0 = empty slot"""
     cloud_beam: ti.Field = array("n_env", "n_cloud", dtype=ti.i32)
     """first beam of a bubble cloud, counted from the world's x axis"""
@@ -115,7 +115,7 @@ class SonarMemory:
 class DepthImage:
     """Sensed: forward depth camera, row 0 at the top, column 0 at the left."""
 
-    depth_m: ti.Field = array("n_env", "n_pixel_row", "n_pixel_col", lanes=True, dtype=ti.f32)
+    depth_m: ti.Field = array("n_env", "n_pixel_row", "n_pixel_col", lanes=True, dtype=ti.f32, scratch=True)
     """[m] z-depth along the optical axis; no return = maximum range"""
     fresh: ti.Field = array("n_env", dtype=ti.i32)
     """1 = taken in this very step"""

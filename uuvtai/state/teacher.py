@@ -17,7 +17,7 @@ class TeacherState:
     """status of every node after the newest tick (tree_tick codes)"""
     running_child: ti.Field = array("n_env", "n_node", dtype=ti.i16)
     """child (preorder index) that a node with memory goes on with"""
-    result: ti.Field = array("n_env", "n_node", dtype=ti.i8)
+    result: ti.Field = array("n_env", "n_node", dtype=ti.i8, scratch=True)
     """scratch of one tick: what each leaf answers when it is ticked"""
     since_step: ti.Field = array("n_env", "n_node", dtype=ti.i32)
     """episode step at which a leaf that is running began"""
@@ -35,7 +35,7 @@ class TeacherState:
     """[m/s] best evasive velocity found"""
     evade_cost: ti.Field = array("n_env")
     """cost of that velocity"""
-    candidate_cost: ti.Field = array("n_env", "n_candidate")
+    candidate_cost: ti.Field = array("n_env", "n_candidate", scratch=True)
     """cost of every candidate of the newest decision"""
     want_evade: ti.Field = array("n_env", dtype=ti.i32)
     """1 = plan an evasion in this step"""

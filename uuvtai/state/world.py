@@ -85,7 +85,7 @@ class FixedTable:
 class ScenarioScratch:
     """Scratch of scenario drawing: free space on a coarse grid, to see whether start and goal are joined."""
 
-    reach: ti.Field = array("n_env", "n_coarse_row", "n_coarse_col", dtype=ti.u8)
+    reach: ti.Field = array("n_env", "n_coarse_row", "n_coarse_col", dtype=ti.u8, scratch=True)
     """0 = free, 1 = blocked, 2 = reached from the start"""
-    footprint: ti.Field = array("n_env", "n_body", vec=7)
+    footprint: ti.Field = array("n_env", "n_body", vec=7, scratch=True)
     """plan view of the bodies at rest (footprint.py)"""
