@@ -1,0 +1,74 @@
+"""The record of a run: ``metrics.jsonl``, one object an iteration, and the same as TensorBoard events under the usual names."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+METRICS, EVENTS = "metrics.jsonl", "tensorboard"
+
+
+class Recorder:
+    """Writes what every iteration gave; each line is on its way to the disk before ``write`` returns.
+
+    A resumed run goes on behind the iteration of its checkpoint: what came later is cut off, and TensorBoard is told to forget it.
+    """
+
+    def __init__(self, run: Path, iteration: int = 0) -> None:
+        """``iteration``: how many are done already. Raises OSError where the folder cannot be written."""
+        from torch.utils.tensorboard import SummaryWriter  # takes a second to import
+
+        _cut(run / METRICS, iteration)
+        self._file = (run / METRICS).open("a", encoding="utf-8")
+        self._events = SummaryWriter(str(run / EVENTS), purge_step=iteration + 1 if iteration else None)
+
+    def write(self, iteration: int, metrics: Mapping[str, float]) -> None:
+        """Record an iteration, counted from 1. What is not finite becomes null, and no event."""
+        row = {name: value if math.isfinite(value) else None for name, value in metrics.items()}
+        self._file.write(json.dumps({"iteration": iteration, **row}, allow_nan=False) + "\n")
+        self._file.flush()
+        for name, value in row.items():
+            if value is not None:
+                self._events.add_scalar(name, value, iteration)
+        self._events.flush()
+
+    def close(self) -> None:
+        """Flush and close both."""
+        self._file.close()
+        self._events.close()
+
+
+def read_metrics(run: Path) -> list[dict[str, Any]]:
+    """Every whole line of a run's ``metrics.jsonl``; a last line that was cut off is left out. Raises OSError."""
+    rows = []
+    for line in (run / METRICS).read_text(encoding="utf-8").splitlines(keepends=True):
+        if (row := _row(line)) is None:
+            break
+        rows.append(row)
+    return rows
+
+
+def _cut(file: Path, iteration: int) -> None:
+    """Shorten the file to the whole lines of iterations up to this one."""
+    if not file.exists():
+        return
+    kept = 0
+    for line in file.read_bytes().splitlines(keepends=True):
+        row = _row(line)
+        if row is None or row["iteration"] > iteration:
+            break
+        kept += len(line)
+    with file.open("r+b") as stream:
+        stream.truncate(kept)
+
+
+def _row(line: str | bytes) -> dict[str, Any] | None:
+    """The object of a line; None where the line was cut off."""
+    try:
+        row = json.loads(line)
+    except ValueError:
+        return None
+    return row if line[-1:] in ("\n", b"\n") and isinstance(row, dict) and isinstance(row.get("iteration"), int) else None
