@@ -105,6 +105,9 @@ class WorldModelConfig(Section):
     reconstruction_weight: NonNegative = 1.0
     dynamics_weight: NonNegative = 0.2
     """beta"""
+    predict_change: bool = True
+    """the decoder says how the targets change (residual decoder); false = their values, as in the paper, which is further off than saying
+    "as before": in one step of 0.02 s little changes"""
     likelihood: bool = True
     """Gaussian negative log-likelihood; false = mean squared error"""
     beta_nll: Fraction = 0.5

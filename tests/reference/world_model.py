@@ -1,0 +1,44 @@
+"""World model's forward pass and losses in NumPy float64, from a model's parameters."""
+
+import numpy as np
+
+LOW, HIGH = -12.0, 6.0
+
+
+def _softplus(x):
+    return np.logaddexp(0.0, x)
+
+
+def _mlp(net, x):
+    layers = [m for m in net if hasattr(m, "weight")]
+    for number, layer in enumerate(layers):
+        x = x @ layer.weight.detach().double().numpy().T + layer.bias.detach().double().numpy()
+        if number < len(layers) - 1:
+            x = np.where(x > 0, x, np.expm1(np.minimum(x, 0)))
+    return x
+
+
+def encode(model, obs):
+    """z of raw observations, from the running moments; deviations count as 0.01 at least."""
+    norm = model.observation_norm
+    std = np.maximum(np.sqrt(norm.m2.numpy() / norm.count.item()), 1e-2)
+    return _mlp(model.encoder, np.clip((obs - norm.mean.numpy()) / std, -10, 10))
+
+
+def losses(model, obs, action, next_obs):
+    """(reconstruction, dynamics) of every sample, each (B,)."""
+    config, norm, change = model.config, model.observation_norm, model.change_norm
+    ahead = _mlp(model.dynamics, np.concatenate([encode(model, obs), np.clip(action, -1, 1)], axis=1))
+    out = _mlp(model.decoder, ahead)
+    mean, log_var = out[:, :24], HIGH - _softplus(HIGH - LOW - _softplus(out[:, 24:] - LOW))
+    if config.predict_change:
+        target, std = next_obs[:, :24] - obs[:, :24], np.sqrt(change.m2.numpy() / change.count.item())
+        middle = 0.0
+    else:
+        target, std, middle = next_obs[:, :24], np.sqrt(norm.m2.numpy() / norm.count.item())[:24], norm.mean.numpy()[:24]
+    if config.normalise_targets:
+        target = (target - middle) / std
+    error = (target - mean) ** 2
+    if config.likelihood:
+        error = 0.5 * (error * np.exp(-log_var) + log_var) * np.exp(config.beta_nll * log_var)
+    return error.sum(axis=1), ((encode(model, next_obs) - ahead) ** 2).sum(axis=1)
