@@ -9,9 +9,10 @@ from uuvtai.logs import canvas as ink
 from uuvtai.logs.canvas import Canvas
 from uuvtai.logs.errors import LogError
 from uuvtai.logs.mcap_log import McapEpisodeLog
-from uuvtai.logs.painting import map_canvas, paint_walls, paint_water
+from uuvtai.logs.painting import map_canvas, paint_truth, paint_walls, paint_water
 from uuvtai.logs.picture import draw_picture, picture
 from uuvtai.logs.recording import PICTURE_TOPICS, load_recording
+from uuvtai.logs.scenario import body_positions
 from uuvtai.logs.video import FrameArtist, video
 
 N_STEP = 110
@@ -98,6 +99,43 @@ def test_the_end_shows_the_outcome(bt, straight):
     at = place(loaded[1].positions[-1])
     difference = np.abs(crash.astype(int) - arrival.astype(int)).max(axis=2)
     assert difference[at[1] - 9 : at[1] + 10, at[0] - 9 : at[0] + 10].max() > 100
+
+
+def test_where_methods_go_the_same_way_both_are_seen(folder, bt):
+    twin = record(folder / "twin.mcap", "twin")
+    loaded = [load_recording(path, PICTURE_TOPICS) for path in (bt, twin)]
+    image = draw_picture(loaded, obstacles=False)
+    path = loaded[0].positions
+    assert has(around(image, place(path[len(path) // 4]), 2), ink.METHODS[0])
+    assert has(around(image, place(path[len(path) // 4]), 5), ink.METHODS[1], 60)  # its edge, a pixel and a half wide
+
+
+def test_true_bodies_are_as_old_as_the_map(folder, bt):
+    """The first method's map is drawn; another method that took longer does not move the bodies on."""
+    longer = folder / "longer.mcap"
+    with McapEpisodeLog(longer, episode.header("straight")) as log:
+        for snap in episode.snapshots(2 * N_STEP, sway=-0.9):
+            log.write(snap)
+        log.close(episode.result(2 * N_STEP))
+    first, second = (load_recording(path, PICTURE_TOPICS) for path in (bt, longer))
+    body = episode.BODIES[4]
+    then, later = (body_positions(body, np.array([recording.duration_s]))[0] for recording in (first, second))
+    assert np.linalg.norm(then - later) > 1.0
+    alone, both = draw_picture([first]), draw_picture([first, second])
+    for center, there in ((then, True), (later, False)):
+        rim = place((center[0], center[1] + body["size"][0]))
+        assert has(around(alone, rim, 2), ink.MOVER, 60) is has(around(both, rim, 2), ink.MOVER, 60) is there
+
+
+def test_bodies_above_and_below_the_vehicle_are_dashed():
+    def ink_used(own_z_m):
+        canvas = map_canvas(episode.scenario()["tank"], 1280, (52, 28, 84, 212))
+        paint_truth(canvas, {"bodies": [episode.BODIES[0] | {"size": [0.35, 0.35, 0.2]}]}, 0.0, own_z_m)
+        return int((255 - canvas.image.astype(int)).sum())
+
+    level, reaching_up, below, above = (ink_used(z) for z in (-0.8, -1.1, -1.3, -0.3))
+    assert level == reaching_up == ink_used(None)
+    assert 0.4 * level < below == above < 0.8 * level
 
 
 def test_trajectories_of_other_episodes_are_not_overlaid(folder, bt):

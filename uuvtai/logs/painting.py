@@ -14,6 +14,8 @@ from uuvtai.logs.scenario import body_positions
 
 _MAX_MAP = 1000
 """[px] greatest height of the map"""
+_HULL_RADIUS_M = 0.17
+"""half the height of the hull that ``Canvas.vehicle`` draws"""
 
 
 def map_canvas(tank: dict[str, Any], width_px: int, margins: tuple[int, int, int, int]) -> Canvas:
@@ -58,15 +60,23 @@ def paint_layers(canvas: Canvas, static: Layer, dynamic: Layer, faint: np.ndarra
     canvas.cells(np.array(DYNAMIC), np.clip(dynamic.values, 0, 1) ** 0.8 * 0.95, dynamic.origin_m, dynamic.cell_m)
 
 
-def paint_truth(canvas: Canvas, scenario: dict[str, Any], time_s: float, paths: bool = True) -> None:
-    """True bodies as thin outlines where they are at this time, and the paths of those that move."""
+def paint_truth(canvas: Canvas, scenario: dict[str, Any], time_s: float, own_z_m: float | None = None) -> None:
+    """True bodies as thin outlines where they are at this time, and the paths of those that move.
+
+    With the vehicle's height, bodies that pass wholly above or below its hull are dashed: from above they seem to be in its way.
+    """
     for body in scenario["bodies"]:
         at = body_positions(body, np.array([time_s]))[0]
-        moves = body["path"] is not None
-        if moves and paths:
+        color = GREY
+        if body["path"] is not None:
+            color = MOVER
             period = body["path"]["length_m"] / max(body["path"]["speed_m_s"], 1e-6)
             canvas.dashes(body_positions(body, np.linspace(0, period, 181))[:, :2], mixed(MOVER, WATER, 0.45), 1)
-        canvas.line(body_outline(body, at), MOVER if moves else GREY, 1, closed=True)
+        outline = body_outline(body, at)
+        if own_z_m is not None and abs(at[2] - own_z_m) > body["size"][2] + _HULL_RADIUS_M:
+            canvas.dashes(np.vstack([outline, outline[:1]]), color, 1)
+        else:
+            canvas.line(outline, color, 1, closed=True)
 
 
 def body_outline(body: dict[str, Any], at: np.ndarray) -> np.ndarray:

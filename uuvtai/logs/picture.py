@@ -69,12 +69,11 @@ def draw_picture(recordings: list[Recording], clearance: bool = False, obstacles
         _paint_clearance(canvas, recordings, side)
     _paint_occupancy(canvas, recordings[0], trace=not clearance)
     if obstacles:
-        paint_truth(canvas, recordings[0].scenario, max(recording.duration_s for recording in recordings))
+        paint_truth(canvas, recordings[0].scenario, recordings[0].duration_s)  # as old as the map
     paint_walls(canvas, tank)
-    for i, recording in enumerate(recordings):
-        _paint_trajectory(canvas, recording, METHODS[i % len(METHODS)])
+    _paint_trajectories(canvas, recordings)
     _paint_ends(canvas, recordings)
-    _paint_frame(canvas, recordings)
+    _paint_frame(canvas, recordings, trace=not clearance)
     return canvas.image
 
 
@@ -110,10 +109,13 @@ def _paint_color_bar(canvas: Canvas, top_m: float) -> None:
     canvas.text((x + 26, y0 - 12), "clearance", 15, GREY)
 
 
-def _paint_trajectory(canvas: Canvas, recording: Recording, color: Color) -> None:
-    path = recording.positions[:, :2]
-    canvas.line(path, PAPER, 6)
-    canvas.line(path, color, 3)
+def _paint_trajectories(canvas: Canvas, recordings: list[Recording]) -> None:
+    """The first method on top; the others below it a little wider each, so that their edges show where all go the same way."""
+    wide = [3 + 3 * min(i, 3) for i in range(len(recordings))]
+    for recording, width in zip(recordings, wide, strict=True):
+        canvas.line(recording.positions[:, :2], PAPER, width + 3)
+    for i in reversed(range(len(recordings))):
+        canvas.line(recordings[i].positions[:, :2], METHODS[i % len(METHODS)], wide[i])
 
 
 def _paint_ends(canvas: Canvas, recordings: list[Recording]) -> None:
@@ -122,24 +124,24 @@ def _paint_ends(canvas: Canvas, recordings: list[Recording]) -> None:
     canvas.dashes(np.array(goal[:2]) + scenario["goal_radius_m"] * _ring(90), INK, 1)
     canvas.disc(start, 8, PAPER)
     canvas.disc(start, 7, INK, 2)
-    for i, recording in enumerate(recordings):
-        canvas.vehicle(recording.positions[-1], METHODS[i % len(METHODS)])
+    for i in reversed(range(len(recordings))):
+        canvas.vehicle(recordings[i].positions[-1], METHODS[i % len(METHODS)])
     canvas.star(goal, 17)
     for i, recording in enumerate(recordings):
         if recording.outcome in ("collision", "ttc", "out_of_tank"):
             canvas.cross(recording.positions[-1][:2], 9, METHODS[i % len(METHODS)])
 
 
-def _paint_frame(canvas: Canvas, recordings: list[Recording]) -> None:
+def _paint_frame(canvas: Canvas, recordings: list[Recording], trace: bool) -> None:
     scenario = recordings[0].scenario
     canvas.text((_LEFT - 2, 40), f"{scenario['world']} · seed {scenario['seed']} · episode {scenario['episode']}", 27, INK, bold=True)
     moving = f", {scenario['D']} moving at {scenario['v_m_s']:g} m/s" if scenario["D"] else ""
-    canvas.text((_LEFT - 2, 70), f"{scenario['S']} resting obstacles{moving}; map of {recordings[0].method}", 18, GREY)
+    canvas.text((_LEFT - 2, 70), f"{scenario['S']} resting obstacles{moving}; map and bodies when {recordings[0].method} ends", 18, GREY)
     paint_ruler(canvas)
     base = canvas.pixels([(canvas.x_m[0], canvas.y_m[0])])[0][1] + 62
     for i, recording in enumerate(recordings):
         _legend_row(canvas, base + i * _ROW, recording, METHODS[i % len(METHODS)])
-    _legend_symbols(canvas, base)
+    _legend_symbols(canvas, base, trace)
 
 
 def _legend_row(canvas: Canvas, y: float, recording: Recording, color: Color) -> None:
@@ -150,17 +152,15 @@ def _legend_row(canvas: Canvas, y: float, recording: Recording, color: Color) ->
     canvas.text((_LEFT + 46 + max(width, 90) + 14, y), told, 18, GREY)
 
 
-def _legend_symbols(canvas: Canvas, base: float) -> None:
+def _legend_symbols(canvas: Canvas, base: float, trace: bool) -> None:
     x, width = canvas.image.shape[1] - _RIGHT - 430, 15
-    swatches = (
-        (STATIC, "static occupancy", 0, 0),
-        (DYNAMIC, "dynamic occupancy", 0, 1),
-        (mixed(DYNAMIC, WATER, 0.22), "dynamic earlier", 0, 2),
-    )
-    for color, label, column, row in swatches:
-        left, y = x + column * 200, base + row * _ROW
-        canvas.filled(np.array([(left, y - 13), (left + width, y - 13), (left + width, y + 2), (left, y + 2)]), color)
-        canvas.text((left + 26, y), label, 17, GREY)
+    swatches = [(STATIC, "static occupancy"), (DYNAMIC, "dynamic occupancy")]
+    if trace:
+        swatches.append((mixed(DYNAMIC, WATER, 0.22), "dynamic earlier"))
+    for row, (color, label) in enumerate(swatches):
+        y = base + row * _ROW
+        canvas.filled(np.array([(x, y - 13), (x + width, y - 13), (x + width, y + 2), (x, y + 2)]), color)
+        canvas.text((x + 26, y), label, 17, GREY)
     left = x + 210
     world = (np.array([left + 8, base - 6]) - np.array(canvas.corner)) / canvas.scale
     goal = (canvas.x_m[0] + world[0], canvas.y_m[1] - world[1])

@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from uuvtai.logs.canvas import DYNAMIC, FAINT, GREY, INK, METHODS, MOVER, PAPER, ROUTE, Color, bgr
+from uuvtai.logs.canvas import DYNAMIC, FAINT, GREY, INK, METHODS, MOVER, PAPER, ROUTE, STATIC, Color, bgr
 from uuvtai.logs.errors import LogError
 from uuvtai.logs.painting import (
     map_canvas,
@@ -29,6 +29,14 @@ _PANEL = 160
 """[px] height of the panel below the map"""
 _ECHO, _GOOD, _BAD = bgr("#0b7a75"), bgr("#2b8a3e"), bgr("#c92a2a")
 _TRIGGER_COLORS = {"initial": GREY, "stuck": bgr("#ae3ec9"), "safety": bgr("#e8590c"), "intersection": bgr("#1971c2")}
+_LEGEND = (
+    (ROUTE, "route"),
+    (_ECHO, "sonar"),
+    (STATIC, "mapped"),
+    (DYNAMIC, "tracked"),
+    (MOVER, "true, moving"),
+    (GREY, "true, resting"),
+)
 _HOLD_S = 1.0
 """The last frame stays this long."""
 _CODECS = ("VP80", "VP90")
@@ -122,7 +130,7 @@ class FrameArtist:
         canvas.image = self._background(time_s).copy()
         i = max(int(np.searchsorted(self._times, time_s + 1e-9)) - 1, 0)
         pose = self._track[i]
-        paint_truth(canvas, recording.scenario, time_s)
+        paint_truth(canvas, recording.scenario, time_s, float(pose[2]))
         self._paint_plan(time_s)
         canvas.line(self._track[: i + 1, :2], METHODS[0], 2)
         self._paint_echoes(time_s)
@@ -182,7 +190,7 @@ class FrameArtist:
         title = f"{recording.method} · {scenario['world']} · seed {scenario['seed']} · episode {scenario['episode']}"
         canvas.text((24, 34), title, 22, INK, bold=True)
         moving = f", {scenario['D']} moving at {scenario['v_m_s']:g} m/s" if scenario["D"] else ""
-        canvas.text((24, 60), f"{scenario['S']} resting obstacles{moving}", 16, GREY)
+        canvas.text((24, 60), f"{scenario['S']} resting obstacles{moving}; dashed while wholly above or below the vehicle", 16, GREY)
         canvas.text((width - 28, 36), f"{time_s:5.1f} s", 26, INK, bold=True, align="right")
         if time_s >= recording.duration_s:
             good = recording.outcome == "success"
@@ -211,7 +219,7 @@ class FrameArtist:
 
     def _paint_legend(self, x: float, y: float) -> None:
         canvas = self._canvas
-        for color, label in ((ROUTE, "route"), (_ECHO, "sonar"), (DYNAMIC, "tracked"), (MOVER, "true, moving"), (GREY, "true, resting")):
+        for color, label in _LEGEND:
             square = np.array([(0, -9), (9, -9), (9, 0), (0, 0)]) + np.array([x, y])
             canvas.filled(square, color)
             x += 16 + canvas.text((x + 14, y), label, 14, GREY) + 14
