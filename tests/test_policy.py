@@ -1,0 +1,142 @@
+"""Policy: densities against torch.distributions, the teacher at birth, values that statistics do not change, and no hidden state."""
+
+import math
+
+import pytest
+import torch
+from torch import nn
+
+from uuvtai.config.learning import PolicyConfig
+from uuvtai.learn.mlp import mlp
+from uuvtai.learn.normalise import moments_of
+from uuvtai.learn.policy import Policy, entropy, log_prob
+
+N_IN = 7
+FLOAT32 = 1e-5
+"""relative and absolute; a small network in float32, its sums in another order"""
+
+
+def make(seed=0, teacher_slice=None, **config):
+    return Policy(N_IN, PolicyConfig(hidden=(16, 16), **config), teacher_slice, torch.Generator().manual_seed(seed))
+
+
+@pytest.fixture
+def x():
+    return torch.randn(50, N_IN, generator=torch.Generator().manual_seed(5)) * 3 + 2
+
+
+def test_densities_are_those_of_torch(x):
+    generator = torch.Generator().manual_seed(2)
+    mean, action = torch.randn(50, 4, generator=generator), torch.randn(50, 4, generator=generator)
+    log_std = torch.tensor([-0.5, 0.0, 0.3, -2.0])
+    expected = torch.distributions.Normal(mean, log_std.exp())
+    assert torch.allclose(log_prob(action, mean, log_std), expected.log_prob(action).sum(-1), rtol=FLOAT32)
+    assert torch.allclose(entropy(log_std), expected.entropy().sum(-1)[0], rtol=FLOAT32)
+
+
+def test_a_step_is_a_draw_from_the_distribution(x):
+    policy = make()
+    step = policy.act(x, torch.Generator().manual_seed(9))
+    mean, log_std = policy.distribution(x)
+    assert torch.allclose(step.mean, mean, atol=FLOAT32)
+    assert torch.allclose(step.value, policy.value(x), atol=FLOAT32)
+    assert torch.allclose(step.log_prob, log_prob(step.action, mean, log_std), atol=FLOAT32)
+    assert not any(tensor.requires_grad for tensor in step)
+    many = policy.act(x[:1].expand(40_000, -1), torch.Generator().manual_seed(3))
+    spread = many.action - many.mean
+    assert torch.allclose(spread.std(0), torch.full((4,), 0.6), rtol=0.02)  # 0.35 % is one standard error of 40,000
+    assert float(spread.mean(0).abs().max()) < 0.015  # five standard errors
+    again = policy.act(x, torch.Generator().manual_seed(9))
+    assert all(torch.equal(a, b) for a, b in zip(step, again, strict=True))
+
+
+def test_shapes_follow_the_input(x):
+    policy = make()
+    assert policy.distribution(x.view(5, 10, N_IN))[0].shape == (5, 10, 4)
+    assert policy.value(x.view(5, 10, N_IN)).shape == (5, 10)
+
+
+def test_a_residual_policy_is_the_teacher_at_birth(x):
+    policy = make(teacher_slice=slice(2, 6), residual=True, residual_limit=0.3)
+    policy.observation_norm.update(x)
+    assert torch.equal(policy.distribution(x)[0], x[:, 2:6])
+    nn.init.normal_(policy.actor[-1].weight, std=100.0, generator=torch.Generator().manual_seed(0))
+    added = (policy.distribution(x)[0] - x[:, 2:6]).detach()
+    assert float(added.abs().max()) == pytest.approx(0.3, abs=FLOAT32)
+
+
+def test_a_residual_policy_without_a_finite_teacher_stays_finite(x):
+    policy = make(teacher_slice=slice(2, 6), residual=True)
+    x[3, 2] = math.nan
+    mean = policy.distribution(x)[0]
+    assert torch.isfinite(mean).all()
+    assert float(mean[3, 0]) == 0.0
+
+
+@pytest.mark.parametrize("teacher_slice", [None, slice(0, 3), slice(5, 9)])
+def test_a_residual_policy_needs_the_teacher_s_columns(teacher_slice):
+    with pytest.raises(ValueError, match=r"features\.teacher=true"):
+        make(teacher_slice=teacher_slice, residual=True)
+
+
+def test_the_floor_of_the_deviation():
+    with pytest.raises(ValueError, match=r"policy\.min_std"):
+        make(initial_std=0.1, min_std=0.2)
+    policy = make(min_std=0.2)
+    with torch.no_grad():
+        policy.log_std.copy_(torch.tensor([-5.0, 0.0, -1.0, -5.0]))
+    policy.floor_std()
+    assert policy.log_std.exp().tolist() == pytest.approx([0.2, 1.0, math.exp(-1.0), 0.2])
+
+
+def test_learning_returns_changes_the_statistics_but_no_value(x):
+    policy = make()
+    policy.observation_norm.update(x)
+    before = policy.value(x)
+    for returns in (torch.linspace(-50.0, 300.0, 40)[:, None], torch.linspace(900.0, 1000.0, 400)[:, None]):
+        policy.learn_returns(moments_of(returns))
+        assert torch.allclose(policy.value(x), before, rtol=1e-4, atol=1e-3)  # in parts of returns of 1000 in float32
+    assert float(policy.value_norm.mean) > 800
+    normalised = policy.critic(policy.observation_norm(x)).squeeze(-1)
+    assert torch.allclose(policy.value_norm(before), normalised, atol=1e-4)
+
+
+def test_input_that_is_no_number_does_not_reach_the_action(x):
+    policy = make()
+    policy.observation_norm.update(x)
+    x[0, 1], x[1, 2] = math.nan, math.inf
+    step = policy.act(x, torch.Generator().manual_seed(0))
+    assert all(torch.isfinite(tensor).all() for tensor in step)
+
+
+def test_everything_random_comes_from_the_generator(x):
+    torch.manual_seed(1)
+    state = torch.get_rng_state()
+    policy, same, other = make(seed=4), make(seed=4), make(seed=5)
+    policy.act(x, torch.Generator().manual_seed(0))
+    assert torch.equal(torch.get_rng_state(), state)
+    assert all(torch.equal(a, b) for a, b in zip(policy.state_dict().values(), same.state_dict().values(), strict=True))
+    assert not torch.equal(policy.actor[0].weight, other.actor[0].weight)
+
+
+def test_the_state_dict_is_the_whole_policy(x):
+    policy, other = make(seed=4), make(seed=5)
+    policy.observation_norm.update(x)
+    policy.learn_returns(moments_of(torch.arange(9.0)[:, None]))
+    other.load_state_dict(policy.state_dict())
+    assert torch.equal(other.distribution(x)[0], policy.distribution(x)[0])
+    assert torch.equal(other.value(x), policy.value(x))
+
+
+@pytest.mark.parametrize("activation", ["elu", "tanh", "relu"])
+def test_networks_have_the_widths_and_activations_asked_for(activation):
+    net = mlp((5, 8, 3, 2), activation, torch.Generator().manual_seed(0), out_gain=0.5)
+    linears = [layer for layer in net if isinstance(layer, nn.Linear)]
+    assert [tuple(layer.weight.shape) for layer in linears] == [(8, 5), (3, 8), (2, 3)]
+    assert [type(layer).__name__.lower() for layer in net if not isinstance(layer, nn.Linear)] == [activation] * 2
+    first, last = linears[0].weight, linears[-1].weight
+    assert torch.allclose(first.T @ first, 2.0 * torch.eye(5), atol=FLOAT32)
+    assert torch.allclose(last @ last.T, 0.25 * torch.eye(2), atol=FLOAT32)
+    assert all(torch.equal(layer.bias, torch.zeros_like(layer.bias)) for layer in linears)
+    with pytest.raises(ValueError, match="at least"):
+        mlp((5,), activation, torch.Generator())
