@@ -192,7 +192,7 @@ class Ppo:
         return Batch(
             normalised=self._normalise(rollout.flat("x")),
             prior=flat_valid.new_empty(len(flat_valid), 0) if prior is None else prior,
-            advantage=_standardised(advantage, valid).flatten(),
+            advantage=_standardised(advantage, valid, self._gathered(moments_of(advantage[valid][:, None]))).flatten(),
             target=norm(returns.flatten()),
             value=norm(value.flatten()),
             valid=flat_valid.float(),
@@ -295,12 +295,10 @@ def _valid(rollout: Rollout) -> torch.Tensor:
     return torch.isfinite(total)
 
 
-def _standardised(advantage: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
-    """Mean 0, deviation 1 over the valid samples; the others become 0."""
-    kept = advantage[valid]
-    std = kept.std(correction=0) if len(kept) else advantage.new_tensor(1.0)
-    mean = kept.mean() if len(kept) else advantage.new_tensor(0.0)
-    return torch.where(valid, (advantage - mean) / (std + 1e-8), 0.0)
+def _standardised(advantage: torch.Tensor, valid: torch.Tensor, moments: Moments) -> torch.Tensor:
+    """Mean 0, deviation 1 by the moments of the valid samples (of all processes); the others become 0."""
+    std = (moments.m2 / moments.count.clamp(min=1.0)).sqrt()
+    return torch.where(valid, (advantage - moments.mean.float()) / (std.float() + 1e-8), 0.0)
 
 
 def _explained_variance(value: torch.Tensor, returns: torch.Tensor) -> float:
