@@ -200,6 +200,11 @@ class Sim:
         """Put the rows whose episode has ended to sleep; they cost nothing until their next reset."""
         episode.sleep_ended(self.s.clock, self.s.referee)
 
+    def sleep(self) -> None:
+        """Put every row to sleep, as in a new simulator."""
+        self.s.clock.active.fill(0)
+        self.s.clock.awake.fill(0)
+
     def _move(self) -> None:
         c, s = self.config, self.s
         with self._stage("dynamics"):

@@ -67,6 +67,11 @@ class Recent:
             "rollout/episodes": self._episodes(self.rows[-1]),
         }
 
+    @property
+    def episodes(self) -> float:
+        """Episodes that the figures are the mean of."""
+        return sum(self._episodes(row) for row in self.rows)
+
     @staticmethod
     def _episodes(row: list[float]) -> float:
         return sum(row[2:])
