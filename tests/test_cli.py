@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -213,17 +214,21 @@ def test_a_run_folder_that_cannot_be_written_is_exit_1(tmp_path, place):
     assert "Traceback" not in done.stderr
 
 
+def _parts_with_messages(folder: Path) -> list[Path]:
+    """Unfinished logs that have been flushed once at least: header and attachments alone are smaller."""
+    return [part for part in (folder / "logs").glob("*.part") if part.exists() and part.stat().st_size > 50_000]
+
+
 def test_interrupt_leaves_a_marked_run_and_repairable_logs(evaluation, tmp_path):
     """The same sizes and rules as ``evaluation``, whose kernels are compiled by now: a compiling process does not listen."""
     folder = tmp_path / "run"
     process = subprocess.Popen(
         [sys.executable, "-m", "uuvtai", "eval", "--controller", "bt", "--episodes", "400", "--seeds", "3", "--num-envs", "4",
-         "--set", "episode.horizon_steps=400", "--record", "1", "--run-dir", str(folder), "--device", "cpu"],
+         "--set", "episode.horizon_steps=400", "--record", "400", "--run-dir", str(folder), "--device", "cpu"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
-    part = folder / "logs" / "bt_seed3_episode0.mcap.part"
     deadline = time.monotonic() + 600
-    while not (part.exists() and part.stat().st_size > 50_000) and process.poll() is None and time.monotonic() < deadline:
+    while not _parts_with_messages(folder) and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=240)
@@ -231,6 +236,7 @@ def test_interrupt_leaves_a_marked_run_and_repairable_logs(evaluation, tmp_path)
     assert "interrupted" in err
     assert "Traceback" not in err
     assert json.loads((folder / "run.json").read_text())["status"] == "interrupted"
+    part = _parts_with_messages(folder)[0]
     done = subprocess.run([sys.executable, "-m", "uuvtai", "log", "repair", str(part)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "messages recovered" in done.stdout
