@@ -43,7 +43,7 @@ def poison(env):
     for view in memory.views(memory.read(), scratch=True).values():
         view[...] = NO_NUMBER[view.dtype.kind]
     env.sim.fallback.overlay[:] = np.nan
-    for tensor in (env._obs, env._return, env.sim.reward, env.sim.action, *env._info.values()):
+    for tensor in (env._obs, env.sim.reward, env.sim.action, *env._info.values()):
         tensor.fill_(77)
 
 

@@ -91,6 +91,14 @@ def test_an_episode_that_ends_is_followed_by_its_rows_next_one_in_the_same_step(
     assert info["episode_steps"][row] == 1
 
 
+def test_the_rewards_terms_add_up_to_it(env):
+    env.reset(seed=SEED)
+    _obs, reward, _terminated, _truncated, info = env.step(full([0.5, 0.0, 0.0, 0.1]))
+    assert info["reward_terms"].shape == (N, len(env.reward_terms))
+    assert torch.allclose(info["reward_terms"].sum(dim=1), reward, atol=RETURN_ROUNDING)
+    assert info["reward_terms"][:, env.reward_terms.index("progress")].any()
+
+
 def test_the_horizon_truncates(env):
     env.reset(seed=SEED)
     near_horizon(env, [2, 5], steps_left=2)
@@ -195,6 +203,39 @@ def test_table_covers_every_column_once(env):
     assert len({row.name for row in table}) == len(table)
     assert {row.unit for row in table} <= {"m", "m/s", "rad", "rad/s", "s", "1"}
     assert all(row.frame and row.meaning for row in table)
+
+
+def test_reward_terms_are_the_reward_and_sum_up_over_the_episode(env):
+    """Each term is told with its sign and weight, by step and by episode; a new episode begins at zero."""
+    _obs, info = env.reset(seed=SEED)
+    assert not info["reward_terms"].any() and not info["episode_terms"].any()
+    near_horizon(env, [3], steps_left=4)
+    total = torch.zeros(N, len(env.reward_terms))
+    for step in range(1, 7):
+        _obs, reward, _terminated, truncated, info = env.step(full([0.8, 0.1, 0, 0.2]))
+        terms = info["reward_terms"]
+        torch.testing.assert_close(terms.sum(dim=1), reward)
+        total += terms
+        torch.testing.assert_close(info["episode_terms"], total)
+        torch.testing.assert_close(info["episode_terms"].sum(dim=1), info["episode_return"])
+        assert truncated[3] == (step == 4)
+        total[truncated] = 0
+    named = dict(zip(env.reward_terms, terms.T, strict=True))
+    weights = env.config.reward
+    assert (named["alive"] == weights.alive).all() and (named["effort"] < 0).all() and (named["path_distance"] < 0).all()
+    assert env.outcomes == OUTCOMES and not named["success"].any()
+
+
+def test_leaf_is_the_node_whose_action_is_told(env):
+    """The straight tree has one leaf, which acts in every step; the teacher's acting leaves are actions of the tree."""
+    _obs, info = env.reset(seed=SEED)
+    seen = set()
+    for _ in range(30):
+        *_rest, info = env.step(info["teacher_action"].clone())
+        np.testing.assert_array_equal(info["leaf"], env.sim.s.teacher.leaf.to_numpy())
+        seen |= set(info["leaf"].tolist())
+    actions = {i for i, kind in enumerate(env.sim.tree.types) if kind in ("BackOff", "Hold", "Evade", "Unstick", "FollowRoute")}
+    assert seen <= actions and "FollowRoute" in {env.node_names[i] for i in seen}
 
 
 def test_gradients_do_not_leak_into_the_simulator(env):

@@ -18,12 +18,17 @@ import torch
 from uuvtai.capture import check_arrays, check_setting
 from uuvtai.config import Config
 from uuvtai.kernels.features import placed_columns
+from uuvtai.kernels.outcome import OUTCOMES
+from uuvtai.kernels.reward import TERMS
 from uuvtai.sim import Sim
 
 NUM_ACTIONS = 4
 """surge, sway, heave, yaw rate"""
 
 _MAX_SEED = 2**31 - 1
+
+_TOLD = ("reward_terms", "episode_terms", "episode_return", "episode_steps", "outcome")
+"""What ``Sim.tell_step`` writes, in its order."""
 
 Slice = slice
 
@@ -49,6 +54,11 @@ class VectorEnv:
     ``sim`` may be shared, for example with an evaluation: whoever else has reset it, call ``reset`` before the next ``step``.
     """
 
+    outcomes = OUTCOMES
+    """names of ``info["outcome"]``, by index"""
+    reward_terms = TERMS
+    """names of the columns of ``info["reward_terms"]`` and ``info["episode_terms"]``"""
+
     def __init__(self, sim: Sim, seed: int = 0, check_actions: bool | None = None) -> None:
         """``check_actions``: refuse actions that are not finite (default: on the CPU; a GPU would wait). Unchecked, NaN = stop."""
         self.sim, self.num_envs, self.device = sim, sim.num_envs, sim.device
@@ -64,7 +74,6 @@ class VectorEnv:
         self._seed = torch.full_like(self._first_number, checked_seed(seed))
         self._number = self._first_number.clone()
         self._terminated, self._truncated = (torch.zeros(self.num_envs, dtype=torch.bool, device=self.device) for _ in range(2))
-        self._return = torch.zeros(self.num_envs, device=self.device)
         self._info = {
             "teacher_action": sim.action,
             "leaf": torch.full_like(self._number, -1),
@@ -72,7 +81,9 @@ class VectorEnv:
             "episode": self._number,
             "final_obs": torch.zeros_like(self._obs),
             "outcome": torch.zeros_like(self._number),
-            "episode_return": torch.zeros_like(self._return),
+            "reward_terms": torch.zeros(self.num_envs, len(TERMS), device=self.device),
+            "episode_terms": torch.zeros(self.num_envs, len(TERMS), device=self.device),
+            "episode_return": torch.zeros(self.num_envs, device=self.device),
             "episode_steps": torch.zeros_like(self._number),
         }
         self._begun = self._closed = False
@@ -98,6 +109,8 @@ class VectorEnv:
         self._begun = True
         for name in ("outcome", "episode_return", "episode_steps"):
             self._info[name].masked_fill_(rows, 0)
+        for name in ("reward_terms", "episode_terms"):
+            self._info[name].masked_fill_(rows[:, None], 0)
         torch.where(rows[:, None], self._obs, self._info["final_obs"], out=self._info["final_obs"])
         return self._obs, dict(self._info)
 
@@ -108,8 +121,9 @@ class VectorEnv:
         already begun their next episode: obs, ``info["teacher_action"]`` (what the behaviour tree would do now), ``info["leaf"]`` (which of
         its nodes says so, an index into ``node_names``, -1 = none), ``info["seed"]`` and ``info["episode"]`` belong to it. To the step
         itself belong reward and ``info["final_obs"]`` (the observation the step led to, of every env: the next state to bootstrap from),
-        ``info["outcome"]`` (index into ``kernels.outcome.OUTCOMES``), ``info["episode_return"]`` and ``info["episode_steps"]`` (of the
-        episode so far, whole where it ended).
+        ``info["outcome"]`` (index into ``outcomes``), ``info["reward_terms"]`` (num_envs, number of terms: what each weighted term of
+        ``reward_terms`` adds to the reward), and ``info["episode_terms"]`` (their sums), ``info["episode_return"]`` and
+        ``info["episode_steps"]`` of the episode so far, whole where it ended.
         """
         self._require_open()
         if not self._begun:
@@ -119,10 +133,7 @@ class VectorEnv:
         sim.observation = self._obs
         sim.step(action.detach())
         info["final_obs"].copy_(self._obs)
-        sim.read_into(sim.s.referee.outcome, info["outcome"])
-        sim.read_into(sim.s.clock.step, info["episode_steps"])
-        self._return += sim.reward
-        info["episode_return"].copy_(self._return)
+        sim.tell_step(*(info[name] for name in _TOLD))
         torch.ne(sim.terminated, 0, out=self._terminated)
         torch.ne(sim.truncated, 0, out=self._truncated)
         ended = self._terminated | self._truncated
@@ -169,7 +180,7 @@ class VectorEnv:
 
     def _carried(self) -> dict[str, torch.Tensor]:
         """Every tensor that is carried from step to step, or was returned by the last one."""
-        own = {"obs": self._obs, "return": self._return, "terminated": self._terminated, "truncated": self._truncated}
+        own = {"obs": self._obs, "terminated": self._terminated, "truncated": self._truncated}
         return own | self._info | {"reward": self.sim.reward}
 
     def _setting(self) -> str:
@@ -195,7 +206,6 @@ class VectorEnv:
         self.close()
 
     def _begin(self, rows: torch.Tensor) -> None:
-        self._return.masked_fill_(rows, 0.0)
         self.sim.reset(rows.to(torch.int32), self._seed, self._number)
 
     def _require_open(self) -> None:

@@ -385,6 +385,18 @@ class Sim:
         """Copy a whole field into ``out`` on the device, without a wait or a copy through the host."""
         copy_rows(field, self._every_row, out)
 
+    def tell_step(
+        self,
+        terms: torch.Tensor,
+        episode_terms: torch.Tensor,
+        episode_return: torch.Tensor,
+        episode_steps: torch.Tensor,
+        outcome: torch.Tensor,
+    ) -> None:
+        """Write how the step went into the caller's tensors: float32 (n_env, n_term) twice, float32 (n_env,), int32 (n_env,) twice."""
+        s = self.s
+        reward.tell_step(terms, episode_terms, episode_return, episode_steps, outcome, s.reward, s.referee, s.clock)
+
     def memory(self) -> Memory:
         """Where every array lies, when all kernels are done: for a capture."""
         anchor, address = self.s.clock.active, torch.zeros(1, dtype=torch.int64, device=self.device)

@@ -171,3 +171,24 @@ def compute_reward(
             outcome = referee.outcome[env]
             terminated[env] = ti.cast(outcome == SUCCESS, ti.i32) | is_failure(outcome)
             truncated[env] = ti.cast(outcome == TIMEOUT, ti.i32)
+
+
+@ti.kernel
+def tell_step(
+    terms: ti.types.ndarray(dtype=ti.f32, ndim=2),  # type: ignore[valid-type]
+    episode_terms: ti.types.ndarray(dtype=ti.f32, ndim=2),  # type: ignore[valid-type]
+    episode_return: ti.types.ndarray(dtype=ti.f32, ndim=1),  # type: ignore[valid-type]
+    episode_steps: ti.types.ndarray(dtype=ti.i32, ndim=1),  # type: ignore[valid-type]
+    outcome: ti.types.ndarray(dtype=ti.i32, ndim=1),  # type: ignore[valid-type]
+    reward: In[RewardState],
+    referee: In[RefereeState],
+    clock: In[ClockState],
+):
+    """How the step and the episode so far went, for whoever learns from it: weighted terms, their sums, return, steps and outcome."""
+    for env in range(ti.static(clock.awake.shape[0])):
+        for i in ti.static(range(N_TERM)):
+            terms[env, i] = ti.cast(reward.term[env, i], ti.f32)
+            episode_terms[env, i] = ti.cast(reward.episode_sum[env, i], ti.f32)
+        episode_return[env] = ti.cast(reward.episode_return[env], ti.f32)
+        episode_steps[env] = clock.step[env]
+        outcome[env] = referee.outcome[env]
