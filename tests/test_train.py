@@ -1,14 +1,20 @@
 """The trainer: learns, goes on bit for bit from its state, neither spreads nor hides what is not finite, and is one with two processes."""
 
+import hashlib
 import math
+import multiprocessing
 from pathlib import Path
 
 import pytest
 import torch
 
+from tests.conftest import SmallSim
 from tests.point_env import PointEnv
 from tests.test_distributed import two
+from uuvtai.config import Config
 from uuvtai.config.learning import LearningConfig
+from uuvtai.env import VectorEnv
+from uuvtai.learn.checkpoint import open_checkpoint, save
 from uuvtai.learn.distributed import Processes
 from uuvtai.learn.guard import TrainingError
 from uuvtai.learn.packing import pack
@@ -214,3 +220,49 @@ def test_two_processes_train_one_policy_the_same_as_one_process_with_all_envs():
 
 
 # ------------------------------------------------------------------------------------------------------------- the simulator
+
+
+def real_config(sim_config):
+    return LearningConfig.model_validate(
+        sim_config.model_dump(mode="json") | config_of(ppo={"rollout_steps": 8}).model_dump(mode="json", include=LEARNING)
+    )
+
+
+LEARNING = LearningConfig.model_fields.keys() - Config.model_fields.keys()
+
+
+def go_on(checkpoints, answers):
+    """In a fresh process: two more iterations from the newest checkpoint, told as metrics and packed state."""
+    torch.set_num_threads(1)
+    small = SmallSim()
+    trainer = Trainer(VectorEnv(small.sim), real_config(small.config))
+    trainer.load_state(open_checkpoint(checkpoints / "step_000002").state(like=trainer.state()))
+    metrics = [told(trainer.iterate()) for _ in range(2)]
+    answers.put((metrics, packed_bytes(trainer.state())))
+
+
+def packed_bytes(state):
+    plain, tensors = pack(state)
+    return plain, {name: hashlib.sha256(tensor.numpy().tobytes()).hexdigest() for name, tensor in tensors.items()}
+
+
+def test_the_simulators_run_goes_on_bit_for_bit_in_a_fresh_process(small, tmp_path):
+    config, threads = real_config(small.config), torch.get_num_threads()
+    torch.set_num_threads(1)
+    env = VectorEnv(small.sim)
+    trainer = Trainer(env, config)
+    for _ in range(2):
+        trainer.iterate()
+    save(tmp_path, 2, trainer.state(), config, env.observation_table)
+    expected = [told(trainer.iterate()) for _ in range(2)]
+    whole = packed_bytes(trainer.state())
+    env.close()
+    torch.set_num_threads(threads)
+    context = multiprocessing.get_context("spawn")
+    answers = context.Queue()
+    child = context.Process(target=go_on, args=(tmp_path, answers))
+    child.start()
+    metrics, resumed = answers.get(timeout=300)
+    child.join(timeout=60)
+    assert metrics == expected
+    assert resumed == whole
