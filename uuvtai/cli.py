@@ -53,8 +53,16 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document an
 
 @app.command("eval")
 def evaluate(
+    runs: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[RUN]...", help="Trained policies: run folders, checkpoint folders or shipped names (best)."),
+    ] = None,
     controller: Annotated[
-        list[str] | None, typer.Option("--controller", help="straight, planner, bt or a tree's XML (repeatable) \\[default: all three].")
+        list[str] | None,
+        typer.Option(
+            "--controller",
+            help="straight, planner, bt or a tree's XML (repeatable); none = policies alone \\[default: all three, beside a RUN bt].",
+        ),
     ] = None,
     world: World = "pool",
     sensors: Sensors = None,
@@ -80,7 +88,7 @@ def evaluate(
     run_dir: RunDir = None,
     as_json: AsJson = False,
 ) -> None:
-    """Play the same episodes with every controller and print the table of methods."""
+    """Play the same episodes with every controller and trained policy and print the table of methods."""
     seed_list = _seeds(seeds)
     _at_least("--episodes", episodes, 1)
     _at_least("--record", record, 0)
@@ -88,10 +96,8 @@ def evaluate(
         _at_least("--explain-record", explain_record, 0)
         if not explain:
             raise UsageError("--explain-record: give --explain too, it says which episodes to record")
-    config = _config(world, sensors, vehicle, n_static, n_dynamic, speed, overrides)
-    names = [name for item in controller or ["straight", "planner", "bt"] for name in item.split(",") if name]
-    if not names:
-        raise UsageError("--controller: name at least one of straight, planner, bt or a tree's XML")
+    policies = runs or []
+    config = _config(world, sensors, vehicle, n_static, n_dynamic, speed, overrides, _policy_features(policies))
 
     from uuvtai.loader import sensors_of
     from uuvtai.measure.compare import Request, compare
@@ -100,7 +106,8 @@ def evaluate(
         config=config,
         world=world,
         sensors=sensors_of(world, sensors),
-        controllers=names,
+        controllers=_controllers(controller, bool(policies)),
+        policies=tuple(policies),
         seeds=seed_list,
         episodes=episodes,
         num_envs=num_envs,
@@ -113,14 +120,38 @@ def evaluate(
         run_dir=run_dir,
     )
     result, folder = compare(request, _Progress())
+    _print_evaluation(result, folder, as_json)
+
+
+def _controllers(given: list[str] | None, has_policies: bool) -> list[str]:
+    """Names typed with --controller; without any all three, or the tree alone beside a policy."""
+    default = ["bt"] if has_policies else ["straight", "planner", "bt"]
+    names = [name for item in given or default for name in item.split(",") if name]
+    if has_policies and names == ["none"]:
+        return []
+    if not names:
+        raise UsageError("--controller: name at least one of straight, planner, bt or a tree's XML")
+    return names
+
+
+def _policy_features(policies: list[str]) -> list[tuple[str, Any]]:
+    """Settings of the observation that the policies were trained with."""
+    if not policies:
+        return []
+    from uuvtai.measure.methods import features_of
+
+    return features_of(policies)
+
+
+def _print_evaluation(result: dict[str, Any], folder: Path, as_json: bool) -> None:
     if as_json:
         _print_json(result)
-    else:
-        _print_methods(result)
-        if explain:
-            _print_causes(result)
-            _say(f"facts of every failure, and which of them are recorded: {folder / 'eval/explain.json'}")
-        _say(f"run folder: {folder}")
+        return
+    _print_methods(result)
+    if any("causes" in method for method in result["methods"]):
+        _print_causes(result)
+        _say(f"facts of every failure, and which of them are recorded: {folder / 'eval/explain.json'}")
+    _say(f"run folder: {folder}")
 
 
 def _print_methods(result: dict[str, Any]) -> None:
@@ -202,6 +233,133 @@ def _rate(k: int, n: int, interval: list[float] | None) -> str:
 
 def _number(value: float | None, digits: int = 1) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
+
+
+# ------------------------------------------------------------------------------------------------------------------- train
+
+
+@app.command("train")
+def train_policy(
+    preset: Annotated[str | None, typer.Argument(help="Training preset or path of a YAML file \\[default: best].")] = None,
+    resume: Annotated[Path | None, typer.Option("--resume", help="Run folder to go on with, with its own config.")] = None,
+    iterations: Annotated[
+        int | None,
+        typer.Option("--iterations", help="Stop when so many are done in all; schedules run over train.iterations in any case."),
+    ] = None,
+    num_envs: Annotated[int | None, typer.Option("--num-envs", help="Envs stepped together (train.num_envs).")] = None,
+    seed: Annotated[int | None, typer.Option("--seed", help="Seed of networks, exploration and scenarios (train.seed).")] = None,
+    world: Annotated[str | None, typer.Option("--world", help="World preset or path \\[default: the training preset's].")] = None,
+    sensors: Annotated[str | None, typer.Option("--sensors", help="Sensor preset or path \\[default: the training preset's].")] = None,
+    n_static: Static = None,
+    n_dynamic: Dynamic = None,
+    speed: Speed = None,
+    device: Device = "auto",
+    overrides: Set = None,
+    run_dir: RunDir = None,
+    as_json: AsJson = False,
+) -> None:
+    """Train a policy into a run folder, or go on with one. Ctrl-C saves; --resume goes on."""
+    from uuvtai.loader import load_training
+    from uuvtai.measure.training import TrainRequest, train
+
+    if resume is None:
+        sizes = [(f"train.{key}", value) for key, value in (("num_envs", num_envs), ("seed", seed)) if value is not None]
+        chosen = preset or "best"
+        typed = [*sizes, *_scene_flags(n_static, n_dynamic, speed), *(overrides or [])]
+        config = load_training(chosen, typed, world, sensors)
+        request = TrainRequest(config=config, preset=chosen, iterations=iterations, device=device, run_dir=run_dir)
+    else:
+        given = {"PRESET": preset, "--num-envs": num_envs, "--seed": seed, "--world": world, "--sensors": sensors}
+        given |= {"-S": n_static, "-D": n_dynamic, "-v": speed, "--run-dir": run_dir}
+        _refuse_beside_resume(given)
+        request = TrainRequest(resume=resume, overrides=list(overrides or []), iterations=iterations, device=device)
+    result, _folder = train(request, _Training())
+    if as_json:
+        _print_json(result)
+
+
+def _refuse_beside_resume(given: dict[str, Any]) -> None:
+    for option, value in given.items():
+        if value is not None:
+            raise UsageError(f"{option} {value}: a resumed run keeps its own; leave it out, or begin a new run without --resume")
+
+
+class _Training:
+    """Live dashboard on a terminal, one plain line every few seconds otherwise."""
+
+    _PERIOD_S = 5.0
+
+    def __init__(self) -> None:
+        self._live = None
+        self._last = 0.0
+        self._evaluated: dict[str, float] = {}
+        """newest figures of an evaluation"""
+
+    def start(self, folder: Path, config: Any, done: int, total: int) -> None:
+        """``done`` of ``total`` iterations are over as the run begins in ``folder``."""
+        import time
+
+        _say(f"run folder: {folder}")
+        self._folder, self._done, self._total, self._begun = folder, done, total, time.perf_counter()
+        world = config.world
+        self._title = f"{config.train.num_envs} envs, S = {world.n_static}, D = {world.n_dynamic}, v = {world.dynamic_speed_m_s} m/s"
+        if sys.stderr.isatty():
+            from rich.live import Live
+
+            self._live = Live(console=Console(stderr=True), refresh_per_second=4, transient=False)
+            self._live.start()
+
+    def note(self, text: str) -> None:
+        """A message for the person who waits."""
+        if self._live is not None:
+            self._live.console.print(text, highlight=False, markup=False)
+        else:
+            _say(text)
+
+    def update(self, done: int, metrics: dict[str, float], success_ci95: tuple[float, float] | None) -> None:
+        """Iteration ``done`` is over."""
+        import time
+
+        now = time.perf_counter()
+        eta_s = (now - self._begun) / max(1, done - self._done) * (self._total - done)
+        self._evaluated |= {name: value for name, value in metrics.items() if name.startswith("eval/")}
+        rows = _training_rows(self._evaluated | metrics, success_ci95, eta_s)
+        if self._live is not None:
+            table = Table(
+                title=f"{self._folder}: iteration {done} of {self._total}, {self._title}", title_justify="left", show_header=False
+            )
+            for name, text in rows.items():
+                table.add_row(name, text)
+            self._live.update(table)
+        elif now - self._last >= self._PERIOD_S or done == self._total:
+            self._last = now
+            _say(f"{done}/{self._total}: " + ", ".join(f"{name} {text}" for name, text in rows.items()))
+
+    def stop(self) -> None:
+        """The run is over."""
+        if self._live is not None:
+            self._live.stop()
+            self._live = None
+
+
+def _training_rows(metrics: dict[str, float], success_ci95: tuple[float, float] | None, eta_s: float) -> dict[str, str]:
+    """What the dashboard shows: name -> text."""
+    of = metrics.get
+    interval = f" [{100 * success_ci95[0]:.0f}, {100 * success_ci95[1]:.0f}]" if success_ci95 else ""
+    times = {name: of(f"time/{name}_s", 0.0) for name in ("simulate", "infer", "learn")}
+    split = " / ".join(f"{name} {100 * spent / max(1e-9, sum(times.values())):.0f} %" for name, spent in times.items())
+    rows = {
+        "reward": _number(of("rollout/ep_rew_mean"), 2),
+        "success": _percent(of("rollout/success_rate")) + interval,
+        "collision": _percent(of("rollout/collision_rate")),
+        "env-steps/s": f"{of('time/env_steps_per_s', 0.0):,.0f} ({split})",
+        "env-steps": f"{of('time/env_steps', 0.0):,.0f}",
+        "lambda": _number(of("distill/lambda_risk"), 3),
+        "ETA": f"{eta_s:.0f} s",
+    }
+    if "eval/success_rate" in metrics:
+        rows["evaluation"] = f"success {_percent(of('eval/success_rate'))}, collision {_percent(of('eval/collision_rate'))}"
+    return rows
 
 
 # ---------------------------------------------------------------------------------------------------------------- simulate
@@ -326,7 +484,7 @@ def _print_profile(result: dict[str, Any]) -> None:
 @app.command()
 def presets(
     action: Annotated[str | None, typer.Argument(help="'show' to print one preset, resolved.")] = None,
-    name: Annotated[str | None, typer.Argument(help="Preset to show.")] = None,
+    name: Annotated[str | None, typer.Argument(help="Preset to show; KIND/NAME where two kinds have one of that name.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """List the shipped presets, or show one with every key."""
@@ -338,21 +496,46 @@ def presets(
             _print_json(found)
             return
         for kind, names in found.items():
-            _stdout().print(f"[bold]{kind}[/bold]  {', '.join(names)}")
+            _stdout().print(f"[bold]{kind}[/bold]  {', '.join(names) or '-'}")
         return
     if action != "show" or not name:
         raise UsageError("write 'uuv presets' or 'uuv presets show NAME'")
-    kinds = [kind for kind in loader.KINDS if name in loader.preset_names(kind)]
-    if kinds == ["tree"]:
+    kind, name = _preset_kind(name)
+    if kind == "tree":
         typer.echo(loader.preset_path("tree", name).read_text())
         return
-    kind = kinds[0] if kinds else "world"
-    chosen = {"world": "pool", kind: name}
-    config = loader.load_config(chosen["world"], chosen.get("sensors"), chosen.get("vehicle"))
+    config = _shown(kind, name)
     if as_json:
         _print_json(config.model_dump(mode="json"))
     else:
         typer.echo(loader.to_yaml(config))
+
+
+def _preset_kind(name: str) -> tuple[str, str]:
+    """(kind, name) of 'NAME' or 'KIND/NAME'; a name that no kind has is taken for a world."""
+    from uuvtai import loader
+
+    kind, slash, rest = name.partition("/")
+    if slash and kind in loader.KINDS:
+        return kind, rest
+    kinds = [kind for kind in loader.KINDS if name in loader.preset_names(kind)]
+    for other in kinds[1:]:
+        _say(f"there is another one: uuv presets show {other}/{name}")
+    return (kinds[0] if kinds else "world"), name
+
+
+def _shown(kind: str, name: str) -> Any:
+    """Config that a preset of this kind gives."""
+    from uuvtai import loader
+
+    if kind == "train":
+        return loader.load_training(name)
+    if kind == "policy":
+        from uuvtai.measure.methods import find_policy
+
+        return find_policy(name).config
+    chosen = {"world": "pool", kind: name}
+    return loader.load_config(chosen["world"], chosen.get("sensors"), chosen.get("vehicle"))
 
 
 @app.command()
@@ -468,12 +651,16 @@ def log_picture(
 # ------------------------------------------------------------------------------------------------------- parsing and output
 
 
-def _config(world, sensors, vehicle, n_static, n_dynamic, speed, overrides):
+def _config(world, sensors, vehicle, n_static, n_dynamic, speed, overrides, first=()):
+    """Config of presets, then ``first``, then -S -D -v, then --set."""
     from uuvtai.loader import load_config
 
+    return load_config(world, sensors, vehicle, [*first, *_scene_flags(n_static, n_dynamic, speed), *(overrides or [])])
+
+
+def _scene_flags(n_static: int | None, n_dynamic: int | None, speed: float | None) -> list[tuple[str, Any]]:
     flags = {"n_static": n_static, "n_dynamic": n_dynamic, "dynamic_speed_m_s": speed}
-    typed = [(f"world.{key}", value) for key, value in flags.items() if value is not None]
-    return load_config(world, sensors, vehicle, [*typed, *(overrides or [])])
+    return [(f"world.{key}", value) for key, value in flags.items() if value is not None]
 
 
 def _seeds(text: str) -> list[int]:

@@ -22,7 +22,7 @@ from uuvtai.config import Config
 from uuvtai.config.learning import LearningConfig
 
 PRESET_DIR = Path(__file__).parent / "presets"
-KINDS = {"world": "worlds", "sensors": "sensors", "vehicle": "vehicles", "tree": "trees", "train": "train"}
+KINDS = {"world": "worlds", "sensors": "sensors", "vehicle": "vehicles", "tree": "trees", "train": "train", "policy": "policies"}
 DEFAULT_WORLD, DEFAULT_SENSORS = "pool", "paper"
 _SCENE_KINDS = ("world", "sensors", "vehicle")
 _LEARNING_SECTIONS = LearningConfig.model_fields.keys() - Config.model_fields.keys()
@@ -130,9 +130,10 @@ def _checked(model: type[AnyConfig], tree: dict[str, Any], origin: dict[str, str
         raise ConfigError(f"config: {error}; values are numbers, strings, lists and mappings") from None
 
 
-def load_resolved(path: Path) -> Config:
-    """Config from a run folder's ``config.yaml`` (complete, no presets); of a training run, a LearningConfig."""
+def load_resolved(path: Path, overrides: Overrides | None = None) -> Config:
+    """Config from a run folder's ``config.yaml`` (complete, no presets), then overrides; of a training run, a LearningConfig."""
     layer = _read_yaml(path)
+    layer.merge(_overrides(overrides or {}))
     return _checked(LearningConfig if _LEARNING_SECTIONS & layer.tree.keys() else Config, layer.tree, layer.origin)
 
 
@@ -142,8 +143,11 @@ def to_yaml(config: Config) -> str:
 
 
 def preset_names(kind: str) -> list[str]:
-    """Names of the shipped presets of a kind (``KINDS``)."""
-    return sorted(path.stem for path in (PRESET_DIR / KINDS[kind]).iterdir() if path.suffix in (".yaml", ".xml"))
+    """Names of what is shipped of a kind (``KINDS``)."""
+    folder = PRESET_DIR / KINDS[kind]
+    if kind == "policy":
+        return sorted(path.parent.name for path in folder.glob("*/manifest.json"))
+    return sorted(path.stem for path in folder.iterdir() if path.suffix in (".yaml", ".xml"))
 
 
 def preset_path(kind: str, name: str) -> Path:

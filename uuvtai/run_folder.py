@@ -29,6 +29,8 @@ def default_run_dir(preset: str) -> Path:
 class RunFolder:
     """Creates ``path`` with config.yaml and run.json; ``finish`` records how the run ended."""
 
+    _lock: Any = None
+
     def __init__(self, path: Path, config: Config, seeds: list[int]) -> None:
         """Raises RunFolderError where the folder exists with content or cannot be written."""
         self.path = path
@@ -49,6 +51,37 @@ class RunFolder:
         self.write("config.yaml", to_yaml(config))
         self.write_json("run.json", self._record)
 
+    @classmethod
+    def reopen(cls, path: Path, since: dict[str, Any]) -> RunFolder:
+        """Hold and go on with a run that ended or was killed; ``since`` says from where. Raises RunFolderError."""
+        folder = cls.__new__(cls)
+        folder.path, folder._started = path, time.time()
+        folder.hold()
+        try:
+            folder._record = json.loads((path / "run.json").read_text(encoding="utf-8"))
+            resumed = {"argv": sys.argv, "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"), "versions": versions(), **since}
+            folder._record |= {"status": "running", "resumed": [*folder._record.get("resumed", []), resumed]}
+        except (OSError, ValueError, TypeError, AttributeError) as error:
+            raise RunFolderError(f"{path / 'run.json'}: cannot be read ({error}); give the folder that 'uuv train' printed") from None
+        folder._record.pop("exit", None)
+        folder.write_json("run.json", folder._record)
+        return folder
+
+    def hold(self) -> None:
+        """Keep other processes from writing into the same run until this one ends. Raises RunFolderError where one does."""
+        try:
+            import fcntl
+        except ImportError:  # not on this system: nothing to hold it by
+            return
+        self._guarded("hold it", self._open_lock)
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise RunFolderError(f"{self.path}: another process is training in this folder; wait for it, or stop it") from None
+
+    def _open_lock(self) -> None:
+        self._lock = (self.path / ".lock").open("w")
+
     def write(self, name: str, text: str) -> Path:
         """Write a text file atomically; RunFolderError names the file and the reason."""
         target = self.path / name
@@ -61,7 +94,8 @@ class RunFolder:
 
     def finish(self, status: str, exit_code: int) -> None:
         """Record the end: status 'finished', 'interrupted' or 'failed'."""
-        self._record |= {"status": status, "exit": exit_code, "wall_s": round(time.time() - self._started, 3)}
+        wall_s = self._record.get("wall_s", 0.0) + time.time() - self._started
+        self._record |= {"status": status, "exit": exit_code, "wall_s": round(wall_s, 3)}
         self.write_json("run.json", self._record)
 
     def _guarded(self, what: str, work) -> None:

@@ -1,15 +1,21 @@
-"""Compare controllers on paired scenarios in one run folder: results, logs, pictures, videos."""
+"""Compare controllers and trained policies on paired scenarios in one run folder: results, logs, pictures, videos."""
 
 from __future__ import annotations
 
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from uuvtai.config import Config
 from uuvtai.loader import ConfigError
 from uuvtai.run_folder import RunFolder, default_run_dir
+
+if TYPE_CHECKING:
+    from uuvtai.measure.evaluate import EpisodeResult, Job
+    from uuvtai.measure.methods import Method
+    from uuvtai.measure.recording import EpisodeRecorder, PolicyNote
+    from uuvtai.sim import Sim
 
 _BATCH = 256
 """Episodes played together by default: enough to fill the cores, few enough that the last stragglers cost little."""
@@ -25,6 +31,8 @@ class Request:
     controllers: list[str]
     seeds: list[int]
     episodes: int
+    policies: tuple[str, ...] = ()
+    """run folders, checkpoint folders or shipped names"""
     num_envs: int | None = None
     record: int = 0
     video: bool = False
@@ -44,80 +52,128 @@ class Watch(Protocol):
     def stop(self) -> None: ...
 
 
-def compare(request: Request, watch: Watch) -> tuple[dict[str, Any], Path]:
-    """Play every controller's episodes; the ``uuv eval --json`` document and the run folder.
+@dataclass
+class _Played:
+    """What a method has done."""
 
-    Everything that can be refused is refused before anything is written. Raises ConfigError, ValueError, MemoryError, RunFolderError.
+    method: Method
+    policy: PolicyNote | None
+    results: list[EpisodeResult]
+    use: list[dict[str, Any]]
+    logs: dict[Job, Path]
+
+
+def compare(request: Request, watch: Watch) -> tuple[dict[str, Any], Path]:
+    """Play every method's episodes; the ``uuv eval --json`` document and the run folder.
+
+    Everything that can be refused is refused before anything is written. Raises ConfigError, ValueError, MemoryError, RunFolderError,
+    CheckpointError.
     """
-    from uuvtai.measure.evaluate import EpisodeResult, document, jobs_of, run_episodes, summary, tree_use
+    from uuvtai.measure.evaluate import document, jobs_of
     from uuvtai.sim import Sim
-    from uuvtai.tree import read_tree
 
     if request.num_envs is not None and request.num_envs < 1:
         raise ValueError(f"--num-envs {request.num_envs}: at least 1 env is needed, for example --num-envs 64")
     if len(set(request.seeds)) != len(request.seeds):
         raise ConfigError(f"--seeds {','.join(map(str, request.seeds))}: a seed is given twice; its episodes would be the same")
     jobs = jobs_of(request.seeds, request.episodes)
-    trees = {_label(name): read_tree(name, request.config.teacher.max_node) for name in request.controllers}
+    methods = _methods(request, watch)
     num_envs = request.num_envs or min(len(jobs), _BATCH)
     watch.note(f"starting {num_envs} envs (the first run on a machine compiles its kernels, about a minute)")
-    sim = Sim(request.config, num_envs, next(iter(trees.values())), request.device)
+    sim = Sim(request.config, num_envs, methods[0].tree, request.device)
+    policies = {method.name: method.driver_for(sim) for method in methods}
     folder = RunFolder(request.run_dir or default_run_dir(request.world), request.config, request.seeds)
-    methods, use, logs = [], {}, []
-    played: dict[str, list[EpisodeResult]] = {}
-    status, code, recorder = "failed", 1, None
+    status, code = "failed", 1
+    played: list[_Played] = []
+    entries: list[dict[str, Any]] = []
     try:
-        for label, tree in trees.items():
-            sim.use_tree(tree)
-            recorder = _recorder(request, folder.path, label, jobs)
-            watch.start(label, len(jobs))
-            begun = time.perf_counter()
-            results, env_steps = run_episodes(sim, jobs, recorder, watch.update)
-            methods.append(summary(label, results, env_steps, time.perf_counter() - begun))
-            watch.stop()
-            played[label] = results
-            use[label] = tree_use(sim, results)
-            if recorder:
-                logs.append(recorder.paths)
-        result = document(request.config, request.world, request.sensors, request.seeds, request.episodes, methods)
-        folder.write_json("eval/result.json", result)
-        for label, tree in trees.items():
-            folder.write(f"eval/trees/{label}.xml", Path(tree.source).read_text())
-        folder.write_json("eval/tree.json", {"schema": 1, "use": use})
+        for method in methods:
+            _play(request, sim, method, policies[method.name], jobs, folder, watch, played, entries)
+        result = document(request.config, request.world, request.sensors, request.seeds, request.episodes, entries)
+        _write_results(folder, result, played)
         if request.explain:
-            _explain(request, sim, trees, played, result, folder, watch)
-        _draw(request, folder.path, logs, watch)
+            _explain(request, sim, played, result, folder, watch)
+        _draw(request, folder.path, [p.logs for p in played if p.logs], watch)
         status, code = "finished", 0
     except KeyboardInterrupt:
         status, code = "interrupted", 130
         raise
     finally:
         watch.stop()
-        if recorder:
-            recorder.abort()
         folder.finish(status, code)
     return result, folder.path
 
 
-def _explain(request: Request, sim: Any, trees: dict, played: dict, result: dict[str, Any], folder: RunFolder, watch: Watch) -> None:
+def _methods(request: Request, watch: Watch) -> list[Method]:
+    from uuvtai.measure.methods import differences, policies_of, trees_of
+
+    max_node = request.config.teacher.max_node
+    methods = [*trees_of(request.controllers, max_node), *policies_of(list(request.policies), max_node, watch.note)]
+    names = [method.name for method in methods]
+    if len(set(names)) != len(names):
+        raise ConfigError(f"{', '.join(names)}: a policy and a controller have the same name; rename the run's folder")
+    for method in methods:
+        if told := differences(method, request.config):
+            watch.note(f"note: {told}")
+    return methods
+
+
+def _play(
+    request: Request,
+    sim: Sim,
+    method: Method,
+    policy: PolicyNote | None,
+    jobs: list[Job],
+    folder: RunFolder,
+    watch: Watch,
+    played: list[_Played],
+    entries: list[dict[str, Any]],
+) -> None:
+    """Play one method's episodes and add them to ``played`` and ``entries``."""
+    from uuvtai.measure.evaluate import run_episodes, summary, tree_use
+
+    sim.use_tree(method.tree)
+    recorder = _recorder(request, folder.path, method.name, jobs, policy)
+    watch.start(method.name, len(jobs))
+    begun = time.perf_counter()
+    try:
+        results, env_steps = run_episodes(sim, jobs, recorder, watch.update, policy.pilot if policy else None)
+    finally:
+        watch.stop()
+        if recorder:
+            recorder.abort()
+    entries.append(summary(method.name, results, env_steps, time.perf_counter() - begun) | method.document())
+    played.append(_Played(method, policy, results, tree_use(sim, results), recorder.paths if recorder else {}))
+
+
+def _write_results(folder: RunFolder, result: dict[str, Any], played: list[_Played]) -> None:
+    """The document, and the trees that drove with the use of their nodes."""
+    folder.write_json("eval/result.json", result)
+    driving = [p for p in played if p.policy is None]
+    for p in driving:
+        folder.write(f"eval/trees/{p.method.name}.xml", Path(p.method.tree.source).read_text())
+    folder.write_json("eval/tree.json", {"schema": 1, "use": {p.method.name: p.use for p in driving}})
+
+
+def _explain(request: Request, sim: Sim, played: list[_Played], result: dict[str, Any], folder: RunFolder, watch: Watch) -> None:
     """Replay what failed, add the causes to the document, record the worst. What is known is written before the next long step begins."""
     from uuvtai.measure.explain import chosen_for_recording, explain_failures, failures, record_worst, table_of
 
     explained = {}
-    for method in result["methods"]:
-        label = method["name"]
-        watch.start(f"{label}: replaying failures", len(failures(played[label])))
-        explained[label] = explain_failures(sim, trees[label], played[label], watch.update)
+    for entry, p in zip(result["methods"], played, strict=True):
+        label = entry["name"]
+        watch.start(f"{label}: replaying failures", len(failures(p.results)))
+        explained[label] = explain_failures(sim, p.method.tree, p.results, watch.update, p.policy.pilot if p.policy else None)
         watch.stop()
-        method["causes"] = table_of(explained[label])
-        method["explain"] = [row.document() for row in explained[label]]
+        entry["causes"] = table_of(explained[label])
+        entry["explain"] = [row.document() for row in explained[label]]
     _write_causes(folder, result)
-    for method in result["methods"]:
-        label = method["name"]
+    for entry, p in zip(result["methods"], played, strict=True):
+        label = entry["name"]
         chosen = chosen_for_recording(explained[label], request.explain_record)
-        paths = record_worst(sim, trees[label], chosen, folder.path / "explain", request.world, label, watch.note)
+        paths = record_worst(sim, p.method.tree, chosen, folder.path / "explain", request.world, label, watch.note, p.policy)
         for row, path in zip(chosen, paths, strict=True):
-            method["explain"][explained[label].index(row)]["log"] = str(path.relative_to(folder.path))
+            entry["explain"][explained[label].index(row)]["log"] = str(path.relative_to(folder.path))
     _write_causes(folder, result)
 
 
@@ -127,16 +183,12 @@ def _write_causes(folder: RunFolder, result: dict[str, Any]) -> None:
     folder.write_json("eval/explain.json", {"schema": 1, "methods": methods})
 
 
-def _recorder(request: Request, folder: Path, label: str, jobs: list) -> Any:
+def _recorder(request: Request, folder: Path, label: str, jobs: list[Job], policy: PolicyNote | None) -> EpisodeRecorder | None:
     from uuvtai.measure.recording import EpisodeRecorder
 
     if not request.record:
         return None
-    return EpisodeRecorder(folder / "logs", Path(request.world).stem, label, jobs[: request.record], request.depth_images)
-
-
-def _label(name: str) -> str:
-    return Path(name).stem if name.endswith(".xml") else name
+    return EpisodeRecorder(folder / "logs", Path(request.world).stem, label, jobs[: request.record], request.depth_images, policy)
 
 
 def _draw(request: Request, folder: Path, logs: list[dict[Any, Path]], watch: Watch) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
@@ -15,6 +15,9 @@ from uuvtai.kernels.plan_codes import PLANNERS, REASONS, TRIGGERS
 from uuvtai.measure.statistics import mean, rate, time_to_success_s, wilson_interval
 from uuvtai.sim import Sim
 from uuvtai.tree import node_use
+
+if TYPE_CHECKING:
+    from uuvtai.learn.pilot import Decision
 
 _REFILL_SHARE = 16
 """Ended rows wait until this part of the batch can be reset together, or until nothing runs: fewer reset passes, same results."""
@@ -61,6 +64,20 @@ class Recorder(Protocol):
         """The episode of this row is over."""
 
 
+class Driver(Protocol):
+    """Chooses the actions of all rows from their observations (``learn.pilot.Pilot``)."""
+
+    def reset(self, rows: torch.Tensor) -> None:
+        """New episodes have begun in the rows (n_env,) where this is not 0."""
+
+    def decide(self, obs: torch.Tensor) -> Decision:
+        """What to do now; asking again changes nothing."""
+        ...
+
+    def advance(self) -> None:
+        """What was decided last has been done."""
+
+
 Progress = Callable[[int, int, int], None]
 """Called with (episodes done, episodes in all, env steps done)."""
 
@@ -71,9 +88,11 @@ def jobs_of(seeds: Iterable[int], episodes: int) -> list[Job]:
 
 
 def run_episodes(
-    sim: Sim, jobs: list[Job], recorder: Recorder | None = None, progress: Progress | None = None
+    sim: Sim, jobs: list[Job], recorder: Recorder | None = None, progress: Progress | None = None, driver: Driver | None = None
 ) -> tuple[list[EpisodeResult], int]:
-    """Play every job with the simulator's current tree; results in the order of ``jobs``, and the env steps it took."""
+    """Play every job; results in the order of ``jobs``, and the env steps it took. Without a driver the simulator's tree drives."""
+    observed = sim.observation
+    wheel = _Wheel(sim, driver)
     waiting = list(enumerate(jobs))[::-1]
     playing: dict[int, int] = {}
     results: dict[int, EpisodeResult] = {}
@@ -81,9 +100,9 @@ def run_episodes(
     env_steps = 0
     while waiting or playing:
         if waiting and free and (len(free) * _REFILL_SHARE >= sim.num_envs or not playing):
-            _refill(sim, jobs, waiting, free, playing, recorder)
+            _refill(sim, wheel, jobs, waiting, free, playing, recorder)
         env_steps += len(playing)
-        sim.step()
+        wheel.step()
         if recorder:
             recorder.step(sim)
         outcome = sim.rows(sim.s.referee.outcome)
@@ -98,10 +117,40 @@ def run_episodes(
         sim.sleep_ended()
         if progress:
             progress(len(results), len(jobs), env_steps)
+    sim.observation = observed
     return [results[i] for i in range(len(jobs))], env_steps
 
 
-def _refill(sim: Sim, jobs: list[Job], waiting: list, free: list[int], playing: dict[int, int], recorder: Recorder | None) -> None:
+class _Wheel:
+    """Steps the simulator by a driver, or by its tree where there is none."""
+
+    def __init__(self, sim: Sim, driver: Driver | None) -> None:
+        self._sim, self._driver = sim, driver
+        self._obs = sim.observe() if driver else None
+        self._action: torch.Tensor | None = None
+
+    def step(self) -> None:
+        """One control step, and what to do in the next."""
+        self._sim.step(self._action)
+        if self._driver:
+            self._driver.advance()
+            self._decide(self._driver)
+
+    def reset(self, mask: torch.Tensor, seed: torch.Tensor, number: torch.Tensor) -> None:
+        """Begin episodes as ``Sim.reset`` does."""
+        self._sim.reset(mask, seed, number)
+        if self._driver:
+            self._driver.reset(mask)
+            self._decide(self._driver)
+
+    def _decide(self, driver: Driver) -> None:
+        assert self._obs is not None  # observed since the beginning
+        self._action = driver.decide(self._obs).action
+
+
+def _refill(
+    sim: Sim, wheel: _Wheel, jobs: list[Job], waiting: list, free: list[int], playing: dict[int, int], recorder: Recorder | None
+) -> None:
     mask, seed, number = (torch.zeros(sim.num_envs, dtype=torch.int32) for _ in range(3))
     begun = []
     while waiting and free:
@@ -110,7 +159,7 @@ def _refill(sim: Sim, jobs: list[Job], waiting: list, free: list[int], playing: 
         playing[row] = index
         mask[row], seed[row], number[row] = 1, job.seed, job.episode
         begun.append((row, job))
-    sim.reset(mask.to(sim.device), seed.to(sim.device), number.to(sim.device))
+    wheel.reset(mask.to(sim.device), seed.to(sim.device), number.to(sim.device))
     if recorder:
         for row, job in begun:
             recorder.begin(sim, row, job)

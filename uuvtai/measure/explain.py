@@ -10,19 +10,22 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from uuvtai.config import Config
 from uuvtai.measure import causes, facts
 from uuvtai.measure.causes import Explanation
-from uuvtai.measure.evaluate import EpisodeResult, Job, Progress, run_episodes
+from uuvtai.measure.evaluate import Driver, EpisodeResult, Job, Progress, run_episodes
 from uuvtai.measure.history import Bodies, Diary, History
 from uuvtai.measure.statistics import mean
 from uuvtai.scenario import body_slots
 from uuvtai.sim import Sim
 from uuvtai.tree import FlatTree
+
+if TYPE_CHECKING:
+    from uuvtai.measure.recording import PolicyNote
 
 EXAMPLES = 3
 """Episodes named per label in the table."""
@@ -157,14 +160,19 @@ class Coroner:
         return [self._tree.types[node] if node >= 0 else "" for node in nodes]
 
 
-def explain_failures(sim: Sim, tree: FlatTree, results: list[EpisodeResult], progress: Progress | None = None) -> list[Row]:
-    """Replay the failed episodes of one method and explain them; in the order of ``results``. Raises RuntimeError (see ``Coroner.end``)."""
+def explain_failures(
+    sim: Sim, tree: FlatTree, results: list[EpisodeResult], progress: Progress | None = None, driver: Driver | None = None
+) -> list[Row]:
+    """Replay the failed episodes of one method and explain them; in the order of ``results``. Raises RuntimeError (see ``Coroner.end``).
+
+    Where a ``driver`` drives, the facts about leaves and actions are those of the tree beside it.
+    """
     failed = failures(results)
     if not failed:
         return []
     sim.use_tree(tree)
     coroner = Coroner(sim.config, tree, failed)
-    run_episodes(sim, [Job(r.seed, r.episode) for r in failed], coroner, progress)
+    run_episodes(sim, [Job(r.seed, r.episode) for r in failed], coroner, progress, driver)
     return [Row(r, coroner.found[Job(r.seed, r.episode)]) for r in failed]
 
 
@@ -225,7 +233,14 @@ def chosen_for_recording(rows: list[Row], wanted: int) -> list[Row]:
 
 
 def record_worst(
-    sim: Sim, tree: FlatTree, rows: list[Row], folder: Path, world: str, method: str, note: Callable[[str], None]
+    sim: Sim,
+    tree: FlatTree,
+    rows: list[Row],
+    folder: Path,
+    world: str,
+    method: str,
+    note: Callable[[str], None],
+    policy: PolicyNote | None = None,
 ) -> list[Path]:
     """Play these episodes once more into ``folder``: an MCAP log each, named after the cause, with a picture and a video beside it."""
     from uuvtai.logs.picture import picture
@@ -236,9 +251,9 @@ def record_worst(
         return []
     jobs = [Job(row.result.seed, row.result.episode) for row in rows]
     sim.use_tree(tree)
-    recorder = EpisodeRecorder(folder, Path(world).stem, method, jobs)
+    recorder = EpisodeRecorder(folder, Path(world).stem, method, jobs, policy=policy)
     try:
-        run_episodes(sim, jobs, recorder)
+        run_episodes(sim, jobs, recorder, driver=policy.pilot if policy else None)
     finally:
         recorder.abort()
     paths = [_renamed(recorder.paths[job], row.explanation.label) for job, row in zip(jobs, rows, strict=True)]

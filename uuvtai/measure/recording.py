@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from uuvtai.kernels.grid import grid_origin
 from uuvtai.kernels.outcome import OUTCOMES, RUNNING
 from uuvtai.kernels.plan_codes import PLANNERS, REASONS, TRIGGERS
 from uuvtai.kernels.reward import TERMS
+from uuvtai.learn.pilot import Pilot
 from uuvtai.loader import to_yaml
 from uuvtai.logs.mcap_log import Due, McapEpisodeLog
 from uuvtai.logs.scenario import scenario_document
@@ -44,11 +45,24 @@ _STEP_FIELDS = {
 _MAP_FIELDS = {"grid_map": ("static_occ", "dynamic_occ"), "clearance": ("clearance_m",)}
 
 
+@dataclass(frozen=True)
+class PolicyNote:
+    """What a log says of the policy that drives."""
+
+    pilot: Pilot
+    checkpoint_sha256: str
+    distill_lambda: float | None
+    """weight of the distillation when the checkpoint was written"""
+
+
 class EpisodeRecorder:
     """Writes one MCAP file per recorded job; ``paths`` maps each to its file."""
 
-    def __init__(self, folder: Path, world: str, controller: str, jobs: list[Job], depth_images: bool = False) -> None:
-        self._world, self._controller, self._wanted, self._depth = world, controller, set(jobs), depth_images
+    def __init__(
+        self, folder: Path, world: str, controller: str, jobs: list[Job], depth_images: bool = False, policy: PolicyNote | None = None
+    ) -> None:
+        """``policy``: who drives; None = the simulator's tree."""
+        self._world, self._controller, self._wanted, self._depth, self._policy = world, controller, set(jobs), depth_images, policy
         self._logs: dict[int, McapEpisodeLog] = {}
         self._applied: dict[int, np.ndarray] = {}
         self.paths = {job: folder / f"{controller}_seed{job.seed}_episode{job.episode}.mcap" for job in jobs}
@@ -99,6 +113,7 @@ class EpisodeRecorder:
             reward_terms=TERMS,
             tree_nodes=sim.tree.names,
             git_sha=git_sha() or "unknown",
+            checkpoint_sha256=self._policy.checkpoint_sha256 if self._policy else "",
         )
 
     def _write(self, sim: Sim, rows: list[int]) -> None:
@@ -111,12 +126,26 @@ class EpisodeRecorder:
             snapshot = _snapshot(sim, {name: values[i] for name, values in read.items()}, self._applied[row], layers)
             if row in images:
                 snapshot = _with_image(sim.config, snapshot, images[row], due[row].depth_image)
-            self._logs[row].write(snapshot)
-            self._applied[row] = read["teacher.action"][i]
+            thoughts = _thoughts(self._policy, row) if self._policy else {}
+            self._logs[row].write(replace(snapshot, **thoughts))
+            self._applied[row] = thoughts.get("action_policy", read["teacher.action"][i])
 
     def _due(self, row: int, r: dict[str, Any]) -> Due:
         due = self._logs[row].due(int(r["clock.step"]), _is_fresh(r), int(r["referee.outcome"]) != RUNNING)
         return Due(due.maps, due.depth_image and bool(r["image.fresh"]))
+
+
+def _thoughts(policy: PolicyNote, row: int) -> dict[str, Any]:
+    """What the policy chooses and expects in this row, as a snapshot's fields."""
+    decision = policy.pilot.decision
+    return {
+        "action_policy": decision.action[row].cpu().numpy(),
+        "policy_value": float(decision.value[row]),
+        "policy_std": decision.std.cpu().numpy(),
+        "distill_lambda": policy.distill_lambda,
+        "wm_residual": float(decision.residual[row]) if policy.pilot.world_model else None,
+        "wm_uncertainty": float(decision.uncertainty[row]) if policy.pilot.world_model else None,
+    }
 
 
 def _read(sim: Sim, fields: dict[str, tuple[str, ...]], rows: list[int]) -> dict[str, np.ndarray]:

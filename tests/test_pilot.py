@@ -1,0 +1,203 @@
+"""A policy at the wheel: the same decisions in any batch, memory per row, and checkpoints that do not fit are refused."""
+
+import itertools
+import json
+
+import pytest
+import torch
+
+from uuvtai.env import VectorEnv
+from uuvtai.learn import checkpoint, manifest
+from uuvtai.learn.checkpoint import CheckpointError
+from uuvtai.learn.pilot import CHUNK, Pilot, load_pilot
+from uuvtai.learn.policy import Policy
+from uuvtai.learn.world_model import WorldModel
+from uuvtai.loader import load_training
+from uuvtai.measure.evaluate import jobs_of, run_episodes
+from uuvtai.measure.methods import Method, features_of, find_policy, policies_of
+from uuvtai.measure.recording import EpisodeRecorder
+
+N_OBS = 60
+
+
+def networks(n_obs=N_OBS, seed=0, **config):
+    """A policy and a world model that have seen a batch and act decidedly."""
+    learning = load_training("smoke", [(f"policy.{key}", value) for key, value in config.items()])
+    rng = torch.Generator().manual_seed(seed)
+    policy, model = Policy(n_obs + 2, learning.policy, None, rng), WorldModel(n_obs, learning.world_model, rng)
+    policy.observation_norm.update(3.0 * torch.randn(500, n_obs + 2, generator=rng))
+    model.observation_norm.update(3.0 * torch.randn(500, n_obs, generator=rng))
+    model.change_norm.update(torch.randn(500, 24, generator=rng))
+    with torch.no_grad():
+        policy.actor[-1].weight.mul_(30.0)
+    return policy, model
+
+
+def flown(policy, model, rows, steps=4):
+    """Decisions of a pilot over some steps for the given rows of one fixed stream of observations."""
+    rng = torch.Generator().manual_seed(1)
+    stream = 3.0 * torch.randn(steps, 300, N_OBS, generator=rng)
+    pilot, out = Pilot(policy, model, len(rows)), []
+    for obs in stream:
+        decision = pilot.decide(obs[rows])
+        out.append(torch.cat([decision.action, decision.value[:, None], decision.residual[:, None], decision.uncertainty[:, None]], 1))
+        pilot.advance()
+    return torch.stack(out)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_row_does_not_depend_on_its_batch_to_the_last_bit(threads):
+    policy, model = networks()
+    before = torch.get_num_threads()
+    expected = flown(policy, model, list(range(300)))
+    torch.set_num_threads(threads)
+    try:
+        for rows in ([0], [7, 3], list(range(CHUNK, CHUNK + 50)), list(range(299, 0, -1))):
+            assert torch.equal(flown(policy, model, rows), expected[:, rows])
+    finally:
+        torch.set_num_threads(before)
+    assert expected[:, :, :4].std() > 0.1, "the actions do depend on the observations"
+    assert (expected[0, :, 5:] == 0).all(), "nothing was predicted before the first step"
+    assert (expected[1:, :, 5:] > 0).all()
+
+
+def test_memory_is_reset_by_row_and_deciding_again_changes_nothing():
+    policy, model = networks()
+    pilot = Pilot(policy, model, 3)
+    obs = torch.randn(3, N_OBS, generator=torch.Generator().manual_seed(2))
+    pilot.act(torch.zeros(3, N_OBS))
+    first = pilot.decide(obs)
+    assert all(torch.equal(a, b) for a, b in zip(first, pilot.decide(obs), strict=True))
+    pilot.reset(torch.tensor([0, 1, 0], dtype=torch.int32))
+    again = pilot.decide(obs)
+    assert again.residual[1] == 0.0
+    assert torch.equal(again.action[[0, 2]], first.action[[0, 2]])
+    assert not torch.equal(again.action[1], first.action[1])
+
+
+def test_actions_are_means_within_the_limits_and_nan_does_not_spread():
+    policy, model = networks()
+    pilot = Pilot(policy, model, 2)
+    obs = torch.randn(2, N_OBS)
+    clean = pilot.decide(obs).action
+    obs[1, 5] = float("nan")
+    found = pilot.decide(obs).action
+    assert torch.equal(found[0], clean[0])
+    assert torch.isfinite(found).all()
+    assert (found.abs() <= 1).all()
+    x = torch.cat([obs[:1], torch.zeros(1, 2)], 1)
+    assert torch.allclose(found[0], policy.distribution(x)[0][0].clamp(-1, 1), atol=1e-5)  # other shapes sum in another order
+
+
+# ------------------------------------------------------------------------------------------------------------ in a simulator
+
+
+@pytest.fixture(scope="module")
+def trained(small, tmp_path_factory):
+    """(run folder, config): a run with one checkpoint whose policy fits the session's simulator."""
+    folder = tmp_path_factory.mktemp("runs") / "mine"
+    config = load_training("smoke", {"world.dynamic_capacity": 9})
+    env = VectorEnv(small.sim)
+    policy, model = networks(env.num_obs, seed=3)
+    with torch.no_grad():
+        policy.actor[-1].bias[2] = 3.0  # down or up until something stops it: short episodes
+    state = {"policy": policy.state_dict(), "world_model": model.state_dict(), "env": {}}
+    checkpoint.save(folder / "checkpoints", 5, state, config, env.observation_table, metrics={"distill/lambda": 0.25})
+    return folder, config
+
+
+def pilot_of(folder, small):
+    (method,) = policies_of([str(folder)], 64, print)
+    note = method.driver_for(small.sim)
+    small.sim.use_tree(method.tree)
+    return method, note
+
+
+def test_episodes_do_not_depend_on_order_or_neighbours(small, trained):
+    method, note = pilot_of(trained[0], small)
+    assert method.name == "mine"
+    jobs = jobs_of([21], 10)
+    results, _ = run_episodes(small.sim, jobs, driver=note.pilot)
+    backwards, _ = run_episodes(small.sim, jobs[::-1], driver=load_pilot(method.checkpoint, small.N))
+    alone, _ = run_episodes(small.sim, jobs[4:5], driver=note.pilot)
+    told = [vars(r) | {"ticks": r.ticks.tolist(), "acted": r.acted.tolist()} for r in results]
+    assert [vars(r) | {"ticks": r.ticks.tolist(), "acted": r.acted.tolist()} for r in backwards[::-1]] == told
+    assert vars(alone[0]) | {"ticks": alone[0].ticks.tolist(), "acted": alone[0].acted.tolist()} == told[4]
+    assert not {r.outcome for r in results} & {"success", "timeout"}, "the policy drove, not the tree"
+    assert small.sim.observation is None, "nobody else is made to pay for observations"
+
+
+def test_the_log_tells_what_the_policy_thought(small, trained, tmp_path):
+    from uuvtai.logs.reader import read_head, read_messages
+
+    method, note = pilot_of(trained[0], small)
+    jobs = jobs_of([21], 1)
+    recorder = EpisodeRecorder(tmp_path, "pool", method.name, jobs, policy=note)
+    run_episodes(small.sim, jobs, recorder, driver=note.pilot)
+    log = recorder.paths[jobs[0]]
+    run = read_head(log).metadata["uuv.run"]
+    assert (run["controller"], run["checkpoint_sha256"]) == ("mine", method.checkpoint.sha256)
+    messages = list(read_messages(log, ("/policy", "/action")))
+    thoughts = [m.data for m in messages if m.topic == "/policy"]
+    actions = [m.data for m in messages if m.topic == "/action"]
+    assert all(t["lambda"] == 0.25 and len(t["std"]) == 4 for t in thoughts)
+    assert thoughts[0]["wm_residual"] == 0.0
+    assert all(t["wm_residual"] > 0 and t["wm_uncertainty"] > 0 for t in thoughts[1:])
+    assert {"alive", "progress", "success"} <= set(thoughts[0])
+    assert all(b["applied"] == a["policy"] for a, b in itertools.pairwise(actions)), "what it chose is what was done next"
+    assert any(a["policy"] != a["teacher"] for a in actions)
+
+
+def test_another_observation_is_refused_before_driving(small, trained):
+    method, _ = pilot_of(trained[0], small)
+    changed = method.checkpoint.manifest.model_copy(update={"observation_table": method.checkpoint.manifest.observation_table[:-1]})
+    other = checkpoint.Checkpoint(method.checkpoint.path, changed, method.checkpoint.config, "")
+    with pytest.raises(CheckpointError, match="another observation table"):
+        Method("other", method.tree, other).driver_for(small.sim)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda state: state.pop("world_model"), "its networks are not those of its config"),
+        (lambda state: state["policy"].pop("log_std"), "its networks are not those of its config"),
+        (lambda state: state["policy"].update(log_std=torch.zeros(3)), "its networks are not those of its config"),
+        (lambda state: state["policy"].update(log_std=torch.full((4,), float("nan"))), "log_std is not finite"),
+    ],
+)
+def test_networks_that_cannot_drive_are_refused(small, trained, tmp_path, change, says):
+    env = VectorEnv(small.sim)
+    policy, model = networks(env.num_obs)
+    state = {"policy": policy.state_dict(), "world_model": model.state_dict(), "env": {}}
+    change(state)
+    path = checkpoint.save(tmp_path / "checkpoints", 1, state, trained[1], env.observation_table)
+    with pytest.raises(CheckpointError, match=says):
+        load_pilot(checkpoint.open_checkpoint(path), 4)
+
+
+# -------------------------------------------------------------------------------------------------------------------- names
+
+
+def test_a_policy_is_found_by_run_and_by_checkpoint(trained):
+    folder, config = trained
+    by_run, by_step = find_policy(str(folder)), find_policy(str(folder / "checkpoints" / "step_000005"))
+    assert by_run.sha256 == by_step.sha256 == manifest.sha256_of(folder / "checkpoints" / "step_000005" / "manifest.json")
+    assert policies_of([str(folder / "checkpoints" / "step_000005")], 64, print)[0].name == "mine-step_000005"
+    assert features_of([str(folder)]) == [("features", config.features.model_dump(mode="json"))]
+
+
+def test_names_that_are_no_policy(trained, tmp_path):
+    with pytest.raises(ValueError, match="is no trained policy"):
+        find_policy(str(tmp_path))
+    with pytest.raises(ValueError, match="given twice"):
+        policies_of([str(trained[0])] * 2, 64, print)
+
+
+def test_policies_with_other_columns_are_not_evaluated_together(trained, tmp_path):
+    folder, config = trained
+    wider = config.model_copy(update={"features": config.features.model_copy(update={"n_sector": 16})})
+    table = json.loads((folder / "checkpoints/step_000005/manifest.json").read_text())["observation_table"]
+    columns = [type("Column", (), row | {"slice": slice(row["first"], row["stop"])}) for row in table]
+    checkpoint.save(tmp_path / "other" / "checkpoints", 1, {"policy": {}, "env": {}}, wider, columns)
+    with pytest.raises(ValueError, match="evaluate them one by one"):
+        features_of([str(folder), str(tmp_path / "other")])

@@ -1,0 +1,127 @@
+"""What drives an evaluation: behaviour trees by name, trained policies by run folder, checkpoint folder or shipped name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from uuvtai.config import Config
+from uuvtai.loader import PRESET_DIR, ConfigError, preset_names
+from uuvtai.tree import FlatTree, read_tree
+
+if TYPE_CHECKING:
+    from uuvtai.learn.checkpoint import Checkpoint
+    from uuvtai.measure.recording import PolicyNote
+    from uuvtai.sim import Sim
+
+TRAINING_TREE = "bt"
+"""tree beside a policy: what it was distilled from, and what its observation's teacher columns come from"""
+
+_STACK = ("tracking", "forecast", "elevation", "mapping", "clearance", "voronoi", "route", "teacher", "actuation", "episode")
+"""sections that shape what a policy sees and does; differences from its training are told, not refused"""
+
+
+@dataclass(frozen=True)
+class Method:
+    """One row of the table of methods."""
+
+    name: str
+    tree: FlatTree
+    checkpoint: Checkpoint | None = None
+    """None = the tree drives"""
+
+    def driver_for(self, sim: Sim) -> PolicyNote | None:
+        """The policy ready for this simulator's rows; None where the tree drives. Raises CheckpointError for one that does not fit."""
+        if self.checkpoint is None:
+            return None
+        from uuvtai.env import VectorEnv
+        from uuvtai.learn.pilot import load_pilot
+        from uuvtai.measure.recording import PolicyNote
+
+        self.checkpoint.check_table(VectorEnv(sim).observation_table, sim.config)
+        weight = self.checkpoint.manifest.metrics.get("distill/lambda")
+        pilot = load_pilot(self.checkpoint, sim.num_envs, sim.device)
+        return PolicyNote(pilot, self.checkpoint.sha256, weight if isinstance(weight, float) else None)
+
+    def document(self) -> dict[str, Any]:
+        """What ``uuv eval --json`` says of a policy beside its results."""
+        if self.checkpoint is None:
+            return {}
+        found = self.checkpoint
+        return {"checkpoint": {"path": str(found.path), "sha256": found.sha256, "step": found.step, "version": found.manifest.version}}
+
+
+def trees_of(names: list[str], max_node: int) -> list[Method]:
+    """Methods that a tree drives, by names of trees or paths of their XML. Raises ConfigError."""
+    found = {_label(name): Method(_label(name), read_tree(name, max_node)) for name in names}
+    return list(found.values())
+
+
+def policies_of(names: list[str], max_node: int, note: Callable[[str], None]) -> list[Method]:
+    """Methods that a trained policy drives; ``note`` is told of checkpoints that were left out. Raises ConfigError, CheckpointError."""
+    tree = read_tree(TRAINING_TREE, max_node) if names else None
+    found = [Method(_name_of(name, checkpoint), tree, checkpoint) for name in names if (checkpoint := find_policy(name, note)) and tree]
+    doubled = {method.name for method in found if [other.name for other in found].count(method.name) > 1}
+    if doubled:
+        raise ConfigError(f"{', '.join(sorted(doubled))}: given twice, or two runs with the same name; evaluate them one by one")
+    return found
+
+
+def find_policy(name: str, note: Callable[[str], None] = lambda _text: None) -> Checkpoint:
+    """Checkpoint of a shipped policy, a checkpoint folder, or a run folder (its best one, else its newest).
+
+    Raises ConfigError for what is none of them, CheckpointError for what cannot be used.
+    """
+    from uuvtai.learn import checkpoint, manifest
+
+    shipped = preset_names("policy")
+    if name in shipped:
+        return checkpoint.open_checkpoint(PRESET_DIR / "policies" / name)
+    path = Path(name)
+    if (path / manifest.MANIFEST).exists():
+        return checkpoint.open_checkpoint(path)
+    if (path / "checkpoints").is_dir():
+        return checkpoint.best(path, note)
+    raise ConfigError(
+        f"{name!r} is no trained policy: give the run folder of 'uuv train', one of its checkpoints/step_N, or a shipped policy's name "
+        f"({', '.join(shipped) or 'none is shipped'})"
+    )
+
+
+def features_of(names: list[str]) -> list[tuple[str, Any]]:
+    """Overrides that give the observation the columns these policies were trained with. ConfigError where they differ among themselves."""
+    sections = {name: find_policy(name).config.features.model_dump(mode="json") for name in names}
+    for name, section in sections.items():
+        if section != next(iter(sections.values())):
+            raise ConfigError(
+                f"{names[0]} and {name} see other columns ({sections[names[0]]} and {section}); "
+                "evaluate them one by one: with the same seeds they meet the same episodes"
+            )
+    return [("features", section) for section in list(sections.values())[:1]]
+
+
+def differences(method: Method, config: Config) -> str:
+    """Keys of the stack that differ from the policy's training, in words; empty = none."""
+    if method.checkpoint is None:
+        return ""
+    ours, trained = config.model_dump(mode="json"), method.checkpoint.config.model_dump(mode="json")
+    told = [
+        f"{section}.{key} = {value} (trained with {trained[section].get(key)})"
+        for section in _STACK
+        for key, value in ours[section].items()
+        if value != trained[section].get(key)
+    ]
+    return f"{method.name}: {', '.join(told)}" if told else ""
+
+
+def _name_of(name: str, checkpoint: Checkpoint) -> str:
+    if name in preset_names("policy"):
+        return name
+    path = Path(name).resolve()
+    return path.name if path != checkpoint.path.resolve() else f"{path.parent.parent.name}-{path.name}"
+
+
+def _label(name: str) -> str:
+    return Path(name).stem if name.endswith(".xml") else name

@@ -1,0 +1,251 @@
+"""``uuv train``: a run folder, iterations one after the other, checkpoints and evaluations in between, and how it all ends."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+from uuvtai.config.learning import LearningConfig
+from uuvtai.loader import ConfigError, Overrides, load_resolved, to_yaml
+from uuvtai.measure.methods import TRAINING_TREE
+from uuvtai.measure.statistics import wilson_interval
+from uuvtai.run_folder import RunFolder, default_run_dir
+
+if TYPE_CHECKING:
+    from uuvtai.learn.checkpoint import Checkpoint
+    from uuvtai.learn.train import Trainer
+
+Metrics = dict[str, float]
+
+SCORE = "eval/success_rate"
+"""metric by which a checkpoint is the best"""
+
+
+@dataclass(frozen=True)
+class TrainRequest:
+    """What ``uuv train`` was asked for: a new run with ``config``, or to go on with the run folder ``resume``."""
+
+    config: LearningConfig | None = None
+    preset: str = "run"
+    """what a new run's folder is named after"""
+    resume: Path | None = None
+    overrides: Overrides | None = None
+    """changes of the resumed run's config"""
+    iterations: int | None = None
+    """stop when so many are done in all; None = ``train.iterations``, over which the schedules run in any case"""
+    device: str = "auto"
+    run_dir: Path | None = None
+
+
+class TrainWatch(Protocol):
+    """Shows how far a training is."""
+
+    def start(self, folder: Path, config: LearningConfig, done: int, total: int) -> None: ...
+    def note(self, text: str) -> None: ...
+    def update(self, done: int, metrics: Metrics, success_ci95: tuple[float, float] | None) -> None: ...
+    def stop(self) -> None: ...
+
+
+def train(request: TrainRequest, watch: TrainWatch) -> tuple[dict[str, Any], Path]:
+    """Train or go on training; what ``uuv train --json`` prints, and the run folder.
+
+    Everything that can be refused is refused before anything is written. An interrupt (SIGINT, SIGTERM) lets the iteration end, saves and
+    raises KeyboardInterrupt; a second one stops at once. Under torchrun rank 0 writes. Raises ConfigError, ValueError, MemoryError,
+    RunFolderError, CheckpointError, TrainingError.
+    """
+    from uuvtai.learn.distributed import claim_gpu
+
+    if request.iterations is not None and request.iterations < 1:
+        raise ConfigError(f"--iterations {request.iterations}: at least 1, for example --iterations 100")
+    found, config = _begin(request, watch)
+    total = request.iterations or config.train.iterations
+    if found and found.step >= total:
+        raise ConfigError(
+            f"{request.resume}: has done {found.step} of {total} iterations; to go on give more: --iterations {2 * found.step}"
+        )
+    claim_gpu()
+    watch.note(f"starting {config.train.num_envs} envs (the first run on a machine compiles its kernels, about a minute)")
+    trainer = _trainer(config, request.device, found)
+    folder = _folder(request, config, found) if trainer.processes.writes else None
+    run = _Run(trainer, config, folder, watch, total)
+    status, code = "failed", 1
+    try:
+        with _interrupts() as pressed:
+            is_complete = run.go(pressed)
+        status, code = ("finished", 0) if is_complete else ("interrupted", 130)
+    except KeyboardInterrupt:
+        status, code = "interrupted", 130
+        raise
+    finally:
+        run.close()
+        trainer.processes.close()
+        if folder:
+            folder.finish(status, code)
+    if code:
+        raise KeyboardInterrupt
+    return run.document(), folder.path if folder else Path()
+
+
+def _begin(request: TrainRequest, watch: TrainWatch) -> tuple[Checkpoint | None, LearningConfig]:
+    """The checkpoint to go on from, None for a new run, and the config."""
+    from uuvtai.learn import checkpoint
+
+    if request.resume is None:
+        assert request.config is not None
+        return None, request.config
+    file = request.resume / "config.yaml"
+    if not file.is_file():
+        raise ConfigError(f"{request.resume}: is no run folder, it has no config.yaml; give the folder that 'uuv train' printed")
+    config = load_resolved(file, request.overrides)
+    if not isinstance(config, LearningConfig):
+        raise ConfigError(f"{request.resume}: is no training run; give the folder that 'uuv train' printed")
+    return checkpoint.newest(request.resume, watch.note, resumable=True), config
+
+
+def _trainer(config: LearningConfig, device: str, found: Checkpoint | None) -> Trainer:
+    """A trainer that stands where the checkpoint does, or at the beginning."""
+    from uuvtai.env import VectorEnv
+    from uuvtai.learn.distributed import join_processes
+    from uuvtai.learn.train import Trainer
+    from uuvtai.sim import Sim
+    from uuvtai.tree import read_tree
+
+    sim = Sim(config, config.train.num_envs, read_tree(TRAINING_TREE, config.teacher.max_node), device)
+    env = VectorEnv(sim, config.train.seed)
+    if found:
+        found.check_table(env.observation_table, config)
+    trainer = Trainer(env, config, join_processes(sim.device))
+    if found:
+        own = trainer.state()
+        state = found.state(like=own)
+        if not trainer.processes.writes:
+            # the checkpoint holds rank 0's envs; other ranks begin new episodes
+            state |= {name: own[name] for name in ("env", "generator", "collector")}
+        trainer.load_state(state)
+    return trainer
+
+
+def _folder(request: TrainRequest, config: LearningConfig, found: Checkpoint | None) -> RunFolder:
+    if request.resume is None or found is None:
+        folder = RunFolder(request.run_dir or default_run_dir(request.preset), config, [config.train.seed])
+        folder.hold()
+        return folder
+    folder = RunFolder.reopen(request.resume, {"iteration": found.step, "checkpoint_sha256": found.sha256})
+    if request.overrides:
+        folder.write("config.yaml", to_yaml(config))
+    return folder
+
+
+class _Run:
+    """The iterations of a run, and what is written about them. ``folder`` is None in processes that do not write."""
+
+    def __init__(self, trainer: Trainer, config: LearningConfig, folder: RunFolder | None, watch: TrainWatch, total: int) -> None:
+        from uuvtai.learn.recorder import Recorder
+
+        self._trainer, self._config, self._folder, self._watch, self._total = trainer, config, folder, watch, total
+        self._recorder = Recorder(folder.path, trainer.iteration) if folder else None
+        self._metrics: Metrics = {}
+        self._saved = trainer.iteration if trainer.iteration else None
+        if folder:
+            watch.start(folder.path, config, trainer.iteration, total)
+
+    def go(self, pressed: threading.Event) -> bool:
+        """Iterate to the end, or until somebody presses Ctrl-C: then save and return False."""
+        trainer, is_stopped = self._trainer, False
+        while trainer.iteration < self._total and not is_stopped:
+            self._metrics = trainer.iterate()
+            is_stopped = trainer.processes.any(pressed.is_set())
+            if self._folder:
+                self._note_iteration(self._folder, is_stopped)
+        if self._folder and self._saved != trainer.iteration:
+            self._save(self._folder)
+        if self._folder and is_stopped:
+            self._watch.note(f"saved; go on with: uuv train --resume {self._folder.path}")
+        return not is_stopped
+
+    def document(self) -> dict[str, Any]:
+        """What ``uuv train --json`` prints."""
+        from uuvtai.learn.manifest import finite
+
+        return {
+            "schema": 1,
+            "run": str(self._folder.path) if self._folder else None,
+            "iterations": self._trainer.iteration,
+            "env_steps": self._trainer.env_steps,
+            "metrics": finite(self._metrics),
+        }
+
+    def close(self) -> None:
+        """Give everything back."""
+        self._watch.stop()
+        if self._recorder:
+            self._recorder.close()
+
+    def _note_iteration(self, folder: RunFolder, is_stopped: bool) -> None:
+        done, train = self._trainer.iteration, self._config.train
+        is_evaluated = not is_stopped and train.evaluate_every > 0 and done % train.evaluate_every == 0
+        if is_evaluated:
+            self._metrics |= evaluate_now(self._trainer, self._config)
+        if self._recorder:
+            self._recorder.write(done, self._metrics)
+        self._watch.update(done, self._metrics, self._success_interval())
+        if is_evaluated or done % train.checkpoint_every == 0:
+            self._save(folder)
+
+    def _save(self, folder: RunFolder) -> None:
+        from uuvtai.learn import checkpoint
+
+        trainer, table = self._trainer, self._trainer.env.observation_table
+        score = self._metrics.get(SCORE)
+        checkpoint.save(folder.path / "checkpoints", trainer.iteration, trainer.state(), self._config, table, self._metrics, score)
+        self._saved = trainer.iteration
+
+    def _success_interval(self) -> tuple[float, float] | None:
+        """95 % interval of ``rollout/success_rate`` over the episodes that it is the mean of."""
+        rate, episodes = self._metrics.get("rollout/success_rate"), self._trainer.recent.episodes
+        return None if rate is None else wilson_interval(round(rate * episodes), round(episodes))
+
+
+def evaluate_now(trainer: Trainer, config: LearningConfig) -> Metrics:
+    """``eval/*``: the policy as it is, without exploration, on scenarios of its own; training goes on as if nothing had been."""
+    from uuvtai.learn.pilot import Pilot
+    from uuvtai.measure.evaluate import jobs_of, run_episodes, summary
+
+    env = trainer.env
+    held = env.capture()
+    try:
+        env.sim.sleep()
+        model = trainer.world_model if config.world_model.as_features else None
+        jobs = jobs_of([config.train.evaluate_seed], config.train.evaluate_episodes)
+        results, env_steps = run_episodes(env.sim, jobs, driver=Pilot(trainer.policy, model, env.num_envs, env.device))
+    finally:
+        env.restore(held)
+    told = summary("policy", results, env_steps, 0.0)
+    names = ("success_rate", "collision_rate", "return_mean", "time_to_success_mean_s")
+    return {f"eval/{name}": told[name] for name in names if told[name] is not None}
+
+
+@contextlib.contextmanager
+def _interrupts() -> Iterator[threading.Event]:
+    """An event that the first SIGINT or SIGTERM sets; the next one raises KeyboardInterrupt."""
+    pressed = threading.Event()
+
+    def note(_signal: int, _frame: object) -> None:
+        if pressed.is_set():
+            raise KeyboardInterrupt
+        pressed.set()
+
+    if threading.current_thread() is not threading.main_thread():
+        yield pressed  # signals go to the main thread; whoever runs this elsewhere stops it otherwise
+        return
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield pressed
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
