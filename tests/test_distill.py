@@ -7,7 +7,16 @@ import torch
 from torch import nn
 
 from uuvtai.config.learning import DistillConfig
-from uuvtai.learn.distill import MAX_WEIGHT_RATIO, LeafErrors, TeacherBatches, distillation_loss, imitation_error, sample_weight, weights_of
+from uuvtai.learn.distill import (
+    MAX_WEIGHT_RATIO,
+    LeafErrors,
+    TeacherBatches,
+    check_weighting,
+    distillation_loss,
+    imitation_error,
+    sample_weight,
+    weights_of,
+)
 
 FLOAT32 = 1e-6
 """a handful of float32 operations on numbers near one"""
@@ -62,8 +71,15 @@ def test_weighting_by_name():
     assert weights_of("none", uncertainty, risk).tolist() == [1.0, 1.0]
     assert weights_of("uncertainty", uncertainty, risk).tolist() == [0.5, 1.5]
     assert weights_of("risk", uncertainty, risk).tolist() == [1.5, 0.5]
+
+
+def test_a_weighting_needs_its_signal():
+    check_weighting("none", False, False)
+    check_weighting("uncertainty", True, False)
     with pytest.raises(ValueError, match=r"risk\.enabled=true"):
-        weights_of("risk", uncertainty, None)
+        check_weighting("risk", True, False)
+    with pytest.raises(ValueError, match=r"world_model\.enabled=true"):
+        check_weighting("uncertainty", False, True)
 
 
 def test_teacher_batches_teach_the_mean_and_leave_the_critic(lesson):

@@ -68,14 +68,18 @@ def test_it_learns_the_task_from_its_teacher_and_says_so():
     assert set(WALL_TIMES) < set(last)
 
 
-def test_four_iterations_equal_two_and_two_more_after_a_resume():
-    whole = Trainer(PointEnv(), config_of())
+@pytest.mark.parametrize(
+    "more", [{}, {"risk": {"enabled": True, "batch": 64}, "ppo": {"shuffle": True, "target_kl": 0.01, "rollout_steps": 16}}]
+)
+def test_four_iterations_equal_two_and_two_more_after_a_resume(more):
+    config = config_of(**more)
+    whole = Trainer(PointEnv(), config)
     metrics = [told(whole.iterate()) for _ in range(4)]
-    first = Trainer(PointEnv(), config_of())
+    first = Trainer(PointEnv(), config)
     assert [told(first.iterate()) for _ in range(2)] == metrics[:2]
     state = first.state()
     first.iterate()
-    second = Trainer(PointEnv(seed=9), config_of())
+    second = Trainer(PointEnv(seed=9), config)
     second.iterate()
     second.load_state(state)
     assert [told(second.iterate()) for _ in range(2)] == metrics[2:]
@@ -143,6 +147,21 @@ def test_critic_warm_up_leaves_the_policy_alone_without_distillation():
     assert not torch.equal(trainer.policy.critic[0].weight, critic)
     trainer.iterate()
     assert not torch.equal(trainer.policy.actor[0].weight, actor)
+
+
+def test_the_risk_head_learns_beside_and_weighs_the_distillation():
+    config = config_of(risk={"enabled": True, "horizon_s": 0.2, "batch": 64, "hidden": [8]}, distill={"weighting": "risk"})
+    trainer = Trainer(PointEnv(), config)
+    metrics = [trainer.iterate() for _ in range(4)][-1]
+    assert 0 <= metrics["risk/brier"] <= 1
+    weight = trainer.rollout.weight
+    assert float(weight.mean()) == pytest.approx(1.0, abs=1e-4) and float(weight.std()) > 0
+    assert {"risk", "risk_learner"} <= trainer.state().keys()
+
+
+def test_weighting_by_risk_without_a_risk_head_is_an_error_before_the_first_step():
+    with pytest.raises(ValueError, match=r"risk\.enabled=true"):
+        Trainer(PointEnv(), config_of(distill={"weighting": "risk"}))
 
 
 def test_the_world_models_columns_can_be_left_out():

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 N_FEATURES = 2
 """columns of the policy's input behind the observation: the world model's residual and uncertainty, zero without one"""
 
+FAILURES = ("collision", "ttc")
+"""outcomes that the risk head foresees"""
+
 Info = dict[str, torch.Tensor]
 
 
@@ -46,6 +49,9 @@ class Collector:
         self.x, self.final_x = (torch.zeros(n, rollout.n_in, device=device) for _ in range(2))
         self.uncertainty = torch.zeros(rollout.steps, n, device=device)
         """(T, N) the world model's uncertainty proxy of every transition in the rollout"""
+        self.failed = torch.zeros(rollout.steps, n, dtype=torch.bool, device=device)
+        """(T, N) the step ended in a collision or a TTC stop"""
+        self._failures = torch.tensor([name in FAILURES for name in env.outcomes], device=device)
         self.leaf_errors = LeafErrors(env.node_names, device)
         self._teacher, self._reward = torch.zeros(n, NUM_ACTIONS, device=device), torch.zeros(n, device=device)
         self._leaf = torch.zeros(n, dtype=torch.int32, device=device)
@@ -99,6 +105,7 @@ class Collector:
             self.uncertainty[t].copy_(self._features[:, -1])
             last_value = final_value(self.policy, self.final_x, terminated, ended)
             rollout.add(self.x, step, self._reward, terminated, ended, last_value, self._teacher, self._leaf)
+            self.failed[t] = ended & self._failures[self.info["outcome"].long()]
             self._count(tally, ended)
             self._move_on(ended)
         rollout.close(self.policy.value(self.x))

@@ -45,13 +45,22 @@ def sample_weight(signal: torch.Tensor) -> torch.Tensor:
     return ratio / ratio.mean()
 
 
-def weights_of(kind: Literal["none", "uncertainty", "risk"], uncertainty: torch.Tensor, risk: torch.Tensor | None) -> torch.Tensor:
-    """Weights by ``distill.weighting``; ValueError where the run has no risk head to weigh by."""
-    if kind == "none":
-        return torch.ones_like(uncertainty)
-    if kind == "risk" and risk is None:
-        raise ValueError("distill.weighting = risk needs the risk head: set risk.enabled=true, or distill.weighting=uncertainty")
-    return sample_weight(uncertainty if risk is None or kind == "uncertainty" else risk)
+Weighting = Literal["none", "uncertainty", "risk"]
+
+
+def check_weighting(kind: Weighting, has_world_model: bool, has_risk: bool) -> None:
+    """Raise ValueError for a ``distill.weighting`` whose signal this run does not have."""
+    if kind == "risk" and not has_risk:
+        raise ValueError("distill.weighting=risk needs the risk head: set risk.enabled=true, or distill.weighting=none")
+    if kind == "uncertainty" and not has_world_model:
+        raise ValueError("distill.weighting=uncertainty needs the world model: set world_model.enabled=true, or distill.weighting=none")
+
+
+def weights_of(kind: Weighting, uncertainty: torch.Tensor, risk: torch.Tensor | None) -> torch.Tensor:
+    """Weights by ``distill.weighting``, of the shape of the uncertainties; ``risk`` may be None where the kind does not ask for it."""
+    if kind == "uncertainty":
+        return sample_weight(uncertainty)
+    return torch.ones_like(uncertainty) if kind == "none" or risk is None else sample_weight(risk)
 
 
 class TeacherBatches:

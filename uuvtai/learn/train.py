@@ -11,12 +11,13 @@ import torch
 
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learn.collect import N_FEATURES, Collector
-from uuvtai.learn.distill import TeacherBatches, weights_of
+from uuvtai.learn.distill import TeacherBatches, check_weighting, weights_of
 from uuvtai.learn.distributed import Processes
 from uuvtai.learn.guard import PREFIX, Guard
 from uuvtai.learn.normalise import Moments, combined
 from uuvtai.learn.policy import Policy
 from uuvtai.learn.ppo import Ppo
+from uuvtai.learn.risk import RiskHead, RiskLearner
 from uuvtai.learn.rollout import Rollout
 from uuvtai.learn.schedule import piecewise_linear
 from uuvtai.learn.tally import Recent
@@ -38,6 +39,7 @@ class Trainer:
 
     def __init__(self, env: VectorEnv, config: LearningConfig, processes: Processes | None = None) -> None:
         """Resets ``env`` to this process's scenarios. ValueError for settings that do not fit each other."""
+        check_weighting(config.distill.weighting, config.world_model.enabled, config.risk.enabled)
         self.env, self.config = env, config
         self.processes = processes or Processes(device=env.device)
         self.generator = torch.Generator().manual_seed(config.train.seed)
@@ -51,6 +53,9 @@ class Trainer:
         world = config.world_model
         self.world_model = WorldModel(env.num_obs, world, self.generator).to(device) if world.enabled else None
         self.world_learner = self.world_model and WorldModelLearner(self.world_model, world, self._reduce, self._united)
+        risk = config.risk
+        self.risk = RiskHead(n_in, risk, self.generator).to(device) if risk.enabled else None
+        self.risk_learner = self.risk and RiskLearner(self.risk, risk, config.episode.control_dt_s, self._reduce, self._united)
         self.collector = Collector(env, self.policy, self.world_model, self.rollout, self.guard, self.generator, world.as_features)
         self.recent = Recent(env.outcomes, env.reward_terms)
         self.iteration = self.env_steps = 0
@@ -105,9 +110,11 @@ class Trainer:
         parts = {
             "policy": self.policy,
             "world_model": self.world_model,
+            "risk": self.risk,
             "ppo": self.ppo,
             "teacher_batches": self.teacher_batches,
             "world_learner": self.world_learner,
+            "risk_learner": self.risk_learner,
             "uncertainty": self.uncertainty,
             "collector": self.collector,
         }
@@ -119,13 +126,13 @@ class Trainer:
         """Everything that learns from the rollout; ``share`` of the run is over."""
         strength, metrics = self._strength(share)
         rollout, config = self.rollout, self.config.distill
-        rollout.weight.copy_(weights_of(config.weighting, self.collector.uncertainty, None))
+        rollout.weight.copy_(weights_of(config.weighting, self.collector.uncertainty, self._foreseen()))
         surrogate = self.iteration >= config.critic_warmup_iterations
         metrics |= self.ppo.update(rollout, strength, surrogate, self.generator)
         metrics |= self.collector.leaf_errors.take()
         kept = torch.where(torch.isfinite(rollout.reward), rollout.weight, 0.0)
         self.teacher_batches.update(rollout.flat("x"), rollout.flat("teacher_action"), kept.flatten(), strength, self.generator)
-        return metrics | self._learn_world()
+        return metrics | self._learn_world() | self._learn_risk()
 
     def _look_around(self) -> None:
         """Statistics begin with what the behaviour tree meets: networks that begin unscaled learn from their first rollout in vain."""
@@ -141,6 +148,18 @@ class Trainer:
             return {}
         obs, valid = self.rollout.x[..., : self.env.num_obs], ~self.rollout.ended[:-1]
         return self.world_learner.update(obs[:-1], self.rollout.action[:-1], obs[1:], self.generator, valid)
+
+    def _learn_risk(self) -> dict[str, float]:
+        """Risk head, from the moments whose future is known by now."""
+        if self.risk_learner is None:
+            return {}
+        rollout = self.rollout
+        censored = rollout.ended & ~rollout.terminated
+        return self.risk_learner.update(rollout.x, self.collector.failed, rollout.ended, censored, self.generator)
+
+    def _foreseen(self) -> torch.Tensor | None:
+        """(T, N) probability of a failure soon at every moment of the rollout, where the weights ask for it."""
+        return self.risk(self.rollout.x) if self.risk is not None and self.config.distill.weighting == "risk" else None
 
     def _strength(self, share: float) -> tuple[float, dict[str, float]]:
         """lambda_t s_t, and both for the log. All processes scale by the mean of their uncertainties, or their steps would differ."""
