@@ -127,7 +127,8 @@ class RiskConfig(Section):
     batch: PositiveCount = 2048
     steps: PositiveCount = 4
     """gradient steps per iteration"""
-    learning_rate: Positive = 3e-4
+    learning_rate: Positive = 1e-3
+    """takes a third of the steps of 3e-4 to the same AUROC (EC)"""
     bins: PositiveCount = 10
     """of the reliability diagram"""
     miss_rate: Annotated[float, Field(gt=0, lt=1)] = 0.05
