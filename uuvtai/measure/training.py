@@ -17,6 +17,7 @@ from uuvtai.measure.statistics import wilson_interval
 from uuvtai.run_folder import RunFolder, default_run_dir
 
 if TYPE_CHECKING:
+    from uuvtai.env import VectorEnv
     from uuvtai.learn.checkpoint import Checkpoint
     from uuvtai.learn.train import Trainer
 
@@ -70,7 +71,7 @@ def train(request: TrainRequest, watch: TrainWatch) -> tuple[dict[str, Any], Pat
         )
     claim_gpu()
     watch.note(f"starting {config.train.num_envs} envs (the first run on a machine compiles its kernels, about a minute)")
-    trainer = _trainer(config, request.device, found)
+    trainer = _trainer(_env(config, request.device), config, found)
     folder = _folder(request, config, found) if trainer.processes.writes else None
     run = _Run(trainer, config, folder, watch, total)
     status, code = "failed", 1
@@ -107,19 +108,23 @@ def _begin(request: TrainRequest, watch: TrainWatch) -> tuple[Checkpoint | None,
     return checkpoint.newest(request.resume, watch.note, resumable=True), config
 
 
-def _trainer(config: LearningConfig, device: str, found: Checkpoint | None) -> Trainer:
-    """A trainer that stands where the checkpoint does, or at the beginning."""
+def _env(config: LearningConfig, device: str) -> VectorEnv:
     from uuvtai.env import VectorEnv
-    from uuvtai.learn.distributed import join_processes
-    from uuvtai.learn.train import Trainer
     from uuvtai.sim import Sim
     from uuvtai.tree import read_tree
 
     sim = Sim(config, config.train.num_envs, read_tree(TRAINING_TREE, config.teacher.max_node), device)
-    env = VectorEnv(sim, config.train.seed)
+    return VectorEnv(sim, config.train.seed)
+
+
+def _trainer(env: VectorEnv, config: LearningConfig, found: Checkpoint | None) -> Trainer:
+    """A trainer that stands where the checkpoint does, or at the beginning."""
+    from uuvtai.learn.distributed import join_processes
+    from uuvtai.learn.train import Trainer
+
     if found:
         found.check_table(env.observation_table, config)
-    trainer = Trainer(env, config, join_processes(sim.device))
+    trainer = Trainer(env, config, join_processes(env.device))
     if found:
         own = trainer.state()
         state = found.state(like=own)

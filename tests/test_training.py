@@ -1,0 +1,269 @@
+"""A training run: its folder, going on bit for bit, interrupts that save, failures that are marked, evaluations that leave no trace."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import torch
+
+from tests.point_env import PointEnv
+from uuvtai.env import VectorEnv
+from uuvtai.learn import checkpoint
+from uuvtai.learn.guard import TrainingError
+from uuvtai.learn.packing import pack
+from uuvtai.learn.recorder import read_metrics
+from uuvtai.learn.train import Trainer
+from uuvtai.loader import ConfigError, load_training
+from uuvtai.measure import training
+from uuvtai.measure.training import TrainRequest, evaluate_now, train
+from uuvtai.run_folder import RunFolder, RunFolderError
+
+TINY = {
+    "policy.hidden": [8, 8], "world_model.hidden": [8], "world_model.latent": 4, "risk.hidden": [8], "ppo.rollout_steps": 8,
+    "ppo.epochs": 1, "train.evaluate_every": 0, "train.checkpoint_every": 2,
+}  # fmt: skip
+
+
+class Quiet:
+    """Watches without a word; ``press_at``: iteration after which somebody presses Ctrl-C."""
+
+    def __init__(self, press_at=None, times=1):
+        self.press_at, self.times, self.told, self.rows = press_at, times, [], []
+
+    def start(self, folder, config, done, total):
+        self.began = (done, total)
+
+    def note(self, text):
+        self.told.append(text)
+
+    def update(self, done, metrics, success_ci95):
+        self.rows.append((done, metrics, success_ci95))
+        for _ in range(self.times if done == self.press_at else 0):
+            signal.raise_signal(signal.SIGINT)
+
+    def stop(self):
+        pass
+
+
+@pytest.fixture
+def points(monkeypatch):
+    """Training drives points instead of vehicles; what it made is told."""
+    made = []
+    monkeypatch.setattr(training, "_env", lambda config, _device: made.append(PointEnv(8)) or made[-1])
+    monkeypatch.setattr(os, "fsync", lambda _descriptor: None)  # takes its time, and tests nothing here
+    return made
+
+
+def config_of(**overrides):
+    return load_training("smoke", TINY | {key.replace("__", "."): value for key, value in overrides.items()})
+
+
+def run_json(folder):
+    return json.loads((folder / "run.json").read_text())
+
+
+def content_of(path):
+    """Every file of a checkpoint that holds state."""
+    return {p.name: p.read_bytes() for p in path.iterdir() if p.name != "manifest.json"}
+
+
+def told(folder):
+    """The metrics of a run, but for wall times."""
+    return [
+        {name: value for name, value in row.items() if not name.startswith("time/") or name == "time/env_steps"}
+        for row in read_metrics(folder)
+    ]
+
+
+def test_a_run_leaves_a_complete_folder(points, tmp_path):
+    watch = Quiet()
+    document, folder = train(TrainRequest(config=config_of(), run_dir=tmp_path / "run"), watch)
+    assert (document["iterations"], document["run"]) == (6, str(folder))
+    assert (run_json(folder)["status"], run_json(folder)["exit"]) == ("finished", 0)
+    assert [row["iteration"] for row in read_metrics(folder)] == [1, 2, 3, 4, 5, 6] == [row[0] for row in watch.rows]
+    assert list((folder / "tensorboard").glob("events.*"))
+    assert sorted(p.name for p in (folder / "checkpoints").iterdir()) == ["step_000002", "step_000004", "step_000006"]
+    assert checkpoint.newest(folder).config == config_of()
+    rates = [(metrics.get("rollout/success_rate"), interval) for _, metrics, interval in watch.rows]
+    assert all((rate is None) == (interval is None) for rate, interval in rates)
+    assert all(interval[0] <= rate <= interval[1] for rate, interval in rates if rate is not None)
+
+
+def test_2n_iterations_are_n_and_a_resumed_n_bit_for_bit(points, tmp_path):
+    whole, half = tmp_path / "whole", tmp_path / "half"
+    train(TrainRequest(config=config_of(), run_dir=whole), Quiet())
+    train(TrainRequest(config=config_of(), run_dir=half, iterations=3), Quiet())
+    train(TrainRequest(resume=half, iterations=6), Quiet())
+    assert content_of(whole / "checkpoints/step_000006") == content_of(half / "checkpoints/step_000006")
+    assert told(whole) == told(half)
+    assert [entry["iteration"] for entry in run_json(half)["resumed"]] == [3]
+
+
+def test_an_interrupt_finishes_the_iteration_and_saves(points, tmp_path):
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    watch = Quiet(press_at=3)
+    with pytest.raises(KeyboardInterrupt):
+        train(TrainRequest(config=config_of(), run_dir=cut), watch)
+    assert (run_json(cut)["status"], run_json(cut)["exit"]) == ("interrupted", 130)
+    assert checkpoint.newest(cut, resumable=True).step >= 3
+    assert f"uuv train --resume {cut}" in watch.told[-1]
+    train(TrainRequest(resume=cut), Quiet())
+    train(TrainRequest(config=config_of(), run_dir=whole), Quiet())
+    assert content_of(whole / "checkpoints/step_000006") == content_of(cut / "checkpoints/step_000006")
+    assert told(whole) == told(cut)
+    assert run_json(cut)["status"] == "finished"
+
+
+def test_a_second_interrupt_stops_at_once(points, tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        train(TrainRequest(config=config_of(), run_dir=tmp_path / "run"), Quiet(press_at=3, times=2))
+    assert run_json(tmp_path / "run")["status"] == "interrupted"
+    assert checkpoint.newest(tmp_path / "run").step == 2, "the last one that was due"
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_failed_run_is_marked_and_keeps_its_checkpoints(points, tmp_path):
+    class Poisoned(Quiet):
+        def update(self, done, metrics, success_ci95):
+            if done == 2:
+                points[-1].poison = {"reward"}
+
+    config = config_of(train__patience=2)
+    with pytest.raises(TrainingError, match="not finite"):
+        train(TrainRequest(config=config, run_dir=tmp_path / "run"), Poisoned())
+    assert (run_json(tmp_path / "run")["status"], run_json(tmp_path / "run")["exit"]) == ("failed", 1)
+    assert checkpoint.newest(tmp_path / "run", resumable=True).step == 2
+
+
+def test_a_damaged_checkpoint_is_told_and_the_one_before_goes_on(points, tmp_path):
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    train(TrainRequest(config=config_of(), run_dir=cut, iterations=4), Quiet())
+    with (cut / "checkpoints/step_000004/training.safetensors").open("r+b") as file:
+        file.truncate(100)
+    watch = Quiet()
+    train(TrainRequest(resume=cut), watch)
+    assert any("was cut off" in text for text in watch.told)
+    assert watch.began == (2, 6)
+    train(TrainRequest(config=config_of(), run_dir=whole), Quiet())
+    assert content_of(whole / "checkpoints/step_000006") == content_of(cut / "checkpoints/step_000006")
+    assert told(whole) == told(cut)
+
+
+def test_settings_may_change_as_a_run_goes_on(points, tmp_path):
+    train(TrainRequest(config=config_of(), run_dir=tmp_path / "run", iterations=2), Quiet())
+    train(TrainRequest(resume=tmp_path / "run", overrides=["ppo.learning_rate=1e-5"]), Quiet())
+    assert checkpoint.newest(tmp_path / "run").config.ppo.learning_rate == 1e-5
+    assert "learning_rate: 1.0e-05" in (tmp_path / "run" / "config.yaml").read_text()
+
+
+def test_a_run_that_cannot_go_on_says_why_and_loses_nothing(points, tmp_path, monkeypatch):
+    run = tmp_path / "run"
+    train(TrainRequest(config=config_of(), run_dir=run, iterations=2), Quiet())
+    before = {p: p.read_bytes() for p in run.rglob("*") if p.is_file()}
+    for request, error, says in (
+        (TrainRequest(resume=run, iterations=2), ConfigError, "has done 2 of 2 iterations; to go on give more: --iterations 4"),
+        (TrainRequest(resume=run, iterations=0), ConfigError, "at least 1"),
+        (TrainRequest(resume=tmp_path), ConfigError, "is no run folder"),
+        (TrainRequest(resume=run, overrides=["ppo.gama=1"]), ConfigError, "did you mean 'gamma'"),
+        (TrainRequest(resume=run, overrides=["policy.hidden=[4]"]), RuntimeError, "size mismatch"),
+        (TrainRequest(config=config_of(), run_dir=run), RunFolderError, "already there and not empty"),
+    ):
+        with pytest.raises(error, match=says):
+            train(request, Quiet())
+    other = PointEnv(8)
+    other.observation_table = other.observation_table[::-1]
+    monkeypatch.setattr(training, "_env", lambda _config, _device: other)
+    with pytest.raises(checkpoint.CheckpointError, match="another observation table"):
+        train(TrainRequest(resume=run), Quiet())
+    assert {p: p.read_bytes() for p in run.rglob("*") if p.is_file()} == before
+
+
+def test_an_evaluation_is_no_training_run(tmp_path):
+    from uuvtai.loader import load_config
+
+    RunFolder(tmp_path / "run", load_config("pool"), [0])
+    with pytest.raises(ConfigError, match="is no training run"):
+        train(TrainRequest(resume=tmp_path / "run"), Quiet())
+
+
+def test_two_processes_do_not_train_in_one_folder(points, tmp_path):
+    train(TrainRequest(config=config_of(), run_dir=tmp_path / "run", iterations=2), Quiet())
+    script = """if True:
+        import sys
+        from pathlib import Path
+        from uuvtai.run_folder import RunFolder
+        folder = RunFolder.__new__(RunFolder)
+        folder.path = Path(sys.argv[1])
+        folder.hold()
+        print("held", flush=True)
+        sys.stdin.read()
+    """
+    holder = subprocess.Popen(
+        [sys.executable, "-c", script, str(tmp_path / "run")], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert holder.stdout.readline() == "held\n"
+    with pytest.raises(RunFolderError, match="another process is training in this folder"):
+        train(TrainRequest(resume=tmp_path / "run"), Quiet())
+    holder.communicate()
+    train(TrainRequest(resume=tmp_path / "run"), Quiet())
+
+
+# ------------------------------------------------------------------------------------------------------------ the real thing
+
+
+def test_an_evaluation_in_between_leaves_no_trace(small):
+    """Training shares its simulator with the evaluation, and goes on as if nothing had been."""
+    config = load_training("smoke", TINY | {"world.dynamic_capacity": 9, "train.evaluate_episodes": 2})
+    states = []
+    for is_evaluated in (False, True):
+        trainer = Trainer(VectorEnv(small.sim), config)
+        with torch.no_grad():
+            trainer.policy.actor[-1].bias[2] = 3.0  # down or up until something stops it: short episodes
+        trainer.iterate()
+        if is_evaluated:
+            found = evaluate_now(trainer, config)
+            assert found["eval/success_rate"] == 0.0
+            assert found["eval/collision_rate"] == 1.0
+        trainer.iterate()
+        states.append(pack(trainer.state()))
+    (plain, tensors), (other_plain, other) = states
+    assert plain == other_plain
+    assert all(torch.equal(tensor.view(-1).view(torch.uint8), other[name].view(-1).view(torch.uint8)) for name, tensor in tensors.items())
+
+
+RUN = (
+    "train", "smoke", "--num-envs", "4", "--set", "episode.horizon_steps=400", "--set", "distill.batch=32", "--set", "world_model.batch=32",
+    "--device", "cpu",
+)  # fmt: skip
+
+
+def uuv(*arguments, **more):
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "NO_COLOR": "1"}
+    return subprocess.Popen(
+        [sys.executable, "-m", "uuvtai", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+    )
+
+
+def test_a_killed_run_goes_on_bit_for_bit_in_another_process(tmp_path):
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    process = uuv(*RUN, "--run-dir", str(whole), "--json")
+    out, err = process.communicate(timeout=600)
+    assert process.returncode == 0, err
+    assert json.loads(out)["iterations"] == 6
+    assert "6/6: reward" in err
+    process = uuv(*RUN, "--run-dir", str(killed))
+    while len(list((killed / "checkpoints").glob("step_*"))) < 2 and process.poll() is None:
+        time.sleep(0.01)
+    process.kill()
+    process.communicate()
+    assert run_json(killed)["status"] == "running", "nobody was there to say otherwise"
+    assert checkpoint.newest(killed, resumable=True).step in (2, 3, 4)
+    process = uuv("train", "--resume", str(killed), "--device", "cpu")
+    _, err = process.communicate(timeout=600)
+    assert process.returncode == 0, err
+    assert content_of(whole / "checkpoints/step_000006") == content_of(killed / "checkpoints/step_000006")
+    assert told(whole) == told(killed)
