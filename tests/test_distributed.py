@@ -43,23 +43,20 @@ def two(work):
 def exchange(processes):
     r = float(processes.rank)
     mean, total = [torch.tensor([r, 2.0]), torch.full((2, 2), r)], [torch.tensor([r + 1], dtype=torch.float64)]
-    shared = torch.tensor([r])
     processes.average(mean)
     processes.total(total)
-    processes.share([shared])
     metrics = processes.mean_metrics({"both": r, f"only_{processes.rank}": 5.0})
     gathered = [t.tolist() for t in processes.gather(torch.tensor([r]))]
     any_one = processes.any(processes.rank == 1), processes.any(False)
-    return [t.tolist() for t in mean], total[0].tolist(), shared.tolist(), metrics, gathered, any_one, processes.writes
+    return [t.tolist() for t in mean], total[0].tolist(), metrics, gathered, any_one, processes.writes
 
 
 def test_two_processes_exchange():
     first, second = two(exchange)
     assert first[:-1] == second[:-1]
-    mean, total, shared, metrics, gathered, any_one, writes = first
+    mean, total, metrics, gathered, any_one, writes = first
     assert mean == [[0.5, 2.0], [[0.5, 0.5], [0.5, 0.5]]]
     assert total == [3.0]
-    assert shared == [0.0]
     assert metrics == {"both": 0.5, "only_0": 5.0, "only_1": 5.0}
     assert gathered == [[0.0], [1.0]]
     assert any_one == (True, False)
@@ -72,7 +69,6 @@ def test_one_process_needs_no_group(monkeypatch):
     tensor = torch.tensor([3.0])
     alone.average([tensor])
     alone.total([tensor])
-    alone.share([tensor])
     assert tensor.tolist() == [3.0] and alone.gather(tensor) == [tensor]
     assert alone.mean_metrics({"a": 1.0}) == {"a": 1.0}
     assert alone.any(True) and not alone.any(False) and alone.writes

@@ -7,7 +7,7 @@ Adam forgets a constant factor of the loss, so in these batches lambda_t scales 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import torch
@@ -125,10 +125,6 @@ class LeafErrors:
         finite = torch.isfinite(error)
         self._error.index_add_(0, node, torch.where(finite, error, 0.0).double())
         self._count.index_add_(0, node, finite.double())
-
-    def moments(self) -> Iterable[torch.Tensor]:
-        """The sums, to be added up over the processes."""
-        return (self._error, self._count)
 
     def take(self) -> dict[str, float]:
         """``distill/loss`` (over all samples) and ``distill/leaf/<name>`` of the leaves that acted; the sums begin anew."""

@@ -45,12 +45,6 @@ class Processes:
         """Sum over the processes, in place, in one message."""
         self._add_up(list(tensors), 1.0)
 
-    def share(self, tensors: Iterable[torch.Tensor]) -> None:
-        """Copy rank 0's values into every process."""
-        if self.size > 1:
-            for tensor in tensors:
-                dist.broadcast(tensor, src=0)
-
     def gather(self, tensor: torch.Tensor) -> list[torch.Tensor]:
         """Every process's tensor (equal shapes), in the order of ranks."""
         if self.size == 1:
