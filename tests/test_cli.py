@@ -188,6 +188,10 @@ def test_tree_shows_the_use_of_every_node(evaluation, capfd):
     code, _, err = uuv(capfd, "tree", str(folder), "--controller", "planner")
     assert code == 2
     assert "has no controller 'planner'" in err
+    code, out, _ = uuv(capfd, "tree", str(folder))
+    assert code == 0 and "acted: control steps whose action the leaf set" in out
+    code, _, err = uuv(capfd, "tree", "bt")
+    assert code == 2 and "bt: is no run folder" in err and "uuv tree --controller bt" in err
 
 
 def test_an_existing_run_folder_is_never_overwritten(evaluation, capfd):

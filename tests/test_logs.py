@@ -512,8 +512,10 @@ def test_repair_never_overwrites(log_path, tmp_path):
 @pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r\n", b"not a log at all", b"\x89MCAP0\r\n" + b"\x07" * 300])
 def test_files_without_anything_in_them(tmp_path, content):
     (tmp_path / "a.mcap").write_bytes(content)
-    with pytest.raises(LogError, match=r"a\.mcap"):
+    with pytest.raises(LogError, match=r"a\.mcap") as refused:
         info(tmp_path / "a.mcap")
+    assert ("is not an MCAP file" in str(refused.value)) is not content.startswith(b"\x89MCAP0\r\n")
+    assert ("uuv log repair" in str(refused.value)) is content.startswith(b"\x89MCAP0\r\n")
     with pytest.raises(LogError, match="nothing can be recovered"):
         repair(tmp_path / "a.mcap", tmp_path / "out.mcap")
     assert [entry.name for entry in tmp_path.iterdir()] == ["a.mcap"]

@@ -127,6 +127,17 @@ def test_true_bodies_are_as_old_as_the_map(folder, bt):
         assert has(around(alone, rim, 2), ink.MOVER, 60) is has(around(both, rim, 2), ink.MOVER, 60) is there
 
 
+def test_remarks_stand_in_red_beside_the_title(bt):
+    recording = load_recording(bt)
+    for plain, marked in (
+        (draw_picture([recording]), draw_picture([recording], remark="unseen above")),
+        (FrameArtist(recording).frame(1.0), FrameArtist(recording, remark="unseen above").frame(1.0)),
+    ):
+        rows, cols = np.nonzero((plain != marked).any(axis=2))
+        assert rows.max() < 60 and cols.min() > 250
+        assert has(marked[: rows.max() + 1, cols.min() :].reshape(-1, 3).astype(int), ink.FAILED, 60)
+
+
 def test_bodies_above_and_below_the_vehicle_are_dashed():
     def ink_used(own_z_m):
         canvas = map_canvas(episode.scenario()["tank"], 1280, (52, 28, 84, 212))

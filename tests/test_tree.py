@@ -124,6 +124,16 @@ def test_presets_open_in_groot(name):
     assert len(read_tree(name, TeacherConfig().max_node).kind) <= TeacherConfig().max_node
 
 
+@pytest.mark.parametrize("name", ["straight", "planner", "bt"])
+def test_use_of_a_long_evaluation_fits_a_hundred_columns(name):
+    flat = read_tree(name)
+    ticks, acted = np.full((1000, 64), 99_999), np.full((1000, 64), 77_777)
+    lines = tree_text(flat, node_use(ticks, acted, len(flat.kind))).splitlines()
+    assert max(map(len, lines)) <= 100
+    for line, kind in zip(lines[1:], flat.kind, strict=True):
+        assert "99999000" in line and ("77777000" in line) is (kind == codes.ACTION)
+
+
 def test_text_and_dot_name_every_node_and_its_use():
     flat = read_tree("bt")
     ticks = np.zeros((4, 64), int)

@@ -24,6 +24,7 @@ def bgr(code: str) -> Color:
 
 PAPER, WATER, INK, GREY, FAINT = bgr("#ffffff"), bgr("#eef5f9"), bgr("#1d2733"), bgr("#66727f"), bgr("#c9d2da")
 STATIC, DYNAMIC, GOAL, ROUTE, MOVER = bgr("#262c38"), bgr("#e53946"), bgr("#f7b801"), bgr("#1f8fff"), bgr("#d9480f")
+FAILED = bgr("#c92a2a")
 METHODS = tuple(bgr(code) for code in ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#8d5524", "#6a3d9a"))
 """after Okabe and Ito: told apart by colour-blind eyes"""
 

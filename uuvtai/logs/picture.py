@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from uuvtai.logs.canvas import DYNAMIC, GREY, INK, METHODS, MOVER, PAPER, STATIC, WATER, Canvas, Color
+from uuvtai.logs.canvas import DYNAMIC, FAILED, GREY, INK, METHODS, MOVER, PAPER, STATIC, WATER, Canvas, Color
 from uuvtai.logs.errors import LogError
 from uuvtai.logs.painting import map_canvas, mixed, paint_layers, paint_ruler, paint_truth, paint_walls, paint_water
 from uuvtai.logs.recording import PICTURE_TOPICS, Recording, load_recording
@@ -22,18 +22,20 @@ _ROW = 30
 """[px] per line of the legend"""
 
 
-def picture(paths: Path | Sequence[Path], out: Path, clearance: bool = False, obstacles: bool = True, width_px: int = 1600) -> Path:
+def picture(
+    paths: Path | Sequence[Path], out: Path, clearance: bool = False, obstacles: bool = True, width_px: int = 1600, remark: str = ""
+) -> Path:
     """Draw logs of the same episode into one PNG: trajectories overlaid, one colour per method.
 
-    ``clearance`` shows the distance to mapped obstacles as colours; ``obstacles`` the true bodies and their paths as thin lines.
-    Raises LogError; the file appears whole or not at all.
+    ``clearance`` shows the distance to mapped obstacles as colours; ``obstacles`` the true bodies and their paths as thin lines;
+    ``remark`` stands beside the title. Raises LogError; the file appears whole or not at all.
     """
     found = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
     if not found:
         raise LogError("uuv log picture: give at least one log")
     recordings = [load_recording(path, PICTURE_TOPICS) for path in found]
     check_same_episode(recordings)
-    return save_image(draw_picture(recordings, clearance, obstacles, width_px), Path(out))
+    return save_image(draw_picture(recordings, clearance, obstacles, width_px, remark), Path(out))
 
 
 def check_same_episode(recordings: list[Recording]) -> None:
@@ -58,7 +60,9 @@ def save_image(image: np.ndarray, out: Path) -> Path:
     return out
 
 
-def draw_picture(recordings: list[Recording], clearance: bool = False, obstacles: bool = True, width_px: int = 1600) -> np.ndarray:
+def draw_picture(
+    recordings: list[Recording], clearance: bool = False, obstacles: bool = True, width_px: int = 1600, remark: str = ""
+) -> np.ndarray:
     """The picture as an image (height, width, 3), blue green red."""
     tank = recordings[0].scenario["tank"]
     rows = len(recordings)
@@ -73,7 +77,7 @@ def draw_picture(recordings: list[Recording], clearance: bool = False, obstacles
     paint_walls(canvas, tank)
     _paint_trajectories(canvas, recordings)
     _paint_ends(canvas, recordings)
-    _paint_frame(canvas, recordings, trace=not clearance)
+    _paint_frame(canvas, recordings, not clearance, remark)
     return canvas.image
 
 
@@ -132,9 +136,11 @@ def _paint_ends(canvas: Canvas, recordings: list[Recording]) -> None:
             canvas.cross(recording.positions[-1][:2], 9, METHODS[i % len(METHODS)])
 
 
-def _paint_frame(canvas: Canvas, recordings: list[Recording], trace: bool) -> None:
+def _paint_frame(canvas: Canvas, recordings: list[Recording], trace: bool, remark: str) -> None:
     scenario = recordings[0].scenario
-    canvas.text((_LEFT - 2, 40), f"{scenario['world']} · seed {scenario['seed']} · episode {scenario['episode']}", 27, INK, bold=True)
+    title = f"{scenario['world']} · seed {scenario['seed']} · episode {scenario['episode']}"
+    width = canvas.text((_LEFT - 2, 40), title, 27, INK, bold=True)
+    canvas.text((_LEFT - 2 + width + 24, 40), remark, 19, FAILED)
     moving = f", {scenario['D']} moving at {scenario['v_m_s']:g} m/s" if scenario["D"] else ""
     canvas.text((_LEFT - 2, 70), f"{scenario['S']} resting obstacles{moving}; map and bodies when {recordings[0].method} ends", 18, GREY)
     paint_ruler(canvas)
@@ -148,7 +154,7 @@ def _legend_row(canvas: Canvas, y: float, recording: Recording, color: Color) ->
     canvas.filled(np.array([(_LEFT, y - 8), (_LEFT + 34, y - 8), (_LEFT + 34, y - 3), (_LEFT, y - 3)]), color)
     width = canvas.text((_LEFT + 46, y), recording.method, 19, INK, bold=True)
     closest = "" if recording.min_clearance_m is None else f", closest {recording.min_clearance_m:.2f} m"
-    told = f"{recording.outcome.replace('_', ' ')} after {recording.duration_s:.1f} s{closest}"
+    told = f"{recording.ending} after {recording.duration_s:.1f} s{closest}"
     canvas.text((_LEFT + 46 + max(width, 90) + 14, y), told, 18, GREY)
 
 

@@ -155,6 +155,8 @@ def records(path: Path, skip_chunks: bool = False) -> Iterator[Any]:
         try:
             yield from scanner.records(skip_chunks)
         except DamageError as damage:
+            if scanner.at == 0:
+                raise LogError(f"{path}: is not an MCAP file (no magic bytes); give a log that uuv eval --record wrote") from None
             raise _unreadable(path, f"{damage.reason} at byte {scanner.at}") from None
         if not scanner.finished:
             raise _unreadable(path, f"it ends at byte {scanner.at} without the end mark: its writing was cut off")

@@ -76,6 +76,11 @@ class Recording:
         return self.head.metadata.get("uuv.result", {}).get("outcome", "cut off")
 
     @property
+    def ending(self) -> str:
+        """The outcome in words."""
+        return _ENDINGS.get(self.outcome, self.outcome.replace("_", " "))
+
+    @property
     def duration_s(self) -> float:
         return self.pose.times[-1]
 
@@ -89,6 +94,7 @@ class Recording:
         return min((value[0] for value in self.safety.values), default=None)
 
 
+_ENDINGS = {"ttc": "TTC stop"}
 PICTURE_TOPICS = ("/pose", "/safety", "/map/static", "/map/dynamic", "/map/clearance", "/plan/info")
 VIDEO_TOPICS = (*PICTURE_TOPICS, "/sonar/scan", "/plan/lookahead", "/state", "/action", "/tracks")
 

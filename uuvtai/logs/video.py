@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from uuvtai.logs.canvas import DYNAMIC, FAINT, GREY, INK, METHODS, MOVER, PAPER, ROUTE, STATIC, Color, bgr
+from uuvtai.logs.canvas import DYNAMIC, FAILED, FAINT, GREY, INK, METHODS, MOVER, PAPER, ROUTE, STATIC, Color, bgr
 from uuvtai.logs.errors import LogError
 from uuvtai.logs.painting import (
     map_canvas,
@@ -27,7 +27,7 @@ _MARGINS = (52, 28, 84, 212)
 """[px] left, right, top, bottom"""
 _PANEL = 160
 """[px] height of the panel below the map"""
-_ECHO, _GOOD, _BAD = bgr("#0b7a75"), bgr("#2b8a3e"), bgr("#c92a2a")
+_ECHO, _GOOD = bgr("#0b7a75"), bgr("#2b8a3e")
 _TRIGGER_COLORS = {"initial": GREY, "stuck": bgr("#ae3ec9"), "safety": bgr("#e8590c"), "intersection": bgr("#1971c2")}
 _LEGEND = (
     (ROUTE, "route"),
@@ -46,10 +46,15 @@ Progress = Callable[[int, int], None]
 """Called with (frames done, frames in all)."""
 
 
-def video(path: Path, out: Path, width_px: int = 1280, fps: float = 15.0, speed: float = 1.0, progress: Progress | None = None) -> Path:
-    """Render a log as WebM; ``speed`` 2 shows it twice as fast as it was. Raises LogError; the file appears whole or not at all."""
+def video(
+    path: Path, out: Path, width_px: int = 1280, fps: float = 15.0, speed: float = 1.0, progress: Progress | None = None, remark: str = ""
+) -> Path:
+    """Render a log as WebM; ``speed`` 2 shows it twice as fast as it was, ``remark`` stands beside the title.
+
+    Raises LogError; the file appears whole or not at all.
+    """
     recording, out = load_recording(path), Path(out)
-    artist = FrameArtist(recording, width_px)
+    artist = FrameArtist(recording, width_px, remark)
     times = np.arange(0.0, recording.duration_s, speed / fps)
     times = np.concatenate([times, np.full(1 + round(_HOLD_S * fps), recording.duration_s)])
     part = out.with_name(f".{out.stem}.{os.getpid()}.part.webm")
@@ -115,8 +120,8 @@ def _check_whole(part: Path, out: Path) -> None:
 class FrameArtist:
     """Draws the frame of any moment of a recording; what stays between two maps is drawn once."""
 
-    def __init__(self, recording: Recording, width_px: int = 1280) -> None:
-        self.recording = recording
+    def __init__(self, recording: Recording, width_px: int = 1280, remark: str = "") -> None:
+        self.recording, self.remark = recording, remark
         self._canvas = map_canvas(recording.scenario["tank"], width_px - width_px % 2, _MARGINS)
         self._base_time: float | None = None
         self._base = self._canvas.image
@@ -188,13 +193,14 @@ class FrameArtist:
         canvas, recording, scenario = self._canvas, self.recording, self.recording.scenario
         width = canvas.image.shape[1]
         title = f"{recording.method} · {scenario['world']} · seed {scenario['seed']} · episode {scenario['episode']}"
-        canvas.text((24, 34), title, 22, INK, bold=True)
+        end = 24 + canvas.text((24, 34), title, 22, INK, bold=True)
+        canvas.text((end + 20, 34), self.remark, 17, FAILED)
         moving = f", {scenario['D']} moving at {scenario['v_m_s']:g} m/s" if scenario["D"] else ""
         canvas.text((24, 60), f"{scenario['S']} resting obstacles{moving}; dashed while wholly above or below the vehicle", 16, GREY)
         canvas.text((width - 28, 36), f"{time_s:5.1f} s", 26, INK, bold=True, align="right")
         if time_s >= recording.duration_s:
             good = recording.outcome == "success"
-            canvas.text((width - 150, 36), recording.outcome.replace("_", " "), 24, _GOOD if good else _BAD, bold=True, align="right")
+            canvas.text((width - 150, 36), recording.ending, 24, _GOOD if good else FAILED, bold=True, align="right")
 
     # --------------------------------------------------------------------------------------------------------- panel below
 
@@ -205,7 +211,7 @@ class FrameArtist:
         speed = recording.speed.at(time_s)
         clearance = None if safety is None else safety[0]
         near = clearance is not None and clearance < 0.3
-        self._figure(24, top, "clearance", "-" if clearance is None else f"{clearance:.2f} m", _BAD if near else INK)
+        self._figure(24, top, "clearance", "-" if clearance is None else f"{clearance:.2f} m", FAILED if near else INK)
         self._figure(164, top, "time to collision", "-" if not safety or safety[1] is None else f"{safety[1]:.1f} s", INK)
         self._figure(320, top, "speed", "-" if speed is None else f"{speed:.2f} m/s", INK)
         canvas.text((24, top + 86), "tree", 15, GREY)

@@ -257,10 +257,12 @@ def record_worst(
     finally:
         recorder.abort()
     paths = [_renamed(recorder.paths[job], row.explanation.label) for job, row in zip(jobs, rows, strict=True)]
-    for path in paths:
+    for path, row in zip(paths, rows, strict=True):
         note(f"drawing {path.stem}")
-        picture(path, path.with_suffix(".png"))
-        video(path, path.with_suffix(".webm"))
+        label = row.explanation.label
+        cause = label.replace("_", " ")
+        picture(path, path.with_suffix(".png"), remark=f"{cause}: {causes.CAUSES[label]}")
+        video(path, path.with_suffix(".webm"), remark=cause)
     return paths
 
 

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from uuvtai.loader import ConfigError
+from uuvtai.loader import ConfigError, preset_names
 from uuvtai.tree import FlatTree, NodeUse, read_tree, tree_dot, tree_text
+
+_LEGEND = "episodes: share that ticked the node; acted: control steps whose action the leaf set"
 
 
 @dataclass(frozen=True)
@@ -33,11 +35,15 @@ def tree_report(controller: str, run: Path | None) -> TreeReport:
             raise ConfigError(f"{run}: the tree {controller!r} has changed since that evaluation; run it again with 'uuv eval'")
     else:
         tree = read_tree(controller)
-    return TreeReport(tree_text(tree, use), tree_dot(tree, use), _document(controller, tree, use))
+    text = tree_text(tree, use) + (f"\n\n{_LEGEND}" if use else "")
+    return TreeReport(text, tree_dot(tree, use), _document(controller, tree, use))
 
 
 def _record(run: Path) -> dict[str, Any]:
     path = run / "eval" / "tree.json"
+    if not run.is_dir():
+        shipped = f"; the tree alone: 'uuv tree --controller {run}'" if str(run) in preset_names("tree") else ""
+        raise ConfigError(f"{run}: is no run folder; give one of an evaluation ('uuv eval' prints it){shipped}")
     try:
         return json.loads(path.read_text())
     except OSError as error:
