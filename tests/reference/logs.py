@@ -89,60 +89,80 @@ def snapshots(
         share = step / max(n_step, 1)
         pos, yaw = _pose(share, sway)
         bodies = np.array([body_positions(body, step * DT)[0] for body in BODIES])
-        later = np.array([body_positions(body, step * DT + 1e-3)[0] for body in BODIES])
         ranges, hit, which = cast(pos, yaw, bodies)
         ranges = np.where(hit, ranges + rng.normal(0, 0.02, N_RAY), ranges).astype(np.float32)
         dynamic *= 0.99
         _mark(static, dynamic, pos, yaw, ranges, hit, which)
-        big = maps and (step % 25 == 0 or step == n_step)
         yield EpisodeSnapshot(
-            step=step,
             outcome=outcome if step == n_step else "running",
-            pos_w=pos.astype(np.float32),
-            quat_wb=_quaternion(0.02, -0.03, yaw),
-            vel_b=np.array([0.5, 0.02, 0.0], np.float32),
-            rate_b=rng.normal(0, 0.01, 3).astype(np.float32),
-            current_w=np.zeros(3, np.float32),
-            rpm=rng.normal(500, 20, 6).astype(np.float32),
-            thrust_n=rng.normal(2, 0.1, 6).astype(np.float32),
-            clearance_m=float(np.float32(max(ranges.min() - 0.17, 0.01))),
-            ttc_s=None if step % 3 else float(np.float32(2.3)),
-            obstacle_kind=np.array([2, 3, 2, 0, 1, 2], np.int32),
-            obstacle_pos_w=np.insert(bodies, 3, 0.0, axis=0).astype(np.float32),
-            obstacle_vel_w=np.insert((later - bodies) / 1e-3, 3, 0.0, axis=0).astype(np.float32),
-            obstacle_size=np.insert(np.array([body["size"] for body in BODIES]), 3, 0.0, axis=0).astype(np.float32),
-            obstacle_yaw=np.array([0, 0.6, 0, 0, 0, 0], np.float32),
-            estimate_pos_w=(pos + 0.01).astype(np.float32),
-            estimate_rpy=np.array([0.02, -0.03, yaw], np.float32),
-            measured_vel_b=np.array([0.5, 0.02, 0.0], np.float32),
-            measured_vel_valid=True,
-            measured_rate_b=np.zeros(3, np.float32),
-            depth_m=-float(pos[2]),
-            sonar_fresh=True,
-            sonar_ping_step=step,
-            sonar_range_m=ranges,
-            sonar_doppler_m_s=rng.normal(-0.3, 0.05, N_RAY).astype(np.float32),
-            sonar_intensity=rng.uniform(0.01, 1, N_RAY).astype(np.float32),
-            sonar_hit=hit.astype(np.int32),
-            sonar_ping_vel_b=np.array([0.5, 0.02, 0.0], np.float32),
-            action_applied=np.array([0.8, 0.0, 0.1, -0.2], np.float32),
-            action_teacher=np.array([0.8, 0.0, 0.1, -0.2], np.float32),
-            route_w=np.linspace(pos[:2], GOAL[:2], 40).astype(np.float32),
-            route_fresh=step % 200 == 0,
-            route_planner="rrt" if step == 200 else "voronoi",
-            route_fallback="no_path" if step == 200 else "",
-            replan_trigger="none" if step % 200 else ("initial" if step == 0 else "stuck"),
-            lookahead_w=np.array([*_pose(min(share + 0.06, 1.0), sway)[0][:2], -0.8], np.float32),
-            path_risk=0.4,
+            **_truth(step, pos, yaw, bodies, ranges.min(), rng),
+            **_sensed(step, pos, yaw, ranges, hit, rng),
+            **_planned(step, pos, _pose(min(share + 0.06, 1.0), sway)[0]),
             tracks=np.column_stack([bodies[3:], np.zeros((2, 2)), [0.22, 0.2]]).astype(np.float32),
             track_beams=np.flatnonzero(which >= 3),
-            tree_status=np.array([2, 3, 0, 3, 2, 0] if step % 100 < 70 else [1, 3, 0, 1, 0, 0], np.int32),
-            tree_leaf=4 if step % 100 < 70 else 3,
-            reward=np.array([0.01, 0.02, -0.001, 0.0], np.float32),
-            depth_line=DepthLine(COLUMNS, COLUMNS // 4, 1.0 + COLUMNS / np.float32(64)) if step % 5 == 0 else None,
             depth_image_m=rng.uniform(0.5, 10, (72, 128)).astype(np.float32) if depth and step % 25 == 0 else None,
-            maps=layers(static, dynamic) if big else None,
+            maps=layers(static, dynamic) if maps and (step % 25 == 0 or step == n_step) else None,
         )
+
+
+def _truth(step: int, pos: np.ndarray, yaw: float, bodies: np.ndarray, nearest_m: np.floating, rng: np.random.Generator) -> dict:
+    """Slot 3 is empty."""
+    later = np.array([body_positions(body, step * DT + 1e-3)[0] for body in BODIES])
+    return {
+        "step": step,
+        "pos_w": pos.astype(np.float32),
+        "quat_wb": _quaternion(0.02, -0.03, yaw),
+        "vel_b": np.array([0.5, 0.02, 0.0], np.float32),
+        "rate_b": rng.normal(0, 0.01, 3).astype(np.float32),
+        "current_w": np.zeros(3, np.float32),
+        "rpm": rng.normal(500, 20, 6).astype(np.float32),
+        "thrust_n": rng.normal(2, 0.1, 6).astype(np.float32),
+        "clearance_m": float(np.float32(max(nearest_m - 0.17, 0.01))),
+        "ttc_s": None if step % 3 else float(np.float32(2.3)),
+        "obstacle_kind": np.array([2, 3, 2, 0, 1, 2], np.int32),
+        "obstacle_pos_w": np.insert(bodies, 3, 0.0, axis=0).astype(np.float32),
+        "obstacle_vel_w": np.insert((later - bodies) / 1e-3, 3, 0.0, axis=0).astype(np.float32),
+        "obstacle_size": np.insert(np.array([body["size"] for body in BODIES]), 3, 0.0, axis=0).astype(np.float32),
+        "obstacle_yaw": np.array([0, 0.6, 0, 0, 0, 0], np.float32),
+    }
+
+
+def _sensed(step: int, pos: np.ndarray, yaw: float, ranges: np.ndarray, hit: np.ndarray, rng: np.random.Generator) -> dict:
+    return {
+        "estimate_pos_w": (pos + 0.01).astype(np.float32),
+        "estimate_rpy": np.array([0.02, -0.03, yaw], np.float32),
+        "measured_vel_b": np.array([0.5, 0.02, 0.0], np.float32),
+        "measured_vel_valid": True,
+        "measured_rate_b": np.zeros(3, np.float32),
+        "depth_m": -float(pos[2]),
+        "sonar_fresh": True,
+        "sonar_ping_step": step,
+        "sonar_range_m": ranges,
+        "sonar_doppler_m_s": rng.normal(-0.3, 0.05, N_RAY).astype(np.float32),
+        "sonar_intensity": rng.uniform(0.01, 1, N_RAY).astype(np.float32),
+        "sonar_hit": hit.astype(np.int32),
+        "sonar_ping_vel_b": np.array([0.5, 0.02, 0.0], np.float32),
+        "depth_line": DepthLine(COLUMNS, COLUMNS // 4, 1.0 + COLUMNS / np.float32(64)) if step % 5 == 0 else None,
+    }
+
+
+def _planned(step: int, pos: np.ndarray, ahead: np.ndarray) -> dict:
+    """A new route every 200 steps, the second one by RRT; the tree evades in the last 30 of every 100."""
+    follows = step % 100 < 70
+    return {
+        "action_applied": np.array([0.8, 0.0, 0.1, -0.2], np.float32),
+        "action_teacher": np.array([0.8, 0.0, 0.1, -0.2], np.float32),
+        "route_w": np.linspace(pos[:2], GOAL[:2], 40).astype(np.float32),
+        "route_fresh": step % 200 == 0,
+        "route_planner": "rrt" if step == 200 else "voronoi",
+        "route_fallback": "no_path" if step == 200 else "",
+        "replan_trigger": "none" if step % 200 else ("initial" if step == 0 else "stuck"),
+        "lookahead_w": np.array([*ahead[:2], -0.8], np.float32),
+        "path_risk": 0.4,
+        "tree_status": np.array([2, 3, 0, 3, 2, 0] if follows else [1, 3, 0, 1, 0, 0], np.int32),
+        "tree_leaf": 4 if follows else 3,
+        "reward": np.array([0.01, 0.02, -0.001, 0.0], np.float32),
+    }
 
 
 def result(n_step: int, outcome: str = "success") -> EpisodeResult:
