@@ -5,7 +5,7 @@ import yaml
 
 from uuvtai import loader
 from uuvtai.config import Config
-from uuvtai.loader import ConfigError, load_config, to_yaml, validated
+from uuvtai.loader import ConfigError, load_config, load_training, to_yaml, validated
 
 
 def write(folder, text, name="mine.yaml"):
@@ -118,3 +118,91 @@ def test_resolved_config_is_read_back(tmp_path):
     path = tmp_path / "config.yaml"
     path.write_text(to_yaml(config))
     assert loader.load_resolved(path) == config
+
+
+# ---------------------------------------------------------------------------------------------------------------- training
+
+
+@pytest.mark.parametrize("preset", loader.preset_names("train"))
+def test_every_training_preset_loads_and_is_read_back(tmp_path, preset):
+    config = load_training(preset)
+    path = tmp_path / "config.yaml"
+    path.write_text(to_yaml(config))
+    assert loader.load_resolved(path) == config
+
+
+def test_paper_is_the_table_to_the_letter():
+    """Table app_repro of the paper."""
+    c = load_training("paper")
+    assert (c.train.num_envs, c.train.iterations, c.episode.horizon_steps) == (8, 1200, 3000)
+    assert (c.policy.hidden, c.policy.activation, c.ppo.rollout_steps) == ((256, 256), "elu", 64)
+    assert (c.ppo.learning_rate, c.ppo.epochs, c.ppo.minibatches, c.ppo.clip) == (3e-4, 6, 4, 0.2)
+    assert (c.ppo.gamma, c.ppo.gae_lambda, c.ppo.entropy_weight, c.ppo.value_weight, c.ppo.max_grad_norm) == (0.99, 0.95, 0.003, 1.5, 1.0)
+    assert (c.distill.batch, c.distill.steps, c.distill.learning_rate) == (1024, 2, 1.5e-4)
+    assert (c.world_model.latent, c.world_model.hidden, c.world_model.batch, c.world_model.steps) == (64, (128, 128), 2048, 2)
+    assert (c.world_model.learning_rate, c.world_model.reconstruction_weight, c.world_model.dynamics_weight) == (3e-4, 1.0, 0.2)
+    assert (c.uncertainty.ema, c.uncertainty.gain, c.uncertainty.max_scale) == (0.05, 0.8, 2.0)
+    beyond = ("predict_change", "normalise_targets", "stop_target_gradient", "beta_nll")
+    assert not any(getattr(c.world_model, switch) for switch in beyond)
+    assert not (c.policy.residual or c.risk.enabled)
+    assert c.sensors == load_config("pool", "paper").sensors
+
+
+def test_the_paper_schedule_meets_the_equation():
+    """lambda_t: 1 up to 800, 0.2 (1 - (t - 800) / 800) up to 1600, then 0 (paper, equation of the staged schedule)."""
+    from uuvtai.learn.schedule import piecewise_linear
+
+    points = load_training("paper").distill.schedule
+    for t in (0, 400, 800, 801, 1000, 1199, 1500, 1600, 2000):
+        expected = 1.0 if t <= 800 else 0.2 * (1 - (t - 800) / 800) if t <= 1600 else 0.0
+        assert piecewise_linear(points, t / 1200) == pytest.approx(expected, abs=1e-6)
+
+
+def differing(config, base):
+    """Dotted keys in which two configs differ."""
+    a, b = config.model_dump(), base.model_dump()
+    return {f"{section}.{key}" for section in a for key in a[section] if a[section][key] != b[section][key]}
+
+
+@pytest.mark.parametrize(
+    ("row", "keys"),
+    [
+        ("ppo", {"distill.schedule", "distill.steps"}),
+        ("distill_20", {"distill.schedule"}),
+        ("full", set()),
+        ("no_risk_scaling", {"uncertainty.gain"}),
+        ("no_world_model", {"world_model.as_features"}),
+        ("no_distill", {"distill.schedule", "distill.steps"}),
+    ],
+)
+def test_rows_of_the_tables_differ_in_one_thing(row, keys):
+    assert differing(load_training(row), load_training("curriculum")) == keys
+
+
+def test_a_training_preset_names_presets_and_changes_them(tmp_path):
+    write(tmp_path, "world: gauntlet\nsensors: nominal\ntrain: {num_envs: 2}\n", "base.yaml")
+    config = load_training(write(tmp_path, "extends: base.yaml\nworld: {n_dynamic: 2}\n"))
+    assert config.world == load_config("gauntlet", overrides={"world.n_dynamic": 2}).world
+    assert config.sensors == load_config("pool", "nominal").sensors
+    assert config.train.num_envs == 2
+    moved = load_training(str(tmp_path / "mine.yaml"), ["train.num_envs=3"], world="maze", sensors="clean")
+    assert moved.world == load_config("maze", overrides={"world.n_dynamic": 2}).world
+    assert moved.sensors == load_config("pool", "clean").sensors
+    assert moved.train.num_envs == 3
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("world: {preset: pol}\n", "did you mean 'pool'"),
+        ("world:\n  preset: 3\n", "mine.yaml:2: world.preset must be the name or path of a world preset, got 3"),
+        ("ppo:\n  gama: 1\n", "mine.yaml:2: unknown key 'ppo.gama'; did you mean 'gamma'?"),
+        ("distill: {schedule: [[1, 0], [0, 1]]}\n", "shares not falling"),
+        ("train: {seed: 500000}\n", "must differ from train.seed"),
+        ("extends: curiculum\n", "did you mean 'curriculum'"),
+    ],
+)
+def test_a_bad_training_preset_is_named_with_its_line(tmp_path, text, says):
+    with pytest.raises(ConfigError) as error:
+        load_training(write(tmp_path, text))
+    assert says in str(error.value)

@@ -82,7 +82,7 @@ def load_training(
     for kind, name in named.items():
         if name is not None and not isinstance(name, str):
             raise ConfigError(
-                f"{layer.origin.get(f'{kind}.preset', preset)}: {kind}.preset must be the name or path of a preset, got {name!r}"
+                f"{layer.origin.get(f'{kind}.preset', preset)}: {kind}.preset must be the name or path of a {kind} preset, got {name!r}"
             )
     chosen_world = world or named.get("world") or DEFAULT_WORLD
     merged = _scene(chosen_world, sensors or named.get("sensors"), vehicle or named.get("vehicle"))

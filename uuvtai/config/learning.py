@@ -148,7 +148,7 @@ class TrainConfig(Section):
     evaluate_every: Count = 0
     """iterations between evaluations without exploration noise; 0 = none"""
     evaluate_episodes: PositiveCount = 64
-    evaluate_seed: Annotated[int, Field(ge=0, lt=2**31)] = 500_000
+    evaluate_seed: Annotated[int, Field(ge=0, lt=2**31, validate_default=True)] = 500_000
     """scenarios of these evaluations; training never meets them"""
     patience: PositiveCount = 10
     """iterations in a row with values that are not finite before the run stops with an error (EC)"""
