@@ -2,13 +2,14 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 import uuvtai
-from uuvtai.env import VectorEnv
+from uuvtai.env import VectorEnv, observation_sha256
 from uuvtai.kernels.outcome import OUTCOMES
 from uuvtai.loader import ConfigError
 
@@ -236,6 +237,68 @@ def test_leaf_is_the_node_whose_action_is_told(env):
         seen |= set(info["leaf"].tolist())
     actions = {i for i, kind in enumerate(env.sim.tree.types) if kind in ("BackOff", "Hold", "Evade", "Unstick", "FollowRoute")}
     assert seen <= actions and "FollowRoute" in {env.node_names[i] for i in seen}
+
+
+def test_columns_find_every_group(env):
+    obs, _info = env.reset(seed=SEED)
+    assert list(env.columns) == [row.name for row in env.observation_table]
+    assert env.columns["goal"] == slice(0, 3) and env.columns["sector_range"] == slice(12, 24)
+    np.testing.assert_allclose(obs[:, env.columns["sector_range"]], env.sim.s.features.sector_range_m.to_numpy())
+
+
+def test_bodies_and_advice_stand_behind_the_paper_observation(small, env, monkeypatch):
+    """Switched on by the config alone: what was there stays as it was, the tree's action is the one that is told."""
+    plain = VectorEnv(small.sim, seed=SEED)
+    wanted = [plain.reset()[0].clone(), *(plain.step(full([0.6, 0, 0, 0.05]))[0].clone() for _ in range(80))]
+    more = small.config.features.model_copy(update={"n_track": 2, "teacher": True})
+    monkeypatch.setattr(small.sim, "config", small.config.model_copy(update={"features": more}))
+    with VectorEnv(small.sim, seed=SEED) as shown:
+        assert shown.observation_sha256 != plain.observation_sha256
+        assert list(shown.columns)[-4:] == ["teacher_action", "teacher_conflict", "teacher_evade_cost", "teacher_class"]
+        obs, info = shown.reset()
+        seen = 0
+        for step, paper in enumerate(wanted):
+            assert torch.equal(obs[:, : plain.num_obs], paper), f"step {step}"
+            assert torch.equal(obs[:, shown.columns["teacher_action"]], info["teacher_action"])
+            assert (obs[:, shown.columns["teacher_class"]].sum(dim=1) == (info["leaf"] >= 0)).all()
+            moving = (small.sim.s.tracks.alive.to_numpy() * small.sim.s.tracks.moving.to_numpy()).sum(axis=1)
+            np.testing.assert_array_equal(obs[:, shown.columns["body_valid"]].sum(dim=1), moving.clip(max=2))
+            seen += int(moving.sum())
+            obs, *_rest, info = shown.step(full([0.6, 0, 0, 0.05]))
+        assert seen > 0, "no body was ever tracked"
+        obs = obs.clone()
+        arrays = shown.capture()
+        assert torch.equal(shown.restore(arrays)[0], obs)
+
+
+def test_fingerprint_tells_observations_apart(env):
+    """It changes with a name, a width, a unit, a frame or the order, and with nothing else."""
+    table = env.observation_table
+    first, second, *rest = table
+    assert env.observation_sha256 == observation_sha256(table) and len(env.observation_sha256) == 64
+    assert observation_sha256((replace(first, meaning="another wording"), second, *rest)) == env.observation_sha256
+    changes = (
+        (second, first, *rest),
+        (replace(first, name="goals"), second, *rest),
+        (replace(first, slice=slice(0, 2)), second, *rest),
+        (replace(first, unit="km"), second, *rest),
+        (replace(first, frame="world"), second, *rest),
+        table[:-1],
+    )
+    assert len({observation_sha256(changed) for changed in changes} | {env.observation_sha256}) == len(changes) + 1
+
+
+def test_what_is_not_finite_is_told_by_column(env):
+    obs, _info = env.reset(seed=SEED)
+    assert env.not_finite() == {}
+    rollout, reward = obs.repeat(5, 1, 1), torch.zeros(5, N)
+    assert env.not_finite(rollout, reward) == {}
+    assert env.not_finite(rollout, torch.full((5, N), 3e38)) == {}, "a sum that overflows is no NaN"
+    rollout[2, 3, env.columns["depth"]] = torch.nan
+    rollout[4, :, env.columns["sector_ttc"].start + 5] = torch.inf
+    rollout[4, 0, env.columns["sector_ttc"].start + 6] = -torch.inf
+    reward[1, 1] = torch.nan
+    assert env.not_finite(rollout, reward) == {"depth": 1, "sector_ttc": N + 1, "reward": 1}
 
 
 def test_gradients_do_not_leak_into_the_simulator(env):

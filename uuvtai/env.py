@@ -7,6 +7,7 @@ must outlive the next ``step`` or ``reset``.
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -44,6 +45,12 @@ class ObservationColumn:
     meaning: str
 
 
+def observation_sha256(table: tuple[ObservationColumn, ...]) -> str:
+    """Fingerprint of names, widths, units and frames in their order: policies of another one cannot read this observation."""
+    rows = [(column.name, column.slice.stop - column.slice.start, column.unit, column.frame) for column in table]
+    return hashlib.sha256(json.dumps(rows).encode()).hexdigest()
+
+
 class VectorEnv:
     """``num_envs`` episodes side by side; an env whose episode ends begins its next one in the same step.
 
@@ -66,8 +73,10 @@ class VectorEnv:
         self.check_actions = sim.device.type == "cpu" if check_actions is None else check_actions
         self.observation_table = tuple(
             ObservationColumn(column.name, slice(first, first + width), column.unit, column.frame, column.meaning)
-            for column, first, width in placed_columns(sim.config.features.n_sector)
+            for column, first, width in placed_columns(sim.config.features)
         )
+        self.columns = {column.name: column.slice for column in self.observation_table}
+        self.observation_sha256 = observation_sha256(self.observation_table)
         self.num_obs, self.num_actions = self.observation_table[-1].slice.stop, NUM_ACTIONS
         self._obs = torch.zeros(self.num_envs, self.num_obs, device=self.device)
         self._first_number = torch.arange(self.num_envs, dtype=torch.int32, device=self.device)
@@ -142,6 +151,20 @@ class VectorEnv:
             self._begin(ended)
         sim.read_into(sim.s.teacher.leaf, info["leaf"])
         return self._obs, sim.reward, self._terminated, self._truncated, dict(info)
+
+    def not_finite(self, obs: torch.Tensor | None = None, reward: torch.Tensor | None = None) -> dict[str, int]:
+        """How many values are NaN or infinite, by column of the observation and for 'reward'; empty = none is.
+
+        ``obs`` (..., num_obs) and ``reward`` may be those of a whole rollout (default: the newest): one pass over them, one wait.
+        """
+        values = self._obs if obs is None else obs
+        rewards = self.sim.reward if reward is None else reward
+        if bool(torch.isfinite(values.sum() + rewards.sum())):  # whatever is not finite makes a sum so; large numbers may too
+            return {}
+        counts = (~torch.isfinite(values)).reshape(-1, self.num_obs).sum(dim=0)
+        found = {name: int(counts[place].sum()) for name, place in self.columns.items()}
+        found["reward"] = int((~torch.isfinite(rewards)).sum())
+        return {name: count for name, count in found.items() if count > 0}
 
     @property
     def node_names(self) -> tuple[str, ...]:

@@ -146,9 +146,9 @@ class Sim:
         set_scene(self.s.scene, self.config.world, n_static, n_dynamic, speed_m_s)
 
     def observe(self) -> torch.Tensor:
-        """From the next pass on, write every awake row's observation into the tensor returned, (n_env, n_obs) (``features.COLUMNS``)."""
+        """From the next pass on, write every awake row's observation into the tensor returned, (n_env, n_obs) (``features.columns``)."""
         if self.observation is None:
-            width = features.observation_width(self.config.features.n_sector)
+            width = features.observation_width(self.config.features)
             self.observation = torch.zeros(self.num_envs, width, device=self.device)
         return self.observation
 
@@ -285,7 +285,17 @@ class Sim:
             self._teach()
         if self.observation is not None:
             with self._stage("features"):
-                features.write_observation(self.observation, s.features, s.route, s.ego, s.mission, s.clock)
+                self._observe(self.observation)
+
+    def _observe(self, obs: torch.Tensor) -> None:
+        c, s = self.config, self.s
+        features.write_observation(obs, s.features, s.route, s.ego, s.mission, s.clock, c.features)
+        if c.features.n_track > 0:
+            features.write_bodies(
+                obs, s.features, s.forecast, s.tracks, s.ego, s.clock, c.features, c.forecast, c.tracking, c.world.tank, c.episode
+            )
+        if c.features.teacher:
+            features.write_advice(obs, s.teacher, s.table, s.clock, c.features)
 
     def _plan(self) -> None:
         c, s = self.config, self.s

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from tests.reference.forecast import turned
+from tests.reference.habits import expected_turn_rate
+
 
 def sectors(range_m, doppler_m_s, hit, turned, n_sector, max_range_m, ttc_cap_s):
     """(range, ttc, closing, valid), each (n_sector,): beams binned by their bearing after a turn of ``turned`` [rad] since."""
@@ -50,3 +53,47 @@ def observation(values):
         "sector_ttc": values["sector_ttc_s"],
         "sector_closing": values["sector_closing_m_s"],
     }
+
+
+def closest_approach(pos, radius, own, vel, dt):
+    """(distance to the surface, time) at the closest approach of two points that move straight between samples; pos (n, 2)."""
+    t = dt * np.arange(len(pos))
+    away = pos - own - np.outer(t, vel)
+    course = np.diff(away, axis=0)
+    share = np.clip(-(away[:-1] * course).sum(axis=1) / (course**2).sum(axis=1).clip(1e-9), 0, 1)
+    gap = np.linalg.norm(away[:-1] + share[:, None] * course, axis=1) - (radius[:-1] + share * np.diff(radius))
+    best = int(np.argmin(gap))
+    return gap[best], t[best] + share[best] * dt
+
+
+def bodies(v, n_body, forecast_cfg, tracking, tank, rules):
+    """Columns of the moving bodies of one env, closest approach first, as arrays (n_body, width); ``v`` by 'struct.array'."""
+    yaw, own = v["ego.rpy"][2], v["ego.pos_w"]
+    vel = (rotation_wb(*v["ego.rpy"]) @ v["ego.vel_b"])[:2]
+    rows = []
+    for track in np.flatnonzero(v["forecast.radius_m"][:, 0] >= 0):
+        pos, radius, state = v["forecast.pos_w"][track], v["forecast.radius_m"][track], v["tracks.state"][track]
+        gap, time = closest_approach(pos, radius, own[:2], vel, tracking.forecast_dt_s)
+        rate, rate_var = v["tracks.turn_rate"][track], v["tracks.turn_cov"][track, 4]
+        water = np.array([v["forecast.above_w"][track] - own[2], own[2] - v["forecast.below_w"][track]])
+        rows.append(
+            {
+                "body_valid": [1.0],
+                "body_position": turned(pos[0] - own[:2], -yaw),
+                "body_velocity": turned(state[2:] - vel, -yaw),
+                "body_turn_rate": [expected_turn_rate(rate, rate_var, forecast_cfg, tracking)],
+                "body_radius": [radius[0]],
+                "body_free_water": np.minimum(water, tank.z_m[1] - tank.z_m[0]),
+                "body_age": [(v["clock.step"] - v["tracks.seen_step"][track]) * rules.control_dt_s],
+                "body_closest": [gap],
+                "body_closest_time": [time],
+            }
+        )
+    rows = sorted(rows, key=lambda row: row["body_closest"][0])[:n_body]
+    widths = {"body_position": 2, "body_velocity": 2, "body_free_water": 2}
+    names = ("valid", "position", "velocity", "turn_rate", "radius", "free_water", "age", "closest", "closest_time")
+    out = {f"body_{name}": np.zeros((n_body, widths.get(f"body_{name}", 1))) for name in names}
+    for slot, row in enumerate(rows):
+        for name, value in row.items():
+            out[name][slot] = value
+    return out

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from uuvtai.config.section import NonNegative, Positive, PositiveCount, Section
+from uuvtai.config.section import Count, NonNegative, Positive, PositiveCount, Section
 
 
 class ClearanceConfig(Section):
@@ -67,7 +67,12 @@ class RouteConfig(Section):
 
 
 class FeaturesConfig(Section):
-    """Sectors of the sonar features."""
+    """What the observation holds: the sonar by sectors, and what may be added to the paper's phi."""
 
     n_sector: PositiveCount = 12
     ttc_cap_s: Positive = 10.0
+    """times to collision or conflict are cut off here"""
+    n_track: Count = 0
+    """moving bodies with columns of their own, those that come closest; 0 = none (the paper's phi)"""
+    teacher: bool = False
+    """the behaviour tree's action, and why it takes it, as columns; false = the paper's phi"""

@@ -1,16 +1,28 @@
 """Sector features of the newest sonar scan (nearest range, fastest approach, smallest time to collision), and the policy's observation.
 
-``COLUMNS`` declares the observation once: the kernel writes by it and the environment's table is read off it.
+``columns`` declares the observation once: the kernels write by it and the environment's table is read off it.
 """
-
-from typing import Any, NamedTuple
 
 import taichi as ti
 
-from uuvtai.config import FeaturesConfig, SonarConfig
+from uuvtai.config import EpisodeConfig, FeaturesConfig, ForecastConfig, SonarConfig, TankConfig, TrackingConfig
+from uuvtai.kernels.advice import TEACHER_COLUMNS
+from uuvtai.kernels.approach import BODY_COLUMNS, closest_approach, next_body
+from uuvtai.kernels.columns import Column
 from uuvtai.kernels.geometry import FAR_M, TWO_PI, quaternion_wb, rotation_wb
 from uuvtai.kernels.signature import Const, In, Out, spread
-from uuvtai.state import ClockState, FeatureState, MissionState, Proprioception, RouteState, SonarScan
+from uuvtai.state import (
+    ClockState,
+    FeatureState,
+    ForecastState,
+    MissionState,
+    Proprioception,
+    RouteState,
+    SonarScan,
+    TeacherState,
+    TrackState,
+    TreeTable,
+)
 
 
 @ti.kernel
@@ -148,22 +160,6 @@ def _sector_closing(env, sector, features: In[FeatureState]):
     return features.sector_closing_m_s[env, sector]
 
 
-PER_SECTOR = 0
-"""Width of a column group that has one column per sector."""
-
-
-class Column(NamedTuple):
-    """A group of neighbouring columns of the observation, all of one quantity."""
-
-    name: str
-    width: int
-    unit: str
-    frame: str
-    meaning: str
-    source: Any
-    """func that returns the values of one env, or the value of one of its sectors"""
-
-
 COLUMNS = (
     Column("goal", 3, "m", "body", "from the position estimate to the goal", _goal),
     Column("heading_error", 2, "1", "level", "sine, cosine of the look-ahead point's bearing, left positive", _heading_error),
@@ -171,36 +167,48 @@ COLUMNS = (
     Column("yaw_rate", 1, "rad/s", "body", "of the gyro", _yaw_rate),
     Column("depth", 1, "m", "world", "pressure depth, positive down", _depth),
     Column("tilt", 2, "rad", "level", "roll, pitch of the IMU", _tilt),
-    Column("sector_range", PER_SECTOR, "m", "body", "smallest range; maximum range where nothing returned", _sector_range),
+    Column("sector_range", 1, "m", "body", "smallest range; maximum range where nothing returned", _sector_range, "sector"),
     Column("lookahead", 3, "m", "body", "to the look-ahead point of the route; zero without a route", _lookahead),
     Column("cross_track", 1, "m", "route", "distance from the route, positive = left of it", _cross_track),
     Column("remaining", 1, "m", "route", "route length still ahead; the straight distance without a route", _remaining),
     Column("path_risk", 1, "1", "route", "mean risk over the look-ahead segment", _path_risk),
     Column("tilt_rate", 2, "rad/s", "body", "roll rate, pitch rate of the gyro", _tilt_rate),
-    Column("sector_ttc", PER_SECTOR, "s", "body", "smallest time to collision, capped", _sector_ttc),
-    Column("sector_closing", PER_SECTOR, "m/s", "body", "largest closing speed, own motion included; 0 = no return", _sector_closing),
+    Column("sector_ttc", 1, "s", "body", "smallest time to collision, capped", _sector_ttc, "sector"),
+    Column("sector_closing", 1, "m/s", "body", "largest closing speed, own motion included; 0 = no return", _sector_closing, "sector"),
 )
-"""The observation, in order: the paper's phi and what it names as the world model's targets, which are the first 24 (with 12 sectors)."""
+"""The observation, in order: the paper's phi and what it names as the world model's targets, which are the first 24 (with 12 sectors).
+
+A config may add columns behind them (``columns``).
+"""
 
 
-def placed_columns(n_sector: int) -> list[tuple[Column, int, int]]:
+def columns(cfg: FeaturesConfig) -> tuple[Column, ...]:
+    """The groups of a config's observation: ``COLUMNS``, then the bodies' where any are asked for, then the tree's."""
+    return COLUMNS + (BODY_COLUMNS if cfg.n_track > 0 else ()) + (TEACHER_COLUMNS if cfg.teacher else ())
+
+
+def placed_columns(cfg: FeaturesConfig) -> list[tuple[Column, int, int]]:
     """(group, first column, number of columns) of every group."""
     out, first = [], 0
-    for column in COLUMNS:
-        width = n_sector if column.width == PER_SECTOR else column.width
+    for column in columns(cfg):
+        width = column.width * {"": 1, "sector": cfg.n_sector, "body": cfg.n_track}[column.per]
         out.append((column, first, width))
         first += width
     return out
 
 
-def observation_width(n_sector: int) -> int:
+def observation_width(cfg: FeaturesConfig) -> int:
     """Columns of the observation."""
-    return sum(width for _column, _first, width in placed_columns(n_sector))
+    return sum(width for _column, _first, width in placed_columns(cfg))
 
 
-def _sources(n_sector, of_sectors):
-    """(source, first column, width) of the groups that are, or are not, per sector; plain Python, unrolled by the kernel."""
-    return [(c.source, first, width) for c, first, width in placed_columns(n_sector) if (c.width == PER_SECTOR) == of_sectors]
+def _sources(group, cfg):
+    """(source, first column, width of one) of the groups of ``group`` (a tuple of columns); plain Python, unrolled by the kernels."""
+    return [(c.source, first, c.width) for c, first, _width in placed_columns(cfg) if c in group]
+
+
+_SECTOR_COLUMNS = tuple(column for column in COLUMNS if column.per == "sector")
+_OWN_COLUMNS = tuple(column for column in COLUMNS if not column.per)
 
 
 @ti.kernel
@@ -211,15 +219,72 @@ def write_observation(
     ego: In[Proprioception],
     mission: In[MissionState],
     clock: In[ClockState],
+    features_cfg: Const[FeaturesConfig],
 ):
     """Observation (n_env, n_obs) of the awake rows, raw SI units, in the order of ``COLUMNS``."""
     n, n_sector = ti.static(features.sector_range_m.shape[0], features.sector_range_m.shape[1])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
         if pad == 0 and clock.awake[env] == 1:
-            for source, first, width in ti.static(_sources(n_sector, False)):
+            for source, first, width in ti.static(_sources(_OWN_COLUMNS, features_cfg)):
                 value = source(env, route, ego, mission)
                 for i in ti.static(range(width)):
                     obs[env, first + i] = ti.cast(value[i], ti.f32)
             for sector in range(n_sector):
-                for source, first, _width in ti.static(_sources(n_sector, True)):
+                for source, first, _width in ti.static(_sources(_SECTOR_COLUMNS, features_cfg)):
                     obs[env, first + sector] = ti.cast(source(env, sector, features), ti.f32)
+
+
+@ti.kernel
+def write_bodies(
+    obs: ti.types.ndarray(dtype=ti.f32, ndim=2),  # type: ignore[valid-type]
+    features: Out[FeatureState],
+    forecast: In[ForecastState],
+    tracks: In[TrackState],
+    ego: In[Proprioception],
+    clock: In[ClockState],
+    features_cfg: Const[FeaturesConfig],
+    forecast_cfg: Const[ForecastConfig],
+    tracking: Const[TrackingConfig],
+    tank: Const[TankConfig],
+    rules: Const[EpisodeConfig],
+):
+    """Columns of the ``n_track`` moving bodies that come closest to the awake rows, in the order of ``BODY_COLUMNS``."""
+    n, n_track = ti.static(tracks.alive.shape[0], tracks.alive.shape[1])
+    for env, track in ti.ndrange(n, n_track):
+        if clock.awake[env] == 1:
+            features.closest_m[env, track] = FAR_M
+            if forecast.radius_m[env, track, 0] >= 0.0:
+                gap, time = closest_approach(env, track, forecast, ego, tracking)
+                features.closest_m[env, track], features.closest_s[env, track] = gap, time
+    for env, pad in ti.ndrange(n, ti.static(spread(n))):
+        if pad == 0 and clock.awake[env] == 1:
+            track, used = -1, 1
+            for slot in range(ti.static(features_cfg.n_track)):
+                if used == 1:
+                    track = next_body(env, track, features)
+                    used = ti.cast(track >= 0, ti.i32)
+                for source, first, width in ti.static(_sources(BODY_COLUMNS, features_cfg)):
+                    for i in ti.static(range(width)):
+                        obs[env, first + slot * width + i] = 0.0
+                    if used == 1:
+                        value = source(env, track, features, forecast, tracks, ego, clock, forecast_cfg, tracking, tank, rules)
+                        for i in ti.static(range(width)):
+                            obs[env, first + slot * width + i] = ti.cast(value[i], ti.f32)
+
+
+@ti.kernel
+def write_advice(
+    obs: ti.types.ndarray(dtype=ti.f32, ndim=2),  # type: ignore[valid-type]
+    teacher: In[TeacherState],
+    table: In[TreeTable],
+    clock: In[ClockState],
+    features_cfg: Const[FeaturesConfig],
+):
+    """Columns of what the behaviour tree does now in the awake rows, in the order of ``TEACHER_COLUMNS``."""
+    n = ti.static(clock.awake.shape[0])
+    for env, pad in ti.ndrange(n, ti.static(spread(n))):
+        if pad == 0 and clock.awake[env] == 1:
+            for source, first, width in ti.static(_sources(TEACHER_COLUMNS, features_cfg)):
+                value = source(env, teacher, table, features_cfg)
+                for i in ti.static(range(width)):
+                    obs[env, first + i] = ti.cast(value[i], ti.f32)

@@ -141,3 +141,7 @@ class FeatureState:
     """[m/s] largest closing speed in the sector, ego motion included; 0 where nothing returned"""
     sector_valid: ti.Field = array("n_env", "n_sector", dtype=ti.i32)
     """1 = at least one beam of the sector returned"""
+    closest_m: ti.Field = array("n_env", "n_track", scratch=True)
+    """[m] closest approach of each moving track within its forecast, FAR_M = does not move; written where the observation shows bodies"""
+    closest_s: ti.Field = array("n_env", "n_track", scratch=True)
+    """[s] time until then"""
