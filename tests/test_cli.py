@@ -44,6 +44,23 @@ def uuv(capfd, *arguments):
         (["eval", "-S", "-1"], "greater than or equal to 0"),
         (["eval", "-v", "nan"], "finite"),
         (["eval", "--device", "tpu"], "use auto, cpu or cuda"),
+        (["eval", "no/such/run"], "is no trained policy"),
+        (["eval", "bestt"], "is no trained policy"),
+        (["eval", "--controller", "none"], "'none' is no preset"),
+        (["train", "curiculum"], "did you mean 'curriculum'"),
+        (["train", "nowhere.yaml"], "no such file"),
+        (["train", "smoke", "--set", "ppo.gama=1"], "did you mean 'gamma'"),
+        (["train", "smoke", "--iterations", "0"], "--iterations 0: at least 1"),
+        (["train", "smoke", "--num-envs", "0"], "train.num_envs"),
+        (["train", "smoke", "--num-envs", "900000"], "GiB"),
+        (["train", "smoke", "--seed", "-1"], "train.seed"),
+        (["train", "smoke", "--seed", "500000"], "must differ from train.seed"),
+        (["train", "smoke", "-v", "nan"], "finite"),
+        (["train", "smoke", "--world", "pol"], "did you mean 'pool'"),
+        (["train", "smoke", "--device", "tpu"], "use auto, cpu or cuda"),
+        (["train", "--resume", "no/such/run"], "is no run folder"),
+        (["train", "smoke", "--resume", "run"], "PRESET smoke: a resumed run keeps its own"),
+        (["train", "--resume", "run", "--seed", "3"], "--seed 3: a resumed run keeps its own"),
         (["simulate", "--seconds", "nan"], "seconds"),
         (["simulate", "--seconds", "-1"], "seconds"),
         (["simulate", "--seconds", "1", "--wrench", "1,2"], "give 6 finite numbers"),
@@ -56,7 +73,7 @@ def uuv(capfd, *arguments):
         (["profile", "--seconds", "0"], "positive"),
         (["presets", "show"], "uuv presets show NAME"),
         (["presets", "show", "nothing"], "is no preset"),
-        (["tree", "no/such/run"], "cannot be read"),
+        (["tree", "no/such/run"], "is no run folder"),
     ],
 )
 def test_bad_usage_is_one_message_and_exit_2(capfd, tmp_path, monkeypatch, arguments, says):
@@ -88,9 +105,19 @@ def test_presets_are_listed_and_shown(capfd):
     assert code == 0
     assert {"pool", "gauntlet", "maze", "netpen", "transfer", "open"} <= set(listed["world"])
     assert {"clean", "paper", "nominal", "harsh"} == set(listed["sensors"])
+    assert {"paper", "ppo", "distill_20", "curriculum", "full", "no_risk_scaling", "no_world_model", "no_distill", "smoke"} <= set(
+        listed["train"]
+    )
     code, out, _ = uuv(capfd, "presets", "show", "gauntlet")
     assert code == 0
     assert "n_dynamic: 6" in out
+    code, out, err = uuv(capfd, "presets", "show", "paper")
+    assert code == 0
+    assert "range_sigma_m: 0.02" in out
+    assert "uuv presets show train/paper" in err
+    code, out, _ = uuv(capfd, "presets", "show", "train/paper")
+    assert code == 0
+    assert "rollout_steps: 64" in out
 
 
 def test_doctor_finds_everything(capfd, tmp_path, monkeypatch):
