@@ -73,6 +73,8 @@ def measure(job: Job) -> list[Row]:
     num_envs, steps, updates, passes = (64, 450, 4, 1) if job.quick else (320, 700, 300, 10)
     env = uuvtai.make("pool", num_envs=num_envs, seed=TRAIN_SEED)
     train, held_out = (driven(env, seed, steps, job) for seed in (TRAIN_SEED, HELD_OUT_SEED))
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # layers this narrow gain little from a second one, and lose much where other programs run
     models = {}
     for name, switches in SWITCHES.items():
         models[name] = trained(train, WorldModelConfig(**switches), updates // 2)
@@ -81,6 +83,7 @@ def measure(job: Job) -> list[Row]:
     rows = [*prediction_rows(full, held_out), switch_row(models, held_out)]
     rows += event_rows(full, held_out, env.config.episode.control_dt_s)
     rows += risk_rows(full, train, held_out, env, passes)
+    torch.set_num_threads(threads)
     return rows + cost_rows(job)
 
 
