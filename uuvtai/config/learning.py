@@ -53,7 +53,9 @@ class PpoConfig(Section):
     target_kl: NonNegative = 0.0
     """0 = fixed learning rate; else the rate follows the KL divergence of every update (as rsl_rl does)"""
     shuffle: bool = False
-    """draw minibatches at random instead of as contiguous blocks of envs"""
+    """draw minibatches at random instead of as contiguous blocks, each of all envs in a span of steps"""
+    bfloat16: bool = False
+    """products of the hidden layers in bfloat16 during the update: faster where the CPU has the instructions, the gradient is coarser"""
     normalise_observations: bool = True
     normalise_values: bool = True
 

@@ -48,20 +48,27 @@ class Policy(nn.Module):
     ``residual_limit`` tanh(network): the teacher itself at birth.
     """
 
-    def __init__(self, n_in: int, config: PolicyConfig, teacher_slice: slice | None, generator: torch.Generator) -> None:
+    def __init__(
+        self,
+        n_in: int,
+        config: PolicyConfig,
+        teacher_slice: slice | None,
+        generator: torch.Generator,
+        num_actions: int = NUM_ACTIONS,
+    ) -> None:
         """``teacher_slice``: columns of x with the teacher's action; ValueError where a residual policy has none."""
         super().__init__()
-        if config.residual and (teacher_slice is None or len(range(n_in)[teacher_slice]) != NUM_ACTIONS):
+        if config.residual and (teacher_slice is None or len(range(n_in)[teacher_slice]) != num_actions):
             raise ValueError(
-                f"policy.residual adds to the teacher's {NUM_ACTIONS} commands, but the observation has no such columns "
+                f"policy.residual adds to the teacher's {num_actions} commands, but the observation has no such columns "
                 f"(got {teacher_slice}): set features.teacher=true or policy.residual=false"
             )
         if config.initial_std < config.min_std:
             raise ValueError(f"policy.initial_std {config.initial_std:g} lies below the floor policy.min_std {config.min_std:g}")
         self.config, self.n_in, self.teacher_slice = config, n_in, teacher_slice
-        self.actor = mlp((n_in, *config.hidden, NUM_ACTIONS), config.activation, generator, 0.0 if config.residual else _MEAN_GAIN)
+        self.actor = mlp((n_in, *config.hidden, num_actions), config.activation, generator, 0.0 if config.residual else _MEAN_GAIN)
         self.critic = mlp((n_in, *config.hidden, 1), config.activation, generator, _VALUE_GAIN)
-        self.log_std = nn.Parameter(torch.full((NUM_ACTIONS,), math.log(config.initial_std)))
+        self.log_std = nn.Parameter(torch.full((num_actions,), math.log(config.initial_std)))
         self.observation_norm = RunningNorm(n_in, config.clip_observation)
         self.value_norm = RunningNorm(1, math.inf)
 
@@ -85,7 +92,10 @@ class Policy(nn.Module):
 
     def mean(self, normalised: torch.Tensor, teacher_action: torch.Tensor | None) -> torch.Tensor:
         """(..., 4) mean action of normalised inputs; ``teacher_action`` is what ``teacher_action(x)`` gave."""
-        out = self.actor(normalised)
+        return self.mean_of(self.actor(normalised), teacher_action)
+
+    def mean_of(self, out: torch.Tensor, teacher_action: torch.Tensor | None) -> torch.Tensor:
+        """(..., 4) mean action from the actor network's output (..., 4)."""
         if not self.config.residual or teacher_action is None:
             return out
         return teacher_action + self.config.residual_limit * torch.tanh(out)

@@ -17,6 +17,7 @@ import torch
 from uuvtai.config.learning import PpoConfig
 from uuvtai.learn.distill import Reduce, imitation_error
 from uuvtai.learn.normalise import Moments, moments_of
+from uuvtai.learn.passes import Passes
 from uuvtai.learn.policy import Policy, entropy, log_prob
 from uuvtai.learn.rollout import Rollout
 
@@ -121,6 +122,7 @@ class Ppo:
         self.skipped = 0
         """minibatches left out because loss or gradient was not finite"""
         self._normalised = torch.empty(0, device=device)
+        self._passes: tuple[Passes, Passes] | None = None
 
     def update(
         self, rollout: Rollout, distill_weight: float = 0.0, surrogate: bool = True, generator: torch.Generator | None = None
@@ -223,23 +225,48 @@ class Ppo:
 
     def _learn(self, batch: Batch, distill_weight: float, surrogate: bool, sums: torch.Tensor) -> None:
         self.optimiser.zero_grad(set_to_none=True)
+        actor, critic = self._networks(len(batch.valid))
+        critic.begin()
+        if acting := surrogate or distill_weight != 0.0:
+            actor.begin()
         count = batch.valid.sum().clamp(min=1.0)
-        before = sums.clone()
-        rows = CACHE_ROWS if batch.valid.device.type == "cpu" else len(batch.valid)
-        for first in range(0, len(batch.valid), rows):
-            self._loss(batch.rows(slice(first, first + rows)), count, distill_weight, surrogate, sums).backward()
-        self._step((sums[2] - before[2]).float() / count, surrogate)
+        kl_before = sums[_SUMS.index("approx_kl")].clone()
+        for first in range(0, len(batch.valid), critic.rows):
+            block = batch.rows(slice(first, first + critic.rows))
+            value = critic.forward(block.normalised).requires_grad_()
+            out = actor.forward(block.normalised).requires_grad_() if acting else block.action
+            self._loss(block, value, out, count, distill_weight, surrogate, sums).backward()
+            critic.backward(block.normalised, _gradient(value))
+            if acting:
+                actor.backward(block.normalised, _gradient(out))
+        self._step((sums[_SUMS.index("approx_kl")] - kl_before).float() / count, surrogate)
 
-    def _loss(self, batch: Batch, count: torch.Tensor, distill_weight: float, surrogate: bool, sums: torch.Tensor) -> torch.Tensor:
-        """This part's share of the minibatch's loss; its sums are added to ``sums`` in the order of ``_SUMS``."""
+    def _networks(self, samples: int) -> tuple[Passes, Passes]:
+        """Passes through actor and critic for minibatches of this size."""
+        rows = min(samples, CACHE_ROWS) if self.rate.device.type == "cpu" else samples
+        if self._passes is None or self._passes[0].rows < rows:
+            dtype = torch.bfloat16 if self.config.bfloat16 else torch.float32
+            self._passes = Passes(self.policy.actor, rows, dtype), Passes(self.policy.critic, rows, dtype)
+        return self._passes
+
+    def _loss(
+        self,
+        batch: Batch,
+        value_out: torch.Tensor,
+        actor_out: torch.Tensor,
+        count: torch.Tensor,
+        distill_weight: float,
+        surrogate: bool,
+        sums: torch.Tensor,
+    ) -> torch.Tensor:
+        """This block's share of the minibatch's loss by the networks' outputs; its sums are added to ``sums`` in the order of ``_SUMS``."""
         config, share = self.config, batch.valid / count
-        value = self.policy.critic(batch.normalised).squeeze(-1)
         old_value = batch.value if config.clip_value else None
-        value_error = value_loss(value, batch.target, old_value, config.clip)
+        value_error = value_loss(value_out.squeeze(-1), batch.target, old_value, config.clip)
         loss = config.value_weight * (share * value_error).sum()
-        zero = torch.zeros_like(value_error)
+        zero = torch.zeros_like(batch.valid)
         policy_loss, kl, clipped, distill = zero, zero, zero, zero
-        mean = self.policy.mean(batch.normalised, batch.prior) if surrogate or distill_weight else batch.action
+        mean = self.policy.mean_of(actor_out, batch.prior)
         if surrogate:
             log_ratio = log_prob(batch.action, mean, self.policy.log_std) - batch.log_prob
             policy_loss = surrogate_loss(log_ratio, batch.advantage, config.clip)
@@ -285,6 +312,11 @@ class Ppo:
             "train/skipped_updates": float(self.skipped - skipped_before),
             "train/distill_loss": means["distill"],
         }
+
+
+def _gradient(leaf: torch.Tensor) -> torch.Tensor:
+    assert leaf.grad is not None
+    return leaf.grad
 
 
 def _valid(rollout: Rollout) -> torch.Tensor:
