@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, TypeVar
 
 import numpy as np
+import taichi as ti
 
 from uuvtai import state
 from uuvtai.allocation import allocation_matrices
@@ -47,7 +48,7 @@ class Plant:
     def write(self, field: Any, value: Any) -> None:
         """Fill a field of continuous values from anything that broadcasts to (field shape, vector length)."""
         shape = (*field.shape, field.n) if hasattr(field, "n") else field.shape
-        dtype = np.float64 if self.real is state.ti.f64 else np.float32
+        dtype = np.float64 if self.real is ti.f64 else np.float32
         field.from_numpy(np.ascontiguousarray(np.broadcast_to(np.asarray(value, dtype=dtype), shape)))
 
     def reset(self, keys: np.ndarray | None = None) -> None:
