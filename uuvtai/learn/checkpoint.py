@@ -88,7 +88,7 @@ class Checkpoint:
         if not self.is_resumable:
             raise CheckpointError(f"{self.path}: has networks only and cannot be trained on; resume the run's newest checkpoint")
         state = self.model() | self._part(TRAINING, self.manifest.training)
-        plain, expected = pack(like[SIMULATOR_PART], SIMULATOR_PART)
+        plain, expected = pack(like[SIMULATOR_PART], SIMULATOR_PART, copy=False)
         layout = self.manifest.simulator_layout
         if _structure(plain) != _structure(self.manifest.simulator) or layout != layout_of(expected):
             raise CheckpointError(
@@ -185,7 +185,7 @@ def _write_parts(folder: Path, state: Mapping[str, Any]) -> dict[str, Any]:
     _write(folder / TRAINING, safetensors.torch.save(_named(tensors)))
     described: dict[str, Any] = {"schema": SCHEMA, "model": model, "training": training}
     if SIMULATOR_PART in state:
-        described["simulator"], tensors = pack(state[SIMULATOR_PART], SIMULATOR_PART)
+        described["simulator"], tensors = pack(state[SIMULATOR_PART], SIMULATOR_PART, copy=False)
         described["simulator_layout"] = layout_of(tensors)
         write_stream(folder / SIMULATOR, tensors)
     return described

@@ -21,14 +21,14 @@ class PackingError(ValueError):
     """Something that cannot be packed, or a packed state that does not fit together."""
 
 
-def pack(state: Any, name: str = "state") -> tuple[Any, dict[str, torch.Tensor]]:
-    """(plain, tensors): ``plain`` is JSON with references to ``tensors``, which are host copies, contiguous and apart from each other.
+def pack(state: Any, name: str = "state", copy: bool = True) -> tuple[Any, dict[str, torch.Tensor]]:
+    """(plain, tensors): ``plain`` is JSON with references to ``tensors`` on the host, contiguous, by default copies apart from each other.
 
     Dictionaries, lists, tuples, tensors, NumPy arrays, numbers, texts, booleans and None are kept as they are; anything else is a
     PackingError that names the place.
     """
     tensors: dict[str, torch.Tensor] = {}
-    return _packed(state, name, tensors), tensors
+    return _packed(state, name, tensors, copy), tensors
 
 
 def unpack(plain: Any, tensors: dict[str, torch.Tensor]) -> Any:
@@ -39,19 +39,22 @@ def unpack(plain: Any, tensors: dict[str, torch.Tensor]) -> Any:
         raise PackingError(f"the packed state does not fit together ({error!r})") from None
 
 
-def _packed(node: Any, place: str, tensors: dict[str, torch.Tensor]) -> Any:
+def _packed(node: Any, place: str, tensors: dict[str, torch.Tensor], copy: bool) -> Any:
     if isinstance(node, torch.Tensor | np.ndarray):
         if place in tensors:
             raise PackingError(f"{place}: two tensors have this name")
         is_array = isinstance(node, np.ndarray)
-        tensors[place] = torch.from_numpy(node.copy()) if is_array else node.detach().to("cpu", copy=True).contiguous()
+        tensor = torch.from_numpy(np.ascontiguousarray(node)) if is_array else node.detach()
+        tensors[place] = tensor.to("cpu", copy=copy).contiguous()
         return {"$array" if is_array else "$tensor": place}
     if isinstance(node, dict):
         if all(isinstance(key, str) and not key.startswith("$") for key in node):
-            return {key: _packed(value, f"{place}.{key}", tensors) for key, value in node.items()}
-        return {"$items": [[_packed(key, place, tensors), _packed(value, f"{place}.{key}", tensors)] for key, value in node.items()]}
+            return {key: _packed(value, f"{place}.{key}", tensors, copy) for key, value in node.items()}
+        return {
+            "$items": [[_packed(key, place, tensors, copy), _packed(value, f"{place}.{key}", tensors, copy)] for key, value in node.items()]
+        }
     if isinstance(node, list | tuple):
-        items = [_packed(value, f"{place}.{i}", tensors) for i, value in enumerate(node)]
+        items = [_packed(value, f"{place}.{i}", tensors, copy) for i, value in enumerate(node)]
         return items if isinstance(node, list) else {"$tuple": items}
     if isinstance(node, float) and not math.isfinite(node):
         return {"$float": repr(float(node))}
