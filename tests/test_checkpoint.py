@@ -32,7 +32,7 @@ def state_of(step):
         "ppo": {"state": {0: moments}, "betas": (0.9, 0.999), "lr": 0.1 + 0.2},
         "generator": rng.get_state(),
         "counters": {"iteration": step, "best": float("-inf"), "names": ["a", "b"], "done": True},
-        "env": {"step": row, "map": torch.rand(2, 300, generator=rng), "empty": torch.zeros(0, 2)},
+        "env": {"step": row, "map": torch.rand(2, 300, generator=rng), "empty": torch.zeros(0, 2), "number": np.array(7)},
     }
 
 

@@ -44,7 +44,7 @@ def _packed(node: Any, place: str, tensors: dict[str, torch.Tensor], copy: bool)
         if place in tensors:
             raise PackingError(f"{place}: two tensors have this name")
         is_array = isinstance(node, np.ndarray)
-        tensor = torch.from_numpy(np.ascontiguousarray(node)) if is_array else node.detach()
+        tensor = torch.from_numpy(np.asarray(node, order="C")) if is_array else node.detach()
         tensors[place] = tensor.to("cpu", copy=copy).contiguous()
         return {"$array" if is_array else "$tensor": place}
     if isinstance(node, dict):
