@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import optimize
 
@@ -54,6 +54,7 @@ def test_labels_by_hand(failed, ended, censored, expected):
     assert labels_of(failed, ended, censored, 3) == expected
 
 
+@settings(deadline=None, max_examples=50)
 @given(st.lists(st.sampled_from("..........fst"), min_size=12, max_size=60), st.integers(1, 8))
 def test_memory_returns_every_moment_once_with_the_label_of_the_whole_record(record, horizon):
     """In rollouts of 6 steps: the same labels as from one long rollout, for every moment whose horizon has been seen."""
@@ -157,6 +158,7 @@ def test_pool_adjacent_violators_by_hand():
     assert score.tolist() == [1.0, 2.0, 3.0, 4.0] and value.tolist() == [0.0, 0.5, 0.5, 0.5]
 
 
+@settings(deadline=None, max_examples=50)
 @given(st.lists(st.tuples(st.integers(0, 9), st.booleans()), min_size=1, max_size=40))
 def test_isotonic_regression_agrees_with_scipy(pairs):
     """SciPy's takes one value per score: ours has merged equal scores before."""
