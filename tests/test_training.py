@@ -241,29 +241,36 @@ RUN = (
 )  # fmt: skip
 
 
-def uuv(*arguments, **more):
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "NO_COLOR": "1"}
-    return subprocess.Popen(
-        [sys.executable, "-m", "uuvtai", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
-    )
+UUV = (sys.executable, "-m", "uuvtai")
+QUIET = {**os.environ, "OMP_NUM_THREADS": "1", "NO_COLOR": "1"}
+LONGEST_S = 900.0
+"""kernels that are not compiled yet take minutes on a busy machine"""
+
+
+def uuv(*arguments):
+    """(stdout, stderr) of a command that must succeed; it is stopped when it takes too long."""
+    done = subprocess.run([*UUV, *arguments], capture_output=True, text=True, env=QUIET, timeout=LONGEST_S, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout, done.stderr
+
+
+def killed_between_checkpoints(folder, *arguments):
+    """Run a training and kill it as soon as it has written two checkpoints."""
+    with subprocess.Popen([*UUV, *arguments, "--run-dir", str(folder)], stderr=subprocess.DEVNULL, env=QUIET) as process:
+        deadline = time.monotonic() + LONGEST_S
+        while len(list((folder / "checkpoints").glob("step_*"))) < 2 and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.01)
+        process.kill()
 
 
 def test_a_killed_run_goes_on_bit_for_bit_in_another_process(tmp_path):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    process = uuv(*RUN, "--run-dir", str(whole), "--json")
-    out, err = process.communicate(timeout=600)
-    assert process.returncode == 0, err
+    out, err = uuv(*RUN, "--run-dir", str(whole), "--json")
     assert json.loads(out)["iterations"] == 6
     assert "6/6: reward" in err
-    process = uuv(*RUN, "--run-dir", str(killed))
-    while len(list((killed / "checkpoints").glob("step_*"))) < 2 and process.poll() is None:
-        time.sleep(0.01)
-    process.kill()
-    process.communicate()
+    killed_between_checkpoints(killed, *RUN)
     assert run_json(killed)["status"] == "running", "nobody was there to say otherwise"
     assert checkpoint.newest(killed, resumable=True).step in (2, 3, 4)
-    process = uuv("train", "--resume", str(killed), "--device", "cpu")
-    _, err = process.communicate(timeout=600)
-    assert process.returncode == 0, err
+    uuv("train", "--resume", str(killed), "--device", "cpu")
     assert content_of(whole / "checkpoints/step_000006") == content_of(killed / "checkpoints/step_000006")
     assert told(whole) == told(killed)
