@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -35,45 +38,48 @@ def measure(job: Job) -> list[Row]:
     if worst > AGREEMENT:
         raise RuntimeError(f"kernels and peers disagree by {worst:.2g}")
 
-    shared = torch.from_numpy(actions).to(job.device)
+    ours = _step_of(config, plant, torch.from_numpy(actions).to(job.device))
+    theirs = {name: _step_of_peer(peer, turned[name], job.device) for name, peer in peers.items()}
+    cost = seconds_per_call({"ours": ours, **theirs}, job.seconds, clock=time.perf_counter)
+    cpu_ns = 1e9 * seconds_per_call({"ours": ours}, job.seconds / 3)["ours"] / n_env
+    row = Row(
+        what=f"actuation and {config.episode.substeps} substeps, {n_env:,} envs",
+        ours=n_env / cost["ours"],
+        unit="env-steps/s",
+        details={"num_envs": n_env, "disagreement": worst},
+    )
+    rows = [replace(row, peer=n_env / cost[name], peer_name=name) for name in peers]
+    rows[0].floor = FLOOR if not job.quick and job.device == "cpu" else None
+    rows[0].note = f"{cpu_ns:.0f} ns of CPU time; apart by {worst:.1g} after {_CHECKED_STEPS} steps"
+    return rows
+
+
+def _step_of(config: Config, plant: Plant, shared: torch.Tensor) -> Callable[[], None]:
+    """One call: actuation and dynamics of a control step."""
     c, p = config, plant
 
-    def ours():
+    def step() -> None:
         actuation.command_thrusters(shared, p.actuation, p.params, p.allocation, p.ego, p.clock, c.vehicle, c.actuation, c.episode)
         dynamics.move_vehicle(
             p.vehicle, p.actuation, p.current, p.params, p.allocation, p.episode, p.clock,
             c.vehicle, c.actuation, c.disturbance, c.episode.control_dt_s, c.episode.substeps,
         )  # fmt: skip
-        if job.device == "cuda":
+        if shared.is_cuda:
             torch.cuda.synchronize()
 
-    def theirs(name: str):
-        def call():
-            peers[name].control(turned[name])
-            peers[name].move()
-            if job.device == "cuda":
-                torch.cuda.synchronize()
+    return step
 
-        return call
 
-    cost = seconds_per_call({"ours": ours, **{name: theirs(name) for name in peers}}, job.seconds, clock=time.perf_counter)
-    cpu = seconds_per_call({"ours": ours}, job.seconds / 3)["ours"]
-    rows = []
-    for name in peers:
-        first = name == "NumPy"
-        rows.append(
-            Row(
-                what=f"actuation and {config.episode.substeps} substeps, {n_env:,} envs",
-                ours=n_env / cost["ours"],
-                peer=n_env / cost[name],
-                peer_name=name,
-                unit="env-steps/s",
-                floor=FLOOR if first and not job.quick and job.device == "cpu" else None,
-                note=f"{1e9 * cpu / n_env:.0f} ns of CPU time; apart by {worst:.1g} after {_CHECKED_STEPS} steps" if first else "",
-                details={"num_envs": n_env, "disagreement": worst},
-            )
-        )
-    return rows
+def _step_of_peer(peer: Vehicles, action: Any, device: str) -> Callable[[], None]:
+    """One call: the same of a peer."""
+
+    def step() -> None:
+        peer.control(action)
+        peer.move()
+        if device == "cuda":
+            torch.cuda.synchronize()
+
+    return step
 
 
 def disagreement(plant: Plant, peers: dict[str, Vehicles], actions: np.ndarray, turned: dict) -> float:

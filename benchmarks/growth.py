@@ -36,34 +36,34 @@ def measure(job: Job) -> list[Row]:
             job.say(f"turn {turn + 1} of {_TURNS}: {n} envs")
             for _ in range(sizes[-1] // n):
                 next(players[n], None)
-    rows = []
-    for n in sizes:
-        wall_us, cpu_us = (1e6 * s / (sizes[-1] // n * n * _TURNS * _TURN_STEPS) for s in spent[n])
-        memory = memory_bytes(config, n) / 1e3 / n
-        rows.append(
-            Row(
-                what=f"{n:,} envs",
-                ours=wall_us,
-                unit="us per env-step",
-                less_is_better=True,
-                note=f"{cpu_us:.1f} us of CPU time, {memory:,.0f} kB/env",
-                details={"num_envs": n, "cpu_us_per_env_step": cpu_us, "memory_kb_per_env": memory},
-            )
-        )
-    growth = rows[-1].ours / rows[0].ours  # type: ignore[operator]
-    bounded = (sizes[0], sizes[-1]) == (1024, 8192) and job.device == "cpu"
-    growth_cpu = rows[-1].details["cpu_us_per_env_step"] / rows[0].details["cpu_us_per_env_step"]
-    rows.append(
-        Row(
-            what=f"growth, {sizes[0]:,} to {sizes[-1]:,} envs",
-            ours=growth,
-            unit="times the cost",
-            less_is_better=True,
-            floor=FLOOR if bounded else None,
-            note=f"{growth_cpu:.3f} in CPU time",
-        )
+    rows = [_row(n, sizes[-1], spent[n], memory_bytes(config, n) / 1e3 / n) for n in sizes]
+    return [*rows, _growth(rows[0], rows[-1], job.device)]
+
+
+def _row(n: int, most: int, spent_s: list[float], memory_kb: float) -> Row:
+    wall_us, cpu_us = (1e6 * s / (most // n * n * _TURNS * _TURN_STEPS) for s in spent_s)
+    return Row(
+        what=f"{n:,} envs",
+        ours=wall_us,
+        unit="us per env-step",
+        less_is_better=True,
+        note=f"{cpu_us:.1f} us of CPU time, {memory_kb:,.0f} kB/env",
+        details={"num_envs": n, "cpu_us_per_env_step": cpu_us, "memory_kb_per_env": memory_kb},
     )
-    return rows
+
+
+def _growth(small: Row, big: Row, device: str) -> Row:
+    """How many times the cost of the smallest size the biggest has."""
+    ends = small.details["num_envs"], big.details["num_envs"]
+    cpu = big.details["cpu_us_per_env_step"] / small.details["cpu_us_per_env_step"]
+    return Row(
+        what=f"growth, {ends[0]:,} to {ends[1]:,} envs",
+        ours=big.ours / small.ours,  # type: ignore[operator]
+        unit="times the cost",
+        less_is_better=True,
+        floor=FLOOR if ends == (1024, 8192) and device == "cpu" else None,
+        note=f"{cpu:.3f} in CPU time",
+    )
 
 
 def _played(sim: Sim, episodes: int, spent: list[float]) -> Iterator[None]:

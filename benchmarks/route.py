@@ -38,21 +38,13 @@ def measure(job: Job) -> list[Row]:
 
     floor_m, origin = config.voronoi.min_clearance_m, (float(maps.ORIGIN[0]), float(maps.ORIGIN[1]))
     grids = [rrt.ClearanceGrid(clearance, origin, maps.CELL_M, floor_m, _START) for _occ, clearance, _row, _col in found]
-    checkers = [grid.checker((_START, _GOAL)) for grid in grids]
+    pairs = [(grid, grid.checker((_START, _GOAL))) for grid in grids]
 
     def theirs():
-        return [
-            rrt.solve_rrt(_START, _GOAL, grid, check, 20_000, i, 1.0) for i, (grid, check) in enumerate(zip(grids, checkers, strict=True))
-        ]
+        return [rrt.solve_rrt(_START, _GOAL, grid, check, 20_000, i, 1.0) for i, (grid, check) in enumerate(pairs)]
 
     ours()
-    paths = theirs()
-    failed = sum(s["route"].fallback_reason.to_numpy() != FAIL_NONE)
-    if failed or any(path is None for path in paths):
-        raise RuntimeError(f"{failed} maps without our route, {sum(path is None for path in paths)} without OMPL's; all of them have one")
-    ways, counts = s["route"].way_w.to_numpy(), s["route"].n_way.to_numpy()
-    mine = [_cost(ways[i, : counts[i]], grid) for i, grid in enumerate(grids)]
-    others = [_cost(path, grid) for path, grid in zip(paths, grids, strict=True) if path is not None]
+    mine, others = _way_costs(s["route"], theirs(), grids)
     cost = seconds_per_call({"ours": ours, "peer": theirs}, job.seconds)
     return [
         Row(
@@ -64,8 +56,8 @@ def measure(job: Job) -> list[Row]:
             floor=FLOOR,
             floor_on="ratio",
             note=f"{1e6 * cost['ours'] / n_env:.0f} against {1e6 * cost['peer'] / n_env:.0f} us a plan; "
-            f"cost of the way {np.mean(mine):.0f} against {np.mean(others):.0f}",
-            details={"num_envs": n_env, "way_cost": float(np.mean(mine)), "peer_way_cost": float(np.mean(others))},
+            f"cost of the way {mine:.0f} against {others:.0f}",
+            details={"num_envs": n_env, "way_cost": mine, "peer_way_cost": others},
         )
     ]
 
@@ -111,6 +103,16 @@ def _structs(n_env: int, config: Config, found: list[tuple]) -> dict:
     s["route"].queue.from_numpy(np.arange(n_env, dtype=np.int32))
     s["route"].n_queue[None] = n_env
     return s
+
+
+def _way_costs(ours: state.RouteState, theirs: list, grids: list[rrt.ClearanceGrid]) -> tuple[float, float]:
+    """Mean cost of our ways and of the peer's. Raises RuntimeError where a map is without one: all of them have ways."""
+    failed, lost = sum(ours.fallback_reason.to_numpy() != FAIL_NONE), sum(path is None for path in theirs)
+    if failed or lost:
+        raise RuntimeError(f"{failed} maps without our route, {lost} without OMPL's; all of them have one")
+    ways, counts = ours.way_w.to_numpy(), ours.n_way.to_numpy()
+    mine = [_cost(ways[i, : counts[i]], grid) for i, grid in enumerate(grids)]
+    return float(np.mean(mine)), float(np.mean([_cost(path, grid) for path, grid in zip(theirs, grids, strict=True)]))
 
 
 def _cost(way: np.ndarray, grid: rrt.ClearanceGrid) -> float:

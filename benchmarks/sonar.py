@@ -47,6 +47,16 @@ class Rays:
         for env in range(_MODELS):
             self.cast(env)
 
+    def apart(self, scan: state.SonarScan) -> int:
+        """Beams of our scan of flat beams that saw something else or something elsewhere."""
+        ranges, hits = scan.range_m.to_numpy(), scan.hit.to_numpy() == 1
+        count = 0
+        for env in range(_MODELS):
+            found = self.cast(env)
+            seen = (self.geom >= 0) & (found <= self.max_range_m)
+            count += int((hits[env] != seen).sum() + (np.abs(ranges[env] - found)[seen & hits[env]] > _TOLERANCE_M).sum())
+        return count
+
 
 def measure(job: Job) -> list[Row]:
     """Scans per second of one core: with flat beams, which is what MuJoCo casts, and with the vertical aperture of the product."""
@@ -66,14 +76,9 @@ def measure(job: Job) -> list[Row]:
         return lambda: sonar.cast_sonar(*structs, config, TankConfig(), EpisodeConfig())  # type: ignore[call-arg]
 
     ours(flat)()
-    ranges, hits = scan.range_m.to_numpy()[:_MODELS], scan.hit.to_numpy()[:_MODELS]
-    apart = 0
-    for env in range(_MODELS):
-        found = peer.cast(env)
-        seen = (peer.geom >= 0) & (found <= flat.max_range_m)
-        apart += int(((hits[env] == 1) != seen).sum() + (np.abs(ranges[env] - found)[seen & (hits[env] == 1)] > _TOLERANCE_M).sum())
-    if apart > _GRAZING_SHARE * ranges.size:
-        raise RuntimeError(f"{apart} of {ranges.size} beams differ from MuJoCo's")
+    apart, beams = peer.apart(scan), _MODELS * flat.n_ray
+    if apart > _GRAZING_SHARE * beams:
+        raise RuntimeError(f"{apart} of {beams} beams differ from MuJoCo's")
 
     cost = seconds_per_call({"flat": ours(flat), "wide": ours(wide), "peer": peer.cast_all}, job.seconds)
     return [
@@ -85,7 +90,7 @@ def measure(job: Job) -> list[Row]:
             unit="scans/s per core",
             floor=FLOOR,
             floor_on="ratio",
-            note=f"{1e6 * cost[side] / n_env:.2f} against {1e6 * cost['peer'] / _MODELS:.1f} us; {apart} of {ranges.size} beams apart",
+            note=f"{1e6 * cost[side] / n_env:.2f} against {1e6 * cost['peer'] / _MODELS:.1f} us; {apart} of {beams} beams apart",
             details={"num_envs": n_env, "beams_apart": apart},
         )
         for side, what in (("flat", "flat beams"), ("wide", "beams with their aperture"))

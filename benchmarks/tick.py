@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import torch
 
@@ -18,6 +20,8 @@ THREADS = 1
 FLOOR = 200.0
 _BLACKBOARDS = 64
 """Different leaf answers that py_trees ticks in turn, the first envs of ours."""
+_TURNS = 4
+"""Sets of such answers, taken in turn."""
 
 
 def measure(job: Job) -> list[Row]:
@@ -28,30 +32,21 @@ def measure(job: Job) -> list[Row]:
     sizes = array_sizes(config, n_env)
     teacher, table = state.allocate(state.TeacherState, sizes), state.allocate(state.TreeTable, sizes)
     load_tree(table, tree)
-    rng = np.random.default_rng(0)
-    answers = rng.integers(tree_tick.RUNNING, tree_tick.FAILURE + 1, (4, n_env, config.teacher.max_node), dtype=np.int8)
+    shape = (_TURNS, n_env, config.teacher.max_node)
+    answers = np.random.default_rng(0).integers(tree_tick.RUNNING, tree_tick.FAILURE + 1, shape, dtype=np.int8)
     given = [torch.from_numpy(a) for a in answers]
     n_node = len(tree.kind)
     peers = [PyTree(tree) for _ in range(_BLACKBOARDS)]
+    check(teacher, table, peers, answers, n_node)
+    prepared = [[peers[0].prepared(row[:n_node]) for row in a[:_BLACKBOARDS]] for a in answers]
+    ours_next, theirs_next = itertools.cycle(given), itertools.cycle(prepared)
 
-    for turn in range(len(given)):  # agreement first: statuses of every node, tick by tick, memories included
-        tree_tick.tick_with_given_statuses(given[turn], teacher, table)
-        found = teacher.status.to_numpy()[:_BLACKBOARDS, :n_node]
-        expected = [peer.tick(answers[turn, i, :n_node]) for i, peer in enumerate(peers)]
-        np.testing.assert_array_equal(found, expected)
+    def ours() -> None:
+        tree_tick.tick_with_given_statuses(next(ours_next), teacher, table)
 
-    turns = {"ours": 0, "peer": 0}
-
-    def ours():
-        turns["ours"] += 1
-        tree_tick.tick_with_given_statuses(given[turns["ours"] % len(given)], teacher, table)
-
-    peer_answers = [[peers[0].prepared(row[:n_node]) for row in a[:_BLACKBOARDS]] for a in answers]
-
-    def theirs():
-        turns["peer"] += 1
-        for peer, prepared in zip(peers, peer_answers[turns["peer"] % len(given)], strict=True):
-            peer.tick_prepared(prepared)
+    def theirs() -> None:
+        for peer, answer in zip(peers, next(theirs_next), strict=True):
+            peer.tick_prepared(answer)
 
     cost = seconds_per_call({"ours": ours, "peer": theirs}, job.seconds)
     return [
@@ -67,3 +62,11 @@ def measure(job: Job) -> list[Row]:
             details={"num_envs": n_env},
         )
     ]
+
+
+def check(teacher: state.TeacherState, table: state.TreeTable, peers: list[PyTree], answers: np.ndarray, n_node: int) -> None:
+    """Raise AssertionError unless every node's status is the peers', tick by tick, memories included."""
+    for answer in answers:
+        tree_tick.tick_with_given_statuses(torch.from_numpy(answer), teacher, table)
+        found = teacher.status.to_numpy()[: len(peers), :n_node]
+        np.testing.assert_array_equal(found, [peer.tick(answer[i, :n_node]) for i, peer in enumerate(peers)])
