@@ -183,57 +183,67 @@ def _with_image(config: Config, snapshot: EpisodeSnapshot, image: dict[str, np.n
 
 def _snapshot(sim: Sim, r: dict[str, Any], applied: np.ndarray, maps: MapLayers | None) -> EpisodeSnapshot:
     """``r`` maps 'struct.field' to this env's row."""
-    n_way, n_node = int(r["route.n_way"]), len(sim.tree.names)
-    moving = (r["tracks.alive"] == 1) & (r["tracks.moving"] == 1)
-    state = r["tracks.state"][moving]
-    explained = r["tracks.beam_track"]
-    reason = int(r["route.fallback_reason"])
     return EpisodeSnapshot(
         step=int(r["clock.step"]),
-        outcome=OUTCOMES[int(r["referee.outcome"])],
-        pos_w=r["vehicle.pos_w"],
-        quat_wb=r["vehicle.quat_wb"],
-        vel_b=r["vehicle.vel_b"],
-        rate_b=r["vehicle.rate_b"],
-        current_w=r["current.vel_w"],
-        rpm=r["vehicle.rpm"],
-        thrust_n=r["actuation.thrust_n"],
-        clearance_m=float(r["referee.clearance_m"]),
-        ttc_s=float(r["referee.ttc_s"]),
-        obstacle_kind=r["world.kind"],
-        obstacle_pos_w=r["world.pos_w"],
-        obstacle_vel_w=r["world.vel_w"],
-        obstacle_size=r["world.size"],
-        obstacle_yaw=r["world.yaw"],
-        estimate_pos_w=r["ego.pos_w"],
-        estimate_rpy=r["ego.rpy"],
-        measured_vel_b=r["ego.vel_b"],
-        measured_vel_valid=bool(r["ego.vel_valid"]),
-        measured_rate_b=r["ego.rate_b"],
-        depth_m=float(r["ego.depth_m"]),
-        sonar_fresh=bool(r["scan.fresh"]),
-        sonar_ping_step=int(r["scan.ping_step"]),
-        sonar_range_m=r["scan.range_m"],
-        sonar_doppler_m_s=r["scan.doppler_m_s"],
-        sonar_intensity=r["scan.intensity"],
-        sonar_hit=r["scan.hit"],
-        sonar_ping_vel_b=r["scan.ping_vel_b"],
+        **_truth(r),
+        **_sensed(r),
+        **_tracked(r),
+        **_planned(r),
         action_applied=applied,
         action_teacher=r["teacher.action"],
-        route_w=r["route.way_w"][:n_way],
-        route_fresh=_is_fresh(r),
-        route_planner=_code_name(PLANNERS, int(r["route.planner"])),
-        route_fallback=_code_name(REASONS, reason) if reason else "",
-        replan_trigger=_code_name(TRIGGERS, int(r["route.trigger"])),
-        lookahead_w=r["route.lookahead_w"],
-        path_risk=float(r["route.path_risk"]),
-        tracks=np.column_stack([state[:, :2], r["tracks.z_m"][moving], state[:, 2:], r["tracks.radius_m"][moving]]),
-        track_beams=np.flatnonzero((explained >= 0) & moving[np.maximum(explained, 0)]),
-        tree_status=r["teacher.status"][:n_node],
+        tree_status=r["teacher.status"][: len(sim.tree.names)],
         tree_leaf=int(r["teacher.leaf"]),
         reward=r["reward.term"],
         maps=maps,
     )
+
+
+def _truth(r: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "outcome": OUTCOMES[int(r["referee.outcome"])],
+        "clearance_m": float(r["referee.clearance_m"]),
+        "ttc_s": float(r["referee.ttc_s"]),
+        "current_w": r["current.vel_w"],
+        "thrust_n": r["actuation.thrust_n"],
+        **{name: r[f"vehicle.{name}"] for name in ("pos_w", "quat_wb", "vel_b", "rate_b", "rpm")},
+        **{f"obstacle_{name}": r[f"world.{name}"] for name in ("kind", "pos_w", "vel_w", "size", "yaw")},
+    }
+
+
+def _sensed(r: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "estimate_pos_w": r["ego.pos_w"],
+        "estimate_rpy": r["ego.rpy"],
+        "measured_vel_b": r["ego.vel_b"],
+        "measured_vel_valid": bool(r["ego.vel_valid"]),
+        "measured_rate_b": r["ego.rate_b"],
+        "depth_m": float(r["ego.depth_m"]),
+        "sonar_fresh": bool(r["scan.fresh"]),
+        "sonar_ping_step": int(r["scan.ping_step"]),
+        **{f"sonar_{name}": r[f"scan.{name}"] for name in ("range_m", "doppler_m_s", "intensity", "hit", "ping_vel_b")},
+    }
+
+
+def _tracked(r: dict[str, Any]) -> dict[str, Any]:
+    moving = (r["tracks.alive"] == 1) & (r["tracks.moving"] == 1)
+    state, explained = r["tracks.state"][moving], r["tracks.beam_track"]
+    return {
+        "tracks": np.column_stack([state[:, :2], r["tracks.z_m"][moving], state[:, 2:], r["tracks.radius_m"][moving]]),
+        "track_beams": np.flatnonzero((explained >= 0) & moving[np.maximum(explained, 0)]),
+    }
+
+
+def _planned(r: dict[str, Any]) -> dict[str, Any]:
+    reason = int(r["route.fallback_reason"])
+    return {
+        "route_w": r["route.way_w"][: int(r["route.n_way"])],
+        "route_fresh": _is_fresh(r),
+        "route_planner": _code_name(PLANNERS, int(r["route.planner"])),
+        "route_fallback": _code_name(REASONS, reason) if reason else "",
+        "replan_trigger": _code_name(TRIGGERS, int(r["route.trigger"])),
+        "lookahead_w": r["route.lookahead_w"],
+        "path_risk": float(r["route.path_risk"]),
+    }
 
 
 def _code_name(names: tuple[str, ...], code: int) -> str:
