@@ -37,6 +37,7 @@ from uuvtai.kernels import (
     reward,
     route,
     sonar,
+    spotting,
     teacher,
     threats,
     tracking,
@@ -93,6 +94,7 @@ class SimState:
     image: state.DepthImage
     tracks: state.TrackState
     clusters: state.ClusterState
+    spots: state.SpotState
     habits: state.HabitState
     forecast: state.ForecastState
     mask: state.GridMask
@@ -253,6 +255,21 @@ class Sim:
                 c.world.tank,
                 c.episode,
             )
+            if c.spotting.use_camera:
+                spotting.scan_columns(s.spots, s.image, s.clock, c.spotting, c.sensors.depth, c.world.tank)
+                spotting.follow_spots(
+                    s.tracks,
+                    s.spots,
+                    s.image,
+                    s.scan,
+                    s.clock,
+                    c.spotting,
+                    c.sensors.depth,
+                    c.sensors.sonar,
+                    c.elevation,
+                    c.tracking,
+                    c.episode,
+                )
             if c.elevation.use_camera:
                 look.look_at_bodies(s.tracks, s.image, s.clock, c.elevation, c.sensors.depth, c.world.tank, c.episode)
             forecast.learn_habits(s.habits, s.tracks, s.clusters, s.clock, c.forecast, c.episode)

@@ -104,7 +104,8 @@ def candidates(follow, last, yaw, own_z, cfg, vehicle, tank):
         for s in range(cfg.n_speed)
         for h in range(cfg.n_heading)
     ]
-    held += [(0.0, 0.0, 0.0), tuple(last), tuple(follow)]
+    within = np.clip(last[2], min(low - own_z, 0.0), max(high - own_z, 0.0))
+    held += [(0.0, 0.0, 0.0), (last[0], last[1], within), tuple(follow)]
     if cfg.heave_m_s > 0:
         for h in range(cfg.n_heave_heading):
             way = level_velocity(ahead + 2 * np.pi * h / cfg.n_heave_heading, 1.0, yaw, cfg, vehicle)

@@ -5,7 +5,7 @@ YAML in and out, and presets, live in ``loader.py``; what training adds is in ``
 
 from __future__ import annotations
 
-from uuvtai.config.perception import ElevationConfig, ForecastConfig, MappingConfig, TrackingConfig
+from uuvtai.config.perception import ElevationConfig, ForecastConfig, MappingConfig, SpottingConfig, TrackingConfig
 from uuvtai.config.planning import ClearanceConfig, FeaturesConfig, RouteConfig, VoronoiConfig
 from uuvtai.config.section import Section
 from uuvtai.config.sensors import DepthConfig, DvlConfig, ImuConfig, PressureConfig, SensorsConfig, SonarConfig
@@ -26,6 +26,7 @@ class Config(Section):
     tracking: TrackingConfig = TrackingConfig()
     forecast: ForecastConfig = ForecastConfig()
     elevation: ElevationConfig = ElevationConfig()
+    spotting: SpottingConfig = SpottingConfig()
     mapping: MappingConfig = MappingConfig()
     clearance: ClearanceConfig = ClearanceConfig()
     voronoi: VoronoiConfig = VoronoiConfig()
@@ -57,6 +58,7 @@ __all__ = [
     "Section",
     "SensorsConfig",
     "SonarConfig",
+    "SpottingConfig",
     "StaticObstacles",
     "TankConfig",
     "TeacherConfig",

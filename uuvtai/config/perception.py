@@ -121,6 +121,30 @@ class ElevationConfig(Section):
         return self
 
 
+class SpottingConfig(Section):
+    """Tracked bodies followed by the camera where the sonar's fan misses them (values EC, tuned)."""
+
+    use_camera: bool = True
+    """off: the image tells heights only"""
+    range_m: Positive = 4.0
+    """nothing farther is looked at: the sonar's fan is high enough there"""
+    band_m: Positive = 0.9
+    """nor what is farther above or below the camera"""
+    wall_margin_m: NonNegative = 0.25
+    split_m: Positive = 0.25
+    """a larger jump of distance between columns separates spots; a sonar return within it explains one"""
+    sigma_m: Positive = 0.035
+    """error of a spot's place"""
+    gate_m: Positive = 0.3
+    """a spot this close to where a track is expected may match it,"""
+    max_gate_m: Positive = 1.2
+    """and farther for bodies that were not seen for long, up to this"""
+    apart_m: Positive = 0.35
+    """a spot farther than this from every track is a body of its own"""
+    turn_gate: Positive = 12.0
+    """squared normalised innovation (2 values) beyond which a body is taken to have turned"""
+
+
 class MappingConfig(Section):
     """Two-layer occupancy map. Gains are per scan at 10 Hz; at another scan rate they are scaled so that gain per second is kept."""
 

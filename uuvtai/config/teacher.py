@@ -80,13 +80,23 @@ class TeacherConfig(Section):
     unstick_m_s: Positive = 0.3
     slow_clearance_m: Positive = 0.6
     """speed falls below cruise where the static clearance is smaller than this"""
-    slow_fraction: Fraction = 0.5
+    slow_fraction: Fraction = 0.75
     """share of cruise speed left at contact"""
     edge_gap_m: NonNegative = 0.26
     """hull centre to surface or floor, at least"""
     depth_gain: Positive = 1.0
     """[1/s] heave per metre of depth error"""
-    yaw_gain: Positive = 1.5
+    gaze_m: NonNegative = 3.0
+    """the nose, and with it the camera, turns to the nearest moving body this close: near ones leave the sonar's fan; 0 = along the way"""
+    gaze_level_m: NonNegative = 1.0
+    """bodies level with the vehicle count as so much farther: the sonar sees them"""
+    gaze_clearance_m: NonNegative = 0.6
+    """mapped clearance below which the nose stays along the way: the hull is longer than wide"""
+    askew_clearance_m: NonNegative = 0.5
+    """where the way is narrower the vehicle slows down until its nose lies along it"""
+    gaze_off_deg: NonNegative = 25.0
+    """the nose may be so far off the body that is looked at, towards a diagonal of the body along the way"""
+    yaw_gain: Positive = 2.5
     """[1/s]"""
     max_node: PositiveCount = 64
 

@@ -105,6 +105,7 @@ def candidate(
         out = _towards(env, turn, speed, follow[2], teacher, ego, teacher_cfg, vehicle_cfg)
     elif index == n_level + 1:
         out = teacher.last_vel_w[env]
+        out[2] = edge_limited(out[2], ego.pos_w[env][2], teacher_cfg, tank_cfg)
     elif index == n_level + 2:
         out = follow
     elif index > n_level + 2 and index < ti.static(teacher_cfg.n_held):

@@ -20,7 +20,7 @@ from uuvtai.state import DepthImage, MapScratch, MapState, SonarScan, TrackState
 _MAX_REACH = 4
 """[cells] farthest neighbour that may explain a surprising return as the edge of a static body."""
 
-_NO_RETURN_SHARE = 0.999
+NO_RETURN_SHARE = 0.999
 """A depth pixel beyond this share of the camera's range saw nothing."""
 
 
@@ -208,7 +208,7 @@ def nearest_in_gate(env, first_col, image: In[DepthImage], R_wb, depth: Const[De
         climb = R_wb[2, 0] + R_wb[2, 2] * (middle_row - row) / focal + R_wb[2, 1] * left
         rise = mount + z * climb
         for i in ti.static(range(LANES)):
-            seen = (ti.abs(rise[i]) <= gate_m) & (z[i] < ti.static(depth.max_range_m * _NO_RETURN_SHARE)) & (z[i] > 0.0)
+            seen = (ti.abs(rise[i]) <= gate_m) & (z[i] < ti.static(depth.max_range_m * NO_RETURN_SHARE)) & (z[i] > 0.0)
             nearer = seen & (z[i] < nearest[i])
             nearest[i] = ti.select(nearer, z[i], nearest[i])
             nearest_row[i] = ti.select(nearer, row, nearest_row[i])

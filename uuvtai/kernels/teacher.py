@@ -1,5 +1,7 @@
 """The behaviour tree's leaves and its tick: conditions read the blackboard, one action drives the vehicle."""
 
+import math
+
 import taichi as ti
 
 from uuvtai.config import EpisodeConfig, TankConfig, TeacherConfig, VehicleConfig
@@ -76,7 +78,10 @@ def tick_tree(
             teacher.evading_steps[env] = ti.select(leaf == codes.EVADE, teacher.evading_steps[env] + 1, 0)
             velocity = _wanted_velocity(env, leaf, acting, teacher, table, ego, mission, teacher_cfg, vehicle_cfg, tank_cfg)
             teacher.last_vel_w[env] = velocity
-            teacher.action[env] = _action_of(env, leaf, velocity, teacher, route, ego, mission, teacher_cfg, vehicle_cfg)
+            turn = _turn(
+                leaf, velocity, _gaze(env, leaf, acting, teacher, table), ego.rpy[env][2], teacher.path_clearance_m[env], teacher_cfg
+            )
+            teacher.action[env] = _action_of(env, velocity, turn, ego, teacher_cfg, vehicle_cfg)
             for i in ti.static(range(4)):
                 action[env, i] = ti.cast(teacher.action[env][i], ti.f32)
 
@@ -189,35 +194,44 @@ def _retreat(back, away, clearance_m, cfg: Const[TeacherConfig]):
 
 
 @ti.func
-def _action_of(
-    env,
-    leaf,
-    velocity,
-    teacher: In[TeacherState],
-    route: In[RouteState],
-    ego: In[Proprioception],
-    mission: In[MissionState],
-    cfg: Const[TeacherConfig],
-    vehicle_cfg: Const[VehicleConfig],
-):
-    """Normalised action of a world velocity: body axes, direction kept where an axis saturates, nose towards the way."""
+def _action_of(env, velocity, turn, ego: In[Proprioception], cfg: Const[TeacherConfig], vehicle_cfg: Const[VehicleConfig]):
+    """Normalised action of a world velocity and an angle to turn by: body axes, direction kept where an axis saturates."""
     rpy = ego.rpy[env]
     body = rotation_wb(quaternion_wb(rpy[0], rpy[1], rpy[2])).transpose() @ velocity
     surge, sway = body[0] / ti.static(vehicle_cfg.max_surge_m_s), body[1] / ti.static(vehicle_cfg.max_sway_m_s)
     excess = ti.max(1.0, ti.max(ti.abs(surge), ti.abs(sway)))
     heave = ti.math.clamp(body[2] / ti.static(vehicle_cfg.max_heave_m_s), -1.0, 1.0)
-    turn = _turn(leaf, velocity, rpy[2])
     rate = ti.math.clamp(turn * ti.static(cfg.yaw_gain / vehicle_cfg.max_yaw_rate_rad_s), -1.0, 1.0)
     return ti.Vector([surge / excess, sway / excess, heave, rate])
 
 
 @ti.func
-def _turn(leaf, velocity, yaw):
-    """Angle to turn by: nose along the way; in danger a diagonal of the body along it, because diagonals are faster."""
-    turn = 0.0
+def _gaze(env, leaf, node, teacher: In[TeacherState], table: In[TreeTable]):
+    """[m] horizontal way to what is to be looked at, zero = nothing; the yardsticks, which heed no bodies, look at none."""
+    blind = leaf == codes.DRIVE_STRAIGHT
+    if leaf == codes.FOLLOW_ROUTE:
+        blind = _port(node, 1, 1.0, table) < 0.5
+    return ti.select(blind, ti.Vector([0.0, 0.0]), teacher.gaze_w[env])
+
+
+@ti.func
+def _turn(leaf, velocity, gaze, yaw, room, cfg: Const[TeacherConfig]):
+    """Angle to turn by: nose towards what is to be looked at, else along the way (where that is narrow, tail first is as slim).
+
+    In danger a diagonal of the body goes along the way, because diagonals are faster: that whose nose is nearest to what is to be looked
+    at, not farther off than the camera sees well, or else nearest to the present heading.
+    """
+    gazes = gaze[0] * gaze[0] + gaze[1] * gaze[1] > 0.0
+    look = wrapped_angle(ti.atan2(gaze[1], gaze[0]) - yaw)
+    turn = ti.select(gazes, look, 0.0)
     if velocity[0] * velocity[0] + velocity[1] * velocity[1] > 0.01:
-        turn = wrapped_angle(ti.atan2(velocity[1], velocity[0]) - yaw)
+        way = wrapped_angle(ti.atan2(velocity[1], velocity[0]) - yaw)
         if leaf >= codes.BACK_OFF and leaf <= codes.EVADE:
-            quarter = 0.5 * PI
-            turn = wrapped_angle(turn - quarter * (ti.floor(turn / quarter) + 0.5))
+            off, quarter = wrapped_angle(way - turn), 0.5 * PI
+            aside = off - quarter * (ti.floor(off / quarter) + 0.5)
+            most = ti.select(gazes, ti.static(math.radians(cfg.gaze_off_deg)), PI)
+            turn = wrapped_angle(turn + ti.math.clamp(aside, -most, most))
+        elif not gazes:
+            tail_first = room < ti.static(cfg.gaze_clearance_m) and leaf == codes.FOLLOW_ROUTE
+            turn = way - ti.select(tail_first, PI * ti.floor(way / PI + 0.5), 0.0)
     return turn

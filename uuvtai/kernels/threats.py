@@ -12,6 +12,11 @@ from uuvtai.state import ClearanceState, ClockState, ForecastState, MissionState
 
 _PATH_SAMPLES = 8
 
+_NEARER = 3
+"""Points of the route before the look-ahead point that are tried where the straight way to it is narrow,"""
+_NEARER_M = 0.2
+"""[m] so far apart, from the foot of the route on."""
+
 
 @ti.kernel
 def assess_threats(
@@ -102,12 +107,33 @@ def _read_clearance(
         )
         away = _unit(ti.Vector([pos[0] - site[0], pos[1] - site[1]]))
     teacher.away_w[env] = away
-    smallest = teacher.clearance_m[env]
+    here = ti.Vector([pos[0], pos[1]])
+    steer, room = ti.Vector([route.lookahead_w[env][0], route.lookahead_w[env][1]]), teacher.clearance_m[env]
     if route.n_way[env] > 0:
-        for k in range(1, _PATH_SAMPLES + 1):
-            on_way = _held_cell(pos + (route.lookahead_w[env] - pos) * (k / _PATH_SAMPLES), n_row, n_col, tank_cfg, mapping_cfg)
-            smallest = ti.min(smallest, clearance.clearance_m[env, on_way[0], on_way[1]])
-    teacher.path_clearance_m[env] = smallest
+        room = _room_to(env, here, steer, teacher.clearance_m[env], clearance, tank_cfg, mapping_cfg)
+        for nearer in range(_NEARER):
+            nth = (_NEARER - nearer) * ti.static(round(_NEARER_M / mapping_cfg.cell_m))
+            if (
+                room < ti.static(teacher_cfg.hull_reach_m + teacher_cfg.contact_m + teacher_cfg.static_margin_m)
+                and nth < route.n_ahead[env]
+            ):
+                point = route.ahead_w[env, nth]
+                wider = _room_to(env, here, point, teacher.clearance_m[env], clearance, tank_cfg, mapping_cfg)
+                if wider > room:
+                    steer, room = point, wider
+    teacher.path_clearance_m[env] = room
+    teacher.steer_w[env] = steer - here
+
+
+@ti.func
+def _room_to(env, here, there, own, clearance: In[ClearanceState], tank_cfg: Const[TankConfig], mapping_cfg: Const[MappingConfig]):
+    """Smallest mapped clearance [m] on the straight way to a place, the own one included."""
+    n_row, n_col = ti.static(clearance.clearance_m.shape[1], clearance.clearance_m.shape[2])
+    smallest = own
+    for k in range(1, _PATH_SAMPLES + 1):
+        on_way = _held_cell(here + (there - here) * (k / _PATH_SAMPLES), n_row, n_col, tank_cfg, mapping_cfg)
+        smallest = ti.min(smallest, clearance.clearance_m[env, on_way[0], on_way[1]])
+    return smallest
 
 
 @ti.func
@@ -123,11 +149,13 @@ def _unit(v):
 
 @ti.func
 def _follow_velocity(env, teacher: Out[TeacherState], route: In[RouteState], ego: In[Proprioception], cfg: Const[TeacherConfig]):
-    """Level velocity towards the look-ahead point, slower in narrow places; zero without a route."""
-    ahead = route.lookahead_w[env] - ego.pos_w[env]
-    level = ti.Vector([ahead[0], ahead[1]])
+    """Level velocity towards the point that is steered for, slower in narrow places; zero without a route."""
+    level = teacher.steer_w[env]
     room = (teacher.clearance_m[env] - ti.static(cfg.hull_reach_m + cfg.contact_m)) / ti.static(cfg.slow_clearance_m)
     share = ti.static(cfg.slow_fraction) + ti.static(1.0 - cfg.slow_fraction) * ti.math.clamp(room, 0.0, 1.0)
+    askew = ti.abs(ti.sin(ti.atan2(level[1], level[0]) - ego.rpy[env][2]))
+    if teacher.path_clearance_m[env] < ti.static(cfg.askew_clearance_m):  # across the way the hull is wider: let it turn first
+        share *= 1.0 - 0.6 * askew
     speed = ti.select(route.n_way[env] > 0, ti.static(cfg.cruise_m_s) * share, 0.0)
     wanted = _unit(level) * speed
     teacher.follow_vel_w[env] = ti.Vector([wanted[0], wanted[1], teacher.follow_vel_w[env][2]])
@@ -167,7 +195,9 @@ def _foresee_conflict(
         teacher.follow_vel_w[env][2] = ti.select(climbs, heave, 0.0)
         teacher.conflict_s[env] = ti.select(climbs, first[1], first[0])
         teacher.hold_conflict_s[env] = first[2]
-        teacher.body_near_m[env] = _nearest_body(env, ti.Vector([pos[0], pos[1]]), forecast, teacher_cfg)
+        gap, way = _nearest_body(env, pos, forecast, teacher_cfg)
+        teacher.body_near_m[env] = gap
+        teacher.gaze_w[env] = way * ti.cast(teacher.path_clearance_m[env] > ti.static(teacher_cfg.gaze_clearance_m), ti.f32)
         if teacher.conflict_s[env] < FAR_M:
             teacher.calm_steps[env] = 0
         calm = teacher.calm_steps[env] * ti.static(episode_cfg.control_dt_s)
@@ -178,9 +208,19 @@ def _foresee_conflict(
 
 @ti.func
 def _nearest_body(env, pos, forecast: In[ForecastState], cfg: Const[TeacherConfig]):
-    nearest = FAR_M
+    """(distance [m] from the hull to the nearest forecast body, horizontal way [m] to the one that needs to be looked at).
+
+    A body above or below the sonar's fan needs it most. FAR_M and zero where there is none.
+    """
+    nearest, need, way = FAR_M, ti.static(cfg.gaze_m), ti.Vector([0.0, 0.0])
     for track in range(ti.static(forecast.radius_m.shape[1])):
         radius = forecast.radius_m[env, track, 0]
         if radius >= 0:
-            nearest = ti.min(nearest, (forecast.pos_w[env, track, 0] - pos).norm() - radius - ti.static(cfg.hull_reach_m))
-    return nearest
+            off = forecast.pos_w[env, track, 0] - ti.Vector([pos[0], pos[1]])
+            gap = off.norm() - radius - ti.static(cfg.hull_reach_m)
+            nearest = ti.min(nearest, gap)
+            level = forecast.above_w[env, track] <= pos[2] and forecast.below_w[env, track] >= pos[2]
+            wanted = gap + ti.select(level, ti.static(cfg.gaze_level_m), 0.0)
+            if wanted < need:
+                need, way = wanted, off
+    return nearest, way

@@ -19,6 +19,9 @@ BLOCKED = 2
 _MISS_S = 0.1
 """One "miss" of the config: a nominal 10 Hz scan."""
 
+_SPOTTED_S = 0.3
+"""[s] a body that the camera showed this lately is there, though beams pass above or below it."""
+
 _PEEKING_RADIUS_M = 0.2
 """Least radius given to a body first seen past something nearer: half the size of the design's typical body."""
 
@@ -46,6 +49,7 @@ def clear_track(env, track, tracks: Out[TrackState]):
     tracks.pick_cost[env, track] = 0.0
     tracks.height[env, track, 0] = f16x(0.0)
     tracks.present[env, track] = 0.0
+    tracks.spot_step[env, track] = -1
 
 
 # --------------------------------------------------------------------------------------------------------------------- prune
@@ -107,7 +111,10 @@ def is_lost(env, track, sight, tracks: In[TrackState], scan: In[SonarScan], trac
     """1 where an unmatched track is seen through, or was unseen for too long (longer where hidden)."""
     unseen = (scan.ping_step[env] - tracks.seen_step[env, track]) * rules.control_dt_s
     longest = ti.select(sight == BLOCKED, tracking.hidden_s, ti.static(tracking.max_misses * _MISS_S))
-    through = sight == SEEN_THROUGH and (tracks.age[env, track] < CONFIRMED or unseen >= tracking.see_through_s)
+    if tracks.spot_step[env, track] >= 0:  # the camera shows it
+        unseen = ti.min(unseen, (scan.ping_step[env] - tracks.spot_step[env, track]) * rules.control_dt_s)
+    spotted = tracks.spot_step[env, track] >= 0 and unseen < _SPOTTED_S
+    through = sight == SEEN_THROUGH and not spotted and (tracks.age[env, track] < CONFIRMED or unseen >= tracking.see_through_s)
     return ti.cast(through or unseen > longest, ti.i32)
 
 

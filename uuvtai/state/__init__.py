@@ -9,7 +9,7 @@ The files group the stages as ``config/`` does; everybody imports the structs fr
 from __future__ import annotations
 
 from uuvtai.state.arrays import PACKET, REAL, WORD, allocate, array, bytes_of
-from uuvtai.state.perception import ClusterState, ForecastState, GridMask, HabitState, MapScratch, MapState, TrackState
+from uuvtai.state.perception import ClusterState, ForecastState, GridMask, HabitState, MapScratch, MapState, SpotState, TrackState
 from uuvtai.state.planning import ClearanceMemory, ClearanceState, FeatureState, RouteState, VoronoiState
 from uuvtai.state.sensors import DepthImage, Proprioception, ProprioceptionMemory, SonarMemory, SonarScan
 from uuvtai.state.task import ClockState, EpisodeState, MissionState, RefereeState, RewardState
@@ -48,6 +48,7 @@ __all__ = [
     "SceneState",
     "SonarMemory",
     "SonarScan",
+    "SpotState",
     "TeacherState",
     "TrackState",
     "TreeTable",

@@ -51,6 +51,8 @@ class TrackState:
     """share of each height hypothesis (elevation.heights), summing to 1"""
     present: ti.Field = array("n_env", "n_track")
     """probability that the body is where it is expected"""
+    spot_step: ti.Field = array("n_env", "n_track", dtype=ti.i32)
+    """episode step of the image that showed it last, -1 = none"""
     scan_step: ti.Field = array("n_env", dtype=ti.i32)
     """episode step of the ping that the states refer to, -1 = no scan yet"""
     beam_track: ti.Field = array("n_env", "n_ray", dtype=ti.i32)
@@ -103,6 +105,16 @@ class ClusterState:
     """cluster of this beam, -1 = none"""
     beam_doppler: ti.Field = array("n_env", "n_ray")
     """[m/s] Doppler of this beam, compensated with the own measured velocity"""
+
+
+@dataclass(frozen=True, eq=False)
+class SpotState:
+    """What the camera shows that the sonar does not."""
+
+    column_m: ti.Field = array("n_env", "n_pixel_col", lanes=True)
+    """[m] horizontal distance of the nearest thing in every column of the newest image, geometry.FAR_M = none"""
+    edge_m: ti.Field = array("n_env", "n_pixel_col", lanes=True)
+    """[m] the same in the column's first and last pixel: what reaches there goes on beyond the image"""
 
 
 @dataclass(frozen=True, eq=False)

@@ -59,6 +59,10 @@ class TeacherState:
     """[s] time of the first predicted conflict of stopping here, geometry.FAR_M = none"""
     body_near_m: ti.Field = array("n_env")
     """[m] distance to the nearest forecast body now, hull to surface"""
+    steer_w: ti.Field = array("n_env", vec=2)
+    """[m] horizontal way to the point that is steered for: the look-ahead point, or a nearer one where the straight way there is narrow"""
+    gaze_w: ti.Field = array("n_env", vec=2)
+    """[m] horizontal way to the body that the camera should look at, zero = none near"""
     calm_steps: ti.Field = array("n_env", dtype=ti.i32)
     """control steps since a conflict was last predicted"""
     evading_steps: ti.Field = array("n_env", dtype=ti.i32)
