@@ -5,17 +5,28 @@ import torch
 
 
 @pytest.fixture(scope="session", autouse=True)
-def taichi_runtime():
-    """One CPU runtime with exact floating point for the whole session."""
+def taichi_runtime(request):
+    """One CPU runtime with exact floating point for the whole session.
+
+    Where a test of the session needs the small simulator it is built first of all: Taichi finds compiled kernels again by the layout of
+    the memory before them too.
+    """
     from uuvtai.runtime import start_taichi
 
     start_taichi("cpu")
+    if any("small" in getattr(item, "fixturenames", ()) for item in request.session.items):
+        _built.append(SmallSim())
+
+
+_built = []
 
 
 class SmallSim:
     """A simulator whose kernels are compiled once for the session, and what tests do with it."""
 
     N = 8
+    OPTIONS = ("--num-envs", "8", "--set", "world.dynamic_capacity=9", "--device", "cpu")
+    """of commands in processes of their own that are to find these kernels compiled (``tests/warm.py`` compiles them beforehand)"""
 
     def __init__(self):
         from uuvtai.loader import load_config
@@ -42,4 +53,4 @@ class SmallSim:
 @pytest.fixture(scope="session")
 def small(taichi_runtime):
     """The session's simulator."""
-    return SmallSim()
+    return _built[0]

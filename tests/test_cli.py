@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.conftest import SmallSim
 from uuvtai.cli import main
 
 
@@ -154,8 +155,8 @@ def evaluation(tmp_path_factory):
     """One real evaluation in a process of its own: two controllers, recorded, as JSON."""
     folder = tmp_path_factory.mktemp("eval") / "run"
     command = [
-        sys.executable, "-m", "uuvtai", "eval", "--controller", "straight,bt", "--episodes", "4", "--seeds", "3", "--num-envs", "4",
-        "--record", "1", "--video", "--set", "episode.horizon_steps=400", "--run-dir", str(folder), "--json", "--device", "cpu",
+        sys.executable, "-m", "uuvtai", "eval", "--controller", "straight,bt", "--episodes", "4", "--seeds", "3", *SmallSim.OPTIONS,
+        "--record", "1", "--video", "--set", "episode.horizon_steps=400", "--run-dir", str(folder), "--json",
     ]  # fmt: skip
     done = subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ, "NO_COLOR": "1"})
     assert done.returncode == 0, done.stderr
@@ -182,8 +183,8 @@ def test_eval_prints_one_document_with_every_documented_key(evaluation):
 def test_one_thread_gives_the_same_episodes_to_the_last_digit(evaluation, tmp_path):
     _, document, _ = evaluation
     command = [
-        sys.executable, "-m", "uuvtai", "eval", "--controller", "bt", "--episodes", "4", "--seeds", "3", "--num-envs", "4",
-        "--set", "episode.horizon_steps=400", "--run-dir", str(tmp_path / "run"), "--json", "--device", "cpu",
+        sys.executable, "-m", "uuvtai", "eval", "--controller", "bt", "--episodes", "4", "--seeds", "3", *SmallSim.OPTIONS,
+        "--set", "episode.horizon_steps=400", "--run-dir", str(tmp_path / "run"), "--json",
     ]  # fmt: skip
     done = subprocess.run(command, capture_output=True, text=True, check=True, env={**os.environ, "UUV_NUM_THREADS": "1"})
     assert json.loads(done.stdout)["methods"][0]["episodes_detail"] == document["methods"][1]["episodes_detail"]
@@ -225,7 +226,7 @@ def test_an_existing_run_folder_is_never_overwritten(evaluation, capfd):
     folder, _, _ = evaluation
     before = (folder / "run.json").read_text()
     done = subprocess.run(
-        [sys.executable, "-m", "uuvtai", "eval", "--episodes", "1", "--num-envs", "4", "--run-dir", str(folder), "--device", "cpu"],
+        [sys.executable, "-m", "uuvtai", "eval", "--episodes", "1", *SmallSim.OPTIONS, "--run-dir", str(folder)],
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 1
@@ -237,7 +238,7 @@ def test_an_existing_run_folder_is_never_overwritten(evaluation, capfd):
 def test_a_run_folder_that_cannot_be_written_is_exit_1(tmp_path, place):
     (tmp_path / "file").write_text("mine")
     done = subprocess.run(
-        [sys.executable, "-m", "uuvtai", "eval", "--episodes", "1", "--num-envs", "4", "--run-dir", place, "--device", "cpu"],
+        [sys.executable, "-m", "uuvtai", "eval", "--episodes", "1", *SmallSim.OPTIONS, "--run-dir", place],
         capture_output=True, text=True, check=False, cwd=tmp_path,
     )  # fmt: skip
     assert done.returncode == 1
@@ -254,8 +255,8 @@ def test_interrupt_leaves_a_marked_run_and_repairable_logs(evaluation, tmp_path)
     """The same sizes and rules as ``evaluation``, whose kernels are compiled by now: a compiling process does not listen."""
     folder = tmp_path / "run"
     process = subprocess.Popen(
-        [sys.executable, "-m", "uuvtai", "eval", "--controller", "bt", "--episodes", "400", "--seeds", "3", "--num-envs", "4",
-         "--set", "episode.horizon_steps=400", "--record", "400", "--run-dir", str(folder), "--device", "cpu"],
+        [sys.executable, "-m", "uuvtai", "eval", "--controller", "bt", "--episodes", "400", "--seeds", "3", *SmallSim.OPTIONS,
+         "--set", "episode.horizon_steps=400", "--record", "400", "--run-dir", str(folder)],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     deadline = time.monotonic() + 600

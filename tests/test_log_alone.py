@@ -19,11 +19,11 @@ from mcap.reader import make_reader
 from mcap.records import Attachment, Chunk, Metadata
 from mcap.stream_reader import StreamReader
 
+from tests.conftest import SmallSim
 from tests.reference import log_alone
 from uuvtai.loader import load_config, load_resolved
 
 HORIZON = 200
-N_ENV = 4
 """as in test_cli.py: the same kernels are compiled once"""
 
 FIT_SHARE = 0.99
@@ -43,7 +43,7 @@ CLOSED_FORM = 1e-5
 
 def recorded(folder, *options):
     command = [
-        sys.executable, "-m", "uuvtai", "eval", "--num-envs", str(N_ENV), "--device", "cpu",
+        sys.executable, "-m", "uuvtai", "eval", *SmallSim.OPTIONS,
         "--set", f"episode.horizon_steps={HORIZON}", "--run-dir", str(folder), "--json", *options,
     ]  # fmt: skip
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=Path(__file__).parent.parent, timeout=600)

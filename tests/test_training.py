@@ -10,6 +10,7 @@ import time
 import pytest
 import torch
 
+from tests.conftest import SmallSim
 from tests.point_env import PointEnv
 from uuvtai.env import VectorEnv
 from uuvtai.learn import checkpoint
@@ -236,8 +237,7 @@ def test_an_evaluation_in_between_leaves_no_trace(small):
 
 
 RUN = (
-    "train", "smoke", "--num-envs", "4", "--set", "episode.horizon_steps=400", "--set", "distill.batch=32", "--set", "world_model.batch=32",
-    "--device", "cpu",
+    "train", "smoke", *SmallSim.OPTIONS, "--set", "episode.horizon_steps=400", "--set", "distill.batch=32", "--set", "world_model.batch=32",
 )  # fmt: skip
 
 
