@@ -85,6 +85,7 @@ class Stage:
         self.forecast.below_w.fill(-9.0)
         self.clock.awake.fill(1)
         self.tracks.alive.fill(1)
+        self.tracks.spot_step.fill(-1)
         self.tracks.moving.fill(1)
         self.tracks.radius_m.fill(0.2)
         self.own = np.tile([5.0, 3.0, -0.8], (N_ENV, 1))
@@ -210,7 +211,7 @@ def test_own_change_of_depth_tells_above_from_below(stage):
 
 
 def test_what_is_missed_everywhere_has_gone(stage):
-    """A miss where it could hide takes little of its presence; misses at all depths take it all."""
+    """A miss where it could hide takes little of its presence; misses at all depths take nearly all of it."""
     stage.weigh(MISS)
     once = stage.present[0, 0]
     assert 0.9 < once < 0.95
@@ -218,7 +219,17 @@ def test_what_is_missed_everywhere_has_gone(stage):
         stage.own[:, 2] = own_z
         for _ in range(20):
             stage.weigh(MISS)
-    assert stage.present[0, 0] < 0.05
+    assert stage.present[0, 0] < 0.25 * CFG.gone_share
+
+
+def test_a_wrong_belief_is_given_up(stage):
+    """Hundreds of scans say "level with the vehicle"; then it dives, and what it hits there cannot be where it was believed to be."""
+    for _ in range(300):
+        stage.weigh(HIT)
+    stage.own[:, 2] = -1.5
+    for _ in range(5):
+        stage.weigh(HIT)
+    assert stage.share[0, 0, near(-1.5)] > 10 * stage.share[0, 0, near(-0.8)]
 
 
 def test_an_unsure_place_makes_a_miss_say_less(stage):

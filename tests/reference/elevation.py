@@ -9,6 +9,7 @@ N_SLICE = 15
 CERTAIN = 0.95
 """probability of a body that was just matched to be where it is expected"""
 LEAST = 0.01
+LEAST_SHARE = 1e-3
 """likelihood of what cannot be"""
 
 
@@ -28,12 +29,18 @@ def hit_probability(own_z, away_m, radius_m, half_m, cfg, sonar, tank):
     return np.append(np.interp(overlap, [-cfg.edge_m, cfg.edge_m], [0, 1]), 1.0)
 
 
+def shared(weighed):
+    """Shares that sum to 1 after every hypothesis has been lifted to the least one."""
+    held = np.maximum(weighed / weighed.sum(), LEAST_SHARE)
+    return held / held.sum()
+
+
 def after_hit(share, own, place, radius_m, cfg, sonar, tank):
     """(shares, presence) after the sonar at ``own`` (x, y, z) has hit the body expected at ``place``: a hit tells little near the edge."""
     half = max(radius_m, cfg.half_height_m) + cfg.edge_m
     likely = hit_probability(own[2], np.hypot(*(place - own[:2])), radius_m, half, cfg, sonar, tank)
     weighed = share * np.maximum(likely, LEAST)
-    return weighed / weighed.sum(), CERTAIN
+    return shared(weighed), CERTAIN
 
 
 def after_miss(share, present, own, place, place_cov, radius_m, dt_s, cfg, sonar, tank):
@@ -48,7 +55,7 @@ def after_miss(share, present, own, place, place_cov, radius_m, dt_s, cfg, sonar
 def seen_not(share, present, likely):
     """Bayes' rule for what did not show: ``likely`` = its probability per hypothesis where the body is there, 1 where it is not."""
     joint = present * share * likely
-    return joint / joint.sum(), joint.sum() / (joint.sum() + 1 - present)
+    return shared(joint), joint.sum() / (joint.sum() + 1 - present)
 
 
 def free_water(share, own_z, radius_m, cfg, tank):

@@ -40,7 +40,7 @@ def look(share, present, image, pos, rpy, at, radius, cfg, depth, tank):
     if len(body):
         likely, unsure = shown(eye[2] + rays[body, 2] * away[body], body, hides, z, tank)
         weighed = share * likely
-        return weighed / weighed.sum(), present, min(doubt, unsure)
+        return elevation.shared(weighed), present, min(doubt, unsure)
     front = eye + rays * (ahead - radius / 2)
     rows = [np.abs(front[:, 2] - height).argmin() for height in z]
     pitch = abs(front[1, 2] - front[0, 2])

@@ -21,7 +21,10 @@ COLUMN = LANES - 1
 """Lane of the hypothesis "through the full water column"; the others are centre heights from floor to surface."""
 
 _LEAST = 0.01
-"""Likelihood of what cannot be: no hypothesis dies for ever on one wrong scan."""
+"""Likelihood of what cannot be, for one scan may be wrong."""
+
+_LEAST_SHARE = 1.0e-3
+"""Share that every hypothesis keeps: many scans may be wrong too (two bodies that cross swap their tracks), and nothing comes back from 0."""
 
 _WELL_THERE = 0.95
 """Probability of a body that has just been matched to be where it is expected."""
@@ -35,6 +38,13 @@ def heights(tank: Const[TankConfig]):
     out = ramp_lanes(0.5) * step + floor
     out[COLUMN] = 0.5 * (floor + top)
     return out
+
+
+@ti.func
+def shared(weighed):
+    """Weights as shares that sum to 1, none below the least one but for rounding."""
+    held = ti.max(weighed * (1.0 / weighed.sum()), _LEAST_SHARE)
+    return held * (1.0 / held.sum())
 
 
 @ti.func
@@ -76,7 +86,7 @@ def weigh_seen(env, track, own, tracks: Out[TrackState], cfg: Const[ElevationCon
     """The sonar at ``own`` hit it: it is there, and within the fan."""
     likely = in_fan(env, track, own, half_height(env, track, tracks, cfg) + cfg.edge_m, tracks, cfg, sonar, tank)
     weighed = tracks.height[env, track, 0] * ti.max(likely, _LEAST)
-    tracks.height[env, track, 0] = weighed / weighed.sum()
+    tracks.height[env, track, 0] = shared(weighed)
     tracks.present[env, track] = _WELL_THERE
 
 
@@ -96,7 +106,7 @@ def weigh_unseen(
     likely = in_fan(env, track, own, cfg.least_half_height_m - cfg.edge_m, tracks, cfg, sonar, tank)
     weighed = tracks.height[env, track, 0] * ti.max(1.0 - likely * hit, _LEAST)
     total = weighed.sum()
-    tracks.height[env, track, 0] = weighed / total
+    tracks.height[env, track, 0] = shared(weighed)
     there = tracks.present[env, track] * total
     tracks.present[env, track] = there / (there + 1.0 - tracks.present[env, track])
 
@@ -106,7 +116,7 @@ def weigh_camera(env, track, likely, missing, tracks: Out[TrackState]):
     """An image's likelihood per hypothesis; where it shows no body (``missing`` 1) the body is also less surely where it is expected."""
     weighed = tracks.height[env, track, 0] * likely
     total = weighed.sum()
-    tracks.height[env, track, 0] = weighed / total
+    tracks.height[env, track, 0] = shared(weighed)
     if missing == 1:
         there = tracks.present[env, track] * total
         tracks.present[env, track] = there / (there + 1.0 - tracks.present[env, track])
