@@ -227,7 +227,7 @@ def test_a_wrong_belief_is_given_up(stage):
     for _ in range(300):
         stage.weigh(HIT)
     stage.own[:, 2] = -1.5
-    for _ in range(5):
+    for _ in range(20):
         stage.weigh(HIT)
     assert stage.share[0, 0, near(-1.5)] > 10 * stage.share[0, 0, near(-0.8)]
 

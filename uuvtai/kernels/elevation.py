@@ -24,7 +24,7 @@ _LEAST = 0.01
 """Likelihood of what cannot be, for one scan may be wrong."""
 
 _LEAST_SHARE = 1.0e-3
-"""Share that every hypothesis keeps: many scans may be wrong too (two bodies that cross swap their tracks), and nothing comes back from 0."""
+"""Share that every hypothesis keeps: many scans may be wrong (two bodies that cross swap their tracks), and nothing comes back from 0."""
 
 _WELL_THERE = 0.95
 """Probability of a body that has just been matched to be where it is expected."""
