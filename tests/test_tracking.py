@@ -427,6 +427,37 @@ def test_track_survives_occlusion_and_dies_when_seen_through(paper):
     assert (lab.read("alive").sum(1) == 1).all()
 
 
+def test_what_the_camera_shows_is_not_seen_through(paper):
+    """Beams meet nothing where a track is expected: it lives as long as images show it, and 0.3 s longer; without any it ends at once.
+
+    Alike for an older track (odd envs) and for one that has never been a scan's.
+    """
+    lab, (pos, yaw, own) = paper.begin(20), at_rest()
+    blank = np.full((N_ENV, 256), 12.0), np.zeros((N_ENV, 256)), np.zeros((N_ENV, 256))
+    lab.feed(0, pos, yaw, own, *blank)
+    older, stops = np.arange(N_ENV) % 2 == 1, np.choose(np.arange(N_ENV) // 2 % 4, [-1, 0, 60, 999])
+    known = {
+        "alive": 1, "misses": 1, "state": [12.0, 3.0, 0.0, 0.0], "cov": [1e-3, 0, 0, 0, 1e-3, 0, 0, 1e-3, 0, 1e-3], "radius_m": 0.2,
+        "age": np.where(older, 10, 0), "moving": older, "spot_step": -1,
+    }  # fmt: skip
+    for name, value in known.items():
+        stored = lab.read(name)
+        stored[:, 5] = value
+        getattr(lab.tracks, name).from_numpy(stored)
+    lived_s = np.zeros(N_ENV)
+    for step in range(3, 150, 3):
+        spots = lab.read("spot_step")
+        spots[:, 5] = np.where(step // 5 * 5 <= stops, step // 5 * 5, spots[:, 5])
+        spots[lab.read("alive") == 0] = -1
+        lab.tracks.spot_step.from_numpy(spots)
+        lab.feed(step, pos, yaw, own, *blank)
+        lived_s = np.where(lab.read("alive")[:, 5] == 1, step * DT_S, lived_s)
+    assert (lived_s[(stops < 0) & ~older] == 0).all()
+    assert (lived_s[(stops < 0) & older] < CONFIG.see_through_s).all()
+    for last, most in ((0, 0.3), (60, 1.5), (999, 3.0)):
+        assert ((lived_s[stops == last] > most - 2 * PERIOD_S) & (lived_s[stops == last] <= most)).all()
+
+
 def test_partly_hidden_body_keeps_its_centre(paper):
     """Half of a resting cylinder comes to lie behind a nearer one as the vehicle moves: its track stays at the centre and at rest."""
     lab, (pos, yaw, own) = paper.begin(6), at_rest(5.0, 3.6)
