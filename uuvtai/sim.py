@@ -402,7 +402,7 @@ class Sim:
 
     def rows(self, field: ti.Field, envs: list[int] | None = None) -> np.ndarray:
         """Host copy of a field's rows, shape (len(envs), ...) (default: all envs); only these rows are copied."""
-        chosen = torch.tensor(range(self.num_envs) if envs is None else envs, dtype=torch.int32, device=self.device)
+        chosen = self._every_row if envs is None else torch.tensor(envs, dtype=torch.int32, device=self.device)
         inner = (field.n,) if hasattr(field, "n") else ()
         out = torch.empty((len(chosen), *field.shape[1:], *inner), dtype=_TORCH_DTYPE[field.dtype], device=self.device)
         copy_rows(field, chosen, out)

@@ -11,10 +11,11 @@ import taichi as ti
 from uuvtai.config import ActuationConfig, EpisodeConfig, VehicleConfig
 from uuvtai.kernels.lanes import column, is_awake, n_awake, n_column, put_column
 from uuvtai.kernels.rotor import rpm_of_thrust, thrust_limits
-from uuvtai.kernels.signature import Const, In, Out, spread
+from uuvtai.kernels.signature import Const, In, Out, quick_launch, spread
 from uuvtai.state import ActuationState, Allocation, ClockState, Proprioception, VehicleParams
 
 
+@quick_launch
 @ti.kernel
 def command_thrusters(
     action: ti.types.ndarray(dtype=ti.f32, ndim=2),  # type: ignore[valid-type]
@@ -39,6 +40,7 @@ def command_thrusters(
             _drive(packet * lanes, lanes, actuation, params, allocation, ego, clock, vehicle_cfg, actuation_cfg, episode_cfg)
 
 
+@quick_launch
 @ti.kernel
 def reset_actuation(actuation: Out[ActuationState], clock: In[ClockState]):
     """Nothing commanded, nothing under way."""

@@ -21,7 +21,7 @@ import taichi as ti
 from uuvtai.config import ClearanceConfig, MappingConfig, VoronoiConfig
 from uuvtai.kernels.bits import WORD, highest_bit, lowest_bit, put_bit, without_lowest
 from uuvtai.kernels.lanes import LANES, i16x
-from uuvtai.kernels.signature import Const, In, Out, spread
+from uuvtai.kernels.signature import Const, In, Out, quick_launch, spread
 from uuvtai.state import ClearanceMemory, ClearanceState, ClockState, GridMask, MapState
 
 _FAR_COLS = 1 << 12
@@ -270,6 +270,7 @@ def is_due(env, clock: In[ClockState], cfg: Const[ClearanceConfig]):
     return ti.cast(clock.awake[env] == 1 and clock.step[env] % cfg.period_steps == 0, ti.i32)
 
 
+@quick_launch
 @ti.kernel
 def compute_clearance(
     clearance: Out[ClearanceState],

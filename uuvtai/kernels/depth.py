@@ -14,7 +14,7 @@ from uuvtai.kernels.geometry import BOX, FAR_M, NONE, SPHERE, rotation_wb
 from uuvtai.kernels.lanes import LANES, f16x, ramp_lanes
 from uuvtai.kernels.noise import STREAM_DEPTH, normal_pair_lanes, stream_key
 from uuvtai.kernels.raycast import ball_span, disc_span, rim_distance, slab_span
-from uuvtai.kernels.signature import Const, In, Out, spread
+from uuvtai.kernels.signature import Const, In, Out, quick_launch, spread
 from uuvtai.state import ClockState, DepthImage, EpisodeState, Proprioception, VehicleState, WorldState
 
 _BLOCK = 36
@@ -36,6 +36,7 @@ Eye = ti.types.struct(pos=ti.math.vec3, R_wb=ti.math.mat3)
 """Truth of the camera as float32: world position [m], body to world."""
 
 
+@quick_launch
 @ti.kernel
 def reset_depth(image: Out[DepthImage], clock: In[ClockState]):
     """Forget the image of the awake rows (the shot of step 0 fills it)."""
@@ -50,6 +51,7 @@ def reset_depth(image: Out[DepthImage], clock: In[ClockState]):
                 image.shot_rpy[env] = ti.zero(image.shot_rpy[env])
 
 
+@quick_launch
 @ti.kernel
 def cast_depth(
     image: Out[DepthImage],

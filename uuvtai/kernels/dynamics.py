@@ -18,7 +18,7 @@ from uuvtai.kernels.geometry import quaternion_wb, roll_pitch_yaw, rotation_wb
 from uuvtai.kernels.lanes import column, is_awake, n_awake, n_column, put_column
 from uuvtai.kernels.noise import STREAM_CURRENT, STREAM_THRUSTER, STREAM_VEHICLE, normal, stream_key, uniform_in
 from uuvtai.kernels.rotor import lag_kept, thrust_of_rpm
-from uuvtai.kernels.signature import Const, In, Out, spread
+from uuvtai.kernels.signature import Const, In, Out, quick_launch, spread
 from uuvtai.state import (
     ActuationState,
     Allocation,
@@ -38,6 +38,7 @@ _DRAW_LINEAR = 7
 _DRAW_QUADRATIC = 13
 
 
+@quick_launch
 @ti.kernel
 def move_vehicle(
     vehicle: Out[VehicleState],
@@ -79,6 +80,7 @@ def move_vehicle(
                         current.vel_w[env] = current_after(current.mean_w[env], current.vel_w[env], key, disturbance_cfg, dt_s)
 
 
+@quick_launch
 @ti.kernel
 def reset_vehicle(
     vehicle: Out[VehicleState],
@@ -103,6 +105,7 @@ def reset_vehicle(
             _draw_current(env, current, episode, disturbance_cfg)
 
 
+@quick_launch
 @ti.kernel
 def sense_exactly(ego: Out[Proprioception], vehicle: In[VehicleState], clock: In[ClockState]):
     """Perfect velocity, attitude and rates for the inner loop: experiments on the plant alone have no sensors."""

@@ -14,7 +14,7 @@ from uuvtai.config import ElevationConfig, SonarConfig, TankConfig
 from uuvtai.kernels.geometry import FAR_M
 from uuvtai.kernels.kalman import largest_position_variance
 from uuvtai.kernels.lanes import LANES, f16x, ramp_lanes
-from uuvtai.kernels.signature import Const, In, Out, spread
+from uuvtai.kernels.signature import Const, In, Out, quick_launch, spread
 from uuvtai.state import ClockState, ForecastState, Proprioception, TrackState
 
 COLUMN = LANES - 1
@@ -122,6 +122,7 @@ def weigh_camera(env, track, likely, missing, tracks: Out[TrackState]):
         tracks.present[env, track] = there / (there + 1.0 - tracks.present[env, track])
 
 
+@quick_launch
 @ti.kernel
 def bound_heights(
     forecast: Out[ForecastState],

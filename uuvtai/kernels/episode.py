@@ -7,7 +7,7 @@ from uuvtai.kernels.geometry import FAR_M, NONE, rotation_wb
 from uuvtai.kernels.hull import hull_to_body, hull_to_floor_or_surface, hull_to_side_wall, is_in_tank
 from uuvtai.kernels.noise import episode_key
 from uuvtai.kernels.outcome import COLLISION, OUT_OF_TANK, OUTCOMES, RUNNING, SUCCESS, TIMEOUT, TTC
-from uuvtai.kernels.signature import Const, In, Out, spread
+from uuvtai.kernels.signature import Const, In, Out, quick_launch, spread
 from uuvtai.state import ClockState, EpisodeState, MissionState, RefereeState, VehicleState, WorldState
 
 __all__ = ["COLLISION", "OUTCOMES", "OUT_OF_TANK", "RUNNING", "SUCCESS", "TIMEOUT", "TTC"]
@@ -32,6 +32,7 @@ def begin_episodes(
             episode.key[env] = episode_key(seed[env], number[env])
 
 
+@quick_launch
 @ti.kernel
 def advance_clock(clock: Out[ClockState]):
     """One control step more for the awake rows."""
@@ -40,6 +41,7 @@ def advance_clock(clock: Out[ClockState]):
             clock.step[env] += 1
 
 
+@quick_launch
 @ti.kernel
 def wake(clock: Out[ClockState]):
     """After a reset: every running row takes part in the next step."""
@@ -47,6 +49,7 @@ def wake(clock: Out[ClockState]):
         clock.awake[env] = clock.active[env]
 
 
+@quick_launch
 @ti.kernel
 def sleep_ended(clock: Out[ClockState], referee: In[RefereeState]):
     """Rows whose episode has ended take no part in further steps."""
@@ -117,6 +120,7 @@ def outcome_of(
     return out
 
 
+@quick_launch
 @ti.kernel
 def reset_referee(
     referee: Out[RefereeState],
@@ -140,6 +144,7 @@ def reset_referee(
             referee.last_pos_w[env] = vehicle.pos_w[env]
 
 
+@quick_launch
 @ti.kernel
 def judge(
     referee: Out[RefereeState],

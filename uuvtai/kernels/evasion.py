@@ -6,10 +6,11 @@ from uuvtai.config import MappingConfig, TankConfig, TeacherConfig, TrackingConf
 from uuvtai.kernels.geometry import FAR_M, TWO_PI, turned_z3
 from uuvtai.kernels.lanes import LANES, f16x, put_column
 from uuvtai.kernels.rollout import body_depths, depth_band, static_depths
-from uuvtai.kernels.signature import Const, In, Out, spread
+from uuvtai.kernels.signature import Const, In, Out, quick_launch, spread
 from uuvtai.state import ClearanceState, ClockState, ForecastState, Proprioception, TeacherState
 
 
+@quick_launch
 @ti.kernel
 def plan_evasion(
     teacher: Out[TeacherState],

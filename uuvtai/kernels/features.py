@@ -10,7 +10,7 @@ from uuvtai.kernels.advice import TEACHER_COLUMNS
 from uuvtai.kernels.approach import BODY_COLUMNS, closest_approach, next_body
 from uuvtai.kernels.columns import Column
 from uuvtai.kernels.geometry import FAR_M, TWO_PI, quaternion_wb, rotation_wb
-from uuvtai.kernels.signature import Const, In, Out, spread
+from uuvtai.kernels.signature import Const, In, Out, quick_launch, spread
 from uuvtai.state import (
     ClockState,
     FeatureState,
@@ -25,6 +25,7 @@ from uuvtai.state import (
 )
 
 
+@quick_launch
 @ti.kernel
 def sense_sectors(
     features: Out[FeatureState],
@@ -211,6 +212,7 @@ _SECTOR_COLUMNS = tuple(column for column in COLUMNS if column.per == "sector")
 _OWN_COLUMNS = tuple(column for column in COLUMNS if not column.per)
 
 
+@quick_launch
 @ti.kernel
 def write_observation(
     obs: ti.types.ndarray(dtype=ti.f32, ndim=2),  # type: ignore[valid-type]
@@ -234,6 +236,7 @@ def write_observation(
                     obs[env, first + sector] = ti.cast(source(env, sector, features), ti.f32)
 
 
+@quick_launch
 @ti.kernel
 def write_bodies(
     obs: ti.types.ndarray(dtype=ti.f32, ndim=2),  # type: ignore[valid-type]
@@ -272,6 +275,7 @@ def write_bodies(
                             obs[env, first + slot * width + i] = ti.cast(value[i], ti.f32)
 
 
+@quick_launch
 @ti.kernel
 def write_advice(
     obs: ti.types.ndarray(dtype=ti.f32, ndim=2),  # type: ignore[valid-type]

@@ -6,13 +6,14 @@ from uuvtai.config import EpisodeConfig, ForecastConfig, TankConfig, TrackingCon
 from uuvtai.kernels.geometry import turned_z
 from uuvtai.kernels.habits import expected_turn_rate, forget_habits, learn_habit, next_event
 from uuvtai.kernels.kalman import largest_position_variance
-from uuvtai.kernels.signature import Const, In, Out, spread
+from uuvtai.kernels.signature import Const, In, Out, quick_launch, spread
 from uuvtai.state import ClockState, ClusterState, ForecastState, HabitState, TrackState
 
 MOST_LEGS = 6
 """Turns within one forecast; beyond them a body goes straight on."""
 
 
+@quick_launch
 @ti.kernel
 def reset_forecast(forecast: Out[ForecastState], habits: Out[HabitState], clock: In[ClockState]):
     """Know no habits and expect nothing in the awake rows."""
@@ -26,6 +27,7 @@ def reset_forecast(forecast: Out[ForecastState], habits: Out[HabitState], clock:
                     forecast.pos_w[env, track, k] = ti.Vector([0.0, 0.0])
 
 
+@quick_launch
 @ti.kernel
 def learn_habits(
     habits: Out[HabitState],
@@ -43,6 +45,7 @@ def learn_habits(
                 learn_habit(env, track, habits, tracks, forecast_cfg, rules)
 
 
+@quick_launch
 @ti.kernel
 def forecast_tracks(
     forecast: Out[ForecastState],

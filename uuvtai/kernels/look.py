@@ -12,7 +12,7 @@ from uuvtai.kernels.elevation import COLUMN, heights, weigh_camera
 from uuvtai.kernels.evidence import pinhole
 from uuvtai.kernels.geometry import FAR_M, quaternion_wb, rotation_wb
 from uuvtai.kernels.lanes import LANES, f16x
-from uuvtai.kernels.signature import Const, In, Out, spread
+from uuvtai.kernels.signature import Const, In, Out, quick_launch, spread
 from uuvtai.state import ClockState, DepthImage, TrackState
 
 _DEPTH_SLACK_M = 0.25
@@ -33,6 +33,7 @@ _BODY = 1
 _PAST = 2
 
 
+@quick_launch
 @ti.kernel
 def look_at_bodies(
     tracks: Out[TrackState],

@@ -26,7 +26,7 @@ from uuvtai.config import DepthConfig, EpisodeConfig, MappingConfig, SonarConfig
 from uuvtai.kernels.bits import WORD, bit_of, cell_bit, lowest_bit, taken, with_bit, without_lowest
 from uuvtai.kernels.evidence import mark_depth, mark_hits
 from uuvtai.kernels.fan import mark_fan
-from uuvtai.kernels.signature import Const, In, Out, spread
+from uuvtai.kernels.signature import Const, In, Out, quick_launch, spread
 from uuvtai.state import ClockState, DepthImage, GridMask, MapScratch, MapState, SonarScan, TrackState
 
 RATED_HZ = 10.0
@@ -250,6 +250,7 @@ def merge_scan(
 # ---------------------------------------------------------------------------------------------------------------------- kernels
 
 
+@quick_launch
 @ti.kernel
 def update_map(
     grid_map: Out[MapState],
@@ -285,6 +286,7 @@ def update_map(
                     grid_map.map_step[env] = clock.step[env]
 
 
+@quick_launch
 @ti.kernel
 def reset_map(grid_map: Out[MapState], clock: In[ClockState]):
     """An empty map: nothing occupied, nothing seen."""

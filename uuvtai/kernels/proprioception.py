@@ -10,13 +10,14 @@ import taichi as ti
 from uuvtai.config import EpisodeConfig, SensorsConfig, VehicleConfig
 from uuvtai.kernels.geometry import quaternion_wb, roll_pitch_yaw, rotation_wb, wrapped_angle
 from uuvtai.kernels.noise import STREAM_DVL, STREAM_IMU, STREAM_PRESSURE, normal, stream_key, uniform, uniform_in
-from uuvtai.kernels.signature import Const, In, Out, spread
+from uuvtai.kernels.signature import Const, In, Out, quick_launch, spread
 from uuvtai.state import ClockState, EpisodeState, Proprioception, ProprioceptionMemory, VehicleState
 
 _EPISODE_DRAW = 1000
 """Index of draws made once per episode, apart from those of step 0."""
 
 
+@quick_launch
 @ti.kernel
 def reset_proprioception(
     ego: Out[Proprioception],
@@ -55,6 +56,7 @@ def clear_readings(env, ego: Out[Proprioception], vehicle: In[VehicleState]):
     ego.pos_w[env] = vehicle.pos_w[env]
 
 
+@quick_launch
 @ti.kernel
 def sense_proprioception(
     ego: Out[Proprioception],

@@ -10,7 +10,7 @@ import taichi as ti
 from uuvtai.config import EpisodeConfig, RewardConfig, VehicleConfig
 from uuvtai.kernels.geometry import rotation_wb
 from uuvtai.kernels.outcome import SUCCESS, TIMEOUT, is_failure
-from uuvtai.kernels.signature import Const, In, Out, spread
+from uuvtai.kernels.signature import Const, In, Out, quick_launch, spread
 from uuvtai.state import ActuationState, ClockState, RefereeState, RewardState, RouteState, VehicleState
 
 TERMS = (
@@ -43,6 +43,7 @@ def signed_weights(reward_cfg):
     return tuple(-getattr(reward_cfg, name) if name in _PENALTIES else getattr(reward_cfg, name) for name in TERMS)
 
 
+@quick_launch
 @ti.kernel
 def reset_reward(reward: Out[RewardState], clock: In[ClockState]):
     """Forget the last episode of the awake rows."""
@@ -135,6 +136,7 @@ def unweighted_terms(
     )
 
 
+@quick_launch
 @ti.kernel
 def compute_reward(
     reward_out: ti.types.ndarray(dtype=ti.f32, ndim=1),  # type: ignore[valid-type]
@@ -173,6 +175,7 @@ def compute_reward(
             truncated[env] = ti.cast(outcome == TIMEOUT, ti.i32)
 
 
+@quick_launch
 @ti.kernel
 def tell_step(
     terms: ti.types.ndarray(dtype=ti.f32, ndim=2),  # type: ignore[valid-type]

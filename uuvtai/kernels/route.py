@@ -23,7 +23,7 @@ from uuvtai.kernels.plan_codes import (
     TRIGGERS,
 )
 from uuvtai.kernels.polyline import MAX_WIDENINGS, WIDENING, count_after_segment, install_route
-from uuvtai.kernels.signature import Const, In, Out, spread
+from uuvtai.kernels.signature import Const, In, Out, quick_launch, spread
 from uuvtai.state import ClearanceState, ClockState, MapState, MissionState, Proprioception, RouteState
 
 __all__ = [
@@ -51,6 +51,7 @@ _LONG_AGO = -(1 << 20)
 """Step at which no trigger has been served yet."""
 
 
+@quick_launch
 @ti.kernel
 def reset_route(route: Out[RouteState], clock: In[ClockState]):
     """No route, no history, in the awake rows."""
@@ -94,6 +95,7 @@ def reset_route(route: Out[RouteState], clock: In[ClockState]):
                 route.fallbacks[env, i] = 0
 
 
+@quick_launch
 @ti.kernel
 def follow_route(
     route: Out[RouteState],

@@ -13,7 +13,7 @@ from uuvtai.config import EpisodeConfig, SonarConfig, TankConfig
 from uuvtai.kernels.geometry import FAR_M, rotation_wb
 from uuvtai.kernels.lanes import LANES, f16x
 from uuvtai.kernels.raycast import nearest_echo, place_bodies
-from uuvtai.kernels.signature import Const, In, Out, spread
+from uuvtai.kernels.signature import Const, In, Out, quick_launch, spread
 from uuvtai.kernels.sonar_error import (
     cloud_covered,
     cut_off,
@@ -37,6 +37,7 @@ Mount = ti.types.struct(pos=ti.math.vec3, vel=ti.math.vec2, heading=ti.math.vec2
 """Truth of the sensor as float32: world position [m], horizontal velocity [m/s], unit vector ahead."""
 
 
+@quick_launch
 @ti.kernel
 def reset_sonar(scan: Out[SonarScan], memory: Out[SonarMemory], clock: In[ClockState]):
     """Forget scans and clouds of the awake rows: no return anywhere, nothing fresh or under way (step 0 then fills the scan)."""
@@ -69,6 +70,7 @@ def clear_memory(env, memory: Out[SonarMemory]):
         memory.cloud_until[env, cloud] = 0
 
 
+@quick_launch
 @ti.kernel
 def cast_sonar(
     scan: Out[SonarScan],

@@ -14,7 +14,7 @@ from uuvtai.kernels.geometry import FAR_M, TWO_PI, quaternion_wb, rotation_wb, w
 from uuvtai.kernels.kalman import born, corrected, position_variance
 from uuvtai.kernels.lanes import LANES, f16x, ramp_lanes
 from uuvtai.kernels.sighting import bearing_vector
-from uuvtai.kernels.signature import Const, In, Out, spread
+from uuvtai.kernels.signature import Const, In, Out, quick_launch, spread
 from uuvtai.kernels.track_slots import clear_track
 from uuvtai.state import ClockState, DepthImage, SonarScan, SpotState, TrackState
 
@@ -28,6 +28,7 @@ _NEWLY_SEEN_S = 0.15
 """[s] a track that the sonar saw this lately needs no image."""
 
 
+@quick_launch
 @ti.kernel
 def scan_columns(
     spots: Out[SpotState],
@@ -81,6 +82,7 @@ def column_distances(env, first_col, image: In[DepthImage], cfg: Const[SpottingC
     return near, edge
 
 
+@quick_launch
 @ti.kernel
 def follow_spots(
     tracks: Out[TrackState],

@@ -8,11 +8,12 @@ from uuvtai.config import EpisodeConfig, TankConfig, TeacherConfig, VehicleConfi
 from uuvtai.kernels import tree_tick as codes
 from uuvtai.kernels.geometry import FAR_M, PI, quaternion_wb, rotation_wb, turned_z, wrapped_angle
 from uuvtai.kernels.rollout import held_heave
-from uuvtai.kernels.signature import Const, In, Out, spread
+from uuvtai.kernels.signature import Const, In, Out, quick_launch, spread
 from uuvtai.kernels.tree_tick import tick_nodes
 from uuvtai.state import ClockState, MissionState, Proprioception, RouteState, TeacherState, TreeTable
 
 
+@quick_launch
 @ti.kernel
 def reset_teacher(teacher: Out[TeacherState], clock: In[ClockState]):
     """Forget everything of the last episode in the awake rows."""
@@ -47,6 +48,7 @@ def _reset_blackboard(env, teacher: Out[TeacherState]):
     teacher.calm_steps[env], teacher.evading_steps[env] = 0, 0
 
 
+@quick_launch
 @ti.kernel
 def tick_tree(
     teacher: Out[TeacherState],

@@ -7,7 +7,7 @@ from uuvtai.kernels.geometry import FAR_M, TWO_PI, turned_z3, wrapped_angle
 from uuvtai.kernels.grid import cell_of, centre_of
 from uuvtai.kernels.lanes import f16x
 from uuvtai.kernels.rollout import body_depths, depth_band, held_heave
-from uuvtai.kernels.signature import Const, In, Out, spread
+from uuvtai.kernels.signature import Const, In, Out, quick_launch, spread
 from uuvtai.state import ClearanceState, ClockState, ForecastState, MissionState, Proprioception, RouteState, SonarScan, TeacherState
 
 _PATH_SAMPLES = 8
@@ -18,6 +18,7 @@ _NEARER_M = 0.2
 """[m] so far apart, from the foot of the route on."""
 
 
+@quick_launch
 @ti.kernel
 def assess_threats(
     teacher: Out[TeacherState],

@@ -14,12 +14,13 @@ from uuvtai.kernels.association import associate
 from uuvtai.kernels.clustering import find_clusters, label_beams
 from uuvtai.kernels.habits import coasted, expected_turn_rate
 from uuvtai.kernels.kalman import predicted
-from uuvtai.kernels.signature import Const, In, Out, spread
+from uuvtai.kernels.signature import Const, In, Out, quick_launch, spread
 from uuvtai.kernels.track_slots import carry_names, clear_track, name_beams, prune_tracks, spawn_tracks
 from uuvtai.kernels.track_update import update_tracks
 from uuvtai.state import ClockState, ClusterState, HabitState, SonarScan, TrackState
 
 
+@quick_launch
 @ti.kernel
 def reset_tracks(tracks: Out[TrackState], clusters: Out[ClusterState], clock: In[ClockState]):
     """Forget everything about the awake rows."""
@@ -65,6 +66,7 @@ def track_bodies(
     keep_slots(tracks, clusters, scan, clock, tracking, elevation, sonar, tank, rules)
 
 
+@quick_launch
 @ti.kernel
 def take_scan(
     clusters: Out[ClusterState],
@@ -85,6 +87,7 @@ def take_scan(
                 label_beams(env, clusters, scan, tracking, sonar, tank)
 
 
+@quick_launch
 @ti.kernel
 def cluster_beams(
     clusters: Out[ClusterState], scan: In[SonarScan], clock: In[ClockState], tracking: Const[TrackingConfig], sonar: Const[SonarConfig]
@@ -96,6 +99,7 @@ def cluster_beams(
             find_clusters(env, clusters, scan, tracking, sonar)
 
 
+@quick_launch
 @ti.kernel
 def follow_bodies(
     tracks: Out[TrackState],
@@ -118,6 +122,7 @@ def follow_bodies(
             update_tracks(env, dt, tracks, clusters, scan, tracking, sonar, rules)
 
 
+@quick_launch
 @ti.kernel
 def keep_slots(
     tracks: Out[TrackState],

@@ -8,7 +8,7 @@ the children of a finished node to IDLE at once. The kept form shows in a log wh
 
 import taichi as ti
 
-from uuvtai.kernels.signature import In, Out
+from uuvtai.kernels.signature import In, Out, quick_launch
 from uuvtai.state import TeacherState, TreeTable
 
 # statuses, numbered as in BehaviorTree.CPP
@@ -128,6 +128,7 @@ def _decorated(kind, answer):
     return status
 
 
+@quick_launch
 @ti.kernel
 def tick_with_given_statuses(result: ti.types.ndarray(), teacher: Out[TeacherState], table: In[TreeTable]):  # pyright: ignore
     """Tick every env with leaf answers given from outside, result[env, node]: for tests of the engine against another one."""

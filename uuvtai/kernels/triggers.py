@@ -22,11 +22,12 @@ from uuvtai.kernels.plan_codes import (
     TRIGGER_SAFETY,
     TRIGGER_STUCK,
 )
-from uuvtai.kernels.signature import Const, In, Out, spread
+from uuvtai.kernels.signature import Const, In, Out, quick_launch, spread
 from uuvtai.kernels.traversable import is_traversable
 from uuvtai.state import ClearanceState, ClockState, ForecastState, GridMask, MapState, MissionState, Proprioception, RouteState, SonarScan
 
 
+@quick_launch
 @ti.kernel
 def fire_triggers(
     route: Out[RouteState],

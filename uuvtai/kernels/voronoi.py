@@ -21,7 +21,7 @@ from uuvtai.kernels.plan_codes import (
     PLANNER_VORONOI,
 )
 from uuvtai.kernels.polyline import MAX_WIDENINGS, WIDENING, install_route
-from uuvtai.kernels.signature import Const, In, Out, spread
+from uuvtai.kernels.signature import Const, In, Out, quick_launch, spread
 from uuvtai.kernels.traversable import is_traversable, occupancy
 from uuvtai.state import (
     ClearanceState,
@@ -36,6 +36,7 @@ from uuvtai.state import (
 )
 
 
+@quick_launch
 @ti.kernel
 def plan_routes(
     voronoi: Out[VoronoiState],

@@ -13,10 +13,11 @@ from uuvtai.kernels.footprint import footprint_of
 from uuvtai.kernels.geometry import NONE
 from uuvtai.kernels.layout import draw_layout
 from uuvtai.kernels.paths import draw_moving_bodies, path_point, polyline_length
-from uuvtai.kernels.signature import Const, In, Out, spread
+from uuvtai.kernels.signature import Const, In, Out, quick_launch, spread
 from uuvtai.state import ClockState, EpisodeState, FixedTable, MissionState, PathState, ScenarioScratch, SceneState, WorldState
 
 
+@quick_launch
 @ti.kernel
 def generate_scenarios(
     world: Out[WorldState],
@@ -80,6 +81,7 @@ def place_fixed(
         scratch.footprint[env, slot] = footprint_of(fixed.kind[i], fixed.pos_w[i], fixed.size[i], fixed.yaw[i])
 
 
+@quick_launch
 @ti.kernel
 def move_obstacles(world: Out[WorldState], path: In[PathState], clock: In[ClockState], episode_cfg: Const[EpisodeConfig]):
     """Put every moving body of the awake rows where it is at time step * dt, with its velocity; depth stays."""

@@ -10,7 +10,6 @@ from typing import Any
 import torch
 
 from uuvtai.config import Config
-from uuvtai.kernels.outcome import RUNNING
 from uuvtai.run_folder import hardware, versions
 from uuvtai.sim import STAGES, Sim
 from uuvtai.sizes import memory_bytes
@@ -50,7 +49,7 @@ class Batch:
 
     def renew(self) -> None:
         """Begin the next episode of every row whose episode has ended."""
-        ended = torch.from_numpy((self.sim.rows(self.sim.s.referee.outcome) != RUNNING).astype("int32")).to(self.sim.device)
+        ended = self.sim.terminated | self.sim.truncated
         if bool(ended.any()):
             rows = ended.nonzero().flatten().tolist()
             self.replans += int(self.sim.rows(self.sim.s.route.replans, rows).sum())
