@@ -2,6 +2,7 @@
 
 import dataclasses
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ TEACHER = {
     "softness": 0.05, "calm_s": 0.5, "conflict_within_s": 2.5, "emergency_ttc_s": 0.35, "emergency_range_m": 0.12,
     "emergency_closing_m_s": 0.15, "back_off_m_s": 0.85, "blocked_clearance_m": 0.25, "goal_near_m": 1.5, "stuck_s": 4.0, "unstick_s": 1.5,
     "unstick_m_s": 0.3, "slow_clearance_m": 0.6, "slow_fraction": 0.5, "edge_gap_m": 0.26, "depth_gain": 1.0, "yaw_gain": 1.5,
+    "gaze_m": 3.0, "gaze_level_m": 1.0, "gaze_clearance_m": 0.6, "askew_clearance_m": 0.5, "gaze_off_deg": 25.0,
 }  # fmt: skip
 """Every number of the stage, so that tuning the defaults breaks nothing here. The dashes end between two samples of the forecast."""
 CFG = Config.model_validate(
@@ -46,6 +48,7 @@ SIZES = {
     "n_track": N_TRACK,
     "n_forecast": N_SAMPLE,
     "n_ray": N_RAY,
+    "n_ahead": 16,
     "n_row": grid_shape(TANK, CELL)[0],
     "n_col": grid_shape(TANK, CELL)[1],
 }
@@ -95,6 +98,7 @@ def scene(stage):
     fill(stage.mission.goal_w, (15.0, 3.0, -0.8))
     fill(stage.route.lookahead_w, (6.0, 3.0, -0.8))
     stage.route.n_way.fill(10)
+    stage.route.n_ahead.fill(0)
     stage.route.stuck_steps.fill(0)
     stage.forecast.radius_m.fill(-1.0)
     stage.forecast.pos_w.fill(0.0)
@@ -174,6 +178,10 @@ def plan(stage):
 def decide(stage):
     assess(stage)
     plan(stage)
+    tick(stage)
+
+
+def tick(stage):
     teacher.tick_tree(
         stage.t,
         stage.action,
@@ -581,6 +589,191 @@ def test_faster_than_the_axes_only_on_diagonals(scene):
     off = (np.arctan2(velocity[1], velocity[0]) - turn) / (np.pi / 4)
     assert abs(turn) <= np.pi / 4 + 1e-4
     assert abs(off - round(off)) < 0.02 and round(off) % 2 == 1
+
+
+# ------------------------------------------------------------------------------------------------------------- narrow places
+
+
+def blocks(scene, env, *ways, clearance_m=0.2):
+    """Little clearance in the cells at these ways from the vehicle."""
+    x0, y0 = grid_origin(TANK, CELL)
+    for x, y in scene.ego.pos_w.to_numpy()[env, :2] + np.array(ways):
+        put(scene.clearance.clearance_m, clearance_m, env, int((y - y0) / CELL), int((x - x0) / CELL))
+
+
+def route_ahead(scene, way, lookahead):
+    """Own place off the borders of cells, points of the route at ``way`` [n, 2] from there, 0.1 m apart, and the look-ahead point."""
+    own = np.array([5.05, 3.03])
+    fill(scene.ego.pos_w, (*own, -0.8))
+    put(scene.route.ahead_w, own + way)
+    scene.route.n_ahead.fill(len(way))
+    put(scene.route.lookahead_w, (*(own + lookahead), -0.8))
+
+
+def test_round_a_corner_a_nearer_point_of_the_route_is_steered_for(scene):
+    """The route goes up and then right: the farthest of its points at 0.6, 0.4 and 0.2 m is taken if only the straight way is narrow."""
+    up, right = np.minimum(np.arange(16), 4), np.maximum(np.arange(16) - 4, 0)
+    route_ahead(scene, 0.1 * np.stack([right, up], 1), (1.0, 0.4))
+    put(scene.route.n_ahead, 5, 3)
+    put(scene.route.n_way, 0, 5)
+    straight, to_sixth = (0.375, 0.15), (0.15, 0.3)
+    for env in (1, 2, 3, 5):
+        blocks(scene, env, straight)
+    blocks(scene, 2, to_sixth)
+    blocks(scene, 4, straight, clearance_m=0.43)
+    assess(scene)
+    steer, room = scene.t.steer_w.to_numpy(), scene.t.path_clearance_m.to_numpy()
+    np.testing.assert_allclose(steer, [(1.0, 0.4), (0.2, 0.4), (0.0, 0.4), (0.0, 0.4), (1.0, 0.4), (1.0, 0.4)], atol=1e-5)
+    np.testing.assert_allclose(room, [2.0, 2.0, 2.0, 2.0, 0.43, 2.0], atol=1e-6)
+    follow = scene.t.follow_vel_w.to_numpy()[:, :2]
+    np.testing.assert_allclose(np.arctan2(*follow[:5].T), np.arctan2(*steer[:5].T), atol=1e-5)
+    np.testing.assert_allclose(np.hypot(*follow[[0, 1, 5]].T), [CFG.teacher.cruise_m_s, CFG.teacher.cruise_m_s, 0.0], atol=1e-5)
+
+
+def test_where_every_way_is_narrow_the_widest_is_steered_for(scene):
+    """Of equals the farthest, so the look-ahead point where no nearer one has more room."""
+    route_ahead(scene, 0.1 * np.stack([np.zeros(16), np.arange(16)], 1), (1.0, 0.0))
+    scene.clearance.clearance_m.fill(0.35)
+    narrow = ((0.1, 0.2, 0.25, 0.3), (0.1, 0.3, 0.32, 0.32), (0.3, 0.1, 0.2, 0.3), (0.1, 0.35, 0.35, 0.35))
+    for env, rooms in enumerate(narrow):
+        for way, room_m in zip(((0.5, 0.0), (0.0, 0.53), (0.0, 0.32), (0.0, 0.12)), rooms, strict=True):
+            blocks(scene, env, way, clearance_m=room_m)
+    assess(scene)
+    np.testing.assert_allclose(scene.t.steer_w.to_numpy()[:4], [(0.0, 0.2), (0.0, 0.4), (1.0, 0.0), (0.0, 0.6)], atol=1e-5)
+    np.testing.assert_allclose(scene.t.path_clearance_m.to_numpy()[:4], [0.3, 0.32, 0.3, 0.35], atol=1e-6)
+
+
+def test_a_narrow_way_is_entered_lengthwise(scene):
+    """Across the way, 0.4 of the speed is left; head or tail along it, all of what the clearance here allows (0.5 + 0.5 x 0.13 / 0.6)."""
+    turned = np.radians([0, 90, 180, 30, -90, 90])
+    put(scene.ego.rpy, np.stack([0 * turned, 0 * turned, turned], 1))
+    scene.clearance.clearance_m.fill(0.45)
+    put(scene.clearance.clearance_m, 0.51, 5)
+    assess(scene)
+    speed = np.hypot(*scene.t.follow_vel_w.to_numpy()[:, :2].T)
+    here = 0.6 * (0.5 + 0.5 * 0.13 / 0.6)
+    np.testing.assert_allclose(speed, [here, 0.4 * here, here, 0.7 * here, 0.4 * here, 0.6 * (0.5 + 0.5 * 0.19 / 0.6)], atol=1e-5)
+
+
+# ----------------------------------------------------------------------------------------------------------------------- gaze
+
+
+def test_who_is_looked_at(scene):
+    """Above and below before level ones (which count as 1 m farther), the nearest first, nobody beyond 3 m, nobody from narrow places."""
+    reach = 0.2 + CFG.teacher.hull_reach_m
+    still, over, under = (0.0, 0.0), {"above": -0.3, "below": -OPEN_M}, {"above": OPEN_M, "below": -1.3}
+    cases = [
+        [((1.0, 0.0), {}), ((0.0, 1.9), over), ((0.0, -2.5), under)],
+        [((1.0, 0.0), {}), ((0.0, 2.1), over)],
+        [((0.0, 2.1), {}), ((-1.5, 0.0), {}), ((0.0, 2.6), over)],
+        [((0.0, 1.95 + reach), {}), ((0.0, -2.05 - reach), {})],
+        [((2.05 + reach, 0.0), {}), ((3.05 + reach, 0.0), over)],
+        [((0.0, 2.95 + reach), under)],
+    ]
+    for env, bodies in enumerate(cases):
+        for track, (way, height) in enumerate(bodies):
+            body(scene, env, track, np.add((5.0, 3.0), way), still, **height)
+    wanted = np.array([(0.0, 1.9), (1.0, 0.0), (-1.5, 0.0), (0.0, 1.95 + reach), (0.0, 0.0), (0.0, 2.95 + reach)])
+    assess(scene)
+    np.testing.assert_allclose(scene.t.gaze_w.to_numpy(), wanted, atol=1e-5)
+    nearest = np.array([1.0 - reach, 1.0 - reach, 1.5 - reach, 1.95, 2.05, 2.95])
+    np.testing.assert_allclose(scene.t.body_near_m.to_numpy(), nearest, atol=1e-5)
+    put(scene.clearance.clearance_m, 0.59, slice(0, 3))
+    put(scene.clearance.clearance_m, 0.61, 3)
+    blocks(scene, 5, (0.55, 0.05))
+    assess(scene)
+    np.testing.assert_allclose(scene.t.gaze_w.to_numpy(), [*np.zeros((3, 2)), wanted[3], *np.zeros((2, 2))], atol=1e-5)
+
+
+def polar(degrees, length=1.0):
+    return length * np.stack([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))], -1)
+
+
+def turns(scene, xml, yaw: Any = 0.0, gaze: Any = None, way: Any = None, way_of="follow_vel_w", speed=0.5, room_m=2.0):
+    """[degree] that the nose is told to turn by, with the blackboard set by hand: bearings of the gaze and of the velocity, None = none."""
+    for name, degrees, length in (("gaze_w", gaze, 1.5), (way_of, way, speed)):
+        field = getattr(scene.t, name)
+        at = np.array([np.zeros(2) if d is None else polar(d, length) for d in np.broadcast_to(degrees, N_ENV)])
+        put(field, np.pad(at, ((0, 0), (0, field.n - 2))))
+    put(scene.t.path_clearance_m, room_m)
+    put(scene.ego.rpy, np.stack([np.zeros(N_ENV), np.zeros(N_ENV), np.radians(np.broadcast_to(yaw, N_ENV))], 1))
+    scene.tree = parse_tree(f'<root BTCPP_format="4"><BehaviorTree ID="main">{xml}</BehaviorTree></root>')
+    load_tree(scene.table, scene.tree)
+    tick(scene)
+    return np.degrees(scene.action[:, 3].numpy() * CFG.vehicle.max_yaw_rate_rad_s / CFG.teacher.yaw_gain)
+
+
+MOST_DEG = np.degrees(CFG.vehicle.max_yaw_rate_rad_s / CFG.teacher.yaw_gain)
+"""A larger angle saturates the yaw rate."""
+
+ANGLE_TOLERANCE = 1e-3
+"""[degree] float32 angles of up to 3 rad are good to 1e-5 degrees; the action stores them as a share of 38 degrees."""
+
+
+def test_following_the_nose_looks_at_the_body(scene):
+    """Whatever the way; without one, along the way; the shorter way round."""
+    found = turns(scene, "<FollowRoute/>", yaw=[0, 0, 0, 170, 0, 0], gaze=[20, -30, None, -170, 120, -120], way=[0, 90, 10, 0, 0, 0])
+    np.testing.assert_allclose(found, [20, -30, 10, 20, MOST_DEG, -MOST_DEG], atol=ANGLE_TOLERANCE)
+    np.testing.assert_allclose(np.hypot(*scene.t.last_vel_w.to_numpy()[:, :2].T), 0.5, atol=1e-6)  # the way itself stays
+
+
+def test_waiting_the_nose_looks_at_the_body(scene):
+    np.testing.assert_allclose(
+        turns(scene, "<Hold/>", yaw=[0, 10, 0, 0, -175, 0], gaze=[20, 20, None, -35, 175, 38], way=0),
+        [20, 10, 0, -35, -10, 38],
+        atol=ANGLE_TOLERANCE,
+    )
+    assert not scene.t.last_vel_w.to_numpy().any()
+
+
+def test_in_danger_a_diagonal_goes_along_the_way_near_the_gaze(scene):
+    """Gaze and way to turn: the diagonals are 45 degrees off the way (and 90 from each other); the nearest to the gaze, within 25 of it.
+
+    20/30: diagonals at -15 and 75, the nearest is 35 off, so 20 - 25. 10/60: at 15, taken. 5/90: at 45, 40 off, so 5 + 25. Without a gaze
+    the nearest to the present heading: 20 gives -25, 100 gives -35.
+    """
+    gaze, way = [20, 10, 5, None, None, 0], [30, 60, 90, 20, 100, None]
+    wanted = [-5, 15, 30, -25, -35, 0]
+    np.testing.assert_allclose(turns(scene, "<Evade/>", 0, gaze, way, "evade_vel_w"), wanted, atol=ANGLE_TOLERANCE)
+    again = turns(
+        scene, "<Evade/>", 150, [None if g is None else g + 150 for g in gaze], [None if w is None else w + 150 for w in way], "evade_vel_w"
+    )
+    np.testing.assert_allclose(again, wanted, atol=ANGLE_TOLERANCE)
+    narrow = turns(scene, "<Evade/>", 0, None, [20, 100, 150, 200, -20, 0], "evade_vel_w", room_m=0.3)
+    np.testing.assert_allclose(narrow[:5], [-25, -35, 15, -25, 25], atol=ANGLE_TOLERANCE)  # no tail first: any diagonal is as good
+
+
+def test_backing_off_the_nose_keeps_to_the_diagonal_near_the_gaze(scene):
+    """The threat, ahead, is what is looked at: its retreat goes straight back, the nose 25 degrees towards the nearest diagonal."""
+    scene.t.threat_bearing.fill(0.0)
+    scene.t.clearance_m.fill(2.0)
+    np.testing.assert_allclose(np.abs(turns(scene, "<BackOff/>", gaze=[0, 0, 0, 5, 5, 5])), [25, 25, 25, 30, 30, 30], atol=ANGLE_TOLERANCE)
+
+
+def test_in_narrow_places_tail_first_is_as_slim(scene):
+    """Following the route below 0.6 m of clearance, the nearer of nose and tail turns along the way; else the nose."""
+    way = [150, -150, 30, 80, 100, 180]
+    nose = np.clip(way, -MOST_DEG, MOST_DEG)
+    tail = turns(scene, "<FollowRoute/>", way=way, room_m=0.59)
+    np.testing.assert_allclose(tail[:3], [-30, 30, 30], atol=ANGLE_TOLERANCE)
+    np.testing.assert_allclose(tail[3:5], [MOST_DEG, -MOST_DEG], atol=ANGLE_TOLERANCE)
+    assert abs(tail[5]) < ANGLE_TOLERANCE
+    for room_m in (0.6, 2.0):
+        np.testing.assert_allclose(np.abs(turns(scene, "<FollowRoute/>", way=way, room_m=room_m)), np.abs(nose), atol=ANGLE_TOLERANCE)
+    put(scene.mission.goal_w, np.column_stack([np.array([5.0, 3.0]) + polar(way, 5.0), np.full(N_ENV, -0.8)]))
+    straight = turns(scene, "<DriveStraight/>", way=way, room_m=0.3)
+    np.testing.assert_allclose(straight[:5], nose[:5], atol=ANGLE_TOLERANCE)
+
+
+def test_yardsticks_look_at_nobody(scene):
+    """A route followed without guarding the depth, and straight driving: the nose goes along the way, whatever is beside it."""
+    way, gaze = [0, 10, 20, -10, 30, 0], [30, -30, 90, 180, 0, -5]
+    np.testing.assert_allclose(turns(scene, '<FollowRoute depth_guard="0"/>', gaze=gaze, way=way), way, atol=ANGLE_TOLERANCE)
+    put(scene.mission.goal_w, np.column_stack([np.array([5.0, 3.0]) + polar(way, 5.0), np.full(N_ENV, -0.8)]))
+    np.testing.assert_allclose(turns(scene, "<DriveStraight/>", gaze=gaze), way, atol=ANGLE_TOLERANCE)
+    np.testing.assert_allclose(
+        turns(scene, '<FollowRoute depth_guard="1"/>', gaze=gaze, way=way)[[0, 1, 5]], [30, -30, -5], atol=ANGLE_TOLERANCE
+    )
 
 
 # ---------------------------------------------------------------------------------------------------------------- discipline
