@@ -308,6 +308,15 @@ def test_how_far_a_track_may_be_found(rig):
     np.testing.assert_array_equal(memory["alive"][:4].sum(1), [1, 1, 1, 2])  # 1.25 m away it is a body of its own
 
 
+def test_one_track_takes_one_spot(rig):
+    """Two small bodies within reach of it: the left one, which comes first, is it; the other is too near for a track of its own."""
+    for slot, y in enumerate((3.13, 2.87)):
+        rig.put(0, 6.8, y, size=(0.1, 0.1, 0.1), slot=slot)
+    rig.track(0, (6.8, 3.02), radius_m=0.1)
+    assert rig.look()["alive"][0].sum() == 1
+    assert off_m(rig, 0) < PLACE_M
+
+
 def test_an_unknown_body_rests_until_its_second_sighting(rig):
     """Born at its place with unknown heights; called moving by the first image more than 0.15 s later, and then its velocity is learnt."""
     for env in range(2):
