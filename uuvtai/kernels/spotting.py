@@ -2,7 +2,7 @@
 
 Per column of the image the nearest thing before the known walls, at a height that matters; neighbouring columns make a spot. A spot
 that the sonar's beams show too is the sonar's affair; of the others each corrects the moving track that is expected nearest to it, by a
-position only: a depth camera measures no speed. Sees the image, the scan and tracks only.
+position only: a depth camera measures no speed. Spots that are nobody's begin tracks. Sees the image, the scan and tracks only.
 """
 
 import taichi as ti
@@ -58,7 +58,7 @@ def eye_of(env, image: In[DepthImage], depth: Const[DepthConfig]):
 
 @ti.func
 def column_distances(env, first_col, image: In[DepthImage], cfg: Const[SpottingConfig], depth: Const[DepthConfig], tank: Const[TankConfig]):
-    """Sixteen columns."""
+    """(nearest thing, nearest thing in the first or last row looked at): horizontal distances [m] of sixteen columns, FAR_M = none."""
     focal, middle_row, middle_col = ti.static(pinhole(depth))
     eye, R_wb = eye_of(env, image, depth)
     left = ramp_lanes(ti.cast(first_col, ti.f32) - middle_col) * ti.static(-1.0 / focal)
@@ -163,7 +163,10 @@ def use_spot(
     tracking: Const[TrackingConfig],
     rules: Const[EpisodeConfig],
 ):
-    """Match one spot, columns first..last, with the track that is expected nearest to it, and correct that."""
+    """Match one spot with a track and correct that; a spot that is nobody's begins a track.
+
+    The spot: columns first..last; ``near`` [m] its smallest horizontal distance, ``edge`` [m] that in the image's first and last rows.
+    """
     from_left, from_right = bearing_of(first - 0.5, R_wb, depth), bearing_of(last + 0.5, R_wb, depth)
     width = wrapped_angle(from_left - from_right)
     bearing = from_right + 0.5 * width
@@ -171,21 +174,33 @@ def use_spot(
     seen = ti.Vector([eye[0], eye[1]]) + near * along
     if width * near < tracking.max_width_m and is_off_fan(seen, env, scan, cfg, sonar) == 1:
         late = (clock.step[env] - tracks.scan_step[env]) * rules.control_dt_s
-        best, best_gap, best_offset = -1, FAR_M, ti.Vector([0.0, 0.0])
-        for track in range(tracks.alive.shape[1]):
-            if is_wanted(env, track, tracks, clock, rules) == 1:
-                mean = tracks.state[env, track]
-                offset = seen + tracks.radius_m[env, track] * along - ti.Vector([mean[0] + late * mean[2], mean[1] + late * mean[3]])
-                gap = offset.norm() - reach_of(env, track, tracks, clock, cfg, rules)
-                if gap < best_gap:
-                    best, best_gap, best_offset = track, gap, offset
+        best, best_offset = match_of(env, seen, along, late, tracks, clock, cfg, rules)
         cut = first == 0 or last == ti.static(depth.cols - 1)
-        if best_gap < 0.0:
+        if best >= 0:
             correct_track(env, best, best_offset, along, cut, edge < near + cfg.split_m, tracks, cfg, tracking)
             tracks.spot_step[env, best] = clock.step[env]
         elif not cut and scan.ping_step[env] >= 0:
             radius = ti.max(0.5 * width * near, tracking.min_radius_m)
             begin_spotted(env, seen + radius * along, along, radius, late, eye[2], tracks, clock, cfg, tracking, elevation)
+
+
+@ti.func
+def match_of(
+    env, seen, along, late, tracks: In[TrackState], clock: In[ClockState], cfg: Const[SpottingConfig], rules: Const[EpisodeConfig]
+):
+    """(track that most easily is what shows at ``seen`` [m], its centre minus where it is expected [m]); -1 where none is within reach.
+
+    ``late`` [s] = how much newer the image is than the states.
+    """
+    best, best_gap, best_offset = -1, 0.0, ti.Vector([0.0, 0.0])
+    for track in range(tracks.alive.shape[1]):
+        if is_wanted(env, track, tracks, clock, rules) == 1:
+            mean = tracks.state[env, track]
+            offset = seen + tracks.radius_m[env, track] * along - ti.Vector([mean[0] + late * mean[2], mean[1] + late * mean[3]])
+            gap = offset.norm() - reach_of(env, track, tracks, clock, cfg, rules)
+            if gap < best_gap:
+                best, best_gap, best_offset = track, gap, offset
+    return best, best_offset
 
 
 @ti.func
@@ -266,7 +281,7 @@ def begin_spotted(
     tracking: Const[TrackingConfig],
     elevation: Const[ElevationConfig],
 ):
-    """A track of a body that only the camera has seen yet, in a free slot, unless a track is there already. It rests until it has moved."""
+    """A track of a body that only the camera has seen yet, in a free slot, unless one is there already. It rests until it is seen again."""
     slot = -1
     known = False
     for track in range(tracks.alive.shape[1]):
