@@ -21,6 +21,9 @@ from uuvtai.state import ClockState, DepthImage, SonarScan, SpotState, TrackStat
 _ROW_STRIDE = 2
 """Rows of the image that are looked at: every second one; a body fills several within the range that matters."""
 
+_ROUNDING_M = 1.0e-3
+"""Far more than float32 rounds a distance by."""
+
 _PRESENT = 0.95
 """Probability of a body that has just been seen to be where it is expected."""
 
@@ -63,22 +66,32 @@ def column_distances(env, first_col, image: In[DepthImage], cfg: Const[SpottingC
     eye, R_wb = eye_of(env, image, depth)
     left = ramp_lanes(ti.cast(first_col, ti.f32) - middle_col) * ti.static(-1.0 / focal)
     level_x, level_y = left * R_wb[0, 1] + R_wb[0, 0], left * R_wb[1, 1] + R_wb[1, 0]
-    scale = 1.0 / ti.sqrt(level_x * level_x + level_y * level_y)
+    length = ti.sqrt(level_x * level_x + level_y * level_y)
+    scale = 1.0 / length
     wall = wall_lanes(ti.Vector([eye[0], eye[1]]), level_x * scale, level_y * scale, tank)
-    near, edge = f16x(FAR_M), f16x(FAR_M)
+    near, edge, limit = f16x(FAR_M), f16x(FAR_M), f16x(0.0)
+    for i in ti.static(range(LANES)):
+        limit[i] = ti.min(wall[i] - cfg.wall_margin_m, cfg.range_m)
+    sway = ti.sqrt(R_wb[0, 2] * R_wb[0, 2] + R_wb[1, 2] * R_wb[1, 2])
     for k in range(ti.static(depth.rows // _ROW_STRIDE)):
         row = k * _ROW_STRIDE
         up = (middle_row - row) * ti.static(1.0 / focal)
+        away, spare = f16x(0.0), f16x(0.0)
         for i in ti.static(range(LANES)):
-            away = image.depth_m[env, row, first_col + i]
-            x = R_wb[0, 0] + R_wb[0, 1] * left[i] + R_wb[0, 2] * up
-            y = R_wb[1, 0] + R_wb[1, 1] * left[i] + R_wb[1, 2] * up
-            z = R_wb[2, 0] + R_wb[2, 1] * left[i] + R_wb[2, 2] * up
-            level = away * ti.sqrt(x * x + y * y)
-            shown = (away < ti.static(NO_RETURN_SHARE * depth.max_range_m)) & (ti.abs(away * z) < cfg.band_m)
-            shown = shown & (level < wall[i] - cfg.wall_margin_m) & (level < cfg.range_m)
-            near[i] = ti.min(near[i], ti.select(shown, level, FAR_M))
-            edge[i] = ti.min(edge[i], ti.select(shown & (row == 0 or row >= ti.static(depth.rows - _ROW_STRIDE)), level, FAR_M))
+            away[i] = image.depth_m[env, row, first_col + i]
+            spare[i] = limit[i] - away[i] * (length[i] - sway * ti.abs(up))
+        if (
+            spare.max() > -_ROUNDING_M
+        ):  # else none of the sixteen is near enough, for a tilt changes a ray's level length by no more than that
+            for i in ti.static(range(LANES)):
+                x = R_wb[0, 0] + R_wb[0, 1] * left[i] + R_wb[0, 2] * up
+                y = R_wb[1, 0] + R_wb[1, 1] * left[i] + R_wb[1, 2] * up
+                z = R_wb[2, 0] + R_wb[2, 1] * left[i] + R_wb[2, 2] * up
+                level = away[i] * ti.sqrt(x * x + y * y)
+                shown = (away[i] < ti.static(NO_RETURN_SHARE * depth.max_range_m)) & (ti.abs(away[i] * z) < cfg.band_m)
+                shown = shown & (level < wall[i] - cfg.wall_margin_m) & (level < cfg.range_m)
+                near[i] = ti.min(near[i], ti.select(shown, level, FAR_M))
+                edge[i] = ti.min(edge[i], ti.select(shown & (row == 0 or row >= ti.static(depth.rows - _ROW_STRIDE)), level, FAR_M))
     return near, edge
 
 
