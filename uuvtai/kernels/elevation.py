@@ -43,7 +43,9 @@ def heights(tank: Const[TankConfig]):
 @ti.func
 def shared(weighed):
     """Weights as shares that sum to 1, none below the least one but for rounding."""
-    held = ti.max(weighed * (1.0 / weighed.sum()), _LEAST_SHARE)
+    scale, held = 1.0 / weighed.sum(), f16x(0.0)
+    for i in ti.static(range(LANES)):
+        held[i] = ti.max(weighed[i] * scale, _LEAST_SHARE)
     return held * (1.0 / held.sum())
 
 

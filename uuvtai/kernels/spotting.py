@@ -66,7 +66,9 @@ def column_distances(env, first_col, image: In[DepthImage], cfg: Const[SpottingC
     eye, R_wb = eye_of(env, image, depth)
     left = ramp_lanes(ti.cast(first_col, ti.f32) - middle_col) * ti.static(-1.0 / focal)
     level_x, level_y = left * R_wb[0, 1] + R_wb[0, 0], left * R_wb[1, 1] + R_wb[1, 0]
-    length = ti.sqrt(level_x * level_x + level_y * level_y)
+    length = f16x(0.0)
+    for i in ti.static(range(LANES)):
+        length[i] = ti.sqrt(level_x[i] * level_x[i] + level_y[i] * level_y[i])
     scale = 1.0 / length
     wall = wall_lanes(ti.Vector([eye[0], eye[1]]), level_x * scale, level_y * scale, tank)
     near, edge, limit = f16x(FAR_M), f16x(FAR_M), f16x(0.0)
@@ -80,9 +82,8 @@ def column_distances(env, first_col, image: In[DepthImage], cfg: Const[SpottingC
         for i in ti.static(range(LANES)):
             away[i] = image.depth_m[env, row, first_col + i]
             spare[i] = limit[i] - away[i] * (length[i] - sway * ti.abs(up))
-        if (
-            spare.max() > -_ROUNDING_M
-        ):  # else none of the sixteen is near enough, for a tilt changes a ray's level length by no more than that
+        # a tilt changes a ray's level length by no more than ``sway``: most packets show nothing that is near enough
+        if spare.max() > -_ROUNDING_M:
             for i in ti.static(range(LANES)):
                 x = R_wb[0, 0] + R_wb[0, 1] * left[i] + R_wb[0, 2] * up
                 y = R_wb[1, 0] + R_wb[1, 1] * left[i] + R_wb[1, 2] * up
