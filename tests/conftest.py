@@ -1,7 +1,15 @@
 """Fixtures shared by the tests. Taichi is started once per session; one small simulator serves every test of the whole stack."""
 
+import signal
+
 import pytest
 import torch
+
+
+@pytest.fixture(scope="session", autouse=True)
+def interrupts():
+    """Interrupts are heard, also where the tests run in the background of a shell, which has its children ignore them."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session", autouse=True)
