@@ -8,7 +8,7 @@ from tests.reference import habits as habit_oracle
 from uuvtai.config import EpisodeConfig, ForecastConfig, TankConfig, TrackingConfig
 from uuvtai.kernels import forecast
 from uuvtai.kernels.lanes import LANES
-from uuvtai.state import ClockState, ForecastState, HabitState, TrackState, allocate
+from uuvtai.state import ClockState, ClusterState, DepthImage, ForecastState, HabitState, TrackState, allocate
 
 N_ENV, N_TRACK = 6, 5
 TRACKING, RULES, TANK = TrackingConfig(), EpisodeConfig(), TankConfig()
@@ -16,6 +16,9 @@ SIZES = {
     "n_env": N_ENV,
     "n_ray": 16,
     "n_track": N_TRACK,
+    "n_cluster": 1,
+    "n_pixel_row": 1,
+    "n_pixel_col": LANES,
     "n_height": LANES,
     "n_turn": 16,
     "n_forecast": round(TRACKING.horizon_s / TRACKING.forecast_dt_s) + 1,
@@ -35,7 +38,7 @@ GROWTH_TOLERANCE = 2e-4
 class Stage:
     def __init__(self):
         self.tracks, self.clock, self.forecast = allocate(TrackState, SIZES), allocate(ClockState, SIZES), allocate(ForecastState, SIZES)
-        self.habits = allocate(HabitState, SIZES)
+        self.habits, self.clusters, self.image = (allocate(struct, SIZES) for struct in (HabitState, ClusterState, DepthImage))
 
     def begin(self, cfg=None):
         self.cfg = cfg or ForecastConfig()
@@ -43,6 +46,8 @@ class Stage:
             for field in vars(struct).values():
                 field.fill(0)
         self.clock.awake.fill(1)
+        self.clusters.fresh.fill(1)
+        self.image.fresh.fill(0)
         forecast.reset_forecast(self.forecast, self.habits, self.clock)
         return self
 
@@ -52,7 +57,9 @@ class Stage:
             field.from_numpy(np.asarray(value).astype(field.to_numpy().dtype))
 
     def predict(self):
-        forecast.forecast_tracks(self.forecast, self.tracks, self.habits, self.clock, self.cfg, TRACKING, TANK, RULES)
+        forecast.forecast_tracks(
+            self.forecast, self.tracks, self.habits, self.clusters, self.image, self.clock, self.cfg, TRACKING, TANK, RULES
+        )
         return self.forecast.pos_w.to_numpy().astype(float), self.forecast.radius_m.to_numpy().astype(float)
 
 
@@ -154,3 +161,23 @@ def test_forecast_equals_the_walk_from_turn_to_turn(stage, switches):
         np.testing.assert_allclose(pos[env, track], where, atol=WALK_TOLERANCE)
         turned += last @ habit_oracle.unit(x[2:]) < 0.9
     assert turned > 10, turned
+
+
+def test_the_first_turn_is_searched_again_when_a_scan_or_an_image_has_come(stage):
+    """A body that goes east and is known to turn north 0.6 m ahead; between scans nothing is searched, so nothing forgotten shows."""
+    for news in ("clusters", "image"):
+        stage.begin(ForecastConfig(n_turn=SIZES["n_turn"], use_reflection=False))
+        size = (N_ENV, N_TRACK)
+        state = np.broadcast_to([5.0, 3.0, 0.5, 0.0], (*size, 4))
+        lay_out(stage, state, np.broadcast_to(1e-4 * np.eye(4), (*size, 4, 4)), np.full(size, 0.2), np.zeros(size), np.ones(size))
+        for name, value in {"turn_x": 5.6, "turn_y": 3.0, "in_x": 1.0, "in_y": 0.0, "out_x": 0.0, "out_y": 1.0, "weight": 1.0}.items():
+            filled = np.zeros((N_ENV, SIZES["n_turn"] // LANES, LANES), np.float32)
+            filled[:, 0, 0] = value
+            getattr(stage.habits, name).from_numpy(filled)
+        north = 3.0 + 0.5 * AHEAD[-1] - 0.6
+        np.testing.assert_allclose(stage.predict()[0][..., -1, 1], north, atol=WALK_TOLERANCE)
+        stage.clusters.fresh.fill(0)
+        stage.habits.weight.fill(0.0)
+        np.testing.assert_allclose(stage.predict()[0][..., -1, 1], north, atol=WALK_TOLERANCE)
+        getattr(stage, news).fresh.fill(1)
+        np.testing.assert_allclose(stage.predict()[0][..., -1, 1], 3.0, atol=WALK_TOLERANCE)

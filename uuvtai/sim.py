@@ -273,7 +273,9 @@ class Sim:
             if c.elevation.use_camera:
                 look.look_at_bodies(s.tracks, s.image, s.clock, c.elevation, c.sensors.depth, c.world.tank, c.episode)
             forecast.learn_habits(s.habits, s.tracks, s.clusters, s.clock, c.forecast, c.episode)
-            forecast.forecast_tracks(s.forecast, s.tracks, s.habits, s.clock, c.forecast, c.tracking, c.world.tank, c.episode)
+            forecast.forecast_tracks(
+                s.forecast, s.tracks, s.habits, s.clusters, s.image, s.clock, c.forecast, c.tracking, c.world.tank, c.episode
+            )
             elevation.bound_heights(s.forecast, s.tracks, s.ego, s.clock, c.elevation, c.world.tank)
         with self._stage("mapping"):
             mapping.update_map(

@@ -7,7 +7,7 @@ from uuvtai.kernels.geometry import turned_z
 from uuvtai.kernels.habits import expected_turn_rate, forget_habits, learn_habit, next_event
 from uuvtai.kernels.kalman import largest_position_variance
 from uuvtai.kernels.signature import Const, In, Out, quick_launch, spread
-from uuvtai.state import ClockState, ClusterState, ForecastState, HabitState, TrackState
+from uuvtai.state import ClockState, ClusterState, DepthImage, ForecastState, HabitState, TrackState
 
 MOST_LEGS = 6
 """Turns within one forecast; beyond them a body goes straight on."""
@@ -51,6 +51,8 @@ def forecast_tracks(
     forecast: Out[ForecastState],
     tracks: In[TrackState],
     habits: In[HabitState],
+    clusters: In[ClusterState],
+    image: In[DepthImage],
     clock: In[ClockState],
     forecast_cfg: Const[ForecastConfig],
     tracking: Const[TrackingConfig],
@@ -66,11 +68,12 @@ def forecast_tracks(
     n_track = ti.static(tracks.alive.shape[1])
     for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n * n_track))):
         if pad == 0 and clock.awake[env] == 1:
+            changed = clusters.fresh[env] + image.fresh[env] > 0  # only a tracked scan or an image changes tracks and habits
             if tracks.alive[env, track] * tracks.moving[env, track] == 1:
                 if expected_turn_rate(env, track, tracks, forecast_cfg, tracking) != 0.0:
                     follow_arc(env, track, forecast, tracks, clock, forecast_cfg, tracking, rules)
                 else:
-                    follow_legs(env, track, forecast, tracks, habits, clock, forecast_cfg, tracking, tank, rules)
+                    follow_legs(env, track, changed, forecast, tracks, habits, clock, forecast_cfg, tracking, tank, rules)
             elif forecast.radius_m[env, track, 0] >= 0:
                 clear_forecast(env, track, forecast)
 
@@ -113,6 +116,7 @@ def follow_arc(
 def follow_legs(
     env,
     track,
+    changed,
     forecast: Out[ForecastState],
     tracks: In[TrackState],
     habits: In[HabitState],
@@ -122,11 +126,15 @@ def follow_legs(
     tank: Const[TankConfig],
     rules: Const[EpisodeConfig],
 ):
-    """Constant speed on straight legs, from turn to turn."""
+    """Constant speed on straight legs, from turn to turn; the search for the first turn is kept until something has ``changed``."""
     mean, cov, radius = tracks.state[env, track], tracks.cov[env, track], tracks.radius_m[env, track]
     pos, speed = ti.Vector([mean[0], mean[1]]), ti.max(ti.sqrt(mean[2] * mean[2] + mean[3] * mean[3]), 1e-6)
     course = ti.Vector([mean[2], mean[3]]) / speed
-    gap, out = next_event(env, pos, course, radius, habits, forecast_cfg, tank)
+    gap, out = forecast.turn_m[env, track], forecast.turn_out_w[env, track]
+    if changed:
+        gap, out = next_event(env, pos, course, radius, habits, forecast_cfg, tank)
+        forecast.turn_m[env, track] = gap
+        forecast.turn_out_w[env, track] = out
     legs = 0
     ahead = (clock.step[env] - tracks.scan_step[env]) * rules.control_dt_s
     way = speed * ahead

@@ -151,6 +151,10 @@ class ForecastState:
     """[m]"""
     radius_m: ti.Field = array("n_env", "n_track", "n_forecast")
     """[m] body radius plus what the uncertainty adds"""
+    turn_m: ti.Field = array("n_env", "n_track")
+    """[m] from the track's state to its next expected turn, for bodies that go straight"""
+    turn_out_w: ti.Field = array("n_env", "n_track", vec=2)
+    """course after it, unit vector"""
     above_w: ti.Field = array("n_env", "n_track")
     """[m] world z of the lowest edge of what may be above the own height; the own height where the body may be level with the vehicle"""
     below_w: ti.Field = array("n_env", "n_track")
