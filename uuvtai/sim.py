@@ -242,41 +242,7 @@ class Sim:
         with self._stage("depth"):
             depth.cast_depth(s.image, s.ego, s.vehicle, s.world, s.episode, s.clock, c.sensors.depth, c.world.tank)
         with self._stage("tracking"):
-            tracking.track_bodies(
-                s.tracks,
-                s.clusters,
-                s.habits,
-                s.scan,
-                s.clock,
-                c.tracking,
-                c.forecast,
-                c.elevation,
-                c.sensors.sonar,
-                c.world.tank,
-                c.episode,
-            )
-            if c.spotting.use_camera:
-                spotting.scan_columns(s.spots, s.image, s.clock, c.spotting, c.sensors.depth, c.world.tank)
-                spotting.follow_spots(
-                    s.tracks,
-                    s.spots,
-                    s.image,
-                    s.scan,
-                    s.clock,
-                    c.spotting,
-                    c.sensors.depth,
-                    c.sensors.sonar,
-                    c.elevation,
-                    c.tracking,
-                    c.episode,
-                )
-            if c.elevation.use_camera:
-                look.look_at_bodies(s.tracks, s.image, s.clock, c.elevation, c.sensors.depth, c.world.tank, c.episode)
-            forecast.learn_habits(s.habits, s.tracks, s.clusters, s.clock, c.forecast, c.episode)
-            forecast.forecast_tracks(
-                s.forecast, s.tracks, s.habits, s.clusters, s.image, s.clock, c.forecast, c.tracking, c.world.tank, c.episode
-            )
-            elevation.bound_heights(s.forecast, s.tracks, s.ego, s.clock, c.elevation, c.world.tank)
+            self._track()
         with self._stage("mapping"):
             mapping.update_map(
                 s.grid_map,
@@ -305,6 +271,45 @@ class Sim:
         if self.observation is not None:
             with self._stage("features"):
                 self._observe(self.observation)
+
+    def _track(self) -> None:
+        """Moving bodies: by the sonar, by the camera where the fan misses them, how they turn, where they will be, how high they are."""
+        c, s = self.config, self.s
+        tracking.track_bodies(
+            s.tracks,
+            s.clusters,
+            s.habits,
+            s.scan,
+            s.clock,
+            c.tracking,
+            c.forecast,
+            c.elevation,
+            c.sensors.sonar,
+            c.world.tank,
+            c.episode,
+        )
+        if c.spotting.use_camera:
+            spotting.scan_columns(s.spots, s.image, s.clock, c.spotting, c.sensors.depth, c.world.tank)
+            spotting.follow_spots(
+                s.tracks,
+                s.spots,
+                s.image,
+                s.scan,
+                s.clock,
+                c.spotting,
+                c.sensors.depth,
+                c.sensors.sonar,
+                c.elevation,
+                c.tracking,
+                c.episode,
+            )
+        if c.elevation.use_camera:
+            look.look_at_bodies(s.tracks, s.image, s.clock, c.elevation, c.sensors.depth, c.world.tank, c.episode)
+        forecast.learn_habits(s.habits, s.tracks, s.clusters, s.clock, c.forecast, c.episode)
+        forecast.forecast_tracks(
+            s.forecast, s.tracks, s.habits, s.clusters, s.image, s.clock, c.forecast, c.tracking, c.world.tank, c.episode
+        )
+        elevation.bound_heights(s.forecast, s.tracks, s.ego, s.clock, c.elevation, c.world.tank)
 
     def _observe(self, obs: torch.Tensor) -> None:
         c, s = self.config, self.s

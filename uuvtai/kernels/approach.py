@@ -57,7 +57,7 @@ def _own_velocity(env, ego: In[Proprioception]):
 
 
 @ti.func
-def _valid(
+def body_values(
     env,
     track,
     features: In[FeatureState],
@@ -70,160 +70,44 @@ def _valid(
     tank: Const[TankConfig],
     rules: Const[EpisodeConfig],
 ):
-    return ti.Vector([1.0])
-
-
-@ti.func
-def _position(
-    env,
-    track,
-    features: In[FeatureState],
-    forecast: In[ForecastState],
-    tracks: In[TrackState],
-    ego: In[Proprioception],
-    clock: In[ClockState],
-    forecast_cfg: Const[ForecastConfig],
-    tracking: Const[TrackingConfig],
-    tank: Const[TankConfig],
-    rules: Const[EpisodeConfig],
-):
-    own = ti.Vector([ego.pos_w[env][0], ego.pos_w[env][1]])
-    return turned_z(forecast.pos_w[env, track, 0] - own, -ego.rpy[env][2])
-
-
-@ti.func
-def _velocity(
-    env,
-    track,
-    features: In[FeatureState],
-    forecast: In[ForecastState],
-    tracks: In[TrackState],
-    ego: In[Proprioception],
-    clock: In[ClockState],
-    forecast_cfg: Const[ForecastConfig],
-    tracking: Const[TrackingConfig],
-    tank: Const[TankConfig],
-    rules: Const[EpisodeConfig],
-):
+    """All values of ``BODY_COLUMNS`` of one moving body, in their order."""
+    yaw, own_z = ego.rpy[env][2], ego.pos_w[env][2]
+    at = turned_z(forecast.pos_w[env, track, 0] - ti.Vector([ego.pos_w[env][0], ego.pos_w[env][1]]), -yaw)
     moving = ti.Vector([tracks.state[env, track][2], tracks.state[env, track][3]])
-    return turned_z(moving - _own_velocity(env, ego), -ego.rpy[env][2])
-
-
-@ti.func
-def _turn_rate(
-    env,
-    track,
-    features: In[FeatureState],
-    forecast: In[ForecastState],
-    tracks: In[TrackState],
-    ego: In[Proprioception],
-    clock: In[ClockState],
-    forecast_cfg: Const[ForecastConfig],
-    tracking: Const[TrackingConfig],
-    tank: Const[TankConfig],
-    rules: Const[EpisodeConfig],
-):
-    return ti.Vector([expected_turn_rate(env, track, tracks, forecast_cfg, tracking)])
-
-
-@ti.func
-def _radius(
-    env,
-    track,
-    features: In[FeatureState],
-    forecast: In[ForecastState],
-    tracks: In[TrackState],
-    ego: In[Proprioception],
-    clock: In[ClockState],
-    forecast_cfg: Const[ForecastConfig],
-    tracking: Const[TrackingConfig],
-    tank: Const[TankConfig],
-    rules: Const[EpisodeConfig],
-):
-    return ti.Vector([forecast.radius_m[env, track, 0]])
-
-
-@ti.func
-def _free_water(
-    env,
-    track,
-    features: In[FeatureState],
-    forecast: In[ForecastState],
-    tracks: In[TrackState],
-    ego: In[Proprioception],
-    clock: In[ClockState],
-    forecast_cfg: Const[ForecastConfig],
-    tracking: Const[TrackingConfig],
-    tank: Const[TankConfig],
-    rules: Const[EpisodeConfig],
-):
+    vel = turned_z(moving - _own_velocity(env, ego), -yaw)
     water = ti.static(tank.z_m[1] - tank.z_m[0])
-    above = ti.min(forecast.above_w[env, track] - ego.pos_w[env][2], water)
-    below = ti.min(ego.pos_w[env][2] - forecast.below_w[env, track], water)
-    return ti.Vector([above, below])
-
-
-@ti.func
-def _age(
-    env,
-    track,
-    features: In[FeatureState],
-    forecast: In[ForecastState],
-    tracks: In[TrackState],
-    ego: In[Proprioception],
-    clock: In[ClockState],
-    forecast_cfg: Const[ForecastConfig],
-    tracking: Const[TrackingConfig],
-    tank: Const[TankConfig],
-    rules: Const[EpisodeConfig],
-):
-    return ti.Vector([(clock.step[env] - tracks.seen_step[env, track]) * ti.static(rules.control_dt_s)])
-
-
-@ti.func
-def _closest(
-    env,
-    track,
-    features: In[FeatureState],
-    forecast: In[ForecastState],
-    tracks: In[TrackState],
-    ego: In[Proprioception],
-    clock: In[ClockState],
-    forecast_cfg: Const[ForecastConfig],
-    tracking: Const[TrackingConfig],
-    tank: Const[TankConfig],
-    rules: Const[EpisodeConfig],
-):
-    return ti.Vector([features.closest_m[env, track]])
-
-
-@ti.func
-def _closest_time(
-    env,
-    track,
-    features: In[FeatureState],
-    forecast: In[ForecastState],
-    tracks: In[TrackState],
-    ego: In[Proprioception],
-    clock: In[ClockState],
-    forecast_cfg: Const[ForecastConfig],
-    tracking: Const[TrackingConfig],
-    tank: Const[TankConfig],
-    rules: Const[EpisodeConfig],
-):
-    return ti.Vector([features.closest_s[env, track]])
+    return ti.Vector(
+        [
+            1.0,
+            at[0],
+            at[1],
+            vel[0],
+            vel[1],
+            expected_turn_rate(env, track, tracks, forecast_cfg, tracking),
+            forecast.radius_m[env, track, 0],
+            ti.min(forecast.above_w[env, track] - own_z, water),
+            ti.min(own_z - forecast.below_w[env, track], water),
+            (clock.step[env] - tracks.seen_step[env, track]) * ti.static(rules.control_dt_s),
+            features.closest_m[env, track],
+            features.closest_s[env, track],
+        ]
+    )
 
 
 BODY_COLUMNS = (
-    Column("body_valid", 1, "1", "level", "1 = a moving body is remembered, 0 = no more bodies: all of its columns are 0", _valid, "body"),
-    Column("body_position", 2, "m", "level", "where it is now, from the position estimate", _position, "body"),
-    Column("body_velocity", 2, "m/s", "level", "its velocity less the own", _velocity, "body"),
-    Column("body_turn_rate", 1, "rad/s", "level", "rate at which its velocity turns, left positive; 0 = straight on", _turn_rate, "body"),
-    Column("body_radius", 1, "m", "level", "its radius and what the uncertainty of its place adds", _radius, "body"),
-    Column("body_free_water", 2, "m", "level", "above and below the own depth, up to where it may be; 0 = level", _free_water, "body"),
-    Column("body_age", 1, "s", "level", "since it was last seen", _age, "body"),
-    Column("body_closest", 1, "m", "level", "to its surface at the closest approach, if the own velocity stays as it is", _closest, "body"),
-    Column("body_closest_time", 1, "s", "level", "until then; at most the forecast's horizon", _closest_time, "body"),
+    Column(
+        "body_valid", 1, "1", "level", "1 = a moving body is remembered, 0 = no more bodies: all of its columns are 0", body_values, "body"
+    ),
+    Column("body_position", 2, "m", "level", "where it is now, from the position estimate", body_values, "body"),
+    Column("body_velocity", 2, "m/s", "level", "its velocity less the own", body_values, "body"),
+    Column("body_turn_rate", 1, "rad/s", "level", "rate at which its velocity turns, left positive; 0 = straight on", body_values, "body"),
+    Column("body_radius", 1, "m", "level", "its radius and what the uncertainty of its place adds", body_values, "body"),
+    Column("body_free_water", 2, "m", "level", "above and below the own depth, up to where it may be; 0 = level", body_values, "body"),
+    Column("body_age", 1, "s", "level", "since it was last seen", body_values, "body"),
+    Column(
+        "body_closest", 1, "m", "level", "to its surface at the closest approach, if the own velocity stays as it is", body_values, "body"
+    ),
+    Column("body_closest_time", 1, "s", "level", "until then; at most the forecast's horizon", body_values, "body"),
 )
 """Of each of the bodies that come closest, the closest first: how close matters more than how soon, and a body that recedes, whose closest
 approach is now, does not push one out that is still to come.

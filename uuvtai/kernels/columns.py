@@ -14,6 +14,6 @@ class Column(NamedTuple):
     """"level" is the body frame without roll and pitch: x along the heading, y to its left, z up"""
     meaning: str
     source: Any
-    """func that returns the values of one env, or the value of one of its sectors, or the values of one of its bodies"""
+    """func that returns the values of one env, or the value of one of its sectors, or the values of all groups of one of its bodies"""
     per: str = ""
     """'sector' or 'body': there are so many for each"""

@@ -7,7 +7,7 @@ import taichi as ti
 
 from uuvtai.config import EpisodeConfig, FeaturesConfig, ForecastConfig, SonarConfig, TankConfig, TrackingConfig
 from uuvtai.kernels.advice import TEACHER_COLUMNS
-from uuvtai.kernels.approach import BODY_COLUMNS, closest_approach, next_body
+from uuvtai.kernels.approach import BODY_COLUMNS, body_values, closest_approach, next_body
 from uuvtai.kernels.columns import Column
 from uuvtai.kernels.geometry import FAR_M, TWO_PI, quaternion_wb, rotation_wb
 from uuvtai.kernels.signature import Const, In, Out, quick_launch, spread
@@ -208,6 +208,13 @@ def _sources(group, cfg):
     return [(c.source, first, c.width) for c, first, _width in placed_columns(cfg) if c in group]
 
 
+def _body_places(cfg):
+    """(place in ``body_values``, first column of the first body, width of one) of the groups of BODY_COLUMNS; plain Python."""
+    widths = [column.width for column in BODY_COLUMNS]
+    return [(sum(widths[:n]), first, width) for n, (_, first, width) in enumerate(_sources(BODY_COLUMNS, cfg))]
+
+
+_BODY_WIDTH = sum(column.width for column in BODY_COLUMNS)
 _SECTOR_COLUMNS = tuple(column for column in COLUMNS if column.per == "sector")
 _OWN_COLUMNS = tuple(column for column in COLUMNS if not column.per)
 
@@ -266,13 +273,12 @@ def write_bodies(
                 if used == 1:
                     track = next_body(env, track, features)
                     used = ti.cast(track >= 0, ti.i32)
-                for source, first, width in ti.static(_sources(BODY_COLUMNS, features_cfg)):
+                value = ti.Vector.zero(ti.f32, ti.static(_BODY_WIDTH))
+                if used == 1:
+                    value = body_values(env, track, features, forecast, tracks, ego, clock, forecast_cfg, tracking, tank, rules)
+                for at, first, width in ti.static(_body_places(features_cfg)):
                     for i in ti.static(range(width)):
-                        obs[env, first + slot * width + i] = 0.0
-                    if used == 1:
-                        value = source(env, track, features, forecast, tracks, ego, clock, forecast_cfg, tracking, tank, rules)
-                        for i in ti.static(range(width)):
-                            obs[env, first + slot * width + i] = ti.cast(value[i], ti.f32)
+                        obs[env, first + slot * width + i] = ti.cast(value[at + i], ti.f32)
 
 
 @quick_launch

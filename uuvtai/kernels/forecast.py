@@ -3,7 +3,7 @@
 import taichi as ti
 
 from uuvtai.config import EpisodeConfig, ForecastConfig, TankConfig, TrackingConfig
-from uuvtai.kernels.geometry import turned_z
+from uuvtai.kernels.geometry import FAR_M, turned_z
 from uuvtai.kernels.habits import expected_turn_rate, forget_habits, learn_habit, next_event
 from uuvtai.kernels.kalman import largest_position_variance
 from uuvtai.kernels.signature import Const, In, Out, quick_launch, spread
@@ -23,6 +23,7 @@ def reset_forecast(forecast: Out[ForecastState], habits: Out[HabitState], clock:
             forget_habits(env, habits)
             for track in range(forecast.radius_m.shape[1]):
                 clear_forecast(env, track, forecast)
+                forecast.turn_m[env, track], forecast.turn_out_w[env, track] = FAR_M, ti.Vector([0.0, 0.0])
                 for k in range(forecast.pos_w.shape[2]):
                     forecast.pos_w[env, track, k] = ti.Vector([0.0, 0.0])
 

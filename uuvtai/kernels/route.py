@@ -10,42 +10,11 @@ from uuvtai.kernels.plan_codes import (
     N_PLANNER,
     N_REASON,
     N_TRIGGER,
-    PLANNER_NONE,
     PLANNER_RRT,
-    PLANNER_VORONOI,
-    PLANNERS,
-    REASONS,
-    TRIGGER_INITIAL,
-    TRIGGER_INTERSECTION,
-    TRIGGER_NONE,
-    TRIGGER_SAFETY,
-    TRIGGER_STUCK,
-    TRIGGERS,
 )
 from uuvtai.kernels.polyline import MAX_WIDENINGS, WIDENING, count_after_segment, install_route
 from uuvtai.kernels.signature import Const, In, Out, quick_launch, spread
 from uuvtai.state import ClearanceState, ClockState, MapState, MissionState, Proprioception, RouteState
-
-__all__ = [
-    "N_PLANNER",
-    "N_REASON",
-    "N_TRIGGER",
-    "PLANNERS",
-    "PLANNER_NONE",
-    "PLANNER_RRT",
-    "PLANNER_VORONOI",
-    "REASONS",
-    "TRIGGERS",
-    "TRIGGER_INITIAL",
-    "TRIGGER_INTERSECTION",
-    "TRIGGER_NONE",
-    "TRIGGER_SAFETY",
-    "TRIGGER_STUCK",
-    "follow_route",
-    "keep_route",
-    "load_route",
-    "reset_route",
-]
 
 _LONG_AGO = -(1 << 20)
 """Step at which no trigger has been served yet."""

@@ -43,7 +43,8 @@ def _reset_blackboard(env, teacher: Out[TeacherState]):
     teacher.ttc_s[env], teacher.nearest_m[env] = FAR_M, FAR_M
     teacher.threat_bearing[env], teacher.nearest_bearing[env] = 0.0, 0.0
     teacher.clearance_m[env], teacher.path_clearance_m[env] = 0.0, 0.0
-    teacher.away_w[env] = ti.Vector([0.0, 0.0])
+    level = ti.Vector([0.0, 0.0])
+    teacher.away_w[env], teacher.gaze_w[env], teacher.steer_w[env] = level, level, level
     teacher.conflict_s[env], teacher.hold_conflict_s[env], teacher.body_near_m[env] = FAR_M, FAR_M, FAR_M
     teacher.calm_steps[env], teacher.evading_steps[env] = 0, 0
 

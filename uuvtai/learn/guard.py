@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 
 import torch
 
@@ -74,6 +75,24 @@ class Guard:
             "uuv train --resume RUN --set ppo.learning_rate=1e-4. If an observation or a reward is not finite, the simulator is at fault: "
             "please report seed and episode"
         )
+
+
+def guarded_step(
+    loss: torch.Tensor, module: torch.nn.Module, optimiser: torch.optim.Optimizer, reduce: Callable[[list[torch.Tensor]], None] | None
+) -> bool:
+    """One gradient step on ``loss`` (a scalar); False where the gradient is zero or not finite, and nothing was changed.
+
+    ``reduce`` unites the gradients of several processes; it comes before the judgement, so that all of them decide alike.
+    """
+    optimiser.zero_grad(set_to_none=True)
+    loss.backward()
+    gradients = [p.grad for p in module.parameters() if p.grad is not None]
+    if reduce is not None:
+        reduce(gradients)
+    sound = 0.0 < float(torch.nn.utils.get_total_norm(gradients)) < math.inf
+    if sound:
+        optimiser.step()
+    return sound
 
 
 _ROWS_TOLD = 4

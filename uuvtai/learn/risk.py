@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from uuvtai.config.learning import RiskConfig
 from uuvtai.learn.calibration import brier, expected_calibration_error
+from uuvtai.learn.guard import guarded_step
 from uuvtai.learn.mlp import mlp
 from uuvtai.learn.normalise import Moments, RunningNorm, moments_of
 
@@ -216,18 +217,9 @@ class RiskLearner:
     def _learn(self, moment: Tensor, event: Tensor, generator: torch.Generator) -> None:
         """One step; without labels the gradient is zero, so that all processes take part in the reduction."""
         rows = torch.randint(len(event), (self.config.batch,), generator=generator).to(event.device) if len(event) else slice(0)
-        self.optimiser.zero_grad(set_to_none=True)
         logit = self.head.logit(moment[rows])
         loss = fn.binary_cross_entropy_with_logits(logit, event[rows].float(), reduction="sum") / self.config.batch
-        loss.backward()
-        gradients = [p.grad for p in self.head.parameters() if p.grad is not None]
-        if self.reduce is not None:
-            self.reduce(gradients)
-        norm = float(torch.nn.utils.get_total_norm(gradients))  # after the reduction: all processes decide alike
-        if 0.0 < norm < math.inf:
-            self.optimiser.step()
-        else:
-            self.skipped += 1
+        self.skipped += not guarded_step(loss, self.head, self.optimiser, self.reduce)
 
 
 # --------------------------------------------------------------------------------------------------------------- calibration

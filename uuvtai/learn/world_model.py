@@ -6,7 +6,6 @@ z = f(o), z' = g(z, a), o' = h(z') with a mean and a log-variance per target. Lo
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
@@ -16,6 +15,7 @@ from torch import Tensor, nn
 
 from uuvtai.config.learning import WorldModelConfig
 from uuvtai.learn.calibration import coverage, mean_squared_standardised_residual
+from uuvtai.learn.guard import guarded_step
 from uuvtai.learn.mlp import mlp
 from uuvtai.learn.normalise import Moments, RunningNorm, moments_of
 
@@ -265,17 +265,8 @@ class WorldModelLearner:
         }
 
     def _learn(self, batch: Batch) -> Losses:
-        self.optimiser.zero_grad(set_to_none=True)
         losses = self.model.loss(*batch)
-        losses.total.backward()
-        gradients = [p.grad for p in self.model.parameters() if p.grad is not None]
-        if self.reduce is not None:
-            self.reduce(gradients)
-        norm = float(torch.nn.utils.get_total_norm(gradients))  # after the reduction: all processes decide alike
-        if 0.0 < norm < math.inf:
-            self.optimiser.step()
-        else:
-            self.skipped += 1
+        self.skipped += not guarded_step(losses.total, self.model, self.optimiser, self.reduce)
         return losses
 
 

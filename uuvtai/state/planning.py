@@ -78,9 +78,9 @@ class RouteState:
     cost: ti.Field = array("n_env")
     """sum |dp| / max(clearance, eps) of the route when it was planned"""
     planner: ti.Field = array("n_env", dtype=ti.i32)
-    """who planned it: route.PLANNER_NONE, PLANNER_VORONOI, PLANNER_RRT"""
+    """who planned it: plan_codes.PLANNER_NONE, PLANNER_VORONOI, PLANNER_RRT"""
     trigger: ti.Field = array("n_env", dtype=ti.i32)
-    """trigger of this step's replan, route.TRIGGER_NONE if none (a bit set of the triggers that fired in `fired`)"""
+    """trigger of this step's replan, plan_codes.TRIGGER_NONE if none (a bit set of the triggers that fired in `fired`)"""
     fired: ti.Field = array("n_env", dtype=ti.i32)
     """bit set of every trigger that holds in this step"""
     want_plan: ti.Field = array("n_env", dtype=ti.i32, scratch=True)
