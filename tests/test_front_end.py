@@ -1,0 +1,91 @@
+"""Taichi's front end with a memory says and compiles what it does without one."""
+
+import ast
+import inspect
+import subprocess
+import sys
+import textwrap
+
+import pytest
+import taichi as ti
+from taichi.lang import kernel_impl
+from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
+
+from uuvtai import front_end
+from uuvtai.front_end import remember_sources
+
+
+@ti.func
+def halved(x):
+    if x > 0.0:
+        x = 0.5 * x
+    for _ in range(2):
+        x += (
+            1.0
+            - 1.0
+        )  # fmt: skip
+    return x
+
+
+@ti.kernel
+def wrong() -> ti.f32:
+    return halved(unknown_name)  # noqa: F821
+
+
+def context_of(decorated):
+    """What Taichi makes before it transforms a func."""
+    return kernel_impl._get_tree_and_ctx(decorated.func, is_kernel=False, args=())
+
+
+def test_every_position_reads_as_without_memory():
+    remember_sources()
+    plain = ASTTransformerContext.get_pos_info.__wrapped__
+    told = set()
+    for _ in range(2):  # the second time from memory
+        tree, context = context_of(halved)
+        nodes = [node for node in ast.walk(tree) if isinstance(node, (ast.stmt, ast.expr))]
+        for node in nodes:
+            assert context.get_pos_info(node) == plain(context, node)
+            told.add(plain(context, node))
+    assert len(nodes) > 20 and len(told) > 15, "positions differ from node to node"
+
+
+def test_a_source_is_looked_up_once(monkeypatch):
+    remember_sources()
+    expected = [textwrap.fill(line, tabsize=4, width=9999) for line in inspect.getsourcelines(halved.func.func)[0]]
+    assert context_of(halved)[1].src == expected
+    monkeypatch.setattr(inspect, "getsourcelines", lambda _: pytest.fail("looked up again"))
+    assert context_of(halved)[1].src == expected
+
+
+def test_an_error_still_names_its_line():
+    with pytest.raises(
+        ti.TaichiCompilationError, match=r'(?s)test_front_end\.py", line \d+, in wrong:.*halved\(unknown_name\).*\^.*unknown_name'
+    ):
+        wrong()
+
+
+def test_kernels_in_classes_are_still_told_apart():
+    @ti.data_oriented
+    class Body:
+        @ti.func
+        def inside(self):
+            return 1
+
+        assert front_end._inside_class(2) is True  # 0: itself, 1: the class's body, 2: the test
+
+    assert Body.inside.func.classfunc is True
+    assert halved.func.classfunc is False
+    assert kernel_impl._inside_class is front_end._inside_class
+
+
+def test_a_taichi_without_these_names_is_left_alone():
+    program = (
+        "from taichi.lang import kernel_impl as k\n"
+        "from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext as C\n"
+        "del C.get_pos_info, k.getsourcefile, k.getsourcelines, k._inside_class, k.textwrap\n"
+        "from uuvtai.front_end import remember_sources\n"
+        "remember_sources()\n"
+        "assert not any(hasattr(k, n) for n in ('getsourcefile', 'getsourcelines', '_inside_class', 'textwrap'))"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)
