@@ -53,7 +53,7 @@ def measure(job: Job) -> list[Row]:
             peer_name="(the paper, printed)",
         )
     )
-    sim.set_scene(world.n_static, world.n_dynamic, world.dynamic_speed_m_s)
+    sim.set_scenes()
     return [*rows, _real_time(sim, world.n_static, world.n_dynamic, job)]
 
 
@@ -65,7 +65,7 @@ def _loops(sim: Sim, scenes: list[tuple[int, int]], speed_m_s: float, job: Job) 
     for turn in range(turns):
         for scene in scenes:
             job.say(f"turn {turn + 1} of {turns}: S = {scene[0]}, D = {scene[1]}")
-            sim.set_scene(*scene, speed_m_s)
+            sim.set_scenes([(*scene, speed_m_s)])
             batch = Batch(sim, first_episode=turn)
             for _ in range(WARM_STEPS):
                 batch.step()

@@ -1,10 +1,5 @@
 """Clearance against scipy's exact transform, its sites and ties, what must hold for any map, and the funcs that others read it with."""
 
-import hashlib
-import os
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -239,19 +234,3 @@ def test_only_awake_rows_whose_step_is_due_are_computed(stage):
     np.testing.assert_array_equal(changed, [True, False, False, False, True, False, False, False])
     # sleeping rows keep their flag too
     np.testing.assert_array_equal(stage.clearance.fresh.to_numpy(), [1, 0, 0, 1, 1, 0, 0, 1])
-
-
-def digest_of_a_batch():
-    """Digest of the clearance of 64 random maps (enough loop items for several threads)."""
-    static = np.concatenate([maps_of(seed) for seed in range(8)])
-    return hashlib.sha256(b"".join(f.tobytes() for f in Stage(64).compute(static))).hexdigest()
-
-
-def test_thread_count_changes_nothing():
-    """One thread in a process of its own, all cores in this one."""
-    program = "from uuvtai.runtime import start_taichi; start_taichi('cpu'); import tests.test_clearance as t; print(t.digest_of_a_batch())"
-    one = subprocess.run(
-        [sys.executable, "-c", program], env={**os.environ, "UUV_NUM_THREADS": "1"}, capture_output=True, text=True, check=True
-    )
-    digest = digest_of_a_batch()
-    assert len(digest) == 64 and one.stdout.split()[-1] == digest

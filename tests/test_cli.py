@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
 
 from tests.conftest import SmallSim
 from uuvtai.cli import main
@@ -104,7 +105,7 @@ def test_presets_are_listed_and_shown(capfd):
     code, out, _ = uuv(capfd, "presets", "--json")
     listed = json.loads(out)
     assert code == 0
-    assert {"pool", "gauntlet", "maze", "netpen", "transfer", "open"} <= set(listed["world"])
+    assert {"pool", "gauntlet", "mixed", "maze", "netpen", "transfer", "open"} <= set(listed["world"])
     assert {"clean", "paper", "nominal", "harsh"} == set(listed["sensors"])
     assert {"paper", "ppo", "distill_20", "curriculum", "full", "no_risk_scaling", "no_world_model", "no_distill", "smoke"} <= set(
         listed["train"]
@@ -180,14 +181,24 @@ def test_eval_prints_one_document_with_every_documented_key(evaluation):
         assert method["env_steps"] == sum(round(d["time_s"] / 0.02) for d in method["episodes_detail"])
 
 
+def messages_of(log):
+    """(topic, time, content) of every message of a recorded episode: sensors, maps, tracks, routes, commands, truth."""
+    with log.open("rb") as file:
+        return [(channel.topic, message.log_time, message.data) for _, channel, message in make_reader(file).iter_messages()]
+
+
 def test_one_thread_gives_the_same_episodes_to_the_last_digit(evaluation, tmp_path):
-    _, document, _ = evaluation
+    """Outcomes of four episodes, and all that one of them wrote down on its way."""
+    folder, document, _ = evaluation
     command = [
         sys.executable, "-m", "uuvtai", "eval", "--controller", "bt", "--episodes", "4", "--seeds", "3", *SmallSim.OPTIONS,
-        "--set", "episode.horizon_steps=400", "--run-dir", str(tmp_path / "run"), "--json",
+        "--record", "1", "--set", "episode.horizon_steps=400", "--run-dir", str(tmp_path / "run"), "--json",
     ]  # fmt: skip
     done = subprocess.run(command, capture_output=True, text=True, check=True, env={**os.environ, "UUV_NUM_THREADS": "1"})
     assert json.loads(done.stdout)["methods"][0]["episodes_detail"] == document["methods"][1]["episodes_detail"]
+    alone, together = (messages_of(run / "logs/bt_seed3_episode0.mcap") for run in (tmp_path / "run", folder))
+    assert {topic for topic, _, _ in alone} >= {"/sonar/scan", "/map/static", "/map/dynamic"}
+    assert alone == together
 
 
 def test_eval_leaves_a_complete_run_folder(evaluation):
@@ -225,20 +236,27 @@ def test_tree_shows_the_use_of_every_node(evaluation, capfd):
 def test_an_existing_run_folder_is_never_overwritten(evaluation, capfd):
     folder, _, _ = evaluation
     before = (folder / "run.json").read_text()
-    done = subprocess.run(
-        [sys.executable, "-m", "uuvtai", "eval", "--episodes", "1", *SmallSim.OPTIONS, "--run-dir", str(folder)],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == 1
-    assert "already there and not empty" in done.stderr
+    for command in (["eval", "--episodes", "1"], ["train", "smoke"]):
+        code, _, err = uuv(capfd, *command, "--run-dir", str(folder))
+        assert code == 1
+        assert "already there and not empty" in err
     assert (folder / "run.json").read_text() == before
 
 
-@pytest.mark.parametrize("place", ["file/run", "/proc/nowhere/run"])
-def test_a_run_folder_that_cannot_be_written_is_exit_1(tmp_path, place):
+def test_a_place_without_room_for_a_run_folder_is_refused_before_anything_is_compiled(tmp_path, capfd, monkeypatch):
     (tmp_path / "file").write_text("mine")
+    monkeypatch.setattr("uuvtai.sim.Sim", lambda *_: pytest.fail("compiles"))
+    for command in (["eval", "--episodes", "1"], ["train", "smoke"]):
+        code, _, err = uuv(capfd, *command, "--run-dir", str(tmp_path / "file/run"))
+        assert code == 1
+        assert "Not a directory" in err and "give a folder that can be written: --run-dir DIR" in err
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_a_run_folder_that_cannot_be_written_is_exit_1(tmp_path):
+    """Nobody, not even root, makes a folder there; that shows only when it is tried."""
     done = subprocess.run(
-        [sys.executable, "-m", "uuvtai", "eval", "--episodes", "1", *SmallSim.OPTIONS, "--run-dir", place],
+        [sys.executable, "-m", "uuvtai", "eval", "--episodes", "1", *SmallSim.OPTIONS, "--run-dir", "/proc/nowhere/run"],
         capture_output=True, text=True, check=False, cwd=tmp_path,
     )  # fmt: skip
     assert done.returncode == 1

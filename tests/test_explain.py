@@ -498,11 +498,11 @@ def test_recordings_go_round_the_labels():
 def played(small):
     """Blind driving among fast bodies: most episodes fail within seconds."""
     small.sim.use_tree(small.trees["straight"])
-    small.sim.set_scene(8, 9, 1.5)
+    small.sim.set_scenes([(8, 9, 1.5)])
     results, _ = run_episodes(small.sim, jobs_of([7], 12))
     rows = explain_failures(small.sim, small.trees["straight"], results)
     yield small, results, rows
-    small.sim.set_scene(8, 6, 0.6)
+    small.sim.set_scenes()
     small.sim.use_tree(small.trees["bt"])
 
 

@@ -1,10 +1,5 @@
 """The two-layer map: against the oracle on random scans, known situations by hand, and what must hold for any scan."""
 
-import hashlib
-import os
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -582,20 +577,3 @@ def test_debugging_stamp_is_off_by_default_and_marks_moving_bodies_only(stage):
 
 
 # ------------------------------------------------------------------------------------------------------------------ threads
-
-
-def digest_of_a_batch():
-    """Digest of the maps of 96 envs after four scans (enough loop items for several threads)."""
-    stage = Stage(96)
-    after = random_run(stage, range(96), 11, n_scan=4)
-    return hashlib.sha256(b"".join(after[name].tobytes() for name in FIELDS)).hexdigest()
-
-
-def test_thread_count_changes_nothing():
-    """One thread in a process of its own, all cores in this one."""
-    program = "from uuvtai.runtime import start_taichi; start_taichi('cpu'); import tests.test_mapping as t; print(t.digest_of_a_batch())"
-    one = subprocess.run(
-        [sys.executable, "-c", program], env={**os.environ, "UUV_NUM_THREADS": "1"}, capture_output=True, text=True, check=True
-    )
-    digest = digest_of_a_batch()
-    assert len(digest) == 64 and one.stdout.split()[-1] == digest

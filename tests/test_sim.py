@@ -134,7 +134,7 @@ def test_outcomes_do_not_depend_on_order_or_batch(small, order):
 def test_scene_is_data(small):
     """S, D and v change without another simulator, and what does not fit is refused."""
     sim = small.sim
-    sim.set_scene(3, 9, 1.5)
+    sim.set_scenes([(3, 9, 1.5)])
     small.begin([0])
     kinds = sim.s.world.kind.to_numpy()[0]
     slots = len(kinds) - 9
@@ -142,9 +142,14 @@ def test_scene_is_data(small):
     assert (kinds[slots:] != 0).sum() == 9
     moving = np.linalg.norm(sim.s.world.vel_w.to_numpy()[0, slots:], axis=1)
     np.testing.assert_allclose(moving, 1.5, rtol=1e-4)
+    sim.set_scenes([(8, 6, 0.6), (2, 0, 0.6), (5, 7, 0.3)])
+    small.begin([0, 1, 2, 3])
+    bodies = sim.s.world.kind.to_numpy()[:4] != 0
+    assert bodies[:, :slots].sum(axis=1).tolist() == [8, 2, 5, 8], "dealt out in turn"
+    assert bodies[:, slots:].sum(axis=1).tolist() == [6, 0, 7, 6]
     with pytest.raises(ValueError, match="dynamic_capacity"):
-        sim.set_scene(3, 10, 1.5)
-    sim.set_scene(8, 6, 0.6)
+        sim.set_scenes([(3, 10, 1.5)])
+    sim.set_scenes()
 
 
 def test_another_kind_of_runtime_in_one_process_is_refused():

@@ -1,21 +1,14 @@
 """The trainer: learns, goes on bit for bit from its state, neither spreads nor hides what is not finite, and is one with two processes."""
 
-import hashlib
 import math
-import multiprocessing
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import pytest
 import torch
 
-from tests.conftest import SmallSim
 from tests.point_env import PointEnv
 from tests.test_distributed import two
-from uuvtai.config import Config
 from uuvtai.config.learning import LearningConfig
-from uuvtai.env import VectorEnv
-from uuvtai.learn.checkpoint import open_checkpoint, save
 from uuvtai.learn.distributed import Processes
 from uuvtai.learn.guard import TrainingError
 from uuvtai.learn.packing import pack
@@ -237,48 +230,3 @@ def test_two_processes_train_one_policy_the_same_as_one_process_with_all_envs():
         assert torch.allclose(torch.tensor(first[name]), torch.tensor(values), rtol=SUMMED_APART, atol=SUMMED_APART), name
     for name in ("rollout/episodes", "rollout/ep_rew_mean", "reward/progress", "time/env_steps", "distill/loss"):
         assert metrics[name] == pytest.approx(expected[name], rel=SUMMED_APART), name
-
-
-# ------------------------------------------------------------------------------------------------------------- the simulator
-
-
-def real_config(sim_config):
-    return LearningConfig.model_validate(
-        sim_config.model_dump(mode="json") | config_of(ppo={"rollout_steps": 8}).model_dump(mode="json", include=LEARNING)
-    )
-
-
-LEARNING = LearningConfig.model_fields.keys() - Config.model_fields.keys()
-
-
-def go_on(checkpoints):
-    """In a fresh process: two more iterations from the newest checkpoint, told as metrics and packed state."""
-    torch.set_num_threads(1)
-    small = SmallSim()
-    trainer = Trainer(VectorEnv(small.sim), real_config(small.config))
-    trainer.load_state(open_checkpoint(checkpoints / "step_000002").state(like=trainer.state()))
-    metrics = [told(trainer.iterate()) for _ in range(2)]
-    return metrics, packed_bytes(trainer.state())
-
-
-def packed_bytes(state):
-    plain, tensors = pack(state)
-    return plain, {name: hashlib.sha256(tensor.numpy().tobytes()).hexdigest() for name, tensor in tensors.items()}
-
-
-def test_the_simulators_run_goes_on_bit_for_bit_in_a_fresh_process(small, tmp_path):
-    config, threads = real_config(small.config), torch.get_num_threads()
-    torch.set_num_threads(1)
-    env = VectorEnv(small.sim)
-    trainer = Trainer(env, config)
-    for _ in range(2):
-        trainer.iterate()
-    save(tmp_path, 2, trainer.state(), config, env.observation_table)
-    expected = [told(trainer.iterate()) for _ in range(2)]
-    whole = packed_bytes(trainer.state())
-    env.close()
-    torch.set_num_threads(threads)
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as fresh:
-        metrics, resumed = fresh.submit(go_on, tmp_path).result()
-    assert metrics == expected
-    assert resumed == whole

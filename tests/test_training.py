@@ -218,8 +218,10 @@ def test_two_processes_do_not_train_in_one_folder(points, tmp_path):
 
 def test_an_evaluation_in_between_leaves_no_trace(small):
     """Training shares its simulator with the evaluation, and goes on as if nothing had been."""
-    config = load_training("smoke", TINY | {"world.dynamic_capacity": 9, "train.evaluate_episodes": 2})
+    scenes = [[8, 6, 0.6], [3, 0, 0.6], [8, 9, 1.5]]
+    config = load_training("smoke", TINY | {"world.dynamic_capacity": 9, "train.evaluate_episodes": 2, "train.scenes": scenes})
     states = []
+    small.sim.set_scenes(config.train.scenes)
     for is_evaluated in (False, True):
         trainer = Trainer(VectorEnv(small.sim), config)
         with torch.no_grad():
@@ -231,6 +233,9 @@ def test_an_evaluation_in_between_leaves_no_trace(small):
             assert found["eval/collision_rate"] == 1.0
         trainer.iterate()
         states.append(pack(trainer.state()))
+    dealt = small.sim.s.scene.n_dynamic.to_numpy().tolist()
+    small.sim.set_scenes()
+    assert dealt[:4] == [6, 0, 9, 6]
     (plain, tensors), (other_plain, other) = states
     assert plain == other_plain
     assert all(torch.equal(tensor.view(-1).view(torch.uint8), other[name].view(-1).view(torch.uint8)) for name, tensor in tensors.items())

@@ -27,7 +27,7 @@ OUTLINE_TOL_M = 1.5e-3
 SPEED_TOL_M_S = 0.02
 """a corner passed within the last 2 % of a step; float32 positions alone give 2e-4"""
 SHARE_SIGMAS = 5.0
-WORLDS = ("pool", "gauntlet", "maze", "netpen", "transfer", "open")
+WORLDS = ("pool", "gauntlet", "mixed", "maze", "netpen", "transfer", "open")
 STRUCTS = (
     state.WorldState,
     state.PathState,
@@ -59,7 +59,7 @@ class Drawn:
     def draw(self, seed=0, numbers=None, mask=None, scene=None):
         """Arrays by name of the episodes ``numbers`` (default 0 .. n_env - 1)."""
         cfg, n = self.cfg, self.n_env
-        scenario.set_scene(self.scene, cfg, *(scene or (cfg.n_static, cfg.n_dynamic, cfg.dynamic_speed_m_s)))
+        scenario.set_scenes(self.scene, cfg, [scene or (cfg.n_static, cfg.n_dynamic, cfg.dynamic_speed_m_s)])
         numbers = np.arange(n) if numbers is None else np.asarray(numbers)
         mask = np.ones(n) if mask is None else np.asarray(mask)
         episode.begin_episodes(*(np.broadcast_to(a, n).astype(np.int32) for a in (mask, seed, numbers)), self.clock, self.episode)
@@ -187,6 +187,10 @@ def test_half_are_cylinders_and_half_of_each_go_in_circles(any_world):
     if cfg.motion == "line_circle":
         circle = drawn["path_n_way"][:, :n] == 0
         assert np.all(np.abs(circle.sum(axis=1) - n * cfg.circle_fraction) < 1)
+    if cfg.motion == "mixed":
+        n_way = drawn["path_n_way"][:, :n]
+        assert abs((n_way > 2).mean() - 0.5) < 5 * 0.5 / np.sqrt(n_way.size)
+        assert (n_way == 0).mean() > 0.2 and (n_way == 2).mean() > 0.2, "a quarter each"
 
 
 def test_paths_keep_their_shapes_within_the_walls(any_world):
@@ -204,7 +208,7 @@ def test_paths_keep_their_shapes_within_the_walls(any_world):
                 assert length == pytest.approx(2 * np.pi * abs(radius), rel=1e-6)
                 continue
             assert length == pytest.approx(legs.sum(), rel=1e-6)
-            if cfg.motion == "waypoints":
+            if cfg.motion == "waypoints" or (cfg.motion == "mixed" and n_way > 2):
                 assert cfg.corners[0] <= n_way <= cfg.corners[1]
                 assert min(np.hypot(*(a - b)) for i, a in enumerate(way[:n_way]) for b in way[:i]) >= cfg.corner_gap_m - FLOAT_TOL_M
             else:
@@ -451,7 +455,7 @@ def test_a_world_that_cannot_be_placed_is_told():
 def test_scenes_that_do_not_fit_are_refused(scene):
     of = drawn_world("gauntlet")[0]
     with pytest.raises(ValueError, match=r"slots|speed"):
-        scenario.set_scene(of.scene, of.cfg, *scene)
+        scenario.set_scenes(of.scene, of.cfg, [scene])
 
 
 @pytest.mark.parametrize(

@@ -26,6 +26,16 @@ def default_run_dir(preset: str) -> Path:
     return Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}_{Path(preset).stem}"
 
 
+def refuse_place(path: Path) -> None:
+    """Raise RunFolderError at once where a run folder plainly cannot be made, not after minutes of compiling; nothing is written."""
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise RunFolderError(f"{path}: is already there and not empty; give another --run-dir or remove it")
+    nearest = next(place for place in (path, *path.absolute().parents) if place.exists())
+    if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
+        reason = "Permission denied" if nearest.is_dir() else "Not a directory"
+        raise RunFolderError(f"{path}: cannot make it in {nearest} ({reason}); give a folder that can be written: --run-dir DIR")
+
+
 class RunFolder:
     """Creates ``path`` with config.yaml and run.json; ``finish`` records how the run ended."""
 
@@ -33,9 +43,8 @@ class RunFolder:
 
     def __init__(self, path: Path, config: Config, seeds: list[int]) -> None:
         """Raises RunFolderError where the folder exists with content or cannot be written."""
+        refuse_place(path)
         self.path = path
-        if path.exists() and (not path.is_dir() or any(path.iterdir())):
-            raise RunFolderError(f"{path}: is already there and not empty; give another --run-dir or remove it")
         self._started = time.time()
         self._record = {
             "schema": 1,

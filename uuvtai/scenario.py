@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -100,16 +100,22 @@ def _center_and_size(obstacle: FixedObstacle, world: WorldConfig) -> tuple[float
     return z, (extent_x, extent_y, half_height)
 
 
-def set_scene(scene: SceneState, world: WorldConfig, n_static: int, n_dynamic: int, speed_m_s: float) -> None:
-    """S, D and v of every env's next scenario. Raises ValueError where they do not fit the slots of ``world``."""
-    for name, wanted, slots in (("static", n_static, world.static_slots), ("dynamic", n_dynamic, world.dynamic_slots)):
-        if not 0 <= wanted <= slots:
-            raise ValueError(f"{wanted} {name} obstacles do not fit {slots} slots: set world.{name}_capacity to at least {wanted}")
-    if not (math.isfinite(speed_m_s) and speed_m_s >= 0):
-        raise ValueError(f"the obstacles' speed must be finite and not negative, got {speed_m_s}")
-    scene.n_static.fill(n_static)
-    scene.n_dynamic.fill(n_dynamic)
-    scene.speed_m_s.fill(speed_m_s)
+Scene = tuple[int, int, float]
+"""(S, D, v [m/s])"""
+
+
+def set_scenes(scene: SceneState, world: WorldConfig, scenes: Sequence[Scene]) -> None:
+    """Deal the scenes out to the envs in turn, for their next scenarios. ValueError where one does not fit the slots of ``world``."""
+    for n_static, n_dynamic, speed_m_s in scenes:
+        for name, wanted, slots in (("static", n_static, world.static_slots), ("dynamic", n_dynamic, world.dynamic_slots)):
+            if not 0 <= wanted <= slots:
+                raise ValueError(f"{wanted} {name} obstacles do not fit {slots} slots: set world.{name}_capacity to at least {wanted}")
+        if not (math.isfinite(speed_m_s) and speed_m_s >= 0):
+            raise ValueError(f"the obstacles' speed must be finite and not negative, got {speed_m_s}")
+    dealt = np.resize(np.array(scenes, dtype=np.float32), (scene.n_static.shape[0], 3))
+    scene.n_static.from_numpy(dealt[:, 0].astype(np.int32))
+    scene.n_dynamic.from_numpy(dealt[:, 1].astype(np.int32))
+    scene.speed_m_s.from_numpy(np.ascontiguousarray(dealt[:, 2]))
 
 
 def check_scenarios(faults: np.ndarray) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -49,7 +49,7 @@ from uuvtai.kernels.grid import outside_cells
 from uuvtai.kernels.recording import copy_rows, tell_address
 from uuvtai.rrt import RouteFallback
 from uuvtai.runtime import start_taichi
-from uuvtai.scenario import check_scenarios, load_fixed, set_scene
+from uuvtai.scenario import Scene, check_scenarios, load_fixed, set_scenes
 from uuvtai.sizes import array_sizes, check_size
 from uuvtai.tree import FlatTree, load_tree
 
@@ -143,9 +143,10 @@ class Sim:
         self.tree = tree
         load_tree(self.s.table, tree)
 
-    def set_scene(self, n_static: int, n_dynamic: int, speed_m_s: float) -> None:
-        """S, D and v of every env's next scenario; S and D must fit the slots that were allocated."""
-        set_scene(self.s.scene, self.config.world, n_static, n_dynamic, speed_m_s)
+    def set_scenes(self, scenes: Sequence[Scene] = ()) -> None:
+        """Deal (S, D, v) out to the envs in turn, for their next scenarios; none = the world's own. ValueError where slots are too few."""
+        world = self.config.world
+        set_scenes(self.s.scene, world, scenes or [(world.n_static, world.n_dynamic, world.dynamic_speed_m_s)])
 
     def observe(self) -> torch.Tensor:
         """From the next pass on, write every awake row's observation into the tensor returned, (n_env, n_obs) (``features.columns``)."""
@@ -156,7 +157,7 @@ class Sim:
 
     def _fill_constants(self) -> None:
         world_cfg = self.config.world
-        self.set_scene(world_cfg.n_static, world_cfg.n_dynamic, world_cfg.dynamic_speed_m_s)
+        self.set_scenes()
         load_fixed(self.s.fixed, world_cfg)
         outside = outside_cells(world_cfg.tank, self.config.mapping.cell_m)
         self.s.mask.outside.from_numpy(np.array(outside, dtype=np.int32))

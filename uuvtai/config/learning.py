@@ -143,6 +143,8 @@ class TrainConfig(Section):
     iterations: PositiveCount = 1200
     num_envs: PositiveCount = 8
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    scenes: tuple[tuple[Count, Count, NonNegative], ...] = ()
+    """(S, D, v [m/s]) dealt out to the envs in turn, slots permitting; none = the world's own, which evaluations play in any case"""
     checkpoint_every: PositiveCount = 50
     """iterations between checkpoints"""
     keep_checkpoints: PositiveCount = 3

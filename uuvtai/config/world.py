@@ -57,7 +57,8 @@ class DynamicObstacles(Section):
     """the others are spheres"""
     full_column_fraction: Fraction = 0.0
     """share of the moving bodies that are cylinders through the full water column (counted within cylinder_fraction)"""
-    motion: Literal["line_circle", "waypoints"] = "line_circle"
+    motion: Literal["line_circle", "waypoints", "mixed"] = "line_circle"
+    """mixed: each body by a throw of a coin"""
     circle_fraction: Fraction = 0.5
     """the others go back and forth on a line"""
     line_length_m: PositiveInterval = (2.0, 6.0)

@@ -142,11 +142,24 @@ def draw_path(env, lane, i, draw, radius, key, path: Out[PathState], world_cfg: 
     first = 16 + _DRAW_STRIDE * draw
     if ti.static(world_cfg.dynamic.motion == "waypoints"):
         fits = draw_loop(env, lane, radius, key, first, path, world_cfg)
-    elif is_chosen(crossed(i), world_cfg.dynamic.circle_fraction) == 1:
+    elif ti.static(world_cfg.dynamic.motion == "line_circle"):
+        fits = draw_line_or_circle(env, lane, i, radius, key, first, path, world_cfg)
+    elif bits(key, 6) & 1 == 1:
+        fits = draw_loop(env, lane, radius, key, first, path, world_cfg)
+    else:
+        fits = draw_line_or_circle(env, lane, i, radius, key, first, path, world_cfg)
+    path.phase_m[env, lane] = path.length_m[env, lane] * uniform(key, first)
+    return fits
+
+
+@ti.func
+def draw_line_or_circle(env, lane, i, radius, key, first, path: Out[PathState], world_cfg: Const[WorldConfig]):
+    """One draw of the shape that obstacle i has; 0 where it does not stay within the walls."""
+    fits = 0
+    if is_chosen(crossed(i), world_cfg.dynamic.circle_fraction) == 1:
         fits = draw_circle(env, lane, radius, key, first, path, world_cfg)
     else:
         fits = draw_line(env, lane, radius, key, first, path, world_cfg)
-    path.phase_m[env, lane] = path.length_m[env, lane] * uniform(key, first)
     return fits
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from uuvtai.config import Config
 from uuvtai.loader import ConfigError
-from uuvtai.run_folder import RunFolder, default_run_dir
+from uuvtai.run_folder import RunFolder, default_run_dir, refuse_place
 
 if TYPE_CHECKING:
     from uuvtai.measure.evaluate import EpisodeResult, Job
@@ -69,20 +69,22 @@ def compare(request: Request, watch: Watch) -> tuple[dict[str, Any], Path]:
     Everything that can be refused is refused before anything is written. Raises ConfigError, ValueError, MemoryError, RunFolderError,
     CheckpointError.
     """
-    from uuvtai.measure.evaluate import document, jobs_of
-    from uuvtai.sim import Sim
-
     if request.num_envs is not None and request.num_envs < 1:
         raise ValueError(f"--num-envs {request.num_envs}: at least 1 env is needed, for example --num-envs 64")
     if len(set(request.seeds)) != len(request.seeds):
         raise ConfigError(f"--seeds {','.join(map(str, request.seeds))}: a seed is given twice; its episodes would be the same")
+    run_dir = request.run_dir or default_run_dir(request.world)
+    refuse_place(run_dir)
+    from uuvtai.measure.evaluate import document, jobs_of
+    from uuvtai.sim import Sim
+
     jobs = jobs_of(request.seeds, request.episodes)
     methods = _methods(request, watch)
     num_envs = request.num_envs or min(len(jobs), _BATCH)
     watch.note(f"starting {num_envs} envs (the first run on a machine compiles its kernels, about a minute)")
     sim = Sim(request.config, num_envs, methods[0].tree, request.device)
     policies = {method.name: method.driver_for(sim) for method in methods}
-    folder = RunFolder(request.run_dir or default_run_dir(request.world), request.config, request.seeds)
+    folder = RunFolder(run_dir, request.config, request.seeds)
     status, code = "failed", 1
     played: list[_Played] = []
     entries: list[dict[str, Any]] = []

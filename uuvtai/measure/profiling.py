@@ -162,7 +162,7 @@ def _density(config: Config, tree: Any, device: str, seconds: float, say: Callab
     rows = []
     for n_dynamic in _DENSITY:
         say(f"D = {n_dynamic}")
-        sim.set_scene(config.world.n_static, n_dynamic, config.world.dynamic_speed_m_s)
+        sim.set_scenes([(config.world.n_static, n_dynamic, config.world.dynamic_speed_m_s)])
         batch = Batch(sim)
         for _ in range(WARM_STEPS):
             batch.step()

@@ -14,7 +14,7 @@ from uuvtai.config.learning import LearningConfig
 from uuvtai.loader import ConfigError, Overrides, load_resolved, to_yaml
 from uuvtai.measure.methods import TRAINING_TREE
 from uuvtai.measure.statistics import wilson_interval
-from uuvtai.run_folder import RunFolder, default_run_dir
+from uuvtai.run_folder import RunFolder, default_run_dir, refuse_place
 
 if TYPE_CHECKING:
     from uuvtai.env import VectorEnv
@@ -63,6 +63,8 @@ def train(request: TrainRequest, watch: TrainWatch) -> tuple[dict[str, Any], Pat
 
     if request.iterations is not None and request.iterations < 1:
         raise ConfigError(f"--iterations {request.iterations}: at least 1, for example --iterations 100")
+    if request.run_dir and request.resume is None:
+        refuse_place(request.run_dir)
     found, config = _begin(request, watch)
     total = request.iterations or config.train.iterations
     if found and found.step >= total:
@@ -114,6 +116,7 @@ def _env(config: LearningConfig, device: str) -> VectorEnv:
     from uuvtai.tree import read_tree
 
     sim = Sim(config, config.train.num_envs, read_tree(TRAINING_TREE, config.teacher.max_node), device)
+    sim.set_scenes(config.train.scenes)
     return VectorEnv(sim, config.train.seed)
 
 
@@ -225,10 +228,12 @@ def evaluate_now(trainer: Trainer, config: LearningConfig) -> Metrics:
     held = env.capture()
     try:
         env.sim.sleep()
+        env.sim.set_scenes()
         model = trainer.world_model if config.world_model.as_features else None
         jobs = jobs_of([config.train.evaluate_seed], config.train.evaluate_episodes)
         results, env_steps = run_episodes(env.sim, jobs, driver=Pilot(trainer.policy, model, env.num_envs, env.device))
     finally:
+        env.sim.set_scenes(config.train.scenes)
         env.restore(held)
     told = summary("policy", results, env_steps, 0.0)
     names = ("success_rate", "collision_rate", "return_mean", "time_to_success_mean_s")
