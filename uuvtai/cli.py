@@ -148,6 +148,9 @@ def _print_evaluation(result: dict[str, Any], folder: Path, as_json: bool) -> No
         _print_json(result)
         return
     _print_methods(result)
+    for method in result["methods"]:
+        if "risk" in method:
+            _print_risk(method["name"], method["risk"])
     if any("causes" in method for method in result["methods"]):
         _print_causes(result)
         _say(f"facts of every failure, and which of them are recorded: {folder / 'eval/explain.json'}")
@@ -188,6 +191,25 @@ def _print_methods(result: dict[str, Any]) -> None:
     _stdout().print(table)
 
 
+def _print_risk(name: str, risk: dict[str, Any]) -> None:
+    """How far the policy's probability of an accident soon can be believed."""
+    _stdout().print(
+        f"{name}: risk of an accident soon at {risk['moments']:,} moments: Brier {risk['brier']:.4f} "
+        f"(base rate {risk['brier_base_rate']:.4f}), ECE {risk['ece']:.4f}, AUROC {risk['auroc']:.3f}",
+        highlight=False,
+    )
+    bins = risk["reliability"]
+    pairs = zip(bins["predicted"], bins["observed"], bins["samples"], strict=True)
+    _stdout().print("  said -> came (n): " + ", ".join(f"{p:.2f} -> {o:.2f} ({n:,.0f})" for p, o, n in pairs), highlight=False)
+    if "accidents" in risk:
+        low, high = risk["missed_ci95"]
+        _stdout().print(
+            f"  alarm: missed {risk['missed']} of {risk['accidents']} accidents, {100 * low:.1f} to {100 * high:.1f} % "
+            f"(promised {100 * risk['promised_miss_rate']:g} %), raised in {100 * risk['alarm_rate_safe']:.1f} % of the safe moments",
+            highlight=False,
+        )
+
+
 def _print_causes(result: dict[str, Any]) -> None:
     for m in result["methods"]:
         failed = len(m["explain"])
@@ -206,6 +228,7 @@ def _print_causes(result: dict[str, Any]) -> None:
         for c in m["causes"]:
             remarks = ", ".join(f"{k} {remark}" for remark, k in c["remarks"].items() if k >= _REMARKABLE_SHARE * c["count"])
             _stdout().print(f"[bold]{c['label']}[/bold]: {c['meaning']}{f' [dim]({remarks})[/dim]' if remarks else ''}", highlight=False)
+    if any(m["explain"] for m in result["methods"]):
         _stdout().print(f"[dim]{_CAUSES_LEGEND}[/dim]", highlight=False)
 
 

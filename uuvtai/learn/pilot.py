@@ -14,6 +14,7 @@ import torch
 from uuvtai.learn.checkpoint import Checkpoint
 from uuvtai.learn.manifest import MODEL, CheckpointError
 from uuvtai.learn.policy import NUM_ACTIONS, Policy
+from uuvtai.learn.risk import RiskHead
 from uuvtai.learn.world_model import N_FEATURES, WorldModel
 
 CHUNK = 64
@@ -35,14 +36,23 @@ class Decision(NamedTuple):
     """(N,) of the world model's last prediction; 0 = none yet, or no world model"""
     uncertainty: torch.Tensor
     """(N,) of that prediction"""
+    risk_logit: torch.Tensor
+    """(N,) uncalibrated logit of a collision or TTC stop soon; empty without a risk head"""
 
 
 class Pilot:
     """Drives ``num_envs`` rows. ``decide`` looks, ``advance`` goes on to the next step; ``reset`` when a row begins another episode."""
 
-    def __init__(self, policy: Policy, world_model: WorldModel | None, num_envs: int, device: torch.device | str = "cpu") -> None:
+    def __init__(
+        self,
+        policy: Policy,
+        world_model: WorldModel | None,
+        num_envs: int,
+        device: torch.device | str = "cpu",
+        risk: RiskHead | None = None,
+    ) -> None:
         """``world_model``: None where the policy was trained without its features. The networks are used, not copied."""
-        self.policy, self.world_model, self.device = policy, world_model, torch.device(device)
+        self.policy, self.world_model, self.risk, self.device = policy, world_model, risk, torch.device(device)
         self._n_obs = policy.n_in - N_FEATURES
         rows = -(-num_envs // CHUNK) * CHUNK
         self._num_envs = num_envs
@@ -66,7 +76,8 @@ class Pilot:
         self._action = self._by_chunk(lambda part: self.policy.distribution(part)[0], x)
         value = self._by_chunk(self.policy.value, x)[:n]
         std = self.policy.log_std.exp()
-        self.decision = Decision(self._action[:n].clamp(-1.0, 1.0), value, std, x[:n, -2].clone(), x[:n, -1].clone())
+        risk_logit = value[:0] if self.risk is None else self._by_chunk(self.risk.logit, x)[:n]
+        self.decision = Decision(self._action[:n].clamp(-1.0, 1.0), value, std, x[:n, -2].clone(), x[:n, -1].clone(), risk_logit)
         return self.decision
 
     def advance(self) -> None:
@@ -105,11 +116,16 @@ def load_pilot(checkpoint: Checkpoint, num_envs: int, device: torch.device | str
         if config.world_model.enabled and config.world_model.as_features:
             world_model = WorldModel(n_obs, config.world_model, generator)
             world_model.load_state_dict(parts["world_model"])
+        risk = None
+        if config.risk.enabled:
+            risk = RiskHead(n_obs + N_FEATURES, config.risk, generator)
+            risk.load_state_dict(parts["risk"])
     except (KeyError, ValueError, RuntimeError, TypeError) as error:
         raise CheckpointError(f"{checkpoint.path / MODEL}: its networks are not those of its config ({error}); take another one") from None
-    for module in (policy, world_model):
-        for name, tensor in module.state_dict().items() if module is not None else ():
+    modules = [module for module in (policy, world_model, risk) if module is not None]
+    for module in modules:
+        for name, tensor in module.state_dict().items():
             if not bool(torch.isfinite(tensor).all()):
                 raise CheckpointError(f"{checkpoint.path / MODEL}: {name} is not finite: the training failed; take an older checkpoint")
-    policy.to(device).eval()
-    return Pilot(policy, None if world_model is None else world_model.to(device).eval(), num_envs, device)
+        module.to(device).eval()
+    return Pilot(policy, world_model, num_envs, device, risk)

@@ -25,6 +25,8 @@ STRIDE = 5
 """control steps between the moments that are learned from: neighbours in time are nearly the same sample"""
 MAX_LOGIT = 12.0
 """logits of the calibration table lie within +- this"""
+NO_THRESHOLD = 1e9
+"""a finite number that no logit reaches: networks with anything that is not finite are refused"""
 N_KNOT = 241
 """knots of the calibration table: one per 0.1 of the logit"""
 _ROUNDING = 1e-9
@@ -39,6 +41,8 @@ class RiskHead(nn.Module):
 
     table: Tensor
     """(N_KNOT,) float64 calibrated probability at logits from -12 to 12; the logistic function until ``calibrate``"""
+    threshold: Tensor
+    """logit from which on to raise an alarm; ``NO_THRESHOLD`` until ``set_threshold``"""
 
     def __init__(self, n_in: int, config: RiskConfig, generator: torch.Generator) -> None:
         """``n_in`` columns of the policy's input; initial weights come from the CPU ``generator``."""
@@ -47,6 +51,7 @@ class RiskHead(nn.Module):
         self.observation_norm = RunningNorm(n_in)
         self.net = mlp((n_in, *config.hidden, 1), "elu", generator, 0.01)
         self.register_buffer("table", torch.sigmoid(_knots()))
+        self.register_buffer("threshold", torch.tensor(NO_THRESHOLD, dtype=torch.float64))
 
     def logit(self, x: Tensor) -> Tensor:
         """(...,) uncalibrated logit of inputs (..., n_in)."""
@@ -69,6 +74,15 @@ class RiskHead(nn.Module):
         _require_both(event)
         score, value = isotonic(logit.double(), event.double())
         self.table.copy_(interpolated(_knots().to(score.device), score, value))
+
+    @property
+    def has_threshold(self) -> bool:
+        """Whether an alarm threshold is known."""
+        return float(self.threshold) < NO_THRESHOLD
+
+    def set_threshold(self, logit: float) -> None:
+        """Raise an alarm from this logit on."""
+        self.threshold.fill_(logit)
 
 
 def _knots() -> Tensor:

@@ -132,19 +132,21 @@ def _play(
     entries: list[dict[str, Any]],
 ) -> None:
     """Play one method's episodes and add them to ``played`` and ``entries``."""
-    from uuvtai.measure.evaluate import run_episodes, summary, tree_use
+    from uuvtai.measure.evaluate import Recorders, run_episodes, summary, tree_use
+    from uuvtai.measure.foresight import foresight_of, told
 
     sim.use_tree(method.tree)
     recorder = _recorder(request, folder.path, method.name, jobs, policy)
+    foresight = foresight_of(policy.pilot, request.config.episode.control_dt_s) if policy else None
     watch.start(method.name, len(jobs))
     begun = time.perf_counter()
     try:
-        results, env_steps = run_episodes(sim, jobs, recorder, watch.update, policy.pilot if policy else None)
+        results, env_steps = run_episodes(sim, jobs, Recorders([recorder, foresight]), watch.update, policy.pilot if policy else None)
     finally:
         watch.stop()
         if recorder:
             recorder.abort()
-    entries.append(summary(method.name, results, env_steps, time.perf_counter() - begun) | method.document())
+    entries.append(summary(method.name, results, env_steps, time.perf_counter() - begun) | method.document() | told(foresight))
     played.append(_Played(method, policy, results, tree_use(sim, results), recorder.paths if recorder else {}))
 
 

@@ -64,6 +64,29 @@ class Recorder(Protocol):
         """The episode of this row is over."""
 
 
+class Recorders:
+    """Several recorders as one."""
+
+    def __init__(self, parts: Iterable[Recorder | None]) -> None:
+        """None among them is nobody."""
+        self._parts = [part for part in parts if part is not None]
+
+    def begin(self, sim: Sim, row: int, job: Job) -> None:
+        """The episode ``job`` begins in this row."""
+        for part in self._parts:
+            part.begin(sim, row, job)
+
+    def step(self, sim: Sim) -> None:
+        """A control step has been done."""
+        for part in self._parts:
+            part.step(sim)
+
+    def end(self, sim: Sim, row: int, result: EpisodeResult) -> None:
+        """The episode of this row is over."""
+        for part in self._parts:
+            part.end(sim, row, result)
+
+
 class Driver(Protocol):
     """Chooses the actions of all rows from their observations (``learn.pilot.Pilot``)."""
 

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from uuvtai.env import VectorEnv
     from uuvtai.learn.checkpoint import Checkpoint
     from uuvtai.learn.train import Trainer
+    from uuvtai.measure.foresight import Foresight
 
 Metrics = dict[str, float]
 
@@ -220,24 +221,50 @@ class _Run:
 
 
 def evaluate_now(trainer: Trainer, config: LearningConfig) -> Metrics:
-    """``eval/*``: the policy as it is, without exploration, on scenarios of its own; training goes on as if nothing had been."""
+    """``eval/*``: the policy as it is, without exploration, on scenarios of its own; training goes on as if nothing had been.
+
+    Half of these episodes calibrate the risk head, where there is one and they hold enough accidents; the others judge it.
+    """
     from uuvtai.learn.pilot import Pilot
-    from uuvtai.measure.evaluate import jobs_of, run_episodes, summary
+    from uuvtai.measure.evaluate import Recorders, jobs_of, run_episodes, summary
+    from uuvtai.measure.foresight import foresight_of
 
     env = trainer.env
+    model = trainer.world_model if config.world_model.as_features else None
+    pilot = Pilot(trainer.policy, model, env.num_envs, env.device, trainer.risk)
+    foresight = foresight_of(pilot, config.episode.control_dt_s)
     held = env.capture()
     try:
         env.sim.sleep()
         env.sim.set_scenes()
-        model = trainer.world_model if config.world_model.as_features else None
         jobs = jobs_of([config.train.evaluate_seed], config.train.evaluate_episodes)
-        results, env_steps = run_episodes(env.sim, jobs, driver=Pilot(trainer.policy, model, env.num_envs, env.device))
+        results, env_steps = run_episodes(env.sim, jobs, Recorders([foresight]), driver=pilot)
     finally:
         env.sim.set_scenes(config.train.scenes)
         env.restore(held)
     told = summary("policy", results, env_steps, 0.0)
     names = ("success_rate", "collision_rate", "return_mean", "time_to_success_mean_s")
-    return {f"eval/{name}": told[name] for name in names if told[name] is not None}
+    metrics = {f"eval/{name}": told[name] for name in names if told[name] is not None}
+    return metrics | (_calibrated(foresight) if foresight else {})
+
+
+_RISK_FIGURES = ("event_rate", "brier", "brier_base_rate", "ece", "auroc", "alarm_rate_safe")
+
+
+def _calibrated(foresight: Foresight) -> Metrics:
+    """Calibrate on every second episode, ``eval/risk_*`` on the others; nothing where accidents are too few for the promised miss rate."""
+    from uuvtai.measure.foresight import fit, judged
+
+    moments = foresight.moments()
+    try:
+        fit(foresight.head, moments.of_episodes(0))
+    except ValueError:
+        return {}
+    figures = judged(foresight.head, moments.of_episodes(1))
+    if figures is None:
+        return {}
+    rates = {"miss_rate": figures["missed"] / figures["accidents"]} | {name: figures[name] for name in _RISK_FIGURES}
+    return {f"eval/risk_{name}": float(value) for name, value in rates.items()}
 
 
 @contextlib.contextmanager
