@@ -11,6 +11,7 @@ from uuvtai.learn import checkpoint, manifest
 from uuvtai.learn.checkpoint import CheckpointError
 from uuvtai.learn.pilot import CHUNK, Pilot, load_pilot
 from uuvtai.learn.policy import Policy
+from uuvtai.learn.risk import RiskHead
 from uuvtai.learn.world_model import WorldModel
 from uuvtai.loader import load_training
 from uuvtai.measure.evaluate import jobs_of, run_episodes
@@ -33,14 +34,30 @@ def networks(n_obs=N_OBS, seed=0, **config):
     return policy, model
 
 
+def head(n_obs=N_OBS, seed=5):
+    """A risk head that has an opinion."""
+    rng = torch.Generator().manual_seed(seed)
+    made = RiskHead(n_obs + 2, load_training("smoke").risk, rng)
+    made.observation_norm.update(3.0 * torch.randn(500, n_obs + 2, generator=rng))
+    with torch.no_grad():
+        made.net[-1].weight.mul_(30.0)
+    return made
+
+
+def state_of(policy, model, n_obs):
+    """What a checkpoint holds of them."""
+    return {"policy": policy.state_dict(), "world_model": model.state_dict(), "risk": head(n_obs).state_dict(), "env": {}}
+
+
 def flown(policy, model, rows, steps=4):
     """Decisions of a pilot over some steps for the given rows of one fixed stream of observations."""
     rng = torch.Generator().manual_seed(1)
     stream = 3.0 * torch.randn(steps, 300, N_OBS, generator=rng)
-    pilot, out = Pilot(policy, model, len(rows)), []
+    pilot, out = Pilot(policy, model, len(rows), risk=head()), []
     for obs in stream:
         decision = pilot.decide(obs[rows])
-        out.append(torch.cat([decision.action, decision.value[:, None], decision.residual[:, None], decision.uncertainty[:, None]], 1))
+        columns = (decision.value, decision.residual, decision.uncertainty, decision.risk_logit)
+        out.append(torch.cat([decision.action, *(column[:, None] for column in columns)], 1))
         pilot.advance()
     return torch.stack(out)
 
@@ -53,12 +70,15 @@ def test_a_row_does_not_depend_on_its_batch_to_the_last_bit(threads):
     torch.set_num_threads(threads)
     try:
         for rows in ([0], [7, 3], list(range(CHUNK, CHUNK + 50)), list(range(299, 0, -1))):
-            assert torch.equal(flown(policy, model, rows), expected[:, rows])
+            found = flown(policy, model, rows)
+            assert torch.equal(found[:, :, :7], expected[:, rows, :7])
+            assert torch.allclose(found[:, :, 7], expected[:, rows, 7], atol=1e-5), "only told, nothing depends on it"
     finally:
         torch.set_num_threads(before)
     assert expected[:, :, :4].std() > 0.1, "the actions do depend on the observations"
-    assert (expected[0, :, 5:] == 0).all(), "nothing was predicted before the first step"
-    assert (expected[1:, :, 5:] > 0).all()
+    assert expected[:, :, 7].std() > 0.1, "so does the risk"
+    assert (expected[0, :, 5:7] == 0).all(), "nothing was predicted before the first step"
+    assert (expected[1:, :, 5:7] > 0).all()
 
 
 def test_memory_is_reset_by_row_and_deciding_again_changes_nothing():
@@ -101,7 +121,7 @@ def trained(small, tmp_path_factory):
     policy, model = networks(env.num_obs, seed=3)
     with torch.no_grad():
         policy.actor[-1].bias[2] = 3.0  # down or up until something stops it: short episodes
-    state = {"policy": policy.state_dict(), "world_model": model.state_dict(), "env": {}}
+    state = state_of(policy, model, env.num_obs)
     checkpoint.save(folder / "checkpoints", 5, state, config, env.observation_table, metrics={"distill/lambda": 0.25})
     return folder, config
 
@@ -160,6 +180,8 @@ def test_another_observation_is_refused_before_driving(small, trained):
     ("change", "says"),
     [
         (lambda state: state.pop("world_model"), "its networks are not those of its config"),
+        (lambda state: state.pop("risk"), "its networks are not those of its config"),
+        (lambda state: state["risk"].update(table=torch.full((241,), float("nan"))), "table is not finite"),
         (lambda state: state["policy"].pop("log_std"), "its networks are not those of its config"),
         (lambda state: state["policy"].update(log_std=torch.zeros(3)), "its networks are not those of its config"),
         (lambda state: state["policy"].update(log_std=torch.full((4,), float("nan"))), "log_std is not finite"),
@@ -168,7 +190,7 @@ def test_another_observation_is_refused_before_driving(small, trained):
 def test_networks_that_cannot_drive_are_refused(small, trained, tmp_path, change, says):
     env = VectorEnv(small.sim)
     policy, model = networks(env.num_obs)
-    state = {"policy": policy.state_dict(), "world_model": model.state_dict(), "env": {}}
+    state = state_of(policy, model, env.num_obs)
     change(state)
     path = checkpoint.save(tmp_path / "checkpoints", 1, state, trained[1], env.observation_table)
     with pytest.raises(CheckpointError, match=says):
