@@ -1,0 +1,65 @@
+"""Env-steps per second of `uuv train` with everything on, beside Stable-Baselines3's PPO on the same environment (pool, 1,024 envs)."""
+
+from __future__ import annotations
+
+import time
+
+from benchmarks.common import Job, Row
+from uuvtai.config.learning import LearningConfig
+from uuvtai.env import VectorEnv
+from uuvtai.learn.train import Trainer
+from uuvtai.loader import load_training
+from uuvtai.sim import Sim
+from uuvtai.tree import read_tree
+
+FLOORS = {"paper": 6_000.0, "nominal": 12_000.0}
+"""[env-steps/s] at 1,024 envs on two CPU cores"""
+_PARTS = {"simulate": "time/simulate_s", "infer": "time/infer_s", "learn": "time/learn_s"}
+
+
+def measure(job: Job) -> list[Row]:
+    """One row per sensing preset. Ours has teacher, distillation, world model and its features on; the peer is plain PPO."""
+    num_envs, iterations = (8, 1) if job.quick else (1024, 4)
+    return [_row(job, sensors, num_envs, iterations) for sensors in FLOORS]
+
+
+def _row(job: Job, sensors: str, num_envs: int, iterations: int) -> Row:
+    config = load_training("curriculum", {"train.num_envs": num_envs}, sensors=sensors)
+    sim = Sim(config, num_envs, read_tree("bt", config.teacher.max_node))
+    job.say(f"{sensors} sensing: ours")
+    trainer = Trainer(VectorEnv(sim), config)
+    trainer.iterate()  # allocates
+    begun, told = time.perf_counter(), [trainer.iterate() for _ in range(iterations)]
+    samples = iterations * config.ppo.rollout_steps * num_envs
+    ours = samples / (time.perf_counter() - begun)
+    parts = {name: 1e6 * sum(metrics[key] for metrics in told) / samples for name, key in _PARTS.items()}
+    trainer.env.close()
+    job.say(f"{sensors} sensing: Stable-Baselines3")
+    theirs = _theirs(VectorEnv(sim, seed=1), config, iterations)
+    return Row(
+        what=f"{sensors} sensing, all of `uuv train curriculum`, {num_envs:,} envs",
+        ours=ours,
+        unit="env-steps/s",
+        peer=theirs,
+        peer_name="SB3 PPO, no teacher, no world model",
+        floor=None if job.quick else FLOORS[sensors],
+        note=", ".join(f"{name} {us:.0f}" for name, us in parts.items()) + f" us per env-step; {config.ppo.epochs} epochs both",
+        details={"us_per_env_step": parts, "samples": samples},
+    )
+
+
+def _theirs(env: VectorEnv, config: LearningConfig, iterations: int) -> float:
+    """Env-steps per second of SB3's PPO with our sizes: networks, rollout, epochs, minibatches."""
+    from stable_baselines3 import PPO
+
+    from benchmarks.peers.sb3_env import Sb3Env
+
+    samples = config.ppo.rollout_steps * env.num_envs
+    model = PPO(
+        "MlpPolicy", Sb3Env(env), device="cpu", n_steps=config.ppo.rollout_steps, batch_size=samples // config.ppo.minibatches,
+        n_epochs=config.ppo.epochs, learning_rate=config.ppo.learning_rate, policy_kwargs={"net_arch": list(config.policy.hidden)},
+    )  # fmt: skip
+    model.learn(samples)
+    begun = time.perf_counter()
+    model.learn(iterations * samples, reset_num_timesteps=False)
+    return iterations * samples / (time.perf_counter() - begun)
