@@ -30,7 +30,7 @@ if sys.path[0] == str(HERE):
 from benchmarks.common import Job, Row  # noqa: E402
 
 NOT_BENCHMARKS = ("__init__", "common", "run")
-PEERS = ("mujoco", "opencv-python-headless", "scipy", "ompl", "py_trees", "numpy", "torch")
+PEERS = ("mujoco", "opencv-python-headless", "scipy", "ompl", "py_trees", "numpy", "torch", "stable-baselines3")
 _LONGEST_S = 1200
 _THREAD_VARIABLES = ("UUV_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
