@@ -48,7 +48,7 @@ def start_taichi(device: str = "cpu", precision: str = "f32", fast_math: bool = 
             default_fp=wanted.real,
             fast_math=fast_math,
             offline_cache=True,
-            cfg_optimization=False,  # half of the time to compile; LLVM does the same work again: equal results, equal speed
+            cfg_optimization=wanted.device == "cuda",  # on the CPU LLVM does that work again: half of the time to compile, equal results
             log_level=ti.WARN,
             **options,
         )

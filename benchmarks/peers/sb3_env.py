@@ -55,9 +55,9 @@ class Sb3Env(VecEnv):
         return [getattr(self.env, attr_name, None)] * self.num_envs
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Not needed."""
-        raise NotImplementedError
+        """Its trainers do not ask for it."""
+        raise NotImplementedError("Sb3Env has no attributes or methods of single envs")
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        """Not needed."""
-        raise NotImplementedError
+        """Its trainers do not ask for it."""
+        raise NotImplementedError("Sb3Env has no attributes or methods of single envs")

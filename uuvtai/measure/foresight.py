@@ -113,7 +113,7 @@ def judged(head: RiskHead, moments: Moments) -> dict[str, Any] | None:
     probability, config = head.calibrated(moments.logit), head.config
     diagram = reliability(probability, event, config.bins)
     base = count / len(event)
-    told: dict[str, Any] = {
+    figures: dict[str, Any] = {
         "moments": len(event),
         "event_rate": base,
         "brier": brier(probability, event),
@@ -122,7 +122,7 @@ def judged(head: RiskHead, moments: Moments) -> dict[str, Any] | None:
         "auroc": auroc(moments.logit, event),
         "reliability": {name: [float(v) for v in getattr(diagram, name)] for name in ("samples", "predicted", "observed")},
     }
-    return told | _alarm(head, moments)
+    return figures | _alarm(head, moments)
 
 
 def _alarm(head: RiskHead, moments: Moments) -> dict[str, Any]:
