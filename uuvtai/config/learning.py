@@ -31,6 +31,9 @@ class PolicyConfig(Section):
     """the mean is the tree's action plus what the network adds; needs ``features.teacher``"""
     residual_limit: Positive = 0.5
     """largest addition, in parts of the vehicle's limits"""
+    hold_steps: PositiveCount = 1
+    """control steps that a decision is held: the action, or what a residual policy adds to the tree's newest one. Noise drawn anew every
+    0.02 s averages out before the vehicle has moved; held, it explores, and the networks run that much less often"""
     clip_observation: Positive = 10.0
     """standard deviations beyond which an observation is cut off"""
 

@@ -10,6 +10,7 @@ import torch
 
 from uuvtai.learn.distill import LeafErrors, imitation_error
 from uuvtai.learn.guard import Guard
+from uuvtai.learn.hold import Hold, Info, Stretch
 from uuvtai.learn.policy import NUM_ACTIONS, Policy
 from uuvtai.learn.rollout import Rollout, final_value
 from uuvtai.learn.tally import Tally
@@ -23,8 +24,6 @@ N_FEATURES = 2
 
 FAILURES = ("collision", "ttc")
 """outcomes that the risk head foresees"""
-
-Info = dict[str, torch.Tensor]
 
 
 class Collector:
@@ -53,6 +52,7 @@ class Collector:
         """(T, N) the step ended in a collision or a TTC stop"""
         self._failures = torch.tensor([name in FAILURES for name in env.outcomes], device=device)
         self.leaf_errors = LeafErrors(env.node_names, device)
+        self.hold = Hold(env, policy)
         self._teacher, self._reward = torch.zeros(n, NUM_ACTIONS, device=device), torch.zeros(n, device=device)
         self._leaf = torch.zeros(n, dtype=torch.int32, device=device)
         self._bad = torch.zeros(n, dtype=torch.bool, device=device)
@@ -76,9 +76,9 @@ class Collector:
             self._note_teacher()
             rollout.x[t].copy_(self.x)
             rollout.action[t].copy_(self._teacher)
-            _terminated, ended = self._drive(self._teacher)
-            rollout.ended[t].copy_(ended)
-            self._move_on(ended)
+            end = self._drive(self._teacher)
+            rollout.ended[t].copy_(end.ended)
+            self._move_on(end.ended)
 
     @torch.no_grad()
     def recall_features(self) -> None:
@@ -101,13 +101,12 @@ class Collector:
             step = self.policy.act(self.x, self.generator)
             self._note_teacher()
             self.leaf_errors.add(imitation_error(step.mean, self._teacher), self._leaf)
-            terminated, ended = self._drive(step.action)
+            end = self._drive(step.action, tally)
             self.uncertainty[t].copy_(self._features[:, -1])
-            last_value = final_value(self.policy, self.final_x, terminated, ended)
-            rollout.add(self.x, step, self._reward, terminated, ended, last_value, self._teacher, self._leaf)
-            self.failed[t] = ended & self._failures[self.info["outcome"].long()]
-            self._count(tally, ended)
-            self._move_on(ended)
+            last_value = final_value(self.policy, self.final_x, end.terminated, end.ended)
+            rollout.add(self.x, step, self._reward, end.terminated, end.ended, last_value, self._teacher, self._leaf)
+            self.failed[t] = end.ended & self._failures[end.outcome]
+            self._move_on(end.ended)
         rollout.close(self.policy.value(self.x))
         self.infer_s = time.perf_counter() - began - self.simulate_s
         return tally
@@ -117,17 +116,17 @@ class Collector:
         self._bad |= self.guard.values("teacher_action", self.info["teacher_action"], self._teacher)
         self._leaf.copy_(self.info["leaf"])
 
-    def _drive(self, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """One step of the envs: (terminated, ended); fills the reward, NaN for samples with anything bad, and the input it led to."""
+    def _drive(self, action: torch.Tensor, tally: Tally | None = None) -> Stretch:
+        """Hold a decision; fills the reward, NaN for samples with anything bad, and the input it led to."""
         began = time.perf_counter()
-        self._obs, reward, terminated, truncated, self.info = self.env.step(action)
+        end = self.hold.drive(action, self._teacher, None if tally is None else lambda ended, info: _count(tally, ended, info))
+        self._obs, self.info = end.obs, end.info
         self.simulate_s += time.perf_counter() - began
-        ended = terminated | truncated
-        self._bad |= self.guard.values("reward", reward, self._reward)
-        self._bad |= self._cleaned(self.info["final_obs"], self.final_x, ended)
+        self._bad |= self.guard.values("reward", end.reward, self._reward)
+        self._bad |= self._cleaned(end.final_obs, self.final_x, end.ended)
         self._sense(action)
         self._reward.masked_fill_(self._bad, math.nan)  # PPO leaves such samples out
-        return terminated, ended
+        return end
 
     def _sense(self, action: torch.Tensor) -> None:
         """World-model columns of the input that ``action`` led to."""
@@ -147,14 +146,6 @@ class Collector:
         n = self.env.num_obs
         return self.guard.observation(obs, self.policy.observation_norm.mean[:n].float(), x[:, :n], counted)
 
-    def _count(self, tally: Tally, ended: torch.Tensor) -> None:
-        info, weight = self.info, ended.double()
-        tally.outcomes.index_add_(0, info["outcome"].long(), weight)
-        tally.episode_return += torch.where(ended, info["episode_return"], 0.0).nansum()
-        tally.episode_steps += (info["episode_steps"] * ended).sum()
-        tally.terms += info["reward_terms"].nansum(dim=0)
-        tally.samples += len(ended)
-
     def state_dict(self) -> dict[str, torch.Tensor]:
         """The present input: its world-model columns remember the last step."""
         return {"x": self.x.clone(), "bad": self._bad.clone()}
@@ -167,3 +158,13 @@ class Collector:
     def resume(self, obs: torch.Tensor, info: Info) -> None:
         """Go on with what ``env.restore`` gave."""
         self._obs, self.info = obs, info
+
+
+def _count(tally: Tally, ended: torch.Tensor, info: Info) -> None:
+    """Add one control step of all envs to the tally."""
+    weight = ended.double()
+    tally.outcomes.index_add_(0, info["outcome"].long(), weight)
+    tally.episode_return += torch.where(ended, info["episode_return"], 0.0).nansum()
+    tally.episode_steps += (info["episode_steps"] * ended).sum()
+    tally.terms += info["reward_terms"].nansum(dim=0)
+    tally.samples += len(ended)

@@ -54,37 +54,49 @@ class Pilot:
         """``world_model``: None where the policy was trained without its features. The networks are used, not copied."""
         self.policy, self.world_model, self.risk, self.device = policy, world_model, risk, torch.device(device)
         self._n_obs = policy.n_in - N_FEATURES
-        rows = -(-num_envs // CHUNK) * CHUNK
-        self._num_envs = num_envs
+        rows = num_envs
         self._x, self._last_obs = (torch.zeros(rows, width, device=device) for width in (policy.n_in, self._n_obs))
         self._action, self._last_action = (torch.zeros(rows, NUM_ACTIONS, device=device) for _ in range(2))
         self._has_last = torch.zeros(rows, dtype=torch.bool, device=device)
+        self._hold, self._age = policy.config.hold_steps, torch.zeros(rows, dtype=torch.int64, device=device)
+        self._offset, self._said = (torch.zeros(rows, width, device=device) for width in (NUM_ACTIONS, 4))
         self.decision = Decision(*(torch.zeros(0) for _ in Decision._fields))
-        """the last one"""
+        """the last one; where an older one is held, what the networks said then"""
 
     def reset(self, rows: torch.Tensor) -> None:
         """Forget the last step of the rows (num_envs,) where this is not 0."""
-        self._has_last[: self._num_envs] &= rows.to(self.device) == 0
+        kept = rows.to(self.device) == 0
+        self._has_last &= kept
+        self._age *= kept
 
     @torch.no_grad()
     def decide(self, obs: torch.Tensor) -> Decision:
         """Decision for observations (num_envs, n_obs); changes nothing that the next one depends on."""
-        n, x = self._num_envs, self._x
+        x = self._x
         fill = self.policy.observation_norm.mean[: self._n_obs].float()
-        x[:n, : self._n_obs] = torch.where(torch.isfinite(obs), obs, fill)
-        x[:, self._n_obs :] = self._features()
-        self._action = self._by_chunk(lambda part: self.policy.distribution(part)[0], x)
-        value = self._by_chunk(self.policy.value, x)[:n]
-        std = self.policy.log_std.exp()
-        risk_logit = value[:0] if self.risk is None else self._by_chunk(self.risk.logit, x)[:n]
-        self.decision = Decision(self._action[:n].clamp(-1.0, 1.0), value, std, x[:n, -2].clone(), x[:n, -1].clone(), risk_logit)
+        x[:, : self._n_obs] = torch.where(torch.isfinite(obs), obs, fill)
+        due = self._due()
+        if len(due):
+            self._think(due)
+        teacher = self.policy.teacher_action(x)
+        self._action = self._offset if teacher is None else teacher + self._offset
+        value, residual, uncertainty, risk_logit = self._said.clone().T
+        self.decision = Decision(
+            self._action.clamp(-1.0, 1.0),
+            value,
+            self.policy.log_std.exp(),
+            residual,
+            uncertainty,
+            value[:0] if self.risk is None else risk_logit,
+        )
         return self.decision
 
     def advance(self) -> None:
         """The last decision has been carried out."""
-        self._last_obs.copy_(self._x[:, : self._n_obs])
-        self._last_action.copy_(self._action)
-        self._has_last.fill_(True)
+        due = self._due()
+        self._last_obs[due], self._last_action[due] = self._x[due, : self._n_obs], self._action[due]
+        self._has_last[due] = True
+        self._age += 1
 
     def act(self, obs: torch.Tensor) -> torch.Tensor:
         """Decide and carry it out: actions (num_envs, 4)."""
@@ -92,15 +104,36 @@ class Pilot:
         self.advance()
         return action
 
-    def _features(self) -> torch.Tensor:
-        if self.world_model is None:
-            return self._x.new_zeros(len(self._x), N_FEATURES)
-        found = self._by_chunk(self.world_model.features, self._last_obs, self._last_action, self._x[:, : self._n_obs])
-        return torch.where(self._has_last[:, None], found, 0.0)
+    def _due(self) -> torch.Tensor:
+        """Rows whose decision is not held any more."""
+        return (self._age % self._hold == 0).nonzero().flatten()
 
-    def _by_chunk(self, function: Callable[..., torch.Tensor], *inputs: torch.Tensor) -> torch.Tensor:
-        parts = [function(*(tensor[i : i + CHUNK].contiguous() for tensor in inputs)) for i in range(0, len(self._x), CHUNK)]
-        return torch.cat(parts)
+    def _think(self, rows: torch.Tensor) -> None:
+        """Ask the networks about these rows."""
+        x = self._x[rows]
+        x[:, self._n_obs :] = self._features(rows, x)
+        self._x[rows] = x
+        teacher = self.policy.teacher_action(x)
+        mean = _by_chunk(lambda part: self.policy.distribution(part)[0], x)
+        self._offset[rows] = mean if teacher is None else mean - teacher
+        risk_logit = x.new_zeros(len(x)) if self.risk is None else _by_chunk(self.risk.logit, x)
+        self._said[rows] = torch.stack([_by_chunk(self.policy.value, x), x[:, -2], x[:, -1], risk_logit], dim=1)
+
+    def _features(self, rows: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
+        if self.world_model is None:
+            return x.new_zeros(len(x), N_FEATURES)
+        found = _by_chunk(self.world_model.features, self._last_obs[rows], self._last_action[rows], x[:, : self._n_obs])
+        return torch.where(self._has_last[rows, None], found, 0.0)
+
+
+def _by_chunk(function: Callable[..., torch.Tensor], *inputs: torch.Tensor) -> torch.Tensor:
+    """Function of inputs (n, ...), ``CHUNK`` rows at a time, the last chunk filled up with its first row."""
+    parts = []
+    for i in range(0, len(inputs[0]), CHUNK):
+        chunk = [tensor[i : i + CHUNK] for tensor in inputs]
+        missing = CHUNK - len(chunk[0])
+        parts.append(function(*(torch.cat([t, t[:1].expand(missing, -1)]) if missing else t.contiguous() for t in chunk)))
+    return torch.cat(parts)[: len(inputs[0])]
 
 
 def load_pilot(checkpoint: Checkpoint, num_envs: int, device: torch.device | str = "cpu") -> Pilot:

@@ -123,11 +123,11 @@ def label_events(failed: Tensor, ended: Tensor, censored: Tensor, horizon_steps:
 class RiskMemory:
     """Recent moments that wait for their label: the horizon may be longer than a rollout, whose end must not choose what is learned."""
 
-    def __init__(self, horizon_steps: int) -> None:
-        """``horizon_steps``: control steps of the horizon."""
+    def __init__(self, horizon_steps: int, stride: int = STRIDE) -> None:
+        """``horizon_steps``: steps of a rollout that make up the horizon; ``stride``: steps between the moments."""
         if horizon_steps < 1:
-            raise ValueError(f"the risk horizon must be at least one control step, got {horizon_steps}: raise risk.horizon_s")
-        self.horizon_steps = horizon_steps
+            raise ValueError(f"the risk horizon must be at least one step of a rollout, got {horizon_steps}: raise risk.horizon_s")
+        self.horizon_steps, self.stride = horizon_steps, stride
         self.x: list[Tensor] = []
         """(N, n_in) inputs of the moments that wait, oldest first"""
         self.places: list[int] = []
@@ -138,12 +138,12 @@ class RiskMemory:
     def add(self, x: Tensor, failed: Tensor, ended: Tensor, censored: Tensor) -> tuple[Tensor, Tensor]:
         """Take in a rollout: x (T, N, n_in), others (T, N); returns (x (M, n_in), event (M,)) of the moments that are decided now.
 
-        Every ``STRIDE``-th step of a rollout is a moment; each is returned once, when all of its horizon has been seen.
+        Every ``stride``-th step of a rollout is a moment; each is returned once, when all of its horizon has been seen.
         """
         new = torch.stack([failed, ended, censored])
         before = self.ends.shape[1]
         self.ends = torch.cat([self.ends, new], dim=1) if before else new
-        for t in range(0, x.shape[0], STRIDE):
+        for t in range(0, x.shape[0], self.stride):
             self.x.append(x[t].clone())
             self.places.append(before + t)
         return self._decided()
@@ -182,11 +182,19 @@ class RiskLearner:
     """Adam on the cross-entropy of labelled moments, with a guard against NaN."""
 
     def __init__(
-        self, head: RiskHead, config: RiskConfig, control_dt_s: float, reduce: Reduce | None = None, gather: Gather | None = None
+        self,
+        head: RiskHead,
+        config: RiskConfig,
+        control_dt_s: float,
+        reduce: Reduce | None = None,
+        gather: Gather | None = None,
+        hold_steps: int = 1,
     ) -> None:
-        """``control_dt_s``: length of a control step; ``reduce`` averages gradients over the processes, ``gather`` unites moments."""
+        """``control_dt_s``: length of a control step, ``hold_steps`` of which are a step of a rollout; ``reduce`` averages gradients over
+        the processes, ``gather`` unites moments.
+        """
         self.head, self.config, self.reduce, self.gather = head, config, reduce, gather
-        self.memory = RiskMemory(round(config.horizon_s / control_dt_s))
+        self.memory = RiskMemory(round(config.horizon_s / (control_dt_s * hold_steps)), max(1, STRIDE // hold_steps))
         self.optimiser = torch.optim.Adam(head.parameters(), lr=config.learning_rate, fused=True)
         self.skipped = 0
         """steps left out because the gradient was not finite, or zero for want of labels"""

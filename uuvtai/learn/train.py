@@ -53,9 +53,9 @@ class Trainer:
         world = config.world_model
         self.world_model = WorldModel(env.num_obs, world, self.generator).to(device) if world.enabled else None
         self.world_learner = self.world_model and WorldModelLearner(self.world_model, world, self._reduce, self._united)
-        risk = config.risk
+        risk, dt_s, hold = config.risk, config.episode.control_dt_s, config.policy.hold_steps
         self.risk = RiskHead(n_in, risk, self.generator).to(device) if risk.enabled else None
-        self.risk_learner = self.risk and RiskLearner(self.risk, risk, config.episode.control_dt_s, self._reduce, self._united)
+        self.risk_learner = self.risk and RiskLearner(self.risk, risk, dt_s, self._reduce, self._united, hold)
         self.collector = Collector(env, self.policy, self.world_model, self.rollout, self.guard, self.generator, world.as_features)
         self.recent = Recent(env.outcomes, env.reward_terms)
         self.iteration = self.env_steps = 0
@@ -187,7 +187,7 @@ class Trainer:
     @property
     def _samples(self) -> int:
         """Env-steps of one rollout, all processes together."""
-        return self.rollout.steps * self.env.num_envs * self.processes.size
+        return self.rollout.steps * self.collector.hold.steps * self.env.num_envs * self.processes.size
 
     def _reduce(self, tensors: Iterable[torch.Tensor]) -> None:
         self.processes.average(tensors)
