@@ -1,8 +1,10 @@
 """Hand-computed intervals and times."""
 
+import numpy as np
 import pytest
 
-from uuvtai.measure.statistics import mean, rate, time_to_success_s, wilson_interval
+from uuvtai.measure.paired import paired
+from uuvtai.measure.statistics import bootstrap_interval, holm_adjusted, mcnemar_p, mean, rate, time_to_success_s, wilson_interval
 
 
 @pytest.mark.parametrize(
@@ -37,3 +39,58 @@ def test_impossible_counts_are_refused(k, n):
 def test_tts_of_the_papers_first_row():
     # Table main: 22.84 s at 0.20 gives 114.2 s, the one row that adds up
     assert time_to_success_s(22.84, 0.20) == pytest.approx(114.2)
+
+
+def test_mcnemar_by_hand():
+    # 10 discordant pairs, 2 : 8: 2 (1 + 10 + 45) / 1024
+    assert mcnemar_p(2, 8) == mcnemar_p(8, 2) == pytest.approx(2 * 56 / 1024)
+    assert mcnemar_p(0, 0) == 1.0
+    assert mcnemar_p(5, 5) == 1.0
+    assert mcnemar_p(0, 6) == pytest.approx(2 / 64)
+    with pytest.raises(ValueError, match="not be negative"):
+        mcnemar_p(-1, 3)
+
+
+def test_bootstrap_interval_of_known_samples():
+    assert bootstrap_interval([3.0]) is None
+    assert bootstrap_interval([2.5] * 7) == (2.5, 2.5)
+    rng = np.random.default_rng(0)
+    values = list(rng.normal(10.0, 2.0, 400))
+    low, high = bootstrap_interval(values)
+    half = 1.96 * np.std(values) / 20  # the normal approximation, good for 400 samples
+    assert (low, high) == pytest.approx((np.mean(values) - half, np.mean(values) + half), abs=0.1 * half)
+    assert bootstrap_interval(values) == (low, high)
+
+
+def test_bootstrap_interval_covers_the_mean_as_often_as_it_says():
+    rng, covered = np.random.default_rng(1), 0
+    for _ in range(200):
+        low, high = bootstrap_interval(list(rng.normal(0.0, 1.0, 40)), resamples=300)
+        covered += low <= 0.0 <= high
+    assert 0.89 <= covered / 200 <= 0.985, "95 % nominal, a little less for 40 samples; 200 trials have an error of 1.5 %"
+
+
+def test_holm_by_hand():
+    assert holm_adjusted([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
+    assert holm_adjusted([0.9, 0.8]) == pytest.approx([1.0, 1.0])
+    assert holm_adjusted([]) == []
+
+
+def _method(name, outcomes, times):
+    return {
+        "name": name,
+        "episodes_detail": [
+            {"seed": 1, "episode": i, "outcome": o, "time_s": t} for i, (o, t) in enumerate(zip(outcomes, times, strict=True))
+        ],
+    }
+
+
+def test_pairs_count_who_alone_arrives_and_compare_times_where_both_do():
+    a = _method("a", ["success", "success", "ttc", "success"], [10.0, 12.0, 3.0, 9.0])
+    b = _method("b", ["success", "collision", "success", "success"], [11.0, 5.0, 8.0, 12.0])
+    (row,) = paired([a, b])
+    assert (row["a"], row["b"], row["both"], row["only_a"], row["only_b"]) == ("a", "b", 2, 1, 1)
+    assert row["mcnemar_p"] == 1.0
+    assert row["time_difference_mean_s"] == pytest.approx((10 - 11 + 9 - 12) / 2)
+    assert len(paired([a, b, a])) == 3
+    assert paired([a]) == []

@@ -438,6 +438,102 @@ def _picked(n: int, wanted: int) -> list[int]:
     return sorted({round(i * (n - 1) / max(1, wanted - 1)) for i in range(wanted)}) if n else []
 
 
+# ------------------------------------------------------------------------------------------------------------------- sweep
+
+
+@app.command()
+def sweep(
+    runs: Annotated[list[str] | None, typer.Argument(metavar="[RUN]...", help="Trained policies, as for eval.")] = None,
+    controller: Annotated[
+        list[str] | None, typer.Option("--controller", help="straight, planner, bt or a tree's XML (repeatable) \\[default: bt].")
+    ] = None,
+    grid: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--grid",
+            help="AXIS=value,value,.. (repeatable: S, D, v, sensors, vehicle, any config key) or a grid preset \\[default: paper].",
+        ),
+    ] = None,
+    world: World = "pool",
+    sensors: Sensors = None,
+    vehicle: Vehicle = None,
+    n_static: Static = None,
+    n_dynamic: Dynamic = None,
+    speed: Speed = None,
+    episodes: Annotated[int, typer.Option("--episodes", help="Episodes per seed, cell and method.")] = 64,
+    seeds: Annotated[str, typer.Option("--seeds", "--seed", help="Seeds, separated by commas.")] = "0",
+    num_envs: Annotated[int | None, typer.Option("--num-envs", help="Episodes played together \\[default: as many as sensible].")] = None,
+    engine: Annotated[str, typer.Option("--engine", help="local (processes on this machine) or ray (a cluster).")] = "local",
+    workers: Annotated[int, typer.Option("--workers", help="Processes of the local engine.")] = 1,
+    address: Annotated[str, typer.Option("--address", help="Ray cluster: host:port, auto, or local (inside this process).")] = "auto",
+    resume: Annotated[Path | None, typer.Option("--resume", help="Run folder of a sweep to go on with.")] = None,
+    device: Device = "auto",
+    overrides: Set = None,
+    run_dir: RunDir = None,
+    as_json: AsJson = False,
+) -> None:
+    """Play every cell of a grid with every method; finished cells survive a kill: --resume goes on."""
+    from uuvtai.measure.sweep.grid import grid_of
+    from uuvtai.measure.sweep.plan import SweepRequest
+    from uuvtai.measure.sweep.run import resume as go_on
+    from uuvtai.measure.sweep.run import sweep as begin
+
+    _at_least("--episodes", episodes, 1)
+    _at_least("--workers", workers, 1)
+    if resume is not None:
+        _refuse_beside_resume({"RUN": runs, "--controller": controller, "--grid": grid, "--set": overrides, "--run-dir": run_dir})
+        result, folder = go_on(resume, _engine(engine, workers, address), _Progress("cells"))
+    else:
+        policies = runs or []
+        request = SweepRequest(
+            grid=grid_of(grid or []),
+            world=world,
+            sensors=sensors,
+            vehicle=vehicle,
+            overrides=(*_scene_flags(n_static, n_dynamic, speed), *(overrides or [])),
+            controllers=tuple(_controllers(controller or ["bt"], bool(policies))),
+            policies=tuple(policies),
+            seeds=tuple(_seeds(seeds)),
+            episodes=episodes,
+            num_envs=num_envs,
+            device=device,
+        )
+        result, folder = begin(request, _engine(engine, workers, address), run_dir, _Progress("cells"))
+    if as_json:
+        _print_json(result)
+        return
+    _print_sweep(result)
+    _say(f"run folder: {folder}")
+
+
+def _engine(name: str, workers: int, address: str) -> Any:
+    from uuvtai.measure.sweep.engines import LocalEngine, RayEngine
+
+    if name not in ("local", "ray"):
+        raise UsageError(f"--engine {name!r}: local or ray")
+    return LocalEngine(workers) if name == "local" else RayEngine(address)
+
+
+def _print_sweep(result: dict[str, Any]) -> None:
+    table = Table(title=f"{result['world']}: {len(result['cells'])} cells x {result['episodes_per_seed']} episodes", title_justify="left")
+    others = [name for name in result["axes"] if name not in ("S", "D", "v")]
+    for head in ("S", "D", "v m/s", *others, "method", "success [95 %]", "collision [95 %]", "time to goal s"):
+        table.add_column(head, justify="right")
+    for row in result["cells"]:
+        o, n = row["outcomes"], row["episodes"]
+        table.add_row(
+            str(row["S"]),
+            str(row["D"]),
+            _number(row["v_m_s"]),
+            *(str(row.get(name, "")) for name in others),
+            row["method"],
+            _rate(o["success"], n, row["success_ci95"]),
+            _rate(o["collision"] + o["ttc"] + o["out_of_tank"], n, row["collision_ci95"]),
+            _number(row["time_to_success_mean_s"]),
+        )
+    _stdout().print(table)
+
+
 # ----------------------------------------------------------------------------------------------------------------- profile
 
 
@@ -735,9 +831,10 @@ class _Progress:
 
     _PERIOD_S = 5.0
 
-    def __init__(self) -> None:
+    def __init__(self, what: str = "episodes") -> None:
         self._bar = None
         self._last = 0.0
+        self._what = what
 
     def start(self, name: str, total: int) -> None:
         """A method with ``total`` episodes begins."""
@@ -771,13 +868,13 @@ class _Progress:
         import time
 
         now = time.perf_counter()
-        speed = env_steps / max(1e-9, now - self._begun)
+        speed = f"{env_steps / max(1e-9, now - self._begun):,.0f} env-steps/s" if env_steps else ""
         if self._bar is not None:
-            self._bar.update(self._task, completed=done, rate=f"{speed:,.0f} env-steps/s")
+            self._bar.update(self._task, completed=done, rate=speed)
         elif now - self._last >= self._PERIOD_S:
             self._last = now
             eta = (now - self._begun) / max(1, done) * (total - done)
-            _say(f"{self._name}: {done}/{total} episodes, {speed:,.0f} env-steps/s, ETA {eta:.0f} s")
+            _say(f"{self._name}: {done}/{total} {self._what}, {speed + ', ' if speed else ''}ETA {eta:.0f} s")
 
     def stop(self) -> None:
         """The method is done."""

@@ -22,7 +22,15 @@ from uuvtai.config import Config
 from uuvtai.config.learning import LearningConfig
 
 PRESET_DIR = Path(__file__).parent / "presets"
-KINDS = {"world": "worlds", "sensors": "sensors", "vehicle": "vehicles", "tree": "trees", "train": "train", "policy": "policies"}
+KINDS = {
+    "world": "worlds",
+    "sensors": "sensors",
+    "vehicle": "vehicles",
+    "tree": "trees",
+    "train": "train",
+    "grid": "grids",
+    "policy": "policies",
+}
 DEFAULT_WORLD, DEFAULT_SENSORS = "pool", "paper"
 _SCENE_KINDS = ("world", "sensors", "vehicle")
 _LEARNING_SECTIONS = LearningConfig.model_fields.keys() - Config.model_fields.keys()
@@ -164,6 +172,11 @@ def preset_path(kind: str, name: str) -> Path:
             f"(see 'uuv presets'), or give the path of a {suffix} file"
         )
     return PRESET_DIR / KINDS[kind] / f"{name}{suffix}"
+
+
+def read_preset(kind: str, name: str) -> dict[str, Any]:
+    """What a preset (name or path) and those that it extends say, as nested dicts. Raises ConfigError."""
+    return _read_preset(kind, name).tree
 
 
 def _read_preset(kind: str, name: str, depth: int = 0) -> _Layer:

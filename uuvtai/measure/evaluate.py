@@ -12,7 +12,9 @@ import torch
 from uuvtai.config import Config
 from uuvtai.kernels.outcome import OUTCOMES, RUNNING
 from uuvtai.kernels.plan_codes import PLANNERS, REASONS, TRIGGERS
-from uuvtai.measure.statistics import mean, rate, time_to_success_s, wilson_interval
+from uuvtai.measure.paired import paired
+from uuvtai.measure.statistics import bootstrap_interval, mean, rate, time_to_success_s, wilson_interval
+from uuvtai.scenario import Scene
 from uuvtai.sim import Sim
 from uuvtai.tree import node_use
 
@@ -31,6 +33,8 @@ class Job:
 
     seed: int
     episode: int
+    scene: Scene | None = None
+    """(S, D, v [m/s]) of its scenario; None = the simulator's own. One of ``run_episodes``'s jobs has one only if all have"""
 
 
 @dataclass(frozen=True)
@@ -175,17 +179,26 @@ def _refill(
     sim: Sim, wheel: _Wheel, jobs: list[Job], waiting: list, free: list[int], playing: dict[int, int], recorder: Recorder | None
 ) -> None:
     mask, seed, number = (torch.zeros(sim.num_envs, dtype=torch.int32) for _ in range(3))
-    begun = []
+    begun: list[tuple[int, Job]] = []
     while waiting and free:
         index, job = waiting.pop()
         row = free.pop()
         playing[row] = index
         mask[row], seed[row], number[row] = 1, job.seed, job.episode
         begun.append((row, job))
+    _set_scenes(sim, begun)
     wheel.reset(mask.to(sim.device), seed.to(sim.device), number.to(sim.device))
     if recorder:
         for row, job in begun:
             recorder.begin(sim, row, job)
+
+
+def _set_scenes(sim: Sim, begun: list[tuple[int, Job]]) -> None:
+    """Give the rows about to be reset the scenes of their jobs; the others have drawn their scenarios already."""
+    scenes = {row: job.scene for row, job in begun if job.scene is not None}
+    if scenes:
+        any_scene = next(iter(scenes.values()))
+        sim.set_scenes([scenes.get(row, any_scene) for row in range(sim.num_envs)])
 
 
 def _results(sim: Sim, rows: list[int], jobs: list[Job]) -> list[EpisodeResult]:
@@ -236,19 +249,21 @@ def summary(name: str, results: list[EpisodeResult], env_steps: int, wall_s: flo
     n = len(results)
     outcomes = {outcome: sum(r.outcome == outcome for r in results) for outcome in ("success", *COLLIDED, "timeout")}
     collided = sum(outcomes[o] for o in COLLIDED)
-    time_mean = mean([r.time_s for r in results])
+    time_mean, to_goal = mean([r.time_s for r in results]), [r.time_s for r in results if r.outcome == "success"]
     return {
         "name": name,
         "episodes": n,
         "outcomes": outcomes,
         "success_rate": rate(outcomes["success"], n),
-        "success_ci95": _interval(outcomes["success"], n),
+        "success_ci95": _as_list(wilson_interval(outcomes["success"], n)),
         "collision_rate": rate(collided, n),
-        "collision_ci95": _interval(collided, n),
+        "collision_ci95": _as_list(wilson_interval(collided, n)),
         "return_mean": mean([r.episode_return for r in results]),
+        "return_ci95": _as_list(bootstrap_interval([r.episode_return for r in results])),
         "time_mean_s": time_mean,
         "tts_s": time_to_success_s(time_mean, rate(outcomes["success"], n)),
-        "time_to_success_mean_s": mean([r.time_s for r in results if r.outcome == "success"]),
+        "time_to_success_mean_s": mean(to_goal),
+        "time_to_success_ci95": _as_list(bootstrap_interval(to_goal)),
         "min_clearance_mean_m": mean([r.min_clearance_m for r in results]),
         "path_length_mean_m": mean([r.path_length_m for r in results]),
         "replans_per_episode": mean([float(sum(r.replans.values())) for r in results]),
@@ -292,11 +307,11 @@ def document(config: Config, world: str, sensors: str, seeds: list[int], episode
         "seeds": seeds,
         "episodes_per_seed": episodes,
         "methods": methods,
+        "paired": paired(methods),
     }
 
 
-def _interval(k: int, n: int) -> list[float] | None:
-    interval = wilson_interval(k, n)
+def _as_list(interval: tuple[float, float] | None) -> list[float] | None:
     return None if interval is None else list(interval)
 
 

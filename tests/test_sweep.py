@@ -1,0 +1,346 @@
+"""Sweeps: cells of a grid, tasks, engines that lose workers, and folders that survive a kill at any moment."""
+
+import json
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from tests import sweep_work
+from tests.conftest import SmallSim
+from uuvtai.loader import ConfigError
+from uuvtai.measure.evaluate import Job, run_episodes
+from uuvtai.measure.sweep import run as sweep_run
+from uuvtai.measure.sweep.engines import EngineError, LocalEngine, RayEngine
+from uuvtai.measure.sweep.grid import Grid, grid_of
+from uuvtai.measure.sweep.plan import SweepRequest, base_config, request_of, tasks_of
+from uuvtai.measure.sweep.run import ROWS, read_rows, resume, sweep
+from uuvtai.run_folder import RunFolderError
+
+
+class Quiet:
+    """Watches without a word."""
+
+    def __init__(self):
+        self.told = []
+
+    def start(self, name, total):
+        self.total = total
+
+    def note(self, text):
+        self.told.append(text)
+
+    def update(self, done, total, env_steps):
+        self.done = done
+
+    def stop(self):
+        pass
+
+
+# ------------------------------------------------------------------------------------------------------------------- grid
+
+
+def test_the_papers_grid_shares_what_does_not_move():
+    cells = grid_of(["paper"]).cells()
+    assert len(cells) == 3 * (1 + 4 * 6)
+    assert sum(cell["D"] == 0 for cell in cells) == 3
+    assert all(("v" in cell) == (cell["D"] > 0) for cell in cells)
+    assert grid_of([]) == grid_of(["paper"])
+
+
+def test_axes_are_read_as_typed():
+    grid = grid_of(["S=4,8", "teacher.caution=0.5,1", "disturbance.current_m_s=[0.1,0,0]", "sensors=paper,harsh"])
+    assert grid.axes == {
+        "S": (4, 8), "teacher.caution": (0.5, 1), "disturbance.current_m_s": ([0.1, 0, 0],), "sensors": ("paper", "harsh"),
+    }  # fmt: skip
+    assert len(grid.cells()) == 8
+
+
+def test_typed_axes_replace_those_of_the_preset():
+    grid = grid_of(["paper", "S=8", "v=0.6"])
+    assert (grid.axes["S"], grid.axes["D"], grid.axes["v"]) == ((8,), (0, 3, 6, 9, 15), (0.6,))
+
+
+def test_one_at_a_time_varies_each_axis_around_the_condition():
+    grid = Grid({"D": (3, 9), "sensors": ("harsh",)}, one_at_a_time=True)
+    assert grid.cells() == [{}, {"D": 3}, {"D": 9}, {"sensors": "harsh"}]
+
+
+@pytest.mark.parametrize(
+    ("texts", "said"),
+    [
+        (["Q=1"], "no such axis"),
+        (["S="], "has no values"),
+        (["S=4,4"], "given twice"),
+        (["S=4", "S=8"], "an axis is given twice"),
+        (["S=-1"], "no number of obstacles"),
+        (["D=1.5"], "no number of obstacles"),
+        (["v=fast"], "no speed"),
+        (["v=.inf"], "no speed"),
+        (["sensors=sharp"], "no sensors preset; there are clean"),
+        (["S=[1"], "not valid YAML"),
+        (["nosuch"], "nosuch"),
+        (["paper", "caution"], "one preset at most"),
+        (["world.n_static=" + ",".join(map(str, range(200))), "world.n_dynamic=" + ",".join(map(str, range(200)))], "split it"),
+    ],
+)
+def test_grids_that_cannot_be_are_refused(texts, said):
+    with pytest.raises(ConfigError, match=said):
+        grid_of(texts)
+
+
+def test_a_grid_file_says_what_is_wrong(tmp_path):
+    file = tmp_path / "g.yaml"
+    for text, said in [("axes: {S: 4}", "each a list"), ("axis: {S: [4]}", "axis is not known"), ("{}", "needs 'axes:'")]:
+        file.write_text(text)
+        with pytest.raises(ConfigError, match=said):
+            grid_of([str(file)])
+
+
+@pytest.mark.parametrize("name", ["paper", "caution", "robustness"])
+def test_shipped_grids_load_and_every_cell_has_a_config(name):
+    request = asked(grid_of([name]))
+    tasks = tasks_of(request, [("bt", "bt", None)], set())
+    assert sum(len(task.labels) for task in tasks) == len(request.grid.cells())
+
+
+# ------------------------------------------------------------------------------------------------------------------ tasks
+
+
+def asked(grid, **changes):
+    given = {
+        "grid": grid, "world": "pool", "sensors": None, "vehicle": None, "overrides": (), "controllers": ("bt",), "policies": (),
+        "seeds": (3,), "episodes": 4,
+    }  # fmt: skip
+    return SweepRequest(**(given | changes))
+
+
+def test_one_simulator_serves_every_scene():
+    tasks = tasks_of(asked(grid_of(["paper"]), episodes=64), [("bt", "bt", None), ("straight", "straight", None)], set())
+    assert len({task.config.model_dump_json() for task in tasks}) == 1
+    assert (tasks[0].config.world.static_slots, tasks[0].config.world.dynamic_slots) == (12, 15)
+    assert all(64 * len(task.scenes) <= 1024 for task in tasks)
+    labels = [label for task in tasks for label in task.labels]
+    assert len(labels) == 2 * 75
+    assert labels[0] == {"S": 4, "D": 0, "v_m_s": None}
+
+
+def test_other_axes_make_configs_of_their_own():
+    request = asked(grid_of(["teacher.caution=0.5,2", "D=0,6"]))
+    tasks = tasks_of(request, [("bt", "bt", None)], set())
+    assert [task.config.teacher.caution for task in tasks] == [0.5, 2.0]
+    assert tasks[1].labels == ({"S": 8, "D": 0, "v_m_s": None, "teacher.caution": 2}, {"S": 8, "D": 6, "v_m_s": 0.6, "teacher.caution": 2})
+
+
+def test_a_request_survives_its_json():
+    request = asked(grid_of(["S=4,8", "teacher.caution=0.5,1"]), overrides=("world.n_dynamic=3", ("features", {"n_track": 4})))
+    assert request_of(json.loads(json.dumps(request.document()))) == request
+
+
+def test_wrong_keys_are_refused_before_anything_is_written(tmp_path):
+    place = tmp_path / "run"
+    with pytest.raises(ConfigError, match="did you mean 'caution'"):
+        sweep(asked(Grid({"teacher.cautoin": (1, 2)})), Canned(), place, Quiet())
+    with pytest.raises(ConfigError, match="same cell twice"):
+        sweep(asked(Grid({"D": (6,)}, one_at_a_time=True)), Canned(), place, Quiet())
+    assert not place.exists()
+
+
+# ----------------------------------------------------------------------------------------------------------------- folder
+
+
+def row(label, method):
+    return {**label, "method": method, "success_rate": 0.5, "told": label["S"] + label["D"]}
+
+
+class Canned:
+    """An engine that knows the rows already and stops after some tasks as if it had been killed, or somebody had pressed Ctrl-C."""
+
+    def __init__(self, stop_after=None, error=KeyboardInterrupt):
+        self.stop_after, self.error, self.ran = stop_after, error, []
+
+    def run(self, work, items):
+        for number, task in enumerate(items):
+            if self.stop_after is not None and len(self.ran) >= self.stop_after:
+                raise self.error
+            self.ran.append(task)
+            yield number, [row(label, task.controller) for label in task.labels]
+
+
+GRID = grid_of(["S=4,8,12", "D=0,6", "v=0.4,0.6"])
+
+
+def test_an_interrupted_sweep_goes_on_where_it_was(tmp_path):
+    request = asked(GRID, episodes=300)  # three cells a task
+    whole, _ = sweep(request, Canned(), tmp_path / "whole", Quiet())
+    place, watch = tmp_path / "cut", Quiet()
+    with pytest.raises(KeyboardInterrupt):
+        sweep(request, Canned(stop_after=1), place, watch)
+    assert any(f"--resume {place}" in text for text in watch.told)
+    assert json.loads((place / "run.json").read_text())["status"] == "interrupted"
+    rest = Canned()
+    assert resume(place, rest, Quiet())[0] == whole
+    assert sum(len(task.labels) for task in rest.ran) == 9 - 3
+    again = Canned()
+    assert resume(place, again, Quiet())[0] == whole
+    assert again.ran == []
+
+
+@pytest.mark.parametrize("cut", [1, 5, 60])
+def test_a_line_cut_off_by_a_kill_is_played_again(tmp_path, cut):
+    request, place = asked(GRID, episodes=300), tmp_path / "run"
+    whole, _ = sweep(request, Canned(), place, Quiet())
+    file = place / ROWS
+    file.write_bytes(file.read_bytes()[:-cut])
+    rest = Canned()
+    assert resume(place, rest, Quiet())[0] == whole
+    assert [len(task.labels) for task in rest.ran] == [1]
+    assert len(read_rows(file)) == 9
+
+
+def test_only_a_sweeps_folder_is_resumed(tmp_path):
+    with pytest.raises(RunFolderError, match="give the folder that 'uuv sweep' printed"):
+        resume(tmp_path, Canned(), Quiet())
+
+
+def test_two_processes_do_not_share_a_sweep(tmp_path, monkeypatch):
+    place = tmp_path / "run"
+    sweep(asked(GRID), Canned(), place, Quiet())
+
+    class Nosy(Canned):
+        def run(self, work, items):
+            with pytest.raises(RunFolderError, match="another process"):
+                resume(place, Canned(), Quiet())
+            yield from super().run(work, items)
+
+    assert resume(place, Nosy(), Quiet())[0]["cells"]
+
+
+# ---------------------------------------------------------------------------------------------------------------- engines
+
+
+def test_local_workers_give_every_result_once():
+    assert sorted(LocalEngine(2).run(sweep_work.square, [3, 1, 2])) == [(0, 9), (1, 1), (2, 4)]
+
+
+def test_a_lost_worker_costs_its_task_once_more(tmp_path):
+    assert list(LocalEngine(1).run(sweep_work.fall_once, [str(tmp_path / "a"), str(tmp_path / "b")])) == [(0, "a"), (1, "b")]
+
+
+def test_workers_that_keep_dying_end_the_sweep_with_a_reason():
+    with pytest.raises(EngineError, match="lost its worker 3 times"):
+        list(LocalEngine(1).run(sweep_work.always_fall, [1]))
+
+
+def test_errors_of_the_work_are_not_tried_again():
+    with pytest.raises(ValueError, match="-2 is negative"):
+        list(LocalEngine(1).run(sweep_work.square, [-2]))
+
+
+def _start_waiting(place):
+    list(LocalEngine(1).run(sweep_work.tell_and_wait, [place]))
+
+
+def test_workers_end_with_a_parent_that_was_killed(tmp_path):
+    place = tmp_path / "pid"
+    parent = multiprocessing.get_context("spawn").Process(target=_start_waiting, args=(str(place),))
+    parent.start()
+    worker = _pid_in(place)
+    os.kill(parent.pid, signal.SIGKILL)
+    parent.join()
+    assert _gone(worker), "a worker without a parent would fill the machine for ever"
+
+
+def _pid_in(place, patience_s=60.0):
+    for _ in range(int(patience_s / 0.05)):
+        if place.exists() and place.read_text():
+            return int(place.read_text())
+        time.sleep(0.05)
+    raise AssertionError("the worker never began")
+
+
+def _gone(pid, patience_s=30.0):
+    for _ in range(int(patience_s / 0.05)):
+        try:
+            os.kill(pid, 0)
+        except ProcessLookupError:
+            return True
+        time.sleep(0.05)
+    return False
+
+
+def test_a_ray_cluster_gives_the_same_results():
+    pytest.importorskip("ray", reason="the extra [cluster] is not installed")
+    engine = RayEngine("local", cpus_per_task=1)
+    assert sorted(engine.run(sweep_work.square, [3, 1, 2])) == [(0, 9), (1, 1), (2, 4)]
+    with pytest.raises(ValueError, match="-2 is negative"):
+        list(engine.run(sweep_work.square, [-2]))
+
+
+def test_without_ray_the_error_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(EngineError, match="uuvtai\\[cluster\\]"):
+        RayEngine()
+
+
+# --------------------------------------------------------------------------------------------------------- the real thing
+
+HORIZON_S = 8.0
+OPTIONS = [*SmallSim.OPTIONS, "--set", "episode.horizon_steps=400", "--episodes", "4", "--seeds", "7", "--json"]
+
+
+def uuv(*arguments):
+    return subprocess.run([sys.executable, "-m", "uuvtai", *arguments], capture_output=True, text=True, check=False)
+
+
+def test_a_killed_sweep_gives_what_an_evaluation_gives(small, tmp_path):
+    """To the last digit, also after SIGKILL."""
+    place, command = tmp_path / "sweep", ["sweep", "--grid", "D=2,6", "--grid", "v=1.5", "--controller", "bt", *OPTIONS]
+    child = subprocess.Popen(
+        [sys.executable, "-m", "uuvtai", *command, "--run-dir", str(place)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    while not (place / sweep_run.REQUEST).exists():
+        assert child.poll() is None, "ended before it had begun"
+        time.sleep(0.02)
+    child.kill()
+    child.wait()
+    done = uuv("sweep", "--resume", str(place), "--json")
+    assert done.returncode == 0, done.stderr
+    cells = json.loads(done.stdout)["cells"]
+    assert [(cell["D"], cell["v_m_s"]) for cell in cells] == [(2, 1.5), (6, 1.5)]
+    results, _ = run_episodes(small.sim, [Job(7, episode, (8, 2, 1.5)) for episode in range(4)])
+    small.sim.set_scenes()
+    ours = [(r.outcome, r.time_s) for r in results if r.time_s <= HORIZON_S]
+    theirs = list(zip(cells[0]["episode_outcomes"], cells[0]["episode_times_s"], strict=True))
+    assert ours == [end for end in theirs if end[0] != "timeout"]
+    assert ours, "or nothing was compared"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--grid", "Q=1"], "no such axis"),
+        (["--engine", "slurm"], "local or ray"),
+        (["--workers", "0"], "at least 1"),
+        (["--resume", "/nosuch"], "give the folder that 'uuv sweep' printed"),
+        (["--resume", "x", "--grid", "S=4"], "a resumed run keeps its own"),
+        (["nosuch"], "no trained policy"),
+        (["--controller", "nosuch"], "nosuch"),
+    ],
+)
+def test_bad_input_is_one_message_and_no_folder(arguments, said, tmp_path):
+    place = tmp_path / "run"
+    done = uuv("sweep", *arguments, *([] if "--resume" in arguments else ["--run-dir", str(place)]))
+    assert done.returncode in (1, 2)
+    assert said in " ".join(done.stderr.split())
+    assert "Traceback" not in done.stderr
+    assert not place.exists()
+
+
+def test_base_config_has_room_for_the_largest_cell():
+    config = base_config(asked(grid_of(["S=4,12", "D=3"]), overrides=("world.n_dynamic=9",)))
+    assert (config.world.static_slots, config.world.dynamic_slots) == (12, 9)

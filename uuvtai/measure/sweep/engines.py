@@ -1,0 +1,134 @@
+"""Who does the work of a sweep: processes on this machine, or a Ray cluster. A worker that is lost costs its task once more."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import connection
+from typing import Any, Protocol, TypeVar
+
+Item = TypeVar("Item")
+Work = Callable[[Item], Any]
+"""a module's function of one picklable argument"""
+
+ATTEMPTS = 3
+"""how often a task is tried that loses its worker"""
+
+
+class EngineError(RuntimeError):
+    """The engine cannot start, or a task cannot be finished: what, where, why, what to type next."""
+
+
+class Engine(Protocol):
+    """Runs tasks somewhere."""
+
+    def run(self, work: Work, items: Sequence[Item]) -> Iterator[tuple[int, Any]]:
+        """(number of the item, result) as they come. Errors of the work itself are raised; EngineError where workers keep dying."""
+        ...
+
+
+class LocalEngine:
+    """Processes on this machine. They end with the one that started them, however it ends."""
+
+    def __init__(self, workers: int = 1) -> None:
+        """Each worker is a process that may use its share of the cores."""
+        if workers < 1:
+            raise ValueError(f"--workers {workers}: at least 1 is needed")
+        self._workers = workers
+
+    def run(self, work: Work, items: Sequence[Item]) -> Iterator[tuple[int, Any]]:
+        """As ``Engine.run``."""
+        waiting, tries = list(range(len(items))), [0] * len(items)
+        while waiting:
+            lost = yield from self._round(work, items, waiting)
+            for number in lost:
+                tries[number] += 1
+                if tries[number] >= ATTEMPTS:
+                    raise EngineError(
+                        f"task {number + 1} of {len(items)} lost its worker {ATTEMPTS} times (killed, or out of memory): "
+                        "try fewer --workers or a smaller --num-envs; what is finished is kept, go on with --resume"
+                    )
+            waiting = lost
+
+    def _round(self, work: Work, items: Sequence[Item], numbers: list[int]) -> Iterator[tuple[int, Any]]:
+        """Run until all are done or a worker dies; returns the numbers that were lost."""
+        threads = max(1, (os.cpu_count() or 1) // self._workers)
+        context = multiprocessing.get_context("spawn")
+        pool = ProcessPoolExecutor(min(self._workers, len(numbers)), context, _begin_worker, (threads,))
+        running: dict[Future, int] = {}
+        todo, lost = list(numbers), []
+        try:
+            while todo or running:
+                try:
+                    while todo and len(running) < self._workers:  # no more than run: what waits inside a broken pool is lost too
+                        future = pool.submit(work, items[todo[0]])
+                        running[future] = todo.pop(0)
+                except BrokenProcessPool:
+                    return [*running.values(), *lost, *todo]
+                done, _rest = wait(running, return_when=FIRST_COMPLETED)
+                for future in done:
+                    number = running.pop(future)
+                    try:
+                        result = future.result()
+                    except BrokenProcessPool:
+                        lost.append(number)
+                        continue
+                    yield number, result
+                if lost:
+                    return [*lost, *running.values(), *todo]
+            return []
+        finally:
+            for process in list((pool._processes or {}).values()):
+                process.terminate()
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _begin_worker(threads: int) -> None:
+    """Set up a worker: its share of the threads, Ctrl-C left to the parent, death with the parent."""
+    os.environ.setdefault("UUV_NUM_THREADS", str(threads))
+    os.environ.setdefault("OMP_NUM_THREADS", str(threads))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        connection.wait([parent.sentinel])
+        os._exit(1)
+
+
+class RayEngine:
+    """Tasks on a Ray cluster that runs already, or on one inside this process; Ray itself runs lost tasks again."""
+
+    def __init__(self, address: str = "auto", cpus_per_task: float = 2.0) -> None:
+        """``address``: of the cluster, ``auto`` = the one that this machine belongs to, ``local`` = one inside this process."""
+        try:
+            import ray
+        except ImportError:
+            raise EngineError("--engine ray: the package ray is missing; install it: pip install 'uuvtai[cluster]'") from None
+        self._ray = ray
+        try:
+            ray.init(address=None if address == "local" else address, ignore_reinit_error=True, log_to_driver=False, logging_level="ERROR")
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            raise EngineError(f"--engine ray: no cluster at {address!r} ({error}); start one: ray start --head") from None
+        self._cpus = min(cpus_per_task, ray.cluster_resources().get("CPU", 1.0))
+
+    def run(self, work: Work, items: Sequence[Item]) -> Iterator[tuple[int, Any]]:
+        """As ``Engine.run``."""
+        remote = self._ray.remote(num_cpus=self._cpus, max_retries=ATTEMPTS - 1)(work)
+        running = {remote.remote(item): number for number, item in enumerate(items)}
+        while running:
+            (done, *_), _rest = self._ray.wait(list(running))
+            number = running.pop(done)
+            try:
+                yield number, self._ray.get(done)
+            except (self._ray.exceptions.WorkerCrashedError, self._ray.exceptions.NodeDiedError) as error:
+                raise EngineError(f"task {number + 1} of {len(items)} lost its worker {ATTEMPTS} times: {error}") from None
+            except self._ray.exceptions.RayTaskError as error:
+                raise error.as_instanceof_cause() from None

@@ -1,0 +1,155 @@
+"""A sweep's run folder: every finished row is on disk at once, so that a sweep killed at any moment goes on where it was."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Protocol
+
+from uuvtai.measure.sweep.engines import Engine
+from uuvtai.measure.sweep.grid import Grid
+from uuvtai.measure.sweep.plan import SweepRequest, base_config, check_rows, ordered, request_of, row_key, tasks_of
+from uuvtai.measure.sweep.tasks import Row, play
+from uuvtai.run_folder import RunFolder, RunFolderError, default_run_dir, refuse_place
+
+ROWS, REQUEST, RESULT = "cells.jsonl", "sweep_request.json", "sweep.json"
+
+MethodKey = tuple[str, str | None, str | None]
+"""(name in the table, controller, policy): exactly one of the last two"""
+
+
+class Watch(Protocol):
+    """Shows how far a sweep is."""
+
+    def start(self, name: str, total: int) -> None: ...
+    def note(self, text: str) -> None: ...
+    def update(self, done: int, total: int, env_steps: int) -> None: ...
+    def stop(self) -> None: ...
+
+
+def sweep(request: SweepRequest, engine: Engine, run_dir: Path | None, watch: Watch) -> tuple[dict[str, Any], Path]:
+    """Begin a sweep: the ``uuv sweep --json`` document and the run folder. Whatever can be refused is refused before anything is written.
+
+    Raises ConfigError, CheckpointError, RunFolderError, EngineError.
+    """
+    place = run_dir or default_run_dir(f"sweep-{Path(request.world).stem}")
+    refuse_place(place)
+    request, methods = resolved(request, watch)
+    keys = check_rows(request, [name for name, _controller, _policy in methods])
+    folder = RunFolder(place, base_config(request), list(request.seeds))
+    folder.hold()
+    folder.write_json(REQUEST, {"schema": 1, **request.document(), "methods": methods})
+    return _play(request, methods, keys, engine, folder, watch), folder.path
+
+
+def resume(place: Path, engine: Engine, watch: Watch) -> tuple[dict[str, Any], Path]:
+    """Go on with a sweep that was killed or interrupted: rows that are finished stay as they are. Raises RunFolderError."""
+    try:
+        document = json.loads((place / REQUEST).read_text(encoding="utf-8"))
+        request, methods = request_of(document), [tuple(method) for method in document["methods"]]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise RunFolderError(f"{place / REQUEST}: cannot be read ({error}); give the folder that 'uuv sweep' printed") from None
+    folder = RunFolder.reopen(place, {"rows": len(read_rows(place / ROWS))})
+    keys = check_rows(request, [name for name, _controller, _policy in methods])
+    return _play(request, methods, keys, engine, folder, watch), place
+
+
+def resolved(request: SweepRequest, watch: Watch) -> tuple[SweepRequest, list[MethodKey]]:
+    """The request with the columns that its policies see, and its methods by their names in the table; paths made absolute.
+
+    Raises ConfigError, CheckpointError.
+    """
+    from uuvtai.measure.methods import features_of, policies_of, trees_of
+
+    limit = base_config(request).teacher.max_node
+    trees = trees_of(list(request.controllers), limit)
+    policies = tuple(str(Path(name).resolve()) if Path(name).exists() else name for name in request.policies)
+    trained = policies_of(list(policies), limit, watch.note)
+    controllers = [str(Path(name).resolve()) if name.endswith(".xml") else name for name in request.controllers]
+    methods: list[MethodKey] = [(tree.name, name, None) for tree, name in zip(trees, controllers, strict=True)]
+    methods += [(method.name, None, name) for method, name in zip(trained, policies, strict=True)]
+    features = features_of(list(policies)) if policies else []
+    return replace(request, overrides=(*features, *request.overrides), policies=policies), methods
+
+
+def _play(
+    request: SweepRequest, methods: Sequence[MethodKey], keys: list[str], engine: Engine, folder: RunFolder, watch: Watch
+) -> dict[str, Any]:
+    rows = {row_key(_label(row, request.grid), row["method"]): row for row in read_rows(folder.path / ROWS)}
+    tasks = tasks_of(request, methods, set(rows))
+    status, code = "failed", 1
+    watch.start(f"{len(keys)} cells", len(keys))
+    try:
+        for number, played in engine.run(play, tasks):
+            for row in played:
+                append_row(folder.path / ROWS, row)
+                rows[row_key(_label(row, request.grid), row["method"])] = row
+            watch.note(f"{_told(tasks[number].labels[0])} .. {_told(tasks[number].labels[-1])}: done")
+            watch.update(len(rows), len(keys), 0)
+        document = _document(request, ordered(rows, keys))
+        folder.write_json(RESULT, document)
+        status, code = "finished", 0
+        return document
+    except KeyboardInterrupt:
+        status, code = "interrupted", 130
+        watch.note(f"finished rows are kept; go on with: uuv sweep --resume {folder.path}")
+        raise
+    finally:
+        watch.stop()
+        folder.finish(status, code)
+
+
+def _label(row: Row, grid: Grid) -> dict[str, Any]:
+    """Of a row that was written: what ``label_of`` gave for its cell."""
+    names = ("S", "D", "v_m_s", *(name for name in grid.axes if name in row and name not in ("S", "D", "v")))
+    return {name: row[name] for name in names}
+
+
+def _told(label: dict[str, Any]) -> str:
+    return ", ".join(f"{name} = {value}" for name, value in label.items() if value is not None)
+
+
+def _document(request: SweepRequest, rows: list[Row]) -> dict[str, Any]:
+    return {
+        "schema": 1,
+        "world": request.world,
+        "sensors": request.sensors,
+        "axes": request.grid.document(),
+        "seeds": list(request.seeds),
+        "episodes_per_seed": request.episodes,
+        "cells": rows,
+    }
+
+
+# ------------------------------------------------------------------------------------------------------------------- file
+
+
+def append_row(path: Path, row: Row) -> None:
+    """Add a row and see it on the disk."""
+    with path.open("a", encoding="utf-8") as stream:
+        stream.write(json.dumps(row, allow_nan=False) + "\n")
+        stream.flush()
+        os.fsync(stream.fileno())
+
+
+def read_rows(path: Path) -> list[Row]:
+    """Rows written so far; a last line that a kill cut off is removed from the file, so that the next row begins a line of its own."""
+    if not path.exists():
+        return []
+    lines = path.read_bytes().splitlines(keepends=True)
+    rows = [row for line in lines if (row := _row(line)) is not None]
+    if lines and _row(lines[-1]) is None:
+        with path.open("r+b") as stream:
+            stream.truncate(sum(len(line) for line in lines[:-1]))
+    return rows
+
+
+def _row(line: bytes) -> Row | None:
+    try:
+        row = json.loads(line)
+    except ValueError:
+        return None
+    return row if line.endswith(b"\n") and isinstance(row, dict) else None
