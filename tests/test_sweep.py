@@ -290,7 +290,18 @@ def test_without_ray_the_error_says_what_to_install(monkeypatch):
 # --------------------------------------------------------------------------------------------------------- the real thing
 
 HORIZON_S = 8.0
-OPTIONS = [*SmallSim.OPTIONS, "--set", "episode.horizon_steps=400", "--episodes", "4", "--seeds", "7", "--json"]
+OPTIONS = [
+    *SmallSim.OPTIONS,
+    "--set",
+    "episode.horizon_steps=400",
+    "-S",
+    "4",
+    "--set",
+    "world.static_capacity=8",
+    "--episodes",
+    "4",
+    "--json",
+]
 
 
 def uuv(*arguments):
@@ -312,7 +323,7 @@ def test_a_killed_sweep_gives_what_an_evaluation_gives(small, tmp_path):
     assert done.returncode == 0, done.stderr
     cells = json.loads(done.stdout)["cells"]
     assert [(cell["D"], cell["v_m_s"]) for cell in cells] == [(2, 1.5), (6, 1.5)]
-    results, _ = run_episodes(small.sim, [Job(7, episode, (8, 2, 1.5)) for episode in range(4)])
+    results, _ = run_episodes(small.sim, [Job(0, episode, (4, 2, 1.5)) for episode in range(4)])
     small.sim.set_scenes()
     ours = [(r.outcome, r.time_s) for r in results if r.time_s <= HORIZON_S]
     theirs = list(zip(cells[0]["episode_outcomes"], cells[0]["episode_times_s"], strict=True))
