@@ -541,6 +541,7 @@ def _print_sweep(result: dict[str, Any]) -> None:
 def profile(
     num_envs: Annotated[str, typer.Option("--num-envs", help="Batch sizes, separated by commas.")] = "1,64,1024",
     controller: Annotated[str, typer.Option("--controller", help="Tree that is ticked.")] = "bt",
+    preset: Annotated[str, typer.Option("--preset", help="Training preset: what learns in the rate with training.")] = "curriculum",
     world: World = "pool",
     sensors: Sensors = None,
     n_static: Static = None,
@@ -552,13 +553,14 @@ def profile(
     overrides: Set = None,
     as_json: AsJson = False,
 ) -> None:
-    """Time per stage, env-steps per second and memory, for several batch sizes."""
+    """Time per stage, env-steps per second (simulated, with inference, with training), memory, and the paper's timing tables."""
     sizes = [_integer("--num-envs", text) for text in num_envs.split(",")]
     if not math.isfinite(seconds) or seconds <= 0:
         raise UsageError(f"--seconds {seconds}: must be a positive number, for example --seconds 10")
-    config = _config(world, sensors, None, n_static, n_dynamic, speed, overrides)
-
+    from uuvtai.loader import load_training
     from uuvtai.measure.profiling import profile as run
+
+    config = load_training(preset, [*_scene_flags(n_static, n_dynamic, speed), *(overrides or [])], world, sensors)
 
     result = run(config, sizes, controller, device, seconds, density, _say)
     if as_json:
@@ -568,33 +570,75 @@ def profile(
 
 
 def _print_profile(result: dict[str, Any]) -> None:
-    table = Table(
-        title=f"{result['machine']['cpu']}, {result['machine']['cores']} cores, {result['machine']['device']}", title_justify="left"
-    )
+    machine = f"{result['machine']['cpu']}, {result['machine']['cores']} cores, {result['machine']['device']}"
+    table = Table(title=machine, title_justify="left")
     table.add_column("us per env-step")
     for row in result["rows"]:
         table.add_column(f"{row['num_envs']} env", justify="right")
     for stage in result["rows"][0]["stages_us_per_env_step"]:
         table.add_row(stage, *[f"{row['stages_us_per_env_step'][stage]:.2f}" for row in result["rows"]])
     table.add_section()
-    table.add_row("env-steps/s", *[f"{row['env_steps_per_s']['step']:,.0f}" for row in result["rows"]])
+    for name, label in _RATES.items():
+        table.add_row(f"env-steps/s: {label}", *[f"{row['env_steps_per_s'][name]:,.0f}" for row in result["rows"]])
     table.add_row("memory MB", *[f"{row['memory_mb']:,.0f}" for row in result["rows"]])
     table.add_row("compile s", *[f"{row['compile_s']:.1f}" for row in result["rows"]])
     _stdout().print(table)
+    for row in result["rows"]:
+        _print_flame(row)
     if result["paper_latency"]:
-        paper = Table(title="beside the paper's timing table (one env)", title_justify="left")
-        for head in ("component", "mean ms", "max ms", "paper mean ms", "paper max ms"):
-            paper.add_column(head, justify="left" if head == "component" else "right")
-        for row in result["paper_latency"]:
-            if row["component"] == "Replanning rate":
-                paper.caption = (
-                    f"{row['replans_per_episode']:.1f} replans an episode, {row['hz']:.2f} Hz "
-                    f"(paper: {row['paper_replans_per_episode']}, {row['paper_hz']} Hz)"
-                )
-                continue
-            values = (row["mean_ms"], row["max_ms"], row["paper_mean_ms"], row["paper_max_ms"])
-            paper.add_row(row["component"], *[_number(value, 3) for value in values])
-        _stdout().print(paper)
+        _print_latency(result)
+    if result["paper_density"]:
+        _print_density(result["paper_density"])
+
+
+_RATES = {"step": "random actions", "tree": "driven by the tree", "step_inference": "+ policy", "train": "+ training"}
+_FLAME_WIDTH = 100
+_FLAME_COLORS = ("blue", "cyan", "green", "yellow", "magenta", "red", "bright_blue", "bright_cyan", "bright_green", "bright_yellow")
+
+
+def _print_flame(row: dict[str, Any]) -> None:
+    """Stages of a step as one bar, each as wide as its share of the time."""
+    from rich.text import Text
+
+    stages = {name: us for name, us in row["stages_us_per_env_step"].items() if us > 0}
+    total, bar, edge = sum(stages.values()), Text(), 0.0
+    for (name, us), color in zip(stages.items(), _FLAME_COLORS * 2, strict=False):
+        first, edge = round(_FLAME_WIDTH * edge / total), edge + us
+        width = round(_FLAME_WIDTH * edge / total) - first
+        bar.append(name[:width].ljust(width), style=f"black on {color}")
+    _stdout().print(Text(f"{row['num_envs']:>6} env ").append(bar).append(f" {total:.1f} us"))
+
+
+def _print_latency(result: dict[str, Any]) -> None:
+    paper = Table(title="beside the paper's timing table (one env; theirs on a workstation with an RTX 5090)", title_justify="left")
+    for head in ("component", "mean ms", "max ms", "paper mean ms", "paper max ms"):
+        paper.add_column(head, justify="left" if head == "component" else "right")
+    for row in result["paper_latency"]:
+        if row["component"] == "Replanning rate":
+            paper.caption = (
+                f"{row['replans_per_episode']:.1f} replans an episode, {row['hz']:.2f} Hz "
+                f"(paper: {row['paper_replans_per_episode']}, {row['paper_hz']} Hz)"
+            )
+            continue
+        values = (row["mean_ms"], row["max_ms"], row["paper_mean_ms"], row["paper_max_ms"])
+        paper.add_row(row["component"], *[_number(value, 3) for value in values])
+    _stdout().print(paper)
+    loop = result["real_time"]
+    times = ", ".join(f"{name} {loop[f'{name}_ms']:.2f}" for name in ("p50", "p99", "max"))
+    _stdout().print(
+        f"{loop['budget_ms']:.0f} ms a step {'kept' if loop['within'] else 'NOT kept'}: {times} ms; {loop['late']} of {loop['steps']} steps late",
+        highlight=False,
+    )
+
+
+def _print_density(rows: list[dict[str, Any]]) -> None:
+    table = Table(title="loop time against moving obstacles (one env)", title_justify="left")
+    for head in ("D", "loop ms", "paper ms", "replans an episode", "paper replans"):
+        table.add_column(head, justify="right")
+    for row in rows:
+        replans = _number(row["replans_per_episode"])
+        table.add_row(str(row["D"]), _number(row["loop_ms"], 2), _number(row["paper_loop_ms"]), replans, _number(row["paper_replans"]))
+    _stdout().print(table)
 
 
 # --------------------------------------------------------------------------------------------------------- presets, doctor

@@ -10,18 +10,19 @@ from typing import Any
 import torch
 
 from uuvtai.config import Config
+from uuvtai.config.learning import LearningConfig
+from uuvtai.measure.latency import latency_rows
 from uuvtai.run_folder import hardware, versions
 from uuvtai.sim import STAGES, Sim
-from uuvtai.sizes import memory_bytes
+from uuvtai.sizes import check_size, memory_bytes
 
 WARM_STEPS = 60
 """More than every divider's period, so that each stage has run several times before the clock starts."""
 _MAX_STEPS = 100_000
 _DENSITY = (0, 3, 6, 9, 15)
 
-# the paper's table "Workstation deployability timing" and "Runtime versus dynamic-obstacle density", as printed
-_PAPER_LATENCY = {"Mapping update": (3.33, 6.17), "Global planner": (5.22, 9.89), "Full loop": (28.63, 39.88)}
 PAPER_DENSITY = {0: (19.7, 51.9), 3: (25.2, 62.7), 6: (28.6, 54.4), 9: (31.6, 48.8), 15: (38.0, 42.7)}
+"""D: (loop [ms], replans an episode) of the paper's table "Runtime versus dynamic-obstacle density", as printed"""
 
 
 @dataclass
@@ -59,13 +60,15 @@ class Batch:
 
 
 def profile(
-    config: Config, sizes: list[int], controller: str, device: str, seconds: float, density: bool, say: Callable[[str], None]
+    config: LearningConfig, sizes: list[int], controller: str, device: str, seconds: float, density: bool, say: Callable[[str], None]
 ) -> dict[str, Any]:
     """The ``uuv profile --json`` document; raises ValueError or MemoryError for sizes that cannot work, before anything runs."""
     from uuvtai.tree import read_tree
 
     tree = read_tree(controller, config.teacher.max_node)
-    rows, latency, device_used = [], [], device
+    for n in sizes:
+        check_size(config, n, device)
+    rows, latency, real_time, device_used = [], [], None, device
     for n in sizes:
         say(f"{n} env(s): starting")
         begun = time.perf_counter()
@@ -77,15 +80,30 @@ def profile(
         compile_s = time.perf_counter() - begun
         rows.append(_row(config, batch, controller, seconds, compile_s))
         if n == 1:
-            latency = _latency(batch, seconds)
-    document = {
+            latency, real_time = latency_rows(batch, config, seconds)
+        rows[-1]["env_steps_per_s"] |= _learning_rates(config, sim)
+    return {
         "schema": 1,
         "machine": {**hardware(), "device": device_used, "versions": versions()},
         "rows": rows,
         "paper_latency": latency,
+        "real_time": real_time,
         "paper_density": _density(config, tree, device, seconds, say) if density else [],
     }
-    return document
+
+
+def _learning_rates(config: LearningConfig, sim: Sim) -> dict[str, float]:
+    """Env-steps per second with a policy that decides, and with everything that learns as well: one iteration of the training preset."""
+    from uuvtai.env import VectorEnv
+    from uuvtai.learn.train import Trainer
+
+    with VectorEnv(sim) as env:
+        trainer = Trainer(env, config)
+        trainer.iterate()  # allocates
+        told = trainer.iterate()
+    samples = config.ppo.rollout_steps * config.policy.hold_steps * sim.num_envs
+    driving_s = told["time/simulate_s"] + told["time/infer_s"]
+    return {"step_inference": samples / driving_s, "train": samples / (driving_s + told["time/learn_s"])}
 
 
 def _row(config: Config, batch: Batch, controller: str, seconds: float, compile_s: float) -> dict[str, Any]:
@@ -102,7 +120,7 @@ def _row(config: Config, batch: Batch, controller: str, seconds: float, compile_
         "S": config.world.n_static,
         "D": config.world.n_dynamic,
         "depth_every": config.sensors.depth.period_steps,
-        "env_steps_per_s": {"step": step, "step_inference": driven, "train": None},
+        "env_steps_per_s": {"step": step, "tree": driven},
         "compile_s": compile_s,
         "memory_mb": memory_bytes(config, sim.num_envs) / 1e6,
         "memory_kb_per_env": memory_bytes(config, sim.num_envs) / 1e3 / sim.num_envs,
@@ -120,39 +138,6 @@ def env_steps_per_s(batch: Batch, seconds: float, action: Callable[[], torch.Ten
         if elapsed >= seconds:
             break
     return batch.env_steps / elapsed
-
-
-def _latency(batch: Batch, seconds: float) -> list[dict[str, Any]]:
-    """Rows of the paper's timing table that this stack has, one env, mean and max per step."""
-    sim, dt = batch.sim, batch.sim.config.episode.control_dt_s
-    samples: dict[str, list[float]] = {name: [] for name in _PAPER_LATENCY}
-    batch.replans = batch.episodes = batch.env_steps = 0
-    end = time.perf_counter() + seconds
-    while time.perf_counter() < end:
-        sim.stage_s = {}
-        begun = time.perf_counter()
-        sim.step()
-        samples["Full loop"].append(time.perf_counter() - begun)
-        samples["Mapping update"].append(sum(sim.stage_s[name] for name in ("mapping", "clearance")))
-        samples["Global planner"].append(sim.stage_s["planning"])
-        sim.stage_s = None
-        batch.step()
-    rows = [
-        {
-            "component": name,
-            "mean_ms": 1e3 * sum(values) / len(values),
-            "max_ms": 1e3 * max(values),
-            "paper_mean_ms": _PAPER_LATENCY[name][0],
-            "paper_max_ms": _PAPER_LATENCY[name][1],
-        }
-        for name, values in samples.items()
-    ]
-    if batch.episodes:
-        per_episode = batch.replans / batch.episodes
-        rate = batch.replans / (2 * batch.env_steps * dt)
-        rows.append({"component": "Replanning rate", "replans_per_episode": per_episode, "hz": rate, "mean_ms": None, "max_ms": None,
-                     "paper_mean_ms": None, "paper_max_ms": None, "paper_hz": 6.21, "paper_replans_per_episode": 52.1})  # fmt: skip
-    return rows
 
 
 def _density(config: Config, tree: Any, device: str, seconds: float, say: Callable[[str], None]) -> list[dict[str, Any]]:
