@@ -625,10 +625,8 @@ def _print_latency(result: dict[str, Any]) -> None:
     _stdout().print(paper)
     loop = result["real_time"]
     times = ", ".join(f"{name} {loop[f'{name}_ms']:.2f}" for name in ("p50", "p99", "max"))
-    _stdout().print(
-        f"{loop['budget_ms']:.0f} ms a step {'kept' if loop['within'] else 'NOT kept'}: {times} ms; {loop['late']} of {loop['steps']} steps late",
-        highlight=False,
-    )
+    verdict = f"{loop['budget_ms']:.0f} ms a step {'kept' if loop['within'] else 'NOT kept'}"
+    _stdout().print(f"{verdict}: {times} ms; {loop['late']} of {loop['steps']} steps late", highlight=False)
 
 
 def _print_density(rows: list[dict[str, Any]]) -> None:
@@ -639,6 +637,38 @@ def _print_density(rows: list[dict[str, Any]]) -> None:
         replans = _number(row["replans_per_episode"])
         table.add_row(str(row["D"]), _number(row["loop_ms"], 2), _number(row["paper_loop_ms"]), replans, _number(row["paper_replans"]))
     _stdout().print(table)
+
+
+# --------------------------------------------------------------------------------------------------------------- reproduce
+
+
+@app.command()
+def reproduce(
+    budget: Annotated[str, typer.Option("--budget", help="quick (half an hour on two cores) or full (overnight).")] = "quick",
+    resume: Annotated[Path | None, typer.Option("--resume", help="Run folder of a reproduction to go on with.")] = None,
+    run_dir: RunDir = None,
+    as_json: AsJson = False,
+) -> None:
+    """Train, evaluate, sweep and profile whatever the paper shows, and judge each of its claims."""
+    from uuvtai.measure.reproduce.run import reproduce as begin
+    from uuvtai.measure.reproduce.run import resume as go_on
+
+    if resume is not None:
+        _refuse_beside_resume({"--run-dir": run_dir})
+        result, folder = go_on(resume, _Progress())
+    else:
+        result, folder = begin(budget, run_dir, _Progress())
+    if as_json:
+        _print_json(result)
+        return
+    table = Table(title=f"the paper's claims, budget {result['budget']}", title_justify="left")
+    for head in ("claim", "the paper", "here", "verdict"):
+        table.add_column(head, overflow="fold")
+    for claim in result["claims"]:
+        color = {"holds": "green", "does not hold": "red"}.get(claim["verdict"], "yellow")
+        table.add_row(claim["text"], claim["theirs"], claim["ours"], f"[{color}]{claim['verdict']}[/]")
+    _stdout().print(table, highlight=False)
+    _say(f"run folder: {folder}")
 
 
 # --------------------------------------------------------------------------------------------------------- presets, doctor

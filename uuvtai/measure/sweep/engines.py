@@ -109,7 +109,7 @@ class RayEngine:
     def __init__(self, address: str = "auto", cpus_per_task: float = 2.0) -> None:
         """``address``: of the cluster, ``auto`` = the one that this machine belongs to, ``local`` = one inside this process."""
         try:
-            import ray
+            import ray  # type: ignore[import-not-found]  # an extra
         except ImportError:
             raise EngineError("--engine ray: the package ray is missing; install it: pip install 'uuvtai[cluster]'") from None
         self._ray = ray

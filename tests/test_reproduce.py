@@ -1,0 +1,202 @@
+"""A reproduction: verdicts by hand, steps that are done once, and a page with every number."""
+
+import json
+
+import pytest
+
+from uuvtai.loader import preset_names
+from uuvtai.measure.reproduce import claims, paper, steps
+from uuvtai.measure.reproduce.claims import FAILS, HOLDS, OPEN, Share
+from uuvtai.measure.reproduce.markdown import results_page, table
+from uuvtai.measure.reproduce.run import reproduce, resume
+from uuvtai.run_folder import RunFolderError
+
+
+def entry(success, n=100, collision=0, time_s=10.0, **more):
+    outcomes = {"success": success, "collision": collision, "ttc": 0, "out_of_tank": 0, "timeout": n - success - collision}
+    return {"episodes": n, "outcomes": outcomes, "time_mean_s": time_s, "time_to_success_mean_s": time_s} | more
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "verdict"),
+    [((90, 100), (20, 100), HOLDS), ((20, 100), (90, 100), FAILS), ((50, 100), (45, 100), OPEN), ((0, 0), (5, 10), OPEN)],
+)
+def test_larger_needs_intervals_apart(a, b, verdict):
+    assert claims.larger(Share(*a), Share(*b)) == verdict
+
+
+def test_a_printed_value_is_reached_missed_or_open():
+    assert claims.at_least(Share(83, 100), 0.828) == HOLDS
+    assert claims.at_least(Share(80, 100), 0.828) == OPEN, "the interval holds it"
+    assert claims.at_least(Share(60, 100), 0.828) == FAILS
+    assert claims.at_most(Share(1, 100), 0.011) == HOLDS
+    assert claims.at_most(Share(2, 100), 0.011) == OPEN
+    assert claims.at_most(Share(20, 100), 0.011) == FAILS
+
+
+def verdicts(found):
+    return {claim.text: claim.verdict for claim in found}
+
+
+def test_claims_of_table_main_by_hand():
+    table_main = {
+        "ppo": [entry(20, collision=40, time_s=22.84)],
+        "distill_20": [entry(46, collision=20)],
+        "curriculum": [entry(87, collision=10, time_s=11.41)],
+        "bt": [entry(80, collision=10)],
+        "no_risk_scaling": [entry(86)],
+        "no_world_model": [entry(30)],
+    }
+    found = claims.of_table_main(table_main)
+    assert [claim.verdict for claim in found] == [HOLDS, HOLDS, HOLDS, HOLDS, HOLDS, HOLDS, OPEN, HOLDS]
+    assert "13.1 s against 114.2 s" in [claim.ours for claim in found]
+    swapped = claims.of_table_main(table_main | {"ppo": table_main["curriculum"], "curriculum": table_main["ppo"]})
+    assert [claim.verdict for claim in swapped[:6]] == [FAILS] * 6
+
+
+def test_training_seeds_are_pooled():
+    assert claims.pooled([entry(50), entry(70, n=200)], "success") == Share(120, 300)
+
+
+def cell(n_static, n_dynamic, speed, method="best", **more):
+    return entry(**more) | {"S": n_static, "D": n_dynamic, "v_m_s": speed, "method": method}
+
+
+def test_claims_of_the_sweep_take_the_papers_conditions():
+    cells = [
+        cell(4, 0, None, success=100),
+        cell(8, 9, 1.5, success=90, collision=1),
+        cell(8, 9, 3.0, success=0, collision=100),  # too fast for the mean
+        cell(12, 9, 1.5, success=0, collision=100),  # too many
+        cell(12, 15, 3.0, success=5, collision=95),
+        cell(8, 9, 1.5, method="bt", success=0, collision=100),
+    ]
+    found = claims.of_sweep(cells, "best")
+    assert found[0].ours.startswith("190/200")
+    assert found[1].ours.startswith("1/200")
+    assert found[2].ours.startswith("1 of 2")
+    assert found[4].ours.startswith("5/100")
+    assert [claim.verdict for claim in found] == [HOLDS, HOLDS, FAILS, HOLDS, HOLDS]
+
+
+def test_claims_of_timing():
+    rows = {
+        "WM encoder": 0.02,
+        "WM dynamics": 0.02,
+        "WM decoder": 0.02,
+        "PPO policy": 0.1,
+        "Mapping update": 1.0,
+        "Global planner": 1.0,
+        "Full loop": 3.0,
+    }
+    profile = {
+        "paper_latency": [{"component": name, "mean_ms": ms} for name, ms in rows.items()],
+        "real_time": {"p99_ms": 4.0},
+        "paper_density": [{"D": d, "loop_ms": 2.0 + 0.01 * d, "paper_loop_ms": 19.7} for d in (0, 15)],
+    }
+    assert [claim.verdict for claim in claims.of_timing(profile)] == [HOLDS, FAILS, FAILS]
+
+
+def test_losses_must_fall():
+    falling = [{"world_model/reconstruction_loss": 10 - i, "world_model/dynamics_loss": 5.0} for i in range(8)]
+    assert [claim.verdict for claim in claims.of_training(falling)] == [HOLDS, FAILS]
+    assert [claim.verdict for claim in claims.of_training([])] == [OPEN, OPEN]
+
+
+def test_the_papers_own_time_to_success_is_as_inconsistent_as_we_say():
+    off = {
+        name: round(row.mean_time_s / row.success, 1)
+        for name, row in paper.TABLE_MAIN.items()
+        if abs(row.mean_time_s / row.success - row.tts_s) > 0.1
+    }
+    assert off == {"distill_20": 29.2, "curriculum": 13.1, "bt": 18.1}
+
+
+# ------------------------------------------------------------------------------------------------------------------- steps
+
+
+@pytest.mark.parametrize("budget", list(steps.BUDGETS))
+def test_steps_have_folders_of_their_own_and_known_presets(budget, tmp_path):
+    found = steps.steps_of(steps.BUDGETS[budget], None, tmp_path)
+    assert len({step.folder for step in found}) == len(found)
+    trained = [step.command[1] for step in found if step.command[0] == "train"]
+    assert set(trained) <= set(preset_names("train"))
+    assert len(trained) == len(steps.TRAINED) * steps.BUDGETS[budget].training_seeds
+    grids = [step.command[step.command.index("--grid") + 1] for step in found if "--grid" in step.command]
+    assert set(grids) <= set(preset_names("grid"))
+
+
+class Uuv:
+    """Stands for the command: writes what it would write."""
+
+    def __init__(self, monkeypatch, fail_at=None):
+        self.ran, self.fail_at = [], fail_at
+        monkeypatch.setattr(steps, "launch", self)
+
+    def __call__(self, arguments):
+        self.ran.append(arguments)
+        code = 130 if len(self.ran) == self.fail_at else 0
+        place = next((arguments[i + 1] for i, part in enumerate(arguments) if part in ("--run-dir", "--resume")), None)
+        if place:
+            folder = steps.Path(place)
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / "run.json").write_text(json.dumps({"status": "interrupted" if code else "finished"}))
+            (folder / "metrics.jsonl").write_text("")
+        return type("Done", (), {"returncode": code, "stdout": json.dumps(printed(arguments)).encode()})()
+
+
+def printed(arguments):
+    if arguments[0] == "eval":
+        names = [part.rpartition("/")[2] for part in arguments[1:] if "/train/" in part]
+        names += [arguments[i + 1] for i, part in enumerate(arguments) if part == "--controller"]
+        return {"methods": [entry(50) | {"name": name, "episodes_detail": []} for name in names]}
+    if arguments[0] == "sweep" or "sweep/" in arguments[-2]:
+        cells = [cell(8, 6, 0.6, method=name, success=90) for name in ("curriculum-0", "bt")]
+        return {"axes": {"S": [8], "D": [6], "v": [0.6]}, "cells": cells}
+    if arguments[0] == "profile":
+        row = {"num_envs": 1, "env_steps_per_s": {"step": 1.0, "step_inference": 1.0, "train": 1.0}}
+        return {"paper_latency": [], "paper_density": [], "rows": [row], "real_time": None}
+    return {}
+
+
+class Quiet:
+    def __init__(self):
+        self.told = []
+
+    def note(self, text):
+        self.told.append(text)
+
+
+def test_an_interrupted_reproduction_goes_on_and_runs_no_step_twice(tmp_path, monkeypatch):
+    place, watch = tmp_path / "run", Quiet()
+    first = Uuv(monkeypatch, fail_at=3)
+    with pytest.raises(KeyboardInterrupt):
+        reproduce("quick", place, watch)
+    assert any(f"--resume {place}" in text for text in watch.told)
+    second = Uuv(monkeypatch)
+    document, _ = resume(place, Quiet())
+    wanted = steps.steps_of(steps.BUDGETS["quick"], document.get("policy"), place)
+    assert len(first.ran) + len(second.ran) == len(wanted) + 1, "the interrupted step alone runs again"
+    assert (place / "results.md").read_text() == results_page(document)
+    assert str(place) not in json.dumps(document["commands"]), "commands are told without the machine's paths"
+    third = Uuv(monkeypatch)
+    assert resume(place, Quiet())[0]["claims"] == document["claims"]
+    assert third.ran == []
+
+
+def test_a_step_that_fails_says_which(tmp_path, monkeypatch):
+    monkeypatch.setattr(steps, "launch", lambda _arguments: type("Done", (), {"returncode": 2, "stdout": b""})())
+    with pytest.raises(RunFolderError, match="train ppo, seed 0: 'uuv train ppo"):
+        reproduce("quick", tmp_path / "run", Quiet())
+
+
+def test_bad_input_is_refused_before_anything_is_written(tmp_path):
+    with pytest.raises(ValueError, match="quick or full"):
+        reproduce("slow", tmp_path / "run", Quiet())
+    assert not (tmp_path / "run").exists()
+    with pytest.raises(RunFolderError, match="give the folder"):
+        resume(tmp_path, Quiet())
+
+
+def test_tables_are_markdown():
+    assert table(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | --- |\n| 1 | 2 |"

@@ -1,0 +1,120 @@
+"""The key tables of a reproduction as Markdown: docs/results.md is one of these pages."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from uuvtai.measure.reproduce import paper
+from uuvtai.measure.reproduce.claims import COLLIDED, pooled
+from uuvtai.measure.statistics import mean
+
+
+def results_page(document: dict[str, Any]) -> str:
+    """The whole page of a ``uuv reproduce --json`` document."""
+    machine = document["hardware"]
+    head = [
+        "# Results",
+        f"`uuv reproduce --budget {document['budget']}`, {document['started']}, commit {document['git_sha'] or 'unknown'}, "
+        f"{machine['cpu']}, {machine['cores']} cores. Intervals are 95 % (Wilson). RUN is the reproduction's folder; the evaluations' seed "
+        "was never trained or tuned on.",
+    ]
+    parts = [_claims(document), _main(document), _ceilings(document), _sweeps(document), _timing(document), _paper_notes(document)]
+    return "\n\n".join(["\n".join(head), *parts]) + "\n"
+
+
+def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def _claims(document: dict[str, Any]) -> str:
+    rows = [[c["text"], c["theirs"], c["ours"], c["verdict"]] for c in document["claims"]]
+    return "## The paper's claims\n" + table(["claim", "the paper", "here", "verdict"], rows)
+
+
+def _main(document: dict[str, Any]) -> str:
+    rows = []
+    for name, entries in document["table_main"].items():
+        printed = paper.TABLE_MAIN.get(name)
+        theirs = f"{printed.success:.2f} / {printed.collision:.2f} / {printed.tts_s} s" if printed else "-"
+        arrived = mean([m["time_to_success_mean_s"] for m in entries if m["time_to_success_mean_s"] is not None])
+        time = "-" if arrived is None else f"{arrived:.1f} s"
+        rows.append([f"`{name}`", str(len(entries)), str(pooled(entries, "success")), str(pooled(entries, *COLLIDED)), time, theirs])
+    heads = ["method", "training seeds", "success", "collision", "time to success", "the paper: success / collision / TTS"]
+    return f"## Table main and ablations\n`{document['commands']['eval/main']}`\n\n" + table(heads, rows)
+
+
+def _ceilings(document: dict[str, Any]) -> str:
+    rows = [
+        [f"`{m['name']}`", str(pooled([m], "success")), str(pooled([m], *COLLIDED)), _seconds(m["time_to_success_mean_s"])]
+        for m in document["ceilings"]["methods"]
+    ]
+    note = "`bt+truth` is told the true bodies, `oracle` knows the future: privileged, no methods."
+    return f"## Ceilings\n{note} `{document['commands']['eval/ceilings']}`\n\n" + table(["", "success", "collision", "time"], rows)
+
+
+def _sweeps(document: dict[str, Any]) -> str:
+    return "\n\n".join(
+        f"## Sweep: {name}\n`{document['commands'][f'sweep/{name}']}`\n\n{_sweep(sweep)}" for name, sweep in document["sweeps"].items()
+    )
+
+
+def _sweep(sweep: dict[str, Any]) -> str:
+    """Rows: method and every axis but the speed; columns: speeds; cells: success / collision in %."""
+    axes = [("v_m_s" if name == "v" else name) for name in sweep["axes"]]
+    across = "v_m_s" if "v_m_s" in axes else axes[-1]
+    down = [name for name in axes if name != across]
+    values = list(dict.fromkeys(cell.get(across) for cell in sweep["cells"]))
+    lines: dict[tuple[Any, ...], dict[Any, str]] = {}
+    for cell in sweep["cells"]:
+        key = (cell["method"], *(str(cell.get(name, "")) for name in down))
+        lines.setdefault(key, {})[str(cell.get(across))] = _both(cell)
+    heads = ["method", *down, *("nothing moves" if value is None else f"{across} = {value}" for value in values)]
+    rows = [[*map(str, key), *(found.get(str(value), "") for value in values)] for key, found in lines.items()]
+    return "success / collision in %\n\n" + table(heads, rows)
+
+
+def _both(cell: dict[str, Any]) -> str:
+    return f"{100 * pooled([cell], 'success').rate:.0f} / {100 * pooled([cell], *COLLIDED).rate:.0f}"
+
+
+def _timing(document: dict[str, Any]) -> str:
+    profile = document["profile"]
+    rows = [
+        [r["component"], _ms(r["mean_ms"]), _ms(r["max_ms"]), _ms(r["paper_mean_ms"]), _ms(r["paper_max_ms"])]
+        for r in profile["paper_latency"]
+        if r["mean_ms"] is not None
+    ]
+    density = [
+        [str(r["D"]), _ms(r["loop_ms"]), _ms(r["paper_loop_ms"]), _one(r["replans_per_episode"]), _one(r["paper_replans"])]
+        for r in profile["paper_density"]
+    ]
+    rates = [
+        [f"{r['num_envs']:,}", *(f"{r['env_steps_per_s'][k]:,.0f}" for k in ("step", "step_inference", "train"))] for r in profile["rows"]
+    ]
+    return "\n\n".join(
+        [
+            f"## Timing\n`{document['commands']['profile']}`",
+            table(["one vehicle", "mean ms", "max ms", "paper mean ms", "paper max ms"], rows),
+            table(["D", "loop ms", "paper ms", "replans an episode", "paper"], density),
+            table(["envs", "env-steps/s", "+ inference", "+ training"], rates),
+        ]
+    )
+
+
+def _paper_notes(document: dict[str, Any]) -> str:
+    return "## Where the paper's figures do not add up\n" + "\n".join(f"- {text}" for text in document["inconsistencies"])
+
+
+def _seconds(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1f} s"
+
+
+def _ms(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
+
+
+def _one(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1f}"

@@ -1,0 +1,144 @@
+"""Runs the steps of a reproduction, gathers what they found, judges the claims and writes it all down."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from uuvtai.loader import load_config, preset_names
+from uuvtai.measure.reproduce import claims, paper
+from uuvtai.measure.reproduce.markdown import results_page
+from uuvtai.measure.reproduce.steps import BUDGETS, EVALUATION_SEED, TRAINED, Budget, Step, is_done, result_file, run_step, steps_of
+from uuvtai.run_folder import RunFolder, RunFolderError, default_run_dir, refuse_place
+
+REQUEST, RESULT, PAGE = "reproduce_request.json", "reproduce.json", "results.md"
+
+
+class Watch(Protocol):
+    """Shows how far it is."""
+
+    def note(self, text: str) -> None: ...
+
+
+def reproduce(budget: str, run_dir: Path | None, watch: Watch) -> tuple[dict[str, Any], Path]:
+    """Begin a reproduction: its document and its folder. Raises ValueError for an unknown budget, RunFolderError."""
+    if budget not in BUDGETS:
+        raise ValueError(f"--budget {budget!r}: {' or '.join(BUDGETS)}")
+    root = (run_dir or default_run_dir(f"reproduce-{budget}")).absolute()
+    refuse_place(root)
+    folder = RunFolder(root, load_config("pool"), [EVALUATION_SEED])
+    folder.hold()
+    folder.write_json(REQUEST, {"schema": 1, "budget": budget, "policy": "best" if "best" in preset_names("policy") else None})
+    return _run(folder, watch), root
+
+
+def resume(place: Path, watch: Watch) -> tuple[dict[str, Any], Path]:
+    """Go on with a reproduction that was killed or interrupted; finished steps stay as they are. Raises RunFolderError."""
+    try:
+        request = json.loads((place / REQUEST).read_text(encoding="utf-8"))
+        known = request["budget"] in BUDGETS and "policy" in request
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise RunFolderError(f"{place / REQUEST}: cannot be read ({error}); give the folder that 'uuv reproduce' printed") from None
+    if not known:
+        raise RunFolderError(f"{place / REQUEST}: no budget of this version; begin a new reproduction")
+    return _run(RunFolder.reopen(place.absolute(), {}), watch), place.absolute()
+
+
+def _run(folder: RunFolder, watch: Watch) -> dict[str, Any]:
+    request = json.loads((folder.path / REQUEST).read_text(encoding="utf-8"))
+    steps = steps_of(BUDGETS[request["budget"]], request["policy"], folder.path)
+    status, code = "failed", 1
+    try:
+        for number, step in enumerate(steps, start=1):
+            _step(step, f"{number}/{len(steps)} {step.name}", folder, watch)
+        document = document_of(folder.path, request, steps)
+        folder.write_json(RESULT, document)
+        folder.write(PAGE, results_page(document))
+        status, code = "finished", 0
+        return document
+    except KeyboardInterrupt:
+        status, code = "interrupted", 130
+        watch.note(f"what is finished is kept; go on with: uuv reproduce --resume {folder.path}")
+        raise
+    finally:
+        folder.finish(status, code)
+
+
+def _step(step: Step, name: str, folder: RunFolder, watch: Watch) -> None:
+    if is_done(step, folder.path) and result_file(step, folder.path).exists():
+        watch.note(f"{name}: done before")
+        return
+    watch.note(f"{name}: uuv {' '.join(step.argv(folder.path))}")
+    began = time.perf_counter()
+    run_step(step, folder.path)
+    watch.note(f"{name}: {time.perf_counter() - began:.0f} s")
+
+
+# ---------------------------------------------------------------------------------------------------------------- gathering
+
+
+def document_of(root: Path, request: dict[str, Any], steps: Sequence[Step]) -> dict[str, Any]:
+    """The ``uuv reproduce --json`` document: results of every step by its folder, and the verdicts."""
+    results = {step.folder: json.loads(result_file(step, root).read_text(encoding="utf-8")) for step in steps}
+    record = json.loads((root / "run.json").read_text(encoding="utf-8"))
+    budget = BUDGETS[request["budget"]]
+    by_preset = _by_preset(results["eval/main"], budget)
+    return {
+        "schema": 1,
+        "budget": request["budget"],
+        "started": record["started"],
+        "git_sha": record["git_sha"],
+        "hardware": record["hardware"],
+        "versions": record["versions"],
+        "python": sys.version.split()[0],
+        "commands": {step.folder: "uuv " + " ".join(_shown(part, root) for part in step.argv(root)) for step in steps},
+        "table_main": by_preset,
+        "claims": [vars(claim) for claim in _claims(root, results, by_preset, request["policy"])],
+        "inconsistencies": list(paper.INCONSISTENCIES),
+        "ceilings": results["eval/ceilings"],
+        "transfer": results["eval/transfer"],
+        "sweeps": {folder.removeprefix("sweep/"): found for folder, found in results.items() if folder.startswith("sweep/")},
+        "profile": results["profile"],
+    }
+
+
+def _shown(part: str, root: Path) -> str:
+    """An argument without the machine's paths."""
+    return part.replace(str(root), "RUN")
+
+
+def _by_preset(main: dict[str, Any], budget: Budget) -> dict[str, list[dict[str, Any]]]:
+    """Entries of the methods' table by preset, without their single episodes."""
+    entries = {entry["name"]: {k: v for k, v in entry.items() if k != "episodes_detail"} for entry in main["methods"]}
+    trained = {preset: [entries[f"{preset}-{seed}"] for seed in range(budget.training_seeds)] for preset in TRAINED}
+    return trained | {name: [entries[name]] for name in ("bt", "planner", "straight")}
+
+
+def _claims(root: Path, results: dict[str, Any], by_preset: dict[str, Any], policy: str | None) -> list[claims.Claim]:
+    cells = results["sweep/pool"]["cells"]
+    names = list(dict.fromkeys(cell["method"] for cell in cells))
+    pilot = next(name for name in names if name != "bt")
+    there = next(entry for entry in results["eval/transfer"]["methods"] if entry["name"] != "bt")
+    here = None if policy else by_preset["curriculum"][0]
+    return [
+        *claims.of_table_main(by_preset),
+        *claims.of_training(_metrics(root / "train" / "curriculum-0")),
+        *(claim for name in (pilot, "bt") for claim in claims.of_sweep(cells, name)),
+        *claims.of_timing(results["profile"]),
+        *(claims.of_transfer(here or _cell_of(cells, pilot), there)),
+    ]
+
+
+def _cell_of(cells: Sequence[dict[str, Any]], method: str) -> dict[str, Any]:
+    """The pool's own condition in the sweep."""
+    return next(cell for cell in cells if cell["method"] == method and (cell["S"], cell["D"], cell["v_m_s"]) == (8, 6, 0.6))
+
+
+def _metrics(run: Path) -> list[dict[str, Any]]:
+    from uuvtai.learn.recorder import read_metrics
+
+    return read_metrics(run)
