@@ -273,12 +273,14 @@ def _gone(pid, patience_s=30.0):
     return False
 
 
-def test_a_ray_cluster_gives_the_same_results():
-    pytest.importorskip("ray", reason="the extra [cluster] is not installed")
+def test_a_ray_cluster_gives_the_same_results_and_runs_lost_tasks_again(tmp_path):
+    ray = pytest.importorskip("ray", reason="the extra [cluster] is not installed")
     engine = RayEngine("local", cpus_per_task=1)
+    assert list(engine.run(sweep_work.fall_once, [str(tmp_path / "a")])) == [(0, "a")]
     assert sorted(engine.run(sweep_work.square, [3, 1, 2])) == [(0, 9), (1, 1), (2, 4)]
     with pytest.raises(ValueError, match="-2 is negative"):
         list(engine.run(sweep_work.square, [-2]))
+    ray.shutdown()
 
 
 def test_without_ray_the_error_says_what_to_install(monkeypatch):
