@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -130,6 +131,18 @@ def test_every_bound_is_of_a_column(small):
     assert (space.high[places["sector_range"]] == small.config.sensors.sonar.max_range_m).all() and np.isinf(
         space.low[places["goal"]]
     ).all()
+
+
+def test_the_docs_list_the_columns(small):
+    features = small.config.features.model_copy(update={"n_track": 1, "teacher": True})
+    per = {"": "", "sector": " a sector", "body": " a body"}
+    rows = [
+        f"| `{column.name}` | {column.width}{per[column.per]} | {column.unit} | {column.frame} | {column.meaning} |"
+        for column, _first, _width in placed_columns(features)
+    ]
+    told = (Path(__file__).parents[1] / "docs" / "gym.md").read_text().splitlines()
+    first = told.index(rows[0])
+    assert told[first : first + len(rows)] == rows
 
 
 def test_same_step_tells_the_end_beside_the_next_beginning(make):
