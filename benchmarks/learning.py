@@ -35,7 +35,7 @@ def _row(job: Job, sensors: str, num_envs: int, iterations: int) -> Row:
     parts = {name: 1e6 * sum(metrics[key] for metrics in told) / samples for name, key in _PARTS.items()}
     trainer.env.close()
     job.say(f"{sensors} sensing: Stable-Baselines3")
-    theirs = _theirs(VectorEnv(sim, seed=1), config, iterations)
+    theirs = _theirs(sim, config, iterations)
     return Row(
         what=f"{sensors} sensing, all of `uuv train curriculum`, {num_envs:,} envs",
         ours=ours,
@@ -48,15 +48,17 @@ def _row(job: Job, sensors: str, num_envs: int, iterations: int) -> Row:
     )
 
 
-def _theirs(env: VectorEnv, config: LearningConfig, iterations: int) -> float:
+def _theirs(sim: Sim, config: LearningConfig, iterations: int) -> float:
     """Env-steps per second of SB3's PPO with our sizes: networks, rollout, epochs, minibatches."""
     from stable_baselines3 import PPO
 
-    from benchmarks.peers.sb3_env import Sb3Env
+    from uuvtai.gym import UuvVectorEnv
+    from uuvtai.gym.sb3 import Sb3VecEnv
 
-    samples = config.ppo.rollout_steps * env.num_envs
+    samples = config.ppo.rollout_steps * sim.num_envs
     model = PPO(
-        "MlpPolicy", Sb3Env(env), device="cpu", n_steps=config.ppo.rollout_steps, batch_size=samples // config.ppo.minibatches,
+        "MlpPolicy", Sb3VecEnv(UuvVectorEnv(sim=sim)), seed=1, device="cpu",
+        n_steps=config.ppo.rollout_steps, batch_size=samples // config.ppo.minibatches,
         n_epochs=config.ppo.epochs, learning_rate=config.ppo.learning_rate, policy_kwargs={"net_arch": list(config.policy.hidden)},
     )  # fmt: skip
     model.learn(samples)

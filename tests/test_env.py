@@ -115,6 +115,22 @@ def test_the_horizon_truncates(env):
     assert torch.equal(info["episode_return"][[2, 5]], reward[[2, 5]]), "a new episode's return begins at 0"
 
 
+def test_without_autoreset_an_ended_row_rests_until_its_reset(env):
+    with VectorEnv(env.sim, seed=SEED, autoreset=False) as resting:
+        resting.reset()
+        near_horizon(resting, [2], steps_left=1)
+        obs, reward, _terminated, truncated, _info = resting.step(full([0.5, 0, 0, 0]))
+        assert truncated.tolist() == [i == 2 for i in range(N)] and reward[2] != 0
+        last = obs[2].clone()
+        obs, reward, _terminated, truncated, info = resting.step(full([0.5, 0, 0, 0]))
+        assert truncated[2] and reward[2] == 0 and torch.equal(obs[2], last) and OUTCOMES[info["outcome"][2]] == "timeout"
+        resting.reset(mask=truncated.clone())
+        _obs, reward, _terminated, truncated, info = resting.step(full([0.5, 0, 0, 0]))
+        assert (
+            not truncated.any() and info["episode"][2] == N + 2 and info["episode_steps"].tolist() == [1 if i == 2 else 3 for i in range(N)]
+        )
+
+
 def test_every_row_goes_on_through_its_own_episodes(env):
     env.reset(seed=SEED)
     for turn in range(1, 4):

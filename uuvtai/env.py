@@ -52,7 +52,7 @@ def observation_sha256(table: tuple[ObservationColumn, ...]) -> str:
 
 
 class VectorEnv:
-    """``num_envs`` episodes side by side; an env whose episode ends begins its next one in the same step.
+    """``num_envs`` episodes side by side; an env whose episode ends begins its next one in the same step (``autoreset``).
 
     Env i plays the episodes i, i + num_envs, i + 2 num_envs, ... of its seed, the same scenarios whatever is done in them. Actions are
     float32 (num_envs, 4): surge, sway, heave, yaw rate in parts of the vehicle's limits, body frame; beyond [-1, 1] they are clamped.
@@ -66,10 +66,14 @@ class VectorEnv:
     reward_terms = TERMS
     """names of the columns of ``info["reward_terms"]`` and ``info["episode_terms"]``"""
 
-    def __init__(self, sim: Sim, seed: int = 0, check_actions: bool | None = None) -> None:
-        """``check_actions``: refuse actions that are not finite (default: on the CPU; a GPU would wait). Unchecked, NaN = stop."""
+    def __init__(self, sim: Sim, seed: int = 0, check_actions: bool | None = None, autoreset: bool = True) -> None:
+        """``check_actions``: refuse actions that are not finite (default: on the CPU; a GPU would wait). Unchecked, NaN = stop.
+
+        Without ``autoreset`` an env whose episode has ended rests: it earns 0 and tells its end again in every step, until a ``reset``
+        with a mask begins its next episode.
+        """
         self.sim, self.num_envs, self.device = sim, sim.num_envs, sim.device
-        self.config = sim.config
+        self.config, self.autoreset = sim.config, autoreset
         self.check_actions = sim.device.type == "cpu" if check_actions is None else check_actions
         self.observation_table = tuple(
             ObservationColumn(column.name, slice(first, first + width), column.unit, column.frame, column.meaning)
@@ -147,8 +151,7 @@ class VectorEnv:
         torch.ne(sim.truncated, 0, out=self._truncated)
         ended = self._terminated | self._truncated
         if bool(ended.any()):
-            self._number += self.num_envs * ended
-            self._begin(ended)
+            self._go_on(ended)
         sim.read_into(sim.s.teacher.leaf, info["leaf"])
         return self._obs, sim.reward, self._terminated, self._truncated, dict(info)
 
@@ -227,6 +230,14 @@ class VectorEnv:
     def __exit__(self, *_error: Any) -> None:
         """Close."""
         self.close()
+
+    def _go_on(self, ended: torch.Tensor) -> None:
+        """The next episodes of the rows that ended, or rest."""
+        if not self.autoreset:
+            self.sim.sleep_ended()
+            return
+        self._number += self.num_envs * ended
+        self._begin(ended)
 
     def _begin(self, rows: torch.Tensor) -> None:
         self.sim.reset(rows.to(torch.int32), self._seed, self._number)

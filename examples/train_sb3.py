@@ -1,0 +1,42 @@
+"""PPO of Stable-Baselines3 on the batch: ``python examples/train_sb3.py`` (pip install 'uuvtai[sb3]')."""
+
+from __future__ import annotations
+
+import numpy as np
+from judge import HOLD_STEPS, Act, main
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecNormalize
+
+from uuvtai.gym import UuvVectorEnv
+from uuvtai.gym.sb3 import Sb3VecEnv
+from uuvtai.sim import Sim
+
+ROLLOUT_STEPS = 64
+
+
+def train(sim: Sim, iterations: int) -> Act:
+    """The policy after so many rollouts and updates; observations and rewards are scaled by SB3's own wrapper."""
+    envs = VecNormalize(Sb3VecEnv(UuvVectorEnv(sim=sim, hold_steps=HOLD_STEPS)), gamma=0.99)
+    model = PPO(
+        "MlpPolicy",
+        envs,
+        seed=0,
+        device="cpu",
+        n_steps=ROLLOUT_STEPS,
+        batch_size=ROLLOUT_STEPS * envs.num_envs // 4,
+        n_epochs=5,
+        learning_rate=1e-3,
+        ent_coef=0.0,
+        policy_kwargs={"log_std_init": -0.7},
+    )
+    if iterations:
+        model.learn(iterations * ROLLOUT_STEPS * envs.num_envs)
+
+    def act(obs: np.ndarray) -> np.ndarray:
+        return model.predict(np.asarray(envs.normalize_obs(obs)), deterministic=True)[0]
+
+    return act
+
+
+if __name__ == "__main__":
+    main(train, iterations=40)

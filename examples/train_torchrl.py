@@ -1,0 +1,65 @@
+"""PPO of TorchRL on the batch: ``python examples/train_torchrl.py`` (pip install 'uuvtai[torchrl]')."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from judge import HOLD_STEPS, Act, main
+from tensordict.nn import TensorDictModule
+from tensordict.nn.distributions import NormalParamExtractor
+from torch import nn
+from torchrl.collectors import Collector
+from torchrl.envs import GymWrapper, TransformedEnv, VecNormV2
+from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+
+from uuvtai.gym import UuvVectorEnv
+from uuvtai.sim import Sim
+
+ROLLOUT_STEPS, EPOCHS, MINIBATCHES = 64, 5, 4
+
+
+def network(inputs: int, outputs: int) -> nn.Sequential:
+    """Two hidden layers."""
+    return nn.Sequential(nn.Linear(inputs, 64), nn.Tanh(), nn.Linear(64, 64), nn.Tanh(), nn.Linear(64, outputs))
+
+
+def train(sim: Sim, iterations: int) -> Act:
+    """The policy after so many rollouts and updates; observations are scaled by TorchRL's own transform."""
+    torch.manual_seed(0)
+    norm = VecNormV2(["observation"], decay=1.0, reduce_batch_dims=True)
+    envs = TransformedEnv(GymWrapper(UuvVectorEnv(sim=sim, hold_steps=HOLD_STEPS, autoreset_mode="Disabled")), norm)
+    envs.set_seed(0)
+    n_obs, n_act = envs.observation_spec["observation"].shape[-1], envs.action_spec.shape[-1]
+    spread = nn.Sequential(network(n_obs, 2 * n_act), NormalParamExtractor("biased_softplus_0.5"))
+    actor = ProbabilisticActor(
+        TensorDictModule(spread, ["observation"], ["loc", "scale"]),
+        ["loc", "scale"],
+        distribution_class=IndependentNormal,
+        return_log_prob=True,
+    )
+    critic = ValueOperator(network(n_obs, 1), ["observation"])
+    loss, advantage = ClipPPOLoss(actor, critic, entropy_coeff=0.0, critic_coeff=0.5), GAE(gamma=0.99, lmbda=0.95, value_network=critic)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
+    frames = ROLLOUT_STEPS * sim.num_envs
+    quiet = {"auto_register_policy_transforms": False}
+    for batch in Collector(envs, actor, frames_per_batch=frames, total_frames=iterations * frames, **quiet) if iterations else ():
+        for _ in range(EPOCHS):
+            advantage(batch)
+            for part in batch.reshape(-1)[torch.randperm(frames)].split(frames // MINIBATCHES):
+                terms = loss(part)
+                optimizer.zero_grad()
+                (terms["loss_objective"] + terms["loss_critic"]).backward()
+                nn.utils.clip_grad_norm_(loss.parameters(), 0.5)
+                optimizer.step()
+
+    def act(obs: np.ndarray) -> np.ndarray:
+        with torch.no_grad():
+            return spread((torch.from_numpy(obs) - norm.loc["observation"]) / norm.scale["observation"])[0].numpy()
+
+    return act
+
+
+if __name__ == "__main__":
+    main(train, iterations=40)

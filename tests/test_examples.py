@@ -1,0 +1,149 @@
+"""The examples: every script runs, on the session's simulator and with short episodes, and gives the result that it promises."""
+
+import importlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from tests.test_world import Drawn
+from uuvtai.env import VectorEnv
+from uuvtai.gym import UuvVectorEnv
+from uuvtai.loader import load_config
+from uuvtai.runtime import start_taichi
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+N = 8
+MOST_LINES = {"train": 80, "custom": 60}
+"""a newcomer reads an example in one go"""
+SHORT = 60
+"""[control steps] of an episode here"""
+TRAINERS = {"train_sb3": "stable_baselines3", "train_skrl": "skrl", "train_torchrl": "torchrl", "train_rsl_rl": "rsl_rl"}
+
+
+@pytest.fixture
+def example(monkeypatch):
+    """Module of an example, as ``python examples/NAME.py`` would find what it imports."""
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    return importlib.import_module
+
+
+@pytest.fixture
+def short(small, monkeypatch):
+    """The session's simulator with every episode begun shortly before its horizon."""
+    small.sim.use_tree(small.trees["bt"])
+    begin = small.sim.reset
+
+    def reset(mask, seed, number):
+        begin(mask, seed, number)
+        for row in mask.nonzero().flatten().tolist():
+            small.sim.s.clock.step[row] = small.config.episode.horizon_steps - SHORT
+
+    monkeypatch.setattr(small.sim, "reset", reset)
+    yield small.sim
+    small.sim.use_tree(small.trees["bt"])
+
+
+@pytest.mark.parametrize("name", TRAINERS)
+def test_a_trainer_learns_for_two_updates(short, example, monkeypatch, name):
+    pytest.importorskip(TRAINERS[name], reason=f"{TRAINERS[name]} is not installed")
+    module = example(name)
+    if name == "train_rsl_rl":
+        monkeypatch.setitem(module.CONFIG, "num_steps_per_env", 8)
+    else:
+        monkeypatch.setattr(module, "ROLLOUT_STEPS", 8)
+    obs, _info = UuvVectorEnv(sim=short).reset(seed=1)
+    before, again, after = (module.train(short, iterations)(obs) for iterations in (0, 0, 2))
+    assert after.shape == (N, 4) and np.isfinite(after).all()
+    np.testing.assert_array_equal(before, again)
+    assert not np.allclose(before, after)
+
+
+def test_judge_plays_each_env_once(short, example):
+    """The return is that of the first episode, though other envs go on for longer."""
+    judge = example("judge")
+    seen = []
+
+    def act(obs):
+        seen.append(len(obs))
+        return np.zeros((N, 4), np.float32)
+
+    returns, won = judge.judge(short, act, seed=5)
+    assert won == 0 and seen == [N] * (SHORT // judge.HOLD_STEPS)
+    native = VectorEnv(short, seed=5)
+    native.reset()
+    for _ in range(SHORT):
+        *_rest, info = native.step(torch.zeros(N, 4))
+    np.testing.assert_allclose(returns, info["episode_return"], atol=1e-3)
+
+
+def test_custom_controller_prints_a_table(short, example):
+    head, *rows = example("custom_controller").main(short).splitlines()
+    assert head.split() == ["controller", "success", "return"]
+    assert [row.split()[0] for row in rows] == ["careful", "blind"] and all(f"/{N}" in row for row in rows)
+
+
+def test_custom_controller_turns_and_stops(small, example):
+    module = example("custom_controller")
+    columns, obs = VectorEnv(small.sim).columns, np.zeros((3, VectorEnv(small.sim).num_obs), np.float32)
+    obs[:, columns["sector_range"]] = 12.0
+    obs[:, columns["heading_error"]] = [[0, 1], [1, 0], [0, 1]]
+    obs[2, columns["sector_range"].start] = 0.4
+    action = module.careful(obs, columns)
+    assert action[0, 0] == 1 and action[0, 3] == 0, "free and straight ahead: full speed"
+    assert action[1, 0] == pytest.approx(0, abs=1e-6) and action[1, 3] == 1, "to the left: turn left on the spot"
+    assert action[2, 0] < 0, "too near: back"
+
+
+def test_custom_world_is_played_and_drawn(short, example, tmp_path):
+    told = example("custom_world").main(tmp_path / "new" / "harbour.png", short)
+    assert told.startswith("harbour.yaml: timeout") and told.endswith("harbour.png")
+    assert cv2.imread(str(tmp_path / "new" / "harbour.png")).std() > 1
+
+
+def test_custom_world_can_be_placed(taichi_runtime):
+    world = load_config(str(EXAMPLES / "harbour.yaml")).world
+    drawn = Drawn(world, n_env=64).draw()
+    assert not drawn["faults"].any()
+    assert (drawn["kind"] != 0).sum(axis=1).tolist() == [world.n_static + world.n_dynamic + len(world.fixed)] * 64
+
+
+def test_custom_vehicle_follows_its_command(taichi_runtime, example):
+    module = example("custom_vehicle")
+    head, *rows = module.main(start_taichi("cpu")).splitlines()
+    assert head.split()[-2:] == ["4.0", "s"] and [row.split()[0] for row in rows] == ["bluerov2", "heavy_pack"]
+    speeds = np.array([[float(value) for value in row.split()[1:]] for row in rows])
+    assert (np.abs(speeds[:, -1] - 0.6) < 0.02).all() and not np.array_equal(*speeds)
+    ours, theirs = (load_config("open", vehicle=name).vehicle for name in reversed(module.VEHICLES))
+    assert ours.mass_kg > theirs.mass_kg and len(ours.thrusters) == len(theirs.thrusters)
+
+
+def test_custom_reward_changes_the_terms_it_names(small, example, monkeypatch):
+    module = example("custom_reward")
+    names = VectorEnv(small.sim).reward_terms
+    default = module.terms(VectorEnv(small.sim), 30)
+    weights = {key.removeprefix("reward."): value for key, value in module.CAREFUL.items()}
+    changed = small.config.reward.model_copy(update=weights)
+    monkeypatch.setattr(small.sim, "config", small.config.model_copy(update={"reward": changed}))
+    careful = module.terms(VectorEnv(small.sim), 30)
+    for i, name in enumerate(names):
+        factor = getattr(changed, name) / getattr(small.config.reward, name)
+        assert float(careful[i]) == pytest.approx(factor * float(default[i]), rel=1e-4, abs=1e-6)
+        assert (factor != 1) == (name in weights)
+    rows = module.table({"default": default, "careful": careful}, names).splitlines()
+    assert len(rows) == len(names) + 2 and float(rows[-1].split()[1]) == pytest.approx(float(default.sum()), abs=0.01)
+
+
+def test_custom_tree_stands_beside_the_shipped_ones(short, example):
+    head, *rows = example("custom_tree").main(short, episodes=4).splitlines()
+    assert head.split()[0] == "tree" and [row.split()[0] for row in rows] == ["patient", "bt", "planner"]
+    assert all("/4 (" in row for row in rows)
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*_*.py")), ids=lambda path: path.stem)
+def test_an_example_is_short_and_says_what_it_does(path):
+    lines = path.read_text().splitlines()
+    assert len(lines) <= MOST_LINES[path.stem.partition("_")[0]]
+    assert lines[0].startswith('"""') and f"python examples/{path.name}" in path.read_text()

@@ -1,0 +1,89 @@
+"""The batch as Stable-Baselines3 and rsl_rl want it: ends, last observations, time-outs, seeds, and what is refused."""
+
+import numpy as np
+import pytest
+import torch
+
+from uuvtai.gym import UuvVectorEnv
+
+sb3 = pytest.importorskip("stable_baselines3", reason="stable_baselines3 is not installed")
+rsl_rl = pytest.importorskip("rsl_rl", reason="rsl_rl is not installed")
+
+from uuvtai.gym.rsl_rl import RslRlVecEnv  # noqa: E402
+from uuvtai.gym.sb3 import Sb3VecEnv  # noqa: E402
+
+N = 8
+SEED = 3
+
+
+@pytest.fixture
+def batch(small):
+    """Batches on the session's simulator."""
+    small.sim.use_tree(small.trees["bt"])
+    return lambda **options: UuvVectorEnv(sim=small.sim, **options)
+
+
+def near_horizon(envs, rows, steps_left):
+    for row in rows:
+        envs.native.sim.s.clock.step[row] = envs.native.config.episode.horizon_steps - steps_left
+
+
+def test_sb3_gets_last_observations_and_statistics(batch):
+    envs = batch(hold_steps=2)
+    adapter = Sb3VecEnv(envs)
+    adapter.seed(SEED)
+    first = adapter.reset()
+    np.testing.assert_array_equal(first, batch().reset(seed=SEED)[0])
+    adapter.seed(SEED)
+    adapter.reset()
+    near_horizon(envs, [5], steps_left=4)
+    assert adapter.step(np.zeros((N, 4), np.float32))[3] == [{}] * N
+    obs, reward, ended, infos = adapter.step(np.zeros((N, 4), np.float32))
+    assert ended.tolist() == [i == 5 for i in range(N)] and reward.shape == (N,)
+    assert [sorted(info) for info in infos] == [
+        ["TimeLimit.truncated", "episode", "is_success", "terminal_observation"] if i == 5 else [] for i in range(N)
+    ]
+    told = infos[5]
+    assert told["TimeLimit.truncated"] and not told["is_success"]
+    assert told["episode"]["l"] == envs.native.config.episode.horizon_steps // 2
+    goal = envs.native.columns["goal"]
+    assert np.abs(told["terminal_observation"][goal] - first[5, goal]).max() < 0.2 < np.abs(obs[5, goal] - first[5, goal]).max()
+    assert adapter.env_is_wrapped(object) == [False] * N and adapter.get_attr("num_envs") == [N] * N
+    for use in (lambda: adapter.set_attr("x", 1), lambda: adapter.env_method("x")):
+        with pytest.raises(NotImplementedError, match="no attributes or methods of single envs"):
+            use()
+    adapter.close()
+    with pytest.raises(RuntimeError, match="closed"):
+        adapter.reset()
+
+
+def test_rsl_rl_gets_time_outs_apart(batch):
+    envs = batch(backend="torch", hold_steps=2)
+    adapter = RslRlVecEnv(envs, seed=SEED)
+    assert adapter.max_episode_length == envs.native.config.episode.horizon_steps // 2
+    before = adapter.get_observations()["policy"]
+    kept = before.clone()
+    near_horizon(envs, [5], steps_left=4)
+    _obs, _reward, ended, extras = adapter.step(torch.zeros(N, 4))
+    assert not ended.any() and extras["log"] == {} and torch.equal(before, kept)
+    obs, reward, ended, extras = adapter.step(torch.zeros(N, 4))
+    assert ended.tolist() == [i == 5 for i in range(N)] and extras["time_outs"].tolist() == ended.float().tolist()
+    assert set(extras["log"]) == {"/episode_return", "/is_success"} and extras["log"]["/is_success"] == 0
+    assert adapter.episode_length_buf.tolist() == [0 if i == 5 else 2 for i in range(N)]
+    assert obs.batch_size == (N,) and torch.equal(obs["policy"], adapter.get_observations()["policy"]) and reward.shape == (N,)
+    with pytest.raises(RuntimeError, match="init_at_random_ep_len=False"):
+        adapter.episode_length_buf = torch.zeros(N)
+
+
+@pytest.mark.parametrize(
+    ("adapter", "options", "words"),
+    [
+        (Sb3VecEnv, {"backend": "torch"}, "'numpy', got SAME_STEP and 'torch'"),
+        (Sb3VecEnv, {"autoreset_mode": "NextStep"}, "needs SAME_STEP .* got NEXT_STEP"),
+        (RslRlVecEnv, {}, "'torch', got SAME_STEP and 'numpy'"),
+        (RslRlVecEnv, {"backend": "torch", "autoreset_mode": "Disabled"}, "got DISABLED"),
+    ],
+)
+def test_other_modes_are_refused(batch, adapter, options, words):
+    with pytest.raises(ValueError, match=words):
+        adapter(batch(**options))
