@@ -62,11 +62,9 @@ def trees_of(names: list[str], max_node: int) -> list[Method]:
     """Methods that a tree drives, by names of trees or paths of their XML, each perhaps with ``+truth``. Raises ConfigError."""
     found = {}
     for name in names:
-        tree, plus, suffix = name.partition("+") if not Path(name).is_file() else (name, "", "")
-        if plus and suffix != TRUTH:
-            raise ConfigError(f"--controller {name}: '+{suffix}' is unknown; the one suffix is +{TRUTH}, for example {tree}+{TRUTH}")
-        label = _label(tree) + plus + suffix
-        found[label] = Method(label, read_tree(tree, max_node), privileged=bool(plus))
+        tree, privileged = _parted(name)
+        label = f"{_label(tree)}+{TRUTH}" if privileged else _label(tree)
+        found[label] = Method(label, read_tree(tree, max_node), privileged=privileged)
     return list(found.values())
 
 
@@ -132,6 +130,16 @@ def _name_of(name: str, checkpoint: Checkpoint) -> str:
         return name
     path = Path(name).resolve()
     return path.name if path != checkpoint.path.resolve() else f"{path.parent.parent.name}-{path.name}"
+
+
+def _parted(name: str) -> tuple[str, bool]:
+    """(tree, whether it is told the truth) of a controller's name. Raises ConfigError."""
+    if "+" not in name or name.endswith(".xml"):
+        return name, False
+    tree, _, suffix = name.rpartition("+")
+    if suffix != TRUTH:
+        raise ConfigError(f"--controller {name}: '+{suffix}' is unknown; the one suffix is +{TRUTH}, for example {tree}+{TRUTH}")
+    return tree, True
 
 
 def _label(name: str) -> str:
