@@ -6,7 +6,7 @@ import pytest
 
 from tests.conftest import SmallSim
 from uuvtai.cli import main
-from uuvtai.measure.ceilings import condition_of, scenarios_of
+from uuvtai.measure.ceilings import condition_of, remainder_of, scenarios_of
 from uuvtai.measure.evaluate import Job, jobs_of
 from uuvtai.measure.methods import trees_of
 
@@ -50,6 +50,11 @@ def test_ceilings_are_rows_of_the_table(borrowed, small, capfd, tmp_path):
     assert oracle["return_mean"] is None and oracle["env_steps"] == 0
     assert json.loads((tmp_path / "run/eval/result.json").read_text()) == document
     assert document["condition"] == condition_of(small.config, scenarios_of(small.sim, jobs_of([SEED], 3)))
+    (remainder,) = document["remainder"]
+    assert remainder == remainder_of(document["methods"])[0]
+    assert (
+        remainder["missed"] == 3 - bt["outcomes"]["success"] == sum(remainder[part] for part in ("sensing", "forecast_decision", "physics"))
+    )
     assert document["condition"]["rides"] == 3 and document["condition"]["detection"]["closing_m_s"] == pytest.approx(1.2)
 
 
@@ -79,6 +84,17 @@ def test_failures_of_a_privileged_tree_are_replayed_with_the_truth(borrowed, cap
     assert len(straight["explain"]) == 3 - straight["outcomes"]["success"] > 0
     assert "explain" not in oracle
     assert [m["name"] for m in json.loads((tmp_path / "run/eval/explain.json").read_text())["methods"]] == ["straight+truth"]
+
+
+def test_what_is_missing_is_split_by_hand():
+    def entry(name, *won):
+        details = [{"seed": 0, "episode": i, "outcome": "success" if i in won else "ttc"} for i in range(10)]
+        return {"name": name, "episodes": 10, "episodes_detail": details}
+
+    entries = [entry("bt", 0, 1, 2, 3), entry("planner", 0), entry("bt+truth", 1, 2, 3, 4, 5, 6), entry("oracle", *range(9))]
+    parts = {"sensing": 2, "forecast_decision": 3, "physics": 1, "lost_with_truth": 1}
+    assert remainder_of(entries) == [{"method": "bt", "episodes": 10, "missed": 6, **parts}]
+    assert remainder_of(entries[:3]) == []
 
 
 def test_scenarios_are_those_that_are_played_in_any_batch(small):

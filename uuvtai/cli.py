@@ -191,9 +191,20 @@ def _print_methods(result: dict[str, Any]) -> None:
         )
     _stdout().print(table)
     _print_condition(result["condition"])
+    for part in result["remainder"]:
+        _print_remainder(part)
     for m in result["methods"]:
         if m["privileged"]:
             _stdout().print(f"[dim]{_DAGGER} {m['name']} is privileged: {_privilege(m['name'])}[/dim]", highlight=False)
+
+
+def _print_remainder(part: dict[str, Any]) -> None:
+    _stdout().print(
+        f"{part['method']} misses {part['missed']} of {part['episodes']}: {part['sensing']} by sensing (told of the moving bodies it "
+        f"arrives), {part['forecast_decision']} by forecast, decision and inertia (a point had a way), {part['physics']} by physics "
+        "(the oracle finds none)",
+        highlight=False,
+    )
 
 
 _DAGGER = "\u2020"

@@ -13,6 +13,7 @@ from uuvtai.config import Config
 from uuvtai.kernels.plan_codes import PLANNERS, REASONS, TRIGGERS
 from uuvtai.measure.compare import ORACLE
 from uuvtai.measure.evaluate import EpisodeResult, Job, Progress, summary
+from uuvtai.measure.methods import TRUTH
 from uuvtai.measure.statistics import rate, wilson_interval
 from uuvtai.privileged.blind_ride import ride_blindly
 from uuvtai.privileged.detection import required_detection
@@ -100,3 +101,33 @@ def condition_of(config: Config, scenarios: list[dict[str, Any]]) -> dict[str, A
         "rides_threatened_ci95": None if interval is None else list(interval),
         "detection": None if detection is None else vars(detection),
     }
+
+
+def remainder_of(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """What each method lacks of 100 %, split: ``remainder`` of ``uuv eval --json``, for methods whose ``+truth`` and the oracle are there.
+
+    Episodes, as differences of successes that add up to ``missed``: sensing = with the true tracks less without, forecast_decision = the
+    oracle's less that (with the vehicle's inertia, which the oracle has not), physics = what the oracle cannot reach either. A part may be
+    negative where knowing more did not help; ``lost_with_truth`` counts the episodes that the method won and its ``+truth`` did not.
+    """
+    won = {entry["name"]: _won(entry) for entry in entries}
+    if ORACLE not in won:
+        return []
+    ceiling = won[ORACLE]
+    return [
+        {
+            "method": name,
+            "episodes": entries[0]["episodes"],
+            "missed": entries[0]["episodes"] - len(own),
+            "sensing": len(told) - len(own),
+            "forecast_decision": len(ceiling) - len(told),
+            "physics": entries[0]["episodes"] - len(ceiling),
+            "lost_with_truth": len(own - told),
+        }
+        for name, own in won.items()
+        if (told := won.get(f"{name}+{TRUTH}")) is not None
+    ]
+
+
+def _won(entry: dict[str, Any]) -> set[tuple[int, int]]:
+    return {(detail["seed"], detail["episode"]) for detail in entry["episodes_detail"] if detail["outcome"] == "success"}

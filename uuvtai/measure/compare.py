@@ -80,7 +80,7 @@ def compare(request: Request, watch: Watch) -> tuple[dict[str, Any], Path]:
         raise ConfigError(f"--seeds {','.join(map(str, request.seeds))}: a seed is given twice; its episodes would be the same")
     run_dir = request.run_dir or default_run_dir(request.world)
     refuse_place(run_dir)
-    from uuvtai.measure.ceilings import condition_of, scenarios_of
+    from uuvtai.measure.ceilings import condition_of, remainder_of, scenarios_of
     from uuvtai.measure.evaluate import document, jobs_of
     from uuvtai.sim import Sim
 
@@ -101,7 +101,7 @@ def compare(request: Request, watch: Watch) -> tuple[dict[str, Any], Path]:
         if ORACLE in request.controllers:
             entries.append(_ask_oracle(request, jobs, scenarios, watch))
         result = document(request.config, request.world, request.sensors, request.seeds, request.episodes, entries)
-        result["condition"] = condition_of(request.config, scenarios)
+        result |= {"condition": condition_of(request.config, scenarios), "remainder": remainder_of(entries)}
         _write_results(folder, result, played)
         if request.explain:
             _explain(request, sim, played, result, folder, watch)
