@@ -22,7 +22,7 @@ FLOOR = {p.stem for p in KERNELS} - STAGES
 """Kernel files that stages may import: all that are no stage themselves."""
 
 SIMULATOR_SIDE = {
-    "actuation", "debug_stamp", "depth", "dynamics", "episode", "proprioception", "reward", "sonar", "world",
+    "actuation", "debug_stamp", "debug_tracks", "depth", "dynamics", "episode", "proprioception", "reward", "sonar", "world",
     "bodies", "hull", "layout", "paths", "raycast", "sonar_error", "rotor",
 }  # fmt: skip
 """Files that may see the truth; every other kernel file is part of the stack and may not."""

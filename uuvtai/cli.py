@@ -61,7 +61,8 @@ def evaluate(
         list[str] | None,
         typer.Option(
             "--controller",
-            help="straight, planner, bt or a tree's XML (repeatable); none = policies alone \\[default: all three, beside a RUN bt].",
+            help="straight, planner, bt or a tree's XML (repeatable); none = policies alone \\[default: all three, beside a RUN bt]. "
+            "Privileged yardsticks: NAME+truth (a tree that knows where every moving body is), oracle (knows the future: an upper bound).",
         ),
     ] = None,
     world: World = "pool",
@@ -179,16 +180,53 @@ def _print_methods(result: dict[str, Any]) -> None:
         o = m["outcomes"]
         collided = o["collision"] + o["ttc"] + o["out_of_tank"]
         table.add_row(
-            m["name"],
+            f"{m['name']} {_DAGGER}" if m["privileged"] else m["name"],
             _rate(o["success"], m["episodes"], m["success_ci95"]),
             _rate(collided, m["episodes"], m["collision_ci95"]),
             f"{o['collision']}/{o['ttc']}/{o['out_of_tank']}/{o['timeout']}",
             _number(m["time_to_success_mean_s"]),
             _number(m["tts_s"]),
             _number(m["replans_per_episode"]),
-            f"{m['env_steps_per_s']:,.0f}",
+            "-" if m["env_steps_per_s"] is None else f"{m['env_steps_per_s']:,.0f}",
         )
     _stdout().print(table)
+    _print_condition(result["condition"])
+    for part in result["remainder"]:
+        _print_remainder(part)
+    for m in result["methods"]:
+        if m["privileged"]:
+            _stdout().print(f"[dim]{_DAGGER} {m['name']} is privileged: {_privilege(m['name'])}[/dim]", highlight=False)
+
+
+def _print_remainder(part: dict[str, Any]) -> None:
+    _stdout().print(
+        f"{part['method']} misses {part['missed']} of {part['episodes']}: {part['sensing']} by sensing (told of the moving bodies it "
+        f"arrives), {part['forecast_decision']} by forecast, decision and inertia (a point had a way), {part['physics']} by physics "
+        "(the oracle finds none)",
+        highlight=False,
+    )
+
+
+_DAGGER = "\u2020"
+
+
+def _privilege(name: str) -> str:
+    if name == "oracle":
+        return "it knows the future and has no inertia; timeout = not reachable. An upper bound, no controller"
+    return "it is told where every moving body is and how it moves; what stands still it senses"
+
+
+def _print_condition(condition: dict[str, Any]) -> None:
+    """How hard the condition is, in one line."""
+    detection, rides = condition["detection"], _rate(condition["rides_threatened"], condition["rides"], condition["rides_threatened_ci95"])
+    if detection is None:
+        return
+    _stdout().print(
+        f"threat rate {condition['threats_per_min']:.2f} per minute ({condition['threats']} moving bodies in "
+        f"{condition['ride_minutes']:.1f} min of blind rides; {rides} of the rides meet one), required detection distance "
+        f"{detection['required_m']:.1f} m (closing {detection['closing_m_s']:.1f} m/s, {detection['aside_s']:.1f} s to move aside)",
+        highlight=False,
+    )
 
 
 def _print_risk(name: str, risk: dict[str, Any]) -> None:

@@ -24,6 +24,7 @@ from uuvtai.kernels import (
     actuation,
     clearance,
     debug_stamp,
+    debug_tracks,
     depth,
     dynamics,
     elevation,
@@ -114,7 +115,8 @@ class Sim:
     """Thousands of vehicles in their worlds, stepped together.
 
     ``action`` is a torch tensor (n_env, 4) in [-1, 1] on the simulator's device: the behaviour tree writes its choice there, the next
-    ``step`` reads it; overwrite it to drive otherwise. ``observation`` is None until somebody asks by ``observe``.
+    ``step`` reads it; overwrite it to drive otherwise. ``observation`` is None until somebody asks by ``observe``. While ``privileged`` is
+    on (a yardstick, off in a new simulator), the tracks of moving bodies are the truth.
     """
 
     def __init__(self, config: Config, num_envs: int, tree: FlatTree, device: str = "cpu") -> None:
@@ -133,6 +135,7 @@ class Sim:
         self._every_row = torch.arange(num_envs, dtype=torch.int32, device=self.device)
         self.fallback = RouteFallback(config)
         self.stage_s: dict[str, float] | None = None
+        self.privileged = False
         self.use_tree(tree)
         self._fill_constants()
 
@@ -179,11 +182,7 @@ class Sim:
     def reset(self, mask: torch.Tensor, seed: torch.Tensor, number: torch.Tensor) -> None:
         """Begin episode ``number`` of ``seed`` in the rows where ``mask`` is 1 (all int32, shape (n_env,)), up to the first observation."""
         c, s = self.config, self.s
-        episode.begin_episodes(mask, seed, number, s.clock, s.episode)
-        with self._stage("world"):
-            world.generate_scenarios(s.world, s.path, s.mission, s.scratch, s.scene, s.fixed, s.episode, s.clock, c.world)
-            world.move_obstacles(s.world, s.path, s.clock, c.episode)
-        check_scenarios(self.rows(s.world.faults)[mask.cpu().numpy() == 1])
+        self.draw(mask, seed, number)
         dynamics.reset_vehicle(s.vehicle, s.params, s.current, s.mission, s.episode, s.clock, c.vehicle, c.disturbance, c.episode)
         actuation.reset_actuation(s.actuation, s.clock)
         proprioception.reset_proprioception(s.ego, s.ego_memory, s.vehicle, s.episode, s.clock, c.sensors)
@@ -198,6 +197,15 @@ class Sim:
         episode.reset_referee(s.referee, s.clock, s.vehicle, s.world, c.vehicle, c.world.tank, c.episode)
         self._perceive()
         episode.wake(s.clock)
+
+    def draw(self, mask: torch.Tensor, seed: torch.Tensor, number: torch.Tensor) -> None:
+        """Draw the scenarios of a ``reset`` and nothing more: to look at them; their rows are not ready to be stepped."""
+        c, s = self.config, self.s
+        episode.begin_episodes(mask, seed, number, s.clock, s.episode)
+        with self._stage("world"):
+            world.generate_scenarios(s.world, s.path, s.mission, s.scratch, s.scene, s.fixed, s.episode, s.clock, c.world)
+            world.move_obstacles(s.world, s.path, s.clock, c.episode)
+        check_scenarios(self.rows(s.world.faults)[mask.cpu().numpy() == 1])
 
     def sleep_ended(self) -> None:
         """Put the rows whose episode has ended to sleep; they cost nothing until their next reset."""
@@ -274,7 +282,22 @@ class Sim:
                 self._observe(self.observation)
 
     def _track(self) -> None:
-        """Moving bodies: by the sonar, by the camera where the fan misses them, how they turn, where they will be, how high they are."""
+        """Moving bodies: where they are, how they turn, where they will be, how high they are."""
+        c, s = self.config, self.s
+        if self.privileged:
+            debug_tracks.take_true_tracks(
+                s.tracks, s.clusters, s.world, s.path, s.ego, s.scan, s.clock, c.elevation, c.sensors.sonar, c.world.tank, c.episode
+            )
+        else:
+            self._sense_bodies()
+        forecast.learn_habits(s.habits, s.tracks, s.clusters, s.clock, c.forecast, c.episode)
+        forecast.forecast_tracks(
+            s.forecast, s.tracks, s.habits, s.clusters, s.image, s.clock, c.forecast, c.tracking, c.world.tank, c.episode
+        )
+        elevation.bound_heights(s.forecast, s.tracks, s.ego, s.clock, c.elevation, c.world.tank)
+
+    def _sense_bodies(self) -> None:
+        """Tracks by the sonar, and by the camera where the fan misses them or does not show their height."""
         c, s = self.config, self.s
         tracking.track_bodies(
             s.tracks,
@@ -306,11 +329,6 @@ class Sim:
             )
         if c.elevation.use_camera:
             look.look_at_bodies(s.tracks, s.image, s.clock, c.elevation, c.sensors.depth, c.world.tank, c.episode)
-        forecast.learn_habits(s.habits, s.tracks, s.clusters, s.clock, c.forecast, c.episode)
-        forecast.forecast_tracks(
-            s.forecast, s.tracks, s.habits, s.clusters, s.image, s.clock, c.forecast, c.tracking, c.world.tank, c.episode
-        )
-        elevation.bound_heights(s.forecast, s.tracks, s.ego, s.clock, c.elevation, c.world.tank)
 
     def _observe(self, obs: torch.Tensor) -> None:
         c, s = self.config, self.s

@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from uuvtai.measure.methods import Method
     from uuvtai.measure.recording import EpisodeRecorder, PolicyNote
     from uuvtai.sim import Sim
+    from uuvtai.tree import FlatTree
+
+ORACLE = "oracle"
+"""controller that is asked, not driven: the privileged upper bound"""
 
 _BATCH = 256
 """Episodes played together by default: enough to fill the cores, few enough that the last stragglers cost little."""
@@ -29,6 +33,7 @@ class Request:
     world: str
     sensors: str
     controllers: list[str]
+    """names of trees, paths of XML files, either with ``+truth``; ``oracle``"""
     seeds: list[int]
     episodes: int
     policies: tuple[str, ...] = ()
@@ -75,6 +80,7 @@ def compare(request: Request, watch: Watch) -> tuple[dict[str, Any], Path]:
         raise ConfigError(f"--seeds {','.join(map(str, request.seeds))}: a seed is given twice; its episodes would be the same")
     run_dir = request.run_dir or default_run_dir(request.world)
     refuse_place(run_dir)
+    from uuvtai.measure.ceilings import condition_of, remainder_of, scenarios_of
     from uuvtai.measure.evaluate import document, jobs_of
     from uuvtai.sim import Sim
 
@@ -82,16 +88,20 @@ def compare(request: Request, watch: Watch) -> tuple[dict[str, Any], Path]:
     methods = _methods(request, watch)
     num_envs = request.num_envs or min(len(jobs), _BATCH)
     watch.note(f"starting {num_envs} envs (the first run on a machine compiles its kernels, about a minute)")
-    sim = Sim(request.config, num_envs, methods[0].tree, request.device)
+    sim = Sim(request.config, num_envs, methods[0].tree if methods else _any_tree(), request.device)
     policies = {method.name: method.driver_for(sim) for method in methods}
     folder = RunFolder(run_dir, request.config, request.seeds)
     status, code = "failed", 1
     played: list[_Played] = []
     entries: list[dict[str, Any]] = []
     try:
+        scenarios = scenarios_of(sim, jobs)
         for method in methods:
             _play(request, sim, method, policies[method.name], jobs, folder, watch, played, entries)
+        if ORACLE in request.controllers:
+            entries.append(_ask_oracle(request, jobs, scenarios, watch))
         result = document(request.config, request.world, request.sensors, request.seeds, request.episodes, entries)
+        result |= {"condition": condition_of(request.config, scenarios), "remainder": remainder_of(entries)}
         _write_results(folder, result, played)
         if request.explain:
             _explain(request, sim, played, result, folder, watch)
@@ -110,10 +120,13 @@ def _methods(request: Request, watch: Watch) -> list[Method]:
     from uuvtai.measure.methods import differences, policies_of, trees_of
 
     max_node = request.config.teacher.max_node
-    methods = [*trees_of(request.controllers, max_node), *policies_of(list(request.policies), max_node, watch.note)]
-    names = [method.name for method in methods]
+    trees = [name for name in request.controllers if name != ORACLE]
+    methods = [*trees_of(trees, max_node), *policies_of(list(request.policies), max_node, watch.note)]
+    names = [method.name for method in methods] + [ORACLE] * (ORACLE in request.controllers)
     if len(set(names)) != len(names):
         raise ConfigError(f"{', '.join(names)}: a policy and a controller have the same name; rename the run's folder")
+    if not methods and (request.record or request.explain):
+        raise ConfigError("--record, --explain: the oracle drives no vehicle; add who does, for example --controller bt,oracle")
     for method in methods:
         if told := differences(method, request.config):
             watch.note(f"note: {told}")
@@ -136,6 +149,7 @@ def _play(
     from uuvtai.measure.foresight import foresight_of, told
 
     sim.use_tree(method.tree)
+    sim.privileged = method.privileged
     recorder = _recorder(request, folder.path, method.name, jobs, policy)
     foresight = foresight_of(policy.pilot, request.config.episode.control_dt_s) if policy else None
     watch.start(method.name, len(jobs))
@@ -146,8 +160,27 @@ def _play(
         watch.stop()
         if recorder:
             recorder.abort()
-    entries.append(summary(method.name, results, env_steps, time.perf_counter() - begun) | method.document() | told(foresight))
+    entry = summary(method.name, results, env_steps, time.perf_counter() - begun) | {"privileged": method.privileged}
+    entries.append(entry | method.document() | told(foresight))
     played.append(_Played(method, policy, results, tree_use(sim, results), recorder.paths if recorder else {}))
+
+
+def _any_tree() -> FlatTree:
+    """The oracle drives no vehicle, but a simulator wants a tree."""
+    from uuvtai.measure.methods import TRAINING_TREE
+    from uuvtai.tree import read_tree
+
+    return read_tree(TRAINING_TREE)
+
+
+def _ask_oracle(request: Request, jobs: list[Job], scenarios: list[dict[str, Any]], watch: Watch) -> dict[str, Any]:
+    from uuvtai.measure.ceilings import oracle_entry
+
+    watch.start(ORACLE, len(jobs))
+    try:
+        return oracle_entry(request.config, jobs, scenarios, watch.update)
+    finally:
+        watch.stop()
 
 
 def _write_results(folder: RunFolder, result: dict[str, Any], played: list[_Played]) -> None:
@@ -164,16 +197,19 @@ def _explain(request: Request, sim: Sim, played: list[_Played], result: dict[str
     from uuvtai.measure.explain import chosen_for_recording, explain_failures, failures, record_worst, table_of
 
     explained = {}
-    for entry, p in zip(result["methods"], played, strict=True):
+    driven = [entry for entry in result["methods"] if entry["name"] != ORACLE]
+    for entry, p in zip(driven, played, strict=True):
         label = entry["name"]
+        sim.privileged = p.method.privileged
         watch.start(f"{label}: replaying failures", len(failures(p.results)))
         explained[label] = explain_failures(sim, p.method.tree, p.results, watch.update, p.policy.pilot if p.policy else None)
         watch.stop()
         entry["causes"] = table_of(explained[label])
         entry["explain"] = [row.document() for row in explained[label]]
     _write_causes(folder, result)
-    for entry, p in zip(result["methods"], played, strict=True):
+    for entry, p in zip(driven, played, strict=True):
         label = entry["name"]
+        sim.privileged = p.method.privileged
         chosen = chosen_for_recording(explained[label], request.explain_record)
         paths = record_worst(sim, p.method.tree, chosen, folder.path / "explain", request.world, label, watch.note, p.policy)
         for row, path in zip(chosen, paths, strict=True):
@@ -183,7 +219,7 @@ def _explain(request: Request, sim: Sim, played: list[_Played], result: dict[str
 
 def _write_causes(folder: RunFolder, result: dict[str, Any]) -> None:
     folder.write_json("eval/result.json", result)
-    methods = [{"name": m["name"], "causes": m["causes"], "explain": m["explain"]} for m in result["methods"]]
+    methods = [{"name": m["name"], "causes": m["causes"], "explain": m["explain"]} for m in result["methods"] if "explain" in m]
     folder.write_json("eval/explain.json", {"schema": 1, "methods": methods})
 
 

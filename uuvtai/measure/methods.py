@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 TRAINING_TREE = "bt"
 """tree beside a policy: what it was distilled from, and what its observation's teacher columns come from"""
 
+TRUTH = "truth"
+"""suffix of a tree's name: a privileged yardstick whose tracks of moving bodies are the truth"""
+
 _STACK = ("tracking", "forecast", "elevation", "mapping", "clearance", "voronoi", "route", "teacher", "actuation", "episode")
 """sections that shape what a policy sees and does; differences from its training are told, not refused"""
 
@@ -31,6 +34,8 @@ class Method:
     tree: FlatTree
     checkpoint: Checkpoint | None = None
     """None = the tree drives"""
+    privileged: bool = False
+    """its tracks of moving bodies are the truth"""
 
     def driver_for(self, sim: Sim) -> PolicyNote | None:
         """The policy ready for this simulator's rows; None where the tree drives. Raises CheckpointError for one that does not fit."""
@@ -54,8 +59,12 @@ class Method:
 
 
 def trees_of(names: list[str], max_node: int) -> list[Method]:
-    """Methods that a tree drives, by names of trees or paths of their XML. Raises ConfigError."""
-    found = {_label(name): Method(_label(name), read_tree(name, max_node)) for name in names}
+    """Methods that a tree drives, by names of trees or paths of their XML, each perhaps with ``+truth``. Raises ConfigError."""
+    found = {}
+    for name in names:
+        tree, privileged = _parted(name)
+        label = f"{_label(tree)}+{TRUTH}" if privileged else _label(tree)
+        found[label] = Method(label, read_tree(tree, max_node), privileged=privileged)
     return list(found.values())
 
 
@@ -121,6 +130,16 @@ def _name_of(name: str, checkpoint: Checkpoint) -> str:
         return name
     path = Path(name).resolve()
     return path.name if path != checkpoint.path.resolve() else f"{path.parent.parent.name}-{path.name}"
+
+
+def _parted(name: str) -> tuple[str, bool]:
+    """(tree, whether it is told the truth) of a controller's name. Raises ConfigError."""
+    if "+" not in name or name.endswith(".xml"):
+        return name, False
+    tree, _, suffix = name.rpartition("+")
+    if suffix != TRUTH:
+        raise ConfigError(f"--controller {name}: '+{suffix}' is unknown; the one suffix is +{TRUTH}, for example {tree}+{TRUTH}")
+    return tree, True
 
 
 def _label(name: str) -> str:
