@@ -85,6 +85,7 @@ def evaluate(
     ] = None,
     device: Device = "auto",
     overrides: Set = None,
+    with_report: Annotated[bool, typer.Option("--report", help="Also write the run's report.html.")] = False,
     run_dir: RunDir = None,
     as_json: AsJson = False,
 ) -> None:
@@ -121,6 +122,8 @@ def evaluate(
     )
     result, folder = compare(request, _Progress())
     _print_evaluation(result, folder, as_json)
+    if with_report:
+        _say(f"report: {_write_report([folder], None).page}")
 
 
 def _controllers(given: list[str] | None, has_policies: bool) -> list[str]:
@@ -499,6 +502,29 @@ def _print_profile(result: dict[str, Any]) -> None:
             values = (row["mean_ms"], row["max_ms"], row["paper_mean_ms"], row["paper_max_ms"])
             paper.add_row(row["component"], *[_number(value, 3) for value in values])
         _stdout().print(paper)
+
+
+# ------------------------------------------------------------------------------------------------------------------ report
+
+
+@app.command("report")
+def report_run(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Run folder; several trainings are compared in one page.")],
+    out: Annotated[Path | None, typer.Option("--out", help="The page \\[default: RUN/report.html]; figures/ is made beside it.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write one self-contained HTML page of a run: tables, figures, pictures, videos, and where they come from."""
+    written = _write_report(runs, out)
+    if as_json:
+        _print_json({"schema": 1, "report": str(written.page), "figures": [str(path) for path in written.figures]})
+    else:
+        typer.echo(str(written.page))
+
+
+def _write_report(runs: list[Path], out: Path | None) -> Any:
+    from uuvtai.report.build import report
+
+    return report(runs, out)
 
 
 # --------------------------------------------------------------------------------------------------------- presets, doctor
