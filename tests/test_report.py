@@ -269,6 +269,11 @@ def test_only_the_seed_makes_no_other_method():
     assert [m.name for m in grouped(same)] == ["run0", "run1"], "a preset with two settings is told apart by its folders"
 
 
+def test_an_evaluation_in_between_is_shown_with_its_count_and_interval():
+    run = Training("a", "train:\n  evaluate_episodes: 64\n", [*samples.metrics(9), {**samples.metrics(9)[-1], "eval/success_rate": 0.75}])
+    assert tables(training([run]))[0].rows[0][6] == "48/64 = 75.0 % [63.2, 84.0]"
+
+
 def test_a_training_without_iterations_says_so():
     assert training([Training("x", "", [])])[0].text == "No iteration was recorded."
 

@@ -9,9 +9,10 @@ from typing import Any
 import yaml
 
 from uuvtai.loader import ConfigError
+from uuvtai.measure.statistics import wilson_interval
 from uuvtai.report.blocks import Block, Data, Figure, Prose, Table
 from uuvtai.report.figures import Line, curves
-from uuvtai.report.wording import number, percent
+from uuvtai.report.wording import number, percent, rate
 
 Metrics = list[dict[str, Any]]
 
@@ -73,14 +74,22 @@ def grouped(runs: Sequence[Training]) -> list[MethodRuns]:
     return [MethodRuns(name if unique else group[0].name, group) for name, group in zip(names, groups, strict=True)]
 
 
-def _without_seed(run: Training) -> str:
+def _config_of(run: Training) -> dict[str, Any]:
     try:
-        config = yaml.safe_load(run.config) or {}
+        config = yaml.safe_load(run.config)
     except yaml.YAMLError as error:
         raise ConfigError(f"{run.name}/config.yaml: is not valid YAML ({error})") from None
-    if isinstance(config, dict) and isinstance(config.get("train"), dict):
-        config["train"].pop("seed", None)
-    return yaml.safe_dump(config)
+    return config if isinstance(config, dict) else {}
+
+
+def _without_seed(run: Training) -> str:
+    config = _config_of(run)
+    return yaml.safe_dump(config | {"train": {key: value for key, value in _section(config).items() if key != "seed"}})
+
+
+def _section(config: dict[str, Any]) -> dict[str, Any]:
+    train = config.get("train")
+    return train if isinstance(train, dict) else {}
 
 
 def _method_name(group: Sequence[Training]) -> str:
@@ -120,7 +129,6 @@ def _last_table(methods: Sequence[MethodRuns]) -> Table:
     for method in methods:
         for run in method.runs:
             last = run.metrics[-1]
-            judged = [row["eval/success_rate"] for row in run.metrics if _is_number(row.get("eval/success_rate"))]
             rows.append(
                 [
                     run.name,
@@ -129,8 +137,18 @@ def _last_table(methods: Sequence[MethodRuns]) -> Table:
                     number(last.get("rollout/ep_rew_mean"), 2),
                     percent(last.get("rollout/success_rate")),
                     percent(last.get("rollout/collision_rate")),
-                    percent(judged[-1]) if judged else "-",
+                    _judged(run),
                     number(last.get("time/env_steps_per_s"), 0),
                 ]
             )
     return Table(columns, rows, "Where each training ended: the record of its last iteration")
+
+
+def _judged(run: Training) -> str:
+    """Success in the last evaluation in between, with its count and interval; the config says of how many episodes."""
+    shares = [row["eval/success_rate"] for row in run.metrics if _is_number(row.get("eval/success_rate"))]
+    n = _section(_config_of(run)).get("evaluate_episodes")
+    if not shares or not isinstance(n, int):
+        return percent(shares[-1] if shares else None)
+    k = round(shares[-1] * n)
+    return rate(k, n, wilson_interval(k, n))

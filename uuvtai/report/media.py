@@ -16,6 +16,7 @@ MEDIA_BYTES, PICTURE_BYTES = 12_000_000, 4_000_000
 
 _NAME = re.compile(r"(?P<label>.*?)_?seed(?P<seed>-?\d+)_episode(?P<episode>\d+)(?P<rest>.*)")
 _SUCCESS = "success"
+_OUTCOMES = {"ttc": "TTC stop", "out_of_tank": "out of the tank"}
 
 Detail = dict[str, Any]
 
@@ -108,5 +109,5 @@ def _caption(one: _Shown) -> str:
 
 
 def _outcome(detail: Detail) -> str:
-    outcome = detail["outcome"].replace("_", " ")
+    outcome = _OUTCOMES.get(detail["outcome"], detail["outcome"])
     return f"{outcome} after {number(detail['time_s'])} s, closest {number(detail.get('min_clearance_m'), 2)} m"
