@@ -99,6 +99,12 @@ def test_figures_follow_light_and_dark(seen):
     assert light["inkedTexts"] == dark["inkedTexts"] > 100, "text of the figures has the page's colour in both"
 
 
+def test_a_dark_screen_prints_black_on_white(seen):
+    printed = seen[True, 1280, "dark"]["printed"]
+    assert sum(channels(printed["background"])) > 700 and sum(channels(printed["ink"])) < 200
+    assert printed["scrollWidth"] <= 1280
+
+
 def channels(colour):
     return [int(part) for part in colour.removeprefix("rgb(").removesuffix(")").split(",")]
 

@@ -26,12 +26,14 @@ async function look(browser, page, width, scheme) {
   const closed = await measure(tab);
   await tab.evaluate(() => document.querySelectorAll("details").forEach((one) => (one.open = true)));
   const open = await measure(tab);
+  await tab.evaluate(() => document.querySelectorAll("details").forEach((one) => (one.open = false)));
   if (folder) {
-    await tab.evaluate(() => document.querySelectorAll("details").forEach((one) => (one.open = false)));
     await tab.screenshot({ path: `${folder}/${basename(page, ".html")}-${width}-${scheme}.png`, fullPage: true });
   }
+  await tab.emulateMedia({ media: "print" });
+  const printed = await measure(tab);
   await context.close();
-  return { width, scheme, errors, requests: requests.slice(1), closed, open };
+  return { width, scheme, errors, requests: requests.slice(1), closed, open, printed };
 }
 
 function measure(tab) {
