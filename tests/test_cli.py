@@ -80,6 +80,10 @@ def uuv(capfd, *arguments):
         (["presets", "show"], "uuv presets show NAME"),
         (["presets", "show", "nothing"], "is no preset"),
         (["tree", "no/such/run"], "is no run folder"),
+        (["report", "no/such/run"], "is no run folder"),
+        (["report", "."], "has nothing to report yet"),
+        (["report", ".", "."], "--out FILE"),
+        (["report", ".", "--out", "."], "is a folder"),
     ],
 )
 def test_bad_usage_is_one_message_and_exit_2(capfd, tmp_path, monkeypatch, arguments, says):
@@ -161,7 +165,7 @@ def evaluation(tmp_path_factory):
     folder = tmp_path_factory.mktemp("eval") / "run"
     command = [
         sys.executable, "-m", "uuvtai", "eval", "--controller", "straight,bt", "--episodes", "4", "--seeds", "3", *SmallSim.OPTIONS,
-        "--record", "1", "--video", "--set", "episode.horizon_steps=400", "--run-dir", str(folder), "--json",
+        "--record", "1", "--video", "--set", "episode.horizon_steps=400", "--run-dir", str(folder), "--report", "--json",
     ]  # fmt: skip
     done = subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ, "NO_COLOR": "1"})
     assert done.returncode == 0, done.stderr
@@ -211,6 +215,7 @@ def test_eval_leaves_a_complete_run_folder(evaluation):
     assert {
         "config.yaml", "run.json", "eval/result.json", "eval/tree.json", "eval/trees/bt.xml", "logs/bt_seed3_episode0.mcap",
         "logs/straight_seed3_episode0.mcap", "pictures/seed3_episode0.png", "videos/bt_seed3_episode0.webm",
+        "report.html", "figures/methods.png",
     } <= names  # fmt: skip
     assert not [n for n in names if n.endswith((".tmp", ".part"))]
     run = json.loads((folder / "run.json").read_text())

@@ -86,6 +86,7 @@ def evaluate(
     ] = None,
     device: Device = "auto",
     overrides: Set = None,
+    with_report: Annotated[bool, typer.Option("--report", help="Also write the run's report.html.")] = False,
     run_dir: RunDir = None,
     as_json: AsJson = False,
 ) -> None:
@@ -122,6 +123,8 @@ def evaluate(
     )
     result, folder = compare(request, _Progress())
     _print_evaluation(result, folder, as_json)
+    if with_report:
+        _say(f"report: {_write_report([folder], None).page}")
 
 
 def _controllers(given: list[str] | None, has_policies: bool) -> list[str]:
@@ -707,6 +710,29 @@ def reproduce(
         table.add_row(claim["text"], claim["theirs"], claim["ours"], f"[{color}]{claim['verdict']}[/]")
     _stdout().print(table, highlight=False)
     _say(f"run folder: {folder}")
+
+
+# ------------------------------------------------------------------------------------------------------------------ report
+
+
+@app.command("report")
+def report_run(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Run folder; several trainings are compared in one page.")],
+    out: Annotated[Path | None, typer.Option("--out", help="The page \\[default: RUN/report.html]; figures/ is made beside it.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write one self-contained HTML page of a run: tables, figures, pictures, videos, and where they come from."""
+    written = _write_report(runs, out)
+    if as_json:
+        _print_json({"schema": 1, "report": str(written.page), "figures": [str(path) for path in written.figures]})
+    else:
+        typer.echo(str(written.page))
+
+
+def _write_report(runs: list[Path], out: Path | None) -> Any:
+    from uuvtai.report.build import report
+
+    return report(runs, out)
 
 
 # --------------------------------------------------------------------------------------------------------- presets, doctor

@@ -1,0 +1,497 @@
+"""The report: layout of heat maps, figures that follow the page's colours, and a page that says everything and trusts nothing."""
+
+import csv
+import io
+import json
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from urllib.parse import unquote
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+
+from tests import report_samples as samples
+from uuvtai.loader import ConfigError
+from uuvtai.report import ink
+from uuvtai.report.blocks import Data, Figure, Gallery, Prose, Table
+from uuvtai.report.build import report
+from uuvtai.report.colours import contrast, ink_on, shade
+from uuvtai.report.evaluation import evaluation
+from uuvtai.report.figures import Line, curves, heat_map
+from uuvtai.report.heatmap import pivot
+from uuvtai.report.learning_curves import Training, grouped, training
+from uuvtai.report.media import media
+from uuvtai.report.page import Page, render
+from uuvtai.report.sweep import sweep
+from uuvtai.report.terminal import print_heat_maps
+from uuvtai.report.timing import timing
+from uuvtai.run_folder import RunFolderError
+
+READABLE = 4.5
+"""contrast of small text, WCAG 2.2 level AA"""
+
+# --------------------------------------------------------------------------------------------------- colours and layout
+
+
+@given(st.floats(0, 1))
+def test_text_stands_out_from_every_shade(share):
+    assert contrast(ink_on(shade(share)), shade(share)) >= READABLE
+
+
+def test_more_is_brighter_all_along():
+    against_black = [contrast(shade(i / 50), "#000000") for i in range(51)]
+    assert against_black == sorted(against_black)
+    assert (shade(-1), shade(2)) == ("#440154", "#fde725")
+
+
+def test_contrast_as_the_standard_computes_it():
+    assert contrast("#000000", "#ffffff") == pytest.approx(21.0)
+    assert contrast("#777777", "#ffffff") == pytest.approx(4.48, abs=0.01)
+
+
+def test_the_papers_grid_has_a_row_for_every_s_and_d_and_no_speed_without_motion():
+    document = samples.sweep_document()
+    grid = pivot(document["cells"], document["axes"])
+    assert (grid.row_axes, grid.column_axis) == (("S", "D"), "v_m_s")
+    assert grid.row_names[:6] == ["4 · 0", "4 · 3", "4 · 6", "4 · 9", "4 · 15", "8 · 0"]
+    assert grid.column_names == ["0.2", "0.4", "0.6", "0.8", "1.5", "3"]
+    still = [place for place in grid.places if place.cell["D"] == 0]
+    assert [(place.row, place.first, place.n_columns) for place in still] == [(0, 0, 6), (5, 0, 6), (10, 0, 6)]
+    fast = next(place for place in grid.places if (place.cell["S"], place.cell["D"], place.cell["v_m_s"]) == (8, 6, 3.0))
+    assert (fast.row, fast.first, fast.n_columns) == (7, 5, 1)
+
+
+def test_any_two_axes_make_a_heat_map():
+    axes = {"world.current_m_s": [0.0, 0.2], "sensors": ["paper", "harsh"]}
+    cells = [{"world.current_m_s": c, "sensors": s, "episodes": 4} for c in (0.2, 0.0) for s in ("harsh", "paper")]
+    grid = pivot(cells, axes)
+    assert (grid.row_names, grid.column_names) == (["0", "0.2"], ["paper", "harsh"])
+    turned = pivot(cells, axes, columns="world.current_m_s")
+    assert (turned.row_names, turned.column_names) == (["paper", "harsh"], ["0", "0.2"])
+
+
+def test_a_grid_that_cannot_be_laid_out_says_why():
+    document = samples.sweep_document()
+    with pytest.raises(ValueError, match="'speed' is no axis of this sweep; there are: S, D, v_m_s"):
+        pivot(document["cells"], document["axes"], columns="speed")
+    with pytest.raises(ValueError, match="same place"):
+        pivot(document["cells"] * 2, document["axes"])
+    with pytest.raises(ValueError, match="not among the axis' values"):
+        pivot([{"S": 4, "D": 3, "v_m_s": 9.9}], document["axes"])
+
+
+def printed(document, width, **more):
+    console = Console(file=io.StringIO(), width=width, **more)
+    print_heat_maps(document, console)
+    return console.file.getvalue()
+
+
+def test_heat_maps_in_the_terminal_stand_side_by_side_and_are_read_without_colour():
+    plain = printed(samples.sweep_document(), 120)
+    head = plain.splitlines()[0]
+    assert head.index("bt: collision") < head.index("bt: success")
+    assert "\x1b" not in plain
+    row = next(line for line in plain.splitlines() if line.count("12 · 15") == 2)
+    assert " ".join(row.split()) == "12 · 15 0 % 6 % 6 % 12 % 25 % 44 % 12 · 15 94 % 88 % 81 % 75 % 50 % 6 %"
+    assert max(map(len, printed(samples.sweep_document(), 80).splitlines())) <= 80
+
+
+def test_heat_maps_in_the_terminal_are_coloured_where_colours_are_shown():
+    red, green, blue = (int(shade(6 / 16 / 6)[i : i + 2], 16) for i in (1, 3, 5))
+    assert f"48;2;{red};{green};{blue}m   6 % " in printed(samples.sweep_document(), 120, force_terminal=True, color_system="truecolor")
+
+
+def test_a_cell_without_episodes_is_a_dash():
+    document = samples.sweep_document(axes={"S": [4], "D": [3], "v_m_s": [0.2, 0.4]})
+    document["cells"][0] |= {"success_rate": None, "collision_rate": None, "success_ci95": None, "time_to_success_mean_s": None}
+    assert "-" in printed(document, 120)
+    assert "0 %" in printed(document, 120)
+    hover = drawn(heat_map(pivot(document["cells"], document["axes"]), "success_rate", "x"))[1]
+    assert hover["cell-0"] == "S = 4, D = 3, v m/s = 0.2\ncollision -\nmean time to success - s".replace("\ncollision -", "")
+
+
+def test_nothing_draws_that_only_prints():
+    heavy = ("matplotlib", "jinja2", "torch", "taichi")
+    code = f"import sys, uuvtai.report.terminal, uuvtai.report.build; print([m for m in {heavy} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+# -------------------------------------------------------------------------------------------------------------- figures
+
+
+def drawn(panel, prefix="f-"):
+    """(root of the SVG, hover texts by id without the prefix)."""
+    root = ElementTree.fromstring(ink.svg(panel, prefix, "what it shows"))
+    titles = {e.get("id").removeprefix(prefix): t.text for e in root.iter() for t in e if t.tag.endswith("}title") and e.get("id")}
+    return root, titles
+
+
+def test_figures_take_the_colours_of_the_page():
+    root, _ = drawn(curves([Line("a", [0, 1], [1, 2]), Line("b", [0, 1], [2, 1])], "title", "x"))
+    text = ElementTree.tostring(root, encoding="unicode")
+    assert ink.INK not in text
+    assert "currentColor" in text and "var(--series-0" in text and "var(--series-1" in text
+    assert not [e for e in root.iter() if e.tag.endswith(("}style", "}metadata", "}script"))]
+    assert all("currentColor" in e.get("style") for e in root.iter() if e.tag.endswith("}text"))
+
+
+def test_ids_of_two_figures_never_meet_and_every_reference_is_kept():
+    panel = curves([Line("a", [0, 1], [1, 2], [0, 1], [2, 3])], "t", "x")
+    ids = []
+    for prefix in ("one-", "two-"):
+        text = ink.svg(panel, prefix, "")
+        own = re.findall(r' id="([^"]*)"', text)
+        used = re.findall(r'href="#([^"]*)"', text) + re.findall(r"url\(#([^)]*)\)", text)
+        assert used and set(used) <= set(own)
+        ids += own
+    assert len(ids) == len(set(ids))
+
+
+def test_every_cell_tells_its_count_and_interval_on_hover():
+    document = samples.sweep_document()
+    root, hover = drawn(heat_map(pivot(document["cells"], document["axes"]), "success_rate", "bt"))
+    assert len(hover) == len(document["cells"]) == 75
+    corner = next(text for text in hover.values() if text.startswith("S = 12, D = 15, v m/s = 3\n"))
+    assert corner.splitlines()[1:] == [
+        "success 1/16 = 6.2 % [1.1, 28.3]", "collision 7/16 = 43.8 % [23.1, 66.8]", "mean time to success 9.5 s",
+    ]  # fmt: skip
+    shown = [e.text for e in root.iter() if e.tag.endswith("}text")]
+    assert {"6 %", "9.5 s", "100 %", "S · D", "v m/s"} <= set(shown)
+
+
+def test_names_are_drawn_as_they_are():
+    root, _ = drawn(curves([Line("$x^2$", [0, 1], [1, 2]), Line("</svg><script>", [0, 1], [1, 2])], "\\alpha & <b>", "x"))
+    texts = {e.text for e in root.iter() if e.tag.endswith("}text")}
+    assert {"$x^2$", "</svg><script>", "\\alpha & <b>"} <= texts
+
+
+def test_a_figure_on_disk_is_a_picture_with_both_panels():
+    import cv2
+
+    document = samples.sweep_document()
+    grid = pivot(document["cells"], document["axes"])
+    one, two = (ink.png([heat_map(grid, key, "t") for key in keys]) for keys in (["success_rate"], ["collision_rate", "success_rate"]))
+    sizes = [cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR).shape for content in (one, two)]
+    assert sizes[1][1] == pytest.approx(2 * sizes[0][1], abs=2)
+    assert sizes[1][0] == sizes[0][0]
+
+
+# --------------------------------------------------------------------------------------------------------------- blocks
+
+
+def tables(blocks):
+    return [block for block in blocks if isinstance(block, Table)]
+
+
+def figures(blocks):
+    return {block.name: block for block in blocks if isinstance(block, Figure)}
+
+
+def test_methods_are_shown_with_counts_intervals_and_both_times():
+    blocks = evaluation(samples.evaluation_document())
+    first = tables(blocks)[0]
+    assert first.rows[1] == ["bt", "6/8 = 75.0 % [40.9, 92.9]", "2/8 = 25.0 % [7.1, 59.1]", "2 / 0 / 0 / 0", "12.0", "16.0", "3.0", "0.30"]
+    assert first.data.columns[:3] == ["method", "episodes", "success"]
+    assert first.data.rows[1][:3] == ["bt", 8, 6]
+
+
+def test_a_method_without_episodes_is_dashes():
+    nobody = samples.method("bt") | samples.rates(0, 0, 1) | {"episodes": 0, "success_rate": None, "success_ci95": None}
+    nobody |= {"collision_rate": None, "collision_ci95": None}
+    row = tables(evaluation(samples.evaluation_document(nobody)))[0].rows[0]
+    assert row[1:3] == ["-", "-"]
+
+
+def test_causes_and_risk_are_shown_where_there_are_any():
+    blocks = evaluation(samples.evaluation_document(samples.method("best", risk=samples.RISK, causes=[samples.CAUSE], explain=[1, 2])))
+    assert tables(blocks)[-1].rows == [["unseen above", "2", "100 %", "50 %", "1.7", "-", "0.2", samples.CAUSE["meaning"]]]
+    said = [block.text for block in blocks if isinstance(block, Prose)][-1]
+    assert "missed 1 of 9 accidents, 2.0 % to 44.0 % (promised 10.0 %)" in said
+    figure = figures(blocks)["reliability_best"]
+    assert figure.data.rows == [(0.005, 0.004, 1200.0), (0.13, 0.1, 80.0), (0.6, 0.5, 20.0)]
+    assert drawn(figure.panels[0])[1]["bin-2"] == "said 0.600, came 0.500, 20 moments"
+
+
+def test_a_sweep_over_two_axes_is_two_heat_maps_a_method():
+    document = samples.sweep_document()
+    document["cells"] += samples.sweep_document("best")["cells"]
+    found = figures(sweep(document))
+    assert [(name, len(figure.panels)) for name, figure in found.items()] == [("heat_map_bt", 2), ("heat_map_best", 2)]
+    assert len(found["heat_map_bt"].data.rows) == 75
+
+
+def test_a_sweep_over_one_axis_is_curves_with_intervals():
+    document = samples.noise_sweep()
+    blocks = sweep(document)
+    figure = figures(blocks)["sweep_sensors"]
+    hover = drawn(figure.panels[0])[1]
+    assert hover["interval-1-3"].splitlines()[:2] == ["best, sensors = harsh", "success 12/16 = 75.0 % [50.5, 89.8]"]
+    assert tables(blocks)[0].rows[0][:3] == ["bt", "clean", "16/16 = 100.0 % [80.6, 100.0]"]
+
+
+def test_an_unfinished_sweep_says_so():
+    assert "No cell" in sweep({"cells": [], "axes": {"S": [4]}})[0].text
+
+
+def test_a_profile_shows_rates_stages_and_the_papers_tables():
+    blocks = timing(samples.PROFILE)
+    rates, latency, density = tables(blocks)
+    assert rates.rows[1] == ["1,024", "bt", "8", "6", "92,160", "81,920", "-", "307.2", "20.0"]
+    assert latency.rows == [["Full loop", "3.100", "9.000", "28.630", "39.880"]]
+    assert density.rows[2] == ["15", "3.50", "20.00", "35.00", "50.00"]
+    stages = figures(blocks)["stages"]
+    assert len(stages.data.rows) == 2 * len(samples.STAGES)
+    assert drawn(stages.panels[1])[1]["stage-0-9"] == "export: 10.00 us per env-step, 18.2 %"
+
+
+def seeds_of(name, offsets, n=30, config="train:\n  seed: {}\n"):
+    return [Training(f"{name}_{i}", config.format(i), samples.metrics(n + i, offset)) for i, offset in enumerate(offsets)]
+
+
+def test_seeds_of_a_method_are_its_mean_and_its_range():
+    blocks = training(seeds_of("ppo", (0.0, 3.0, 6.0)))
+    rows = [row for row in figures(blocks)["training"].data.rows if row[1] == "rollout/ep_rew_mean"]
+    assert len(rows) == 30, "only iterations that every seed has"
+    assert rows[9] == ["ppo (3 seeds)", "rollout/ep_rew_mean", 0.01, -17.0, -20.0, -14.0]
+
+
+def test_only_the_seed_makes_no_other_method():
+    other = Training("curriculum_0", "train:\n  seed: 0\n  iterations: 9\n", samples.metrics())
+    assert [(m.name, len(m.runs)) for m in grouped([*seeds_of("ppo", (0, 1)), other])] == [("ppo", 2), ("curriculum_0", 1)]
+    same = [Training(f"run{i}", f"a: {i}\n", samples.metrics(), "best") for i in range(2)]
+    assert [m.name for m in grouped(same)] == ["run0", "run1"], "a preset with two settings is told apart by its folders"
+
+
+def test_an_evaluation_in_between_is_shown_with_its_count_and_interval():
+    run = Training("a", "train:\n  evaluate_episodes: 64\n", [*samples.metrics(9), {**samples.metrics(9)[-1], "eval/success_rate": 0.75}])
+    assert tables(training([run]))[0].rows[0][6] == "48/64 = 75.0 % [63.2, 84.0]"
+
+
+def test_a_training_without_iterations_says_so():
+    assert training([Training("x", "", [])])[0].text == "No iteration was recorded."
+
+
+@pytest.fixture
+def recorded(tmp_path):
+    """A run folder with pictures and videos, by their sizes only."""
+    sizes = {
+        "pictures/seed0_episode0.png": 100, "pictures/seed0_episode7.png": 100, "videos/bt_seed0_episode0.webm": 300,
+        "videos/bt_seed0_episode7.webm": 300, "videos/bt_seed0_episode5.webm": 900, "explain/late_bt_seed0_episode7.webm": 301,
+        "videos/unknown.webm": 50,
+    }  # fmt: skip
+    for name, size in sizes.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"x" * size)
+    return tmp_path, samples.evaluation_document(samples.method("bt"))
+
+
+def test_the_worst_episodes_come_first_and_once(recorded):
+    pictures, videos = (block for block in media(*recorded) if isinstance(block, Gallery))
+    assert [item.caption.split(".")[0] for item in pictures.items] == ["Seed 0, episode 7", "Seed 0, episode 0"]
+    assert [item.caption for item in videos.items] == [
+        "Late, seed 0, episode 7. bt: collision after 17.0 s, closest 0.23 m",
+        "Seed 0, episode 5. bt: success after 15.0 s, closest 0.25 m",
+        "Seed 0, episode 0. bt: success after 10.0 s, closest 0.30 m",
+        "unknown",
+    ]
+    assert videos.note == ""
+
+
+def test_what_does_not_fit_is_named(recorded):
+    pictures, videos = (block for block in media(*recorded, budget=900) if isinstance(block, Gallery))
+    assert len(pictures.items) == 2 and pictures.note == ""
+    assert [len(item.content) for item in videos.items] == [301, 300, 50]
+    assert "videos/bt_seed0_episode5.webm (0.0 MB)" in videos.note and "run folder" in videos.note
+
+
+# ----------------------------------------------------------------------------------------------------------------- page
+
+
+class Reader(HTMLParser):
+    """What a browser would make of a page: tags, attributes, text outside of tags."""
+
+    def __init__(self, html):
+        super().__init__()
+        self.tags, self.words = [], []
+        self.feed(html)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_data(self, data):
+        self.words.append(data)
+
+    def of(self, tag):
+        return [attributes for name, attributes in self.tags if name == tag]
+
+
+EVIL = "</title><script>alert(1)</script>$x$\"'&"
+
+
+@pytest.fixture(scope="module")
+def evil(tmp_path_factory):
+    """Page of an evaluation whose every name wants to be more than a name."""
+    name = EVIL.replace("/", ":")
+    method = samples.method(EVIL, risk=samples.RISK, causes=[samples.CAUSE | {"label": EVIL, "meaning": EVIL}], explain=[1])
+    folder = tmp_path_factory.mktemp("evil") / name
+    document = samples.evaluation_document(method) | {"world": EVIL}
+    samples.write_run(folder, ("uuv", "eval", EVIL), EVIL, eval__result=document)
+    return folder, report([folder])
+
+
+def test_everything_from_files_is_escaped(evil):
+    _, written = evil
+    page = Reader(written.page.read_text())
+    assert not page.of("script") and not page.of("b")
+    assert not [key for _, attributes in page.tags for key in attributes if key.startswith("on")]
+    text = "".join(page.words)
+    assert text.count("alert(1)") > 5, "as words they are there"
+    assert [path.name for path in written.figures] == ["methods.png", "reliability_title_script_alert_1_script_x.png"]
+
+
+def test_a_page_needs_nothing_but_itself(evil):
+    page = Reader(evil[1].page.read_text())
+    policy = next(meta["content"] for meta in page.of("meta") if meta.get("http-equiv") == "Content-Security-Policy")
+    assert policy.startswith("default-src 'none'") and "script" not in policy
+    addresses = [value for _, attributes in page.tags for key, value in attributes.items() if key in ("src", "href", "xlink:href")]
+    assert addresses and all(address.startswith(("data:", "#")) for address in addresses)
+    assert not re.search(r"@import|url\((?!#)", evil[1].page.read_text())
+
+
+def test_the_same_run_is_the_same_page(evil):
+    folder, written = evil
+    before = written.page.read_bytes(), [path.read_bytes() for path in written.figures]
+    again = report([folder])
+    assert (again.page.read_bytes(), [path.read_bytes() for path in again.figures]) == before
+    assert not list(folder.rglob("*.tmp"))
+
+
+def test_the_data_of_a_figure_can_be_had_as_csv(tmp_path):
+    data = Data(["name", "value"], [["a, b", 0.1], ['"c"', None]])
+    html, _ = render(Page("t", "", [], []))
+    assert "<h1>t</h1>" in html
+    samples.write_run(tmp_path, sweep=samples.sweep_document())
+    links = [a for a in Reader(report([tmp_path]).page.read_text()).of("a") if "download" in a]
+    head, *rows = csv.DictReader(io.StringIO(unquote(links[0]["href"].split(",", 1)[1]))), links[0]["download"]
+    cells = list(head)
+    assert rows == ["heat_map_bt.csv"]
+    assert len(cells) == 75
+    assert (cells[-1]["S"], cells[-1]["v_m_s"], cells[-1]["success"], cells[-1]["success_rate"]) == ("12", "3.0", "1", "0.0625")
+    assert data.csv() == 'name,value\n"a, b",0.1\n"""c""",\n'
+
+
+def test_a_page_says_where_its_figures_come_from(evil):
+    text = " ".join(Reader(evil[1].page.read_text()).words)
+    for said in ("uuv eval", "some processor", "uuvtai 0.1.0", "2026-01-01T00:00:00+0000", "abc", "3.0 s"):
+        assert said in text
+
+
+def test_a_run_that_did_not_finish_is_marked(tmp_path):
+    samples.write_run(tmp_path, metrics=samples.metrics())
+    record = json.loads((tmp_path / "run.json").read_text())
+    (tmp_path / "run.json").write_text(json.dumps(record | {"status": "interrupted"}))
+    assert "marked 'interrupted'" in "".join(Reader(report([tmp_path]).page.read_text()).words)
+
+
+def test_a_training_that_was_killed_while_it_wrote_is_shown_without_its_last_line(tmp_path):
+    samples.write_run(tmp_path / "run", metrics=samples.metrics(5))
+    with (tmp_path / "run/metrics.jsonl").open("a") as file:
+        file.write('\n{"iteration": 6, "rollo')
+    assert "<td>5</td>" in report([tmp_path / "run"]).page.read_text()
+
+
+def test_several_trainings_are_one_page(tmp_path):
+    runs = [samples.write_run(tmp_path / f"ppo_{i}", config=f"train:\n  seed: {i}\n", metrics=samples.metrics(5)) for i in range(2)]
+    written = report(runs, tmp_path / "both.html")
+    assert "ppo (2 seeds)" in written.page.read_text()
+    assert written.figures == [tmp_path / "figures/training.png"] and written.figures[0].exists()
+    samples.write_run(tmp_path / "sweep", sweep=samples.noise_sweep())
+    with pytest.raises(ConfigError, match="is no training"):
+        report([*runs, tmp_path / "sweep"], tmp_path / "x.html")
+
+
+# --------------------------------------------------------------------------------------------------------- reproduction
+
+
+def reproduced(folder, *blocks):
+    document = {"schema": 1, "title": "The paper", "sections": [{"title": "First", "blocks": list(blocks)}]}
+    return samples.write_run(folder, ("uuv", "reproduce"), reproduce=document)
+
+
+def test_a_reproduction_composes_verdicts_tables_and_runs(tmp_path):
+    verdicts = [
+        {"claim": "it swims", "verdict": "holds", "numbers": "3 of 3"},
+        {"claim": "it flies", "verdict": "does not hold", "numbers": "0 of 3"},
+    ]
+    point = {"collision_rate": 0.01, "success_rate": 0.9}
+    folder = reproduced(
+        tmp_path,
+        {"kind": "verdicts", "items": verdicts},
+        {"kind": "table", "columns": ["what", "paper", "ours"], "rows": [["bt", 0.8, None]], "caption": "Table main"},
+        {"kind": "trade_off", "series": [{"name": "bt", "points": [point]}], "marks": [{"name": "paper", **point}]},
+        {"kind": "run", "path": "grid"},
+        {"kind": "run", "path": "noise"},
+        {"kind": "curves", "paths": ["a_0", "a_1"]},
+    )
+    samples.write_run(tmp_path / "grid", sweep=samples.sweep_document())
+    samples.write_run(tmp_path / "noise", sweep=samples.noise_sweep())
+    for i in range(2):
+        samples.write_run(tmp_path / f"a_{i}", config=f"train:\n  seed: {i}\n", metrics=samples.metrics(5))
+    written = report([folder])
+    page = Reader(written.page.read_text())
+    assert [path.stem for path in written.figures] == ["trade_off", "grid_heat_map_bt", "noise_sweep_sensors", "training"]
+    assert [item["class"] for item in page.of("li")] == ["holds", "fails"]
+    assert "a (2 seeds)" in page.words
+
+
+@pytest.mark.parametrize(
+    ("block", "says"),
+    [
+        ({"kind": "run", "path": "../.."}, "lies outside"),
+        ({"kind": "run", "path": "/etc"}, "lies outside"),
+        ({"kind": "run", "path": "nothing"}, "is no folder here"),
+        ({"kind": "song"}, "'song' is no kind of block"),
+        ({"kind": "prose"}, "KeyError: 'text'"),
+        ({"kind": "verdicts", "items": [{"claim": "a", "verdict": "maybe", "numbers": ""}]}, "'maybe' is no verdict"),
+    ],
+)
+def test_a_reproduction_that_cannot_be_shown_says_why(tmp_path, block, says):
+    with pytest.raises(ConfigError, match=re.escape(says)):
+        report([reproduced(tmp_path / "run", block)])
+    assert not (tmp_path / "run/report.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "says"),
+    [
+        ("eval/result.json", "{", "is not valid JSON"),
+        ("eval/result.json", "[1]", "is no JSON object"),
+        ("eval/result.json", '{"schema": 1}', "KeyError: 'methods'"),
+        ("sweep.json", '{"cells": [{}], "axes": {"S": [4, 8], "D": [0, 3]}}', "KeyError: 'episodes'"),
+        ("metrics.jsonl", '{"iteration": 1}\nnothing\n{"iteration": 2}', "line 2: is no JSON object"),
+    ],
+)
+def test_a_damaged_file_is_one_clear_error_and_nothing_is_written(tmp_path, file, content, says):
+    samples.write_run(tmp_path)
+    (tmp_path / file).parent.mkdir(exist_ok=True)
+    (tmp_path / file).write_text(content)
+    with pytest.raises(ConfigError, match=re.escape(says)) as told:
+        report([tmp_path])
+    assert str(tmp_path) in str(told.value)
+    assert not (tmp_path / "report.html").exists() and not (tmp_path / "figures").exists()
+
+
+def test_a_page_that_cannot_be_written_leaves_the_old_one(tmp_path):
+    samples.write_run(tmp_path, sweep=samples.noise_sweep())
+    before = report([tmp_path]).page.read_bytes()
+    (tmp_path / "wall").write_text("a file")
+    with pytest.raises(RunFolderError, match="--out FILE"):
+        report([tmp_path], tmp_path / "wall" / "x.html")
+    assert (tmp_path / "report.html").read_bytes() == before

@@ -1,0 +1,117 @@
+"""The report in a real browser, opened from disk: nothing overflows, nothing fails, nothing is asked of the network, light and dark."""
+
+import json
+import os
+import platform
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests import report_samples as samples
+from uuvtai.report.build import report
+
+JS = Path(__file__).parent / "js"
+
+BAD = """<!DOCTYPE html><title>bad</title><div id="a" style="width: 3000px">wide</div><p id="a"></p>
+<img src="http://uuvtai.invalid/picture.png"><script>throw new Error("broken")</script>"""
+"""What the check must find fault with"""
+
+
+def picture(path):
+    path.parent.mkdir(exist_ok=True)
+    cv2.imwrite(str(path), np.full((300, 1600, 3), 200, np.uint8))
+
+
+def video(path):
+    path.parent.mkdir(exist_ok=True)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"VP80"), 10.0, (640, 240))
+    for i in range(10):
+        writer.write(np.full((240, 640, 3), 25 * i, np.uint8))
+    writer.release()
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    """A page with everything that a report can hold, with long names."""
+    folder = tmp_path_factory.mktemp("browser") / "run"
+    long = "a_method_with_a_name_that_is_far_longer_than_any_column_would_like_it_to_be"
+    methods = [samples.method(long, risk=samples.RISK, causes=[samples.CAUSE], explain=[1, 2]), samples.method("bt")]
+    verdict = {"claim": "it swims " * 30, "verdict": "holds", "numbers": "3 of 3"}
+    blocks = [{"kind": "verdicts", "items": [verdict]}, {"kind": "curves", "paths": ["t_0", "t_1"]}, {"kind": "run", "path": "noise"}]
+    document = {"schema": 1, "title": "Everything", "sections": [{"title": "First", "blocks": blocks}]}
+    samples.write_run(
+        folder, ("uuv", "eval", "x" * 300), "key: " + "y" * 500, reproduce=document, eval__result=samples.evaluation_document(*methods),
+        sweep=samples.sweep_document(), profile=samples.PROFILE,
+    )  # fmt: skip
+    samples.write_run(folder / "noise", sweep=samples.noise_sweep())
+    for i in range(2):
+        samples.write_run(folder / f"t_{i}", config=f"train:\n  seed: {i}\n", metrics=samples.metrics(12))
+    picture(folder / "pictures/seed0_episode0.png")
+    video(folder / "videos/bt_seed0_episode7.webm")
+    return report([folder]).page
+
+
+@pytest.fixture(scope="module")
+def seen(page, tmp_path_factory):
+    """What the browser met in the page and in one that is wrong in every way, by (is good, width, scheme)."""
+    node = shutil.which("node")
+    if node is None or not (JS / "node_modules/@sparticuz").is_dir():
+        pytest.skip("needs node and `npm ci` in tests/js (bootstrap.py does it)")
+    if (platform.system(), platform.machine()) != ("Linux", "x86_64") and "CHROME_PATH" not in os.environ:
+        pytest.skip("the packed Chromium is for Linux on x86_64: set CHROME_PATH to another one")
+    bad = tmp_path_factory.mktemp("bad") / "bad.html"
+    bad.write_text(BAD)
+    with tempfile.TemporaryDirectory() as unpacked:
+        command = [node, "look.mjs", str(page), str(bad)]
+        environment = {**os.environ, "TMPDIR": unpacked}
+        done = subprocess.run(command, cwd=JS, env=environment, capture_output=True, text=True, check=False, timeout=120)
+    if done.returncode == 3:
+        pytest.skip(f"Chromium does not start here: {done.stderr.strip().splitlines()[0]}")
+    assert done.returncode == 0, done.stderr
+    return {(one["page"] == str(page), one["width"], one["scheme"]): one for one in json.loads(done.stdout)["seen"]}
+
+
+VIEWS = [(width, scheme) for width in (1280, 390) for scheme in ("light", "dark")]
+
+
+@pytest.mark.parametrize(("width", "scheme"), VIEWS)
+def test_a_report_is_whole_and_quiet_in_every_view(seen, width, scheme):
+    found = seen[True, width, scheme]
+    assert found["errors"] == [] and found["requests"] == []
+    for folds in ("closed", "open"):
+        assert found[folds]["innerWidth"] == width
+        assert found[folds]["scrollWidth"] <= width, f"the page overflows with its details {folds}"
+    there = found["open"]
+    assert there["title"] == "Everything"
+    assert (there["images"], there["videos"], there["scripts"], there["doubleIds"], there["deadLinks"]) == (1, 1, 0, [], 0)
+    assert there["svgs"] > 10 and there["hovers"] > 150 and there["downloads"] > 5
+
+
+def test_figures_follow_light_and_dark(seen):
+    light, dark = (seen[True, 390, scheme]["open"] for scheme in ("light", "dark"))
+    assert sum(channels(light["background"])) > 700 > 100 > sum(channels(dark["background"]))
+    assert sum(channels(light["ink"])) < 200 < 600 < sum(channels(dark["ink"]))
+    assert light["inkedTexts"] == dark["inkedTexts"] > 100, "text of the figures has the page's colour in both"
+
+
+def test_a_dark_screen_prints_black_on_white(seen):
+    printed = seen[True, 1280, "dark"]["printed"]
+    assert sum(channels(printed["background"])) > 700 and sum(channels(printed["ink"])) < 200
+    assert printed["scrollWidth"] <= 1280
+
+
+def channels(colour):
+    return [int(part) for part in colour.removeprefix("rgb(").removesuffix(")").split(",")]
+
+
+def test_the_check_finds_fault_with_a_bad_page(seen):
+    found = seen[False, 390, "light"]
+    assert found["closed"]["scrollWidth"] == pytest.approx(3000, abs=20)
+    assert any("broken" in error for error in found["errors"])
+    assert found["requests"] == ["http://uuvtai.invalid/picture.png"]
+    assert found["closed"]["doubleIds"] == ["a"] and found["closed"]["scripts"] == 1

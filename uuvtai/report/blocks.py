@@ -1,0 +1,145 @@
+"""What a page is made of: sections of blocks. Sections are built from dicts; only ``page.py`` knows HTML."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Hover = dict[str, str]
+"""id of a drawn thing -> what is shown while the pointer is over it"""
+
+
+@dataclass(frozen=True)
+class Data:
+    """Numbers behind a figure or a table, as a spreadsheet would take them."""
+
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Any]]
+
+    def csv(self) -> str:
+        """The numbers as CSV (RFC 4180) with a header line; None is an empty field."""
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(self.columns)
+        writer.writerows(self.rows)
+        return text.getvalue()
+
+
+@dataclass(frozen=True)
+class Prose:
+    """A paragraph of plain text."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Heading:
+    """A heading within a section."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Notice:
+    """A paragraph that must not be overlooked."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Table:
+    """Cells as they are shown; the first ``n_left`` columns hold words and are set flush left."""
+
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    caption: str = ""
+    n_left: int = 1
+    data: Data | None = None
+    """the same as numbers, for download"""
+    folded: bool = False
+    """long: shown when asked for"""
+
+
+@dataclass(frozen=True)
+class Facts:
+    """Names and what they are."""
+
+    items: Sequence[tuple[str, str]]
+
+
+@dataclass(frozen=True)
+class Code:
+    """A text file, folded away."""
+
+    title: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What became of a claim: ``ruling`` is 'holds', 'does not hold' or 'cannot be judged'."""
+
+    claim: str
+    ruling: str
+    numbers: str
+
+
+@dataclass(frozen=True)
+class Verdicts:
+    """The claims that a run was to judge."""
+
+    items: Sequence[Verdict]
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One pair of axes: ``draw`` fills it and says what is shown while the pointer is over which id."""
+
+    draw: Callable[[Axes], Hover]
+    width_in: float = 4.4
+    height_in: float = 3.0
+
+
+@dataclass(frozen=True)
+class Figure:
+    """Panels side by side, with the numbers drawn in them and the command that made those."""
+
+    name: str
+    panels: Sequence[Panel]
+    caption: str
+    data: Data
+    command: str = ""
+
+
+@dataclass(frozen=True)
+class Media:
+    """A picture or video of an episode."""
+
+    mime: str
+    content: bytes
+    caption: str
+
+
+@dataclass(frozen=True)
+class Gallery:
+    """Pictures or videos; ``note`` says what was left out."""
+
+    items: Sequence[Media]
+    note: str = ""
+
+
+Block = Prose | Heading | Notice | Table | Facts | Code | Verdicts | Figure | Gallery
+
+
+@dataclass(frozen=True)
+class Section:
+    """A titled part of the page."""
+
+    title: str
+    blocks: Sequence[Block] = field(default_factory=list)

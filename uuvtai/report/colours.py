@@ -1,0 +1,39 @@
+"""Colours that the page, the figures and the terminal share; all of them can be told apart by the colour-blind."""
+
+from __future__ import annotations
+
+_ANCHORS = ("440154", "472d7b", "3b528b", "2c728e", "21918c", "28ae80", "5ec962", "addc30", "fde725")
+"""Viridis (Smith and van der Walt 2015) at every eighth: its lightness rises evenly, also in grey and to every kind of colour vision."""
+
+SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+"""Okabe and Ito 2008 without black and yellow, which a dark or a light page would swallow."""
+
+DARK, LIGHT = "#000000", "#ffffff"
+
+
+def shade(share: float) -> str:
+    """'#rrggbb' of a share in [0, 1]: dark is little, bright is much. Shares outside are taken as the nearest end."""
+    place = min(max(share, 0.0), 1.0) * (len(_ANCHORS) - 1)
+    below = min(int(place), len(_ANCHORS) - 2)
+    low, high = _channels(_ANCHORS[below]), _channels(_ANCHORS[below + 1])
+    return "#" + "".join(f"{round(a + (place - below) * (b - a)):02x}" for a, b in zip(low, high, strict=True))
+
+
+def ink_on(background: str) -> str:
+    """Black or white, whichever stands out more from '#rrggbb'."""
+    return max((DARK, LIGHT), key=lambda ink: contrast(ink, background))
+
+
+def contrast(one: str, other: str) -> float:
+    """Contrast ratio of two colours from 1 to 21 (WCAG 2.2)."""
+    bright, dim = sorted((_luminance(one), _luminance(other)), reverse=True)
+    return (bright + 0.05) / (dim + 0.05)
+
+
+def _luminance(colour: str) -> float:
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in (x / 255 for x in _channels(colour.lstrip("#")))]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+def _channels(colour: str) -> list[int]:
+    return [int(colour[i : i + 2], 16) for i in (0, 2, 4)]

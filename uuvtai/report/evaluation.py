@@ -1,0 +1,153 @@
+"""Blocks of an evaluation (the document of ``uuv eval --json``): methods, why they failed, how far the risk head can be believed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from uuvtai.report.blocks import Block, Data, Figure, Heading, Prose, Table
+from uuvtai.report.figures import Line, intervals, rates_text, reliability
+from uuvtai.report.wording import accidents, number, percent, rate
+
+Method = dict[str, Any]
+
+
+def evaluation(result: dict[str, Any], command: str = "") -> list[Block]:
+    """Everything that an evaluation has to show but its pictures."""
+    methods = result["methods"]
+    blocks: list[Block] = [Prose(conditions(result)), methods_table(methods)]
+    if methods:
+        blocks.append(_rates_figure(methods, command))
+    blocks.append(_planning_table(methods))
+    for method in methods:
+        blocks += [*_causes(method), *_risk(method, command)]
+    return blocks
+
+
+def conditions(result: dict[str, Any]) -> str:
+    """The scene in a sentence."""
+    speed = f", v = {result['v_m_s']} m/s" if result["D"] else ""
+    seeds = ", ".join(map(str, result["seeds"]))
+    return (
+        f"World {result['world']}, S = {result['S']} resting and D = {result['D']} moving obstacles{speed}, {result['sensors']} sensing; "
+        f"seeds {seeds}, {result['episodes_per_seed']} episodes each, the same ones for every method."
+    )
+
+
+def methods_table(methods: list[Method]) -> Table:
+    """One row a method: rates with counts and 95 % Wilson intervals, how the rest ended, both times."""
+    columns = ["method", "success", "collision", "contact / TTC / out / timeout", "time to goal s", "TTS s", "return", "closest m"]
+    caption = (
+        "Methods. Collision counts contacts, TTC stops and episodes out of the tank; intervals are 95 % Wilson. "
+        "Time to goal: mean over successes; TTS: mean time over success rate."
+    )
+    return Table(columns, [_method_row(m) for m in methods], caption, data=_methods_data(methods))
+
+
+def _method_row(m: Method) -> list[str]:
+    o = m["outcomes"]
+    return [
+        m["name"],
+        rate(o["success"], m["episodes"], m["success_ci95"]),
+        rate(accidents(o), m["episodes"], m["collision_ci95"]),
+        f"{o['collision']} / {o['ttc']} / {o['out_of_tank']} / {o['timeout']}",
+        number(m["time_to_success_mean_s"]),
+        number(m["tts_s"]),
+        number(m.get("return_mean")),
+        number(m.get("min_clearance_mean_m"), 2),
+    ]
+
+
+_PLAIN = ("success_rate", "collision_rate", "time_to_success_mean_s", "time_mean_s", "tts_s", "return_mean", "min_clearance_mean_m")
+
+
+def _methods_data(methods: list[Method]) -> Data:
+    outcomes = ("success", "collision", "ttc", "out_of_tank", "timeout")
+    bounds = ("success_ci95_low", "success_ci95_high", "collision_ci95_low", "collision_ci95_high")
+    rows = [
+        [m["name"], m["episodes"], *(m["outcomes"][name] for name in outcomes), *_bounds(m), *(m.get(name) for name in _PLAIN)]
+        for m in methods
+    ]
+    return Data(["method", "episodes", *outcomes, *bounds, *_PLAIN], rows)
+
+
+def _bounds(m: dict[str, Any]) -> list[float | None]:
+    return [*(m["success_ci95"] or (None, None)), *(m["collision_ci95"] or (None, None))]
+
+
+def _rates_figure(methods: list[Method], command: str) -> Figure:
+    names = [m["name"] for m in methods]
+    panels = [intervals([_rates_line(methods, key)], names, key, "", joined=False) for key in ("success", "collision")]
+    return Figure("methods", panels, "Success and collision of every method with 95 % Wilson intervals", _methods_data(methods), command)
+
+
+def _rates_line(methods: list[Method], key: str) -> Line:
+    known = [(i, m) for i, m in enumerate(methods) if m[f"{key}_rate"] is not None]
+    low, high = ([m[f"{key}_ci95"][end] for _, m in known] for end in (0, 1))
+    said = [f"{m['name']}\n{rates_text(m)}" for _, m in known]
+    return Line(key, [i for i, _ in known], [m[f"{key}_rate"] for _, m in known], low, high, said)
+
+
+def _planning_table(methods: list[Method]) -> Table:
+    columns = ["method", "replans an episode", "initial / stuck / safety / intersection", "Voronoi / RRT", "path m", "env-steps/s"]
+    rows = []
+    for m in methods:
+        triggers, planners = m.get("replans_by_trigger", {}), m.get("planned_by", {})
+        rows.append(
+            [
+                m["name"],
+                number(m.get("replans_per_episode")),
+                " / ".join(str(triggers.get(name, "-")) for name in ("initial", "stuck", "safety", "intersection")),
+                " / ".join(str(planners.get(name, "-")) for name in ("voronoi", "rrt")),
+                number(m.get("path_length_mean_m")),
+                number(m.get("env_steps_per_s"), 0),
+            ]
+        )
+    return Table(columns, rows, "Planning")
+
+
+# -------------------------------------------------------------------------------------------------------- causes and risk
+
+
+def _causes(m: Method) -> list[Block]:
+    if not m.get("causes"):
+        return []
+    columns = ["cause", "n", "share", "knew", "unseen s", "evading s", "last chance s", "meaning"]
+    rows = [
+        [
+            c["label"].replace("_", " "),
+            str(c["count"]),
+            percent(c["share"], 0),
+            percent(c["knew_share"], 0),
+            *(number(c[key]) for key in ("unseen_median_s", "evading_median_s", "last_chance_median_s")),
+            c["meaning"],
+        ]
+        for c in m["causes"]
+    ]
+    caption = (
+        f"Why {len(m['explain'])} of {m['episodes']} episodes of {m['name']} failed. Knew: share whose forecast of the killer 1 s before "
+        "the end was right; the times are medians before the end"
+    )
+    return [Table(columns, rows, caption)]
+
+
+def _risk(m: Method, command: str) -> list[Block]:
+    risk = m.get("risk")
+    if not risk:
+        return []
+    bins = risk["reliability"]
+    said = (
+        f"At {risk['moments']:,} moments the risk head of {m['name']} gave the probability of an accident soon: Brier score "
+        f"{number(risk['brier'], 4)} (base rate alone {number(risk['brier_base_rate'], 4)}), expected calibration error "
+        f"{number(risk['ece'], 4)}, area under the ROC curve {number(risk.get('auroc'), 3)}."
+    )
+    if "accidents" in risk:
+        low, high = risk["missed_ci95"]
+        said += (
+            f" The alarm missed {risk['missed']} of {risk['accidents']} accidents, {percent(low)} to {percent(high)} "
+            f"(promised {percent(risk['promised_miss_rate'])}), and was raised in {percent(risk['alarm_rate_safe'])} of the safe moments."
+        )
+    columns = ["said", "came", "moments"]
+    data = Data(columns, list(zip(bins["predicted"], bins["observed"], bins["samples"], strict=True)))
+    caption = "Reliability: a point's area grows with the number of its moments; on the dashed line a forecast can be taken at its word"
+    panel = reliability(bins, m["name"])
+    return [Heading(f"Risk: {m['name']}"), Prose(said), Figure(f"reliability_{m['name']}", [panel], caption, data, command)]

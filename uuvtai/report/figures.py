@@ -1,0 +1,268 @@
+"""What the figures show, panel by panel: heat maps, curves with seed bands, intervals, reliability, time per stage.
+
+Every function gives a ``Panel`` whose drawing is done later; the hover texts carry counts and intervals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from uuvtai.report.blocks import Hover, Panel
+from uuvtai.report.colours import SERIES, ink_on, shade
+from uuvtai.report.heatmap import HeatMap, Place
+from uuvtai.report.ink import INK
+from uuvtai.report.wording import axis_name, number, percent, rate, value_name
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_CELL_IN = (0.62, 0.36)
+_MARGIN_IN = (1.15, 0.95)
+_LOG_SPAN = 20.0
+"""A quantity that is positive throughout and spans more than this factor is drawn on a logarithmic axis."""
+_ROOM = 0.09
+"""A stage is named in its bar where it takes more than this share of the longest one."""
+_GOLDEN = 0.618034
+"""Stages that follow each other get colours this share of the scale apart, so that neighbours differ."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """A named curve; ``low`` and ``high`` bound its band or its error bars, ``said`` is shown while the pointer is over a point."""
+
+    name: str
+    x: Sequence[float]
+    y: Sequence[float]
+    low: Sequence[float] | None = None
+    high: Sequence[float] | None = None
+    said: Sequence[str] = ()
+
+
+# --------------------------------------------------------------------------------------------------------------- heat maps
+
+
+def heat_map(chosen: HeatMap, key: str, title: str) -> Panel:
+    """Rate ``key`` of every cell in per cent, below it the mean time to success [s]; bright is good in both maps of a pair."""
+
+    def draw(axes: Axes) -> Hover:
+        axes.set_title(title, loc="left")
+        axes.grid(False)
+        axes.spines[:].set_visible(False)
+        axes.tick_params(length=0)
+        axes.set_xlim(0, len(chosen.column_values))
+        axes.set_ylim(len(chosen.row_values), 0)
+        axes.set_xticks([i + 0.5 for i in range(len(chosen.column_values))], chosen.column_names)
+        axes.set_yticks([i + 0.5 for i in range(len(chosen.row_values))], chosen.row_names)
+        axes.set_xlabel(axis_name(chosen.column_axis))
+        axes.set_ylabel(chosen.row_title)
+        for row in _group_begins(chosen):
+            axes.axhline(row, color=INK, linewidth=1.0, xmin=-0.02, clip_on=False)
+        return dict(_draw_cell(axes, place, key, f"cell-{i}") for i, place in enumerate(chosen.places))
+
+    width = _MARGIN_IN[0] + _CELL_IN[0] * max(4, len(chosen.column_values))
+    return Panel(draw, width, _MARGIN_IN[1] + _CELL_IN[1] * len(chosen.row_values))
+
+
+def _draw_cell(axes: Axes, place: Place, key: str, identity: str) -> tuple[str, str]:
+    """(id, hover text) of the cell that was drawn."""
+    from matplotlib.patches import Rectangle
+
+    value = place.cell.get(key)
+    ground = "none" if value is None else shade(value if key == "success_rate" else 1.0 - value)
+    corner, gap = (place.first + 0.02, place.row + 0.03), (0.04, 0.06)
+    box = Rectangle(corner, place.n_columns - gap[0], 1 - gap[1], facecolor=ground, edgecolor="none", gid=identity)
+    axes.add_patch(box)
+    ink = INK if value is None else ink_on(ground)
+    middle = place.first + place.n_columns / 2
+    axes.text(middle, place.row + 0.34, percent(value, 0), color=ink, ha="center", va="center", fontsize=8.5, fontweight="bold")
+    below = number(place.cell.get("time_to_success_mean_s")) + " s"
+    axes.text(middle, place.row + 0.73, below, color=ink, ha="center", va="center", fontsize=7)
+    return identity, hover_text(place.cell)
+
+
+def hover_text(cell: dict[str, Any]) -> str:
+    """Where a cell stands, and its rates."""
+    where = ", ".join(f"{axis_name(name)} = {value_name(value)}" for name, value in place_of(cell).items())
+    return f"{where}\n{rates_text(cell)}"
+
+
+def rates_text(cell: dict[str, Any]) -> str:
+    """Rates of a cell or a method with count and interval, a line each."""
+    n = cell["episodes"]
+    rates = [
+        f"{name} {rate(round(share * n), n, cell.get(f'{name}_ci95'))}"
+        for name in ("success", "collision")
+        if (share := cell.get(f"{name}_rate")) is not None
+    ]
+    return "\n".join([*rates, f"mean time to success {number(cell.get('time_to_success_mean_s'))} s"])
+
+
+def place_of(cell: dict[str, Any]) -> dict[str, Any]:
+    """Axes of a cell with their values: every key that is no result."""
+    return {key: value for key, value in cell.items() if key not in _RESULTS and value is not None and not isinstance(value, dict | list)}
+
+
+_RESULTS = {
+    "method", "episodes", "outcomes", "k", "n", "success_rate", "success_ci95", "collision_rate", "collision_ci95", "time_mean_s",
+    "tts_s", "time_to_success_mean_s", "return_mean", "env_steps", "wall_s", "env_steps_per_s", "min_clearance_mean_m",
+    "path_length_mean_m", "replans_per_episode",
+}  # fmt: skip
+
+
+def _group_begins(chosen: HeatMap) -> list[int]:
+    """Rows at which the slowest row axis takes its next value."""
+    if len(chosen.row_axes) < 2:
+        return []
+    first = [values[0] for values in chosen.row_values]
+    return [row for row in range(1, len(first)) if first[row] != first[row - 1]]
+
+
+# ------------------------------------------------------------------------------------------------------------------ curves
+
+
+def curves(lines: Sequence[Line], title: str, x_label: str, share: bool = False, zero: bool = False) -> Panel:
+    """Curves with their bands; ``share``: drawn in per cent from 0 to 100; ``zero``: the axis begins at 0."""
+
+    def draw(axes: Axes) -> Hover:
+        axes.set_title(title, loc="left")
+        axes.set_xlabel(x_label)
+        scale = 100.0 if share else 1.0
+        for i, line in enumerate(lines):
+            colour = SERIES[i % len(SERIES)]
+            few = {"marker": "o", "markersize": 3} if len(line.x) <= 12 else {}
+            axes.plot(line.x, [scale * y for y in line.y], color=colour, label=line.name, **few)
+            if line.low is not None and line.high is not None:
+                axes.fill_between(
+                    line.x, [scale * y for y in line.low], [scale * y for y in line.high], color=colour, alpha=0.2, linewidth=0
+                )
+        _frame(axes, lines, share, zero)
+        return {}
+
+    return Panel(draw)
+
+
+def intervals(lines: Sequence[Line], names: Sequence[str], title: str, x_label: str, joined: bool = True) -> Panel:
+    """Shares with their intervals at named places, joined where these are values of one axis. ``x`` of a line counts places."""
+
+    def draw(axes: Axes) -> Hover:
+        axes.set_title(title, loc="left")
+        axes.set_xlabel(x_label)
+        hover: Hover = {}
+        for i, line in enumerate(lines):
+            shift = 0.12 * (i - (len(lines) - 1) / 2)
+            hover |= _draw_intervals(axes, i, line, shift, joined)
+        axes.set_xticks(range(len(names)), names)
+        axes.set_xlim(-0.5, len(names) - 0.5)
+        _frame(axes, lines, share=True, zero=True)
+        return hover
+
+    return Panel(draw, width_in=max(4.4, 1.6 + 0.55 * len(names)))
+
+
+def _draw_intervals(axes: Axes, i: int, line: Line, shift: float, joined: bool) -> Hover:
+    """Points and error bars of one line, moved aside by ``shift`` so that lines do not cover each other."""
+    colour, places = SERIES[i % len(SERIES)], [x + shift for x in line.x]
+    axes.plot(places, [100 * y for y in line.y], color=colour, marker="o", markersize=5, linewidth=0.8 if joined else 0, label=line.name)
+    for k, (x, low, high) in enumerate(zip(places, line.low or line.y, line.high or line.y, strict=True)):
+        axes.plot([x, x], [100 * low, 100 * high], color=colour, linewidth=2.4, solid_capstyle="butt", gid=f"interval-{i}-{k}")
+    return {f"interval-{i}-{k}": text for k, text in enumerate(line.said)}
+
+
+def _frame(axes: Axes, lines: Sequence[Line], share: bool, zero: bool) -> None:
+    if share:
+        axes.set_ylim(-3, 103)
+        axes.set_ylabel("%")
+    elif zero:
+        axes.set_ylim(bottom=0)
+    elif _spans_decades([y for line in lines for y in line.y]):
+        axes.set_yscale("log")
+    if len(lines) > 1:
+        axes.legend(loc="best")
+
+
+def _spans_decades(values: Sequence[float]) -> bool:
+    return bool(values) and min(values) > 0 and max(values) > _LOG_SPAN * min(values)
+
+
+def reliability(bins: dict[str, Sequence[float]], title: str) -> Panel:
+    """What came against what was said; the diagonal is a forecast that can be taken at its word. Area grows with the number of moments."""
+
+    def draw(axes: Axes) -> Hover:
+        axes.set_title(title, loc="left")
+        axes.set_xlabel("said: probability of an accident soon")
+        axes.set_ylabel("came: share of the moments")
+        axes.plot([0, 1], [0, 1], color=INK, linewidth=0.8, linestyle=(0, (4, 3)))
+        most = max(bins["samples"], default=1.0)
+        hover: Hover = {}
+        for i, (said, came, n) in enumerate(zip(bins["predicted"], bins["observed"], bins["samples"], strict=True)):
+            size = 3.0 + 9.0 * (n / most) ** 0.5
+            axes.plot([said], [came], marker="o", markersize=size, color=SERIES[0], alpha=0.75, linestyle="none", gid=f"bin-{i}")
+            hover[f"bin-{i}"] = f"said {said:.3f}, came {came:.3f}, {n:,.0f} moments"
+        axes.set_xlim(-0.03, 1.03)
+        axes.set_ylim(-0.03, 1.03)
+        return hover
+
+    return Panel(draw, 3.8, 3.6)
+
+
+def trade_off(series: Sequence[Line], marks: Sequence[tuple[str, float, float]]) -> Panel:
+    """Success over collision [shares] along one setting per line; ``marks`` are single points (name, collision, success)."""
+
+    def draw(axes: Axes) -> Hover:
+        axes.set_xlabel("collision %")
+        axes.set_ylabel("success %")
+        for i, line in enumerate(series):
+            axes.plot(
+                [100 * x for x in line.x],
+                [100 * y for y in line.y],
+                color=SERIES[i % len(SERIES)],
+                marker="o",
+                markersize=4,
+                label=line.name,
+            )
+        for i, (name, collision, success) in enumerate(marks):
+            colour = SERIES[(len(series) + i) % len(SERIES)]
+            axes.plot([100 * collision], [100 * success], marker="*", markersize=12, linestyle="none", color=colour, label=name)
+        axes.set_xlim(left=0)
+        axes.legend(loc="best")
+        return {}
+
+    return Panel(draw, 4.4, 3.4)
+
+
+# -------------------------------------------------------------------------------------------------------------------- time
+
+
+def stages(rows: Sequence[tuple[str, dict[str, float]]], title: str) -> Panel:
+    """Time per stage as one bar a row, widest stage first, like a flame graph's floor: (row's name, stage -> us per env-step)."""
+
+    def draw(axes: Axes) -> Hover:
+        axes.set_title(title, loc="left")
+        axes.set_xlabel("us per env-step")
+        axes.grid(False, axis="y")
+        longest = max(sum(spent.values()) for _, spent in rows)
+        hover: Hover = {}
+        for row, (_name, spent) in enumerate(rows):
+            hover |= _stage_bar(axes, row, spent, longest)
+        axes.set_yticks(range(len(rows)), [name for name, _ in rows])
+        axes.set_ylim(len(rows) - 0.5, -0.5)
+        return hover
+
+    return Panel(draw, 8.6, 0.9 + 0.55 * len(rows))
+
+
+def _stage_bar(axes: Axes, row: int, spent: dict[str, float], longest: float) -> Hover:
+    """One bar; a stage keeps its colour in every row, and its name where there is room for it."""
+    hover: Hover = {}
+    left, whole, order = 0.0, sum(spent.values()), list(spent)
+    for stage, us in sorted(spent.items(), key=lambda item: -item[1]):
+        i = order.index(stage)
+        gid, ground = f"stage-{row}-{i}", shade(0.1 + 0.85 * (i * _GOLDEN % 1.0))
+        axes.barh(row, us, left=left, height=0.7, color=ground)[0].set_gid(gid)
+        if us > _ROOM * longest:
+            axes.text(left + us / 2, row, f"{stage}\n{us:.1f}", ha="center", va="center", fontsize=7, color=ink_on(ground))
+        hover[gid] = f"{stage}: {us:.2f} us per env-step, {percent(us / whole if whole else None)}"
+        left += us
+    return hover

@@ -1,0 +1,96 @@
+"""Blocks of ``reproduce.json``: sections of prose, tables, verdicts and the runs that they rest on.
+
+``{"schema": 1, "title": "..", "sections": [{"title": "..", "blocks": [BLOCK, ..]}]}`` where a BLOCK is one of
+
+- ``{"kind": "prose" | "heading" | "notice", "text": ".."}``
+- ``{"kind": "table", "columns": [..], "rows": [[..], ..], "caption": "..", "n_left": 1}``
+- ``{"kind": "verdicts", "items": [{"claim": "..", "verdict": "holds" | "does not hold" | "cannot be judged", "numbers": ".."}]}``
+- ``{"kind": "trade_off", "series": [{"name": "..", "points": [{"collision_rate": 0, "success_rate": 0}]}],
+  "marks": [{"name": "paper", "collision_rate": 0.011, "success_rate": 0.828}], "caption": "..", "command": ".."}``
+- ``{"kind": "run", "path": ".."}``: what a run folder inside this one has to show (evaluation, sweep, profile, pictures, videos)
+- ``{"kind": "curves", "paths": ["..", ..]}``: training curves of run folders inside this one, seeds of one method as a band
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from uuvtai.loader import ConfigError
+from uuvtai.report.blocks import Block, Data, Figure, Heading, Notice, Prose, Section, Table, Verdict, Verdicts
+from uuvtai.report.figures import Line, trade_off
+from uuvtai.report.wording import value_name
+
+RULINGS = ("holds", "does not hold", "cannot be judged")
+
+Described = dict[str, Any]
+OfRun = Callable[[Path], list[Block]]
+OfCurves = Callable[[list[Path]], list[Block]]
+
+
+def reproduction(document: Described, folder: Path, of_run: OfRun, of_curves: OfCurves) -> list[Section]:
+    """Sections of a reproduction; ``of_run`` and ``of_curves`` give the blocks of run folders. Raises ConfigError."""
+    return [
+        Section(
+            str(section["title"]), [block for described in section["blocks"] for block in _blocks(described, folder, of_run, of_curves)]
+        )
+        for section in document["sections"]
+    ]
+
+
+def _blocks(described: Described, folder: Path, of_run: OfRun, of_curves: OfCurves) -> list[Block]:
+    kind = described["kind"]
+    if kind == "run":
+        return of_run(_inside(folder, described["path"]))
+    if kind == "curves":
+        return of_curves([_inside(folder, path) for path in described["paths"]])
+    if kind not in _SIMPLE:
+        raise ConfigError(f"{folder / 'reproduce.json'}: {kind!r} is no kind of block; there are: run, curves, {', '.join(_SIMPLE)}")
+    return [_SIMPLE[kind](described)]
+
+
+def _inside(folder: Path, path: str) -> Path:
+    """A run folder within this one: a report never reads elsewhere."""
+    found = (folder / path).resolve()
+    if not found.is_relative_to(folder.resolve()):
+        raise ConfigError(f"{folder / 'reproduce.json'}: {path!r} lies outside this run folder; name a folder inside it")
+    if not found.is_dir():
+        raise ConfigError(f"{folder / 'reproduce.json'}: {path!r} is no folder here; run 'uuv reproduce' again to make it")
+    return found
+
+
+def _table(described: Described) -> Table:
+    rows = [["-" if cell is None else value_name(cell) for cell in row] for row in described["rows"]]
+    data = Data(described["columns"], described["rows"])
+    return Table(described["columns"], rows, described.get("caption", ""), described.get("n_left", 1), data)
+
+
+def _verdicts(described: Described) -> Verdicts:
+    items = [Verdict(str(item["claim"]), str(item["verdict"]), str(item["numbers"])) for item in described["items"]]
+    for item in items:
+        if item.ruling not in RULINGS:
+            raise ConfigError(f"reproduce.json: {item.ruling!r} is no verdict; there are: {', '.join(RULINGS)}")
+    return Verdicts(items)
+
+
+def _trade_off(described: Described) -> Figure:
+    series = [
+        Line(str(one["name"]), [p["collision_rate"] for p in one["points"]], [p["success_rate"] for p in one["points"]])
+        for one in described["series"]
+    ]
+    marks = [(str(mark["name"]), mark["collision_rate"], mark["success_rate"]) for mark in described.get("marks", [])]
+    rows = [[line.name, *point] for line in series for point in zip(line.x, line.y, strict=True)] + [list(mark) for mark in marks]
+    data = Data(["series", "collision_rate", "success_rate"], rows)
+    caption = described.get("caption", "Success against collision along one setting")
+    return Figure("trade_off", [trade_off(series, marks)], caption, data, described.get("command", ""))
+
+
+_SIMPLE: dict[str, Callable[[Described], Block]] = {
+    "prose": lambda described: Prose(str(described["text"])),
+    "heading": lambda described: Heading(str(described["text"])),
+    "notice": lambda described: Notice(str(described["text"])),
+    "table": _table,
+    "verdicts": _verdicts,
+    "trade_off": _trade_off,
+}

@@ -1,0 +1,121 @@
+"""Blocks of a sweep (the document of ``uuv sweep --json``): heat maps over two or more axes, curves with intervals over one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from uuvtai.report.blocks import Block, Data, Figure, Notice, Prose, Table
+from uuvtai.report.figures import Line, heat_map, hover_text, intervals, place_of
+from uuvtai.report.heatmap import Cell, pivot, varying
+from uuvtai.report.wording import accidents, axis_name, number, rate, value_name
+
+_NUMBERS = ("success_rate", "collision_rate", "time_mean_s", "tts_s", "time_to_success_mean_s")
+_OUTCOMES = ("success", "collision", "ttc", "out_of_tank", "timeout")
+
+
+def sweep(document: dict[str, Any], command: str = "") -> list[Block]:
+    """Figures and the table of every cell."""
+    cells, axes = document["cells"], document["axes"]
+    if not cells:
+        return [Notice("No cell of this sweep is finished yet.")]
+    spans = "; ".join(f"{axis_name(name)} in {{{', '.join(map(value_name, values))}}}" for name, values in axes.items())
+    episodes = sum(cell["episodes"] for cell in cells)
+    said = f"World {document.get('world', '-')}, {spans}: {len(cells)} cells, {episodes:,} episodes in all."
+    drawn = _curves(cells, axes, command) if len(varying(axes)) < 2 else _maps(cells, axes, command)
+    return [Prose(said), *drawn]
+
+
+def _maps(cells: list[Cell], axes: dict[str, list[Any]], command: str) -> list[Block]:
+    """Two heat maps a method, like the paper's figure."""
+    blocks: list[Block] = []
+    for method, own in by_method(cells).items():
+        chosen = pivot(own, axes)
+        panels = [heat_map(chosen, f"{key}_rate", f"{method}: {key}") for key in ("collision", "success")]
+        caption = (
+            f"{method}: collision (left) and success (right) in per cent of the episodes, below each the mean time of the successes. "
+            "Bright is good in both. A cell that spans the row does not depend on the column. Counts and intervals: on hover and below"
+        )
+        blocks += [Figure(f"heat_map_{method}", panels, caption, cells_data(own), command), cells_table(own, f"Every cell of {method}")]
+    return blocks
+
+
+def _curves(cells: list[Cell], axes: dict[str, list[Any]], command: str) -> list[Block]:
+    """Success and collision along the one axis that varies, every method a line."""
+    named = varying(axes)
+    axis = named[0] if named else next(iter(axes), "")
+    places = list(dict.fromkeys(cell.get(axis) for cell in cells))
+    panels = [
+        intervals(
+            [_line(method, own, key, axis, places) for method, own in by_method(cells).items()],
+            list(map(value_name, places)),
+            key,
+            axis_name(axis),
+        )
+        for key in ("success", "collision")
+    ]
+    caption = f"Success and collision over {axis_name(axis)}, with 95 % Wilson intervals"
+    return [Figure(f"sweep_{axis}", panels, caption, cells_data(cells), command), cells_table(cells, "Every cell")]
+
+
+def _line(method: str, own: list[Cell], key: str, axis: str, places: list[Any]) -> Line:
+    known = [cell for cell in own if cell.get(f"{key}_rate") is not None]
+    bounds = [cell.get(f"{key}_ci95") or [cell[f"{key}_rate"]] * 2 for cell in known]
+    x = [places.index(cell.get(axis)) for cell in known]
+    said = [f"{method}, {hover_text(cell)}" for cell in known]
+    return Line(method, x, [cell[f"{key}_rate"] for cell in known], [low for low, _ in bounds], [high for _, high in bounds], said)
+
+
+def by_method(cells: list[Cell]) -> dict[str, list[Cell]]:
+    """Cells of each method, in the order in which they come."""
+    found: dict[str, list[Cell]] = {}
+    for cell in cells:
+        found.setdefault(cell.get("method", "policy"), []).append(cell)
+    return found
+
+
+def cells_table(cells: list[Cell], caption: str) -> Table:
+    """One row a cell: rates with counts and intervals, how the rest ended, times."""
+    axes = _axes_of(cells)
+    columns = ["method", *map(axis_name, axes), "success", "collision", "contact / TTC / out / timeout", "time to goal s", "TTS s"]
+    return Table(columns, [_row(cell, axes) for cell in cells], caption, n_left=1 + len(axes), folded=True)
+
+
+def _axes_of(cells: list[Cell]) -> list[str]:
+    return list(dict.fromkeys(name for cell in cells for name in place_of(cell)))
+
+
+def _row(cell: Cell, axes: list[str]) -> list[str]:
+    n, outcomes = cell["episodes"], cell.get("outcomes") or {}
+    k_success, k_collision = _count(cell, "success"), _count(cell, "collision")
+    split = " / ".join(str(outcomes.get(name, "-")) for name in ("collision", "ttc", "out_of_tank", "timeout"))
+    return [
+        str(cell.get("method", "policy")),
+        *("-" if cell.get(name) is None else value_name(cell[name]) for name in axes),
+        rate(k_success, n, cell.get("success_ci95")),
+        rate(k_collision, n, cell.get("collision_ci95")),
+        split,
+        number(cell.get("time_to_success_mean_s")),
+        number(cell.get("tts_s")),
+    ]
+
+
+def _count(cell: Cell, key: str) -> int | None:
+    """Episodes behind a rate: as counted, else as the rate says."""
+    if outcomes := cell.get("outcomes"):
+        return outcomes["success"] if key == "success" else accidents(outcomes)
+    share = cell.get(f"{key}_rate")
+    return None if share is None else round(share * cell["episodes"])
+
+
+def cells_data(cells: list[Cell]) -> Data:
+    """Every cell as numbers."""
+    axes = _axes_of(cells)
+    bounds = [f"{key}_ci95_{end}" for key in ("success", "collision") for end in ("low", "high")]
+    return Data(["method", *axes, "episodes", *_OUTCOMES, *bounds, *_NUMBERS], [_numbers(cell, axes) for cell in cells])
+
+
+def _numbers(cell: Cell, axes: list[str]) -> list[Any]:
+    outcomes = cell.get("outcomes") or {}
+    bounds = [bound for key in ("success", "collision") for bound in (cell.get(f"{key}_ci95") or (None, None))]
+    head = [cell.get("method"), *(cell.get(name) for name in axes), cell["episodes"]]
+    return [*head, *(outcomes.get(name) for name in _OUTCOMES), *bounds, *(cell.get(name) for name in _NUMBERS)]
