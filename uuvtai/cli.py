@@ -501,6 +501,56 @@ def _print_profile(result: dict[str, Any]) -> None:
         _stdout().print(paper)
 
 
+# ------------------------------------------------------------------------------------------------------------------ export
+
+
+@app.command("export")
+def export_policy(
+    run: Annotated[str | None, typer.Argument(metavar="[RUN]", help="Run folder, checkpoint folder or shipped name (best).")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="New folder \\[default: runs/NAME_export].")] = None,
+    evaluation: Annotated[
+        list[Path] | None,
+        typer.Option("--evaluation", help="Run folder of 'uuv eval RUN': counts for the model card (repeatable)."),
+    ] = None,
+    check: Annotated[Path | None, typer.Option("--check", help="Verify an exported folder instead: sha256 and golden pairs.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write a policy that drives without uuvtai (NumPy alone, or ONNX), or check such a folder. Exit code 3: it disagrees."""
+    if (run is None) == (check is None):
+        raise UsageError("give the RUN to export, or --check DIR for a folder that was exported")
+    from uuvtai.deploy import export as deploy
+
+    if check is not None:
+        found = deploy.check(check, _say)
+    else:
+        from uuvtai.measure.methods import find_policy, policy_name
+
+        assert run is not None
+        checkpoint = find_policy(run, _say)
+        name = policy_name(run, checkpoint)
+        found = deploy.export(checkpoint, name, out or Path("runs") / f"{name}_export", evaluation or [], _say)
+    if as_json:
+        _print_json(found.document())
+    else:
+        _print_export(found)
+    if not found.agrees:
+        raise typer.Exit(GATE)
+
+
+def _print_export(found: Any) -> None:
+    for damage in found.damages:
+        _say(damage)
+    table = Table(title=str(found.folder), title_justify="left")
+    for head in ("engine", "largest difference", "p50 ms", "p99 ms", ""):
+        table.add_column(head, justify="right" if head else "left")
+    for one in found.agreements:
+        worst = max(one.difference, key=lambda name: one.difference[name])
+        told = f"{one.difference[worst]:.1e} ({worst})"
+        table.add_row(one.engine, told, f"{one.p50_ms:.3f}", f"{one.p99_ms:.3f}", "agrees" if one.agrees else "DIFFERS")
+    if found.agreements:
+        _stdout().print(table)
+
+
 # --------------------------------------------------------------------------------------------------------- presets, doctor
 
 

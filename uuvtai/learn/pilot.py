@@ -63,6 +63,11 @@ class Pilot:
         self.decision = Decision(*(torch.zeros(0) for _ in Decision._fields))
         """the last one; where an older one is held, what the networks said then"""
 
+    @property
+    def mean_action(self) -> torch.Tensor:
+        """(num_envs, 4) action of the last decision before it was cut off to [-1, 1]: what the difference that is held was taken from."""
+        return self._action
+
     def reset(self, rows: torch.Tensor) -> None:
         """Forget the last step of the rows (num_envs,) where this is not 0."""
         kept = rows.to(self.device) == 0
