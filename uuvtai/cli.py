@@ -695,6 +695,17 @@ def log_repair(
     typer.echo(f"{found.path}: {found.messages} messages recovered, the last at {found.last_time_s:.2f} s")
 
 
+@log_app.command("convert")
+def log_convert(
+    file: LogFile, out: Annotated[Path | None, typer.Option("--out", help="New file \\[default: NAME.protobuf.mcap].")] = None
+) -> None:
+    """Write a log with protobuf messages and point clouds, for Rerun and other viewers that do not read JSON."""
+    from uuvtai.logs import convert
+
+    target = out or file.with_suffix(".protobuf.mcap")
+    typer.echo(f"{target}: {convert.convert(file, target)} messages")
+
+
 @log_app.command("video")
 def log_video(
     file: LogFile, out: Annotated[Path | None, typer.Option("--out", help="WebM file \\[default: beside the log].")] = None
