@@ -18,6 +18,7 @@ import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from uuvtai import __version__
 
@@ -645,7 +646,7 @@ def tree(
     if as_json:
         _print_json(report.document)
     else:
-        typer.echo(report.dot if dot else report.text)
+        typer.echo(plain(report.dot if dot else report.text))
 
 
 LogFile = Annotated[Path, typer.Argument(help="An .mcap file.")]
@@ -664,9 +665,9 @@ def log_info(file: LogFile, as_json: AsJson = False) -> None:
     for head in ("topic", "schema", "messages", "Hz"):
         table.add_column(head, justify="right" if head in ("messages", "Hz") else "left")
     for topic in found["topics"]:
-        table.add_row(topic["topic"], topic["schema"], str(topic["messages"]), _number(topic["rate_hz"]))
+        table.add_row(Text(plain(topic["topic"])), Text(plain(topic["schema"])), str(topic["messages"]), _number(topic["rate_hz"]))
     _stdout().print(table)
-    _stdout().print(f"duration {found['duration_s']:.2f} s, outcome {found['outcome'] or 'none: the log was cut off'}", highlight=False)
+    typer.echo(f"duration {found['duration_s']:.2f} s, outcome {plain(found['outcome'] or 'none: the log was cut off')}")
 
 
 @log_app.command("export")
@@ -788,7 +789,12 @@ def _stdout() -> Console:
 
 
 def _say(text: str) -> None:
-    typer.echo(text, err=True)
+    typer.echo(plain(text), err=True)
+
+
+def plain(text: str) -> str:
+    """Text that a file may have brought along, without what would steer the terminal."""
+    return "".join(c if c.isprintable() or c in "\n\t" else "?" for c in text)
 
 
 class _Progress:

@@ -15,6 +15,8 @@ from uuvtai.deploy.golden import TOLERANCE, Arrays, inputs_of
 from uuvtai.deploy.graph import OUTPUTS, OneDecision
 
 RUNTIME = "onnxruntime"
+_BRANCHES = ("Loop", "Scan", "If", "SequenceMap")
+"""operators that hold graphs of their own"""
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,7 @@ def of_onnx(graph: bytes, golden: Arrays) -> Agreement:
     """ONNX Runtime on one thread. Raises RuntimeError where it cannot use the graph."""
     import onnxruntime
 
+    _refuse_strange(graph)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     try:
@@ -75,8 +78,23 @@ def of_onnx(graph: bytes, golden: Arrays) -> Agreement:
 
 
 def has_onnx_runtime() -> bool:
-    """Whether the graph can be run here."""
-    return importlib.util.find_spec(RUNTIME) is not None
+    """Whether the graph can be read and run here."""
+    return all(importlib.util.find_spec(name) is not None for name in (RUNTIME, "onnx"))
+
+
+def _refuse_strange(graph: bytes) -> None:
+    """Raise RuntimeError for a graph that reaches beyond itself or may run for ever: other operators, other files, loops, functions."""
+    import onnx
+
+    try:
+        model = onnx.load_from_string(graph)
+    except Exception as error:  # protobuf's own, which this package does not import
+        raise RuntimeError(f"policy.onnx: is no ONNX graph ({error}); export the policy again") from None
+    strange = {f"{node.domain or 'onnx'}.{node.op_type}" for node in model.graph.node if node.domain or node.op_type in _BRANCHES}
+    strange |= {tensor.name for tensor in model.graph.initializer if tensor.external_data}
+    strange |= {function.name for function in model.functions}
+    if strange:
+        raise RuntimeError(f"policy.onnx: was not written by uuv export, it has {', '.join(sorted(strange)[:5])}; export the policy again")
 
 
 def _differences(found: Arrays, golden: Arrays) -> dict[str, float]:
