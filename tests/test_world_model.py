@@ -86,7 +86,7 @@ def test_prediction_is_the_decoders_in_si_units():
         predicted = model.predict(obs, action)
         nll = 0.5 * ((next_obs[:, :N_TARGET] - predicted.mean) ** 2 / predicted.log_var.exp() + predicted.log_var).sum(1).mean()
         inside = model.loss(obs, action, next_obs, torch.ones(N_ENV, dtype=torch.bool)).reconstruction
-        assert (nll - inside).item() == pytest.approx(model._scale().log().sum().item(), rel=1e-4)
+        assert (nll - inside).item() == pytest.approx(model.scale().log().sum().item(), rel=1e-4)
 
 
 @pytest.mark.parametrize("stopped", [True, False])

@@ -18,6 +18,7 @@ import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from uuvtai import __version__
 
@@ -735,6 +736,56 @@ def _write_report(runs: list[Path], out: Path | None) -> Any:
     return report(runs, out)
 
 
+# ------------------------------------------------------------------------------------------------------------------ export
+
+
+@app.command("export")
+def export_policy(
+    run: Annotated[str | None, typer.Argument(metavar="[RUN]", help="Run folder, checkpoint folder or shipped name (best).")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="New folder \\[default: runs/NAME_export].")] = None,
+    evaluation: Annotated[
+        list[Path] | None,
+        typer.Option("--evaluation", help="Run folder of 'uuv eval RUN': counts for the model card (repeatable)."),
+    ] = None,
+    check: Annotated[Path | None, typer.Option("--check", help="Verify an exported folder instead: sha256 and golden pairs.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write a policy that drives without uuvtai (NumPy alone, or ONNX), or check such a folder. Exit code 3: it disagrees."""
+    if (run is None) == (check is None):
+        raise UsageError("give the RUN to export, or --check DIR for a folder that was exported")
+    from uuvtai.deploy import export as deploy
+
+    if check is not None:
+        found = deploy.check(check, _say)
+    else:
+        from uuvtai.measure.methods import find_policy, policy_name
+
+        assert run is not None
+        checkpoint = find_policy(run, _say)
+        name = policy_name(run, checkpoint)
+        found = deploy.export(checkpoint, name, out or Path("runs") / f"{name}_export", evaluation or [], _say)
+    if as_json:
+        _print_json(found.document())
+    else:
+        _print_export(found)
+    if not found.agrees:
+        raise typer.Exit(GATE)
+
+
+def _print_export(found: Any) -> None:
+    for damage in found.damages:
+        _say(damage)
+    table = Table(title=str(found.folder), title_justify="left")
+    for head in ("engine", "largest difference", "p50 ms", "p99 ms", ""):
+        table.add_column(head, justify="right" if head else "left")
+    for one in found.agreements:
+        worst = max(one.difference, key=lambda name: one.difference[name])
+        told = f"{one.difference[worst]:.1e} ({worst})"
+        table.add_row(one.engine, told, f"{one.p50_ms:.3f}", f"{one.p99_ms:.3f}", "agrees" if one.agrees else "DIFFERS")
+    if found.agreements:
+        _stdout().print(table)
+
+
 # --------------------------------------------------------------------------------------------------------- presets, doctor
 
 
@@ -829,7 +880,7 @@ def tree(
     if as_json:
         _print_json(report.document)
     else:
-        typer.echo(report.dot if dot else report.text)
+        typer.echo(plain(report.dot if dot else report.text))
 
 
 LogFile = Annotated[Path, typer.Argument(help="An .mcap file.")]
@@ -848,9 +899,9 @@ def log_info(file: LogFile, as_json: AsJson = False) -> None:
     for head in ("topic", "schema", "messages", "Hz"):
         table.add_column(head, justify="right" if head in ("messages", "Hz") else "left")
     for topic in found["topics"]:
-        table.add_row(topic["topic"], topic["schema"], str(topic["messages"]), _number(topic["rate_hz"]))
+        table.add_row(Text(plain(topic["topic"])), Text(plain(topic["schema"])), str(topic["messages"]), _number(topic["rate_hz"]))
     _stdout().print(table)
-    _stdout().print(f"duration {found['duration_s']:.2f} s, outcome {found['outcome'] or 'none: the log was cut off'}", highlight=False)
+    typer.echo(f"duration {found['duration_s']:.2f} s, outcome {plain(found['outcome'] or 'none: the log was cut off')}")
 
 
 @log_app.command("export")
@@ -877,6 +928,17 @@ def log_repair(
     for damage in found.damages:
         _say(damage)
     typer.echo(f"{found.path}: {found.messages} messages recovered, the last at {found.last_time_s:.2f} s")
+
+
+@log_app.command("convert")
+def log_convert(
+    file: LogFile, out: Annotated[Path | None, typer.Option("--out", help="New file \\[default: NAME.protobuf.mcap].")] = None
+) -> None:
+    """Write a log with protobuf messages and point clouds, for Rerun and other viewers that do not read JSON."""
+    from uuvtai.logs import convert
+
+    target = out or file.with_suffix(".protobuf.mcap")
+    typer.echo(f"{target}: {convert.convert(file, target)} messages")
 
 
 @log_app.command("video")
@@ -961,7 +1023,12 @@ def _stdout() -> Console:
 
 
 def _say(text: str) -> None:
-    typer.echo(text, err=True)
+    typer.echo(plain(text), err=True)
+
+
+def plain(text: str) -> str:
+    """Text that a file may have brought along, without what would steer the terminal."""
+    return "".join(c if c.isprintable() or c in "\n\t" else "?" for c in text)
 
 
 class _Progress:

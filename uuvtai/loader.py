@@ -36,6 +36,8 @@ _SCENE_KINDS = ("world", "sensors", "vehicle")
 _LEARNING_SECTIONS = LearningConfig.model_fields.keys() - Config.model_fields.keys()
 _MAX_BYTES = 1 << 20
 _MAX_EXTENDS = 8
+_MAX_SCALAR, _MAX_NODES = 1000, 50_000
+"""characters of one value, values of one file: some of YAML's own readers take the square of a value's length"""
 
 
 Overrides = dict[str, Any] | list[str | tuple[str, Any]]
@@ -209,12 +211,19 @@ def _spell_out(layer: _Layer) -> None:
 
 
 class _SafeLoader(yaml.SafeLoader):
-    """Safe YAML that reads 3e-4 as a number and refuses aliases and duplicate keys."""
+    """Safe YAML that reads 3e-4 as a number and refuses aliases, duplicate keys and what no config is as long as."""
+
+    nodes = 0
 
     def compose_node(self, parent, index):  # type: ignore[override]
-        if self.check_event(yaml.events.AliasEvent):
-            event = self.peek_event()
+        event = self.peek_event()
+        self.nodes += 1
+        if isinstance(event, yaml.events.AliasEvent):
             raise yaml.MarkedYAMLError(problem="aliases (*name) are not allowed here", problem_mark=event.start_mark)
+        if isinstance(event, yaml.events.ScalarEvent) and len(event.value) > _MAX_SCALAR:
+            raise yaml.MarkedYAMLError(problem=f"a value of {len(event.value)} characters", problem_mark=event.start_mark)
+        if self.nodes > _MAX_NODES:
+            raise yaml.MarkedYAMLError(problem=f"more than {_MAX_NODES} values", problem_mark=event.start_mark)
         return super().compose_node(parent, index)
 
     def construct_mapping(self, node, deep=False):  # type: ignore[override]
@@ -229,18 +238,20 @@ class _SafeLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-_SafeLoader.add_implicit_resolver("tag:yaml.org,2002:float", re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+0123456789."))
+_SafeLoader.add_implicit_resolver("tag:yaml.org,2002:float", re.compile(r"^[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$"), list("-+0123456789."))
 
 
 def parsed_yaml(text: str, where: str) -> Any:
     """Python value of a YAML text; ConfigError names ``where`` and the line."""
+    if len(text) > _MAX_BYTES:
+        raise ConfigError(f"{where}: larger than 1 MiB; a config is a small text file")
     try:
         return yaml.load(text, Loader=_SafeLoader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         line = f":{mark.line + 1}" if mark else ""
         raise ConfigError(f"{where}{line}: not valid YAML: {error.problem}; mend that line") from None
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
+    except (yaml.YAMLError, RecursionError, ValueError, OverflowError) as error:
         raise ConfigError(f"{where}: not valid YAML: {error}") from None
 
 

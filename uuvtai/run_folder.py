@@ -16,6 +16,9 @@ from uuvtai import __version__
 from uuvtai.config import Config
 from uuvtai.loader import to_yaml
 
+_WRITTEN_IN_PLACE = (".lock", "metrics.jsonl")
+"""files that a resumed run opens for writing; others are replaced as a whole"""
+
 
 class RunFolderError(RuntimeError):
     """The run folder cannot be made, written or read: what, where, why, what to type next."""
@@ -65,12 +68,17 @@ class RunFolder:
         """Hold and go on with a run that ended or was killed; ``since`` says from where. Raises RunFolderError."""
         folder = cls.__new__(cls)
         folder.path, folder._started = path, time.time()
+        for name in _WRITTEN_IN_PLACE:
+            if (path / name).is_symlink():
+                raise RunFolderError(
+                    f"{path / name}: is a link; a run folder holds plain files, and what a link leads to is not ours to write"
+                )
         folder.hold()
         try:
             folder._record = json.loads((path / "run.json").read_text(encoding="utf-8"))
             resumed = {"argv": sys.argv, "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"), "versions": versions(), **since}
             folder._record |= {"status": "running", "resumed": [*folder._record.get("resumed", []), resumed]}
-        except (OSError, ValueError, TypeError, AttributeError) as error:
+        except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
             raise RunFolderError(f"{path / 'run.json'}: cannot be read ({error}); give the folder that 'uuv train' printed") from None
         folder._record.pop("exit", None)
         folder.write_json("run.json", folder._record)

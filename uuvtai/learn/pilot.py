@@ -6,11 +6,13 @@ What a row does must not depend on its neighbours, the batch's size or the numbe
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 
+from uuvtai.config.learning import LearningConfig
 from uuvtai.learn.checkpoint import Checkpoint
 from uuvtai.learn.manifest import MODEL, CheckpointError
 from uuvtai.learn.policy import NUM_ACTIONS, Policy
@@ -62,6 +64,11 @@ class Pilot:
         self._offset, self._said = (torch.zeros(rows, width, device=device) for width in (NUM_ACTIONS, 4))
         self.decision = Decision(*(torch.zeros(0) for _ in Decision._fields))
         """the last one; where an older one is held, what the networks said then"""
+
+    @property
+    def mean_action(self) -> torch.Tensor:
+        """(num_envs, 4) action of the last decision before it was cut off to [-1, 1]: what the difference that is held was taken from."""
+        return self._action
 
     def reset(self, rows: torch.Tensor) -> None:
         """Forget the last step of the rows (num_envs,) where this is not 0."""
@@ -136,13 +143,31 @@ def _by_chunk(function: Callable[..., torch.Tensor], *inputs: torch.Tensor) -> t
     return torch.cat(parts)[: len(inputs[0])]
 
 
+def _check_sizes(parts: dict[str, Any], config: LearningConfig, n_obs: int) -> None:
+    """Raise ValueError where the networks of a config are not as wide as the tensors that came with it, before anything is made so wide."""
+    n_in, latent = n_obs + N_FEATURES, config.world_model.latent
+    nets = [("policy", "actor", (n_in, *config.policy.hidden)), ("policy", "critic", (n_in, *config.policy.hidden))]
+    if config.world_model.enabled and config.world_model.as_features:
+        hidden = config.world_model.hidden
+        nets += [("world_model", "encoder", (n_obs, *hidden, latent)), ("world_model", "dynamics", (latent + NUM_ACTIONS, *hidden, latent))]
+        nets += [("world_model", "decoder", (latent, *hidden))]
+    if config.risk.enabled:
+        nets += [("risk", "net", (n_in, *config.risk.hidden))]
+    for part, net, widths in nets:
+        for number, (first, last) in enumerate(itertools.pairwise(widths)):
+            name = f"{net}.{2 * number}.weight"
+            if parts[part][name].shape != (last, first):
+                raise ValueError(f"{part}.{name} is {tuple(parts[part][name].shape)} instead of {(last, first)}")
+
+
 def load_pilot(checkpoint: Checkpoint, num_envs: int, device: torch.device | str = "cpu") -> Pilot:
     """Pilot with the networks of a checkpoint. Raises CheckpointError where they do not fit what its config says."""
     config, rows = checkpoint.config, checkpoint.manifest.observation_table
-    n_obs = max(row["stop"] for row in rows)
-    teacher = next((slice(row["first"], row["stop"]) for row in rows if row["name"] == TEACHER_COLUMN), None)
     parts, generator = checkpoint.model(), torch.Generator()
     try:
+        n_obs = max(row["stop"] for row in rows)
+        teacher = next((slice(row["first"], row["stop"]) for row in rows if row["name"] == TEACHER_COLUMN), None)
+        _check_sizes(parts, config, n_obs)
         policy = Policy(n_obs + N_FEATURES, config.policy, teacher, generator)
         policy.load_state_dict(parts["policy"])
         world_model = None
@@ -153,7 +178,7 @@ def load_pilot(checkpoint: Checkpoint, num_envs: int, device: torch.device | str
         if config.risk.enabled:
             risk = RiskHead(n_obs + N_FEATURES, config.risk, generator)
             risk.load_state_dict(parts["risk"])
-    except (KeyError, ValueError, RuntimeError, TypeError) as error:
+    except (KeyError, ValueError, RuntimeError, TypeError, AttributeError) as error:
         raise CheckpointError(f"{checkpoint.path / MODEL}: its networks are not those of its config ({error}); take another one") from None
     modules = [module for module in (policy, world_model, risk) if module is not None]
     for module in modules:

@@ -95,8 +95,8 @@ class WorldModel(nn.Module):
         """What follows observations (..., n_obs) and actions (..., 4)."""
         latent = self.advance(self.encode(obs), action)
         mean, log_var = self.decode(latent)
-        scale = self._scale()
-        return Prediction(latent, self._base(obs) + scale * mean, log_var + 2.0 * scale.log())
+        scale = self.scale()
+        return Prediction(latent, self.base(obs) + scale * mean, log_var + 2.0 * scale.log())
 
     @torch.no_grad()
     def features(self, obs: Tensor, action: Tensor, next_obs: Tensor) -> Tensor:
@@ -120,7 +120,7 @@ class WorldModel(nn.Module):
         config, weight = self.config, valid / valid.sum().clamp(min=1)
         ahead = self.advance(self.encode(obs), action)
         mean, log_var = self.decode(ahead)
-        target = ((next_obs[:, :N_TARGET] - self._base(obs)) / self._scale()).clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS)
+        target = ((next_obs[:, :N_TARGET] - self.base(obs)) / self.scale()).clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS)
         with torch.set_grad_enabled(torch.is_grad_enabled() and not config.stop_target_gradient):
             following = self.encode(next_obs)
         reconstruction = self._reconstruction(mean, log_var, target).sum(dim=-1) @ weight
@@ -140,13 +140,13 @@ class WorldModel(nn.Module):
         nll = 0.5 * (error * torch.exp(-log_var) + log_var)
         return nll * torch.exp(self.config.beta_nll * log_var).detach() if self.config.beta_nll else nll
 
-    def _base(self, obs: Tensor) -> Tensor:
+    def base(self, obs: Tensor) -> Tensor:
         """What the decoder's mean is added to."""
         if self.config.predict_change:
             return obs[..., :N_TARGET]
         return self.observation_norm.mean[:N_TARGET].float() if self.config.normalise_targets else obs.new_zeros(N_TARGET)
 
-    def _scale(self) -> Tensor:
+    def scale(self) -> Tensor:
         """(24,) decoder's unit in SI units."""
         if not self.config.normalise_targets:
             return torch.ones_like(self.change_norm.mean, dtype=torch.float32)

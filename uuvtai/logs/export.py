@@ -9,6 +9,7 @@ import json
 import os
 import re
 import shutil
+import struct
 import tempfile
 import zipfile
 from collections.abc import Collection
@@ -22,6 +23,10 @@ from uuvtai.logs.errors import LogError
 from uuvtai.logs.reader import info, read_head, read_messages
 
 FORMATS = ("jsonl", "csv", "npz")
+_PNG_HEAD = struct.Struct(">8s4x4sII")
+"""signature, first chunk's name, width, height"""
+_MAX_PIXELS = 1 << 24
+"""of a depth image: a thousand times the camera's, and far below what a small file can claim"""
 
 
 def export(path: Path, out_dir: Path, topics: Collection[str] | None = None, fmt: str = "jsonl") -> list[Path]:
@@ -150,7 +155,13 @@ def grid_values(data: dict[str, Any]) -> np.ndarray:
 
 def depth_image(data: dict[str, Any]) -> np.ndarray:
     """Depth image of a foxglove.CompressedImage [mm], uint16 (row, col)."""
-    image = cv2.imdecode(np.frombuffer(base64.b64decode(data["data"]), np.uint8), cv2.IMREAD_UNCHANGED)
-    if image is None:
+    png = base64.b64decode(data["data"])
+    signature, name, width, height = _PNG_HEAD.unpack_from(png.ljust(_PNG_HEAD.size, b"\0"))
+    if signature != b"\x89PNG\r\n\x1a\n" or name != b"IHDR":
         raise LogError("a depth image of the log cannot be decoded: it is not a PNG")
+    if width * height > _MAX_PIXELS:
+        raise LogError(f"a depth image of the log claims {width} x {height} pixels: no camera of ours has so many")
+    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise LogError("a depth image of the log cannot be decoded: it is damaged")
     return image

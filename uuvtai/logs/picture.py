@@ -12,7 +12,7 @@ import numpy as np
 from uuvtai.logs.canvas import DYNAMIC, FAILED, GREY, INK, METHODS, MOVER, PAPER, STATIC, WATER, Canvas, Color
 from uuvtai.logs.errors import LogError
 from uuvtai.logs.painting import map_canvas, mixed, paint_layers, paint_ruler, paint_truth, paint_walls, paint_water
-from uuvtai.logs.recording import PICTURE_TOPICS, Recording, load_recording
+from uuvtai.logs.recording import PICTURE_TOPICS, Recording, drawing, load_recording
 from uuvtai.logs.video import video
 
 __all__ = ["draw_picture", "picture", "video"]
@@ -35,7 +35,9 @@ def picture(
         raise LogError("uuv log picture: give at least one log")
     recordings = [load_recording(path, PICTURE_TOPICS) for path in found]
     check_same_episode(recordings)
-    return save_image(draw_picture(recordings, clearance, obstacles, width_px, remark), Path(out))
+    with drawing(found[0]):
+        image = draw_picture(recordings, clearance, obstacles, width_px, remark)
+    return save_image(image, Path(out))
 
 
 def check_same_episode(recordings: list[Recording]) -> None:

@@ -25,6 +25,8 @@ MAX_RECORD = 256 << 20
 """[bytes] longest record that is looked at"""
 MAX_CHUNK = 64 << 20
 """[bytes] most that a chunk may unpack to: 256 times what we write, far below what would fill a memory"""
+MAX_UNPACKED = 4 << 30
+"""[bytes] most that all chunks of a file may unpack to: 30 times the longest log that was seen, and what an export may take of a disk"""
 
 _READ = 64 * 1024
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
@@ -179,6 +181,7 @@ class Scanner:
         file.seek(0)
         self.at = 0
         self.finished = False
+        self._unpacked = 0
 
     def records(self, skip_chunks: bool = False) -> Iterator[Any]:
         """Records up to the end of the data section. Raises DamageError; iterate again to go on behind it where it ``can_go_on``."""
@@ -232,6 +235,9 @@ class Scanner:
         if chunk.uncompressed_size > MAX_CHUNK:
             raise self._behind(length, f"a chunk claims to unpack to {chunk.uncompressed_size} bytes")
         plain, trouble = unpacked(chunk.data, chunk.compression)
+        self._unpacked += len(plain)
+        if self._unpacked > MAX_UNPACKED:
+            raise DamageError(f"its chunks unpack to more than {MAX_UNPACKED >> 20} MiB")
         found, used = split_records(plain)
         if cut:
             raise DamageError("a chunk is cut off", found)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import bisect
+import contextlib
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from uuvtai.logs.errors import LogError
@@ -95,6 +98,8 @@ class Recording:
 
 
 _ENDINGS = {"ttc": "TTC stop"}
+_MAX_DURATION_S, _MAX_EXTENT_M, _FARTHEST_M, _MAX_BODIES = 3600.0, 1000.0, 1e4, 1000
+"""what is drawn must fit a picture and a video that somebody waits for"""
 PICTURE_TOPICS = ("/pose", "/safety", "/map/static", "/map/dynamic", "/map/clearance", "/plan/info")
 VIDEO_TOPICS = (*PICTURE_TOPICS, "/sonar/scan", "/plan/lookahead", "/state", "/action", "/tracks")
 
@@ -104,6 +109,7 @@ def load_recording(path: Path, topics: tuple[str, ...] = VIDEO_TOPICS) -> Record
     path = Path(path)
     head = read_head(path)
     found = Recording(path, head, head.scenario)
+    _check_scenario(path, head.scenario)
     try:
         for message in read_messages(path, topics):
             _take(found, message)
@@ -111,7 +117,41 @@ def load_recording(path: Path, topics: tuple[str, ...] = VIDEO_TOPICS) -> Record
         raise LogError(f"{path}: a message is not as its schema says ({error!r}); see what is in it with: uuv log info {path}") from error
     if not found.pose.times:
         raise LogError(f"{path}: the log has no messages on /pose, so there is nothing to draw; see uuv log info {path}")
+    if not found.duration_s <= _MAX_DURATION_S:
+        raise LogError(f"{path}: claims to last {found.duration_s:g} s; no episode is longer than {_MAX_DURATION_S:g} s")
     return found
+
+
+@contextlib.contextmanager
+def drawing(path: Path) -> Iterator[None]:
+    """Turn everything that a scenario or a message unlike ours can raise while it is drawn into a LogError."""
+    try:
+        yield
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError, cv2.error) as error:
+        raise LogError(f"{path}: cannot be drawn ({error!r}); give a log that uuv eval --record wrote") from None
+
+
+def _check_scenario(path: Path, scenario: Any) -> None:
+    """Raise LogError for a tank or bodies that cannot be drawn: what is drawn grows with their extent."""
+    try:
+        tank, bodies = scenario["tank"], scenario["bodies"]
+        extents = [float(tank[axis][1]) - float(tank[axis][0]) for axis in ("x_m", "y_m")]
+        if not all(0 < extent <= _MAX_EXTENT_M for extent in extents):
+            raise ValueError(f"a tank of {extents[0]:g} x {extents[1]:g} m")
+        numbers = list(_numbers([tank, bodies, scenario["goal"], scenario["start"]]))
+        if len(bodies) > _MAX_BODIES or not all(abs(number) <= _FARTHEST_M for number in numbers):
+            raise ValueError("bodies beyond all bounds")
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError, RecursionError) as error:
+        raise LogError(f"{path}: its scenario.json cannot be drawn ({error!r}); give a log that uuv eval --record wrote") from None
+
+
+def _numbers(value: Any) -> Iterator[float]:
+    """Every number within."""
+    if isinstance(value, int | float):
+        yield value
+    elif isinstance(value, dict | list):
+        for inner in value.values() if isinstance(value, dict) else value:
+            yield from _numbers(inner)
 
 
 def _take(found: Recording, message: LogMessage) -> None:

@@ -21,7 +21,7 @@ from uuvtai.logs.painting import (
     paint_walls,
     paint_water,
 )
-from uuvtai.logs.recording import Recording, load_recording
+from uuvtai.logs.recording import Recording, drawing, load_recording
 
 _MARGINS = (52, 28, 84, 212)
 """[px] left, right, top, bottom"""
@@ -54,17 +54,21 @@ def video(
     Raises LogError; the file appears whole or not at all.
     """
     recording, out = load_recording(path), Path(out)
-    artist = FrameArtist(recording, width_px, remark)
+    with drawing(Path(path)):
+        artist = FrameArtist(recording, width_px, remark)
     times = np.arange(0.0, recording.duration_s, speed / fps)
     times = np.concatenate([times, np.full(1 + round(_HOLD_S * fps), recording.duration_s)])
     part = out.with_name(f".{out.stem}.{os.getpid()}.part.webm")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         part.touch()
-        height, width = artist.frame(0.0).shape[:2]
+        with drawing(Path(path)):
+            height, width = artist.frame(0.0).shape[:2]
         with _webm_writer(part, (width, height), fps) as writer:
             for i, time_s in enumerate(times):
-                writer.write(artist.frame(float(time_s)))
+                with drawing(Path(path)):
+                    frame = artist.frame(float(time_s))
+                writer.write(frame)
                 if progress:
                     progress(i + 1, len(times))
         _check_whole(part, out)

@@ -71,7 +71,7 @@ def trees_of(names: list[str], max_node: int) -> list[Method]:
 def policies_of(names: list[str], max_node: int, note: Callable[[str], None]) -> list[Method]:
     """Methods that a trained policy drives; ``note`` is told of checkpoints that were left out. Raises ConfigError, CheckpointError."""
     tree = read_tree(TRAINING_TREE, max_node) if names else None
-    found = [Method(_name_of(name, checkpoint), tree, checkpoint) for name in names if (checkpoint := find_policy(name, note)) and tree]
+    found = [Method(policy_name(name, checkpoint), tree, checkpoint) for name in names if (checkpoint := find_policy(name, note)) and tree]
     doubled = {method.name for method in found if [other.name for other in found].count(method.name) > 1}
     if doubled:
         raise ConfigError(f"{', '.join(sorted(doubled))}: given twice, or two runs with the same name; evaluate them one by one")
@@ -125,7 +125,8 @@ def differences(method: Method, config: Config) -> str:
     return f"{method.name}: {', '.join(told)}" if told else ""
 
 
-def _name_of(name: str, checkpoint: Checkpoint) -> str:
+def policy_name(name: str, checkpoint: Checkpoint) -> str:
+    """What a policy is called in tables: its shipped name, its run, or its run and step."""
     if name in preset_names("policy"):
         return name
     path = Path(name).resolve()

@@ -26,11 +26,11 @@ def tree_report(controller: str, run: Path | None) -> TreeReport:
     """Report of a controller's tree; with a run folder, the use of its nodes there. Raises ConfigError."""
     use = None
     if run is not None:
-        record = _record(run)
-        if controller not in record["use"]:
-            raise ConfigError(f"{run}: has no controller {controller!r}; there are: {', '.join(record['use'])} (--controller NAME)")
+        used = _record(run)
+        if controller not in used:
+            raise ConfigError(f"{run}: has no controller {controller!r}; there are: {', '.join(used)} (--controller NAME)")
         tree = read_tree(str(run / "eval" / "trees" / f"{controller}.xml"))
-        use = [NodeUse(**node) for node in record["use"][controller]]
+        use = used[controller]
         if len(use) != len(tree.names):
             raise ConfigError(f"{run}: the tree {controller!r} has changed since that evaluation; run it again with 'uuv eval'")
     else:
@@ -39,19 +39,26 @@ def tree_report(controller: str, run: Path | None) -> TreeReport:
     return TreeReport(text, tree_dot(tree, use), _document(controller, tree, use))
 
 
-def _record(run: Path) -> dict[str, Any]:
+def _record(run: Path) -> dict[str, list[NodeUse]]:
+    """Use of every node by controller."""
     path = run / "eval" / "tree.json"
     if not run.is_dir():
         shipped = f"; the tree alone: 'uuv tree --controller {run}'" if str(run) in preset_names("tree") else ""
         raise ConfigError(f"{run}: is no run folder; give one of an evaluation ('uuv eval' prints it){shipped}")
     try:
-        return json.loads(path.read_text())
+        record = json.loads(path.read_bytes())
+        return {
+            name: [NodeUse(float(node["share"]), int(node["ticks"]), int(node["acted"])) for node in nodes]
+            for name, nodes in record["use"].items()
+        }
     except OSError as error:
         raise ConfigError(
             f"{path}: cannot be read ({error.strerror}); give the run folder of an evaluation ('uuv eval' prints it)"
         ) from None
     except json.JSONDecodeError as error:
         raise ConfigError(f"{path}: is not valid JSON ({error}); run the evaluation again with 'uuv eval'") from None
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise ConfigError(f"{path}: is not what 'uuv eval' writes ({error!r}); run the evaluation again with 'uuv eval'") from None
 
 
 def _document(controller: str, tree: FlatTree, use: list[NodeUse] | None) -> dict[str, Any]:

@@ -8,8 +8,11 @@ from xml.parsers import expat
 
 from uuvtai.loader import ConfigError
 
-_MAX_BYTES = 1 << 20
+MAX_BYTES = 1 << 20
+"""of a tree's file"""
 _MAX_DEPTH = 64
+_MAX_WORD = 1000
+"""characters of a name or an attribute: looking for the nearest known name takes the square of it"""
 
 
 class TreeError(ConfigError):
@@ -26,15 +29,17 @@ class Element:
 
 def read_elements(text: bytes, source: str) -> Element:
     """Element tree with line numbers; DTDs and entities are refused."""
-    if len(text) > _MAX_BYTES:
-        raise TreeError(f"{source}: larger than {_MAX_BYTES} bytes")
+    if len(text) > MAX_BYTES:
+        raise TreeError(f"{source}: larger than {MAX_BYTES} bytes")
     parser = expat.ParserCreate()
     holder = Element("", {}, 0)
     stack = [holder]
 
     def begin(tag: str, attributes: dict[str, str]) -> None:
         if len(stack) > _MAX_DEPTH:
-            raise TreeError(f"{source}:{parser.CurrentLineNumber}: <{tag}> is nested more than {_MAX_DEPTH} deep")
+            raise TreeError(f"{source}:{parser.CurrentLineNumber}: <{tag[:40]}> is nested more than {_MAX_DEPTH} deep")
+        if any(len(word) > _MAX_WORD for word in (tag, *attributes, *attributes.values())):
+            raise TreeError(f"{source}:{parser.CurrentLineNumber}: <{tag[:40]}> has a name or attribute longer than {_MAX_WORD} characters")
         element = Element(tag, attributes, parser.CurrentLineNumber)
         stack[-1].children.append(element)
         stack.append(element)

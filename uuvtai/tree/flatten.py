@@ -9,7 +9,7 @@ from typing import NoReturn
 
 from uuvtai.kernels import tree_tick as codes
 from uuvtai.loader import preset_path
-from uuvtai.tree.elements import Element, TreeError, read_elements
+from uuvtai.tree.elements import MAX_BYTES, Element, TreeError, read_elements
 from uuvtai.tree.flat import UNSET, FlatTree
 from uuvtai.tree.nodes import CONTROLS, DECORATORS, LEAVES, MAX_PORTS, Leaf
 
@@ -20,7 +20,8 @@ def read_tree(name: str, max_node: int = 64) -> FlatTree:
     """Tree of a preset (straight, planner, bt) or of an XML file. Raises TreeError, or ConfigError for an unknown name."""
     path = preset_path("tree", name)
     try:
-        text = path.read_bytes()
+        with path.open("rb") as file:
+            text = file.read(MAX_BYTES + 1)  # one more is refused
     except OSError as error:
         raise TreeError(f"{path}: cannot be read: {error.strerror}") from None
     return parse_tree(text, str(path), max_node)
@@ -99,6 +100,8 @@ class _Flattener:
             self._fail(element, f"no BehaviorTree has the ID {name!r}{_nearest(name, self.trees)}")
         if name in inside:
             self._fail(element, f"tree {name!r} contains itself")
+        if len(inside) > self.max_node:
+            self._fail(element, f"subtrees are nested more than {self.max_node} deep")
         for port in attributes:
             if port not in ("name", "_autoremap"):
                 self._fail(element, f"port {port!r}: ports of subtrees are not supported, give numbers to the leaves")

@@ -1,0 +1,485 @@
+"""Exported policies: NumPy, ONNX Runtime and torch agree with the pilot; folders are whole, checked, and never believed."""
+
+import ast
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from uuvtai import cli
+from uuvtai.deploy import export as deploy
+from uuvtai.deploy import run_policy
+from uuvtai.deploy.agreement import of_torch
+from uuvtai.deploy.evaluations import evaluations_of
+from uuvtai.deploy.golden import TOLERANCE, golden_of
+from uuvtai.deploy.graph import OneDecision, missing_packages
+from uuvtai.deploy.weights import weights_of
+from uuvtai.learn import checkpoint
+from uuvtai.learn.checkpoint import CheckpointError
+from uuvtai.learn.pilot import TEACHER_COLUMN, Pilot, load_pilot
+from uuvtai.learn.policy import Policy
+from uuvtai.learn.risk import RiskHead
+from uuvtai.learn.world_model import N_TARGET, WorldModel
+from uuvtai.loader import ConfigError, load_training
+
+N_OBS = 40
+TEACHER = slice(30, 34)
+TABLE = [("goal", 0, 3, "m", "body"), ("rest", 3, 30, "1", "level"), (TEACHER_COLUMN, 30, 34, "1", "body"), ("more", 34, 40, "s", "body")]
+SMALL = {"policy.hidden": [16, 16], "world_model.hidden": [16], "world_model.latent": 8, "risk.hidden": [8]}
+
+
+class Column:
+    """A row of an observation table."""
+
+    def __init__(self, name, first, stop, unit, frame):
+        self.name, self.slice, self.unit, self.frame = name, slice(first, stop), unit, frame
+
+
+def config_of(**changes):
+    return load_training("smoke", list((SMALL | {key.replace("__", "."): value for key, value in changes.items()}).items()))
+
+
+def networks(config, seed=0):
+    """Networks that have seen a batch and act decidedly, as a trainer's state."""
+    rng = torch.Generator().manual_seed(seed)
+    policy = Policy(N_OBS + 2, config.policy, TEACHER, rng)
+    policy.observation_norm.update(3.0 * torch.randn(500, N_OBS + 2, generator=rng) + 1.0)
+    policy.value_norm.update(20.0 * torch.randn(500, 1, generator=rng) + 5.0)
+    with torch.no_grad():
+        policy.actor[-1].weight.copy_(torch.randn(policy.actor[-1].weight.shape, generator=rng))
+    state = {"policy": policy.state_dict(), "env": {}}
+    if config.world_model.enabled:
+        model = WorldModel(N_OBS, config.world_model, rng)
+        model.observation_norm.update(3.0 * torch.randn(500, N_OBS, generator=rng))
+        model.change_norm.update(0.2 * torch.randn(500, N_TARGET, generator=rng))
+        state["world_model"] = model.state_dict()
+    if config.risk.enabled:
+        head = RiskHead(N_OBS + 2, config.risk, rng)
+        head.observation_norm.update(3.0 * torch.randn(500, N_OBS + 2, generator=rng))
+        with torch.no_grad():
+            head.net[-1].weight.mul_(300.0)
+        logit = torch.randn(400, generator=rng)
+        head.calibrate(logit, torch.rand(400, generator=rng) < torch.sigmoid(2 * logit))
+        head.set_threshold(0.5)
+        state["risk"] = head.state_dict()
+    return state
+
+
+def saved(folder, config=None, metrics=None, **changes):
+    """A run folder with one checkpoint."""
+    config = config or config_of(**changes)
+    table = [Column(*row) for row in TABLE]
+    checkpoint.save(folder / "checkpoints", 3, networks(config), config, table, metrics=metrics)
+    return checkpoint.newest(folder)
+
+
+def exported(found, out, note=lambda _text: None, evaluations=()):
+    return deploy.export(found, "mine", out, evaluations, note)
+
+
+@pytest.fixture
+def no_onnx(monkeypatch):
+    """As if the extra were not installed; ONNX takes seconds."""
+    monkeypatch.setattr(deploy, "missing_packages", lambda: ["onnx"])
+
+
+# --------------------------------------------------------------------------------------------------------------- agreement
+
+CASES = {
+    "residual held for ten steps": {"policy.residual": True, "policy.hold_steps": 10},
+    "residual at every step": {"policy.residual": True},
+    "plain, held for ten": {"policy.hold_steps": 10},
+    "plain at every step": {},
+    "no features, tanh": {"world_model.as_features": False, "policy.activation": "tanh", "policy.hold_steps": 3},
+    "no risk head, relu": {"risk.enabled": False, "policy.activation": "relu"},
+    "world model as in the paper": {"world_model.predict_change": False, "world_model.normalise_targets": True},
+    "targets as they are": {"world_model.predict_change": False, "world_model.normalise_targets": False},
+}
+
+
+@pytest.mark.parametrize("changes", CASES.values(), ids=CASES)
+def test_numpy_and_a_decision_without_memory_agree_with_the_pilot(tmp_path, changes):
+    found = saved(tmp_path, load_training("smoke", list((SMALL | changes).items())))
+    pilot = load_pilot(found, 1)
+    golden = golden_of(pilot)
+    spec = {
+        "observation": {"width": N_OBS},
+        "action": found.manifest.action,
+        "rate": {"hold_steps": found.config.policy.hold_steps, "control_dt_s": 0.02},
+        "network": deploy.specification(found, pilot, "mine", False)["network"],
+    }
+    policy = run_policy.Policy(spec, {name: tensor.numpy() for name, tensor in weights_of(pilot).items()})
+    told = run_policy.replayed(policy, golden)
+    for name, values in told.items():
+        assert run_policy.difference(values, golden[name]) <= TOLERANCE, name
+    assert of_torch(OneDecision(pilot), golden).agrees
+    has_model, has_risk = pilot.world_model is not None, pilot.risk is not None
+    assert golden["action"].std() > 0.1 and np.abs(golden["action"]).max() <= 1.0
+    assert (golden["residual"] > 0).any() == has_model and ("risk" in told) == has_risk
+    assert not has_risk or np.ptp(golden["risk"]) > 0.1
+    first, hold = len(golden["obs"]) // 2 + 1, found.config.policy.hold_steps
+    assert len(golden["pair_obs"]) == -(-first // hold) + -(-(len(golden["obs"]) - first) // hold)
+    assert not np.isfinite(golden["obs"]).all(), "sensors that fail are among the golden pairs"
+
+
+def test_networks_that_have_seen_nothing_agree_too():
+    config, rng = config_of(), torch.Generator().manual_seed(0)
+    pilot = Pilot(Policy(N_OBS + 2, config.policy, None, rng), WorldModel(N_OBS, config.world_model, rng), 1)
+    golden = golden_of(pilot)
+    spec = {"observation": {"width": N_OBS}, "action": [{"limit": 1.0}] * 4, "rate": {"hold_steps": 1, "control_dt_s": 0.02}}
+    spec["network"] = {"teacher_columns": None, "activation": "elu", "predict_change": True, "residual_limit": 0.5}
+    policy = run_policy.Policy(spec, {name: tensor.numpy() for name, tensor in weights_of(pilot).items()})
+    told = run_policy.replayed(policy, golden)
+    assert max(run_policy.difference(values, golden[name]) for name, values in told.items()) <= TOLERANCE
+
+
+def test_a_held_residual_follows_the_newest_tree_action(tmp_path, no_onnx):
+    exported(saved(tmp_path / "run", policy__residual=True, policy__hold_steps=10), tmp_path / "out")
+    policy = run_policy.load(tmp_path / "out")
+    obs = np.zeros(N_OBS, np.float32)
+    first = policy.act(obs)
+    obs[TEACHER] = 0.1
+    second = policy.act(obs)
+    np.testing.assert_allclose(second.action, np.clip(first.action + 0.1, -1, 1), atol=1e-6)
+    np.testing.assert_allclose(second.command_si, second.action * [0.6, 0.6, 0.4, 1.0], rtol=1e-6)
+    assert second.value == first.value, "what it thinks is held too"
+    policy.reset()
+    assert policy.act(obs).value != first.value
+
+
+def test_an_observation_of_another_width_is_refused(folder):
+    with pytest.raises(ValueError, match=r"must have shape \(40,\), got \(39,\)"):
+        run_policy.load(folder).act(np.zeros(39))
+
+
+def test_the_alarm_sounds_from_the_threshold_on(tmp_path, no_onnx):
+    found = saved(tmp_path / "run")
+    exported(found, tmp_path / "out")
+    policy, pilot = run_policy.load(tmp_path / "out"), load_pilot(found, 1)
+    rng = np.random.default_rng(1)
+    alarms = []
+    for _ in range(40):
+        obs = rng.normal(1, 3, N_OBS).astype(np.float32)
+        logit = float(pilot.decide(torch.from_numpy(obs)[None]).risk_logit)
+        pilot.advance()
+        alarms.append(policy.act(obs).alarm)
+        assert alarms[-1] == (logit >= 0.5)
+    assert len(set(alarms)) == 2
+
+
+# ----------------------------------------------------------------------------------------------------------------- folder
+
+
+@pytest.mark.skipif(bool(missing_packages()), reason="needs the extra uuvtai[export]")
+@pytest.mark.parametrize(
+    "changes", [{"policy__residual": True, "policy__hold_steps": 10}, {"risk__enabled": False, "world_model__as_features": False}]
+)
+def test_onnx_runtime_agrees_and_the_folder_passes_its_check(tmp_path, changes, capfd):
+    pytest.importorskip("onnxruntime")
+    found = exported(saved(tmp_path / "run", **changes), tmp_path / "out")
+    assert [one.engine for one in found.agreements] == ["torch", "NumPy", "ONNX Runtime"]
+    assert found.agrees and all(0 < one.p50_ms <= one.p99_ms for one in found.agreements)
+    again = deploy.check(tmp_path / "out", print)
+    assert again.agrees and [one.engine for one in again.agreements] == ["NumPy", "ONNX Runtime"]
+    assert capfd.readouterr().out == "", "results only on stdout"
+    spec = run_policy.read_spec(tmp_path / "out")
+    assert set(spec["graph"]["inputs"]) == {"obs", "last_obs", "last_action", "has_last"}
+    assert ("risk" in spec["graph"]["outputs"]) == ("risk__enabled" not in changes)
+
+
+def test_the_specification_says_what_every_column_is(tmp_path, no_onnx):
+    found = saved(tmp_path / "run", policy__hold_steps=10)
+    exported(found, tmp_path / "out")
+    spec = run_policy.read_spec(tmp_path / "out")
+    columns = spec["observation"]["columns"]
+    assert [column["index"] for column in columns] == list(range(N_OBS))
+    norm = load_pilot(found, 1).policy.observation_norm
+    mean, std = float(norm.mean[2]), float(norm.std()[2])
+    assert columns[2] == {
+        "index": 2,
+        "name": "goal[2]",
+        "unit": "m",
+        "frame": "body",
+        "mean": mean,
+        "std": std,
+    }
+    assert [row["name"] for row in spec["features"]] == ["residual", "uncertainty"]
+    assert [(row["name"], row["limit"], row["unit"]) for row in spec["action"]] == [
+        ("surge", 0.6, "m/s"), ("sway", 0.6, "m/s"), ("heave", 0.4, "m/s"), ("yaw_rate", 1.0, "rad/s"),
+    ]  # fmt: skip
+    assert (spec["rate"]["control_hz"], spec["rate"]["decision_hz"], spec["rate"]["hold_steps"]) == (50.0, 5.0, 10)
+    assert spec["checkpoint"]["sha256"] == found.sha256
+    listed = {path.name for path in (tmp_path / "out").iterdir()} - {"policy_spec.json"}
+    assert set(spec["files"]) == listed == {"policy.safetensors", "golden.npz", "README.md", "run_policy.py"}
+
+
+def test_the_folder_drives_where_there_is_numpy_alone(folder):
+    """In a process that can import neither torch nor uuvtai; and the file itself imports NumPy and the standard library alone."""
+    code = (
+        "import sys, runpy\n"
+        "class Guard:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.split('.')[0] in ('torch', 'uuvtai', 'taichi', 'safetensors', 'onnxruntime', 'onnx'): raise ImportError(name)\n"
+        "sys.meta_path.insert(0, Guard()); sys.argv = ['run_policy.py']; runpy.run_path('run_policy.py', run_name='__main__')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "risk: largest difference" in done.stdout and "p50" in done.stdout
+    roots = {
+        (node.module or "").split(".")[0] if isinstance(node, ast.ImportFrom) else node.names[0].name.split(".")[0]
+        for node in ast.walk(ast.parse((folder / "run_policy.py").read_text()))
+        if isinstance(node, ast.Import | ast.ImportFrom)
+    }
+    assert roots - set(sys.stdlib_module_names) == {"numpy"}
+
+
+def test_constants_that_the_driver_repeats_are_those_of_the_package():
+    from uuvtai.learn import risk, world_model
+
+    assert (run_policy.N_TARGET, run_policy.N_ACTION) == (world_model.N_TARGET, world_model.N_ACTION)
+    assert (run_policy._LOG_VAR, run_policy._MAX_DEVIATIONS) == (world_model.LOG_VAR_BOUNDS, world_model.MAX_DEVIATIONS)
+    assert run_policy._MAX_LOGIT == risk.MAX_LOGIT
+
+
+def test_without_the_extra_the_graph_is_left_out_and_told(tmp_path, no_onnx):
+    notes = []
+    found = exported(saved(tmp_path / "run"), tmp_path / "out", notes.append)
+    assert found.agrees and not (tmp_path / "out" / "policy.onnx").exists()
+    assert "pip install 'uuvtai[export]'" in notes[0]
+    assert run_policy.read_spec(tmp_path / "out")["graph"] is None
+
+
+def test_a_place_that_is_taken_is_refused_and_a_full_disk_leaves_nothing(tmp_path, no_onnx, monkeypatch):
+    found = saved(tmp_path / "run")
+    (tmp_path / "out").mkdir()
+    with pytest.raises(ConfigError, match="already there; give another folder with --out"):
+        exported(found, tmp_path / "out")
+
+    def full(path, content):
+        if path.name == "golden.npz":
+            raise OSError(28, "No space left on device")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+
+    monkeypatch.setattr(deploy, "write_atomic", full)
+    with pytest.raises(RuntimeError, match="No space left"):
+        exported(found, tmp_path / "other")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "run"]
+
+
+def test_networks_that_cannot_drive_are_not_exported(tmp_path, no_onnx):
+    config = config_of()
+    state = networks(config)
+    state["policy"]["log_std"] = torch.full((4,), float("nan"))
+    checkpoint.save(tmp_path / "run" / "checkpoints", 1, state, config, [Column(*row) for row in TABLE])
+    with pytest.raises(CheckpointError, match="log_std is not finite"):
+        exported(checkpoint.newest(tmp_path / "run"), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+# -------------------------------------------------------------------------------------------------------------------- card
+
+
+def result_of(found, k=90, n=100):
+    """A result of ``uuv eval`` with this checkpoint and a tree."""
+    outcomes = {"success": k, "collision": n - k - 2, "ttc": 1, "out_of_tank": 0, "timeout": 1}
+    methods = [{"name": "bt", "episodes": n, "outcomes": outcomes}]
+    methods.append({"name": "mine", "episodes": n, "outcomes": outcomes, "checkpoint": {"sha256": found.sha256}})
+    return {"world": "pool", "S": 8, "D": 6, "v_m_s": 0.6, "sensors": "paper", "seeds": [1, 2], "methods": methods}
+
+
+def written(folder, result):
+    (folder / "eval").mkdir(parents=True)
+    (folder / "eval" / "result.json").write_text(json.dumps(result))
+    return folder
+
+
+def test_the_card_has_counts_and_intervals(tmp_path, no_onnx):
+    found = saved(tmp_path / "run", metrics={"eval/success_rate": 0.5, "eval/collision_rate": 0.25, "time/env_steps": 2e6})
+    written(tmp_path / "run" / "eval_pool", result_of(found))
+    elsewhere = written(tmp_path / "elsewhere", result_of(found, 40, 50))
+    exported(found, tmp_path / "out", evaluations=[elsewhere])
+    card = (tmp_path / "out" / "README.md").read_text()
+    assert "pool, S = 8, D = 6, v = 0.6 m/s, paper sensing, seed 1, 2 | 90/100 = 90.0 % [82.6, 94.5] | 9/100 = 9.0 %" in card
+    assert "40/50 = 80.0 %" in card and "2/4 = 50.0 % [15.0, 85.0] | 1/4" in card and "too good by selection" in card
+    assert "2.00 million env-steps" in card
+
+
+def test_without_evaluations_the_card_says_so(folder):
+    assert "No evaluation was at hand" in (folder / "README.md").read_text()
+
+
+def test_evaluations_of_something_else_are_refused(tmp_path):
+    found = saved(tmp_path / "run")
+    other = result_of(found)
+    other["methods"][1]["checkpoint"]["sha256"] = "0" * 64
+    with pytest.raises(ConfigError, match="does not evaluate this checkpoint"):
+        evaluations_of(found, [written(tmp_path / "other", other)])
+    for number, broken in enumerate(
+        (result_of(found, k=-3), {"methods": [3]}, [], {"methods": [{"checkpoint": {"sha256": found.sha256}}]})
+    ):
+        with pytest.raises(ConfigError, match="is no result of uuv eval"):
+            evaluations_of(found, [written(tmp_path / str(number), broken)])
+    with pytest.raises(ConfigError, match="is no result of uuv eval"):
+        evaluations_of(found, [tmp_path / "nowhere"])
+
+
+# ---------------------------------------------------------------------------------------------------------------- command
+
+
+def run_cli(*arguments):
+    with pytest.raises(SystemExit) as left:
+        cli.main([str(argument) for argument in arguments])
+    return left.value.code
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """An exported policy."""
+    root = tmp_path_factory.mktemp("export")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(deploy, "missing_packages", lambda: ["onnx"])
+        exported(saved(root / "run"), root / "out")
+    return root / "out"
+
+
+@pytest.fixture
+def folder(whole, tmp_path):
+    """A copy of it to be spoiled."""
+    return Path(shutil.copytree(whole, tmp_path / "out"))
+
+
+def test_the_command_exports_prints_and_checks(tmp_path, no_onnx, capfd):
+    saved(tmp_path / "run")
+    assert run_cli("export", tmp_path / "run", "--out", tmp_path / "out", "--json") == 0
+    told = capfd.readouterr()
+    document = json.loads(told.out)
+    assert document["agrees"] and [engine["engine"] for engine in document["engines"]] == ["torch", "NumPy"]
+    assert "left out policy.onnx" in told.err
+    assert run_cli("export", "--check", tmp_path / "out") == 0
+    assert "agrees" in capfd.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["policy.safetensors", "golden.npz", "README.md", "run_policy.py"])
+def test_a_changed_file_is_exit_3(folder, name, capfd):
+    content = bytearray((folder / name).read_bytes())
+    content[-1] ^= 1
+    (folder / name).write_bytes(content)
+    assert run_cli("export", "--check", folder) == 3
+    assert f"{name}: has changed" in capfd.readouterr().err
+
+
+def resigned(folder, name, content):
+    """Put other content in a file, with its right sha256 in the specification."""
+    (folder / name).write_bytes(content)
+    spec = json.loads((folder / "policy_spec.json").read_text())
+    spec["files"][name] = run_policy.hashlib.sha256(content).hexdigest()
+    (folder / "policy_spec.json").write_text(json.dumps(spec))
+
+
+def test_other_weights_with_the_right_sha256_are_exit_3(folder, tmp_path, capfd):
+    other = saved(tmp_path / "other", config_of(), metrics={"a": 1.0})
+    weights = weights_of(load_pilot(other, 1))
+    weights["actor.4.bias"] += 0.01
+    from safetensors.torch import save
+
+    resigned(folder, "policy.safetensors", save(weights))
+    assert run_cli("export", "--check", folder) == 3
+    assert "DIFFERS" in capfd.readouterr().out
+    done = subprocess.run([sys.executable, "run_policy.py"], cwd=folder, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says", "code"),
+    [
+        (["export"], "give the RUN to export", 2),
+        (["export", "x", "--check", "y"], "give the RUN to export", 2),
+        (["export", "nothing"], "is no trained policy", 2),
+        (["export", "--check", "nothing"], "policy_spec.json: is missing", 1),
+    ],
+)
+def test_bad_usage(arguments, says, code, capfd, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run_cli(*arguments) == code
+    assert says in capfd.readouterr().err
+
+
+# ---------------------------------------------------------------------------------------------------------- hostile folders
+
+
+def with_header(header, data=b""):
+    text = header if isinstance(header, bytes) else json.dumps(header).encode()
+    return len(text).to_bytes(8, "little") + text + data
+
+
+BAD_WEIGHTS = {
+    "empty": b"",
+    "a pickle": b"\x80\x04\x95\x10\x00\x00\x00\x00\x00\x00\x00\x8c\x02os\x94",
+    "header beyond the file": (1 << 62).to_bytes(8, "little") + b"{}",
+    "no JSON": with_header(b"{nonsense"),
+    "nested without end": with_header(b"[" * 100_000),
+    "a list": with_header([1]),
+    "beyond the data": with_header({"a": {"dtype": "F32", "shape": [4], "data_offsets": [0, 16]}}, bytes(8)),
+    "overlapping": with_header({n: {"dtype": "F32", "shape": [2], "data_offsets": [0, 8]} for n in "ab"}, bytes(16)),
+    "shape unlike bytes": with_header({"a": {"dtype": "F32", "shape": [1 << 40, 1 << 40], "data_offsets": [0, 8]}}, bytes(8)),
+    "negative": with_header({"a": {"dtype": "F32", "shape": [-1, -2], "data_offsets": [0, 8]}}, bytes(8)),
+    "objects": with_header({"a": {"dtype": "O", "shape": [1], "data_offsets": [0, 8]}}, bytes(8)),
+    "too much data": with_header({"a": {"dtype": "F32", "shape": [1], "data_offsets": [0, 4]}}, bytes(8)),
+    "NaN": with_header({"a": {"dtype": "F32", "shape": [1], "data_offsets": [0, 4]}}, np.float32("nan").tobytes()),
+}
+
+
+@pytest.mark.parametrize("content", BAD_WEIGHTS.values(), ids=BAD_WEIGHTS)
+def test_weights_are_read_without_trust(tmp_path, content):
+    file = tmp_path / "policy.safetensors"
+    file.write_bytes(content)
+    with pytest.raises(run_policy.PolicyError, match="is not a safetensors file"):
+        run_policy.read_safetensors(file)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda a: a.pop("actor.0.bias"),
+        lambda a: a.update({"actor.0.weight": a["actor.0.weight"][:, 1:]}),
+        lambda a: a.update({"critic.4.weight": a["actor.4.weight"], "critic.4.bias": a["actor.4.bias"]}),
+        lambda a: a.update({"decoder.2.bias": a["decoder.2.bias"][:5]}),
+        lambda a: a.clear(),
+    ],
+)
+def test_networks_that_do_not_fit_the_specification(folder, change):
+    arrays = dict(run_policy.read_safetensors(folder / "policy.safetensors"))
+    change(arrays)
+    with pytest.raises(run_policy.PolicyError, match="do not fit together"):
+        run_policy.Policy(run_policy.read_spec(folder), arrays)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("{", "is not JSON"),
+        ("[" * 100_000, "is not JSON"),
+        ("[]", "is not the specification"),
+        ('{"schema": 2}', "is not the specification"),
+        ('{"schema": 1, "files": {}}', "lists other files"),
+        ('{"schema": 1, "files": {"policy.safetensors": "", "golden.npz": "", "../../etc/passwd": ""}}', "lists other files"),
+    ],
+)
+def test_specifications_are_read_without_trust(folder, text, says, capfd):
+    (folder / "policy_spec.json").write_text(text)
+    assert run_cli("export", "--check", folder) == 1
+    assert says in capfd.readouterr().err
+
+
+def test_links_out_of_the_folder_are_not_followed(folder, tmp_path):
+    (folder / "golden.npz").rename(tmp_path / "elsewhere.npz")
+    (folder / "golden.npz").symlink_to(tmp_path / "elsewhere.npz")
+    with pytest.raises(run_policy.PolicyError, match="no plain file"):
+        run_policy.load(folder)
+    assert Path(tmp_path / "elsewhere.npz").exists()

@@ -1,0 +1,525 @@
+"""No file can make uuv execute code, fill the memory, or write outside its folder by being opened: each way is tried.
+
+Every attack that executes would leave the file ``executed`` behind. Bombs are checked by what refuses them: without it they would run for
+hours or take all memory.
+"""
+
+import ast
+import base64
+import json
+import pickle
+import struct
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import zstandard
+
+from tests import test_deploy as deployed
+from tests.reference import logs as episode
+from uuvtai import cli
+from uuvtai.config.learning import LearningConfig
+from uuvtai.deploy import run_policy
+from uuvtai.deploy.agreement import of_onnx
+from uuvtai.learn import checkpoint
+from uuvtai.learn.checkpoint import CheckpointError
+from uuvtai.learn.manifest import config_sha256, sha256_of
+from uuvtai.learn.packing import PackingError, read_stream
+from uuvtai.learn.pilot import load_pilot
+from uuvtai.loader import ConfigError, load_config, load_resolved, parsed_yaml
+from uuvtai.logs import reader
+from uuvtai.logs.container import MAGIC, McapFile
+from uuvtai.logs.errors import LogError
+from uuvtai.logs.export import depth_image
+from uuvtai.logs.picture import picture
+from uuvtai.logs.reader import info
+from uuvtai.logs.recording import load_recording
+from uuvtai.run_folder import RunFolder, RunFolderError
+from uuvtai.tree import TreeError, parse_tree, read_tree
+
+PACKAGE = Path(__file__).parent.parent / "uuvtai"
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """An empty folder to work in; nothing may have been executed when the test is over."""
+    monkeypatch.chdir(tmp_path)
+    yield tmp_path
+    assert not (tmp_path / "executed").exists(), "a file was executed"
+
+
+def run_cli(*arguments):
+    with pytest.raises(SystemExit) as left:
+        cli.main([str(argument) for argument in arguments])
+    return left.value.code
+
+
+class Exploit:
+    """What a pickle may do when it is opened."""
+
+    def __reduce__(self):
+        return (open, ("executed", "w"))
+
+
+def test_the_exploit_would_work(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    pickle.loads(pickle.dumps(Exploit())).close()
+    assert (tmp_path / "executed").exists()
+
+
+def test_nothing_in_the_package_can_execute_what_it_reads():
+    """Calls that turn data into code do not occur; YAML is loaded by our own safe loader alone, NumPy without pickles."""
+    forbidden = {
+        "eval",
+        "exec",
+        "compile",
+        "__import__",
+        "pickle",
+        "marshal",
+        "shelve",
+        "dill",
+        "joblib",
+        "os.system",
+        "os.popen",
+        "torch.load",
+    }
+    forbidden |= {"np.load", "yaml.unsafe_load", "yaml.full_load", "yaml.load_all", "torch.jit.load", "runpy", "tarfile"}
+    found, yaml_loads, imports = [], [], []
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import | ast.ImportFrom):
+                names = [alias.name for alias in node.names] + [getattr(node, "module", None) or ""]
+                found += [f"{path.name}: import {name}" for name in names if name.split(".")[0] in forbidden]
+            elif isinstance(node, ast.Call):
+                name = ast.unparse(node.func)
+                found += [f"{path.name}:{node.lineno} {name}"] if name in forbidden else []
+                yaml_loads += [ast.unparse(node)] if name == "yaml.load" else []
+                imports += [(path.name, ast.unparse(node.args[0]))] if name == "importlib.import_module" else []
+                assert not any(word.arg == "shell" for word in node.keywords), f"{path.name}:{node.lineno}"
+                assert not any(word.arg == "allow_pickle" and ast.unparse(word.value) != "False" for word in node.keywords)
+    assert not found
+    assert yaml_loads == ["yaml.load(text, Loader=_SafeLoader)"]
+    assert {name for name, _ in imports} <= {"doctor.py", "convert.py", "__init__.py"}, "modules are never imported by names from files"
+
+
+# -------------------------------------------------------------------------------------------------------------------- YAML
+
+TAGS = [
+    "world: !!python/object/apply:builtins.open ['executed', 'w']",
+    "world: !!python/object/new:builtins.open ['executed', 'w']",
+    "world: !!python/name:os.system",
+    "!!python/module:os",
+    'world: {n_static: !!python/object/apply:eval [\'open("executed", "w")\']}',
+    "? !!python/object/apply:builtins.open ['executed', 'w']\n: 1",
+]
+
+
+@pytest.mark.parametrize("text", TAGS)
+def test_yaml_tags_are_refused_in_every_kind_of_file(here, text, capfd):
+    file = here / "evil.yaml"
+    file.write_text(text)
+    for option in ("--world", "--sensors", "--vehicle"):
+        assert run_cli("eval", option, file) == 2
+    assert run_cli("train", file) == 2
+    assert run_cli("eval", "--set", f"world.n_static={text.partition(' ')[2]}") == 2
+    (here / "config.yaml").write_text(text)
+    assert run_cli("train", "--resume", here) == 2
+    assert capfd.readouterr().err.count("not valid YAML") >= 5
+    for load in (lambda: load_config(str(file)), lambda: load_resolved(file)):
+        with pytest.raises(ConfigError, match="not valid YAML"):
+            load()
+
+
+YAML_BOMBS = {
+    "billion laughs": "a: &a [1]\n" + "\n".join(f"{chr(98 + i)}: &{chr(98 + i)} [{','.join([f'*{chr(97 + i)}'] * 9)}]" for i in range(9)),
+    "merged into itself": "a: &a\n  <<: *a\n",
+    "nested": "[" * 200_000,
+    "nested maps": "a: " + "{a: " * 100_000,
+    "a number that a regular expression takes hours over": "a: " + "1" * 900_000 + "x",
+    "base 60": "a: 1" + ":1" * 400_000,
+    "base 60, not whole": "a: 1" + ":1" * 200 + ".5",
+    "many digits": "a: " + "9" * 900,
+    "a million values": "a: [" + "0," * 500_000 + "0]",
+    "a long key": "k" * 900_000 + ": 1",
+}
+
+
+@pytest.mark.parametrize("text", YAML_BOMBS.values(), ids=YAML_BOMBS)
+def test_yaml_bombs(here, text):
+    (here / "bomb.yaml").write_text(text)
+    with pytest.raises(ConfigError):
+        load_config(str(here / "bomb.yaml"))
+
+
+def test_yaml_from_elsewhere_is_bounded_too():
+    with pytest.raises(ConfigError, match="larger than 1 MiB"):
+        parsed_yaml("#" * (2 << 20), "an attachment")
+
+
+# --------------------------------------------------------------------------------------------------------------------- XML
+
+TREE = '<root BTCPP_format="4"><BehaviorTree ID="m">{}</BehaviorTree></root>'
+ENTITIES = {
+    "billion laughs": '<!DOCTYPE r [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;"><!ENTITY c "&b;&b;&b;&b;">]>' + TREE.format("&c;"),
+    "a file from outside": '<!DOCTYPE r [<!ENTITY x SYSTEM "file:///etc/passwd">]>' + TREE.format("&x;"),
+    "a DTD from outside": '<!DOCTYPE r SYSTEM "http://127.0.0.1:9/evil.dtd">' + TREE.format("<FollowRoute/>"),
+    "parameter entities": '<!DOCTYPE r [<!ENTITY % x SYSTEM "file:///etc/passwd"> %x;]>' + TREE.format("<FollowRoute/>"),
+    "an undeclared entity": TREE.format("&x;"),
+}
+
+
+@pytest.mark.parametrize("text", ENTITIES.values(), ids=ENTITIES)
+def test_xml_entities_are_refused(here, text, capfd):
+    (here / "evil.xml").write_text(text)
+    assert run_cli("tree", "--controller", here / "evil.xml") == 2
+    told = capfd.readouterr()
+    assert told.out == "" and "root:" not in told.err and "evil.xml:1" in told.err
+
+
+def test_xml_bombs(here):
+    chained = "".join(f'<BehaviorTree ID="t{i}"><SubTree ID="t{i + 1}"/></BehaviorTree>' for i in range(5000))
+    bombs = {
+        "nested more than": TREE.format("<Sequence>" * 100_000),
+        "attribute longer than": TREE.format(f'<FollowRoute name="{"ab" * 200_000}"/>'),
+        "or attribute longer": TREE.format(f"<{'ab' * 200_000}/>"),
+        "larger than": TREE.format(" " * (2 << 20)),
+        "subtrees are nested": f'<root BTCPP_format="4" main_tree_to_execute="t0">{chained}</root>',
+        "contains itself": TREE.format('<SubTree ID="m"/>'),
+        "more than 64 nodes": TREE.format("<Sequence>" + "<FollowRoute/>" * 10_000 + "</Sequence>"),
+    }
+    for says, text in bombs.items():
+        with pytest.raises(TreeError, match=says):
+            parse_tree(text)
+    (here / "big.xml").write_bytes(b" " * (3 << 20))
+    with pytest.raises(TreeError, match="larger than"):
+        read_tree(str(here / "big.xml"))
+
+
+# -------------------------------------------------------------------------------------------------------------- checkpoints
+
+
+def forged(path, name, content):
+    """Other content for a file of a checkpoint, with the right size and sha256 in the manifest."""
+    (path / name).write_bytes(content)
+    rewritten(path, lambda document: document["files"].update({name: {"bytes": len(content), "sha256": sha256_of(path / name)}}))
+
+
+def rewritten(path, change):
+    document = json.loads((path / "manifest.json").read_text())
+    change(document)
+    (path / "manifest.json").write_text(json.dumps(document))
+
+
+def torch_saved(folder):
+    torch.save(Exploit(), folder / "m.pt")
+    return (folder / "m.pt").read_bytes()
+
+
+@pytest.mark.parametrize("content", [lambda _f: pickle.dumps(Exploit()), torch_saved, lambda _f: pickle.dumps(Exploit(), protocol=0)])
+@pytest.mark.parametrize("name", ["model.safetensors", "manifest.json"])
+def test_a_pickle_as_a_checkpoint(here, name, content, capfd):
+    path = deployed.saved(here / "run").path
+    if name == "manifest.json":
+        (path / name).write_bytes(content(here))
+    else:
+        forged(path, name, content(here))
+    assert run_cli("export", path) == 1
+    assert run_cli("eval", path) == 1
+    said = capfd.readouterr().err
+    assert name in said and "Traceback" not in said
+
+
+def test_networks_wider_than_their_file_are_refused_before_they_are_made(here):
+    """A manifest of a few bytes must not make a network of terabytes, nor one whose initial weights take days."""
+    path = deployed.saved(here / "run").path
+
+    def wide(document):
+        document["config"]["policy"]["hidden"] = [10**6, 10**6]
+        document["config_sha256"] = config_sha256(LearningConfig.model_validate_json(json.dumps(document["config"])))
+
+    rewritten(path, wide)
+    with pytest.raises(CheckpointError, match=r"instead of \(1000000, 42\)"):
+        load_pilot(checkpoint.open_checkpoint(path), 1)
+
+
+@pytest.mark.parametrize("stop", [10**9, "many", None])
+def test_observations_wider_than_the_networks_are_refused(here, stop):
+    path = deployed.saved(here / "run").path
+    rewritten(path, lambda document: document["observation_table"][-1].update(stop=stop))
+    with pytest.raises(CheckpointError, match="its networks are not those of its config"):
+        load_pilot(checkpoint.open_checkpoint(path), 1)
+
+
+def test_a_compressed_simulator_state_cannot_unfold(here):
+    with (here / "s.zst").open("wb") as file, zstandard.ZstdCompressor().stream_writer(file) as stream:
+        for _ in range(256):
+            stream.write(bytes(1 << 20))
+    assert (here / "s.zst").stat().st_size < 1 << 16
+    with pytest.raises(PackingError, match="more than its layout says"):
+        read_stream(here / "s.zst", [("x", "uint8", [1000])])
+
+
+# -------------------------------------------------------------------------------------------------------------- run folders
+
+
+@pytest.mark.parametrize("name", [".lock", "metrics.jsonl"])
+def test_a_link_in_a_run_folder_is_not_written_through(here, name):
+    victim = here / "victim"
+    victim.write_text("precious")
+    run = here / "run"
+    RunFolder(run, LearningConfig(), [0])
+    (run / name).symlink_to(victim)
+    with pytest.raises(RunFolderError, match="is a link"):
+        RunFolder.reopen(run, {})
+    assert victim.read_text() == "precious"
+
+
+@pytest.mark.parametrize(
+    "content", [pickle.dumps(Exploit()), b"[" * 200_000, b'{"use": 3}', b'{"use": {"bt": [{"share": "much"}]}}', b"[]"]
+)
+def test_records_of_an_evaluation_are_read_without_trust(here, content, capfd):
+    (here / "eval" / "trees").mkdir(parents=True)
+    (here / "eval" / "tree.json").write_bytes(content)
+    assert run_cli("tree", here) == 2
+    assert "tree.json" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("content", [pickle.dumps(Exploit()), b"[" * 200_000, b"[]", b""])
+def test_the_record_of_a_run_is_read_without_trust(here, content):
+    (here / "run.json").write_bytes(content)
+    with pytest.raises(RunFolderError, match=r"run\.json: cannot be read"):
+        RunFolder.reopen(here, {})
+
+
+# --------------------------------------------------------------------------------------------------------- exported policies
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    root = tmp_path_factory.mktemp("export")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(deployed.deploy, "missing_packages", lambda: ["onnx"])
+        deployed.exported(deployed.saved(root / "run"), root / "out")
+    return root / "out"
+
+
+@pytest.fixture
+def folder(exported, here):
+    deployed.shutil.copytree(exported, here / "out")
+    return here / "out"
+
+
+def objects_npz(path):
+    np.savez(path, obs=np.array([Exploit()], dtype=object))
+
+
+def deflated_npz(path):
+    """Sixty-four megabytes of zeros in a few kilobytes."""
+    np.savez_compressed(path, obs=np.zeros((1 << 24,), np.float32))
+
+
+def claiming_npz(path):
+    """An array that claims to have 2^50 values."""
+    with zipfile.ZipFile(path, "w") as archive, archive.open("obs.npy", "w") as member:
+        np.lib.format.write_array_header_1_0(member, {"descr": "<f4", "fortran_order": False, "shape": (1 << 50,)})
+
+
+def lying_npz(path):
+    """A member that claims to be stored with more bytes than there are."""
+    objects = bytearray()
+    np.savez(path, obs=np.zeros(4, np.float32))
+    objects += path.read_bytes()
+    at = objects.index(b"PK\x01\x02")
+    objects[at + 20 : at + 28] = struct.pack("<II", 1 << 31, 1 << 31)
+    path.write_bytes(bytes(objects))
+
+
+@pytest.mark.parametrize(
+    "make", [objects_npz, deflated_npz, claiming_npz, lying_npz, lambda path: path.write_bytes(pickle.dumps(Exploit()))]
+)
+def test_golden_pairs_are_neither_pickles_nor_bombs(folder, make, capfd):
+    make(folder / "golden.npz")
+    deployed.resigned(folder, "golden.npz", (folder / "golden.npz").read_bytes())
+    assert run_cli("export", "--check", folder) == 1
+    assert "is not the golden pairs" in capfd.readouterr().err
+
+
+def test_the_driver_of_a_folder_is_never_executed_by_its_check(folder):
+    deployed.resigned(folder, "run_policy.py", b"open('executed', 'w')")
+    assert run_cli("export", "--check", folder) == 0
+
+
+def test_files_outside_an_exported_folder_are_never_opened(folder, capfd):
+    spec = json.loads((folder / "policy_spec.json").read_text())
+    for name in ("../../etc/passwd", "/etc/passwd", "sub/policy.onnx"):
+        (folder / "policy_spec.json").write_text(json.dumps(spec | {"files": spec["files"] | {name: "0" * 64}}))
+        assert run_cli("export", "--check", folder) == 1
+        assert "lists other files" in capfd.readouterr().err
+
+
+def test_graphs_that_reach_beyond_themselves_are_refused():
+    onnx = pytest.importorskip("onnx", reason="needs the extra uuvtai[export]")
+    helper, tensor = onnx.helper, onnx.TensorProto
+    value = helper.make_tensor_value_info("obs", tensor.FLOAT, [1])
+    outside = onnx.TensorProto(name="w", data_type=tensor.FLOAT, dims=[1], data_location=onnx.TensorProto.EXTERNAL)
+    outside.external_data.add(key="location", value="../../etc/passwd")
+    body = helper.make_graph([], "b", [], [])
+    graphs = {
+        "evil.Run": helper.make_graph([helper.make_node("Run", ["obs"], ["out"], domain="evil")], "g", [value], []),
+        "onnx.Loop": helper.make_graph([helper.make_node("Loop", ["", ""], [], body=body)], "g", [value], []),
+        "has w": helper.make_graph([], "g", [value], [], initializer=[outside]),
+    }
+    for says, graph in graphs.items():
+        with pytest.raises(RuntimeError, match=says):
+            of_onnx(helper.make_model(graph).SerializeToString(), {})
+    with pytest.raises(RuntimeError, match="is no ONNX graph"):
+        of_onnx(pickle.dumps(Exploit()), {})
+
+
+# -------------------------------------------------------------------------------------------------------------------- logs
+
+
+def chunk_of(data, unpacked_size):
+    content = struct.pack("<QQQII", 0, 0, unpacked_size, 0, 4) + b"zstd" + struct.pack("<Q", len(data)) + data
+    return struct.pack("<BQ", 6, len(content)) + content
+
+
+END = struct.pack("<BQI", 0x0F, 4, 0)
+"""end of the data"""
+
+COMMANDS = (("log", "info"), ("log", "export", "--out", "out"), ("log", "repair"), ("log", "picture"), ("log", "video"), ("log", "convert"))
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command[1])
+@pytest.mark.parametrize("claimed", [1000, 200 << 20, 1 << 60])
+def test_chunks_that_unfold(here, command, claimed, capfd):
+    """200 MiB of zeros in 20 kB, with a modest, the true and an absurd size."""
+    if command[1] == "convert":
+        pytest.importorskip("mcap_protobuf", reason="needs the extra uuvtai[viz]")
+    bomb = chunk_of(zstandard.ZstdCompressor().compress(bytes(200 << 20)), claimed)
+    file = McapFile(here / "a.mcap")
+    file.add_attachment("scenario.json", "application/json", json.dumps(episode.scenario()).encode())
+    file.leave()
+    (here / "a.mcap").write_bytes((here / "a.mcap.part").read_bytes() + bomb + END)
+    (here / "a.mcap.part").unlink()
+    assert run_cli(*command[:2], here / "a.mcap", *command[2:]) == 1
+    assert "unpack" in capfd.readouterr().err
+    assert {path.name for path in here.rglob("*") if path.is_file()} == {"a.mcap"}
+
+
+def test_many_chunks_that_unfold_together(here, monkeypatch):
+    """Each is within its bound; all of them would fill a disk."""
+    monkeypatch.setattr(reader, "MAX_UNPACKED", 10 << 20)
+    record = struct.pack("<BQ", 0x85, (1 << 20) - 9) + bytes((1 << 20) - 9)
+    chunk = chunk_of(zstandard.ZstdCompressor().compress(record), len(record))
+    (here / "a.mcap").write_bytes(MAGIC + 10 * chunk + END)
+    assert info(here / "a.mcap")["messages"] == 0
+    (here / "a.mcap").write_bytes(MAGIC + 11 * chunk + END)
+    with pytest.raises(LogError, match="unpack to more than 10 MiB"):
+        info(here / "a.mcap")
+
+
+def test_names_of_attachments_and_topics_stay_inside(here, capfd):
+    names = ["../../evil", "/tmp/evil_absolute", "..\\..\\evil", "a/../../b", "..", ".", "", "\0x", "C:\\evil", "~/.bashrc", "x\n--flag"]
+    file = McapFile(here / "a.mcap")
+    for name in names:
+        file.add_attachment(name, "text/plain", b"x")
+        file.add_message(file.add_channel(f"/{name}", file.add_schema("s", "jsonschema", b"{}")), 0, b'{"x": 1}')
+    file.finish()
+    assert run_cli("log", "export", here / "a.mcap", "--out", here / "deep" / "out") == 0
+    written = {path for path in here.rglob("*") if path.is_file()} - {here / "a.mcap"}
+    assert written and all(path.parent == here / "deep" / "out" for path in written)
+    assert not any(path.name.startswith((".", "-", "~")) for path in written)
+    capfd.readouterr()
+
+
+def log_with(path, scenario=None, attachments=(), poses=((0.0, 1.0),)):
+    """A log with a scenario and poses (time [s], x)."""
+    file = McapFile(path)
+    file.add_attachment("scenario.json", "application/json", json.dumps(scenario or episode.scenario()).encode())
+    for name, data in attachments:
+        file.add_attachment(name, "", data)
+    channel = file.add_channel("/pose", file.add_schema("foxglove.PoseInFrame", "jsonschema", b"{}"))
+    for time_s, x in poses:
+        pose = {"position": {"x": x, "y": 1.0, "z": -1.0}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}
+        file.add_message(channel, int(time_s * 1e9), json.dumps({"pose": pose}).encode())
+    file.finish()
+    return path
+
+
+def changed(**keys):
+    return episode.scenario() | keys
+
+
+DRAWN = {
+    "a huge tank": changed(tank={"shape": "rectangle", "x_m": [0, 1e9], "y_m": [0, 6], "z_m": [-1, 0], "radius_m": 1}),
+    "a tank turned inside out": changed(tank={"shape": "rectangle", "x_m": [1, 0], "y_m": [0, 6], "z_m": [-1, 0], "radius_m": 1}),
+    "no tank": changed(tank={}),
+    "a tank of words": changed(tank={"shape": "rectangle", "x_m": ["a", "b"], "y_m": [0, 6]}),
+    "bodies at the end of the world": changed(bodies=[episode.BODIES[0] | {"position": [1e300, 0, 0]}]),
+    "endless bodies": changed(bodies=[episode.BODIES[0]] * 100_000),
+    "no goal": {key: value for key, value in episode.scenario().items() if key != "goal"},
+    "bodies without shape": changed(bodies=[{"position": [1, 2, 3]}]),
+    "a list": [],
+}
+
+
+@pytest.mark.parametrize("scenario", DRAWN.values(), ids=DRAWN)
+def test_scenarios_that_cannot_be_drawn(here, scenario):
+    file = McapFile(here / "a.mcap")
+    file.add_attachment("scenario.json", "application/json", json.dumps(scenario).encode())
+    file.finish()
+    log_with(here / "b.mcap", scenario or [0])
+    with pytest.raises(LogError, match="drawn"):
+        picture(here / "b.mcap", here / "b.png")
+    assert not (here / "b.png").exists()
+
+
+def test_an_episode_that_claims_to_last_for_years(here):
+    log_with(here / "a.mcap", poses=((0.0, 1.0), (1e9, 2.0)))
+    with pytest.raises(LogError, match=r"claims to last 1e\+09 s"):
+        load_recording(here / "a.mcap")
+
+
+def png(width, height):
+    head = struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", len(head)) + b"IHDR" + head + bytes(4)
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [(png(40_000, 40_000), "claims 40000 x 40000"), (png(8, 8), "is damaged"), (b"GIF89a", "is not a PNG"), (b"", "is not a PNG")],
+)
+def test_images_that_unfold(content, says):
+    with pytest.raises(LogError, match=says):
+        depth_image({"data": base64.b64encode(content).decode()})
+
+
+@pytest.mark.parametrize("text", TAGS[:3])
+def test_a_config_within_a_log_is_yaml_without_tags(here, text, capfd):
+    pytest.importorskip("mcap_protobuf", reason="needs the extra uuvtai[viz]")
+    log_with(here / "a.mcap", attachments=[("config.yaml", text.encode())])
+    assert run_cli("log", "convert", here / "a.mcap") == 1
+    assert "its config.yaml cannot be read" in capfd.readouterr().err
+
+
+def test_names_in_a_log_cannot_steer_the_terminal(here, capfd):
+    file = McapFile(here / "a.mcap")
+    for topic in ("/\x1b]52;c;ZXZpbA==\x07", "/[link=file:///etc/passwd]x[/link]", "/[/nothing]", "/\x9b31m\u202e"):
+        file.add_message(file.add_channel(topic, file.add_schema("\x1b[2J", "jsonschema", b"{}")), 0, b"not json")
+    file.add_metadata("uuv.result", {"outcome": "\x1b[31m[/x]"})
+    file.finish()
+    assert run_cli("log", "info", here / "a.mcap") == 0
+    assert run_cli("log", "export", here / "a.mcap", "--out", here / "out", "--topic", "\x1b[2J") == 1
+    told = capfd.readouterr()
+    assert not any(bad in told.out + told.err for bad in ("\x1b", "\x07", "\x9b", "\u202e"))
+    assert "[link=file:///etc/passwd]" in told.out, "shown as it is, not as a link"
+
+
+def test_the_reader_of_safetensors_is_the_only_one_that_run_policy_has():
+    """The driver that goes to the vehicle reads with NumPy; it must not have a way to load pickles."""
+    names = {ast.unparse(node.func) for node in ast.walk(ast.parse(Path(run_policy.__file__).read_text())) if isinstance(node, ast.Call)}
+    assert not names & {"np.load", "np.lib.format.read_array", "pickle.load", "pickle.loads"}
+    assert "np.frombuffer" in names

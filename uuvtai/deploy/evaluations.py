@@ -1,0 +1,103 @@
+"""How often a policy arrived and collided, from the evaluations that are at hand: the counts behind every rate of the model card."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from uuvtai.learn.checkpoint import Checkpoint
+from uuvtai.loader import ConfigError
+from uuvtai.measure.statistics import wilson_interval
+
+RESULT = Path("eval/result.json")
+"""what ``uuv eval`` leaves in its run folder"""
+_MAX_BYTES = 256 << 20
+_FAILURES = ("collision", "ttc", "out_of_tank")
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """One row of the card's table."""
+
+    where: str
+    """world, obstacles, sensing, seeds"""
+    episodes: int
+    successes: int
+    collisions: int
+    """contacts, TTC stops and leaving the tank"""
+
+    def rates(self) -> tuple[str, str]:
+        """Success and collision as k/n with their 95 % Wilson intervals."""
+        return _rate(self.successes, self.episodes), _rate(self.collisions, self.episodes)
+
+
+def during_training(checkpoint: Checkpoint) -> Evaluation | None:
+    """The evaluation by which training chose this checkpoint; None where there was none at this step."""
+    metrics, config = checkpoint.manifest.metrics, checkpoint.config
+    success, collision = (metrics.get(f"eval/{name}_rate") for name in ("success", "collision"))
+    if not isinstance(success, float | int) or not isinstance(collision, float | int):
+        return None
+    n, world = config.train.evaluate_episodes, config.world
+    where = (
+        f"the training's own world and sensing, S = {world.n_static}, D = {world.n_dynamic}, v = {world.dynamic_speed_m_s:g} m/s, "
+        f"seed {config.train.evaluate_seed}"
+    )
+    return Evaluation(where, n, round(success * n), round(collision * n))
+
+
+def evaluations_of(checkpoint: Checkpoint, folders: Iterable[Path]) -> list[Evaluation]:
+    """This checkpoint's rows in the results of ``uuv eval`` below the run folder and in ``folders``.
+
+    Raises ConfigError for one of ``folders`` that does not hold any.
+    """
+    found = [row for file in _own_results(checkpoint) for row in _rows(file, checkpoint.sha256)]
+    for folder in folders:
+        rows = _rows(folder / RESULT, checkpoint.sha256)
+        if not rows:
+            raise ConfigError(f"--evaluation {folder}: does not evaluate this checkpoint; give the run folder that 'uuv eval RUN' printed")
+        found += rows
+    return found
+
+
+def _own_results(checkpoint: Checkpoint) -> list[Path]:
+    run = checkpoint.path.parent.parent
+    if checkpoint.path.parent.name != "checkpoints":
+        return []
+    return sorted(file for file in (run / RESULT, *run.glob(f"*/{RESULT}")) if file.is_file())
+
+
+def _rows(file: Path, sha256: str) -> list[Evaluation]:
+    """Rows of the methods that this checkpoint drove. Raises ConfigError for a file that is no result."""
+    try:
+        if file.stat().st_size > _MAX_BYTES:
+            raise ValueError(f"larger than {_MAX_BYTES >> 20} MiB")
+        result = json.loads(file.read_bytes())
+        return [_row(result, m) for m in result["methods"] if m.get("checkpoint", {}).get("sha256") == sha256]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise ConfigError(f"{file}: is no result of uuv eval ({error!r}); give the run folder that 'uuv eval RUN' printed") from None
+
+
+def _row(result: dict[str, Any], method: dict[str, Any]) -> Evaluation:
+    speed = f", v = {float(result['v_m_s']):g} m/s" if result["D"] else ""
+    seeds = ", ".join(str(int(seed)) for seed in result["seeds"])
+    where = (
+        f"{_word(result['world'])}, S = {int(result['S'])}, D = {int(result['D'])}{speed}, {_word(result['sensors'])} sensing, seed {seeds}"
+    )
+    k, n = int(method["outcomes"]["success"]), int(method["episodes"])
+    collisions = sum(int(method["outcomes"][name]) for name in _FAILURES)
+    if min(k, collisions) < 0 or k + collisions > n:
+        raise ValueError(f"{k} successes and {collisions} collisions of {n} episodes")
+    return Evaluation(where, n, k, collisions)
+
+
+def _word(name: Any) -> str:
+    """A preset's name or the last part of a path, without what would break a table."""
+    return "".join(c for c in Path(str(name)).stem if c.isalnum() or c in "-_ ") or "unnamed"
+
+
+def _rate(k: int, n: int) -> str:
+    bounds = wilson_interval(k, n)
+    return "-" if bounds is None else f"{k}/{n} = {100 * k / n:.1f} % [{100 * bounds[0]:.1f}, {100 * bounds[1]:.1f}]"

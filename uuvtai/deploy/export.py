@@ -1,0 +1,125 @@
+"""``uuv export``: a policy as a folder that drives without uuvtai, written whole or not at all, and the check of such a folder."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import safetensors.torch
+
+from uuvtai.deploy import run_policy
+from uuvtai.deploy.agreement import RUNTIME, Agreement, has_onnx_runtime, of_numpy, of_onnx, of_torch
+from uuvtai.deploy.card import model_card
+from uuvtai.deploy.evaluations import evaluations_of
+from uuvtai.deploy.golden import golden_of, npz_bytes
+from uuvtai.deploy.graph import OneDecision, missing_packages, onnx_bytes
+from uuvtai.deploy.run_policy import GOLDEN, SPEC, WEIGHTS, PolicyError
+from uuvtai.deploy.spec import ONNX, specification
+from uuvtai.deploy.weights import weights_of
+from uuvtai.learn.checkpoint import Checkpoint
+from uuvtai.learn.pilot import load_pilot
+from uuvtai.loader import ConfigError
+from uuvtai.logs.container import sync_folder
+from uuvtai.run_folder import write_atomic
+
+Note = Callable[[str], None]
+
+EXTRA = "uuvtai[export]"
+"""extra that brings ONNX"""
+
+
+@dataclass(frozen=True)
+class Export:
+    """A folder and what its engines say to the golden pairs."""
+
+    folder: Path
+    agreements: tuple[Agreement, ...]
+    damages: tuple[str, ...] = ()
+    """files that are not as the specification says"""
+
+    @property
+    def agrees(self) -> bool:
+        """Every file is whole and every engine agrees."""
+        return not self.damages and all(found.agrees for found in self.agreements)
+
+    def document(self) -> dict[str, Any]:
+        """What ``uuv export --json`` prints."""
+        engines = [found.document() for found in self.agreements]
+        return {"schema": 1, "folder": str(self.folder), "agrees": self.agrees, "damages": list(self.damages), "engines": engines}
+
+
+def export(checkpoint: Checkpoint, name: str, out: Path, evaluations: Iterable[Path], note: Note) -> Export:
+    """Write the policy of a checkpoint into a new folder ``out``; ``note`` is told what it lacks.
+
+    Raises ConfigError for a place that is taken, CheckpointError for networks that cannot drive, RuntimeError where the disk refuses.
+    """
+    _refuse_place(out)
+    pilot, rows = load_pilot(checkpoint, 1), evaluations_of(checkpoint, evaluations)
+    decision, golden, graph = OneDecision(pilot).eval(), golden_of(pilot), None
+    if missing := missing_packages():
+        note(f"left out {ONNX}: {', '.join(missing)} not installed. For an ONNX graph: pip install '{EXTRA}', then export again")
+    else:
+        graph = onnx_bytes(decision)
+    spec = specification(checkpoint, pilot, name, graph is not None)
+    files = {
+        WEIGHTS: safetensors.torch.save(weights_of(pilot)),
+        GOLDEN: npz_bytes(golden),
+        "README.md": model_card(spec, checkpoint, rows).encode(),
+        "run_policy.py": Path(run_policy.__file__).read_bytes(),
+    } | ({} if graph is None else {ONNX: graph})
+    _publish(out, files, spec)
+    return Export(out, (of_torch(decision, golden), *_replayed(out, run_policy.read_spec(out), note)))
+
+
+def check(folder: Path, note: Note) -> Export:
+    """Verify the sha256 of every file of an exported policy and replay its golden pairs; nothing in it is executed.
+
+    Raises PolicyError for a folder that is no exported policy.
+    """
+    spec = run_policy.read_spec(folder)
+    if damages := run_policy.changed_files(folder, spec):
+        return Export(folder, (), tuple(damages))
+    return Export(folder, tuple(_replayed(folder, spec, note)))
+
+
+def _replayed(folder: Path, spec: dict[str, Any], note: Note) -> list[Agreement]:
+    """What NumPy and, where it is here, ONNX Runtime make of the folder's files."""
+    golden = run_policy.read_golden(folder / GOLDEN)
+    try:
+        found = [of_numpy(run_policy.Policy(spec, run_policy.read_safetensors(folder / WEIGHTS)), golden)]
+        if ONNX not in spec["files"]:
+            return found
+        if has_onnx_runtime():
+            return [*found, of_onnx(run_policy.content_of(folder / ONNX), golden)]
+    except (KeyError, ValueError, TypeError) as error:
+        raise PolicyError(f"{folder}: its golden pairs do not fit its policy ({error!r}); export it again") from None
+    note(f"{ONNX} was not replayed: {RUNTIME} is not installed; pip install '{EXTRA}'")
+    return found
+
+
+def _refuse_place(out: Path) -> None:
+    if out.exists():
+        raise ConfigError(f"{out}: is already there; give another folder with --out DIR, or remove it")
+
+
+def _publish(out: Path, files: dict[str, bytes], spec: dict[str, Any]) -> None:
+    """Write everything into a neighbour, flush it, give it its name. Raises RuntimeError."""
+    spec = spec | {"files": {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}}
+    text = json.dumps(spec, indent=1, allow_nan=False) + "\n"
+    partial = out.with_name(f".{out.name}.{os.getpid()}.partial")
+    try:
+        for name, content in {**files, SPEC: text.encode()}.items():
+            write_atomic(partial / name, content)
+        sync_folder(partial)
+        partial.rename(out)
+        sync_folder(out.parent)
+    except OSError as error:
+        raise RuntimeError(f"{out}: cannot be written ({error.strerror}); give a folder that can be: --out DIR") from None
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)

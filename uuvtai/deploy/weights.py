@@ -1,0 +1,62 @@
+"""The networks of a pilot as float32 arrays under plain names, with everything that they scale by: what ``run_policy.py`` computes with."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor, nn
+
+from uuvtai.learn.normalise import RunningNorm
+from uuvtai.learn.pilot import Pilot
+from uuvtai.learn.policy import Policy
+from uuvtai.learn.risk import RiskHead
+from uuvtai.learn.world_model import WorldModel, deviation
+
+NO_LIMIT = float(torch.finfo(torch.float32).max)
+"""of a normaliser that has seen nothing and therefore cuts nothing off"""
+
+
+def weights_of(pilot: Pilot) -> dict[str, Tensor]:
+    """Arrays of policy, world model and risk head, on the host, contiguous."""
+    found = dict(_policy(pilot.policy))
+    if pilot.world_model is not None:
+        found |= dict(_world_model(pilot.world_model))
+    if pilot.risk is not None:
+        found |= dict(_risk(pilot.risk))
+    return {name: tensor.detach().cpu().contiguous().clone() for name, tensor in found.items()}
+
+
+def _policy(policy: Policy) -> Iterator[tuple[str, Tensor]]:
+    yield from _net("actor", policy.actor)
+    yield from _net("critic", policy.critic)
+    yield from _norm("norm", policy.observation_norm)
+    yield "value.mean", policy.value_norm.mean.float()
+    yield "value.std", policy.value_norm.std().float()
+
+
+def _world_model(model: WorldModel) -> Iterator[tuple[str, Tensor]]:
+    for name in ("encoder", "dynamics", "decoder"):
+        yield from _net(name, getattr(model, name))
+    yield from _norm("world_norm", model.observation_norm)
+    yield "target.scale", model.scale()
+    yield "target.base", model.base(torch.zeros(model.n_obs, device=model.change_norm.mean.device))
+    yield "change.unit", deviation(model.change_norm.moments)
+
+
+def _risk(head: RiskHead) -> Iterator[tuple[str, Tensor]]:
+    yield from _net("risk", head.net)
+    yield from _norm("risk.norm", head.observation_norm)
+    yield "risk.table", head.table
+    yield "risk.threshold", head.threshold
+
+
+def _net(name: str, net: nn.Module) -> Iterator[tuple[str, Tensor]]:
+    for key, tensor in net.state_dict().items():
+        yield f"{name}.{key}", tensor.float()
+
+
+def _norm(name: str, norm: RunningNorm) -> Iterator[tuple[str, Tensor]]:
+    yield f"{name}.mean", norm.mean.float()
+    yield f"{name}.scale", (1.0 / norm.std()).float()
+    yield f"{name}.limit", torch.tensor([norm.clip if float(norm.count) > 0 else NO_LIMIT])
