@@ -5,7 +5,7 @@ import json
 import pytest
 
 from uuvtai.loader import preset_names
-from uuvtai.measure.reproduce import claims, paper, steps
+from uuvtai.measure.reproduce import claims, paper, run, steps
 from uuvtai.measure.reproduce.claims import FAILS, HOLDS, OPEN, Share
 from uuvtai.measure.reproduce.markdown import results_page, table
 from uuvtai.measure.reproduce.run import reproduce, resume
@@ -165,6 +165,12 @@ class Quiet:
 
     def note(self, text):
         self.told.append(text)
+
+
+@pytest.fixture(autouse=True)
+def no_page(monkeypatch):
+    """The page is drawn from run folders that stand-ins do not write."""
+    monkeypatch.setattr(run, "report", lambda folders: type("Report", (), {"page": folders[0] / "report.html"})())
 
 
 def test_an_interrupted_reproduction_goes_on_and_runs_no_step_twice(tmp_path, monkeypatch):

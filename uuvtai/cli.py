@@ -46,6 +46,7 @@ Speed = Annotated[float | None, typer.Option("-v", help="Speed of the moving obs
 Set = Annotated[list[str] | None, typer.Option("--set", help="Override a config key: key.sub=value (repeatable).")]
 Device = Annotated[str, typer.Option("--device", help="auto, cpu or cuda.")]
 RunDir = Annotated[Path | None, typer.Option("--run-dir", help="The run's folder \\[default: runs/<time>_<preset>].")]
+WithReport = Annotated[bool, typer.Option("--report", help="Also write the run's report.html.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else on stdout.")]
 
 
@@ -87,7 +88,7 @@ def evaluate(
     ] = None,
     device: Device = "auto",
     overrides: Set = None,
-    with_report: Annotated[bool, typer.Option("--report", help="Also write the run's report.html.")] = False,
+    with_report: WithReport = False,
     run_dir: RunDir = None,
     as_json: AsJson = False,
 ) -> None:
@@ -319,6 +320,7 @@ def train_policy(
     n_dynamic: Dynamic = None,
     speed: Speed = None,
     device: Device = "auto",
+    with_report: WithReport = False,
     overrides: Set = None,
     run_dir: RunDir = None,
     as_json: AsJson = False,
@@ -338,7 +340,9 @@ def train_policy(
         given |= {"-S": n_static, "-D": n_dynamic, "-v": speed, "--run-dir": run_dir}
         _refuse_beside_resume(given)
         request = TrainRequest(resume=resume, overrides=list(overrides or []), iterations=iterations, device=device)
-    result, _folder = train(request, _Training())
+    result, folder = train(request, _Training())
+    if with_report:
+        _say(f"report: {_write_report([folder], None).page}")
     if as_json:
         _print_json(result)
 
@@ -510,6 +514,7 @@ def sweep(
     address: Annotated[str, typer.Option("--address", help="Ray cluster: host:port, auto, or local (inside this process).")] = "auto",
     resume: Annotated[Path | None, typer.Option("--resume", help="Run folder of a sweep to go on with.")] = None,
     device: Device = "auto",
+    with_report: WithReport = False,
     overrides: Set = None,
     run_dir: RunDir = None,
     as_json: AsJson = False,
@@ -541,6 +546,8 @@ def sweep(
             device=device,
         )
         result, folder = begin(request, _engine(engine, workers, address), run_dir, _Progress("cells"))
+    if with_report:
+        _say(f"report: {_write_report([folder], None).page}")
     if as_json:
         _print_json(result)
         return
@@ -557,6 +564,13 @@ def _engine(name: str, workers: int, address: str) -> Any:
 
 
 def _print_sweep(result: dict[str, Any]) -> None:
+    from uuvtai.report.heatmap import varying
+
+    if len(varying(result["axes"])) > 1:
+        from uuvtai.report.terminal import print_heat_maps
+
+        print_heat_maps(result, _stdout())
+        return
     table = Table(title=f"{result['world']}: {len(result['cells'])} cells x {result['episodes_per_seed']} episodes", title_justify="left")
     others = [name for name in result["axes"] if name not in ("S", "D", "v")]
     for head in ("S", "D", "v m/s", *others, "method", "success [95 %]", "collision [95 %]", "time to goal s"):

@@ -12,7 +12,9 @@ from typing import Any, Protocol
 from uuvtai.loader import load_config, preset_names
 from uuvtai.measure.reproduce import claims, paper
 from uuvtai.measure.reproduce.markdown import results_page
+from uuvtai.measure.reproduce.sections import sections_of
 from uuvtai.measure.reproduce.steps import BUDGETS, EVALUATION_SEED, TRAINED, Budget, Step, is_done, result_file, run_step, steps_of
+from uuvtai.report.build import report
 from uuvtai.run_folder import RunFolder, RunFolderError, default_run_dir, refuse_place
 
 REQUEST, RESULT, PAGE = "reproduce_request.json", "reproduce.json", "results.md"
@@ -58,6 +60,7 @@ def _run(folder: RunFolder, watch: Watch) -> dict[str, Any]:
         document = document_of(folder.path, request, steps)
         folder.write_json(RESULT, document)
         folder.write(PAGE, results_page(document))
+        watch.note(f"report: {report([folder.path]).page}")
         status, code = "finished", 0
         return document
     except KeyboardInterrupt:
@@ -87,8 +90,9 @@ def document_of(root: Path, request: dict[str, Any], steps: Sequence[Step]) -> d
     record = json.loads((root / "run.json").read_text(encoding="utf-8"))
     budget = BUDGETS[request["budget"]]
     by_preset = _by_preset(results["eval/main"], budget)
-    return {
+    document = {
         "schema": 1,
+        "title": f"The paper reproduced, budget {request['budget']}",
         "budget": request["budget"],
         "started": record["started"],
         "git_sha": record["git_sha"],
@@ -104,6 +108,7 @@ def document_of(root: Path, request: dict[str, Any], steps: Sequence[Step]) -> d
         "sweeps": {folder.removeprefix("sweep/"): found for folder, found in results.items() if folder.startswith("sweep/")},
         "profile": results["profile"],
     }
+    return document | {"sections": sections_of(document, budget)}
 
 
 def _shown(part: str, root: Path) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import os
 import signal
@@ -114,7 +115,9 @@ class RayEngine:
             raise EngineError("--engine ray: the package ray is missing; install it: pip install 'uuvtai[cluster]'") from None
         self._ray = ray
         try:
-            ray.init(address=None if address == "local" else address, ignore_reinit_error=True, log_to_driver=False, logging_level="ERROR")
+            ray.init(
+                address=None if address == "local" else address, ignore_reinit_error=True, log_to_driver=False, logging_level=logging.ERROR
+            )
         except (ConnectionError, ValueError, RuntimeError) as error:
             raise EngineError(f"--engine ray: no cluster at {address!r} ({error}); start one: ray start --head") from None
         self._cpus = min(cpus_per_task, ray.cluster_resources().get("CPU", 1.0))
