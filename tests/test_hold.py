@@ -1,4 +1,4 @@
-"""A decision held for several control steps is one transition: rewards add up, endings on the way are kept, the next episode is the tree's."""
+"""A decision held for several control steps is one transition: rewards add up, endings are kept, the next episode is the tree's."""
 
 from types import SimpleNamespace
 

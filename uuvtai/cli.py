@@ -167,7 +167,7 @@ def _print_methods(result: dict[str, Any]) -> None:
     speed = f"v = {result['v_m_s']} m/s, " if result["D"] else ""
     table = Table(
         title=f"{result['world']}: S = {result['S']}, D = {result['D']}, {speed}{result['sensors']} sensing, "
-        f"{len(result['seeds'])} seed(s) x {result['episodes_per_seed']} episodes",
+        f"{len(result['seeds'])} {'seed' if len(result['seeds']) == 1 else 'seeds'} x {result['episodes_per_seed']} episodes",
         title_justify="left",
     )
     for head in (
@@ -823,8 +823,11 @@ def presets(
     if action != "show" or not name:
         raise UsageError("write 'uuv presets' or 'uuv presets show NAME'")
     kind, name = _preset_kind(name)
-    if kind == "tree":
-        typer.echo(loader.preset_path("tree", name).read_text())
+    if kind in ("tree", "grid"):
+        if as_json and kind == "grid":
+            _print_json(loader.read_preset(kind, name))
+        else:
+            typer.echo(loader.preset_path(kind, name).read_text())
         return
     config = _shown(kind, name)
     if as_json:
@@ -834,7 +837,7 @@ def presets(
 
 
 def _preset_kind(name: str) -> tuple[str, str]:
-    """(kind, name) of 'NAME' or 'KIND/NAME'; a name that no kind has is taken for a world."""
+    """(kind, name) of 'NAME' or 'KIND/NAME'; a path is taken for a world's. UsageError for a name that no kind has."""
     from uuvtai import loader
 
     kind, slash, rest = name.partition("/")
@@ -843,6 +846,9 @@ def _preset_kind(name: str) -> tuple[str, str]:
     kinds = [kind for kind in loader.KINDS if name in loader.preset_names(kind)]
     for other in kinds[1:]:
         _say(f"there is another one: uuv presets show {other}/{name}")
+    if not kinds and not slash and not Path(name).suffix:
+        known = "; ".join(f"{kind}: {', '.join(names)}" for kind in loader.KINDS if (names := loader.preset_names(kind)))
+        raise UsageError(f"{name!r} is no preset. There are {known}")
     return (kinds[0] if kinds else "world"), name
 
 
