@@ -9,6 +9,8 @@ from uuvtai import state
 from uuvtai.config import EpisodeConfig, TankConfig, VehicleConfig
 from uuvtai.kernels import episode
 from uuvtai.kernels.geometry import BOX, CYLINDER, FAR_M, SPHERE
+from uuvtai.kernels.outcome import COLLISION, OUT_OF_TANK, OUTCOMES, SUCCESS, TIMEOUT, TTC
+from uuvtai.outcomes import COLLIDED, ENDINGS, FORESEEABLE
 
 N, N_BODY = 8, 3
 TOL = 1e-5
@@ -243,3 +245,9 @@ def test_episodes_begin_advance_end_and_sleep(court):
 def test_negative_seeds_have_keys_too(court):
     begin(court, [1] * N, seed=-1, number=0)
     assert court.episode.key[0] == noise_reference.episode_key(2**32 - 1, 0)
+
+
+def test_codes_and_names_of_the_endings_agree():
+    assert ("running", *ENDINGS) == OUTCOMES
+    assert [OUTCOMES[code] for code in (SUCCESS, COLLISION, TTC, OUT_OF_TANK, TIMEOUT)] == list(ENDINGS)
+    assert set(FORESEEABLE) < set(COLLIDED) < set(ENDINGS)

@@ -11,11 +11,11 @@ from typing import Any
 from uuvtai.learn.checkpoint import Checkpoint
 from uuvtai.loader import ConfigError
 from uuvtai.measure.statistics import wilson_interval
+from uuvtai.outcomes import COLLIDED
 
 RESULT = Path("eval/result.json")
 """what ``uuv eval`` leaves in its run folder"""
 _MAX_BYTES = 256 << 20
-_FAILURES = ("collision", "ttc", "out_of_tank")
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def _row(result: dict[str, Any], method: dict[str, Any]) -> Evaluation:
         f"{_word(result['world'])}, S = {int(result['S'])}, D = {int(result['D'])}{speed}, {_word(result['sensors'])} sensing, seed {seeds}"
     )
     k, n = int(method["outcomes"]["success"]), int(method["episodes"])
-    collisions = sum(int(method["outcomes"][name]) for name in _FAILURES)
+    collisions = sum(int(method["outcomes"][name]) for name in COLLIDED)
     if min(k, collisions) < 0 or k + collisions > n:
         raise ValueError(f"{k} successes and {collisions} collisions of {n} episodes")
     return Evaluation(where, n, k, collisions)

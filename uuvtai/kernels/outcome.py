@@ -10,7 +10,7 @@ OUT_OF_TANK = 4
 TIMEOUT = 5
 
 OUTCOMES = ("running", "success", "collision", "ttc", "out_of_tank", "timeout")
-"""Names by code."""
+"""Names by code: running, then ``uuvtai.outcomes.ENDINGS``."""
 
 
 @ti.func

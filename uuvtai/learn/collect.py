@@ -14,6 +14,7 @@ from uuvtai.learn.hold import Hold, Info, Stretch
 from uuvtai.learn.policy import NUM_ACTIONS, Policy
 from uuvtai.learn.rollout import Rollout, final_value
 from uuvtai.learn.tally import Tally
+from uuvtai.outcomes import FORESEEABLE
 
 if TYPE_CHECKING:
     from uuvtai.env import VectorEnv
@@ -21,9 +22,6 @@ if TYPE_CHECKING:
 
 N_FEATURES = 2
 """columns of the policy's input behind the observation: the world model's residual and uncertainty, zero without one"""
-
-FAILURES = ("collision", "ttc")
-"""outcomes that the risk head foresees"""
 
 
 class Collector:
@@ -50,7 +48,7 @@ class Collector:
         """(T, N) the world model's uncertainty proxy of every transition in the rollout"""
         self.failed = torch.zeros(rollout.steps, n, dtype=torch.bool, device=device)
         """(T, N) the step ended in a collision or a TTC stop"""
-        self._failures = torch.tensor([name in FAILURES for name in env.outcomes], device=device)
+        self._failures = torch.tensor([name in FORESEEABLE for name in env.outcomes], device=device)
         self.leaf_errors = LeafErrors(env.node_names, device)
         self.hold = Hold(env, policy)
         self._teacher, self._reward = torch.zeros(n, NUM_ACTIONS, device=device), torch.zeros(n, device=device)

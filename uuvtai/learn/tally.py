@@ -7,10 +7,10 @@ from dataclasses import dataclass, fields
 
 import torch
 
+from uuvtai.outcomes import COLLIDED
+
 WINDOW = 100
 """episodes at least that a figure is the mean of, once there were so many (as other trainers do)"""
-_COLLIDED = ("collision", "ttc", "out_of_tank")
-"""outcomes that count as a collision, as in the evaluation"""
 
 
 @dataclass
@@ -62,7 +62,7 @@ class Recent:
             "rollout/ep_rew_mean": total / episodes,
             "rollout/ep_len_mean": steps / episodes,
             "rollout/success_rate": by_name["success"] / episodes,
-            "rollout/collision_rate": sum(by_name[name] for name in _COLLIDED) / episodes,
+            "rollout/collision_rate": sum(by_name[name] for name in COLLIDED) / episodes,
             "rollout/timeout_rate": by_name["timeout"] / episodes,
             "rollout/episodes": self._episodes(self.rows[-1]),
         }

@@ -14,6 +14,7 @@ from uuvtai.logs.errors import LogError
 from uuvtai.logs.painting import map_canvas, mixed, paint_layers, paint_ruler, paint_truth, paint_walls, paint_water
 from uuvtai.logs.recording import PICTURE_TOPICS, Recording, drawing, load_recording
 from uuvtai.logs.video import video
+from uuvtai.outcomes import COLLIDED
 
 __all__ = ["draw_picture", "picture", "video"]
 
@@ -134,7 +135,7 @@ def _paint_ends(canvas: Canvas, recordings: list[Recording]) -> None:
         canvas.vehicle(recordings[i].positions[-1], METHODS[i % len(METHODS)])
     canvas.star(goal, 17)
     for i, recording in enumerate(recordings):
-        if recording.outcome in ("collision", "ttc", "out_of_tank"):
+        if recording.outcome in COLLIDED:
             canvas.cross(recording.positions[-1][:2], 9, METHODS[i % len(METHODS)])
 
 

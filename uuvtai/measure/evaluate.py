@@ -14,6 +14,7 @@ from uuvtai.kernels.outcome import OUTCOMES, RUNNING
 from uuvtai.kernels.plan_codes import PLANNERS, REASONS, TRIGGERS
 from uuvtai.measure.paired import paired
 from uuvtai.measure.statistics import bootstrap_interval, mean, rate, time_to_success_s, wilson_interval
+from uuvtai.outcomes import COLLIDED, ENDINGS
 from uuvtai.scenario import Scene
 from uuvtai.sim import Sim
 from uuvtai.tree import node_use
@@ -23,8 +24,6 @@ if TYPE_CHECKING:
 
 _REFILL_SHARE = 16
 """Ended rows wait until this part of the batch can be reset together, or until nothing runs: fewer reset passes, same results."""
-
-COLLIDED = ("collision", "ttc", "out_of_tank")
 
 
 @dataclass(frozen=True)
@@ -247,7 +246,7 @@ def _named(names: tuple[str, ...], counts: np.ndarray) -> dict[str, int]:
 def summary(name: str, results: list[EpisodeResult], env_steps: int, wall_s: float) -> dict[str, Any]:
     """One method's entry of ``uuv eval --json`` (docs: interfaces); rates without episodes are None, never NaN."""
     n = len(results)
-    outcomes = {outcome: sum(r.outcome == outcome for r in results) for outcome in ("success", *COLLIDED, "timeout")}
+    outcomes = {outcome: sum(r.outcome == outcome for r in results) for outcome in ENDINGS}
     collided = sum(outcomes[o] for o in COLLIDED)
     time_mean, to_goal = mean([r.time_s for r in results]), [r.time_s for r in results if r.outcome == "success"]
     return {

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from uuvtai.learn.calibration import auroc, brier, expected_calibration_error, reliability
-from uuvtai.learn.collect import FAILURES
 from uuvtai.learn.risk import STRIDE, RiskHead, conformal_threshold
 from uuvtai.measure.statistics import wilson_interval
+from uuvtai.outcomes import FORESEEABLE
 
 if TYPE_CHECKING:
     from uuvtai.learn.pilot import Pilot
@@ -71,7 +71,7 @@ class Foresight:
         kept = (to_end > 0) & (~soon | torch.tensor(result.outcome != "timeout"))
         if kept.any():
             said = torch.stack([entry[row] for entry in self._said[first:]]).cpu()
-            event = soon & torch.tensor(result.outcome in FAILURES)
+            event = soon & torch.tensor(result.outcome in FORESEEABLE)
             self._parts.append(Moments(said[kept], event[kept], torch.full((int(kept.sum()),), self._ended)))
         self._ended += 1
 

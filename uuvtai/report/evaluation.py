@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from uuvtai.outcomes import ENDINGS
 from uuvtai.report.blocks import Block, Data, Figure, Heading, Prose, Table
 from uuvtai.report.figures import Line, intervals, rates_text, reliability
 from uuvtai.report.wording import accidents, number, percent, rate
@@ -61,13 +62,12 @@ _PLAIN = ("success_rate", "collision_rate", "time_to_success_mean_s", "time_mean
 
 
 def _methods_data(methods: list[Method]) -> Data:
-    outcomes = ("success", "collision", "ttc", "out_of_tank", "timeout")
     bounds = ("success_ci95_low", "success_ci95_high", "collision_ci95_low", "collision_ci95_high")
     rows = [
-        [m["name"], m["episodes"], *(m["outcomes"][name] for name in outcomes), *_bounds(m), *(m.get(name) for name in _PLAIN)]
+        [m["name"], m["episodes"], *(m["outcomes"][name] for name in ENDINGS), *_bounds(m), *(m.get(name) for name in _PLAIN)]
         for m in methods
     ]
-    return Data(["method", "episodes", *outcomes, *bounds, *_PLAIN], rows)
+    return Data(["method", "episodes", *ENDINGS, *bounds, *_PLAIN], rows)
 
 
 def _bounds(m: dict[str, Any]) -> list[float | None]:

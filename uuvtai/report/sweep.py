@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+from uuvtai.outcomes import ENDINGS
 from uuvtai.report.blocks import Block, Data, Figure, Notice, Prose, Table
 from uuvtai.report.figures import Line, heat_map, hover_text, intervals, place_of
 from uuvtai.report.heatmap import Cell, pivot, varying
 from uuvtai.report.wording import accidents, axis_name, number, rate, value_name
 
 _NUMBERS = ("success_rate", "collision_rate", "time_mean_s", "tts_s", "time_to_success_mean_s")
-_OUTCOMES = ("success", "collision", "ttc", "out_of_tank", "timeout")
 
 
 def sweep(document: dict[str, Any], command: str = "") -> list[Block]:
@@ -111,11 +111,11 @@ def cells_data(cells: list[Cell]) -> Data:
     """Every cell as numbers."""
     axes = _axes_of(cells)
     bounds = [f"{key}_ci95_{end}" for key in ("success", "collision") for end in ("low", "high")]
-    return Data(["method", *axes, "episodes", *_OUTCOMES, *bounds, *_NUMBERS], [_numbers(cell, axes) for cell in cells])
+    return Data(["method", *axes, "episodes", *ENDINGS, *bounds, *_NUMBERS], [_numbers(cell, axes) for cell in cells])
 
 
 def _numbers(cell: Cell, axes: list[str]) -> list[Any]:
     outcomes = cell.get("outcomes") or {}
     bounds = [bound for key in ("success", "collision") for bound in (cell.get(f"{key}_ci95") or (None, None))]
     head = [cell.get("method"), *(cell.get(name) for name in axes), cell["episodes"]]
-    return [*head, *(outcomes.get(name) for name in _OUTCOMES), *bounds, *(cell.get(name) for name in _NUMBERS)]
+    return [*head, *(outcomes.get(name) for name in ENDINGS), *bounds, *(cell.get(name) for name in _NUMBERS)]

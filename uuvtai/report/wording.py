@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-ACCIDENTS = ("collision", "ttc", "out_of_tank")
-"""outcomes that count as a collision"""
+from uuvtai.outcomes import COLLIDED
 
 _NAMES = {"v_m_s": "v m/s"}
 
@@ -40,7 +39,7 @@ def axis_name(key: str) -> str:
 
 def accidents(outcomes: dict[str, int]) -> int:
     """Contacts, TTC stops and episodes out of the tank."""
-    return sum(outcomes.get(name, 0) for name in ACCIDENTS)
+    return sum(outcomes.get(name, 0) for name in COLLIDED)
 
 
 def megabytes(n_bytes: int) -> str:

@@ -8,10 +8,9 @@ from typing import Any
 
 from uuvtai.measure.reproduce import paper
 from uuvtai.measure.statistics import rate, time_to_success_s, wilson_interval
+from uuvtai.outcomes import COLLIDED
 
 HOLDS, FAILS, OPEN = "holds", "does not hold", "cannot be judged"
-
-COLLIDED = ("collision", "ttc", "out_of_tank")
 
 
 @dataclass(frozen=True)

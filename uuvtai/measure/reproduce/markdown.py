@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from uuvtai.measure.reproduce import paper
-from uuvtai.measure.reproduce.claims import COLLIDED, pooled
+from uuvtai.measure.reproduce.claims import pooled
 from uuvtai.measure.statistics import mean
+from uuvtai.outcomes import COLLIDED
 
 
 def results_page(document: dict[str, Any]) -> str:
