@@ -1,4 +1,4 @@
-"""One line from a fresh checkout to a result: ``python3 bootstrap.py demo`` or ``python3 bootstrap.py test``.
+"""One line from a fresh checkout to a result: ``python3 bootstrap.py demo``; for who works on it ``test``, ``docs`` and ``setup``.
 
 Needs CPython 3.10 to 3.13 and nothing else; makes its own environment in .venv and works from any folder.
 """
@@ -25,7 +25,7 @@ DEMO = ["eval", "--world", "pool", "--record", "2", "--video"]
 def main() -> int:
     """Run the job named on the command line; its exit code."""
     os.environ.setdefault("PATH", os.defpath)  # an empty environment has none
-    jobs = {"demo": demo, "test": test, "setup": setup}
+    jobs = {"demo": demo, "test": test, "docs": docs, "setup": setup}
     name = sys.argv[1] if len(sys.argv) > 1 else ""
     if name not in jobs:
         print(f"usage: python3 bootstrap.py {' | '.join(jobs)}", file=sys.stderr)
@@ -58,6 +58,12 @@ def test(arguments: list[str]) -> int:
     if warm:  # meanwhile the other core has compiled what both test processes need
         warm.wait()
     return code or run([python, "-m", "pytest", *(arguments or IN_FULL)])
+
+
+def docs(arguments: list[str]) -> int:
+    """Build the documentation into site/; a broken link is an error."""
+    install(".[dev]")
+    return run([str(BIN / "python"), "-m", "sphinx", "-W", "--keep-going", "-q", "docs", "site", *arguments])
 
 
 def setup(_arguments: list[str]) -> int:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -55,7 +55,8 @@ class McapEpisodeLog:
             self._file = McapFile(self.path)
         with self._guarded():
             self._write_head()
-            self._channels = {topic: self._channel(topic, name, schema) for topic, (name, schema) in self._topics().items()}
+            topics = topic_schemas(header.reward_terms, self._nodes, header.tree_statuses, depth_images)
+            self._channels = {topic: self._channel(topic, schema) for topic, schema in topics.items()}
 
     def due(self, step: int, replanned: bool = False, final: bool = False) -> Due:
         """What the snapshot of this step should carry: maps at 2 Hz, on a replan and at the end; depth images at 2 Hz if they are wanted.
@@ -102,38 +103,8 @@ class McapEpisodeLog:
         scenario = json.dumps(self.header.scenario, indent=1, allow_nan=False)
         self._file.add_attachment("scenario.json", "application/json", scenario.encode())
 
-    def _topics(self) -> dict[str, tuple[str, schemas.Schema]]:
-        known = {
-            "/tf": schemas.FRAME_TRANSFORMS,
-            "/pose": schemas.POSE_IN_FRAME,
-            "/pose_estimate": schemas.POSE_IN_FRAME,
-            "/sonar/scan": schemas.LASER_SCAN,
-            "/sonar/doppler": schemas.SONAR_DOPPLER,
-            "/camera/line": schemas.DEPTH_LINE,
-            "/camera/depth": schemas.COMPRESSED_IMAGE,
-            "/map/static": schemas.GRID,
-            "/map/dynamic": schemas.GRID,
-            "/map/clearance": schemas.GRID,
-            "/map/risk": schemas.GRID,
-            "/plan": schemas.SCENE_UPDATE,
-            "/plan/info": schemas.PLAN,
-            "/plan/lookahead": schemas.POSE_IN_FRAME,
-            "/goal": schemas.SCENE_UPDATE,
-            "/obstacles": schemas.SCENE_UPDATE,
-            "/obstacles/truth": schemas.OBSTACLES,
-            "/tracks": schemas.TRACKS,
-            "/state": schemas.STATE,
-            "/action": schemas.ACTION,
-            "/policy": schemas.policy_schema(self.header.reward_terms),
-            "/safety": schemas.SAFETY,
-            "/tree": schemas.tree_schema(self._nodes, self.header.tree_statuses),
-            "/log": schemas.LOG,
-        }
-        if not self._depth_images:
-            del known["/camera/depth"]
-        return {topic: (schema["title"], schema) for topic, schema in known.items()}
-
-    def _channel(self, topic: str, name: str, schema: schemas.Schema) -> int:
+    def _channel(self, topic: str, schema: schemas.Schema) -> int:
+        name = schema["title"]
         if name not in self._schema_ids:
             self._schema_ids[name] = self._file.add_schema(name, "jsonschema", json.dumps(schema, separators=(",", ":")).encode())
         return self._file.add_channel(topic, self._schema_ids[name])
@@ -282,6 +253,41 @@ class McapEpisodeLog:
                 f"{self.path}: cannot write the log ({error.strerror or error}); nothing of it was kept. "
                 "Make room or choose a folder that can be written: --run-dir DIR"
             ) from error
+
+
+def topic_schemas(
+    reward_terms: Sequence[str], nodes: Sequence[str], statuses: Sequence[str], depth_images: bool
+) -> dict[str, schemas.Schema]:
+    """Schema of every topic; those of the policy and the tree have a field per reward term and node."""
+    known = {
+        "/tf": schemas.FRAME_TRANSFORMS,
+        "/pose": schemas.POSE_IN_FRAME,
+        "/pose_estimate": schemas.POSE_IN_FRAME,
+        "/sonar/scan": schemas.LASER_SCAN,
+        "/sonar/doppler": schemas.SONAR_DOPPLER,
+        "/camera/line": schemas.DEPTH_LINE,
+        "/camera/depth": schemas.COMPRESSED_IMAGE,
+        "/map/static": schemas.GRID,
+        "/map/dynamic": schemas.GRID,
+        "/map/clearance": schemas.GRID,
+        "/map/risk": schemas.GRID,
+        "/plan": schemas.SCENE_UPDATE,
+        "/plan/info": schemas.PLAN,
+        "/plan/lookahead": schemas.POSE_IN_FRAME,
+        "/goal": schemas.SCENE_UPDATE,
+        "/obstacles": schemas.SCENE_UPDATE,
+        "/obstacles/truth": schemas.OBSTACLES,
+        "/tracks": schemas.TRACKS,
+        "/state": schemas.STATE,
+        "/action": schemas.ACTION,
+        "/policy": schemas.policy_schema(reward_terms),
+        "/safety": schemas.SAFETY,
+        "/tree": schemas.tree_schema(nodes, statuses),
+        "/log": schemas.LOG,
+    }
+    if not depth_images:
+        del known["/camera/depth"]
+    return known
 
 
 def unique_names(names: tuple[str, ...]) -> tuple[str, ...]:

@@ -1,0 +1,25 @@
+"""Sphinx: docs/ as a site. ``python -m sphinx -W docs site``; what the code says itself is written by ``writers/`` first."""
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from docs.writers import write_reference
+from uuvtai import __version__
+
+project = "uuvtai"
+copyright = "the uuvtai authors, MIT license"
+release = __version__
+extensions = ["myst_parser"]
+myst_heading_anchors = 3
+"""links to headings are checked too"""
+exclude_patterns = ["writers"]
+html_theme = "alabaster"
+html_theme_options = {"description": "observation-only navigation for underwater vehicles", "page_width": "1100px"}
+html_copy_source = False
+
+
+def setup(app) -> None:
+    """Write the generated pages before Sphinx looks for sources."""
+    app.connect("builder-inited", lambda app: write_reference(Path(app.srcdir) / "reference"))

@@ -1,0 +1,69 @@
+"""One page per command of ``uuv``, from the Typer app itself."""
+
+from __future__ import annotations
+
+import typer
+from typer.cli import get_docs_for_click
+
+from docs.writers.markdown import contents, table
+from uuvtai import cli
+
+SEE = {
+    "eval": ("quickstart", "ceilings", "viewers", "determinism"),
+    "train": ("quickstart", "learning"),
+    "simulate": ("simulator",),
+    "sweep": ("scale",),
+    "profile": ("history",),
+    "reproduce": ("learning",),
+    "report": ("quickstart",),
+    "export": ("deployment",),
+    "presets": ("reference/configuration",),
+    "doctor": ("quickstart",),
+    "tree": ("simulator",),
+    "log": ("viewers", "reference/topics", "security"),
+}
+"""prose about a command"""
+
+EXIT_CODES = (
+    (cli.OK, "done"),
+    (cli.FAILED, "failed while running: a file that cannot be read or written, a device that is missing, a worker lost too often"),
+    (cli.USAGE, "usage or configuration: nothing was begun, nothing was written; the message says what to type instead"),
+    (cli.GATE, "finished, but a gate was not met: `uuv export` found that an exported policy disagrees"),
+    (cli.INTERRUPTED, "interrupted (Ctrl-C); what was finished is kept, and the message names the command that goes on"),
+)
+
+
+def app() -> typer.core.TyperGroup:
+    """The command line as Typer runs it."""
+    found = typer.main.get_command(cli.app)
+    assert isinstance(found, typer.core.TyperGroup)
+    return found
+
+
+def pages() -> dict[str, str]:
+    """The list of commands with the exit codes, and a page for each."""
+    commands = app().commands
+    return {"commands.md": _list(), **{f"commands/{name}.md": _page(name) for name in commands}}
+
+
+def _page(name: str) -> str:
+    root = app()
+    text = get_docs_for_click(obj=root.commands[name], ctx=typer.Context(root, info_name="uuv"), name=f"uuv {name}")
+    links = ", ".join(f"[{page.rpartition('/')[2]}](../../{page}.md)" for page in SEE[name])
+    return f"{text.rstrip()}\n\nMore: {links}. Exit codes: [commands](../commands.md#exit-codes).\n"
+
+
+def _list() -> str:
+    root = app()
+    rows = [[f"[`uuv {name}`](commands/{name}.md)", command.help or ""] for name, command in root.commands.items()]
+    codes = [[str(code), meaning] for code, meaning in EXIT_CODES]
+    return "\n\n".join(
+        [
+            "# Commands",
+            "Results go to stdout, progress and messages to stderr. `--json` prints one document and nothing else on stdout.",
+            table(["command", "does"], rows),
+            "## Exit codes",
+            table(["code", "meaning"], codes),
+            contents([f"commands/{name}" for name in root.commands]),
+        ]
+    )

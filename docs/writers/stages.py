@@ -1,0 +1,46 @@
+"""What every stage of a step does, in the words of its kernel files and in the order of the step."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import uuvtai
+
+KERNELS = Path(uuvtai.__file__).parent / "kernels"
+
+FILES = {
+    "dynamics": ("actuation", "dynamics"),
+    "world": ("world", "episode"),
+    "proprioception": ("proprioception",),
+    "sonar": ("sonar", "sonar_error", "raycast"),
+    "depth": ("depth",),
+    "tracking": ("tracking", "habits", "elevation", "look", "forecast", "spotting"),
+    "mapping": ("mapping",),
+    "clearance": ("clearance",),
+    "planning": ("triggers", "voronoi", "medial", "route"),
+    "features": ("features",),
+    "teacher": ("threats", "evasion", "teacher"),
+    "reward": ("reward",),
+}
+"""kernel files of each stage, by the names of ``uuvtai.sim.STAGES``"""
+
+
+def page() -> str:
+    """All stages."""
+    parts = [
+        "# Stages of a step",
+        "One control step runs these stages in this order; a row of `uuv profile` carries the same name. The text is that of the files in "
+        "`uuvtai/kernels/`. What they stand on, and what is assumed: [how the simulator works](../simulator.md).",
+    ]
+    for stage, files in FILES.items():
+        parts.append(f"## {stage}")
+        parts += [f"### `{name}.py`\n\n{_docstring(name)}" for name in files]
+    return "\n\n".join(parts) + "\n"
+
+
+def _docstring(name: str) -> str:
+    text = ast.get_docstring(ast.parse((KERNELS / f"{name}.py").read_text(encoding="utf-8")))
+    if not text:
+        raise ValueError(f"uuvtai/kernels/{name}.py has no docstring for the page of stages; write one")
+    return text
