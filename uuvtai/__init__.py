@@ -12,6 +12,8 @@ __version__ = "0.1.0"
 
 # Taichi prints a banner to stdout when it is imported; stdout belongs to results
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+# and it asks a server for its newest version, once a day; nothing here uses the network that was not told to
+os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
 
 
 def make(

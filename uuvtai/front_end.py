@@ -1,8 +1,9 @@
 """Taichi's front end with a memory: what it works out again for every call of a ``ti.func`` is worked out once.
 
 Taichi inlines: it transforms a func's source anew wherever it is called, thousands of times before the first step of a simulator. Each
-time it looks the source up and wraps its lines, and it words a position for error messages for every node of the syntax tree, errors or
-not. These are pure functions of the source. Texts stay the same, so Taichi finds kernels that were compiled without this in its cache.
+time it looks the source up and wraps its lines, which are pure functions of the source; and it words a position that quotes the source for
+every node of the syntax tree, errors or not: a fifth of a warm start. Here the quotation is made when there is an error. Positions are no
+part of what Taichi's cache is asked for, so it finds kernels that were compiled without this.
 """
 
 from __future__ import annotations
@@ -16,14 +17,11 @@ from typing import Any
 from taichi.lang import kernel_impl
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
-_OPENING = ("For", "While", "FunctionDef", "If")
-"""nodes whose position is that of their first line"""
-
 
 def remember_sources() -> None:
     """Give this process's Taichi the memory; once is enough. A Taichi without these names is left as it is."""
     if hasattr(ASTTransformerContext, "get_pos_info") and not hasattr(ASTTransformerContext.get_pos_info, "__wrapped__"):
-        ASTTransformerContext.get_pos_info = _remembered(ASTTransformerContext.get_pos_info)
+        ASTTransformerContext.get_pos_info = _short_unless_raised(ASTTransformerContext.get_pos_info)
     for name in ("getsourcefile", "getsourcelines"):
         if hasattr(kernel_impl, name) and not hasattr(getattr(kernel_impl, name), "__wrapped__"):
             setattr(kernel_impl, name, functools.cache(getattr(kernel_impl, name)))
@@ -41,21 +39,13 @@ def _inside_class(level_of_class_stackframe: int) -> bool:
     return "__qualname__" in sys._getframe(level_of_class_stackframe - 1).f_locals
 
 
-def _remembered(get_pos_info: Any) -> Any:
-    """``get_pos_info(context, node)`` by everything that its text depends on."""
-    known: dict[tuple, str] = {}
+def _short_unless_raised(get_pos_info: Any) -> Any:
+    """``get_pos_info(context, node)`` that quotes the source only while an exception is being handled, and else names file and line."""
 
     @functools.wraps(get_pos_info)
     def position(context: Any, node: Any) -> str:
-        kind = type(node).__name__
-        first = node.body[0].lineno if kind in _OPENING else 0
-        key = (
-            context.file, context.func.func.__name__, context.lineno_offset, context.indent, kind, first,
-            node.lineno, node.end_lineno, node.col_offset, node.end_col_offset,
-        )  # fmt: skip
-        text = known.get(key)
-        if text is None:
-            text = known[key] = get_pos_info(context, node)
-        return text
+        if sys.exc_info()[0] is not None:
+            return get_pos_info(context, node)
+        return f'File "{context.file}", line {node.lineno + context.lineno_offset}, in {context.func.func.__name__}:\n'
 
     return position
