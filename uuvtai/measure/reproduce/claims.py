@@ -59,17 +59,28 @@ def larger(a: Share, b: Share) -> str:
 
 
 def at_least(a: Share, value: float) -> str:
-    """Whether a's rate reaches a value: the measured rate does, or its interval excludes it."""
-    if a.rate >= value:
+    """Whether a's rate reaches a value: only an interval wholly on one side of it decides."""
+    if a.interval[0] >= value:
         return HOLDS
     return FAILS if a.interval[1] < value else OPEN
 
 
 def at_most(a: Share, value: float) -> str:
     """Whether a's rate stays below a value."""
-    if a.rate <= value:
+    if a.interval[1] <= value:
         return HOLDS
     return FAILS if a.interval[0] > value else OPEN
+
+
+_MARGIN = 0.1
+"""how far a rate may fall behind another one that it is said to come near"""
+
+
+def near(a: Share, b: Share) -> str:
+    """Whether a's rate comes near b's or above (non-inferiority with a margin of 10 points)."""
+    if a.interval[0] >= b.rate - _MARGIN:
+        return HOLDS
+    return FAILS if a.interval[1] < b.interval[0] else OPEN
 
 
 # -------------------------------------------------------------------------------------------------------------- Table main
@@ -117,7 +128,7 @@ def of_table_main(by_preset: dict[str, list[dict[str, Any]]]) -> list[Claim]:
             "It approaches the robustness of the behaviour tree",
             "0.87 against 0.80",
             f"{ours} against {success['bt']}",
-            _approaches(ours, success["bt"]),
+            near(ours, success["bt"]),
         ),
         *[
             Claim(text, "no table", f"{success['curriculum']} against {success[name]}", larger(success["curriculum"], success[name]))
@@ -130,11 +141,6 @@ _ABLATIONS = {
     "no_risk_scaling": "Scaling the distillation by the world model's uncertainty raises success (ablation 'LWM risk')",
     "no_world_model": "The world model's features raise success (ablation 'LWM')",
 }
-
-
-def _approaches(ours: Share, tree: Share) -> str:
-    """No worse than the tree beyond chance."""
-    return FAILS if ours.interval[1] < tree.interval[0] else HOLDS
 
 
 def _tts(entries: Sequence[dict[str, Any]]) -> float | None:
@@ -249,12 +255,11 @@ def of_timing(profile: dict[str, Any]) -> list[Claim]:
 def of_transfer(here: dict[str, Any], there: dict[str, Any]) -> list[Claim]:
     """Whether the policy, untouched, drives in the second scene as well; entries of ``uuv eval`` of the same policy."""
     a, b = pooled([here], "success"), pooled([there], "success")
-    verdict = FAILS if b.interval[1] < a.interval[0] else HOLDS
     return [
         Claim(
             "The policy transfers to another pool-style scene with other geometry and noise",
             "shown, not counted",
             f"{b} there, {a} in pool",
-            verdict,
+            near(b, a),
         )
     ]
