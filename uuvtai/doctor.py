@@ -7,9 +7,13 @@ import os
 import platform
 import sys
 import tempfile
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+_LOCKED_S = 60.0
+"""Taichi locks its cache for as long as it reads or writes files: a lock older than this has no owner."""
 
 
 def checks() -> list[dict[str, Any]]:
@@ -99,6 +103,9 @@ def _cache() -> str:
     from taichi.lang.impl import default_cfg
 
     path = Path(default_cfg().offline_cache_file_path)
+    for lock in path.rglob("*.lock"):
+        if time.time() - lock.stat().st_mtime > _LOCKED_S:
+            raise RuntimeError(f"{lock} was left by a process that was killed, so every run compiles again; delete this file")
     size = sum(f.stat().st_size for f in path.rglob("*") if f.is_file()) if path.exists() else 0
     return f"{path}, {size / 2**20:.1f} MB (empty = the next run compiles for about a minute)"
 
