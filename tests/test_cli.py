@@ -10,8 +10,10 @@ from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
+from taichi.lang.impl import default_cfg
 
 from tests.conftest import SmallSim
+from uuvtai import doctor
 from uuvtai.cli import main
 
 
@@ -132,11 +134,35 @@ def test_presets_are_listed_and_shown(capfd):
 
 def test_doctor_finds_everything(capfd, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(default_cfg(), "offline_cache_file_path", str(tmp_path))  # a killed test may have left its lock in the real one
     code, out, _ = uuv(capfd, "doctor", "--json")
     found = json.loads(out)
     assert code == 0, found
     assert found["ok"]
     assert all(check["detail"] for check in found["checks"])
+
+
+def test_doctor_finds_the_lock_of_a_killed_process(tmp_path, monkeypatch):
+    """With it Taichi neither reads nor writes its cache: each start takes a minute, and only a warning says so."""
+    monkeypatch.setattr(default_cfg(), "offline_cache_file_path", str(tmp_path))
+    lock = tmp_path / "ticache.lock"
+    lock.touch()
+    assert "0.0 MB" in doctor._cache(), "a fresh lock has an owner"
+    os.utime(lock, (time.time() - 3600,) * 2)
+    with pytest.raises(RuntimeError, match=r"ticache\.lock was left by a process that was killed.*delete this file"):
+        doctor._cache()
+
+
+def test_a_start_removes_the_lock_of_a_killed_process_and_no_other(tmp_path):
+    old, fresh = tmp_path / "ticache.lock", tmp_path / "other.lock"
+    for lock in (old, fresh):
+        lock.touch()
+    os.utime(old, (time.time() - 3600,) * 2)
+    start = "from uuvtai.runtime import start_taichi; start_taichi('cpu')"
+    environment = os.environ | {"TI_OFFLINE_CACHE_FILE_PATH": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", start], env=environment, capture_output=True, text=True, check=True)
+    assert "Lock" not in done.stdout + done.stderr
+    assert not old.exists() and fresh.exists()
 
 
 def test_tree_is_printed_and_drawn(capfd):

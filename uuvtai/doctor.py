@@ -98,7 +98,11 @@ def _cuda() -> str:
 def _cache() -> str:
     from taichi.lang.impl import default_cfg
 
+    from uuvtai.runtime import stale_locks
+
     path = Path(default_cfg().offline_cache_file_path)
+    for lock in stale_locks():
+        raise RuntimeError(f"{lock} was left by a process that was killed, so every run compiles again; delete this file")
     size = sum(f.stat().st_size for f in path.rglob("*") if f.is_file()) if path.exists() else 0
     return f"{path}, {size / 2**20:.1f} MB (empty = the next run compiles for about a minute)"
 

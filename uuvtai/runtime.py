@@ -5,9 +5,12 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import taichi as ti
+from taichi.lang.impl import default_cfg
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,15 @@ class Runtime:
 
 _started: list[Runtime] = []
 
+_LOCKED_S = 60.0
+"""Taichi locks its cache by a file, for as long as it reads or writes there: one older than this belongs to a process that was killed"""
+
+
+def stale_locks() -> list[Path]:
+    """Locks of the kernel cache that nobody holds any more: with one of them every process compiles everything again."""
+    cache = Path(os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or default_cfg().offline_cache_file_path)
+    return [lock for lock in cache.rglob("*.lock") if time.time() - lock.stat().st_mtime > _LOCKED_S]
+
 
 def start_taichi(device: str = "cpu", precision: str = "f32", fast_math: bool = False) -> Runtime:
     """Start Taichi on ``device`` ('auto', 'cpu' or 'cuda'), or return the runtime that is already up.
@@ -39,6 +51,9 @@ def start_taichi(device: str = "cpu", precision: str = "f32", fast_math: bool = 
         if _started[0] != wanted:
             raise RuntimeError(f"Taichi already runs as {_started[0]}; start a new process for {wanted}")
         return wanted
+    with contextlib.suppress(OSError):  # another process was faster, or may do so in our place: ``uuv doctor`` tells
+        for lock in stale_locks():
+            lock.unlink()
     options = {}
     if threads := os.environ.get("UUV_NUM_THREADS"):
         options["cpu_max_num_threads"] = int(threads)
