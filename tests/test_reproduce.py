@@ -152,12 +152,13 @@ class Uuv:
 
 
 def printed(arguments):
+    options = next((i for i, part in enumerate(arguments) if part.startswith("--")), len(arguments))
+    policies = [part.rpartition("/")[2] for part in arguments[1:options]]
     if arguments[0] == "eval":
-        names = [part.rpartition("/")[2] for part in arguments[1:] if "/train/" in part]
-        names += [arguments[i + 1] for i, part in enumerate(arguments) if part == "--controller"]
+        names = policies + [arguments[i + 1] for i, part in enumerate(arguments) if part == "--controller"]
         return {"methods": [entry(50) | {"name": name, "episodes_detail": []} for name in names]}
-    if arguments[0] == "sweep" or "sweep/" in arguments[-2]:
-        cells = [cell(8, 6, 0.6, method=name, success=90) for name in ("curriculum-0", "bt")]
+    if arguments[0] == "sweep":
+        cells = [cell(8, 6, 0.6, method=name, success=90) for name in (*policies, "bt")]
         return {"axes": {"S": [8], "D": [6], "v": [0.6]}, "cells": cells}
     if arguments[0] == "profile":
         row = {"num_envs": 1, "env_steps_per_s": {"step": 1.0, "step_inference": 1.0, "train": 1.0}}
