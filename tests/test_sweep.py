@@ -202,6 +202,16 @@ def test_a_line_cut_off_by_a_kill_is_played_again(tmp_path, cut):
     assert len(read_rows(file)) == 9
 
 
+def test_a_policy_that_was_trained_on_is_refused(tmp_path):
+    place = tmp_path / "run"
+    sweep(asked(GRID), Canned(), place, Quiet())
+    file = place / "sweep_request.json"
+    document = json.loads(file.read_text())
+    file.write_text(json.dumps(document | {"checkpoints": {"mine": "0" * 64}}))
+    with pytest.raises(RunFolderError, match="mine has changed since this sweep began"):
+        resume(place, Canned(), Quiet())
+
+
 def test_only_a_sweeps_folder_is_resumed(tmp_path):
     with pytest.raises(RunFolderError, match="give the folder that 'uuv sweep' printed"):
         resume(tmp_path, Canned(), Quiet())
@@ -229,6 +239,12 @@ def test_local_workers_give_every_result_once():
 
 def test_a_lost_worker_costs_its_task_once_more(tmp_path):
     assert list(LocalEngine(1).run(sweep_work.fall_once, [str(tmp_path / "a"), str(tmp_path / "b")])) == [(0, "a"), (1, "b")]
+
+
+def test_what_only_waited_is_not_counted_as_lost(tmp_path):
+    """Each of the first tasks kills its worker once; the last one, which waits meanwhile, must not use up its attempts."""
+    places = [str(tmp_path / name) for name in "abcde"]
+    assert sorted(LocalEngine(1).run(sweep_work.fall_once, places)) == list(enumerate("abcde"))
 
 
 def test_workers_that_keep_dying_end_the_sweep_with_a_reason():

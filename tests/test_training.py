@@ -207,7 +207,7 @@ def test_two_processes_do_not_train_in_one_folder(points, tmp_path):
         [sys.executable, "-c", script, str(tmp_path / "run")], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
     assert holder.stdout.readline() == "held\n"
-    with pytest.raises(RunFolderError, match="another process is training in this folder"):
+    with pytest.raises(RunFolderError, match="another process is working in this folder"):
         train(TrainRequest(resume=tmp_path / "run"), Quiet())
     holder.communicate()
     train(TrainRequest(resume=tmp_path / "run"), Quiet())

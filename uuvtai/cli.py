@@ -528,7 +528,9 @@ def sweep(
     _at_least("--episodes", episodes, 1)
     _at_least("--workers", workers, 1)
     if resume is not None:
-        _refuse_beside_resume({"RUN": runs, "--controller": controller, "--grid": grid, "--set": overrides, "--run-dir": run_dir})
+        given = {"RUN": runs, "--controller": controller, "--grid": grid, "--set": overrides, "--run-dir": run_dir, "--num-envs": num_envs}
+        given |= {"--sensors": sensors, "--vehicle": vehicle, "-S": n_static, "-D": n_dynamic, "-v": speed}
+        _refuse_beside_resume(given)
         result, folder = go_on(resume, _engine(engine, workers, address), _Progress("cells"))
     else:
         policies = runs or []

@@ -8,6 +8,8 @@ import platform
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -94,7 +96,7 @@ class RunFolder:
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise RunFolderError(f"{self.path}: another process is training in this folder; wait for it, or stop it") from None
+            raise RunFolderError(f"{self.path}: another process is working in this folder; wait for it, or stop it") from None
 
     def _open_lock(self) -> None:
         self._lock = (self.path / ".lock").open("w")
@@ -114,6 +116,19 @@ class RunFolder:
         wall_s = self._record.get("wall_s", 0.0) + time.time() - self._started
         self._record |= {"status": status, "exit": exit_code, "wall_s": round(wall_s, 3)}
         self.write_json("run.json", self._record)
+
+    @contextmanager
+    def recorded(self) -> Iterator[None]:
+        """Record how the work inside ends: finished, interrupted by Ctrl-C, or failed."""
+        status, code = "failed", 1
+        try:
+            yield
+            status, code = "finished", 0
+        except KeyboardInterrupt:
+            status, code = "interrupted", 130
+            raise
+        finally:
+            self.finish(status, code)
 
     def _guarded(self, what: str, work) -> None:
         try:

@@ -91,28 +91,23 @@ def compare(request: Request, watch: Watch) -> tuple[dict[str, Any], Path]:
     sim = Sim(request.config, num_envs, methods[0].tree if methods else _any_tree(), request.device)
     policies = {method.name: method.driver_for(sim) for method in methods}
     folder = RunFolder(run_dir, request.config, request.seeds)
-    status, code = "failed", 1
     played: list[_Played] = []
     entries: list[dict[str, Any]] = []
     try:
-        scenarios = scenarios_of(sim, jobs)
-        for method in methods:
-            _play(request, sim, method, policies[method.name], jobs, folder, watch, played, entries)
-        if ORACLE in request.controllers:
-            entries.append(_ask_oracle(request, jobs, scenarios, watch))
-        result = document(request.config, request.world, request.sensors, request.seeds, request.episodes, entries)
-        result |= {"condition": condition_of(request.config, scenarios), "remainder": remainder_of(entries)}
-        _write_results(folder, result, played)
-        if request.explain:
-            _explain(request, sim, played, result, folder, watch)
-        _draw(request, folder.path, [p.logs for p in played if p.logs], watch)
-        status, code = "finished", 0
-    except KeyboardInterrupt:
-        status, code = "interrupted", 130
-        raise
+        with folder.recorded():
+            scenarios = scenarios_of(sim, jobs)
+            for method in methods:
+                _play(request, sim, method, policies[method.name], jobs, folder, watch, played, entries)
+            if ORACLE in request.controllers:
+                entries.append(_ask_oracle(request, jobs, scenarios, watch))
+            result = document(request.config, request.world, request.sensors, request.seeds, request.episodes, entries)
+            result |= {"condition": condition_of(request.config, scenarios), "remainder": remainder_of(entries)}
+            _write_results(folder, result, played)
+            if request.explain:
+                _explain(request, sim, played, result, folder, watch)
+            _draw(request, folder.path, [p.logs for p in played if p.logs], watch)
     finally:
         watch.stop()
-        folder.finish(status, code)
     return result, folder.path
 
 

@@ -53,22 +53,18 @@ def resume(place: Path, watch: Watch) -> tuple[dict[str, Any], Path]:
 def _run(folder: RunFolder, watch: Watch) -> dict[str, Any]:
     request = json.loads((folder.path / REQUEST).read_text(encoding="utf-8"))
     steps = steps_of(BUDGETS[request["budget"]], request["policy"], folder.path)
-    status, code = "failed", 1
     try:
-        for number, step in enumerate(steps, start=1):
-            _step(step, f"{number}/{len(steps)} {step.name}", folder, watch)
-        document = document_of(folder.path, request, steps)
-        folder.write_json(RESULT, document)
-        folder.write(PAGE, results_page(document))
-        watch.note(f"report: {report([folder.path]).page}")
-        status, code = "finished", 0
-        return document
+        with folder.recorded():
+            for number, step in enumerate(steps, start=1):
+                _step(step, f"{number}/{len(steps)} {step.name}", folder, watch)
+            document = document_of(folder.path, request, steps)
+            folder.write_json(RESULT, document)
+            folder.write(PAGE, results_page(document))
+            watch.note(f"report: {report([folder.path]).page}")
+            return document
     except KeyboardInterrupt:
-        status, code = "interrupted", 130
         watch.note(f"what is finished is kept; go on with: uuv reproduce --resume {folder.path}")
         raise
-    finally:
-        folder.finish(status, code)
 
 
 def _step(step: Step, name: str, folder: RunFolder, watch: Watch) -> None:

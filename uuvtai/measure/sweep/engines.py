@@ -7,7 +7,7 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import connection
@@ -47,6 +47,7 @@ class LocalEngine:
         waiting, tries = list(range(len(items))), [0] * len(items)
         while waiting:
             lost = yield from self._round(work, items, waiting)
+            waiting = [*lost, *waiting]
             for number in lost:
                 tries[number] += 1
                 if tries[number] >= ATTEMPTS:
@@ -54,15 +55,14 @@ class LocalEngine:
                         f"task {number + 1} of {len(items)} lost its worker {ATTEMPTS} times (killed, or out of memory): "
                         "try fewer --workers or a smaller --num-envs; what is finished is kept, go on with --resume"
                     )
-            waiting = lost
 
-    def _round(self, work: Work, items: Sequence[Item], numbers: list[int]) -> Iterator[tuple[int, Any]]:
-        """Run until all are done or a worker dies; returns the numbers that were lost."""
+    def _round(self, work: Work, items: Sequence[Item], todo: list[int]) -> Generator[tuple[int, Any], None, list[int]]:
+        """Run what is ``todo``, taken from its front, until all is done or a worker dies; returns the numbers that ran then."""
         threads = max(1, (os.cpu_count() or 1) // self._workers)
         context = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(min(self._workers, len(numbers)), context, _begin_worker, (threads,))
+        pool = ProcessPoolExecutor(min(self._workers, len(todo)), context, _begin_worker, (threads,))
         running: dict[Future, int] = {}
-        todo, lost = list(numbers), []
+        lost: list[int] = []
         try:
             while todo or running:
                 try:
@@ -70,7 +70,7 @@ class LocalEngine:
                         future = pool.submit(work, items[todo[0]])
                         running[future] = todo.pop(0)
                 except BrokenProcessPool:
-                    return [*running.values(), *lost, *todo]
+                    return list(running.values())
                 done, _rest = wait(running, return_when=FIRST_COMPLETED)
                 for future in done:
                     number = running.pop(future)
@@ -81,7 +81,7 @@ class LocalEngine:
                         continue
                     yield number, result
                 if lost:
-                    return [*lost, *running.values(), *todo]
+                    return [*lost, *running.values()]
             return []
         finally:
             for process in list((pool._processes or {}).values()):

@@ -37,11 +37,11 @@ def sweep(request: SweepRequest, engine: Engine, run_dir: Path | None, watch: Wa
     """
     place = run_dir or default_run_dir(f"sweep-{Path(request.world).stem}")
     refuse_place(place)
-    request, methods = resolved(request, watch)
+    request, methods, checkpoints = resolved(request, watch)
     keys = check_rows(request, [name for name, _controller, _policy in methods])
     folder = RunFolder(place, base_config(request), list(request.seeds))
     folder.hold()
-    folder.write_json(REQUEST, {"schema": 1, **request.document(), "methods": methods})
+    folder.write_json(REQUEST, {"schema": 1, **request.document(), "methods": methods, "checkpoints": checkpoints})
     return _play(request, methods, keys, engine, folder, watch), folder.path
 
 
@@ -50,17 +50,30 @@ def resume(place: Path, engine: Engine, watch: Watch) -> tuple[dict[str, Any], P
     try:
         document = json.loads((place / REQUEST).read_text(encoding="utf-8"))
         request, methods = request_of(document), [tuple(method) for method in document["methods"]]
+        checkpoints = dict(document["checkpoints"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise RunFolderError(f"{place / REQUEST}: cannot be read ({error}); give the folder that 'uuv sweep' printed") from None
+    _refuse_other_policies(place, request, checkpoints, watch)
     folder = RunFolder.reopen(place, {"rows": len(read_rows(place / ROWS))})
     keys = check_rows(request, [name for name, _controller, _policy in methods])
     return _play(request, methods, keys, engine, folder, watch), place
 
 
-def resolved(request: SweepRequest, watch: Watch) -> tuple[SweepRequest, list[MethodKey]]:
-    """The request with the columns that its policies see, and its methods by their names in the table; paths made absolute.
+def _refuse_other_policies(place: Path, request: SweepRequest, checkpoints: dict[str, str], watch: Watch) -> None:
+    """RunFolderError where a policy is another one by now: cells of two policies under one name would prove nothing."""
+    from uuvtai.measure.methods import policies_of
 
-    Raises ConfigError, CheckpointError.
+    trained = policies_of(list(request.policies), base_config(request).teacher.max_node, watch.note)
+    now = {method.name: method.checkpoint.sha256 for method in trained if method.checkpoint}
+    changed = [name for name, sha256 in checkpoints.items() if now.get(name) != sha256]
+    if changed:
+        raise RunFolderError(f"{place}: {', '.join(changed)} has changed since this sweep began; begin a new sweep with another --run-dir")
+
+
+def resolved(request: SweepRequest, watch: Watch) -> tuple[SweepRequest, list[MethodKey], dict[str, str]]:
+    """The request with the columns that its policies see, its methods by their names in the table, and the sha256 of every policy.
+
+    Paths are made absolute. Raises ConfigError, CheckpointError.
     """
     from uuvtai.measure.methods import features_of, policies_of, trees_of
 
@@ -72,7 +85,8 @@ def resolved(request: SweepRequest, watch: Watch) -> tuple[SweepRequest, list[Me
     methods: list[MethodKey] = [(tree.name, name, None) for tree, name in zip(trees, controllers, strict=True)]
     methods += [(method.name, None, name) for method, name in zip(trained, policies, strict=True)]
     features = features_of(list(policies)) if policies else []
-    return replace(request, overrides=(*features, *request.overrides), policies=policies), methods
+    checkpoints = {method.name: method.checkpoint.sha256 for method in trained if method.checkpoint}
+    return replace(request, overrides=(*features, *request.overrides), policies=policies), methods, checkpoints
 
 
 def _play(
@@ -80,26 +94,23 @@ def _play(
 ) -> dict[str, Any]:
     rows = {row_key(_label(row, request.grid), row["method"]): row for row in read_rows(folder.path / ROWS)}
     tasks = tasks_of(request, methods, set(rows))
-    status, code = "failed", 1
     watch.start(f"{len(keys)} cells", len(keys))
     try:
-        for number, played in engine.run(play, tasks):
-            for row in played:
-                append_row(folder.path / ROWS, row)
-                rows[row_key(_label(row, request.grid), row["method"])] = row
-            watch.note(f"{_told(tasks[number].labels[0])} .. {_told(tasks[number].labels[-1])}: done")
-            watch.update(len(rows), len(keys), 0)
-        document = _document(request, ordered(rows, keys))
-        folder.write_json(RESULT, document)
-        status, code = "finished", 0
-        return document
+        with folder.recorded():
+            for number, played in engine.run(play, tasks):
+                for row in played:
+                    append_row(folder.path / ROWS, row)
+                    rows[row_key(_label(row, request.grid), row["method"])] = row
+                watch.note(f"{_told(tasks[number].labels[0])} .. {_told(tasks[number].labels[-1])}: done")
+                watch.update(len(rows), len(keys), 0)
+            document = _document(request, ordered(rows, keys))
+            folder.write_json(RESULT, document)
+            return document
     except KeyboardInterrupt:
-        status, code = "interrupted", 130
         watch.note(f"finished rows are kept; go on with: uuv sweep --resume {folder.path}")
         raise
     finally:
         watch.stop()
-        folder.finish(status, code)
 
 
 def _label(row: Row, grid: Grid) -> dict[str, Any]:
