@@ -60,6 +60,14 @@ def test_claims_of_table_main_by_hand():
     assert [claim.verdict for claim in swapped[:6]] == [FAILS] * 6
 
 
+def test_who_never_arrives_takes_for_ever():
+    arriving, never = [entry(87, time_s=11.0)], [entry(0, collision=100, time_s=5.0)]
+    table_main = dict.fromkeys(("distill_20", "bt", "no_risk_scaling", "no_world_model"), arriving)
+    assert claims.of_table_main(table_main | {"curriculum": arriving, "ppo": never})[4].verdict == HOLDS
+    assert claims.of_table_main(table_main | {"curriculum": never, "ppo": arriving})[4].verdict == FAILS
+    assert claims.of_table_main(table_main | {"curriculum": never, "ppo": never})[4].verdict == FAILS
+
+
 def test_training_seeds_are_pooled():
     assert claims.pooled([entry(50), entry(70, n=200)], "success") == Share(120, 300)
 

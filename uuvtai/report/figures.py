@@ -77,7 +77,8 @@ def _draw_cell(axes: Axes, place: Place, key: str, identity: str) -> tuple[str, 
     ink = INK if value is None else ink_on(ground)
     middle = place.first + place.n_columns / 2
     axes.text(middle, place.row + 0.34, percent(value, 0), color=ink, ha="center", va="center", fontsize=8.5, fontweight="bold")
-    below = number(place.cell.get("time_to_success_mean_s")) + " s"
+    mean_s = place.cell.get("time_to_success_mean_s")
+    below = "" if mean_s is None else f"{number(mean_s)} s"
     axes.text(middle, place.row + 0.73, below, color=ink, ha="center", va="center", fontsize=7)
     return identity, hover_text(place.cell)
 

@@ -101,7 +101,7 @@ def of_table_main(by_preset: dict[str, list[dict[str, Any]]]) -> list[Claim]:
             larger(ours, plain),
         ),
         Claim(
-            "by nearly a factor of four",
+            "Success rises by nearly a factor of four over PPO without distillation",
             f"{0.87 / 0.20:.2f}",
             "-" if ratio is None else f"{ratio:.2f}",
             OPEN if ratio is None else HOLDS if ratio >= 3.5 else FAILS,
@@ -113,19 +113,19 @@ def of_table_main(by_preset: dict[str, list[dict[str, Any]]]) -> list[Claim]:
             larger(ours, success["distill_20"]),
         ),
         Claim(
-            "It collides less than PPO without distillation",
+            "Curriculum distillation collides less than PPO without distillation",
             "0.15 against 0.40",
             f"{collision['curriculum']} against {collision['ppo']}",
             larger(collision["ppo"], collision["curriculum"]),
         ),
         Claim(
-            "Its time to success (mean time / success rate) is far lower",
+            "Time to success (mean time / success rate) falls far below that of PPO without distillation",
             "15.8 s against 114.2 s",
             f"{_seconds(tts['curriculum'])} against {_seconds(tts['ppo'])}",
-            larger(ours, plain) if tts["curriculum"] and tts["ppo"] and tts["curriculum"] < tts["ppo"] / 2 else FAILS,
+            _far_below(tts["curriculum"], tts["ppo"], larger(ours, plain)),
         ),
         Claim(
-            "It approaches the robustness of the behaviour tree",
+            "Curriculum distillation approaches the robustness of the behaviour tree",
             "0.87 against 0.80",
             f"{ours} against {success['bt']}",
             near(ours, success["bt"]),
@@ -141,6 +141,12 @@ _ABLATIONS = {
     "no_risk_scaling": "Scaling the distillation by the world model's uncertainty raises success (ablation 'LWM risk')",
     "no_world_model": "The world model's features raise success (ablation 'LWM')",
 }
+
+
+def _far_below(ours_s: float | None, theirs_s: float | None, by_success: str) -> str:
+    """Less than half; None = nobody ever arrived, as slow as can be. How sure that is follows from the rates of success."""
+    slower = ours_s is None or (theirs_s is not None and ours_s >= theirs_s / 2)
+    return FAILS if slower else by_success
 
 
 def _tts(entries: Sequence[dict[str, Any]]) -> float | None:

@@ -18,7 +18,7 @@ def sections_of(document: dict[str, Any], budget: Budget) -> list[Described]:
     curves = [f"train/{preset}-{seed}" for preset in TRAINED for seed in range(budget.training_seeds)]
     return [
         _section("The paper's claims", {"kind": "verdicts", "items": [_item(claim) for claim in document["claims"]]}),
-        _section("Table main and ablations", _main_table(document), _notes()),
+        _section("Table main and ablations", _main_table(document), *_notes()),
         _section("Training", {"kind": "curves", "paths": curves}),
         _section("Robustness over conditions", *_trade_off(document), {"kind": "run", "path": "sweep/pool"}),
         *[_section(f"Sweep: {name}", {"kind": "run", "path": f"sweep/{name}"}) for name in document["sweeps"] if name != "pool"],
@@ -53,8 +53,9 @@ def _main_table(document: dict[str, Any]) -> Described:
     return {"kind": "table", "columns": columns, "rows": rows, "caption": caption, "n_left": 1}
 
 
-def _notes() -> Described:
-    return {"kind": "prose", "text": "Where the paper's figures do not add up: " + " ".join(paper.INCONSISTENCIES)}
+def _notes() -> list[Described]:
+    heading = {"kind": "heading", "text": "Where the paper's figures do not add up"}
+    return [heading, *({"kind": "prose", "text": text} for text in paper.INCONSISTENCIES)]
 
 
 def _trade_off(document: dict[str, Any]) -> list[Described]:
