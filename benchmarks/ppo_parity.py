@@ -11,7 +11,7 @@ import torch
 from benchmarks.common import Job, Row
 
 THREADS = 1
-_SEEDS, _ENVS, _STEPS, _ROLLOUTS, _EPISODES_PER_ENV = 3, 8, 128, 80, 5
+_SEEDS, _ENVS, _STEPS, _ROLLOUTS, _EPISODES_PER_ENV = 6, 8, 128, 80, 5
 _MINIBATCHES, _EPOCHS, _RATE, _GAMMA, _LAMBDA, _CLIP, _VALUE, _NORM = 8, 10, 1e-3, 0.9, 0.95, 0.2, 0.5, 0.5
 _HIDDEN = (64, 64)
 _UNSEEN = 1000

@@ -6,6 +6,7 @@ Results go to stdout, progress and messages to stderr. Exit codes: 0 ok, 1 runti
 
 from __future__ import annotations
 
+import gc
 import json
 import math
 import os
@@ -1115,6 +1116,7 @@ def _root(version: Annotated[bool, typer.Option("--version", help="Print the ver
     if version:
         typer.echo(__version__)
         raise typer.Exit
+    gc.set_threshold(50_000, 50, 1000)  # building kernels makes millions of objects, few of them garbage: half a second of a start
 
 
 def main(arguments: list[str] | None = None) -> None:

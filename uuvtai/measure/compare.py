@@ -95,9 +95,9 @@ def compare(request: Request, watch: Watch) -> tuple[dict[str, Any], Path]:
     entries: list[dict[str, Any]] = []
     try:
         with folder.recorded():
-            scenarios = scenarios_of(sim, jobs)
             for method in methods:
                 _play(request, sim, method, policies[method.name], jobs, folder, watch, played, entries)
+            scenarios = scenarios_of(sim, jobs)
             if ORACLE in request.controllers:
                 entries.append(_ask_oracle(request, jobs, scenarios, watch))
             result = document(request.config, request.world, request.sensors, request.seeds, request.episodes, entries)
