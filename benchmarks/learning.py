@@ -14,30 +14,41 @@ from uuvtai.tree import read_tree
 
 FLOORS = {"paper": 6_000.0, "nominal": 12_000.0}
 """[env-steps/s] at 1,024 envs on two CPU cores"""
+BFLOAT16 = (False, True)
+"""``ppo.bfloat16``: the hidden layers' products in half of the width, where the CPU can do so"""
 _PARTS = {"simulate": "time/simulate_s", "infer": "time/infer_s", "learn": "time/learn_s"}
 
 
 def measure(job: Job) -> list[Row]:
-    """One row per sensing preset. Ours has teacher, distillation, world model and its features on; the peer is plain PPO."""
+    """A row for either width of the products under each sensing preset.
+
+    Ours has teacher, distillation, world model and its features on; the peer is plain PPO.
+    """
     num_envs, iterations = (8, 1) if job.quick else (1024, 4)
-    return [_row(job, sensors, num_envs, iterations) for sensors in FLOORS]
+    rows = []
+    for sensors in FLOORS:
+        config = load_training("curriculum", {"train.num_envs": num_envs}, sensors=sensors)
+        sim = Sim(config, num_envs, read_tree("bt", config.teacher.max_node))
+        job.say(f"{sensors} sensing: Stable-Baselines3")
+        theirs = _theirs(sim, config, iterations)
+        for bfloat16 in BFLOAT16:
+            job.say(f"{sensors} sensing: ours{', bfloat16' if bfloat16 else ''}")
+            ppo = config.ppo.model_copy(update={"bfloat16": bfloat16})
+            rows.append(_row(job, sensors, sim, config.model_copy(update={"ppo": ppo}), theirs, iterations))
+    return rows
 
 
-def _row(job: Job, sensors: str, num_envs: int, iterations: int) -> Row:
-    config = load_training("curriculum", {"train.num_envs": num_envs}, sensors=sensors)
-    sim = Sim(config, num_envs, read_tree("bt", config.teacher.max_node))
-    job.say(f"{sensors} sensing: ours")
+def _row(job: Job, sensors: str, sim: Sim, config: LearningConfig, theirs: float, iterations: int) -> Row:
+    num_envs = sim.num_envs
     trainer = Trainer(VectorEnv(sim), config)
     trainer.iterate()  # allocates
     begun, told = time.perf_counter(), [trainer.iterate() for _ in range(iterations)]
     samples = iterations * config.ppo.rollout_steps * num_envs
     ours = samples / (time.perf_counter() - begun)
     parts = {name: 1e6 * sum(metrics[key] for metrics in told) / samples for name, key in _PARTS.items()}
-    trainer.env.close()
-    job.say(f"{sensors} sensing: Stable-Baselines3")
-    theirs = _theirs(sim, config, iterations)
+    products = " with ppo.bfloat16=true" if config.ppo.bfloat16 else ""
     return Row(
-        what=f"{sensors} sensing, all of `uuv train curriculum`, {num_envs:,} envs",
+        what=f"{sensors} sensing, all of `uuv train curriculum`{products}, {num_envs:,} envs",
         ours=ours,
         unit="env-steps/s",
         peer=theirs,

@@ -1,10 +1,18 @@
-"""What the training examples share: the same episodes before and after training, and a table of what came out."""
+"""What the training examples share: the same episodes before and after training, a table of what came out, and the learning curve.
+
+``python examples/train_sb3.py --curve sb3.csv`` keeps the return of every training episode;
+``python examples/judge.py sb3.csv skrl.csv curves.png`` draws such files.
+"""
 
 from __future__ import annotations
 
 import argparse
+import csv
+import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +26,31 @@ HOLD_STEPS = 10
 
 Act = Callable[[np.ndarray], np.ndarray]
 """observations (n, n_obs) -> actions (n, 4), without exploration"""
+
+
+class Watched(UuvVectorEnv):
+    """The batch as it is, which also keeps the return of every episode that ends in it."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._decisions, self._return = 0, np.zeros(self.num_envs)
+        self.curve: list[tuple[int, float]] = []
+        """(decisions of all envs so far, return)"""
+        watched.append(self)
+
+    def step(self, actions: Any) -> Any:
+        """``UuvVectorEnv.step``."""
+        told = super().step(actions)
+        self._decisions += self.num_envs
+        self._return += np.asarray(told[1])
+        for env in np.flatnonzero(np.asarray(told[2]) | np.asarray(told[3])):
+            self.curve.append((self._decisions, float(self._return[env])))
+            self._return[env] = 0.0
+        return told
+
+
+watched: list[Watched] = []
+"""the newest one is the one that training used"""
 
 
 def judge(sim: Sim, act: Act, seed: int = 1000) -> tuple[np.ndarray, int]:
@@ -40,6 +73,7 @@ def main(train: Callable[[Sim, int], Act], iterations: int) -> None:
     parser.add_argument("--world", default="pool")
     parser.add_argument("--num-envs", type=int, default=64)
     parser.add_argument("--iterations", type=int, default=iterations)
+    parser.add_argument("--curve", type=Path, help="CSV file for the return of every training episode")
     given = parser.parse_args()
     sim = uuvtai.make(given.world, num_envs=given.num_envs).sim
     for name, count in (("before", 0), ("after", given.iterations)):
@@ -54,3 +88,30 @@ def main(train: Callable[[Sim, int], Act], iterations: int) -> None:
             f"success {won}/{len(returns)} ({100 * low:.0f} .. {100 * high:.0f} %)",
             flush=True,
         )
+    if given.curve:
+        with given.curve.open("w", newline="") as file:
+            csv.writer(file).writerows([("decisions", "return"), *watched[-1].curve])
+
+
+def draw(files: list[Path], target: Path) -> None:
+    """Mean return of the episodes that end within the same 4096 decisions, with its standard error, one line a file."""
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
+    for path in files:
+        decisions, returns = np.loadtxt(path, delimiter=",", skiprows=1, unpack=True)
+        bins = ((decisions - 1) // 4096).astype(int)
+        groups = [returns[bins == i] for i in range(bins.max() + 1)]
+        at = np.array([4096 * (i + 1) for i, group in enumerate(groups) if len(group) > 1])
+        mean = np.array([group.mean() for group in groups if len(group) > 1])
+        error = np.array([group.std(ddof=1) / np.sqrt(len(group)) for group in groups if len(group) > 1])
+        axes.plot(at, mean, label=path.stem)
+        axes.fill_between(at, mean - error, mean + error, alpha=0.25)
+    axes.set(xlabel="decisions (0.2 s each, all envs)", ylabel="return of a training episode")
+    axes.legend()
+    figure.savefig(target, dpi=110)
+
+
+if __name__ == "__main__":
+    *sources, picture = map(Path, sys.argv[1:])
+    draw(sources, picture)

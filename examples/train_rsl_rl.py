@@ -8,11 +8,10 @@ from copy import deepcopy
 
 import numpy as np
 import torch
-from judge import HOLD_STEPS, Act, main
+from judge import HOLD_STEPS, Act, Watched, main
 from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
 
-from uuvtai.gym import UuvVectorEnv
 from uuvtai.gym.rsl_rl import RslRlVecEnv
 from uuvtai.sim import Sim
 
@@ -37,7 +36,7 @@ CONFIG = {
 def train(sim: Sim, iterations: int) -> Act:
     """The policy after so many rollouts and updates; observations are scaled inside the network."""
     torch.manual_seed(0)
-    envs = RslRlVecEnv(UuvVectorEnv(sim=sim, hold_steps=HOLD_STEPS, backend="torch"), seed=0)
+    envs = RslRlVecEnv(Watched(sim=sim, hold_steps=HOLD_STEPS, backend="torch"), seed=0)
     with open(os.devnull, "w") as nothing, contextlib.redirect_stdout(nothing):  # it prints every layer and iteration
         runner = OnPolicyRunner(envs, deepcopy(CONFIG), device=str(envs.device))
         runner.learn(iterations)

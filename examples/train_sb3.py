@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from judge import HOLD_STEPS, Act, main
+from judge import HOLD_STEPS, Act, Watched, main
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
-from uuvtai.gym import UuvVectorEnv
 from uuvtai.gym.sb3 import Sb3VecEnv
 from uuvtai.sim import Sim
 
@@ -16,7 +15,7 @@ ROLLOUT_STEPS = 64
 
 def train(sim: Sim, iterations: int) -> Act:
     """The policy after so many rollouts and updates; observations and rewards are scaled by SB3's own wrapper."""
-    envs = VecNormalize(Sb3VecEnv(UuvVectorEnv(sim=sim, hold_steps=HOLD_STEPS)), gamma=0.99)
+    envs = VecNormalize(Sb3VecEnv(Watched(sim=sim, hold_steps=HOLD_STEPS)), gamma=0.99)
     model = PPO(
         "MlpPolicy",
         envs,

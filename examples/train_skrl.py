@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from judge import HOLD_STEPS, Act, main
+from judge import HOLD_STEPS, Act, Watched, main
 from skrl.agents.torch.ppo import PPO, PPO_CFG
 from skrl.envs.wrappers.torch import wrap_env
 from skrl.memories.torch import RandomMemory
@@ -14,7 +14,6 @@ from skrl.trainers.torch import SequentialTrainer
 from skrl.utils import set_seed
 from torch import nn
 
-from uuvtai.gym import UuvVectorEnv
 from uuvtai.sim import Sim
 
 ROLLOUT_STEPS = 64
@@ -56,7 +55,7 @@ class Value(DeterministicMixin, Model):
 def train(sim: Sim, iterations: int) -> Act:
     """The policy after so many rollouts and updates; observations and values are scaled by skrl's own preprocessors."""
     set_seed(0)
-    envs = wrap_env(UuvVectorEnv(sim=sim, hold_steps=HOLD_STEPS), verbose=False)
+    envs = wrap_env(Watched(sim=sim, hold_steps=HOLD_STEPS), wrapper="gymnasium", verbose=False)
     spaces = {"observation_space": envs.observation_space, "action_space": envs.action_space, "device": envs.device}
     config = PPO_CFG(
         rollouts=ROLLOUT_STEPS, learning_epochs=5, mini_batches=4, learning_rate=1e-3, time_limit_bootstrap=True,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from judge import HOLD_STEPS, Act, main
+from judge import HOLD_STEPS, Act, Watched, main
 from tensordict.nn import TensorDictModule
 from tensordict.nn.distributions import NormalParamExtractor
 from torch import nn
@@ -14,7 +14,6 @@ from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from uuvtai.gym import UuvVectorEnv
 from uuvtai.sim import Sim
 
 ROLLOUT_STEPS, EPOCHS, MINIBATCHES = 64, 5, 4
@@ -29,7 +28,7 @@ def train(sim: Sim, iterations: int) -> Act:
     """The policy after so many rollouts and updates; observations are scaled by TorchRL's own transform."""
     torch.manual_seed(0)
     norm = VecNormV2(["observation"], decay=1.0, reduce_batch_dims=True)
-    envs = TransformedEnv(GymWrapper(UuvVectorEnv(sim=sim, hold_steps=HOLD_STEPS, autoreset_mode="Disabled")), norm)
+    envs = TransformedEnv(GymWrapper(Watched(sim=sim, hold_steps=HOLD_STEPS, autoreset_mode="Disabled")), norm)
     envs.set_seed(0)
     n_obs, n_act = envs.observation_spec["observation"].shape[-1], envs.action_spec.shape[-1]
     spread = nn.Sequential(network(n_obs, 2 * n_act), NormalParamExtractor("biased_softplus_0.5"))

@@ -83,7 +83,7 @@ def test_what_others_wrote_is_pinned():
 
 def test_the_release_waits_for_tests_and_build_and_needs_a_tag():
     release = WORKFLOW["jobs"]["release"]
-    assert set(release["needs"]) == {"test", "build"} and "refs/tags/v" in release["if"]
+    assert set(release["needs"]) == {"test", "build", "docs"} and "refs/tags/v" in release["if"]
     assert WORKFLOW["permissions"] == {"contents": "read"}
 
 

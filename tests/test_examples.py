@@ -61,6 +61,27 @@ def test_a_trainer_learns_for_two_updates(short, example, monkeypatch, name):
     assert not np.allclose(before, after)
 
 
+@pytest.mark.parametrize("mode", ["SameStep", "NextStep"])
+def test_a_watched_batch_keeps_every_return_once(short, example, mode):
+    """In both modes the sums are those of the simulator, and what follows an end counts for the next episode."""
+    envs = example("judge").Watched(sim=short, hold_steps=5, autoreset_mode=mode)
+    envs.reset(seed=1)
+    rewards, ends = np.zeros(N), []
+    for decision in range(1, 2 + SHORT // 5):
+        _obs, reward, terminated, truncated, _info = envs.step(np.zeros((N, 4), np.float32))
+        rewards += reward
+        for env in np.flatnonzero(terminated | truncated):
+            ends.append((decision * N, float(rewards[env])))
+            rewards[env] = 0.0
+    assert len(ends) >= N and envs.curve == ends
+
+
+def test_curves_are_drawn_from_what_was_kept(example, tmp_path):
+    (tmp_path / "a.csv").write_text("decisions,return\n" + "".join(f"{64 * i},{i}\n" for i in range(1, 300)))
+    example("judge").draw([tmp_path / "a.csv"], tmp_path / "out.png")
+    assert cv2.imread(str(tmp_path / "out.png")).std() > 5
+
+
 def test_judge_plays_each_env_once(short, example):
     """The return is that of the first episode, though other envs go on for longer."""
     judge = example("judge")

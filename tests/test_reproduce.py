@@ -183,12 +183,19 @@ class Quiet:
 
 
 @pytest.fixture(autouse=True)
-def no_page(monkeypatch):
-    """The page is drawn from run folders that stand-ins do not write."""
-    monkeypatch.setattr(run, "report", lambda folders: type("Report", (), {"page": folders[0] / "report.html"})())
+def pages(monkeypatch):
+    """How the run stood whenever a page was made; it would be drawn from run folders that stand-ins do not write."""
+    states = []
+
+    def page(folders):
+        states.append(json.loads((folders[0] / "run.json").read_text())["status"])
+        return type("Report", (), {"page": folders[0] / "report.html"})()
+
+    monkeypatch.setattr(run, "report", page)
+    return states
 
 
-def test_an_interrupted_reproduction_goes_on_and_runs_no_step_twice(tmp_path, monkeypatch):
+def test_an_interrupted_reproduction_goes_on_and_runs_no_step_twice(tmp_path, monkeypatch, pages):
     place, watch = tmp_path / "run", Quiet()
     first = Uuv(monkeypatch, fail_at=3)
     with pytest.raises(KeyboardInterrupt):
@@ -203,6 +210,7 @@ def test_an_interrupted_reproduction_goes_on_and_runs_no_step_twice(tmp_path, mo
     third = Uuv(monkeypatch)
     assert resume(place, Quiet())[0]["claims"] == document["claims"]
     assert third.ran == []
+    assert pages == ["finished", "finished"], "a page tells how the run ended"
 
 
 def test_a_step_that_fails_says_which(tmp_path, monkeypatch):

@@ -60,11 +60,11 @@ def _run(folder: RunFolder, watch: Watch) -> dict[str, Any]:
             document = document_of(folder.path, request, steps)
             folder.write_json(RESULT, document)
             folder.write(PAGE, results_page(document))
-            watch.note(f"report: {report([folder.path]).page}")
-            return document
     except KeyboardInterrupt:
         watch.note(f"what is finished is kept; go on with: uuv reproduce --resume {folder.path}")
         raise
+    watch.note(f"report: {report([folder.path]).page}")  # the page tells how the run ended
+    return document
 
 
 def _step(step: Step, name: str, folder: RunFolder, watch: Watch) -> None:
