@@ -15,9 +15,11 @@ from benchmarks.common import Job, Row
 from uuvtai.measure.sweep.run import REQUEST, ROWS
 
 _KILLS = 10
-_LONGEST_S = 20.0
-"""a kill comes at a random moment up to so long after the start: some before the first episode, some in the midst of a cell"""
-_SWEEP = ["--grid", "S=4,8", "--grid", "D=0,3,6,9", "--grid", "v=0.4,0.8,1.5,3.0", "--controller", "bt", "--episodes", "24"]
+_LONGEST_S = 40.0
+"""a kill comes at a random moment up to so long after the start: some before the first episode, some in the midst of one"""
+_METHODS = ["--controller", "straight", "--controller", "planner", "--controller", "bt"]
+_SWEEP = ["--grid", "S=4,8", "--grid", "D=0,3,6,9", "--grid", "v=0.4,0.8,1.5,3.0", *_METHODS, "--episodes", "16"]
+"""three tasks, one a method: what a kill loses is the task that runs"""
 _SEED = 20261122
 _TINY = ["--grid", "S=4", "--grid", "D=3,6", "--grid", "v=0.6", "--controller", "bt", "--episodes", "4"]
 
