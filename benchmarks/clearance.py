@@ -9,8 +9,9 @@ from scipy.ndimage import distance_transform_edt
 from benchmarks.common import Job, Row, seconds_per_call
 from tests.map_bits import put_layers
 from uuvtai import state
+from uuvtai.bounds import load_bounds
 from uuvtai.config import ClearanceConfig
-from uuvtai.kernels import clearance, mapping
+from uuvtai.kernels import clearance
 from uuvtai.kernels.grid import outside_cells
 from uuvtai.kernels.lanes import LANES
 from uuvtai.loader import load_config
@@ -53,8 +54,7 @@ class Maps:
         self.structs = [state.allocate(getattr(state, name), sizes) for name in names]
         self.clearance, self.memory, self.grid_map, self.mask, clock = self.structs
         clock.awake.fill(1)
-        self.mask.outside.from_numpy(self.outside.astype(np.int32))
-        mapping.pack_mask(self.mask)
+        load_bounds(self.mask, self.outside)
 
     def put(self, occupied: np.ndarray) -> None:
         """Take these maps."""

@@ -8,6 +8,7 @@ import numpy as np
 from tests import planning_maps as maps
 from tests.reference.voronoi import clearance_of
 from uuvtai import state
+from uuvtai.bounds import load_bounds
 from uuvtai.config import Config
 
 N_ENV = 8
@@ -49,7 +50,7 @@ def stage():
         "clock": state.ClockState,
     }
     s = SimpleNamespace(**{name: state.allocate(struct, sizes) for name, struct in structs.items()})
-    s.mask.outside.from_numpy(maps.OUTSIDE.astype(np.int32))
+    load_bounds(s.mask, maps.OUTSIDE)
     return s
 
 

@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 
 from tests.map_bits import put_layers
 from tests.reference.clearance import clearance_of, sites_of
+from uuvtai.bounds import load_bounds
 from uuvtai.config import ClearanceConfig, MappingConfig, TankConfig, VoronoiConfig
-from uuvtai.kernels import clearance, mapping
+from uuvtai.kernels import clearance
 from uuvtai.kernels.grid import grid_shape, outside_cells
 from uuvtai.kernels.lanes import LANES
 from uuvtai.state import PACKET, ClearanceMemory, ClearanceState, ClockState, GridMask, MapState, allocate
@@ -41,8 +42,7 @@ class Stage:
 
     def set_outside(self, outside):
         self.outside = outside
-        self.mask.outside.from_numpy(outside.astype(np.int32))
-        mapping.pack_mask(self.mask)
+        load_bounds(self.mask, outside)
 
     def compute(self, static, dynamic=None, cfg=CFG, voronoi=VORONOI):
         """(clearance, site_row, site_col) of these layers [n_env, row, col]."""

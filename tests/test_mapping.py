@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from tests.map_bits import check_bits, get_map, put_map
 from tests.reference.mapping import MapOracle
+from uuvtai.bounds import load_bounds
 from uuvtai.config import DepthConfig, EpisodeConfig, MappingConfig, SonarConfig, TankConfig
 from uuvtai.kernels import debug_stamp, mapping
 from uuvtai.kernels.geometry import BOX, CYLINDER, NONE
@@ -65,8 +66,7 @@ class Stage:
 
     def set_tank(self, tank):
         self.tank = tank
-        self.mask.outside.from_numpy(np.array(outside_cells(tank, MAP.cell_m), dtype=np.int32))
-        mapping.pack_mask(self.mask)
+        load_bounds(self.mask, np.array(outside_cells(tank, MAP.cell_m)))
 
     def reset(self, awake=1):
         self.set_awake(awake)

@@ -10,7 +10,7 @@ import ctypes
 import dataclasses
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,17 @@ import torch
 from uuvtai.state import PACKET
 
 _DTYPE = {"f32": "f4", "f64": "f8", "i8": "i1", "u8": "u1", "i16": "i2", "u16": "u2", "i32": "i4", "u32": "u4", "i64": "i8", "u64": "u8"}
+
+Put = Callable[[Any, np.ndarray], None]
+"""Fills a field from an array of its shape (vectors add a last axis) and dtype."""
+
+
+def put_by_kernel(field: Any, values: np.ndarray) -> None:
+    """Fill a field wherever it lies; Taichi compiles a kernel for every field."""
+    if field.shape == ():
+        field[None] = values.item()
+    else:
+        field.from_numpy(values)
 
 
 class Memory:
@@ -49,11 +60,14 @@ class Memory:
         Shapes are those of ``state``, with a last axis for vectors; arrays in lanes are as long as their memory, whole packets.
         """
         return {
-            f"{struct.name}.{declared.name}": _view(getattr(getattr(self.structs, struct.name), declared.name), declared, content)
+            f"{struct.name}.{declared.name}": _view(self._field(struct.name, declared.name), declared.metadata["lanes"], content)
             for struct in dataclasses.fields(self.structs)
             for declared in dataclasses.fields(getattr(self.structs, struct.name))
             if scratch or not declared.metadata["scratch"]
         }
+
+    def _field(self, struct: str, name: str) -> Any:
+        return getattr(getattr(self.structs, struct), name)
 
     def read(self) -> np.ndarray:
         """Bytes (n_bytes,): on the CPU the memory itself, on a GPU a copy."""
@@ -65,6 +79,13 @@ class Memory:
         """Put back what ``read`` gave and what was changed in it."""
         if self.device.type != "cpu":
             self._on_device().copy_(torch.from_numpy(content))
+
+    def put(self, field: Any, values: np.ndarray) -> None:
+        """Fill a field that is not in lanes; ``values`` has its shape (vectors add a last axis) and dtype."""
+        if self.device.type == "cpu":
+            np.copyto(_view(field, False, self.read()), values, casting="no")
+        else:
+            put_by_kernel(field, values)
 
     def _on_device(self) -> torch.Tensor:
         interface = {"shape": (self.n_bytes,), "typestr": "|u1", "data": (self.address, False), "version": 3}
@@ -84,9 +105,9 @@ def _offset(field: Any) -> int:
     return sum(node.offset_bytes_in_parent_cell for node in _path(field))
 
 
-def _view(field: Any, declared: dataclasses.Field, content: np.ndarray) -> np.ndarray:
+def _view(field: Any, lanes: bool, content: np.ndarray) -> np.ndarray:
     shape, dtype = tuple(field.shape), np.dtype(_DTYPE[str(field.dtype)])
-    if declared.metadata["lanes"]:
+    if lanes:
         shape = (*shape[:-1], PACKET * -(-shape[-1] // PACKET))
     cell = _path(field)[1].cell_size_bytes
     strides = tuple(cell * math.prod(shape[axis + 1 :]) for axis in range(len(shape)))

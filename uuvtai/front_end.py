@@ -8,13 +8,14 @@ part of what Taichi's cache is asked for, so it finds kernels that were compiled
 
 from __future__ import annotations
 
+import ast
 import functools
 import sys
 import textwrap
 import types
 from typing import Any
 
-from taichi.lang import kernel_impl
+from taichi.lang import impl, kernel_impl, snode
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
 
@@ -28,7 +29,12 @@ def remember_sources() -> None:
     if hasattr(kernel_impl, "_inside_class"):
         kernel_impl._inside_class = _inside_class  # type: ignore[attr-defined]
     if getattr(kernel_impl, "textwrap", None) is textwrap:
-        kernel_impl.textwrap = types.SimpleNamespace(fill=functools.cache(textwrap.fill), dedent=textwrap.dedent)  # type: ignore[attr-defined]
+        kernel_impl.textwrap = types.SimpleNamespace(fill=functools.cache(textwrap.fill), dedent=functools.cache(textwrap.dedent))  # type: ignore[attr-defined]
+    if getattr(kernel_impl, "ast", None) is ast:
+        kernel_impl.ast = types.SimpleNamespace(**{**vars(ast), "parse": _parse})  # type: ignore[attr-defined]
+    for module in (impl, snode):
+        if hasattr(module, "get_traceback"):
+            module.get_traceback = _caller
 
 
 def _inside_class(level_of_class_stackframe: int) -> bool:
@@ -37,6 +43,27 @@ def _inside_class(level_of_class_stackframe: int) -> bool:
     Taichi reads that frame's source and searches all loaded modules for it, for each of our funcs and kernels when it is imported.
     """
     return "__qualname__" in sys._getframe(level_of_class_stackframe - 1).f_locals
+
+
+@functools.cache
+def _tree(source: str) -> tuple[ast.Module, list[ast.arg]]:
+    tree = ast.parse(source)
+    return tree, list(tree.body[0].args.args)  # type: ignore[attr-defined]
+
+
+def _parse(source: str) -> ast.Module:
+    """The tree of a function's source, as good as new: Taichi takes a kernel's parameters out, and what it notes at nodes it overwrites."""
+    tree, parameters = _tree(source)
+    tree.body[0].args.args = list(parameters)  # type: ignore[attr-defined]
+    return tree
+
+
+def _caller(stacklevel: int = 1) -> str:
+    """Where a field is declared: the frame that asked Taichi for it."""
+    frame = sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("taichi."):
+        frame = frame.f_back
+    return f'  File "{frame.f_code.co_filename}", line {frame.f_lineno}, in {frame.f_code.co_name}\n'
 
 
 def _short_unless_raised(get_pos_info: Any) -> Any:

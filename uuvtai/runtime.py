@@ -33,6 +33,9 @@ _started: list[Runtime] = []
 _LOCKED_S = 60.0
 """Taichi locks its cache by a file, for as long as it reads or writes there: one older than this belongs to a process that was killed"""
 
+_CACHE_BYTES = 1 << 30
+"""Taichi's own limit, 100 MB, is about twelve sizes of simulator (6 to 9 MB each): a sweep and a training push each other's kernels out"""
+
 
 def stale_locks() -> list[Path]:
     """Locks of the kernel cache that nobody holds any more: with one of them every process compiles everything again."""
@@ -63,6 +66,7 @@ def start_taichi(device: str = "cpu", precision: str = "f32", fast_math: bool = 
             default_fp=wanted.real,
             fast_math=fast_math,
             offline_cache=True,
+            offline_cache_max_size_of_files=_CACHE_BYTES,
             cfg_optimization=wanted.device == "cuda",  # on the CPU LLVM does that work again: half of the time to compile, equal results
             log_level=ti.WARN,
             **options,

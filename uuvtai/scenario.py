@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
+from uuvtai.capture import Put, put_by_kernel
 from uuvtai.config import FixedObstacle, WorldConfig
 from uuvtai.kernels.geometry import BOX, CYLINDER, NONE, SPHERE
 from uuvtai.kernels.layout import COARSE_M, FAULT_ENDPOINTS, FAULT_JOINED, FAULT_STATIC
@@ -104,7 +105,7 @@ Scene = tuple[int, int, float]
 """(S, D, v [m/s])"""
 
 
-def set_scenes(scene: SceneState, world: WorldConfig, scenes: Sequence[Scene]) -> None:
+def set_scenes(scene: SceneState, world: WorldConfig, scenes: Sequence[Scene], put: Put = put_by_kernel) -> None:
     """Deal the scenes out to the envs in turn, for their next scenarios. ValueError where one does not fit the slots of ``world``."""
     for n_static, n_dynamic, speed_m_s in scenes:
         for name, wanted, slots in (("static", n_static, world.static_slots), ("dynamic", n_dynamic, world.dynamic_slots)):
@@ -113,9 +114,9 @@ def set_scenes(scene: SceneState, world: WorldConfig, scenes: Sequence[Scene]) -
         if not (math.isfinite(speed_m_s) and speed_m_s >= 0):
             raise ValueError(f"the obstacles' speed must be finite and not negative, got {speed_m_s}")
     dealt = np.resize(np.array(scenes, dtype=np.float32), (scene.n_static.shape[0], 3))
-    scene.n_static.from_numpy(dealt[:, 0].astype(np.int32))
-    scene.n_dynamic.from_numpy(dealt[:, 1].astype(np.int32))
-    scene.speed_m_s.from_numpy(np.ascontiguousarray(dealt[:, 2]))
+    put(scene.n_static, dealt[:, 0].astype(np.int32))
+    put(scene.n_dynamic, dealt[:, 1].astype(np.int32))
+    put(scene.speed_m_s, np.ascontiguousarray(dealt[:, 2]))
 
 
 def check_scenarios(faults: np.ndarray) -> None:

@@ -18,6 +18,7 @@ import torch
 
 from uuvtai import state
 from uuvtai.allocation import allocation_matrices
+from uuvtai.bounds import load_bounds
 from uuvtai.capture import Memory
 from uuvtai.config import Config
 from uuvtai.kernels import (
@@ -136,6 +137,7 @@ class Sim:
         self.fallback = RouteFallback(config)
         self.stage_s: dict[str, float] | None = None
         self.privileged = False
+        self._put = self.memory().put
         self.use_tree(tree)
         self._fill_constants()
 
@@ -144,12 +146,12 @@ class Sim:
     def use_tree(self, tree: FlatTree) -> None:
         """Drive by another behaviour tree from the next tick on (trees are data: nothing is compiled again)."""
         self.tree = tree
-        load_tree(self.s.table, tree)
+        load_tree(self.s.table, tree, self._put)
 
     def set_scenes(self, scenes: Sequence[Scene] = ()) -> None:
         """Deal (S, D, v) out to the envs in turn, for their next scenarios; none = the world's own. ValueError where slots are too few."""
         world = self.config.world
-        set_scenes(self.s.scene, world, scenes or [(world.n_static, world.n_dynamic, world.dynamic_speed_m_s)])
+        set_scenes(self.s.scene, world, scenes or [(world.n_static, world.n_dynamic, world.dynamic_speed_m_s)], self._put)
 
     def observe(self) -> torch.Tensor:
         """From the next pass on, write every awake row's observation into the tensor returned, (n_env, n_obs) (``features.columns``)."""
@@ -163,11 +165,10 @@ class Sim:
         self.set_scenes()
         load_fixed(self.s.fixed, world_cfg)
         outside = outside_cells(world_cfg.tank, self.config.mapping.cell_m)
-        self.s.mask.outside.from_numpy(np.array(outside, dtype=np.int32))
-        mapping.pack_mask(self.s.mask)
+        load_bounds(self.s.mask, np.array(outside), self._put)
         wrench_of_thrust, thrust_of_wrench = allocation_matrices(self.config.vehicle)
-        self.s.allocation.wrench_of_thrust.from_numpy(wrench_of_thrust.astype(np.float32))
-        self.s.allocation.thrust_of_wrench.from_numpy(thrust_of_wrench.astype(np.float32))
+        self._put(self.s.allocation.wrench_of_thrust, wrench_of_thrust.astype(np.float32))
+        self._put(self.s.allocation.thrust_of_wrench, thrust_of_wrench.astype(np.float32))
 
     # -------------------------------------------------------------------------------------------------------------- step
 

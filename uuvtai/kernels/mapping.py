@@ -23,7 +23,7 @@ import math
 import taichi as ti
 
 from uuvtai.config import DepthConfig, EpisodeConfig, MappingConfig, SonarConfig, TankConfig
-from uuvtai.kernels.bits import WORD, bit_of, cell_bit, lowest_bit, taken, with_bit, without_lowest
+from uuvtai.kernels.bits import WORD, bit_of, lowest_bit, taken, with_bit, without_lowest
 from uuvtai.kernels.evidence import mark_depth, mark_hits
 from uuvtai.kernels.fan import mark_fan
 from uuvtai.kernels.signature import Const, In, Out, quick_launch, spread
@@ -303,16 +303,3 @@ def reset_map(grid_map: Out[MapState], clock: In[ClockState]):
                 grid_map.free_scans[env, row, word] = ti.Vector.zero(ti.u64, ti.static(grid_map.free_scans.n))
                 for words in ti.static(bit_fields(grid_map)):
                     words[env, row, word] = ti.cast(0, ti.u64)
-
-
-@ti.kernel
-def pack_mask(mask: Out[GridMask]):
-    """``outside_bits`` from ``outside``."""
-    n_row, n_col = ti.static(mask.outside.shape)
-    for row, word in ti.ndrange(n_row, ti.static(mask.outside_bits.shape[1])):
-        found = ti.cast(0, ti.u64)
-        for i in range(WORD):
-            col = word * WORD + i
-            if col < n_col and mask.outside[row, ti.min(col, n_col - 1)] == 1:
-                found |= cell_bit(col)
-        mask.outside_bits[row, word] = found

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from uuvtai.capture import Put, put_by_kernel
 from uuvtai.state import TreeTable
 from uuvtai.tree.elements import TreeError
 from uuvtai.tree.nodes import MAX_PORTS
@@ -39,7 +40,7 @@ class FlatTree:
         return tuple(found)
 
 
-def load_tree(table: TreeTable, flat: FlatTree) -> None:
+def load_tree(table: TreeTable, flat: FlatTree, put: Put = put_by_kernel) -> None:
     """Copy a flat tree into the simulator's table. Raises TreeError when it does not fit."""
     n, capacity = len(flat.kind), table.kind.shape[0]
     if n > capacity:
@@ -47,8 +48,8 @@ def load_tree(table: TreeTable, flat: FlatTree) -> None:
     for array, values in ((table.kind, flat.kind), (table.end, flat.end), (table.parent, flat.parent), (table.leaf, flat.leaf)):
         padded = np.zeros(capacity, np.int32)
         padded[:n] = values
-        array.from_numpy(padded)
+        put(array, padded)
     param = np.full((capacity, MAX_PORTS), UNSET, np.float32)
     param[:n] = flat.param
-    table.param.from_numpy(param)
-    table.n_node[None] = n
+    put(table.param, param)
+    put(table.n_node, np.array(n, np.int32))
