@@ -15,11 +15,11 @@ from benchmarks.common import Job, Row
 from uuvtai.measure.sweep.run import REQUEST, ROWS
 
 _KILLS = 10
-_LONGEST_S = 20.0
-"""a kill comes at a random moment up to so long after the start, or, every second one, after this run has finished its first task"""
+_LONGEST_S = 16.0
+"""a kill comes at a random moment up to so long after the start, or, every second one, up to half of that after this run has finished a task"""
 _METHODS = ["--controller", "straight", "--controller", "planner", "--controller", "bt"]
-_SWEEP = ["--grid", "S=4,8", "--grid", "D=0,3,6,9", "--grid", "v=0.4,0.8,1.5,3.0", *_METHODS, "--episodes", "48"]
-"""six tasks, two a method: what a kill loses is the task that runs"""
+_SWEEP = ["--grid", "S=4,8", "--grid", "D=0,3,6,9", "--grid", "v=0.4,0.8,1.5,3.0", *_METHODS, "--episodes", "96"]
+"""nine tasks, three a method: what a kill loses is the task that runs"""
 _SEED = 20261122
 _TINY = ["--grid", "S=4", "--grid", "D=3,6", "--grid", "v=0.6", "--controller", "bt", "--episodes", "4"]
 
@@ -52,7 +52,7 @@ def _killed(sweep: list[str], place: Path, kills: int, job: Job) -> tuple[list[f
         if len(moments) % 2:
             while child.poll() is None and _finished(place) == finished:
                 time.sleep(0.01)
-            moment += time.monotonic() - begun
+            moment = time.monotonic() - begun + 0.5 * moment
         while child.poll() is None and (time.monotonic() - begun < moment or not (place / REQUEST).exists()):
             time.sleep(0.01)
         if child.poll() is not None:

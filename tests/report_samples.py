@@ -42,6 +42,20 @@ def noise_sweep():
     return {"schema": 1, "world": "pool", "axes": {"sensors": ["clean", "paper", "nominal", "harsh"]}, "cells": cells}
 
 
+def robustness_sweep():
+    """One axis at a time around a condition, two methods; one axis has lists for values, one is of the scene."""
+    scene = {"S": 8, "D": 6, "v_m_s": 0.6}
+    places = [{}, {"D": 9}, {"disturbance.current_m_s": [0.0, 0.2, 0.0]}, {"sensors": "clean"}, {"sensors": "harsh"}]
+    cells = [
+        {**scene, **place, "method": name, **rates(N - i - j, i)} for j, name in enumerate(("bt", "best")) for i, place in enumerate(places)
+    ]
+    return {
+        "schema": 1, "world": "pool", "episodes_per_seed": N, "cells": cells, "one_at_a_time": True,
+        "axes": {"D": [9], "disturbance.current_m_s": [[0.0, 0.2, 0.0]], "sensors": ["clean", "harsh"]},
+        "unchanged": {"D": 6, "disturbance.current_m_s": [0.0, 0.0, 0.0], "sensors": None},
+    }  # fmt: skip
+
+
 def method(name, k_success=6, k_collision=2, n=8, **more):
     """One entry of an evaluation."""
     detail = [

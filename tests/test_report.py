@@ -6,6 +6,7 @@ import json
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from html.parser import HTMLParser
 from urllib.parse import unquote
 from xml.etree import ElementTree
@@ -23,7 +24,7 @@ from uuvtai.report.blocks import Data, Figure, Gallery, Prose, Table
 from uuvtai.report.build import report
 from uuvtai.report.colours import contrast, ink_on, shade
 from uuvtai.report.evaluation import evaluation
-from uuvtai.report.figures import Line, curves, heat_map
+from uuvtai.report.figures import Line, curves, heat_map, intervals
 from uuvtai.report.heatmap import pivot
 from uuvtai.report.learning_curves import Training, grouped, training
 from uuvtai.report.media import media
@@ -74,6 +75,12 @@ def test_any_two_axes_make_a_heat_map():
     assert (grid.row_names, grid.column_names) == (["0", "0.2"], ["paper", "harsh"])
     turned = pivot(cells, axes, columns="world.current_m_s")
     assert (turned.row_names, turned.column_names) == (["paper", "harsh"], ["0", "0.2"])
+
+
+def test_values_of_an_axis_may_be_lists():
+    axes = {"disturbance.current_m_s": [[0.0, 0.1, 0.0], [0.0, 0.2, 0.0]], "D": [3, 6]}
+    cells = [{"disturbance.current_m_s": list(c), "D": d, "episodes": 4} for c in ((0.0, 0.2, 0.0), (0.0, 0.1, 0.0)) for d in (3, 6)]
+    assert pivot(cells, axes).row_names == ["[0.0, 0.1, 0.0]", "[0.0, 0.2, 0.0]"]
 
 
 def test_a_grid_that_cannot_be_laid_out_says_why():
@@ -131,6 +138,11 @@ def drawn(panel, prefix="f-"):
     root = ElementTree.fromstring(ink.svg(panel, prefix, "what it shows"))
     titles = {e.get("id").removeprefix(prefix): t.text for e in root.iter() for t in e if t.tag.endswith("}title") and e.get("id")}
     return root, titles
+
+
+def words(root):
+    """Every line of text, in the order of the drawing: ticks across, ticks up, then titles."""
+    return [e.text for e in root.iter() if e.tag.endswith("}text") and e.text and e.text.strip()]
 
 
 def test_figures_take_the_colours_of_the_page():
@@ -234,6 +246,29 @@ def test_a_sweep_over_one_axis_is_curves_with_intervals():
     hover = drawn(figure.panels[0])[1]
     assert hover["interval-1-3"].splitlines()[:2] == ["best, sensors = harsh", "success 12/16 = 75.0 % [50.5, 89.8]"]
     assert tables(blocks)[0].rows[0][:3] == ["bt", "clean", "16/16 = 100.0 % [80.6, 100.0]"]
+
+
+def test_a_sweep_of_one_axis_at_a_time_is_a_figure_an_axis_around_what_is_unchanged():
+    blocks = sweep(samples.robustness_sweep())
+    found = figures(blocks)
+    assert {name: [row[0:4] for row in figure.data.rows if row[0] == "bt"] for name, figure in found.items()} == {
+        "sweep_D": [["bt", 8, 6, 0.6], ["bt", 8, 9, 0.6]],
+        "sweep_disturbance.current_m_s": [["bt", 8, 6, 0.6], ["bt", 8, 6, 0.6]],
+        "sweep_sensors": [["bt", 8, 6, 0.6]] * 3,
+    }
+    root, hover = drawn(found["sweep_sensors"].panels[1])
+    assert words(root)[:3] == ["unchanged", "clean", "harsh"]
+    assert hover["interval-1-2"].splitlines()[0] == "best, S = 8, D = 6, v m/s = 0.6, sensors = harsh"
+    root, hover = drawn(found["sweep_disturbance.current_m_s"].panels[0])
+    assert words(root)[:3] == ["[0.0, 0.0, 0.0]", "(own)", "[0.0, 0.2, 0.0]"]
+    assert "disturbance.current_m_s = [0.0, 0.2, 0.0]" in hover["interval-0-1"]
+    assert len(tables(blocks)[0].rows) == 10
+
+
+def test_an_axis_of_shares_ends_where_the_intervals_do():
+    line = Line("bt", [0], [0.02], [0.01], [0.19], ["said"])
+    assert words(drawn(intervals([line], ["here"], "collision", "x"))[0])[-3] == "20.0"
+    assert words(drawn(intervals([replace(line, high=[0.51])], ["here"], "collision", "x"))[0])[-3] == "100"
 
 
 def test_an_unfinished_sweep_says_so():

@@ -4,10 +4,11 @@ import json
 
 import pytest
 
+from tests.report_samples import robustness_sweep
 from uuvtai.loader import preset_names
 from uuvtai.measure.reproduce import claims, paper, run, steps
 from uuvtai.measure.reproduce.claims import FAILS, HOLDS, OPEN, Share
-from uuvtai.measure.reproduce.markdown import results_page, table
+from uuvtai.measure.reproduce.markdown import _sweep, results_page, table
 from uuvtai.measure.reproduce.run import reproduce, resume
 from uuvtai.run_folder import RunFolderError
 
@@ -225,6 +226,16 @@ def test_bad_input_is_refused_before_anything_is_written(tmp_path):
     assert not (tmp_path / "run").exists()
     with pytest.raises(RunFolderError, match="give the folder"):
         resume(tmp_path, Quiet())
+
+
+def test_a_sweep_of_one_axis_at_a_time_is_a_row_a_change():
+    lines = _sweep(robustness_sweep()).splitlines()
+    assert lines[2] == "| changed | bt | best |"
+    assert lines[4:7] == [
+        "| nothing | 100 / 0 | 94 / 0 |",
+        "| D = 9 | 94 / 6 | 88 / 6 |",
+        "| disturbance.current_m_s = [0.0, 0.2, 0.0] | 88 / 12 | 81 / 12 |",
+    ]
 
 
 def test_tables_are_markdown():

@@ -12,6 +12,8 @@ import pytest
 
 from tests import sweep_work
 from tests.conftest import SmallSim
+from tests.report_samples import robustness_sweep
+from uuvtai import cli
 from uuvtai.loader import ConfigError
 from uuvtai.measure.evaluate import Job, run_episodes
 from uuvtai.measure.sweep import run as sweep_run
@@ -101,7 +103,7 @@ def test_a_grid_file_says_what_is_wrong(tmp_path):
             grid_of([str(file)])
 
 
-@pytest.mark.parametrize("name", ["paper", "caution", "robustness"])
+@pytest.mark.parametrize("name", ["paper", "caution", "robustness", "dead_reckoning"])
 def test_shipped_grids_load_and_every_cell_has_a_config(name):
     request = asked(grid_of([name]))
     tasks = tasks_of(request, [("bt", "bt", None)], set())
@@ -134,6 +136,21 @@ def test_other_axes_make_configs_of_their_own():
     tasks = tasks_of(request, [("bt", "bt", None)], set())
     assert [task.config.teacher.caution for task in tasks] == [0.5, 2.0]
     assert tasks[1].labels == ({"S": 8, "D": 0, "v_m_s": None, "teacher.caution": 2}, {"S": 8, "D": 6, "v_m_s": 0.6, "teacher.caution": 2})
+
+
+def test_one_axis_at_a_time_tells_what_is_unchanged(tmp_path):
+    grid = Grid({"D": (3,), "sensors": ("harsh",), "disturbance.current_m_s": ([0.1, 0.0, 0.0],)}, one_at_a_time=True)
+    document, folder = sweep(asked(grid), Canned(), tmp_path / "run", Quiet())
+    assert document["one_at_a_time"] and document["unchanged"] == {"D": 6, "sensors": None, "disturbance.current_m_s": [0.0, 0.0, 0.0]}
+    assert json.loads((folder / "sweep.json").read_text())["unchanged"] == document["unchanged"]
+
+
+def test_what_is_printed_of_one_axis_at_a_time_names_what_changes(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "160")
+    cli._print_sweep(robustness_sweep())
+    lines = capsys.readouterr().out.splitlines()
+    assert sum("nothing" in line for line in lines) == 2
+    assert any("sensors = harsh" in line and "best" in line and "11/16" in line for line in lines)
 
 
 def test_a_request_survives_its_json():

@@ -567,15 +567,16 @@ def _engine(name: str, workers: int, address: str) -> Any:
 
 
 def _print_sweep(result: dict[str, Any]) -> None:
+    from uuvtai.report.alone import is_alone, told
     from uuvtai.report.heatmap import varying
 
-    if len(varying(result["axes"])) > 1:
+    if len(varying(result["axes"])) > 1 and not is_alone(result):
         from uuvtai.report.terminal import print_heat_maps
 
         print_heat_maps(result, _stdout())
         return
     table = Table(title=f"{result['world']}: {len(result['cells'])} cells x {result['episodes_per_seed']} episodes", title_justify="left")
-    others = [name for name in result["axes"] if name not in ("S", "D", "v")]
+    others = ["changed"] if is_alone(result) else [name for name in result["axes"] if name not in ("S", "D", "v")]
     for head in ("S", "D", "v m/s", *others, "method", "success [95 %]", "collision [95 %]", "time to goal s"):
         table.add_column(head, justify="right")
     for row in result["cells"]:
@@ -584,7 +585,7 @@ def _print_sweep(result: dict[str, Any]) -> None:
             str(row["S"]),
             str(row["D"]),
             _number(row["v_m_s"]),
-            *(str(row.get(name, "")) for name in others),
+            *([told(row, result)] if is_alone(result) else [str(row.get(name, "")) for name in others]),
             row["method"],
             _rate(o["success"], n, row["success_ci95"]),
             _rate(o["collision"] + o["ttc"] + o["out_of_tank"], n, row["collision_ci95"]),

@@ -101,8 +101,9 @@ def rates_text(cell: dict[str, Any]) -> str:
 
 
 def place_of(cell: dict[str, Any]) -> dict[str, Any]:
-    """Axes of a cell with their values: every key that is no result."""
-    return {key: value for key, value in cell.items() if key not in _RESULTS and value is not None and not isinstance(value, dict | list)}
+    """Axes of a cell with their values: every key that is no result (values of config keys may be lists)."""
+    plain = {key: value for key, value in cell.items() if "." in key or not isinstance(value, dict | list)}
+    return {key: value for key, value in plain.items() if key not in _RESULTS and value is not None}
 
 
 _RESULTS = {
@@ -157,9 +158,16 @@ def intervals(lines: Sequence[Line], names: Sequence[str], title: str, x_label: 
         axes.set_xticks(range(len(names)), names)
         axes.set_xlim(-0.5, len(names) - 0.5)
         _frame(axes, lines, share=True, zero=True)
+        axes.set_ylim(-0.03 * (top := _top(lines)), 1.03 * top)
         return hover
 
     return Panel(draw, width_in=max(4.4, 1.6 + 0.55 * len(names)))
+
+
+def _top(lines: Sequence[Line]) -> float:
+    """End of an axis of shares [%] that shows the highest bound, in round steps."""
+    highest = max((100 * y for line in lines for y in (line.high or line.y)), default=100.0)
+    return next((top for top in (10.0, 20.0, 50.0) if highest <= top), 100.0)
 
 
 def _draw_intervals(axes: Axes, i: int, line: Line, shift: float, joined: bool) -> Hover:

@@ -9,10 +9,12 @@ from typing import Any
 from uuvtai.report.wording import axis_name, value_name
 
 SPEED = "v_m_s"
-_SHORT = {"v": SPEED}
-"""axes that a sweep may name shorter than its cells do"""
-
 Cell = dict[str, Any]
+
+
+def cell_name(axis: str) -> str:
+    """What cells call an axis that a sweep may name shorter."""
+    return SPEED if axis == "v" else axis
 
 
 @dataclass(frozen=True)
@@ -57,13 +59,14 @@ def pivot(cells: Iterable[Cell], axes: dict[str, list[Any]], columns: str | None
     Without ``columns``, the speed of the moving obstacles where it varies, else the last axis that does. Raises ValueError for a column
     axis that is none, and for two cells in one place.
     """
-    named = {_SHORT.get(name, name): list(values) for name, values in axes.items()}
-    across = _SHORT.get(columns, columns) if columns else _default_columns(named)
+    named = {cell_name(name): list(values) for name, values in axes.items()}
+    across = cell_name(columns) if columns else _default_columns(named)
     if across not in named:
         raise ValueError(f"{columns!r} is no axis of this sweep; there are: {', '.join(named) or 'none'}")
     down = tuple(name for name in named if name != across)
     found = list(cells)
-    row_values = tuple(sorted({tuple(cell.get(name) for name in down) for cell in found}, key=lambda row: _order(row, down, named)))
+    rows = [tuple(cell.get(name) for name in down) for cell in found]
+    row_values = tuple(sorted({repr(row): row for row in rows}.values(), key=lambda row: _order(row, down, named)))  # values may be lists
     places = tuple(_place(cell, down, across, row_values, named[across]) for cell in found)
     _refuse_doubles(places)
     return HeatMap(down, across, row_values, tuple(named[across]), places)
@@ -71,7 +74,7 @@ def pivot(cells: Iterable[Cell], axes: dict[str, list[Any]], columns: str | None
 
 def varying(axes: dict[str, list[Any]]) -> list[str]:
     """Axes with more than one value, under the names that cells use."""
-    return [_SHORT.get(name, name) for name, values in axes.items() if len(values) > 1]
+    return [cell_name(name) for name, values in axes.items() if len(values) > 1]
 
 
 def _default_columns(axes: dict[str, list[Any]]) -> str:

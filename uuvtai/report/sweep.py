@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from uuvtai.outcomes import ENDINGS
+from uuvtai.report.alone import axes_of, is_alone, of_axis, place_names, places
 from uuvtai.report.blocks import Block, Data, Figure, Notice, Prose, Table
 from uuvtai.report.figures import Line, heat_map, hover_text, intervals, place_of
 from uuvtai.report.heatmap import Cell, pivot, varying
@@ -21,8 +22,18 @@ def sweep(document: dict[str, Any], command: str = "") -> list[Block]:
     spans = "; ".join(f"{axis_name(name)} in {{{', '.join(map(value_name, values))}}}" for name, values in axes.items())
     episodes = sum(cell["episodes"] for cell in cells)
     said = f"World {document.get('world', '-')}, {spans}: {len(cells)} cells, {episodes:,} episodes in all."
+    if is_alone(document):
+        return [Prose(f"{said} One axis at a time, all else unchanged."), *_each_axis(document, command), cells_table(cells, "Every cell")]
     drawn = _curves(cells, axes, command) if len(varying(axes)) < 2 else _maps(cells, axes, command)
     return [Prose(said), *drawn]
+
+
+def _each_axis(document: dict[str, Any], command: str) -> list[Block]:
+    """Success and collision along every axis; the unchanged condition stands first."""
+    return [
+        _axis_figure(of_axis(axis, document), axis, places(axis, document), place_names(axis, document), command)
+        for axis in axes_of(document)
+    ]
 
 
 def _maps(cells: list[Cell], axes: dict[str, list[Any]], command: str) -> list[Block]:
@@ -43,18 +54,17 @@ def _curves(cells: list[Cell], axes: dict[str, list[Any]], command: str) -> list
     """Success and collision along the one axis that varies, every method a line."""
     named = varying(axes)
     axis = named[0] if named else next(iter(axes), "")
-    places = list(dict.fromkeys(cell.get(axis) for cell in cells))
+    places = list({repr(value): value for cell in cells for value in [cell.get(axis)]}.values())
+    return [_axis_figure(cells, axis, places, list(map(value_name, places)), command), cells_table(cells, "Every cell")]
+
+
+def _axis_figure(cells: list[Cell], axis: str, places: list[Any], names: list[str], command: str) -> Figure:
     panels = [
-        intervals(
-            [_line(method, own, key, axis, places) for method, own in by_method(cells).items()],
-            list(map(value_name, places)),
-            key,
-            axis_name(axis),
-        )
+        intervals([_line(method, own, key, axis, places) for method, own in by_method(cells).items()], names, key, axis_name(axis))
         for key in ("success", "collision")
     ]
     caption = f"Success and collision over {axis_name(axis)}, with 95 % Wilson intervals"
-    return [Figure(f"sweep_{axis}", panels, caption, cells_data(cells), command), cells_table(cells, "Every cell")]
+    return Figure(f"sweep_{axis}", panels, caption, cells_data(cells), command)
 
 
 def _line(method: str, own: list[Cell], key: str, axis: str, places: list[Any]) -> Line:

@@ -9,6 +9,7 @@ from uuvtai.measure.reproduce import paper
 from uuvtai.measure.reproduce.claims import pooled
 from uuvtai.measure.statistics import mean
 from uuvtai.outcomes import COLLIDED
+from uuvtai.report.alone import is_alone, told
 
 
 def results_page(document: dict[str, Any]) -> str:
@@ -64,6 +65,8 @@ def _sweeps(document: dict[str, Any]) -> str:
 
 def _sweep(sweep: dict[str, Any]) -> str:
     """Rows: method and every axis but the speed; columns: speeds; cells: success / collision in %."""
+    if is_alone(sweep):
+        return _alone(sweep)
     axes = [("v_m_s" if name == "v" else name) for name in sweep["axes"]]
     across = "v_m_s" if "v_m_s" in axes else axes[-1]
     down = [name for name in axes if name != across]
@@ -75,6 +78,16 @@ def _sweep(sweep: dict[str, Any]) -> str:
     heads = ["method", *down, *("nothing moves" if value is None else f"{across} = {value}" for value in values)]
     rows = [[*map(str, key), *(found.get(str(value), "") for value in values)] for key, found in lines.items()]
     return "success / collision in %\n\n" + table(heads, rows)
+
+
+def _alone(sweep: dict[str, Any]) -> str:
+    """Rows: what is changed; columns: methods; cells: success / collision in %."""
+    methods = list(dict.fromkeys(cell["method"] for cell in sweep["cells"]))
+    lines: dict[str, dict[str, str]] = {}
+    for cell in sweep["cells"]:
+        lines.setdefault(told(cell, sweep), {})[cell["method"]] = _both(cell)
+    rows = [[name, *(found.get(method, "") for method in methods)] for name, found in lines.items()]
+    return "success / collision in %, one axis at a time\n\n" + table(["changed", *methods], rows)
 
 
 def _both(cell: dict[str, Any]) -> str:

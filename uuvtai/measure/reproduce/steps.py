@@ -112,6 +112,7 @@ def _beyond(pilot: str, budget: Budget) -> list[Step]:
         Step("gauntlet", _sweep(pilot, "paper", few, "--world", "gauntlet"), "sweep/gauntlet", resumes=True),
         Step("trade-off", ("sweep", *_controllers("bt"), "--grid", "caution", "--episodes", str(few)), "sweep/caution", resumes=True),
         Step("robustness", _sweep(pilot, "robustness", 4 * budget.sweep_episodes), "sweep/robustness", resumes=True),
+        Step("dead reckoning", _sweep(pilot, "dead_reckoning", 4 * budget.sweep_episodes), "sweep/dead_reckoning", resumes=True),
     ]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 from collections.abc import Sequence
@@ -74,6 +75,16 @@ def label_of(cell: Cell, config: Config) -> dict[str, Any]:
     n_dynamic = cell.get("D", world.n_dynamic)
     scene = {"S": cell.get("S", world.n_static), "D": n_dynamic, "v_m_s": cell.get("v", world.dynamic_speed_m_s) if n_dynamic else None}
     return {**scene, **{name: value for name, value in cell.items() if name not in SCENE_AXES}}
+
+
+def unchanged(request: SweepRequest) -> dict[str, Any]:
+    """What every axis is where the grid does not set it; None for a preset that the world names itself."""
+    config = base_config(request)
+    world = config.world
+    known: dict[str, Any] = {"S": world.n_static, "D": world.n_dynamic, "v": world.dynamic_speed_m_s}
+    known |= {kind: getattr(request, kind) for kind in PRESET_AXES}
+    own = {name: known[name] if name in known else functools.reduce(getattr, name.split("."), config) for name in request.grid.axes}
+    return json.loads(json.dumps(own))
 
 
 def row_key(label: dict[str, Any], method: str) -> str:

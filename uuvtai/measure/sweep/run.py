@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 from uuvtai.measure.sweep.engines import Engine
 from uuvtai.measure.sweep.grid import Grid
-from uuvtai.measure.sweep.plan import SweepRequest, base_config, check_rows, ordered, request_of, row_key, tasks_of
+from uuvtai.measure.sweep.plan import SweepRequest, base_config, check_rows, ordered, request_of, row_key, tasks_of, unchanged
 from uuvtai.measure.sweep.tasks import Row, play
 from uuvtai.run_folder import RunFolder, RunFolderError, default_run_dir, refuse_place
 
@@ -129,6 +129,7 @@ def _document(request: SweepRequest, rows: list[Row]) -> dict[str, Any]:
         "world": request.world,
         "sensors": request.sensors,
         "axes": request.grid.document(),
+        **({"one_at_a_time": True, "unchanged": unchanged(request)} if request.grid.one_at_a_time else {}),
         "seeds": list(request.seeds),
         "episodes_per_seed": request.episodes,
         "cells": rows,
