@@ -103,6 +103,31 @@ def test_views_show_every_layout_as_taichi_does(small):
         views[name][...] = values
 
 
+def test_put_writes_what_taichi_reads_and_refuses_what_does_not_fit(small):
+    s, put = small.sim.s, small.sim.memory().put
+    fields = [
+        s.table.n_node,
+        s.table.kind,
+        s.table.param,
+        s.mask.outside,
+        s.mask.outside_bits,
+        s.allocation.wrench_of_thrust,
+        s.scene.n_static,
+    ]
+    for number, field in enumerate(fields):
+        before = np.asarray(field[None]) if field.shape == () else field.to_numpy()
+        before = before.astype(np.int32) if field.shape == () else before
+        other = (before + number + 1).astype(before.dtype)
+        put(field, other)
+        found = np.asarray(field[None]) if field.shape == () else field.to_numpy()
+        np.testing.assert_array_equal(found, other)
+        with pytest.raises(ValueError, match="the field is"):
+            put(field, np.zeros(other.shape, np.int8))
+        put(field, before)
+    with pytest.raises(ValueError, match="but got"):
+        put(s.table.kind, np.zeros(1, np.int32))
+
+
 def test_views_do_not_overlap(small):
     """Every byte of every array belongs to it alone, and the padding of arrays in lanes lies inside the block."""
     memory = small.sim.memory()

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import textwrap
 
+import numpy as np
 import pytest
 import taichi as ti
 from taichi.lang import kernel_impl
@@ -60,6 +61,29 @@ def test_a_source_is_looked_up_once(monkeypatch):
     assert context_of(halved)[1].src == expected
 
 
+@ti.kernel
+def load(field: ti.template(), values: ti.types.ndarray()):  # type: ignore[valid-type]
+    for i in field:
+        field[i] = values[i]
+
+
+def test_a_source_is_parsed_once_and_serves_kernels_of_other_arguments(monkeypatch):
+    remember_sources()
+    short, long = ti.field(ti.f32, 2), ti.field(ti.i32, 3)
+    load(short, np.array([1.0, 2.0], np.float32))
+    monkeypatch.setattr(ast, "parse", lambda *_: pytest.fail("parsed again"))
+    load(long, np.array([3, 4, 5], np.int32))  # Taichi takes the parameters out of a kernel's tree when it compiles
+    monkeypatch.undo()
+    assert short.to_numpy().tolist() == [1.0, 2.0] and long.to_numpy().tolist() == [3, 4, 5]
+
+
+def test_a_field_tells_where_it_was_declared():
+    remember_sources()
+    place = ti.field(ti.f32, 1).vars[0].declaration_tb
+    assert place.count("\n") == 1
+    assert "test_front_end.py" in place and "test_a_field_tells" in place
+
+
 def test_an_error_still_names_its_line():
     with pytest.raises(
         ti.TaichiCompilationError, match=r'(?s)test_front_end\.py", line \d+, in wrong:.*halved\(unknown_name\).*\^.*unknown_name'
@@ -85,9 +109,12 @@ def test_a_taichi_without_these_names_is_left_alone():
     program = (
         "from taichi.lang import kernel_impl as k\n"
         "from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext as C\n"
-        "del C.get_pos_info, k.getsourcefile, k.getsourcelines, k._inside_class, k.textwrap\n"
+        "from taichi.lang import impl, snode\n"
+        "del C.get_pos_info, k.getsourcefile, k.getsourcelines, k._inside_class, k.textwrap, k.ast\n"
+        "del impl.get_traceback, snode.get_traceback\n"
         "from uuvtai.front_end import remember_sources\n"
         "remember_sources()\n"
-        "assert not any(hasattr(k, n) for n in ('getsourcefile', 'getsourcelines', '_inside_class', 'textwrap'))"
+        "assert not any(hasattr(k, n) for n in ('getsourcefile', 'getsourcelines', '_inside_class', 'textwrap', 'ast'))"
+        "\nassert not any(hasattr(m, 'get_traceback') for m in (impl, snode))"
     )
     subprocess.run([sys.executable, "-c", program], check=True)

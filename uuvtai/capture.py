@@ -83,7 +83,10 @@ class Memory:
     def put(self, field: Any, values: np.ndarray) -> None:
         """Fill a field that is not in lanes; ``values`` has its shape (vectors add a last axis) and dtype."""
         if self.device.type == "cpu":
-            np.copyto(_view(field, False, self.read()), values, casting="no")
+            view = _view(field, False, self.read())
+            if values.shape != view.shape or values.dtype != view.dtype:
+                raise ValueError(f"the field is {view.dtype} {view.shape}, but got {values.dtype} {values.shape}")
+            view[...] = values
         else:
             put_by_kernel(field, values)
 
