@@ -16,7 +16,7 @@ from uuvtai.measure.sweep.run import REQUEST, ROWS
 
 _KILLS = 10
 _LONGEST_S = 16.0
-"""a kill comes at a random moment up to so long after the start, or, every second one, up to half of that after this run has finished a task"""
+"""a kill comes at a random moment up to so long after the start; every second one up to half of that after this run has finished a task"""
 _METHODS = ["--controller", "straight", "--controller", "planner", "--controller", "bt"]
 _SWEEP = ["--grid", "S=4,8", "--grid", "D=0,3,6,9", "--grid", "v=0.4,0.8,1.5,3.0", *_METHODS, "--episodes", "96"]
 """nine tasks, three a method: what a kill loses is the task that runs"""

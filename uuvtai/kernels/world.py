@@ -1,4 +1,4 @@
-"""Scenarios and moving obstacles: everything true about the world as a pure function of (world preset, seed, episode, time).
+"""Scenarios and moving obstacles: all that is true of the world as a pure function of (world preset, seed, episode, time).
 
 Draws of different purposes have keys of their own, so that the number of moving obstacles or their speed changes neither the static
 obstacles nor start and goal, and obstacle i of S is drawn alike for every S. Every search is bounded; where its draws run out,
