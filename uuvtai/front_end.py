@@ -2,8 +2,8 @@
 
 Taichi inlines: it transforms a func's source anew wherever it is called, thousands of times before the first step of a simulator. Each
 time it looks the source up and wraps its lines, which are pure functions of the source; and it words a position that quotes the source for
-every node of the syntax tree, errors or not: a fifth of a warm start. Here the quotation is made when there is an error. Positions are no
-part of what Taichi's cache is asked for, so it finds kernels that were compiled without this.
+every node of the syntax tree, errors or not: a fifth of a warm start. Here the quotation is made when there is an error, a source is
+parsed once, and a field keeps the line that declared it instead of a stack trace. Positions are no part of what Taichi's cache is asked for, so it finds kernels that were compiled without this.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def _parse(source: str) -> ast.Module:
 
 
 def _caller(stacklevel: int = 1) -> str:
-    """Where a field is declared: the frame that asked Taichi for it."""
+    """Where a field is declared: the frame that asked Taichi for it; Taichi's ``stacklevel`` has no meaning here."""
     frame = sys._getframe(1)
     while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("taichi."):
         frame = frame.f_back

@@ -54,8 +54,8 @@ def _curves(cells: list[Cell], axes: dict[str, list[Any]], command: str) -> list
     """Success and collision along the one axis that varies, every method a line."""
     named = varying(axes)
     axis = named[0] if named else next(iter(axes), "")
-    places = list({repr(value): value for cell in cells for value in [cell.get(axis)]}.values())
-    return [_axis_figure(cells, axis, places, list(map(value_name, places)), command), cells_table(cells, "Every cell")]
+    values = list({repr(cell.get(axis)): cell.get(axis) for cell in cells}.values())  # they may be lists
+    return [_axis_figure(cells, axis, values, list(map(value_name, values)), command), cells_table(cells, "Every cell")]
 
 
 def _axis_figure(cells: list[Cell], axis: str, places: list[Any], names: list[str], command: str) -> Figure:
