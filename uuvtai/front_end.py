@@ -3,7 +3,8 @@
 Taichi inlines: it transforms a func's source anew wherever it is called, thousands of times before the first step of a simulator. Each
 time it looks the source up and wraps its lines, which are pure functions of the source; and it words a position that quotes the source for
 every node of the syntax tree, errors or not: a fifth of a warm start. Here the quotation is made when there is an error, a source is
-parsed once, and a field keeps the line that declared it instead of a stack trace. Positions are no part of what Taichi's cache is asked for, so it finds kernels that were compiled without this.
+parsed once, and a field keeps the line that declared it instead of a stack trace. Positions are no part of what Taichi's cache is asked
+for, so it finds kernels that were compiled without this.
 """
 
 from __future__ import annotations
