@@ -20,6 +20,7 @@ from pydantic import BaseModel, ValidationError
 
 from uuvtai.config import Config
 from uuvtai.config.learning import LearningConfig
+from uuvtai.errors import UserError
 
 PRESET_DIR = Path(__file__).parent / "presets"
 KINDS = {
@@ -44,7 +45,7 @@ Overrides = dict[str, Any] | list[str | tuple[str, Any]]
 AnyConfig = TypeVar("AnyConfig", bound=Config)
 
 
-class ConfigError(ValueError):
+class ConfigError(UserError, ValueError):
     """What is wrong, where, why, and what to type next."""
 
 

@@ -16,13 +16,14 @@ from typing import Any
 
 from uuvtai import __version__
 from uuvtai.config import Config
+from uuvtai.errors import UserError
 from uuvtai.loader import to_yaml
 
 _WRITTEN_IN_PLACE = (".lock", "metrics.jsonl")
 """files that a resumed run opens for writing; others are replaced as a whole"""
 
 
-class RunFolderError(RuntimeError):
+class RunFolderError(UserError, RuntimeError):
     """The run folder cannot be made, written or read: what, where, why, what to type next."""
 
 

@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from safetensors import SafetensorError
 
 from uuvtai import __version__
+from uuvtai.errors import UserError
 from uuvtai.learn.packing import PackingError
 
 SCHEMA = 1
@@ -28,7 +29,7 @@ _MAX_BYTES = 8 << 20
 _CHUNK_BYTES = 1 << 20
 
 
-class CheckpointError(RuntimeError):
+class CheckpointError(UserError, RuntimeError):
     """A checkpoint that cannot be used or written: what, where, why, what to type next."""
 
 

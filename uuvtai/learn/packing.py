@@ -10,6 +10,8 @@ import numpy as np
 import torch
 import zstandard
 
+from uuvtai.errors import UserError
+
 Layout = list[tuple[str, str, list[int]]]
 """(name, NumPy dtype, shape) of every array in a stream, in order"""
 
@@ -17,7 +19,7 @@ _LEVEL = 1
 """of zstandard: higher ones save a few per cent of disk and take several times as long"""
 
 
-class PackingError(ValueError):
+class PackingError(UserError, ValueError):
     """Something that cannot be packed, or a packed state that does not fit together."""
 
 

@@ -13,6 +13,8 @@ from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import connection
 from typing import Any, Protocol, TypeVar
 
+from uuvtai.errors import UserError
+
 Item = TypeVar("Item")
 Work = Callable[[Item], Any]
 """a module's function of one picklable argument"""
@@ -21,7 +23,7 @@ ATTEMPTS = 3
 """how often a task is tried that loses its worker"""
 
 
-class EngineError(RuntimeError):
+class EngineError(UserError, RuntimeError):
     """The engine cannot start, or a task cannot be finished: what, where, why, what to type next."""
 
 
