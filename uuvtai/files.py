@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import stat
+from collections.abc import Iterable
 from pathlib import Path
 from typing import BinaryIO
 
@@ -63,6 +64,34 @@ def refuse_links(folder: Path, path: Path) -> None:
         place = place / part
         if place.is_symlink():
             raise FileError(f"{place}: is a link; what a link leads to is not ours to read, write or delete: remove the link")
+
+
+def refuse_output(out: Path, inputs: Iterable[Path], force: bool) -> None:
+    """Raise FileError where ``out`` must not be written: one of ``inputs``, or already there and ``force`` is not set.
+
+    A link, a folder or a device there is refused with ``force`` too, and so is an input by another name.
+    """
+    for given in inputs:
+        if _same(out, given):
+            raise FileError(f"{out}: is what is read here ({given}); give --out another name")
+    try:
+        found = os.lstat(out)
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    if stat.S_ISLNK(found.st_mode):
+        raise FileError(f"{out}: is a link; give --out the name of a new file")
+    if not stat.S_ISREG(found.st_mode):
+        raise FileError(f"{out}: is {_kind(found.st_mode)}; give --out the name of a new file")
+    if not force:
+        raise FileError(f"{out}: is already there; give another --out, or --force to replace it")
+
+
+def _same(one: Path, other: Path) -> bool:
+    """Whether two paths name one file, by whatever links; a name that nothing has yet counts by where it would lie."""
+    try:
+        return one.samefile(other)
+    except OSError:
+        return os.path.realpath(one) == os.path.realpath(other)
 
 
 def _open_below(folder: Path, path: Path) -> int:
