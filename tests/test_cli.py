@@ -100,12 +100,12 @@ def test_bad_usage_is_one_message_and_exit_2(capfd, tmp_path, monkeypatch, argum
 
 @pytest.mark.parametrize("command", ["info", "repair", "video", "picture"])
 @pytest.mark.parametrize("content", [None, b"", b"not a log", b"\x89MCAP0\r\n" + b"\x00" * 40])
-def test_missing_and_corrupt_logs_are_exit_1(capfd, tmp_path, command, content):
+def test_missing_and_corrupt_logs_are_refused(capfd, tmp_path, command, content):
     log = tmp_path / "broken.mcap"
     if content is not None:
         log.write_bytes(content)
     code, _out, err = uuv(capfd, "log", command, str(log))
-    assert code == 1, err
+    assert code == 2, err
     assert "broken.mcap" in err
     assert "Traceback" not in err
     assert {p.name for p in tmp_path.iterdir()} <= {"broken.mcap"}
@@ -275,7 +275,7 @@ def test_an_existing_run_folder_is_never_overwritten(evaluation, capfd):
     before = (folder / "run.json").read_text()
     for command in (["eval", "--episodes", "1"], ["train", "smoke"]):
         code, _, err = uuv(capfd, *command, "--run-dir", str(folder))
-        assert code == 1
+        assert code == 2
         assert "already there and not empty" in err
     assert (folder / "run.json").read_text() == before
 
@@ -285,18 +285,18 @@ def test_a_place_without_room_for_a_run_folder_is_refused_before_anything_is_com
     monkeypatch.setattr("uuvtai.sim.Sim", lambda *_: pytest.fail("compiles"))
     for command in (["eval", "--episodes", "1"], ["train", "smoke"]):
         code, _, err = uuv(capfd, *command, "--run-dir", str(tmp_path / "file/run"))
-        assert code == 1
+        assert code == 2
         assert "Not a directory" in err and "give a folder that can be written: --run-dir DIR" in err
     assert (tmp_path / "file").read_text() == "mine"
 
 
-def test_a_run_folder_that_cannot_be_written_is_exit_1(tmp_path):
+def test_a_run_folder_that_cannot_be_written_is_refused(tmp_path):
     """Nobody, not even root, makes a folder there; that shows only when it is tried."""
     done = subprocess.run(
         [sys.executable, "-m", "uuvtai", "eval", "--episodes", "1", *SmallSim.OPTIONS, "--run-dir", "/proc/nowhere/run"],
         capture_output=True, text=True, check=False, cwd=tmp_path,
     )  # fmt: skip
-    assert done.returncode == 1
+    assert done.returncode == 2
     assert "give a folder that can be written: --run-dir DIR" in done.stderr
     assert "Traceback" not in done.stderr
 

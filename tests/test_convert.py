@@ -177,7 +177,7 @@ def test_the_command(recorded, tmp_path, capfd):
     assert run_cli("log", "convert", recorded, "--out", out) == 0
     assert capfd.readouterr().out == f"{out}: {info(out)['messages']} messages\n"
     whole = out.read_bytes()
-    assert run_cli("log", "convert", recorded, "--out", out) == 1
+    assert run_cli("log", "convert", recorded, "--out", out) == 2
     assert "is already there" in capfd.readouterr().err and out.read_bytes() == whole
 
 

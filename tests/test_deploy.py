@@ -401,7 +401,7 @@ def test_other_weights_with_the_right_sha256_are_exit_3(folder, tmp_path, capfd)
         (["export"], "give the RUN to export", 2),
         (["export", "x", "--check", "y"], "give the RUN to export", 2),
         (["export", "nothing"], "is no trained policy", 2),
-        (["export", "--check", "nothing"], "policy_spec.json: is missing", 1),
+        (["export", "--check", "nothing"], "policy_spec.json: is missing", 2),
     ],
 )
 def test_bad_usage(arguments, says, code, capfd, tmp_path, monkeypatch):
@@ -473,7 +473,7 @@ def test_networks_that_do_not_fit_the_specification(folder, change):
 )
 def test_specifications_are_read_without_trust(folder, text, says, capfd):
     (folder / "policy_spec.json").write_text(text)
-    assert run_cli("export", "--check", folder) == 1
+    assert run_cli("export", "--check", folder) == 2
     assert says in capfd.readouterr().err
 
 

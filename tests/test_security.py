@@ -225,8 +225,8 @@ def test_a_pickle_as_a_checkpoint(here, name, content, capfd):
         (path / name).write_bytes(content(here))
     else:
         forged(path, name, content(here))
-    assert run_cli("export", path) == 1
-    assert run_cli("eval", path) == 1
+    assert run_cli("export", path) == 2
+    assert run_cli("eval", path) == 2
     said = capfd.readouterr().err
     assert name in said and "Traceback" not in said
 
@@ -342,7 +342,7 @@ def lying_npz(path):
 def test_golden_pairs_are_neither_pickles_nor_bombs(folder, make, capfd):
     make(folder / "golden.npz")
     deployed.resigned(folder, "golden.npz", (folder / "golden.npz").read_bytes())
-    assert run_cli("export", "--check", folder) == 1
+    assert run_cli("export", "--check", folder) == 2
     assert "is not the golden pairs" in capfd.readouterr().err
 
 
@@ -355,7 +355,7 @@ def test_files_outside_an_exported_folder_are_never_opened(folder, capfd):
     spec = json.loads((folder / "policy_spec.json").read_text())
     for name in ("../../etc/passwd", "/etc/passwd", "sub/policy.onnx"):
         (folder / "policy_spec.json").write_text(json.dumps(spec | {"files": spec["files"] | {name: "0" * 64}}))
-        assert run_cli("export", "--check", folder) == 1
+        assert run_cli("export", "--check", folder) == 2
         assert "lists other files" in capfd.readouterr().err
 
 
@@ -404,7 +404,7 @@ def test_chunks_that_unfold(here, command, claimed, capfd):
     file.leave()
     (here / "a.mcap").write_bytes((here / "a.mcap.part").read_bytes() + bomb + END)
     (here / "a.mcap.part").unlink()
-    assert run_cli(*command[:2], here / "a.mcap", *command[2:]) == 1
+    assert run_cli(*command[:2], here / "a.mcap", *command[2:]) == 2
     assert "unpack" in capfd.readouterr().err
     assert {path.name for path in here.rglob("*") if path.is_file()} == {"a.mcap"}
 
@@ -501,7 +501,7 @@ def test_images_that_unfold(content, says):
 def test_a_config_within_a_log_is_yaml_without_tags(here, text, capfd):
     pytest.importorskip("mcap_protobuf", reason="needs the extra uuvtai[viz]")
     log_with(here / "a.mcap", attachments=[("config.yaml", text.encode())])
-    assert run_cli("log", "convert", here / "a.mcap") == 1
+    assert run_cli("log", "convert", here / "a.mcap") == 2
     assert "its config.yaml cannot be read" in capfd.readouterr().err
 
 
@@ -512,7 +512,7 @@ def test_names_in_a_log_cannot_steer_the_terminal(here, capfd):
     file.add_metadata("uuv.result", {"outcome": "\x1b[31m[/x]"})
     file.finish()
     assert run_cli("log", "info", here / "a.mcap") == 0
-    assert run_cli("log", "export", here / "a.mcap", "--out", here / "out", "--topic", "\x1b[2J") == 1
+    assert run_cli("log", "export", here / "a.mcap", "--out", here / "out", "--topic", "\x1b[2J") == 2
     told = capfd.readouterr()
     assert not any(bad in told.out + told.err for bad in ("\x1b", "\x07", "\x9b", "\u202e"))
     assert "[link=file:///etc/passwd]" in told.out, "shown as it is, not as a link"

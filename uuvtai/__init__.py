@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, Any
 
+TYPE_CHECKING = False  # without typing, which takes longer to import than this file: signals are not heard before it is done
 if TYPE_CHECKING:
+    from typing import Any
+
     from uuvtai.env import VectorEnv
 
 __version__ = "0.1.0"

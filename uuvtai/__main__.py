@@ -1,5 +1,6 @@
 """``python -m uuvtai`` is ``uuv``."""
 
-from uuvtai.cli import main
+from uuvtai.entry import main
 
-main()
+if __name__ == "__main__":  # the processes of a sweep import this file too, under another name
+    main()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from uuvtai.config import VehicleConfig
+from uuvtai.errors import SettingError
 
 _AXIS_ORDER = (0, 1, 2, 5, 3, 4)
 """Who comes first where a frame cannot command all axes: surge, sway, heave, yaw, then roll, then pitch."""
@@ -22,7 +23,7 @@ def allocation_matrices(vehicle: VehicleConfig) -> tuple[np.ndarray, np.ndarray]
     direction = np.array([t.direction for t in vehicle.thrusters])
     lengths = np.linalg.norm(direction, axis=1, keepdims=True)
     if (lengths < 1e-6).any():
-        raise ValueError(f"vehicle.thrusters.{int(np.argmin(lengths))}.direction is zero: give the way positive thrust pushes")
+        raise SettingError(f"vehicle.thrusters.{int(np.argmin(lengths))}.direction is zero: give the way positive thrust pushes")
     direction = direction / lengths
     wrench_of_thrust = np.vstack([direction.T, np.cross(position, direction).T])
     axes = controllable_axes(wrench_of_thrust)

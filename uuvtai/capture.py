@@ -16,12 +16,17 @@ from typing import Any
 import numpy as np
 import torch
 
+from uuvtai.errors import UserError
 from uuvtai.state import PACKET
 
 _DTYPE = {"f32": "f4", "f64": "f8", "i8": "i1", "u8": "u1", "i16": "i2", "u16": "u2", "i32": "i4", "u32": "u4", "i64": "i8", "u64": "u8"}
 
 Put = Callable[[Any, np.ndarray], None]
 """Fills a field from an array of its shape (vectors add a last axis) and dtype."""
+
+
+class CaptureError(UserError, ValueError):
+    """A captured state that does not fit: it lacks something, is damaged or belongs to another setting."""
 
 
 def put_by_kernel(field: Any, values: np.ndarray) -> None:
@@ -123,14 +128,14 @@ def check_arrays(given: Mapping[str, np.ndarray], wanted: Mapping[str, np.ndarra
     """Raise ValueError unless both hold arrays of the same names, shapes and dtypes."""
     advice = "give what capture() returned in an environment of the same version, config, tree and number of envs"
     if missing := sorted(set(wanted) - set(given)):
-        raise ValueError(f"the captured state lacks {_listed(missing)}; {advice}")
+        raise CaptureError(f"the captured state lacks {_listed(missing)}; {advice}")
     if unknown := sorted(set(given) - set(wanted)):
-        raise ValueError(f"the captured state holds {_listed(unknown)}, which this version does not know; {advice}")
+        raise CaptureError(f"the captured state holds {_listed(unknown)}, which this version does not know; {advice}")
     for name, array in wanted.items():
         got = given[name]
         if not isinstance(got, np.ndarray) or got.shape != array.shape or got.dtype != array.dtype:
             found = f"{got.dtype} {got.shape}" if isinstance(got, np.ndarray) else f"a {type(got).__name__}"
-            raise ValueError(f"the captured array {name!r} is {found}, but {array.dtype} {array.shape} is needed; {advice}")
+            raise CaptureError(f"the captured array {name!r} is {found}, but {array.dtype} {array.shape} is needed; {advice}")
 
 
 def _listed(names: list[str]) -> str:
@@ -140,14 +145,14 @@ def _listed(names: list[str]) -> str:
 def check_setting(given: Any, wanted: str) -> None:
     """Raise ValueError unless ``given``, JSON as bytes, says the same as ``wanted``; the message names what differs."""
     if given is None:
-        raise ValueError("the captured state lacks 'setting': it comes from no capture()")
+        raise CaptureError("the captured state lacks 'setting': it comes from no capture()")
     try:
         before, now = json.loads(bytes(given)), json.loads(wanted)
     except (TypeError, ValueError):
-        raise ValueError("the captured state's 'setting' cannot be read: the file is damaged; use an older one") from None
+        raise CaptureError("the captured state's 'setting' cannot be read: the file is damaged; use an older one") from None
     if differing := _differences(before, now):
         listed = "; ".join(differing[:4]) + (f" and {len(differing) - 4} more" if len(differing) > 4 else "")
-        raise ValueError(f"the captured state is of another setting: {listed}. Make the environment with the config that was captured")
+        raise CaptureError(f"the captured state is of another setting: {listed}. Make the environment with the config that was captured")
 
 
 def _differences(before: Any, now: Any, key: str = "") -> list[str]:

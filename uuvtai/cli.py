@@ -1,7 +1,8 @@
 """The command line ``uuv``: parse, load the preset, call one function, print.
 
-Results go to stdout, progress and messages to stderr. Exit codes: 0 ok, 1 runtime failure, 2 usage or config, 3 a gate was not met,
-130 interrupted. Heavy packages are imported inside the commands, so that ``uuv --help`` is quick.
+Results go to stdout, progress and messages to stderr. Exit codes: 0 ok, 1 failed (a bug of ours, or the machine: a full disk), 2 refused,
+with what to type instead, 3 a gate was not met, 130 or 143 interrupted (SIGINT, SIGTERM). Heavy packages are imported inside the commands,
+so that ``uuv --help`` is quick.
 """
 
 from __future__ import annotations
@@ -9,9 +10,7 @@ from __future__ import annotations
 import gc
 import json
 import math
-import os
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,12 +20,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from uuvtai import __version__
-
-OK, FAILED, USAGE, GATE, INTERRUPTED = 0, 1, 2, 3, 130
-
-UsageError: Any = typer.BadParameter.__base__
-"""Typer carries its own copy of click from 0.26 on, so the class is taken from what Typer exports."""
+from uuvtai import __version__, signals
+from uuvtai.endings import FAILED, GATE, UsageError, guarded, plain
+from uuvtai.endings import say as _say
 
 app = typer.Typer(
     name="uuv",
@@ -201,7 +197,7 @@ def _print_methods(result: dict[str, Any]) -> None:
         _print_remainder(part)
     for m in result["methods"]:
         if m["privileged"]:
-            _stdout().print(f"[dim]{_DAGGER} {m['name']} is privileged: {_privilege(m['name'])}[/dim]", highlight=False)
+            _stdout().print(f"{_DAGGER} {m['name']} is privileged: {_privilege(m['name'])}", style="dim", highlight=False)
 
 
 def _print_remainder(part: dict[str, Any]) -> None:
@@ -271,9 +267,10 @@ def _print_causes(result: dict[str, Any]) -> None:
         _stdout().print(table)
         for c in m["causes"]:
             remarks = ", ".join(f"{k} {remark}" for remark, k in c["remarks"].items() if k >= _REMARKABLE_SHARE * c["count"])
-            _stdout().print(f"[bold]{c['label']}[/bold]: {c['meaning']}{f' [dim]({remarks})[/dim]' if remarks else ''}", highlight=False)
+            remark = (f" ({remarks})", "dim") if remarks else ""
+            _stdout().print(Text.assemble((c["label"], "bold"), f": {c['meaning']}", remark))
     if any(m["explain"] for m in result["methods"]):
-        _stdout().print(f"[dim]{_CAUSES_LEGEND}[/dim]", highlight=False)
+        _stdout().print(_CAUSES_LEGEND, style="dim", highlight=False)
 
 
 _REMARKABLE_SHARE = 0.2
@@ -376,7 +373,7 @@ class _Training:
         if sys.stderr.isatty():
             from rich.live import Live
 
-            self._live = Live(console=Console(stderr=True), refresh_per_second=4, transient=False)
+            self._live = Live(console=_stderr(), refresh_per_second=4, transient=False)
             self._live.start()
 
     def note(self, text: str) -> None:
@@ -726,7 +723,7 @@ def reproduce(
         table.add_column(head, overflow="fold")
     for claim in result["claims"]:
         color = {"holds": "green", "does not hold": "red"}.get(claim["verdict"], "yellow")
-        table.add_row(claim["text"], claim["theirs"], claim["ours"], f"[{color}]{claim['verdict']}[/]")
+        table.add_row(claim["text"], claim["theirs"], claim["ours"], Text(claim["verdict"], style=color))
     _stdout().print(table, highlight=False)
     _say(f"run folder: {folder}")
 
@@ -822,7 +819,7 @@ def presets(
             _print_json(found)
             return
         for kind, names in found.items():
-            _stdout().print(f"[bold]{kind}[/bold]  {', '.join(names) or '-'}")
+            _stdout().print(Text.assemble((kind, "bold"), f"  {', '.join(names) or '-'}"))
         return
     if action != "show" or not name:
         raise UsageError("write 'uuv presets' or 'uuv presets show NAME'")
@@ -880,9 +877,8 @@ def doctor(as_json: AsJson = False) -> None:
         _print_json({"ok": all(c["ok"] for c in found), "checks": found})
     else:
         for c in found:
-            _stdout().print(
-                f"[{'green' if c['ok'] else 'red'}]{'ok ' if c['ok'] else 'BAD'}[/] {c['name']}: {c['detail']}", highlight=False
-            )
+            verdict = ("ok ", "green") if c["ok"] else ("BAD", "red")
+            _stdout().print(Text.assemble(verdict, f" {c['name']}: {c['detail']}"))
     if not all(c["ok"] for c in found):
         raise typer.Exit(FAILED)
 
@@ -1043,16 +1039,11 @@ def _print_json(document: Any) -> None:
 
 def _stdout() -> Console:
     # a pipe has no width: wide enough that no column is cut
-    return Console(width=None if sys.stdout.isatty() else 160)
+    return Console(width=None if sys.stdout is not None and sys.stdout.isatty() else 160, markup=False)
 
 
-def _say(text: str) -> None:
-    typer.echo(plain(text), err=True)
-
-
-def plain(text: str) -> str:
-    """Text that a file may have brought along, without what would steer the terminal."""
-    return "".join(c if c.isprintable() or c in "\n\t" else "?" for c in text)
+def _stderr() -> Console:
+    return Console(stderr=True, markup=False)
 
 
 class _Progress:
@@ -1075,14 +1066,14 @@ class _Progress:
             from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
             self._bar = Progress(
-                TextColumn("{task.description}"),
+                TextColumn("{task.description}", markup=False),
                 BarColumn(),
                 MofNCompleteColumn(),
                 TimeElapsedColumn(),
                 TextColumn("ETA"),
                 TimeRemainingColumn(),
-                TextColumn("{task.fields[rate]}"),
-                console=Console(stderr=True),
+                TextColumn("{task.fields[rate]}", markup=False),
+                console=_stderr(),
                 transient=True,
             )
             self._bar.start()
@@ -1113,42 +1104,20 @@ class _Progress:
 
 
 @app.callback(invoke_without_command=True)
-def _root(version: Annotated[bool, typer.Option("--version", help="Print the version and leave.")] = False) -> None:
+def _root(ctx: typer.Context, version: Annotated[bool, typer.Option("--version", help="Print the version and leave.")] = False) -> None:
     if version:
         typer.echo(__version__)
         raise typer.Exit
+    if ctx.invoked_subcommand in ("report", "export", "log", "doctor"):  # others have nothing to tidy up before they have a run folder
+        signals.engage()
     gc.set_threshold(50_000, 50, 1000)  # building kernels makes millions of objects, few of them garbage: half a second of a start
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Entry point: run a command and turn errors into one message and an exit code."""
-    sys.exit(_guarded(lambda: app(args=arguments, prog_name="uuv", standalone_mode=False)))
-
-
-def _guarded(run: Callable[[], Any]) -> int:
-    try:
-        code = run()
-        if code == INTERRUPTED:  # Typer turns Ctrl-C into this
-            _say("interrupted")
-        return code if isinstance(code, int) else OK
-    except UsageError.__base__ as error:
-        error.show()
-        return USAGE
-    except (KeyboardInterrupt, typer.Abort):
-        return _told("interrupted", INTERRUPTED)
-    except BrokenPipeError:
-        # the reader of our output has gone (| head): not an error of ours
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return OK
-    except (ValueError, MemoryError) as error:
-        return _told(f"uuv: {error}", USAGE)
-    except (RuntimeError, OSError) as error:
-        return _told(f"uuv: {error}", FAILED)
-
-
-def _told(text: str, code: int) -> int:
-    _say(text)
-    return code
+    """Run a command and leave with its exit code. ``uuv`` itself begins in ``uuvtai.entry``."""
+    code = guarded(lambda: app(args=arguments, prog_name="uuv", standalone_mode=False))
+    signals.finish(code)
+    sys.exit(code)
 
 
 if __name__ == "__main__":

@@ -259,6 +259,8 @@ class VectorEnv:
     def _check_action(self, action: torch.Tensor) -> None:
         if not isinstance(action, torch.Tensor) or action.dtype != torch.float32:
             raise TypeError(f"action must be a float32 torch tensor, got {_described(action)}; use torch.as_tensor(action).float()")
+        if action.layout != torch.strided:
+            raise TypeError(f"action must be a dense tensor, got one of layout {action.layout}; use action.to_dense()")
         if action.shape != (self.num_envs, NUM_ACTIONS):
             raise ValueError(f"action must have shape ({self.num_envs}, {NUM_ACTIONS}), got {_described(action)}")
         if action.device.type != self.device.type:

@@ -5,3 +5,15 @@ from __future__ import annotations
 
 class UserError(Exception):
     """A refusal: what is wrong, where, why, and what to type next. The command line prints it as one message and ends with exit code 2."""
+
+
+class SettingError(UserError, ValueError):
+    """A value that was typed, or that stands in a config, cannot be used."""
+
+
+class SizeError(UserError, MemoryError):
+    """What was asked for does not fit the memory or any array."""
+
+
+class DeviceError(UserError, RuntimeError):
+    """The device that was asked for is not here or cannot be had."""

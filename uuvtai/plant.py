@@ -10,6 +10,7 @@ import taichi as ti
 from uuvtai import state
 from uuvtai.allocation import allocation_matrices
 from uuvtai.config import Config
+from uuvtai.errors import SettingError
 from uuvtai.kernels import actuation, dynamics
 from uuvtai.runtime import Runtime
 
@@ -109,4 +110,4 @@ def check_thruster_index(config: Config) -> None:
     """ValueError where ``disturbance.dead_thruster`` names a thruster that the vehicle does not have."""
     dead, count = config.disturbance.dead_thruster, len(config.vehicle.thrusters)
     if dead is not None and dead >= count:
-        raise ValueError(f"disturbance.dead_thruster is {dead}, but the vehicle has thrusters 0 to {count - 1}")
+        raise SettingError(f"disturbance.dead_thruster is {dead}, but the vehicle has thrusters 0 to {count - 1}")

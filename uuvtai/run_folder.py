@@ -14,7 +14,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from uuvtai import __version__
+from uuvtai import __version__, signals
 from uuvtai.config import Config
 from uuvtai.errors import UserError
 from uuvtai.loader import to_yaml
@@ -100,6 +100,7 @@ class RunFolder:
             raise RunFolderError(f"{self.path}: another process is working in this folder; wait for it, or stop it") from None
 
     def _open_lock(self) -> None:
+        signals.engage()
         self._lock = (self.path / ".lock").open("w")
 
     def write(self, name: str, text: str) -> Path:
@@ -126,7 +127,7 @@ class RunFolder:
             yield
             status, code = "finished", 0
         except KeyboardInterrupt:
-            status, code = "interrupted", 130
+            status, code = "interrupted", signals.exit_code()
             raise
         finally:
             self.finish(status, code)
@@ -142,6 +143,7 @@ class RunFolder:
 
 def write_atomic(target: Path, content: bytes) -> None:
     """Write to a temporary neighbour, flush it to disk, rename; on any error nothing is left behind."""
+    signals.engage()
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
     try:

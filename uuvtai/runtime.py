@@ -12,6 +12,8 @@ from pathlib import Path
 import taichi as ti
 from taichi.lang.impl import default_cfg
 
+from uuvtai.errors import DeviceError, SettingError
+
 
 @dataclass(frozen=True)
 class Runtime:
@@ -33,6 +35,8 @@ _started: list[Runtime] = []
 _LOCKED_S = 60.0
 """Taichi locks its cache by a file, for as long as it reads or writes there: one older than this belongs to a process that was killed"""
 
+_MAX_THREADS = 1024
+
 _CACHE_BYTES = 1 << 30
 """Taichi's own limit, 100 MB, is about twelve sizes of simulator (6 to 9 MB each): a sweep and a training push each other's kernels out"""
 
@@ -47,7 +51,7 @@ def start_taichi(device: str = "cpu", precision: str = "f32", fast_math: bool = 
     """Start Taichi on ``device`` ('auto', 'cpu' or 'cuda'), or return the runtime that is already up.
 
     A second ``ti.init`` would destroy every field, so a process has one runtime; asking for another kind is an error.
-    ``UUV_NUM_THREADS`` bounds the CPU threads. Raises RuntimeError where the device is missing.
+    ``UUV_NUM_THREADS`` bounds the CPU threads. Raises DeviceError where the device is missing, SettingError for others.
     """
     wanted = Runtime(_resolved(device), precision)
     if _started:
@@ -59,7 +63,7 @@ def start_taichi(device: str = "cpu", precision: str = "f32", fast_math: bool = 
             lock.unlink()
     options = {}
     if threads := os.environ.get("UUV_NUM_THREADS"):
-        options["cpu_max_num_threads"] = int(threads)
+        options["cpu_max_num_threads"] = _thread_count(threads)
     with contextlib.redirect_stdout(sys.stderr):  # Taichi greets on stdout, which belongs to results
         ti.init(
             arch=ti.cuda if wanted.device == "cuda" else ti.cpu,
@@ -75,6 +79,17 @@ def start_taichi(device: str = "cpu", precision: str = "f32", fast_math: bool = 
     return wanted
 
 
+def _thread_count(text: str) -> int:
+    """Number of threads that ``UUV_NUM_THREADS`` asks for. Raises SettingError."""
+    try:
+        count = int(text)
+    except ValueError:
+        count = 0
+    if not 1 <= count <= _MAX_THREADS:
+        raise SettingError(f"UUV_NUM_THREADS={text!r}: must be a whole number of CPU threads from 1 to {_MAX_THREADS}; unset it to use all")
+    return count
+
+
 def _resolved(device: str) -> str:
     if device == "cpu":
         return "cpu"
@@ -84,6 +99,6 @@ def _resolved(device: str) -> str:
         return "cuda" if torch.cuda.is_available() else "cpu"
     if device == "cuda":
         if not torch.cuda.is_available():
-            raise RuntimeError("--device cuda: torch sees no CUDA device here; use --device cpu")
+            raise DeviceError("--device cuda: torch sees no CUDA device here; use --device cpu")
         return "cuda"
-    raise ValueError(f"unknown device {device!r}: use auto, cpu or cuda")
+    raise SettingError(f"unknown device {device!r}: use auto, cpu or cuda")

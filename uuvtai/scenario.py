@@ -12,6 +12,7 @@ import taichi as ti
 
 from uuvtai.capture import Put, put_by_kernel
 from uuvtai.config import FixedObstacle, WorldConfig
+from uuvtai.errors import SettingError, UserError
 from uuvtai.kernels.geometry import BOX, CYLINDER, NONE, SPHERE
 from uuvtai.kernels.layout import COARSE_M, FAULT_ENDPOINTS, FAULT_JOINED, FAULT_STATIC
 from uuvtai.kernels.paths import FAULT_MOVING
@@ -29,6 +30,10 @@ FAULTS = {
     FAULT_JOINED: "no layout joins start and goal by free space: ask for fewer static obstacles or a smaller static.joined_clearance_m",
     FAULT_MOVING: "a moving obstacle finds no path within the walls and away from the start: shrink its size, path or start_gap_m",
 }
+
+
+class SceneError(UserError, RuntimeError):
+    """Scenarios that cannot be placed: how many, why, and what to change."""
 
 
 @dataclass(frozen=True)
@@ -106,13 +111,13 @@ Scene = tuple[int, int, float]
 
 
 def set_scenes(scene: SceneState, world: WorldConfig, scenes: Sequence[Scene], put: Put = put_by_kernel) -> None:
-    """Deal the scenes out to the envs in turn, for their next scenarios. ValueError where one does not fit the slots of ``world``."""
+    """Deal the scenes out to the envs in turn, for their next scenarios. SettingError where one does not fit the slots of ``world``."""
     for n_static, n_dynamic, speed_m_s in scenes:
         for name, wanted, slots in (("static", n_static, world.static_slots), ("dynamic", n_dynamic, world.dynamic_slots)):
             if not 0 <= wanted <= slots:
-                raise ValueError(f"{wanted} {name} obstacles do not fit {slots} slots: set world.{name}_capacity to at least {wanted}")
+                raise SettingError(f"{wanted} {name} obstacles do not fit {slots} slots: set world.{name}_capacity to at least {wanted}")
         if not (math.isfinite(speed_m_s) and speed_m_s >= 0):
-            raise ValueError(f"the obstacles' speed must be finite and not negative, got {speed_m_s}")
+            raise SettingError(f"the obstacles' speed must be finite and not negative, got {speed_m_s}")
     dealt = np.resize(np.array(scenes, dtype=np.float32), (scene.n_static.shape[0], 3))
     put(scene.n_static, dealt[:, 0].astype(np.int32))
     put(scene.n_dynamic, dealt[:, 1].astype(np.int32))
@@ -120,12 +125,12 @@ def set_scenes(scene: SceneState, world: WorldConfig, scenes: Sequence[Scene], p
 
 
 def check_scenarios(faults: np.ndarray) -> None:
-    """Raise RuntimeError where a scenario could not be placed as asked; ``faults`` is ``WorldState.faults`` of the rows just drawn."""
+    """Raise SceneError where a scenario could not be placed as asked; ``faults`` is ``WorldState.faults`` of the rows just drawn."""
     bad = np.flatnonzero(faults)
     if len(bad) == 0:
         return
     reasons = [text for bit, text in FAULTS.items() if np.any(faults & bit)]
-    raise RuntimeError(f"{len(bad)} of {len(faults)} scenarios cannot be placed: " + "; ".join(reasons))
+    raise SceneError(f"{len(bad)} of {len(faults)} scenarios cannot be placed: " + "; ".join(reasons))
 
 
 Read = Callable[[ti.Field], np.ndarray]

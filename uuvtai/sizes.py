@@ -9,8 +9,11 @@ from pathlib import Path
 
 from uuvtai import state
 from uuvtai.config import Config
+from uuvtai.errors import SettingError, SizeError
+from uuvtai.kernels import clearance
 from uuvtai.kernels.grid import grid_shape
 from uuvtai.kernels.lanes import LANES
+from uuvtai.kernels.mapping import map_period_s, scans_in
 from uuvtai.kernels.plan_codes import N_PLANNER, N_REASON, N_TRIGGER
 from uuvtai.kernels.reward import TERMS
 from uuvtai.scenario import scenario_sizes
@@ -69,18 +72,40 @@ def memory_bytes(config: Config, n_env: int, device: str = "cpu") -> int:
 
 
 def check_size(config: Config, n_env: int, device: str) -> None:
-    """Refuse sizes that cannot work before anything is allocated: ValueError or MemoryError with the estimate and what to type."""
+    """Refuse sizes that cannot work before anything is allocated: SettingError or SizeError with the estimate and what to type."""
     if n_env < 1:
-        raise ValueError(f"--num-envs {n_env}: at least 1 env is needed, for example --num-envs 64")
+        raise SettingError(f"--num-envs {n_env}: at least 1 env is needed, for example --num-envs 64")
     if n_env > _MAX_ENVS:
-        raise MemoryError(f"--num-envs {n_env}: more than {_MAX_ENVS} envs are not supported; use a smaller number")
+        raise SizeError(f"--num-envs {n_env}: more than {_MAX_ENVS} envs are not supported; use a smaller number")
     needed, free = memory_bytes(config, n_env, device), free_memory_bytes(device)
     if free is not None and needed > 0.9 * free:
-        fitting = max(1, int(n_env * 0.9 * free / needed))
-        raise MemoryError(
+        raise SizeError(
             f"--num-envs {n_env} needs about {needed / 2**30:.1f} GiB, {free / 2**30:.1f} GiB are free on {device}: "
-            f"use --num-envs {fitting} or fewer"
+            f"{_smaller(config, n_env, device, free)}"
         )
+    _check_kernels(config)
+
+
+def _smaller(config: Config, n_env: int, device: str, free: int) -> str:
+    """What to type where the memory is too small."""
+    alone = memory_bytes(config, 1, device)
+    if alone > 0.9 * free:
+        return "not even one env fits; make the map coarser (--set mapping.cell_m=...), the tank smaller, or free memory"
+    fitting = int(n_env * 0.9 * free / memory_bytes(config, n_env, device))
+    while fitting > 1 and memory_bytes(config, fitting, device) > 0.9 * free:  # what all envs share takes its part too
+        fitting = fitting * 9 // 10
+    return f"use --num-envs {max(1, fitting)} or fewer"
+
+
+def _check_kernels(config: Config) -> None:
+    """SettingError for what the kernels' counters and keys cannot hold; else Taichi would say so, in the middle of compiling."""
+    mapping, sensors = config.mapping, config.sensors
+    try:
+        clearance.offset_bits(config.clearance, mapping)
+        for seconds in (mapping.free_confident_s, mapping.promote_s):
+            scans_in(seconds, map_period_s(mapping, sensors.sonar, config.episode))
+    except ValueError as error:
+        raise SettingError(str(error)) from None
 
 
 def free_memory_bytes(device: str) -> int | None:

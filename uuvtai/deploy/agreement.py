@@ -13,10 +13,15 @@ import torch
 from uuvtai.deploy import run_policy
 from uuvtai.deploy.golden import TOLERANCE, Arrays, inputs_of
 from uuvtai.deploy.graph import OUTPUTS, OneDecision
+from uuvtai.errors import UserError
 
 RUNTIME = "onnxruntime"
 _BRANCHES = ("Loop", "Scan", "If", "SequenceMap")
 """operators that hold graphs of their own"""
+
+
+class GraphError(UserError, RuntimeError):
+    """policy.onnx is no graph of ours, or ONNX Runtime cannot use it."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +75,7 @@ def of_onnx(graph: bytes, golden: Arrays) -> Agreement:
         names = [output.name for output in session.get_outputs()]
         outputs = [np.asarray(output) for output in session.run(names, inputs_of(golden))]
     except Exception as error:  # its own errors share no base class beyond this
-        raise RuntimeError(f"policy.onnx: ONNX Runtime cannot use it ({error}); export the policy again") from None
+        raise GraphError(f"policy.onnx: ONNX Runtime cannot use it ({error}); export the policy again") from None
     inputs = inputs_of(golden)
     rows = [{name: array[i : i + 1] for name, array in inputs.items()} for i in range(len(inputs["obs"]))]
     found = _differences(dict(zip(names, outputs, strict=True)), golden)
@@ -89,12 +94,12 @@ def _refuse_strange(graph: bytes) -> None:
     try:
         model = onnx.load_from_string(graph)
     except Exception as error:  # protobuf's own, which this package does not import
-        raise RuntimeError(f"policy.onnx: is no ONNX graph ({error}); export the policy again") from None
+        raise GraphError(f"policy.onnx: is no ONNX graph ({error}); export the policy again") from None
     strange = {f"{node.domain or 'onnx'}.{node.op_type}" for node in model.graph.node if node.domain or node.op_type in _BRANCHES}
     strange |= {tensor.name for tensor in model.graph.initializer if tensor.external_data}
     strange |= {function.name for function in model.functions}
     if strange:
-        raise RuntimeError(f"policy.onnx: was not written by uuv export, it has {', '.join(sorted(strange)[:5])}; export the policy again")
+        raise GraphError(f"policy.onnx: was not written by uuv export, it has {', '.join(sorted(strange)[:5])}; export the policy again")
 
 
 def _differences(found: Arrays, golden: Arrays) -> dict[str, float]:

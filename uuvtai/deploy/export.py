@@ -22,16 +22,21 @@ from uuvtai.deploy.graph import OneDecision, missing_packages, onnx_bytes
 from uuvtai.deploy.run_policy import GOLDEN, SPEC, WEIGHTS, PolicyError
 from uuvtai.deploy.spec import ONNX, specification
 from uuvtai.deploy.weights import weights_of
+from uuvtai.errors import UserError
 from uuvtai.learn.checkpoint import Checkpoint
 from uuvtai.learn.pilot import load_pilot
 from uuvtai.loader import ConfigError
 from uuvtai.logs.container import sync_folder
-from uuvtai.run_folder import write_atomic
+from uuvtai.run_folder import RunFolderError, write_atomic
 
 Note = Callable[[str], None]
 
 EXTRA = "uuvtai[export]"
 """extra that brings ONNX"""
+
+
+class ExportError(UserError, PolicyError):
+    """What a folder lacks to be an exported policy (``run_policy.PolicyError``, whose module knows nothing of this package)."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +62,7 @@ class Export:
 def export(checkpoint: Checkpoint, name: str, out: Path, evaluations: Iterable[Path], note: Note) -> Export:
     """Write the policy of a checkpoint into a new folder ``out``; ``note`` is told what it lacks.
 
-    Raises ConfigError for a place that is taken, CheckpointError for networks that cannot drive, RuntimeError where the disk refuses.
+    Raises ConfigError for a place that is taken, CheckpointError for networks that cannot drive, RunFolderError where the disk refuses.
     """
     _refuse_place(out)
     pilot, rows = load_pilot(checkpoint, 1), evaluations_of(checkpoint, evaluations)
@@ -80,12 +85,15 @@ def export(checkpoint: Checkpoint, name: str, out: Path, evaluations: Iterable[P
 def check(folder: Path, note: Note) -> Export:
     """Verify the sha256 of every file of an exported policy and replay its golden pairs; nothing in it is executed.
 
-    Raises PolicyError for a folder that is no exported policy.
+    Raises ExportError for a folder that is no exported policy.
     """
-    spec = run_policy.read_spec(folder)
-    if damages := run_policy.changed_files(folder, spec):
-        return Export(folder, (), tuple(damages))
-    return Export(folder, tuple(_replayed(folder, spec, note)))
+    try:
+        spec = run_policy.read_spec(folder)
+        if damages := run_policy.changed_files(folder, spec):
+            return Export(folder, (), tuple(damages))
+        return Export(folder, tuple(_replayed(folder, spec, note)))
+    except PolicyError as error:
+        raise ExportError(str(error)) from None
 
 
 def _replayed(folder: Path, spec: dict[str, Any], note: Note) -> list[Agreement]:
@@ -109,7 +117,7 @@ def _refuse_place(out: Path) -> None:
 
 
 def _publish(out: Path, files: dict[str, bytes], spec: dict[str, Any]) -> None:
-    """Write everything into a neighbour, flush it, give it its name. Raises RuntimeError."""
+    """Write everything into a neighbour, flush it, give it its name. Raises RunFolderError."""
     spec = spec | {"files": {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}}
     text = json.dumps(spec, indent=1, allow_nan=False) + "\n"
     partial = out.with_name(f".{out.name}.{os.getpid()}.partial")
@@ -120,6 +128,6 @@ def _publish(out: Path, files: dict[str, bytes], spec: dict[str, Any]) -> None:
         partial.rename(out)
         sync_folder(out.parent)
     except OSError as error:
-        raise RuntimeError(f"{out}: cannot be written ({error.strerror}); give a folder that can be: --out DIR") from None
+        raise RunFolderError(f"{out}: cannot be written ({error.strerror}); give a folder that can be: --out DIR") from None
     finally:
         shutil.rmtree(partial, ignore_errors=True)

@@ -14,6 +14,7 @@ import torch
 from torch import nn
 
 from uuvtai.config.learning import DistillConfig
+from uuvtai.errors import SettingError
 
 MAX_WEIGHT_RATIO = 4.0
 """a sample counts at most this many times the mean signal, and at least its inverse, before the weights' mean is made one"""
@@ -51,9 +52,9 @@ Weighting = Literal["none", "uncertainty", "risk"]
 def check_weighting(kind: Weighting, has_world_model: bool, has_risk: bool) -> None:
     """Raise ValueError for a ``distill.weighting`` whose signal this run does not have."""
     if kind == "risk" and not has_risk:
-        raise ValueError("distill.weighting=risk needs the risk head: set risk.enabled=true, or distill.weighting=none")
+        raise SettingError("distill.weighting=risk needs the risk head: set risk.enabled=true, or distill.weighting=none")
     if kind == "uncertainty" and not has_world_model:
-        raise ValueError("distill.weighting=uncertainty needs the world model: set world_model.enabled=true, or distill.weighting=none")
+        raise SettingError("distill.weighting=uncertainty needs the world model: set world_model.enabled=true, or distill.weighting=none")
 
 
 def weights_of(kind: Weighting, uncertainty: torch.Tensor, risk: torch.Tensor | None) -> torch.Tensor:

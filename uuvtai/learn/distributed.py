@@ -14,6 +14,8 @@ from dataclasses import dataclass
 import torch
 import torch.distributed as dist
 
+from uuvtai.errors import DeviceError
+
 SEED_STRIDE = 1_000_003
 """between the env seeds of neighbouring ranks: a prime far above the seeds that people type, so that streams of scenarios stay apart"""
 _SEEDS = 2**31
@@ -105,7 +107,7 @@ def claim_gpu(environ: MutableMapping[str, str] = os.environ) -> None:
         return
     gpus = visible.split(",")
     if int(local) >= len(gpus):
-        raise RuntimeError(
+        raise DeviceError(
             f"process {local} of this machine has no GPU: CUDA_VISIBLE_DEVICES={visible} names {len(gpus)}; "
             f"type torchrun --nproc-per-node={len(gpus)}"
         )

@@ -7,11 +7,13 @@ from collections.abc import Callable, Sequence
 
 import torch
 
+from uuvtai.errors import UserError
+
 PREFIX = "non_finite/"
 """of the metrics that count what was replaced; they are there only when something was"""
 
 
-class TrainingError(RuntimeError):
+class TrainingError(UserError, RuntimeError):
     """Training cannot go on: what is wrong, since when, and what to type next."""
 
 

@@ -9,6 +9,7 @@ import torch
 from torch import nn
 
 from uuvtai.config.learning import PolicyConfig
+from uuvtai.errors import SettingError
 from uuvtai.learn.mlp import mlp
 from uuvtai.learn.normalise import Moments, RunningNorm
 
@@ -59,12 +60,12 @@ class Policy(nn.Module):
         """``teacher_slice``: columns of x with the teacher's action; ValueError where a residual policy has none."""
         super().__init__()
         if config.residual and (teacher_slice is None or len(range(n_in)[teacher_slice]) != num_actions):
-            raise ValueError(
+            raise SettingError(
                 f"policy.residual adds to the teacher's {num_actions} commands, but the observation has no such columns "
                 f"(got {teacher_slice}): set features.teacher=true or policy.residual=false"
             )
         if config.initial_std < config.min_std:
-            raise ValueError(f"policy.initial_std {config.initial_std:g} lies below the floor policy.min_std {config.min_std:g}")
+            raise SettingError(f"policy.initial_std {config.initial_std:g} lies below the floor policy.min_std {config.min_std:g}")
         self.config, self.n_in, self.teacher_slice = config, n_in, teacher_slice
         self.actor = mlp((n_in, *config.hidden, num_actions), config.activation, generator, 0.0 if config.residual else _MEAN_GAIN)
         self.critic = mlp((n_in, *config.hidden, 1), config.activation, generator, _VALUE_GAIN)

@@ -15,6 +15,7 @@ from typing import Any
 import torch
 
 from uuvtai.config.learning import PpoConfig
+from uuvtai.errors import SettingError
 from uuvtai.learn.distill import Reduce, imitation_error
 from uuvtai.learn.normalise import Moments, moments_of
 from uuvtai.learn.passes import Passes
@@ -135,7 +136,7 @@ class Ppo:
         """
         batch, metrics = self._prepared(rollout)
         if self.config.minibatches > len(batch.valid):
-            raise ValueError(
+            raise SettingError(
                 f"ppo.minibatches={self.config.minibatches}, but a rollout has only {len(batch.valid)} samples: "
                 "raise ppo.rollout_steps or train.num_envs"
             )

@@ -16,6 +16,7 @@ import torch.nn.functional as fn
 from torch import Tensor, nn
 
 from uuvtai.config.learning import RiskConfig
+from uuvtai.errors import SettingError
 from uuvtai.learn.calibration import brier, expected_calibration_error
 from uuvtai.learn.guard import guarded_step
 from uuvtai.learn.mlp import mlp
@@ -126,7 +127,7 @@ class RiskMemory:
     def __init__(self, horizon_steps: int, stride: int = STRIDE) -> None:
         """``horizon_steps``: steps of a rollout that make up the horizon; ``stride``: steps between the moments."""
         if horizon_steps < 1:
-            raise ValueError(f"the risk horizon must be at least one step of a rollout, got {horizon_steps}: raise risk.horizon_s")
+            raise SettingError(f"the risk horizon must be at least one step of a rollout, got {horizon_steps}: raise risk.horizon_s")
         self.horizon_steps, self.stride = horizon_steps, stride
         self.x: list[Tensor] = []
         """(N, n_in) inputs of the moments that wait, oldest first"""

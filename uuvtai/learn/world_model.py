@@ -14,6 +14,7 @@ import torch.nn.functional as fn
 from torch import Tensor, nn
 
 from uuvtai.config.learning import WorldModelConfig
+from uuvtai.errors import SettingError
 from uuvtai.learn.calibration import coverage, mean_squared_standardised_residual
 from uuvtai.learn.guard import guarded_step
 from uuvtai.learn.mlp import mlp
@@ -70,7 +71,7 @@ class WorldModel(nn.Module):
         """``n_obs`` columns of the observation, at least 24 (ValueError); initial weights come from the CPU ``generator``."""
         super().__init__()
         if n_obs < N_TARGET:
-            raise ValueError(f"the world model predicts the first {N_TARGET} columns of the observation, but it has only {n_obs}")
+            raise SettingError(f"the world model predicts the first {N_TARGET} columns of the observation, but it has only {n_obs}")
         self.n_obs, self.config = n_obs, config
         self.encoder = mlp((n_obs, *config.hidden, config.latent), "elu", generator)
         self.dynamics = mlp((config.latent + N_ACTION, *config.hidden, config.latent), "elu", generator)

@@ -58,8 +58,10 @@ def save_image(image: np.ndarray, out: Path) -> Path:
         part.write_bytes(cv2.imencode(".png", image)[1].tobytes())
         os.replace(part, out)
     except OSError as error:
-        part.unlink(missing_ok=True) if part.parent.is_dir() else None
         raise LogError(f"{out}: cannot write the picture ({error.strerror}); choose another place with --out FILE") from error
+    finally:
+        if part.parent.is_dir():
+            part.unlink(missing_ok=True)
     return out
 
 

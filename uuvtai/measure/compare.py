@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from uuvtai.config import Config
+from uuvtai.errors import SettingError
 from uuvtai.loader import ConfigError
 from uuvtai.run_folder import RunFolder, default_run_dir, refuse_place
 
@@ -75,7 +76,7 @@ def compare(request: Request, watch: Watch) -> tuple[dict[str, Any], Path]:
     CheckpointError.
     """
     if request.num_envs is not None and request.num_envs < 1:
-        raise ValueError(f"--num-envs {request.num_envs}: at least 1 env is needed, for example --num-envs 64")
+        raise SettingError(f"--num-envs {request.num_envs}: at least 1 env is needed, for example --num-envs 64")
     if len(set(request.seeds)) != len(request.seeds):
         raise ConfigError(f"--seeds {','.join(map(str, request.seeds))}: a seed is given twice; its episodes would be the same")
     run_dir = request.run_dir or default_run_dir(request.world)

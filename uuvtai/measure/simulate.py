@@ -9,8 +9,14 @@ from typing import Any
 import numpy as np
 
 from uuvtai.config import Config
+from uuvtai.errors import SettingError, UserError
 from uuvtai.plant import Plant
 from uuvtai.runtime import Runtime, start_taichi
+
+
+class DivergenceError(UserError, FloatingPointError):
+    """The integration left the finite numbers: its substep is too long for what acts on the vehicle."""
+
 
 CONTROL_DT_S = 0.02
 """Samples are this far apart, or one substep where that is longer."""
@@ -44,7 +50,7 @@ def simulate(
     ``wrench`` is a constant body-frame force and moment on top of the thrusters, which are off unless ``command`` (body velocity and yaw
     rate) drives them through the inner loop; ``dt`` is the substep; ``neutral`` sets buoyancy equal to weight. Starts Taichi in double
     precision unless ``runtime`` says what is running. Returns {"t" [s], "position" [m], "rpy_deg", "nu" [m/s, rad/s], "rpm"}.
-    Raises ValueError for input that makes no sense, FloatingPointError where the integration diverges.
+    Raises SettingError for input that makes no sense, DivergenceError where the integration diverges.
     """
     given = {
         "wrench": wrench,
@@ -66,7 +72,7 @@ def simulate(
         plant.step(action)
         samples.append(_sample(plant, k * control_dt))
         if not math.isfinite(sum(samples[-1]["nu"])):
-            raise FloatingPointError(f"the integration diverged at t = {k * control_dt:.2f} s: use a smaller substep, --dt {dt / 4:g}")
+            raise DivergenceError(f"the integration diverged at t = {k * control_dt:.2f} s: use a smaller substep, --dt {dt / 4:g}")
     return {key: [s[key] for s in samples] for key in samples[0]}
 
 
@@ -74,25 +80,25 @@ def simulate(
 
 
 def checked_vector(name: str, value: Sequence[float]) -> np.ndarray:
-    """``value`` as float64; ValueError unless it has the right number of finite, sane components."""
+    """``value`` as float64; SettingError unless it has the right number of finite, sane components."""
     what, length = _WHAT[name]
     flag = "--" + name.replace("_", "-")
     try:
         vector = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ValueError(f"{flag} must be {length} numbers ({what}), got {value!r}") from None
+        raise SettingError(f"{flag} must be {length} numbers ({what}), got {value!r}") from None
     example = ",".join(["0.1"] + ["0"] * (length - 1))
     if vector.shape != (length,):
-        raise ValueError(f"{flag} must be {length} numbers ({what}), got {vector.size}: for example {flag} {example}")
+        raise SettingError(f"{flag} must be {length} numbers ({what}), got {vector.size}: for example {flag} {example}")
     if not np.isfinite(vector).all() or np.abs(vector).max() > _MAX_COMPONENT:
-        raise ValueError(f"{flag} must be finite numbers below {_MAX_COMPONENT:g} ({what}), got {value!r}: for example {flag} {example}")
+        raise SettingError(f"{flag} must be finite numbers below {_MAX_COMPONENT:g} ({what}), got {value!r}: for example {flag} {example}")
     return vector
 
 
 def control_step(dt: float) -> tuple[int, float]:
     """(substeps, control step [s]) for a substep of ``dt``: 0.02 s where dt divides it, else the next multiple of dt."""
     if not (isinstance(dt, (int, float)) and math.isfinite(dt) and dt > 0):
-        raise ValueError(f"--dt must be a positive number of seconds, got {dt!r}: for example --dt 0.01")
+        raise SettingError(f"--dt must be a positive number of seconds, got {dt!r}: for example --dt 0.01")
     ratio = CONTROL_DT_S / dt
     substeps = max(1, math.ceil(ratio - 1e-9))
     if abs(ratio - substeps) < 1e-6:
@@ -101,11 +107,11 @@ def control_step(dt: float) -> tuple[int, float]:
 
 
 def checked_steps(seconds: float, control_dt: float, substeps: int) -> int:
-    """Control steps that cover ``seconds``; ValueError where that is nothing or far too many."""
+    """Control steps that cover ``seconds``; SettingError where that is nothing or far too many."""
     if not (isinstance(seconds, (int, float)) and math.isfinite(seconds) and seconds > 0):
-        raise ValueError(f"--seconds must be a positive number, got {seconds!r}: for example --seconds 10")
+        raise SettingError(f"--seconds must be a positive number, got {seconds!r}: for example --seconds 10")
     if seconds / control_dt * substeps > _MAX_STEPS:
-        raise ValueError(
+        raise SettingError(
             f"--seconds {seconds:g} at --dt {control_dt / substeps:g} is more than {_MAX_STEPS} substeps: use fewer seconds or larger --dt"
         )
     return max(1, math.ceil(seconds / control_dt - 1e-6))
@@ -117,7 +123,7 @@ def _action(config: Config, command: np.ndarray) -> np.ndarray:
     limits = np.array([getattr(vehicle, name) for name in names])
     for name, value, limit in zip(names, command, limits, strict=True):
         if abs(value) > limit * (1 + 1e-9):
-            raise ValueError(
+            raise SettingError(
                 f"--command asks for {value:g}, above vehicle.{name} = {limit:g}: ask for less, or --set vehicle.{name}={abs(value):g}"
             )
     return (command / limits).astype(np.float32)[None, :]

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
-import signal
 import threading
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+from uuvtai import signals
 from uuvtai.config.learning import LearningConfig
 from uuvtai.loader import ConfigError, Overrides, load_resolved, to_yaml
 from uuvtai.measure.methods import TRAINING_TREE
@@ -57,7 +55,7 @@ def train(request: TrainRequest, watch: TrainWatch) -> tuple[dict[str, Any], Pat
     """Train or go on training; what ``uuv train --json`` prints, and the run folder.
 
     Everything that can be refused is refused before anything is written. An interrupt (SIGINT, SIGTERM) lets the iteration end, saves and
-    raises KeyboardInterrupt; a second one stops at once. Under torchrun rank 0 writes. Raises ConfigError, ValueError, MemoryError,
+    raises KeyboardInterrupt; a second one ends at once. Under torchrun rank 0 writes. Raises ConfigError, ValueError, MemoryError,
     RunFolderError, CheckpointError, TrainingError.
     """
     from uuvtai.learn.distributed import claim_gpu
@@ -79,11 +77,11 @@ def train(request: TrainRequest, watch: TrainWatch) -> tuple[dict[str, Any], Pat
     run = _Run(trainer, config, folder, watch, total)
     status, code = "failed", 1
     try:
-        with _interrupts() as pressed:
+        with signals.Noted() as pressed:
             is_complete = run.go(pressed)
-        status, code = ("finished", 0) if is_complete else ("interrupted", 130)
+        status, code = ("finished", 0) if is_complete else ("interrupted", signals.exit_code())
     except KeyboardInterrupt:
-        status, code = "interrupted", 130
+        status, code = "interrupted", signals.exit_code()
         raise
     finally:
         run.close()
@@ -265,24 +263,3 @@ def _calibrated(foresight: Foresight) -> Metrics:
         return {}
     rates = {"miss_rate": figures["missed"] / figures["accidents"]} | {name: figures[name] for name in _RISK_FIGURES}
     return {f"eval/risk_{name}": float(value) for name, value in rates.items()}
-
-
-@contextlib.contextmanager
-def _interrupts() -> Iterator[threading.Event]:
-    """An event that the first SIGINT or SIGTERM sets; the next one raises KeyboardInterrupt."""
-    pressed = threading.Event()
-
-    def note(_signal: int, _frame: object) -> None:
-        if pressed.is_set():
-            raise KeyboardInterrupt
-        pressed.set()
-
-    if threading.current_thread() is not threading.main_thread():
-        yield pressed  # signals go to the main thread; whoever runs this elsewhere stops it otherwise
-        return
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield pressed
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

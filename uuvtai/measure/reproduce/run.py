@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
+from uuvtai.errors import SettingError
 from uuvtai.loader import load_config, preset_names
 from uuvtai.measure.reproduce import claims, paper
 from uuvtai.measure.reproduce.markdown import results_page
@@ -29,7 +30,7 @@ class Watch(Protocol):
 def reproduce(budget: str, run_dir: Path | None, watch: Watch) -> tuple[dict[str, Any], Path]:
     """Begin a reproduction: its document and its folder. Raises ValueError for an unknown budget, RunFolderError."""
     if budget not in BUDGETS:
-        raise ValueError(f"--budget {budget!r}: {' or '.join(BUDGETS)}")
+        raise SettingError(f"--budget {budget!r}: {' or '.join(BUDGETS)}")
     root = (run_dir or default_run_dir(f"reproduce-{budget}")).absolute()
     refuse_place(root)
     folder = RunFolder(root, load_config("pool"), [EVALUATION_SEED])

@@ -13,7 +13,7 @@ from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import connection
 from typing import Any, Protocol, TypeVar
 
-from uuvtai.errors import UserError
+from uuvtai.errors import SettingError, UserError
 
 Item = TypeVar("Item")
 Work = Callable[[Item], Any]
@@ -41,7 +41,7 @@ class LocalEngine:
     def __init__(self, workers: int = 1) -> None:
         """Each worker is a process that may use its share of the cores."""
         if workers < 1:
-            raise ValueError(f"--workers {workers}: at least 1 is needed")
+            raise SettingError(f"--workers {workers}: at least 1 is needed")
         self._workers = workers
 
     def run(self, work: Work, items: Sequence[Item]) -> Iterator[tuple[int, Any]]:
