@@ -68,9 +68,10 @@ class Poison:
 
 @pytest.fixture
 def watched(small, monkeypatch):
-    """The session's simulator, writing observations."""
-    width = features.observation_width(small.config.features)
-    monkeypatch.setattr(small.sim, "observation", torch.zeros(small.N, width))
+    """The session's simulator, writing observations with all the columns there are: only their kernels are compiled for it."""
+    columns = small.config.features.model_copy(update={"n_track": 4, "teacher": True})
+    monkeypatch.setattr(small.sim, "config", small.config.model_copy(update={"features": columns}))
+    monkeypatch.setattr(small.sim, "observation", torch.zeros(small.N, features.observation_width(columns)))
     return small
 
 
@@ -111,7 +112,7 @@ def test_every_struct_is_known_or_truth():
 def with_sensors(small, monkeypatch, **changed):
     """Another reading of pose and speed: only the two kernels of proprioception are compiled for it."""
     sensors = small.config.sensors.model_copy(update=changed)
-    monkeypatch.setattr(small.sim, "config", small.config.model_copy(update={"sensors": sensors}))
+    monkeypatch.setattr(small.sim, "config", small.sim.config.model_copy(update={"sensors": sensors}))
 
 
 def test_no_decision_observation_or_memory_depends_on_the_truth(watched):
