@@ -1,0 +1,162 @@
+"""The stack decides by observations alone: with every truth array poisoned from tracking to the teacher not one bit of it changes."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from uuvtai.kernels import features, proprioception
+from uuvtai.loader import load_config
+from uuvtai.sim import SimState
+
+KNOWN = {
+    "clock", "mission", "ego", "scan", "image", "tracks", "clusters", "spots", "habits", "forecast", "mask", "grid_map", "map_scratch",
+    "clearance", "clearance_memory", "voronoi", "route", "features", "teacher", "table",
+}  # fmt: skip
+"""Structs of what the vehicle is told, senses, remembers and decides. Every other struct, a new one too, counts as truth."""
+TRUTH = {f.name for f in dataclasses.fields(SimState)} - KNOWN
+STEPS, RESET_AT, RESET_ROWS = 60, 30, [2, 5]
+POISON = 77
+"""of whole numbers; NaN of the others"""
+
+
+class Poison:
+    """Spoils every truth array while it is ``on``; ``off`` puts back what was there."""
+
+    def __init__(self, sim):
+        memory = sim.memory()
+        views = memory.views(memory.read(), scratch=True)
+        self.arrays = {name: view for name, view in views.items() if name.partition(".")[0] in TRUTH}
+        self.kept, self.written = {}, set()
+
+    def on(self):
+        self.kept = {name: view.copy() for name, view in self.arrays.items()}
+        for view in self.arrays.values():
+            view[...] = np.nan if view.dtype.kind == "f" else POISON
+
+    def off(self):
+        for name, view in self.arrays.items():
+            if not (np.isnan(view) if view.dtype.kind == "f" else view == POISON).all():
+                self.written.add(name)
+            view[...] = self.kept[name]
+
+    def during(self, sim, patch):
+        """From now on be on from the first kernel of tracking to the last that writes the observation."""
+        track, observe, planned_with = sim._track, sim._observe, sim._plan_seed
+
+        def poisoned_track():
+            self.on()
+            track()
+
+        def poisoned_observe(obs):
+            observe(obs)
+            self.off()
+
+        def seed_of(env):
+            """The fallback planner's random numbers come from the episode's key: a random number is no knowledge."""
+            poisoned = int(self.arrays["episode.key"][env])
+            self.arrays["episode.key"][env] = self.kept["episode.key"][env]
+            seed = planned_with(env)
+            self.arrays["episode.key"][env] = poisoned
+            return seed
+
+        patch.setattr(sim, "_track", poisoned_track)
+        patch.setattr(sim, "_observe", poisoned_observe)
+        patch.setattr(sim, "_plan_seed", seed_of)
+
+
+@pytest.fixture
+def watched(small, monkeypatch):
+    """The session's simulator, writing observations with all the columns there are: only their kernels are compiled for it."""
+    columns = small.config.features.model_copy(update={"n_track": 4, "teacher": True})
+    monkeypatch.setattr(small.sim, "config", small.config.model_copy(update={"features": columns}))
+    monkeypatch.setattr(small.sim, "observation", torch.zeros(small.N, features.observation_width(columns)))
+    return small
+
+
+def driven(small, poison=None):
+    """(actions, observations, all arrays that a later step depends on) of an episode in every row, two of them begun anew on the way."""
+    with pytest.MonkeyPatch.context() as patch:
+        if poison:
+            poison.during(small.sim, patch)
+        small.begin(range(small.N), seed=731971)
+        actions, observations = [], []
+        for step in range(STEPS):
+            if step == RESET_AT:
+                small.begin([40, 41], seed=731971, rows=RESET_ROWS)
+            small.sim.step()
+            actions.append(small.sim.action.clone())
+            observations.append(small.sim.observation.clone())
+        return torch.stack(actions), torch.stack(observations), small.sim.memory().capture()
+
+
+def compared(small):
+    """(undisturbed actions, what differs from them under the poison, truth that somebody wrote between tracking and teacher)."""
+    driven(small)  # slots beyond what is counted keep what an earlier episode left: both runs follow equal ones
+    actions, observations, arrays = driven(small)
+    poison = Poison(small.sim)
+    others = driven(small, poison)
+    differing = [name for name in arrays if arrays[name].tobytes() != others[2][name].tobytes()]
+    differing += ["action"] * (not torch.equal(actions, others[0])) + ["observation"] * (not torch.equal(observations, others[1]))
+    assert actions.abs().mean() > 0.1 and observations.isfinite().all(), "they drive, and see something"
+    assert arrays["tracks.moving"].any() and arrays["route.n_way"].all() and (arrays["grid_map.static_occ"] > 0.5).any()
+    return actions, differing, poison.written
+
+
+def test_every_struct_is_known_or_truth():
+    assert {f.name for f in dataclasses.fields(SimState)} >= KNOWN
+    assert {"world", "vehicle", "params", "current", "path", "episode", "referee", "reward", "ego_memory", "sonar_memory"} <= TRUTH
+
+
+def with_sensors(small, monkeypatch, **changed):
+    """Another reading of pose and speed: only the two kernels of proprioception are compiled for it."""
+    sensors = small.config.sensors.model_copy(update=changed)
+    monkeypatch.setattr(small.sim, "config", small.sim.config.model_copy(update={"sensors": sensors}))
+
+
+def test_no_decision_observation_or_memory_depends_on_the_truth(watched):
+    _, differing, written = compared(watched)
+    assert differing == []
+    assert written == set(), "truth belongs to the simulator: nobody else writes it"
+
+
+def test_nor_with_dead_reckoning_and_harsh_readings(watched, monkeypatch):
+    """Position, heading and speed are off: whoever took the true ones would do something else."""
+    exact, _, _ = driven(watched)
+    harsh = load_config("pool", "harsh").sensors
+    with_sensors(watched, monkeypatch, localization="dead_reckoning", dvl=harsh.dvl, imu=harsh.imu, pressure=harsh.pressure)
+    actions, differing, written = compared(watched)
+    assert (differing, written) == ([], set())
+    assert not torch.equal(actions, exact), "the readings are others"
+    apart = np.abs(watched.sim.s.ego.pos_w.to_numpy() - watched.sim.s.vehicle.pos_w.to_numpy())
+    assert apart.max() > 0.02
+
+
+# ------------------------------------------------------------------------------------------------------- the tests above can fail
+
+
+def test_the_poison_reaches_whoever_reads_the_truth(watched):
+    sim = watched.sim
+    watched.begin(range(watched.N))
+    poison, c, s = Poison(sim), sim.config, sim.s
+    assert {name.partition(".")[0] for name in poison.arrays} == TRUTH
+    s.clock.awake.fill(1)
+    before = s.ego.pos_w.to_numpy()
+    poison.on()
+    proprioception.sense_proprioception(s.ego, s.ego_memory, s.vehicle, s.episode, s.clock, c.sensors, c.vehicle, c.episode)
+    sensed = {name: getattr(s.ego, name).to_numpy() for name in ("pos_w", "rate_b", "depth_m")}
+    poison.off()
+    assert np.isfinite(before).all() and all(np.isnan(values).all() for values in sensed.values())
+    proprioception.sense_proprioception(s.ego, s.ego_memory, s.vehicle, s.episode, s.clock, c.sensors, c.vehicle, c.episode)
+    assert np.array_equal(s.ego.pos_w.to_numpy(), before), "what was there is back"
+
+
+def test_the_true_pose_in_place_of_the_estimate_is_found(watched, monkeypatch):
+    """With exact sensors the estimate equals the truth: nothing but the poison tells them apart."""
+    from uuvtai.kernels import elevation
+
+    honest, vehicle = elevation.bound_heights, watched.sim.s.vehicle
+    monkeypatch.setattr("uuvtai.sim.elevation.bound_heights", lambda forecast, tracks, ego, *rest: honest(forecast, tracks, vehicle, *rest))
+    _, differing, _ = compared(watched)
+    assert {"forecast.above_w", "observation"} & set(differing)
