@@ -69,6 +69,8 @@ class SonarScan:
     """[rad] own yaw estimate when it was taken"""
     ping_vel_b: ti.Field = array("n_env", vec=3)
     """[m/s] own measured velocity when it was taken"""
+    ping_vel_valid: ti.Field = array("n_env", dtype=ti.i32)
+    """1 = that was a reading; 0 = the last one, held since"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +93,8 @@ class SonarMemory:
     """[rad]"""
     vel_b: ti.Field = array("n_env", "n_latency", vec=3)
     """[m/s]"""
+    vel_valid: ti.Field = array("n_env", "n_latency", dtype=ti.i32)
+    """1 = a reading"""
     mount_w: ti.Field = array("n_env", vec=3, scratch=True)
     """[m] scratch of one ping: true position of the sonar"""
     mount_vel_w: ti.Field = array("n_env", vec=2, scratch=True)
