@@ -6,13 +6,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.map_bits import check_bits, get_map, put_map
-from tests.reference.mapping import MapOracle
+from tests.reference.mapping import MapOracle, rotation
 from uuvtai.bounds import load_bounds
 from uuvtai.config import DepthConfig, EpisodeConfig, MappingConfig, SonarConfig, TankConfig
 from uuvtai.kernels import debug_stamp, mapping
 from uuvtai.kernels.geometry import BOX, CYLINDER, NONE
 from uuvtai.kernels.grid import grid_origin, grid_shape, outside_cells
-from uuvtai.state import ClockState, DepthImage, GridMask, MapScratch, MapState, SonarScan, TrackState, WorldState, allocate
+from uuvtai.state import (
+    ClockState,
+    ClusterState,
+    DepthImage,
+    GridMask,
+    MapScratch,
+    MapState,
+    SonarScan,
+    TrackState,
+    WorldState,
+    allocate,
+)
 
 N_ENV = 6
 TANK = TankConfig(x_m=(0.0, 6.0), y_m=(0.0, 4.0))
@@ -45,6 +56,7 @@ class Stage:
             "n_col": SHAPE[1],
             "n_ray": SONAR.n_ray,
             "n_track": 4,
+            "n_cluster": 4,
             "n_body": 4,
             "n_height": 16,
             "n_slot": 4,
@@ -56,6 +68,7 @@ class Stage:
             "scan": SonarScan,
             "image": DepthImage,
             "tracks": TrackState,
+            "clusters": ClusterState,
             "mask": GridMask,
             "clock": ClockState,
         }
@@ -95,6 +108,12 @@ class Stage:
         s.ping_yaw.from_numpy(np.array([c["yaw"] for c in scans], np.float32))
         s.ping_vel_b.from_numpy(np.stack([c["vel"] for c in scans]).astype(np.float32))
         s.fresh.fill(fresh)
+        s.ping_vel_valid.from_numpy(np.array([c.get("valid", True) for c in scans], np.int32))
+        s.ping_step.fill(7)
+        walls = [c.get("walls") or ((0.0, 0.0), 0.0, False) for c in scans]
+        self.clusters.slip_w.from_numpy(np.array([error for error, _, _ in walls], np.float32))
+        self.clusters.own_sigma_m_s.from_numpy(np.array([sigma for _, sigma, _ in walls], np.float32))
+        self.clusters.scan_step.from_numpy(np.array([7 if same else 4 for _, _, same in walls], np.int32))
         self.tracks.moving.from_numpy(np.tile(np.array([1, 0, 0, 0], np.int32), (self.n_env, 1)))
         # untracked beams: half of them on a track that does not move
         still = np.tile(np.where(np.arange(SONAR.n_ray) % 2, 1, -1), (self.n_env, 1))
@@ -108,7 +127,7 @@ class Stage:
             self.image.shot_rpy.from_numpy(np.stack([i["rpy"] for i in images]).astype(np.float32))
 
     def update(self):
-        args = (self.grid_map, self.scratch, self.scan, self.image, self.tracks, self.mask, self.clock)
+        args = (self.grid_map, self.scratch, self.scan, self.image, self.tracks, self.clusters, self.mask, self.clock)
         mapping.update_map(*args, MAP, SONAR, DEPTH_CAMERA, self.tank, EPISODE)
 
     def run(self, scan_of, n_scan, first=0, image_of=None):
@@ -197,6 +216,12 @@ def random_scan(rng, tank):
     scan["range"] = np.where(missed, SONAR.max_range_m, scan["range"])
     scan["doppler"] = scan["doppler"] + rng.normal(0, 0.08, SONAR.n_ray)
     scan["tracked"] = rng.random(SONAR.n_ray) < 0.1
+    # the reading is off by what the walls show, give or take; held or not, of this scan or of one before
+    error = rng.normal(0, 0.3, 2)
+    wrong = (rotation(0, 0, float(scan["yaw"])).T @ [*error, 0.0]) + rng.normal(0, 0.03, 3)
+    scan["vel"] = scan["vel"] + wrong
+    scan["valid"] = rng.random() < 0.5
+    scan["walls"] = (error.astype(np.float32), np.float32(rng.choice([0.0, 0.02, 0.2])), rng.random() < 0.5)
     return {k: (v.astype(np.float32) if getattr(v, "dtype", None) == np.float64 else v) for k, v in scan.items()} | {
         "yaw": np.float32(scan["yaw"])
     }
@@ -349,6 +374,48 @@ def test_doppler_alone_is_dynamic_evidence_and_own_motion_is_compensated(stage):
     stage.reset()
     still = stage.run(lambda k: ring(EYE, [(*BODY, 0.0, 0.0)], vel=(0.6, 0.1, 0.0), yaw=0.4), 1)
     assert still["dynamic"].max() == 0 and still["static"][cell(*FACE)] > 0
+
+
+WRONG = (0.5, -0.3)
+"""[m/s, world] what a stale reading of the own velocity may be off by"""
+
+
+def misread(yaw, valid, walls):
+    """A scan at rest whose own velocity is said to be ``WRONG``, beside a body that stands still."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    told = (c * WRONG[0] + s * WRONG[1], -s * WRONG[0] + c * WRONG[1], 0.0)
+    return ring(EYE, [(*BODY, 0.0, 0.0)], yaw=yaw) | {"vel": np.array(told), "valid": valid, "walls": walls}
+
+
+@pytest.mark.parametrize("yaw", [0.0, 21 * 2 * np.pi / SONAR.n_ray])
+@pytest.mark.parametrize(("valid", "same"), [(False, True), (False, False), (True, True)])
+def test_walls_that_show_a_wrong_own_velocity_keep_the_standing_at_rest(stage, yaw, valid, same):
+    """Bottom lost while the vehicle stopped: the walls' Doppler tells, in the tracked scan and, while the reading is held, after it."""
+    stage.reset()
+    after = stage.run(lambda k: misread(yaw, valid, (WRONG, 0.0 if valid else 0.01, same)), 1)
+    assert after["dynamic"].max() == 0 and after["static"][cell(*FACE)] > 0
+
+
+def test_a_valid_reading_is_not_mended_by_an_older_scan(stage):
+    """The error of a scan before belongs to a reading that is gone."""
+    stage.reset()
+    scan = ring(EYE, [(*BODY, 0.0, 0.0)], vel=(0.4, 0.0, 0.0)) | {"walls": (WRONG, 0.0, False)}
+    after = stage.run(lambda k: scan, 1)
+    assert after["dynamic"].max() == 0 and after["static"][cell(*FACE)] > 0
+
+
+def test_without_a_reading_and_without_walls_doppler_proves_nothing(stage):
+    """Nobody knows the own velocity: what stands does not move by it. A body faster than all doubt still does."""
+    stage.reset()
+    blindly = stage.run(lambda k: misread(0.0, False, ((0.0, 0.0), 1.0, True)), 1)
+    assert blindly["dynamic"].max() == 0 and blindly["static"][cell(*FACE)] > 0
+    stage.reset()
+    fast = ring(EYE, [(*BODY, -3.5, 0.0)]) | {"valid": False, "walls": ((0.0, 0.0), 1.0, True)}
+    after = stage.run(lambda k: fast, 1)
+    assert after["dynamic"][cell(*FACE)] > 0 and after["static"][cell(*FACE)] == 0
+    stage.reset()
+    trusted = stage.run(lambda k: misread(0.0, True, ((0.0, 0.0), 0.0, True)), 1)
+    assert trusted["dynamic"][cell(*FACE)] > 0, "a valid reading counts"
 
 
 def test_beams_of_a_moving_track_are_dynamic_evidence(stage):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.reference.proprioception import dead_reckoned, roll_pitch_yaw, specific_force
+from tests.reference.proprioception import dead_reckoned, roll_pitch_yaw, specific_force, zeroed_depth
 from tests.reference.scenes import quaternions
 from uuvtai.config import DvlConfig, EpisodeConfig, ImuConfig, PressureConfig, SensorsConfig, VehicleConfig
 from uuvtai.kernels import proprioception
@@ -224,7 +224,43 @@ def test_dead_reckoning_coasts_without_the_bottom_and_takes_depth_from_pressure(
         out = rig.sense(sensors, step)
     assert np.all(out["vel_valid"] == 0) and np.all(out["vel_b"] == np.float32((0.5, 0, 0)))
     assert np.abs(out["pos_w"][:, :2] - (5.0, 3.5)).max() < 1e-4
-    assert np.allclose(out["pos_w"][:, 2], -0.5 - rig.memory.pressure_bias_m.to_numpy())
+    assert np.abs(rig.memory.pressure_bias_m.to_numpy()).max() > 0.4
+    assert np.allclose(out["pos_w"][:, 2], -0.5, atol=1e-6), "the start's depth is known: the bias drops out"
+
+
+def test_dead_reckoning_zeroes_the_pressure_sensor_at_the_known_start(rig):
+    """Whatever the bias, depth begins at the start's and follows the truth; the first reading's noise is all that stays."""
+    sensors = SensorsConfig(localization="dead_reckoning", pressure=PressureConfig(bias_m=0.5, sigma_m=0.02))
+    z = np.array([-1.0, -0.9, -0.4, -1.5])
+    rig.start(sensors)
+    bias = rig.memory.pressure_bias_m.to_numpy()
+    told = []
+    for step, height in enumerate(z):
+        rig.move(pos_w=(5.0, 3.0, height))
+        told.append(rig.sense(sensors, step))
+        assert np.array_equal(told[-1]["pos_w"][:, 2], -told[-1]["depth_m"])
+    depth = np.stack([out["depth_m"] for out in told], 1)
+    assert np.allclose(depth[:, 0], 1.0, atol=1e-6)
+    assert_normal(depth[:, 3] - 1.5, 0.02 * np.sqrt(2.0))
+    rig.start(SensorsConfig(pressure=sensors.pressure))
+    raw = []
+    for step, height in enumerate(z):
+        rig.move(pos_w=(5.0, 3.0, height))
+        raw.append(rig.sense(SensorsConfig(pressure=sensors.pressure), step)["depth_m"])
+    noise = np.stack(raw, 1) + z - bias[:, None]
+    expected = [zeroed_depth(-1.0, z, b, n) for b, n in zip(bias, noise, strict=True)]
+    assert np.abs(depth - expected).max() < ROUNDING
+    assert np.abs(np.stack(raw, 1)[:, 0] - 1.0).max() > 0.4, "where the position is given the reading stays as it is"
+
+
+def test_zeroing_changes_no_bit_of_a_perfect_pressure_sensor(rig):
+    """Nothing to zero: dead reckoning with clean sensors tells the same depths as given positions do."""
+    depths = {}
+    for where in ("truth", "dead_reckoning"):
+        sensors = SensorsConfig(localization=where)
+        rig.start(sensors, **random_motion(np.random.default_rng(8)))
+        depths[where] = [rig.sense(sensors, step)["depth_m"] for step in range(3)]
+    assert np.array_equal(depths["truth"], depths["dead_reckoning"])
 
 
 def test_dead_reckoning_error_grows_with_scale_error_and_drift(rig):

@@ -384,6 +384,7 @@ def test_rate_latency_and_what_a_scan_is_labelled_with(rig):
         scenes.load(scene, rig.vehicle, rig.world)
         rig.ego.pos_w.from_numpy(np.full((N_ENV, 3), step, np.float32))
         rig.ego.vel_b.from_numpy(np.full((N_ENV, 3), -step, np.float32))
+        rig.ego.vel_valid.from_numpy(np.full(N_ENV, step % 4 == 0, np.int32))
         rig.ego.rpy.from_numpy(np.full((N_ENV, 3), 0.01 * step, np.float32))
         out = rig.cast(config)
         assert len(set(out["fresh"])) == 1
@@ -394,6 +395,7 @@ def test_rate_latency_and_what_a_scan_is_labelled_with(rig):
         assert out["range_m"][0, N_RAY // 2] == pytest.approx(10.0 - 0.1 * last, abs=1e-4), "what was true when it was pinged"
         assert np.all(rig.scan.ping_pos_w.to_numpy() == last)
         assert np.all(rig.scan.ping_vel_b.to_numpy() == -last)
+        assert np.all(rig.scan.ping_vel_valid.to_numpy() == (last % 4 == 0))
         assert np.allclose(rig.scan.ping_yaw.to_numpy(), 0.01 * last)
     assert fresh == {0: 0, 5: 2, 7: 4, 9: 6, 11: 8}, "the first scan is delivered at once, and only then"
 

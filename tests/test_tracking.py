@@ -64,8 +64,8 @@ class Lab:
         tracking.reset_tracks(self.tracks, self.clusters, self.clock)
         return self
 
-    def feed(self, step, pos, yaw, vel_w, range_m, doppler, hit, late=0):
-        """One scan for every env: own pose and world velocity, beams."""
+    def feed(self, step, pos, yaw, vel_w, range_m, doppler, hit, late=0, valid=1):
+        """One scan for every env: own pose and world velocity (held where it is not ``valid``), beams."""
         c, s = np.cos(yaw), np.sin(yaw)
         vel_b = np.stack([c * vel_w[:, 0] + s * vel_w[:, 1], -s * vel_w[:, 0] + c * vel_w[:, 1], 0 * yaw], 1)
         for name, value in (
@@ -73,7 +73,8 @@ class Lab:
             ("ping_pos_w", np.column_stack([pos, np.full(N_ENV, -0.8)])),
         ):  # fmt: skip
             getattr(self.scan, name).from_numpy(np.asarray(value, np.float32))
-        for name, value in (("hit", hit), ("fresh", np.ones(N_ENV)), ("ping_step", np.full(N_ENV, step))):
+        counts = {"fresh": 1, "ping_step": step, "ping_vel_valid": valid}
+        for name, value in (("hit", hit), *((name, np.full(N_ENV, count)) for name, count in counts.items())):
             getattr(self.scan, name).from_numpy(np.asarray(value, np.int32))
         self.clock.step.fill(step + late)
         self.track()
@@ -507,6 +508,49 @@ def test_own_velocity_error_does_not_move_the_world(paper):
         lab.feed(3 * k, pos, yaw, np.tile([0.3, -0.2], (N_ENV, 1)), *seen)
     np.testing.assert_allclose(lab.clusters.slip_w.to_numpy(), np.tile([0.3, -0.2], (N_ENV, 1)), atol=0.05)
     assert lab.read("moving").sum() == 0
+
+
+@pytest.mark.parametrize("preset", ["paper", "harsh"])
+@pytest.mark.parametrize("valid", [1, 0])
+def test_own_velocity_error_equals_the_oracle(preset, valid, request):
+    """What the walls say of the own velocity, and how sure that is: with the walls in sight, and with two thirds of the beams dead."""
+    lab, rng = request.getfixturevalue(preset), np.random.default_rng(12)
+    for dead in (0.0, 0.7):
+        lab.begin(12)
+        drive, wrong = Drive(rng), rng.normal(0, 0.4, (N_ENV, 2))
+        range_m, doppler, hit, _ = small_sonar.cast(drive.pos, drive.yaw, drive.vel, *no_bodies(), TANK)
+        range_m, doppler, hit = small_sonar.noisy(range_m, doppler, hit, rng, lab.sonar)
+        hit[rng.random(hit.shape) < dead] = 0
+        lab.feed(0, drive.pos, drive.yaw, drive.vel + wrong, range_m, doppler, hit, valid=valid)
+        slip_w, sigma = lab.clusters.slip_w.to_numpy(), lab.clusters.own_sigma_m_s.to_numpy()
+        read = {n: getattr(lab.scan, n).to_numpy().astype(float) for n in ("range_m", "doppler_m_s", "hit", "ping_pos_w", "ping_vel_b")}
+        for env in range(N_ENV):
+            beams = [read[n][env] for n in ("range_m", "doppler_m_s", "hit", "ping_pos_w")]
+            yaw = float(lab.scan.ping_yaw.to_numpy()[env])
+            scan = oracle.Scan(*beams, yaw, read["ping_vel_b"][env], 0, bool(valid))
+            _, _, expected = oracle.labelled(scan, CONFIG, lab.sonar, TANK)
+            np.testing.assert_allclose(slip_w[env], expected, atol=1e-4)
+        if valid:
+            assert (sigma == 0).all()
+        else:
+            assert (sigma > 0.9 * lab.sonar.doppler_sigma_m_s / np.sqrt(0.5 * hit.sum(1))).all() and (sigma < 0.2).all()
+
+
+def test_a_held_velocity_is_left_to_the_walls_and_a_reading_is_not(paper):
+    """One beam says that its wall moves by 0.6 m/s: a reading that is good to 0.05 m/s is half believed, a held one is not at all; without
+    any wall the error is unknown, and how much of it is left says so."""
+    lab, (pos, yaw, own) = paper.begin(13), at_rest()
+    range_m, doppler, hit, _ = small_sonar.cast(pos, yaw, own, *no_bodies(), TANK)
+    doppler[:, 0], hit[:, 1:] = 0.6, 0
+    found = {}
+    for valid in (1, 0):
+        lab.begin(13).feed(0, pos, yaw, own, range_m, doppler, hit, valid=valid)
+        found[valid] = lab.clusters.slip_w.to_numpy()[0] @ (np.cos(yaw[0]), np.sin(yaw[0]))
+    assert found[1] == pytest.approx(0.3) and found[0] == pytest.approx(0.6, rel=0.01)
+    assert lab.clusters.own_sigma_m_s.to_numpy()[0] == pytest.approx(1.0, rel=1e-4), "nothing is known across the one beam"
+    hit[:] = 0
+    lab.begin(13).feed(0, pos, yaw, own, range_m, doppler, hit, valid=0)
+    assert (lab.clusters.slip_w.to_numpy() == 0).all() and lab.clusters.own_sigma_m_s.to_numpy()[0] == pytest.approx(1.0, rel=1e-4)
 
 
 # -------------------------------------------------------------------------------------------------------------------- slots

@@ -260,6 +260,7 @@ class Sim:
                 s.scan,
                 s.image,
                 s.tracks,
+                s.clusters,
                 s.mask,
                 s.clock,
                 c.mapping,

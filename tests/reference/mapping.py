@@ -94,6 +94,23 @@ class MapOracle:
         near = static[max(0, cell[0] - reach) : cell[0] + reach + 1, max(0, cell[1] - reach) : cell[1] + reach + 1]
         return bool((near >= self.m.occupied).any()), abs(extent - round(extent)) < DOUBT and reach < 4
 
+    def own_motion(self, scan, yaw):
+        """(own velocity ahead and left, Doppler that counts as motion): the reading, mended by what the walls told the tracking.
+
+        ``walls``: None = this scan was not tracked and the one before told nothing; else (error in the world, sigma left, same scan?).
+        """
+        own, threshold = np.array(scan["vel"][:2], float), self.threshold
+        if scan.get("walls") is None:
+            return own, threshold
+        error, sigma, same = scan["walls"]
+        held = not scan.get("valid", True)
+        if held or same:
+            c, s = math.cos(yaw), math.sin(yaw)
+            own = own - np.array([[c, s], [-s, c]]) @ np.asarray(error, float)
+        if held:
+            threshold = max(threshold, 3 * math.hypot(self.sonar.doppler_sigma_m_s, sigma))
+        return own, threshold
+
     def hit_of(self, pos, yaw, ray, scan, tracked, state, doubtful):
         """(cell, bit) of a return, or None."""
         n_ray, r = self.sonar.n_ray, float(scan["range"][ray])
@@ -102,9 +119,10 @@ class MapOracle:
         point = pos[:2] + r * unit
         gap, wall = self.gap(point) - self.m.wall_margin_m, self.wall_range(pos[:2], unit) - self.error(r) - r
         cell, options = self.cells(point)
-        through_water = scan["doppler"][ray] + scan["vel"][0] * math.cos(angle) + scan["vel"][1] * math.sin(angle)
-        moves = abs(through_water) > self.threshold or tracked
-        unsure = len(options) > 1 or min(abs(gap), abs(wall)) < DOUBT or (not tracked and abs(abs(through_water) - self.threshold) < DOUBT)
+        own, threshold = self.own_motion(scan, float(yaw))
+        through_water = scan["doppler"][ray] + own[0] * math.cos(angle) + own[1] * math.sin(angle)
+        moves = abs(through_water) > threshold or tracked
+        unsure = len(options) > 1 or min(abs(gap), abs(wall)) < DOUBT or (not tracked and abs(abs(through_water) - threshold) < DOUBT)
         if gap < -DOUBT or wall < -DOUBT or self.outside[cell]:
             return None
         held = 0 < state["dynamic_scans"][cell] < self.promote

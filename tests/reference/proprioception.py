@@ -16,6 +16,12 @@ def specific_force(quat, acc_b, gravity):
     return acc_b - rotation(quat).T @ np.array([0.0, 0.0, -gravity])
 
 
+def zeroed_depth(start_z, z, bias, noise):
+    """[n] depth of a pressure sensor that was set to the start's depth when it was read first; z, noise [n], first = start."""
+    raw = -np.asarray(z) + bias + np.asarray(noise)
+    return raw - (raw[0] + start_z)
+
+
 def dead_reckoned(start, quats, vels, dt):
     """[n + 1, 3] positions summed up from body velocities [n, 3] at attitudes [n, 4]."""
     moves = [rotation(q) @ v * dt for q, v in zip(quats, vels, strict=True)]

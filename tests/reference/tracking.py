@@ -21,6 +21,7 @@ class Scan:
     yaw: float
     vel_b: np.ndarray
     step: int
+    vel_valid: bool = True
 
 
 @dataclass
@@ -86,9 +87,17 @@ def labelled(scan, cfg, sonar, tank):
         gap = np.minimum(np.minimum(p[:, 0] - tank.x_m[0], tank.x_m[1] - p[:, 0]), np.minimum(p[:, 1] - tank.y_m[0], tank.y_m[1] - p[:, 1]))
     near_wall = gap < cfg.wall_margin_m + 2 * np.sqrt([range_variance(r, sonar) for r in scan.range_m])
     wall = (scan.hit == 1) & near_wall
-    prior = (max(sonar.doppler_sigma_m_s, 0.01) / cfg.own_speed_sigma_m_s) ** 2
-    slip = np.linalg.solve(u[wall].T @ u[wall] + prior * np.eye(2), u[wall].T @ still[wall])
+    slip, _left = velocity_error(u[wall], still[wall], cfg, sonar, scan.vel_valid)
     return (scan.hit == 1) & ~near_wall, still, slip
+
+
+def velocity_error(u, still, cfg, sonar, valid):
+    """(error of the own velocity that explains the walls' Doppler, its largest standard deviation afterwards; 0 for a valid reading)."""
+    sigma = max(sonar.doppler_sigma_m_s, 0.01)
+    trust = cfg.own_speed_sigma_m_s if valid else 1.0  # m/s: a held reading may be off by the vehicle's whole speed
+    information = u.T @ u / sigma**2 + np.eye(2) / trust**2
+    left = np.linalg.inv(information)
+    return left @ (u.T @ still) / sigma**2, 0.0 if valid else np.sqrt(np.linalg.eigvalsh(left).max())
 
 
 def clusters_of(scan, cfg, sonar, tank):

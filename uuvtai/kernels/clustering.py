@@ -27,6 +27,9 @@ _BRIDGE = 3
 _MODEL_SIGMA_M = 0.01
 """What remains of a range's error however many beams are averaged: bodies are not circles (EC)."""
 
+HELD_SIGMA_M_S = 1.0
+"""Trust in the own velocity's last reading while the DVL has lost the bottom: it may be off by as much as the vehicle can change (EC)."""
+
 _SLIP_SIGMA_M_S = 0.01
 """What remains of a Doppler's error however many beams are averaged: the own velocity's error (EC)."""
 
@@ -97,7 +100,9 @@ def label_beams(
         for i in ti.static(range(LANES)):
             clusters.beam_doppler[env, packet * LANES + i] = still[i]
             clusters.beam_cluster[env, packet * LANES + i] = ti.select(body[i] > 0.5, _CANDIDATE, -1)
-    clusters.slip_w[env] = velocity_slip(normal, tracking, sonar)
+    slip_w, sigma = velocity_slip(normal, scan.ping_vel_valid[env], tracking, sonar)
+    clusters.slip_w[env] = slip_w
+    clusters.own_sigma_m_s[env] = sigma
 
 
 @ti.func
@@ -123,12 +128,19 @@ def wall_distance(x, y, tank: Const[TankConfig]):
 
 
 @ti.func
-def velocity_slip(normal, tracking: Const[TrackingConfig], sonar: Const[SonarConfig]):
-    """Error of the own measured velocity [m/s, world] by which known walls would move: least squares with the own measurement as prior."""
-    prior = ti.static((max(sonar.doppler_sigma_m_s, 0.01) / tracking.own_speed_sigma_m_s) ** 2)
+def velocity_slip(normal, valid, tracking: Const[TrackingConfig], sonar: Const[SonarConfig]):
+    """Error of the own measured velocity [m/s, world] by which known walls would move: least squares with the own measurement as prior.
+
+    Also the standard deviation [m/s] of what is left of it along the worst direction; 0 where the measurement is ``valid``. A reading that
+    is only held is hardly trusted: the walls decide, as far as they are seen.
+    """
+    sigma = ti.static(max(sonar.doppler_sigma_m_s, 0.01))
+    prior = ti.select(valid == 1, ti.static((sigma / tracking.own_speed_sigma_m_s) ** 2), ti.static((sigma / HELD_SIGMA_M_S) ** 2))
     xx, xy, yy = normal[0] + prior, normal[1], normal[2] + prior
     det = xx * yy - xy * xy
-    return ti.Vector([yy * normal[3] - xy * normal[4], xx * normal[4] - xy * normal[3]]) / det
+    slip_w = ti.Vector([yy * normal[3] - xy * normal[4], xx * normal[4] - xy * normal[3]]) / det
+    weakest = 0.5 * (xx + yy) - ti.sqrt(0.25 * (xx - yy) * (xx - yy) + xy * xy)
+    return slip_w, ti.select(valid == 1, 0.0, sigma / ti.sqrt(ti.max(weakest, prior)))
 
 
 # ----------------------------------------------------------------------------------------------------------------------- runs

@@ -11,11 +11,11 @@ import taichi as ti
 from uuvtai.config import DepthConfig, MappingConfig, SonarConfig, TankConfig
 from uuvtai.kernels.bits import WORD, bit_of, cell_bit, put_bit
 from uuvtai.kernels.fan import beam_lanes
-from uuvtai.kernels.geometry import FAR_M, TWO_PI, quaternion_wb, rotation_wb
+from uuvtai.kernels.geometry import FAR_M, TWO_PI, quaternion_wb, rotation_wb, turned_z
 from uuvtai.kernels.grid import cell_of, grid_origin, grid_shape
 from uuvtai.kernels.lanes import LANES, f16x, i16x, ramp_lanes
 from uuvtai.kernels.signature import Const, In, Out
-from uuvtai.state import DepthImage, MapScratch, MapState, SonarScan, TrackState
+from uuvtai.state import ClusterState, DepthImage, MapScratch, MapState, SonarScan, TrackState
 
 _MAX_REACH = 4
 """[cells] farthest neighbour that may explain a surprising return as the edge of a static body."""
@@ -135,10 +135,39 @@ def is_inconsistent(
 
 
 @ti.func
+def own_motion(env, scan: In[SonarScan], clusters: In[ClusterState], mapping: Const[MappingConfig], sonar: Const[SonarConfig]):
+    """Own velocity (ahead, left) [m/s] at the ping, as the tracking knows it, and the Doppler [m/s] beyond which a return then moves.
+
+    It is the measured velocity less the error that the known walls show in the same scan. A scan between tracked ones takes the error of
+    the last of them as long as the reading is only held, and trusts a valid reading as it is. Where neither a reading nor the walls tell
+    the own velocity, Doppler proves little: the threshold is three standard deviations of what is left.
+    """
+    vel, threshold = ti.Vector([scan.ping_vel_b[env][0], scan.ping_vel_b[env][1]]), ti.static(doppler_threshold(mapping, sonar))
+    held = scan.ping_vel_valid[env] == 0
+    if held or clusters.scan_step[env] == scan.ping_step[env]:
+        vel -= turned_z(clusters.slip_w[env], -scan.ping_yaw[env])
+    if held:
+        sigma = clusters.own_sigma_m_s[env]
+        threshold = ti.max(threshold, 3.0 * ti.sqrt(ti.static(sonar.doppler_sigma_m_s**2) + sigma * sigma))
+    return vel, threshold
+
+
+@ti.func
 def mapped_lanes(
-    env, first_ray, pos, scan: In[SonarScan], mapping: Const[MappingConfig], sonar: Const[SonarConfig], tank: Const[TankConfig]
+    env,
+    first_ray,
+    pos,
+    vel,
+    threshold,
+    scan: In[SonarScan],
+    mapping: Const[MappingConfig],
+    sonar: Const[SonarConfig],
+    tank: Const[TankConfig],
 ):
-    """Of sixteen beams: kind of return (0 = none or from a known wall, 1 = at rest, 2 = moving by its Doppler), row, column, range [m]."""
+    """Of sixteen beams: kind of return (0 = none or from a known wall, 1 = at rest, 2 = moving by its Doppler), row, column, range [m].
+
+    ``vel`` [m/s] is the own velocity along x and y of the body, ``threshold`` [m/s] the compensated Doppler that counts as motion.
+    """
     n_row, n_col = ti.static(grid_shape(tank, mapping.cell_m))
     x0, y0 = ti.static(grid_origin(tank, mapping.cell_m))
     range_m, doppler, hit = f16x(0.0), f16x(0.0), i16x(0)
@@ -152,7 +181,7 @@ def mapped_lanes(
     # noise along a slanting beam reaches deeper into the tank than the margin
     gap, short = wall_gaps(x, y, tank), wall_lanes(pos, unit_x, unit_y, tank) - range_error(range_m, sonar) - range_m
     # measured rate of range plus own velocity along the beam: motion through the water
-    moves = doppler + ahead_x * scan.ping_vel_b[env][0] + ahead_y * scan.ping_vel_b[env][1]
+    moves = doppler + ahead_x * vel[0] + ahead_y * vel[1]
     kind, row, col = i16x(0), i16x(0), i16x(0)
     for i in ti.static(range(LANES)):
         row[i] = ti.cast(ti.floor((y[i] - y0) / mapping.cell_m), ti.i32)
@@ -160,7 +189,7 @@ def mapped_lanes(
     for i in ti.static(range(LANES)):
         known = (gap[i] < mapping.wall_margin_m) | (short[i] < 0.0)
         off = (row[i] < 0) | (row[i] >= n_row) | (col[i] < 0) | (col[i] >= n_col)
-        moving = ti.abs(moves[i]) > ti.static(doppler_threshold(mapping, sonar))
+        moving = ti.abs(moves[i]) > threshold
         kind[i] = ti.select((hit[i] == 0) | known | off, 0, ti.select(moving, 2, 1))
     return kind, row, col, range_m
 
@@ -173,6 +202,7 @@ def mark_hits(
     grid_map: In[MapState],
     scan: In[SonarScan],
     tracks: In[TrackState],
+    clusters: In[ClusterState],
     mapping: Const[MappingConfig],
     sonar: Const[SonarConfig],
     tank: Const[TankConfig],
@@ -180,8 +210,9 @@ def mark_hits(
 ):
     """Bit of every return's cell: what moves is a dynamic hit only, the rest static hits; returns from known walls are left out."""
     pos = ti.Vector([scan.ping_pos_w[env][0], scan.ping_pos_w[env][1]])
+    vel, threshold = own_motion(env, scan, clusters, mapping, sonar)
     for packet in range(ti.static(sonar.n_ray // LANES)):
-        kind, row, col, range_m = mapped_lanes(env, packet * LANES, pos, scan, mapping, sonar, tank)
+        kind, row, col, range_m = mapped_lanes(env, packet * LANES, pos, vel, threshold, scan, mapping, sonar, tank)
         for i in range(LANES):
             if kind[i] != 0:
                 moves = ti.cast(kind[i] == 2, ti.i32) | moves_by_track(env, packet * LANES + i, tracks)

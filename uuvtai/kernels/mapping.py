@@ -27,7 +27,7 @@ from uuvtai.kernels.bits import WORD, bit_of, lowest_bit, taken, with_bit, witho
 from uuvtai.kernels.evidence import mark_depth, mark_hits
 from uuvtai.kernels.fan import mark_fan
 from uuvtai.kernels.signature import Const, In, Out, quick_launch, spread
-from uuvtai.state import ClockState, DepthImage, GridMask, MapScratch, MapState, SonarScan, TrackState
+from uuvtai.state import ClockState, ClusterState, DepthImage, GridMask, MapScratch, MapState, SonarScan, TrackState
 
 RATED_HZ = 10.0
 """Scan rate for which the gains of MappingConfig are given."""
@@ -258,6 +258,7 @@ def update_map(
     scan: In[SonarScan],
     image: In[DepthImage],
     tracks: In[TrackState],
+    clusters: In[ClusterState],
     mask: In[GridMask],
     clock: In[ClockState],
     mapping: Const[MappingConfig],
@@ -281,7 +282,7 @@ def update_map(
                 if is_due(env, scan, clock, grid_map, mapping) == 1:
                     fetch_cells(env, slot, scratch, grid_map)
                     mark_fan(env, slot, scratch, scan, mapping, sonar, tank)
-                    mark_hits(env, slot, scratch, grid_map, scan, tracks, mapping, sonar, tank, promote)
+                    mark_hits(env, slot, scratch, grid_map, scan, tracks, clusters, mapping, sonar, tank, promote)
                     merge_scan(env, slot, scratch, grid_map, mask, mapping, scan_s, depth_s, confident)
                     grid_map.map_step[env] = clock.step[env]
 

@@ -2,7 +2,8 @@
 
 Every error is a config number, compiled away at zero. Heading error = constant drift rate of the episode plus the integrated noise of the
 yaw gyro. Position is the truth (as in the paper), or dead reckoning: DVL velocity turned by the IMU's attitude, summed up from the known
-start, z from pressure; while the DVL has lost the bottom it goes on with the last velocity.
+start, z from pressure; while the DVL has lost the bottom it goes on with the last velocity. Where depth is found by pressure the sensor is
+zeroed at the known start: its first reading is taken for the start's depth, so that the bias drops out and one reading's noise stays.
 """
 
 import taichi as ti
@@ -43,6 +44,7 @@ def draw_constants(env, memory: Out[ProprioceptionMemory], episode: In[EpisodeSt
     memory.heading_rate[env] = sensors.imu.heading_drift_rad_s * normal(imu, _EPISODE_DRAW)
     memory.heading_error[env] = 0.0
     memory.dropout_until[env] = 0
+    memory.pressure_zero_m[env] = 0.0
     bias = sensors.pressure.bias_m
     memory.pressure_bias_m[env] = uniform_in(stream_key(key, 0, STREAM_PRESSURE), _EPISODE_DRAW, -bias, bias)
 
@@ -151,14 +153,18 @@ def read_pressure(
     key,
     step,
     ego: Out[Proprioception],
-    memory: In[ProprioceptionMemory],
+    memory: Out[ProprioceptionMemory],
     vehicle: In[VehicleState],
     sensors: Const[SensorsConfig],
 ):
-    """Depth, positive down."""
+    """Depth, positive down; in dead reckoning less what the first reading was off the known start, where ``ego.pos_w`` is at step 0."""
     reading = memory.pressure_bias_m[env] - vehicle.pos_w[env][2]
     if ti.static(sensors.pressure.sigma_m > 0):
         reading += sensors.pressure.sigma_m * normal(stream_key(key, step, STREAM_PRESSURE), 0)
+    if ti.static(sensors.localization == "dead_reckoning"):
+        if step == 0:
+            memory.pressure_zero_m[env] = reading + ego.pos_w[env][2]
+        reading -= memory.pressure_zero_m[env]
     ego.depth_m[env] = reading
 
 

@@ -60,6 +60,7 @@ def clear_scan(env, scan: Out[SonarScan]):
     scan.ping_pos_w[env] = ti.zero(scan.ping_pos_w[env])
     scan.ping_yaw[env] = 0.0
     scan.ping_vel_b[env] = ti.zero(scan.ping_vel_b[env])
+    scan.ping_vel_valid[env] = 0
 
 
 @ti.func
@@ -140,6 +141,7 @@ def show(env, packet, step, range_m, doppler, intensity, scan: Out[SonarScan], e
         scan.ping_pos_w[env] = ego.pos_w[env]
         scan.ping_yaw[env] = ego.rpy[env][2]
         scan.ping_vel_b[env] = ego.vel_b[env]
+        scan.ping_vel_valid[env] = ego.vel_valid[env]
 
 
 @ti.func
@@ -158,6 +160,7 @@ def queue(env, packet, step, range_m, doppler, intensity, memory: Out[SonarMemor
         memory.pos_w[env, slot] = ego.pos_w[env]
         memory.yaw[env, slot] = ego.rpy[env][2]
         memory.vel_b[env, slot] = ego.vel_b[env]
+        memory.vel_valid[env, slot] = ego.vel_valid[env]
 
 
 @ti.func
@@ -184,6 +187,7 @@ def deliver(env, packet, step, scan: Out[SonarScan], memory: In[SonarMemory], so
                 scan.ping_pos_w[env] = memory.pos_w[env, slot]
                 scan.ping_yaw[env] = memory.yaw[env, slot]
                 scan.ping_vel_b[env] = memory.vel_b[env, slot]
+                scan.ping_vel_valid[env] = memory.vel_valid[env, slot]
             for ray in range(packet * LANES, (packet + 1) * LANES):
                 scan.range_m[env, ray] = memory.range_m[env, slot, ray]
                 scan.doppler_m_s[env, ray] = memory.doppler_m_s[env, slot, ray]

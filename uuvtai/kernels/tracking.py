@@ -11,7 +11,7 @@ import taichi as ti
 
 from uuvtai.config import ElevationConfig, EpisodeConfig, ForecastConfig, SonarConfig, TankConfig, TrackingConfig
 from uuvtai.kernels.association import associate
-from uuvtai.kernels.clustering import find_clusters, label_beams
+from uuvtai.kernels.clustering import HELD_SIGMA_M_S, find_clusters, label_beams
 from uuvtai.kernels.habits import coasted, expected_turn_rate
 from uuvtai.kernels.kalman import predicted
 from uuvtai.kernels.signature import Const, In, Out, quick_launch, spread
@@ -30,6 +30,7 @@ def reset_tracks(tracks: Out[TrackState], clusters: Out[ClusterState], clock: In
             tracks.scan_step[env] = -1
             clusters.scan_step[env] = -1
             clusters.slip_w[env] = ti.zero(clusters.slip_w[env])
+            clusters.own_sigma_m_s[env] = HELD_SIGMA_M_S
             clusters.fresh[env] = 0
             clusters.count[env] = 0
             for track in range(tracks.alive.shape[1]):

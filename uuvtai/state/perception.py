@@ -75,6 +75,8 @@ class ClusterState:
     """[rad] own yaw at that ping"""
     slip_w: ti.Field = array("n_env", vec=2)
     """[m/s] error of the own measured velocity, as the known walls show it"""
+    own_sigma_m_s: ti.Field = array("n_env")
+    """[m/s] what is left of that error along its worst direction, where the velocity was no valid reading; 0 where it was one"""
     count: ti.Field = array("n_env", dtype=ti.i32)
     """clusters found"""
     pos_w: ti.Field = array("n_env", "n_cluster", vec=2)

@@ -24,7 +24,7 @@ class Proprioception:
     specific_force_b: ti.Field = array("n_env", vec=3)
     """[m/s^2] accelerometer: acceleration minus gravity, in body axes"""
     depth_m: ti.Field = array("n_env")
-    """[m] pressure depth, positive down"""
+    """[m] pressure depth, positive down; zeroed at the known start in dead reckoning"""
     pos_w: ti.Field = array("n_env", vec=3)
     """[m] position estimate (truth or dead reckoning; z from pressure in dead reckoning)"""
 
@@ -35,6 +35,8 @@ class ProprioceptionMemory:
 
     pressure_bias_m: ti.Field = array("n_env")
     """[m] constant over an episode"""
+    pressure_zero_m: ti.Field = array("n_env")
+    """[m] what the sensor is zeroed by: its first reading less the known start's depth; 0 where the position is given"""
     dvl_scale: ti.Field = array("n_env")
     """1 + scale error, constant over an episode"""
     heading_error: ti.Field = array("n_env")
@@ -67,6 +69,8 @@ class SonarScan:
     """[rad] own yaw estimate when it was taken"""
     ping_vel_b: ti.Field = array("n_env", vec=3)
     """[m/s] own measured velocity when it was taken"""
+    ping_vel_valid: ti.Field = array("n_env", dtype=ti.i32)
+    """1 = that was a reading; 0 = the last one, held since"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +93,8 @@ class SonarMemory:
     """[rad]"""
     vel_b: ti.Field = array("n_env", "n_latency", vec=3)
     """[m/s]"""
+    vel_valid: ti.Field = array("n_env", "n_latency", dtype=ti.i32)
+    """1 = a reading"""
     mount_w: ti.Field = array("n_env", vec=3, scratch=True)
     """[m] scratch of one ping: true position of the sonar"""
     mount_vel_w: ti.Field = array("n_env", vec=2, scratch=True)
