@@ -30,8 +30,8 @@ NOT_KEPT = re.compile(r"raw files? (?:was|were) not kept")
 
 _N = r"(?<![\w.,])-?\d+(?:,\d{3})*(?:\.\d+)?"
 RATES = re.compile(
-    rf"{_N}\s?%|(?<![\w./])\d+/\d+(?![\w/])|\[{_N}\s?%?, {_N}\s?%?\]|{_N} \.\. {_N}|{_N} / {_N}(?![ ]?/|\w)"
-    rf"|{_N} (?:[\w-]+/s\b|times\b|points?\b|x\b)|\bp = {_N}|\bAUROC {_N}|{_N} (?:of|against) {_N}"
+    rf"{_N}\s?%|(?<![\w./])\d+/\d+(?![\w/])|\[(?!-){_N}\s?%?, {_N}\s?%?\]|{_N} \.\. {_N}|{_N} / {_N}(?![ ]?/|\w)"
+    rf"|{_N} (?!m/s|rad/s)(?:[\w-]+/s\b|times\b|points?\b|x\b(?! \(?\d))|\bp = {_N}|\bAUROC {_N}|{_N} (?:of|against) {_N}"
 )
 """numbers that are results wherever they stand"""
 SIZES = re.compile(rf"{_N}\s?(?:s|ms|us|ns|min|h|hours?|minutes?|seconds?|kB|MB|GB|MiB|GiB|TiB|core-hours)\b(?!/)")
