@@ -88,7 +88,7 @@ def compare(request: Request, watch: Watch) -> tuple[dict[str, Any], Path]:
     jobs = jobs_of(request.seeds, request.episodes)
     methods = _methods(request, watch)
     num_envs = request.num_envs or min(len(jobs), _BATCH)
-    watch.note(f"starting {num_envs} envs (the first run on a machine compiles its kernels, about a minute)")
+    watch.note(f"starting {num_envs} envs (sizes not used before compile their kernels first, about half a minute)")
     sim = Sim(request.config, num_envs, methods[0].tree if methods else _any_tree(), request.device)
     policies = {method.name: method.driver_for(sim) for method in methods}
     folder = RunFolder(run_dir, request.config, request.seeds)

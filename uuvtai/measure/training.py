@@ -71,7 +71,7 @@ def train(request: TrainRequest, watch: TrainWatch) -> tuple[dict[str, Any], Pat
             f"{request.resume}: has done {found.step} of {total} iterations; to go on give more: --iterations {2 * found.step}"
         )
     claim_gpu()
-    watch.note(f"starting {config.train.num_envs} envs (the first run on a machine compiles its kernels, about a minute)")
+    watch.note(f"starting {config.train.num_envs} envs (sizes not used before compile their kernels first, about half a minute)")
     trainer = _trainer(_env(config, request.device), config, found)
     folder = _folder(request, config, found) if trainer.processes.writes else None
     run = _Run(trainer, config, folder, watch, total)

@@ -1,0 +1,290 @@
+"""Tables in README and docs that are written from committed results; each is named in the text by ``<!-- table: NAME -->``."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from docs.writers.figure_sources import Counts, SourceError, Sources, fitting, pooled, weighted
+from docs.writers.markdown import table
+from uuvtai.measure.reproduce import paper
+from uuvtai.measure.reproduce.steps import RETIRED_SEEDS
+
+DASH = "-"
+"""what was not measured or not kept"""
+
+
+def share(counts: Counts, ending: str) -> str:
+    """'490/500 = 98.0 % [96.3, 98.9]'."""
+    return f"{counts.field(ending + '_of')} = {rated(counts, ending)}"
+
+
+def rated(counts: Counts, ending: str) -> str:
+    """'98.0 % [96.3, 98.9]': rate and 95 % Wilson interval."""
+    low, high = (100 * counts.field(f"{ending}_{end}") for end in ("low", "high"))
+    return f"{100 * counts.field(ending + '_rate'):.1f} % [{low:.1f}, {high:.1f}]"
+
+
+# -------------------------------------------------------------------------------------------------------------- evaluations
+
+
+def measured(sources: Sources) -> str:
+    """The line above README's table: what was played, and whether the seed was free of tuning."""
+    shown = sources.evaluations()
+    seen = (
+        "was looked at while tuning (figures of a seed that was not will replace these)"
+        if shown["seed"] in RETIRED_SEEDS
+        else "was never tuned on and looked at once, for these figures"
+    )
+    kept = f" {shown['note']}" if "note" in shown else ""
+    return (
+        f"Measured here, {shown['episodes']} episodes a row of seed {shown['seed']}, paper sensing, S = 8. This seed {seen}. "
+        f"`python -m docs.writers.evaluations` plays all rows; commands and counts: `docs/data/`. `-` = not played or not kept.{kept}"
+    )
+
+
+def evaluations(sources: Sources) -> str:
+    """README's table: the tree in every world, beside the yardsticks, and why the rest failed."""
+    head = [
+        "world (D, v in m/s)",
+        "success",
+        "collision",
+        "contact / TTC stop / out / timeout",
+        "`planner`",
+        "`straight`",
+        "what ended most of the rest",
+    ]
+    return table(head, [_evaluated(entry) for entry in sources.evaluations()["rows"]])
+
+
+def _evaluated(entry: dict[str, Any]) -> list[str]:
+    methods = {name: Counts(m["episodes"], m["outcomes"]) for name, m in entry["methods"].items()}
+    name = "bt" if "bt" in methods else next(iter(methods))
+    own = methods[name]
+    ends = " / ".join(str(own.count(ending)) for ending in ("collision", "ttc", "out_of_tank", "timeout"))
+    others = [f"{100 * methods[other].field('success_rate'):.1f} %" if other in methods else DASH for other in ("planner", "straight")]
+    return [entry["title"], share(own, "success"), rated(own, "collision"), ends, *others, _causes(entry["methods"][name])]
+
+
+def _causes(method: dict[str, Any]) -> str:
+    """The two most frequent labels of ``uuv eval --explain`` with their counts."""
+    told = [f"{cause['label']} {cause['count']}" for cause in method["causes"][:2]]
+    return ", ".join(told) or ("" if method["outcomes"]["success"] == method["episodes"] else DASH)
+
+
+def policy(sources: Sources) -> str:
+    """The shipped policy beside its tree wherever both were played: counts, and who alone arrives."""
+    head = [
+        "world (D, v in m/s)",
+        "`bt`",
+        "`best`",
+        "`bt`: collision",
+        "`best`: collision",
+        "only `bt`, only `best` arrives",
+        "exact McNemar p",
+    ]
+    rows = []
+    for entry in sources.evaluations()["rows"]:
+        methods = {name: Counts(m["episodes"], m["outcomes"]) for name, m in entry["methods"].items()}
+        pair = next((p for p in entry["paired"] if {p["a"], p["b"]} == {"bt", "best"} and "only_a" in p), None)
+        if pair is None:
+            continue
+        only = (pair["only_a"], pair["only_b"]) if pair["a"] == "bt" else (pair["only_b"], pair["only_a"])
+        cells = [rated(methods[name], ending) for ending in ("success", "collision") for name in ("bt", "best")]
+        rows.append([entry["title"], *cells, f"{only[0]}, {only[1]}", f"{pair['mcnemar_p']:.2g}"])
+    return table(head, rows) if rows else "Not among the evaluations that are shown."
+
+
+# ------------------------------------------------------------------------------------------------------------------- sweeps
+
+
+def grid(sources: Sources) -> str:
+    """The paper's grid, pooled as the paper pools it, for both methods and both worlds."""
+    head = ["", "success [95 %]", "collision [95 %]", "weighted as the paper's 40 conditions", "cells without a collision"]
+    spotless = f"{paper.WITHOUT_COLLISION} of {paper.MODERATE_CONDITIONS}"
+    rows = [
+        ["`pool`, S <= 8, D <= 9, v <= 1.5: the paper", f"{paper.MODERATE_SUCCESS}", f"{paper.MODERATE_COLLISION}", "", spotless],
+        *_pooled_rows(sources, "pool", "", ("moderate",), True),
+        ["`pool`, D <= 3, all S and v: the paper", "", f"below {paper.FEW_MOVERS_COLLISION}", "", ""],
+        *_pooled_rows(sources, "pool", "", ("D<=3",)),
+        *_pooled_rows(sources, "pool", "the corner S = 12, D = 15, v = 3.0: ", ("S=12", "D=15", "v_m_s=3.0")),
+        *_pooled_rows(sources, "gauntlet", "`gauntlet`, S <= 8, D <= 9, v <= 1.5: ", ("moderate",), True),
+        *_pooled_rows(sources, "gauntlet", "`gauntlet`, all cells: ", ()),
+    ]
+    return table(head, rows)
+
+
+def _pooled_rows(sources: Sources, sweep: str, title: str, conditions: Sequence[str], is_weighted: bool = False) -> list[list[str]]:
+    rows = []
+    for method in ("bt", "best"):
+        cells = fitting(sources.cells(sweep), [method, *conditions])
+        spotless = sum(pooled([cell]).count("collided") == 0 for cell in cells)
+        paper_like = weighted(cells) if is_weighted else None
+        both = "" if paper_like is None else _both(paper_like, 1)
+        counts = pooled(cells)
+        rows.append([f"{title}`{method}`", share(counts, "success"), share(counts, "collision"), both, f"{spotless} of {len(cells)}"])
+    return rows
+
+
+def _both(counts: Counts, digits: int = 0) -> str:
+    """success / collision in %."""
+    return f"{100 * counts.field('success_rate'):.{digits}f} / {100 * counts.field('collision_rate'):.{digits}f}"
+
+
+def caution(sources: Sources) -> str:
+    """Success and collision against ``teacher.caution``."""
+    cells = sources.cells("caution")
+    rows = []
+    for value in dict.fromkeys(cell["teacher.caution"] for cell in cells):
+        own = fitting(cells, [f"teacher.caution={value}"])
+        counts = pooled(own)
+        name = f"{value} (default)" if value == "1.0" else value
+        rows.append([name, share(counts, "success"), rated(counts, "collision"), _both(weighted(own), 1), f"{counts.time_s:.1f} s"])
+    rows.append(["the paper", f"{100 * paper.MODERATE_SUCCESS:.1f} %", f"{100 * paper.MODERATE_COLLISION:.1f} %", "", ""])
+    return table(["caution", "success [95 %]", "collision [95 %]", "weighted", "time to success"], rows)
+
+
+def alone(sources: Sources) -> str:
+    """One thing changed at a time: a row a change."""
+    found: dict[str, dict[str, Counts]] = {}
+    for sweep in ("robustness", "dead_reckoning"):
+        for cell in sources.cells(sweep):
+            axes = [name for name in cell if name not in ("method", "episodes", "success", "contact", "ttc_stop", "out_of_tank", "timeout")]
+            told = ", ".join(f"`{name}={cell[name]}`" for name in axes if cell[name] and name != "time_to_success_mean_s") or "nothing"
+            found.setdefault(told, {})[cell["method"]] = pooled([cell])
+    head = [
+        "changed",
+        "`bt`: success [95 %]",
+        "collision [95 %]",
+        "timeouts",
+        "time",
+        "`best`: success [95 %]",
+        "collision [95 %]",
+        "timeouts",
+        "time",
+    ]
+    return table(head, [[told, *_alone(methods.get("bt")), *_alone(methods.get("best"))] for told, methods in found.items()])
+
+
+def _alone(counts: Counts | None) -> list[str]:
+    if counts is None:
+        return [DASH] * 4
+    time = DASH if counts.time_s is None else f"{counts.time_s:.1f} s"
+    return [rated(counts, "success"), rated(counts, "collision"), str(counts.count("timeout")), time]
+
+
+# --------------------------------------------------------------------------------------------------------------- benchmarks
+
+
+def learning_cost(sources: Sources) -> str:
+    """Rates of training beside Stable-Baselines3's."""
+    rows = []
+    for row in sources.benchmark("learning")["rows"]:
+        sensing = row["what"].partition(" sensing")[0] + (", `ppo.bfloat16=true`" if "bfloat16" in row["what"] else "")
+        floor = f"{row['floor']:,.0f}: {'met' if row['met'] else 'not met'}"
+        us = row["details"]["us_per_env_step"]
+        rows.append(
+            [sensing, f"{row['ours']:,.0f}", floor, *(f"{us[k]:.0f} us" for k in ("simulate", "infer", "learn")), f"{row['peer']:,.0f}"]
+        )
+    return table(["sensing", "env-steps/s", "floor", "simulate", "infer", "learn", "Stable-Baselines3"], rows)
+
+
+def world_model_errors(sources: Sources) -> str:
+    """Errors of the world model beside "as before"."""
+    rows = []
+    for row in sources.benchmark("world_model")["rows"]:
+        if row["peer_name"] != "as before":
+            continue
+        found = _noted(r"([\d.]+) of its error, 95 % in ([\d.]+) \.\. ([\d.]+); squared standardised residual ([\d.]+)", row)
+        unit = "" if row["unit"] == "1" else f" {row['unit']}"
+        error, before = (f"{row[side]:.3g}{unit}" for side in ("ours", "peer"))
+        rows.append([row["what"].removeprefix("RMSE "), error, before, f"{found[1]} ({found[2]} .. {found[3]})", found[4]])
+    return table(["targets", "RMSE", '"as before"', "ratio, 95 %", "squared standardised residual"], rows)
+
+
+_SWITCHES = {
+    "all on": "defaults",
+    "plain NLL": "`beta_nll=0` (plain likelihood)",
+    "gradient": "`stop_target_gradient=false`",
+    "SI targets": "`normalise_targets=false`",
+    "values": "`predict_change=false`",
+    "values, SI": "`predict_change=false normalise_targets=false`",
+    "MSE": "`likelihood=false` (MSE)",
+}
+
+
+def world_model_switches(sources: Sources) -> str:
+    """Each switch turned alone."""
+    columns = _row(sources, "world_model", "switches")["details"]["table"]
+    traits = [*list(columns["all on"])[:9], "latent spread"]
+    rows = [[title, *(_short(columns[name][trait]) for trait in traits)] for name, title in _SWITCHES.items()]
+    return table(["", *(trait.removeprefix("RMSE ") for trait in traits)], rows)
+
+
+def _short(value: float) -> str:
+    return DASH if math.isnan(value) else f"{value:.3g}"
+
+
+def risk(sources: Sources) -> str:
+    """What the risk head knows, beside what stands next to it."""
+    brier, ece, auroc, miss = (
+        _row(sources, "world_model", f"risk: {what}") for what in ("Brier score", "ECE", "AUROC", "conformal miss rate")
+    )
+    found = _noted(
+        r"(\d+ of \d+) accidents, 95 % in ([\d.]+) \.\. ([\d.]+); promised ([\d.]+) from (\d+) accidents; "
+        r"threshold ([\d.]+), alarm in (\d+) %",
+        miss,
+    )
+    low, high, promised = (100 * float(found[i]) for i in (2, 3, 4))
+    rows = [
+        ["Brier score", f"{brier['ours']:.4f}", f"{brier['peer']:.4f} base rate"],
+        ["ECE", f"{ece['ours']:.4f}", f"{ece['peer']:.4f} before isotonic regression"],
+        ["AUROC", f"{auroc['ours']:.3f}", f"{auroc['peer']:.3f} smallest time to collision of a sector"],
+        [
+            f"missed accidents at a promised {promised:.0f} %",
+            f"{found[1]} ({low:.1f} .. {high:.1f} %)",
+            f"threshold {found[6]} from {found[5]} accidents",
+        ],
+        ["alarm in safe moments", f"{found[7]} %", ""],
+    ]
+    return table(["", "head", "beside"], rows)
+
+
+def risk_bins(sources: Sources) -> str:
+    """The reliability diagram as numbers."""
+    columns = _row(sources, "world_model", "risk: ECE")["details"]["table"]
+    rows = [[name, *(f"{value:.2f}" for value in columns[name].values())] for name in ("predicted", "observed")]
+    rows.append(["moments", *(f"{value:.0f}" for value in columns["moments"].values())])
+    return table(rows[0], rows[1:])
+
+
+def _row(sources: Sources, what: str, text: str) -> dict[str, Any]:
+    return next(row for row in sources.benchmark(what)["rows"] if row["what"] == text)
+
+
+def _noted(pattern: str, row: dict[str, Any]) -> re.Match[str]:
+    """Figures that a benchmark tells in its note alone."""
+    found = re.search(pattern, row["note"])
+    if not found:
+        raise SourceError(f"{row['what']!r}: the note says something else: {row['note']!r}")
+    return found
+
+
+TABLES: dict[str, Callable[[Sources], str]] = {
+    made.__name__: made
+    for made in (
+        measured,
+        evaluations,
+        policy,
+        grid,
+        caution,
+        alone,
+        learning_cost,
+        world_model_errors,
+        world_model_switches,
+        risk,
+        risk_bins,
+    )
+}
