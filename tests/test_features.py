@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from tests.reference import features as oracle
+from uuvtai import tree_codes as codes
 from uuvtai.config import EpisodeConfig, FeaturesConfig, ForecastConfig, SonarConfig, TankConfig, TrackingConfig
-from uuvtai.kernels import tree_tick as codes
 from uuvtai.kernels.features import (
     COLUMNS,
     columns,

@@ -8,8 +8,9 @@ import pytest
 
 from benchmarks.peers.tick_py_trees import PyTree
 from uuvtai import state
+from uuvtai import tree_codes as codes
 from uuvtai.config import TeacherConfig
-from uuvtai.kernels import tree_tick as codes
+from uuvtai.kernels.tree_tick import tick_with_given_statuses
 from uuvtai.loader import ConfigError, preset_names, preset_path
 from uuvtai.tree import CONTROLS, DECORATORS, LEAVES, FlatTree, TreeError, load_tree, node_use, parse_tree, read_tree, tree_dot, tree_text
 
@@ -172,7 +173,7 @@ def begin(engine, flat):
 def tick(engine, answers):
     """Statuses [env, node] after a tick with the given leaf answers, and the acting node."""
     teacher, table = engine
-    codes.tick_with_given_statuses(np.ascontiguousarray(answers, np.int32), teacher, table)
+    tick_with_given_statuses(np.ascontiguousarray(answers, np.int32), teacher, table)
     return teacher.status.to_numpy(), teacher.leaf.to_numpy()
 
 

@@ -14,7 +14,7 @@ from uuvtai import scenario, state
 from uuvtai.config import EpisodeConfig, WorldConfig
 from uuvtai.kernels import episode, world
 from uuvtai.kernels.geometry import BOX, CYLINDER, NONE, SPHERE
-from uuvtai.loader import PRESET_DIR
+from uuvtai.shipped import PRESET_DIR
 
 N = 192
 """Episodes drawn per world."""

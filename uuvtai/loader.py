@@ -21,17 +21,8 @@ from pydantic import BaseModel, ValidationError
 from uuvtai.config import Config
 from uuvtai.config.learning import LearningConfig
 from uuvtai.errors import UserError
+from uuvtai.shipped import preset_names, shipped_file
 
-PRESET_DIR = Path(__file__).parent / "presets"
-KINDS = {
-    "world": "worlds",
-    "sensors": "sensors",
-    "vehicle": "vehicles",
-    "tree": "trees",
-    "train": "train",
-    "grid": "grids",
-    "policy": "policies",
-}
 DEFAULT_WORLD, DEFAULT_SENSORS = "pool", "paper"
 _SCENE_KINDS = ("world", "sensors", "vehicle")
 _LEARNING_SECTIONS = LearningConfig.model_fields.keys() - Config.model_fields.keys()
@@ -153,14 +144,6 @@ def to_yaml(config: Config) -> str:
     return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, width=120)
 
 
-def preset_names(kind: str) -> list[str]:
-    """Names of what is shipped of a kind (``KINDS``)."""
-    folder = PRESET_DIR / KINDS[kind]
-    if kind == "policy":
-        return sorted(path.parent.name for path in folder.glob("*/manifest.json"))
-    return sorted(path.stem for path in folder.iterdir() if path.suffix in (".yaml", ".xml"))
-
-
 def preset_path(kind: str, name: str) -> Path:
     """File of a preset given by name or path; ConfigError lists the names there are."""
     suffix = ".xml" if kind == "tree" else ".yaml"
@@ -174,7 +157,7 @@ def preset_path(kind: str, name: str) -> Path:
             f"{kind} {name!r} is no preset{_nearest(name, preset_names(kind))}; there are: {', '.join(preset_names(kind))} "
             f"(see 'uuv presets'), or give the path of a {suffix} file"
         )
-    return PRESET_DIR / KINDS[kind] / f"{name}{suffix}"
+    return shipped_file(kind, name)
 
 
 def read_preset(kind: str, name: str) -> dict[str, Any]:

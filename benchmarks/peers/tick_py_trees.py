@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import py_trees
 from py_trees.common import Status
 
-from uuvtai.kernels import tree_tick as codes
+from uuvtai import tree_codes as codes
 from uuvtai.tree import FlatTree
 
 _CODE = {Status.INVALID: codes.IDLE, Status.RUNNING: codes.RUNNING, Status.SUCCESS: codes.SUCCESS, Status.FAILURE: codes.FAILURE}
@@ -64,7 +64,7 @@ class PyTree:
         self.root.tick_once()
 
     def tick(self, answers: Sequence[int]) -> list[int]:
-        """One tick; the status of every node, coded as in ``tree_tick``."""
+        """One tick; the status of every node, coded as in ``tree_codes``."""
         self.tick_prepared(self.prepared(answers))
         return self.statuses()
 
@@ -74,5 +74,5 @@ class PyTree:
         return [int(node.name) for node in self.root.tick()]
 
     def statuses(self) -> list[int]:
-        """Status of every node, coded as in ``tree_tick``."""
+        """Status of every node, coded as in ``tree_codes``."""
         return [_CODE[node.status] for node in self.nodes]

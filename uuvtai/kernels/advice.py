@@ -2,8 +2,8 @@
 
 import taichi as ti
 
+from uuvtai import tree_codes as codes
 from uuvtai.config import FeaturesConfig
-from uuvtai.kernels import tree_tick as codes
 from uuvtai.kernels.columns import Column
 from uuvtai.kernels.signature import Const, In
 from uuvtai.state import TeacherState, TreeTable

@@ -4,8 +4,8 @@ import math
 
 import taichi as ti
 
+from uuvtai import tree_codes as codes
 from uuvtai.config import EpisodeConfig, TankConfig, TeacherConfig, VehicleConfig
-from uuvtai.kernels import tree_tick as codes
 from uuvtai.kernels.geometry import FAR_M, PI, quaternion_wb, rotation_wb, turned_z, wrapped_angle
 from uuvtai.kernels.rollout import held_heave
 from uuvtai.kernels.signature import Const, In, Out, quick_launch, spread

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from uuvtai.config import Config
-from uuvtai.loader import PRESET_DIR, ConfigError, preset_names
+from uuvtai.loader import ConfigError
+from uuvtai.shipped import PRESET_DIR, preset_names
 from uuvtai.tree import FlatTree, read_tree
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ class TeacherState:
     """The behaviour tree: blackboard, statuses and action."""
 
     status: ti.Field = array("n_env", "n_node", dtype=ti.i8)
-    """status of every node after the newest tick (tree_tick codes)"""
+    """status of every node after the newest tick (``tree_codes``)"""
     running_child: ti.Field = array("n_env", "n_node", dtype=ti.i16)
     """child (preorder index) that a node with memory goes on with"""
     result: ti.Field = array("n_env", "n_node", dtype=ti.i8, scratch=True)
@@ -78,7 +78,7 @@ class TreeTable:
     n_node: ti.Field = array(dtype=ti.i32)
     """nodes in use"""
     kind: ti.Field = array("n_node", dtype=ti.i32)
-    """kind of node (tree_tick codes)"""
+    """kind of node (``tree_codes``)"""
     end: ti.Field = array("n_node", dtype=ti.i32)
     """one past the last descendant in preorder"""
     parent: ti.Field = array("n_node", dtype=ti.i32)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uuvtai.capture import Put, put_by_kernel
-from uuvtai.state import TreeTable
 from uuvtai.tree.elements import TreeError
 from uuvtai.tree.nodes import MAX_PORTS
+
+if TYPE_CHECKING:  # a tree is read and printed without Taichi and torch
+    from uuvtai.capture import Put
+    from uuvtai.state import TreeTable
 
 UNSET = -1.0
 """Value of a port that is not given: the leaf takes the number of the config's teacher section."""
@@ -40,8 +43,10 @@ class FlatTree:
         return tuple(found)
 
 
-def load_tree(table: TreeTable, flat: FlatTree, put: Put = put_by_kernel) -> None:
-    """Copy a flat tree into the simulator's table. Raises TreeError when it does not fit."""
+def load_tree(table: TreeTable, flat: FlatTree, put: Put | None = None) -> None:
+    """Copy a flat tree into the simulator's table by ``put`` (default: ``put_by_kernel``). Raises TreeError when it does not fit."""
+    if put is None:
+        from uuvtai.capture import put_by_kernel as put
     n, capacity = len(flat.kind), table.kind.shape[0]
     if n > capacity:
         raise TreeError(f"{flat.source}: {n} nodes do not fit the {capacity} that were allocated (teacher.max_node)")

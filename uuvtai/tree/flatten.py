@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from typing import NoReturn
 
-from uuvtai.kernels import tree_tick as codes
+from uuvtai import tree_codes as codes
 from uuvtai.loader import preset_path
 from uuvtai.tree.elements import MAX_BYTES, Element, TreeError, read_elements
 from uuvtai.tree.flat import UNSET, FlatTree

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from uuvtai.kernels import tree_tick as codes
+from uuvtai import tree_codes as codes
 
 MAX_PORTS = 4
 """Numbers that a leaf can be given."""

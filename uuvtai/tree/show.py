@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uuvtai.kernels import tree_tick as codes
+from uuvtai import tree_codes as codes
 from uuvtai.tree.flat import UNSET, FlatTree
 from uuvtai.tree.nodes import LEAVES
 
