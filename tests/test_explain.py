@@ -550,7 +550,7 @@ def test_the_worst_are_recorded_with_picture_and_video(played, tmp_path):
 class _Silent:
     def start(self, name, total): ...
     def note(self, text): ...
-    def update(self, done, total, env_steps): ...
+    def update(self, done, total, env_steps, left=None): ...
     def stop(self): ...
 
 
@@ -620,11 +620,12 @@ def test_bad_combinations_are_one_message(capfd, arguments, says):
 
 
 def test_the_table_is_printed_and_no_failure_is_said(capfd):
-    from uuvtai.cli import _print_causes
+    from uuvtai.show.causes import show_causes
+    from uuvtai.show.screen import Screen
 
     causes_found = table_of([row("late", 0, 0.2, forecast_error_m=0.1, seen_ago_s=0.0, evading_s=0.4, last_chance_s=0.5)])
     method = {"name": "bt", "episodes": 9, "explain": [{}], "causes": causes_found}
-    _print_causes({"methods": [method, {"name": "calm", "episodes": 9, "explain": [], "causes": []}]})
+    show_causes(Screen(), {"methods": [method, {"name": "calm", "episodes": 9, "explain": [], "causes": []}]})
     out = capfd.readouterr().out
     assert "bt: why 1 of 9 episodes failed" in out
     assert "late" in out and "1:0" in out and "100 %" in out

@@ -13,7 +13,6 @@ import pytest
 from tests import sweep_work
 from tests.conftest import SmallSim
 from tests.report_samples import robustness_sweep
-from uuvtai import cli
 from uuvtai.loader import ConfigError
 from uuvtai.measure.evaluate import Job, run_episodes
 from uuvtai.measure.sweep import run as sweep_run
@@ -22,6 +21,8 @@ from uuvtai.measure.sweep.grid import Grid, grid_of
 from uuvtai.measure.sweep.plan import SweepRequest, base_config, request_of, tasks_of
 from uuvtai.measure.sweep.run import ROWS, read_rows, resume, sweep
 from uuvtai.run_folder import RunFolderError
+from uuvtai.show.screen import Screen
+from uuvtai.show.sweeping import show_sweep
 
 
 class Quiet:
@@ -30,7 +31,7 @@ class Quiet:
     def __init__(self):
         self.told = []
 
-    def start(self, name, total):
+    def start(self, name, total, done=0):
         self.total = total
 
     def note(self, text):
@@ -145,9 +146,8 @@ def test_one_axis_at_a_time_tells_what_is_unchanged(tmp_path):
     assert json.loads((folder / "sweep.json").read_text())["unchanged"] == document["unchanged"]
 
 
-def test_what_is_printed_of_one_axis_at_a_time_names_what_changes(capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "160")
-    cli._print_sweep(robustness_sweep())
+def test_what_is_printed_of_one_axis_at_a_time_names_what_changes(capsys):
+    show_sweep(Screen(), robustness_sweep())
     lines = capsys.readouterr().out.splitlines()
     assert sum("nothing" in line for line in lines) == 2
     assert any("sensors = harsh" in line and "best" in line and "11/16" in line for line in lines)

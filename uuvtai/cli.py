@@ -15,14 +15,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from uuvtai import __version__, signals
 from uuvtai.endings import FAILED, GATE, UsageError, guarded, plain
 from uuvtai.endings import say as _say
+from uuvtai.shipped import KINDS, preset_names
+from uuvtai.show.progress import Progress
+from uuvtai.show.screen import Screen
 
 app = typer.Typer(
     name="uuv",
@@ -44,6 +43,7 @@ Set = Annotated[list[str] | None, typer.Option("--set", help="Override a config 
 Device = Annotated[str, typer.Option("--device", help="auto, cpu or cuda.")]
 RunDir = Annotated[Path | None, typer.Option("--run-dir", help="The run's folder \\[default: runs/<time>_<preset>].")]
 WithReport = Annotated[bool, typer.Option("--report", help="Also write the run's report.html.")]
+Wide = Annotated[bool, typer.Option("--wide", help="Show every column of a table, though the terminal be narrower.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else on stdout.")]
 
 
@@ -87,6 +87,7 @@ def evaluate(
     overrides: Set = None,
     with_report: WithReport = False,
     run_dir: RunDir = None,
+    wide: Wide = False,
     as_json: AsJson = False,
 ) -> None:
     """Play the same episodes with every controller and trained policy and print the table of methods."""
@@ -121,7 +122,7 @@ def evaluate(
         run_dir=run_dir,
     )
     result, folder = compare(request, _Progress())
-    _print_evaluation(result, folder, as_json)
+    _print_evaluation(result, folder, as_json, wide)
     if with_report:
         _say(f"report: {_write_report([folder], None).page}")
 
@@ -146,157 +147,23 @@ def _policy_features(policies: list[str]) -> list[tuple[str, Any]]:
     return features_of(policies)
 
 
-def _print_evaluation(result: dict[str, Any], folder: Path, as_json: bool) -> None:
+def _print_evaluation(result: dict[str, Any], folder: Path, as_json: bool, wide: bool) -> None:
     if as_json:
         _print_json(result)
         return
-    _print_methods(result)
+    from uuvtai.show.causes import show_causes
+    from uuvtai.show.evaluation import show_methods, show_pairs, show_risk
+
+    screen = Screen(wide)
+    show_methods(screen, result)
+    show_pairs(screen, result["paired"])
     for method in result["methods"]:
         if "risk" in method:
-            _print_risk(method["name"], method["risk"])
+            show_risk(screen, method["name"], method["risk"])
     if any("causes" in method for method in result["methods"]):
-        _print_causes(result)
+        show_causes(screen, result)
         _say(f"facts of every failure, and which of them are recorded: {folder / 'eval/explain.json'}")
     _say(f"run folder: {folder}")
-
-
-def _print_methods(result: dict[str, Any]) -> None:
-    speed = f"v = {result['v_m_s']} m/s, " if result["D"] else ""
-    table = Table(
-        title=f"{result['world']}: S = {result['S']}, D = {result['D']}, {speed}{result['sensors']} sensing, "
-        f"{len(result['seeds'])} {'seed' if len(result['seeds']) == 1 else 'seeds'} x {result['episodes_per_seed']} episodes",
-        title_justify="left",
-    )
-    for head in (
-        "method",
-        "success [95 %]",
-        "collision [95 %]",
-        "contact/ttc/out/timeout",
-        "time to goal s",
-        "TTS s",
-        "replans",
-        "steps/s",
-    ):
-        table.add_column(head, justify="left" if head == "method" else "right")
-    for m in result["methods"]:
-        o = m["outcomes"]
-        collided = o["collision"] + o["ttc"] + o["out_of_tank"]
-        table.add_row(
-            f"{m['name']} {_DAGGER}" if m["privileged"] else m["name"],
-            _rate(o["success"], m["episodes"], m["success_ci95"]),
-            _rate(collided, m["episodes"], m["collision_ci95"]),
-            f"{o['collision']}/{o['ttc']}/{o['out_of_tank']}/{o['timeout']}",
-            _number(m["time_to_success_mean_s"]),
-            _number(m["tts_s"]),
-            _number(m["replans_per_episode"]),
-            "-" if m["env_steps_per_s"] is None else f"{m['env_steps_per_s']:,.0f}",
-        )
-    _stdout().print(table)
-    _print_condition(result["condition"])
-    for part in result["remainder"]:
-        _print_remainder(part)
-    for m in result["methods"]:
-        if m["privileged"]:
-            _stdout().print(f"{_DAGGER} {m['name']} is privileged: {_privilege(m['name'])}", style="dim", highlight=False)
-
-
-def _print_remainder(part: dict[str, Any]) -> None:
-    _stdout().print(
-        f"{part['method']} misses {part['missed']} of {part['episodes']}: {part['sensing']} by sensing (told of the moving bodies it "
-        f"arrives), {part['forecast_decision']} by forecast, decision and inertia (a point had a way), {part['physics']} by physics "
-        "(the oracle finds none)",
-        highlight=False,
-    )
-
-
-_DAGGER = "\u2020"
-
-
-def _privilege(name: str) -> str:
-    if name == "oracle":
-        return "it knows the future and has no inertia; timeout = not reachable. An upper bound, no controller"
-    return "it is told where every moving body is and how it moves; what stands still it senses"
-
-
-def _print_condition(condition: dict[str, Any]) -> None:
-    """How hard the condition is, in one line."""
-    detection, rides = condition["detection"], _rate(condition["rides_threatened"], condition["rides"], condition["rides_threatened_ci95"])
-    if detection is None:
-        return
-    _stdout().print(
-        f"threat rate {condition['threats_per_min']:.2f} per minute ({condition['threats']} moving bodies in "
-        f"{condition['ride_minutes']:.1f} min of blind rides; {rides} of the rides meet one), required detection distance "
-        f"{detection['required_m']:.1f} m (closing {detection['closing_m_s']:.1f} m/s, {detection['aside_s']:.1f} s to move aside)",
-        highlight=False,
-    )
-
-
-def _print_risk(name: str, risk: dict[str, Any]) -> None:
-    """How far the policy's probability of an accident soon can be believed."""
-    _stdout().print(
-        f"{name}: risk of an accident soon at {risk['moments']:,} moments: Brier {risk['brier']:.4f} "
-        f"(base rate {risk['brier_base_rate']:.4f}), ECE {risk['ece']:.4f}, AUROC {risk['auroc']:.3f}",
-        highlight=False,
-    )
-    bins = risk["reliability"]
-    pairs = zip(bins["predicted"], bins["observed"], bins["samples"], strict=True)
-    _stdout().print("  said -> came (n): " + ", ".join(f"{p:.2f} -> {o:.2f} ({n:,.0f})" for p, o, n in pairs), highlight=False)
-    if "accidents" in risk:
-        low, high = risk["missed_ci95"]
-        _stdout().print(
-            f"  alarm: missed {risk['missed']} of {risk['accidents']} accidents, {100 * low:.1f} to {100 * high:.1f} % "
-            f"(promised {100 * risk['promised_miss_rate']:g} %), raised in {100 * risk['alarm_rate_safe']:.1f} % of the safe moments",
-            highlight=False,
-        )
-
-
-def _print_causes(result: dict[str, Any]) -> None:
-    for m in result["methods"]:
-        failed = len(m["explain"])
-        if not failed:
-            _stdout().print(f"{m['name']}: no episode failed, nothing to explain", highlight=False)
-            continue
-        title = f"{m['name']}: why {failed} of {m['episodes']} episodes failed"
-        table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-        for head in ("cause", "n", "share", "knew", "unseen", "evading", "chance", "worst"):
-            table.add_column(head, justify="left" if head in ("cause", "worst") else "right", no_wrap=True)
-        for c in m["causes"]:
-            medians = (c["unseen_median_s"], c["evading_median_s"], c["last_chance_median_s"])
-            worst = ":".join(map(str, c["examples"][0]))
-            table.add_row(c["label"], str(c["count"]), _percent(c["share"]), _percent(c["knew_share"]), *map(_seconds, medians), worst)
-        _stdout().print(table)
-        for c in m["causes"]:
-            remarks = ", ".join(f"{k} {remark}" for remark, k in c["remarks"].items() if k >= _REMARKABLE_SHARE * c["count"])
-            remark = (f" ({remarks})", "dim") if remarks else ""
-            _stdout().print(Text.assemble((c["label"], "bold"), f": {c['meaning']}", remark))
-    if any(m["explain"] for m in result["methods"]):
-        _stdout().print(_CAUSES_LEGEND, style="dim", highlight=False)
-
-
-_REMARKABLE_SHARE = 0.2
-"""Remarks on fewer of a cause's episodes are left to the JSON."""
-
-_CAUSES_LEGEND = (
-    "knew: share whose forecast of the killer, made 1 s before the end, was right. Medians before the end: unseen = since a beam last met "
-    "the killer, evading = since evasion began, chance = until when some velocity still escaped. worst: seed:episode of the hardest hit"
-)
-
-
-def _percent(share: float | None) -> str:
-    return "-" if share is None else f"{100 * share:.0f} %"
-
-
-def _seconds(value: float | None) -> str:
-    return "-" if value is None else f"{value:.1f} s"
-
-
-def _rate(k: int, n: int, interval: list[float] | None) -> str:
-    bounds = f" [{100 * interval[0]:.0f}, {100 * interval[1]:.0f}]" if interval else ""
-    return f"{k}/{n} = {100 * k / n:.1f} %{bounds}" if n else "-"
-
-
-def _number(value: float | None, digits: int = 1) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
 
 
 # ------------------------------------------------------------------------------------------------------------------- train
@@ -326,6 +193,7 @@ def train_policy(
     """Train a policy into a run folder, or go on with one. Ctrl-C saves; --resume goes on."""
     from uuvtai.loader import load_training
     from uuvtai.measure.training import TrainRequest, train
+    from uuvtai.show.training import TrainingProgress
 
     if resume is None:
         sizes = [(f"train.{key}", value) for key, value in (("num_envs", num_envs), ("seed", seed)) if value is not None]
@@ -338,7 +206,7 @@ def train_policy(
         given |= {"-S": n_static, "-D": n_dynamic, "-v": speed, "--run-dir": run_dir}
         _refuse_beside_resume(given)
         request = TrainRequest(resume=resume, overrides=list(overrides or []), iterations=iterations, device=device)
-    result, folder = train(request, _Training())
+    result, folder = train(request, TrainingProgress())
     if with_report:
         _say(f"report: {_write_report([folder], None).page}")
     if as_json:
@@ -349,84 +217,6 @@ def _refuse_beside_resume(given: dict[str, Any]) -> None:
     for option, value in given.items():
         if value is not None:
             raise UsageError(f"{option} {value}: a resumed run keeps its own; leave it out, or begin a new run without --resume")
-
-
-class _Training:
-    """Live dashboard on a terminal, one plain line every few seconds otherwise."""
-
-    _PERIOD_S = 5.0
-
-    def __init__(self) -> None:
-        self._live = None
-        self._last = 0.0
-        self._evaluated: dict[str, float] = {}
-        """newest figures of an evaluation"""
-
-    def start(self, folder: Path, config: Any, done: int, total: int) -> None:
-        """``done`` of ``total`` iterations are over as the run begins in ``folder``."""
-        import time
-
-        _say(f"run folder: {folder}")
-        self._folder, self._done, self._total, self._begun = folder, done, total, time.perf_counter()
-        world = config.world
-        self._title = f"{config.train.num_envs} envs, S = {world.n_static}, D = {world.n_dynamic}, v = {world.dynamic_speed_m_s} m/s"
-        if sys.stderr.isatty():
-            from rich.live import Live
-
-            self._live = Live(console=_stderr(), refresh_per_second=4, transient=False)
-            self._live.start()
-
-    def note(self, text: str) -> None:
-        """A message for the person who waits."""
-        if self._live is not None:
-            self._live.console.print(text, highlight=False, markup=False)
-        else:
-            _say(text)
-
-    def update(self, done: int, metrics: dict[str, float], success_ci95: tuple[float, float] | None) -> None:
-        """Iteration ``done`` is over."""
-        import time
-
-        now = time.perf_counter()
-        eta_s = (now - self._begun) / max(1, done - self._done) * (self._total - done)
-        self._evaluated |= {name: value for name, value in metrics.items() if name.startswith("eval/")}
-        rows = _training_rows(self._evaluated | metrics, success_ci95, eta_s)
-        if self._live is not None:
-            table = Table(
-                title=f"{self._folder}: iteration {done} of {self._total}, {self._title}", title_justify="left", show_header=False
-            )
-            for name, text in rows.items():
-                table.add_row(name, text)
-            self._live.update(table)
-        elif now - self._last >= self._PERIOD_S or done == self._total:
-            self._last = now
-            _say(f"{done}/{self._total}: " + ", ".join(f"{name} {text}" for name, text in rows.items()))
-
-    def stop(self) -> None:
-        """The run is over."""
-        if self._live is not None:
-            self._live.stop()
-            self._live = None
-
-
-def _training_rows(metrics: dict[str, float], success_ci95: tuple[float, float] | None, eta_s: float) -> dict[str, str]:
-    """What the dashboard shows: name -> text."""
-    of = metrics.get
-    interval = f" [{100 * success_ci95[0]:.0f}, {100 * success_ci95[1]:.0f}]" if success_ci95 else ""
-    times = {name: of(f"time/{name}_s", 0.0) for name in ("simulate", "infer", "learn")}
-    split = " / ".join(f"{name} {100 * spent / max(1e-9, sum(times.values())):.0f} %" for name, spent in times.items())
-    rows = {
-        "reward": _number(of("rollout/ep_rew_mean"), 2),
-        "success": _percent(of("rollout/success_rate")) + interval,
-        "collision": _percent(of("rollout/collision_rate")),
-        "env-steps/s": f"{of('time/env_steps_per_s', 0.0):,.0f} ({split})",
-        "env-steps": f"{of('time/env_steps', 0.0):,.0f}",
-        "lambda": _number(of("distill/lambda_risk"), 3),
-        "ETA": f"{eta_s:.0f} s",
-    }
-    if "eval/success_rate" in metrics:
-        rows["evaluation"] = f"success {_percent(of('eval/success_rate'))}, collision {_percent(of('eval/collision_rate'))}"
-    return rows
 
 
 # ---------------------------------------------------------------------------------------------------------------- simulate
@@ -447,6 +237,7 @@ def simulate(
     neutral: Annotated[bool, typer.Option("--neutral", help="Buoyancy equal to weight.")] = False,
     dt: Annotated[float, typer.Option("--dt", help="Dynamics substep \\[s].")] = 0.01,
     overrides: Set = None,
+    wide: Wide = False,
     as_json: AsJson = False,
 ) -> None:
     """Open-loop physics in open water, to validate a vehicle against theory or data."""
@@ -469,17 +260,9 @@ def simulate(
     if as_json:
         _print_json(result)
         return
-    table = Table(title=f"{vehicle}: {seconds:g} s, substep {dt:g} s", title_justify="left")
-    for head in ("t s", "x m", "y m", "z m", "roll deg", "pitch deg", "yaw deg", "u m/s", "v m/s", "w m/s", "p", "q", "r rad/s"):
-        table.add_column(head, justify="right")
-    for i in _picked(len(result["t"]), 12):
-        values = [result["t"][i], *result["position"][i], *result["rpy_deg"][i], *result["nu"][i]]
-        table.add_row(*[f"{value:.3f}" for value in values])
-    _stdout().print(table)
+    from uuvtai.show.simulation import show_simulation
 
-
-def _picked(n: int, wanted: int) -> list[int]:
-    return sorted({round(i * (n - 1) / max(1, wanted - 1)) for i in range(wanted)}) if n else []
+    show_simulation(Screen(wide), result, f"{vehicle}: {seconds:g} s, substep {dt:g} s")
 
 
 # ------------------------------------------------------------------------------------------------------------------- sweep
@@ -515,6 +298,7 @@ def sweep(
     with_report: WithReport = False,
     overrides: Set = None,
     run_dir: RunDir = None,
+    wide: Wide = False,
     as_json: AsJson = False,
 ) -> None:
     """Play every cell of a grid with every method; finished cells survive a kill: --resume goes on."""
@@ -551,7 +335,9 @@ def sweep(
     if as_json:
         _print_json(result)
         return
-    _print_sweep(result)
+    from uuvtai.show.sweeping import show_sweep
+
+    show_sweep(Screen(wide), result)
     _say(f"run folder: {folder}")
 
 
@@ -561,34 +347,6 @@ def _engine(name: str, workers: int, address: str) -> Any:
     if name not in ("local", "ray"):
         raise UsageError(f"--engine {name!r}: local or ray")
     return LocalEngine(workers) if name == "local" else RayEngine(address)
-
-
-def _print_sweep(result: dict[str, Any]) -> None:
-    from uuvtai.report.alone import is_alone, told
-    from uuvtai.report.heatmap import varying
-
-    if len(varying(result["axes"])) > 1 and not is_alone(result):
-        from uuvtai.report.terminal import print_heat_maps
-
-        print_heat_maps(result, _stdout())
-        return
-    table = Table(title=f"{result['world']}: {len(result['cells'])} cells x {result['episodes_per_seed']} episodes", title_justify="left")
-    others = ["changed"] if is_alone(result) else [name for name in result["axes"] if name not in ("S", "D", "v")]
-    for head in ("S", "D", "v m/s", *others, "method", "success [95 %]", "collision [95 %]", "time to goal s"):
-        table.add_column(head, justify="right")
-    for row in result["cells"]:
-        o, n = row["outcomes"], row["episodes"]
-        table.add_row(
-            str(row["S"]),
-            str(row["D"]),
-            _number(row["v_m_s"]),
-            *([told(row, result)] if is_alone(result) else [str(row.get(name, "")) for name in others]),
-            row["method"],
-            _rate(o["success"], n, row["success_ci95"]),
-            _rate(o["collision"] + o["ttc"] + o["out_of_tank"], n, row["collision_ci95"]),
-            _number(row["time_to_success_mean_s"]),
-        )
-    _stdout().print(table)
 
 
 # ----------------------------------------------------------------------------------------------------------------- profile
@@ -608,6 +366,7 @@ def profile(
     density: Annotated[bool, typer.Option("--density", help="Also loop time against D.")] = False,
     device: Device = "auto",
     overrides: Set = None,
+    wide: Wide = False,
     as_json: AsJson = False,
 ) -> None:
     """Time per stage, env-steps per second (simulated, with inference, with training), memory, and the paper's timing tables."""
@@ -622,78 +381,10 @@ def profile(
     result = run(config, sizes, controller, device, seconds, density, _say)
     if as_json:
         _print_json(result)
-    else:
-        _print_profile(result)
+        return
+    from uuvtai.show.profile import show_profile
 
-
-def _print_profile(result: dict[str, Any]) -> None:
-    machine = f"{result['machine']['cpu']}, {result['machine']['cores']} cores, {result['machine']['device']}"
-    table = Table(title=machine, title_justify="left")
-    table.add_column("us per env-step")
-    for row in result["rows"]:
-        table.add_column(f"{row['num_envs']} env", justify="right")
-    for stage in result["rows"][0]["stages_us_per_env_step"]:
-        table.add_row(stage, *[f"{row['stages_us_per_env_step'][stage]:.2f}" for row in result["rows"]])
-    table.add_section()
-    for name, label in _RATES.items():
-        table.add_row(f"env-steps/s: {label}", *[f"{row['env_steps_per_s'][name]:,.0f}" for row in result["rows"]])
-    table.add_row("memory MB", *[f"{row['memory_mb']:,.0f}" for row in result["rows"]])
-    table.add_row("compile s", *[f"{row['compile_s']:.1f}" for row in result["rows"]])
-    _stdout().print(table)
-    for row in result["rows"]:
-        _print_flame(row)
-    if result["paper_latency"]:
-        _print_latency(result)
-    if result["paper_density"]:
-        _print_density(result["paper_density"])
-
-
-_RATES = {"step": "random actions", "tree": "driven by the tree", "step_inference": "+ policy", "train": "+ training"}
-_FLAME_WIDTH = 100
-_FLAME_COLORS = ("blue", "cyan", "green", "yellow", "magenta", "red", "bright_blue", "bright_cyan", "bright_green", "bright_yellow")
-
-
-def _print_flame(row: dict[str, Any]) -> None:
-    """Stages of a step as one bar, each as wide as its share of the time."""
-    from rich.text import Text
-
-    stages = {name: us for name, us in row["stages_us_per_env_step"].items() if us > 0}
-    total, bar, edge = sum(stages.values()), Text(), 0.0
-    for (name, us), color in zip(stages.items(), _FLAME_COLORS * 2, strict=False):
-        first, edge = round(_FLAME_WIDTH * edge / total), edge + us
-        width = round(_FLAME_WIDTH * edge / total) - first
-        bar.append(name[:width].ljust(width), style=f"black on {color}")
-    _stdout().print(Text(f"{row['num_envs']:>6} env ").append(bar).append(f" {total:.1f} us"))
-
-
-def _print_latency(result: dict[str, Any]) -> None:
-    paper = Table(title="beside the paper's timing table (one env; theirs on a workstation with an RTX 5090)", title_justify="left")
-    for head in ("component", "mean ms", "max ms", "paper mean ms", "paper max ms"):
-        paper.add_column(head, justify="left" if head == "component" else "right")
-    for row in result["paper_latency"]:
-        if row["component"] == "Replanning rate":
-            paper.caption = (
-                f"{row['replans_per_episode']:.1f} replans an episode, {row['hz']:.2f} Hz "
-                f"(paper: {row['paper_replans_per_episode']}, {row['paper_hz']} Hz)"
-            )
-            continue
-        values = (row["mean_ms"], row["max_ms"], row["paper_mean_ms"], row["paper_max_ms"])
-        paper.add_row(row["component"], *[_number(value, 3) for value in values])
-    _stdout().print(paper)
-    loop = result["real_time"]
-    times = ", ".join(f"{name} {loop[f'{name}_ms']:.2f}" for name in ("p50", "p99", "max"))
-    verdict = f"{loop['budget_ms']:.0f} ms a step {'kept' if loop['within'] else 'NOT kept'}"
-    _stdout().print(f"{verdict}: {times} ms; {loop['late']} of {loop['steps']} steps late", highlight=False)
-
-
-def _print_density(rows: list[dict[str, Any]]) -> None:
-    table = Table(title="loop time against moving obstacles (one env)", title_justify="left")
-    for head in ("D", "loop ms", "paper ms", "replans an episode", "paper replans"):
-        table.add_column(head, justify="right")
-    for row in rows:
-        replans = _number(row["replans_per_episode"])
-        table.add_row(str(row["D"]), _number(row["loop_ms"], 2), _number(row["paper_loop_ms"]), replans, _number(row["paper_replans"]))
-    _stdout().print(table)
+    show_profile(Screen(wide), result)
 
 
 # --------------------------------------------------------------------------------------------------------------- reproduce
@@ -704,6 +395,7 @@ def reproduce(
     budget: Annotated[str, typer.Option("--budget", help="quick (half an hour on two cores) or full (overnight).")] = "quick",
     resume: Annotated[Path | None, typer.Option("--resume", help="Run folder of a reproduction to go on with.")] = None,
     run_dir: RunDir = None,
+    wide: Wide = False,
     as_json: AsJson = False,
 ) -> None:
     """Train, evaluate, sweep and profile whatever the paper shows, and judge each of its claims."""
@@ -718,13 +410,9 @@ def reproduce(
     if as_json:
         _print_json(result)
         return
-    table = Table(title=f"the paper's claims, budget {result['budget']}", title_justify="left")
-    for head in ("claim", "the paper", "here", "verdict"):
-        table.add_column(head, overflow="fold")
-    for claim in result["claims"]:
-        color = {"holds": "green", "does not hold": "red"}.get(claim["verdict"], "yellow")
-        table.add_row(claim["text"], claim["theirs"], claim["ours"], Text(claim["verdict"], style=color))
-    _stdout().print(table, highlight=False)
+    from uuvtai.show.claims import show_claims
+
+    show_claims(Screen(wide), result)
     _say(f"run folder: {folder}")
 
 
@@ -763,6 +451,7 @@ def export_policy(
         typer.Option("--evaluation", help="Run folder of 'uuv eval RUN': counts for the model card (repeatable)."),
     ] = None,
     check: Annotated[Path | None, typer.Option("--check", help="Verify an exported folder instead: sha256 and golden pairs.")] = None,
+    wide: Wide = False,
     as_json: AsJson = False,
 ) -> None:
     """Write a policy that drives without uuvtai (NumPy alone, or ONNX), or check such a folder. Exit code 3: it disagrees."""
@@ -782,23 +471,17 @@ def export_policy(
     if as_json:
         _print_json(found.document())
     else:
-        _print_export(found)
+        _print_export(found, wide)
     if not found.agrees:
         raise typer.Exit(GATE)
 
 
-def _print_export(found: Any) -> None:
+def _print_export(found: Any, wide: bool) -> None:
+    from uuvtai.show.exports import show_export
+
     for damage in found.damages:
         _say(damage)
-    table = Table(title=str(found.folder), title_justify="left")
-    for head in ("engine", "largest difference", "p50 ms", "p99 ms", ""):
-        table.add_column(head, justify="right" if head else "left")
-    for one in found.agreements:
-        worst = max(one.difference, key=lambda name: one.difference[name])
-        told = f"{one.difference[worst]:.1e} ({worst})"
-        table.add_row(one.engine, told, f"{one.p50_ms:.3f}", f"{one.p99_ms:.3f}", "agrees" if one.agrees else "DIFFERS")
-    if found.agreements:
-        _stdout().print(table)
+    show_export(Screen(wide), found)
 
 
 # --------------------------------------------------------------------------------------------------------- presets, doctor
@@ -806,50 +489,81 @@ def _print_export(found: Any) -> None:
 
 @app.command()
 def presets(
-    action: Annotated[str | None, typer.Argument(help="'show' to print one preset, resolved.")] = None,
-    name: Annotated[str | None, typer.Argument(help="Preset to show; KIND/NAME where two kinds have one of that name.")] = None,
+    action: Annotated[str | None, typer.Argument(help="'show' to print one preset as it is written.")] = None,
+    name: Annotated[
+        str | None,
+        typer.Argument(help="Preset to show; KIND/NAME where two kinds have one of that name."),
+    ] = None,
+    everything: Annotated[
+        bool, typer.Option("--all", help="With show: every key that the preset gives, its own, those it builds on, and the defaults.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """List the shipped presets, or show one with every key."""
-    from uuvtai import loader
+    """List the shipped presets with a sentence each, or show what one of them states."""
+    from uuvtai.show import presets as shown
 
     if action is None:
-        found = {kind: loader.preset_names(kind) for kind in loader.KINDS}
         if as_json:
-            _print_json(found)
-            return
-        for kind, names in found.items():
-            _stdout().print(Text.assemble((kind, "bold"), f"  {', '.join(names) or '-'}"))
+            _print_json(shown.sentences())
+        else:
+            shown.show_presets(Screen())
         return
     if action != "show" or not name:
         raise UsageError("write 'uuv presets' or 'uuv presets show NAME'")
     kind, name = _preset_kind(name)
-    if kind in ("tree", "grid"):
-        if as_json and kind == "grid":
-            _print_json(loader.read_preset(kind, name))
-        else:
-            typer.echo(loader.preset_path(kind, name).read_text())
-        return
-    config = _shown(kind, name)
-    if as_json:
-        _print_json(config.model_dump(mode="json"))
+    if everything:
+        _print_resolved(kind, name, as_json)
     else:
-        typer.echo(loader.to_yaml(config))
+        _print_stated(kind, name, as_json)
+
+
+def _print_stated(kind: str, name: str, as_json: bool) -> None:
+    """What a preset states itself."""
+    from uuvtai import loader
+    from uuvtai.show.presets import stated
+
+    path = loader.preset_path(kind, name)
+    if not as_json:
+        typer.echo(stated(path))
+        if (base := loader.base_of(path)) is not None:
+            _say(f"it changes these keys of {base} (uuv presets show {kind}/{base}); every key: --all")
+    elif path.suffix in (".xml", ".md"):
+        _print_json({"schema": 1, "text": stated(path)})
+    else:
+        _print_json(loader.stated(path))
+
+
+def _print_resolved(kind: str, name: str, as_json: bool) -> None:
+    """Every key that a preset gives; of a tree, which has none, what it states."""
+    from uuvtai import loader
+
+    if kind == "tree":
+        _print_stated(kind, name, as_json)
+    elif kind == "grid":
+        found = loader.read_preset(kind, name)
+        if as_json:
+            _print_json(found)
+        else:
+            typer.echo(loader.dumped(found))
+    elif as_json:
+        _print_json(_shown(kind, name).model_dump(mode="json"))
+    else:
+        typer.echo(loader.to_yaml(_shown(kind, name)))
 
 
 def _preset_kind(name: str) -> tuple[str, str]:
     """(kind, name) of 'NAME' or 'KIND/NAME'; a path is taken for a world's. UsageError for a name that no kind has."""
-    from uuvtai import loader
+    from uuvtai.show.presets import near
 
     kind, slash, rest = name.partition("/")
-    if slash and kind in loader.KINDS:
+    if slash and kind in KINDS:
         return kind, rest
-    kinds = [kind for kind in loader.KINDS if name in loader.preset_names(kind)]
+    kinds = [kind for kind in KINDS if name in preset_names(kind)]
     for other in kinds[1:]:
         _say(f"there is another one: uuv presets show {other}/{name}")
     if not kinds and not slash and not Path(name).suffix:
-        known = "; ".join(f"{kind}: {', '.join(names)}" for kind in loader.KINDS if (names := loader.preset_names(kind)))
-        raise UsageError(f"{name!r} is no preset. There are {known}")
+        known = "; ".join(f"{kind}: {', '.join(names)}" for kind in KINDS if (names := preset_names(kind)))
+        raise UsageError(f"{name!r} is no preset{near(name) or '.'} There are {known}")
     return (kinds[0] if kinds else "world"), name
 
 
@@ -876,9 +590,9 @@ def doctor(as_json: AsJson = False) -> None:
     if as_json:
         _print_json({"ok": all(c["ok"] for c in found), "checks": found})
     else:
-        for c in found:
-            verdict = ("ok ", "green") if c["ok"] else ("BAD", "red")
-            _stdout().print(Text.assemble(verdict, f" {c['name']}: {c['detail']}"))
+        from uuvtai.show.health import show_checks
+
+        show_checks(Screen(), found)
     if not all(c["ok"] for c in found):
         raise typer.Exit(FAILED)
 
@@ -907,7 +621,7 @@ LogFile = Annotated[Path, typer.Argument(help="An .mcap file.")]
 
 
 @log_app.command("info")
-def log_info(file: LogFile, as_json: AsJson = False) -> None:
+def log_info(file: LogFile, wide: Wide = False, as_json: AsJson = False) -> None:
     """Topics, counts, rates, metadata and outcome of a log."""
     from uuvtai.logs import reader
 
@@ -915,13 +629,9 @@ def log_info(file: LogFile, as_json: AsJson = False) -> None:
     if as_json:
         _print_json(found)
         return
-    table = Table(title=str(file), title_justify="left")
-    for head in ("topic", "schema", "messages", "Hz"):
-        table.add_column(head, justify="right" if head in ("messages", "Hz") else "left")
-    for topic in found["topics"]:
-        table.add_row(Text(plain(topic["topic"])), Text(plain(topic["schema"])), str(topic["messages"]), _number(topic["rate_hz"]))
-    _stdout().print(table)
-    typer.echo(f"duration {found['duration_s']:.2f} s, outcome {plain(found['outcome'] or 'none: the log was cut off')}")
+    from uuvtai.show.logs import show_log
+
+    show_log(Screen(wide), found, file)
 
 
 @log_app.command("export")
@@ -1037,70 +747,7 @@ def _print_json(document: Any) -> None:
     typer.echo(json.dumps(document, allow_nan=False))
 
 
-def _stdout() -> Console:
-    # a pipe has no width: wide enough that no column is cut
-    return Console(width=None if sys.stdout is not None and sys.stdout.isatty() else 160, markup=False)
-
-
-def _stderr() -> Console:
-    return Console(stderr=True, markup=False)
-
-
-class _Progress:
-    """Rich progress with ETA on a terminal, one plain line every few seconds otherwise."""
-
-    _PERIOD_S = 5.0
-
-    def __init__(self, what: str = "episodes") -> None:
-        self._bar = None
-        self._last = 0.0
-        self._what = what
-
-    def start(self, name: str, total: int) -> None:
-        """A method with ``total`` episodes begins."""
-        import time
-
-        self._name, self._total, self._begun = name, total, time.perf_counter()
-        self._last = self._begun
-        if sys.stderr.isatty():
-            from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
-            self._bar = Progress(
-                TextColumn("{task.description}", markup=False),
-                BarColumn(),
-                MofNCompleteColumn(),
-                TimeElapsedColumn(),
-                TextColumn("ETA"),
-                TimeRemainingColumn(),
-                TextColumn("{task.fields[rate]}", markup=False),
-                console=_stderr(),
-                transient=True,
-            )
-            self._bar.start()
-            self._task = self._bar.add_task(name, total=total, rate="")
-
-    def note(self, text: str) -> None:
-        """A message for the person who waits."""
-        _say(text)
-
-    def update(self, done: int, total: int, env_steps: int) -> None:
-        """``done`` of ``total`` episodes are over after ``env_steps`` env steps."""
-        import time
-
-        now = time.perf_counter()
-        speed = f"{env_steps / max(1e-9, now - self._begun):,.0f} env-steps/s" if env_steps else ""
-        if self._bar is not None:
-            self._bar.update(self._task, completed=done, rate=speed)
-        elif now - self._last >= self._PERIOD_S:
-            self._last = now
-            eta = (now - self._begun) / max(1, done) * (total - done)
-            _say(f"{self._name}: {done}/{total} {self._what}, {speed + ', ' if speed else ''}ETA {eta:.0f} s")
-
-    def stop(self) -> None:
-        """The method is done."""
-        if self._bar is not None:
-            self._bar.stop()
-            self._bar = None
+_Progress = Progress
 
 
 @app.callback(invoke_without_command=True)

@@ -36,6 +36,27 @@ def remember_sources() -> None:
     for module in (impl, snode):
         if hasattr(module, "get_traceback"):
             module.get_traceback = _caller
+    if hasattr(kernel_impl.Kernel, "materialize") and not hasattr(kernel_impl.Kernel.materialize, "__wrapped__"):
+        kernel_impl.Kernel.materialize = _counted(kernel_impl.Kernel.materialize)
+
+
+_made = [0]
+
+
+def kernels_made() -> int:
+    """How many kernels were compiled, or found in the cache, since this process began: time in which this grows is no working time."""
+    return _made[0]
+
+
+def _counted(materialize: Any) -> Any:
+    @functools.wraps(materialize)
+    def counted(kernel: Any, *arguments: Any, **named: Any) -> Any:
+        before = len(kernel.compiled_kernels)
+        result = materialize(kernel, *arguments, **named)
+        _made[0] += len(kernel.compiled_kernels) - before
+        return result
+
+    return counted
 
 
 def _inside_class(level_of_class_stackframe: int) -> bool:

@@ -141,7 +141,23 @@ def load_resolved(path: Path, overrides: Overrides | None = None) -> Config:
 
 def to_yaml(config: Config) -> str:
     """Complete YAML of a config; ``load_resolved`` reads it back."""
-    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, width=120)
+    return dumped(config.model_dump(mode="json"))
+
+
+def stated(path: Path) -> dict[str, Any]:
+    """What the file of a preset says itself, as nested dicts, ``extends`` among it. Raises ConfigError."""
+    return _read_yaml(path).tree
+
+
+def base_of(path: Path) -> str | None:
+    """The preset that this one extends; None for none, and for files that cannot extend any."""
+    base = _read_yaml(path).tree.get("extends") if path.suffix in (".yaml", ".yml") else None
+    return base if isinstance(base, str) else None
+
+
+def dumped(tree: dict[str, Any]) -> str:
+    """YAML of nested dicts."""
+    return yaml.safe_dump(tree, sort_keys=False, width=120)
 
 
 def preset_path(kind: str, name: str) -> Path:
@@ -315,7 +331,7 @@ def _explained(error: ValidationError, origin: dict[str, str], model: type[BaseM
         else:
             got = problem.get("input")
             lines.append(f"{where}{dotted}: {problem['msg']} (got {got!r})")
-    return "\n".join(lines) + "\n'uuv presets show NAME' prints every key with its default"
+    return "\n".join(lines) + "\n'uuv presets show NAME --all' prints every key with its value"
 
 
 def _origin_of(dotted: str, origin: dict[str, str]) -> str:

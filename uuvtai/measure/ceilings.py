@@ -56,7 +56,7 @@ def oracle_entry(config: Config, jobs: list[Job], scenarios: list[dict[str, Any]
     for job, scenario in zip(jobs, scenarios, strict=True):
         results.append(_result(job, earliest_arrival(scenario, config).time_s, config))
         if progress:
-            progress(len(results), len(jobs), 0)
+            progress(len(results), len(jobs), 0, None)
     entry = summary(ORACLE, results, 0, time.perf_counter() - begun)
     details = [detail | dict.fromkeys(_UNKNOWN_OF_EPISODE) for detail in entry["episodes_detail"]]
     return entry | dict.fromkeys(_UNKNOWN) | {"episodes_detail": details, "privileged": True}

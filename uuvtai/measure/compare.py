@@ -54,7 +54,7 @@ class Watch(Protocol):
 
     def start(self, name: str, total: int) -> None: ...
     def note(self, text: str) -> None: ...
-    def update(self, done: int, total: int, env_steps: int) -> None: ...
+    def update(self, done: int, total: int, env_steps: int, left: int | None = None) -> None: ...
     def stop(self) -> None: ...
 
 
@@ -143,20 +143,23 @@ def _play(
     """Play one method's episodes and add them to ``played`` and ``entries``."""
     from uuvtai.measure.evaluate import Recorders, run_episodes, summary, tree_use
     from uuvtai.measure.foresight import foresight_of, told
+    from uuvtai.measure.stopwatch import StepClock
 
     sim.use_tree(method.tree)
     sim.privileged = method.privileged
     recorder = _recorder(request, folder.path, method.name, jobs, policy)
     foresight = foresight_of(policy.pilot, request.config.episode.control_dt_s) if policy else None
     watch.start(method.name, len(jobs))
-    begun = time.perf_counter()
+    begun, clock = time.perf_counter(), StepClock()
     try:
-        results, env_steps = run_episodes(sim, jobs, Recorders([recorder, foresight]), watch.update, policy.pilot if policy else None)
+        watchers = Recorders([recorder, foresight])
+        results, env_steps = run_episodes(sim, jobs, watchers, watch.update, policy.pilot if policy else None, clock)
     finally:
         watch.stop()
         if recorder:
             recorder.abort()
-    entry = summary(method.name, results, env_steps, time.perf_counter() - begun) | {"privileged": method.privileged}
+    wall_s = time.perf_counter() - begun
+    entry = summary(method.name, results, env_steps, wall_s, clock.env_steps_per_s) | {"privileged": method.privileged}
     entries.append(entry | method.document() | told(foresight))
     played.append(_Played(method, policy, results, tree_use(sim, results), recorder.paths if recorder else {}))
 

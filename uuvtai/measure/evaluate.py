@@ -14,6 +14,7 @@ from uuvtai.kernels.outcome import OUTCOMES, RUNNING
 from uuvtai.kernels.plan_codes import PLANNERS, REASONS, TRIGGERS
 from uuvtai.measure.paired import paired
 from uuvtai.measure.statistics import bootstrap_interval, mean, rate, time_to_success_s, wilson_interval
+from uuvtai.measure.stopwatch import StepClock, env_steps_left
 from uuvtai.outcomes import COLLIDED, ENDINGS
 from uuvtai.scenario import Scene
 from uuvtai.sim import Sim
@@ -104,8 +105,9 @@ class Driver(Protocol):
         """What was decided last has been done."""
 
 
-Progress = Callable[[int, int, int], None]
-"""Called with (episodes done, episodes in all, env steps done)."""
+Progress = Callable[[int, int, int, int | None], None]
+"""Called with (episodes done, episodes in all, env steps done, env steps still to come); (0, n, 0, None) before the first pass, which may
+compile; the last is None where it is too early to guess."""
 
 
 def jobs_of(seeds: Iterable[int], episodes: int) -> list[Job]:
@@ -114,24 +116,43 @@ def jobs_of(seeds: Iterable[int], episodes: int) -> list[Job]:
 
 
 def run_episodes(
-    sim: Sim, jobs: list[Job], recorder: Recorder | None = None, progress: Progress | None = None, driver: Driver | None = None
+    sim: Sim,
+    jobs: list[Job],
+    recorder: Recorder | None = None,
+    progress: Progress | None = None,
+    driver: Driver | None = None,
+    clock: StepClock | None = None,
 ) -> tuple[list[EpisodeResult], int]:
-    """Play every job; results in the order of ``jobs``, and the env steps it took. Without a driver the simulator's tree drives."""
+    """Play every job; results in the order of ``jobs``, and the env steps it took. Without a driver the simulator's tree drives.
+
+    ``clock`` is told the time of simulating, without what the recorder takes.
+    """
     observed = sim.observation
     wheel = _Wheel(sim, driver)
     waiting = list(enumerate(jobs))[::-1]
     playing: dict[int, int] = {}
     results: dict[int, EpisodeResult] = {}
     free = list(range(sim.num_envs))[::-1]
-    env_steps = 0
+    begun: dict[int, int] = {}
+    passes = env_steps = 0
+    clock = clock or StepClock()
+    if progress:
+        progress(0, len(jobs), 0, None)
     while waiting or playing:
         if waiting and free and (len(free) * _REFILL_SHARE >= sim.num_envs or not playing):
-            _refill(sim, wheel, jobs, waiting, free, playing, recorder)
-        env_steps += len(playing)
-        wheel.step()
+            with clock.counting("reset"):
+                rows = _refill(sim, wheel, jobs, waiting, free, playing)
+            begun |= dict.fromkeys(rows, passes)
+            for row in rows if recorder else ():
+                recorder.begin(sim, row, jobs[playing[row]])
+        passes, env_steps = passes + 1, env_steps + len(playing)
+        with clock.counting("step", len(playing)):
+            wheel.step()
+            outcome = sim.rows(sim.s.referee.outcome)
         if recorder:
             recorder.step(sim)
-        outcome = sim.rows(sim.s.referee.outcome)
+        if progress and passes == 1:
+            progress(0, len(jobs), env_steps, None)
         ended = [row for row in sorted(playing) if outcome[row] != RUNNING]
         if not ended:
             continue
@@ -142,7 +163,9 @@ def run_episodes(
                 recorder.end(sim, row, result)
         sim.sleep_ended()
         if progress:
-            progress(len(results), len(jobs), env_steps)
+            dt = sim.config.episode.control_dt_s
+            left = env_steps_left((round(r.time_s / dt) for r in results.values()), (passes - begun[row] for row in playing), len(waiting))
+            progress(len(results), len(jobs), env_steps, left)
     sim.observation = observed
     return [results[i] for i in range(len(jobs))], env_steps
 
@@ -174,9 +197,8 @@ class _Wheel:
         self._action = driver.decide(self._obs).action
 
 
-def _refill(
-    sim: Sim, wheel: _Wheel, jobs: list[Job], waiting: list, free: list[int], playing: dict[int, int], recorder: Recorder | None
-) -> None:
+def _refill(sim: Sim, wheel: _Wheel, jobs: list[Job], waiting: list, free: list[int], playing: dict[int, int]) -> list[int]:
+    """Begin as many jobs as there are free rows; the rows."""
     mask, seed, number = (torch.zeros(sim.num_envs, dtype=torch.int32) for _ in range(3))
     begun: list[tuple[int, Job]] = []
     while waiting and free:
@@ -187,9 +209,7 @@ def _refill(
         begun.append((row, job))
     _set_scenes(sim, begun)
     wheel.reset(mask.to(sim.device), seed.to(sim.device), number.to(sim.device))
-    if recorder:
-        for row, job in begun:
-            recorder.begin(sim, row, job)
+    return [row for row, _job in begun]
 
 
 def _set_scenes(sim: Sim, begun: list[tuple[int, Job]]) -> None:
@@ -243,8 +263,11 @@ def _named(names: tuple[str, ...], counts: np.ndarray) -> dict[str, int]:
 # ------------------------------------------------------------------------------------------------------------------ summary
 
 
-def summary(name: str, results: list[EpisodeResult], env_steps: int, wall_s: float) -> dict[str, Any]:
-    """One method's entry of ``uuv eval --json`` (docs: interfaces); rates without episodes are None, never NaN."""
+def summary(name: str, results: list[EpisodeResult], env_steps: int, wall_s: float, env_steps_per_s: float | None = None) -> dict[str, Any]:
+    """One method's entry of ``uuv eval --json`` (docs: interfaces); rates without episodes are None, never NaN.
+
+    ``env_steps_per_s`` is a ``StepClock``'s: of simulating alone, where ``wall_s`` is all the time that the method took.
+    """
     n = len(results)
     outcomes = {outcome: sum(r.outcome == outcome for r in results) for outcome in ENDINGS}
     collided = sum(outcomes[o] for o in COLLIDED)
@@ -271,7 +294,7 @@ def summary(name: str, results: list[EpisodeResult], env_steps: int, wall_s: flo
         "fallbacks_by_reason": _summed(REASONS, [r.fallbacks for r in results]),
         "env_steps": env_steps,
         "wall_s": round(wall_s, 3),
-        "env_steps_per_s": round(env_steps / wall_s, 1) if wall_s > 0 else None,
+        "env_steps_per_s": None if env_steps_per_s is None else round(env_steps_per_s, 1),
         "episodes_detail": [
             {
                 "seed": r.seed,

@@ -24,7 +24,7 @@ MethodKey = tuple[str, str | None, str | None]
 class Watch(Protocol):
     """Shows how far a sweep is."""
 
-    def start(self, name: str, total: int) -> None: ...
+    def start(self, name: str, total: int, done: int = 0) -> None: ...
     def note(self, text: str) -> None: ...
     def update(self, done: int, total: int, env_steps: int) -> None: ...
     def stop(self) -> None: ...
@@ -94,7 +94,7 @@ def _play(
 ) -> dict[str, Any]:
     rows = {row_key(_label(row, request.grid), row["method"]): row for row in read_rows(folder.path / ROWS)}
     tasks = tasks_of(request, methods, set(rows))
-    watch.start(f"{len(keys)} cells", len(keys))
+    watch.start(f"{len(keys)} cells", len(keys), len(rows))
     try:
         with folder.recorded():
             for number, played in engine.run(play, tasks):

@@ -1,0 +1,185 @@
+"""Tables of the command line at 80, 100 and 120 columns: columns go before cells are cut, and what is left out is said."""
+
+import io
+import re
+
+import pytest
+from rich.cells import cell_len
+from rich.console import Console
+
+from tests import report_samples as samples
+from uuvtai.measure.paired import paired
+from uuvtai.show.causes import show_causes
+from uuvtai.show.claims import show_claims
+from uuvtai.show.evaluation import show_methods, show_pairs
+from uuvtai.show.exports import show_export
+from uuvtai.show.health import show_checks
+from uuvtai.show.logs import show_log
+from uuvtai.show.presets import sentences, show_presets
+from uuvtai.show.profile import show_profile
+from uuvtai.show.screen import Column, Screen
+from uuvtai.show.simulation import show_simulation
+from uuvtai.show.sweeping import show_sweep
+
+WIDTHS = (80, 100, 120)
+CONDITION = {
+    "detection": {"required_m": 1.9, "closing_m_s": 1.2, "aside_s": 1.1},
+    "rides": 64, "rides_threatened": 40, "rides_threatened_ci95": [0.5, 0.7], "threats_per_min": 3.1, "threats": 99, "ride_minutes": 32.0,
+}  # fmt: skip
+
+
+def shown(show, width, wide=False):
+    """What ``show`` prints on a terminal of so many columns."""
+    console = Console(file=io.StringIO(), width=width, force_terminal=False)
+    show(Screen(wide, console))
+    return console.file.getvalue()
+
+
+def evaluation():
+    """Four methods with the longest figures that there are, one of them privileged."""
+    names = {"straight": 281, "planner": 290, "bt+truth": 500, "20261122-154501_curriculum": 0}
+    methods = [samples.method(name, k, 500 - k, 500, privileged=name == "bt+truth", env_steps_per_s=25123.4) for name, k in names.items()]
+    return samples.evaluation_document(*methods) | {"condition": CONDITION, "remainder": [], "paired": paired(methods)}
+
+
+def explained():
+    cause = samples.CAUSE | {"examples": [[90001, 499]], "label": "unseen_above_or_below"}
+    return {"methods": [{"name": "bt", "episodes": 500, "explain": [{}, {}], "causes": [cause]}]}
+
+
+def simulated():
+    n = 40
+    return {
+        "t": [0.5 * i for i in range(n)],
+        "position": [[1.0, -2.0, -10.25]] * n,
+        "rpy_deg": [[-179.999] * 3] * n,
+        "nu": [[-0.125] * 6] * n,
+    }
+
+
+class Exported:
+    """What ``deploy.export`` returns, as far as it is shown."""
+
+    folder = "runs/" + "long_" * 20 + "export"
+
+    class One:
+        engine, agrees, p50_ms, p99_ms = "ONNX Runtime 1.31.0", True, 0.123, 4.567
+        difference = {"action": 1.2e-7, "uncertainty": 3.4e-6}
+
+    agreements = [One, One]
+
+
+LOG = {
+    "topics": [{"topic": f"/topic/{i}", "schema": "foxglove.CompressedImage", "messages": 10**i, "rate_hz": 50.0} for i in range(6)],
+    "duration_s": 12.0, "outcome": "success",
+}  # fmt: skip
+CHECKS = [{"name": "kernel cache", "ok": False, "detail": "word " * 60}]
+CLAIMS = {"budget": "quick", "claims": [{"text": "word " * 30, "theirs": "82.8 %", "ours": "96.5 % [95.1, 97.5]", "verdict": "holds"}]}
+SHOWS = {
+    "eval": (lambda s: show_methods(s, evaluation()), ["method", "success [95 %]", "collision [95 %]"]),
+    "pairs": (lambda s: show_pairs(s, evaluation()["paired"]), ["a : b", "only a", "only b", "(McNemar)"]),
+    "causes": (lambda s: show_causes(s, explained()), ["cause", "n"]),
+    "simulate": (lambda s: show_simulation(s, simulated(), "bluerov2"), ["t s", "x m", "y m", "z m"]),
+    "sweep": (lambda s: show_sweep(s, samples.robustness_sweep()), ["changed", "method", "success [95 %]", "collision [95 %]"]),
+    "profile": (lambda s: show_profile(s, PROFILE), ["us per env-step", "65536 env"]),
+    "export": (lambda s: show_export(s, Exported), ["engine"]),
+    "log": (lambda s: show_log(s, LOG, "x" * 200 + ".mcap"), ["topic", "messages", "Hz"]),
+    "doctor": (lambda s: show_checks(s, CHECKS), []),
+    "claims": (lambda s: show_claims(s, CLAIMS), ["claim", "the paper", "here", "verdict"]),
+    "presets": (show_presets, ["gauntlet", "policy"]),
+}
+PROFILE = samples.PROFILE | {
+    "rows": [samples.PROFILE["rows"][0] | {"num_envs": 4**i} for i in range(9)],
+    "real_time": {"p50_ms": 1.0, "p99_ms": 2.0, "max_ms": 3.0, "budget_ms": 20.0, "within": True, "late": 0, "steps": 500},
+}
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize("name", SHOWS)
+def test_no_cell_is_cut_and_the_essential_columns_are_there(name, width):
+    show, heads = SHOWS[name]
+    text = shown(show, width)
+    assert "…" not in text and "..." not in text
+    assert max(map(cell_len, text.splitlines())) <= width
+    for head in heads:
+        assert head in text, text
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_rates_of_an_evaluation_stand_whole_in_one_line(width):
+    result = evaluation()
+    lines = shown(lambda s: show_methods(s, result), width).splitlines()
+    for m in result["methods"]:
+        o = m["outcomes"]
+        (row,) = [line for line in lines if re.search(rf"\b{o['success']}/500 = .*\b{o['collision']}/500 = ", line)]
+        assert row.count("[") == row.count("]") == 2
+
+
+def test_a_wider_terminal_shows_more_and_what_is_left_out_is_said():
+    result = evaluation()
+    found = {width: shown(lambda s: show_methods(s, result), width) for width in (*WIDTHS, 200)}
+    assert "steps/s" in found[200].split("left out")[0] and "left out" not in found[200]
+    for width in WIDTHS:
+        before, _, after = found[width].partition("left out, for want of room: ")
+        told = after.partition("; --wide shows all")[0]
+        assert "steps/s" in told and "steps/s" not in before, "the least important goes first"
+    assert "contact/ttc/" in found[120] and "contact/ttc/" not in found[80].split("left out")[0]
+    assert "contact/ttc/ out/timeout" in re.sub(r"\s+", " ", found[80])
+
+
+@pytest.mark.parametrize("name", SHOWS)
+def test_wide_shows_every_column(name):
+    text = shown(SHOWS[name][0], 80, wide=True)
+    assert "left out" not in text and "…" not in text
+    heads = {"eval": "steps/s", "simulate": "r rad/s", "profile": "64 env", "causes": "chance", "log": "schema", "export": "p99 ms"}
+    assert heads.get(name, "") in text
+
+
+def test_a_file_is_wide(capsys):
+    show_methods(Screen(), evaluation())
+    out = capsys.readouterr().out
+    assert "steps/s" in out and "left out" not in out
+
+
+def test_essential_cells_that_have_no_room_go_on_in_the_next_line():
+    text = shown(lambda s: s.table([Column("a", left=True), Column("b")], [["x" * 50, "1"], ["y", "2"]]), 30)
+    assert text.count("x") == 50 and max(map(len, text.splitlines())) <= 30 and "…" not in text
+
+
+def test_prose_is_wrapped_before_columns_are_left_out():
+    columns = [Column("name", left=True), Column("n", 1), Column("meaning", 0, prose=True)]
+    text = shown(lambda s: s.table(columns, [["a", "12345", "some words " * 12]]), 60)
+    assert "12345" in text and text.count("words") == 12
+
+
+def test_what_a_file_brought_along_is_no_markup_and_steers_nothing():
+    text = shown(lambda s: s.table([Column("[red]", left=True)], [["[/x] \x1b[2J"]], "[/no] [bold]"), 80)
+    assert "[/x] ?[2J" in text and "[red]" in text and "[/no] [bold]" in text
+
+
+def test_heat_maps_come_in_pieces_where_they_are_wider_than_the_terminal():
+    speeds = [0.1 * i for i in range(1, 16)]
+    document = samples.sweep_document(axes={"S": [4, 8], "D": [6], "v_m_s": speeds})
+    text = shown(lambda s: show_sweep(s, document), 80)
+    assert max(map(len, text.splitlines())) <= 80 and "…" not in text
+    assert text.count("bt: collision") == 2
+    whole = shown(lambda s: show_sweep(s, document), 80, wide=True)
+    assert whole.count("bt: collision") == 1 and max(map(len, whole.splitlines())) > 100
+    for said in (text, whole):
+        rates = re.findall(r"\d+ %", said)
+        assert len(rates) == 2 * len(document["cells"]), "every cell in both maps"
+
+
+def test_long_values_of_an_axis_are_not_cut():
+    axes = {"S": [4, 8], "sensors.localization": ["truth", "dead_reckoning_with_drift"]}
+    cells = [
+        {"S": s, "sensors.localization": v, "method": "bt", **samples.rates(9, 3)} for s in axes["S"] for v in axes["sensors.localization"]
+    ]
+    text = shown(lambda s: show_sweep(s, {"world": "pool", "axes": axes, "cells": cells}), 80)
+    assert "dead_reckoning_with_drift" in text and "…" not in text
+
+
+def test_every_preset_has_a_sentence():
+    for kind, found in sentences().items():
+        for name, said in found.items():
+            assert said.endswith(".") and 15 < len(said) < 250 and not said.startswith(("#", "<")), f"{kind}/{name}: {said}"

@@ -1,0 +1,58 @@
+"""Why episodes failed, in the terminal: one table per method, and what each cause means."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich.text import Text
+
+from uuvtai.endings import plain
+from uuvtai.show.screen import Column, Screen
+from uuvtai.show.words import percent, seconds
+
+_CAUSES = (
+    Column("cause", left=True),
+    Column("n"),
+    Column("share"),
+    Column("knew", 2),
+    Column("unseen", 3),
+    Column("evading", 4),
+    Column("chance", 5),
+    Column("worst", 1, left=True),
+)
+
+_REMARKABLE_SHARE = 0.2
+"""Remarks on fewer of a cause's episodes are left to the JSON."""
+
+_LEGEND = (
+    "knew: share whose forecast of the killer, made 1 s before the end, was right. Medians before the end: unseen = since a beam last met "
+    "the killer, evading = since evasion began, chance = until when some velocity still escaped. worst: seed:episode of the hardest hit"
+)
+
+
+def show_causes(screen: Screen, result: dict[str, Any]) -> None:
+    """Causes of every method of a ``uuv eval --explain --json`` document."""
+    for m in result["methods"]:
+        if "explain" in m:
+            _show_method(screen, m)
+    if any(m.get("explain") for m in result["methods"]):
+        screen.line(_LEGEND, "dim")
+
+
+def _show_method(screen: Screen, m: dict[str, Any]) -> None:
+    failed = len(m["explain"])
+    screen.line("")
+    if not failed:
+        screen.line(f"{m['name']}: no episode failed, nothing to explain")
+        return
+    screen.table(_CAUSES, [_cause(c) for c in m["causes"]], f"{m['name']}: why {failed} of {m['episodes']} episodes failed")
+    for c in m["causes"]:
+        remarks = ", ".join(f"{k} {remark}" for remark, k in c["remarks"].items() if k >= _REMARKABLE_SHARE * c["count"])
+        meaning = Text(plain(c["label"]), style="bold").append(plain(f": {c['meaning']}"), style="not bold")
+        screen.line(meaning.append(plain(f" ({remarks})"), style="not bold dim") if remarks else meaning)
+
+
+def _cause(c: dict[str, Any]) -> list[str]:
+    medians = (c["unseen_median_s"], c["evading_median_s"], c["last_chance_median_s"])
+    worst = ":".join(map(str, c["examples"][0]))
+    return [c["label"], str(c["count"]), percent(c["share"]), percent(c["knew_share"]), *map(seconds, medians), worst]

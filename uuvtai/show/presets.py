@@ -1,0 +1,62 @@
+"""The shipped presets in the terminal: a sentence for each, and what one of them states, with its comments, units and sources."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from pathlib import Path
+
+from rich.text import Text
+
+from uuvtai.endings import plain
+from uuvtai.files import read_text
+from uuvtai.shipped import KINDS, preset_names, shipped_file
+from uuvtai.show.screen import Column, Screen
+
+_PRESETS = (Column("", left=True), Column("", prose=True))
+_MAX_BYTES = 1 << 20
+_SENTENCE = re.compile(r"(.+?[.])(?:\s+(?=[A-Z0-9])|$)", re.S)
+
+
+def sentence(kind: str, name: str) -> str:
+    """What a shipped preset says of itself first: its first comment's first sentence; a policy's model card."""
+    text = shipped_file(kind, name).read_text(encoding="utf-8")
+    if kind == "policy":
+        said = text.split("\n", 1)[1].strip().partition("\n\n")[0]
+    elif kind == "tree":
+        said = text.partition("<!--")[2].partition("-->")[0]
+    else:
+        lines = text.splitlines()
+        head = lines[: next((i for i, line in enumerate(lines) if not line.startswith("#")), len(lines))]
+        said = " ".join(line.lstrip("# ") for line in head)
+    said = " ".join(said.split()).removeprefix(f"{name}: ")
+    first = _SENTENCE.match(said)
+    return first.group(1) if first else said
+
+
+def sentences() -> dict[str, dict[str, str]]:
+    """Kind -> name -> sentence, of everything that is shipped."""
+    return {kind: {name: sentence(kind, name) for name in preset_names(kind)} for kind in KINDS}
+
+
+def show_presets(screen: Screen) -> None:
+    """Every kind with its presets."""
+    for number, (kind, found) in enumerate(sentences().items()):
+        if number:
+            screen.line("")
+        screen.line(Text(kind, style="bold"))
+        screen.table(_PRESETS, [[f"  {name}", said] for name, said in found.items()])
+    screen.line("")
+    screen.line("one of them as it is written: uuv presets show NAME; every key that it gives: uuv presets show NAME --all", "dim")
+
+
+def stated(path: Path) -> str:
+    """A preset as it is written, its comments included. Raises FileError, OSError."""
+    return plain(read_text(path, _MAX_BYTES)).rstrip("\n")
+
+
+def near(name: str) -> str:
+    """'; did you mean ...' for a name that no kind of preset has, or nothing."""
+    known = {name: kind for kind in reversed(KINDS) for name in preset_names(kind)}
+    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    return f"; did you mean '{close[0]}' ({known[close[0]]})?" if close else ""
