@@ -60,6 +60,7 @@ def test_steps_of_real_episodes_are_counted_without_what_watches_them(small):
     jobs = jobs_of([77], 10)
     watched, steps = run_episodes(small.sim, jobs, Dawdler(), lambda *a: told.append(a), clock=clock)
     plain, again = run_episodes(small.sim, jobs)
+    small.sim.use_tree(small.trees["bt"])
     assert steps == again and [(r.outcome, r.time_s) for r in watched] == [(r.outcome, r.time_s) for r in plain]
     assert clock.seconds == 0.0 and 0 < clock.env_steps < steps
     assert told[0] == (0, 10, 0, None) and told[1][0] == 0 and told[1][2] == small.N
