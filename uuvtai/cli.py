@@ -20,6 +20,7 @@ from uuvtai import __version__, signals
 from uuvtai.endings import FAILED, GATE, UsageError, guarded, plain
 from uuvtai.endings import say as _say
 from uuvtai.shipped import KINDS, preset_names
+from uuvtai.show import choices
 from uuvtai.show.progress import Progress
 from uuvtai.show.screen import Screen
 
@@ -28,20 +29,45 @@ app = typer.Typer(
     help="Train, measure and inspect observation-only navigation for underwater vehicles.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    epilog="Example: uuv eval --world gauntlet --episodes 16 --record 1",
 )
-log_app = typer.Typer(help="Look into recorded episodes (MCAP).", no_args_is_help=True)
+log_app = typer.Typer(
+    help="Look into recorded episodes (MCAP).", no_args_is_help=True, epilog="Example: uuv log info runs/first/logs/bt_seed0_episode0.mcap"
+)
 app.add_typer(log_app, name="log")
 
-World = Annotated[str, typer.Option("--world", help="World preset or path of a YAML file.")]
-Sensors = Annotated[str | None, typer.Option("--sensors", help="Sensor preset or path \\[default: the world's own, else paper].")]
-Vehicle = Annotated[str | None, typer.Option("--vehicle", help="Vehicle preset or path.")]
+_WORLDS, _SENSORS, _VEHICLES = (choices.names(kind) for kind in ("world", "sensors", "vehicle"))
+_NAME = "NAME|FILE"
+
+World = Annotated[
+    str,
+    typer.Option("--world", metavar=_NAME, help=f"World: {_WORLDS}, or a YAML file.", autocompletion=choices.presets("world")),
+]
+Sensors = Annotated[
+    str | None,
+    typer.Option(
+        "--sensors",
+        metavar=_NAME,
+        help=f"Sensors: {_SENSORS}, or a YAML file \\[default: the world's own, else paper].",
+        autocompletion=choices.presets("sensors"),
+    ),
+]
+Vehicle = Annotated[
+    str | None,
+    typer.Option(
+        "--vehicle",
+        metavar=_NAME,
+        help=f"Vehicle: {_VEHICLES}, or a YAML file \\[default: the world's own, else bluerov2].",
+        autocompletion=choices.presets("vehicle"),
+    ),
+]
 Static = Annotated[int | None, typer.Option("-S", help="Static obstacles.")]
 Dynamic = Annotated[int | None, typer.Option("-D", help="Moving obstacles.")]
 Speed = Annotated[float | None, typer.Option("-v", help="Speed of the moving obstacles \\[m/s].")]
-Set = Annotated[list[str] | None, typer.Option("--set", help="Override a config key: key.sub=value (repeatable).")]
-Device = Annotated[str, typer.Option("--device", help="auto, cpu or cuda.")]
-RunDir = Annotated[Path | None, typer.Option("--run-dir", help="The run's folder \\[default: runs/<time>_<preset>].")]
+Set = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a config key: key.sub=value (repeatable).")]
+Device = Annotated[str, choices.device()]
+RunDir = Annotated[Path | None, typer.Option("--run-dir", help="The run's folder \\[default: runs/TIME_PRESET].")]
 WithReport = Annotated[bool, typer.Option("--report", help="Also write the run's report.html.")]
 Wide = Annotated[bool, typer.Option("--wide", help="Show every column of a table, though the terminal be narrower.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else on stdout.")]
@@ -50,16 +76,22 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document an
 # -------------------------------------------------------------------------------------------------------------------- eval
 
 
-@app.command("eval")
+@app.command("eval", epilog="Example: uuv eval best --world gauntlet -D 9 -v 1.5 --episodes 64 --seeds 7")
 def evaluate(
     runs: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[RUN]...", help="Trained policies: run folders, checkpoint folders or shipped names (best)."),
+        typer.Argument(
+            metavar="RUN",
+            help=f"Trained policies: run folders, checkpoint folders or shipped names ({choices.names('policy')}).",
+            autocompletion=choices.policies,
+        ),
     ] = None,
     controller: Annotated[
         list[str] | None,
         typer.Option(
             "--controller",
+            metavar="NAME|FILE",
+            autocompletion=choices.controllers,
             help="straight, planner, bt or a tree's XML (repeatable); none = policies alone \\[default: all three, beside a RUN bt]. "
             "Privileged yardsticks: NAME+truth (a tree that knows where every moving body is), oracle (knows the future: an upper bound).",
         ),
@@ -169,18 +201,44 @@ def _print_evaluation(result: dict[str, Any], folder: Path, as_json: bool, wide:
 # ------------------------------------------------------------------------------------------------------------------- train
 
 
-@app.command("train")
+@app.command("train", epilog="Example: uuv train curriculum --iterations 20 --set ppo.learning_rate=0.0005 --run-dir runs/first")
 def train_policy(
-    preset: Annotated[str | None, typer.Argument(help="Training preset or path of a YAML file \\[default: best].")] = None,
-    resume: Annotated[Path | None, typer.Option("--resume", help="Run folder to go on with, with its own config.")] = None,
+    preset: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="PRESET",
+            help=f"Training preset: {choices.names('train')}, or a YAML file \\[default: best].",
+            autocompletion=choices.presets("train"),
+        ),
+    ] = None,
+    resume: Annotated[
+        Path | None,
+        typer.Option("--resume", help="Run folder to go on with, with its own config.", autocompletion=choices.runs),
+    ] = None,
     iterations: Annotated[
         int | None,
         typer.Option("--iterations", help="Stop when so many are done in all; schedules run over train.iterations in any case."),
     ] = None,
     num_envs: Annotated[int | None, typer.Option("--num-envs", help="Envs stepped together (train.num_envs).")] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Seed of networks, exploration and scenarios (train.seed).")] = None,
-    world: Annotated[str | None, typer.Option("--world", help="World preset or path \\[default: the training preset's].")] = None,
-    sensors: Annotated[str | None, typer.Option("--sensors", help="Sensor preset or path \\[default: the training preset's].")] = None,
+    world: Annotated[
+        str | None,
+        typer.Option(
+            "--world",
+            metavar=_NAME,
+            help=f"World: {_WORLDS}, or a YAML file \\[default: the training preset's].",
+            autocompletion=choices.presets("world"),
+        ),
+    ] = None,
+    sensors: Annotated[
+        str | None,
+        typer.Option(
+            "--sensors",
+            metavar=_NAME,
+            help=f"Sensors: {_SENSORS}, or a YAML file \\[default: the training preset's].",
+            autocompletion=choices.presets("sensors"),
+        ),
+    ] = None,
     n_static: Static = None,
     n_dynamic: Dynamic = None,
     speed: Speed = None,
@@ -222,11 +280,17 @@ def _refuse_beside_resume(given: dict[str, Any]) -> None:
 # ---------------------------------------------------------------------------------------------------------------- simulate
 
 
-@app.command()
+@app.command(epilog="Example: uuv simulate --seconds 5 --wrench 10,0,0,0,0,0 --vehicle bluerov2_heavy")
 def simulate(
     seconds: Annotated[float, typer.Option("--seconds", help="Duration \\[s].")],
-    vehicle: Annotated[str, typer.Option("--vehicle", help="Vehicle preset or path.")] = "bluerov2",
-    attitude_hold: Annotated[str | None, typer.Option("--attitude-hold", help="ideal, thrusters, none \\[default: the vehicle's].")] = None,
+    vehicle: Annotated[
+        str,
+        typer.Option("--vehicle", metavar=_NAME, help=f"Vehicle: {_VEHICLES}, or a YAML file.", autocompletion=choices.presets("vehicle")),
+    ] = "bluerov2",
+    attitude_hold: Annotated[
+        str | None,
+        choices.choice("--attitude-hold", ("ideal", "thrusters", "none"), "What holds roll and pitch \\[default: the vehicle's own]."),
+    ] = None,
     wrench: Annotated[str | None, typer.Option("--wrench", help="Constant body wrench fx,fy,fz,mx,my,mz [N, N m].")] = None,
     command: Annotated[
         str | None, typer.Option("--command", help="Body velocity command u,v,w,r \\[m/s, rad/s] for the inner loop.")
@@ -268,17 +332,28 @@ def simulate(
 # ------------------------------------------------------------------------------------------------------------------- sweep
 
 
-@app.command()
+@app.command(epilog="Example: uuv sweep best --grid D=0,6 --grid v=0.4,1.5 --episodes 16 --workers 2")
 def sweep(
-    runs: Annotated[list[str] | None, typer.Argument(metavar="[RUN]...", help="Trained policies, as for eval.")] = None,
+    runs: Annotated[
+        list[str] | None, typer.Argument(metavar="[RUN]...", help="Trained policies, as for eval.", autocompletion=choices.policies)
+    ] = None,
     controller: Annotated[
-        list[str] | None, typer.Option("--controller", help="straight, planner, bt or a tree's XML (repeatable) \\[default: bt].")
+        list[str] | None,
+        typer.Option(
+            "--controller",
+            metavar="NAME|FILE",
+            help="straight, planner, bt or a tree's XML (repeatable) \\[default: bt].",
+            autocompletion=choices.controllers,
+        ),
     ] = None,
     grid: Annotated[
         list[str] | None,
         typer.Option(
             "--grid",
-            help="AXIS=value,value,.. (repeatable: S, D, v, sensors, vehicle, any config key) or a grid preset \\[default: paper].",
+            metavar="NAME|AXIS=VALUES",
+            help="AXIS=value,value,.. (repeatable: S, D, v, sensors, vehicle, any config key) or a preset: "
+            f"{choices.names('grid')} \\[default: paper].",
+            autocompletion=choices.grids,
         ),
     ] = None,
     world: World = "pool",
@@ -290,10 +365,12 @@ def sweep(
     episodes: Annotated[int, typer.Option("--episodes", help="Episodes per seed, cell and method.")] = 64,
     seeds: Annotated[str, typer.Option("--seeds", "--seed", help="Seeds, separated by commas.")] = "0",
     num_envs: Annotated[int | None, typer.Option("--num-envs", help="Episodes played together \\[default: as many as sensible].")] = None,
-    engine: Annotated[str, typer.Option("--engine", help="local (processes on this machine) or ray (a cluster).")] = "local",
+    engine: Annotated[str, choices.choice("--engine", ("local", "ray"), "Who works: processes on this machine, or a cluster.")] = "local",
     workers: Annotated[int, typer.Option("--workers", help="Processes of the local engine.")] = 1,
     address: Annotated[str, typer.Option("--address", help="Ray cluster: host:port, auto, or local (inside this process).")] = "auto",
-    resume: Annotated[Path | None, typer.Option("--resume", help="Run folder of a sweep to go on with.")] = None,
+    resume: Annotated[
+        Path | None, typer.Option("--resume", help="Run folder of a sweep to go on with.", autocompletion=choices.runs)
+    ] = None,
     device: Device = "auto",
     with_report: WithReport = False,
     overrides: Set = None,
@@ -344,19 +421,33 @@ def sweep(
 def _engine(name: str, workers: int, address: str) -> Any:
     from uuvtai.measure.sweep.engines import LocalEngine, RayEngine
 
-    if name not in ("local", "ray"):
-        raise UsageError(f"--engine {name!r}: local or ray")
     return LocalEngine(workers) if name == "local" else RayEngine(address)
 
 
 # ----------------------------------------------------------------------------------------------------------------- profile
 
 
-@app.command()
+@app.command(epilog="Example: uuv profile --num-envs 1,64 --seconds 5")
 def profile(
     num_envs: Annotated[str, typer.Option("--num-envs", help="Batch sizes, separated by commas.")] = "1,64,1024",
-    controller: Annotated[str, typer.Option("--controller", help="Tree that is ticked.")] = "bt",
-    preset: Annotated[str, typer.Option("--preset", help="Training preset: what learns in the rate with training.")] = "curriculum",
+    controller: Annotated[
+        str,
+        typer.Option(
+            "--controller",
+            metavar="NAME|FILE",
+            help=f"Tree that is ticked: {choices.names('tree')}, or an XML file.",
+            autocompletion=choices.presets("tree", suffix=".xml"),
+        ),
+    ] = "bt",
+    preset: Annotated[
+        str,
+        typer.Option(
+            "--preset",
+            metavar=_NAME,
+            help=f"What learns in the rate with training: {choices.names('train')}, or a YAML file.",
+            autocompletion=choices.presets("train"),
+        ),
+    ] = "curriculum",
     world: World = "pool",
     sensors: Sensors = None,
     n_static: Static = None,
@@ -390,10 +481,12 @@ def profile(
 # --------------------------------------------------------------------------------------------------------------- reproduce
 
 
-@app.command()
+@app.command(epilog="Example: uuv reproduce --budget quick --run-dir runs/reproduction")
 def reproduce(
-    budget: Annotated[str, typer.Option("--budget", help="quick (half an hour on two cores) or full (overnight).")] = "quick",
-    resume: Annotated[Path | None, typer.Option("--resume", help="Run folder of a reproduction to go on with.")] = None,
+    budget: Annotated[str, choices.choice("--budget", ("quick", "full"), "How much: half an hour on two cores, or overnight.")] = "quick",
+    resume: Annotated[
+        Path | None, typer.Option("--resume", help="Run folder of a reproduction to go on with.", autocompletion=choices.runs)
+    ] = None,
     run_dir: RunDir = None,
     wide: Wide = False,
     as_json: AsJson = False,
@@ -419,7 +512,7 @@ def reproduce(
 # ------------------------------------------------------------------------------------------------------------------ report
 
 
-@app.command("report")
+@app.command("report", epilog="Example: uuv report runs/first")
 def report_run(
     runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Run folder; several trainings are compared in one page.")],
     out: Annotated[Path | None, typer.Option("--out", help="The page \\[default: RUN/report.html]; figures/ is made beside it.")] = None,
@@ -442,9 +535,12 @@ def _write_report(runs: list[Path], out: Path | None) -> Any:
 # ------------------------------------------------------------------------------------------------------------------ export
 
 
-@app.command("export")
+@app.command("export", epilog="Example: uuv export best --out runs/best_export")
 def export_policy(
-    run: Annotated[str | None, typer.Argument(metavar="[RUN]", help="Run folder, checkpoint folder or shipped name (best).")] = None,
+    run: Annotated[
+        str | None,
+        typer.Argument(metavar="[RUN]", help="Run folder, checkpoint folder or shipped name (best).", autocompletion=choices.policies),
+    ] = None,
     out: Annotated[Path | None, typer.Option("--out", help="New folder \\[default: runs/NAME_export].")] = None,
     evaluation: Annotated[
         list[Path] | None,
@@ -487,12 +583,18 @@ def _print_export(found: Any, wide: bool) -> None:
 # --------------------------------------------------------------------------------------------------------- presets, doctor
 
 
-@app.command()
+@app.command(epilog="Example: uuv presets show gauntlet")
 def presets(
-    action: Annotated[str | None, typer.Argument(help="'show' to print one preset as it is written.")] = None,
+    action: Annotated[
+        str | None, typer.Argument(metavar="[show]", help="'show' to print one preset as it is written.", autocompletion=lambda: ["show"])
+    ] = None,
     name: Annotated[
         str | None,
-        typer.Argument(help="Preset to show; KIND/NAME where two kinds have one of that name."),
+        typer.Argument(
+            metavar="NAME",
+            help="Preset to show; KIND/NAME where two kinds have one of that name.",
+            autocompletion=choices.shown,
+        ),
     ] = None,
     everything: Annotated[
         bool, typer.Option("--all", help="With show: every key that the preset gives, its own, those it builds on, and the defaults.")
@@ -581,7 +683,7 @@ def _shown(kind: str, name: str) -> Any:
     return loader.load_config(chosen["world"], chosen.get("sensors"), chosen.get("vehicle"))
 
 
-@app.command()
+@app.command(epilog="Example: uuv doctor --json")
 def doctor(as_json: AsJson = False) -> None:
     """Check that everything uuv needs is here and works."""
     from uuvtai.doctor import checks
@@ -600,10 +702,21 @@ def doctor(as_json: AsJson = False) -> None:
 # -------------------------------------------------------------------------------------------------------------- tree, log
 
 
-@app.command()
+@app.command(epilog="Example: uuv tree --controller planner --dot")
 def tree(
-    run: Annotated[Path | None, typer.Argument(help="Run folder of an evaluation; without one, the tree alone.")] = None,
-    controller: Annotated[str, typer.Option("--controller", help="straight, planner, bt or a tree's XML.")] = "bt",
+    run: Annotated[
+        Path | None,
+        typer.Argument(metavar="RUN", help="Run folder of an evaluation; without one, the tree alone.", autocompletion=choices.evaluations),
+    ] = None,
+    controller: Annotated[
+        str,
+        typer.Option(
+            "--controller",
+            metavar="NAME|FILE",
+            help=f"Tree: {choices.names('tree')}, or an XML file.",
+            autocompletion=choices.presets("tree", suffix=".xml"),
+        ),
+    ] = "bt",
     dot: Annotated[bool, typer.Option("--dot", help="Print Graphviz DOT instead.")] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -620,7 +733,7 @@ def tree(
 LogFile = Annotated[Path, typer.Argument(help="An .mcap file.")]
 
 
-@log_app.command("info")
+@log_app.command("info", epilog="Example: uuv log info runs/first/logs/bt_seed0_episode0.mcap")
 def log_info(file: LogFile, wide: Wide = False, as_json: AsJson = False) -> None:
     """Topics, counts, rates, metadata and outcome of a log."""
     from uuvtai.logs import reader
@@ -634,7 +747,7 @@ def log_info(file: LogFile, wide: Wide = False, as_json: AsJson = False) -> None
     show_log(Screen(wide), found, file)
 
 
-@log_app.command("export")
+@log_app.command("export", epilog="Example: uuv log export runs/first/logs/bt_seed0_episode0.mcap --out exported")
 def log_export(
     file: LogFile,
     out: Annotated[Path, typer.Option("--out", help="Folder for the exported files.")],
@@ -647,7 +760,7 @@ def log_export(
         typer.echo(str(path))
 
 
-@log_app.command("repair")
+@log_app.command("repair", epilog="Example: uuv log repair runs/first/logs/bt_seed0_episode0.mcap")
 def log_repair(
     file: LogFile, out: Annotated[Path | None, typer.Option("--out", help="Repaired file \\[default: NAME.repaired.mcap].")] = None
 ) -> None:
@@ -660,7 +773,7 @@ def log_repair(
     typer.echo(f"{found.path}: {found.messages} messages recovered, the last at {found.last_time_s:.2f} s")
 
 
-@log_app.command("convert")
+@log_app.command("convert", epilog="Example: uuv log convert runs/first/logs/bt_seed0_episode0.mcap")
 def log_convert(
     file: LogFile, out: Annotated[Path | None, typer.Option("--out", help="New file \\[default: NAME.protobuf.mcap].")] = None
 ) -> None:
@@ -671,7 +784,7 @@ def log_convert(
     typer.echo(f"{target}: {convert.convert(file, target)} messages")
 
 
-@log_app.command("video")
+@log_app.command("video", epilog="Example: uuv log video runs/first/logs/bt_seed0_episode0.mcap")
 def log_video(
     file: LogFile, out: Annotated[Path | None, typer.Option("--out", help="WebM file \\[default: beside the log].")] = None
 ) -> None:
@@ -683,7 +796,7 @@ def log_video(
     typer.echo(str(target))
 
 
-@log_app.command("picture")
+@log_app.command("picture", epilog="Example: uuv log picture runs/first/logs/bt_seed0_episode0.mcap")
 def log_picture(
     file: Annotated[list[Path], typer.Argument(help="Logs of the same episode; trajectories are overlaid.")],
     out: Annotated[Path | None, typer.Option("--out", help="PNG file \\[default: beside the first log].")] = None,
