@@ -77,7 +77,7 @@ def test_a_row_s_next_episode_begins_anew():
     rows.run(12)
     rows.end(1, "collision")
     assert rows.events(0) == {5: False, 10: False}
-    assert rows.events(1) == {15: True, 20: True}
+    assert rows.events(1) == {17: True, 22: True}, "counted from its own beginning"
     logits = rows.foresight.moments().logit
     assert ((logits >= 1000) & (logits < 2000)).all(), "of its own row"
 

@@ -78,6 +78,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document an
 
 @app.command("eval", epilog="Example: uuv eval best --world gauntlet -D 9 -v 1.5 --episodes 64 --seeds 7")
 def evaluate(
+    ctx: typer.Context,
     runs: Annotated[
         list[str] | None,
         typer.Argument(
@@ -115,6 +116,7 @@ def evaluate(
         int | None,
         typer.Option("--explain-record", help="With --explain: log, picture, video of N of the worst failures per method \\[default: 3]."),
     ] = None,
+    resume: Annotated[Path | None, typer.Option("--resume", help="Run folder of an interrupted evaluation to go on with.")] = None,
     device: Device = "auto",
     overrides: Set = None,
     with_report: WithReport = False,
@@ -123,6 +125,13 @@ def evaluate(
     as_json: AsJson = False,
 ) -> None:
     """Play the same episodes with every controller and trained policy and print the table of methods."""
+    if resume is not None:
+        from uuvtai.measure.compare import resume as go_on
+
+        _refuse_all_beside_resume(ctx, ("with_report", "as_json", "wide"))
+        result, folder = go_on(resume, _Progress())
+        _finish_evaluation(result, folder, as_json, wide, with_report)
+        return
     seed_list = _seeds(seeds)
     _at_least("--episodes", episodes, 1)
     _at_least("--record", record, 0)
@@ -154,6 +163,10 @@ def evaluate(
         run_dir=run_dir,
     )
     result, folder = compare(request, _Progress())
+    _finish_evaluation(result, folder, as_json, wide, with_report)
+
+
+def _finish_evaluation(result: dict[str, Any], folder: Path, as_json: bool, wide: bool, with_report: bool) -> None:
     _print_evaluation(result, folder, as_json, wide)
     if with_report:
         _say(f"report: {_write_report([folder], None).page}")
@@ -275,6 +288,15 @@ def _refuse_beside_resume(given: dict[str, Any]) -> None:
     for option, value in given.items():
         if value is not None:
             raise UsageError(f"{option} {value}: a resumed run keeps its own; leave it out, or begin a new run without --resume")
+
+
+def _refuse_all_beside_resume(ctx: typer.Context, allowed: tuple[str, ...]) -> None:
+    """UsageError for whatever else was typed, be it a default's value."""
+    for parameter in ctx.command.params:
+        name = parameter.name or ""
+        source = ctx.get_parameter_source(name)
+        if name not in ("resume", *allowed) and source is not None and source.name == "COMMANDLINE":
+            _refuse_beside_resume({parameter.opts[0] if parameter.param_type_name == "option" else "RUN": ctx.params[name]})
 
 
 # ---------------------------------------------------------------------------------------------------------------- simulate

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from uuvtai.config import Config
 from uuvtai.errors import SettingError
 from uuvtai.loader import ConfigError
+from uuvtai.measure.eval_request import FILE as REQUEST
+from uuvtai.measure.eval_request import Request, document_of, drivers_of, read_request, refuse_others
 from uuvtai.run_folder import RunFolder, default_run_dir, refuse_place
 
 if TYPE_CHECKING:
     from uuvtai.measure.evaluate import EpisodeResult, Job
+    from uuvtai.measure.foresight import Foresight, Moments
+    from uuvtai.measure.ledger import Finished, Ledger
     from uuvtai.measure.methods import Method
     from uuvtai.measure.recording import EpisodeRecorder, PolicyNote
     from uuvtai.sim import Sim
@@ -25,28 +29,7 @@ ORACLE = "oracle"
 _BATCH = 256
 """Episodes played together by default: enough to fill the cores, few enough that the last stragglers cost little."""
 
-
-@dataclass(frozen=True)
-class Request:
-    """What ``uuv eval`` was asked for."""
-
-    config: Config
-    world: str
-    sensors: str
-    controllers: list[str]
-    """names of trees, paths of XML files, either with ``+truth``; ``oracle``"""
-    seeds: list[int]
-    episodes: int
-    policies: tuple[str, ...] = ()
-    """run folders, checkpoint folders or shipped names"""
-    num_envs: int | None = None
-    record: int = 0
-    video: bool = False
-    depth_images: bool = False
-    explain: bool = False
-    explain_record: int = 3
-    device: str = "auto"
-    run_dir: Path | None = None
+_STARTING = "starting {} envs (sizes not used before compile their kernels first, about half a minute)"
 
 
 class Watch(Protocol):
@@ -81,35 +64,83 @@ def compare(request: Request, watch: Watch) -> tuple[dict[str, Any], Path]:
         raise ConfigError(f"--seeds {','.join(map(str, request.seeds))}: a seed is given twice; its episodes would be the same")
     run_dir = request.run_dir or default_run_dir(request.world)
     refuse_place(run_dir)
-    from uuvtai.measure.ceilings import condition_of, remainder_of, scenarios_of
-    from uuvtai.measure.evaluate import document, jobs_of
     from uuvtai.sim import Sim
 
-    jobs = jobs_of(request.seeds, request.episodes)
     methods = _methods(request, watch)
-    num_envs = request.num_envs or min(len(jobs), _BATCH)
-    watch.note(f"starting {num_envs} envs (sizes not used before compile their kernels first, about half a minute)")
+    num_envs = request.num_envs or min(len(request.seeds) * request.episodes, _BATCH)
+    watch.note(_STARTING.format(num_envs))
     sim = Sim(request.config, num_envs, methods[0].tree if methods else _any_tree(), request.device)
     policies = {method.name: method.driver_for(sim) for method in methods}
     folder = RunFolder(run_dir, request.config, request.seeds)
-    played: list[_Played] = []
-    entries: list[dict[str, Any]] = []
+    folder.hold()
+    with _going_on(folder, watch):
+        folder.write_json(REQUEST, document_of(request, num_envs, sim.device.type, drivers_of(methods)))
+        return _compared(request, sim, methods, policies, folder, watch), folder.path
+
+
+def resume(place: Path, watch: Watch) -> tuple[dict[str, Any], Path]:
+    """Go on with an evaluation that was interrupted or killed: episodes that are over stay as they are.
+
+    The document is that of an undisturbed evaluation, times of the machine excepted. Raises RunFolderError, FileError, ConfigError,
+    CheckpointError.
+    """
+    from uuvtai.sim import Sim
+
+    request, drivers = read_request(place)
+    methods = _methods(request, watch)
+    refuse_others(place, drivers, drivers_of(methods))
+    folder = RunFolder.reopen(place, {"what": "eval"})
+    with _going_on(folder, watch):
+        watch.note(_STARTING.format(request.num_envs))
+        assert request.num_envs is not None  # the file states it
+        sim = Sim(request.config, request.num_envs, methods[0].tree if methods else _any_tree(), request.device)
+        policies = {method.name: method.driver_for(sim) for method in methods}
+        return _compared(request, sim, methods, policies, folder, watch), place
+
+
+@contextmanager
+def _going_on(folder: RunFolder, watch: Watch) -> Iterator[None]:
+    """Record how the work inside ends, and say how to go on where it was interrupted."""
     try:
         with folder.recorded():
-            for method in methods:
-                _play(request, sim, method, policies[method.name], jobs, folder, watch, played, entries)
-            scenarios = scenarios_of(sim, jobs)
-            if ORACLE in request.controllers:
-                entries.append(_ask_oracle(request, jobs, scenarios, watch))
-            result = document(request.config, request.world, request.sensors, request.seeds, request.episodes, entries)
-            result |= {"condition": condition_of(request.config, scenarios), "remainder": remainder_of(entries)}
-            _write_results(folder, result, played)
-            if request.explain:
-                _explain(request, sim, played, result, folder, watch)
-            _draw(request, folder.path, [p.logs for p in played if p.logs], watch)
+            yield
+    except KeyboardInterrupt:
+        watch.stop()
+        watch.note(f"finished episodes are kept; go on with: uuv eval --resume {folder.path}")
+        if any((folder.path / "logs").glob("*.part")):
+            watch.note(f"{folder.path / 'logs'}: .part files end where it was interrupted; --resume records them anew, or: uuv log repair")
+        raise
     finally:
         watch.stop()
-    return result, folder.path
+
+
+def _compared(
+    request: Request, sim: Sim, methods: list[Method], policies: dict[str, PolicyNote | None], folder: RunFolder, watch: Watch
+) -> dict[str, Any]:
+    """Play what is not over yet; the whole document, and all that is written and drawn of it."""
+    from uuvtai.measure.ceilings import condition_of, remainder_of, scenarios_of
+    from uuvtai.measure.evaluate import document, jobs_of
+    from uuvtai.measure.ledger import Ledger
+
+    jobs = jobs_of(request.seeds, request.episodes)
+    played: list[_Played] = []
+    entries: list[dict[str, Any]] = []
+    ledger = Ledger(folder.path)
+    try:
+        for method in methods:
+            _play(request, sim, method, policies[method.name], jobs, folder, ledger, watch, played, entries)
+    finally:
+        ledger.close()
+    scenarios = scenarios_of(sim, jobs)
+    if ORACLE in request.controllers:
+        entries.append(_ask_oracle(request, jobs, scenarios, watch))
+    result = document(request.config, request.world, request.sensors, request.seeds, request.episodes, entries)
+    result |= {"condition": condition_of(request.config, scenarios), "remainder": remainder_of(entries)}
+    _write_results(folder, result, played)
+    if request.explain:
+        _explain(request, sim, played, result, folder, watch)
+    _draw(request, folder.path, [p.logs for p in played if p.logs], watch)
+    return result
 
 
 def _methods(request: Request, watch: Watch) -> list[Method]:
@@ -136,32 +167,57 @@ def _play(
     policy: PolicyNote | None,
     jobs: list[Job],
     folder: RunFolder,
+    ledger: Ledger,
     watch: Watch,
     played: list[_Played],
     entries: list[dict[str, Any]],
 ) -> None:
-    """Play one method's episodes and add them to ``played`` and ``entries``."""
+    """Play one method's episodes, as far as they are not over, and add them to ``played`` and ``entries``."""
     from uuvtai.measure.evaluate import Recorders, run_episodes, summary, tree_use
     from uuvtai.measure.foresight import foresight_of, told
+    from uuvtai.measure.ledger import Keeper
     from uuvtai.measure.stopwatch import StepClock
 
     sim.use_tree(method.tree)
     sim.privileged = method.privileged
     recorder = _recorder(request, folder.path, method.name, jobs, policy)
     foresight = foresight_of(policy.pilot, request.config.episode.control_dt_s) if policy else None
+    logs = recorder.paths if recorder else {}
+    over = ledger.finished(method.name)
+    left = [job for job in jobs if job not in over or (job in logs and not logs[job].exists())]
+    before = len(jobs) - len(left)
     watch.start(method.name, len(jobs))
-    begun, clock = time.perf_counter(), StepClock()
+    keeper, clock = Keeper(ledger, method.name, foresight), StepClock()
     try:
-        watchers = Recorders([recorder, foresight])
-        results, env_steps = run_episodes(sim, jobs, watchers, watch.update, policy.pilot if policy else None, clock)
+        run_episodes(
+            sim,
+            left,
+            Recorders([recorder, foresight, keeper]),
+            lambda done, _total, env_steps, to_come: watch.update(before + done, len(jobs), env_steps, to_come),
+            policy.pilot if policy else None,
+            clock,
+        )
     finally:
         watch.stop()
         if recorder:
             recorder.abort()
-    wall_s = time.perf_counter() - begun
-    entry = summary(method.name, results, env_steps, wall_s, clock.env_steps_per_s) | {"privileged": method.privileged}
-    entries.append(entry | method.document() | told(foresight))
-    played.append(_Played(method, policy, results, tree_use(sim, results), recorder.paths if recorder else {}))
+    results = [over[job].result for job in jobs]
+    dt = request.config.episode.control_dt_s
+    env_steps, wall_s = sum(round(r.time_s / dt) for r in results), keeper.wall_s if left else keeper.before_s
+    entry = summary(method.name, results, env_steps, wall_s, clock.env_steps_per_s)
+    entry |= {"privileged": method.privileged} | method.document() | told(foresight, _moments(foresight, [over[job] for job in jobs], dt))
+    entries.append(entry)
+    played.append(_Played(method, policy, results, tree_use(sim, results), logs))
+
+
+def _moments(foresight: Foresight | None, finished: list[Finished], dt: float) -> Moments | None:
+    """What the risk head said along the episodes, in their order, whoever has played them."""
+    from uuvtai.measure.foresight import joined, moments_of
+
+    if foresight is None:
+        return None
+    rows = [(f.said or [], round(f.result.time_s / dt), f.result.outcome) for f in finished]
+    return joined([moments_of(*row, foresight.horizon_steps, number) for number, row in enumerate(rows)])
 
 
 def _any_tree() -> FlatTree:
@@ -242,5 +298,7 @@ def _draw(request: Request, folder: Path, logs: list[dict[Any, Path]], watch: Wa
         picture(files, folder / "pictures" / f"seed{job.seed}_episode{job.episode}.png")
         picture(files, folder / "pictures" / f"seed{job.seed}_episode{job.episode}_clearance.png", clearance=True)
         for file in files if request.video else []:
-            watch.note(f"drawing {file.stem}.webm")
-            video(file, folder / "videos" / f"{file.stem}.webm")
+            target = folder / "videos" / f"{file.stem}.webm"
+            if not target.exists():  # an evaluation that goes on may have drawn it before
+                watch.note(f"drawing {target.name}")
+                video(file, target)

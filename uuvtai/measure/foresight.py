@@ -41,45 +41,63 @@ class Moments(NamedTuple):
 
 
 class Foresight:
-    """Recorder of what the head says at every ``STRIDE``-th step of all rows."""
+    """Recorder of what the head says at every ``STRIDE``-th step of each episode, counted from its own beginning."""
 
     def __init__(self, head: RiskHead, pilot: Pilot, horizon_steps: int) -> None:
         """``pilot`` drives and asks the head at every step; ``horizon_steps``: control steps of ``risk.horizon_s``."""
-        self.head, self._pilot, self._horizon = head, pilot, horizon_steps
-        self._now = self._ended = 0
+        self.head, self._pilot, self.horizon_steps = head, pilot, horizon_steps
+        self.newest_said: list[float] = []
+        """of the episode that ended last"""
         self._said: list[Tensor] = []
-        """(N,) logits of all rows, every ``STRIDE`` steps"""
+        """(N,) logits of all rows after every step, as far back as the oldest running episode"""
+        self._forgotten = 0
+        """steps before them"""
         self._first: dict[int, int] = {}
-        """of each row's episode: its first entry in ``_said``"""
-        self._parts: list[Moments] = []
+        """of each row's episode: steps that had been done when it began"""
+        self._ended: list[Moments] = []
 
     def begin(self, sim: Sim, row: int, job: Job) -> None:
         """An episode begins."""
-        self._first[row] = len(self._said)
+        self._first[row] = self._now
 
     def step(self, sim: Sim) -> None:
         """Note what the head says of the state that the step led to."""
-        self._now += 1
-        if self._now % STRIDE == 0:
-            self._said.append(self._pilot.decision.risk_logit.clone())
+        self._said.append(self._pilot.decision.risk_logit.clone())
 
     def end(self, sim: Sim, row: int, result: EpisodeResult) -> None:
-        """An episode is over: its moments get their labels. What would have followed a timeout is not known."""
-        first = self._first.pop(row)
-        to_end = self._now - STRIDE * (torch.arange(first, len(self._said)) + 1)
-        soon = to_end <= self._horizon
-        kept = (to_end > 0) & (~soon | torch.tensor(result.outcome != "timeout"))
-        if kept.any():
-            said = torch.stack([entry[row] for entry in self._said[first:]]).cpu()
-            event = soon & torch.tensor(result.outcome in FORESEEABLE)
-            self._parts.append(Moments(said[kept], event[kept], torch.full((int(kept.sum()),), self._ended)))
-        self._ended += 1
+        """An episode is over: its moments get their labels."""
+        steps = self._now - self._first[row]
+        own = self._said[self._first.pop(row) - self._forgotten :][STRIDE - 1 :: STRIDE]
+        self.newest_said = torch.stack([entry[row] for entry in own]).cpu().tolist() if own else []
+        self._ended.append(moments_of(self.newest_said, steps, result.outcome, self.horizon_steps, len(self._ended)))
+        unused = min(self._first.values(), default=self._now) - self._forgotten
+        del self._said[:unused]
+        self._forgotten += unused
 
     def moments(self) -> Moments:
         """All that was noted, by the order in which the episodes ended."""
-        if not self._parts:
-            return Moments(torch.zeros(0), torch.zeros(0, dtype=torch.bool), torch.zeros(0, dtype=torch.int64))
-        return Moments(*(torch.cat(column) for column in zip(*self._parts, strict=True)))
+        return joined(self._ended)
+
+    @property
+    def _now(self) -> int:
+        return self._forgotten + len(self._said)
+
+
+def moments_of(said: list[float], steps: int, outcome: str, horizon_steps: int, number: int) -> Moments:
+    """Moments of an episode of so many control steps; ``said``: logits at every ``STRIDE``-th. What would have followed a timeout is not
+    known, and the state in which it ended is no moment."""
+    to_end = steps - STRIDE * (torch.arange(len(said)) + 1)
+    soon = to_end <= horizon_steps
+    kept = (to_end > 0) & (~soon | torch.tensor(outcome != "timeout"))
+    event = soon & torch.tensor(outcome in FORESEEABLE)
+    return Moments(torch.tensor(said, dtype=torch.float32)[kept], event[kept], torch.full((int(kept.sum()),), number))
+
+
+def joined(parts: list[Moments]) -> Moments:
+    """Moments of many episodes, in this order."""
+    if not parts:
+        return Moments(torch.zeros(0), torch.zeros(0, dtype=torch.bool), torch.zeros(0, dtype=torch.int64))
+    return Moments(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
 
 def foresight_of(pilot: Pilot, control_dt_s: float) -> Foresight | None:
@@ -87,9 +105,12 @@ def foresight_of(pilot: Pilot, control_dt_s: float) -> Foresight | None:
     return None if pilot.risk is None else Foresight(pilot.risk, pilot, round(pilot.risk.config.horizon_s / control_dt_s))
 
 
-def told(foresight: Foresight | None) -> dict[str, Any]:
-    """What ``uuv eval --json`` says of a method's risk head beside its results; empty where there is nothing to say."""
-    figures = None if foresight is None else judged(foresight.head, foresight.moments())
+def told(foresight: Foresight | None, moments: Moments | None = None) -> dict[str, Any]:
+    """What ``uuv eval --json`` says of a method's risk head beside its results; empty where there is nothing to say.
+
+    ``moments``: judged in place of those that this process has seen.
+    """
+    figures = None if foresight is None else judged(foresight.head, foresight.moments() if moments is None else moments)
     return {} if figures is None else {"risk": figures}
 
 
