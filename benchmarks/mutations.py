@@ -532,6 +532,6 @@ KERNELS = (
     ),
 )
 
-ALL = (*LEARNING, *STATISTICS, *KERNELS)
+ALL = (*KERNELS, *STATISTICS, *LEARNING)
 QUICK = ("scale_dropped", "popart_norm", "wilson_half_width")
 """names of three that need no kernel"""
