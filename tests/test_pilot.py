@@ -95,6 +95,24 @@ def test_memory_is_reset_by_row_and_deciding_again_changes_nothing():
     assert not torch.equal(again.action[1], first.action[1])
 
 
+def test_what_it_thinks_of_the_world_model_is_about_its_own_last_action():
+    """Residual and uncertainty are those of the prediction from the last observation and the action chosen there."""
+    policy, model = networks()
+    with torch.no_grad():
+        model.decoder[-1].weight.mul_(100.0)  # or an untrained prediction would hardly depend on the action
+    first, second = 3.0 * torch.randn(2, 3, N_OBS, generator=torch.Generator().manual_seed(4))
+    pilot = Pilot(policy, model, 3)
+    pilot.act(first)
+    own = policy.distribution(torch.cat([first, torch.zeros(3, 2)], 1))[0].detach()
+    assert own.abs().mean() > 0.1
+    decision = pilot.decide(second)
+    expected = model.features(first, own, second)
+    assert torch.allclose(torch.stack([decision.residual, decision.uncertainty], 1), expected, rtol=1e-4)
+    assert not torch.allclose(model.features(first, torch.zeros(3, 4), second), expected, rtol=1e-3)
+    x = torch.cat([second, expected], 1)
+    assert torch.allclose(decision.action, policy.distribution(x)[0].clamp(-1, 1), atol=1e-4)
+
+
 def test_actions_are_means_within_the_limits_and_nan_does_not_spread():
     policy, model = networks()
     pilot = Pilot(policy, model, 2)

@@ -238,6 +238,18 @@ def test_metrics_have_their_names_and_statistics_follow_the_rollout():
     assert torch.allclose(ppo.policy.observation_norm.mean.float(), rollout.flat("x").mean(0), rtol=FLOAT32)
 
 
+def test_values_keep_their_meaning_while_their_statistics_move():
+    """Pop-Art: an update that hardly steps leaves every value where it was, however far off the returns are."""
+    ppo = make_ppo(learning_rate=1e-12, epochs=1, minibatches=1, normalise_observations=False)
+    rollout = fill(Rollout(T, N, N_IN), ppo.policy)
+    for reward in (0.0, 50.0):
+        rollout.reward += reward
+        value, mean = ppo.policy.value(rollout.x).detach(), float(ppo.policy.value_norm.mean)
+        ppo.update(rollout)
+        assert abs(float(ppo.policy.value_norm.mean) - mean) > 0.5
+        assert torch.allclose(ppo.policy.value(rollout.x), value, atol=1e-3)
+
+
 def test_switches_of_the_normalisers():
     ppo = make_ppo(normalise_observations=False, normalise_values=False)
     ppo.update(fill(Rollout(T, N, N_IN), ppo.policy))

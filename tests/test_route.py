@@ -198,6 +198,19 @@ def test_intersection_with_the_forecast(when, at, fires):
     assert [s.route.queue[i] for i in range(s.route.n_queue[None])] == ([4] if fires else [])
 
 
+@pytest.mark.parametrize(("now", "then", "fires"), [(0.2, 0.4, True), (0.4, 0.2, False)])
+def test_intersection_with_the_forecast_keeps_the_radius_of_that_moment(now, then, fires):
+    """Passing 0.65 m away after 2 s: within 0.35 m of a radius of 0.4 m, not of one of 0.2 m."""
+    s = with_routes()
+    put_body(4, (1.9, 2.1), (3.1, 3.65))
+    times = np.arange(s.forecast.radius_m.shape[2]) * CONFIG.tracking.forecast_dt_s
+    radii = s.forecast.radius_m.to_numpy()
+    radii[4, 1] = np.where(times < 1.0, now, then)
+    s.forecast.radius_m.from_numpy(radii)
+    fire()
+    assert held(4) == (["intersection"] if fires else [])
+
+
 def test_the_queue_holds_awake_envs_in_order():
     s = clean()
     s.clock.awake.from_numpy(np.array([0, 1, 0, 1, 1, 0, 0, 1], np.int32))

@@ -96,7 +96,6 @@ def update_filter(
         cov[9] += ti.max(speed, 0.5) ** 2
     h = ti.Vector([along[0], along[1], 0.0, 0.0])
     rate, link = tracks.turn_rate[env, track], tracks.turn_cov[env, track]
-    h = ti.Vector([along[0], along[1], 0.0, 0.0])
     mean_r, cov_r, rate_r, link_r = corrected(mean, cov, rate, link, h, offset.dot(along), radial_var)
     left = centre - ti.Vector([mean_r[0], mean_r[1]])
     h_cross = ti.Vector([across[0], across[1], 0.0, 0.0])
