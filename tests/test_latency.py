@@ -61,6 +61,13 @@ def test_the_full_loop_holds_the_networks_and_no_new_scenario(samples):
     assert max(bare) < 100.0, "a step that draws the next episode's scenario takes 5 s"
 
 
+def test_stages_are_timed_for_longer_where_few_routes_were_planned(monkeypatch):
+    sim = Sim()
+    monkeypatch.setattr(latency.time, "perf_counter", lambda: sim.now)
+    found = latency._loop_samples(Batch(sim), 0.2, [])
+    assert len(found[latency.EVERY_STEP]) > len(found["Full loop"]) + 2 and len(found["Global planner"]) > 0
+
+
 def test_a_row_without_samples_has_no_mean():
     row = latency._row("Global planner", [])
     assert row["mean_ms"] is None and row["paper_mean_ms"] == 5.22

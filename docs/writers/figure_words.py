@@ -45,7 +45,7 @@ _FENCE = re.compile(r"^```.*?^```", re.M | re.S)
 _TABLE = re.compile(r"<!-- table: \w+ -->\n.*?^<!-- end -->", re.M | re.S)
 _CODE = re.compile(r"`[^`\n]*`")
 _ADDRESS = re.compile(r"https?://[^\s<>)]+|\]\([^)\n]*\)")
-_SCENE = re.compile(r"\([SDv0-9., /m-]*\)|\b[SDv] (?:=|<=|>=) [\d.]+(?: m/s)?|\{[^}\n]*\}")
+_SCENE = re.compile(r"\(\d+(?:, \d+(?:\.\d+)?)*\)|\b[SDv] (?:=|<=|>=) [\d.]+(?: m/s)?|\{[^}\n]*\}")
 """a scene such as (8, 6, 0.6), or one of its numbers"""
 _LEVEL = re.compile(r"(?<!\d)95 % (?=Wilson|intervals?|bootstrap)|\[95 %\]|(?<=, )95 %(?= \|)")
 """the level of an interval"""
