@@ -13,7 +13,7 @@ PLANNING = [0.010, 0.0, 0.020, 0.0, 0.0, 0.030]
 class Sim:
     """One env: every step takes what the list says, and every eighth step ends an episode."""
 
-    num_envs, device = 1, torch.device("cpu")
+    num_envs, device, every = 1, torch.device("cpu"), 8
 
     def __init__(self):
         self.stage_s, self.steps, self.planned, self.now = None, 0, 0, 0.0
@@ -25,7 +25,7 @@ class Sim:
         self.steps += 1
         self.planned += takes > 0
         self.now += 0.001 + takes
-        self.terminated = torch.tensor([self.steps % 8 == 0])
+        self.terminated = torch.tensor([self.steps % self.every == 0])
         if self.stage_s is not None:
             self.stage_s = {"planning": takes, "mapping": 0.0006, "clearance": 0.0004}
 
@@ -63,8 +63,9 @@ def test_the_full_loop_holds_the_networks_and_no_new_scenario(samples):
 
 def test_stages_are_timed_for_longer_where_few_routes_were_planned(monkeypatch):
     sim = Sim()
+    sim.every = 1_000_000
     monkeypatch.setattr(latency.time, "perf_counter", lambda: sim.now)
-    found = latency._loop_samples(Batch(sim), 0.2, [])
+    found = latency._loop_samples(Batch(sim), 0.1, [])
     assert len(found[latency.EVERY_STEP]) > len(found["Full loop"]) + 2 and len(found["Global planner"]) > 0
 
 
