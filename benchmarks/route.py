@@ -56,7 +56,7 @@ def measure(job: Job) -> list[Row]:
             floor=FLOOR,
             floor_on="ratio",
             note=f"{1e6 * cost['ours'] / n_env:.0f} against {1e6 * cost['peer'] / n_env:.0f} us a plan; "
-            f"cost of the way {mine:.0f} against {others:.0f}",
+            f"cost of the way {mine:.0f} against {others:.0f}; OMPL calls a validity checker in Python",
             details={"num_envs": n_env, "way_cost": mine, "peer_way_cost": others},
         )
     ]

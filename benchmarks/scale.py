@@ -21,7 +21,7 @@ _SENSING = {"paper": "sonar and map each step", "nominal": "at 10 Hz"}
 
 
 def measure(job: Job) -> list[Row]:
-    """One row per sensing preset and batch size; the paper's stack does about 280 env-steps/s on an RTX 5090."""
+    """One row per sensing preset and batch size."""
     sizes = job.num_envs or ((8,) if job.quick else (1024,))
     return [_row(job, sensors, n) for sensors in FLOORS for n in sizes]
 

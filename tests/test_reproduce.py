@@ -1,6 +1,7 @@
 """A reproduction: verdicts by hand, steps that are done once, and a page with every number."""
 
 import json
+import math
 
 import pytest
 
@@ -13,6 +14,11 @@ from uuvtai.measure.reproduce.run import reproduce, resume
 from uuvtai.run_folder import RunFolderError
 
 
+def alone(finding):
+    """The verdict of a claim that is the only one."""
+    return claims.judged([claims.claim("", "", "", finding)])[0].verdict
+
+
 def entry(success, n=100, collision=0, time_s=10.0, **more):
     outcomes = {"success": success, "collision": collision, "ttc": 0, "out_of_tank": 0, "timeout": n - success - collision}
     return {"episodes": n, "outcomes": outcomes, "time_mean_s": time_s, "time_to_success_mean_s": time_s} | more
@@ -22,23 +28,46 @@ def entry(success, n=100, collision=0, time_s=10.0, **more):
     ("a", "b", "verdict"),
     [((90, 100), (20, 100), HOLDS), ((20, 100), (90, 100), FAILS), ((50, 100), (45, 100), OPEN), ((0, 0), (5, 10), OPEN)],
 )
-def test_larger_needs_intervals_apart(a, b, verdict):
-    assert claims.larger(Share(*a), Share(*b)) == verdict
+def test_larger_needs_more_than_chance(a, b, verdict):
+    assert alone(claims.larger(Share(*a), Share(*b))) == verdict
 
 
 def test_a_printed_value_is_reached_missed_or_open():
-    assert claims.at_least(Share(95, 100), 0.828) == HOLDS
-    assert claims.at_least(Share(83, 100), 0.828) == OPEN, "the interval holds it"
-    assert claims.at_least(Share(60, 100), 0.828) == FAILS
-    assert claims.at_most(Share(0, 1000), 0.011) == HOLDS
-    assert claims.at_most(Share(0, 20), 0.011) == OPEN, "twenty episodes without a collision prove nothing"
-    assert claims.at_most(Share(20, 100), 0.011) == FAILS
+    assert alone(claims.at_least(Share(95, 100), 0.828)) == HOLDS
+    assert alone(claims.at_least(Share(83, 100), 0.828)) == OPEN, "the interval holds it"
+    assert alone(claims.at_least(Share(60, 100), 0.828)) == FAILS
+    assert alone(claims.at_most(Share(0, 1000), 0.011)) == HOLDS
+    assert alone(claims.at_most(Share(0, 20), 0.011)) == OPEN, "twenty episodes without a collision prove nothing"
+    assert alone(claims.at_most(Share(4, 512), 0.011)) == OPEN, "0.8 % of 512 is not below 1.1 %: its interval holds that"
+    assert alone(claims.at_most(Share(20, 100), 0.011)) == FAILS
 
 
 def test_coming_near_allows_ten_points():
-    assert claims.near(Share(480, 500), Share(490, 500)) == HOLDS
-    assert claims.near(Share(4, 8), Share(8, 8)) == OPEN, "eight episodes prove nothing"
-    assert claims.near(Share(300, 500), Share(490, 500)) == FAILS
+    assert alone(claims.near(Share(480, 500), Share(490, 500))) == HOLDS
+    assert alone(claims.near(Share(4, 8), Share(8, 8))) == OPEN, "eight episodes prove nothing"
+    assert alone(claims.near(Share(197, 200), Share(8, 8))) == OPEN, "neither do eight to compare with"
+    assert alone(claims.near(Share(300, 500), Share(490, 500))) == FAILS
+    # by hand: 481/502 and 491/502, z = (0.9582 - 0.9781 + 0.1) / sqrt(0.9582 0.0418 / 502 + 0.9781 0.0219 / 502)
+    z = (481 / 502 - 491 / 502 + 0.1) / math.sqrt((481 * 21 + 491 * 11) / 502**3)
+    assert claims.near(Share(480, 500), Share(490, 500)).p == pytest.approx(math.erfc(z / math.sqrt(2)))
+
+
+def test_a_ratio_is_tested_on_its_logarithm():
+    assert alone(claims.times_as_large(Share(870, 1000), Share(200, 1000), 3.5)) == HOLDS
+    assert alone(claims.times_as_large(Share(87, 100), Share(24, 100), 3.5)) == OPEN, "3.6 times, but of a hundred"
+    assert alone(claims.times_as_large(Share(300, 1000), Share(200, 1000), 3.5)) == FAILS
+    assert claims.times_as_large(Share(5, 10), Share(0, 10), 3.5) == claims.Finding(OPEN, None)
+    z = math.log(4.35 / 3.5) / math.sqrt(0.13 / 870 + 0.8 / 200)
+    assert claims.times_as_large(Share(870, 1000), Share(200, 1000), 3.5).p == pytest.approx(math.erfc(z / math.sqrt(2)))
+
+
+def test_holm_decides_over_the_whole_list():
+    """Four tests at 0.01, 0.02, 0.03, 0.04: alone each would decide, together only the first does (4 x 0.01, then 3 x 0.02)."""
+    found = [claims.Claim(str(p), "", "", HOLDS, p) for p in (0.03, 0.01, None, 0.04, 0.02)]
+    told = claims.judged(found)
+    assert [c.verdict for c in told] == [OPEN, HOLDS, HOLDS, OPEN, OPEN]
+    assert [c.p_holm for c in told] == pytest.approx([0.06, 0.04, None, 0.06, 0.06])
+    assert [c.p for c in told] == [0.03, 0.01, None, 0.04, 0.02]
 
 
 def verdicts(found):
@@ -54,10 +83,10 @@ def test_claims_of_table_main_by_hand():
         "no_risk_scaling": [entry(86)],
         "no_world_model": [entry(30)],
     }
-    found = claims.of_table_main(table_main)
-    assert [claim.verdict for claim in found] == [HOLDS, HOLDS, HOLDS, HOLDS, HOLDS, HOLDS, OPEN, HOLDS]
+    found = claims.judged(claims.of_table_main(table_main))
+    assert [claim.verdict for claim in found] == [HOLDS, OPEN, HOLDS, HOLDS, HOLDS, HOLDS, OPEN, HOLDS]
     assert "13.1 s against 114.2 s" in [claim.ours for claim in found]
-    swapped = claims.of_table_main(table_main | {"ppo": table_main["curriculum"], "curriculum": table_main["ppo"]})
+    swapped = claims.judged(claims.of_table_main(table_main | {"ppo": table_main["curriculum"], "curriculum": table_main["ppo"]}))
     assert [claim.verdict for claim in swapped[:6]] == [FAILS] * 6
 
 
@@ -86,12 +115,12 @@ def test_claims_of_the_sweep_take_the_papers_conditions():
         cell(12, 15, 3.0, success=5, collision=95),
         cell(8, 9, 1.5, method="bt", success=0, collision=100),
     ]
-    found = claims.of_sweep(cells, "best")
+    found = claims.judged(claims.of_sweep(cells, "best"))
     assert found[0].ours.startswith("190/200")
     assert found[1].ours.startswith("1/200")
     assert found[2].ours.startswith("1 of 2")
     assert found[4].ours.startswith("5/100")
-    assert [claim.verdict for claim in found] == [HOLDS, OPEN, FAILS, OPEN, HOLDS]
+    assert [claim.verdict for claim in found] == [HOLDS, OPEN, OPEN, OPEN, HOLDS]
 
 
 def test_claims_of_timing():
@@ -110,6 +139,49 @@ def test_claims_of_timing():
         "paper_density": [{"D": d, "loop_ms": 2.0 + 0.01 * d, "paper_loop_ms": 19.7} for d in (0, 15)],
     }
     assert [claim.verdict for claim in claims.of_timing(profile)] == [HOLDS, FAILS, FAILS]
+    profile["paper_latency"][5]["mean_ms"] = None
+    assert claims.of_timing(profile)[0].verdict == OPEN, "no step planned anything"
+
+
+def test_time_to_success_is_the_papers_and_stands_beside_the_papers():
+    """Mean time of all episodes / rate of success; the mean over successes stands apart, without a peer."""
+    assert claims.tts_s([entry(50, time_s=10.0), entry(100, time_s=40.0)]) == pytest.approx(25.0 / 0.75)
+    assert claims.tts_s([entry(0)]) is None and claims.tts_s([entry(5, time_s=None)]) is None
+    document = minimal() | {"table_main": {"curriculum": [entry(50, time_s=10.0) | {"time_to_success_mean_s": 7.0}]}}
+    (head,) = [line for line in results_page(document).splitlines() if line.startswith("| method | training")]
+    (row,) = [line for line in results_page(document).splitlines() if line.startswith("| `curriculum`")]
+    cells = dict(zip([c.strip() for c in head.split("|")], [c.strip() for c in row.split("|")], strict=True))
+    assert (cells["TTS"], cells["the paper: TTS"]) == ("20.0 s", "15.8 s")
+    assert (cells["mean time"], cells["the paper: mean time"]) == ("10.0 s", "11.41 s")
+    assert cells["mean time of successes"] == "7.0 s"
+
+
+def minimal():
+    """A document with one claim and empty tables."""
+    profile = {"paper_latency": [], "paper_density": [], "rows": []}
+    found = claims.judged([claims.Claim("it holds", "1", "2", HOLDS, 0.00001), claims.Claim("untested", "1", "2", FAILS)])
+    return {
+        "budget": "quick",
+        "seed": 90007,
+        "started": "today",
+        "git_sha": None,
+        "hardware": {"cpu": "a", "cores": 2},
+        "commands": {"eval/main": "uuv eval", "eval/ceilings": "uuv eval", "profile": "uuv profile"},
+        "claims": [vars(claim) for claim in found],
+        "table_main": {},
+        "ceilings": {"methods": []},
+        "sweeps": {},
+        "profile": profile,
+        "inconsistencies": [],
+    }
+
+
+def test_the_page_tells_p_values_and_an_evaluation_seed_that_was_tuned_on():
+    text = results_page(minimal())
+    assert "| it holds | 1 | 2 | holds | < 0.0001 | < 0.0001 |" in text and "| untested | 1 | 2 | does not hold | - | - |" in text
+    assert "seed, 90007, was never trained or tuned on" in text
+    assert "seed, 90001, was looked at while tuning" in results_page(minimal() | {"seed": 90001})
+    assert steps.EVALUATION_SEED not in steps.RETIRED_SEEDS
 
 
 def test_losses_must_fall():

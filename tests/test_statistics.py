@@ -4,7 +4,18 @@ import numpy as np
 import pytest
 
 from uuvtai.measure.paired import paired
-from uuvtai.measure.statistics import bootstrap_interval, holm_adjusted, mcnemar_p, mean, rate, time_to_success_s, wilson_interval
+from uuvtai.measure.statistics import (
+    binomial_p,
+    bootstrap_interval,
+    fisher_p,
+    holm_adjusted,
+    mcnemar_p,
+    mean,
+    normal_p,
+    rate,
+    time_to_success_s,
+    wilson_interval,
+)
 
 
 @pytest.mark.parametrize(
@@ -49,6 +60,41 @@ def test_mcnemar_by_hand():
     assert mcnemar_p(0, 6) == pytest.approx(2 / 64)
     with pytest.raises(ValueError, match="not be negative"):
         mcnemar_p(-1, 3)
+
+
+def test_binomial_by_hand():
+    # 10 throws of a coin, 8 heads: 2 (45 + 10 + 1) / 1024
+    assert [binomial_p(8, 10, 0.5), binomial_p(2, 10, 0.5)] == pytest.approx([2 * 56 / 1024] * 2)
+    assert binomial_p(0, 20, 0.011) == 1.0, "twice (1 - 0.011)^20 is beyond 1"
+    assert binomial_p(0, 1000, 0.011) == pytest.approx(2 * 0.989**1000)
+    assert binomial_p(0, 0, 0.3) == 1.0
+    for k, n, p in ((3, 2, 0.5), (-1, 2, 0.5), (1, 2, 0.0)):
+        with pytest.raises(ValueError, match="want 0 <= k"):
+            binomial_p(k, n, p)
+
+
+def test_fisher_by_hand():
+    # the lady tasting tea: 3 of 4 cups right, tables 1, 16, 36, 16, 1 of 70
+    assert fisher_p(3, 4, 1, 4) == fisher_p(1, 4, 3, 4) == pytest.approx(34 / 70)
+    assert fisher_p(4, 4, 0, 4) == pytest.approx(2 / 70)
+    assert fisher_p(2, 4, 2, 4) == pytest.approx(1.0)
+    assert fisher_p(0, 0, 5, 10) == 1.0
+    with pytest.raises(ValueError, match="5/4"):
+        fisher_p(5, 4, 1, 4)
+
+
+def test_fisher_and_binomial_agree_with_scipy():
+    stats = pytest.importorskip("scipy.stats")
+    assert fisher_p(138, 200, 17, 200) == pytest.approx(stats.fisher_exact([[138, 62], [17, 183]]).pvalue, rel=1e-6)
+    assert fisher_p(28, 32, 38, 40) == pytest.approx(stats.fisher_exact([[28, 4], [38, 2]]).pvalue, rel=1e-6)
+    for k, n, p in ((49, 2048, 0.011), (1976, 2048, 0.828), (4, 512, 0.011)):
+        tails = stats.binom.cdf(k, n, p), stats.binom.sf(k - 1, n, p)
+        assert binomial_p(k, n, p) == pytest.approx(min(1.0, 2 * min(tails)), rel=1e-6)
+
+
+def test_normal_p_of_known_quantiles():
+    assert normal_p(1.959963984540054) == normal_p(-1.959963984540054) == pytest.approx(0.05)
+    assert normal_p(0.0) == 1.0
 
 
 def test_bootstrap_interval_of_known_samples():

@@ -6,7 +6,8 @@
 ``sweep.NAME[METHOD;AXIS<=VALUE].FIELD``   ``docs/data/sweep_NAME.csv``, the cells that fit, pooled; ``sweep.NAME.about.KEY``: its entry
                                            in ``docs/data/sweeps.json``
 ``bench.WHAT[TEXT].FIELD``                 newest ``benchmarks/results/*_WHAT.json``: the one row whose ``what`` holds TEXT (commas part
-                                           several texts); without brackets a list, for ``min(...)`` and ``max(...)``
+                                           several texts); without brackets a list, for ``min(...)`` and ``max(...)``; FIELD may be
+                                           ``note/PATTERN/``, a number within the note
 ``paper.NAME``                             what the paper prints: a constant of ``uuvtai/measure/reproduce/paper.py``
 =========================================  ===========================================================================================
 
@@ -164,7 +165,7 @@ class Sources:
         return pooled(cells).field(parts[3])
 
     def _of_benchmark(self, path: str) -> Any:
-        parts = re.fullmatch(r"(\w+)(?:\[([^\]]*)\])?\.(\w+)", path)
+        parts = re.fullmatch(r"(\w+)(?:\[([^\]]*)\])?\.(\w+)(?:/(.+)/)?", path)
         if not parts:
             raise SourceError("wanted: bench.WHAT[TEXT].FIELD")
         rows = self.benchmark(parts[1])["rows"]
@@ -174,13 +175,22 @@ class Sources:
         found = [row for row in rows if all(text in f"{row['what']} | {row['peer_name']}" for text in texts)]
         if len(found) != 1:
             raise SourceError(f"{len(found)} rows hold {parts[2]!r}; there are {[row['what'] for row in rows]}")
-        return _pick({**found[0], **found[0]["details"]}, parts[3], "field")
+        value = _pick({**found[0], **found[0]["details"]}, parts[3], "field")
+        return value if parts[4] is None else _searched(parts[4], str(value))
 
 
 def _pick(entries: dict[str, Any], name: str, noun: str) -> Any:
     if name not in entries:
         raise SourceError(f"no {noun} {name!r}; there are {', '.join(map(str, entries))}")
     return entries[name]
+
+
+def _searched(pattern: str, text: str) -> float:
+    """The number that the pattern's group finds."""
+    found = re.search(pattern, text)
+    if not found:
+        raise SourceError(f"{pattern!r} is not in {text!r}")
+    return float(found[1])
 
 
 def _of_paper(name: str) -> Any:

@@ -1,4 +1,9 @@
-"""The paper's timing table for one vehicle: every row, mean and max, and whether the loop keeps 50 Hz."""
+"""The paper's timing table for one vehicle: every row, mean and max, and whether the loop keeps 50 Hz.
+
+"Global planner" is the mean over steps in which a route is planned, as a planner's time is meant; "Planner stage, every step" is the mean
+over all steps, most of which only check whether to plan. "Full loop" is a whole step of the simulator (truth, sensing, mapping, planning,
+tree) and one decision of the networks (world model and policy); "Loop without networks" is the step alone.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +31,11 @@ PAPER_MS: dict[str, tuple[float, float | None]] = {
 """(mean, max [ms]) of the paper's table "Workstation deployability timing", as printed (RTX 5090 workstation); None = not given"""
 PAPER_REPLANS = {"paper_hz": 6.21, "paper_replans_per_episode": 52.1}
 _CALLS, _WARM_CALLS = 2000, 200
-_STAGES = {"Mapping update": ("mapping", "clearance"), "Global planner": ("planning",)}
+EVERY_STEP, NO_NETWORKS = "Planner stage, every step", "Loop without networks"
+_STAGES = {"Mapping update": ("mapping", "clearance"), EVERY_STEP: ("planning",)}
+_LEAST_STEPS = 4
+"""a loop of fewer steps has no quantiles to speak of"""
+_ENOUGH_PLANS = 20
 
 
 def latency_rows(batch: Batch, config: LearningConfig, seconds: float) -> tuple[list[dict[str, Any]], dict[str, Any]]:
@@ -35,8 +44,11 @@ def latency_rows(batch: Batch, config: LearningConfig, seconds: float) -> tuple[
     The loop is one control step driven by the tree, all stages; its stages are timed in every second step, the whole in the others, since
     waiting after every stage costs time itself.
     """
-    loop, stages = _loop_samples(batch, seconds)
-    rows = [_row(name, samples) for name, samples in (_networks_ms(config) | stages | {"Full loop": loop}).items()]
+    networks = _networks(config)
+    samples = {name: _times_ms(call) for name, call in networks.items()}
+    found = _loop_samples(batch, seconds, list(networks.values()))
+    loop = found["Full loop"]
+    rows = [_row(name, values) for name, values in (samples | found).items()]
     if batch.episodes:
         rate = batch.replans / (batch.env_steps * config.episode.control_dt_s)
         rows.append(
@@ -52,11 +64,13 @@ def latency_rows(batch: Batch, config: LearningConfig, seconds: float) -> tuple[
 
 
 def _row(name: str, samples_ms: list[float]) -> dict[str, Any]:
-    paper_mean, paper_max = PAPER_MS[name]
+    """A row; means are None where nothing was sampled, the paper's columns where it has no such row."""
+    paper_mean, paper_max = PAPER_MS.get(name, (None, None))
     return {
         "component": name,
-        "mean_ms": float(np.mean(samples_ms)),
-        "max_ms": float(np.max(samples_ms)),
+        "mean_ms": float(np.mean(samples_ms)) if samples_ms else None,
+        "max_ms": float(np.max(samples_ms)) if samples_ms else None,
+        "samples": len(samples_ms),
         "paper_mean_ms": paper_mean,
         "paper_max_ms": paper_max,
     }
@@ -71,27 +85,56 @@ def _real_time(loop_ms: list[float], budget_ms: float) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _loop_samples(batch: Batch, seconds: float) -> tuple[list[float], dict[str, list[float]]]:
-    """[ms] of whole steps, and of the stages that the table names."""
-    sim = batch.sim
-    loop: list[float] = []
-    stages: dict[str, list[float]] = {name: [] for name in _STAGES}
+def _loop_samples(batch: Batch, seconds: float, networks: list[Callable[[], Any]]) -> dict[str, list[float]]:
+    """[ms] of the stages that the table names, of the planner in steps that plan, and of whole steps without and with the networks.
+
+    Routes are planned once in hundreds of steps: where ``seconds`` saw few of them, stages are timed for up to twice as long again.
+    """
+    found: dict[str, list[float]] = {name: [] for name in (*_STAGES, "Global planner", NO_NETWORKS, "Full loop")}
     batch.replans = batch.episodes = batch.env_steps = 0
     end = time.perf_counter() + seconds
-    while time.perf_counter() < end or len(loop) < 2:
-        sim.stage_s = {}
-        batch.step()
-        for name, parts in _STAGES.items():
-            stages[name].append(1e3 * sum(sim.stage_s.get(part, 0.0) for part in parts))
-        sim.stage_s = None
-        begun = time.perf_counter()
-        batch.step()
-        loop.append(1e3 * (time.perf_counter() - begun))
-    return loop, stages
+    while time.perf_counter() < end or len(found["Full loop"]) < _LEAST_STEPS:
+        _time_stages(batch, found)
+        _time_loop(batch, networks, found)
+    while len(found["Global planner"]) < _ENOUGH_PLANS and time.perf_counter() < end + 2 * seconds:
+        _time_stages(batch, found)
+    return found
 
 
-def _networks_ms(config: LearningConfig) -> dict[str, list[float]]:
-    """[ms] of one call of each network for one vehicle on the CPU, of the sizes that ``config`` gives; their weights do not matter."""
+def _time_stages(batch: Batch, found: dict[str, list[float]]) -> None:
+    """One step with the stages timed, each waited for."""
+    sim, before = batch.sim, _replans(batch)
+    sim.stage_s = {}
+    sim.step(None)
+    for name, parts in _STAGES.items():
+        found[name].append(1e3 * sum(sim.stage_s.get(part, 0.0) for part in parts))
+    sim.stage_s = None
+    if _replans(batch) > before:
+        found["Global planner"].append(found[EVERY_STEP][-1])
+    batch.env_steps += sim.num_envs
+    batch.renew()
+
+
+def _time_loop(batch: Batch, networks: list[Callable[[], Any]], found: dict[str, list[float]]) -> None:
+    """One whole step, then the networks; drawing the next episode's scenario is no part of a control loop and not counted."""
+    ended, begun = batch.episodes, time.perf_counter()
+    batch.step()
+    stepped = time.perf_counter()
+    with torch.no_grad():
+        for network in networks:
+            network()
+    if batch.episodes == ended:
+        found[NO_NETWORKS].append(1e3 * (stepped - begun))
+        found["Full loop"].append(1e3 * (time.perf_counter() - begun))
+
+
+def _replans(batch: Batch) -> int:
+    """Routes planned so far in the episode of the one env."""
+    return int(batch.sim.rows(batch.sim.s.route.replans, [0]).sum())
+
+
+def _networks(config: LearningConfig) -> dict[str, Callable[[], Any]]:
+    """One call of each network for one vehicle on the CPU, of the sizes that ``config`` gives; their weights do not matter."""
     from uuvtai.kernels.features import observation_width
     from uuvtai.learn.policy import Policy
     from uuvtai.learn.world_model import N_FEATURES, WorldModel
@@ -101,20 +144,20 @@ def _networks_ms(config: LearningConfig) -> dict[str, list[float]]:
     policy = Policy(n_obs + N_FEATURES, config.policy.model_copy(update={"residual": False}), None, generator)
     obs, action, x = torch.randn(1, n_obs), torch.rand(1, 4), torch.randn(1, n_obs + N_FEATURES)
     latent = torch.randn(1, config.world_model.latent)
-    calls: dict[str, Callable[[], Any]] = {
+    return {
         "WM encoder": lambda: model.encode(obs),
         "WM dynamics": lambda: model.advance(latent, action),
         "WM decoder": lambda: model.decode(latent),
         "PPO policy": lambda: policy.distribution(x),
     }
-    with torch.no_grad():
-        return {name: _times_ms(call) for name, call in calls.items()}
 
 
 def _times_ms(call: Callable[[], Any]) -> list[float]:
+    """[ms] of many calls, without the first ones."""
     samples = []
-    for _ in range(_WARM_CALLS + _CALLS):
-        begun = time.perf_counter()
-        call()
-        samples.append(1e3 * (time.perf_counter() - begun))
+    with torch.no_grad():
+        for _ in range(_WARM_CALLS + _CALLS):
+            begun = time.perf_counter()
+            call()
+            samples.append(1e3 * (time.perf_counter() - begun))
     return samples[_WARM_CALLS:]

@@ -73,6 +73,40 @@ def mcnemar_p(only_a: int, only_b: int) -> float:
     return min(1.0, 2.0 * tail / 2**n)
 
 
+def binomial_p(k: int, n: int, p: float) -> float:
+    """Two-sided exact p value of k successes in n trials against the rate p: twice the smaller tail (Clopper and Pearson 1934).
+
+    1 without trials. Raises ValueError unless 0 <= k <= n and 0 < p < 1.
+    """
+    if not 0 <= k <= n or not 0.0 < p < 1.0:
+        raise ValueError(f"want 0 <= k <= n and 0 < p < 1, got k={k}, n={n}, p={p}")
+    terms = [math.exp(_log_choose(n, i) + i * math.log(p) + (n - i) * math.log1p(-p)) for i in range(n + 1)]
+    return min(1.0, 2.0 * min(math.fsum(terms[: k + 1]), math.fsum(terms[k:])))
+
+
+def fisher_p(k_a: int, n_a: int, k_b: int, n_b: int) -> float:
+    """Two-sided p value of Fisher's exact test (1922) that two rates are one: all tables at most as probable as the one at hand.
+
+    1 where either has no trials. Raises ValueError for impossible counts. On paired episodes it errs on the safe side.
+    """
+    if not (0 <= k_a <= n_a and 0 <= k_b <= n_b):
+        raise ValueError(f"want 0 <= k <= n, got {k_a}/{n_a} and {k_b}/{n_b}")
+    total = k_a + k_b
+    logs = {i: _log_choose(n_a, i) + _log_choose(n_b, total - i) for i in range(max(0, total - n_b), min(n_a, total) + 1)}
+    whole = _log_choose(n_a + n_b, total)
+    limit = logs[k_a] + 1e-9  # rounding must not part tables that are equally probable
+    return min(1.0, math.fsum(math.exp(value - whole) for value in logs.values() if value <= limit))
+
+
+def _log_choose(n: int, k: int) -> float:
+    return math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)
+
+
+def normal_p(z: float) -> float:
+    """Two-sided p value of a standard normal z."""
+    return math.erfc(abs(z) / math.sqrt(2.0))
+
+
 def holm_adjusted(p_values: Sequence[float]) -> list[float]:
     """p values of several tests made together, adjusted by Holm (1979) so that the chance of any false alarm stays bounded."""
     order = sorted(range(len(p_values)), key=lambda i: p_values[i])

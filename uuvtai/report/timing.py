@@ -54,7 +54,7 @@ def _latency(rows: list[dict[str, Any]]) -> list[Block]:
     shown = [[str(row["component"]), *(number(row.get(key), 3) for key in keys)] for row in timed]
     data = Data(["component", *keys], [[row["component"], *(row.get(key) for key in keys)] for row in timed])
     columns = ["component", "mean ms", "max ms", "paper: mean ms", "paper: max ms"]
-    caption = "Beside the paper's table 'Workstation deployability timing' (its machine: RTX 5090, 8 envs)"
+    caption = "Beside the paper's table 'Workstation deployability timing' (its machine has an RTX 5090)"
     return [Table(columns, shown, caption, data=data)]
 
 

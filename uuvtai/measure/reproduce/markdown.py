@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from uuvtai.measure.reproduce import paper
-from uuvtai.measure.reproduce.claims import pooled
+from uuvtai.measure.reproduce.claims import LEVEL, pooled, tts_s
+from uuvtai.measure.reproduce.steps import RETIRED_SEEDS
 from uuvtai.measure.statistics import mean
 from uuvtai.outcomes import COLLIDED
 from uuvtai.report.alone import is_alone, told
@@ -14,12 +15,14 @@ from uuvtai.report.alone import is_alone, told
 
 def results_page(document: dict[str, Any]) -> str:
     """The whole page of a ``uuv reproduce --json`` document."""
-    machine = document["hardware"]
+    machine, seed = document["hardware"], document["seed"]
+    tuned = "was looked at while tuning" if seed in RETIRED_SEEDS else "was never trained or tuned on"
     head = [
         "# Results",
         f"`uuv reproduce --budget {document['budget']}`, {document['started']}, commit {document['git_sha'] or 'unknown'}, "
-        f"{machine['cpu']}, {machine['cores']} cores. Intervals are 95 % (Wilson). RUN is the reproduction's folder; the evaluations' seed "
-        "was never trained or tuned on.",
+        f"{machine['cpu']}, {machine['cores']} cores. Intervals are 95 % (Wilson). RUN is the reproduction's folder; the evaluations' "
+        f"seed, {seed}, {tuned}.",
+        *document.get("notes", []),
     ]
     parts = [_claims(document), _main(document), _ceilings(document), _sweeps(document), _timing(document), _paper_notes(document)]
     return "\n\n".join(["\n".join(head), *parts]) + "\n"
@@ -32,20 +35,38 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def _claims(document: dict[str, Any]) -> str:
-    rows = [[c["text"], c["theirs"], c["ours"], c["verdict"]] for c in document["claims"]]
-    return "## The paper's claims\n" + table(["claim", "the paper", "here", "verdict"], rows)
+    rows = [[c["text"], c["theirs"], c["ours"], c["verdict"], _p(c["p"]), _p(c["p_holm"])] for c in document["claims"]]
+    note = (
+        f"A claim with a p value is decided where that value, adjusted by Holm for all tests of this page, is below {LEVEL}; else it "
+        "cannot be judged. Rates are compared by Fisher's exact test, with a printed value by the exact binomial test. Claims without a p "
+        "value set one number beside another: one run, one machine, no test."
+    )
+    return f"## The paper's claims\n{note}\n\n" + table(["claim", "the paper", "here", "verdict", "p", "p (Holm)"], rows)
+
+
+def _p(value: float | None) -> str:
+    return "-" if value is None else "< 0.0001" if value < 1e-4 else f"{value:.4f}"
 
 
 def _main(document: dict[str, Any]) -> str:
     rows = []
     for name, entries in document["table_main"].items():
         printed = paper.TABLE_MAIN.get(name)
-        theirs = f"{printed.success:.2f} / {printed.collision:.2f} / {printed.tts_s} s" if printed else "-"
+        theirs = (
+            [f"{printed.success:.2f} / {printed.collision:.2f}", f"{printed.tts_s} s", f"{printed.mean_time_s} s"] if printed else ["-"] * 3
+        )
+        rates = [str(pooled(entries, "success")), str(pooled(entries, *COLLIDED))]
+        mean_s = mean([m["time_mean_s"] for m in entries if m["time_mean_s"] is not None])
         arrived = mean([m["time_to_success_mean_s"] for m in entries if m["time_to_success_mean_s"] is not None])
-        time = "-" if arrived is None else f"{arrived:.1f} s"
-        rows.append([f"`{name}`", str(len(entries)), str(pooled(entries, "success")), str(pooled(entries, *COLLIDED)), time, theirs])
-    heads = ["method", "training seeds", "success", "collision", "time to success", "the paper: success / collision / TTS"]
-    return f"## Table main and ablations\n`{document['commands']['eval/main']}`\n\n" + table(heads, rows)
+        times = [_seconds(tts_s(entries)), theirs[1], _seconds(mean_s), theirs[2], _seconds(arrived)]
+        rows.append([f"`{name}`", str(len(entries)), *rates, theirs[0], *times])
+    note = (
+        "TTS is the paper's: mean time of all episodes / rate of success. The last column, the mean over the episodes that arrive, has no "
+        "peer in the paper."
+    )
+    heads = ["method", "training seeds", "success", "collision", "the paper: success / collision"]
+    heads += ["TTS", "the paper: TTS", "mean time", "the paper: mean time", "mean time of successes"]
+    return f"## Table main and ablations\n`{document['commands']['eval/main']}`\n\n{note}\n\n" + table(heads, rows)
 
 
 def _ceilings(document: dict[str, Any]) -> str:
@@ -54,7 +75,9 @@ def _ceilings(document: dict[str, Any]) -> str:
         for m in document["ceilings"]["methods"]
     ]
     note = "`bt+truth` is told the true bodies, `oracle` knows the future: privileged, no methods."
-    return f"## Ceilings\n{note} `{document['commands']['eval/ceilings']}`\n\n" + table(["", "success", "collision", "time"], rows)
+    return f"## Ceilings\n{note} `{document['commands']['eval/ceilings']}`\n\n" + table(
+        ["", "success", "collision", "mean time of successes"], rows
+    )
 
 
 def _sweeps(document: dict[str, Any]) -> str:
@@ -108,9 +131,16 @@ def _timing(document: dict[str, Any]) -> str:
     rates = [
         [f"{r['num_envs']:,}", *(f"{r['env_steps_per_s'][k]:,.0f}" for k in ("step", "step_inference", "train"))] for r in profile["rows"]
     ]
+    note = (
+        '"Global planner" is the mean over the steps that plan a route; "Planner stage, every step" over all steps, most of which '
+        "plan none. "
+        '"Full loop" is a whole step (simulated truth and sensing, mapping, planning, behaviour tree) and one decision of world model and '
+        "policy; what the paper's loop contains it does not say."
+    )
     return "\n\n".join(
         [
             f"## Timing\n`{document['commands']['profile']}`",
+            note,
             table(["one vehicle", "mean ms", "max ms", "paper mean ms", "paper max ms"], rows),
             table(["D", "loop ms", "paper ms", "replans an episode", "paper"], density),
             table(["envs", "env-steps/s", "+ inference", "+ training"], rates),

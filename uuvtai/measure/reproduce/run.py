@@ -91,6 +91,7 @@ def document_of(root: Path, request: dict[str, Any], steps: Sequence[Step]) -> d
         "schema": 1,
         "title": f"The paper reproduced, budget {request['budget']}",
         "budget": request["budget"],
+        "seed": EVALUATION_SEED,
         "started": record["started"],
         "git_sha": record["git_sha"],
         "hardware": record["hardware"],
@@ -126,13 +127,14 @@ def _claims(root: Path, results: dict[str, Any], by_preset: dict[str, Any], poli
     pilot = next(name for name in names if name != "bt")
     there = next(entry for entry in results["eval/transfer"]["methods"] if entry["name"] != "bt")
     here = None if policy else by_preset["curriculum"][0]
-    return [
+    found = [
         *claims.of_table_main(by_preset),
         *claims.of_training(_metrics(root / "train" / "curriculum-0")),
         *(claim for name in (pilot, "bt") for claim in claims.of_sweep(cells, name)),
         *claims.of_timing(results["profile"]),
         *(claims.of_transfer(here or _cell_of(cells, pilot), there)),
     ]
+    return claims.judged(found)
 
 
 def _cell_of(cells: Sequence[dict[str, Any]], method: str) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from uuvtai.measure.reproduce import paper
-from uuvtai.measure.reproduce.claims import pooled
+from uuvtai.measure.reproduce.claims import pooled, tts_s
 from uuvtai.measure.reproduce.steps import TRAINED, Budget
 from uuvtai.outcomes import COLLIDED
 
@@ -39,7 +39,8 @@ def _section(title: str, *blocks: Described) -> Described:
 
 
 def _item(claim: dict[str, Any]) -> Described:
-    return {"claim": claim["text"], "verdict": claim["verdict"], "numbers": f"here {claim['ours']}; the paper: {claim['theirs']}"}
+    tested = "" if claim["p_holm"] is None else f"; p = {claim['p']:.3g}, by Holm {claim['p_holm']:.3g}"
+    return {"claim": claim["text"], "verdict": claim["verdict"], "numbers": f"here {claim['ours']}; the paper: {claim['theirs']}{tested}"}
 
 
 def _main_table(document: dict[str, Any]) -> Described:
@@ -47,8 +48,10 @@ def _main_table(document: dict[str, Any]) -> Described:
     for name, entries in document["table_main"].items():
         printed = paper.TABLE_MAIN.get(name)
         theirs = [f"{printed.success:.2f}", f"{printed.collision:.2f}", f"{printed.tts_s}"] if printed else ["-"] * 3
-        rows.append([name, str(len(entries)), str(pooled(entries, "success")), str(pooled(entries, *COLLIDED)), *theirs])
-    columns = ["method", "training seeds", "success", "collision", "paper: success", "paper: collision", "paper: TTS s"]
+        own = tts_s(entries)
+        ours = [str(pooled(entries, "success")), str(pooled(entries, *COLLIDED)), "-" if own is None else f"{own:.1f}"]
+        rows.append([name, str(len(entries)), *ours, *theirs])
+    columns = ["method", "training seeds", "success", "collision", "TTS s", "paper: success", "paper: collision", "paper: TTS s"]
     caption = f"Table main, ours beside the paper's as printed; {document['commands']['eval/main']}"
     return {"kind": "table", "columns": columns, "rows": rows, "caption": caption, "n_left": 1}
 
