@@ -79,8 +79,7 @@ def compare(request: Request, watch: Watch) -> tuple[dict[str, Any], Path]:
         raise SettingError(f"--num-envs {request.num_envs}: at least 1 env is needed, for example --num-envs 64")
     if len(set(request.seeds)) != len(request.seeds):
         raise ConfigError(f"--seeds {','.join(map(str, request.seeds))}: a seed is given twice; its episodes would be the same")
-    run_dir = request.run_dir or default_run_dir(request.world)
-    refuse_place(run_dir)
+    refuse_place(request.run_dir)
     from uuvtai.measure.ceilings import condition_of, remainder_of, scenarios_of
     from uuvtai.measure.evaluate import document, jobs_of
     from uuvtai.sim import Sim
@@ -91,7 +90,7 @@ def compare(request: Request, watch: Watch) -> tuple[dict[str, Any], Path]:
     watch.note(f"starting {num_envs} envs (sizes not used before compile their kernels first, about half a minute)")
     sim = Sim(request.config, num_envs, methods[0].tree if methods else _any_tree(), request.device)
     policies = {method.name: method.driver_for(sim) for method in methods}
-    folder = RunFolder(run_dir, request.config, request.seeds)
+    folder = RunFolder(request.run_dir or default_run_dir(request.world), request.config, request.seeds)
     played: list[_Played] = []
     entries: list[dict[str, Any]] = []
     try:
@@ -187,7 +186,7 @@ def _write_results(folder: RunFolder, result: dict[str, Any], played: list[_Play
     folder.write_json("eval/result.json", result)
     driving = [p for p in played if p.policy is None]
     for p in driving:
-        folder.write(f"eval/trees/{p.method.name}.xml", Path(p.method.tree.source).read_text())
+        folder.write_bytes(f"eval/trees/{p.method.name}.xml", p.method.tree.xml)
     folder.write_json("eval/tree.json", {"schema": 1, "use": {p.method.name: p.use for p in driving}})
 
 
