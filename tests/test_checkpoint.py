@@ -164,7 +164,7 @@ REFUSALS = {
     "manifest is no JSON": (lambda p: (p / "manifest.json").write_bytes(b"\x80\x04\x95"), "cannot be read"),
     "manifest nested without end": (lambda p: (p / "manifest.json").write_text("[" * 100_000), "cannot be read"),
     "manifest of something else": (lambda p: (p / "manifest.json").write_text('{"a": 1}'), "is not a manifest"),
-    "huge manifest": (lambda p: (p / "manifest.json").write_bytes(b" " * (9 << 20)), "larger than 8 MiB"),
+    "huge manifest": (lambda p: (p / "manifest.json").write_bytes(b" " * (9 << 20)), "more than the 8,388,608 that such a file may have"),
     "other schema": (lambda p: rewritten(p, lambda d: d.update(schema=2)), "has schema 2, this uuvtai reads 1"),
     "newer version": (lambda p: rewritten(p, lambda d: d.update(version="9.9.0")), "was written by uuvtai 9.9.0"),
     "no version": (lambda p: rewritten(p, lambda d: d.pop("version")), "was written by uuvtai None"),

@@ -24,7 +24,7 @@ def test_a_run_records_its_config_and_its_end(tmp_path):
     assert (run["status"], run["exit"], run["seeds"]) == ("finished", 0, [1, 2])
     assert {"taichi", "torch", "python"} <= set(run["versions"])
     assert load_resolved(folder.path / "config.yaml") == config
-    assert files_in(folder.path) == ["config.yaml", "eval/result.json", "run.json"]
+    assert files_in(folder.path) == [".lock", "config.yaml", "eval/result.json", "run.json"]
 
 
 @pytest.mark.parametrize("place", ["file/run", "file"])

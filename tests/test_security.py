@@ -7,8 +7,11 @@ hours or take all memory.
 import ast
 import base64
 import json
+import os
 import pickle
+import re
 import struct
+import time
 import zipfile
 from pathlib import Path
 
@@ -17,17 +20,20 @@ import pytest
 import torch
 import zstandard
 
+from tests import report_samples as samples
 from tests import test_deploy as deployed
 from tests.reference import logs as episode
 from uuvtai import cli
 from uuvtai.config.learning import LearningConfig
 from uuvtai.deploy import run_policy
 from uuvtai.deploy.agreement import of_onnx
+from uuvtai.errors import UserError
 from uuvtai.learn import checkpoint
 from uuvtai.learn.checkpoint import CheckpointError
 from uuvtai.learn.manifest import config_sha256, sha256_of
 from uuvtai.learn.packing import PackingError, read_stream
 from uuvtai.learn.pilot import load_pilot
+from uuvtai.learn.recorder import Recorder
 from uuvtai.loader import ConfigError, load_config, load_resolved, parsed_yaml
 from uuvtai.logs import reader
 from uuvtai.logs.container import MAGIC, McapFile
@@ -36,6 +42,12 @@ from uuvtai.logs.export import depth_image
 from uuvtai.logs.picture import picture
 from uuvtai.logs.reader import info
 from uuvtai.logs.recording import load_recording
+from uuvtai.measure.reproduce.run import resume as resume_reproduction
+from uuvtai.measure.sweep.run import resume as resume_sweep
+from uuvtai.measure.training import TrainRequest, train
+from uuvtai.measure.tree_report import tree_report
+from uuvtai.report.build import report
+from uuvtai.report.media import media
 from uuvtai.run_folder import RunFolder, RunFolderError
 from uuvtai.tree import TreeError, parse_tree, read_tree
 
@@ -48,6 +60,13 @@ def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     yield tmp_path
     assert not (tmp_path / "executed").exists(), "a file was executed"
+
+
+class Quiet:
+    """Watches and says nothing."""
+
+    def __getattr__(self, _name):
+        return lambda *_arguments: None
 
 
 def run_cli(*arguments):
@@ -104,6 +123,96 @@ def test_nothing_in_the_package_can_execute_what_it_reads():
     assert {name for name, _ in imports} <= {"doctor.py", "convert.py", "__init__.py"}, "modules are never imported by names from files"
 
 
+READERS = {
+    "files.py": "it is the one reader",
+    "report/page.py": "the page's template lies in the package",
+    "deploy/run_policy.py": "it must run without uuvtai and has a reader of its own",
+}
+"""files that may open others themselves, and why"""
+SYSTEM = {"run_folder.py": "/proc/cpuinfo", "sizes.py": "/proc/meminfo"}
+"""files that read one file of the system, by its name"""
+UNFINISHED = {"logs", "deploy"}
+"""folders whose readers are still to be moved: to be empty"""
+OPENS = {
+    "open",
+    "read_text",
+    "read_bytes",
+    "readlines",
+    "fromfile",
+    "loadtxt",
+    "genfromtxt",
+    "memmap",
+    "imread",
+    "VideoCapture",
+    "load_file",
+    "safe_open",
+}
+PARSES = {"json.load", "json.loads", "np.load", "io.open", "os.open", "open", "torch.load"}
+OWN_JSON = {"capture.py", "learn/distributed.py", "measure/sweep/plan.py"}
+"""files whose JSON comes from this process or its siblings, not from a file"""
+
+
+def reads_of(tree):
+    """(line, call) of whatever opens or parses a file."""
+    imported = {
+        alias.asname or alias.name
+        for n in ast.walk(tree)
+        if isinstance(n, ast.ImportFrom) and n.module == "uuvtai.files"
+        for alias in n.names
+    }
+    ours = {"files"} | ({"read_text", "read_bytes", "read_json"} & imported)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            name = ast.unparse(node.func)
+            last = name.rpartition(".")[2]
+            if name not in ours and not name.startswith("files.") and (last in OPENS or name in PARSES):
+                yield node.lineno, name
+
+
+def test_whatever_is_read_goes_through_the_one_reader():
+    """A read that nobody guards hangs on a pipe, fills the memory, or follows a link out of the folder."""
+    found = []
+    for path in sorted(PACKAGE.rglob("*.py")):
+        name = str(path.relative_to(PACKAGE))
+        if name in READERS or name.partition("/")[0] in UNFINISHED:
+            continue
+        for line, call in reads_of(ast.parse(path.read_text())):
+            system = name in SYSTEM and SYSTEM[name] in path.read_text() and call.endswith(".read_text")
+            own = name in OWN_JSON and call == "json.loads"
+            devnull = "os.devnull" in path.read_text().splitlines()[line - 1]
+            found += [] if system or own or devnull else [f"{name}:{line} {call}"]
+    assert found == []
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "open('x')",
+        "path.open()",
+        "Path('x').read_text()",
+        "json.load(f)",
+        "json.loads(t)",
+        "os.open('x', 0)",
+        "cv2.imread('x')",
+        "np.load('x')",
+    ],
+)
+def test_the_search_for_readers_finds_them(text):
+    assert list(reads_of(ast.parse(text)))
+
+
+def test_yaml_is_loaded_in_one_place():
+    """Any other call of the package yaml reads numbers to the base of 60, aliases and duplicate keys."""
+    allowed = {
+        "loader.py": {"yaml.load(text, Loader=_SafeLoader)", "yaml.compose(text, Loader=_SafeLoader)"},
+    }
+    for path in PACKAGE.rglob("*.py"):
+        calls = {ast.unparse(n) for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Call)}
+        reads = {call for call in calls if re.match(r"yaml\.(?!safe_dump\b|MarkedYAMLError\b)", call)}
+        assert reads <= allowed.get(str(path.relative_to(PACKAGE)), set()), path
+        assert "from yaml" not in path.read_text(), path
+
+
 # -------------------------------------------------------------------------------------------------------------------- YAML
 
 TAGS = [
@@ -125,6 +234,7 @@ def test_yaml_tags_are_refused_in_every_kind_of_file(here, text, capfd):
     assert run_cli("train", file) == 2
     assert run_cli("eval", "--set", f"world.n_static={text.partition(' ')[2]}") == 2
     (here / "config.yaml").write_text(text)
+    (here / "run.json").write_text("{}")
     assert run_cli("train", "--resume", here) == 2
     assert capfd.readouterr().err.count("not valid YAML") >= 5
     for load in (lambda: load_config(str(file)), lambda: load_resolved(file)):
@@ -193,7 +303,7 @@ def test_xml_bombs(here):
         with pytest.raises(TreeError, match=says):
             parse_tree(text)
     (here / "big.xml").write_bytes(b" " * (3 << 20))
-    with pytest.raises(TreeError, match="larger than"):
+    with pytest.raises(TreeError, match="more than the 1,048,576 that such a file may have"):
         read_tree(str(here / "big.xml"))
 
 
@@ -264,16 +374,171 @@ def test_a_compressed_simulator_state_cannot_unfold(here):
 # -------------------------------------------------------------------------------------------------------------- run folders
 
 
-@pytest.mark.parametrize("name", [".lock", "metrics.jsonl"])
-def test_a_link_in_a_run_folder_is_not_written_through(here, name):
-    victim = here / "victim"
-    victim.write_text("precious")
-    run = here / "run"
-    RunFolder(run, LearningConfig(), [0])
-    (run / name).symlink_to(victim)
-    with pytest.raises(RunFolderError, match="is a link"):
-        RunFolder.reopen(run, {})
-    assert victim.read_text() == "precious"
+WRITTEN = [
+    ".lock", "run.json", "config.yaml", "metrics.jsonl", "cells.jsonl", "sweep.json", "sweep_request.json", "reproduce.json", "report.html",
+    "profile.json", "checkpoints", "checkpoints/step_000002", "checkpoints/step_000002/model.safetensors",
+    "checkpoints/.partial-step_000003.1", "eval", "eval/result.json", "eval/tree.json", "eval/trees", "eval/trees/bt.xml", "figures",
+    "figures/methods.png", "pictures", "pictures/x.png", "videos", "videos/x.webm", "explain", "explain/x.png", "logs", "logs/x.mcap",
+    "tensorboard", "tensorboard/events.out.tfevents.1", "anything/else",
+]  # fmt: skip
+"""what a run folder may hold, and what a resumed run, a report or an evaluation writes or deletes there"""
+
+
+def precious(here):
+    """A folder outside, and a file in it, that nobody may touch."""
+    (here / "outside" / "step_000001").mkdir(parents=True)
+    (here / "outside" / ".partial-x").mkdir()
+    for name in ("file", "methods.png", "result.json", "step_000001/manifest.json", ".partial-x/model.safetensors", "manifest.json"):
+        (here / "outside" / name).write_text('{"iteration": 9}\n{"cut')
+    return here / "outside", here / "outside" / "file"
+
+
+def everything(folder):
+    return {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def with_link(here, name):
+    """A run folder where ``name`` is a link to what is precious, and what that was."""
+    outside, file = precious(here)
+    run = samples.write_run(here / "run", metrics=samples.metrics(3), sweep=samples.noise_sweep())
+    link = run / name
+    link.parent.mkdir(parents=True, exist_ok=True)
+    link.unlink(missing_ok=True)
+    link.symlink_to(file if "." in link.name.lstrip(".") or name == ".lock" else outside)
+    return run, everything(outside)
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+@pytest.mark.parametrize(
+    "open_it",
+    [
+        lambda run: RunFolder.reopen(run, {}),
+        lambda run: train(TrainRequest(resume=run), Quiet()),
+        lambda run: resume_sweep(run, None, Quiet()),
+        lambda run: resume_reproduction(run, Quiet()),
+        lambda run: report([run]),
+        lambda run: report([run], run.parent / "new.html"),
+        lambda run: report([run, run], run.parent / "new.html", force=True),
+    ],
+    ids=["reopen", "train --resume", "sweep --resume", "reproduce --resume", "report", "report --out", "several"],
+)
+def test_a_link_in_a_run_folder_is_neither_read_nor_written_nor_deleted_through(here, name, open_it):
+    run, before = with_link(here, name)
+    with pytest.raises(UserError, match=r"is a link|no plain file run\.json"):
+        open_it(run)
+    assert everything(here / "outside") == before
+    assert sorted(path.name for path in here.iterdir()) == ["outside", "run"]
+
+
+def test_a_sweep_takes_the_lock_before_it_touches_anything(here):
+    """The last line of cells.jsonl was cut off before anybody had looked whose file it is."""
+    run = samples.write_run(here / "run", metrics=[])
+    (run / "cells.jsonl").write_text('{"S": 1}\n{"S": 2')
+    holder = RunFolder.held(run)
+    with pytest.raises(RunFolderError, match="another process is working in this folder"):
+        resume_sweep(run, None, Quiet())
+    assert (run / "cells.jsonl").read_text() == '{"S": 1}\n{"S": 2'
+    holder.release()
+
+
+def test_files_with_a_second_name_are_not_written_in_place(here):
+    run = samples.write_run(here / "run", metrics=samples.metrics(3))
+    (here / "copy.jsonl").hardlink_to(run / "metrics.jsonl")
+    before = (here / "copy.jsonl").read_bytes()
+    with pytest.raises(UserError, match="has a second name"):
+        Recorder(run, 1)
+    assert (here / "copy.jsonl").read_bytes() == before
+
+
+def test_a_checkpoint_is_not_written_into_a_folder_elsewhere(here):
+    outside, _file = precious(here)
+    (here / "run").mkdir()
+    (here / "run" / "checkpoints").symlink_to(outside)
+    before = everything(outside)
+    with pytest.raises(CheckpointError, match="is a link"):
+        deployed.saved(here / "run")
+    with pytest.raises(CheckpointError, match="no usable checkpoint"):
+        checkpoint.best(here / "run")
+    assert everything(outside) == before
+
+
+def fill(path, kind):
+    """A place that cannot be read to its end, or that never answers."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.unlink(missing_ok=True)
+    make = {
+        "pipe": lambda: os.mkfifo(path),
+        "endless link": lambda: path.symlink_to("/dev/zero"),
+        "folder": path.mkdir,
+        "sparse": lambda: path.touch() or os.truncate(path, 1 << 40),
+    }
+    make[kind]()
+
+
+READ = ["run.json", "config.yaml", "metrics.jsonl", "sweep.json", "profile.json", "reproduce.json", "eval/result.json"]
+
+
+@pytest.mark.parametrize("kind", ["pipe", "endless link", "folder", "sparse"])
+@pytest.mark.parametrize("name", [*READ, "checkpoints/step_000001/manifest.json"])
+def test_a_report_waits_for_nothing_and_reads_nothing_endless(here, name, kind):
+    run = samples.write_run(here / "run", metrics=samples.metrics(3))
+    fill(run / name, kind)
+    begun = time.monotonic()
+    with pytest.raises(UserError, match=re.escape(name.rpartition("/")[2])):
+        report([run])
+    assert time.monotonic() - begun < 10
+    assert not (run / "report.html").exists()
+
+
+@pytest.mark.parametrize("kind", ["pipe", "endless link", "folder"])
+@pytest.mark.parametrize("name", ["pictures/x.png", "explain/x.png", "videos/x.webm"])
+def test_only_plain_files_are_shown_in_a_page(here, name, kind):
+    run = samples.write_run(here / "run", metrics=samples.metrics(3))
+    fill(run / name, kind)
+    with pytest.raises(UserError, match=re.escape(name.rpartition("/")[2])):
+        report([run])
+
+
+def test_a_picture_that_is_a_link_is_never_embedded(here):
+    run = samples.write_run(here / "run", metrics=samples.metrics(3))
+    (here / "secret").write_text("the secret")
+    (run / "pictures").mkdir()
+    (run / "pictures" / "x.png").symlink_to(here / "secret")
+    with pytest.raises(UserError, match="is a link"):
+        report([run])
+    with pytest.raises(UserError, match="is a link"):
+        media(run, None)
+
+
+ODD = {
+    "nothing": b"", "a list": b"[]", "a number": b"3", "deep": b'{"argv": ' + b"[" * 10_000 + b"]" * 10_000 + b"}",
+    "deep objects": b'{"a":' * 100_000 + b"1" + b"}" * 100_000,
+    "a pickle": pickle.dumps(Exploit()), "not UTF-8": b'{"started": "\xff"}', "infinite": b'{"wall_s": 1e999}', "NaN": b'{"wall_s": NaN}',
+    "half a character": b'{"started": "\\ud800"}', "many digits": b'{"wall_s": ' + b"9" * 4000 + b"}",
+    "wall_s": b'{"wall_s": [1]}', "argv": b'{"argv": 3}', "argv of lists": b'{"argv": [[1], {"a": 2}, null]}',
+    "hardware": b'{"hardware": 3, "versions": "none"}', "hardware as a list": b'{"hardware": ["cpu"]}',
+    "seeds": b'{"seeds": 7}', "seeds null": b'{"seeds": null}', "resumed": b'{"resumed": [3]}', "status": b'{"status": {"a": []}}',
+    "a million lists": b'{"argv": [' + b"[]," * 2_000_000 + b"[]]}",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("content", ODD.values(), ids=ODD)
+def test_an_odd_record_is_one_line_or_a_page(here, content):
+    """A record may lack anything; what it has must be what it says it is."""
+    run = samples.write_run(here / "run", metrics=samples.metrics(3))
+    (run / "run.json").write_bytes(content)
+    for runs, out in (([run], None), ([run, run], here / "both.html")):
+        try:
+            report(runs, out)
+        except UserError as error:
+            assert "\n" not in str(error) and len(str(error)) < 1000
+
+
+def test_the_config_of_a_run_is_read_by_our_own_loader(here):
+    """PyYAML's own loader takes hours over a number to the base of 60."""
+    run = samples.write_run(here / "run", metrics=samples.metrics(3), config="train:\n  seed: 1" + ":1" * 400_000)
+    with pytest.raises(ConfigError, match=r"config\.yaml"):
+        report([run])
 
 
 @pytest.mark.parametrize(
@@ -286,7 +551,41 @@ def test_records_of_an_evaluation_are_read_without_trust(here, content, capfd):
     assert "tree.json" in capfd.readouterr().err
 
 
-@pytest.mark.parametrize("content", [pickle.dumps(Exploit()), b"[" * 200_000, b"[]", b""])
+@pytest.mark.parametrize(
+    "content",
+    [b'{"use": {"bt": [{"share": 1e999, "ticks": 1, "acted": 1}]}}', b'{"use": {"bt": [{"share": 1, "ticks": 1e999, "acted": 1}]}}'],
+)
+def test_numbers_of_an_evaluation_are_numbers(here, content):
+    (here / "eval" / "trees").mkdir(parents=True)
+    (here / "eval" / "tree.json").write_bytes(content)
+    with pytest.raises(ConfigError, match="is beyond what a number holds"):
+        tree_report("bt", here)
+
+
+@pytest.mark.parametrize("name", ["../../secret", "/etc/passwd", "link"])
+def test_a_record_cannot_name_a_tree_elsewhere(here, name):
+    run, node = here / "run", {"share": 1, "ticks": 1, "acted": 1}
+    (run / "eval" / "trees").mkdir(parents=True)
+    (here / "secret.xml").write_text((PACKAGE / "presets/trees/straight.xml").read_text())
+    (run / "eval" / "trees" / "link.xml").symlink_to(here / "secret.xml")
+    (run / "eval" / "tree.json").write_text(json.dumps({"use": {name: [node]}}))
+    with pytest.raises(TreeError, match=r"is a link|does not lie in"):
+        tree_report(name, run)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        pickle.dumps(Exploit()),
+        b"[" * 200_000,
+        b"[]",
+        b"",
+        b'{"resumed": 3}',
+        b'{"resumed": {"a": 1}}',
+        b'{"wall_s": "long"}',
+        b'{"wall_s": 1e999}',
+    ],
+)
 def test_the_record_of_a_run_is_read_without_trust(here, content):
     (here / "run.json").write_bytes(content)
     with pytest.raises(RunFolderError, match=r"run\.json: cannot be read"):

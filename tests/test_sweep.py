@@ -216,7 +216,7 @@ def test_a_line_cut_off_by_a_kill_is_played_again(tmp_path, cut):
     rest = Canned()
     assert resume(place, rest, Quiet())[0] == whole
     assert [len(task.labels) for task in rest.ran] == [1]
-    assert len(read_rows(file)) == 9
+    assert len(read_rows(place)) == 9
 
 
 def test_a_policy_that_was_trained_on_is_refused(tmp_path):

@@ -538,20 +538,21 @@ def reproduce(
 def report_run(
     runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Run folder; several trainings are compared in one page.")],
     out: Annotated[Path | None, typer.Option("--out", help="The page \\[default: RUN/report.html]; figures/ is made beside it.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace files that are there already.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Write one self-contained HTML page of a run: tables, figures, pictures, videos, and where they come from."""
-    written = _write_report(runs, out)
+    written = _write_report(runs, out, force)
     if as_json:
         _print_json({"schema": 1, "report": str(written.page), "figures": [str(path) for path in written.figures]})
     else:
         typer.echo(str(written.page))
 
 
-def _write_report(runs: list[Path], out: Path | None) -> Any:
+def _write_report(runs: list[Path], out: Path | None, force: bool = False) -> Any:
     from uuvtai.report.build import report
 
-    return report(runs, out)
+    return report(runs, out, force)
 
 
 # ------------------------------------------------------------------------------------------------------------------ export

@@ -212,7 +212,8 @@ class VectorEnv:
     def _setting(self) -> str:
         """JSON of what a captured state fits to."""
         tree = dataclasses.asdict(self.sim.tree)
-        tree.pop("source")
+        for told in ("source", "xml"):  # where it was read from changes nothing
+            tree.pop(told)
         return json.dumps(
             {"num_envs": self.num_envs, "tree": tree, **self.config.model_dump(mode="json", include=set(Config.model_fields))}
         )

@@ -2,19 +2,34 @@
 
 from __future__ import annotations
 
+import json
+import math
 import os
+import re
 import stat
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from uuvtai.errors import UserError
 
 MAX_BYTES = 1 << 30
 """[bytes] most that any file may bring into memory"""
+MAX_JSON_BYTES = 64 << 20
+"""[bytes] most that a JSON document may have"""
+_MAX_JSON_CONTAINERS, _MAX_JSON_VALUES = 1_000_000, 8_000_000
+"""of one document: in memory an empty list takes thirty times the two bytes that it is written with"""
+_MAX_INTEGER = 1 << 128
+"""what the state of a random generator takes; a float holds it too"""
+_MAX_ENTRIES = 1_000_000
+"""files and folders of one run folder: more are not counted"""
 
 _NO_FOLLOW = getattr(os, "O_NOFOLLOW", 0)  # absent on Windows, where making a link takes rights that a stranger does not have
-_OPEN = os.O_RDONLY | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)
+_ALWAYS = getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)
+_OPEN, _CHANGE = os.O_RDONLY | _ALWAYS, os.O_RDWR | _ALWAYS
+_CREATE = os.O_WRONLY | os.O_CREAT | _NO_FOLLOW | _ALWAYS
+_FOLDER = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_CLOEXEC", 0)
+_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 
 
 class FileError(UserError):
@@ -57,6 +72,39 @@ def read_text(path: Path, limit: int = MAX_BYTES, folder: Path | None = None) ->
         raise FileError(f"{path}: is not UTF-8 text (byte {error.start}); save it as UTF-8") from None
 
 
+def read_json(path: Path, limit: int = MAX_JSON_BYTES, folder: Path | None = None) -> Any:
+    """Value of a JSON file, as ``read_bytes`` reads it and ``parsed_json`` understands it."""
+    return parsed_json(read_bytes(path, limit, folder), str(path))
+
+
+def parsed_json(content: bytes | str, where: str) -> Any:
+    """Value of a JSON text from elsewhere: finite numbers, integers of 128 bits, no more than fits 1 GiB of memory.
+
+    Raises FileError, which names ``where``.
+    """
+    try:
+        text = content.decode("utf-8") if isinstance(content, bytes) else content
+        if text.count("{") + text.count("[") > _MAX_JSON_CONTAINERS or text.count(",") > _MAX_JSON_VALUES:
+            raise FileError(f"{where}: holds more than {_MAX_JSON_CONTAINERS:,} lists and objects or {_MAX_JSON_VALUES:,} values")
+        value = json.loads(text, parse_constant=_no_constant, parse_float=_finite, parse_int=_whole)
+        if _SURROGATE.search(text):
+            json.dumps(value, ensure_ascii=False).encode()  # half a character cannot be written anywhere again
+    except (ValueError, RecursionError) as error:
+        raise FileError(f"{where}: is not valid JSON ({error})") from None
+    return value
+
+
+def read_lines(path: Path, limit: int = MAX_BYTES, folder: Path | None = None, longest: int = 1 << 20) -> Iterator[bytes]:
+    """Lines of a file one by one, with their ends; FileError for one of more than ``longest`` bytes."""
+    with open_file(path, limit, folder) as file:
+        left = limit
+        while line := file.readline(longest + 1):
+            left -= len(line)
+            if len(line) > longest or left < 0:
+                raise FileError(f"{path}: has a line of more than {longest:,} bytes, or more than {limit:,} in all")
+            yield line
+
+
 def refuse_links(folder: Path, path: Path) -> None:
     """Raise FileError where ``path``, which lies below ``folder``, is a link or lies behind one; what does not exist is no link."""
     place = folder
@@ -64,6 +112,52 @@ def refuse_links(folder: Path, path: Path) -> None:
         place = place / part
         if place.is_symlink():
             raise FileError(f"{place}: is a link; what a link leads to is not ours to read, write or delete: remove the link")
+
+
+def refuse_links_in(folder: Path) -> None:
+    """Raise FileError for any link below ``folder``: all that lies there may be read, written and deleted. Raises OSError."""
+    waiting, count = [str(folder)], 0
+    while waiting:
+        with os.scandir(waiting.pop()) as entries:
+            for entry in entries:
+                count += 1
+                if entry.is_symlink() or _is_junction(entry):
+                    raise FileError(f"{entry.path}: is a link; what a link leads to is not ours to read, write or delete: remove the link")
+                if count > _MAX_ENTRIES:
+                    raise FileError(f"{folder}: holds more than {_MAX_ENTRIES:,} files; no run folder does")
+                if entry.is_dir(follow_symlinks=False):
+                    waiting.append(entry.path)
+
+
+def open_new(path: Path) -> BinaryIO:
+    """Open a file for writing that did not exist; whatever is there already, a link too, is a FileExistsError. Raises OSError."""
+    return os.fdopen(os.open(path, _CREATE | os.O_EXCL, 0o666), "wb")
+
+
+def open_to_append(path: Path, folder: Path) -> BinaryIO:
+    """Open a file below ``folder`` for writing at its end, made if it is missing. Raises FileError for what is not ours, OSError.
+
+    A file with a second name (hard link) is refused: what is written would turn up under the other name too.
+    """
+    return os.fdopen(_open_to_change(path, folder, _CREATE | os.O_APPEND), "ab")
+
+
+def truncate(path: Path, size: int, folder: Path) -> None:
+    """Cut a file below ``folder`` to its first ``size`` bytes. Raises as ``open_to_append``."""
+    handle = _open_to_change(path, folder, _CHANGE)
+    try:
+        os.ftruncate(handle, size)
+    finally:
+        os.close(handle)
+
+
+def flush(path: Path) -> None:
+    """See a file, or the names in a folder, on the disk. Raises OSError."""
+    handle = os.open(path, os.O_RDONLY | getattr(os, "O_CLOEXEC", 0))
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def refuse_output(out: Path, inputs: Iterable[Path], force: bool) -> None:
@@ -86,6 +180,29 @@ def refuse_output(out: Path, inputs: Iterable[Path], force: bool) -> None:
         raise FileError(f"{out}: is already there; give another --out, or --force to replace it")
 
 
+def _no_constant(text: str) -> float:
+    raise ValueError(f"{text} is no number of JSON")
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text[:40]} is beyond what a number holds")
+    return value
+
+
+def _whole(text: str) -> int:
+    value = int(text) if len(text) <= len(str(-_MAX_INTEGER)) else _MAX_INTEGER + 1
+    if abs(value) > _MAX_INTEGER:
+        raise ValueError(f"{text[:40]} is beyond 128 bits")
+    return value
+
+
+def _is_junction(entry: os.DirEntry[str]) -> bool:
+    """A folder elsewhere under a name here, as Windows has them."""
+    return os.name == "nt" and bool(os.lstat(entry.path).st_reparse_tag)  # type: ignore[attr-defined]
+
+
 def _same(one: Path, other: Path) -> bool:
     """Whether two paths name one file, by whatever links; a name that nothing has yet counts by where it would lie."""
     try:
@@ -94,18 +211,31 @@ def _same(one: Path, other: Path) -> bool:
         return os.path.realpath(one) == os.path.realpath(other)
 
 
-def _open_below(folder: Path, path: Path) -> int:
+def _open_to_change(path: Path, folder: Path, flags: int) -> int:
+    handle = _open_below(folder, path, flags)
+    try:
+        found = os.fstat(handle)
+        if not stat.S_ISREG(found.st_mode):
+            raise FileError(f"{path}: is {_kind(found.st_mode)}; a run folder holds plain files: remove it")
+        if found.st_nlink > 1:
+            raise FileError(f"{path}: has a second name (a hard link), which would change too; put a copy in its place")
+    except BaseException:
+        os.close(handle)
+        raise
+    return handle
+
+
+def _open_below(folder: Path, path: Path, flags: int = _OPEN) -> int:
     """File descriptor of ``path``, opened name by name from ``folder`` on, so that no name can turn into a link meanwhile."""
     parts = _parts_below(folder, path)
     if os.open not in os.supports_dir_fd:
         refuse_links(folder, path)
-        return os.open(path, _OPEN)
-    place = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        return os.open(path, flags, 0o666)
+    place = os.open(folder, _FOLDER)
     try:
         for i, part in enumerate(parts):
-            flags = _OPEN | _NO_FOLLOW | (os.O_DIRECTORY if i < len(parts) - 1 else 0)
             try:
-                inner = os.open(part, flags, dir_fd=place)
+                inner = os.open(part, _NO_FOLLOW | (flags if i == len(parts) - 1 else _FOLDER), 0o666, dir_fd=place)
             except OSError:
                 refuse_links(folder, path)  # the likely reason, in words
                 raise

@@ -21,12 +21,14 @@ from pydantic import BaseModel, ValidationError
 from uuvtai.config import Config
 from uuvtai.config.learning import LearningConfig
 from uuvtai.errors import UserError
+from uuvtai.files import FileError, read_text
 from uuvtai.shipped import preset_names, shipped_file
 
 DEFAULT_WORLD, DEFAULT_SENSORS = "pool", "paper"
 _SCENE_KINDS = ("world", "sensors", "vehicle")
 _LEARNING_SECTIONS = LearningConfig.model_fields.keys() - Config.model_fields.keys()
-_MAX_BYTES = 1 << 20
+MAX_BYTES = 1 << 20
+"""of a YAML file"""
 _MAX_EXTENDS = 8
 _MAX_SCALAR, _MAX_NODES = 1000, 50_000
 """characters of one value, values of one file: some of YAML's own readers take the square of a value's length"""
@@ -134,7 +136,7 @@ def _checked(model: type[AnyConfig], tree: dict[str, Any], origin: dict[str, str
 
 def load_resolved(path: Path, overrides: Overrides | None = None) -> Config:
     """Config from a run folder's ``config.yaml`` (complete, no presets), then overrides; of a training run, a LearningConfig."""
-    layer = _read_yaml(path)
+    layer = _read_yaml(path, path.parent)
     layer.merge(_overrides(overrides or {}))
     return _checked(LearningConfig if _LEARNING_SECTIONS & layer.tree.keys() else Config, layer.tree, layer.origin)
 
@@ -243,7 +245,7 @@ _SafeLoader.add_implicit_resolver("tag:yaml.org,2002:float", re.compile(r"^[-+]?
 
 def parsed_yaml(text: str, where: str) -> Any:
     """Python value of a YAML text; ConfigError names ``where`` and the line."""
-    if len(text) > _MAX_BYTES:
+    if len(text) > MAX_BYTES:
         raise ConfigError(f"{where}: larger than 1 MiB; a config is a small text file")
     try:
         return yaml.load(text, Loader=_SafeLoader)
@@ -255,15 +257,13 @@ def parsed_yaml(text: str, where: str) -> Any:
         raise ConfigError(f"{where}: not valid YAML: {error}") from None
 
 
-def _read_yaml(path: Path) -> _Layer:
+def _read_yaml(path: Path, folder: Path | None = None) -> _Layer:
     try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise ConfigError(f"{path}: larger than 1 MiB; a config is a small text file")
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path, MAX_BYTES, folder)
+    except FileError as error:
+        raise ConfigError(f"{error}; a config is a small YAML file") from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from None
-    except UnicodeDecodeError:
-        raise ConfigError(f"{path}: is not UTF-8 text; give a YAML file") from None
     tree = parsed_yaml(text, str(path)) or {}
     if not isinstance(tree, dict):
         raise ConfigError(f"{path}: must be a mapping of sections such as 'world:', got {type(tree).__name__}")

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import platform
+import secrets
+import stat
 import subprocess
 import sys
 import time
@@ -17,10 +19,12 @@ from typing import Any
 from uuvtai import __version__, signals
 from uuvtai.config import Config
 from uuvtai.errors import UserError
+from uuvtai.files import FileError, open_new, open_to_append, read_json, refuse_links, refuse_links_in
 from uuvtai.loader import to_yaml
 
-_WRITTEN_IN_PLACE = (".lock", "metrics.jsonl")
-"""files that a resumed run opens for writing; others are replaced as a whole"""
+_RUNS = Path("runs")
+_LOCK, _RECORD = ".lock", "run.json"
+_MAX_RECORD_BYTES = 8 << 20
 
 
 class RunFolderError(UserError, RuntimeError):
@@ -28,12 +32,28 @@ class RunFolderError(UserError, RuntimeError):
 
 
 def default_run_dir(preset: str) -> Path:
-    """``runs/<time>_<preset>``."""
-    return Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}_{Path(preset).stem}"
+    """A new folder ``runs/<time>_<preset>``, with a number behind it where the name is taken. Raises RunFolderError."""
+    name, number = f"{time.strftime('%Y%m%d-%H%M%S')}_{Path(preset).stem}", 1
+    try:
+        _RUNS.mkdir(exist_ok=True)
+        while True:
+            path = _RUNS / (f"{name}-{number}" if number > 1 else name)
+            try:
+                path.mkdir()
+            except FileExistsError:  # another run began in this second
+                number += 1
+            else:
+                return path
+    except OSError as error:
+        raise RunFolderError(f"{_RUNS}: cannot make a folder there ({error.strerror}); give a place: --run-dir DIR") from None
 
 
-def refuse_place(path: Path) -> None:
-    """Raise RunFolderError at once where a run folder plainly cannot be made, not after minutes of compiling; nothing is written."""
+def refuse_place(path: Path | None) -> None:
+    """Raise RunFolderError at once where a run folder plainly cannot be made, not after minutes of compiling; nothing is written.
+
+    None is the default place, whose name is not chosen yet.
+    """
+    path = path or _RUNS / "new"
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise RunFolderError(f"{path}: is already there and not empty; give another --run-dir or remove it")
     nearest = next(place for place in (path, *path.absolute().parents) if place.exists())
@@ -43,15 +63,21 @@ def refuse_place(path: Path) -> None:
 
 
 class RunFolder:
-    """Creates ``path`` with config.yaml and run.json; ``finish`` records how the run ended."""
+    """Creates ``path`` with config.yaml and run.json and holds it; ``finish`` records how the run ended and lets go of it.
+
+    Whoever holds a folder is the only one that writes into it: other processes are refused until this one ends, however it ends.
+    """
 
     _lock: Any = None
+    _record: dict[str, Any]
 
     def __init__(self, path: Path, config: Config, seeds: list[int]) -> None:
-        """Raises RunFolderError where the folder exists with content or cannot be written."""
+        """Raises RunFolderError where the folder exists with content, another process has just taken it, or it cannot be written."""
         refuse_place(path)
         self.path = path
         self._started = time.time()
+        self._guarded("make", lambda: path.mkdir(parents=True, exist_ok=True))
+        self._take()
         self._record = {
             "schema": 1,
             "argv": sys.argv,
@@ -62,30 +88,62 @@ class RunFolder:
             "git_sha": git_sha(),
             "hardware": hardware(),
         }
-        self._guarded("make", lambda: path.mkdir(parents=True, exist_ok=True))
         self.write("config.yaml", to_yaml(config))
-        self.write_json("run.json", self._record)
+        self.write_json(_RECORD, self._record)
 
     @classmethod
     def reopen(cls, path: Path, since: dict[str, Any]) -> RunFolder:
         """Hold and go on with a run that ended or was killed; ``since`` says from where. Raises RunFolderError."""
+        folder = cls.held(path)
+        try:
+            folder.go_on(since)
+        except BaseException:
+            folder.release()
+            raise
+        return folder
+
+    @classmethod
+    def held(cls, path: Path, command: str = "uuv") -> RunFolder:
+        """The folder of a run that ended or was killed, held, and nothing read or changed in it yet; ``go_on`` comes next.
+
+        ``command`` makes such folders, for the message.
+        Raises RunFolderError for what is no run folder, for one that another process works in, and for one with a link anywhere in it.
+        """
         folder = cls.__new__(cls)
         folder.path, folder._started = path, time.time()
-        for name in _WRITTEN_IN_PLACE:
-            if (path / name).is_symlink():
-                raise RunFolderError(
-                    f"{path / name}: is a link; a run folder holds plain files, and what a link leads to is not ours to write"
-                )
+        if not _is_plain(path / _RECORD):
+            raise RunFolderError(f"{path}: is no run folder, it has no plain file {_RECORD}; give the folder that '{command}' printed")
         folder.hold()
         try:
-            folder._record = json.loads((path / "run.json").read_text(encoding="utf-8"))
-            resumed = {"argv": sys.argv, "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"), "versions": versions(), **since}
-            folder._record |= {"status": "running", "resumed": [*folder._record.get("resumed", []), resumed]}
-        except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
-            raise RunFolderError(f"{path / 'run.json'}: cannot be read ({error}); give the folder that 'uuv train' printed") from None
-        folder._record.pop("exit", None)
-        folder.write_json("run.json", folder._record)
+            folder._guarded("read it", lambda: refuse_links_in(path))
+        except BaseException:
+            folder.release()
+            raise
         return folder
+
+    def go_on(self, since: dict[str, Any]) -> None:
+        """Mark a held folder's run as running again; ``since`` says from where. Raises RunFolderError for a record that is none."""
+        self._record = self._read_record()
+        resumed = {"argv": sys.argv, "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"), "versions": versions(), **since}
+        self._record |= {"status": "running", "resumed": [*self._record.get("resumed", []), resumed]}
+        self._record.pop("exit", None)
+        self.write_json(_RECORD, self._record)
+
+    def _read_record(self) -> dict[str, Any]:
+        """run.json, as far as it is gone on with."""
+        file = self.path / _RECORD
+        why = "it is no record of a run"
+        try:
+            record = read_json(file, _MAX_RECORD_BYTES, self.path)
+        except (FileError, OSError) as error:
+            record, why = None, str(error)
+        if (
+            not isinstance(record, dict)
+            or not isinstance(record.get("resumed", []), list)
+            or type(record.get("wall_s", 0.0)) not in (int, float)
+        ):
+            raise RunFolderError(f"{file}: cannot be read ({why}); give the folder that 'uuv train' printed") from None
+        return record
 
     def hold(self) -> None:
         """Keep other processes from writing into the same run until this one ends. Raises RunFolderError where one does."""
@@ -93,20 +151,49 @@ class RunFolder:
             import fcntl
         except ImportError:  # not on this system: nothing to hold it by
             return
-        self._guarded("hold it", self._open_lock)
+        if self._lock is None:
+            self._guarded("hold it", self._open_lock)
+        lock: Any = self._lock
         try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
+            self.release()
             raise RunFolderError(f"{self.path}: another process is working in this folder; wait for it, or stop it") from None
+
+    def release(self) -> None:
+        """Let other processes write into the folder."""
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
 
     def _open_lock(self) -> None:
         signals.engage()
-        self._lock = (self.path / ".lock").open("w")
+        self._lock = open_to_append(self.path / _LOCK, self.path)
+
+    def _take(self) -> None:
+        """Hold a new folder. The lock is the first file in it, and of several processes that want to begin here one makes it."""
+        self._guarded("hold it", self._make_lock)
+        self.hold()
+        if any(place.name != _LOCK for place in self.path.iterdir()):
+            self.release()
+            raise RunFolderError(f"{self.path}: is already there and not empty; give another --run-dir or remove it")
+
+    def _make_lock(self) -> None:
+        signals.engage()
+        try:
+            self._lock = open_new(self.path / _LOCK)
+        except FileExistsError:
+            raise RunFolderError(f"{self.path}: another process has just begun a run there; give another --run-dir") from None
 
     def write(self, name: str, text: str) -> Path:
         """Write a text file atomically; RunFolderError names the file and the reason."""
+        return self.write_bytes(name, text.encode())
+
+    def write_bytes(self, name: str, content: bytes) -> Path:
+        """Write a file atomically, as ``write``."""
         target = self.path / name
-        self._guarded(f"write {target}", lambda: write_atomic(target, text.encode()))
+        self._guarded(f"write {target}", lambda: refuse_links(self.path, target))
+        self._guarded(f"write {target}", lambda: write_atomic(target, content))
         return target
 
     def write_json(self, name: str, document: Any) -> Path:
@@ -114,10 +201,11 @@ class RunFolder:
         return self.write(name, json.dumps(document, indent=1, allow_nan=False) + "\n")
 
     def finish(self, status: str, exit_code: int) -> None:
-        """Record the end: status 'finished', 'interrupted' or 'failed'."""
+        """Record the end, status 'finished', 'interrupted' or 'failed', and release the folder."""
         wall_s = self._record.get("wall_s", 0.0) + time.time() - self._started
         self._record |= {"status": status, "exit": exit_code, "wall_s": round(wall_s, 3)}
-        self.write_json("run.json", self._record)
+        self.write_json(_RECORD, self._record)
+        self.release()
 
     @contextmanager
     def recorded(self) -> Iterator[None]:
@@ -135,6 +223,8 @@ class RunFolder:
     def _guarded(self, what: str, work) -> None:
         try:
             work()
+        except FileError as error:
+            raise RunFolderError(str(error)) from None
         except OSError as error:
             raise RunFolderError(
                 f"{self.path}: cannot {what} ({error.strerror}); give a folder that can be written: --run-dir DIR"
@@ -142,12 +232,12 @@ class RunFolder:
 
 
 def write_atomic(target: Path, content: bytes) -> None:
-    """Write to a temporary neighbour, flush it to disk, rename; on any error nothing is left behind."""
+    """Write to a new temporary neighbour, flush it to disk, rename; on any error nothing is left behind. Raises OSError."""
     signals.engage()
     target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.{secrets.token_hex(4)}.tmp")  # nobody can have put a link there before
     try:
-        with temporary.open("wb") as file:
+        with open_new(temporary) as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
@@ -155,6 +245,13 @@ def write_atomic(target: Path, content: bytes) -> None:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def _is_plain(path: Path) -> bool:
+    try:
+        return stat.S_ISREG(os.lstat(path).st_mode)
+    except OSError:
+        return False
 
 
 def versions() -> dict[str, str]:

@@ -1,7 +1,7 @@
 """README's picture anew: ``python -m docs.writers.pictures`` plays one episode with three controllers and writes ``docs/pool.png``.
 
-The other pictures are figures of pages: ``pool_grid_best.png`` and ``robustness_collision.png`` come from ``uuv report`` of the sweeps named
-in ``docs/robustness.md``, ``training.png`` and ``trainers.png`` from the commands beside them.
+The other pictures are figures of pages: ``pool_grid_best.png`` and ``robustness_collision.png`` come from ``uuv report`` of the sweeps
+named in ``docs/robustness.md``, ``training.png`` and ``trainers.png`` from the commands beside them.
 """
 
 from __future__ import annotations
@@ -17,9 +17,8 @@ from pathlib import Path
 from docs.writers.evaluations import ONE_THREAD
 from docs.writers.figure_sources import ROOT
 
-COMMAND = (
-    "eval --controller straight --controller planner --controller bt --world pool -S 8 -D 6 -v 0.6 --seeds 0 --episodes 1 --record 1"
-).split()
+METHODS = ("--controller", "straight", "--controller", "planner", "--controller", "bt")
+COMMAND = ("eval", *METHODS, "--world", "pool", "-S", "8", "-D", "6", "-v", "0.6", "--seeds", "0", "--episodes", "1", "--record", "1")
 
 
 def pool(target: Path) -> Path:

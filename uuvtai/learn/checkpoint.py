@@ -25,7 +25,10 @@ import torch
 
 from uuvtai import __version__
 from uuvtai.config.learning import LearningConfig
+from uuvtai.errors import UserError
+from uuvtai.files import FileError, flush, open_new, read_bytes, refuse_links, refuse_links_in
 from uuvtai.learn.manifest import (
+    LARGEST,
     MANIFEST,
     MODEL,
     OPTIONAL,
@@ -110,7 +113,7 @@ class Checkpoint:
 
     def _part(self, name: str, plain: Any) -> dict[str, Any]:
         with refused(self.path / name):
-            content = (self.path / name).read_bytes()
+            content = read_bytes(self.path / name, LARGEST[name], self.path)
             if hashlib.sha256(content).hexdigest() != self.manifest.files[name].sha256:
                 raise PackingError("has changed since it was verified")
             return unpack(plain, safetensors.torch.load(content))
@@ -136,6 +139,8 @@ def save(
     target = checkpoints / f"{_STEP}{step:06d}"
     try:
         checkpoints.mkdir(parents=True, exist_ok=True)
+        refuse_links(checkpoints.parent, checkpoints)  # what lies there is deleted one day
+        refuse_links_in(checkpoints)
         sweep(checkpoints)
         partial = checkpoints / f"{_PARTIAL}{target.name}.{os.getpid()}"
         partial.mkdir()
@@ -155,6 +160,8 @@ def save(
         )
         _publish(partial, target, manifest)
         _thin(checkpoints, config.train.keep_checkpoints)
+    except FileError as error:
+        raise CheckpointError(str(error)) from None
     except OSError as error:
         sweep(checkpoints)
         raise CheckpointError(f"{target}: cannot be written ({error.strerror}); make room or mend the folder, then: --resume") from None
@@ -165,7 +172,7 @@ def ship(checkpoint: Checkpoint, target: Path) -> None:
     """Copy the networks of a checkpoint into a new folder ``target``: a policy that drives but cannot be trained on."""
     partial = target.with_name(f"{_PARTIAL}{target.name}")
     partial.mkdir(parents=True)
-    shutil.copyfile(checkpoint.path / MODEL, partial / MODEL)
+    _write(partial / MODEL, read_bytes(checkpoint.path / MODEL, LARGEST[MODEL], checkpoint.path))
     kept = {"training": None, "simulator": None, "simulator_layout": None, "files": {MODEL: checkpoint.manifest.files[MODEL]}}
     _publish(partial, target, checkpoint.manifest.model_copy(update=kept))
 
@@ -200,12 +207,12 @@ def _publish(partial: Path, target: Path, manifest: Manifest) -> None:
     text = json.dumps(manifest.model_dump(mode="json", by_alias=True), indent=1, allow_nan=False)
     _write(partial / MANIFEST, text.encode())
     for path in partial.iterdir():
-        _flush(path)
-    _flush(partial)
+        flush(path)
+    flush(partial)
     if target.exists():
         _remove(target)
     partial.rename(target)
-    _flush(target.parent)
+    flush(target.parent)
 
 
 def _thin(checkpoints: Path, keep: int) -> None:
@@ -227,16 +234,8 @@ def _remove(folder: Path) -> None:
 
 
 def _write(path: Path, content: bytes) -> None:
-    with path.open("xb") as file:
+    with open_new(path) as file:
         file.write(content)
-
-
-def _flush(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _entry(path: Path) -> FileEntry:
@@ -267,7 +266,7 @@ def newest(run: Path, note: Callable[[str], None] = lambda _text: None, resumabl
     checkpoints = run / "checkpoints"
     for path in _folders(checkpoints):
         try:
-            found = open_checkpoint(path)
+            found = _open_below(run, path)
         except CheckpointError as error:
             note(f"left out: {error}")
             continue
@@ -282,10 +281,17 @@ def best(run: Path, note: Callable[[str], None] = lambda _text: None) -> Checkpo
     found = _best_folder(_folders(run / "checkpoints"))
     if found is not None:
         try:
-            return open_checkpoint(found)
+            return _open_below(run, found)
         except CheckpointError as error:
             note(f"left out: {error}")
     return newest(run, note)
+
+
+def _open_below(run: Path, path: Path) -> Checkpoint:
+    """As ``open_checkpoint``, of a run's own folder; a link to another one is none of its own."""
+    with refused(path):
+        refuse_links(run, path)
+    return open_checkpoint(path)
 
 
 def _folders(checkpoints: Path) -> list[Path]:
@@ -298,7 +304,7 @@ def _best_folder(folders: list[Path]) -> Path | None:
     """Highest score, the newest of equals; None where nothing was scored."""
     scored = []
     for path in folders:
-        with contextlib.suppress(CheckpointError, PackingError, ValueError, RecursionError):
+        with contextlib.suppress(UserError, ValueError, RecursionError):
             score = parsed(manifest_content(path)).score
             scored += [] if score is None else [(score, path)]
     return max(scored, key=lambda pair: pair[0])[1] if scored else None

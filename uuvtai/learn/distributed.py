@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, MutableMapping
+from collections.abc import Iterable, Mapping, MutableMapping
 from dataclasses import dataclass
 
 import torch
@@ -89,6 +89,11 @@ class Processes:
         for tensor in tensors:
             tensor.copy_(bucket[first : first + tensor.numel()].view_as(tensor))
             first += tensor.numel()
+
+
+def is_writer(environ: Mapping[str, str] = os.environ) -> bool:
+    """Whether this process will be the one that writes files, known before it has joined the others."""
+    return environ.get("WORLD_SIZE", "1") == "1" or environ.get("RANK", "0") == "0"
 
 
 def claim_gpu(environ: MutableMapping[str, str] = os.environ) -> None:

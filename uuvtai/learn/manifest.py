@@ -15,6 +15,7 @@ from safetensors import SafetensorError
 
 from uuvtai import __version__
 from uuvtai.errors import UserError
+from uuvtai.files import FileError, open_file, parsed_json, read_bytes
 from uuvtai.learn.packing import PackingError
 
 SCHEMA = 1
@@ -26,6 +27,8 @@ MANIFEST, MODEL, TRAINING, SIMULATOR = "manifest.json", "model.safetensors", "tr
 OPTIONAL = (TRAINING, SIMULATOR)
 """files that a policy drives without"""
 _MAX_BYTES = 8 << 20
+LARGEST = {MODEL: 256 << 20, TRAINING: 512 << 20, SIMULATOR: 8 << 30}
+"""[bytes] most that a file may have; the first two are read into memory, the last one as far as its reader expects"""
 _CHUNK_BYTES = 1 << 20
 
 
@@ -88,14 +91,16 @@ def manifest_content(path: Path) -> bytes:
         raise CheckpointError(f"{path}: no such folder; give a run folder, one of its checkpoints/step_N, or a shipped policy's name")
     if file.is_symlink() or not file.is_file():
         raise CheckpointError(f"{file}: is missing; the folder is no checkpoint, or its writing was cut off")
-    if file.stat().st_size > _MAX_BYTES:
-        raise CheckpointError(f"{file}: larger than {_MAX_BYTES >> 20} MiB; no manifest of uuvtai is")
-    return file.read_bytes()
+    with refused(file):
+        return read_bytes(file, _MAX_BYTES, path)
 
 
 def parsed(content: bytes) -> Manifest:
     """The manifest itself. Raises PackingError for another schema or version before anything else is looked at, ValueError for nonsense."""
-    raw = json.loads(content, parse_constant=_no_constant)
+    try:
+        raw = parsed_json(content, MANIFEST)
+    except FileError as error:
+        raise ValueError(str(error)) from None
     if not isinstance(raw, dict) or "schema" not in raw:
         raise PackingError("is not a manifest of uuvtai")
     if raw["schema"] != SCHEMA:
@@ -116,7 +121,9 @@ def verify(file: Path, entry: FileEntry | None, is_optional: bool) -> None:
         raise CheckpointError(f"{file}: is missing; take another checkpoint of the run")
     if entry is None:
         raise CheckpointError(f"{file}: is not listed in {MANIFEST}; take another checkpoint of the run")
-    size = file.stat().st_size
+    size, most = file.stat().st_size, LARGEST[file.name]
+    if size > most:
+        raise CheckpointError(f"{file}: has {size:,} bytes, more than the {most:,} that such a file may have")
     if size != entry.bytes:
         raise CheckpointError(f"{file}: has {size} bytes instead of {entry.bytes}, it was cut off; take another checkpoint of the run")
     if sha256_of(file) != entry.sha256:
@@ -134,8 +141,8 @@ def refused(file: Path) -> Iterator[None]:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
         raise CheckpointError(f"{file}: {where}: {first['msg']}; it was not written by this version of uuvtai") from None
-    except PackingError as error:
-        raise CheckpointError(f"{file}: {error}") from None
+    except (PackingError, FileError) as error:
+        raise CheckpointError(f"{file}: {str(error).removeprefix(f'{file}: ')}") from None
     except (ValueError, RecursionError, OSError) as error:
         raise CheckpointError(f"{file}: cannot be read ({error}); take another checkpoint of the run") from None
 
@@ -173,14 +180,10 @@ def finite(metrics: Mapping[str, Any]) -> dict[str, Any]:
     return {name: None if isinstance(value, float) and not math.isfinite(value) else value for name, value in metrics.items()}
 
 
-def _no_constant(text: str) -> float:
-    raise ValueError(f"{text} is not JSON")
-
-
 def sha256_of(file: Path) -> str:
     """Of a file's content, hexadecimal."""
     digest = hashlib.sha256()
-    with file.open("rb") as stream:
+    with open_file(file, LARGEST[SIMULATOR], file.parent) as stream:
         while chunk := stream.read(_CHUNK_BYTES):
             digest.update(chunk)
     return digest.hexdigest()

@@ -11,10 +11,13 @@ import torch
 import zstandard
 
 from uuvtai.errors import UserError
+from uuvtai.files import open_file, open_new
 
 Layout = list[tuple[str, str, list[int]]]
 """(name, NumPy dtype, shape) of every array in a stream, in order"""
 
+MAX_STREAM_BYTES = 1 << 40
+"""[bytes] of a stream on disk, of which no more is read than its reader expects"""
 _LEVEL = 1
 """of zstandard: higher ones save a few per cent of disk and take several times as long"""
 
@@ -97,7 +100,7 @@ def write_stream(path: Path, tensors: dict[str, torch.Tensor]) -> None:
     """Compress host tensors one after the other into a new file."""
     size = sum(tensor.nbytes for tensor in tensors.values())
     compressor = zstandard.ZstdCompressor(level=_LEVEL, write_checksum=True)
-    with path.open("xb") as file, compressor.stream_writer(file, size=size, closefd=False) as stream:
+    with open_new(path) as file, compressor.stream_writer(file, size=size, closefd=False) as stream:
         for tensor in tensors.values():
             stream.write(_bytes_of(tensor.numpy()))
 
@@ -106,7 +109,7 @@ def read_stream(path: Path, layout: Layout) -> dict[str, torch.Tensor]:
     """Read exactly what ``layout`` says, so that a file cannot unfold to more than its reader expects. Raises PackingError."""
     tensors = {}
     try:
-        with path.open("rb") as file, zstandard.ZstdDecompressor().stream_reader(file) as stream:
+        with open_file(path, MAX_STREAM_BYTES, path.parent) as file, zstandard.ZstdDecompressor().stream_reader(file) as stream:
             for name, dtype, shape in layout:
                 array = np.empty(shape, dtype)
                 _fill(_bytes_of(array), stream, name)

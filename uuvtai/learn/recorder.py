@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
+
+from uuvtai.files import FileError, open_to_append, parsed_json, read_lines, truncate
 
 METRICS, EVENTS = "metrics.jsonl", "tensorboard"
 
@@ -18,17 +20,17 @@ class Recorder:
     """
 
     def __init__(self, run: Path, iteration: int = 0) -> None:
-        """``iteration``: how many are done already. Raises OSError where the folder cannot be written."""
+        """``iteration``: how many are done already. Raises OSError, and FileError for what is no plain file of the run."""
         from torch.utils.tensorboard import SummaryWriter  # takes a second to import
 
-        _cut(run / METRICS, iteration)
-        self._file = (run / METRICS).open("a", encoding="utf-8")
+        _cut(run, iteration)
+        self._file = open_to_append(run / METRICS, run)
         self._events = SummaryWriter(str(run / EVENTS), purge_step=iteration + 1 if iteration else None)
 
     def write(self, iteration: int, metrics: Mapping[str, float]) -> None:
         """Record an iteration, counted from 1. What is not finite becomes null, and no event."""
         row = {name: value if math.isfinite(value) else None for name, value in metrics.items()}
-        self._file.write(json.dumps({"iteration": iteration, **row}, allow_nan=False) + "\n")
+        self._file.write(json.dumps({"iteration": iteration, **row}, allow_nan=False).encode() + b"\n")
         self._file.flush()
         for name, value in row.items():
             if value is not None:
@@ -42,33 +44,34 @@ class Recorder:
 
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:
-    """Every whole line of a run's ``metrics.jsonl``; a last line that was cut off is left out. Raises OSError."""
-    rows = []
-    for line in (run / METRICS).read_text(encoding="utf-8").splitlines(keepends=True):
+    """Every whole line of a run's ``metrics.jsonl``; a last line that was cut off is left out. Raises OSError, FileError."""
+    return list(_whole_rows(run))
+
+
+def _whole_rows(run: Path) -> Iterator[dict[str, Any]]:
+    for line in read_lines(run / METRICS, folder=run):
         if (row := _row(line)) is None:
-            break
-        rows.append(row)
-    return rows
+            return
+        yield row
 
 
-def _cut(file: Path, iteration: int) -> None:
+def _cut(run: Path, iteration: int) -> None:
     """Shorten the file to the whole lines of iterations up to this one."""
+    file, kept = run / METRICS, 0
     if not file.exists():
         return
-    kept = 0
-    for line in file.read_bytes().splitlines(keepends=True):
+    for line in read_lines(file, folder=run):
         row = _row(line)
         if row is None or row["iteration"] > iteration:
             break
         kept += len(line)
-    with file.open("r+b") as stream:
-        stream.truncate(kept)
+    truncate(file, kept, run)
 
 
-def _row(line: str | bytes) -> dict[str, Any] | None:
+def _row(line: bytes) -> dict[str, Any] | None:
     """The object of a line; None where the line was cut off."""
     try:
-        row = json.loads(line)
-    except ValueError:
+        row = parsed_json(line, METRICS)
+    except FileError:
         return None
-    return row if line[-1:] in ("\n", b"\n") and isinstance(row, dict) and isinstance(row.get("iteration"), int) else None
+    return row if line[-1:] == b"\n" and isinstance(row, dict) and isinstance(row.get("iteration"), int) else None

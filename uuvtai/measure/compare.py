@@ -62,8 +62,7 @@ def compare(request: Request, watch: Watch) -> tuple[dict[str, Any], Path]:
         raise SettingError(f"--num-envs {request.num_envs}: at least 1 env is needed, for example --num-envs 64")
     if len(set(request.seeds)) != len(request.seeds):
         raise ConfigError(f"--seeds {','.join(map(str, request.seeds))}: a seed is given twice; its episodes would be the same")
-    run_dir = request.run_dir or default_run_dir(request.world)
-    refuse_place(run_dir)
+    refuse_place(request.run_dir)
     from uuvtai.sim import Sim
 
     methods = _methods(request, watch)
@@ -71,8 +70,7 @@ def compare(request: Request, watch: Watch) -> tuple[dict[str, Any], Path]:
     watch.note(_STARTING.format(num_envs))
     sim = Sim(request.config, num_envs, methods[0].tree if methods else _any_tree(), request.device)
     policies = {method.name: method.driver_for(sim) for method in methods}
-    folder = RunFolder(run_dir, request.config, request.seeds)
-    folder.hold()
+    folder = RunFolder(request.run_dir or default_run_dir(request.world), request.config, request.seeds)
     with _going_on(folder, watch):
         folder.write_json(REQUEST, document_of(request, num_envs, sim.device.type, drivers_of(methods)))
         return _compared(request, sim, methods, policies, folder, watch), folder.path
@@ -86,10 +84,15 @@ def resume(place: Path, watch: Watch) -> tuple[dict[str, Any], Path]:
     """
     from uuvtai.sim import Sim
 
-    request, drivers = read_request(place)
-    methods = _methods(request, watch)
-    refuse_others(place, drivers, drivers_of(methods))
-    folder = RunFolder.reopen(place, {"what": "eval"})
+    folder = RunFolder.held(place, "uuv eval")
+    try:
+        request, drivers = read_request(place)
+        methods = _methods(request, watch)
+        refuse_others(place, drivers, drivers_of(methods))
+        folder.go_on({"what": "eval"})
+    except BaseException:
+        folder.release()
+        raise
     with _going_on(folder, watch):
         watch.note(_STARTING.format(request.num_envs))
         assert request.num_envs is not None  # the file states it
@@ -243,7 +246,7 @@ def _write_results(folder: RunFolder, result: dict[str, Any], played: list[_Play
     folder.write_json("eval/result.json", result)
     driving = [p for p in played if p.policy is None]
     for p in driving:
-        folder.write(f"eval/trees/{p.method.name}.xml", Path(p.method.tree.source).read_text())
+        folder.write_bytes(f"eval/trees/{p.method.name}.xml", p.method.tree.xml)
     folder.write_json("eval/tree.json", {"schema": 1, "use": {p.method.name: p.use for p in driving}})
 
 

@@ -143,8 +143,9 @@ def run_episodes(
             with clock.counting("reset"):
                 rows = _refill(sim, wheel, jobs, waiting, free, playing)
             begun |= dict.fromkeys(rows, passes)
-            for row in rows if recorder else ():
-                recorder.begin(sim, row, jobs[playing[row]])
+            if recorder:
+                for row in rows:
+                    recorder.begin(sim, row, jobs[playing[row]])
         passes, env_steps = passes + 1, env_steps + len(playing)
         with clock.counting("step", len(playing)):
             wheel.step()

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 Metrics = dict[str, float]
 
+CONFIG = "config.yaml"
+"""of a run folder"""
 SCORE = "eval/success_rate"
 """metric by which a checkpoint is the best"""
 
@@ -58,12 +60,27 @@ def train(request: TrainRequest, watch: TrainWatch) -> tuple[dict[str, Any], Pat
     raises KeyboardInterrupt; a second one ends at once. Under torchrun rank 0 writes. Raises ConfigError, ValueError, MemoryError,
     RunFolderError, CheckpointError, TrainingError.
     """
-    from uuvtai.learn.distributed import claim_gpu
+    from uuvtai.learn.distributed import is_writer
 
     if request.iterations is not None and request.iterations < 1:
         raise ConfigError(f"--iterations {request.iterations}: at least 1, for example --iterations 100")
-    if request.run_dir and request.resume is None:
+    if request.resume is None:
         refuse_place(request.run_dir)
+        return _train(request, None, watch)
+    _refuse_no_run(request.resume)
+    if not is_writer():
+        return _train(request, None, watch)
+    held = RunFolder.held(request.resume, "uuv train")  # before anything is read: what another process writes meanwhile must not count
+    try:
+        return _train(request, held, watch)
+    finally:
+        held.release()
+
+
+def _train(request: TrainRequest, held: RunFolder | None, watch: TrainWatch) -> tuple[dict[str, Any], Path]:
+    """As ``train``; ``held`` is the folder of the run to go on with, where this process writes."""
+    from uuvtai.learn.distributed import claim_gpu
+
     found, config = _begin(request, watch)
     total = request.iterations or config.train.iterations
     if found and found.step >= total:
@@ -73,7 +90,7 @@ def train(request: TrainRequest, watch: TrainWatch) -> tuple[dict[str, Any], Pat
     claim_gpu()
     watch.note(f"starting {config.train.num_envs} envs (sizes not used before compile their kernels first, about half a minute)")
     trainer = _trainer(_env(config, request.device), config, found)
-    folder = _folder(request, config, found) if trainer.processes.writes else None
+    folder = _folder(request, config, found, held) if trainer.processes.writes else None
     run = _Run(trainer, config, folder, watch, total)
     status, code = "failed", 1
     try:
@@ -100,13 +117,15 @@ def _begin(request: TrainRequest, watch: TrainWatch) -> tuple[Checkpoint | None,
     if request.resume is None:
         assert request.config is not None
         return None, request.config
-    file = request.resume / "config.yaml"
-    if not file.is_file():
-        raise ConfigError(f"{request.resume}: is no run folder, it has no config.yaml; give the folder that 'uuv train' printed")
-    config = load_resolved(file, request.overrides)
+    config = load_resolved(request.resume / CONFIG, request.overrides)
     if not isinstance(config, LearningConfig):
         raise ConfigError(f"{request.resume}: is no training run; give the folder that 'uuv train' printed")
     return checkpoint.newest(request.resume, watch.note, resumable=True), config
+
+
+def _refuse_no_run(place: Path) -> None:
+    if not (place / CONFIG).is_file():
+        raise ConfigError(f"{place}: is no run folder, it has no {CONFIG}; give the folder that 'uuv train' printed")
 
 
 def _env(config: LearningConfig, device: str) -> VectorEnv:
@@ -137,15 +156,13 @@ def _trainer(env: VectorEnv, config: LearningConfig, found: Checkpoint | None) -
     return trainer
 
 
-def _folder(request: TrainRequest, config: LearningConfig, found: Checkpoint | None) -> RunFolder:
-    if request.resume is None or found is None:
-        folder = RunFolder(request.run_dir or default_run_dir(request.preset), config, [config.train.seed])
-        folder.hold()
-        return folder
-    folder = RunFolder.reopen(request.resume, {"iteration": found.step, "checkpoint_sha256": found.sha256})
+def _folder(request: TrainRequest, config: LearningConfig, found: Checkpoint | None, held: RunFolder | None) -> RunFolder:
+    if held is None or found is None:
+        return RunFolder(request.run_dir or default_run_dir(request.preset), config, [config.train.seed])
+    held.go_on({"iteration": found.step, "checkpoint_sha256": found.sha256})
     if request.overrides:
-        folder.write("config.yaml", to_yaml(config))
-    return folder
+        held.write(CONFIG, to_yaml(config))
+    return held
 
 
 class _Run:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from uuvtai.files import FileError, read_json
 from uuvtai.loader import ConfigError, preset_names
-from uuvtai.tree import FlatTree, NodeUse, read_tree, tree_dot, tree_text
+from uuvtai.tree import FlatTree, NodeUse, read_tree, read_tree_file, tree_dot, tree_text
 
 _LEGEND = "episodes: share that ticked the node; acted: control steps whose action the leaf set"
 
@@ -29,7 +29,7 @@ def tree_report(controller: str, run: Path | None) -> TreeReport:
         used = _record(run)
         if controller not in used:
             raise ConfigError(f"{run}: has no controller {controller!r}; there are: {', '.join(used)} (--controller NAME)")
-        tree = read_tree(str(run / "eval" / "trees" / f"{controller}.xml"))
+        tree = read_tree_file(run / "eval" / "trees" / f"{controller}.xml", folder=run)
         use = used[controller]
         if len(use) != len(tree.names):
             raise ConfigError(f"{run}: the tree {controller!r} has changed since that evaluation; run it again with 'uuv eval'")
@@ -46,19 +46,25 @@ def _record(run: Path) -> dict[str, list[NodeUse]]:
         shipped = f"; the tree alone: 'uuv tree --controller {run}'" if str(run) in preset_names("tree") else ""
         raise ConfigError(f"{run}: is no run folder; give one of an evaluation ('uuv eval' prints it){shipped}")
     try:
-        record = json.loads(path.read_bytes())
+        record = read_json(path, folder=run)
         return {
-            name: [NodeUse(float(node["share"]), int(node["ticks"]), int(node["acted"])) for node in nodes]
+            name: [NodeUse(_number(node["share"]), int(node["ticks"]), int(node["acted"])) for node in nodes]
             for name, nodes in record["use"].items()
         }
     except OSError as error:
         raise ConfigError(
             f"{path}: cannot be read ({error.strerror}); give the run folder of an evaluation ('uuv eval' prints it)"
         ) from None
-    except json.JSONDecodeError as error:
-        raise ConfigError(f"{path}: is not valid JSON ({error}); run the evaluation again with 'uuv eval'") from None
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except FileError as error:
+        raise ConfigError(f"{error}; run the evaluation again with 'uuv eval'") from None
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ConfigError(f"{path}: is not what 'uuv eval' writes ({error!r}); run the evaluation again with 'uuv eval'") from None
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, int | float):
+        return float(value)
+    raise TypeError(f"{value!r:.40} is no number")
 
 
 def _document(controller: str, tree: FlatTree, use: list[NodeUse] | None) -> dict[str, Any]:

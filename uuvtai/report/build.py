@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from uuvtai.errors import UserError
+from uuvtai.files import FileError, refuse_links_in, refuse_output
 from uuvtai.loader import ConfigError
 from uuvtai.report.blocks import Block, Figure, Heading, Section
 from uuvtai.report.evaluation import evaluation
-from uuvtai.report.files import read_json, read_lines, read_text
+from uuvtai.report.files import read_config, read_json, read_lines
 from uuvtai.report.learning_curves import Training, training
 from uuvtai.report.media import media
 from uuvtai.report.page import Page, render
@@ -24,6 +27,9 @@ from uuvtai.run_folder import RunFolderError, write_atomic
 _NOTHING = "has nothing to report yet: no eval/result.json, metrics.jsonl, sweep.json, profile.json or reproduce.json"
 
 
+PAGE, FIGURES = "report.html", "figures"
+
+
 @dataclass(frozen=True)
 class Report:
     """What was written."""
@@ -32,50 +38,70 @@ class Report:
     figures: list[Path]
 
 
-def report(runs: list[Path], out: Path | None = None) -> Report:
+def report(runs: list[Path], out: Path | None = None, force: bool = False) -> Report:
     """Write the page of a run folder to ``out`` (default: its report.html) and its figures as PNG to ``figures/`` beside the page.
 
     Several folders are trainings to be compared: seeds of a method, or methods; then ``out`` must be given. Everything is read and drawn
-    before anything is written. Raises ConfigError for a folder without anything to report or with a damaged file, RunFolderError where
-    the page cannot be written.
+    before anything is written. The default page and its figures are renewed; elsewhere files are replaced with ``force`` only, and files
+    of the run never. Raises ConfigError for a folder without anything to report or with a damaged file, FileError for a link in it or for
+    a file that would be replaced, RunFolderError where the page cannot be written.
     """
     if len(runs) > 1 and out is None:
         raise ConfigError(f"{len(runs)} run folders: say where their common page is to be written: --out FILE")
     for run in runs:
         _refuse(run)
-    target = out or runs[0] / "report.html"
+    target = out or runs[0] / PAGE
     if target.is_dir():
         raise ConfigError(f"{target}: is a folder; give the page a name, for example --out {target / 'report.html'}")
-    page = _of_trainings(runs) if len(runs) > 1 else _of_run(runs[0])
-    html, pngs = render(page)
-    return _write(target, html, pngs)
+    _refuse_place(target, runs, force)
+    with _told(runs[0] if len(runs) == 1 else target):
+        html, pngs = render(_of_trainings(runs) if len(runs) > 1 else _of_run(runs[0]))
+    figures = [target.parent / FIGURES / f"{name}.png" for name in pngs]
+    for figure in figures:
+        _refuse_place(figure, runs, force)
+    return _write(target, html, dict(zip(figures, pngs.values(), strict=True)))
 
 
 def _refuse(run: Path) -> None:
     if not run.is_dir():
         raise ConfigError(f"{run}: is no run folder; give one that 'uuv eval', 'uuv train' or 'uuv sweep' printed")
-
-
-def _write(target: Path, html: str, pngs: dict[str, bytes]) -> Report:
-    figures = [target.parent / "figures" / f"{name}.png" for name in pngs]
     try:
-        for path, content in zip(figures, pngs.values(), strict=True):
+        refuse_links_in(run)
+    except OSError as error:
+        raise ConfigError(f"{run}: cannot be read ({error.strerror})") from None
+
+
+def _refuse_place(target: Path, runs: list[Path], force: bool) -> None:
+    """Raise FileError where a file must not be written: what the report of a run wrote before may be renewed, no other file of a run."""
+    place, renewed = Path(os.path.realpath(target)), force
+    for run in (Path(os.path.realpath(run)) for run in runs):
+        if place == run / PAGE or place.parent == run / FIGURES:
+            renewed = force or len(runs) == 1
+        elif place.is_relative_to(run) and place.exists() and place.suffix != ".html":
+            raise FileError(f"{target}: is part of the run {run.name}; give --out another name")
+    if target.parent.is_symlink() and target.parent.name == FIGURES:
+        raise FileError(f"{target.parent}: is a link; give --out a place whose {FIGURES}/ is a folder")
+    refuse_output(target, [], renewed)
+
+
+def _write(target: Path, html: str, figures: dict[Path, bytes]) -> Report:
+    try:
+        for path, content in figures.items():
             write_atomic(path, content)
         write_atomic(target, html.encode())
     except OSError as error:
         raise RunFolderError(f"{target}: cannot write it ({error.strerror}); give a place that can be written: --out FILE") from None
-    return Report(target, figures)
+    return Report(target, list(figures))
 
 
 # ----------------------------------------------------------------------------------------------------------------- compose
 
 
 def _of_run(run: Path) -> Page:
-    record = read_json(run / "run.json") or {}
-    document = read_json(run / "reproduce.json")
-    with _told(run):
-        sections = reproduction(document, run, _nested, _curves_of) if document else []
-        sections += content(run)
+    record = read_json(run, "run.json") or {}
+    document = read_json(run, "reproduce.json")
+    sections = reproduction(document, run, _nested, _curves_of) if document else []
+    sections += content(run)
     if not sections:
         raise ConfigError(f"{run}: {_NOTHING}; give a run folder that 'uuv eval', 'uuv train' or 'uuv sweep' printed")
     title = str(document["title"]) if document else run.resolve().name
@@ -87,7 +113,7 @@ def _of_trainings(runs: list[Path]) -> Page:
     for run in runs:
         if not (run / "metrics.jsonl").exists():
             raise ConfigError(f"{run}: is no training (no metrics.jsonl); several folders can be reported together if all are trainings")
-    closing = [block for run in runs for block in (Heading(run.name), *provenance(read_json(run / "run.json") or {}), *config_text(run))]
+    closing = [block for run in runs for block in (Heading(run.name), *provenance(read_json(run, "run.json") or {}), *config_text(run))]
     return Page(f"{len(runs)} trainings", "", [], [Section("Training", _curves_of(runs)), Section("Where this comes from", closing)])
 
 
@@ -97,13 +123,13 @@ def _subtitle(record: dict[str, Any]) -> str:
 
 def content(run: Path) -> list[Section]:
     """Sections of whatever a run folder holds."""
-    command = command_of(read_json(run / "run.json") or {})
-    result = read_json(run / "eval" / "result.json")
+    command = command_of(read_json(run, "run.json") or {})
+    result = read_json(run, "eval/result.json")
     found = [
         Section("Evaluation", evaluation(result, command) if result else []),
-        Section("Sweep", sweep(document, command) if (document := read_json(run / "sweep.json")) else []),
+        Section("Sweep", sweep(document, command) if (document := read_json(run, "sweep.json")) else []),
         Section("Training", _curves_of([run]) if (run / "metrics.jsonl").exists() else []),
-        Section("Time", timing(document, command) if (document := read_json(run / "profile.json")) else []),
+        Section("Time", timing(document, command) if (document := read_json(run, "profile.json")) else []),
         Section("Episodes", media(run, result)),
     ]
     return [section for section in found if section.blocks]
@@ -119,16 +145,16 @@ def _nested(run: Path) -> list[Block]:
 
 
 def _curves_of(runs: list[Path]) -> list[Block]:
-    commands = [command_of(read_json(run / "run.json") or {}) for run in runs]
+    commands = [command_of(read_json(run, "run.json") or {}) for run in runs]
     trainings = [_training_of(run) for run in runs]
     return training(trainings, "\n".join(command for command in commands if command))
 
 
 def _training_of(run: Path) -> Training:
-    argv = [str(word) for word in (read_json(run / "run.json") or {}).get("argv", [])]
+    argv = [str(word) for word in (read_json(run, "run.json") or {}).get("argv", [])]
     after = argv[argv.index("train") + 1 :] if "train" in argv else []
     preset = Path(after[0]).stem if after and not after[0].startswith("-") else ""
-    return Training(run.resolve().name, read_text(run / "config.yaml") or "", read_lines(run / "metrics.jsonl"), preset)
+    return Training(run.resolve().name, read_config(run) or "", read_lines(run, "metrics.jsonl"), preset)
 
 
 @contextmanager
@@ -136,6 +162,8 @@ def _told(run: Path) -> Iterator[None]:
     """A document that lacks what its schema promises is told as such, with the folder that it lies in."""
     try:
         yield
-    except (KeyError, TypeError, AttributeError, IndexError) as error:
+    except UserError:
+        raise
+    except (ArithmeticError, AssertionError, AttributeError, LookupError, RecursionError, SyntaxError, TypeError, ValueError) as error:
         what = f"{type(error).__name__}: {error}"
         raise ConfigError(f"{run}: a result file there is not as this version writes it ({what}); make the run again") from error

@@ -2,49 +2,73 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
+from uuvtai import files
+from uuvtai.files import FileError, parsed_json
+from uuvtai.loader import MAX_BYTES as MAX_YAML_BYTES
 from uuvtai.loader import ConfigError
 
+_MAX_LINES = 1_000_000
 
-def read_json(path: Path) -> dict[str, Any] | None:
-    """The document, or None where there is no such file. Raises ConfigError for one that is no JSON object."""
+
+def read_json(run: Path, name: str) -> dict[str, Any] | None:
+    """The document ``name`` of a run folder, or None where there is no such file. Raises ConfigError for one that is no JSON object."""
+    path = run / name
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+        document = files.read_json(path, folder=run)
+    except (FileNotFoundError, NotADirectoryError):
         return None
+    except FileError as error:
+        raise ConfigError(f"{error}; write it again with the command in run.json") from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
-    except ValueError as error:
-        raise ConfigError(f"{path}: is not valid JSON ({error}); write it again with the command in run.json") from None
     if not isinstance(document, dict):
         raise ConfigError(f"{path}: is no JSON object; write it again with the command in run.json")
     return document
 
 
-def read_lines(path: Path) -> list[dict[str, Any]]:
+def read_lines(run: Path, name: str) -> list[dict[str, Any]]:
     """Objects of a JSONL file, [] where there is none; a last line that a kill cut off is left out. Raises ConfigError."""
+    path, found, damaged = run / name, [], 0
     try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+        for i, line in enumerate(files.read_lines(path, files.MAX_JSON_BYTES, run), start=1):
+            if damaged or i > _MAX_LINES:
+                why = "is no JSON object; take that line out to go on without it" if damaged else f"is one of more than {_MAX_LINES:,}"
+                raise ConfigError(f"{path}, line {damaged or i}: {why}")
+            row = _object(line)
+            if row is None:
+                damaged = i
+            else:
+                found.append(row)
     except FileNotFoundError:
         return []
+    except FileError as error:
+        raise ConfigError(str(error)) from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
-    found = []
-    for i, line in enumerate(lines, start=1):
-        try:
-            found.append(dict(json.loads(line)))
-        except (ValueError, TypeError):
-            if i < len(lines):
-                raise ConfigError(f"{path}, line {i}: is no JSON object; take that line out to go on without it") from None
     return found
 
 
-def read_text(path: Path) -> str | None:
-    """Text of a file, or None where there is none."""
+def _object(line: bytes) -> dict[str, Any] | None:
     try:
-        return path.read_text(encoding="utf-8", errors="replace")
-    except OSError:
+        row = parsed_json(line, "a line")
+    except FileError:
         return None
+    if not isinstance(row, dict):
+        return None
+    return {key: value for key, value in row.items() if not isinstance(value, list | dict)}  # a record of figures
+
+
+def read_config(run: Path) -> str | None:
+    """Text of config.yaml, or None where there is none. Raises ConfigError for what is no small text."""
+    path = run / "config.yaml"
+    try:
+        return files.read_text(path, MAX_YAML_BYTES, run)
+    except FileNotFoundError:
+        return None
+    except FileError as error:
+        raise ConfigError(str(error)) from None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
-import yaml
-
-from uuvtai.loader import ConfigError
+from uuvtai.loader import parsed_yaml
 from uuvtai.measure.statistics import wilson_interval
 from uuvtai.report.blocks import Block, Data, Figure, Prose, Table
 from uuvtai.report.figures import Line, curves
@@ -75,16 +75,20 @@ def grouped(runs: Sequence[Training]) -> list[MethodRuns]:
 
 
 def _config_of(run: Training) -> dict[str, Any]:
-    try:
-        config = yaml.safe_load(run.config)
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{run.name}/config.yaml: is not valid YAML ({error})") from None
+    """Raises ConfigError."""
+    return _parsed(run.config, f"{run.name}/config.yaml")
+
+
+@lru_cache(maxsize=64)
+def _parsed(text: str, where: str) -> dict[str, Any]:
+    config = parsed_yaml(text, where)
     return config if isinstance(config, dict) else {}
 
 
 def _without_seed(run: Training) -> str:
     config = _config_of(run)
-    return yaml.safe_dump(config | {"train": {key: value for key, value in _section(config).items() if key != "seed"}})
+    alike = config | {"train": {key: value for key, value in _section(config).items() if key != "seed"}}
+    return json.dumps(alike, sort_keys=True, default=str)
 
 
 def _section(config: dict[str, Any]) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from uuvtai.files import read_bytes
 from uuvtai.report.blocks import Block, Gallery, Heading, Media
 from uuvtai.report.wording import megabytes, number
 
@@ -61,12 +62,12 @@ def _gallery(folder: Path, shown: Iterable[_Shown], mime: str, budget: int) -> G
     """As many files as the budget holds, in order; what is too big is named."""
     items, left_out = [], []
     for one in shown:
-        size = one.path.stat().st_size
+        size = one.path.lstat().st_size
         if size > budget:
             left_out.append(f"{one.path.relative_to(folder)} ({megabytes(size)})")
             continue
         budget -= size
-        items.append(Media(mime, one.path.read_bytes(), _caption(one)))
+        items.append(Media(mime, read_bytes(one.path, size, folder), _caption(one)))
     note = f"Left out to keep this page small, to be found in the run folder: {', '.join(left_out)}." if left_out else ""
     return Gallery(items, note)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from uuvtai.report.blocks import Block, Code, Facts, Notice, Table
-from uuvtai.report.files import read_json, read_text
+from uuvtai.report.files import read_config, read_json
 from uuvtai.report.wording import number
 
 
@@ -46,7 +46,7 @@ def provenance(record: dict[str, Any]) -> list[Block]:
 
 def config_text(folder: Path) -> list[Block]:
     """config.yaml, folded away."""
-    text = read_text(folder / "config.yaml")
+    text = read_config(folder)
     return [] if text is None else [Code("config.yaml", text)]
 
 
@@ -54,7 +54,7 @@ def checkpoints(folder: Path) -> list[Block]:
     """Table of the checkpoints that are kept."""
     rows = []
     for path in sorted((folder / "checkpoints").glob("*/manifest.json")):
-        manifest = read_json(path) or {}
+        manifest = read_json(folder, str(path.relative_to(folder))) or {}
         files = manifest.get("files", {})
         digest = (files.get("model.safetensors") or {}).get("sha256", "-")
         rows.append([path.parent.name, str(manifest.get("step", "-")), number(manifest.get("score"), 3), str(digest)[:16]])

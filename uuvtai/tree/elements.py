@@ -11,6 +11,8 @@ from uuvtai.loader import ConfigError
 MAX_BYTES = 1 << 20
 """of a tree's file"""
 _MAX_DEPTH = 64
+_ENCODINGS = (None, "utf-8", "us-ascii", "iso-8859-1", "utf-16")
+"""that the parser itself knows; for others it would ask Python, which knows some that are no character sets"""
 _MAX_WORD = 1000
 """characters of a name or an attribute: looking for the nearest known name takes the square of it"""
 
@@ -47,10 +49,15 @@ def read_elements(text: bytes, source: str) -> Element:
     def refuse(*_: object) -> NoReturn:
         raise TreeError(f"{source}:{parser.CurrentLineNumber}: DTDs and entities are not allowed in a tree")
 
+    def declared(_version: str, encoding: str | None, _standalone: int) -> None:
+        if (encoding.lower() if encoding else None) not in _ENCODINGS:
+            raise TreeError(f"{source}:1: the encoding {encoding!r:.40} is not read; save the tree as UTF-8")
+
     def words(data: str) -> None:
         if data.strip() and not _described(stack):
             raise TreeError(f"{source}:{parser.CurrentLineNumber}: text {data.strip()[:20]!r} inside <{stack[-1].tag}>")
 
+    parser.XmlDeclHandler = declared
     parser.StartElementHandler = begin
     parser.EndElementHandler = lambda _: stack.pop()
     parser.CharacterDataHandler = words

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,6 +33,8 @@ class FlatTree:
     param: tuple[tuple[float, ...], ...]
     source: str = ""
     """file it was read from"""
+    xml: bytes = field(default=b"", compare=False, repr=False)
+    """what was read: a run keeps the tree that drove, whatever becomes of the file meanwhile"""
 
     @property
     def depth(self) -> tuple[int, ...]:

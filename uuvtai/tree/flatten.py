@@ -5,9 +5,12 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import NoReturn
 
 from uuvtai import tree_codes as codes
+from uuvtai.files import FileError, read_bytes
 from uuvtai.loader import preset_path
 from uuvtai.tree.elements import MAX_BYTES, Element, TreeError, read_elements
 from uuvtai.tree.flat import UNSET, FlatTree
@@ -18,10 +21,15 @@ _WRAPPERS = ("Action", "Condition", "Control", "Decorator")
 
 def read_tree(name: str, max_node: int = 64) -> FlatTree:
     """Tree of a preset (straight, planner, bt) or of an XML file. Raises TreeError, or ConfigError for an unknown name."""
-    path = preset_path("tree", name)
+    return read_tree_file(preset_path("tree", name), max_node)
+
+
+def read_tree_file(path: Path, max_node: int = 64, folder: Path | None = None) -> FlatTree:
+    """Tree of an XML file, which must lie below ``folder`` if one is given. Raises TreeError."""
     try:
-        with path.open("rb") as file:
-            text = file.read(MAX_BYTES + 1)  # one more is refused
+        text = read_bytes(path, MAX_BYTES, folder)
+    except FileError as error:
+        raise TreeError(str(error)) from None
     except OSError as error:
         raise TreeError(f"{path}: cannot be read: {error.strerror}") from None
     return parse_tree(text, str(path), max_node)
@@ -29,7 +37,8 @@ def read_tree(name: str, max_node: int = 64) -> FlatTree:
 
 def parse_tree(text: bytes | str, source: str = "tree", max_node: int = 64) -> FlatTree:
     """Flat arrays of BehaviorTree.CPP format 4 XML. Raises TreeError."""
-    return _Flattener(read_elements(text.encode() if isinstance(text, str) else text, source), source, max_node).flat()
+    xml = text.encode() if isinstance(text, str) else text
+    return replace(_Flattener(read_elements(xml, source), source, max_node).flat(), xml=xml)
 
 
 class _Flattener:

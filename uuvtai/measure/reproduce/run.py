@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from collections.abc import Sequence
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from uuvtai.errors import SettingError
+from uuvtai.files import FileError, read_json
 from uuvtai.loader import load_config, preset_names
 from uuvtai.measure.reproduce import claims, paper
 from uuvtai.measure.reproduce.markdown import results_page
@@ -31,28 +31,40 @@ def reproduce(budget: str, run_dir: Path | None, watch: Watch) -> tuple[dict[str
     """Begin a reproduction: its document and its folder. Raises ValueError for an unknown budget, RunFolderError."""
     if budget not in BUDGETS:
         raise SettingError(f"--budget {budget!r}: {' or '.join(BUDGETS)}")
+    refuse_place(run_dir)
     root = (run_dir or default_run_dir(f"reproduce-{budget}")).absolute()
-    refuse_place(root)
     folder = RunFolder(root, load_config("pool"), [EVALUATION_SEED])
-    folder.hold()
-    folder.write_json(REQUEST, {"schema": 1, "budget": budget, "policy": "best" if "best" in preset_names("policy") else None})
-    return _run(folder, watch), root
+    request = {"schema": 1, "budget": budget, "policy": "best" if "best" in preset_names("policy") else None}
+    folder.write_json(REQUEST, request)
+    return _run(folder, request, watch), root
 
 
 def resume(place: Path, watch: Watch) -> tuple[dict[str, Any], Path]:
     """Go on with a reproduction that was killed or interrupted; finished steps stay as they are. Raises RunFolderError."""
+    root = place.absolute()
+    folder = RunFolder.held(root, "uuv reproduce")
     try:
-        request = json.loads((place / REQUEST).read_text(encoding="utf-8"))
-        known = request["budget"] in BUDGETS and "policy" in request
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise RunFolderError(f"{place / REQUEST}: cannot be read ({error}); give the folder that 'uuv reproduce' printed") from None
+        request = _request(root)
+        folder.go_on({})
+        return _run(folder, request, watch), root
+    finally:
+        folder.release()
+
+
+def _request(root: Path) -> dict[str, Any]:
+    """What a reproduction that was begun had been asked for. Raises RunFolderError."""
+    file = root / REQUEST
+    try:
+        request = read_json(file, folder=root)
+        known = request["budget"] in BUDGETS and isinstance(request["policy"], str | None)
+    except (FileError, OSError, KeyError, TypeError) as error:
+        raise RunFolderError(f"{file}: cannot be read ({error}); give the folder that 'uuv reproduce' printed") from None
     if not known:
-        raise RunFolderError(f"{place / REQUEST}: no budget of this version; begin a new reproduction")
-    return _run(RunFolder.reopen(place.absolute(), {}), watch), place.absolute()
+        raise RunFolderError(f"{file}: no budget of this version; begin a new reproduction")
+    return request
 
 
-def _run(folder: RunFolder, watch: Watch) -> dict[str, Any]:
-    request = json.loads((folder.path / REQUEST).read_text(encoding="utf-8"))
+def _run(folder: RunFolder, request: dict[str, Any], watch: Watch) -> dict[str, Any]:
     steps = steps_of(BUDGETS[request["budget"]], request["policy"], folder.path)
     try:
         with folder.recorded():
@@ -83,8 +95,8 @@ def _step(step: Step, name: str, folder: RunFolder, watch: Watch) -> None:
 
 def document_of(root: Path, request: dict[str, Any], steps: Sequence[Step]) -> dict[str, Any]:
     """The ``uuv reproduce --json`` document: results of every step by its folder, and the verdicts."""
-    results = {step.folder: json.loads(result_file(step, root).read_text(encoding="utf-8")) for step in steps}
-    record = json.loads((root / "run.json").read_text(encoding="utf-8"))
+    results = {step.folder: read_json(result_file(step, root), folder=root) for step in steps}
+    record = read_json(root / "run.json", folder=root)
     budget = BUDGETS[request["budget"]]
     by_preset = _by_preset(results["eval/main"], budget)
     document = {

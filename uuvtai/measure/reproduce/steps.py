@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import json
 import os
 import shutil
 import signal
@@ -12,6 +11,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from uuvtai.files import FileError, read_json
 from uuvtai.run_folder import RunFolderError, write_atomic
 
 TRAINED = ("ppo", "distill_20", "curriculum", "no_risk_scaling", "no_world_model")
@@ -130,8 +130,8 @@ def is_done(step: Step, root: Path) -> bool:
     if step.to_file:
         return result_file(step, root).exists()
     try:
-        return json.loads((root / step.folder / "run.json").read_text(encoding="utf-8"))["status"] == "finished"
-    except (OSError, ValueError, KeyError):
+        return read_json(root / step.folder / "run.json", folder=root)["status"] == "finished"
+    except (FileError, OSError, KeyError, TypeError):
         return False
 
 

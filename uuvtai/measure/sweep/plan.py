@@ -11,7 +11,7 @@ from typing import Any
 
 from uuvtai.config import Config
 from uuvtai.loader import ConfigError, load_config
-from uuvtai.measure.sweep.grid import PRESET_AXES, SCENE_AXES, Cell, Grid
+from uuvtai.measure.sweep.grid import PRESET_AXES, SCENE_AXES, Cell, Grid, checked
 from uuvtai.measure.sweep.tasks import Row, Task
 
 BATCH = 256
@@ -46,12 +46,32 @@ class SweepRequest:
 
 
 def request_of(document: dict[str, Any]) -> SweepRequest:
-    """The request that ``document`` came from. Raises KeyError or TypeError for another document."""
-    grid = Grid({name: tuple(values) for name, values in document["grid"]["axes"].items()}, document["grid"]["one_at_a_time"])
+    """The request that ``document`` came from. Raises KeyError or TypeError for another document, ConfigError for another grid."""
+    one_at_a_time, axes = document["grid"]["one_at_a_time"], document["grid"]["axes"]
+    grid = checked(Grid({name: tuple(values) for name, values in axes.items()}, _typed(one_at_a_time, bool)))
     lists = {name: tuple(document[name]) for name in ("controllers", "policies", "seeds")}
     overrides = tuple(item if isinstance(item, str) else tuple(item) for item in document["overrides"])
-    rest = {name: document[name] for name in ("world", "sensors", "vehicle", "episodes", "num_envs", "device")}
+    rest = {name: _typed(document[name], of) for name, of in _TYPES.items()}
+    for name, values in lists.items():
+        for value in values:
+            _typed(value, int if name == "seeds" else str)
     return SweepRequest(grid=grid, overrides=overrides, **lists, **rest)
+
+
+_TYPES: dict[str, Any] = {
+    "world": str,
+    "sensors": str | None,
+    "vehicle": str | None,
+    "episodes": int,
+    "num_envs": int | None,
+    "device": str,
+}
+
+
+def _typed(value: Any, of: Any) -> Any:
+    if not isinstance(value, of) or (isinstance(value, bool) and of is not bool):
+        raise TypeError(f"{value!r:.80} is no {of}")
+    return value
 
 
 def base_config(request: SweepRequest, cell: Cell | None = None) -> Config:

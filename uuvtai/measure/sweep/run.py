@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
+from uuvtai.files import FileError, open_to_append, parsed_json, read_json, read_lines, truncate
 from uuvtai.measure.sweep.engines import Engine
 from uuvtai.measure.sweep.grid import Grid
 from uuvtai.measure.sweep.plan import SweepRequest, base_config, check_rows, ordered, request_of, row_key, tasks_of, unchanged
@@ -35,28 +36,39 @@ def sweep(request: SweepRequest, engine: Engine, run_dir: Path | None, watch: Wa
 
     Raises ConfigError, CheckpointError, RunFolderError, EngineError.
     """
-    place = run_dir or default_run_dir(f"sweep-{Path(request.world).stem}")
-    refuse_place(place)
+    refuse_place(run_dir)
     request, methods, checkpoints = resolved(request, watch)
     keys = check_rows(request, [name for name, _controller, _policy in methods])
+    place = run_dir or default_run_dir(f"sweep-{Path(request.world).stem}")
     folder = RunFolder(place, base_config(request), list(request.seeds))
-    folder.hold()
     folder.write_json(REQUEST, {"schema": 1, **request.document(), "methods": methods, "checkpoints": checkpoints})
     return _play(request, methods, keys, engine, folder, watch), folder.path
 
 
 def resume(place: Path, engine: Engine, watch: Watch) -> tuple[dict[str, Any], Path]:
     """Go on with a sweep that was killed or interrupted: rows that are finished stay as they are. Raises RunFolderError."""
+    folder = RunFolder.held(place, "uuv sweep")
     try:
-        document = json.loads((place / REQUEST).read_text(encoding="utf-8"))
-        request, methods = request_of(document), [tuple(method) for method in document["methods"]]
-        checkpoints = dict(document["checkpoints"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise RunFolderError(f"{place / REQUEST}: cannot be read ({error}); give the folder that 'uuv sweep' printed") from None
-    _refuse_other_policies(place, request, checkpoints, watch)
-    folder = RunFolder.reopen(place, {"rows": len(read_rows(place / ROWS))})
-    keys = check_rows(request, [name for name, _controller, _policy in methods])
-    return _play(request, methods, keys, engine, folder, watch), place
+        try:
+            document = read_json(place / REQUEST, folder=place)
+            request, methods = request_of(document), [_method_key(method) for method in document["methods"]]
+            checkpoints = dict(document["checkpoints"])
+        except (FileError, OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise RunFolderError(f"{place / REQUEST}: cannot be read ({error}); give the folder that 'uuv sweep' printed") from None
+        _refuse_other_policies(place, request, checkpoints, watch)
+        keys = check_rows(request, [name for name, _controller, _policy in methods])
+        folder.go_on({"rows": len(read_rows(place))})
+        return _play(request, methods, keys, engine, folder, watch), place
+    finally:
+        folder.release()
+
+
+def _method_key(given: Any) -> MethodKey:
+    """Of a request on disk. Raises TypeError, ValueError."""
+    name, controller, policy = given
+    if not isinstance(name, str) or not all(isinstance(one, str | None) for one in (controller, policy)):
+        raise TypeError(f"{given!r:.80} is no method")
+    return name, controller, policy
 
 
 def _refuse_other_policies(place: Path, request: SweepRequest, checkpoints: dict[str, str], watch: Watch) -> None:
@@ -92,14 +104,14 @@ def resolved(request: SweepRequest, watch: Watch) -> tuple[SweepRequest, list[Me
 def _play(
     request: SweepRequest, methods: Sequence[MethodKey], keys: list[str], engine: Engine, folder: RunFolder, watch: Watch
 ) -> dict[str, Any]:
-    rows = {row_key(_label(row, request.grid), row["method"]): row for row in read_rows(folder.path / ROWS)}
+    rows = _by_key(folder.path, request.grid)
     tasks = tasks_of(request, methods, set(rows))
     watch.start(f"{len(keys)} cells", len(keys), len(rows))
     try:
         with folder.recorded():
             for number, played in engine.run(play, tasks):
                 for row in played:
-                    append_row(folder.path / ROWS, row)
+                    append_row(folder.path, row)
                     rows[row_key(_label(row, request.grid), row["method"])] = row
                 watch.note(f"{_told(tasks[number].labels[0])} .. {_told(tasks[number].labels[-1])}: done")
                 watch.update(len(rows), len(keys), 0)
@@ -111,6 +123,14 @@ def _play(
         raise
     finally:
         watch.stop()
+
+
+def _by_key(place: Path, grid: Grid) -> dict[str, Row]:
+    """Rows that are finished. Raises RunFolderError for rows of another grid."""
+    try:
+        return {row_key(_label(row, grid), row["method"]): row for row in read_rows(place)}
+    except (KeyError, TypeError) as error:
+        raise RunFolderError(f"{place / ROWS}: holds a row that is not of this sweep ({error!r}); take it out to go on") from None
 
 
 def _label(row: Row, grid: Grid) -> dict[str, Any]:
@@ -139,29 +159,36 @@ def _document(request: SweepRequest, rows: list[Row]) -> dict[str, Any]:
 # ------------------------------------------------------------------------------------------------------------------- file
 
 
-def append_row(path: Path, row: Row) -> None:
-    """Add a row and see it on the disk."""
-    with path.open("a", encoding="utf-8") as stream:
-        stream.write(json.dumps(row, allow_nan=False) + "\n")
+def append_row(place: Path, row: Row) -> None:
+    """Add a row to a run folder that is held, and see it on the disk."""
+    with open_to_append(place / ROWS, place) as stream:
+        stream.write(json.dumps(row, allow_nan=False).encode() + b"\n")
         stream.flush()
         os.fsync(stream.fileno())
 
 
-def read_rows(path: Path) -> list[Row]:
-    """Rows written so far; a last line that a kill cut off is removed from the file, so that the next row begins a line of its own."""
+def read_rows(place: Path) -> list[Row]:
+    """Rows written so far in a run folder that is held.
+
+    A last line that a kill cut off is removed from the file, so that the next row begins a line of its own.
+    """
+    path = place / ROWS
     if not path.exists():
         return []
-    lines = path.read_bytes().splitlines(keepends=True)
-    rows = [row for line in lines if (row := _row(line)) is not None]
-    if lines and _row(lines[-1]) is None:
-        with path.open("r+b") as stream:
-            stream.truncate(sum(len(line) for line in lines[:-1]))
+    rows: list[Row] = []
+    whole, last, row = 0, 0, None
+    for line in read_lines(path, folder=place):
+        row = _row(line)
+        rows += [] if row is None else [row]
+        whole, last = whole + len(line), len(line)
+    if row is None and whole:
+        truncate(path, whole - last, place)
     return rows
 
 
 def _row(line: bytes) -> Row | None:
     try:
-        row = json.loads(line)
-    except ValueError:
+        row = parsed_json(line, ROWS)
+    except FileError:
         return None
     return row if line.endswith(b"\n") and isinstance(row, dict) else None
