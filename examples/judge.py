@@ -1,6 +1,7 @@
 """What the training examples share: the same episodes before and after training, a table of what came out, and the learning curve.
 
-``python examples/train_sb3.py --curve sb3.csv`` keeps the return of every training episode;
+``python examples/train_sb3.py --out runs/sb3`` saves the policy there, reads it back and plays it; ``--play runs/sb3`` plays it again.
+``--curve sb3.csv`` keeps the return of every training episode;
 ``python examples/judge.py sb3.csv skrl.csv curves.png`` draws such files.
 """
 
@@ -19,6 +20,7 @@ import numpy as np
 import uuvtai
 from uuvtai.gym import UuvVectorEnv
 from uuvtai.measure.statistics import wilson_interval
+from uuvtai.run_folder import default_run_dir, refuse_place
 from uuvtai.sim import Sim
 
 HOLD_STEPS = 10
@@ -67,30 +69,47 @@ def judge(sim: Sim, act: Act, seed: int = 1000) -> tuple[np.ndarray, int]:
     return returns, int(won.sum())
 
 
-def main(train: Callable[[Sim, int], Act], iterations: int) -> None:
-    """Train from the command line; judges before (0 iterations) and after."""
+Train = Callable[[Sim, int, Path | None], Act]
+"""(simulator, iterations, where to save) -> the policy"""
+Play = Callable[[Sim, Path], Act]
+"""(simulator, where it was saved) -> the policy"""
+
+
+def main(train: Train, play: Play, iterations: int, arguments: list[str] | None = None, sim: Sim | None = None) -> None:
+    """From the command line: judge the untrained policy, train and save it, read it back and judge it; or only the last.
+
+    ``sim`` is one that is there already, in place of ``--world`` and ``--num-envs``.
+    """
     parser = argparse.ArgumentParser()
     parser.add_argument("--world", default="pool")
     parser.add_argument("--num-envs", type=int, default=64)
     parser.add_argument("--iterations", type=int, default=iterations)
     parser.add_argument("--curve", type=Path, help="CSV file for the return of every training episode")
-    given = parser.parse_args()
-    sim = uuvtai.make(given.world, num_envs=given.num_envs).sim
-    for name, count in (("before", 0), ("after", given.iterations)):
+    parser.add_argument("--out", type=Path, help="new folder for what was learnt [default: runs/TIME_EXAMPLE]")
+    parser.add_argument("--play", type=Path, metavar="FOLDER", help="train nothing: play what was saved there")
+    given = parser.parse_args(arguments)
+    out = given.play or given.out or default_run_dir(train.__module__ if train.__module__ != "__main__" else Path(sys.argv[0]).stem)
+    if not given.play:
+        refuse_place(out)
+    sim = sim or uuvtai.make(given.world, num_envs=given.num_envs).sim
+    if not given.play:
+        print(f"before {told(sim, train(sim, 0, None))}", flush=True)
         begun = time.perf_counter()
-        act = train(sim, count)
-        wall_s = time.perf_counter() - begun
-        returns, won = judge(sim, act)
-        low, high = wilson_interval(won, len(returns)) or (0.0, 1.0)
-        error = returns.std(ddof=1) / np.sqrt(len(returns))
-        print(
-            f"{name:6} {count:4} iterations, {wall_s:4.0f} s: return {returns.mean():6.1f} +- {error:.1f}, "
-            f"success {won}/{len(returns)} ({100 * low:.0f} .. {100 * high:.0f} %)",
-            flush=True,
-        )
-    if given.curve:
+        out.mkdir(parents=True, exist_ok=True)
+        train(sim, given.iterations, out)
+        print(f"{given.iterations} iterations, {time.perf_counter() - begun:.0f} s, saved in {out}", flush=True)
+    if given.curve and watched:
         with given.curve.open("w", newline="") as file:
             csv.writer(file).writerows([("decisions", "return"), *watched[-1].curve])
+    print(f"played {told(sim, play(sim, out))}")
+
+
+def told(sim: Sim, act: Act) -> str:
+    """Mean return and success of one episode per env."""
+    returns, won = judge(sim, act)
+    low, high = wilson_interval(won, len(returns)) or (0.0, 1.0)
+    error = returns.std(ddof=1) / np.sqrt(len(returns))
+    return f"return {returns.mean():6.1f} +- {error:.1f}, success {won}/{len(returns)} ({100 * low:.0f} .. {100 * high:.0f} %)"
 
 
 def draw(files: list[Path], target: Path) -> None:

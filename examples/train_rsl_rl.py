@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 from copy import deepcopy
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -33,13 +34,39 @@ CONFIG = {
 }
 
 
-def train(sim: Sim, iterations: int) -> Act:
-    """The policy after so many rollouts and updates; observations are scaled inside the network."""
+@contextlib.contextmanager
+def quiet():
+    """It prints every layer and iteration."""
+    with open(os.devnull, "w") as nothing, contextlib.redirect_stdout(nothing):
+        yield
+
+
+def make(sim: Sim) -> OnPolicyRunner:
+    """What trains an untrained policy; observations are scaled inside the network."""
     torch.manual_seed(0)
     envs = RslRlVecEnv(Watched(sim=sim, hold_steps=HOLD_STEPS, backend="torch"), seed=0)
-    with open(os.devnull, "w") as nothing, contextlib.redirect_stdout(nothing):  # it prints every layer and iteration
-        runner = OnPolicyRunner(envs, deepcopy(CONFIG), device=str(envs.device))
+    with quiet():
+        return OnPolicyRunner(envs, deepcopy(CONFIG), device=str(envs.device))
+
+
+def train(sim: Sim, iterations: int, out: Path | None = None) -> Act:
+    """The policy after so many rollouts and updates, saved in ``out``."""
+    runner = make(sim)
+    with quiet():
         runner.learn(iterations)
+    if out:
+        runner.save(str(out / "model.pt"))
+    return _acting(runner)
+
+
+def play(sim: Sim, folder: Path) -> Act:
+    """The policy that ``train`` saved."""
+    runner = make(sim)
+    runner.load(str(folder / "model.pt"))
+    return _acting(runner)
+
+
+def _acting(runner: OnPolicyRunner) -> Act:
     policy = runner.get_inference_policy()
 
     def act(obs: np.ndarray) -> np.ndarray:
@@ -50,4 +77,4 @@ def train(sim: Sim, iterations: int) -> Act:
 
 
 if __name__ == "__main__":
-    main(train, iterations=40)
+    main(train, play, iterations=40)

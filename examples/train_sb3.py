@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from judge import HOLD_STEPS, Act, Watched, main
 from stable_baselines3 import PPO
@@ -13,8 +15,8 @@ from uuvtai.sim import Sim
 ROLLOUT_STEPS = 64
 
 
-def train(sim: Sim, iterations: int) -> Act:
-    """The policy after so many rollouts and updates; observations and rewards are scaled by SB3's own wrapper."""
+def train(sim: Sim, iterations: int, out: Path | None = None) -> Act:
+    """The policy after so many rollouts and updates, saved in ``out``; observations and rewards are scaled by SB3's own wrapper."""
     envs = VecNormalize(Sb3VecEnv(Watched(sim=sim, hold_steps=HOLD_STEPS)), gamma=0.99)
     model = PPO(
         "MlpPolicy",
@@ -30,7 +32,19 @@ def train(sim: Sim, iterations: int) -> Act:
     )
     if iterations:
         model.learn(iterations * ROLLOUT_STEPS * envs.num_envs)
+    if out:
+        model.save(out / "model.zip")
+        envs.save(str(out / "scales.pkl"))
+    return _acting(model, envs)
 
+
+def play(sim: Sim, folder: Path) -> Act:
+    """The policy that ``train`` saved. SB3 unpickles both files: load your own only."""
+    envs = VecNormalize.load(str(folder / "scales.pkl"), Sb3VecEnv(Watched(sim=sim, hold_steps=HOLD_STEPS)))
+    return _acting(PPO.load(folder / "model.zip", device="cpu"), envs)
+
+
+def _acting(model: PPO, envs: VecNormalize) -> Act:
     def act(obs: np.ndarray) -> np.ndarray:
         return model.predict(np.asarray(envs.normalize_obs(obs)), deterministic=True)[0]
 
@@ -38,4 +52,4 @@ def train(sim: Sim, iterations: int) -> Act:
 
 
 if __name__ == "__main__":
-    main(train, iterations=40)
+    main(train, play, iterations=40)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import torch
 from judge import HOLD_STEPS, Act, Watched, main
@@ -52,8 +54,8 @@ class Value(DeterministicMixin, Model):
         return self.net(inputs["observations"]), {}
 
 
-def train(sim: Sim, iterations: int) -> Act:
-    """The policy after so many rollouts and updates; observations and values are scaled by skrl's own preprocessors."""
+def make(sim: Sim):
+    """(envs, untrained agent); observations and values are scaled by skrl's own preprocessors."""
     set_seed(0)
     envs = wrap_env(Watched(sim=sim, hold_steps=HOLD_STEPS), wrapper="gymnasium", verbose=False)
     spaces = {"observation_space": envs.observation_space, "action_space": envs.action_space, "device": envs.device}
@@ -64,10 +66,27 @@ def train(sim: Sim, iterations: int) -> Act:
         experiment={"write_interval": 0, "checkpoint_interval": 0},
     )  # fmt: skip
     memory = RandomMemory(memory_size=ROLLOUT_STEPS, num_envs=envs.num_envs, device=envs.device)
-    agent = PPO(models={"policy": Policy(**spaces), "value": Value(**spaces)}, memory=memory, cfg=config, **spaces)
+    return envs, PPO(models={"policy": Policy(**spaces), "value": Value(**spaces)}, memory=memory, cfg=config, **spaces)
+
+
+def train(sim: Sim, iterations: int, out: Path | None = None) -> Act:
+    """The policy after so many rollouts and updates, saved in ``out``."""
+    envs, agent = make(sim)
     quiet = {"headless": True, "disable_progressbar": True, "close_environment_at_exit": False}
     SequentialTrainer(env=envs, agents=agent, cfg={"timesteps": iterations * ROLLOUT_STEPS, **quiet}).train()
+    if out:
+        agent.save(str(out / "agent.pt"))
+    return _acting(agent)
 
+
+def play(sim: Sim, folder: Path) -> Act:
+    """The policy that ``train`` saved."""
+    _envs, agent = make(sim)
+    agent.load(str(folder / "agent.pt"))
+    return _acting(agent)
+
+
+def _acting(agent: PPO) -> Act:
     def act(obs: np.ndarray) -> np.ndarray:
         with torch.no_grad():
             return agent.act(torch.from_numpy(obs), None, timestep=0, timesteps=0)[1]["mean_actions"].numpy()
@@ -76,4 +95,4 @@ def train(sim: Sim, iterations: int) -> Act:
 
 
 if __name__ == "__main__":
-    main(train, iterations=40)
+    main(train, play, iterations=40)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import torch
 from judge import HOLD_STEPS, Act, Watched, main
@@ -24,14 +26,19 @@ def network(inputs: int, outputs: int) -> nn.Sequential:
     return nn.Sequential(nn.Linear(inputs, 64), nn.Tanh(), nn.Linear(64, 64), nn.Tanh(), nn.Linear(64, outputs))
 
 
-def train(sim: Sim, iterations: int) -> Act:
-    """The policy after so many rollouts and updates; observations are scaled by TorchRL's own transform."""
+def policy(inputs: int, outputs: int) -> nn.Sequential:
+    """Mean and spread of the actions."""
+    return nn.Sequential(network(inputs, 2 * outputs), NormalParamExtractor("biased_softplus_0.5"))
+
+
+def train(sim: Sim, iterations: int, out: Path | None = None) -> Act:
+    """The policy after so many rollouts and updates, saved in ``out``; observations are scaled by TorchRL's own transform."""
     torch.manual_seed(0)
     norm = VecNormV2(["observation"], decay=1.0, reduce_batch_dims=True)
     envs = TransformedEnv(GymWrapper(Watched(sim=sim, hold_steps=HOLD_STEPS, autoreset_mode="Disabled")), norm)
     envs.set_seed(0)
     n_obs, n_act = envs.observation_spec["observation"].shape[-1], envs.action_spec.shape[-1]
-    spread = nn.Sequential(network(n_obs, 2 * n_act), NormalParamExtractor("biased_softplus_0.5"))
+    spread = policy(n_obs, n_act)
     actor = ProbabilisticActor(
         TensorDictModule(spread, ["observation"], ["loc", "scale"]),
         ["loc", "scale"],
@@ -53,12 +60,27 @@ def train(sim: Sim, iterations: int) -> Act:
                 nn.utils.clip_grad_norm_(loss.parameters(), 0.5)
                 optimizer.step()
 
+    if out:
+        scales = {"loc": norm.loc["observation"], "scale": norm.scale["observation"]}
+        torch.save({"policy": spread.state_dict(), "shape": (n_obs, n_act), **scales}, out / "policy.pt")
+    return _acting(spread, norm.loc["observation"], norm.scale["observation"])
+
+
+def play(_sim: Sim, folder: Path) -> Act:
+    """The policy that ``train`` saved."""
+    saved = torch.load(folder / "policy.pt", weights_only=True)
+    spread = policy(*saved["shape"])
+    spread.load_state_dict(saved["policy"])
+    return _acting(spread, saved["loc"], saved["scale"])
+
+
+def _acting(spread: nn.Module, loc: torch.Tensor, scale: torch.Tensor) -> Act:
     def act(obs: np.ndarray) -> np.ndarray:
         with torch.no_grad():
-            return spread((torch.from_numpy(obs) - norm.loc["observation"]) / norm.scale["observation"])[0].numpy()
+            return spread((torch.from_numpy(obs) - loc) / scale)[0].numpy()
 
     return act
 
 
 if __name__ == "__main__":
-    main(train, iterations=40)
+    main(train, play, iterations=40)

@@ -8,6 +8,8 @@ import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+import uuvtai
+
 ROOT = Path(__file__).parent.parent
 WORKFLOW = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text())
 PROJECT = (ROOT / "pyproject.toml").read_text()
@@ -95,3 +97,11 @@ def test_the_image_is_made_of_files_that_docker_is_shown_and_runs_as_nobody_spec
     assert re.findall(r"(?m)^USER (\d+)$", text) and not re.findall(r"(?m)^USER (root|0)$", text)
     torch = next(requirement for requirement in wanted() if requirement.name == "torch")
     assert Requirement(re.findall(r'"(torch[^"]*)"', text)[0]) == torch
+
+
+def test_the_citation_is_of_this_version_and_licence():
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert {"cff-version", "message", "title", "authors", "version", "license"} <= cited.keys()
+    assert (str(cited["version"]), cited["license"]) == (uuvtai.__version__, "MIT")
+    assert "Partial Observability" in cited["message"]
+    assert "CITATION.cff" in (ROOT / "MANIFEST.in").read_text()

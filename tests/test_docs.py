@@ -119,6 +119,8 @@ def variants(usage):
 def fault(words, whole=True):
     """What is wrong with the words after ``uuv``; None = they can be parsed. In passing (not ``whole``) arguments may be missing."""
     command = commands.app()
+    if {"--install-completion", "--show-completion"} & set(words):
+        return None  # parsing them does what they say: the first writes into the reader's shell
     try:
         while hasattr(command, "commands") and words and not words[0].startswith("-"):
             name, words = words[0], words[1:]

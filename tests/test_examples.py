@@ -12,11 +12,12 @@ from tests.test_world import Drawn
 from uuvtai.env import VectorEnv
 from uuvtai.gym import UuvVectorEnv
 from uuvtai.loader import load_config
+from uuvtai.run_folder import RunFolderError
 from uuvtai.runtime import start_taichi
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 N = 8
-MOST_LINES = {"train": 80, "custom": 60}
+MOST_LINES = {"train": 100, "custom": 60}
 """a newcomer reads an example in one go"""
 SHORT = 60
 """[control steps] of an episode here"""
@@ -59,6 +60,32 @@ def test_a_trainer_learns_for_two_updates(short, example, monkeypatch, name):
     assert after.shape == (N, 4) and np.isfinite(after).all()
     np.testing.assert_array_equal(before, again)
     assert not np.allclose(before, after)
+
+
+@pytest.mark.parametrize("name", TRAINERS)
+def test_what_a_trainer_learnt_is_saved_and_played_again(short, example, monkeypatch, tmp_path, capsys, name):
+    """The policy that is read back acts as the one that was saved; and the command line does both."""
+    pytest.importorskip(TRAINERS[name], reason=f"{TRAINERS[name]} is not installed")
+    module, judge = example(name), example("judge")
+    if name == "train_rsl_rl":
+        monkeypatch.setitem(module.CONFIG, "num_steps_per_env", 8)
+    else:
+        monkeypatch.setattr(module, "ROLLOUT_STEPS", 8)
+    obs, _info = UuvVectorEnv(sim=short).reset(seed=1)
+    (tmp_path / "saved").mkdir()
+    trained = module.train(short, 2, tmp_path / "saved")(obs)
+    np.testing.assert_allclose(module.play(short, tmp_path / "saved")(obs), trained, rtol=1e-5, atol=1e-6)
+    assert not np.allclose(module.train(short, 0)(obs), trained)
+    out = tmp_path / "new" / "run"
+    judge.main(module.train, module.play, 1, ["--out", str(out), "--curve", str(tmp_path / "curve.csv")], short)
+    before, saved, played = capsys.readouterr().out.splitlines()
+    assert before.startswith("before return") and saved.endswith(f"saved in {out}")
+    assert played.startswith("played return") and f"/{N} (" in played
+    assert any(out.iterdir()) and (tmp_path / "curve.csv").read_text().startswith("decisions,return")
+    judge.main(module.train, module.play, 1, ["--play", str(out)], short)
+    assert capsys.readouterr().out.splitlines() == [played]
+    with pytest.raises(RunFolderError, match="already there and not empty"):
+        judge.main(module.train, module.play, 1, ["--out", str(out)], short)
 
 
 @pytest.mark.parametrize("mode", ["SameStep", "NextStep"])

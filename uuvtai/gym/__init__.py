@@ -1,4 +1,7 @@
-"""Gymnasium's interfaces: the batch ``UuvVectorEnv`` and the single env ``uuvtai/Nav-v0``, registered when this is imported."""
+"""Gymnasium's interfaces: the batch ``UuvVectorEnv`` and the single env ``uuvtai/Nav-v0``, registered when this is imported.
+
+``gymnasium.make("uuvtai.gym:uuvtai/Nav-v0")`` imports it by itself; Gymnasium reads no entry points from 1.0 on.
+"""
 
 from __future__ import annotations
 

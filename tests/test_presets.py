@@ -1,0 +1,80 @@
+"""``uuv presets``: a sentence for each, what one states with its comments, and every key that it gives."""
+
+import json
+
+import pytest
+import yaml
+
+from uuvtai.cli import main
+from uuvtai.shipped import KINDS, preset_names, shipped_file
+from uuvtai.show.presets import near, sentences
+
+
+def uuv(capfd, *arguments):
+    """(exit code, stdout, stderr) of one command in this process."""
+    with pytest.raises(SystemExit) as left:
+        main(list(arguments))
+    out, err = capfd.readouterr()
+    return left.value.code, out, err
+
+
+def test_the_list_has_every_preset_with_its_sentence(capfd):
+    code, out, _ = uuv(capfd, "presets")
+    assert code == 0
+    told = " ".join(out.split())
+    for kind, found in sentences().items():
+        assert list(found) == preset_names(kind)
+        for name, said in found.items():
+            assert f"{name} {said}" in told
+    code, out, _ = uuv(capfd, "presets", "--json")
+    assert code == 0 and json.loads(out) == sentences()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_show_prints_what_a_preset_states_with_units_and_sources(kind, capfd):
+    for name in preset_names(kind):
+        code, out, err = uuv(capfd, "presets", "show", f"{kind}/{name}")
+        assert code == 0, err
+        assert out == shipped_file(kind, name).read_text().rstrip("\n") + "\n"
+        extends = "extends:" in out and kind != "tree" and kind != "policy"
+        assert ("it changes these keys of" in err) == extends
+
+
+@pytest.mark.parametrize("kind", ["world", "sensors", "vehicle", "train", "grid"])
+def test_json_of_show_holds_what_the_file_states(kind, capfd):
+    name = preset_names(kind)[0]
+    _, out, _ = uuv(capfd, "presets", "show", f"{kind}/{name}", "--json")
+    assert json.loads(out) == yaml.safe_load(shipped_file(kind, name).read_text())
+
+
+def test_all_prints_every_key_with_defaults_and_what_it_builds_on(capfd):
+    _, out, _ = uuv(capfd, "presets", "show", "gauntlet", "--all")
+    whole = yaml.safe_load(out)
+    assert whole["world"]["n_dynamic"] == 6 and "tank" in whole["world"] and "sonar" in whole["sensors"]
+    _, own, _ = uuv(capfd, "presets", "show", "gauntlet", "--json")
+    assert "tank" not in json.loads(own)["world"]
+    _, out, _ = uuv(capfd, "presets", "show", "train/full", "--all", "--json")
+    assert json.loads(out)["ppo"]["rollout_steps"] == 64, "from the preset below the preset below it"
+    _, out, _ = uuv(capfd, "presets", "show", "grid/paper", "--all")
+    assert yaml.safe_load(out)["axes"]["S"] == [4, 8, 12]
+    _, out, _ = uuv(capfd, "presets", "show", "tree/bt", "--all")
+    assert "BTCPP_format" in out
+
+
+def test_a_file_of_ones_own_is_shown(capfd, tmp_path):
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("# mine\nextends: pool  # the base\nworld: {n_dynamic: 3}\n\x1b[2J")
+    code, out, _ = uuv(capfd, "presets", "show", str(mine))
+    assert code == 2 or "\x1b" not in out
+    mine.write_text("# mine\nextends: pool  # the base\nworld: {n_dynamic: 3}\n")
+    code, out, err = uuv(capfd, "presets", "show", str(mine))
+    assert code == 0 and "# the base" in out and "changes these keys of pool" in err
+    _, out, _ = uuv(capfd, "presets", "show", str(mine), "--all")
+    assert "n_dynamic: 3" in out and "n_static: 8" in out
+
+
+def test_the_nearest_name_of_any_kind_is_meant():
+    assert near("gauntlt") == "; did you mean 'gauntlet' (world)?"
+    assert near("nominl") == "; did you mean 'nominal' (sensors)?"
+    assert near("distill_2") == "; did you mean 'distill_20' (train)?"
+    assert near("zzzzzz") == ""
