@@ -1,10 +1,14 @@
 """The command line as a newcomer meets it: results, exit codes, and one clear message for everything wrong."""
 
+import ast
+import errno
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -12,9 +16,11 @@ import pytest
 from mcap.reader import make_reader
 from taichi.lang.impl import default_cfg
 
+import uuvtai
 from tests.conftest import SmallSim
-from uuvtai import doctor
+from uuvtai import cli, doctor, endings, loader
 from uuvtai.cli import main
+from uuvtai.errors import SettingError, SizeError
 
 
 def uuv(capfd, *arguments):
@@ -109,6 +115,135 @@ def test_missing_and_corrupt_logs_are_refused(capfd, tmp_path, command, content)
     assert "broken.mcap" in err
     assert "Traceback" not in err
     assert {p.name for p in tmp_path.iterdir()} <= {"broken.mcap"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["simulate", "--seconds", "4", "--dt", "0.5", "--wrench", "90,0,0,0,0,5"], "use a smaller substep, --dt 0.125"),
+        (["simulate", "--seconds", "1", "--vehicle", "[/x].yaml"], "[/x].yaml"),
+        (["log", "info", "[/x].mcap"], "[/x].mcap: cannot open"),
+        (["report", "[/x]"], "[/x]: is no run folder"),
+        (["eval", "--world", "a/" + 5000 * "b" + ".yaml"], "too long"),
+        (["eval", "--resume", "nowhere"], "nowhere/eval/request.json: cannot be read"),
+        (["eval", "--resume", "nowhere", "--episodes", "64"], "--episodes 64: a resumed run keeps its own"),
+        (["eval", "best", "--resume", "nowhere"], "RUN ['best']: a resumed run keeps its own"),
+        (["train", "smoke", "--set", "train.scenes=[[9, 9999, 1.0]]"], "do not fit"),
+        (["train", "smoke", "--set", "policy.initial_std=0.01"], "lies below the floor"),
+    ],
+)
+def test_what_once_was_a_traceback_or_passed_for_a_failure_is_refused(tmp_path, arguments, says):
+    code, out, err = in_a_process(tmp_path, *arguments)
+    assert (code, out) == (2, "")
+    assert says in " ".join(err.split())
+    assert "Traceback" not in err and "a bug of ours" not in err
+    assert not list(tmp_path.iterdir())
+
+
+def in_a_process(folder, *arguments, environment=None, stdout=subprocess.PIPE):
+    done = subprocess.run(
+        [sys.executable, "-m", "uuvtai", *arguments], stdout=stdout, stderr=subprocess.PIPE, text=True, cwd=folder, check=False,
+        env=os.environ | {"PYTHONPATH": str(Path(uuvtai.__file__).parents[1])} | (environment or {}),
+    )  # fmt: skip
+    return done.returncode, done.stdout, done.stderr
+
+
+@pytest.mark.parametrize("text", ["abc", "0", "-1", "1.5", "99999999999999999999"])
+def test_a_nonsense_thread_count_is_named(tmp_path, text):
+    code, _, err = in_a_process(tmp_path, "simulate", "--seconds", "0.1", environment={"UUV_NUM_THREADS": text})
+    assert code == 2 and f"UUV_NUM_THREADS='{text}'" in err
+
+
+def test_text_from_outside_is_never_markup(tmp_path, monkeypatch, capfd, evaluation):
+    """A run folder, a vehicle and a method whose names look like markup: in titles, cells and lines of every table."""
+    folder, document, _ = evaluation
+    odd = json.loads(json.dumps(document))
+    odd["world"] = odd["sensors"] = "[/x]"
+    for method in odd["methods"]:
+        method["name"] = "[/x]" + method["name"]
+    cli._print_evaluation(odd, Path("[/x]"), as_json=False)
+    monkeypatch.chdir(tmp_path)
+    Path("a[/x]").mkdir()
+    shutil.copy(folder / "logs/bt_seed3_episode0.mcap", "a[/x]/log.mcap")
+    shutil.copy(loader.preset_path("vehicle", "bluerov2_li2020"), "a[/x]/odd.yaml")
+    assert uuv(capfd, "log", "info", "a[/x]/log.mcap")[0] == 0
+    code, out, err = in_a_process(tmp_path, "simulate", "--seconds", "0.1", "--vehicle", "a[/x]/odd.yaml")
+    assert code == 0 and "a[/x]/odd.yaml: 0.1 s" in out, err
+
+
+@pytest.mark.parametrize(
+    "error", [KeyError("x"), ValueError("y"), RuntimeError("z"), OverflowError("w"), StopIteration(), LookupError("v")]
+)
+def test_a_bug_is_one_line_exit_1_and_a_file_with_the_traceback(error, capfd, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.delenv("UUV_DEBUG", raising=False)
+    assert endings.guarded(lambda: _fail(error)) == 1
+    _, err = capfd.readouterr()
+    [kept] = tmp_path.iterdir()
+    assert len(err.splitlines()) == 1 and str(kept) in err and type(error).__name__ in err
+    assert "Traceback" in kept.read_text() and "_fail" in kept.read_text()
+    monkeypatch.setenv("UUV_DEBUG", "1")
+    assert endings.guarded(lambda: _fail(error)) == 1
+    assert "Traceback" in capfd.readouterr().err and list(tmp_path.iterdir()) == [kept]
+
+
+def _fail(error):
+    raise error
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device", "a/b"), 1),
+        (PermissionError(errno.EACCES, "Permission denied", "a/b"), 1),
+        (MemoryError(), 1),
+        (RuntimeError("[enforce fail at alloc_cpu.cpp] DefaultCPUAllocator: can't allocate memory"), 1),
+        (OSError(errno.ENAMETOOLONG, "File name too long", "a"), 2),
+        (SizeError("too much"), 2),
+        (SettingError("no"), 2),
+    ],
+)
+def test_what_the_machine_refuses_is_no_bug(error, code, capfd, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    assert endings.guarded(lambda: _fail(error)) == code
+    assert len(capfd.readouterr().err.splitlines()) == 1
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no such device here")
+def test_results_that_cannot_be_written_are_told_once(tmp_path):
+    with open("/dev/full", "w") as full:
+        code, _, err = in_a_process(tmp_path, "presets", stdout=full)
+    assert code == 1 and len(err.splitlines()) == 1 and "No space left" in err
+
+
+@pytest.mark.skipif(os.name != "posix", reason="a shell closes them")
+def test_closed_streams_are_like_the_null_device(tmp_path):
+    environment = os.environ | {"PYTHONPATH": str(Path(uuvtai.__file__).parents[1])}
+    for closed in (">&-", ">&- 2>&-", "<&- >&- 2>&-"):
+        command = f"exec {sys.executable} -m uuvtai presets show pool {closed}"
+        done = subprocess.run(["sh", "-c", command], capture_output=True, cwd=tmp_path, env=environment, check=False)
+        assert (done.returncode, done.stdout, done.stderr) == (0, b"", b"")
+
+
+def test_every_refusal_of_the_package_is_of_one_type():
+    """Modules whose errors reach the user raise nothing plain: a plain one would be told as a bug of ours."""
+    root = Path(uuvtai.__file__).parent
+    plain = {"ValueError", "RuntimeError", "MemoryError", "OverflowError", "FloatingPointError", "OSError", "KeyError"}
+    found = {}
+    for path in [*root.glob("measure/**/*.py"), *root.glob("tree/*.py"), *root.glob("report/*.py"), root / "sizes.py", root / "runtime.py"]:
+        raised = [node.exc.func.id for node in ast.walk(ast.parse(path.read_text()))
+                  if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call) and isinstance(node.exc.func, ast.Name)]  # fmt: skip
+        if odd := [name for name in raised if name in plain]:
+            found[str(path.relative_to(root))] = sorted(odd)
+    assert found == PLAIN
+
+
+PLAIN = {
+    "measure/explain.py": ["RuntimeError"],  # a replay that ends otherwise: a bug of ours
+    "measure/statistics.py": ["ValueError", "ValueError"],  # counts that cannot be: a bug of ours
+    "runtime.py": ["RuntimeError"],  # two runtimes in one process: a mistake of a Python caller
+}
 
 
 def test_presets_are_listed_and_shown(capfd):

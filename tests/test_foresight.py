@@ -8,7 +8,7 @@ import torch
 from uuvtai.config.learning import RiskConfig
 from uuvtai.learn.risk import NO_THRESHOLD, STRIDE, RiskHead
 from uuvtai.measure.evaluate import Job, Recorders
-from uuvtai.measure.foresight import Foresight, Moments, fit, foresight_of, judged, told
+from uuvtai.measure.foresight import Foresight, Moments, fit, foresight_of, judged, moments_of, told
 
 HORIZON = 20
 
@@ -137,3 +137,27 @@ def test_too_few_accidents_change_nothing():
 def test_a_pilot_without_a_head_is_not_asked():
     assert foresight_of(SimpleNamespace(risk=None), 0.02) is None
     assert told(None) == {}
+
+
+def test_what_was_said_does_not_depend_on_when_the_episode_began():
+    """An evaluation that goes on plays an episode beside others than before."""
+    said = []
+    for late in (0, 3):
+        rows = Rows(1)
+        rows.begin(0)
+        rows.run(late)
+        rows.begin(0)
+        rows.run(17)
+        rows.end(0, "success")
+        said.append([value - late for value in rows.foresight.newest_said])
+    assert said == [[5.0, 10.0, 15.0]] * 2
+
+
+def test_moments_of_what_was_kept_are_those_that_were_seen():
+    rows = Rows(2)
+    rows.begin(0)
+    rows.begin(1)
+    rows.run(43)
+    rows.end(1, "ttc")
+    kept = moments_of(rows.foresight.newest_said, 43, "ttc", HORIZON, 0)
+    assert all(torch.equal(a, b) for a, b in zip(kept, rows.foresight.moments(), strict=True))

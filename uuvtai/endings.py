@@ -75,11 +75,17 @@ def _ended_by(error: BaseException) -> int:
     if isinstance(error, OSError) and error.errno in _SYSTEM:
         _settle_output()
         return told(f"uuv: {_one_line(error)}; make room, or choose another place", FAILED)
-    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":  # the second is torch's, which need not be here
+    if _is_out_of_memory(error):
         return told(f"uuv: out of memory ({_one_line(error) or 'no more is known'}); try a smaller --num-envs", FAILED)
     if isinstance(error, SystemExit):
         return error.code if isinstance(error.code, int) else OK if error.code is None else told(str(error.code), FAILED)
     return _bug(error)
+
+
+def _is_out_of_memory(error: BaseException) -> bool:
+    """Python's own, and torch's on a GPU and on a CPU, without importing torch."""
+    is_told = isinstance(error, RuntimeError) and ("can't allocate memory" in str(error) or "not enough memory" in str(error))
+    return isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError" or is_told
 
 
 def _interrupted() -> int:

@@ -92,7 +92,7 @@ class UncertaintyConfig(Section):
     """rho: weight of the newest uncertainty in the running mean"""
     gain: NonNegative = 0.8
     """alpha; 0 = no scaling (ablation 'LWM risk')"""
-    max_scale: Annotated[float, Field(ge=1)] = 2.0
+    max_scale: Annotated[float, Field(ge=1, le=1e12)] = 2.0
 
 
 class WorldModelConfig(Section):

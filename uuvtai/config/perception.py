@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from uuvtai.config.section import Fraction, NonNegative, Positive, PositiveCount, Section
+from uuvtai.config.section import Fraction, NonNegative, Packets, Positive, PositiveCount, Section
 
 
 class TrackingConfig(Section):
@@ -68,7 +68,7 @@ class ForecastConfig(Section):
     """prior odds that a body goes straight: a turn rate is used where its evidence against 0 outweighs them"""
     use_habits: bool = True
     """bodies turn where one was seen to turn"""
-    n_turn: Annotated[int, Field(ge=16, multiple_of=16)] = 48
+    n_turn: Packets = 48
     """turns remembered"""
     across_m: Positive = 0.25
     """a course that passes a remembered turn within this leads to it,"""

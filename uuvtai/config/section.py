@@ -10,14 +10,22 @@ from typing import TYPE_CHECKING, Annotated
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-Positive = Annotated[float, Field(gt=0)]
-NonNegative = Annotated[float, Field(ge=0)]
+_LARGEST, _SMALLEST = 1e12, 1e-12
+"""no quantity here is larger, nor smaller where it must not be 0: quotients and squares of them stay numbers"""
+_MOST = 2**31 - 1
+"""kernels count in 32 bits"""
+
+Real = Annotated[float, Field(ge=-_LARGEST, le=_LARGEST)]
+Positive = Annotated[float, Field(ge=_SMALLEST, le=_LARGEST)]
+NonNegative = Annotated[float, Field(ge=0, le=_LARGEST)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Spread = Annotated[float, Field(ge=0, le=0.9)]
 """half width of a factor around 1 that must stay positive"""
-Count = Annotated[int, Field(ge=0)]
-PositiveCount = Annotated[int, Field(ge=1)]
-Interval = tuple[float, float]
+Count = Annotated[int, Field(ge=0, le=_MOST)]
+PositiveCount = Annotated[int, Field(ge=1, le=_MOST)]
+Packets = Annotated[int, Field(ge=16, le=_MOST, multiple_of=16)]
+"""a count in whole packets of lanes"""
+Interval = tuple[Real, Real]
 
 
 def _ordered_interval(value: Interval) -> Interval:
@@ -28,8 +36,8 @@ def _ordered_interval(value: Interval) -> Interval:
 
 OrderedInterval = Annotated[Interval, AfterValidator(_ordered_interval)]
 PositiveInterval = Annotated[tuple[Positive, Positive], AfterValidator(_ordered_interval)]
-Vector3 = tuple[float, float, float]
-Vector6 = tuple[float, float, float, float, float, float]
+Vector3 = tuple[Real, Real, Real]
+Vector6 = tuple[Real, Real, Real, Real, Real, Real]
 NonNegative6 = tuple[NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative]
 
 

@@ -6,13 +6,13 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from uuvtai.config.section import Count, Fraction, Interval, NonNegative, Positive, PositiveCount, Section, Vector3
+from uuvtai.config.section import Count, Fraction, Interval, NonNegative, Packets, Positive, PositiveCount, Section, Vector3
 
 
 class SonarConfig(Section):
     """Horizontal ring of beams, fixed to the yaw, always level."""
 
-    n_ray: Annotated[int, Field(ge=16, multiple_of=16)] = 256
+    n_ray: Packets = 256
     max_range_m: Positive = 12.0
     vertical_half_aperture_deg: Annotated[float, Field(ge=0, lt=80)] = 10.0
     period_steps: PositiveCount = 1
@@ -28,7 +28,7 @@ class SonarConfig(Section):
     false_return: Fraction = 0.0
     bubble_clouds_per_s: NonNegative = 0.0
     """mean rate at which bubble clouds form; each hides a run of beams at one range and bearing"""
-    bubble_beams: tuple[int, int] = (3, 8)
+    bubble_beams: tuple[Count, Count] = (3, 8)
     bubble_s: Interval = (1.0, 3.0)
     ghost: Fraction = 0.0
     """probability per beam that a specular bounce replaces the direct return"""
@@ -45,8 +45,8 @@ class DepthConfig(Section):
     """Forward camera."""
 
     rows: PositiveCount = 72
-    cols: Annotated[int, Field(ge=16, multiple_of=16)] = 128
-    fov_deg: Annotated[float, Field(gt=0, lt=170)] = 90.0
+    cols: Packets = 128
+    fov_deg: Annotated[float, Field(ge=1e-3, lt=170)] = 90.0
     """horizontal"""
     offset_b_m: Vector3 = (0.2, 0.0, 0.0)
     max_range_m: Positive = 10.0

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from uuvtai.config.section import NonNegative, Positive, PositiveCount, Section
+from uuvtai.config.section import NonNegative, Positive, PositiveCount, Real, Section
 
 
 class RewardConfig(Section):
@@ -15,31 +15,31 @@ class RewardConfig(Section):
     Scale: driving at 0.6 m/s along the route earns about 0.015 a step, 20 over a typical episode: as much as one success.
     """
 
-    alive: float = 0.01
+    alive: Real = 0.01
     """r_alive; less than path_distance takes at the usual look-ahead of 1 m, so that waiting does not pay"""
-    progress: float = 1.0
+    progress: Real = 1.0
     """w_p [1/m]"""
-    path_distance: float = 0.02
+    path_distance: Real = 0.02
     """w_d [1/m]"""
-    cross_track: float = 0.02
+    cross_track: Real = 0.02
     """w_ct [1/m]"""
-    clearance: float = 0.1
+    clearance: Real = 0.1
     """w_c; touching costs five times what full speed earns"""
-    ttc: float = 0.1
+    ttc: Real = 0.1
     """w_ttc"""
-    overspeed: float = 0.1
+    overspeed: Real = 0.1
     """w_v [s^2/m^2]"""
-    upright: float = 0.005
+    upright: Real = 0.005
     """w_u"""
-    heading: float = 0.01
+    heading: Real = 0.01
     """w_h; about as much as progress at full speed, so that the vehicle looks where it goes"""
-    success: float = 20.0
+    success: Real = 20.0
     """w_s"""
-    failure: float = 20.0
+    failure: Real = 20.0
     """w_f"""
-    tilt: float = 0.02
+    tilt: Real = 0.02
     """w_tilt [1/rad]"""
-    effort: float = 0.005
+    effort: Real = 0.005
     """w_eff"""
     soft_clearance_m: Positive = 0.4
     """C_t grows linearly from 0 here to 1 at contact"""

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from uuvtai.config.section import Count, Fraction, NonNegative, NonNegative6, Positive, Section, Spread, Vector3
+from uuvtai.config.section import Count, Fraction, NonNegative, NonNegative6, Positive, Real, Section, Spread, Vector3
 
 _S = 0.7071067811865476
 
@@ -36,7 +36,7 @@ class VehicleConfig(Section):
     water_density_kg_m3: Positive = 997.0
     gravity_m_s2: Positive = 9.81
     volume_m3: Positive = 0.0113459
-    buoyancy_height_m: float = 0.01
+    buoyancy_height_m: Real = 0.01
     added_mass: NonNegative6 = (5.5, 12.7, 14.57, 0.12, 0.12, 0.12)
     added_mass_follows: Literal["ground", "water"] = "ground"
     """whose acceleration the added mass resists: "ground" is M_A dnu/dt, the design's equation; "water" is M_A dnu_r/dt (Fossen 2011),
@@ -70,7 +70,7 @@ class VehicleConfig(Section):
             ("thrust_reverse", self.thrust_reverse, self.dead_band_rpm[1], -1.0),
         ):
             edge = sign * max(dead, -sign * curve[1] / (2 * curve[0])) if sign * curve[0] > 0 else 0.0
-            if sign * curve[0] <= 0 or sign * (curve[0] * edge**2 + curve[1] * edge + curve[2]) < 0:
+            if sign * curve[0] <= 0 or sign * (curve[0] * edge * edge + curve[1] * edge + curve[2]) < 0:
                 raise ValueError(f"{name} must push its own way and harder with speed outside the dead band, got {curve}")
             if abs(edge) >= self.rotor_max_rpm:
                 raise ValueError(f"rotor_max_rpm must exceed the dead band of {name} ({abs(edge):.0f} rpm), got {self.rotor_max_rpm}")

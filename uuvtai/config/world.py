@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import model_validator
 
-from uuvtai.config.section import Count, Fraction, Interval, NonNegative, OrderedInterval, Positive, PositiveInterval, Section
+from uuvtai.config.section import Count, Fraction, Interval, NonNegative, OrderedInterval, Positive, PositiveInterval, Real, Section
 
 
 class TankConfig(Section):
@@ -63,7 +63,7 @@ class DynamicObstacles(Section):
     """the others go back and forth on a line"""
     line_length_m: PositiveInterval = (2.0, 6.0)
     circle_radius_m: PositiveInterval = (0.5, 2.0)
-    corners: tuple[int, int] = (3, 5)
+    corners: tuple[Count, Count] = (3, 5)
     corner_gap_m: NonNegative = 2.0
     """between any two corners of one path"""
     keep_clear_draws: Count = 16
@@ -84,23 +84,23 @@ class DynamicObstacles(Section):
 class Waypoint(Section):
     """One corner of an explicit obstacle's closed path."""
 
-    x_m: float
-    y_m: float
+    x_m: Real
+    y_m: Real
 
 
 class FixedObstacle(Section):
     """An obstacle that is always there, given explicitly; with ``path`` it moves along the closed polyline."""
 
     kind: Literal["sphere", "cylinder", "box"]
-    x_m: float
-    y_m: float
-    z_m: float | None = None
+    x_m: Real
+    y_m: Real
+    z_m: Real | None = None
     """centre; default: middle of the water column"""
     radius_m: Positive | None = None
     half_extents_m: tuple[Positive, Positive] | None = None
     height_m: Positive | None = None
     """default: the full water column"""
-    yaw_deg: float = 0.0
+    yaw_deg: Real = 0.0
     path: tuple[Waypoint, ...] = ()
     speed_m_s: NonNegative | None = None
     """default: the scenario's v"""

@@ -47,24 +47,22 @@ def _record(run: Path) -> dict[str, list[NodeUse]]:
         raise ConfigError(f"{run}: is no run folder; give one of an evaluation ('uuv eval' prints it){shipped}")
     try:
         record = read_json(path, folder=run)
-        return {
-            name: [NodeUse(_number(node["share"]), int(node["ticks"]), int(node["acted"])) for node in nodes]
-            for name, nodes in record["use"].items()
-        }
+        return {name: [_use(node) for node in nodes] for name, nodes in record["use"].items()}
     except OSError as error:
         raise ConfigError(
             f"{path}: cannot be read ({error.strerror}); give the run folder of an evaluation ('uuv eval' prints it)"
         ) from None
     except FileError as error:
         raise ConfigError(f"{error}; run the evaluation again with 'uuv eval'") from None
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, OverflowError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ConfigError(f"{path}: is not what 'uuv eval' writes ({error!r}); run the evaluation again with 'uuv eval'") from None
 
 
-def _number(value: Any) -> float:
-    if isinstance(value, int | float):
-        return float(value)
-    raise TypeError(f"{value!r:.40} is no number")
+def _use(node: dict[str, Any]) -> NodeUse:
+    share, ticks, acted = node["share"], int(node["ticks"]), int(node["acted"])
+    if not (isinstance(share, int | float) and 0.0 <= share <= 1.0 and 0 <= acted <= ticks):
+        raise ValueError(f"a node ticked in {share!r:.40} of the episodes, {ticks} times, {acted} of which acted")
+    return NodeUse(float(share), ticks, acted)
 
 
 def _document(controller: str, tree: FlatTree, use: list[NodeUse] | None) -> dict[str, Any]:

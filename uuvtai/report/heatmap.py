@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
+from uuvtai.errors import SettingError
 from uuvtai.report.wording import axis_name, value_name
 
 SPEED = "v_m_s"
@@ -62,7 +63,7 @@ def pivot(cells: Iterable[Cell], axes: dict[str, list[Any]], columns: str | None
     named = {cell_name(name): list(values) for name, values in axes.items()}
     across = cell_name(columns) if columns else _default_columns(named)
     if across not in named:
-        raise ValueError(f"{columns!r} is no axis of this sweep; there are: {', '.join(named) or 'none'}")
+        raise SettingError(f"{columns!r} is no axis of this sweep; there are: {', '.join(named) or 'none'}")
     down = tuple(name for name in named if name != across)
     found = list(cells)
     rows = [tuple(cell.get(name) for name in down) for cell in found]
@@ -95,7 +96,7 @@ def _place(cell: Cell, down: tuple[str, ...], across: str, rows: tuple[tuple[Any
     if value is None:
         return Place(row, 0, len(columns), cell)
     if value not in columns:
-        raise ValueError(f"a cell has {across} = {value}, which is not among the axis' values {columns}")
+        raise SettingError(f"a cell has {across} = {value}, which is not among the axis' values {columns}")
     return Place(row, columns.index(value), 1, cell)
 
 
@@ -104,5 +105,5 @@ def _refuse_doubles(places: tuple[Place, ...]) -> None:
     for place in places:
         spots = {(place.row, column) for column in range(place.first, place.first + place.n_columns)}
         if spots & taken:
-            raise ValueError(f"two cells of one method stand in the same place: {place.cell}")
+            raise SettingError(f"two cells of one method stand in the same place: {place.cell}")
         taken |= spots

@@ -140,6 +140,9 @@ def result_file(step: Step, root: Path) -> Path:
     return root / step.folder / ("profile.json" if step.to_file else "stdout.json")
 
 
+_INTERRUPTED = (130, 143, -signal.SIGINT, -signal.SIGTERM)
+
+
 def run_step(step: Step, root: Path) -> None:
     """Run what is not done; what was begun goes on or begins anew. KeyboardInterrupt and RunFolderError as the command ends."""
     place = root / step.folder
@@ -148,7 +151,7 @@ def run_step(step: Step, root: Path) -> None:
     if begun and not resume:
         shutil.rmtree(place)
     done = launch(step.argv(root, resume))
-    if done.returncode == 130:
+    if done.returncode in _INTERRUPTED:
         raise KeyboardInterrupt
     if done.returncode:
         raise RunFolderError(f"{step.name}: 'uuv {' '.join(step.argv(root, resume))}' ended with {done.returncode}; its message is above")
@@ -157,12 +160,17 @@ def run_step(step: Step, root: Path) -> None:
 
 def launch(arguments: list[str]) -> subprocess.CompletedProcess[bytes]:
     """Run ``uuv`` in a process of its own; what it prints is kept, its messages go where ours go."""
-    return subprocess.run(
-        [sys.executable, "-m", "uuvtai", *arguments],
-        stdout=subprocess.PIPE,
-        preexec_fn=_die_with_parent if os.name == "posix" else None,
-        check=False,
-    )
+    command = [sys.executable, "-m", "uuvtai", *arguments]
+    before = _die_with_parent if os.name == "posix" else None
+    # a session of its own: what a terminal tells us it hears once, from us, and can save
+    child = subprocess.Popen(command, stdout=subprocess.PIPE, preexec_fn=before, start_new_session=True)  # noqa: PLW1509
+    try:
+        printed, _ = child.communicate()
+    except KeyboardInterrupt:
+        child.terminate()
+        child.communicate()  # it saves what it keeps
+        raise
+    return subprocess.CompletedProcess(command, child.returncode, printed)
 
 
 def _can_resume(step: Step, place: Path) -> bool:

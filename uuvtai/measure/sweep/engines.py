@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import multiprocessing
 import os
@@ -13,6 +14,7 @@ from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import connection
 from typing import Any, Protocol, TypeVar
 
+from uuvtai import signals
 from uuvtai.errors import SettingError, UserError
 
 Item = TypeVar("Item")
@@ -69,7 +71,8 @@ class LocalEngine:
             while todo or running:
                 try:
                     while todo and len(running) < self._workers:  # no more than run: what waits inside a broken pool is lost too
-                        future = pool.submit(work, items[todo[0]])
+                        with _ctrl_c_held():
+                            future = pool.submit(work, items[todo[0]])
                         running[future] = todo.pop(0)
                 except BrokenProcessPool:
                     return list(running.values())
@@ -89,6 +92,19 @@ class LocalEngine:
             for process in list((pool._processes or {}).values()):
                 process.terminate()
             pool.shutdown(wait=True, cancel_futures=True)
+
+
+@contextlib.contextmanager
+def _ctrl_c_held() -> Iterator[None]:
+    """Processes that are started inside do not hear Ctrl-C, which a terminal sends to all of them, before they can leave it to us."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _begin_worker(threads: int) -> None:
@@ -122,18 +138,26 @@ class RayEngine:
             )
         except (ConnectionError, ValueError, RuntimeError) as error:
             raise EngineError(f"--engine ray: no cluster at {address!r} ({error}); start one: ray start --head") from None
+        signals.reinstall()  # Ray has put its own handler of SIGTERM in their place
         self._cpus = min(cpus_per_task, ray.cluster_resources().get("CPU", 1.0))
 
     def run(self, work: Work, items: Sequence[Item]) -> Iterator[tuple[int, Any]]:
         """As ``Engine.run``."""
         remote = self._ray.remote(num_cpus=self._cpus, max_retries=ATTEMPTS - 1)(work)
         running = {remote.remote(item): number for number, item in enumerate(items)}
+        try:
+            yield from self._results(running, len(items))
+        finally:
+            for left in running:  # of a cluster that outlives us
+                self._ray.cancel(left, force=True)
+
+    def _results(self, running: dict[Any, int], total: int) -> Iterator[tuple[int, Any]]:
         while running:
             (done, *_), _rest = self._ray.wait(list(running))
             number = running.pop(done)
             try:
                 yield number, self._ray.get(done)
             except (self._ray.exceptions.WorkerCrashedError, self._ray.exceptions.NodeDiedError) as error:
-                raise EngineError(f"task {number + 1} of {len(items)} lost its worker {ATTEMPTS} times: {error}") from None
+                raise EngineError(f"task {number + 1} of {total} lost its worker {ATTEMPTS} times: {error}") from None
             except self._ray.exceptions.RayTaskError as error:
                 raise error.as_instanceof_cause() from None

@@ -1,0 +1,165 @@
+"""An evaluation that is interrupted or killed goes on where it was, and ends as if nobody had disturbed it."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from uuvtai.errors import UserError
+from uuvtai.loader import preset_path
+from uuvtai.logs import reader
+from uuvtai.measure import ledger
+from uuvtai.measure.compare import Request, compare, resume
+from uuvtai.measure.eval_request import FILE as REQUEST
+
+TIMES = ("wall_s", "env_steps_per_s")
+"""of the machine, not of the vehicles"""
+EPISODES = 5
+
+
+class Watch:
+    """Interrupts at the ``after``-th finished episode of a method."""
+
+    def __init__(self, method=None, after=0):
+        self.method, self.after, self.notes, self.begun = method, after, [], {}
+
+    def start(self, name, total):
+        self.name = name
+        self.begun[name] = None
+
+    def note(self, text):
+        self.notes.append(text)
+
+    def update(self, done, total, env_steps):
+        if self.begun[self.name] is None:
+            self.begun[self.name] = done
+        if self.name == self.method and done >= self.after:
+            raise KeyboardInterrupt
+
+    def stop(self):
+        pass
+
+
+@pytest.fixture
+def ask(small, monkeypatch):
+    """Requests of the session's simulator: nothing is compiled."""
+    monkeypatch.setattr("uuvtai.sim.Sim", lambda _config, _num_envs, tree, _device: small.sim.use_tree(tree) or small.sim)
+
+    def request(folder, **others):
+        given = {"controllers": ["straight", "bt"], "episodes": EPISODES, "seeds": [77], "num_envs": small.N, "device": "cpu", "record": 2}
+        return Request(config=small.config, world="pool", sensors="paper", run_dir=folder, **given | others)
+
+    yield request
+    small.sim.use_tree(small.trees["bt"])
+
+
+def outcome(result):
+    """A document without the machine's times."""
+    return result | {"methods": [{name: value for name, value in m.items() if name not in TIMES} for m in result["methods"]]}
+
+
+@pytest.fixture
+def whole(ask, tmp_path):
+    return compare(ask(tmp_path / "whole"), Watch())
+
+
+@pytest.mark.parametrize(("method", "after"), [("straight", 1), ("straight", EPISODES), ("bt", 3)])
+def test_an_interrupted_evaluation_ends_as_an_undisturbed_one(ask, whole, tmp_path, method, after):
+    run, watch = tmp_path / "run", Watch(method, after)
+    with pytest.raises(KeyboardInterrupt):
+        compare(ask(run), watch)
+    assert f"finished episodes are kept; go on with: uuv eval --resume {run}" in watch.notes
+    assert json.loads((run / "run.json").read_text())["status"] == "interrupted"
+    assert not (run / "eval/result.json").exists()
+    kept = (run / ledger.FILE).read_bytes()
+    finished = sum(json.loads(line)["method"] == method for line in kept.splitlines())
+    assert after <= finished <= EPISODES
+    old = {log.name: log.stat().st_mtime_ns for log in (run / "logs").glob("*.mcap")}
+    watch = Watch()
+    result, _ = resume(run, watch)
+    assert outcome(result) == outcome(whole[0])
+    assert json.loads((run / "eval/result.json").read_text()) == result
+    assert (run / "eval/tree.json").read_bytes() == (whole[1] / "eval/tree.json").read_bytes()
+    assert (run / ledger.FILE).read_bytes().startswith(kept), "nothing that is over is played again"
+    assert watch.begun[method] is None or watch.begun[method] > finished or finished == EPISODES
+    logs = sorted((run / "logs").iterdir())
+    assert [log.name for log in logs] == sorted(log.name for log in (whole[1] / "logs").iterdir()), "every log whole, no part left"
+    assert all((run / "logs" / name).stat().st_mtime_ns == time for name, time in old.items()), "finished logs are kept"
+    assert all(reader.info(log)["outcome"] for log in logs)
+
+
+def test_a_line_that_a_kill_cut_off_and_a_lost_log_are_played_again(ask, whole, tmp_path):
+    run = tmp_path / "run"
+    with pytest.raises(KeyboardInterrupt):
+        compare(ask(run), Watch("bt", EPISODES))
+    file = run / ledger.FILE
+    file.write_bytes(file.read_bytes()[:-30])
+    next((run / "logs").glob("straight*.mcap")).unlink()
+    result, _ = resume(run, Watch())
+    assert outcome(result) == outcome(whole[0])
+    assert len(list((run / "logs").glob("*.mcap"))) == 4
+    again, _ = resume(run, Watch())
+    assert outcome(again) == outcome(result), "a finished one is told again"
+
+
+def interrupted(ask, run, **others):
+    with pytest.raises(KeyboardInterrupt):
+        compare(ask(run, **others), Watch("straight" if "controllers" not in others else "mine", 1))
+
+
+def test_another_tree_under_the_same_name_is_refused(ask, tmp_path):
+    tree = tmp_path / "mine.xml"
+    tree.write_text(preset_path("tree", "straight").read_text())
+    run = tmp_path / "run"
+    interrupted(ask, run, controllers=[str(tree)], record=0)
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    tree.write_text(preset_path("tree", "planner").read_text())
+    with pytest.raises(UserError, match="mine has changed since this evaluation began"):
+        resume(run, Watch())
+    assert before == {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "says"),
+    [
+        (REQUEST, b"{", "is no request"),
+        (REQUEST, b"[1]", "is no request"),
+        (REQUEST, None, "cannot be read"),
+        (ledger.FILE, b'{"method": "straight"}\n', "line 1: is no finished episode"),
+        (ledger.FILE, b"\xff\xfe\n", "line 1: is no finished episode"),
+    ],
+)
+def test_a_damaged_folder_is_refused(ask, tmp_path, file, content, says):
+    run = tmp_path / "run"
+    interrupted(ask, run, record=0)
+    (run / file).unlink()
+    if content is not None:
+        (run / file).write_bytes(content)
+    with pytest.raises(UserError, match=says):
+        resume(run, Watch())
+
+
+def test_a_ledger_that_is_a_link_is_not_written_through(ask, tmp_path):
+    run, victim = tmp_path / "run", tmp_path / "victim"
+    interrupted(ask, run, record=0)
+    victim.write_text("mine, without an end of line")
+    (run / ledger.FILE).unlink()
+    (run / ledger.FILE).symlink_to(victim)
+    with pytest.raises(UserError, match="is a link"):
+        resume(run, Watch())
+    assert victim.read_text() == "mine, without an end of line"
+
+
+def test_paths_of_the_request_are_found_from_another_folder(ask, tmp_path, monkeypatch):
+    (tmp_path / "mine.xml").write_text(preset_path("tree", "straight").read_text())
+    monkeypatch.chdir(tmp_path)
+    interrupted(ask, Path("run"), controllers=["mine.xml"], record=0)
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    result, _ = resume(tmp_path / "run", Watch())
+    assert [method["name"] for method in result["methods"]] == ["mine"]
+
+
+def test_a_folder_of_something_else_is_refused(tmp_path):
+    with pytest.raises(UserError, match=r"eval/request\.json: cannot be read.*give the folder that an interrupted"):
+        resume(tmp_path, Watch())

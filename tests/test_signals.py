@@ -1,0 +1,219 @@
+"""SIGINT and SIGTERM: heard from the first line on, alike, without a traceback, and nothing half-written stays."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import uuvtai
+from tests.conftest import SmallSim
+from uuvtai import signals
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(uuvtai.__file__).parents[1])}
+BOTH = [signal.SIGINT, signal.SIGTERM]
+
+
+def started(folder, *arguments, program=None):
+    """A command whose handlers are in place: what Python does before its first line is not ours."""
+    command = [sys.executable, "-c", program] if program else [sys.executable, "-m", "uuvtai", *arguments]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder, env=ENVIRONMENT)
+    deadline = time.monotonic() + 60
+    while process.poll() is None and not catches(process.pid, signal.SIGTERM) and time.monotonic() < deadline:
+        time.sleep(0.001)
+    return process
+
+
+def catches(pid, number):
+    try:
+        status = Path(f"/proc/{pid}/status").read_text()
+    except OSError:
+        return False
+    caught = next(line for line in status.splitlines() if line.startswith("SigCgt:"))
+    return bool(int(caught.split()[1], 16) >> (number - 1) & 1)
+
+
+def ended(process, number):
+    """(exit code, stderr); an end without any message by us is checked by the caller."""
+    _, err = process.communicate(timeout=120)
+    assert "Traceback" not in err and "a bug of ours" not in err, err
+    if process.returncode == 128 + number:
+        assert err.splitlines()[-1] == "interrupted"
+    return process.returncode, err
+
+
+@pytest.mark.parametrize("number", BOTH)
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("eval", "--episodes", "4", "--run-dir", "run"), ("train", "smoke", "--run-dir", "run"), ("simulate", "--seconds", "1"),
+        ("sweep", "--grid", "D=0,3", "--run-dir", "run"), ("profile",), ("report", "nowhere"), ("export", "best", "--out", "out"),
+        ("presets",), ("doctor",), ("tree",), ("log", "info", "nowhere.mcap"), ("reproduce", "--run-dir", "run"),
+    ],
+)  # fmt: skip
+def test_a_command_that_begins_ends_at_once_and_leaves_nothing(tmp_path, arguments, number):
+    process = started(tmp_path, *arguments)
+    time.sleep(random.Random(f"{arguments}{number}").uniform(0.0, 0.6))
+    process.send_signal(number)
+    code, err = ended(process, number)
+    assert code in (128 + number, 0, 2), err
+    assert not [
+        path for path in tmp_path.rglob("*") if path.is_file() and (path.name.endswith((".tmp", ".part")) or ".partial" in path.name)
+    ]
+
+
+@pytest.mark.parametrize("number", BOTH)
+def test_while_nothing_is_kept_it_ends_in_the_middle_of_an_import(tmp_path, number):
+    program = "from uuvtai import signals; signals.install(); import slow"
+    (tmp_path / "slow.py").write_text("import time\ntry:\n    time.sleep(30)\nexcept BaseException:\n    pass\nprint('went on')\n")
+    process = started(tmp_path, program=program)
+    time.sleep(0.2)
+    process.send_signal(number)
+    out, err = process.communicate(timeout=20)
+    assert (process.returncode, out, err) == (128 + number, "", "interrupted\n")
+
+
+KEEPS = """
+import os, sys, time
+from uuvtai import signals
+from uuvtai.endings import guarded
+signals.install(); signals.end_at_second(); signals.engage()
+def work():
+    try:
+        {work}
+    finally:
+        print("tidied up", flush=True)
+sys.exit(guarded(work))
+"""
+
+
+@pytest.mark.parametrize("number", BOTH)
+@pytest.mark.parametrize(
+    "work",
+    [
+        "time.sleep(30)",
+        "import slow",  # not in the middle of an import, which makes other errors of it, but behind it
+        "import collecting",  # an exception in a finaliser is lost
+        "int('x') if not time.sleep(30) else 0",
+    ],
+)
+def test_what_is_kept_is_tidied_up(tmp_path, number, work):
+    (tmp_path / "slow.py").write_text(
+        "import time\ntry:\n    time.sleep(1)\nexcept BaseException:\n    print('swallowed')\n    raise ImportError\n"
+    )
+    (tmp_path / "collecting.py").write_text("import time\nclass Slow:\n    def __del__(self):\n        time.sleep(1)\nSlow()\n")
+    process = started(tmp_path, program=KEEPS.format(work=work + ("" if "sleep" in work else "; time.sleep(30)")))
+    time.sleep(0.4)
+    process.send_signal(number)
+    code, err = ended(process, number)
+    assert (code, err) == (128 + number, "interrupted\n")
+
+
+@pytest.mark.parametrize("number", BOTH)
+def test_the_second_one_does_not_wait_for_compiled_code(tmp_path, number):
+    """A sleep in C that holds the interpreter, as Taichi's compiler does."""
+    work = "import ctypes; print('now', flush=True); ctypes.PyDLL(None).sleep(20); [ctypes.PyDLL(None).sleep(20) for _ in range(3)]"
+    process = started(tmp_path, program=KEEPS.format(work=work))
+    assert process.stdout.readline() == "now\n"
+    time.sleep(0.3)
+    begun = time.monotonic()
+    process.send_signal(signal.SIGWINCH)  # PyDLL's sleep ends with any signal that has a handler; this one has none
+    for _ in range(2):
+        process.send_signal(number)
+        time.sleep(0.1)
+    process.communicate(timeout=60)
+    assert process.returncode in (-number, 128 + number)
+    assert time.monotonic() - begun < 10
+
+
+def test_an_ignored_signal_stays_ignored(tmp_path):
+    """nohup, and a shell's background."""
+    program = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n" + KEEPS.format(work="time.sleep(1.5)")
+    process = started(tmp_path, program=program)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert (process.returncode, out, err) == (0, "tidied up\n", "")
+
+
+def test_a_signal_at_the_very_end_does_not_change_the_exit_code(tmp_path):
+    program = "import time\nfrom uuvtai import signals\nsignals.install(); signals.finish(3); time.sleep(30)"
+    process = started(tmp_path, program=program)
+    time.sleep(0.3)
+    process.send_signal(signal.SIGTERM)
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (3, "")
+
+
+def test_nobody_is_told_by_a_library(tmp_path):
+    """Importing the package installs nothing: that is the command line's affair."""
+    program = "import signal; before = signal.getsignal(2), signal.getsignal(15)\nimport uuvtai, uuvtai.cli, uuvtai.signals\n"
+    program += "assert before == (signal.getsignal(2), signal.getsignal(15))"
+    subprocess.run([sys.executable, "-c", program], env=ENVIRONMENT, check=True)
+    assert not signals.was_received() and signals.exit_code() == 130
+
+
+def test_sigterm_ends_a_training_as_ctrl_c_does(tmp_path):
+    process = started(tmp_path, "train", "smoke", "--iterations", "5000", "--device", "cpu", "--run-dir", "run")
+    metrics = tmp_path / "run/metrics.jsonl"
+    deadline = time.monotonic() + 400
+    while process.poll() is None and not (metrics.exists() and metrics.stat().st_size) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGTERM)
+    code, err = ended(process, signal.SIGTERM)
+    assert code == 143 and "saved; go on with: uuv train --resume run" in err
+    record = json.loads((tmp_path / "run/run.json").read_text())
+    assert (record["status"], record["exit"]) == ("interrupted", 143)
+    assert any((tmp_path / "run/checkpoints").glob("step_*"))
+
+
+def test_the_workers_of_a_sweep_end_with_it(tmp_path):
+    command = [
+        "sweep",
+        "--grid",
+        "D=0,3,6,9",
+        "--grid",
+        "v=0.5,1.5",
+        "--controller",
+        "bt",
+        "--episodes",
+        "64",
+        "--workers",
+        "2",
+        "--run-dir",
+        "run",
+    ]
+    process = started(tmp_path, *command, "--device", "cpu", "--num-envs", SmallSim.OPTIONS[1])
+    deadline = time.monotonic() + 120
+    while (
+        len(children := children_of(process.pid)) < 3 and process.poll() is None and time.monotonic() < deadline
+    ):  # and a resource tracker
+        time.sleep(0.05)
+    assert len(children) >= 3
+    os.kill(process.pid, signal.SIGTERM)
+    code, err = ended(process, signal.SIGTERM)
+    assert code == 143 and "go on with: uuv sweep --resume run" in err
+    deadline = time.monotonic() + 20
+    while any(Path(f"/proc/{child}").exists() for child in children) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not [child for child in children if Path(f"/proc/{child}").exists()]
+    held = subprocess.run(["sh", "-c", "flock --nonblock run/.lock true"], cwd=tmp_path, check=False)
+    assert held.returncode in (0, 127), "the lock is free"
+
+
+def children_of(pid):
+    found = []
+    for status in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = status.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if int(fields[1]) == pid:
+            found.append(int(status.parent.name))
+    return found
