@@ -6,7 +6,7 @@ import typer
 from typer.cli import get_docs_for_click
 
 from docs.writers.markdown import contents, table
-from uuvtai import cli
+from uuvtai import cli, endings
 
 SEE = {
     "eval": ("quickstart", "ceilings", "viewers", "determinism"),
@@ -25,11 +25,11 @@ SEE = {
 """prose about a command"""
 
 EXIT_CODES = (
-    (cli.OK, "done"),
-    (cli.FAILED, "failed while running: a file that cannot be read or written, a device that is missing, a worker lost too often"),
-    (cli.USAGE, "usage or configuration: nothing was begun, nothing was written; the message says what to type instead"),
-    (cli.GATE, "finished, but a gate was not met: `uuv export` found that an exported policy disagrees"),
-    (cli.INTERRUPTED, "interrupted (Ctrl-C); what was finished is kept, and the message names the command that goes on"),
+    (endings.OK, "done"),
+    (endings.FAILED, "failed while running: a file that cannot be read or written, a device that is missing, a worker lost too often"),
+    (endings.USAGE, "usage or configuration: nothing was begun, nothing was written; the message says what to type instead"),
+    (endings.GATE, "finished, but a gate was not met: `uuv export` found that an exported policy disagrees"),
+    (endings.INTERRUPTED, "interrupted (Ctrl-C); what was finished is kept, and the message names the command that goes on"),
 )
 
 
