@@ -17,15 +17,14 @@ from pathlib import Path
 from docs.writers.evaluations import ONE_THREAD
 from docs.writers.figure_sources import ROOT
 
-METHODS = ("--controller", "straight", "--controller", "planner", "--controller", "bt")
-COMMAND = ("eval", *METHODS, "--world", "pool", "-S", "8", "-D", "6", "-v", "0.6", "--seeds", "0", "--episodes", "1", "--record", "1")
+COMMAND = "eval --controller straight --controller planner --controller bt --world pool -S 8 -D 6 -v 0.6 --seeds 0 --episodes 1 --record 1"
 
 
 def pool(target: Path) -> Path:
     """Play and draw. Raises subprocess.CalledProcessError, OSError, and StopIteration where no picture was drawn."""
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
-        words = [sys.executable, "-m", "uuvtai", *COMMAND, "--run-dir", str(run)]
+        words = [sys.executable, "-m", "uuvtai", *COMMAND.split(), "--run-dir", str(run)]
         subprocess.run(words, cwd=ROOT, env={**os.environ, **ONE_THREAD}, stdout=subprocess.DEVNULL, check=True)
         drawn = next(path for path in sorted((run / "pictures").glob("*.png")) if "clearance" not in path.name)
         shutil.copy(drawn, target)
