@@ -113,6 +113,30 @@ def test_equals_the_exact_transform(stage, seed):
         check([f[env] for f in found], sites_of(static[env], 0, stage.outside, MAP.occupied, "static"), CFG)
 
 
+@pytest.mark.parametrize("outside", [outside_cells(TANK, MAP.cell_m), outside_cells(POND, MAP.cell_m)], ids=["tank", "pond"])
+def test_inflation_brings_obstacles_nearer_and_leaves_the_boundary(stage, outside):
+    """min(d_occ - inflation, d_bnd) wherever an obstacle is the nearest site; where the boundary is, its own distance, which is no more
+    than the inflation too large. The boundary and the water far from everything stay as they are."""
+    stage.set_outside(np.array(outside))
+    static, cfg = maps_of(8), ClearanceConfig(inflate_m=0.08)
+    plain, (distance, site_row, site_col) = stage.compute(static), stage.compute(static, cfg=cfg)
+    stage.launch(CFG)  # other stages' distances are again those without inflation
+    np.testing.assert_array_equal(plain[1], site_row)
+    np.testing.assert_array_equal(plain[2], site_col)
+    nearer = 0
+    for env in range(N_ENV):
+        occupied = (static[env] >= MAP.occupied) & ~stage.outside
+        to_obstacle = clearance_of(occupied, MAP.cell_m, 99.0)[0]
+        to_bound = clearance_of(stage.outside, MAP.cell_m, 99.0)[0]
+        near = (site_row[env] >= 0) & ~stage.outside[site_row[env], site_col[env]]
+        expected = np.where(near, np.maximum(to_obstacle - 0.08, 0.0), np.minimum(to_bound, CFG.max_m))
+        assert np.abs(distance[env] - expected).max() <= ROUNDING_M
+        letter = np.minimum(np.minimum(np.maximum(to_obstacle - 0.08, 0.0), to_bound), CFG.max_m)
+        assert np.all(distance[env] - letter < 0.08 + ROUNDING_M) and np.all(distance[env] - letter > -ROUNDING_M)
+        nearer += int(near.sum())
+    assert nearer > 1000
+
+
 def test_fused_layer_and_odd_limit(stage):
     static, dynamic = maps_of(3), maps_of(4)[::-1]
     for cfg, voronoi in ((SHORT, VORONOI), (WIDE, VORONOI), (CFG, FUSED)):

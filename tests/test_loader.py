@@ -5,7 +5,7 @@ import yaml
 
 from uuvtai import loader
 from uuvtai.config import Config
-from uuvtai.loader import ConfigError, load_config, load_training, to_yaml, validated
+from uuvtai.loader import ConfigError, load_config, load_training, to_yaml, validated, with_stack
 
 
 def write(folder, text, name="mine.yaml"):
@@ -145,7 +145,10 @@ def test_paper_is_the_table_to_the_letter():
     beyond = ("predict_change", "normalise_targets", "stop_target_gradient", "beta_nll")
     assert not any(getattr(c.world_model, switch) for switch in beyond)
     assert not (c.policy.residual or c.risk.enabled)
+    assert c.world_model.error_unit == "decoder"
     assert c.sensors == load_config("pool", "paper").sensors
+    assert (c.voronoi.use, c.clearance.inflate_m, c.route.rrt_clearance_m, c.tracking.horizon_s) == ("fused", 0.08, 0.1, 2.5)
+    assert not any(c.forecast.model_dump()[switch] for switch in ("use_turn_rate", "use_habits", "use_reflection", "use_coasting"))
 
 
 def test_the_paper_schedule_meets_the_equation():
@@ -156,6 +159,65 @@ def test_the_paper_schedule_meets_the_equation():
     for t in (0, 400, 800, 801, 1000, 1199, 1500, 1600, 2000):
         expected = 1.0 if t <= 800 else 0.2 * (1 - (t - 800) / 800) if t <= 1600 else 0.0
         assert piecewise_linear(points, t / 1200) == pytest.approx(expected, abs=1e-6)
+
+
+def test_the_rows_that_build_on_the_papers_training_have_the_defaults_stack():
+    for preset in loader.preset_names("train"):
+        if preset != "paper":
+            assert all(getattr(load_training(preset), name) == getattr(Config(), name) for name in loader.STACK_SECTIONS), preset
+
+
+# ------------------------------------------------------------------------------------------------------------------ stacks
+
+
+def test_a_stack_is_one_word_wherever_a_config_is_made(tmp_path):
+    """By --set and by make's overrides; below what is set itself, above the presets; a null takes it off again."""
+    found = load_config("pool", overrides=["stack=paper"])
+    assert found == load_config("pool", overrides={"stack": "paper"}) == with_stack(load_config("pool"), "paper")
+    assert found.voronoi.use == "fused" and found.world == load_config("pool").world
+    mine = load_config("pool", overrides=["voronoi.use=static", "stack=paper"])
+    assert mine.voronoi.use == "static" and mine.clearance.inflate_m == 0.08
+    assert load_training("curriculum", ["stack=paper"]).clearance == found.clearance == load_training("paper").clearance
+    assert load_training("paper", ["stack=null"]).clearance == Config().clearance
+    path = tmp_path / "config.yaml"
+    path.write_text(to_yaml(load_config("pool")))
+    assert loader.load_resolved(path, ["stack=paper"]) == found
+
+
+def test_a_users_own_stack_extends_one(tmp_path):
+    path = write(tmp_path, "extends: paper\ntree: planner\nvoronoi: {min_clearance_m: 0.5}\n")
+    found = load_config("pool", overrides={"stack": path})
+    assert (found.voronoi.use, found.voronoi.min_clearance_m) == ("fused", 0.5)
+    assert loader.tree_of_stack(path) == "planner"
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("world: {n_static: 0}\n", "mine.yaml:1: a stack cannot set 'world'"),
+        ("features: {n_track: 4}\n", "a stack cannot set 'features'"),
+        ("voronoi: {usee: fused}\n", "mine.yaml:1: unknown key 'voronoi.usee'; did you mean 'use'?"),
+        ("extends: papr\n", "did you mean 'paper'"),
+    ],
+)
+def test_a_bad_stack_is_named_with_its_line(tmp_path, text, says):
+    with pytest.raises(ConfigError) as error:
+        load_config("pool", overrides={"stack": write(tmp_path, text)})
+    assert says in str(error.value)
+
+
+@pytest.mark.parametrize(("value", "says"), [("papr", "did you mean 'paper'"), (3, "must be the name or path of a stack preset, got 3")])
+def test_a_stack_that_does_not_exist_is_refused(value, says):
+    with pytest.raises(ConfigError, match=says):
+        load_config("pool", overrides={"stack": value})
+
+
+def test_a_stack_that_is_to_drive_needs_a_tree(tmp_path):
+    with pytest.raises(ConfigError, match="needs 'tree:'"):
+        loader.tree_of_stack(write(tmp_path, "voronoi: {use: fused}\n"))
+
+
+# -------------------------------------------------------------------------------------------------------------------- rows
 
 
 def differing(config, base):

@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from tests.reference import world_model as reference
-from uuvtai.config.learning import WorldModelConfig
+from uuvtai.config.learning import UncertaintyConfig, WorldModelConfig
 from uuvtai.learn.calibration import mean_squared_standardised_residual, spearman
-from uuvtai.learn.normalise import Moments
+from uuvtai.learn.normalise import Moments, moments_of
+from uuvtai.learn.uncertainty import Uncertainty
 from uuvtai.learn.world_model import LOG_VAR_BOUNDS, N_TARGET, Recollection, WorldModel, WorldModelLearner
 
 N_OBS, STEPS, N_ENV = 30, 16, 32
@@ -151,6 +152,35 @@ def test_residual_is_the_error_in_deviations_of_the_change():
     sigma = (predicted.log_var.exp() / change**2).mean(dim=1)
     drawn_twice = 0.1  # statistics are of drawn samples, not of all of them
     torch.testing.assert_close(model.features(obs, action, next_obs), torch.stack([expected, sigma], 1), rtol=drawn_twice, atol=0.0)
+
+
+def test_in_the_decoders_unit_the_uncertainty_is_the_papers_to_the_letter():
+    """sigma_t = mean(exp(log variance)) as the decoder says it, whatever the targets' one-step changes are."""
+    for switches in ({}, {"normalise_targets": False}, {"predict_change": False}, {"predict_change": False, "normalise_targets": False}):
+        model, _, _ = trained(3, SMALL.model_copy(update={"error_unit": "decoder", **switches}))
+        obs, action, next_obs = (part[0] for part in transitions(5))
+        with torch.no_grad():
+            mean, log_var = model.decode(model.advance(model.encode(obs), action))
+            target = (next_obs[:, :N_TARGET] - model.base(obs)) / model.scale()
+        expected = torch.stack([(target - mean).square().mean(1).sqrt(), log_var.exp().mean(1)], 1)
+        torch.testing.assert_close(model.features(obs, action, next_obs), expected, rtol=ROUNDING, atol=1e-5)
+
+
+def test_sure_of_small_raw_targets_the_paper_scales_little_and_the_change_to_the_cap():
+    """A decoder that says "0.2 m give or take" of targets that change by 0.01 m: sigma_t is 0.04 in its own unit, 400 in changes."""
+    scales = {}
+    for unit in ("decoder", "change"):
+        config = SMALL.model_copy(update={"predict_change": False, "normalise_targets": False, "error_unit": unit})
+        model = WorldModel(N_OBS, config, generator())
+        rows = 0.01 * torch.randn(4000, N_TARGET, generator=generator(3))
+        model.observe(moments_of(torch.zeros(10, N_OBS)), moments_of(rows))
+        with torch.no_grad():
+            model.decoder[-1].weight.zero_()
+            model.decoder[-1].bias[N_TARGET:] = math.log(0.04)
+        uncertainty = Uncertainty(UncertaintyConfig())
+        uncertainty.update(model.features(torch.zeros(5, N_OBS), torch.zeros(5, 4), torch.zeros(5, N_OBS))[:, 1])
+        scales[unit] = uncertainty.scale
+    assert scales["decoder"] == pytest.approx(1 + 0.8 * 0.04, rel=0.02) and scales["change"] == UncertaintyConfig().max_scale
 
 
 def test_memory_gives_the_features_of_the_last_step_and_forgets_where_it_is_told_to():

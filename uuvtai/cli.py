@@ -65,6 +65,15 @@ Vehicle = Annotated[
 Static = Annotated[int | None, typer.Option("-S", help="Static obstacles.")]
 Dynamic = Annotated[int | None, typer.Option("-D", help="Moving obstacles.")]
 Speed = Annotated[float | None, typer.Option("-v", help="Speed of the moving obstacles \\[m/s].")]
+Stack = Annotated[
+    str | None,
+    typer.Option(
+        "--stack",
+        metavar=_NAME,
+        help=f"How the classical half works: {choices.names('stack')} (as in the paper), or a YAML file \\[default: ours].",
+        autocompletion=choices.presets("stack"),
+    ),
+]
 Set = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a config key: key.sub=value (repeatable).")]
 Device = Annotated[str, choices.device()]
 RunDir = Annotated[Path | None, typer.Option("--run-dir", help="The run's folder \\[default: runs/TIME_PRESET].")]
@@ -93,13 +102,15 @@ def evaluate(
             "--controller",
             metavar="NAME|FILE",
             autocompletion=choices.controllers,
-            help="straight, planner, bt or a tree's XML (repeatable); none = policies alone \\[default: all three, beside a RUN bt]. "
+            help="straight, planner, bt or a tree's XML (repeatable); paper = bt on the paper's own stack, a row of its own; "
+            "none = policies alone \\[default: straight, planner, bt, beside a RUN bt]. "
             "Privileged yardsticks: NAME+truth (a tree that knows where every moving body is), oracle (knows the future: an upper bound).",
         ),
     ] = None,
     world: World = "pool",
     sensors: Sensors = None,
     vehicle: Vehicle = None,
+    stack: Stack = None,
     episodes: Annotated[int, typer.Option("--episodes", help="Episodes per seed.")] = 64,
     seeds: Annotated[str, typer.Option("--seeds", "--seed", help="Seeds, separated by commas.")] = "0",
     n_static: Static = None,
@@ -140,7 +151,7 @@ def evaluate(
         if not explain:
             raise UsageError("--explain-record: give --explain too, it says which episodes to record")
     policies = runs or []
-    config = _config(world, sensors, vehicle, n_static, n_dynamic, speed, overrides, _policy_features(policies))
+    config = _config(world, sensors, vehicle, n_static, n_dynamic, speed, overrides, [*_policy_features(policies), *_stack(stack)])
 
     from uuvtai.loader import sensors_of
     from uuvtai.measure.compare import Request, compare
@@ -252,6 +263,7 @@ def train_policy(
             autocompletion=choices.presets("sensors"),
         ),
     ] = None,
+    stack: Stack = None,
     n_static: Static = None,
     n_dynamic: Dynamic = None,
     speed: Speed = None,
@@ -269,12 +281,12 @@ def train_policy(
     if resume is None:
         sizes = [(f"train.{key}", value) for key, value in (("num_envs", num_envs), ("seed", seed)) if value is not None]
         chosen = preset or "best"
-        typed = [*sizes, *_scene_flags(n_static, n_dynamic, speed), *(overrides or [])]
+        typed = [*sizes, *_stack(stack), *_scene_flags(n_static, n_dynamic, speed), *(overrides or [])]
         config = load_training(chosen, typed, world, sensors)
         request = TrainRequest(config=config, preset=chosen, iterations=iterations, device=device, run_dir=run_dir)
     else:
         given = {"PRESET": preset, "--num-envs": num_envs, "--seed": seed, "--world": world, "--sensors": sensors}
-        given |= {"-S": n_static, "-D": n_dynamic, "-v": speed, "--run-dir": run_dir}
+        given |= {"--stack": stack, "-S": n_static, "-D": n_dynamic, "-v": speed, "--run-dir": run_dir}
         _refuse_beside_resume(given)
         request = TrainRequest(resume=resume, overrides=list(overrides or []), iterations=iterations, device=device)
     result, folder = train(request, TrainingProgress())
@@ -381,6 +393,7 @@ def sweep(
     world: World = "pool",
     sensors: Sensors = None,
     vehicle: Vehicle = None,
+    stack: Stack = None,
     n_static: Static = None,
     n_dynamic: Dynamic = None,
     speed: Speed = None,
@@ -410,7 +423,7 @@ def sweep(
     _at_least("--workers", workers, 1)
     if resume is not None:
         given = {"RUN": runs, "--controller": controller, "--grid": grid, "--set": overrides, "--run-dir": run_dir, "--num-envs": num_envs}
-        given |= {"--sensors": sensors, "--vehicle": vehicle, "-S": n_static, "-D": n_dynamic, "-v": speed}
+        given |= {"--sensors": sensors, "--vehicle": vehicle, "--stack": stack, "-S": n_static, "-D": n_dynamic, "-v": speed}
         _refuse_beside_resume(given)
         result, folder = go_on(resume, _engine(engine, workers, address), _Progress("cells"))
     else:
@@ -420,7 +433,7 @@ def sweep(
             world=world,
             sensors=sensors,
             vehicle=vehicle,
-            overrides=(*_scene_flags(n_static, n_dynamic, speed), *(overrides or [])),
+            overrides=(*_stack(stack), *_scene_flags(n_static, n_dynamic, speed), *(overrides or [])),
             controllers=tuple(_controllers(controller or ["bt"], bool(policies))),
             policies=tuple(policies),
             seeds=tuple(_seeds(seeds)),
@@ -472,6 +485,7 @@ def profile(
     ] = "curriculum",
     world: World = "pool",
     sensors: Sensors = None,
+    stack: Stack = None,
     n_static: Static = None,
     n_dynamic: Dynamic = None,
     speed: Speed = None,
@@ -489,7 +503,7 @@ def profile(
     from uuvtai.loader import load_training
     from uuvtai.measure.profiling import profile as run
 
-    config = load_training(preset, [*_scene_flags(n_static, n_dynamic, speed), *(overrides or [])], world, sensors)
+    config = load_training(preset, [*_stack(stack), *_scene_flags(n_static, n_dynamic, speed), *(overrides or [])], world, sensors)
 
     result = run(config, sizes, controller, device, seconds, density, _say)
     if as_json:
@@ -703,7 +717,8 @@ def _shown(kind: str, name: str) -> Any:
 
         return find_policy(name).config
     chosen = {"world": "pool", kind: name}
-    return loader.load_config(chosen["world"], chosen.get("sensors"), chosen.get("vehicle"))
+    stack = {"stack": name} if kind == "stack" else {}
+    return loader.load_config(chosen["world"], chosen.get("sensors"), chosen.get("vehicle"), stack)
 
 
 @app.command(epilog="Example: uuv doctor --json")
@@ -846,6 +861,10 @@ def _config(world, sensors, vehicle, n_static, n_dynamic, speed, overrides, firs
 def _scene_flags(n_static: int | None, n_dynamic: int | None, speed: float | None) -> list[tuple[str, Any]]:
     flags = {"n_static": n_static, "n_dynamic": n_dynamic, "dynamic_speed_m_s": speed}
     return [(f"world.{key}", value) for key, value in flags.items() if value is not None]
+
+
+def _stack(name: str | None) -> list[tuple[str, Any]]:
+    return [] if name is None else [("stack", name)]
 
 
 def _seeds(text: str) -> list[int]:

@@ -2,8 +2,9 @@
 
 A preset is a YAML file that states differences only. Its top-level keys are config sections, plus ``extends`` (another preset of the same
 kind) and, in a world, ``sensors: NAME`` or ``vehicle: NAME`` in place of a section. A training preset may name all three, ``world: NAME``
-or, to change something in it, ``world: {preset: NAME, ...}``. Loading never executes code: safe YAML, no tags, no aliases, no duplicate
-keys, at most 1 MiB.
+or, to change something in it, ``world: {preset: NAME, ...}``, and ``stack: NAME``. A stack preset says how the classical half works
+(``STACK_SECTIONS``) and names a ``tree``; ``--set stack=NAME`` puts one below everything else that is set. Loading never executes code:
+safe YAML, no tags, no aliases, no duplicate keys, at most 1 MiB.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ from uuvtai.shipped import preset_names, shipped_file
 
 DEFAULT_WORLD, DEFAULT_SENSORS = "pool", "paper"
 _SCENE_KINDS = ("world", "sensors", "vehicle")
+STACK_SECTIONS = ("tracking", "forecast", "elevation", "spotting", "mapping", "clearance", "voronoi", "route", "teacher")
+"""what a stack preset may set: nothing that a scenario, a sensor, the referee or the observation's columns depend on"""
 _LEARNING_SECTIONS = LearningConfig.model_fields.keys() - Config.model_fields.keys()
 MAX_BYTES = 1 << 20
 """of a YAML file"""
@@ -62,11 +65,13 @@ def load_config(
 ) -> Config:
     """Config of a world (preset name or path) with a sensor and a vehicle preset on top, then overrides.
 
-    ``overrides`` maps dotted keys to values, or lists (key, value) pairs and ``key.sub=value`` texts as typed on the command line.
-    Without ``sensors`` the world's own choice counts, else ``paper``. Raises ConfigError.
+    ``overrides`` maps dotted keys to values, or lists (key, value) pairs and ``key.sub=value`` texts as typed on the command line;
+    ``stack`` among them names a stack preset. Without ``sensors`` the world's own choice counts, else ``paper``. Raises ConfigError.
     """
+    typed = _overrides(overrides or {})
     merged = _scene(world, sensors, vehicle)
-    merged.merge(_overrides(overrides or {}))
+    merged.merge(_stack_of(typed))
+    merged.merge(typed)
     return validated(merged.tree, merged.origin)
 
 
@@ -89,10 +94,47 @@ def load_training(
                 f"{layer.origin.get(f'{kind}.preset', preset)}: {kind}.preset must be the name or path of a {kind} preset, got {name!r}"
             )
     chosen_world = world or named.get("world") or DEFAULT_WORLD
+    typed = _overrides(overrides or {})
     merged = _scene(chosen_world, sensors or named.get("sensors"), vehicle or named.get("vehicle"))
+    own, asked = _stack_of(layer), _stack_of(typed)
+    merged.merge(asked if asked.tree or "stack" in typed.origin else own)
     merged.merge(layer)
-    merged.merge(_overrides(overrides or {}))
+    merged.merge(typed)
     return _checked(LearningConfig, merged.tree, merged.origin)
+
+
+def with_stack(config: AnyConfig, stack: str) -> AnyConfig:
+    """The config with what a stack preset (name or path) states in place of its own. Raises ConfigError."""
+    merged = _Layer(config.model_dump(mode="json"))
+    merged.merge(_read_stack(stack))
+    return _checked(type(config), merged.tree, merged.origin)
+
+
+def tree_of_stack(stack: str) -> str:
+    """Name of the tree that drives a stack (name or path of its preset). Raises ConfigError."""
+    tree = _read_preset("stack", stack).tree.get("tree")
+    if not isinstance(tree, str):
+        raise ConfigError(f"{preset_path('stack', stack)}: needs 'tree:', the name of the behaviour tree that drives, for example tree: bt")
+    return tree
+
+
+def _stack_of(layer: _Layer) -> _Layer:
+    """What the stack preset says that a layer names, which loses the name; nothing where it names none."""
+    name = layer.tree.pop("stack", None)
+    if name is None:
+        return _Layer()
+    if not isinstance(name, str):
+        raise ConfigError(f"{layer.origin.get('stack', 'stack')}: stack must be the name or path of a stack preset, got {name!r}")
+    return _read_stack(name)
+
+
+def _read_stack(name: str) -> _Layer:
+    """Sections of a stack preset, without its tree."""
+    layer = _read_preset("stack", name)
+    layer.tree.pop("tree", None)
+    for key in layer.tree.keys() - set(STACK_SECTIONS):
+        raise ConfigError(f"{layer.origin[key]}: a stack cannot set '{key}'; it has {', '.join(STACK_SECTIONS)} and tree")
+    return layer
 
 
 def scene_of(preset: str) -> dict[str, str | None]:
@@ -137,7 +179,9 @@ def _checked(model: type[AnyConfig], tree: dict[str, Any], origin: dict[str, str
 def load_resolved(path: Path, overrides: Overrides | None = None) -> Config:
     """Config from a run folder's ``config.yaml`` (complete, no presets), then overrides; of a training run, a LearningConfig."""
     layer = _read_yaml(path, path.parent)
-    layer.merge(_overrides(overrides or {}))
+    typed = _overrides(overrides or {})
+    layer.merge(_stack_of(typed))
+    layer.merge(typed)
     return _checked(LearningConfig if _LEARNING_SECTIONS & layer.tree.keys() else Config, layer.tree, layer.origin)
 
 
@@ -172,7 +216,7 @@ def preset_path(kind: str, name: str) -> Path:
         return path
     if name not in preset_names(kind):
         raise ConfigError(
-            f"{kind} {name!r} is no preset{_nearest(name, preset_names(kind))}; there are: {', '.join(preset_names(kind))} "
+            f"{kind} {name!r} is no preset{nearest(name, preset_names(kind))}; there are: {', '.join(preset_names(kind))} "
             f"(see 'uuv presets'), or give the path of a {suffix} file"
         )
     return shipped_file(kind, name)
@@ -327,7 +371,7 @@ def _explained(error: ValidationError, origin: dict[str, str], model: type[BaseM
         dotted = ".".join(str(part) for part in problem["loc"])
         where = _origin_of(dotted, origin)
         if problem["type"] == "extra_forbidden":
-            lines.append(f"{where}unknown key '{dotted}'{_nearest(dotted.rsplit('.', 1)[-1], _siblings(problem['loc'], model))}")
+            lines.append(f"{where}unknown key '{dotted}'{nearest(dotted.rsplit('.', 1)[-1], _siblings(problem['loc'], model))}")
         else:
             got = problem.get("input")
             lines.append(f"{where}{dotted}: {problem['msg']} (got {got!r})")
@@ -362,6 +406,7 @@ def _inner_model(annotation: Any) -> type[BaseModel] | None:
     return None
 
 
-def _nearest(name: str, names: list[str]) -> str:
+def nearest(name: str, names: list[str]) -> str:
+    """'; did you mean ...?' where a name is like one of those that there are, else nothing."""
     close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
     return f"; did you mean '{close[0]}'?" if close else ""

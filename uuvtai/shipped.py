@@ -9,6 +9,7 @@ KINDS = {
     "world": "worlds",
     "sensors": "sensors",
     "vehicle": "vehicles",
+    "stack": "stacks",
     "tree": "trees",
     "train": "train",
     "grid": "grids",

@@ -18,7 +18,7 @@ from uuvtai.config.learning import LearningConfig
 Schema = dict[str, Any]
 Model = type[BaseModel]
 
-KINDS = ("world", "sensors", "vehicle", "train")
+KINDS = ("world", "sensors", "vehicle", "stack", "train")
 """of presets that set config keys"""
 
 UNITS = {

@@ -119,6 +119,9 @@ class WorldModelConfig(Section):
     """weight of each term by its variance to this power (Seitzer 2022); 0 = plain likelihood"""
     normalise_targets: bool = True
     """metres, radians and m/s do not average: targets by their running mean and deviation"""
+    error_unit: Literal["change", "decoder"] = "change"
+    """what the features, residual and uncertainty, count errors in: deviations of each target's one-step change, in which an uncertainty
+    of 1 is no better than "as before"; or the decoder's own unit, as in the paper: mean(exp(log variance)) as the decoder says it"""
     stop_target_gradient: bool = True
     """no gradient through the encoding of the next observation, or the latent collapses"""
 

@@ -11,7 +11,7 @@ from uuvtai.learn.normalise import RunningNorm
 from uuvtai.learn.pilot import Pilot
 from uuvtai.learn.policy import Policy
 from uuvtai.learn.risk import RiskHead
-from uuvtai.learn.world_model import WorldModel, deviation
+from uuvtai.learn.world_model import WorldModel
 
 NO_LIMIT = float(torch.finfo(torch.float32).max)
 """of a normaliser that has seen nothing and therefore cuts nothing off"""
@@ -41,7 +41,7 @@ def _world_model(model: WorldModel) -> Iterator[tuple[str, Tensor]]:
     yield from _norm("world_norm", model.observation_norm)
     yield "target.scale", model.scale()
     yield "target.base", model.base(torch.zeros(model.n_obs, device=model.change_norm.mean.device))
-    yield "change.unit", deviation(model.change_norm.moments)
+    yield "change.unit", model.error_unit()
 
 
 def _risk(head: RiskHead) -> Iterator[tuple[str, Tensor]]:

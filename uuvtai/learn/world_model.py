@@ -103,18 +103,18 @@ class WorldModel(nn.Module):
     def features(self, obs: Tensor, action: Tensor, next_obs: Tensor) -> Tensor:
         """Columns of the policy's input at ``next_obs``, (N, 2): one-step residual and uncertainty of the prediction made before it.
 
-        Both are free of units, because errors are counted in the running deviation of each target's one-step change: the residual is the
-        root mean square of the errors, the uncertainty sigma_t = mean(exp(log_var)) the mean predicted variance: 1 = no better than saying
-        "as before". What is not finite becomes 0.
+        Errors are counted in ``error_unit``: the residual is the root mean square of the errors, the uncertainty
+        sigma_t = mean(exp(log_var)) the mean predicted variance. In deviations of the one-step change 1 = no better than saying "as
+        before". What is not finite becomes 0.
         """
         predicted = self.predict(obs, action)
-        unit = deviation(self.change_norm.moments)
-        residual = ((next_obs[..., :N_TARGET] - predicted.mean) / unit).clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS).square().mean(dim=-1).sqrt()
+        error = ((next_obs[..., :N_TARGET] - predicted.mean) / self.error_unit()).clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS)
+        residual = error.square().mean(dim=-1).sqrt()
         return torch.stack([residual, self.uncertainty(predicted)], dim=-1).nan_to_num_(0.0, 0.0, 0.0)
 
     def uncertainty(self, predicted: Prediction) -> Tensor:
-        """sigma_t (...,): mean over the targets of predicted variance in parts of the running variance of the one-step change."""
-        return torch.exp(predicted.log_var - 2.0 * deviation(self.change_norm.moments).log()).mean(dim=-1)
+        """sigma_t (...,): mean over the targets of predicted variance in squares of ``error_unit``."""
+        return torch.exp(predicted.log_var - 2.0 * self.error_unit().log()).mean(dim=-1)
 
     def loss(self, obs: Tensor, action: Tensor, next_obs: Tensor, valid: Tensor) -> Losses:
         """Losses of a batch: obs, next_obs (B, n_obs), action (B, 4), valid (B,) bool. ``next_obs`` is the true one, also at an end."""
@@ -154,6 +154,10 @@ class WorldModel(nn.Module):
         if self.config.predict_change:
             return deviation(self.change_norm.moments)
         return deviation(self.observation_norm.moments)[:N_TARGET]
+
+    def error_unit(self) -> Tensor:
+        """(24,) SI units that the features count errors in (``config.error_unit``)."""
+        return deviation(self.change_norm.moments) if self.config.error_unit == "change" else self.scale()
 
 
 def deviation(moments: Moments) -> Tensor:

@@ -83,7 +83,8 @@ FORMULAS = {
     ),
     "map_clearance": (
         "Distance between the centre of a cell and the centre of the nearest cell that is occupied (>= mapping.occupied in the "
-        "layers named by voronoi.use) or whose centre lies outside the tank; clearance.max_m stands for 'at least'. Computed "
+        "layers named by voronoi.use), less clearance.inflate_m, or whose centre lies outside the tank; clearance.max_m stands for 'at "
+        "least'. Computed "
         "every clearance.period_steps from the map of that step: its time is the timestamp of /map/clearance and /map/risk, "
         "which on a replan may lie before their log time."
     ),

@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     from uuvtai.sim import Sim
     from uuvtai.tree import FlatTree
 
+    Simulators = dict[str | None, Sim]
+    """by the stack that drives; None = the request's own"""
+
 ORACLE = "oracle"
 """controller that is asked, not driven: the privileged upper bound"""
 
@@ -63,17 +66,15 @@ def compare(request: Request, watch: Watch) -> tuple[dict[str, Any], Path]:
     if len(set(request.seeds)) != len(request.seeds):
         raise ConfigError(f"--seeds {','.join(map(str, request.seeds))}: a seed is given twice; its episodes would be the same")
     refuse_place(request.run_dir)
-    from uuvtai.sim import Sim
-
     methods = _methods(request, watch)
     num_envs = request.num_envs or min(len(request.seeds) * request.episodes, _BATCH)
     watch.note(_STARTING.format(num_envs))
-    sim = Sim(request.config, num_envs, methods[0].tree if methods else _any_tree(), request.device)
-    policies = {method.name: method.driver_for(sim) for method in methods}
+    sims = _simulators(request, num_envs, methods)
+    policies = {method.name: method.driver_for(sims[method.stack]) for method in methods}
     folder = RunFolder(request.run_dir or default_run_dir(request.world), request.config, request.seeds)
     with _going_on(folder, watch):
-        folder.write_json(REQUEST, document_of(request, num_envs, sim.device.type, drivers_of(methods)))
-        return _compared(request, sim, methods, policies, folder, watch), folder.path
+        folder.write_json(REQUEST, document_of(request, num_envs, _any_of(sims).device.type, drivers_of(methods)))
+        return _compared(request, sims, methods, policies, folder, watch), folder.path
 
 
 def resume(place: Path, watch: Watch) -> tuple[dict[str, Any], Path]:
@@ -82,8 +83,6 @@ def resume(place: Path, watch: Watch) -> tuple[dict[str, Any], Path]:
     The document is that of an undisturbed evaluation, times of the machine excepted. Raises RunFolderError, FileError, ConfigError,
     CheckpointError.
     """
-    from uuvtai.sim import Sim
-
     folder = RunFolder.held(place, "uuv eval")
     try:
         request, drivers = read_request(place)
@@ -96,9 +95,9 @@ def resume(place: Path, watch: Watch) -> tuple[dict[str, Any], Path]:
     with _going_on(folder, watch):
         watch.note(_STARTING.format(request.num_envs))
         assert request.num_envs is not None  # the file states it
-        sim = Sim(request.config, request.num_envs, methods[0].tree if methods else _any_tree(), request.device)
-        policies = {method.name: method.driver_for(sim) for method in methods}
-        return _compared(request, sim, methods, policies, folder, watch), place
+        sims = _simulators(request, request.num_envs, methods)
+        policies = {method.name: method.driver_for(sims[method.stack]) for method in methods}
+        return _compared(request, sims, methods, policies, folder, watch), place
 
 
 @contextmanager
@@ -117,8 +116,22 @@ def _going_on(folder: RunFolder, watch: Watch) -> Iterator[None]:
         watch.stop()
 
 
+def _simulators(request: Request, num_envs: int, methods: list[Method]) -> Simulators:
+    """A simulator for the request's own config and one for every stack that drives a row; the episodes are the same in all."""
+    from uuvtai.sim import Sim
+
+    configs = {method.stack: method.config_of(request.config) for method in methods} or {None: request.config}
+    tree = methods[0].tree if methods else _any_tree()
+    return {stack: Sim(config, num_envs, tree, request.device) for stack, config in configs.items()}
+
+
+def _any_of(sims: Simulators) -> Sim:
+    """For what is the same in all of them."""
+    return next(iter(sims.values()))
+
+
 def _compared(
-    request: Request, sim: Sim, methods: list[Method], policies: dict[str, PolicyNote | None], folder: RunFolder, watch: Watch
+    request: Request, sims: Simulators, methods: list[Method], policies: dict[str, PolicyNote | None], folder: RunFolder, watch: Watch
 ) -> dict[str, Any]:
     """Play what is not over yet; the whole document, and all that is written and drawn of it."""
     from uuvtai.measure.ceilings import condition_of, remainder_of, scenarios_of
@@ -131,17 +144,17 @@ def _compared(
     ledger = Ledger(folder.path)
     try:
         for method in methods:
-            _play(request, sim, method, policies[method.name], jobs, folder, ledger, watch, played, entries)
+            _play(request, sims[method.stack], method, policies[method.name], jobs, folder, ledger, watch, played, entries)
     finally:
         ledger.close()
-    scenarios = scenarios_of(sim, jobs)
+    scenarios = scenarios_of(_any_of(sims), jobs)
     if ORACLE in request.controllers:
         entries.append(_ask_oracle(request, jobs, scenarios, watch))
     result = document(request.config, request.world, request.sensors, request.seeds, request.episodes, entries)
     result |= {"condition": condition_of(request.config, scenarios), "remainder": remainder_of(entries)}
     _write_results(folder, result, played)
     if request.explain:
-        _explain(request, sim, played, result, folder, watch)
+        _explain(request, sims, played, result, folder, watch)
     _draw(request, folder.path, [p.logs for p in played if p.logs], watch)
     return result
 
@@ -250,14 +263,14 @@ def _write_results(folder: RunFolder, result: dict[str, Any], played: list[_Play
     folder.write_json("eval/tree.json", {"schema": 1, "use": {p.method.name: p.use for p in driving}})
 
 
-def _explain(request: Request, sim: Sim, played: list[_Played], result: dict[str, Any], folder: RunFolder, watch: Watch) -> None:
+def _explain(request: Request, sims: Simulators, played: list[_Played], result: dict[str, Any], folder: RunFolder, watch: Watch) -> None:
     """Replay what failed, add the causes to the document, record the worst. What is known is written before the next long step begins."""
     from uuvtai.measure.explain import chosen_for_recording, explain_failures, failures, record_worst, table_of
 
     explained = {}
     driven = [entry for entry in result["methods"] if entry["name"] != ORACLE]
     for entry, p in zip(driven, played, strict=True):
-        label = entry["name"]
+        label, sim = entry["name"], sims[p.method.stack]
         sim.privileged = p.method.privileged
         watch.start(f"{label}: replaying failures", len(failures(p.results)))
         explained[label] = explain_failures(sim, p.method.tree, p.results, watch.update, p.policy.pilot if p.policy else None)
@@ -266,7 +279,7 @@ def _explain(request: Request, sim: Sim, played: list[_Played], result: dict[str
         entry["explain"] = [row.document() for row in explained[label]]
     _write_causes(folder, result)
     for entry, p in zip(driven, played, strict=True):
-        label = entry["name"]
+        label, sim = entry["name"], sims[p.method.stack]
         sim.privileged = p.method.privileged
         chosen = chosen_for_recording(explained[label], request.explain_record)
         paths = record_worst(sim, p.method.tree, chosen, folder.path / "explain", request.world, label, watch.note, p.policy)

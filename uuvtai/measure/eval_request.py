@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from uuvtai.config import Config
 from uuvtai.files import read_text
-from uuvtai.loader import ConfigError, preset_names, validated
+from uuvtai.loader import ConfigError, preset_names, read_preset, validated
 from uuvtai.run_folder import RunFolderError
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ class Request:
     world: str
     sensors: str
     controllers: list[str]
-    """names of trees, paths of XML files, either with ``+truth``; ``oracle``"""
+    """names of trees or stacks, paths of XML or YAML files, each perhaps with ``+truth``; ``oracle``"""
     seeds: list[int]
     episodes: int
     policies: tuple[str, ...] = ()
@@ -100,7 +100,7 @@ def _found_again(request: Request, cwd: Path) -> Request:
     """Paths that were typed in another folder, seen from this one; names of what is shipped stay names."""
 
     def seen(kind: str, name: str) -> str:
-        is_path = name not in preset_names(kind) and (kind == "policy" or name.endswith(".xml"))
+        is_path = name not in preset_names(kind) and (kind == "policy" or name.endswith((".xml", ".yaml", ".yml")))
         return str(cwd / name) if is_path and not Path(name).exists() else name
 
     controllers = [seen("tree", name) for name in request.controllers]
@@ -108,7 +108,7 @@ def _found_again(request: Request, cwd: Path) -> Request:
 
 
 def drivers_of(methods: list[Method]) -> dict[str, str]:
-    """sha256 of what drives, by method: of a policy's checkpoint, of a tree as it is played."""
+    """sha256 of what drives, by method: of a policy's checkpoint, of a tree as it is played, with its stack."""
     return {method.name: method.checkpoint.sha256 if method.checkpoint else _tree_sha256(method) for method in methods}
 
 
@@ -123,4 +123,5 @@ def refuse_others(place: Path, before: dict[str, str], now: dict[str, str]) -> N
 def _tree_sha256(method: Method) -> str:
     tree = dataclasses.asdict(method.tree)
     tree.pop("source")
-    return hashlib.sha256(json.dumps([tree, method.privileged]).encode()).hexdigest()
+    stack = [] if method.stack is None else [read_preset("stack", method.stack)]
+    return hashlib.sha256(json.dumps([tree, method.privileged, *stack]).encode()).hexdigest()

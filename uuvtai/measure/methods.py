@@ -1,4 +1,4 @@
-"""What drives an evaluation: behaviour trees by name, trained policies by run folder, checkpoint folder or shipped name."""
+"""What drives an evaluation: behaviour trees and stacks by name, trained policies by run folder, checkpoint folder or shipped name."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from uuvtai.config import Config
-from uuvtai.loader import ConfigError
+from uuvtai.loader import ConfigError, nearest, preset_path, tree_of_stack, with_stack
 from uuvtai.shipped import PRESET_DIR, preset_names
 from uuvtai.tree import FlatTree, read_tree
 
@@ -37,6 +37,12 @@ class Method:
     """None = the tree drives"""
     privileged: bool = False
     """its tracks of moving bodies are the truth"""
+    stack: str | None = None
+    """stack preset (name or path) that this row alone drives with; None = the request's own"""
+
+    def config_of(self, config: Config) -> Config:
+        """What this method's simulator runs on; scenarios, sensors and referee are those of ``config``. Raises ConfigError."""
+        return config if self.stack is None else with_stack(config, self.stack)
 
     def driver_for(self, sim: Sim) -> PolicyNote | None:
         """The policy ready for this simulator's rows; None where the tree drives. Raises CheckpointError for one that does not fit."""
@@ -52,21 +58,39 @@ class Method:
         return PolicyNote(pilot, self.checkpoint.sha256, weight if isinstance(weight, float) else None)
 
     def document(self) -> dict[str, Any]:
-        """What ``uuv eval --json`` says of a policy beside its results."""
+        """What ``uuv eval --json`` says of a policy or a stack beside its results."""
         if self.checkpoint is None:
-            return {}
+            return {} if self.stack is None else {"stack": {"preset": self.stack, "tree": tree_of_stack(self.stack)}}
         found = self.checkpoint
         return {"checkpoint": {"path": str(found.path), "sha256": found.sha256, "step": found.step, "version": found.manifest.version}}
 
 
 def trees_of(names: list[str], max_node: int) -> list[Method]:
-    """Methods that a tree drives, by names of trees or paths of their XML, each perhaps with ``+truth``. Raises ConfigError."""
+    """Methods that a tree drives, by names of trees or stacks or paths of their XML or YAML, each perhaps with ``+truth``. ConfigError."""
     found = {}
     for name in names:
-        tree, privileged = _parted(name)
-        label = f"{_label(tree)}+{TRUTH}" if privileged else _label(tree)
-        found[label] = Method(label, read_tree(tree, max_node), privileged=privileged)
+        driver, privileged = _parted(name)
+        label = f"{_label(driver)}+{TRUTH}" if privileged else _label(driver)
+        stack = driver if _is_stack(driver) else None
+        tree = tree_of_stack(driver) if stack else driver
+        found[label] = Method(label, read_tree(tree, max_node), privileged=privileged, stack=stack)
     return list(found.values())
+
+
+def _is_stack(name: str) -> bool:
+    """Whether a controller's name is that of a stack preset, or a path of one; ConfigError for what is neither tree nor stack."""
+    if name.endswith((".yaml", ".yml")):
+        preset_path("stack", name)
+        return True
+    trees, stacks = preset_names("tree"), preset_names("stack")
+    if name in stacks and name not in trees:
+        return True
+    if name not in trees and not name.endswith(".xml") and "/" not in name:
+        raise ConfigError(
+            f"--controller: {name!r} is no preset of a tree or a stack{nearest(name, [*trees, *stacks])}; trees: {', '.join(trees)}; "
+            f"stacks: {', '.join(stacks)}; or give the path of a tree's .xml or a stack's .yaml"
+        )
+    return False
 
 
 def policies_of(names: list[str], max_node: int, note: Callable[[str], None]) -> list[Method]:
@@ -136,7 +160,7 @@ def policy_name(name: str, checkpoint: Checkpoint) -> str:
 
 def _parted(name: str) -> tuple[str, bool]:
     """(tree, whether it is told the truth) of a controller's name. Raises ConfigError."""
-    if "+" not in name or name.endswith(".xml"):
+    if "+" not in name or name.endswith((".xml", ".yaml", ".yml")):
         return name, False
     tree, _, suffix = name.rpartition("+")
     if suffix != TRUTH:
@@ -145,4 +169,4 @@ def _parted(name: str) -> tuple[str, bool]:
 
 
 def _label(name: str) -> str:
-    return Path(name).stem if name.endswith(".xml") else name
+    return Path(name).stem if name.endswith((".xml", ".yaml", ".yml")) else name

@@ -53,11 +53,11 @@ def presets(kind: str, *more: str, suffix: str = ".yaml") -> Complete:
 
 
 def controllers(incomplete: str) -> list[str]:
-    """Trees, yardsticks that are told the truth, and files of trees; after a comma the next one."""
+    """Trees, stacks, yardsticks that are told the truth, and files of trees and stacks; after a comma the next one."""
     before, comma, last = incomplete.rpartition(",")
     trees = preset_names("tree")
-    found = _starting([*trees, *(f"{tree}+truth" for tree in trees), "oracle", "none"], last) + _paths(
-        last, lambda path: path.suffix == ".xml"
+    found = _starting([*trees, *preset_names("stack"), *(f"{tree}+truth" for tree in trees), "oracle", "none"], last) + _paths(
+        last, lambda path: path.suffix in (".xml", ".yaml")
     )
     return [f"{before}{comma}{name}" for name in found]
 

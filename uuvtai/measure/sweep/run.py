@@ -93,7 +93,7 @@ def resolved(request: SweepRequest, watch: Watch) -> tuple[SweepRequest, list[Me
     trees = trees_of(list(request.controllers), limit)
     policies = tuple(str(Path(name).resolve()) if Path(name).exists() else name for name in request.policies)
     trained = policies_of(list(policies), limit, watch.note)
-    controllers = [str(Path(name).resolve()) if name.endswith(".xml") else name for name in request.controllers]
+    controllers = [str(Path(name).resolve()) if name.endswith((".xml", ".yaml", ".yml")) else name for name in request.controllers]
     methods: list[MethodKey] = [(tree.name, name, None) for tree, name in zip(trees, controllers, strict=True)]
     methods += [(method.name, None, name) for method, name in zip(trained, policies, strict=True)]
     features = features_of(list(policies)) if policies else []

@@ -55,7 +55,7 @@ def play(task: Task) -> list[Row]:
     limit = task.config.teacher.max_node
     found = trees_of([task.controller], limit) if task.controller else policies_of([task.policy or ""], limit, lambda _text: None)
     method = found[0]
-    sim = _sim_of(task)
+    sim = _sim_of(task, method.config_of(task.config))
     sim.use_tree(method.tree)
     jobs = [Job(seed, episode, scene) for scene in task.scenes for seed in task.seeds for episode in range(task.episodes)]
     note = method.driver_for(sim)
@@ -64,15 +64,15 @@ def play(task: Task) -> list[Row]:
     return [row_of(method.name, label, results[i * each : (i + 1) * each]) for i, label in enumerate(task.labels)]
 
 
-def _sim_of(task: Task) -> Sim:
+def _sim_of(task: Task, config: Config) -> Sim:
     from uuvtai.measure.methods import TRAINING_TREE
     from uuvtai.sim import Sim
     from uuvtai.tree import read_tree
 
-    key = (task.config.model_dump_json(), task.num_envs, task.device)
+    key = (config.model_dump_json(), task.num_envs, task.device)
     if _kept.key != key:
         _kept.key, _kept.sim = None, None
-        _kept.sim = Sim(task.config, task.num_envs, read_tree(TRAINING_TREE, task.config.teacher.max_node), task.device)
+        _kept.sim = Sim(config, task.num_envs, read_tree(TRAINING_TREE, config.teacher.max_node), task.device)
         _kept.key = key
     return _kept.sim
 

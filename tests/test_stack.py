@@ -1,0 +1,80 @@
+"""A stack as a row of its own: which simulator it gets, that it meets the same episodes, and its entry in the table."""
+
+import json
+
+import pytest
+
+from uuvtai.loader import STACK_SECTIONS, ConfigError, load_config, tree_of_stack, with_stack
+from uuvtai.measure.compare import Request, compare
+from uuvtai.measure.methods import trees_of
+
+SMALL = {"episode.horizon_steps": 60, "world.n_static": 3, "world.n_dynamic": 2}
+
+
+class Quiet:
+    """Hears nothing of how far a comparison is."""
+
+    def start(self, name, total): ...
+    def note(self, text): ...
+    def update(self, done, total, env_steps, left=None): ...
+    def stop(self): ...
+
+
+def test_a_stacks_name_is_a_controller_with_its_own_config_and_tree(tmp_path):
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("extends: paper\ntree: planner\n")
+    bt, paper, told, own = trees_of(["bt", "paper", "paper+truth", str(mine)], 64)
+    config = load_config("pool")
+    assert (bt.name, bt.stack, bt.document()) == ("bt", None, {}) and bt.config_of(config) is config
+    assert (paper.name, paper.privileged, paper.tree.types) == ("paper", False, bt.tree.types)
+    assert paper.document() == {"stack": {"preset": "paper", "tree": "bt"}}
+    assert paper.config_of(config).voronoi.use == "fused" == told.config_of(config).voronoi.use
+    assert (told.name, told.privileged, own.name) == ("paper+truth", True, "mine") and own.tree.types != bt.tree.types
+
+
+def test_a_controller_that_is_neither_tree_nor_stack_is_refused():
+    with pytest.raises(ConfigError, match="'papr' is no preset of a tree or a stack; did you mean 'paper'"):
+        trees_of(["papr"], 64)
+    with pytest.raises(ConfigError, match=r"nowhere.yaml.*no such file"):
+        trees_of(["nowhere.yaml"], 64)
+
+
+def test_a_stack_touches_nothing_that_makes_an_episode():
+    """World, vehicle, sensors, referee, reward and columns are the request's: rows are paired."""
+    config = load_config("gauntlet", "harsh", overrides={"features.n_track": 2})
+    other = with_stack(config, "paper")
+    same = set(type(config).model_fields) - set(STACK_SECTIONS)
+    assert {"world", "vehicle", "actuation", "disturbance", "sensors", "features", "reward", "episode"} == same
+    assert all(getattr(other, name) == getattr(config, name) for name in same)
+    assert any(getattr(other, name) != getattr(config, name) for name in STACK_SECTIONS)
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory):
+    request = Request(
+        config=load_config("pool", overrides=SMALL), world="pool", sensors="paper", controllers=["bt", "paper"], seeds=[5], episodes=3,
+        record=1, device="cpu", run_dir=tmp_path_factory.mktemp("runs") / "run",
+    )  # fmt: skip
+    return compare(request, Quiet())
+
+
+def test_bt_and_paper_are_two_rows_of_one_table(compared):
+    result, folder = compared
+    bt, paper = result["methods"]
+    assert (bt["name"], paper["name"], paper["stack"]["tree"]) == ("bt", "paper", tree_of_stack("paper"))
+    assert [(d["seed"], d["episode"]) for d in bt["episodes_detail"]] == [(d["seed"], d["episode"]) for d in paper["episodes_detail"]]
+    assert len(result["paired"]) == 1
+    assert bt["episodes_detail"] != paper["episodes_detail"], "they do drive differently"
+    assert (folder / "eval/trees/paper.xml").read_text() == (folder / "eval/trees/bt.xml").read_text()
+
+
+def test_both_rows_meet_the_same_scenarios_and_say_what_they_ran_on(compared):
+    """Each method's own simulator drew the episode that its log describes."""
+    from uuvtai.logs.reader import read_head
+
+    _, folder = compared
+    logs = sorted((folder / "logs").glob("*.mcap"))
+    assert len(logs) == 2
+    first, second = (read_head(log).scenario for log in logs)
+    assert first == second
+    assert json.loads((folder / "eval/result.json").read_text())["methods"][1]["stack"]["preset"] == "paper"
