@@ -15,9 +15,10 @@ from uuvtai.logs.recording import PICTURE_TOPICS, load_recording
 from uuvtai.logs.scenario import body_positions
 from uuvtai.logs.video import FrameArtist, video
 
+INKS = ink.method_inks(["bt", "straight", "planner"])
 N_STEP = 110
 CODEC_ERROR = 40
-"""VP8 keeps colours of small details only so well (0 to 255)"""
+"""VP9 keeps colours of small details only so well (0 to 255)"""
 
 
 def record(path, controller="bt", sway=1.0, outcome="success", number=3):
@@ -67,10 +68,10 @@ def test_picture_has_what_it_should_where_it_should(folder, bt, straight):
     spot = (last.origin_m[0] + (col + 0.5) * last.cell_m, last.origin_m[1] + (row + 0.5) * last.cell_m)
     assert has(around(image, place(spot)), ink.DYNAMIC, 30)
     assert has(around(image, place(episode.GOAL), 5), ink.GOAL)
-    for i, name in enumerate((bt, straight)):
-        path = load_recording(name, PICTURE_TOPICS).positions
+    for name, log in (("bt", bt), ("straight", straight)):
+        path = load_recording(log, PICTURE_TOPICS).positions
         middle = path[len(path) // 4]
-        assert has(around(image, place(middle), 2), ink.METHODS[i])
+        assert has(around(image, place(middle), 2), INKS[name])
     assert has(around(image, place((1.0, 5.0)), 1), ink.WATER, 1)
     assert has(around(image, place((0.0, 3.0)), 2), ink.INK)
     assert (image[5, 5] == 255).all()
@@ -106,8 +107,10 @@ def test_where_methods_go_the_same_way_both_are_seen(folder, bt):
     loaded = [load_recording(path, PICTURE_TOPICS) for path in (bt, twin)]
     image = draw_picture(loaded, obstacles=False)
     path = loaded[0].positions
-    assert has(around(image, place(path[len(path) // 4]), 2), ink.METHODS[0])
-    assert has(around(image, place(path[len(path) // 4]), 5), ink.METHODS[1], 60)  # its edge, a pixel and a half wide
+    assert has(around(image, place(path[len(path) // 4]), 2), INKS["bt"])
+    assert has(
+        around(image, place(path[len(path) // 4]), 5), ink.method_inks(["bt", "twin"])["twin"], 60
+    )  # its edge, a pixel and a half wide
 
 
 def test_true_bodies_are_as_old_as_the_map(folder, bt):
@@ -217,7 +220,7 @@ def test_a_frame_shows_the_moment(bt):
     for time_s in (0.3, 1.7):
         frame = artist.frame(time_s)
         hull = canvas.pixels([recording.pose.at(time_s)])[0].round().astype(int)
-        assert has(around(frame, hull, 1), ink.METHODS[0])
+        assert has(around(frame, hull, 1), INKS["bt"])
         x, y, radius = recording.tracks.at(time_s)[0]
         rim = canvas.pixels([(x, y + radius + 0.06)])[0].round().astype(int)
         assert has(around(frame, rim, 2), ink.DYNAMIC, 30)
@@ -226,13 +229,13 @@ def test_a_frame_shows_the_moment(bt):
     assert (artist.frame(0.3) == FrameArtist(recording).frame(0.3)).all()  # independent of what was drawn before
 
 
-@pytest.mark.parametrize("draw", [picture, video])
-def test_missing_files_and_bad_places(folder, bt, tmp_path, draw):
+@pytest.mark.parametrize(("draw", "name"), [(picture, "out.png"), (picture, "out.svg"), (video, "out.webm"), (video, "out.gif")])
+def test_missing_files_and_bad_places(folder, bt, tmp_path, draw, name):
     with pytest.raises(LogError, match="cannot open"):
-        draw(tmp_path / "nowhere.mcap", tmp_path / "out.png")
+        draw(tmp_path / "nowhere.mcap", tmp_path / name)
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(LogError, match="cannot write"):
-        draw(bt, tmp_path / "file" / "out.webm")
+        draw(bt, tmp_path / "file" / name)
     assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
 
 

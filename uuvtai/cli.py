@@ -824,23 +824,41 @@ def log_convert(
 
 @log_app.command("video", epilog="Example: uuv log video runs/first/logs/bt_seed0_episode0.mcap")
 def log_video(
-    file: LogFile, out: Annotated[Path | None, typer.Option("--out", help="WebM file \\[default: beside the log].")] = None
+    file: LogFile,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Its ending says the format: .webm, .mp4 or .gif \\[default: the log's name, .webm].")
+    ] = None,
+    speed: Annotated[float, typer.Option("--speed", help="Times as fast as it was.")] = 1.0,
+    fps: Annotated[float | None, typer.Option("--fps", help="Frames per second \\[default: 15, GIF 10].")] = None,
+    width: Annotated[int | None, typer.Option("--width", help="Width \\[px] \\[default: 1280, GIF 800].")] = None,
 ) -> None:
-    """Render a top-down video of a recorded episode."""
+    """Render a top-down video of a recorded episode as WebM, MP4 or GIF."""
     from uuvtai.logs import video
 
     target = out or file.with_suffix(".webm")
-    video.video(file, target)
+    progress = _Progress("frames")
+
+    def drawn(done: int, total: int) -> None:
+        if done == 1:
+            progress.start(target.name, total)
+        progress.update(done, total, 0)
+
+    try:
+        video.video(file, target, width, fps, speed, drawn)
+    finally:
+        progress.stop()
     typer.echo(str(target))
 
 
 @log_app.command("picture", epilog="Example: uuv log picture runs/first/logs/bt_seed0_episode0.mcap")
 def log_picture(
     file: Annotated[list[Path], typer.Argument(help="Logs of the same episode; trajectories are overlaid.")],
-    out: Annotated[Path | None, typer.Option("--out", help="PNG file \\[default: beside the first log].")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Its ending says the format: .png, .pdf or .svg \\[default: the first log's name, .png].")
+    ] = None,
     clearance: Annotated[bool, typer.Option("--clearance", help="Colour the clearance field.")] = False,
 ) -> None:
-    """Draw a recorded episode: occupancy, trajectories, goal."""
+    """Draw a recorded episode as PNG, PDF or SVG: occupancy, trajectories, goal."""
     from uuvtai.logs import picture
 
     target = out or file[0].with_suffix(".png")

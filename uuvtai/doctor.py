@@ -20,6 +20,7 @@ def checks() -> list[dict[str, Any]]:
         "torch": _torch,
         "ompl": _ompl,
         "opencv": _opencv,
+        "video": _video,
         "mcap": _mcap,
         "cuda": _cuda,
         "kernel cache": _cache,
@@ -72,15 +73,23 @@ def _opencv() -> str:
     import cv2
     import numpy as np
 
+    if not cv2.imencode(".png", np.zeros((8, 8, 3), np.uint8))[0]:
+        raise RuntimeError("cannot write PNG pictures; reinstall opencv-python-headless")
+    return f"{cv2.__version__}, pictures can be drawn"
+
+
+def _video() -> str:
+    import av
+    import numpy as np
+
+    from uuvtai.logs.film import check_whole, write_film
+
+    frames = [np.full((64, 64, 3), 80 * i, np.uint8) for i in range(3)]
     with tempfile.TemporaryDirectory() as folder:
-        target = str(Path(folder) / "test.webm")
-        writer = cv2.VideoWriter(target, cv2.VideoWriter.fourcc(*"VP80"), 10, (64, 64))
-        for _ in range(3):
-            writer.write(np.zeros((64, 64, 3), np.uint8))
-        writer.release()
-        if not Path(target).exists() or Path(target).stat().st_size == 0:
-            raise RuntimeError("cannot write WebM video; reinstall opencv-python-headless")
-    return f"{cv2.__version__}, WebM video works"
+        for suffix in (".webm", ".mp4", ".gif"):
+            target = Path(folder) / f"test{suffix}"
+            check_whole(target, write_film(target, frames, 10.0, frames, []), target)
+    return f"PyAV {av.__version__}, WebM, MP4 and GIF can be written"
 
 
 def _mcap() -> str:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from uuvtai.kernels.grid import grid_origin
-from uuvtai.logs.canvas import METHODS, ROUTE
+from uuvtai.logs.canvas import ROUTE, method_inks
 from uuvtai.logs.painting import map_canvas, paint_layers, paint_truth, paint_walls, paint_water
 from uuvtai.logs.recording import Layer
 from uuvtai.logs.scenario import scenario_document
@@ -38,7 +38,7 @@ def draw_frame(sim: Sim, row: int, width_px: int = 640) -> np.ndarray:
     paint_walls(canvas, scenario["tank"])
     canvas.line(read(s.route.way_w)[: int(read(s.route.n_way))], ROUTE, 2)
     canvas.star(scenario["goal"], 12)
-    canvas.vehicle([*pos_w, _yaw(read(s.vehicle.quat_wb))], METHODS[0])
+    canvas.vehicle([*pos_w, _yaw(read(s.vehicle.quat_wb))], method_inks(["bt"])["bt"])
     return canvas.image[:, :, ::-1].copy()
 
 

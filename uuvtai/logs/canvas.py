@@ -9,6 +9,8 @@ from typing import Any
 import cv2
 import numpy as np
 
+from uuvtai.report.colours import method_colours
+
 Color = tuple[int, int, int]
 """blue, green, red"""
 
@@ -25,19 +27,26 @@ def bgr(code: str) -> Color:
 PAPER, WATER, INK, GREY, FAINT = bgr("#ffffff"), bgr("#eef5f9"), bgr("#1d2733"), bgr("#66727f"), bgr("#c9d2da")
 STATIC, DYNAMIC, GOAL, ROUTE, MOVER = bgr("#262c38"), bgr("#e53946"), bgr("#f7b801"), bgr("#1f8fff"), bgr("#d9480f")
 FAILED = bgr("#c92a2a")
-METHODS = tuple(bgr(code) for code in ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#8d5524", "#6a3d9a"))
-"""after Okabe and Ito: told apart by colour-blind eyes"""
+
+
+def method_inks(names: Sequence[str]) -> dict[str, Color]:
+    """Colour of every method, the same as in the charts."""
+    return {name: bgr(code) for name, code in method_colours(names).items()}
 
 
 class Canvas:
-    """An image with a map area in which one metre is ``scale`` pixels, y up."""
+    """An image with a map area in which one metre is ``scale`` pixels, y up.
+
+    All shapes come down to ``strip``, ``filled``, ``dot``, ``paste``, ``cells`` and ``text``; ``vector.VectorCanvas`` draws these as paths.
+    """
 
     def __init__(
         self, size: tuple[int, int], corner: tuple[float, float], scale: float, x_m: Sequence[float], y_m: Sequence[float]
     ) -> None:
         """``size`` = (width, height); ``corner`` = pixel of the map area's upper left corner, which shows (x_m[0], y_m[1])."""
-        self.image = np.full((size[1], size[0], 3), PAPER, np.uint8)
+        self.size = size
         self.corner, self.scale, self.x_m, self.y_m = corner, scale, tuple(x_m), tuple(y_m)
+        self.begin()
 
     def pixels(self, points: Any) -> np.ndarray:
         """World (n, 2 or more) to pixels (n, 2), float; only x and y count."""
@@ -46,19 +55,61 @@ class Canvas:
             [self.corner[0] + (flat[:, 0] - self.x_m[0]) * self.scale, self.corner[1] + (self.y_m[1] - flat[:, 1]) * self.scale]
         )
 
+    # ------------------------------------------------------------------------------------------------------- what draws
+
+    def begin(self) -> None:
+        """Take a new sheet of paper."""
+        self.image = np.full((self.size[1], self.size[0], 3), PAPER, np.uint8)
+
+    def strip(self, pixels: Any, color: Color, width: int = 2, closed: bool = False) -> None:
+        """Polyline in pixels."""
+        cv2.polylines(self.image, [_fixed(pixels)], closed, color, width, cv2.LINE_AA, _SHIFT)
+
+    def dot(self, pixel: Sequence[float] | np.ndarray, radius_px: float, color: Color, width: int = -1) -> None:
+        """Circle in pixels; width -1 fills it."""
+        at = _fixed(np.asarray([pixel]))[0]
+        cv2.circle(self.image, (int(at[0]), int(at[1])), round(radius_px * (1 << _SHIFT)), color, width, cv2.LINE_AA, _SHIFT)
+
+    def filled(self, pixels: np.ndarray, color: Color, hole: np.ndarray | None = None) -> None:
+        """Filled polygon in pixels, but for the polygon ``hole`` within."""
+        rings = [_fixed(ring) for ring in (pixels, hole) if ring is not None]
+        cv2.fillPoly(self.image, rings, color, cv2.LINE_AA, _SHIFT)
+
+    def paste(self, corner: tuple[int, int], colors: np.ndarray) -> None:
+        """An image (height, width, 3), blue green red, with its upper left corner at a pixel."""
+        height, width = colors.shape[:2]
+        self.image[corner[1] : corner[1] + height, corner[0] : corner[0] + width] = colors
+
+    def cells(self, colors: np.ndarray, opacity: np.ndarray, origin_m: Sequence[float], cell_m: float) -> None:
+        """Lay a grid of cells (row, col[, 3]) over the map area; only what lies inside the area is drawn."""
+        rows, cols = opacity.shape
+        (left, top), (right, bottom) = self.area_pixels()
+        x = self.x_m[0] + (np.arange(left, right) + 0.5 - self.corner[0]) / self.scale
+        y = self.y_m[1] - (np.arange(top, bottom) + 0.5 - self.corner[1]) / self.scale
+        col = np.clip(np.floor((x - origin_m[0]) / cell_m).astype(int), 0, cols - 1)
+        row = np.clip(np.floor((y - origin_m[1]) / cell_m).astype(int), 0, rows - 1)
+        share = opacity[row][:, col][..., None].astype(np.float32)
+        ink = np.broadcast_to(np.asarray(colors, np.float32), (rows, cols, 3))[row][:, col]
+        part = self.image[top:bottom, left:right]
+        part[:] = (part * (1 - share) + ink * share + 0.5).astype(np.uint8)
+
+    def text(
+        self, place: tuple[float, float], text: str, size: int = 16, color: Color = INK, bold: bool = False, align: str = "left"
+    ) -> int:
+        """Text with its baseline at a pixel; gives its width [px]."""
+        return draw_text(self.image, place, text, size, color, bold, align)
+
+    # ------------------------------------------------------------------------------------------------ what is drawn of it
+
+    def area_pixels(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """((left, top), (right, bottom)) of the map area."""
+        (left, top), (right, bottom) = self.pixels([(self.x_m[0], self.y_m[1]), (self.x_m[1], self.y_m[0])]).round().astype(int)
+        return (int(left), int(top)), (int(right), int(bottom))
+
     def line(self, points: Any, color: Color, width: int = 2, closed: bool = False) -> None:
         """Polyline in the world."""
         if len(points) > 1:
-            cv2.polylines(self.image, [_fixed(self.pixels(points))], closed, color, width, cv2.LINE_AA, _SHIFT)
-
-    def strip(self, pixels: np.ndarray, color: Color, width: int = 2) -> None:
-        """Polyline in pixels."""
-        cv2.polylines(self.image, [_fixed(pixels)], False, color, width, cv2.LINE_AA, _SHIFT)
-
-    def dot(self, pixel: Sequence[float] | np.ndarray, radius_px: float, color: Color) -> None:
-        """Disc in pixels."""
-        at = _fixed(np.asarray([pixel]))[0]
-        cv2.circle(self.image, (int(at[0]), int(at[1])), round(radius_px * (1 << _SHIFT)), color, -1, cv2.LINE_AA, _SHIFT)
+            self.strip(self.pixels(points), color, width, closed)
 
     def dashes(self, points: Any, color: Color, width: int = 1, period_px: float = 9.0) -> None:
         """Dashed polyline in the world."""
@@ -66,8 +117,7 @@ class Canvas:
         along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
         for begin in np.arange(0.0, along[-1], period_px):
             at = np.linspace(begin, min(begin + 0.55 * period_px, along[-1]), 4)
-            piece = np.column_stack([np.interp(at, along, path[:, axis]) for axis in (0, 1)])
-            cv2.polylines(self.image, [_fixed(piece)], False, color, width, cv2.LINE_AA, _SHIFT)
+            self.strip(np.column_stack([np.interp(at, along, path[:, axis]) for axis in (0, 1)]), color, width)
 
     def area(self, points: Any, color: Color) -> None:
         """Filled polygon in the world."""
@@ -75,30 +125,24 @@ class Canvas:
 
     def area_between(self, outer: Any, inner: Any, color: Color) -> None:
         """What lies inside one polygon and outside another."""
-        cv2.fillPoly(self.image, [_fixed(self.pixels(outer)), _fixed(self.pixels(inner))], color, cv2.LINE_AA, _SHIFT)
-
-    def filled(self, pixels: np.ndarray, color: Color) -> None:
-        """Filled polygon in pixels."""
-        cv2.fillPoly(self.image, [_fixed(pixels)], color, cv2.LINE_AA, _SHIFT)
+        self.filled(self.pixels(outer), color, self.pixels(inner))
 
     def disc(self, center: Sequence[float], radius_px: float, color: Color, width: int = -1) -> None:
         """Circle around a world point; width -1 fills it."""
-        at = _fixed(self.pixels([center]))[0]
-        cv2.circle(self.image, (int(at[0]), int(at[1])), round(radius_px * (1 << _SHIFT)), color, width, cv2.LINE_AA, _SHIFT)
+        self.dot(self.pixels([center])[0], radius_px, color, width)
 
     def star(self, center: Sequence[float], radius_px: float, fill: Color = GOAL, edge: Color = INK) -> None:
         """Five-pointed star."""
         pixels = self.pixels([center])[0] + star_shape(radius_px)
         self.filled(pixels, fill)
-        cv2.polylines(self.image, [_fixed(pixels)], True, edge, 1, cv2.LINE_AA, _SHIFT)
+        self.strip(pixels, edge, 1, closed=True)
 
     def cross(self, center: Sequence[float], radius_px: float, color: Color) -> None:
         """An X with a white rim."""
         at = self.pixels([center])[0]
         for ink, width in ((PAPER, 7), (color, 4)):
             for sign in (-1, 1):
-                ends = at + radius_px * np.array([[-1, -sign], [1, sign]])
-                cv2.polylines(self.image, [_fixed(ends)], False, ink, width, cv2.LINE_AA, _SHIFT)
+                self.strip(at + radius_px * np.array([[-1, -sign], [1, sign]]), ink, width)
 
     def vehicle(self, pose: Sequence[float], color: Color, length_m: float = 0.54, width_m: float = 0.34) -> None:
         """The hull from above with its bow: at least 14 pixels long, so that it can be seen."""
@@ -109,29 +153,6 @@ class Canvas:
         world = shape @ np.array([[c, s], [-s, c]]) + np.array(pose[:2])
         self.area(world, color)
         self.line(world, PAPER, 1, closed=True)
-
-    def cells(self, colors: np.ndarray, opacity: np.ndarray, origin_m: Sequence[float], cell_m: float) -> None:
-        """Lay a grid of cells (row, col[, 3]) over the map area; only what lies inside the area is drawn."""
-        rows, cols = opacity.shape
-        (left, top), (right, bottom) = self._area_pixels()
-        x = self.x_m[0] + (np.arange(left, right) + 0.5 - self.corner[0]) / self.scale
-        y = self.y_m[1] - (np.arange(top, bottom) + 0.5 - self.corner[1]) / self.scale
-        col = np.clip(np.floor((x - origin_m[0]) / cell_m).astype(int), 0, cols - 1)
-        row = np.clip(np.floor((y - origin_m[1]) / cell_m).astype(int), 0, rows - 1)
-        share = opacity[row][:, col][..., None].astype(np.float32)
-        ink = np.broadcast_to(np.asarray(colors, np.float32), (rows, cols, 3))[row][:, col]
-        part = self.image[top:bottom, left:right]
-        part[:] = (part * (1 - share) + ink * share + 0.5).astype(np.uint8)
-
-    def _area_pixels(self) -> tuple[tuple[int, int], tuple[int, int]]:
-        (left, top), (right, bottom) = self.pixels([(self.x_m[0], self.y_m[1]), (self.x_m[1], self.y_m[0])]).round().astype(int)
-        return (int(left), int(top)), (int(right), int(bottom))
-
-    def text(
-        self, place: tuple[float, float], text: str, size: int = 16, color: Color = INK, bold: bool = False, align: str = "left"
-    ) -> int:
-        """Text with its baseline at a pixel; gives its width [px]."""
-        return draw_text(self.image, place, text, size, color, bold, align)
 
 
 def draw_text(image: np.ndarray, place: tuple[float, float], text: str, size: int, color: Color, bold: bool, align: str = "left") -> int:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, TypeVar
 
-import cv2
 import numpy as np
 
 from uuvtai.logs.canvas import DYNAMIC, FAINT, GREY, INK, MOVER, PAPER, STATIC, WATER, Canvas, Color
 from uuvtai.logs.recording import Layer
 from uuvtai.logs.scenario import body_positions
+
+AnyCanvas = TypeVar("AnyCanvas", bound=Canvas)
 
 _MAX_MAP = 1000
 """[px] greatest height of the map"""
@@ -18,14 +19,14 @@ _HULL_RADIUS_M = 0.17
 """half the height of the hull that ``Canvas.vehicle`` draws"""
 
 
-def map_canvas(tank: dict[str, Any], width_px: int, margins: tuple[int, int, int, int]) -> Canvas:
+def map_canvas(tank: dict[str, Any], width_px: int, margins: tuple[int, int, int, int], kind: type[AnyCanvas] = Canvas) -> AnyCanvas:
     """A canvas that fits the tank between margins (left, right, top, bottom), with even sizes."""
     left, right, top, bottom = margins
     across, along = tank["x_m"][1] - tank["x_m"][0], tank["y_m"][1] - tank["y_m"][0]
     scale = min((width_px - left - right) / across, _MAX_MAP / along)
     height = top + math.ceil(along * scale) + bottom
     shift = 0.5 * (width_px - left - right - across * scale)
-    return Canvas((width_px, height + height % 2), (round(left + shift), top), scale, tank["x_m"], tank["y_m"])
+    return kind((width_px, height + height % 2), (round(left + shift), top), scale, tank["x_m"], tank["y_m"])
 
 
 def tank_outline(tank: dict[str, Any]) -> np.ndarray:
@@ -101,15 +102,15 @@ def paint_ruler(canvas: Canvas) -> None:
     gap = next(step for step in (1, 2, 5, 10, 20, 50, 100, 1000) if across / step <= 14)
     for x in np.arange(math.ceil(canvas.x_m[0] / gap) * gap, canvas.x_m[1] + 1e-6, gap):
         at = canvas.pixels([(x, canvas.y_m[0])])[0]
-        cv2.line(canvas.image, (round(at[0]), round(at[1]) + 3), (round(at[0]), round(at[1]) + 8), FAINT, 1, cv2.LINE_AA)
+        canvas.strip(np.round(at) + np.array([(0, 3), (0, 8)]) + 0.5, FAINT, 1)
         canvas.text((at[0], at[1] + 24), f"{x:g}", 14, GREY, align="center")
     for y in np.arange(math.ceil(canvas.y_m[0] / gap) * gap, canvas.y_m[1] + 1e-6, gap):
         at = canvas.pixels([(canvas.x_m[0], y)])[0]
-        cv2.line(canvas.image, (round(at[0]) - 8, round(at[1])), (round(at[0]) - 3, round(at[1])), FAINT, 1, cv2.LINE_AA)
+        canvas.strip(np.round(at) + np.array([(-8, 0), (-3, 0)]) + 0.5, FAINT, 1)
         canvas.text((at[0] - 12, at[1] + 5), f"{y:g}", 14, GREY, align="right")
     right = canvas.pixels([(canvas.x_m[1], canvas.y_m[1])])[0]
     begin, y = (round(right[0] - gap * canvas.scale), round(right[1] - 14))
-    cv2.line(canvas.image, (begin, y), (round(right[0]), y), INK, 3)
+    canvas.strip(np.array([(begin, y), (round(right[0]), y)]) + 0.5, INK, 3)
     for x in (begin, round(right[0])):
-        cv2.line(canvas.image, (x, y - 5), (x, y + 5), INK, 2)
+        canvas.strip(np.array([(x, y - 5), (x, y + 5)]) + 0.5, INK, 2)
     canvas.text((begin - 10, y + 5), f"{gap} m", 16, INK, align="right")

@@ -9,9 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from uuvtai.logs.canvas import DYNAMIC, FAILED, GREY, INK, METHODS, MOVER, PAPER, STATIC, WATER, Canvas, Color
-from uuvtai.logs.errors import LogError
-from uuvtai.logs.painting import map_canvas, mixed, paint_layers, paint_ruler, paint_truth, paint_walls, paint_water
+from uuvtai.logs.canvas import DYNAMIC, FAILED, GREY, INK, MOVER, PAPER, STATIC, WATER, Canvas, Color, method_inks
+from uuvtai.logs.errors import LogError, checked_suffix
+from uuvtai.logs.painting import AnyCanvas, map_canvas, mixed, paint_layers, paint_ruler, paint_truth, paint_walls, paint_water
 from uuvtai.logs.recording import PICTURE_TOPICS, Recording, drawing, load_recording
 from uuvtai.logs.video import video
 from uuvtai.outcomes import COLLIDED
@@ -23,22 +23,45 @@ _ROW = 30
 """[px] per line of the legend"""
 
 
+FORMATS = (".png", ".pdf", ".svg")
+"""what a picture's name may end in"""
+
+
 def picture(
-    paths: Path | Sequence[Path], out: Path, clearance: bool = False, obstacles: bool = True, width_px: int = 1600, remark: str = ""
+    paths: Path | Sequence[Path],
+    out: Path,
+    clearance: bool = False,
+    obstacles: bool = True,
+    width_px: int = 1600,
+    remark: str = "",
+    methods: Sequence[str] = (),
 ) -> Path:
-    """Draw logs of the same episode into one PNG: trajectories overlaid, one colour per method.
+    """Draw logs of the same episode into one PNG, PDF or SVG, as the name of ``out`` ends: trajectories overlaid, a colour per method.
 
     ``clearance`` shows the distance to mapped obstacles as colours; ``obstacles`` the true bodies and their paths as thin lines;
-    ``remark`` stands beside the title. Raises LogError; the file appears whole or not at all.
+    ``remark`` stands beside the title; ``methods``: all that are compared with each other, in order, so that each keeps its colour.
+    In PDF and SVG everything but the map is lines, shapes and text. Raises LogError; the file appears whole or not at all.
     """
+    out = Path(out)
+    suffix = checked_suffix(out, FORMATS, "picture")
     found = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
     if not found:
         raise LogError("uuv log picture: give at least one log")
     recordings = [load_recording(path, PICTURE_TOPICS) for path in found]
     check_same_episode(recordings)
     with drawing(found[0]):
-        image = draw_picture(recordings, clearance, obstacles, width_px, remark)
-    return save_image(image, Path(out))
+        content = _drawn(recordings, suffix, clearance, obstacles, width_px, remark, methods)
+    return write_whole(content, out)
+
+
+def _drawn(
+    recordings: list[Recording], suffix: str, clearance: bool, obstacles: bool, width_px: int, remark: str, methods: Sequence[str]
+) -> bytes:
+    if suffix == ".png":
+        return png_bytes(draw_picture(recordings, clearance, obstacles, width_px, remark, methods))
+    from uuvtai.logs.vector import VectorCanvas  # matplotlib, which takes a second
+
+    return _painted(VectorCanvas, recordings, clearance, obstacles, width_px, remark, methods).document(suffix.lstrip("."))
 
 
 def check_same_episode(recordings: list[Recording]) -> None:
@@ -52,10 +75,20 @@ def check_same_episode(recordings: list[Recording]) -> None:
 
 def save_image(image: np.ndarray, out: Path) -> Path:
     """Write a PNG atomically. Raises LogError."""
+    return write_whole(png_bytes(image), out)
+
+
+def png_bytes(image: np.ndarray) -> bytes:
+    """An image (height, width, 3), blue green red, as PNG."""
+    return cv2.imencode(".png", image)[1].tobytes()
+
+
+def write_whole(content: bytes, out: Path) -> Path:
+    """Write a picture atomically. Raises LogError."""
     part = out.with_name(f".{out.name}.{os.getpid()}.part")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        part.write_bytes(cv2.imencode(".png", image)[1].tobytes())
+        part.write_bytes(content)
         os.replace(part, out)
     except OSError as error:
         raise LogError(f"{out}: cannot write the picture ({error.strerror}); choose another place with --out FILE") from error
@@ -66,13 +99,31 @@ def save_image(image: np.ndarray, out: Path) -> Path:
 
 
 def draw_picture(
-    recordings: list[Recording], clearance: bool = False, obstacles: bool = True, width_px: int = 1600, remark: str = ""
+    recordings: list[Recording],
+    clearance: bool = False,
+    obstacles: bool = True,
+    width_px: int = 1600,
+    remark: str = "",
+    methods: Sequence[str] = (),
 ) -> np.ndarray:
     """The picture as an image (height, width, 3), blue green red."""
+    return _painted(Canvas, recordings, clearance, obstacles, width_px, remark, methods).image
+
+
+def _painted(
+    kind: type[AnyCanvas],
+    recordings: list[Recording],
+    clearance: bool,
+    obstacles: bool,
+    width_px: int,
+    remark: str,
+    methods: Sequence[str],
+) -> AnyCanvas:
     tank = recordings[0].scenario["tank"]
     rows = len(recordings)
     side = 92 if clearance else 0
-    canvas = map_canvas(tank, width_px, (_LEFT, _RIGHT + side, _TOP, _BOTTOM + _ROW * max(rows, 3)))
+    canvas = map_canvas(tank, width_px, (_LEFT, _RIGHT + side, _TOP, _BOTTOM + _ROW * max(rows, 3)), kind)
+    inks = _inks(recordings, methods)
     paint_water(canvas, tank)
     if clearance:
         _paint_clearance(canvas, recordings, side)
@@ -80,10 +131,19 @@ def draw_picture(
     if obstacles:
         paint_truth(canvas, recordings[0].scenario, recordings[0].duration_s)  # as old as the map
     paint_walls(canvas, tank)
-    _paint_trajectories(canvas, recordings)
-    _paint_ends(canvas, recordings)
-    _paint_frame(canvas, recordings, not clearance, remark)
-    return canvas.image
+    _paint_trajectories(canvas, recordings, inks)
+    _paint_ends(canvas, recordings, inks)
+    _paint_frame(canvas, recordings, inks, not clearance, remark)
+    return canvas
+
+
+def _inks(recordings: list[Recording], methods: Sequence[str]) -> list[Color]:
+    """Colour of each recording: its method's; logs of one method (of several policies, say) are told apart by their place."""
+    names = [recording.method for recording in recordings]
+    if len(set(names)) < len(names):
+        names = [f"{i} {name}" for i, name in enumerate(names)]
+    found = method_inks([*methods, *names])
+    return [found[name] for name in names]
 
 
 # ------------------------------------------------------------------------------------------------------------------- parts
@@ -111,37 +171,37 @@ def _paint_clearance(canvas: Canvas, recordings: list[Recording], side: int) -> 
 def _paint_color_bar(canvas: Canvas, top_m: float) -> None:
     (x, y0), (_, y1) = canvas.pixels([(canvas.x_m[1], canvas.y_m[1]), (canvas.x_m[1], canvas.y_m[0])]).round().astype(int)
     ramp = cv2.applyColorMap(np.linspace(255, 0, y1 - y0).astype(np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)
-    canvas.image[y0:y1, x + 26 : x + 44] = ramp
-    cv2.rectangle(canvas.image, (x + 26, y0), (x + 43, y1 - 1), GREY, 1)
+    canvas.paste((x + 26, y0), np.repeat(ramp, 18, axis=1))
+    canvas.strip(np.array([(x + 26, y0), (x + 44, y0), (x + 44, y1), (x + 26, y1)]), GREY, 1, closed=True)
     for share in (0.0, 0.5, 1.0):
         canvas.text((x + 50, y1 - share * (y1 - y0) + (4 if share < 1 else 14)), f"{share * top_m:.1f} m", 15, GREY)
     canvas.text((x + 26, y0 - 12), "clearance", 15, GREY)
 
 
-def _paint_trajectories(canvas: Canvas, recordings: list[Recording]) -> None:
+def _paint_trajectories(canvas: Canvas, recordings: list[Recording], inks: list[Color]) -> None:
     """The first method on top; the others below it a little wider each, so that their edges show where all go the same way."""
     wide = [3 + 3 * min(i, 3) for i in range(len(recordings))]
     for recording, width in zip(recordings, wide, strict=True):
         canvas.line(recording.positions[:, :2], PAPER, width + 3)
     for i in reversed(range(len(recordings))):
-        canvas.line(recordings[i].positions[:, :2], METHODS[i % len(METHODS)], wide[i])
+        canvas.line(recordings[i].positions[:, :2], inks[i], wide[i])
 
 
-def _paint_ends(canvas: Canvas, recordings: list[Recording]) -> None:
+def _paint_ends(canvas: Canvas, recordings: list[Recording], inks: list[Color]) -> None:
     scenario = recordings[0].scenario
     goal, start = scenario["goal"], scenario["start"]
     canvas.dashes(np.array(goal[:2]) + scenario["goal_radius_m"] * _ring(90), INK, 1)
     canvas.disc(start, 8, PAPER)
     canvas.disc(start, 7, INK, 2)
     for i in reversed(range(len(recordings))):
-        canvas.vehicle(recordings[i].positions[-1], METHODS[i % len(METHODS)])
+        canvas.vehicle(recordings[i].positions[-1], inks[i])
     canvas.star(goal, 17)
     for i, recording in enumerate(recordings):
         if recording.outcome in COLLIDED:
-            canvas.cross(recording.positions[-1][:2], 9, METHODS[i % len(METHODS)])
+            canvas.cross(recording.positions[-1][:2], 9, inks[i])
 
 
-def _paint_frame(canvas: Canvas, recordings: list[Recording], trace: bool, remark: str) -> None:
+def _paint_frame(canvas: Canvas, recordings: list[Recording], inks: list[Color], trace: bool, remark: str) -> None:
     scenario = recordings[0].scenario
     title = f"{scenario['world']} · seed {scenario['seed']} · episode {scenario['episode']}"
     width = canvas.text((_LEFT - 2, 40), title, 27, INK, bold=True)
@@ -151,7 +211,7 @@ def _paint_frame(canvas: Canvas, recordings: list[Recording], trace: bool, remar
     paint_ruler(canvas)
     base = canvas.pixels([(canvas.x_m[0], canvas.y_m[0])])[0][1] + 62
     for i, recording in enumerate(recordings):
-        _legend_row(canvas, base + i * _ROW, recording, METHODS[i % len(METHODS)])
+        _legend_row(canvas, base + i * _ROW, recording, inks[i])
     _legend_symbols(canvas, base, trace)
 
 
@@ -164,7 +224,7 @@ def _legend_row(canvas: Canvas, y: float, recording: Recording, color: Color) ->
 
 
 def _legend_symbols(canvas: Canvas, base: float, trace: bool) -> None:
-    x, width = canvas.image.shape[1] - _RIGHT - 430, 15
+    x, width = canvas.size[0] - _RIGHT - 430, 15
     swatches = [(STATIC, "static occupancy"), (DYNAMIC, "dynamic occupancy")]
     if trace:
         swatches.append((mixed(DYNAMIC, WATER, 0.22), "dynamic earlier"))

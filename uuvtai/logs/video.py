@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
-from uuvtai.logs.canvas import DYNAMIC, FAILED, FAINT, GREY, INK, METHODS, MOVER, PAPER, ROUTE, STATIC, Color, bgr
-from uuvtai.logs.errors import LogError
+from uuvtai.logs.canvas import DYNAMIC, FAILED, FAINT, GOAL, GREY, INK, MOVER, PAPER, ROUTE, STATIC, Color, bgr, method_inks
+from uuvtai.logs.errors import LogError, checked_suffix
 from uuvtai.logs.painting import (
     map_canvas,
     mixed,
@@ -39,39 +40,52 @@ _LEGEND = (
 )
 _HOLD_S = 1.0
 """The last frame stays this long."""
-_CODECS = ("VP80", "VP90")
-"""VP8 first: a fifth of the time for the same size."""
+_DRAWN_PX = 1280
+"""Narrower frames are drawn this wide and made smaller: the panel below the map needs the room."""
+FORMATS = {".webm": (1280, 15.0), ".mp4": (1280, 15.0), ".gif": (800, 10.0)}
+"""what a video's name may end in: (width [px], frames per second) unless told"""
+WIDTHS, FPS, SPEEDS = (320, 3840), (1.0, 60.0), (0.05, 100.0)
+"""least and most"""
+SMALL: dict[str, Any] = {"width_px": 960, "speed": 2.0}
+"""what a run folder holds, so that several fit a page: some 40 kB per second of the episode"""
+_MOST_FRAMES = 100_000
 
 Progress = Callable[[int, int], None]
 """Called with (frames done, frames in all)."""
 
 
 def video(
-    path: Path, out: Path, width_px: int = 1280, fps: float = 15.0, speed: float = 1.0, progress: Progress | None = None, remark: str = ""
+    path: Path,
+    out: Path,
+    width_px: int | None = None,
+    fps: float | None = None,
+    speed: float = 1.0,
+    progress: Progress | None = None,
+    remark: str = "",
+    methods: Sequence[str] = (),
 ) -> Path:
-    """Render a log as WebM; ``speed`` 2 shows it twice as fast as it was, ``remark`` stands beside the title.
+    """Render a log as WebM, MP4 or GIF, as the name of ``out`` ends; ``width_px`` and ``fps`` default to what ``FORMATS`` says of it.
 
-    Raises LogError; the file appears whole or not at all.
+    ``speed`` 2 shows it twice as fast as it was, ``remark`` stands beside the title; ``methods``: all that are compared with each other,
+    in order, so that each has the colour of the picture of them all. Raises LogError; the file appears whole or not at all.
     """
-    recording, out = load_recording(path), Path(out)
+    out = Path(out)
+    suffix = checked_suffix(out, tuple(FORMATS), "video")
+    width_px, fps = width_px or FORMATS[suffix][0], fps or FORMATS[suffix][1]
+    _check(width_px, fps, speed)
+    recording = load_recording(path)
+    times = frame_times(recording, fps, speed)
     with drawing(Path(path)):
-        artist = FrameArtist(recording, width_px, remark)
-    times = np.arange(0.0, recording.duration_s, speed / fps)
-    times = np.concatenate([times, np.full(1 + round(_HOLD_S * fps), recording.duration_s)])
-    part = out.with_name(f".{out.stem}.{os.getpid()}.part.webm")
+        artist = FrameArtist(recording, max(width_px, _DRAWN_PX), remark, methods)
+        samples = [_sized(artist.frame(recording.duration_s * share), width_px) for share in (0.0, 0.5, 1.0)]
+    part = out.with_name(f".{out.stem}.{os.getpid()}.part{suffix}")
+    from uuvtai.logs.film import check_whole, write_film  # PyAV, which takes a third of a second
+
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         part.touch()
-        with drawing(Path(path)):
-            height, width = artist.frame(0.0).shape[:2]
-        with _webm_writer(part, (width, height), fps) as writer:
-            for i, time_s in enumerate(times):
-                with drawing(Path(path)):
-                    frame = artist.frame(float(time_s))
-                writer.write(frame)
-                if progress:
-                    progress(i + 1, len(times))
-        _check_whole(part, out)
+        n_frames = write_film(part, _frames(artist, times, width_px, progress), fps, samples, artist.inks)
+        check_whole(part, n_frames, out)
         os.replace(part, out)
     except OSError as error:
         raise LogError(f"{out}: cannot write the video ({error.strerror}); choose another place with --out FILE") from error
@@ -81,57 +95,54 @@ def video(
     return out
 
 
-@contextlib.contextmanager
-def _webm_writer(part: Path, size: tuple[int, int], fps: float) -> Iterator[cv2.VideoWriter]:
-    with _quiet_stderr():
-        writer = cv2.VideoWriter()
-        opened = any(writer.open(str(part), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*codec), fps, size) for codec in _CODECS)  # type: ignore[attr-defined]
-    if not opened:
-        raise LogError(f"{part.parent}: OpenCV cannot write WebM here (neither VP8 nor VP9); install opencv-python-headless from PyPI")
-    try:
-        yield writer
-    finally:
-        writer.release()
+def _check(width_px: int, fps: float, speed: float) -> None:
+    for name, value, (least, most) in (("--width", width_px, WIDTHS), ("--fps", fps, FPS), ("--speed", speed, SPEEDS)):
+        if not least <= value <= most:
+            raise LogError(f"{name} {value:g}: must be from {least:g} to {most:g}")
 
 
-@contextlib.contextmanager
-def _quiet_stderr() -> Iterator[None]:
-    """FFmpeg prints a harmless note about the codec's tag straight to the process's stderr."""
-    kept, nothing = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nothing, 2)
-    try:
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(nothing)
+def frame_times(recording: Recording, fps: float, speed: float) -> np.ndarray:
+    """Moments [s] of the frames; the last one stays for a while. Raises LogError for more frames than anybody waits for."""
+    n_frames = recording.duration_s * fps / speed
+    if n_frames > _MOST_FRAMES:
+        raise LogError(f"{recording.path}: {n_frames:,.0f} frames, more than {_MOST_FRAMES:,}; raise --speed or lower --fps")
+    times = np.arange(0.0, recording.duration_s, speed / fps)
+    return np.concatenate([times, np.full(1 + round(_HOLD_S * fps), recording.duration_s)])
 
 
-def _check_whole(part: Path, out: Path) -> None:
-    """A full disk shows neither in ``write`` nor in ``release``: read the end of the file back."""
-    reader = cv2.VideoCapture(str(part))
-    readable = reader.isOpened() and reader.read()[0]
-    reader.release()
-    if not readable:
-        raise LogError(f"{out}: the video could not be written whole; is the disk full? Make room or choose another place with --out FILE")
-    handle = os.open(part, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+def _frames(artist: FrameArtist, times: np.ndarray, width_px: int, progress: Progress | None) -> Iterator[np.ndarray]:
+    for i, time_s in enumerate(times):
+        with drawing(artist.recording.path):
+            frame = _sized(artist.frame(float(time_s)), width_px)
+        yield frame
+        if progress:
+            progress(i + 1, len(times))
+
+
+def _sized(frame: np.ndarray, width_px: int) -> np.ndarray:
+    """The frame in this width (one less where that is odd), with an even height, as the codecs want it."""
+    height, width = frame.shape[:2]
+    wanted = width_px - width_px % 2
+    return frame if wanted == width else cv2.resize(frame, (wanted, 2 * round(height * wanted / width / 2)), interpolation=cv2.INTER_AREA)
 
 
 class FrameArtist:
     """Draws the frame of any moment of a recording; what stays between two maps is drawn once."""
 
-    def __init__(self, recording: Recording, width_px: int = 1280, remark: str = "") -> None:
+    def __init__(self, recording: Recording, width_px: int = 1280, remark: str = "", methods: Sequence[str] = ()) -> None:
         self.recording, self.remark = recording, remark
+        self._ink = method_inks([*methods, recording.method])[recording.method]
         self._canvas = map_canvas(recording.scenario["tank"], width_px - width_px % 2, _MARGINS)
         self._base_time: float | None = None
         self._base = self._canvas.image
         self._track = recording.positions
         self._times = np.array(recording.pose.times)
         self._clearance = np.array([value[0] for value in recording.safety.values])
+
+    @property
+    def inks(self) -> list[Color]:
+        """Colours that mean something."""
+        return [self._ink, GOAL, _GOOD, FAILED, *(color for color, _ in _LEGEND), *_TRIGGER_COLORS.values()]
 
     def frame(self, time_s: float) -> np.ndarray:
         """Image (height, width, 3), blue green red."""
@@ -141,13 +152,13 @@ class FrameArtist:
         pose = self._track[i]
         paint_truth(canvas, recording.scenario, time_s, float(pose[2]))
         self._paint_plan(time_s)
-        canvas.line(self._track[: i + 1, :2], METHODS[0], 2)
+        canvas.line(self._track[: i + 1, :2], self._ink, 2)
         self._paint_echoes(time_s)
         tracks = recording.tracks.at(time_s)
         for x, y, radius in () if tracks is None else tracks:
             canvas.disc((x, y), (radius + 0.06) * canvas.scale, DYNAMIC, 2)
         self._paint_goal()
-        canvas.vehicle(pose, METHODS[0])
+        canvas.vehicle(pose, self._ink)
         self._paint_head(time_s)
         self._paint_panel(time_s, i)
         return canvas.image
@@ -219,7 +230,7 @@ class FrameArtist:
         self._figure(164, top, "time to collision", "-" if not safety or safety[1] is None else f"{safety[1]:.1f} s", INK)
         self._figure(320, top, "speed", "-" if speed is None else f"{speed:.2f} m/s", INK)
         canvas.text((24, top + 86), "tree", 15, GREY)
-        canvas.text((24, top + 112), leaf or "-", 21, METHODS[0], bold=True)
+        canvas.text((24, top + 112), leaf or "-", 21, INK, bold=True)
         self._paint_legend(24, top + 138)
         self._paint_curve(time_s, i, top)
 
@@ -251,11 +262,11 @@ class FrameArtist:
         canvas.text((left, top + 12), "clearance [m]", 14, GREY)
         self._paint_replans(place, time_s, low)
         curve = place(np.array(recording.safety.times), self._clearance)
-        canvas.strip(curve, mixed(METHODS[0], PAPER, 0.25), 2)
+        canvas.strip(curve, mixed(self._ink, PAPER, 0.25), 2)
         if i > 0:
-            canvas.strip(curve[: i + 1], METHODS[0], 2)
+            canvas.strip(curve[: i + 1], self._ink, 2)
         if len(curve):
-            canvas.dot(curve[min(i, len(curve) - 1)], 4, METHODS[0])
+            canvas.dot(curve[min(i, len(curve) - 1)], 4, self._ink)
 
     def _paint_replans(self, place: Callable[[np.ndarray, np.ndarray], np.ndarray], time_s: float, low: int) -> None:
         canvas, x = self._canvas, 700.0

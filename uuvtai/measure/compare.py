@@ -282,7 +282,8 @@ def _explain(request: Request, sims: Simulators, played: list[_Played], result: 
         label, sim = entry["name"], sims[p.method.stack]
         sim.privileged = p.method.privileged
         chosen = chosen_for_recording(explained[label], request.explain_record)
-        paths = record_worst(sim, p.method.tree, chosen, folder.path / "explain", request.world, label, watch.note, p.policy)
+        names = [one["name"] for one in driven]
+        paths = record_worst(sim, p.method.tree, chosen, folder.path / "explain", request.world, label, watch.note, p.policy, names)
         for row, path in zip(chosen, paths, strict=True):
             entry["explain"][explained[label].index(row)]["log"] = str(path.relative_to(folder.path))
     _write_causes(folder, result)
@@ -307,14 +308,16 @@ def _draw(request: Request, folder: Path, logs: list[dict[Any, Path]], watch: Wa
     if not logs:
         return
     from uuvtai.logs.picture import picture
-    from uuvtai.logs.video import video
+    from uuvtai.logs.video import SMALL, video
 
     for job in logs[0]:
+        end = f"seed{job.seed}_episode{job.episode}"
         files = [paths[job] for paths in reversed(logs)]  # the map drawn is that of the last method
-        picture(files, folder / "pictures" / f"seed{job.seed}_episode{job.episode}.png")
-        picture(files, folder / "pictures" / f"seed{job.seed}_episode{job.episode}_clearance.png", clearance=True)
+        names = [file.stem.removesuffix(f"_{end}") for file in reversed(files)]
+        picture(files, folder / "pictures" / f"{end}.png", methods=names)
+        picture(files, folder / "pictures" / f"{end}_clearance.png", clearance=True, methods=names)
         for file in files if request.video else []:
             target = folder / "videos" / f"{file.stem}.webm"
             if not target.exists():  # an evaluation that goes on may have drawn it before
                 watch.note(f"drawing {target.name}")
-                video(file, target)
+                video(file, target, methods=names, **SMALL)

@@ -7,7 +7,7 @@ time before the last ``facts.WINDOW_S`` but a coarse diary.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -241,10 +241,14 @@ def record_worst(
     method: str,
     note: Callable[[str], None],
     policy: PolicyNote | None = None,
+    methods: Sequence[str] = (),
 ) -> list[Path]:
-    """Play these episodes once more into ``folder``: an MCAP log each, named after the cause, with a picture and a video beside it."""
+    """Play these episodes once more into ``folder``: an MCAP log each, named after the cause, with a picture and a video beside it.
+
+    ``methods``: all that are compared, in order, so that each keeps its colour.
+    """
     from uuvtai.logs.picture import picture
-    from uuvtai.logs.video import video
+    from uuvtai.logs.video import SMALL, video
     from uuvtai.measure.recording import EpisodeRecorder
 
     if not rows:
@@ -261,8 +265,8 @@ def record_worst(
         note(f"drawing {path.stem}")
         label = row.explanation.label
         cause = label.replace("_", " ")
-        picture(path, path.with_suffix(".png"), remark=f"{cause}: {causes.CAUSES[label]}")
-        video(path, path.with_suffix(".webm"), remark=cause)
+        picture(path, path.with_suffix(".png"), remark=f"{cause}: {causes.CAUSES[label]}", methods=methods)
+        video(path, path.with_suffix(".webm"), remark=cause, methods=methods, **SMALL)
     return paths
 
 

@@ -1,0 +1,258 @@
+"""Pictures and videos are what their names say, judged by readers of others: Pillow, FFmpeg, an XML parser, poppler where it is."""
+
+import io
+import shutil
+import subprocess
+from xml.etree import ElementTree
+
+import av
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.reference import logs as episode
+from uuvtai.cli import main
+from uuvtai.errors import UserError
+from uuvtai.logs import canvas, film
+from uuvtai.logs.mcap_log import McapEpisodeLog
+from uuvtai.logs.picture import draw_picture, picture
+from uuvtai.logs.recording import PICTURE_TOPICS, load_recording
+from uuvtai.logs.video import FrameArtist, video
+from uuvtai.report.colours import PALETTE, contrast, method_colours
+
+N_STEP = 60
+DURATION_S = N_STEP * episode.DT
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+def record(path, controller, sway=1.0):
+    with McapEpisodeLog(path, episode.header(controller)) as log:
+        for snap in episode.snapshots(N_STEP, sway=sway):
+            log.write(snap)
+        log.close(episode.result(N_STEP))
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("formats")
+
+
+@pytest.fixture(scope="module")
+def logs(folder):
+    return [record(folder / "bt.mcap", "bt"), record(folder / "straight.mcap", "straight", -0.9)]
+
+
+def code(color):
+    return "#" + "".join(f"{part:02x}" for part in reversed(color))
+
+
+# -------------------------------------------------------------------------------------------------------------- pictures
+
+
+def test_a_png_is_a_png(folder, logs):
+    with Image.open(picture(logs, folder / "p.PNG")) as image:
+        assert (image.format, image.size[0]) == ("PNG", 1600)
+
+
+def test_an_svg_holds_paths_in_the_methods_colours_and_the_maps_as_images(folder, logs):
+    root = ElementTree.fromstring(picture(logs, folder / "p.svg").read_bytes())
+    assert root.tag == f"{SVG}svg"
+    strokes = {method: [e for e in root.iter(f"{SVG}path") if f"stroke: {colour}" in e.get("style", "")] for method, colour in COLOURS}
+    for log in logs:  # the trajectory is one path with a corner for every pose
+        recording = load_recording(log, PICTURE_TOPICS)
+        corners = [e.get("d").count("L") for e in strokes[recording.method]]
+        assert max(corners) == len(recording.positions) - 1
+    images = list(root.iter(f"{SVG}image"))
+    assert len(images) == 3 and all(e.get("{http://www.w3.org/1999/xlink}href").startswith("data:image/png;base64,") for e in images)
+    assert not list(root.iter(f"{SVG}script"))
+
+
+COLOURS = tuple(method_colours(["bt", "straight"]).items())
+
+
+def test_a_pdf_is_a_pdf_and_poppler_sees_what_the_png_shows(folder, logs):
+    out = picture(logs, folder / "p.pdf")
+    content = out.read_bytes()
+    assert content.startswith(b"%PDF-") and content.rstrip().endswith(b"%%EOF")
+    if shutil.which("pdftoppm") is None:
+        pytest.skip("poppler is not installed: the PDF's frame alone was looked at")
+    told = subprocess.run(["pdftotext", str(out), "-"], capture_output=True, text=True, check=True).stdout
+    assert {"bt", "straight"} <= set(told.split())
+    shown = subprocess.run(["pdftoppm", "-r", "100", "-png", str(out)], capture_output=True, check=True).stdout
+    paths = np.array(Image.open(io.BytesIO(shown)).convert("RGB"))[..., ::-1]
+    pixels = draw_picture([load_recording(log, PICTURE_TOPICS) for log in logs])
+    assert paths.shape == pixels.shape
+    alone = draw_picture([load_recording(logs[0], PICTURE_TOPICS)])
+    assert unlike(paths, pixels) < 0.002 < 0.006 < unlike(alone, pixels), "without one trajectory it is another picture"
+
+
+def unlike(one, other):
+    """Share of the map's squares of 4 x 4 pixels that differ; edges of lines do not count, nor text, whose font is another."""
+    (x0, x1), (y0, y1) = (62, 1556), (96, 540)
+    small = [
+        cv2.resize(image[y0:y1, x0:x1].astype(np.uint8), None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA) for image in (one, other)
+    ]
+    return (np.abs(small[0].astype(int) - small[1]).max(axis=2) > 60).mean()
+
+
+def test_the_same_picture_is_the_same_file(folder, logs):
+    for name in ("p.svg", "p.pdf"):
+        one, two = (picture(logs, folder / f"{i}_{name}").read_bytes() for i in range(2))
+        assert one == two
+
+
+def test_a_ring_keeps_its_hole_on_either_canvas():
+    from uuvtai.logs.vector import VectorCanvas
+
+    outer, inner = (np.array([(-r, -r), (r, -r), (r, r), (-r, r)]) + 5.0 for r in (4.0, 2.0))
+    for turn in (1, -1):
+        plain, paths = (kind((200, 200), (0.0, 0.0), 20.0, (0.0, 10.0), (0.0, 10.0)) for kind in (canvas.Canvas, VectorCanvas))
+        for one in (plain, paths):
+            one.area_between(outer, inner[::turn], canvas.FAILED)
+        assert tuple(plain.image[100, 100]) == canvas.PAPER and tuple(plain.image[40, 40]) == canvas.FAILED
+        (path,) = [e for e in ElementTree.fromstring(paths.document("svg")).iter(f"{SVG}path") if code(canvas.FAILED) in e.get("style", "")]
+        assert _winding(path.get("d"), (72.0, 72.0)) == 0 and abs(_winding(path.get("d"), (26.0, 72.0))) == 1
+
+
+def _winding(d, place):
+    """How often the subpaths of straight lines turn around a place: what the non-zero rule fills by."""
+    total = 0.0
+    for part in d.split("M")[1:]:
+        numbers = [float(word) for word in part.replace("L", " ").replace("z", " ").split()]
+        ring = np.array(numbers).reshape(-1, 2) - place
+        angles = np.unwrap(np.arctan2(*np.vstack([ring, ring[:1]]).T[::-1]))
+        total += angles[-1] - angles[0]
+    return round(total / (2 * np.pi))
+
+
+# ---------------------------------------------------------------------------------------------------------------- videos
+
+
+@pytest.mark.parametrize(
+    ("name", "container", "codec"),
+    [("v.webm", "matroska,webm", "vp9"), ("v.mp4", "mov,mp4,m4a,3gp,3g2,mj2", "h264"), ("v.gif", "gif", "gif")],
+)
+def test_a_video_is_what_its_name_says(folder, logs, capfd, name, container, codec):
+    """Container, codec, size, rate and length by FFmpeg; what a frame shows by its pixels; nothing on stderr."""
+    fps, speed = 10.0, 2.0
+    out = video(logs[0], folder / name, fps=fps, speed=speed, width_px=640)
+    assert capfd.readouterr().err == ""
+    expected = len(np.arange(0.0, DURATION_S, speed / fps)) + 11
+    with av.open(str(out)) as found:
+        stream = found.streams.video[0]
+        assert (found.format.name, stream.codec_context.name.removeprefix("libdav1d")) == (container, codec)
+        frames = [frame.to_ndarray(format="bgr24").astype(int) for frame in found.decode(video=0)]
+        assert float(stream.average_rate) == pytest.approx(fps, rel=0.01)
+        if codec == "h264":
+            assert stream.codec_context.pix_fmt == "yuv420p", "the only one that every player knows"
+    assert len(frames) == expected and frames[0].shape[1] == 640 and frames[0].shape[0] % 2 == 0
+    drawn = cv2.resize(FrameArtist(load_recording(logs[0])).frame(0.4), (640, frames[0].shape[0]), interpolation=cv2.INTER_AREA)
+    errors = [np.abs(frame - drawn).mean() for frame in frames]
+    assert int(np.argmin(errors)) == 2 and errors[2] < 6
+
+
+def test_an_mp4_can_be_played_while_it_loads(folder, logs):
+    content = video(logs[0], folder / "fast.mp4", width_px=320).read_bytes()
+    assert 0 < content.index(b"moov") < content.index(b"mdat")
+
+
+def test_a_gif_keeps_its_time_and_its_colours(folder, logs):
+    """Pillow counts: 15 frames a second are no whole hundredths, and the rare colours must not melt into the frequent ones."""
+    with Image.open(video(logs[0], folder / "t.gif", fps=15.0)) as image:
+        durations, seen = [], set()
+        for i in range(image.n_frames):
+            image.seek(i)
+            durations.append(image.info["duration"])
+            seen |= set(map(tuple, np.array(image.convert("RGB")).reshape(-1, 3)))
+        assert image.info["loop"] == 0 and image.size[0] == 800
+    assert sum(durations) == pytest.approx(1000 * (image.n_frames / 15), abs=40)
+    assert {color[::-1] for color in (canvas.GOAL, canvas.ROUTE, canvas.method_inks(["bt"])["bt"])} <= seen
+
+
+def test_what_cannot_be_written_is_refused_before_anything_is_read(tmp_path):
+    for draw, name, there in ((picture, "a.jpg", ".png, .pdf, .svg"), (video, "a.avi", ".webm, .mp4, .gif"), (video, "a", ".webm")):
+        with pytest.raises(UserError, match="can be") as told:
+            draw(tmp_path / "nowhere.mcap", tmp_path / name)
+        assert there in str(told.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"speed": 0.0}, {"speed": -1.0}, {"speed": float("nan")}, {"fps": 1e9}, {"fps": 0.5}, {"width_px": 100_000}]
+)
+def test_values_without_sense_are_refused(tmp_path, logs, wrong):
+    with pytest.raises(UserError, match="must be from"):
+        video(logs[0], tmp_path / "a.webm", **wrong)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_cut_file_is_seen(tmp_path, logs):
+    frames = [np.full((64, 64, 3), 20 * i, np.uint8) for i in range(10)]
+    for suffix in (".webm", ".mp4", ".gif"):
+        path = tmp_path / f"a{suffix}"
+        assert film.write_film(path, frames, 10.0, frames, []) == 10
+        film.check_whole(path, 10, path)
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+        with pytest.raises(UserError, match="disk full"):
+            film.check_whole(path, 10, path)
+
+
+def test_videos_of_a_run_folder_are_small(folder, logs):
+    """A second of an episode takes less than 60 kB, so a page holds three minutes of episodes."""
+    from uuvtai.logs.video import SMALL
+
+    assert video(logs[0], folder / "small.webm", **SMALL).stat().st_size < 60_000 * DURATION_S + 60_000
+
+
+def test_the_command_takes_speed_rate_and_width_and_tells_its_progress(tmp_path, logs, capfd, monkeypatch):
+    monkeypatch.setattr("uuvtai.cli._Progress._PERIOD_S", 0.0)
+    out = tmp_path / "talk.gif"
+    with pytest.raises(SystemExit) as left:
+        main(["log", "video", str(logs[0]), "--out", str(out), "--speed", "3", "--fps", "5", "--width", "400"])
+    said = capfd.readouterr()
+    assert left.value.code == 0 and said.out.strip() == str(out) and "frames" in said.err
+    with Image.open(out) as image:
+        assert image.size[0] == 400
+
+
+# --------------------------------------------------------------------------------------------------------------- colours
+
+
+def test_a_method_has_one_colour_wherever_it_is_shown():
+    known = method_colours(["straight", "planner", "bt", "paper", "best", "oracle", "bt+truth"])
+    assert len(set(known.values())) == len(known)
+    for name, colour in known.items():
+        assert method_colours([name]) == {name: colour} and method_colours(["mine", name])[name] == colour
+
+
+def test_other_methods_take_what_is_free_in_their_order():
+    names = ["bt", "a", "b", "c"]
+    found = method_colours(names)
+    assert len(set(found.values())) == 4 and method_colours(["bt", "a"]) == {name: found[name] for name in ("bt", "a")}
+    many = method_colours([f"m{i}" for i in range(20)])
+    assert set(many.values()) <= set(PALETTE) and len(set(many.values())) == 7
+
+
+def test_every_method_stands_out_from_what_a_map_shows():
+    for colour in method_colours(["straight", "planner", "bt", "paper", "best", "oracle", "bt+truth"]).values():
+        assert contrast(colour, "#ffffff") > 1.9
+        for meaning in (canvas.DYNAMIC, canvas.MOVER):
+            assert np.abs(np.array(canvas.bgr(colour)) - meaning).max() > 60
+
+
+def test_a_video_draws_its_method_in_its_colour(folder, logs):
+    recording = load_recording(logs[1])
+    own, other = canvas.method_inks(["straight"])["straight"], canvas.method_inks(["bt"])["bt"]
+    pixels = set(map(tuple, FrameArtist(recording).frame(1.0).reshape(-1, 3)))
+    assert tuple(own) in pixels and tuple(other) not in pixels
+
+
+def test_methods_of_a_user_keep_the_colour_that_they_have_beside_each_other(tmp_path):
+    path = record(tmp_path / "b.mcap", "second")
+    names = ["bt", "first", "second"]
+    pixels = set(map(tuple, FrameArtist(load_recording(path), methods=names).frame(1.0).reshape(-1, 3)))
+    assert tuple(canvas.method_inks(names)["second"]) in pixels
+    image = draw_picture([load_recording(path, PICTURE_TOPICS)], methods=names)
+    assert tuple(canvas.method_inks(names)["second"]) in set(map(tuple, image.reshape(-1, 3)))
