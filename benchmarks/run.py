@@ -54,14 +54,14 @@ def main() -> int:
         return _work(chosen)
     failed, started = [], time.perf_counter()
     for name in chosen.what or names:
-        devices, threads = _traits(name)
+        devices, threads, longest_s = _traits(name)
         if chosen.device not in devices:
             if chosen.what:
                 print(f"{name}: runs on {', '.join(devices)} only", file=sys.stderr)
                 failed.append(name)
             continue
         print(f"{name} ...", file=sys.stderr, flush=True)
-        document, error = _measured(name, threads)
+        document, error = _measured(name, threads, longest_s)
         if document is None:
             print(f"{name}: failed\n{error}", file=sys.stderr)
             failed.append(name)
@@ -74,22 +74,24 @@ def main() -> int:
     return 1 if failed else 0
 
 
-def _traits(name: str) -> tuple[tuple[str, ...], int | None]:
-    """DEVICES and THREADS of a benchmark, read from its source: importing it could start what it measures."""
+def _traits(name: str) -> tuple[tuple[str, ...], int | None, int]:
+    """DEVICES, THREADS and LONGEST_S of a benchmark, read from its source: importing it could start what it measures."""
     devices: tuple[str, ...] = ("cpu",)
-    threads = None
+    threads, longest_s = None, _LONGEST_S
     for line in (HERE / f"{name}.py").read_text().splitlines():
         if line.startswith("DEVICES = "):
             devices = tuple(part.strip("\"' ") for part in line.partition("=")[2].strip(" ()").split(",") if part.strip("\"' )"))
         if line.startswith("THREADS = "):
             threads = int(line.partition("=")[2])
-    return devices, threads
+        if line.startswith("LONGEST_S = "):
+            longest_s = int(line.partition("=")[2])
+    return devices, threads, longest_s
 
 
 # ------------------------------------------------------------------------------------------------------- one process for each
 
 
-def _measured(name: str, threads: int | None) -> tuple[dict[str, Any] | None, str]:
+def _measured(name: str, threads: int | None, longest_s: int) -> tuple[dict[str, Any] | None, str]:
     """(what the worker found, '') or (None, what went wrong)."""
     environment = dict(os.environ)
     if threads:
@@ -98,9 +100,9 @@ def _measured(name: str, threads: int | None) -> tuple[dict[str, Any] | None, st
         target = Path(folder) / "rows.json"
         command = [sys.executable, str(HERE / "run.py"), *sys.argv[1:], "--worker", f"{name}:{target}"]
         try:
-            done = subprocess.run(command, env=environment, stdout=sys.stderr, check=False, timeout=_LONGEST_S)
+            done = subprocess.run(command, env=environment, stdout=sys.stderr, check=False, timeout=longest_s)
         except subprocess.TimeoutExpired:
-            return None, f"not done after {_LONGEST_S} s"
+            return None, f"not done after {longest_s} s"
         if done.returncode or not target.exists():
             return None, f"exit code {done.returncode} (its message is above)"
         return json.loads(target.read_text()), ""
