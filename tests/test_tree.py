@@ -1,10 +1,12 @@
 """Behaviour trees: reading, flattening, showing, and the tick engine against py_trees."""
 
+import io
 import xml.etree.ElementTree as ET
 from itertools import pairwise
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from benchmarks.peers.tick_py_trees import PyTree
 from uuvtai import state
@@ -12,6 +14,8 @@ from uuvtai import tree_codes as codes
 from uuvtai.config import TeacherConfig
 from uuvtai.kernels.tree_tick import tick_with_given_statuses
 from uuvtai.loader import ConfigError, preset_names, preset_path
+from uuvtai.show.screen import Screen
+from uuvtai.show.trees import show_tree
 from uuvtai.tree import CONTROLS, DECORATORS, LEAVES, FlatTree, TreeError, load_tree, node_use, parse_tree, read_tree, tree_dot, tree_text
 
 N_BOARD = 20
@@ -125,14 +129,22 @@ def test_presets_open_in_groot(name):
     assert len(read_tree(name, TeacherConfig().max_node).kind) <= TeacherConfig().max_node
 
 
-@pytest.mark.parametrize("name", ["straight", "planner", "bt"])
-def test_use_of_a_long_evaluation_fits_a_hundred_columns(name):
+@pytest.mark.parametrize("width", [80, 100, 120])
+@pytest.mark.parametrize("name", PRESETS)
+def test_the_use_of_a_long_evaluation_fits_the_terminal(name, width):
     flat = read_tree(name)
     ticks, acted = np.full((1000, 64), 99_999), np.full((1000, 64), 77_777)
-    lines = tree_text(flat, node_use(ticks, acted, len(flat.kind))).splitlines()
-    assert max(map(len, lines)) <= 100
-    for line, kind in zip(lines[1:], flat.kind, strict=True):
-        assert "99999000" in line and ("77777000" in line) is (kind == codes.ACTION)
+    used = node_use(ticks, acted, len(flat.kind))
+    nodes = [{"type": kind, **vars(use)} for kind, use in zip(flat.types, used, strict=True)]
+    console = Console(file=io.StringIO(), width=width)
+    show_tree(Screen(False, console), tree_text(flat), nodes)
+    lines = console.file.getvalue().splitlines()
+    assert max(map(len, lines)) <= width and "episodes" in lines[0]
+    rows = [line for line in lines if "100.0 %" in line]
+    assert len(rows) == len(flat.kind)
+    if width == 120:
+        for line, kind in zip(rows, flat.kind, strict=True):
+            assert "99999000" in line and ("77777000" in line) is (kind == codes.ACTION)
 
 
 def test_text_and_dot_name_every_node_and_its_use():
@@ -143,12 +155,11 @@ def test_text_and_dot_name_every_node_and_its_use():
     acted[0, flat.types.index("FollowRoute")] = 5
     use = node_use(ticks, acted, len(flat.kind))
     assert use[0].share == 1.0 and use[1].share == 0.25 and use[1].ticks == 7
-    text, dot = tree_text(flat, use), tree_dot(flat, use)
-    assert len(text.splitlines()) == len(flat.kind) + 1
-    for node in (*flat.names, "25.0%", "100.0%"):
+    text, dot = tree_text(flat), tree_dot(flat, use)
+    assert len(text.splitlines()) == len(flat.kind)
+    for node in flat.names:
         assert node in text
     assert dot.count("->") >= len(flat.kind) - 1 and "25.0 %" in dot
-    assert len(tree_text(flat).splitlines()) == len(flat.kind)
     assert node_use(np.zeros((0, 64)), np.zeros((0, 64)), 2)[1].ticks == 0
     quoted = parse_tree(xml("<Hold name='a \"b\"'/>"))
     assert '\\"b\\"' in tree_dot(quoted)

@@ -127,7 +127,9 @@ def evaluate(
         int | None,
         typer.Option("--explain-record", help="With --explain: log, picture, video of N of the worst failures per method \\[default: 3]."),
     ] = None,
-    resume: Annotated[Path | None, typer.Option("--resume", help="Run folder of an interrupted evaluation to go on with.")] = None,
+    resume: Annotated[
+        Path | None, typer.Option("--resume", help="Run folder of an interrupted evaluation to go on with.", autocompletion=choices.runs)
+    ] = None,
     device: Device = "auto",
     overrides: Set = None,
     with_report: WithReport = False,
@@ -623,7 +625,7 @@ def _print_export(found: Any, wide: bool) -> None:
 @app.command(epilog="Example: uuv presets show gauntlet")
 def presets(
     action: Annotated[
-        str | None, typer.Argument(metavar="[show]", help="'show' to print one preset as it is written.", autocompletion=lambda: ["show"])
+        str | None, typer.Argument(metavar="show", help="'show' to print one preset as it is written.", autocompletion=lambda: ["show"])
     ] = None,
     name: Annotated[
         str | None,
@@ -756,6 +758,7 @@ def tree(
         ),
     ] = "bt",
     dot: Annotated[bool, typer.Option("--dot", help="Print Graphviz DOT instead.")] = False,
+    wide: Wide = False,
     as_json: AsJson = False,
 ) -> None:
     """Print a behaviour tree, with the share of episodes and ticks per node after an evaluation."""
@@ -764,8 +767,14 @@ def tree(
     report = tree_report(controller, run)
     if as_json:
         _print_json(report.document)
+    elif dot:
+        typer.echo(plain(report.dot))
+    elif run is not None:
+        from uuvtai.show.trees import show_tree
+
+        show_tree(Screen(wide), report.text, report.document["nodes"])
     else:
-        typer.echo(plain(report.dot if dot else report.text))
+        typer.echo(plain(report.text))
 
 
 LogFile = Annotated[Path, typer.Argument(help="An .mcap file.")]

@@ -27,6 +27,10 @@ _REFILL_SHARE = 16
 """Ended rows wait until this part of the batch can be reset together, or until nothing runs: fewer reset passes, same results."""
 
 
+_TOLD_EVERY = 50
+"""passes between two words about the progress while no episode ends"""
+
+
 @dataclass(frozen=True)
 class Job:
     """One episode to play."""
@@ -136,6 +140,11 @@ def run_episodes(
     begun: dict[int, int] = {}
     passes = env_steps = 0
     clock = clock or StepClock()
+
+    def left() -> int | None:
+        over = (round(r.time_s / sim.config.episode.control_dt_s) for r in results.values())
+        return env_steps_left(over, (passes - begun[row] for row in playing), len(waiting))
+
     if progress:
         progress(0, len(jobs), 0, None)
     while waiting or playing:
@@ -152,8 +161,8 @@ def run_episodes(
             outcome = sim.rows(sim.s.referee.outcome)
         if recorder:
             recorder.step(sim)
-        if progress and passes == 1:
-            progress(0, len(jobs), env_steps, None)
+        if progress and passes % _TOLD_EVERY == 1:
+            progress(len(results), len(jobs), env_steps, left())
         ended = [row for row in sorted(playing) if outcome[row] != RUNNING]
         if not ended:
             continue
@@ -164,9 +173,7 @@ def run_episodes(
                 recorder.end(sim, row, result)
         sim.sleep_ended()
         if progress:
-            dt = sim.config.episode.control_dt_s
-            left = env_steps_left((round(r.time_s / dt) for r in results.values()), (passes - begun[row] for row in playing), len(waiting))
-            progress(len(results), len(jobs), env_steps, left)
+            progress(len(results), len(jobs), env_steps, left())
     sim.observation = observed
     return [results[i] for i in range(len(jobs))], env_steps
 

@@ -10,16 +10,16 @@ from uuvtai.files import FileError, read_json
 from uuvtai.loader import ConfigError, preset_names
 from uuvtai.tree import FlatTree, NodeUse, read_tree, read_tree_file, tree_dot, tree_text
 
-_LEGEND = "episodes: share that ticked the node; acted: control steps whose action the leaf set"
-
 
 @dataclass(frozen=True)
 class TreeReport:
     """The same tree three ways."""
 
     text: str
+    """one line per node"""
     dot: str
     document: dict[str, Any]
+    """nodes in the order of the lines, with their use where a run was given"""
 
 
 def tree_report(controller: str, run: Path | None) -> TreeReport:
@@ -35,8 +35,7 @@ def tree_report(controller: str, run: Path | None) -> TreeReport:
             raise ConfigError(f"{run}: the tree {controller!r} has changed since that evaluation; run it again with 'uuv eval'")
     else:
         tree = read_tree(controller)
-    text = tree_text(tree, use) + (f"\n\n{_LEGEND}" if use else "")
-    return TreeReport(text, tree_dot(tree, use), _document(controller, tree, use))
+    return TreeReport(tree_text(tree), tree_dot(tree, use), _document(controller, tree, use))
 
 
 def _record(run: Path) -> dict[str, list[NodeUse]]:

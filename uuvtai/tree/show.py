@@ -40,23 +40,9 @@ def node_use(ticks: np.ndarray, acted: np.ndarray, n_node: int) -> list[NodeUse]
     return [NodeUse(float((ticks[:, i] > 0).mean()), int(ticks[:, i].sum()), int(acted[:, i].sum())) for i in range(n_node)]
 
 
-def tree_text(flat: FlatTree, use: Sequence[NodeUse] | None = None) -> str:
-    """The tree as indented text; with ``use`` also the share of episodes, ticks and steps acted of every node."""
-    lines = [f"{branch}{_label(flat, i)}" for i, branch in enumerate(_branches(flat))]
-    if use is None:
-        return "\n".join(lines)
-    width = max(map(len, lines))
-    head = f"{'node':{width}}  {'episodes':>8}  {'ticks':>10}  {'acted':>8}  {'acted %':>7}"
-    total = max(1, sum(u.acted for u in use))
-    rows = [
-        f"{line:{width}}  {100 * u.share:7.1f}%  {u.ticks:10d}  {_acted(flat, i, u, total)}"
-        for i, (line, u) in enumerate(zip(lines, use, strict=True))
-    ]
-    return "\n".join([head, *(row.rstrip() for row in rows)])
-
-
-def _acted(flat: FlatTree, node: int, use: NodeUse, total: int) -> str:
-    return f"{use.acted:8d}  {100 * use.acted / total:6.1f}%" if flat.kind[node] == codes.ACTION else ""
+def tree_text(flat: FlatTree) -> str:
+    """The tree as indented text, one line per node."""
+    return "\n".join(f"{branch}{_label(flat, i)}" for i, branch in enumerate(_branches(flat)))
 
 
 def _label(flat: FlatTree, node: int) -> str:
