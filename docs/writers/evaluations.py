@@ -38,6 +38,8 @@ class Row:
     options: str
     """of ``uuv eval``"""
     methods: str = "--controller straight --controller planner --controller bt"
+    shows: str = "bt"
+    """the method whose counts stand in the table's row"""
 
 
 _MOVING = "-S 8 -D 6 -v 0.6"
@@ -59,7 +61,13 @@ ROWS = (
         "`pool` (6, 0.6), harsh sensing, dead reckoning",
         f"--world pool {_MOVING} --sensors harsh --set sensors.localization=dead_reckoning",
     ),
-    Row("pool_6_paper", "`pool` (6, 0.6), the paper's classical stack", f"--world pool {_MOVING}", "--controller paper"),
+    Row(
+        "pool_6_paper",
+        "`pool` (6, 0.6), the paper's classical stack",
+        f"--world pool {_MOVING}",
+        "--controller bt --controller paper",
+        "paper",
+    ),
 )
 
 SWEEPS = {
@@ -102,6 +110,7 @@ def entry_of(row: Row, command: str, result: dict[str, Any], commit: str, date: 
     return {
         "name": row.name,
         "title": row.title,
+        "shows": row.shows,
         "command": command,
         "commit": commit,
         "date": date,

@@ -61,7 +61,7 @@ def evaluations(sources: Sources) -> str:
 
 def _evaluated(entry: dict[str, Any]) -> list[str]:
     methods = {name: Counts(m["episodes"], m["outcomes"]) for name, m in entry["methods"].items()}
-    name = "bt" if "bt" in methods else next(iter(methods))
+    name = entry.get("shows", "bt")
     own = methods[name]
     ends = " / ".join(str(own.count(ending)) for ending in ("collision", "ttc", "out_of_tank", "timeout"))
     others = [f"{100 * methods[other].field('success_rate'):.1f} %" if other in methods else DASH for other in ("planner", "straight")]
