@@ -122,6 +122,6 @@ def refuse_others(place: Path, before: dict[str, str], now: dict[str, str]) -> N
 
 def _tree_sha256(method: Method) -> str:
     tree = dataclasses.asdict(method.tree)
-    tree.pop("source")
+    del tree["source"], tree["xml"]
     stack = [] if method.stack is None else [read_preset("stack", method.stack)]
     return hashlib.sha256(json.dumps([tree, method.privileged, *stack]).encode()).hexdigest()
