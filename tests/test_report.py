@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from tests import report_samples as samples
+from uuvtai.errors import UserError
 from uuvtai.loader import ConfigError
 from uuvtai.report import ink
 from uuvtai.report.blocks import Data, Figure, Gallery, Prose, Table
@@ -530,3 +531,59 @@ def test_a_page_that_cannot_be_written_leaves_the_old_one(tmp_path):
     with pytest.raises(RunFolderError, match="--out FILE"):
         report([tmp_path], tmp_path / "wall" / "x.html")
     assert (tmp_path / "report.html").read_bytes() == before
+
+
+# ------------------------------------------------------------------------------------------------------- where it may be written
+
+
+def test_the_default_page_may_be_renewed(tmp_path):
+    run = samples.write_run(tmp_path / "run", sweep=samples.noise_sweep())
+    assert report([run]).page == report([run]).page == report([run], run / "report.html").page
+
+
+@pytest.mark.parametrize("name", ["run/run.json", "run/config.yaml", "run/sweep.json", "run/../run/sweep.json", "link/sweep.json"])
+def test_a_page_never_replaces_a_file_of_the_run(tmp_path, name):
+    run = samples.write_run(tmp_path / "run", sweep=samples.noise_sweep())
+    (tmp_path / "link").symlink_to(run)
+    before = (tmp_path / name).read_bytes()
+    for force in (False, True):
+        with pytest.raises(UserError, match="is part of the run"):
+            report([run], tmp_path / name, force)
+    assert (tmp_path / name).read_bytes() == before
+    assert not (run / "figures").exists()
+
+
+def test_a_page_elsewhere_replaces_files_with_force_only(tmp_path):
+    run = samples.write_run(tmp_path / "run", sweep=samples.noise_sweep())
+    (tmp_path / "mine.html").write_text("mine")
+    with pytest.raises(UserError, match="--force"):
+        report([run], tmp_path / "mine.html")
+    assert (tmp_path / "mine.html").read_text() == "mine" and not (tmp_path / "figures").exists()
+    written = report([run], tmp_path / "mine.html", force=True)
+    assert "<html" in (tmp_path / "mine.html").read_text()
+    (tmp_path / "mine.html").unlink()
+    written.figures[0].write_text("my figure")
+    with pytest.raises(UserError, match="--force"):
+        report([run], tmp_path / "mine.html")
+    assert written.figures[0].read_text() == "my figure" and not (tmp_path / "mine.html").exists()
+
+
+@pytest.mark.parametrize("kind", ["page", "figures", "figure"])
+def test_a_page_is_not_written_through_a_link(tmp_path, kind):
+    run = samples.write_run(tmp_path / "run", sweep=samples.noise_sweep())
+    (tmp_path / "outside").mkdir()
+    (tmp_path / "outside" / "sweep_sensors.png").write_text("precious")
+    places = {"page": "page.html", "figures": "figures", "figure": "figures/sweep_sensors.png"}
+    link = tmp_path / places[kind]
+    link.parent.mkdir(exist_ok=True)
+    link.symlink_to(tmp_path / "outside" if kind == "figures" else tmp_path / "outside" / "sweep_sensors.png")
+    with pytest.raises(UserError, match="is a link"):
+        report([run], tmp_path / "page.html", force=True)
+    assert [path.read_text() for path in (tmp_path / "outside").iterdir()] == ["precious"]
+
+
+def test_a_page_of_several_trainings_is_none_of_theirs(tmp_path):
+    runs = [samples.write_run(tmp_path / name, metrics=samples.metrics(5)) for name in "ab"]
+    report([runs[0]])
+    with pytest.raises(UserError, match="--force"):
+        report(runs, runs[0] / "report.html")

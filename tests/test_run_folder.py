@@ -3,11 +3,17 @@
 import errno
 import json
 import os
+import subprocess
+import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 
+from uuvtai.errors import UserError
 from uuvtai.loader import load_config, load_resolved
-from uuvtai.run_folder import RunFolder, RunFolderError, write_atomic
+from uuvtai.run_folder import RunFolder, RunFolderError, default_run_dir, refuse_place, write_atomic
 
 
 def files_in(folder):
@@ -65,3 +71,152 @@ def test_write_atomic_replaces(tmp_path):
     write_atomic(target, b"two")
     assert target.read_bytes() == b"two"
     assert files_in(tmp_path) == ["deep/file.bin"]
+
+
+# ------------------------------------------------------------------------------------------------------- one process at a time
+
+
+def at_once(n, work):
+    """What ``n`` threads get from ``work`` that all begin it together; an error counts as what it is."""
+    start = threading.Barrier(n)
+
+    def one(_i):
+        start.wait()
+        try:
+            return work()
+        except UserError as error:
+            return error
+
+    with ThreadPoolExecutor(n) as pool:
+        return list(pool.map(one, range(n)))
+
+
+@pytest.mark.parametrize("is_there", [False, True])
+def test_of_several_that_begin_in_one_folder_exactly_one_does(tmp_path, is_there):
+    config = load_config("pool")
+    for i in range(10):
+        place = tmp_path / str(i)
+        if is_there:
+            place.mkdir()
+        found = at_once(8, lambda place=place: RunFolder(place, config, [0]))
+        assert sum(isinstance(one, RunFolder) for one in found) == 1
+        assert files_in(place) == [".lock", "config.yaml", "run.json"]
+
+
+def test_of_two_processes_that_begin_in_one_folder_exactly_one_does(tmp_path):
+    script = """if True:
+        import sys
+        from pathlib import Path
+        from uuvtai.loader import load_config
+        from uuvtai.run_folder import RunFolder, RunFolderError
+        config = load_config("pool")
+        print("ready", flush=True)
+        sys.stdin.readline()
+        try:
+            folder = RunFolder(Path(sys.argv[1]), config, [0])
+        except RunFolderError:
+            sys.exit(2)
+        sys.stdin.readline()
+    """
+    command = [sys.executable, "-c", script, str(tmp_path / "run")]
+    both = [subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    assert [one.stdout.readline() for one in both] == ["ready\n"] * 2
+    for one in both:
+        one.stdin.write("\n")
+        one.stdin.flush()
+    for one in both:
+        one.communicate("\n")
+    assert sorted(one.returncode for one in both) == [0, 2]
+
+
+def test_a_run_is_held_from_its_first_file_to_its_end(tmp_path):
+    folder = RunFolder(tmp_path / "run", load_config("pool"), [0])
+    with pytest.raises(RunFolderError, match="another process is working in this folder"):
+        RunFolder.reopen(folder.path, {})
+    with pytest.raises(RunFolderError, match="already there and not empty"):
+        RunFolder(folder.path, load_config("pool"), [0])
+    folder.finish("finished", 0)
+    again = RunFolder.reopen(folder.path, {"from": 1})
+    assert json.loads((folder.path / "run.json").read_text())["resumed"][0]["from"] == 1
+    with pytest.raises(RunFolderError, match="another process"):
+        RunFolder.held(folder.path)
+    again.release()
+
+
+def test_what_is_no_run_folder_is_left_as_it_is(tmp_path):
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(RunFolderError, match="'uuv sweep' printed"):
+        RunFolder.held(tmp_path, "uuv sweep")
+    assert files_in(tmp_path) == ["mine.txt"]
+
+
+def test_a_folder_that_cannot_be_gone_on_with_is_let_go(tmp_path):
+    (tmp_path / "run.json").write_text("{")
+    for _ in range(2):
+        with pytest.raises(RunFolderError, match=r"run\.json: cannot be read"):
+            RunFolder.reopen(tmp_path, {})
+
+
+def test_an_evaluation_holds_its_folder(tmp_path, monkeypatch):
+    """Of 25 pairs of evaluations that began in one folder all 50 succeeded, and their files were mixed."""
+    from uuvtai.measure import compare
+
+    made = []
+    monkeypatch.setattr(compare, "RunFolder", lambda *arguments: made.append(RunFolder(*arguments)) or made[0])
+    monkeypatch.setattr(compare, "_methods", lambda *_: [])
+    monkeypatch.setattr(compare, "_any_tree", lambda: None)
+    monkeypatch.setattr("uuvtai.sim.Sim", lambda *_: None)
+
+    class Watch:
+        def __getattr__(self, _name):
+            return lambda *_: None
+
+    def scenarios(_sim, _jobs):
+        with pytest.raises(RunFolderError, match="another process"):
+            RunFolder.held(tmp_path / "run")
+        raise LookupError("seen")
+
+    monkeypatch.setattr("uuvtai.measure.ceilings.scenarios_of", scenarios)
+    request = compare.Request(load_config("pool"), "pool", "paper", ["oracle"], [77], 1, run_dir=tmp_path / "run")
+    with pytest.raises(LookupError, match="seen"):
+        compare.compare(request, Watch())
+    RunFolder.held(tmp_path / "run").release()
+
+
+def test_default_names_do_not_collide(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    found = at_once(16, lambda: default_run_dir("some/world.yaml"))
+    assert len(set(found)) == 16 and all(path.is_dir() and "_world" in path.name for path in found)
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    refuse_place(None)
+    assert not list(Path().iterdir()), "a refusal leaves nothing behind"
+    Path("runs").write_text("a file")
+    with pytest.raises(RunFolderError, match="Not a directory"):
+        refuse_place(None)
+    with pytest.raises(RunFolderError, match="--run-dir"):
+        default_run_dir("pool")
+
+
+# ------------------------------------------------------------------------------------------------------------------- links
+
+
+def test_the_temporary_neighbour_is_never_somebody_elses_file(tmp_path, monkeypatch):
+    monkeypatch.setattr("secrets.token_hex", lambda _n: "0")
+    (tmp_path / "victim").write_text("precious")
+    (tmp_path / f".x.{os.getpid()}.0.tmp").symlink_to(tmp_path / "victim")
+    with pytest.raises(FileExistsError):
+        write_atomic(tmp_path / "x", b"new")
+    assert (tmp_path / "victim").read_text() == "precious" and not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize("name", ["figures/x.png", "x.json"])
+def test_nothing_is_written_through_a_link_that_came_later(tmp_path, name):
+    (tmp_path / "outside").mkdir()
+    (tmp_path / "outside" / "x.png").write_text("precious")
+    folder = RunFolder(tmp_path / "run", load_config("pool"), [0])
+    link = folder.path / name.partition("/")[0]
+    link.symlink_to(tmp_path / "outside" if "/" in name else tmp_path / "outside" / "x.png")
+    with pytest.raises(RunFolderError, match="is a link"):
+        folder.write(name, "new")
+    assert (tmp_path / "outside" / "x.png").read_text() == "precious"

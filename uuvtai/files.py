@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
@@ -29,6 +30,8 @@ _ALWAYS = getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0) | getattr(os,
 _OPEN, _CHANGE = os.O_RDONLY | _ALWAYS, os.O_RDWR | _ALWAYS
 _CREATE = os.O_WRONLY | os.O_CREAT | _NO_FOLLOW | _ALWAYS
 _FOLDER = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_CLOEXEC", 0)
+_NO_FILE = (errno.ENXIO, errno.ENODEV, errno.EISDIR)
+"""what opening a socket, a pipe that nobody reads or a folder may say"""
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 
 
@@ -42,7 +45,7 @@ def open_file(path: Path, limit: int = MAX_BYTES, folder: Path | None = None) ->
     ``folder``: the file must lie below it, with no link among the names in between; without it a link counts as the user's own, who typed
     the path. Raises FileError for what is refused, OSError (FileNotFoundError, PermissionError, ...) for what cannot be opened.
     """
-    handle = os.open(path, _OPEN) if folder is None else _open_below(folder, path)
+    handle = _open(path, folder, _OPEN)
     try:
         found = os.fstat(handle)
         if not stat.S_ISREG(found.st_mode):
@@ -212,7 +215,7 @@ def _same(one: Path, other: Path) -> bool:
 
 
 def _open_to_change(path: Path, folder: Path, flags: int) -> int:
-    handle = _open_below(folder, path, flags)
+    handle = _open(path, folder, flags)
     try:
         found = os.fstat(handle)
         if not stat.S_ISREG(found.st_mode):
@@ -225,7 +228,16 @@ def _open_to_change(path: Path, folder: Path, flags: int) -> int:
     return handle
 
 
-def _open_below(folder: Path, path: Path, flags: int = _OPEN) -> int:
+def _open(path: Path, folder: Path | None, flags: int) -> int:
+    try:
+        return os.open(path, flags) if folder is None else _open_below(folder, path, flags)
+    except OSError as error:
+        if error.errno in _NO_FILE:
+            raise FileError(f"{path}: is no plain file ({error.strerror})") from None
+        raise
+
+
+def _open_below(folder: Path, path: Path, flags: int) -> int:
     """File descriptor of ``path``, opened name by name from ``folder`` on, so that no name can turn into a link meanwhile."""
     parts = _parts_below(folder, path)
     if os.open not in os.supports_dir_fd:
