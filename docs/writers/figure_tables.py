@@ -133,6 +133,22 @@ def _both(counts: Counts, digits: int = 0) -> str:
     return f"{100 * counts.field('success_rate'):.{digits}f} / {100 * counts.field('collision_rate'):.{digits}f}"
 
 
+def sweep_commands(sources: Sources) -> str:
+    """What made the sweeps of the grid and of caution, and how long each took."""
+    return _commands(sources, ("pool", "gauntlet", "caution"))
+
+
+def sweep_commands_alone(sources: Sources) -> str:
+    """What made the sweeps of one thing at a time."""
+    return _commands(sources, ("robustness", "dead_reckoning"))
+
+
+def _commands(sources: Sources, names: Sequence[str]) -> str:
+    about = sources.json("docs/data/sweeps.json")
+    lines = [f"{about[name]['command']}  # {about[name]['wall_s'] / 60:.0f} min on one thread" for name in names]
+    return "\n".join(["```sh", *lines, "```"])
+
+
 def caution(sources: Sources) -> str:
     """Success and collision against ``teacher.caution``."""
     cells = sources.cells("caution")
@@ -279,6 +295,8 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         evaluations,
         policy,
         grid,
+        sweep_commands,
+        sweep_commands_alone,
         caution,
         alone,
         learning_cost,
