@@ -15,7 +15,7 @@ import sys
 import tempfile
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -198,7 +198,7 @@ def play_all(rows: list[Row], sweep_names: list[str], seed: int, document: dict[
     """Play rows and sweeps, ``jobs`` at a time; what went wrong, in words. The others are played and kept all the same."""
     failed: list[str] = []
     with ThreadPoolExecutor(jobs) as pool:
-        waiting = {pool.submit(_play, row, seed, document["episodes"], commit): row.name for row in rows}
+        waiting: dict[Future[Any], str] = {pool.submit(_play, row, seed, document["episodes"], commit): row.name for row in rows}
         waiting |= {pool.submit(_sweep, name, seed): f"sweep/{name}" for name in sweep_names}
         try:
             for future in as_completed(waiting):

@@ -139,7 +139,8 @@ class Sources:
             return _pick(self.evaluations(), parts[0], "entry")
         row, method, field = parts
         if "/" in method:  # a paired comparison: pool_0.bt/straight.time_ratio
-            return self._paired(row, *method.split("/"), field)
+            a, _, b = method.partition("/")
+            return self._paired(row, a, b, field)
         return self.evaluation(row, method).field(field)
 
     def _paired(self, row: str, a: str, b: str, field: str) -> Any:
