@@ -14,7 +14,7 @@ from uuvtai.measure.eval_request import FILE as REQUEST
 
 TIMES = ("wall_s", "env_steps_per_s")
 """of the machine, not of the vehicles"""
-EPISODES = 5
+EPISODES = 4
 
 
 class Watch:
@@ -40,16 +40,19 @@ class Watch:
         pass
 
 
-@pytest.fixture
-def ask(small, monkeypatch):
-    """Requests of the session's simulator: nothing is compiled."""
-    monkeypatch.setattr("uuvtai.sim.Sim", lambda _config, _num_envs, tree, _device: small.sim.use_tree(tree) or small.sim)
+@pytest.fixture(scope="module")
+def ask(small, tmp_path_factory):
+    """Requests of the session's simulator: nothing is compiled. The blind yardstick drives, twice: its episodes are short."""
+    second = tmp_path_factory.mktemp("trees") / "second.xml"
+    second.write_text(preset_path("tree", "straight").read_text())
 
     def request(folder, **others):
-        given = {"controllers": ["straight", "bt"], "episodes": EPISODES, "seeds": [77], "num_envs": small.N, "device": "cpu", "record": 2}
+        given = {"controllers": ["straight", str(second)], "episodes": EPISODES, "seeds": [77], "num_envs": 2, "device": "cpu", "record": 2}
         return Request(config=small.config, world="pool", sensors="paper", run_dir=folder, **given | others)
 
-    yield request
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("uuvtai.sim.Sim", lambda _config, _num_envs, tree, _device: small.sim.use_tree(tree) or small.sim)
+        yield request
     small.sim.use_tree(small.trees["bt"])
 
 
@@ -58,12 +61,12 @@ def outcome(result):
     return result | {"methods": [{name: value for name, value in m.items() if name not in TIMES} for m in result["methods"]]}
 
 
-@pytest.fixture
-def whole(ask, tmp_path):
-    return compare(ask(tmp_path / "whole"), Watch())
+@pytest.fixture(scope="module")
+def whole(ask, tmp_path_factory):
+    return compare(ask(tmp_path_factory.mktemp("whole") / "run"), Watch())
 
 
-@pytest.mark.parametrize(("method", "after"), [("straight", 1), ("straight", EPISODES), ("bt", 3)])
+@pytest.mark.parametrize(("method", "after"), [("straight", 1), ("second", 2)])
 def test_an_interrupted_evaluation_ends_as_an_undisturbed_one(ask, whole, tmp_path, method, after):
     run, watch = tmp_path / "run", Watch(method, after)
     with pytest.raises(KeyboardInterrupt):
@@ -91,7 +94,7 @@ def test_an_interrupted_evaluation_ends_as_an_undisturbed_one(ask, whole, tmp_pa
 def test_a_line_that_a_kill_cut_off_and_a_lost_log_are_played_again(ask, whole, tmp_path):
     run = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
-        compare(ask(run), Watch("bt", EPISODES))
+        compare(ask(run), Watch("second", EPISODES))
     file = run / ledger.FILE
     file.write_bytes(file.read_bytes()[:-30])
     next((run / "logs").glob("straight*.mcap")).unlink()

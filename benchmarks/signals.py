@@ -1,0 +1,277 @@
+"""SIGKILL, SIGINT and SIGTERM at random moments of every command: is anything lost, half-written or told by a traceback?"""
+
+from __future__ import annotations
+
+import json
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from benchmarks.common import Job, Row
+
+LONGEST_S = 14400
+"""the whole of it, on two cores"""
+_SEED = 20261122
+_KILLS = {"train": 100, "eval": 50, "export": 25, "report": 25, "signals": 100}
+_QUICK = {"train": 3, "eval": 3, "export": 2, "report": 2, "signals": 12}
+_ONE_S = 900.0
+_TRAIN = ["train", "smoke", "--device", "cpu", "--set", "train.checkpoint_every=2"]
+_EVAL = ["eval", "--controller", "straight,bt", "--seeds", "77", "--num-envs", "8", "--device", "cpu"]
+_HORIZON = ["--set", "episode.horizon_steps=400", "--set", "world.dynamic_capacity=9"]
+_HALF = (".tmp", ".part", ".partial", ".repairing", ".part.webm")
+_TIMES = ("wall_s", "env_steps_per_s")
+
+
+def measure(job: Job) -> list[Row]:
+    """Violations of each kind; a violation is told as it is found."""
+    counts = _QUICK if job.quick else _KILLS
+    with tempfile.TemporaryDirectory() as folder:
+        bench = _Bench(Path(folder), job)
+        rows = bench.killed_train(counts["train"]) + bench.killed_eval(counts["eval"])
+        return rows + bench.killed_export(counts["export"]) + bench.killed_report(counts["report"]) + bench.signalled(counts["signals"])
+
+
+class _Bench:
+    """All parts in one folder: what one of them makes the next ones read."""
+
+    def __init__(self, folder: Path, job: Job) -> None:
+        self.folder, self.job, self.random = folder, job, random.Random(_SEED)
+
+    # ------------------------------------------------------------------------------------------------------------- SIGKILL
+
+    def killed_train(self, kills: int) -> list[Row]:
+        """Resume after every kill until so many have hit; the last checkpoint bit-equal to an undisturbed run's."""
+        iterations = ["--iterations", str(20 if self.job.quick else 60)]
+        whole_s = self._whole([*_TRAIN, *iterations, "--run-dir", "whole"])
+        place, wrong, hit = self.folder / "killed", [], 0
+        while hit < kills:
+            if _done(place) or not any((place / "checkpoints").glob("step_*")):
+                wrong += self._unequal(place) if _done(place) else []
+                shutil.rmtree(place, ignore_errors=True)
+                command = [*_TRAIN, *iterations, "--run-dir", "killed"]
+            else:
+                command = ["train", "--resume", "killed", *iterations]
+            hit += self._kill(command, whole_s)
+        if not _done(place):
+            begun = any((place / "checkpoints").glob("step_*"))
+            if not begun:
+                shutil.rmtree(place, ignore_errors=True)
+            self._uuv(["train", "--resume", "killed", *iterations] if begun else [*_TRAIN, *iterations, "--run-dir", "killed"])
+        wrong += self._unequal(place)
+        return [self._row(f"train killed {hit} times and resumed: runs that end otherwise than undisturbed", wrong)]
+
+    def _unequal(self, place: Path) -> list[str]:
+        ours, theirs = (max((run / "checkpoints").glob("step_*"), key=_step) for run in (place, self.folder / "whole"))
+        names = {file.name for file in theirs.iterdir() if file.name != "manifest.json"}
+        return [f"train: {name} differs" for name in sorted(names) if (ours / name).read_bytes() != (theirs / name).read_bytes()]
+
+    def killed_eval(self, kills: int) -> list[Row]:
+        """Resume after every kill; the result that of an undisturbed evaluation, every log readable, nothing else half-written."""
+        record = "2" if self.job.quick else "6"
+        arguments = [*_EVAL, "--episodes", "8" if self.job.quick else "24", "--record", record, *_HORIZON]
+        whole_s = self._whole([*arguments, "--run-dir", "played"])
+        wanted, wrong, hit, place = _result(self.folder / "played"), [], 0, self.folder / "eval"
+        while hit < kills:
+            if _done(place) or not (place / "eval/request.json").exists():
+                shutil.rmtree(place, ignore_errors=True)
+                command = [*arguments, "--run-dir", "eval"]
+            else:
+                command = ["eval", "--resume", "eval"]
+            hit += self._kill(command, whole_s)
+            wrong += self._unreadable(place)
+            if _done(place) and _result(place) != wanted:
+                wrong.append("eval: the result differs")
+        if (place / "eval/request.json").exists():
+            self._uuv(["eval", "--resume", "eval"])
+            wrong += [] if _result(place) == wanted else ["eval: the result differs at the end"]
+            wrong += _half_written(place)
+        return [self._row(f"eval --record killed {hit} times and resumed: results that differ, unreadable logs, halves left", wrong)]
+
+    def _unreadable(self, place: Path) -> list[str]:
+        """One log of those under way that ``uuv log repair`` cannot read, and of the finished ones that ``log info`` cannot."""
+        wrong = []
+        for log in sorted((place / "logs").glob("*.mcap"))[-1:]:
+            wrong += [f"{log.name}: unreadable"] if self._run(["log", "info", str(log)])[0] else []
+        for part in [p for p in sorted((place / "logs").glob("*.part")) if p.stat().st_size > 100_000][-1:]:
+            repaired = self.folder / "repaired.mcap"
+            wrong += [f"{part.name}: beyond repair"] if self._run(["log", "repair", str(part), "--out", str(repaired)])[0] else []
+            repaired.unlink(missing_ok=True)
+        return wrong
+
+    def killed_export(self, kills: int) -> list[Row]:
+        """The folder is whole or not there, and the next try succeeds."""
+        whole_s, wrong = self._whole(["export", "best", "--out", "exported"]), []
+        for _ in range(kills):
+            self._kill(["export", "best", "--out", "again"], whole_s)
+            if (self.folder / "again").exists() and self._run(["export", "--check", "again"])[0]:
+                wrong.append("export: a folder that does not agree")
+            shutil.rmtree(self.folder / "again", ignore_errors=True)
+        wrong += [f"export: {err}" for code, err in [self._run(["export", "best", "--out", "again"])] if code]
+        return [self._row(f"export killed {kills} times: halves under its name", wrong)]
+
+    def killed_report(self, kills: int) -> list[Row]:
+        """The page is whole or not there, and the next try succeeds."""
+        whole_s, wrong, page = self._whole(["report", "played"]), [], self.folder / "played/report.html"
+        for _ in range(kills):
+            page.unlink(missing_ok=True)
+            self._kill(["report", "played"], whole_s)
+            if page.exists() and not page.read_text(encoding="utf-8").rstrip().endswith("</html>"):
+                wrong.append("report: half a page")
+        wrong += [f"report: {err}" for code, err in [self._run(["report", "played"])] if code]
+        return [self._row(f"report killed {kills} times: halves under its name", wrong)]
+
+    def _kill(self, command: list[str], whole_s: float) -> bool:
+        """Whether a kill at a random moment hit."""
+        child = self._begun(command)
+        moment = self.random.uniform(0.0, 1.1 * whole_s)
+        try:
+            _, err = child.communicate(timeout=moment)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            child.communicate()
+            return True
+        if child.returncode:
+            raise RuntimeError(f"uuv {' '.join(command)}: exit code {child.returncode}\n{err}")
+        return False
+
+    # ---------------------------------------------------------------------------------------------------- SIGINT and SIGTERM
+
+    def signalled(self, count: int) -> list[Row]:
+        """Every command in turn, one of the two signals at a random moment of it."""
+        log = next((self.folder / "played/logs").glob("*.mcap"))
+        commands = [
+            [*_EVAL, "--episodes", "8", "--record", "1", *_HORIZON, "--run-dir", "out"],
+            [*_TRAIN, "--iterations", "10", "--run-dir", "out"],
+            ["simulate", "--seconds", "20"], ["report", "played", "--out", "out/page.html"], ["export", "best", "--out", "out/policy"],
+            ["sweep", "--grid", "D=0,3", "--controller", "straight", "--episodes", "4", "--num-envs", "8", "--run-dir", "out"],
+            ["profile", "--num-envs", "8", "--seconds", "1"], ["presets"], ["doctor"], ["tree", "played"], ["log", "info", str(log)],
+            ["log", "repair", str(log), "--out", "out/log.mcap"], ["log", "picture", str(log), "--out", "out/log.png"],
+            ["log", "video", str(log), "--out", "out/log.webm"], ["reproduce", "--run-dir", "out"],
+        ]  # fmt: skip
+        wrong, interrupted, times = [], 0, {}
+        for i in range(count):
+            command, number = commands[i % len(commands)], (signal.SIGINT, signal.SIGTERM)[i // len(commands) % 2]
+            code, told = self._signal(command, number, times)
+            interrupted += code == 128 + number
+            wrong += [f"{' '.join(command)}: {what}" for what in told]
+        return [
+            self._row(f"{count} signals, every command in turn: tracebacks, other exit codes, halves, inconsistent folders", wrong),
+            Row("signals that hit a command at work", interrupted, f"of {count}"),
+        ]
+
+    def _signal(self, command: list[str], number: int, times: dict[str, float]) -> tuple[int, list[str]]:
+        out = self.folder / "out"
+        shutil.rmtree(out, ignore_errors=True)
+        if "--run-dir" not in command:
+            out.mkdir()
+        key, begun = " ".join(command[:2]), time.monotonic()
+        child = self._begun(command)
+        while child.poll() is None and not _hears(child.pid):  # what Python does before our first line is not ours
+            time.sleep(0.002)
+        longest = 20.0 if command[0] == "reproduce" else times.get(key, 40.0)
+        moment = self.random.uniform(0.0, longest)
+        try:
+            _, err = child.communicate(timeout=moment)
+            times[key] = time.monotonic() - begun
+            wanted = [0]
+        except subprocess.TimeoutExpired:
+            child.send_signal(number)
+            try:
+                _, err = child.communicate(timeout=_ONE_S)
+            except subprocess.TimeoutExpired:
+                child.kill()
+                return -9, ["did not end"]
+            wanted = [128 + number, 0]
+        told = [f"exit code {child.returncode} after {moment:.2f} s: {err[-300:]}"] if child.returncode not in wanted else []
+        told += [f"after {moment:.2f} s: {err[-600:]}"] if "Traceback" in err or "a bug of ours" in err else []
+        told += _half_written(out, parts=command[0] == "eval") + _inconsistent(out, child.returncode)
+        return child.returncode, told
+
+    # --------------------------------------------------------------------------------------------------------------- commands
+
+    def _begun(self, command: list[str]) -> subprocess.Popen[str]:
+        return subprocess.Popen(
+            [sys.executable, "-m", "uuvtai", *command], cwd=self.folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        )
+
+    def _run(self, command: list[str]) -> tuple[int, str]:
+        child = self._begun(command)
+        _, err = child.communicate()
+        return child.returncode, err
+
+    def _uuv(self, command: list[str]) -> None:
+        code, err = self._run(command)
+        if code:
+            raise RuntimeError(f"uuv {' '.join(command)}: exit code {code}\n{err}")
+
+    def _whole(self, command: list[str]) -> float:
+        """Time of an undisturbed run [s], kernels compiled."""
+        begun = time.monotonic()
+        self._uuv(command)
+        self.job.say(f"undisturbed: uuv {' '.join(command[:2])}: {time.monotonic() - begun:.0f} s")
+        return time.monotonic() - begun
+
+    def _row(self, what: str, wrong: list[str]) -> Row:
+        for text in wrong:
+            self.job.say(f"VIOLATION {text}")
+        self.job.say(f"{what}: {len(wrong)}")
+        return Row(what, len(wrong), "violations", less_is_better=True, floor=0, details={"violations": wrong, "seed": _SEED})
+
+
+def _step(path: Path) -> int:
+    return int(path.name.partition("_")[2])
+
+
+def _done(place: Path) -> bool:
+    return _status(place) == "finished"
+
+
+def _status(place: Path) -> str | None:
+    file = place / "run.json"
+    return json.loads(file.read_text())["status"] if file.exists() else None
+
+
+def _result(place: Path) -> dict[str, Any]:
+    """The document without the machine's times."""
+    document = json.loads((place / "eval/result.json").read_text())
+    for method in document["methods"]:
+        for name in _TIMES:
+            method.pop(name)
+    return document
+
+
+def _half_written(place: Path, parts: bool = False) -> list[str]:
+    """Temporary files; of an evaluation ``.mcap.part`` may stay, and it says so."""
+    halves: Callable[[Path], bool] = lambda path: path.name.endswith(_HALF) or path.name.startswith(".partial")  # noqa: E731
+    return [f"left {path.name}" for path in place.rglob("*") if halves(path) and not (parts and path.name.endswith(".mcap.part"))]
+
+
+def _inconsistent(place: Path, code: int) -> list[str]:
+    """Files that cannot be read, and a run folder that says otherwise than the exit code."""
+    wrong = []
+    for file in place.rglob("*.json"):
+        try:
+            json.loads(file.read_text())
+        except ValueError:
+            wrong.append(f"{file.name} is not whole")
+    status = _status(place)
+    if status is not None and status != {0: "finished", 130: "interrupted", 143: "interrupted"}.get(code, "failed"):
+        wrong.append(f"run.json says {status}, exit code {code}")
+    return wrong
+
+
+def _hears(pid: int) -> bool:
+    """Whether a process has a handler of SIGTERM (Linux)."""
+    try:
+        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    except OSError:
+        return False
+    caught = next((line.split()[1] for line in lines if line.startswith("SigCgt:")), "0")
+    return bool(int(caught, 16) >> (signal.SIGTERM - 1) & 1)
