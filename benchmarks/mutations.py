@@ -272,8 +272,8 @@ STATISTICS = (
         "uuvtai/outcomes.py",
         'COLLIDED = ("collision", "ttc", "out_of_tank")',
         'COLLIDED = ("collision", "ttc", "timeout")',
-        "tests/test_episode.py",
-        "names_of_the_endings",
+        _WIRING,
+        "rates_count",
     ),
     Mutation(
         "stops_are_no_accidents",
