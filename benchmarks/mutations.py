@@ -409,7 +409,7 @@ KERNELS = (
         "pos[2] = -ego.depth_m[env]",
         "pos[2] = vehicle.pos_w[env][2]",
         "tests/test_proprioception.py",
-        "dead_reckoning_coasts",
+        "zeroes_the_pressure",
     ),
     Mutation(
         "decay_unscaled",
