@@ -38,7 +38,8 @@ def measure(job: Job) -> list[Row]:
     chosen = [m for m in ALL if m.name in QUICK] if job.quick else list(ALL)
     check_texts(chosen)
     done = {} if job.quick else _finished()
-    results = {m.name: done[key] for m in chosen if (key := _key(m)) in done}
+    keys = {m.name: _key(m) for m in chosen}  # now: the copy is made now, and files may change meanwhile
+    results = {name: done[key] for name, key in keys.items() if key in done}
     todo = [m for m in chosen if m.name not in results]
     job.say(f"{len(results)} known from an earlier run, {len(todo)} to do")
     with contextlib.ExitStack() as stack:
@@ -53,7 +54,7 @@ def measure(job: Job) -> list[Row]:
                 results[mutation.name] = found
                 job.say(f"{len(results)}/{len(chosen)} {mutation.name}: {found['by'] or found['said']} ({found['seconds']:.0f} s)")
                 if not job.quick:
-                    _keep(mutation, found)
+                    _keep({"key": keys[mutation.name], "name": mutation.name, **found})
         wrong = _fail_without_mutants({found["by"] for found in results.values() if found["by"]}, copies.get())
     return _rows(chosen, results, wrong)
 
@@ -151,7 +152,7 @@ def _finished() -> dict[str, dict[str, Any]]:
     return {row["key"]: row for row in rows if row["by"]}
 
 
-def _keep(mutation: Mutation, found: dict[str, Any]) -> None:
+def _keep(row: dict[str, Any]) -> None:
     _DONE.parent.mkdir(exist_ok=True)
     with _DONE.open("a") as file:
-        file.write(json.dumps({"key": _key(mutation), "name": mutation.name, **found}) + "\n")
+        file.write(json.dumps(row) + "\n")

@@ -272,8 +272,8 @@ STATISTICS = (
         "uuvtai/outcomes.py",
         'COLLIDED = ("collision", "ttc", "out_of_tank")',
         'COLLIDED = ("collision", "ttc", "timeout")',
-        "tests/test_episode.py",
-        "names_of_the_endings",
+        _WIRING,
+        "rates_count",
     ),
     Mutation(
         "stops_are_no_accidents",
@@ -409,7 +409,7 @@ KERNELS = (
         "pos[2] = -ego.depth_m[env]",
         "pos[2] = vehicle.pos_w[env][2]",
         "tests/test_proprioception.py",
-        "dead_reckoning_coasts",
+        "zeroes_the_pressure",
     ),
     Mutation(
         "decay_unscaled",

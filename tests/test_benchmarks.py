@@ -55,7 +55,7 @@ def test_every_benchmark_measures_and_says_what(name):
     assert len((ast.get_docstring(module) or "").splitlines()[0]) > 40
     devices, threads, longest_s = run._traits(name)
     assert set(devices) <= {"cpu", "cuda"} and threads in (None, 1)
-    assert longest_s == (mutants.LONGEST_S if name == "mutants" else 1200)
+    assert longest_s >= 1200 and (name != "mutants" or longest_s == mutants.LONGEST_S)
     assert f"`{name}`" in (FOLDER / "README.md").read_text()
 
 

@@ -138,5 +138,8 @@ def test_pairs_count_who_alone_arrives_and_compare_times_where_both_do():
     assert (row["a"], row["b"], row["both"], row["only_a"], row["only_b"]) == ("a", "b", 2, 1, 1)
     assert row["mcnemar_p"] == 1.0
     assert row["time_difference_mean_s"] == pytest.approx((10 - 11 + 9 - 12) / 2)
+    (row,) = paired([a, _method("c", ["ttc", "success", "ttc", "ttc"], [1.0, 11.0, 1.0, 1.0])])
+    assert (row["both"], row["only_a"], row["only_b"]) == (1, 2, 0)
+    assert (row["time_a_mean_s"], row["time_b_mean_s"], row["mcnemar_p"]) == (12.0, 11.0, 0.5)
     assert len(paired([a, b, a])) == 3
     assert paired([a]) == []

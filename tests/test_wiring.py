@@ -251,8 +251,9 @@ def test_accidents_are_events_timeouts_are_not_known_and_other_endings_are_safe(
     script = [[(STEPS + ENDS_AT, how)] if how else [] for how in LABELS]
     risk = {"enabled": True, "horizon_s": 0.06, "batch": 64, "hidden": [8]}
     trainer, env = trainer_of(script, risk=risk)
-    with torch.no_grad():
+    with torch.no_grad():  # an opinion of its own on every moment, but not by its running number, which would drown the rest
         trainer.risk.net[-1].weight.mul_(100.0)
+        trainer.risk.net[0].weight[:, N_TARGET] = 0.0
     head = copy.deepcopy(trainer.risk)
     metrics = trainer.iterate()
     assert env.log[STEPS + ENDS_AT - 1].ended.sum() == len(LABELS) - 1
@@ -260,5 +261,14 @@ def test_accidents_are_events_timeouts_are_not_known_and_other_endings_are_safe(
     samples = [(t, row, label) for t, row, label in samples if label is not None]
     errors = [(float(head(trainer.rollout.x[t, row])) - label) ** 2 for t, row, label in samples]
     assert len(samples) == 17 and metrics["risk/event_rate"] == pytest.approx(2 / 17)
-    assert metrics["risk/brier"] == pytest.approx(sum(errors) / 17, rel=1e-4)
-    assert max(errors) - min(errors) > 0.1, "the head has an opinion: the wrong moments would have another error"
+    assert metrics["risk/brier"] == pytest.approx(sum(errors) / 17, rel=1e-5)
+    opinions = head(trainer.rollout.x[5]).sort().values.diff()
+    assert opinions.min() > 5e-4, "with the labels of two envs exchanged the error would be another"
+
+
+def test_rates_count_every_ending_by_what_it_was():
+    """A collision, a stop for the time to collision and leaving the tank are collisions; the env that goes on is no episode."""
+    trainer, _ = trainer_of([[(STEPS + ENDS_AT, how)] if how else [] for how in LABELS])
+    metrics = trainer.iterate()
+    rates = [metrics[f"rollout/{name}"] for name in ("episodes", "success_rate", "collision_rate", "timeout_rate", "ep_len_mean")]
+    assert rates == pytest.approx([5, 1 / 5, 3 / 5, 1 / 5, STEPS + ENDS_AT])
