@@ -255,7 +255,7 @@ def test_presets_are_listed_and_shown(capfd):
     assert {"paper", "ppo", "distill_20", "curriculum", "full", "no_risk_scaling", "no_world_model", "no_distill", "smoke"} <= set(
         listed["train"]
     )
-    code, out, _ = uuv(capfd, "presets", "show", "gauntlet")
+    code, out, _ = uuv(capfd, "presets", "show", "gauntlet", "--all")
     assert code == 0
     assert "n_dynamic: 6" in out
     code, out, err = uuv(capfd, "presets", "show", "paper")
