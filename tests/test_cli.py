@@ -80,7 +80,7 @@ def uuv(capfd, *arguments):
         (["simulate", "--seconds", "1", "--wrench", "1,2"], "give 6 finite numbers"),
         (["simulate", "--seconds", "1", "--wrench", "1,2,3,4,5,inf"], "give 6 finite numbers"),
         (["simulate", "--seconds", "1", "--dt", "0"], "dt"),
-        (["simulate", "--seconds", "1", "--attitude-hold", "ideel"], "attitude_hold"),
+        (["simulate", "--seconds", "1", "--attitude-hold", "ideel"], "--attitude-hold ideel: use ideal, thrusters or none"),
         (["simulate", "--seconds", "1", "--vehicle", "bluerov9"], "did you mean"),
         (["profile", "--num-envs", "1,x"], "whole numbers"),
         (["profile", "--num-envs", "0"], "at least 1 env"),
@@ -256,7 +256,7 @@ def test_presets_are_listed_and_shown(capfd):
     assert {"paper", "ppo", "distill_20", "curriculum", "full", "no_risk_scaling", "no_world_model", "no_distill", "smoke"} <= set(
         listed["train"]
     )
-    code, out, _ = uuv(capfd, "presets", "show", "gauntlet")
+    code, out, _ = uuv(capfd, "presets", "show", "gauntlet", "--all")
     assert code == 0
     assert "n_dynamic: 6" in out
     code, out, err = uuv(capfd, "presets", "show", "paper")
