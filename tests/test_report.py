@@ -677,3 +677,21 @@ def test_a_page_of_several_trainings_is_none_of_theirs(tmp_path):
     report([runs[0]])
     with pytest.raises(UserError, match="--force"):
         report(runs, runs[0] / "report.html")
+
+
+@pytest.mark.parametrize(
+    ("file", "document", "says"),
+    [
+        ("eval/result.json", samples.evaluation_document() | {"methods": [samples.method("bt")] * 201}, "methods has 201 entries"),
+        ("sweep.json", samples.noise_sweep() | {"cells": [{}] * 20_001}, "cells has 20,001 entries"),
+        ("sweep.json", {"cells": [], "axes": {"S": [1] * 10_001}}, "axes.S has 10,001 entries"),
+        ("profile.json", {"rows": [{}] * 201}, "rows has 201 entries"),
+        ("reproduce.json", {"title": "x", "sections": [{"title": "y", "blocks": [{"kind": "run", "path": "."}] * 1001}]}, "1,000 blocks"),
+    ],
+)
+def test_a_small_file_cannot_make_a_page_without_end(tmp_path, file, document, says):
+    run = samples.write_run(tmp_path / "run")
+    (run / file).parent.mkdir(exist_ok=True)
+    (run / file).write_text(json.dumps(document))
+    with pytest.raises(ConfigError, match=re.escape(says)):
+        report([run])

@@ -11,6 +11,10 @@ from uuvtai.loader import MAX_BYTES as MAX_YAML_BYTES
 from uuvtai.loader import ConfigError
 
 _MAX_LINES = 1_000_000
+_MOST = {"methods": 200, "cells": 20_000, "rows": 200, "paper_latency": 1000, "paper_density": 1000, "sections": 200}
+"""entries of a result's lists that a page has room for: each is drawn, and drawing takes time"""
+_MOST_VALUES = 10_000
+"""of an axis of a sweep"""
 
 
 def read_json(run: Path, name: str) -> dict[str, Any] | None:
@@ -26,7 +30,18 @@ def read_json(run: Path, name: str) -> dict[str, Any] | None:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
     if not isinstance(document, dict):
         raise ConfigError(f"{path}: is no JSON object; write it again with the command in run.json")
+    _refuse_many(document, path)
     return document
+
+
+def _refuse_many(document: dict[str, Any], path: Path) -> None:
+    """Raise ConfigError for a document that would be drawn for hours."""
+    axes = document.get("axes")
+    lists = [(name, document.get(name), most) for name, most in _MOST.items()]
+    lists += [(f"axes.{name:.40}", values, _MOST_VALUES) for name, values in axes.items()] if isinstance(axes, dict) else []
+    for name, entries, most in [*lists, ("axes", axes, _MOST["methods"])]:
+        if isinstance(entries, list | dict) and len(entries) > most:
+            raise ConfigError(f"{path}: {name} has {len(entries):,} entries, more than the {most:,} that a page has room for")
 
 
 def read_lines(run: Path, name: str) -> list[dict[str, Any]]:

@@ -24,6 +24,8 @@ from uuvtai.report.wording import value_name
 
 RULINGS = ("holds", "does not hold", "cannot be judged")
 
+_MAX_BLOCKS = 1000
+
 Described = dict[str, Any]
 OfRun = Callable[[Path], list[Block]]
 OfCurves = Callable[[list[Path]], list[Block]]
@@ -31,6 +33,8 @@ OfCurves = Callable[[list[Path]], list[Block]]
 
 def reproduction(document: Described, folder: Path, of_run: OfRun, of_curves: OfCurves) -> list[Section]:
     """Sections of a reproduction; ``of_run`` and ``of_curves`` give the blocks of run folders. Raises ConfigError."""
+    if sum(len(section["blocks"]) for section in document["sections"]) > _MAX_BLOCKS:
+        raise ConfigError(f"{folder / 'reproduce.json'}: has more than the {_MAX_BLOCKS:,} blocks that a page has room for")
     return [
         Section(
             str(section["title"]), [block for described in section["blocks"] for block in _blocks(described, folder, of_run, of_curves)]
