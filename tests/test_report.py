@@ -1,6 +1,7 @@
 """The report: layout of heat maps, figures that follow the page's colours, and a page that says everything and trusts nothing."""
 
 import csv
+import hashlib
 import io
 import json
 import re
@@ -8,6 +9,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from html.parser import HTMLParser
+from importlib.resources import files
 from urllib.parse import unquote
 from xml.etree import ElementTree
 
@@ -20,11 +22,12 @@ from rich.console import Console
 from tests import report_samples as samples
 from uuvtai.errors import UserError
 from uuvtai.loader import ConfigError
+from uuvtai.measure.paired import paired
 from uuvtai.report import ink
 from uuvtai.report.blocks import Data, Figure, Gallery, Prose, Table
 from uuvtai.report.build import report
 from uuvtai.report.colours import contrast, ink_on, shade
-from uuvtai.report.evaluation import evaluation
+from uuvtai.report.evaluation import evaluation, paired_table
 from uuvtai.report.figures import Line, curves, heat_map, intervals
 from uuvtai.report.heatmap import pivot
 from uuvtai.report.learning_curves import Training, grouped, training
@@ -448,9 +451,96 @@ def test_several_trainings_are_one_page(tmp_path):
     written = report(runs, tmp_path / "both.html")
     assert "ppo (2 seeds)" in written.page.read_text()
     assert written.figures == [tmp_path / "figures/training.png"] and written.figures[0].exists()
-    samples.write_run(tmp_path / "sweep", sweep=samples.noise_sweep())
-    with pytest.raises(ConfigError, match="is no training"):
-        report([*runs, tmp_path / "sweep"], tmp_path / "x.html")
+    samples.write_run(tmp_path / "empty")
+    with pytest.raises(ConfigError, match=r"empty: has nothing to report"):
+        report([*runs, tmp_path / "empty"], tmp_path / "x.html")
+
+
+def test_a_training_and_its_evaluations_are_one_page(tmp_path):
+    """The checkpoint's sha256 says which training an evaluation is of; figures of two folders do not overwrite each other."""
+    trained = samples.write_run(tmp_path / "first", metrics=samples.metrics(5))
+    manifest = trained / "checkpoints/step_000005/manifest.json"
+    manifest.parent.mkdir(parents=True)
+    manifest.write_text('{"step": 5}')
+    shas = {"first_eval": hashlib.sha256(manifest.read_bytes()).hexdigest(), "other_eval": "0" * 64}
+    for name, sha in shas.items():
+        document = samples.evaluation_document(samples.method("bt"), samples.method("mine", checkpoint={"sha256": sha}))
+        samples.write_run(tmp_path / name, eval__result=document)
+    written = report([trained, *(tmp_path / name for name in shas)], tmp_path / "page.html")
+    page = Reader(written.page.read_text())
+    titles = ["Training", "Evaluation: first_eval", "Evaluation: other_eval"]
+    assert [word for word in page.words if word in titles] == titles * 2, "in the list of sections and above them"
+    assert [path.name for path in written.figures] == ["training.png", "first_eval_methods.png", "other_eval_methods.png"]
+    text = " ".join(page.words)
+    assert "mine is checkpoint step_000005 of the training first." in text
+    assert "mine (checkpoint 0000000000000000) is none of the checkpoints" in text
+
+
+def test_pairs_of_methods_are_told_with_p_and_interval():
+    methods = [samples.method("straight", 3, 5), samples.method("bt", 8, 0)]
+    (pairs,) = [
+        table for table in tables(evaluation(samples.evaluation_document(*methods) | {"paired": paired(methods)})) if table.n_left == 2
+    ]
+    assert pairs.rows == [["straight", "bt", "8", "3", "0", "5", "0.062", "11.00", "11.00", "0.00 [0.00, 0.00]"]]
+    assert pairs.data.rows[0][3:7] == [3, 0, 5, pytest.approx(0.0625)]
+    assert paired_table([]) == []
+    nobody = [samples.method(name, 0, 8) for name in "ab"]
+    assert paired_table(paired(nobody))[0].rows == [["a", "b", "8", "0", "0", "0", "1", "-", "-", "-"]]
+    assert paired_table([paired(methods)[0] | {"mcnemar_p": 1e-9}])[0].rows[0][6] == "< 0.0001"
+
+
+def test_a_method_has_its_colour_in_charts_and_tables(tmp_path):
+    from uuvtai.report.colours import method_colours
+
+    names = ["straight", "planner", "bt", "mine"]
+    colours = method_colours(names)
+    document = samples.evaluation_document(*map(samples.method, names))
+    blocks = evaluation(document)
+    assert tables(blocks)[0].swatches == [colours[name] for name in names]
+    (figure,) = [block for block in blocks if isinstance(block, Figure)]
+    root, hover = drawn(figure.panels[0])
+    assert [text.split("\n")[0] for text in hover.values()] == names
+    bars = {
+        e.get("id").removeprefix("f-"): ElementTree.tostring(e, encoding="unicode")
+        for e in root.iter()
+        if "interval" in (e.get("id") or "")
+    }
+    for (identity, text), name in zip(hover.items(), names, strict=True):
+        assert colours[name] in bars[identity], text
+    samples.write_run(tmp_path, eval__result=document)
+    swatches = [span["style"] for span in Reader(report([tmp_path]).page.read_text()).of("span") if span.get("class") == "swatch"]
+    assert len(swatches) == 2 * len(names) and all(
+        colours[name] in style for name, style in zip(names, swatches[: len(names)], strict=True)
+    )
+
+
+def test_every_colour_of_a_line_has_a_lighter_one_for_the_dark():
+    from uuvtai.report.colours import PALETTE
+
+    template = (files("uuvtai") / "presets/report/page.html.j2").read_text()
+    lighter = dict(re.findall(r"--series-(\d): (#\w{6})", template))
+    assert [int(i) for i in lighter] == list(range(len(PALETTE)))
+    for i, colour in enumerate(PALETTE):
+        assert contrast(lighter[str(i)], "#12171d") > 5 and contrast(lighter[str(i)], "#12171d") >= contrast(colour, "#12171d")
+
+
+def test_a_page_of_many_videos_stays_below_ten_megabytes(tmp_path):
+    """Also where it is of several runs, each of which would fit alone."""
+    runs = []
+    for i in range(2):
+        run = samples.write_run(tmp_path / f"run_{i}", eval__result=samples.evaluation_document(samples.method("bt")))
+        for place, name, n_files, size in (
+            ("pictures", "seed0_episode{}.png", 8, 300_000),
+            ("videos", "bt_seed0_episode{}.webm", 9, 900_000),
+        ):
+            (run / place).mkdir()
+            for k in range(n_files):
+                (run / place / name.format(k)).write_bytes(bytes(size))
+        runs.append(run)
+    for some in (runs[:1], runs):
+        page = report(some, tmp_path / "page.html").page
+        assert 7e6 < page.stat().st_size < 10e6
+        assert "Left out to keep this page small" in page.read_text() and "videos/bt_seed0_episode" in page.read_text()
 
 
 # --------------------------------------------------------------------------------------------------------- reproduction

@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 
 from tests import report_samples as samples
+from uuvtai.logs.film import write_film
+from uuvtai.measure.paired import paired
 from uuvtai.report.build import report
 
 JS = Path(__file__).parent / "js"
@@ -29,10 +31,8 @@ def picture(path):
 
 def video(path):
     path.parent.mkdir(exist_ok=True)
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"VP80"), 10.0, (640, 240))
-    for i in range(10):
-        writer.write(np.full((240, 640, 3), 25 * i, np.uint8))
-    writer.release()
+    frames = [np.full((240, 640, 3), 25 * i, np.uint8) for i in range(10)]
+    write_film(path, frames, 10.0, frames[:1], [])
 
 
 @pytest.fixture(scope="module")
@@ -44,8 +44,9 @@ def page(tmp_path_factory):
     verdict = {"claim": "it swims " * 30, "verdict": "holds", "numbers": "3 of 3"}
     blocks = [{"kind": "verdicts", "items": [verdict]}, {"kind": "curves", "paths": ["t_0", "t_1"]}, {"kind": "run", "path": "noise"}]
     document = {"schema": 1, "title": "Everything", "sections": [{"title": "First", "blocks": blocks}]}
+    result = samples.evaluation_document(*methods) | {"paired": paired(methods)}
     samples.write_run(
-        folder, ("uuv", "eval", "x" * 300), "key: " + "y" * 500, reproduce=document, eval__result=samples.evaluation_document(*methods),
+        folder, ("uuv", "eval", "x" * 300), "key: " + "y" * 500, reproduce=document, eval__result=result,
         sweep=samples.sweep_document(), profile=samples.PROFILE,
     )  # fmt: skip
     samples.write_run(folder / "noise", sweep=samples.noise_sweep())
@@ -76,7 +77,7 @@ def seen(page, tmp_path_factory):
     return {(one["page"] == str(page), one["width"], one["scheme"]): one for one in json.loads(done.stdout)["seen"]}
 
 
-VIEWS = [(width, scheme) for width in (1280, 390) for scheme in ("light", "dark")]
+VIEWS = [(width, scheme) for width in (1400, 390) for scheme in ("light", "dark")]
 
 
 @pytest.mark.parametrize(("width", "scheme"), VIEWS)
@@ -100,9 +101,9 @@ def test_figures_follow_light_and_dark(seen):
 
 
 def test_a_dark_screen_prints_black_on_white(seen):
-    printed = seen[True, 1280, "dark"]["printed"]
+    printed = seen[True, 1400, "dark"]["printed"]
     assert sum(channels(printed["background"])) > 700 and sum(channels(printed["ink"])) < 200
-    assert printed["scrollWidth"] <= 1280
+    assert printed["scrollWidth"] <= 1400
 
 
 def channels(colour):

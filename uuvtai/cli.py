@@ -552,7 +552,9 @@ def reproduce(
 
 @app.command("report", epilog="Example: uuv report runs/first")
 def report_run(
-    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Run folder; several trainings are compared in one page.")],
+    runs: Annotated[
+        list[Path], typer.Argument(metavar="RUN...", help="Run folders; several make one page: trainings are compared, the rest follows.")
+    ],
     out: Annotated[Path | None, typer.Option("--out", help="The page \\[default: RUN/report.html]; figures/ is made beside it.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace files that are there already.")] = False,
     as_json: AsJson = False,

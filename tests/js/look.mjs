@@ -23,6 +23,10 @@ async function look(browser, page, width, scheme) {
   tab.on("pageerror", (error) => errors.push(String(error)));
   tab.on("request", (request) => request.url().startsWith("data:") || requests.push(request.url()));
   await tab.goto(pathToFileURL(page).href, { waitUntil: "load" });
+  await tab.evaluate(() => {
+    const known = (video) => video.readyState > 0 || video.error || new Promise((done) => (video.onloadedmetadata = video.onerror = done));
+    return Promise.all([...document.querySelectorAll("video")].map(known)).then(() => undefined);
+  });
   const closed = await measure(tab);
   await tab.evaluate(() => document.querySelectorAll("details").forEach((one) => (one.open = true)));
   const open = await measure(tab);
@@ -40,7 +44,7 @@ function measure(tab) {
   return tab.evaluate(() => {
     const root = document.scrollingElement;
     const ids = [...document.querySelectorAll("[id]")].map((one) => one.id);
-    const videos = [...document.querySelectorAll("video")];
+    const videos = [...document.querySelectorAll("video")].filter((one) => one.videoWidth > 0);
     const texts = [...document.querySelectorAll("svg text")].filter((one) => getComputedStyle(one).fill === getComputedStyle(document.body).color);
     return {
       scrollWidth: root.scrollWidth,
@@ -68,7 +72,7 @@ const browser = await launch().catch((error) => {
 try {
   const seen = [];
   for (const page of pages)
-    for (const width of [1280, 390]) for (const scheme of ["light", "dark"]) seen.push({ page, ...(await look(browser, page, width, scheme)) });
+    for (const width of [1400, 390]) for (const scheme of ["light", "dark"]) seen.push({ page, ...(await look(browser, page, width, scheme)) });
   console.log(JSON.stringify({ version: browser.version(), seen }));
 } finally {
   await browser.close();

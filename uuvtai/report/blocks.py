@@ -64,6 +64,8 @@ class Table:
     """the same as numbers, for download"""
     folded: bool = False
     """long: shown when asked for"""
+    swatches: Sequence[str] = ()
+    """colour of each row, '#rrggbb': the one that its method has in the figures; none = no colours"""
 
 
 @dataclass(frozen=True)
@@ -124,6 +126,8 @@ class Media:
     mime: str
     content: bytes
     caption: str
+    name: str = ""
+    """where it lies in the run folder"""
 
 
 @dataclass(frozen=True)

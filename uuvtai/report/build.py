@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,9 +16,9 @@ from uuvtai.report.blocks import Block, Figure, Heading, Section
 from uuvtai.report.evaluation import evaluation
 from uuvtai.report.files import read_config, read_json, read_lines
 from uuvtai.report.learning_curves import Training, training
-from uuvtai.report.media import media
+from uuvtai.report.media import media, shared
 from uuvtai.report.page import Page, render
-from uuvtai.report.provenance import checkpoints, command_of, config_text, provenance, status_notice
+from uuvtai.report.provenance import checkpoints, command_of, config_text, origins, provenance, status_notice
 from uuvtai.report.reproduction import reproduction
 from uuvtai.report.sweep import sweep
 from uuvtai.report.timing import timing
@@ -41,10 +41,11 @@ class Report:
 def report(runs: list[Path], out: Path | None = None, force: bool = False) -> Report:
     """Write the page of a run folder to ``out`` (default: its report.html) and its figures as PNG to ``figures/`` beside the page.
 
-    Several folders are trainings to be compared: seeds of a method, or methods; then ``out`` must be given. Everything is read and drawn
-    before anything is written. The default page and its figures are renewed; elsewhere files are replaced with ``force`` only, and files
-    of the run never. Raises ConfigError for a folder without anything to report or with a damaged file, FileError for a link in it or for
-    a file that would be replaced, RunFolderError where the page cannot be written.
+    Several folders make one page, for which ``out`` must be given: trainings (seeds of a method, or methods) are compared in one section,
+    what the other folders hold follows, an evaluation beside the training that it is of. Everything is read and drawn before anything is
+    written. The default page and its figures are renewed; elsewhere files are replaced with ``force`` only, and files of the run never.
+    Raises ConfigError for a folder without anything to report or with a damaged file, FileError for a link in it or for a file that would
+    be replaced, RunFolderError where the page cannot be written.
     """
     if len(runs) > 1 and out is None:
         raise ConfigError(f"{len(runs)} run folders: say where their common page is to be written: --out FILE")
@@ -55,7 +56,8 @@ def report(runs: list[Path], out: Path | None = None, force: bool = False) -> Re
         raise ConfigError(f"{target}: is a folder; give the page a name, for example --out {target / 'report.html'}")
     _refuse_place(target, runs, force)
     with _told(runs[0] if len(runs) == 1 else target):
-        html, pngs = render(_of_trainings(runs) if len(runs) > 1 else _of_run(runs[0]))
+        page = _of_several(runs) if len(runs) > 1 else _of_run(runs[0])
+        html, pngs = render(replace(page, sections=shared(page.sections)))
     figures = [target.parent / FIGURES / f"{name}.png" for name in pngs]
     for figure in figures:
         _refuse_place(figure, runs, force)
@@ -109,12 +111,32 @@ def _of_run(run: Path) -> Page:
     return Page(title, _subtitle(record), status_notice(record), [*sections, closing])
 
 
-def _of_trainings(runs: list[Path]) -> Page:
-    for run in runs:
-        if not (run / "metrics.jsonl").exists():
-            raise ConfigError(f"{run}: is no training (no metrics.jsonl); several folders can be reported together if all are trainings")
+def _of_several(runs: list[Path]) -> Page:
+    """Trainings in one section, then what the other folders hold, each under its folder's name."""
+    trainings = [run for run in runs if (run / "metrics.jsonl").exists()]
+    others = [run for run in runs if run not in trainings]
+    sections = [Section("Training", _curves_of(trainings))] if trainings else []
+    for run in others:
+        sections += _named_after(run, trainings)
     closing = [block for run in runs for block in (Heading(run.name), *provenance(read_json(run, "run.json") or {}), *config_text(run))]
-    return Page(f"{len(runs)} trainings", "", [], [Section("Training", _curves_of(runs)), Section("Where this comes from", closing)])
+    title = ", ".join(run.resolve().name for run in runs) if others else f"{len(runs)} trainings"
+    return Page(title, "", [], [*sections, Section("Where this comes from", closing)])
+
+
+def _named_after(run: Path, trainings: list[Path]) -> list[Section]:
+    """Sections of one of several folders. An evaluation says which of the trainings its policies come from."""
+    with _told(run):
+        sections = content(run)
+        methods = (read_json(run, "eval/result.json") or {}).get("methods", [])
+    if not sections:
+        raise ConfigError(f"{run}: {_NOTHING}")
+    origin = origins(methods, trainings)
+    named = [replace(section, title=f"{section.title}: {run.name}", blocks=_figures_of(run, section.blocks)) for section in sections]
+    return [replace(named[0], blocks=[*origin, *named[0].blocks]), *named[1:]]
+
+
+def _figures_of(run: Path, blocks: Sequence[Block]) -> list[Block]:
+    return [replace(block, name=f"{run.name}_{block.name}") if isinstance(block, Figure) else block for block in blocks]
 
 
 def _subtitle(record: dict[str, Any]) -> str:
@@ -141,7 +163,7 @@ def _nested(run: Path) -> list[Block]:
         blocks = [block for section in content(run) for block in section.blocks]
     if not blocks:
         raise ConfigError(f"{run}: {_NOTHING}")
-    return [replace(block, name=f"{run.name}_{block.name}") if isinstance(block, Figure) else block for block in blocks]
+    return _figures_of(run, blocks)
 
 
 def _curves_of(runs: list[Path]) -> list[Block]:

@@ -38,6 +38,11 @@ def method_colours(names: Sequence[str]) -> dict[str, str]:
     return known | {name: free[i % len(free)] for i, name in enumerate(others)}
 
 
+def on_page(colour: str) -> str:
+    """The colour as CSS: a variable of the page, which has a lighter one for the dark."""
+    return f"var(--series-{PALETTE.index(colour)}, {colour})"
+
+
 def _known(name: str) -> str | None:
     return _SKY if name.endswith(_TRUTH) else _METHODS.get(name)
 

@@ -6,6 +6,7 @@ from typing import Any
 
 from uuvtai.outcomes import ENDINGS
 from uuvtai.report.blocks import Block, Data, Figure, Heading, Prose, Table
+from uuvtai.report.colours import method_colours
 from uuvtai.report.figures import Line, intervals, rates_text, reliability
 from uuvtai.report.wording import accidents, number, percent, rate
 
@@ -18,6 +19,7 @@ def evaluation(result: dict[str, Any], command: str = "") -> list[Block]:
     blocks: list[Block] = [Prose(conditions(result)), methods_table(methods)]
     if methods:
         blocks.append(_rates_figure(methods, command))
+    blocks += paired_table(result.get("paired", []))
     blocks.append(_planning_table(methods))
     for method in methods:
         blocks += [*_causes(method), *_risk(method, command)]
@@ -41,7 +43,13 @@ def methods_table(methods: list[Method]) -> Table:
         "Methods. Collision counts contacts, TTC stops and episodes out of the tank; intervals are 95 % Wilson. "
         "Time to goal: mean over successes; TTS: mean time over success rate."
     )
-    return Table(columns, [_method_row(m) for m in methods], caption, data=_methods_data(methods))
+    return Table(columns, [_method_row(m) for m in methods], caption, data=_methods_data(methods), swatches=_swatches(methods))
+
+
+def _swatches(methods: list[Method]) -> list[str]:
+    names = [m["name"] for m in methods]
+    colours = method_colours(names)
+    return [colours[name] for name in names]
 
 
 def _method_row(m: Method) -> list[str]:
@@ -76,15 +84,57 @@ def _bounds(m: dict[str, Any]) -> list[float | None]:
 
 def _rates_figure(methods: list[Method], command: str) -> Figure:
     names = [m["name"] for m in methods]
-    panels = [intervals([_rates_line(methods, key)], names, key, "", joined=False) for key in ("success", "collision")]
+    colours = _swatches(methods)
+    panels = [
+        intervals([_rates_line(i, m, key, colours[i]) for i, m in enumerate(methods)], names, key, "", joined=False)
+        for key in ("success", "collision")
+    ]
     return Figure("methods", panels, "Success and collision of every method with 95 % Wilson intervals", _methods_data(methods), command)
 
 
-def _rates_line(methods: list[Method], key: str) -> Line:
-    known = [(i, m) for i, m in enumerate(methods) if m[f"{key}_rate"] is not None]
-    low, high = ([m[f"{key}_ci95"][end] for _, m in known] for end in (0, 1))
-    said = [f"{m['name']}\n{rates_text(m)}" for _, m in known]
-    return Line(key, [i for i, _ in known], [m[f"{key}_rate"] for _, m in known], low, high, said)
+def _rates_line(place: int, m: Method, key: str, colour: str) -> Line:
+    """The one point of a method; none where it played nothing."""
+    if m[f"{key}_rate"] is None:
+        return Line(m["name"], [], [], [], [], colour=colour)
+    low, high = m[f"{key}_ci95"]
+    return Line(m["name"], [place], [m[f"{key}_rate"]], [low], [high], [f"{m['name']}\n{rates_text(m)}"], colour)
+
+
+_PAIRED = ("both", "only_a", "only_b", "mcnemar_p", "time_a_mean_s", "time_b_mean_s", "time_difference_mean_s")
+
+
+def paired_table(pairs: list[dict[str, Any]]) -> list[Block]:
+    """Who alone arrives, how sure that is, and the difference in time where both do; [] without two methods."""
+    if not pairs:
+        return []
+    columns = ["a", "b", "episodes", "both arrive", "only a", "only b", "McNemar's p", "time of a s", "time of b s", "a - b s"]
+    rows = [_pair_row(pair) for pair in pairs]
+    caption = (
+        "Pairs of methods on the same episodes: who alone arrives, with McNemar's exact p, and the mean times where both arrive, their "
+        "difference with its 95 % bootstrap interval. The values of p are not adjusted for the number of pairs"
+    )
+    bounds = [[*pair[:-1], *(pair[-1] or (None, None))] for pair in ([*(p.get(k) for k in _PAIRED), p.get(_BOUNDS)] for p in pairs)]
+    data = Data(
+        ["a", "b", "episodes", *_PAIRED, f"{_BOUNDS}_low", f"{_BOUNDS}_high"],
+        [[p["a"], p["b"], p["episodes"], *numbers] for p, numbers in zip(pairs, bounds, strict=True)],
+    )
+    return [Table(columns, rows, caption, n_left=2, data=data)]
+
+
+_BOUNDS = "time_difference_ci95"
+
+
+def _pair_row(pair: dict[str, Any]) -> list[str]:
+    bounds = pair.get(_BOUNDS)
+    interval = f" [{bounds[0]:.2f}, {bounds[1]:.2f}]" if bounds else ""
+    counts = [str(pair[key]) for key in ("episodes", "both", "only_a", "only_b")]
+    times = [number(pair.get(key), 2) for key in ("time_a_mean_s", "time_b_mean_s")]
+    return [pair["a"], pair["b"], *counts, _p_value(pair["mcnemar_p"]), *times, number(pair.get("time_difference_mean_s"), 2) + interval]
+
+
+def _p_value(p: float | None) -> str:
+    """Two digits; what is smaller than anybody distinguishes is told as a bound."""
+    return "-" if p is None else "< 0.0001" if p < 1e-4 else f"{p:.2g}"
 
 
 def _planning_table(methods: list[Method]) -> Table:
@@ -102,7 +152,7 @@ def _planning_table(methods: list[Method]) -> Table:
                 number(m.get("env_steps_per_s"), 0),
             ]
         )
-    return Table(columns, rows, "Planning")
+    return Table(columns, rows, "Planning", swatches=_swatches(methods))
 
 
 # -------------------------------------------------------------------------------------------------------- causes and risk

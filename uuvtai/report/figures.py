@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from uuvtai.report.blocks import Hover, Panel
-from uuvtai.report.colours import SERIES, ink_on, shade
+from uuvtai.report.colours import SERIES, ink_on, method_colours, shade
 from uuvtai.report.heatmap import HeatMap, Place
 from uuvtai.report.ink import INK
 from uuvtai.report.wording import axis_name, number, percent, rate, value_name
@@ -38,6 +38,8 @@ class Line:
     low: Sequence[float] | None = None
     high: Sequence[float] | None = None
     said: Sequence[str] = ()
+    colour: str = ""
+    """'#rrggbb' of a method; none = by the order of the lines"""
 
 
 # --------------------------------------------------------------------------------------------------------------- heat maps
@@ -132,7 +134,7 @@ def curves(lines: Sequence[Line], title: str, x_label: str, share: bool = False,
         axes.set_xlabel(x_label)
         scale = 100.0 if share else 1.0
         for i, line in enumerate(lines):
-            colour = SERIES[i % len(SERIES)]
+            colour = _colour(line, i)
             few = {"marker": "o", "markersize": 3} if len(line.x) <= 12 else {}
             axes.plot(line.x, [scale * y for y in line.y], color=colour, label=line.name, **few)
             if line.low is not None and line.high is not None:
@@ -146,22 +148,29 @@ def curves(lines: Sequence[Line], title: str, x_label: str, share: bool = False,
 
 
 def intervals(lines: Sequence[Line], names: Sequence[str], title: str, x_label: str, joined: bool = True) -> Panel:
-    """Shares with their intervals at named places, joined where these are values of one axis. ``x`` of a line counts places."""
+    """Shares with their intervals at named places, joined where these are values of one axis. ``x`` of a line counts places.
+
+    Lines that are not joined have a place of their own each, which names them.
+    """
 
     def draw(axes: Axes) -> Hover:
         axes.set_title(title, loc="left")
         axes.set_xlabel(x_label)
         hover: Hover = {}
         for i, line in enumerate(lines):
-            shift = 0.12 * (i - (len(lines) - 1) / 2)
+            shift = 0.12 * (i - (len(lines) - 1) / 2) if joined else 0.0
             hover |= _draw_intervals(axes, i, line, shift, joined)
         axes.set_xticks(range(len(names)), names)
         axes.set_xlim(-0.5, len(names) - 0.5)
-        _frame(axes, lines, share=True, zero=True)
+        _frame(axes, lines if joined else [], share=True, zero=True)
         axes.set_ylim(-0.03 * (top := _top(lines)), 1.03 * top)
         return hover
 
     return Panel(draw, width_in=max(4.4, 1.6 + 0.55 * len(names)))
+
+
+def _colour(line: Line, i: int) -> str:
+    return line.colour or SERIES[i % len(SERIES)]
 
 
 def _top(lines: Sequence[Line]) -> float:
@@ -172,7 +181,7 @@ def _top(lines: Sequence[Line]) -> float:
 
 def _draw_intervals(axes: Axes, i: int, line: Line, shift: float, joined: bool) -> Hover:
     """Points and error bars of one line, moved aside by ``shift`` so that lines do not cover each other."""
-    colour, places = SERIES[i % len(SERIES)], [x + shift for x in line.x]
+    colour, places = _colour(line, i), [x + shift for x in line.x]
     axes.plot(places, [100 * y for y in line.y], color=colour, marker="o", markersize=5, linewidth=0.8 if joined else 0, label=line.name)
     for k, (x, low, high) in enumerate(zip(places, line.low or line.y, line.high or line.y, strict=True)):
         axes.plot([x, x], [100 * low, 100 * high], color=colour, linewidth=2.4, solid_capstyle="butt", gid=f"interval-{i}-{k}")
@@ -222,18 +231,18 @@ def trade_off(series: Sequence[Line], marks: Sequence[tuple[str, float, float]])
     def draw(axes: Axes) -> Hover:
         axes.set_xlabel("collision %")
         axes.set_ylabel("success %")
-        for i, line in enumerate(series):
+        colours = method_colours([*(line.name for line in series), *(name for name, _, _ in marks)])
+        for line in series:
             axes.plot(
                 [100 * x for x in line.x],
                 [100 * y for y in line.y],
-                color=SERIES[i % len(SERIES)],
+                color=colours[line.name],
                 marker="o",
                 markersize=4,
                 label=line.name,
             )
-        for i, (name, collision, success) in enumerate(marks):
-            colour = SERIES[(len(series) + i) % len(SERIES)]
-            axes.plot([100 * collision], [100 * success], marker="*", markersize=12, linestyle="none", color=colour, label=name)
+        for name, collision, success in marks:
+            axes.plot([100 * collision], [100 * success], marker="*", markersize=12, linestyle="none", color=colours[name], label=name)
         axes.set_xlim(left=0)
         axes.legend(loc="best")
         return {}

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
 from uuvtai.report.blocks import Hover, Panel
-from uuvtai.report.colours import PALETTE
+from uuvtai.report.colours import PALETTE, on_page
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -109,7 +109,7 @@ def _strip(root: ElementTree.Element) -> None:
 
 def _recolour(root: ElementTree.Element) -> None:
     """The ink becomes the page's text colour, the series' colours variables of the page, which has lighter ones for the dark."""
-    named = {INK: "currentColor"} | {colour: f"var(--series-{i}, {colour})" for i, colour in enumerate(PALETTE)}
+    named = {INK: "currentColor"} | {colour: on_page(colour) for colour in PALETTE}
     for element in root.iter():
         style = element.get("style")
         if style:

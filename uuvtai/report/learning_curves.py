@@ -11,6 +11,7 @@ from typing import Any
 from uuvtai.loader import parsed_yaml
 from uuvtai.measure.statistics import wilson_interval
 from uuvtai.report.blocks import Block, Data, Figure, Prose, Table
+from uuvtai.report.colours import method_colours
 from uuvtai.report.figures import Line, curves
 from uuvtai.report.wording import number, percent, rate
 
@@ -49,9 +50,10 @@ class MethodRuns:
 def training(runs: Sequence[Training], command: str = "") -> list[Block]:
     """Curves of these trainings, grouped into methods, and where each ended."""
     methods = grouped([run for run in runs if run.metrics])
+    colours = method_colours([method.name for method in methods])
     panels, rows = [], []
     for key, title, share in PANELS:
-        lines = [line for method in methods if (line := _line(method, key)) is not None]
+        lines = [line for method in methods if (line := _line(method, key, colours[method.name])) is not None]
         if lines:
             panels.append(curves(lines, title, "million env-steps", share))
             rows += [[line.name, key, *point] for line in lines for point in _points(line)]
@@ -106,7 +108,7 @@ def _several(methods: Sequence[MethodRuns]) -> bool:
     return any(len(method.runs) > 1 for method in methods)
 
 
-def _line(method: MethodRuns, key: str) -> Line | None:
+def _line(method: MethodRuns, key: str, colour: str) -> Line | None:
     """Mean over the seeds at the iterations that all of them have; None where the metric is missing."""
     by_iteration = [{row["iteration"]: row for row in run.metrics if _is_number(row.get(key)) and _STEPS in row} for run in method.runs]
     common = sorted(set.intersection(*(set(rows) for rows in by_iteration)))
@@ -116,7 +118,7 @@ def _line(method: MethodRuns, key: str) -> Line | None:
     x = [by_iteration[0][i][_STEPS] / 1e6 for i in common]
     name = f"{method.name} ({len(values[0])} seeds)" if len(values[0]) > 1 else method.name
     band = ([min(v) for v in values], [max(v) for v in values]) if len(values[0]) > 1 else (None, None)
-    return Line(name, x, [sum(v) / len(v) for v in values], *band)
+    return Line(name, x, [sum(v) / len(v) for v in values], *band, colour=colour)
 
 
 def _is_number(value: object) -> bool:
@@ -145,7 +147,9 @@ def _last_table(methods: Sequence[MethodRuns]) -> Table:
                     number(last.get("time/env_steps_per_s"), 0),
                 ]
             )
-    return Table(columns, rows, "Where each training ended: the record of its last iteration")
+    colours = method_colours([method.name for method in methods])
+    swatches = [colours[method.name] for method in methods for _ in method.runs]
+    return Table(columns, rows, "Where each training ended: the record of its last iteration", swatches=swatches)
 
 
 def _judged(run: Training) -> str:

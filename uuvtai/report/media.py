@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from uuvtai.files import read_bytes
-from uuvtai.report.blocks import Block, Gallery, Heading, Media
+from uuvtai.report.blocks import Block, Gallery, Heading, Media, Section
 from uuvtai.report.wording import megabytes, number
 
-MEDIA_BYTES, PICTURE_BYTES = 12_000_000, 4_000_000
-"""What pictures and videos together, and the pictures among them, may weigh: in base64 16 MB, which a browser opens at once"""
+MEDIA_BYTES, PICTURE_BYTES = 6_600_000, 2_200_000
+"""What all pictures and videos of a page, and the pictures of a run among them, may weigh: in base64 8.8 MB of a page's 10 MB"""
 
 _NAME = re.compile(r"(?P<label>.*?)_?seed(?P<seed>-?\d+)_episode(?P<episode>\d+)(?P<rest>.*)")
 _SUCCESS = "success"
@@ -67,9 +67,33 @@ def _gallery(folder: Path, shown: Iterable[_Shown], mime: str, budget: int) -> G
             left_out.append(f"{one.path.relative_to(folder)} ({megabytes(size)})")
             continue
         budget -= size
-        items.append(Media(mime, read_bytes(one.path, size, folder), _caption(one)))
-    note = f"Left out to keep this page small, to be found in the run folder: {', '.join(left_out)}." if left_out else ""
-    return Gallery(items, note)
+        items.append(Media(mime, read_bytes(one.path, size, folder), _caption(one), str(one.path.relative_to(folder))))
+    return Gallery(items, _note(left_out))
+
+
+def _note(left_out: Sequence[str]) -> str:
+    return f"Left out to keep this page small, to be found in the run folder: {', '.join(left_out)}." if left_out else ""
+
+
+def shared(sections: Sequence[Section], budget: int = MEDIA_BYTES) -> list[Section]:
+    """The same sections with what the page's budget [bytes] holds: pictures of every run first, then videos, in the page's order."""
+    kept: dict[int, Gallery] = {}
+    galleries = [block for section in sections for block in section.blocks if isinstance(block, Gallery)]
+    for gallery in sorted(galleries, key=lambda one: any(item.mime.startswith("video/") for item in one.items)):
+        kept[id(gallery)] = _trimmed(gallery, budget)
+        budget -= sum(len(item.content) for item in kept[id(gallery)].items)
+    return [replace(section, blocks=[kept.get(id(block), block) for block in section.blocks]) for section in sections]
+
+
+def _trimmed(gallery: Gallery, budget: int) -> Gallery:
+    items, left_out = [], []
+    for item in gallery.items:
+        if len(item.content) > budget:
+            left_out.append(f"{item.name} ({megabytes(len(item.content))})")
+            continue
+        budget -= len(item.content)
+        items.append(item)
+    return replace(gallery, items=items, note=" ".join(part for part in (gallery.note, _note(left_out)) if part))
 
 
 def _worst_first(paths: Iterable[Path], methods: list[dict[str, Any]]) -> list[_Shown]:

@@ -14,6 +14,7 @@ from urllib.parse import quote
 from uuvtai import __version__
 from uuvtai.report import ink
 from uuvtai.report.blocks import Block, Data, Figure, Section
+from uuvtai.report.colours import on_page
 
 if TYPE_CHECKING:
     from jinja2 import Template
@@ -59,7 +60,7 @@ def render(page: Page) -> tuple[str, dict[str, bytes]]:
     drawing = _Drawing()
     html = _template().render(
         page=page, version=__version__, svgs=drawing.svgs, kind=lambda block: type(block).__name__, max_rows=_MAX_SHOWN_ROWS,
-        csv_uri=_csv_uri, file_name=_file_name, data_uri=_data_uri, text=_text,
+        on_page=on_page, csv_uri=_csv_uri, file_name=_file_name, data_uri=_data_uri, text=_text,
     )  # fmt: skip
     return html, drawing.pngs
 

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
 import shlex
 from pathlib import Path
 from typing import Any
 
-from uuvtai.report.blocks import Block, Code, Facts, Notice, Table
+from uuvtai.files import read_bytes
+from uuvtai.report.blocks import Block, Code, Facts, Notice, Prose, Table
 from uuvtai.report.files import read_config, read_json
 from uuvtai.report.wording import number
+
+MANIFEST_BYTES = 16 << 20
+"""[bytes] more than any manifest of a checkpoint has"""
 
 
 def command_of(record: dict[str, Any]) -> str:
@@ -61,3 +66,20 @@ def checkpoints(folder: Path) -> list[Block]:
     if not rows:
         return []
     return [Table(["checkpoint", "iteration", "score", "sha256 of the model (first 16 digits)"], rows, "Checkpoints")]
+
+
+def origins(methods: list[dict[str, Any]], trainings: list[Path]) -> list[Block]:
+    """For every policy of an evaluation the training that made it, by the sha256 of its checkpoint's manifest; [] without trainings."""
+    kept = {_sha256(path, run): (run.name, path.parent.name) for run in trainings for path in (run / "checkpoints").glob("*/manifest.json")}
+    told = []
+    for method in methods if trainings else []:
+        digest = str(method.get("checkpoint", {}).get("sha256", ""))
+        if digest in kept:
+            told.append("{} is checkpoint {} of the training {}.".format(method["name"], *reversed(kept[digest])))
+        elif digest:
+            told.append(f"{method['name']} (checkpoint {digest[:16]}) is none of the checkpoints that these trainings keep.")
+    return [Prose(" ".join(told))] if told else []
+
+
+def _sha256(path: Path, run: Path) -> str:
+    return hashlib.sha256(read_bytes(path, MANIFEST_BYTES, run)).hexdigest()

@@ -7,6 +7,7 @@ from typing import Any
 from uuvtai.outcomes import ENDINGS
 from uuvtai.report.alone import axes_of, is_alone, of_axis, place_names, places
 from uuvtai.report.blocks import Block, Data, Figure, Notice, Prose, Table
+from uuvtai.report.colours import method_colours
 from uuvtai.report.figures import Line, heat_map, hover_text, intervals, place_of
 from uuvtai.report.heatmap import Cell, pivot, varying
 from uuvtai.report.wording import accidents, axis_name, number, rate, value_name
@@ -59,20 +60,22 @@ def _curves(cells: list[Cell], axes: dict[str, list[Any]], command: str) -> list
 
 
 def _axis_figure(cells: list[Cell], axis: str, places: list[Any], names: list[str], command: str) -> Figure:
+    own = by_method(cells)
+    colours = method_colours(list(own))
     panels = [
-        intervals([_line(method, own, key, axis, places) for method, own in by_method(cells).items()], names, key, axis_name(axis))
+        intervals([_line(method, own[method], key, axis, places, colours[method]) for method in own], names, key, axis_name(axis))
         for key in ("success", "collision")
     ]
     caption = f"Success and collision over {axis_name(axis)}, with 95 % Wilson intervals"
     return Figure(f"sweep_{axis}", panels, caption, cells_data(cells), command)
 
 
-def _line(method: str, own: list[Cell], key: str, axis: str, places: list[Any]) -> Line:
+def _line(method: str, own: list[Cell], key: str, axis: str, places: list[Any], colour: str) -> Line:
     known = [cell for cell in own if cell.get(f"{key}_rate") is not None]
     bounds = [cell.get(f"{key}_ci95") or [cell[f"{key}_rate"]] * 2 for cell in known]
     x = [places.index(cell.get(axis)) for cell in known]
     said = [f"{method}, {hover_text(cell)}" for cell in known]
-    return Line(method, x, [cell[f"{key}_rate"] for cell in known], [low for low, _ in bounds], [high for _, high in bounds], said)
+    return Line(method, x, [cell[f"{key}_rate"] for cell in known], [low for low, _ in bounds], [high for _, high in bounds], said, colour)
 
 
 def by_method(cells: list[Cell]) -> dict[str, list[Cell]]:
@@ -87,7 +90,9 @@ def cells_table(cells: list[Cell], caption: str) -> Table:
     """One row a cell: rates with counts and intervals, how the rest ended, times."""
     axes = _axes_of(cells)
     columns = ["method", *map(axis_name, axes), "success", "collision", "contact / TTC / out / timeout", "time to goal s", "TTS s"]
-    return Table(columns, [_row(cell, axes) for cell in cells], caption, n_left=1 + len(axes), folded=True)
+    colours = method_colours(list(by_method(cells)))
+    swatches = [colours[cell.get("method", "policy")] for cell in cells]
+    return Table(columns, [_row(cell, axes) for cell in cells], caption, n_left=1 + len(axes), folded=True, swatches=swatches)
 
 
 def _axes_of(cells: list[Cell]) -> list[str]:
