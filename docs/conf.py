@@ -11,12 +11,18 @@ from uuvtai import __version__
 project = "uuvtai"
 copyright = "the uuvtai authors, MIT license"
 release = __version__
-extensions = ["myst_parser"]
+extensions = ["myst_parser", "sphinx.ext.autodoc"]
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
 myst_heading_anchors = 3
 """links to headings are checked too"""
-exclude_patterns = ["writers"]
-html_theme = "alabaster"
-html_theme_options = {"description": "observation-only navigation for underwater vehicles", "page_width": "1100px"}
+exclude_patterns = ["writers", "static"]
+smartquotes = False
+"""an option begins with two hyphens, not with a dash"""
+html_theme = "furo"
+html_title = f"uuvtai {release}"
+html_static_path = ["static"]
+html_css_files = ["custom.css"]
 html_copy_source = False
 
 

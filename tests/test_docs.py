@@ -44,6 +44,10 @@ def test_the_site_builds_without_a_warning_and_lacks_no_page(tmp_path):
     assert {f"reference/commands/{name}" for name in commands.app().commands} <= built
     assert {f"reference/configuration/{name}" for name in LearningConfig.model_fields} <= built
     assert {path.stem for path in (ROOT / "docs").glob("*.md")} <= built
+    of_eval = (tmp_path / "site/reference/commands/eval.html").read_text()
+    assert "runs/&lt;time&gt;_&lt;preset&gt;]" in of_eval and "With --explain:" in of_eval, "help texts are shown as they are"
+    assert "overflow-x: auto" in (tmp_path / "site/_static/custom.css").read_text() and "custom.css" in of_eval
+    assert 'id="uuvtai.make"' in (tmp_path / "site/python.html").read_text()
 
 
 def test_generated_pages_are_not_committed():
@@ -86,6 +90,10 @@ def test_every_key_has_a_row_with_type_default_unit_and_meaning():
 )
 def test_units_come_from_the_text_or_the_name(key, told, unit):
     assert configuration.unit_of(key, told) == unit
+
+
+def test_what_a_help_text_says_is_no_markup():
+    assert commands.words("a <b> `c <d>`\n```x\n<e>\n``` <f>") == "a \\<b> `c <d>`\n```x\n<e>\n``` \\<f>"
 
 
 def test_every_stage_of_the_simulator_is_told():

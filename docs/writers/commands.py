@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import typer
 from typer.cli import get_docs_for_click
 
@@ -48,9 +50,14 @@ def pages() -> dict[str, str]:
 
 def _page(name: str) -> str:
     root = app()
-    text = get_docs_for_click(obj=root.commands[name], ctx=typer.Context(root, info_name="uuv"), name=f"uuv {name}")
+    text = words(get_docs_for_click(obj=root.commands[name], ctx=typer.Context(root, info_name="uuv"), name=f"uuv {name}"))
     links = ", ".join(f"[{page.rpartition('/')[2]}](../../{page}.md)" for page in SEE[name])
     return f"{text.rstrip()}\n\nMore: {links}. Exit codes: [commands](../commands.md#exit-codes).\n"
+
+
+def words(text: str) -> str:
+    """Markdown in which ``<time>`` of a help text stays words: outside of code an angle bracket would begin a tag, which no page shows."""
+    return re.sub(r"```.*?```|`[^`\n]*`|<", lambda found: found[0] if found[0] != "<" else r"\<", text, flags=re.S)
 
 
 def _list() -> str:
