@@ -65,8 +65,8 @@ def _samples(folder: Path) -> dict[str, list[bytes]]:
     """Whole files of every kind."""
     from tests import test_deploy as deployed
     from tests.reference import logs as episode
-    from uuvtai.logs.mcap_log import McapEpisodeLog
     from uuvtai.loader import preset_path
+    from uuvtai.logs.mcap_log import McapEpisodeLog
 
     with McapEpisodeLog(folder / "a.mcap", episode.header(), depth_images=True) as log:
         for snap in episode.snapshots(20, depth=True):
