@@ -347,7 +347,8 @@ def test_a_log_cannot_plant_files_in_a_folder_that_is_there(tmp_path, capfd):
 def test_the_output_of_convert_is_called_by_its_name(log_path, tmp_path, command, capfd):
     pytest.importorskip("mcap_protobuf", reason="needs the extra uuvtai[viz]")
     convert(log_path, tmp_path / "a.protobuf.mcap")
-    assert run_cli("log", command, tmp_path / "a.protobuf.mcap", "--out", tmp_path / "out") == 2
+    out = tmp_path / {"picture": "out.png", "video": "out.webm"}.get(command, "out")
+    assert run_cli("log", command, tmp_path / "a.protobuf.mcap", "--out", out) == 2
     told = capfd.readouterr().err
     assert "is the output of uuv log convert (protobuf); use the original: a.mcap" in told and len(told.splitlines()) == 1
     assert run_cli("log", "info", tmp_path / "a.protobuf.mcap") == 0
