@@ -179,6 +179,7 @@ def test_the_command(recorded, tmp_path, capfd):
     whole = out.read_bytes()
     assert run_cli("log", "convert", recorded, "--out", out) == 2
     assert "is already there" in capfd.readouterr().err and out.read_bytes() == whole
+    assert run_cli("log", "convert", recorded, "--out", out, "--force") == 0
 
 
 def one_message(path, topic, schema, data, config=b"{}"):

@@ -23,6 +23,7 @@ from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from tests.reference import logs as episode
+from uuvtai.files import FileError
 from uuvtai.kernels import geometry
 from uuvtai.logs.container import CHUNK_MAX, CHUNK_MIN, McapFile
 from uuvtai.logs.errors import LogError
@@ -502,11 +503,15 @@ def test_a_whole_file_is_copied_completely(log_path, tmp_path):
 
 def test_repair_never_overwrites(log_path, tmp_path):
     (tmp_path / "b.mcap").write_text("mine")
-    with pytest.raises(LogError, match="already there"):
+    before = log_path.read_bytes()
+    with pytest.raises(FileError, match="already there"):
         repair(log_path, tmp_path / "b.mcap")
-    with pytest.raises(LogError, match="already there"):
-        repair(log_path, log_path)
     assert (tmp_path / "b.mcap").read_text() == "mine"
+    for force in (False, True):
+        with pytest.raises(FileError, match="is what is read here"):
+            repair(log_path, log_path, force)
+    assert log_path.read_bytes() == before
+    assert repair(log_path, tmp_path / "b.mcap", force=True).complete
 
 
 @pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r\n", b"not a log at all", b"\x89MCAP0\r\n" + b"\x07" * 300])
@@ -628,13 +633,15 @@ def test_records_of_other_writers_are_read(tmp_path):
 
 
 def test_export_as_json_lines(log_path, tmp_path):
-    files = {path.name: path for path in export(log_path, tmp_path / "out")}
+    found = export(log_path, tmp_path / "out")
+    files = {path.name: path for path in found}
     lines = [json.loads(line) for line in files["safety.jsonl"].read_text().splitlines()]
     expected = [{"t": m.time_s, **m.data} for m in read_messages(log_path, ["/safety"])]
     assert lines == expected
     assert {"config.yaml", "scenario.json", "metadata.json", "map_static.jsonl"} <= files.keys()
     assert files["config.yaml"].read_bytes() == episode.header().config_yaml.encode()
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(files)
+    assert sorted(path for path in (tmp_path / "out").rglob("*") if path.is_file()) == found
+    assert files["config.yaml"].parent == tmp_path / "out" / "attachments"
 
 
 def test_export_as_csv(log_path, tmp_path):
@@ -662,16 +669,19 @@ def test_export_as_arrays(log_path, tmp_path, snaps):
 def test_export_of_an_unknown_topic_or_format(log_path, tmp_path):
     with pytest.raises(LogError, match=r"/nothing; it has .*/pose"):
         export(log_path, tmp_path / "out", ["/nothing"])
-    with pytest.raises(LogError, match="jsonl, csv, npz"):
+    with pytest.raises(LogError, match="json, csv, npz"):
         export(log_path, tmp_path / "out", fmt="xls")
     assert not (tmp_path / "out").exists()
 
 
 def test_export_where_nothing_can_be_written(log_path, tmp_path):
     (tmp_path / "out").write_text("in the way")
-    with pytest.raises(LogError, match="cannot write the export"):
+    with pytest.raises(FileError, match="is already there"):
         export(log_path, tmp_path / "out")
+    with pytest.raises(LogError, match="cannot write the export"):
+        export(log_path, tmp_path / "out" / "deeper")
     assert (tmp_path / "out").read_text() == "in the way"
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
 def hostile_log(path, topic="/a", data=b'{"x":1}', names=()):
@@ -689,7 +699,7 @@ def test_names_in_a_log_cannot_leave_the_folder(tmp_path):
     out = tmp_path / "deep" / "out"
     files = export(path, out)
     assert len(files) == len(names) + 2
-    assert {file.parent for file in files} == {out}
+    assert {file.parent for file in files} == {out, out / "attachments"}
     assert all(file.is_file() and not file.name.startswith(".") for file in files)
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["a.mcap", "deep"]
     assert file_name("..") == file_name("/") == file_name("") == "unnamed"
@@ -700,7 +710,7 @@ def test_messages_unlike_their_schema_are_reported(tmp_path, data):
     path = hostile_log(tmp_path / "a.mcap", data=data)
     with pytest.raises(LogError):
         export(path, tmp_path / "out", fmt="npz")
-    assert list((tmp_path / "out").iterdir()) == []
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a.mcap"]
 
 
 def test_info_counts_what_is_there(log_path):

@@ -589,6 +589,7 @@ def export_policy(
     ] = None,
     check: Annotated[Path | None, typer.Option("--check", help="Verify an exported folder instead: sha256 and golden pairs.")] = None,
     wide: Wide = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace the exported policy that --out names.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Write a policy that drives without uuvtai (NumPy alone, or ONNX), or check such a folder. Exit code 3: it disagrees."""
@@ -604,7 +605,7 @@ def export_policy(
         assert run is not None
         checkpoint = find_policy(run, _say)
         name = policy_name(run, checkpoint)
-        found = deploy.export(checkpoint, name, out or Path("runs") / f"{name}_export", evaluation or [], _say)
+        found = deploy.export(checkpoint, name, out or Path("runs") / f"{name}_export", evaluation or [], _say, force)
     if as_json:
         _print_json(found.document())
     else:
@@ -780,6 +781,7 @@ def tree(
 
 
 LogFile = Annotated[Path, typer.Argument(help="An .mcap file.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace the file that --out names.")]
 
 
 @log_app.command("info", epilog="Example: uuv log info runs/first/logs/bt_seed0_episode0.mcap")
@@ -794,29 +796,34 @@ def log_info(file: LogFile, wide: Wide = False, as_json: AsJson = False) -> None
     from uuvtai.show.logs import show_log
 
     show_log(Screen(wide), found, file)
+    if found["converted_from"]:
+        typer.echo(f"output of uuv log convert (protobuf); for every other command use {plain(found['converted_from'])}")
 
 
 @log_app.command("export", epilog="Example: uuv log export runs/first/logs/bt_seed0_episode0.mcap --out exported")
 def log_export(
     file: LogFile,
-    out: Annotated[Path, typer.Option("--out", help="Folder for the exported files.")],
+    out: Annotated[Path, typer.Option("--out", help="New or empty folder for the exported files.")],
     topic: Annotated[list[str] | None, typer.Option("--topic", help="Only these topics (repeatable).")] = None,
+    fmt: Annotated[str, typer.Option("--format", help="json (a line a message), csv or npz (NumPy arrays).")] = "json",
 ) -> None:
-    """Write every topic as JSON lines and the attachments as files."""
+    """Write every topic as a file, and the attachments below attachments/."""
     from uuvtai.logs import export
 
-    for path in export.export(file, out, topic):
+    for path in export.export(file, out, topic, fmt):
         typer.echo(str(path))
 
 
 @log_app.command("repair", epilog="Example: uuv log repair runs/first/logs/bt_seed0_episode0.mcap")
 def log_repair(
-    file: LogFile, out: Annotated[Path | None, typer.Option("--out", help="Repaired file \\[default: NAME.repaired.mcap].")] = None
+    file: LogFile,
+    out: Annotated[Path | None, typer.Option("--out", help="Repaired file \\[default: NAME.repaired.mcap].")] = None,
+    force: Force = False,
 ) -> None:
     """Recover the messages of a log whose writing was cut off."""
     from uuvtai.logs import repair
 
-    found = repair.repair(file, out)
+    found = repair.repair(file, out, force)
     for damage in found.damages:
         _say(damage)
     typer.echo(f"{found.path}: {found.messages} messages recovered, the last at {found.last_time_s:.2f} s")
@@ -824,13 +831,15 @@ def log_repair(
 
 @log_app.command("convert", epilog="Example: uuv log convert runs/first/logs/bt_seed0_episode0.mcap")
 def log_convert(
-    file: LogFile, out: Annotated[Path | None, typer.Option("--out", help="New file \\[default: NAME.protobuf.mcap].")] = None
+    file: LogFile,
+    out: Annotated[Path | None, typer.Option("--out", help="New file \\[default: NAME.protobuf.mcap].")] = None,
+    force: Force = False,
 ) -> None:
     """Write a log with protobuf messages and point clouds, for Rerun and other viewers that do not read JSON."""
     from uuvtai.logs import convert
 
     target = out or file.with_suffix(".protobuf.mcap")
-    typer.echo(f"{target}: {convert.convert(file, target)} messages")
+    typer.echo(f"{target}: {convert.convert(file, target, force)} messages")
 
 
 @log_app.command("video", epilog="Example: uuv log video runs/first/logs/bt_seed0_episode0.mcap")
@@ -842,11 +851,14 @@ def log_video(
     speed: Annotated[float, typer.Option("--speed", help="Times as fast as it was.")] = 1.0,
     fps: Annotated[float | None, typer.Option("--fps", help="Frames per second \\[default: 15, GIF 10].")] = None,
     width: Annotated[int | None, typer.Option("--width", help="Width \\[px] \\[default: 1280, GIF 800].")] = None,
+    force: Force = False,
 ) -> None:
     """Render a top-down video of a recorded episode as WebM, MP4 or GIF."""
+    from uuvtai.files import refuse_output
     from uuvtai.logs import video
 
     target = out or file.with_suffix(".webm")
+    refuse_output(target, [file], force)
     progress = _Progress("frames")
 
     def drawn(done: int, total: int) -> None:
@@ -868,11 +880,14 @@ def log_picture(
         Path | None, typer.Option("--out", help="Its ending says the format: .png, .pdf or .svg \\[default: the first log's name, .png].")
     ] = None,
     clearance: Annotated[bool, typer.Option("--clearance", help="Colour the clearance field.")] = False,
+    force: Force = False,
 ) -> None:
     """Draw a recorded episode as PNG, PDF or SVG: occupancy, trajectories, goal."""
+    from uuvtai.files import refuse_output
     from uuvtai.logs import picture
 
     target = out or file[0].with_suffix(".png")
+    refuse_output(target, file, force)
     picture.picture(file, target, clearance=clearance)
     typer.echo(str(target))
 

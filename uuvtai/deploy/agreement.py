@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -10,18 +9,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from uuvtai.deploy import run_policy
+from uuvtai.deploy import run_policy, runtime
 from uuvtai.deploy.golden import TOLERANCE, Arrays, inputs_of
 from uuvtai.deploy.graph import OUTPUTS, OneDecision
-from uuvtai.errors import UserError
-
-RUNTIME = "onnxruntime"
-_BRANCHES = ("Loop", "Scan", "If", "SequenceMap")
-"""operators that hold graphs of their own"""
-
-
-class GraphError(UserError, RuntimeError):
-    """policy.onnx is no graph of ours, or ONNX Runtime cannot use it."""
+from uuvtai.deploy.graph_check import GraphError, refuse_strange
 
 
 @dataclass(frozen=True)
@@ -64,42 +55,20 @@ def of_torch(decision: OneDecision, golden: Arrays) -> Agreement:
 
 
 def of_onnx(graph: bytes, golden: Arrays) -> Agreement:
-    """ONNX Runtime on one thread. Raises RuntimeError where it cannot use the graph."""
-    import onnxruntime
-
-    _refuse_strange(graph)
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    try:
-        session = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
-        names = [output.name for output in session.get_outputs()]
-        outputs = [np.asarray(output) for output in session.run(names, inputs_of(golden))]
-    except Exception as error:  # its own errors share no base class beyond this
-        raise GraphError(f"policy.onnx: ONNX Runtime cannot use it ({error}); export the policy again") from None
+    """ONNX Runtime on one thread. Raises GraphError for a graph that is not ours or that it cannot use."""
     inputs = inputs_of(golden)
+    if not all(array.ndim and 0 < len(array) == len(inputs["obs"]) for array in inputs.values()):
+        raise GraphError("its golden pairs are no rows of inputs")
+    refuse_strange(graph, {name: array.shape for name, array in inputs.items()}, run_policy.CALLS)
+    try:
+        session = runtime.session(graph)
+        names = [output.name for output in session.get_outputs()]
+        outputs = [np.asarray(output) for output in session.run(names, inputs)]
+    except Exception as error:  # its own errors share no base class beyond this
+        raise GraphError(f"ONNX Runtime cannot use it ({error})") from None
     rows = [{name: array[i : i + 1] for name, array in inputs.items()} for i in range(len(inputs["obs"]))]
     found = _differences(dict(zip(names, outputs, strict=True)), golden)
     return Agreement("ONNX Runtime", found, **_in_turn(lambda row: session.run(names, row), rows))
-
-
-def has_onnx_runtime() -> bool:
-    """Whether the graph can be read and run here."""
-    return all(importlib.util.find_spec(name) is not None for name in (RUNTIME, "onnx"))
-
-
-def _refuse_strange(graph: bytes) -> None:
-    """Raise RuntimeError for a graph that reaches beyond itself or may run for ever: other operators, other files, loops, functions."""
-    import onnx
-
-    try:
-        model = onnx.load_from_string(graph)
-    except Exception as error:  # protobuf's own, which this package does not import
-        raise GraphError(f"policy.onnx: is no ONNX graph ({error}); export the policy again") from None
-    strange = {f"{node.domain or 'onnx'}.{node.op_type}" for node in model.graph.node if node.domain or node.op_type in _BRANCHES}
-    strange |= {tensor.name for tensor in model.graph.initializer if tensor.external_data}
-    strange |= {function.name for function in model.functions}
-    if strange:
-        raise GraphError(f"policy.onnx: was not written by uuv export, it has {', '.join(sorted(strange)[:5])}; export the policy again")
 
 
 def _differences(found: Arrays, golden: Arrays) -> dict[str, float]:

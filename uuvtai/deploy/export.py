@@ -13,13 +13,13 @@ from typing import Any
 
 import safetensors.torch
 
-from uuvtai.deploy import run_policy
-from uuvtai.deploy.agreement import RUNTIME, Agreement, has_onnx_runtime, of_numpy, of_onnx, of_torch
+from uuvtai.deploy import run_policy, runtime
+from uuvtai.deploy.agreement import Agreement, of_numpy, of_onnx, of_torch
 from uuvtai.deploy.card import model_card
 from uuvtai.deploy.evaluations import evaluations_of
 from uuvtai.deploy.golden import golden_of, npz_bytes
 from uuvtai.deploy.graph import OneDecision, missing_packages, onnx_bytes
-from uuvtai.deploy.run_policy import GOLDEN, SPEC, WEIGHTS, PolicyError
+from uuvtai.deploy.run_policy import FILES, GOLDEN, SPEC, WEIGHTS, PolicyError
 from uuvtai.deploy.spec import ONNX, specification
 from uuvtai.deploy.weights import weights_of
 from uuvtai.errors import UserError
@@ -59,12 +59,12 @@ class Export:
         return {"schema": 1, "folder": str(self.folder), "agrees": self.agrees, "damages": list(self.damages), "engines": engines}
 
 
-def export(checkpoint: Checkpoint, name: str, out: Path, evaluations: Iterable[Path], note: Note) -> Export:
-    """Write the policy of a checkpoint into a new folder ``out``; ``note`` is told what it lacks.
+def export(checkpoint: Checkpoint, name: str, out: Path, evaluations: Iterable[Path], note: Note, force: bool = False) -> Export:
+    """Write the policy of a checkpoint into a new folder ``out``; ``note`` is told what it lacks. ``force`` replaces an exported policy.
 
     Raises ConfigError for a place that is taken, CheckpointError for networks that cannot drive, RunFolderError where the disk refuses.
     """
-    _refuse_place(out)
+    _refuse_place(out, force)
     pilot, rows = load_pilot(checkpoint, 1), evaluations_of(checkpoint, evaluations)
     decision, golden, graph = OneDecision(pilot).eval(), golden_of(pilot), None
     if missing := missing_packages():
@@ -103,31 +103,43 @@ def _replayed(folder: Path, spec: dict[str, Any], note: Note) -> list[Agreement]
         found = [of_numpy(run_policy.Policy(spec, run_policy.read_safetensors(folder / WEIGHTS)), golden)]
         if ONNX not in spec["files"]:
             return found
-        if has_onnx_runtime():
+        if runtime.is_installed():
             return [*found, of_onnx(run_policy.content_of(folder / ONNX), golden)]
-    except (KeyError, ValueError, TypeError) as error:
+    except (LookupError, ValueError, TypeError, AttributeError, ArithmeticError) as error:
         raise PolicyError(f"{folder}: its golden pairs do not fit its policy ({error!r}); export it again") from None
-    note(f"{ONNX} was not replayed: {RUNTIME} is not installed; pip install '{EXTRA}'")
+    note(f"{ONNX} was not replayed: {runtime.NAME} is not installed; pip install '{EXTRA}'")
     return found
 
 
-def _refuse_place(out: Path) -> None:
-    if out.exists():
-        raise ConfigError(f"{out}: is already there; give another folder with --out DIR, or remove it")
+def _refuse_place(out: Path, force: bool) -> None:
+    """Raise ConfigError for a place that is taken; with ``force`` a folder that holds an exported policy and nothing else may be."""
+    if not out.exists() and not out.is_symlink():
+        return
+    if not force:
+        raise ConfigError(f"{out}: is already there; give another folder with --out DIR, or --force to replace an exported policy")
+    ours = out.is_dir() and not out.is_symlink() and {path.name for path in out.iterdir()} <= {SPEC, *FILES}
+    if not ours or not (out / SPEC).is_file():
+        raise ConfigError(f"{out}: is not just an exported policy, so it is not replaced; give another folder with --out DIR")
 
 
 def _publish(out: Path, files: dict[str, bytes], spec: dict[str, Any]) -> None:
     """Write everything into a neighbour, flush it, give it its name. Raises RunFolderError."""
     spec = spec | {"files": {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}}
     text = json.dumps(spec, indent=1, allow_nan=False) + "\n"
-    partial = out.with_name(f".{out.name}.{os.getpid()}.partial")
+    partial, old = (out.with_name(f".{out.name}.{os.getpid()}.{what}") for what in ("partial", "old"))
     try:
         for name, content in {**files, SPEC: text.encode()}.items():
             write_atomic(partial / name, content)
         sync_folder(partial)
+        if out.exists():
+            out.rename(old)
         partial.rename(out)
         sync_folder(out.parent)
     except OSError as error:
         raise RunFolderError(f"{out}: cannot be written ({error.strerror}); give a folder that can be: --out DIR") from None
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+        if out.exists():
+            shutil.rmtree(old, ignore_errors=True)
+        elif old.exists():
+            old.rename(out)

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor, nn
 
+from uuvtai.deploy.runtime import without_telemetry
 from uuvtai.learn.pilot import Pilot
 from uuvtai.learn.policy import NUM_ACTIONS
 from uuvtai.learn.world_model import N_FEATURES
@@ -72,6 +73,7 @@ def missing_packages() -> list[str]:
 
 def onnx_bytes(decision: OneDecision) -> bytes:
     """The ONNX graph with its weights inside, any number of rows at once. Needs PACKAGES."""
+    without_telemetry()
     n_obs = decision.policy.n_in - N_FEATURES
     example = torch.zeros(2, n_obs), torch.zeros(2, n_obs), torch.zeros(2, NUM_ACTIONS), torch.tensor([True, False])
     rows = torch.export.Dim("rows", min=1)

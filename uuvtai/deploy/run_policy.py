@@ -15,6 +15,8 @@ import hashlib
 import io
 import json
 import math
+import os
+import stat
 import sys
 import time
 import zipfile
@@ -30,9 +32,14 @@ SCHEMA = 1
 FILES = (WEIGHTS, GOLDEN, "policy.onnx", "README.md", "run_policy.py")
 """names that the spec may list; nothing else is ever opened"""
 N_TARGET, N_ACTION = 24, 4
-MAX_BYTES = 256 << 20
-"""of any file of the folder"""
+MAX_BYTES = 64 << 20
+"""of any file of the folder: sixteen million parameters"""
+CALLS = 330
+"""decisions that a latency is measured with"""
+MAX_STEPS, MAX_WORK = 1 << 16, 1 << 34
+"""of the golden pairs, and multiplications to replay them: seconds"""
 
+_OPEN = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
 _LOG_VAR = (-12.0, 6.0)  # bounds of the world model's log-variance
 _MAX_DEVIATIONS = 100.0  # a residual counts as at most this many deviations
 _MAX_LOGIT = 12.0  # range of the risk head's calibration table
@@ -81,6 +88,8 @@ class Policy:
             self._check_widths()
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise PolicyError(f"{SPEC} and {WEIGHTS} do not fit together ({error!r}); export the policy again") from None
+        self.work = sum(weight.size for layers in self._nets.values() for weight, _ in layers)
+        """multiplications of a decision"""
         self.reset()
 
     def reset(self) -> None:
@@ -246,15 +255,21 @@ def changed_files(folder: Path, spec: dict[str, Any]) -> list[str]:
 
 
 def content_of(file: Path) -> bytes:
-    """Bytes of a plain file of bearable size. Raises PolicyError."""
-    if file.is_symlink() or not file.is_file():
-        raise PolicyError(f"{file}: is missing or no plain file; give a folder of uuv export")
-    if file.stat().st_size > MAX_BYTES:
-        raise PolicyError(f"{file}: is larger than {MAX_BYTES >> 20} MiB; no exported policy is")
+    """Bytes of a plain file of bearable size; no link is followed and neither a pipe nor a device is waited for. Raises PolicyError."""
     try:
-        return file.read_bytes()
-    except OSError as error:
-        raise PolicyError(f"{file}: cannot be read ({error.strerror})") from None
+        if file.is_symlink():
+            raise PolicyError(f"{file}: is missing or no plain file; give a folder of uuv export")
+        with open(os.open(file, _OPEN), "rb") as stream:
+            if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
+                raise PolicyError(f"{file}: is missing or no plain file; give a folder of uuv export")
+            content = stream.read(MAX_BYTES + 1)
+    except FileNotFoundError:
+        raise PolicyError(f"{file}: is missing or no plain file; give a folder of uuv export") from None
+    except (OSError, ValueError) as error:
+        raise PolicyError(f"{file}: cannot be read ({error})") from None
+    if len(content) > MAX_BYTES:
+        raise PolicyError(f"{file}: is larger than {MAX_BYTES >> 20} MiB; no exported policy is")
+    return content
 
 
 def read_safetensors(file: Path) -> Arrays:
@@ -314,7 +329,15 @@ def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
 
 
 def replayed(policy: Policy, golden: Arrays) -> Arrays:
-    """What the policy says to the golden observations, under the names of the golden outputs that it has."""
+    """What the policy says to the golden observations, under the names of the golden outputs that it has.
+
+    Raises PolicyError for golden pairs of another shape, or that would take minutes.
+    """
+    steps = golden["obs"].shape[:1]
+    if golden["obs"].shape != (*steps, policy.n_obs) or golden["begins"].shape != steps or not 0 < steps[0] <= MAX_STEPS:
+        raise PolicyError(f"{GOLDEN}: has no missions of this policy; export the policy again")
+    if policy.work * (steps[0] // policy.hold_steps + golden["begins"].sum() + CALLS) > MAX_WORK:
+        raise PolicyError(f"{GOLDEN}: would take minutes to replay; no exported policy does")
     decisions = []
     for obs, begins in zip(golden["obs"], golden["begins"], strict=True):
         if begins:
@@ -331,7 +354,7 @@ def difference(found: np.ndarray, expected: np.ndarray) -> float:
     return float(np.max(np.abs(found - expected), initial=0.0) / np.max(np.abs(expected), initial=1.0))
 
 
-def latency_ms(step: Callable[[], Any], count: int = 300, warm_up: int = 30) -> dict[str, float]:
+def latency_ms(step: Callable[[], Any], count: int = CALLS - 30, warm_up: int = 30) -> dict[str, float]:
     """p50 and p99 [ms] of a call, over ``count`` calls after ``warm_up``."""
     times = []
     for _ in range(warm_up + count):
@@ -364,11 +387,12 @@ def main(arguments: list[str]) -> int:
         found = replayed(policy, golden)
         worst = {name: difference(values, golden[name]) for name, values in found.items()}
         tolerance = float(spec["golden"]["tolerance"])
-    except (PolicyError, KeyError, TypeError, ValueError) as error:
+    except (PolicyError, KeyError, TypeError, ValueError, AttributeError, IndexError, ArithmeticError) as error:
         print(f"{folder}: {error}", file=sys.stderr)
         return 1
+    steps = len(golden["obs"])
     for name, value in worst.items():
-        print(f"{name}: largest difference {value:.2g} over {len(golden[name])} steps (tolerance {tolerance:g})")
+        print(f"{name}: largest difference {value:.2g} over {steps} steps (tolerance {tolerance:g})")
     time_ms = decision_latency_ms(policy, golden["obs"])
     print(f"decision: p50 {time_ms['p50_ms']:.3f} ms, p99 {time_ms['p99_ms']:.3f} ms")
     return 0 if max(worst.values()) <= tolerance else 3

@@ -17,11 +17,12 @@ from typing import Any
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 
 from uuvtai.config import Config
+from uuvtai.files import refuse_output
 from uuvtai.loader import ConfigError, parsed_yaml
 from uuvtai.logs.clouds import occupied_cells, sonar_returns, waypoints
 from uuvtai.logs.container import McapFile
 from uuvtai.logs.errors import LogError
-from uuvtai.logs.reader import read_head, records
+from uuvtai.logs.reader import read_head, records, refuse_converted
 
 EXTRA = "uuvtai[viz]"
 """extra that brings the protobuf schemas"""
@@ -44,12 +45,14 @@ ADDED: dict[str, tuple[str, str, Make]] = {
 """topic: (topic made of it, foxglove schema, how)"""
 
 
-def convert(path: Path, out: Path) -> int:
-    """Write ``path`` with protobuf messages to the new file ``out``; how many messages. Raises LogError, and then nothing is left."""
+def convert(path: Path, out: Path, force: bool = False) -> int:
+    """Write ``path`` with protobuf messages to the new file ``out``; how many messages. Raises LogError, and then nothing is left.
+
+    Raises FileError where ``out`` is the input, or exists and ``force`` is not set.
+    """
     path, out = Path(path), Path(out)
     _require_packages()
-    if out.exists():
-        raise LogError(f"{out}: is already there; nothing was written. Give another name: uuv log convert {path} --out FILE")
+    refuse_output(out, [path], force)
     occupied = _occupied(path)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -62,7 +65,7 @@ def convert(path: Path, out: Path) -> int:
 
 def _converted(path: Path, file: McapFile, occupied: float) -> int:
     """Fill and finish the new file; on any error nothing of it is left."""
-    copy = _Conversion(file, occupied)
+    copy = _Conversion(path, file, occupied)
     try:
         for record in records(path):
             copy.add(record)
@@ -97,8 +100,8 @@ def _occupied(path: Path) -> float:
 class _Conversion:
     """Records on their way into a new file."""
 
-    def __init__(self, file: McapFile, occupied: float) -> None:
-        self.file, self.messages = file, 0
+    def __init__(self, path: Path, file: McapFile, occupied: float) -> None:
+        self._path, self.file, self.messages = path, file, 0
         self._occupied = occupied
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
@@ -121,6 +124,7 @@ class _Conversion:
             self._put(record)
 
     def _declare(self, channel: Channel) -> None:
+        refuse_converted(self._path, channel)
         self._channels[channel.id] = channel
         schema = self._schemas.get(channel.schema_id)
         if self._is_converted(channel):

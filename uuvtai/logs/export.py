@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import csv
 import itertools
 import json
@@ -10,113 +11,191 @@ import os
 import re
 import shutil
 import struct
-import tempfile
 import zipfile
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import cv2
 import numpy as np
 
+from uuvtai.files import refuse_output
 from uuvtai.logs.errors import LogError
-from uuvtai.logs.reader import info, read_head, read_messages
+from uuvtai.logs.reader import info, original, read_head, read_messages
 
-FORMATS = ("jsonl", "csv", "npz")
+FORMATS = ("json", "csv", "npz")
+ATTACHMENTS = "attachments"
+"""folder within an export"""
+MAX_COLUMNS, MAX_CELLS = 20_000, 50_000_000
+"""of a topic as CSV, and of all topics together: what is written grows with the widest message"""
+MAX_ARRAYS = 256 << 20
+"""[bytes] arrays of one export, which wait in memory"""
+_OVERHEAD = 64
+"""[bytes] an array or a number takes beyond its values"""
 _PNG_HEAD = struct.Struct(">8s4x4sII")
 """signature, first chunk's name, width, height"""
 _MAX_PIXELS = 1 << 24
 """of a depth image: a thousand times the camera's, and far below what a small file can claim"""
+_RESERVED = re.compile(r"(con|prn|aux|nul|com[0-9]|lpt[0-9])(\..*)?", re.IGNORECASE)
+"""names that open a device on some systems"""
+_MAX_NAME = 100
+_ODD = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError, struct.error, csv.Error, cv2.error)
+"""what a message unlike its schema can raise"""
 
 
-def export(path: Path, out_dir: Path, topics: Collection[str] | None = None, fmt: str = "jsonl") -> list[Path]:
-    """Write each topic's messages and the attachments below ``out_dir``; the files' paths.
+def export(path: Path, out_dir: Path, topics: Collection[str] | None = None, fmt: str = "json") -> list[Path]:
+    """Write each topic's messages into the new or empty folder ``out_dir`` and the attachments below it; the files' paths.
 
-    ``jsonl``: one message a line with its time under ``t``. ``csv``: a column for every number (grids and images are left out). ``npz``:
-    arrays with the message as first axis; grids as ``value`` (n, row, col), depth images as ``depth_mm``. All files appear at once or none
-    does. Raises LogError.
+    ``json``: NAME.jsonl, one message a line with its time under ``t``. ``csv``: a column for every number (grids and images are left out).
+    ``npz``: arrays with the message as first axis; grids as ``value`` (n, row, col), depth images as ``depth_mm``. The folder appears whole
+    or not at all. Raises LogError, and FileError where ``out_dir`` is anything but a folder.
     """
     path, out_dir = Path(path), Path(out_dir)
     if fmt not in FORMATS:
         raise LogError(f"--format {fmt}: choose one of {', '.join(FORMATS)}")
-    known = [entry["topic"] for entry in info(path)["topics"] if entry["messages"]]
+    _refuse_place(out_dir)
+    found = info(path)
+    if found["converted_from"]:
+        raise LogError(f"{path}: is the output of uuv log convert (protobuf); use the original: {original(path)}")
+    known = [entry["topic"] for entry in found["topics"] if entry["messages"]]
     if missing := [topic for topic in topics or () if topic not in known]:
         raise LogError(f"{path}: no messages on {', '.join(missing)}; it has {', '.join(known)}")
-    wanted = list(topics or known)
+    wanted = list(dict.fromkeys(topics or known))
+    staging = out_dir.with_name(f".{out_dir.name}.{os.getpid()}.partial")
+    with _told(path, out_dir), _removed(staging):
+        out_dir.parent.mkdir(parents=True, exist_ok=True)
+        staging.mkdir()
+        names = _Names(staging)
+        _write_attachments(path, staging, names)
+        {"json": _write_jsonl, "csv": _write_csv, "npz": _write_npz}[fmt](path, wanted, names)
+        if out_dir.is_dir():
+            out_dir.rmdir()  # only where it is empty
+        staging.rename(out_dir)
+    return sorted(file for file in out_dir.rglob("*") if file.is_file())
+
+
+def _refuse_place(out: Path) -> None:
+    """Raise LogError or FileError for a place that is taken: a log's own names must not meet anybody's files."""
+    if out.is_symlink() or not out.is_dir():
+        refuse_output(out, [], force=False)
+    elif any(out.iterdir()):
+        raise LogError(f"{out}: is a folder that is not empty; give a new or an empty one with --out DIR")
+
+
+@contextlib.contextmanager
+def _told(path: Path, out: Path) -> Iterator[None]:
+    """What a log unlike its schemas, or the disk, raises, as LogError."""
     try:
-        out_dir.mkdir(parents=True, exist_ok=True)
-        staging = Path(tempfile.mkdtemp(prefix=".export-", dir=out_dir))
-        try:
-            _write_attachments(path, staging)
-            {"jsonl": _write_jsonl, "csv": _write_csv, "npz": _write_npz}[fmt](path, staging, wanted)
-            return [_moved(file, out_dir) for file in sorted(staging.iterdir())]
-        finally:
-            shutil.rmtree(staging, ignore_errors=True)
-    except (KeyError, TypeError, ValueError, StopIteration) as error:
+        yield
+    except _ODD as error:
         raise LogError(f"{path}: a message is not as its schema says ({error!r}); see what is in it with: uuv log info {path}") from error
     except OSError as error:
-        raise LogError(f"{out_dir}: cannot write the export ({error.strerror}); choose another folder with --out DIR") from error
+        raise LogError(f"{out}: cannot write the export ({error.strerror}); choose another folder with --out DIR") from error
 
 
-def _moved(file: Path, folder: Path) -> Path:
-    os.replace(file, folder / file.name)
-    return folder / file.name
+@contextlib.contextmanager
+def _removed(folder: Path) -> Iterator[None]:
+    """Nothing of ``folder`` is left."""
+    try:
+        yield
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def file_name(name: str) -> str:
-    """A plain file name from a topic or an attachment's name, which may be anything: no folders, no hidden files."""
-    plain = re.sub(r"[^A-Za-z0-9._-]+", "_", name.replace("\\", "/").strip("/")).lstrip(".")
-    return plain[:100] or "unnamed"
+    """A plain file name from a topic or an attachment's name, which may be anything: no folders, hidden files, options or devices."""
+    plain = re.sub(r"[^A-Za-z0-9._-]+", "_", name.replace("\\", "/").strip("/")).lstrip(".-")[:_MAX_NAME].rstrip(".")
+    return f"_{plain}" if _RESERVED.fullmatch(plain) else plain or "unnamed"
 
 
-def _fresh(folder: Path, name: str) -> Path:
-    """A path that no other export of this run has taken: two topics may give the same plain name."""
-    stem, dot, ending = name.rpartition(".")
-    tries = (f"{stem}{dot}{ending}" if n == 1 else f"{stem}_{n}{dot}{ending}" for n in itertools.count(1))
-    path = next(folder / name for name in tries if not (folder / name).exists())
-    path.touch()
-    return path
+class _Names:
+    """Paths below a folder, none given out twice: neither on systems where a and A are one file, nor for topics that give one name."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._taken: set[str] = set()
+
+    def fresh(self, name: str) -> Path:
+        stem, dot, ending = name.rpartition(".") if "." in name else (name, "", "")
+        tries = (name if n == 1 else f"{stem}_{n}{dot}{ending}" for n in itertools.count(1))
+        found = next(name for name in tries if name.casefold() not in self._taken)
+        self._taken.add(found.casefold())
+        return self.folder / found
 
 
-def _write_attachments(path: Path, folder: Path) -> None:
+def _write_attachments(path: Path, folder: Path, names: _Names) -> None:
     head = read_head(path)
+    names.fresh("metadata.json").write_text(json.dumps(head.metadata, indent=1) + "\n", encoding="utf-8")
+    if not head.attachments:
+        return
+    inner = _Names(folder / ATTACHMENTS)
+    inner.folder.mkdir()
     for name, data in head.attachments.items():
-        _fresh(folder, file_name(name.replace("\\", "/").rsplit("/", 1)[-1])).write_bytes(data)
-    _fresh(folder, "metadata.json").write_text(json.dumps(head.metadata, indent=1) + "\n")
+        inner.fresh(file_name(name.replace("\\", "/").rsplit("/", 1)[-1])).write_bytes(data)
 
 
-def _write_jsonl(path: Path, folder: Path, topics: list[str]) -> None:
-    files = {topic: _fresh(folder, f"{file_name(topic)}.jsonl").open("w") for topic in topics}
-    try:
+@contextlib.contextmanager
+def _files(topics: list[str], ending: str, names: _Names) -> Iterator[dict[str, TextIO]]:
+    """One open file a topic."""
+    with contextlib.ExitStack() as stack:
+        yield {
+            topic: stack.enter_context(names.fresh(f"{file_name(topic)}.{ending}").open("w", encoding="utf-8", newline=""))
+            for topic in topics
+        }
+
+
+def _write_jsonl(path: Path, topics: list[str], names: _Names) -> None:
+    with _files(topics, "jsonl", names) as files:
         for message in read_messages(path, topics):
             files[message.topic].write(json.dumps({"t": message.time_s, **message.data}, separators=(",", ":")) + "\n")
-    finally:
-        for file in files.values():
-            file.close()
 
 
-def _write_csv(path: Path, folder: Path, topics: list[str]) -> None:
+def _write_csv(path: Path, topics: list[str], names: _Names) -> None:
     """Columns are those of all messages of the topic: the widest list decides; what a message lacks stays empty."""
-    for topic in topics:
-        rows = [{"t": message.time_s, **flattened(message.data)} for message in read_messages(path, [topic])]
-        columns = list(dict.fromkeys(name for row in rows for name in row))
-        with _fresh(folder, f"{file_name(topic)}.csv").open("w", newline="") as file:
-            writer = csv.DictWriter(file, columns)
+    columns: dict[str, dict[str, None]] = {topic: {} for topic in topics}
+    counts = dict.fromkeys(topics, 0)
+    for message in read_messages(path, topics):
+        found = columns[message.topic]
+        found.update(dict.fromkeys(("t", *flattened(message.data))))
+        counts[message.topic] += 1
+        if len(found) > MAX_COLUMNS:
+            raise LogError(f"{path}: {message.topic} has more than {MAX_COLUMNS:,} columns; use --format json")
+    if sum(counts[topic] * len(columns[topic]) for topic in topics) > MAX_CELLS:
+        raise LogError(f"{path}: makes more than {MAX_CELLS:,} cells; use --format json, or fewer topics with --topic")
+    with _files(topics, "csv", names) as files:
+        writers = {topic: csv.DictWriter(files[topic], list(columns[topic]), lineterminator="\n") for topic in topics}
+        for writer in writers.values():
             writer.writeheader()
-            writer.writerows(rows)
+        for message in read_messages(path, topics):
+            writers[message.topic].writerow({"t": message.time_s, **flattened(message.data)})
 
 
-def _write_npz(path: Path, folder: Path, topics: list[str]) -> None:
+def _write_npz(path: Path, topics: list[str], names: _Names) -> None:
+    rows: dict[str, list[dict[str, np.ndarray]]] = {topic: [] for topic in topics}
+    size = 0
+    for message in read_messages(path, topics):
+        row = {name: np.asarray(value) for name, value in {"t": message.time_s, **_arrays(message.data)}.items()}
+        size += sum(array.nbytes + _OVERHEAD for array in row.values())
+        if size > MAX_ARRAYS:
+            raise LogError(f"{path}: has arrays of more than {MAX_ARRAYS >> 20} MiB; use --format json, or fewer topics with --topic")
+        rows[message.topic].append(row)
     for topic in topics:
-        rows = [{"t": message.time_s, **_arrays(message.data)} for message in read_messages(path, [topic])]
-        names = [name for name in rows[0] if all(name in row for row in rows)]
-        stacked = {name: np.array([row[name] for row in rows]) for name in names if len({np.shape(row[name]) for row in rows}) == 1}
-        numeric = {name.replace("/", "_"): values for name, values in stacked.items() if values.dtype.kind in "biufU"}
         # not np.savez: its own parameter names would collide with fields such as "file"
-        with zipfile.ZipFile(_fresh(folder, f"{file_name(topic)}.npz"), "w", zipfile.ZIP_DEFLATED) as archive:
-            for name, values in numeric.items():
-                with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+        with zipfile.ZipFile(names.fresh(f"{file_name(topic)}.npz"), "w", zipfile.ZIP_DEFLATED) as archive:
+            members = _Names(Path())
+            for name, values in _stacked(rows.pop(topic)):
+                plain = re.sub(r"[^\w .-]", "_", name)[:_MAX_NAME].lstrip(".") or "unnamed"
+                with archive.open(members.fresh(f"{plain}.npy").name, "w", force_zip64=True) as member:
                     np.lib.format.write_array(member, values, allow_pickle=False)
+
+
+def _stacked(rows: list[dict[str, np.ndarray]]) -> Iterator[tuple[str, np.ndarray]]:
+    """(field, values with the message as first axis) of the fields that all messages have in one shape, as numbers or words."""
+    for name in rows[0]:
+        if all(name in row for row in rows) and len({row[name].shape for row in rows}) == 1:
+            values = np.array([row[name] for row in rows])
+            if values.dtype.kind in "biufU":
+                yield name, values
 
 
 def flattened(value: Any, name: str = "") -> dict[str, Any]:
@@ -148,7 +227,9 @@ def _arrays(data: dict[str, Any]) -> dict[str, Any]:
 def grid_values(data: dict[str, Any]) -> np.ndarray:
     """``value`` of a foxglove.Grid as an array (row, col)."""
     cells = base64.b64decode(data["data"])
-    offset = next(entry["offset"] for entry in data["fields"] if entry["name"] == "value")
+    offset = next((entry["offset"] for entry in data["fields"] if entry["name"] == "value"), None)
+    if offset is None:
+        raise ValueError("a grid without a field named value")
     packed = np.frombuffer(cells, np.uint8).reshape(-1, data["column_count"], data["cell_stride"])
     return packed[..., offset : offset + 4].copy().view("<f4")[..., 0]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bisect
 import contextlib
+import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -100,6 +101,10 @@ class Recording:
 _ENDINGS = {"ttc": "TTC stop"}
 _MAX_DURATION_S, _MAX_EXTENT_M, _FARTHEST_M, _MAX_BODIES = 3600.0, 1000.0, 1e4, 1000
 """what is drawn must fit a picture and a video that somebody waits for"""
+_MAX_NUMBERS = 100_000
+"""of a scenario: corners of paths are drawn in every frame"""
+_MAX_ARRAYS, _OVERHEAD = 384 << 20, 200
+"""[bytes] all that is drawn together, and what a message takes beyond its arrays"""
 PICTURE_TOPICS = ("/pose", "/safety", "/map/static", "/map/dynamic", "/map/clearance", "/plan/info")
 VIDEO_TOPICS = (*PICTURE_TOPICS, "/sonar/scan", "/plan/lookahead", "/state", "/action", "/tracks")
 
@@ -109,11 +114,14 @@ def load_recording(path: Path, topics: tuple[str, ...] = VIDEO_TOPICS) -> Record
     path = Path(path)
     head = read_head(path)
     found = Recording(path, head, head.scenario)
-    _check_scenario(path, head.scenario)
+    _check_scenario(path, found.scenario)
+    size = 0
     try:
         for message in read_messages(path, topics):
-            _take(found, message)
-    except (KeyError, TypeError, ValueError, IndexError) as error:
+            size += _take(found, message) + _OVERHEAD
+            if size > _MAX_ARRAYS:
+                raise LogError(f"{path}: holds more than {_MAX_ARRAYS >> 20} MiB to draw; no episode of ours does")
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         raise LogError(f"{path}: a message is not as its schema says ({error!r}); see what is in it with: uuv log info {path}") from error
     if not found.pose.times:
         raise LogError(f"{path}: the log has no messages on /pose, so there is nothing to draw; see uuv log info {path}")
@@ -138,8 +146,8 @@ def _check_scenario(path: Path, scenario: Any) -> None:
         extents = [float(tank[axis][1]) - float(tank[axis][0]) for axis in ("x_m", "y_m")]
         if not all(0 < extent <= _MAX_EXTENT_M for extent in extents):
             raise ValueError(f"a tank of {extents[0]:g} x {extents[1]:g} m")
-        numbers = list(_numbers([tank, bodies, scenario["goal"], scenario["start"]]))
-        if len(bodies) > _MAX_BODIES or not all(abs(number) <= _FARTHEST_M for number in numbers):
+        numbers = list(itertools.islice(_numbers([tank, bodies, scenario["goal"], scenario["start"]]), _MAX_NUMBERS + 1))
+        if len(numbers) > _MAX_NUMBERS or len(bodies) > _MAX_BODIES or not all(abs(number) <= _FARTHEST_M for number in numbers):
             raise ValueError("bodies beyond all bounds")
     except (KeyError, TypeError, ValueError, IndexError, OverflowError, RecursionError) as error:
         raise LogError(f"{path}: its scenario.json cannot be drawn ({error!r}); give a log that uuv eval --record wrote") from None
@@ -154,7 +162,8 @@ def _numbers(value: Any) -> Iterator[float]:
             yield from _numbers(inner)
 
 
-def _take(found: Recording, message: LogMessage) -> None:
+def _take(found: Recording, message: LogMessage) -> int:
+    """Add a message; bytes of the arrays that it brings."""
     time_s, data = message.time_s, message.data
     match message.topic:
         case "/pose":
@@ -163,10 +172,14 @@ def _take(found: Recording, message: LogMessage) -> None:
             found.pose.add(time_s, (place["x"], place["y"], place["z"], yaw))
         case "/sonar/scan":
             ping_s = data["timestamp"]["sec"] + data["timestamp"]["nsec"] / 1e9
-            found.scan.add(time_s, (np.array(data["ranges"]), np.array(data["intensities"]) > 0, ping_s))
+            ranges, hit = np.array(data["ranges"]), np.array(data["intensities"]) > 0
+            found.scan.add(time_s, (ranges, hit, ping_s))
+            return ranges.nbytes + hit.nbytes
         case "/plan/info":
-            found.route.add(time_s, np.array([(point["x"], point["y"]) for point in data["points"]]).reshape(-1, 2))
+            route = np.array([(point["x"], point["y"]) for point in data["points"]]).reshape(-1, 2)
+            found.route.add(time_s, route)
             found.replans.append((time_s, data["trigger"]))
+            return route.nbytes
         case "/plan/lookahead":
             place = data["pose"]["position"]
             found.lookahead.add(time_s, (place["x"], place["y"]))
@@ -177,8 +190,12 @@ def _take(found: Recording, message: LogMessage) -> None:
         case "/action":
             found.leaf.add(time_s, data.get("leaf", ""))
         case "/tracks":
-            found.tracks.add(time_s, np.array([(t["x"], t["y"], t["radius"]) for t in data["tracks"]]).reshape(-1, 3))
+            tracks = np.array([(t["x"], t["y"], t["radius"]) for t in data["tracks"]]).reshape(-1, 3)
+            found.tracks.add(time_s, tracks)
+            return tracks.nbytes
         case topic:
             origin = data["pose"]["position"]
             layer = Layer(time_s, grid_values(data), (origin["x"], origin["y"]), data["cell_size"]["x"])
             found.layers.setdefault(topic.rpartition("/")[2], Series()).add(time_s, layer)
+            return layer.values.nbytes
+    return 0

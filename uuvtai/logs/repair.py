@@ -10,9 +10,10 @@ from typing import Any
 
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 
+from uuvtai.files import refuse_output
 from uuvtai.logs.container import McapFile
 from uuvtai.logs.errors import LogError
-from uuvtai.logs.reader import DamageError, Scanner, opened
+from uuvtai.logs.reader import DamageError, Scanner, opened, refuse_converted
 
 
 @dataclass(frozen=True)
@@ -28,54 +29,77 @@ class Repair:
     """what was wrong, with the byte"""
 
 
-def repair(path: Path, out: Path | None = None) -> Repair:
+MAX_DAMAGES = 100
+"""that are told one by one"""
+
+
+def repair(path: Path, out: Path | None = None, force: bool = False) -> Repair:
     """Write every message that can still be read to ``out``, with indexes and summary; the input is never changed.
 
     Default for ``out``: NAME.repaired.mcap. The new file says in its metadata ``uuv.repair`` what was found. Raises LogError, also where
-    ``out`` exists or nothing at all can be recovered.
+    nothing at all can be recovered, and FileError where ``out`` is the input, or exists and ``force`` is not set.
     """
     path = Path(path)
     out = path.with_name(path.name.removesuffix(".part").removesuffix(".mcap") + ".repaired.mcap") if out is None else Path(out)
     with opened(path) as source:
-        if out.exists():
-            raise LogError(f"{out}: is already there; nothing was written. Give another name: uuv log repair {path} --out FILE")
+        refuse_output(out, [path], force)
         try:
-            return _copied(path, Scanner(source), out)
+            return _copied(path, Scanner(source, str(path)), out)
         except OSError as error:
             raise LogError(f"{out}: cannot write the repaired log ({error.strerror}); choose another place with --out FILE") from error
 
 
 def _copied(path: Path, scanner: Scanner, out: Path) -> Repair:
-    damages: list[str] = []
+    damages = _Damages()
     copy = _Copy(McapFile(out, ".repairing"))  # not .part: that may be the input
     try:
         for record in _recovered(scanner, damages):
+            if isinstance(record, Channel):
+                refuse_converted(path, record)
             copy.add(record)
         if not copy.messages:
-            reason = damages[0] if damages else "it holds no messages"
+            reason = damages.told[0] if damages.told else "it holds no messages"
             raise LogError(f"{path}: nothing can be recovered: {reason}; record the episode again with uuv eval --record")
-        if damages:
-            copy.file.add_metadata("uuv.repair", {"messages": str(copy.messages), "damages": json.dumps(damages)})
+        told = damages.document()
+        if told:
+            copy.file.add_metadata("uuv.repair", {"messages": str(copy.messages), "damages": json.dumps(told)})
         copy.file.finish()
     except BaseException:
         copy.file.discard()
         raise
-    return Repair(out, copy.messages, copy.last_ns / 1e9, not damages, tuple(damages))
+    return Repair(out, copy.messages, copy.last_ns / 1e9, not told, tuple(told))
 
 
-def _recovered(scanner: Scanner, damages: list[str]) -> Iterator[Any]:
-    """Every record that can be read; what was wrong is added to ``damages``."""
+class _Damages:
+    """What was wrong, the first in words and the others counted."""
+
+    def __init__(self) -> None:
+        self.told: list[str] = []
+        self._more = 0
+
+    def add(self, text: str) -> None:
+        if len(self.told) < MAX_DAMAGES:
+            self.told.append(text)
+        else:
+            self._more += 1
+
+    def document(self) -> list[str]:
+        return self.told + ([f"and {self._more} more"] if self._more else [])
+
+
+def _recovered(scanner: Scanner, damages: _Damages) -> Iterator[Any]:
+    """Every record that can be read; what was wrong is added to ``damages``. Raises BudgetError."""
     going = True
     while going:
         going = False
         try:
             yield from scanner.records()
         except DamageError as damage:
-            damages.append(f"{damage.reason} (byte {scanner.at})")
+            damages.add(f"{damage.reason} (byte {scanner.at})")
             yield from damage.records
-            going = damage.can_go_on
-    if not scanner.finished and not damages:
-        damages.append(f"no end mark (byte {scanner.at})")
+            going = damage.can_go_on or scanner.resume()
+    if not scanner.finished and not damages.told:
+        damages.add(f"no end mark (byte {scanner.at})")
 
 
 class _Copy:

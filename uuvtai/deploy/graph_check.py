@@ -1,0 +1,151 @@
+"""What an ONNX graph of a stranger may hold before ONNX Runtime sees it: our operators, and memory and work that are reckoned first."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+from uuvtai.errors import UserError
+
+_OURS = """
+Add And Cast Clip Concat ConstantOfShape Div Elu Exp Floor GatherND Gemm Greater IsInf IsNaN Less Min Mul Not Pow ReduceMean Relu
+Shape Slice Softplus Split Sqrt Squeeze Sub Tanh Unsqueeze Where
+"""
+_LIKE_OURS = """
+Abs Constant Equal Flatten Gather GreaterOrEqual Identity LessOrEqual Log MatMul Max Neg Or ReduceSum Reshape Sigmoid Sign
+Transpose
+"""
+OPERATORS = frozenset((_OURS + _LIKE_OURS).split())
+"""What torch's exporter makes of a policy, and what other versions of it make of the same. No loops, branches, random numbers or functions,
+and nothing that repeats or resizes. ConstantOfShape is ours too (features before the first decision): what it makes is bounded like all
+else, by its shape."""
+OPSETS = range(17, 27)
+MAX_NODES = 5000
+MAX_BYTES = 64 << 20
+"""of the graph with its weights: ONNX Runtime holds them about four times"""
+MAX_VALUES = 256 << 20
+"""[bytes] all values between the operators together, eight bytes a number"""
+MAX_WORK = 1 << 34
+"""multiplications of all matrix products, and values as well, of all calls together"""
+_RANK = 8
+_LEAST_ROWS = 1
+
+
+class GraphError(UserError, RuntimeError):
+    """policy.onnx is no graph of ours, or ONNX Runtime cannot use it."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(f"policy.onnx: {reason}; export the policy again")
+
+
+def refuse_strange(graph: bytes, inputs: dict[str, tuple[int, ...]], single_calls: int) -> None:
+    """Raise GraphError for a graph that reaches beyond itself or may take more memory or time than a policy does.
+
+    ``inputs``: shapes (rows, ...) with which it will run once; it will run ``single_calls`` times with one row.
+    """
+    model = _parsed(graph)
+    _refuse_parts(model)
+    _refuse_interface(model, set(inputs))
+    work = 0
+    for rows, calls in ((None, 1), (_LEAST_ROWS, single_calls)):
+        shapes = _shapes(model, {name: (rows or shape[0], *shape[1:]) for name, shape in inputs.items()})
+        work += calls * _work(model, shapes)
+    if work > MAX_WORK:
+        raise GraphError(f"takes {work:.1e} multiplications")
+
+
+def _parsed(graph: bytes) -> Any:
+    import onnx
+
+    if len(graph) > MAX_BYTES:
+        raise GraphError(f"has {len(graph):,} bytes, more than {MAX_BYTES >> 20} MiB")
+    try:
+        return onnx.load_from_string(graph)
+    except Exception as error:  # protobuf's own, which this package does not import
+        raise GraphError(f"is no ONNX graph ({error})") from None
+
+
+def _refuse_parts(model: Any) -> None:
+    """Operators, domains, functions, graphs within graphs, other files."""
+    graph = model.graph
+    strange = {f"{node.domain or 'onnx'}.{node.op_type}" for node in graph.node if node.domain or node.op_type not in OPERATORS}
+    strange |= {f"a graph in {node.op_type}" for node in graph.node for a in node.attribute if a.HasField("g") or a.graphs}
+    strange |= {tensor.name for tensor in _tensors(graph) if tensor.external_data or tensor.data_location}
+    strange |= {function.name for function in model.functions}
+    strange |= {"training" for _ in model.training_info}
+    strange |= {"sparse weights" for _ in graph.sparse_initializer}
+    strange |= {"sparse weights" for node in graph.node for a in node.attribute if a.HasField("sparse_tensor") or a.sparse_tensors}
+    strange |= {f"opset {o.domain or 'onnx'} {o.version}" for o in model.opset_import if o.domain or o.version not in OPSETS}
+    if strange:
+        raise GraphError(f"was not written by uuv export, it has {', '.join(sorted(strange)[:5])}")
+    if len(graph.node) > MAX_NODES or len(graph.initializer) > MAX_NODES:
+        raise GraphError(f"has more than {MAX_NODES:,} operators or weights")
+    for tensor in _tensors(graph):
+        if len(tensor.dims) > _RANK or not all(size >= 0 for size in tensor.dims) or math.prod(tensor.dims) > MAX_BYTES:
+            raise GraphError(f"has weights {tensor.name} of shape {list(tensor.dims)[:_RANK]}")
+
+
+def _tensors(graph: Any) -> Iterator[Any]:
+    yield from graph.initializer
+    for node in graph.node:
+        for attribute in node.attribute:
+            if attribute.HasField("t"):
+                yield attribute.t
+            yield from attribute.tensors
+
+
+def _refuse_interface(model: Any, wanted: set[str]) -> None:
+    """Inputs are those that will be given; nothing else is asked for."""
+    weights = {tensor.name for tensor in model.graph.initializer}
+    found = {value.name for value in model.graph.input} - weights
+    if found != wanted:
+        raise GraphError(f"takes {', '.join(sorted(found)) or 'nothing'} instead of {', '.join(sorted(wanted))}")
+
+
+def _shapes(model: Any, inputs: dict[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
+    """Shape of every value for these inputs, reckoned without what the file itself says about them; GraphError where one is unknown."""
+    import onnx
+    from onnx import shape_inference
+
+    bare = onnx.ModelProto()
+    bare.CopyFrom(model)
+    graph = bare.graph
+    del graph.value_info[:]
+    for value in graph.output:
+        value.type.tensor_type.ClearField("shape")
+    for value in graph.input:
+        if value.name in inputs:
+            shape = value.type.tensor_type.shape
+            del shape.dim[:]
+            for size in inputs[value.name]:
+                shape.dim.add().dim_value = size
+    try:
+        told = shape_inference.infer_shapes(bare, check_type=True, strict_mode=True, data_prop=True).graph
+    except Exception as error:  # onnx's own, or protobuf's
+        raise GraphError(f"does not fit together ({str(error).strip().splitlines()[-1][:200]})") from None
+    found = {tensor.name: tuple(tensor.dims) for tensor in graph.initializer} | dict(inputs)
+    for value in (*told.value_info, *told.output):
+        shape = value.type.tensor_type.shape
+        if value.type.tensor_type.HasField("shape") and all(size.HasField("dim_value") for size in shape.dim):
+            found[value.name] = tuple(size.dim_value for size in shape.dim)
+    values = [name for node in graph.node for name in node.output if name]
+    for name in values:
+        if name not in found or min(found[name], default=0) < 0:
+            raise GraphError(f"has a value whose shape cannot be told: {name[:100]}")
+    if 8 * sum(math.prod(found[name]) for name in values) > MAX_VALUES:
+        raise GraphError(f"would take more than {MAX_VALUES >> 20} MiB to run")
+    return found
+
+
+def _work(model: Any, shapes: dict[str, tuple[int, ...]]) -> int:
+    """Multiplications of the matrix products and values of everything."""
+    total = 0
+    for node in model.graph.node:
+        size = sum(math.prod(shapes[name]) for name in node.output if name)
+        taken = sum(math.prod(shapes.get(name, ())) for name in node.input if name)
+        total += size + taken
+        if node.op_type in ("Gemm", "MatMul"):
+            first = shapes.get(node.input[0], ())
+            total += size * max(first, default=1)
+    return total
