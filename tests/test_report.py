@@ -538,7 +538,7 @@ def test_a_page_of_many_videos_stays_below_ten_megabytes(tmp_path):
                 (run / place / name.format(k)).write_bytes(bytes(size))
         runs.append(run)
     for some in (runs[:1], runs):
-        page = report(some, tmp_path / "page.html").page
+        page = report(some, tmp_path / f"page_of_{len(some)}.html").page
         assert 7e6 < page.stat().st_size < 10e6
         assert "Left out to keep this page small" in page.read_text() and "videos/bt_seed0_episode" in page.read_text()
 
