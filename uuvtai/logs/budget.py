@@ -15,14 +15,14 @@ UNPACKED_BASE, UNPACKED_RATIO = 64 << 20, 64
 MAX_MESSAGE = 8 << 20
 """[bytes] of a message or a JSON attachment: a hundred times our largest; read as JSON it takes thirty times that"""
 
-_TOTALS = {
+_TOTALS: dict[int, tuple[int, str]] = {
     Opcode.ATTACHMENT: (64 << 20, "attachments"),
     Opcode.SCHEMA: (16 << 20, "schemas"),
     Opcode.CHANNEL: (4 << 20, "channels"),
     Opcode.METADATA: (4 << 20, "metadata"),
 }
 """[bytes] all records of a kind together"""
-_COUNTS = {Opcode.SCHEMA: (1000, "schemas"), Opcode.CHANNEL: (400, "topics")}
+_COUNTS: dict[int, tuple[int, str]] = {Opcode.SCHEMA: (1000, "schemas"), Opcode.CHANNEL: (400, "topics")}
 """fewer than the files that a process may have open: an export opens one for each topic"""
 
 
@@ -50,12 +50,12 @@ class Budget:
             self._refuse(f"has a message of {length:,} bytes, more than {MAX_MESSAGE >> 20} MiB")
         if opcode in _TOTALS:
             self._bytes[opcode] += length
-            limit, what = _TOTALS[Opcode(opcode)]
+            limit, what = _TOTALS[opcode]
             if self._bytes[opcode] > limit:
                 self._refuse(f"has {what} of more than {limit >> 20} MiB together")
         if opcode in _COUNTS:
             self._counts[opcode] += 1
-            limit, what = _COUNTS[Opcode(opcode)]
+            limit, what = _COUNTS[opcode]
             if self._counts[opcode] > limit:
                 self._refuse(f"has more than {limit:,} {what}")
 
