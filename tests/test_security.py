@@ -131,8 +131,8 @@ READERS = {
 """files that may open others themselves, and why"""
 SYSTEM = {"run_folder.py": "/proc/cpuinfo", "sizes.py": "/proc/meminfo"}
 """files that read one file of the system, by its name"""
-UNFINISHED = {"logs", "deploy"}
-"""folders whose readers are still to be moved: to be empty"""
+OWN_FILES = {"logs/container.py": "os.open", "logs/film.py": "os.open av.open", "deploy/export.py": "Path(run_policy.__file__).read_bytes"}
+"""files that open what they have just written, or what lies in the package, by these calls"""
 OPENS = {
     "open",
     "read_text",
@@ -150,6 +150,8 @@ OPENS = {
 PARSES = {"json.load", "json.loads", "np.load", "io.open", "os.open", "open", "torch.load"}
 OWN_JSON = {"capture.py", "learn/distributed.py", "measure/sweep/plan.py"}
 """files whose JSON comes from this process or its siblings, not from a file"""
+BOUNDED_JSON = {"logs/reader.py", "logs/convert.py"}
+"""files whose JSON are messages and attachments of a log, which ``logs/budget.py`` has counted before"""
 
 
 def reads_of(tree):
@@ -165,7 +167,8 @@ def reads_of(tree):
         if isinstance(node, ast.Call):
             name = ast.unparse(node.func)
             last = name.rpartition(".")[2]
-            if name not in ours and not name.startswith("files.") and (last in OPENS or name in PARSES):
+            writes = last == "open" and any(isinstance(a, ast.Constant) and str(a.value).startswith("w") for a in node.args)
+            if name not in ours and not name.startswith("files.") and not writes and (last in OPENS or name in PARSES):
                 yield node.lineno, name
 
 
@@ -174,11 +177,12 @@ def test_whatever_is_read_goes_through_the_one_reader():
     found = []
     for path in sorted(PACKAGE.rglob("*.py")):
         name = str(path.relative_to(PACKAGE))
-        if name in READERS or name.partition("/")[0] in UNFINISHED:
+        if name in READERS:
             continue
         for line, call in reads_of(ast.parse(path.read_text())):
             system = name in SYSTEM and SYSTEM[name] in path.read_text() and call.endswith(".read_text")
-            own = name in OWN_JSON and call == "json.loads"
+            own = name in OWN_JSON | BOUNDED_JSON and call == "json.loads"
+            own |= call in OWN_FILES.get(name, "").split()
             devnull = "os.devnull" in path.read_text().splitlines()[line - 1]
             found += [] if system or own or devnull else [f"{name}:{line} {call}"]
     assert found == []

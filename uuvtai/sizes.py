@@ -10,7 +10,7 @@ from pathlib import Path
 from uuvtai import state
 from uuvtai.config import Config
 from uuvtai.errors import SettingError, SizeError
-from uuvtai.kernels import clearance
+from uuvtai.kernels.clearance import offset_bits
 from uuvtai.kernels.grid import grid_shape
 from uuvtai.kernels.lanes import LANES
 from uuvtai.kernels.mapping import map_period_s, scans_in
@@ -101,7 +101,7 @@ def _check_kernels(config: Config) -> None:
     """SettingError for what the kernels' counters and keys cannot hold; else Taichi would say so, in the middle of compiling."""
     mapping, sensors = config.mapping, config.sensors
     try:
-        clearance.offset_bits(config.clearance, mapping)
+        offset_bits(config.clearance, mapping)
         for seconds in (mapping.free_confident_s, mapping.promote_s):
             scans_in(seconds, map_period_s(mapping, sensors.sonar, config.episode))
     except ValueError as error:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from uuvtai.errors import UserError
+from uuvtai.files import read_json
 from uuvtai.learn.checkpoint import Checkpoint
 from uuvtai.loader import ConfigError
 from uuvtai.measure.statistics import wilson_interval
@@ -53,9 +54,10 @@ def evaluations_of(checkpoint: Checkpoint, folders: Iterable[Path]) -> list[Eval
 
     Raises ConfigError for one of ``folders`` that does not hold any.
     """
-    found = [row for file in _own_results(checkpoint) for row in _rows(file, checkpoint.sha256)]
+    run = checkpoint.path.parent.parent
+    found = [row for file in _own_results(checkpoint) for row in _rows(file, run, checkpoint.sha256)]
     for folder in folders:
-        rows = _rows(folder / RESULT, checkpoint.sha256)
+        rows = _rows(folder / RESULT, folder, checkpoint.sha256)
         if not rows:
             raise ConfigError(f"--evaluation {folder}: does not evaluate this checkpoint; give the run folder that 'uuv eval RUN' printed")
         found += rows
@@ -69,14 +71,12 @@ def _own_results(checkpoint: Checkpoint) -> list[Path]:
     return sorted(file for file in (run / RESULT, *run.glob(f"*/{RESULT}")) if file.is_file())
 
 
-def _rows(file: Path, sha256: str) -> list[Evaluation]:
-    """Rows of the methods that this checkpoint drove. Raises ConfigError for a file that is no result."""
+def _rows(file: Path, folder: Path, sha256: str) -> list[Evaluation]:
+    """Rows of the methods that this checkpoint drove. Raises ConfigError for a file below ``folder`` that is no result."""
     try:
-        if file.stat().st_size > _MAX_BYTES:
-            raise ValueError(f"larger than {_MAX_BYTES >> 20} MiB")
-        result = json.loads(file.read_bytes())
+        result = read_json(file, _MAX_BYTES, folder)
         return [_row(result, m) for m in result["methods"] if m.get("checkpoint", {}).get("sha256") == sha256]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (UserError, OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ConfigError(f"{file}: is no result of uuv eval ({error!r}); give the run folder that 'uuv eval RUN' printed") from None
 
 
