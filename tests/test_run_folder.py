@@ -220,3 +220,14 @@ def test_nothing_is_written_through_a_link_that_came_later(tmp_path, name):
     with pytest.raises(RunFolderError, match="is a link"):
         folder.write(name, "new")
     assert (tmp_path / "outside" / "x.png").read_text() == "precious"
+
+
+def test_what_a_kill_left_half_written_is_swept_when_the_run_goes_on(tmp_path):
+    RunFolder(tmp_path / "run", load_config("pool"), [0]).finish("interrupted", 130)
+    left = tmp_path / "run" / "eval" / ".result.json.4711.0a1b2c3d.tmp"
+    theirs = [tmp_path / "run" / name for name in (".notes.tmp", "result.json.4711.0a1b2c3d.tmp", ".a.1.0a1b2c3d.tmp.txt")]
+    left.parent.mkdir()
+    for file in (left, *theirs):
+        file.write_text("{")
+    RunFolder.held(tmp_path / "run").release()
+    assert not left.exists() and all(file.exists() for file in theirs)

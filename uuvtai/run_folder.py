@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import re
 import secrets
 import stat
 import subprocess
@@ -22,6 +23,8 @@ from uuvtai.errors import UserError
 from uuvtai.files import FileError, open_new, open_to_append, read_json, refuse_links, refuse_links_in
 from uuvtai.loader import to_yaml
 
+_TEMPORARY = re.compile(r"\..+\.\d+\.[0-9a-f]{8}\.tmp")
+"""names that ``write_atomic`` gives"""
 _RUNS = Path("runs")
 _LOCK, _RECORD = ".lock", "run.json"
 _MAX_RECORD_BYTES = 8 << 20
@@ -116,10 +119,17 @@ class RunFolder:
         folder.hold()
         try:
             folder._guarded("read it", lambda: refuse_links_in(path))
+            folder._guarded("tidy it", folder._sweep)
         except BaseException:
             folder.release()
             raise
         return folder
+
+    def _sweep(self) -> None:
+        """Remove what a kill left half-written; whoever holds the folder is the only one that writes there."""
+        for place in self.path.rglob(".*.tmp"):
+            if _TEMPORARY.fullmatch(place.name):
+                place.unlink()
 
     def go_on(self, since: dict[str, Any]) -> None:
         """Mark a held folder's run as running again; ``since`` says from where. Raises RunFolderError for a record that is none."""
