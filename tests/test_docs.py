@@ -45,7 +45,7 @@ def test_the_site_builds_without_a_warning_and_lacks_no_page(tmp_path):
     assert {f"reference/configuration/{name}" for name in LearningConfig.model_fields} <= built
     assert {path.stem for path in (ROOT / "docs").glob("*.md")} <= built
     of_eval = (tmp_path / "site/reference/commands/eval.html").read_text()
-    assert "runs/&lt;time&gt;_&lt;preset&gt;]" in of_eval and "With --explain:" in of_eval, "help texts are shown as they are"
+    assert "[default: runs/TIME_PRESET]" in of_eval and "With --explain:" in of_eval, "help texts are shown as they are"
     assert "overflow-x: auto" in (tmp_path / "site/_static/custom.css").read_text() and "custom.css" in of_eval
     assert 'id="uuvtai.make"' in (tmp_path / "site/python.html").read_text()
 

@@ -207,7 +207,7 @@ def test_videos_of_a_run_folder_are_small(folder, logs):
 
 
 def test_the_command_takes_speed_rate_and_width_and_tells_its_progress(tmp_path, logs, capfd, monkeypatch):
-    monkeypatch.setattr("uuvtai.cli._Progress._PERIOD_S", 0.0)
+    monkeypatch.setattr("uuvtai.show.progress._PERIOD_S", 0.0)
     out = tmp_path / "talk.gif"
     with pytest.raises(SystemExit) as left:
         main(["log", "video", str(logs[0]), "--out", str(out), "--speed", "3", "--fps", "5", "--width", "400"])
