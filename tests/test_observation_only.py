@@ -72,7 +72,10 @@ def watched(small, monkeypatch):
     columns = small.config.features.model_copy(update={"n_track": 4, "teacher": True})
     monkeypatch.setattr(small.sim, "config", small.config.model_copy(update={"features": columns}))
     monkeypatch.setattr(small.sim, "observation", torch.zeros(small.N, features.observation_width(columns)))
-    return small
+    memory = small.sim.memory()
+    before = memory.read().copy()
+    yield small
+    memory.read()[:] = before  # scratch too: other tests never write that of the columns of bodies
 
 
 def driven(small, poison=None):
