@@ -481,6 +481,7 @@ KERNELS = (
         "gap > ti.static(cfg.site_gap_cells**2)",
         "gap > ti.static(4.0 * cfg.site_gap_cells**2)",
         "tests/test_voronoi.py",
+        "sites_of_neighbours",
     ),
     Mutation(
         "clearance_dynamic",
