@@ -184,6 +184,7 @@ def _kept(name: str, chosen: argparse.Namespace, document: dict[str, Any]) -> Pa
 
 def _show(name: str, document: dict[str, Any]) -> None:
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     console = Console(width=None if sys.stdout.isatty() else 150)
@@ -194,7 +195,9 @@ def _show(name: str, document: dict[str, Any]) -> None:
         peer = f"{_number(row['peer'])} {row['peer_name']}" if row["peer"] is not None else ""
         ratio = f"{row['ratio']:.3g} x" if row["ratio"] is not None else ""
         mark = {None: "", True: "met", False: "[bold red]NOT MET[/]"}[row["met"]]
-        table.add_row(row["what"], _number(row["ours"]), peer, ratio, row["unit"], _floor(row), " ".join(filter(None, (mark, row["note"]))))
+        table.add_row(
+            row["what"], _number(row["ours"]), peer, ratio, row["unit"], _floor(row), " ".join(filter(None, (mark, escape(row["note"]))))
+        )
     console.print(table)
     for row in document["rows"]:
         if columns := row["details"].get("table"):
