@@ -231,6 +231,21 @@ def test_another_observation_or_action_table_is_refused(tmp_path):
         found.check_table(TABLE, load_training("smoke", ["vehicle.max_surge_m_s=1.5"]))
 
 
+def test_a_config_key_that_is_younger_than_a_checkpoint_has_its_default(tmp_path):
+    """A new key must not make every policy that was ever trained unreadable."""
+    path = saved(tmp_path)
+
+    def older(document):
+        del document["config"]["world_model"]["error_unit"]
+        document["config_sha256"] = manifest.config_sha256(document["config"])
+
+    rewritten(path, older)
+    assert checkpoint.open_checkpoint(path).config == CONFIG
+    rewritten(path, lambda document: document["config"]["train"].update(seed=1))
+    with pytest.raises(CheckpointError, match="does not have the sha256"):
+        checkpoint.open_checkpoint(path)
+
+
 def test_a_simulator_of_another_size_is_refused(tmp_path):
     found = checkpoint.open_checkpoint(saved(tmp_path))
     other = state_of(0)

@@ -125,7 +125,7 @@ def test_missing_and_corrupt_logs_are_refused(capfd, tmp_path, command, content)
         (["log", "info", "[/x].mcap"], "[/x].mcap: cannot open"),
         (["report", "[/x]"], "[/x]: is no run folder"),
         (["eval", "--world", "a/" + 5000 * "b" + ".yaml"], "too long"),
-        (["eval", "--resume", "nowhere"], "nowhere/eval/request.json: cannot be read"),
+        (["eval", "--resume", "nowhere"], "nowhere: is no run folder"),
         (["eval", "--resume", "nowhere", "--episodes", "64"], "--episodes 64: a resumed run keeps its own"),
         (["eval", "best", "--resume", "nowhere"], "RUN ['best']: a resumed run keeps its own"),
         (["train", "smoke", "--set", "train.scenes=[[9, 9999, 1.0]]"], "do not fit"),
@@ -161,9 +161,9 @@ def test_text_from_outside_is_never_markup(tmp_path, monkeypatch, capfd, evaluat
     odd["world"] = odd["sensors"] = "[/x]"
     for method in odd["methods"]:
         method["name"] = "[/x]" + method["name"]
-    cli._print_evaluation(odd, Path("[/x]"), as_json=False)
+    cli._print_evaluation(odd, Path("[/x]"), as_json=False, wide=False)
     monkeypatch.chdir(tmp_path)
-    Path("a[/x]").mkdir()
+    Path("a[/x]").mkdir(parents=True)
     shutil.copy(folder / "logs/bt_seed3_episode0.mcap", "a[/x]/log.mcap")
     shutil.copy(loader.preset_path("vehicle", "bluerov2_li2020"), "a[/x]/odd.yaml")
     assert uuv(capfd, "log", "info", "a[/x]/log.mcap")[0] == 0

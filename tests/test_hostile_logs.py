@@ -412,7 +412,7 @@ STRANGE = {
 
 @pytest.mark.parametrize(("nodes", "weights", "says"), STRANGE.values(), ids=STRANGE)
 def test_graphs_that_take_memory_or_time_never_reach_onnx_runtime(nodes, weights, says, monkeypatch):
-    monkeypatch.setattr("uuvtai.deploy.runtime.session", lambda _graph: pytest.fail("ONNX Runtime saw it"))
+    monkeypatch.setattr("uuvtai.deploy.onnx_session.session", lambda _graph: pytest.fail("ONNX Runtime saw it"))
     graph = graph_of(nodes, weights)
     with pytest.raises(GraphError, match=says):
         of_onnx(graph, {f"pair_{name}": np.zeros(shape, bool if name == "has_last" else np.float32) for name, shape in INPUTS.items()})

@@ -30,7 +30,7 @@ class Watch:
     def note(self, text):
         self.notes.append(text)
 
-    def update(self, done, total, env_steps):
+    def update(self, done, total, env_steps, left=None):
         if self.begun[self.name] is None:
             self.begun[self.name] = done
         if self.name == self.method and done >= self.after:
@@ -84,7 +84,7 @@ def test_an_interrupted_evaluation_ends_as_an_undisturbed_one(ask, whole, tmp_pa
     assert json.loads((run / "eval/result.json").read_text()) == result
     assert (run / "eval/tree.json").read_bytes() == (whole[1] / "eval/tree.json").read_bytes()
     assert (run / ledger.FILE).read_bytes().startswith(kept), "nothing that is over is played again"
-    assert watch.begun[method] is None or watch.begun[method] > finished or finished == EPISODES
+    assert watch.begun[method] is None or watch.begun[method] >= finished
     logs = sorted((run / "logs").iterdir())
     assert [log.name for log in logs] == sorted(log.name for log in (whole[1] / "logs").iterdir()), "every log whole, no part left"
     assert all((run / "logs" / name).stat().st_mtime_ns == time for name, time in old.items()), "finished logs are kept"
@@ -164,5 +164,5 @@ def test_paths_of_the_request_are_found_from_another_folder(ask, tmp_path, monke
 
 
 def test_a_folder_of_something_else_is_refused(tmp_path):
-    with pytest.raises(UserError, match=r"eval/request\.json: cannot be read.*give the folder that an interrupted"):
+    with pytest.raises(UserError, match=r"is no run folder, it has no plain file run\.json; give the folder that 'uuv eval' printed"):
         resume(tmp_path, Watch())

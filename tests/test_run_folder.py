@@ -8,8 +8,10 @@ import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+import torch
 
 from uuvtai.errors import UserError
 from uuvtai.loader import load_config, load_resolved
@@ -165,7 +167,7 @@ def test_an_evaluation_holds_its_folder(tmp_path, monkeypatch):
     monkeypatch.setattr(compare, "RunFolder", lambda *arguments: made.append(RunFolder(*arguments)) or made[0])
     monkeypatch.setattr(compare, "_methods", lambda *_: [])
     monkeypatch.setattr(compare, "_any_tree", lambda: None)
-    monkeypatch.setattr("uuvtai.sim.Sim", lambda *_: None)
+    monkeypatch.setattr("uuvtai.sim.Sim", lambda *_: SimpleNamespace(device=torch.device("cpu")))
 
     class Watch:
         def __getattr__(self, _name):

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests import test_deploy as deployed
-from uuvtai.deploy import runtime
+from uuvtai.deploy import onnx_session
 
 ROOT = Path(__file__).parent.parent
 
@@ -60,7 +60,7 @@ def watched(work, home):
     for name in ("home", "cache", "state", "tmp"):
         (home / name).mkdir(parents=True, exist_ok=True)
     places = {"HOME": home / "home", "XDG_CACHE_HOME": home / "cache", "XDG_STATE_HOME": home / "state", "XDG_DATA_HOME": home / "state"}
-    environment = {name: value for name, value in os.environ.items() if name != runtime.VARIABLE}
+    environment = {name: value for name, value in os.environ.items() if name != onnx_session.VARIABLE}
     environment |= {name: str(place) for name, place in places.items()} | {"TMPDIR": str(home / "tmp"), "PYTHONPATH": str(ROOT)}
     code = WATCHED.replace("WORK", textwrap.indent(work, "    ").strip())
     done = subprocess.run([sys.executable, "-c", code], cwd=home, env=environment, capture_output=True, text=True, timeout=300, check=False)
@@ -96,10 +96,10 @@ def test_the_watch_sees_a_socket_and_a_file(tmp_path):
 def test_the_call_is_made_before_a_session(monkeypatch):
     onnxruntime = pytest.importorskip("onnxruntime", reason="needs the extra uuvtai[export]")
     order = []
-    monkeypatch.delenv(runtime.VARIABLE, raising=False)
-    monkeypatch.setattr(onnxruntime, "disable_telemetry_events", lambda: order.append(f"off {os.environ.get(runtime.VARIABLE)}"))
+    monkeypatch.delenv(onnx_session.VARIABLE, raising=False)
+    monkeypatch.setattr(onnxruntime, "disable_telemetry_events", lambda: order.append(f"off {os.environ.get(onnx_session.VARIABLE)}"))
     monkeypatch.setattr(onnxruntime, "InferenceSession", lambda *_arguments, **_words: order.append("session"))
-    runtime.session(b"")
+    onnx_session.session(b"")
     assert order == ["off 1", "session"]
 
 
@@ -111,7 +111,7 @@ def test_one_place_imports_onnx_runtime():
                 names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
                 names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
                 places += [str(path.relative_to(ROOT))] if any(name.split(".")[0] == "onnxruntime" for name in names) else []
-    assert places == ["uuvtai/deploy/runtime.py"]
+    assert places == ["uuvtai/deploy/onnx_session.py"]
 
 
 def test_only_versions_that_were_checked_are_installed():
@@ -125,4 +125,4 @@ def test_the_library_reads_the_variable():
     libraries = list((Path(onnxruntime.__file__).parent / "capi").glob("*onnxruntime*.so*"))
     content = b"".join(path.read_bytes() for path in libraries)
     assert content, "no library found"
-    assert b"mobile.events.data.microsoft.com" not in content or runtime.VARIABLE.encode() in content
+    assert b"mobile.events.data.microsoft.com" not in content or onnx_session.VARIABLE.encode() in content

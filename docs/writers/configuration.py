@@ -14,6 +14,7 @@ from pydantic import BaseModel
 from docs.writers.markdown import contents, table
 from uuvtai import loader
 from uuvtai.config.learning import LearningConfig
+from uuvtai.config.section import LARGEST, MOST, SMALLEST
 
 Schema = dict[str, Any]
 Model = type[BaseModel]
@@ -147,9 +148,14 @@ def _list_text(schema: Schema) -> str:
     return f"{len(parts)} of: {parts[0]}" if len(set(parts)) == 1 else f"[{', '.join(parts)}]"
 
 
+_GUARDS = (SMALLEST, LARGEST, MOST)
+"""bounds of every number, which keep arithmetic from overflowing and mean nothing to a reader"""
+
+
 def _bounds(schema: Schema) -> str:
     signs = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
-    told = [f"{sign} {schema[name]:.10g}" for name, sign in signs.items() if name in schema]
+    told = [f"{sign} {schema[name]:.10g}" for name, sign in signs.items() if name in schema and abs(schema[name]) not in _GUARDS]
+    told = ["> 0", *told] if schema.get("minimum") == SMALLEST else told
     told += [f"multiple of {schema['multipleOf']}"] if "multipleOf" in schema else []
     return f" {', '.join(told)}" if told else ""
 

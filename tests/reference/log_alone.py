@@ -210,6 +210,7 @@ class Mapper:
     def __init__(self, log):
         self.log, self.tank = log, log.scenario["tank"]
         self.m, self.sonar, self.depth = log.config["mapping"], log.config["sensors"]["sonar"], log.config["sensors"]["depth"]
+        self.tracking = log.config["tracking"]
         first = log.messages["/map/static"][0][1]
         self.cell = first["cell_size"]["x"]
         self.origin = np.array([first["pose"]["position"][axis] for axis in "xy"])
@@ -219,7 +220,7 @@ class Mapper:
         self.static, self.dynamic = np.zeros(shape), np.zeros(shape)
         self.free_scans, self.dynamic_scans = np.zeros(shape, int), np.zeros(shape, int)
         self.depth_mark = np.zeros(shape, bool)
-        self.last_mapped = None
+        self.last_mapped = self.last_tracked = None
         scan_steps = self.sonar["period_steps"] * math.ceil(self.m["period_steps"] / self.sonar["period_steps"])
         self.period = scan_steps * log.dt
         self.depth_period = max(self.period, self.depth["period_steps"] * log.dt)
@@ -237,6 +238,8 @@ class Mapper:
         for step in range(len(self.pos)):
             if step in lines:
                 self.mark_depth(lines[step])
+            if step in scans and (self.last_tracked is None or step - self.last_tracked >= self.tracking["period_steps"]):
+                self.last_tracked = step
             if step in scans and (self.last_mapped is None or step - self.last_mapped >= self.m["period_steps"]):
                 self.fold(scans[step], dopplers[step], tracked.get(step, []))
                 self.last_mapped = step
@@ -277,6 +280,9 @@ class Mapper:
         )
         beams.wall = wall_ranges(self.tank, beams.x, beams.y, beams.ux, beams.uy)
         beams.sigma = self.sonar["range_sigma_m"] + self.sonar["range_sigma_slope"] * beams.range
+        beams.spread = np.sqrt(beams.sigma**2 + self.sonar["range_jitter_m"] ** 2 + self.sonar["range_quantum_m"] ** 2 / 12)
+        if self.last_tracked == step:  # a valid reading between tracked scans is taken as it is
+            beams.through = beams.through - self.slip(beams)
         static_hit, moving_hit = self.returns(beams)
         hit = static_hit | moving_hit
         free = self.free_water(beams) & ~hit
@@ -296,6 +302,14 @@ class Mapper:
         self.free_scans = np.where(hit, 0, np.minimum(self.free_scans + free, 255))
         self.dynamic_scans = np.where(free, 0, np.minimum(self.dynamic_scans + moving_hit, 255))
         self.depth_mark = np.zeros_like(self.depth_mark)
+
+    def slip(self, b):
+        """[m/s] along every beam: the error of the own velocity by which the known walls would move; a prior keeps it small."""
+        near = wall_gap(self.tank, b.x + b.range * b.ux, b.y + b.range * b.uy) < self.tracking["wall_margin_m"] + 2 * b.spread
+        wall, sigma = b.hit & near, max(self.sonar["doppler_sigma_m_s"], 0.01)
+        u = np.stack([b.ux, b.uy], 1)
+        prior = (sigma / self.tracking["own_speed_sigma_m_s"]) ** 2 * np.eye(2)
+        return u @ np.linalg.solve(u[wall].T @ u[wall] + prior, u[wall].T @ b.through[wall])
 
     def free_water(self, b):
         silent = min(self.m["free_range_m"], self.sonar["max_range_m"])

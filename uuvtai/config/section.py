@@ -10,20 +10,20 @@ from typing import TYPE_CHECKING, Annotated
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-_LARGEST, _SMALLEST = 1e12, 1e-12
+LARGEST, SMALLEST = 1e12, 1e-12
 """no quantity here is larger, nor smaller where it must not be 0: quotients and squares of them stay numbers"""
-_MOST = 2**31 - 1
+MOST = 2**31 - 1
 """kernels count in 32 bits"""
 
-Real = Annotated[float, Field(ge=-_LARGEST, le=_LARGEST)]
-Positive = Annotated[float, Field(ge=_SMALLEST, le=_LARGEST)]
-NonNegative = Annotated[float, Field(ge=0, le=_LARGEST)]
+Real = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+Positive = Annotated[float, Field(ge=SMALLEST, le=LARGEST)]
+NonNegative = Annotated[float, Field(ge=0, le=LARGEST)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Spread = Annotated[float, Field(ge=0, le=0.9)]
 """half width of a factor around 1 that must stay positive"""
-Count = Annotated[int, Field(ge=0, le=_MOST)]
-PositiveCount = Annotated[int, Field(ge=1, le=_MOST)]
-Packets = Annotated[int, Field(ge=16, le=_MOST, multiple_of=16)]
+Count = Annotated[int, Field(ge=0, le=MOST)]
+PositiveCount = Annotated[int, Field(ge=1, le=MOST)]
+Packets = Annotated[int, Field(ge=16, le=MOST, multiple_of=16)]
 """a count in whole packets of lanes"""
 Interval = tuple[Real, Real]
 

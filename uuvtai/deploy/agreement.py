@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from uuvtai.deploy import run_policy, runtime
+from uuvtai.deploy import onnx_session, run_policy
 from uuvtai.deploy.golden import TOLERANCE, Arrays, inputs_of
 from uuvtai.deploy.graph import OUTPUTS, OneDecision
 from uuvtai.deploy.graph_check import GraphError, refuse_strange
@@ -61,7 +61,7 @@ def of_onnx(graph: bytes, golden: Arrays) -> Agreement:
         raise GraphError("its golden pairs are no rows of inputs")
     refuse_strange(graph, {name: array.shape for name, array in inputs.items()}, run_policy.CALLS)
     try:
-        session = runtime.session(graph)
+        session = onnx_session.session(graph)
         names = [output.name for output in session.get_outputs()]
         outputs = [np.asarray(output) for output in session.run(names, inputs)]
     except Exception as error:  # its own errors share no base class beyond this

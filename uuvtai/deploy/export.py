@@ -13,7 +13,7 @@ from typing import Any
 
 import safetensors.torch
 
-from uuvtai.deploy import run_policy, runtime
+from uuvtai.deploy import onnx_session, run_policy
 from uuvtai.deploy.agreement import Agreement, of_numpy, of_onnx, of_torch
 from uuvtai.deploy.card import model_card
 from uuvtai.deploy.evaluations import evaluations_of
@@ -103,11 +103,11 @@ def _replayed(folder: Path, spec: dict[str, Any], note: Note) -> list[Agreement]
         found = [of_numpy(run_policy.Policy(spec, run_policy.read_safetensors(folder / WEIGHTS)), golden)]
         if ONNX not in spec["files"]:
             return found
-        if runtime.is_installed():
+        if onnx_session.is_installed():
             return [*found, of_onnx(run_policy.content_of(folder / ONNX), golden)]
     except (LookupError, ValueError, TypeError, AttributeError, ArithmeticError) as error:
         raise PolicyError(f"{folder}: its golden pairs do not fit its policy ({error!r}); export it again") from None
-    note(f"{ONNX} was not replayed: {runtime.NAME} is not installed; pip install '{EXTRA}'")
+    note(f"{ONNX} was not replayed: {onnx_session.NAME} is not installed; pip install '{EXTRA}'")
     return found
 
 

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor, nn
 
-from uuvtai.deploy.runtime import without_telemetry
+from uuvtai.deploy.onnx_session import without_telemetry
 from uuvtai.learn.pilot import Pilot
 from uuvtai.learn.policy import NUM_ACTIONS
 from uuvtai.learn.world_model import N_FEATURES

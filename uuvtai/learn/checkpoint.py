@@ -152,7 +152,7 @@ def save(
             score=score,
             metrics=finite(metrics or {}),
             config=config.model_dump(mode="json"),
-            config_sha256=config_sha256(config),
+            config_sha256=config_sha256(config.model_dump(mode="json")),
             observation_table=table_rows(table),
             action=action_rows(config),
             files={path.name: _entry(path) for path in sorted(partial.iterdir())},
@@ -250,8 +250,9 @@ def open_checkpoint(path: Path) -> Checkpoint:
     content = manifest_content(path)
     with refused(path / MANIFEST):
         manifest = parsed(content)
+        # keys that are younger than this config get their defaults, which mean what was done before there was a choice
         config = LearningConfig.model_validate_json(json.dumps(manifest.config), strict=True)
-        if config_sha256(config) != manifest.config_sha256:
+        if config_sha256(manifest.config) != manifest.config_sha256:
             raise PackingError("its config does not have the sha256 that it states")
     for name in manifest.files:
         if name not in (MODEL, *OPTIONAL):

@@ -162,9 +162,9 @@ def action_rows(config: Any) -> list[dict[str, Any]]:
     return [{"name": name, "limit": limit, "unit": "rad/s" if name == "yaw_rate" else "m/s"} for name, limit in limits]
 
 
-def config_sha256(config: Any) -> str:
-    """Of the config as canonical JSON."""
-    return hashlib.sha256(json.dumps(config.model_dump(mode="json"), sort_keys=True).encode()).hexdigest()
+def config_sha256(config: dict[str, Any]) -> str:
+    """Of a config's values as canonical JSON."""
+    return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()
 
 
 def difference(own: list[dict[str, Any]], theirs: list[dict[str, Any]]) -> str:

@@ -100,8 +100,9 @@ def _found_again(request: Request, cwd: Path) -> Request:
     """Paths that were typed in another folder, seen from this one; names of what is shipped stay names."""
 
     def seen(kind: str, name: str) -> str:
-        is_path = name not in preset_names(kind) and (kind == "policy" or name.endswith((".xml", ".yaml", ".yml")))
-        return str(cwd / name) if is_path and not Path(name).exists() else name
+        file = name.removesuffix("+truth")
+        is_path = file not in preset_names(kind) and (kind == "policy" or file.endswith((".xml", ".yaml", ".yml")))
+        return str(cwd / name) if is_path and not Path(file).exists() else name
 
     controllers = [seen("tree", name) for name in request.controllers]
     return replace(request, controllers=controllers, policies=tuple(seen("policy", name) for name in request.policies))
