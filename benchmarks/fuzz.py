@@ -226,7 +226,7 @@ class _Worker:
 _COMMANDS: dict[str, list[list[str]]] = {
     "mcap": [["log", name, "FILE", *rest] for name, *rest in (["info"], ["export", "--out", "out"], ["repair"], ["picture"], ["convert"])],
     "xml": [["tree", "--controller", "FILE"]],
-    "yaml": [["eval", "--world", "FILE", "--episodes", "0"], ["presets", "show", "FILE"]],
+    "yaml": [["eval", "--world", "FILE", "--controller", "nobody"], ["presets", "show", "FILE"]],
     "json": [["export", "--check", "."], ["report", "."], ["train", "--resume", "."]],
     "safetensors": [["export", "--check", "."]],
 }
