@@ -7,6 +7,7 @@ import subprocess
 import sys
 import textwrap
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -30,7 +31,7 @@ from uuvtai.logs.picture import picture
 from uuvtai.logs.reader import info, read_messages
 from uuvtai.logs.recording import load_recording
 from uuvtai.logs.repair import repair
-from uuvtai.logs.video import video
+from uuvtai.logs.video import frame_times, video
 
 N_STEP = 60
 BOUND_S, BOUND_MIB = 30, 1024
@@ -499,3 +500,13 @@ def test_only_an_exported_policy_is_replaced(folder, tmp_path, monkeypatch):
         deployed.deploy.export(found, "mine", folder, (), lambda _text: None, force=True)
     assert (folder / "thesis.txt").read_text() == "precious"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "run"]
+
+
+@pytest.mark.parametrize(("poses", "is_watched"), [(2, False), (100, False), (180_000, True)])
+def test_a_small_file_cannot_order_an_hour_of_frames(poses, is_watched):
+    recording = SimpleNamespace(path="x.mcap", duration_s=3600.0, pose=SimpleNamespace(times=np.linspace(0.0, 3600.0, poses)))
+    if is_watched:
+        assert len(frame_times(recording, 15.0, 1.0)) == 3600 * 15 + 16
+    else:
+        with pytest.raises(LogError, match=f"{poses} poses in 3,600 s are no episode to watch; raise --speed"):
+            frame_times(recording, 15.0, 1.0)

@@ -49,6 +49,8 @@ WIDTHS, FPS, SPEEDS = (320, 3840), (1.0, 60.0), (0.05, 100.0)
 SMALL: dict[str, Any] = {"width_px": 960, "speed": 2.0}
 """what a run folder holds, so that several fit a page: some 40 kB per second of the episode"""
 _MOST_FRAMES = 100_000
+_FEW_FRAMES, _FRAMES_PER_POSE = 1000, 10
+"""a small file must not cost minutes: beyond so many frames a log has to hold something new for them (ours hold 50 poses a second)"""
 
 Progress = Callable[[int, int], None]
 """Called with (frames done, frames in all)."""
@@ -106,6 +108,11 @@ def frame_times(recording: Recording, fps: float, speed: float) -> np.ndarray:
     n_frames = recording.duration_s * fps / speed
     if n_frames > _MOST_FRAMES:
         raise LogError(f"{recording.path}: {n_frames:,.0f} frames, more than {_MOST_FRAMES:,}; raise --speed or lower --fps")
+    poses = len(recording.pose.times)
+    if n_frames > _FEW_FRAMES and n_frames > _FRAMES_PER_POSE * poses:
+        raise LogError(
+            f"{recording.path}: {poses} poses in {recording.duration_s:,.0f} s are no episode to watch; raise --speed or lower --fps"
+        )
     times = np.arange(0.0, recording.duration_s, speed / fps)
     return np.concatenate([times, np.full(1 + round(_HOLD_S * fps), recording.duration_s)])
 
