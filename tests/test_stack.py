@@ -7,8 +7,7 @@ import pytest
 from uuvtai.loader import STACK_SECTIONS, ConfigError, load_config, tree_of_stack, with_stack
 from uuvtai.measure.compare import Request, compare
 from uuvtai.measure.methods import trees_of
-
-SMALL = {"episode.horizon_steps": 60, "world.n_static": 3, "world.n_dynamic": 2}
+from uuvtai.sim import Sim
 
 
 class Quiet:
@@ -50,12 +49,22 @@ def test_a_stack_touches_nothing_that_makes_an_episode():
 
 
 @pytest.fixture(scope="module")
-def compared(tmp_path_factory):
+def compared(small, tmp_path_factory):
+    """The session's simulator drives the request's own row; the stack's is made for it."""
     request = Request(
-        config=load_config("pool", overrides=SMALL), world="pool", sensors="paper", controllers=["bt", "paper"], seeds=[5], episodes=3,
+        config=small.config, world="pool", sensors="paper", controllers=["bt", "paper"], seeds=[5], episodes=3, num_envs=small.N,
         record=1, device="cpu", run_dir=tmp_path_factory.mktemp("runs") / "run",
     )  # fmt: skip
-    return compare(request, Quiet())
+
+    def made(config, num_envs, tree, device):
+        assert num_envs == small.N
+        return small.sim if config == small.config else Sim(config, num_envs, tree, device)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("uuvtai.sim.Sim", made)
+        found = compare(request, Quiet())
+    small.sim.use_tree(small.trees["bt"])
+    return found
 
 
 def test_bt_and_paper_are_two_rows_of_one_table(compared):

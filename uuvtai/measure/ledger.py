@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from uuvtai.files import read_bytes, refuse_links
+from uuvtai.files import open_to_append, read_bytes, refuse_links, truncate
 from uuvtai.measure.evaluate import EpisodeResult, Job
 from uuvtai.run_folder import RunFolderError
 
@@ -74,11 +74,9 @@ class Ledger:
         refuse_links(folder, self._path)
         self._path.parent.mkdir(parents=True, exist_ok=True)
         self._found: dict[str, dict[Job, Finished]] = {}
-        kept = self._read(folder) if self._path.exists() else 0
-        handle = os.open(self._path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0), 0o666)
-        self._file = os.fdopen(handle, "r+b")
-        self._file.truncate(kept)
-        self._file.seek(kept)
+        if self._path.exists():
+            truncate(self._path, self._read(folder), folder)
+        self._file = open_to_append(self._path, folder)
 
     def finished(self, method: str) -> dict[Job, Finished]:
         """A method's episodes that are over."""
