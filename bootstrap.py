@@ -47,6 +47,8 @@ def test(arguments: list[str]) -> int:
     install(".[dev]")
     _install_js()
     python = str(BIN / "python")
+    if not arguments:  # torch's threads of two test processes on two cores wait for each other more than they work
+        os.environ.setdefault("OMP_NUM_THREADS", "1")
     warm = None if arguments else subprocess.Popen([python, "-m", "tests.warm"], cwd=ROOT)
     checks = [
         [str(BIN / "ruff"), "check", "."],
