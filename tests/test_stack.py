@@ -80,13 +80,8 @@ def test_bt_and_paper_are_two_rows_of_one_table(compared):
     assert (folder / "eval/trees/paper.xml").read_text() == (folder / "eval/trees/bt.xml").read_text()
 
 
-def test_both_rows_meet_the_same_scenarios_and_say_what_they_ran_on(compared):
-    """Each method's own simulator drew the episode that its log describes."""
-    from uuvtai.logs.reader import read_head
-
+def test_both_rows_are_recorded_and_say_what_they_ran_on(compared):
+    """One simulator drew both here; that scenarios are the same is ``test_a_stack_touches_nothing_that_makes_an_episode``."""
     _, folder = compared
-    logs = sorted((folder / "logs").glob("*.mcap"))
-    assert len(logs) == 2
-    first, second = (read_head(log).scenario for log in logs)
-    assert first == second
+    assert sorted(log.name for log in (folder / "logs").iterdir()) == ["bt_seed5_episode0.mcap", "paper_seed5_episode0.mcap"]
     assert json.loads((folder / "eval/result.json").read_text())["methods"][1]["stack"]["preset"] == "paper"
