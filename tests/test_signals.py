@@ -151,6 +151,18 @@ def test_a_signal_at_the_very_end_does_not_change_the_exit_code(tmp_path):
     assert (process.returncode, err) == (3, "")
 
 
+@pytest.mark.parametrize("number", BOTH)
+def test_nor_one_while_python_tidies_up_its_modules(tmp_path, number):
+    """The interpreter gives the signals back to the system before that."""
+    program = "import sys, time\nfrom uuvtai import signals\nsignals.install(); signals.end_at_second(); signals.finish(0)\n"
+    program += "class Slow:\n    def __del__(self, sleep=time.sleep):\n        print('now', flush=True); sleep(1)\nslow = Slow()"
+    process = started(tmp_path, program=program)
+    assert process.stdout.readline() == "now\n"
+    process.send_signal(number)
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (0, "")
+
+
 def test_nobody_is_told_by_a_library(tmp_path):
     """Importing the package installs nothing: that is the command line's affair."""
     program = "import signal; before = signal.getsignal(2), signal.getsignal(15)\nimport uuvtai, uuvtai.cli, uuvtai.signals\n"

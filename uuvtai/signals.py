@@ -8,6 +8,7 @@ The second signal of a kind is the system's own affair: it ends the process at o
 
 from __future__ import annotations
 
+import atexit
 import os
 import signal
 import sys
@@ -49,6 +50,8 @@ def install() -> None:
     for number in STOPPING:
         if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, _hear)
+    if not _installed:  # what is registered first runs last
+        atexit.register(_rest)
     _installed[:] = [True]
     sys.unraisablehook = _unraisable
 
@@ -162,6 +165,12 @@ def _unraisable(unraisable: Any) -> None:
         return
     if not _received:
         sys.__unraisablehook__(unraisable)
+
+
+def _rest() -> None:
+    """Python is about to put the system's own handlers back: in what little is left a signal would change the exit code, and only that."""
+    for number in STOPPING:
+        signal.signal(number, signal.SIG_IGN)
 
 
 def _say(text: str) -> None:
