@@ -90,7 +90,8 @@ def install(what: str) -> None:
         print("making .venv", file=sys.stderr)
         subprocess.run([_python(), "-m", "venv", str(VENV)], check=True)
     print("installing packages (first run only)", file=sys.stderr)
-    subprocess.run([str(BIN / "python"), "-m", "pip", "install", "--quiet", "--editable", what], cwd=ROOT, check=True)
+    pip = [str(BIN / "python"), "-m", "pip", "install", "--quiet", "--no-compile"]  # what is imported is compiled then; the rest never
+    subprocess.run([*pip, "--editable", what], cwd=ROOT, check=True)
     stamp.write_text(project)
 
 

@@ -2,6 +2,7 @@
 
 import signal
 
+import numpy as np
 import pytest
 import torch
 
@@ -26,6 +27,11 @@ def taichi_runtime(request):
         _built.append(SmallSim())
 
 
+def set_step(clock, step):
+    """Every env's step number. ``fill`` would compile a kernel for every value."""
+    clock.step.from_numpy(np.full(clock.step.shape, step, dtype=np.int32))
+
+
 _built = []
 
 
@@ -35,6 +41,7 @@ class SmallSim:
     N = 8
     OPTIONS = ("--num-envs", "8", "--set", "world.dynamic_capacity=9", "--device", "cpu")
     """of commands in processes of their own that are to find these kernels compiled (``tests/warm.py`` compiles them beforehand)"""
+    TRAIN = ("train", "smoke", *OPTIONS, "--set", "episode.horizon_steps=400", "--set", "distill.batch=32", "--set", "world_model.batch=32")
 
     def __init__(self):
         from uuvtai.loader import load_config

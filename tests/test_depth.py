@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from tests.conftest import set_step
 from tests.reference import scenes
 from tests.reference.depth import camera_position, camera_rays, z_depths
 from uuvtai.config import DepthConfig, TankConfig
@@ -165,7 +166,7 @@ def test_rate_and_labels(rig):
     rig.start(scene)
     seen = []
     for step in range(12):
-        rig.clock.step.fill(step)
+        set_step(rig.clock, step)
         scene["pos"][:, 0] = 13.0 - 0.1 * step
         scenes.load(scene, rig.vehicle, rig.world)
         rig.ego.pos_w.from_numpy(np.full((N_ENV, 3), step, np.float32))

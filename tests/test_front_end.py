@@ -118,3 +118,28 @@ def test_a_taichi_without_these_names_is_left_alone():
         "\nassert not any(hasattr(m, 'get_traceback') for m in (impl, snode))"
     )
     subprocess.run([sys.executable, "-c", program], check=True)
+
+
+def test_a_tracer_does_not_see_the_front_end_and_goes_on_afterwards():
+    """Coverage and debuggers follow every line of Python; Taichi's run to millions."""
+
+    @ti.kernel
+    def doubled(x: ti.i32) -> ti.i32:
+        return 2 * x
+
+    seen = []
+
+    def trace(frame, _event, _argument):
+        seen.append(frame.f_code.co_filename)
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        found = doubled(4)
+        assert sys.gettrace() is trace
+        inspect.unwrap(doubled)
+    finally:
+        sys.settrace(before)
+    assert found == 8
+    assert any(name.endswith("inspect.py") for name in seen), "it goes on"
+    assert not [name for name in seen if "taichi/lang/ast/" in name]

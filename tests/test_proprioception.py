@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from tests.conftest import set_step
 from tests.reference.proprioception import dead_reckoned, roll_pitch_yaw, specific_force, zeroed_depth
 from tests.reference.scenes import quaternions
 from uuvtai.config import DvlConfig, EpisodeConfig, ImuConfig, PressureConfig, SensorsConfig, VehicleConfig
@@ -48,7 +49,7 @@ class Rig:
         proprioception.reset_proprioception(self.ego, self.memory, self.vehicle, self.episode, self.clock, sensors)
 
     def sense(self, sensors, step, names=READINGS):
-        self.clock.step.fill(step)
+        set_step(self.clock, step)
         proprioception.sense_proprioception(
             self.ego, self.memory, self.vehicle, self.episode, self.clock, sensors, BODY, RULES
         )  # fmt: skip

@@ -172,7 +172,7 @@ def test_nobody_is_told_by_a_library(tmp_path):
 
 
 def test_sigterm_ends_a_training_as_ctrl_c_does(tmp_path):
-    process = started(tmp_path, "train", "smoke", "--iterations", "5000", "--device", "cpu", "--run-dir", "run")
+    process = started(tmp_path, *SmallSim.TRAIN, "--iterations", "5000", "--run-dir", "run")
     metrics = tmp_path / "run/metrics.jsonl"
     deadline = time.monotonic() + 400
     while process.poll() is None and not (metrics.exists() and metrics.stat().st_size) and time.monotonic() < deadline:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import taichi as ti
 
+from tests.conftest import set_step
 from tests.reference import scenes
 from tests.reference.sonar import WALL, beam_headings, doppler_by_differences, sonar_scan
 from uuvtai.config import EpisodeConfig, SonarConfig, TankConfig
@@ -319,7 +320,7 @@ def test_harsh_preset_shows_every_error_at_its_rate(rig):
     rig.start(scene)
     pings = []
     for step in range(204):
-        rig.clock.step.fill(step)
+        set_step(rig.clock, step)
         rig.cast(HARSH, names=())
         if rig.scan.fresh[0] == 1:
             pings.append((rig.scan.hit.to_numpy(), rig.scan.range_m.to_numpy(), rig.scan.doppler_m_s.to_numpy()))
@@ -352,7 +353,7 @@ def test_bubble_clouds_come_last_and_hide_what_is_behind(rig):
     rig.start(scene)
     covered, runs, lives = [], [], np.zeros((N_ENV, N_RAY), int)
     for step in range(0, 1000, 5):
-        rig.clock.step.fill(step)
+        set_step(rig.clock, step)
         out = rig.cast(config, names=("range_m",))
         nearer = out["range_m"] < clean["range_m"] - 1e-3
         covered.append(nearer.mean())
@@ -379,7 +380,7 @@ def test_rate_latency_and_what_a_scan_is_labelled_with(rig):
     rig.start(scene)
     fresh = {}
     for step in range(12):
-        rig.clock.step.fill(step)
+        set_step(rig.clock, step)
         scene["pos"][:, 0] = 10.0 - 0.1 * step
         scenes.load(scene, rig.vehicle, rig.world)
         rig.ego.pos_w.from_numpy(np.full((N_ENV, 3), step, np.float32))
@@ -422,7 +423,7 @@ def test_envs_do_not_touch_each_other_and_a_reset_forgets_everything(rig, batche
         rig.start(scene)
         rig.episode.key.from_numpy(keys)
         for step in range(8):
-            rig.clock.step.fill(step)
+            set_step(rig.clock, step)
             out = rig.cast(HARSH)
         return out
 

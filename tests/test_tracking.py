@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import taichi as ti
 
+from tests.conftest import set_step
 from tests.reference import small_sonar
 from tests.reference import tracking as oracle
 from uuvtai.config import ElevationConfig, EpisodeConfig, ForecastConfig, SonarConfig, TankConfig, TrackingConfig
@@ -76,7 +77,7 @@ class Lab:
         counts = {"fresh": 1, "ping_step": step, "ping_vel_valid": valid}
         for name, value in (("hit", hit), *((name, np.full(N_ENV, count)) for name, count in counts.items())):
             getattr(self.scan, name).from_numpy(np.asarray(value, np.int32))
-        self.clock.step.fill(step + late)
+        set_step(self.clock, step + late)
         self.track()
 
     def track(self):

@@ -241,9 +241,7 @@ def test_an_evaluation_in_between_leaves_no_trace(small):
     assert all(torch.equal(tensor.view(-1).view(torch.uint8), other[name].view(-1).view(torch.uint8)) for name, tensor in tensors.items())
 
 
-RUN = (
-    "train", "smoke", *SmallSim.OPTIONS, "--set", "episode.horizon_steps=400", "--set", "distill.batch=32", "--set", "world_model.batch=32",
-)  # fmt: skip
+RUN = SmallSim.TRAIN
 
 
 UUV = (sys.executable, "-m", "uuvtai")

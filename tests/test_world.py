@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
+from tests.conftest import set_step
 from tests.reference import world as reference
 from uuvtai import scenario, state
 from uuvtai.config import EpisodeConfig, WorldConfig
@@ -70,7 +71,7 @@ class Drawn:
         """Arrays by name with the obstacles where they are at a step."""
         if not keep_awake:
             episode.wake(self.clock)
-        self.clock.step.fill(step)
+        set_step(self.clock, step)
         world.move_obstacles(self.world, self.path, self.clock, EpisodeConfig())
         out = {f"path_{name}": field.to_numpy() for name, field in vars(self.path).items()}
         for struct in (self.world, self.mission):
