@@ -11,9 +11,9 @@ from tests.map_bits import put_layers
 from uuvtai import state
 from uuvtai.bounds import load_bounds
 from uuvtai.config import ClearanceConfig
-from uuvtai.kernels import clearance
-from uuvtai.kernels.grid import outside_cells
-from uuvtai.kernels.lanes import LANES
+from uuvtai.kernels.core.grid import outside_cells
+from uuvtai.kernels.core.lanes import LANES
+from uuvtai.kernels.planning import clearance
 from uuvtai.loader import load_config
 from uuvtai.runtime import start_taichi
 

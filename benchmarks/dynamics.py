@@ -13,7 +13,7 @@ import torch
 from benchmarks.common import Job, Row, seconds_per_call
 from benchmarks.peers.vehicle_arrays import Vehicles
 from uuvtai.config import Config
-from uuvtai.kernels import actuation, dynamics
+from uuvtai.kernels.vehicle import actuation, dynamics
 from uuvtai.plant import Plant
 from uuvtai.runtime import start_taichi
 

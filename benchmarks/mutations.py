@@ -285,7 +285,7 @@ STATISTICS = (
     ),
 )
 
-_REFEREE, _REWARD = "uuvtai/kernels/episode.py", "uuvtai/kernels/reward.py"
+_REFEREE, _REWARD = "uuvtai/kernels/task/episode.py", "uuvtai/kernels/task/reward.py"
 
 KERNELS = (
     Mutation(
@@ -298,7 +298,7 @@ KERNELS = (
     ),
     Mutation(
         "no_coriolis",
-        "uuvtai/kernels/dynamics.py",
+        "uuvtai/kernels/vehicle/dynamics.py",
         "tau_v -= body.mass * w.cross(v) + w.cross(momentum)",
         "tau_v -= w.cross(momentum)",
         "tests/test_dynamics.py",
@@ -306,7 +306,7 @@ KERNELS = (
     ),
     Mutation(
         "munk_ground",
-        "uuvtai/kernels/dynamics.py",
+        "uuvtai/kernels/vehicle/dynamics.py",
         "+ v_r.cross(momentum)\n",
         "+ v.cross(body.added_v * v)\n",
         "tests/test_dynamics.py",
@@ -314,7 +314,7 @@ KERNELS = (
     ),
     Mutation(
         "delay_off_by_one",
-        "uuvtai/kernels/actuation.py",
+        "uuvtai/kernels/vehicle/actuation.py",
         "due = (clock.step[env] - params.delay_steps[env]) % n_slot",
         "due = (clock.step[env] - ti.max(params.delay_steps[env] - 1, 0)) % n_slot",
         "tests/test_disturbance.py",
@@ -365,7 +365,7 @@ KERNELS = (
     Mutation("effort_without_heave", _REWARD, "sway * sway + heave * heave", "sway * sway", "tests/test_reward.py", "every_term"),
     Mutation(
         "leaving_ends_nothing",
-        "uuvtai/kernels/outcome.py",
+        "uuvtai/outcomes.py",
         "outcome <= OUT_OF_TANK",
         "outcome < OUT_OF_TANK",
         "tests/test_reward.py",
@@ -373,7 +373,7 @@ KERNELS = (
     ),
     Mutation(
         "doppler_sign",
-        "uuvtai/kernels/sonar.py",
+        "uuvtai/kernels/sensors/sonar.py",
         "doppler_noisy(speed - own, key",
         "doppler_noisy(own - speed, key",
         "tests/test_sonar.py",
@@ -381,7 +381,7 @@ KERNELS = (
     ),
     Mutation(
         "obs_own_track_stale",
-        "uuvtai/kernels/sonar.py",
+        "uuvtai/kernels/sensors/sonar.py",
         "scan.ping_vel_b[env] = memory.vel_b[env, slot]",
         "scan.ping_vel_b[env] = memory.vel_b[env, 0]",
         "tests/test_sonar.py",
@@ -389,7 +389,7 @@ KERNELS = (
     ),
     Mutation(
         "jitter_shortens",
-        "uuvtai/kernels/sonar_error.py",
+        "uuvtai/kernels/sensors/sonar_error.py",
         "out -= sonar.range_jitter_m * ti.log(",
         "out += sonar.range_jitter_m * ti.log(",
         "tests/test_sonar.py",
@@ -397,7 +397,7 @@ KERNELS = (
     ),
     Mutation(
         "image_upside_down",
-        "uuvtai/kernels/depth.py",
+        "uuvtai/kernels/sensors/depth.py",
         "up = (0.5 * depth.rows - 0.5 - row)",
         "up = (row + 0.5 - 0.5 * depth.rows)",
         "tests/test_depth.py",
@@ -405,7 +405,7 @@ KERNELS = (
     ),
     Mutation(
         "pressure_in_map",
-        "uuvtai/kernels/proprioception.py",
+        "uuvtai/kernels/sensors/proprioception.py",
         "pos[2] = -ego.depth_m[env]",
         "pos[2] = vehicle.pos_w[env][2]",
         "tests/test_proprioception.py",
@@ -413,7 +413,7 @@ KERNELS = (
     ),
     Mutation(
         "decay_unscaled",
-        "uuvtai/kernels/mapping.py",
+        "uuvtai/kernels/perception/mapping.py",
         "return 1.0 - (1.0 - decay) ** (period_s * RATED_HZ)",
         "return decay",
         "tests/test_mapping.py",
@@ -421,7 +421,7 @@ KERNELS = (
     ),
     Mutation(
         "no_mask",
-        "uuvtai/kernels/mapping.py",
+        "uuvtai/kernels/perception/mapping.py",
         "inside = ~mask.outside_bits[row, word]",
         "inside = ~ti.cast(0, ti.u64)",
         "tests/test_mapping.py",
@@ -429,7 +429,7 @@ KERNELS = (
     ),
     Mutation(
         "camera_maps_alone",
-        "uuvtai/kernels/mapping.py",
+        "uuvtai/kernels/perception/mapping.py",
         "(static_hit == 1) | (static_old > 0.0)",
         "(static_hit == 1) | (static_old >= 0.0)",
         "tests/test_mapping.py",
@@ -437,7 +437,7 @@ KERNELS = (
     ),
     Mutation(
         "kalman_no_turn_cross",
-        "uuvtai/kernels/kalman.py",
+        "uuvtai/kernels/core/kalman.py",
         "row[j] + linked[i] * turn[j] + turn[i] * linked[j] + link[4] * turn[i] * turn[j]",
         "row[j] + link[4] * turn[i] * turn[j]",
         "tests/test_tracking.py",
@@ -445,7 +445,7 @@ KERNELS = (
     ),
     Mutation(
         "dearest_pair_first",
-        "uuvtai/kernels/association.py",
+        "uuvtai/kernels/perception/association.py",
         "tracks.pick_cost[env, asking] < tracks.pick_cost[env, holder]",
         "tracks.pick_cost[env, asking] > tracks.pick_cost[env, holder]",
         "tests/test_tracking.py",
@@ -453,7 +453,7 @@ KERNELS = (
     ),
     Mutation(
         "hidden_bodies_shrink",
-        "uuvtai/kernels/track_update.py",
+        "uuvtai/kernels/perception/track_update.py",
         "if clusters.hidden[env, c] == 0 or seen > known:",
         "if clusters.hidden[env, c] == 0 or seen < known:",
         "tests/test_tracking.py",
@@ -461,7 +461,7 @@ KERNELS = (
     ),
     Mutation(
         "forecast_late",
-        "uuvtai/kernels/forecast.py",
+        "uuvtai/kernels/perception/forecast.py",
         "late = (clock.step[env] - tracks.scan_step[env]) * rules.control_dt_s",
         "late = 0.0",
         "tests/test_forecast.py",
@@ -469,7 +469,7 @@ KERNELS = (
     ),
     Mutation(
         "transform_stops_early",
-        "uuvtai/kernels/clearance.py",
+        "uuvtai/kernels/planning/clearance.py",
         "if 2 * offset * offset << bits > worst:",
         "if 4 * offset * offset << bits > worst:",
         "tests/test_clearance.py",
@@ -477,7 +477,7 @@ KERNELS = (
     ),
     Mutation(
         "skeleton_identity",
-        "uuvtai/kernels/medial.py",
+        "uuvtai/kernels/planning/medial.py",
         "gap > ti.static(cfg.site_gap_cells**2)",
         "gap > ti.static(4.0 * cfg.site_gap_cells**2)",
         "tests/test_voronoi.py",
@@ -485,7 +485,7 @@ KERNELS = (
     ),
     Mutation(
         "clearance_dynamic",
-        "uuvtai/kernels/route.py",
+        "uuvtai/kernels/planning/route.py",
         "moving = ti.static(cfg.risk_dynamic) * grid_map.dynamic_occ",
         "moving = ti.static(cfg.risk_dynamic) * grid_map.static_occ",
         "tests/test_route.py",
@@ -493,7 +493,7 @@ KERNELS = (
     ),
     Mutation(
         "trigger_ttc_range",
-        "uuvtai/kernels/triggers.py",
+        "uuvtai/kernels/planning/triggers.py",
         "soon = -scan.doppler_m_s[env, beam]",
         "soon = scan.doppler_m_s[env, beam]",
         "tests/test_route.py",
@@ -501,7 +501,7 @@ KERNELS = (
     ),
     Mutation(
         "fc_trigger_speed",
-        "uuvtai/kernels/triggers.py",
+        "uuvtai/kernels/planning/triggers.py",
         "limit = forecast.radius_m[env, track, k] + ti.static(cfg.forecast_clearance_m)",
         "limit = forecast.radius_m[env, track, 0] + ti.static(cfg.forecast_clearance_m)",
         "tests/test_route.py",
@@ -509,7 +509,7 @@ KERNELS = (
     ),
     Mutation(
         "heave_unforecast",
-        "uuvtai/kernels/rollout.py",
+        "uuvtai/kernels/teacher/rollout.py",
         "z = ti.math.clamp(cz * gain + (pos[2] + vel[2] * settle), low, high)",
         "z = ti.math.clamp(cz * gain + pos[2], low, high)",
         "tests/test_teacher.py",
@@ -517,7 +517,7 @@ KERNELS = (
     ),
     Mutation(
         "last_command_forgotten",
-        "uuvtai/kernels/evasion.py",
+        "uuvtai/kernels/teacher/evasion.py",
         "out = teacher.last_vel_w[env]\n",
         "out = 0.5 * teacher.last_vel_w[env]\n",
         "tests/test_teacher.py",
@@ -525,7 +525,7 @@ KERNELS = (
     ),
     Mutation(
         "inverter_agrees",
-        "uuvtai/kernels/tree_tick.py",
+        "uuvtai/kernels/teacher/tree_tick.py",
         "status = SUCCESS + FAILURE - answer",
         "status = answer",
         "tests/test_tree.py",

@@ -11,8 +11,8 @@ from tests import planning_maps as maps
 from tests.reference.voronoi import clearance_of
 from uuvtai import rrt, state
 from uuvtai.config import Config
-from uuvtai.kernels import route, voronoi
-from uuvtai.kernels.plan_codes import FAIL_NONE, N_PLANNER, N_REASON, N_TRIGGER
+from uuvtai.kernels.planning import route, voronoi
+from uuvtai.plan_codes import FAIL_NONE, N_PLANNER, N_REASON, N_TRIGGER
 from uuvtai.runtime import start_taichi
 
 THREADS = 1

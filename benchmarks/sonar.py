@@ -10,7 +10,7 @@ from tests.reference import scenes
 from tests.reference.sonar import beam_headings
 from uuvtai import state
 from uuvtai.config import EpisodeConfig, SonarConfig, TankConfig
-from uuvtai.kernels import sonar
+from uuvtai.kernels.sensors import sonar
 from uuvtai.runtime import start_taichi
 
 THREADS = 1

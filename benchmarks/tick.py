@@ -11,7 +11,7 @@ from benchmarks.common import Job, Row, seconds_per_call
 from benchmarks.peers.tick_py_trees import PyTree
 from uuvtai import state
 from uuvtai.config import Config
-from uuvtai.kernels import tree_tick
+from uuvtai.kernels.teacher.teacher import tree_tick
 from uuvtai.runtime import start_taichi
 from uuvtai.sizes import array_sizes
 from uuvtai.tree import load_tree, read_tree

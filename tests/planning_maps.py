@@ -3,7 +3,7 @@
 import numpy as np
 
 from uuvtai.config import TankConfig
-from uuvtai.kernels.grid import grid_origin, grid_shape, outside_cells
+from uuvtai.kernels.core.grid import grid_origin, grid_shape, outside_cells
 
 CELL_M = 0.1
 TANK = TankConfig()

@@ -56,7 +56,7 @@ def stage():
 
 def clean():
     """Empty water, nothing seen, every env awake at step 0, no route; start and goal on the centre line."""
-    from uuvtai.kernels.route import reset_route
+    from uuvtai.kernels.planning.route import reset_route
 
     s = stage()
     s.clock.awake.fill(1)
@@ -91,7 +91,7 @@ def put_ends(starts, goals, z=-0.8):
 
 def plan(envs=range(N_ENV), config=CONFIG):
     """Run the Voronoi planner for these envs."""
-    from uuvtai.kernels.voronoi import plan_routes
+    from uuvtai.kernels.planning.voronoi import plan_routes
 
     s, queue = stage(), np.zeros(N_ENV, np.int32)
     queue[: len(envs)] = list(envs)

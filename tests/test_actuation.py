@@ -7,8 +7,8 @@ import taichi as ti
 from tests.reference import actuation as oracle
 from uuvtai.allocation import allocation_matrices, controllable_axes
 from uuvtai.config import Config, Thruster, VehicleConfig
-from uuvtai.kernels.rotor import rpm_of_thrust, thrust_limits, thrust_of_rpm
-from uuvtai.kernels.signature import Const
+from uuvtai.kernels.core.signature import Const
+from uuvtai.kernels.vehicle.rotor import rpm_of_thrust, thrust_limits, thrust_of_rpm
 from uuvtai.loader import load_config
 from uuvtai.measure.simulate import roll_pitch_yaw
 from uuvtai.plant import Plant

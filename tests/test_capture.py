@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from uuvtai.env import VectorEnv
-from uuvtai.kernels.outcome import OUTCOMES
+from uuvtai.outcomes import OUTCOMES
 
 N, SEED = 8, 11
 BEFORE, AFTER = 37, 200

@@ -9,9 +9,9 @@ from tests.map_bits import put_layers
 from tests.reference.clearance import clearance_of, sites_of
 from uuvtai.bounds import load_bounds
 from uuvtai.config import ClearanceConfig, MappingConfig, TankConfig, VoronoiConfig
-from uuvtai.kernels import clearance
-from uuvtai.kernels.grid import grid_shape, outside_cells
-from uuvtai.kernels.lanes import LANES
+from uuvtai.kernels.core.grid import grid_shape, outside_cells
+from uuvtai.kernels.core.lanes import LANES
+from uuvtai.kernels.planning import clearance
 from uuvtai.state import PACKET, ClearanceMemory, ClearanceState, ClockState, GridMask, MapState, allocate
 
 N_ENV = 8

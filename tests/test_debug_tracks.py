@@ -9,8 +9,8 @@ import taichi as ti
 from tests.test_architecture import PACKAGE, tree_of
 from uuvtai import state
 from uuvtai.config import Config, TrackingConfig, WorldConfig
-from uuvtai.kernels import debug_tracks
-from uuvtai.kernels.geometry import NONE, SPHERE
+from uuvtai.kernels.core.geometry import NONE, SPHERE
+from uuvtai.kernels.perception import debug_tracks
 from uuvtai.loader import load_config
 from uuvtai.sizes import array_sizes
 

@@ -7,7 +7,7 @@ from tests.conftest import set_step
 from tests.reference import scenes
 from tests.reference.depth import camera_position, camera_rays, z_depths
 from uuvtai.config import DepthConfig, TankConfig
-from uuvtai.kernels import depth
+from uuvtai.kernels.sensors import depth
 from uuvtai.state import ClockState, DepthImage, EpisodeState, Proprioception, VehicleState, WorldState, allocate
 
 N_ENV, N_BODY, N_BATCH = 125, 14, 8

@@ -6,10 +6,10 @@ import taichi as ti
 
 from tests.reference import elevation as oracle
 from uuvtai.config import ElevationConfig, EpisodeConfig, SonarConfig, TankConfig, TrackingConfig
-from uuvtai.kernels import elevation
-from uuvtai.kernels.lanes import LANES
-from uuvtai.kernels.signature import Const, In, Out
-from uuvtai.kernels.track_slots import prune_tracks
+from uuvtai.kernels.core.lanes import LANES
+from uuvtai.kernels.core.signature import Const, In, Out
+from uuvtai.kernels.perception import elevation
+from uuvtai.kernels.perception.track_slots import prune_tracks
 from uuvtai.loader import ConfigError, load_config
 from uuvtai.state import ClockState, ForecastState, Proprioception, SonarScan, TrackState, allocate
 

@@ -10,8 +10,8 @@ import torch
 
 import uuvtai
 from uuvtai.env import VectorEnv, observation_sha256
-from uuvtai.kernels.outcome import OUTCOMES
 from uuvtai.loader import ConfigError
+from uuvtai.outcomes import OUTCOMES
 
 N = 8
 SEED = 3

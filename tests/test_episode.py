@@ -7,10 +7,9 @@ import torch
 from tests.reference import noise as noise_reference
 from uuvtai import state
 from uuvtai.config import EpisodeConfig, TankConfig, VehicleConfig
-from uuvtai.kernels import episode
-from uuvtai.kernels.geometry import BOX, CYLINDER, FAR_M, SPHERE
-from uuvtai.kernels.outcome import COLLISION, OUT_OF_TANK, OUTCOMES, SUCCESS, TIMEOUT, TTC
-from uuvtai.outcomes import COLLIDED, ENDINGS, FORESEEABLE
+from uuvtai.kernels.core.geometry import BOX, CYLINDER, FAR_M, SPHERE
+from uuvtai.kernels.task import episode
+from uuvtai.outcomes import COLLIDED, COLLISION, ENDINGS, FORESEEABLE, OUT_OF_TANK, OUTCOMES, SUCCESS, TIMEOUT, TTC
 
 N, N_BODY = 8, 3
 TOL = 1e-5

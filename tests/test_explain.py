@@ -9,7 +9,7 @@ import pytest
 from tests.reference import hull as hull_reference
 from tests.reference import sonar as sonar_reference
 from uuvtai.config import Config, TankConfig
-from uuvtai.kernels.geometry import BOX, CYLINDER, NONE, SPHERE
+from uuvtai.kernels.core.geometry import BOX, CYLINDER, NONE, SPHERE
 from uuvtai.measure import hindsight
 from uuvtai.measure.causes import CAUSES, REMARKS, Explanation, Killer, explain, timeout_label
 from uuvtai.measure.escape import candidates, escapes, motion, rolled_out

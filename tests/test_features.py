@@ -7,7 +7,8 @@ import torch
 from tests.reference import features as oracle
 from uuvtai import tree_codes as codes
 from uuvtai.config import EpisodeConfig, FeaturesConfig, ForecastConfig, SonarConfig, TankConfig, TrackingConfig
-from uuvtai.kernels.features import (
+from uuvtai.kernels.core.geometry import FAR_M
+from uuvtai.kernels.planning.features import (
     COLUMNS,
     columns,
     observation_width,
@@ -17,7 +18,6 @@ from uuvtai.kernels.features import (
     write_bodies,
     write_observation,
 )
-from uuvtai.kernels.geometry import FAR_M
 from uuvtai.state import (
     ClockState,
     FeatureState,

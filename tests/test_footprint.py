@@ -5,8 +5,8 @@ import pytest
 import taichi as ti
 
 from tests.reference import world as reference
-from uuvtai.kernels import footprint
-from uuvtai.kernels.geometry import BOX, CYLINDER
+from uuvtai.kernels.core import footprint
+from uuvtai.kernels.core.geometry import BOX, CYLINDER
 
 N = 512
 TOL_M = 2e-3

@@ -6,8 +6,8 @@ import pytest
 from tests.reference import forecast as oracle
 from tests.reference import habits as habit_oracle
 from uuvtai.config import EpisodeConfig, ForecastConfig, TankConfig, TrackingConfig
-from uuvtai.kernels import forecast
-from uuvtai.kernels.lanes import LANES
+from uuvtai.kernels.core.lanes import LANES
+from uuvtai.kernels.perception import forecast
 from uuvtai.state import ClockState, ClusterState, DepthImage, ForecastState, HabitState, TrackState, allocate
 
 N_ENV, N_TRACK = 6, 5

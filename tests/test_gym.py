@@ -15,7 +15,7 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from uuvtai.env import VectorEnv
 from uuvtai.gym import ENV_ID, UuvEnv, UuvVectorEnv, single, vector
 from uuvtai.gym.spaces import bounds, observation_space
-from uuvtai.kernels.features import placed_columns
+from uuvtai.kernels.planning.features import placed_columns
 from uuvtai.loader import ConfigError
 
 N = 8

@@ -6,9 +6,9 @@ import taichi as ti
 
 from tests.reference import habits as oracle
 from uuvtai.config import EpisodeConfig, ForecastConfig, TankConfig
-from uuvtai.kernels import forecast, habits
-from uuvtai.kernels.lanes import LANES
-from uuvtai.kernels.signature import In
+from uuvtai.kernels.core.lanes import LANES
+from uuvtai.kernels.core.signature import In
+from uuvtai.kernels.perception import forecast, habits
 from uuvtai.state import ClockState, ClusterState, ForecastState, HabitState, TrackState, allocate
 
 N_ENV, N_TRACK, PERIOD = 6, 5, 3

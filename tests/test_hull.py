@@ -6,9 +6,9 @@ import taichi as ti
 
 from tests.reference import hull as reference
 from uuvtai.config import TankConfig, VehicleConfig
-from uuvtai.kernels import hull
-from uuvtai.kernels.geometry import BOX, CYLINDER, SPHERE
-from uuvtai.kernels.signature import Const
+from uuvtai.kernels.core import hull
+from uuvtai.kernels.core.geometry import BOX, CYLINDER, SPHERE
+from uuvtai.kernels.core.signature import Const
 
 N = 1024
 DISTANCE_TOL_M = 1e-3

@@ -24,7 +24,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 
 from tests.reference import logs as episode
 from uuvtai.files import FileError
-from uuvtai.kernels import geometry
+from uuvtai.kernels.core import geometry
 from uuvtai.logs.container import CHUNK_MAX, CHUNK_MIN, McapFile
 from uuvtai.logs.errors import LogError
 from uuvtai.logs.export import depth_image, export, file_name, grid_values

@@ -8,8 +8,8 @@ from tests.reference import look as oracle
 from tests.reference.depth import camera_position, camera_rays, z_depths
 from tests.reference.scenes import BOX, CYLINDER, SPHERE, quaternions
 from uuvtai.config import DepthConfig, ElevationConfig, EpisodeConfig, TankConfig
-from uuvtai.kernels import look
-from uuvtai.kernels.lanes import LANES
+from uuvtai.kernels.core.lanes import LANES
+from uuvtai.kernels.perception import look
 from uuvtai.state import ClockState, DepthImage, TrackState, allocate
 
 N_ENV, N_TRACK = 12, 3

@@ -7,8 +7,8 @@ import pytest
 import taichi as ti
 
 from tests.reference import noise as reference
-from uuvtai.kernels import noise
-from uuvtai.kernels.lanes import LANES
+from uuvtai.kernels.core import noise
+from uuvtai.kernels.core.lanes import LANES
 
 N = 1 << 16
 BINS = 256

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from uuvtai.kernels import features, proprioception
+from uuvtai.kernels.planning import features
+from uuvtai.kernels.sensors import proprioception
 from uuvtai.loader import load_config
 from uuvtai.sim import SimState
 
@@ -157,7 +158,7 @@ def test_the_poison_reaches_whoever_reads_the_truth(watched):
 
 def test_the_true_pose_in_place_of_the_estimate_is_found(watched, monkeypatch):
     """With exact sensors the estimate equals the truth: nothing but the poison tells them apart."""
-    from uuvtai.kernels import elevation
+    from uuvtai.kernels.perception import elevation
 
     honest, vehicle = elevation.bound_heights, watched.sim.s.vehicle
     monkeypatch.setattr("uuvtai.sim.elevation.bound_heights", lambda forecast, tracks, ego, *rest: honest(forecast, tracks, vehicle, *rest))

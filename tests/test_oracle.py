@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from uuvtai.config import Config, DisturbanceConfig, FixedObstacle, Waypoint, WorldConfig
-from uuvtai.kernels.geometry import BOX, CYLINDER, SPHERE
+from uuvtai.kernels.core.geometry import BOX, CYLINDER, SPHERE
 from uuvtai.measure import hindsight
 from uuvtai.privileged.blind_ride import ride_blindly
 from uuvtai.privileged.detection import required_detection, time_aside_s

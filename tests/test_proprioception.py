@@ -7,7 +7,7 @@ from tests.conftest import set_step
 from tests.reference.proprioception import dead_reckoned, roll_pitch_yaw, specific_force, zeroed_depth
 from tests.reference.scenes import quaternions
 from uuvtai.config import DvlConfig, EpisodeConfig, ImuConfig, PressureConfig, SensorsConfig, VehicleConfig
-from uuvtai.kernels import proprioception
+from uuvtai.kernels.sensors import proprioception
 from uuvtai.loader import load_config
 from uuvtai.state import ClockState, EpisodeState, Proprioception, ProprioceptionMemory, VehicleState, allocate
 

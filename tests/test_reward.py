@@ -9,8 +9,8 @@ import torch
 from tests.reference import reward as reference
 from uuvtai import state
 from uuvtai.config import EpisodeConfig, RewardConfig, VehicleConfig
-from uuvtai.kernels import reward
-from uuvtai.kernels.episode import OUTCOMES
+from uuvtai.kernels.task import reward
+from uuvtai.kernels.task.episode import OUTCOMES
 
 N = 64
 TOL = 2e-5

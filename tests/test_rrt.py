@@ -9,8 +9,8 @@ from tests import planning_maps as maps
 from tests.planning_stage import CONFIG, N_ENV, clean, plan, put_ends, put_maps, way_of
 from tests.reference.voronoi import clearance_of, line_points
 from tests.test_voronoi import STRICT, wall
+from uuvtai import plan_codes as codes
 from uuvtai import rrt
-from uuvtai.kernels import plan_codes as codes
 
 pytest.importorskip("ompl")
 

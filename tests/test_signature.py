@@ -5,7 +5,7 @@ import pytest
 import taichi as ti
 import torch
 
-from uuvtai.kernels.signature import Const, In, quick_launch
+from uuvtai.kernels.core.signature import Const, In, quick_launch
 from uuvtai.runtime import start_taichi
 
 N = 4

@@ -8,10 +8,10 @@ from tests.conftest import set_step
 from tests.reference import scenes
 from tests.reference.sonar import WALL, beam_headings, doppler_by_differences, sonar_scan
 from uuvtai.config import EpisodeConfig, SonarConfig, TankConfig
-from uuvtai.kernels import sonar, sonar_error
-from uuvtai.kernels.geometry import FAR_M
-from uuvtai.kernels.lanes import LANES, f16x
-from uuvtai.kernels.signature import Const
+from uuvtai.kernels.core.geometry import FAR_M
+from uuvtai.kernels.core.lanes import LANES, f16x
+from uuvtai.kernels.core.signature import Const
+from uuvtai.kernels.sensors import sonar, sonar_error
 from uuvtai.loader import load_config
 from uuvtai.state import ClockState, EpisodeState, Proprioception, SonarMemory, SonarScan, VehicleState, WorldState, allocate
 

@@ -9,7 +9,8 @@ from tests.reference.scenes import BOX, CYLINDER, SPHERE, load, quaternions
 from tests.reference.tracking import predicted
 from uuvtai import state
 from uuvtai.config import DepthConfig, ElevationConfig, EpisodeConfig, SonarConfig, SpottingConfig, TankConfig, TrackingConfig
-from uuvtai.kernels import depth, spotting
+from uuvtai.kernels.perception import spotting
+from uuvtai.kernels.sensors import depth
 
 N_ENV, N_TRACK, N_BODY = 12, 3, 3
 TANK, RULES = TankConfig(x_m=(0.0, 20.0), y_m=(0.0, 6.0), z_m=(-1.6, 0.0)), EpisodeConfig(control_dt_s=0.02)

@@ -12,9 +12,9 @@ import torch
 from tests.reference import teacher as oracle
 from uuvtai import state
 from uuvtai.config import Config, TeacherConfig
-from uuvtai.kernels import evasion, teacher, threats
-from uuvtai.kernels.geometry import FAR_M
-from uuvtai.kernels.grid import grid_origin, grid_shape
+from uuvtai.kernels.core.geometry import FAR_M
+from uuvtai.kernels.core.grid import grid_origin, grid_shape
+from uuvtai.kernels.teacher.teacher import evasion, teacher, threats
 from uuvtai.tree import load_tree, parse_tree, read_tree
 
 N_ENV, N_TRACK, N_RAY = 6, 4, 64

@@ -10,7 +10,8 @@ from tests.conftest import set_step
 from tests.reference import small_sonar
 from tests.reference import tracking as oracle
 from uuvtai.config import ElevationConfig, EpisodeConfig, ForecastConfig, SonarConfig, TankConfig, TrackingConfig
-from uuvtai.kernels import kalman, tracking
+from uuvtai.kernels.core import kalman
+from uuvtai.kernels.perception import tracking
 from uuvtai.state import ClockState, ClusterState, HabitState, SonarScan, TrackState, allocate
 
 N_ENV = 16

@@ -12,7 +12,7 @@ from benchmarks.peers.tick_py_trees import PyTree
 from uuvtai import state
 from uuvtai import tree_codes as codes
 from uuvtai.config import TeacherConfig
-from uuvtai.kernels.tree_tick import tick_with_given_statuses
+from uuvtai.kernels.teacher.tree_tick import tick_with_given_statuses
 from uuvtai.loader import ConfigError, preset_names, preset_path
 from uuvtai.show.screen import Screen
 from uuvtai.show.trees import show_tree

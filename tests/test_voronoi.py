@@ -10,8 +10,10 @@ import taichi as ti
 from tests import planning_maps as maps
 from tests.planning_stage import CONFIG, N_ENV, N_PLAN, clean, plan, put_ends, put_maps, stage, way_of
 from tests.reference import voronoi as oracle
-from uuvtai.kernels import heap, medial, plan_codes
-from uuvtai.kernels.signature import Out
+from uuvtai import plan_codes
+from uuvtai.kernels.core import heap
+from uuvtai.kernels.core.signature import Out
+from uuvtai.kernels.planning import medial
 from uuvtai.state import VoronoiState
 
 N_MAP = 300

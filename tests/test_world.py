@@ -13,8 +13,9 @@ from tests.conftest import set_step
 from tests.reference import world as reference
 from uuvtai import scenario, state
 from uuvtai.config import EpisodeConfig, WorldConfig
-from uuvtai.kernels import episode, world
-from uuvtai.kernels.geometry import BOX, CYLINDER, NONE, SPHERE
+from uuvtai.kernels.core.geometry import BOX, CYLINDER, NONE, SPHERE
+from uuvtai.kernels.task import episode
+from uuvtai.kernels.world.world import world
 from uuvtai.shipped import PRESET_DIR
 
 N = 192

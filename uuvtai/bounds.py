@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from uuvtai.capture import Put, put_by_kernel
-from uuvtai.kernels.bits import WORD
+from uuvtai.kernels.core.bits import WORD
 from uuvtai.state import GridMask
 
 

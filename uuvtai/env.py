@@ -18,9 +18,9 @@ import torch
 
 from uuvtai.capture import check_arrays, check_setting
 from uuvtai.config import Config
-from uuvtai.kernels.features import placed_columns
-from uuvtai.kernels.outcome import OUTCOMES
-from uuvtai.kernels.reward import TERMS
+from uuvtai.kernels.planning.features import placed_columns
+from uuvtai.kernels.task.reward import TERMS
+from uuvtai.outcomes import OUTCOMES
 from uuvtai.sim import Sim
 
 NUM_ACTIONS = 4

@@ -1,6 +1,10 @@
-"""How an episode can end, by name: the same words in logs, results and tables. Their codes are in ``kernels/outcome.py``."""
+"""How an episode can stand and end: codes for kernels, names for logs, results and tables."""
 
-ENDINGS = ("success", "collision", "ttc", "out_of_tank", "timeout")
+OUTCOMES = ("running", "success", "collision", "ttc", "out_of_tank", "timeout")
+"""names by code"""
+RUNNING, SUCCESS, COLLISION, TTC, OUT_OF_TANK, TIMEOUT = range(len(OUTCOMES))
+
+ENDINGS = OUTCOMES[1:]
 """exclusive; every finished episode has one"""
 COLLIDED = ("collision", "ttc", "out_of_tank")
 """what counts as a collision in every rate: contact, a stop for the time to collision, and leaving the tank"""

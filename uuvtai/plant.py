@@ -11,7 +11,7 @@ from uuvtai import state
 from uuvtai.allocation import allocation_matrices
 from uuvtai.config import Config
 from uuvtai.errors import SettingError
-from uuvtai.kernels import actuation, dynamics
+from uuvtai.kernels.vehicle import actuation, dynamics
 from uuvtai.runtime import Runtime
 
 _T = TypeVar("_T")

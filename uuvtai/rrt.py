@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uuvtai.config import Config
-from uuvtai.kernels.grid import grid_origin, grid_shape
+from uuvtai.kernels.core.grid import grid_origin, grid_shape
 
 if TYPE_CHECKING:
     from uuvtai.state import ClearanceState, ClockState, ForecastState, GridMask, MapState, MissionState, Proprioception, RouteState
@@ -205,8 +205,8 @@ class RouteFallback:
         seed_of: Callable[[int], int],
     ) -> int:
         """Plan for ``route.failed``; returns how many there were. ``seed_of(env)`` gives the env's number of (seed, episode, step)."""
-        from uuvtai.kernels.route import keep_route, load_route
-        from uuvtai.kernels.voronoi import overlay_clearance
+        from uuvtai.kernels.planning.route import keep_route, load_route
+        from uuvtai.kernels.planning.voronoi import overlay_clearance
 
         c = self.config
         n_failed = int(route.n_failed[None])

@@ -13,9 +13,9 @@ import taichi as ti
 from uuvtai.capture import Put, put_by_kernel
 from uuvtai.config import FixedObstacle, WorldConfig
 from uuvtai.errors import SettingError, UserError
-from uuvtai.kernels.geometry import BOX, CYLINDER, NONE, SPHERE
-from uuvtai.kernels.layout import COARSE_M, FAULT_ENDPOINTS, FAULT_JOINED, FAULT_STATIC
-from uuvtai.kernels.paths import FAULT_MOVING
+from uuvtai.kernels.core.geometry import BOX, CYLINDER, NONE, SPHERE
+from uuvtai.kernels.world.layout import COARSE_M, FAULT_ENDPOINTS, FAULT_JOINED, FAULT_STATIC
+from uuvtai.kernels.world.paths import FAULT_MOVING
 from uuvtai.state import FixedTable, MissionState, PathState, SceneState, WorldState
 
 N_CORNER = 5

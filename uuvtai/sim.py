@@ -21,34 +21,15 @@ from uuvtai.allocation import allocation_matrices
 from uuvtai.bounds import load_bounds
 from uuvtai.capture import Memory
 from uuvtai.config import Config
-from uuvtai.kernels import (
-    actuation,
-    clearance,
-    debug_stamp,
-    debug_tracks,
-    depth,
-    dynamics,
-    elevation,
-    episode,
-    evasion,
-    features,
-    forecast,
-    look,
-    mapping,
-    proprioception,
-    reward,
-    route,
-    sonar,
-    spotting,
-    teacher,
-    threats,
-    tracking,
-    triggers,
-    voronoi,
-    world,
-)
-from uuvtai.kernels.grid import outside_cells
-from uuvtai.kernels.recording import copy_rows, tell_address
+from uuvtai.kernels.core.grid import outside_cells
+from uuvtai.kernels.core.rows import copy_rows, tell_address
+from uuvtai.kernels.perception import debug_stamp, debug_tracks, elevation, forecast, look, mapping, spotting, tracking
+from uuvtai.kernels.planning import clearance, features, route, triggers, voronoi
+from uuvtai.kernels.sensors import depth, proprioception, sonar
+from uuvtai.kernels.task import episode, reward
+from uuvtai.kernels.teacher.teacher import evasion, teacher, threats
+from uuvtai.kernels.vehicle import actuation, dynamics
+from uuvtai.kernels.world.world import world
 from uuvtai.rrt import RouteFallback
 from uuvtai.runtime import start_taichi
 from uuvtai.scenario import Scene, check_scenarios, load_fixed, set_scenes

@@ -10,12 +10,12 @@ from pathlib import Path
 from uuvtai import state
 from uuvtai.config import Config
 from uuvtai.errors import SettingError, SizeError
-from uuvtai.kernels.clearance import offset_bits
-from uuvtai.kernels.grid import grid_shape
-from uuvtai.kernels.lanes import LANES
-from uuvtai.kernels.mapping import map_period_s, scans_in
-from uuvtai.kernels.plan_codes import N_PLANNER, N_REASON, N_TRIGGER
-from uuvtai.kernels.reward import TERMS
+from uuvtai.kernels.core.grid import grid_shape
+from uuvtai.kernels.core.lanes import LANES
+from uuvtai.kernels.perception.mapping import map_period_s, scans_in
+from uuvtai.kernels.planning.clearance import offset_bits
+from uuvtai.kernels.task.reward import TERMS
+from uuvtai.plan_codes import N_PLANNER, N_REASON, N_TRIGGER
 from uuvtai.scenario import scenario_sizes
 
 _MAX_ENVS = 1 << 20

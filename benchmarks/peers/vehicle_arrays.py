@@ -11,8 +11,8 @@ import numpy as np
 
 from uuvtai.allocation import allocation_matrices
 from uuvtai.config import Config
-from uuvtai.kernels.actuation import axis_loops
-from uuvtai.kernels.rotor import KGF, edge_rpm, thrust_at, thrust_limits
+from uuvtai.kernels.vehicle.actuation import axis_loops
+from uuvtai.kernels.vehicle.rotor import KGF, edge_rpm, thrust_at, thrust_limits
 
 
 class Vehicles:

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from uuvtai.kernels.grid import grid_origin, outside_cells
+from uuvtai.kernels.core.grid import grid_origin, outside_cells
 
 DOUBT = 3e-4
 """[cells, or the threshold's own unit] float32 positions of tens of metres are good to 1e-5 m = 1e-4 cells; with a margin."""

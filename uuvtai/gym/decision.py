@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 
 from uuvtai.env import VectorEnv
-from uuvtai.kernels.outcome import SUCCESS
+from uuvtai.outcomes import SUCCESS
 
 
 class Transition(NamedTuple):

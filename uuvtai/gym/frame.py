@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from uuvtai.kernels.grid import grid_origin
+from uuvtai.kernels.core.grid import grid_origin
 from uuvtai.logs.canvas import ROUTE, method_inks
 from uuvtai.logs.painting import map_canvas, paint_layers, paint_truth, paint_walls, paint_water
 from uuvtai.logs.recording import Layer

@@ -10,11 +10,11 @@ import numpy as np
 import torch
 
 from uuvtai.config import Config
-from uuvtai.kernels.plan_codes import PLANNERS, REASONS, TRIGGERS
 from uuvtai.measure.compare import ORACLE
 from uuvtai.measure.evaluate import EpisodeResult, Job, Progress, summary
 from uuvtai.measure.methods import TRUTH
 from uuvtai.measure.statistics import rate, wilson_interval
+from uuvtai.plan_codes import PLANNERS, REASONS, TRIGGERS
 from uuvtai.privileged.blind_ride import ride_blindly
 from uuvtai.privileged.detection import required_detection
 from uuvtai.privileged.oracle import earliest_arrival

@@ -10,12 +10,11 @@ import numpy as np
 import torch
 
 from uuvtai.config import Config
-from uuvtai.kernels.outcome import OUTCOMES, RUNNING
-from uuvtai.kernels.plan_codes import PLANNERS, REASONS, TRIGGERS
 from uuvtai.measure.paired import paired
 from uuvtai.measure.statistics import bootstrap_interval, mean, rate, time_to_success_s, wilson_interval
 from uuvtai.measure.stopwatch import StepClock, env_steps_left
-from uuvtai.outcomes import COLLIDED, ENDINGS
+from uuvtai.outcomes import COLLIDED, ENDINGS, OUTCOMES, RUNNING
+from uuvtai.plan_codes import PLANNERS, REASONS, TRIGGERS
 from uuvtai.scenario import Scene
 from uuvtai.sim import Sim
 from uuvtai.tree import node_use

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from uuvtai.config import Config
-from uuvtai.kernels.geometry import BOX, NONE
+from uuvtai.kernels.core.geometry import BOX, NONE
 from uuvtai.measure import hindsight
 from uuvtai.measure.escape import escapes
 from uuvtai.measure.history import Array, Bodies, Diary, History

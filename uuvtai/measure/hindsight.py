@@ -1,7 +1,7 @@
 """What the truth looked like, in NumPy: distances of the hull to every body, what the sonar could reach, what its beams met.
 
-For explanations after the fact only; nothing that drives a vehicle may import it. Same geometry as ``kernels/hull.py`` and
-``kernels/raycast.py``. Arrays of one episode have the samples first, shape (n, ...); bodies are on the next axis.
+For explanations after the fact only; nothing that drives a vehicle may import it. Same geometry as ``kernels/core/hull.py`` and
+``kernels/sensors/raycast.py``. Arrays of one episode have the samples first, shape (n, ...); bodies are on the next axis.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from uuvtai.config import SonarConfig, TankConfig
-from uuvtai.kernels.geometry import BOX, CYLINDER, NONE, SPHERE
+from uuvtai.kernels.core.geometry import BOX, CYLINDER, NONE, SPHERE
 
 Array = np.ndarray
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uuvtai.kernels.geometry import NONE
+from uuvtai.kernels.core.geometry import NONE
 
 Array = np.ndarray
 

@@ -135,7 +135,7 @@ def _replans(batch: Batch) -> int:
 
 def _networks(config: LearningConfig) -> dict[str, Callable[[], Any]]:
     """One call of each network for one vehicle on the CPU, of the sizes that ``config`` gives; their weights do not matter."""
-    from uuvtai.kernels.features import observation_width
+    from uuvtai.kernels.planning.features import observation_width
     from uuvtai.learn.policy import Policy
     from uuvtai.learn.world_model import N_FEATURES, WorldModel
 

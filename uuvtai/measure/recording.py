@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 
 from uuvtai.config import Config
-from uuvtai.kernels.grid import grid_origin
-from uuvtai.kernels.outcome import OUTCOMES, RUNNING
-from uuvtai.kernels.plan_codes import PLANNERS, REASONS, TRIGGERS
-from uuvtai.kernels.reward import TERMS
+from uuvtai.kernels.core.grid import grid_origin
+from uuvtai.kernels.task.reward import TERMS
 from uuvtai.learn.pilot import Pilot
 from uuvtai.loader import to_yaml
 from uuvtai.logs.mcap_log import Due, McapEpisodeLog
 from uuvtai.logs.scenario import scenario_document
 from uuvtai.measure.depth_line import depth_line
 from uuvtai.measure.evaluate import EpisodeResult, Job
+from uuvtai.outcomes import OUTCOMES, RUNNING
+from uuvtai.plan_codes import PLANNERS, REASONS, TRIGGERS
 from uuvtai.run_folder import git_sha
 from uuvtai.scenario import describe_scenario
 from uuvtai.sim import Sim

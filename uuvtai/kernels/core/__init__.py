@@ -1,0 +1,1 @@
+"""Floor: what kernels of several rooms share. Nothing here knows a stage."""

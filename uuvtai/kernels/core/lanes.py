@@ -1,0 +1,72 @@
+"""Vector code from Taichi 1.7.4, which never turns a loop over rows of fields into vectors by itself. Two ways (measured):
+
+1. Sixteen-lane packets. Expressions of fixed vectors become vector code. Fill lanes with ``ti.static`` loops; never rebind a lane vector
+   to its own name inside a loop (``b = ti.sqrt(b)`` can silently keep the old lanes): use a new name. Good for few quantities and long
+   loops.
+2. Columns. Copy what some rows need into local matrices (a row per quantity, a column per lane), then loop over the columns with a plain
+   ``for lane in range(lanes)`` whose body is scalar code on ``column(...)`` and touches nothing but local variables: LLVM turns that loop
+   into vectors, branches included. One load of a field in the loop, or a loop inside it, and it stays scalar. Good for much work per row.
+
+Test every packet kernel against a scalar reference.
+"""
+
+from typing import Any
+
+import taichi as ti
+
+from uuvtai.kernels.core.signature import Const, In, Out
+from uuvtai.state import ClockState
+
+LANES = 16
+"""Width of one packet: one AVX-512 register of float32."""
+
+f16x = ti.types.vector(LANES, ti.f32)
+i16x = ti.types.vector(LANES, ti.i32)
+u16x = ti.types.vector(LANES, ti.u32)
+
+
+_COLUMNS = 8
+"""Columns on a CPU: LLVM prefers vectors of 256 bits even where there are longer ones, and every element costs compile time."""
+
+
+def n_column() -> int:
+    """Rows that one loop item takes together; one on a GPU, whose threads are lanes already. Plain Python."""
+    return 1 if ti.cfg.arch == ti.cuda else _COLUMNS  # pyright: ignore[reportOptionalMemberAccess]
+
+
+@ti.func
+def ramp_lanes(first):
+    """(first, first + 1, ..., first + 15)."""
+    out = f16x(0.0)
+    for i in ti.static(range(LANES)):
+        out[i] = first + float(i)
+    return out
+
+
+@ti.func
+def column(matrix: In[Any], lane):
+    """Vector of one lane of a local matrix."""
+    return ti.Vector([matrix[row, lane] for row in range(matrix.n)])
+
+
+@ti.func
+def put_column(matrix: Out[Any], lane, values):
+    """Write one lane of a local matrix."""
+    for row in ti.static(range(matrix.n)):
+        matrix[row, lane] = values[row]
+
+
+@ti.func
+def n_awake(first, lanes: Const[int], clock: In[ClockState]):
+    """How many of the rows from ``first`` on are processed in this pass; the last packet may be short."""
+    count = 0
+    for env in range(first, ti.min(first + lanes, ti.static(clock.awake.shape[0]))):
+        count += clock.awake[env]
+    return count
+
+
+@ti.func
+def is_awake(env, clock: In[ClockState]):
+    """Whether a row exists and is processed in this pass."""
+    n = ti.static(clock.awake.shape[0])
+    return env < n and clock.awake[ti.min(env, n - 1)] == 1

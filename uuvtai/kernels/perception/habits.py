@@ -1,0 +1,246 @@
+"""Habits of moving bodies, learnt within the episode: places where one turned, from which course to which. Sees tracks only.
+
+A body on a line turns back at the same two ends, one on a loop turns at the same corners; who reaches a remembered turn on its course will
+turn there again. The memory belongs to the env, not to a track: a body that was lost and found again, or one never seen to turn while it
+was tracked, is known by where it goes. Circles need no memory, their turn rate is in the filter.
+
+A turn is what lies between two straight legs of one track. Their ends p0, p1 [m], unit courses d0, d1 and the way L = speed x time between
+give the corner p0 + a d0 = p1 - b d1 by least squares along d0 - d1 under a + b = L: the speed is kept through a turn, which is what places
+a reversal, where both legs lie on one line.
+"""
+
+import math
+
+import taichi as ti
+
+from uuvtai.config import EpisodeConfig, ForecastConfig, TankConfig, TrackingConfig
+from uuvtai.kernels.core.geometry import FAR_M
+from uuvtai.kernels.core.lanes import LANES, f16x
+from uuvtai.kernels.core.signature import Const, In, Out
+from uuvtai.state import HabitState, TrackState
+
+_STRAIGHT_SIGMA = 0.4
+"""[rad/s] a body is on a straight leg where its turn rate is known to this and less than its standard deviation."""
+
+_SETTLED = 0.05
+"""... and where its velocity's variance is below this share of its square."""
+
+_TURNED_COS = 0.9
+"""Cosine of the change of course that makes a turn: 26 deg."""
+
+_ALIKE_COS = 0.94
+"""Cosine within which two courses are the same: 20 deg."""
+
+_LONGEST_S = 4.0
+"""Two legs farther apart in time than this do not make one turn."""
+
+_MISFIT_M = 0.3
+"""Two legs whose lines and way do not meet within this had more than one turn between them."""
+
+_SAME_M = 0.4
+"""Turns closer than this, on the same courses, are one."""
+
+_MOST_WEIGHT = 4.0
+"""A remembered turn moves by at least a quarter of what is seen anew."""
+
+
+@ti.func
+def forget_habits(env, habits: Out[HabitState]):
+    habits.next_slot[env] = 0
+    for packet in range(habits.weight.shape[1]):
+        habits.turn_x[env, packet] = ti.zero(habits.turn_x[env, packet])
+        habits.turn_y[env, packet] = ti.zero(habits.turn_y[env, packet])
+        habits.in_x[env, packet] = ti.zero(habits.in_x[env, packet])
+        habits.in_y[env, packet] = ti.zero(habits.in_y[env, packet])
+        habits.out_x[env, packet] = ti.zero(habits.out_x[env, packet])
+        habits.out_y[env, packet] = ti.zero(habits.out_y[env, packet])
+        habits.weight[env, packet] = ti.zero(habits.weight[env, packet])
+    for track in range(habits.leg_step.shape[1]):
+        habits.leg[env, track] = ti.zero(habits.leg[env, track])
+        habits.leg_step[env, track] = -1
+
+
+# --------------------------------------------------------------------------------------------------------------------- learn
+
+
+@ti.func
+def learn_habit(env, track, habits: Out[HabitState], tracks: In[TrackState], cfg: Const[ForecastConfig], rules: Const[EpisodeConfig]):
+    """Where a track is on a straight leg: remember the turn since its last one, and forget a turn that it went past."""
+    if tracks.alive[env, track] == 0 or tracks.age[env, track] == 0:
+        habits.leg_step[env, track] = -1
+    elif tracks.moving[env, track] == 1 and tracks.misses[env, track] == 0 and on_straight_leg(env, track, tracks):
+        now, leg = tracks.state[env, track], habits.leg[env, track]
+        time = (tracks.scan_step[env] - habits.leg_step[env, track]) * rules.control_dt_s
+        if habits.leg_step[env, track] >= 0 and time < _LONGEST_S:
+            speed, leg_speed = ti.sqrt(now[2] ** 2 + now[3] ** 2), ti.sqrt(leg[2] ** 2 + leg[3] ** 2)
+            course, leg_course = ti.Vector([now[2] / speed, now[3] / speed]), ti.Vector([leg[2] / leg_speed, leg[3] / leg_speed])
+            if course.dot(leg_course) < _TURNED_COS:
+                way = 0.5 * time * (speed + leg_speed)
+                place_turn(env, ti.Vector([leg[0], leg[1]]), leg_course, ti.Vector([now[0], now[1]]), course, way, habits)
+            else:
+                drop_passed(env, ti.Vector([now[0], now[1]]), course, speed * time, habits, cfg)
+        habits.leg[env, track] = now
+        habits.leg_step[env, track] = tracks.scan_step[env]
+
+
+@ti.func
+def on_straight_leg(env, track, tracks: In[TrackState]):
+    """Whether course and speed are known well and the course does not turn."""
+    mean, cov = tracks.state[env, track], tracks.cov[env, track]
+    rate, rate_var = tracks.turn_rate[env, track], tracks.turn_cov[env, track][4]
+    known = 0.0 < rate_var < ti.static(_STRAIGHT_SIGMA**2)
+    return known and rate * rate <= rate_var and cov[7] + cov[9] < _SETTLED * (mean[2] ** 2 + mean[3] ** 2)
+
+
+@ti.func
+def place_turn(env, p0, d0, p1, d1, way, habits: Out[HabitState]):
+    """Remember the turn between two legs, unless they do not meet."""
+    fold = d0 - d1
+    uneven = 2.0 * (p1 - p0 - 0.5 * way * (d0 + d1)).dot(fold) / fold.norm_sqr()
+    before, after = 0.5 * (way + uneven), 0.5 * (way - uneven)
+    corner = p0 + before * d0
+    misfit = (p1 - after * d1 - corner).norm()
+    if ti.min(before, after) > -_MISFIT_M and misfit < _MISFIT_M:
+        store_turn(env, 0.5 * (corner + p1 - after * d1), d0, d1, habits)
+
+
+@ti.func
+def store_turn(env, pos, d0, d1, habits: Out[HabitState]):
+    """Average with the same turn seen before; else a new one in the place of the oldest."""
+    n_packet = ti.static(habits.weight.shape[1])
+    slot, weight = habits.next_slot[env], 1.0
+    known = 0
+    for packet in range(n_packet):
+        for lane in range(LANES):
+            if known == 0 and habits.weight[env, packet][lane] > 0.0:
+                off = ti.Vector([habits.turn_x[env, packet][lane], habits.turn_y[env, packet][lane]]) - pos
+                alike_in = habits.in_x[env, packet][lane] * d0[0] + habits.in_y[env, packet][lane] * d0[1] > _ALIKE_COS
+                alike_out = habits.out_x[env, packet][lane] * d1[0] + habits.out_y[env, packet][lane] * d1[1] > _ALIKE_COS
+                if alike_in and alike_out and off.norm_sqr() < ti.static(_SAME_M**2):
+                    known, slot = 1, packet * LANES + lane
+    packet, lane = slot // LANES, slot % LANES
+    if known == 1:
+        weight = ti.min(habits.weight[env, packet][lane] + 1.0, _MOST_WEIGHT)
+    else:
+        habits.next_slot[env] = (slot + 1) % ti.static(LANES * n_packet)
+    keep, gain = 1.0 - 1.0 / weight, 1.0 / weight
+    came = keep * known * ti.Vector([habits.in_x[env, packet][lane], habits.in_y[env, packet][lane]]) + gain * d0
+    went = keep * known * ti.Vector([habits.out_x[env, packet][lane], habits.out_y[env, packet][lane]]) + gain * d1
+    came, went = came.normalized(), went.normalized()
+    habits.turn_x[env, packet][lane] = keep * habits.turn_x[env, packet][lane] * known + gain * pos[0]
+    habits.turn_y[env, packet][lane] = keep * habits.turn_y[env, packet][lane] * known + gain * pos[1]
+    habits.in_x[env, packet][lane] = came[0]
+    habits.in_y[env, packet][lane] = came[1]
+    habits.out_x[env, packet][lane] = went[0]
+    habits.out_y[env, packet][lane] = went[1]
+    habits.weight[env, packet][lane] = weight
+
+
+@ti.func
+def drop_passed(env, pos, course, moved, habits: Out[HabitState], cfg: Const[ForecastConfig]):
+    """A body that was expected to turn and has gone straight on past the place, in the last ``moved`` [m], takes one off its weight."""
+    for packet in range(habits.weight.shape[1]):
+        along, across = offsets(env, packet, pos, course, habits)
+        for lane in ti.static(range(LANES)):
+            behind = along[lane] < -cfg.passed_m and along[lane] + moved >= -cfg.passed_m
+            if behind and across[lane] < ti.static(0.5 * cfg.across_m) and habits.weight[env, packet][lane] > 0.0:
+                habits.weight[env, packet][lane] -= 1.0
+
+
+# -------------------------------------------------------------------------------------------------------------------- recall
+
+
+@ti.func
+def offsets(env, packet, pos, course, habits: In[HabitState]):
+    """Lanes: how far ahead along the course a remembered turn lies, and how far aside; FAR_M aside for those on another course."""
+    dx, dy = habits.turn_x[env, packet] - pos[0], habits.turn_y[env, packet] - pos[1]
+    along = dx * course[0] + dy * course[1]
+    aside = dx * course[1] - dy * course[0]
+    alike = habits.in_x[env, packet] * course[0] + habits.in_y[env, packet] * course[1]
+    weight = habits.weight[env, packet]
+    across = f16x(FAR_M)
+    for lane in ti.static(range(LANES)):
+        across[lane] = ti.select(alike[lane] > _ALIKE_COS and weight[lane] > 0.0, ti.abs(aside[lane]), FAR_M)
+    return along, across
+
+
+@ti.func
+def next_turn(env, pos, course, habits: In[HabitState], cfg: Const[ForecastConfig]):
+    """(distance [m] to the nearest remembered turn ahead, course after it); FAR_M = none."""
+    gap, slot = FAR_M, 0
+    for packet in range(habits.weight.shape[1]):
+        along, across = offsets(env, packet, pos, course, habits)
+        for lane in ti.static(range(LANES)):
+            meets = across[lane] < cfg.across_m + cfg.across_slope * along[lane] and along[lane] > -cfg.overdue_m
+            if meets and along[lane] < gap:
+                gap, slot = along[lane], packet * LANES + lane
+    out = course
+    if gap < FAR_M:
+        gap = ti.max(gap, 0.0)
+        out = ti.Vector([habits.out_x[env, slot // LANES][slot % LANES], habits.out_y[env, slot // LANES][slot % LANES]])
+    return gap, out
+
+
+@ti.func
+def wall_ahead(pos, course, radius, tank: Const[TankConfig]):
+    """Distance [m] along the course at which a body of that radius touches a side wall; it may be negative."""
+    gap = FAR_M
+    if ti.static(tank.shape == "circle"):
+        off = pos - ti.Vector([0.5 * (tank.x_m[0] + tank.x_m[1]), 0.5 * (tank.y_m[0] + tank.y_m[1])])
+        half = off.dot(course)
+        gap = ti.sqrt(ti.max(half * half + ti.max(tank.radius_m - radius, 0.0) ** 2 - off.norm_sqr(), 0.0)) - half
+    else:
+        for side in ti.static(range(2)):
+            low, high = ti.static((tank.x_m, tank.y_m)[side])
+            if ti.abs(course[side]) > 1e-6:
+                edge = ti.select(course[side] > 0.0, high - radius, low + radius)
+                gap = ti.min(gap, (edge - pos[side]) / course[side])
+    return gap
+
+
+@ti.func
+def next_event(env, pos, course, radius, habits: In[HabitState], cfg: Const[ForecastConfig], tank: Const[TankConfig]):
+    """(distance [m] to the next turn on a straight course, course after it): a remembered one, or the wall if that comes first.
+
+    At a wall bodies are expected to turn back: right for lines, and nearer than a mirrored course to what loops do, whose next leg goes
+    anywhere into the tank.
+    """
+    gap, out = FAR_M, course
+    if ti.static(cfg.use_habits):
+        gap, out = next_turn(env, pos, course, habits, cfg)
+    if ti.static(cfg.use_reflection):
+        far = ti.max(wall_ahead(pos, course, radius, tank), 0.0)
+        if far < gap:
+            gap, out = far, -course
+    return gap, out
+
+
+@ti.func
+def expected_turn_rate(env, track, tracks: In[TrackState], cfg: Const[ForecastConfig], tracking: Const[TrackingConfig]):
+    """[rad/s] the filter's turn rate, where that explains the track better than none: most bodies go straight.
+
+    Odds for a turn = density of rate 0 in the prior over that in the posterior (Savage-Dickey): an uncertain rate must stand out of its
+    noise by little, a well known one by more, for a prior as wide as this one makes small rates unlikely.
+    """
+    rate = 0.0
+    if ti.static(cfg.use_turn_rate and tracking.turn_rate_sigma_rad_s > 0):
+        known, var = tracks.turn_rate[env, track], tracks.turn_cov[env, track][4]
+        bar = ti.log(ti.static(tracking.turn_rate_sigma_rad_s**2) / ti.max(var, 1e-9)) + ti.static(2.0 * math.log(cfg.straight_odds))
+        if var > 0.0 and known * known > var * ti.max(bar, 0.0):
+            rate = known
+    return rate
+
+
+@ti.func
+def coasted(env, track, mean, time, habits: In[HabitState], tracks: In[TrackState], cfg: Const[ForecastConfig], tank: Const[TankConfig]):
+    """Mean (x, y, vx, vy) of an unseen body on a straight leg after ``time`` [s]: it turns where bodies turn."""
+    speed = ti.max(ti.sqrt(mean[2] ** 2 + mean[3] ** 2), 1e-6)
+    course, way = ti.Vector([mean[2] / speed, mean[3] / speed]), speed * time
+    gap, out = next_event(env, ti.Vector([mean[0], mean[1]]), course, tracks.radius_m[env, track], habits, cfg, tank)
+    before = ti.min(gap, way)
+    after = way - before
+    late = course
+    if after > 0.0:
+        late = out
+    x, y = mean[0] + before * course[0] + after * late[0], mean[1] + before * course[1] + after * late[1]
+    return ti.Vector([x, y, speed * late[0], speed * late[1]])

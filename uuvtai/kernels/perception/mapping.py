@@ -1,0 +1,306 @@
+"""Two-layer occupancy map from sonar and depth: M^s (what stays) and M^d (what moves), fused by max.
+
+One scan becomes binary indicators per cell (``fan.py``, ``evidence.py``), then the paper's two equations apply:
+
+    M^s = clip((1 - lambda_s) M^s + eta_occ I^s-hit - eta_free I^free + eta_depth I^depth, 0, 1)
+    M^d = clip((1 - lambda_d) M^d + eta_dyn I^d-hit - eta_dyn,free I^free, 0, 1)
+
+A return of either kind cancels I^free in its cell. What moves is told from observations only: compensated Doppler, a moving track, or a
+return where the map was confident of free water; it feeds M^d alone. A body that stops is promoted after ``promote_s``: without newer
+evidence of motion its returns then count as static ones, and M^d decays.
+
+I^depth is "depth-gated consistency": a camera point at the vehicle's own depth counts where the sonar supports it (the cell is not free of
+static occupancy, or has a static return in this scan) and does not contradict it (no beam passed through), and where nothing moves (no
+dynamic return, M^d below the threshold): the camera alone cannot tell a passing body from a standing one.
+
+Nearly all of a map is water where both layers are 0 and stay so. Indicators and facts about cells are bits therefore, sixty-four cells a
+word; counters of free water are numbers written vertically (bit k of sixty-four counters is a word), and the equations run over the few
+cells that have a return, a point, or a layer that is not 0.
+"""
+
+import math
+
+import taichi as ti
+
+from uuvtai.config import DepthConfig, EpisodeConfig, MappingConfig, SonarConfig, TankConfig
+from uuvtai.kernels.core.bits import WORD, bit_of, lowest_bit, taken, with_bit, without_lowest
+from uuvtai.kernels.core.signature import Const, In, Out, quick_launch, spread
+from uuvtai.kernels.perception.evidence import mark_depth, mark_hits
+from uuvtai.kernels.perception.fan import mark_fan
+from uuvtai.state import ClockState, ClusterState, DepthImage, GridMask, MapScratch, MapState, SonarScan, TrackState
+
+RATED_HZ = 10.0
+"""Scan rate for which the gains of MappingConfig are given."""
+
+COUNTER_MAX = 255
+VANISHED = 1e-6
+"""Occupancy below this is 0: decay alone would never end."""
+
+_NO_SCAN = -(1 << 20)
+
+
+# ----------------------------------------------------------------------------------- plain Python, evaluated when a kernel is compiled
+
+
+def map_period_s(mapping, sonar, episode):
+    """[s] between two mapped scans: the first multiple of the sonar's period that is no shorter than the map's own."""
+    return sonar.period_steps * math.ceil(mapping.period_steps / sonar.period_steps) * episode.control_dt_s
+
+
+def depth_period_s(mapping, sonar, depth, episode):
+    """[s] between two mapped scans that can carry depth evidence."""
+    return max(map_period_s(mapping, sonar, episode), depth.period_steps * episode.control_dt_s)
+
+
+def per_scan(gain, period_s):
+    """Gain per scan that keeps the gain per second of ``gain`` at 10 Hz; at most 1."""
+    return min(1.0, gain * period_s * RATED_HZ)
+
+
+def decay_per_scan(decay, period_s):
+    """Decay per scan that forgets as much per second as ``decay`` does at 10 Hz."""
+    return 1.0 - (1.0 - decay) ** (period_s * RATED_HZ)
+
+
+def scans_in(seconds, period_s):
+    """Scans that span ``seconds``, at least 1. Raises ValueError where the map's counters could not hold them."""
+    count = max(1, math.ceil(seconds / period_s - 1e-6))
+    if count > COUNTER_MAX:
+        raise ValueError(
+            f"mapping: {seconds} s are {count} mapped scans, but the counters end at {COUNTER_MAX}: raise mapping.period_steps"
+        )
+    return count
+
+
+def bit_fields(grid_map):
+    """Every array of bits that a map keeps from scan to scan, but the counters."""
+    m = grid_map
+    return m.confident, m.held, m.alive, m.seen, m.static_occupied, m.dynamic_occupied, m.depth_hit
+
+
+# ------------------------------------------------------------------------------------------------------------------------ merge
+
+
+@ti.func
+def is_due(env, scan: In[SonarScan], clock: In[ClockState], grid_map: In[MapState], mapping: Const[MappingConfig]):
+    """1 where a scan arrived that is to be mapped."""
+    due = clock.awake[env] == 1 and scan.fresh[env] == 1 and clock.step[env] - grid_map.map_step[env] >= mapping.period_steps
+    return ti.cast(due, ti.i32)
+
+
+@ti.func
+def clipped(value):
+    """Occupancy clipped to [0, 1]; what has all but decayed is 0."""
+    return ti.select(value < VANISHED, 0.0, ti.min(value, 1.0))
+
+
+@ti.func
+def count_free(env, row, word, free, returned, grid_map: Out[MapState], confident_scans: Const[int]):
+    """Counters of free water: one more where a cell is free and not yet confident, 0 where it has a return."""
+    sure = grid_map.confident[env, row, word]
+    more = free & ~sure
+    reset = returned & grid_map.seen[env, row, word]
+    if more | reset != 0:
+        old = grid_map.free_scans[env, row, word]
+        new, full = old, more
+        for k in ti.static(range(confident_scans.bit_length())):
+            new[k] = (old[k] ^ more) & ~returned
+            more &= old[k]
+            full &= new[k] if ti.static(confident_scans >> k & 1) else ~new[k]
+        grid_map.free_scans[env, row, word] = new
+        grid_map.confident[env, row, word] = (sure & ~returned) | full
+
+
+@ti.func
+def count_dynamic(env, row, word, free, dynamics, grid_map: Out[MapState]):
+    """Counters of dynamic evidence: one more where there is some, 0 where the cell is free."""
+    held = grid_map.held[env, row, word]
+    gone = free & held
+    if gone | dynamics != 0:
+        grid_map.held[env, row, word] = (held & ~gone) | dynamics
+        while gone != 0:
+            grid_map.dynamic_scans[env, row, word * WORD + lowest_bit(gone)] = ti.u8(0)
+            gone = without_lowest(gone)
+        more = dynamics
+        while more != 0:
+            col = word * WORD + lowest_bit(more)
+            raised = ti.min(ti.cast(grid_map.dynamic_scans[env, row, col], ti.i32) + 1, COUNTER_MAX)
+            grid_map.dynamic_scans[env, row, col] = ti.cast(raised, ti.u8)
+            more = without_lowest(more)
+
+
+@ti.func
+def folded(
+    static_old,
+    dynamic_old,
+    static_hit,
+    dynamic_hit,
+    free,
+    point,
+    mapping: Const[MappingConfig],
+    scan_s: Const[float],
+    depth_s: Const[float],
+):
+    """Both equations for one cell; indicators are 0 or 1."""
+    supported = (static_hit == 1) | (static_old > 0.0)
+    depth_hit = ti.select(supported & (dynamic_old < mapping.occupied), point & ~dynamic_hit & ~free, 0)
+    static_new = clipped(
+        ti.static(1.0 - decay_per_scan(mapping.static_decay, scan_s)) * static_old
+        + ti.static(per_scan(mapping.static_hit, scan_s)) * static_hit
+        - ti.static(per_scan(mapping.static_free, scan_s)) * free
+        + ti.static(per_scan(mapping.depth_hit, depth_s)) * depth_hit
+    )
+    dynamic_new = clipped(
+        ti.static(1.0 - decay_per_scan(mapping.dynamic_decay, scan_s)) * dynamic_old
+        + ti.static(per_scan(mapping.dynamic_hit, scan_s)) * dynamic_hit
+        - ti.static(per_scan(mapping.dynamic_free, scan_s)) * free
+    )
+    return static_new, dynamic_new
+
+
+@ti.func
+def fold_cells(
+    env,
+    row,
+    word,
+    statics,
+    dynamics,
+    free,
+    points,
+    grid_map: Out[MapState],
+    mapping: Const[MappingConfig],
+    scan_s: Const[float],
+    depth_s: Const[float],
+):
+    """Both equations for the cells of a word that have anything to fold, and what is then true of them."""
+    alive = grid_map.alive[env, row, word]
+    left = alive | statics | dynamics | points
+    if left != 0:
+        static_occupied, dynamic_occupied = grid_map.static_occupied[env, row, word], grid_map.dynamic_occupied[env, row, word]
+        while left != 0:
+            i = lowest_bit(left)
+            left = without_lowest(left)
+            col = word * WORD + i
+            static_new, dynamic_new = folded(
+                grid_map.static_occ[env, row, col],
+                grid_map.dynamic_occ[env, row, col],
+                bit_of(statics, i),
+                bit_of(dynamics, i),
+                bit_of(free, i),
+                bit_of(points, i),
+                mapping,
+                scan_s,
+                depth_s,
+            )
+            grid_map.static_occ[env, row, col], grid_map.dynamic_occ[env, row, col] = static_new, dynamic_new
+            alive = with_bit(alive, i, (static_new > 0.0) | (dynamic_new > 0.0))
+            static_occupied = with_bit(static_occupied, i, static_new >= mapping.occupied)
+            dynamic_occupied = with_bit(dynamic_occupied, i, dynamic_new >= mapping.occupied)
+        grid_map.alive[env, row, word] = alive
+        grid_map.static_occupied[env, row, word], grid_map.dynamic_occupied[env, row, word] = static_occupied, dynamic_occupied
+
+
+@ti.func
+def fetch_cells(env, slot, scratch: Out[MapScratch], grid_map: In[MapState]):
+    """Read one number of every word that holds something, so that memory answers many of them at once and not one after another."""
+    fetched = 0.0
+    for row in range(ti.static(grid_map.alive.shape[1])):
+        for word in range(ti.static(grid_map.alive.shape[2])):
+            alive = grid_map.alive[env, row, word]
+            if alive != 0:
+                fetched += grid_map.static_occ[env, row, word * WORD + lowest_bit(alive)]
+    scratch.fetched[slot] = fetched
+
+
+@ti.func
+def merge_scan(
+    env,
+    slot,
+    scratch: Out[MapScratch],
+    grid_map: Out[MapState],
+    mask: In[GridMask],
+    mapping: Const[MappingConfig],
+    scan_s: Const[float],
+    depth_s: Const[float],
+    confident_scans: Const[int],
+):
+    """Fold everything marked in the slot's scratch into an env's map, word by word; the marks are used up.
+
+    Each strip of sixty-four columns goes upwards: an odd number of the fan's edges below means inside.
+    """
+    for word in range(ti.static(scratch.fan_edge.shape[2])):
+        in_fan = ti.cast(0, ti.u64)
+        for row in range(ti.static(scratch.fan_edge.shape[1])):
+            in_fan ^= taken(scratch.fan_edge, slot, row, word)
+            inside = ~mask.outside_bits[row, word]
+            statics, dynamics = taken(scratch.static_hit, slot, row, word) & inside, taken(scratch.dynamic_hit, slot, row, word) & inside
+            points = ti.cast(0, ti.u64)
+            if grid_map.depth_waits[env] == 1:
+                points = taken(grid_map.depth_hit, env, row, word) & inside
+            free = in_fan & inside & ~(statics | dynamics)
+            count_free(env, row, word, free, statics | dynamics, grid_map, confident_scans)
+            count_dynamic(env, row, word, free, dynamics, grid_map)
+            fold_cells(env, row, word, statics, dynamics, free, points, grid_map, mapping, scan_s, depth_s)
+            seen = grid_map.seen[env, row, word]
+            if (free | statics | dynamics | points) & ~seen != 0:
+                grid_map.seen[env, row, word] = seen | free | statics | dynamics | points
+    grid_map.depth_waits[env] = 0
+
+
+# ---------------------------------------------------------------------------------------------------------------------- kernels
+
+
+@quick_launch
+@ti.kernel
+def update_map(
+    grid_map: Out[MapState],
+    scratch: Out[MapScratch],
+    scan: In[SonarScan],
+    image: In[DepthImage],
+    tracks: In[TrackState],
+    clusters: In[ClusterState],
+    mask: In[GridMask],
+    clock: In[ClockState],
+    mapping: Const[MappingConfig],
+    sonar: Const[SonarConfig],
+    depth: Const[DepthConfig],
+    tank: Const[TankConfig],
+    episode: Const[EpisodeConfig],
+):
+    """Take a fresh image's points and fold a fresh scan that is due into both layers; else the map stays as it is."""
+    n_env, n_slot = ti.static(clock.awake.shape[0], scratch.fan_edge.shape[0])
+    scan_s = ti.static(map_period_s(mapping, sonar, episode))
+    depth_s = ti.static(depth_period_s(mapping, sonar, depth, episode))
+    confident, promote = ti.static(scans_in(mapping.free_confident_s, scan_s), scans_in(mapping.promote_s, scan_s))
+    # one thread has all of an env's bits, and does all of it while its scratch is in the cache
+    for slot, pad in ti.ndrange(n_slot, ti.static(spread(n_slot))):
+        if pad == 0:
+            for env in range(slot * n_env // n_slot, (slot + 1) * n_env // n_slot):
+                if clock.awake[env] == 1 and image.fresh[env] == 1:
+                    mark_depth(env, grid_map, image, mapping, depth, tank)
+                    grid_map.depth_waits[env] = 1
+                if is_due(env, scan, clock, grid_map, mapping) == 1:
+                    fetch_cells(env, slot, scratch, grid_map)
+                    mark_fan(env, slot, scratch, scan, mapping, sonar, tank)
+                    mark_hits(env, slot, scratch, grid_map, scan, tracks, clusters, mapping, sonar, tank, promote)
+                    merge_scan(env, slot, scratch, grid_map, mask, mapping, scan_s, depth_s, confident)
+                    grid_map.map_step[env] = clock.step[env]
+
+
+@quick_launch
+@ti.kernel
+def reset_map(grid_map: Out[MapState], clock: In[ClockState]):
+    """An empty map: nothing occupied, nothing seen."""
+    n_env, n_row, n_col = ti.static(grid_map.static_occ.shape)
+    for env, row in ti.ndrange(n_env, n_row):
+        if clock.awake[env] == 1:
+            grid_map.map_step[env] = _NO_SCAN
+            grid_map.depth_waits[env] = 0
+            for col in range(n_col):
+                grid_map.static_occ[env, row, col] = 0.0
+                grid_map.dynamic_occ[env, row, col] = 0.0
+                grid_map.dynamic_scans[env, row, col] = ti.u8(0)
+            for word in range(ti.static(grid_map.seen.shape[2])):
+                grid_map.free_scans[env, row, word] = ti.Vector.zero(ti.u64, ti.static(grid_map.free_scans.n))
+                for words in ti.static(bit_fields(grid_map)):
+                    words[env, row, word] = ti.cast(0, ti.u64)

@@ -1,0 +1,1 @@
+"""Clearance, routes, and what of all that the policy reads."""

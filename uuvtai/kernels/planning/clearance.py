@@ -1,0 +1,318 @@
+"""Clearance delta = min(d_occ, d_bnd): exact Euclidean distance transform, truncated at ``max_m``, with the nearest site of every cell.
+
+Sites are the occupied cells and the cells outside the tank, so one transform gives the minimum of both distances. Two passes (the
+separation of Felzenszwalb and Huttenlocher): the nearest site within each row, then the best row of each cell's window, sixteen columns at
+a time (rows are the short way across the tank, and packets of one column range stay aligned). Both carry one integer key per cell that
+orders candidates by distance and holds the site, so that taking the smallest key settles everything:
+
+    key = (2 * d^2 + right) << bits | row offset + reach      [cells]; right = 1 where the site's column is the larger one
+
+Equally near sites: one to the left (or straight above or below) wins over one to the right, then the one in the lower row.
+
+Most of the water is far from everything, and little changes from one map to the next. So packets without a site in reach of their row
+cost nothing in the second pass (``near_up``, ``near_down``: a bit a row), and of a map that changed only those packets are redone that a
+new or a vanished site can concern: those it lies no farther from than the farthest of their own sites. The result is the same.
+
+``inflate_m`` shortens the distance to a nearest site that is an obstacle. Where the boundary is nearest it alone counts, though a
+little beyond it, by less than ``inflate_m``, an inflated obstacle may be nearer.
+"""
+
+import math
+
+import taichi as ti
+
+from uuvtai.config import ClearanceConfig, MappingConfig, VoronoiConfig
+from uuvtai.kernels.core.bits import WORD, highest_bit, lowest_bit, put_bit, without_lowest
+from uuvtai.kernels.core.lanes import LANES, i16x
+from uuvtai.kernels.core.signature import Const, In, Out, quick_launch, spread
+from uuvtai.state import ClearanceMemory, ClearanceState, ClockState, GridMask, MapState
+
+_FAR_COLS = 1 << 12
+"""[cells] stands for "no site in this row"; its square fits an int32."""
+
+_MAX_CHANGES = 48
+"""Sites that may change before redoing everything is cheaper than finding what they concern."""
+
+
+# ----------------------------------------------------------------------------------- plain Python, evaluated when a kernel is compiled
+
+
+def squared_limit(cfg, mapping):
+    """[cells^2] largest squared distance that is not beyond ``max_m``."""
+    return math.floor((cfg.max_m / mapping.cell_m) ** 2 + 1e-6)
+
+
+def window_reach(cfg, mapping):
+    """[cells] farthest row that can hold a site within ``max_m``."""
+    return math.isqrt(squared_limit(cfg, mapping))
+
+
+def offset_bits(cfg, mapping):
+    """Bits of a key that hold the row offset. Raises ValueError where keys would not fit an int32."""
+    bits = (2 * window_reach(cfg, mapping)).bit_length()
+    if window_reach(cfg, mapping) >= WORD or 4 * (squared_limit(cfg, mapping) + 1) << bits >= 1 << 31:
+        raise ValueError(f"clearance.max_m {cfg.max_m} is too many cells of {mapping.cell_m} m")
+    return bits
+
+
+def no_site(cfg, mapping):
+    """Key of a cell without a site within ``max_m``: larger than that of any cell with one."""
+    return 2 * (squared_limit(cfg, mapping) + 1) << offset_bits(cfg, mapping)
+
+
+# ------------------------------------------------------------------------------------------------------------------------ sites
+
+
+@ti.func
+def site_word(env, row, word, grid_map: In[MapState], mask: In[GridMask], voronoi: Const[VoronoiConfig]):
+    """Cells that are occupied or outside the tank."""
+    sites = grid_map.static_occupied[env, row, word] | mask.outside_bits[row, word]
+    if ti.static(voronoi.use == "fused"):
+        sites |= grid_map.dynamic_occupied[env, row, word]
+    return sites
+
+
+@ti.func
+def take_sites(
+    env, slot, limit: Const[int], memory: Out[ClearanceMemory], grid_map: In[MapState], mask: In[GridMask], voronoi: Const[VoronoiConfig]
+):
+    """Read the sites, and mark the packets that those which changed may concern; how many changed."""
+    n_row, n_word = ti.static(memory.sites.shape[1:])
+    known = memory.limit[env] == limit
+    changed = ti.select(known, 0, _MAX_CHANGES + 1)
+    for row in range(n_row):
+        for word in range(n_word):
+            sites = site_word(env, row, word, grid_map, mask, voronoi)
+            different = sites ^ memory.sites[env, row, word]
+            if different != 0:
+                memory.sites[env, row, word] = sites
+                while different != 0 and changed <= _MAX_CHANGES:
+                    mark_stale(env, slot, row, word * WORD + lowest_bit(different), limit, memory)
+                    different = without_lowest(different)
+                    changed += 1
+    memory.limit[env] = limit
+    return changed
+
+
+@ti.func
+def mark_stale(env, slot, site_row, site_col, limit: Const[int], memory: Out[ClearanceMemory]):
+    """Mark the packets that a changed site may concern: it lies no farther from them than the farthest of their sites."""
+    n_row, n_packet = ti.static(memory.farthest.shape[1:])
+    reach = ti.static(math.isqrt(limit))
+    for packet in range(ti.max(site_col - reach, 0) // LANES, ti.min((site_col + reach) // LANES, n_packet - 1) + 1):
+        cols = ti.max(packet * LANES - site_col, site_col - packet * LANES - (LANES - 1), 0)
+        for row in range(ti.max(site_row - reach, 0), ti.min(site_row + reach + 1, n_row)):
+            if (row - site_row) ** 2 + cols * cols <= memory.farthest[env, row, packet]:
+                put_bit(memory.stale, slot, packet, row)
+
+
+# ----------------------------------------------------------------------------------------------------------------------- passes
+
+
+@ti.func
+def next_site(env, row, first_col, memory: In[ClearanceMemory]):
+    """Column of the first site from a column on, far away if there is none."""
+    n_word = ti.static(memory.sites.shape[2])
+    word = first_col // WORD
+    found = ti.cast(0, ti.u64)
+    if word < n_word:
+        found = memory.sites[env, row, word] & (~ti.cast(0, ti.u64) << ti.cast(first_col % WORD, ti.u64))
+    while found == 0 and word + 1 < n_word:
+        word += 1
+        found = memory.sites[env, row, word]
+    return ti.select(found != 0, word * WORD + lowest_bit(found), _FAR_COLS)
+
+
+@ti.func
+def row_keys(sites, left_gap, right_gap, cfg: Const[ClearanceConfig], mapping: Const[MappingConfig]):
+    """Keys of the nearest site in the same row for sixteen cells; gaps [cells] lie between their ends and the sites beyond."""
+    reach, bits = ti.static(window_reach(cfg, mapping), offset_bits(cfg, mapping))
+    to_left, to_right = i16x(0), i16x(0)
+    left, right = left_gap - 1, right_gap - 1
+    for i in ti.static(range(LANES)):
+        left = ti.select((sites >> i) & 1 == 1, 0, left + 1)
+        to_left[i] = left
+    for back in ti.static(range(LANES)):
+        right = ti.select((sites >> (LANES - 1 - back)) & 1 == 1, 0, right + 1)
+        to_right[LANES - 1 - back] = right
+    keys = i16x(0)
+    for i in ti.static(range(LANES)):
+        gap = ti.min(to_left[i], to_right[i])
+        key = ((2 * gap * gap + ti.cast(to_right[i] < to_left[i], ti.i32)) << bits) + reach
+        keys[i] = ti.select(gap <= reach, key, ti.static(no_site(cfg, mapping)))
+    return keys
+
+
+@ti.func
+def scan_row(env, slot, row, memory: Out[ClearanceMemory], cfg: Const[ClearanceConfig], mapping: Const[MappingConfig]):
+    """Keys of the nearest site in the same row, and which packets have one in reach."""
+    n_row, n_packet = ti.static(memory.farthest.shape[1:])
+    reach = ti.static(window_reach(cfg, mapping))
+    last = -_FAR_COLS
+    for packet in range(n_packet):
+        first = packet * LANES
+        sites = ti.cast((memory.sites[env, row, first // WORD] >> ti.cast(first % WORD, ti.u64)) & ti.cast(0xFFFF, ti.u64), ti.i32)
+        left_gap, right_gap = first - last, next_site(env, row, first + LANES, memory) - (first + LANES - 1)
+        if sites != 0 or ti.min(left_gap, right_gap) <= reach:
+            memory.row_key[slot, row, packet] = row_keys(sites, left_gap, right_gap, cfg, mapping)
+            put_bit(memory.near_up, slot, packet, row)
+            put_bit(memory.near_down, slot, packet, n_row - 1 - row)
+        else:
+            memory.row_key[slot, row, packet] = i16x(ti.static(no_site(cfg, mapping)))
+        if sites != 0:
+            last = first + highest_bit(ti.cast(sites, ti.u64))
+
+
+@ti.func
+def bits_from(words: In[ti.Field], slot, packet, first):
+    """Sixty-four bits of a row of words, from one on."""
+    n_word = ti.static(words.shape[2])
+    word, shift = first // WORD, ti.cast(first % WORD, ti.u64)
+    found = words[slot, packet, word] >> shift
+    if word + 1 < n_word and shift > 0:
+        found |= words[slot, packet, word + 1] << (ti.cast(WORD, ti.u64) - shift)
+    return found
+
+
+@ti.func
+def keys_at(slot, row, packet, offset, memory: In[ClearanceMemory], cfg: Const[ClearanceConfig], mapping: Const[MappingConfig]):
+    """Keys of the rows ``offset`` below and above; beyond the grid its last row stands in, taken for farther than it is."""
+    last = ti.static(memory.farthest.shape[1] - 1)
+    farther = 2 * offset * offset << ti.static(offset_bits(cfg, mapping))
+    below = memory.row_key[slot, ti.max(row - offset, 0), packet] + (farther - offset)
+    above = memory.row_key[slot, ti.min(row + offset, last), packet] + (farther + offset)
+    return below, above
+
+
+@ti.func
+def best_keys(slot, row, packet, memory: In[ClearanceMemory], cfg: Const[ClearanceConfig], mapping: Const[MappingConfig]):
+    """Smallest keys over the rows with a site, nearest first; it ends where no farther row can be better for any of the sixteen cells."""
+    n_row = ti.static(memory.farthest.shape[1])
+    reach, bits = ti.static(window_reach(cfg, mapping), offset_bits(cfg, mapping))
+    offsets = bits_from(memory.near_up, slot, packet, row) | bits_from(memory.near_down, slot, packet, n_row - 1 - row)
+    offsets &= (ti.cast(2, ti.u64) << ti.cast(reach, ti.u64)) - ti.cast(2, ti.u64)
+    best = memory.row_key[slot, row, packet]
+    worst = best.max()
+    while offsets != 0:
+        offset = lowest_bit(offsets)
+        offsets = without_lowest(offsets)
+        if 2 * offset * offset << bits > worst:
+            offsets = ti.cast(0, ti.u64)
+        else:
+            below, above = keys_at(slot, row, packet, offset, memory, cfg, mapping)
+            for i in ti.static(range(LANES)):
+                best[i] = ti.min(best[i], below[i], above[i])
+            worst = best.max()
+    return best, worst
+
+
+@ti.func
+def write_packet(
+    env,
+    slot,
+    row,
+    packet,
+    clearance: Out[ClearanceState],
+    memory: Out[ClearanceMemory],
+    mask: In[GridMask],
+    cfg: Const[ClearanceConfig],
+    mapping: Const[MappingConfig],
+):
+    """Distance and site of sixteen cells, decoded from their keys."""
+    reach, bits, limit = ti.static(window_reach(cfg, mapping), offset_bits(cfg, mapping), squared_limit(cfg, mapping))
+    key, worst = best_keys(slot, row, packet, memory, cfg, mapping)
+    memory.farthest[env, row, packet] = worst >> (bits + 1)
+    squared = key >> (bits + 1)
+    rows = (key & ti.static((1 << bits) - 1)) - reach
+    cols = ti.cast(ti.sqrt(ti.cast(squared - rows * rows, ti.f32)), ti.i32)
+    signed_cols = cols * (2 * ((key >> bits) & 1) - 1)
+    for i in ti.static(range(LANES)):
+        distance = ti.sqrt(ti.cast(squared[i], ti.f32)) * mapping.cell_m
+        clearance.clearance_m[env, row, packet * LANES + i] = ti.select(squared[i] <= limit, distance, cfg.max_m)
+    for i in ti.static(range(LANES)):
+        clearance.site_row[env, row, packet * LANES + i] = ti.cast(ti.select(squared[i] <= limit, row + rows[i], -1), ti.i16)
+    for i in ti.static(range(LANES)):
+        col = packet * LANES + i + signed_cols[i]
+        clearance.site_col[env, row, packet * LANES + i] = ti.cast(ti.select(squared[i] <= limit, col, -1), ti.i16)
+    if ti.static(cfg.inflate_m > 0):
+        shorten(env, row, packet, clearance, mask, cfg)
+
+
+@ti.func
+def shorten(env, row, packet, clearance: Out[ClearanceState], mask: In[GridMask], cfg: Const[ClearanceConfig]):
+    """Take the inflation off the distances of sixteen cells to obstacles."""
+    for col in range(packet * LANES, (packet + 1) * LANES):
+        site_row, site_col = ti.cast(clearance.site_row[env, row, col], ti.i32), ti.cast(clearance.site_col[env, row, col], ti.i32)
+        if site_row >= 0 and mask.outside[site_row, site_col] == 0:
+            clearance.clearance_m[env, row, col] = ti.max(clearance.clearance_m[env, row, col] - cfg.inflate_m, 0.0)
+
+
+# ----------------------------------------------------------------------------------------------------------------------- kernel
+
+
+@ti.func
+def transform(
+    env,
+    slot,
+    changed,
+    clearance: Out[ClearanceState],
+    memory: Out[ClearanceMemory],
+    mask: In[GridMask],
+    cfg: Const[ClearanceConfig],
+    mapping: Const[MappingConfig],
+):
+    """Both passes for an env, over everything or over what is stale; the marks are used up."""
+    n_row, n_packet = ti.static(memory.farthest.shape[1:])
+    for packet in range(n_packet):
+        for word in range(ti.static(memory.near_up.shape[2])):
+            memory.near_up[slot, packet, word] = ti.cast(0, ti.u64)
+            memory.near_down[slot, packet, word] = ti.cast(0, ti.u64)
+    for row in range(n_row):
+        scan_row(env, slot, row, memory, cfg, mapping)
+    for packet in range(n_packet):
+        for word in range(ti.static(memory.stale.shape[2])):
+            rows = ti.select(changed > _MAX_CHANGES, ~ti.cast(0, ti.u64), memory.stale[slot, packet, word])
+            memory.stale[slot, packet, word] = ti.cast(0, ti.u64)
+            while rows != 0:
+                row = word * WORD + lowest_bit(rows)
+                rows = without_lowest(rows)
+                if row < n_row:
+                    write_packet(env, slot, row, packet, clearance, memory, mask, cfg, mapping)
+
+
+@ti.func
+def is_due(env, clock: In[ClockState], cfg: Const[ClearanceConfig]):
+    """1 where the clearance is computed in this step."""
+    return ti.cast(clock.awake[env] == 1 and clock.step[env] % cfg.period_steps == 0, ti.i32)
+
+
+@quick_launch
+@ti.kernel
+def compute_clearance(
+    clearance: Out[ClearanceState],
+    memory: Out[ClearanceMemory],
+    grid_map: In[MapState],
+    mask: In[GridMask],
+    clock: In[ClockState],
+    cfg: Const[ClearanceConfig],
+    mapping: Const[MappingConfig],
+    voronoi: Const[VoronoiConfig],
+):
+    """Clearance of every cell from the layer that the planner must avoid (``voronoi.use``), where it is due."""
+    n_env, n_slot = ti.static(clock.awake.shape[0], memory.row_key.shape[0])
+    for slot, pad in ti.ndrange(n_slot, ti.static(spread(n_slot))):
+        if pad == 0:
+            for env in range(slot * n_env // n_slot, (slot + 1) * n_env // n_slot):
+                if clock.awake[env] == 1:
+                    clearance.fresh[env] = is_due(env, clock, cfg)
+                if is_due(env, clock, cfg) == 1:
+                    changed = take_sites(env, slot, ti.static(squared_limit(cfg, mapping)), memory, grid_map, mask, voronoi)
+                    if changed > 0:
+                        transform(env, slot, changed, clearance, memory, mask, cfg, mapping)
+
+
+@ti.kernel
+def forget_clearance(memory: Out[ClearanceMemory]):
+    """Have everything computed anew, as after the start."""
+    for env in range(ti.static(memory.limit.shape[0])):
+        memory.limit[env] = 0

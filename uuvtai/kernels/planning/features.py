@@ -1,0 +1,300 @@
+"""Sector features of the newest sonar scan (nearest range, fastest approach, smallest time to collision), and the policy's observation.
+
+``columns`` declares the observation once: the kernels write by it and the environment's table is read off it.
+"""
+
+import taichi as ti
+
+from uuvtai.config import EpisodeConfig, FeaturesConfig, ForecastConfig, SonarConfig, TankConfig, TrackingConfig
+from uuvtai.kernels.core.columns import Column
+from uuvtai.kernels.core.geometry import FAR_M, TWO_PI, quaternion_wb, rotation_wb
+from uuvtai.kernels.core.signature import Const, In, Out, quick_launch, spread
+from uuvtai.kernels.planning.advice import TEACHER_COLUMNS
+from uuvtai.kernels.planning.approach import BODY_COLUMNS, body_values, closest_approach, next_body
+from uuvtai.state import (
+    ClockState,
+    FeatureState,
+    ForecastState,
+    MissionState,
+    Proprioception,
+    RouteState,
+    SonarScan,
+    TeacherState,
+    TrackState,
+    TreeTable,
+)
+
+
+@quick_launch
+@ti.kernel
+def sense_sectors(
+    features: Out[FeatureState],
+    scan: In[SonarScan],
+    ego: In[Proprioception],
+    clock: In[ClockState],
+    features_cfg: Const[FeaturesConfig],
+    sonar_cfg: Const[SonarConfig],
+):
+    """Sector s is centred at s * 360 / n_sector degrees from ahead, counter-clockwise. One work item per sector."""
+    n, n_sector = ti.static(features.sector_range_m.shape[0], features.sector_range_m.shape[1])
+    for env, sector in ti.ndrange(n, n_sector):
+        if clock.awake[env] == 1:
+            first, last = sector_beams(sector, ego.rpy[env][2] - scan.ping_yaw[env], n_sector, ti.static(scan.range_m.shape[1]))
+            _summarise(env, sector, first, last, features, scan, features_cfg, sonar_cfg)
+
+
+@ti.func
+def _summarise(
+    env,
+    sector,
+    first,
+    last,
+    features: Out[FeatureState],
+    scan: In[SonarScan],
+    features_cfg: Const[FeaturesConfig],
+    sonar_cfg: Const[SonarConfig],
+):
+    """Doppler already holds the own motion, so a beam's time to collision is its range over its closing speed."""
+    n_ray = ti.static(scan.range_m.shape[1])
+    nearest, ttc, closing, hits = 0.0 + sonar_cfg.max_range_m, 0.0 + features_cfg.ttc_cap_s, -FAR_M, 0
+    begin = first % n_ray
+    for i in range(last - first):  # no branches: signs of noisy rates cannot be predicted
+        beam = begin + i
+        beam -= ti.select(beam >= n_ray, n_ray, 0)
+        hit, gap, rate = scan.hit[env, beam] == 1, scan.range_m[env, beam], -scan.doppler_m_s[env, beam]
+        hits += ti.cast(hit, ti.i32)
+        closing = ti.max(closing, ti.select(hit, rate, -FAR_M))
+        nearest = ti.min(nearest, ti.select(hit, gap, sonar_cfg.max_range_m))
+        ttc = ti.min(ttc, ti.select(hit & (rate > 0.0), gap / rate, features_cfg.ttc_cap_s))
+    features.sector_range_m[env, sector] = nearest
+    features.sector_ttc_s[env, sector] = ttc
+    features.sector_closing_m_s[env, sector] = ti.select(hits > 0, closing, 0.0)
+    features.sector_valid[env, sector] = ti.cast(hits > 0, ti.i32)
+
+
+@ti.func
+def sector_beams(sector, turned, n_sector, n_ray):
+    """Half-open range of beams in a sector now, after the vehicle has turned by ``turned`` [rad] since the ping; take it modulo n_ray."""
+    shift = turned * n_sector / TWO_PI
+    per_sector = n_ray / n_sector
+    first = ti.ceil((sector - 0.5 + shift) * per_sector)
+    last = ti.ceil((sector + 0.5 + shift) * per_sector)
+    return ti.cast(first, ti.i32), ti.cast(last, ti.i32)
+
+
+# -------------------------------------------------------------------------------------------------------------- observation
+
+
+@ti.func
+def _in_body(vector_w, rpy):
+    """World vector in the body frame of the measured attitude."""
+    return rotation_wb(quaternion_wb(rpy[0], rpy[1], rpy[2])).transpose() @ vector_w
+
+
+@ti.func
+def _goal(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
+    return _in_body(mission.goal_w[env] - ego.pos_w[env], ego.rpy[env])
+
+
+@ti.func
+def _heading_error(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
+    return ti.Vector([ti.sin(route.heading_error[env]), ti.cos(route.heading_error[env])])
+
+
+@ti.func
+def _velocity(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
+    return ego.vel_b[env]
+
+
+@ti.func
+def _yaw_rate(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
+    return ti.Vector([ego.rate_b[env][2]])
+
+
+@ti.func
+def _depth(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
+    return ti.Vector([ego.depth_m[env]])
+
+
+@ti.func
+def _tilt(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
+    return ti.Vector([ego.rpy[env][0], ego.rpy[env][1]])
+
+
+@ti.func
+def _lookahead(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
+    return _in_body(route.lookahead_w[env] - ego.pos_w[env], ego.rpy[env])
+
+
+@ti.func
+def _cross_track(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
+    return ti.Vector([route.cross_track_m[env]])
+
+
+@ti.func
+def _remaining(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
+    return ti.Vector([route.remaining_m[env]])
+
+
+@ti.func
+def _path_risk(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
+    return ti.Vector([route.path_risk[env]])
+
+
+@ti.func
+def _tilt_rate(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
+    return ti.Vector([ego.rate_b[env][0], ego.rate_b[env][1]])
+
+
+@ti.func
+def _sector_range(env, sector, features: In[FeatureState]):
+    return features.sector_range_m[env, sector]
+
+
+@ti.func
+def _sector_ttc(env, sector, features: In[FeatureState]):
+    return features.sector_ttc_s[env, sector]
+
+
+@ti.func
+def _sector_closing(env, sector, features: In[FeatureState]):
+    return features.sector_closing_m_s[env, sector]
+
+
+COLUMNS = (
+    Column("goal", 3, "m", "body", "from the position estimate to the goal", _goal),
+    Column("heading_error", 2, "1", "level", "sine, cosine of the look-ahead point's bearing, left positive", _heading_error),
+    Column("velocity", 3, "m/s", "body", "over ground, as the DVL measured it last", _velocity),
+    Column("yaw_rate", 1, "rad/s", "body", "of the gyro", _yaw_rate),
+    Column("depth", 1, "m", "world", "pressure depth, positive down", _depth),
+    Column("tilt", 2, "rad", "level", "roll, pitch of the IMU", _tilt),
+    Column("sector_range", 1, "m", "body", "smallest range; maximum range where nothing returned", _sector_range, "sector"),
+    Column("lookahead", 3, "m", "body", "to the look-ahead point of the route; zero without a route", _lookahead),
+    Column("cross_track", 1, "m", "route", "distance from the route, positive = left of it", _cross_track),
+    Column("remaining", 1, "m", "route", "route length still ahead; the straight distance without a route", _remaining),
+    Column("path_risk", 1, "1", "route", "mean risk over the look-ahead segment", _path_risk),
+    Column("tilt_rate", 2, "rad/s", "body", "roll rate, pitch rate of the gyro", _tilt_rate),
+    Column("sector_ttc", 1, "s", "body", "smallest time to collision, capped", _sector_ttc, "sector"),
+    Column("sector_closing", 1, "m/s", "body", "largest closing speed, own motion included; 0 = no return", _sector_closing, "sector"),
+)
+"""The observation, in order: the paper's phi and what it names as the world model's targets, which are the first 24 (with 12 sectors).
+
+A config may add columns behind them (``columns``).
+"""
+
+
+def columns(cfg: FeaturesConfig) -> tuple[Column, ...]:
+    """The groups of a config's observation: ``COLUMNS``, then the bodies' where any are asked for, then the tree's."""
+    return COLUMNS + (BODY_COLUMNS if cfg.n_track > 0 else ()) + (TEACHER_COLUMNS if cfg.teacher else ())
+
+
+def placed_columns(cfg: FeaturesConfig) -> list[tuple[Column, int, int]]:
+    """(group, first column, number of columns) of every group."""
+    out, first = [], 0
+    for column in columns(cfg):
+        width = column.width * {"": 1, "sector": cfg.n_sector, "body": cfg.n_track}[column.per]
+        out.append((column, first, width))
+        first += width
+    return out
+
+
+def observation_width(cfg: FeaturesConfig) -> int:
+    """Columns of the observation."""
+    return sum(width for _column, _first, width in placed_columns(cfg))
+
+
+def _sources(group, cfg):
+    """(source, first column, width of one) of the groups of ``group`` (a tuple of columns); plain Python, unrolled by the kernels."""
+    return [(c.source, first, c.width) for c, first, _width in placed_columns(cfg) if c in group]
+
+
+def _body_places(cfg):
+    """(place in ``body_values``, first column of the first body, width of one) of the groups of BODY_COLUMNS; plain Python."""
+    widths = [column.width for column in BODY_COLUMNS]
+    return [(sum(widths[:n]), first, width) for n, (_, first, width) in enumerate(_sources(BODY_COLUMNS, cfg))]
+
+
+_BODY_WIDTH = sum(column.width for column in BODY_COLUMNS)
+_SECTOR_COLUMNS = tuple(column for column in COLUMNS if column.per == "sector")
+_OWN_COLUMNS = tuple(column for column in COLUMNS if not column.per)
+
+
+@quick_launch
+@ti.kernel
+def write_observation(
+    obs: ti.types.ndarray(dtype=ti.f32, ndim=2),  # type: ignore[valid-type]
+    features: In[FeatureState],
+    route: In[RouteState],
+    ego: In[Proprioception],
+    mission: In[MissionState],
+    clock: In[ClockState],
+    features_cfg: Const[FeaturesConfig],
+):
+    """Observation (n_env, n_obs) of the awake rows, raw SI units, in the order of ``COLUMNS``."""
+    n, n_sector = ti.static(features.sector_range_m.shape[0], features.sector_range_m.shape[1])
+    for env, pad in ti.ndrange(n, ti.static(spread(n))):
+        if pad == 0 and clock.awake[env] == 1:
+            for source, first, width in ti.static(_sources(_OWN_COLUMNS, features_cfg)):
+                value = source(env, route, ego, mission)
+                for i in ti.static(range(width)):
+                    obs[env, first + i] = ti.cast(value[i], ti.f32)
+            for sector in range(n_sector):
+                for source, first, _width in ti.static(_sources(_SECTOR_COLUMNS, features_cfg)):
+                    obs[env, first + sector] = ti.cast(source(env, sector, features), ti.f32)
+
+
+@quick_launch
+@ti.kernel
+def write_bodies(
+    obs: ti.types.ndarray(dtype=ti.f32, ndim=2),  # type: ignore[valid-type]
+    features: Out[FeatureState],
+    forecast: In[ForecastState],
+    tracks: In[TrackState],
+    ego: In[Proprioception],
+    clock: In[ClockState],
+    features_cfg: Const[FeaturesConfig],
+    forecast_cfg: Const[ForecastConfig],
+    tracking: Const[TrackingConfig],
+    tank: Const[TankConfig],
+    rules: Const[EpisodeConfig],
+):
+    """Columns of the ``n_track`` moving bodies that come closest to the awake rows, in the order of ``BODY_COLUMNS``."""
+    n, n_track = ti.static(tracks.alive.shape[0], tracks.alive.shape[1])
+    for env, track in ti.ndrange(n, n_track):
+        if clock.awake[env] == 1:
+            features.closest_m[env, track] = FAR_M
+            if forecast.radius_m[env, track, 0] >= 0.0:
+                gap, time = closest_approach(env, track, forecast, ego, tracking)
+                features.closest_m[env, track], features.closest_s[env, track] = gap, time
+    for env, pad in ti.ndrange(n, ti.static(spread(n))):
+        if pad == 0 and clock.awake[env] == 1:
+            track, used = -1, 1
+            for slot in range(ti.static(features_cfg.n_track)):
+                if used == 1:
+                    track = next_body(env, track, features)
+                    used = ti.cast(track >= 0, ti.i32)
+                value = ti.Vector.zero(ti.f32, ti.static(_BODY_WIDTH))
+                if used == 1:
+                    value = body_values(env, track, features, forecast, tracks, ego, clock, forecast_cfg, tracking, tank, rules)
+                for at, first, width in ti.static(_body_places(features_cfg)):
+                    for i in ti.static(range(width)):
+                        obs[env, first + slot * width + i] = ti.cast(value[at + i], ti.f32)
+
+
+@quick_launch
+@ti.kernel
+def write_advice(
+    obs: ti.types.ndarray(dtype=ti.f32, ndim=2),  # type: ignore[valid-type]
+    teacher: In[TeacherState],
+    table: In[TreeTable],
+    clock: In[ClockState],
+    features_cfg: Const[FeaturesConfig],
+):
+    """Columns of what the behaviour tree does now in the awake rows, in the order of ``TEACHER_COLUMNS``."""
+    n = ti.static(clock.awake.shape[0])
+    for env, pad in ti.ndrange(n, ti.static(spread(n))):
+        if pad == 0 and clock.awake[env] == 1:
+            for source, first, width in ti.static(_sources(TEACHER_COLUMNS, features_cfg)):
+                value = source(env, teacher, table, features_cfg)
+                for i in ti.static(range(width)):
+                    obs[env, first + i] = ti.cast(value[i], ti.f32)

@@ -1,0 +1,223 @@
+"""Rays against convex primitives: each function returns the span (enter, leave) of the ray parameter inside the primitive.
+
+A body is an intersection of such sets, so its own span is (largest enter, smallest leave); it is hit from outside where
+0 < enter <= leave. Arguments may be scalars or 16-lane packets: a scalar start with packet directions is the usual mix.
+"""
+
+import taichi as ti
+
+from uuvtai.config import TankConfig
+from uuvtai.kernels.core.geometry import BOX, FAR_M, NONE, SPHERE
+from uuvtai.kernels.core.lanes import LANES, f16x
+from uuvtai.kernels.core.signature import Const, In, Out
+from uuvtai.state import SonarMemory, WorldState
+
+_TINY = 1.0e-9
+"""Below this a direction component counts as parallel."""
+
+_SKIN_M = 1.0e-4
+"""A ray that starts on a surface (after a bounce) does not meet that surface again within this."""
+
+Echo = ti.types.struct(range_m=f16x, normal_x=f16x, normal_y=f16x, vel_x=f16x, vel_y=f16x)
+"""What sixteen level rays meet: range [m] (FAR_M = nothing), outward unit normal and velocity [m/s] of the surface."""
+
+
+@ti.func
+def slab_span(start, direction, half):
+    """Span of |start + t * direction| <= half."""
+    inverse = 1.0 / ti.select(ti.abs(direction) < _TINY, _TINY, direction)
+    one = (-half - start) * inverse
+    other = (half - start) * inverse
+    return ti.min(one, other), ti.max(one, other)
+
+
+@ti.func
+def disc_span(x, y, dx, dy, radius_squared):
+    """Span inside a circle (or an infinite cylinder) around the origin; (x, y) = ray's start, (dx, dy) = direction of any length.
+
+    The distance of the line to the centre comes from a cross product: b^2 - c would cancel badly in float32 at 12 m.
+    """
+    length_squared = ti.max(dx * dx + dy * dy, _TINY)
+    cross = x * dy - y * dx
+    room = radius_squared * length_squared - cross * cross
+    return _span(room, -(x * dx + y * dy), length_squared)
+
+
+@ti.func
+def ball_span(x, y, z, dx, dy, dz, radius_squared):
+    """Span inside a sphere around the origin."""
+    length_squared = dx * dx + dy * dy + dz * dz
+    cx, cy, cz = y * dz - z * dy, z * dx - x * dz, x * dy - y * dx
+    room = radius_squared * length_squared - (cx * cx + cy * cy + cz * cz)
+    return _span(room, -(x * dx + y * dy + z * dz), length_squared)
+
+
+@ti.func
+def _span(room, middle, length_squared):
+    root = ti.sqrt(ti.max(room, 0.0))
+    inverse = 1.0 / length_squared
+    enter = ti.select(room < 0.0, FAR_M, (middle - root) * inverse)
+    leave = ti.select(room < 0.0, -FAR_M, (middle + root) * inverse)
+    return enter, leave
+
+
+@ti.func
+def plane_distance(start, direction, low, high):
+    """Ray parameter at which a coordinate that starts within [low, high] leaves it; 0 if it starts beyond that end."""
+    safe = ti.select(ti.abs(direction) < _TINY, _TINY, direction)
+    return ti.max(ti.select(safe > 0.0, high - start, low - start) / safe, 0.0)
+
+
+@ti.func
+def rim_distance(x, y, dx, dy, radius):
+    """Ray parameter at which a ray leaves a circle around the origin; FAR_M if it never meets it."""
+    enter, leave = disc_span(x, y, dx, dy, radius * radius)
+    return ti.select(enter > leave, FAR_M, ti.max(leave, 0.0))
+
+
+# -------------------------------------------------------------------------------------- level rays in the world
+
+
+@ti.func
+def place_bodies(env, x, y, world: In[WorldState], memory: Out[SonarMemory]):
+    """Write centre and reach of every body's outline, as seen from (x, y), for ``bodies_in_wedge``; an empty slot reaches nowhere."""
+    n_body = ti.static(world.kind.shape[1])
+    for slot in range(memory.body_reach_m.shape[1]):
+        reach = -FAR_M
+        if slot < n_body:
+            kind = world.kind[env, slot]
+            if kind != NONE:
+                size = world.size[env, slot]
+                memory.body_x_m[env, slot] = world.pos_w[env, slot][0] - x
+                memory.body_y_m[env, slot] = world.pos_w[env, slot][1] - y
+                reach = ti.cast(size[0] + ti.select(kind == BOX, size[1], 0.0), ti.f32)  # no less than half a box's diagonal
+        memory.body_reach_m[env, slot] = reach
+
+
+@ti.func
+def bodies_in_wedge(env, first, wedge, memory: In[SonarMemory]):
+    """Bit set of those among sixteen bodies whose outline may reach into a wedge at the sensor (conservative).
+
+    ``wedge`` = (x, y) of its middle direction, then (cos, sin) of its half angle.
+    """
+    x, y, reach = f16x(0.0), f16x(0.0), f16x(0.0)
+    for i in ti.static(range(LANES)):
+        x[i], y[i], reach[i] = memory.body_x_m[env, first + i], memory.body_y_m[env, first + i], memory.body_reach_m[env, first + i]
+    along = x * wedge[0] + y * wedge[1]
+    across = ti.abs(x * wedge[1] - y * wedge[0])
+    return lane_bits(across * wedge[2] - along * wedge[3] <= reach)
+
+
+@ti.func
+def bodies_there(env, first, memory: In[SonarMemory]):
+    """Bit set of the slots in use among sixteen."""
+    reach = f16x(0.0)
+    for i in ti.static(range(LANES)):
+        reach[i] = memory.body_reach_m[env, first + i]
+    return lane_bits(reach >= 0.0)
+
+
+@ti.func
+def lane_bits(condition):
+    """Bit i is 1 where the condition holds in lane i."""
+    weights = ti.Vector(ti.static([1 << i for i in range(LANES)]))
+    return ti.select(condition, weights, 0).sum()  # type: ignore[misc]
+
+
+@ti.func
+def nearest_echo(
+    env,
+    x,
+    y,
+    z,
+    ux,
+    uy,
+    travelled,
+    slope,
+    wedge,
+    direct: Const[bool],
+    memory: In[SonarMemory],
+    world: In[WorldState],
+    tank: Const[TankConfig],
+):
+    """Nearest surface along level rays (ux, uy) from (x, y) in the plane z, after a path already ``travelled`` [m].
+
+    A body counts where its vertical gap is at most slope x path. (x, y) and ``travelled`` are scalars, or lanes after a bounce.
+    ``direct`` rays start at the sensor, where only bodies in their ``wedge`` need a test.
+    """
+    echo = wall_echo(x, y, ux, uy, tank)
+    for group in range(ti.static(memory.body_reach_m.shape[1] // LANES)):
+        waiting = 0
+        if ti.static(direct):
+            waiting = bodies_in_wedge(env, group * LANES, wedge, memory)
+        else:
+            waiting = bodies_there(env, group * LANES, memory)
+        while waiting != 0:
+            body = group * LANES + 31 - ti.math.clz(waiting & -waiting)  # the lowest bit
+            waiting &= waiting - 1
+            echo = nearer_echo(env, body, echo, x, y, z, ux, uy, travelled, slope, world)
+    return echo
+
+
+@ti.func
+def nearer_echo(env, body, echo, x, y, z, ux, uy, travelled, slope, world: In[WorldState]):
+    """The echo, or a body's where that is nearer."""
+    out = echo
+    kind = world.kind[env, body]
+    pos, size = world.pos_w[env, body].cast(ti.f32), world.size[env, body].cast(ti.f32)
+    enter, normal_x, normal_y = outline_entry(env, body, kind, size, pos[2] - z, x - pos[0], y - pos[1], ux, uy, travelled, slope, world)
+    gap = ti.select(kind == SPHERE, 0.0, ti.max(ti.abs(pos[2] - z) - size[2], 0.0))
+    nearer = (enter > _SKIN_M) & (enter < echo.range_m) & ((enter + travelled) * slope >= gap)
+    vel = world.vel_w[env, body].cast(ti.f32)
+    out.range_m = ti.select(nearer, enter, echo.range_m)
+    out.normal_x = ti.select(nearer, normal_x, echo.normal_x)
+    out.normal_y = ti.select(nearer, normal_y, echo.normal_y)
+    out.vel_x = ti.select(nearer, vel[0], echo.vel_x)
+    out.vel_y = ti.select(nearer, vel[1], echo.vel_y)
+    return out
+
+
+@ti.func
+def outline_entry(env, body, kind, size, rise, sx, sy, ux, uy, travelled, slope, world: In[WorldState]):
+    """(range, normal x, normal y) where rays from (sx, sy), relative to the body's centre, enter its horizontal outline."""
+    range_m, normal_x, normal_y = f16x(FAR_M), f16x(0.0), f16x(0.0)
+    if kind == BOX:
+        yaw = ti.cast(world.yaw[env, body], ti.f32)
+        c, s = ti.cos(yaw), ti.sin(yaw)
+        dx, dy = ux * c + uy * s, uy * c - ux * s
+        in_x, out_x = slab_span(sx * c + sy * s, dx, size[0])
+        in_y, out_y = slab_span(sy * c - sx * s, dy, size[1])
+        enter, leave = ti.max(in_x, in_y), ti.min(out_x, out_y)
+        face_x = ti.select(in_x > in_y, ti.select(dx > 0.0, -1.0, 1.0), 0.0)
+        face_y = ti.select(in_x > in_y, 0.0, ti.select(dy > 0.0, -1.0, 1.0))
+        range_m = ti.select(enter <= leave, enter, FAR_M)
+        normal_x = face_x * c - face_y * s
+        normal_y = face_x * s + face_y * c
+    else:
+        lost = ti.max(ti.abs(rise) - (ti.sqrt(sx * sx + sy * sy) + travelled) * slope, 0.0)
+        radius_squared = size[0] * size[0] - ti.select(kind == SPHERE, 1.0, 0.0) * lost * lost
+        enter, leave = disc_span(sx, sy, ux, uy, radius_squared)
+        inverse = 1.0 / ti.sqrt(ti.max(radius_squared, 1.0e-12))
+        range_m = enter
+        normal_x = (sx + enter * ux) * inverse
+        normal_y = (sy + enter * uy) * inverse
+    return range_m, normal_x, normal_y
+
+
+@ti.func
+def wall_echo(x, y, ux, uy, tank: Const[TankConfig]):
+    """Side walls of the tank: nothing moves, normals point inwards."""
+    range_m, normal_x, normal_y = f16x(0.0), f16x(0.0), f16x(0.0)
+    if ti.static(tank.shape == "circle"):
+        sx = x - ti.static(0.5 * (tank.x_m[0] + tank.x_m[1]))
+        sy = y - ti.static(0.5 * (tank.y_m[0] + tank.y_m[1]))
+        range_m = rim_distance(sx, sy, ux, uy, tank.radius_m)
+        normal_x = (sx + range_m * ux) * ti.static(-1.0 / tank.radius_m)
+        normal_y = (sy + range_m * uy) * ti.static(-1.0 / tank.radius_m)
+    else:
+        to_x = plane_distance(x, ux, tank.x_m[0], tank.x_m[1])
+        to_y = plane_distance(y, uy, tank.y_m[0], tank.y_m[1])
+        range_m = ti.min(to_x, to_y)
+        normal_x = ti.select(to_x < to_y, ti.select(ux > 0.0, -1.0, 1.0), 0.0)
+        normal_y = ti.select(to_x < to_y, 0.0, ti.select(uy > 0.0, -1.0, 1.0))
+    return Echo(range_m=range_m, normal_x=normal_x, normal_y=normal_y, vel_x=f16x(0.0), vel_y=f16x(0.0))

@@ -1,0 +1,1 @@
+"""Episodes: their clock, how they end, what a step is worth."""

@@ -1,0 +1,1 @@
+"""The behaviour tree and the trajectories it weighs."""

@@ -1,0 +1,213 @@
+"""Search for an evasive velocity: headings times speeds, stop, the last command and the follow velocity, rolled out in packets."""
+
+import taichi as ti
+
+from uuvtai.config import MappingConfig, TankConfig, TeacherConfig, TrackingConfig, VehicleConfig
+from uuvtai.kernels.core.geometry import FAR_M, TWO_PI, turned_z3
+from uuvtai.kernels.core.lanes import LANES, f16x, put_column
+from uuvtai.kernels.core.signature import Const, In, Out, quick_launch, spread
+from uuvtai.kernels.teacher.rollout import body_depths, depth_band, static_depths
+from uuvtai.state import ClearanceState, ClockState, ForecastState, Proprioception, TeacherState
+
+
+@quick_launch
+@ti.kernel
+def plan_evasion(
+    teacher: Out[TeacherState],
+    forecast: In[ForecastState],
+    clearance: In[ClearanceState],
+    ego: In[Proprioception],
+    clock: In[ClockState],
+    teacher_cfg: Const[TeacherConfig],
+    vehicle_cfg: Const[VehicleConfig],
+    tracking_cfg: Const[TrackingConfig],
+    tank_cfg: Const[TankConfig],
+    mapping_cfg: Const[MappingConfig],
+):
+    """Best evasive velocity of the envs with ``want_evade``: the softmax mean of the candidates where that is as good as the best one."""
+    n, n_packet = ti.static(clock.awake.shape[0], teacher.candidate_cost.shape[1] // LANES)
+    for env, packet in ti.ndrange(n, n_packet):
+        if clock.awake[env] == 1 and teacher.want_evade[env] == 1:
+            cx, cy, cz = candidate_lanes(env, packet * LANES, teacher, ego, teacher_cfg, vehicle_cfg, tank_cfg)
+            burst_s = ti.select(packet * LANES >= teacher_cfg.first_burst, teacher_cfg.burst_s, FAR_M)
+            cost = cost_lanes(env, cx, cy, cz, burst_s, teacher, forecast, clearance, ego, teacher_cfg, tracking_cfg, tank_cfg, mapping_cfg)
+            for i in ti.static(range(LANES)):
+                teacher.candidate_cost[env, packet * LANES + i] = cost[i]
+    for env, pad in ti.ndrange(n, ti.static(spread(n))):
+        if pad == 0 and clock.awake[env] == 1 and teacher.want_evade[env] == 1:
+            best, best_cost, mean = _chosen(env, teacher, ego, teacher_cfg, vehicle_cfg, tank_cfg)
+            cx, cy, cz = f16x(0.0), f16x(0.0), f16x(0.0)
+            for i in ti.static(range(LANES)):
+                cx[i], cy[i], cz[i] = mean[0], mean[1], mean[2]
+            cost = cost_lanes(
+                env,
+                cx,
+                cy,
+                cz,
+                FAR_M,
+                teacher,
+                forecast,
+                clearance,
+                ego,
+                teacher_cfg,
+                tracking_cfg,
+                tank_cfg,
+                mapping_cfg,
+            )
+            good = cost[0] <= best_cost + ti.static(teacher_cfg.softness)
+            teacher.evade_vel_w[env] = ti.select(good, mean, best)
+            teacher.evade_cost[env] = ti.select(good, cost[0], best_cost)
+
+
+@ti.func
+def candidate_lanes(
+    env,
+    first,
+    teacher: In[TeacherState],
+    ego: In[Proprioception],
+    teacher_cfg: Const[TeacherConfig],
+    vehicle_cfg: Const[VehicleConfig],
+    tank_cfg: Const[TankConfig],
+):
+    """World velocities (lanes x, y, z [m/s]) of candidates first .. first + 15."""
+    cx, cy, cz = f16x(0.0), f16x(0.0), f16x(0.0)
+    velocities = ti.Matrix.zero(ti.f32, 3, LANES)
+    for lane in range(LANES):
+        put_column(velocities, lane, candidate(env, first + lane, teacher, ego, teacher_cfg, vehicle_cfg, tank_cfg))
+    for i in ti.static(range(LANES)):
+        cx[i], cy[i], cz[i] = velocities[0, i], velocities[1, i], velocities[2, i]
+    return cx, cy, cz
+
+
+@ti.func
+def candidate(
+    env,
+    index,
+    teacher: In[TeacherState],
+    ego: In[Proprioception],
+    teacher_cfg: Const[TeacherConfig],
+    vehicle_cfg: Const[VehicleConfig],
+    tank_cfg: Const[TankConfig],
+):
+    """World velocity of one candidate. Heading 0 is the follow direction, so that slowing down on the route is among them.
+
+    First the level ones (they keep the heave of following), then stop, last command and follow, then those that climb and those that dive,
+    and from ``first_burst`` on the level dashes, which last ``burst_s`` only. Padding repeats standing still.
+    """
+    n_level, n_heave = ti.static(teacher_cfg.n_heading * teacher_cfg.n_speed, teacher_cfg.n_heave_heading)
+    follow = teacher.follow_vel_w[env]
+    out = ti.Vector([0.0, 0.0, 0.0])
+    if index >= ti.static(teacher_cfg.first_burst):
+        turn = ti.static(TWO_PI / 32) * (index - ti.static(teacher_cfg.first_burst))
+        out = _towards(env, turn, 1.0, follow[2], teacher, ego, teacher_cfg, vehicle_cfg)
+    elif index < n_level:
+        speed = 1.0 / ti.static(teacher_cfg.n_speed) * (index // ti.static(teacher_cfg.n_heading) + 1)
+        turn = ti.static(TWO_PI / teacher_cfg.n_heading) * (index % ti.static(teacher_cfg.n_heading))
+        out = _towards(env, turn, speed, follow[2], teacher, ego, teacher_cfg, vehicle_cfg)
+    elif index == n_level + 1:
+        out = teacher.last_vel_w[env]
+        out[2] = edge_limited(out[2], ego.pos_w[env][2], teacher_cfg, tank_cfg)
+    elif index == n_level + 2:
+        out = follow
+    elif index > n_level + 2 and index < ti.static(teacher_cfg.n_held):
+        nth = index - n_level - 3
+        heave = edge_limited(ti.select(nth % 2 == 0, 1.0, -1.0) * teacher_cfg.heave_m_s, ego.pos_w[env][2], teacher_cfg, tank_cfg)
+        turn = ti.static(TWO_PI / teacher_cfg.n_heave_heading) * (nth // 2)
+        out = _towards(env, turn, ti.select(nth >= 2 * n_heave, 0.0, 1.0), heave, teacher, ego, teacher_cfg, vehicle_cfg)
+    return out
+
+
+@ti.func
+def _towards(
+    env,
+    turn,
+    share,
+    heave,
+    teacher: In[TeacherState],
+    ego: In[Proprioception],
+    teacher_cfg: Const[TeacherConfig],
+    vehicle_cfg: Const[VehicleConfig],
+):
+    """World velocity at an angle from the follow direction, at a share of the speed possible there."""
+    follow = teacher.follow_vel_w[env]
+    heading = ti.atan2(follow[1], follow[0]) + turn
+    speed = share * ti.min(ti.static(teacher_cfg.evade_m_s), speed_limit(heading - ego.rpy[env][2], vehicle_cfg))
+    return ti.Vector([ti.cos(heading) * speed, ti.sin(heading) * speed, heave])
+
+
+@ti.func
+def edge_limited(heave, own_z, teacher_cfg: Const[TeacherConfig], tank_cfg: Const[TankConfig]):
+    """Heave [m/s] that stops at the band's edges instead of running into floor or surface."""
+    low, high = ti.static(depth_band(tank_cfg, teacher_cfg))
+    return ti.math.clamp(heave, ti.min(low - own_z, 0.0), ti.max(high - own_z, 0.0))
+
+
+@ti.func
+def speed_limit(angle, cfg: Const[VehicleConfig]):
+    """Fastest level speed in a direction of the body frame: surge and sway are limited one by one, so diagonals are faster."""
+    along = ti.abs(ti.cos(angle)) / ti.static(cfg.max_surge_m_s)
+    across = ti.abs(ti.sin(angle)) / ti.static(cfg.max_sway_m_s)
+    return 1.0 / ti.max(along, across)
+
+
+@ti.func
+def cost_lanes(
+    env,
+    cx,
+    cy,
+    cz,
+    burst_s,
+    teacher: In[TeacherState],
+    forecast: In[ForecastState],
+    clearance: In[ClearanceState],
+    ego: In[Proprioception],
+    teacher_cfg: Const[TeacherConfig],
+    tracking_cfg: Const[TrackingConfig],
+    tank_cfg: Const[TankConfig],
+    mapping_cfg: Const[MappingConfig],
+):
+    """Cost of sixteen commanded velocities. Violations count by depth: a flat penalty drives straight on when every candidate is bad."""
+    pos, vel = ego.pos_w[env], turned_z3(ego.vel_b[env], ego.rpy[env][2])
+    level, level_vel = ti.Vector([pos[0], pos[1]]), ti.Vector([vel[0], vel[1]])
+    peak, mean, contact, _ = body_depths(env, cx, cy, cz, burst_s, pos, vel, forecast, teacher_cfg, tracking_cfg, tank_cfg)
+    static_mean, static_contact = static_depths(env, cx, cy, burst_s, level, level_vel, clearance, teacher_cfg, tank_cfg, mapping_cfg)
+    off = _distance_lanes(cx, cy, cz, teacher.follow_vel_w[env]) * ti.static(teacher_cfg.weight_deviation / teacher_cfg.cruise_m_s)
+    change = _distance_lanes(cx, cy, cz, teacher.last_vel_w[env]) * ti.static(teacher_cfg.weight_change / teacher_cfg.cruise_m_s)
+    moving = peak * ti.static(teacher_cfg.weight_peak) + mean * ti.static(teacher_cfg.weight_mean)
+    touching = contact * ti.static(teacher_cfg.weight_contact) + static_contact * ti.static(teacher_cfg.weight_static_contact)
+    return moving + touching + static_mean * ti.static(teacher_cfg.weight_static) + off + change
+
+
+@ti.func
+def _distance_lanes(cx, cy, cz, velocity):
+    dx = cx - velocity[0]
+    dy = cy - velocity[1]
+    dz = cz - velocity[2]
+    return ti.sqrt(dx * dx + dy * dy + dz * dz)
+
+
+@ti.func
+def _chosen(
+    env,
+    teacher: In[TeacherState],
+    ego: In[Proprioception],
+    teacher_cfg: Const[TeacherConfig],
+    vehicle_cfg: Const[VehicleConfig],
+    tank_cfg: Const[TankConfig],
+):
+    """Candidate of least cost (first of equals), and the mean of the candidates weighted by exp(-cost / softness)."""
+    n_used = ti.static(teacher_cfg.n_candidate)
+    best_cost, best = FAR_M, 0
+    for index in range(n_used):
+        if teacher.candidate_cost[env, index] < best_cost:
+            best_cost = teacher.candidate_cost[env, index]
+            best = index
+    total, mean = 0.0, ti.Vector([0.0, 0.0, 0.0])
+    for index in range(n_used):
+        excess = (teacher.candidate_cost[env, index] - best_cost) * ti.static(1.0 / teacher_cfg.softness)
+        if excess < 12.0:
+            weight = ti.exp(-excess)
+            total += weight
+            mean += weight * candidate(env, index, teacher, ego, teacher_cfg, vehicle_cfg, tank_cfg)
+    average = ti.Vector([mean[i] / total for i in range(3)])
+    return candidate(env, best, teacher, ego, teacher_cfg, vehicle_cfg, tank_cfg), best_cost, average

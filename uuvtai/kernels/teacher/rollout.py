@@ -1,0 +1,174 @@
+"""Roll-outs of sixteen commanded velocities at once against forecast bodies and the mapped clearance.
+
+A commanded velocity c is reached with a first-order lag tau, so from velocity v0 the vehicle drives
+x(t) = x0 + v0 A(t) + c B(t), A(t) = tau (1 - exp(-t / tau)), B(t) = t - A(t): linear in c, which is all the lanes differ in.
+A burst that ends after T commands -c on top from then on: c (B(t) - B(t - T)).
+"""
+
+import taichi as ti
+
+from uuvtai.config import MappingConfig, TankConfig, TeacherConfig, TrackingConfig, VehicleConfig
+from uuvtai.kernels.core.geometry import FAR_M
+from uuvtai.kernels.core.grid import grid_origin
+from uuvtai.kernels.core.lanes import LANES, f16x
+from uuvtai.kernels.core.signature import Const, In
+from uuvtai.state import ClearanceState, ForecastState
+
+
+@ti.func
+def body_depths(
+    env,
+    cx,
+    cy,
+    cz,
+    burst_s,
+    pos,
+    vel,
+    forecast: In[ForecastState],
+    teacher_cfg: Const[TeacherConfig],
+    tracking_cfg: Const[TrackingConfig],
+    tank_cfg: Const[TankConfig],
+):
+    """How deep each commanded velocity (lanes cx, cy, cz [m/s]) violates the wanted clearance from the forecast bodies.
+
+    The velocities are commanded for ``burst_s`` [s], then stop. ``pos``, ``vel``: own position [m] and velocity [m/s] now, world.
+    Returns lanes: largest depth [m]; depth averaged over the horizon and summed over bodies [m]; largest depth below contact [m]; time of
+    the first violation [s], FAR_M = none. The clearance is reduced by closing_s times the closing speed, as the referee also stops at a
+    small time to collision. Bodies are upright cylinders; water known to be free above or below them (``above_w``, ``below_w``) adds to
+    the distance.
+    """
+    n_track, n_sample = ti.static(forecast.radius_m.shape[1], _samples(forecast.radius_m.shape[2], teacher_cfg, tracking_cfg))
+    dt = ti.static(tracking_cfg.forecast_dt_s)
+    low, high = ti.static(depth_band(tank_cfg, teacher_cfg))
+    peak, mean, contact, first = f16x(0.0), f16x(0.0), f16x(0.0), f16x(FAR_M)
+    level, level_vel = ti.Vector([pos[0], pos[1]]), ti.Vector([vel[0], vel[1]])
+    reach_speed = level_vel.norm() + ti.static(_fastest(teacher_cfg))
+    for track in range(n_track):
+        if forecast.radius_m[env, track, 0] >= 0:
+            above, below = forecast.above_w[env, track], forecast.below_w[env, track]
+            decay, rest = 1.0, 1.0
+            for k in range(1, n_sample):
+                decay *= ti.static(_decay(tracking_cfg.forecast_dt_s, teacher_cfg.lag_s))
+                time = k * dt
+                over = ti.max(time - burst_s, 0.0)
+                if over > 0.0:
+                    rest = ti.exp(over * ti.static(-1.0 / teacher_cfg.lag_s))
+                settle = ti.static(teacher_cfg.lag_s) * (1.0 - decay)
+                gain = time - settle - over + ti.static(teacher_cfg.lag_s) * (1.0 - rest)
+                body = forecast.pos_w[env, track, k]
+                body_vel = (body - forecast.pos_w[env, track, k - 1]) / dt
+                start = level + level_vel * settle - body
+                drift = level_vel * decay - body_vel
+                margin = teacher_cfg.margin_m + teacher_cfg.margin_growth_m_s * time
+                wanted = teacher_cfg.contact_m + teacher_cfg.caution * margin
+                radius = forecast.radius_m[env, track, k]
+                bound = radius + ti.static(teacher_cfg.hull_reach_m) + wanted + ti.static(_fastest(teacher_cfg)) * gain
+                bound += ti.static(teacher_cfg.closing_s) * (reach_speed + body_vel.norm())
+                if radius >= 0 and start.norm_sqr() < bound * bound:
+                    z = ti.math.clamp(cz * gain + (pos[2] + vel[2] * settle), low, high)
+                    gap = ti.max(ti.min(above - z, z - below), 0.0) * ti.static(teacher_cfg.vertical_weight)
+                    free = _free_lanes(cx, cy, gap, start, drift, gain, rest - decay, radius, teacher_cfg)
+                    for i in ti.static(range(LANES)):
+                        depth = ti.max(wanted - free[i], 0.0)
+                        peak[i] = ti.max(peak[i], depth)
+                        mean[i] += depth * ti.static(1.0 / (_samples(forecast.radius_m.shape[2], teacher_cfg, tracking_cfg) - 1))
+                        contact[i] = ti.max(contact[i], ti.static(teacher_cfg.contact_m) - free[i])
+                        first[i] = ti.min(first[i], ti.select(depth > 0.0, time, FAR_M))
+    return peak, mean, contact, first
+
+
+@ti.func
+def _free_lanes(cx, cy, gap, start, drift, gain, share, radius, teacher_cfg: Const[TeacherConfig]):
+    """Surface-to-surface distance less closing_s times the closing speed, per lane; ``gap`` = weighted free water above or below.
+
+    Position relative to the body is start + c gain, relative velocity drift + c share. Level with the body (gap 0) the distance goes on
+    below zero inside its radius, so that deeper is worse.
+    """
+    dx = cx * gain + start[0]
+    dy = cy * gain + start[1]
+    middle = ti.sqrt(dx * dx + dy * dy + 1.0e-8)
+    beyond = ti.max(middle - radius, 0.0)
+    within = ti.select(gap > 0.0, 0.0, ti.min(middle - radius, 0.0))
+    distance = ti.sqrt(beyond * beyond + gap * gap + 1.0e-8)
+    approach = -(dx * (cx * share + drift[0]) + dy * (cy * share + drift[1])) / middle
+    closing = ti.max(approach, 0.0) * ti.select(gap > 0.0, beyond / distance, 1.0)
+    return distance + within - ti.static(teacher_cfg.hull_reach_m) - ti.static(teacher_cfg.closing_s) * closing
+
+
+@ti.func
+def static_depths(
+    env,
+    cx,
+    cy,
+    burst_s,
+    pos,
+    vel,
+    clearance: In[ClearanceState],
+    teacher_cfg: Const[TeacherConfig],
+    tank_cfg: Const[TankConfig],
+    mapping_cfg: Const[MappingConfig],
+):
+    """How deep each commanded velocity violates the wanted static clearance: lanes mean depth and largest depth below contact [m]."""
+    mean, contact = f16x(0.0), f16x(0.0)
+    n_sample = ti.static(max(1, round(teacher_cfg.static_horizon_s / teacher_cfg.static_dt_s)))
+    touch = ti.static(teacher_cfg.hull_reach_m + teacher_cfg.contact_m)
+    for k in range(1, n_sample + 1):
+        time = k * ti.static(teacher_cfg.static_dt_s)
+        settle = settling(time, teacher_cfg)
+        over = ti.max(time - burst_s, 0.0)
+        gain = time - settle - over + settling(over, teacher_cfg)
+        free = clearance_lanes(
+            env, cx * gain + (pos[0] + vel[0] * settle), cy * gain + (pos[1] + vel[1] * settle), clearance, tank_cfg, mapping_cfg
+        )
+        for i in ti.static(range(LANES)):
+            below = touch - free[i]
+            mean[i] += ti.max(below + ti.static(teacher_cfg.static_margin_m), 0.0) / n_sample
+            contact[i] = ti.max(contact[i], below)
+    return mean, contact
+
+
+@ti.func
+def settling(time, cfg: Const[TeacherConfig]):
+    """A(t) [s] of the module's text."""
+    return ti.static(cfg.lag_s) * (1.0 - ti.exp(-time * ti.static(1.0 / cfg.lag_s)))
+
+
+@ti.func
+def clearance_lanes(env, x, y, clearance: In[ClearanceState], tank_cfg: Const[TankConfig], mapping_cfg: Const[MappingConfig]):
+    """Mapped clearance [m] of the cells that hold the lanes' positions; positions off the grid take its border, which is 0."""
+    x0, y0 = ti.static(grid_origin(tank_cfg, mapping_cfg.cell_m))
+    n_row, n_col = ti.static(clearance.clearance_m.shape[1], clearance.clearance_m.shape[2])
+    at_col = (x - x0) * ti.static(1.0 / mapping_cfg.cell_m)
+    at_row = (y - y0) * ti.static(1.0 / mapping_cfg.cell_m)
+    out = f16x(0.0)
+    for i in ti.static(range(LANES)):
+        row = ti.math.clamp(ti.cast(ti.floor(at_row[i]), ti.i32), 0, n_row - 1)
+        col = ti.math.clamp(ti.cast(ti.floor(at_col[i]), ti.i32), 0, n_col - 1)
+        out[i] = clearance.clearance_m[env, row, col]
+    return out
+
+
+@ti.func
+def held_heave(error_m, cfg: Const[TeacherConfig], vehicle_cfg: Const[VehicleConfig]):
+    """Vertical speed [m/s] that corrects a depth error [m]."""
+    top = ti.static(vehicle_cfg.max_heave_m_s)
+    return ti.math.clamp(error_m * ti.static(cfg.depth_gain), -top, top)
+
+
+def depth_band(tank_cfg, teacher_cfg):
+    """(lowest, highest) own z [m] that the teacher steers for."""
+    return tank_cfg.z_m[0] + teacher_cfg.edge_gap_m, tank_cfg.z_m[1] - teacher_cfg.edge_gap_m
+
+
+def _decay(dt_s, lag_s):
+    return 2.718281828459045 ** (-dt_s / lag_s)
+
+
+def _fastest(teacher_cfg):
+    """[m/s] no level velocity that is ever rolled out is faster."""
+    return max(teacher_cfg.evade_m_s, teacher_cfg.cruise_m_s, teacher_cfg.back_off_m_s, teacher_cfg.unstick_m_s)
+
+
+def _samples(n_forecast, teacher_cfg, tracking_cfg):
+    """Forecast samples used: the horizon, or what there is."""
+    return min(n_forecast, round(teacher_cfg.horizon_s / tracking_cfg.forecast_dt_s) + 1)

@@ -1,0 +1,1 @@
+"""From an action to thrust, and from thrust to motion."""

@@ -1,0 +1,251 @@
+"""Inner loop: commanded body velocity and yaw rate -> wrench -> thrusts -> rotor commands, from measured motion only.
+
+The vehicle knows its nominal parameters (vehicle section): drag, Coriolis and net buoyancy are fed forward, PI feedback does the rest.
+Vehicles are driven in packets of neighbouring rows (lanes.py, second way).
+"""
+
+from typing import Any, NamedTuple
+
+import taichi as ti
+
+from uuvtai.config import ActuationConfig, EpisodeConfig, VehicleConfig
+from uuvtai.kernels.core.lanes import column, is_awake, n_awake, n_column, put_column
+from uuvtai.kernels.core.signature import Const, In, Out, quick_launch, spread
+from uuvtai.kernels.vehicle.rotor import rpm_of_thrust, thrust_limits
+from uuvtai.state import ActuationState, Allocation, ClockState, Proprioception, VehicleParams
+
+
+@quick_launch
+@ti.kernel
+def command_thrusters(
+    action: ti.types.ndarray(dtype=ti.f32, ndim=2),  # type: ignore[valid-type]
+    actuation: Out[ActuationState],
+    params: In[VehicleParams],
+    allocation: In[Allocation],
+    ego: In[Proprioception],
+    clock: In[ClockState],
+    vehicle_cfg: Const[VehicleConfig],
+    actuation_cfg: Const[ActuationConfig],
+    episode_cfg: Const[EpisodeConfig],
+):
+    """action (n_env, 4): surge, sway, heave, yaw rate in [-1, 1] of the vehicle's limits -> actuation.rpm_command."""
+    n, lanes = ti.static(clock.awake.shape[0], n_column())
+    n_packet = ti.static(-(-n // lanes))
+    for packet, pad in ti.ndrange(n_packet, ti.static(spread(n_packet))):
+        if pad == 0 and n_awake(packet * lanes, lanes, clock) > 0:
+            for env in range(packet * lanes, (packet + 1) * lanes):
+                if is_awake(env, clock):
+                    raw = ti.Vector([action[env, 0], action[env, 1], action[env, 2], action[env, 3]])
+                    actuation.command[env] = scaled_command(raw, vehicle_cfg)
+            _drive(packet * lanes, lanes, actuation, params, allocation, ego, clock, vehicle_cfg, actuation_cfg, episode_cfg)
+
+
+@quick_launch
+@ti.kernel
+def reset_actuation(actuation: Out[ActuationState], clock: In[ClockState]):
+    """Nothing commanded, nothing under way."""
+    n = ti.static(clock.awake.shape[0])
+    for env, pad in ti.ndrange(n, ti.static(spread(n))):
+        if pad == 0 and clock.awake[env] == 1:
+            actuation.command[env] = 0.0
+            actuation.integral[env] = 0.0
+            actuation.hold_moment_b[env] = 0.0
+            actuation.external_wrench_b[env] = 0.0
+            for i in range(ti.static(actuation.rpm_command.shape[1])):
+                actuation.rpm_command[env, i] = 0.0
+                actuation.thrust_n[env, i] = 0.0
+                for slot in range(ti.static(actuation.rpm_queue.shape[1])):
+                    actuation.rpm_queue[env, slot, i] = 0.0
+
+
+class AxisLoop(NamedTuple):
+    """PI loop of one commanded axis."""
+
+    gain: float
+    integral_gain: float
+    band: float
+    """[m/s or rad/s] errors beyond it do not build up the integral"""
+    bound: float
+    """[N or N m] of the integral"""
+    limit: float
+    """[N or N m] of the whole"""
+
+
+def axis_loops(cfg):
+    """Loops of surge, sway, heave and yaw rate; plain Python, constants of the kernel."""
+    linear = zip(cfg.velocity_gain, cfg.velocity_integral, cfg.max_force_n, strict=True)
+    yaw = AxisLoop(cfg.yaw_rate_gain, cfg.yaw_rate_integral, cfg.integral_band_rad_s, cfg.max_integral_n_m, cfg.max_moment_n_m)
+    return (*(AxisLoop(p, i, cfg.integral_band_m_s, cfg.max_integral_n, limit) for p, i, limit in linear), yaw)
+
+
+@ti.func
+def scaled_command(action, cfg: Const[VehicleConfig]):
+    """[m/s, m/s, m/s, rad/s] of an action, clamped to [-1, 1]; NaN asks for nothing."""
+    limits = ti.Vector([cfg.max_surge_m_s, cfg.max_sway_m_s, cfg.max_heave_m_s, cfg.max_yaw_rate_rad_s])
+    out = ti.Vector([0.0] * 4)
+    for axis in ti.static(range(4)):
+        if action[axis] >= 1.0:
+            out[axis] = limits[axis]
+        elif action[axis] <= -1.0:
+            out[axis] = -limits[axis]
+        elif action[axis] > -1.0 and action[axis] < 1.0:  # false for NaN
+            out[axis] = action[axis] * limits[axis]
+    return out
+
+
+@ti.func
+def _drive(
+    first,
+    lanes: Const[int],
+    actuation: Out[ActuationState],
+    params: In[VehicleParams],
+    allocation: In[Allocation],
+    ego: In[Proprioception],
+    clock: In[ClockState],
+    vehicle_cfg: Const[VehicleConfig],
+    actuation_cfg: Const[ActuationConfig],
+    episode_cfg: Const[EpisodeConfig],
+):
+    """Rotor speeds of the velocity loop for the packet of vehicles that begins with ``first``, into this step's slot of the queue."""
+    n, n_thruster = ti.static(actuation.rpm_command.shape[0], actuation.rpm_command.shape[1])
+    fleet = ti.Struct(
+        command=ti.Matrix([[0.0] * lanes for _ in range(4)]),
+        vel=ti.Matrix([[0.0] * lanes for _ in range(3)]),
+        rate=ti.Matrix([[0.0] * lanes for _ in range(3)]),
+        up=ti.Matrix([[0.0] * lanes for _ in range(3)]),
+        integral=ti.Matrix([[0.0] * lanes for _ in range(4)]),
+        seen=ti.Matrix([[0.0] * lanes for _ in range(1)]),
+        rpm=ti.Matrix([[0.0] * lanes for _ in range(n_thruster)]),
+    )
+    for lane in range(lanes):
+        _embark(lane, ti.min(first + lane, n - 1), fleet, actuation, ego)
+    inverse = ti.Matrix([[allocation.thrust_of_wrench[i, axis] for axis in range(6)] for i in range(n_thruster)])
+    for lane in range(lanes):
+        _control(lane, fleet, inverse, vehicle_cfg, actuation_cfg, episode_cfg)
+    for lane in range(lanes):
+        if is_awake(first + lane, clock):
+            _disembark(lane, first + lane, fleet, actuation, params, clock)
+
+
+@ti.func
+def _embark(lane, env, fleet: Out[Any], actuation: In[ActuationState], ego: In[Proprioception]):
+    """Copy what one vehicle wants and senses into its column."""
+    command, vel = actuation.command[env], ego.vel_b[env]
+    # a lost DVL holds an old velocity: feeding that back would run away, so the feed-forward drives alone until it is back
+    seen = ego.vel_valid[env] == 1
+    for axis in ti.static(range(3)):
+        fleet.vel[axis, lane] = ti.select(seen, vel[axis], command[axis])
+    fleet.seen[0, lane] = ti.select(seen, 1.0, 0.0)
+    put_column(fleet.command, lane, command)
+    put_column(fleet.rate, lane, ego.rate_b[env])
+    put_column(fleet.up, lane, _up_b(ego.rpy[env]))
+    put_column(fleet.integral, lane, actuation.integral[env])
+
+
+@ti.func
+def _disembark(lane, env, fleet: In[Any], actuation: Out[ActuationState], params: In[VehicleParams], clock: In[ClockState]):
+    """Copy one vehicle's column back. What left the queue's tail reaches the rotors: the command of delay_steps control steps ago."""
+    actuation.integral[env] = column(fleet.integral, lane)
+    n_slot = ti.static(actuation.rpm_queue.shape[1])
+    slot = clock.step[env] % n_slot
+    due = (clock.step[env] - params.delay_steps[env]) % n_slot
+    for i in ti.static(range(actuation.rpm_command.shape[1])):
+        actuation.rpm_queue[env, slot, i] = fleet.rpm[i, lane]
+    for i in ti.static(range(actuation.rpm_command.shape[1])):
+        actuation.rpm_command[env, i] = actuation.rpm_queue[env, due, i]
+
+
+@ti.func
+def _control(
+    lane,
+    fleet: Out[Any],
+    inverse: In[Any],
+    vehicle_cfg: Const[VehicleConfig],
+    actuation_cfg: Const[ActuationConfig],
+    episode_cfg: Const[EpisodeConfig],
+):
+    """Velocity loop of one column. It touches local variables only, so that the loop over columns becomes vector code."""
+    command, vel, rate = column(fleet.command, lane), column(fleet.vel, lane), column(fleet.rate, lane)
+    integral, up = column(fleet.integral, lane), column(fleet.up, lane)
+    error = ti.Vector([command[0] - vel[0], command[1] - vel[1], command[2] - vel[2], command[3] - rate[2]])
+    force, moment = feed_forward(command, vel, rate, up, vehicle_cfg)
+    ahead = ti.Vector([force[0], force[1], force[2], moment[2]])
+    loops = ti.static(axis_loops(actuation_cfg))
+    asked = ti.Vector([ahead[axis] + integral[axis] for axis in range(4)])
+    given = ti.Vector([0.0] * 4)
+    for axis in ti.static(range(4)):
+        asked[axis] += loops[axis].gain * error[axis]
+        given[axis] = ti.math.clamp(asked[axis], -loops[axis].limit, loops[axis].limit)
+    roll_moment, pitch_moment = 0.0, 0.0
+    if ti.static(vehicle_cfg.attitude_hold == "thrusters"):
+        roll_moment, pitch_moment = stabilising_moment(up, rate, moment, actuation_cfg)
+    wrench = ti.Vector([given[0], given[1], given[2], roll_moment, pitch_moment, given[3]])
+    share = _allocate(lane, wrench, fleet, inverse, vehicle_cfg)
+    for axis in ti.static(range(4)):
+        starved = share < 1.0 or given[axis] != asked[axis]
+        per_step = loops[axis].integral_gain * episode_cfg.control_dt_s
+        after = integrated(integral[axis], error[axis], starved, per_step, loops[axis].band, loops[axis].bound)
+        fleet.integral[axis, lane] = ti.select(fleet.seen[0, lane] == 1.0 or axis == 3, after, integral[axis])
+
+
+@ti.func
+def integrated(integral, error, starved, gain, band, bound):
+    """Integral part [N or N m] after one control step; ``gain`` is per step. It never winds up:
+
+    it shrinks freely, but grows only on errors smaller than ``band`` that the actuators can serve (``starved``: they give less than asked).
+    """
+    share = 0.0 if starved else ti.max(0.0, 1.0 - abs(error) / band)
+    if error * integral < 0.0:
+        share = 1.0
+    return ti.math.clamp(integral + gain * share * error, -bound, bound)
+
+
+@ti.func
+def feed_forward(command, vel, rate, up, cfg: Const[VehicleConfig]):
+    """Force and moment that hold the commanded velocity in still water: drag of the command, Coriolis of the motion, net buoyancy."""
+    mass, added, linear, quadratic = ti.static(cfg.mass_kg, cfg.added_mass, cfg.linear_damping, cfg.quadratic_damping)
+    momentum = ti.Vector([(mass + added[0]) * vel[0], (mass + added[1]) * vel[1], (mass + added[2]) * vel[2]])
+    spin = ti.Vector([(cfg.inertia_kg_m2[i] + added[3 + i]) * rate[i] for i in ti.static(range(3))])
+    force = rate.cross(momentum)
+    moment = rate.cross(spin) + vel.cross(momentum)
+    for axis in ti.static(range(3)):
+        force[axis] += (linear[axis] + quadratic[axis] * abs(command[axis])) * command[axis]
+    moment[2] += (linear[5] + quadratic[5] * abs(command[3])) * command[3]
+    net = ti.static(cfg.gravity_m_s2 * (cfg.water_density_kg_m3 * cfg.volume_m3 - cfg.mass_kg))
+    return force - net * up, moment
+
+
+@ti.func
+def stabilising_moment(up, rate, coriolis, cfg: Const[ActuationConfig]):
+    """[N m] roll and pitch moment of the hold by thrusters: upright, damped, Munk moment fed forward, bounded."""
+    k, d = cfg.thruster_hold_gain_n_m, cfg.thruster_hold_damping
+    roll, pitch = coriolis[0] - k * up[1] - d * rate[0], coriolis[1] + k * up[0] - d * rate[1]
+    share = ti.min(1.0, cfg.hold_limit_n_m / ti.max(ti.sqrt(roll * roll + pitch * pitch), 1e-6))
+    return share * roll, share * pitch
+
+
+@ti.func
+def _up_b(rpy):
+    """World z axis seen in body axes."""
+    return ti.Vector([-ti.sin(rpy[1]), ti.sin(rpy[0]) * ti.cos(rpy[1]), ti.cos(rpy[0]) * ti.cos(rpy[1])])
+
+
+@ti.func
+def _allocate(lane, wrench, fleet: Out[Any], inverse: In[Any], cfg: Const[VehicleConfig]):
+    """Least-squares thrusts to rotor speeds; returns the share <= 1 by which all thrusts are scaled so that none exceeds its limit.
+
+    One factor for all keeps the wrench's direction: a vehicle that clips single thrusters turns and drifts where it should only be slower.
+    """
+    forward, reverse = ti.static(thrust_limits(cfg))
+    thrust = ti.Vector([0.0] * ti.static(len(cfg.thrusters)))
+    share = 1.0
+    for i in ti.static(range(len(cfg.thrusters))):
+        for axis in ti.static(range(6)):
+            thrust[i] += inverse[i, axis] * wrench[axis]
+        if thrust[i] > 0.0:
+            share = ti.min(share, forward / thrust[i])
+        elif thrust[i] < 0.0:
+            share = ti.min(share, reverse / thrust[i])
+    for i in ti.static(range(len(cfg.thrusters))):
+        fleet.rpm[i, lane] = rpm_of_thrust(share * thrust[i], cfg)
+    return share

@@ -1,0 +1,422 @@
+"""Rigid body in water: Fossen's six degrees of freedom with current, added mass, damping, buoyancy and rotors.
+
+(M_RB + M_A) dnu/dt + C_RB(nu) nu + C_A(nu_r) nu_r + D(nu_r) nu_r + g(eta) = tau   (T. Fossen, Handbook of Marine Craft, 2011)
+
+Origin at the centre of mass and diagonal added mass make the full mass matrix diagonal, so it is solved exactly; the acceleration is never
+filtered (that is unstable when M_A > M_RB). Each substep is one explicit midpoint step, second order in dt.
+
+Vehicles move in packets of neighbouring rows (lanes.py, second way): a packet is copied into a local ``fleet``, whose matrices have a
+column per vehicle, moved by a loop over the columns that touches nothing else, and copied back.
+"""
+
+from typing import Any
+
+import taichi as ti
+
+from uuvtai.config import ActuationConfig, DisturbanceConfig, EpisodeConfig, VehicleConfig
+from uuvtai.kernels.core.geometry import quaternion_wb, roll_pitch_yaw, rotation_wb
+from uuvtai.kernels.core.lanes import column, is_awake, n_awake, n_column, put_column
+from uuvtai.kernels.core.noise import STREAM_CURRENT, STREAM_THRUSTER, STREAM_VEHICLE, normal, stream_key, uniform_in
+from uuvtai.kernels.core.signature import Const, In, Out, quick_launch, spread
+from uuvtai.kernels.vehicle.rotor import lag_kept, thrust_of_rpm
+from uuvtai.state import (
+    ActuationState,
+    Allocation,
+    ClockState,
+    CurrentState,
+    EpisodeState,
+    MissionState,
+    Proprioception,
+    VehicleParams,
+    VehicleState,
+)
+
+# draws of STREAM_VEHICLE (each spread has its own index, so switching one on does not change another)
+_DRAW_MASS = 0
+_DRAW_ADDED_MASS = 1
+_DRAW_LINEAR = 7
+_DRAW_QUADRATIC = 13
+
+
+@quick_launch
+@ti.kernel
+def move_vehicle(
+    vehicle: Out[VehicleState],
+    actuation: Out[ActuationState],
+    current: Out[CurrentState],
+    params: In[VehicleParams],
+    allocation: In[Allocation],
+    episode: In[EpisodeState],
+    clock: In[ClockState],
+    vehicle_cfg: Const[VehicleConfig],
+    actuation_cfg: Const[ActuationConfig],
+    disturbance_cfg: Const[DisturbanceConfig],
+    dt_s: float,
+    n_substep: int,
+):
+    """One control step of dt_s [s] in n_substep substeps; then the current moves on to the end of the step."""
+    n, lanes = ti.static(clock.awake.shape[0], n_column())
+    n_packet = ti.static(-(-n // lanes))
+    for packet, pad in ti.ndrange(n_packet, ti.static(spread(n_packet))):
+        if pad == 0 and n_awake(packet * lanes, lanes, clock) > 0:
+            _move(
+                packet * lanes,
+                lanes,
+                vehicle,
+                actuation,
+                current,
+                params,
+                allocation,
+                clock,
+                vehicle_cfg,
+                actuation_cfg,
+                dt_s / n_substep,
+                n_substep,
+            )
+            if ti.static(disturbance_cfg.current_sigma_m_s > 0):
+                for env in range(packet * lanes, (packet + 1) * lanes):
+                    if is_awake(env, clock):
+                        key = stream_key(episode.key[env], clock.step[env], STREAM_CURRENT)
+                        current.vel_w[env] = current_after(current.mean_w[env], current.vel_w[env], key, disturbance_cfg, dt_s)
+
+
+@quick_launch
+@ti.kernel
+def reset_vehicle(
+    vehicle: Out[VehicleState],
+    params: Out[VehicleParams],
+    current: Out[CurrentState],
+    mission: In[MissionState],
+    episode: In[EpisodeState],
+    clock: In[ClockState],
+    vehicle_cfg: Const[VehicleConfig],
+    disturbance_cfg: Const[DisturbanceConfig],
+    episode_cfg: Const[EpisodeConfig],
+):
+    """At rest at the mission's start, with this episode's parameters and current."""
+    n = ti.static(clock.awake.shape[0])
+    for env, pad in ti.ndrange(n, ti.static(spread(n))):
+        if pad == 0 and clock.awake[env] == 1:
+            _place(env, vehicle, mission)
+            _draw_body(env, params, episode, vehicle_cfg, disturbance_cfg)
+            _draw_thrusters(env, params, episode, vehicle_cfg, disturbance_cfg)
+            delay = ti.static(round(disturbance_cfg.thruster_delay_s / episode_cfg.control_dt_s))
+            params.delay_steps[env] = delay
+            _draw_current(env, current, episode, disturbance_cfg)
+
+
+@quick_launch
+@ti.kernel
+def sense_exactly(ego: Out[Proprioception], vehicle: In[VehicleState], clock: In[ClockState]):
+    """Perfect velocity, attitude and rates for the inner loop: experiments on the plant alone have no sensors."""
+    for env in range(ti.static(clock.awake.shape[0])):
+        if clock.awake[env] == 1:
+            ego.vel_b[env] = vehicle.vel_b[env]
+            ego.vel_valid[env] = 1
+            ego.rate_b[env] = vehicle.rate_b[env]
+            ego.rpy[env] = roll_pitch_yaw(vehicle.quat_wb[env])
+            ego.pos_w[env] = vehicle.pos_w[env]
+
+
+# ------------------------------------------------------------------------------------------------------------------ one step
+
+
+@ti.func
+def _move(
+    first,
+    lanes: Const[int],
+    vehicle: Out[VehicleState],
+    actuation: Out[ActuationState],
+    current: In[CurrentState],
+    params: In[VehicleParams],
+    allocation: In[Allocation],
+    clock: In[ClockState],
+    vehicle_cfg: Const[VehicleConfig],
+    actuation_cfg: Const[ActuationConfig],
+    dt,
+    n_substep,
+):
+    """n_substep midpoint steps of the packet of vehicles that begins with ``first``."""
+    n, n_thruster = ti.static(vehicle.rpm.shape[0], vehicle.rpm.shape[1])
+    fleet = ti.Struct(
+        pos=ti.Matrix([[0.0] * lanes for _ in range(3)]),
+        quat=ti.Matrix([[0.0] * lanes for _ in range(4)]),
+        vel=ti.Matrix([[0.0] * lanes for _ in range(3)]),
+        rate=ti.Matrix([[0.0] * lanes for _ in range(3)]),
+        acc=ti.Matrix([[0.0] * lanes for _ in range(3)]),
+        hold=ti.Matrix([[0.0] * lanes for _ in range(3)]),
+        rpm=ti.Matrix([[0.0] * lanes for _ in range(n_thruster)]),
+        thrust=ti.Matrix([[0.0] * lanes for _ in range(n_thruster)]),
+        # from here on read only
+        command=ti.Matrix([[0.0] * lanes for _ in range(n_thruster)]),
+        gain=ti.Matrix([[0.0] * lanes for _ in range(n_thruster)]),
+        outside=ti.Matrix([[0.0] * lanes for _ in range(6)]),
+        current=ti.Matrix([[0.0] * lanes for _ in range(3)]),
+        mass=ti.Matrix([[0.0] * lanes for _ in range(6)]),
+        added=ti.Matrix([[0.0] * lanes for _ in range(6)]),
+        linear=ti.Matrix([[0.0] * lanes for _ in range(6)]),
+        quadratic=ti.Matrix([[0.0] * lanes for _ in range(6)]),
+        lift=ti.Matrix([[0.0] * lanes for _ in range(2)]),
+    )
+    for lane in range(lanes):
+        _embark(lane, ti.min(first + lane, n - 1), fleet, vehicle, actuation, current, params)
+    geometry = ti.Matrix([[allocation.wrench_of_thrust[axis, i] for i in range(n_thruster)] for axis in range(6)])
+    kept = lag_kept(0.5 * dt, vehicle_cfg.rotor_tau_s)
+    for _ in range(n_substep):
+        for lane in range(lanes):
+            _advance(lane, fleet, geometry, kept, dt, vehicle_cfg, actuation_cfg)
+    for lane in range(lanes):
+        if is_awake(first + lane, clock):
+            _disembark(lane, first + lane, fleet, vehicle, actuation, vehicle_cfg)
+
+
+@ti.func
+def _embark(
+    lane,
+    env,
+    fleet: Out[Any],
+    vehicle: In[VehicleState],
+    actuation: In[ActuationState],
+    current: In[CurrentState],
+    params: In[VehicleParams],
+):
+    """Copy what moves one vehicle into its column."""
+    put_column(fleet.pos, lane, vehicle.pos_w[env])
+    put_column(fleet.quat, lane, vehicle.quat_wb[env])
+    put_column(fleet.vel, lane, vehicle.vel_b[env])
+    put_column(fleet.rate, lane, vehicle.rate_b[env])
+    put_column(fleet.outside, lane, actuation.external_wrench_b[env])
+    put_column(fleet.current, lane, current.vel_w[env])
+    put_column(fleet.added, lane, params.added_mass[env])
+    put_column(fleet.linear, lane, params.linear_damping[env])
+    put_column(fleet.quadratic, lane, params.quadratic_damping[env])
+    for axis in ti.static(range(3)):
+        fleet.mass[axis, lane] = params.mass_kg[env]
+        fleet.mass[axis + 3, lane] = params.inertia[env][axis]
+    fleet.lift[0, lane] = params.buoyancy_n[env]
+    fleet.lift[1, lane] = params.buoyancy_height_m[env]
+    for i in ti.static(range(vehicle.rpm.shape[1])):
+        fleet.rpm[i, lane] = vehicle.rpm[env, i]
+        fleet.command[i, lane] = actuation.rpm_command[env, i]
+        fleet.gain[i, lane] = params.thruster_gain[env, i]
+
+
+@ti.func
+def _disembark(lane, env, fleet: In[Any], vehicle: Out[VehicleState], actuation: Out[ActuationState], cfg: Const[VehicleConfig]):
+    """Copy one vehicle's column back."""
+    vehicle.pos_w[env] = column(fleet.pos, lane)
+    vehicle.quat_wb[env] = column(fleet.quat, lane)
+    vehicle.vel_b[env] = column(fleet.vel, lane)
+    vehicle.rate_b[env] = column(fleet.rate, lane)
+    vehicle.acc_b[env] = column(fleet.acc, lane)
+    if ti.static(cfg.attitude_hold == "ideal"):
+        actuation.hold_moment_b[env] = column(fleet.hold, lane)
+    for i in ti.static(range(vehicle.rpm.shape[1])):
+        vehicle.rpm[env, i] = fleet.rpm[i, lane]
+        actuation.thrust_n[env, i] = fleet.thrust[i, lane]
+
+
+@ti.func
+def _advance(
+    lane,
+    fleet: Out[Any],
+    geometry: In[Any],
+    kept,
+    dt,
+    vehicle_cfg: Const[VehicleConfig],
+    actuation_cfg: Const[ActuationConfig],
+):
+    """One midpoint step of one column. It touches local variables only, so that the loop over columns becomes vector code."""
+    body = body_of(lane, fleet, vehicle_cfg)
+    current_w = column(fleet.current, lane)
+    force, moment = _rotor_wrench(lane, fleet, geometry, vehicle_cfg, kept)
+    pos, q, v, w = column(fleet.pos, lane), column(fleet.quat, lane), column(fleet.vel, lane), column(fleet.rate, lane)
+    dv, dw = acceleration(q, v, w, force, moment, current_w, body, vehicle_cfg, actuation_cfg)
+    q_mid = turned(q, w, 0.5 * dt)
+    v_mid, w_mid = v + 0.5 * dt * dv, w + 0.5 * dt * dw
+    dv_mid, dw_mid = acceleration(q_mid, v_mid, w_mid, force, moment, current_w, body, vehicle_cfg, actuation_cfg)
+    q_end = (q + 0.5 * dt * quaternion_product_pure(q_mid, w_mid)).normalized()
+    w_end = w + dt * dw_mid
+    put_column(fleet.pos, lane, pos + dt * (rotation_wb(q_mid) @ v_mid))
+    put_column(fleet.quat, lane, q_end)
+    put_column(fleet.vel, lane, v + dt * dv_mid)
+    put_column(fleet.rate, lane, w_end)
+    put_column(fleet.acc, lane, dv_mid + w_mid.cross(v_mid))
+    if ti.static(vehicle_cfg.attitude_hold == "ideal"):
+        put_column(fleet.hold, lane, hold_moment(up_b(q_end), w_end, actuation_cfg))
+
+
+@ti.func
+def _rotor_wrench(lane, fleet: Out[Any], geometry: In[Any], cfg: Const[VehicleConfig], kept):
+    """Force and moment of all thrusters at the middle of the substep, plus what acts from outside; the rotors move on by a substep.
+
+    ``kept`` is what the lag leaves of the distance to the command after half a substep. The middle value keeps the midpoint rule second
+    order although the lag is as short as a substep.
+    """
+    force = ti.Vector([fleet.outside[0, lane], fleet.outside[1, lane], fleet.outside[2, lane]])
+    moment = ti.Vector([fleet.outside[3, lane], fleet.outside[4, lane], fleet.outside[5, lane]])
+    for i in ti.static(range(fleet.rpm.n)):
+        command = fleet.command[i, lane]
+        middle = command + kept * (fleet.rpm[i, lane] - command)
+        fleet.rpm[i, lane] = command + kept * (middle - command)
+        thrust = fleet.gain[i, lane] * thrust_of_rpm(middle, cfg)
+        fleet.thrust[i, lane] = thrust
+        for axis in ti.static(range(3)):
+            force[axis] += geometry[axis, i] * thrust
+            moment[axis] += geometry[axis + 3, i] * thrust
+    return force, moment
+
+
+# ------------------------------------------------------------------------------------------------------------ equation of motion
+
+
+@ti.func
+def body_of(lane, fleet: In[Any], cfg: Const[VehicleConfig]):
+    """Parameters of one vehicle in local variables, linear and angular parts apart."""
+    added, linear, quadratic, inert = (
+        column(fleet.added, lane),
+        column(fleet.linear, lane),
+        column(fleet.quadratic, lane),
+        column(fleet.mass, lane),
+    )
+    return ti.Struct(
+        mass=inert[0],
+        inertia=ti.Vector([inert[3], inert[4], inert[5]]),
+        added_v=ti.Vector([added[0], added[1], added[2]]),
+        added_w=ti.Vector([added[3], added[4], added[5]]),
+        linear_v=ti.Vector([linear[0], linear[1], linear[2]]),
+        linear_w=ti.Vector([linear[3], linear[4], linear[5]]),
+        quadratic_v=ti.Vector([quadratic[0], quadratic[1], quadratic[2]]),
+        quadratic_w=ti.Vector([quadratic[3], quadratic[4], quadratic[5]]),
+        weight=inert[0] * cfg.gravity_m_s2,
+        buoyancy=fleet.lift[0, lane],
+        height=fleet.lift[1, lane],
+        per_mass_v=1.0 / (inert[0] + ti.Vector([added[0], added[1], added[2]])),
+        per_mass_w=1.0 / ti.Vector([inert[3] + added[3], inert[4] + added[4], inert[5] + added[5]]),
+    )
+
+
+@ti.func
+def acceleration(
+    q, v, w, force, moment, current_w, body: In[Any], vehicle_cfg: Const[VehicleConfig], actuation_cfg: Const[ActuationConfig]
+):
+    """(dv/dt, dw/dt) in body axes [m/s^2, rad/s^2]: Fossen's equation solved for the derivative of nu."""
+    up = up_b(q)
+    current_b = rotation_wb(q).transpose() @ current_w
+    v_r = v - current_b
+    momentum = body.added_v * v_r
+    tau_v = force + (body.buoyancy - body.weight) * up
+    tau_v -= body.mass * w.cross(v) + w.cross(momentum)
+    if ti.static(vehicle_cfg.added_mass_follows == "water"):
+        tau_v -= body.added_v * w.cross(current_b)  # dnu_r/dt = dnu/dt + w x current_b in a uniform current
+    tau_v -= (body.linear_v + body.quadratic_v * abs(v_r)) * v_r
+    tau_w = moment + body.height * body.buoyancy * ti.Vector([-up[1], up[0], 0.0])
+    tau_w -= w.cross((body.inertia + body.added_w) * w) + v_r.cross(momentum)
+    tau_w -= (body.linear_w + body.quadratic_w * abs(w)) * w
+    if ti.static(vehicle_cfg.attitude_hold == "ideal"):
+        tau_w += hold_moment(up, w, actuation_cfg)
+    return body.per_mass_v * tau_v, body.per_mass_w * tau_w
+
+
+@ti.func
+def hold_moment(up, w, cfg: Const[ActuationConfig]):
+    """[N m] ideal attitude hold: pulls body z upright and damps roll and pitch rate, bounded; yaw stays free."""
+    k, d = cfg.hold_gain_n_m, cfg.hold_damping
+    roll, pitch = -k * up[1] - d * w[0], k * up[0] - d * w[1]
+    share = ti.min(1.0, cfg.hold_limit_n_m / ti.max(ti.sqrt(roll * roll + pitch * pitch), 1e-6))
+    return share * ti.Vector([roll, pitch, 0.0])
+
+
+@ti.func
+def up_b(q):
+    """World z axis seen in body axes."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    return ti.Vector([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
+
+
+@ti.func
+def quaternion_product_pure(q, w):
+    """q times the pure quaternion (0, w): twice the time derivative of q under body rates w."""
+    return ti.Vector(
+        [
+            -q[1] * w[0] - q[2] * w[1] - q[3] * w[2],
+            q[0] * w[0] + q[2] * w[2] - q[3] * w[1],
+            q[0] * w[1] - q[1] * w[2] + q[3] * w[0],
+            q[0] * w[2] + q[1] * w[1] - q[2] * w[0],
+        ]
+    )
+
+
+@ti.func
+def turned(q, w, dt):
+    """Unit quaternion after dt [s] of body rates w [rad/s], to first order."""
+    return (q + 0.5 * dt * quaternion_product_pure(q, w)).normalized()
+
+
+@ti.func
+def current_after(mean, velocity, key, cfg: Const[DisturbanceConfig], dt_s):
+    """[m/s] current after dt of a Gauss-Markov process about its mean, horizontal axes; exact for any dt."""
+    keep = ti.exp(-dt_s / cfg.current_tau_s)
+    kick = cfg.current_sigma_m_s * ti.sqrt(1.0 - keep * keep)
+    noise = ti.Vector([normal(key, 0), normal(key, 1), 0.0])
+    return mean + keep * (velocity - mean) + kick * noise
+
+
+# --------------------------------------------------------------------------------------------------------------------- reset
+
+
+@ti.func
+def _place(env, vehicle: Out[VehicleState], mission: In[MissionState]):
+    vehicle.pos_w[env] = mission.start_w[env]
+    vehicle.quat_wb[env] = quaternion_wb(0.0, 0.0, mission.start_yaw[env])
+    vehicle.vel_b[env] = 0.0
+    vehicle.rate_b[env] = 0.0
+    vehicle.acc_b[env] = 0.0
+    for i in range(ti.static(vehicle.rpm.shape[1])):
+        vehicle.rpm[env, i] = 0.0
+
+
+@ti.func
+def _draw_body(
+    env, params: Out[VehicleParams], episode: In[EpisodeState], cfg: Const[VehicleConfig], disturbance_cfg: Const[DisturbanceConfig]
+):
+    """Nominal values times the factors of this episode. Buoyancy follows the mass: the vehicle is trimmed again, not sunk."""
+    key = stream_key(episode.key[env], 0, STREAM_VEHICLE)
+    heavier = _factor(key, _DRAW_MASS, disturbance_cfg.mass_spread)
+    params.mass_kg[env] = heavier * cfg.mass_kg
+    params.buoyancy_n[env] = heavier * ti.static(cfg.water_density_kg_m3 * cfg.gravity_m_s2 * cfg.volume_m3)
+    params.buoyancy_height_m[env] = cfg.buoyancy_height_m
+    for axis in ti.static(range(3)):
+        params.inertia[env][axis] = heavier * cfg.inertia_kg_m2[axis]
+    for axis in ti.static(range(6)):
+        params.added_mass[env][axis] = cfg.added_mass[axis] * _factor(key, _DRAW_ADDED_MASS + axis, disturbance_cfg.added_mass_spread)
+        params.linear_damping[env][axis] = cfg.linear_damping[axis] * _factor(key, _DRAW_LINEAR + axis, disturbance_cfg.damping_spread)
+        params.quadratic_damping[env][axis] = cfg.quadratic_damping[axis] * _factor(
+            key, _DRAW_QUADRATIC + axis, disturbance_cfg.damping_spread
+        )
+
+
+@ti.func
+def _factor(key, index, half_width: Const[float]):
+    """Factor in [1 - half_width, 1 + half_width)."""
+    return uniform_in(key, index, 1.0 - half_width, 1.0 + half_width)
+
+
+@ti.func
+def _draw_thrusters(
+    env, params: Out[VehicleParams], episode: In[EpisodeState], cfg: Const[VehicleConfig], disturbance_cfg: Const[DisturbanceConfig]
+):
+    key = stream_key(episode.key[env], 0, STREAM_THRUSTER)
+    for i in ti.static(range(len(cfg.thrusters))):
+        gain = 1.0 - disturbance_cfg.thruster_gain_loss * uniform_in(key, i, 0.0, 1.0)
+        params.thruster_gain[env, i] = 0.0 if ti.static(i == disturbance_cfg.dead_thruster) else gain
+
+
+@ti.func
+def _draw_current(env, current: Out[CurrentState], episode: In[EpisodeState], cfg: Const[DisturbanceConfig]):
+    """Mean plus a draw of the stationary distribution, so that the statistics are the same at every time of an episode."""
+    mean = ti.Vector([cfg.current_m_s[0], cfg.current_m_s[1], cfg.current_m_s[2]])
+    key = stream_key(episode.key[env], 0, STREAM_CURRENT)
+    noise = ti.Vector([normal(key, 2), normal(key, 3), 0.0])  # draws 0 and 1 belong to the first step
+    current.mean_w[env] = mean
+    current.vel_w[env] = mean + cfg.current_sigma_m_s * noise
