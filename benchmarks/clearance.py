@@ -9,11 +9,13 @@ from scipy.ndimage import distance_transform_edt
 from benchmarks.common import Job, Row, seconds_per_call
 from tests.map_bits import put_layers
 from uuvtai import state
+from uuvtai.binding import bind
 from uuvtai.bounds import load_bounds
 from uuvtai.config import ClearanceConfig
 from uuvtai.kernels.core.grid import outside_cells
 from uuvtai.kernels.core.lanes import LANES
 from uuvtai.kernels.planning import clearance
+from uuvtai.kernels.planning.bundles import ClearanceIO
 from uuvtai.loader import load_config
 from uuvtai.runtime import start_taichi
 
@@ -64,9 +66,11 @@ class Maps:
     def ours(self, cfg: ClearanceConfig):
         """One call computes every map anew."""
 
+        io = bind(ClearanceIO, *self.structs, cfg, self.config.mapping, self.config.voronoi)
+
         def call() -> None:
-            clearance.forget_clearance(self.memory)
-            clearance.compute_clearance(*self.structs, cfg, self.config.mapping, self.config.voronoi)  # type: ignore[call-arg]
+            clearance.forget_clearance(io)
+            clearance.compute_clearance(io)
 
         return call
 

@@ -56,14 +56,11 @@ def measure(job: Job) -> list[Row]:
 
 def _step_of(config: Config, plant: Plant, shared: torch.Tensor) -> Callable[[], None]:
     """One call: actuation and dynamics of a control step."""
-    c, p = config, plant
+    rules = config.episode
 
     def step() -> None:
-        actuation.command_thrusters(shared, p.actuation, p.params, p.allocation, p.ego, p.clock, c.vehicle, c.actuation, c.episode)
-        dynamics.move_vehicle(
-            p.vehicle, p.actuation, p.current, p.params, p.allocation, p.episode, p.clock,
-            c.vehicle, c.actuation, c.disturbance, c.episode.control_dt_s, c.episode.substeps,
-        )  # fmt: skip
+        actuation.command_thrusters(plant.actuation_io, shared)
+        dynamics.move_vehicle(plant.dynamics_io, rules.control_dt_s, rules.substeps)
         if shared.is_cuda:
             torch.cuda.synchronize()
 

@@ -10,8 +10,10 @@ from benchmarks.common import Job, Row, seconds_per_call
 from tests import planning_maps as maps
 from tests.reference.voronoi import clearance_of
 from uuvtai import rrt, state
+from uuvtai.binding import bind
 from uuvtai.config import Config
 from uuvtai.kernels.planning import route, voronoi
+from uuvtai.kernels.planning.bundles import RouteIO, VoronoiIO
 from uuvtai.plan_codes import FAIL_NONE, N_PLANNER, N_REASON, N_TRIGGER
 from uuvtai.runtime import start_taichi
 
@@ -30,11 +32,10 @@ def measure(job: Job) -> list[Row]:
     found = _maps(n_env, config)
     s = _structs(n_env, config, found)
 
+    io = bind(VoronoiIO, *s.values(), config)
+
     def ours():
-        voronoi.plan_routes(
-            s["voronoi"], s["route"], s["clearance"], s["grid_map"], s["mask"], s["mission"], s["ego"], s["forecast"], s["clock"],
-            config.voronoi, config.route, config.clearance, config.mapping, config.world.tank,
-        )  # fmt: skip
+        voronoi.plan_routes(io)
 
     floor_m, origin = config.voronoi.min_clearance_m, (float(maps.ORIGIN[0]), float(maps.ORIGIN[1]))
     grids = [rrt.ClearanceGrid(clearance, origin, maps.CELL_M, floor_m, _START) for _occ, clearance, _row, _col in found]
@@ -91,7 +92,7 @@ def _structs(n_env: int, config: Config, found: list[tuple]) -> dict:
     s = {name: state.allocate(getattr(state, struct), sizes) for name, struct in names.items()}
     s["mask"].outside.from_numpy(maps.OUTSIDE.astype(np.int32))
     s["clock"].awake.fill(1)
-    route.reset_route(s["route"], s["clock"])
+    route.reset_route(bind(RouteIO, s["route"], s["clock"], partial=True))
     for field, i, dtype in (
         (s["grid_map"].static_occ, 0, np.float32), (s["clearance"].clearance_m, 1, np.float32),
         (s["clearance"].site_row, 2, np.int16), (s["clearance"].site_col, 3, np.int16),

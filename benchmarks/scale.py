@@ -7,8 +7,9 @@ import time
 from benchmarks.common import Job, Row
 from uuvtai.loader import load_config
 from uuvtai.measure.profiling import WARM_STEPS, Batch, env_steps_per_s
-from uuvtai.sim import STAGES, Sim
+from uuvtai.sim import Sim
 from uuvtai.sizes import memory_bytes
+from uuvtai.stages import STAGES
 from uuvtai.tree import read_tree
 
 DEVICES = ("cpu", "cuda")

@@ -9,8 +9,10 @@ from benchmarks.common import Job, Row, seconds_per_call
 from tests.reference import scenes
 from tests.reference.sonar import beam_headings
 from uuvtai import state
+from uuvtai.binding import bind
 from uuvtai.config import EpisodeConfig, SonarConfig, TankConfig
 from uuvtai.kernels.sensors import sonar
+from uuvtai.kernels.sensors.bundles import SonarIO
 from uuvtai.runtime import start_taichi
 
 THREADS = 1
@@ -69,11 +71,12 @@ def measure(job: Job) -> list[Row]:
     structs = scan, memory, _ego, vehicle, world, _episode, clock = [state.allocate(getattr(state, name), sizes) for name in names]
     scenes.load(scene, vehicle, world)
     clock.awake.fill(1)
-    sonar.reset_sonar(scan, memory, clock)
+    sonar.reset_sonar(bind(SonarIO, scan, memory, clock, partial=True))
     peer = Rays(scene, flat.n_ray, flat.max_range_m)
 
     def ours(config: SonarConfig):
-        return lambda: sonar.cast_sonar(*structs, config, TankConfig(), EpisodeConfig())  # type: ignore[call-arg]
+        io = bind(SonarIO, *structs, config, TankConfig(), EpisodeConfig())
+        return lambda: sonar.cast_sonar(io)
 
     ours(flat)()
     apart, beams = peer.apart(scan), _MODELS * flat.n_ray

@@ -10,8 +10,10 @@ import torch
 from benchmarks.common import Job, Row, seconds_per_call
 from benchmarks.peers.tick_py_trees import PyTree
 from uuvtai import state
+from uuvtai.binding import bind
 from uuvtai.config import Config
-from uuvtai.kernels.teacher.teacher import tree_tick
+from uuvtai.kernels.teacher import tree_tick
+from uuvtai.kernels.teacher.bundles import TeacherIO
 from uuvtai.runtime import start_taichi
 from uuvtai.sizes import array_sizes
 from uuvtai.tree import load_tree, read_tree
@@ -41,8 +43,10 @@ def measure(job: Job) -> list[Row]:
     prepared = [[peers[0].prepared(row[:n_node]) for row in a[:_BLACKBOARDS]] for a in answers]
     ours_next, theirs_next = itertools.cycle(given), itertools.cycle(prepared)
 
+    io = bind(TeacherIO, teacher, table, partial=True)
+
     def ours() -> None:
-        tree_tick.tick_with_given_statuses(next(ours_next), teacher, table)
+        tree_tick.tick_with_given_statuses(io, next(ours_next))
 
     def theirs() -> None:
         for peer, answer in zip(peers, next(theirs_next), strict=True):
@@ -66,7 +70,8 @@ def measure(job: Job) -> list[Row]:
 
 def check(teacher: state.TeacherState, table: state.TreeTable, peers: list[PyTree], answers: np.ndarray, n_node: int) -> None:
     """Raise AssertionError unless every node's status is the peers', tick by tick, memories included."""
+    io = bind(TeacherIO, teacher, table, partial=True)
     for answer in answers:
-        tree_tick.tick_with_given_statuses(torch.from_numpy(answer), teacher, table)
+        tree_tick.tick_with_given_statuses(io, torch.from_numpy(answer))
         found = teacher.status.to_numpy()[: len(peers), :n_node]
         np.testing.assert_array_equal(found, [peer.tick(answer[i, :n_node]) for i, peer in enumerate(peers)])

@@ -32,6 +32,17 @@ def set_step(clock, step):
     clock.step.from_numpy(np.full(clock.step.shape, step, dtype=np.int32))
 
 
+def configure(monkeypatch, sim, config):
+    """Give a simulator another config for a test; stages whose sections stay keep their compiled kernels."""
+    from uuvtai.binding import bind_all
+    from uuvtai.stages import Stages
+
+    new = vars(bind_all(Stages, sim.s, config))
+    same = {name: old for name, old in vars(sim.io).items() if all(vars(old)[member] is part for member, part in vars(new[name]).items())}
+    monkeypatch.setattr(sim, "config", config)
+    monkeypatch.setattr(sim, "io", Stages(**(new | same)))
+
+
 _built = []
 
 

@@ -6,10 +6,12 @@ from types import SimpleNamespace
 import numpy as np
 
 from tests import planning_maps as maps
+from tests.bundles import io_for
 from tests.reference.voronoi import clearance_of
 from uuvtai import state
 from uuvtai.bounds import load_bounds
 from uuvtai.config import Config
+from uuvtai.kernels.planning.bundles import RouteIO, VoronoiIO
 
 N_ENV = 8
 N_PLAN = 3
@@ -69,7 +71,7 @@ def clean():
     s.forecast.pos_w.fill(0.0)
     put_maps([np.zeros(maps.SHAPE, bool)] * N_ENV)
     put_ends([(2.0, 3.0)] * N_ENV, [(18.0, 3.0)] * N_ENV)
-    reset_route(s.route, s.clock)
+    reset_route(io_for(RouteIO, s.route, s.clock))
     return s
 
 
@@ -98,20 +100,23 @@ def plan(envs=range(N_ENV), config=CONFIG):
     s.route.queue.from_numpy(queue)
     s.route.n_queue[None] = len(envs)
     plan_routes(
-        s.voronoi,
-        s.route,
-        s.clearance,
-        s.grid_map,
-        s.mask,
-        s.mission,
-        s.ego,
-        s.forecast,
-        s.clock,
-        config.voronoi,
-        config.route,
-        config.clearance,
-        config.mapping,
-        maps.TANK,
+        io_for(
+            VoronoiIO,
+            s.voronoi,
+            s.route,
+            s.clearance,
+            s.grid_map,
+            s.mask,
+            s.mission,
+            s.ego,
+            s.forecast,
+            s.clock,
+            config.voronoi,
+            config.route,
+            config.clearance,
+            config.mapping,
+            maps.TANK,
+        )
     )
     return s.route
 

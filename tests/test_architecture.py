@@ -8,29 +8,27 @@ from pathlib import Path
 import pytest
 import taichi as ti
 
-from uuvtai import state
+from tests import signatures
+from tests.signatures import BUNDLES, FILES, FUNCTIONS, KERNELS, ROOMS, is_kernel
+from uuvtai import config, state
+from uuvtai.binding import members_of
+from uuvtai.truth import Truth
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "uuvtai"
-KERNELS = sorted((PACKAGE / "kernels").glob("*.py"))
 
-LENT = {"elevation", "recording", "tree_tick"}
-"""Files with a kernel that lend their functions to stages too."""
-WITH_KERNELS = {p.stem for p in KERNELS if "@ti.kernel" in p.read_text()}
-STAGES = WITH_KERNELS - LENT
-FLOOR = {p.stem for p in KERNELS} - STAGES
-"""Kernel files that stages may import: all that are no stage themselves."""
-
-SIMULATOR_SIDE = {
-    "actuation", "debug_stamp", "debug_tracks", "depth", "dynamics", "episode", "proprioception", "reward", "sonar", "world",
-    "bodies", "hull", "layout", "paths", "raycast", "sonar_error", "rotor",
-}  # fmt: skip
-"""Files that may see the truth; every other kernel file is part of the stack and may not."""
-OBSERVATION_ONLY = {p.stem for p in KERNELS} - SIMULATOR_SIDE
+KNOWS = {"world", "vehicle", "sensors", "task", "privileged"}
+"""Rooms that may see the truth; the others are the stack."""
+BELOW = ("state", "config", "kernels", "front_end", "tree_codes", "plan_codes", "outcomes")
+"""What kernels may import of the package."""
+STACK = {"core", "perception", "planning", "teacher"}
 TRUTH = {
-    "WorldState", "PathState", "VehicleState", "VehicleParams", "CurrentState", "SceneState", "RefereeState", "EpisodeState",
-    "FixedTable", "ScenarioScratch", "WorldConfig", "ProprioceptionMemory", "SonarMemory", "ActuationState",
-}  # fmt: skip
+    kind.__name__ for module in (state, config) for kind in vars(module).values() if isinstance(kind, type) and issubclass(kind, Truth)
+}
+
+
+def room_of(path):
+    return path.parent.name
 
 
 def tree_of(path):
@@ -57,58 +55,66 @@ def imports_of(path):
     return found
 
 
-def functions_of(path):
-    return [n for n in ast.walk(tree_of(path)) if isinstance(n, ast.FunctionDef)]
+def ids(function):
+    return f"{function.path.stem}.{function.name}"
 
 
-def is_kernel(function):
-    return any(ast.unparse(d) == "ti.kernel" for d in function.decorator_list)
+def test_there_is_something_to_check():
+    assert {"WorldState", "VehicleState", "PathState", "EpisodeState", "WorldConfig"} <= TRUTH
+    assert set(ROOMS) == KNOWS | STACK
+    assert len(BUNDLES) > 20 and len(FUNCTIONS) > 450
+    assert {kind for bundle in BUNDLES.values() for kind in members_of(bundle).values()} >= TRUTH, "some truth is nobody's"
 
 
-def marker_of(argument):
-    """('In', 'WorldState') of an argument annotated In[WorldState]."""
-    a = argument.annotation
-    if isinstance(a, ast.Subscript) and isinstance(a.value, ast.Name):
-        return a.value.id, ast.unparse(a.slice)
-    return None, None
-
-
-def test_there_are_observation_only_stages_to_check():
-    present = {p.stem for p in KERNELS}
-    assert {"tracking", "forecast", "elevation", "look", "mapping", "clearance", "voronoi", "route", "features"} <= OBSERVATION_ONLY
-    assert {"threats", "evasion", "rollout", "teacher", "tree_tick"} <= OBSERVATION_ONLY
-    assert present >= SIMULATOR_SIDE, f"gone: {SIMULATOR_SIDE - present}"
-    assert {"WorldState", "VehicleState"} <= {struct.__name__ for struct in structs()}
-
-
-@pytest.mark.parametrize("path", [p for p in KERNELS if p.stem in OBSERVATION_ONLY], ids=lambda p: p.stem)
-def test_observation_only_stages_never_name_the_truth(path):
+@pytest.mark.parametrize("path", [p for p in KERNELS.rglob("*.py") if room_of(p) in STACK], ids=lambda p: f"{room_of(p)}.{p.stem}")
+def test_the_stack_never_names_the_truth(path):
+    """Nor is it handed any: a bundle is a file of its room, and what is imported comes from the stack's rooms."""
     assert not names_in(path) & TRUTH
+    for module in imports_of(path):
+        parts = module.split(".")
+        if parts[:2] == ["uuvtai", "kernels"] and len(parts) > 2:
+            assert parts[2] in STACK, f"{path.name} imports {module}"
 
 
-@pytest.mark.parametrize("path", KERNELS, ids=lambda p: p.stem)
+def test_what_knows_the_truth_writes_nothing_that_the_stack_reads_but_readings():
+    """Simulated instruments, the clock and the mission are what the vehicle may know; the yardsticks say what they are."""
+    told = {kind for name in BUNDLES if name in ("EpisodeIO", "WorldIO") for kind in ("ClockState", "MissionState")}
+    readings = {"Proprioception", "SonarScan", "DepthImage"}
+    of_the_stack = {kind for name, bundle in BUNDLES.items() if room_of_bundle(name) in STACK for kind in members_of(bundle).values()}
+    assert readings | told <= of_the_stack
+    for name, bundle in BUNDLES.items():
+        outputs = {members_of(bundle)[f.name] for f in dataclasses.fields(bundle) if str(f.type).startswith("Out")}
+        if set(members_of(bundle).values()) & TRUTH and room_of_bundle(name) != "privileged":
+            assert outputs & of_the_stack <= readings | told, f"{name} writes {outputs & of_the_stack}"
+
+
+def room_of_bundle(name):
+    return BUNDLES[name].__module__.split(".")[2]
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: f"{room_of(p)}.{p.stem}")
 def test_kernels_import_taichi_and_the_floor_only(path):
-    own = {i for i in imports_of(path) if i.startswith("uuvtai.")}
     assert "import uuvtai\n" not in path.read_text(), f"{path.name} imports the whole package"
     foreign = {i.split(".")[0] for i in imports_of(path)} - {"uuvtai", "taichi", "typing", "math"}
     assert not foreign, f"{path.name} imports {foreign}"
-    for module in own:
+    for module in (i for i in imports_of(path) if i.startswith("uuvtai.")):
         parts = module.split(".")
-        if parts[:2] == ["uuvtai", "kernels"] and len(parts) > 2:
-            assert parts[2] in FLOOR, f"{path.name} imports the stage {parts[2]}"
-        else:
-            assert parts[1] in ("state", "config", "kernels", "front_end", "tree_codes"), f"{path.name} imports {module}"
+        assert parts[1] in ("state", "config", "kernels", "front_end", "tree_codes", "plan_codes", "outcomes"), (
+            f"{path.name} imports {module}"
+        )
+        if room_of(path) == "core" and parts[1] == "kernels":
+            assert parts[2] == "core", f"{path.name} imports {module}"
 
 
 def test_kernel_files_lend_functions_never_kernels():
     """A kernel is launched by the simulator, in its order; what two files share is a function."""
-    kernels = {f"uuvtai.kernels.{path.stem}.{function.name}" for path in KERNELS for function in functions_of(path) if is_kernel(function)}
+    kernels = {f"{module}.{name}" for (module, name), function in FUNCTIONS.items() if is_kernel(function.node)}
     assert len(kernels) > 30
-    for path in KERNELS:
+    for path in FILES:
         assert not imports_of(path) & kernels, f"{path.name} imports {imports_of(path) & kernels}"
 
 
-@pytest.mark.parametrize("path", KERNELS, ids=lambda p: p.stem)
+@pytest.mark.parametrize("path", FILES, ids=lambda p: f"{room_of(p)}.{p.stem}")
 def test_kernel_files_stay_in_the_safe_subset(path):
     text = path.read_text()
     assert "from __future__ import annotations" not in text, "Taichi needs real annotations"
@@ -117,28 +123,45 @@ def test_kernel_files_stay_in_the_safe_subset(path):
         assert name not in ("ti.random", "ti.randn", "ti.init", "print"), f"{path.name}:{call.lineno} calls {name}"
 
 
-@pytest.mark.parametrize("path", KERNELS, ids=lambda p: p.stem)
-def test_a_kernel_never_writes_what_it_only_reads(path):
-    for function in functions_of(path):
-        read_only = {a.arg for a in function.args.args if marker_of(a)[0] in ("In", "Const")}
-        for node in ast.walk(function):
-            targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AugAssign) else []
-            for target in targets:
-                root = target
-                while isinstance(root, ast.Attribute | ast.Subscript):
-                    root = root.value
-                if isinstance(target, ast.Subscript | ast.Attribute) and isinstance(root, ast.Name) and function.name[0] != "_":
-                    assert root.id not in read_only, f"{path.name}:{node.lineno} {function.name} writes {root.id}"
+@pytest.mark.parametrize("function", FUNCTIONS.values(), ids=ids)
+def test_no_function_writes_what_it_only_reads(function):
+    """Nor hands it to one that writes it."""
+    marks = function.marks()
+    for root, line in signatures.written(function):
+        assert marks.get(root, ("Out", ""))[0] == "Out", f"{function.path.name}:{line} {function.name} writes {root}"
+    for root, mark, kind, called, line in signatures.handed(function):
+        if mark == "Bundle":
+            assert root == "io", f"{function.path.name}:{line} hands {root} to {called} as {kind}"
+        elif root in marks and mark == "Out":
+            assert marks[root][0] == "Out", f"{function.path.name}:{line} {function.name} hands {root} to {called}, which writes it"
 
 
-@pytest.mark.parametrize("path", KERNELS, ids=lambda p: p.stem)
-def test_every_kernel_says_what_it_reads_and_writes(path):
-    for function in functions_of(path):
-        if not is_kernel(function):
+@pytest.mark.parametrize("function", FUNCTIONS.values(), ids=ids)
+def test_every_kernel_says_what_it_reads_and_writes(function):
+    names = [argument.arg for argument in function.node.args.args]
+    if is_kernel(function.node):
+        assert ast.get_docstring(function.node), f"{function.name} has no docstring"
+        assert all(argument.annotation is not None for argument in function.node.args.args)
+    used = {node.id for node in ast.walk(function.node) if isinstance(node, ast.Name)}
+    assert set(names) <= used | {"io"}, f"{function.path.name}: {function.name} does not use {set(names) - used}"
+
+
+def test_every_bundle_holds_what_its_stage_touches_and_nothing_else():
+    """Members that some function of the stage names; what is marked Out is written by one."""
+    touched, stored = {name: set() for name in BUNDLES}, {name: set() for name in BUNDLES}
+    for function in FUNCTIONS.values():
+        bundle = next((kind for a in function.node.args.args for mark, kind in [signatures.mark_of(a)] if mark == "Bundle"), None)
+        if bundle is None:
             continue
-        assert ast.get_docstring(function), f"{path.name}: {function.name} has no docstring"
-        for argument in function.args.args:
-            assert argument.annotation is not None, f"{path.name}: {function.name}({argument.arg}) is not annotated"
+        for node in ast.walk(function.node):
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "io":
+                touched[bundle].add(node.attr)
+        stored[bundle] |= {root[3:] for root, _ in signatures.written(function) if root.startswith("io.")}
+        stored[bundle] |= {root[3:] for root, mark, *_ in signatures.handed(function) if mark == "Out" and root.startswith("io.")}
+    for name, bundle in BUNDLES.items():
+        members = {f.name: str(f.type).partition("[")[0] for f in dataclasses.fields(bundle)}
+        assert touched[name] == set(members), f"{name}: {touched[name] ^ set(members)}"
+        assert stored[name] == {member for member, mark in members.items() if mark == "Out"}, f"{name}: {stored[name]}"
 
 
 def test_only_the_runtime_starts_taichi():
@@ -148,19 +171,20 @@ def test_only_the_runtime_starts_taichi():
 
 
 def test_only_sim_plant_and_the_fallback_launch_kernels():
+    stages = {signatures.module_of(path) for path in FILES if "@ti.kernel" in path.read_text()}
     for path in PACKAGE.rglob("*.py"):
-        if path.parent.name == "kernels" or path.stem in ("sim", "plant", "rrt"):
+        if KERNELS in path.parents or path.stem in ("sim", "plant", "rrt"):
             continue
+        modules = {i.split(".")[-1] for i in imports_of(path) if i in stages}
         launched = {
             ast.unparse(n.func)
             for n in ast.walk(tree_of(path))
             if isinstance(n, ast.Call)
             and isinstance(n.func, ast.Attribute)
             and isinstance(n.func.value, ast.Name)
-            and n.func.value.id in WITH_KERNELS
+            and n.func.value.id in modules
         }
-        imported = {i for i in imports_of(path) if i.startswith("uuvtai.kernels.") and i.split(".")[-1] in WITH_KERNELS}
-        assert not (launched and imported), f"{path.name} launches {launched}"
+        assert not launched, f"{path.name} launches {launched}"
 
 
 def structs():

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.bundles import io_for
 from tests.map_bits import put_layers
 from tests.reference.clearance import clearance_of, sites_of
 from uuvtai.bounds import load_bounds
@@ -12,6 +13,7 @@ from uuvtai.config import ClearanceConfig, MappingConfig, TankConfig, VoronoiCon
 from uuvtai.kernels.core.grid import grid_shape, outside_cells
 from uuvtai.kernels.core.lanes import LANES
 from uuvtai.kernels.planning import clearance
+from uuvtai.kernels.planning.bundles import ClearanceIO
 from uuvtai.state import PACKET, ClearanceMemory, ClearanceState, ClockState, GridMask, MapState, allocate
 
 N_ENV = 8
@@ -51,7 +53,9 @@ class Stage:
         return self.launch(cfg, voronoi)
 
     def launch(self, cfg=CFG, voronoi=VORONOI):
-        clearance.compute_clearance(self.clearance, self.memory, self.grid_map, self.mask, self.clock, cfg, MAP, voronoi)
+        clearance.compute_clearance(
+            io_for(ClearanceIO, self.clearance, self.memory, self.grid_map, self.mask, self.clock, cfg, MAP, voronoi)
+        )
         return tuple(f.to_numpy() for f in (self.clearance.clearance_m, self.clearance.site_row, self.clearance.site_col))
 
 
@@ -120,9 +124,9 @@ def test_inflation_brings_obstacles_nearer_and_leaves_the_boundary(stage, outsid
     stage.set_outside(np.array(outside))
     static, cfg = maps_of(8), ClearanceConfig(inflate_m=0.08)
     plain = stage.compute(static)
-    clearance.forget_clearance(stage.memory)  # the same map again, else there would be nothing to do
+    clearance.forget_clearance(io_for(ClearanceIO, stage.memory))  # the same map again, else there would be nothing to do
     distance, site_row, site_col = stage.compute(static, cfg=cfg)
-    clearance.forget_clearance(stage.memory)
+    clearance.forget_clearance(io_for(ClearanceIO, stage.memory))
     np.testing.assert_array_equal(plain[1], site_row)
     np.testing.assert_array_equal(plain[2], site_col)
     nearer = 0
@@ -194,7 +198,7 @@ def test_what_changed_is_redone_and_nothing_else_differs(stage):
             elif kind == 2:
                 static[env][rng.random(SHAPE) < 0.01] = rng.random()
         partly = stage.compute(static)
-        clearance.forget_clearance(stage.memory)
+        clearance.forget_clearance(io_for(ClearanceIO, stage.memory))
         for a, b in zip(partly, stage.compute(static), strict=True):
             np.testing.assert_array_equal(a, b)
 
@@ -206,7 +210,7 @@ def test_what_did_not_change_is_left_alone(stage):
     static[0, 20, 30] = 1
     found = stage.compute(static)[0]
     assert (found[1:] == 9).all()
-    clearance.forget_clearance(stage.memory)
+    clearance.forget_clearance(io_for(ClearanceIO, stage.memory))
     assert found[0, 20, 30] == 0 and (found[0, :, 64:] == 9).all()
 
 

@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 
+from tests.bundles import io_for
 from tests.conftest import set_step
 from tests.reference import scenes
 from tests.reference.depth import camera_position, camera_rays, z_depths
 from uuvtai.config import DepthConfig, TankConfig
 from uuvtai.kernels.sensors import depth
+from uuvtai.kernels.sensors.bundles import DepthIO
 from uuvtai.state import ClockState, DepthImage, EpisodeState, Proprioception, VehicleState, WorldState, allocate
 
 N_ENV, N_BODY, N_BATCH = 125, 14, 8
@@ -48,10 +50,10 @@ class Rig:
         self.episode.key.from_numpy((np.arange(N_ENV) + key).astype(np.uint32))
         self.clock.awake.fill(1)
         self.clock.step.fill(0)
-        depth.reset_depth(self.image, self.clock)
+        depth.reset_depth(io_for(DepthIO, self.image, self.clock))
 
     def shoot(self, config=CLEAN, tank=TANK):
-        depth.cast_depth(self.image, self.ego, self.vehicle, self.world, self.episode, self.clock, config, tank)
+        depth.cast_depth(io_for(DepthIO, self.image, self.ego, self.vehicle, self.world, self.episode, self.clock, config, tank))
         return self.image.depth_m.to_numpy()
 
 

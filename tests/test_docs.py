@@ -97,7 +97,7 @@ def test_what_a_help_text_says_is_no_markup():
 
 
 def test_every_stage_of_the_simulator_is_told():
-    from uuvtai.sim import STAGES
+    from uuvtai.stages import STAGES
 
     assert tuple(stages.FILES) == STAGES
 

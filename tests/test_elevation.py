@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 import taichi as ti
 
+from tests.bundles import io_for
 from tests.reference import elevation as oracle
 from uuvtai.config import ElevationConfig, EpisodeConfig, SonarConfig, TankConfig, TrackingConfig
 from uuvtai.kernels.core.lanes import LANES
 from uuvtai.kernels.core.signature import Const, In, Out
 from uuvtai.kernels.perception import elevation
+from uuvtai.kernels.perception.bundles import HeightsIO, TrackingIO
 from uuvtai.kernels.perception.track_slots import prune_tracks
 from uuvtai.loader import ConfigError, load_config
 from uuvtai.state import ClockState, ForecastState, Proprioception, SonarScan, TrackState, allocate
@@ -67,7 +69,7 @@ def prune(
     rules: Const[EpisodeConfig],
 ):
     for env in range(N_ENV):
-        prune_tracks(env, dt, tracks, scan, tracking, cfg, sonar, tank, rules)
+        prune_tracks(env, dt, io_for(TrackingIO, tracks, scan, tracking, cfg, sonar, tank, rules))
 
 
 class Stage:
@@ -110,7 +112,7 @@ class Stage:
 
     def bound(self, cfg=CFG):
         """(above_w, below_w) as the kernel writes them."""
-        elevation.bound_heights(self.forecast, self.tracks, self.ego, self.clock, cfg, TANK)
+        elevation.bound_heights(io_for(HeightsIO, self.forecast, self.tracks, self.ego, self.clock, cfg, TANK))
         return self.forecast.above_w.to_numpy().astype(float), self.forecast.below_w.to_numpy().astype(float)
 
     def set_share(self, share):

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import uuvtai
+from tests.conftest import configure
 from uuvtai.env import VectorEnv, observation_sha256
 from uuvtai.loader import ConfigError
 from uuvtai.outcomes import OUTCOMES
@@ -267,7 +268,7 @@ def test_bodies_and_advice_stand_behind_the_paper_observation(small, env, monkey
     plain = VectorEnv(small.sim, seed=SEED)
     wanted = [plain.reset()[0].clone(), *(plain.step(full([0.6, 0, 0, 0.05]))[0].clone() for _ in range(80))]
     more = small.config.features.model_copy(update={"n_track": 2, "teacher": True})
-    monkeypatch.setattr(small.sim, "config", small.config.model_copy(update={"features": more}))
+    configure(monkeypatch, small.sim, small.config.model_copy(update={"features": more}))
     with VectorEnv(small.sim, seed=SEED) as shown:
         assert shown.observation_sha256 != plain.observation_sha256
         assert list(shown.columns)[-4:] == ["teacher_action", "teacher_conflict", "teacher_evade_cost", "teacher_class"]

@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 import torch
 
+from tests.bundles import io_for
 from tests.reference import noise as noise_reference
 from uuvtai import state
 from uuvtai.config import EpisodeConfig, TankConfig, VehicleConfig
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, FAR_M, SPHERE
 from uuvtai.kernels.task import episode
+from uuvtai.kernels.task.bundles import EpisodeIO
 from uuvtai.outcomes import COLLIDED, COLLISION, ENDINGS, FORESEEABLE, OUT_OF_TANK, OUTCOMES, SUCCESS, TIMEOUT, TTC
 
 N, N_BODY = 8, 3
@@ -36,7 +38,7 @@ class Court:
             self.vehicle.pos_w[env] = (10.0, 3.0, -0.8)
             self.vehicle.quat_wb[env] = (1.0, 0.0, 0.0, 0.0)
             self.mission.goal_w[env] = (18.0, 3.0, -0.8)
-        episode.reset_referee(self.referee, self.clock, self.vehicle, self.world, VEHICLE, TANK, RULES)
+        episode.reset_referee(io_for(EpisodeIO, self.referee, self.clock, self.vehicle, self.world, VEHICLE, TANK, RULES))
         return self
 
     def put(self, env, slot, kind, pos, size, vel=(0, 0, 0), yaw=0.0):
@@ -45,7 +47,7 @@ class Court:
         self.world.vel_w[env, slot], self.world.yaw[env, slot] = vel, yaw
 
     def judge(self):
-        episode.judge(self.referee, self.clock, self.vehicle, self.world, self.mission, VEHICLE, TANK, RULES)
+        episode.judge(io_for(EpisodeIO, self.referee, self.clock, self.vehicle, self.world, self.mission, VEHICLE, TANK, RULES))
         return {name: field.to_numpy() for name, field in vars(self.referee).items()}
 
 
@@ -188,7 +190,7 @@ def test_rules_hold_in_their_order(court):
 def test_book_of_the_episode(court):
     """Way driven sums straight steps; the smallest clearance stays; a reset starts with the clearance there and then."""
     court.put(0, 0, SPHERE, (10 + FRONT_M + 1.2, 3, -0.8), (0.2, 0.2, 0.2))
-    episode.reset_referee(court.referee, court.clock, court.vehicle, court.world, VEHICLE, TANK, RULES)
+    episode.reset_referee(io_for(EpisodeIO, court.referee, court.clock, court.vehicle, court.world, VEHICLE, TANK, RULES))
     assert court.referee.min_clearance_m[0] == pytest.approx(1.0, abs=TOL)
     for x in (10.3, 10.5, 10.1):
         court.vehicle.pos_w[0] = (x, 3.0, -0.8)
@@ -196,7 +198,7 @@ def test_book_of_the_episode(court):
     assert book["path_length_m"][0] == pytest.approx(0.3 + 0.2 + 0.4, abs=TOL)
     assert book["min_clearance_m"][0] == pytest.approx(0.5, abs=TOL)
     assert book["clearance_m"][0] == pytest.approx(0.9, abs=TOL)
-    episode.reset_referee(court.referee, court.clock, court.vehicle, court.world, VEHICLE, TANK, RULES)
+    episode.reset_referee(io_for(EpisodeIO, court.referee, court.clock, court.vehicle, court.world, VEHICLE, TANK, RULES))
     again = {name: field.to_numpy()[0] for name, field in vars(court.referee).items()}
     assert again["path_length_m"] == 0
     assert again["min_clearance_m"] == again["clearance_m"] == pytest.approx(0.9, abs=TOL)
@@ -217,7 +219,7 @@ def test_sleeping_rows_stay_as_they_are(court):
 
 def begin(court, mask, seed=3, number=7):
     rows = (torch.tensor(values, dtype=torch.int32).expand(N).contiguous() for values in (mask, seed, number))
-    episode.begin_episodes(*rows, court.clock, court.episode)
+    episode.begin_episodes(io_for(EpisodeIO, court.clock, court.episode), *rows)
 
 
 def test_episodes_begin_advance_end_and_sleep(court):
@@ -230,13 +232,13 @@ def test_episodes_begin_advance_end_and_sleep(court):
     assert court.episode.key[0] == noise_reference.episode_key(3, 7)
     begin(court, [0] + [1] * (N - 1))  # a reset pass of other rows: row 0 rests meanwhile, and goes on afterwards
     assert court.clock.awake[0] == 0
-    episode.wake(court.clock)
+    episode.wake(io_for(EpisodeIO, court.clock))
     assert court.clock.awake.to_numpy().all()
-    episode.advance_clock(court.clock)
+    episode.advance_clock(io_for(EpisodeIO, court.clock))
     assert np.all(court.clock.step.to_numpy() == 1)
     court.referee.outcome[2] = episode.TIMEOUT
-    episode.sleep_ended(court.clock, court.referee)
-    episode.advance_clock(court.clock)
+    episode.sleep_ended(io_for(EpisodeIO, court.clock, court.referee))
+    episode.advance_clock(io_for(EpisodeIO, court.clock))
     assert court.clock.step.to_numpy().tolist() == [2, 2, 1] + [2] * (N - 3)
     assert court.clock.active[2] == court.clock.awake[2] == 0
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.conftest import configure
 from tests.test_world import Drawn
 from uuvtai.env import VectorEnv
 from uuvtai.gym import UuvVectorEnv
@@ -173,7 +174,7 @@ def test_custom_reward_changes_the_terms_it_names(small, example, monkeypatch):
     default = module.terms(VectorEnv(small.sim), 30)
     weights = {key.removeprefix("reward."): value for key, value in module.CAREFUL.items()}
     changed = small.config.reward.model_copy(update=weights)
-    monkeypatch.setattr(small.sim, "config", small.config.model_copy(update={"reward": changed}))
+    configure(monkeypatch, small.sim, small.config.model_copy(update={"reward": changed}))
     careful = module.terms(VectorEnv(small.sim), 30)
     for i, name in enumerate(names):
         factor = getattr(changed, name) / getattr(small.config.reward, name)

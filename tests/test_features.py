@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 import torch
 
+from tests.bundles import io_for
 from tests.reference import features as oracle
 from uuvtai import tree_codes as codes
 from uuvtai.config import EpisodeConfig, FeaturesConfig, ForecastConfig, SonarConfig, TankConfig, TrackingConfig
 from uuvtai.kernels.core.geometry import FAR_M
+from uuvtai.kernels.planning.bundles import FeaturesIO
 from uuvtai.kernels.planning.features import (
     COLUMNS,
     columns,
@@ -55,7 +57,7 @@ class Stage:
         self.scan.ping_yaw.from_numpy(ping_yaw.astype(np.float32))
         self.ego.rpy.from_numpy(np.stack([0 * yaw, 0 * yaw, yaw], axis=1).astype(np.float32))
         self.clock.awake.from_numpy(np.ones(N_ENV, np.int32) if awake is None else awake.astype(np.int32))
-        sense_sectors(self.features, self.scan, self.ego, self.clock, FEATURES, SONAR)
+        sense_sectors(io_for(FeaturesIO, self.features, self.scan, self.ego, self.clock, FEATURES, SONAR))
         f = self.features
         return np.array([x.to_numpy() for x in (f.sector_range_m, f.sector_ttc_s, f.sector_closing_m_s, f.sector_valid)])
 
@@ -136,7 +138,7 @@ def observed(stage):
     awake = np.arange(N_ENV) % 4 != 1
     stage.clock.awake.from_numpy(awake.astype(np.int32))
     obs = torch.full((N_ENV, observation_width(FEATURES)), -7.0)
-    write_observation(obs, stage.features, route, stage.ego, mission, stage.clock, FEATURES)
+    write_observation(io_for(FeaturesIO, stage.features, route, stage.ego, mission, stage.clock, FEATURES), obs)
     return obs.numpy(), arrays, awake
 
 
@@ -193,7 +195,9 @@ class Bodies:
             getattr(getattr(self, struct), field).from_numpy(array)
         self.clock.awake.from_numpy(np.ones(N_ENV, np.int32) if awake is None else awake.astype(np.int32))
         obs = torch.full((N_ENV, observation_width(MORE)), -7.0)
-        write_bodies(obs, self.features, self.forecast, self.tracks, self.ego, self.clock, MORE, FORECAST, TRACKING, TANK, RULES)
+        write_bodies(
+            io_for(FeaturesIO, self.features, self.forecast, self.tracks, self.ego, self.clock, MORE, FORECAST, TRACKING, TANK, RULES), obs
+        )
         return obs.numpy()
 
 
@@ -316,7 +320,7 @@ def test_advice_is_what_the_tree_says(stage):
     awake = np.arange(N_ENV) != 9
     stage.clock.awake.from_numpy(awake.astype(np.int32))
     tensor = torch.full((N_ENV, observation_width(MORE)), -7.0)
-    write_advice(tensor, teacher, table, stage.clock, MORE)
+    write_advice(io_for(FeaturesIO, teacher, table, stage.clock, MORE), tensor)
     obs = tensor.numpy()
     assert span("teacher_class").stop == obs.shape[1], "the last columns of all"
     assert (obs[9] == -7).all() and (obs[:, : span("teacher_action").start] == -7).all()

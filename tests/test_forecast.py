@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 
+from tests.bundles import io_for
 from tests.reference import forecast as oracle
 from tests.reference import habits as habit_oracle
 from uuvtai.config import EpisodeConfig, ForecastConfig, TankConfig, TrackingConfig
 from uuvtai.kernels.core.lanes import LANES
 from uuvtai.kernels.perception import forecast
+from uuvtai.kernels.perception.bundles import ForecastIO
 from uuvtai.state import ClockState, ClusterState, DepthImage, ForecastState, HabitState, TrackState, allocate
 
 N_ENV, N_TRACK = 6, 5
@@ -48,7 +50,7 @@ class Stage:
         self.clock.awake.fill(1)
         self.clusters.fresh.fill(1)
         self.image.fresh.fill(0)
-        forecast.reset_forecast(self.forecast, self.habits, self.clock)
+        forecast.reset_forecast(io_for(ForecastIO, self.forecast, self.habits, self.clock))
         return self
 
     def put(self, **fields):
@@ -58,7 +60,9 @@ class Stage:
 
     def predict(self):
         forecast.forecast_tracks(
-            self.forecast, self.tracks, self.habits, self.clusters, self.image, self.clock, self.cfg, TRACKING, TANK, RULES
+            io_for(
+                ForecastIO, self.forecast, self.tracks, self.habits, self.clusters, self.image, self.clock, self.cfg, TRACKING, TANK, RULES
+            )
         )
         return self.forecast.pos_w.to_numpy().astype(float), self.forecast.radius_m.to_numpy().astype(float)
 
@@ -129,7 +133,7 @@ def test_only_moving_tracks_of_awake_rows_are_forecast(stage):
     assert (then[awake == 1][:, [0, 3, 4]] > 0).all()
     np.testing.assert_array_equal(then[awake == 0], first[awake == 0])
     stage.clock.awake.fill(1)
-    forecast.reset_forecast(stage.forecast, stage.habits, stage.clock)
+    forecast.reset_forecast(io_for(ForecastIO, stage.forecast, stage.habits, stage.clock))
     assert (stage.forecast.radius_m.to_numpy() < 0).all()
     assert (stage.forecast.pos_w.to_numpy() == 0).all()
 

@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 import taichi as ti
 
+from tests.bundles import io_for
 from tests.reference import habits as oracle
 from uuvtai.config import EpisodeConfig, ForecastConfig, TankConfig
 from uuvtai.kernels.core.lanes import LANES
 from uuvtai.kernels.core.signature import In
 from uuvtai.kernels.perception import forecast, habits
+from uuvtai.kernels.perception.bundles import ForecastIO
 from uuvtai.state import ClockState, ClusterState, ForecastState, HabitState, TrackState, allocate
 
 N_ENV, N_TRACK, PERIOD = 6, 5, 3
@@ -38,7 +40,7 @@ class Stage:
         self.tracks.moving.fill(1)
         self.tracks.alive.fill(1)
         self.step = 0
-        forecast.reset_forecast(self.forecast, self.habits, self.clock)
+        forecast.reset_forecast(io_for(ForecastIO, self.forecast, self.habits, self.clock))
         return self
 
     def put(self, **fields):
@@ -52,7 +54,7 @@ class Stage:
         turn_cov = np.zeros((N_ENV, N_TRACK, 5))
         turn_cov[..., 4] = rate_var
         self.put(state=state, cov=cov, turn_rate=rate, turn_cov=turn_cov, scan_step=self.step, **{"age": self.step, **fields})
-        forecast.learn_habits(self.habits, self.tracks, self.clusters, self.clock, CONFIG, RULES)
+        forecast.learn_habits(io_for(ForecastIO, self.habits, self.tracks, self.clusters, self.clock, CONFIG, RULES))
 
     def read(self):
         """Every array of the habits; the packed ones as (N_ENV, n_turn)."""
@@ -240,10 +242,10 @@ def test_only_awake_rows_learn_and_forget(stage):
         stage.watch(state, alive=alive)
     assert [len(stage.turns(env)) for env in range(N_ENV)] == list(awake)
     stage.clock.awake.from_numpy((1 - awake).astype(np.int32))
-    forecast.reset_forecast(stage.forecast, stage.habits, stage.clock)
+    forecast.reset_forecast(io_for(ForecastIO, stage.forecast, stage.habits, stage.clock))
     assert [len(stage.turns(env)) for env in range(N_ENV)] == list(awake)
     stage.clock.awake.fill(1)
-    forecast.reset_forecast(stage.forecast, stage.habits, stage.clock)
+    forecast.reset_forecast(io_for(ForecastIO, stage.forecast, stage.habits, stage.clock))
     assert (stage.read()["leg_step"] == -1).all()
     for name, value in stage.read().items():
         assert name == "leg_step" or (value == 0).all(), f"{name} keeps a trace of the last episode"

@@ -5,13 +5,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.bundles import io_for
 from tests.map_bits import check_bits, get_map, put_map
 from tests.reference.mapping import MapOracle, rotation
 from uuvtai.bounds import load_bounds
 from uuvtai.config import DepthConfig, EpisodeConfig, MappingConfig, SonarConfig, TankConfig
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, NONE
 from uuvtai.kernels.core.grid import grid_origin, grid_shape, outside_cells
-from uuvtai.kernels.perception import debug_stamp, mapping
+from uuvtai.kernels.perception import mapping
+from uuvtai.kernels.perception.bundles import MappingIO
+from uuvtai.kernels.privileged import true_map
+from uuvtai.kernels.privileged.bundles import TrueMapIO
 from uuvtai.state import (
     ClockState,
     ClusterState,
@@ -84,7 +88,7 @@ class Stage:
     def reset(self, awake=1):
         self.set_awake(awake)
         self.set_step(0)
-        mapping.reset_map(self.grid_map, self.clock)
+        mapping.reset_map(io_for(MappingIO, self.grid_map, self.clock))
 
     def set_awake(self, awake):
         self.clock.awake.from_numpy(np.broadcast_to(awake, self.n_env).astype(np.int32).copy())
@@ -128,7 +132,7 @@ class Stage:
 
     def update(self):
         args = (self.grid_map, self.scratch, self.scan, self.image, self.tracks, self.clusters, self.mask, self.clock)
-        mapping.update_map(*args, MAP, SONAR, DEPTH_CAMERA, self.tank, EPISODE)
+        mapping.update_map(io_for(MappingIO, *args, MAP, SONAR, DEPTH_CAMERA, self.tank, EPISODE))
 
     def run(self, scan_of, n_scan, first=0, image_of=None):
         """``n_scan`` scans at the map's rate, the same for every env: scan_of(k), image_of(k)."""
@@ -634,7 +638,7 @@ def test_debugging_stamp_is_off_by_default_and_marks_moving_bodies_only(stage):
     world.yaw.fill(np.pi / 2)
     cfg = MappingConfig(stamp=0.7)
     for _ in range(2):
-        debug_stamp.stamp_truth(stage.grid_map, world, stage.clock, cfg, TANK)
+        true_map.stamp_truth(io_for(TrueMapIO, stage.grid_map, world, stage.clock, cfg, TANK))
     dynamic = stage.read()["dynamic"][0]
     assert dynamic[cell(3.05, 1.05)] == 1.0 and dynamic[cell(5.05, 3.35)] == 1.0
     for x, y in ((1.05, 1.05), (5.35, 3.05), (3.05, 3.05), (3.05, 1.45)):

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from tests.conftest import configure
 from uuvtai.kernels.planning import features
 from uuvtai.kernels.sensors import proprioception
 from uuvtai.loader import load_config
-from uuvtai.sim import SimState
+from uuvtai.stages import SimState
 
 KNOWN = {
     "clock", "mission", "ego", "scan", "image", "tracks", "clusters", "spots", "habits", "forecast", "mask", "grid_map", "map_scratch",
@@ -71,7 +72,7 @@ class Poison:
 def watched(small, monkeypatch):
     """The session's simulator, writing observations with all the columns there are: only their kernels are compiled for it."""
     columns = small.config.features.model_copy(update={"n_track": 4, "teacher": True})
-    monkeypatch.setattr(small.sim, "config", small.config.model_copy(update={"features": columns}))
+    configure(monkeypatch, small.sim, small.config.model_copy(update={"features": columns}))
     monkeypatch.setattr(small.sim, "observation", torch.zeros(small.N, features.observation_width(columns)))
     memory = small.sim.memory()
     before = memory.read().copy()
@@ -116,7 +117,7 @@ def test_every_struct_is_known_or_truth():
 def with_sensors(small, monkeypatch, **changed):
     """Another reading of pose and speed: only the two kernels of proprioception are compiled for it."""
     sensors = small.config.sensors.model_copy(update=changed)
-    monkeypatch.setattr(small.sim, "config", small.sim.config.model_copy(update={"sensors": sensors}))
+    configure(monkeypatch, small.sim, small.sim.config.model_copy(update={"sensors": sensors}))
 
 
 def test_no_decision_observation_or_memory_depends_on_the_truth(watched):
@@ -143,16 +144,16 @@ def test_nor_with_dead_reckoning_and_harsh_readings(watched, monkeypatch):
 def test_the_poison_reaches_whoever_reads_the_truth(watched):
     sim = watched.sim
     watched.begin(range(watched.N))
-    poison, c, s = Poison(sim), sim.config, sim.s
+    poison, s = Poison(sim), sim.s
     assert {name.partition(".")[0] for name in poison.arrays} == TRUTH
     s.clock.awake.fill(1)
     before = s.ego.pos_w.to_numpy()
     poison.on()
-    proprioception.sense_proprioception(s.ego, s.ego_memory, s.vehicle, s.episode, s.clock, c.sensors, c.vehicle, c.episode)
+    proprioception.sense_proprioception(sim.io.proprioception)
     sensed = {name: getattr(s.ego, name).to_numpy() for name in ("pos_w", "rate_b", "depth_m")}
     poison.off()
     assert np.isfinite(before).all() and all(np.isnan(values).all() for values in sensed.values())
-    proprioception.sense_proprioception(s.ego, s.ego_memory, s.vehicle, s.episode, s.clock, c.sensors, c.vehicle, c.episode)
+    proprioception.sense_proprioception(sim.io.proprioception)
     assert np.array_equal(s.ego.pos_w.to_numpy(), before), "what was there is back"
 
 
@@ -160,7 +161,7 @@ def test_the_true_pose_in_place_of_the_estimate_is_found(watched, monkeypatch):
     """With exact sensors the estimate equals the truth: nothing but the poison tells them apart."""
     from uuvtai.kernels.perception import elevation
 
-    honest, vehicle = elevation.bound_heights, watched.sim.s.vehicle
-    monkeypatch.setattr("uuvtai.sim.elevation.bound_heights", lambda forecast, tracks, ego, *rest: honest(forecast, tracks, vehicle, *rest))
+    honest, leaking = elevation.bound_heights, dataclasses.replace(watched.sim.io.heights, ego=watched.sim.s.vehicle)
+    monkeypatch.setattr("uuvtai.sim.elevation.bound_heights", lambda _io: honest(leaking))
     _, differing, _ = compared(watched)
     assert {"forecast.above_w", "observation"} & set(differing)

@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 
+from tests.bundles import io_for
 from tests.conftest import set_step
 from tests.reference.proprioception import dead_reckoned, roll_pitch_yaw, specific_force, zeroed_depth
 from tests.reference.scenes import quaternions
 from uuvtai.config import DvlConfig, EpisodeConfig, ImuConfig, PressureConfig, SensorsConfig, VehicleConfig
 from uuvtai.kernels.sensors import proprioception
+from uuvtai.kernels.sensors.bundles import ProprioceptionIO
 from uuvtai.loader import load_config
 from uuvtai.state import ClockState, EpisodeState, Proprioception, ProprioceptionMemory, VehicleState, allocate
 
@@ -30,9 +32,12 @@ class Rig:
 
     def __init__(self):
         for name, struct in (
-            ("ego", Proprioception), ("memory", ProprioceptionMemory), ("vehicle", VehicleState),
-            ("episode", EpisodeState), ("clock", ClockState),
-        ):  # fmt: skip
+            ("ego", Proprioception),
+            ("memory", ProprioceptionMemory),
+            ("vehicle", VehicleState),
+            ("episode", EpisodeState),
+            ("clock", ClockState),
+        ):
             setattr(self, name, allocate(struct, SIZES))
 
     def move(self, **truth):
@@ -46,13 +51,15 @@ class Rig:
         self.episode.key.from_numpy((np.arange(N_ENV) * 31 + key).astype(np.uint32))
         self.clock.awake.fill(1)
         self.clock.step.fill(0)
-        proprioception.reset_proprioception(self.ego, self.memory, self.vehicle, self.episode, self.clock, sensors)
+        proprioception.reset_proprioception(
+            io_for(ProprioceptionIO, self.ego, self.memory, self.vehicle, self.episode, self.clock, sensors)
+        )
 
     def sense(self, sensors, step, names=READINGS):
         set_step(self.clock, step)
         proprioception.sense_proprioception(
-            self.ego, self.memory, self.vehicle, self.episode, self.clock, sensors, BODY, RULES
-        )  # fmt: skip
+            io_for(ProprioceptionIO, self.ego, self.memory, self.vehicle, self.episode, self.clock, sensors, BODY, RULES)
+        )
         return {name: getattr(self.ego, name).to_numpy() for name in names}
 
 
@@ -284,7 +291,7 @@ def test_rows_do_not_touch_each_other_and_sleepers_keep_everything(rig):
     def run(truth, keys):
         rig.start(sensors, **truth)
         rig.episode.key.from_numpy(keys)
-        proprioception.reset_proprioception(rig.ego, rig.memory, rig.vehicle, rig.episode, rig.clock, sensors)
+        proprioception.reset_proprioception(io_for(ProprioceptionIO, rig.ego, rig.memory, rig.vehicle, rig.episode, rig.clock, sensors))
         for step in range(15):
             out = rig.sense(sensors, step)
         return out
@@ -295,7 +302,7 @@ def test_rows_do_not_touch_each_other_and_sleepers_keep_everything(rig):
     assert all(np.array_equal(first[name][order], permuted[name]) for name in READINGS)
     rig.clock.awake.from_numpy((np.arange(N_ENV) % 2).astype(np.int32))
     rig.move(vel_b=(3, 3, 3))
-    proprioception.reset_proprioception(rig.ego, rig.memory, rig.vehicle, rig.episode, rig.clock, sensors)
+    proprioception.reset_proprioception(io_for(ProprioceptionIO, rig.ego, rig.memory, rig.vehicle, rig.episode, rig.clock, sensors))
     after = rig.sense(sensors, 20)
     assert all(np.array_equal(permuted[name][::2], after[name][::2]) for name in READINGS)
     assert not np.array_equal(permuted["rate_b"][1::2], after["rate_b"][1::2])

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from tests.bundles import io_for
 from tests.reference import reward as reference
 from uuvtai import state
 from uuvtai.config import EpisodeConfig, RewardConfig, VehicleConfig
 from uuvtai.kernels.task import reward
+from uuvtai.kernels.task.bundles import RewardIO
 from uuvtai.kernels.task.episode import OUTCOMES
 
 N = 64
@@ -47,7 +49,7 @@ class Bench:
     def clean(self):
         """Every row upright at 10 m, driving ahead at 0.5 m/s on a route of old, one step in."""
         self.clock.awake.fill(1)
-        reward.reset_reward(self.reward, self.clock)
+        reward.reset_reward(io_for(RewardIO, self.reward, self.clock))
         rest = {"quat": (1, 0, 0, 0), "vel": (0.5, 0, 0), "pos": (10, 3, -0.8), "command": (0.5, 0, 0, 0), "lookahead": (11, 3, -0.8)}
         for name, value in rest.items():
             self.set(name, np.tile(value, (N, 1)))
@@ -62,7 +64,7 @@ class Bench:
         field.from_numpy(np.asarray(values, np.int32 if name in ("n_way", "outcome", "plan_step", "step") else np.float32))
 
     def compute(self):
-        reward.compute_reward(*self.out, *self.structs, CFG, VEHICLE, RULES)
+        reward.compute_reward(io_for(RewardIO, *self.structs, CFG, VEHICLE, RULES), *self.out)
         return dict(zip(reward.TERMS, self.reward.term.to_numpy().T.astype(float), strict=True))
 
 
@@ -122,7 +124,7 @@ def test_total_is_the_sum_and_goes_out(bench):
     bench.compute()
     assert bench.reward.episode_return.to_numpy() == pytest.approx(2 * total, abs=0.02)  # the second step earns other progress
     assert bench.reward.episode_sum.to_numpy().sum(axis=1) == pytest.approx(bench.reward.episode_return.to_numpy(), abs=TOL)
-    reward.reset_reward(bench.reward, bench.clock)
+    reward.reset_reward(io_for(RewardIO, bench.reward, bench.clock))
     assert not bench.reward.episode_sum.to_numpy().any()
     assert not bench.reward.episode_return.to_numpy().any()
 
@@ -139,7 +141,7 @@ def test_bytes_and_booleans_hold_the_ends_too(bench):
     bench.set("outcome", np.full(N, OUTCOMES.index("timeout")))
     for dtype in (torch.uint8, torch.bool):
         ends = torch.ones(N, dtype=dtype), torch.zeros(N, dtype=dtype)
-        reward.compute_reward(bench.out[0], *ends, *bench.structs, CFG, VEHICLE, RULES)
+        reward.compute_reward(io_for(RewardIO, *bench.structs, CFG, VEHICLE, RULES), bench.out[0], *ends)
         assert not ends[0].any()
         assert ends[1].all()
 

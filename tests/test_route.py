@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 
 from tests import planning_maps as maps
+from tests.bundles import io_for
 from tests.planning_stage import CONFIG, N_ENV, clean, plan, put_ends, put_maps, stage, way_of
 from tests.reference import route as oracle
 from uuvtai import plan_codes as codes
 from uuvtai.kernels.planning import route, triggers
+from uuvtai.kernels.planning.bundles import RouteIO, TriggersIO
 
 POSITION_M = 2e-5
 """float32 at 20 m resolves 1e-6 m; lengths are sums of a hundred such steps."""
@@ -18,21 +20,39 @@ REST_STEPS = round(R.min_replan_s / DT)
 def fire():
     s, c = stage(), CONFIG
     triggers.fire_triggers(
-        s.route, s.clearance, s.grid_map, s.mask, s.forecast, s.scan, s.ego, s.mission, s.clock,
-        c.route, c.voronoi, c.tracking, c.mapping, maps.TANK, c.episode,
-    )  # fmt: skip
+        io_for(
+            TriggersIO,
+            s.route,
+            s.clearance,
+            s.grid_map,
+            s.mask,
+            s.forecast,
+            s.scan,
+            s.ego,
+            s.mission,
+            s.clock,
+            c.route,
+            c.voronoi,
+            c.tracking,
+            c.mapping,
+            maps.TANK,
+            c.episode,
+        )
+    )
 
 
 def follow():
     s, c = stage(), CONFIG
     route.follow_route(
-        s.route, s.clearance, s.grid_map, s.ego, s.mission, s.clock, c.route, c.clearance, c.mapping, maps.TANK
-    )  # fmt: skip
+        io_for(RouteIO, s.route, s.clearance, s.grid_map, s.ego, s.mission, s.clock, c.route, c.clearance, c.mapping, maps.TANK)
+    )
 
 
 def load(env, corners):
     s, c = stage(), CONFIG
-    route.load_route(s.route, s.clearance, s.clock, np.array(corners, np.float32), env, c.route, c.voronoi, c.mapping, maps.TANK)
+    route.load_route(
+        io_for(RouteIO, s.route, s.clearance, s.clock, c.route, c.voronoi, c.mapping, maps.TANK), np.array(corners, np.float32), env
+    )
 
 
 def set_step(step):
@@ -363,7 +383,7 @@ def test_reset_clears_only_the_rows_that_are_awake():
     follow()
     before = {name: getattr(s.route, name).to_numpy() for name in vars(s.route) if getattr(s.route, name).shape[:1] == (N_ENV,)}
     s.clock.awake.from_numpy(np.array([1, 0, 1, 0, 0, 0, 0, 0], np.int32))
-    route.reset_route(s.route, s.clock)
+    route.reset_route(io_for(RouteIO, s.route, s.clock))
     for name, values in before.items():
         after = getattr(s.route, name).to_numpy()
         assert np.array_equal(after[[1, 3, 4, 5, 6, 7]], values[[1, 3, 4, 5, 6, 7]]), name

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import taichi as ti
 
+from tests.bundles import io_for
 from tests.conftest import set_step
 from tests.reference import scenes
 from tests.reference.sonar import WALL, beam_headings, doppler_by_differences, sonar_scan
@@ -12,6 +13,7 @@ from uuvtai.kernels.core.geometry import FAR_M
 from uuvtai.kernels.core.lanes import LANES, f16x
 from uuvtai.kernels.core.signature import Const
 from uuvtai.kernels.sensors import sonar, sonar_error
+from uuvtai.kernels.sensors.bundles import SonarIO
 from uuvtai.loader import load_config
 from uuvtai.state import ClockState, EpisodeState, Proprioception, SonarMemory, SonarScan, VehicleState, WorldState, allocate
 
@@ -43,9 +45,14 @@ class Rig:
 
     def __init__(self):
         for name, struct in (
-            ("scan", SonarScan), ("memory", SonarMemory), ("ego", Proprioception), ("vehicle", VehicleState),
-            ("world", WorldState), ("episode", EpisodeState), ("clock", ClockState),
-        ):  # fmt: skip
+            ("scan", SonarScan),
+            ("memory", SonarMemory),
+            ("ego", Proprioception),
+            ("vehicle", VehicleState),
+            ("world", WorldState),
+            ("episode", EpisodeState),
+            ("clock", ClockState),
+        ):
             setattr(self, name, allocate(struct, SIZES))
 
     def start(self, scene, key=1):
@@ -55,12 +62,12 @@ class Rig:
         self.clock.awake.fill(1)
         self.clock.step.fill(0)
         self.ego.pos_w.from_numpy(scene["pos"].astype(np.float32))
-        sonar.reset_sonar(self.scan, self.memory, self.clock)
+        sonar.reset_sonar(io_for(SonarIO, self.scan, self.memory, self.clock))
 
     def cast(self, config=CLEAN, tank=TANK, names=("range_m", "doppler_m_s", "intensity", "hit", "fresh", "ping_step")):
         sonar.cast_sonar(
-            self.scan, self.memory, self.ego, self.vehicle, self.world, self.episode, self.clock, config, tank, RULES
-        )  # fmt: skip
+            io_for(SonarIO, self.scan, self.memory, self.ego, self.vehicle, self.world, self.episode, self.clock, config, tank, RULES)
+        )
         return {name: getattr(self.scan, name).to_numpy() for name in names}
 
 
@@ -178,26 +185,30 @@ def test_own_motion_along_the_beam_is_negative_doppler_of_everything_still(rig):
 
 @ti.kernel
 def apply_error(
-    which: Const[int], range_m: ti.f32, cosine: ti.f32, step: ti.i32, config: Const[SonarConfig],
+    which: Const[int],
+    range_m: ti.f32,
+    cosine: ti.f32,
+    step: ti.i32,
+    config: Const[SonarConfig],
     out: ti.types.ndarray(dtype=ti.f32, ndim=3),
-):  # fmt: skip
+):
     """out[key, ray, (range, rate, brightness)] of one error source for beams that would tell (range_m, 1, cosine)."""
     for row, packet in ti.ndrange(out.shape[0], out.shape[1] // LANES):
         key, ray = ti.cast(row + 7, ti.u32), packet * LANES
         r, rate, bright = f16x(range_m), f16x(1.0), f16x(cosine)
         told, speed, lit = r + 0.0, rate + 0.0, bright + 0.0
         if ti.static(which == 0):
-            told = sonar_error.range_noisy(r, key, step, ray, config)
+            told = sonar_error.range_noisy(r, key, step, ray, io_for(SonarIO, config))
         elif ti.static(which == 1):
-            told = sonar_error.missed(r, key, step, ray, config)
+            told = sonar_error.missed(r, key, step, ray, io_for(SonarIO, config))
         elif ti.static(which == 2):
-            told, speed, lit = sonar_error.falsely_returned(r, rate, bright, key, step, ray, config)
+            told, speed, lit = sonar_error.falsely_returned(r, rate, bright, key, step, ray, io_for(SonarIO, config))
         elif ti.static(which == 3):
-            told = sonar_error.grazing_lost(r, bright, config)
+            told = sonar_error.grazing_lost(r, bright, io_for(SonarIO, config))
         elif ti.static(which == 4):
-            told = sonar_error.cut_off(r, config)
+            told = sonar_error.cut_off(r, io_for(SonarIO, config))
         else:
-            speed = sonar_error.doppler_noisy(rate, key, step, ray, config)
+            speed = sonar_error.doppler_noisy(rate, key, step, ray, io_for(SonarIO, config))
         for i in ti.static(range(LANES)):
             out[row, ray + i, 0] = told[i]
             out[row, ray + i, 1] = speed[i]
@@ -410,7 +421,7 @@ def test_sleeping_rows_keep_their_scan(rig, batches):
     after = rig.cast()
     assert all(np.array_equal(before[name][::2], after[name][::2]) for name in before)
     assert not np.array_equal(before["range_m"][1::2], after["range_m"][1::2])
-    sonar.reset_sonar(rig.scan, rig.memory, rig.clock)
+    sonar.reset_sonar(io_for(SonarIO, rig.scan, rig.memory, rig.clock))
     cleared = rig.scan.hit.to_numpy()
     assert np.array_equal(cleared[::2], after["hit"][::2]) and not cleared[1::2].any()
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from tests.bundles import io_for
 from tests.reference import spotting as oracle
 from tests.reference.elevation import prior
 from tests.reference.scenes import BOX, CYLINDER, SPHERE, load, quaternions
@@ -10,7 +11,9 @@ from tests.reference.tracking import predicted
 from uuvtai import state
 from uuvtai.config import DepthConfig, ElevationConfig, EpisodeConfig, SonarConfig, SpottingConfig, TankConfig, TrackingConfig
 from uuvtai.kernels.perception import spotting
+from uuvtai.kernels.perception.bundles import SpottingIO
 from uuvtai.kernels.sensors import depth
+from uuvtai.kernels.sensors.bundles import DepthIO
 
 N_ENV, N_TRACK, N_BODY = 12, 3, 3
 TANK, RULES = TankConfig(x_m=(0.0, 20.0), y_m=(0.0, 6.0), z_m=(-1.6, 0.0)), EpisodeConfig(control_dt_s=0.02)
@@ -109,12 +112,14 @@ class Rig:
     def look(self):
         """Draw the image and follow what it shows; returns the memory afterwards."""
         self.load()
-        depth.cast_depth(self.image, self.ego, self.vehicle, self.world, self.episode, self.clock, CAMERA, TANK)
+        depth.cast_depth(io_for(DepthIO, self.image, self.ego, self.vehicle, self.world, self.episode, self.clock, CAMERA, TANK))
         return self.follow()
 
     def follow(self):
-        spotting.scan_columns(self.spots, self.image, self.clock, CFG, CAMERA, TANK)
-        spotting.follow_spots(self.tracks, self.spots, self.image, self.scan, self.clock, CFG, CAMERA, SONAR, ELEVATION, TRACKING, RULES)
+        spotting.scan_columns(io_for(SpottingIO, self.spots, self.image, self.clock, CFG, CAMERA, TANK))
+        spotting.follow_spots(
+            io_for(SpottingIO, self.tracks, self.spots, self.image, self.scan, self.clock, CFG, CAMERA, SONAR, ELEVATION, TRACKING, RULES)
+        )
         self.memory = {name: field.to_numpy() for name, field in vars(self.tracks).items()}
         return self.memory
 
@@ -434,7 +439,7 @@ def test_sleeping_rows_old_images_and_other_rows(rig):
         rig.awake[rows] = still == "stale"
         rig.load()
         before = {name: field.to_numpy() for name, field in vars(rig.tracks).items()}
-        depth.cast_depth(rig.image, rig.ego, rig.vehicle, rig.world, rig.episode, rig.clock, CAMERA, TANK)
+        depth.cast_depth(io_for(DepthIO, rig.image, rig.ego, rig.vehicle, rig.world, rig.episode, rig.clock, CAMERA, TANK))
         fresh = np.ones(N_ENV)
         fresh[rows] = still == "asleep"
         rig.write(rig.image, fresh=fresh)

@@ -9,12 +9,14 @@ import pytest
 import taichi as ti
 import torch
 
+from tests.bundles import io_for
 from tests.reference import teacher as oracle
 from uuvtai import state
 from uuvtai.config import Config, TeacherConfig
 from uuvtai.kernels.core.geometry import FAR_M
 from uuvtai.kernels.core.grid import grid_origin, grid_shape
-from uuvtai.kernels.teacher.teacher import evasion, teacher, threats
+from uuvtai.kernels.teacher import evasion, teacher, threats
+from uuvtai.kernels.teacher.bundles import EvasionIO, TeacherIO, ThreatsIO
 from uuvtai.tree import load_tree, parse_tree, read_tree
 
 N_ENV, N_TRACK, N_RAY = 6, 4, 64
@@ -113,7 +115,7 @@ def scene(stage):
     stage.clearance.site_row.fill(-1)
     stage.clearance.site_col.fill(-1)
     use(stage, "bt")
-    teacher.reset_teacher(stage.t, stage.clock)
+    teacher.reset_teacher(io_for(TeacherIO, stage.t, stage.clock))
     return stage
 
 
@@ -143,35 +145,41 @@ def body(stage, env, track, pos, vel, radius=0.2, above=-0.8, below=-0.8):
 
 def assess(stage, cfg=CFG.teacher):
     threats.assess_threats(
-        stage.t,
-        stage.route,
-        stage.forecast,
-        stage.scan,
-        stage.clearance,
-        stage.ego,
-        stage.mission,
-        stage.clock,
-        cfg,
-        CFG.vehicle,
-        CFG.tracking,
-        TANK,
-        CFG.mapping,
-        CFG.episode,
+        io_for(
+            ThreatsIO,
+            stage.t,
+            stage.route,
+            stage.forecast,
+            stage.scan,
+            stage.clearance,
+            stage.ego,
+            stage.mission,
+            stage.clock,
+            cfg,
+            CFG.vehicle,
+            CFG.tracking,
+            TANK,
+            CFG.mapping,
+            CFG.episode,
+        )
     )
 
 
 def plan(stage):
     evasion.plan_evasion(
-        stage.t,
-        stage.forecast,
-        stage.clearance,
-        stage.ego,
-        stage.clock,
-        CFG.teacher,
-        CFG.vehicle,
-        CFG.tracking,
-        TANK,
-        CFG.mapping,
+        io_for(
+            EvasionIO,
+            stage.t,
+            stage.forecast,
+            stage.clearance,
+            stage.ego,
+            stage.clock,
+            CFG.teacher,
+            CFG.vehicle,
+            CFG.tracking,
+            TANK,
+            CFG.mapping,
+        )
     )
 
 
@@ -183,17 +191,10 @@ def decide(stage):
 
 def tick(stage):
     teacher.tick_tree(
-        stage.t,
+        io_for(
+            TeacherIO, stage.t, stage.table, stage.route, stage.ego, stage.mission, stage.clock, CFG.teacher, CFG.vehicle, TANK, CFG.episode
+        ),
         stage.action,
-        stage.table,
-        stage.route,
-        stage.ego,
-        stage.mission,
-        stage.clock,
-        CFG.teacher,
-        CFG.vehicle,
-        TANK,
-        CFG.episode,
     )
     ti.sync()
 
@@ -790,7 +791,7 @@ def test_sleeping_rows_are_untouched_and_rows_do_not_meet(scene):
         scene.clock.awake.fill(1)
         scene.clock.step.fill(0)
         scene.forecast.radius_m.fill(-1.0)
-        teacher.reset_teacher(scene.t, scene.clock)
+        teacher.reset_teacher(io_for(TeacherIO, scene.t, scene.clock))
         body(scene, 0, 0, (7.0, 3.1), (-0.6, 0.0))
         for env in range(1, N_ENV):
             if others:

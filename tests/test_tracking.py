@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 import taichi as ti
 
+from tests.bundles import io_for
 from tests.conftest import set_step
 from tests.reference import small_sonar
 from tests.reference import tracking as oracle
 from uuvtai.config import ElevationConfig, EpisodeConfig, ForecastConfig, SonarConfig, TankConfig, TrackingConfig
 from uuvtai.kernels.core import kalman
 from uuvtai.kernels.perception import tracking
+from uuvtai.kernels.perception.bundles import TrackingIO
 from uuvtai.state import ClockState, ClusterState, HabitState, SonarScan, TrackState, allocate
 
 N_ENV = 16
@@ -63,7 +65,7 @@ class Lab:
     def begin(self, seed=0):
         self.rng = np.random.default_rng(seed)
         self.clock.awake.fill(1)
-        tracking.reset_tracks(self.tracks, self.clusters, self.clock)
+        tracking.reset_tracks(io_for(TrackingIO, self.tracks, self.clusters, self.clock))
         return self
 
     def feed(self, step, pos, yaw, vel_w, range_m, doppler, hit, late=0, valid=1):
@@ -659,10 +661,10 @@ def test_only_awake_rows_change(paper):
     assert not half["alive"][awake == 0].any()
     paper.clock.awake.from_numpy((1 - awake).astype(np.int32))
     before = paper.everything()
-    tracking.reset_tracks(paper.tracks, paper.clusters, paper.clock)
+    tracking.reset_tracks(io_for(TrackingIO, paper.tracks, paper.clusters, paper.clock))
     assert_same(before, paper.everything(), awake == 1)
     paper.clock.awake.fill(1)
-    tracking.reset_tracks(paper.tracks, paper.clusters, paper.clock)
+    tracking.reset_tracks(io_for(TrackingIO, paper.tracks, paper.clusters, paper.clock))
     assert not paper.read("alive").any()
     assert (paper.read("beam_track") == -1).all()
     assert (paper.read("scan_step") == -1).all()

@@ -9,9 +9,11 @@ import pytest
 from rich.console import Console
 
 from benchmarks.peers.tick_py_trees import PyTree
+from tests.bundles import io_for
 from uuvtai import state
 from uuvtai import tree_codes as codes
 from uuvtai.config import TeacherConfig
+from uuvtai.kernels.teacher.bundles import TeacherIO
 from uuvtai.kernels.teacher.tree_tick import tick_with_given_statuses
 from uuvtai.loader import ConfigError, preset_names, preset_path
 from uuvtai.show.screen import Screen
@@ -184,7 +186,7 @@ def begin(engine, flat):
 def tick(engine, answers):
     """Statuses [env, node] after a tick with the given leaf answers, and the acting node."""
     teacher, table = engine
-    tick_with_given_statuses(np.ascontiguousarray(answers, np.int32), teacher, table)
+    tick_with_given_statuses(io_for(TeacherIO, teacher, table), np.ascontiguousarray(answers, np.int32))
     return teacher.status.to_numpy(), teacher.leaf.to_numpy()
 
 

@@ -9,13 +9,16 @@ import numpy as np
 import pytest
 import yaml
 
+from tests.bundles import io_for
 from tests.conftest import set_step
 from tests.reference import world as reference
 from uuvtai import scenario, state
 from uuvtai.config import EpisodeConfig, WorldConfig
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, NONE, SPHERE
 from uuvtai.kernels.task import episode
-from uuvtai.kernels.world.world import world
+from uuvtai.kernels.task.bundles import EpisodeIO
+from uuvtai.kernels.world import world
+from uuvtai.kernels.world.bundles import WorldIO
 from uuvtai.shipped import PRESET_DIR
 
 N = 192
@@ -64,16 +67,17 @@ class Drawn:
         scenario.set_scenes(self.scene, cfg, [scene or (cfg.n_static, cfg.n_dynamic, cfg.dynamic_speed_m_s)])
         numbers = np.arange(n) if numbers is None else np.asarray(numbers)
         mask = np.ones(n) if mask is None else np.asarray(mask)
-        episode.begin_episodes(*(np.broadcast_to(a, n).astype(np.int32) for a in (mask, seed, numbers)), self.clock, self.episode)
-        world.generate_scenarios(*self.structs, cfg)
+        rows = (np.broadcast_to(a, n).astype(np.int32) for a in (mask, seed, numbers))
+        episode.begin_episodes(io_for(EpisodeIO, self.clock, self.episode), *rows)
+        world.generate_scenarios(io_for(WorldIO, *self.structs, cfg))
         return self.at(0, keep_awake=True)
 
     def at(self, step, keep_awake=False):
         """Arrays by name with the obstacles where they are at a step."""
         if not keep_awake:
-            episode.wake(self.clock)
+            episode.wake(io_for(EpisodeIO, self.clock))
         set_step(self.clock, step)
-        world.move_obstacles(self.world, self.path, self.clock, EpisodeConfig())
+        world.move_obstacles(io_for(WorldIO, self.world, self.path, self.clock, EpisodeConfig()))
         out = {f"path_{name}": field.to_numpy() for name, field in vars(self.path).items()}
         for struct in (self.world, self.mission):
             out |= {name: field.to_numpy() for name, field in vars(struct).items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import is_dataclass
 from typing import Any, TypeVar
 
 import numpy as np
@@ -9,9 +10,13 @@ import taichi as ti
 
 from uuvtai import state
 from uuvtai.allocation import allocation_matrices
+from uuvtai.binding import bind
 from uuvtai.config import Config
 from uuvtai.errors import SettingError
+from uuvtai.kernels.sensors import proprioception
+from uuvtai.kernels.sensors.bundles import ExactProprioceptionIO
 from uuvtai.kernels.vehicle import actuation, dynamics
+from uuvtai.kernels.vehicle.bundles import ActuationIO, DynamicsIO
 from uuvtai.runtime import Runtime
 
 _T = TypeVar("_T")
@@ -38,6 +43,10 @@ class Plant:
         self.allocation = self._allocated(state.Allocation)
         self.current = self._allocated(state.CurrentState)
         self.ego = self._allocated(state.Proprioception)
+        structs = [value for value in vars(self).values() if is_dataclass(value)]
+        self.actuation_io = bind(ActuationIO, config, *structs)
+        self.dynamics_io = bind(DynamicsIO, config, *structs)
+        self.senses_io = bind(ExactProprioceptionIO, config, *structs)
         wrench_of_thrust, thrust_of_wrench = allocation_matrices(config.vehicle)
         self.write(self.allocation.wrench_of_thrust, wrench_of_thrust)
         self.write(self.allocation.thrust_of_wrench, thrust_of_wrench)
@@ -54,36 +63,21 @@ class Plant:
 
     def reset(self, keys: np.ndarray | None = None) -> None:
         """All vehicles at rest at the origin; ``keys`` (n_env) are the episodes' random keys (default: 0, 1, 2, ..)."""
-        c = self.config
         self.clock.active.fill(1)
         self.clock.awake.fill(1)
         self._set_time(0)
         self.episode.key.from_numpy((np.arange(self.n_env) if keys is None else keys).astype(np.uint32))
-        dynamics.reset_vehicle(
-            self.vehicle, self.params, self.current, self.mission, self.episode, self.clock, c.vehicle, c.disturbance, c.episode
-        )
-        actuation.reset_actuation(self.actuation, self.clock)
+        dynamics.reset_vehicle(self.dynamics_io)
+        actuation.reset_actuation(self.actuation_io)
 
     def step(self, action: np.ndarray | None = None, substeps: int | None = None, dt_s: float | None = None) -> None:
         """One control step, driven by the inner loop on exact measurements where ``action`` (n_env, 4) is given."""
-        c, e = self.config, self.config.episode
+        rules = self.config.episode
         if action is not None:
-            dynamics.sense_exactly(self.ego, self.vehicle, self.clock)
+            proprioception.sense_exactly(self.senses_io)
             self.command(action)
-        dynamics.move_vehicle(
-            self.vehicle,
-            self.actuation,
-            self.current,
-            self.params,
-            self.allocation,
-            self.episode,
-            self.clock,
-            c.vehicle,
-            c.actuation,
-            c.disturbance,
-            e.control_dt_s if dt_s is None else dt_s,
-            e.substeps if substeps is None else substeps,
-        )
+        dt_s = rules.control_dt_s if dt_s is None else dt_s
+        dynamics.move_vehicle(self.dynamics_io, dt_s, rules.substeps if substeps is None else substeps)
         self._set_time(self.steps + 1)
 
     def _set_time(self, steps: int) -> None:
@@ -92,18 +86,7 @@ class Plant:
 
     def command(self, action: np.ndarray) -> None:
         """The inner loop alone, on whatever ``ego`` holds."""
-        c = self.config
-        actuation.command_thrusters(
-            np.ascontiguousarray(action, dtype=np.float32),
-            self.actuation,
-            self.params,
-            self.allocation,
-            self.ego,
-            self.clock,
-            c.vehicle,
-            c.actuation,
-            c.episode,
-        )
+        actuation.command_thrusters(self.actuation_io, np.ascontiguousarray(action, dtype=np.float32))
 
 
 def check_thruster_index(config: Config) -> None:

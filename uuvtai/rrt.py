@@ -18,9 +18,10 @@ import numpy as np
 
 from uuvtai.config import Config
 from uuvtai.kernels.core.grid import grid_origin, grid_shape
+from uuvtai.kernels.planning.bundles import RouteIO, VoronoiIO
 
 if TYPE_CHECKING:
-    from uuvtai.state import ClearanceState, ClockState, ForecastState, GridMask, MapState, MissionState, Proprioception, RouteState
+    pass
 
 Point = tuple[float, float]
 
@@ -192,33 +193,22 @@ class RouteFallback:
         self.overlay = np.zeros(grid_shape(tank, cell_m), dtype=np.float32)
         self.origin = grid_origin(tank, cell_m)
 
-    def serve(
-        self,
-        route: RouteState,
-        clearance: ClearanceState,
-        grid_map: MapState,
-        mask: GridMask,
-        forecast: ForecastState,
-        mission: MissionState,
-        ego: Proprioception,
-        clock: ClockState,
-        seed_of: Callable[[int], int],
-    ) -> int:
+    def serve(self, route_io: RouteIO, voronoi_io: VoronoiIO, seed_of: Callable[[int], int]) -> int:
         """Plan for ``route.failed``; returns how many there were. ``seed_of(env)`` gives the env's number of (seed, episode, step)."""
         from uuvtai.kernels.planning.route import keep_route, load_route
         from uuvtai.kernels.planning.voronoi import overlay_clearance
 
-        c = self.config
+        route, ego, mission = route_io.route, route_io.ego, route_io.mission
         n_failed = int(route.n_failed[None])
         for item in range(n_failed):
             env = int(route.failed[item])
-            overlay_clearance(clearance, grid_map, mask, forecast, self.overlay, env, c.voronoi, c.mapping, c.world.tank)
+            overlay_clearance(voronoi_io, self.overlay, env)
             start, goal = ego.pos_w[env], mission.goal_w[env]
             corners = self.plan((start[0], start[1]), (goal[0], goal[1]), seed_of(env))
             if corners is None:
-                keep_route(route, env)
+                keep_route(route_io, env)
             else:
-                load_route(route, clearance, clock, corners.astype(np.float32), env, c.route, c.voronoi, c.mapping, c.world.tank)
+                load_route(route_io, corners.astype(np.float32), env)
         return n_failed
 
     def plan(self, start_xy: Point, goal_xy: Point, seed: int) -> np.ndarray | None:

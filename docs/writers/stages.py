@@ -23,7 +23,7 @@ FILES = {
     "teacher": ("threats", "evasion", "teacher"),
     "reward": ("reward",),
 }
-"""kernel files of each stage, by the names of ``uuvtai.sim.STAGES``"""
+"""kernel files of each stage, by the names of ``uuvtai.stages.STAGES``"""
 
 
 def page() -> str:
@@ -40,7 +40,8 @@ def page() -> str:
 
 
 def _docstring(name: str) -> str:
-    text = ast.get_docstring(ast.parse((KERNELS / f"{name}.py").read_text(encoding="utf-8")))
+    (path,) = KERNELS.glob(f"*/{name}.py")
+    text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
     if not text:
-        raise ValueError(f"uuvtai/kernels/{name}.py has no docstring for the page of stages; write one")
+        raise ValueError(f"{path} has no docstring for the page of stages; write one")
     return text

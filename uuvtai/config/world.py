@@ -7,6 +7,7 @@ from typing import Literal
 from pydantic import model_validator
 
 from uuvtai.config.section import Count, Fraction, Interval, NonNegative, OrderedInterval, Positive, PositiveInterval, Real, Section
+from uuvtai.truth import Truth
 
 
 class TankConfig(Section):
@@ -118,7 +119,7 @@ class FixedObstacle(Section):
         return self
 
 
-class WorldConfig(Section):
+class WorldConfig(Section, Truth):
     """Tank, spawn ranges and obstacles: with (seed, episode) it defines a scenario completely."""
 
     tank: TankConfig = TankConfig()

@@ -13,8 +13,9 @@ from uuvtai.config import Config
 from uuvtai.config.learning import LearningConfig
 from uuvtai.measure.latency import latency_rows
 from uuvtai.run_folder import hardware, versions
-from uuvtai.sim import STAGES, Sim
+from uuvtai.sim import Sim
 from uuvtai.sizes import check_size, memory_bytes
+from uuvtai.stages import STAGES
 
 WARM_STEPS = 60
 """More than every divider's period, so that each stage has run several times before the clock starts."""

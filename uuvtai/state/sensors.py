@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import taichi as ti
 
 from uuvtai.state.arrays import array
+from uuvtai.truth import Truth
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +31,7 @@ class Proprioception:
 
 
 @dataclass(frozen=True, eq=False)
-class ProprioceptionMemory:
+class ProprioceptionMemory(Truth):
     """Hidden state of the proprioceptive sensors (simulator side)."""
 
     pressure_bias_m: ti.Field = array("n_env")
@@ -74,7 +75,7 @@ class SonarScan:
 
 
 @dataclass(frozen=True, eq=False)
-class SonarMemory:
+class SonarMemory(Truth):
     """Hidden state of the sonar (simulator side): scans under way and bubble clouds."""
 
     range_m: ti.Field = array("n_env", "n_latency", "n_ray", lanes=True)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import taichi as ti
 
 from uuvtai.state.arrays import array
+from uuvtai.truth import Truth
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +23,7 @@ class ClockState:
 
 
 @dataclass(frozen=True, eq=False)
-class EpisodeState:
+class EpisodeState(Truth):
     """Which episode each env plays. Its key opens every random stream, so only the simulator's side (world, vehicle, sensors) gets it."""
 
     seed: ti.Field = array("n_env", dtype=ti.i32)
@@ -62,7 +63,7 @@ class RewardState:
 
 
 @dataclass(frozen=True, eq=False)
-class RefereeState:
+class RefereeState(Truth):
     """How each episode stands, judged from the truth. Never an input of mapping, planning, teacher or policy."""
 
     outcome: ti.Field = array("n_env", dtype=ti.i32)

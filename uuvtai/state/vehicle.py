@@ -7,10 +7,11 @@ from dataclasses import dataclass
 import taichi as ti
 
 from uuvtai.state.arrays import array
+from uuvtai.truth import Truth
 
 
 @dataclass(frozen=True, eq=False)
-class VehicleState:
+class VehicleState(Truth):
     """Truth: rigid body and rotors. Origin = centre of mass."""
 
     pos_w: ti.Field = array("n_env", vec=3)
@@ -28,7 +29,7 @@ class VehicleState:
 
 
 @dataclass(frozen=True, eq=False)
-class VehicleParams:
+class VehicleParams(Truth):
     """Truth: physical parameters of each vehicle (equal unless randomised). Diagonals in the order of Fossen's nu."""
 
     mass_kg: ti.Field = array("n_env")
@@ -52,7 +53,7 @@ class VehicleParams:
 
 
 @dataclass(frozen=True, eq=False)
-class ActuationState:
+class ActuationState(Truth):
     """Inner loop and rotors' commands."""
 
     command: ti.Field = array("n_env", vec=4)
@@ -82,7 +83,7 @@ class Allocation:
 
 
 @dataclass(frozen=True, eq=False)
-class CurrentState:
+class CurrentState(Truth):
     """Truth: water velocity."""
 
     mean_w: ti.Field = array("n_env", vec=3)

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 import taichi as ti
 
 from uuvtai.state.arrays import array
+from uuvtai.truth import Truth
 
 
 @dataclass(frozen=True, eq=False)
-class SceneState:
+class SceneState(Truth):
     """What is asked of the scenario of each env: data, so that cells of a sweep need no recompilation."""
 
     n_static: ti.Field = array("n_env", dtype=ti.i32)
@@ -22,7 +23,7 @@ class SceneState:
 
 
 @dataclass(frozen=True, eq=False)
-class WorldState:
+class WorldState(Truth):
     """Truth: obstacles as a list per env, fixed and static ones first, moving ones from ``first_dynamic`` on. kind NONE = empty slot."""
 
     kind: ti.Field = array("n_env", "n_body", dtype=ti.i32)
@@ -44,7 +45,7 @@ class WorldState:
 
 
 @dataclass(frozen=True, eq=False)
-class PathState:
+class PathState(Truth):
     """Truth: how the moving obstacles move. A closed polyline of 2 to 5 waypoints (2 = back and forth), or a circle (n_way = 0)."""
 
     n_way: ti.Field = array("n_env", "n_dynamic", dtype=ti.i32)
@@ -62,7 +63,7 @@ class PathState:
 
 
 @dataclass(frozen=True, eq=False)
-class FixedTable:
+class FixedTable(Truth):
     """Obstacles given explicitly by the world's YAML, the same for all envs; moving ones fill the first slots of the moving list."""
 
     kind: ti.Field = array("n_fixed", dtype=ti.i32)
@@ -82,7 +83,7 @@ class FixedTable:
 
 
 @dataclass(frozen=True, eq=False)
-class ScenarioScratch:
+class ScenarioScratch(Truth):
     """Scratch of scenario drawing: free space on a coarse grid, to see whether start and goal are joined."""
 
     reach: ti.Field = array("n_env", "n_coarse_row", "n_coarse_col", dtype=ti.u8, scratch=True)

@@ -133,17 +133,17 @@ def is_off_ring(shape, center, radius, body_radius):
 
 
 @ti.func
-def is_inside(shape, margin_m, tank: Const[TankConfig]):
+def is_inside(shape, margin_m, tank_cfg: Const[TankConfig]):
     """1 where the whole footprint lies within the side walls, ``margin_m`` off them."""
     out = 0
-    if ti.static(tank.shape == "circle"):
-        center = ti.Vector([0.5 * (tank.x_m[0] + tank.x_m[1]), 0.5 * (tank.y_m[0] + tank.y_m[1])])
-        room = tank.radius_m - margin_m - shape[6]
+    if ti.static(tank_cfg.shape == "circle"):
+        center = ti.Vector([0.5 * (tank_cfg.x_m[0] + tank_cfg.x_m[1]), 0.5 * (tank_cfg.y_m[0] + tank_cfg.y_m[1])])
+        room = tank_cfg.radius_m - margin_m - shape[6]
         out = ti.cast(room > 0.0 and farthest_squared(shape, center) <= room * room, ti.i32)
     else:
         reach_x = half_width(shape, ti.Vector([1.0, 0.0])) + shape[6] + margin_m
         reach_y = half_width(shape, ti.Vector([0.0, 1.0])) + shape[6] + margin_m
-        in_x = shape[0] - reach_x >= tank.x_m[0] and shape[0] + reach_x <= tank.x_m[1]
-        in_y = shape[1] - reach_y >= tank.y_m[0] and shape[1] + reach_y <= tank.y_m[1]
+        in_x = shape[0] - reach_x >= tank_cfg.x_m[0] and shape[0] + reach_x <= tank_cfg.x_m[1]
+        in_y = shape[1] - reach_y >= tank_cfg.y_m[0] and shape[1] + reach_y <= tank_cfg.y_m[1]
         out = ti.cast(in_x and in_y, ti.i32)
     return out

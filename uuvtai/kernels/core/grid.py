@@ -45,14 +45,14 @@ def _inside(tank, x, y):
 
 
 @ti.func
-def cell_of(pos_w, tank: Const[TankConfig], cell_m: Const[float]):
+def cell_of(pos_w, tank_cfg: Const[TankConfig], cell_m: Const[float]):
     """(row, col) of a world position [m]; may lie off the grid."""
-    x0, y0 = ti.static(grid_origin(tank, cell_m))
+    x0, y0 = ti.static(grid_origin(tank_cfg, cell_m))
     return ti.Vector([ti.cast(ti.floor((pos_w[1] - y0) / cell_m), ti.i32), ti.cast(ti.floor((pos_w[0] - x0) / cell_m), ti.i32)])
 
 
 @ti.func
-def centre_of(row, col, tank: Const[TankConfig], cell_m: Const[float]):
+def centre_of(row, col, tank_cfg: Const[TankConfig], cell_m: Const[float]):
     """World (x, y) [m] of a cell's centre."""
-    x0, y0 = ti.static(grid_origin(tank, cell_m))
+    x0, y0 = ti.static(grid_origin(tank_cfg, cell_m))
     return ti.Vector([x0 + (col + 0.5) * cell_m, y0 + (row + 0.5) * cell_m])

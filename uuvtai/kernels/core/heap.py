@@ -16,49 +16,49 @@ def entry_of(cell, key):
 
 
 @ti.func
-def top_cell(heap: In[VoronoiState], slot):
+def top_cell(voronoi: In[VoronoiState], slot):
     """Cell with the smallest key; of equal keys, the smallest cell."""
-    return ti.cast(heap.heap[slot, 0] & ti.u64(0xFFFFFFFF), ti.i32)
+    return ti.cast(voronoi.heap[slot, 0] & ti.u64(0xFFFFFFFF), ti.i32)
 
 
 @ti.func
-def heap_after_push(heap: Out[VoronoiState], slot, size, cell, key):
+def heap_after_push(voronoi: Out[VoronoiState], slot, size, cell, key):
     """Insert; returns the new size. The caller makes sure that there is room."""
-    put_rising(heap, slot, size, entry_of(cell, key))
+    put_rising(voronoi, slot, size, entry_of(cell, key))
     return size + 1
 
 
 @ti.func
-def heap_after_pop(heap: Out[VoronoiState], slot, size):
+def heap_after_pop(voronoi: Out[VoronoiState], slot, size):
     """Remove the top (read it before); returns the new size.
 
     The hole sinks to the bottom along the smaller children without asking where the last entry would stop: it almost always belongs down
     there, and a comparison that cannot be predicted costs more than a step up again.
     """
     last = size - 1
-    moved = heap.heap[slot, last]
+    moved = voronoi.heap[slot, last]
     place, below = 0, 1
     while below < last:
-        left, right = heap.heap[slot, below], heap.heap[slot, below + 1]  # at the end of the heap right is ``moved``: harmless
+        left, right = voronoi.heap[slot, below], voronoi.heap[slot, below + 1]  # at the end of the heap right is ``moved``: harmless
         below += ti.cast(right < left, ti.i32)
-        heap.heap[slot, place] = ti.min(left, right)
+        voronoi.heap[slot, place] = ti.min(left, right)
         place = below
         below = 2 * place + 1
-    put_rising(heap, slot, place, moved)
+    put_rising(voronoi, slot, place, moved)
     return last
 
 
 @ti.func
-def put_rising(heap: Out[VoronoiState], slot, hole, entry):
+def put_rising(voronoi: Out[VoronoiState], slot, hole, entry):
     """Put an entry into a hole at the bottom or above, where it belongs."""
     place = hole
     rising = 1
     while rising == 1 and place > 0:
         above = (place - 1) // 2
-        upper = heap.heap[slot, above]
+        upper = voronoi.heap[slot, above]
         if entry < upper:
-            heap.heap[slot, place] = upper
+            voronoi.heap[slot, place] = upper
             place = above
         else:
             rising = 0
-    heap.heap[slot, place] = entry
+    voronoi.heap[slot, place] = entry

@@ -89,40 +89,40 @@ def hull_to_body(pos_w, axis_w, kind, body_pos_w, size, yaw, vehicle_cfg: Const[
 
 
 @ti.func
-def hull_to_side_wall(pos_w, axis_w, vehicle_cfg: Const[VehicleConfig], tank: Const[TankConfig]):
+def hull_to_side_wall(pos_w, axis_w, vehicle_cfg: Const[VehicleConfig], tank_cfg: Const[TankConfig]):
     """Clearance to the nearest side wall [m], negative beyond it; the walls are flat or curve inwards, so an end of the axis is nearest."""
     half = vehicle_cfg.hull_half_length_m * axis_w
     gap = 0.0
-    if ti.static(tank.shape == "circle"):
-        x = pos_w[0] - 0.5 * (tank.x_m[0] + tank.x_m[1])
-        y = pos_w[1] - 0.5 * (tank.y_m[0] + tank.y_m[1])
+    if ti.static(tank_cfg.shape == "circle"):
+        x = pos_w[0] - 0.5 * (tank_cfg.x_m[0] + tank_cfg.x_m[1])
+        y = pos_w[1] - 0.5 * (tank_cfg.y_m[0] + tank_cfg.y_m[1])
         ahead = (x + half[0]) ** 2 + (y + half[1]) ** 2
         behind = (x - half[0]) ** 2 + (y - half[1]) ** 2
-        gap = tank.radius_m - ti.sqrt(ti.max(ahead, behind))
+        gap = tank_cfg.radius_m - ti.sqrt(ti.max(ahead, behind))
     else:
-        gap_x = ti.min(pos_w[0] - tank.x_m[0], tank.x_m[1] - pos_w[0]) - ti.abs(half[0])
-        gap_y = ti.min(pos_w[1] - tank.y_m[0], tank.y_m[1] - pos_w[1]) - ti.abs(half[1])
+        gap_x = ti.min(pos_w[0] - tank_cfg.x_m[0], tank_cfg.x_m[1] - pos_w[0]) - ti.abs(half[0])
+        gap_y = ti.min(pos_w[1] - tank_cfg.y_m[0], tank_cfg.y_m[1] - pos_w[1]) - ti.abs(half[1])
         gap = ti.min(gap_x, gap_y)
     return gap - vehicle_cfg.hull_radius_m
 
 
 @ti.func
-def hull_to_floor_or_surface(pos_w, axis_w, vehicle_cfg: Const[VehicleConfig], tank: Const[TankConfig]):
+def hull_to_floor_or_surface(pos_w, axis_w, vehicle_cfg: Const[VehicleConfig], tank_cfg: Const[TankConfig]):
     """Clearance to the nearer of floor and surface [m]."""
-    gap = ti.min(pos_w[2] - tank.z_m[0], tank.z_m[1] - pos_w[2])
+    gap = ti.min(pos_w[2] - tank_cfg.z_m[0], tank_cfg.z_m[1] - pos_w[2])
     return gap - ti.abs(axis_w[2]) * vehicle_cfg.hull_half_length_m - vehicle_cfg.hull_radius_m
 
 
 @ti.func
-def is_in_tank(pos_w, tank: Const[TankConfig]):
+def is_in_tank(pos_w, tank_cfg: Const[TankConfig]):
     """1 where a point lies within walls, floor and surface; a position that is not finite lies outside."""
     flat = 0
-    if ti.static(tank.shape == "circle"):
-        x = pos_w[0] - 0.5 * (tank.x_m[0] + tank.x_m[1])
-        y = pos_w[1] - 0.5 * (tank.y_m[0] + tank.y_m[1])
-        flat = ti.cast(x * x + y * y <= tank.radius_m**2, ti.i32)
+    if ti.static(tank_cfg.shape == "circle"):
+        x = pos_w[0] - 0.5 * (tank_cfg.x_m[0] + tank_cfg.x_m[1])
+        y = pos_w[1] - 0.5 * (tank_cfg.y_m[0] + tank_cfg.y_m[1])
+        flat = ti.cast(x * x + y * y <= tank_cfg.radius_m**2, ti.i32)
     else:
-        in_x = pos_w[0] >= tank.x_m[0] and pos_w[0] <= tank.x_m[1]
-        in_y = pos_w[1] >= tank.y_m[0] and pos_w[1] <= tank.y_m[1]
+        in_x = pos_w[0] >= tank_cfg.x_m[0] and pos_w[0] <= tank_cfg.x_m[1]
+        in_y = pos_w[1] >= tank_cfg.y_m[0] and pos_w[1] <= tank_cfg.y_m[1]
         flat = ti.cast(in_x and in_y, ti.i32)
-    return flat * ti.cast(pos_w[2] >= tank.z_m[0] and pos_w[2] <= tank.z_m[1], ti.i32)
+    return flat * ti.cast(pos_w[2] >= tank_cfg.z_m[0] and pos_w[2] <= tank_cfg.z_m[1], ti.i32)

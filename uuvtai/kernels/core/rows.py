@@ -2,11 +2,11 @@
 
 import taichi as ti
 
-from uuvtai.kernels.core.signature import In
+from uuvtai.kernels.core.signature import AnyTensor, In, IntVector, LongVector, Out
 
 
 @ti.kernel
-def copy_rows(field: In[ti.Field], envs: ti.types.ndarray(dtype=ti.i32, ndim=1), out: ti.types.ndarray()):  # type: ignore[valid-type]
+def copy_rows(field: In[ti.Field], envs: IntVector, out: AnyTensor):
     """out[i] = field[envs[i]] for a field of rank 1, 2 or 3 (vectors add a last axis)."""
     for i in range(envs.shape[0]):
         env = envs[i]
@@ -21,7 +21,7 @@ def copy_rows(field: In[ti.Field], envs: ti.types.ndarray(dtype=ti.i32, ndim=1),
 
 
 @ti.func
-def _copy_cell(field: In[ti.Field], out: In[ti.Field], env, i):
+def _copy_cell(field: In[ti.Field], out: Out[ti.Field], env, i):
     if ti.static(hasattr(field, "n")):
         for c in ti.static(range(field.n)):
             out[i, c] = field[env][c]
@@ -30,7 +30,7 @@ def _copy_cell(field: In[ti.Field], out: In[ti.Field], env, i):
 
 
 @ti.func
-def _copy_cell_2(field: In[ti.Field], out: In[ti.Field], env, i, j):
+def _copy_cell_2(field: In[ti.Field], out: Out[ti.Field], env, i, j):
     if ti.static(hasattr(field, "n")):
         for c in ti.static(range(field.n)):
             out[i, j, c] = field[env, j][c]
@@ -39,7 +39,7 @@ def _copy_cell_2(field: In[ti.Field], out: In[ti.Field], env, i, j):
 
 
 @ti.func
-def _copy_cell_3(field: In[ti.Field], out: In[ti.Field], env, i, j, k):
+def _copy_cell_3(field: In[ti.Field], out: Out[ti.Field], env, i, j, k):
     if ti.static(hasattr(field, "n")):
         for c in ti.static(range(field.n)):
             out[i, j, k, c] = field[env, j, k][c]
@@ -48,6 +48,6 @@ def _copy_cell_3(field: In[ti.Field], out: In[ti.Field], env, i, j, k):
 
 
 @ti.kernel
-def tell_address(field: In[ti.Field], out: ti.types.ndarray(dtype=ti.i64, ndim=1)):  # type: ignore[valid-type]
+def tell_address(field: In[ti.Field], out: LongVector):
     """out[0] = address in memory of the first element of a field of rank 1."""
     out[0] = ti.cast(ti.get_addr(field, 0), ti.i64)

@@ -1,8 +1,10 @@
 """Markers for kernel parameters, and the loop helper every per-env kernel uses.
 
-A kernel says what it reads and what it writes: ``In[Struct]``, ``Out[Struct]``, ``Const[Section]`` (a frozen config section whose
-numbers become constants of the compiled kernel). For the type checker they are the plain classes; for Taichi they are
-``ti.template()``. ``tests/test_architecture.py`` reads them to prove who sees what.
+A bundle says what a stage reads and what it writes: ``In[Struct]``, ``Out[Struct]``, ``Const[Section]`` (a frozen config section whose
+numbers become constants of the compiled kernel); its kernels take ``io: Bundle[..]`` and what changes from call to call, functions that
+serve one stage end in ``io``, and those that several stages share take the structs and sections that they need, marked in the same way.
+For the type checker these are the plain classes; for Taichi they are ``ti.template()``. Tensors of the caller are ``FloatMatrix`` and the
+like. ``tests/test_architecture.py`` reads all of this to prove who sees what.
 ``quick_launch`` makes launching cheap.
 """
 
@@ -17,7 +19,12 @@ if TYPE_CHECKING:
     In = Annotated[_T, "read only"]
     Out = Annotated[_T, "read and written"]
     Const = Annotated[_T, "compile-time constant"]
+    Bundle = Annotated[_T, "what a stage reads and writes"]
+    FloatVector = FloatMatrix = IntVector = LongVector = AnyVector = AnyTensor = Any
 else:
+    FloatVector, FloatMatrix = ti.types.ndarray(dtype=ti.f32, ndim=1), ti.types.ndarray(dtype=ti.f32, ndim=2)
+    IntVector, LongVector = ti.types.ndarray(dtype=ti.i32, ndim=1), ti.types.ndarray(dtype=ti.i64, ndim=1)
+    AnyVector, AnyTensor = ti.types.ndarray(ndim=1), ti.types.ndarray()
 
     class _Marker:
         def __class_getitem__(cls, _item):
@@ -31,6 +38,9 @@ else:
 
     class Const(_Marker):
         """A frozen config section: its values are constants of the compiled kernel."""
+
+    class Bundle(_Marker):
+        """All that a stage reads and writes, in one frozen dataclass."""
 
 
 _CPU_BLOCK = 512

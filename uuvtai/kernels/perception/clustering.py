@@ -9,11 +9,10 @@ import math
 
 import taichi as ti
 
-from uuvtai.config import SonarConfig, TankConfig, TrackingConfig
 from uuvtai.kernels.core.geometry import TWO_PI, turned_z
 from uuvtai.kernels.core.lanes import LANES, f16x
-from uuvtai.kernels.core.signature import Const, In, Out
-from uuvtai.state import ClusterState, SonarScan
+from uuvtai.kernels.core.signature import Bundle
+from uuvtai.kernels.perception.bundles import TrackingIO
 
 ARC = 0.25 * math.pi
 """Mean over the beams of a far circle's visible arc of sqrt(1 - x^2): how many radii its mean range lies before the centre."""
@@ -35,28 +34,28 @@ _SLIP_SIGMA_M_S = 0.01
 
 
 @ti.func
-def range_variance(range_m, sonar: Const[SonarConfig]):
+def range_variance(range_m, io: Bundle[TrackingIO]):
     """Variance of one beam's range [m^2]."""
-    sigma = sonar.range_sigma_m + sonar.range_sigma_slope * range_m
-    return sigma * sigma + ti.static(sonar.range_jitter_m**2 + sonar.range_quantum_m**2 / 12)
+    sigma = io.sonar_cfg.range_sigma_m + io.sonar_cfg.range_sigma_slope * range_m
+    return sigma * sigma + ti.static(io.sonar_cfg.range_jitter_m**2 + io.sonar_cfg.range_quantum_m**2 / 12)
 
 
 @ti.func
-def split_distance(range_m, tracking: Const[TrackingConfig], sonar: Const[SonarConfig]):
+def split_distance(range_m, io: Bundle[TrackingIO]):
     """Jump of range [m] between two beams that ends a body: the design's rule, or what noise alone can do."""
-    return ti.max(tracking.split_m + tracking.split_slope * range_m, 4.0 * ti.sqrt(range_variance(range_m, sonar)))
+    return ti.max(io.tracking_cfg.split_m + io.tracking_cfg.split_slope * range_m, 4.0 * ti.sqrt(range_variance(range_m, io)))
 
 
 @ti.func
-def find_clusters(env, clusters: Out[ClusterState], scan: In[SonarScan], tracking: Const[TrackingConfig], sonar: Const[SonarConfig]):
+def find_clusters(env, io: Bundle[TrackingIO]):
     """Fill ``clusters`` from the labelled beams of this env (``label_beams`` first)."""
-    start = quiet_beam(env, clusters, scan, tracking, sonar)
-    clusters.count[env] = 0
+    start = quiet_beam(env, io)
+    io.clusters.count[env] = 0
     k = 0
-    while k < sonar.n_ray:
-        if clusters.beam_cluster[env, (start + k) % sonar.n_ray] == _CANDIDATE:
-            last, sums = walk_run(env, start, k, clusters, scan, tracking, sonar)
-            store_run(env, start, k, last, sums, clusters, scan, tracking, sonar)
+    while k < io.sonar_cfg.n_ray:
+        if io.clusters.beam_cluster[env, (start + k) % io.sonar_cfg.n_ray] == _CANDIDATE:
+            last, sums = walk_run(env, start, k, io)
+            store_run(env, start, k, last, sums, io)
             k = last
         k += 1
 
@@ -65,32 +64,25 @@ def find_clusters(env, clusters: Out[ClusterState], scan: In[SonarScan], trackin
 
 
 @ti.func
-def label_beams(
-    env,
-    clusters: Out[ClusterState],
-    scan: In[SonarScan],
-    tracking: Const[TrackingConfig],
-    sonar: Const[SonarConfig],
-    tank: Const[TankConfig],
-):
+def label_beams(env, io: Bundle[TrackingIO]):
     """Label every beam _CANDIDATE or -1, compensate its Doppler, and learn the own velocity's error from the walls: they do not move.
 
     ``normal`` = (sum ux ux, sum ux uy, sum uy uy, sum ux e, sum uy e) over the walls' beams, u = beam, e = compensated Doppler.
     """
-    pos, yaw = scan.ping_pos_w[env], scan.ping_yaw[env]
-    vel = turned_z(scan.ping_vel_b[env], yaw)
+    pos, yaw = io.scan.ping_pos_w[env], io.scan.ping_yaw[env]
+    vel = turned_z(io.scan.ping_vel_b[env], yaw)
     normal = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0])
-    for packet in range(sonar.n_ray // LANES):
-        ux, uy = packet_directions(yaw + packet * ti.static(LANES * TWO_PI / sonar.n_ray), sonar)
+    for packet in range(io.sonar_cfg.n_ray // LANES):
+        ux, uy = packet_directions(yaw + packet * ti.static(LANES * TWO_PI / io.sonar_cfg.n_ray), io)
         range_m, doppler, hit = f16x(0.0), f16x(0.0), f16x(0.0)
         for i in ti.static(range(LANES)):
-            range_m[i] = scan.range_m[env, packet * LANES + i]
-            doppler[i] = scan.doppler_m_s[env, packet * LANES + i]
-            hit[i] = ti.cast(scan.hit[env, packet * LANES + i], ti.f32)
+            range_m[i] = io.scan.range_m[env, packet * LANES + i]
+            doppler[i] = io.scan.doppler_m_s[env, packet * LANES + i]
+            hit[i] = ti.cast(io.scan.hit[env, packet * LANES + i], ti.f32)
         own = vel[0] * ux + vel[1] * uy
         still = doppler + own
-        margin = tracking.wall_margin_m + 2.0 * ti.sqrt(range_variance(range_m, sonar))
-        free = wall_distance(pos[0] + range_m * ux, pos[1] + range_m * uy, tank) - margin
+        margin = io.tracking_cfg.wall_margin_m + 2.0 * ti.sqrt(range_variance(range_m, io))
+        free = wall_distance(pos[0] + range_m * ux, pos[1] + range_m * uy, io) - margin
         wall = ti.select(free < 0.0, hit, f16x(0.0))
         error = wall * still
         body = hit - wall
@@ -98,44 +90,44 @@ def label_beams(
         wy = wall * uy
         normal += ti.Vector([(wx * ux).sum(), (wx * uy).sum(), (wy * uy).sum(), (error * ux).sum(), (error * uy).sum()])
         for i in ti.static(range(LANES)):
-            clusters.beam_doppler[env, packet * LANES + i] = still[i]
-            clusters.beam_cluster[env, packet * LANES + i] = ti.select(body[i] > 0.5, _CANDIDATE, -1)
-    slip_w, sigma = velocity_slip(normal, scan.ping_vel_valid[env], tracking, sonar)
-    clusters.slip_w[env] = slip_w
-    clusters.own_sigma_m_s[env] = sigma
+            io.clusters.beam_doppler[env, packet * LANES + i] = still[i]
+            io.clusters.beam_cluster[env, packet * LANES + i] = ti.select(body[i] > 0.5, _CANDIDATE, -1)
+    slip_w, sigma = velocity_slip(normal, io.scan.ping_vel_valid[env], io)
+    io.clusters.slip_w[env] = slip_w
+    io.clusters.own_sigma_m_s[env] = sigma
 
 
 @ti.func
-def packet_directions(first_bearing, sonar: Const[SonarConfig]):
+def packet_directions(first_bearing, io: Bundle[TrackingIO]):
     """Unit vectors (x, y) of sixteen neighbouring beams, the first at this world bearing."""
     c, s = ti.cos(first_bearing), ti.sin(first_bearing)
     ahead, left = f16x(0.0), f16x(0.0)
     for i in ti.static(range(LANES)):
-        ahead[i] = ti.cast(ti.static(math.cos(i * TWO_PI / sonar.n_ray)), ti.f32)
-        left[i] = ti.cast(ti.static(math.sin(i * TWO_PI / sonar.n_ray)), ti.f32)
+        ahead[i] = ti.cast(ti.static(math.cos(i * TWO_PI / io.sonar_cfg.n_ray)), ti.f32)
+        left[i] = ti.cast(ti.static(math.sin(i * TWO_PI / io.sonar_cfg.n_ray)), ti.f32)
     return c * ahead - s * left, s * ahead + c * left
 
 
 @ti.func
-def wall_distance(x, y, tank: Const[TankConfig]):
+def wall_distance(x, y, io: Bundle[TrackingIO]):
     """Distance [m] from the nearest side wall, positive inside; lanes."""
-    out = ti.min(ti.min(x - tank.x_m[0], tank.x_m[1] - x), ti.min(y - tank.y_m[0], tank.y_m[1] - y))
-    if ti.static(tank.shape == "circle"):
-        dx = x - ti.static(0.5 * (tank.x_m[0] + tank.x_m[1]))
-        dy = y - ti.static(0.5 * (tank.y_m[0] + tank.y_m[1]))
-        out = ti.static(tank.radius_m) - ti.sqrt(dx * dx + dy * dy)
+    out = ti.min(ti.min(x - io.tank_cfg.x_m[0], io.tank_cfg.x_m[1] - x), ti.min(y - io.tank_cfg.y_m[0], io.tank_cfg.y_m[1] - y))
+    if ti.static(io.tank_cfg.shape == "circle"):
+        dx = x - ti.static(0.5 * (io.tank_cfg.x_m[0] + io.tank_cfg.x_m[1]))
+        dy = y - ti.static(0.5 * (io.tank_cfg.y_m[0] + io.tank_cfg.y_m[1]))
+        out = ti.static(io.tank_cfg.radius_m) - ti.sqrt(dx * dx + dy * dy)
     return out
 
 
 @ti.func
-def velocity_slip(normal, valid, tracking: Const[TrackingConfig], sonar: Const[SonarConfig]):
+def velocity_slip(normal, valid, io: Bundle[TrackingIO]):
     """Error of the own measured velocity [m/s, world] by which known walls would move: least squares with the own measurement as prior.
 
     Also the standard deviation [m/s] of what is left of it along the worst direction; 0 where the measurement is ``valid``. A reading that
     is only held is hardly trusted: the walls decide, as far as they are seen.
     """
-    sigma = ti.static(max(sonar.doppler_sigma_m_s, 0.01))
-    prior = ti.select(valid == 1, ti.static((sigma / tracking.own_speed_sigma_m_s) ** 2), ti.static((sigma / HELD_SIGMA_M_S) ** 2))
+    sigma = ti.static(max(io.sonar_cfg.doppler_sigma_m_s, 0.01))
+    prior = ti.select(valid == 1, ti.static((sigma / io.tracking_cfg.own_speed_sigma_m_s) ** 2), ti.static((sigma / HELD_SIGMA_M_S) ** 2))
     xx, xy, yy = normal[0] + prior, normal[1], normal[2] + prior
     det = xx * yy - xy * xy
     slip_w = ti.Vector([yy * normal[3] - xy * normal[4], xx * normal[4] - xy * normal[3]]) / det
@@ -147,45 +139,45 @@ def velocity_slip(normal, valid, tracking: Const[TrackingConfig], sonar: Const[S
 
 
 @ti.func
-def joined(env, a, b, clusters: In[ClusterState], scan: In[SonarScan], tracking: Const[TrackingConfig], sonar: Const[SonarConfig]):
+def joined(env, a, b, io: Bundle[TrackingIO]):
     """Whether two beams may lie on one body."""
     out = False
-    if clusters.beam_cluster[env, a] == _CANDIDATE or clusters.beam_cluster[env, a] == clusters.count[env]:
-        if clusters.beam_cluster[env, b] == _CANDIDATE:
-            jump = ti.abs(scan.range_m[env, b] - scan.range_m[env, a])
-            swing = ti.abs(clusters.beam_doppler[env, b] - clusters.beam_doppler[env, a])
-            out = jump <= split_distance(scan.range_m[env, a], tracking, sonar) and swing <= ti.static(
-                tracking.split_doppler_m_s + 6 * sonar.doppler_sigma_m_s
+    if io.clusters.beam_cluster[env, a] == _CANDIDATE or io.clusters.beam_cluster[env, a] == io.clusters.count[env]:
+        if io.clusters.beam_cluster[env, b] == _CANDIDATE:
+            jump = ti.abs(io.scan.range_m[env, b] - io.scan.range_m[env, a])
+            swing = ti.abs(io.clusters.beam_doppler[env, b] - io.clusters.beam_doppler[env, a])
+            out = jump <= split_distance(io.scan.range_m[env, a], io) and swing <= ti.static(
+                io.tracking_cfg.split_doppler_m_s + 6 * io.sonar_cfg.doppler_sigma_m_s
             )
     return out
 
 
 @ti.func
-def next_beam(env, beam, clusters: In[ClusterState], scan: In[SonarScan], tracking: Const[TrackingConfig], sonar: Const[SonarConfig]):
+def next_beam(env, beam, io: Bundle[TrackingIO]):
     """Beams from this one to the next of the same run, 0 = the run ends here."""
-    n = ti.static(sonar.n_ray)
+    n = ti.static(io.sonar_cfg.n_ray)
     out = 0
     step = 1
-    last = ti.select(scan.hit[env, (beam + 1) % n] + scan.hit[env, (beam + 2) % n] == 0, _BRIDGE, 2)
+    last = ti.select(io.scan.hit[env, (beam + 1) % n] + io.scan.hit[env, (beam + 2) % n] == 0, _BRIDGE, 2)
     while out == 0 and step <= last:
-        if joined(env, beam, (beam + step) % n, clusters, scan, tracking, sonar):
+        if joined(env, beam, (beam + step) % n, io):
             out = step
         step += 1
     return out
 
 
 @ti.func
-def quiet_beam(env, clusters: In[ClusterState], scan: In[SonarScan], tracking: Const[TrackingConfig], sonar: Const[SonarConfig]):
+def quiet_beam(env, io: Bundle[TrackingIO]):
     """A beam that no run crosses, so that runs through beam 0 stay whole; 0 if there is none."""
-    n = ti.static(sonar.n_ray)
+    n = ti.static(io.sonar_cfg.n_ray)
     out = -1
     s = 0
     while out < 0 and s < n:
         crossed = False
         for back in range(1, _BRIDGE + 1):
             beam = (s + n - back) % n
-            if clusters.beam_cluster[env, beam] == _CANDIDATE:
-                crossed = crossed or next_beam(env, beam, clusters, scan, tracking, sonar) >= back
+            if io.clusters.beam_cluster[env, beam] == _CANDIDATE:
+                crossed = crossed or next_beam(env, beam, io) >= back
         if not crossed:
             out = s
         s += 1
@@ -193,126 +185,114 @@ def quiet_beam(env, clusters: In[ClusterState], scan: In[SonarScan], tracking: C
 
 
 @ti.func
-def walk_run(
-    env, start, first, clusters: Out[ClusterState], scan: In[SonarScan], tracking: Const[TrackingConfig], sonar: Const[SonarConfig]
-):
+def walk_run(env, start, first, io: Bundle[TrackingIO]):
     """Follow a run from offset ``first``; returns its last offset and (beams, sum of range, sum of Doppler). Labels its beams."""
-    label = clusters.count[env]
+    label = io.clusters.count[env]
     k = first
     sums = ti.Vector([0.0, 0.0, 0.0])
     going = True
     while going:
-        beam = (start + k) % sonar.n_ray
-        clusters.beam_cluster[env, beam] = label
-        sums += ti.Vector([1.0, scan.range_m[env, beam], clusters.beam_doppler[env, beam]])
-        ahead = next_beam(env, beam, clusters, scan, tracking, sonar)
-        going = ahead > 0 and k + ahead < sonar.n_ray
+        beam = (start + k) % io.sonar_cfg.n_ray
+        io.clusters.beam_cluster[env, beam] = label
+        sums += ti.Vector([1.0, io.scan.range_m[env, beam], io.clusters.beam_doppler[env, beam]])
+        ahead = next_beam(env, beam, io)
+        going = ahead > 0 and k + ahead < io.sonar_cfg.n_ray
         if going:
             for skipped in range(1, ahead):
-                clusters.beam_cluster[env, (beam + skipped) % sonar.n_ray] = -1
+                io.clusters.beam_cluster[env, (beam + skipped) % io.sonar_cfg.n_ray] = -1
             k += ahead
     return k, sums
 
 
 @ti.func
-def store_run(
-    env,
-    start,
-    first,
-    last,
-    sums,
-    clusters: Out[ClusterState],
-    scan: In[SonarScan],
-    tracking: Const[TrackingConfig],
-    sonar: Const[SonarConfig],
-):
+def store_run(env, start, first, last, sums, io: Bundle[TrackingIO]):
     """Keep a run as a cluster if it can be a body; else take the label off its beams."""
-    c = clusters.count[env]
-    a, b = (start + first) % sonar.n_ray, (start + last) % sonar.n_ray
-    range_m = sums[1] / sums[0] - sonar.range_jitter_m
-    hidden = open_edges(env, a, b, clusters, scan, tracking, sonar)
-    expected = tracking.min_radius_m / (ti.max(range_m, 0.1) * ti.static(TWO_PI / sonar.n_ray))
-    if c < clusters.match.shape[1] and is_narrow(env, a, b, last - first, scan, tracking, sonar) and (hidden > 0 or sums[0] >= expected):
-        clusters.first_beam[env, c] = a
-        clusters.span[env, c] = last - first + 1
-        clusters.n_beam[env, c] = ti.cast(sums[0], ti.i32)
-        clusters.hidden[env, c] = hidden
-        clusters.match[env, c] = -1
-        place_cluster(env, c, range_m, clusters, scan, tracking, sonar)
-        weigh_doppler(env, c, sums, clusters, sonar)
-        clusters.count[env] = c + 1
+    c = io.clusters.count[env]
+    a, b = (start + first) % io.sonar_cfg.n_ray, (start + last) % io.sonar_cfg.n_ray
+    range_m = sums[1] / sums[0] - io.sonar_cfg.range_jitter_m
+    hidden = open_edges(env, a, b, io)
+    expected = io.tracking_cfg.min_radius_m / (ti.max(range_m, 0.1) * ti.static(TWO_PI / io.sonar_cfg.n_ray))
+    if c < io.clusters.match.shape[1] and is_narrow(env, a, b, last - first, io) and (hidden > 0 or sums[0] >= expected):
+        io.clusters.first_beam[env, c] = a
+        io.clusters.span[env, c] = last - first + 1
+        io.clusters.n_beam[env, c] = ti.cast(sums[0], ti.i32)
+        io.clusters.hidden[env, c] = hidden
+        io.clusters.match[env, c] = -1
+        place_cluster(env, c, range_m, io)
+        weigh_doppler(env, c, sums, io)
+        io.clusters.count[env] = c + 1
     else:
         for k in range(first, last + 1):
-            clusters.beam_cluster[env, (start + k) % sonar.n_ray] = -1
+            io.clusters.beam_cluster[env, (start + k) % io.sonar_cfg.n_ray] = -1
 
 
 @ti.func
-def is_narrow(env, a, b, steps, scan: In[SonarScan], tracking: Const[TrackingConfig], sonar: Const[SonarConfig]):
+def is_narrow(env, a, b, steps, io: Bundle[TrackingIO]):
     """Whether the chord between the end beams can belong to a body."""
-    ra, rb = scan.range_m[env, a], scan.range_m[env, b]
-    half = ti.sin(ti.min(steps, sonar.n_ray // 2) * ti.static(0.5 * TWO_PI / sonar.n_ray))
-    slack = ti.max(tracking.max_width_m, 4.0 * ti.sqrt(range_variance(ra, sonar)))
-    return steps < sonar.n_ray // 2 and 4.0 * ra * rb * half * half < tracking.max_width_m**2 and ti.abs(ra - rb) < slack
+    ra, rb = io.scan.range_m[env, a], io.scan.range_m[env, b]
+    half = ti.sin(ti.min(steps, io.sonar_cfg.n_ray // 2) * ti.static(0.5 * TWO_PI / io.sonar_cfg.n_ray))
+    slack = ti.max(io.tracking_cfg.max_width_m, 4.0 * ti.sqrt(range_variance(ra, io)))
+    return steps < io.sonar_cfg.n_ray // 2 and 4.0 * ra * rb * half * half < io.tracking_cfg.max_width_m**2 and ti.abs(ra - rb) < slack
 
 
 @ti.func
-def open_edges(env, a, b, clusters: In[ClusterState], scan: In[SonarScan], tracking: Const[TrackingConfig], sonar: Const[SonarConfig]):
+def open_edges(env, a, b, io: Bundle[TrackingIO]):
     """Bit set of the edges (1 = first, 2 = last) that border a nearer return or go on as something else at the same range."""
-    return edge_open(env, a, -1, clusters, scan, tracking, sonar) + 2 * edge_open(env, b, 1, clusters, scan, tracking, sonar)
+    return edge_open(env, a, -1, io) + 2 * edge_open(env, b, 1, io)
 
 
 @ti.func
-def edge_open(env, edge, way, clusters: In[ClusterState], scan: In[SonarScan], tracking: Const[TrackingConfig], sonar: Const[SonarConfig]):
+def edge_open(env, edge, way, io: Bundle[TrackingIO]):
     """1 where the first return beyond this edge, within two beams, is nearer or continues it."""
     out = 0
     looking = True
     for step in ti.static((1, 2)):
-        beam = (edge + way * step + sonar.n_ray) % sonar.n_ray
-        if looking and scan.hit[env, beam] == 1:
+        beam = (edge + way * step + io.sonar_cfg.n_ray) % io.sonar_cfg.n_ray
+        if looking and io.scan.hit[env, beam] == 1:
             looking = False
-            beyond = scan.range_m[env, beam] - scan.range_m[env, edge]
-            touching = 0.1 + 3.0 * ti.sqrt(range_variance(scan.range_m[env, edge], sonar))
+            beyond = io.scan.range_m[env, beam] - io.scan.range_m[env, edge]
+            touching = 0.1 + 3.0 * ti.sqrt(range_variance(io.scan.range_m[env, edge], io))
             out = ti.cast(beyond < touching, ti.i32)
     return out
 
 
 @ti.func
-def place_cluster(
-    env, c, range_m, clusters: Out[ClusterState], scan: In[SonarScan], tracking: Const[TrackingConfig], sonar: Const[SonarConfig]
-):
+def place_cluster(env, c, range_m, io: Bundle[TrackingIO]):
     """Circle through the visible arc: bearing, radius, centre, and the variance of the mean range."""
-    step = ti.static(TWO_PI / sonar.n_ray)
-    half = 0.5 * step * clusters.span[env, c]
-    bearing = scan.ping_yaw[env] + step * (clusters.first_beam[env, c] + 0.5 * (clusters.span[env, c] - 1))
-    radius = ti.math.clamp(range_m * ti.sin(half) / (1.0 - ARC * ti.sin(half)), tracking.min_radius_m, 0.5 * tracking.max_width_m)
+    step = ti.static(TWO_PI / io.sonar_cfg.n_ray)
+    half = 0.5 * step * io.clusters.span[env, c]
+    bearing = io.scan.ping_yaw[env] + step * (io.clusters.first_beam[env, c] + 0.5 * (io.clusters.span[env, c] - 1))
+    radius = ti.math.clamp(
+        range_m * ti.sin(half) / (1.0 - ARC * ti.sin(half)), io.tracking_cfg.min_radius_m, 0.5 * io.tracking_cfg.max_width_m
+    )
     distance = range_m + ARC * radius
-    pos = scan.ping_pos_w[env]
-    clusters.bearing_w[env, c] = bearing
-    clusters.radius_m[env, c] = radius
-    clusters.range_m[env, c] = range_m
-    clusters.range_var[env, c] = range_variance(range_m, sonar) / clusters.n_beam[env, c] + ti.static(_MODEL_SIGMA_M**2)
-    clusters.pos_w[env, c] = ti.Vector([pos[0] + distance * ti.cos(bearing), pos[1] + distance * ti.sin(bearing)])
+    pos = io.scan.ping_pos_w[env]
+    io.clusters.bearing_w[env, c] = bearing
+    io.clusters.radius_m[env, c] = radius
+    io.clusters.range_m[env, c] = range_m
+    io.clusters.range_var[env, c] = range_variance(range_m, io) / io.clusters.n_beam[env, c] + ti.static(_MODEL_SIGMA_M**2)
+    io.clusters.pos_w[env, c] = ti.Vector([pos[0] + distance * ti.cos(bearing), pos[1] + distance * ti.sin(bearing)])
 
 
 @ti.func
-def weigh_doppler(env, c, sums, clusters: Out[ClusterState], sonar: Const[SonarConfig]):
+def weigh_doppler(env, c, sums, io: Bundle[TrackingIO]):
     """Mean compensated Doppler of a cluster, outliers pulled in where the sonar is known to have them, and its variance."""
     mean = sums[2] / sums[0]
-    spread_m_s = ti.static(max(sonar.doppler_sigma_m_s, 0.01))
-    if ti.static(sonar.doppler_outlier > 0):
-        mean = clipped_mean(env, c, mean, 3.0 * spread_m_s, clusters, sonar)
-    bearing, slip_w = clusters.bearing_w[env, c], clusters.slip_w[env]
-    clusters.doppler_m_s[env, c] = mean - (slip_w[0] * ti.cos(bearing) + slip_w[1] * ti.sin(bearing))
-    wild = ti.static(sonar.doppler_outlier * (3.0 * max(sonar.doppler_sigma_m_s, 0.01)) ** 2)
-    clusters.doppler_var[env, c] = (spread_m_s**2 + wild) / sums[0] + ti.static(_SLIP_SIGMA_M_S**2)
+    spread_m_s = ti.static(max(io.sonar_cfg.doppler_sigma_m_s, 0.01))
+    if ti.static(io.sonar_cfg.doppler_outlier > 0):
+        mean = clipped_mean(env, c, mean, 3.0 * spread_m_s, io)
+    bearing, slip_w = io.clusters.bearing_w[env, c], io.clusters.slip_w[env]
+    io.clusters.doppler_m_s[env, c] = mean - (slip_w[0] * ti.cos(bearing) + slip_w[1] * ti.sin(bearing))
+    wild = ti.static(io.sonar_cfg.doppler_outlier * (3.0 * max(io.sonar_cfg.doppler_sigma_m_s, 0.01)) ** 2)
+    io.clusters.doppler_var[env, c] = (spread_m_s**2 + wild) / sums[0] + ti.static(_SLIP_SIGMA_M_S**2)
 
 
 @ti.func
-def clipped_mean(env, c, centre, bound, clusters: In[ClusterState], sonar: Const[SonarConfig]):
+def clipped_mean(env, c, centre, bound, io: Bundle[TrackingIO]):
     """Mean Doppler of a cluster's beams, each pulled to within ``bound`` of ``centre``."""
     total = 0.0
-    for k in range(clusters.span[env, c]):
-        beam = (clusters.first_beam[env, c] + k) % sonar.n_ray
-        if clusters.beam_cluster[env, beam] == c:
-            total += ti.math.clamp(clusters.beam_doppler[env, beam], centre - bound, centre + bound)
-    return total / clusters.n_beam[env, c]
+    for k in range(io.clusters.span[env, c]):
+        beam = (io.clusters.first_beam[env, c] + k) % io.sonar_cfg.n_ray
+        if io.clusters.beam_cluster[env, beam] == c:
+            total += ti.math.clamp(io.clusters.beam_doppler[env, beam], centre - bound, centre + bound)
+    return total / io.clusters.n_beam[env, c]

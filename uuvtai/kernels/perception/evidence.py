@@ -8,14 +8,14 @@ import math
 
 import taichi as ti
 
-from uuvtai.config import DepthConfig, MappingConfig, SonarConfig, TankConfig
+from uuvtai.config import TankConfig
 from uuvtai.kernels.core.bits import WORD, bit_of, cell_bit, put_bit
 from uuvtai.kernels.core.geometry import FAR_M, TWO_PI, quaternion_wb, rotation_wb, turned_z
 from uuvtai.kernels.core.grid import cell_of, grid_origin, grid_shape
 from uuvtai.kernels.core.lanes import LANES, f16x, i16x, ramp_lanes
-from uuvtai.kernels.core.signature import Const, In, Out
+from uuvtai.kernels.core.signature import Bundle, Const
+from uuvtai.kernels.perception.bundles import MappingIO
 from uuvtai.kernels.perception.fan import beam_lanes
-from uuvtai.state import ClusterState, DepthImage, MapScratch, MapState, SonarScan, TrackState
 
 _MAX_REACH = 4
 """[cells] farthest neighbour that may explain a surprising return as the edge of a static body."""
@@ -38,43 +38,46 @@ def pinhole(depth):
 
 
 @ti.func
-def range_error(range_m, sonar: Const[SonarConfig]):
+def range_error(range_m, io: Bundle[MappingIO]):
     """[m] error that a return at this range may have: 3 sigma of its noise, jitter and quantum (data sheet)."""
-    return 3.0 * (sonar.range_sigma_m + sonar.range_sigma_slope * range_m + sonar.range_jitter_m) + sonar.range_quantum_m
+    return (
+        3.0 * (io.sonar_cfg.range_sigma_m + io.sonar_cfg.range_sigma_slope * range_m + io.sonar_cfg.range_jitter_m)
+        + io.sonar_cfg.range_quantum_m
+    )
 
 
 @ti.func
-def wall_lanes(pos, unit_x, unit_y, tank: Const[TankConfig]):
+def wall_lanes(pos, unit_x, unit_y, tank_cfg: Const[TankConfig]):
     """[m] along sixteen horizontal beams to the known side wall through which each leaves the tank; negative where it misses the tank."""
     leave = f16x(0.0)
-    if ti.static(tank.shape == "circle"):
-        off = pos - ti.Vector([0.5 * (tank.x_m[0] + tank.x_m[1]), 0.5 * (tank.y_m[0] + tank.y_m[1])])
+    if ti.static(tank_cfg.shape == "circle"):
+        off = pos - ti.Vector([0.5 * (tank_cfg.x_m[0] + tank_cfg.x_m[1]), 0.5 * (tank_cfg.y_m[0] + tank_cfg.y_m[1])])
         along = unit_x * off[0] + unit_y * off[1]
         # distance of the line from the centre by a cross product: along^2 - off^2 would cancel badly
         across = unit_y * off[0] - unit_x * off[1]
-        inside = ti.static(tank.radius_m**2) - across * across
+        inside = ti.static(tank_cfg.radius_m**2) - across * across
         for i in ti.static(range(LANES)):
             leave[i] = ti.select(inside[i] < 0.0, -1.0, ti.sqrt(ti.max(inside[i], 0.0)) - along[i])
     else:
         for i in ti.static(range(LANES)):
-            to_x = ti.select(unit_x[i] > 0.0, tank.x_m[1] - pos[0], pos[0] - tank.x_m[0])
-            to_y = ti.select(unit_y[i] > 0.0, tank.y_m[1] - pos[1], pos[1] - tank.y_m[0])
+            to_x = ti.select(unit_x[i] > 0.0, tank_cfg.x_m[1] - pos[0], pos[0] - tank_cfg.x_m[0])
+            to_y = ti.select(unit_y[i] > 0.0, tank_cfg.y_m[1] - pos[1], pos[1] - tank_cfg.y_m[0])
             leave[i] = ti.min(to_x / ti.max(ti.abs(unit_x[i]), 1e-9), to_y / ti.max(ti.abs(unit_y[i]), 1e-9))
     return leave
 
 
 @ti.func
-def wall_gaps(x, y, tank: Const[TankConfig]):
+def wall_gaps(x, y, io: Bundle[MappingIO]):
     """[m] from sixteen points to the nearest side wall, negative outside."""
     gap = f16x(0.0)
-    if ti.static(tank.shape == "circle"):
-        off_x, off_y = x - 0.5 * (tank.x_m[0] + tank.x_m[1]), y - 0.5 * (tank.y_m[0] + tank.y_m[1])
+    if ti.static(io.tank_cfg.shape == "circle"):
+        off_x, off_y = x - 0.5 * (io.tank_cfg.x_m[0] + io.tank_cfg.x_m[1]), y - 0.5 * (io.tank_cfg.y_m[0] + io.tank_cfg.y_m[1])
         squared = off_x * off_x + off_y * off_y
         for i in ti.static(range(LANES)):
-            gap[i] = ti.static(tank.radius_m) - ti.sqrt(squared[i])
+            gap[i] = ti.static(io.tank_cfg.radius_m) - ti.sqrt(squared[i])
     else:
         for i in ti.static(range(LANES)):
-            gap[i] = ti.min(x[i] - tank.x_m[0], tank.x_m[1] - x[i], y[i] - tank.y_m[0], tank.y_m[1] - y[i])
+            gap[i] = ti.min(x[i] - io.tank_cfg.x_m[0], io.tank_cfg.x_m[1] - x[i], y[i] - io.tank_cfg.y_m[0], io.tank_cfg.y_m[1] - y[i])
     return gap
 
 
@@ -82,112 +85,96 @@ def wall_gaps(x, y, tank: Const[TankConfig]):
 
 
 @ti.func
-def moves_by_track(env, ray, tracks: In[TrackState]):
+def moves_by_track(env, ray, io: Bundle[MappingIO]):
     """1 where the beam belongs to a track that is confirmed as moving."""
-    track = tracks.beam_track[env, ray]
+    track = io.tracks.beam_track[env, ray]
     moving = 0
     if track >= 0:
-        moving = tracks.moving[env, track]
+        moving = io.tracks.moving[env, track]
     return moving
 
 
 @ti.func
-def edge_of_static(env, row, col, reach, grid_map: In[MapState]):
+def edge_of_static(env, row, col, reach, io: Bundle[MappingIO]):
     """1 where a cell within ``reach`` cells (square) is statically occupied."""
-    n_row, n_word = ti.static(grid_map.static_occupied.shape[1:])
+    n_row, n_word = ti.static(io.grid_map.static_occupied.shape[1:])
     first_col = ti.max(col - reach, 0)
     word, shift = first_col // WORD, ti.cast(first_col % WORD, ti.u64)
     window = cell_bit(col + reach + 1 - first_col) - ti.cast(1, ti.u64)
     found = ti.cast(0, ti.u64)
     r, end = ti.max(row - reach, 0), ti.min(row + reach + 1, n_row)
     while r < end and found == 0:  # a second way out keeps LLVM from unrolling it: half of the time to compile the whole kernel
-        found |= (grid_map.static_occupied[env, r, word] >> shift) & window
+        found |= (io.grid_map.static_occupied[env, r, word] >> shift) & window
         if shift > 0 and word + 1 < n_word:
-            found |= (grid_map.static_occupied[env, r, word + 1] << (ti.cast(WORD, ti.u64) - shift)) & window
+            found |= (io.grid_map.static_occupied[env, r, word + 1] << (ti.cast(WORD, ti.u64) - shift)) & window
         r += 1
     return ti.cast(found != 0, ti.i32)
 
 
 @ti.func
-def is_inconsistent(
-    env,
-    row,
-    col,
-    range_m,
-    grid_map: In[MapState],
-    mapping: Const[MappingConfig],
-    sonar: Const[SonarConfig],
-    promote_scans: Const[int],
-):
+def is_inconsistent(env, row, col, range_m, promote_scans: Const[int], io: Bundle[MappingIO]):
     """1 where a return contradicts a cell that was confidently free, or one that such evidence holds and has not yet promoted.
 
     The edge of a static body does this too: range noise and the gap between beams move its returns into cells that other beams
     cleared. So nothing counts near a statically occupied cell: within one cell plus beam spacing plus range error.
     """
-    confident = bit_of(grid_map.confident[env, row, col // WORD], col % WORD)
-    held = bit_of(grid_map.held[env, row, col // WORD], col % WORD)
+    confident = bit_of(io.grid_map.confident[env, row, col // WORD], col % WORD)
+    held = bit_of(io.grid_map.held[env, row, col // WORD], col % WORD)
     inconsistent = 0
-    if confident == 1 or (held == 1 and ti.cast(grid_map.dynamic_scans[env, row, col], ti.i32) < promote_scans):
-        spacing = ti.static(TWO_PI / sonar.n_ray) * range_m
-        reach = 1 + ti.cast((spacing + range_error(range_m, sonar)) / mapping.cell_m, ti.i32)
-        inconsistent = 1 - edge_of_static(env, row, col, ti.min(reach, _MAX_REACH), grid_map)
+    if confident == 1 or (held == 1 and ti.cast(io.grid_map.dynamic_scans[env, row, col], ti.i32) < promote_scans):
+        spacing = ti.static(TWO_PI / io.sonar_cfg.n_ray) * range_m
+        reach = 1 + ti.cast((spacing + range_error(range_m, io)) / io.mapping_cfg.cell_m, ti.i32)
+        inconsistent = 1 - edge_of_static(env, row, col, ti.min(reach, _MAX_REACH), io)
     return inconsistent
 
 
 @ti.func
-def own_motion(env, scan: In[SonarScan], clusters: In[ClusterState], mapping: Const[MappingConfig], sonar: Const[SonarConfig]):
+def own_motion(env, io: Bundle[MappingIO]):
     """Own velocity (ahead, left) [m/s] at the ping, as the tracking knows it, and the Doppler [m/s] beyond which a return then moves.
 
     It is the measured velocity less the error that the known walls show in the same scan. A scan between tracked ones takes the error of
     the last of them as long as the reading is only held, and trusts a valid reading as it is. Where neither a reading nor the walls tell
     the own velocity, Doppler proves little: the threshold is three standard deviations of what is left.
     """
-    vel, threshold = ti.Vector([scan.ping_vel_b[env][0], scan.ping_vel_b[env][1]]), ti.static(doppler_threshold(mapping, sonar))
-    held = scan.ping_vel_valid[env] == 0
-    if held or clusters.scan_step[env] == scan.ping_step[env]:
-        vel -= turned_z(clusters.slip_w[env], -scan.ping_yaw[env])
+    vel, threshold = (
+        ti.Vector([io.scan.ping_vel_b[env][0], io.scan.ping_vel_b[env][1]]),
+        ti.static(doppler_threshold(io.mapping_cfg, io.sonar_cfg)),
+    )
+    held = io.scan.ping_vel_valid[env] == 0
+    if held or io.clusters.scan_step[env] == io.scan.ping_step[env]:
+        vel -= turned_z(io.clusters.slip_w[env], -io.scan.ping_yaw[env])
     if held:
-        sigma = clusters.own_sigma_m_s[env]
-        threshold = ti.max(threshold, 3.0 * ti.sqrt(ti.static(sonar.doppler_sigma_m_s**2) + sigma * sigma))
+        sigma = io.clusters.own_sigma_m_s[env]
+        threshold = ti.max(threshold, 3.0 * ti.sqrt(ti.static(io.sonar_cfg.doppler_sigma_m_s**2) + sigma * sigma))
     return vel, threshold
 
 
 @ti.func
-def mapped_lanes(
-    env,
-    first_ray,
-    pos,
-    vel,
-    threshold,
-    scan: In[SonarScan],
-    mapping: Const[MappingConfig],
-    sonar: Const[SonarConfig],
-    tank: Const[TankConfig],
-):
+def mapped_lanes(env, first_ray, pos, vel, threshold, io: Bundle[MappingIO]):
     """Of sixteen beams: kind of return (0 = none or from a known wall, 1 = at rest, 2 = moving by its Doppler), row, column, range [m].
 
     ``vel`` [m/s] is the own velocity along x and y of the body, ``threshold`` [m/s] the compensated Doppler that counts as motion.
     """
-    n_row, n_col = ti.static(grid_shape(tank, mapping.cell_m))
-    x0, y0 = ti.static(grid_origin(tank, mapping.cell_m))
+    n_row, n_col = ti.static(grid_shape(io.tank_cfg, io.mapping_cfg.cell_m))
+    x0, y0 = ti.static(grid_origin(io.tank_cfg, io.mapping_cfg.cell_m))
     range_m, doppler, hit = f16x(0.0), f16x(0.0), i16x(0)
     for i in ti.static(range(LANES)):
-        range_m[i] = scan.range_m[env, first_ray + i]
-        doppler[i] = scan.doppler_m_s[env, first_ray + i]
-        hit[i] = scan.hit[env, first_ray + i]
-    unit_x, unit_y = beam_lanes(scan.ping_yaw[env], first_ray, sonar.n_ray)
-    ahead_x, ahead_y = beam_lanes(0.0, first_ray, sonar.n_ray)
+        range_m[i] = io.scan.range_m[env, first_ray + i]
+        doppler[i] = io.scan.doppler_m_s[env, first_ray + i]
+        hit[i] = io.scan.hit[env, first_ray + i]
+    unit_x, unit_y = beam_lanes(io.scan.ping_yaw[env], first_ray, io.sonar_cfg.n_ray)
+    ahead_x, ahead_y = beam_lanes(0.0, first_ray, io.sonar_cfg.n_ray)
     x, y = pos[0] + unit_x * range_m, pos[1] + unit_y * range_m
     # noise along a slanting beam reaches deeper into the tank than the margin
-    gap, short = wall_gaps(x, y, tank), wall_lanes(pos, unit_x, unit_y, tank) - range_error(range_m, sonar) - range_m
+    gap, short = wall_gaps(x, y, io), wall_lanes(pos, unit_x, unit_y, io.tank_cfg) - range_error(range_m, io) - range_m
     # measured rate of range plus own velocity along the beam: motion through the water
     moves = doppler + ahead_x * vel[0] + ahead_y * vel[1]
     kind, row, col = i16x(0), i16x(0), i16x(0)
     for i in ti.static(range(LANES)):
-        row[i] = ti.cast(ti.floor((y[i] - y0) / mapping.cell_m), ti.i32)
-        col[i] = ti.cast(ti.floor((x[i] - x0) / mapping.cell_m), ti.i32)
+        row[i] = ti.cast(ti.floor((y[i] - y0) / io.mapping_cfg.cell_m), ti.i32)
+        col[i] = ti.cast(ti.floor((x[i] - x0) / io.mapping_cfg.cell_m), ti.i32)
     for i in ti.static(range(LANES)):
-        known = (gap[i] < mapping.wall_margin_m) | (short[i] < 0.0)
+        known = (gap[i] < io.mapping_cfg.wall_margin_m) | (short[i] < 0.0)
         off = (row[i] < 0) | (row[i] >= n_row) | (col[i] < 0) | (col[i] >= n_col)
         moving = ti.abs(moves[i]) > threshold
         kind[i] = ti.select((hit[i] == 0) | known | off, 0, ti.select(moving, 2, 1))
@@ -195,53 +182,41 @@ def mapped_lanes(
 
 
 @ti.func
-def mark_hits(
-    env,
-    slot,
-    scratch: Out[MapScratch],
-    grid_map: In[MapState],
-    scan: In[SonarScan],
-    tracks: In[TrackState],
-    clusters: In[ClusterState],
-    mapping: Const[MappingConfig],
-    sonar: Const[SonarConfig],
-    tank: Const[TankConfig],
-    promote_scans: Const[int],
-):
+def mark_hits(env, slot, promote_scans: Const[int], io: Bundle[MappingIO]):
     """Bit of every return's cell: what moves is a dynamic hit only, the rest static hits; returns from known walls are left out."""
-    pos = ti.Vector([scan.ping_pos_w[env][0], scan.ping_pos_w[env][1]])
-    vel, threshold = own_motion(env, scan, clusters, mapping, sonar)
-    for packet in range(ti.static(sonar.n_ray // LANES)):
-        kind, row, col, range_m = mapped_lanes(env, packet * LANES, pos, vel, threshold, scan, mapping, sonar, tank)
+    pos = ti.Vector([io.scan.ping_pos_w[env][0], io.scan.ping_pos_w[env][1]])
+    vel, threshold = own_motion(env, io)
+    for packet in range(ti.static(io.sonar_cfg.n_ray // LANES)):
+        kind, row, col, range_m = mapped_lanes(env, packet * LANES, pos, vel, threshold, io)
         for i in range(LANES):
             if kind[i] != 0:
-                moves = ti.cast(kind[i] == 2, ti.i32) | moves_by_track(env, packet * LANES + i, tracks)
+                moves = ti.cast(kind[i] == 2, ti.i32) | moves_by_track(env, packet * LANES + i, io)
                 if moves == 0:
-                    moves = is_inconsistent(env, row[i], col[i], range_m[i], grid_map, mapping, sonar, promote_scans)
+                    moves = is_inconsistent(env, row[i], col[i], range_m[i], promote_scans, io)
                 if moves == 1:
-                    put_bit(scratch.dynamic_hit, slot, row[i], col[i])
+                    put_bit(io.map_scratch.dynamic_hit, slot, row[i], col[i])
                 else:
-                    put_bit(scratch.static_hit, slot, row[i], col[i])
+                    put_bit(io.map_scratch.static_hit, slot, row[i], col[i])
 
 
 # ------------------------------------------------------------------------------------------------------------------------ depth
 
 
 @ti.func
-def nearest_in_gate(env, first_col, image: In[DepthImage], R_wb, depth: Const[DepthConfig], gate_m: Const[float]):
+def nearest_in_gate(env, first_col, R_wb, gate_m: Const[float], io: Bundle[MappingIO]):
     """Per image column, sixteen of them: smallest depth [m] whose point lies within ``gate_m`` of the vehicle's own depth, and its row."""
-    focal, middle_row, middle_col = ti.static(pinhole(depth))
+    focal, middle_row, middle_col = ti.static(pinhole(io.depth_cfg))
     left = (middle_col - ramp_lanes(float(first_col))) / focal
-    mount = R_wb[2, 0] * depth.offset_b_m[0] + R_wb[2, 1] * depth.offset_b_m[1] + R_wb[2, 2] * depth.offset_b_m[2]
+    mount = R_wb[2, 0] * io.depth_cfg.offset_b_m[0] + R_wb[2, 1] * io.depth_cfg.offset_b_m[1] + R_wb[2, 2] * io.depth_cfg.offset_b_m[2]
     nearest, nearest_row = f16x(FAR_M), i16x(0)
-    for row in range(ti.static(image.depth_m.shape[1])):
+    for row in range(ti.static(io.image.depth_m.shape[1])):
         z = f16x(0.0)
         for i in ti.static(range(LANES)):
-            z[i] = image.depth_m[env, row, first_col + i]
+            z[i] = io.image.depth_m[env, row, first_col + i]
         climb = R_wb[2, 0] + R_wb[2, 2] * (middle_row - row) / focal + R_wb[2, 1] * left
         rise = mount + z * climb
         for i in ti.static(range(LANES)):
-            seen = (ti.abs(rise[i]) <= gate_m) & (z[i] < ti.static(depth.max_range_m * NO_RETURN_SHARE)) & (z[i] > 0.0)
+            seen = (ti.abs(rise[i]) <= gate_m) & (z[i] < ti.static(io.depth_cfg.max_range_m * NO_RETURN_SHARE)) & (z[i] > 0.0)
             nearer = seen & (z[i] < nearest[i])
             nearest[i] = ti.select(nearer, z[i], nearest[i])
             nearest_row[i] = ti.select(nearer, row, nearest_row[i])
@@ -249,26 +224,19 @@ def nearest_in_gate(env, first_col, image: In[DepthImage], R_wb, depth: Const[De
 
 
 @ti.func
-def mark_depth(
-    env,
-    grid_map: Out[MapState],
-    image: In[DepthImage],
-    mapping: Const[MappingConfig],
-    depth: Const[DepthConfig],
-    tank: Const[TankConfig],
-):
+def mark_depth(env, io: Bundle[MappingIO]):
     """Depth hit in the cell of the nearest point at the vehicle's own depth, per image column; it waits there for the next merge."""
-    focal, middle_row, middle_col = ti.static(pinhole(depth))
-    n_row, n_col = ti.static(grid_shape(tank, mapping.cell_m))
-    rpy = image.shot_rpy[env]
+    focal, middle_row, middle_col = ti.static(pinhole(io.depth_cfg))
+    n_row, n_col = ti.static(grid_shape(io.tank_cfg, io.mapping_cfg.cell_m))
+    rpy = io.image.shot_rpy[env]
     R_wb = rotation_wb(quaternion_wb(rpy[0], rpy[1], rpy[2]))
-    offset = ti.Vector([depth.offset_b_m[0], depth.offset_b_m[1], depth.offset_b_m[2]])
-    for packet in range(ti.static(image.depth_m.shape[2] // LANES)):
-        nearest, nearest_row = nearest_in_gate(env, packet * LANES, image, R_wb, depth, mapping.depth_gate_m)
+    offset = ti.Vector([io.depth_cfg.offset_b_m[0], io.depth_cfg.offset_b_m[1], io.depth_cfg.offset_b_m[2]])
+    for packet in range(ti.static(io.image.depth_m.shape[2] // LANES)):
+        nearest, nearest_row = nearest_in_gate(env, packet * LANES, R_wb, io.mapping_cfg.depth_gate_m, io)
         for i in range(LANES):
             if nearest[i] < FAR_M:
                 ray_b = ti.Vector([1.0, (middle_col - packet * LANES - i) / focal, (middle_row - nearest_row[i]) / focal])
-                point = image.shot_pos_w[env] + R_wb @ (offset + nearest[i] * ray_b)
-                cell = cell_of(point, tank, mapping.cell_m)
+                point = io.image.shot_pos_w[env] + R_wb @ (offset + nearest[i] * ray_b)
+                cell = cell_of(point, io.tank_cfg, io.mapping_cfg.cell_m)
                 if cell[0] >= 0 and cell[0] < n_row and cell[1] >= 0 and cell[1] < n_col:
-                    put_bit(grid_map.depth_hit, env, cell[0], cell[1])
+                    put_bit(io.grid_map.depth_hit, env, cell[0], cell[1])

@@ -11,13 +11,12 @@ import math
 
 import taichi as ti
 
-from uuvtai.config import MappingConfig, SonarConfig, TankConfig
 from uuvtai.kernels.core.bits import WORD, cell_bit
 from uuvtai.kernels.core.geometry import TWO_PI
 from uuvtai.kernels.core.grid import grid_origin, grid_shape
 from uuvtai.kernels.core.lanes import LANES, f16x, i16x
-from uuvtai.kernels.core.signature import Const, In, Out
-from uuvtai.state import MapScratch, SonarScan
+from uuvtai.kernels.core.signature import Bundle, Const
+from uuvtai.kernels.perception.bundles import MappingIO
 
 
 @ti.func
@@ -33,63 +32,57 @@ def beam_lanes(yaw, first_ray, n_ray: Const[int]):
 
 
 @ti.func
-def free_reach(env, ray, scan: In[SonarScan], sonar: Const[SonarConfig], mapping: Const[MappingConfig]):
+def free_reach(env, ray, io: Bundle[MappingIO]):
     """[m] up to which a beam proves free water: one cell and one sigma before its return, ``free_range_m`` without one; at least 0."""
-    range_m = scan.range_m[env, ray]
-    before = range_m - mapping.cell_m - (sonar.range_sigma_m + sonar.range_sigma_slope * range_m)
-    return ti.max(0.0, ti.select(scan.hit[env, ray] == 1, before, ti.static(min(mapping.free_range_m, sonar.max_range_m))))
+    range_m = io.scan.range_m[env, ray]
+    before = range_m - io.mapping_cfg.cell_m - (io.sonar_cfg.range_sigma_m + io.sonar_cfg.range_sigma_slope * range_m)
+    return ti.max(0.0, ti.select(io.scan.hit[env, ray] == 1, before, ti.static(min(io.mapping_cfg.free_range_m, io.sonar_cfg.max_range_m))))
 
 
 @ti.func
-def triangle_legs(env, first_ray, scan: In[SonarScan], sonar: Const[SonarConfig], mapping: Const[MappingConfig]):
+def triangle_legs(env, first_ray, io: Bundle[MappingIO]):
     """[cells] legs of the sixteen triangles from beam ``first_ray`` on: the smaller of two neighbours' reaches."""
     reach = f16x(0.0)
     for i in ti.static(range(LANES)):
-        reach[i] = free_reach(env, first_ray + i, scan, sonar, mapping)
-    after = free_reach(env, (first_ray + LANES) % ti.static(sonar.n_ray), scan, sonar, mapping)
+        reach[i] = free_reach(env, first_ray + i, io)
+    after = free_reach(env, (first_ray + LANES) % ti.static(io.sonar_cfg.n_ray), io)
     legs = f16x(0.0)
     for i in ti.static(range(LANES - 1)):
-        legs[i] = ti.min(reach[i], reach[i + 1]) / mapping.cell_m
-    legs[LANES - 1] = ti.min(reach[LANES - 1], after) / mapping.cell_m
+        legs[i] = ti.min(reach[i], reach[i + 1]) / io.mapping_cfg.cell_m
+    legs[LANES - 1] = ti.min(reach[LANES - 1], after) / io.mapping_cfg.cell_m
     return legs
 
 
 @ti.func
-def mark_edge(slot, begin, end, first_col, end_col, n_col: Const[int], scratch: Out[MapScratch]):
+def mark_edge(slot, begin, end, first_col, end_col, n_col: Const[int], io: Bundle[MappingIO]):
     """A bit in the lowest cell of each column whose centres lie on or above the edge; ends are (x, y) [cells], centres whole numbers.
 
     ``first_col`` and ``end_col`` are the rounded-up x of both ends: whole numbers shared by neighbouring edges, so that no column can be
     crossed by one of two edges that meet in it and missed by the other.
     """
-    n_row = ti.static(scratch.fan_edge.shape[1])
+    n_row = ti.static(io.map_scratch.fan_edge.shape[1])
     if first_col != end_col:
         slope = (end[1] - begin[1]) / (end[0] - begin[0])
         for col in range(ti.max(ti.min(first_col, end_col), 0), ti.min(ti.max(first_col, end_col), n_col)):
             row = ti.max(ti.cast(ti.ceil(begin[1] + (col - begin[0]) * slope), ti.i32), 0)
             if row < n_row:
-                scratch.fan_edge[slot, row, col // WORD] = scratch.fan_edge[slot, row, col // WORD] ^ cell_bit(col)
+                io.map_scratch.fan_edge[slot, row, col // WORD] = io.map_scratch.fan_edge[slot, row, col // WORD] ^ cell_bit(col)
 
 
 @ti.func
-def mark_fan(
-    env,
-    slot,
-    scratch: Out[MapScratch],
-    scan: In[SonarScan],
-    mapping: Const[MappingConfig],
-    sonar: Const[SonarConfig],
-    tank: Const[TankConfig],
-):
+def mark_fan(env, slot, io: Bundle[MappingIO]):
     """Bits of the fan's outline, triangle after triangle: along each chord, then along the beam to the next triangle's leg."""
-    n_ray, n_col = ti.static(sonar.n_ray, grid_shape(tank, mapping.cell_m)[1])
-    x0, y0 = ti.static(grid_origin(tank, mapping.cell_m))
-    ping = ti.Vector([(scan.ping_pos_w[env][0] - x0) / mapping.cell_m - 0.5, (scan.ping_pos_w[env][1] - y0) / mapping.cell_m - 0.5])
+    n_ray, n_col = ti.static(io.sonar_cfg.n_ray, grid_shape(io.tank_cfg, io.mapping_cfg.cell_m)[1])
+    x0, y0 = ti.static(grid_origin(io.tank_cfg, io.mapping_cfg.cell_m))
+    ping = ti.Vector(
+        [(io.scan.ping_pos_w[env][0] - x0) / io.mapping_cfg.cell_m - 0.5, (io.scan.ping_pos_w[env][1] - y0) / io.mapping_cfg.cell_m - 0.5]
+    )
     first, last = ti.Vector([0.0, 0.0]), ti.Vector([0.0, 0.0])
     first_col, last_col = 0, 0
     for packet in range(ti.static(n_ray // LANES)):
-        unit_x, unit_y = beam_lanes(scan.ping_yaw[env], packet * LANES, n_ray)
-        next_x, next_y = beam_lanes(scan.ping_yaw[env], packet * LANES + 1, n_ray)
-        legs = triangle_legs(env, packet * LANES, scan, sonar, mapping)
+        unit_x, unit_y = beam_lanes(io.scan.ping_yaw[env], packet * LANES, n_ray)
+        next_x, next_y = beam_lanes(io.scan.ping_yaw[env], packet * LANES + 1, n_ray)
+        legs = triangle_legs(env, packet * LANES, io)
         begin_x, begin_y = ping[0] + legs * unit_x, ping[1] + legs * unit_y
         end_x, end_y = ping[0] + legs * next_x, ping[1] + legs * next_y
         begin_col, end_col = i16x(0), i16x(0)
@@ -102,7 +95,7 @@ def mark_fan(
             last, last_col = first, first_col
         for i in range(LANES):
             begin, end = ti.Vector([begin_x[i], begin_y[i]]), ti.Vector([end_x[i], end_y[i]])
-            mark_edge(slot, last, begin, last_col, begin_col[i], n_col, scratch)
-            mark_edge(slot, begin, end, begin_col[i], end_col[i], n_col, scratch)
+            mark_edge(slot, last, begin, last_col, begin_col[i], n_col, io)
+            mark_edge(slot, begin, end, begin_col[i], end_col[i], n_col, io)
             last, last_col = end, end_col[i]
-    mark_edge(slot, last, first, last_col, first_col, n_col, scratch)
+    mark_edge(slot, last, first, last_col, first_col, n_col, io)

@@ -13,10 +13,11 @@ import math
 
 import taichi as ti
 
-from uuvtai.config import EpisodeConfig, ForecastConfig, TankConfig, TrackingConfig
+from uuvtai.config import ForecastConfig, TankConfig, TrackingConfig
 from uuvtai.kernels.core.geometry import FAR_M
 from uuvtai.kernels.core.lanes import LANES, f16x
-from uuvtai.kernels.core.signature import Const, In, Out
+from uuvtai.kernels.core.signature import Bundle, Const, In
+from uuvtai.kernels.perception.bundles import ForecastIO
 from uuvtai.state import HabitState, TrackState
 
 _STRAIGHT_SIGMA = 0.4
@@ -45,55 +46,55 @@ _MOST_WEIGHT = 4.0
 
 
 @ti.func
-def forget_habits(env, habits: Out[HabitState]):
-    habits.next_slot[env] = 0
-    for packet in range(habits.weight.shape[1]):
-        habits.turn_x[env, packet] = ti.zero(habits.turn_x[env, packet])
-        habits.turn_y[env, packet] = ti.zero(habits.turn_y[env, packet])
-        habits.in_x[env, packet] = ti.zero(habits.in_x[env, packet])
-        habits.in_y[env, packet] = ti.zero(habits.in_y[env, packet])
-        habits.out_x[env, packet] = ti.zero(habits.out_x[env, packet])
-        habits.out_y[env, packet] = ti.zero(habits.out_y[env, packet])
-        habits.weight[env, packet] = ti.zero(habits.weight[env, packet])
-    for track in range(habits.leg_step.shape[1]):
-        habits.leg[env, track] = ti.zero(habits.leg[env, track])
-        habits.leg_step[env, track] = -1
+def forget_habits(env, io: Bundle[ForecastIO]):
+    io.habits.next_slot[env] = 0
+    for packet in range(io.habits.weight.shape[1]):
+        io.habits.turn_x[env, packet] = ti.zero(io.habits.turn_x[env, packet])
+        io.habits.turn_y[env, packet] = ti.zero(io.habits.turn_y[env, packet])
+        io.habits.in_x[env, packet] = ti.zero(io.habits.in_x[env, packet])
+        io.habits.in_y[env, packet] = ti.zero(io.habits.in_y[env, packet])
+        io.habits.out_x[env, packet] = ti.zero(io.habits.out_x[env, packet])
+        io.habits.out_y[env, packet] = ti.zero(io.habits.out_y[env, packet])
+        io.habits.weight[env, packet] = ti.zero(io.habits.weight[env, packet])
+    for track in range(io.habits.leg_step.shape[1]):
+        io.habits.leg[env, track] = ti.zero(io.habits.leg[env, track])
+        io.habits.leg_step[env, track] = -1
 
 
 # --------------------------------------------------------------------------------------------------------------------- learn
 
 
 @ti.func
-def learn_habit(env, track, habits: Out[HabitState], tracks: In[TrackState], cfg: Const[ForecastConfig], rules: Const[EpisodeConfig]):
+def learn_habit(env, track, io: Bundle[ForecastIO]):
     """Where a track is on a straight leg: remember the turn since its last one, and forget a turn that it went past."""
-    if tracks.alive[env, track] == 0 or tracks.age[env, track] == 0:
-        habits.leg_step[env, track] = -1
-    elif tracks.moving[env, track] == 1 and tracks.misses[env, track] == 0 and on_straight_leg(env, track, tracks):
-        now, leg = tracks.state[env, track], habits.leg[env, track]
-        time = (tracks.scan_step[env] - habits.leg_step[env, track]) * rules.control_dt_s
-        if habits.leg_step[env, track] >= 0 and time < _LONGEST_S:
+    if io.tracks.alive[env, track] == 0 or io.tracks.age[env, track] == 0:
+        io.habits.leg_step[env, track] = -1
+    elif io.tracks.moving[env, track] == 1 and io.tracks.misses[env, track] == 0 and on_straight_leg(env, track, io):
+        now, leg = io.tracks.state[env, track], io.habits.leg[env, track]
+        time = (io.tracks.scan_step[env] - io.habits.leg_step[env, track]) * io.episode_cfg.control_dt_s
+        if io.habits.leg_step[env, track] >= 0 and time < _LONGEST_S:
             speed, leg_speed = ti.sqrt(now[2] ** 2 + now[3] ** 2), ti.sqrt(leg[2] ** 2 + leg[3] ** 2)
             course, leg_course = ti.Vector([now[2] / speed, now[3] / speed]), ti.Vector([leg[2] / leg_speed, leg[3] / leg_speed])
             if course.dot(leg_course) < _TURNED_COS:
                 way = 0.5 * time * (speed + leg_speed)
-                place_turn(env, ti.Vector([leg[0], leg[1]]), leg_course, ti.Vector([now[0], now[1]]), course, way, habits)
+                place_turn(env, ti.Vector([leg[0], leg[1]]), leg_course, ti.Vector([now[0], now[1]]), course, way, io)
             else:
-                drop_passed(env, ti.Vector([now[0], now[1]]), course, speed * time, habits, cfg)
-        habits.leg[env, track] = now
-        habits.leg_step[env, track] = tracks.scan_step[env]
+                drop_passed(env, ti.Vector([now[0], now[1]]), course, speed * time, io)
+        io.habits.leg[env, track] = now
+        io.habits.leg_step[env, track] = io.tracks.scan_step[env]
 
 
 @ti.func
-def on_straight_leg(env, track, tracks: In[TrackState]):
+def on_straight_leg(env, track, io: Bundle[ForecastIO]):
     """Whether course and speed are known well and the course does not turn."""
-    mean, cov = tracks.state[env, track], tracks.cov[env, track]
-    rate, rate_var = tracks.turn_rate[env, track], tracks.turn_cov[env, track][4]
+    mean, cov = io.tracks.state[env, track], io.tracks.cov[env, track]
+    rate, rate_var = io.tracks.turn_rate[env, track], io.tracks.turn_cov[env, track][4]
     known = 0.0 < rate_var < ti.static(_STRAIGHT_SIGMA**2)
     return known and rate * rate <= rate_var and cov[7] + cov[9] < _SETTLED * (mean[2] ** 2 + mean[3] ** 2)
 
 
 @ti.func
-def place_turn(env, p0, d0, p1, d1, way, habits: Out[HabitState]):
+def place_turn(env, p0, d0, p1, d1, way, io: Bundle[ForecastIO]):
     """Remember the turn between two legs, unless they do not meet."""
     fold = d0 - d1
     uneven = 2.0 * (p1 - p0 - 0.5 * way * (d0 + d1)).dot(fold) / fold.norm_sqr()
@@ -101,50 +102,50 @@ def place_turn(env, p0, d0, p1, d1, way, habits: Out[HabitState]):
     corner = p0 + before * d0
     misfit = (p1 - after * d1 - corner).norm()
     if ti.min(before, after) > -_MISFIT_M and misfit < _MISFIT_M:
-        store_turn(env, 0.5 * (corner + p1 - after * d1), d0, d1, habits)
+        store_turn(env, 0.5 * (corner + p1 - after * d1), d0, d1, io)
 
 
 @ti.func
-def store_turn(env, pos, d0, d1, habits: Out[HabitState]):
+def store_turn(env, pos, d0, d1, io: Bundle[ForecastIO]):
     """Average with the same turn seen before; else a new one in the place of the oldest."""
-    n_packet = ti.static(habits.weight.shape[1])
-    slot, weight = habits.next_slot[env], 1.0
+    n_packet = ti.static(io.habits.weight.shape[1])
+    slot, weight = io.habits.next_slot[env], 1.0
     known = 0
     for packet in range(n_packet):
         for lane in range(LANES):
-            if known == 0 and habits.weight[env, packet][lane] > 0.0:
-                off = ti.Vector([habits.turn_x[env, packet][lane], habits.turn_y[env, packet][lane]]) - pos
-                alike_in = habits.in_x[env, packet][lane] * d0[0] + habits.in_y[env, packet][lane] * d0[1] > _ALIKE_COS
-                alike_out = habits.out_x[env, packet][lane] * d1[0] + habits.out_y[env, packet][lane] * d1[1] > _ALIKE_COS
+            if known == 0 and io.habits.weight[env, packet][lane] > 0.0:
+                off = ti.Vector([io.habits.turn_x[env, packet][lane], io.habits.turn_y[env, packet][lane]]) - pos
+                alike_in = io.habits.in_x[env, packet][lane] * d0[0] + io.habits.in_y[env, packet][lane] * d0[1] > _ALIKE_COS
+                alike_out = io.habits.out_x[env, packet][lane] * d1[0] + io.habits.out_y[env, packet][lane] * d1[1] > _ALIKE_COS
                 if alike_in and alike_out and off.norm_sqr() < ti.static(_SAME_M**2):
                     known, slot = 1, packet * LANES + lane
     packet, lane = slot // LANES, slot % LANES
     if known == 1:
-        weight = ti.min(habits.weight[env, packet][lane] + 1.0, _MOST_WEIGHT)
+        weight = ti.min(io.habits.weight[env, packet][lane] + 1.0, _MOST_WEIGHT)
     else:
-        habits.next_slot[env] = (slot + 1) % ti.static(LANES * n_packet)
+        io.habits.next_slot[env] = (slot + 1) % ti.static(LANES * n_packet)
     keep, gain = 1.0 - 1.0 / weight, 1.0 / weight
-    came = keep * known * ti.Vector([habits.in_x[env, packet][lane], habits.in_y[env, packet][lane]]) + gain * d0
-    went = keep * known * ti.Vector([habits.out_x[env, packet][lane], habits.out_y[env, packet][lane]]) + gain * d1
+    came = keep * known * ti.Vector([io.habits.in_x[env, packet][lane], io.habits.in_y[env, packet][lane]]) + gain * d0
+    went = keep * known * ti.Vector([io.habits.out_x[env, packet][lane], io.habits.out_y[env, packet][lane]]) + gain * d1
     came, went = came.normalized(), went.normalized()
-    habits.turn_x[env, packet][lane] = keep * habits.turn_x[env, packet][lane] * known + gain * pos[0]
-    habits.turn_y[env, packet][lane] = keep * habits.turn_y[env, packet][lane] * known + gain * pos[1]
-    habits.in_x[env, packet][lane] = came[0]
-    habits.in_y[env, packet][lane] = came[1]
-    habits.out_x[env, packet][lane] = went[0]
-    habits.out_y[env, packet][lane] = went[1]
-    habits.weight[env, packet][lane] = weight
+    io.habits.turn_x[env, packet][lane] = keep * io.habits.turn_x[env, packet][lane] * known + gain * pos[0]
+    io.habits.turn_y[env, packet][lane] = keep * io.habits.turn_y[env, packet][lane] * known + gain * pos[1]
+    io.habits.in_x[env, packet][lane] = came[0]
+    io.habits.in_y[env, packet][lane] = came[1]
+    io.habits.out_x[env, packet][lane] = went[0]
+    io.habits.out_y[env, packet][lane] = went[1]
+    io.habits.weight[env, packet][lane] = weight
 
 
 @ti.func
-def drop_passed(env, pos, course, moved, habits: Out[HabitState], cfg: Const[ForecastConfig]):
+def drop_passed(env, pos, course, moved, io: Bundle[ForecastIO]):
     """A body that was expected to turn and has gone straight on past the place, in the last ``moved`` [m], takes one off its weight."""
-    for packet in range(habits.weight.shape[1]):
-        along, across = offsets(env, packet, pos, course, habits)
+    for packet in range(io.habits.weight.shape[1]):
+        along, across = offsets(env, packet, pos, course, io.habits)
         for lane in ti.static(range(LANES)):
-            behind = along[lane] < -cfg.passed_m and along[lane] + moved >= -cfg.passed_m
-            if behind and across[lane] < ti.static(0.5 * cfg.across_m) and habits.weight[env, packet][lane] > 0.0:
-                habits.weight[env, packet][lane] -= 1.0
+            behind = along[lane] < -io.forecast_cfg.passed_m and along[lane] + moved >= -io.forecast_cfg.passed_m
+            if behind and across[lane] < ti.static(0.5 * io.forecast_cfg.across_m) and io.habits.weight[env, packet][lane] > 0.0:
+                io.habits.weight[env, packet][lane] -= 1.0
 
 
 # -------------------------------------------------------------------------------------------------------------------- recall
@@ -165,13 +166,13 @@ def offsets(env, packet, pos, course, habits: In[HabitState]):
 
 
 @ti.func
-def next_turn(env, pos, course, habits: In[HabitState], cfg: Const[ForecastConfig]):
+def next_turn(env, pos, course, habits: In[HabitState], forecast_cfg: Const[ForecastConfig]):
     """(distance [m] to the nearest remembered turn ahead, course after it); FAR_M = none."""
     gap, slot = FAR_M, 0
     for packet in range(habits.weight.shape[1]):
         along, across = offsets(env, packet, pos, course, habits)
         for lane in ti.static(range(LANES)):
-            meets = across[lane] < cfg.across_m + cfg.across_slope * along[lane] and along[lane] > -cfg.overdue_m
+            meets = across[lane] < forecast_cfg.across_m + forecast_cfg.across_slope * along[lane] and along[lane] > -forecast_cfg.overdue_m
             if meets and along[lane] < gap:
                 gap, slot = along[lane], packet * LANES + lane
     out = course
@@ -182,16 +183,16 @@ def next_turn(env, pos, course, habits: In[HabitState], cfg: Const[ForecastConfi
 
 
 @ti.func
-def wall_ahead(pos, course, radius, tank: Const[TankConfig]):
+def wall_ahead(pos, course, radius, tank_cfg: Const[TankConfig]):
     """Distance [m] along the course at which a body of that radius touches a side wall; it may be negative."""
     gap = FAR_M
-    if ti.static(tank.shape == "circle"):
-        off = pos - ti.Vector([0.5 * (tank.x_m[0] + tank.x_m[1]), 0.5 * (tank.y_m[0] + tank.y_m[1])])
+    if ti.static(tank_cfg.shape == "circle"):
+        off = pos - ti.Vector([0.5 * (tank_cfg.x_m[0] + tank_cfg.x_m[1]), 0.5 * (tank_cfg.y_m[0] + tank_cfg.y_m[1])])
         half = off.dot(course)
-        gap = ti.sqrt(ti.max(half * half + ti.max(tank.radius_m - radius, 0.0) ** 2 - off.norm_sqr(), 0.0)) - half
+        gap = ti.sqrt(ti.max(half * half + ti.max(tank_cfg.radius_m - radius, 0.0) ** 2 - off.norm_sqr(), 0.0)) - half
     else:
         for side in ti.static(range(2)):
-            low, high = ti.static((tank.x_m, tank.y_m)[side])
+            low, high = ti.static((tank_cfg.x_m, tank_cfg.y_m)[side])
             if ti.abs(course[side]) > 1e-6:
                 edge = ti.select(course[side] > 0.0, high - radius, low + radius)
                 gap = ti.min(gap, (edge - pos[side]) / course[side])
@@ -199,44 +200,48 @@ def wall_ahead(pos, course, radius, tank: Const[TankConfig]):
 
 
 @ti.func
-def next_event(env, pos, course, radius, habits: In[HabitState], cfg: Const[ForecastConfig], tank: Const[TankConfig]):
+def next_event(env, pos, course, radius, habits: In[HabitState], forecast_cfg: Const[ForecastConfig], tank_cfg: Const[TankConfig]):
     """(distance [m] to the next turn on a straight course, course after it): a remembered one, or the wall if that comes first.
 
     At a wall bodies are expected to turn back: right for lines, and nearer than a mirrored course to what loops do, whose next leg goes
     anywhere into the tank.
     """
     gap, out = FAR_M, course
-    if ti.static(cfg.use_habits):
-        gap, out = next_turn(env, pos, course, habits, cfg)
-    if ti.static(cfg.use_reflection):
-        far = ti.max(wall_ahead(pos, course, radius, tank), 0.0)
+    if ti.static(forecast_cfg.use_habits):
+        gap, out = next_turn(env, pos, course, habits, forecast_cfg)
+    if ti.static(forecast_cfg.use_reflection):
+        far = ti.max(wall_ahead(pos, course, radius, tank_cfg), 0.0)
         if far < gap:
             gap, out = far, -course
     return gap, out
 
 
 @ti.func
-def expected_turn_rate(env, track, tracks: In[TrackState], cfg: Const[ForecastConfig], tracking: Const[TrackingConfig]):
+def expected_turn_rate(env, track, tracks: In[TrackState], forecast_cfg: Const[ForecastConfig], tracking_cfg: Const[TrackingConfig]):
     """[rad/s] the filter's turn rate, where that explains the track better than none: most bodies go straight.
 
     Odds for a turn = density of rate 0 in the prior over that in the posterior (Savage-Dickey): an uncertain rate must stand out of its
     noise by little, a well known one by more, for a prior as wide as this one makes small rates unlikely.
     """
     rate = 0.0
-    if ti.static(cfg.use_turn_rate and tracking.turn_rate_sigma_rad_s > 0):
+    if ti.static(forecast_cfg.use_turn_rate and tracking_cfg.turn_rate_sigma_rad_s > 0):
         known, var = tracks.turn_rate[env, track], tracks.turn_cov[env, track][4]
-        bar = ti.log(ti.static(tracking.turn_rate_sigma_rad_s**2) / ti.max(var, 1e-9)) + ti.static(2.0 * math.log(cfg.straight_odds))
+        bar = ti.log(ti.static(tracking_cfg.turn_rate_sigma_rad_s**2) / ti.max(var, 1e-9)) + ti.static(
+            2.0 * math.log(forecast_cfg.straight_odds)
+        )
         if var > 0.0 and known * known > var * ti.max(bar, 0.0):
             rate = known
     return rate
 
 
 @ti.func
-def coasted(env, track, mean, time, habits: In[HabitState], tracks: In[TrackState], cfg: Const[ForecastConfig], tank: Const[TankConfig]):
+def coasted(
+    env, track, mean, time, habits: In[HabitState], tracks: In[TrackState], forecast_cfg: Const[ForecastConfig], tank_cfg: Const[TankConfig]
+):
     """Mean (x, y, vx, vy) of an unseen body on a straight leg after ``time`` [s]: it turns where bodies turn."""
     speed = ti.max(ti.sqrt(mean[2] ** 2 + mean[3] ** 2), 1e-6)
     course, way = ti.Vector([mean[2] / speed, mean[3] / speed]), speed * time
-    gap, out = next_event(env, ti.Vector([mean[0], mean[1]]), course, tracks.radius_m[env, track], habits, cfg, tank)
+    gap, out = next_event(env, ti.Vector([mean[0], mean[1]]), course, tracks.radius_m[env, track], habits, forecast_cfg, tank_cfg)
     before = ti.min(gap, way)
     after = way - before
     late = course

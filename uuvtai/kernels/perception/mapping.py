@@ -22,12 +22,11 @@ import math
 
 import taichi as ti
 
-from uuvtai.config import DepthConfig, EpisodeConfig, MappingConfig, SonarConfig, TankConfig
 from uuvtai.kernels.core.bits import WORD, bit_of, lowest_bit, taken, with_bit, without_lowest
-from uuvtai.kernels.core.signature import Const, In, Out, quick_launch, spread
+from uuvtai.kernels.core.signature import Bundle, Const, quick_launch, spread
+from uuvtai.kernels.perception.bundles import MappingIO
 from uuvtai.kernels.perception.evidence import mark_depth, mark_hits
 from uuvtai.kernels.perception.fan import mark_fan
-from uuvtai.state import ClockState, ClusterState, DepthImage, GridMask, MapScratch, MapState, SonarScan, TrackState
 
 RATED_HZ = 10.0
 """Scan rate for which the gains of MappingConfig are given."""
@@ -82,9 +81,13 @@ def bit_fields(grid_map):
 
 
 @ti.func
-def is_due(env, scan: In[SonarScan], clock: In[ClockState], grid_map: In[MapState], mapping: Const[MappingConfig]):
+def is_due(env, io: Bundle[MappingIO]):
     """1 where a scan arrived that is to be mapped."""
-    due = clock.awake[env] == 1 and scan.fresh[env] == 1 and clock.step[env] - grid_map.map_step[env] >= mapping.period_steps
+    due = (
+        io.clock.awake[env] == 1
+        and io.scan.fresh[env] == 1
+        and io.clock.step[env] - io.grid_map.map_step[env] >= io.mapping_cfg.period_steps
+    )
     return ti.cast(due, ti.i32)
 
 
@@ -95,156 +98,129 @@ def clipped(value):
 
 
 @ti.func
-def count_free(env, row, word, free, returned, grid_map: Out[MapState], confident_scans: Const[int]):
+def count_free(env, row, word, free, returned, confident_scans: Const[int], io: Bundle[MappingIO]):
     """Counters of free water: one more where a cell is free and not yet confident, 0 where it has a return."""
-    sure = grid_map.confident[env, row, word]
+    sure = io.grid_map.confident[env, row, word]
     more = free & ~sure
-    reset = returned & grid_map.seen[env, row, word]
+    reset = returned & io.grid_map.seen[env, row, word]
     if more | reset != 0:
-        old = grid_map.free_scans[env, row, word]
+        old = io.grid_map.free_scans[env, row, word]
         new, full = old, more
         for k in ti.static(range(confident_scans.bit_length())):
             new[k] = (old[k] ^ more) & ~returned
             more &= old[k]
             full &= new[k] if ti.static(confident_scans >> k & 1) else ~new[k]
-        grid_map.free_scans[env, row, word] = new
-        grid_map.confident[env, row, word] = (sure & ~returned) | full
+        io.grid_map.free_scans[env, row, word] = new
+        io.grid_map.confident[env, row, word] = (sure & ~returned) | full
 
 
 @ti.func
-def count_dynamic(env, row, word, free, dynamics, grid_map: Out[MapState]):
+def count_dynamic(env, row, word, free, dynamics, io: Bundle[MappingIO]):
     """Counters of dynamic evidence: one more where there is some, 0 where the cell is free."""
-    held = grid_map.held[env, row, word]
+    held = io.grid_map.held[env, row, word]
     gone = free & held
     if gone | dynamics != 0:
-        grid_map.held[env, row, word] = (held & ~gone) | dynamics
+        io.grid_map.held[env, row, word] = (held & ~gone) | dynamics
         while gone != 0:
-            grid_map.dynamic_scans[env, row, word * WORD + lowest_bit(gone)] = ti.u8(0)
+            io.grid_map.dynamic_scans[env, row, word * WORD + lowest_bit(gone)] = ti.u8(0)
             gone = without_lowest(gone)
         more = dynamics
         while more != 0:
             col = word * WORD + lowest_bit(more)
-            raised = ti.min(ti.cast(grid_map.dynamic_scans[env, row, col], ti.i32) + 1, COUNTER_MAX)
-            grid_map.dynamic_scans[env, row, col] = ti.cast(raised, ti.u8)
+            raised = ti.min(ti.cast(io.grid_map.dynamic_scans[env, row, col], ti.i32) + 1, COUNTER_MAX)
+            io.grid_map.dynamic_scans[env, row, col] = ti.cast(raised, ti.u8)
             more = without_lowest(more)
 
 
 @ti.func
 def folded(
-    static_old,
-    dynamic_old,
-    static_hit,
-    dynamic_hit,
-    free,
-    point,
-    mapping: Const[MappingConfig],
-    scan_s: Const[float],
-    depth_s: Const[float],
+    static_old, dynamic_old, static_hit, dynamic_hit, free, point, scan_s: Const[float], depth_s: Const[float], io: Bundle[MappingIO]
 ):
     """Both equations for one cell; indicators are 0 or 1."""
     supported = (static_hit == 1) | (static_old > 0.0)
-    depth_hit = ti.select(supported & (dynamic_old < mapping.occupied), point & ~dynamic_hit & ~free, 0)
+    depth_hit = ti.select(supported & (dynamic_old < io.mapping_cfg.occupied), point & ~dynamic_hit & ~free, 0)
     static_new = clipped(
-        ti.static(1.0 - decay_per_scan(mapping.static_decay, scan_s)) * static_old
-        + ti.static(per_scan(mapping.static_hit, scan_s)) * static_hit
-        - ti.static(per_scan(mapping.static_free, scan_s)) * free
-        + ti.static(per_scan(mapping.depth_hit, depth_s)) * depth_hit
+        ti.static(1.0 - decay_per_scan(io.mapping_cfg.static_decay, scan_s)) * static_old
+        + ti.static(per_scan(io.mapping_cfg.static_hit, scan_s)) * static_hit
+        - ti.static(per_scan(io.mapping_cfg.static_free, scan_s)) * free
+        + ti.static(per_scan(io.mapping_cfg.depth_hit, depth_s)) * depth_hit
     )
     dynamic_new = clipped(
-        ti.static(1.0 - decay_per_scan(mapping.dynamic_decay, scan_s)) * dynamic_old
-        + ti.static(per_scan(mapping.dynamic_hit, scan_s)) * dynamic_hit
-        - ti.static(per_scan(mapping.dynamic_free, scan_s)) * free
+        ti.static(1.0 - decay_per_scan(io.mapping_cfg.dynamic_decay, scan_s)) * dynamic_old
+        + ti.static(per_scan(io.mapping_cfg.dynamic_hit, scan_s)) * dynamic_hit
+        - ti.static(per_scan(io.mapping_cfg.dynamic_free, scan_s)) * free
     )
     return static_new, dynamic_new
 
 
 @ti.func
-def fold_cells(
-    env,
-    row,
-    word,
-    statics,
-    dynamics,
-    free,
-    points,
-    grid_map: Out[MapState],
-    mapping: Const[MappingConfig],
-    scan_s: Const[float],
-    depth_s: Const[float],
-):
+def fold_cells(env, row, word, statics, dynamics, free, points, scan_s: Const[float], depth_s: Const[float], io: Bundle[MappingIO]):
     """Both equations for the cells of a word that have anything to fold, and what is then true of them."""
-    alive = grid_map.alive[env, row, word]
+    alive = io.grid_map.alive[env, row, word]
     left = alive | statics | dynamics | points
     if left != 0:
-        static_occupied, dynamic_occupied = grid_map.static_occupied[env, row, word], grid_map.dynamic_occupied[env, row, word]
+        static_occupied, dynamic_occupied = io.grid_map.static_occupied[env, row, word], io.grid_map.dynamic_occupied[env, row, word]
         while left != 0:
             i = lowest_bit(left)
             left = without_lowest(left)
             col = word * WORD + i
             static_new, dynamic_new = folded(
-                grid_map.static_occ[env, row, col],
-                grid_map.dynamic_occ[env, row, col],
+                io.grid_map.static_occ[env, row, col],
+                io.grid_map.dynamic_occ[env, row, col],
                 bit_of(statics, i),
                 bit_of(dynamics, i),
                 bit_of(free, i),
                 bit_of(points, i),
-                mapping,
                 scan_s,
                 depth_s,
+                io,
             )
-            grid_map.static_occ[env, row, col], grid_map.dynamic_occ[env, row, col] = static_new, dynamic_new
+            io.grid_map.static_occ[env, row, col], io.grid_map.dynamic_occ[env, row, col] = static_new, dynamic_new
             alive = with_bit(alive, i, (static_new > 0.0) | (dynamic_new > 0.0))
-            static_occupied = with_bit(static_occupied, i, static_new >= mapping.occupied)
-            dynamic_occupied = with_bit(dynamic_occupied, i, dynamic_new >= mapping.occupied)
-        grid_map.alive[env, row, word] = alive
-        grid_map.static_occupied[env, row, word], grid_map.dynamic_occupied[env, row, word] = static_occupied, dynamic_occupied
+            static_occupied = with_bit(static_occupied, i, static_new >= io.mapping_cfg.occupied)
+            dynamic_occupied = with_bit(dynamic_occupied, i, dynamic_new >= io.mapping_cfg.occupied)
+        io.grid_map.alive[env, row, word] = alive
+        io.grid_map.static_occupied[env, row, word], io.grid_map.dynamic_occupied[env, row, word] = static_occupied, dynamic_occupied
 
 
 @ti.func
-def fetch_cells(env, slot, scratch: Out[MapScratch], grid_map: In[MapState]):
+def fetch_cells(env, slot, io: Bundle[MappingIO]):
     """Read one number of every word that holds something, so that memory answers many of them at once and not one after another."""
     fetched = 0.0
-    for row in range(ti.static(grid_map.alive.shape[1])):
-        for word in range(ti.static(grid_map.alive.shape[2])):
-            alive = grid_map.alive[env, row, word]
+    for row in range(ti.static(io.grid_map.alive.shape[1])):
+        for word in range(ti.static(io.grid_map.alive.shape[2])):
+            alive = io.grid_map.alive[env, row, word]
             if alive != 0:
-                fetched += grid_map.static_occ[env, row, word * WORD + lowest_bit(alive)]
-    scratch.fetched[slot] = fetched
+                fetched += io.grid_map.static_occ[env, row, word * WORD + lowest_bit(alive)]
+    io.map_scratch.fetched[slot] = fetched
 
 
 @ti.func
-def merge_scan(
-    env,
-    slot,
-    scratch: Out[MapScratch],
-    grid_map: Out[MapState],
-    mask: In[GridMask],
-    mapping: Const[MappingConfig],
-    scan_s: Const[float],
-    depth_s: Const[float],
-    confident_scans: Const[int],
-):
+def merge_scan(env, slot, scan_s: Const[float], depth_s: Const[float], confident_scans: Const[int], io: Bundle[MappingIO]):
     """Fold everything marked in the slot's scratch into an env's map, word by word; the marks are used up.
 
     Each strip of sixty-four columns goes upwards: an odd number of the fan's edges below means inside.
     """
-    for word in range(ti.static(scratch.fan_edge.shape[2])):
+    for word in range(ti.static(io.map_scratch.fan_edge.shape[2])):
         in_fan = ti.cast(0, ti.u64)
-        for row in range(ti.static(scratch.fan_edge.shape[1])):
-            in_fan ^= taken(scratch.fan_edge, slot, row, word)
-            inside = ~mask.outside_bits[row, word]
-            statics, dynamics = taken(scratch.static_hit, slot, row, word) & inside, taken(scratch.dynamic_hit, slot, row, word) & inside
+        for row in range(ti.static(io.map_scratch.fan_edge.shape[1])):
+            in_fan ^= taken(io.map_scratch.fan_edge, slot, row, word)
+            inside = ~io.mask.outside_bits[row, word]
+            statics, dynamics = (
+                taken(io.map_scratch.static_hit, slot, row, word) & inside,
+                taken(io.map_scratch.dynamic_hit, slot, row, word) & inside,
+            )
             points = ti.cast(0, ti.u64)
-            if grid_map.depth_waits[env] == 1:
-                points = taken(grid_map.depth_hit, env, row, word) & inside
+            if io.grid_map.depth_waits[env] == 1:
+                points = taken(io.grid_map.depth_hit, env, row, word) & inside
             free = in_fan & inside & ~(statics | dynamics)
-            count_free(env, row, word, free, statics | dynamics, grid_map, confident_scans)
-            count_dynamic(env, row, word, free, dynamics, grid_map)
-            fold_cells(env, row, word, statics, dynamics, free, points, grid_map, mapping, scan_s, depth_s)
-            seen = grid_map.seen[env, row, word]
+            count_free(env, row, word, free, statics | dynamics, confident_scans, io)
+            count_dynamic(env, row, word, free, dynamics, io)
+            fold_cells(env, row, word, statics, dynamics, free, points, scan_s, depth_s, io)
+            seen = io.grid_map.seen[env, row, word]
             if (free | statics | dynamics | points) & ~seen != 0:
-                grid_map.seen[env, row, word] = seen | free | statics | dynamics | points
-    grid_map.depth_waits[env] = 0
+                io.grid_map.seen[env, row, word] = seen | free | statics | dynamics | points
+    io.grid_map.depth_waits[env] = 0
 
 
 # ---------------------------------------------------------------------------------------------------------------------- kernels
@@ -252,55 +228,41 @@ def merge_scan(
 
 @quick_launch
 @ti.kernel
-def update_map(
-    grid_map: Out[MapState],
-    scratch: Out[MapScratch],
-    scan: In[SonarScan],
-    image: In[DepthImage],
-    tracks: In[TrackState],
-    clusters: In[ClusterState],
-    mask: In[GridMask],
-    clock: In[ClockState],
-    mapping: Const[MappingConfig],
-    sonar: Const[SonarConfig],
-    depth: Const[DepthConfig],
-    tank: Const[TankConfig],
-    episode: Const[EpisodeConfig],
-):
+def update_map(io: Bundle[MappingIO]):
     """Take a fresh image's points and fold a fresh scan that is due into both layers; else the map stays as it is."""
-    n_env, n_slot = ti.static(clock.awake.shape[0], scratch.fan_edge.shape[0])
-    scan_s = ti.static(map_period_s(mapping, sonar, episode))
-    depth_s = ti.static(depth_period_s(mapping, sonar, depth, episode))
-    confident, promote = ti.static(scans_in(mapping.free_confident_s, scan_s), scans_in(mapping.promote_s, scan_s))
+    n_env, n_slot = ti.static(io.clock.awake.shape[0], io.map_scratch.fan_edge.shape[0])
+    scan_s = ti.static(map_period_s(io.mapping_cfg, io.sonar_cfg, io.episode_cfg))
+    depth_s = ti.static(depth_period_s(io.mapping_cfg, io.sonar_cfg, io.depth_cfg, io.episode_cfg))
+    confident, promote = ti.static(scans_in(io.mapping_cfg.free_confident_s, scan_s), scans_in(io.mapping_cfg.promote_s, scan_s))
     # one thread has all of an env's bits, and does all of it while its scratch is in the cache
     for slot, pad in ti.ndrange(n_slot, ti.static(spread(n_slot))):
         if pad == 0:
             for env in range(slot * n_env // n_slot, (slot + 1) * n_env // n_slot):
-                if clock.awake[env] == 1 and image.fresh[env] == 1:
-                    mark_depth(env, grid_map, image, mapping, depth, tank)
-                    grid_map.depth_waits[env] = 1
-                if is_due(env, scan, clock, grid_map, mapping) == 1:
-                    fetch_cells(env, slot, scratch, grid_map)
-                    mark_fan(env, slot, scratch, scan, mapping, sonar, tank)
-                    mark_hits(env, slot, scratch, grid_map, scan, tracks, clusters, mapping, sonar, tank, promote)
-                    merge_scan(env, slot, scratch, grid_map, mask, mapping, scan_s, depth_s, confident)
-                    grid_map.map_step[env] = clock.step[env]
+                if io.clock.awake[env] == 1 and io.image.fresh[env] == 1:
+                    mark_depth(env, io)
+                    io.grid_map.depth_waits[env] = 1
+                if is_due(env, io) == 1:
+                    fetch_cells(env, slot, io)
+                    mark_fan(env, slot, io)
+                    mark_hits(env, slot, promote, io)
+                    merge_scan(env, slot, scan_s, depth_s, confident, io)
+                    io.grid_map.map_step[env] = io.clock.step[env]
 
 
 @quick_launch
 @ti.kernel
-def reset_map(grid_map: Out[MapState], clock: In[ClockState]):
+def reset_map(io: Bundle[MappingIO]):
     """An empty map: nothing occupied, nothing seen."""
-    n_env, n_row, n_col = ti.static(grid_map.static_occ.shape)
+    n_env, n_row, n_col = ti.static(io.grid_map.static_occ.shape)
     for env, row in ti.ndrange(n_env, n_row):
-        if clock.awake[env] == 1:
-            grid_map.map_step[env] = _NO_SCAN
-            grid_map.depth_waits[env] = 0
+        if io.clock.awake[env] == 1:
+            io.grid_map.map_step[env] = _NO_SCAN
+            io.grid_map.depth_waits[env] = 0
             for col in range(n_col):
-                grid_map.static_occ[env, row, col] = 0.0
-                grid_map.dynamic_occ[env, row, col] = 0.0
-                grid_map.dynamic_scans[env, row, col] = ti.u8(0)
-            for word in range(ti.static(grid_map.seen.shape[2])):
-                grid_map.free_scans[env, row, word] = ti.Vector.zero(ti.u64, ti.static(grid_map.free_scans.n))
-                for words in ti.static(bit_fields(grid_map)):
+                io.grid_map.static_occ[env, row, col] = 0.0
+                io.grid_map.dynamic_occ[env, row, col] = 0.0
+                io.grid_map.dynamic_scans[env, row, col] = ti.u8(0)
+            for word in range(ti.static(io.grid_map.seen.shape[2])):
+                io.grid_map.free_scans[env, row, word] = ti.Vector.zero(ti.u64, ti.static(io.grid_map.free_scans.n))
+                for words in ti.static(bit_fields(io.grid_map)):
                     words[env, row, word] = ti.cast(0, ti.u64)

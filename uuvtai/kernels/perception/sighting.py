@@ -2,12 +2,11 @@
 
 import taichi as ti
 
-from uuvtai.config import SonarConfig
 from uuvtai.kernels.core.geometry import TWO_PI
 from uuvtai.kernels.core.kalman import position_variance, velocity_variance
-from uuvtai.kernels.core.signature import Const, In
+from uuvtai.kernels.core.signature import Bundle
+from uuvtai.kernels.perception.bundles import TrackingIO
 from uuvtai.kernels.perception.clustering import ARC
-from uuvtai.state import ClusterState, TrackState
 
 _CROSS_SIGMA_M = 0.02
 """Error of a centre across the beam beside that of its edges (EC)."""
@@ -22,50 +21,50 @@ def bearing_vector(bearing):
 
 
 @ti.func
-def centre_sight(env, c, radius, clusters: In[ClusterState], sonar: Const[SonarConfig]):
+def centre_sight(env, c, radius, io: Bundle[TrackingIO]):
     """(bearing [rad], distance [m], half-angle [rad]) of the centre of a body of known radius; the open edge stands in for a hidden one."""
-    distance = clusters.range_m[env, c] + ARC * radius
+    distance = io.clusters.range_m[env, c] + ARC * radius
     half = radius / distance
     distance /= 1.0 - half * half / 6.0
-    spare = half - 0.5 * ti.static(TWO_PI / sonar.n_ray) * clusters.span[env, c]
-    bearing = clusters.bearing_w[env, c]
-    if clusters.hidden[env, c] == 1:
+    spare = half - 0.5 * ti.static(TWO_PI / io.sonar_cfg.n_ray) * io.clusters.span[env, c]
+    bearing = io.clusters.bearing_w[env, c]
+    if io.clusters.hidden[env, c] == 1:
         bearing -= ti.max(spare, 0.0)
-    if clusters.hidden[env, c] == 2:
+    if io.clusters.hidden[env, c] == 2:
         bearing += ti.max(spare, 0.0)
     return bearing, distance, half
 
 
 @ti.func
-def centre_variances(env, c, radius, radius_var, clusters: In[ClusterState], sonar: Const[SonarConfig]):
+def centre_variances(env, c, radius, radius_var, io: Bundle[TrackingIO]):
     """Variances [m^2] of a cluster's centre along and across the beam, larger where an edge is hidden."""
-    edge = _EDGE_SIGMA * ti.static(TWO_PI / sonar.n_ray) * clusters.range_m[env, c]
-    radial = clusters.range_var[env, c] + ARC * ARC * radius_var
+    edge = _EDGE_SIGMA * ti.static(TWO_PI / io.sonar_cfg.n_ray) * io.clusters.range_m[env, c]
+    radial = io.clusters.range_var[env, c] + ARC * ARC * radius_var
     cross = edge * edge + _CROSS_SIGMA_M * _CROSS_SIGMA_M
-    if clusters.hidden[env, c] > 0:
+    if io.clusters.hidden[env, c] > 0:
         radial += 0.09 * radius * radius
         cross += 0.25 * radius * radius + radius_var
     return radial, cross
 
 
 @ti.func
-def radius_variance(env, c, clusters: In[ClusterState], sonar: Const[SonarConfig]):
+def radius_variance(env, c, io: Bundle[TrackingIO]):
     """Variance [m^2] of a cluster's radius: half of two edges, each uniform within one beam spacing."""
-    edge = _EDGE_SIGMA * ti.static(TWO_PI / sonar.n_ray) * clusters.range_m[env, c]
+    edge = _EDGE_SIGMA * ti.static(TWO_PI / io.sonar_cfg.n_ray) * io.clusters.range_m[env, c]
     return edge * edge + _CROSS_SIGMA_M * _CROSS_SIGMA_M
 
 
 @ti.func
-def pair_surprise(env, track, c, offset, tracks: In[TrackState], clusters: In[ClusterState], sonar: Const[SonarConfig]):
+def pair_surprise(env, track, c, offset, io: Bundle[TrackingIO]):
     """(squared normalised innovation of range, cross range and Doppler; product of their variances; the part of the position alone)."""
-    mean, cov = tracks.state[env, track], tracks.cov[env, track]
-    along = bearing_vector(clusters.bearing_w[env, c])
+    mean, cov = io.tracks.state[env, track], io.tracks.cov[env, track]
+    along = bearing_vector(io.clusters.bearing_w[env, c])
     across = ti.Vector([-along[1], along[0]])
-    radial_var, cross_var = centre_variances(env, c, tracks.radius_m[env, track], tracks.radius_var[env, track], clusters, sonar)
+    radial_var, cross_var = centre_variances(env, c, io.tracks.radius_m[env, track], io.tracks.radius_var[env, track], io)
     s_radial = position_variance(cov, along) + radial_var
     s_cross = position_variance(cov, across) + cross_var
-    s_doppler = velocity_variance(cov, along) + clusters.doppler_var[env, c]
+    s_doppler = velocity_variance(cov, along) + io.clusters.doppler_var[env, c]
     radial, cross = offset.dot(along), offset.dot(across)
-    swing = clusters.doppler_m_s[env, c] - (mean[2] * along[0] + mean[3] * along[1])
+    swing = io.clusters.doppler_m_s[env, c] - (mean[2] * along[0] + mean[3] * along[1])
     near = radial * radial / s_radial + cross * cross / s_cross
     return near + swing * swing / s_doppler, s_radial * s_cross * s_doppler, near

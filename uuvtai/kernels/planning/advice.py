@@ -3,10 +3,9 @@
 import taichi as ti
 
 from uuvtai import tree_codes as codes
-from uuvtai.config import FeaturesConfig
 from uuvtai.kernels.core.columns import Column
-from uuvtai.kernels.core.signature import Const, In
-from uuvtai.state import TeacherState, TreeTable
+from uuvtai.kernels.core.signature import Bundle
+from uuvtai.kernels.planning.bundles import FeaturesIO
 
 CLASSES = ((codes.BACK_OFF,), (codes.EVADE,), (codes.HOLD,), (codes.UNSTICK,), (codes.FOLLOW_ROUTE, codes.DRIVE_STRAIGHT))
 """Leaves by class: emergency, evade, wait, unstick, travel."""
@@ -15,32 +14,32 @@ N_CLASS = len(CLASSES)
 
 
 @ti.func
-def _leaf(env, teacher: In[TeacherState], table: In[TreeTable]):
+def _leaf(env, io: Bundle[FeaturesIO]):
     """Code of the leaf that acts, -1 = none."""
-    node, leaf = teacher.leaf[env], -1
+    node, leaf = io.teacher.leaf[env], -1
     if node >= 0:
-        leaf = table.leaf[node]
+        leaf = io.table.leaf[node]
     return leaf
 
 
 @ti.func
-def _action(env, teacher: In[TeacherState], table: In[TreeTable], cfg: Const[FeaturesConfig]):
-    return teacher.action[env]
+def _action(env, io: Bundle[FeaturesIO]):
+    return io.teacher.action[env]
 
 
 @ti.func
-def _conflict(env, teacher: In[TeacherState], table: In[TreeTable], cfg: Const[FeaturesConfig]):
-    return ti.Vector([ti.min(teacher.conflict_s[env], cfg.ttc_cap_s)])
+def _conflict(env, io: Bundle[FeaturesIO]):
+    return ti.Vector([ti.min(io.teacher.conflict_s[env], io.features_cfg.ttc_cap_s)])
 
 
 @ti.func
-def _evade_cost(env, teacher: In[TeacherState], table: In[TreeTable], cfg: Const[FeaturesConfig]):
-    return ti.Vector([ti.select(_leaf(env, teacher, table) == codes.EVADE, teacher.evade_cost[env], 0.0)])
+def _evade_cost(env, io: Bundle[FeaturesIO]):
+    return ti.Vector([ti.select(_leaf(env, io) == codes.EVADE, io.teacher.evade_cost[env], 0.0)])
 
 
 @ti.func
-def _class(env, teacher: In[TeacherState], table: In[TreeTable], cfg: Const[FeaturesConfig]):
-    leaf = _leaf(env, teacher, table)
+def _class(env, io: Bundle[FeaturesIO]):
+    leaf = _leaf(env, io)
     out = ti.Vector([0.0] * N_CLASS)
     for i, leaves in ti.static(enumerate(CLASSES)):
         for code in ti.static(leaves):

@@ -45,13 +45,13 @@ def point_left(route: In[RouteState], env, first, left_m):
 
 
 @ti.func
-def advanced_arc(route: In[RouteState], env, pos_w, cfg: Const[RouteConfig]):
+def advanced_arc(route: In[RouteState], env, pos_w, route_cfg: Const[RouteConfig]):
     """Foot of the vehicle: the nearest point of the route from the last foot on, within progress_window_m. It never moves back."""
     arc = route.arc[env]
     first = segment_of(route, env, arc)
     nearest = (pos_w - foot_of(route, env, arc)).norm_sqr()
     out, i = arc, first
-    while i < route.n_way[env] - 1 and route.way_left_m[env, first] - route.way_left_m[env, i] <= ti.static(cfg.progress_window_m):
+    while i < route.n_way[env] - 1 and route.way_left_m[env, first] - route.way_left_m[env, i] <= ti.static(route_cfg.progress_window_m):
         a, along = route.way_w[env, i], route.way_w[env, i + 1] - route.way_w[env, i]
         share = ti.math.clamp((pos_w - a).dot(along) / ti.max(along.norm_sqr(), 1e-12), 0.0, 1.0)
         if i == first:
@@ -64,13 +64,13 @@ def advanced_arc(route: In[RouteState], env, pos_w, cfg: Const[RouteConfig]):
 
 
 @ti.func
-def look_along(route: Out[RouteState], env, pos_w, cfg: Const[RouteConfig], mapping_cfg: Const[MappingConfig]):
+def look_along(route: Out[RouteState], env, pos_w, route_cfg: Const[RouteConfig], mapping_cfg: Const[MappingConfig]):
     """Fill ``ahead_w``: points of the route one cell apart, from the foot to risk_horizon_m ahead or the goal. No route: own place."""
     route.ahead_w[env, 0] = pos_w
     route.n_ahead[env] = 1
     if route.n_way[env] > 0:
         left = left_of_foot(route, env)
-        length = ti.min(left, ti.static(cfg.risk_horizon_m))
+        length = ti.min(left, ti.static(route_cfg.risk_horizon_m))
         count = ti.cast(ti.ceil(length / ti.static(mapping_cfg.cell_m) - 1e-3), ti.i32) + 1
         route.n_ahead[env] = ti.min(count, ti.static(route.ahead_w.shape[1]))
         i = segment_of(route, env, route.arc[env])

@@ -7,10 +7,10 @@ Positions here are in cells, (col, row) = (x, y) from the grid's outer corner. T
 import taichi as ti
 
 from uuvtai.kernels.core.geometry import FAR_M
-from uuvtai.kernels.core.signature import In, Out
+from uuvtai.kernels.core.signature import Bundle
+from uuvtai.kernels.planning.bundles import VoronoiIO
 from uuvtai.kernels.planning.medial import next_direction, step_of
 from uuvtai.kernels.planning.polyline import count_after_segment
-from uuvtai.state import RouteState, VoronoiState
 
 STRIDE = 4
 """A chord may begin and end at every fourth cell of the path."""
@@ -26,7 +26,7 @@ _GAIN = 1.0e-4
 
 
 @ti.func
-def chord_cost(voronoi: In[VoronoiState], slot, a, b, bound):
+def chord_cost(slot, a, b, bound, io: Bundle[VoronoiIO]):
     """Cost [cells / m] of the straight line a to b, cell by cell; FAR_M where it leaves the traversable cells or exceeds ``bound``."""
     along = b - a
     length = along.norm()
@@ -42,7 +42,7 @@ def chord_cost(voronoi: In[VoronoiState], slot, a, b, bound):
         to_row = ti.select(step_row > 0, row + 1.0 - a[1], a[1] - row) * per_row
     near_corner = _CORNER / ti.max(length, 1e-9)
     cost, at, open_cells = 0.0, 0.0, 1
-    weight = voronoi.weight[slot, row, col]
+    weight = io.voronoi.weight[slot, row, col]
     walking = ti.cast(weight > 0, ti.i32)
     open_cells = walking
     while walking == 1:
@@ -54,7 +54,7 @@ def chord_cost(voronoi: In[VoronoiState], slot, a, b, bound):
             walking = 0
         else:
             at_corner = ti.abs(to_col - to_row) < near_corner
-            if at_corner and (voronoi.weight[slot, row + step_row, col] <= 0 or voronoi.weight[slot, row, col + step_col] <= 0):
+            if at_corner and (io.voronoi.weight[slot, row + step_row, col] <= 0 or io.voronoi.weight[slot, row, col + step_col] <= 0):
                 open_cells = 0
             if to_col <= to_row:
                 col += step_col
@@ -62,7 +62,7 @@ def chord_cost(voronoi: In[VoronoiState], slot, a, b, bound):
             else:
                 row += step_row
                 to_row += per_row
-            weight = voronoi.weight[slot, row, col]
+            weight = io.voronoi.weight[slot, row, col]
             if weight <= 0:
                 open_cells = 0
             if open_cells == 0 or cost > bound:
@@ -71,82 +71,82 @@ def chord_cost(voronoi: In[VoronoiState], slot, a, b, bound):
 
 
 @ti.func
-def path_cells(voronoi: Out[VoronoiState], slot, start, goal):
+def path_cells(slot, start, goal, io: Bundle[VoronoiIO]):
     """Write the cells from start to goal; returns how many (at least 2: both ends may be the same cell), 0 where they do not fit."""
-    n_col, room = ti.static(voronoi.cost.shape[2], voronoi.path_cell.shape[1])
+    n_col, room = ti.static(io.voronoi.cost.shape[2], io.voronoi.path_cell.shape[1])
     row, col = start[0], start[1]
-    voronoi.path_cell[slot, 0] = row * n_col + col
+    io.voronoi.path_cell[slot, 0] = row * n_col + col
     count = 1
     while (row != goal[0] or col != goal[1]) and count < room:
-        step = step_of(next_direction(voronoi, slot, row, col))
+        step = step_of(next_direction(slot, row, col, io))
         row += step[0]
         col += step[1]
-        voronoi.path_cell[slot, count] = row * n_col + col
+        io.voronoi.path_cell[slot, count] = row * n_col + col
         count += 1
     if row != goal[0] or col != goal[1]:
         count = 0
     elif count == 1:
-        voronoi.path_cell[slot, 1] = row * n_col + col
+        io.voronoi.path_cell[slot, 1] = row * n_col + col
         count = 2
     return count
 
 
 @ti.func
-def _point(voronoi: In[VoronoiState], slot, i, n_cell, start_at, goal_at):
+def _point(slot, i, n_cell, start_at, goal_at, io: Bundle[VoronoiIO]):
     """Position of the path's i-th cell: its centre, but the ends lie where the vehicle and the goal are."""
-    n_col = ti.static(voronoi.cost.shape[2])
-    cell = voronoi.path_cell[slot, i]
+    n_col = ti.static(io.voronoi.cost.shape[2])
+    cell = io.voronoi.path_cell[slot, i]
     centre = ti.Vector([cell % n_col + 0.5, cell // n_col + 0.5])
     return ti.select(i == 0, start_at, ti.select(i == n_cell - 1, goal_at, centre))
 
 
 @ti.func
-def _cost_to_go(voronoi: In[VoronoiState], slot, i):
-    n_col = ti.static(voronoi.cost.shape[2])
-    cell = voronoi.path_cell[slot, i]
-    return voronoi.cost[slot, cell // n_col, cell % n_col]
+def _cost_to_go(slot, i, io: Bundle[VoronoiIO]):
+    n_col = ti.static(io.voronoi.cost.shape[2])
+    cell = io.voronoi.path_cell[slot, i]
+    return io.voronoi.cost[slot, cell // n_col, cell % n_col]
 
 
 @ti.func
-def _cells_cost(voronoi: In[VoronoiState], slot, i, j, n_cell, start_at, goal_at):
+def _cells_cost(slot, i, j, n_cell, start_at, goal_at, io: Bundle[VoronoiIO]):
     """Cost of going along the cells from path index i to j. At the ends the way to the cell's centre is added: an upper bound."""
-    cost = _cost_to_go(voronoi, slot, i) - _cost_to_go(voronoi, slot, j)
+    cost = _cost_to_go(slot, i, io) - _cost_to_go(slot, j, io)
     if i == 0:
-        cost += _detour(voronoi, slot, start_at)
+        cost += _detour(slot, start_at, io)
     if j == n_cell - 1:
-        cost += _detour(voronoi, slot, goal_at)
+        cost += _detour(slot, goal_at, io)
     return cost
 
 
 @ti.func
-def _detour(voronoi: In[VoronoiState], slot, at):
+def _detour(slot, at, io: Bundle[VoronoiIO]):
     row, col = ti.cast(ti.floor(at[1]), ti.i32), ti.cast(ti.floor(at[0]), ti.i32)
-    return (at - ti.Vector([col + 0.5, row + 0.5])).norm() * voronoi.weight[slot, row, col]
+    return (at - ti.Vector([col + 0.5, row + 0.5])).norm() * io.voronoi.weight[slot, row, col]
 
 
 @ti.func
-def straightened_cost(voronoi: Out[VoronoiState], slot, n_cell, start_at, goal_at):
+def straightened_cost(slot, n_cell, start_at, goal_at, io: Bundle[VoronoiIO]):
     """Choose for every node of the path (every fourth cell) the best continuation by dynamic programming from the goal; total cost."""
     last = (n_cell - 2) // STRIDE + 1
-    voronoi.node_cost[slot, last] = 0.0
+    io.voronoi.node_cost[slot, last] = 0.0
     for back in range(last):
         node = last - 1 - back
         i = node * STRIDE
-        here = _point(voronoi, slot, i, n_cell, start_at, goal_at)
+        here = _point(slot, i, n_cell, start_at, goal_at, io)
         j = ti.min(i + STRIDE, n_cell - 1)
-        best = (1.0 + _GAIN) * _cells_cost(voronoi, slot, i, j, n_cell, start_at, goal_at) + voronoi.node_cost[slot, node + 1]
+        best = (1.0 + _GAIN) * _cells_cost(slot, i, j, n_cell, start_at, goal_at, io) + io.voronoi.node_cost[slot, node + 1]
         chosen, span = 0, 1
         while span > 0:
             k = ti.min((node + span) * STRIDE, n_cell - 1)
-            there = _point(voronoi, slot, k, n_cell, start_at, goal_at)
-            rest = voronoi.node_cost[slot, node + span]
-            total = rest + chord_cost(voronoi, slot, here, there, best - rest)
+            there = _point(slot, k, n_cell, start_at, goal_at, io)
+            rest = io.voronoi.node_cost[slot, node + span]
+            total = rest + chord_cost(slot, here, there, best - rest, io)
             if total <= best:
                 best, chosen = total, span
             span = _next_span(span, last - node)
-        voronoi.node_cost[slot, node] = best
-        voronoi.node_next[slot, node] = chosen
-    return voronoi.node_cost[slot, 0]
+        io.voronoi.node_cost[slot, node] = best
+        io.voronoi.node_next[slot, node] = chosen
+    return io.voronoi.node_cost[slot, 0]
 
 
 @ti.func
@@ -157,24 +157,22 @@ def _next_span(span, longest):
 
 
 @ti.func
-def count_of_waypoints(
-    route: Out[RouteState], voronoi: In[VoronoiState], slot, env, n_cell, start_at, goal_at, origin, cell_m, spacing, write
-):
+def count_of_waypoints(slot, env, n_cell, start_at, goal_at, origin, cell_m, spacing, write, io: Bundle[VoronoiIO]):
     """Go along the chosen chords and cells; returns the number of waypoints, and writes them where ``write`` is 1."""
     last = (n_cell - 2) // STRIDE + 1
     at = origin + start_at * cell_m
     if write == 1:
-        route.way_w[env, 0] = at
+        io.route.way_w[env, 0] = at
     count, node = 1, 0
     while node < last:
-        span = voronoi.node_next[slot, node]
+        span = io.voronoi.node_next[slot, node]
         i = node * STRIDE
         j = ti.min((node + ti.max(span, 1)) * STRIDE, n_cell - 1)
         i = ti.select(span > 0, j - 1, i)  # a chord goes to its end at once, otherwise cell by cell
         while i < j:
             i += 1
-            to = origin + _point(voronoi, slot, i, n_cell, start_at, goal_at) * cell_m
-            count = count_after_segment(route, env, count, at, to, spacing, write)
+            to = origin + _point(slot, i, n_cell, start_at, goal_at, io) * cell_m
+            count = count_after_segment(io.route, env, count, at, to, spacing, write)
             at = to
         node += ti.max(span, 1)
     return count

@@ -21,11 +21,10 @@ import math
 
 import taichi as ti
 
-from uuvtai.config import ClearanceConfig, MappingConfig, VoronoiConfig
 from uuvtai.kernels.core.bits import WORD, highest_bit, lowest_bit, put_bit, without_lowest
 from uuvtai.kernels.core.lanes import LANES, i16x
-from uuvtai.kernels.core.signature import Const, In, Out, quick_launch, spread
-from uuvtai.state import ClearanceMemory, ClearanceState, ClockState, GridMask, MapState
+from uuvtai.kernels.core.signature import Bundle, Const, In, quick_launch, spread
+from uuvtai.kernels.planning.bundles import ClearanceIO
 
 _FAR_COLS = 1 << 12
 """[cells] stands for "no site in this row"; its square fits an int32."""
@@ -64,69 +63,67 @@ def no_site(cfg, mapping):
 
 
 @ti.func
-def site_word(env, row, word, grid_map: In[MapState], mask: In[GridMask], voronoi: Const[VoronoiConfig]):
+def site_word(env, row, word, io: Bundle[ClearanceIO]):
     """Cells that are occupied or outside the tank."""
-    sites = grid_map.static_occupied[env, row, word] | mask.outside_bits[row, word]
-    if ti.static(voronoi.use == "fused"):
-        sites |= grid_map.dynamic_occupied[env, row, word]
+    sites = io.grid_map.static_occupied[env, row, word] | io.mask.outside_bits[row, word]
+    if ti.static(io.voronoi_cfg.use == "fused"):
+        sites |= io.grid_map.dynamic_occupied[env, row, word]
     return sites
 
 
 @ti.func
-def take_sites(
-    env, slot, limit: Const[int], memory: Out[ClearanceMemory], grid_map: In[MapState], mask: In[GridMask], voronoi: Const[VoronoiConfig]
-):
+def take_sites(env, slot, limit: Const[int], io: Bundle[ClearanceIO]):
     """Read the sites, and mark the packets that those which changed may concern; how many changed."""
-    n_row, n_word = ti.static(memory.sites.shape[1:])
-    known = memory.limit[env] == limit
+    n_row, n_word = ti.static(io.clearance_memory.sites.shape[1:])
+    known = io.clearance_memory.limit[env] == limit
     changed = ti.select(known, 0, _MAX_CHANGES + 1)
     for row in range(n_row):
         for word in range(n_word):
-            sites = site_word(env, row, word, grid_map, mask, voronoi)
-            different = sites ^ memory.sites[env, row, word]
+            sites = site_word(env, row, word, io)
+            different = sites ^ io.clearance_memory.sites[env, row, word]
             if different != 0:
-                memory.sites[env, row, word] = sites
+                io.clearance_memory.sites[env, row, word] = sites
                 while different != 0 and changed <= _MAX_CHANGES:
-                    mark_stale(env, slot, row, word * WORD + lowest_bit(different), limit, memory)
+                    mark_stale(env, slot, row, word * WORD + lowest_bit(different), limit, io)
                     different = without_lowest(different)
                     changed += 1
-    memory.limit[env] = limit
+    io.clearance_memory.limit[env] = limit
     return changed
 
 
 @ti.func
-def mark_stale(env, slot, site_row, site_col, limit: Const[int], memory: Out[ClearanceMemory]):
+def mark_stale(env, slot, site_row, site_col, limit: Const[int], io: Bundle[ClearanceIO]):
     """Mark the packets that a changed site may concern: it lies no farther from them than the farthest of their sites."""
-    n_row, n_packet = ti.static(memory.farthest.shape[1:])
+    n_row, n_packet = ti.static(io.clearance_memory.farthest.shape[1:])
     reach = ti.static(math.isqrt(limit))
     for packet in range(ti.max(site_col - reach, 0) // LANES, ti.min((site_col + reach) // LANES, n_packet - 1) + 1):
         cols = ti.max(packet * LANES - site_col, site_col - packet * LANES - (LANES - 1), 0)
         for row in range(ti.max(site_row - reach, 0), ti.min(site_row + reach + 1, n_row)):
-            if (row - site_row) ** 2 + cols * cols <= memory.farthest[env, row, packet]:
-                put_bit(memory.stale, slot, packet, row)
+            if (row - site_row) ** 2 + cols * cols <= io.clearance_memory.farthest[env, row, packet]:
+                put_bit(io.clearance_memory.stale, slot, packet, row)
 
 
 # ----------------------------------------------------------------------------------------------------------------------- passes
 
 
 @ti.func
-def next_site(env, row, first_col, memory: In[ClearanceMemory]):
+def next_site(env, row, first_col, io: Bundle[ClearanceIO]):
     """Column of the first site from a column on, far away if there is none."""
-    n_word = ti.static(memory.sites.shape[2])
+    n_word = ti.static(io.clearance_memory.sites.shape[2])
     word = first_col // WORD
     found = ti.cast(0, ti.u64)
     if word < n_word:
-        found = memory.sites[env, row, word] & (~ti.cast(0, ti.u64) << ti.cast(first_col % WORD, ti.u64))
+        found = io.clearance_memory.sites[env, row, word] & (~ti.cast(0, ti.u64) << ti.cast(first_col % WORD, ti.u64))
     while found == 0 and word + 1 < n_word:
         word += 1
-        found = memory.sites[env, row, word]
+        found = io.clearance_memory.sites[env, row, word]
     return ti.select(found != 0, word * WORD + lowest_bit(found), _FAR_COLS)
 
 
 @ti.func
-def row_keys(sites, left_gap, right_gap, cfg: Const[ClearanceConfig], mapping: Const[MappingConfig]):
+def row_keys(sites, left_gap, right_gap, io: Bundle[ClearanceIO]):
     """Keys of the nearest site in the same row for sixteen cells; gaps [cells] lie between their ends and the sites beyond."""
-    reach, bits = ti.static(window_reach(cfg, mapping), offset_bits(cfg, mapping))
+    reach, bits = ti.static(window_reach(io.clearance_cfg, io.mapping_cfg), offset_bits(io.clearance_cfg, io.mapping_cfg))
     to_left, to_right = i16x(0), i16x(0)
     left, right = left_gap - 1, right_gap - 1
     for i in ti.static(range(LANES)):
@@ -139,26 +136,28 @@ def row_keys(sites, left_gap, right_gap, cfg: Const[ClearanceConfig], mapping: C
     for i in ti.static(range(LANES)):
         gap = ti.min(to_left[i], to_right[i])
         key = ((2 * gap * gap + ti.cast(to_right[i] < to_left[i], ti.i32)) << bits) + reach
-        keys[i] = ti.select(gap <= reach, key, ti.static(no_site(cfg, mapping)))
+        keys[i] = ti.select(gap <= reach, key, ti.static(no_site(io.clearance_cfg, io.mapping_cfg)))
     return keys
 
 
 @ti.func
-def scan_row(env, slot, row, memory: Out[ClearanceMemory], cfg: Const[ClearanceConfig], mapping: Const[MappingConfig]):
+def scan_row(env, slot, row, io: Bundle[ClearanceIO]):
     """Keys of the nearest site in the same row, and which packets have one in reach."""
-    n_row, n_packet = ti.static(memory.farthest.shape[1:])
-    reach = ti.static(window_reach(cfg, mapping))
+    n_row, n_packet = ti.static(io.clearance_memory.farthest.shape[1:])
+    reach = ti.static(window_reach(io.clearance_cfg, io.mapping_cfg))
     last = -_FAR_COLS
     for packet in range(n_packet):
         first = packet * LANES
-        sites = ti.cast((memory.sites[env, row, first // WORD] >> ti.cast(first % WORD, ti.u64)) & ti.cast(0xFFFF, ti.u64), ti.i32)
-        left_gap, right_gap = first - last, next_site(env, row, first + LANES, memory) - (first + LANES - 1)
+        sites = ti.cast(
+            (io.clearance_memory.sites[env, row, first // WORD] >> ti.cast(first % WORD, ti.u64)) & ti.cast(0xFFFF, ti.u64), ti.i32
+        )
+        left_gap, right_gap = first - last, next_site(env, row, first + LANES, io) - (first + LANES - 1)
         if sites != 0 or ti.min(left_gap, right_gap) <= reach:
-            memory.row_key[slot, row, packet] = row_keys(sites, left_gap, right_gap, cfg, mapping)
-            put_bit(memory.near_up, slot, packet, row)
-            put_bit(memory.near_down, slot, packet, n_row - 1 - row)
+            io.clearance_memory.row_key[slot, row, packet] = row_keys(sites, left_gap, right_gap, io)
+            put_bit(io.clearance_memory.near_up, slot, packet, row)
+            put_bit(io.clearance_memory.near_down, slot, packet, n_row - 1 - row)
         else:
-            memory.row_key[slot, row, packet] = i16x(ti.static(no_site(cfg, mapping)))
+            io.clearance_memory.row_key[slot, row, packet] = i16x(ti.static(no_site(io.clearance_cfg, io.mapping_cfg)))
         if sites != 0:
             last = first + highest_bit(ti.cast(sites, ti.u64))
 
@@ -175,23 +174,25 @@ def bits_from(words: In[ti.Field], slot, packet, first):
 
 
 @ti.func
-def keys_at(slot, row, packet, offset, memory: In[ClearanceMemory], cfg: Const[ClearanceConfig], mapping: Const[MappingConfig]):
+def keys_at(slot, row, packet, offset, io: Bundle[ClearanceIO]):
     """Keys of the rows ``offset`` below and above; beyond the grid its last row stands in, taken for farther than it is."""
-    last = ti.static(memory.farthest.shape[1] - 1)
-    farther = 2 * offset * offset << ti.static(offset_bits(cfg, mapping))
-    below = memory.row_key[slot, ti.max(row - offset, 0), packet] + (farther - offset)
-    above = memory.row_key[slot, ti.min(row + offset, last), packet] + (farther + offset)
+    last = ti.static(io.clearance_memory.farthest.shape[1] - 1)
+    farther = 2 * offset * offset << ti.static(offset_bits(io.clearance_cfg, io.mapping_cfg))
+    below = io.clearance_memory.row_key[slot, ti.max(row - offset, 0), packet] + (farther - offset)
+    above = io.clearance_memory.row_key[slot, ti.min(row + offset, last), packet] + (farther + offset)
     return below, above
 
 
 @ti.func
-def best_keys(slot, row, packet, memory: In[ClearanceMemory], cfg: Const[ClearanceConfig], mapping: Const[MappingConfig]):
+def best_keys(slot, row, packet, io: Bundle[ClearanceIO]):
     """Smallest keys over the rows with a site, nearest first; it ends where no farther row can be better for any of the sixteen cells."""
-    n_row = ti.static(memory.farthest.shape[1])
-    reach, bits = ti.static(window_reach(cfg, mapping), offset_bits(cfg, mapping))
-    offsets = bits_from(memory.near_up, slot, packet, row) | bits_from(memory.near_down, slot, packet, n_row - 1 - row)
+    n_row = ti.static(io.clearance_memory.farthest.shape[1])
+    reach, bits = ti.static(window_reach(io.clearance_cfg, io.mapping_cfg), offset_bits(io.clearance_cfg, io.mapping_cfg))
+    offsets = bits_from(io.clearance_memory.near_up, slot, packet, row) | bits_from(
+        io.clearance_memory.near_down, slot, packet, n_row - 1 - row
+    )
     offsets &= (ti.cast(2, ti.u64) << ti.cast(reach, ti.u64)) - ti.cast(2, ti.u64)
-    best = memory.row_key[slot, row, packet]
+    best = io.clearance_memory.row_key[slot, row, packet]
     worst = best.max()
     while offsets != 0:
         offset = lowest_bit(offsets)
@@ -199,7 +200,7 @@ def best_keys(slot, row, packet, memory: In[ClearanceMemory], cfg: Const[Clearan
         if 2 * offset * offset << bits > worst:
             offsets = ti.cast(0, ti.u64)
         else:
-            below, above = keys_at(slot, row, packet, offset, memory, cfg, mapping)
+            below, above = keys_at(slot, row, packet, offset, io)
             for i in ti.static(range(LANES)):
                 best[i] = ti.min(best[i], below[i], above[i])
             worst = best.max()
@@ -207,112 +208,88 @@ def best_keys(slot, row, packet, memory: In[ClearanceMemory], cfg: Const[Clearan
 
 
 @ti.func
-def write_packet(
-    env,
-    slot,
-    row,
-    packet,
-    clearance: Out[ClearanceState],
-    memory: Out[ClearanceMemory],
-    mask: In[GridMask],
-    cfg: Const[ClearanceConfig],
-    mapping: Const[MappingConfig],
-):
+def write_packet(env, slot, row, packet, io: Bundle[ClearanceIO]):
     """Distance and site of sixteen cells, decoded from their keys."""
-    reach, bits, limit = ti.static(window_reach(cfg, mapping), offset_bits(cfg, mapping), squared_limit(cfg, mapping))
-    key, worst = best_keys(slot, row, packet, memory, cfg, mapping)
-    memory.farthest[env, row, packet] = worst >> (bits + 1)
+    reach, bits, limit = ti.static(
+        window_reach(io.clearance_cfg, io.mapping_cfg),
+        offset_bits(io.clearance_cfg, io.mapping_cfg),
+        squared_limit(io.clearance_cfg, io.mapping_cfg),
+    )
+    key, worst = best_keys(slot, row, packet, io)
+    io.clearance_memory.farthest[env, row, packet] = worst >> (bits + 1)
     squared = key >> (bits + 1)
     rows = (key & ti.static((1 << bits) - 1)) - reach
     cols = ti.cast(ti.sqrt(ti.cast(squared - rows * rows, ti.f32)), ti.i32)
     signed_cols = cols * (2 * ((key >> bits) & 1) - 1)
     for i in ti.static(range(LANES)):
-        distance = ti.sqrt(ti.cast(squared[i], ti.f32)) * mapping.cell_m
-        clearance.clearance_m[env, row, packet * LANES + i] = ti.select(squared[i] <= limit, distance, cfg.max_m)
+        distance = ti.sqrt(ti.cast(squared[i], ti.f32)) * io.mapping_cfg.cell_m
+        io.clearance.clearance_m[env, row, packet * LANES + i] = ti.select(squared[i] <= limit, distance, io.clearance_cfg.max_m)
     for i in ti.static(range(LANES)):
-        clearance.site_row[env, row, packet * LANES + i] = ti.cast(ti.select(squared[i] <= limit, row + rows[i], -1), ti.i16)
+        io.clearance.site_row[env, row, packet * LANES + i] = ti.cast(ti.select(squared[i] <= limit, row + rows[i], -1), ti.i16)
     for i in ti.static(range(LANES)):
         col = packet * LANES + i + signed_cols[i]
-        clearance.site_col[env, row, packet * LANES + i] = ti.cast(ti.select(squared[i] <= limit, col, -1), ti.i16)
-    if ti.static(cfg.inflate_m > 0):
-        shorten(env, row, packet, clearance, mask, cfg)
+        io.clearance.site_col[env, row, packet * LANES + i] = ti.cast(ti.select(squared[i] <= limit, col, -1), ti.i16)
+    if ti.static(io.clearance_cfg.inflate_m > 0):
+        shorten(env, row, packet, io)
 
 
 @ti.func
-def shorten(env, row, packet, clearance: Out[ClearanceState], mask: In[GridMask], cfg: Const[ClearanceConfig]):
+def shorten(env, row, packet, io: Bundle[ClearanceIO]):
     """Take the inflation off the distances of sixteen cells to obstacles."""
     for col in range(packet * LANES, (packet + 1) * LANES):
-        site_row, site_col = ti.cast(clearance.site_row[env, row, col], ti.i32), ti.cast(clearance.site_col[env, row, col], ti.i32)
-        if site_row >= 0 and mask.outside[site_row, site_col] == 0:
-            clearance.clearance_m[env, row, col] = ti.max(clearance.clearance_m[env, row, col] - cfg.inflate_m, 0.0)
+        site_row, site_col = ti.cast(io.clearance.site_row[env, row, col], ti.i32), ti.cast(io.clearance.site_col[env, row, col], ti.i32)
+        if site_row >= 0 and io.mask.outside[site_row, site_col] == 0:
+            io.clearance.clearance_m[env, row, col] = ti.max(io.clearance.clearance_m[env, row, col] - io.clearance_cfg.inflate_m, 0.0)
 
 
 # ----------------------------------------------------------------------------------------------------------------------- kernel
 
 
 @ti.func
-def transform(
-    env,
-    slot,
-    changed,
-    clearance: Out[ClearanceState],
-    memory: Out[ClearanceMemory],
-    mask: In[GridMask],
-    cfg: Const[ClearanceConfig],
-    mapping: Const[MappingConfig],
-):
+def transform(env, slot, changed, io: Bundle[ClearanceIO]):
     """Both passes for an env, over everything or over what is stale; the marks are used up."""
-    n_row, n_packet = ti.static(memory.farthest.shape[1:])
+    n_row, n_packet = ti.static(io.clearance_memory.farthest.shape[1:])
     for packet in range(n_packet):
-        for word in range(ti.static(memory.near_up.shape[2])):
-            memory.near_up[slot, packet, word] = ti.cast(0, ti.u64)
-            memory.near_down[slot, packet, word] = ti.cast(0, ti.u64)
+        for word in range(ti.static(io.clearance_memory.near_up.shape[2])):
+            io.clearance_memory.near_up[slot, packet, word] = ti.cast(0, ti.u64)
+            io.clearance_memory.near_down[slot, packet, word] = ti.cast(0, ti.u64)
     for row in range(n_row):
-        scan_row(env, slot, row, memory, cfg, mapping)
+        scan_row(env, slot, row, io)
     for packet in range(n_packet):
-        for word in range(ti.static(memory.stale.shape[2])):
-            rows = ti.select(changed > _MAX_CHANGES, ~ti.cast(0, ti.u64), memory.stale[slot, packet, word])
-            memory.stale[slot, packet, word] = ti.cast(0, ti.u64)
+        for word in range(ti.static(io.clearance_memory.stale.shape[2])):
+            rows = ti.select(changed > _MAX_CHANGES, ~ti.cast(0, ti.u64), io.clearance_memory.stale[slot, packet, word])
+            io.clearance_memory.stale[slot, packet, word] = ti.cast(0, ti.u64)
             while rows != 0:
                 row = word * WORD + lowest_bit(rows)
                 rows = without_lowest(rows)
                 if row < n_row:
-                    write_packet(env, slot, row, packet, clearance, memory, mask, cfg, mapping)
+                    write_packet(env, slot, row, packet, io)
 
 
 @ti.func
-def is_due(env, clock: In[ClockState], cfg: Const[ClearanceConfig]):
+def is_due(env, io: Bundle[ClearanceIO]):
     """1 where the clearance is computed in this step."""
-    return ti.cast(clock.awake[env] == 1 and clock.step[env] % cfg.period_steps == 0, ti.i32)
+    return ti.cast(io.clock.awake[env] == 1 and io.clock.step[env] % io.clearance_cfg.period_steps == 0, ti.i32)
 
 
 @quick_launch
 @ti.kernel
-def compute_clearance(
-    clearance: Out[ClearanceState],
-    memory: Out[ClearanceMemory],
-    grid_map: In[MapState],
-    mask: In[GridMask],
-    clock: In[ClockState],
-    cfg: Const[ClearanceConfig],
-    mapping: Const[MappingConfig],
-    voronoi: Const[VoronoiConfig],
-):
+def compute_clearance(io: Bundle[ClearanceIO]):
     """Clearance of every cell from the layer that the planner must avoid (``voronoi.use``), where it is due."""
-    n_env, n_slot = ti.static(clock.awake.shape[0], memory.row_key.shape[0])
+    n_env, n_slot = ti.static(io.clock.awake.shape[0], io.clearance_memory.row_key.shape[0])
     for slot, pad in ti.ndrange(n_slot, ti.static(spread(n_slot))):
         if pad == 0:
             for env in range(slot * n_env // n_slot, (slot + 1) * n_env // n_slot):
-                if clock.awake[env] == 1:
-                    clearance.fresh[env] = is_due(env, clock, cfg)
-                if is_due(env, clock, cfg) == 1:
-                    changed = take_sites(env, slot, ti.static(squared_limit(cfg, mapping)), memory, grid_map, mask, voronoi)
+                if io.clock.awake[env] == 1:
+                    io.clearance.fresh[env] = is_due(env, io)
+                if is_due(env, io) == 1:
+                    changed = take_sites(env, slot, ti.static(squared_limit(io.clearance_cfg, io.mapping_cfg)), io)
                     if changed > 0:
-                        transform(env, slot, changed, clearance, memory, mask, cfg, mapping)
+                        transform(env, slot, changed, io)
 
 
 @ti.kernel
-def forget_clearance(memory: Out[ClearanceMemory]):
+def forget_clearance(io: Bundle[ClearanceIO]):
     """Have everything computed anew, as after the start."""
-    for env in range(ti.static(memory.limit.shape[0])):
-        memory.limit[env] = 0
+    for env in range(ti.static(io.clearance_memory.limit.shape[0])):
+        io.clearance_memory.limit[env] = 0

@@ -5,71 +5,44 @@
 
 import taichi as ti
 
-from uuvtai.config import EpisodeConfig, FeaturesConfig, ForecastConfig, SonarConfig, TankConfig, TrackingConfig
+from uuvtai.config import FeaturesConfig
 from uuvtai.kernels.core.columns import Column
 from uuvtai.kernels.core.geometry import FAR_M, TWO_PI, quaternion_wb, rotation_wb
-from uuvtai.kernels.core.signature import Const, In, Out, quick_launch, spread
+from uuvtai.kernels.core.signature import Bundle, FloatMatrix, quick_launch, spread
 from uuvtai.kernels.planning.advice import TEACHER_COLUMNS
 from uuvtai.kernels.planning.approach import BODY_COLUMNS, body_values, closest_approach, next_body
-from uuvtai.state import (
-    ClockState,
-    FeatureState,
-    ForecastState,
-    MissionState,
-    Proprioception,
-    RouteState,
-    SonarScan,
-    TeacherState,
-    TrackState,
-    TreeTable,
-)
+from uuvtai.kernels.planning.bundles import FeaturesIO
 
 
 @quick_launch
 @ti.kernel
-def sense_sectors(
-    features: Out[FeatureState],
-    scan: In[SonarScan],
-    ego: In[Proprioception],
-    clock: In[ClockState],
-    features_cfg: Const[FeaturesConfig],
-    sonar_cfg: Const[SonarConfig],
-):
+def sense_sectors(io: Bundle[FeaturesIO]):
     """Sector s is centred at s * 360 / n_sector degrees from ahead, counter-clockwise. One work item per sector."""
-    n, n_sector = ti.static(features.sector_range_m.shape[0], features.sector_range_m.shape[1])
+    n, n_sector = ti.static(io.features.sector_range_m.shape[0], io.features.sector_range_m.shape[1])
     for env, sector in ti.ndrange(n, n_sector):
-        if clock.awake[env] == 1:
-            first, last = sector_beams(sector, ego.rpy[env][2] - scan.ping_yaw[env], n_sector, ti.static(scan.range_m.shape[1]))
-            _summarise(env, sector, first, last, features, scan, features_cfg, sonar_cfg)
+        if io.clock.awake[env] == 1:
+            first, last = sector_beams(sector, io.ego.rpy[env][2] - io.scan.ping_yaw[env], n_sector, ti.static(io.scan.range_m.shape[1]))
+            _summarise(env, sector, first, last, io)
 
 
 @ti.func
-def _summarise(
-    env,
-    sector,
-    first,
-    last,
-    features: Out[FeatureState],
-    scan: In[SonarScan],
-    features_cfg: Const[FeaturesConfig],
-    sonar_cfg: Const[SonarConfig],
-):
+def _summarise(env, sector, first, last, io: Bundle[FeaturesIO]):
     """Doppler already holds the own motion, so a beam's time to collision is its range over its closing speed."""
-    n_ray = ti.static(scan.range_m.shape[1])
-    nearest, ttc, closing, hits = 0.0 + sonar_cfg.max_range_m, 0.0 + features_cfg.ttc_cap_s, -FAR_M, 0
+    n_ray = ti.static(io.scan.range_m.shape[1])
+    nearest, ttc, closing, hits = 0.0 + io.sonar_cfg.max_range_m, 0.0 + io.features_cfg.ttc_cap_s, -FAR_M, 0
     begin = first % n_ray
     for i in range(last - first):  # no branches: signs of noisy rates cannot be predicted
         beam = begin + i
         beam -= ti.select(beam >= n_ray, n_ray, 0)
-        hit, gap, rate = scan.hit[env, beam] == 1, scan.range_m[env, beam], -scan.doppler_m_s[env, beam]
+        hit, gap, rate = io.scan.hit[env, beam] == 1, io.scan.range_m[env, beam], -io.scan.doppler_m_s[env, beam]
         hits += ti.cast(hit, ti.i32)
         closing = ti.max(closing, ti.select(hit, rate, -FAR_M))
-        nearest = ti.min(nearest, ti.select(hit, gap, sonar_cfg.max_range_m))
-        ttc = ti.min(ttc, ti.select(hit & (rate > 0.0), gap / rate, features_cfg.ttc_cap_s))
-    features.sector_range_m[env, sector] = nearest
-    features.sector_ttc_s[env, sector] = ttc
-    features.sector_closing_m_s[env, sector] = ti.select(hits > 0, closing, 0.0)
-    features.sector_valid[env, sector] = ti.cast(hits > 0, ti.i32)
+        nearest = ti.min(nearest, ti.select(hit, gap, io.sonar_cfg.max_range_m))
+        ttc = ti.min(ttc, ti.select(hit & (rate > 0.0), gap / rate, io.features_cfg.ttc_cap_s))
+    io.features.sector_range_m[env, sector] = nearest
+    io.features.sector_ttc_s[env, sector] = ttc
+    io.features.sector_closing_m_s[env, sector] = ti.select(hits > 0, closing, 0.0)
+    io.features.sector_valid[env, sector] = ti.cast(hits > 0, ti.i32)
 
 
 @ti.func
@@ -92,73 +65,73 @@ def _in_body(vector_w, rpy):
 
 
 @ti.func
-def _goal(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
-    return _in_body(mission.goal_w[env] - ego.pos_w[env], ego.rpy[env])
+def _goal(env, io: Bundle[FeaturesIO]):
+    return _in_body(io.mission.goal_w[env] - io.ego.pos_w[env], io.ego.rpy[env])
 
 
 @ti.func
-def _heading_error(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
-    return ti.Vector([ti.sin(route.heading_error[env]), ti.cos(route.heading_error[env])])
+def _heading_error(env, io: Bundle[FeaturesIO]):
+    return ti.Vector([ti.sin(io.route.heading_error[env]), ti.cos(io.route.heading_error[env])])
 
 
 @ti.func
-def _velocity(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
-    return ego.vel_b[env]
+def _velocity(env, io: Bundle[FeaturesIO]):
+    return io.ego.vel_b[env]
 
 
 @ti.func
-def _yaw_rate(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
-    return ti.Vector([ego.rate_b[env][2]])
+def _yaw_rate(env, io: Bundle[FeaturesIO]):
+    return ti.Vector([io.ego.rate_b[env][2]])
 
 
 @ti.func
-def _depth(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
-    return ti.Vector([ego.depth_m[env]])
+def _depth(env, io: Bundle[FeaturesIO]):
+    return ti.Vector([io.ego.depth_m[env]])
 
 
 @ti.func
-def _tilt(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
-    return ti.Vector([ego.rpy[env][0], ego.rpy[env][1]])
+def _tilt(env, io: Bundle[FeaturesIO]):
+    return ti.Vector([io.ego.rpy[env][0], io.ego.rpy[env][1]])
 
 
 @ti.func
-def _lookahead(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
-    return _in_body(route.lookahead_w[env] - ego.pos_w[env], ego.rpy[env])
+def _lookahead(env, io: Bundle[FeaturesIO]):
+    return _in_body(io.route.lookahead_w[env] - io.ego.pos_w[env], io.ego.rpy[env])
 
 
 @ti.func
-def _cross_track(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
-    return ti.Vector([route.cross_track_m[env]])
+def _cross_track(env, io: Bundle[FeaturesIO]):
+    return ti.Vector([io.route.cross_track_m[env]])
 
 
 @ti.func
-def _remaining(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
-    return ti.Vector([route.remaining_m[env]])
+def _remaining(env, io: Bundle[FeaturesIO]):
+    return ti.Vector([io.route.remaining_m[env]])
 
 
 @ti.func
-def _path_risk(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
-    return ti.Vector([route.path_risk[env]])
+def _path_risk(env, io: Bundle[FeaturesIO]):
+    return ti.Vector([io.route.path_risk[env]])
 
 
 @ti.func
-def _tilt_rate(env, route: In[RouteState], ego: In[Proprioception], mission: In[MissionState]):
-    return ti.Vector([ego.rate_b[env][0], ego.rate_b[env][1]])
+def _tilt_rate(env, io: Bundle[FeaturesIO]):
+    return ti.Vector([io.ego.rate_b[env][0], io.ego.rate_b[env][1]])
 
 
 @ti.func
-def _sector_range(env, sector, features: In[FeatureState]):
-    return features.sector_range_m[env, sector]
+def _sector_range(env, sector, io: Bundle[FeaturesIO]):
+    return io.features.sector_range_m[env, sector]
 
 
 @ti.func
-def _sector_ttc(env, sector, features: In[FeatureState]):
-    return features.sector_ttc_s[env, sector]
+def _sector_ttc(env, sector, io: Bundle[FeaturesIO]):
+    return io.features.sector_ttc_s[env, sector]
 
 
 @ti.func
-def _sector_closing(env, sector, features: In[FeatureState]):
-    return features.sector_closing_m_s[env, sector]
+def _sector_closing(env, sector, io: Bundle[FeaturesIO]):
+    return io.features.sector_closing_m_s[env, sector]
 
 
 COLUMNS = (
@@ -221,80 +194,54 @@ _OWN_COLUMNS = tuple(column for column in COLUMNS if not column.per)
 
 @quick_launch
 @ti.kernel
-def write_observation(
-    obs: ti.types.ndarray(dtype=ti.f32, ndim=2),  # type: ignore[valid-type]
-    features: In[FeatureState],
-    route: In[RouteState],
-    ego: In[Proprioception],
-    mission: In[MissionState],
-    clock: In[ClockState],
-    features_cfg: Const[FeaturesConfig],
-):
+def write_observation(io: Bundle[FeaturesIO], obs: FloatMatrix):
     """Observation (n_env, n_obs) of the awake rows, raw SI units, in the order of ``COLUMNS``."""
-    n, n_sector = ti.static(features.sector_range_m.shape[0], features.sector_range_m.shape[1])
+    n, n_sector = ti.static(io.features.sector_range_m.shape[0], io.features.sector_range_m.shape[1])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and clock.awake[env] == 1:
-            for source, first, width in ti.static(_sources(_OWN_COLUMNS, features_cfg)):
-                value = source(env, route, ego, mission)
+        if pad == 0 and io.clock.awake[env] == 1:
+            for source, first, width in ti.static(_sources(_OWN_COLUMNS, io.features_cfg)):
+                value = source(env, io)
                 for i in ti.static(range(width)):
                     obs[env, first + i] = ti.cast(value[i], ti.f32)
             for sector in range(n_sector):
-                for source, first, _width in ti.static(_sources(_SECTOR_COLUMNS, features_cfg)):
-                    obs[env, first + sector] = ti.cast(source(env, sector, features), ti.f32)
+                for source, first, _width in ti.static(_sources(_SECTOR_COLUMNS, io.features_cfg)):
+                    obs[env, first + sector] = ti.cast(source(env, sector, io), ti.f32)
 
 
 @quick_launch
 @ti.kernel
-def write_bodies(
-    obs: ti.types.ndarray(dtype=ti.f32, ndim=2),  # type: ignore[valid-type]
-    features: Out[FeatureState],
-    forecast: In[ForecastState],
-    tracks: In[TrackState],
-    ego: In[Proprioception],
-    clock: In[ClockState],
-    features_cfg: Const[FeaturesConfig],
-    forecast_cfg: Const[ForecastConfig],
-    tracking: Const[TrackingConfig],
-    tank: Const[TankConfig],
-    rules: Const[EpisodeConfig],
-):
+def write_bodies(io: Bundle[FeaturesIO], obs: FloatMatrix):
     """Columns of the ``n_track`` moving bodies that come closest to the awake rows, in the order of ``BODY_COLUMNS``."""
-    n, n_track = ti.static(tracks.alive.shape[0], tracks.alive.shape[1])
+    n, n_track = ti.static(io.tracks.alive.shape[0], io.tracks.alive.shape[1])
     for env, track in ti.ndrange(n, n_track):
-        if clock.awake[env] == 1:
-            features.closest_m[env, track] = FAR_M
-            if forecast.radius_m[env, track, 0] >= 0.0:
-                gap, time = closest_approach(env, track, forecast, ego, tracking)
-                features.closest_m[env, track], features.closest_s[env, track] = gap, time
+        if io.clock.awake[env] == 1:
+            io.features.closest_m[env, track] = FAR_M
+            if io.forecast.radius_m[env, track, 0] >= 0.0:
+                gap, time = closest_approach(env, track, io)
+                io.features.closest_m[env, track], io.features.closest_s[env, track] = gap, time
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and clock.awake[env] == 1:
+        if pad == 0 and io.clock.awake[env] == 1:
             track, used = -1, 1
-            for slot in range(ti.static(features_cfg.n_track)):
+            for slot in range(ti.static(io.features_cfg.n_track)):
                 if used == 1:
-                    track = next_body(env, track, features)
+                    track = next_body(env, track, io)
                     used = ti.cast(track >= 0, ti.i32)
                 value = ti.Vector.zero(ti.f32, ti.static(_BODY_WIDTH))
                 if used == 1:
-                    value = body_values(env, track, features, forecast, tracks, ego, clock, forecast_cfg, tracking, tank, rules)
-                for at, first, width in ti.static(_body_places(features_cfg)):
+                    value = body_values(env, track, io)
+                for at, first, width in ti.static(_body_places(io.features_cfg)):
                     for i in ti.static(range(width)):
                         obs[env, first + slot * width + i] = ti.cast(value[at + i], ti.f32)
 
 
 @quick_launch
 @ti.kernel
-def write_advice(
-    obs: ti.types.ndarray(dtype=ti.f32, ndim=2),  # type: ignore[valid-type]
-    teacher: In[TeacherState],
-    table: In[TreeTable],
-    clock: In[ClockState],
-    features_cfg: Const[FeaturesConfig],
-):
+def write_advice(io: Bundle[FeaturesIO], obs: FloatMatrix):
     """Columns of what the behaviour tree does now in the awake rows, in the order of ``TEACHER_COLUMNS``."""
-    n = ti.static(clock.awake.shape[0])
+    n = ti.static(io.clock.awake.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and clock.awake[env] == 1:
-            for source, first, width in ti.static(_sources(TEACHER_COLUMNS, features_cfg)):
-                value = source(env, teacher, table, features_cfg)
+        if pad == 0 and io.clock.awake[env] == 1:
+            for source, first, width in ti.static(_sources(TEACHER_COLUMNS, io.features_cfg)):
+                value = source(env, io)
                 for i in ti.static(range(width)):
                     obs[env, first + i] = ti.cast(value[i], ti.f32)

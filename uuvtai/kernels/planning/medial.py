@@ -7,10 +7,9 @@ plateaus that belong to the skeleton. Neighbours are the eight around a cell; a 
 
 import taichi as ti
 
-from uuvtai.config import ClearanceConfig, VoronoiConfig
 from uuvtai.kernels.core.heap import heap_after_pop, heap_after_push, top_cell
-from uuvtai.kernels.core.signature import Const, In, Out
-from uuvtai.state import ClearanceState, VoronoiState
+from uuvtai.kernels.core.signature import Bundle
+from uuvtai.kernels.planning.bundles import VoronoiIO
 
 # bits of VoronoiState.cell; bits 4 to 6 hold the direction of the next cell towards the goal
 KNOWN = 1
@@ -44,101 +43,83 @@ def step_of(direction):
 
 
 @ti.func
-def bits_at(voronoi: In[VoronoiState], slot, row, col):
-    return ti.cast(voronoi.cell[slot, row, col], ti.i32)
+def bits_at(slot, row, col, io: Bundle[VoronoiIO]):
+    return ti.cast(io.voronoi.cell[slot, row, col], ti.i32)
 
 
 @ti.func
-def next_direction(voronoi: In[VoronoiState], slot, row, col):
+def next_direction(slot, row, col, io: Bundle[VoronoiIO]):
     """Direction of the next cell towards the goal."""
-    return bits_at(voronoi, slot, row, col) >> _NEXT_SHIFT & 7
+    return bits_at(slot, row, col, io) >> _NEXT_SHIFT & 7
 
 
 @ti.func
-def on_skeleton(
-    voronoi: Out[VoronoiState],
-    clearance: In[ClearanceState],
-    slot,
-    env,
-    row,
-    col,
-    cfg: Const[VoronoiConfig],
-    clearance_cfg: Const[ClearanceConfig],
-):
+def on_skeleton(slot, env, row, col, io: Bundle[VoronoiIO]):
     """True for skeleton cells; found out once per plan and kept. The cell must be traversable (so it is not at the grid's edge)."""
-    bits = bits_at(voronoi, slot, row, col)
+    bits = bits_at(slot, row, col, io)
     if bits & KNOWN == 0:
         bits |= KNOWN
-        if _is_medial(clearance, env, row, col, cfg, clearance_cfg):
+        if _is_medial(env, row, col, io):
             bits |= SKELETON
-        voronoi.cell[slot, row, col] = ti.cast(bits, ti.u8)
+        io.voronoi.cell[slot, row, col] = ti.cast(bits, ti.u8)
     return bits & SKELETON != 0
 
 
 @ti.func
-def _is_medial(clearance: In[ClearanceState], env, row, col, cfg: Const[VoronoiConfig], clearance_cfg: Const[ClearanceConfig]):
+def _is_medial(env, row, col, io: Bundle[VoronoiIO]):
     """True on a plateau and where a neighbour's nearest site is far from the own one."""
-    medial = clearance.clearance_m[env, row, col] >= ti.static(clearance_cfg.max_m - _FLAT_M)
-    site_row = ti.cast(clearance.site_row[env, row, col], ti.i32)
-    site_col = ti.cast(clearance.site_col[env, row, col], ti.i32)
+    medial = io.clearance.clearance_m[env, row, col] >= ti.static(io.clearance_cfg.max_m - _FLAT_M)
+    site_row = ti.cast(io.clearance.site_row[env, row, col], ti.i32)
+    site_col = ti.cast(io.clearance.site_col[env, row, col], ti.i32)
     for k in range(4):
         step = step_of(ti.select(k < 2, 1 + 2 * k, 2 * k))  # the four sides: 1, 3, 4, 6
-        other_row = ti.cast(clearance.site_row[env, row + step[0], col + step[1]], ti.i32)
-        other_col = ti.cast(clearance.site_col[env, row + step[0], col + step[1]], ti.i32)
+        other_row = ti.cast(io.clearance.site_row[env, row + step[0], col + step[1]], ti.i32)
+        other_col = ti.cast(io.clearance.site_col[env, row + step[0], col + step[1]], ti.i32)
         gap = ti.cast((other_row - site_row) ** 2 + (other_col - site_col) ** 2, ti.f32)
-        if other_row >= 0 and site_row >= 0 and gap > ti.static(cfg.site_gap_cells**2):
+        if other_row >= 0 and site_row >= 0 and gap > ti.static(io.voronoi_cfg.site_gap_cells**2):
             medial = True
     return medial
 
 
 @ti.func
-def _step_is_open(voronoi: In[VoronoiState], slot, row, col, step):
+def _step_is_open(slot, row, col, step, io: Bundle[VoronoiIO]):
     """True where a step may be made: the cell is traversable, and so are both beside a diagonal step."""
-    is_open = voronoi.weight[slot, row + step[0], col + step[1]] > 0
+    is_open = io.voronoi.weight[slot, row + step[0], col + step[1]] > 0
     if step[0] != 0 and step[1] != 0:
-        is_open = is_open and voronoi.weight[slot, row + step[0], col] > 0 and voronoi.weight[slot, row, col + step[1]] > 0
+        is_open = is_open and io.voronoi.weight[slot, row + step[0], col] > 0 and io.voronoi.weight[slot, row, col + step[1]] > 0
     return is_open
 
 
 @ti.func
-def join_skeleton(
-    voronoi: Out[VoronoiState],
-    clearance: In[ClearanceState],
-    slot,
-    env,
-    start,
-    goal,
-    cfg: Const[VoronoiConfig],
-    clearance_cfg: Const[ClearanceConfig],
-):
+def join_skeleton(slot, env, start, goal, io: Bundle[VoronoiIO]):
     """Join both ends to the skeleton: one way uphill in clearance, and eight straight ways, so that the search chooses the side."""
     for joint in range(18):
         way = joint % 9
         row, col = ti.select(joint < 9, start[0], goal[0]), ti.select(joint < 9, start[1], goal[1])
         walking = True
         while walking:
-            voronoi.cell[slot, row, col] = ti.cast(bits_at(voronoi, slot, row, col) | JOINED, ti.u8)
+            io.voronoi.cell[slot, row, col] = ti.cast(bits_at(slot, row, col, io) | JOINED, ti.u8)
             direction = way
             if way == 8:
-                direction = _uphill(voronoi, clearance, slot, env, row, col)
+                direction = _uphill(slot, env, row, col, io)
             walking = direction >= 0
             if walking:
                 step = step_of(direction)
-                walking = _step_is_open(voronoi, slot, row, col, step)
+                walking = _step_is_open(slot, row, col, step, io)
                 row += step[0]
                 col += step[1]
                 if walking:
-                    walking = not on_skeleton(voronoi, clearance, slot, env, row, col, cfg, clearance_cfg)
+                    walking = not on_skeleton(slot, env, row, col, io)
 
 
 @ti.func
-def _uphill(voronoi: In[VoronoiState], clearance: In[ClearanceState], slot, env, row, col):
+def _uphill(slot, env, row, col, io: Bundle[VoronoiIO]):
     """Direction of the open neighbour with the largest clearance, -1 on a summit."""
-    best, best_m = -1, clearance.clearance_m[env, row, col]
+    best, best_m = -1, io.clearance.clearance_m[env, row, col]
     for k in range(8):
         step = step_of(k)
-        higher = clearance.clearance_m[env, row + step[0], col + step[1]]
-        if higher > best_m and _step_is_open(voronoi, slot, row, col, step):
+        higher = io.clearance.clearance_m[env, row + step[0], col + step[1]]
+        if higher > best_m and _step_is_open(slot, row, col, step, io):
             best, best_m = k, higher
     return best
 
@@ -152,79 +133,56 @@ def _estimate(cost, row, col, start_row, start_col, floor_weight):
 
 
 @ti.func
-def search_cells(
-    voronoi: Out[VoronoiState],
-    clearance: In[ClearanceState],
-    slot,
-    env,
-    start,
-    goal,
-    everywhere,
-    cfg: Const[VoronoiConfig],
-    clearance_cfg: Const[ClearanceConfig],
-):
+def search_cells(slot, env, start, goal, everywhere, io: Bundle[VoronoiIO]):
     """Cheapest way from the goal back to the start (so that the next cell leads to the goal), along the skeleton or ``everywhere``.
 
     An edge costs its length times the mean weight of its two cells [cells / m]: the paper's sum with segments bounded by the cells.
     Returns FOUND, NOT_FOUND or OUT_OF_BUDGET.
     """
-    n_col = ti.static(voronoi.cost.shape[2])
-    floor_weight = ti.static(_STRETCH / max(clearance_cfg.max_m, cfg.cost_epsilon_m))
-    size, status, budget = 0, NOT_FOUND, voronoi.pops[env] + ti.static(cfg.max_pops)
-    if voronoi.weight[slot, goal[0], goal[1]] > 0:
-        voronoi.cost[slot, goal[0], goal[1]] = 0.0
-        voronoi.cell[slot, goal[0], goal[1]] = ti.cast(bits_at(voronoi, slot, goal[0], goal[1]) | REACHED, ti.u8)
+    n_col = ti.static(io.voronoi.cost.shape[2])
+    floor_weight = ti.static(_STRETCH / max(io.clearance_cfg.max_m, io.voronoi_cfg.cost_epsilon_m))
+    size, status, budget = 0, NOT_FOUND, io.voronoi.pops[env] + ti.static(io.voronoi_cfg.max_pops)
+    if io.voronoi.weight[slot, goal[0], goal[1]] > 0:
+        io.voronoi.cost[slot, goal[0], goal[1]] = 0.0
+        io.voronoi.cell[slot, goal[0], goal[1]] = ti.cast(bits_at(slot, goal[0], goal[1], io) | REACHED, ti.u8)
         key = _estimate(0.0, goal[0], goal[1], start[0], start[1], floor_weight)
-        size = heap_after_push(voronoi, slot, size, goal[0] * n_col + goal[1], key)
+        size = heap_after_push(io.voronoi, slot, size, goal[0] * n_col + goal[1], key)
     while size > 0 and status == NOT_FOUND:
-        top = top_cell(voronoi, slot)
+        top = top_cell(io.voronoi, slot)
         row, col = top // n_col, top % n_col
-        size = heap_after_pop(voronoi, slot, size)
+        size = heap_after_pop(io.voronoi, slot, size)
         if row == start[0] and col == start[1]:
             status = FOUND
-        elif voronoi.pops[env] > budget or size + 8 > ti.static(voronoi.heap.shape[1]):
+        elif io.voronoi.pops[env] > budget or size + 8 > ti.static(io.voronoi.heap.shape[1]):
             status = OUT_OF_BUDGET
-        elif bits_at(voronoi, slot, row, col) & CLOSED == 0:
-            voronoi.cell[slot, row, col] = ti.cast(bits_at(voronoi, slot, row, col) | CLOSED, ti.u8)
-            voronoi.pops[env] += 1
-            size = _size_after_expansion(voronoi, clearance, slot, env, size, row, col, start, everywhere, floor_weight, cfg, clearance_cfg)
+        elif bits_at(slot, row, col, io) & CLOSED == 0:
+            io.voronoi.cell[slot, row, col] = ti.cast(bits_at(slot, row, col, io) | CLOSED, ti.u8)
+            io.voronoi.pops[env] += 1
+            size = _size_after_expansion(slot, env, size, row, col, start, everywhere, floor_weight, io)
     return status
 
 
 @ti.func
-def _size_after_expansion(
-    voronoi: Out[VoronoiState],
-    clearance: In[ClearanceState],
-    slot,
-    env,
-    size,
-    row,
-    col,
-    start,
-    everywhere,
-    floor_weight,
-    cfg: Const[VoronoiConfig],
-    clearance_cfg: Const[ClearanceConfig],
-):
+def _size_after_expansion(slot, env, size, row, col, start, everywhere, floor_weight, io: Bundle[VoronoiIO]):
     """Offer a cell to its eight neighbours as their next; returns the heap's new size."""
-    n_col = ti.static(voronoi.cost.shape[2])
-    here, weight = voronoi.cost[slot, row, col], voronoi.weight[slot, row, col]
+    n_col = ti.static(io.voronoi.cost.shape[2])
+    here, weight = io.voronoi.cost[slot, row, col], io.voronoi.weight[slot, row, col]
     new_size = size
     for k in range(8):
         step = step_of(k)
         to_row, to_col = row + step[0], col + step[1]
-        known = bits_at(voronoi, slot, to_row, to_col)
+        known = bits_at(slot, to_row, to_col, io)
         if known & CLOSED == 0 and (known & KNOWN == 0 or everywhere > 0 or known & (SKELETON | JOINED) != 0):
-            if _step_is_open(voronoi, slot, row, col, step):
-                medial = on_skeleton(voronoi, clearance, slot, env, to_row, to_col, cfg, clearance_cfg)
-                bits = bits_at(voronoi, slot, to_row, to_col)
+            if _step_is_open(slot, row, col, step, io):
+                medial = on_skeleton(slot, env, to_row, to_col, io)
+                bits = bits_at(slot, to_row, to_col, io)
                 length = ti.select(step[0] != 0 and step[1] != 0, 1.41421356, 1.0)
-                offer = ti.cast(here + 0.5 * length * (weight + voronoi.weight[slot, to_row, to_col]), ti.f32)
+                offer = ti.cast(here + 0.5 * length * (weight + io.voronoi.weight[slot, to_row, to_col]), ti.f32)
                 if everywhere > 0 or medial or bits & JOINED != 0:
-                    if bits & REACHED == 0 or offer < _BETTER * voronoi.cost[slot, to_row, to_col]:
-                        voronoi.cost[slot, to_row, to_col] = offer
+                    if bits & REACHED == 0 or offer < _BETTER * io.voronoi.cost[slot, to_row, to_col]:
+                        io.voronoi.cost[slot, to_row, to_col] = offer
                         kept = bits & (KNOWN | SKELETON | JOINED)
-                        voronoi.cell[slot, to_row, to_col] = ti.cast(kept | REACHED | ((7 - k) << _NEXT_SHIFT), ti.u8)
+                        io.voronoi.cell[slot, to_row, to_col] = ti.cast(kept | REACHED | ((7 - k) << _NEXT_SHIFT), ti.u8)
                         key = _estimate(offer, to_row, to_col, start[0], start[1], floor_weight)
-                        new_size = heap_after_push(voronoi, slot, new_size, to_row * n_col + to_col, key)
+                        new_size = heap_after_push(io.voronoi, slot, new_size, to_row * n_col + to_col, key)
     return new_size

@@ -11,10 +11,10 @@ _SLACK_M = 1.0e-5
 
 
 @ti.func
-def occupancy(grid_map: In[MapState], env, row, col, cfg: Const[VoronoiConfig]):
+def occupancy(grid_map: In[MapState], env, row, col, voronoi_cfg: Const[VoronoiConfig]):
     """Occupancy in [0, 1] of the layer that routes avoid."""
     value = grid_map.static_occ[env, row, col]
-    if ti.static(cfg.use == "fused"):
+    if ti.static(voronoi_cfg.use == "fused"):
         value = ti.max(value, grid_map.dynamic_occ[env, row, col])
     return value
 
@@ -27,10 +27,10 @@ def is_traversable(
     env,
     row,
     col,
-    cfg: Const[VoronoiConfig],
+    voronoi_cfg: Const[VoronoiConfig],
     mapping_cfg: Const[MappingConfig],
 ):
     """True where a route may pass. The map may be newer than the clearance, so both are asked."""
-    wide = clearance.clearance_m[env, row, col] >= ti.static(cfg.min_clearance_m - _SLACK_M)
-    free = occupancy(grid_map, env, row, col, cfg) < ti.static(mapping_cfg.occupied)
+    wide = clearance.clearance_m[env, row, col] >= ti.static(voronoi_cfg.min_clearance_m - _SLACK_M)
+    free = occupancy(grid_map, env, row, col, voronoi_cfg) < ti.static(mapping_cfg.occupied)
     return wide and free and mask.outside[row, col] == 0

@@ -9,13 +9,12 @@ import math
 
 import taichi as ti
 
-from uuvtai.config import DepthConfig, TankConfig
 from uuvtai.kernels.core.geometry import BOX, FAR_M, NONE, SPHERE, rotation_wb
 from uuvtai.kernels.core.lanes import LANES, f16x, ramp_lanes
 from uuvtai.kernels.core.noise import STREAM_DEPTH, normal_pair_lanes, stream_key
-from uuvtai.kernels.core.signature import Const, In, Out, quick_launch, spread
+from uuvtai.kernels.core.signature import Bundle, quick_launch, spread
+from uuvtai.kernels.sensors.bundles import DepthIO
 from uuvtai.kernels.sensors.raycast import ball_span, disc_span, rim_distance, slab_span
-from uuvtai.state import ClockState, DepthImage, EpisodeState, Proprioception, VehicleState, WorldState
 
 _BLOCK = 36
 """Image rows per loop item on a CPU: bodies are projected once per item."""
@@ -38,43 +37,34 @@ Eye = ti.types.struct(pos=ti.math.vec3, R_wb=ti.math.mat3)
 
 @quick_launch
 @ti.kernel
-def reset_depth(image: Out[DepthImage], clock: In[ClockState]):
+def reset_depth(io: Bundle[DepthIO]):
     """Forget the image of the awake rows (the shot of step 0 fills it)."""
-    n, n_row, n_col = ti.static(image.depth_m.shape)
+    n, n_row, n_col = ti.static(io.image.depth_m.shape)
     for env, row, pad in ti.ndrange(n, n_row, ti.static(spread(n * n_row))):
-        if pad == 0 and clock.awake[env] == 1:
+        if pad == 0 and io.clock.awake[env] == 1:
             for col in range(n_col):
-                image.depth_m[env, row, col] = 0.0
+                io.image.depth_m[env, row, col] = 0.0
             if row == 0:
-                image.fresh[env] = 0
-                image.shot_pos_w[env] = ti.zero(image.shot_pos_w[env])
-                image.shot_rpy[env] = ti.zero(image.shot_rpy[env])
+                io.image.fresh[env] = 0
+                io.image.shot_pos_w[env] = ti.zero(io.image.shot_pos_w[env])
+                io.image.shot_rpy[env] = ti.zero(io.image.shot_rpy[env])
 
 
 @quick_launch
 @ti.kernel
-def cast_depth(
-    image: Out[DepthImage],
-    ego: In[Proprioception],
-    vehicle: In[VehicleState],
-    world: In[WorldState],
-    episode: In[EpisodeState],
-    clock: In[ClockState],
-    depth: Const[DepthConfig],
-    tank: Const[TankConfig],
-):
+def cast_depth(io: Bundle[DepthIO]):
     """New image in the rows whose step is a multiple of period_steps (step 0 included); the others keep theirs with ``fresh`` = 0."""
-    n = ti.static(clock.awake.shape[0])
+    n = ti.static(io.clock.awake.shape[0])
     block_rows = ti.static(rows_per_item())
-    n_block = ti.static(-(-depth.rows // block_rows))
+    n_block = ti.static(-(-io.depth_cfg.rows // block_rows))
     for env, block, pad in ti.ndrange(n, n_block, ti.static(spread(n * n_block))):
-        if pad == 0 and clock.awake[env] == 1:
-            due = clock.step[env] % depth.period_steps == 0
+        if pad == 0 and io.clock.awake[env] == 1:
+            due = io.clock.step[env] % io.depth_cfg.period_steps == 0
             if block == 0:
-                label_image(env, due, image, ego)
+                label_image(env, due, io)
             if due:
-                fill_block(env, block * block_rows, image, vehicle, world, depth, tank)
-                disturb_block(env, block * block_rows, clock.step[env], image, episode, depth)
+                fill_block(env, block * block_rows, io)
+                disturb_block(env, block * block_rows, io.clock.step[env], io)
 
 
 def rows_per_item() -> int:
@@ -83,60 +73,52 @@ def rows_per_item() -> int:
 
 
 @ti.func
-def label_image(env, due, image: Out[DepthImage], ego: In[Proprioception]):
+def label_image(env, due, io: Bundle[DepthIO]):
     """Freshness, and the own pose estimate of a new image."""
-    image.fresh[env] = ti.cast(due, ti.i32)
+    io.image.fresh[env] = ti.cast(due, ti.i32)
     if due:
-        image.shot_pos_w[env] = ego.pos_w[env]
-        image.shot_rpy[env] = ego.rpy[env]
+        io.image.shot_pos_w[env] = io.ego.pos_w[env]
+        io.image.shot_rpy[env] = io.ego.rpy[env]
 
 
 @ti.func
-def fill_block(
-    env,
-    first_row,
-    image: Out[DepthImage],
-    vehicle: In[VehicleState],
-    world: In[WorldState],
-    depth: Const[DepthConfig],
-    tank: Const[TankConfig],
-):
+def fill_block(env, first_row, io: Bundle[DepthIO]):
     """Noise-free depth of _BLOCK rows: walls first, then every body over them inside its bounding rectangle."""
-    R_wb = rotation_wb(vehicle.quat_wb[env]).cast(ti.f32)
-    offset_b = ti.Vector([depth.offset_b_m[0], depth.offset_b_m[1], depth.offset_b_m[2]], ti.f32)
-    eye = Eye(pos=vehicle.pos_w[env].cast(ti.f32) + R_wb @ offset_b, R_wb=R_wb)
-    last_row = ti.min(first_row + ti.static(rows_per_item()), depth.rows)
+    R_wb = rotation_wb(io.vehicle.quat_wb[env]).cast(ti.f32)
+    offset_b = ti.Vector([io.depth_cfg.offset_b_m[0], io.depth_cfg.offset_b_m[1], io.depth_cfg.offset_b_m[2]], ti.f32)
+    eye = Eye(pos=io.vehicle.pos_w[env].cast(ti.f32) + R_wb @ offset_b, R_wb=R_wb)
+    last_row = ti.min(first_row + ti.static(rows_per_item()), io.depth_cfg.rows)
     for row in range(first_row, last_row):
-        for packet in range(ti.static(depth.cols // LANES)):
-            dx, dy, _dz = ray_directions(row, packet * LANES, eye.R_wb, depth)
-            seen = ti.min(wall_depth(eye, dx, dy, tank), depth.max_range_m)
-            paint(env, row, packet * LANES, seen, image)
-    for body in range(world.kind.shape[1]):
-        if world.kind[env, body] != NONE:
-            draw_body(env, body, first_row, last_row, eye, image, world, depth)
+        for packet in range(ti.static(io.depth_cfg.cols // LANES)):
+            dx, dy, _dz = ray_directions(row, packet * LANES, eye.R_wb, io)
+            seen = ti.min(wall_depth(eye, dx, dy, io), io.depth_cfg.max_range_m)
+            paint(env, row, packet * LANES, seen, io)
+    for body in range(io.world.kind.shape[1]):
+        if io.world.kind[env, body] != NONE:
+            draw_body(env, body, first_row, last_row, eye, io)
 
 
 @ti.func
-def paint(env, row, first_col, seen, image: Out[DepthImage]):
+def paint(env, row, first_col, seen, io: Bundle[DepthIO]):
     """Write sixteen pixels."""
     for i in ti.static(range(LANES)):
-        image.depth_m[env, row, first_col + i] = seen[i]
+        io.image.depth_m[env, row, first_col + i] = seen[i]
 
 
 @ti.func
-def paint_nearer(env, row, first_col, enter, image: Out[DepthImage]):
+def paint_nearer(env, row, first_col, enter, io: Bundle[DepthIO]):
     """Write those of sixteen pixels in which ``enter`` lies before the camera and nearer than what is there."""
     for i in ti.static(range(LANES)):
-        behind = image.depth_m[env, row, first_col + i]
-        image.depth_m[env, row, first_col + i] = ti.select((enter[i] > 0.0) & (enter[i] < behind), enter[i], behind)
+        behind = io.image.depth_m[env, row, first_col + i]
+        io.image.depth_m[env, row, first_col + i] = ti.select((enter[i] > 0.0) & (enter[i] < behind), enter[i], behind)
 
 
 @ti.func
-def ray_directions(row, first_col, R_wb, depth: Const[DepthConfig]):
+def ray_directions(row, first_col, R_wb, io: Bundle[DepthIO]):
     """World directions (x, y, z) of sixteen pixels' rays, scaled so that their body-x component is 1."""
-    inverse_focal = ti.static(2.0 * math.tan(math.radians(0.5 * depth.fov_deg)) / depth.cols)
-    left = ramp_lanes(ti.cast(first_col, ti.f32) + ti.static(0.5 - 0.5 * depth.cols)) * -inverse_focal
-    up = (0.5 * depth.rows - 0.5 - row) * inverse_focal
+    inverse_focal = ti.static(2.0 * math.tan(math.radians(0.5 * io.depth_cfg.fov_deg)) / io.depth_cfg.cols)
+    left = ramp_lanes(ti.cast(first_col, ti.f32) + ti.static(0.5 - 0.5 * io.depth_cfg.cols)) * -inverse_focal
+    up = (0.5 * io.depth_cfg.rows - 0.5 - row) * inverse_focal
     dx = left * R_wb[0, 1] + (R_wb[0, 0] + up * R_wb[0, 2])
     dy = left * R_wb[1, 1] + (R_wb[1, 0] + up * R_wb[1, 2])
     dz = left * R_wb[2, 1] + (R_wb[2, 0] + up * R_wb[2, 2])
@@ -144,16 +126,16 @@ def ray_directions(row, first_col, R_wb, depth: Const[DepthConfig]):
 
 
 @ti.func
-def wall_depth(eye, dx, dy, tank: Const[TankConfig]):
+def wall_depth(eye, dx, dy, io: Bundle[DepthIO]):
     """z-depth of the side walls; 0 where the camera pokes through them."""
     seen = f16x(0.0)
-    if ti.static(tank.shape == "circle"):
-        x = eye.pos[0] - ti.static(0.5 * (tank.x_m[0] + tank.x_m[1]))
-        y = eye.pos[1] - ti.static(0.5 * (tank.y_m[0] + tank.y_m[1]))
-        seen = rim_distance(x, y, dx, dy, tank.radius_m)
+    if ti.static(io.tank_cfg.shape == "circle"):
+        x = eye.pos[0] - ti.static(0.5 * (io.tank_cfg.x_m[0] + io.tank_cfg.x_m[1]))
+        y = eye.pos[1] - ti.static(0.5 * (io.tank_cfg.y_m[0] + io.tank_cfg.y_m[1]))
+        seen = rim_distance(x, y, dx, dy, io.tank_cfg.radius_m)
     else:
-        nearness_x = nearness(dx, tank.x_m[0] - eye.pos[0], tank.x_m[1] - eye.pos[0])
-        nearness_y = nearness(dy, tank.y_m[0] - eye.pos[1], tank.y_m[1] - eye.pos[1])
+        nearness_x = nearness(dx, io.tank_cfg.x_m[0] - eye.pos[0], io.tank_cfg.x_m[1] - eye.pos[0])
+        nearness_y = nearness(dy, io.tank_cfg.y_m[0] - eye.pos[1], io.tank_cfg.y_m[1] - eye.pos[1])
         seen = 1.0 / ti.max(nearness_x, nearness_y, ti.static(1.0 / FAR_M))
     return seen
 
@@ -168,35 +150,35 @@ def nearness(direction, low, high):
 
 
 @ti.func
-def draw_body(env, body, first_row, last_row, eye, image: Out[DepthImage], world: In[WorldState], depth: Const[DepthConfig]):
+def draw_body(env, body, first_row, last_row, eye, io: Bundle[DepthIO]):
     """Overwrite the pixels of these rows in which the body is nearer than what is there."""
-    kind = world.kind[env, body]
-    size = world.size[env, body].cast(ti.f32)
-    yaw = ti.cast(world.yaw[env, body], ti.f32)
-    offset = eye.pos - world.pos_w[env, body].cast(ti.f32)
-    if may_be_seen(offset, size.norm(), eye.R_wb, depth):
+    kind = io.world.kind[env, body]
+    size = io.world.size[env, body].cast(ti.f32)
+    yaw = ti.cast(io.world.yaw[env, body], ti.f32)
+    offset = eye.pos - io.world.pos_w[env, body].cast(ti.f32)
+    if may_be_seen(offset, size.norm(), eye.R_wb, io):
         c, s = ti.cos(yaw), ti.sin(yaw)
-        left, right, top, bottom = image_rectangle(offset, size, c, s, eye.R_wb, depth)
+        left, right, top, bottom = image_rectangle(offset, size, c, s, eye.R_wb, io)
         for row in range(ti.max(top, first_row), ti.min(bottom + 1, last_row)):
             for packet in range(left // LANES, (right + LANES) // LANES):
-                dx, dy, dz = ray_directions(row, packet * LANES, eye.R_wb, depth)
+                dx, dy, dz = ray_directions(row, packet * LANES, eye.R_wb, io)
                 enter = body_entry(kind, size, c, s, offset, dx, dy, dz)
-                paint_nearer(env, row, packet * LANES, enter, image)
+                paint_nearer(env, row, packet * LANES, enter, io)
 
 
 @ti.func
-def may_be_seen(offset, radius, R_wb, depth: Const[DepthConfig]):
+def may_be_seen(offset, radius, R_wb, io: Bundle[DepthIO]):
     """Whether a ball of this radius around -offset (relative to the camera) reaches into the view and its range."""
     centre_b = -(R_wb.transpose() @ offset)
-    half_width = ti.static(math.tan(math.radians(0.5 * depth.fov_deg)))
-    half_height = ti.static(half_height_tangent(depth))
+    half_width = ti.static(math.tan(math.radians(0.5 * io.depth_cfg.fov_deg)))
+    half_height = ti.static(half_height_tangent(io.depth_cfg))
     beyond_x = ti.abs(centre_b[1]) - half_width * centre_b[0]
     beyond_z = ti.abs(centre_b[2]) - half_height * centre_b[0]
     return (
         centre_b[0] > -radius
-        and centre_b[0] < depth.max_range_m + radius
-        and beyond_x < radius * ti.static(math.hypot(1.0, math.tan(math.radians(0.5 * depth.fov_deg))))
-        and beyond_z < radius * ti.static(math.hypot(1.0, half_height_tangent(depth)))
+        and centre_b[0] < io.depth_cfg.max_range_m + radius
+        and beyond_x < radius * ti.static(math.hypot(1.0, math.tan(math.radians(0.5 * io.depth_cfg.fov_deg))))
+        and beyond_z < radius * ti.static(math.hypot(1.0, half_height_tangent(io.depth_cfg)))
     )
 
 
@@ -206,13 +188,13 @@ def half_height_tangent(depth):
 
 
 @ti.func
-def image_rectangle(offset, size, c, s, R_wb, depth: Const[DepthConfig]):
+def image_rectangle(offset, size, c, s, R_wb, io: Bundle[DepthIO]):
     """Columns and rows (left, right, top, bottom; inclusive, inside the image) that a box of half extents ``size`` can cover.
 
     (c, s) turns the box about z; ``offset`` is the camera relative to its centre in the world. The whole image where a corner
     is not well in front of the camera.
     """
-    focal = ti.static(0.5 * depth.cols / math.tan(math.radians(0.5 * depth.fov_deg)))
+    focal = ti.static(0.5 * io.depth_cfg.cols / math.tan(math.radians(0.5 * io.depth_cfg.fov_deg)))
     low_u, high_u, low_v, high_v = FAR_M, -FAR_M, FAR_M, -FAR_M
     in_front = True
     for corner in range(8):
@@ -224,10 +206,10 @@ def image_rectangle(offset, size, c, s, R_wb, depth: Const[DepthConfig]):
         scale = focal / ti.max(corner_b[0], _NEAR_M)
         u, v = -corner_b[1] * scale, -corner_b[2] * scale
         low_u, high_u, low_v, high_v = ti.min(low_u, u), ti.max(high_u, u), ti.min(low_v, v), ti.max(high_v, v)
-    left, right, top, bottom = 0, ti.static(depth.cols - 1), 0, ti.static(depth.rows - 1)
+    left, right, top, bottom = 0, ti.static(io.depth_cfg.cols - 1), 0, ti.static(io.depth_cfg.rows - 1)
     if in_front:
-        left, right = pixel_span(low_u, high_u, depth.cols)
-        top, bottom = pixel_span(low_v, high_v, depth.rows)
+        left, right = pixel_span(low_u, high_u, io.depth_cfg.cols)
+        top, bottom = pixel_span(low_v, high_v, io.depth_cfg.rows)
     return left, right, top, bottom
 
 
@@ -261,24 +243,24 @@ def body_entry(kind, size, c, s, offset, dx, dy, dz):
 
 
 @ti.func
-def disturb_block(env, first_row, step, image: Out[DepthImage], episode: In[EpisodeState], depth: Const[DepthConfig]):
+def disturb_block(env, first_row, step, io: Bundle[DepthIO]):
     """Normal error, sigma = a + b depth, on every return; what then lies beyond the range is no return."""
-    if ti.static(depth.sigma_m > 0 or depth.sigma_slope > 0):
-        key = stream_key(episode.key[env], step, STREAM_DEPTH)
-        n_packet = ti.static(depth.cols // LANES)
-        for row in range(first_row, ti.min(first_row + ti.static(rows_per_item()), depth.rows)):
+    if ti.static(io.depth_cfg.sigma_m > 0 or io.depth_cfg.sigma_slope > 0):
+        key = stream_key(io.episode.key[env], step, STREAM_DEPTH)
+        n_packet = ti.static(io.depth_cfg.cols // LANES)
+        for row in range(first_row, ti.min(first_row + ti.static(rows_per_item()), io.depth_cfg.rows)):
             for pair in range(ti.static(-(-n_packet // 2))):  # the two normals of a draw go to neighbouring packets
-                one, other = normal_pair_lanes(key, row * depth.cols + pair * LANES)
-                paint_noisy(env, row, 2 * pair * LANES, one, image, depth)
+                one, other = normal_pair_lanes(key, row * io.depth_cfg.cols + pair * LANES)
+                paint_noisy(env, row, 2 * pair * LANES, one, io)
                 if ti.static(n_packet % 2 == 0) or 2 * pair + 1 < n_packet:
-                    paint_noisy(env, row, (2 * pair + 1) * LANES, other, image, depth)
+                    paint_noisy(env, row, (2 * pair + 1) * LANES, other, io)
 
 
 @ti.func
-def paint_noisy(env, row, first_col, error, image: Out[DepthImage], depth: Const[DepthConfig]):
+def paint_noisy(env, row, first_col, error, io: Bundle[DepthIO]):
     """Add ``error`` standard deviations to sixteen pixels where they show a return."""
     for i in ti.static(range(LANES)):
-        true_m = image.depth_m[env, row, first_col + i]
-        noisy = true_m + (depth.sigma_m + depth.sigma_slope * true_m) * error[i]
-        told = ti.min(ti.max(noisy, 0.0), depth.max_range_m)
-        image.depth_m[env, row, first_col + i] = ti.select(true_m < depth.max_range_m, told, true_m)
+        true_m = io.image.depth_m[env, row, first_col + i]
+        noisy = true_m + (io.depth_cfg.sigma_m + io.depth_cfg.sigma_slope * true_m) * error[i]
+        told = ti.min(ti.max(noisy, 0.0), io.depth_cfg.max_range_m)
+        io.image.depth_m[env, row, first_col + i] = ti.select(true_m < io.depth_cfg.max_range_m, told, true_m)

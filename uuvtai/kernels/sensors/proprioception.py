@@ -8,11 +8,10 @@ zeroed at the known start: its first reading is taken for the start's depth, so 
 
 import taichi as ti
 
-from uuvtai.config import EpisodeConfig, SensorsConfig, VehicleConfig
 from uuvtai.kernels.core.geometry import quaternion_wb, roll_pitch_yaw, rotation_wb, wrapped_angle
 from uuvtai.kernels.core.noise import STREAM_DVL, STREAM_IMU, STREAM_PRESSURE, normal, stream_key, uniform, uniform_in
-from uuvtai.kernels.core.signature import Const, In, Out, quick_launch, spread
-from uuvtai.state import ClockState, EpisodeState, Proprioception, ProprioceptionMemory, VehicleState
+from uuvtai.kernels.core.signature import Bundle, quick_launch, spread
+from uuvtai.kernels.sensors.bundles import ExactProprioceptionIO, ProprioceptionIO
 
 _EPISODE_DRAW = 1000
 """Index of draws made once per episode, apart from those of step 0."""
@@ -20,66 +19,63 @@ _EPISODE_DRAW = 1000
 
 @quick_launch
 @ti.kernel
-def reset_proprioception(
-    ego: Out[Proprioception],
-    memory: Out[ProprioceptionMemory],
-    vehicle: In[VehicleState],
-    episode: In[EpisodeState],
-    clock: In[ClockState],
-    sensors: Const[SensorsConfig],
-):
+def reset_proprioception(io: Bundle[ProprioceptionIO]):
     """Draw the errors that stay constant over an episode; the estimate starts at the true position. Awake rows only."""
-    n = ti.static(clock.awake.shape[0])
+    n = ti.static(io.clock.awake.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and clock.awake[env] == 1:
-            draw_constants(env, memory, episode, sensors)
-            clear_readings(env, ego, vehicle)
-
-
-@ti.func
-def draw_constants(env, memory: Out[ProprioceptionMemory], episode: In[EpisodeState], sensors: Const[SensorsConfig]):
-    key = episode.key[env]
-    dvl, imu = stream_key(key, 0, STREAM_DVL), stream_key(key, 0, STREAM_IMU)
-    memory.dvl_scale[env] = 1.0 + sensors.dvl.scale_error * normal(dvl, _EPISODE_DRAW)
-    memory.heading_rate[env] = sensors.imu.heading_drift_rad_s * normal(imu, _EPISODE_DRAW)
-    memory.heading_error[env] = 0.0
-    memory.dropout_until[env] = 0
-    memory.pressure_zero_m[env] = 0.0
-    bias = sensors.pressure.bias_m
-    memory.pressure_bias_m[env] = uniform_in(stream_key(key, 0, STREAM_PRESSURE), _EPISODE_DRAW, -bias, bias)
-
-
-@ti.func
-def clear_readings(env, ego: Out[Proprioception], vehicle: In[VehicleState]):
-    zero = ti.zero(ego.vel_b[env])
-    ego.vel_b[env], ego.rpy[env], ego.rate_b[env], ego.specific_force_b[env] = zero, zero, zero, zero
-    ego.vel_valid[env] = 0
-    ego.depth_m[env] = 0.0
-    ego.pos_w[env] = vehicle.pos_w[env]
+        if pad == 0 and io.clock.awake[env] == 1:
+            draw_constants(env, io)
+            clear_readings(env, io)
 
 
 @quick_launch
 @ti.kernel
-def sense_proprioception(
-    ego: Out[Proprioception],
-    memory: Out[ProprioceptionMemory],
-    vehicle: In[VehicleState],
-    episode: In[EpisodeState],
-    clock: In[ClockState],
-    sensors: Const[SensorsConfig],
-    body: Const[VehicleConfig],
-    rules: Const[EpisodeConfig],
-):
+def sense_exactly(io: Bundle[ExactProprioceptionIO]):
+    """Perfect velocity, attitude and rates for the inner loop: experiments on the plant alone have no sensors."""
+    for env in range(ti.static(io.clock.awake.shape[0])):
+        if io.clock.awake[env] == 1:
+            io.ego.vel_b[env] = io.vehicle.vel_b[env]
+            io.ego.vel_valid[env] = 1
+            io.ego.rate_b[env] = io.vehicle.rate_b[env]
+            io.ego.rpy[env] = roll_pitch_yaw(io.vehicle.quat_wb[env])
+            io.ego.pos_w[env] = io.vehicle.pos_w[env]
+
+
+@ti.func
+def draw_constants(env, io: Bundle[ProprioceptionIO]):
+    key = io.episode.key[env]
+    dvl, imu = stream_key(key, 0, STREAM_DVL), stream_key(key, 0, STREAM_IMU)
+    io.ego_memory.dvl_scale[env] = 1.0 + io.sensors_cfg.dvl.scale_error * normal(dvl, _EPISODE_DRAW)
+    io.ego_memory.heading_rate[env] = io.sensors_cfg.imu.heading_drift_rad_s * normal(imu, _EPISODE_DRAW)
+    io.ego_memory.heading_error[env] = 0.0
+    io.ego_memory.dropout_until[env] = 0
+    io.ego_memory.pressure_zero_m[env] = 0.0
+    bias = io.sensors_cfg.pressure.bias_m
+    io.ego_memory.pressure_bias_m[env] = uniform_in(stream_key(key, 0, STREAM_PRESSURE), _EPISODE_DRAW, -bias, bias)
+
+
+@ti.func
+def clear_readings(env, io: Bundle[ProprioceptionIO]):
+    zero = ti.zero(io.ego.vel_b[env])
+    io.ego.vel_b[env], io.ego.rpy[env], io.ego.rate_b[env], io.ego.specific_force_b[env] = zero, zero, zero, zero
+    io.ego.vel_valid[env] = 0
+    io.ego.depth_m[env] = 0.0
+    io.ego.pos_w[env] = io.vehicle.pos_w[env]
+
+
+@quick_launch
+@ti.kernel
+def sense_proprioception(io: Bundle[ProprioceptionIO]):
     """One reading of every sensor whose turn it is, then the pose estimate. Awake rows only."""
-    n = ti.static(clock.awake.shape[0])
+    n = ti.static(io.clock.awake.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and clock.awake[env] == 1:
-            key, step = episode.key[env], clock.step[env]
-            read_imu(env, key, step, ego, memory, vehicle, sensors, body, rules)
-            if step % sensors.dvl.period_steps == 0:
-                read_dvl(env, key, step, ego, memory, vehicle, sensors, rules)
-            read_pressure(env, key, step, ego, memory, vehicle, sensors)
-            estimate_position(env, step, ego, vehicle, sensors, rules)
+        if pad == 0 and io.clock.awake[env] == 1:
+            key, step = io.episode.key[env], io.clock.step[env]
+            read_imu(env, key, step, io)
+            if step % io.sensors_cfg.dvl.period_steps == 0:
+                read_dvl(env, key, step, io)
+            read_pressure(env, key, step, io)
+            estimate_position(env, step, io)
 
 
 @ti.func
@@ -89,100 +85,66 @@ def normal_vector(key, first):
 
 
 @ti.func
-def read_imu(
-    env,
-    key,
-    step,
-    ego: Out[Proprioception],
-    memory: Out[ProprioceptionMemory],
-    vehicle: In[VehicleState],
-    sensors: Const[SensorsConfig],
-    body: Const[VehicleConfig],
-    rules: Const[EpisodeConfig],
-):
+def read_imu(env, key, step, io: Bundle[ProprioceptionIO]):
     """Attitude with heading error, angular rate, and specific force = acceleration minus gravity, in body axes."""
     stream = stream_key(key, step, STREAM_IMU)
-    rate, heading_rate = vehicle.rate_b[env], memory.heading_rate[env]
-    if ti.static(sensors.imu.gyro_noise_rad_s_rthz > 0):
-        error = ti.static(sensors.imu.gyro_noise_rad_s_rthz / rules.control_dt_s**0.5) * normal_vector(stream, 0)
+    rate, heading_rate = io.vehicle.rate_b[env], io.ego_memory.heading_rate[env]
+    if ti.static(io.sensors_cfg.imu.gyro_noise_rad_s_rthz > 0):
+        error = ti.static(io.sensors_cfg.imu.gyro_noise_rad_s_rthz / io.episode_cfg.control_dt_s**0.5) * normal_vector(stream, 0)
         rate += error
         heading_rate += error[2]
     if step > 0:
-        memory.heading_error[env] += heading_rate * rules.control_dt_s
-    rpy = roll_pitch_yaw(vehicle.quat_wb[env])
-    if ti.static(sensors.imu.attitude_sigma_rad > 0):
-        rpy += sensors.imu.attitude_sigma_rad * normal_vector(stream, 3)
-    force = vehicle.acc_b[env] + rotation_wb(vehicle.quat_wb[env]).transpose() @ ti.Vector([0.0, 0.0, body.gravity_m_s2])
-    if ti.static(sensors.imu.accel_sigma_m_s2 > 0):
-        force += sensors.imu.accel_sigma_m_s2 * normal_vector(stream, 6)
-    ego.rpy[env] = ti.Vector([rpy[0], rpy[1], wrapped_angle(rpy[2] + memory.heading_error[env])])
-    ego.rate_b[env] = rate
-    ego.specific_force_b[env] = force
+        io.ego_memory.heading_error[env] += heading_rate * io.episode_cfg.control_dt_s
+    rpy = roll_pitch_yaw(io.vehicle.quat_wb[env])
+    if ti.static(io.sensors_cfg.imu.attitude_sigma_rad > 0):
+        rpy += io.sensors_cfg.imu.attitude_sigma_rad * normal_vector(stream, 3)
+    force = io.vehicle.acc_b[env] + rotation_wb(io.vehicle.quat_wb[env]).transpose() @ ti.Vector([0.0, 0.0, io.vehicle_cfg.gravity_m_s2])
+    if ti.static(io.sensors_cfg.imu.accel_sigma_m_s2 > 0):
+        force += io.sensors_cfg.imu.accel_sigma_m_s2 * normal_vector(stream, 6)
+    io.ego.rpy[env] = ti.Vector([rpy[0], rpy[1], wrapped_angle(rpy[2] + io.ego_memory.heading_error[env])])
+    io.ego.rate_b[env] = rate
+    io.ego.specific_force_b[env] = force
 
 
 @ti.func
-def read_dvl(
-    env,
-    key,
-    step,
-    ego: Out[Proprioception],
-    memory: Out[ProprioceptionMemory],
-    vehicle: In[VehicleState],
-    sensors: Const[SensorsConfig],
-    rules: Const[EpisodeConfig],
-):
+def read_dvl(env, key, step, io: Bundle[ProprioceptionIO]):
     """Velocity over ground; no reading while the bottom is lost. An episode starts with it in sight, so there always is a last reading."""
     stream = stream_key(key, step, STREAM_DVL)
-    lost = step < memory.dropout_until[env]
-    if ti.static(sensors.dvl.dropout > 0):
-        if not lost and step > 0 and uniform(stream, 20) < sensors.dvl.dropout:
-            lasts = uniform_in(stream, 21, sensors.dvl.dropout_s[0], sensors.dvl.dropout_s[1])
-            memory.dropout_until[env] = step + ti.cast(ti.ceil(lasts / rules.control_dt_s), ti.i32)
+    lost = step < io.ego_memory.dropout_until[env]
+    if ti.static(io.sensors_cfg.dvl.dropout > 0):
+        if not lost and step > 0 and uniform(stream, 20) < io.sensors_cfg.dvl.dropout:
+            lasts = uniform_in(stream, 21, io.sensors_cfg.dvl.dropout_s[0], io.sensors_cfg.dvl.dropout_s[1])
+            io.ego_memory.dropout_until[env] = step + ti.cast(ti.ceil(lasts / io.episode_cfg.control_dt_s), ti.i32)
             lost = True
-    ego.vel_valid[env] = ti.select(lost, 0, 1)
+    io.ego.vel_valid[env] = ti.select(lost, 0, 1)
     if not lost:
-        reading = memory.dvl_scale[env] * vehicle.vel_b[env]
-        if ti.static(sensors.dvl.sigma_m_s > 0):
-            reading += sensors.dvl.sigma_m_s * normal_vector(stream, 0)
-        ego.vel_b[env] = reading
+        reading = io.ego_memory.dvl_scale[env] * io.vehicle.vel_b[env]
+        if ti.static(io.sensors_cfg.dvl.sigma_m_s > 0):
+            reading += io.sensors_cfg.dvl.sigma_m_s * normal_vector(stream, 0)
+        io.ego.vel_b[env] = reading
 
 
 @ti.func
-def read_pressure(
-    env,
-    key,
-    step,
-    ego: Out[Proprioception],
-    memory: Out[ProprioceptionMemory],
-    vehicle: In[VehicleState],
-    sensors: Const[SensorsConfig],
-):
+def read_pressure(env, key, step, io: Bundle[ProprioceptionIO]):
     """Depth, positive down; in dead reckoning less what the first reading was off the known start, where ``ego.pos_w`` is at step 0."""
-    reading = memory.pressure_bias_m[env] - vehicle.pos_w[env][2]
-    if ti.static(sensors.pressure.sigma_m > 0):
-        reading += sensors.pressure.sigma_m * normal(stream_key(key, step, STREAM_PRESSURE), 0)
-    if ti.static(sensors.localization == "dead_reckoning"):
+    reading = io.ego_memory.pressure_bias_m[env] - io.vehicle.pos_w[env][2]
+    if ti.static(io.sensors_cfg.pressure.sigma_m > 0):
+        reading += io.sensors_cfg.pressure.sigma_m * normal(stream_key(key, step, STREAM_PRESSURE), 0)
+    if ti.static(io.sensors_cfg.localization == "dead_reckoning"):
         if step == 0:
-            memory.pressure_zero_m[env] = reading + ego.pos_w[env][2]
-        reading -= memory.pressure_zero_m[env]
-    ego.depth_m[env] = reading
+            io.ego_memory.pressure_zero_m[env] = reading + io.ego.pos_w[env][2]
+        reading -= io.ego_memory.pressure_zero_m[env]
+    io.ego.depth_m[env] = reading
 
 
 @ti.func
-def estimate_position(
-    env,
-    step,
-    ego: Out[Proprioception],
-    vehicle: In[VehicleState],
-    sensors: Const[SensorsConfig],
-    rules: Const[EpisodeConfig],
-):
+def estimate_position(env, step, io: Bundle[ProprioceptionIO]):
     """Position estimate: truth, or one step of dead reckoning from what was just measured."""
-    if ti.static(sensors.localization == "truth"):
-        ego.pos_w[env] = vehicle.pos_w[env]
+    if ti.static(io.sensors_cfg.localization == "truth"):
+        io.ego.pos_w[env] = io.vehicle.pos_w[env]
     else:
-        pos, rpy = ego.pos_w[env], ego.rpy[env]
+        pos, rpy = io.ego.pos_w[env], io.ego.rpy[env]
         if step > 0:
-            pos += rotation_wb(quaternion_wb(rpy[0], rpy[1], rpy[2])) @ ego.vel_b[env] * rules.control_dt_s
-        pos[2] = -ego.depth_m[env]
-        ego.pos_w[env] = pos
+            pos += rotation_wb(quaternion_wb(rpy[0], rpy[1], rpy[2])) @ io.ego.vel_b[env] * io.episode_cfg.control_dt_s
+        pos[2] = -io.ego.depth_m[env]
+        io.ego.pos_w[env] = pos

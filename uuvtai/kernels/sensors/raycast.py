@@ -6,11 +6,10 @@ A body is an intersection of such sets, so its own span is (largest enter, small
 
 import taichi as ti
 
-from uuvtai.config import TankConfig
 from uuvtai.kernels.core.geometry import BOX, FAR_M, NONE, SPHERE
 from uuvtai.kernels.core.lanes import LANES, f16x
-from uuvtai.kernels.core.signature import Const, In, Out
-from uuvtai.state import SonarMemory, WorldState
+from uuvtai.kernels.core.signature import Bundle, Const
+from uuvtai.kernels.sensors.bundles import SonarIO
 
 _TINY = 1.0e-9
 """Below this a direction component counts as parallel."""
@@ -79,41 +78,45 @@ def rim_distance(x, y, dx, dy, radius):
 
 
 @ti.func
-def place_bodies(env, x, y, world: In[WorldState], memory: Out[SonarMemory]):
+def place_bodies(env, x, y, io: Bundle[SonarIO]):
     """Write centre and reach of every body's outline, as seen from (x, y), for ``bodies_in_wedge``; an empty slot reaches nowhere."""
-    n_body = ti.static(world.kind.shape[1])
-    for slot in range(memory.body_reach_m.shape[1]):
+    n_body = ti.static(io.world.kind.shape[1])
+    for slot in range(io.sonar_memory.body_reach_m.shape[1]):
         reach = -FAR_M
         if slot < n_body:
-            kind = world.kind[env, slot]
+            kind = io.world.kind[env, slot]
             if kind != NONE:
-                size = world.size[env, slot]
-                memory.body_x_m[env, slot] = world.pos_w[env, slot][0] - x
-                memory.body_y_m[env, slot] = world.pos_w[env, slot][1] - y
+                size = io.world.size[env, slot]
+                io.sonar_memory.body_x_m[env, slot] = io.world.pos_w[env, slot][0] - x
+                io.sonar_memory.body_y_m[env, slot] = io.world.pos_w[env, slot][1] - y
                 reach = ti.cast(size[0] + ti.select(kind == BOX, size[1], 0.0), ti.f32)  # no less than half a box's diagonal
-        memory.body_reach_m[env, slot] = reach
+        io.sonar_memory.body_reach_m[env, slot] = reach
 
 
 @ti.func
-def bodies_in_wedge(env, first, wedge, memory: In[SonarMemory]):
+def bodies_in_wedge(env, first, wedge, io: Bundle[SonarIO]):
     """Bit set of those among sixteen bodies whose outline may reach into a wedge at the sensor (conservative).
 
     ``wedge`` = (x, y) of its middle direction, then (cos, sin) of its half angle.
     """
     x, y, reach = f16x(0.0), f16x(0.0), f16x(0.0)
     for i in ti.static(range(LANES)):
-        x[i], y[i], reach[i] = memory.body_x_m[env, first + i], memory.body_y_m[env, first + i], memory.body_reach_m[env, first + i]
+        x[i], y[i], reach[i] = (
+            io.sonar_memory.body_x_m[env, first + i],
+            io.sonar_memory.body_y_m[env, first + i],
+            io.sonar_memory.body_reach_m[env, first + i],
+        )
     along = x * wedge[0] + y * wedge[1]
     across = ti.abs(x * wedge[1] - y * wedge[0])
     return lane_bits(across * wedge[2] - along * wedge[3] <= reach)
 
 
 @ti.func
-def bodies_there(env, first, memory: In[SonarMemory]):
+def bodies_there(env, first, io: Bundle[SonarIO]):
     """Bit set of the slots in use among sixteen."""
     reach = f16x(0.0)
     for i in ti.static(range(LANES)):
-        reach[i] = memory.body_reach_m[env, first + i]
+        reach[i] = io.sonar_memory.body_reach_m[env, first + i]
     return lane_bits(reach >= 0.0)
 
 
@@ -125,50 +128,36 @@ def lane_bits(condition):
 
 
 @ti.func
-def nearest_echo(
-    env,
-    x,
-    y,
-    z,
-    ux,
-    uy,
-    travelled,
-    slope,
-    wedge,
-    direct: Const[bool],
-    memory: In[SonarMemory],
-    world: In[WorldState],
-    tank: Const[TankConfig],
-):
+def nearest_echo(env, x, y, z, ux, uy, travelled, slope, wedge, direct: Const[bool], io: Bundle[SonarIO]):
     """Nearest surface along level rays (ux, uy) from (x, y) in the plane z, after a path already ``travelled`` [m].
 
     A body counts where its vertical gap is at most slope x path. (x, y) and ``travelled`` are scalars, or lanes after a bounce.
     ``direct`` rays start at the sensor, where only bodies in their ``wedge`` need a test.
     """
-    echo = wall_echo(x, y, ux, uy, tank)
-    for group in range(ti.static(memory.body_reach_m.shape[1] // LANES)):
+    echo = wall_echo(x, y, ux, uy, io)
+    for group in range(ti.static(io.sonar_memory.body_reach_m.shape[1] // LANES)):
         waiting = 0
         if ti.static(direct):
-            waiting = bodies_in_wedge(env, group * LANES, wedge, memory)
+            waiting = bodies_in_wedge(env, group * LANES, wedge, io)
         else:
-            waiting = bodies_there(env, group * LANES, memory)
+            waiting = bodies_there(env, group * LANES, io)
         while waiting != 0:
             body = group * LANES + 31 - ti.math.clz(waiting & -waiting)  # the lowest bit
             waiting &= waiting - 1
-            echo = nearer_echo(env, body, echo, x, y, z, ux, uy, travelled, slope, world)
+            echo = nearer_echo(env, body, echo, x, y, z, ux, uy, travelled, slope, io)
     return echo
 
 
 @ti.func
-def nearer_echo(env, body, echo, x, y, z, ux, uy, travelled, slope, world: In[WorldState]):
+def nearer_echo(env, body, echo, x, y, z, ux, uy, travelled, slope, io: Bundle[SonarIO]):
     """The echo, or a body's where that is nearer."""
     out = echo
-    kind = world.kind[env, body]
-    pos, size = world.pos_w[env, body].cast(ti.f32), world.size[env, body].cast(ti.f32)
-    enter, normal_x, normal_y = outline_entry(env, body, kind, size, pos[2] - z, x - pos[0], y - pos[1], ux, uy, travelled, slope, world)
+    kind = io.world.kind[env, body]
+    pos, size = io.world.pos_w[env, body].cast(ti.f32), io.world.size[env, body].cast(ti.f32)
+    enter, normal_x, normal_y = outline_entry(env, body, kind, size, pos[2] - z, x - pos[0], y - pos[1], ux, uy, travelled, slope, io)
     gap = ti.select(kind == SPHERE, 0.0, ti.max(ti.abs(pos[2] - z) - size[2], 0.0))
     nearer = (enter > _SKIN_M) & (enter < echo.range_m) & ((enter + travelled) * slope >= gap)
-    vel = world.vel_w[env, body].cast(ti.f32)
+    vel = io.world.vel_w[env, body].cast(ti.f32)
     out.range_m = ti.select(nearer, enter, echo.range_m)
     out.normal_x = ti.select(nearer, normal_x, echo.normal_x)
     out.normal_y = ti.select(nearer, normal_y, echo.normal_y)
@@ -178,11 +167,11 @@ def nearer_echo(env, body, echo, x, y, z, ux, uy, travelled, slope, world: In[Wo
 
 
 @ti.func
-def outline_entry(env, body, kind, size, rise, sx, sy, ux, uy, travelled, slope, world: In[WorldState]):
+def outline_entry(env, body, kind, size, rise, sx, sy, ux, uy, travelled, slope, io: Bundle[SonarIO]):
     """(range, normal x, normal y) where rays from (sx, sy), relative to the body's centre, enter its horizontal outline."""
     range_m, normal_x, normal_y = f16x(FAR_M), f16x(0.0), f16x(0.0)
     if kind == BOX:
-        yaw = ti.cast(world.yaw[env, body], ti.f32)
+        yaw = ti.cast(io.world.yaw[env, body], ti.f32)
         c, s = ti.cos(yaw), ti.sin(yaw)
         dx, dy = ux * c + uy * s, uy * c - ux * s
         in_x, out_x = slab_span(sx * c + sy * s, dx, size[0])
@@ -205,18 +194,18 @@ def outline_entry(env, body, kind, size, rise, sx, sy, ux, uy, travelled, slope,
 
 
 @ti.func
-def wall_echo(x, y, ux, uy, tank: Const[TankConfig]):
+def wall_echo(x, y, ux, uy, io: Bundle[SonarIO]):
     """Side walls of the tank: nothing moves, normals point inwards."""
     range_m, normal_x, normal_y = f16x(0.0), f16x(0.0), f16x(0.0)
-    if ti.static(tank.shape == "circle"):
-        sx = x - ti.static(0.5 * (tank.x_m[0] + tank.x_m[1]))
-        sy = y - ti.static(0.5 * (tank.y_m[0] + tank.y_m[1]))
-        range_m = rim_distance(sx, sy, ux, uy, tank.radius_m)
-        normal_x = (sx + range_m * ux) * ti.static(-1.0 / tank.radius_m)
-        normal_y = (sy + range_m * uy) * ti.static(-1.0 / tank.radius_m)
+    if ti.static(io.tank_cfg.shape == "circle"):
+        sx = x - ti.static(0.5 * (io.tank_cfg.x_m[0] + io.tank_cfg.x_m[1]))
+        sy = y - ti.static(0.5 * (io.tank_cfg.y_m[0] + io.tank_cfg.y_m[1]))
+        range_m = rim_distance(sx, sy, ux, uy, io.tank_cfg.radius_m)
+        normal_x = (sx + range_m * ux) * ti.static(-1.0 / io.tank_cfg.radius_m)
+        normal_y = (sy + range_m * uy) * ti.static(-1.0 / io.tank_cfg.radius_m)
     else:
-        to_x = plane_distance(x, ux, tank.x_m[0], tank.x_m[1])
-        to_y = plane_distance(y, uy, tank.y_m[0], tank.y_m[1])
+        to_x = plane_distance(x, ux, io.tank_cfg.x_m[0], io.tank_cfg.x_m[1])
+        to_y = plane_distance(y, uy, io.tank_cfg.y_m[0], io.tank_cfg.y_m[1])
         range_m = ti.min(to_x, to_y)
         normal_x = ti.select(to_x < to_y, ti.select(ux > 0.0, -1.0, 1.0), 0.0)
         normal_y = ti.select(to_x < to_y, 0.0, ti.select(uy > 0.0, -1.0, 1.0))

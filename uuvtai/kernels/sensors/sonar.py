@@ -9,10 +9,10 @@ import math
 
 import taichi as ti
 
-from uuvtai.config import EpisodeConfig, SonarConfig, TankConfig
 from uuvtai.kernels.core.geometry import FAR_M, rotation_wb
 from uuvtai.kernels.core.lanes import LANES, f16x
-from uuvtai.kernels.core.signature import Const, In, Out, quick_launch, spread
+from uuvtai.kernels.core.signature import Bundle, quick_launch, spread
+from uuvtai.kernels.sensors.bundles import SonarIO
 from uuvtai.kernels.sensors.raycast import nearest_echo, place_bodies
 from uuvtai.kernels.sensors.sonar_error import (
     cloud_covered,
@@ -25,7 +25,6 @@ from uuvtai.kernels.sensors.sonar_error import (
     range_noisy,
     start_cloud,
 )
-from uuvtai.state import ClockState, EpisodeState, Proprioception, SonarMemory, SonarScan, VehicleState, WorldState
 
 _FALLOFF = 0.9
 """Intensity = cosine of incidence x (1 - 0.9 r / maximum range): Lambert's law and what gain control leaves of the range loss (EC)."""
@@ -39,238 +38,211 @@ Mount = ti.types.struct(pos=ti.math.vec3, vel=ti.math.vec2, heading=ti.math.vec2
 
 @quick_launch
 @ti.kernel
-def reset_sonar(scan: Out[SonarScan], memory: Out[SonarMemory], clock: In[ClockState]):
+def reset_sonar(io: Bundle[SonarIO]):
     """Forget scans and clouds of the awake rows: no return anywhere, nothing fresh or under way (step 0 then fills the scan)."""
-    n = ti.static(clock.awake.shape[0])
+    n = ti.static(io.clock.awake.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and clock.awake[env] == 1:
-            clear_scan(env, scan)
-            clear_memory(env, memory)
+        if pad == 0 and io.clock.awake[env] == 1:
+            clear_scan(env, io)
+            clear_memory(env, io)
 
 
 @ti.func
-def clear_scan(env, scan: Out[SonarScan]):
-    for ray in range(scan.range_m.shape[1]):
-        scan.range_m[env, ray] = 0.0
-        scan.doppler_m_s[env, ray] = 0.0
-        scan.intensity[env, ray] = 0.0
-        scan.hit[env, ray] = 0
-    scan.fresh[env] = 0
-    scan.ping_step[env] = 0
-    scan.ping_pos_w[env] = ti.zero(scan.ping_pos_w[env])
-    scan.ping_yaw[env] = 0.0
-    scan.ping_vel_b[env] = ti.zero(scan.ping_vel_b[env])
-    scan.ping_vel_valid[env] = 0
+def clear_scan(env, io: Bundle[SonarIO]):
+    for ray in range(io.scan.range_m.shape[1]):
+        io.scan.range_m[env, ray] = 0.0
+        io.scan.doppler_m_s[env, ray] = 0.0
+        io.scan.intensity[env, ray] = 0.0
+        io.scan.hit[env, ray] = 0
+    io.scan.fresh[env] = 0
+    io.scan.ping_step[env] = 0
+    io.scan.ping_pos_w[env] = ti.zero(io.scan.ping_pos_w[env])
+    io.scan.ping_yaw[env] = 0.0
+    io.scan.ping_vel_b[env] = ti.zero(io.scan.ping_vel_b[env])
+    io.scan.ping_vel_valid[env] = 0
 
 
 @ti.func
-def clear_memory(env, memory: Out[SonarMemory]):
-    for slot in range(memory.step.shape[1]):
-        memory.step[env, slot] = -1
-    for cloud in range(memory.cloud_until.shape[1]):
-        memory.cloud_until[env, cloud] = 0
+def clear_memory(env, io: Bundle[SonarIO]):
+    for slot in range(io.sonar_memory.step.shape[1]):
+        io.sonar_memory.step[env, slot] = -1
+    for cloud in range(io.sonar_memory.cloud_until.shape[1]):
+        io.sonar_memory.cloud_until[env, cloud] = 0
 
 
 @quick_launch
 @ti.kernel
-def cast_sonar(
-    scan: Out[SonarScan],
-    memory: Out[SonarMemory],
-    ego: In[Proprioception],
-    vehicle: In[VehicleState],
-    world: In[WorldState],
-    episode: In[EpisodeState],
-    clock: In[ClockState],
-    sonar: Const[SonarConfig],
-    tank: Const[TankConfig],
-    rules: Const[EpisodeConfig],
-):
+def cast_sonar(io: Bundle[SonarIO]):
     """Ping where a ping is due, deliver what is due; ``scan.fresh`` is 1 only in the step of delivery.
 
     A ping at step s is delivered at s + latency_steps. The first ping of an episode is delivered at once (and only then), so that the first
     observation is not empty. ``memory`` needs n_latency > latency_steps / period_steps.
     """
-    n = ti.static(clock.awake.shape[0])
-    n_packet = ti.static(sonar.n_ray // LANES)
+    n = ti.static(io.clock.awake.shape[0])
+    n_packet = ti.static(io.sonar_cfg.n_ray // LANES)
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and clock.awake[env] == 1 and clock.step[env] % sonar.period_steps == 0:
-            place_sonar(env, memory, vehicle, world)
-            if ti.static(sonar.bubble_clouds_per_s > 0):
-                start_cloud(env, memory, episode, clock, sonar, rules)
+        if pad == 0 and io.clock.awake[env] == 1 and io.clock.step[env] % io.sonar_cfg.period_steps == 0:
+            place_sonar(env, io)
+            if ti.static(io.sonar_cfg.bubble_clouds_per_s > 0):
+                start_cloud(env, io)
     for env, packet, pad in ti.ndrange(n, n_packet, ti.static(spread(n * n_packet))):
-        if pad == 0 and clock.awake[env] == 1:
-            step = clock.step[env]
-            if step % sonar.period_steps == 0:
-                ping(env, packet, step, scan, memory, ego, world, episode, sonar, tank)
-            deliver(env, packet, step, scan, memory, sonar)
+        if pad == 0 and io.clock.awake[env] == 1:
+            step = io.clock.step[env]
+            if step % io.sonar_cfg.period_steps == 0:
+                ping(env, packet, step, io)
+            deliver(env, packet, step, io)
 
 
 @ti.func
-def ping(
-    env,
-    packet,
-    step,
-    scan: Out[SonarScan],
-    memory: Out[SonarMemory],
-    ego: In[Proprioception],
-    world: In[WorldState],
-    episode: In[EpisodeState],
-    sonar: Const[SonarConfig],
-    tank: Const[TankConfig],
-):
+def ping(env, packet, step, io: Bundle[SonarIO]):
     """Sixteen beams: without latency straight into the scan, else into the ring."""
-    range_m, doppler, intensity = measured(env, packet, step, memory, world, episode, sonar, tank)
-    if ti.static(sonar.latency_steps == 0):
-        show(env, packet, step, range_m, doppler, intensity, scan, ego, sonar)
+    range_m, doppler, intensity = measured(env, packet, step, io)
+    if ti.static(io.sonar_cfg.latency_steps == 0):
+        show(env, packet, step, range_m, doppler, intensity, io)
     else:
-        queue(env, packet, step, range_m, doppler, intensity, memory, ego, sonar)
+        queue(env, packet, step, range_m, doppler, intensity, io)
 
 
 @ti.func
-def show(env, packet, step, range_m, doppler, intensity, scan: Out[SonarScan], ego: In[Proprioception], sonar: Const[SonarConfig]):
+def show(env, packet, step, range_m, doppler, intensity, io: Bundle[SonarIO]):
     """Write a packet to the output; its first packet also writes the own state of the ping."""
     for i in ti.static(range(LANES)):
         ray = packet * LANES + i
         hit = range_m[i] < FAR_M
-        scan.range_m[env, ray] = ti.select(hit, range_m[i], sonar.max_range_m)
-        scan.doppler_m_s[env, ray] = ti.select(hit, doppler[i], 0.0)
-        scan.intensity[env, ray] = ti.select(hit, intensity[i], 0.0)
-        scan.hit[env, ray] = ti.select(hit, 1, 0)
+        io.scan.range_m[env, ray] = ti.select(hit, range_m[i], io.sonar_cfg.max_range_m)
+        io.scan.doppler_m_s[env, ray] = ti.select(hit, doppler[i], 0.0)
+        io.scan.intensity[env, ray] = ti.select(hit, intensity[i], 0.0)
+        io.scan.hit[env, ray] = ti.select(hit, 1, 0)
     if packet == 0:
-        scan.ping_step[env] = step
-        scan.ping_pos_w[env] = ego.pos_w[env]
-        scan.ping_yaw[env] = ego.rpy[env][2]
-        scan.ping_vel_b[env] = ego.vel_b[env]
-        scan.ping_vel_valid[env] = ego.vel_valid[env]
+        io.scan.ping_step[env] = step
+        io.scan.ping_pos_w[env] = io.ego.pos_w[env]
+        io.scan.ping_yaw[env] = io.ego.rpy[env][2]
+        io.scan.ping_vel_b[env] = io.ego.vel_b[env]
+        io.scan.ping_vel_valid[env] = io.ego.vel_valid[env]
 
 
 @ti.func
-def queue(env, packet, step, range_m, doppler, intensity, memory: Out[SonarMemory], ego: In[Proprioception], sonar: Const[SonarConfig]):
+def queue(env, packet, step, range_m, doppler, intensity, io: Bundle[SonarIO]):
     """Write a packet to the ring of scans under way."""
-    slot = ring_slot(step, memory, sonar)
+    slot = ring_slot(step, io)
     for i in ti.static(range(LANES)):
         ray = packet * LANES + i
         hit = range_m[i] < FAR_M
-        memory.range_m[env, slot, ray] = ti.select(hit, range_m[i], sonar.max_range_m)
-        memory.doppler_m_s[env, slot, ray] = ti.select(hit, doppler[i], 0.0)
-        memory.intensity[env, slot, ray] = ti.select(hit, intensity[i], 0.0)
-        memory.hit[env, slot, ray] = ti.select(hit, 1, 0)
+        io.sonar_memory.range_m[env, slot, ray] = ti.select(hit, range_m[i], io.sonar_cfg.max_range_m)
+        io.sonar_memory.doppler_m_s[env, slot, ray] = ti.select(hit, doppler[i], 0.0)
+        io.sonar_memory.intensity[env, slot, ray] = ti.select(hit, intensity[i], 0.0)
+        io.sonar_memory.hit[env, slot, ray] = ti.select(hit, 1, 0)
     if packet == 0:
-        memory.step[env, slot] = step
-        memory.pos_w[env, slot] = ego.pos_w[env]
-        memory.yaw[env, slot] = ego.rpy[env][2]
-        memory.vel_b[env, slot] = ego.vel_b[env]
-        memory.vel_valid[env, slot] = ego.vel_valid[env]
+        io.sonar_memory.step[env, slot] = step
+        io.sonar_memory.pos_w[env, slot] = io.ego.pos_w[env]
+        io.sonar_memory.yaw[env, slot] = io.ego.rpy[env][2]
+        io.sonar_memory.vel_b[env, slot] = io.ego.vel_b[env]
+        io.sonar_memory.vel_valid[env, slot] = io.ego.vel_valid[env]
 
 
 @ti.func
-def ring_slot(step, memory: In[SonarMemory], sonar: Const[SonarConfig]):
+def ring_slot(step, io: Bundle[SonarIO]):
     """Slot of the ring in which the scan pinged at ``step`` waits."""
-    return (step // sonar.period_steps) % memory.step.shape[1]
+    return (step // io.sonar_cfg.period_steps) % io.sonar_memory.step.shape[1]
 
 
 @ti.func
-def deliver(env, packet, step, scan: Out[SonarScan], memory: In[SonarMemory], sonar: Const[SonarConfig]):
+def deliver(env, packet, step, io: Bundle[SonarIO]):
     """Move the scan that is due now from the ring to the output."""
-    pinged = step - sonar.latency_steps
-    if ti.static(sonar.latency_steps == 0):
+    pinged = step - io.sonar_cfg.latency_steps
+    if ti.static(io.sonar_cfg.latency_steps == 0):
         if packet == 0:
-            scan.fresh[env] = ti.cast(step % sonar.period_steps == 0, ti.i32)
+            io.scan.fresh[env] = ti.cast(step % io.sonar_cfg.period_steps == 0, ti.i32)
     else:
-        due = step == 0 or (pinged > 0 and pinged % sonar.period_steps == 0)
-        slot = ring_slot(ti.max(pinged, 0), memory, sonar)
+        due = step == 0 or (pinged > 0 and pinged % io.sonar_cfg.period_steps == 0)
+        slot = ring_slot(ti.max(pinged, 0), io)
         if packet == 0:
-            scan.fresh[env] = ti.cast(due, ti.i32)
+            io.scan.fresh[env] = ti.cast(due, ti.i32)
         if due:
             if packet == 0:
-                scan.ping_step[env] = memory.step[env, slot]
-                scan.ping_pos_w[env] = memory.pos_w[env, slot]
-                scan.ping_yaw[env] = memory.yaw[env, slot]
-                scan.ping_vel_b[env] = memory.vel_b[env, slot]
-                scan.ping_vel_valid[env] = memory.vel_valid[env, slot]
+                io.scan.ping_step[env] = io.sonar_memory.step[env, slot]
+                io.scan.ping_pos_w[env] = io.sonar_memory.pos_w[env, slot]
+                io.scan.ping_yaw[env] = io.sonar_memory.yaw[env, slot]
+                io.scan.ping_vel_b[env] = io.sonar_memory.vel_b[env, slot]
+                io.scan.ping_vel_valid[env] = io.sonar_memory.vel_valid[env, slot]
             for ray in range(packet * LANES, (packet + 1) * LANES):
-                scan.range_m[env, ray] = memory.range_m[env, slot, ray]
-                scan.doppler_m_s[env, ray] = memory.doppler_m_s[env, slot, ray]
-                scan.intensity[env, ray] = memory.intensity[env, slot, ray]
-                scan.hit[env, ray] = memory.hit[env, slot, ray]
+                io.scan.range_m[env, ray] = io.sonar_memory.range_m[env, slot, ray]
+                io.scan.doppler_m_s[env, ray] = io.sonar_memory.doppler_m_s[env, slot, ray]
+                io.scan.intensity[env, ray] = io.sonar_memory.intensity[env, slot, ray]
+                io.scan.hit[env, ray] = io.sonar_memory.hit[env, slot, ray]
 
 
 # ---------------------------------------------------------------------------------------------------------------- measurement
 
 
 @ti.func
-def measured(
-    env,
-    packet,
-    step,
-    memory: In[SonarMemory],
-    world: In[WorldState],
-    episode: In[EpisodeState],
-    sonar: Const[SonarConfig],
-    tank: Const[TankConfig],
-):
+def measured(env, packet, step, io: Bundle[SonarIO]):
     """(range, Doppler, intensity) of sixteen beams as the sensor reports them; range FAR_M = no return."""
-    mount = sonar_mount(env, memory)
-    ux, uy = beam_directions(packet, mount.heading, sonar)
-    wedge = packet_wedge(packet, mount.heading, sonar)
-    slope = ti.static(math.tan(math.radians(sonar.vertical_half_aperture_deg)))
-    echo = nearest_echo(env, mount.pos[0], mount.pos[1], mount.pos[2], ux, uy, 0.0, slope, wedge, True, memory, world, tank)
+    mount = sonar_mount(env, io)
+    ux, uy = beam_directions(packet, mount.heading, io)
+    wedge = packet_wedge(packet, mount.heading, io)
+    slope = ti.static(math.tan(math.radians(io.sonar_cfg.vertical_half_aperture_deg)))
+    echo = nearest_echo(env, mount.pos[0], mount.pos[1], mount.pos[2], ux, uy, 0.0, slope, wedge, True, io)
     cosine = -(ux * echo.normal_x + uy * echo.normal_y)
     own = ux * mount.vel[0] + uy * mount.vel[1]
-    key, ray = episode.key[env], packet * LANES
-    bounced, away = ghosted(env, echo, cosine, ux, uy, mount.pos, slope, wedge, key, step, ray, memory, world, sonar, tank)
-    clear = grazing_lost(bounced, cosine, sonar)
-    clouded, still, bright = cloud_covered(env, clear, away, cosine, mount.heading, ray, step, memory, sonar)
-    heard = missed(clouded, key, step, ray, sonar)
-    noisy = range_noisy(heard, key, step, ray, sonar)
-    told, speed, lit = falsely_returned(noisy, still, bright, key, step, ray, sonar)
-    final = cut_off(told, sonar)
-    doppler = doppler_noisy(speed - own, key, step, ray, sonar)
-    intensity = ti.max(lit, _DIMMEST) * (1.0 - _FALLOFF / sonar.max_range_m * ti.min(final, sonar.max_range_m))
+    key, ray = io.episode.key[env], packet * LANES
+    bounced, away = ghosted(env, echo, cosine, ux, uy, mount.pos, slope, wedge, key, step, ray, io)
+    clear = grazing_lost(bounced, cosine, io)
+    clouded, still, bright = cloud_covered(env, clear, away, cosine, mount.heading, ray, step, io)
+    heard = missed(clouded, key, step, ray, io)
+    noisy = range_noisy(heard, key, step, ray, io)
+    told, speed, lit = falsely_returned(noisy, still, bright, key, step, ray, io)
+    final = cut_off(told, io)
+    doppler = doppler_noisy(speed - own, key, step, ray, io)
+    intensity = ti.max(lit, _DIMMEST) * (1.0 - _FALLOFF / io.sonar_cfg.max_range_m * ti.min(final, io.sonar_cfg.max_range_m))
     return final, doppler, intensity
 
 
 @ti.func
-def place_sonar(env, memory: Out[SonarMemory], vehicle: In[VehicleState], world: In[WorldState]):
+def place_sonar(env, io: Bundle[SonarIO]):
     """Truth of a ping that all its beams share, once per ping: roll and pitch do not matter."""
-    R_wb = rotation_wb(vehicle.quat_wb[env])
-    vel_w = R_wb @ vehicle.vel_b[env]
+    R_wb = rotation_wb(io.vehicle.quat_wb[env])
+    vel_w = R_wb @ io.vehicle.vel_b[env]
     ahead = ti.Vector([R_wb[0, 0], R_wb[1, 0]])
     heading = ahead / ti.max(ahead.norm(), 1.0e-6)
-    memory.mount_w[env] = vehicle.pos_w[env]
-    memory.mount_vel_w[env] = ti.Vector([vel_w[0], vel_w[1]])
-    memory.heading_w[env] = heading
-    place_bodies(env, vehicle.pos_w[env][0], vehicle.pos_w[env][1], world, memory)
+    io.sonar_memory.mount_w[env] = io.vehicle.pos_w[env]
+    io.sonar_memory.mount_vel_w[env] = ti.Vector([vel_w[0], vel_w[1]])
+    io.sonar_memory.heading_w[env] = heading
+    place_bodies(env, io.vehicle.pos_w[env][0], io.vehicle.pos_w[env][1], io)
 
 
 @ti.func
-def sonar_mount(env, memory: In[SonarMemory]):
+def sonar_mount(env, io: Bundle[SonarIO]):
     """Where the sonar is, how it moves and where it looks."""
-    return Mount(pos=memory.mount_w[env].cast(ti.f32), vel=memory.mount_vel_w[env].cast(ti.f32), heading=memory.heading_w[env].cast(ti.f32))
+    return Mount(
+        pos=io.sonar_memory.mount_w[env].cast(ti.f32),
+        vel=io.sonar_memory.mount_vel_w[env].cast(ti.f32),
+        heading=io.sonar_memory.heading_w[env].cast(ti.f32),
+    )
 
 
 @ti.func
-def direction_before(packet, heading, sonar: Const[SonarConfig]):
+def direction_before(packet, heading, io: Bundle[SonarIO]):
     """Direction (x, y) one beam before a packet's first, where no cosine or sine of a lane's turn is 0 or 1, so that all lanes stay alike.
 
     The packet's turn comes from a table of constants.
     """
     c, s = 0.0, 0.0
-    for k in ti.static(range(sonar.n_ray // LANES)):
+    for k in ti.static(range(io.sonar_cfg.n_ray // LANES)):
         if packet == k:
-            turn = ti.static(2.0 * math.pi * (LANES * k - 1) / sonar.n_ray)
+            turn = ti.static(2.0 * math.pi * (LANES * k - 1) / io.sonar_cfg.n_ray)
             cosine, sine = ti.static(math.cos(turn), math.sin(turn))
             c, s = cosine, sine
     return ti.Vector([c * heading[0] - s * heading[1], s * heading[0] + c * heading[1]])
 
 
 @ti.func
-def beam_directions(packet, heading, sonar: Const[SonarConfig]):
+def beam_directions(packet, heading, io: Bundle[SonarIO]):
     """Horizontal unit vectors (x, y) of a packet's beams."""
-    before = direction_before(packet, heading, sonar)
+    before = direction_before(packet, heading, io)
     ux, uy = f16x(0.0), f16x(0.0)
     for i in ti.static(range(LANES)):
-        turn = ti.static(2.0 * math.pi * (i + 1) / sonar.n_ray)
+        turn = ti.static(2.0 * math.pi * (i + 1) / io.sonar_cfg.n_ray)
         c, s = ti.static(math.cos(turn), math.sin(turn))
         ux[i] = before[0] * c - before[1] * s
         uy[i] = before[0] * s + before[1] * c
@@ -278,11 +250,11 @@ def beam_directions(packet, heading, sonar: Const[SonarConfig]):
 
 
 @ti.func
-def packet_wedge(packet, heading, sonar: Const[SonarConfig]):
+def packet_wedge(packet, heading, io: Bundle[SonarIO]):
     """(x, y) of the middle direction of a packet's beams, then (cos, sin) of the half angle between its outermost beams."""
-    half = ti.static((LANES - 1) * math.pi / sonar.n_ray)
-    middle = ti.static(half + 2.0 * math.pi / sonar.n_ray)
+    half = ti.static((LANES - 1) * math.pi / io.sonar_cfg.n_ray)
+    middle = ti.static(half + 2.0 * math.pi / io.sonar_cfg.n_ray)
     c, s = ti.static(math.cos(middle), math.sin(middle))
-    before = direction_before(packet, heading, sonar)
+    before = direction_before(packet, heading, io)
     x, y = c * before[0] - s * before[1], s * before[0] + c * before[1]
     return ti.Vector([x, y, ti.static(math.cos(half)), ti.static(math.sin(half))])

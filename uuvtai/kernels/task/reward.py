@@ -7,11 +7,10 @@ Safety terms come from the referee (truth), which the reward may use; the policy
 
 import taichi as ti
 
-from uuvtai.config import EpisodeConfig, RewardConfig, VehicleConfig
 from uuvtai.kernels.core.geometry import rotation_wb
-from uuvtai.kernels.core.signature import Const, In, Out, quick_launch, spread
+from uuvtai.kernels.core.signature import AnyVector, Bundle, Const, FloatMatrix, FloatVector, IntVector, quick_launch, spread
+from uuvtai.kernels.task.bundles import RewardIO
 from uuvtai.outcomes import COLLISION, OUT_OF_TANK, SUCCESS, TIMEOUT
-from uuvtai.state import ActuationState, ClockState, RefereeState, RewardState, RouteState, VehicleState
 
 TERMS = (
     "alive",
@@ -51,93 +50,82 @@ def is_failure(outcome):
 
 @quick_launch
 @ti.kernel
-def reset_reward(reward: Out[RewardState], clock: In[ClockState]):
+def reset_reward(io: Bundle[RewardIO]):
     """Forget the last episode of the awake rows."""
-    for env in range(ti.static(clock.awake.shape[0])):
-        if clock.awake[env] == 1:
+    for env in range(ti.static(io.clock.awake.shape[0])):
+        if io.clock.awake[env] == 1:
             for term in range(ti.static(N_TERM)):
-                reward.term[env, term] = 0.0
-                reward.episode_sum[env, term] = 0.0
-            reward.total[env] = 0.0
-            reward.episode_return[env] = 0.0
-            reward.last_remaining_m[env] = _UNKNOWN_M
+                io.reward.term[env, term] = 0.0
+                io.reward.episode_sum[env, term] = 0.0
+            io.reward.total[env] = 0.0
+            io.reward.episode_return[env] = 0.0
+            io.reward.last_remaining_m[env] = _UNKNOWN_M
 
 
 @ti.func
-def route_progress(
-    env, reward: Out[RewardState], vehicle: In[VehicleState], route: In[RouteState], clock: In[ClockState], dt_s: Const[float]
-):
+def route_progress(env, dt_s: Const[float], io: Bundle[RewardIO]):
     """Route length gained in this step [m], never more than the vehicle moved, so that no jump of the route or of the foot on it pays.
 
     Where a new route was just adopted (or none is known from before), lengths of two routes would be compared: the movement towards the
     look-ahead point stands in.
     """
-    R_wb = rotation_wb(vehicle.quat_wb[env])
-    vel_w = R_wb @ vehicle.vel_b[env]
+    R_wb = rotation_wb(io.vehicle.quat_wb[env])
+    vel_w = R_wb @ io.vehicle.vel_b[env]
     step_x, step_y = dt_s * vel_w[0], dt_s * vel_w[1]
     moved = ti.sqrt(step_x * step_x + step_y * step_y)
     remaining = _UNKNOWN_M + 0.0
     gained = 0.0
-    if route.n_way[env] > 0:
-        remaining = route.remaining_m[env]
-        if reward.last_remaining_m[env] < 0.0 or route.plan_step[env] == clock.step[env]:
-            ahead = route.lookahead_w[env] - vehicle.pos_w[env]
+    if io.route.n_way[env] > 0:
+        remaining = io.route.remaining_m[env]
+        if io.reward.last_remaining_m[env] < 0.0 or io.route.plan_step[env] == io.clock.step[env]:
+            ahead = io.route.lookahead_w[env] - io.vehicle.pos_w[env]
             ahead_m = ti.sqrt(ahead[0] * ahead[0] + ahead[1] * ahead[1])
             gained = (step_x * ahead[0] + step_y * ahead[1]) / ti.max(ahead_m, 1e-6)
         else:
-            gained = ti.math.clamp(reward.last_remaining_m[env] - remaining, -moved, moved)
-    reward.last_remaining_m[env] = remaining
+            gained = ti.math.clamp(io.reward.last_remaining_m[env] - remaining, -moved, moved)
+    io.reward.last_remaining_m[env] = remaining
     return gained
 
 
 @ti.func
-def control_effort(env, actuation: In[ActuationState], vehicle_cfg: Const[VehicleConfig]):
+def control_effort(env, io: Bundle[RewardIO]):
     """E_t: mean square of the command in units of its limits, 0 to 1."""
-    command = actuation.command[env]
-    surge = command[0] / vehicle_cfg.max_surge_m_s
-    sway = command[1] / vehicle_cfg.max_sway_m_s
-    heave = command[2] / vehicle_cfg.max_heave_m_s
-    yaw = command[3] / vehicle_cfg.max_yaw_rate_rad_s
+    command = io.actuation.command[env]
+    surge = command[0] / io.vehicle_cfg.max_surge_m_s
+    sway = command[1] / io.vehicle_cfg.max_sway_m_s
+    heave = command[2] / io.vehicle_cfg.max_heave_m_s
+    yaw = command[3] / io.vehicle_cfg.max_yaw_rate_rad_s
     return 0.25 * (surge * surge + sway * sway + heave * heave + yaw * yaw)
 
 
 @ti.func
-def unweighted_terms(
-    env,
-    progress,
-    referee: In[RefereeState],
-    vehicle: In[VehicleState],
-    route: In[RouteState],
-    actuation: In[ActuationState],
-    reward_cfg: Const[RewardConfig],
-    vehicle_cfg: Const[VehicleConfig],
-):
+def unweighted_terms(env, progress, io: Bundle[RewardIO]):
     """Every term before its weight, in the order of TERMS. Path terms are 0 while there is no route."""
-    upright = rotation_wb(vehicle.quat_wb[env])[2, 2]
-    over = ti.max(0.0, vehicle.vel_b[env].norm() - reward_cfg.safe_speed_m_s)
-    outcome = referee.outcome[env]
+    upright = rotation_wb(io.vehicle.quat_wb[env])[2, 2]
+    over = ti.max(0.0, io.vehicle.vel_b[env].norm() - io.reward_cfg.safe_speed_m_s)
+    outcome = io.referee.outcome[env]
     reference = 0.0
     cross_track = 0.0
     heading = 0.0
-    if route.n_way[env] > 0:
-        reference = (route.lookahead_w[env] - vehicle.pos_w[env]).norm()
-        cross_track = ti.abs(route.cross_track_m[env])
-        heading = ti.cos(route.heading_error[env])
+    if io.route.n_way[env] > 0:
+        reference = (io.route.lookahead_w[env] - io.vehicle.pos_w[env]).norm()
+        cross_track = ti.abs(io.route.cross_track_m[env])
+        heading = ti.cos(io.route.heading_error[env])
     return ti.Vector(
         [
             1.0,
             progress,
             reference,
             cross_track,
-            ti.math.clamp(1.0 - referee.clearance_m[env] / reward_cfg.soft_clearance_m, 0.0, 1.0),
-            ti.math.clamp(1.0 - referee.ttc_s[env] / reward_cfg.soft_ttc_s, 0.0, 1.0),
+            ti.math.clamp(1.0 - io.referee.clearance_m[env] / io.reward_cfg.soft_clearance_m, 0.0, 1.0),
+            ti.math.clamp(1.0 - io.referee.ttc_s[env] / io.reward_cfg.soft_ttc_s, 0.0, 1.0),
             over * over,
             upright,
             heading,
             ti.cast(outcome == SUCCESS, ti.f32),
             ti.cast(is_failure(outcome), ti.f32),
             ti.acos(ti.math.clamp(upright, -1.0, 1.0)),
-            control_effort(env, actuation, vehicle_cfg),
+            control_effort(env, io),
         ]
     )
 
@@ -145,38 +133,30 @@ def unweighted_terms(
 @quick_launch
 @ti.kernel
 def compute_reward(
-    reward_out: ti.types.ndarray(dtype=ti.f32, ndim=1),  # type: ignore[valid-type]
-    terminated: ti.types.ndarray(ndim=1),  # type: ignore[valid-type]
-    truncated: ti.types.ndarray(ndim=1),  # type: ignore[valid-type]
-    reward: Out[RewardState],
-    referee: In[RefereeState],
-    vehicle: In[VehicleState],
-    route: In[RouteState],
-    actuation: In[ActuationState],
-    clock: In[ClockState],
-    reward_cfg: Const[RewardConfig],
-    vehicle_cfg: Const[VehicleConfig],
-    episode_cfg: Const[EpisodeConfig],
+    io: Bundle[RewardIO],
+    reward_out: FloatVector,
+    terminated: AnyVector,
+    truncated: AnyVector,
 ):
     """Reward of the step, weighted terms, their sums, and how the step ended. Rows that sleep earn 0 and keep their end."""
-    weights = ti.Vector(ti.static(list(signed_weights(reward_cfg))))
-    n = ti.static(clock.awake.shape[0])
+    weights = ti.Vector(ti.static(list(signed_weights(io.reward_cfg))))
+    n = ti.static(io.clock.awake.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and clock.awake[env] == 0:
+        if pad == 0 and io.clock.awake[env] == 0:
             reward_out[env] = 0.0
-        if pad == 0 and clock.awake[env] == 1:
-            progress = route_progress(env, reward, vehicle, route, clock, episode_cfg.control_dt_s)
-            terms = unweighted_terms(env, progress, referee, vehicle, route, actuation, reward_cfg, vehicle_cfg)
+        if pad == 0 and io.clock.awake[env] == 1:
+            progress = route_progress(env, io.episode_cfg.control_dt_s, io)
+            terms = unweighted_terms(env, progress, io)
             total = 0.0
             for i in ti.static(range(N_TERM)):
                 weighted = weights[i] * terms[i]
-                reward.term[env, i] = weighted
-                reward.episode_sum[env, i] += weighted
+                io.reward.term[env, i] = weighted
+                io.reward.episode_sum[env, i] += weighted
                 total += weighted
-            reward.total[env] = total
-            reward.episode_return[env] += total
+            io.reward.total[env] = total
+            io.reward.episode_return[env] += total
             reward_out[env] = total
-            outcome = referee.outcome[env]
+            outcome = io.referee.outcome[env]
             terminated[env] = ti.cast(outcome == SUCCESS, ti.i32) | is_failure(outcome)
             truncated[env] = ti.cast(outcome == TIMEOUT, ti.i32)
 
@@ -184,20 +164,18 @@ def compute_reward(
 @quick_launch
 @ti.kernel
 def tell_step(
-    terms: ti.types.ndarray(dtype=ti.f32, ndim=2),  # type: ignore[valid-type]
-    episode_terms: ti.types.ndarray(dtype=ti.f32, ndim=2),  # type: ignore[valid-type]
-    episode_return: ti.types.ndarray(dtype=ti.f32, ndim=1),  # type: ignore[valid-type]
-    episode_steps: ti.types.ndarray(dtype=ti.i32, ndim=1),  # type: ignore[valid-type]
-    outcome: ti.types.ndarray(dtype=ti.i32, ndim=1),  # type: ignore[valid-type]
-    reward: In[RewardState],
-    referee: In[RefereeState],
-    clock: In[ClockState],
+    io: Bundle[RewardIO],
+    terms: FloatMatrix,
+    episode_terms: FloatMatrix,
+    episode_return: FloatVector,
+    episode_steps: IntVector,
+    outcome: IntVector,
 ):
     """How the step and the episode so far went, for whoever learns from it: weighted terms, their sums, return, steps and outcome."""
-    for env in range(ti.static(clock.awake.shape[0])):
+    for env in range(ti.static(io.clock.awake.shape[0])):
         for i in ti.static(range(N_TERM)):
-            terms[env, i] = ti.cast(reward.term[env, i], ti.f32)
-            episode_terms[env, i] = ti.cast(reward.episode_sum[env, i], ti.f32)
-        episode_return[env] = ti.cast(reward.episode_return[env], ti.f32)
-        episode_steps[env] = clock.step[env]
-        outcome[env] = referee.outcome[env]
+            terms[env, i] = ti.cast(io.reward.term[env, i], ti.f32)
+            episode_terms[env, i] = ti.cast(io.reward.episode_sum[env, i], ti.f32)
+        episode_return[env] = ti.cast(io.reward.episode_return[env], ti.f32)
+        episode_steps[env] = io.clock.step[env]
+        outcome[env] = io.referee.outcome[env]

@@ -2,180 +2,117 @@
 
 import taichi as ti
 
-from uuvtai.config import MappingConfig, TankConfig, TeacherConfig, TrackingConfig, VehicleConfig
 from uuvtai.kernels.core.geometry import FAR_M, TWO_PI, turned_z3
 from uuvtai.kernels.core.lanes import LANES, f16x, put_column
-from uuvtai.kernels.core.signature import Const, In, Out, quick_launch, spread
+from uuvtai.kernels.core.signature import Bundle, quick_launch, spread
+from uuvtai.kernels.teacher.bundles import EvasionIO
 from uuvtai.kernels.teacher.rollout import body_depths, depth_band, static_depths
-from uuvtai.state import ClearanceState, ClockState, ForecastState, Proprioception, TeacherState
 
 
 @quick_launch
 @ti.kernel
-def plan_evasion(
-    teacher: Out[TeacherState],
-    forecast: In[ForecastState],
-    clearance: In[ClearanceState],
-    ego: In[Proprioception],
-    clock: In[ClockState],
-    teacher_cfg: Const[TeacherConfig],
-    vehicle_cfg: Const[VehicleConfig],
-    tracking_cfg: Const[TrackingConfig],
-    tank_cfg: Const[TankConfig],
-    mapping_cfg: Const[MappingConfig],
-):
+def plan_evasion(io: Bundle[EvasionIO]):
     """Best evasive velocity of the envs with ``want_evade``: the softmax mean of the candidates where that is as good as the best one."""
-    n, n_packet = ti.static(clock.awake.shape[0], teacher.candidate_cost.shape[1] // LANES)
+    n, n_packet = ti.static(io.clock.awake.shape[0], io.teacher.candidate_cost.shape[1] // LANES)
     for env, packet in ti.ndrange(n, n_packet):
-        if clock.awake[env] == 1 and teacher.want_evade[env] == 1:
-            cx, cy, cz = candidate_lanes(env, packet * LANES, teacher, ego, teacher_cfg, vehicle_cfg, tank_cfg)
-            burst_s = ti.select(packet * LANES >= teacher_cfg.first_burst, teacher_cfg.burst_s, FAR_M)
-            cost = cost_lanes(env, cx, cy, cz, burst_s, teacher, forecast, clearance, ego, teacher_cfg, tracking_cfg, tank_cfg, mapping_cfg)
+        if io.clock.awake[env] == 1 and io.teacher.want_evade[env] == 1:
+            cx, cy, cz = candidate_lanes(env, packet * LANES, io)
+            burst_s = ti.select(packet * LANES >= io.teacher_cfg.first_burst, io.teacher_cfg.burst_s, FAR_M)
+            cost = cost_lanes(env, cx, cy, cz, burst_s, io)
             for i in ti.static(range(LANES)):
-                teacher.candidate_cost[env, packet * LANES + i] = cost[i]
+                io.teacher.candidate_cost[env, packet * LANES + i] = cost[i]
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and clock.awake[env] == 1 and teacher.want_evade[env] == 1:
-            best, best_cost, mean = _chosen(env, teacher, ego, teacher_cfg, vehicle_cfg, tank_cfg)
+        if pad == 0 and io.clock.awake[env] == 1 and io.teacher.want_evade[env] == 1:
+            best, best_cost, mean = _chosen(env, io)
             cx, cy, cz = f16x(0.0), f16x(0.0), f16x(0.0)
             for i in ti.static(range(LANES)):
                 cx[i], cy[i], cz[i] = mean[0], mean[1], mean[2]
-            cost = cost_lanes(
-                env,
-                cx,
-                cy,
-                cz,
-                FAR_M,
-                teacher,
-                forecast,
-                clearance,
-                ego,
-                teacher_cfg,
-                tracking_cfg,
-                tank_cfg,
-                mapping_cfg,
-            )
-            good = cost[0] <= best_cost + ti.static(teacher_cfg.softness)
-            teacher.evade_vel_w[env] = ti.select(good, mean, best)
-            teacher.evade_cost[env] = ti.select(good, cost[0], best_cost)
+            cost = cost_lanes(env, cx, cy, cz, FAR_M, io)
+            good = cost[0] <= best_cost + ti.static(io.teacher_cfg.softness)
+            io.teacher.evade_vel_w[env] = ti.select(good, mean, best)
+            io.teacher.evade_cost[env] = ti.select(good, cost[0], best_cost)
 
 
 @ti.func
-def candidate_lanes(
-    env,
-    first,
-    teacher: In[TeacherState],
-    ego: In[Proprioception],
-    teacher_cfg: Const[TeacherConfig],
-    vehicle_cfg: Const[VehicleConfig],
-    tank_cfg: Const[TankConfig],
-):
+def candidate_lanes(env, first, io: Bundle[EvasionIO]):
     """World velocities (lanes x, y, z [m/s]) of candidates first .. first + 15."""
     cx, cy, cz = f16x(0.0), f16x(0.0), f16x(0.0)
     velocities = ti.Matrix.zero(ti.f32, 3, LANES)
     for lane in range(LANES):
-        put_column(velocities, lane, candidate(env, first + lane, teacher, ego, teacher_cfg, vehicle_cfg, tank_cfg))
+        put_column(velocities, lane, candidate(env, first + lane, io))
     for i in ti.static(range(LANES)):
         cx[i], cy[i], cz[i] = velocities[0, i], velocities[1, i], velocities[2, i]
     return cx, cy, cz
 
 
 @ti.func
-def candidate(
-    env,
-    index,
-    teacher: In[TeacherState],
-    ego: In[Proprioception],
-    teacher_cfg: Const[TeacherConfig],
-    vehicle_cfg: Const[VehicleConfig],
-    tank_cfg: Const[TankConfig],
-):
+def candidate(env, index, io: Bundle[EvasionIO]):
     """World velocity of one candidate. Heading 0 is the follow direction, so that slowing down on the route is among them.
 
     First the level ones (they keep the heave of following), then stop, last command and follow, then those that climb and those that dive,
     and from ``first_burst`` on the level dashes, which last ``burst_s`` only. Padding repeats standing still.
     """
-    n_level, n_heave = ti.static(teacher_cfg.n_heading * teacher_cfg.n_speed, teacher_cfg.n_heave_heading)
-    follow = teacher.follow_vel_w[env]
+    n_level, n_heave = ti.static(io.teacher_cfg.n_heading * io.teacher_cfg.n_speed, io.teacher_cfg.n_heave_heading)
+    follow = io.teacher.follow_vel_w[env]
     out = ti.Vector([0.0, 0.0, 0.0])
-    if index >= ti.static(teacher_cfg.first_burst):
-        turn = ti.static(TWO_PI / 32) * (index - ti.static(teacher_cfg.first_burst))
-        out = _towards(env, turn, 1.0, follow[2], teacher, ego, teacher_cfg, vehicle_cfg)
+    if index >= ti.static(io.teacher_cfg.first_burst):
+        turn = ti.static(TWO_PI / 32) * (index - ti.static(io.teacher_cfg.first_burst))
+        out = _towards(env, turn, 1.0, follow[2], io)
     elif index < n_level:
-        speed = 1.0 / ti.static(teacher_cfg.n_speed) * (index // ti.static(teacher_cfg.n_heading) + 1)
-        turn = ti.static(TWO_PI / teacher_cfg.n_heading) * (index % ti.static(teacher_cfg.n_heading))
-        out = _towards(env, turn, speed, follow[2], teacher, ego, teacher_cfg, vehicle_cfg)
+        speed = 1.0 / ti.static(io.teacher_cfg.n_speed) * (index // ti.static(io.teacher_cfg.n_heading) + 1)
+        turn = ti.static(TWO_PI / io.teacher_cfg.n_heading) * (index % ti.static(io.teacher_cfg.n_heading))
+        out = _towards(env, turn, speed, follow[2], io)
     elif index == n_level + 1:
-        out = teacher.last_vel_w[env]
-        out[2] = edge_limited(out[2], ego.pos_w[env][2], teacher_cfg, tank_cfg)
+        out = io.teacher.last_vel_w[env]
+        out[2] = edge_limited(out[2], io.ego.pos_w[env][2], io)
     elif index == n_level + 2:
         out = follow
-    elif index > n_level + 2 and index < ti.static(teacher_cfg.n_held):
+    elif index > n_level + 2 and index < ti.static(io.teacher_cfg.n_held):
         nth = index - n_level - 3
-        heave = edge_limited(ti.select(nth % 2 == 0, 1.0, -1.0) * teacher_cfg.heave_m_s, ego.pos_w[env][2], teacher_cfg, tank_cfg)
-        turn = ti.static(TWO_PI / teacher_cfg.n_heave_heading) * (nth // 2)
-        out = _towards(env, turn, ti.select(nth >= 2 * n_heave, 0.0, 1.0), heave, teacher, ego, teacher_cfg, vehicle_cfg)
+        heave = edge_limited(ti.select(nth % 2 == 0, 1.0, -1.0) * io.teacher_cfg.heave_m_s, io.ego.pos_w[env][2], io)
+        turn = ti.static(TWO_PI / io.teacher_cfg.n_heave_heading) * (nth // 2)
+        out = _towards(env, turn, ti.select(nth >= 2 * n_heave, 0.0, 1.0), heave, io)
     return out
 
 
 @ti.func
-def _towards(
-    env,
-    turn,
-    share,
-    heave,
-    teacher: In[TeacherState],
-    ego: In[Proprioception],
-    teacher_cfg: Const[TeacherConfig],
-    vehicle_cfg: Const[VehicleConfig],
-):
+def _towards(env, turn, share, heave, io: Bundle[EvasionIO]):
     """World velocity at an angle from the follow direction, at a share of the speed possible there."""
-    follow = teacher.follow_vel_w[env]
+    follow = io.teacher.follow_vel_w[env]
     heading = ti.atan2(follow[1], follow[0]) + turn
-    speed = share * ti.min(ti.static(teacher_cfg.evade_m_s), speed_limit(heading - ego.rpy[env][2], vehicle_cfg))
+    speed = share * ti.min(ti.static(io.teacher_cfg.evade_m_s), speed_limit(heading - io.ego.rpy[env][2], io))
     return ti.Vector([ti.cos(heading) * speed, ti.sin(heading) * speed, heave])
 
 
 @ti.func
-def edge_limited(heave, own_z, teacher_cfg: Const[TeacherConfig], tank_cfg: Const[TankConfig]):
+def edge_limited(heave, own_z, io: Bundle[EvasionIO]):
     """Heave [m/s] that stops at the band's edges instead of running into floor or surface."""
-    low, high = ti.static(depth_band(tank_cfg, teacher_cfg))
+    low, high = ti.static(depth_band(io.tank_cfg, io.teacher_cfg))
     return ti.math.clamp(heave, ti.min(low - own_z, 0.0), ti.max(high - own_z, 0.0))
 
 
 @ti.func
-def speed_limit(angle, cfg: Const[VehicleConfig]):
+def speed_limit(angle, io: Bundle[EvasionIO]):
     """Fastest level speed in a direction of the body frame: surge and sway are limited one by one, so diagonals are faster."""
-    along = ti.abs(ti.cos(angle)) / ti.static(cfg.max_surge_m_s)
-    across = ti.abs(ti.sin(angle)) / ti.static(cfg.max_sway_m_s)
+    along = ti.abs(ti.cos(angle)) / ti.static(io.vehicle_cfg.max_surge_m_s)
+    across = ti.abs(ti.sin(angle)) / ti.static(io.vehicle_cfg.max_sway_m_s)
     return 1.0 / ti.max(along, across)
 
 
 @ti.func
-def cost_lanes(
-    env,
-    cx,
-    cy,
-    cz,
-    burst_s,
-    teacher: In[TeacherState],
-    forecast: In[ForecastState],
-    clearance: In[ClearanceState],
-    ego: In[Proprioception],
-    teacher_cfg: Const[TeacherConfig],
-    tracking_cfg: Const[TrackingConfig],
-    tank_cfg: Const[TankConfig],
-    mapping_cfg: Const[MappingConfig],
-):
+def cost_lanes(env, cx, cy, cz, burst_s, io: Bundle[EvasionIO]):
     """Cost of sixteen commanded velocities. Violations count by depth: a flat penalty drives straight on when every candidate is bad."""
-    pos, vel = ego.pos_w[env], turned_z3(ego.vel_b[env], ego.rpy[env][2])
+    pos, vel = io.ego.pos_w[env], turned_z3(io.ego.vel_b[env], io.ego.rpy[env][2])
     level, level_vel = ti.Vector([pos[0], pos[1]]), ti.Vector([vel[0], vel[1]])
-    peak, mean, contact, _ = body_depths(env, cx, cy, cz, burst_s, pos, vel, forecast, teacher_cfg, tracking_cfg, tank_cfg)
-    static_mean, static_contact = static_depths(env, cx, cy, burst_s, level, level_vel, clearance, teacher_cfg, tank_cfg, mapping_cfg)
-    off = _distance_lanes(cx, cy, cz, teacher.follow_vel_w[env]) * ti.static(teacher_cfg.weight_deviation / teacher_cfg.cruise_m_s)
-    change = _distance_lanes(cx, cy, cz, teacher.last_vel_w[env]) * ti.static(teacher_cfg.weight_change / teacher_cfg.cruise_m_s)
-    moving = peak * ti.static(teacher_cfg.weight_peak) + mean * ti.static(teacher_cfg.weight_mean)
-    touching = contact * ti.static(teacher_cfg.weight_contact) + static_contact * ti.static(teacher_cfg.weight_static_contact)
-    return moving + touching + static_mean * ti.static(teacher_cfg.weight_static) + off + change
+    peak, mean, contact, _ = body_depths(env, cx, cy, cz, burst_s, pos, vel, io.forecast, io.teacher_cfg, io.tracking_cfg, io.tank_cfg)
+    static_mean, static_contact = static_depths(
+        env, cx, cy, burst_s, level, level_vel, io.clearance, io.teacher_cfg, io.tank_cfg, io.mapping_cfg
+    )
+    off = _distance_lanes(cx, cy, cz, io.teacher.follow_vel_w[env]) * ti.static(io.teacher_cfg.weight_deviation / io.teacher_cfg.cruise_m_s)
+    change = _distance_lanes(cx, cy, cz, io.teacher.last_vel_w[env]) * ti.static(io.teacher_cfg.weight_change / io.teacher_cfg.cruise_m_s)
+    moving = peak * ti.static(io.teacher_cfg.weight_peak) + mean * ti.static(io.teacher_cfg.weight_mean)
+    touching = contact * ti.static(io.teacher_cfg.weight_contact) + static_contact * ti.static(io.teacher_cfg.weight_static_contact)
+    return moving + touching + static_mean * ti.static(io.teacher_cfg.weight_static) + off + change
 
 
 @ti.func
@@ -187,27 +124,20 @@ def _distance_lanes(cx, cy, cz, velocity):
 
 
 @ti.func
-def _chosen(
-    env,
-    teacher: In[TeacherState],
-    ego: In[Proprioception],
-    teacher_cfg: Const[TeacherConfig],
-    vehicle_cfg: Const[VehicleConfig],
-    tank_cfg: Const[TankConfig],
-):
+def _chosen(env, io: Bundle[EvasionIO]):
     """Candidate of least cost (first of equals), and the mean of the candidates weighted by exp(-cost / softness)."""
-    n_used = ti.static(teacher_cfg.n_candidate)
+    n_used = ti.static(io.teacher_cfg.n_candidate)
     best_cost, best = FAR_M, 0
     for index in range(n_used):
-        if teacher.candidate_cost[env, index] < best_cost:
-            best_cost = teacher.candidate_cost[env, index]
+        if io.teacher.candidate_cost[env, index] < best_cost:
+            best_cost = io.teacher.candidate_cost[env, index]
             best = index
     total, mean = 0.0, ti.Vector([0.0, 0.0, 0.0])
     for index in range(n_used):
-        excess = (teacher.candidate_cost[env, index] - best_cost) * ti.static(1.0 / teacher_cfg.softness)
+        excess = (io.teacher.candidate_cost[env, index] - best_cost) * ti.static(1.0 / io.teacher_cfg.softness)
         if excess < 12.0:
             weight = ti.exp(-excess)
             total += weight
-            mean += weight * candidate(env, index, teacher, ego, teacher_cfg, vehicle_cfg, tank_cfg)
+            mean += weight * candidate(env, index, io)
     average = ti.Vector([mean[i] / total for i in range(3)])
-    return candidate(env, best, teacher, ego, teacher_cfg, vehicle_cfg, tank_cfg), best_cost, average
+    return candidate(env, best, io), best_cost, average

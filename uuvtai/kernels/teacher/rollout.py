@@ -128,9 +128,9 @@ def static_depths(
 
 
 @ti.func
-def settling(time, cfg: Const[TeacherConfig]):
+def settling(time, teacher_cfg: Const[TeacherConfig]):
     """A(t) [s] of the module's text."""
-    return ti.static(cfg.lag_s) * (1.0 - ti.exp(-time * ti.static(1.0 / cfg.lag_s)))
+    return ti.static(teacher_cfg.lag_s) * (1.0 - ti.exp(-time * ti.static(1.0 / teacher_cfg.lag_s)))
 
 
 @ti.func
@@ -149,10 +149,10 @@ def clearance_lanes(env, x, y, clearance: In[ClearanceState], tank_cfg: Const[Ta
 
 
 @ti.func
-def held_heave(error_m, cfg: Const[TeacherConfig], vehicle_cfg: Const[VehicleConfig]):
+def held_heave(error_m, teacher_cfg: Const[TeacherConfig], vehicle_cfg: Const[VehicleConfig]):
     """Vertical speed [m/s] that corrects a depth error [m]."""
     top = ti.static(vehicle_cfg.max_heave_m_s)
-    return ti.math.clamp(error_m * ti.static(cfg.depth_gain), -top, top)
+    return ti.math.clamp(error_m * ti.static(teacher_cfg.depth_gain), -top, top)
 
 
 def depth_band(tank_cfg, teacher_cfg):

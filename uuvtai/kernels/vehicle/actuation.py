@@ -8,54 +8,43 @@ from typing import Any, NamedTuple
 
 import taichi as ti
 
-from uuvtai.config import ActuationConfig, EpisodeConfig, VehicleConfig
 from uuvtai.kernels.core.lanes import column, is_awake, n_awake, n_column, put_column
-from uuvtai.kernels.core.signature import Const, In, Out, quick_launch, spread
+from uuvtai.kernels.core.signature import Bundle, Const, FloatMatrix, In, Out, quick_launch, spread
+from uuvtai.kernels.vehicle.bundles import ActuationIO
 from uuvtai.kernels.vehicle.rotor import rpm_of_thrust, thrust_limits
-from uuvtai.state import ActuationState, Allocation, ClockState, Proprioception, VehicleParams
 
 
 @quick_launch
 @ti.kernel
-def command_thrusters(
-    action: ti.types.ndarray(dtype=ti.f32, ndim=2),  # type: ignore[valid-type]
-    actuation: Out[ActuationState],
-    params: In[VehicleParams],
-    allocation: In[Allocation],
-    ego: In[Proprioception],
-    clock: In[ClockState],
-    vehicle_cfg: Const[VehicleConfig],
-    actuation_cfg: Const[ActuationConfig],
-    episode_cfg: Const[EpisodeConfig],
-):
+def command_thrusters(io: Bundle[ActuationIO], action: FloatMatrix):
     """action (n_env, 4): surge, sway, heave, yaw rate in [-1, 1] of the vehicle's limits -> actuation.rpm_command."""
-    n, lanes = ti.static(clock.awake.shape[0], n_column())
+    n, lanes = ti.static(io.clock.awake.shape[0], n_column())
     n_packet = ti.static(-(-n // lanes))
     for packet, pad in ti.ndrange(n_packet, ti.static(spread(n_packet))):
-        if pad == 0 and n_awake(packet * lanes, lanes, clock) > 0:
+        if pad == 0 and n_awake(packet * lanes, lanes, io.clock) > 0:
             for env in range(packet * lanes, (packet + 1) * lanes):
-                if is_awake(env, clock):
+                if is_awake(env, io.clock):
                     raw = ti.Vector([action[env, 0], action[env, 1], action[env, 2], action[env, 3]])
-                    actuation.command[env] = scaled_command(raw, vehicle_cfg)
-            _drive(packet * lanes, lanes, actuation, params, allocation, ego, clock, vehicle_cfg, actuation_cfg, episode_cfg)
+                    io.actuation.command[env] = scaled_command(raw, io)
+            _drive(packet * lanes, lanes, io)
 
 
 @quick_launch
 @ti.kernel
-def reset_actuation(actuation: Out[ActuationState], clock: In[ClockState]):
+def reset_actuation(io: Bundle[ActuationIO]):
     """Nothing commanded, nothing under way."""
-    n = ti.static(clock.awake.shape[0])
+    n = ti.static(io.clock.awake.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and clock.awake[env] == 1:
-            actuation.command[env] = 0.0
-            actuation.integral[env] = 0.0
-            actuation.hold_moment_b[env] = 0.0
-            actuation.external_wrench_b[env] = 0.0
-            for i in range(ti.static(actuation.rpm_command.shape[1])):
-                actuation.rpm_command[env, i] = 0.0
-                actuation.thrust_n[env, i] = 0.0
-                for slot in range(ti.static(actuation.rpm_queue.shape[1])):
-                    actuation.rpm_queue[env, slot, i] = 0.0
+        if pad == 0 and io.clock.awake[env] == 1:
+            io.actuation.command[env] = 0.0
+            io.actuation.integral[env] = 0.0
+            io.actuation.hold_moment_b[env] = 0.0
+            io.actuation.external_wrench_b[env] = 0.0
+            for i in range(ti.static(io.actuation.rpm_command.shape[1])):
+                io.actuation.rpm_command[env, i] = 0.0
+                io.actuation.thrust_n[env, i] = 0.0
+                for slot in range(ti.static(io.actuation.rpm_queue.shape[1])):
+                    io.actuation.rpm_queue[env, slot, i] = 0.0
 
 
 class AxisLoop(NamedTuple):
@@ -79,9 +68,11 @@ def axis_loops(cfg):
 
 
 @ti.func
-def scaled_command(action, cfg: Const[VehicleConfig]):
+def scaled_command(action, io: Bundle[ActuationIO]):
     """[m/s, m/s, m/s, rad/s] of an action, clamped to [-1, 1]; NaN asks for nothing."""
-    limits = ti.Vector([cfg.max_surge_m_s, cfg.max_sway_m_s, cfg.max_heave_m_s, cfg.max_yaw_rate_rad_s])
+    limits = ti.Vector(
+        [io.vehicle_cfg.max_surge_m_s, io.vehicle_cfg.max_sway_m_s, io.vehicle_cfg.max_heave_m_s, io.vehicle_cfg.max_yaw_rate_rad_s]
+    )
     out = ti.Vector([0.0] * 4)
     for axis in ti.static(range(4)):
         if action[axis] >= 1.0:
@@ -94,20 +85,9 @@ def scaled_command(action, cfg: Const[VehicleConfig]):
 
 
 @ti.func
-def _drive(
-    first,
-    lanes: Const[int],
-    actuation: Out[ActuationState],
-    params: In[VehicleParams],
-    allocation: In[Allocation],
-    ego: In[Proprioception],
-    clock: In[ClockState],
-    vehicle_cfg: Const[VehicleConfig],
-    actuation_cfg: Const[ActuationConfig],
-    episode_cfg: Const[EpisodeConfig],
-):
+def _drive(first, lanes: Const[int], io: Bundle[ActuationIO]):
     """Rotor speeds of the velocity loop for the packet of vehicles that begins with ``first``, into this step's slot of the queue."""
-    n, n_thruster = ti.static(actuation.rpm_command.shape[0], actuation.rpm_command.shape[1])
+    n, n_thruster = ti.static(io.actuation.rpm_command.shape[0], io.actuation.rpm_command.shape[1])
     fleet = ti.Struct(
         command=ti.Matrix([[0.0] * lanes for _ in range(4)]),
         vel=ti.Matrix([[0.0] * lanes for _ in range(3)]),
@@ -118,72 +98,65 @@ def _drive(
         rpm=ti.Matrix([[0.0] * lanes for _ in range(n_thruster)]),
     )
     for lane in range(lanes):
-        _embark(lane, ti.min(first + lane, n - 1), fleet, actuation, ego)
-    inverse = ti.Matrix([[allocation.thrust_of_wrench[i, axis] for axis in range(6)] for i in range(n_thruster)])
+        _embark(lane, ti.min(first + lane, n - 1), fleet, io)
+    inverse = ti.Matrix([[io.allocation.thrust_of_wrench[i, axis] for axis in range(6)] for i in range(n_thruster)])
     for lane in range(lanes):
-        _control(lane, fleet, inverse, vehicle_cfg, actuation_cfg, episode_cfg)
+        _control(lane, fleet, inverse, io)
     for lane in range(lanes):
-        if is_awake(first + lane, clock):
-            _disembark(lane, first + lane, fleet, actuation, params, clock)
+        if is_awake(first + lane, io.clock):
+            _disembark(lane, first + lane, fleet, io)
 
 
 @ti.func
-def _embark(lane, env, fleet: Out[Any], actuation: In[ActuationState], ego: In[Proprioception]):
+def _embark(lane, env, fleet: Out[Any], io: Bundle[ActuationIO]):
     """Copy what one vehicle wants and senses into its column."""
-    command, vel = actuation.command[env], ego.vel_b[env]
+    command, vel = io.actuation.command[env], io.ego.vel_b[env]
     # a lost DVL holds an old velocity: feeding that back would run away, so the feed-forward drives alone until it is back
-    seen = ego.vel_valid[env] == 1
+    seen = io.ego.vel_valid[env] == 1
     for axis in ti.static(range(3)):
         fleet.vel[axis, lane] = ti.select(seen, vel[axis], command[axis])
     fleet.seen[0, lane] = ti.select(seen, 1.0, 0.0)
     put_column(fleet.command, lane, command)
-    put_column(fleet.rate, lane, ego.rate_b[env])
-    put_column(fleet.up, lane, _up_b(ego.rpy[env]))
-    put_column(fleet.integral, lane, actuation.integral[env])
+    put_column(fleet.rate, lane, io.ego.rate_b[env])
+    put_column(fleet.up, lane, _up_b(io.ego.rpy[env]))
+    put_column(fleet.integral, lane, io.actuation.integral[env])
 
 
 @ti.func
-def _disembark(lane, env, fleet: In[Any], actuation: Out[ActuationState], params: In[VehicleParams], clock: In[ClockState]):
+def _disembark(lane, env, fleet: In[Any], io: Bundle[ActuationIO]):
     """Copy one vehicle's column back. What left the queue's tail reaches the rotors: the command of delay_steps control steps ago."""
-    actuation.integral[env] = column(fleet.integral, lane)
-    n_slot = ti.static(actuation.rpm_queue.shape[1])
-    slot = clock.step[env] % n_slot
-    due = (clock.step[env] - params.delay_steps[env]) % n_slot
-    for i in ti.static(range(actuation.rpm_command.shape[1])):
-        actuation.rpm_queue[env, slot, i] = fleet.rpm[i, lane]
-    for i in ti.static(range(actuation.rpm_command.shape[1])):
-        actuation.rpm_command[env, i] = actuation.rpm_queue[env, due, i]
+    io.actuation.integral[env] = column(fleet.integral, lane)
+    n_slot = ti.static(io.actuation.rpm_queue.shape[1])
+    slot = io.clock.step[env] % n_slot
+    due = (io.clock.step[env] - io.params.delay_steps[env]) % n_slot
+    for i in ti.static(range(io.actuation.rpm_command.shape[1])):
+        io.actuation.rpm_queue[env, slot, i] = fleet.rpm[i, lane]
+    for i in ti.static(range(io.actuation.rpm_command.shape[1])):
+        io.actuation.rpm_command[env, i] = io.actuation.rpm_queue[env, due, i]
 
 
 @ti.func
-def _control(
-    lane,
-    fleet: Out[Any],
-    inverse: In[Any],
-    vehicle_cfg: Const[VehicleConfig],
-    actuation_cfg: Const[ActuationConfig],
-    episode_cfg: Const[EpisodeConfig],
-):
+def _control(lane, fleet: Out[Any], inverse: In[Any], io: Bundle[ActuationIO]):
     """Velocity loop of one column. It touches local variables only, so that the loop over columns becomes vector code."""
     command, vel, rate = column(fleet.command, lane), column(fleet.vel, lane), column(fleet.rate, lane)
     integral, up = column(fleet.integral, lane), column(fleet.up, lane)
     error = ti.Vector([command[0] - vel[0], command[1] - vel[1], command[2] - vel[2], command[3] - rate[2]])
-    force, moment = feed_forward(command, vel, rate, up, vehicle_cfg)
+    force, moment = feed_forward(command, vel, rate, up, io)
     ahead = ti.Vector([force[0], force[1], force[2], moment[2]])
-    loops = ti.static(axis_loops(actuation_cfg))
+    loops = ti.static(axis_loops(io.actuation_cfg))
     asked = ti.Vector([ahead[axis] + integral[axis] for axis in range(4)])
     given = ti.Vector([0.0] * 4)
     for axis in ti.static(range(4)):
         asked[axis] += loops[axis].gain * error[axis]
         given[axis] = ti.math.clamp(asked[axis], -loops[axis].limit, loops[axis].limit)
     roll_moment, pitch_moment = 0.0, 0.0
-    if ti.static(vehicle_cfg.attitude_hold == "thrusters"):
-        roll_moment, pitch_moment = stabilising_moment(up, rate, moment, actuation_cfg)
+    if ti.static(io.vehicle_cfg.attitude_hold == "thrusters"):
+        roll_moment, pitch_moment = stabilising_moment(up, rate, moment, io)
     wrench = ti.Vector([given[0], given[1], given[2], roll_moment, pitch_moment, given[3]])
-    share = _allocate(lane, wrench, fleet, inverse, vehicle_cfg)
+    share = _allocate(lane, wrench, fleet, inverse, io)
     for axis in ti.static(range(4)):
         starved = share < 1.0 or given[axis] != asked[axis]
-        per_step = loops[axis].integral_gain * episode_cfg.control_dt_s
+        per_step = loops[axis].integral_gain * io.episode_cfg.control_dt_s
         after = integrated(integral[axis], error[axis], starved, per_step, loops[axis].band, loops[axis].bound)
         fleet.integral[axis, lane] = ti.select(fleet.seen[0, lane] == 1.0 or axis == 3, after, integral[axis])
 
@@ -201,26 +174,28 @@ def integrated(integral, error, starved, gain, band, bound):
 
 
 @ti.func
-def feed_forward(command, vel, rate, up, cfg: Const[VehicleConfig]):
+def feed_forward(command, vel, rate, up, io: Bundle[ActuationIO]):
     """Force and moment that hold the commanded velocity in still water: drag of the command, Coriolis of the motion, net buoyancy."""
-    mass, added, linear, quadratic = ti.static(cfg.mass_kg, cfg.added_mass, cfg.linear_damping, cfg.quadratic_damping)
+    mass, added, linear, quadratic = ti.static(
+        io.vehicle_cfg.mass_kg, io.vehicle_cfg.added_mass, io.vehicle_cfg.linear_damping, io.vehicle_cfg.quadratic_damping
+    )
     momentum = ti.Vector([(mass + added[0]) * vel[0], (mass + added[1]) * vel[1], (mass + added[2]) * vel[2]])
-    spin = ti.Vector([(cfg.inertia_kg_m2[i] + added[3 + i]) * rate[i] for i in ti.static(range(3))])
+    spin = ti.Vector([(io.vehicle_cfg.inertia_kg_m2[i] + added[3 + i]) * rate[i] for i in ti.static(range(3))])
     force = rate.cross(momentum)
     moment = rate.cross(spin) + vel.cross(momentum)
     for axis in ti.static(range(3)):
         force[axis] += (linear[axis] + quadratic[axis] * abs(command[axis])) * command[axis]
     moment[2] += (linear[5] + quadratic[5] * abs(command[3])) * command[3]
-    net = ti.static(cfg.gravity_m_s2 * (cfg.water_density_kg_m3 * cfg.volume_m3 - cfg.mass_kg))
+    net = ti.static(io.vehicle_cfg.gravity_m_s2 * (io.vehicle_cfg.water_density_kg_m3 * io.vehicle_cfg.volume_m3 - io.vehicle_cfg.mass_kg))
     return force - net * up, moment
 
 
 @ti.func
-def stabilising_moment(up, rate, coriolis, cfg: Const[ActuationConfig]):
+def stabilising_moment(up, rate, coriolis, io: Bundle[ActuationIO]):
     """[N m] roll and pitch moment of the hold by thrusters: upright, damped, Munk moment fed forward, bounded."""
-    k, d = cfg.thruster_hold_gain_n_m, cfg.thruster_hold_damping
+    k, d = io.actuation_cfg.thruster_hold_gain_n_m, io.actuation_cfg.thruster_hold_damping
     roll, pitch = coriolis[0] - k * up[1] - d * rate[0], coriolis[1] + k * up[0] - d * rate[1]
-    share = ti.min(1.0, cfg.hold_limit_n_m / ti.max(ti.sqrt(roll * roll + pitch * pitch), 1e-6))
+    share = ti.min(1.0, io.actuation_cfg.hold_limit_n_m / ti.max(ti.sqrt(roll * roll + pitch * pitch), 1e-6))
     return share * roll, share * pitch
 
 
@@ -231,21 +206,21 @@ def _up_b(rpy):
 
 
 @ti.func
-def _allocate(lane, wrench, fleet: Out[Any], inverse: In[Any], cfg: Const[VehicleConfig]):
+def _allocate(lane, wrench, fleet: Out[Any], inverse: In[Any], io: Bundle[ActuationIO]):
     """Least-squares thrusts to rotor speeds; returns the share <= 1 by which all thrusts are scaled so that none exceeds its limit.
 
     One factor for all keeps the wrench's direction: a vehicle that clips single thrusters turns and drifts where it should only be slower.
     """
-    forward, reverse = ti.static(thrust_limits(cfg))
-    thrust = ti.Vector([0.0] * ti.static(len(cfg.thrusters)))
+    forward, reverse = ti.static(thrust_limits(io.vehicle_cfg))
+    thrust = ti.Vector([0.0] * ti.static(len(io.vehicle_cfg.thrusters)))
     share = 1.0
-    for i in ti.static(range(len(cfg.thrusters))):
+    for i in ti.static(range(len(io.vehicle_cfg.thrusters))):
         for axis in ti.static(range(6)):
             thrust[i] += inverse[i, axis] * wrench[axis]
         if thrust[i] > 0.0:
             share = ti.min(share, forward / thrust[i])
         elif thrust[i] < 0.0:
             share = ti.min(share, reverse / thrust[i])
-    for i in ti.static(range(len(cfg.thrusters))):
-        fleet.rpm[i, lane] = rpm_of_thrust(share * thrust[i], cfg)
+    for i in ti.static(range(len(io.vehicle_cfg.thrusters))):
+        fleet.rpm[i, lane] = rpm_of_thrust(share * thrust[i], io.vehicle_cfg)
     return share

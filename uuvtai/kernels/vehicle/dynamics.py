@@ -13,23 +13,12 @@ from typing import Any
 
 import taichi as ti
 
-from uuvtai.config import ActuationConfig, DisturbanceConfig, EpisodeConfig, VehicleConfig
-from uuvtai.kernels.core.geometry import quaternion_wb, roll_pitch_yaw, rotation_wb
+from uuvtai.kernels.core.geometry import quaternion_wb, rotation_wb
 from uuvtai.kernels.core.lanes import column, is_awake, n_awake, n_column, put_column
 from uuvtai.kernels.core.noise import STREAM_CURRENT, STREAM_THRUSTER, STREAM_VEHICLE, normal, stream_key, uniform_in
-from uuvtai.kernels.core.signature import Const, In, Out, quick_launch, spread
+from uuvtai.kernels.core.signature import Bundle, Const, In, Out, quick_launch, spread
+from uuvtai.kernels.vehicle.bundles import DynamicsIO
 from uuvtai.kernels.vehicle.rotor import lag_kept, thrust_of_rpm
-from uuvtai.state import (
-    ActuationState,
-    Allocation,
-    ClockState,
-    CurrentState,
-    EpisodeState,
-    MissionState,
-    Proprioception,
-    VehicleParams,
-    VehicleState,
-)
 
 # draws of STREAM_VEHICLE (each spread has its own index, so switching one on does not change another)
 _DRAW_MASS = 0
@@ -40,104 +29,42 @@ _DRAW_QUADRATIC = 13
 
 @quick_launch
 @ti.kernel
-def move_vehicle(
-    vehicle: Out[VehicleState],
-    actuation: Out[ActuationState],
-    current: Out[CurrentState],
-    params: In[VehicleParams],
-    allocation: In[Allocation],
-    episode: In[EpisodeState],
-    clock: In[ClockState],
-    vehicle_cfg: Const[VehicleConfig],
-    actuation_cfg: Const[ActuationConfig],
-    disturbance_cfg: Const[DisturbanceConfig],
-    dt_s: float,
-    n_substep: int,
-):
+def move_vehicle(io: Bundle[DynamicsIO], dt_s: float, n_substep: int):
     """One control step of dt_s [s] in n_substep substeps; then the current moves on to the end of the step."""
-    n, lanes = ti.static(clock.awake.shape[0], n_column())
+    n, lanes = ti.static(io.clock.awake.shape[0], n_column())
     n_packet = ti.static(-(-n // lanes))
     for packet, pad in ti.ndrange(n_packet, ti.static(spread(n_packet))):
-        if pad == 0 and n_awake(packet * lanes, lanes, clock) > 0:
-            _move(
-                packet * lanes,
-                lanes,
-                vehicle,
-                actuation,
-                current,
-                params,
-                allocation,
-                clock,
-                vehicle_cfg,
-                actuation_cfg,
-                dt_s / n_substep,
-                n_substep,
-            )
-            if ti.static(disturbance_cfg.current_sigma_m_s > 0):
+        if pad == 0 and n_awake(packet * lanes, lanes, io.clock) > 0:
+            _move(packet * lanes, lanes, dt_s / n_substep, n_substep, io)
+            if ti.static(io.disturbance_cfg.current_sigma_m_s > 0):
                 for env in range(packet * lanes, (packet + 1) * lanes):
-                    if is_awake(env, clock):
-                        key = stream_key(episode.key[env], clock.step[env], STREAM_CURRENT)
-                        current.vel_w[env] = current_after(current.mean_w[env], current.vel_w[env], key, disturbance_cfg, dt_s)
+                    if is_awake(env, io.clock):
+                        key = stream_key(io.episode.key[env], io.clock.step[env], STREAM_CURRENT)
+                        io.current.vel_w[env] = current_after(io.current.mean_w[env], io.current.vel_w[env], key, dt_s, io)
 
 
 @quick_launch
 @ti.kernel
-def reset_vehicle(
-    vehicle: Out[VehicleState],
-    params: Out[VehicleParams],
-    current: Out[CurrentState],
-    mission: In[MissionState],
-    episode: In[EpisodeState],
-    clock: In[ClockState],
-    vehicle_cfg: Const[VehicleConfig],
-    disturbance_cfg: Const[DisturbanceConfig],
-    episode_cfg: Const[EpisodeConfig],
-):
+def reset_vehicle(io: Bundle[DynamicsIO]):
     """At rest at the mission's start, with this episode's parameters and current."""
-    n = ti.static(clock.awake.shape[0])
+    n = ti.static(io.clock.awake.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and clock.awake[env] == 1:
-            _place(env, vehicle, mission)
-            _draw_body(env, params, episode, vehicle_cfg, disturbance_cfg)
-            _draw_thrusters(env, params, episode, vehicle_cfg, disturbance_cfg)
-            delay = ti.static(round(disturbance_cfg.thruster_delay_s / episode_cfg.control_dt_s))
-            params.delay_steps[env] = delay
-            _draw_current(env, current, episode, disturbance_cfg)
-
-
-@quick_launch
-@ti.kernel
-def sense_exactly(ego: Out[Proprioception], vehicle: In[VehicleState], clock: In[ClockState]):
-    """Perfect velocity, attitude and rates for the inner loop: experiments on the plant alone have no sensors."""
-    for env in range(ti.static(clock.awake.shape[0])):
-        if clock.awake[env] == 1:
-            ego.vel_b[env] = vehicle.vel_b[env]
-            ego.vel_valid[env] = 1
-            ego.rate_b[env] = vehicle.rate_b[env]
-            ego.rpy[env] = roll_pitch_yaw(vehicle.quat_wb[env])
-            ego.pos_w[env] = vehicle.pos_w[env]
+        if pad == 0 and io.clock.awake[env] == 1:
+            _place(env, io)
+            _draw_body(env, io)
+            _draw_thrusters(env, io)
+            delay = ti.static(round(io.disturbance_cfg.thruster_delay_s / io.episode_cfg.control_dt_s))
+            io.params.delay_steps[env] = delay
+            _draw_current(env, io)
 
 
 # ------------------------------------------------------------------------------------------------------------------ one step
 
 
 @ti.func
-def _move(
-    first,
-    lanes: Const[int],
-    vehicle: Out[VehicleState],
-    actuation: Out[ActuationState],
-    current: In[CurrentState],
-    params: In[VehicleParams],
-    allocation: In[Allocation],
-    clock: In[ClockState],
-    vehicle_cfg: Const[VehicleConfig],
-    actuation_cfg: Const[ActuationConfig],
-    dt,
-    n_substep,
-):
+def _move(first, lanes: Const[int], dt, n_substep, io: Bundle[DynamicsIO]):
     """n_substep midpoint steps of the packet of vehicles that begins with ``first``."""
-    n, n_thruster = ti.static(vehicle.rpm.shape[0], vehicle.rpm.shape[1])
+    n, n_thruster = ti.static(io.vehicle.rpm.shape[0], io.vehicle.rpm.shape[1])
     fleet = ti.Struct(
         pos=ti.Matrix([[0.0] * lanes for _ in range(3)]),
         quat=ti.Matrix([[0.0] * lanes for _ in range(4)]),
@@ -159,82 +86,66 @@ def _move(
         lift=ti.Matrix([[0.0] * lanes for _ in range(2)]),
     )
     for lane in range(lanes):
-        _embark(lane, ti.min(first + lane, n - 1), fleet, vehicle, actuation, current, params)
-    geometry = ti.Matrix([[allocation.wrench_of_thrust[axis, i] for i in range(n_thruster)] for axis in range(6)])
-    kept = lag_kept(0.5 * dt, vehicle_cfg.rotor_tau_s)
+        _embark(lane, ti.min(first + lane, n - 1), fleet, io)
+    geometry = ti.Matrix([[io.allocation.wrench_of_thrust[axis, i] for i in range(n_thruster)] for axis in range(6)])
+    kept = lag_kept(0.5 * dt, io.vehicle_cfg.rotor_tau_s)
     for _ in range(n_substep):
         for lane in range(lanes):
-            _advance(lane, fleet, geometry, kept, dt, vehicle_cfg, actuation_cfg)
+            _advance(lane, fleet, geometry, kept, dt, io)
     for lane in range(lanes):
-        if is_awake(first + lane, clock):
-            _disembark(lane, first + lane, fleet, vehicle, actuation, vehicle_cfg)
+        if is_awake(first + lane, io.clock):
+            _disembark(lane, first + lane, fleet, io)
 
 
 @ti.func
-def _embark(
-    lane,
-    env,
-    fleet: Out[Any],
-    vehicle: In[VehicleState],
-    actuation: In[ActuationState],
-    current: In[CurrentState],
-    params: In[VehicleParams],
-):
+def _embark(lane, env, fleet: Out[Any], io: Bundle[DynamicsIO]):
     """Copy what moves one vehicle into its column."""
-    put_column(fleet.pos, lane, vehicle.pos_w[env])
-    put_column(fleet.quat, lane, vehicle.quat_wb[env])
-    put_column(fleet.vel, lane, vehicle.vel_b[env])
-    put_column(fleet.rate, lane, vehicle.rate_b[env])
-    put_column(fleet.outside, lane, actuation.external_wrench_b[env])
-    put_column(fleet.current, lane, current.vel_w[env])
-    put_column(fleet.added, lane, params.added_mass[env])
-    put_column(fleet.linear, lane, params.linear_damping[env])
-    put_column(fleet.quadratic, lane, params.quadratic_damping[env])
+    put_column(fleet.pos, lane, io.vehicle.pos_w[env])
+    put_column(fleet.quat, lane, io.vehicle.quat_wb[env])
+    put_column(fleet.vel, lane, io.vehicle.vel_b[env])
+    put_column(fleet.rate, lane, io.vehicle.rate_b[env])
+    put_column(fleet.outside, lane, io.actuation.external_wrench_b[env])
+    put_column(fleet.current, lane, io.current.vel_w[env])
+    put_column(fleet.added, lane, io.params.added_mass[env])
+    put_column(fleet.linear, lane, io.params.linear_damping[env])
+    put_column(fleet.quadratic, lane, io.params.quadratic_damping[env])
     for axis in ti.static(range(3)):
-        fleet.mass[axis, lane] = params.mass_kg[env]
-        fleet.mass[axis + 3, lane] = params.inertia[env][axis]
-    fleet.lift[0, lane] = params.buoyancy_n[env]
-    fleet.lift[1, lane] = params.buoyancy_height_m[env]
-    for i in ti.static(range(vehicle.rpm.shape[1])):
-        fleet.rpm[i, lane] = vehicle.rpm[env, i]
-        fleet.command[i, lane] = actuation.rpm_command[env, i]
-        fleet.gain[i, lane] = params.thruster_gain[env, i]
+        fleet.mass[axis, lane] = io.params.mass_kg[env]
+        fleet.mass[axis + 3, lane] = io.params.inertia[env][axis]
+    fleet.lift[0, lane] = io.params.buoyancy_n[env]
+    fleet.lift[1, lane] = io.params.buoyancy_height_m[env]
+    for i in ti.static(range(io.vehicle.rpm.shape[1])):
+        fleet.rpm[i, lane] = io.vehicle.rpm[env, i]
+        fleet.command[i, lane] = io.actuation.rpm_command[env, i]
+        fleet.gain[i, lane] = io.params.thruster_gain[env, i]
 
 
 @ti.func
-def _disembark(lane, env, fleet: In[Any], vehicle: Out[VehicleState], actuation: Out[ActuationState], cfg: Const[VehicleConfig]):
+def _disembark(lane, env, fleet: In[Any], io: Bundle[DynamicsIO]):
     """Copy one vehicle's column back."""
-    vehicle.pos_w[env] = column(fleet.pos, lane)
-    vehicle.quat_wb[env] = column(fleet.quat, lane)
-    vehicle.vel_b[env] = column(fleet.vel, lane)
-    vehicle.rate_b[env] = column(fleet.rate, lane)
-    vehicle.acc_b[env] = column(fleet.acc, lane)
-    if ti.static(cfg.attitude_hold == "ideal"):
-        actuation.hold_moment_b[env] = column(fleet.hold, lane)
-    for i in ti.static(range(vehicle.rpm.shape[1])):
-        vehicle.rpm[env, i] = fleet.rpm[i, lane]
-        actuation.thrust_n[env, i] = fleet.thrust[i, lane]
+    io.vehicle.pos_w[env] = column(fleet.pos, lane)
+    io.vehicle.quat_wb[env] = column(fleet.quat, lane)
+    io.vehicle.vel_b[env] = column(fleet.vel, lane)
+    io.vehicle.rate_b[env] = column(fleet.rate, lane)
+    io.vehicle.acc_b[env] = column(fleet.acc, lane)
+    if ti.static(io.vehicle_cfg.attitude_hold == "ideal"):
+        io.actuation.hold_moment_b[env] = column(fleet.hold, lane)
+    for i in ti.static(range(io.vehicle.rpm.shape[1])):
+        io.vehicle.rpm[env, i] = fleet.rpm[i, lane]
+        io.actuation.thrust_n[env, i] = fleet.thrust[i, lane]
 
 
 @ti.func
-def _advance(
-    lane,
-    fleet: Out[Any],
-    geometry: In[Any],
-    kept,
-    dt,
-    vehicle_cfg: Const[VehicleConfig],
-    actuation_cfg: Const[ActuationConfig],
-):
+def _advance(lane, fleet: Out[Any], geometry: In[Any], kept, dt, io: Bundle[DynamicsIO]):
     """One midpoint step of one column. It touches local variables only, so that the loop over columns becomes vector code."""
-    body = body_of(lane, fleet, vehicle_cfg)
+    body = body_of(lane, fleet, io)
     current_w = column(fleet.current, lane)
-    force, moment = _rotor_wrench(lane, fleet, geometry, vehicle_cfg, kept)
+    force, moment = _rotor_wrench(lane, fleet, geometry, kept, io)
     pos, q, v, w = column(fleet.pos, lane), column(fleet.quat, lane), column(fleet.vel, lane), column(fleet.rate, lane)
-    dv, dw = acceleration(q, v, w, force, moment, current_w, body, vehicle_cfg, actuation_cfg)
+    dv, dw = acceleration(q, v, w, force, moment, current_w, body, io)
     q_mid = turned(q, w, 0.5 * dt)
     v_mid, w_mid = v + 0.5 * dt * dv, w + 0.5 * dt * dw
-    dv_mid, dw_mid = acceleration(q_mid, v_mid, w_mid, force, moment, current_w, body, vehicle_cfg, actuation_cfg)
+    dv_mid, dw_mid = acceleration(q_mid, v_mid, w_mid, force, moment, current_w, body, io)
     q_end = (q + 0.5 * dt * quaternion_product_pure(q_mid, w_mid)).normalized()
     w_end = w + dt * dw_mid
     put_column(fleet.pos, lane, pos + dt * (rotation_wb(q_mid) @ v_mid))
@@ -242,12 +153,12 @@ def _advance(
     put_column(fleet.vel, lane, v + dt * dv_mid)
     put_column(fleet.rate, lane, w_end)
     put_column(fleet.acc, lane, dv_mid + w_mid.cross(v_mid))
-    if ti.static(vehicle_cfg.attitude_hold == "ideal"):
-        put_column(fleet.hold, lane, hold_moment(up_b(q_end), w_end, actuation_cfg))
+    if ti.static(io.vehicle_cfg.attitude_hold == "ideal"):
+        put_column(fleet.hold, lane, hold_moment(up_b(q_end), w_end, io))
 
 
 @ti.func
-def _rotor_wrench(lane, fleet: Out[Any], geometry: In[Any], cfg: Const[VehicleConfig], kept):
+def _rotor_wrench(lane, fleet: Out[Any], geometry: In[Any], kept, io: Bundle[DynamicsIO]):
     """Force and moment of all thrusters at the middle of the substep, plus what acts from outside; the rotors move on by a substep.
 
     ``kept`` is what the lag leaves of the distance to the command after half a substep. The middle value keeps the midpoint rule second
@@ -259,7 +170,7 @@ def _rotor_wrench(lane, fleet: Out[Any], geometry: In[Any], cfg: Const[VehicleCo
         command = fleet.command[i, lane]
         middle = command + kept * (fleet.rpm[i, lane] - command)
         fleet.rpm[i, lane] = command + kept * (middle - command)
-        thrust = fleet.gain[i, lane] * thrust_of_rpm(middle, cfg)
+        thrust = fleet.gain[i, lane] * thrust_of_rpm(middle, io.vehicle_cfg)
         fleet.thrust[i, lane] = thrust
         for axis in ti.static(range(3)):
             force[axis] += geometry[axis, i] * thrust
@@ -271,7 +182,7 @@ def _rotor_wrench(lane, fleet: Out[Any], geometry: In[Any], cfg: Const[VehicleCo
 
 
 @ti.func
-def body_of(lane, fleet: In[Any], cfg: Const[VehicleConfig]):
+def body_of(lane, fleet: In[Any], io: Bundle[DynamicsIO]):
     """Parameters of one vehicle in local variables, linear and angular parts apart."""
     added, linear, quadratic, inert = (
         column(fleet.added, lane),
@@ -288,7 +199,7 @@ def body_of(lane, fleet: In[Any], cfg: Const[VehicleConfig]):
         linear_w=ti.Vector([linear[3], linear[4], linear[5]]),
         quadratic_v=ti.Vector([quadratic[0], quadratic[1], quadratic[2]]),
         quadratic_w=ti.Vector([quadratic[3], quadratic[4], quadratic[5]]),
-        weight=inert[0] * cfg.gravity_m_s2,
+        weight=inert[0] * io.vehicle_cfg.gravity_m_s2,
         buoyancy=fleet.lift[0, lane],
         height=fleet.lift[1, lane],
         per_mass_v=1.0 / (inert[0] + ti.Vector([added[0], added[1], added[2]])),
@@ -297,9 +208,7 @@ def body_of(lane, fleet: In[Any], cfg: Const[VehicleConfig]):
 
 
 @ti.func
-def acceleration(
-    q, v, w, force, moment, current_w, body: In[Any], vehicle_cfg: Const[VehicleConfig], actuation_cfg: Const[ActuationConfig]
-):
+def acceleration(q, v, w, force, moment, current_w, body: In[Any], io: Bundle[DynamicsIO]):
     """(dv/dt, dw/dt) in body axes [m/s^2, rad/s^2]: Fossen's equation solved for the derivative of nu."""
     up = up_b(q)
     current_b = rotation_wb(q).transpose() @ current_w
@@ -307,23 +216,23 @@ def acceleration(
     momentum = body.added_v * v_r
     tau_v = force + (body.buoyancy - body.weight) * up
     tau_v -= body.mass * w.cross(v) + w.cross(momentum)
-    if ti.static(vehicle_cfg.added_mass_follows == "water"):
+    if ti.static(io.vehicle_cfg.added_mass_follows == "water"):
         tau_v -= body.added_v * w.cross(current_b)  # dnu_r/dt = dnu/dt + w x current_b in a uniform current
     tau_v -= (body.linear_v + body.quadratic_v * abs(v_r)) * v_r
     tau_w = moment + body.height * body.buoyancy * ti.Vector([-up[1], up[0], 0.0])
     tau_w -= w.cross((body.inertia + body.added_w) * w) + v_r.cross(momentum)
     tau_w -= (body.linear_w + body.quadratic_w * abs(w)) * w
-    if ti.static(vehicle_cfg.attitude_hold == "ideal"):
-        tau_w += hold_moment(up, w, actuation_cfg)
+    if ti.static(io.vehicle_cfg.attitude_hold == "ideal"):
+        tau_w += hold_moment(up, w, io)
     return body.per_mass_v * tau_v, body.per_mass_w * tau_w
 
 
 @ti.func
-def hold_moment(up, w, cfg: Const[ActuationConfig]):
+def hold_moment(up, w, io: Bundle[DynamicsIO]):
     """[N m] ideal attitude hold: pulls body z upright and damps roll and pitch rate, bounded; yaw stays free."""
-    k, d = cfg.hold_gain_n_m, cfg.hold_damping
+    k, d = io.actuation_cfg.hold_gain_n_m, io.actuation_cfg.hold_damping
     roll, pitch = -k * up[1] - d * w[0], k * up[0] - d * w[1]
-    share = ti.min(1.0, cfg.hold_limit_n_m / ti.max(ti.sqrt(roll * roll + pitch * pitch), 1e-6))
+    share = ti.min(1.0, io.actuation_cfg.hold_limit_n_m / ti.max(ti.sqrt(roll * roll + pitch * pitch), 1e-6))
     return share * ti.Vector([roll, pitch, 0.0])
 
 
@@ -354,10 +263,10 @@ def turned(q, w, dt):
 
 
 @ti.func
-def current_after(mean, velocity, key, cfg: Const[DisturbanceConfig], dt_s):
+def current_after(mean, velocity, key, dt_s, io: Bundle[DynamicsIO]):
     """[m/s] current after dt of a Gauss-Markov process about its mean, horizontal axes; exact for any dt."""
-    keep = ti.exp(-dt_s / cfg.current_tau_s)
-    kick = cfg.current_sigma_m_s * ti.sqrt(1.0 - keep * keep)
+    keep = ti.exp(-dt_s / io.disturbance_cfg.current_tau_s)
+    kick = io.disturbance_cfg.current_sigma_m_s * ti.sqrt(1.0 - keep * keep)
     noise = ti.Vector([normal(key, 0), normal(key, 1), 0.0])
     return mean + keep * (velocity - mean) + kick * noise
 
@@ -366,33 +275,37 @@ def current_after(mean, velocity, key, cfg: Const[DisturbanceConfig], dt_s):
 
 
 @ti.func
-def _place(env, vehicle: Out[VehicleState], mission: In[MissionState]):
-    vehicle.pos_w[env] = mission.start_w[env]
-    vehicle.quat_wb[env] = quaternion_wb(0.0, 0.0, mission.start_yaw[env])
-    vehicle.vel_b[env] = 0.0
-    vehicle.rate_b[env] = 0.0
-    vehicle.acc_b[env] = 0.0
-    for i in range(ti.static(vehicle.rpm.shape[1])):
-        vehicle.rpm[env, i] = 0.0
+def _place(env, io: Bundle[DynamicsIO]):
+    io.vehicle.pos_w[env] = io.mission.start_w[env]
+    io.vehicle.quat_wb[env] = quaternion_wb(0.0, 0.0, io.mission.start_yaw[env])
+    io.vehicle.vel_b[env] = 0.0
+    io.vehicle.rate_b[env] = 0.0
+    io.vehicle.acc_b[env] = 0.0
+    for i in range(ti.static(io.vehicle.rpm.shape[1])):
+        io.vehicle.rpm[env, i] = 0.0
 
 
 @ti.func
-def _draw_body(
-    env, params: Out[VehicleParams], episode: In[EpisodeState], cfg: Const[VehicleConfig], disturbance_cfg: Const[DisturbanceConfig]
-):
+def _draw_body(env, io: Bundle[DynamicsIO]):
     """Nominal values times the factors of this episode. Buoyancy follows the mass: the vehicle is trimmed again, not sunk."""
-    key = stream_key(episode.key[env], 0, STREAM_VEHICLE)
-    heavier = _factor(key, _DRAW_MASS, disturbance_cfg.mass_spread)
-    params.mass_kg[env] = heavier * cfg.mass_kg
-    params.buoyancy_n[env] = heavier * ti.static(cfg.water_density_kg_m3 * cfg.gravity_m_s2 * cfg.volume_m3)
-    params.buoyancy_height_m[env] = cfg.buoyancy_height_m
+    key = stream_key(io.episode.key[env], 0, STREAM_VEHICLE)
+    heavier = _factor(key, _DRAW_MASS, io.disturbance_cfg.mass_spread)
+    io.params.mass_kg[env] = heavier * io.vehicle_cfg.mass_kg
+    io.params.buoyancy_n[env] = heavier * ti.static(
+        io.vehicle_cfg.water_density_kg_m3 * io.vehicle_cfg.gravity_m_s2 * io.vehicle_cfg.volume_m3
+    )
+    io.params.buoyancy_height_m[env] = io.vehicle_cfg.buoyancy_height_m
     for axis in ti.static(range(3)):
-        params.inertia[env][axis] = heavier * cfg.inertia_kg_m2[axis]
+        io.params.inertia[env][axis] = heavier * io.vehicle_cfg.inertia_kg_m2[axis]
     for axis in ti.static(range(6)):
-        params.added_mass[env][axis] = cfg.added_mass[axis] * _factor(key, _DRAW_ADDED_MASS + axis, disturbance_cfg.added_mass_spread)
-        params.linear_damping[env][axis] = cfg.linear_damping[axis] * _factor(key, _DRAW_LINEAR + axis, disturbance_cfg.damping_spread)
-        params.quadratic_damping[env][axis] = cfg.quadratic_damping[axis] * _factor(
-            key, _DRAW_QUADRATIC + axis, disturbance_cfg.damping_spread
+        io.params.added_mass[env][axis] = io.vehicle_cfg.added_mass[axis] * _factor(
+            key, _DRAW_ADDED_MASS + axis, io.disturbance_cfg.added_mass_spread
+        )
+        io.params.linear_damping[env][axis] = io.vehicle_cfg.linear_damping[axis] * _factor(
+            key, _DRAW_LINEAR + axis, io.disturbance_cfg.damping_spread
+        )
+        io.params.quadratic_damping[env][axis] = io.vehicle_cfg.quadratic_damping[axis] * _factor(
+            key, _DRAW_QUADRATIC + axis, io.disturbance_cfg.damping_spread
         )
 
 
@@ -403,20 +316,18 @@ def _factor(key, index, half_width: Const[float]):
 
 
 @ti.func
-def _draw_thrusters(
-    env, params: Out[VehicleParams], episode: In[EpisodeState], cfg: Const[VehicleConfig], disturbance_cfg: Const[DisturbanceConfig]
-):
-    key = stream_key(episode.key[env], 0, STREAM_THRUSTER)
-    for i in ti.static(range(len(cfg.thrusters))):
-        gain = 1.0 - disturbance_cfg.thruster_gain_loss * uniform_in(key, i, 0.0, 1.0)
-        params.thruster_gain[env, i] = 0.0 if ti.static(i == disturbance_cfg.dead_thruster) else gain
+def _draw_thrusters(env, io: Bundle[DynamicsIO]):
+    key = stream_key(io.episode.key[env], 0, STREAM_THRUSTER)
+    for i in ti.static(range(len(io.vehicle_cfg.thrusters))):
+        gain = 1.0 - io.disturbance_cfg.thruster_gain_loss * uniform_in(key, i, 0.0, 1.0)
+        io.params.thruster_gain[env, i] = 0.0 if ti.static(i == io.disturbance_cfg.dead_thruster) else gain
 
 
 @ti.func
-def _draw_current(env, current: Out[CurrentState], episode: In[EpisodeState], cfg: Const[DisturbanceConfig]):
+def _draw_current(env, io: Bundle[DynamicsIO]):
     """Mean plus a draw of the stationary distribution, so that the statistics are the same at every time of an episode."""
-    mean = ti.Vector([cfg.current_m_s[0], cfg.current_m_s[1], cfg.current_m_s[2]])
-    key = stream_key(episode.key[env], 0, STREAM_CURRENT)
+    mean = ti.Vector([io.disturbance_cfg.current_m_s[0], io.disturbance_cfg.current_m_s[1], io.disturbance_cfg.current_m_s[2]])
+    key = stream_key(io.episode.key[env], 0, STREAM_CURRENT)
     noise = ti.Vector([normal(key, 2), normal(key, 3), 0.0])  # draws 0 and 1 belong to the first step
-    current.mean_w[env] = mean
-    current.vel_w[env] = mean + cfg.current_sigma_m_s * noise
+    io.current.mean_w[env] = mean
+    io.current.vel_w[env] = mean + io.disturbance_cfg.current_sigma_m_s * noise

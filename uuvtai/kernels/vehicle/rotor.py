@@ -37,26 +37,26 @@ def lag_kept(dt_s, tau_s):
 
 
 @ti.func
-def thrust_of_rpm(rpm, cfg: Const[VehicleConfig]):
+def thrust_of_rpm(rpm, vehicle_cfg: Const[VehicleConfig]):
     """Thrust [N] at a rotor speed [rpm]."""
-    forward, reverse = ti.static(cfg.thrust_forward, cfg.thrust_reverse)
+    forward, reverse = ti.static(vehicle_cfg.thrust_forward, vehicle_cfg.thrust_reverse)
     thrust = 0.0 * rpm
-    if rpm >= ti.static(edge_rpm(cfg.thrust_forward, cfg.dead_band_rpm[0], 1.0)):
-        thrust = ti.static(KGF * cfg.thrust_scale) * ((forward[0] * rpm + forward[1]) * rpm + forward[2])
-    elif rpm <= ti.static(edge_rpm(cfg.thrust_reverse, cfg.dead_band_rpm[1], -1.0)):
-        thrust = ti.static(KGF * cfg.thrust_scale) * ((reverse[0] * rpm + reverse[1]) * rpm + reverse[2])
+    if rpm >= ti.static(edge_rpm(vehicle_cfg.thrust_forward, vehicle_cfg.dead_band_rpm[0], 1.0)):
+        thrust = ti.static(KGF * vehicle_cfg.thrust_scale) * ((forward[0] * rpm + forward[1]) * rpm + forward[2])
+    elif rpm <= ti.static(edge_rpm(vehicle_cfg.thrust_reverse, vehicle_cfg.dead_band_rpm[1], -1.0)):
+        thrust = ti.static(KGF * vehicle_cfg.thrust_scale) * ((reverse[0] * rpm + reverse[1]) * rpm + reverse[2])
     return thrust
 
 
 @ti.func
-def rpm_of_thrust(thrust, cfg: Const[VehicleConfig]):
+def rpm_of_thrust(thrust, vehicle_cfg: Const[VehicleConfig]):
     """Rotor speed [rpm] that gives a thrust [N]; a thrust below the smallest one is rounded to it or to nothing, whichever is nearer."""
     rpm = 0.0 * thrust
     if thrust > 0:
-        rpm = _branch_rpm(thrust, cfg.thrust_forward, cfg.dead_band_rpm[0], 1.0, cfg.thrust_scale)
+        rpm = _branch_rpm(thrust, vehicle_cfg.thrust_forward, vehicle_cfg.dead_band_rpm[0], 1.0, vehicle_cfg.thrust_scale)
     else:
-        rpm = _branch_rpm(thrust, cfg.thrust_reverse, cfg.dead_band_rpm[1], -1.0, cfg.thrust_scale)
-    return ti.math.clamp(rpm, -cfg.rotor_max_rpm, cfg.rotor_max_rpm)
+        rpm = _branch_rpm(thrust, vehicle_cfg.thrust_reverse, vehicle_cfg.dead_band_rpm[1], -1.0, vehicle_cfg.thrust_scale)
+    return ti.math.clamp(rpm, -vehicle_cfg.rotor_max_rpm, vehicle_cfg.rotor_max_rpm)
 
 
 @ti.func

@@ -2,18 +2,19 @@
 
 import taichi as ti
 
-from uuvtai.kernels.core.signature import Const, In, Out
+from uuvtai.kernels.core.signature import Bundle, Const, In
+from uuvtai.kernels.world.bundles import WorldIO
 from uuvtai.state import PathState, WorldState
 
 
 @ti.func
-def put_body(env, slot, kind, pos_w, size, yaw, world: Out[WorldState]):
+def put_body(env, slot, kind, pos_w, size, yaw, io: Bundle[WorldIO]):
     """Write one body, at rest."""
-    world.kind[env, slot] = kind
-    world.pos_w[env, slot] = pos_w
-    world.vel_w[env, slot] = ti.Vector([0.0, 0.0, 0.0])
-    world.size[env, slot] = size
-    world.yaw[env, slot] = yaw
+    io.world.kind[env, slot] = kind
+    io.world.pos_w[env, slot] = pos_w
+    io.world.vel_w[env, slot] = ti.Vector([0.0, 0.0, 0.0])
+    io.world.size[env, slot] = size
+    io.world.yaw[env, slot] = yaw
 
 
 @ti.func

@@ -5,13 +5,12 @@ Every search is bounded; where its draws run out, ``WorldState.faults`` says so 
 
 import taichi as ti
 
-from uuvtai.config import WorldConfig
 from uuvtai.kernels.core.footprint import disc, footprint_of, is_apart, is_inside, nearest_squared
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, NONE, TWO_PI
 from uuvtai.kernels.core.noise import STREAM_SCENARIO, stream_key, uniform, uniform_in
-from uuvtai.kernels.core.signature import Const, In, Out
+from uuvtai.kernels.core.signature import Bundle
 from uuvtai.kernels.world.bodies import is_chosen, put_body
-from uuvtai.state import EpisodeState, MissionState, ScenarioScratch, SceneState, WorldState
+from uuvtai.kernels.world.bundles import WorldIO
 
 COARSE_M = 0.2
 """Cell of the grid on which free space is flooded from the start [m]."""
@@ -33,15 +32,7 @@ _PAIR_STEP = 1 << 20
 
 
 @ti.func
-def draw_layout(
-    env,
-    world: Out[WorldState],
-    mission: Out[MissionState],
-    scratch: Out[ScenarioScratch],
-    scene: In[SceneState],
-    episode: In[EpisodeState],
-    world_cfg: Const[WorldConfig],
-):
+def draw_layout(env, io: Bundle[WorldIO]):
     """Start, goal and static obstacles, drawn again until free space joins start and goal."""
     joined = 0
     draws = 0
@@ -49,27 +40,25 @@ def draw_layout(
     while joined == 0 and draws < _LAYOUTS * _PAIRS:
         if draws % _LAYOUTS == 0:
             pair = draws // _LAYOUTS
-            fault = draw_endpoints(env, pair, mission, scratch, episode, world_cfg)
+            fault = draw_endpoints(env, pair, io)
         layout_fault = fault
-        if ti.static(world_cfg.static_slots > 0):
-            if draw_static_bodies(env, draws, world, mission, scratch, scene, episode, world_cfg) == 0:
+        if ti.static(io.world_cfg.static_slots > 0):
+            if draw_static_bodies(env, draws, io) == 0:
                 layout_fault |= FAULT_STATIC
-        if ti.static(world_cfg.n_fixed_static + world_cfg.static_slots > 0):
-            if layout_fault == 0 and is_joined(env, world, mission, scratch, world_cfg) == 0:
+        if ti.static(io.world_cfg.n_fixed_static + io.world_cfg.static_slots > 0):
+            if layout_fault == 0 and is_joined(env, io) == 0:
                 layout_fault |= FAULT_JOINED
         joined = ti.cast(layout_fault == 0, ti.i32)
-        world.faults[env] = layout_fault
+        io.world.faults[env] = layout_fault
         draws += 1
-    world.draws[env] = draws
+    io.world.draws[env] = draws
 
 
 @ti.func
-def draw_endpoints(
-    env, pair, mission: Out[MissionState], scratch: In[ScenarioScratch], episode: In[EpisodeState], world_cfg: Const[WorldConfig]
-):
+def draw_endpoints(env, pair, io: Bundle[WorldIO]):
     """Start, goal and heading; a fault where no draw keeps the gaps."""
-    key = stream_key(episode.key[env], _PAIR_STEP + pair, STREAM_SCENARIO)
-    mission.start_yaw[env] = uniform_in(key, 0, -0.5 * TWO_PI, 0.5 * TWO_PI)
+    key = stream_key(io.episode.key[env], _PAIR_STEP + pair, STREAM_SCENARIO)
+    io.mission.start_yaw[env] = uniform_in(key, 0, -0.5 * TWO_PI, 0.5 * TWO_PI)
     found = 0
     draw = 0
     while found == 0 and draw < _PAIR_DRAWS:
@@ -79,9 +68,9 @@ def draw_endpoints(
             first = 8 + 8 * draw + 4 * end
             point = ti.Vector(
                 [
-                    uniform_in(key, first, world_cfg.spawn_x_m[0], world_cfg.spawn_x_m[1]),
-                    uniform_in(key, first + 1, world_cfg.spawn_y_m[0], world_cfg.spawn_y_m[1]),
-                    uniform_in(key, first + 2, world_cfg.spawn_z_m[0], world_cfg.spawn_z_m[1]),
+                    uniform_in(key, first, io.world_cfg.spawn_x_m[0], io.world_cfg.spawn_x_m[1]),
+                    uniform_in(key, first + 1, io.world_cfg.spawn_y_m[0], io.world_cfg.spawn_y_m[1]),
+                    uniform_in(key, first + 2, io.world_cfg.spawn_z_m[0], io.world_cfg.spawn_z_m[1]),
                 ]
             )
             if end == 0:
@@ -89,87 +78,76 @@ def draw_endpoints(
             else:
                 goal = point
         across = ti.Vector([goal[0] - start[0], goal[1] - start[1]])
-        found = ti.cast(across.dot(across) >= world_cfg.start_goal_gap_m**2, ti.i32)
-        mission.start_w[env] = start
-        mission.goal_w[env] = goal
-        for slot in range(ti.static(world_cfg.n_fixed_static)):
-            found &= keeps_endpoints(env, scratch.footprint[env, slot], mission, world_cfg)
+        found = ti.cast(across.dot(across) >= io.world_cfg.start_goal_gap_m**2, ti.i32)
+        io.mission.start_w[env] = start
+        io.mission.goal_w[env] = goal
+        for slot in range(ti.static(io.world_cfg.n_fixed_static)):
+            found &= keeps_endpoints(env, io.scratch.footprint[env, slot], io)
         draw += 1
     return ti.cast(found == 0, ti.i32) * FAULT_ENDPOINTS
 
 
 @ti.func
-def keeps_endpoints(env, shape, mission: In[MissionState], world_cfg: Const[WorldConfig]):
+def keeps_endpoints(env, shape, io: Bundle[WorldIO]):
     """1 where a footprint's surface keeps its gap from start and goal."""
-    reach = world_cfg.static.endpoint_gap_m + shape[6]
-    nearest = ti.min(nearest_squared(shape, mission.start_w[env]), nearest_squared(shape, mission.goal_w[env]))
+    reach = io.world_cfg.static.endpoint_gap_m + shape[6]
+    nearest = ti.min(nearest_squared(shape, io.mission.start_w[env]), nearest_squared(shape, io.mission.goal_w[env]))
     return ti.cast(nearest > 0.0 and nearest >= reach * reach, ti.i32)
 
 
 @ti.func
-def draw_static_bodies(
-    env,
-    layout,
-    world: Out[WorldState],
-    mission: In[MissionState],
-    scratch: Out[ScenarioScratch],
-    scene: In[SceneState],
-    episode: In[EpisodeState],
-    world_cfg: Const[WorldConfig],
-):
+def draw_static_bodies(env, layout, io: Bundle[WorldIO]):
     """Draw S static obstacles one after the other; 0 where one finds no place."""
-    key = stream_key(episode.key[env], layout, STREAM_SCENARIO)
-    n_static = ti.min(scene.n_static[env], ti.static(world_cfg.static_slots))
-    first = ti.static(world_cfg.n_fixed_static)
-    for i in range(ti.static(world_cfg.static_slots)):
-        world.kind[env, first + i] = NONE
+    key = stream_key(io.episode.key[env], layout, STREAM_SCENARIO)
+    n_static = ti.min(io.scene.n_static[env], ti.static(io.world_cfg.static_slots))
+    first = ti.static(io.world_cfg.n_fixed_static)
+    for i in range(ti.static(io.world_cfg.static_slots)):
+        io.world.kind[env, first + i] = NONE
     placed = 1
     i = 0
     while placed == 1 and i < n_static:
-        placed = draw_static_body(env, first + i, i, key, world, mission, scratch, world_cfg)
+        placed = draw_static_body(env, first + i, i, key, io)
         i += 1
     return placed
 
 
 @ti.func
-def draw_static_body(
-    env, slot, i, key, world: Out[WorldState], mission: In[MissionState], scratch: Out[ScenarioScratch], world_cfg: Const[WorldConfig]
-):
+def draw_static_body(env, slot, i, key, io: Bundle[WorldIO]):
     """Draw size and heading once, then places until the gaps are kept; 0 where none keeps them."""
     first = i * (8 + 2 * _PLACE_DRAWS)
-    half_height = 0.5 * (world_cfg.tank.z_m[1] - world_cfg.tank.z_m[0])
-    radius = uniform_in(key, first, world_cfg.static.radius_m[0], world_cfg.static.radius_m[1])
+    half_height = 0.5 * (io.world_cfg.tank.z_m[1] - io.world_cfg.tank.z_m[0])
+    radius = uniform_in(key, first, io.world_cfg.static.radius_m[0], io.world_cfg.static.radius_m[1])
     kind = CYLINDER
     size = ti.Vector([radius, radius, half_height])
     yaw = 0.0
-    if is_chosen(i, world_cfg.static.box_fraction) == 1:
+    if is_chosen(i, io.world_cfg.static.box_fraction) == 1:
         kind = BOX
-        size[0] = uniform_in(key, first + 1, world_cfg.static.half_extent_m[0], world_cfg.static.half_extent_m[1])
-        size[1] = uniform_in(key, first + 2, world_cfg.static.half_extent_m[0], world_cfg.static.half_extent_m[1])
+        size[0] = uniform_in(key, first + 1, io.world_cfg.static.half_extent_m[0], io.world_cfg.static.half_extent_m[1])
+        size[1] = uniform_in(key, first + 2, io.world_cfg.static.half_extent_m[0], io.world_cfg.static.half_extent_m[1])
         yaw = TWO_PI * uniform(key, first + 3)
     found = 0
     draw = 0
     while found == 0 and draw < _PLACE_DRAWS:
-        x = uniform_in(key, first + 8 + 2 * draw, world_cfg.tank.x_m[0], world_cfg.tank.x_m[1])
-        y = uniform_in(key, first + 9 + 2 * draw, world_cfg.tank.y_m[0], world_cfg.tank.y_m[1])
-        pos_w = ti.Vector([x, y, world_cfg.tank.z_m[0] + half_height])
+        x = uniform_in(key, first + 8 + 2 * draw, io.world_cfg.tank.x_m[0], io.world_cfg.tank.x_m[1])
+        y = uniform_in(key, first + 9 + 2 * draw, io.world_cfg.tank.y_m[0], io.world_cfg.tank.y_m[1])
+        pos_w = ti.Vector([x, y, io.world_cfg.tank.z_m[0] + half_height])
         shape = footprint_of(kind, pos_w, size, yaw)
-        if is_inside(shape, 0.0, world_cfg.tank) == 1 and keeps_endpoints(env, shape, mission, world_cfg) == 1:
-            found = keeps_gaps(env, shape, slot, world_cfg.static.gap_m, scratch)
+        if is_inside(shape, 0.0, io.world_cfg.tank) == 1 and keeps_endpoints(env, shape, io) == 1:
+            found = keeps_gaps(env, shape, slot, io.world_cfg.static.gap_m, io)
         if found == 1:
-            put_body(env, slot, kind, pos_w, size, yaw, world)
-            scratch.footprint[env, slot] = shape
+            put_body(env, slot, kind, pos_w, size, yaw, io)
+            io.scratch.footprint[env, slot] = shape
         draw += 1
     return found
 
 
 @ti.func
-def keeps_gaps(env, shape, n_body, gap_m, scratch: In[ScenarioScratch]):
+def keeps_gaps(env, shape, n_body, gap_m, io: Bundle[WorldIO]):
     """1 where a footprint keeps its gap from the first bodies of the list."""
     kept = 1
     for slot in range(n_body):
         if kept == 1:
-            kept = is_apart(shape, scratch.footprint[env, slot], gap_m)
+            kept = is_apart(shape, io.scratch.footprint[env, slot], gap_m)
     return kept
 
 
@@ -177,60 +155,62 @@ def keeps_gaps(env, shape, n_body, gap_m, scratch: In[ScenarioScratch]):
 
 
 @ti.func
-def is_joined(env, world: In[WorldState], mission: In[MissionState], scratch: Out[ScenarioScratch], world_cfg: Const[WorldConfig]):
+def is_joined(env, io: Bundle[WorldIO]):
     """1 where free space with the wanted clearance joins start and goal.
 
     Conservative: cells are neighbours over their edges, and a cell is free where its centre has half a cell more clearance than wanted,
     so that the straight way between neighbours has what is wanted (distance is 1-Lipschitz).
     """
-    block_cells(env, world_cfg.static.joined_clearance_m + 0.5 * COARSE_M, world, scratch, world_cfg)
-    start = coarse_cell(mission.start_w[env], scratch, world_cfg)
-    goal = coarse_cell(mission.goal_w[env], scratch, world_cfg)
-    changed = ti.cast(scratch.reach[env, start[0], start[1]] == 0, ti.i32)
+    block_cells(env, io.world_cfg.static.joined_clearance_m + 0.5 * COARSE_M, io)
+    start = coarse_cell(io.mission.start_w[env], io)
+    goal = coarse_cell(io.mission.goal_w[env], io)
+    changed = ti.cast(io.scratch.reach[env, start[0], start[1]] == 0, ti.i32)
     if changed == 1:
-        scratch.reach[env, start[0], start[1]] = ti.u8(2)
+        io.scratch.reach[env, start[0], start[1]] = ti.u8(2)
     sweep = 0
-    while changed == 1 and sweep < 2 * _SWEEPS and scratch.reach[env, goal[0], goal[1]] != 2:
-        changed = flood_sweep(env, sweep & 1, scratch)
+    while changed == 1 and sweep < 2 * _SWEEPS and io.scratch.reach[env, goal[0], goal[1]] != 2:
+        changed = flood_sweep(env, sweep & 1, io)
         if changed == 0 and sweep == 0:
             changed = 1  # the first sweep runs one way only
         sweep += 1
-    return ti.cast(scratch.reach[env, goal[0], goal[1]] == 2, ti.i32)
+    return ti.cast(io.scratch.reach[env, goal[0], goal[1]] == 2, ti.i32)
 
 
 @ti.func
-def coarse_cell(pos_w, scratch: In[ScenarioScratch], world_cfg: Const[WorldConfig]):
+def coarse_cell(pos_w, io: Bundle[WorldIO]):
     """(row, col) of the coarse cell that holds a position."""
-    row = ti.cast((pos_w[1] - world_cfg.tank.y_m[0]) * (1.0 / COARSE_M), ti.i32)
-    col = ti.cast((pos_w[0] - world_cfg.tank.x_m[0]) * (1.0 / COARSE_M), ti.i32)
-    return ti.Vector([ti.math.clamp(row, 0, scratch.reach.shape[1] - 1), ti.math.clamp(col, 0, scratch.reach.shape[2] - 1)])
+    row = ti.cast((pos_w[1] - io.world_cfg.tank.y_m[0]) * (1.0 / COARSE_M), ti.i32)
+    col = ti.cast((pos_w[0] - io.world_cfg.tank.x_m[0]) * (1.0 / COARSE_M), ti.i32)
+    return ti.Vector([ti.math.clamp(row, 0, io.scratch.reach.shape[1] - 1), ti.math.clamp(col, 0, io.scratch.reach.shape[2] - 1)])
 
 
 @ti.func
-def block_cells(env, clearance_m, world: In[WorldState], scratch: Out[ScenarioScratch], world_cfg: Const[WorldConfig]):
+def block_cells(env, clearance_m, io: Bundle[WorldIO]):
     """Mark the cells whose centre is nearer than ``clearance_m`` to a wall or static obstacle."""
-    for row, col in ti.ndrange(scratch.reach.shape[1], scratch.reach.shape[2]):
-        center = ti.Vector([world_cfg.tank.x_m[0] + (col + 0.5) * COARSE_M, world_cfg.tank.y_m[0] + (row + 0.5) * COARSE_M])
-        scratch.reach[env, row, col] = ti.cast(1 - is_inside(disc(center, 0.0), clearance_m, world_cfg.tank), ti.u8)
-    for slot in range(ti.static(world_cfg.n_fixed_static + world_cfg.static_slots)):
-        if world.kind[env, slot] != NONE:
-            shape = scratch.footprint[env, slot]
+    for row, col in ti.ndrange(io.scratch.reach.shape[1], io.scratch.reach.shape[2]):
+        center = ti.Vector([io.world_cfg.tank.x_m[0] + (col + 0.5) * COARSE_M, io.world_cfg.tank.y_m[0] + (row + 0.5) * COARSE_M])
+        io.scratch.reach[env, row, col] = ti.cast(1 - is_inside(disc(center, 0.0), clearance_m, io.world_cfg.tank), ti.u8)
+    for slot in range(ti.static(io.world_cfg.n_fixed_static + io.world_cfg.static_slots)):
+        if io.world.kind[env, slot] != NONE:
+            shape = io.scratch.footprint[env, slot]
             reach = clearance_m + shape[6]
             span = ti.Vector([1.0, 1.0]) * (reach + shape[4] + shape[5])  # bounds the turned rectangle
-            low = coarse_cell(ti.Vector([shape[0], shape[1]]) - span, scratch, world_cfg)
-            high = coarse_cell(ti.Vector([shape[0], shape[1]]) + span, scratch, world_cfg)
+            low = coarse_cell(ti.Vector([shape[0], shape[1]]) - span, io)
+            high = coarse_cell(ti.Vector([shape[0], shape[1]]) + span, io)
             for row in range(low[0], high[0] + 1):
                 for col in range(low[1], high[1] + 1):
-                    center = ti.Vector([world_cfg.tank.x_m[0] + (col + 0.5) * COARSE_M, world_cfg.tank.y_m[0] + (row + 0.5) * COARSE_M])
+                    center = ti.Vector(
+                        [io.world_cfg.tank.x_m[0] + (col + 0.5) * COARSE_M, io.world_cfg.tank.y_m[0] + (row + 0.5) * COARSE_M]
+                    )
                     if nearest_squared(shape, center) < reach * reach:
-                        scratch.reach[env, row, col] = ti.u8(1)
+                        io.scratch.reach[env, row, col] = ti.u8(1)
 
 
 @ti.func
-def flood_sweep(env, backward, scratch: Out[ScenarioScratch]):
+def flood_sweep(env, backward, io: Bundle[WorldIO]):
     """Carry "reached" to free neighbours in raster order, forward or backward; 1 where anything changed."""
-    n_row = ti.static(scratch.reach.shape[1])
-    n_col = ti.static(scratch.reach.shape[2])
+    n_row = ti.static(io.scratch.reach.shape[1])
+    n_col = ti.static(io.scratch.reach.shape[2])
     changed = 0
     for i in range(n_row * n_col):
         cell = i
@@ -238,17 +218,17 @@ def flood_sweep(env, backward, scratch: Out[ScenarioScratch]):
             cell = n_row * n_col - 1 - i
         row = cell // n_col
         col = cell - row * n_col
-        if scratch.reach[env, row, col] == 0:
+        if io.scratch.reach[env, row, col] == 0:
             near = 0
-            if row > 0 and scratch.reach[env, row - 1, col] == 2:
+            if row > 0 and io.scratch.reach[env, row - 1, col] == 2:
                 near = 1
-            if row < n_row - 1 and scratch.reach[env, row + 1, col] == 2:
+            if row < n_row - 1 and io.scratch.reach[env, row + 1, col] == 2:
                 near = 1
-            if col > 0 and scratch.reach[env, row, col - 1] == 2:
+            if col > 0 and io.scratch.reach[env, row, col - 1] == 2:
                 near = 1
-            if col < n_col - 1 and scratch.reach[env, row, col + 1] == 2:
+            if col < n_col - 1 and io.scratch.reach[env, row, col + 1] == 2:
                 near = 1
             if near == 1:
-                scratch.reach[env, row, col] = ti.u8(2)
+                io.scratch.reach[env, row, col] = ti.u8(2)
                 changed = 1
     return changed

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 import taichi as ti
 
+from tests.bundles import io_for
 from tests.test_architecture import PACKAGE, tree_of
 from uuvtai import state
 from uuvtai.config import Config, TrackingConfig, WorldConfig
 from uuvtai.kernels.core.geometry import NONE, SPHERE
-from uuvtai.kernels.perception import debug_tracks
+from uuvtai.kernels.privileged import true_tracks
+from uuvtai.kernels.privileged.bundles import TrueTracksIO
 from uuvtai.loader import load_config
 from uuvtai.sizes import array_sizes
 
@@ -99,7 +101,7 @@ def test_where_tracks_are_too_few_the_nearest_bodies_get_them():
         world.size[0, first + lane] = (0.2, 0.2, 0.2)
         world.vel_w[0, first + lane] = (0.5, 0.0, 0.0)
         path.n_way[0, lane] = 2
-    debug_tracks.know_bodies(tracks, clusters, world, path, ego, clock, config.elevation, config.world.tank)
+    true_tracks.know_bodies(io_for(TrueTracksIO, tracks, clusters, world, path, ego, clock, config.elevation, config.world.tank))
     ti.sync()
     assert tracks.state.to_numpy()[0, :, 0].tolist() == [2.0, 3.0, 7.0]
     assert tracks.alive.to_numpy()[0].tolist() == [1, 1, 1]

@@ -1,0 +1,86 @@
+"""Fills the bundles of the stages, once, by type: a kernel's ``io`` says what it reads and writes, and here it gets it."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from functools import cache
+from typing import Any, TypeVar
+
+from uuvtai.config import Section
+
+_T = TypeVar("_T")
+
+_MARKED = re.compile(r"(?:In|Out|Const)\[(\w+)\]")
+
+
+def bind(bundle: type[_T], *sources: object, partial: bool = False) -> _T:
+    """A bundle whose members are those parts of the sources that have their types.
+
+    ``sources`` are structs, config sections (searched with all their parts), bundles, and dataclasses of structs. Raises TypeError for a
+    member that two sources have, and for one that none has; where ``partial`` is set that one stays None, and what uses it cannot compile.
+    """
+    parts: dict[str, Any] = {}
+    for source in sources:
+        _gather(source, parts)
+    if partial:
+        return bundle(**{name: parts.get(kind) for name, kind in members_of(bundle).items()})
+    return _filled(bundle, parts)
+
+
+def bind_all(stages: type[_T], *sources: object) -> _T:
+    """A dataclass of bundles, each of them bound."""
+    parts: dict[str, Any] = {}
+    for source in sources:
+        _gather(source, parts)
+    bundles = _resolved(stages)
+    return stages(**{name: _filled(bundle, parts) for name, bundle in bundles.items()})
+
+
+def members_of(bundle: type) -> dict[str, str]:
+    """Name of the type of each member, as its annotation says."""
+    found = {}
+    for member in dataclasses.fields(bundle):  # type: ignore[arg-type]
+        marked = _MARKED.fullmatch(str(member.type))
+        if marked is None:
+            raise TypeError(f"{bundle.__name__}.{member.name}: {member.type} is none of In[..], Out[..] and Const[..]")
+        found[member.name] = marked.group(1)
+    return found
+
+
+@cache
+def _resolved(stages: type) -> dict[str, type]:
+    import typing
+
+    return typing.get_type_hints(stages)
+
+
+def _filled(bundle: type[_T], parts: dict[str, Any]) -> _T:
+    wanted = members_of(bundle)
+    if missing := sorted(kind for kind in wanted.values() if kind not in parts):
+        raise TypeError(f"{bundle.__name__} needs {', '.join(missing)}: pass them too")
+    return bundle(**{name: parts[kind] for name, kind in wanted.items()})
+
+
+def _gather(source: object, parts: dict[str, Any]) -> None:
+    """Note ``source`` and all of its parts by the names of their types."""
+    if isinstance(source, Section):
+        for name in type(source).model_fields:
+            value = getattr(source, name)
+            if isinstance(value, Section):
+                _note(value, parts)
+                _gather(value, parts)
+        _note(source, parts)
+    elif dataclasses.is_dataclass(source) and not isinstance(source, type):
+        inner = [getattr(source, member.name) for member in dataclasses.fields(source)]
+        if inner and all(dataclasses.is_dataclass(value) or isinstance(value, Section) for value in inner):
+            for value in inner:
+                _gather(value, parts)
+        else:
+            _note(source, parts)
+
+
+def _note(value: object, parts: dict[str, Any]) -> None:
+    kind = type(value).__name__
+    if parts.setdefault(kind, value) is not value:
+        raise TypeError(f"two different {kind} to bind")

@@ -1,0 +1,70 @@
+"""What each stage of this room reads and writes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from uuvtai.config import EpisodeConfig, MappingConfig, TankConfig, TeacherConfig, TrackingConfig, VehicleConfig
+from uuvtai.kernels.core.signature import Const, In, Out
+from uuvtai.state import (
+    ClearanceState,
+    ClockState,
+    ForecastState,
+    MissionState,
+    Proprioception,
+    RouteState,
+    SonarScan,
+    TeacherState,
+    TreeTable,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class EvasionIO:
+    """The evasive velocity of least cost."""
+
+    teacher: Out[TeacherState]
+    clearance: In[ClearanceState]
+    clock: In[ClockState]
+    ego: In[Proprioception]
+    forecast: In[ForecastState]
+    mapping_cfg: Const[MappingConfig]
+    tank_cfg: Const[TankConfig]
+    teacher_cfg: Const[TeacherConfig]
+    tracking_cfg: Const[TrackingConfig]
+    vehicle_cfg: Const[VehicleConfig]
+
+
+@dataclass(frozen=True, eq=False)
+class TeacherIO:
+    """The behaviour tree and its action."""
+
+    teacher: Out[TeacherState]
+    clock: In[ClockState]
+    ego: In[Proprioception]
+    mission: In[MissionState]
+    route: In[RouteState]
+    table: In[TreeTable]
+    episode_cfg: Const[EpisodeConfig]
+    teacher_cfg: Const[TeacherConfig]
+    vehicle_cfg: Const[VehicleConfig]
+
+
+@dataclass(frozen=True, eq=False)
+class ThreatsIO:
+    """What is dangerous now."""
+
+    teacher: Out[TeacherState]
+    clearance: In[ClearanceState]
+    clock: In[ClockState]
+    ego: In[Proprioception]
+    forecast: In[ForecastState]
+    mission: In[MissionState]
+    route: In[RouteState]
+    scan: In[SonarScan]
+    episode_cfg: Const[EpisodeConfig]
+    mapping_cfg: Const[MappingConfig]
+    tank_cfg: Const[TankConfig]
+    teacher_cfg: Const[TeacherConfig]
+    tracking_cfg: Const[TrackingConfig]
+    vehicle_cfg: Const[VehicleConfig]

@@ -1,0 +1,122 @@
+"""All that one simulator owns: its structs, and the bundles by which its stages see them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from uuvtai import state
+from uuvtai.allocation import allocation_matrices
+from uuvtai.bounds import load_bounds
+from uuvtai.capture import Put
+from uuvtai.config import Config
+from uuvtai.kernels.core.grid import outside_cells
+from uuvtai.kernels.perception.bundles import (
+    ForecastIO,
+    HeightsIO,
+    LookIO,
+    MappingIO,
+    SpottingIO,
+    TrackingIO,
+)
+from uuvtai.kernels.planning.bundles import ClearanceIO, FeaturesIO, RouteIO, TriggersIO, VoronoiIO
+from uuvtai.kernels.privileged.bundles import TrueMapIO, TrueTracksIO
+from uuvtai.kernels.sensors.bundles import DepthIO, ProprioceptionIO, SonarIO
+from uuvtai.kernels.task.bundles import EpisodeIO, RewardIO
+from uuvtai.kernels.teacher.bundles import EvasionIO, TeacherIO, ThreatsIO
+from uuvtai.kernels.vehicle.bundles import ActuationIO, DynamicsIO
+from uuvtai.kernels.world.bundles import WorldIO
+from uuvtai.scenario import load_fixed
+
+STAGES = (
+    "dynamics", "world", "proprioception", "sonar", "depth", "tracking",
+    "mapping", "clearance", "planning", "features", "teacher", "reward",
+)  # fmt: skip
+"""what is timed apart, in order"""
+
+
+@dataclass(frozen=True)
+class SimState:
+    """Every struct of the simulator, by the noun of its stage."""
+
+    clock: state.ClockState
+    episode: state.EpisodeState
+    vehicle: state.VehicleState
+    params: state.VehicleParams
+    actuation: state.ActuationState
+    allocation: state.Allocation
+    current: state.CurrentState
+    scene: state.SceneState
+    world: state.WorldState
+    path: state.PathState
+    fixed: state.FixedTable
+    scratch: state.ScenarioScratch
+    mission: state.MissionState
+    referee: state.RefereeState
+    ego: state.Proprioception
+    ego_memory: state.ProprioceptionMemory
+    scan: state.SonarScan
+    sonar_memory: state.SonarMemory
+    image: state.DepthImage
+    tracks: state.TrackState
+    clusters: state.ClusterState
+    spots: state.SpotState
+    habits: state.HabitState
+    forecast: state.ForecastState
+    mask: state.GridMask
+    grid_map: state.MapState
+    map_scratch: state.MapScratch
+    clearance: state.ClearanceState
+    clearance_memory: state.ClearanceMemory
+    voronoi: state.VoronoiState
+    route: state.RouteState
+    features: state.FeatureState
+    teacher: state.TeacherState
+    table: state.TreeTable
+    reward: state.RewardState
+
+
+@dataclass(frozen=True)
+class Stages:
+    """What every stage reads and writes, by the noun of the stage."""
+
+    episode: EpisodeIO
+    world: WorldIO
+    actuation: ActuationIO
+    dynamics: DynamicsIO
+    proprioception: ProprioceptionIO
+    sonar: SonarIO
+    depth: DepthIO
+    tracking: TrackingIO
+    spotting: SpottingIO
+    look: LookIO
+    true_tracks: TrueTracksIO
+    forecast: ForecastIO
+    heights: HeightsIO
+    mapping: MappingIO
+    true_map: TrueMapIO
+    clearance: ClearanceIO
+    features: FeaturesIO
+    triggers: TriggersIO
+    voronoi: VoronoiIO
+    route: RouteIO
+    threats: ThreatsIO
+    evasion: EvasionIO
+    teacher: TeacherIO
+    reward: RewardIO
+
+
+def allocate_state(sizes: dict[str, int]) -> SimState:
+    """Every struct, with the lengths of ``sizes.array_sizes``."""
+    kinds = {member.name: getattr(state, str(member.type).rpartition(".")[2]) for member in fields(SimState)}
+    return SimState(**{name: state.allocate(kind, sizes) for name, kind in kinds.items()})
+
+
+def fill_constants(s: SimState, config: Config, put: Put) -> None:
+    """What no step changes: explicit obstacles, the tank's bounds on the map, the thrusters' geometry."""
+    load_fixed(s.fixed, config.world)
+    load_bounds(s.mask, np.array(outside_cells(config.world.tank, config.mapping.cell_m)), put)
+    wrench_of_thrust, thrust_of_wrench = allocation_matrices(config.vehicle)
+    put(s.allocation.wrench_of_thrust, wrench_of_thrust.astype(np.float32))
+    put(s.allocation.thrust_of_wrench, thrust_of_wrench.astype(np.float32))
