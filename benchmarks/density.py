@@ -7,7 +7,8 @@ import time
 
 from benchmarks.common import Job, Row
 from uuvtai.loader import load_config
-from uuvtai.measure.profiling import PAPER_DENSITY, WARM_STEPS, Batch
+from uuvtai.measure.profiling import PAPER_DENSITY, WARM_STEPS
+from uuvtai.measure.sim_batch import SimBatch
 from uuvtai.sim import Sim
 from uuvtai.tree import read_tree
 
@@ -66,7 +67,7 @@ def _loops(sim: Sim, scenes: list[tuple[int, int]], speed_m_s: float, job: Job) 
         for scene in scenes:
             job.say(f"turn {turn + 1} of {turns}: S = {scene[0]}, D = {scene[1]}")
             sim.set_scenes([(*scene, speed_m_s)])
-            batch = Batch(sim, first_episode=turn)
+            batch = SimBatch(sim, first_episode=turn)
             for _ in range(WARM_STEPS):
                 batch.step()
             begun = time.perf_counter()
@@ -78,7 +79,7 @@ def _loops(sim: Sim, scenes: list[tuple[int, int]], speed_m_s: float, job: Job) 
 
 def _real_time(sim: Sim, n_static: int, n_dynamic: int, job: Job) -> Row:
     """99th percentile of ``Sim.step`` alone, as a vehicle would run it."""
-    batch = Batch(sim)
+    batch = SimBatch(sim)
     for _ in range(WARM_STEPS):
         batch.step()
     samples = []

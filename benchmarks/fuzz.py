@@ -121,7 +121,7 @@ def _open(kind: str, path: Path, exported: Path) -> None:
     from uuvtai.deploy import run_policy
     from uuvtai.deploy.agreement import of_onnx
     from uuvtai.loader import load_config
-    from uuvtai.logs import export, reader, recording, repair
+    from uuvtai.logs import log_export, reader, recording, repair
     from uuvtai.tree import read_tree
 
     golden = exported / "golden.npz"
@@ -138,7 +138,7 @@ def _open(kind: str, path: Path, exported: Path) -> None:
             lambda: reader.info(path),
             lambda: recording.load_recording(path),
             lambda: repair.repair(path, path.parent / "repaired.mcap", force=True),
-            *(lambda fmt=fmt: export.export(path, path.parent / f"out_{fmt}", fmt=fmt) for fmt in ("json", "csv", "npz")),
+            *(lambda fmt=fmt: log_export.export(path, path.parent / f"out_{fmt}", fmt=fmt) for fmt in ("json", "csv", "npz")),
         ],
     }
     refused = None

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 from benchmarks.common import Job, Row
 from uuvtai.loader import load_config
-from uuvtai.measure.profiling import Batch
+from uuvtai.measure.sim_batch import SimBatch
 from uuvtai.sim import Sim
 from uuvtai.sizes import memory_bytes
 from uuvtai.tree import read_tree
@@ -29,7 +29,7 @@ def measure(job: Job) -> list[Row]:
     for n in sizes:
         job.say(f"{n} envs: starting")
         sim = Sim(config, n, tree, job.device)
-        Batch(sim).step()  # compiled before any clock runs
+        SimBatch(sim).step()  # compiled before any clock runs
         players[n] = _played(sim, sizes[-1], spent[n])
     for turn in range(_TURNS):
         for n in sizes:
@@ -69,7 +69,7 @@ def _growth(small: Row, big: Row, device: str) -> Row:
 def _played(sim: Sim, episodes: int, spent: list[float]) -> Iterator[None]:
     """Play that many episodes in groups of the simulator's size, a turn at a time; adds wall and CPU time to ``spent``."""
     for first in range(0, episodes - sim.num_envs + 1, sim.num_envs):
-        batch = Batch(sim, first)
+        batch = SimBatch(sim, first)
         for _ in range(_WARM):
             batch.step()
         for _ in range(_TURNS):

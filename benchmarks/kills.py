@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.common import Job, Row
-from uuvtai.measure.sweep.run import REQUEST, ROWS
+from uuvtai.measure.sweep.play import REQUEST, ROWS
 
 _KILLS = 10
 _LONGEST_S = 16.0

@@ -509,7 +509,7 @@ KERNELS = (
     ),
     Mutation(
         "heave_unforecast",
-        "uuvtai/kernels/teacher/rollout.py",
+        "uuvtai/kernels/teacher/trajectories.py",
         "z = ti.math.clamp(cz * gain + (pos[2] + vel[2] * settle), low, high)",
         "z = ti.math.clamp(cz * gain + pos[2], low, high)",
         "tests/test_teacher.py",

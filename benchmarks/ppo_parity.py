@@ -93,12 +93,12 @@ def _theirs(seed: int, rollouts: int):
 
 def _ours(seed: int, rollouts: int):
     from uuvtai.config.learning import PolicyConfig, PpoConfig
-    from uuvtai.learn.policy import Policy
+    from uuvtai.learn.policy import ActorCritic
     from uuvtai.learn.ppo import Ppo
     from uuvtai.learn.rollout import Rollout
 
     generator = torch.Generator().manual_seed(seed)
-    policy = Policy(3, PolicyConfig(hidden=_HIDDEN, activation="tanh", initial_std=1.0, min_std=1e-3), None, generator, num_actions=1)
+    policy = ActorCritic(3, PolicyConfig(hidden=_HIDDEN, activation="tanh", initial_std=1.0, min_std=1e-3), None, generator, num_actions=1)
     config = PpoConfig(
         rollout_steps=_STEPS, learning_rate=_RATE, epochs=_EPOCHS, minibatches=_MINIBATCHES, clip=_CLIP, gamma=_GAMMA, gae_lambda=_LAMBDA,
         entropy_weight=0.0, value_weight=_VALUE, max_grad_norm=_NORM, shuffle=True, normalise_observations=False, normalise_values=False,

@@ -6,7 +6,8 @@ import time
 
 from benchmarks.common import Job, Row
 from uuvtai.loader import load_config
-from uuvtai.measure.profiling import WARM_STEPS, Batch, env_steps_per_s
+from uuvtai.measure.profiling import WARM_STEPS, env_steps_per_s
+from uuvtai.measure.sim_batch import SimBatch
 from uuvtai.sim import Sim
 from uuvtai.sizes import memory_bytes
 from uuvtai.stages import STAGES
@@ -32,7 +33,7 @@ def _row(job: Job, sensors: str, n_env: int) -> Row:
     config = load_config("pool", sensors)
     begun = time.perf_counter()
     sim = Sim(config, n_env, read_tree("bt", config.teacher.max_node), job.device)
-    batch = Batch(sim)
+    batch = SimBatch(sim)
     for _ in range(WARM_STEPS):
         batch.step()
     start_s = time.perf_counter() - begun

@@ -1,5 +1,6 @@
 """Fixtures shared by the tests. Taichi is started once per session; one small simulator serves every test of the whole stack."""
 
+import dataclasses
 import signal
 
 import numpy as np
@@ -72,8 +73,10 @@ class SmallSim:
         self.sim.reset(mask, seeds, numbers)
 
     def arrays(self, *nouns):
-        """NumPy copies of every array of these structs, by 'struct.field'."""
-        return {f"{noun}.{name}": field.to_numpy() for noun in nouns for name, field in vars(getattr(self.sim.s, noun)).items()}
+        """NumPy copies of every array of these structs but scratch, which keeps what earlier tests left in it, by 'struct.field'."""
+        structs = {noun: getattr(self.sim.s, noun) for noun in nouns}
+        kept = {noun: [f.name for f in dataclasses.fields(struct) if not f.metadata["scratch"]] for noun, struct in structs.items()}
+        return {f"{noun}.{name}": getattr(structs[noun], name).to_numpy() for noun in nouns for name in kept[noun]}
 
 
 @pytest.fixture(scope="session")

@@ -15,8 +15,8 @@ from uuvtai.config import Config
 from uuvtai.logs import convert as module
 from uuvtai.logs.container import McapFile
 from uuvtai.logs.convert import ADDED, convert, serialised
-from uuvtai.logs.errors import LogError
-from uuvtai.logs.export import grid_values
+from uuvtai.logs.log_errors import LogError
+from uuvtai.logs.log_export import grid_values
 from uuvtai.logs.mcap_log import McapEpisodeLog
 from uuvtai.logs.reader import info, read_head, read_messages
 

@@ -22,7 +22,7 @@ from uuvtai.deploy.weights import weights_of
 from uuvtai.learn import checkpoint
 from uuvtai.learn.checkpoint import CheckpointError
 from uuvtai.learn.pilot import TEACHER_COLUMN, Pilot, load_pilot
-from uuvtai.learn.policy import Policy
+from uuvtai.learn.policy import ActorCritic
 from uuvtai.learn.risk import RiskHead
 from uuvtai.learn.world_model import N_TARGET, WorldModel
 from uuvtai.loader import ConfigError, load_training
@@ -47,7 +47,7 @@ def config_of(**changes):
 def networks(config, seed=0):
     """Networks that have seen a batch and act decidedly, as a trainer's state."""
     rng = torch.Generator().manual_seed(seed)
-    policy = Policy(N_OBS + 2, config.policy, TEACHER, rng)
+    policy = ActorCritic(N_OBS + 2, config.policy, TEACHER, rng)
     policy.observation_norm.update(3.0 * torch.randn(500, N_OBS + 2, generator=rng) + 1.0)
     policy.value_norm.update(20.0 * torch.randn(500, 1, generator=rng) + 5.0)
     with torch.no_grad():
@@ -129,7 +129,7 @@ def test_numpy_and_a_decision_without_memory_agree_with_the_pilot(tmp_path, chan
 
 def test_networks_that_have_seen_nothing_agree_too():
     config, rng = config_of(), torch.Generator().manual_seed(0)
-    pilot = Pilot(Policy(N_OBS + 2, config.policy, None, rng), WorldModel(N_OBS, config.world_model, rng), 1)
+    pilot = Pilot(ActorCritic(N_OBS + 2, config.policy, None, rng), WorldModel(N_OBS, config.world_model, rng), 1)
     golden = golden_of(pilot)
     spec = {"observation": {"width": N_OBS}, "action": [{"limit": 1.0}] * 4, "rate": {"hold_steps": 1, "control_dt_s": 0.02}}
     spec["network"] = {"teacher_columns": None, "activation": "elu", "predict_change": True, "residual_limit": 0.5}

@@ -620,7 +620,7 @@ def test_bad_combinations_are_one_message(capfd, arguments, says):
 
 
 def test_the_table_is_printed_and_no_failure_is_said(capfd):
-    from uuvtai.show.causes import show_causes
+    from uuvtai.show.cause_table import show_causes
     from uuvtai.show.screen import Screen
 
     causes_found = table_of([row("late", 0, 0.2, forecast_error_m=0.1, seen_ago_s=0.0, evading_s=0.4, last_chance_s=0.5)])

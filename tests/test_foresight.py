@@ -8,7 +8,7 @@ import torch
 from uuvtai.config.learning import RiskConfig
 from uuvtai.learn.risk import NO_THRESHOLD, STRIDE, RiskHead
 from uuvtai.measure.evaluate import Job, Recorders
-from uuvtai.measure.foresight import Foresight, Moments, fit, foresight_of, judged, moments_of, told
+from uuvtai.measure.foresight import Foresight, RiskMoments, fit, foresight_of, judged, moments_of, told
 
 HORIZON = 20
 
@@ -96,7 +96,7 @@ def test_an_episode_too_short_for_a_moment_is_counted_all_the_same():
 
 
 def test_one_moment_stands_for_an_accident():
-    m = Moments(torch.tensor([1.0, 2.0, 3.0, 4.0, 9.0]), torch.tensor([0, 1, 1, 1, 1]).bool(), torch.tensor([0, 0, 0, 0, 7]))
+    m = RiskMoments(torch.tensor([1.0, 2.0, 3.0, 4.0, 9.0]), torch.tensor([0, 1, 1, 1, 1]).bool(), torch.tensor([0, 0, 0, 0, 7]))
     assert m.one_per_accident().tolist() == [3.0, 9.0]
     assert m.of_episodes(1).logit.tolist() == [9.0]
 
@@ -105,7 +105,7 @@ def sample(n, seed):
     """Episodes of one moment each whose event has probability sigmoid(logit / 2): the head is twice too sure."""
     generator = torch.Generator().manual_seed(seed)
     logit = 4.0 * torch.randn(n, generator=generator)
-    return Moments(logit, torch.rand(n, generator=generator) < torch.sigmoid(0.5 * logit), torch.arange(n))
+    return RiskMoments(logit, torch.rand(n, generator=generator) < torch.sigmoid(0.5 * logit), torch.arange(n))
 
 
 def test_calibration_holds_on_moments_that_it_has_not_seen():
@@ -129,9 +129,9 @@ def test_too_few_accidents_change_nothing():
     head = RiskHead(3, RiskConfig(miss_rate=0.05), torch.Generator())
     table = head.table.clone()
     with pytest.raises(ValueError, match="too few"):
-        fit(head, Moments(torch.zeros(20), torch.arange(20) < 5, torch.arange(20)))
+        fit(head, RiskMoments(torch.zeros(20), torch.arange(20) < 5, torch.arange(20)))
     assert torch.equal(head.table, table) and not head.has_threshold
-    assert judged(head, Moments(torch.zeros(9), torch.zeros(9).bool(), torch.arange(9))) is None
+    assert judged(head, RiskMoments(torch.zeros(9), torch.zeros(9).bool(), torch.arange(9))) is None
 
 
 def test_a_pilot_without_a_head_is_not_asked():

@@ -24,8 +24,8 @@ from uuvtai.files import FileError
 from uuvtai.logs import budget
 from uuvtai.logs.container import MAGIC, McapFile
 from uuvtai.logs.convert import convert
-from uuvtai.logs.errors import LogError
-from uuvtai.logs.export import export
+from uuvtai.logs.log_errors import LogError
+from uuvtai.logs.log_export import export
 from uuvtai.logs.mcap_log import McapEpisodeLog
 from uuvtai.logs.picture import picture
 from uuvtai.logs.reader import info, read_messages
@@ -61,7 +61,7 @@ def bounded(work, tmp_path):
     import resource
     from pathlib import Path
     from uuvtai.errors import UserError
-    from uuvtai.logs import export, reader, repair
+    from uuvtai.logs import log_export, reader, repair
     here = Path({str(tmp_path)!r})
     begun = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     try:
@@ -165,7 +165,7 @@ def test_topics_without_end(tmp_path, monkeypatch):
 
 def test_an_honest_log_is_far_from_every_limit(log_path, tmp_path):
     """Ten minutes of what the reference episode writes would still be read."""
-    record = budget.Budget("x", log_path.stat().st_size)
+    record = budget.LogBudget("x", log_path.stat().st_size)
     read = sum(1 for _ in read_messages(log_path))
     per_second = read / (N_STEP * episode.DT)
     assert per_second * 600 < budget.MAX_RECORDS
@@ -273,7 +273,7 @@ def test_a_table_that_grows_with_every_message(tmp_path, monkeypatch):
     file.finish()
     with pytest.raises(LogError, match="more than 20,000 columns"):
         export(tmp_path / "a.mcap", tmp_path / "out", fmt="csv")
-    monkeypatch.setattr("uuvtai.logs.export.MAX_ARRAYS", 100_000)
+    monkeypatch.setattr("uuvtai.logs.log_export.MAX_ARRAYS", 100_000)
     with pytest.raises(LogError, match="use --format json"):
         export(tmp_path / "a.mcap", tmp_path / "out", fmt="npz")
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]

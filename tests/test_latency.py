@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from uuvtai.measure import latency
-from uuvtai.measure.profiling import Batch
+from uuvtai.measure.sim_batch import SimBatch
 
 PLANNING = [0.010, 0.0, 0.020, 0.0, 0.0, 0.030]
 """[s] of the planning stage, step after step; where it is not 0 a route is planned"""
@@ -45,7 +45,7 @@ def samples(monkeypatch):
     def network():
         sim.now += 0.1
 
-    return latency._loop_samples(Batch(sim), 60.0, [network, network])
+    return latency._loop_samples(SimBatch(sim), 60.0, [network, network])
 
 
 def test_the_planner_is_the_mean_over_steps_that_plan(samples):
@@ -65,7 +65,7 @@ def test_stages_are_timed_for_longer_where_few_routes_were_planned(monkeypatch):
     sim = Sim()
     sim.every = 1_000_000
     monkeypatch.setattr(latency.time, "perf_counter", lambda: sim.now)
-    found = latency._loop_samples(Batch(sim), 0.1, [])
+    found = latency._loop_samples(SimBatch(sim), 0.1, [])
     assert len(found[latency.EVERY_STEP]) > len(found["Full loop"]) + 2 and len(found["Global planner"]) > 0
 
 

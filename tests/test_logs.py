@@ -25,14 +25,14 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from tests.reference import logs as episode
 from uuvtai.files import FileError
 from uuvtai.kernels.core import geometry
+from uuvtai.logs.closed_form import body_positions
 from uuvtai.logs.container import CHUNK_MAX, CHUNK_MIN, McapFile
-from uuvtai.logs.errors import LogError
-from uuvtai.logs.export import depth_image, export, file_name, grid_values
+from uuvtai.logs.log_errors import LogError
+from uuvtai.logs.log_export import depth_image, export, file_name, grid_values
 from uuvtai.logs.mcap_log import McapEpisodeLog, unique_names
 from uuvtai.logs.reader import info, read_head, read_messages
 from uuvtai.logs.recording import load_recording
 from uuvtai.logs.repair import repair
-from uuvtai.logs.scenario import body_positions
 from uuvtai.snapshot import KINDS
 
 N_STEP = 210

@@ -104,7 +104,7 @@ def test_the_same_picture_is_the_same_file(folder, logs):
 
 
 def test_a_ring_keeps_its_hole_on_either_canvas():
-    from uuvtai.logs.vector import VectorCanvas
+    from uuvtai.logs.vector_graphics import VectorCanvas
 
     outer, inner = (np.array([(-r, -r), (r, -r), (r, r), (-r, r)]) + 5.0 for r in (4.0, 2.0))
     for turn in (1, -1):

@@ -7,12 +7,12 @@ import pytest
 from tests.reference import logs as episode
 from uuvtai.logs import canvas as ink
 from uuvtai.logs.canvas import Canvas
-from uuvtai.logs.errors import LogError
+from uuvtai.logs.closed_form import body_positions
+from uuvtai.logs.log_errors import LogError
 from uuvtai.logs.mcap_log import McapEpisodeLog
 from uuvtai.logs.painting import map_canvas, paint_truth, paint_walls, paint_water
 from uuvtai.logs.picture import draw_picture, picture
 from uuvtai.logs.recording import PICTURE_TOPICS, load_recording
-from uuvtai.logs.scenario import body_positions
 from uuvtai.logs.video import FrameArtist, video
 
 INKS = ink.method_inks(["bt", "straight", "planner"])

@@ -10,13 +10,13 @@ from uuvtai.env import VectorEnv
 from uuvtai.learn import checkpoint, manifest
 from uuvtai.learn.checkpoint import CheckpointError
 from uuvtai.learn.pilot import CHUNK, Pilot, load_pilot
-from uuvtai.learn.policy import Policy
+from uuvtai.learn.policy import ActorCritic
 from uuvtai.learn.risk import RiskHead
 from uuvtai.learn.world_model import WorldModel
 from uuvtai.loader import load_training, preset_names
 from uuvtai.measure.evaluate import jobs_of, run_episodes
+from uuvtai.measure.log_recorder import EpisodeRecorder
 from uuvtai.measure.methods import Method, features_of, find_policy, policies_of
-from uuvtai.measure.recording import EpisodeRecorder
 
 N_OBS = 60
 
@@ -25,7 +25,7 @@ def networks(n_obs=N_OBS, seed=0, **config):
     """A policy and a world model that have seen a batch and act decidedly."""
     learning = load_training("smoke", [(f"policy.{key}", value) for key, value in config.items()])
     rng = torch.Generator().manual_seed(seed)
-    policy, model = Policy(n_obs + 2, learning.policy, None, rng), WorldModel(n_obs, learning.world_model, rng)
+    policy, model = ActorCritic(n_obs + 2, learning.policy, None, rng), WorldModel(n_obs, learning.world_model, rng)
     policy.observation_norm.update(3.0 * torch.randn(500, n_obs + 2, generator=rng))
     model.observation_norm.update(3.0 * torch.randn(500, n_obs, generator=rng))
     model.change_norm.update(torch.randn(500, 24, generator=rng))

@@ -9,7 +9,7 @@ from torch import nn
 from uuvtai.config.learning import PolicyConfig
 from uuvtai.learn.mlp import mlp
 from uuvtai.learn.normalise import moments_of
-from uuvtai.learn.policy import Policy, entropy, log_prob
+from uuvtai.learn.policy import ActorCritic, entropy, log_prob
 
 N_IN = 7
 FLOAT32 = 1e-5
@@ -17,7 +17,7 @@ FLOAT32 = 1e-5
 
 
 def make(seed=0, teacher_slice=None, **config):
-    return Policy(N_IN, PolicyConfig(hidden=(16, 16), **config), teacher_slice, torch.Generator().manual_seed(seed))
+    return ActorCritic(N_IN, PolicyConfig(hidden=(16, 16), **config), teacher_slice, torch.Generator().manual_seed(seed))
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import torch
 from uuvtai.config.learning import PolicyConfig, PpoConfig
 from uuvtai.learn import ppo as ppo_module
 from uuvtai.learn.normalise import combined
-from uuvtai.learn.policy import Policy, log_prob
+from uuvtai.learn.policy import ActorCritic, log_prob
 from uuvtai.learn.ppo import Ppo, adapted_rate, approximate_kl, gae, surrogate_loss, value_loss
 from uuvtai.learn.rollout import Rollout, final_value
 
@@ -109,7 +109,7 @@ def test_the_rate_follows_the_divergence():
 
 
 def make_policy(seed=0, **config):
-    return Policy(N_IN, PolicyConfig(hidden=(16, 16), **config), None, torch.Generator().manual_seed(seed))
+    return ActorCritic(N_IN, PolicyConfig(hidden=(16, 16), **config), None, torch.Generator().manual_seed(seed))
 
 
 def make_ppo(seed=0, reduce=None, gather=None, **config):
@@ -473,7 +473,7 @@ def test_a_point_learns_to_go_home():
 
     def train():
         generator = torch.Generator().manual_seed(3)
-        policy = Policy(4, PolicyConfig(hidden=(32, 32), initial_std=0.5), None, generator)
+        policy = ActorCritic(4, PolicyConfig(hidden=(32, 32), initial_std=0.5), None, generator)
         ppo = Ppo(policy, PpoConfig(rollout_steps=32, learning_rate=3e-3, epochs=4, gamma=0.9, entropy_weight=0.0))
         return play(policy, ppo, PointTask(generator), generator, 25), weights(policy)
 

@@ -5,11 +5,11 @@ import json
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from uuvtai.learn.recorder import Recorder, read_metrics
+from uuvtai.learn.recorder import MetricsRecorder, read_metrics
 
 
 def record(run, done, iterations, factor=1.0):
-    recorder = Recorder(run, done)
+    recorder = MetricsRecorder(run, done)
     for i in iterations:
         recorder.write(i, {"rollout/ep_rew_mean": factor * i, "train/policy_loss": -0.5})
     recorder.close()
@@ -26,7 +26,7 @@ def test_every_iteration_is_a_line_and_an_event(tmp_path):
 
 
 def test_lines_are_readable_while_the_run_goes_on(tmp_path):
-    recorder = Recorder(tmp_path)
+    recorder = MetricsRecorder(tmp_path)
     recorder.write(1, {"a": 1.0})
     assert read_metrics(tmp_path) == [{"iteration": 1, "a": 1.0}]
     recorder.close()
@@ -53,7 +53,7 @@ def test_a_last_line_that_was_cut_off_is_lost_alone(tmp_path):
 
 
 def test_what_is_not_finite_is_null_and_no_event(tmp_path):
-    recorder = Recorder(tmp_path)
+    recorder = MetricsRecorder(tmp_path)
     recorder.write(1, {"a": float("nan"), "b": float("inf"), "c": 1.0})
     recorder.close()
     assert read_metrics(tmp_path) == [{"iteration": 1, "a": None, "b": None, "c": 1.0}]

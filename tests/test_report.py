@@ -27,11 +27,11 @@ from uuvtai.report import ink
 from uuvtai.report.blocks import Data, Figure, Gallery, Prose, Table
 from uuvtai.report.build import report
 from uuvtai.report.colours import contrast, ink_on, shade
-from uuvtai.report.evaluation import evaluation, paired_table
 from uuvtai.report.figures import Line, curves, heat_map, intervals
 from uuvtai.report.heatmap import pivot
 from uuvtai.report.learning_curves import Training, grouped, training
 from uuvtai.report.media import media
+from uuvtai.report.methods_table import evaluation, paired_table
 from uuvtai.report.page import Page, render
 from uuvtai.report.sweep import sweep
 from uuvtai.report.terminal import print_heat_maps

@@ -7,10 +7,10 @@ import pytest
 
 from tests.report_samples import robustness_sweep
 from uuvtai.loader import preset_names
-from uuvtai.measure.reproduce import claims, paper, run, steps
+from uuvtai.measure.reproduce import claims, paper, paper_run, steps
 from uuvtai.measure.reproduce.claims import FAILS, HOLDS, OPEN, Share
 from uuvtai.measure.reproduce.markdown import _sweep, results_page, table
-from uuvtai.measure.reproduce.run import reproduce, resume
+from uuvtai.measure.reproduce.paper_run import reproduce, resume
 from uuvtai.run_folder import RunFolderError
 
 
@@ -264,7 +264,7 @@ def pages(monkeypatch):
         states.append(json.loads((folders[0] / "run.json").read_text())["status"])
         return type("Report", (), {"page": folders[0] / "report.html"})()
 
-    monkeypatch.setattr(run, "report", page)
+    monkeypatch.setattr(paper_run, "report", page)
     return states
 
 

@@ -1,16 +1,19 @@
 """OMPL's RRT as the fallback: repeatable whatever ran before, safe, and taking over in every case in which Voronoi fails."""
 
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from tests import planning_maps as maps
+from tests.bundles import io_for
 from tests.planning_stage import CONFIG, N_ENV, clean, plan, put_ends, put_maps, way_of
 from tests.reference.voronoi import clearance_of, line_points
 from tests.test_voronoi import STRICT, wall
 from uuvtai import plan_codes as codes
 from uuvtai import rrt
+from uuvtai.kernels.planning.bundles import RouteIO, VoronoiIO
 
 pytest.importorskip("ompl")
 
@@ -106,7 +109,8 @@ def test_straightening_never_costs_more():
 
 def serve(s, config=CONFIG, seed=1):
     fallback = rrt.RouteFallback(config)
-    return fallback.serve(s.route, s.clearance, s.grid_map, s.mask, s.forecast, s.mission, s.ego, s.clock, lambda env: seed + env)
+    parts = (s.route, s.clearance, s.grid_map, s.mask, s.forecast, s.mission, s.ego, s.clock, config)
+    return fallback.serve(SimpleNamespace(route=io_for(RouteIO, *parts), voronoi=io_for(VoronoiIO, *parts)), lambda env: seed + env)
 
 
 def narrow_gap():

@@ -32,17 +32,17 @@ from uuvtai.learn.checkpoint import CheckpointError
 from uuvtai.learn.manifest import config_sha256, sha256_of
 from uuvtai.learn.packing import PackingError, read_stream
 from uuvtai.learn.pilot import load_pilot
-from uuvtai.learn.recorder import Recorder
+from uuvtai.learn.recorder import MetricsRecorder
 from uuvtai.loader import ConfigError, load_config, load_resolved, parsed_yaml
 from uuvtai.logs import budget
 from uuvtai.logs.container import MAGIC, McapFile
-from uuvtai.logs.errors import LogError
-from uuvtai.logs.export import depth_image
+from uuvtai.logs.log_errors import LogError
+from uuvtai.logs.log_export import depth_image
 from uuvtai.logs.picture import picture
 from uuvtai.logs.reader import info
 from uuvtai.logs.recording import load_recording
-from uuvtai.measure.reproduce.run import resume as resume_reproduction
-from uuvtai.measure.sweep.run import resume as resume_sweep
+from uuvtai.measure.reproduce.paper_run import resume as resume_reproduction
+from uuvtai.measure.sweep.play import resume as resume_sweep
 from uuvtai.measure.training import TrainRequest, train
 from uuvtai.measure.tree_report import tree_report
 from uuvtai.report.build import report
@@ -449,7 +449,7 @@ def test_files_with_a_second_name_are_not_written_in_place(here):
     (here / "copy.jsonl").hardlink_to(run / "metrics.jsonl")
     before = (here / "copy.jsonl").read_bytes()
     with pytest.raises(UserError, match="has a second name"):
-        Recorder(run, 1)
+        MetricsRecorder(run, 1)
     assert (here / "copy.jsonl").read_bytes() == before
 
 

@@ -15,11 +15,11 @@ from tests.conftest import SmallSim
 from tests.report_samples import robustness_sweep
 from uuvtai.loader import ConfigError
 from uuvtai.measure.evaluate import Job, run_episodes
-from uuvtai.measure.sweep import run as sweep_run
+from uuvtai.measure.sweep import play as sweep_run
+from uuvtai.measure.sweep.cells import Grid, grid_of
 from uuvtai.measure.sweep.engines import EngineError, LocalEngine, RayEngine
-from uuvtai.measure.sweep.grid import Grid, grid_of
 from uuvtai.measure.sweep.plan import SweepRequest, base_config, request_of, tasks_of
-from uuvtai.measure.sweep.run import ROWS, read_rows, resume, sweep
+from uuvtai.measure.sweep.play import ROWS, read_rows, resume, sweep
 from uuvtai.run_folder import RunFolderError
 from uuvtai.show.screen import Screen
 from uuvtai.show.sweeping import show_sweep

@@ -9,8 +9,7 @@ from rich.console import Console
 
 from tests import report_samples as samples
 from uuvtai.measure.paired import paired
-from uuvtai.show.causes import show_causes
-from uuvtai.show.claims import show_claims
+from uuvtai.show.cause_table import show_causes
 from uuvtai.show.evaluation import show_methods, show_pairs
 from uuvtai.show.exports import show_export
 from uuvtai.show.health import show_checks
@@ -20,6 +19,7 @@ from uuvtai.show.profile import show_profile
 from uuvtai.show.screen import Column, Screen
 from uuvtai.show.simulation import show_simulation
 from uuvtai.show.sweeping import show_sweep
+from uuvtai.show.verdicts import show_claims
 
 WIDTHS = (80, 100, 120)
 CONDITION = {

@@ -15,7 +15,7 @@ from uuvtai import state
 from uuvtai.config import Config, TeacherConfig
 from uuvtai.kernels.core.geometry import FAR_M
 from uuvtai.kernels.core.grid import grid_origin, grid_shape
-from uuvtai.kernels.teacher import evasion, teacher, threats
+from uuvtai.kernels.teacher import evasion, leaves, threats
 from uuvtai.kernels.teacher.bundles import EvasionIO, TeacherIO, ThreatsIO
 from uuvtai.tree import load_tree, parse_tree, read_tree
 
@@ -115,7 +115,7 @@ def scene(stage):
     stage.clearance.site_row.fill(-1)
     stage.clearance.site_col.fill(-1)
     use(stage, "bt")
-    teacher.reset_teacher(io_for(TeacherIO, stage.t, stage.clock))
+    leaves.reset_teacher(io_for(TeacherIO, stage.t, stage.clock))
     return stage
 
 
@@ -190,7 +190,7 @@ def decide(stage):
 
 
 def tick(stage):
-    teacher.tick_tree(
+    leaves.tick_tree(
         io_for(
             TeacherIO, stage.t, stage.table, stage.route, stage.ego, stage.mission, stage.clock, CFG.teacher, CFG.vehicle, TANK, CFG.episode
         ),
@@ -791,7 +791,7 @@ def test_sleeping_rows_are_untouched_and_rows_do_not_meet(scene):
         scene.clock.awake.fill(1)
         scene.clock.step.fill(0)
         scene.forecast.radius_m.fill(-1.0)
-        teacher.reset_teacher(io_for(TeacherIO, scene.t, scene.clock))
+        leaves.reset_teacher(io_for(TeacherIO, scene.t, scene.clock))
         body(scene, 0, 0, (7.0, 3.1), (-0.6, 0.0))
         for env in range(1, N_ENV):
             if others:

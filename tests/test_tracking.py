@@ -84,9 +84,8 @@ class Lab:
         self.track()
 
     def track(self):
-        tracking.track_bodies(
-            self.tracks, self.clusters, self.habits, self.scan, self.clock, CONFIG, FORECAST, ELEVATION, self.sonar, TANK, RULES
-        )
+        parts = (self.tracks, self.clusters, self.habits, self.scan, self.clock, CONFIG, FORECAST, ELEVATION, self.sonar, TANK, RULES)
+        tracking.track_bodies(io_for(TrackingIO, *parts))
 
     def sense(self, step, pos, yaw, vel_w, bodies, clean=False):
         """Cast, spoil and track one scan of ``bodies`` = (centre, vel, radius, half, yaw); returns the true body of each beam."""

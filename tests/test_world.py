@@ -17,7 +17,7 @@ from uuvtai.config import EpisodeConfig, WorldConfig
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, NONE, SPHERE
 from uuvtai.kernels.task import episode
 from uuvtai.kernels.task.bundles import EpisodeIO
-from uuvtai.kernels.world import world
+from uuvtai.kernels.world import scenarios
 from uuvtai.kernels.world.bundles import WorldIO
 from uuvtai.shipped import PRESET_DIR
 
@@ -69,7 +69,7 @@ class Drawn:
         mask = np.ones(n) if mask is None else np.asarray(mask)
         rows = (np.broadcast_to(a, n).astype(np.int32) for a in (mask, seed, numbers))
         episode.begin_episodes(io_for(EpisodeIO, self.clock, self.episode), *rows)
-        world.generate_scenarios(io_for(WorldIO, *self.structs, cfg))
+        scenarios.generate_scenarios(io_for(WorldIO, *self.structs, cfg))
         return self.at(0, keep_awake=True)
 
     def at(self, step, keep_awake=False):
@@ -77,7 +77,7 @@ class Drawn:
         if not keep_awake:
             episode.wake(io_for(EpisodeIO, self.clock))
         set_step(self.clock, step)
-        world.move_obstacles(io_for(WorldIO, self.world, self.path, self.clock, EpisodeConfig()))
+        scenarios.move_obstacles(io_for(WorldIO, self.world, self.path, self.clock, EpisodeConfig()))
         out = {f"path_{name}": field.to_numpy() for name, field in vars(self.path).items()}
         for struct in (self.world, self.mission):
             out |= {name: field.to_numpy() for name, field in vars(struct).items()}

@@ -209,7 +209,7 @@ def _print_evaluation(result: dict[str, Any], folder: Path, as_json: bool, wide:
     if as_json:
         _print_json(result)
         return
-    from uuvtai.show.causes import show_causes
+    from uuvtai.show.cause_table import show_causes
     from uuvtai.show.evaluation import show_methods, show_pairs, show_risk
 
     screen = Screen(wide)
@@ -278,7 +278,7 @@ def train_policy(
     """Train a policy into a run folder, or go on with one. Ctrl-C saves; --resume goes on."""
     from uuvtai.loader import load_training
     from uuvtai.measure.training import TrainRequest, train
-    from uuvtai.show.training import TrainingProgress
+    from uuvtai.show.dashboard import TrainingProgress
 
     if resume is None:
         sizes = [(f"train.{key}", value) for key, value in (("num_envs", num_envs), ("seed", seed)) if value is not None]
@@ -416,10 +416,10 @@ def sweep(
     as_json: AsJson = False,
 ) -> None:
     """Play every cell of a grid with every method; finished cells survive a kill: --resume goes on."""
-    from uuvtai.measure.sweep.grid import grid_of
+    from uuvtai.measure.sweep.cells import grid_of
     from uuvtai.measure.sweep.plan import SweepRequest
-    from uuvtai.measure.sweep.run import resume as go_on
-    from uuvtai.measure.sweep.run import sweep as begin
+    from uuvtai.measure.sweep.play import resume as go_on
+    from uuvtai.measure.sweep.play import sweep as begin
 
     _at_least("--episodes", episodes, 1)
     _at_least("--workers", workers, 1)
@@ -530,8 +530,8 @@ def reproduce(
     as_json: AsJson = False,
 ) -> None:
     """Train, evaluate, sweep and profile whatever the paper shows, and judge each of its claims."""
-    from uuvtai.measure.reproduce.run import reproduce as begin
-    from uuvtai.measure.reproduce.run import resume as go_on
+    from uuvtai.measure.reproduce.paper_run import reproduce as begin
+    from uuvtai.measure.reproduce.paper_run import resume as go_on
 
     if resume is not None:
         _refuse_beside_resume({"--run-dir": run_dir})
@@ -541,7 +541,7 @@ def reproduce(
     if as_json:
         _print_json(result)
         return
-    from uuvtai.show.claims import show_claims
+    from uuvtai.show.verdicts import show_claims
 
     show_claims(Screen(wide), result)
     _say(f"run folder: {folder}")
@@ -808,9 +808,9 @@ def log_export(
     fmt: Annotated[str, typer.Option("--format", help="json (a line a message), csv or npz (NumPy arrays).")] = "json",
 ) -> None:
     """Write every topic as a file, and the attachments below attachments/."""
-    from uuvtai.logs import export
+    from uuvtai.logs import log_export
 
-    for path in export.export(file, out, topic, fmt):
+    for path in log_export.export(file, out, topic, fmt):
         typer.echo(str(path))
 
 

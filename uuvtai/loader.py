@@ -52,9 +52,9 @@ class _Layer:
     tree: dict[str, Any] = field(default_factory=dict)
     origin: dict[str, str] = field(default_factory=dict)
 
-    def merge(self, other: _Layer) -> None:
-        _merge(self.tree, other.tree)
-        self.origin.update(other.origin)
+    def merge(self, layer: _Layer) -> None:
+        _merge(self.tree, layer.tree)
+        self.origin.update(layer.origin)
 
 
 def load_config(
@@ -103,11 +103,11 @@ def load_training(
     return _checked(LearningConfig, merged.tree, merged.origin)
 
 
-def with_stack(config: AnyConfig, stack: str) -> AnyConfig:
+def with_stack(any_cfg: AnyConfig, stack: str) -> AnyConfig:
     """The config with what a stack preset (name or path) states in place of its own. Raises ConfigError."""
-    merged = _Layer(config.model_dump(mode="json"))
+    merged = _Layer(any_cfg.model_dump(mode="json"))
     merged.merge(_read_stack(stack))
-    return _checked(type(config), merged.tree, merged.origin)
+    return _checked(type(any_cfg), merged.tree, merged.origin)
 
 
 def tree_of_stack(stack: str) -> str:

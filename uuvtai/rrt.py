@@ -18,7 +18,7 @@ import numpy as np
 
 from uuvtai.config import Config
 from uuvtai.kernels.core.grid import grid_origin, grid_shape
-from uuvtai.kernels.planning.bundles import RouteIO, VoronoiIO
+from uuvtai.stages import Stages
 
 if TYPE_CHECKING:
     pass
@@ -193,22 +193,22 @@ class RouteFallback:
         self.overlay = np.zeros(grid_shape(tank, cell_m), dtype=np.float32)
         self.origin = grid_origin(tank, cell_m)
 
-    def serve(self, route_io: RouteIO, voronoi_io: VoronoiIO, seed_of: Callable[[int], int]) -> int:
+    def serve(self, stages: Stages, seed_of: Callable[[int], int]) -> int:
         """Plan for ``route.failed``; returns how many there were. ``seed_of(env)`` gives the env's number of (seed, episode, step)."""
         from uuvtai.kernels.planning.route import keep_route, load_route
         from uuvtai.kernels.planning.voronoi import overlay_clearance
 
-        route, ego, mission = route_io.route, route_io.ego, route_io.mission
+        route, ego, mission = stages.route.route, stages.route.ego, stages.route.mission
         n_failed = int(route.n_failed[None])
         for item in range(n_failed):
             env = int(route.failed[item])
-            overlay_clearance(voronoi_io, self.overlay, env)
+            overlay_clearance(stages.voronoi, self.overlay, env)
             start, goal = ego.pos_w[env], mission.goal_w[env]
             corners = self.plan((start[0], start[1]), (goal[0], goal[1]), seed_of(env))
             if corners is None:
-                keep_route(route_io, env)
+                keep_route(stages.route, env)
             else:
-                load_route(route_io, corners.astype(np.float32), env)
+                load_route(stages.route, corners.astype(np.float32), env)
         return n_failed
 
     def plan(self, start_xy: Point, goal_xy: Point, seed: int) -> np.ndarray | None:

@@ -59,30 +59,30 @@ class BodySlots:
         return self.first_dynamic + self.n_dynamic
 
 
-def body_slots(world: WorldConfig) -> BodySlots:
+def body_slots(world_cfg: WorldConfig) -> BodySlots:
     """Slots of every env's body list."""
-    return BodySlots(world.n_fixed_static, world.static_slots, world.n_fixed_moving, world.dynamic_slots)
+    return BodySlots(world_cfg.n_fixed_static, world_cfg.static_slots, world_cfg.n_fixed_moving, world_cfg.dynamic_slots)
 
 
-def scenario_sizes(world: WorldConfig) -> dict[str, int]:
+def scenario_sizes(world_cfg: WorldConfig) -> dict[str, int]:
     """Lengths of the array axes that the world decides."""
-    slots, tank = body_slots(world), world.tank
+    slots, tank = body_slots(world_cfg), world_cfg.tank
     return {
         "n_body": slots.n_body,
         "n_dynamic": slots.n_dynamic,
-        "n_fixed": max(1, len(world.fixed)),
+        "n_fixed": max(1, len(world_cfg.fixed)),
         "n_corner": N_CORNER,
         "n_coarse_row": math.ceil((tank.y_m[1] - tank.y_m[0]) / COARSE_M - 1e-9),
         "n_coarse_col": math.ceil((tank.x_m[1] - tank.x_m[0]) / COARSE_M - 1e-9),
     }
 
 
-def load_fixed(table: FixedTable, world: WorldConfig) -> None:
+def load_fixed(table: FixedTable, world_cfg: WorldConfig) -> None:
     """Fill the table of explicit obstacles: those at rest first, then those with a path."""
-    at_rest = [obstacle for obstacle in world.fixed if not obstacle.path]
-    moving = [obstacle for obstacle in world.fixed if obstacle.path]
+    at_rest = [obstacle for obstacle in world_cfg.fixed if not obstacle.path]
+    moving = [obstacle for obstacle in world_cfg.fixed if obstacle.path]
     for i, obstacle in enumerate(at_rest + moving):
-        z, size = _center_and_size(obstacle, world)
+        z, size = _center_and_size(obstacle, world_cfg)
         table.kind[i] = _KINDS[obstacle.kind]
         table.pos_w[i] = (obstacle.x_m, obstacle.y_m, z)
         table.size[i] = size
@@ -93,8 +93,8 @@ def load_fixed(table: FixedTable, world: WorldConfig) -> None:
             table.way_w[i, j] = (way.x_m, way.y_m)
 
 
-def _center_and_size(obstacle: FixedObstacle, world: WorldConfig) -> tuple[float, tuple[float, float, float]]:
-    floor, surface = world.tank.z_m
+def _center_and_size(obstacle: FixedObstacle, world_cfg: WorldConfig) -> tuple[float, tuple[float, float, float]]:
+    floor, surface = world_cfg.tank.z_m
     z = 0.5 * (floor + surface) if obstacle.z_m is None else obstacle.z_m
     half_height = 0.5 * (surface - floor if obstacle.height_m is None else obstacle.height_m)
     radius = obstacle.radius_m or 0.0
@@ -110,10 +110,10 @@ Scene = tuple[int, int, float]
 """(S, D, v [m/s])"""
 
 
-def set_scenes(scene: SceneState, world: WorldConfig, scenes: Sequence[Scene], put: Put = put_by_kernel) -> None:
+def set_scenes(scene: SceneState, world_cfg: WorldConfig, scenes: Sequence[Scene], put: Put = put_by_kernel) -> None:
     """Deal the scenes out to the envs in turn, for their next scenarios. SettingError where one does not fit the slots of ``world``."""
     for n_static, n_dynamic, speed_m_s in scenes:
-        for name, wanted, slots in (("static", n_static, world.static_slots), ("dynamic", n_dynamic, world.dynamic_slots)):
+        for name, wanted, slots in (("static", n_static, world_cfg.static_slots), ("dynamic", n_dynamic, world_cfg.dynamic_slots)):
             if not 0 <= wanted <= slots:
                 raise SettingError(f"{wanted} {name} obstacles do not fit {slots} slots: set world.{name}_capacity to at least {wanted}")
         if not (math.isfinite(speed_m_s) and speed_m_s >= 0):

@@ -19,20 +19,21 @@ from uuvtai.binding import bind_all
 from uuvtai.capture import Memory
 from uuvtai.config import Config
 from uuvtai.copying import address_of, copied_rows
+from uuvtai.initial import allocate_state, fill_constants
 from uuvtai.kernels.core.rows import copy_rows
 from uuvtai.kernels.perception import elevation, forecast, look, mapping, spotting, tracking
 from uuvtai.kernels.planning import clearance, features, route, triggers, voronoi
 from uuvtai.kernels.privileged import true_map, true_tracks
 from uuvtai.kernels.sensors import depth, proprioception, sonar
 from uuvtai.kernels.task import episode, reward
-from uuvtai.kernels.teacher import evasion, teacher, threats
+from uuvtai.kernels.teacher import evasion, leaves, threats
 from uuvtai.kernels.vehicle import actuation, dynamics
-from uuvtai.kernels.world import world
+from uuvtai.kernels.world import scenarios
 from uuvtai.rrt import RouteFallback
 from uuvtai.runtime import start_taichi
 from uuvtai.scenario import Scene, check_scenarios, set_scenes
 from uuvtai.sizes import array_sizes, check_size
-from uuvtai.stages import Stages, allocate_state, fill_constants
+from uuvtai.stages import Stages
 from uuvtai.tree import FlatTree, load_tree
 
 
@@ -108,7 +109,7 @@ class Sim:
         forecast.reset_forecast(io.forecast)
         mapping.reset_map(io.mapping)
         route.reset_route(io.route)
-        teacher.reset_teacher(io.teacher)
+        leaves.reset_teacher(io.teacher)
         reward.reset_reward(io.reward)
         episode.reset_referee(io.episode)
         self._perceive()
@@ -119,8 +120,8 @@ class Sim:
         io = self.io
         episode.begin_episodes(io.episode, mask, seed, number)
         with self._stage("world"):
-            world.generate_scenarios(io.world)
-            world.move_obstacles(io.world)
+            scenarios.generate_scenarios(io.world)
+            scenarios.move_obstacles(io.world)
         check_scenarios(self.rows(self.s.world.faults)[mask.cpu().numpy() == 1])
 
     def sleep_ended(self) -> None:
@@ -139,7 +140,7 @@ class Sim:
             dynamics.move_vehicle(io.dynamics, rules.control_dt_s, rules.substeps)
         with self._stage("world"):
             episode.advance_clock(io.episode)
-            world.move_obstacles(io.world)
+            scenarios.move_obstacles(io.world)
             episode.judge(io.episode)
 
     def _perceive(self) -> None:
@@ -164,12 +165,12 @@ class Sim:
         with self._stage("planning"):
             triggers.fire_triggers(io.triggers)
             voronoi.plan_routes(io.voronoi)
-            self.fallback.serve(io.route, io.voronoi, self._plan_seed)
+            self.fallback.serve(io, self._plan_seed)
             route.follow_route(io.route)
         with self._stage("teacher"):
             threats.assess_threats(io.threats)
             evasion.plan_evasion(io.evasion)
-            teacher.tick_tree(io.teacher, self.action)
+            leaves.tick_tree(io.teacher, self.action)
         if self.observation is not None:
             with self._stage("features"):
                 self._observe(self.observation)

@@ -29,7 +29,7 @@ class EpisodeHeader:
     config_yaml: str
     """the resolved config"""
     scenario: dict[str, Any]
-    """``uuvtai.logs.scenario.scenario_document``: everything true about the world, in closed form"""
+    """``uuvtai.logs.closed_form.scenario_document``: everything true about the world, in closed form"""
     control_dt_s: float
     sonar_max_range_m: float
     camera_offset_b_m: tuple[float, float, float] = (0.2, 0.0, 0.0)
@@ -192,7 +192,7 @@ class EpisodeSnapshot:
 
 
 @dataclass(frozen=True)
-class EpisodeResult:
+class EpisodeEnd:
     """How the episode ended: the last thing in the log."""
 
     outcome: str

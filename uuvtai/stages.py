@@ -2,16 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-
-import numpy as np
+from dataclasses import dataclass
 
 from uuvtai import state
-from uuvtai.allocation import allocation_matrices
-from uuvtai.bounds import load_bounds
-from uuvtai.capture import Put
-from uuvtai.config import Config
-from uuvtai.kernels.core.grid import outside_cells
 from uuvtai.kernels.perception.bundles import (
     ForecastIO,
     HeightsIO,
@@ -27,7 +20,6 @@ from uuvtai.kernels.task.bundles import EpisodeIO, RewardIO
 from uuvtai.kernels.teacher.bundles import EvasionIO, TeacherIO, ThreatsIO
 from uuvtai.kernels.vehicle.bundles import ActuationIO, DynamicsIO
 from uuvtai.kernels.world.bundles import WorldIO
-from uuvtai.scenario import load_fixed
 
 STAGES = (
     "dynamics", "world", "proprioception", "sonar", "depth", "tracking",
@@ -105,18 +97,3 @@ class Stages:
     evasion: EvasionIO
     teacher: TeacherIO
     reward: RewardIO
-
-
-def allocate_state(sizes: dict[str, int]) -> SimState:
-    """Every struct, with the lengths of ``sizes.array_sizes``."""
-    kinds = {member.name: getattr(state, str(member.type).rpartition(".")[2]) for member in fields(SimState)}
-    return SimState(**{name: state.allocate(kind, sizes) for name, kind in kinds.items()})
-
-
-def fill_constants(s: SimState, config: Config, put: Put) -> None:
-    """What no step changes: explicit obstacles, the tank's bounds on the map, the thrusters' geometry."""
-    load_fixed(s.fixed, config.world)
-    load_bounds(s.mask, np.array(outside_cells(config.world.tank, config.mapping.cell_m)), put)
-    wrench_of_thrust, thrust_of_wrench = allocation_matrices(config.vehicle)
-    put(s.allocation.wrench_of_thrust, wrench_of_thrust.astype(np.float32))
-    put(s.allocation.thrust_of_wrench, thrust_of_wrench.astype(np.float32))

@@ -11,7 +11,7 @@ KERNELS = Path(uuvtai.__file__).parent / "kernels"
 
 FILES = {
     "dynamics": ("actuation", "dynamics"),
-    "world": ("world", "episode"),
+    "world": ("scenarios", "episode"),
     "proprioception": ("proprioception",),
     "sonar": ("sonar", "sonar_error", "raycast"),
     "depth": ("depth",),
@@ -20,7 +20,7 @@ FILES = {
     "clearance": ("clearance",),
     "planning": ("triggers", "voronoi", "medial", "route"),
     "features": ("features",),
-    "teacher": ("threats", "evasion", "teacher"),
+    "teacher": ("threats", "evasion", "leaves"),
     "reward": ("reward",),
 }
 """kernel files of each stage, by the names of ``uuvtai.stages.STAGES``"""

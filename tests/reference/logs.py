@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from uuvtai.config import Config
-from uuvtai.logs.scenario import body_positions, scenario_document
-from uuvtai.snapshot import DepthLine, EpisodeHeader, EpisodeResult, EpisodeSnapshot, MapLayers
+from uuvtai.logs.closed_form import body_positions, scenario_document
+from uuvtai.snapshot import DepthLine, EpisodeEnd, EpisodeHeader, EpisodeSnapshot, MapLayers
 
 DT = 0.02
 N_RAY = 256
@@ -165,8 +165,8 @@ def _planned(step: int, pos: np.ndarray, ahead: np.ndarray) -> dict:
     }
 
 
-def result(n_step: int, outcome: str = "success") -> EpisodeResult:
-    return EpisodeResult(outcome, 12.5, n_step * DT, 0.31, {"initial": 1, "stuck": 2}, {"voronoi": 2, "rrt": 1})
+def result(n_step: int, outcome: str = "success") -> EpisodeEnd:
+    return EpisodeEnd(outcome, 12.5, n_step * DT, 0.31, {"initial": 1, "stuck": 2}, {"voronoi": 2, "rrt": 1})
 
 
 def layers(static: np.ndarray, dynamic: np.ndarray) -> MapLayers:

@@ -93,8 +93,8 @@ def _said(pilot: Pilot, obs: Tensor) -> Row:
     return found if pilot.risk is None else found | {"risk": pilot.risk.calibrated(said.risk_logit)[0].float()}
 
 
-def _pair_outputs(pilot: Pilot, told: Row) -> Row:
+def _pair_outputs(pilot: Pilot, row: Row) -> Row:
     """The same decision under the names of the graph's outputs."""
-    found = {"mean_action": pilot.mean_action[0].clone(), "value": told["value"]}
-    found["features"] = torch.stack([told["residual"], told["uncertainty"]])
-    return found if pilot.risk is None else found | {"risk_logit": pilot.decision.risk_logit[0].clone(), "risk": told["risk"]}
+    found = {"mean_action": pilot.mean_action[0].clone(), "value": row["value"]}
+    found["features"] = torch.stack([row["residual"], row["uncertainty"]])
+    return found if pilot.risk is None else found | {"risk_logit": pilot.decision.risk_logit[0].clone(), "risk": row["risk"]}

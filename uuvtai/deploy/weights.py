@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from uuvtai.learn.normalise import RunningNorm
 from uuvtai.learn.pilot import Pilot
-from uuvtai.learn.policy import Policy
+from uuvtai.learn.policy import ActorCritic
 from uuvtai.learn.risk import RiskHead
 from uuvtai.learn.world_model import WorldModel
 
@@ -27,7 +27,7 @@ def weights_of(pilot: Pilot) -> dict[str, Tensor]:
     return {name: tensor.detach().cpu().contiguous().clone() for name, tensor in found.items()}
 
 
-def _policy(policy: Policy) -> Iterator[tuple[str, Tensor]]:
+def _policy(policy: ActorCritic) -> Iterator[tuple[str, Tensor]]:
     yield from _net("actor", policy.actor)
     yield from _net("critic", policy.critic)
     yield from _norm("norm", policy.observation_norm)
@@ -35,13 +35,13 @@ def _policy(policy: Policy) -> Iterator[tuple[str, Tensor]]:
     yield "value.std", policy.value_norm.std().float()
 
 
-def _world_model(model: WorldModel) -> Iterator[tuple[str, Tensor]]:
+def _world_model(world_model: WorldModel) -> Iterator[tuple[str, Tensor]]:
     for name in ("encoder", "dynamics", "decoder"):
-        yield from _net(name, getattr(model, name))
-    yield from _norm("world_norm", model.observation_norm)
-    yield "target.scale", model.scale()
-    yield "target.base", model.base(torch.zeros(model.n_obs, device=model.change_norm.mean.device))
-    yield "change.unit", model.error_unit()
+        yield from _net(name, getattr(world_model, name))
+    yield from _norm("world_norm", world_model.observation_norm)
+    yield "target.scale", world_model.scale()
+    yield "target.base", world_model.base(torch.zeros(world_model.n_obs, device=world_model.change_norm.mean.device))
+    yield "change.unit", world_model.error_unit()
 
 
 def _risk(head: RiskHead) -> Iterator[tuple[str, Tensor]]:

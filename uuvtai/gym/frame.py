@@ -8,9 +8,9 @@ import numpy as np
 
 from uuvtai.kernels.core.grid import grid_origin
 from uuvtai.logs.canvas import ROUTE, method_inks
+from uuvtai.logs.closed_form import scenario_document
 from uuvtai.logs.painting import map_canvas, paint_layers, paint_truth, paint_walls, paint_water
 from uuvtai.logs.recording import Layer
-from uuvtai.logs.scenario import scenario_document
 from uuvtai.scenario import describe_scenario
 from uuvtai.sim import Sim
 

@@ -36,7 +36,7 @@ from uuvtai.learn.manifest import (
     SIMULATOR,
     TRAINING,
     CheckpointError,
-    Column,
+    DescribedColumn,
     FileEntry,
     Manifest,
     action_rows,
@@ -102,7 +102,7 @@ class Checkpoint:
             state[SIMULATOR_PART] = unpack(self.manifest.simulator, read_stream(self.path / SIMULATOR, layout_of(expected)))
         return state
 
-    def check_table(self, table: Sequence[Column], config: Any) -> None:
+    def check_table(self, table: Sequence[DescribedColumn], config: Any) -> None:
         """Raise CheckpointError where an environment's observation or action is not what the policy was trained for."""
         for what, own, theirs in (
             ("observation", self.manifest.observation_table, table_rows(table)),
@@ -127,7 +127,7 @@ def save(
     step: int,
     state: Mapping[str, Any],
     config: LearningConfig,
-    table: Sequence[Column],
+    table: Sequence[DescribedColumn],
     metrics: Mapping[str, Any] | None = None,
     score: float | None = None,
 ) -> Path:

@@ -11,7 +11,7 @@ import torch
 from uuvtai.learn.distill import LeafErrors, imitation_error
 from uuvtai.learn.guard import Guard
 from uuvtai.learn.hold import Hold, Info, Stretch
-from uuvtai.learn.policy import NUM_ACTIONS, Policy
+from uuvtai.learn.policy import NUM_ACTIONS, ActorCritic
 from uuvtai.learn.rollout import Rollout, final_value
 from uuvtai.learn.tally import Tally
 from uuvtai.outcomes import FORESEEABLE
@@ -30,7 +30,7 @@ class Collector:
     def __init__(
         self,
         env: VectorEnv,
-        policy: Policy,
+        policy: ActorCritic,
         world_model: WorldModel | None,
         rollout: Rollout,
         guard: Guard,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
-from uuvtai.learn.policy import Policy
+from uuvtai.learn.policy import ActorCritic
 
 if TYPE_CHECKING:
     from uuvtai.env import VectorEnv
@@ -41,7 +41,7 @@ class Hold:
     An episode that begins on the way is driven by the behaviour tree until the next decision.
     """
 
-    def __init__(self, env: VectorEnv, policy: Policy) -> None:
+    def __init__(self, env: VectorEnv, policy: ActorCritic) -> None:
         """What is held is the policy's action, or its difference from the tree's for a residual policy."""
         self._env, self.steps, self._residual = env, policy.config.hold_steps, policy.config.residual
 

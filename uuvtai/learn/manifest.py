@@ -36,7 +36,7 @@ class CheckpointError(UserError, RuntimeError):
     """A checkpoint that cannot be used or written: what, where, why, what to type next."""
 
 
-class Column(Protocol):
+class DescribedColumn(Protocol):
     """A row of the observation table (``env.ObservationColumn``)."""
 
     @property
@@ -150,7 +150,7 @@ def refused(file: Path) -> Iterator[None]:
 # ------------------------------------------------------------------------------------------------------------------- tables
 
 
-def table_rows(table: Sequence[Column]) -> list[dict[str, Any]]:
+def table_rows(table: Sequence[DescribedColumn]) -> list[dict[str, Any]]:
     """An observation table as the manifest keeps it."""
     return [{"name": c.name, "first": c.slice.start, "stop": c.slice.stop, "unit": c.unit, "frame": c.frame} for c in table]
 

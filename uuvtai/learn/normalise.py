@@ -77,9 +77,9 @@ class RunningNorm(nn.Module):
         """Add the rows of x (..., width); rows that are not finite are left out."""
         self.merge(moments_of(x))
 
-    def merge(self, other: Moments) -> None:
+    def merge(self, moments: Moments) -> None:
         """Add samples whose moments are known, for example those of all processes together."""
-        united = combined(self.moments, other)
+        united = combined(self.moments, moments)
         self.mean.copy_(united.mean)
         self.m2.copy_(united.m2)
         self.count.copy_(united.count)

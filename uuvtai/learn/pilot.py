@@ -15,7 +15,7 @@ import torch
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learn.checkpoint import Checkpoint
 from uuvtai.learn.manifest import MODEL, CheckpointError
-from uuvtai.learn.policy import NUM_ACTIONS, Policy
+from uuvtai.learn.policy import NUM_ACTIONS, ActorCritic
 from uuvtai.learn.risk import RiskHead
 from uuvtai.learn.world_model import N_FEATURES, WorldModel
 
@@ -25,7 +25,7 @@ TEACHER_COLUMN = "teacher_action"
 """column of the observation that a residual policy adds to"""
 
 
-class Decision(NamedTuple):
+class PilotDecision(NamedTuple):
     """What the policy chooses for N rows, and what it thinks of their state."""
 
     action: torch.Tensor
@@ -47,14 +47,14 @@ class Pilot:
 
     def __init__(
         self,
-        policy: Policy,
+        policy: ActorCritic,
         world_model: WorldModel | None,
         num_envs: int,
         device: torch.device | str = "cpu",
-        risk: RiskHead | None = None,
+        head: RiskHead | None = None,
     ) -> None:
         """``world_model``: None where the policy was trained without its features. The networks are used, not copied."""
-        self.policy, self.world_model, self.risk, self.device = policy, world_model, risk, torch.device(device)
+        self.policy, self.world_model, self.risk, self.device = policy, world_model, head, torch.device(device)
         self._n_obs = policy.n_in - N_FEATURES
         rows = num_envs
         self._x, self._last_obs = (torch.zeros(rows, width, device=device) for width in (policy.n_in, self._n_obs))
@@ -62,7 +62,7 @@ class Pilot:
         self._has_last = torch.zeros(rows, dtype=torch.bool, device=device)
         self._hold, self._age = policy.config.hold_steps, torch.zeros(rows, dtype=torch.int64, device=device)
         self._offset, self._said = (torch.zeros(rows, width, device=device) for width in (NUM_ACTIONS, 4))
-        self.decision = Decision(*(torch.zeros(0) for _ in Decision._fields))
+        self.decision = PilotDecision(*(torch.zeros(0) for _ in PilotDecision._fields))
         """the last one; where an older one is held, what the networks said then"""
 
     @property
@@ -77,7 +77,7 @@ class Pilot:
         self._age *= kept
 
     @torch.no_grad()
-    def decide(self, obs: torch.Tensor) -> Decision:
+    def decide(self, obs: torch.Tensor) -> PilotDecision:
         """Decision for observations (num_envs, n_obs); changes nothing that the next one depends on."""
         x = self._x
         fill = self.policy.observation_norm.mean[: self._n_obs].float()
@@ -88,7 +88,7 @@ class Pilot:
         teacher = self.policy.teacher_action(x)
         self._action = self._offset if teacher is None else teacher + self._offset
         value, residual, uncertainty, risk_logit = self._said.clone().T
-        self.decision = Decision(
+        self.decision = PilotDecision(
             self._action.clamp(-1.0, 1.0),
             value,
             self.policy.log_std.exp(),
@@ -168,7 +168,7 @@ def load_pilot(checkpoint: Checkpoint, num_envs: int, device: torch.device | str
         n_obs = max(row["stop"] for row in rows)
         teacher = next((slice(row["first"], row["stop"]) for row in rows if row["name"] == TEACHER_COLUMN), None)
         _check_sizes(parts, config, n_obs)
-        policy = Policy(n_obs + N_FEATURES, config.policy, teacher, generator)
+        policy = ActorCritic(n_obs + N_FEATURES, config.policy, teacher, generator)
         policy.load_state_dict(parts["policy"])
         world_model = None
         if config.world_model.enabled and config.world_model.as_features:

@@ -42,7 +42,7 @@ def entropy(log_std: torch.Tensor) -> torch.Tensor:
     return log_std.sum() + log_std.shape[-1] * (0.5 + _HALF_LOG_2PI)
 
 
-class Policy(nn.Module):
+class ActorCritic(nn.Module):
     """Two separate networks on the normalised input; all it knows, statistics included, is in its ``state_dict``.
 
     Inputs x are (..., n_in) raw. With ``config.residual`` the mean is the teacher's action, read from x before normalisation, plus

@@ -19,7 +19,7 @@ from uuvtai.errors import SettingError
 from uuvtai.learn.distill import Reduce, imitation_error
 from uuvtai.learn.normalise import Moments, moments_of
 from uuvtai.learn.passes import Passes
-from uuvtai.learn.policy import Policy, entropy, log_prob
+from uuvtai.learn.policy import ActorCritic, entropy, log_prob
 from uuvtai.learn.rollout import Rollout
 
 Gather = Callable[[Moments], Moments]
@@ -83,7 +83,7 @@ def adapted_rate(rate: torch.Tensor, kl: torch.Tensor, target_kl: float) -> torc
 
 
 @dataclass(frozen=True)
-class Batch:
+class Minibatch:
     """Samples of a rollout as the losses want them: rows (M, ...), finite, with ``valid`` 1 or 0 for those that were not finite."""
 
     normalised: torch.Tensor
@@ -101,9 +101,9 @@ class Batch:
     weight: torch.Tensor
     valid: torch.Tensor
 
-    def rows(self, index: slice | torch.Tensor) -> Batch:
+    def rows(self, index: slice | torch.Tensor) -> Minibatch:
         """These samples: views for a slice, copies for an index."""
-        return Batch(**{name: value[index] for name, value in vars(self).items()})
+        return Minibatch(**{name: value[index] for name, value in vars(self).items()})
 
 
 _SUMS = ("policy_loss", "value_loss", "approx_kl", "clip_fraction", "distill", "count")
@@ -112,7 +112,7 @@ _SUMS = ("policy_loss", "value_loss", "approx_kl", "clip_fraction", "distill", "
 class Ppo:
     """Adam on the clipped surrogate, the value error, the entropy and the distillation term of one policy."""
 
-    def __init__(self, policy: Policy, config: PpoConfig, reduce: Reduce | None = None, gather: Gather | None = None) -> None:
+    def __init__(self, policy: ActorCritic, config: PpoConfig, reduce: Reduce | None = None, gather: Gather | None = None) -> None:
         """``reduce`` averages gradients over the processes in place, between backward and step; ``gather`` unites their moments."""
         self.policy, self.config, self.reduce, self.gather = policy, config, reduce, gather
         device = policy.log_std.device
@@ -172,7 +172,7 @@ class Ppo:
     # ------------------------------------------------------------------------------------------------ what is learned from
 
     @torch.no_grad()
-    def _prepared(self, rollout: Rollout) -> tuple[Batch, dict[str, float]]:
+    def _prepared(self, rollout: Rollout) -> tuple[Minibatch, dict[str, float]]:
         valid = _valid(rollout)
         reward, value, next_value = (torch.where(valid, getattr(rollout, name), 0.0) for name in ("reward", "value", "next_value"))
         advantage, returns = gae(
@@ -192,7 +192,7 @@ class Ppo:
             for name in ("action", "log_prob", "teacher_action", "weight")
         }
         prior = self.policy.teacher_action(rollout.flat("x"))
-        return Batch(
+        return Minibatch(
             normalised=self._normalise(rollout.flat("x")),
             prior=flat_valid.new_empty(len(flat_valid), 0) if prior is None else prior,
             advantage=_standardised(advantage, valid, self._gathered(moments_of(advantage[valid][:, None]))).flatten(),
@@ -210,7 +210,7 @@ class Ppo:
     def _gathered(self, moments: Moments) -> Moments:
         return moments if self.gather is None else self.gather(moments)
 
-    def _minibatches(self, batch: Batch, generator: torch.Generator | None) -> Iterator[Batch]:
+    def _minibatches(self, batch: Minibatch, generator: torch.Generator | None) -> Iterator[Minibatch]:
         """Blocks of neighbouring rows (all envs in a span of steps) as views, or random ones as copies."""
         samples, parts = len(batch.valid), self.config.minibatches
         bounds = [samples * part // parts for part in range(parts + 1)]
@@ -224,7 +224,7 @@ class Ppo:
 
     # ------------------------------------------------------------------------------------------------------------ one minibatch
 
-    def _learn(self, batch: Batch, distill_weight: float, surrogate: bool, sums: torch.Tensor) -> None:
+    def _learn(self, batch: Minibatch, distill_weight: float, surrogate: bool, sums: torch.Tensor) -> None:
         self.optimiser.zero_grad(set_to_none=True)
         actor, critic = self._networks(len(batch.valid))
         critic.begin()
@@ -252,7 +252,7 @@ class Ppo:
 
     def _loss(
         self,
-        batch: Batch,
+        batch: Minibatch,
         value_out: torch.Tensor,
         actor_out: torch.Tensor,
         count: torch.Tensor,

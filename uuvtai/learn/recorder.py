@@ -13,7 +13,7 @@ from uuvtai.files import FileError, open_to_append, parsed_json, read_lines, tru
 METRICS, EVENTS = "metrics.jsonl", "tensorboard"
 
 
-class Recorder:
+class MetricsRecorder:
     """Writes what every iteration gave; each line is on its way to the disk before ``write`` returns.
 
     A resumed run goes on behind the iteration of its checkpoint: what came later is cut off, and TensorBoard is told to forget it.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from uuvtai.learn.policy import NUM_ACTIONS, Policy, PolicyStep
+from uuvtai.learn.policy import NUM_ACTIONS, ActorCritic, PolicyStep
 
 
 class Rollout:
@@ -86,7 +86,7 @@ class Rollout:
 
 
 @torch.no_grad()
-def final_value(policy: Policy, final_x: torch.Tensor, terminated: torch.Tensor, ended: torch.Tensor) -> torch.Tensor:
+def final_value(policy: ActorCritic, final_x: torch.Tensor, terminated: torch.Tensor, ended: torch.Tensor) -> torch.Tensor:
     """(N,) value of the inputs final_x (N, n_in) in which episodes were cut off, zero elsewhere: few rows, so only they are computed."""
     value = torch.zeros(len(final_x), device=final_x.device)
     rows = (ended & ~terminated).nonzero().flatten()

@@ -15,7 +15,7 @@ from uuvtai.learn.distill import TeacherBatches, check_weighting, weights_of
 from uuvtai.learn.distributed import Processes
 from uuvtai.learn.guard import PREFIX, Guard
 from uuvtai.learn.normalise import Moments, combined
-from uuvtai.learn.policy import Policy
+from uuvtai.learn.policy import ActorCritic
 from uuvtai.learn.ppo import Ppo
 from uuvtai.learn.risk import RiskHead, RiskLearner
 from uuvtai.learn.rollout import Rollout
@@ -44,7 +44,7 @@ class Trainer:
         self.processes = processes or Processes(device=env.device)
         self.generator = torch.Generator().manual_seed(config.train.seed)
         n_in, device = env.num_obs + N_FEATURES, env.device
-        self.policy = Policy(n_in, config.policy, _columns(env, TEACHER_COLUMN), self.generator).to(device)
+        self.policy = ActorCritic(n_in, config.policy, _columns(env, TEACHER_COLUMN), self.generator).to(device)
         self.uncertainty = Uncertainty(config.uncertainty).to(device)
         self.rollout = Rollout(config.ppo.rollout_steps, env.num_envs, n_in, device)
         self.guard = Guard([(c.name, c.slice) for c in env.observation_table], env.num_envs, config.train.patience, device)
@@ -192,10 +192,10 @@ class Trainer:
     def _reduce(self, tensors: Iterable[torch.Tensor]) -> None:
         self.processes.average(tensors)
 
-    def _united(self, own: Moments) -> Moments:
+    def _united(self, moments: Moments) -> Moments:
         """Moments of all processes' samples, merged in the order of ranks so that every process gets the same bits."""
-        width = len(own.mean)
-        rows = self.processes.gather(torch.cat([own.mean, own.m2, own.count[None]]))
+        width = len(moments.mean)
+        rows = self.processes.gather(torch.cat([moments.mean, moments.m2, moments.count[None]]))
         parts = [Moments(row[:width], row[width:-1], row[-1]) for row in rows]
         united = parts[0]
         for part in parts[1:]:

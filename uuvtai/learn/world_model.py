@@ -174,9 +174,9 @@ def mean_of(values: Iterable[Tensor]) -> float:
 class Recollection:
     """Last observation and action of every env, for the features of the next step; ``reset`` forgets envs that begin an episode."""
 
-    def __init__(self, model: WorldModel, num_envs: int, device: torch.device | str = "cpu") -> None:
-        self.model = model
-        self.obs = torch.zeros(num_envs, model.n_obs, device=device)
+    def __init__(self, world_model: WorldModel, num_envs: int, device: torch.device | str = "cpu") -> None:
+        self.model = world_model
+        self.obs = torch.zeros(num_envs, world_model.n_obs, device=device)
         self.action = torch.zeros(num_envs, N_ACTION, device=device)
         self.known = torch.zeros(num_envs, dtype=torch.bool, device=device)
         """(num_envs,) there is a last step"""
@@ -199,10 +199,12 @@ class Recollection:
 class WorldModelLearner:
     """Adam on batches drawn from rollouts, with a guard against NaN."""
 
-    def __init__(self, model: WorldModel, config: WorldModelConfig, reduce: Reduce | None = None, gather: Gather | None = None) -> None:
+    def __init__(
+        self, world_model: WorldModel, config: WorldModelConfig, reduce: Reduce | None = None, gather: Gather | None = None
+    ) -> None:
         """``reduce`` averages gradients over the processes in place; ``gather`` unites their moments."""
-        self.model, self.config, self.reduce, self.gather = model, config, reduce, gather
-        self.optimiser = torch.optim.Adam(model.parameters(), lr=config.learning_rate, fused=True)
+        self.model, self.config, self.reduce, self.gather = world_model, config, reduce, gather
+        self.optimiser = torch.optim.Adam(world_model.parameters(), lr=config.learning_rate, fused=True)
         self.skipped = 0
         """steps left out because the gradient was not finite, or zero for want of valid samples"""
 
@@ -234,7 +236,7 @@ class WorldModelLearner:
         self.optimiser.load_state_dict(state["optimiser"])
         self.skipped = int(state["skipped"])
 
-    def _drawn(self, obs: Tensor, action: Tensor, next_obs: Tensor, valid: Tensor | None, generator: torch.Generator) -> Batch:
+    def _drawn(self, obs: Tensor, action: Tensor, next_obs: Tensor, valid: Tensor | None, generator: torch.Generator) -> ModelBatch:
         """Random samples; rows with anything that is not finite are zero and not valid."""
         steps, num_envs = action.shape[:2]
         drawn = torch.randint(steps * num_envs, (self.config.batch,), generator=generator).to(obs.device)
@@ -244,9 +246,9 @@ class WorldModelLearner:
         if valid is not None:
             good &= valid[t, env]
         kept = [torch.where(good[:, None], row, 0.0) for row in rows]
-        return Batch(kept[0], kept[1], kept[2], good)
+        return ModelBatch(kept[0], kept[1], kept[2], good)
 
-    def _observe(self, batches: list[Batch]) -> None:
+    def _observe(self, batches: list[ModelBatch]) -> None:
         """Statistics of what was drawn: a rollout's neighbouring steps are alike, so that all of it would say little more."""
         obs = torch.cat([batch.obs[batch.valid] for batch in batches])
         following = torch.cat([batch.next_obs[batch.valid, :N_TARGET] for batch in batches])
@@ -254,7 +256,7 @@ class WorldModelLearner:
         self.model.observe(*(moments if self.gather is None else map(self.gather, moments)))
 
     @torch.no_grad()
-    def _calibration(self, batch: Batch) -> dict[str, float]:
+    def _calibration(self, batch: ModelBatch) -> dict[str, float]:
         kept = batch.valid
         if not bool(kept.any()):
             return {}
@@ -269,13 +271,13 @@ class WorldModelLearner:
             "world_model/latent_std": float(self.model.encode(obs).std(dim=0, correction=0).mean()),
         }
 
-    def _learn(self, batch: Batch) -> Losses:
+    def _learn(self, batch: ModelBatch) -> Losses:
         losses = self.model.loss(*batch)
         self.skipped += not guarded_step(losses.total, self.model, self.optimiser, self.reduce)
         return losses
 
 
-class Batch(NamedTuple):
+class ModelBatch(NamedTuple):
     """Samples of a gradient step."""
 
     obs: Tensor

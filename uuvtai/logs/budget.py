@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from mcap.opcode import Opcode
 
-from uuvtai.logs.errors import LogError
+from uuvtai.logs.log_errors import LogError
 
 MAX_RECORDS = 1_000_000
 """of a file, chunks and indexes included: an hour of 14 topics at 20 Hz"""
@@ -30,7 +30,7 @@ class BudgetError(LogError):
     """A log that asks for more than any of ours: nothing behind this place is read."""
 
 
-class Budget:
+class LogBudget:
     """What is left for a file of ``size`` bytes; each method takes from it and raises BudgetError where it does not suffice."""
 
     def __init__(self, name: str, size: int) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from uuvtai.logs.encode import IDENTITY
-from uuvtai.logs.export import grid_values
+from uuvtai.logs.log_export import grid_values
 from uuvtai.logs.schemas import FLOAT32
 
 Message = dict[str, Any]

@@ -21,7 +21,7 @@ from uuvtai.files import refuse_output
 from uuvtai.loader import ConfigError, parsed_yaml
 from uuvtai.logs.clouds import occupied_cells, sonar_returns, waypoints
 from uuvtai.logs.container import McapFile
-from uuvtai.logs.errors import LogError
+from uuvtai.logs.log_errors import LogError
 from uuvtai.logs.reader import read_head, records, refuse_converted
 
 EXTRA = "uuvtai[viz]"

@@ -99,10 +99,10 @@ def quaternion_of(rpy: Vector) -> tuple[float, float, float, float]:
     return cr * cp * cy + sr * sp * sy, sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy
 
 
-def frame_transforms(stamp: str, snap: EpisodeSnapshot, camera_offset_b_m: Vector) -> bytes:
+def frame_transforms(stamp: str, snapshot: EpisodeSnapshot, camera_offset_b_m: Vector) -> bytes:
     """world -> base -> sonar, camera."""
-    base = _TRANSFORM % (stamp, "world", "base", *snap.pos_w.tolist(), *snap.quat_wb.tolist())
-    sonar = _TRANSFORM % (stamp, "base", "sonar", 0, 0, 0, *level_rotation(snap.quat_wb))
+    base = _TRANSFORM % (stamp, "world", "base", *snapshot.pos_w.tolist(), *snapshot.quat_wb.tolist())
+    sonar = _TRANSFORM % (stamp, "base", "sonar", 0, 0, 0, *level_rotation(snapshot.quat_wb))
     camera = _TRANSFORM % (stamp, "base", "camera", *camera_offset_b_m, *CAMERA_OPTICAL)
     return f'{{"transforms":[{base},{sonar},{camera}]}}'.encode()
 
@@ -120,11 +120,11 @@ def finite_pose(position: Vector, quat: Vector) -> str:
 # ------------------------------------------------------------------------------------------------------------------ sensing
 
 
-def laser_scan(stamp: str, snap: EpisodeSnapshot, max_range_m: float) -> bytes:
+def laser_scan(stamp: str, snapshot: EpisodeSnapshot, max_range_m: float) -> bytes:
     """Ranges as sensed; where nothing returned: maximum range with intensity 0, which no return has."""
-    hit = snap.sonar_hit != 0
-    ranges = np.where(hit, snap.sonar_range_m, np.float32(max_range_m))
-    thousandths = np.where(hit, np.clip(np.rint(snap.sonar_intensity * 1000), 1, 1000), 0).astype(np.int32)
+    hit = snapshot.sonar_hit != 0
+    ranges = np.where(hit, snapshot.sonar_range_m, np.float32(max_range_m))
+    thousandths = np.where(hit, np.clip(np.rint(snapshot.sonar_intensity * 1000), 1, 1000), 0).astype(np.int32)
     intensities = ",".join(map(_THOUSANDTHS.__getitem__, thousandths.tolist()))
     end_angle = 2 * math.pi * (len(hit) - 1) / len(hit)
     return (
@@ -139,10 +139,10 @@ _THOUSANDTHS = [f"{i / 1000:g}" for i in range(1001)]
 _IDENTITY_TEXT = json.dumps(IDENTITY, separators=(",", ":"))
 
 
-def sonar_doppler(stamp: str, snap: EpisodeSnapshot) -> bytes:
+def sonar_doppler(stamp: str, snapshot: EpisodeSnapshot) -> bytes:
     """Doppler of every beam and the own velocity it has to be compensated with."""
-    velocity = np.where(snap.sonar_hit != 0, snap.sonar_doppler_m_s, np.float32(0))
-    return f'{{"timestamp":{stamp},"velocity":{numbers(velocity)},"own_velocity":{numbers(snap.sonar_ping_vel_b)}}}'.encode()
+    velocity = np.where(snapshot.sonar_hit != 0, snapshot.sonar_doppler_m_s, np.float32(0))
+    return f'{{"timestamp":{stamp},"velocity":{numbers(velocity)},"own_velocity":{numbers(snapshot.sonar_ping_vel_b)}}}'.encode()
 
 
 def depth_line(stamp: str, line: DepthLine) -> bytes:
@@ -288,13 +288,13 @@ def upright_pose(position: Vector, yaw: float = 0.0) -> dict[str, Any]:
 _RESTING, _MOVING = (0.44, 0.5, 0.58, 0.9), (0.95, 0.45, 0.2, 0.9)
 
 
-def obstacle_scene(time_ns: int, snap: EpisodeSnapshot, n_rest: int) -> bytes:
+def obstacle_scene(time_ns: int, snapshot: EpisodeSnapshot, n_rest: int) -> bytes:
     """The true bodies; the first ``n_rest`` of them never move."""
     shapes: dict[str, list] = {"spheres": [], "cylinders": [], "cubes": []}
-    for i, slot in enumerate(body_slots(snap)):
-        kind, size = KINDS[int(snap.obstacle_kind[slot])], snap.obstacle_size[slot]
+    for i, slot in enumerate(body_slots(snapshot)):
+        kind, size = KINDS[int(snapshot.obstacle_kind[slot])], snapshot.obstacle_size[slot]
         shape = {
-            "pose": upright_pose(snap.obstacle_pos_w[slot], float(snap.obstacle_yaw[slot]) if kind == "box" else 0.0),
+            "pose": upright_pose(snapshot.obstacle_pos_w[slot], float(snapshot.obstacle_yaw[slot]) if kind == "box" else 0.0),
             "size": vector(2 * size),
             "color": color(_RESTING if i < n_rest else _MOVING),
         }
@@ -313,29 +313,29 @@ _TRUTH = {
 _SIZES = {"sphere": [0], "cylinder": [0, 2], "box": [0, 1, 2]}
 
 
-def obstacle_truth(snap: EpisodeSnapshot) -> bytes:
+def obstacle_truth(snapshot: EpisodeSnapshot) -> bytes:
     """The true bodies as numbers, in the order of scenario.json."""
     bodies = []
-    for slot in body_slots(snap):
-        kind = KINDS[int(snap.obstacle_kind[slot])]
-        size = snap.obstacle_size[slot][_SIZES[kind]].tolist()
-        place, motion = snap.obstacle_pos_w[slot].tolist(), snap.obstacle_vel_w[slot].tolist()
-        bodies.append(_TRUTH[kind] % (*place, *size, float(snap.obstacle_yaw[slot]), *motion))
+    for slot in body_slots(snapshot):
+        kind = KINDS[int(snapshot.obstacle_kind[slot])]
+        size = snapshot.obstacle_size[slot][_SIZES[kind]].tolist()
+        place, motion = snapshot.obstacle_pos_w[slot].tolist(), snapshot.obstacle_vel_w[slot].tolist()
+        bodies.append(_TRUTH[kind] % (*place, *size, float(snapshot.obstacle_yaw[slot]), *motion))
     return f'{{"obstacles":[{_checked(",".join(bodies))}]}}'.encode()
 
 
-def body_slots(snap: EpisodeSnapshot) -> list[int]:
+def body_slots(snapshot: EpisodeSnapshot) -> list[int]:
     """Slots in use."""
-    return [slot for slot, kind in enumerate(snap.obstacle_kind.tolist()) if kind in KINDS]
+    return [slot for slot, kind in enumerate(snapshot.obstacle_kind.tolist()) if kind in KINDS]
 
 
 _TRACK = '{"x":%.9g,"y":%.9g,"z":%.9g,"vx":%.9g,"vy":%.9g,"radius":%.9g}'
 
 
-def tracks_message(snap: EpisodeSnapshot) -> bytes:
+def tracks_message(snapshot: EpisodeSnapshot) -> bytes:
     """The moving bodies that the vehicle believes in."""
-    rows = [] if snap.tracks is None else snap.tracks.tolist()
-    beams = [] if snap.track_beams is None else snap.track_beams.tolist()
+    rows = [] if snapshot.tracks is None else snapshot.tracks.tolist()
+    beams = [] if snapshot.track_beams is None else snapshot.track_beams.tolist()
     text = ",".join(_TRACK % tuple(row) for row in rows)
     return f'{{"tracks":[{_checked(text)}],"beams":[{",".join(map(str, beams))}]}}'.encode()
 

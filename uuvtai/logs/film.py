@@ -18,7 +18,7 @@ from av.error import FFmpegError
 from PIL import Image
 
 from uuvtai.logs.canvas import Color
-from uuvtai.logs.errors import LogError
+from uuvtai.logs.log_errors import LogError
 
 Frames = Iterable[np.ndarray]
 """images (height, width, 3), blue green red, all of one size"""

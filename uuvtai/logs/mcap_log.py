@@ -21,10 +21,10 @@ from types import TracebackType
 import numpy as np
 
 from uuvtai.logs import encode, schemas
+from uuvtai.logs.closed_form import FRAMES
 from uuvtai.logs.container import McapFile
-from uuvtai.logs.errors import LogError
-from uuvtai.logs.scenario import FRAMES
-from uuvtai.snapshot import RUNNING, EpisodeHeader, EpisodeResult, EpisodeSnapshot
+from uuvtai.logs.log_errors import LogError
+from uuvtai.snapshot import RUNNING, EpisodeEnd, EpisodeHeader, EpisodeSnapshot
 
 MAP_HZ, DEPTH_HZ, OBSTACLE_HZ = 2.0, 2.0, 10.0
 
@@ -69,13 +69,13 @@ class McapEpisodeLog:
             depth_image=self._depth_images and self._elapsed("/camera/depth", time_s, DEPTH_HZ),
         )
 
-    def write(self, snap: EpisodeSnapshot) -> None:
+    def write(self, snapshot: EpisodeSnapshot) -> None:
         """Add one control step. Raises ValueError for numbers that are not finite."""
         with self._guarded():
-            self._write_step(snap)
+            self._write_step(snapshot)
             self._file.settle()
 
-    def close(self, result: EpisodeResult) -> None:
+    def close(self, result: EpisodeEnd) -> None:
         """Add how it ended and finish the file under its name."""
         with self._guarded():
             self._file.add_metadata("uuv.result", _result_metadata(result))
@@ -111,72 +111,73 @@ class McapEpisodeLog:
 
     # --------------------------------------------------------------------------------------------------------------- steps
 
-    def _write_step(self, snap: EpisodeSnapshot) -> None:
-        self._time_s = snap.step * self.header.control_dt_s
+    def _write_step(self, snapshot: EpisodeSnapshot) -> None:
+        self._time_s = snapshot.step * self.header.control_dt_s
         self._time_ns = round(self._time_s * 1e9)
         stamp = encode.time_text(self._time_ns)
-        self._write_motion(stamp, snap)
-        if snap.sonar_fresh:
-            self._write_sonar(snap)
-        if snap.depth_line is not None:
-            self._put("/camera/line", encode.depth_line(stamp, snap.depth_line))
-        if snap.depth_image_m is not None and self._depth_images:
-            self._put("/camera/depth", encode.depth_png(stamp, snap.depth_image_m))
-        if snap.route_fresh:
-            self._write_route(stamp, snap)
-        if snap.maps is not None:
-            computed = snap.step if snap.maps.clearance_step is None else snap.maps.clearance_step
-            for topic, data in encode.grids(stamp, self._stamp(computed), snap.maps).items():
+        self._write_motion(stamp, snapshot)
+        if snapshot.sonar_fresh:
+            self._write_sonar(snapshot)
+        if snapshot.depth_line is not None:
+            self._put("/camera/line", encode.depth_line(stamp, snapshot.depth_line))
+        if snapshot.depth_image_m is not None and self._depth_images:
+            self._put("/camera/depth", encode.depth_png(stamp, snapshot.depth_image_m))
+        if snapshot.route_fresh:
+            self._write_route(stamp, snapshot)
+        if snapshot.maps is not None:
+            computed = snapshot.step if snapshot.maps.clearance_step is None else snapshot.maps.clearance_step
+            for topic, data in encode.grids(stamp, self._stamp(computed), snapshot.maps).items():
                 self._put(topic, data)
-        ended = snap.outcome != RUNNING
+        ended = snapshot.outcome != RUNNING
         if ended or self._elapsed("/obstacles", self._time_s, OBSTACLE_HZ):
-            self._write_truth(snap)
-        self._write_mind(snap)
+            self._write_truth(snapshot)
+        self._write_mind(snapshot)
         if ended:
-            self._put("/log", _log_line(stamp, schemas.INFO, "uuv.episode", f"outcome: {snap.outcome}"))
+            self._put("/log", _log_line(stamp, schemas.INFO, "uuv.episode", f"outcome: {snapshot.outcome}"))
 
-    def _write_motion(self, stamp: str, snap: EpisodeSnapshot) -> None:
-        valid = "true" if snap.measured_vel_valid else "false"
+    def _write_motion(self, stamp: str, snapshot: EpisodeSnapshot) -> None:
+        valid = "true" if snapshot.measured_vel_valid else "false"
         self._put(
             "/state",
             (
-                f'{{"position":{encode.numbers(snap.pos_w)},"orientation":{encode.numbers(snap.quat_wb)},'
-                f'"velocity":{encode.numbers(snap.vel_b)},"rates":{encode.numbers(snap.rate_b)},'
-                f'"current":{encode.numbers(snap.current_w)},"rpm":{encode.numbers(snap.rpm)},'
-                f'"measured":{{"velocity":{encode.numbers(snap.measured_vel_b)},"velocity_valid":{valid},'
-                f'"rates":{encode.numbers(snap.measured_rate_b)},"depth_m":{encode.number(snap.depth_m)}}}}}'
+                f'{{"position":{encode.numbers(snapshot.pos_w)},"orientation":{encode.numbers(snapshot.quat_wb)},'
+                f'"velocity":{encode.numbers(snapshot.vel_b)},"rates":{encode.numbers(snapshot.rate_b)},'
+                f'"current":{encode.numbers(snapshot.current_w)},"rpm":{encode.numbers(snapshot.rpm)},'
+                f'"measured":{{"velocity":{encode.numbers(snapshot.measured_vel_b)},"velocity_valid":{valid},'
+                f'"rates":{encode.numbers(snapshot.measured_rate_b)},"depth_m":{encode.number(snapshot.depth_m)}}}}}'
             ).encode(),
         )
-        self._put("/tf", encode.frame_transforms(stamp, snap, self.header.camera_offset_b_m))
-        self._put("/pose", encode.pose_in_frame(stamp, snap.pos_w, snap.quat_wb))
-        self._put("/pose_estimate", encode.pose_in_frame(stamp, snap.estimate_pos_w, encode.quaternion_of(snap.estimate_rpy)))
+        self._put("/tf", encode.frame_transforms(stamp, snapshot, self.header.camera_offset_b_m))
+        self._put("/pose", encode.pose_in_frame(stamp, snapshot.pos_w, snapshot.quat_wb))
+        self._put("/pose_estimate", encode.pose_in_frame(stamp, snapshot.estimate_pos_w, encode.quaternion_of(snapshot.estimate_rpy)))
 
-    def _write_sonar(self, snap: EpisodeSnapshot) -> None:
-        stamp = self._stamp(snap.sonar_ping_step)
-        self._put("/sonar/scan", encode.laser_scan(stamp, snap, self.header.sonar_max_range_m))
-        self._put("/sonar/doppler", encode.sonar_doppler(stamp, snap))
-        if snap.tracks is not None or snap.track_beams is not None:
-            self._put("/tracks", encode.tracks_message(snap))
+    def _write_sonar(self, snapshot: EpisodeSnapshot) -> None:
+        stamp = self._stamp(snapshot.sonar_ping_step)
+        self._put("/sonar/scan", encode.laser_scan(stamp, snapshot, self.header.sonar_max_range_m))
+        self._put("/sonar/doppler", encode.sonar_doppler(stamp, snapshot))
+        if snapshot.tracks is not None or snapshot.track_beams is not None:
+            self._put("/tracks", encode.tracks_message(snapshot))
 
-    def _write_route(self, stamp: str, snap: EpisodeSnapshot) -> None:
-        points = np.asarray(snap.route_w, float)
+    def _write_route(self, stamp: str, snapshot: EpisodeSnapshot) -> None:
+        points = np.asarray(snapshot.route_w, float)
         if points.shape[1] == 2:
             points = np.column_stack([points, np.full(len(points), self.header.scenario["goal"][2])])
         strip = encode.scene_entity(self._time_ns, "route", lines=[encode.line(points, _ROUTE_COLOR, 0.04)])
         self._put("/plan", encode.dumped({"deletions": [], "entities": [strip]}))
-        plan = {"points": [encode.vector(point) for point in points], "planner": snap.route_planner, "trigger": snap.replan_trigger}
-        self._put("/plan/info", encode.dumped({**plan, "fallback": snap.route_fallback}))
-        found = f"replan ({snap.replan_trigger}): {snap.route_planner}, {len(points)} waypoints"
-        level = schemas.WARNING if snap.route_fallback else schemas.INFO
+        plan = {"points": [encode.vector(point) for point in points], "planner": snapshot.route_planner, "trigger": snapshot.replan_trigger}
+        self._put("/plan/info", encode.dumped({**plan, "fallback": snapshot.route_fallback}))
+        found = f"replan ({snapshot.replan_trigger}): {snapshot.route_planner}, {len(points)} waypoints"
+        level = schemas.WARNING if snapshot.route_fallback else schemas.INFO
         self._put(
-            "/log", _log_line(stamp, level, "uuv.route", found + (f"; voronoi: {snap.route_fallback}" if snap.route_fallback else ""))
+            "/log",
+            _log_line(stamp, level, "uuv.route", found + (f"; voronoi: {snapshot.route_fallback}" if snapshot.route_fallback else "")),
         )
 
-    def _write_truth(self, snap: EpisodeSnapshot) -> None:
+    def _write_truth(self, snapshot: EpisodeSnapshot) -> None:
         scenario = self.header.scenario
         n_rest = sum(body["path"] is None for body in scenario["bodies"])
-        self._put("/obstacles", encode.obstacle_scene(self._time_ns, snap, n_rest))
-        self._put("/obstacles/truth", encode.obstacle_truth(snap))
+        self._put("/obstacles", encode.obstacle_scene(self._time_ns, snapshot, n_rest))
+        self._put("/obstacles/truth", encode.obstacle_truth(snapshot))
         diameter = 2 * scenario["goal_radius_m"]
         spheres = [
             {"pose": encode.upright_pose(scenario["goal"]), "size": {"x": size, "y": size, "z": size}, "color": encode.color(rgba)}
@@ -188,39 +189,39 @@ class McapEpisodeLog:
         ]
         self._put("/goal", encode.dumped({"deletions": [], "entities": entities}))
 
-    def _write_mind(self, snap: EpisodeSnapshot) -> None:
+    def _write_mind(self, snapshot: EpisodeSnapshot) -> None:
         """What drives: action, policy, safety, tree."""
-        leaf = "" if snap.tree_leaf is None or snap.tree_leaf < 0 else self._nodes[snap.tree_leaf]
+        leaf = "" if snapshot.tree_leaf is None or snapshot.tree_leaf < 0 else self._nodes[snapshot.tree_leaf]
         self._put(
             "/action",
             (
-                f'{{"policy":{encode.numbers_or_null(snap.action_policy)},"teacher":{encode.numbers_or_null(snap.action_teacher)},'
-                f'"applied":{encode.numbers(snap.action_applied)},"thrust":{encode.numbers(snap.thrust_n)},"leaf":{json.dumps(leaf)}}}'
+                f'{{"policy":{encode.numbers_or_null(snapshot.action_policy)},"teacher":{encode.numbers_or_null(snapshot.action_teacher)},'
+                f'"applied":{encode.numbers(snapshot.action_applied)},"thrust":{encode.numbers(snapshot.thrust_n)},"leaf":{json.dumps(leaf)}}}'
             ).encode(),
         )
-        self._put("/policy", self._policy(snap))
-        ttc = None if snap.ttc_s is None or snap.ttc_s > encode.FAR_M else snap.ttc_s
+        self._put("/policy", self._policy(snapshot))
+        ttc = None if snapshot.ttc_s is None or snapshot.ttc_s > encode.FAR_M else snapshot.ttc_s
         self._put(
             "/safety",
             (
-                f'{{"clearance_m":{encode.number(snap.clearance_m)},"ttc_s":{encode.number_or_null(ttc)},'
-                f'"path_risk":{encode.number(snap.path_risk)},"replan_trigger":"{snap.replan_trigger}"}}'
+                f'{{"clearance_m":{encode.number(snapshot.clearance_m)},"ttc_s":{encode.number_or_null(ttc)},'
+                f'"path_risk":{encode.number(snapshot.path_risk)},"replan_trigger":"{snapshot.replan_trigger}"}}'
             ).encode(),
         )
-        if snap.tree_status is not None:
-            self._put("/tree", self._tree(snap.tree_status))
-        if snap.lookahead_w is not None:
+        if snapshot.tree_status is not None:
+            self._put("/tree", self._tree(snapshot.tree_status))
+        if snapshot.lookahead_w is not None:
             stamp = encode.time_text(self._time_ns)
-            self._put("/plan/lookahead", encode.pose_in_frame(stamp, snap.lookahead_w, (1, 0, 0, 0)))
+            self._put("/plan/lookahead", encode.pose_in_frame(stamp, snapshot.lookahead_w, (1, 0, 0, 0)))
 
-    def _policy(self, snap: EpisodeSnapshot) -> bytes:
-        terms = np.zeros(len(self.header.reward_terms)) if snap.reward is None else snap.reward
+    def _policy(self, snapshot: EpisodeSnapshot) -> bytes:
+        terms = np.zeros(len(self.header.reward_terms)) if snapshot.reward is None else snapshot.reward
         rewards = ",".join(f'"{name}":{encode.number(value)}' for name, value in zip(self.header.reward_terms, terms, strict=True))
         return (
-            f'{{"value":{encode.number_or_null(snap.policy_value)},"std":{encode.numbers_or_null(snap.policy_std)},'
+            f'{{"value":{encode.number_or_null(snapshot.policy_value)},"std":{encode.numbers_or_null(snapshot.policy_std)},'
             f'"reward":{encode.number(float(np.sum(terms)))},{rewards}{"," if rewards else ""}'
-            f'"lambda":{encode.number_or_null(snap.distill_lambda)},"wm_residual":{encode.number_or_null(snap.wm_residual)},'
-            f'"wm_uncertainty":{encode.number_or_null(snap.wm_uncertainty)}}}'
+            f'"lambda":{encode.number_or_null(snapshot.distill_lambda)},"wm_residual":{encode.number_or_null(snapshot.wm_residual)},'
+            f'"wm_uncertainty":{encode.number_or_null(snapshot.wm_uncertainty)}}}'
         ).encode()
 
     def _tree(self, status: np.ndarray) -> bytes:
@@ -312,7 +313,7 @@ def _run_metadata(header: EpisodeHeader) -> dict[str, str]:
     }
 
 
-def _result_metadata(result: EpisodeResult) -> dict[str, str]:
+def _result_metadata(result: EpisodeEnd) -> dict[str, str]:
     return {
         "outcome": result.outcome,
         "return": encode.number(result.episode_return),

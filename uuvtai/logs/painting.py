@@ -8,8 +8,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from uuvtai.logs.canvas import DYNAMIC, FAINT, GREY, INK, MOVER, PAPER, STATIC, WATER, Canvas, Color
+from uuvtai.logs.closed_form import body_positions
 from uuvtai.logs.recording import Layer
-from uuvtai.logs.scenario import body_positions
 
 AnyCanvas = TypeVar("AnyCanvas", bound=Canvas)
 

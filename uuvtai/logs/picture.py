@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from uuvtai.logs.canvas import DYNAMIC, FAILED, GREY, INK, MOVER, PAPER, STATIC, WATER, Canvas, Color, method_inks
-from uuvtai.logs.errors import LogError, checked_suffix
+from uuvtai.logs.log_errors import LogError, checked_suffix
 from uuvtai.logs.painting import AnyCanvas, map_canvas, mixed, paint_layers, paint_ruler, paint_truth, paint_walls, paint_water
 from uuvtai.logs.recording import PICTURE_TOPICS, Recording, drawing, load_recording
 from uuvtai.logs.video import video
@@ -59,7 +59,7 @@ def _drawn(
 ) -> bytes:
     if suffix == ".png":
         return png_bytes(draw_picture(recordings, clearance, obstacles, width_px, remark, methods))
-    from uuvtai.logs.vector import VectorCanvas  # matplotlib, which takes a second
+    from uuvtai.logs.vector_graphics import VectorCanvas  # matplotlib, which takes a second
 
     return _painted(VectorCanvas, recordings, clearance, obstacles, width_px, remark, methods).document(suffix.lstrip("."))
 

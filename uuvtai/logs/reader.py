@@ -19,9 +19,9 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
 
 from uuvtai.files import open_file
-from uuvtai.logs.budget import MAX_MESSAGE, Budget
+from uuvtai.logs.budget import MAX_MESSAGE, LogBudget
 from uuvtai.logs.container import MAGIC
-from uuvtai.logs.errors import LogError
+from uuvtai.logs.log_errors import LogError
 from uuvtai.logs.search import next_chunk, true_length
 
 MAX_RECORD = 64 << 20
@@ -213,7 +213,7 @@ class Scanner:
         self._corrected = -1, 0
         """place of a chunk whose length lies, and its true length"""
         self.finished = False
-        self.budget = Budget(name, self.size)
+        self.budget = LogBudget(name, self.size)
 
     def records(self, skip_chunks: bool = False) -> Iterator[Any]:
         """Records up to the end of the data section. Raises DamageError; iterate again to go on behind it where it ``can_go_on``.
@@ -322,7 +322,7 @@ class Scanner:
         return DamageError(reason, can_go_on=True)
 
 
-def unpacked(data: bytes, compression: str, limit: int, budget: Budget) -> tuple[bytes, str | None]:
+def unpacked(data: bytes, compression: str, limit: int, budget: LogBudget) -> tuple[bytes, str | None]:
     """(what can be unpacked, what went wrong); of a frame that is cut off, all that was written before. Never more than ``limit`` bytes."""
     if compression == "":
         budget.take_unpacked(len(data))
@@ -350,7 +350,7 @@ def _message(body: bytes) -> Message:
     return Message(channel, log_time, body[_MESSAGE_HEAD.size :], publish_time, sequence)
 
 
-def split_records(plain: bytes, budget: Budget) -> tuple[list[Any], int]:
+def split_records(plain: bytes, budget: LogBudget) -> tuple[list[Any], int]:
     """(whole records of a chunk's content, bytes they take). Raises BudgetError."""
     found: list[Any] = []
     at = 0

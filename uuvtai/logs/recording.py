@@ -14,8 +14,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from uuvtai.logs.errors import LogError
-from uuvtai.logs.export import grid_values
+from uuvtai.logs.log_errors import LogError
+from uuvtai.logs.log_export import grid_values
 from uuvtai.logs.reader import LogHead, LogMessage, read_head, read_messages
 
 
@@ -162,40 +162,40 @@ def _numbers(value: Any) -> Iterator[float]:
             yield from _numbers(inner)
 
 
-def _take(found: Recording, message: LogMessage) -> int:
+def _take(recording: Recording, message: LogMessage) -> int:
     """Add a message; bytes of the arrays that it brings."""
     time_s, data = message.time_s, message.data
     match message.topic:
         case "/pose":
             place, q = data["pose"]["position"], data["pose"]["orientation"]
             yaw = math.atan2(2 * (q["w"] * q["z"] + q["x"] * q["y"]), 1 - 2 * (q["y"] ** 2 + q["z"] ** 2))
-            found.pose.add(time_s, (place["x"], place["y"], place["z"], yaw))
+            recording.pose.add(time_s, (place["x"], place["y"], place["z"], yaw))
         case "/sonar/scan":
             ping_s = data["timestamp"]["sec"] + data["timestamp"]["nsec"] / 1e9
             ranges, hit = np.array(data["ranges"]), np.array(data["intensities"]) > 0
-            found.scan.add(time_s, (ranges, hit, ping_s))
+            recording.scan.add(time_s, (ranges, hit, ping_s))
             return ranges.nbytes + hit.nbytes
         case "/plan/info":
             route = np.array([(point["x"], point["y"]) for point in data["points"]]).reshape(-1, 2)
-            found.route.add(time_s, route)
-            found.replans.append((time_s, data["trigger"]))
+            recording.route.add(time_s, route)
+            recording.replans.append((time_s, data["trigger"]))
             return route.nbytes
         case "/plan/lookahead":
             place = data["pose"]["position"]
-            found.lookahead.add(time_s, (place["x"], place["y"]))
+            recording.lookahead.add(time_s, (place["x"], place["y"]))
         case "/safety":
-            found.safety.add(time_s, (data["clearance_m"], data["ttc_s"], data["replan_trigger"]))
+            recording.safety.add(time_s, (data["clearance_m"], data["ttc_s"], data["replan_trigger"]))
         case "/state":
-            found.speed.add(time_s, math.hypot(*data["velocity"]))
+            recording.speed.add(time_s, math.hypot(*data["velocity"]))
         case "/action":
-            found.leaf.add(time_s, data.get("leaf", ""))
+            recording.leaf.add(time_s, data.get("leaf", ""))
         case "/tracks":
             tracks = np.array([(t["x"], t["y"], t["radius"]) for t in data["tracks"]]).reshape(-1, 3)
-            found.tracks.add(time_s, tracks)
+            recording.tracks.add(time_s, tracks)
             return tracks.nbytes
         case topic:
             origin = data["pose"]["position"]
             layer = Layer(time_s, grid_values(data), (origin["x"], origin["y"]), data["cell_size"]["x"])
-            found.layers.setdefault(topic.rpartition("/")[2], Series()).add(time_s, layer)
+            recording.layers.setdefault(topic.rpartition("/")[2], Series()).add(time_s, layer)
             return layer.values.nbytes
     return 0

@@ -12,7 +12,7 @@ from mcap.records import Attachment, Channel, Message, Metadata, Schema
 
 from uuvtai.files import refuse_output
 from uuvtai.logs.container import McapFile
-from uuvtai.logs.errors import LogError
+from uuvtai.logs.log_errors import LogError
 from uuvtai.logs.reader import DamageError, Scanner, opened, refuse_converted
 
 

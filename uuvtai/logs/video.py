@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from uuvtai.logs.canvas import DYNAMIC, FAILED, FAINT, GOAL, GREY, INK, MOVER, PAPER, ROUTE, STATIC, Color, bgr, method_inks
-from uuvtai.logs.errors import LogError, checked_suffix
+from uuvtai.logs.log_errors import LogError, checked_suffix
 from uuvtai.logs.painting import (
     map_canvas,
     mixed,

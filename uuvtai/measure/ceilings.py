@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from uuvtai.config import Config
-from uuvtai.measure.compare import ORACLE
+from uuvtai.measure.eval_request import ORACLE
 from uuvtai.measure.evaluate import EpisodeResult, Job, Progress, summary
 from uuvtai.measure.methods import TRUTH
 from uuvtai.measure.statistics import rate, wilson_interval

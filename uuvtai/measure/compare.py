@@ -11,23 +11,20 @@ from typing import TYPE_CHECKING, Any, Protocol
 from uuvtai.errors import SettingError
 from uuvtai.loader import ConfigError
 from uuvtai.measure.eval_request import FILE as REQUEST
-from uuvtai.measure.eval_request import Request, document_of, drivers_of, read_request, refuse_others
+from uuvtai.measure.eval_request import ORACLE, Request, document_of, drivers_of, read_request, refuse_others
 from uuvtai.run_folder import RunFolder, default_run_dir, refuse_place
 
 if TYPE_CHECKING:
     from uuvtai.measure.evaluate import EpisodeResult, Job
-    from uuvtai.measure.foresight import Foresight, Moments
+    from uuvtai.measure.foresight import Foresight, RiskMoments
     from uuvtai.measure.ledger import Finished, Ledger
+    from uuvtai.measure.log_recorder import EpisodeRecorder, PolicyNote
     from uuvtai.measure.methods import Method
-    from uuvtai.measure.recording import EpisodeRecorder, PolicyNote
     from uuvtai.sim import Sim
     from uuvtai.tree import FlatTree
 
     Simulators = dict[str | None, Sim]
     """by the stack that drives; None = the request's own"""
-
-ORACLE = "oracle"
-"""controller that is asked, not driven: the privileged upper bound"""
 
 _BATCH = 256
 """Episodes played together by default: enough to fill the cores, few enough that the last stragglers cost little."""
@@ -35,7 +32,7 @@ _BATCH = 256
 _STARTING = "starting {} envs (sizes not used before compile their kernels first, about half a minute)"
 
 
-class Watch(Protocol):
+class EvaluationWatch(Protocol):
     """Shows how far a comparison is."""
 
     def start(self, name: str, total: int) -> None: ...
@@ -55,7 +52,7 @@ class _Played:
     logs: dict[Job, Path]
 
 
-def compare(request: Request, watch: Watch) -> tuple[dict[str, Any], Path]:
+def compare(request: Request, watch: EvaluationWatch) -> tuple[dict[str, Any], Path]:
     """Play every method's episodes; the ``uuv eval --json`` document and the run folder.
 
     Everything that can be refused is refused before anything is written. Raises ConfigError, ValueError, MemoryError, RunFolderError,
@@ -77,7 +74,7 @@ def compare(request: Request, watch: Watch) -> tuple[dict[str, Any], Path]:
         return _compared(request, sims, methods, policies, folder, watch), folder.path
 
 
-def resume(place: Path, watch: Watch) -> tuple[dict[str, Any], Path]:
+def resume(place: Path, watch: EvaluationWatch) -> tuple[dict[str, Any], Path]:
     """Go on with an evaluation that was interrupted or killed: episodes that are over stay as they are.
 
     The document is that of an undisturbed evaluation, times of the machine excepted. Raises RunFolderError, FileError, ConfigError,
@@ -101,7 +98,7 @@ def resume(place: Path, watch: Watch) -> tuple[dict[str, Any], Path]:
 
 
 @contextmanager
-def _going_on(folder: RunFolder, watch: Watch) -> Iterator[None]:
+def _going_on(folder: RunFolder, watch: EvaluationWatch) -> Iterator[None]:
     """Record how the work inside ends, and say how to go on where it was interrupted."""
     try:
         with folder.recorded():
@@ -131,7 +128,12 @@ def _any_of(sims: Simulators) -> Sim:
 
 
 def _compared(
-    request: Request, sims: Simulators, methods: list[Method], policies: dict[str, PolicyNote | None], folder: RunFolder, watch: Watch
+    request: Request,
+    sims: Simulators,
+    methods: list[Method],
+    policies: dict[str, PolicyNote | None],
+    folder: RunFolder,
+    watch: EvaluationWatch,
 ) -> dict[str, Any]:
     """Play what is not over yet; the whole document, and all that is written and drawn of it."""
     from uuvtai.measure.ceilings import condition_of, remainder_of, scenarios_of
@@ -159,7 +161,7 @@ def _compared(
     return result
 
 
-def _methods(request: Request, watch: Watch) -> list[Method]:
+def _methods(request: Request, watch: EvaluationWatch) -> list[Method]:
     from uuvtai.measure.methods import differences, policies_of, trees_of
 
     max_node = request.config.teacher.max_node
@@ -184,7 +186,7 @@ def _play(
     jobs: list[Job],
     folder: RunFolder,
     ledger: Ledger,
-    watch: Watch,
+    watch: EvaluationWatch,
     played: list[_Played],
     entries: list[dict[str, Any]],
 ) -> None:
@@ -226,7 +228,7 @@ def _play(
     played.append(_Played(method, policy, results, tree_use(sim, results), logs))
 
 
-def _moments(foresight: Foresight | None, finished: list[Finished], dt: float) -> Moments | None:
+def _moments(foresight: Foresight | None, finished: list[Finished], dt: float) -> RiskMoments | None:
     """What the risk head said along the episodes, in their order, whoever has played them."""
     from uuvtai.measure.foresight import joined, moments_of
 
@@ -244,7 +246,7 @@ def _any_tree() -> FlatTree:
     return read_tree(TRAINING_TREE)
 
 
-def _ask_oracle(request: Request, jobs: list[Job], scenarios: list[dict[str, Any]], watch: Watch) -> dict[str, Any]:
+def _ask_oracle(request: Request, jobs: list[Job], scenarios: list[dict[str, Any]], watch: EvaluationWatch) -> dict[str, Any]:
     from uuvtai.measure.ceilings import oracle_entry
 
     watch.start(ORACLE, len(jobs))
@@ -263,7 +265,9 @@ def _write_results(folder: RunFolder, result: dict[str, Any], played: list[_Play
     folder.write_json("eval/tree.json", {"schema": 1, "use": {p.method.name: p.use for p in driving}})
 
 
-def _explain(request: Request, sims: Simulators, played: list[_Played], result: dict[str, Any], folder: RunFolder, watch: Watch) -> None:
+def _explain(
+    request: Request, sims: Simulators, played: list[_Played], result: dict[str, Any], folder: RunFolder, watch: EvaluationWatch
+) -> None:
     """Replay what failed, add the causes to the document, record the worst. What is known is written before the next long step begins."""
     from uuvtai.measure.explain import chosen_for_recording, explain_failures, failures, record_worst, table_of
 
@@ -296,14 +300,14 @@ def _write_causes(folder: RunFolder, result: dict[str, Any]) -> None:
 
 
 def _recorder(request: Request, folder: Path, label: str, jobs: list[Job], policy: PolicyNote | None) -> EpisodeRecorder | None:
-    from uuvtai.measure.recording import EpisodeRecorder
+    from uuvtai.measure.log_recorder import EpisodeRecorder
 
     if not request.record:
         return None
     return EpisodeRecorder(folder / "logs", Path(request.world).stem, label, jobs[: request.record], request.depth_images, policy)
 
 
-def _draw(request: Request, folder: Path, logs: list[dict[Any, Path]], watch: Watch) -> None:
+def _draw(request: Request, folder: Path, logs: list[dict[Any, Path]], watch: EvaluationWatch) -> None:
     """One picture per recorded episode with every method's trajectory, and the videos."""
     if not logs:
         return

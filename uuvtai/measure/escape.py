@@ -16,20 +16,20 @@ AFTER_S = 0.5
 """An escape keeps clear up to this after the end."""
 
 
-def escapes(h: History, bodies: Bodies, config: Config, lead_s: float) -> tuple[int, int]:
+def escapes(history: History, bodies: Bodies, config: Config, lead_s: float) -> tuple[int, int]:
     """How many velocities, chosen ``lead_s`` before the end and held, keep clear of everything: (at constant depth, with heave).
 
     Candidates are ``N_HEADING`` headings x ``SPEEDS`` and stopping, each at constant depth and with full heave up and down, within the
     limits of the body axes; the vehicle follows them with the pilot's lag and keeps its yaw. Bodies move as they did, after the end
     straight on. Clear means the referee's rules: clearance, time to collision, tank.
     """
-    end = float(h.t_s[-1])
-    start = int(np.abs(h.t_s - (end - lead_s)).argmin())
-    t = np.arange(0.0, end - h.t_s[start] + AFTER_S + 1e-6, STEP_S)
-    R_wb = hindsight.rotation(h.quat_wb[start])
+    end = float(history.t_s[-1])
+    start = int(np.abs(history.t_s - (end - lead_s)).argmin())
+    t = np.arange(0.0, end - history.t_s[start] + AFTER_S + 1e-6, STEP_S)
+    R_wb = hindsight.rotation(history.quat_wb[start])
     command = candidates(config, float(np.arctan2(R_wb[1, 0], R_wb[0, 0])))
-    pos, vel = rolled_out(h.pos_w[start], R_wb @ h.vel_b[start], command, t, config.teacher.lag_s)
-    clear = is_clear(pos, vel, R_wb[:, 0], *motion(h, h.t_s[start] + t), bodies, config)
+    pos, vel = rolled_out(history.pos_w[start], R_wb @ history.vel_b[start], command, t, config.teacher.lag_s)
+    clear = is_clear(pos, vel, R_wb[:, 0], *motion(history, history.t_s[start] + t), bodies, config)
     level = command[:, 2] == 0
     return int(clear[level].sum()), int(clear[~level].sum())
 
@@ -52,12 +52,12 @@ def rolled_out(pos: Array, vel: Array, command: Array, t: Array, lag_s: float) -
     return pos + command[:, None] * t[:, None] + off * lag_s * (1.0 - left), command[:, None] + off * left
 
 
-def motion(h: History, at_s: Array) -> tuple[Array, Array]:
+def motion(history: History, at_s: Array) -> tuple[Array, Array]:
     """(n_t, nb, 3) true positions and velocities of the bodies; straight on after the last sample."""
-    flat = h.body_w.reshape(len(h.t_s), -1)
-    inside = np.stack([np.interp(at_s, h.t_s, column) for column in flat.T], -1).reshape(len(at_s), -1, 3)
-    vel = h.body_vel_w[np.clip(np.searchsorted(h.t_s, at_s), 0, len(h.t_s) - 1)]
-    return inside + np.maximum(at_s - h.t_s[-1], 0.0)[:, None, None] * h.body_vel_w[-1], vel
+    flat = history.body_w.reshape(len(history.t_s), -1)
+    inside = np.stack([np.interp(at_s, history.t_s, column) for column in flat.T], -1).reshape(len(at_s), -1, 3)
+    vel = history.body_vel_w[np.clip(np.searchsorted(history.t_s, at_s), 0, len(history.t_s) - 1)]
+    return inside + np.maximum(at_s - history.t_s[-1], 0.0)[:, None, None] * history.body_vel_w[-1], vel
 
 
 def is_clear(pos: Array, vel: Array, axis_w: Array, body_w: Array, body_vel_w: Array, bodies: Bodies, config: Config) -> Array:

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from uuvtai.measure.methods import Method
 
 FILE = "eval/request.json"
+ORACLE = "oracle"
+"""controller that is asked, not driven: the privileged upper bound"""
 
 _MAX_BYTES = 1 << 22
 _GIVE = "give the folder that an interrupted 'uuv eval' printed"

@@ -20,7 +20,7 @@ from uuvtai.sim import Sim
 from uuvtai.tree import node_use
 
 if TYPE_CHECKING:
-    from uuvtai.learn.pilot import Decision
+    from uuvtai.learn.pilot import PilotDecision
 
 _REFILL_SHARE = 16
 """Ended rows wait until this part of the batch can be reset together, or until nothing runs: fewer reset passes, same results."""
@@ -58,7 +58,7 @@ class EpisodeResult:
     acted: np.ndarray
 
 
-class Recorder(Protocol):
+class EpisodeObserver(Protocol):
     """Watches chosen episodes as they run."""
 
     def begin(self, sim: Sim, row: int, job: Job) -> None:
@@ -74,7 +74,7 @@ class Recorder(Protocol):
 class Recorders:
     """Several recorders as one."""
 
-    def __init__(self, parts: Iterable[Recorder | None]) -> None:
+    def __init__(self, parts: Iterable[EpisodeObserver | None]) -> None:
         """None among them is nobody."""
         self._parts = [part for part in parts if part is not None]
 
@@ -100,7 +100,7 @@ class Driver(Protocol):
     def reset(self, rows: torch.Tensor) -> None:
         """New episodes have begun in the rows (n_env,) where this is not 0."""
 
-    def decide(self, obs: torch.Tensor) -> Decision:
+    def decide(self, obs: torch.Tensor) -> PilotDecision:
         """What to do now; asking again changes nothing."""
         ...
 
@@ -121,7 +121,7 @@ def jobs_of(seeds: Iterable[int], episodes: int) -> list[Job]:
 def run_episodes(
     sim: Sim,
     jobs: list[Job],
-    recorder: Recorder | None = None,
+    recorder: EpisodeObserver | None = None,
     progress: Progress | None = None,
     driver: Driver | None = None,
     clock: StepClock | None = None,

@@ -25,7 +25,7 @@ from uuvtai.sim import Sim
 from uuvtai.tree import FlatTree
 
 if TYPE_CHECKING:
-    from uuvtai.measure.recording import PolicyNote
+    from uuvtai.measure.log_recorder import PolicyNote
 
 EXAMPLES = 3
 """Episodes named per label in the table."""
@@ -249,7 +249,7 @@ def record_worst(
     """
     from uuvtai.logs.picture import picture
     from uuvtai.logs.video import SMALL, video
-    from uuvtai.measure.recording import EpisodeRecorder
+    from uuvtai.measure.log_recorder import EpisodeRecorder
 
     if not rows:
         return []

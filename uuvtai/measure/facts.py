@@ -70,20 +70,20 @@ def is_waiting(leaf: str) -> bool:
 class Scene:
     """Distances of the hull to everything over the window."""
 
-    def __init__(self, h: History, bodies: Bodies, config: Config) -> None:
-        self.h, self.bodies, self.config = h, bodies, config
+    def __init__(self, history: History, bodies: Bodies, config: Config) -> None:
+        self.h, self.bodies, self.config = history, bodies, config
         radius, half = config.vehicle.hull_radius_m, config.vehicle.hull_half_length_m
-        R_wb = hindsight.rotation(h.quat_wb)
+        R_wb = hindsight.rotation(history.quat_wb)
         self.axis_w = R_wb[:, :, 0]
         self.gap, self.normal, self.along = hindsight.hull_gaps(
-            h.pos_w, self.axis_w, bodies.kind, h.body_w, bodies.size, bodies.yaw, radius, half
+            history.pos_w, self.axis_w, bodies.kind, history.body_w, bodies.size, bodies.yaw, radius, half
         )
-        self.wall = hindsight.wall_gaps(h.pos_w, self.axis_w, config.world.tank, radius, half)
-        self.floor, self.surface = hindsight.floor_and_surface_gaps(h.pos_w, self.axis_w, config.world.tank, radius, half)
-        vel_w = np.einsum("nij,nj->ni", R_wb, h.vel_b)
-        swing_w = np.cross(np.einsum("nij,nj->ni", R_wb, h.rate_b), self.axis_w)
+        self.wall = hindsight.wall_gaps(history.pos_w, self.axis_w, config.world.tank, radius, half)
+        self.floor, self.surface = hindsight.floor_and_surface_gaps(history.pos_w, self.axis_w, config.world.tank, radius, half)
+        vel_w = np.einsum("nij,nj->ni", R_wb, history.vel_b)
+        swing_w = np.cross(np.einsum("nij,nj->ni", R_wb, history.rate_b), self.axis_w)
         point_vel = vel_w[:, None, :] + self.along[..., None] * swing_w[:, None, :]
-        self.closing = ((point_vel - h.body_vel_w) * self.normal).sum(-1)
+        self.closing = ((point_vel - history.body_vel_w) * self.normal).sum(-1)
         self.vel_w = vel_w
 
     def killer(self, outcome: str) -> Killer:
@@ -131,19 +131,19 @@ class Scene:
         }
 
 
-def _sight_facts(h: History, bodies: Bodies, slot: int, config: Config) -> dict[str, Any]:
+def _sight_facts(history: History, bodies: Bodies, slot: int, config: Config) -> dict[str, Any]:
     """When the sonar could reach the killer, when it saw it, and what else it is."""
     sonar, kind, size = config.sensors.sonar, int(bodies.kind[slot]), bodies.size[slot]
-    ago = h.t_s[-1] - h.t_s
-    R_wb = hindsight.rotation(h.quat_wb)
-    late = h.ping_age_s[:, None]
-    then_w = h.pos_w - np.einsum("nij,nj->ni", R_wb, h.vel_b) * late
-    body_then_w = h.body_w[:, slot] - h.body_vel_w[:, slot] * late
-    yaw = np.arctan2(R_wb[:, 1, 0], R_wb[:, 0, 0]) - h.rate_b[:, 2] * h.ping_age_s
+    ago = history.t_s[-1] - history.t_s
+    R_wb = hindsight.rotation(history.quat_wb)
+    late = history.ping_age_s[:, None]
+    then_w = history.pos_w - np.einsum("nij,nj->ni", R_wb, history.vel_b) * late
+    body_then_w = history.body_w[:, slot] - history.body_vel_w[:, slot] * late
+    yaw = np.arctan2(R_wb[:, 1, 0], R_wb[:, 0, 0]) - history.rate_b[:, 2] * history.ping_age_s
     entry = hindsight.beam_entries(then_w, yaw, kind, body_then_w, size, float(bodies.yaw[slot]), sonar)
     reached = np.isfinite(entry)
     tolerance = BEAM_M + 4 * (sonar.range_sigma_m + sonar.range_sigma_slope * np.where(reached, entry, 0.0)) + sonar.range_jitter_m
-    met = reached & (np.abs(h.range_m - np.where(reached, entry, 0.0)) < tolerance)
+    met = reached & (np.abs(history.range_m - np.where(reached, entry, 0.0)) < tolerance)
     in_fan, seen = np.asarray(reached.any(1)), np.asarray(met.any(1))
     before = (ago <= SIGHT_S[0]) & (ago >= SIGHT_S[1])
     return {
@@ -151,46 +151,46 @@ def _sight_facts(h: History, bodies: Bodies, slot: int, config: Config) -> dict[
         "seen_ago_s": _last_ago(ago, seen),
         "fan_share": _round(in_fan[before].mean()) if before.any() else 0.0,
         "seen_share": _round(seen[before].sum() / max(1, in_fan[before].sum())),
-        "vertical_gap_m": _round(hindsight.vertical_gap(h.pos_w[-1:], kind, h.body_w[-1:, slot], size)[0]),
-        "killer_speed_m_s": _round(np.linalg.norm(h.body_vel_w[-1, slot])),
+        "vertical_gap_m": _round(hindsight.vertical_gap(history.pos_w[-1:], kind, history.body_w[-1:, slot], size)[0]),
+        "killer_speed_m_s": _round(np.linalg.norm(history.body_vel_w[-1, slot])),
         "killer_radius_m": _round(size[0]),
         "full_height": bool(kind != BOX and size[2] > 0.49 * (config.world.tank.z_m[1] - config.world.tank.z_m[0])),
         "circle_m": _round(abs(bodies.circle_m[slot])) if bodies.circle_m[slot] else None,
     }
 
 
-def _belief_facts(h: History, slot: int, turned_ago_s: float | None, config: Config) -> dict[str, Any]:
+def _belief_facts(history: History, slot: int, turned_ago_s: float | None, config: Config) -> dict[str, Any]:
     """What the vehicle believed about the killer."""
-    ago = h.t_s[-1] - h.t_s
-    truth = h.body_w[:, slot, :2]
-    away = np.where(h.forecast_m >= 0, np.linalg.norm(h.forecast_w[:, :, 0] - truth[:, None], axis=-1), np.inf)
+    ago = history.t_s[-1] - history.t_s
+    truth = history.body_w[:, slot, :2]
+    away = np.where(history.forecast_m >= 0, np.linalg.norm(history.forecast_w[:, :, 0] - truth[:, None], axis=-1), np.inf)
     belief, distance = away.argmin(1), away.min(1)
     believed = distance <= BELIEF_M
-    tracked = np.linalg.norm(h.track_w - truth[:, None], axis=-1)
-    at_rest = (np.where(h.track_moving == 0, tracked, np.inf) <= BELIEF_M).any(1)
+    tracked = np.linalg.norm(history.track_w - truth[:, None], axis=-1)
+    at_rest = (np.where(history.track_moving == 0, tracked, np.inf) <= BELIEF_M).any(1)
 
     def error_of(back_s: float) -> float | None:
         """Error at the end of the forecast made ``back_s`` before it."""
         at = int(np.abs(ago - back_s).argmin())
         if not believed[at]:
             return None
-        foreseen = _foreseen(h.forecast_w[at, belief[at]], float(ago[at]), config.tracking.forecast_dt_s)
+        foreseen = _foreseen(history.forecast_w[at, belief[at]], float(ago[at]), config.tracking.forecast_dt_s)
         return _round(np.linalg.norm(foreseen - truth[-1]))
 
     return {
         "believed_ago_s": _last_ago(ago, believed),
         "belief_error_m": _round(distance[-1]) if believed[-1] else None,
-        "believed_gap_m": _believed_gap(h, slot, int(belief[-1])) if believed[-1] else None,
+        "believed_gap_m": _believed_gap(history, slot, int(belief[-1])) if believed[-1] else None,
         "forecast_error_m": error_of(LEAD_S),
         "turn_error_m": None if turned_ago_s is None else error_of(turned_ago_s + BEFORE_TURN_S),
         "taken_as_static_ago_s": _last_ago(ago, at_rest & ~believed),
     }
 
 
-def _believed_gap(h: History, slot: int, track: int) -> float:
+def _believed_gap(history: History, slot: int, track: int) -> float:
     """Vertical gap [m] that the vehicle believed in at the end, on the side where the killer was; 0 = it may be level."""
-    own, above = h.pos_w[-1, 2], h.body_w[-1, slot, 2] > h.pos_w[-1, 2]
-    return _round(max(0.0, h.forecast_above_w[-1, track] - own if above else own - h.forecast_below_w[-1, track]))
+    own, above = history.pos_w[-1, 2], history.body_w[-1, slot, 2] > history.pos_w[-1, 2]
+    return _round(max(0.0, history.forecast_above_w[-1, track] - own if above else own - history.forecast_below_w[-1, track]))
 
 
 def _foreseen(forecast_w: Array, lead_s: float, dt_s: float) -> Array:
@@ -199,38 +199,38 @@ def _foreseen(forecast_w: Array, lead_s: float, dt_s: float) -> Array:
     return np.array([np.interp(lead_s, steps, forecast_w[:, axis]) for axis in range(2)])
 
 
-def _course_facts(h: History, bodies: Bodies, slot: int, config: Config) -> dict[str, Any]:
+def _course_facts(history: History, bodies: Bodies, slot: int, config: Config) -> dict[str, Any]:
     """When the killer last turned a corner (a circle has none), and how often it had turned there before within the sonar's reach."""
-    vel = h.body_vel_w[:, slot, :2]
+    vel = history.body_vel_w[:, slot, :2]
     turn = np.abs(np.angle(np.exp(1j * np.diff(np.arctan2(vel[:, 1], vel[:, 0])))))
     corner = (turn > TURN_RAD) & (bodies.circle_m[slot] == 0)
-    ago = _last_ago(h.t_s[-1] - h.t_s[1:], corner)
-    return {"turned_ago_s": ago, "turns_in_reach_before": None if ago is None else _turns_in_reach(h, bodies, slot, ago, config)}
+    ago = _last_ago(history.t_s[-1] - history.t_s[1:], corner)
+    return {"turned_ago_s": ago, "turns_in_reach_before": None if ago is None else _turns_in_reach(history, bodies, slot, ago, config)}
 
 
-def _turns_in_reach(h: History, bodies: Bodies, slot: int, ago_s: float, config: Config) -> int:
+def _turns_in_reach(history: History, bodies: Bodies, slot: int, ago_s: float, config: Config) -> int:
     """Earlier passes of the corner turned ``ago_s`` before the end that lay within the sonar's fan: could it have been learnt?"""
-    turned_s = float(h.t_s[-1]) - ago_s
-    place = h.body_w[int(np.abs(h.t_s - turned_s).argmin()), slot]
+    turned_s = float(history.t_s[-1]) - ago_s
+    place = history.body_w[int(np.abs(history.t_s - turned_s).argmin()), slot]
     passes = np.arange(turned_s - bodies.lap_s[slot], 0.0, -bodies.lap_s[slot])
-    here = np.stack([np.interp(passes, h.diary.t_s, h.diary.pos_w[:, axis]) for axis in range(3)], -1)
+    here = np.stack([np.interp(passes, history.diary.t_s, history.diary.pos_w[:, axis]) for axis in range(3)], -1)
     gap = np.abs(hindsight.vertical_gap(here, int(bodies.kind[slot]), np.broadcast_to(place, here.shape), bodies.size[slot]))
     away = np.linalg.norm(here[:, :2] - place[:2], axis=1)
     sonar = config.sensors.sonar
     return int(((away <= sonar.max_range_m) & (gap <= away * math.tan(math.radians(sonar.vertical_half_aperture_deg)))).sum())
 
 
-def killer_facts(h: History, bodies: Bodies, slot: int, config: Config) -> dict[str, Any]:
+def killer_facts(history: History, bodies: Bodies, slot: int, config: Config) -> dict[str, Any]:
     """What holds where a moving body in this slot was the killer."""
-    course = _course_facts(h, bodies, slot, config)
-    beliefs = _belief_facts(h, slot, course["turned_ago_s"], config)
-    return _sight_facts(h, bodies, slot, config) | course | beliefs | _escape_facts(h, bodies, config)
+    course = _course_facts(history, bodies, slot, config)
+    beliefs = _belief_facts(history, slot, course["turned_ago_s"], config)
+    return _sight_facts(history, bodies, slot, config) | course | beliefs | _escape_facts(history, bodies, config)
 
 
-def _escape_facts(h: History, bodies: Bodies, config: Config) -> dict[str, Any]:
+def _escape_facts(history: History, bodies: Bodies, config: Config) -> dict[str, Any]:
     """Velocities that would have escaped from LEAD_S before the end, and when the last one was gone."""
-    level, heaving = escapes(h, bodies, config, LEAD_S)
-    chances = (back for back in CHANCES_S if any(escapes(h, bodies, config, back)))
+    level, heaving = escapes(history, bodies, config, LEAD_S)
+    chances = (back for back in CHANCES_S if any(escapes(history, bodies, config, back)))
     return {"escapes": level, "escapes_by_heave": heaving, "last_chance_s": next(chances, None)}
 
 

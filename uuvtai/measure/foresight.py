@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from uuvtai.sim import Sim
 
 
-class Moments(NamedTuple):
+class RiskMoments(NamedTuple):
     """Moments of many episodes whose next ``risk.horizon_s`` are known."""
 
     logit: Tensor
@@ -28,10 +28,10 @@ class Moments(NamedTuple):
     episode: Tensor
     """(M,) int: number of the episode in the order in which they ended"""
 
-    def of_episodes(self, rest: int, parts: int = 2) -> Moments:
+    def of_episodes(self, rest: int, parts: int = 2) -> RiskMoments:
         """Those of every ``parts``-th episode."""
         kept = self.episode % parts == rest
-        return Moments(*(column[kept] for column in self))
+        return RiskMoments(*(column[kept] for column in self))
 
     def one_per_accident(self) -> Tensor:
         """(number of accidents,) logits, of one dangerous moment each: those of one episode are not independent. In the middle of them."""
@@ -54,7 +54,7 @@ class Foresight:
         """steps before them"""
         self._first: dict[int, int] = {}
         """of each row's episode: steps that had been done when it began"""
-        self._ended: list[Moments] = []
+        self._ended: list[RiskMoments] = []
 
     def begin(self, sim: Sim, row: int, job: Job) -> None:
         """An episode begins."""
@@ -74,7 +74,7 @@ class Foresight:
         del self._said[:unused]
         self._forgotten += unused
 
-    def moments(self) -> Moments:
+    def moments(self) -> RiskMoments:
         """All that was noted, by the order in which the episodes ended."""
         return joined(self._ended)
 
@@ -83,21 +83,21 @@ class Foresight:
         return self._forgotten + len(self._said)
 
 
-def moments_of(said: list[float], steps: int, outcome: str, horizon_steps: int, number: int) -> Moments:
+def moments_of(said: list[float], steps: int, outcome: str, horizon_steps: int, number: int) -> RiskMoments:
     """Moments of an episode of so many control steps; ``said``: logits at every ``STRIDE``-th. What would have followed a timeout is not
     known, and the state in which it ended is no moment."""
     to_end = steps - STRIDE * (torch.arange(len(said)) + 1)
     soon = to_end <= horizon_steps
     kept = (to_end > 0) & (~soon | torch.tensor(outcome != "timeout"))
     event = soon & torch.tensor(outcome in FORESEEABLE)
-    return Moments(torch.tensor(said, dtype=torch.float32)[kept], event[kept], torch.full((int(kept.sum()),), number))
+    return RiskMoments(torch.tensor(said, dtype=torch.float32)[kept], event[kept], torch.full((int(kept.sum()),), number))
 
 
-def joined(parts: list[Moments]) -> Moments:
+def joined(parts: list[RiskMoments]) -> RiskMoments:
     """Moments of many episodes, in this order."""
     if not parts:
-        return Moments(torch.zeros(0), torch.zeros(0, dtype=torch.bool), torch.zeros(0, dtype=torch.int64))
-    return Moments(*(torch.cat(column) for column in zip(*parts, strict=True)))
+        return RiskMoments(torch.zeros(0), torch.zeros(0, dtype=torch.bool), torch.zeros(0, dtype=torch.int64))
+    return RiskMoments(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
 
 def foresight_of(pilot: Pilot, control_dt_s: float) -> Foresight | None:
@@ -105,7 +105,7 @@ def foresight_of(pilot: Pilot, control_dt_s: float) -> Foresight | None:
     return None if pilot.risk is None else Foresight(pilot.risk, pilot, round(pilot.risk.config.horizon_s / control_dt_s))
 
 
-def told(foresight: Foresight | None, moments: Moments | None = None) -> dict[str, Any]:
+def told(foresight: Foresight | None, moments: RiskMoments | None = None) -> dict[str, Any]:
     """What ``uuv eval --json`` says of a method's risk head beside its results; empty where there is nothing to say.
 
     ``moments``: judged in place of those that this process has seen.
@@ -114,14 +114,14 @@ def told(foresight: Foresight | None, moments: Moments | None = None) -> dict[st
     return {} if figures is None else {"risk": figures}
 
 
-def fit(head: RiskHead, moments: Moments) -> None:
+def fit(head: RiskHead, moments: RiskMoments) -> None:
     """Calibrate the head's probabilities and alarm threshold on these moments. Raises ValueError where accidents are too few."""
     threshold_logit = conformal_threshold(moments.one_per_accident(), head.config.miss_rate)
     head.calibrate(moments.logit, moments.event)
     head.set_threshold(threshold_logit)
 
 
-def judged(head: RiskHead, moments: Moments) -> dict[str, Any] | None:
+def judged(head: RiskHead, moments: RiskMoments) -> dict[str, Any] | None:
     """Figures of the head on moments that it was neither trained nor calibrated on; None where nothing or everything ended badly.
 
     Keys: moments, event_rate, brier, brier_base_rate (of always predicting the event rate), ece, auroc, reliability (samples, predicted,
@@ -146,7 +146,7 @@ def judged(head: RiskHead, moments: Moments) -> dict[str, Any] | None:
     return figures | _alarm(head, moments)
 
 
-def _alarm(head: RiskHead, moments: Moments) -> dict[str, Any]:
+def _alarm(head: RiskHead, moments: RiskMoments) -> dict[str, Any]:
     if not head.has_threshold:
         return {}
     threshold, dangerous = float(head.threshold), moments.one_per_accident()

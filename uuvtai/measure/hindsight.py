@@ -67,19 +67,19 @@ def _core_point(q: Array, kind: Array, size: Array) -> Array:
     return np.where((kind == BOX)[..., None], box, np.where((kind == CYLINDER)[..., None], cylinder, 0.0))
 
 
-def wall_gaps(pos_w: Array, axis_w: Array, tank: TankConfig, radius_m: float, half_m: float) -> Array:
+def wall_gaps(pos_w: Array, axis_w: Array, tank_cfg: TankConfig, radius_m: float, half_m: float) -> Array:
     """(n,) clearance of the hull to the nearest side wall [m]."""
     ends = np.stack([pos_w + half_m * axis_w, pos_w - half_m * axis_w])
-    if tank.shape == "circle":
-        middle = [0.5 * sum(tank.x_m), 0.5 * sum(tank.y_m)]
-        return tank.radius_m - np.linalg.norm(ends[..., :2] - middle, axis=-1).max(0) - radius_m
-    low, high = np.array([tank.x_m, tank.y_m]).T
+    if tank_cfg.shape == "circle":
+        middle = [0.5 * sum(tank_cfg.x_m), 0.5 * sum(tank_cfg.y_m)]
+        return tank_cfg.radius_m - np.linalg.norm(ends[..., :2] - middle, axis=-1).max(0) - radius_m
+    low, high = np.array([tank_cfg.x_m, tank_cfg.y_m]).T
     return np.minimum(ends[..., :2] - low, high - ends[..., :2]).min((0, -1)) - radius_m
 
 
-def floor_and_surface_gaps(pos_w: Array, axis_w: Array, tank: TankConfig, radius_m: float, half_m: float) -> tuple[Array, Array]:
+def floor_and_surface_gaps(pos_w: Array, axis_w: Array, tank_cfg: TankConfig, radius_m: float, half_m: float) -> tuple[Array, Array]:
     """(n,) clearance of the hull to the floor and to the surface [m]."""
-    low, high = tank.z_m
+    low, high = tank_cfg.z_m
     reach = np.abs(axis_w[:, 2]) * half_m + radius_m
     return pos_w[:, 2] - low - reach, high - pos_w[:, 2] - reach
 
@@ -91,10 +91,10 @@ def vertical_gap(pos_w: Array, kind: int, body_w: Array, size: Array) -> Array:
     return np.where(np.abs(rise) > half, rise - np.sign(rise) * half, 0.0)
 
 
-def beam_entries(pos_w: Array, yaw: Array, kind: int, body_w: Array, size: Array, body_yaw: float, sonar: SonarConfig) -> Array:
+def beam_entries(pos_w: Array, yaw: Array, kind: int, body_w: Array, size: Array, body_yaw: float, sonar_cfg: SonarConfig) -> Array:
     """(n, n_ray) range at which each beam enters one body's outline within the sonar's vertical fan; inf = it does not (4-sensing.md)."""
-    slope = math.tan(math.radians(sonar.vertical_half_aperture_deg))
-    bearing = yaw[:, None] + 2 * np.pi * np.arange(sonar.n_ray) / sonar.n_ray
+    slope = math.tan(math.radians(sonar_cfg.vertical_half_aperture_deg))
+    bearing = yaw[:, None] + 2 * np.pi * np.arange(sonar_cfg.n_ray) / sonar_cfg.n_ray
     ux, uy = np.cos(bearing), np.sin(bearing)
     start = pos_w - body_w
     sx, sy, rise = start[:, 0:1], start[:, 1:2], np.abs(start[:, 2:3])
@@ -106,7 +106,7 @@ def beam_entries(pos_w: Array, yaw: Array, kind: int, body_w: Array, size: Array
         room = size[0] ** 2 - lost**2 - (sx * uy - sy * ux) ** 2
         enter = np.where(room >= 0, -(sx * ux + sy * uy) - np.sqrt(np.maximum(room, 0.0)), np.inf)
     gap = 0.0 if kind == SPHERE else np.maximum(rise - size[2], 0.0)
-    return np.where((enter > 0) & (enter * slope >= gap) & (enter <= sonar.max_range_m), enter, np.inf)
+    return np.where((enter > 0) & (enter * slope >= gap) & (enter <= sonar_cfg.max_range_m), enter, np.inf)
 
 
 def _box_entry(x: Array, y: Array, dx: Array, dy: Array, size: Array) -> Array:

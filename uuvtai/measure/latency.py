@@ -17,7 +17,7 @@ import torch
 from uuvtai.config.learning import LearningConfig
 
 if TYPE_CHECKING:
-    from uuvtai.measure.profiling import Batch
+    from uuvtai.measure.sim_batch import SimBatch
 
 PAPER_MS: dict[str, tuple[float, float | None]] = {
     "WM encoder": (0.015, None),
@@ -38,7 +38,7 @@ _LEAST_STEPS = 4
 _ENOUGH_PLANS = 20
 
 
-def latency_rows(batch: Batch, config: LearningConfig, seconds: float) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+def latency_rows(batch: SimBatch, config: LearningConfig, seconds: float) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Rows of the paper's table for a batch of one env, and the loop against its real-time budget.
 
     The loop is one control step driven by the tree, all stages; its stages are timed in every second step, the whole in the others, since
@@ -85,7 +85,7 @@ def _real_time(loop_ms: list[float], budget_ms: float) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _loop_samples(batch: Batch, seconds: float, networks: list[Callable[[], Any]]) -> dict[str, list[float]]:
+def _loop_samples(batch: SimBatch, seconds: float, networks: list[Callable[[], Any]]) -> dict[str, list[float]]:
     """[ms] of the stages that the table names, of the planner in steps that plan, and of whole steps without and with the networks.
 
     Routes are planned once in hundreds of steps: where ``seconds`` saw few of them, stages are timed for up to twice as long again.
@@ -101,7 +101,7 @@ def _loop_samples(batch: Batch, seconds: float, networks: list[Callable[[], Any]
     return found
 
 
-def _time_stages(batch: Batch, found: dict[str, list[float]]) -> None:
+def _time_stages(batch: SimBatch, found: dict[str, list[float]]) -> None:
     """One step with the stages timed, each waited for."""
     sim, before = batch.sim, _replans(batch)
     sim.stage_s = {}
@@ -115,7 +115,7 @@ def _time_stages(batch: Batch, found: dict[str, list[float]]) -> None:
     batch.renew()
 
 
-def _time_loop(batch: Batch, networks: list[Callable[[], Any]], found: dict[str, list[float]]) -> None:
+def _time_loop(batch: SimBatch, networks: list[Callable[[], Any]], found: dict[str, list[float]]) -> None:
     """One whole step, then the networks; drawing the next episode's scenario is no part of a control loop and not counted."""
     ended, begun = batch.episodes, time.perf_counter()
     batch.step()
@@ -128,7 +128,7 @@ def _time_loop(batch: Batch, networks: list[Callable[[], Any]], found: dict[str,
         found["Full loop"].append(1e3 * (time.perf_counter() - begun))
 
 
-def _replans(batch: Batch) -> int:
+def _replans(batch: SimBatch) -> int:
     """Routes planned so far in the episode of the one env."""
     return int(batch.sim.rows(batch.sim.s.route.replans, [0]).sum())
 
@@ -136,12 +136,12 @@ def _replans(batch: Batch) -> int:
 def _networks(config: LearningConfig) -> dict[str, Callable[[], Any]]:
     """One call of each network for one vehicle on the CPU, of the sizes that ``config`` gives; their weights do not matter."""
     from uuvtai.kernels.planning.features import observation_width
-    from uuvtai.learn.policy import Policy
+    from uuvtai.learn.policy import ActorCritic
     from uuvtai.learn.world_model import N_FEATURES, WorldModel
 
     generator, n_obs = torch.Generator().manual_seed(0), observation_width(config.features)
     model = WorldModel(n_obs, config.world_model, generator)
-    policy = Policy(n_obs + N_FEATURES, config.policy.model_copy(update={"residual": False}), None, generator)
+    policy = ActorCritic(n_obs + N_FEATURES, config.policy.model_copy(update={"residual": False}), None, generator)
     obs, action, x = torch.randn(1, n_obs), torch.rand(1, 4), torch.randn(1, n_obs + N_FEATURES)
     latent = torch.randn(1, config.world_model.latent)
     return {

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -12,6 +11,7 @@ import torch
 from uuvtai.config import Config
 from uuvtai.config.learning import LearningConfig
 from uuvtai.measure.latency import latency_rows
+from uuvtai.measure.sim_batch import SimBatch
 from uuvtai.run_folder import hardware, versions
 from uuvtai.sim import Sim
 from uuvtai.sizes import check_size, memory_bytes
@@ -24,40 +24,6 @@ _DENSITY = (0, 3, 6, 9, 15)
 
 PAPER_DENSITY = {0: (19.7, 51.9), 3: (25.2, 62.7), 6: (28.6, 54.4), 9: (31.6, 48.8), 15: (38.0, 42.7)}
 """D: (loop [ms], replans an episode) of the paper's table "Runtime versus dynamic-obstacle density", as printed"""
-
-
-@dataclass
-class Batch:
-    """A simulator kept running: ended rows begin their next episode at once."""
-
-    sim: Sim
-    first_episode: int = 0
-    """number of row 0's first episode; the other rows begin with the numbers after it"""
-    env_steps: int = 0
-    replans: int = 0
-    episodes: int = 0
-
-    def __post_init__(self) -> None:
-        n, device = self.sim.num_envs, self.sim.device
-        self._number = torch.arange(n, dtype=torch.int32, device=device) + self.first_episode
-        self._seed = torch.zeros(n, dtype=torch.int32, device=device)
-        self.sim.reset(torch.ones(n, dtype=torch.int32, device=device), self._seed, self._number)
-
-    def step(self, action: torch.Tensor | None = None) -> None:
-        """One step of every env, resets included."""
-        self.sim.step(action)
-        self.env_steps += self.sim.num_envs
-        self.renew()
-
-    def renew(self) -> None:
-        """Begin the next episode of every row whose episode has ended."""
-        ended = self.sim.terminated | self.sim.truncated
-        if bool(ended.any()):
-            rows = ended.nonzero().flatten().tolist()
-            self.replans += int(self.sim.rows(self.sim.s.route.replans, rows).sum())
-            self.episodes += len(rows)
-            self._number += ended * self.sim.num_envs
-            self.sim.reset(ended, self._seed, self._number)
 
 
 def profile(
@@ -75,7 +41,7 @@ def profile(
         begun = time.perf_counter()
         sim = Sim(config, n, tree, device)
         device_used = sim.device.type
-        batch = Batch(sim)
+        batch = SimBatch(sim)
         for _ in range(WARM_STEPS):
             batch.step()
         compile_s = time.perf_counter() - begun
@@ -107,7 +73,7 @@ def _learning_rates(config: LearningConfig, sim: Sim) -> dict[str, float]:
     return {"step_inference": samples / driving_s, "train": samples / (driving_s + told["time/learn_s"])}
 
 
-def _row(config: Config, batch: Batch, controller: str, seconds: float, compile_s: float) -> dict[str, Any]:
+def _row(config: Config, batch: SimBatch, controller: str, seconds: float, compile_s: float) -> dict[str, Any]:
     sim = batch.sim
     step = env_steps_per_s(batch, seconds, lambda: 2 * torch.rand(sim.num_envs, 4, device=sim.device) - 1)
     driven = env_steps_per_s(batch, seconds, lambda: None)
@@ -129,7 +95,7 @@ def _row(config: Config, batch: Batch, controller: str, seconds: float, compile_
     }
 
 
-def env_steps_per_s(batch: Batch, seconds: float, action: Callable[[], torch.Tensor | None]) -> float:
+def env_steps_per_s(batch: SimBatch, seconds: float, action: Callable[[], torch.Tensor | None]) -> float:
     """Env-steps per second over about ``seconds``."""
     batch.env_steps, elapsed = 0, 0.0
     begun = time.perf_counter()
@@ -149,7 +115,7 @@ def _density(config: Config, tree: Any, device: str, seconds: float, say: Callab
     for n_dynamic in _DENSITY:
         say(f"D = {n_dynamic}")
         sim.set_scenes([(config.world.n_static, n_dynamic, config.world.dynamic_speed_m_s)])
-        batch = Batch(sim)
+        batch = SimBatch(sim)
         for _ in range(WARM_STEPS):
             batch.step()
         batch.replans = batch.episodes = 0

@@ -77,8 +77,8 @@ def train(request: TrainRequest, watch: TrainWatch) -> tuple[dict[str, Any], Pat
         held.release()
 
 
-def _train(request: TrainRequest, held: RunFolder | None, watch: TrainWatch) -> tuple[dict[str, Any], Path]:
-    """As ``train``; ``held`` is the folder of the run to go on with, where this process writes."""
+def _train(request: TrainRequest, folder: RunFolder | None, watch: TrainWatch) -> tuple[dict[str, Any], Path]:
+    """As ``train``; ``folder`` is the folder of the run to go on with, where this process writes."""
     from uuvtai.learn.distributed import claim_gpu
 
     found, config = _begin(request, watch)
@@ -90,8 +90,8 @@ def _train(request: TrainRequest, held: RunFolder | None, watch: TrainWatch) -> 
     claim_gpu()
     watch.note(f"starting {config.train.num_envs} envs (sizes not used before compile their kernels first, about half a minute)")
     trainer = _trainer(_env(config, request.device), config, found)
-    folder = _folder(request, config, found, held) if trainer.processes.writes else None
-    run = _Run(trainer, config, folder, watch, total)
+    place = _folder(request, config, found, folder) if trainer.processes.writes else None
+    run = _Run(trainer, config, place, watch, total)
     status, code = "failed", 1
     try:
         with signals.Noted() as pressed:
@@ -103,11 +103,11 @@ def _train(request: TrainRequest, held: RunFolder | None, watch: TrainWatch) -> 
     finally:
         run.close()
         trainer.processes.close()
-        if folder:
-            folder.finish(status, code)
+        if place:
+            place.finish(status, code)
     if code:
         raise KeyboardInterrupt
-    return run.document(), folder.path if folder else Path()
+    return run.document(), place.path if place else Path()
 
 
 def _begin(request: TrainRequest, watch: TrainWatch) -> tuple[Checkpoint | None, LearningConfig]:
@@ -138,17 +138,17 @@ def _env(config: LearningConfig, device: str) -> VectorEnv:
     return VectorEnv(sim, config.train.seed)
 
 
-def _trainer(env: VectorEnv, config: LearningConfig, found: Checkpoint | None) -> Trainer:
+def _trainer(env: VectorEnv, config: LearningConfig, checkpoint: Checkpoint | None) -> Trainer:
     """A trainer that stands where the checkpoint does, or at the beginning."""
     from uuvtai.learn.distributed import join_processes
     from uuvtai.learn.train import Trainer
 
-    if found:
-        found.check_table(env.observation_table, config)
+    if checkpoint:
+        checkpoint.check_table(env.observation_table, config)
     trainer = Trainer(env, config, join_processes(env.device))
-    if found:
+    if checkpoint:
         own = trainer.state()
-        state = found.state(like=own)
+        state = checkpoint.state(like=own)
         if not trainer.processes.writes:
             # the checkpoint holds rank 0's envs; other ranks begin new episodes
             state |= {name: own[name] for name in ("env", "generator", "collector")}
@@ -156,23 +156,23 @@ def _trainer(env: VectorEnv, config: LearningConfig, found: Checkpoint | None) -
     return trainer
 
 
-def _folder(request: TrainRequest, config: LearningConfig, found: Checkpoint | None, held: RunFolder | None) -> RunFolder:
-    if held is None or found is None:
+def _folder(request: TrainRequest, config: LearningConfig, checkpoint: Checkpoint | None, folder: RunFolder | None) -> RunFolder:
+    if folder is None or checkpoint is None:
         return RunFolder(request.run_dir or default_run_dir(request.preset), config, [config.train.seed])
-    held.go_on({"iteration": found.step, "checkpoint_sha256": found.sha256})
+    folder.go_on({"iteration": checkpoint.step, "checkpoint_sha256": checkpoint.sha256})
     if request.overrides:
-        held.write(CONFIG, to_yaml(config))
-    return held
+        folder.write(CONFIG, to_yaml(config))
+    return folder
 
 
 class _Run:
     """The iterations of a run, and what is written about them. ``folder`` is None in processes that do not write."""
 
     def __init__(self, trainer: Trainer, config: LearningConfig, folder: RunFolder | None, watch: TrainWatch, total: int) -> None:
-        from uuvtai.learn.recorder import Recorder
+        from uuvtai.learn.recorder import MetricsRecorder
 
         self._trainer, self._config, self._folder, self._watch, self._total = trainer, config, folder, watch, total
-        self._recorder = Recorder(folder.path, trainer.iteration) if folder else None
+        self._recorder = MetricsRecorder(folder.path, trainer.iteration) if folder else None
         self._metrics: Metrics = {}
         self._saved = trainer.iteration if trainer.iteration else None
         if folder:

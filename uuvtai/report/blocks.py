@@ -142,7 +142,7 @@ Block = Prose | Heading | Notice | Table | Facts | Code | Verdicts | Figure | Ga
 
 
 @dataclass(frozen=True)
-class Section:
+class PageSection:
     """A titled part of the page."""
 
     title: str

@@ -12,14 +12,14 @@ from typing import Any
 from uuvtai.errors import UserError
 from uuvtai.files import FileError, refuse_links_in, refuse_output
 from uuvtai.loader import ConfigError
-from uuvtai.report.blocks import Block, Figure, Heading, Section
-from uuvtai.report.evaluation import evaluation
-from uuvtai.report.files import read_config, read_json, read_lines
+from uuvtai.report.blocks import Block, Figure, Heading, PageSection
 from uuvtai.report.learning_curves import Training, training
 from uuvtai.report.media import media, shared
+from uuvtai.report.methods_table import evaluation
 from uuvtai.report.page import Page, render
 from uuvtai.report.provenance import checkpoints, command_of, config_text, origins, provenance, status_notice
 from uuvtai.report.reproduction import reproduction
+from uuvtai.report.run_files import read_config, read_json, read_lines
 from uuvtai.report.sweep import sweep
 from uuvtai.report.timing import timing
 from uuvtai.run_folder import RunFolderError, write_atomic
@@ -107,7 +107,7 @@ def _of_run(run: Path) -> Page:
     if not sections:
         raise ConfigError(f"{run}: {_NOTHING}; give a run folder that 'uuv eval', 'uuv train' or 'uuv sweep' printed")
     title = str(document["title"]) if document else run.resolve().name
-    closing = Section("Where this comes from", [*provenance(record), *checkpoints(run), *config_text(run)])
+    closing = PageSection("Where this comes from", [*provenance(record), *checkpoints(run), *config_text(run)])
     return Page(title, _subtitle(record), status_notice(record), [*sections, closing])
 
 
@@ -115,15 +115,15 @@ def _of_several(runs: list[Path]) -> Page:
     """Trainings in one section, then what the other folders hold, each under its folder's name."""
     trainings = [run for run in runs if (run / "metrics.jsonl").exists()]
     others = [run for run in runs if run not in trainings]
-    sections = [Section("Training", _curves_of(trainings))] if trainings else []
+    sections = [PageSection("Training", _curves_of(trainings))] if trainings else []
     for run in others:
         sections += _named_after(run, trainings)
     closing = [block for run in runs for block in (Heading(run.name), *provenance(read_json(run, "run.json") or {}), *config_text(run))]
     title = ", ".join(run.resolve().name for run in runs) if others else f"{len(runs)} trainings"
-    return Page(title, "", [], [*sections, Section("Where this comes from", closing)])
+    return Page(title, "", [], [*sections, PageSection("Where this comes from", closing)])
 
 
-def _named_after(run: Path, trainings: list[Path]) -> list[Section]:
+def _named_after(run: Path, trainings: list[Path]) -> list[PageSection]:
     """Sections of one of several folders. An evaluation says which of the trainings its policies come from."""
     with _told(run):
         sections = content(run)
@@ -143,16 +143,16 @@ def _subtitle(record: dict[str, Any]) -> str:
     return ", ".join(str(part) for part in (record.get("started"), record.get("hardware", {}).get("cpu")) if part)
 
 
-def content(run: Path) -> list[Section]:
+def content(run: Path) -> list[PageSection]:
     """Sections of whatever a run folder holds."""
     command = command_of(read_json(run, "run.json") or {})
     result = read_json(run, "eval/result.json")
     found = [
-        Section("Evaluation", evaluation(result, command) if result else []),
-        Section("Sweep", sweep(document, command) if (document := read_json(run, "sweep.json")) else []),
-        Section("Training", _curves_of([run]) if (run / "metrics.jsonl").exists() else []),
-        Section("Time", timing(document, command) if (document := read_json(run, "profile.json")) else []),
-        Section("Episodes", media(run, result)),
+        PageSection("Evaluation", evaluation(result, command) if result else []),
+        PageSection("Sweep", sweep(document, command) if (document := read_json(run, "sweep.json")) else []),
+        PageSection("Training", _curves_of([run]) if (run / "metrics.jsonl").exists() else []),
+        PageSection("Time", timing(document, command) if (document := read_json(run, "profile.json")) else []),
+        PageSection("Episodes", media(run, result)),
     ]
     return [section for section in found if section.blocks]
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from uuvtai.files import read_bytes
-from uuvtai.report.blocks import Block, Gallery, Heading, Media, Section
+from uuvtai.report.blocks import Block, Gallery, Heading, Media, PageSection
 from uuvtai.report.wording import megabytes, number
 
 MEDIA_BYTES, PICTURE_BYTES = 6_600_000, 2_200_000
@@ -75,7 +75,7 @@ def _note(left_out: Sequence[str]) -> str:
     return f"Left out to keep this page small, to be found in the run folder: {', '.join(left_out)}." if left_out else ""
 
 
-def shared(sections: Sequence[Section], budget: int = MEDIA_BYTES) -> list[Section]:
+def shared(sections: Sequence[PageSection], budget: int = MEDIA_BYTES) -> list[PageSection]:
     """The same sections with what the page's budget [bytes] holds: pictures of every run first, then videos, in the page's order."""
     kept: dict[int, Gallery] = {}
     galleries = [block for section in sections for block in section.blocks if isinstance(block, Gallery)]

@@ -13,7 +13,7 @@ from urllib.parse import quote
 
 from uuvtai import __version__
 from uuvtai.report import ink
-from uuvtai.report.blocks import Block, Data, Figure, Section
+from uuvtai.report.blocks import Block, Data, Figure, PageSection
 from uuvtai.report.colours import on_page
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ class Page:
     title: str
     subtitle: str
     notices: Sequence[Block]
-    sections: Sequence[Section]
+    sections: Sequence[PageSection]
 
 
 @dataclass

@@ -9,7 +9,7 @@ from typing import Any
 
 from uuvtai.files import read_bytes
 from uuvtai.report.blocks import Block, Code, Facts, Notice, Prose, Table
-from uuvtai.report.files import read_config, read_json
+from uuvtai.report.run_files import read_config, read_json
 from uuvtai.report.wording import number
 
 MANIFEST_BYTES = 16 << 20

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from uuvtai.loader import ConfigError
-from uuvtai.report.blocks import Block, Data, Figure, Heading, Notice, Prose, Section, Table, Verdict, Verdicts
+from uuvtai.report.blocks import Block, Data, Figure, Heading, Notice, PageSection, Prose, Table, Verdict, Verdicts
 from uuvtai.report.figures import Line, trade_off
 from uuvtai.report.wording import value_name
 
@@ -31,12 +31,12 @@ OfRun = Callable[[Path], list[Block]]
 OfCurves = Callable[[list[Path]], list[Block]]
 
 
-def reproduction(document: Described, folder: Path, of_run: OfRun, of_curves: OfCurves) -> list[Section]:
+def reproduction(document: Described, folder: Path, of_run: OfRun, of_curves: OfCurves) -> list[PageSection]:
     """Sections of a reproduction; ``of_run`` and ``of_curves`` give the blocks of run folders. Raises ConfigError."""
     if sum(len(section["blocks"]) for section in document["sections"]) > _MAX_BLOCKS:
         raise ConfigError(f"{folder / 'reproduce.json'}: has more than the {_MAX_BLOCKS:,} blocks that a page has room for")
     return [
-        Section(
+        PageSection(
             str(section["title"]), [block for described in section["blocks"] for block in _blocks(described, folder, of_run, of_curves)]
         )
         for section in document["sections"]

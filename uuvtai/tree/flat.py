@@ -45,18 +45,18 @@ class FlatTree:
         return tuple(found)
 
 
-def load_tree(table: TreeTable, flat: FlatTree, put: Put | None = None) -> None:
+def load_tree(table: TreeTable, tree: FlatTree, put: Put | None = None) -> None:
     """Copy a flat tree into the simulator's table by ``put`` (default: ``put_by_kernel``). Raises TreeError when it does not fit."""
     if put is None:
         from uuvtai.capture import put_by_kernel as put
-    n, capacity = len(flat.kind), table.kind.shape[0]
+    n, capacity = len(tree.kind), table.kind.shape[0]
     if n > capacity:
-        raise TreeError(f"{flat.source}: {n} nodes do not fit the {capacity} that were allocated (teacher.max_node)")
-    for array, values in ((table.kind, flat.kind), (table.end, flat.end), (table.parent, flat.parent), (table.leaf, flat.leaf)):
+        raise TreeError(f"{tree.source}: {n} nodes do not fit the {capacity} that were allocated (teacher.max_node)")
+    for array, values in ((table.kind, tree.kind), (table.end, tree.end), (table.parent, tree.parent), (table.leaf, tree.leaf)):
         padded = np.zeros(capacity, np.int32)
         padded[:n] = values
         put(array, padded)
     param = np.full((capacity, MAX_PORTS), UNSET, np.float32)
-    param[:n] = flat.param
+    param[:n] = tree.param
     put(table.param, param)
     put(table.n_node, np.array(n, np.int32))

@@ -44,20 +44,20 @@ def parse_tree(text: bytes | str, source: str = "tree", max_node: int = 64) -> F
 class _Flattener:
     """Writes the main tree in preorder, subtrees in place."""
 
-    def __init__(self, root: Element, source: str, max_node: int) -> None:
+    def __init__(self, element: Element, source: str, max_node: int) -> None:
         self.source, self.max_node = source, max_node
         self.rows: list[tuple[str, str, int, int, tuple[float, ...]]] = []
         self.end: list[int] = []
         self.parent: list[int] = []
-        self._check_root(root)
-        self.trees = self._collect(root)
-        self.main = root.attributes.get("main_tree_to_execute")
+        self._check_root(element)
+        self.trees = self._collect(element)
+        self.main = element.attributes.get("main_tree_to_execute")
         if self.main is None:
             if len(self.trees) > 1:
-                self._fail(root, f"has {len(self.trees)} trees: name one in main_tree_to_execute")
+                self._fail(element, f"has {len(self.trees)} trees: name one in main_tree_to_execute")
             self.main = next(iter(self.trees))
         if self.main not in self.trees:
-            self._fail(root, f"main_tree_to_execute={self.main!r} is no BehaviorTree here{_nearest(self.main, self.trees)}")
+            self._fail(element, f"main_tree_to_execute={self.main!r} is no BehaviorTree here{_nearest(self.main, self.trees)}")
 
     def flat(self) -> FlatTree:
         """Flatten from the main tree on."""
@@ -65,27 +65,27 @@ class _Flattener:
         names, types, kind, leaf, param = (tuple(column) for column in zip(*self.rows, strict=True))
         return FlatTree(names, types, kind, tuple(self.end), tuple(self.parent), leaf, param, self.source)
 
-    def _check_root(self, root: Element) -> None:
-        if root.tag != "root":
-            self._fail(root, 'the outermost element must be <root BTCPP_format="4">')
-        if root.attributes.get("BTCPP_format") != "4":
-            self._fail(root, f'BTCPP_format must be "4", got {root.attributes.get("BTCPP_format")!r}')
+    def _check_root(self, element: Element) -> None:
+        if element.tag != "root":
+            self._fail(element, 'the outermost element must be <root BTCPP_format="4">')
+        if element.attributes.get("BTCPP_format") != "4":
+            self._fail(element, f'BTCPP_format must be "4", got {element.attributes.get("BTCPP_format")!r}')
 
-    def _collect(self, root: Element) -> dict[str, Element]:
+    def _collect(self, element: Element) -> dict[str, Element]:
         trees: dict[str, Element] = {}
-        for element in root.children:
-            if element.tag == "TreeNodesModel":
+        for child in element.children:
+            if child.tag == "TreeNodesModel":
                 continue
-            if element.tag != "BehaviorTree":
-                self._fail(element, "only <BehaviorTree> and <TreeNodesModel> may stand inside <root>; files are not included")
-            name = element.attributes.get("ID")
+            if child.tag != "BehaviorTree":
+                self._fail(child, "only <BehaviorTree> and <TreeNodesModel> may stand inside <root>; files are not included")
+            name = child.attributes.get("ID")
             if not name or name in trees:
-                self._fail(element, "needs an ID" if not name else f"ID {name!r} is given twice")
-            if len(element.children) != 1:
-                self._fail(element, f"must hold exactly one node, holds {len(element.children)}")
-            trees[name] = element
+                self._fail(child, "needs an ID" if not name else f"ID {name!r} is given twice")
+            if len(child.children) != 1:
+                self._fail(child, f"must hold exactly one node, holds {len(child.children)}")
+            trees[name] = child
         if not trees:
-            self._fail(root, "holds no <BehaviorTree>")
+            self._fail(element, "holds no <BehaviorTree>")
         return trees
 
     def _add(self, element: Element, parent: int, inside: tuple[str, ...]) -> None:

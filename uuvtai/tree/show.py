@@ -40,42 +40,42 @@ def node_use(ticks: np.ndarray, acted: np.ndarray, n_node: int) -> list[NodeUse]
     return [NodeUse(float((ticks[:, i] > 0).mean()), int(ticks[:, i].sum()), int(acted[:, i].sum())) for i in range(n_node)]
 
 
-def tree_text(flat: FlatTree) -> str:
+def tree_text(tree: FlatTree) -> str:
     """The tree as indented text, one line per node."""
-    return "\n".join(f"{branch}{_label(flat, i)}" for i, branch in enumerate(_branches(flat)))
+    return "\n".join(f"{branch}{_label(tree, i)}" for i, branch in enumerate(_branches(tree)))
 
 
-def _label(flat: FlatTree, node: int) -> str:
-    kind = flat.types[node]
-    given = zip(LEAVES[kind].ports, flat.param[node], strict=False) if kind in LEAVES else ()
+def _label(tree: FlatTree, node: int) -> str:
+    kind = tree.types[node]
+    given = zip(LEAVES[kind].ports, tree.param[node], strict=False) if kind in LEAVES else ()
     ports = ", ".join(f"{port}={value:g}" for port, value in given if value != UNSET)
     text = f"{_SYMBOLS.get(kind, '')} {kind}".strip() + (f"({ports})" if ports else "")
-    return text if flat.names[node] == kind else f"{flat.names[node]}: {text}"
+    return text if tree.names[node] == kind else f"{tree.names[node]}: {text}"
 
 
-def _branches(flat: FlatTree) -> list[str]:
+def _branches(tree: FlatTree) -> list[str]:
     """Line art before every node."""
     arts: list[str] = []
     stems: list[str] = []
-    for node, parent in enumerate(flat.parent):
+    for node, parent in enumerate(tree.parent):
         if parent < 0:
             arts.append("")
             stems.append("")
             continue
-        last = flat.end[node] == flat.end[parent]
+        last = tree.end[node] == tree.end[parent]
         arts.append(stems[parent] + ("└─ " if last else "├─ "))
         stems.append(stems[parent] + ("   " if last else "│  "))
     return arts
 
 
-def tree_dot(flat: FlatTree, use: Sequence[NodeUse] | None = None) -> str:
+def tree_dot(tree: FlatTree, use: Sequence[NodeUse] | None = None) -> str:
     """The tree as Graphviz DOT; with ``use`` nodes carry the share of episodes that ticked them."""
     shape: Callable[[int], str] = lambda kind: {codes.CONDITION: "ellipse", codes.ACTION: "box"}.get(kind, "plaintext")  # noqa: E731
     lines = ["digraph tree {", "  ordering=out; node [fontname=sans];"]
-    for node, kind in enumerate(flat.kind):
+    for node, kind in enumerate(tree.kind):
         share = f"\\n{100 * use[node].share:.1f} %" if use else ""
-        label = _label(flat, node).replace("\\", "\\\\").replace('"', '\\"')
+        label = _label(tree, node).replace("\\", "\\\\").replace('"', '\\"')
         lines.append(f'  n{node} [label="{label}{share}", shape={shape(kind)}];')
-        if flat.parent[node] >= 0:
-            lines.append(f"  n{flat.parent[node]} -> n{node};")
+        if tree.parent[node] >= 0:
+            lines.append(f"  n{tree.parent[node]} -> n{node};")
     return "\n".join([*lines, "}"])

@@ -3,7 +3,7 @@
 from typing import Any, NamedTuple
 
 
-class Column(NamedTuple):
+class ColumnGroup(NamedTuple):
     """A group of neighbouring columns of the observation, all of one quantity."""
 
     name: str

@@ -3,7 +3,7 @@
 import taichi as ti
 
 from uuvtai import tree_codes as codes
-from uuvtai.kernels.core.columns import Column
+from uuvtai.kernels.core.columns import ColumnGroup
 from uuvtai.kernels.core.signature import Bundle
 from uuvtai.kernels.planning.bundles import FeaturesIO
 
@@ -49,8 +49,8 @@ def _class(env, io: Bundle[FeaturesIO]):
 
 
 TEACHER_COLUMNS = (
-    Column("teacher_action", 4, "1", "body", "surge, sway, heave, yaw rate of the tree, in parts of the vehicle's limits", _action),
-    Column("teacher_conflict", 1, "s", "route", "until following the route comes too close to a forecast body, capped", _conflict),
-    Column("teacher_evade_cost", 1, "1", "route", "cost of the evasion that is driven; 0 = none is", _evade_cost),
-    Column("teacher_class", N_CLASS, "1", "route", "1 = acts: emergency, evade, wait, unstick, travel; all 0 = no leaf", _class),
+    ColumnGroup("teacher_action", 4, "1", "body", "surge, sway, heave, yaw rate of the tree, in parts of the vehicle's limits", _action),
+    ColumnGroup("teacher_conflict", 1, "s", "route", "until following the route comes too close to a forecast body, capped", _conflict),
+    ColumnGroup("teacher_evade_cost", 1, "1", "route", "cost of the evasion that is driven; 0 = none is", _evade_cost),
+    ColumnGroup("teacher_class", N_CLASS, "1", "route", "1 = acts: emergency, evade, wait, unstick, travel; all 0 = no leaf", _class),
 )

@@ -6,7 +6,7 @@ only, never the truth.
 
 import taichi as ti
 
-from uuvtai.kernels.core.columns import Column
+from uuvtai.kernels.core.columns import ColumnGroup
 from uuvtai.kernels.core.geometry import FAR_M, quaternion_wb, rotation_wb, turned_z
 from uuvtai.kernels.core.signature import Bundle
 from uuvtai.kernels.perception.habits import expected_turn_rate
@@ -82,19 +82,21 @@ def body_values(env, track, io: Bundle[FeaturesIO]):
 
 
 BODY_COLUMNS = (
-    Column(
+    ColumnGroup(
         "body_valid", 1, "1", "level", "1 = a moving body is remembered, 0 = no more bodies: all of its columns are 0", body_values, "body"
     ),
-    Column("body_position", 2, "m", "level", "where it is now, from the position estimate", body_values, "body"),
-    Column("body_velocity", 2, "m/s", "level", "its velocity less the own", body_values, "body"),
-    Column("body_turn_rate", 1, "rad/s", "level", "rate at which its velocity turns, left positive; 0 = straight on", body_values, "body"),
-    Column("body_radius", 1, "m", "level", "its radius and what the uncertainty of its place adds", body_values, "body"),
-    Column("body_free_water", 2, "m", "level", "above and below the own depth, up to where it may be; 0 = level", body_values, "body"),
-    Column("body_age", 1, "s", "level", "since it was last seen", body_values, "body"),
-    Column(
+    ColumnGroup("body_position", 2, "m", "level", "where it is now, from the position estimate", body_values, "body"),
+    ColumnGroup("body_velocity", 2, "m/s", "level", "its velocity less the own", body_values, "body"),
+    ColumnGroup(
+        "body_turn_rate", 1, "rad/s", "level", "rate at which its velocity turns, left positive; 0 = straight on", body_values, "body"
+    ),
+    ColumnGroup("body_radius", 1, "m", "level", "its radius and what the uncertainty of its place adds", body_values, "body"),
+    ColumnGroup("body_free_water", 2, "m", "level", "above and below the own depth, up to where it may be; 0 = level", body_values, "body"),
+    ColumnGroup("body_age", 1, "s", "level", "since it was last seen", body_values, "body"),
+    ColumnGroup(
         "body_closest", 1, "m", "level", "to its surface at the closest approach, if the own velocity stays as it is", body_values, "body"
     ),
-    Column("body_closest_time", 1, "s", "level", "until then; at most the forecast's horizon", body_values, "body"),
+    ColumnGroup("body_closest_time", 1, "s", "level", "until then; at most the forecast's horizon", body_values, "body"),
 )
 """Of each of the bodies that come closest, the closest first: how close matters more than how soon, and a body that recedes, whose closest
 approach is now, does not push one out that is still to come.

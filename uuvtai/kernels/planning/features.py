@@ -6,7 +6,7 @@
 import taichi as ti
 
 from uuvtai.config import FeaturesConfig
-from uuvtai.kernels.core.columns import Column
+from uuvtai.kernels.core.columns import ColumnGroup
 from uuvtai.kernels.core.geometry import FAR_M, TWO_PI, quaternion_wb, rotation_wb
 from uuvtai.kernels.core.signature import Bundle, FloatMatrix, quick_launch, spread
 from uuvtai.kernels.planning.advice import TEACHER_COLUMNS
@@ -135,20 +135,20 @@ def _sector_closing(env, sector, io: Bundle[FeaturesIO]):
 
 
 COLUMNS = (
-    Column("goal", 3, "m", "body", "from the position estimate to the goal", _goal),
-    Column("heading_error", 2, "1", "level", "sine, cosine of the look-ahead point's bearing, left positive", _heading_error),
-    Column("velocity", 3, "m/s", "body", "over ground, as the DVL measured it last", _velocity),
-    Column("yaw_rate", 1, "rad/s", "body", "of the gyro", _yaw_rate),
-    Column("depth", 1, "m", "world", "pressure depth, positive down", _depth),
-    Column("tilt", 2, "rad", "level", "roll, pitch of the IMU", _tilt),
-    Column("sector_range", 1, "m", "body", "smallest range; maximum range where nothing returned", _sector_range, "sector"),
-    Column("lookahead", 3, "m", "body", "to the look-ahead point of the route; zero without a route", _lookahead),
-    Column("cross_track", 1, "m", "route", "distance from the route, positive = left of it", _cross_track),
-    Column("remaining", 1, "m", "route", "route length still ahead; the straight distance without a route", _remaining),
-    Column("path_risk", 1, "1", "route", "mean risk over the look-ahead segment", _path_risk),
-    Column("tilt_rate", 2, "rad/s", "body", "roll rate, pitch rate of the gyro", _tilt_rate),
-    Column("sector_ttc", 1, "s", "body", "smallest time to collision, capped", _sector_ttc, "sector"),
-    Column("sector_closing", 1, "m/s", "body", "largest closing speed, own motion included; 0 = no return", _sector_closing, "sector"),
+    ColumnGroup("goal", 3, "m", "body", "from the position estimate to the goal", _goal),
+    ColumnGroup("heading_error", 2, "1", "level", "sine, cosine of the look-ahead point's bearing, left positive", _heading_error),
+    ColumnGroup("velocity", 3, "m/s", "body", "over ground, as the DVL measured it last", _velocity),
+    ColumnGroup("yaw_rate", 1, "rad/s", "body", "of the gyro", _yaw_rate),
+    ColumnGroup("depth", 1, "m", "world", "pressure depth, positive down", _depth),
+    ColumnGroup("tilt", 2, "rad", "level", "roll, pitch of the IMU", _tilt),
+    ColumnGroup("sector_range", 1, "m", "body", "smallest range; maximum range where nothing returned", _sector_range, "sector"),
+    ColumnGroup("lookahead", 3, "m", "body", "to the look-ahead point of the route; zero without a route", _lookahead),
+    ColumnGroup("cross_track", 1, "m", "route", "distance from the route, positive = left of it", _cross_track),
+    ColumnGroup("remaining", 1, "m", "route", "route length still ahead; the straight distance without a route", _remaining),
+    ColumnGroup("path_risk", 1, "1", "route", "mean risk over the look-ahead segment", _path_risk),
+    ColumnGroup("tilt_rate", 2, "rad/s", "body", "roll rate, pitch rate of the gyro", _tilt_rate),
+    ColumnGroup("sector_ttc", 1, "s", "body", "smallest time to collision, capped", _sector_ttc, "sector"),
+    ColumnGroup("sector_closing", 1, "m/s", "body", "largest closing speed, own motion included; 0 = no return", _sector_closing, "sector"),
 )
 """The observation, in order: the paper's phi and what it names as the world model's targets, which are the first 24 (with 12 sectors).
 
@@ -156,24 +156,24 @@ A config may add columns behind them (``columns``).
 """
 
 
-def columns(cfg: FeaturesConfig) -> tuple[Column, ...]:
+def columns(features_cfg: FeaturesConfig) -> tuple[ColumnGroup, ...]:
     """The groups of a config's observation: ``COLUMNS``, then the bodies' where any are asked for, then the tree's."""
-    return COLUMNS + (BODY_COLUMNS if cfg.n_track > 0 else ()) + (TEACHER_COLUMNS if cfg.teacher else ())
+    return COLUMNS + (BODY_COLUMNS if features_cfg.n_track > 0 else ()) + (TEACHER_COLUMNS if features_cfg.teacher else ())
 
 
-def placed_columns(cfg: FeaturesConfig) -> list[tuple[Column, int, int]]:
+def placed_columns(features_cfg: FeaturesConfig) -> list[tuple[ColumnGroup, int, int]]:
     """(group, first column, number of columns) of every group."""
     out, first = [], 0
-    for column in columns(cfg):
-        width = column.width * {"": 1, "sector": cfg.n_sector, "body": cfg.n_track}[column.per]
+    for column in columns(features_cfg):
+        width = column.width * {"": 1, "sector": features_cfg.n_sector, "body": features_cfg.n_track}[column.per]
         out.append((column, first, width))
         first += width
     return out
 
 
-def observation_width(cfg: FeaturesConfig) -> int:
+def observation_width(features_cfg: FeaturesConfig) -> int:
     """Columns of the observation."""
-    return sum(width for _column, _first, width in placed_columns(cfg))
+    return sum(width for _column, _first, width in placed_columns(features_cfg))
 
 
 def _sources(group, cfg):

@@ -7,7 +7,7 @@ from uuvtai.kernels.core.grid import cell_of, centre_of
 from uuvtai.kernels.core.lanes import f16x
 from uuvtai.kernels.core.signature import Bundle, quick_launch, spread
 from uuvtai.kernels.teacher.bundles import ThreatsIO
-from uuvtai.kernels.teacher.rollout import body_depths, depth_band, held_heave
+from uuvtai.kernels.teacher.trajectories import body_depths, depth_band, held_heave
 
 _PATH_SAMPLES = 8
 

@@ -190,10 +190,10 @@ _ABLATIONS = {
 }
 
 
-def _far_below(ours_s: float | None, theirs_s: float | None, by_success: Finding) -> Finding:
+def _far_below(ours_s: float | None, theirs_s: float | None, finding: Finding) -> Finding:
     """Less than half; None = nobody ever arrived, as slow as can be. How sure that is follows from the rates of success."""
     slower = ours_s is None or (theirs_s is not None and ours_s >= theirs_s / 2)
-    return Finding(FAILS if slower else by_success.points_to, by_success.p)
+    return Finding(FAILS if slower else finding.points_to, finding.p)
 
 
 def tts_s(entries: Sequence[dict[str, Any]]) -> float | None:

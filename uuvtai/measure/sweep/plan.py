@@ -11,7 +11,7 @@ from typing import Any
 
 from uuvtai.config import Config
 from uuvtai.loader import ConfigError, load_config
-from uuvtai.measure.sweep.grid import PRESET_AXES, SCENE_AXES, Cell, Grid, checked
+from uuvtai.measure.sweep.cells import PRESET_AXES, SCENE_AXES, Cell, Grid, checked
 from uuvtai.measure.sweep.tasks import Row, Task
 
 BATCH = 256

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from uuvtai.files import refuse_output
-from uuvtai.logs.errors import LogError
+from uuvtai.logs.log_errors import LogError
 from uuvtai.logs.reader import info, original, read_head, read_messages
 
 FORMATS = ("json", "csv", "npz")

@@ -21,13 +21,13 @@ from uuvtai.run_folder import RunFolder, RunFolderError, default_run_dir, refuse
 REQUEST, RESULT, PAGE = "reproduce_request.json", "reproduce.json", "results.md"
 
 
-class Watch(Protocol):
+class ReproductionWatch(Protocol):
     """Shows how far it is."""
 
     def note(self, text: str) -> None: ...
 
 
-def reproduce(budget: str, run_dir: Path | None, watch: Watch) -> tuple[dict[str, Any], Path]:
+def reproduce(budget: str, run_dir: Path | None, watch: ReproductionWatch) -> tuple[dict[str, Any], Path]:
     """Begin a reproduction: its document and its folder. Raises ValueError for an unknown budget, RunFolderError."""
     if budget not in BUDGETS:
         raise SettingError(f"--budget {budget!r}: {' or '.join(BUDGETS)}")
@@ -39,7 +39,7 @@ def reproduce(budget: str, run_dir: Path | None, watch: Watch) -> tuple[dict[str
     return _run(folder, request, watch), root
 
 
-def resume(place: Path, watch: Watch) -> tuple[dict[str, Any], Path]:
+def resume(place: Path, watch: ReproductionWatch) -> tuple[dict[str, Any], Path]:
     """Go on with a reproduction that was killed or interrupted; finished steps stay as they are. Raises RunFolderError."""
     root = place.absolute()
     folder = RunFolder.held(root, "uuv reproduce")
@@ -64,7 +64,7 @@ def _request(root: Path) -> dict[str, Any]:
     return request
 
 
-def _run(folder: RunFolder, request: dict[str, Any], watch: Watch) -> dict[str, Any]:
+def _run(folder: RunFolder, request: dict[str, Any], watch: ReproductionWatch) -> dict[str, Any]:
     steps = steps_of(BUDGETS[request["budget"]], request["policy"], folder.path)
     try:
         with folder.recorded():
@@ -80,7 +80,7 @@ def _run(folder: RunFolder, request: dict[str, Any], watch: Watch) -> dict[str, 
     return document
 
 
-def _step(step: Step, name: str, folder: RunFolder, watch: Watch) -> None:
+def _step(step: Step, name: str, folder: RunFolder, watch: ReproductionWatch) -> None:
     if is_done(step, folder.path) and result_file(step, folder.path).exists():
         watch.note(f"{name}: done before")
         return

@@ -13,8 +13,8 @@ from uuvtai.kernels.core.grid import grid_origin
 from uuvtai.kernels.task.reward import TERMS
 from uuvtai.learn.pilot import Pilot
 from uuvtai.loader import to_yaml
+from uuvtai.logs.closed_form import scenario_document
 from uuvtai.logs.mcap_log import Due, McapEpisodeLog
-from uuvtai.logs.scenario import scenario_document
 from uuvtai.measure.depth_line import depth_line
 from uuvtai.measure.evaluate import EpisodeResult, Job
 from uuvtai.outcomes import OUTCOMES, RUNNING

@@ -52,17 +52,17 @@ def _swatches(methods: list[Method]) -> list[str]:
     return [colours[name] for name in names]
 
 
-def _method_row(m: Method) -> list[str]:
-    o = m["outcomes"]
+def _method_row(method: Method) -> list[str]:
+    o = method["outcomes"]
     return [
-        m["name"],
-        rate(o["success"], m["episodes"], m["success_ci95"]),
-        rate(accidents(o), m["episodes"], m["collision_ci95"]),
+        method["name"],
+        rate(o["success"], method["episodes"], method["success_ci95"]),
+        rate(accidents(o), method["episodes"], method["collision_ci95"]),
         f"{o['collision']} / {o['ttc']} / {o['out_of_tank']} / {o['timeout']}",
-        number(m["time_to_success_mean_s"]),
-        number(m["tts_s"]),
-        number(m.get("return_mean")),
-        number(m.get("min_clearance_mean_m"), 2),
+        number(method["time_to_success_mean_s"]),
+        number(method["tts_s"]),
+        number(method.get("return_mean")),
+        number(method.get("min_clearance_mean_m"), 2),
     ]
 
 
@@ -92,12 +92,12 @@ def _rates_figure(methods: list[Method], command: str) -> Figure:
     return Figure("methods", panels, "Success and collision of every method with 95 % Wilson intervals", _methods_data(methods), command)
 
 
-def _rates_line(place: int, m: Method, key: str, colour: str) -> Line:
+def _rates_line(place: int, method: Method, key: str, colour: str) -> Line:
     """The one point of a method; none where it played nothing."""
-    if m[f"{key}_rate"] is None:
-        return Line(m["name"], [], [], [], [], colour=colour)
-    low, high = m[f"{key}_ci95"]
-    return Line(m["name"], [place], [m[f"{key}_rate"]], [low], [high], [f"{m['name']}\n{rates_text(m)}"], colour)
+    if method[f"{key}_rate"] is None:
+        return Line(method["name"], [], [], [], [], colour=colour)
+    low, high = method[f"{key}_ci95"]
+    return Line(method["name"], [place], [method[f"{key}_rate"]], [low], [high], [f"{method['name']}\n{rates_text(method)}"], colour)
 
 
 _PAIRED = ("both", "only_a", "only_b", "mcnemar_p", "time_a_mean_s", "time_b_mean_s", "time_difference_mean_s")
@@ -158,8 +158,8 @@ def _planning_table(methods: list[Method]) -> Table:
 # -------------------------------------------------------------------------------------------------------- causes and risk
 
 
-def _causes(m: Method) -> list[Block]:
-    if not m.get("causes"):
+def _causes(method: Method) -> list[Block]:
+    if not method.get("causes"):
         return []
     columns = ["cause", "n", "share", "knew", "unseen s", "evading s", "last chance s", "meaning"]
     rows = [
@@ -171,22 +171,22 @@ def _causes(m: Method) -> list[Block]:
             *(number(c[key]) for key in ("unseen_median_s", "evading_median_s", "last_chance_median_s")),
             c["meaning"],
         ]
-        for c in m["causes"]
+        for c in method["causes"]
     ]
     caption = (
-        f"Why {len(m['explain'])} of {m['episodes']} episodes of {m['name']} failed. Knew: share whose forecast of the killer 1 s before "
-        "the end was right; the times are medians before the end"
+        f"Why {len(method['explain'])} of {method['episodes']} episodes of {method['name']} failed. "
+        "Knew: share whose forecast of the killer 1 s before the end was right; the times are medians before the end"
     )
     return [Table(columns, rows, caption)]
 
 
-def _risk(m: Method, command: str) -> list[Block]:
-    risk = m.get("risk")
+def _risk(method: Method, command: str) -> list[Block]:
+    risk = method.get("risk")
     if not risk:
         return []
     bins = risk["reliability"]
     said = (
-        f"At {risk['moments']:,} moments the risk head of {m['name']} gave the probability of an accident soon: Brier score "
+        f"At {risk['moments']:,} moments the risk head of {method['name']} gave the probability of an accident soon: Brier score "
         f"{number(risk['brier'], 4)} (base rate alone {number(risk['brier_base_rate'], 4)}), expected calibration error "
         f"{number(risk['ece'], 4)}, area under the ROC curve {number(risk.get('auroc'), 3)}."
     )
@@ -199,5 +199,5 @@ def _risk(m: Method, command: str) -> list[Block]:
     columns = ["said", "came", "moments"]
     data = Data(columns, list(zip(bins["predicted"], bins["observed"], bins["samples"], strict=True)))
     caption = "Reliability: a point's area grows with the number of its moments; on the dashed line a forecast can be taken at its word"
-    panel = reliability(bins, m["name"])
-    return [Heading(f"Risk: {m['name']}"), Prose(said), Figure(f"reliability_{m['name']}", [panel], caption, data, command)]
+    panel = reliability(bins, method["name"])
+    return [Heading(f"Risk: {method['name']}"), Prose(said), Figure(f"reliability_{method['name']}", [panel], caption, data, command)]

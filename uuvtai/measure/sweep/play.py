@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from uuvtai.files import FileError, open_to_append, parsed_json, read_json, read_lines, truncate
+from uuvtai.measure.sweep.cells import Grid
 from uuvtai.measure.sweep.engines import Engine
-from uuvtai.measure.sweep.grid import Grid
 from uuvtai.measure.sweep.plan import SweepRequest, base_config, check_rows, ordered, request_of, row_key, tasks_of, unchanged
 from uuvtai.measure.sweep.tasks import Row, play
 from uuvtai.run_folder import RunFolder, RunFolderError, default_run_dir, refuse_place
@@ -22,7 +22,7 @@ MethodKey = tuple[str, str | None, str | None]
 """(name in the table, controller, policy): exactly one of the last two"""
 
 
-class Watch(Protocol):
+class SweepWatch(Protocol):
     """Shows how far a sweep is."""
 
     def start(self, name: str, total: int, done: int = 0) -> None: ...
@@ -31,7 +31,7 @@ class Watch(Protocol):
     def stop(self) -> None: ...
 
 
-def sweep(request: SweepRequest, engine: Engine, run_dir: Path | None, watch: Watch) -> tuple[dict[str, Any], Path]:
+def sweep(request: SweepRequest, engine: Engine, run_dir: Path | None, watch: SweepWatch) -> tuple[dict[str, Any], Path]:
     """Begin a sweep: the ``uuv sweep --json`` document and the run folder. Whatever can be refused is refused before anything is written.
 
     Raises ConfigError, CheckpointError, RunFolderError, EngineError.
@@ -45,7 +45,7 @@ def sweep(request: SweepRequest, engine: Engine, run_dir: Path | None, watch: Wa
     return _play(request, methods, keys, engine, folder, watch), folder.path
 
 
-def resume(place: Path, engine: Engine, watch: Watch) -> tuple[dict[str, Any], Path]:
+def resume(place: Path, engine: Engine, watch: SweepWatch) -> tuple[dict[str, Any], Path]:
     """Go on with a sweep that was killed or interrupted: rows that are finished stay as they are. Raises RunFolderError."""
     folder = RunFolder.held(place, "uuv sweep")
     try:
@@ -71,7 +71,7 @@ def _method_key(given: Any) -> MethodKey:
     return name, controller, policy
 
 
-def _refuse_other_policies(place: Path, request: SweepRequest, checkpoints: dict[str, str], watch: Watch) -> None:
+def _refuse_other_policies(place: Path, request: SweepRequest, checkpoints: dict[str, str], watch: SweepWatch) -> None:
     """RunFolderError where a policy is another one by now: cells of two policies under one name would prove nothing."""
     from uuvtai.measure.methods import policies_of
 
@@ -82,7 +82,7 @@ def _refuse_other_policies(place: Path, request: SweepRequest, checkpoints: dict
         raise RunFolderError(f"{place}: {', '.join(changed)} has changed since this sweep began; begin a new sweep with another --run-dir")
 
 
-def resolved(request: SweepRequest, watch: Watch) -> tuple[SweepRequest, list[MethodKey], dict[str, str]]:
+def resolved(request: SweepRequest, watch: SweepWatch) -> tuple[SweepRequest, list[MethodKey], dict[str, str]]:
     """The request with the columns that its policies see, its methods by their names in the table, and the sha256 of every policy.
 
     Paths are made absolute. Raises ConfigError, CheckpointError.
@@ -102,7 +102,7 @@ def resolved(request: SweepRequest, watch: Watch) -> tuple[SweepRequest, list[Me
 
 
 def _play(
-    request: SweepRequest, methods: Sequence[MethodKey], keys: list[str], engine: Engine, folder: RunFolder, watch: Watch
+    request: SweepRequest, methods: Sequence[MethodKey], keys: list[str], engine: Engine, folder: RunFolder, watch: SweepWatch
 ) -> dict[str, Any]:
     rows = _by_key(folder.path, request.grid)
     tasks = tasks_of(request, methods, set(rows))

@@ -1,0 +1,127 @@
+"""One name for one thing: parameters, classes, files; and no module that imports itself by a detour."""
+
+import ast
+import re
+from collections import Counter, defaultdict
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parent.parent / "uuvtai"
+PATHS = sorted(PACKAGE.rglob("*.py"))
+DECKS = ("config", "state", "bundles")
+"""what every room has: a file of the room's name in each of the first two, the last in its folder of kernels"""
+
+
+def module_of(path):
+    return ".".join(("uuvtai", *path.relative_to(PACKAGE).with_suffix("").parts)).removesuffix(".__init__")
+
+
+TREES = {module_of(path): ast.parse(path.read_text()) for path in PATHS}
+
+
+def classes():
+    """Name -> modules that define such a class."""
+    found = defaultdict(list)
+    for module, tree in TREES.items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ClassDef):
+                found[node.name].append(module)
+    return found
+
+
+CLASSES = classes()
+
+
+def ours_in(module):
+    """Names that stand for classes of the package in a module."""
+    tree = TREES[module]
+    imported = {
+        alias.asname or alias.name
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("uuvtai")
+        for alias in node.names
+    }
+    return (imported | {node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}) & set(CLASSES)
+
+
+def kind_of(annotation):
+    """'RouteState' of RouteState, In[RouteState], state.RouteState, RouteState | None."""
+    match = re.fullmatch(r"(?:(?:In|Out|Const|Bundle)\[)?(?:\w+\.)?(\w+)\]?(?: \| None)?", ast.unparse(annotation).strip("'\""))
+    return match.group(1) if match else ""
+
+
+def names_of_types(trees):
+    """Type -> names of the parameters that alone in their function have it -> where."""
+    found = defaultdict(lambda: defaultdict(list))
+    for module in trees:
+        ours = ours_in(module)
+        for node in ast.walk(TREES[module]):
+            if isinstance(node, ast.FunctionDef):
+                given = [(kind_of(a.annotation), a.arg) for a in node.args.args + node.args.kwonlyargs if a.annotation is not None]
+                count = Counter(kind for kind, _ in given)
+                for kind, name in given:
+                    if kind in ours and count[kind] == 1:
+                        found[kind][name].append(f"{module}.{node.name}")
+    return found
+
+
+def test_a_type_has_one_name_as_a_parameter():
+    found = names_of_types(TREES)
+    assert len(found) > 100
+    assert not {kind: {name: where[:3] for name, where in names.items()} for kind, names in found.items() if len(names) > 1}
+
+
+def test_a_second_name_would_be_found(monkeypatch):
+    source = "from uuvtai.run_folder import RunFolder\ndef one(folder: RunFolder): ...\ndef two(held: 'RunFolder | None'): ..."
+    monkeypatch.setitem(TREES, "made.up", ast.parse(source))
+    assert set(names_of_types(["made.up"])["RunFolder"]) == {"folder", "held"}
+
+
+def test_no_two_classes_have_one_name():
+    assert not {name: modules for name, modules in CLASSES.items() if len(modules) > 1}
+
+
+def test_no_two_files_have_one_name():
+    found = defaultdict(list)
+    for path in PATHS:
+        if path.stem not in ("__init__", "__main__", "bundles") and path.parent.name not in DECKS:
+            found[path.stem].append(str(path.relative_to(PACKAGE)))
+    assert len(found) > 150
+    assert not {name: paths for name, paths in found.items() if len(paths) > 1}
+    decks = {path.stem for deck in ("config", "state") for path in (PACKAGE / deck).glob("*.py")} & set(found)
+    assert not decks, f"named like a room: {decks}"
+
+
+def imports():
+    """Module -> modules of ours that it imports, inside functions too."""
+    found = {}
+    for module, tree in TREES.items():
+        named = set()
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("uuvtai"):
+                named |= {f"{node.module}.{a.name}" if f"{node.module}.{a.name}" in TREES else node.module for a in node.names}
+            elif isinstance(node, ast.Import):
+                named |= {a.name for a in node.names if a.name.startswith("uuvtai")}
+        found[module] = named - {module}
+    return found
+
+
+def circle_in(graph):
+    """Modules along one circle of a graph, or nothing."""
+    left = {node: {other for other in others if other in graph} for node, others in graph.items()}
+    while free := [node for node, others in left.items() if not others & left.keys()]:
+        for node in free:
+            del left[node]
+    return sorted(left)
+
+
+def test_no_module_imports_itself_by_a_detour():
+    graph = imports()
+    assert sum(map(len, graph.values())) > 900
+    assert not circle_in(graph)
+
+
+@pytest.mark.parametrize("graph", [{"a": {"b"}, "b": {"a"}}, {"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}])
+def test_a_circle_would_be_found(graph):
+    assert {"a", "b"} <= set(circle_in(graph))
