@@ -216,14 +216,13 @@ def test_bytes_of_equals_what_allocate_takes():
     assert state.bytes_of(Probe, sizes) == probe.a.to_numpy().nbytes + probe.b.to_numpy().nbytes
 
 
-def test_readme_tree_equals_the_real_one():
-    text = (ROOT / "README.md").read_text()
-    block = re.search(r"<!-- tree -->\n```[a-z]*\n(.*?)```", text, re.S)
-    assert block, "README has no tree"
-    drawn = set(re.findall(r"([\w./-]+\.py|[\w-]+/)", block.group(1)))
-    real = {p.name for p in PACKAGE.rglob("*.py") if p.stem != "__init__"} | {
-        f"{p.name}/" for p in PACKAGE.iterdir() if p.is_dir() and p.name[0] != "_"
+def test_the_tree_in_contributing_shows_every_folder():
+    block = re.search(r"<!-- tree -->\n```text\n(.*?)```", (ROOT / "CONTRIBUTING.md").read_text(), re.S)
+    assert block, "CONTRIBUTING has no tree"
+    drawn = set(re.findall(r"^ +([\w-]+/)", block.group(1), re.M))
+    real = {
+        f"{p.name}/" for p in [*PACKAGE.iterdir(), *KERNELS.iterdir(), *(PACKAGE / "measure").iterdir()] if p.is_dir() and p.name[0] != "_"
     }
-    missing = real - drawn
-    gone = {name for name in drawn if name.endswith(".py")} - real - {p.name for p in ROOT.glob("*.py")}
-    assert not missing and not gone, f"README's tree lacks {sorted(missing)} and still shows {sorted(gone)}"
+    assert drawn == real, f"CONTRIBUTING's tree lacks {sorted(real - drawn)} and still shows {sorted(drawn - real)}"
+    files = set(re.findall(r"[\w/]+\.py", block.group(1)))
+    assert files <= {p.name for p in [*PACKAGE.rglob("*.py"), *ROOT.glob("*.py")]}

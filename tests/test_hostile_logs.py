@@ -105,7 +105,7 @@ def test_chunks_that_each_unfold_to_their_limit(tmp_path):
     record = struct.pack("<BQ", 0x85, (15 << 20) - 9) + bytes((15 << 20) - 9)
     (tmp_path / "a.mcap").write_bytes(MAGIC + chunk_of(record) * 64 + END)
     assert (tmp_path / "a.mcap").stat().st_size < 1 << 20
-    for work in ("reader.info(here / 'a.mcap')", "repair.repair(here / 'a.mcap')", "export.export(here / 'a.mcap', here / 'out')"):
+    for work in ("reader.info(here / 'a.mcap')", "repair.repair(here / 'a.mcap')", "log_export.export(here / 'a.mcap', here / 'out')"):
         assert "unpack to more than" in bounded(work, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
 

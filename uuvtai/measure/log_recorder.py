@@ -22,8 +22,7 @@ from uuvtai.plan_codes import PLANNERS, REASONS, TRIGGERS
 from uuvtai.run_folder import git_sha
 from uuvtai.scenario import describe_scenario
 from uuvtai.sim import Sim
-from uuvtai.snapshot import EpisodeHeader, EpisodeSnapshot, MapLayers
-from uuvtai.snapshot import EpisodeResult as LoggedResult
+from uuvtai.snapshot import EpisodeEnd, EpisodeHeader, EpisodeSnapshot, MapLayers
 
 _STEP_FIELDS = {
     "clock": ("step",),
@@ -84,7 +83,7 @@ class EpisodeRecorder:
         """Close the log with the episode's result."""
         if row in self._logs:
             self._logs.pop(row).close(
-                LoggedResult(
+                EpisodeEnd(
                     outcome=result.outcome,
                     episode_return=result.episode_return,
                     time_s=result.time_s,
