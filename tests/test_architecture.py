@@ -3,6 +3,8 @@
 import ast
 import dataclasses
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -226,3 +228,20 @@ def test_the_tree_in_contributing_shows_every_folder():
     assert drawn == real, f"CONTRIBUTING's tree lacks {sorted(real - drawn)} and still shows {sorted(drawn - real)}"
     files = set(re.findall(r"[\w/]+\.py", block.group(1)))
     assert files <= {p.name for p in [*PACKAGE.rglob("*.py"), *ROOT.glob("*.py")]}
+
+
+WITHOUT_TAICHI = """
+import importlib, pkgutil, sys
+sys.modules["taichi"] = None  # an import of it fails
+for room in ("config", "deploy", "learn", "logs", "report", "show", "tree"):
+    package = importlib.import_module(f"uuvtai.{room}")
+    for module in pkgutil.walk_packages(package.__path__, f"uuvtai.{room}."):
+        importlib.import_module(module.name)
+print(sum(name.startswith("uuvtai.") for name in sys.modules))
+"""
+
+
+def test_what_learns_records_and_reports_starts_no_taichi():
+    done = subprocess.run([sys.executable, "-c", WITHOUT_TAICHI], capture_output=True, text=True, check=False, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) > 100

@@ -3,6 +3,7 @@
 import ast
 import re
 from collections import Counter, defaultdict
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -125,3 +126,30 @@ def test_no_module_imports_itself_by_a_detour():
 @pytest.mark.parametrize("graph", [{"a": {"b"}, "b": {"a"}}, {"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}])
 def test_a_circle_would_be_found(graph):
     assert {"a", "b"} <= set(circle_in(graph))
+
+
+@cache
+def defined_in(module):
+    """Names that a module's own text defines, wherever in it."""
+    found = set()
+    for node in ast.walk(TREES[module]):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            found.add(node.name)
+        elif isinstance(node, ast.ImportFrom | ast.Import):
+            found |= {alias.asname or alias.name for alias in node.names}
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            found.add(node.id)
+    return found
+
+
+def test_what_is_imported_is_there():
+    """Also inside functions and under conditions, which no other test may come by."""
+    missing = [
+        f"{module} imports {node.module}.{alias.name}"
+        for module, tree in TREES.items()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("uuvtai")
+        for alias in node.names
+        if f"{node.module}.{alias.name}" not in TREES and alias.name not in defined_in(node.module)
+    ]
+    assert not missing
