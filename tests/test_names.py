@@ -153,3 +153,14 @@ def test_what_is_imported_is_there():
         if f"{node.module}.{alias.name}" not in TREES and alias.name not in defined_in(node.module)
     ]
     assert not missing
+
+
+def test_every_place_of_the_walk_through_the_house_is_there():
+    text = (PACKAGE.parent / "CONTRIBUTING.md").read_text()
+    walk = text[text.index("## A walk through the house") : text.index("## How to add a sensor")]
+    places = re.findall(r"`([\w/]+)\.py(?::(\w+))?`", walk)
+    assert len(places) > 30
+    for path, function in places:
+        tree = TREES[f"uuvtai.{path.replace('/', '.')}"]
+        names = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
+        assert not function or function in names, f"{path}.py has no {function}"
