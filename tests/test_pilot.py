@@ -53,7 +53,7 @@ def flown(policy, model, rows, steps=4):
     """Decisions of a pilot over some steps for the given rows of one fixed stream of observations."""
     rng = torch.Generator().manual_seed(1)
     stream = 3.0 * torch.randn(steps, 300, N_OBS, generator=rng)
-    pilot, out = Pilot(policy, model, len(rows), risk=head()), []
+    pilot, out = Pilot(policy, model, len(rows), head=head()), []
     for obs in stream:
         decision = pilot.decide(obs[rows])
         columns = (decision.value, decision.residual, decision.uncertainty, decision.risk_logit)
