@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 from functools import cache
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_type_hints
 
 from uuvtai.config import Section
 
@@ -20,9 +20,7 @@ def bind(bundle: type[_T], *sources: object, partial: bool = False) -> _T:
     ``sources`` are structs, config sections (searched with all their parts), bundles, and dataclasses of structs. Raises TypeError for a
     member that two sources have, and for one that none has; where ``partial`` is set that one stays None, and what uses it cannot compile.
     """
-    parts: dict[str, Any] = {}
-    for source in sources:
-        _gather(source, parts)
+    parts = _parts_of(sources)
     if partial:
         return bundle(**{name: parts.get(kind) for name, kind in members_of(bundle).items()})
     return _filled(bundle, parts)
@@ -30,11 +28,8 @@ def bind(bundle: type[_T], *sources: object, partial: bool = False) -> _T:
 
 def bind_all(stages: type[_T], *sources: object) -> _T:
     """A dataclass of bundles, each of them bound."""
-    parts: dict[str, Any] = {}
-    for source in sources:
-        _gather(source, parts)
-    bundles = _resolved(stages)
-    return stages(**{name: _filled(bundle, parts) for name, bundle in bundles.items()})
+    parts = _parts_of(sources)
+    return stages(**{name: _filled(bundle, parts) for name, bundle in _bundles_of(stages).items()})
 
 
 def members_of(bundle: type) -> dict[str, str]:
@@ -49,10 +44,16 @@ def members_of(bundle: type) -> dict[str, str]:
 
 
 @cache
-def _resolved(stages: type) -> dict[str, type]:
-    import typing
+def _bundles_of(stages: type) -> dict[str, type]:
+    return get_type_hints(stages)
 
-    return typing.get_type_hints(stages)
+
+def _parts_of(sources: tuple[object, ...]) -> dict[str, Any]:
+    """All structs and sections of the sources by the names of their types."""
+    parts: dict[str, Any] = {}
+    for source in sources:
+        _gather(source, parts)
+    return parts
 
 
 def _filled(bundle: type[_T], parts: dict[str, Any]) -> _T:
