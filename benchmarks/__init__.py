@@ -1,1 +1,2 @@
-"""Speed beside peers from PyPI: ``python benchmarks/run.py``. Every module with a function ``measure`` is a benchmark."""
+"""Speed beside peers from PyPI: ``python benchmarks/run.py``. Every module with a function ``measure`` is a
+benchmark."""

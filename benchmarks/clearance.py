@@ -1,4 +1,5 @@
-"""Clearance with the nearest site, whole maps computed anew, against OpenCV's and SciPy's exact distance transforms of the same maps."""
+"""Clearance with the nearest site, whole maps computed anew, against OpenCV's and SciPy's exact distance
+transforms of the same maps."""
 
 from __future__ import annotations
 
@@ -88,14 +89,23 @@ class Maps:
         """Raise RuntimeError unless all three agree and our sites lie where they are said to."""
         self.ours(cfg)()
         found = self.clearance.clearance_m.to_numpy()
-        rows, cols = self.clearance.site_row.to_numpy().astype(int), self.clearance.site_col.to_numpy().astype(int)
+        rows, cols = (
+            self.clearance.site_row.to_numpy().astype(int),
+            self.clearance.site_col.to_numpy().astype(int),
+        )
         row, col = np.indices(self.outside.shape)
         for i, image in enumerate(self.images):
             exact = np.minimum(np.asarray(distance_transform_edt(image)) * self.cell_m, cfg.max_m)
-            precise = np.minimum(cv2.distanceTransform(image, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * self.cell_m, cfg.max_m)
+            precise = np.minimum(
+                cv2.distanceTransform(image, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * self.cell_m, cfg.max_m
+            )
             near = rows[i] >= 0
             reach = np.hypot(rows[i] - row, cols[i] - col)[near] * self.cell_m
-            worst = max(np.abs(found[i] - exact).max(), np.abs(found[i] - precise).max(), np.abs(reach - found[i][near]).max(initial=0))
+            worst = max(
+                np.abs(found[i] - exact).max(),
+                np.abs(found[i] - precise).max(),
+                np.abs(reach - found[i][near]).max(initial=0),
+            )
             if worst > _TOLERANCE_M or image[rows[i][near], cols[i][near]].any():
                 raise RuntimeError(f"map {i}: {worst} m apart")
 
@@ -105,7 +115,10 @@ def measure(job: Job) -> list[Row]:
     start_taichi(job.device)
     cv2.setNumThreads(1)
     rows = []
-    for world, cfgs in (("pool", (ClearanceConfig(), ClearanceConfig(max_m=_WHOLE_M))), ("maze", (ClearanceConfig(),))):
+    for world, cfgs in (
+        ("pool", (ClearanceConfig(), ClearanceConfig(max_m=_WHOLE_M))),
+        ("maze", (ClearanceConfig(),)),
+    ):
         maps = Maps(world)
         n_row, n_col = maps.outside.shape
         for kind, occupied in occupancies(np.random.default_rng(0), (n_row, n_col)).items():
@@ -113,7 +126,9 @@ def measure(job: Job) -> list[Row]:
             for cfg in cfgs:
                 job.say(f"{world}, {kind}, to {cfg.max_m} m")
                 maps.check(cfg)
-                cost = seconds_per_call({"ours": maps.ours(cfg), "opencv": maps.opencv, "scipy": maps.scipy}, job.seconds / 3)
+                cost = seconds_per_call(
+                    {"ours": maps.ours(cfg), "opencv": maps.opencv, "scipy": maps.scipy}, job.seconds / 3
+                )
                 us = {side: 1e6 * seconds / _MAPS for side, seconds in cost.items()}
                 rows.append(
                     Row(
@@ -124,7 +139,8 @@ def measure(job: Job) -> list[Row]:
                         unit="maps/s per core",
                         floor=FLOOR,
                         floor_on="ratio",
-                        note=f"{us['ours']:.1f} us with sites; OpenCV {us['opencv']:.1f} without; SciPy {us['scipy']:.1f} with",
+                        note=f"{us['ours']:.1f} us with sites; OpenCV {us['opencv']:.1f} without; SciPy "
+                        f"{us['scipy']:.1f} with",
                         details={"us": us, "whole": cfg.max_m == _WHOLE_M},
                     )
                 )

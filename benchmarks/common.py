@@ -1,4 +1,5 @@
-"""What every benchmark shares: what it is asked for, the rows it returns, and stopwatches that treat both sides alike."""
+"""What every benchmark shares: what it is asked for, the rows it returns, and stopwatches that treat both
+sides alike."""
 
 from __future__ import annotations
 
@@ -38,7 +39,8 @@ class Row:
     """the unit is a time or a size, not a rate"""
     floor: float | None = None
     floor_on: str = "ours"
-    """'ours' or 'ratio': the figure that the floor bounds; a ratio must be at least the floor, ours at most it if less is better"""
+    """'ours' or 'ratio': the figure that the floor bounds; a ratio must be at least the floor, ours at most
+    it if less is better"""
     note: str = ""
     details: dict[str, Any] = field(default_factory=dict)
     """kept in the file, not printed, except ``table``: {column: {row: number}}"""
@@ -66,12 +68,16 @@ class Row:
 
 
 def seconds_per_call(
-    sides: dict[str, Callable[[], Any]], seconds: float, clock: Callable[[], float] = time.process_time, rounds: int = 7
+    sides: dict[str, Callable[[], Any]],
+    seconds: float,
+    clock: Callable[[], float] = time.process_time,
+    rounds: int = 7,
 ) -> dict[str, float]:
     """Median time of one call of each side, in turns, so that whatever disturbs the machine meets every side.
 
-    Calls must have finished their work when they return. ``clock``: ``time.process_time`` for comparisons per core (CPU time: other
-    programs' work is not counted), ``time.perf_counter`` for what all cores do together. Each side is called once before the clock runs.
+    Calls must have finished their work when they return. ``clock``: ``time.process_time`` for comparisons per
+    core (CPU time: other programs' work is not counted), ``time.perf_counter`` for what all cores do
+    together. Each side is called once before the clock runs.
     """
     calls = {}
     for name, call in sides.items():

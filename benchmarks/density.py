@@ -1,4 +1,5 @@
-"""One env in real time: time of a whole step against the number of moving and static bodies, and its 99th percentile."""
+"""One env in real time: time of a whole step against the number of moving and static bodies, and its 99th
+percentile."""
 
 from __future__ import annotations
 
@@ -20,13 +21,18 @@ _PAPER_LOOP_MS = 28.63
 
 
 def measure(job: Job) -> list[Row]:
-    """Milliseconds a step of one env: against D and S, one simulator with room for 15 of each, and its 99th percentile."""
+    """Milliseconds a step of one env: against D and S, one simulator with room for 15 of each, and its 99th
+    percentile."""
     config = load_config("pool", "paper")
-    room = config.world.model_copy(update={"dynamic_capacity": max(PAPER_DENSITY), "static_capacity": max(N_STATIC)})
+    room = config.world.model_copy(
+        update={"dynamic_capacity": max(PAPER_DENSITY), "static_capacity": max(N_STATIC)}
+    )
     roomy = config.model_copy(update={"world": room})
     tree = read_tree("bt", config.teacher.max_node)
     world = config.world
-    scenes = [(world.n_static, d) for d in PAPER_DENSITY] + [(s, world.n_dynamic) for s in N_STATIC if s != world.n_static]
+    scenes = [(world.n_static, d) for d in PAPER_DENSITY] + [
+        (s, world.n_dynamic) for s in N_STATIC if s != world.n_static
+    ]
     sim = Sim(roomy, 1, tree, job.device)
     loops = _loops(sim, scenes, world.dynamic_speed_m_s, job)
     rows = []
@@ -58,7 +64,9 @@ def measure(job: Job) -> list[Row]:
     return [*rows, _real_time(sim, world.n_static, world.n_dynamic, job)]
 
 
-def _loops(sim: Sim, scenes: list[tuple[int, int]], speed_m_s: float, job: Job) -> dict[tuple[int, int], float]:
+def _loops(
+    sim: Sim, scenes: list[tuple[int, int]], speed_m_s: float, job: Job
+) -> dict[tuple[int, int], float]:
     """Mean milliseconds of a step of each (S, D), in turns, resets included."""
     spent = dict.fromkeys(scenes, 0.0)
     steps = 10 if job.quick else 250

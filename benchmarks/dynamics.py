@@ -1,4 +1,5 @@
-"""Velocity loop, allocation, rotors and two midpoint substeps of Fossen's equation, against the same on NumPy and torch arrays."""
+"""Velocity loop, allocation, rotors and two midpoint substeps of Fossen's equation, against the same on NumPy
+and torch arrays."""
 
 from __future__ import annotations
 
@@ -33,7 +34,10 @@ def measure(job: Job) -> list[Row]:
     plant.reset()
     peers = {"NumPy": Vehicles(config, n_env, np), "torch": Vehicles(config, n_env, torch, job.device)}
     actions = np.random.default_rng(0).uniform(-1, 1, (n_env, 4)).astype(np.float32)
-    turned = {"NumPy": np.ascontiguousarray(actions.T), "torch": torch.from_numpy(actions.T).contiguous().to(job.device)}
+    turned = {
+        "NumPy": np.ascontiguousarray(actions.T),
+        "torch": torch.from_numpy(actions.T).contiguous().to(job.device),
+    }
     worst = disagreement(plant, peers, actions, turned)
     if worst > AGREEMENT:
         raise RuntimeError(f"kernels and peers disagree by {worst:.2g}")
@@ -88,7 +92,11 @@ def disagreement(plant: Plant, peers: dict[str, Vehicles], actions: np.ndarray, 
         for _ in range(_CHECKED_STEPS):
             peer.control(turned[name])
             peer.move()
-        for field, values in ((plant.vehicle.pos_w, peer.pos), (plant.vehicle.vel_b, peer.vel), (plant.vehicle.rate_b, peer.rate)):
+        for field, values in (
+            (plant.vehicle.pos_w, peer.pos),
+            (plant.vehicle.vel_b, peer.vel),
+            (plant.vehicle.rate_b, peer.rate),
+        ):
             found = values if isinstance(values, np.ndarray) else values.cpu().numpy()
             worst = max(worst, float(np.abs(field.to_numpy() - found.T).max()))
     return worst

@@ -1,4 +1,5 @@
-"""Thousands of damaged files of every kind that uuv opens: how many end in anything but an answer or a refusal within 30 s and 1 GiB."""
+"""Thousands of damaged files of every kind that uuv opens: how many end in anything but an answer or a
+refusal within 30 s and 1 GiB."""
 
 from __future__ import annotations
 
@@ -22,10 +23,53 @@ LONGEST_S = 14400
 """the whole of it, on two cores"""
 _LONGEST_S, _MOST_BYTES = 30.0, 1 << 30
 _SEED = 20261122
-_COUNTS = {"mcap": 2000, "yaml": 250, "xml": 150, "json": 200, "safetensors": 150, "onnx": 150, "npz": 100, "command line": 500}
-_QUICK = {"mcap": 20, "yaml": 4, "xml": 4, "json": 4, "safetensors": 4, "onnx": 2, "npz": 4, "command line": 4}
-_EXTREMES = (0, 1, 0x7F, 0xFF, 1 << 15, 1 << 31, (1 << 32) - 1, 1 << 62, (1 << 63) - 1, 1 << 63, (1 << 64) - 1)
-_WORDS = (b"1e999", b"-1e308", b"NaN", b"Infinity", b"9" * 400, b"null", b"[" * 5000, b"{" * 5000, b"\xff\xfe", b"&a", b"!!x", b"<a>" * 500)
+_COUNTS = {
+    "mcap": 2000,
+    "yaml": 250,
+    "xml": 150,
+    "json": 200,
+    "safetensors": 150,
+    "onnx": 150,
+    "npz": 100,
+    "command line": 500,
+}
+_QUICK = {
+    "mcap": 20,
+    "yaml": 4,
+    "xml": 4,
+    "json": 4,
+    "safetensors": 4,
+    "onnx": 2,
+    "npz": 4,
+    "command line": 4,
+}
+_EXTREMES = (
+    0,
+    1,
+    0x7F,
+    0xFF,
+    1 << 15,
+    1 << 31,
+    (1 << 32) - 1,
+    1 << 62,
+    (1 << 63) - 1,
+    1 << 63,
+    (1 << 64) - 1,
+)
+_WORDS = (
+    b"1e999",
+    b"-1e308",
+    b"NaN",
+    b"Infinity",
+    b"9" * 400,
+    b"null",
+    b"[" * 5000,
+    b"{" * 5000,
+    b"\xff\xfe",
+    b"&a",
+    b"!!x",
+    b"<a>" * 500,
+)
 _BAD = ("bug", "hang", "memory", "wrote outside")
 _REPORT = "fuzz_findings"
 """folder in the temporary folder that keeps every file that was not answered as it should be"""
@@ -42,7 +86,9 @@ def measure(job: Job) -> list[Row]:
             ends: Counter[str] = Counter()
             for i in range(number):
                 generator = random.Random(f"{_SEED} {kind} {i}")
-                end, told = (_by_command if kind == "command line" else worker.judged)(kind, samples, generator, Path(folder))
+                end, told = (_by_command if kind == "command line" else worker.judged)(
+                    kind, samples, generator, Path(folder)
+                )
                 ends[end] += 1
                 if end in _BAD:
                     job.say(f"{kind} {i}: {end}: {told[-300:]}")
@@ -55,12 +101,20 @@ def measure(job: Job) -> list[Row]:
         bad = sum(ends.get(end, 0) for end in _BAD)
         note = ", ".join(f"{end} {n}" for end, n in sorted(ends.items()))
         rows.append(
-            Row(f"{kind}: ended badly", bad, f"of {counts[kind]}", less_is_better=True, floor=0, note=note, details={"seed": _SEED})
+            Row(
+                f"{kind}: ended badly",
+                bad,
+                f"of {counts[kind]}",
+                less_is_better=True,
+                floor=0,
+                note=note,
+                details={"seed": _SEED},
+            )
         )
     return rows
 
 
-# ------------------------------------------------------------------------------------------------------------------- samples
+# ---------------------------------------------------------------------------------------------------- samples
 
 
 def _samples(folder: Path) -> dict[str, list[bytes]]:
@@ -85,12 +139,15 @@ def _samples(folder: Path) -> dict[str, list[bytes]]:
         "safetensors": [(exported / "policy.safetensors").read_bytes()],
         "npz": [(exported / "golden.npz").read_bytes()],
     }
-    found["onnx"] = [(exported / "policy.onnx").read_bytes()] if (exported / "policy.onnx").exists() else [b""]
+    found["onnx"] = (
+        [(exported / "policy.onnx").read_bytes()] if (exported / "policy.onnx").exists() else [b""]
+    )
     return found
 
 
 def _mutated(content: bytes, generator: random.Random) -> bytes:
-    """One to four changes: bits, cuts, ranges doubled, deleted, exchanged, lengths and numbers beyond all bounds."""
+    """One to four changes: bits, cuts, ranges doubled, deleted, exchanged, lengths and numbers beyond all
+    bounds."""
     data = bytearray(content)
     for _ in range(generator.choice((1, 1, 2, 4))):
         at, long = generator.randrange(len(data) + 1), generator.choice((1, 8, 64, 4096))
@@ -113,7 +170,7 @@ def _mutated(content: bytes, generator: random.Random) -> bytes:
     return bytes(data)
 
 
-# ---------------------------------------------------------------------------------------------------------------- in a worker
+# ------------------------------------------------------------------------------------------------ in a worker
 
 
 def _open(kind: str, path: Path, exported: Path) -> None:
@@ -129,16 +186,24 @@ def _open(kind: str, path: Path, exported: Path) -> None:
         "yaml": [lambda: load_config(str(path))],
         "xml": [lambda: read_tree(str(path))],
         "json": [
-            lambda: run_policy.Policy(run_policy.read_spec(path.parent), run_policy.read_safetensors(exported / "policy.safetensors"))
+            lambda: run_policy.Policy(
+                run_policy.read_spec(path.parent),
+                run_policy.read_safetensors(exported / "policy.safetensors"),
+            )
         ],
-        "safetensors": [lambda: run_policy.Policy(run_policy.read_spec(exported), run_policy.read_safetensors(path))],
+        "safetensors": [
+            lambda: run_policy.Policy(run_policy.read_spec(exported), run_policy.read_safetensors(path))
+        ],
         "onnx": [lambda: of_onnx(path.read_bytes(), run_policy.read_golden(golden))],
         "npz": [lambda: run_policy.replayed(run_policy.load(exported), run_policy.read_golden(path))],
         "mcap": [
             lambda: reader.info(path),
             lambda: recording.load_recording(path),
             lambda: repair.repair(path, path.parent / "repaired.mcap", force=True),
-            *(lambda fmt=fmt: log_export.export(path, path.parent / f"out_{fmt}", fmt=fmt) for fmt in ("json", "csv", "npz")),
+            *(
+                lambda fmt=fmt: log_export.export(path, path.parent / f"out_{fmt}", fmt=fmt)
+                for fmt in ("json", "csv", "npz")
+            ),
         ],
     }
     refused = None
@@ -178,7 +243,9 @@ class _Worker:
     def __init__(self) -> None:
         self._start()
 
-    def judged(self, kind: str, samples: dict[str, list[bytes]], generator: random.Random, folder: Path) -> tuple[str, str]:
+    def judged(
+        self, kind: str, samples: dict[str, list[bytes]], generator: random.Random, folder: Path
+    ) -> tuple[str, str]:
         """(how it ended, what was told) of one mutated file."""
         case = _fresh(folder / "case")
         path = case / ("policy_spec.json" if kind == "json" else f"file.{kind}")
@@ -217,14 +284,20 @@ class _Worker:
         place = Path(f"/proc/{self._process.pid}")
         if reset:
             (place / "clear_refs").write_text("5")
-        line = next((line for line in (place / "status").read_text().splitlines() if line.startswith("VmHWM")), "VmHWM: 0 kB")
+        line = next(
+            (line for line in (place / "status").read_text().splitlines() if line.startswith("VmHWM")),
+            "VmHWM: 0 kB",
+        )
         return int(line.split()[1]) * 1024
 
 
-# ---------------------------------------------------------------------------------------------------------- by the command line
+# ---------------------------------------------------------------------------------------- by the command line
 
 _COMMANDS: dict[str, list[list[str]]] = {
-    "mcap": [["log", name, "FILE", *rest] for name, *rest in (["info"], ["export", "--out", "out"], ["repair"], ["picture"], ["convert"])],
+    "mcap": [
+        ["log", name, "FILE", *rest]
+        for name, *rest in (["info"], ["export", "--out", "out"], ["repair"], ["picture"], ["convert"])
+    ],
     "xml": [["tree", "--controller", "FILE"]],
     "yaml": [["eval", "--world", "FILE", "--controller", "nobody"], ["presets", "show", "FILE"]],
     "json": [["export", "--check", "."], ["report", "."], ["train", "--resume", "."]],
@@ -232,10 +305,14 @@ _COMMANDS: dict[str, list[list[str]]] = {
 }
 
 
-def _by_command(_kind: str, samples: dict[str, list[bytes]], generator: random.Random, folder: Path) -> tuple[str, str]:
+def _by_command(
+    _kind: str, samples: dict[str, list[bytes]], generator: random.Random, folder: Path
+) -> tuple[str, str]:
     kind = generator.choice(sorted(_COMMANDS))
     command, case = generator.choice(_COMMANDS[kind]), _fresh(folder / "case")
-    names = {"json": ["policy_spec.json", "run.json"], "safetensors": ["policy.safetensors"]}.get(kind, [f"file.{kind}"])
+    names = {"json": ["policy_spec.json", "run.json"], "safetensors": ["policy.safetensors"]}.get(
+        kind, [f"file.{kind}"]
+    )
     for name in names:
         (case / name).write_bytes(_mutated(generator.choice(samples[kind]), generator))
     outside, begun = _tree(folder, case), time.monotonic()
@@ -261,7 +338,7 @@ def _by_command(_kind: str, samples: dict[str, list[bytes]], generator: random.R
     return ("accepted" if done.returncode == 0 else "refused"), told
 
 
-# -------------------------------------------------------------------------------------------------------------------- folders
+# ---------------------------------------------------------------------------------------------------- folders
 
 
 def _fresh(case: Path) -> Path:
@@ -274,7 +351,9 @@ def _fresh(case: Path) -> Path:
 
 def _tree(folder: Path, without: Path) -> dict[Path, tuple[int, int]]:
     """Size and time of change of every file below ``folder`` that does not lie in ``without``."""
-    files: dict[Path, Any] = {path: path.lstat() for path in folder.rglob("*") if path.is_file() and without not in path.parents}
+    files: dict[Path, Any] = {
+        path: path.lstat() for path in folder.rglob("*") if path.is_file() and without not in path.parents
+    }
     return {path: (found.st_size, found.st_mtime_ns) for path, found in files.items()}
 
 

@@ -1,4 +1,5 @@
-"""Cost of an env-step against the number of envs: a big batch beside small ones that play the very same episodes."""
+"""Cost of an env-step against the number of envs: a big batch beside small ones that play the very same
+episodes."""
 
 from __future__ import annotations
 
@@ -67,7 +68,8 @@ def _growth(small: Row, big: Row, device: str) -> Row:
 
 
 def _played(sim: Sim, episodes: int, spent: list[float]) -> Iterator[None]:
-    """Play that many episodes in groups of the simulator's size, a turn at a time; adds wall and CPU time to ``spent``."""
+    """Play that many episodes in groups of the simulator's size, a turn at a time; adds wall and CPU time to
+    ``spent``."""
     for first in range(0, episodes - sim.num_envs + 1, sim.num_envs):
         batch = SimBatch(sim, first)
         for _ in range(_WARM):

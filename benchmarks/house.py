@@ -1,4 +1,5 @@
-"""How the source reads, in counts: arguments, signatures, long lines, long functions, nesting, second names, import circles."""
+"""How the source reads, in counts: arguments, signatures, long lines, long functions, nesting, second names,
+import circles."""
 
 from __future__ import annotations
 
@@ -19,12 +20,21 @@ _NESTS = (ast.For, ast.While, ast.If, ast.With, ast.Try)
 def measure(job: Job) -> list[Row]:
     """The table; a floor is what we want of the figure."""
     trees = {path: ast.parse(path.read_text(encoding="utf-8")) for path in sorted(PACKAGE.rglob("*.py"))}
-    functions = [(path, node) for path, tree in trees.items() for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    functions = [
+        (path, node)
+        for path, tree in trees.items()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef)
+    ]
     kernels = [(path, node) for path, node in functions if _is_taichi(node)]
     counts = sorted(_arguments(node) for _, node in kernels)
     places = [(PACKAGE / "kernels", "*/*.py"), (PACKAGE, "sim.py")]
     told = {path for folder, pattern in places for path in folder.glob(pattern)}
-    many = {f"{path.stem}.{node.name}": _arguments(node) for path, node in functions if _arguments(node) > MANY_ARGUMENTS}
+    many = {
+        f"{path.stem}.{node.name}": _arguments(node)
+        for path, node in functions
+        if _arguments(node) > MANY_ARGUMENTS
+    }
     lines = {path: path.read_text(encoding="utf-8").splitlines() for path in trees}
     bodies = {f"{path.stem}.{node.name}": _length(node) for path, node in functions}
     deep = {f"{path.stem}.{node.name}": _depth(node) for path, node in functions}
@@ -32,20 +42,34 @@ def measure(job: Job) -> list[Row]:
         _row(f"functions with more than {MANY_ARGUMENTS} arguments", len(many), 12, many),
         _row("arguments of Taichi functions, median", statistics.median(counts), 3),
         _row("arguments of Taichi functions, 90th percentile", counts[int(0.9 * len(counts))], 7),
-        _row("signature lines in kernels and sim.py", sum(_signature(node) for path, node in functions if path in told), 850),
-        _row(f"lines of more than {LONG_LINE} characters", sum(len(line) > LONG_LINE for text in lines.values() for line in text), 0),
+        _row(
+            "signature lines in kernels and sim.py",
+            sum(_signature(node) for path, node in functions if path in told),
+            850,
+        ),
+        _row(
+            f"lines of more than {LONG_LINE} characters",
+            sum(len(line) > LONG_LINE for text in lines.values() for line in text),
+            0,
+        ),
         _row(f"functions of more than {LONG_FUNCTION} lines", *_over(bodies, LONG_FUNCTION)),
         _row(f"functions nested deeper than {DEEP}", *_over(deep, DEEP)),
         _row("lines of the package", sum(map(len, lines.values())), 31_000),
         _row("lines of sim.py", len(lines[PACKAGE / "sim.py"]), 220),
         _row("lines of cli.py", len(lines[PACKAGE / "cli.py"]), 700),
         _row("lines of README", len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()), 120),
-        Row("comment lines in kernels", round(100 * _comments([p for p in lines if PACKAGE / "kernels" in p.parents]), 1), "% of lines"),
+        Row(
+            "comment lines in kernels",
+            round(100 * _comments([p for p in lines if PACKAGE / "kernels" in p.parents]), 1),
+            "% of lines",
+        ),
     ]
 
 
 def _row(what: str, count: float, wanted: float, details: dict[str, int] | None = None) -> Row:
-    return Row(what, count, "", less_is_better=True, floor=wanted, details={"which": details} if details else {})
+    return Row(
+        what, count, "", less_is_better=True, floor=wanted, details={"which": details} if details else {}
+    )
 
 
 def _over(values: dict[str, int], limit: int) -> tuple[int, float, dict[str, int]]:
@@ -91,6 +115,8 @@ def _comments(paths: list[Path]) -> float:
     found = total = 0
     for path in paths:
         text = path.read_text(encoding="utf-8")
-        found += sum(token.type == tokenize.COMMENT for token in tokenize.generate_tokens(io.StringIO(text).readline))
+        found += sum(
+            token.type == tokenize.COMMENT for token in tokenize.generate_tokens(io.StringIO(text).readline)
+        )
         total += text.count("\n")
     return found / total

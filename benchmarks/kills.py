@@ -1,4 +1,5 @@
-"""A sweep killed ten times (SIGKILL, at random moments) and resumed, beside one that nobody disturbed: are the cells equal?"""
+"""A sweep killed ten times (SIGKILL, at random moments) and resumed, beside one that nobody disturbed: are
+the cells equal?"""
 
 from __future__ import annotations
 
@@ -16,9 +17,20 @@ from uuvtai.measure.sweep.play import REQUEST, ROWS
 
 _KILLS = 10
 _LONGEST_S = 16.0
-"""a kill comes at a random moment up to so long after the start; every second one up to half of that after this run has finished a task"""
+"""a kill comes at a random moment up to so long after the start; every second one up to half of that after
+this run has finished a task"""
 _METHODS = ["--controller", "straight", "--controller", "planner", "--controller", "bt"]
-_SWEEP = ["--grid", "S=4,8", "--grid", "D=0,3,6,9", "--grid", "v=0.4,0.8,1.5,3.0", *_METHODS, "--episodes", "96"]
+_SWEEP = [
+    "--grid",
+    "S=4,8",
+    "--grid",
+    "D=0,3,6,9",
+    "--grid",
+    "v=0.4,0.8,1.5,3.0",
+    *_METHODS,
+    "--episodes",
+    "96",
+]
 """nine tasks, three a method: what a kill loses is the task that runs"""
 _SEED = 20261122
 _TINY = ["--grid", "S=4", "--grid", "D=3,6", "--grid", "v=0.6", "--controller", "bt", "--episodes", "4"]
@@ -36,8 +48,20 @@ def measure(job: Job) -> list[Row]:
     details = {"killed_after_s": moments, "cells_when_killed": left, "seed": _SEED}
     what = f"cells equal to the last digit after {len(moments)} kills"
     return [
-        Row(what, equal, f"of {len(whole)} cells", floor=len(whole), note=f"done when killed: {left}", details=details),
-        Row("kills that found finished cells on disk", sum(count > 0 for count in left), f"of {kills} kills", floor=kills / 2),
+        Row(
+            what,
+            equal,
+            f"of {len(whole)} cells",
+            floor=len(whole),
+            note=f"done when killed: {left}",
+            details=details,
+        ),
+        Row(
+            "kills that found finished cells on disk",
+            sum(count > 0 for count in left),
+            f"of {kills} kills",
+            floor=kills / 2,
+        ),
     ]
 
 
@@ -46,7 +70,9 @@ def _killed(sweep: list[str], place: Path, kills: int, job: Job) -> tuple[list[f
     generator, moments, left = random.Random(_SEED), [], []
     command = ["sweep", *sweep, "--run-dir", str(place)]
     while len(moments) < kills:
-        child = subprocess.Popen([sys.executable, "-m", "uuvtai", *command], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        child = subprocess.Popen(
+            [sys.executable, "-m", "uuvtai", *command], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
         moment = generator.uniform(0.0, _LONGEST_S)
         begun, finished = time.monotonic(), _finished(place)
         if len(moments) % 2:
@@ -74,7 +100,9 @@ def _finished(place: Path) -> int:
 
 
 def _uuv(*arguments: str) -> dict[str, Any]:
-    done = subprocess.run([sys.executable, "-m", "uuvtai", *arguments], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-m", "uuvtai", *arguments], capture_output=True, text=True, check=False
+    )
     if done.returncode:
         raise RuntimeError(f"uuv {' '.join(arguments)}: exit code {done.returncode}\n{done.stderr}")
     return json.loads(done.stdout)

@@ -1,4 +1,5 @@
-"""Env-steps per second of `uuv train` with everything on, beside Stable-Baselines3's PPO on the same environment (pool, 1,024 envs)."""
+"""Env-steps per second of `uuv train` with everything on, beside Stable-Baselines3's PPO on the same
+environment (pool, 1,024 envs)."""
 
 from __future__ import annotations
 
@@ -54,7 +55,8 @@ def _row(job: Job, sensors: str, sim: Sim, config: LearningConfig, theirs: float
         peer=theirs,
         peer_name="SB3 PPO, no teacher, no world model",
         floor=None if job.quick else FLOORS[sensors],
-        note=", ".join(f"{name} {us:.0f}" for name, us in parts.items()) + f" us per env-step; {config.ppo.epochs} epochs both",
+        note=", ".join(f"{name} {us:.0f}" for name, us in parts.items())
+        + f" us per env-step; {config.ppo.epochs} epochs both",
         details={"us_per_env_step": parts, "samples": samples},
     )
 
@@ -70,7 +72,8 @@ def _theirs(sim: Sim, config: LearningConfig, iterations: int) -> float:
     model = PPO(
         "MlpPolicy", Sb3VecEnv(UuvVectorEnv(sim=sim)), seed=1, device="cpu",
         n_steps=config.ppo.rollout_steps, batch_size=samples // config.ppo.minibatches,
-        n_epochs=config.ppo.epochs, learning_rate=config.ppo.learning_rate, policy_kwargs={"net_arch": list(config.policy.hidden)},
+        n_epochs=config.ppo.epochs, learning_rate=config.ppo.learning_rate,
+        policy_kwargs={"net_arch": list(config.policy.hidden)},
     )  # fmt: skip
     model.learn(samples)
     begun = time.perf_counter()

@@ -1,4 +1,5 @@
-"""Wrong changes made one by one in a copy of the tree: which test notices each? None may survive. Resumes where it was stopped."""
+"""Wrong changes made one by one in a copy of the tree: which test notices each? None may survive. Resumes
+where it was stopped."""
 
 from __future__ import annotations
 
@@ -34,7 +35,8 @@ _CAUGHT, _SURVIVED = 1, 0
 
 
 def measure(job: Job) -> list[Row]:
-    """A row for every mutant, and the count of those that were caught. Raises ValueError where a text to be changed is not there once."""
+    """A row for every mutant, and the count of those that were caught. Raises ValueError where a text to be
+    changed is not there once."""
     chosen = [m for m in ALL if m.name in QUICK] if job.quick else list(ALL)
     check_texts(chosen)
     done = {} if job.quick else _finished()
@@ -52,10 +54,15 @@ def measure(job: Job) -> list[Row]:
             for future in as_completed(futures):
                 mutation, found = futures[future], future.result()
                 results[mutation.name] = found
-                job.say(f"{len(results)}/{len(chosen)} {mutation.name}: {found['by'] or found['said']} ({found['seconds']:.0f} s)")
+                job.say(
+                    f"{len(results)}/{len(chosen)} {mutation.name}: {found['by'] or found['said']} "
+                    f"({found['seconds']:.0f} s)"
+                )
                 if not job.quick:
                     _keep({"key": keys[mutation.name], "name": mutation.name, **found})
-        wrong = _fail_without_mutants({found["by"] for found in results.values() if found["by"]}, copies.get())
+        wrong = _fail_without_mutants(
+            {found["by"] for found in results.values() if found["by"]}, copies.get()
+        )
     return _rows(chosen, results, wrong)
 
 
@@ -64,7 +71,9 @@ def check_texts(mutations: list[Mutation] | tuple[Mutation, ...]) -> None:
     for mutation in mutations:
         count = (ROOT / mutation.path).read_text().count(mutation.old)
         if count != 1 or mutation.old == mutation.new:
-            raise ValueError(f"mutant {mutation.name}: its text occurs {count} times in {mutation.path}: write it anew")
+            raise ValueError(
+                f"mutant {mutation.name}: its text occurs {count} times in {mutation.path}: write it anew"
+            )
 
 
 def _rows(chosen: list[Mutation], results: dict[str, dict[str, Any]], wrong: set[str]) -> list[Row]:
@@ -76,15 +85,25 @@ def _rows(chosen: list[Mutation], results: dict[str, dict[str, Any]], wrong: set
         note = found["by"] or f"SURVIVED: {found['said']}"
         if found["by"] in wrong:
             note = f"SURVIVED: {found['by']} fails without it too"
-        rows.append(Row(mutation.name, found["seconds"], "s", less_is_better=True, note=note, details={"path": mutation.path}))
+        rows.append(
+            Row(
+                mutation.name,
+                found["seconds"],
+                "s",
+                less_is_better=True,
+                note=note,
+                details={"path": mutation.path},
+            )
+        )
     return [*rows, Row("mutants caught", caught, f"of {len(chosen)}", floor=len(chosen))]
 
 
-# ---------------------------------------------------------------------------------------------------------------- one mutant
+# ------------------------------------------------------------------------------------------------- one mutant
 
 
 def _tried(mutation: Mutation, copies: queue.Queue[Path]) -> dict[str, Any]:
-    """Test that failed ('by', empty: none), what pytest said, and the seconds it took; in a copy that nobody else uses meanwhile."""
+    """Test that failed ('by', empty: none), what pytest said, and the seconds it took; in a copy that nobody
+    else uses meanwhile."""
     copy, begun = copies.get(), time.perf_counter()
     place = copy / mutation.path
     whole = place.read_text()
@@ -95,16 +114,43 @@ def _tried(mutation: Mutation, copies: queue.Queue[Path]) -> dict[str, Any]:
         place.write_text(whole)
         copies.put(copy)
     failed = [line.split()[1] for line in out.splitlines() if line.startswith(("FAILED ", "ERROR "))]
-    said = {_SURVIVED: "all tests passed", _CAUGHT: "tests failed"}.get(code, f"pytest ended with {code}: {out[-300:]}")
-    return {"by": failed[0] if code == _CAUGHT and failed else "", "said": said, "seconds": time.perf_counter() - begun}
+    said = {_SURVIVED: "all tests passed", _CAUGHT: "tests failed"}.get(
+        code, f"pytest ended with {code}: {out[-300:]}"
+    )
+    return {
+        "by": failed[0] if code == _CAUGHT and failed else "",
+        "said": said,
+        "seconds": time.perf_counter() - begun,
+    }
 
 
 def _tests(copy: Path, arguments: list[str]) -> tuple[int, str]:
     """Exit code and output of pytest in the copy; -1 where it took too long."""
-    environment = {**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1", "UUV_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-rfE", "-p", "no:cacheprovider", "-p", "no:xdist", "--no-header", *arguments]
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(copy),
+        "PYTHONDONTWRITEBYTECODE": "1",
+        "UUV_NUM_THREADS": "1",
+        "OMP_NUM_THREADS": "1",
+    }
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-x",
+        "-q",
+        "-rfE",
+        "-p",
+        "no:cacheprovider",
+        "-p",
+        "no:xdist",
+        "--no-header",
+        *arguments,
+    ]
     try:
-        done = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True, check=False, timeout=_TEST_S)
+        done = subprocess.run(
+            command, cwd=copy, env=environment, capture_output=True, text=True, check=False, timeout=_TEST_S
+        )
     except subprocess.TimeoutExpired:
         return -1, f"not done after {_TEST_S} s"
     return done.returncode, done.stdout + done.stderr[-300:]
@@ -133,7 +179,7 @@ def _copied() -> Iterator[Path]:
         yield Path(folder)
 
 
-# -------------------------------------------------------------------------------------------------------------------- resuming
+# --------------------------------------------------------------------------------------------------- resuming
 
 
 def _key(mutation: Mutation) -> str:

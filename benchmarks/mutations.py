@@ -1,4 +1,5 @@
-"""Small wrong changes of the code, each with the tests that must notice it. ``mutants.py`` makes them in a copy of the tree."""
+"""Small wrong changes of the code, each with the tests that must notice it. ``mutants.py`` makes them in a
+copy of the tree."""
 
 from __future__ import annotations
 
@@ -62,7 +63,9 @@ LEARNING = (
         _WIRING,
         "rollout_is_what_happened",
     ),
-    Mutation("scale_dropped", _TRAIN, "return weight * scale, {", "return weight, {", _WIRING, "lambda_times"),
+    Mutation(
+        "scale_dropped", _TRAIN, "return weight * scale, {", "return weight, {", _WIRING, "lambda_times"
+    ),
     Mutation(
         "scale_constant",
         "uuvtai/learn/uncertainty.py",
@@ -97,8 +100,8 @@ LEARNING = (
     Mutation(
         "teacher_batches_off",
         _TRAIN,
-        "kept.flatten(), strength, self.generator)",
-        "kept.flatten(), 0.0 * strength, self.generator)",
+        "kept.flatten(), strength, self.generator\n",
+        "kept.flatten(), 0.0 * strength, self.generator\n",
         "tests/test_train.py",
         "learns_the_task",
     ),
@@ -110,7 +113,14 @@ LEARNING = (
         "tests/test_distill.py",
         "strength_scales",
     ),
-    Mutation("wm_action_late", _COLLECT, "self._sense(action)\n", "self._sense(self._teacher)\n", _WIRING, "policys_own_action"),
+    Mutation(
+        "wm_action_late",
+        _COLLECT,
+        "self._sense(action)\n",
+        "self._sense(self._teacher)\n",
+        _WIRING,
+        "policys_own_action",
+    ),
     Mutation(
         "wm_sigma_swapped",
         _COLLECT,
@@ -254,8 +264,8 @@ STATISTICS = (
     Mutation(
         "paired_times_of_either",
         "uuvtai/measure/paired.py",
-        "strict=True) if all(both)]",
-        "strict=True) if any(both)]",
+        "strict=True)\n        if all(both)\n",
+        "strict=True)\n        if any(both)\n",
         "tests/test_statistics.py",
         "pairs",
     ),
@@ -352,7 +362,14 @@ KERNELS = (
         "tests/test_episode.py",
         "book_of",
     ),
-    Mutation("tunnel_reward_sign", _REWARD, '"failure", "tilt", "effort")', '"failure", "tilt")', "tests/test_reward.py", "every_term"),
+    Mutation(
+        "tunnel_reward_sign",
+        _REWARD,
+        '"failure", "tilt", "effort")',
+        '"failure", "tilt")',
+        "tests/test_reward.py",
+        "every_term",
+    ),
     Mutation(
         "tunnel_reward_sign2",
         _REWARD,
@@ -361,8 +378,22 @@ KERNELS = (
         "tests/test_reward.py",
         "every_term",
     ),
-    Mutation("jumps_of_the_route_pay", _REWARD, "remaining, -moved, moved)", "remaining, -9.0, 9.0)", "tests/test_reward.py", "no_jump"),
-    Mutation("effort_without_heave", _REWARD, "sway * sway + heave * heave", "sway * sway", "tests/test_reward.py", "every_term"),
+    Mutation(
+        "jumps_of_the_route_pay",
+        _REWARD,
+        "remaining, -moved, moved)",
+        "remaining, -9.0, 9.0)",
+        "tests/test_reward.py",
+        "no_jump",
+    ),
+    Mutation(
+        "effort_without_heave",
+        _REWARD,
+        "sway * sway + heave * heave",
+        "sway * sway",
+        "tests/test_reward.py",
+        "every_term",
+    ),
     Mutation(
         "leaving_ends_nothing",
         "uuvtai/kernels/task/reward.py",

@@ -1,4 +1,5 @@
-"""Our PPO beside Stable-Baselines3's on Pendulum-v1: same hyperparameters, same environments, several seeds."""
+"""Our PPO beside Stable-Baselines3's on Pendulum-v1: same hyperparameters, same environments, several
+seeds."""
 
 from __future__ import annotations
 
@@ -37,8 +38,16 @@ def measure(job: Job) -> list[Row]:
     apart = abs(means["ours"] - means["peer"]) / math.hypot(errors["ours"], errors["peer"])
     untrained = _cost(lambda observation: torch.zeros(len(observation), 1).numpy(), episodes)
     steps = rollouts * _ENVS * _STEPS
-    details = {"cost_by_seed": cost, "standard_error": errors, "env_steps": steps, "cost_without_torque": untrained}
-    note = f"{seeds} seeds, standard errors {errors['ours']:.0f} and {errors['peer']:.0f}; no torque: {untrained:.0f}"
+    details = {
+        "cost_by_seed": cost,
+        "standard_error": errors,
+        "env_steps": steps,
+        "cost_without_torque": untrained,
+    }
+    note = (
+        f"{seeds} seeds, standard errors {errors['ours']:.0f} and {errors['peer']:.0f}; no torque: "
+        f"{untrained:.0f}"
+    )
     what = f"cost of an episode after {steps:,} steps"
     return [
         Row(
@@ -70,7 +79,8 @@ def _envs(seed: int):
 
 
 def _cost(act, episodes: int) -> float:
-    """Minus the mean return of this many episodes in each env (Pendulum's last 200 steps) with actions ``act(observation)``."""
+    """Minus the mean return of this many episodes in each env (Pendulum's last 200 steps) with actions
+    ``act(observation)``."""
     envs = _envs(_UNSEEN)
     observation, total = envs.reset(), 0.0
     for _ in range(episodes * 200):
@@ -83,8 +93,10 @@ def _theirs(seed: int, rollouts: int):
     from stable_baselines3 import PPO
 
     model = PPO(
-        "MlpPolicy", _envs(seed), seed=seed, device="cpu", n_steps=_STEPS, batch_size=_ENVS * _STEPS // _MINIBATCHES, n_epochs=_EPOCHS,
-        learning_rate=_RATE, gamma=_GAMMA, gae_lambda=_LAMBDA, clip_range=_CLIP, ent_coef=0.0, vf_coef=_VALUE, max_grad_norm=_NORM,
+        "MlpPolicy", _envs(seed), seed=seed, device="cpu", n_steps=_STEPS,
+        batch_size=_ENVS * _STEPS // _MINIBATCHES, n_epochs=_EPOCHS,
+        learning_rate=_RATE, gamma=_GAMMA, gae_lambda=_LAMBDA, clip_range=_CLIP, ent_coef=0.0, vf_coef=_VALUE,
+        max_grad_norm=_NORM,
         policy_kwargs={"net_arch": list(_HIDDEN), "activation_fn": torch.nn.Tanh},
     )  # fmt: skip
     model.learn(rollouts * _ENVS * _STEPS)
@@ -98,10 +110,18 @@ def _ours(seed: int, rollouts: int):
     from uuvtai.learn.rollout import Rollout
 
     generator = torch.Generator().manual_seed(seed)
-    policy = ActorCritic(3, PolicyConfig(hidden=_HIDDEN, activation="tanh", initial_std=1.0, min_std=1e-3), None, generator, num_actions=1)
+    policy = ActorCritic(
+        3,
+        PolicyConfig(hidden=_HIDDEN, activation="tanh", initial_std=1.0, min_std=1e-3),
+        None,
+        generator,
+        num_actions=1,
+    )
     config = PpoConfig(
-        rollout_steps=_STEPS, learning_rate=_RATE, epochs=_EPOCHS, minibatches=_MINIBATCHES, clip=_CLIP, gamma=_GAMMA, gae_lambda=_LAMBDA,
-        entropy_weight=0.0, value_weight=_VALUE, max_grad_norm=_NORM, shuffle=True, normalise_observations=False, normalise_values=False,
+        rollout_steps=_STEPS, learning_rate=_RATE, epochs=_EPOCHS, minibatches=_MINIBATCHES, clip=_CLIP,
+        gamma=_GAMMA, gae_lambda=_LAMBDA,
+        entropy_weight=0.0, value_weight=_VALUE, max_grad_norm=_NORM, shuffle=True,
+        normalise_observations=False, normalise_values=False,
     )  # fmt: skip
     ppo, rollout = Ppo(policy, config), Rollout(_STEPS, _ENVS, 3, num_actions=1)
     envs = _envs(seed)
@@ -118,7 +138,8 @@ def _ours(seed: int, rollouts: int):
 
 
 def _collected(policy, rollout, envs, x: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-    """Fill the rollout from inputs x on; returns those after its last step. Pendulum never terminates: every ending is a timeout."""
+    """Fill the rollout from inputs x on; returns those after its last step. Pendulum never terminates: every
+    ending is a timeout."""
     from uuvtai.learn.rollout import final_value
 
     rollout.clear()
@@ -127,9 +148,16 @@ def _collected(policy, rollout, envs, x: torch.Tensor, generator: torch.Generato
         step = policy.act(x, generator)
         observation, reward, ended, infos = envs.step(step.action.clamp(-2.0, 2.0).numpy())
         after = torch.from_numpy(observation)
-        final = torch.stack([torch.from_numpy(info.get("terminal_observation", row)) for info, row in zip(infos, observation, strict=True)])
+        final = torch.stack(
+            [
+                torch.from_numpy(info.get("terminal_observation", row))
+                for info, row in zip(infos, observation, strict=True)
+            ]
+        )
         over = torch.from_numpy(ended)
-        rollout.add(x, step, torch.from_numpy(reward), never, over, final_value(policy, final, never, over), idle)
+        rollout.add(
+            x, step, torch.from_numpy(reward), never, over, final_value(policy, final, never, over), idle
+        )
         x = after
     rollout.close(policy.value(x).detach())
     return x

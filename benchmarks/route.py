@@ -38,11 +38,16 @@ def measure(job: Job) -> list[Row]:
         voronoi.plan_routes(io)
 
     floor_m, origin = config.voronoi.min_clearance_m, (float(maps.ORIGIN[0]), float(maps.ORIGIN[1]))
-    grids = [rrt.ClearanceGrid(clearance, origin, maps.CELL_M, floor_m, _START) for _occ, clearance, _row, _col in found]
+    grids = [
+        rrt.ClearanceGrid(clearance, origin, maps.CELL_M, floor_m, _START)
+        for _occ, clearance, _row, _col in found
+    ]
     pairs = [(grid, grid.checker((_START, _GOAL))) for grid in grids]
 
     def theirs():
-        return [rrt.solve_rrt(_START, _GOAL, grid, check, 20_000, i, 1.0) for i, (grid, check) in enumerate(pairs)]
+        return [
+            rrt.solve_rrt(_START, _GOAL, grid, check, 20_000, i, 1.0) for i, (grid, check) in enumerate(pairs)
+        ]
 
     ours()
     mine, others = _way_costs(s["route"], theirs(), grids)
@@ -64,14 +69,16 @@ def measure(job: Job) -> list[Row]:
 
 
 def _maps(n: int, config: Config) -> list[tuple]:
-    """(occupied, clearance [m], site row, site col) of maps in which start and goal are joined by traversable cells."""
+    """(occupied, clearance [m], site row, site col) of maps in which start and goal are joined by traversable
+    cells."""
     from scipy.ndimage import label
 
     out, rng = [], np.random.default_rng(0)
     while len(out) < n:
         occ = maps.scene(rng, _N_BODY)
         found = clearance_of(occ | maps.OUTSIDE, maps.CELL_M, config.clearance.max_m)
-        regions, _count = label((found[0] >= config.voronoi.min_clearance_m - 1e-5) & ~occ)  # type: ignore[misc]
+        wide = found[0] >= config.voronoi.min_clearance_m - 1e-5
+        regions, _count = label(wide & ~occ)  # type: ignore[misc]
         ends = regions[maps.cell_of(_START)], regions[maps.cell_of(_GOAL)]
         if ends[0] == ends[1] != 0:
             out.append((occ, *found))
@@ -80,14 +87,15 @@ def _maps(n: int, config: Config) -> list[tuple]:
 
 def _structs(n_env: int, config: Config, found: list[tuple]) -> dict:
     names = {
-        "voronoi": "VoronoiState", "route": "RouteState", "clearance": "ClearanceState", "grid_map": "MapState", "mask": "GridMask",
-        "mission": "MissionState", "ego": "Proprioception", "forecast": "ForecastState", "clock": "ClockState",
+        "voronoi": "VoronoiState", "route": "RouteState", "clearance": "ClearanceState",
+        "grid_map": "MapState", "mask": "GridMask", "mission": "MissionState", "ego": "Proprioception",
+        "forecast": "ForecastState", "clock": "ClockState",
     }  # fmt: skip
     n_row, n_col = maps.SHAPE
     sizes = {
-        "n_env": n_env, "n_plan": min(n_env, 64), "n_row": n_row, "n_col": n_col, "n_heap": n_row * n_col, "n_path": 2048,
-        "n_way": config.route.n_way, "n_ahead": 32, "n_trigger": N_TRIGGER, "n_planner": N_PLANNER, "n_reason": N_REASON,
-        "n_track": 2, "n_forecast": 2,
+        "n_env": n_env, "n_plan": min(n_env, 64), "n_row": n_row, "n_col": n_col, "n_heap": n_row * n_col,
+        "n_path": 2048, "n_way": config.route.n_way, "n_ahead": 32, "n_trigger": N_TRIGGER,
+        "n_planner": N_PLANNER, "n_reason": N_REASON, "n_track": 2, "n_forecast": 2,
     }  # fmt: skip
     s = {name: state.allocate(getattr(state, struct), sizes) for name, struct in names.items()}
     s["mask"].outside.from_numpy(maps.OUTSIDE.astype(np.int32))
@@ -107,13 +115,16 @@ def _structs(n_env: int, config: Config, found: list[tuple]) -> dict:
 
 
 def _way_costs(ours: state.RouteState, theirs: list, grids: list[rrt.ClearanceGrid]) -> tuple[float, float]:
-    """Mean cost of our ways and of the peer's. Raises RuntimeError where a map is without one: all of them have ways."""
+    """Mean cost of our ways and of the peer's. Raises RuntimeError where a map is without one: all of them
+    have ways."""
     failed, lost = sum(ours.fallback_reason.to_numpy() != FAIL_NONE), sum(path is None for path in theirs)
     if failed or lost:
         raise RuntimeError(f"{failed} maps without our route, {lost} without OMPL's; all of them have one")
     ways, counts = ours.way_w.to_numpy(), ours.n_way.to_numpy()
     mine = [_cost(ways[i, : counts[i]], grid) for i, grid in enumerate(grids)]
-    return float(np.mean(mine)), float(np.mean([_cost(path, grid) for path, grid in zip(theirs, grids, strict=True)]))
+    return float(np.mean(mine)), float(
+        np.mean([_cost(path, grid) for path, grid in zip(theirs, grids, strict=True)])
+    )
 
 
 def _cost(way: np.ndarray, grid: rrt.ClearanceGrid) -> float:

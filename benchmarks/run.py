@@ -1,12 +1,13 @@
-"""Run benchmarks, print a table, keep results/<date>_<device>_<what>.json with machine, versions, commit and command.
+"""Run benchmarks, print a table, keep results/<date>_<device>_<what>.json with machine, versions, commit and
+command.
 
 python benchmarks/run.py                          all of them
 python benchmarks/run.py dynamics tick            some
 python benchmarks/run.py --quick                  small sizes and short times: does everything run?
 python benchmarks/run.py scale --device cuda --num-envs 1024,4096,16384,65536
 
-Every benchmark runs in a process of its own. Exit code: 0 when all of them ran (floors that were not met are marked, not errors), 1 when
-one failed, 2 for unknown names.
+Every benchmark runs in a process of its own. Exit code: 0 when all of them ran (floors that were not met are
+marked, not errors), 1 when one failed, 2 for unknown names.
 """
 
 from __future__ import annotations
@@ -30,7 +31,16 @@ if sys.path[0] == str(HERE):
 from benchmarks.common import Job, Row  # noqa: E402
 
 NOT_BENCHMARKS = ("__init__", "common", "mutations", "run")
-PEERS = ("mujoco", "opencv-python-headless", "scipy", "ompl", "py_trees", "numpy", "torch", "stable-baselines3")
+PEERS = (
+    "mujoco",
+    "opencv-python-headless",
+    "scipy",
+    "ompl",
+    "py_trees",
+    "numpy",
+    "torch",
+    "stable-baselines3",
+)
 _LONGEST_S = 1200
 """of a benchmark that names no LONGEST_S of its own"""
 _THREAD_VARIABLES = ("UUV_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
@@ -39,12 +49,20 @@ _THREAD_VARIABLES = ("UUV_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "O
 def main() -> int:
     """Parse, run each benchmark in its own process, print and keep the rows."""
     names = sorted(path.stem for path in HERE.glob("*.py") if path.stem not in NOT_BENCHMARKS)
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("what", nargs="*", help=f"benchmarks to run (default: all): {', '.join(names)}")
-    parser.add_argument("--quick", action="store_true", help="small sizes, short times; nothing is kept unless --out is given")
+    parser.add_argument(
+        "--quick", action="store_true", help="small sizes, short times; nothing is kept unless --out is given"
+    )
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
-    parser.add_argument("--num-envs", default="", help="batch sizes for scale and growth, separated by commas")
-    parser.add_argument("--seconds", type=float, help="measured time per side of a comparison [s] (default 4)")
+    parser.add_argument(
+        "--num-envs", default="", help="batch sizes for scale and growth, separated by commas"
+    )
+    parser.add_argument(
+        "--seconds", type=float, help="measured time per side of a comparison [s] (default 4)"
+    )
     parser.add_argument("--out", type=Path, help="folder of the results (default benchmarks/results)")
     parser.add_argument("--worker", help=argparse.SUPPRESS)
     chosen = parser.parse_args()
@@ -76,13 +94,16 @@ def main() -> int:
 
 
 def _traits(name: str) -> tuple[tuple[str, ...], int | None, int]:
-    """DEVICES, THREADS and LONGEST_S of a benchmark, read from its source: importing it could start what it measures."""
+    """DEVICES, THREADS and LONGEST_S of a benchmark, read from its source: importing it could start what it
+    measures."""
     devices: tuple[str, ...] = ("cpu",)
     threads, longest_s = None, _LONGEST_S
     for line in (HERE / f"{name}.py").read_text().splitlines():
         value = line.partition("=")[2]
         if line.startswith("DEVICES = "):
-            devices = tuple(part.strip("\"' ") for part in value.strip(" ()").split(",") if part.strip("\"' )"))
+            devices = tuple(
+                part.strip("\"' ") for part in value.strip(" ()").split(",") if part.strip("\"' )")
+            )
         if line.startswith("THREADS = "):
             threads = int(value)
         if line.startswith("LONGEST_S = "):
@@ -90,7 +111,7 @@ def _traits(name: str) -> tuple[tuple[str, ...], int | None, int]:
     return devices, threads, longest_s
 
 
-# ------------------------------------------------------------------------------------------------------- one process for each
+# --------------------------------------------------------------------------------------- one process for each
 
 
 def _measured(name: str, threads: int | None, longest_s: int) -> tuple[dict[str, Any] | None, str]:
@@ -115,11 +136,21 @@ def _work(chosen: argparse.Namespace) -> int:
     name, _, target = chosen.worker.partition(":")
     sizes = tuple(int(n) for n in chosen.num_envs.split(",") if n)
     seconds = chosen.seconds or (0.3 if chosen.quick else 4.0)
-    job = Job(chosen.device, chosen.quick, sizes, seconds, say=lambda text: print(f"  {text}", file=sys.stderr, flush=True))
+    job = Job(
+        chosen.device,
+        chosen.quick,
+        sizes,
+        seconds,
+        say=lambda text: print(f"  {text}", file=sys.stderr, flush=True),
+    )
     module = importlib.import_module(f"benchmarks.{name}")
     begun = time.perf_counter()
     rows: list[Row] = module.measure(job)
-    document = {"about": (module.__doc__ or "").splitlines()[0], "machine": _machine(chosen.device), "seconds": time.perf_counter() - begun}
+    document = {
+        "about": " ".join((module.__doc__ or "").split("\n\n")[0].split()),
+        "machine": _machine(chosen.device),
+        "seconds": time.perf_counter() - begun,
+    }
     Path(target).write_text(json.dumps({**document, "rows": [row.document() for row in rows]}))
     return 0
 
@@ -157,7 +188,16 @@ def _commit() -> str | None:
     if sha is None:
         return None
     changed = subprocess.run(
-        ["git", "-C", str(HERE.parent), "status", "--porcelain", "--untracked-files=no", "uuvtai", "benchmarks/*.py"],
+        [
+            "git",
+            "-C",
+            str(HERE.parent),
+            "status",
+            "--porcelain",
+            "--untracked-files=no",
+            "uuvtai",
+            "benchmarks/*.py",
+        ],
         capture_output=True,
         text=True,
         check=False,
@@ -165,7 +205,7 @@ def _commit() -> str | None:
     return sha + ("+" if changed.stdout.strip() else "")
 
 
-# ------------------------------------------------------------------------------------------------------------ show and keep
+# ---------------------------------------------------------------------------------------------- show and keep
 
 
 def _kept(name: str, chosen: argparse.Namespace, document: dict[str, Any]) -> Path:
@@ -196,7 +236,13 @@ def _show(name: str, document: dict[str, Any]) -> None:
         ratio = f"{row['ratio']:.3g} x" if row["ratio"] is not None else ""
         mark = {None: "", True: "met", False: "[bold red]NOT MET[/]"}[row["met"]]
         table.add_row(
-            row["what"], _number(row["ours"]), peer, ratio, row["unit"], _floor(row), " ".join(filter(None, (mark, escape(row["note"]))))
+            row["what"],
+            _number(row["ours"]),
+            peer,
+            ratio,
+            row["unit"],
+            _floor(row),
+            " ".join(filter(None, (mark, escape(row["note"])))),
         )
     console.print(table)
     for row in document["rows"]:

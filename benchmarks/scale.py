@@ -1,4 +1,5 @@
-"""The whole stack with its tree: env-steps per second, time per stage, memory (pool, S = 8, D = 6, depth each 5th step, resets on)."""
+"""The whole stack with its tree: env-steps per second, time per stage, memory (pool, S = 8, D = 6, depth each
+5th step, resets on)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""SIGKILL, SIGINT and SIGTERM at random moments of every command: is anything lost, half-written or told by a traceback?"""
+"""SIGKILL, SIGINT and SIGTERM at random moments of every command: is anything lost, half-written or told by a
+traceback?"""
 
 from __future__ import annotations
 
@@ -10,7 +11,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,16 @@ _SEED = 20261122
 _KILLS = {"train": 100, "eval": 50, "export": 25, "report": 25, "signals": 100}
 _QUICK = {"train": 3, "eval": 3, "export": 2, "report": 2, "signals": 12}
 _ONE_S = 900.0
-_TRAIN = ["train", "smoke", "--device", "cpu", "--set", "train.checkpoint_every=2", "--set", "train.evaluate_every=10"]
+_TRAIN = [
+    "train",
+    "smoke",
+    "--device",
+    "cpu",
+    "--set",
+    "train.checkpoint_every=2",
+    "--set",
+    "train.evaluate_every=10",
+]
 _ITERATIONS = ["--iterations", "20"]
 _EVAL = ["eval", "--controller", "straight,bt", "--seeds", "77", "--num-envs", "8", "--device", "cpu"]
 _HORIZON = ["--set", "episode.horizon_steps=400", "--set", "world.dynamic_capacity=9"]
@@ -36,7 +45,12 @@ def measure(job: Job) -> list[Row]:
     with tempfile.TemporaryDirectory() as folder:
         bench = _Bench(Path(folder), job)
         rows = bench.killed_train(counts["train"]) + bench.killed_eval(counts["eval"])
-        return rows + bench.killed_export(counts["export"]) + bench.killed_report(counts["report"]) + bench.signalled(counts["signals"])
+        return (
+            rows
+            + bench.killed_export(counts["export"])
+            + bench.killed_report(counts["report"])
+            + bench.signalled(counts["signals"])
+        )
 
 
 class _Bench:
@@ -45,10 +59,11 @@ class _Bench:
     def __init__(self, folder: Path, job: Job) -> None:
         self.folder, self.job, self.random = folder, job, random.Random(_SEED)
 
-    # ------------------------------------------------------------------------------------------------------------- SIGKILL
+    # ------------------------------------------------------------------------------------------------ SIGKILL
 
     def killed_train(self, kills: int) -> list[Row]:
-        """Resume after every kill until so many have hit; the last checkpoint bit-equal to an undisturbed run's."""
+        """Resume after every kill until so many have hit; the last checkpoint bit-equal to an undisturbed
+        run's."""
         whole_s = self._whole([*_TRAIN, *_ITERATIONS], "whole")
         place, wrong, hit = self.folder / "killed", [], 0
         while hit < kills:
@@ -63,17 +78,32 @@ class _Bench:
             begun = any((place / "checkpoints").glob("step_*"))
             if not begun:
                 shutil.rmtree(place, ignore_errors=True)
-            self._uuv(["train", "--resume", "killed", *_ITERATIONS] if begun else [*_TRAIN, *_ITERATIONS, "--run-dir", "killed"])
+            self._uuv(
+                ["train", "--resume", "killed", *_ITERATIONS]
+                if begun
+                else [*_TRAIN, *_ITERATIONS, "--run-dir", "killed"]
+            )
         wrong += self._unequal(place)
-        return [self._row(f"train killed {hit} times and resumed: runs that end otherwise than undisturbed", wrong)]
+        return [
+            self._row(
+                f"train killed {hit} times and resumed: runs that end otherwise than undisturbed", wrong
+            )
+        ]
 
     def _unequal(self, place: Path) -> list[str]:
-        ours, theirs = (max((run / "checkpoints").glob("step_*"), key=_step) for run in (place, self.folder / "whole"))
+        ours, theirs = (
+            max((run / "checkpoints").glob("step_*"), key=_step) for run in (place, self.folder / "whole")
+        )
         names = {file.name for file in theirs.iterdir() if file.name != "manifest.json"}
-        return [f"train: {name} differs" for name in sorted(names) if (ours / name).read_bytes() != (theirs / name).read_bytes()]
+        return [
+            f"train: {name} differs"
+            for name in sorted(names)
+            if (ours / name).read_bytes() != (theirs / name).read_bytes()
+        ]
 
     def killed_eval(self, kills: int) -> list[Row]:
-        """Resume after every kill; the result that of an undisturbed evaluation, every log readable, nothing else half-written."""
+        """Resume after every kill; the result that of an undisturbed evaluation, every log readable, nothing
+        else half-written."""
         record = "2" if self.job.quick else "6"
         arguments = [*_EVAL, "--episodes", "8" if self.job.quick else "24", "--record", record, *_HORIZON]
         whole_s = self._whole(arguments, "played")
@@ -92,16 +122,27 @@ class _Bench:
             self._uuv(["eval", "--resume", "eval"])
             wrong += [] if _result(place) == wanted else ["eval: the result differs at the end"]
             wrong += _half_written(place)
-        return [self._row(f"eval --record killed {hit} times and resumed: results that differ, unreadable logs, halves left", wrong)]
+        return [
+            self._row(
+                f"eval --record killed {hit} times and resumed: results that differ, unreadable logs, halves "
+                "left",
+                wrong,
+            )
+        ]
 
     def _unreadable(self, place: Path) -> list[str]:
-        """One log of those under way that ``uuv log repair`` cannot read, and of the finished ones that ``log info`` cannot."""
+        """One log of those under way that ``uuv log repair`` cannot read, and of the finished ones that ``log
+        info`` cannot."""
         wrong = []
         for log in sorted((place / "logs").glob("*.mcap"))[-1:]:
             wrong += [f"{log.name}: unreadable"] if self._run(["log", "info", str(log)])[0] else []
         for part in [p for p in sorted((place / "logs").glob("*.part")) if p.stat().st_size > 100_000][-1:]:
             repaired = self.folder / "repaired.mcap"
-            wrong += [f"{part.name}: beyond repair"] if self._run(["log", "repair", str(part), "--out", str(repaired)])[0] else []
+            wrong += (
+                [f"{part.name}: beyond repair"]
+                if self._run(["log", "repair", str(part), "--out", str(repaired)])[0]
+                else []
+            )
             repaired.unlink(missing_ok=True)
         return wrong
 
@@ -118,7 +159,11 @@ class _Bench:
 
     def killed_report(self, kills: int) -> list[Row]:
         """The page is whole or not there, and the next try succeeds."""
-        whole_s, wrong, page = self._whole(["report", "played"], "page.html", "--out"), [], self.folder / "played/report.html"
+        whole_s, wrong, page = (
+            self._whole(["report", "played"], "page.html", "--out"),
+            [],
+            self.folder / "played/report.html",
+        )
         for _ in range(kills):
             page.unlink(missing_ok=True)
             self._kill(["report", "played"], whole_s)
@@ -141,7 +186,7 @@ class _Bench:
             raise RuntimeError(f"uuv {' '.join(command)}: exit code {child.returncode}\n{err}")
         return False
 
-    # ---------------------------------------------------------------------------------------------------- SIGINT and SIGTERM
+    # ------------------------------------------------------------------------------------- SIGINT and SIGTERM
 
     def signalled(self, count: int) -> list[Row]:
         """Every command in turn, one of the two signals at a random moment of it."""
@@ -149,20 +194,31 @@ class _Bench:
         commands = [
             [*_EVAL, "--episodes", "8", "--record", "1", *_HORIZON, "--run-dir", "out"],
             [*_TRAIN, "--iterations", "10", "--run-dir", "out"],
-            ["simulate", "--seconds", "20"], ["report", "played", "--out", "out/page.html"], ["export", "best", "--out", "out/policy"],
-            ["sweep", "--grid", "D=0,3", "--controller", "straight", "--episodes", "4", "--num-envs", "8", "--run-dir", "out"],
-            ["profile", "--num-envs", "8", "--seconds", "1"], ["presets"], ["doctor"], ["tree", "played"], ["log", "info", str(log)],
-            ["log", "repair", str(log), "--out", "out/log.mcap"], ["log", "picture", str(log), "--out", "out/log.png"],
+            ["simulate", "--seconds", "20"], ["report", "played", "--out", "out/page.html"],
+            ["export", "best", "--out", "out/policy"],
+            ["sweep", "--grid", "D=0,3", "--controller", "straight", "--episodes", "4", "--num-envs", "8",
+            "--run-dir", "out"],
+            ["profile", "--num-envs", "8", "--seconds", "1"], ["presets"], ["doctor"], ["tree", "played"],
+            ["log", "info", str(log)],
+            ["log", "repair", str(log), "--out", "out/log.mcap"],
+            ["log", "picture", str(log), "--out", "out/log.png"],
             ["log", "video", str(log), "--out", "out/log.webm"], ["reproduce", "--run-dir", "out"],
         ]  # fmt: skip
         wrong, interrupted, times = [], 0, {}
         for i in range(count):
-            command, number = commands[i % len(commands)], (signal.SIGINT, signal.SIGTERM)[i // len(commands) % 2]
+            command, number = (
+                commands[i % len(commands)],
+                (signal.SIGINT, signal.SIGTERM)[i // len(commands) % 2],
+            )
             code, told = self._signal(command, number, times)
             interrupted += code == 128 + number
             wrong += [f"{' '.join(command)}: {what}" for what in told]
         return [
-            self._row(f"{count} signals, every command in turn: tracebacks, other exit codes, halves, inconsistent folders", wrong),
+            self._row(
+                f"{count} signals, every command in turn: tracebacks, other exit codes, halves, inconsistent "
+                "folders",
+                wrong,
+            ),
             Row("signals that hit a command at work", interrupted, f"of {count}"),
         ]
 
@@ -173,7 +229,9 @@ class _Bench:
             out.mkdir()
         key, begun = " ".join(command[:2]), time.monotonic()
         child = self._begun(command)
-        while child.poll() is None and not _hears(child.pid):  # what Python does before our first line is not ours
+        while child.poll() is None and not _hears(
+            child.pid
+        ):  # what Python does before our first line is not ours
             time.sleep(0.002)
         longest = 20.0 if command[0] == "reproduce" else times.get(key, 40.0)
         moment = self.random.uniform(0.0, longest)
@@ -189,16 +247,26 @@ class _Bench:
                 child.kill()
                 return -9, ["did not end"]
             wanted = [128 + number, 0]
-        told = [f"exit code {child.returncode} after {moment:.2f} s: {err[-300:]}"] if child.returncode not in wanted else []
-        told += [f"after {moment:.2f} s: {err[-600:]}"] if "Traceback" in err or "a bug of ours" in err else []
+        told = (
+            [f"exit code {child.returncode} after {moment:.2f} s: {err[-300:]}"]
+            if child.returncode not in wanted
+            else []
+        )
+        told += (
+            [f"after {moment:.2f} s: {err[-600:]}"] if "Traceback" in err or "a bug of ours" in err else []
+        )
         told += _half_written(out, parts=command[0] == "eval") + _inconsistent(out, child.returncode)
         return child.returncode, told
 
-    # --------------------------------------------------------------------------------------------------------------- commands
+    # ----------------------------------------------------------------------------------------------- commands
 
     def _begun(self, command: list[str]) -> subprocess.Popen[str]:
         return subprocess.Popen(
-            [sys.executable, "-m", "uuvtai", *command], cwd=self.folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+            [sys.executable, "-m", "uuvtai", *command],
+            cwd=self.folder,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
         )
 
     def _run(self, command: list[str]) -> tuple[int, str]:
@@ -212,7 +280,8 @@ class _Bench:
             raise RuntimeError(f"uuv {' '.join(command)}: exit code {code}\n{err}")
 
     def _whole(self, command: list[str], place: str, option: str = "--run-dir") -> float:
-        """Time of an undisturbed run [s]. It is run twice, into ``place`` and another one: the first run may compile kernels."""
+        """Time of an undisturbed run [s]. It is run twice, into ``place`` and another one: the first run may
+        compile kernels."""
         self._uuv([*command, option, place])
         begun = time.monotonic()
         self._uuv([*command, option, f"timed_{place}"])
@@ -224,7 +293,14 @@ class _Bench:
         for text in wrong:
             self.job.say(f"VIOLATION {text}")
         self.job.say(f"{what}: {len(wrong)}")
-        return Row(what, len(wrong), "violations", less_is_better=True, floor=0, details={"violations": wrong, "seed": _SEED})
+        return Row(
+            what,
+            len(wrong),
+            "violations",
+            less_is_better=True,
+            floor=0,
+            details={"violations": wrong, "seed": _SEED},
+        )
 
 
 def _step(path: Path) -> int:
@@ -251,8 +327,15 @@ def _result(place: Path) -> dict[str, Any]:
 
 def _half_written(place: Path, parts: bool = False) -> list[str]:
     """Temporary files; of an evaluation ``.mcap.part`` may stay, and it says so."""
-    halves: Callable[[Path], bool] = lambda path: path.name.endswith(_HALF) or path.name.startswith(".partial")  # noqa: E731
-    return [f"left {path.name}" for path in place.rglob("*") if halves(path) and not (parts and path.name.endswith(".mcap.part"))]
+
+    def halves(path: Path) -> bool:
+        return path.name.endswith(_HALF) or path.name.startswith(".partial")
+
+    return [
+        f"left {path.name}"
+        for path in place.rglob("*")
+        if halves(path) and not (parts and path.name.endswith(".mcap.part"))
+    ]
 
 
 def _inconsistent(place: Path, code: int) -> list[str]:
@@ -264,7 +347,9 @@ def _inconsistent(place: Path, code: int) -> list[str]:
         except ValueError:
             wrong.append(f"{file.name} is not whole")
     status = _status(place)
-    if status is not None and status != {0: "finished", 130: "interrupted", 143: "interrupted"}.get(code, "failed"):
+    if status is not None and status != {0: "finished", 130: "interrupted", 143: "interrupted"}.get(
+        code, "failed"
+    ):
         wrong.append(f"run.json says {status}, exit code {code}")
     return wrong
 

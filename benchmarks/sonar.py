@@ -1,4 +1,5 @@
-"""Sonar of 256 beams without noise (range, Doppler, intensity) against MuJoCo's mj_multiRay (range only) in the same scenes."""
+"""Sonar of 256 beams without noise (range, Doppler, intensity) against MuJoCo's mj_multiRay (range only) in
+the same scenes."""
 
 from __future__ import annotations
 
@@ -40,7 +41,18 @@ class Rays:
         """Range of every beam [m]."""
         caster, n = self.casters[env], len(self.found)
         mujoco.mj_multiRay(
-            caster.model, caster.data, self.starts[env], self.rays[env], None, 1, -1, self.geom, self.found, None, n, self.max_range_m
+            caster.model,
+            caster.data,
+            self.starts[env],
+            self.rays[env],
+            None,
+            1,
+            -1,
+            self.geom,
+            self.found,
+            None,
+            n,
+            self.max_range_m,
         )
         return self.found
 
@@ -56,19 +68,40 @@ class Rays:
         for env in range(_MODELS):
             found = self.cast(env)
             seen = (self.geom >= 0) & (found <= self.max_range_m)
-            count += int((hits[env] != seen).sum() + (np.abs(ranges[env] - found)[seen & hits[env]] > _TOLERANCE_M).sum())
+            count += int(
+                (hits[env] != seen).sum()
+                + (np.abs(ranges[env] - found)[seen & hits[env]] > _TOLERANCE_M).sum()
+            )
         return count
 
 
 def measure(job: Job) -> list[Row]:
-    """Scans per second of one core: with flat beams, which is what MuJoCo casts, and with the vertical aperture of the product."""
+    """Scans per second of one core: with flat beams, which is what MuJoCo casts, and with the vertical
+    aperture of the product."""
     n_env = 128 if job.quick else 1024
     start_taichi(job.device)
     flat, wide = SonarConfig(vertical_half_aperture_deg=0.0), SonarConfig()
     scene = scenes.random_scenes(np.random.default_rng(0), n_env, N_BODY, TankConfig())
-    sizes = {"n_env": n_env, "n_body": N_BODY, "n_ray": flat.n_ray, "n_latency": 2, "n_cloud": 8, "n_thruster": 6}
-    names = ("SonarScan", "SonarMemory", "Proprioception", "VehicleState", "WorldState", "EpisodeState", "ClockState")
-    structs = scan, memory, _ego, vehicle, world, _episode, clock = [state.allocate(getattr(state, name), sizes) for name in names]
+    sizes = {
+        "n_env": n_env,
+        "n_body": N_BODY,
+        "n_ray": flat.n_ray,
+        "n_latency": 2,
+        "n_cloud": 8,
+        "n_thruster": 6,
+    }
+    names = (
+        "SonarScan",
+        "SonarMemory",
+        "Proprioception",
+        "VehicleState",
+        "WorldState",
+        "EpisodeState",
+        "ClockState",
+    )
+    structs = scan, memory, _ego, vehicle, world, _episode, clock = [
+        state.allocate(getattr(state, name), sizes) for name in names
+    ]
     scenes.load(scene, vehicle, world)
     clock.awake.fill(1)
     sonar.reset_sonar(bind(SonarIO, scan, memory, clock, partial=True))
@@ -93,7 +126,8 @@ def measure(job: Job) -> list[Row]:
             unit="scans/s per core",
             floor=FLOOR,
             floor_on="ratio",
-            note=f"{1e6 * cost[side] / n_env:.2f} against {1e6 * cost['peer'] / _MODELS:.1f} us; {apart} of {beams} beams apart",
+            note=f"{1e6 * cost[side] / n_env:.2f} against {1e6 * cost['peer'] / _MODELS:.1f} us; {apart} of "
+            f"{beams} beams apart",
             details={"num_envs": n_env, "beams_apart": apart},
         )
         for side, what in (("flat", "flat beams"), ("wide", "beams with their aperture"))

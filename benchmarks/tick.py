@@ -1,4 +1,5 @@
-"""Tick of the behaviour tree ``bt`` with the statuses of all nodes kept, against py_trees on the same tree and the same leaf answers."""
+"""Tick of the behaviour tree ``bt`` with the statuses of all nodes kept, against py_trees on the same tree
+and the same leaf answers."""
 
 from __future__ import annotations
 
@@ -35,7 +36,9 @@ def measure(job: Job) -> list[Row]:
     teacher, table = state.allocate(state.TeacherState, sizes), state.allocate(state.TreeTable, sizes)
     load_tree(table, tree)
     shape = (_TURNS, n_env, config.teacher.max_node)
-    answers = np.random.default_rng(0).integers(tree_tick.RUNNING, tree_tick.FAILURE + 1, shape, dtype=np.int8)
+    answers = np.random.default_rng(0).integers(
+        tree_tick.RUNNING, tree_tick.FAILURE + 1, shape, dtype=np.int8
+    )
     given = [torch.from_numpy(a) for a in answers]
     n_node = len(tree.kind)
     peers = [PyTree(tree) for _ in range(_BLACKBOARDS)]
@@ -62,13 +65,16 @@ def measure(job: Job) -> list[Row]:
             unit="ticks/s per core",
             floor=FLOOR,
             floor_on="ratio",
-            note=f"{1e9 * cost['ours'] / n_env:.0f} ns against {1e6 * cost['peer'] / _BLACKBOARDS:.1f} us a tick",
+            note=f"{1e9 * cost['ours'] / n_env:.0f} ns against {1e6 * cost['peer'] / _BLACKBOARDS:.1f} us a "
+            "tick",
             details={"num_envs": n_env},
         )
     ]
 
 
-def check(teacher: state.TeacherState, table: state.TreeTable, peers: list[PyTree], answers: np.ndarray, n_node: int) -> None:
+def check(
+    teacher: state.TeacherState, table: state.TreeTable, peers: list[PyTree], answers: np.ndarray, n_node: int
+) -> None:
     """Raise AssertionError unless every node's status is the peers', tick by tick, memories included."""
     io = bind(TeacherIO, teacher, table, partial=True)
     for answer in answers:

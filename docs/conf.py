@@ -1,4 +1,5 @@
-"""Sphinx: docs/ as a site. ``python -m sphinx -W docs site``; what the code says itself is written by ``writers/`` first."""
+"""Sphinx: docs/ as a site. ``python -m sphinx -W docs site``; what the code says itself is written by
+``writers/`` first."""
 
 import sys
 from pathlib import Path

@@ -1,4 +1,5 @@
-"""Your own controller, a NumPy function from observations to actions, on the same episodes as a blind one: a table.
+"""Your own controller, a NumPy function from observations to actions, on the same episodes as a blind one: a
+table.
 
 ``python examples/custom_controller.py`` (pip install 'uuvtai[gym]')
 """
@@ -17,9 +18,12 @@ MAX_HEAVE_M = 0.4
 
 
 def careful(obs: np.ndarray, columns: dict[str, slice]) -> np.ndarray:
-    """Turns towards the look-ahead point of the route, drives while it is ahead, and stops for what is near ahead."""
+    """Turns towards the look-ahead point of the route, drives while it is ahead, and stops for what is near
+    ahead."""
     sine, cosine = obs[:, columns["heading_error"]].T
-    near_m = obs[:, columns["sector_range"]][:, [-1, 0, 1]].min(axis=1)  # sector 0 is ahead, counter-clockwise from there
+    near_m = obs[:, columns["sector_range"]][:, [-1, 0, 1]].min(
+        axis=1
+    )  # sector 0 is ahead, counter-clockwise from there
     action = np.zeros((len(obs), 4), np.float32)
     action[:, 0] = np.clip(cosine, 0, 1) * np.clip((near_m - 0.5) / 0.7, -0.5, 1)
     action[:, 2] = np.clip(obs[:, columns["lookahead"]][:, 2] / MAX_HEAVE_M, -1, 1)

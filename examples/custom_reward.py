@@ -11,11 +11,13 @@ import uuvtai
 from uuvtai.env import VectorEnv
 
 CAREFUL = {"reward.clearance": 0.5, "reward.ttc": 0.5, "reward.effort": 0.02, "reward.success": 10.0}
-"""Nearness costs five times, effort four times as much; arriving pays half. `uuv presets show pool` lists every weight."""
+"""Nearness costs five times, effort four times as much; arriving pays half. `uuv presets show pool` lists
+every weight."""
 
 
 def terms(env: VectorEnv, steps: int) -> torch.Tensor:
-    """Mean sum of every weighted term over so many steps that the behaviour tree drives, (number of terms,)."""
+    """Mean sum of every weighted term over so many steps that the behaviour tree drives, (number of
+    terms,)."""
     _obs, info = env.reset(seed=0)
     total = torch.zeros(len(env.reward_terms))
     for _ in range(steps):
@@ -27,8 +29,13 @@ def terms(env: VectorEnv, steps: int) -> torch.Tensor:
 def table(columns: dict[str, torch.Tensor], names: tuple[str, ...]) -> str:
     """One row per term, and their sum: the reward."""
     lines = [f"{'term':16}" + "".join(f"{name:>10}" for name in columns)]
-    lines += [f"{name:16}" + "".join(f"{float(sums[i]):10.2f}" for sums in columns.values()) for i, name in enumerate(names)]
-    return "\n".join([*lines, f"{'reward':16}" + "".join(f"{float(sums.sum()):10.2f}" for sums in columns.values())])
+    lines += [
+        f"{name:16}" + "".join(f"{float(sums[i]):10.2f}" for sums in columns.values())
+        for i, name in enumerate(names)
+    ]
+    return "\n".join(
+        [*lines, f"{'reward':16}" + "".join(f"{float(sums.sum()):10.2f}" for sums in columns.values())]
+    )
 
 
 def main(steps: int = 1000) -> str:

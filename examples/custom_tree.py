@@ -25,7 +25,10 @@ def main(sim: Sim | None = None, episodes: int = 128) -> str:
         found = summary(Path(name).stem, results, env_steps, wall_s=0.0)
         won, (low, high) = found["outcomes"]["success"], found["success_ci95"]
         rate = f"{won}/{episodes} ({100 * low:.0f} .. {100 * high:.0f} %)"
-        lines.append(f"{found['name']:10} {rate:>24} {100 * found['collision_rate']:8.1f} % {found['time_mean_s']:7.1f}")
+        lines.append(
+            f"{found['name']:10} {rate:>24} {100 * found['collision_rate']:8.1f} % "
+            f"{found['time_mean_s']:7.1f}"
+        )
     return "\n".join(lines)
 
 

@@ -1,4 +1,5 @@
-"""Your own vehicle: how ``heavy_pack.yaml`` answers to full surge, beside the BlueROV2 that it extends: a table.
+"""Your own vehicle: how ``heavy_pack.yaml`` answers to full surge, beside the BlueROV2 that it extends: a
+table.
 
 ``python examples/custom_vehicle.py``
 """
@@ -17,7 +18,13 @@ TIMES_S = (0.2, 0.5, 1.0, 2.0, 4.0)
 
 def surge_m_s(vehicle: str, runtime: Runtime | None) -> list[float]:
     """Forward speed at ``TIMES_S`` after the command of 0.6 m/s, through the inner loop and the thrusters."""
-    told = simulate(load_config("open", vehicle=vehicle), seconds=TIMES_S[-1], command=(0.6, 0, 0, 0), neutral=True, runtime=runtime)
+    told = simulate(
+        load_config("open", vehicle=vehicle),
+        seconds=TIMES_S[-1],
+        command=(0.6, 0, 0, 0),
+        neutral=True,
+        runtime=runtime,
+    )
     return [told["nu"][round(time_s / told["t"][1])][0] for time_s in TIMES_S]
 
 
@@ -25,7 +32,9 @@ def main(runtime: Runtime | None = None) -> str:
     """The table: surge [m/s] over time of both."""
     lines = [f"{'surge [m/s] after':20}" + "".join(f"{time_s:7.1f} s" for time_s in TIMES_S)]
     for vehicle in VEHICLES:
-        lines.append(f"{Path(vehicle).stem:20}" + "".join(f"{speed:9.3f}" for speed in surge_m_s(vehicle, runtime)))
+        lines.append(
+            f"{Path(vehicle).stem:20}" + "".join(f"{speed:9.3f}" for speed in surge_m_s(vehicle, runtime))
+        )
     return "\n".join(lines)
 
 

@@ -1,4 +1,5 @@
-"""Your own world: the behaviour tree crosses ``harbour.yaml``, and a picture shows what the vehicle has mapped on the way.
+"""Your own world: the behaviour tree crosses ``harbour.yaml``, and a picture shows what the vehicle has
+mapped on the way.
 
 ``python examples/custom_world.py [PICTURE.png]`` (pip install 'uuvtai[gym]')
 """
@@ -26,7 +27,10 @@ def main(picture: Path, sim: Sim | None = None, most_steps: int = 3000) -> str:
     save_image(env.render()[:, :, ::-1], picture)
     env.close()
     seconds = info["episode_steps"] * env.native.config.episode.control_dt_s
-    return f"{WORLD.name}: {info['outcome']} after {seconds:.1f} s, return {info['episode_return']:.1f}; {picture}"
+    return (
+        f"{WORLD.name}: {info['outcome']} after {seconds:.1f} s, return {info['episode_return']:.1f}; "
+        f"{picture}"
+    )
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
-"""What the training examples share: the same episodes before and after training, a table of what came out, and the learning curve.
+"""What the training examples share: the same episodes before and after training, a table of what came out,
+and the learning curve.
 
-``python examples/train_sb3.py --out runs/sb3`` saves the policy there, reads it back and plays it; ``--play runs/sb3`` plays it again.
-``--curve sb3.csv`` keeps the return of every training episode;
-``python examples/judge.py sb3.csv skrl.csv curves.png`` draws such files.
+``python examples/train_sb3.py --out runs/sb3`` saves the policy there, reads it back and plays it; ``--play
+runs/sb3`` plays it again. ``--curve sb3.csv`` keeps the return of every training episode; ``python
+examples/judge.py sb3.csv skrl.csv curves.png`` draws such files.
 """
 
 from __future__ import annotations
@@ -75,8 +76,11 @@ Play = Callable[[Sim, Path], Act]
 """(simulator, where it was saved) -> the policy"""
 
 
-def main(train: Train, play: Play, iterations: int, arguments: list[str] | None = None, sim: Sim | None = None) -> None:
-    """From the command line: judge the untrained policy, train and save it, read it back and judge it; or only the last.
+def main(
+    train: Train, play: Play, iterations: int, arguments: list[str] | None = None, sim: Sim | None = None
+) -> None:
+    """From the command line: judge the untrained policy, train and save it, read it back and judge it; or
+    only the last.
 
     ``sim`` is one that is there already, in place of ``--world`` and ``--num-envs``.
     """
@@ -85,10 +89,18 @@ def main(train: Train, play: Play, iterations: int, arguments: list[str] | None 
     parser.add_argument("--num-envs", type=int, default=64)
     parser.add_argument("--iterations", type=int, default=iterations)
     parser.add_argument("--curve", type=Path, help="CSV file for the return of every training episode")
-    parser.add_argument("--out", type=Path, help="new folder for what was learnt [default: runs/TIME_EXAMPLE]")
-    parser.add_argument("--play", type=Path, metavar="FOLDER", help="train nothing: play what was saved there")
+    parser.add_argument(
+        "--out", type=Path, help="new folder for what was learnt [default: runs/TIME_EXAMPLE]"
+    )
+    parser.add_argument(
+        "--play", type=Path, metavar="FOLDER", help="train nothing: play what was saved there"
+    )
     given = parser.parse_args(arguments)
-    out = given.play or given.out or default_run_dir(train.__module__ if train.__module__ != "__main__" else Path(sys.argv[0]).stem)
+    out = (
+        given.play
+        or given.out
+        or default_run_dir(train.__module__ if train.__module__ != "__main__" else Path(sys.argv[0]).stem)
+    )
     if not given.play:
         refuse_place(out)
     sim = sim or uuvtai.make(given.world, num_envs=given.num_envs).sim
@@ -97,7 +109,9 @@ def main(train: Train, play: Play, iterations: int, arguments: list[str] | None 
         begun = time.perf_counter()
         out.mkdir(parents=True, exist_ok=True)
         train(sim, given.iterations, out)
-        print(f"{given.iterations} iterations, {time.perf_counter() - begun:.0f} s, saved in {out}", flush=True)
+        print(
+            f"{given.iterations} iterations, {time.perf_counter() - begun:.0f} s, saved in {out}", flush=True
+        )
     if given.curve and watched:
         with given.curve.open("w", newline="") as file:
             csv.writer(file).writerows([("decisions", "return"), *watched[-1].curve])
@@ -109,11 +123,15 @@ def told(sim: Sim, act: Act) -> str:
     returns, won = judge(sim, act)
     low, high = wilson_interval(won, len(returns)) or (0.0, 1.0)
     error = returns.std(ddof=1) / np.sqrt(len(returns))
-    return f"return {returns.mean():6.1f} +- {error:.1f}, success {won}/{len(returns)} ({100 * low:.0f} .. {100 * high:.0f} %)"
+    return (
+        f"return {returns.mean():6.1f} +- {error:.1f}, success {won}/{len(returns)} ({100 * low:.0f} .. "
+        f"{100 * high:.0f} %)"
+    )
 
 
 def draw(files: list[Path], target: Path) -> None:
-    """Mean return of the episodes that end within the same 4096 decisions, with its standard error, one line a file."""
+    """Mean return of the episodes that end within the same 4096 decisions, with its standard error, one line
+    a file."""
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(figsize=(6.4, 3.6), layout="constrained")

@@ -16,7 +16,8 @@ ROLLOUT_STEPS = 64
 
 
 def train(sim: Sim, iterations: int, out: Path | None = None) -> Act:
-    """The policy after so many rollouts and updates, saved in ``out``; observations and rewards are scaled by SB3's own wrapper."""
+    """The policy after so many rollouts and updates, saved in ``out``; observations and rewards are scaled by
+    SB3's own wrapper."""
     envs = VecNormalize(Sb3VecEnv(Watched(sim=sim, hold_steps=HOLD_STEPS)), gamma=0.99)
     model = PPO(
         "MlpPolicy",

@@ -34,7 +34,10 @@ class Policy(GaussianMixin, Model):
     def __init__(self, **spaces) -> None:
         Model.__init__(self, **spaces)
         GaussianMixin.__init__(self)
-        self.net, self.log_std = network(self.num_observations, self.num_actions), nn.Parameter(torch.full((self.num_actions,), -0.7))
+        self.net, self.log_std = (
+            network(self.num_observations, self.num_actions),
+            nn.Parameter(torch.full((self.num_actions,), -0.7)),
+        )
 
     def compute(self, inputs, role=""):
         """(mean, log of the spread)."""
@@ -58,15 +61,23 @@ def make(sim: Sim):
     """(envs, untrained agent); observations and values are scaled by skrl's own preprocessors."""
     set_seed(0)
     envs = wrap_env(Watched(sim=sim, hold_steps=HOLD_STEPS), wrapper="gymnasium", verbose=False)
-    spaces = {"observation_space": envs.observation_space, "action_space": envs.action_space, "device": envs.device}
+    spaces = {
+        "observation_space": envs.observation_space,
+        "action_space": envs.action_space,
+        "device": envs.device,
+    }
     config = PPO_CFG(
-        rollouts=ROLLOUT_STEPS, learning_epochs=5, mini_batches=4, learning_rate=1e-3, time_limit_bootstrap=True,
-        observation_preprocessor=RunningStandardScaler, observation_preprocessor_kwargs={"size": envs.observation_space},
+        rollouts=ROLLOUT_STEPS, learning_epochs=5, mini_batches=4, learning_rate=1e-3,
+        time_limit_bootstrap=True,
+        observation_preprocessor=RunningStandardScaler,
+        observation_preprocessor_kwargs={"size": envs.observation_space},
         value_preprocessor=RunningStandardScaler, value_preprocessor_kwargs={"size": 1},
         experiment={"write_interval": 0, "checkpoint_interval": 0},
     )  # fmt: skip
     memory = RandomMemory(memory_size=ROLLOUT_STEPS, num_envs=envs.num_envs, device=envs.device)
-    return envs, PPO(models={"policy": Policy(**spaces), "value": Value(**spaces)}, memory=memory, cfg=config, **spaces)
+    return envs, PPO(
+        models={"policy": Policy(**spaces), "value": Value(**spaces)}, memory=memory, cfg=config, **spaces
+    )
 
 
 def train(sim: Sim, iterations: int, out: Path | None = None) -> Act:

@@ -23,7 +23,9 @@ ROLLOUT_STEPS, EPOCHS, MINIBATCHES = 64, 5, 4
 
 def network(inputs: int, outputs: int) -> nn.Sequential:
     """Two hidden layers."""
-    return nn.Sequential(nn.Linear(inputs, 64), nn.Tanh(), nn.Linear(64, 64), nn.Tanh(), nn.Linear(64, outputs))
+    return nn.Sequential(
+        nn.Linear(inputs, 64), nn.Tanh(), nn.Linear(64, 64), nn.Tanh(), nn.Linear(64, outputs)
+    )
 
 
 def policy(inputs: int, outputs: int) -> nn.Sequential:
@@ -32,10 +34,13 @@ def policy(inputs: int, outputs: int) -> nn.Sequential:
 
 
 def train(sim: Sim, iterations: int, out: Path | None = None) -> Act:
-    """The policy after so many rollouts and updates, saved in ``out``; observations are scaled by TorchRL's own transform."""
+    """The policy after so many rollouts and updates, saved in ``out``; observations are scaled by TorchRL's
+    own transform."""
     torch.manual_seed(0)
     norm = VecNormV2(["observation"], decay=1.0, reduce_batch_dims=True)
-    envs = TransformedEnv(GymWrapper(Watched(sim=sim, hold_steps=HOLD_STEPS, autoreset_mode="Disabled")), norm)
+    envs = TransformedEnv(
+        GymWrapper(Watched(sim=sim, hold_steps=HOLD_STEPS, autoreset_mode="Disabled")), norm
+    )
     envs.set_seed(0)
     n_obs, n_act = envs.observation_spec["observation"].shape[-1], envs.action_spec.shape[-1]
     spread = policy(n_obs, n_act)
@@ -46,11 +51,18 @@ def train(sim: Sim, iterations: int, out: Path | None = None) -> Act:
         return_log_prob=True,
     )
     critic = ValueOperator(network(n_obs, 1), ["observation"])
-    loss, advantage = ClipPPOLoss(actor, critic, entropy_coeff=0.0, critic_coeff=0.5), GAE(gamma=0.99, lmbda=0.95, value_network=critic)
+    loss, advantage = (
+        ClipPPOLoss(actor, critic, entropy_coeff=0.0, critic_coeff=0.5),
+        GAE(gamma=0.99, lmbda=0.95, value_network=critic),
+    )
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
     frames = ROLLOUT_STEPS * sim.num_envs
     quiet = {"auto_register_policy_transforms": False}
-    for batch in Collector(envs, actor, frames_per_batch=frames, total_frames=iterations * frames, **quiet) if iterations else ():
+    for batch in (
+        Collector(envs, actor, frames_per_batch=frames, total_frames=iterations * frames, **quiet)
+        if iterations
+        else ()
+    ):
         for _ in range(EPOCHS):
             advantage(batch)
             for part in batch.reshape(-1)[torch.randperm(frames)].split(frames // MINIBATCHES):

@@ -1,4 +1,5 @@
-"""Fixtures shared by the tests. Taichi is started once per session; one small simulator serves every test of the whole stack."""
+"""Fixtures shared by the tests. Taichi is started once per session; one small simulator serves every test of
+the whole stack."""
 
 import dataclasses
 import signal
@@ -10,7 +11,8 @@ import torch
 
 @pytest.fixture(scope="session", autouse=True)
 def interrupts():
-    """Interrupts are heard, also where the tests run in the background of a shell, which has its children ignore them."""
+    """Interrupts are heard, also where the tests run in the background of a shell, which has its children
+    ignore them."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
@@ -18,8 +20,8 @@ def interrupts():
 def taichi_runtime(request):
     """One CPU runtime with exact floating point for the whole session.
 
-    Where a test of the session needs the small simulator it is built first of all: Taichi finds compiled kernels again by the layout of
-    the memory before them too.
+    Where a test of the session needs the small simulator it is built first of all: Taichi finds compiled
+    kernels again by the layout of the memory before them too.
     """
     from uuvtai.runtime import start_taichi
 
@@ -39,7 +41,11 @@ def configure(monkeypatch, sim, config):
     from uuvtai.stages import Stages
 
     new = vars(bind_all(Stages, sim.s, config))
-    same = {name: old for name, old in vars(sim.io).items() if all(vars(old)[member] is part for member, part in vars(new[name]).items())}
+    same = {
+        name: old
+        for name, old in vars(sim.io).items()
+        if all(vars(old)[member] is part for member, part in vars(new[name]).items())
+    }
     monkeypatch.setattr(sim, "config", config)
     monkeypatch.setattr(sim, "io", Stages(**(new | same)))
 
@@ -52,8 +58,19 @@ class SmallSim:
 
     N = 8
     OPTIONS = ("--num-envs", "8", "--set", "world.dynamic_capacity=9", "--device", "cpu")
-    """of commands in processes of their own that are to find these kernels compiled (``tests/warm.py`` compiles them beforehand)"""
-    TRAIN = ("train", "smoke", *OPTIONS, "--set", "episode.horizon_steps=400", "--set", "distill.batch=32", "--set", "world_model.batch=32")
+    """of commands in processes of their own that are to find these kernels compiled (``tests/warm.py``
+    compiles them beforehand)"""
+    TRAIN = (
+        "train",
+        "smoke",
+        *OPTIONS,
+        "--set",
+        "episode.horizon_steps=400",
+        "--set",
+        "distill.batch=32",
+        "--set",
+        "world_model.batch=32",
+    )
 
     def __init__(self):
         from uuvtai.loader import load_config
@@ -73,10 +90,16 @@ class SmallSim:
         self.sim.reset(mask, seeds, numbers)
 
     def arrays(self, *nouns):
-        """NumPy copies of every array of these structs but scratch, which keeps what earlier tests left in it, by 'struct.field'."""
+        """NumPy copies of every array of these structs but scratch, which keeps what earlier tests left in
+        it, by 'struct.field'."""
         structs = {noun: getattr(self.sim.s, noun) for noun in nouns}
-        kept = {noun: [f.name for f in dataclasses.fields(struct) if not f.metadata["scratch"]] for noun, struct in structs.items()}
-        return {f"{noun}.{name}": getattr(structs[noun], name).to_numpy() for noun in nouns for name in kept[noun]}
+        kept = {
+            noun: [f.name for f in dataclasses.fields(struct) if not f.metadata["scratch"]]
+            for noun, struct in structs.items()
+        }
+        return {
+            f"{noun}.{name}": getattr(structs[noun], name).to_numpy() for noun in nouns for name in kept[noun]
+        }
 
 
 @pytest.fixture(scope="session")

@@ -29,11 +29,14 @@ def put_layers(grid_map, static, dynamic, occupied):
 
 
 def put_map(grid_map, state, occupied, confident):
-    """Everything that a map remembers; ``state`` has static, dynamic, free_scans, dynamic_scans, seen and depth_hit [n_env, row, col]."""
+    """Everything that a map remembers; ``state`` has static, dynamic, free_scans, dynamic_scans, seen and
+    depth_hit [n_env, row, col]."""
     put_layers(grid_map, state["static"], state["dynamic"], occupied)
     grid_map.dynamic_scans.from_numpy(np.ascontiguousarray(state["dynamic_scans"], np.uint8))
     grid_map.held.from_numpy(words(state["dynamic_scans"] > 0))
-    grid_map.free_scans.from_numpy(np.stack([words(state["free_scans"] >> k & 1) for k in range(grid_map.free_scans.n)], axis=-1))
+    grid_map.free_scans.from_numpy(
+        np.stack([words(state["free_scans"] >> k & 1) for k in range(grid_map.free_scans.n)], axis=-1)
+    )
     grid_map.confident.from_numpy(words(state["free_scans"] >= confident))
     grid_map.seen.from_numpy(words(state["seen"]))
     grid_map.depth_hit.from_numpy(words(state["depth_hit"]))
@@ -49,7 +52,9 @@ def get_map(grid_map):
         "static": static,
         "dynamic": grid_map.dynamic_occ.to_numpy(),
         "dynamic_scans": grid_map.dynamic_scans.to_numpy(),
-        "free_scans": sum(cells(counter[..., k].copy(), n_col).astype(int) << k for k in range(counter.shape[-1])),
+        "free_scans": sum(
+            cells(counter[..., k].copy(), n_col).astype(int) << k for k in range(counter.shape[-1])
+        ),
         "seen": cells(grid_map.seen.to_numpy(), n_col),
         "depth_hit": cells(grid_map.depth_hit.to_numpy(), n_col),
     }

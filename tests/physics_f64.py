@@ -1,7 +1,9 @@
-"""Run the plant in double precision (a process has one Taichi precision, the tests' is single) and print what it did as JSON.
+"""Run the plant in double precision (a process has one Taichi precision, the tests' is single) and print what
+it did as JSON.
 
-stdin: {"substeps": [..], "n_sample", "cases": [{"wrench", "current", "rpy_deg", "nu", "neutral"}, ..]}; cases are the envs of a plant.
-stdout: {"<substeps>": {"position": [sample][case][3], "rpy_deg": .., "nu": ..}}, sampled every tenth control step.
+stdin: {"substeps": [..], "n_sample", "cases": [{"wrench", "current", "rpy_deg", "nu", "neutral"}, ..]}; cases
+are the envs of a plant. stdout: {"<substeps>": {"position": [sample][case][3], "rpy_deg": .., "nu": ..}},
+sampled every tenth control step.
 """
 
 from __future__ import annotations
@@ -37,12 +39,21 @@ def run(plant: Plant, cases: list[dict], substeps: int, n_sample: int) -> dict:
     nu = np.array([c.get("nu", [0] * 6) for c in cases], dtype=float)
     plant.write(v.vel_b, nu[:, :3])
     plant.write(v.rate_b, nu[:, 3:])
-    buoyancy, weight = plant.params.buoyancy_n.to_numpy(), plant.params.mass_kg.to_numpy() * plant.config.vehicle.gravity_m_s2
+    buoyancy, weight = (
+        plant.params.buoyancy_n.to_numpy(),
+        plant.params.mass_kg.to_numpy() * plant.config.vehicle.gravity_m_s2,
+    )
     plant.write(plant.params.buoyancy_n, np.where([c.get("neutral", False) for c in cases], weight, buoyancy))
     samples = []
     for _ in range(n_sample):
         q = v.quat_wb.to_numpy()
-        samples.append((v.pos_w.to_numpy(), np.degrees([roll_pitch_yaw(x) for x in q]), np.c_[v.vel_b.to_numpy(), v.rate_b.to_numpy()]))
+        samples.append(
+            (
+                v.pos_w.to_numpy(),
+                np.degrees([roll_pitch_yaw(x) for x in q]),
+                np.c_[v.vel_b.to_numpy(), v.rate_b.to_numpy()],
+            )
+        )
         for _ in range(10):
             plant.step(substeps=substeps, dt_s=0.02)
     return {name: [s[i].tolist() for s in samples] for i, name in enumerate(("position", "rpy_deg", "nu"))}

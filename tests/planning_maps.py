@@ -50,7 +50,8 @@ def scene(rng, n_body=12):
 
 
 def maze(rng):
-    """Baffles that touch the walls, alternating sides or at random, with a passage of random width at the free end."""
+    """Baffles that touch the walls, alternating sides or at random, with a passage of random width at the
+    free end."""
     occ = np.zeros(SHAPE, bool)
     n, alternate = rng.integers(2, 11), rng.random() < 0.5
     for i, x in enumerate(np.linspace(1.5, 18.5, n) + rng.uniform(-0.2, 0.2, n)):
@@ -62,7 +63,8 @@ def maze(rng):
 
 
 def gaps(rng):
-    """Walls across the tank with one or two gaps about as wide as the vehicle needs: some pass, some do not."""
+    """Walls across the tank with one or two gaps about as wide as the vehicle needs: some pass, some do
+    not."""
     occ = np.zeros(SHAPE, bool)
     for x in np.sort(rng.uniform(2.0, 18.0, rng.integers(1, 5))):
         wall = np.abs(x - X) <= rng.choice([0.06, 0.3])
@@ -73,7 +75,8 @@ def gaps(rng):
 
 
 def random_map(seed):
-    """(occupied, start_w, goal_w): start and goal anywhere in the traversable set of the kind of map that ``seed`` draws."""
+    """(occupied, start_w, goal_w): start and goal anywhere in the traversable set of the kind of map that
+    ``seed`` draws."""
     from tests.reference.voronoi import clearance_of, traversable
 
     rng = np.random.default_rng(seed)

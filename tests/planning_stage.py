@@ -64,7 +64,15 @@ def clean():
     s.clock.awake.fill(1)
     s.clock.active.fill(1)
     s.clock.step.fill(0)
-    for field in (s.grid_map.static_occ, s.grid_map.dynamic_occ, s.ego.vel_b, s.ego.rpy, s.scan.hit, s.scan.doppler_m_s, s.route.n_queue):
+    for field in (
+        s.grid_map.static_occ,
+        s.grid_map.dynamic_occ,
+        s.ego.vel_b,
+        s.ego.rpy,
+        s.scan.hit,
+        s.scan.doppler_m_s,
+        s.route.n_queue,
+    ):
         field.fill(0)
     s.scan.range_m.fill(12.0)
     s.forecast.radius_m.fill(-1.0)

@@ -1,4 +1,5 @@
-"""A task without a simulator: points that must reach the origin, with the interface of ``VectorEnv`` and the same rules of resetting."""
+"""A task without a simulator: points that must reach the origin, with the interface of ``VectorEnv`` and the
+same rules of resetting."""
 
 import torch
 
@@ -9,7 +10,8 @@ CONTROL_DT_S, GOAL_M, EDGE_M, HORIZON = 0.2, 0.3, 3.0, 60
 
 
 class PointEnv:
-    """Action (N, 4): velocity in x, y and two that do nothing. The teacher heads for the origin; node 1 of its tree acts far, 2 near."""
+    """Action (N, 4): velocity in x, y and two that do nothing. The teacher heads for the origin; node 1 of
+    its tree acts far, 2 near."""
 
     num_actions = 4
     num_obs = 24
@@ -36,7 +38,9 @@ class PointEnv:
         )
         self._begin(torch.ones(self.num_envs, dtype=torch.bool))
         self.info = {"final_obs": self._obs()}
-        return self._obs(), self._tell(torch.zeros(self.num_envs, dtype=torch.int32), torch.zeros(self.num_envs, 2))
+        return self._obs(), self._tell(
+            torch.zeros(self.num_envs, dtype=torch.int32), torch.zeros(self.num_envs, 2)
+        )
 
     def step(self, action):
         before = self._pos.norm(dim=1)
@@ -44,11 +48,21 @@ class PointEnv:
         self._steps += 1
         distance = self._pos.norm(dim=1)
         success, out = distance < GOAL_M, distance > EDGE_M
-        terms = torch.stack([before - distance + 3.0 * success - 3.0 * out, -0.01 * action.square().sum(1)], 1)
-        reward, terminated, truncated = terms.sum(1), success | out, (self._steps >= HORIZON) & ~success & ~out
+        terms = torch.stack(
+            [before - distance + 3.0 * success - 3.0 * out, -0.01 * action.square().sum(1)], 1
+        )
+        reward, terminated, truncated = (
+            terms.sum(1),
+            success | out,
+            (self._steps >= HORIZON) & ~success & ~out,
+        )
         self._return += reward
         outcome = torch.where(success, 1, torch.where(out, 4, torch.where(truncated, 5, 0))).to(torch.int32)
-        self.info = {"final_obs": self._obs(), "episode_return": self._return.clone(), "episode_steps": self._steps.clone()}
+        self.info = {
+            "final_obs": self._obs(),
+            "episode_return": self._return.clone(),
+            "episode_steps": self._steps.clone(),
+        }
         self._begin(terminated | truncated, self.num_envs)
         obs, info = self._obs(), self._tell(outcome, terms)
         for name, tensor in {
@@ -62,14 +76,18 @@ class PointEnv:
         return obs, reward, terminated, truncated, info
 
     def capture(self):
-        return {n: getattr(self, f"_{n}").numpy().copy() for n in ("pos", "steps", "return", "episode")} | {"seed": self._seed}
+        return {n: getattr(self, f"_{n}").numpy().copy() for n in ("pos", "steps", "return", "episode")} | {
+            "seed": self._seed
+        }
 
     def restore(self, arrays):
         for name in ("pos", "steps", "return", "episode"):
             setattr(self, f"_{name}", torch.as_tensor(arrays[name].copy()))
         self._seed = arrays["seed"]
         self.info = {"final_obs": self._obs()}
-        return self._obs(), self._tell(torch.zeros(self.num_envs, dtype=torch.int32), torch.zeros(self.num_envs, 2))
+        return self._obs(), self._tell(
+            torch.zeros(self.num_envs, dtype=torch.int32), torch.zeros(self.num_envs, 2)
+        )
 
     def _begin(self, rows, ahead=0):
         self._episode += ahead * rows

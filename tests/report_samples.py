@@ -12,7 +12,8 @@ def rates(k_success, k_collision, n=N):
     """Counts, rates and intervals of one condition."""
     return {
         "episodes": n,
-        "outcomes": {"success": k_success, "collision": k_collision, "ttc": 0, "out_of_tank": 0, "timeout": n - k_success - k_collision},
+        "outcomes": {"success": k_success, "collision": k_collision, "ttc": 0, "out_of_tank": 0,
+        "timeout": n - k_success - k_collision},
         "success_rate": k_success / n, "success_ci95": wilson_interval(k_success, n),
         "collision_rate": k_collision / n, "collision_ci95": wilson_interval(k_collision, n),
         "time_mean_s": 12.0, "tts_s": None if k_success == 0 else 12.0 * n / k_success,
@@ -39,15 +40,29 @@ def noise_sweep():
         for j, method in enumerate(("bt", "best"))
         for i, name in enumerate(("clean", "paper", "nominal", "harsh"))
     ]
-    return {"schema": 1, "world": "pool", "axes": {"sensors": ["clean", "paper", "nominal", "harsh"]}, "cells": cells}
+    return {
+        "schema": 1,
+        "world": "pool",
+        "axes": {"sensors": ["clean", "paper", "nominal", "harsh"]},
+        "cells": cells,
+    }
 
 
 def robustness_sweep():
-    """One axis at a time around a condition, two methods; one axis has lists for values, one is of the scene."""
+    """One axis at a time around a condition, two methods; one axis has lists for values, one is of the
+    scene."""
     scene = {"S": 8, "D": 6, "v_m_s": 0.6}
-    places = [{}, {"D": 9}, {"disturbance.current_m_s": [0.0, 0.2, 0.0]}, {"sensors": "clean"}, {"sensors": "harsh"}]
+    places = [
+        {},
+        {"D": 9},
+        {"disturbance.current_m_s": [0.0, 0.2, 0.0]},
+        {"sensors": "clean"},
+        {"sensors": "harsh"},
+    ]
     cells = [
-        {**scene, **place, "method": name, **rates(N - i - j, i)} for j, name in enumerate(("bt", "best")) for i, place in enumerate(places)
+        {**scene, **place, "method": name, **rates(N - i - j, i)}
+        for j, name in enumerate(("bt", "best"))
+        for i, place in enumerate(places)
     ]
     return {
         "schema": 1, "world": "pool", "episodes_per_seed": N, "cells": cells, "one_at_a_time": True,
@@ -80,39 +95,66 @@ def method(name, k_success=6, k_collision=2, n=8, **more):
 
 def evaluation_document(*methods):
     """An evaluation of these methods."""
-    scene = {"world": "pool", "S": 8, "D": 6, "v_m_s": 0.6, "sensors": "paper", "seeds": [0], "episodes_per_seed": 8}
+    scene = {
+        "world": "pool",
+        "S": 8,
+        "D": 6,
+        "v_m_s": 0.6,
+        "sensors": "paper",
+        "seeds": [0],
+        "episodes_per_seed": 8,
+    }
     return {"schema": 1, **scene, "methods": list(methods or (method("straight", 3, 5), method("bt")))}
 
 
 RISK = {
     "moments": 1300, "brier": 0.0038, "brier_base_rate": 0.0036, "ece": 0.0018, "auroc": 0.69,
-    "reliability": {"samples": [1200.0, 80.0, 20.0], "predicted": [0.005, 0.13, 0.6], "observed": [0.004, 0.1, 0.5]},
-    "accidents": 9, "missed": 1, "missed_ci95": [0.02, 0.44], "promised_miss_rate": 0.1, "alarm_rate_safe": 0.05,
+    "reliability": {"samples": [1200.0, 80.0, 20.0], "predicted": [0.005, 0.13, 0.6],
+    "observed": [0.004, 0.1, 0.5]},
+    "accidents": 9, "missed": 1, "missed_ci95": [0.02, 0.44], "promised_miss_rate": 0.1,
+    "alarm_rate_safe": 0.05,
 }  # fmt: skip
 
 CAUSE = {
-    "label": "unseen_above", "count": 2, "share": 1.0, "knew_share": 0.5, "unseen_median_s": 1.7, "evading_median_s": None,
-    "last_chance_median_s": 0.2, "meaning": "killer above the sonar's fan all through the last 0.3 s", "remarks": {},
+    "label": "unseen_above", "count": 2, "share": 1.0, "knew_share": 0.5, "unseen_median_s": 1.7,
+    "evading_median_s": None,
+    "last_chance_median_s": 0.2, "meaning": "killer above the sonar's fan all through the last 0.3 "
+                                            "s", "remarks": {},
 }  # fmt: skip
 
-STAGES = ("dynamics", "sonar", "depth", "mapping", "clearance", "planning", "features", "teacher", "reward", "export")
+STAGES = (
+    "dynamics",
+    "sonar",
+    "depth",
+    "mapping",
+    "clearance",
+    "planning",
+    "features",
+    "teacher",
+    "reward",
+    "export",
+)
 PROFILE = {
     "schema": 1,
     "machine": {"cpu": "some processor", "cores": 2, "device": "cpu"},
     "rows": [
         {
-            "num_envs": n, "controller": "bt", "S": 8, "D": 6, "depth_every": 5, "compile_s": 20.0, "memory_mb": 0.3 * n,
+            "num_envs": n, "controller": "bt", "S": 8, "D": 6, "depth_every": 5, "compile_s": 20.0,
+            "memory_mb": 0.3 * n,
             "env_steps_per_s": {"step": 90.0 * n, "step_inference": 80.0 * n, "train": None},
             "stages_us_per_env_step": {name: (i + 1.0) * scale for i, name in enumerate(STAGES)},
         }
         for n, scale in ((1, 90.0), (1024, 1.0))
     ],
     "paper_latency": [
-        {"component": "Full loop", "mean_ms": 3.1, "max_ms": 9.0, "paper_mean_ms": 28.63, "paper_max_ms": 39.88},
-        {"component": "Replanning rate", "replans_per_episode": 20.0, "hz": 1.4, "paper_replans_per_episode": 54, "paper_hz": 2.3},
+        {"component": "Full loop", "mean_ms": 3.1, "max_ms": 9.0, "paper_mean_ms": 28.63,
+        "paper_max_ms": 39.88},
+        {"component": "Replanning rate", "replans_per_episode": 20.0, "hz": 1.4,
+        "paper_replans_per_episode": 54, "paper_hz": 2.3},
     ],
     "paper_density": [
-        {"D": d, "loop_ms": 2 + 0.1 * d, "replans_per_episode": 20.0, "paper_loop_ms": 20 + d, "paper_replans": 50.0} for d in (0, 6, 15)
+        {"D": d, "loop_ms": 2 + 0.1 * d, "replans_per_episode": 20.0, "paper_loop_ms": 20 + d,
+        "paper_replans": 50.0} for d in (0, 6, 15)
     ],
 }  # fmt: skip
 
@@ -121,20 +163,26 @@ def metrics(n=30, offset=0.0):
     """Records of a training."""
     return [
         {
-            "iteration": i, "time/env_steps": 1000.0 * i, "time/env_steps_per_s": 900.0, "rollout/ep_rew_mean": -30 + i + offset,
-            "rollout/success_rate": i / (2 * n), "rollout/collision_rate": 1 - i / (2 * n), "world_model/dynamics_loss": 100.0 / i,
-            "world_model/reconstruction_loss": 9.0 - i / n, **({"eval/success_rate": i / n} if i % 10 == 0 else {}),
+            "iteration": i, "time/env_steps": 1000.0 * i, "time/env_steps_per_s": 900.0,
+            "rollout/ep_rew_mean": -30 + i + offset,
+            "rollout/success_rate": i / (2 * n), "rollout/collision_rate": 1 - i / (2 * n),
+            "world_model/dynamics_loss": 100.0 / i,
+            "world_model/reconstruction_loss": 9.0 - i / n,
+            **({"eval/success_rate": i / n} if i % 10 == 0 else {}),
         }
         for i in range(1, n + 1)
     ]  # fmt: skip
 
 
 def write_run(folder, argv=("uuv", "eval"), config="seed: 0\n", **files):
-    """A run folder: run.json, config.yaml and these documents by path (``__`` stands for a slash, lists become JSON lines)."""
+    """A run folder: run.json, config.yaml and these documents by path (``__`` stands for a slash, lists
+    become JSON lines)."""
     folder.mkdir(parents=True, exist_ok=True)
     record = {
-        "schema": 1, "argv": list(argv), "started": "2026-01-01T00:00:00+0000", "status": "finished", "seeds": [0], "git_sha": "abc",
-        "versions": {"uuvtai": "0.1.0"}, "hardware": {"cpu": "some processor", "cores": 2, "system": "Linux"}, "exit": 0, "wall_s": 3.0,
+        "schema": 1, "argv": list(argv), "started": "2026-01-01T00:00:00+0000", "status": "finished",
+        "seeds": [0], "git_sha": "abc",
+        "versions": {"uuvtai": "0.1.0"}, "hardware": {"cpu": "some processor", "cores": 2, "system": "Linux"},
+        "exit": 0, "wall_s": 3.0,
     }  # fmt: skip
     (folder / "run.json").write_text(json.dumps(record))
     (folder / "config.yaml").write_text(config)

@@ -1,4 +1,5 @@
-"""An environment that follows a script and writes down what it was told: what the trainer learns from can be worked out by hand."""
+"""An environment that follows a script and writes down what it was told: what the trainer learns from can be
+worked out by hand."""
 
 from typing import NamedTuple
 
@@ -28,8 +29,8 @@ class Moment(NamedTuple):
 class ScriptedEnv:
     """With the interface of ``VectorEnv``.
 
-    Every target column follows one command of the action, a tenth of it in each step. The tree's action, the reward and the endings follow
-    the script and depend on nothing that is done.
+    Every target column follows one command of the action, a tenth of it in each step. The tree's action, the
+    reward and the endings follow the script and depend on nothing that is done.
     """
 
     num_actions, num_obs = 4, N_TARGET + 1
@@ -38,7 +39,8 @@ class ScriptedEnv:
     reward_terms = ("script",)
 
     def __init__(self, script):
-        """``script``: for every env the steps of its episodes and how each ends, in turn; after the last one it goes on for ever."""
+        """``script``: for every env the steps of its episodes and how each ends, in turn; after the last one
+        it goes on for ever."""
         self.script, self.num_envs, self.device = script, len(script), torch.device("cpu")
         self.observation_table = (
             ObservationColumn("targets", slice(0, N_TARGET), "1", "none", "follow the action"),
@@ -50,9 +52,16 @@ class ScriptedEnv:
     def reset(self, seed=None):
         n = self.num_envs
         self._targets = torch.sin(torch.arange(n * N_TARGET).float()).view(n, N_TARGET)
-        self._episode, self._age, self._t = torch.zeros(n, dtype=torch.int64), torch.zeros(n, dtype=torch.int64), 0
+        self._episode, self._age, self._t = (
+            torch.zeros(n, dtype=torch.int64),
+            torch.zeros(n, dtype=torch.int64),
+            0,
+        )
         self.log.clear()
-        return self._obs(), self._told() | {"outcome": torch.zeros(n, dtype=torch.int32), "reward_terms": torch.zeros(n, 1)}
+        return self._obs(), self._told() | {
+            "outcome": torch.zeros(n, dtype=torch.int32),
+            "reward_terms": torch.zeros(n, 1),
+        }
 
     def step(self, action):
         obs, teacher = self._obs(), self._told()["teacher_action"]
@@ -61,7 +70,9 @@ class ScriptedEnv:
         self._t += 1
         outcome = torch.tensor([self._due(env) for env in range(self.num_envs)], dtype=torch.int32)
         ended, truncated = outcome > 0, outcome == self.outcomes.index("timeout")
-        reward = torch.cos(3.0 * self._t + torch.arange(self.num_envs)) + 2.0 * (outcome == self.outcomes.index("success"))
+        reward = torch.cos(3.0 * self._t + torch.arange(self.num_envs)) + 2.0 * (
+            outcome == self.outcomes.index("success")
+        )
         self.log.append(Moment(obs, teacher, action.clone(), self._obs(), reward, ended & ~truncated, ended))
         final = {"final_obs": self._obs(), "episode_return": reward, "episode_steps": self._age.clone()}
         self._episode += ended

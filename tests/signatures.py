@@ -1,4 +1,5 @@
-"""What every Taichi function says that it reads and writes, what it does, and whom it calls: read off the source."""
+"""What every Taichi function says that it reads and writes, what it does, and whom it calls: read off the
+source."""
 
 import ast
 import dataclasses
@@ -23,7 +24,9 @@ def bundles():
         if (KERNELS / room / "bundles.py").exists():
             module = importlib.import_module(f"uuvtai.kernels.{room}.bundles")
             found |= {
-                name: kind for name, kind in vars(module).items() if dataclasses.is_dataclass(kind) and kind.__module__ == module.__name__
+                name: kind
+                for name, kind in vars(module).items()
+                if dataclasses.is_dataclass(kind) and kind.__module__ == module.__name__
             }
     return found
 
@@ -50,7 +53,10 @@ class Function:
             mark, kind = mark_of(argument)
             if mark == "Bundle":
                 for member in dataclasses.fields(BUNDLES[kind]):
-                    found[f"{argument.arg}.{member.name}"] = (str(member.type).partition("[")[0], members_of(BUNDLES[kind])[member.name])
+                    found[f"{argument.arg}.{member.name}"] = (
+                        str(member.type).partition("[")[0],
+                        members_of(BUNDLES[kind])[member.name],
+                    )
             elif mark:
                 found[argument.arg] = (mark, kind)
         return found
@@ -59,7 +65,11 @@ class Function:
 def mark_of(argument):
     """('In', 'WorldState') of an argument annotated In[WorldState]."""
     a = argument.annotation
-    if isinstance(a, ast.Subscript) and isinstance(a.value, ast.Name) and a.value.id in ("In", "Out", "Const", "Bundle"):
+    if (
+        isinstance(a, ast.Subscript)
+        and isinstance(a.value, ast.Name)
+        and a.value.id in ("In", "Out", "Const", "Bundle")
+    ):
         return a.value.id, ast.unparse(a.slice)
     return None, None
 
@@ -105,8 +115,16 @@ def root_of(node):
 def written(function):
     """(root, line) of every array that a function stores into: by assignment, by an atomic operation."""
     for node in ast.walk(function.node):
-        targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AugAssign) else []
-        for target in [one for t in targets for one in (t.elts if isinstance(t, ast.Tuple | ast.List) else [t])]:
+        targets = (
+            node.targets
+            if isinstance(node, ast.Assign)
+            else [node.target]
+            if isinstance(node, ast.AugAssign)
+            else []
+        )
+        for target in [
+            one for t in targets for one in (t.elts if isinstance(t, ast.Tuple | ast.List) else [t])
+        ]:
             if isinstance(target, ast.Subscript | ast.Attribute):
                 yield root_of(target), node.lineno
         if isinstance(node, ast.Call) and ast.unparse(node.func).startswith("ti.atomic"):
@@ -114,9 +132,14 @@ def written(function):
 
 
 def handed(function):
-    """(root, mark of the parameter that takes it, called name, line) of every struct or section that a function passes on."""
+    """(root, mark of the parameter that takes it, called name, line) of every struct or section that a
+    function passes on."""
     for node in ast.walk(function.node):
-        if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and function.calls.get(node.func.id) in FUNCTIONS):
+        if not (
+            isinstance(node, ast.Call)
+            and isinstance(node.func, ast.Name)
+            and function.calls.get(node.func.id) in FUNCTIONS
+        ):
             continue
         called = FUNCTIONS[function.calls[node.func.id]]
         for given, parameter in zip(node.args, called.node.args.args, strict=True):

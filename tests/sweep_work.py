@@ -1,4 +1,5 @@
-"""Work for the engines of a sweep that needs no simulator; in a module of its own, so that other processes can import it."""
+"""Work for the engines of a sweep that needs no simulator; in a module of its own, so that other processes
+can import it."""
 
 import os
 import time

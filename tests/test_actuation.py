@@ -1,4 +1,5 @@
-"""Inner loop: against a NumPy oracle, its requirements on both frames, saturation, delay, dropouts, odd actions."""
+"""Inner loop: against a NumPy oracle, its requirements on both frames, saturation, delay, dropouts, odd
+actions."""
 
 import numpy as np
 import pytest
@@ -21,12 +22,15 @@ TILT_DEG = 5.0
 LIMITS = np.array([0.6, 0.6, 0.4, 1.0])
 
 F32_THRUST_N = 2e-3
-"""Single precision of forces of 100 N through the allocation and the curve and back; below 1 N the curve is flat and amplifies."""
+"""Single precision of forces of 100 N through the allocation and the curve and back; below 1 N the curve is
+flat and amplifies."""
 
 ACTIONS = np.array(
     [
-        [1, 0, 0, 0], [-1, 0, 0, 0], [0, 1, 0, 0], [0, -1, 0, 0], [0, 0, 1, 0], [0, 0, -1, 0], [0, 0, 0, 1], [0, 0, 0, -1],
-        [1, 1, 0, 0], [1, 1, 0, 1], [1, 1, 1, 1], [1, 1, -1, 1], [-1, -1, -1, -1], [-1, 1, 1, -1], [0.5, -0.5, 0.5, 0.5], [0, 0, 0, 0],
+        [1, 0, 0, 0], [-1, 0, 0, 0], [0, 1, 0, 0], [0, -1, 0, 0], [0, 0, 1, 0], [0, 0, -1, 0], [0, 0, 0, 1],
+        [0, 0, 0, -1],
+        [1, 1, 0, 0], [1, 1, 0, 1], [1, 1, 1, 1], [1, 1, -1, 1], [-1, -1, -1, -1], [-1, 1, 1, -1],
+        [0.5, -0.5, 0.5, 0.5], [0, 0, 0, 0],
     ],
     dtype=np.float32,
 )  # fmt: skip
@@ -45,11 +49,13 @@ def drive(plant, actions, steps):
     for _ in range(steps):
         plant.step(actions)
         velocity.append(np.c_[plant.vehicle.vel_b.to_numpy(), plant.vehicle.rate_b.to_numpy()[:, 2]])
-        tilt.append([np.degrees(np.abs(roll_pitch_yaw(q)[:2]).max()) for q in plant.vehicle.quat_wb.to_numpy()])
+        tilt.append(
+            [np.degrees(np.abs(roll_pitch_yaw(q)[:2]).max()) for q in plant.vehicle.quat_wb.to_numpy()]
+        )
     return np.array(velocity), np.array(tilt)
 
 
-# ---------------------------------------------------------------------------------------------------------- what it must do
+# -------------------------------------------------------------------------------------------- what it must do
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +97,7 @@ def test_braking_ends_at_rest(plant):
     assert tilt.max() < TILT_DEG
 
 
-# --------------------------------------------------------------------------------------------------------------- the equations
+# ---------------------------------------------------------------------------------------------- the equations
 
 
 def set_ego(plant, vel, rate, rpy, valid=1):
@@ -115,14 +121,27 @@ def test_loop_equals_the_oracle(plant, valid):
         set_ego(plant, vel, rate, rpy, valid)
         plant.write(plant.actuation.integral, integral)
         plant.command(action)
-        got_integral, got_thrust = plant.actuation.integral.to_numpy(), oracle.thrust_of_rpm(plant.actuation.rpm_command.to_numpy(), cfg)
+        got_integral, got_thrust = (
+            plant.actuation.integral.to_numpy(),
+            oracle.thrust_of_rpm(plant.actuation.rpm_command.to_numpy(), cfg),
+        )
         for env in range(N_ENV):
             sensed = (vel[env], rate[env], rpy[env])
             thrust, wanted = oracle.control(
-                cfg, gains, 0.02, action[env] * LIMITS, integral[env], *sensed, wrench_of_thrust, thrust_of_wrench, bool(valid)
+                cfg,
+                gains,
+                0.02,
+                action[env] * LIMITS,
+                integral[env],
+                *sensed,
+                wrench_of_thrust,
+                thrust_of_wrench,
+                bool(valid),
             )
             assert np.abs(got_integral[env] - wanted).max() < 1e-4
-            smooth = np.abs(thrust) > 1.0  # below the smallest thrusts the command is rounded, checked elsewhere
+            smooth = (
+                np.abs(thrust) > 1.0
+            )  # below the smallest thrusts the command is rounded, checked elsewhere
             assert np.abs(got_thrust[env] - thrust)[smooth].max(initial=0) < F32_THRUST_N * max(1, scale)
 
 
@@ -137,7 +156,8 @@ def test_saturation_keeps_the_direction(plant):
     assert np.isclose(thrust.max(), top, rtol=1e-4) or np.isclose(thrust.min(), bottom, rtol=1e-4)
     wrench_of_thrust, thrust_of_wrench = allocation_matrices(cfg)
     plain, _ = oracle.control(
-        cfg, plant.config.actuation, 0.02, LIMITS, np.zeros(4), np.array([-3.0, -2.0, 0]), np.array([0, 0, -1.0]), np.zeros(3),
+        cfg, plant.config.actuation, 0.02, LIMITS, np.zeros(4), np.array([-3.0, -2.0, 0]),
+        np.array([0, 0, -1.0]), np.zeros(3),
         wrench_of_thrust, thrust_of_wrench,
     )  # fmt: skip
     wanted, got = wrench_of_thrust @ plain, wrench_of_thrust @ thrust
@@ -146,7 +166,8 @@ def test_saturation_keeps_the_direction(plant):
 
 @pytest.mark.parametrize("speed", [1.0, 0.2])
 def test_blocked_vehicle_does_not_wind_up(plant, speed):
-    """A minute against a wall, then free: no overshoot at full command, six seconds at worst to forget what a slow one has pushed."""
+    """A minute against a wall, then free: no overshoot at full command, six seconds at worst to forget what a
+    slow one has pushed."""
     plant.reset()
     set_ego(plant, 0.0, 0.0, 0.0)
     action = np.tile(np.array([speed, 0, 0, 0], np.float32), (N_ENV, 1))
@@ -166,7 +187,11 @@ def test_integral_does_not_grow_in_saturation(plant, spin, grows):
     set_ego(plant, [0.55, 0.55, 0.0], [0.0, 0.0, spin], 0.0)
     for _ in range(50):
         plant.command(np.tile(np.array([1, 1, 0, 1], np.float32), (N_ENV, 1)))
-    assert (plant.actuation.integral.to_numpy()[:, 0] > 0.5).all() if grows else not plant.actuation.integral.to_numpy()[:, 0].any()
+    assert (
+        (plant.actuation.integral.to_numpy()[:, 0] > 0.5).all()
+        if grows
+        else not plant.actuation.integral.to_numpy()[:, 0].any()
+    )
 
 
 def test_lost_dvl_freezes_the_velocity_integral(plant):
@@ -202,11 +227,13 @@ def test_rows_are_independent_and_reset_is_complete(plant):
     assert np.array_equal(changed[rest], straight[rest]) and not np.array_equal(changed[3], straight[3])
 
 
-# ------------------------------------------------------------------------------------------------------------ curve, allocation
+# ------------------------------------------------------------------------------------------ curve, allocation
 
 
 @ti.kernel
-def _there_and_back(values: ti.types.ndarray(), rpm: ti.types.ndarray(), thrust: ti.types.ndarray(), cfg: Const[VehicleConfig]):
+def _there_and_back(
+    values: ti.types.ndarray(), rpm: ti.types.ndarray(), thrust: ti.types.ndarray(), cfg: Const[VehicleConfig]
+):
     for i in range(values.shape[0]):
         rpm[i] = rpm_of_thrust(values[i], cfg)
         thrust[i] = thrust_of_rpm(rpm[i], cfg)
@@ -218,12 +245,18 @@ def test_thrust_curve_and_its_inverse():
     rpm, thrust = np.zeros_like(wanted), np.zeros_like(wanted)
     _there_and_back(wanted, rpm, thrust, cfg)
     top, bottom = thrust_limits(cfg)
-    assert np.isclose(top, 64.13, atol=0.01) and np.isclose(bottom, -51.55, atol=0.01)  # 3-vehicle.md: +64.1 / -51.6 N
+    assert np.isclose(top, 64.13, atol=0.01) and np.isclose(
+        bottom, -51.55, atol=0.01
+    )  # 3-vehicle.md: +64.1 / -51.6 N
     assert np.abs(thrust - oracle.thrust_of_rpm(rpm, cfg)).max() < F32_THRUST_N
     least = oracle.thrust_of_rpm(np.array([203.5, -210.5]), cfg)
     reachable = ((wanted > least[0]) & (wanted < top)) | ((wanted < least[1]) & (wanted > bottom))
     assert np.abs(thrust - wanted)[reachable].max() < F32_THRUST_N
-    assert (np.abs(rpm) <= cfg.rotor_max_rpm).all() and rpm[-1] == cfg.rotor_max_rpm and rpm[0] == -cfg.rotor_max_rpm
+    assert (
+        (np.abs(rpm) <= cfg.rotor_max_rpm).all()
+        and rpm[-1] == cfg.rotor_max_rpm
+        and rpm[0] == -cfg.rotor_max_rpm
+    )
     assert not thrust[(wanted > 0.5 * least[1] + 1e-3) & (wanted < 0.5 * least[0] - 1e-3)].any()
 
 
@@ -233,7 +266,9 @@ def test_six_thrusters_cannot_pitch_and_eight_can():
     assert np.linalg.matrix_rank(wrench_of_thrust) == 5
     assert np.allclose(wrench_of_thrust[4], -0.0725 * wrench_of_thrust[0] - 0.0025 * wrench_of_thrust[2])
     assert controllable_axes(wrench_of_thrust) == [0, 1, 2, 3, 5]
-    assert np.allclose((wrench_of_thrust @ thrust_of_wrench)[np.ix_([0, 1, 2, 3, 5], [0, 1, 2, 3, 5])], np.eye(5))
+    assert np.allclose(
+        (wrench_of_thrust @ thrust_of_wrench)[np.ix_([0, 1, 2, 3, 5], [0, 1, 2, 3, 5])], np.eye(5)
+    )
     wrench_of_thrust, thrust_of_wrench = allocation_matrices(eight)
     assert np.allclose(wrench_of_thrust @ thrust_of_wrench, np.eye(6))
 

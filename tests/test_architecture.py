@@ -25,7 +25,10 @@ BELOW = ("state", "config", "kernels", "front_end", "tree_codes", "plan_codes", 
 """What kernels may import of the package."""
 STACK = {"core", "perception", "planning", "teacher"}
 TRUTH = {
-    kind.__name__ for module in (state, config) for kind in vars(module).values() if isinstance(kind, type) and issubclass(kind, Truth)
+    kind.__name__
+    for module in (state, config)
+    for kind in vars(module).values()
+    if isinstance(kind, type) and issubclass(kind, Truth)
 }
 
 
@@ -61,12 +64,17 @@ def test_there_is_something_to_check():
     assert {"WorldState", "VehicleState", "PathState", "EpisodeState", "WorldConfig"} <= TRUTH
     assert set(ROOMS) == KNOWS | STACK
     assert len(BUNDLES) > 20 and len(FUNCTIONS) > 450
-    assert {kind for bundle in BUNDLES.values() for kind in members_of(bundle).values()} >= TRUTH, "some truth is nobody's"
+    assert {kind for bundle in BUNDLES.values() for kind in members_of(bundle).values()} >= TRUTH, (
+        "some truth is nobody's"
+    )
 
 
-@pytest.mark.parametrize("path", [p for p in KERNELS.rglob("*.py") if room_of(p) in STACK], ids=lambda p: f"{room_of(p)}.{p.stem}")
+@pytest.mark.parametrize(
+    "path", [p for p in KERNELS.rglob("*.py") if room_of(p) in STACK], ids=lambda p: f"{room_of(p)}.{p.stem}"
+)
 def test_the_stack_never_names_the_truth(path):
-    """Nor is it handed any: a bundle is a file of its room, and what is imported comes from the stack's rooms."""
+    """Nor is it handed any: a bundle is a file of its room, and what is imported comes from the stack's
+    rooms."""
     assert not names_in(path) & TRUTH
     for module in imports_of(path):
         parts = module.split(".")
@@ -75,13 +83,26 @@ def test_the_stack_never_names_the_truth(path):
 
 
 def test_what_knows_the_truth_writes_nothing_that_the_stack_reads_but_readings():
-    """Simulated instruments, the clock and the mission are what the vehicle may know; the yardsticks say what they are."""
-    told = {kind for name in BUNDLES if name in ("EpisodeIO", "WorldIO") for kind in ("ClockState", "MissionState")}
+    """Simulated instruments, the clock and the mission are what the vehicle may know; the yardsticks say what
+    they are."""
+    told = {
+        kind
+        for name in BUNDLES
+        if name in ("EpisodeIO", "WorldIO")
+        for kind in ("ClockState", "MissionState")
+    }
     readings = {"Proprioception", "SonarScan", "DepthImage"}
-    of_the_stack = {kind for name, bundle in BUNDLES.items() if room_of_bundle(name) in STACK for kind in members_of(bundle).values()}
+    of_the_stack = {
+        kind
+        for name, bundle in BUNDLES.items()
+        if room_of_bundle(name) in STACK
+        for kind in members_of(bundle).values()
+    }
     assert readings | told <= of_the_stack
     for name, bundle in BUNDLES.items():
-        outputs = {members_of(bundle)[f.name] for f in dataclasses.fields(bundle) if str(f.type).startswith("Out")}
+        outputs = {
+            members_of(bundle)[f.name] for f in dataclasses.fields(bundle) if str(f.type).startswith("Out")
+        }
         if set(members_of(bundle).values()) & TRUTH and room_of_bundle(name) != "privileged":
             assert outputs & of_the_stack <= readings | told, f"{name} writes {outputs & of_the_stack}"
 
@@ -97,16 +118,24 @@ def test_kernels_import_taichi_and_the_floor_only(path):
     assert not foreign, f"{path.name} imports {foreign}"
     for module in (i for i in imports_of(path) if i.startswith("uuvtai.")):
         parts = module.split(".")
-        assert parts[1] in ("state", "config", "kernels", "front_end", "tree_codes", "plan_codes", "outcomes"), (
-            f"{path.name} imports {module}"
-        )
+        assert parts[1] in (
+            "state",
+            "config",
+            "kernels",
+            "front_end",
+            "tree_codes",
+            "plan_codes",
+            "outcomes",
+        ), f"{path.name} imports {module}"
         if room_of(path) == "core" and parts[1] == "kernels":
             assert parts[2] == "core", f"{path.name} imports {module}"
 
 
 def test_kernel_files_lend_functions_never_kernels():
     """A kernel is launched by the simulator, in its order; what two files share is a function."""
-    kernels = {f"{module}.{name}" for (module, name), function in FUNCTIONS.items() if is_kernel(function.node)}
+    kernels = {
+        f"{module}.{name}" for (module, name), function in FUNCTIONS.items() if is_kernel(function.node)
+    }
     assert len(kernels) > 30
     for path in FILES:
         assert not imports_of(path) & kernels, f"{path.name} imports {imports_of(path) & kernels}"
@@ -118,7 +147,9 @@ def test_kernel_files_stay_in_the_safe_subset(path):
     assert "from __future__ import annotations" not in text, "Taichi needs real annotations"
     for call in (n for n in ast.walk(tree_of(path)) if isinstance(n, ast.Call)):
         name = ast.unparse(call.func)
-        assert name not in ("ti.random", "ti.randn", "ti.init", "print"), f"{path.name}:{call.lineno} calls {name}"
+        assert name not in ("ti.random", "ti.randn", "ti.init", "print"), (
+            f"{path.name}:{call.lineno} calls {name}"
+        )
 
 
 def wrongs_of(function):
@@ -162,25 +193,41 @@ def test_every_kernel_says_what_it_takes_and_nothing_is_handed_over_in_vain():
             assert ast.get_docstring(function.node), f"{function.name} has no docstring"
             assert all(argument.annotation is not None for argument in function.node.args.args), function.name
         used = {node.id for node in ast.walk(function.node) if isinstance(node, ast.Name)}
-        assert set(names) <= used | {"io"}, f"{function.path.name}: {function.name} does not use {set(names) - used}"
+        assert set(names) <= used | {"io"}, (
+            f"{function.path.name}: {function.name} does not use {set(names) - used}"
+        )
 
 
 def test_every_bundle_holds_what_its_stage_touches_and_nothing_else():
     """Members that some function of the stage names; what is marked Out is written by one."""
     touched, stored = {name: set() for name in BUNDLES}, {name: set() for name in BUNDLES}
     for function in FUNCTIONS.values():
-        bundle = next((kind for a in function.node.args.args for mark, kind in [signatures.mark_of(a)] if mark == "Bundle"), None)
+        bundle = next(
+            (
+                kind
+                for a in function.node.args.args
+                for mark, kind in [signatures.mark_of(a)]
+                if mark == "Bundle"
+            ),
+            None,
+        )
         if bundle is None:
             continue
         for node in ast.walk(function.node):
             if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "io":
                 touched[bundle].add(node.attr)
         stored[bundle] |= {root[3:] for root, _ in signatures.written(function) if root.startswith("io.")}
-        stored[bundle] |= {root[3:] for root, mark, *_ in signatures.handed(function) if mark == "Out" and root.startswith("io.")}
+        stored[bundle] |= {
+            root[3:]
+            for root, mark, *_ in signatures.handed(function)
+            if mark == "Out" and root.startswith("io.")
+        }
     for name, bundle in BUNDLES.items():
         members = {f.name: str(f.type).partition("[")[0] for f in dataclasses.fields(bundle)}
         assert touched[name] == set(members), f"{name}: {touched[name] ^ set(members)}"
-        assert stored[name] == {member for member, mark in members.items() if mark == "Out"}, f"{name}: {stored[name]}"
+        assert stored[name] == {member for member, mark in members.items() if mark == "Out"}, (
+            f"{name}: {stored[name]}"
+        )
 
 
 def test_only_the_runtime_starts_taichi():
@@ -217,7 +264,9 @@ def test_every_array_has_a_unit_or_a_meaning():
         for number, line in enumerate(source):
             if " = array(" in line:
                 declared += 1
-                assert source[number + 1].strip().startswith('"""'), f"{path.name}:{number + 1} has no docstring line"
+                assert source[number + 1].strip().startswith('"""'), (
+                    f"{path.name}:{number + 1} has no docstring line"
+                )
     assert declared == sum(len(dataclasses.fields(struct)) for struct in structs())
 
 
@@ -244,9 +293,13 @@ def test_the_tree_in_contributing_shows_every_folder():
     assert block, "CONTRIBUTING has no tree"
     drawn = set(re.findall(r"^ +([\w-]+/)", block.group(1), re.M))
     real = {
-        f"{p.name}/" for p in [*PACKAGE.iterdir(), *KERNELS.iterdir(), *(PACKAGE / "measure").iterdir()] if p.is_dir() and p.name[0] != "_"
+        f"{p.name}/"
+        for p in [*PACKAGE.iterdir(), *KERNELS.iterdir(), *(PACKAGE / "measure").iterdir()]
+        if p.is_dir() and p.name[0] != "_"
     }
-    assert drawn == real, f"CONTRIBUTING's tree lacks {sorted(real - drawn)} and still shows {sorted(drawn - real)}"
+    assert drawn == real, (
+        f"CONTRIBUTING's tree lacks {sorted(real - drawn)} and still shows {sorted(drawn - real)}"
+    )
     files = set(re.findall(r"[\w/]+\.py", block.group(1)))
     assert files <= {p.name for p in [*PACKAGE.rglob("*.py"), *ROOT.glob("*.py")]}
 
@@ -263,6 +316,8 @@ print(sum(name.startswith("uuvtai.") for name in sys.modules))
 
 
 def test_what_learns_records_and_reports_starts_no_taichi():
-    done = subprocess.run([sys.executable, "-c", WITHOUT_TAICHI], capture_output=True, text=True, check=False, cwd=ROOT)
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_TAICHI], capture_output=True, text=True, check=False, cwd=ROOT
+    )
     assert done.returncode == 0, done.stderr
     assert int(done.stdout) > 100

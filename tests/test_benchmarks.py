@@ -1,4 +1,5 @@
-"""Benchmarks: what their rows say, that each is found and described, and that kernels and peers agree where that is cheap to check."""
+"""Benchmarks: what their rows say, that each is found and described, and that kernels and peers agree where
+that is cheap to check."""
 
 import ast
 import math
@@ -26,7 +27,10 @@ def test_ratio_and_floor_know_which_way_is_better():
     rate = Row("", 30.0, "1/s", peer=10.0, floor=2.5, floor_on="ratio")
     assert rate.ratio == 3.0 and rate.met
     assert Row("", 2.0, "ms", peer=10.0, less_is_better=True).ratio == 5.0
-    assert Row("", 2.0, "ms", less_is_better=True, floor=3.0).met and not Row("", 4.0, "ms", less_is_better=True, floor=3.0).met
+    assert (
+        Row("", 2.0, "ms", less_is_better=True, floor=3.0).met
+        and not Row("", 4.0, "ms", less_is_better=True, floor=3.0).met
+    )
     assert not Row("", 2.0, "1/s", floor=3.0).met
     assert Row("", 2.0, "ms", peer=10.0, less_is_better=True, floor=6.0, floor_on="ratio").met is False
     assert Row("", None, "ms", floor=3.0).met is False and Row("", 1.0, "ms").met is None
@@ -42,7 +46,10 @@ def test_stopwatch_takes_turns_and_gives_the_median():
 
         return work
 
-    sides = {"slow": call("slow", [9.0, 3.0, 3.0, 50.0, 2.0]), "fast": call("fast", [9.0, 1.0, 1.0, 1.0, 0.5])}
+    sides = {
+        "slow": call("slow", [9.0, 3.0, 3.0, 50.0, 2.0]),
+        "fast": call("fast", [9.0, 1.0, 1.0, 1.0, 0.5]),
+    }
     assert seconds_per_call(sides, 3.0, lambda: now[0], rounds=3) == {"slow": 3.0, "fast": 1.0}
     assert order == ["slow", "slow", "fast", "fast", *["slow", "fast"] * 3]
 
@@ -52,7 +59,7 @@ def test_every_benchmark_measures_and_says_what(name):
     module = ast.parse((FOLDER / f"{name}.py").read_text())
     measure = [node for node in module.body if isinstance(node, ast.FunctionDef) and node.name == "measure"]
     assert [argument.arg for argument in measure[0].args.args] == ["job"]
-    assert len((ast.get_docstring(module) or "").splitlines()[0]) > 40
+    assert len((ast.get_docstring(module) or "").split("\n\n")[0]) > 40
     devices, threads, longest_s = run._traits(name)
     assert set(devices) <= {"cpu", "cuda"} and threads in (None, 1)
     assert longest_s >= 1200 and (name != "mutants" or longest_s == mutants.LONGEST_S)
@@ -63,7 +70,11 @@ def test_every_benchmark_measures_and_says_what(name):
 def test_every_mutant_changes_a_text_that_is_there_and_names_tests_that_are(mutation):
     mutants.check_texts([mutation])
     tests = ast.parse((FOLDER.parent / mutation.tests).read_text())
-    names = [node.name for node in ast.walk(tests) if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")]
+    names = [
+        node.name
+        for node in ast.walk(tests)
+        if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")
+    ]
     assert any(part in name for part in mutation.only.split(" or ") for name in names)
 
 
@@ -94,12 +105,18 @@ def test_peers_of_dynamics_agree_and_a_wrong_one_is_seen():
         plant.reset()
         peer = Vehicles(config, n_env, xp)
         peer.quadratic *= factor
-        return dynamics.disagreement(plant, {"peer": peer}, actions, {"peer": columns if xp is np else torch.from_numpy(columns)})
+        return dynamics.disagreement(
+            plant, {"peer": peer}, actions, {"peer": columns if xp is np else torch.from_numpy(columns)}
+        )
 
-    assert apart(np, 1.0) < dynamics.AGREEMENT and apart(torch, 1.0) < dynamics.AGREEMENT < apart(torch, 1.001)
+    assert apart(np, 1.0) < dynamics.AGREEMENT and apart(torch, 1.0) < dynamics.AGREEMENT < apart(
+        torch, 1.001
+    )
     assert np.abs(plant.vehicle.vel_b.to_numpy()).max() > 0.2, "nothing moved"
 
 
 def test_unknown_names_are_refused():
-    done = subprocess.run([sys.executable, str(FOLDER / "run.py"), "sonra"], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, str(FOLDER / "run.py"), "sonra"], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 2 and "sonra" in done.stderr and "tick" in done.stderr

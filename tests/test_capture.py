@@ -1,4 +1,5 @@
-"""Capture and restore: a run that goes on from captured arrays is the run that was never stopped, bit for bit."""
+"""Capture and restore: a run that goes on from captured arrays is the run that was never stopped, bit for
+bit."""
 
 import numpy as np
 import pytest
@@ -24,7 +25,8 @@ def env(small):
 
 
 def driven(env, first, last):
-    """Everything that ``step`` returns, from step ``first`` to ``last``: tree or noise drives, some clocks run out."""
+    """Everything that ``step`` returns, from step ``first`` to ``last``: tree or noise drives, some clocks
+    run out."""
     out = []
     for step in range(first, last):
         noise = 2 * torch.rand(N, 4, generator=torch.Generator().manual_seed(step)) - 1
@@ -129,7 +131,8 @@ def test_put_writes_what_taichi_reads_and_refuses_what_does_not_fit(small):
 
 
 def test_views_do_not_overlap(small):
-    """Every byte of every array belongs to it alone, and the padding of arrays in lanes lies inside the block."""
+    """Every byte of every array belongs to it alone, and the padding of arrays in lanes lies inside the
+    block."""
     memory = small.sim.memory()
     content = np.zeros(memory.n_bytes, np.uint8)
     total = 0
@@ -150,7 +153,10 @@ def edited_setting(arrays, old, new):
 BROKEN = {
     "missing": (lambda a: without(a, "sim.grid_map.seen"), "lacks 'grid_map.seen'.*give what capture"),
     "missing tensor": (lambda a: without(a, "env.obs"), "lacks 'obs'"),
-    "unknown": (lambda a: a | {"sim.vehicle.name": np.zeros(3)}, "holds 'vehicle.name', which this version does not know"),
+    "unknown": (
+        lambda a: a | {"sim.vehicle.name": np.zeros(3)},
+        "holds 'vehicle.name', which this version does not know",
+    ),
     "shape": (
         lambda a: a | {"sim.vehicle.pos_w": np.zeros((3, 3), np.float32)},
         r"'vehicle.pos_w' is float32 \(3, 3\), but float32 \(8, 3\) is",
@@ -161,7 +167,10 @@ BROKEN = {
         lambda a: edited_setting(a, b'"horizon_steps": 3000', b'"horizon_steps": 2999'),
         "episode.horizon_steps was 2999, is 3000",
     ),
-    "other number of envs": (lambda a: edited_setting(a, b'"num_envs": 8', b'"num_envs": 9'), "num_envs was 9, is 8"),
+    "other number of envs": (
+        lambda a: edited_setting(a, b'"num_envs": 8', b'"num_envs": 9'),
+        "num_envs was 9, is 8",
+    ),
     "other tree": (lambda a: edited_setting(a, b'"EmergencyTtc"', b'"Emergency"'), "tree.*EmergencyTtc"),
     "no setting": (lambda a: without(a, "setting"), "lacks 'setting'"),
     "damaged setting": (lambda a: a | {"setting": a["setting"][:40]}, "cannot be read"),
@@ -178,7 +187,9 @@ def test_what_does_not_fit_is_refused_and_changes_nothing(env, run, name):
     with pytest.raises(ValueError, match=words):
         env.restore(breaking(arrays))
     after = env.capture()
-    assert all(np.array_equal(after[key], before[key], equal_nan=before[key].dtype.kind == "f") for key in before)
+    assert all(
+        np.array_equal(after[key], before[key], equal_nan=before[key].dtype.kind == "f") for key in before
+    )
 
 
 def test_a_capture_needs_a_reset_and_an_open_environment(small):

@@ -1,4 +1,5 @@
-"""Ceilings in ``uuv eval``: rows and condition in the document and on the screen, marked as privileged, on paired episodes."""
+"""Ceilings in ``uuv eval``: rows and condition in the document and on the screen, marked as privileged, on
+paired episodes."""
 
 import json
 
@@ -33,7 +34,9 @@ COMMAND = ("eval", "--episodes", "3", "--seeds", str(SEED), *SmallSim.OPTIONS)
 
 
 def test_ceilings_are_rows_of_the_table(borrowed, small, capfd, tmp_path):
-    code, out, err = uuv(capfd, *COMMAND, "--controller", "bt,bt+truth,oracle", "--run-dir", str(tmp_path / "run"), "--json")
+    code, out, err = uuv(
+        capfd, *COMMAND, "--controller", "bt,bt+truth,oracle", "--run-dir", str(tmp_path / "run"), "--json"
+    )
     assert code == 0, err
     document = json.loads(out)
     bt, truth, oracle = document["methods"]
@@ -53,9 +56,13 @@ def test_ceilings_are_rows_of_the_table(borrowed, small, capfd, tmp_path):
     (remainder,) = document["remainder"]
     assert remainder == remainder_of(document["methods"])[0]
     assert (
-        remainder["missed"] == 3 - bt["outcomes"]["success"] == sum(remainder[part] for part in ("sensing", "forecast_decision", "physics"))
+        remainder["missed"]
+        == 3 - bt["outcomes"]["success"]
+        == sum(remainder[part] for part in ("sensing", "forecast_decision", "physics"))
     )
-    assert document["condition"]["rides"] == 3 and document["condition"]["detection"]["closing_m_s"] == pytest.approx(1.2)
+    assert document["condition"]["rides"] == 3 and document["condition"]["detection"][
+        "closing_m_s"
+    ] == pytest.approx(1.2)
 
 
 def test_the_oracle_alone_is_printed_with_a_dagger_and_the_condition(borrowed, capfd, tmp_path):
@@ -67,23 +74,40 @@ def test_the_oracle_alone_is_printed_with_a_dagger_and_the_condition(borrowed, c
 
 def test_a_bt_that_comes_after_the_truth_senses_again(borrowed, capfd, tmp_path):
     """The rows of one evaluation do not leak into each other, whatever their order."""
-    code, out, err = uuv(capfd, *COMMAND, "--controller", "bt+truth,bt", "--run-dir", str(tmp_path / "a"), "--json")
+    code, out, err = uuv(
+        capfd, *COMMAND, "--controller", "bt+truth,bt", "--run-dir", str(tmp_path / "a"), "--json"
+    )
     assert code == 0, err
     code, alone, err = uuv(capfd, *COMMAND, "--controller", "bt", "--run-dir", str(tmp_path / "b"), "--json")
     assert code == 0, err
     truth, bt = json.loads(out)["methods"]
-    assert bt["episodes_detail"] == json.loads(alone)["methods"][0]["episodes_detail"] != truth["episodes_detail"]
+    assert (
+        bt["episodes_detail"]
+        == json.loads(alone)["methods"][0]["episodes_detail"]
+        != truth["episodes_detail"]
+    )
 
 
 def test_failures_of_a_privileged_tree_are_replayed_with_the_truth(borrowed, capfd, tmp_path):
     """A replay that ended otherwise than the episode would be refused."""
-    command = (*COMMAND, "--controller", "straight+truth,oracle", "--explain", "--explain-record", "0", "--run-dir", str(tmp_path / "run"))
+    command = (
+        *COMMAND,
+        "--controller",
+        "straight+truth,oracle",
+        "--explain",
+        "--explain-record",
+        "0",
+        "--run-dir",
+        str(tmp_path / "run"),
+    )
     code, out, err = uuv(capfd, *command, "--json")
     assert code == 0, err
     straight, oracle = json.loads(out)["methods"]
     assert len(straight["explain"]) == 3 - straight["outcomes"]["success"] > 0
     assert "explain" not in oracle
-    assert [m["name"] for m in json.loads((tmp_path / "run/eval/explain.json").read_text())["methods"]] == ["straight+truth"]
+    assert [m["name"] for m in json.loads((tmp_path / "run/eval/explain.json").read_text())["methods"]] == [
+        "straight+truth"
+    ]
 
 
 def test_what_is_missing_is_split_by_hand():
@@ -91,7 +115,12 @@ def test_what_is_missing_is_split_by_hand():
         details = [{"seed": 0, "episode": i, "outcome": "success" if i in won else "ttc"} for i in range(10)]
         return {"name": name, "episodes": 10, "episodes_detail": details}
 
-    entries = [entry("bt", 0, 1, 2, 3), entry("planner", 0), entry("bt+truth", 1, 2, 3, 4, 5, 6), entry("oracle", *range(9))]
+    entries = [
+        entry("bt", 0, 1, 2, 3),
+        entry("planner", 0),
+        entry("bt+truth", 1, 2, 3, 4, 5, 6),
+        entry("oracle", *range(9)),
+    ]
     parts = {"sensing": 2, "forecast_decision": 3, "physics": 1, "lost_with_truth": 1}
     assert remainder_of(entries) == [{"method": "bt", "episodes": 10, "missed": 6, **parts}]
     assert remainder_of(entries[:3]) == []
@@ -104,7 +133,10 @@ def test_scenarios_are_those_that_are_played_in_any_batch(small):
     assert not small.sim.rows(small.sim.s.clock.active).any()
     small.begin([4, 2], seed=SEED)
     starts = small.sim.rows(small.sim.s.mission.start_w)
-    assert found[Job(SEED, 4)]["start"] == starts[0].tolist() and found[Job(SEED, 2)]["start"] == starts[1].tolist()
+    assert (
+        found[Job(SEED, 4)]["start"] == starts[0].tolist()
+        and found[Job(SEED, 2)]["start"] == starts[1].tolist()
+    )
     assert len(found[Job(SEED, 4)]["bodies"]) == 14
 
 
@@ -112,4 +144,9 @@ def test_a_tree_of_the_users_own_may_have_a_plus_in_its_name(tmp_path):
     file = tmp_path / "mine+yours.xml"
     file.write_text('<root BTCPP_format="4"><BehaviorTree ID="t"><DriveStraight/></BehaviorTree></root>')
     plain, told = trees_of([str(file), f"{file}+truth"], 64)
-    assert (plain.name, plain.privileged, told.name, told.privileged) == ("mine+yours", False, "mine+yours+truth", True)
+    assert (plain.name, plain.privileged, told.name, told.privileged) == (
+        "mine+yours",
+        False,
+        "mine+yours+truth",
+        True,
+    )

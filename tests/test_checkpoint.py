@@ -1,4 +1,5 @@
-"""Checkpoints: the same state back to the last bit, whatever kills the writer, and a clear refusal of everything else."""
+"""Checkpoints: the same state back to the last bit, whatever kills the writer, and a clear refusal of
+everything else."""
 
 import json
 import pickle
@@ -16,7 +17,10 @@ from uuvtai.learn import checkpoint, manifest, packing
 from uuvtai.learn.checkpoint import CheckpointError
 from uuvtai.loader import load_training
 
-TABLE = (ObservationColumn("goal", slice(0, 3), "m", "body", ""), ObservationColumn("yaw", slice(3, 4), "rad", "world", ""))
+TABLE = (
+    ObservationColumn("goal", slice(0, 3), "m", "body", ""),
+    ObservationColumn("yaw", slice(3, 4), "rad", "world", ""),
+)
 CONFIG = load_training("smoke", ["train.keep_checkpoints=2"])
 
 
@@ -27,12 +31,21 @@ def state_of(step):
     moments = {"step": torch.tensor(3.0), "exp_avg": torch.randn(4, generator=rng)}
     row = np.arange(6, dtype=np.int32).reshape(2, 3) + step
     return {
-        "policy": {"actor.0.weight": weight, "actor.0.shared": weight, "log_std": torch.tensor(0.5, dtype=torch.float64)},
+        "policy": {
+            "actor.0.weight": weight,
+            "actor.0.shared": weight,
+            "log_std": torch.tensor(0.5, dtype=torch.float64),
+        },
         "world_model": None,
         "ppo": {"state": {0: moments}, "betas": (0.9, 0.999), "lr": 0.1 + 0.2},
         "generator": rng.get_state(),
         "counters": {"iteration": step, "best": float("-inf"), "names": ["a", "b"], "done": True},
-        "env": {"step": row, "map": torch.rand(2, 300, generator=rng), "empty": torch.zeros(0, 2), "number": np.array(7)},
+        "env": {
+            "step": row,
+            "map": torch.rand(2, 300, generator=rng),
+            "empty": torch.zeros(0, 2),
+            "number": np.array(7),
+        },
     }
 
 
@@ -73,11 +86,20 @@ def test_state_comes_back_to_the_last_bit(tmp_path):
     found = checkpoint.open_checkpoint(path)
     expected = state_of(7)
     expected.pop("world_model")  # a part that is off is left out
-    assert (found.step, found.manifest.score, found.manifest.metrics) == (7, 0.5, {"reward": 1.5, "bad": None})
+    assert (found.step, found.manifest.score, found.manifest.metrics) == (
+        7,
+        0.5,
+        {"reward": 1.5, "bad": None},
+    )
     assert found.config == CONFIG
     state = found.state(like=state_of(0))
     assert_same({name: state[name] for name in expected}, expected)
-    assert sorted(p.name for p in path.iterdir()) == ["manifest.json", "model.safetensors", "simulator.zst", "training.safetensors"]
+    assert sorted(p.name for p in path.iterdir()) == [
+        "manifest.json",
+        "model.safetensors",
+        "simulator.zst",
+        "training.safetensors",
+    ]
 
 
 def test_what_cannot_be_kept_is_named(tmp_path):
@@ -129,7 +151,7 @@ def test_a_shipped_policy_drives_but_cannot_be_trained_on(tmp_path):
         shipped.state(like=state_of(0))
 
 
-# ------------------------------------------------------------------------------------------------------------------ refusals
+# --------------------------------------------------------------------------------------------------- refusals
 
 
 class Exploit:
@@ -156,25 +178,39 @@ def linked(file):
     file.symlink_to(file.rename(file.parent.parent / "elsewhere"))
 
 
+def shorter(file) -> None:
+    file.write_bytes(file.read_bytes()[:-1])
+
+
 REFUSALS = {
-    "truncated": (lambda p: (p / "model.safetensors").write_bytes((p / "model.safetensors").read_bytes()[:-1]), "was cut off"),
+    "truncated": (lambda p: shorter(p / "model.safetensors"), "was cut off"),
     "missing file": (lambda p: (p / "model.safetensors").unlink(), "model.safetensors: is missing"),
     "missing manifest": (lambda p: (p / "manifest.json").unlink(), "manifest.json: is missing"),
-    "manifest cut off": (lambda p: (p / "manifest.json").write_text((p / "manifest.json").read_text()[:100]), "cannot be read"),
+    "manifest cut off": (lambda p: (p / "manifest.json").write_text((p / "manifest.json").read_text()[:100]),
+    "cannot be read"),
     "manifest is no JSON": (lambda p: (p / "manifest.json").write_bytes(b"\x80\x04\x95"), "cannot be read"),
-    "manifest nested without end": (lambda p: (p / "manifest.json").write_text("[" * 100_000), "cannot be read"),
-    "manifest of something else": (lambda p: (p / "manifest.json").write_text('{"a": 1}'), "is not a manifest"),
-    "huge manifest": (lambda p: (p / "manifest.json").write_bytes(b" " * (9 << 20)), "more than the 8,388,608 that such a file may have"),
-    "other schema": (lambda p: rewritten(p, lambda d: d.update(schema=2)), "has schema 2, this uuvtai reads 1"),
-    "newer version": (lambda p: rewritten(p, lambda d: d.update(version="9.9.0")), "was written by uuvtai 9.9.0"),
+    "manifest nested without end": (lambda p: (p / "manifest.json").write_text("[" * 100_000),
+    "cannot be read"),
+    "manifest of something else": (lambda p: (p / "manifest.json").write_text('{"a": 1}'),
+    "is not a manifest"),
+    "huge manifest": (lambda p: (p / "manifest.json").write_bytes(b" " * (9 << 20)), "more than the "
+                                                                                     "8,388,608 that such a "
+                                                                                     "file may have"),
+    "other schema": (lambda p: rewritten(p, lambda d: d.update(schema=2)), "has schema 2, this uuvtai reads "
+                                                                           "1"),
+    "newer version": (lambda p: rewritten(p, lambda d: d.update(version="9.9.0")), "was written by uuvtai "
+                                                                                   "9.9.0"),
     "no version": (lambda p: rewritten(p, lambda d: d.pop("version")), "was written by uuvtai None"),
     "unknown key": (lambda p: rewritten(p, lambda d: d.update(run="rm")), "run: Extra inputs"),
-    "NaN": (lambda p: (p / "manifest.json").write_text((p / "manifest.json").read_text().replace('"step": 7', '"step": NaN')), "NaN"),
+    "NaN": (lambda p: (p / "manifest.json").write_text((p / "manifest.json").read_text().replace('"step": 7',
+    '"step": NaN')), "NaN"),
     "changed config": (lambda p: rewritten(p, lambda d: d["config"]["ppo"].update(gamma=0.5)), "sha256"),
-    "unknown config key": (lambda p: rewritten(p, lambda d: d["config"].update(extra=1)), "extra: Extra inputs"),
+    "unknown config key": (lambda p: rewritten(p, lambda d: d["config"].update(extra=1)), "extra: Extra "
+                                                                                          "inputs"),
     "path trick": (lambda p: relisted(p, "../../x"), "'../../x', which no"),
     "absolute path": (lambda p: relisted(p, "/etc/passwd"), "no checkpoint has"),
-    "unlisted file": (lambda p: rewritten(p, lambda d: d["files"].pop("training.safetensors")), "is not listed"),
+    "unlisted file": (lambda p: rewritten(p, lambda d: d["files"].pop("training.safetensors")),
+    "is not listed"),
     "link": (lambda p: linked(p / "model.safetensors"), "is a link"),
 }  # fmt: skip
 
@@ -202,7 +238,9 @@ def test_a_flipped_bit_is_found(tmp_path, name, place):
 def test_a_pickle_in_disguise_is_never_opened(tmp_path):
     path = saved(tmp_path)
     forged(path, "model.safetensors", pickle.dumps(Exploit()))
-    with pytest.raises(CheckpointError, match=r"is not a safetensors file .* pickles and other formats are never opened"):
+    with pytest.raises(
+        CheckpointError, match=r"is not a safetensors file .* pickles and other formats are never opened"
+    ):
         checkpoint.open_checkpoint(path).model()
 
 
@@ -273,7 +311,7 @@ def test_a_bomb_stays_small(tmp_path):
         packing.read_stream(tmp_path / "s.zst", [("x", "uint8", [1000])])
 
 
-# ---------------------------------------------------------------------------------------------------------------- SIGKILL
+# ---------------------------------------------------------------------------------------------------- SIGKILL
 
 KILLED = """
     import os, shutil, signal, sys
@@ -314,7 +352,8 @@ KILLED = """
 
 
 def test_sigkill_at_any_file_operation_leaves_the_newest_verified_checkpoint_usable(tmp_path, monkeypatch):
-    """The writer is killed at its 1st, 4th, 7th, ... file operation while two more checkpoints are written over three older ones."""
+    """The writer is killed at its 1st, 4th, 7th, ... file operation while two more checkpoints are written
+    over three older ones."""
     from tests.test_architecture import ROOT
 
     monkeypatch.setattr("os.fsync", lambda _descriptor: None)
@@ -328,7 +367,10 @@ def test_sigkill_at_any_file_operation_leaves_the_newest_verified_checkpoint_usa
         found = checkpoint.newest(run, resumable=True)
         steps.append(found.step)
         state, expected = found.state(like=state_of(0)), state_of(found.step)
-        assert_same({name: state[name] for name in ("policy", "ppo", "env")}, {name: expected[name] for name in ("policy", "ppo", "env")})
+        assert_same(
+            {name: state[name] for name in ("policy", "ppo", "env")},
+            {name: expected[name] for name in ("policy", "ppo", "env")},
+        )
         assert checkpoint.best(run).step == 1
         saved(run, 6)
         assert not list((run / "checkpoints").glob(".partial*")), "the next writer clears what was left"

@@ -1,4 +1,5 @@
-"""What runs elsewhere (GitHub's machines, a container, a contributor's hooks) agrees with this checkout, which cannot run it."""
+"""What runs elsewhere (GitHub's machines, a container, a contributor's hooks) agrees with this checkout,
+which cannot run it."""
 
 import re
 from pathlib import Path
@@ -47,13 +48,22 @@ def test_every_line_of_the_lock_is_a_pin_with_hashes_from_an_ordinary_index():
 @pytest.mark.parametrize("python", PYTHONS)
 def test_the_lock_has_what_the_project_wants(python):
     """On Linux, where CI runs it; where this fails, renew the lock (CONTRIBUTING.md)."""
-    place = {"python_version": python, "python_full_version": f"{python}.9", "sys_platform": "linux", "platform_machine": "x86_64"}
+    place = {
+        "python_version": python,
+        "python_full_version": f"{python}.9",
+        "sys_platform": "linux",
+        "platform_machine": "x86_64",
+    }
     pins, requirements = locked(), wanted()
     assert len(requirements) > 30
     for requirement in requirements:
         if requirement.marker and not requirement.marker.evaluate(place):
             continue
-        fitting = [pin for pin in pins.get(canonicalize_name(requirement.name), []) if not pin.marker or pin.marker.evaluate(place)]
+        fitting = [
+            pin
+            for pin in pins.get(canonicalize_name(requirement.name), [])
+            if not pin.marker or pin.marker.evaluate(place)
+        ]
         assert len(fitting) == 1, f"{requirement}: the lock has {fitting}"
         (version,) = (spec.version for spec in fitting[0].specifier)
         assert requirement.specifier.contains(version), f"{requirement}: the lock has {version}"

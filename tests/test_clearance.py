@@ -1,4 +1,5 @@
-"""Clearance against scipy's exact transform, its sites and ties, what must hold for any map, and the funcs that others read it with."""
+"""Clearance against scipy's exact transform, its sites and ties, what must hold for any map, and the funcs
+that others read it with."""
 
 import numpy as np
 import pytest
@@ -35,7 +36,13 @@ class Stage:
     """The structs of clearance."""
 
     def __init__(self, n_env=N_ENV):
-        sizes = {"n_env": n_env, "n_row": SHAPE[0], "n_col": SHAPE[1], "n_packet": SHAPE[1] // LANES, "n_slot": 4}
+        sizes = {
+            "n_env": n_env,
+            "n_row": SHAPE[0],
+            "n_col": SHAPE[1],
+            "n_packet": SHAPE[1] // LANES,
+            "n_slot": 4,
+        }
         self.clearance, self.grid_map = allocate(ClearanceState, sizes), allocate(MapState, sizes)
         self.memory = allocate(ClearanceMemory, sizes)
         self.mask, self.clock = allocate(GridMask, sizes), allocate(ClockState, sizes)
@@ -49,14 +56,32 @@ class Stage:
     def compute(self, static, dynamic=None, cfg=CFG, voronoi=VORONOI):
         """(clearance, site_row, site_col) of these layers [n_env, row, col]."""
         static32 = static.astype(np.float32)
-        put_layers(self.grid_map, static32, np.zeros_like(static32) if dynamic is None else dynamic.astype(np.float32), MAP.occupied)
+        put_layers(
+            self.grid_map,
+            static32,
+            np.zeros_like(static32) if dynamic is None else dynamic.astype(np.float32),
+            MAP.occupied,
+        )
         return self.launch(cfg, voronoi)
 
     def launch(self, cfg=CFG, voronoi=VORONOI):
         clearance.compute_clearance(
-            io_for(ClearanceIO, self.clearance, self.memory, self.grid_map, self.mask, self.clock, cfg, MAP, voronoi)
+            io_for(
+                ClearanceIO,
+                self.clearance,
+                self.memory,
+                self.grid_map,
+                self.mask,
+                self.clock,
+                cfg,
+                MAP,
+                voronoi,
+            )
         )
-        return tuple(f.to_numpy() for f in (self.clearance.clearance_m, self.clearance.site_row, self.clearance.site_col))
+        return tuple(
+            f.to_numpy()
+            for f in (self.clearance.clearance_m, self.clearance.site_row, self.clearance.site_col)
+        )
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +97,8 @@ def _fresh_clock(stage):
 
 
 def maps_of(seed):
-    """Eight kinds of maps: empty, one cell, sparse, dense, full, blobs, baffles with gaps, random corridors."""
+    """Eight kinds of maps: empty, one cell, sparse, dense, full, blobs, baffles with gaps, random
+    corridors."""
     rng = np.random.default_rng(seed)
     n_row, n_col = SHAPE
     maps = np.zeros((N_ENV, n_row, n_col))
@@ -106,7 +132,7 @@ def check(found, sites, cfg):
     assert np.abs(reach - distance[near]).max(initial=0) <= ROUNDING_M
 
 
-# ------------------------------------------------------------------------------------------------------------------- oracle
+# ----------------------------------------------------------------------------------------------------- oracle
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -117,14 +143,19 @@ def test_equals_the_exact_transform(stage, seed):
         check([f[env] for f in found], sites_of(static[env], 0, stage.outside, MAP.occupied, "static"), CFG)
 
 
-@pytest.mark.parametrize("outside", [outside_cells(TANK, MAP.cell_m), outside_cells(POND, MAP.cell_m)], ids=["tank", "pond"])
+@pytest.mark.parametrize(
+    "outside", [outside_cells(TANK, MAP.cell_m), outside_cells(POND, MAP.cell_m)], ids=["tank", "pond"]
+)
 def test_inflation_brings_obstacles_nearer_and_leaves_the_boundary(stage, outside):
-    """min(d_occ - inflation, d_bnd) wherever an obstacle is the nearest site; where the boundary is, its own distance, which is no more
-    than the inflation too large. The boundary and the water far from everything stay as they are."""
+    """min(d_occ - inflation, d_bnd) wherever an obstacle is the nearest site; where the boundary is, its own
+    distance, which is no more than the inflation too large. The boundary and the water far from everything
+    stay as they are."""
     stage.set_outside(np.array(outside))
     static, cfg = maps_of(8), ClearanceConfig(inflate_m=0.08)
     plain = stage.compute(static)
-    clearance.forget_clearance(io_for(ClearanceIO, stage.memory))  # the same map again, else there would be nothing to do
+    clearance.forget_clearance(
+        io_for(ClearanceIO, stage.memory)
+    )  # the same map again, else there would be nothing to do
     distance, site_row, site_col = stage.compute(static, cfg=cfg)
     clearance.forget_clearance(io_for(ClearanceIO, stage.memory))
     np.testing.assert_array_equal(plain[1], site_row)
@@ -138,7 +169,9 @@ def test_inflation_brings_obstacles_nearer_and_leaves_the_boundary(stage, outsid
         expected = np.where(near, np.maximum(to_obstacle - 0.08, 0.0), np.minimum(to_bound, CFG.max_m))
         assert np.abs(distance[env] - expected).max() <= ROUNDING_M
         letter = np.minimum(np.minimum(np.maximum(to_obstacle - 0.08, 0.0), to_bound), CFG.max_m)
-        assert np.all(distance[env] - letter < 0.08 + ROUNDING_M) and np.all(distance[env] - letter > -ROUNDING_M)
+        assert np.all(distance[env] - letter < 0.08 + ROUNDING_M) and np.all(
+            distance[env] - letter > -ROUNDING_M
+        )
         nearer += int(near.sum())
     assert nearer > 1000
 
@@ -223,7 +256,7 @@ def test_limits_of_the_keys():
     assert PACKET == LANES
 
 
-# --------------------------------------------------------------------------------------------------------------- properties
+# ------------------------------------------------------------------------------------------------- properties
 
 
 @st.composite

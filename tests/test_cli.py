@@ -1,4 +1,5 @@
-"""The command line as a newcomer meets it: results, exit codes, and one clear message for everything wrong."""
+"""The command line as a newcomer meets it: results, exit codes, and one clear message for everything
+wrong."""
 
 import ast
 import errno
@@ -49,7 +50,10 @@ def uuv(capfd, *arguments):
         (["eval", "--sensors", "nominl"], "did you mean 'nominal'"),
         (["eval", "--controller", "btt"], "did you mean 'bt'"),
         (["eval", "--controller", "nowhere.xml"], "no such file"),
-        (["eval", "--controller", "bt+trut"], "'+trut' is unknown; the one suffix is +truth, for example bt+truth"),
+        (
+            ["eval", "--controller", "bt+trut"],
+            "'+trut' is unknown; the one suffix is +truth, for example bt+truth",
+        ),
         (["eval", "--controller", "btt+truth"], "did you mean 'bt'"),
         (["eval", "--controller", "orakel"], "'orakel' is no preset"),
         (["eval", "--controller", "oracle", "--record", "1"], "the oracle drives no vehicle"),
@@ -80,7 +84,10 @@ def uuv(capfd, *arguments):
         (["simulate", "--seconds", "1", "--wrench", "1,2"], "give 6 finite numbers"),
         (["simulate", "--seconds", "1", "--wrench", "1,2,3,4,5,inf"], "give 6 finite numbers"),
         (["simulate", "--seconds", "1", "--dt", "0"], "dt"),
-        (["simulate", "--seconds", "1", "--attitude-hold", "ideel"], "--attitude-hold ideel: use ideal, thrusters or none"),
+        (
+            ["simulate", "--seconds", "1", "--attitude-hold", "ideel"],
+            "--attitude-hold ideel: use ideal, thrusters or none",
+        ),
         (["simulate", "--seconds", "1", "--vehicle", "bluerov9"], "did you mean"),
         (["profile", "--num-envs", "1,x"], "whole numbers"),
         (["profile", "--num-envs", "0"], "at least 1 env"),
@@ -120,7 +127,10 @@ def test_missing_and_corrupt_logs_are_refused(capfd, tmp_path, command, content)
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["simulate", "--seconds", "4", "--dt", "0.5", "--wrench", "90,0,0,0,0,5"], "use a smaller substep, --dt 0.125"),
+        (
+            ["simulate", "--seconds", "4", "--dt", "0.5", "--wrench", "90,0,0,0,0,5"],
+            "use a smaller substep, --dt 0.125",
+        ),
         (["simulate", "--seconds", "1", "--vehicle", "[/x].yaml"], "[/x].yaml"),
         (["log", "info", "[/x].mcap"], "[/x].mcap: cannot open"),
         (["report", "[/x]"], "[/x]: is no run folder"),
@@ -142,7 +152,8 @@ def test_what_once_was_a_traceback_or_passed_for_a_failure_is_refused(tmp_path, 
 
 def in_a_process(folder, *arguments, environment=None, stdout=subprocess.PIPE):
     done = subprocess.run(
-        [sys.executable, "-m", "uuvtai", *arguments], stdout=stdout, stderr=subprocess.PIPE, text=True, cwd=folder, check=False,
+        [sys.executable, "-m", "uuvtai", *arguments], stdout=stdout, stderr=subprocess.PIPE, text=True,
+        cwd=folder, check=False,
         env=os.environ | {"PYTHONPATH": str(Path(uuvtai.__file__).parents[1])} | (environment or {}),
     )  # fmt: skip
     return done.returncode, done.stdout, done.stderr
@@ -150,12 +161,15 @@ def in_a_process(folder, *arguments, environment=None, stdout=subprocess.PIPE):
 
 @pytest.mark.parametrize("text", ["abc", "0", "-1", "1.5", "99999999999999999999"])
 def test_a_nonsense_thread_count_is_named(tmp_path, text):
-    code, _, err = in_a_process(tmp_path, "simulate", "--seconds", "0.1", environment={"UUV_NUM_THREADS": text})
+    code, _, err = in_a_process(
+        tmp_path, "simulate", "--seconds", "0.1", environment={"UUV_NUM_THREADS": text}
+    )
     assert code == 2 and f"UUV_NUM_THREADS='{text}'" in err
 
 
 def test_text_from_outside_is_never_markup(tmp_path, monkeypatch, capfd, evaluation):
-    """A run folder, a vehicle and a method whose names look like markup: in titles, cells and lines of every table."""
+    """A run folder, a vehicle and a method whose names look like markup: in titles, cells and lines of every
+    table."""
     folder, document, _ = evaluation
     odd = json.loads(json.dumps(document))
     odd["world"] = odd["sensors"] = "[/x]"
@@ -172,7 +186,15 @@ def test_text_from_outside_is_never_markup(tmp_path, monkeypatch, capfd, evaluat
 
 
 @pytest.mark.parametrize(
-    "error", [KeyError("x"), ValueError("y"), RuntimeError("z"), OverflowError("w"), StopIteration(), LookupError("v")]
+    "error",
+    [
+        KeyError("x"),
+        ValueError("y"),
+        RuntimeError("z"),
+        OverflowError("w"),
+        StopIteration(),
+        LookupError("v"),
+    ],
 )
 def test_a_bug_is_one_line_exit_1_and_a_file_with_the_traceback(error, capfd, tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
@@ -222,18 +244,39 @@ def test_closed_streams_are_like_the_null_device(tmp_path):
     environment = os.environ | {"PYTHONPATH": str(Path(uuvtai.__file__).parents[1])}
     for closed in (">&-", ">&- 2>&-", "<&- >&- 2>&-"):
         command = f"exec {sys.executable} -m uuvtai presets show pool {closed}"
-        done = subprocess.run(["sh", "-c", command], capture_output=True, cwd=tmp_path, env=environment, check=False)
+        done = subprocess.run(
+            ["sh", "-c", command], capture_output=True, cwd=tmp_path, env=environment, check=False
+        )
         assert (done.returncode, done.stdout, done.stderr) == (0, b"", b"")
 
 
 def test_every_refusal_of_the_package_is_of_one_type():
     """Modules whose errors reach the user raise nothing plain: a plain one would be told as a bug of ours."""
     root = Path(uuvtai.__file__).parent
-    plain = {"ValueError", "RuntimeError", "MemoryError", "OverflowError", "FloatingPointError", "OSError", "KeyError"}
+    plain = {
+        "ValueError",
+        "RuntimeError",
+        "MemoryError",
+        "OverflowError",
+        "FloatingPointError",
+        "OSError",
+        "KeyError",
+    }
     found = {}
-    for path in [*root.glob("measure/**/*.py"), *root.glob("tree/*.py"), *root.glob("report/*.py"), root / "sizes.py", root / "runtime.py"]:
-        raised = [node.exc.func.id for node in ast.walk(ast.parse(path.read_text()))
-                  if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call) and isinstance(node.exc.func, ast.Name)]  # fmt: skip
+    for path in [
+        *root.glob("measure/**/*.py"),
+        *root.glob("tree/*.py"),
+        *root.glob("report/*.py"),
+        root / "sizes.py",
+        root / "runtime.py",
+    ]:
+        raised = [
+            node.exc.func.id
+            for node in ast.walk(ast.parse(path.read_text()))
+            if isinstance(node, ast.Raise)
+            and isinstance(node.exc, ast.Call)
+            and isinstance(node.exc.func, ast.Name)
+        ]
         if odd := [name for name in raised if name in plain]:
             found[str(path.relative_to(root))] = sorted(set(odd))
     assert found == PLAIN
@@ -253,9 +296,17 @@ def test_presets_are_listed_and_shown(capfd):
     assert code == 0
     assert {"pool", "gauntlet", "mixed", "maze", "netpen", "transfer", "open"} <= set(listed["world"])
     assert {"clean", "paper", "nominal", "harsh"} == set(listed["sensors"])
-    assert {"paper", "ppo", "distill_20", "curriculum", "full", "no_risk_scaling", "no_world_model", "no_distill", "smoke"} <= set(
-        listed["train"]
-    )
+    assert {
+        "paper",
+        "ppo",
+        "distill_20",
+        "curriculum",
+        "full",
+        "no_risk_scaling",
+        "no_world_model",
+        "no_distill",
+        "smoke",
+    } <= set(listed["train"])
     code, out, _ = uuv(capfd, "presets", "show", "gauntlet", "--all")
     assert code == 0
     assert "n_dynamic: 6" in out
@@ -270,7 +321,9 @@ def test_presets_are_listed_and_shown(capfd):
 
 def test_doctor_finds_everything(capfd, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(default_cfg(), "offline_cache_file_path", str(tmp_path))  # a killed test may have left its lock in the real one
+    monkeypatch.setattr(
+        default_cfg(), "offline_cache_file_path", str(tmp_path)
+    )  # a killed test may have left its lock in the real one
     code, out, _ = uuv(capfd, "doctor", "--json")
     found = json.loads(out)
     assert code == 0, found
@@ -279,13 +332,16 @@ def test_doctor_finds_everything(capfd, tmp_path, monkeypatch):
 
 
 def test_doctor_finds_the_lock_of_a_killed_process(tmp_path, monkeypatch):
-    """With it Taichi neither reads nor writes its cache: each start takes a minute, and only a warning says so."""
+    """With it Taichi neither reads nor writes its cache: each start takes a minute, and only a warning says
+    so."""
     monkeypatch.setattr(default_cfg(), "offline_cache_file_path", str(tmp_path))
     lock = tmp_path / "ticache.lock"
     lock.touch()
     assert "0.0 MB" in doctor._cache(), "a fresh lock has an owner"
     os.utime(lock, (time.time() - 3600,) * 2)
-    with pytest.raises(RuntimeError, match=r"ticache\.lock was left by a process that was killed.*delete this file"):
+    with pytest.raises(
+        RuntimeError, match=r"ticache\.lock was left by a process that was killed.*delete this file"
+    ):
         doctor._cache()
 
 
@@ -296,7 +352,9 @@ def test_a_start_removes_the_lock_of_a_killed_process_and_no_other(tmp_path):
     os.utime(old, (time.time() - 3600,) * 2)
     start = "from uuvtai.runtime import start_taichi; start_taichi('cpu')"
     environment = os.environ | {"TI_OFFLINE_CACHE_FILE_PATH": str(tmp_path)}
-    done = subprocess.run([sys.executable, "-c", start], env=environment, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", start], env=environment, capture_output=True, text=True, check=True
+    )
     assert "Lock" not in done.stdout + done.stderr
     assert not old.exists() and fresh.exists()
 
@@ -317,7 +375,8 @@ HEAVY = ("taichi", "torch", "cv2", "ompl", "numpy", "yaml", "matplotlib", "tenso
 def test_help_is_quick_because_it_imports_nothing_heavy(arguments):
     program = (
         "import sys\nfrom uuvtai.cli import main\n"
-        f"try: main({arguments})\nexcept SystemExit as left: print('left', left.code, [m for m in {HEAVY} if m in sys.modules])"
+        f"try: main({arguments})\nexcept SystemExit as left: print('left', left.code, [m for m in {HEAVY} if "
+        "m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.strip().endswith("left 0 []")
@@ -328,21 +387,28 @@ def evaluation(tmp_path_factory):
     """One real evaluation in a process of its own: two controllers, recorded, as JSON."""
     folder = tmp_path_factory.mktemp("eval") / "run"
     command = [
-        sys.executable, "-m", "uuvtai", "eval", "--controller", "straight,bt", "--episodes", "4", "--seeds", "3", *SmallSim.OPTIONS,
-        "--record", "1", "--video", "--set", "episode.horizon_steps=400", "--run-dir", str(folder), "--report", "--json",
+        sys.executable, "-m", "uuvtai", "eval", "--controller", "straight,bt", "--episodes", "4", "--seeds",
+        "3", *SmallSim.OPTIONS,
+        "--record", "1", "--video", "--set", "episode.horizon_steps=400", "--run-dir", str(folder),
+        "--report", "--json",
     ]  # fmt: skip
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ, "NO_COLOR": "1"})
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False, env={**os.environ, "NO_COLOR": "1"}
+    )
     assert done.returncode == 0, done.stderr
     return folder, json.loads(done.stdout), done.stderr
 
 
 def test_eval_prints_one_document_with_every_documented_key(evaluation):
     _, document, _ = evaluation
-    assert {"schema", "world", "S", "D", "v_m_s", "sensors", "seeds", "episodes_per_seed", "methods"} <= set(document)
+    assert {"schema", "world", "S", "D", "v_m_s", "sensors", "seeds", "episodes_per_seed", "methods"} <= set(
+        document
+    )
     assert [m["name"] for m in document["methods"]] == ["straight", "bt"]
     for method in document["methods"]:
         assert {
-            "name", "episodes", "outcomes", "success_rate", "success_ci95", "collision_rate", "collision_ci95", "return_mean",
+            "name", "episodes", "outcomes", "success_rate", "success_ci95", "collision_rate",
+            "collision_ci95", "return_mean",
             "time_mean_s", "tts_s", "time_to_success_mean_s", "min_clearance_mean_m", "path_length_mean_m",
             "replans_per_episode", "replans_by_trigger",
             "planned_by", "env_steps", "wall_s", "env_steps_per_s", "episodes_detail",
@@ -354,20 +420,29 @@ def test_eval_prints_one_document_with_every_documented_key(evaluation):
 
 
 def messages_of(log):
-    """(topic, time, content) of every message of a recorded episode: sensors, maps, tracks, routes, commands, truth."""
+    """(topic, time, content) of every message of a recorded episode: sensors, maps, tracks, routes, commands,
+    truth."""
     with log.open("rb") as file:
-        return [(channel.topic, message.log_time, message.data) for _, channel, message in make_reader(file).iter_messages()]
+        return [
+            (channel.topic, message.log_time, message.data)
+            for _, channel, message in make_reader(file).iter_messages()
+        ]
 
 
 def test_one_thread_gives_the_same_episodes_to_the_last_digit(evaluation, tmp_path):
     """Outcomes of four episodes, and all that one of them wrote down on its way."""
     folder, document, _ = evaluation
     command = [
-        sys.executable, "-m", "uuvtai", "eval", "--controller", "bt", "--episodes", "4", "--seeds", "3", *SmallSim.OPTIONS,
+        sys.executable, "-m", "uuvtai", "eval", "--controller", "bt", "--episodes", "4", "--seeds", "3",
+        *SmallSim.OPTIONS,
         "--record", "1", "--set", "episode.horizon_steps=400", "--run-dir", str(tmp_path / "run"), "--json",
     ]  # fmt: skip
-    done = subprocess.run(command, capture_output=True, text=True, check=True, env={**os.environ, "UUV_NUM_THREADS": "1"})
-    assert json.loads(done.stdout)["methods"][0]["episodes_detail"] == document["methods"][1]["episodes_detail"]
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=True, env={**os.environ, "UUV_NUM_THREADS": "1"}
+    )
+    assert (
+        json.loads(done.stdout)["methods"][0]["episodes_detail"] == document["methods"][1]["episodes_detail"]
+    )
     alone, together = (messages_of(run / "logs/bt_seed3_episode0.mcap") for run in (tmp_path / "run", folder))
     assert {topic for topic, _, _ in alone} >= {"/sonar/scan", "/map/static", "/map/dynamic"}
     assert alone == together
@@ -377,7 +452,8 @@ def test_eval_leaves_a_complete_run_folder(evaluation):
     folder, document, _ = evaluation
     names = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
     assert {
-        "config.yaml", "run.json", "eval/result.json", "eval/tree.json", "eval/trees/bt.xml", "logs/bt_seed3_episode0.mcap",
+        "config.yaml", "run.json", "eval/result.json", "eval/tree.json", "eval/trees/bt.xml",
+        "logs/bt_seed3_episode0.mcap",
         "logs/straight_seed3_episode0.mcap", "pictures/seed3_episode0.png", "videos/bt_seed3_episode0.webm",
         "report.html", "figures/methods.png",
     } <= names  # fmt: skip
@@ -416,7 +492,9 @@ def test_an_existing_run_folder_is_never_overwritten(evaluation, capfd):
     assert (folder / "run.json").read_text() == before
 
 
-def test_a_place_without_room_for_a_run_folder_is_refused_before_anything_is_compiled(tmp_path, capfd, monkeypatch):
+def test_a_place_without_room_for_a_run_folder_is_refused_before_anything_is_compiled(
+    tmp_path, capfd, monkeypatch
+):
     (tmp_path / "file").write_text("mine")
     monkeypatch.setattr("uuvtai.sim.Sim", lambda *_: pytest.fail("compiles"))
     for command in (["eval", "--episodes", "1"], ["train", "smoke"]):
@@ -429,7 +507,8 @@ def test_a_place_without_room_for_a_run_folder_is_refused_before_anything_is_com
 def test_a_run_folder_that_cannot_be_written_is_refused(tmp_path):
     """Nobody, not even root, makes a folder there; that shows only when it is tried."""
     done = subprocess.run(
-        [sys.executable, "-m", "uuvtai", "eval", "--episodes", "1", *SmallSim.OPTIONS, "--run-dir", "/proc/nowhere/run"],
+        [sys.executable, "-m", "uuvtai", "eval", "--episodes", "1", *SmallSim.OPTIONS, "--run-dir",
+        "/proc/nowhere/run"],
         capture_output=True, text=True, check=False, cwd=tmp_path,
     )  # fmt: skip
     assert done.returncode == 2
@@ -439,14 +518,18 @@ def test_a_run_folder_that_cannot_be_written_is_refused(tmp_path):
 
 def _parts_with_messages(folder: Path) -> list[Path]:
     """Unfinished logs that have been flushed once at least: header and attachments alone are smaller."""
-    return [part for part in (folder / "logs").glob("*.part") if part.exists() and part.stat().st_size > 50_000]
+    return [
+        part for part in (folder / "logs").glob("*.part") if part.exists() and part.stat().st_size > 50_000
+    ]
 
 
 def test_interrupt_leaves_a_marked_run_and_repairable_logs(evaluation, tmp_path):
-    """The same sizes and rules as ``evaluation``, whose kernels are compiled by now: a compiling process does not listen."""
+    """The same sizes and rules as ``evaluation``, whose kernels are compiled by now: a compiling process does
+    not listen."""
     folder = tmp_path / "run"
     process = subprocess.Popen(
-        [sys.executable, "-m", "uuvtai", "eval", "--controller", "bt", "--episodes", "400", "--seeds", "3", *SmallSim.OPTIONS,
+        [sys.executable, "-m", "uuvtai", "eval", "--controller", "bt", "--episodes", "400", "--seeds", "3",
+        *SmallSim.OPTIONS,
          "--set", "episode.horizon_steps=400", "--record", "400", "--run-dir", str(folder)],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
@@ -460,6 +543,11 @@ def test_interrupt_leaves_a_marked_run_and_repairable_logs(evaluation, tmp_path)
     assert "Traceback" not in err
     assert json.loads((folder / "run.json").read_text())["status"] == "interrupted"
     part = _parts_with_messages(folder)[0]
-    done = subprocess.run([sys.executable, "-m", "uuvtai", "log", "repair", str(part)], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-m", "uuvtai", "log", "repair", str(part)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     assert "messages recovered" in done.stdout

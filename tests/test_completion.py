@@ -1,4 +1,5 @@
-"""The command line answers quickly: what help, completion and light commands import, and what completion offers."""
+"""The command line answers quickly: what help, completion and light commands import, and what completion
+offers."""
 
 import os
 import re
@@ -35,21 +36,24 @@ def modules_after(*arguments, **environment):
     """(exit code, modules loaded) of a command in a process of its own."""
     program = (
         "import sys\nfrom uuvtai.cli import main\n"
-        f"try: main({list(arguments)})\nexcept SystemExit as left: print('left', left.code, *sys.modules, file=sys.stderr)"
+        f"try: main({list(arguments)})\nexcept SystemExit as left: print('left', left.code, *sys.modules, "
+        "file=sys.stderr)"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     _left, code, *modules = done.stderr.splitlines()[-1].split()
     return int(code), set(modules)
 
 
-@pytest.mark.parametrize("arguments", [["tree"], ["tree", "--dot", "--controller", "planner"], ["tree", "--json"]])
+@pytest.mark.parametrize(
+    "arguments", [["tree"], ["tree", "--dot", "--controller", "planner"], ["tree", "--json"]]
+)
 def test_a_tree_is_printed_without_torch_and_taichi(arguments):
     code, modules = modules_after(*arguments)
     assert code == 0
     assert not {"torch", "taichi", "cv2"} & modules
 
 
-# ------------------------------------------------------------------------------------------------------------------- help
+# ------------------------------------------------------------------------------------------------------- help
 
 
 @pytest.mark.parametrize("words", COMMANDS, ids=lambda words: " ".join(words) or "uuv")
@@ -82,7 +86,7 @@ def test_what_may_be_typed_stands_beside_every_option(words):
                 assert "|" in parameter.metavar
 
 
-# ----------------------------------------------------------------------------------------------------------------- choices
+# ---------------------------------------------------------------------------------------------------- choices
 
 
 @pytest.mark.parametrize(
@@ -99,7 +103,9 @@ def test_what_may_be_typed_stands_beside_every_option(words):
         (["presets", "show", "train/curiculum"], "did you mean 'curriculum'"),
     ],
 )
-def test_a_wrong_word_is_refused_at_once_and_the_right_one_named(arguments, says, capfd, tmp_path, monkeypatch):
+def test_a_wrong_word_is_refused_at_once_and_the_right_one_named(
+    arguments, says, capfd, tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as left:
         main(arguments)
@@ -108,17 +114,23 @@ def test_a_wrong_word_is_refused_at_once_and_the_right_one_named(arguments, says
     assert out == "" and "starting" not in err and not list(tmp_path.iterdir())
 
 
-# -------------------------------------------------------------------------------------------------------------- completion
+# ------------------------------------------------------------------------------------------------- completion
 
 
 def completed(words, cwd, shell="bash"):
-    """What the shell is offered after these words, the last of which is being typed; and the modules that it took."""
-    program = "import sys\nfrom uuvtai.cli import main\ntry: main()\nfinally: print(*sys.modules, file=sys.stderr)"
+    """What the shell is offered after these words, the last of which is being typed; and the modules that it
+    took."""
+    program = (
+        "import sys\nfrom uuvtai.cli import main\ntry: main()\nfinally: print(*sys.modules, file=sys.stderr)"
+    )
     environment = os.environ | {
-        "_UUV_COMPLETE": f"complete_{shell}", "COMP_WORDS": "uuv " + " ".join(words), "COMP_CWORD": str(len(words)),
+        "_UUV_COMPLETE": f"complete_{shell}", "COMP_WORDS": "uuv " + " ".join(words),
+        "COMP_CWORD": str(len(words)),
         "_TYPER_COMPLETE_ARGS": "uuv " + " ".join(words),
     }  # fmt: skip
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, env=environment, cwd=cwd)
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False, env=environment, cwd=cwd
+    )
     assert "Traceback" not in done.stderr, done.stderr
     return done.stdout.split(), set(done.stderr.split())
 
@@ -165,7 +177,10 @@ def test_the_shell_is_offered_names_and_folders(words, offers, runs):
 
 
 def test_completion_is_shown_for_a_shell():
-    code = "from typer.completion import get_completion_script as s; print(s(prog_name='uuv', complete_var='_UUV_COMPLETE', shell='bash'))"
+    code = (
+        "from typer.completion import get_completion_script as s; print(s(prog_name='uuv', "
+        "complete_var='_UUV_COMPLETE', shell='bash'))"
+    )
     wanted = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert "_UUV_COMPLETE=complete_bash" in wanted
     for option in ("--show-completion", "--install-completion"):
@@ -173,14 +188,19 @@ def test_completion_is_shown_for_a_shell():
 
 
 def test_everything_that_can_be_shown_is_offered():
-    assert set(choices.shown("")) == {name for kind in KINDS for name in preset_names(kind)} | {f"{kind}/" for kind in KINDS}
+    assert set(choices.shown("")) == {name for kind in KINDS for name in preset_names(kind)} | {
+        f"{kind}/" for kind in KINDS
+    }
 
 
 def test_a_folder_that_cannot_be_read_offers_nothing(tmp_path):
     assert choices.presets("world")(f"{tmp_path}/no/such/") == []
 
 
-@pytest.mark.parametrize("arguments", [["-h"], ["eval", "-h"], ["log", "-h"], ["presets"], ["presets", "show", "sensors/paper", "--json"]])
+@pytest.mark.parametrize(
+    "arguments",
+    [["-h"], ["eval", "-h"], ["log", "-h"], ["presets"], ["presets", "show", "sensors/paper", "--json"]],
+)
 def test_help_and_presets_import_little(arguments):
     code, modules = modules_after(*arguments)
     assert code == 0

@@ -1,4 +1,5 @@
-"""Logs with protobuf messages: nothing is lost or changed, and Rerun draws poses, transforms, images and point clouds from them."""
+"""Logs with protobuf messages: nothing is lost or changed, and Rerun draws poses, transforms, images and
+point clouds from them."""
 
 import base64
 import importlib.util
@@ -71,7 +72,9 @@ def test_every_message_is_there_and_says_the_same(recorded, converted):
     assert set(counts) == {topic for topic, _kind, _make in ADDED.values()}
     assert read_head(recorded) == read_head(converted)
     told = decoded(converted)
-    assert {topic["topic"] for topic in before["topics"] if topic["schema"].startswith("foxglove.")} == told.keys() - counts.keys()
+    assert {
+        topic["topic"] for topic in before["topics"] if topic["schema"].startswith("foxglove.")
+    } == told.keys() - counts.keys()
     for topic in told.keys() - counts.keys():
         for (time_ns, message), original in zip(told[topic], read_messages(recorded, [topic]), strict=True):
             assert time_ns == round(original.time_s * 1e9)
@@ -115,7 +118,9 @@ def test_occupied_cells_are_those_of_the_map(recorded, converted):
     for grid, (_time, cloud) in zip(grids, clouds, strict=True):
         values, origin = grid_values(grid), grid["pose"]["position"]
         rows, columns = np.nonzero(values >= Config().mapping.occupied)
-        expected = np.column_stack([origin["x"] + (columns + 0.5) * episode.CELL_M, origin["y"] + (rows + 0.5) * episode.CELL_M])
+        expected = np.column_stack(
+            [origin["x"] + (columns + 0.5) * episode.CELL_M, origin["y"] + (rows + 0.5) * episode.CELL_M]
+        )
         np.testing.assert_allclose(cloud_of(cloud)[:, :2], expected, atol=FLOAT32)
         assert cloud.frame_id == "world" and [field.name for field in cloud.fields] == ["x", "y", "z"]
 
@@ -125,9 +130,13 @@ def test_returns_lie_at_their_range_and_bearing(recorded, converted):
     hit = np.array(scan["intensities"]) > 0
     points = cloud_of(cloud)
     assert 0 < len(points) == hit.sum() < len(hit) and cloud.frame_id == "sonar"
-    np.testing.assert_allclose(np.hypot(points[:, 0], points[:, 1]), np.array(scan["ranges"])[hit], rtol=FLOAT32)
+    np.testing.assert_allclose(
+        np.hypot(points[:, 0], points[:, 1]), np.array(scan["ranges"])[hit], rtol=FLOAT32
+    )
     bearing = 2 * np.pi * np.flatnonzero(hit) / len(hit)
-    np.testing.assert_allclose(np.mod(np.arctan2(points[:, 1], points[:, 0]), 2 * np.pi), bearing, atol=FLOAT32)
+    np.testing.assert_allclose(
+        np.mod(np.arctan2(points[:, 1], points[:, 0]), 2 * np.pi), bearing, atol=FLOAT32
+    )
 
 
 def test_waypoints_look_ahead(recorded, converted):
@@ -141,13 +150,20 @@ def test_waypoints_look_ahead(recorded, converted):
 
 def test_rerun_draws_poses_transforms_images_and_clouds(converted, recorded):
     """Read back by the loader that Rerun's viewer has."""
-    reader = pytest.importorskip("rerun.chunk", reason="needs rerun-sdk (uuvtai[dev])").McapReader(str(converted))
+    reader = pytest.importorskip("rerun.chunk", reason="needs rerun-sdk (uuvtai[dev])").McapReader(
+        str(converted)
+    )
     columns, values = {}, {}
     for chunk in reader.stream():
         batch = chunk.to_record_batch()
         entity = str(chunk.entity_path)
         columns.setdefault(entity, set()).update(batch.schema.names)
-        for name in ("Points3D:positions", "InstancePoses3D:translations", "Transform3D:translation", "EncodedImage:blob"):
+        for name in (
+            "Points3D:positions",
+            "InstancePoses3D:translations",
+            "Transform3D:translation",
+            "EncodedImage:blob",
+        ):
             if name in batch.schema.names:
                 values.setdefault((entity, name), []).extend(batch.column(name).to_pylist())
     cells = values["/map/static/cells", "Points3D:positions"]
@@ -163,7 +179,7 @@ def test_rerun_draws_poses_transforms_images_and_clouds(converted, recorded):
     assert "TextLog:text" in columns["/log"] and "CoordinateFrame:frame" in columns["/pose"]
 
 
-# ------------------------------------------------------------------------------------------------------------------ errors
+# ----------------------------------------------------------------------------------------------------- errors
 
 
 def run_cli(*arguments):
@@ -233,7 +249,13 @@ def test_the_runs_own_threshold_counts(tmp_path, recorded):
     grid = json.dumps(by_topic(recorded, "/map/static")[-1]).encode()
     sizes = []
     for number, occupied in enumerate((0.1, 2.0)):
-        path = one_message(tmp_path / f"{number}.mcap", "/map/static", "foxglove.Grid", grid, f"mapping: {{occupied: {occupied}}}".encode())
+        path = one_message(
+            tmp_path / f"{number}.mcap",
+            "/map/static",
+            "foxglove.Grid",
+            grid,
+            f"mapping: {{occupied: {occupied}}}".encode(),
+        )
         convert(path, tmp_path / f"{number}_out.mcap")
         sizes.append(len(decoded(tmp_path / f"{number}_out.mcap")["/map/static/cells"][0][1].data))
     assert sizes[0] > sizes[1] == 0
@@ -249,7 +271,14 @@ def test_durations_and_times_are_exact():
     from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 
     entity = SceneEntity.FromString(
-        serialised(SceneEntity, {"timestamp": {"sec": 90061, "nsec": 20000001}, "lifetime": {"sec": 2, "nsec": 5}})
+        serialised(
+            SceneEntity, {"timestamp": {"sec": 90061, "nsec": 20000001}, "lifetime": {"sec": 2, "nsec": 5}}
+        )
     )
-    assert (entity.timestamp.seconds, entity.timestamp.nanos, entity.lifetime.seconds, entity.lifetime.nanos) == (90061, 20000001, 2, 5)
+    assert (
+        entity.timestamp.seconds,
+        entity.timestamp.nanos,
+        entity.lifetime.seconds,
+        entity.lifetime.nanos,
+    ) == (90061, 20000001, 2, 5)
     assert json_format.MessageToDict(entity)["lifetime"] == "2.000000005s"

@@ -1,4 +1,5 @@
-"""Exported policies: NumPy, ONNX Runtime and torch agree with the pilot; folders are whole, checked, and never believed."""
+"""Exported policies: NumPy, ONNX Runtime and torch agree with the pilot; folders are whole, checked, and
+never believed."""
 
 import ast
 import json
@@ -29,7 +30,12 @@ from uuvtai.loader import ConfigError, load_training
 
 N_OBS = 40
 TEACHER = slice(30, 34)
-TABLE = [("goal", 0, 3, "m", "body"), ("rest", 3, 30, "1", "level"), (TEACHER_COLUMN, 30, 34, "1", "body"), ("more", 34, 40, "s", "body")]
+TABLE = [
+    ("goal", 0, 3, "m", "body"),
+    ("rest", 3, 30, "1", "level"),
+    (TEACHER_COLUMN, 30, 34, "1", "body"),
+    ("more", 34, 40, "s", "body"),
+]
 SMALL = {"policy.hidden": [16, 16], "world_model.hidden": [16], "world_model.latent": 8, "risk.hidden": [8]}
 
 
@@ -41,7 +47,9 @@ class Column:
 
 
 def config_of(**changes):
-    return load_training("smoke", list((SMALL | {key.replace("__", "."): value for key, value in changes.items()}).items()))
+    return load_training(
+        "smoke", list((SMALL | {key.replace("__", "."): value for key, value in changes.items()}).items())
+    )
 
 
 def networks(config, seed=0):
@@ -88,16 +96,23 @@ def no_onnx(monkeypatch):
     monkeypatch.setattr(deploy, "missing_packages", lambda: ["onnx"])
 
 
-# --------------------------------------------------------------------------------------------------------------- agreement
+# -------------------------------------------------------------------------------------------------- agreement
 
 CASES = {
     "residual held for ten steps": {"policy.residual": True, "policy.hold_steps": 10},
     "residual at every step": {"policy.residual": True},
     "plain, held for ten": {"policy.hold_steps": 10},
     "plain at every step": {},
-    "no features, tanh": {"world_model.as_features": False, "policy.activation": "tanh", "policy.hold_steps": 3},
+    "no features, tanh": {
+        "world_model.as_features": False,
+        "policy.activation": "tanh",
+        "policy.hold_steps": 3,
+    },
     "no risk head, relu": {"risk.enabled": False, "policy.activation": "relu"},
-    "world model as in the paper": {"world_model.predict_change": False, "world_model.normalise_targets": True},
+    "world model as in the paper": {
+        "world_model.predict_change": False,
+        "world_model.normalise_targets": True,
+    },
     "targets as they are": {"world_model.predict_change": False, "world_model.normalise_targets": False},
 }
 
@@ -129,10 +144,21 @@ def test_numpy_and_a_decision_without_memory_agree_with_the_pilot(tmp_path, chan
 
 def test_networks_that_have_seen_nothing_agree_too():
     config, rng = config_of(), torch.Generator().manual_seed(0)
-    pilot = Pilot(ActorCritic(N_OBS + 2, config.policy, None, rng), WorldModel(N_OBS, config.world_model, rng), 1)
+    pilot = Pilot(
+        ActorCritic(N_OBS + 2, config.policy, None, rng), WorldModel(N_OBS, config.world_model, rng), 1
+    )
     golden = golden_of(pilot)
-    spec = {"observation": {"width": N_OBS}, "action": [{"limit": 1.0}] * 4, "rate": {"hold_steps": 1, "control_dt_s": 0.02}}
-    spec["network"] = {"teacher_columns": None, "activation": "elu", "predict_change": True, "residual_limit": 0.5}
+    spec = {
+        "observation": {"width": N_OBS},
+        "action": [{"limit": 1.0}] * 4,
+        "rate": {"hold_steps": 1, "control_dt_s": 0.02},
+    }
+    spec["network"] = {
+        "teacher_columns": None,
+        "activation": "elu",
+        "predict_change": True,
+        "residual_limit": 0.5,
+    }
     policy = run_policy.Policy(spec, {name: tensor.numpy() for name, tensor in weights_of(pilot).items()})
     told = run_policy.replayed(policy, golden)
     assert max(run_policy.difference(values, golden[name]) for name, values in told.items()) <= TOLERANCE
@@ -172,12 +198,16 @@ def test_the_alarm_sounds_from_the_threshold_on(tmp_path, no_onnx):
     assert len(set(alarms)) == 2
 
 
-# ----------------------------------------------------------------------------------------------------------------- folder
+# ----------------------------------------------------------------------------------------------------- folder
 
 
 @pytest.mark.skipif(bool(missing_packages()), reason="needs the extra uuvtai[export]")
 @pytest.mark.parametrize(
-    "changes", [{"policy__residual": True, "policy__hold_steps": 10}, {"risk__enabled": False, "world_model__as_features": False}]
+    "changes",
+    [
+        {"policy__residual": True, "policy__hold_steps": 10},
+        {"risk__enabled": False, "world_model__as_features": False},
+    ],
 )
 def test_onnx_runtime_agrees_and_the_folder_passes_its_check(tmp_path, changes, capfd):
     pytest.importorskip("onnxruntime")
@@ -212,26 +242,37 @@ def test_the_specification_says_what_every_column_is(tmp_path, no_onnx):
     assert [(row["name"], row["limit"], row["unit"]) for row in spec["action"]] == [
         ("surge", 0.6, "m/s"), ("sway", 0.6, "m/s"), ("heave", 0.4, "m/s"), ("yaw_rate", 1.0, "rad/s"),
     ]  # fmt: skip
-    assert (spec["rate"]["control_hz"], spec["rate"]["decision_hz"], spec["rate"]["hold_steps"]) == (50.0, 5.0, 10)
+    assert (spec["rate"]["control_hz"], spec["rate"]["decision_hz"], spec["rate"]["hold_steps"]) == (
+        50.0,
+        5.0,
+        10,
+    )
     assert spec["checkpoint"]["sha256"] == found.sha256
     listed = {path.name for path in (tmp_path / "out").iterdir()} - {"policy_spec.json"}
     assert set(spec["files"]) == listed == {"policy.safetensors", "golden.npz", "README.md", "run_policy.py"}
 
 
 def test_the_folder_drives_where_there_is_numpy_alone(folder):
-    """In a process that can import neither torch nor uuvtai; and the file itself imports NumPy and the standard library alone."""
+    """In a process that can import neither torch nor uuvtai; and the file itself imports NumPy and the
+    standard library alone."""
     code = (
         "import sys, runpy\n"
         "class Guard:\n"
         "    def find_spec(self, name, path=None, target=None):\n"
-        "        if name.split('.')[0] in ('torch', 'uuvtai', 'taichi', 'safetensors', 'onnxruntime', 'onnx'): raise ImportError(name)\n"
-        "sys.meta_path.insert(0, Guard()); sys.argv = ['run_policy.py']; runpy.run_path('run_policy.py', run_name='__main__')"
+        "        if name.split('.')[0] in ('torch', 'uuvtai', 'taichi', 'safetensors', 'onnxruntime', "
+        "'onnx'): raise ImportError(name)\n"
+        "sys.meta_path.insert(0, Guard()); sys.argv = ['run_policy.py']; runpy.run_path('run_policy.py', "
+        "run_name='__main__')"
     )
-    done = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, timeout=120, check=False
+    )
     assert done.returncode == 0, done.stderr
     assert "risk: largest difference" in done.stdout and "p50" in done.stdout
     roots = {
-        (node.module or "").split(".")[0] if isinstance(node, ast.ImportFrom) else node.names[0].name.split(".")[0]
+        (node.module or "").split(".")[0]
+        if isinstance(node, ast.ImportFrom)
+        else node.names[0].name.split(".")[0]
         for node in ast.walk(ast.parse((folder / "run_policy.py").read_text()))
         if isinstance(node, ast.Import | ast.ImportFrom)
     }
@@ -242,7 +283,10 @@ def test_constants_that_the_driver_repeats_are_those_of_the_package():
     from uuvtai.learn import risk, world_model
 
     assert (run_policy.N_TARGET, run_policy.N_ACTION) == (world_model.N_TARGET, world_model.N_ACTION)
-    assert (run_policy._LOG_VAR, run_policy._MAX_DEVIATIONS) == (world_model.LOG_VAR_BOUNDS, world_model.MAX_DEVIATIONS)
+    assert (run_policy._LOG_VAR, run_policy._MAX_DEVIATIONS) == (
+        world_model.LOG_VAR_BOUNDS,
+        world_model.MAX_DEVIATIONS,
+    )
     assert run_policy._MAX_LOGIT == risk.MAX_LOGIT
 
 
@@ -282,15 +326,25 @@ def test_networks_that_cannot_drive_are_not_exported(tmp_path, no_onnx):
     assert not (tmp_path / "out").exists()
 
 
-# -------------------------------------------------------------------------------------------------------------------- card
+# ------------------------------------------------------------------------------------------------------- card
 
 
 def result_of(found, k=90, n=100):
     """A result of ``uuv eval`` with this checkpoint and a tree."""
     outcomes = {"success": k, "collision": n - k - 2, "ttc": 1, "out_of_tank": 0, "timeout": 1}
     methods = [{"name": "bt", "episodes": n, "outcomes": outcomes}]
-    methods.append({"name": "mine", "episodes": n, "outcomes": outcomes, "checkpoint": {"sha256": found.sha256}})
-    return {"world": "pool", "S": 8, "D": 6, "v_m_s": 0.6, "sensors": "paper", "seeds": [1, 2], "methods": methods}
+    methods.append(
+        {"name": "mine", "episodes": n, "outcomes": outcomes, "checkpoint": {"sha256": found.sha256}}
+    )
+    return {
+        "world": "pool",
+        "S": 8,
+        "D": 6,
+        "v_m_s": 0.6,
+        "sensors": "paper",
+        "seeds": [1, 2],
+        "methods": methods,
+    }
 
 
 def written(folder, result):
@@ -300,13 +354,23 @@ def written(folder, result):
 
 
 def test_the_card_has_counts_and_intervals(tmp_path, no_onnx):
-    found = saved(tmp_path / "run", metrics={"eval/success_rate": 0.5, "eval/collision_rate": 0.25, "time/env_steps": 2e6})
+    found = saved(
+        tmp_path / "run",
+        metrics={"eval/success_rate": 0.5, "eval/collision_rate": 0.25, "time/env_steps": 2e6},
+    )
     written(tmp_path / "run" / "eval_pool", result_of(found))
     elsewhere = written(tmp_path / "elsewhere", result_of(found, 40, 50))
     exported(found, tmp_path / "out", evaluations=[elsewhere])
     card = (tmp_path / "out" / "README.md").read_text()
-    assert "pool, S = 8, D = 6, v = 0.6 m/s, paper sensing, seed 1, 2 | 90/100 = 90.0 % [82.6, 94.5] | 9/100 = 9.0 %" in card
-    assert "40/50 = 80.0 %" in card and "2/4 = 50.0 % [15.0, 85.0] | 1/4" in card and "too good by selection" in card
+    assert (
+        "pool, S = 8, D = 6, v = 0.6 m/s, paper sensing, seed 1, 2 | 90/100 = 90.0 % [82.6, 94.5] | 9/100 = "
+        "9.0 %" in card
+    )
+    assert (
+        "40/50 = 80.0 %" in card
+        and "2/4 = 50.0 % [15.0, 85.0] | 1/4" in card
+        and "too good by selection" in card
+    )
     assert "2.00 million env-steps" in card
 
 
@@ -321,7 +385,12 @@ def test_evaluations_of_something_else_are_refused(tmp_path):
     with pytest.raises(ConfigError, match="does not evaluate this checkpoint"):
         evaluations_of(found, [written(tmp_path / "other", other)])
     for number, broken in enumerate(
-        (result_of(found, k=-3), {"methods": [3]}, [], {"methods": [{"checkpoint": {"sha256": found.sha256}}]})
+        (
+            result_of(found, k=-3),
+            {"methods": [3]},
+            [],
+            {"methods": [{"checkpoint": {"sha256": found.sha256}}]},
+        )
     ):
         with pytest.raises(ConfigError, match="is no result of uuv eval"):
             evaluations_of(found, [written(tmp_path / str(number), broken)])
@@ -329,7 +398,7 @@ def test_evaluations_of_something_else_are_refused(tmp_path):
         evaluations_of(found, [tmp_path / "nowhere"])
 
 
-# ---------------------------------------------------------------------------------------------------------------- command
+# ---------------------------------------------------------------------------------------------------- command
 
 
 def run_cli(*arguments):
@@ -391,7 +460,9 @@ def test_other_weights_with_the_right_sha256_are_exit_3(folder, tmp_path, capfd)
     resigned(folder, "policy.safetensors", save(weights))
     assert run_cli("export", "--check", folder) == 3
     assert "DIFFERS" in capfd.readouterr().out
-    done = subprocess.run([sys.executable, "run_policy.py"], cwd=folder, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(
+        [sys.executable, "run_policy.py"], cwd=folder, capture_output=True, text=True, timeout=60, check=False
+    )
     assert done.returncode == 3
 
 
@@ -410,7 +481,7 @@ def test_bad_usage(arguments, says, code, capfd, tmp_path, monkeypatch):
     assert says in capfd.readouterr().err
 
 
-# ---------------------------------------------------------------------------------------------------------- hostile folders
+# -------------------------------------------------------------------------------------------- hostile folders
 
 
 def with_header(header, data=b""):
@@ -426,12 +497,18 @@ BAD_WEIGHTS = {
     "nested without end": with_header(b"[" * 100_000),
     "a list": with_header([1]),
     "beyond the data": with_header({"a": {"dtype": "F32", "shape": [4], "data_offsets": [0, 16]}}, bytes(8)),
-    "overlapping": with_header({n: {"dtype": "F32", "shape": [2], "data_offsets": [0, 8]} for n in "ab"}, bytes(16)),
-    "shape unlike bytes": with_header({"a": {"dtype": "F32", "shape": [1 << 40, 1 << 40], "data_offsets": [0, 8]}}, bytes(8)),
+    "overlapping": with_header(
+        {n: {"dtype": "F32", "shape": [2], "data_offsets": [0, 8]} for n in "ab"}, bytes(16)
+    ),
+    "shape unlike bytes": with_header(
+        {"a": {"dtype": "F32", "shape": [1 << 40, 1 << 40], "data_offsets": [0, 8]}}, bytes(8)
+    ),
     "negative": with_header({"a": {"dtype": "F32", "shape": [-1, -2], "data_offsets": [0, 8]}}, bytes(8)),
     "objects": with_header({"a": {"dtype": "O", "shape": [1], "data_offsets": [0, 8]}}, bytes(8)),
     "too much data": with_header({"a": {"dtype": "F32", "shape": [1], "data_offsets": [0, 4]}}, bytes(8)),
-    "NaN": with_header({"a": {"dtype": "F32", "shape": [1], "data_offsets": [0, 4]}}, np.float32("nan").tobytes()),
+    "NaN": with_header(
+        {"a": {"dtype": "F32", "shape": [1], "data_offsets": [0, 4]}}, np.float32("nan").tobytes()
+    ),
 }
 
 
@@ -468,7 +545,10 @@ def test_networks_that_do_not_fit_the_specification(folder, change):
         ("[]", "is not the specification"),
         ('{"schema": 2}', "is not the specification"),
         ('{"schema": 1, "files": {}}', "lists other files"),
-        ('{"schema": 1, "files": {"policy.safetensors": "", "golden.npz": "", "../../etc/passwd": ""}}', "lists other files"),
+        (
+            '{"schema": 1, "files": {"policy.safetensors": "", "golden.npz": "", "../../etc/passwd": ""}}',
+            "lists other files",
+        ),
     ],
 )
 def test_specifications_are_read_without_trust(folder, text, says, capfd):

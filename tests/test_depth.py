@@ -10,7 +10,15 @@ from tests.reference.depth import camera_position, camera_rays, z_depths
 from uuvtai.config import DepthConfig, TankConfig
 from uuvtai.kernels.sensors import depth
 from uuvtai.kernels.sensors.bundles import DepthIO
-from uuvtai.state import ClockState, DepthImage, EpisodeState, Proprioception, VehicleState, WorldState, allocate
+from uuvtai.state import (
+    ClockState,
+    DepthImage,
+    EpisodeState,
+    Proprioception,
+    VehicleState,
+    WorldState,
+    allocate,
+)
 
 N_ENV, N_BODY, N_BATCH = 125, 14, 8
 CLEAN = DepthConfig()
@@ -18,14 +26,16 @@ SIZES = {
     "n_env": N_ENV, "n_body": N_BODY, "n_thruster": 6, "n_pixel_row": CLEAN.rows, "n_pixel_col": CLEAN.cols,
 }  # fmt: skip
 EVERY = 5
-"""MuJoCo and the oracle look at every fifth pixel, at another offset in each scene (5 is coprime to the packet width)."""
+"""MuJoCo and the oracle look at every fifth pixel, at another offset in each scene (5 is coprime to the
+packet width)."""
 
 TOLERANCE_M = 2.0e-3
 """Asked for by the issue; float32 rounding itself is below 0.1 mm but for grazing hits."""
 
 GRAZING_RAD = 2.0e-5
-"""A pixel whose answer changes when its ray is turned by this may give either answer: float32 places the camera to about 2e-6 m (an offset
-through the attitude, coordinates up to 20 m), which 0.1 m away is 2e-5 rad."""
+"""A pixel whose answer changes when its ray is turned by this may give either answer: float32 places the
+camera to about 2e-6 m (an offset through the attitude, coordinates up to 20 m), which 0.1 m away is 2e-5
+rad."""
 
 GRAZING_SHARE = 1.0e-4
 """At most this share of the pixels may need that allowance."""
@@ -53,7 +63,19 @@ class Rig:
         depth.reset_depth(io_for(DepthIO, self.image, self.clock))
 
     def shoot(self, config=CLEAN, tank=TANK):
-        depth.cast_depth(io_for(DepthIO, self.image, self.ego, self.vehicle, self.world, self.episode, self.clock, config, tank))
+        depth.cast_depth(
+            io_for(
+                DepthIO,
+                self.image,
+                self.ego,
+                self.vehicle,
+                self.world,
+                self.episode,
+                self.clock,
+                config,
+                tank,
+            )
+        )
         return self.image.depth_m.to_numpy()
 
 
@@ -69,7 +91,8 @@ def batches():
 
 
 def compare(image, scene, env, offset, tank, truth_of):
-    """Assert the pixels offset, offset + EVERY, ... of one image; returns (how many needed the grazing allowance, how many there were)."""
+    """Assert the pixels offset, offset + EVERY, ... of one image; returns (how many needed the grazing
+    allowance, how many there were)."""
     index = np.arange(offset, image.size, EVERY)
     pixels = np.stack([index // CLEAN.cols, index % CLEAN.cols], axis=1)
     rays, eye = camera_rays(scene["quat"][env], pixels, CLEAN), camera_position(scene, env, CLEAN)
@@ -77,7 +100,9 @@ def compare(image, scene, env, offset, tank, truth_of):
     got, truth = image.ravel()[index], np.minimum(cast(rays), CLEAN.max_range_m)
     wrong = np.abs(got - truth) > TOLERANCE_M
     if wrong.any():
-        low, high = (np.minimum(bound, CLEAN.max_range_m) for bound in scenes.envelope(cast, rays[wrong], GRAZING_RAD))
+        low, high = (
+            np.minimum(bound, CLEAN.max_range_m) for bound in scenes.envelope(cast, rays[wrong], GRAZING_RAD)
+        )
         assert np.all((got[wrong] >= low - TOLERANCE_M) & (got[wrong] <= high + TOLERANCE_M))
     return wrong.sum(), len(index)
 
@@ -120,8 +145,11 @@ def test_round_tank_against_mujoco(rig):
 
 
 def test_axes_and_scale_of_the_image(rig):
-    """A ball 0.5 m to the left of and 0.25 m above the axis, 2 m ahead of the camera, level and then rolled by 90 deg to the left."""
-    scene = scenes.one_body_scene(N_ENV, N_BODY, (5.0, 3.0, -0.8), kind=scenes.SPHERE, body_pos=(7.2, 3.5, -0.55), size=(0.1, 0.1, 0.1))
+    """A ball 0.5 m to the left of and 0.25 m above the axis, 2 m ahead of the camera, level and then rolled
+    by 90 deg to the left."""
+    scene = scenes.one_body_scene(
+        N_ENV, N_BODY, (5.0, 3.0, -0.8), kind=scenes.SPHERE, body_pos=(7.2, 3.5, -0.55), size=(0.1, 0.1, 0.1)
+    )
     rig.start(scene)
     image = rig.shoot()[0]
     row, col = np.argwhere(image < 2.5).mean(axis=0)
@@ -136,7 +164,9 @@ def test_axes_and_scale_of_the_image(rig):
 
 def test_body_around_the_image_plane_is_not_lost(rig):
     """A box whose corners lie behind the camera while its face is in view."""
-    scene = scenes.one_body_scene(N_ENV, N_BODY, (5.0, 3.0, -0.8), kind=scenes.BOX, body_pos=(5.2, 4.0, -0.8), size=(0.9, 0.5, 0.8))
+    scene = scenes.one_body_scene(
+        N_ENV, N_BODY, (5.0, 3.0, -0.8), kind=scenes.BOX, body_pos=(5.2, 4.0, -0.8), size=(0.9, 0.5, 0.8)
+    )
     rig.start(scene)
     image = rig.shoot()[0]
     assert_images([image], scene, TANK, by_oracle, range(1))
@@ -177,7 +207,9 @@ def test_rate_and_labels(rig):
         shot = step - step % 5
         assert np.all(rig.image.fresh.to_numpy() == (step == shot))
         assert image[0, 36, 64] == pytest.approx(20.0 - 0.2 - 13.0 + 0.1 * shot, abs=1e-4)
-        assert np.all(rig.image.shot_pos_w.to_numpy() == shot) and np.all(rig.image.shot_rpy.to_numpy() == -shot)
+        assert np.all(rig.image.shot_pos_w.to_numpy() == shot) and np.all(
+            rig.image.shot_rpy.to_numpy() == -shot
+        )
         seen.append(image)
     assert np.array_equal(seen[0], seen[4]) and not np.array_equal(seen[4], seen[5])
 

@@ -1,4 +1,5 @@
-"""Distillation: loss, weights and errors on hand-computed numbers; teacher batches teach by their strength and skip what is not finite."""
+"""Distillation: loss, weights and errors on hand-computed numbers; teacher batches teach by their strength
+and skip what is not finite."""
 
 import math
 
@@ -23,7 +24,8 @@ FLOAT32 = 1e-6
 
 
 class LinearPolicy(nn.Module):
-    """Smallest thing with a mean: four actions linear in two inputs, and a critic that distillation must not touch."""
+    """Smallest thing with a mean: four actions linear in two inputs, and a critic that distillation must not
+    touch."""
 
     def __init__(self):
         super().__init__()
@@ -47,7 +49,9 @@ def test_the_error_is_the_squared_norm_over_the_four_actions():
     mean = torch.tensor([[1.0, 2.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.5]])
     teacher = torch.tensor([[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, -0.5]])
     assert imitation_error(mean, teacher).tolist() == [5.0, 1.0]
-    assert float(distillation_loss(mean, teacher, torch.tensor([0.5, 1.5]))) == pytest.approx((0.5 * 5 + 1.5 * 1) / 2)
+    assert float(distillation_loss(mean, teacher, torch.tensor([0.5, 1.5]))) == pytest.approx(
+        (0.5 * 5 + 1.5 * 1) / 2
+    )
 
 
 def test_weights_have_mean_one_and_bounds():
@@ -100,7 +104,9 @@ def test_strength_scales_the_step_and_zero_draws_nothing(lesson):
 
     def moved(strength):
         policy = LinearPolicy()
-        TeacherBatches(policy, DistillConfig(batch=64, steps=1)).update(x, teacher, weight, strength, torch.Generator().manual_seed(0))
+        TeacherBatches(policy, DistillConfig(batch=64, steps=1)).update(
+            x, teacher, weight, strength, torch.Generator().manual_seed(0)
+        )
         return (policy.actor.weight - 0.1).detach()
 
     # the weight is kept near 0.1: a step of 3e-5 is known to one part in a thousand

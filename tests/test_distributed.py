@@ -18,7 +18,9 @@ def free_port():
 
 def in_process(rank, port, work, answers):
     torch.set_num_threads(1)
-    os.environ.update(RANK=str(rank), LOCAL_RANK=str(rank), WORLD_SIZE="2", MASTER_ADDR="127.0.0.1", MASTER_PORT=str(port))
+    os.environ.update(
+        RANK=str(rank), LOCAL_RANK=str(rank), WORLD_SIZE="2", MASTER_ADDR="127.0.0.1", MASTER_PORT=str(port)
+    )
     processes = join_processes()
     try:
         answers.put((rank, work(processes)))
@@ -42,7 +44,10 @@ def two(work):
 
 def exchange(processes):
     r = float(processes.rank)
-    mean, total = [torch.tensor([r, 2.0]), torch.full((2, 2), r)], [torch.tensor([r + 1], dtype=torch.float64)]
+    mean, total = (
+        [torch.tensor([r, 2.0]), torch.full((2, 2), r)],
+        [torch.tensor([r + 1], dtype=torch.float64)],
+    )
     processes.average(mean)
     processes.total(total)
     metrics = processes.mean_metrics({"both": r, f"only_{processes.rank}": 5.0})

@@ -60,7 +60,12 @@ def test_off_by_default(calm):
 
 @pytest.mark.parametrize(
     ("name", "nominal", "spread"),
-    [("mass_kg", "mass_kg", 0.1), ("added_mass", "added_mass", 0.2), ("linear_damping",) * 2 + (0.5,), ("quadratic_damping",) * 2 + (0.5,)],
+    [
+        ("mass_kg", "mass_kg", 0.1),
+        ("added_mass", "added_mass", 0.2),
+        ("linear_damping",) * 2 + (0.5,),
+        ("quadratic_damping",) * 2 + (0.5,),
+    ],
 )
 def test_parameters_spread_uniformly(disturbed, name, nominal, spread):
     factor = getattr(disturbed.params, name).to_numpy() / np.array(getattr(disturbed.config.vehicle, nominal))
@@ -76,7 +81,9 @@ def test_parameters_spread_uniformly(disturbed, name, nominal, spread):
 def test_buoyancy_and_inertia_follow_the_mass(disturbed):
     p, v = disturbed.params, disturbed.config.vehicle
     factor = p.mass_kg.to_numpy() / v.mass_kg
-    assert np.allclose(p.buoyancy_n.to_numpy(), factor * v.water_density_kg_m3 * v.gravity_m_s2 * v.volume_m3, rtol=1e-6)
+    assert np.allclose(
+        p.buoyancy_n.to_numpy(), factor * v.water_density_kg_m3 * v.gravity_m_s2 * v.volume_m3, rtol=1e-6
+    )
     assert np.allclose(p.inertia.to_numpy(), factor[:, None] * np.array(v.inertia_kg_m2), rtol=1e-6)
 
 
@@ -137,7 +144,9 @@ def test_current_is_a_gauss_markov_process(disturbed):
         assert abs(np.corrcoef(first[:, axis], last[:, axis])[0, 1] - np.exp(-1)) < 4 / np.sqrt(N_ENV)
     kick = (second - np.exp(-0.02 / TAU_S) * first)[:, :2]
     assert np.abs(kick.std(axis=0) / (SIGMA * np.sqrt(1 - np.exp(-0.04 / TAU_S))) - 1).max() < STATISTICS
-    assert np.abs(np.corrcoef(kick.T, first[:, :2].T)[:2, 2:]).max() < 5 / np.sqrt(N_ENV)  # the first kick owes nothing to the initial draw
+    assert np.abs(np.corrcoef(kick.T, first[:, :2].T)[:2, 2:]).max() < 5 / np.sqrt(
+        N_ENV
+    )  # the first kick owes nothing to the initial draw
     assert abs(np.corrcoef(kick.T)[0, 1]) < 5 / np.sqrt(N_ENV)
 
 
@@ -149,7 +158,12 @@ def test_an_episode_is_a_function_of_its_key(disturbed):
         disturbed.reset(k)
         disturbed.step()
         p = disturbed.params
-        return np.c_[p.mass_kg.to_numpy(), p.quadratic_damping.to_numpy(), p.thruster_gain.to_numpy(), disturbed.current.vel_w.to_numpy()]
+        return np.c_[
+            p.mass_kg.to_numpy(),
+            p.quadratic_damping.to_numpy(),
+            p.thruster_gain.to_numpy(),
+            disturbed.current.vel_w.to_numpy(),
+        ]
 
     once = drawn(keys)
     order = rng.permutation(N_ENV)

@@ -1,4 +1,5 @@
-"""Rigid body in water: the design's reference table, an independent RK4 oracle, order of convergence, invariants, independent rows."""
+"""Rigid body in water: the design's reference table, an independent RK4 oracle, order of convergence,
+invariants, independent rows."""
 
 import json
 import os
@@ -24,7 +25,8 @@ PRINTED = 0.5e-3
 """The table prints three decimals."""
 
 F32_ACCELERATION = 2e-4
-"""[m/s^2, rad/s^2] single precision: forces of 100 N cancel to some 1e-5 N, divided by inertias of 0.4 kg m^2."""
+"""[m/s^2, rad/s^2] single precision: forces of 100 N cancel to some 1e-5 N, divided by inertias of 0.4 kg
+m^2."""
 
 F32_DRIFT_M = 2e-3
 """500 substeps of single precision over metres, and the second-order error of turning the current."""
@@ -82,7 +84,9 @@ def run_f64(cases, substeps, n_sample, **environment):
     job = {"cases": cases, "substeps": substeps, "n_sample": n_sample}
     command = [sys.executable, str(Path(__file__).parent / "physics_f64.py")]
     env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1]), **environment}
-    done = subprocess.run(command, input=json.dumps(job), capture_output=True, text=True, env=env, check=False)
+    done = subprocess.run(
+        command, input=json.dumps(job), capture_output=True, text=True, env=env, check=False
+    )
     assert done.returncode == 0, done.stderr[-2000:]
     runs = json.loads(done.stdout[done.stdout.index('{"') :])
     return {int(n): {name: np.array(x) for name, x in run.items()} for n, run in runs.items()}
@@ -95,7 +99,7 @@ def reference(case, seconds, dt=5e-3):
     return oracle.simulate(body, seconds, dt=dt, sample_s=SAMPLE_S, **settings_)
 
 
-# ---------------------------------------------------------------------------------------------------------- double precision
+# ------------------------------------------------------------------------------------------- double precision
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +112,10 @@ def exact_runs():
 def test_reference_table(exact_runs, case, time_s, quantity, component, value, digits):
     got = exact_runs[2][quantity][round(time_s / SAMPLE_S), list(TABLE).index(case), component]
     assert abs(got - value) < ALLOWED[quantity]
-    assert abs(exact_runs[4][quantity][round(time_s / SAMPLE_S), list(TABLE).index(case), component] - value) < 1.5 * digits
+    assert (
+        abs(exact_runs[4][quantity][round(time_s / SAMPLE_S), list(TABLE).index(case), component] - value)
+        < 1.5 * digits
+    )
 
 
 @pytest.mark.parametrize("index", range(6))
@@ -146,7 +153,7 @@ def test_thread_count_changes_nothing():
     assert all(np.array_equal(one[name], two[name]) for name in one)
 
 
-# ---------------------------------------------------------------------------------------------------------- single precision
+# ------------------------------------------------------------------------------------------- single precision
 
 N_ENV = 6
 
@@ -163,7 +170,11 @@ def random_state(plant, seed):
     plant.reset()
     q = rng.normal(size=(N_ENV, 4))
     q /= np.linalg.norm(q, axis=1, keepdims=True)
-    nu, wrench, current = rng.uniform(-1, 1, (N_ENV, 6)), rng.uniform(-20, 20, (N_ENV, 6)) * 0.5, rng.uniform(-0.5, 0.5, (N_ENV, 3))
+    nu, wrench, current = (
+        rng.uniform(-1, 1, (N_ENV, 6)),
+        rng.uniform(-20, 20, (N_ENV, 6)) * 0.5,
+        rng.uniform(-0.5, 0.5, (N_ENV, 3)),
+    )
     plant.write(plant.vehicle.quat_wb, q)
     plant.write(plant.vehicle.vel_b, nu[:, :3])
     plant.write(plant.vehicle.rate_b, nu[:, 3:])
@@ -184,13 +195,20 @@ def test_acceleration_equals_the_oracle(plant):
     for seed in range(5):
         q, nu, wrench, current = random_state(plant, seed)
         plant.step(substeps=1, dt_s=dt)
-        got = (np.c_[plant.vehicle.vel_b.to_numpy(), plant.vehicle.rate_b.to_numpy()].astype(float) - nu.astype(np.float32)) / dt
+        got = (
+            np.c_[plant.vehicle.vel_b.to_numpy(), plant.vehicle.rate_b.to_numpy()].astype(float)
+            - nu.astype(np.float32)
+        ) / dt
         for env in range(N_ENV):
             rotation = oracle.quaternion_rotation(q[env])
             want = oracle.nu_dot(oracle.Body(), rotation, nu[env], wrench[env], current[env])
-            middle = oracle.nu_dot(oracle.Body(), rotation, nu[env] + 0.5 * dt * want, wrench[env], current[env])
+            middle = oracle.nu_dot(
+                oracle.Body(), rotation, nu[env] + 0.5 * dt * want, wrench[env], current[env]
+            )
             rounding = 2 * np.finfo(np.float32).eps / dt  # nu is stored with 24 bits
-            turn = 60 * dt  # the attitude turns by up to 1 mrad meanwhile: some 60 times that in a restoring acceleration
+            turn = (
+                60 * dt
+            )  # the attitude turns by up to 1 mrad meanwhile: some 60 times that in a restoring acceleration
             assert np.abs(got[env] - middle).max() < F32_ACCELERATION + rounding + turn
 
 
@@ -200,10 +218,17 @@ def test_imu_acceleration_is_the_derivative_of_the_world_velocity(plant):
     plant.step(substeps=1, dt_s=dt)
     v = plant.vehicle
     for env in range(N_ENV):
-        before, after = oracle.quaternion_rotation(q[env]), oracle.quaternion_rotation(v.quat_wb.to_numpy()[env].astype(float))
+        before, after = (
+            oracle.quaternion_rotation(q[env]),
+            oracle.quaternion_rotation(v.quat_wb.to_numpy()[env].astype(float)),
+        )
         change = (after @ v.vel_b.to_numpy()[env] - before @ nu[env, :3]) / dt
-        turned = oracle.quaternion_rotation((q[env] + v.quat_wb.to_numpy()[env]) / np.linalg.norm(q[env] + v.quat_wb.to_numpy()[env]))
-        assert np.allclose(turned.T @ change, v.acc_b.to_numpy()[env], atol=5e-3)  # second differences of a motion of about 10 m/s^2
+        turned = oracle.quaternion_rotation(
+            (q[env] + v.quat_wb.to_numpy()[env]) / np.linalg.norm(q[env] + v.quat_wb.to_numpy()[env])
+        )
+        assert np.allclose(
+            turned.T @ change, v.acc_b.to_numpy()[env], atol=5e-3
+        )  # second differences of a motion of about 10 m/s^2
 
 
 @settings(max_examples=20, derandomize=True, deadline=None)
@@ -214,9 +239,17 @@ def test_energy_never_grows_without_thrust_and_current(plant, seed):
     plant.write(plant.current.vel_w, 0.0)
     last = np.full(N_ENV, np.inf)
     for _ in range(40):
-        q, nu = plant.vehicle.quat_wb.to_numpy().astype(float), np.c_[plant.vehicle.vel_b.to_numpy(), plant.vehicle.rate_b.to_numpy()]
+        q, nu = (
+            plant.vehicle.quat_wb.to_numpy().astype(float),
+            np.c_[plant.vehicle.vel_b.to_numpy(), plant.vehicle.rate_b.to_numpy()],
+        )
         z = plant.vehicle.pos_w.to_numpy()[:, 2]
-        now = np.array([oracle.energy(oracle.Body(), z[i], oracle.quaternion_rotation(q[i]), nu[i].astype(float)) for i in range(N_ENV)])
+        now = np.array(
+            [
+                oracle.energy(oracle.Body(), z[i], oracle.quaternion_rotation(q[i]), nu[i].astype(float))
+                for i in range(N_ENV)
+            ]
+        )
         assert (now <= last + 2e-5).all()  # single precision of some 10 J
         last = now
         plant.step()
@@ -240,21 +273,32 @@ def test_frictionless_body_keeps_its_energy(plant):
     before = kinetic()
     for _ in range(50):
         plant.step(substeps=8)
-    assert np.abs(kinetic() / before - 1).max() < 1e-3  # second-order error of 400 substeps of 2.5 ms at rates of 1 rad/s
+    assert (
+        np.abs(kinetic() / before - 1).max() < 1e-3
+    )  # second-order error of 400 substeps of 2.5 ms at rates of 1 rad/s
 
 
 def test_added_mass_that_follows_the_water_knows_no_uniform_current():
     """Galilei: in a uniform current everything is as in still water, plus the drift."""
     current = np.array([0.3, -0.2, 0.0], np.float32)
-    plant = Plant(Config(vehicle=VehicleConfig(attitude_hold="none", added_mass_follows="water")), start_taichi("cpu"), n_env=2)
+    plant = Plant(
+        Config(vehicle=VehicleConfig(attitude_hold="none", added_mass_follows="water")),
+        start_taichi("cpu"),
+        n_env=2,
+    )
     plant.reset()
     plant.write(plant.actuation.external_wrench_b, [4, 1, 0, 0, 0, 0.4])
     plant.write(plant.current.vel_w, [current, 0 * current])
-    plant.write(plant.vehicle.vel_b, [current, 0 * current])  # heading 0: body axes are world axes at the start
+    plant.write(
+        plant.vehicle.vel_b, [current, 0 * current]
+    )  # heading 0: body axes are world axes at the start
     for _ in range(250):
         plant.step()
     assert np.abs(plant.vehicle.rate_b.to_numpy()[1, 2]) > 0.3  # it does turn
-    assert np.abs(plant.vehicle.pos_w.to_numpy()[0] - plant.vehicle.pos_w.to_numpy()[1] - 5.0 * current).max() < F32_DRIFT_M
+    assert (
+        np.abs(plant.vehicle.pos_w.to_numpy()[0] - plant.vehicle.pos_w.to_numpy()[1] - 5.0 * current).max()
+        < F32_DRIFT_M
+    )
     assert np.abs(plant.vehicle.rate_b.to_numpy()[0] - plant.vehicle.rate_b.to_numpy()[1]).max() < F32_DRIFT_M
 
 
@@ -301,7 +345,10 @@ def test_quaternion_stays_a_unit(plant):
 def test_rows_are_independent_and_permute(plant):
     random_state(plant, 9)
     order = np.array([3, 0, 5, 1, 4, 2])
-    start = {name: f.to_numpy() for name, f in (("q", plant.vehicle.quat_wb), ("v", plant.vehicle.vel_b), ("w", plant.vehicle.rate_b))}
+    start = {
+        name: f.to_numpy()
+        for name, f in (("q", plant.vehicle.quat_wb), ("v", plant.vehicle.vel_b), ("w", plant.vehicle.rate_b))
+    }
     wrench, current = plant.actuation.external_wrench_b.to_numpy(), plant.current.vel_w.to_numpy()
 
     def run(rows):
@@ -341,7 +388,10 @@ def test_reset_leaves_nothing_behind(plant):
         plant.step()
     plant.reset()
     assert np.array_equal(motion(plant), fresh)
-    assert not plant.actuation.rpm_command.to_numpy().any() and not plant.actuation.external_wrench_b.to_numpy().any()
+    assert (
+        not plant.actuation.rpm_command.to_numpy().any()
+        and not plant.actuation.external_wrench_b.to_numpy().any()
+    )
 
 
 def test_reset_starts_at_the_mission(plant):
@@ -349,7 +399,10 @@ def test_reset_starts_at_the_mission(plant):
     plant.write(plant.mission.start_yaw, 0.7)
     plant.reset()
     assert np.allclose(plant.vehicle.pos_w.to_numpy(), [1.0, 2.0, -0.5])
-    angles = [oracle.euler_angles(oracle.quaternion_rotation(q.astype(float))) for q in plant.vehicle.quat_wb.to_numpy()]
+    angles = [
+        oracle.euler_angles(oracle.quaternion_rotation(q.astype(float)))
+        for q in plant.vehicle.quat_wb.to_numpy()
+    ]
     assert np.allclose(angles, [0, 0, 0.7], atol=1e-6)
     plant.write(plant.mission.start_w, 0.0)
     plant.write(plant.mission.start_yaw, 0.0)

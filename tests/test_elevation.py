@@ -1,4 +1,5 @@
-"""Heights of tracked bodies: the weighing of hypotheses against its float64 oracle, and what memory and free water come to."""
+"""Heights of tracked bodies: the weighing of hypotheses against its float64 oracle, and what memory and free
+water come to."""
 
 import numpy as np
 import pytest
@@ -18,9 +19,12 @@ from uuvtai.state import ClockState, ForecastState, Proprioception, SonarScan, T
 N_ENV, N_TRACK, N_RAY = 8, 32, 64
 TANK, RULES = TankConfig(z_m=(-1.6, 0.0)), EpisodeConfig(control_dt_s=0.02)
 SONAR = SonarConfig(n_ray=N_RAY, max_range_m=12.0, vertical_half_aperture_deg=10.0)
-TRACKING = TrackingConfig(n_track=N_TRACK, max_misses=8, see_through_s=0.15, hidden_s=2.0, split_m=0.18, split_slope=0.03)
+TRACKING = TrackingConfig(
+    n_track=N_TRACK, max_misses=8, see_through_s=0.15, hidden_s=2.0, split_m=0.18, split_slope=0.03
+)
 NUMBERS = {
-    "half_height_m": 0.2, "least_half_height_m": 0.1, "column_share": 0.05, "edge_m": 0.06, "evidence_s": 0.15, "hit_share": 0.9,
+    "half_height_m": 0.2, "least_half_height_m": 0.1, "column_share": 0.05, "edge_m": 0.06,
+    "evidence_s": 0.15, "hit_share": 0.9,
     "gone_share": 0.25, "tail_share": 0.02, "column_tail_share": 0.15,
 }  # fmt: skip
 """Every number of the stage, so that tuning the defaults breaks nothing here."""
@@ -30,7 +34,8 @@ SIZES = {"n_env": N_ENV, "n_track": N_TRACK, "n_height": LANES, "n_ray": N_RAY, 
 BEGIN, HIT, MISS = 0, 1, 2
 
 SHARE_TOLERANCE = 2e-5
-"""Ten weighings in float32 (6e-8 each) of shares whose ramp multiplies errors of a height (1e-7 m) by 1 / edge_m, about 10."""
+"""Ten weighings in float32 (6e-8 each) of shares whose ramp multiplies errors of a height (1e-7 m) by 1 /
+edge_m, about 10."""
 
 BOUND_TOLERANCE = 1e-5
 """[m] float32 sums of heights."""
@@ -75,11 +80,13 @@ def prune(
 class Stage:
     def __init__(self):
         self.tracks, self.clock, self.forecast, self.ego, self.scan = (
-            allocate(struct, SIZES) for struct in (TrackState, ClockState, ForecastState, Proprioception, SonarScan)
+            allocate(struct, SIZES)
+            for struct in (TrackState, ClockState, ForecastState, Proprioception, SonarScan)
         )
 
     def begin(self):
-        """Every track moves, lies east of its env's vehicle, and may have any height; the vehicles are at (5, 3, -0.8)."""
+        """Every track moves, lies east of its env's vehicle, and may have any height; the vehicles are at (5,
+        3, -0.8)."""
         for struct in (self.tracks, self.clock, self.ego, self.scan):
             for field in vars(struct).values():
                 field.fill(0)
@@ -108,11 +115,21 @@ class Stage:
         self.put(self.scan, ping_pos_w=self.own)
 
     def weigh(self, what, dt=0.06):
-        weigh(np.broadcast_to(what, (N_ENV, N_TRACK)).astype(np.int32), self.own.astype(np.float32), dt, self.tracks, CFG, SONAR, TANK)
+        weigh(
+            np.broadcast_to(what, (N_ENV, N_TRACK)).astype(np.int32),
+            self.own.astype(np.float32),
+            dt,
+            self.tracks,
+            CFG,
+            SONAR,
+            TANK,
+        )
 
     def bound(self, cfg=CFG):
         """(above_w, below_w) as the kernel writes them."""
-        elevation.bound_heights(io_for(HeightsIO, self.forecast, self.tracks, self.ego, self.clock, cfg, TANK))
+        elevation.bound_heights(
+            io_for(HeightsIO, self.forecast, self.tracks, self.ego, self.clock, cfg, TANK)
+        )
         return self.forecast.above_w.to_numpy().astype(float), self.forecast.below_w.to_numpy().astype(float)
 
     def set_share(self, share):
@@ -142,7 +159,7 @@ def near(z):
     return int(np.abs(oracle.heights(TANK) - z).argmin())
 
 
-# --------------------------------------------------------------------------------------------------------- hypotheses, one by one
+# ------------------------------------------------------------------------------------- hypotheses, one by one
 
 
 def test_nothing_is_known_at_first(stage):
@@ -159,10 +176,17 @@ def test_any_sequence_of_hits_and_misses_equals_the_oracle(stage):
     cov = np.zeros((N_ENV, N_TRACK, 10))
     cov[..., 0], cov[..., 1], cov[..., 4] = xx, xy, yy
     stage.put(stage.tracks, radius_m=radius, cov=cov)
-    share, present = np.broadcast_to(oracle.prior(CFG), (N_ENV, N_TRACK, LANES)).copy(), np.full((N_ENV, N_TRACK), 0.95)
+    share, present = (
+        np.broadcast_to(oracle.prior(CFG), (N_ENV, N_TRACK, LANES)).copy(),
+        np.full((N_ENV, N_TRACK), 0.95),
+    )
     for scan in range(10):
         stage.own = rng.uniform([3, 2, -1.5], [6, 4, -0.1], (N_ENV, 3)).astype(np.float32).astype(float)
-        stage.place = (stage.own[:, None, :2] + rng.uniform(-2.5, 2.5, (N_ENV, N_TRACK, 2))).astype(np.float32).astype(float)
+        stage.place = (
+            (stage.own[:, None, :2] + rng.uniform(-2.5, 2.5, (N_ENV, N_TRACK, 2)))
+            .astype(np.float32)
+            .astype(float)
+        )
         stage.stand()
         what = rng.choice([HIT, MISS], (N_ENV, N_TRACK), p=[0.2, 0.8])
         dt = float(np.float32((0.02, 0.06, 0.3)[scan % 3]))
@@ -174,7 +198,9 @@ def test_any_sequence_of_hits_and_misses_equals_the_oracle(stage):
                 found = oracle.after_hit(share[env, track], *here, size, CFG, SONAR, TANK)
             else:
                 spread = np.array([[xx[env, track], xy[env, track]], [xy[env, track], yy[env, track]]])
-                found = oracle.after_miss(share[env, track], present[env, track], *here, spread, size, dt, CFG, SONAR, TANK)
+                found = oracle.after_miss(
+                    share[env, track], present[env, track], *here, spread, size, dt, CFG, SONAR, TANK
+                )
             share[env, track], present[env, track] = found
     np.testing.assert_allclose(stage.share, share, atol=SHARE_TOLERANCE)
     np.testing.assert_allclose(stage.present, present, atol=SHARE_TOLERANCE)
@@ -194,7 +220,8 @@ def test_a_hit_near_by_rules_out_what_is_far_above_or_below(stage):
 
 
 def test_own_change_of_depth_tells_above_from_below(stage):
-    """Misses leave both sides open; the vehicle dives, misses again where the body below would show: it is above."""
+    """Misses leave both sides open; the vehicle dives, misses again where the body below would show: it is
+    above."""
     for _ in range(20):
         stage.weigh(MISS)
     share = stage.share[0, 0]
@@ -225,7 +252,8 @@ def test_what_is_missed_everywhere_has_gone(stage):
 
 
 def test_a_wrong_belief_is_given_up(stage):
-    """Hundreds of scans say "level with the vehicle"; then it dives, and what it hits there cannot be where it was believed to be."""
+    """Hundreds of scans say "level with the vehicle"; then it dives, and what it hits there cannot be where
+    it was believed to be."""
     for _ in range(300):
         stage.weigh(HIT)
     stage.own[:, 2] = -1.5
@@ -246,7 +274,8 @@ def test_an_unsure_place_makes_a_miss_say_less(stage):
 
 
 def test_scans_close_together_count_as_one(stage):
-    """Ten scans within 0.15 s say as much as one that long after the last; twice that time between two says no more."""
+    """Ten scans within 0.15 s say as much as one that long after the last; twice that time between two says
+    no more."""
     level, top = near(-0.8), near(-0.1)
     for _ in range(10):
         stage.weigh(MISS, CFG.evidence_s / 10)
@@ -255,15 +284,19 @@ def test_scans_close_together_count_as_one(stage):
         stage.begin()
         stage.weigh(MISS, dt)
         once = stage.share[0, 0]
-        assert once[level] / once[top] == pytest.approx(often[level] / often[top], rel=1e-3) and once[level] < 0.2 * once[top]
+        assert (
+            once[level] / once[top] == pytest.approx(often[level] / often[top], rel=1e-3)
+            and once[level] < 0.2 * once[top]
+        )
         assert present == pytest.approx(stage.present[0, 0], abs=0.01)
 
 
-# ------------------------------------------------------------------------------------------------------------------ free water
+# ------------------------------------------------------------------------------------------------- free water
 
 
 def test_free_water_equals_the_oracle(stage):
-    """Random peaked shares, own depths and radii: edges of what is likely enough, no farther than the own height."""
+    """Random peaked shares, own depths and radii: edges of what is likely enough, no farther than the own
+    height."""
     rng = np.random.default_rng(6)
     share = rng.dirichlet(np.full(LANES, 0.15), (N_ENV, N_TRACK)).astype(np.float32)
     radius = rng.uniform(0.1, 0.4, (N_ENV, N_TRACK)).astype(np.float32)
@@ -274,16 +307,22 @@ def test_free_water_equals_the_oracle(stage):
     above, below = stage.bound()
     kinds = set()
     for env, track in np.ndindex(N_ENV, N_TRACK):
-        wanted = oracle.free_water(share[env, track].astype(float), stage.own[env, 2], float(radius[env, track]), CFG, TANK)
+        wanted = oracle.free_water(
+            share[env, track].astype(float), stage.own[env, 2], float(radius[env, track]), CFG, TANK
+        )
         for found, edge in zip((above[env, track], below[env, track]), wanted, strict=True):
-            assert found == pytest.approx(edge, abs=BOUND_TOLERANCE) if np.isfinite(edge) else abs(found) > 100.0
+            assert (
+                found == pytest.approx(edge, abs=BOUND_TOLERANCE) if np.isfinite(edge) else abs(found) > 100.0
+            )
         kinds.add((np.isfinite(wanted[0]), np.isfinite(wanted[1]), wanted[0] == wanted[1]))
     assert len(kinds) == 4  # above, below, both, level
 
 
 def test_a_likely_column_leaves_no_free_water(stage):
     share = np.zeros((N_ENV, N_TRACK, LANES))
-    share[:, :, near(-0.2)] = 1 - np.where(np.arange(N_TRACK) % 2 == 0, 0.9, 1.1)[None] * CFG.column_tail_share
+    share[:, :, near(-0.2)] = (
+        1 - np.where(np.arange(N_TRACK) % 2 == 0, 0.9, 1.1)[None] * CFG.column_tail_share
+    )
     share[:, :, -1] = 1 - share[:, :, near(-0.2)]
     stage.set_share(share)
     above, below = stage.bound()
@@ -292,7 +331,8 @@ def test_a_likely_column_leaves_no_free_water(stage):
 
 
 def test_without_memory_every_body_is_level(stage):
-    """And so is what does not move or is not there, with memory too (no trace is left of who had the slot before); who sleeps sleeps."""
+    """And so is what does not move or is not there, with memory too (no trace is left of who had the slot
+    before); who sleeps sleeps."""
     share = np.zeros((N_ENV, N_TRACK, LANES))
     share[:, :, near(-0.2)] = 1
     stage.set_share(share)
@@ -311,15 +351,21 @@ def test_without_memory_every_body_is_level(stage):
 
 
 def test_no_body_is_in_water_called_free(stage):
-    """256 bodies, seen by the fan's geometry from a vehicle that drives by and changes depth: the free water holds none of them.
+    """256 bodies, seen by the fan's geometry from a vehicle that drives by and changes depth: the free water
+    holds none of them.
 
-    Tolerance: a slice (0.11 m) rounds a height by half of it, the fan's edge is soft, and what is less likely than tail_share is given up.
+    Tolerance: a slice (0.11 m) rounds a height by half of it, the fan's edge is soft, and what is less likely
+    than tail_share is given up.
     """
     rng = np.random.default_rng(8)
     half = rng.uniform(0.12, 0.25, (N_ENV, N_TRACK))
     z = rng.uniform(-1.4, -0.2, (N_ENV, N_TRACK))
     stage.put(stage.tracks, radius_m=rng.uniform(0.15, 0.25, (N_ENV, N_TRACK)))
-    away, begin, end = rng.uniform(0.6, 1.2, (N_ENV, N_TRACK)), rng.uniform(-1.2, -0.4, N_ENV), rng.uniform(-1.2, -0.4, N_ENV)
+    away, begin, end = (
+        rng.uniform(0.6, 1.2, (N_ENV, N_TRACK)),
+        rng.uniform(-1.2, -0.4, N_ENV),
+        rng.uniform(-1.2, -0.4, N_ENV),
+    )
     deepest = np.zeros((N_ENV, N_TRACK))
     opened = 0
     for k in range(60):
@@ -337,12 +383,16 @@ def test_no_body_is_in_water_called_free(stage):
     assert opened > 0.2 * 60 * N_ENV * N_TRACK
 
 
-# ---------------------------------------------------------------------------------------------------------------------- memory
+# ----------------------------------------------------------------------------------------------------- memory
 
 
 def scan_for(stage, range_m):
     """Every beam of every env returns at this range; tracks have been missed once."""
-    stage.put(stage.scan, range_m=np.full((N_ENV, N_RAY), range_m), hit=np.full((N_ENV, N_RAY), range_m < SONAR.max_range_m))
+    stage.put(
+        stage.scan,
+        range_m=np.full((N_ENV, N_RAY), range_m),
+        hit=np.full((N_ENV, N_RAY), range_m < SONAR.max_range_m),
+    )
     stage.put(stage.tracks, misses=np.ones((N_ENV, N_TRACK)), age=np.full((N_ENV, N_TRACK), 10))
     others = np.arange(N_TRACK) > 2  # three tracks are enough, apart from each other
     stage.place[:, :3] = np.array([5.0, 3.0]) + np.array([[1.0, 0.0], [0.0, 1.5], [-1.2, 0.0]])
@@ -358,11 +408,14 @@ def pruned(stage, count, cfg=CFG, dt=0.06):
 
 
 def test_unseen_bodies_are_remembered_for_their_time(stage):
-    """Behind something nearer nothing is learnt, only forgotten: with the time constant memory_s until gone_share."""
+    """Behind something nearer nothing is learnt, only forgotten: with the time constant memory_s until
+    gone_share."""
     scan_for(stage, 0.5)
     assert pruned(stage, 50).all()
     np.testing.assert_allclose(stage.present[:, :3], 0.95 * np.exp(-50 * 0.06 / CFG.memory_s), rtol=1e-4)
-    np.testing.assert_allclose(stage.share[:, 0], np.broadcast_to(oracle.prior(CFG), (N_ENV, LANES)), atol=1e-6)
+    np.testing.assert_allclose(
+        stage.share[:, 0], np.broadcast_to(oracle.prior(CFG), (N_ENV, LANES)), atol=1e-6
+    )
     scans = int(np.log(0.95 / CFG.gone_share) * CFG.memory_s / 0.06)
     stage.begin()
     scan_for(stage, 0.5)
@@ -371,7 +424,8 @@ def test_unseen_bodies_are_remembered_for_their_time(stage):
 
 
 def test_a_body_seen_through_is_kept_if_it_may_be_above_or_below(stage):
-    """Open water all round: near by it may have left the fan, but not far away, where the fan holds the full depth."""
+    """Open water all round: near by it may have left the fan, but not far away, where the fan holds the full
+    depth."""
     scan_for(stage, SONAR.max_range_m)
     stage.place[:, 2] = [5.0 - 5.0, 3.0]
     stage.stand()
@@ -405,7 +459,7 @@ def test_memory_can_be_switched_off(stage):
     assert not stage.tracks.alive.to_numpy()[:, :3].any()
 
 
-# ---------------------------------------------------------------------------------------------------------------------- config
+# ----------------------------------------------------------------------------------------------------- config
 
 
 @pytest.mark.parametrize(

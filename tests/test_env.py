@@ -1,4 +1,5 @@
-"""The environment: automatic resets, numbering of episodes, ends, zero copy, the table, and what it refuses."""
+"""The environment: automatic resets, numbering of episodes, ends, zero copy, the table, and what it
+refuses."""
 
 import subprocess
 import sys
@@ -55,7 +56,8 @@ def test_reset_begins_the_episodes_of_the_seed(env):
 
 
 def test_an_episode_that_ends_is_followed_by_its_rows_next_one_in_the_same_step(env):
-    """Drive into a wall until a row ends: final observation, outcome and sums are the old episode's, the observation is the new one's."""
+    """Drive into a wall until a row ends: final observation, outcome and sums are the old episode's, the
+    observation is the new one's."""
     env.reset(seed=SEED)
     total, steps, last = np.zeros(N), 0, torch.zeros(0)
     ended = torch.zeros(N, dtype=torch.bool)
@@ -70,7 +72,11 @@ def test_an_episode_that_ends_is_followed_by_its_rows_next_one_in_the_same_step(
     row, going = int(ended.nonzero()[0]), ~ended
     assert going.any(), "some rows must go on to compare with"
     obs, info = obs.clone(), {name: value.clone() for name, value in info.items()}
-    assert OUTCOMES[info["outcome"][row]] in ("collision", "ttc", "out_of_tank") and terminated[row] and not truncated[row]
+    assert (
+        OUTCOMES[info["outcome"][row]] in ("collision", "ttc", "out_of_tank")
+        and terminated[row]
+        and not truncated[row]
+    )
     assert (info["outcome"][going] == 0).all()
     assert info["episode"].tolist() == [i + N if ended[i] else i for i in range(N)]
     assert info["episode_steps"].tolist() == [steps] * N
@@ -108,7 +114,9 @@ def test_the_horizon_truncates(env):
     assert not truncated.any()
     obs, _reward, terminated, truncated, info = env.step(full([0, 0, 0, 0]))
     assert truncated.tolist() == [i in (2, 5) for i in range(N)] and not terminated.any()
-    assert [OUTCOMES[o] for o in info["outcome"]] == ["timeout" if i in (2, 5) else "running" for i in range(N)]
+    assert [OUTCOMES[o] for o in info["outcome"]] == [
+        "timeout" if i in (2, 5) else "running" for i in range(N)
+    ]
     assert info["episode"].tolist() == [i + N if i in (2, 5) else i for i in range(N)]
     assert not torch.equal(info["final_obs"][2], obs[2])
     _obs, reward, _terminated, truncated, info = env.step(full([0, 0, 0, 0]))
@@ -124,11 +132,18 @@ def test_without_autoreset_an_ended_row_rests_until_its_reset(env):
         assert truncated.tolist() == [i == 2 for i in range(N)] and reward[2] != 0
         last = obs[2].clone()
         obs, reward, _terminated, truncated, info = resting.step(full([0.5, 0, 0, 0]))
-        assert truncated[2] and reward[2] == 0 and torch.equal(obs[2], last) and OUTCOMES[info["outcome"][2]] == "timeout"
+        assert (
+            truncated[2]
+            and reward[2] == 0
+            and torch.equal(obs[2], last)
+            and OUTCOMES[info["outcome"][2]] == "timeout"
+        )
         resting.reset(mask=truncated.clone())
         _obs, reward, _terminated, truncated, info = resting.step(full([0.5, 0, 0, 0]))
         assert (
-            not truncated.any() and info["episode"][2] == N + 2 and info["episode_steps"].tolist() == [1 if i == 2 else 3 for i in range(N)]
+            not truncated.any()
+            and info["episode"][2] == N + 2
+            and info["episode_steps"].tolist() == [1 if i == 2 else 3 for i in range(N)]
         )
 
 
@@ -152,7 +167,9 @@ def test_a_masked_reset_leaves_the_others_alone(env):
     obs, info = env.reset(seed=40, mask=mask)
     others = mask == 0
     assert torch.equal(obs[others], before[others]) and not torch.equal(obs[1], before[1])
-    assert info["seed"].tolist() == [40 if m else SEED for m in mask] and info["episode"].tolist() == list(range(N))
+    assert info["seed"].tolist() == [40 if m else SEED for m in mask] and info["episode"].tolist() == list(
+        range(N)
+    )
     *_rest, info = env.step(full([0, 0, 0, 0]))
     assert info["episode_steps"].tolist() == [1 if m else 6 for m in mask]
 
@@ -167,7 +184,12 @@ def test_the_same_actions_give_the_same_rollout(env):
         out = []
         for action in actions:
             obs, reward, terminated, truncated, info = env.step(action)
-            out.append(torch.cat([obs, reward[:, None], terminated[:, None], truncated[:, None], info["teacher_action"]], dim=1))
+            out.append(
+                torch.cat(
+                    [obs, reward[:, None], terminated[:, None], truncated[:, None], info["teacher_action"]],
+                    dim=1,
+                )
+            )
         return torch.stack(out)
 
     first = rollout()
@@ -176,7 +198,8 @@ def test_the_same_actions_give_the_same_rollout(env):
 
 
 def test_teacher_action_drives_as_the_tree_does(env):
-    """Following info["teacher_action"] is what the simulator does on its own; another action leaves the teacher's choice apart."""
+    """Following info["teacher_action"] is what the simulator does on its own; another action leaves the
+    teacher's choice apart."""
 
     def paths(follow):
         _obs, info = env.reset(seed=SEED)
@@ -240,19 +263,28 @@ def test_reward_terms_are_the_reward_and_sum_up_over_the_episode(env):
         total[truncated] = 0
     named = dict(zip(env.reward_terms, terms.T, strict=True))
     weights = env.config.reward
-    assert (named["alive"] == weights.alive).all() and (named["effort"] < 0).all() and (named["path_distance"] < 0).all()
+    assert (
+        (named["alive"] == weights.alive).all()
+        and (named["effort"] < 0).all()
+        and (named["path_distance"] < 0).all()
+    )
     assert env.outcomes == OUTCOMES and not named["success"].any()
 
 
 def test_leaf_is_the_node_whose_action_is_told(env):
-    """The straight tree has one leaf, which acts in every step; the teacher's acting leaves are actions of the tree."""
+    """The straight tree has one leaf, which acts in every step; the teacher's acting leaves are actions of
+    the tree."""
     _obs, info = env.reset(seed=SEED)
     seen = set()
     for _ in range(30):
         *_rest, info = env.step(info["teacher_action"].clone())
         np.testing.assert_array_equal(info["leaf"], env.sim.s.teacher.leaf.to_numpy())
         seen |= set(info["leaf"].tolist())
-    actions = {i for i, kind in enumerate(env.sim.tree.types) if kind in ("BackOff", "Hold", "Evade", "Unstick", "FollowRoute")}
+    actions = {
+        i
+        for i, kind in enumerate(env.sim.tree.types)
+        if kind in ("BackOff", "Hold", "Evade", "Unstick", "FollowRoute")
+    }
     assert seen <= actions and "FollowRoute" in {env.node_names[i] for i in seen}
 
 
@@ -260,18 +292,26 @@ def test_columns_find_every_group(env):
     obs, _info = env.reset(seed=SEED)
     assert list(env.columns) == [row.name for row in env.observation_table]
     assert env.columns["goal"] == slice(0, 3) and env.columns["sector_range"] == slice(12, 24)
-    np.testing.assert_allclose(obs[:, env.columns["sector_range"]], env.sim.s.features.sector_range_m.to_numpy())
+    np.testing.assert_allclose(
+        obs[:, env.columns["sector_range"]], env.sim.s.features.sector_range_m.to_numpy()
+    )
 
 
 def test_bodies_and_advice_stand_behind_the_paper_observation(small, env, monkeypatch):
-    """Switched on by the config alone: what was there stays as it was, the tree's action is the one that is told."""
+    """Switched on by the config alone: what was there stays as it was, the tree's action is the one that is
+    told."""
     plain = VectorEnv(small.sim, seed=SEED)
     wanted = [plain.reset()[0].clone(), *(plain.step(full([0.6, 0, 0, 0.05]))[0].clone() for _ in range(80))]
     more = small.config.features.model_copy(update={"n_track": 2, "teacher": True})
     configure(monkeypatch, small.sim, small.config.model_copy(update={"features": more}))
     with VectorEnv(small.sim, seed=SEED) as shown:
         assert shown.observation_sha256 != plain.observation_sha256
-        assert list(shown.columns)[-4:] == ["teacher_action", "teacher_conflict", "teacher_evade_cost", "teacher_class"]
+        assert list(shown.columns)[-4:] == [
+            "teacher_action",
+            "teacher_conflict",
+            "teacher_evade_cost",
+            "teacher_class",
+        ]
         obs, info = shown.reset()
         seen = 0
         for step, paper in enumerate(wanted):
@@ -293,7 +333,10 @@ def test_fingerprint_tells_observations_apart(env):
     table = env.observation_table
     first, second, *rest = table
     assert env.observation_sha256 == observation_sha256(table) and len(env.observation_sha256) == 64
-    assert observation_sha256((replace(first, meaning="another wording"), second, *rest)) == env.observation_sha256
+    assert (
+        observation_sha256((replace(first, meaning="another wording"), second, *rest))
+        == env.observation_sha256
+    )
     changes = (
         (second, first, *rest),
         (replace(first, name="goals"), second, *rest),
@@ -302,7 +345,10 @@ def test_fingerprint_tells_observations_apart(env):
         (replace(first, frame="world"), second, *rest),
         table[:-1],
     )
-    assert len({observation_sha256(changed) for changed in changes} | {env.observation_sha256}) == len(changes) + 1
+    assert (
+        len({observation_sha256(changed) for changed in changes} | {env.observation_sha256})
+        == len(changes) + 1
+    )
 
 
 def test_what_is_not_finite_is_told_by_column(env):
@@ -333,7 +379,11 @@ def test_gradients_do_not_leak_into_the_simulator(env):
         (torch.zeros(N, 3), ValueError, r"shape \(8, 4\)"),
         (torch.zeros(4), ValueError, r"shape \(8, 4\)"),
         (torch.zeros(N, 4, device="meta"), ValueError, "on cpu"),
-        (torch.tensor([[0.0, 0, 0, 0]] * 6 + [[0, float("nan"), 0, 0], [0, 0, 0, float("inf")]]), ValueError, "not finite in env 6, 7"),
+        (
+            torch.tensor([[0.0, 0, 0, 0]] * 6 + [[0, float("nan"), 0, 0], [0, 0, 0, float("inf")]]),
+            ValueError,
+            "not finite in env 6, 7",
+        ),
     ],
 )
 def test_bad_actions_are_refused_and_change_nothing(env, action, error, words):
@@ -377,7 +427,9 @@ def test_a_closed_environment_stays_closed(small, env):
     with pytest.raises(RuntimeError, match="closed"):
         other.step(full([0, 0, 0, 0]))
     env.reset(seed=SEED)
-    assert not torch.equal(env.step(full([1, 0, 0, 0]))[0].clone(), env.step(full([1, 0, 0, 0]))[0]), "the other one still works"
+    assert not torch.equal(env.step(full([1, 0, 0, 0]))[0].clone(), env.step(full([1, 0, 0, 0]))[0]), (
+        "the other one still works"
+    )
 
 
 @pytest.mark.parametrize(
@@ -399,6 +451,9 @@ def test_make_refuses_what_cannot_be_made(arguments, error, words):
 
 
 def test_import_is_light():
-    program = "import sys, uuvtai; uuvtai.make; print([m for m in ('taichi', 'torch', 'numpy', 'pydantic') if m in sys.modules])"
+    program = (
+        "import sys, uuvtai; uuvtai.make; print([m for m in ('taichi', 'torch', 'numpy', 'pydantic') "
+        "if m in sys.modules])"
+    )
     done = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True)
     assert done.stdout.strip() == "[]"

@@ -11,7 +11,17 @@ from uuvtai.config import EpisodeConfig, TankConfig, VehicleConfig
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, FAR_M, SPHERE
 from uuvtai.kernels.task import episode
 from uuvtai.kernels.task.bundles import EpisodeIO
-from uuvtai.outcomes import COLLIDED, COLLISION, ENDINGS, FORESEEABLE, OUT_OF_TANK, OUTCOMES, SUCCESS, TIMEOUT, TTC
+from uuvtai.outcomes import (
+    COLLIDED,
+    COLLISION,
+    ENDINGS,
+    FORESEEABLE,
+    OUT_OF_TANK,
+    OUTCOMES,
+    SUCCESS,
+    TIMEOUT,
+    TTC,
+)
 
 N, N_BODY = 8, 3
 TOL = 1e-5
@@ -22,11 +32,21 @@ SIZES = {"n_env": N, "n_body": N_BODY, "n_thruster": 6}
 
 
 class Court:
-    """Structs of N envs; every env starts as a vehicle at rest in mid-tank, heading along x, far from a goal, nothing around."""
+    """Structs of N envs; every env starts as a vehicle at rest in mid-tank, heading along x, far from a goal,
+    nothing around."""
 
     def __init__(self):
-        structs = (state.RefereeState, state.ClockState, state.VehicleState, state.WorldState, state.MissionState, state.EpisodeState)
-        self.referee, self.clock, self.vehicle, self.world, self.mission, self.episode = (state.allocate(s, SIZES) for s in structs)
+        structs = (
+            state.RefereeState,
+            state.ClockState,
+            state.VehicleState,
+            state.WorldState,
+            state.MissionState,
+            state.EpisodeState,
+        )
+        self.referee, self.clock, self.vehicle, self.world, self.mission, self.episode = (
+            state.allocate(s, SIZES) for s in structs
+        )
 
     def clean(self):
         for struct in (self.referee, self.clock, self.vehicle, self.world, self.mission):
@@ -38,7 +58,9 @@ class Court:
             self.vehicle.pos_w[env] = (10.0, 3.0, -0.8)
             self.vehicle.quat_wb[env] = (1.0, 0.0, 0.0, 0.0)
             self.mission.goal_w[env] = (18.0, 3.0, -0.8)
-        episode.reset_referee(io_for(EpisodeIO, self.referee, self.clock, self.vehicle, self.world, VEHICLE, TANK, RULES))
+        episode.reset_referee(
+            io_for(EpisodeIO, self.referee, self.clock, self.vehicle, self.world, VEHICLE, TANK, RULES)
+        )
         return self
 
     def put(self, env, slot, kind, pos, size, vel=(0, 0, 0), yaw=0.0):
@@ -47,7 +69,19 @@ class Court:
         self.world.vel_w[env, slot], self.world.yaw[env, slot] = vel, yaw
 
     def judge(self):
-        episode.judge(io_for(EpisodeIO, self.referee, self.clock, self.vehicle, self.world, self.mission, VEHICLE, TANK, RULES))
+        episode.judge(
+            io_for(
+                EpisodeIO,
+                self.referee,
+                self.clock,
+                self.vehicle,
+                self.world,
+                self.mission,
+                VEHICLE,
+                TANK,
+                RULES,
+            )
+        )
         return {name: field.to_numpy() for name, field in vars(self.referee).items()}
 
 
@@ -78,7 +112,10 @@ def test_nothing_happens_in_open_water(court):
     assert np.all(book["ttc_s"] == np.float32(FAR_M))
 
 
-@pytest.mark.parametrize("pos", [(-0.01, 3, -0.8), (20.01, 3, -0.8), (10, -0.01, -0.8), (10, 6.01, -0.8), (10, 3, 0.01), (10, 3, -1.61)])
+@pytest.mark.parametrize(
+    "pos",
+    [(-0.01, 3, -0.8), (20.01, 3, -0.8), (10, -0.01, -0.8), (10, 6.01, -0.8), (10, 3, 0.01), (10, 3, -1.61)],
+)
 def test_out_of_tank(court, pos):
     court.vehicle.pos_w[0] = pos
     assert outcome(court.judge()) == "out_of_tank"
@@ -136,7 +173,8 @@ def test_time_to_collision_counts_own_motion_towards_a_static_obstacle(court):
 
 
 def test_time_to_collision_counts_the_hull_s_turning(court):
-    """A body abeam of the bow; turning left at 1 rad/s moves the bow end of the axis towards it at 0.1 m/s."""
+    """A body abeam of the bow; turning left at 1 rad/s moves the bow end of the axis towards it at 0.1
+    m/s."""
     court.put(0, 0, SPHERE, (10.1, 3 + 0.17 + 0.2 + 0.15, -0.8), (0.2, 0.2, 0.2))
     court.vehicle.rate_b[0] = (0, 0, 1)
     book = court.judge()
@@ -161,7 +199,10 @@ def test_walls_give_no_time_to_collision(court):
     assert outcome(court.judge()) == "running"
 
 
-@pytest.mark.parametrize(("offset", "expected"), [((0.999, 0, 0), "success"), ((1.001, 0, 0), "running"), ((0.8, 0, 0.7), "running")])
+@pytest.mark.parametrize(
+    ("offset", "expected"),
+    [((0.999, 0, 0), "success"), ((1.001, 0, 0), "running"), ((0.8, 0, 0.7), "running")],
+)
 def test_success_is_a_distance_in_space(court, offset, expected):
     court.mission.goal_w[0] = tuple(np.add((10, 3, -0.8), offset))
     assert outcome(court.judge()) == expected
@@ -174,23 +215,35 @@ def test_timeout_at_the_horizon(court):
 
 
 def test_rules_hold_in_their_order(court):
-    """Each row meets one rule less than the row before: all are out of time, the first four at the goal, and so on."""
+    """Each row meets one rule less than the row before: all are out of time, the first four at the goal, and
+    so on."""
     for env in range(5):
         court.clock.step[env] = 100
     for env in range(4):
         court.mission.goal_w[env] = (10.0, 3.0, -0.8)
     court.vehicle.pos_w[0] = (10.0, 3.0, 0.01)  # out, and through the surface
     for env in (0, 1):
-        court.put(env, 0, SPHERE, (10 + FRONT_M + 0.05 + 0.2, 3, -0.8), (0.2, 0.2, 0.2), vel=(-3, 0, 0))  # touching and closing
+        court.put(
+            env, 0, SPHERE, (10 + FRONT_M + 0.05 + 0.2, 3, -0.8), (0.2, 0.2, 0.2), vel=(-3, 0, 0)
+        )  # touching and closing
     court.put(2, 0, SPHERE, (10 + FRONT_M + 0.15 + 0.2, 3, -0.8), (0.2, 0.2, 0.2), vel=(-3, 0, 0))  # closing
     book = court.judge()
-    assert [outcome(book, env) for env in range(5)] == ["out_of_tank", "collision", "ttc", "success", "timeout"]
+    assert [outcome(book, env) for env in range(5)] == [
+        "out_of_tank",
+        "collision",
+        "ttc",
+        "success",
+        "timeout",
+    ]
 
 
 def test_book_of_the_episode(court):
-    """Way driven sums straight steps; the smallest clearance stays; a reset starts with the clearance there and then."""
+    """Way driven sums straight steps; the smallest clearance stays; a reset starts with the clearance there
+    and then."""
     court.put(0, 0, SPHERE, (10 + FRONT_M + 1.2, 3, -0.8), (0.2, 0.2, 0.2))
-    episode.reset_referee(io_for(EpisodeIO, court.referee, court.clock, court.vehicle, court.world, VEHICLE, TANK, RULES))
+    episode.reset_referee(
+        io_for(EpisodeIO, court.referee, court.clock, court.vehicle, court.world, VEHICLE, TANK, RULES)
+    )
     assert court.referee.min_clearance_m[0] == pytest.approx(1.0, abs=TOL)
     for x in (10.3, 10.5, 10.1):
         court.vehicle.pos_w[0] = (x, 3.0, -0.8)
@@ -198,7 +251,9 @@ def test_book_of_the_episode(court):
     assert book["path_length_m"][0] == pytest.approx(0.3 + 0.2 + 0.4, abs=TOL)
     assert book["min_clearance_m"][0] == pytest.approx(0.5, abs=TOL)
     assert book["clearance_m"][0] == pytest.approx(0.9, abs=TOL)
-    episode.reset_referee(io_for(EpisodeIO, court.referee, court.clock, court.vehicle, court.world, VEHICLE, TANK, RULES))
+    episode.reset_referee(
+        io_for(EpisodeIO, court.referee, court.clock, court.vehicle, court.world, VEHICLE, TANK, RULES)
+    )
     again = {name: field.to_numpy()[0] for name, field in vars(court.referee).items()}
     assert again["path_length_m"] == 0
     assert again["min_clearance_m"] == again["clearance_m"] == pytest.approx(0.9, abs=TOL)
@@ -214,7 +269,7 @@ def test_sleeping_rows_stay_as_they_are(court):
     assert book["path_length_m"][1] == 0
 
 
-# ------------------------------------------------------------------------------------------------------------------ clock
+# ------------------------------------------------------------------------------------------------------ clock
 
 
 def begin(court, mask, seed=3, number=7):
@@ -230,7 +285,9 @@ def test_episodes_begin_advance_end_and_sleep(court):
     assert list(court.clock.awake.to_numpy()) == list(court.clock.active.to_numpy()) == even
     assert list(court.clock.step.to_numpy()) == [0, 50] * (N // 2)
     assert court.episode.key[0] == noise_reference.episode_key(3, 7)
-    begin(court, [0] + [1] * (N - 1))  # a reset pass of other rows: row 0 rests meanwhile, and goes on afterwards
+    begin(
+        court, [0] + [1] * (N - 1)
+    )  # a reset pass of other rows: row 0 rests meanwhile, and goes on afterwards
     assert court.clock.awake[0] == 0
     episode.wake(io_for(EpisodeIO, court.clock))
     assert court.clock.awake.to_numpy().all()

@@ -1,4 +1,5 @@
-"""The examples: every script runs, on the session's simulator and with short episodes, and gives the result that it promises."""
+"""The examples: every script runs, on the session's simulator and with short episodes, and gives the result
+that it promises."""
 
 import importlib
 from pathlib import Path
@@ -22,7 +23,12 @@ MOST_LINES = {"train": 100, "custom": 60}
 """a newcomer reads an example in one go"""
 SHORT = 60
 """[control steps] of an episode here"""
-TRAINERS = {"train_sb3": "stable_baselines3", "train_skrl": "skrl", "train_torchrl": "torchrl", "train_rsl_rl": "rsl_rl"}
+TRAINERS = {
+    "train_sb3": "stable_baselines3",
+    "train_skrl": "skrl",
+    "train_torchrl": "torchrl",
+    "train_rsl_rl": "rsl_rl",
+}
 
 
 @pytest.fixture
@@ -78,7 +84,9 @@ def test_what_a_trainer_learnt_is_saved_and_played_again(short, example, monkeyp
     np.testing.assert_allclose(module.play(short, tmp_path / "saved")(obs), trained, rtol=1e-5, atol=1e-6)
     assert not np.allclose(module.train(short, 0)(obs), trained)
     out = tmp_path / "new" / "run"
-    judge.main(module.train, module.play, 1, ["--out", str(out), "--curve", str(tmp_path / "curve.csv")], short)
+    judge.main(
+        module.train, module.play, 1, ["--out", str(out), "--curve", str(tmp_path / "curve.csv")], short
+    )
     before, saved, played = capsys.readouterr().out.splitlines()
     assert before.startswith("before return") and saved.endswith(f"saved in {out}")
     assert played.startswith("played return") and f"/{N} (" in played
@@ -98,7 +106,10 @@ def test_a_watched_batch_keeps_every_return_once(short, example, mode):
     for decision in range(1, 2 + SHORT // 5):
         *_, terminated, truncated, info = envs.step(np.zeros((N, 4), np.float32))
         ended = info["final_info"] if mode == "SameStep" and "final_info" in info else info
-        told += [(decision * N, float(ended["episode_return"][env])) for env in np.flatnonzero(terminated | truncated)]
+        told += [
+            (decision * N, float(ended["episode_return"][env]))
+            for env in np.flatnonzero(terminated | truncated)
+        ]
     assert len(told) >= N
     np.testing.assert_allclose(envs.curve, told, rtol=1e-4, atol=1e-4)
 
@@ -141,7 +152,9 @@ def test_custom_controller_turns_and_stops(small, example):
     obs[2, columns["sector_range"].start] = 0.4
     action = module.careful(obs, columns)
     assert action[0, 0] == 1 and action[0, 3] == 0, "free and straight ahead: full speed"
-    assert action[1, 0] == pytest.approx(0, abs=1e-6) and action[1, 3] == 1, "to the left: turn left on the spot"
+    assert action[1, 0] == pytest.approx(0, abs=1e-6) and action[1, 3] == 1, (
+        "to the left: turn left on the spot"
+    )
     assert action[2, 0] < 0, "too near: back"
 
 
@@ -155,13 +168,18 @@ def test_custom_world_can_be_placed(taichi_runtime):
     world = load_config(str(EXAMPLES / "harbour.yaml")).world
     drawn = Drawn(world, n_env=64).draw()
     assert not drawn["faults"].any()
-    assert (drawn["kind"] != 0).sum(axis=1).tolist() == [world.n_static + world.n_dynamic + len(world.fixed)] * 64
+    assert (drawn["kind"] != 0).sum(axis=1).tolist() == [
+        world.n_static + world.n_dynamic + len(world.fixed)
+    ] * 64
 
 
 def test_custom_vehicle_follows_its_command(taichi_runtime, example):
     module = example("custom_vehicle")
     head, *rows = module.main(start_taichi("cpu")).splitlines()
-    assert head.split()[-2:] == ["4.0", "s"] and [row.split()[0] for row in rows] == ["bluerov2", "heavy_pack"]
+    assert head.split()[-2:] == ["4.0", "s"] and [row.split()[0] for row in rows] == [
+        "bluerov2",
+        "heavy_pack",
+    ]
     speeds = np.array([[float(value) for value in row.split()[1:]] for row in rows])
     assert (np.abs(speeds[:, -1] - 0.6) < 0.02).all() and not np.array_equal(*speeds)
     ours, theirs = (load_config("open", vehicle=name).vehicle for name in reversed(module.VEHICLES))
@@ -181,7 +199,9 @@ def test_custom_reward_changes_the_terms_it_names(small, example, monkeypatch):
         assert float(careful[i]) == pytest.approx(factor * float(default[i]), rel=1e-4, abs=1e-6)
         assert (factor != 1) == (name in weights)
     rows = module.table({"default": default, "careful": careful}, names).splitlines()
-    assert len(rows) == len(names) + 2 and float(rows[-1].split()[1]) == pytest.approx(float(default.sum()), abs=0.01)
+    assert len(rows) == len(names) + 2 and float(rows[-1].split()[1]) == pytest.approx(
+        float(default.sum()), abs=0.01
+    )
 
 
 def test_custom_tree_stands_beside_the_shipped_ones(short, example):

@@ -14,7 +14,14 @@ from uuvtai.measure import hindsight
 from uuvtai.measure.causes import CAUSES, REMARKS, Explanation, Killer, explain, timeout_label
 from uuvtai.measure.escape import candidates, escapes, motion, rolled_out
 from uuvtai.measure.evaluate import EpisodeResult, jobs_of, run_episodes
-from uuvtai.measure.explain import Row, chosen_for_recording, explain_failures, failures, record_worst, table_of
+from uuvtai.measure.explain import (
+    Row,
+    chosen_for_recording,
+    explain_failures,
+    failures,
+    record_worst,
+    table_of,
+)
 from uuvtai.measure.facts import WINDOW_S
 from uuvtai.measure.history import Bodies, Diary, History
 
@@ -33,7 +40,8 @@ def at(x, y, z):
 
 
 class Story:
-    """Four seconds of a vehicle at rest; a sphere comes from ahead at 1 m/s, seen and foreseen, and touches the nose at the end."""
+    """Four seconds of a vehicle at rest; a sphere comes from ahead at 1 m/s, seen and foreseen, and touches
+    the nose at the end."""
 
     def __init__(self, speed=1.0, radius=0.2, rise=0.0, end_s=END_S, gap=0.05):
         self.t = np.round(np.arange(end_s - min(4.0, end_s - 0.1), end_s + 0.05, 0.1), 3)
@@ -73,7 +81,9 @@ class Story:
         return self
 
     def bodies(self):
-        return Bodies(self.kind, self.size, np.zeros(3), self.speed, self.circle, np.where(self.speed > 0, 8.0, np.inf))
+        return Bodies(
+            self.kind, self.size, np.zeros(3), self.speed, self.circle, np.where(self.speed > 0, 8.0, np.inf)
+        )
 
     def scan(self):
         """Beam 0 looks at the killer, wherever it is: the tests turn the vehicle's yaw with the bearing."""
@@ -107,7 +117,8 @@ class Story:
             leaf=self.leaf,
             action=np.zeros((self.n, 4)),
             map_clearance_m=np.ones(self.n),
-            diary=self.diary or Diary(np.array([0.0, END_S]), np.stack([HERE, HERE]), np.ones(2), np.ones(2, bool), ["", ""]),
+            diary=self.diary
+            or Diary(np.array([0.0, END_S]), np.stack([HERE, HERE]), np.ones(2), np.ones(2, bool), ["", ""]),
         )
 
     def explained(self, outcome="collision", config=CONFIG):
@@ -184,7 +195,10 @@ STORIES = {
     "seen_late": (late_into_the_fan, "collision"),
     "hidden": (lambda: lately(lately(Story(), 0.3, "sees", False), 0.4, "believes", False), "collision"),
     "untracked": (lambda: lately(Story(), 0.9, "believes", False), "collision"),
-    "curving": (lambda: change(Story(), circle=np.array([2.0, 0, 0]), foreseen_vel=np.tile([-1.0, 0.5], (41, 1))), "collision"),
+    "curving": (
+        lambda: change(Story(), circle=np.array([2.0, 0, 0]), foreseen_vel=np.tile([-1.0, 0.5], (41, 1))),
+        "collision",
+    ),
     "forecast_missed": (lambda: change(Story(), foreseen_vel=np.tile([-1.0, 0.5], (41, 1))), "collision"),
     "late": (lambda: lately(Story(), 0.4, "leaf", "FollowRoute"), "collision"),
     "wrong_evasion": (Story, "collision"),
@@ -203,7 +217,13 @@ TIMEOUTS = {
     "stuck": {"driven_m": 0.3},
     "circling": {},
 }
-QUIET = {"no_route_share": 0.0, "progress_m": 0.2, "waiting_share": 0.1, "evading_share": 0.1, "driven_m": 4.0}
+QUIET = {
+    "no_route_share": 0.0,
+    "progress_m": 0.2,
+    "waiting_share": 0.1,
+    "evading_share": 0.1,
+    "driven_m": 4.0,
+}
 
 
 def test_every_label_has_a_story():
@@ -228,11 +248,17 @@ def test_a_timeout_gets_its_label(label):
     [
         (lambda: below(0.25), "wrong_evasion"),  # the fan still holds its edge at the end
         (lambda: Story().turn(1.3), "wrong_evasion"),  # long ago, and the forecasts since were right
-        (lambda: change(Story().turn(1.1), foreseen_vel=_learnt_turn(1.1)), "wrong_evasion"),  # the forecast knew of the turn
+        (
+            lambda: change(Story().turn(1.1), foreseen_vel=_learnt_turn(1.1)),
+            "wrong_evasion",
+        ),  # the forecast knew of the turn
         (lambda: Story(end_s=2.1), "wrong_evasion"),  # old enough not to have started in danger
         (lambda: hit_static(moving_m=0.9), "pushed_into_static"),
         (lambda: hit_static(moving_m=1.1), "hit_static"),
-        (lambda: lately(Story(), 0.6, "leaf", "FollowRoute"), "wrong_evasion"),  # the last chance was 0.5 s before the end
+        (
+            lambda: lately(Story(), 0.6, "leaf", "FollowRoute"),
+            "wrong_evasion",
+        ),  # the last chance was 0.5 s before the end
         (lambda: with_second(Story(speed=5.0), y=1.5), "fast_crossing"),
     ],
 )
@@ -271,7 +297,9 @@ REMARKABLE = {
     "remembered clear of the own depth": lambda: change(below(0.35), believed_gap=0.2),
     "taken as static": lambda: lately(Story(), 2.0, "believes", False),
     "backed off before the last chance": lambda: change(Story(), leaf=["BackOff"] * 41),
-    "only heave escaped": lambda: change(STORIES["needs_heave"][0](), foreseen_vel=np.tile([-2.0, 0.5], (41, 1))),
+    "only heave escaped": lambda: change(
+        STORIES["needs_heave"][0](), foreseen_vel=np.tile([-2.0, 0.5], (41, 1))
+    ),
 }
 
 
@@ -285,7 +313,9 @@ def test_every_remark_has_its_story_and_a_plain_one_has_none():
 
 def test_a_start_in_danger_says_what_it_would_be_otherwise():
     assert Story(end_s=1.5).explained().remarks[0] == "else wrong_evasion"
-    assert Story(end_s=0.2).explained().label == "start_in_danger"  # too short for every interval that is looked at
+    assert (
+        Story(end_s=0.2).explained().label == "start_in_danger"
+    )  # too short for every interval that is looked at
 
 
 def test_a_forgotten_body_and_a_seen_corner_are_told():
@@ -295,11 +325,20 @@ def test_a_forgotten_body_and_a_seen_corner_are_told():
     facts = story.explained().facts
     assert (facts["believed_ago_s"], facts["seen_ago_s"], facts["turned_ago_s"]) == (0.5, 0.3, 1.1)
     assert facts["taken_as_static_ago_s"] == 0.0
-    # the turn was at 12.9 s, a lap lasts 8 s: it passed the same corner once before, and the vehicle stood within reach
+    # the turn was at 12.9 s, a lap lasts 8 s: it passed the same corner once before, and the vehicle stood
+    # within reach
     assert facts["turns_in_reach_before"] == 1
-    far = Diary(np.array([0.0, END_S]), np.stack([at(-13.0, 0, 0), HERE]), np.ones(2), np.ones(2, bool), ["", ""])
+    far = Diary(
+        np.array([0.0, END_S]), np.stack([at(-13.0, 0, 0), HERE]), np.ones(2), np.ones(2, bool), ["", ""]
+    )
     assert change(story, diary=far).explained().facts["turns_in_reach_before"] == 1
-    above = Diary(np.array([0.0, END_S]), np.stack([at(0, 0, 0.7), at(0, 0, 0.7)]), np.ones(2), np.ones(2, bool), ["", ""])
+    above = Diary(
+        np.array([0.0, END_S]),
+        np.stack([at(0, 0, 0.7), at(0, 0, 0.7)]),
+        np.ones(2),
+        np.ones(2, bool),
+        ["", ""],
+    )
     assert change(story, diary=above).explained().facts["turns_in_reach_before"] == 0
 
 
@@ -332,7 +371,9 @@ def test_a_second_body_that_passed_earlier_is_not_near():
 def test_a_scan_is_compared_with_the_moment_of_its_ping():
     """Delivered 0.2 s late: the killer is 0.2 m nearer by then, twice the tolerance."""
     story = Story()
-    late = replace(story.history(), ping_age_s=np.full(story.n, 0.2), range_m=story.scan() + 0.2 * (np.arange(256) == 0))
+    late = replace(
+        story.history(), ping_age_s=np.full(story.n, 0.2), range_m=story.scan() + 0.2 * (np.arange(256) == 0)
+    )
     assert explain("collision", late, story.bodies(), CONFIG).facts["seen_ago_s"] == 0.0
     unchanged = replace(late, ping_age_s=np.zeros(story.n))
     assert explain("collision", unchanged, story.bodies(), CONFIG).facts["seen_ago_s"] is None
@@ -350,7 +391,7 @@ def test_timeout_facts_from_a_diary():
     assert facts["waiting_share"] == pytest.approx(8 / 21, abs=1e-3)
 
 
-# ------------------------------------------------------------------------------------------------------------------ geometry
+# --------------------------------------------------------------------------------------------------- geometry
 
 HULL_TOLERANCE_M = 1e-3
 """The axis is sampled every 25 mm (hindsight._AXIS_SAMPLES)."""
@@ -373,12 +414,15 @@ def test_hull_gaps_equal_the_reference():
     body = rng.uniform(-1, 1, (20, 12, 3)) + 1.2 * np.sign(rng.normal(size=(20, 12, 3)))
     gap, normal, along = hindsight.hull_gaps(pos, axis, kind, body, size, yaw, 0.17, 0.10)
     expected = [
-        [hull_reference.clearance(pos[i], axis[i], kind[j], body[i, j], size[j], yaw[j]) for j in range(12)] for i in range(len(pos))
+        [hull_reference.clearance(pos[i], axis[i], kind[j], body[i, j], size[j], yaw[j]) for j in range(12)]
+        for i in range(len(pos))
     ]
     np.testing.assert_allclose(gap, expected, atol=HULL_TOLERANCE_M)
     step = 1e-4
     pushed, _, _ = hindsight.hull_gaps(pos, axis, kind, body + step * normal, size, yaw, 0.17, 0.10)
-    np.testing.assert_allclose((pushed - gap) / step, 1.0, atol=0.02)  # moving a body along the normal opens the gap
+    np.testing.assert_allclose(
+        (pushed - gap) / step, 1.0, atol=0.02
+    )  # moving a body along the normal opens the gap
     assert np.abs(along).max() <= 0.10 + 1e-9
 
 
@@ -388,13 +432,17 @@ def test_wall_gaps_equal_the_reference(shape):
     tank = TankConfig(shape=shape, x_m=(0.0, 8.0), y_m=(0.0, 6.0))
     pos, axis = rng.uniform([2, 1, -1], [6, 5, -0.5], (30, 3)), rng.normal(size=(30, 3))
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-    expected = [hull_reference.wall_clearance(p, a, shape, tank.x_m, tank.y_m) for p, a in zip(pos, axis, strict=True)]
+    expected = [
+        hull_reference.wall_clearance(p, a, shape, tank.x_m, tank.y_m) for p, a in zip(pos, axis, strict=True)
+    ]
     np.testing.assert_allclose(hindsight.wall_gaps(pos, axis, tank, 0.17, 0.10), expected, atol=1e-9)
 
 
 def test_floor_and_surface_gaps_of_a_tilted_hull():
     axis = np.array([[1.0, 0, 0], [np.sqrt(0.5), 0, np.sqrt(0.5)]])
-    floor, surface = hindsight.floor_and_surface_gaps(np.tile([1.0, 1, -0.5], (2, 1)), axis, CONFIG.world.tank, 0.17, 0.10)
+    floor, surface = hindsight.floor_and_surface_gaps(
+        np.tile([1.0, 1, -0.5], (2, 1)), axis, CONFIG.world.tank, 0.17, 0.10
+    )
     np.testing.assert_allclose(floor, [1.1 - 0.17, 1.1 - 0.17 - 0.1 * np.sqrt(0.5)])
     np.testing.assert_allclose(surface, [0.5 - 0.17, 0.5 - 0.17 - 0.1 * np.sqrt(0.5)])
 
@@ -408,11 +456,20 @@ def test_beam_entries_equal_the_reference():
         pos, heading = rng.uniform(-1, 1, 3), rng.uniform(-3, 3)
         body = pos + rng.uniform([1.0, 1.0, -1.5], [4.0, 4.0, 1.5])
         quat = [np.cos(heading / 2), 0, 0, np.sin(heading / 2)]
-        scene = {"kind": kind[j : j + 1][None], "size": size[j][None, None], "yaw": yaw[j : j + 1][None], "body_pos": body[None, None]}
+        scene = {
+            "kind": kind[j : j + 1][None],
+            "size": size[j][None, None],
+            "yaw": yaw[j : j + 1][None],
+            "body_pos": body[None, None],
+        }
         bearing = sonar_reference.beam_headings(np.array(quat), sonar.n_ray)
         u = np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
-        expected, _ = sonar_reference.body_hits(scene, 0, 0, pos, u, np.tan(np.radians(sonar.vertical_half_aperture_deg)))
-        found = hindsight.beam_entries(pos[None], np.array([heading]), kind[j], body[None], size[j], yaw[j], sonar)[0]
+        expected, _ = sonar_reference.body_hits(
+            scene, 0, 0, pos, u, np.tan(np.radians(sonar.vertical_half_aperture_deg))
+        )
+        found = hindsight.beam_entries(
+            pos[None], np.array([heading]), kind[j], body[None], size[j], yaw[j], sonar
+        )[0]
         np.testing.assert_allclose(found, expected, atol=1e-9)
         met += np.isfinite(found).any()
     assert 5 < met < 30  # some are within the fan, some are not
@@ -420,7 +477,10 @@ def test_beam_entries_equal_the_reference():
 
 def test_a_held_velocity_is_approached_with_the_lag():
     t = np.linspace(0, 2.0, 2001)
-    path, vel = (found[0] for found in rolled_out(np.zeros(3), np.array([0.5, 0, 0]), np.array([[0.0, 0.8, -0.2]]), t, 0.35))
+    path, vel = (
+        found[0]
+        for found in rolled_out(np.zeros(3), np.array([0.5, 0, 0]), np.array([[0.0, 0.8, -0.2]]), t, 0.35)
+    )
     left = np.exp(-t / 0.35)[:, None]
     expected = (1 - left) * [0.0, 0.8, -0.2] + left * [0.5, 0.0, 0.0]
     np.testing.assert_allclose(np.gradient(path, t, axis=0)[1:-1], expected[1:-1], atol=1e-3)
@@ -444,7 +504,9 @@ def test_candidates_respect_the_limits_of_the_body_axes():
     across = command[:, 1] * np.cos(0.7) - command[:, 0] * np.sin(0.7)
     assert np.abs(along).max() == pytest.approx(CONFIG.vehicle.max_surge_m_s)
     assert np.abs(across).max() == pytest.approx(CONFIG.vehicle.max_sway_m_s)
-    assert np.hypot(along, across).max() == pytest.approx(np.hypot(0.6, 0.6), abs=1e-6)  # diagonals are the fastest
+    assert np.hypot(along, across).max() == pytest.approx(
+        np.hypot(0.6, 0.6), abs=1e-6
+    )  # diagonals are the fastest
     assert set(np.round(command[:, 2], 6)) == {0.0, 0.4, -0.4}
 
 
@@ -455,7 +517,7 @@ def test_bodies_go_straight_on_after_the_end():
     np.testing.assert_allclose(vel[:, KILLER], [[-1.0, 0.0, 0.0]] * 2)
 
 
-# ------------------------------------------------------------------------------------------------- tables, replay, recording
+# ---------------------------------------------------------------------------------- tables, replay, recording
 
 
 def row(label, episode, closing=None, **facts):
@@ -464,9 +526,20 @@ def row(label, episode, closing=None, **facts):
 
 
 def test_the_table_counts_sorts_and_names_the_worst():
-    rows = [row("late", 0, 0.2), row("late", 1, 0.9), row("unseen_above", 2), row("late", 3, 0.5), row("hit_wall", 4), row("late", 5, 0.1)]
+    rows = [
+        row("late", 0, 0.2),
+        row("late", 1, 0.9),
+        row("unseen_above", 2),
+        row("late", 3, 0.5),
+        row("hit_wall", 4),
+        row("late", 5, 0.1),
+    ]
     table = table_of(rows)
-    assert [(entry["label"], entry["count"]) for entry in table] == [("late", 4), ("hit_wall", 1), ("unseen_above", 1)]
+    assert [(entry["label"], entry["count"]) for entry in table] == [
+        ("late", 4),
+        ("hit_wall", 1),
+        ("unseen_above", 1),
+    ]
     assert table[0]["examples"] == [[1, 1], [1, 3], [1, 0]]
     assert sum(entry["share"] for entry in table) == pytest.approx(1.0)
     assert table[0]["meaning"] == CAUSES["late"]
@@ -483,7 +556,9 @@ def test_what_is_typical_of_a_label():
     assert (late["knew_share"], late["evading_median_s"], late["last_chance_median_s"]) == (0.5, 2.0, 1.25)
     assert late["unseen_median_s"] == pytest.approx((WINDOW_S + 0.1) / 2)
     assert late["remarks"] == {"turned lately": 2, "static near": 1}
-    assert {stuck[name] for name in ("knew_share", "unseen_median_s", "evading_median_s", "last_chance_median_s")} == {None}
+    assert {
+        stuck[name] for name in ("knew_share", "unseen_median_s", "evading_median_s", "last_chance_median_s")
+    } == {None}
     assert stuck["remarks"] == {}
 
 
@@ -519,10 +594,16 @@ def test_a_replay_ends_as_the_episode_did_and_explains_every_failure(played):
 
 def test_the_killer_is_what_the_referee_saw(played):
     _, _, rows = played
-    stops = [row for row in rows if row.result.outcome == "collision" and row.explanation.killer.name not in ("floor", "surface")]
+    stops = [
+        row
+        for row in rows
+        if row.result.outcome == "collision" and row.explanation.killer.name not in ("floor", "surface")
+    ]
     assert stops
     for row in stops:
-        assert row.explanation.killer.gap_m == pytest.approx(row.result.min_clearance_m, abs=2 * HULL_TOLERANCE_M)
+        assert row.explanation.killer.gap_m == pytest.approx(
+            row.result.min_clearance_m, abs=2 * HULL_TOLERANCE_M
+        )
 
 
 def test_a_replay_that_ends_differently_is_an_error(played):
@@ -540,8 +621,12 @@ def test_the_worst_are_recorded_with_picture_and_video(played, tmp_path):
     small, _, rows = played
     shortest = min(rows, key=lambda row: row.result.time_s)
     notes = []
-    paths = record_worst(small.sim, small.trees["straight"], [shortest], tmp_path, "pool", "straight", notes.append)
-    stem = f"{shortest.explanation.label}_straight_seed{shortest.result.seed}_episode{shortest.result.episode}"
+    paths = record_worst(
+        small.sim, small.trees["straight"], [shortest], tmp_path, "pool", "straight", notes.append
+    )
+    stem = (
+        f"{shortest.explanation.label}_straight_seed{shortest.result.seed}_episode{shortest.result.episode}"
+    )
     assert sorted(path.name for path in tmp_path.iterdir()) == [f"{stem}.mcap", f"{stem}.png", f"{stem}.webm"]
     assert paths == [tmp_path / f"{stem}.mcap"]
     assert notes
@@ -562,8 +647,17 @@ def request_of(small, tmp_path, monkeypatch):
     monkeypatch.setattr("uuvtai.sim.Sim", lambda *_: small.sim)
 
     def build(**options):
-        asked = {"controllers": ["straight"], "seeds": [3], "episodes": 6, "num_envs": small.N, "explain": True, "explain_record": 0}
-        return Request(config=small.config, world="pool", sensors="paper", run_dir=tmp_path / "run", **(asked | options))
+        asked = {
+            "controllers": ["straight"],
+            "seeds": [3],
+            "episodes": 6,
+            "num_envs": small.N,
+            "explain": True,
+            "explain_record": 0,
+        }
+        return Request(
+            config=small.config, world="pool", sensors="paper", run_dir=tmp_path / "run", **(asked | options)
+        )
 
     yield build
     small.sim.use_tree(small.trees["bt"])
@@ -576,12 +670,16 @@ def test_a_comparison_carries_its_causes(request_of):
     method = result["methods"][0]
     failed = [d for d in method["episodes_detail"] if d["outcome"] != "success"]
     assert failed
-    assert [(e["seed"], e["episode"], e["outcome"]) for e in method["explain"]] == [(d["seed"], d["episode"], d["outcome"]) for d in failed]
+    assert [(e["seed"], e["episode"], e["outcome"]) for e in method["explain"]] == [
+        (d["seed"], d["episode"], d["outcome"]) for d in failed
+    ]
     assert sum(cause["count"] for cause in method["causes"]) == len(failed)
     assert [(folder / e["log"]).is_file() for e in method["explain"] if e["log"]] == [True]
     assert json.loads((folder / "eval/result.json").read_text()) == result
     written = json.loads((folder / "eval/explain.json").read_text())
-    assert written["methods"] == [{"name": "straight", "causes": method["causes"], "explain": method["explain"]}]
+    assert written["methods"] == [
+        {"name": "straight", "causes": method["causes"], "explain": method["explain"]}
+    ]
 
 
 def test_without_explain_the_document_has_no_causes(request_of):
@@ -608,7 +706,10 @@ def test_an_interrupted_explanation_leaves_the_results(request_of, monkeypatch):
 
 @pytest.mark.parametrize(
     ("arguments", "says"),
-    [(["--explain-record", "2"], "give --explain too"), (["--explain", "--explain-record", "-1"], "must be at least 0")],
+    [
+        (["--explain-record", "2"], "give --explain too"),
+        (["--explain", "--explain-record", "-1"], "must be at least 0"),
+    ],
 )
 def test_bad_combinations_are_one_message(capfd, arguments, says):
     from uuvtai.cli import main
@@ -623,7 +724,9 @@ def test_the_table_is_printed_and_no_failure_is_said(capfd):
     from uuvtai.show.cause_table import show_causes
     from uuvtai.show.screen import Screen
 
-    causes_found = table_of([row("late", 0, 0.2, forecast_error_m=0.1, seen_ago_s=0.0, evading_s=0.4, last_chance_s=0.5)])
+    causes_found = table_of(
+        [row("late", 0, 0.2, forecast_error_m=0.1, seen_ago_s=0.0, evading_s=0.4, last_chance_s=0.5)]
+    )
     method = {"name": "bt", "episodes": 9, "explain": [{}], "causes": causes_found}
     show_causes(Screen(), {"methods": [method, {"name": "calm", "episodes": 9, "explain": [], "causes": []}]})
     out = capfd.readouterr().out

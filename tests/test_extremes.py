@@ -1,4 +1,5 @@
-"""Every config key at its extremes: accepted, with sizes that can be told, or refused in words; nothing overflows."""
+"""Every config key at its extremes: accepted, with sizes that can be told, or refused in words; nothing
+overflows."""
 
 import copy
 import math
@@ -11,7 +12,24 @@ from uuvtai.errors import UserError
 from uuvtai.loader import _checked, load_config, load_training
 from uuvtai.sizes import array_sizes, check_size, memory_bytes
 
-EXTREMES = (0, -1, 5e-324, 1e-300, 1e-6, 1e300, 1e18, math.nan, math.inf, 2**31, 2**31 - 1, 2**63, -(2**63), 10**400, "", [])
+EXTREMES = (
+    0,
+    -1,
+    5e-324,
+    1e-300,
+    1e-6,
+    1e300,
+    1e18,
+    math.nan,
+    math.inf,
+    2**31,
+    2**31 - 1,
+    2**63,
+    -(2**63),
+    10**400,
+    "",
+    [],
+)
 TREE = load_training("curriculum").model_dump(mode="json")
 
 
@@ -74,7 +92,11 @@ def test_no_extreme_of_a_simulator_s_key_overflows(section):
 
 @pytest.mark.parametrize("section", sorted(LearningConfig.model_fields.keys() - Config.model_fields.keys()))
 def test_no_extreme_of_a_training_s_key_is_more_than_refused(section):
-    found = [taken(LearningConfig, key, value) for key in keys(TREE[section], (section,)) for value in candidates(at(TREE, key))]
+    found = [
+        taken(LearningConfig, key, value)
+        for key in keys(TREE[section], (section,))
+        for value in candidates(at(TREE, key))
+    ]
     assert any(found) and not all(found)
 
 

@@ -7,7 +7,14 @@ import torch
 from tests.bundles import io_for
 from tests.reference import features as oracle
 from uuvtai import tree_codes as codes
-from uuvtai.config import EpisodeConfig, FeaturesConfig, ForecastConfig, SonarConfig, TankConfig, TrackingConfig
+from uuvtai.config import (
+    EpisodeConfig,
+    FeaturesConfig,
+    ForecastConfig,
+    SonarConfig,
+    TankConfig,
+    TrackingConfig,
+)
 from uuvtai.kernels.core.geometry import FAR_M
 from uuvtai.kernels.planning.bundles import FeaturesIO
 from uuvtai.kernels.planning.features import (
@@ -59,7 +66,9 @@ class Stage:
         self.clock.awake.from_numpy(np.ones(N_ENV, np.int32) if awake is None else awake.astype(np.int32))
         sense_sectors(io_for(FeaturesIO, self.features, self.scan, self.ego, self.clock, FEATURES, SONAR))
         f = self.features
-        return np.array([x.to_numpy() for x in (f.sector_range_m, f.sector_ttc_s, f.sector_closing_m_s, f.sector_valid)])
+        return np.array(
+            [x.to_numpy() for x in (f.sector_range_m, f.sector_ttc_s, f.sector_closing_m_s, f.sector_valid)]
+        )
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +79,11 @@ def stage():
 def random_scan(seed):
     rng = np.random.default_rng(seed)
     hit = rng.uniform(size=(N_ENV, N_RAY)) < rng.choice([0.02, 0.3, 1.0], size=(N_ENV, 1))
-    return np.where(hit, rng.uniform(0.2, 12, hit.shape), 12.0), np.where(hit, rng.normal(0, 0.6, hit.shape), 0.0), hit
+    return (
+        np.where(hit, rng.uniform(0.2, 12, hit.shape), 12.0),
+        np.where(hit, rng.normal(0, 0.6, hit.shape), 0.0),
+        hit,
+    )
 
 
 @pytest.mark.parametrize("turn", [0.0, 1.0])
@@ -83,7 +96,9 @@ def test_sectors_equal_the_oracle(stage, turn):
         got = stage.run(range_m, doppler, hit, yaw, ping_yaw)
         for env in range(N_ENV):
             turned = float(yaw[env] - ping_yaw[env])
-            want = oracle.sectors(range_m[env], doppler[env], hit[env], turned, N_SECTOR, SONAR.max_range_m, FEATURES.ttc_cap_s)
+            want = oracle.sectors(
+                range_m[env], doppler[env], hit[env], turned, N_SECTOR, SONAR.max_range_m, FEATURES.ttc_cap_s
+            )
             assert np.allclose(got[:, env], want, rtol=ROUNDING, atol=ROUNDING)
 
 
@@ -97,7 +112,11 @@ def test_a_turn_across_pi_is_no_turn_of_the_beams(stage):
 
 def test_one_approaching_body_by_hand(stage):
     range_m, doppler, hit = np.full((N_ENV, N_RAY), 12.0), np.zeros((N_ENV, N_RAY)), np.zeros((N_ENV, N_RAY))
-    range_m[:, 64:67], doppler[:, 64:67], hit[:, 64:67] = [2.0, 1.9, 2.1], [-0.5, -0.4, 0.3], 1  # 90 degrees to the left
+    range_m[:, 64:67], doppler[:, 64:67], hit[:, 64:67] = (
+        [2.0, 1.9, 2.1],
+        [-0.5, -0.4, 0.3],
+        1,
+    )  # 90 degrees to the left
     got = stage.run(range_m, doppler, hit, np.zeros(N_ENV), np.zeros(N_ENV))
     assert np.allclose(got[:, :, 3].T, [1.9, 4.0, 0.5, 1])
     others = np.delete(got, 3, axis=2)
@@ -113,7 +132,7 @@ def test_sleeping_rows_keep_their_features(stage):
     assert (second[:, awake] != first[:, awake]).any(axis=(0, 2)).all()
 
 
-# -------------------------------------------------------------------------------------------------------------- observation
+# ------------------------------------------------------------------------------------------------ observation
 
 OBSERVATION_ROUNDING = 1e-5
 """Single precision of a rotation of positions of about 10 m."""
@@ -121,7 +140,8 @@ OBSERVATION_ROUNDING = 1e-5
 
 @pytest.fixture(scope="module")
 def observed(stage):
-    """(observation (n_env, n_obs), arrays it was made of, rows awake) for random states; -7 was there before."""
+    """(observation (n_env, n_obs), arrays it was made of, rows awake) for random states; -7 was there
+    before."""
     sizes = {"n_env": N_ENV, "n_way": 2, "n_ahead": 2, "n_trigger": 4, "n_planner": 2, "n_reason": 4}
     route, mission = allocate(RouteState, sizes), allocate(MissionState, sizes)
     rng, arrays = np.random.default_rng(0), {}
@@ -138,7 +158,9 @@ def observed(stage):
     awake = np.arange(N_ENV) % 4 != 1
     stage.clock.awake.from_numpy(awake.astype(np.int32))
     obs = torch.full((N_ENV, observation_width(FEATURES)), -7.0)
-    write_observation(io_for(FeaturesIO, stage.features, route, stage.ego, mission, stage.clock, FEATURES), obs)
+    write_observation(
+        io_for(FeaturesIO, stage.features, route, stage.ego, mission, stage.clock, FEATURES), obs
+    )
     return obs.numpy(), arrays, awake
 
 
@@ -149,7 +171,9 @@ def test_observation_equals_the_oracle_in_every_column(observed):
         assert list(want) == [c.name for c in COLUMNS]
         for column, first, width in placed_columns(FEATURES):
             got = obs[env, first : first + width]
-            np.testing.assert_allclose(got, np.broadcast_to(want[column.name], width), atol=OBSERVATION_ROUNDING, err_msg=column.name)
+            np.testing.assert_allclose(
+                got, np.broadcast_to(want[column.name], width), atol=OBSERVATION_ROUNDING, err_msg=column.name
+            )
 
 
 def test_sleeping_rows_keep_their_observation(observed):
@@ -158,13 +182,22 @@ def test_sleeping_rows_keep_their_observation(observed):
 
 
 def test_first_columns_are_the_papers_targets_of_the_world_model():
-    """3 goal errors, sine and cosine of the heading error, 3 velocities, yaw rate, depth, roll and pitch, 12 ranges: 24."""
+    """3 goal errors, sine and cosine of the heading error, 3 velocities, yaw rate, depth, roll and pitch, 12
+    ranges: 24."""
     names = [column.name for column, _first, width in placed_columns(FEATURES) for _ in range(width)]
-    paper = {"goal": 3, "heading_error": 2, "velocity": 3, "yaw_rate": 1, "depth": 1, "tilt": 2, "sector_range": 12}
+    paper = {
+        "goal": 3,
+        "heading_error": 2,
+        "velocity": 3,
+        "yaw_rate": 1,
+        "depth": 1,
+        "tilt": 2,
+        "sector_range": 12,
+    }
     assert names[:24] == [name for name, width in paper.items() for _ in range(width)]
 
 
-# -------------------------------------------------------------------------------------------------------- bodies and advice
+# ------------------------------------------------------------------------------------------ bodies and advice
 
 MORE = FeaturesConfig(n_track=3, teacher=True)
 FORECAST, TRACKING, TANK, RULES = ForecastConfig(), TrackingConfig(), TankConfig(), EpisodeConfig()
@@ -176,7 +209,9 @@ BODY_ROUNDING = 2e-5
 
 def span(name):
     """Columns of a group with bodies and advice."""
-    first, width = next((first, width) for column, first, width in placed_columns(MORE) if column.name == name)
+    first, width = next(
+        (first, width) for column, first, width in placed_columns(MORE) if column.name == name
+    )
     return slice(first, first + width)
 
 
@@ -196,7 +231,20 @@ class Bodies:
         self.clock.awake.from_numpy(np.ones(N_ENV, np.int32) if awake is None else awake.astype(np.int32))
         obs = torch.full((N_ENV, observation_width(MORE)), -7.0)
         write_bodies(
-            io_for(FeaturesIO, self.features, self.forecast, self.tracks, self.ego, self.clock, MORE, FORECAST, TRACKING, TANK, RULES), obs
+            io_for(
+                FeaturesIO,
+                self.features,
+                self.forecast,
+                self.tracks,
+                self.ego,
+                self.clock,
+                MORE,
+                FORECAST,
+                TRACKING,
+                TANK,
+                RULES,
+            ),
+            obs,
         )
         return obs.numpy()
 
@@ -225,11 +273,14 @@ def no_bodies():
 
 
 def random_bodies(seed):
-    """Up to all slots moving, curved forecasts, every second body's turn rate well known, heights known or not, own motion and tilt."""
+    """Up to all slots moving, curved forecasts, every second body's turn rate well known, heights known or
+    not, own motion and tilt."""
     rng, values = np.random.default_rng(seed), no_bodies()
     moving = rng.uniform(size=(N_ENV, N_TRACK)) < 0.6
     growth = rng.uniform(0, 0.02, (N_ENV, N_TRACK, N_FORECAST)).cumsum(axis=2)
-    values["forecast.radius_m"] = np.where(moving[..., None], rng.uniform(0.1, 0.5, (N_ENV, N_TRACK, 1)) + growth, -1)
+    values["forecast.radius_m"] = np.where(
+        moving[..., None], rng.uniform(0.1, 0.5, (N_ENV, N_TRACK, 1)) + growth, -1
+    )
     steps = rng.normal(0, 0.1, (N_ENV, N_TRACK, 1, 2)) + rng.normal(0, 0.02, (N_ENV, N_TRACK, N_FORECAST, 2))
     values["forecast.pos_w"] = rng.uniform(-5, 5, (N_ENV, N_TRACK, 1, 2)) + steps.cumsum(axis=2)
     unknown = rng.uniform(size=(N_ENV, N_TRACK)) < 0.3
@@ -252,16 +303,26 @@ def test_bodies_equal_the_oracle_in_every_column(bodies):
         values = random_bodies(seed)
         obs = bodies.run(values)
         for env in range(N_ENV):
-            want = oracle.bodies({name: np.float64(a[env]) for name, a in values.items()}, MORE.n_track, FORECAST, TRACKING, TANK, RULES)
+            want = oracle.bodies(
+                {name: np.float64(a[env]) for name, a in values.items()},
+                MORE.n_track,
+                FORECAST,
+                TRACKING,
+                TANK,
+                RULES,
+            )
             for name, rows in want.items():
-                np.testing.assert_allclose(obs[env, span(name)], rows.ravel(), atol=BODY_ROUNDING, err_msg=f"{name} in env {env}")
+                np.testing.assert_allclose(
+                    obs[env, span(name)], rows.ravel(), atol=BODY_ROUNDING, err_msg=f"{name} in env {env}"
+                )
             seen += int(want["body_valid"].sum())
         assert list(want) == [column.name for column in columns(MORE) if column.per == "body"]
     assert 100 < seen < 3 * N_ENV * MORE.n_track
 
 
 def test_bodies_by_hand(bodies):
-    """Heading along y at 0.5 m/s. One body stands 2 m ahead, one comes from the right ahead at 1 m/s and passes behind, one recedes."""
+    """Heading along y at 0.5 m/s. One body stands 2 m ahead, one comes from the right ahead at 1 m/s and
+    passes behind, one recedes."""
     values = no_bodies()
     values["ego.rpy"][:, 2] = np.pi / 2
     values["ego.vel_b"][:, 0] = 0.5
@@ -281,8 +342,11 @@ def test_bodies_by_hand(bodies):
     depth = TANK.z_m[1] - TANK.z_m[0]
     np.testing.assert_allclose(obs[span("body_free_water")], [0.6, depth, 0, 0, 0, 0], atol=BODY_ROUNDING)
     np.testing.assert_allclose(obs[span("body_age")], [0.5, 0.5, 0.5], atol=BODY_ROUNDING)
-    # the crossing body: relative course (-1, -0.5) from (0.5, 0): closest at t = 0.4 s, where it is at (0.1, -0.2)
-    np.testing.assert_allclose(obs[span("body_closest")], [np.hypot(0.1, 0.2) - 0.3, 0.7, 2 - 0.5 * 0.7 - 0.3], atol=BODY_ROUNDING)
+    # the crossing body: relative course (-1, -0.5) from (0.5, 0): closest at t = 0.4 s, where it is at (0.1,
+    # -0.2)
+    np.testing.assert_allclose(
+        obs[span("body_closest")], [np.hypot(0.1, 0.2) - 0.3, 0.7, 2 - 0.5 * 0.7 - 0.3], atol=BODY_ROUNDING
+    )
     np.testing.assert_allclose(obs[span("body_closest_time")], [0.4, 0, 0.7], atol=BODY_ROUNDING)
 
 
@@ -315,7 +379,12 @@ def test_advice_is_what_the_tree_says(stage):
     action = rng.uniform(-1, 1, (N_ENV, 4)).astype(np.float32)
     conflict = np.where(np.arange(N_ENV) % 2 == 0, FAR_M, rng.uniform(0, 2.5, N_ENV)).astype(np.float32)
     cost = rng.uniform(0, 20, N_ENV).astype(np.float32)
-    for field, array in ((teacher.leaf, acting), (teacher.action, action), (teacher.conflict_s, conflict), (teacher.evade_cost, cost)):
+    for field, array in (
+        (teacher.leaf, acting),
+        (teacher.action, action),
+        (teacher.conflict_s, conflict),
+        (teacher.evade_cost, cost),
+    ):
         field.from_numpy(array)
     awake = np.arange(N_ENV) != 9
     stage.clock.awake.from_numpy(awake.astype(np.int32))
@@ -325,8 +394,12 @@ def test_advice_is_what_the_tree_says(stage):
     assert span("teacher_class").stop == obs.shape[1], "the last columns of all"
     assert (obs[9] == -7).all() and (obs[:, : span("teacher_action").start] == -7).all()
     np.testing.assert_array_equal(obs[awake, span("teacher_action")], action[awake])
-    np.testing.assert_array_equal(obs[awake, span("teacher_conflict")][:, 0], np.minimum(conflict, MORE.ttc_cap_s)[awake])
-    np.testing.assert_array_equal(obs[awake, span("teacher_evade_cost")][:, 0], np.where(acting == 1, cost, 0)[awake])
+    np.testing.assert_array_equal(
+        obs[awake, span("teacher_conflict")][:, 0], np.minimum(conflict, MORE.ttc_cap_s)[awake]
+    )
+    np.testing.assert_array_equal(
+        obs[awake, span("teacher_evade_cost")][:, 0], np.where(acting == 1, cost, 0)[awake]
+    )
     kinds = np.zeros((N_ENV, 5))
     kinds[np.arange(len(LEAVES)), CLASS_OF_LEAF] = 1
     np.testing.assert_array_equal(obs[awake, span("teacher_class")], kinds[awake])

@@ -1,4 +1,5 @@
-"""Figures in README and docs: each comes out of a committed results file, and one that does not, or not any more, is caught."""
+"""Figures in README and docs: each comes out of a committed results file, and one that does not, or not any
+more, is caught."""
 
 import json
 import shlex
@@ -15,12 +16,13 @@ from tests.test_docs import fault
 SOURCES = Sources()
 
 
-# -------------------------------------------------------------------------------------------------------------- the pages
+# -------------------------------------------------------------------------------------------------- the pages
 
 
 @pytest.mark.parametrize("path", figures.pages(), ids=lambda path: path.stem)
 def test_no_figure_is_stale_and_none_is_without_a_source(path):
-    """Where this fails: ``python -m docs.writers.figures`` renews what is marked and lists what is not (CONTRIBUTING.md)."""
+    """Where this fails: ``python -m docs.writers.figures`` renews what is marked and lists what is not
+    (CONTRIBUTING.md)."""
     assert figures.faults(path, SOURCES) == []
 
 
@@ -37,13 +39,15 @@ def test_pages_named_in_lists_are_there_and_every_table_is_used():
     assert len(figures.MARK.findall(text)) > 30
 
 
-# ---------------------------------------------------------------------------------------------------- a copy gone wrong
+# ------------------------------------------------------------------------------------------ a copy gone wrong
 
 
 @pytest.fixture
 def copy(tmp_path):
     """What is watched and what it rests on, in a folder of its own."""
-    shutil.copytree(ROOT / "docs", tmp_path / "docs", ignore=shutil.ignore_patterns("reference", "__pycache__", "*.png"))
+    shutil.copytree(
+        ROOT / "docs", tmp_path / "docs", ignore=shutil.ignore_patterns("reference", "__pycache__", "*.png")
+    )
     shutil.copytree(ROOT / "benchmarks/results", tmp_path / "benchmarks/results")
     shutil.copy(ROOT / "README.md", tmp_path / "README.md")
     return tmp_path
@@ -85,16 +89,23 @@ def test_results_that_move_on_leave_the_text_behind(copy):
 
 
 def test_a_mark_that_leads_nowhere_says_what_there_is(copy):
-    told = changed(copy, "README.md", "evaluations.pool_0.straight/bt.time_ratio", "evaluations.pol_0.straight/bt.time_ratio")
+    told = changed(
+        copy,
+        "README.md",
+        "evaluations.pool_0.straight/bt.time_ratio",
+        "evaluations.pol_0.straight/bt.time_ratio",
+    )
     assert "no row 'pol_0'" in told and "pool_0" in told
 
 
 def test_the_page_of_results_changed_by_hand_is_caught(copy):
-    (copy / "docs/results.md").write_text((copy / "docs/results.md").read_text().replace("| holds |", "| HOLDS |", 1))
+    (copy / "docs/results.md").write_text(
+        (copy / "docs/results.md").read_text().replace("| holds |", "| HOLDS |", 1)
+    )
     assert (copy / "docs/results.md").read_text() != reproduction.page(copy)
 
 
-# ------------------------------------------------------------------------------------------------------------ what is seen
+# ----------------------------------------------------------------------------------------------- what is seen
 
 
 @pytest.mark.parametrize(
@@ -117,7 +128,9 @@ def test_the_page_of_results_changed_by_hand_is_caught(copy):
     ],
 )
 def test_figures_without_a_source_are_seen(line):
-    assert [number for number, _told in unmarked("docs/x.md", f"# Title\n\n{line}\n")] == [3] * len(list(unmarked("docs/x.md", line)))
+    assert [number for number, _told in unmarked("docs/x.md", f"# Title\n\n{line}\n")] == [3] * len(
+        list(unmarked("docs/x.md", line))
+    )
     assert list(unmarked("docs/x.md", line)), line
 
 
@@ -149,7 +162,12 @@ def test_a_kind_holds_until_the_next_heading():
 
 def test_logs_say_that_they_are_logs_and_that_the_raw_file_was_not_kept():
     assert "nowhere says" in next(unmarked("docs/x.md", "<!-- figures: log 2026-11-22 -->\nit took 5 s"))[1]
-    assert list(unmarked("docs/x.md", "<!-- figures: log 2026-11-22 -->\nit took 5 s; the raw file was not kept")) == []
+    assert (
+        list(
+            unmarked("docs/x.md", "<!-- figures: log 2026-11-22 -->\nit took 5 s; the raw file was not kept")
+        )
+        == []
+    )
     assert "does not say so" in next(unmarked("docs/history.md", "# Speed\nit took 5 s"))[1]
 
 
@@ -158,13 +176,21 @@ def test_parameter_pages_may_hold_times_but_no_rates():
     assert list(unmarked("docs/simulator.md", "which arrives in 98.0 %")) != []
 
 
-# ---------------------------------------------------------------------------------------------------------------- sources
+# ---------------------------------------------------------------------------------------------------- sources
 
 
 def test_counts_by_hand():
     counts = Counts(500, {"success": 490, "collision": 7, "ttc": 2, "out_of_tank": 1, "timeout": 0}, 13.4)
-    assert (counts.field("success"), counts.field("success_of"), counts.field("success_rate")) == (490, "490/500", 0.98)
-    assert (counts.field("collision"), counts.field("contact"), counts.field("out_of_tank_rate")) == (10, 7, 0.002)
+    assert (counts.field("success"), counts.field("success_of"), counts.field("success_rate")) == (
+        490,
+        "490/500",
+        0.98,
+    )
+    assert (counts.field("collision"), counts.field("contact"), counts.field("out_of_tank_rate")) == (
+        10,
+        7,
+        0.002,
+    )
     assert (counts.field("time_s"), counts.field("episodes")) == (13.4, 500)
     # Wilson by hand: (0.98 + z2 / 1000 -+ z sqrt(0.98 0.02 / 500 + z2 / 10^6)) / (1 + z2 / 500), z2 = 3.8415
     assert counts.field("success_low") == pytest.approx(0.96358, abs=1e-5)
@@ -176,17 +202,55 @@ def test_counts_by_hand():
 
 
 CELLS = [
-    {"S": "4", "D": "0", "v_m_s": "", "method": "bt", "episodes": "10", "success": "10", "contact": "0", "ttc_stop": "0"},
-    {"S": "4", "D": "3", "v_m_s": "0.2", "method": "bt", "episodes": "10", "success": "8", "contact": "1", "ttc_stop": "0"},
-    {"S": "4", "D": "3", "v_m_s": "3.0", "method": "bt", "episodes": "10", "success": "2", "contact": "4", "ttc_stop": "2"},
-    {"S": "4", "D": "3", "v_m_s": "0.2", "method": "best", "episodes": "10", "success": "9", "contact": "0", "ttc_stop": "0"},
+    {
+        "S": "4",
+        "D": "0",
+        "v_m_s": "",
+        "method": "bt",
+        "episodes": "10",
+        "success": "10",
+        "contact": "0",
+        "ttc_stop": "0",
+    },
+    {
+        "S": "4",
+        "D": "3",
+        "v_m_s": "0.2",
+        "method": "bt",
+        "episodes": "10",
+        "success": "8",
+        "contact": "1",
+        "ttc_stop": "0",
+    },
+    {
+        "S": "4",
+        "D": "3",
+        "v_m_s": "3.0",
+        "method": "bt",
+        "episodes": "10",
+        "success": "2",
+        "contact": "4",
+        "ttc_stop": "2",
+    },
+    {
+        "S": "4",
+        "D": "3",
+        "v_m_s": "0.2",
+        "method": "best",
+        "episodes": "10",
+        "success": "9",
+        "contact": "0",
+        "ttc_stop": "0",
+    },
 ]
 CELLS = [cell | {"out_of_tank": "0", "timeout": "0", "time_to_success_mean_s": "10.0"} for cell in CELLS]
 
 
 def test_cells_are_chosen_and_pooled_by_hand():
     assert pooled(fitting(CELLS, ["bt"])).field("success_of") == "20/30"
-    assert pooled(fitting(CELLS, ["bt", "v_m_s<=1.5"])).field("success_of") == "18/20", "where nothing moves it is slow enough"
+    assert pooled(fitting(CELLS, ["bt", "v_m_s<=1.5"])).field("success_of") == "18/20", (
+        "where nothing moves it is slow enough"
+    )
     assert pooled(fitting(CELLS, ["bt", "v_m_s=3.0"])).field("collision") == 6
     assert pooled(fitting(CELLS, ["moderate", "best"])).field("success_of") == "9/10"
     # two speeds: the cell in which nothing moves counts twice
@@ -243,7 +307,7 @@ def test_the_newest_results_of_a_benchmark_are_taken(tmp_path):
     assert Sources(tmp_path).value("bench.scale[w].ours") == 2
 
 
-# ------------------------------------------------------------------------------------------------------------ evaluations
+# ------------------------------------------------------------------------------------------------ evaluations
 
 
 @pytest.mark.parametrize("row", evaluations.ROWS, ids=lambda row: row.name)
@@ -265,11 +329,32 @@ def test_names_of_rows_are_one_each_and_the_default_holds_them():
 def result(success=3, n=4):
     """What ``uuv eval --json`` says of one method."""
     outcomes = {"success": success, "collision": n - success, "ttc": 0, "out_of_tank": 0, "timeout": 0}
-    causes = [{"label": "unseen", "count": n - success, "share": 1.0, "meaning": "m", "examples": []}] if success < n else []
-    method = {"episodes": n, "outcomes": outcomes, "time_mean_s": 9.0, "time_to_success_mean_s": 10.0, "causes": causes}
-    pair = {"a": "straight", "b": "bt", "both": 2, "only_a": 0, "only_b": 1, "mcnemar_p": 1.0, "time_difference_mean_s": -0.5}
+    causes = (
+        [{"label": "unseen", "count": n - success, "share": 1.0, "meaning": "m", "examples": []}]
+        if success < n
+        else []
+    )
+    method = {
+        "episodes": n,
+        "outcomes": outcomes,
+        "time_mean_s": 9.0,
+        "time_to_success_mean_s": 10.0,
+        "causes": causes,
+    }
+    pair = {
+        "a": "straight",
+        "b": "bt",
+        "both": 2,
+        "only_a": 0,
+        "only_b": 1,
+        "mcnemar_p": 1.0,
+        "time_difference_mean_s": -0.5,
+    }
     pair |= {"time_a_mean_s": 10.0, "time_b_mean_s": 10.5, "time_difference_ci95": None}
-    return {"methods": [method | {"name": name, "episodes_detail": []} for name in ("straight", "bt")], "paired": [pair]}
+    return {
+        "methods": [method | {"name": name, "episodes_detail": []} for name in ("straight", "bt")],
+        "paired": [pair],
+    }
 
 
 def test_a_row_is_kept_small_and_shown_from_what_is_kept(tmp_path):
@@ -287,7 +372,9 @@ def test_a_row_is_kept_small_and_shown_from_what_is_kept(tmp_path):
     assert shown[0] == "`x`" and shown[1].startswith("3/4"), "a row may show another method than bt"
     line = figure_tables.evaluations(sources).splitlines()[2]
     assert f"| {row.title} | 3/4 = 75.0 %" in line and "| 1 / 0 / 0 / 0 |" in line and "unseen 1" in line
-    assert "seed 77" in figure_tables.measured(sources) and "never tuned on" in figure_tables.measured(sources)
+    assert "seed 77" in figure_tables.measured(sources) and "never tuned on" in figure_tables.measured(
+        sources
+    )
 
 
 def test_what_was_played_by_this_code_is_not_played_again(tmp_path, monkeypatch):
@@ -301,11 +388,24 @@ def test_what_was_played_by_this_code_is_not_played_again(tmp_path, monkeypatch)
 
     monkeypatch.setattr(evaluations, "_play", play)
     monkeypatch.setattr(evaluations, "commit_of_package", lambda: "abc")
-    arguments = ["--seeds", "77", "--episodes", "4", "--out", str(path), "--only", "pool_6,maze_0,netpen", "--jobs", "1"]
+    arguments = [
+        "--seeds",
+        "77",
+        "--episodes",
+        "4",
+        "--out",
+        str(path),
+        "--only",
+        "pool_6,maze_0,netpen",
+        "--jobs",
+        "1",
+    ]
     assert evaluations.main(arguments) == 1, "one row failed; the others are kept"
     assert evaluations.main(arguments) == 0
     assert played == ["pool_6", "maze_0", "netpen", "maze_0"]
-    assert [row["name"] for row in json.loads(path.read_text())["rows"]] == ["pool_6", "maze_0", "netpen"], "in the order of the table"
+    assert [row["name"] for row in json.loads(path.read_text())["rows"]] == ["pool_6", "maze_0", "netpen"], (
+        "in the order of the table"
+    )
     monkeypatch.setattr(evaluations, "commit_of_package", lambda: "def")
     assert evaluations.main(arguments) == 0 and len(played) == 7, "other code, other results"
 
@@ -313,14 +413,18 @@ def test_what_was_played_by_this_code_is_not_played_again(tmp_path, monkeypatch)
 def test_a_file_of_another_seed_and_unknown_names_are_refused(tmp_path, capsys):
     path = tmp_path / "evaluations.json"
     path.write_text(json.dumps({"schema": 1, "seed": 77, "episodes": 4, "rows": []}))
-    assert evaluations.main(["--seeds", "78", "--out", str(path)]) == 2 and "seed 77" in capsys.readouterr().err
+    assert (
+        evaluations.main(["--seeds", "78", "--out", str(path)]) == 2 and "seed 77" in capsys.readouterr().err
+    )
     assert evaluations.main(["--seeds", "78", "--only", "pol_6"]) == 2 and "pool_6" in capsys.readouterr().err
 
 
 def test_the_commit_is_the_last_that_changed_the_package(tmp_path):
     def git(*arguments):
         identity = ["-c", "user.name=a", "-c", "user.email=a@b"]
-        done = subprocess.run(["git", "-C", str(tmp_path), *identity, *arguments], capture_output=True, text=True, check=True)
+        done = subprocess.run(
+            ["git", "-C", str(tmp_path), *identity, *arguments], capture_output=True, text=True, check=True
+        )
         return done.stdout.strip()
 
     (tmp_path / "uuvtai").mkdir()
@@ -343,25 +447,57 @@ def test_a_sweep_is_kept_as_the_text_reads_it(tmp_path):
     (root / "docs/data").mkdir(parents=True)
     outcomes = {"success": 7, "collision": 1, "ttc": 1, "out_of_tank": 0, "timeout": 1}
     cell = {"method": "bt", "episodes": 10, "outcomes": outcomes, "time_to_success_mean_s": 12.3456}
-    cells = [cell | {"S": 8, "D": 0, "v_m_s": None}, cell | {"S": 8, "D": 6, "v_m_s": 0.6, "teacher.caution": [0.5, 1]}]
-    sweep = {"axes": {"S": [8], "D": [0, 6], "v": [0.6], "teacher.caution": [1]}, "seeds": [77], "episodes_per_seed": 10, "cells": cells}
+    cells = [
+        cell | {"S": 8, "D": 0, "v_m_s": None},
+        cell | {"S": 8, "D": 6, "v_m_s": 0.6, "teacher.caution": [0.5, 1]},
+    ]
+    sweep = {
+        "axes": {"S": [8], "D": [0, 6], "v": [0.6], "teacher.caution": [1]},
+        "seeds": [77],
+        "episodes_per_seed": 10,
+        "cells": cells,
+    }
     (run / "sweep.json").write_text(json.dumps(sweep))
     argv = ["/somewhere/uuv", "sweep", "best", "--run-dir", "/somewhere/runs/x", "--json"]
-    (run / "run.json").write_text(json.dumps({"argv": argv, "started": "today", "git_sha": "abc", "wall_s": 1.5}))
+    (run / "run.json").write_text(
+        json.dumps({"argv": argv, "started": "today", "git_sha": "abc", "wall_s": 1.5})
+    )
     sweeps.keep(run, "small", root)
     sources = Sources(root)
-    assert sources.value("sweep.small[bt].success_of") == "14/20" and sources.value("sweep.small[D=0].collision") == 2
+    assert (
+        sources.value("sweep.small[bt].success_of") == "14/20"
+        and sources.value("sweep.small[D=0].collision") == 2
+    )
     assert sources.value("sweep.small.about.command") == "uuv sweep best", "without the machine's paths"
-    assert sources.cells("small")[1]["teacher.caution"] == "[0.5, 1]" and sources.cells("small")[0]["v_m_s"] == ""
+    assert (
+        sources.cells("small")[1]["teacher.caution"] == "[0.5, 1]"
+        and sources.cells("small")[0]["v_m_s"] == ""
+    )
 
 
 def test_a_sweep_of_one_axis_at_a_time_leaves_out_what_is_unchanged(tmp_path):
     (tmp_path / "docs/data").mkdir(parents=True)
     outcomes = {"success": 1, "collision": 0, "ttc": 0, "out_of_tank": 0, "timeout": 0}
-    cell = {"method": "bt", "episodes": 1, "outcomes": outcomes, "time_to_success_mean_s": None, "S": 8, "v_m_s": 0.6}
-    sweep = {"axes": {"D": [9], "sensors": ["harsh"]}, "unchanged": {"D": 6, "sensors": None}, "seeds": [77], "episodes_per_seed": 1}
+    cell = {
+        "method": "bt",
+        "episodes": 1,
+        "outcomes": outcomes,
+        "time_to_success_mean_s": None,
+        "S": 8,
+        "v_m_s": 0.6,
+    }
+    sweep = {
+        "axes": {"D": [9], "sensors": ["harsh"]},
+        "unchanged": {"D": 6, "sensors": None},
+        "seeds": [77],
+        "episodes_per_seed": 1,
+    }
     sweep["cells"] = [cell | {"D": 6}, cell | {"D": 9}, cell | {"D": 6, "sensors": "harsh"}]
     (tmp_path / "sweep.json").write_text(json.dumps(sweep))
     (tmp_path / "run.json").write_text(json.dumps({"argv": ["uuv"], "started": "today"}))
     sweeps.keep(tmp_path, "alone", tmp_path)
-    assert [(cell["D"], cell["sensors"]) for cell in Sources(tmp_path).cells("alone")] == [("", ""), ("9", ""), ("", "harsh")]
+    assert [(cell["D"], cell["sensors"]) for cell in Sources(tmp_path).cells("alone")] == [
+        ("", ""),
+        ("9", ""),
+        ("", "harsh"),
+    ]

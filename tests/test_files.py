@@ -1,4 +1,5 @@
-"""The one way in and out for files of strangers: what is not a plain file of a bounded size inside its folder is refused at once."""
+"""The one way in and out for files of strangers: what is not a plain file of a bounded size inside its folder
+is refused at once."""
 
 import json
 import os
@@ -24,7 +25,7 @@ from uuvtai.files import (
     truncate,
 )
 
-# ------------------------------------------------------------------------------------------------------------------- input
+# ------------------------------------------------------------------------------------------------------ input
 
 
 def test_a_plain_file_is_read_with_and_without_its_folder(tmp_path):
@@ -39,7 +40,12 @@ def test_a_plain_file_is_read_with_and_without_its_folder(tmp_path):
 @pytest.mark.parametrize("through", ["itself", "a link"])
 def test_only_plain_files_are_read_and_none_is_waited_for(tmp_path, kind, through):
     place = tmp_path / "x"
-    make = {"a pipe": lambda: os.mkfifo(place), "a device": lambda: None, "a folder": place.mkdir, "a socket": lambda: bound(place)}
+    make = {
+        "a pipe": lambda: os.mkfifo(place),
+        "a device": lambda: None,
+        "a folder": place.mkdir,
+        "a socket": lambda: bound(place),
+    }
     make[kind]()
     place = Path("/dev/zero") if kind == "a device" else place
     if through == "a link":
@@ -142,7 +148,7 @@ def test_lines_come_one_by_one_and_none_is_endless(tmp_path):
         next(found)
 
 
-# -------------------------------------------------------------------------------------------------------------------- JSON
+# ------------------------------------------------------------------------------------------------------- JSON
 
 
 @pytest.mark.parametrize("value", [None, 3, -0.5, 2**128, "caf\u00e9 \U0001f600", [1, [2]], {"a": {"b": []}}])
@@ -154,7 +160,8 @@ def test_json_comes_back_as_it_was(tmp_path, value):
 @pytest.mark.parametrize(
     "text",
     [
-        "", "{", "[1,]", "NaN", "[Infinity]", "1e999", "-1e999", "9" * 40, "9" * 5000, "[" * 10_000 + "]" * 10_000, '{"a":' * 100_000,
+        "", "{", "[1,]", "NaN", "[Infinity]", "1e999", "-1e999", "9" * 40, "9" * 5000,
+        "[" * 10_000 + "]" * 10_000, '{"a":' * 100_000,
         '"\\ud800"', "[" + "[]," * 1_000_001 + "0]", "[" + "0," * 8_000_001 + "0]",
     ],
     ids=range(14),
@@ -165,7 +172,7 @@ def test_json_that_cannot_be_used_is_refused_in_one_line(text):
     assert "\n" not in str(told.value) and len(str(told.value)) < 300
 
 
-# ----------------------------------------------------------------------------------------------------------------- in place
+# --------------------------------------------------------------------------------------------------- in place
 
 
 def test_a_file_is_written_at_its_end_and_cut(tmp_path):
@@ -190,14 +197,18 @@ def test_a_new_file_replaces_nothing(tmp_path):
 def test_what_is_changed_in_place_is_a_plain_file_of_its_own(tmp_path, kind):
     place = tmp_path / "x"
     (tmp_path / "victim").write_text("mine")
-    {"pipe": lambda: os.mkfifo(place), "folder": place.mkdir, "second name": lambda: place.hardlink_to(tmp_path / "victim")}[kind]()
+    {
+        "pipe": lambda: os.mkfifo(place),
+        "folder": place.mkdir,
+        "second name": lambda: place.hardlink_to(tmp_path / "victim"),
+    }[kind]()
     for change in (lambda: open_to_append(place, tmp_path), lambda: truncate(place, 0, tmp_path)):
         with pytest.raises(FileError, match=r"is a pipe|second name|is no plain file"):
             change()
     assert (tmp_path / "victim").read_text() == "mine"
 
 
-# ------------------------------------------------------------------------------------------------------------------ output
+# ----------------------------------------------------------------------------------------------------- output
 
 
 def test_a_new_file_may_be_written(tmp_path):

@@ -41,9 +41,14 @@ def turn(angles: ti.template(), out: ti.template()):
 
 def test_distances_between_bodies_and_from_rings():
     rng = np.random.default_rng(0)
-    rows = np.hstack([rng.uniform(0, 2.5, (2 * N, 2)), rng.uniform(0.05, 0.8, (2 * N, 2)), rng.uniform(-7, 7, (2 * N, 1))])
+    rows = np.hstack(
+        [rng.uniform(0, 2.5, (2 * N, 2)), rng.uniform(0.05, 0.8, (2 * N, 2)), rng.uniform(-7, 7, (2 * N, 1))]
+    )
     kinds = rng.choice([CYLINDER, BOX], 2 * N)
-    rows[:2] = [[1, 1, 1.0, 0.05, 0.0], [1, 1, 1.0, 0.05, np.pi / 2]]  # a cross: no corner of one lies in the other
+    rows[:2] = [
+        [1, 1, 1.0, 0.05, 0.0],
+        [1, 1, 1.0, 0.05, np.pi / 2],
+    ]  # a cross: no corner of one lies in the other
     kinds[:2] = BOX
     rows = rows.astype(np.float32)
     fields = ti.field(ti.i32, 2 * N), ti.field(ti.f32, (2 * N, 5)), ti.Vector.field(3, ti.f32, N)
@@ -51,7 +56,10 @@ def test_distances_between_bodies_and_from_rings():
     fields[1].from_numpy(rows)
     compare(*fields)
     got = fields[2].to_numpy()
-    bodies = [(int(kind), row[:2], row[[2, 3, 3]], float(row[4])) for kind, row in zip(kinds, rows.astype(float), strict=True)]
+    bodies = [
+        (int(kind), row[:2], row[[2, 3, 3]], float(row[4]))
+        for kind, row in zip(kinds, rows.astype(float), strict=True)
+    ]
     assert got[0, 0] == 0.0
     overlapping = 0
     for i in range(N):

@@ -28,10 +28,12 @@ SIZES = {
 AHEAD = TRACKING.forecast_dt_s * np.arange(SIZES["n_forecast"])
 
 POSITION_TOLERANCE = 1e-4
-"""[m] 26 steps of at most 0.3 m at positions up to 20 m in float32 (1e-6 m each), and a series of the chord good to 2e-6 of 7.5 m."""
+"""[m] 26 steps of at most 0.3 m at positions up to 20 m in float32 (1e-6 m each), and a series of the chord
+good to 2e-6 of 7.5 m."""
 
 WALK_TOLERANCE = 2e-3
-"""[m] six turns: each place is good to 1e-5 m in float32, and a course that meets a wall at a small angle makes up to a hundred of that."""
+"""[m] six turns: each place is good to 1e-5 m in float32, and a course that meets a wall at a small angle
+makes up to a hundred of that."""
 
 GROWTH_TOLERANCE = 2e-4
 """[m] a square root of a variance that float32 forms from terms up to 100 times as large."""
@@ -39,8 +41,14 @@ GROWTH_TOLERANCE = 2e-4
 
 class Stage:
     def __init__(self):
-        self.tracks, self.clock, self.forecast = allocate(TrackState, SIZES), allocate(ClockState, SIZES), allocate(ForecastState, SIZES)
-        self.habits, self.clusters, self.image = (allocate(struct, SIZES) for struct in (HabitState, ClusterState, DepthImage))
+        self.tracks, self.clock, self.forecast = (
+            allocate(TrackState, SIZES),
+            allocate(ClockState, SIZES),
+            allocate(ForecastState, SIZES),
+        )
+        self.habits, self.clusters, self.image = (
+            allocate(struct, SIZES) for struct in (HabitState, ClusterState, DepthImage)
+        )
 
     def begin(self, cfg=None):
         self.cfg = cfg or ForecastConfig()
@@ -61,7 +69,17 @@ class Stage:
     def predict(self):
         forecast.forecast_tracks(
             io_for(
-                ForecastIO, self.forecast, self.tracks, self.habits, self.clusters, self.image, self.clock, self.cfg, TRACKING, TANK, RULES
+                ForecastIO,
+                self.forecast,
+                self.tracks,
+                self.habits,
+                self.clusters,
+                self.image,
+                self.clock,
+                self.cfg,
+                TRACKING,
+                TANK,
+                RULES,
             )
         )
         return self.forecast.pos_w.to_numpy().astype(float), self.forecast.radius_m.to_numpy().astype(float)
@@ -73,12 +91,15 @@ def stage():
 
 
 def random_tracks(seed):
-    """Moving tracks in every slot: states, covariances (4 x 4), radii, turn rates up to 4 rad/s (and some 0) with their variances."""
+    """Moving tracks in every slot: states, covariances (4 x 4), radii, turn rates up to 4 rad/s (and some 0)
+    with their variances."""
     rng = np.random.default_rng(seed)
     size = (N_ENV, N_TRACK)
     course, speed = rng.uniform(-np.pi, np.pi, size), rng.uniform(0.1, 3.0, size)
     pos = rng.uniform([2, 1], [18, 5], (*size, 2))
-    state = np.concatenate([pos, speed[..., None] * np.stack([np.cos(course), np.sin(course)], -1)], -1).astype(np.float32)
+    state = np.concatenate(
+        [pos, speed[..., None] * np.stack([np.cos(course), np.sin(course)], -1)], -1
+    ).astype(np.float32)
     root = rng.normal(0, 0.1, (*size, 4, 4))
     cov = (root @ np.swapaxes(root, -1, -2)).astype(np.float32)
     rate = np.where(rng.random(size) < 0.3, 0.0, rng.uniform(-4, 4, size)).astype(np.float32)
@@ -91,13 +112,21 @@ def lay_out(stage, state, cov, radius, rate, sigma):
     ones = np.ones((N_ENV, N_TRACK))
     turn_cov = np.zeros((N_ENV, N_TRACK, 5))
     turn_cov[..., 4] = sigma**2
-    stage.put(alive=ones, moving=ones, state=state, cov=cov[..., row, col], radius_m=radius, turn_rate=rate, turn_cov=turn_cov)
+    stage.put(
+        alive=ones,
+        moving=ones,
+        state=state,
+        cov=cov[..., row, col],
+        radius_m=radius,
+        turn_rate=rate,
+        turn_cov=turn_cov,
+    )
 
 
 @pytest.mark.parametrize("use_turn_rate", [True, False])
 def test_forecast_equals_the_arc(stage, use_turn_rate):
-    """The scan is two steps old: sample k lies 0.04 + 0.1 k seconds along the arc (along the tangent where the switch is off, and where
-    the turn rate does not stand out of its noise)."""
+    """The scan is two steps old: sample k lies 0.04 + 0.1 k seconds along the arc (along the tangent where
+    the switch is off, and where the turn rate does not stand out of its noise)."""
     stage.begin(ForecastConfig(use_turn_rate=use_turn_rate, use_reflection=False))
     state, cov, radius, rate, sigma = random_tracks(1)
     lay_out(stage, state, cov, radius, rate, sigma)
@@ -106,10 +135,14 @@ def test_forecast_equals_the_arc(stage, use_turn_rate):
     arcs = 0
     for env, track in np.ndindex(N_ENV, N_TRACK):
         x = state[env, track].astype(float)
-        turn = habit_oracle.expected_turn_rate(float(rate[env, track]), float(sigma[env, track]) ** 2, stage.cfg, TRACKING)
+        turn = habit_oracle.expected_turn_rate(
+            float(rate[env, track]), float(sigma[env, track]) ** 2, stage.cfg, TRACKING
+        )
         arcs += turn != 0
         for k, t in enumerate(AHEAD + 2 * RULES.control_dt_s):
-            np.testing.assert_allclose(pos[env, track, k], oracle.arc(x[:2], x[2:], turn, t), atol=POSITION_TOLERANCE)
+            np.testing.assert_allclose(
+                pos[env, track, k], oracle.arc(x[:2], x[2:], turn, t), atol=POSITION_TOLERANCE
+            )
             grown = radius[env, track] + oracle.growth(cov[env, track].astype(float), t, TRACKING)
             np.testing.assert_allclose(size[env, track, k], grown, atol=GROWTH_TOLERANCE)
     assert (5 < arcs < N_ENV * N_TRACK - 5) if use_turn_rate else arcs == 0
@@ -140,12 +173,16 @@ def test_only_moving_tracks_of_awake_rows_are_forecast(stage):
 
 @pytest.mark.parametrize("switches", [(True, True), (True, False), (False, True)])
 def test_forecast_equals_the_walk_from_turn_to_turn(stage, switches):
-    """Bodies on straight courses, with turns remembered on the way of most: the oracle's walk, in leaps of the forecast's samples."""
+    """Bodies on straight courses, with turns remembered on the way of most: the oracle's walk, in leaps of
+    the forecast's samples."""
     stage.begin(ForecastConfig(n_turn=SIZES["n_turn"], use_habits=switches[0], use_reflection=switches[1]))
     state, cov, radius, _, sigma = random_tracks(3)
     lay_out(stage, state, cov, radius, np.zeros_like(sigma), sigma)
     rng = np.random.default_rng(4)
-    turns = [[habit_oracle.Turn(np.zeros(2), np.ones(2), np.ones(2), 0.0) for _ in range(SIZES["n_turn"])] for _ in range(N_ENV)]
+    turns = [
+        [habit_oracle.Turn(np.zeros(2), np.ones(2), np.ones(2), 0.0) for _ in range(SIZES["n_turn"])]
+        for _ in range(N_ENV)
+    ]
     for env, i in np.ndindex(N_ENV, 10):
         x = state[env, i % N_TRACK].astype(float)
         course, after = np.arctan2(x[3], x[2]) + rng.normal(0, 0.1), rng.uniform(-np.pi, np.pi)
@@ -161,20 +198,38 @@ def test_forecast_equals_the_walk_from_turn_to_turn(stage, switches):
     for env, track in np.ndindex(N_ENV, N_TRACK):
         x = state[env, track].astype(float)
         times = AHEAD + 2 * RULES.control_dt_s
-        where, last = habit_oracle.walk(turns[env], x, float(radius[env, track]), times, stage.cfg, TANK, forecast.MOST_LEGS)
+        where, last = habit_oracle.walk(
+            turns[env], x, float(radius[env, track]), times, stage.cfg, TANK, forecast.MOST_LEGS
+        )
         np.testing.assert_allclose(pos[env, track], where, atol=WALK_TOLERANCE)
         turned += last @ habit_oracle.unit(x[2:]) < 0.9
     assert turned > 10, turned
 
 
 def test_the_first_turn_is_searched_again_when_a_scan_or_an_image_has_come(stage):
-    """A body that goes east and is known to turn north 0.6 m ahead; between scans nothing is searched, so nothing forgotten shows."""
+    """A body that goes east and is known to turn north 0.6 m ahead; between scans nothing is searched, so
+    nothing forgotten shows."""
     for news in ("clusters", "image"):
         stage.begin(ForecastConfig(n_turn=SIZES["n_turn"], use_reflection=False))
         size = (N_ENV, N_TRACK)
         state = np.broadcast_to([5.0, 3.0, 0.5, 0.0], (*size, 4))
-        lay_out(stage, state, np.broadcast_to(1e-4 * np.eye(4), (*size, 4, 4)), np.full(size, 0.2), np.zeros(size), np.ones(size))
-        for name, value in {"turn_x": 5.6, "turn_y": 3.0, "in_x": 1.0, "in_y": 0.0, "out_x": 0.0, "out_y": 1.0, "weight": 1.0}.items():
+        lay_out(
+            stage,
+            state,
+            np.broadcast_to(1e-4 * np.eye(4), (*size, 4, 4)),
+            np.full(size, 0.2),
+            np.zeros(size),
+            np.ones(size),
+        )
+        for name, value in {
+            "turn_x": 5.6,
+            "turn_y": 3.0,
+            "in_x": 1.0,
+            "in_y": 0.0,
+            "out_x": 0.0,
+            "out_y": 1.0,
+            "weight": 1.0,
+        }.items():
             filled = np.zeros((N_ENV, SIZES["n_turn"] // LANES, LANES), np.float32)
             filled[:, 0, 0] = value
             getattr(stage.habits, name).from_numpy(filled)

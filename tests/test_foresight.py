@@ -46,7 +46,16 @@ def test_moments_of_an_accident_are_dangerous_within_the_horizon_only():
     rows.begin(0)
     rows.run(43)
     rows.end(0, "ttc")
-    assert rows.events(0) == {5: False, 10: False, 15: False, 20: False, 25: True, 30: True, 35: True, 40: True}
+    assert rows.events(0) == {
+        5: False,
+        10: False,
+        15: False,
+        20: False,
+        25: True,
+        30: True,
+        35: True,
+        40: True,
+    }
 
 
 def test_the_state_in_which_it_ended_is_no_moment():
@@ -96,16 +105,23 @@ def test_an_episode_too_short_for_a_moment_is_counted_all_the_same():
 
 
 def test_one_moment_stands_for_an_accident():
-    m = RiskMoments(torch.tensor([1.0, 2.0, 3.0, 4.0, 9.0]), torch.tensor([0, 1, 1, 1, 1]).bool(), torch.tensor([0, 0, 0, 0, 7]))
+    m = RiskMoments(
+        torch.tensor([1.0, 2.0, 3.0, 4.0, 9.0]),
+        torch.tensor([0, 1, 1, 1, 1]).bool(),
+        torch.tensor([0, 0, 0, 0, 7]),
+    )
     assert m.one_per_accident().tolist() == [3.0, 9.0]
     assert m.of_episodes(1).logit.tolist() == [9.0]
 
 
 def sample(n, seed):
-    """Episodes of one moment each whose event has probability sigmoid(logit / 2): the head is twice too sure."""
+    """Episodes of one moment each whose event has probability sigmoid(logit / 2): the head is twice too
+    sure."""
     generator = torch.Generator().manual_seed(seed)
     logit = 4.0 * torch.randn(n, generator=generator)
-    return RiskMoments(logit, torch.rand(n, generator=generator) < torch.sigmoid(0.5 * logit), torch.arange(n))
+    return RiskMoments(
+        logit, torch.rand(n, generator=generator) < torch.sigmoid(0.5 * logit), torch.arange(n)
+    )
 
 
 def test_calibration_holds_on_moments_that_it_has_not_seen():
@@ -121,7 +137,9 @@ def test_calibration_holds_on_moments_that_it_has_not_seen():
     assert after["missed"] / after["accidents"] == pytest.approx(0.1, abs=0.02)
     assert after["missed_ci95"][0] < 0.1 < after["missed_ci95"][1] + 0.02
     alarms = sample(20_000, 2)
-    assert after["alarm_rate_safe"] == pytest.approx(float((alarms.logit[~alarms.event] >= head.threshold).double().mean()))
+    assert after["alarm_rate_safe"] == pytest.approx(
+        float((alarms.logit[~alarms.event] >= head.threshold).double().mean())
+    )
     assert sum(after["reliability"]["samples"]) == 20_000
 
 

@@ -55,7 +55,9 @@ def test_a_position_is_short_until_there_is_an_error_and_then_reads_as_taichi_wo
 
 def test_a_source_is_looked_up_once(monkeypatch):
     remember_sources()
-    expected = [textwrap.fill(line, tabsize=4, width=9999) for line in inspect.getsourcelines(halved.func.func)[0]]
+    expected = [
+        textwrap.fill(line, tabsize=4, width=9999) for line in inspect.getsourcelines(halved.func.func)[0]
+    ]
     assert context_of(halved)[1].src == expected
     monkeypatch.setattr(inspect, "getsourcelines", lambda _: pytest.fail("looked up again"))
     assert context_of(halved)[1].src == expected
@@ -72,7 +74,9 @@ def test_a_source_is_parsed_once_and_serves_kernels_of_other_arguments(monkeypat
     short, long = ti.field(ti.f32, 2), ti.field(ti.i32, 3)
     load(short, np.array([1.0, 2.0], np.float32))
     monkeypatch.setattr(ast, "parse", lambda *_: pytest.fail("parsed again"))
-    load(long, np.array([3, 4, 5], np.int32))  # Taichi takes the parameters out of a kernel's tree when it compiles
+    load(
+        long, np.array([3, 4, 5], np.int32)
+    )  # Taichi takes the parameters out of a kernel's tree when it compiles
     monkeypatch.undo()
     assert short.to_numpy().tolist() == [1.0, 2.0] and long.to_numpy().tolist() == [3, 4, 5]
 
@@ -86,7 +90,8 @@ def test_a_field_tells_where_it_was_declared():
 
 def test_an_error_still_names_its_line():
     with pytest.raises(
-        ti.TaichiCompilationError, match=r'(?s)test_front_end\.py", line \d+, in wrong:.*halved\(unknown_name\).*\^.*unknown_name'
+        ti.TaichiCompilationError,
+        match=r'(?s)test_front_end\.py", line \d+, in wrong:.*halved\(unknown_name\).*\^.*unknown_name',
     ):
         wrong()
 
@@ -114,7 +119,8 @@ def test_a_taichi_without_these_names_is_left_alone():
         "del impl.get_traceback, snode.get_traceback\n"
         "from uuvtai.front_end import remember_sources\n"
         "remember_sources()\n"
-        "assert not any(hasattr(k, n) for n in ('getsourcefile', 'getsourcelines', '_inside_class', 'textwrap', 'ast'))"
+        "assert not any(hasattr(k, n) for n in ('getsourcefile', 'getsourcelines', '_inside_class', "
+        "'textwrap', 'ast'))"
         "\nassert not any(hasattr(m, 'get_traceback') for m in (impl, snode))"
     )
     subprocess.run([sys.executable, "-c", program], check=True)

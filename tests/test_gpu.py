@@ -1,4 +1,5 @@
-"""CPU and CUDA run the same kernels: the same states within float tolerance, the same outcomes. Skipped where there is no CUDA device.
+"""CPU and CUDA run the same kernels: the same states within float tolerance, the same outcomes. Skipped where
+there is no CUDA device.
 
 Each device gets a process of its own, because a process has one Taichi runtime.
 """
@@ -14,7 +15,8 @@ import torch
 pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")]
 
 POSITION_TOLERANCE_M = 1e-3
-"""200 steps of float32 with differently rounded sin, cos and fused multiply-adds; the vehicle moves about 2 m in them."""
+"""200 steps of float32 with differently rounded sin, cos and fused multiply-adds; the vehicle moves about 2 m
+in them."""
 
 STATE_PROGRAM = """
 import sys, numpy as np, torch
@@ -27,7 +29,8 @@ sim.reset(ones, 0 * ones, torch.arange(64, dtype=torch.int32, device=sim.device)
 action = torch.tensor([0.5, 0.2, 0.1, 0.3], device=sim.device).repeat(64, 1)
 for _ in range(200):
     sim.step(action)
-np.savez(sys.argv[2], pos=sim.rows(sim.s.vehicle.pos_w), quat=sim.rows(sim.s.vehicle.quat_wb), vel=sim.rows(sim.s.vehicle.vel_b))
+ship = sim.s.vehicle
+np.savez(sys.argv[2], pos=sim.rows(ship.pos_w), quat=sim.rows(ship.quat_wb), vel=sim.rows(ship.vel_b))
 """
 
 
@@ -39,7 +42,8 @@ def state_after_200_steps(device, folder):
 
 def outcomes(device, folder):
     command = [
-        sys.executable, "-m", "uuvtai", "eval", "--controller", "bt", "--episodes", "64", "--num-envs", "64", "--device", device,
+        sys.executable, "-m", "uuvtai", "eval", "--controller", "bt", "--episodes", "64", "--num-envs", "64",
+        "--device", device,
         "--run-dir", str(folder / f"run_{device}"), "--json",
     ]  # fmt: skip
     done = subprocess.run(command, check=True, capture_output=True, text=True)

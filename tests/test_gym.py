@@ -1,4 +1,5 @@
-"""Gymnasium's interfaces: the checkers of Gymnasium, Stable-Baselines3 and TorchRL, and conformance in three autoreset modes."""
+"""Gymnasium's interfaces: the checkers of Gymnasium, Stable-Baselines3 and TorchRL, and conformance in three
+autoreset modes."""
 
 import subprocess
 import sys
@@ -65,14 +66,16 @@ def random_actions(steps, seed=0):
     return np.random.default_rng(seed).uniform(-1, 1, (steps, N, 4)).astype(np.float32)
 
 
-# ------------------------------------------------------------------------------------------------------------- other's checkers
+# ------------------------------------------------------------------------------------------- other's checkers
 
 
 def test_gymnasium_checks_the_env_that_make_gives(registered):
     env = gymnasium.make(ENV_ID, world="pool", overrides={"world.n_dynamic": 3}, render_mode="rgb_array")
     with pytest.warns(UserWarning) as told:
         check_env(env.unwrapped)
-    assert all("infinity" in str(warning.message) for warning in told), "position errors and velocities have no bounds; no other complaint"
+    assert all("infinity" in str(warning.message) for warning in told), (
+        "position errors and velocities have no bounds; no other complaint"
+    )
     assert registered[0] == ("pool", 1, None, None, {"world.n_dynamic": 3}, "cpu", "bt")
     env.close()
     env.close()
@@ -105,16 +108,24 @@ def test_make_vec_gives_the_batch(registered):
     envs = gymnasium.make_vec(ENV_ID, num_envs=16, world="maze", autoreset_mode="NextStep")
     assert isinstance(envs, UuvVectorEnv) and envs.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
     assert registered == [("maze", 16, None, None, None, "cpu", "bt")]
-    assert UuvVectorEnv.__bases__ == (gymnasium.vector.VectorEnv,) and "autoreset_mode" not in UuvVectorEnv.metadata
+    assert (
+        UuvVectorEnv.__bases__ == (gymnasium.vector.VectorEnv,)
+        and "autoreset_mode" not in UuvVectorEnv.metadata
+    )
 
 
-# ------------------------------------------------------------------------------------------------------------------ conformance
+# ------------------------------------------------------------------------------------------------ conformance
 
 
 def test_spaces_hold_what_comes(make):
     envs = make()
-    assert envs.action_space.shape == (N, 4) and envs.single_action_space == gymnasium.spaces.Box(-1, 1, (4,), np.float32)
-    assert envs.single_observation_space.shape == (envs.native.num_obs,) and envs.observation_space.dtype == np.float32
+    assert envs.action_space.shape == (N, 4) and envs.single_action_space == gymnasium.spaces.Box(
+        -1, 1, (4,), np.float32
+    )
+    assert (
+        envs.single_observation_space.shape == (envs.native.num_obs,)
+        and envs.observation_space.dtype == np.float32
+    )
     obs, _info = envs.reset(seed=SEED)
     assert obs in envs.observation_space
     for action in random_actions(60):
@@ -137,7 +148,8 @@ def test_the_docs_list_the_columns(small):
     features = small.config.features.model_copy(update={"n_track": 1, "teacher": True})
     per = {"": "", "sector": " a sector", "body": " a body"}
     rows = [
-        f"| `{column.name}` | {column.width}{per[column.per]} | {column.unit} | {column.frame} | {column.meaning} |"
+        f"| `{column.name}` | {column.width}{per[column.per]} | {column.unit} | {column.frame} | "
+        f"{column.meaning} |"
         for column, _first, _width in placed_columns(features)
     ]
     told = (Path(__file__).parents[1] / "docs" / "gym.md").read_text().splitlines()
@@ -157,11 +169,20 @@ def test_same_step_tells_the_end_beside_the_next_beginning(make):
     for key in ("_final_obs", "_final_info"):
         np.testing.assert_array_equal(info[key], ended)
     final = info["final_info"]
-    assert all((final[key] == ended).all() for key in final if key.startswith("_")) and {"_outcome", "_episode_return"} <= final.keys()
+    assert (
+        all((final[key] == ended).all() for key in final if key.startswith("_"))
+        and {"_outcome", "_episode_return"} <= final.keys()
+    )
     assert [envs.native.outcomes[code] for code in final["outcome"][ended]] == ["timeout", "timeout"]
-    assert (final["episode_steps"][ended] == envs.native.config.episode.horizon_steps).all() and reward[2] != 0
+    assert (final["episode_steps"][ended] == envs.native.config.episode.horizon_steps).all() and reward[
+        2
+    ] != 0
     assert [value is None for value in info["final_obs"]] == (~ended).tolist()
-    assert (info["outcome"] == 0).all() and (info["episode_steps"] == np.where(ended, 0, 2)).all() and info["_outcome"].all()
+    assert (
+        (info["outcome"] == 0).all()
+        and (info["episode_steps"] == np.where(ended, 0, 2)).all()
+        and info["_outcome"].all()
+    )
     assert info["episode_number"].tolist() == [row + N * ended[row] for row in range(N)]
 
 
@@ -202,7 +223,8 @@ def test_disabled_leaves_resets_to_the_user(make):
 
 @pytest.mark.parametrize("mode", MODES)
 def test_every_mode_plays_the_same_episodes(make, mode):
-    """Row by row, observations and rewards are those of the environment underneath, which begins episodes in the same step."""
+    """Row by row, observations and rewards are those of the environment underneath, which begins episodes in
+    the same step."""
     envs, per_row = make(autoreset_mode=mode), [[] for _ in range(N)]
     actions = random_actions(40)
 
@@ -219,7 +241,9 @@ def test_every_mode_plays_the_same_episodes(make, mode):
         began = info["episode_steps"] == 0 if mode == "NextStep" else np.zeros(N, bool)
         for row in np.flatnonzero(~began):
             ended = terminated[row] or truncated[row]
-            per_row[row].append((info["final_obs"][row] if ended and mode == "SameStep" else obs[row], reward[row], ended))
+            per_row[row].append(
+                (info["final_obs"][row] if ended and mode == "SameStep" else obs[row], reward[row], ended)
+            )
         count += ~began
         if mode == "Disabled" and (terminated | truncated).any():
             envs.reset(options={"reset_mask": terminated | truncated})
@@ -260,7 +284,11 @@ def test_seeds(make):
     other, _info = make().reset()
     assert not np.array_equal(drawn, other), "without a seed the first episodes are random"
     first, info = envs.reset(seed=SEED)
-    assert info["seed"].tolist() == [SEED] * N and info["episode_number"].tolist() == list(range(N)) and envs.np_random_seed == SEED
+    assert (
+        info["seed"].tolist() == [SEED] * N
+        and info["episode_number"].tolist() == list(range(N))
+        and envs.np_random_seed == SEED
+    )
     second, info = envs.reset()
     assert (
         info["seed"].tolist() == [SEED] * N
@@ -269,7 +297,13 @@ def test_seeds(make):
     )
     again, _info = envs.reset(seed=np.int64(SEED))
     np.testing.assert_array_equal(again, first)
-    for seed, error in (([1] * N, TypeError), (1.5, TypeError), ("1", TypeError), (-1, ValueError), (2**31, ValueError)):
+    for seed, error in (
+        ([1] * N, TypeError),
+        (1.5, TypeError),
+        ("1", TypeError),
+        (-1, ValueError),
+        (2**31, ValueError),
+    ):
         with pytest.raises(error, match="seed"):
             envs.reset(seed=seed)
     np.testing.assert_array_equal(envs.reset(seed=SEED)[0], first)
@@ -304,8 +338,13 @@ def test_results_are_memory_of_their_own(make, backend):
     near_horizon(envs, [0], steps_left=2)
     for action in random_actions(4):
         results.append(envs.step(torch.from_numpy(action) if backend == "torch" else action))
-        plain.append([np.asarray(value).copy() for value in values(results[-1]) if not isinstance(value, dict)])
-    kept = [[np.asarray(value) for value in values(result) if not isinstance(value, dict)] for result in results[1:]]
+        plain.append(
+            [np.asarray(value).copy() for value in values(results[-1]) if not isinstance(value, dict)]
+        )
+    kept = [
+        [np.asarray(value) for value in values(result) if not isinstance(value, dict)]
+        for result in results[1:]
+    ]
     for now, then in zip(kept, plain, strict=True):
         for a, b in zip(now, then, strict=True):
             assert a.dtype == b.dtype and (a.dtype == object or np.array_equal(a, b))
@@ -319,7 +358,10 @@ def test_torch_and_numpy_say_the_same(make):
     def play(backend):
         envs = make(backend=backend)
         envs.reset(seed=SEED)
-        return [np.column_stack([np.asarray(part) for part in envs.step(action)[:4]]) for action in random_actions(10)]
+        return [
+            np.column_stack([np.asarray(part) for part in envs.step(action)[:4]])
+            for action in random_actions(10)
+        ]
 
     for a, b in zip(play("numpy"), play("torch"), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -396,7 +438,7 @@ def test_what_does_not_fit_is_refused_and_loses_nothing(make, use, error, words)
     np.testing.assert_array_equal(envs.step(FORWARD)[0], wanted)
 
 
-# --------------------------------------------------------------------------------------------------------------------- one env
+# ---------------------------------------------------------------------------------------------------- one env
 
 
 def test_the_single_env_plays_the_first_row(small):
@@ -409,7 +451,13 @@ def test_the_single_env_plays_the_first_row(small):
     for action in actions[:, 0]:
         obs, reward, terminated, truncated, info = env.step(action)
         told.append((obs, reward))
-    assert truncated and not terminated and info["outcome"] == "timeout" and not info["is_success"] and obs in env.observation_space
+    assert (
+        truncated
+        and not terminated
+        and info["outcome"] == "timeout"
+        and not info["is_success"]
+        and obs in env.observation_space
+    )
     with pytest.raises(RuntimeError, match=r"end of the episode: call reset\(\)"):
         env.step(actions[0, 0])
     assert env.reset()[1]["episode_number"] == N
@@ -437,7 +485,9 @@ def test_the_picture_shows_the_tank_in_its_shape(small):
     before = env.render()
     assert before.dtype == np.uint8 and before.shape[1:] == (640, 3)
     tank = small.config.world.tank
-    assert before.shape[0] / 640 == pytest.approx((tank.y_m[1] - tank.y_m[0]) / (tank.x_m[1] - tank.x_m[0]), rel=0.15)
+    assert before.shape[0] / 640 == pytest.approx(
+        (tank.y_m[1] - tank.y_m[0]) / (tank.x_m[1] - tank.x_m[0]), rel=0.15
+    )
     for _ in range(10):
         env.step(FORWARD[0])
     changed = (env.render() != before).any(axis=2)
@@ -449,7 +499,9 @@ def test_without_gymnasium_one_error_says_what_to_install():
     code = "import sys; sys.modules['gymnasium'] = None; import uuvtai.gym"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 1
-    assert done.stderr.splitlines()[-1].endswith("uuvtai.gym needs Gymnasium; install it with: pip install 'uuvtai[gym]'")
+    assert done.stderr.splitlines()[-1].endswith(
+        "uuvtai.gym needs Gymnasium; install it with: pip install 'uuvtai[gym]'"
+    )
 
 
 @pytest.mark.parametrize("make", ["make", "make_vec"])
@@ -457,7 +509,8 @@ def test_gymnasium_finds_the_env_without_an_import_of_ours(make):
     """A world that does not exist is refused by us, before anything is compiled."""
     code = (
         f"import gymnasium, sys\nassert 'uuvtai' not in sys.modules\n"
-        f"try: gymnasium.{make}('uuvtai.gym:uuvtai/Nav-v0', world='pol')\nexcept ValueError as error: print(type(error).__name__, error)"
+        f"try: gymnasium.{make}('uuvtai.gym:uuvtai/Nav-v0', world='pol')\nexcept ValueError as error: "
+        "print(type(error).__name__, error)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert "ConfigError" in done.stdout and "did you mean 'pool'" in done.stdout, done.stderr

@@ -1,4 +1,5 @@
-"""The batch as Stable-Baselines3 and rsl_rl want it: ends, last observations, time-outs, seeds, and what is refused."""
+"""The batch as Stable-Baselines3 and rsl_rl want it: ends, last observations, time-outs, seeds, and what is
+refused."""
 
 import numpy as np
 import pytest
@@ -41,13 +42,18 @@ def test_sb3_gets_last_observations_and_statistics(batch):
     obs, reward, ended, infos = adapter.step(np.zeros((N, 4), np.float32))
     assert ended.tolist() == [i == 5 for i in range(N)] and reward.shape == (N,)
     assert [sorted(info) for info in infos] == [
-        ["TimeLimit.truncated", "episode", "is_success", "terminal_observation"] if i == 5 else [] for i in range(N)
+        ["TimeLimit.truncated", "episode", "is_success", "terminal_observation"] if i == 5 else []
+        for i in range(N)
     ]
     told = infos[5]
     assert told["TimeLimit.truncated"] and not told["is_success"]
     assert told["episode"]["l"] == envs.native.config.episode.horizon_steps // 2
     goal = envs.native.columns["goal"]
-    assert np.abs(told["terminal_observation"][goal] - first[5, goal]).max() < 0.2 < np.abs(obs[5, goal] - first[5, goal]).max()
+    assert (
+        np.abs(told["terminal_observation"][goal] - first[5, goal]).max()
+        < 0.2
+        < np.abs(obs[5, goal] - first[5, goal]).max()
+    )
     assert adapter.env_is_wrapped(object) == [False] * N and adapter.get_attr("num_envs") == [N] * N
     for use in (lambda: adapter.set_attr("x", 1), lambda: adapter.env_method("x")):
         with pytest.raises(NotImplementedError, match="no attributes or methods of single envs"):
@@ -67,10 +73,17 @@ def test_rsl_rl_gets_time_outs_apart(batch):
     _obs, _reward, ended, extras = adapter.step(torch.zeros(N, 4))
     assert not ended.any() and extras["log"] == {} and torch.equal(before, kept)
     obs, reward, ended, extras = adapter.step(torch.zeros(N, 4))
-    assert ended.tolist() == [i == 5 for i in range(N)] and extras["time_outs"].tolist() == ended.float().tolist()
+    assert (
+        ended.tolist() == [i == 5 for i in range(N)]
+        and extras["time_outs"].tolist() == ended.float().tolist()
+    )
     assert set(extras["log"]) == {"/episode_return", "/is_success"} and extras["log"]["/is_success"] == 0
     assert adapter.episode_length_buf.tolist() == [0 if i == 5 else 2 for i in range(N)]
-    assert obs.batch_size == (N,) and torch.equal(obs["policy"], adapter.get_observations()["policy"]) and reward.shape == (N,)
+    assert (
+        obs.batch_size == (N,)
+        and torch.equal(obs["policy"], adapter.get_observations()["policy"])
+        and reward.shape == (N,)
+    )
     with pytest.raises(RuntimeError, match="init_at_random_ep_len=False"):
         adapter.episode_length_buf = torch.zeros(N)
 

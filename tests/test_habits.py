@@ -1,4 +1,5 @@
-"""What is learnt from tracks that turn, and what follows: kernels against a float64 oracle, and bodies on lines, loops and circles."""
+"""What is learnt from tracks that turn, and what follows: kernels against a float64 oracle, and bodies on
+lines, loops and circles."""
 
 import numpy as np
 import pytest
@@ -16,19 +17,25 @@ from uuvtai.state import ClockState, ClusterState, ForecastState, HabitState, Tr
 N_ENV, N_TRACK, PERIOD = 6, 5, 3
 CONFIG, RULES = ForecastConfig(n_turn=16), EpisodeConfig()
 SIZES = {
-    "n_env": N_ENV, "n_ray": 16, "n_track": N_TRACK, "n_cluster": 4, "n_height": LANES, "n_turn": CONFIG.n_turn, "n_forecast": 3,
+    "n_env": N_ENV, "n_ray": 16, "n_track": N_TRACK, "n_cluster": 4, "n_height": LANES,
+    "n_turn": CONFIG.n_turn, "n_forecast": 3,
 }  # fmt: skip
 PERIOD_S = PERIOD * RULES.control_dt_s
 
 TURN_TOLERANCE = 2e-4
-"""[m], and of unit courses: positions of up to 20 m in float32 (1e-6 m), divided by 1 - cos of a turn of at least 26 deg (0.1)."""
+"""[m], and of unit courses: positions of up to 20 m in float32 (1e-6 m), divided by 1 - cos of a turn of at
+least 26 deg (0.1)."""
 
 SETTLED_COV = 0.01 * np.eye(4)[np.triu_indices(4)]
 
 
 class Stage:
     def __init__(self):
-        self.tracks, self.clock, self.clusters = allocate(TrackState, SIZES), allocate(ClockState, SIZES), allocate(ClusterState, SIZES)
+        self.tracks, self.clock, self.clusters = (
+            allocate(TrackState, SIZES),
+            allocate(ClockState, SIZES),
+            allocate(ClusterState, SIZES),
+        )
         self.habits, self.forecast = allocate(HabitState, SIZES), allocate(ForecastState, SIZES)
 
     def begin(self):
@@ -53,18 +60,33 @@ class Stage:
         self.step += PERIOD
         turn_cov = np.zeros((N_ENV, N_TRACK, 5))
         turn_cov[..., 4] = rate_var
-        self.put(state=state, cov=cov, turn_rate=rate, turn_cov=turn_cov, scan_step=self.step, **{"age": self.step, **fields})
-        forecast.learn_habits(io_for(ForecastIO, self.habits, self.tracks, self.clusters, self.clock, CONFIG, RULES))
+        self.put(
+            state=state,
+            cov=cov,
+            turn_rate=rate,
+            turn_cov=turn_cov,
+            scan_step=self.step,
+            **{"age": self.step, **fields},
+        )
+        forecast.learn_habits(
+            io_for(ForecastIO, self.habits, self.tracks, self.clusters, self.clock, CONFIG, RULES)
+        )
 
     def read(self):
         """Every array of the habits; the packed ones as (N_ENV, n_turn)."""
         out = {name: field.to_numpy() for name, field in vars(self.habits).items()}
-        return {name: v.reshape(N_ENV, -1) if v.ndim == 3 and v.shape[-1] == LANES else v for name, v in out.items()}
+        return {
+            name: v.reshape(N_ENV, -1) if v.ndim == 3 and v.shape[-1] == LANES else v
+            for name, v in out.items()
+        }
 
     def turns(self, env):
         """Remembered turns of one env: rows of (x, y, in x, in y, out x, out y, weight)."""
         table = self.read()
-        rows = np.stack([table[name][env] for name in ("turn_x", "turn_y", "in_x", "in_y", "out_x", "out_y", "weight")], -1)
+        rows = np.stack(
+            [table[name][env] for name in ("turn_x", "turn_y", "in_x", "in_y", "out_x", "out_y", "weight")],
+            -1,
+        )
         return rows[rows[:, 6] > 0]
 
 
@@ -74,8 +96,13 @@ def stage():
 
 
 def oracle_turns(table, env):
-    columns = [table[n][env].astype(float) for n in ("turn_x", "turn_y", "in_x", "in_y", "out_x", "out_y", "weight")]
-    return [oracle.Turn(np.array(c[0:2]), np.array(c[2:4]), np.array(c[4:6]), c[6]) for c in zip(*columns, strict=True)]
+    columns = [
+        table[n][env].astype(float) for n in ("turn_x", "turn_y", "in_x", "in_y", "out_x", "out_y", "weight")
+    ]
+    return [
+        oracle.Turn(np.array(c[0:2]), np.array(c[2:4]), np.array(c[4:6]), c[6])
+        for c in zip(*columns, strict=True)
+    ]
 
 
 class Loops:
@@ -104,7 +131,8 @@ class Loops:
 
 
 def test_learning_equals_the_oracle(stage):
-    """Noisy tracks on loops and lines, now and then unsettled, unseen or turning: every scan's change of memory is the oracle's."""
+    """Noisy tracks on loops and lines, now and then unsettled, unseen or turning: every scan's change of
+    memory is the oracle's."""
     stage.begin()
     rng = np.random.default_rng(1)
     paths = Loops(rng, 3, 1.5)
@@ -142,7 +170,15 @@ def test_learning_equals_the_oracle(stage):
                     assert after["leg_step"][env, track] == leg_step
                     continue
                 leg = before["leg"][env, track].astype(float) if leg_step >= 0 else None
-                slot = oracle.learn(turns, slot, leg, leg_step * RULES.control_dt_s, x, stage.step * RULES.control_dt_s, CONFIG)
+                slot = oracle.learn(
+                    turns,
+                    slot,
+                    leg,
+                    leg_step * RULES.control_dt_s,
+                    x,
+                    stage.step * RULES.control_dt_s,
+                    CONFIG,
+                )
                 np.testing.assert_array_equal(after["leg"][env, track], state[env, track])
                 assert after["leg_step"][env, track] == stage.step
             assert after["next_slot"][env] == slot
@@ -177,7 +213,8 @@ def shuttle(t, speed=1.2, length=3.0, begin=(5.0, 2.0), course=0.6):
 
 
 def test_both_ends_of_a_line_are_learnt_in_one_go_and_back(stage):
-    """Seven scans at each reversal are unsettled, as the filter's are; the ends come out within 2 cm, from which side they are reached."""
+    """Seven scans at each reversal are unsettled, as the filter's are; the ends come out within 2 cm, from
+    which side they are reached."""
     stage.begin()
     for k in range(int(8.0 / PERIOD_S)):
         t = k * PERIOD_S
@@ -195,7 +232,8 @@ def test_both_ends_of_a_line_are_learnt_in_one_go_and_back(stage):
 
 
 def test_circles_leave_no_turns(stage):
-    """A body on a circle is on no straight leg once its turn rate stands out; before, its legs bend too little to be a turn."""
+    """A body on a circle is on no straight leg once its turn rate stands out; before, its legs bend too
+    little to be a turn."""
     stage.begin()
     for k in range(120):
         a = 0.8 * k * PERIOD_S
@@ -205,7 +243,8 @@ def test_circles_leave_no_turns(stage):
 
 
 def test_a_turn_that_does_not_come_is_forgotten(stage):
-    """Learnt once from one body, contradicted by another that goes straight on over the same place on the same course."""
+    """Learnt once from one body, contradicted by another that goes straight on over the same place on the
+    same course."""
     stage.begin()
     for k in range(int(4.0 / PERIOD_S)):
         state, alive = one_body(shuttle(k * PERIOD_S))
@@ -253,7 +292,8 @@ def test_only_awake_rows_learn_and_forget(stage):
 
 @pytest.mark.parametrize("shape", ["rectangle", "circle"])
 def test_coasting_equals_the_oracle(stage, shape):
-    """Unseen bodies near remembered turns and walls: one step of 0.06 s or of 0.5 s ends where the oracle's walk ends."""
+    """Unseen bodies near remembered turns and walls: one step of 0.06 s or of 0.5 s ends where the oracle's
+    walk ends."""
     stage.begin()
     tank = TankConfig(shape=shape, y_m=(0.0, 6.0) if shape == "rectangle" else (0.0, 20.0))
     rng = np.random.default_rng(2)
@@ -270,17 +310,24 @@ def test_coasting_equals_the_oracle(stage, shape):
     high = [19, 5] if shape == "rectangle" else [15, 15]
     low = [1, 1] if shape == "rectangle" else [5, 5]
     pos = rng.uniform(low, high, (n, 2))
-    rows = {name: np.zeros((N_ENV, CONFIG.n_turn)) for name in ("turn_x", "turn_y", "in_x", "in_y", "out_x", "out_y", "weight")}
+    rows = {
+        name: np.zeros((N_ENV, CONFIG.n_turn))
+        for name in ("turn_x", "turn_y", "in_x", "in_y", "out_x", "out_y", "weight")
+    }
     for i in range(0, 90):  # a turn just ahead of every other body, or at its side, or behind
         env, slot = i % N_ENV, i // N_ENV
         angle, after = course[i] + rng.normal(0, 0.2), rng.uniform(-np.pi, np.pi)
-        place = pos[i] + rng.normal(0.3, 0.3) * np.array([np.cos(angle), np.sin(angle)]) + rng.normal(0, 0.1, 2)
+        place = (
+            pos[i] + rng.normal(0.3, 0.3) * np.array([np.cos(angle), np.sin(angle)]) + rng.normal(0, 0.1, 2)
+        )
         values = *place, np.cos(angle), np.sin(angle), np.cos(after), np.sin(after), rng.choice([-1, 1, 1, 4])
         for name, value in zip(rows, values, strict=True):
             rows[name][env, slot] = value
     for name, value in rows.items():
         getattr(stage.habits, name).from_numpy(value.reshape(N_ENV, -1, LANES).astype(np.float32))
-    x = np.concatenate([pos, speed[:, None] * np.stack([np.cos(course), np.sin(course)], -1)], -1).astype(np.float32)
+    x = np.concatenate([pos, speed[:, None] * np.stack([np.cos(course), np.sin(course)], -1)], -1).astype(
+        np.float32
+    )
     near = slice(90, 130)
     x[near, 0] = rng.uniform(0.4, 0.9, 40) + (0 if shape == "rectangle" else 0.5)
     x[near, 1] = 3.0 if shape == "rectangle" else 10.0
@@ -293,6 +340,8 @@ def test_coasting_equals_the_oracle(stage, shape):
         turns = oracle_turns(table, i % N_ENV)
         where, last = oracle.walk(turns, x[i].astype(float), 0.25, [float(seconds[i])], CONFIG, tank, 1)
         np.testing.assert_allclose(got[i, :2], where[0], atol=TURN_TOLERANCE)
-        np.testing.assert_allclose(got[i, 2:], last * np.hypot(*x[i, 2:].astype(float)), atol=10 * TURN_TOLERANCE)
+        np.testing.assert_allclose(
+            got[i, 2:], last * np.hypot(*x[i, 2:].astype(float)), atol=10 * TURN_TOLERANCE
+        )
         turned += last @ oracle.unit(x[i, 2:]) < 0.9
     assert turned > 20, turned

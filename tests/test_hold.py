@@ -1,4 +1,5 @@
-"""A decision held for several control steps is one transition: rewards add up, endings are kept, the next episode is the tree's."""
+"""A decision held for several control steps is one transition: rewards add up, endings are kept, the next
+episode is the tree's."""
 
 from types import SimpleNamespace
 
@@ -16,7 +17,8 @@ N = 3
 
 
 class Scripted:
-    """An env that pays 1, 2, 3, ... and ends row 1 in its second step; the teacher says the number of the step."""
+    """An env that pays 1, 2, 3, ... and ends row 1 in its second step; the teacher says the number of the
+    step."""
 
     def __init__(self):
         self.steps, self.actions = 0, []
@@ -30,7 +32,13 @@ class Scripted:
             "teacher_action": torch.full((N, NUM_ACTIONS), float(self.steps)),
             "outcome": torch.where(ended, 3, 0).to(torch.int32),
         }
-        return torch.full((N, 1), 100.0 + self.steps), torch.full((N,), float(self.steps)), ended, torch.zeros_like(ended), info
+        return (
+            torch.full((N, 1), 100.0 + self.steps),
+            torch.full((N,), float(self.steps)),
+            ended,
+            torch.zeros_like(ended),
+            info,
+        )
 
 
 def held(steps, residual):
@@ -41,7 +49,9 @@ def test_rewards_add_up_and_an_ending_on_the_way_is_kept():
     env, policy = held(4, residual=False)
     watched = []
     end = Hold(env, policy).drive(
-        torch.ones(N, NUM_ACTIONS), torch.zeros(N, NUM_ACTIONS), lambda ended, info: watched.append(ended.tolist())
+        torch.ones(N, NUM_ACTIONS),
+        torch.zeros(N, NUM_ACTIONS),
+        lambda ended, info: watched.append(ended.tolist()),
     )
     assert end.reward.tolist() == [10.0, 3.0, 10.0]
     assert end.final_obs.flatten().tolist() == [4.0, 2.0, 4.0]
@@ -57,7 +67,9 @@ def test_what_is_held_is_the_action_or_its_difference_from_the_tree(residual):
     Hold(env, policy).drive(torch.full((N, NUM_ACTIONS), 0.5), torch.full((N, NUM_ACTIONS), 0.2), None)
     ours = [action[0, 0].item() for action in env.actions]
     assert ours == pytest.approx([0.5, 1.3, 2.3, 3.3] if residual else [0.5] * 4)
-    assert [action[1, 0].item() for action in env.actions[2:]] == [2.0, 3.0], "a new episode is driven by the tree until the next decision"
+    assert [action[1, 0].item() for action in env.actions[2:]] == [2.0, 3.0], (
+        "a new episode is driven by the tree until the next decision"
+    )
 
 
 def test_one_step_is_a_step_of_the_env():

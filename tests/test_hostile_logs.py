@@ -1,4 +1,5 @@
-"""Logs and exported policies made to do harm: each ends in one line, within seconds and a small part of the memory, and harms no file."""
+"""Logs and exported policies made to do harm: each ends in one line, within seconds and a small part of the
+memory, and harms no file."""
 
 import json
 import os
@@ -56,7 +57,8 @@ def run_cli(*arguments):
 
 
 def bounded(work, tmp_path):
-    """Run ``work`` in a process of its own under BOUND_S and BOUND_MIB above what it takes to import; its one line of refusal."""
+    """Run ``work`` in a process of its own under BOUND_S and BOUND_MIB above what it takes to import; its one
+    line of refusal."""
     code = f"""
     import resource
     from pathlib import Path
@@ -71,7 +73,12 @@ def bounded(work, tmp_path):
     print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - begun) // 1024)
     """
     done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, timeout=BOUND_S + 30, check=False, cwd=tmp_path
+        [sys.executable, "-c", textwrap.dedent(code)],
+        capture_output=True,
+        text=True,
+        timeout=BOUND_S + 30,
+        check=False,
+        cwd=tmp_path,
     )
     assert done.returncode == 0, done.stderr
     *told, mib = done.stdout.splitlines()
@@ -97,7 +104,7 @@ def chunk_of(plain, compressed=None, claimed=None):
     return struct.pack("<BQ", CHUNK, len(content)) + content
 
 
-# ------------------------------------------------------------------------------------------------------------ time and memory
+# -------------------------------------------------------------------------------------------- time and memory
 
 
 def test_chunks_that_each_unfold_to_their_limit(tmp_path):
@@ -105,7 +112,11 @@ def test_chunks_that_each_unfold_to_their_limit(tmp_path):
     record = struct.pack("<BQ", 0x85, (15 << 20) - 9) + bytes((15 << 20) - 9)
     (tmp_path / "a.mcap").write_bytes(MAGIC + chunk_of(record) * 64 + END)
     assert (tmp_path / "a.mcap").stat().st_size < 1 << 20
-    for work in ("reader.info(here / 'a.mcap')", "repair.repair(here / 'a.mcap')", "log_export.export(here / 'a.mcap', here / 'out')"):
+    for work in (
+        "reader.info(here / 'a.mcap')",
+        "repair.repair(here / 'a.mcap')",
+        "log_export.export(here / 'a.mcap', here / 'out')",
+    ):
         assert "unpack to more than" in bounded(work, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
 
@@ -142,7 +153,8 @@ def test_a_million_tiny_records(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("opcode", "length", "says"), [(3, 17 << 20, "schemas of"), (0x0C, 5 << 20, "metadata of"), (5, 9 << 20, "a message of")]
+    ("opcode", "length", "says"),
+    [(3, 17 << 20, "schemas of"), (0x0C, 5 << 20, "metadata of"), (5, 9 << 20, "a message of")],
 )
 def test_kinds_of_records_have_limits_of_their_own(tmp_path, opcode, length, says):
     (tmp_path / "a.mcap").write_bytes(MAGIC + struct.pack("<BQ", opcode, length) + bytes(length) + END)
@@ -173,7 +185,7 @@ def test_an_honest_log_is_far_from_every_limit(log_path, tmp_path):
     assert info(log_path)["outcome"] == "success"
 
 
-# --------------------------------------------------------------------------------------------------------------- wrong lengths
+# ---------------------------------------------------------------------------------------------- wrong lengths
 
 
 @pytest.mark.parametrize("bit", [0, 7, 16, 20, 40, 63])
@@ -186,7 +198,10 @@ def test_one_wrong_bit_in_a_length_of_a_chunk(log_path, tmp_path, bit, field):
     whole[hit[0] + field + bit // 8] ^= 1 << bit % 8
     (tmp_path / "a.mcap").write_bytes(whole)
     before = [(m.topic, m.time_s) for m in read_messages(log_path)]
-    if field == 45 and bit in (20, 40):  # beyond the record, which ends where it should: the checksum says that nothing is missing
+    if field == 45 and bit in (
+        20,
+        40,
+    ):  # beyond the record, which ends where it should: the checksum says that nothing is missing
         assert [(m.topic, m.time_s) for m in read_messages(tmp_path / "a.mcap")] == before
         return
     with pytest.raises(LogError, match="uuv log repair"):
@@ -207,11 +222,14 @@ def test_a_wrong_length_of_another_record_costs_nothing_behind_it(log_path, tmp_
     behind = places[0][0] + 9 + places[0][1]
     whole[behind + 1 : behind + 9] = struct.pack("<Q", places[1][0] - behind + 500)
     (tmp_path / "a.mcap").write_bytes(whole)
-    before, after = ([(m.topic, m.time_s) for m in read_messages(path)] for path in (log_path, repair(tmp_path / "a.mcap").path))
+    before, after = (
+        [(m.topic, m.time_s) for m in read_messages(path)]
+        for path in (log_path, repair(tmp_path / "a.mcap").path)
+    )
     assert sorted(set(after)) == sorted(set(before))
 
 
-# -------------------------------------------------------------------------------------------------------------- odd contents
+# ----------------------------------------------------------------------------------------------- odd contents
 
 
 GRID = {
@@ -242,8 +260,12 @@ def one_topic(path, data, topic="/map/static"):
     file = McapFile(path)
     file.add_attachment("scenario.json", "application/json", json.dumps(episode.scenario()).encode())
     pose = {"pose": {"position": {"x": 2, "y": 1, "z": -1}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}}
-    file.add_message(file.add_channel("/pose", file.add_schema("p", "jsonschema", b"{}")), 0, json.dumps(pose).encode())
-    file.add_message(file.add_channel(topic, file.add_schema("s", "jsonschema", b"{}")), 0, json.dumps(data).encode())
+    file.add_message(
+        file.add_channel("/pose", file.add_schema("p", "jsonschema", b"{}")), 0, json.dumps(pose).encode()
+    )
+    file.add_message(
+        file.add_channel(topic, file.add_schema("s", "jsonschema", b"{}")), 0, json.dumps(data).encode()
+    )
     file.finish()
     return path
 
@@ -279,7 +301,7 @@ def test_a_table_that_grows_with_every_message(tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
 
 
-# ------------------------------------------------------------------------------------------------------------ pipes and devices
+# ------------------------------------------------------------------------------------------ pipes and devices
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes here")
@@ -300,7 +322,7 @@ def test_a_pipe_is_not_waited_for(tmp_path, command):
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
 
 
-# ------------------------------------------------------------------------------------------------------------------- outputs
+# ---------------------------------------------------------------------------------------------------- outputs
 
 
 @pytest.mark.parametrize("command", ["picture", "video", "convert", "repair"])
@@ -315,13 +337,32 @@ def test_no_output_is_the_input_or_replaces_a_file(log_path, tmp_path, command, 
     for out in (log, tmp_path / "link.mcap", tmp_path / "dangling"):
         assert run_cli("log", command, log, "--out", out, "--force") == 2
     said = capfd.readouterr().err
-    assert said.count("is already there") >= 1 and said.count("is what is read here") >= 4 and "Traceback" not in said
-    assert mine.read_text() == "precious" and log.read_bytes() == log_path.read_bytes() and not (tmp_path / "nothing").exists()
+    assert (
+        said.count("is already there") >= 1
+        and said.count("is what is read here") >= 4
+        and "Traceback" not in said
+    )
+    assert (
+        mine.read_text() == "precious"
+        and log.read_bytes() == log_path.read_bytes()
+        and not (tmp_path / "nothing").exists()
+    )
 
 
 def test_a_log_cannot_plant_files_in_a_folder_that_is_there(tmp_path, capfd):
     file = McapFile(tmp_path / "a.mcap")
-    names = ["conftest.py", "Makefile", "../conftest.py", "CON", "nul.txt", "a", "A", "-rf", "x.", "metadata.json"]
+    names = [
+        "conftest.py",
+        "Makefile",
+        "../conftest.py",
+        "CON",
+        "nul.txt",
+        "a",
+        "A",
+        "-rf",
+        "x.",
+        "metadata.json",
+    ]
     for name in names:
         file.add_attachment(name, "", name.encode())
     file.add_message(file.add_channel("/a", 0), 0, b'{"x": 1}')
@@ -332,15 +373,21 @@ def test_a_log_cannot_plant_files_in_a_folder_that_is_there(tmp_path, capfd):
     (project / "conftest.py").write_text("mine")
     assert run_cli("log", "export", tmp_path / "a.mcap", "--out", project) == 2
     assert "not empty" in capfd.readouterr().err
-    assert [path.name for path in project.iterdir()] == ["conftest.py"] and (project / "conftest.py").read_text() == "mine"
+    assert [path.name for path in project.iterdir()] == ["conftest.py"] and (
+        project / "conftest.py"
+    ).read_text() == "mine"
     (tmp_path / "link").symlink_to(tmp_path)
     assert run_cli("log", "export", tmp_path / "a.mcap", "--out", tmp_path / "link") == 2
     (tmp_path / "new").mkdir()
     assert run_cli("log", "export", tmp_path / "a.mcap", "--out", tmp_path / "new", "--format", "csv") == 0
     kept = sorted(path.name for path in (tmp_path / "new" / "attachments").iterdir())
     assert len({name.casefold() for name in kept}) == len(names)
-    assert not {"CON", "nul.txt"} & set(kept) and not any(name.startswith("-") or name.endswith(".") for name in kept)
-    assert sorted(path.name for path in (tmp_path / "new").glob("*.*")) in (["A_2.csv", "a.csv", "metadata.json"],)
+    assert not {"CON", "nul.txt"} & set(kept) and not any(
+        name.startswith("-") or name.endswith(".") for name in kept
+    )
+    assert sorted(path.name for path in (tmp_path / "new").glob("*.*")) in (
+        ["A_2.csv", "a.csv", "metadata.json"],
+    )
     assert run_cli("log", "export", tmp_path / "a.mcap", "--out", tmp_path / "again", "--format", "xls") == 2
 
 
@@ -351,13 +398,16 @@ def test_the_output_of_convert_is_called_by_its_name(log_path, tmp_path, command
     out = tmp_path / {"picture": "out.png", "video": "out.webm"}.get(command, "out")
     assert run_cli("log", command, tmp_path / "a.protobuf.mcap", "--out", out) == 2
     told = capfd.readouterr().err
-    assert "is the output of uuv log convert (protobuf); use the original: a.mcap" in told and len(told.splitlines()) == 1
+    assert (
+        "is the output of uuv log convert (protobuf); use the original: a.mcap" in told
+        and len(told.splitlines()) == 1
+    )
     assert run_cli("log", "info", tmp_path / "a.protobuf.mcap") == 0
     assert "output of uuv log convert (protobuf)" in capfd.readouterr().out
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.protobuf.mcap"]
 
 
-# --------------------------------------------------------------------------------------------------------- exported policies
+# ------------------------------------------------------------------------------------------ exported policies
 
 
 INPUTS = {"obs": (64, 40), "last_obs": (64, 40), "last_action": (64, 4), "has_last": (64,)}
@@ -367,14 +417,18 @@ def graph_of(nodes, weights=(), **words):
     onnx = pytest.importorskip("onnx", reason="needs the extra uuvtai[export]")
     helper, kinds = onnx.helper, onnx.TensorProto
     values = [
-        helper.make_tensor_value_info(name, kinds.BOOL if name == "has_last" else kinds.FLOAT, ["rows", *shape[1:]])
+        helper.make_tensor_value_info(
+            name, kinds.BOOL if name == "has_last" else kinds.FLOAT, ["rows", *shape[1:]]
+        )
         for name, shape in INPUTS.items()
     ]
     made = [helper.make_node(*node[:3], **(node[3] if len(node) > 3 else {})) for node in nodes]
     out = helper.make_tensor_value_info(nodes[-1][2][0], kinds.FLOAT, None)
     tensors = [onnx.numpy_helper.from_array(np.asarray(array), name) for name, array in weights]
     graph = helper.make_graph(made, "g", values, [out], initializer=tensors)
-    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", words.get("opset", 20))]).SerializeToString()
+    return helper.make_model(
+        graph, opset_imports=[helper.make_opsetid("", words.get("opset", 20))]
+    ).SerializeToString()
 
 
 BIG = ("n", np.array([100_000, 100_000], np.int64))
@@ -406,22 +460,45 @@ STRANGE = {
     ),
     **{
         f"operator {name}": ([(name, ["obs"], ["x"])], [], f"has onnx.{name}")
-        for name in ("Expand", "Tile", "Range", "Resize", "RandomNormalLike", "NonZero", "Loop", "If", "Scan", "Pad", "OneHot", "Einsum")
+        for name in (
+            "Expand",
+            "Tile",
+            "Range",
+            "Resize",
+            "RandomNormalLike",
+            "NonZero",
+            "Loop",
+            "If",
+            "Scan",
+            "Pad",
+            "OneHot",
+            "Einsum",
+        )
     },
 }
 
 
 @pytest.mark.parametrize(("nodes", "weights", "says"), STRANGE.values(), ids=STRANGE)
 def test_graphs_that_take_memory_or_time_never_reach_onnx_runtime(nodes, weights, says, monkeypatch):
-    monkeypatch.setattr("uuvtai.deploy.onnx_session.session", lambda _graph: pytest.fail("ONNX Runtime saw it"))
+    monkeypatch.setattr(
+        "uuvtai.deploy.onnx_session.session", lambda _graph: pytest.fail("ONNX Runtime saw it")
+    )
     graph = graph_of(nodes, weights)
     with pytest.raises(GraphError, match=says):
-        of_onnx(graph, {f"pair_{name}": np.zeros(shape, bool if name == "has_last" else np.float32) for name, shape in INPUTS.items()})
+        of_onnx(
+            graph,
+            {
+                f"pair_{name}": np.zeros(shape, bool if name == "has_last" else np.float32)
+                for name, shape in INPUTS.items()
+            },
+        )
 
 
 def test_what_a_graph_says_of_its_own_shapes_is_not_believed():
     onnx = pytest.importorskip("onnx", reason="needs the extra uuvtai[export]")
-    model = onnx.load_from_string(graph_of([("ConstantOfShape", ["n"], ["x"]), ("ReduceSum", ["x"], ["y"])], [BIG]))
+    model = onnx.load_from_string(
+        graph_of([("ConstantOfShape", ["n"], ["x"]), ("ReduceSum", ["x"], ["y"])], [BIG])
+    )
     model.graph.value_info.append(onnx.helper.make_tensor_value_info("x", onnx.TensorProto.FLOAT, [1, 1]))
     with pytest.raises(GraphError, match="more than 256 MiB"):
         refuse_strange(model.SerializeToString(), INPUTS, 1)
@@ -457,7 +534,9 @@ def folder(exported, tmp_path):
 def test_a_pipe_in_an_exported_folder_is_not_waited_for(folder, name):
     (folder / name).unlink()
     os.mkfifo(folder / name)
-    done = subprocess.run([sys.executable, folder / "run_policy.py"], capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(
+        [sys.executable, folder / "run_policy.py"], capture_output=True, text=True, timeout=60, check=False
+    )
     assert done.returncode == 1 and "no plain file" in done.stderr and "Traceback" not in done.stderr
 
 
@@ -504,9 +583,13 @@ def test_only_an_exported_policy_is_replaced(folder, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(("poses", "is_watched"), [(2, False), (100, False), (180_000, True)])
 def test_a_small_file_cannot_order_an_hour_of_frames(poses, is_watched):
-    recording = SimpleNamespace(path="x.mcap", duration_s=3600.0, pose=SimpleNamespace(times=np.linspace(0.0, 3600.0, poses)))
+    recording = SimpleNamespace(
+        path="x.mcap", duration_s=3600.0, pose=SimpleNamespace(times=np.linspace(0.0, 3600.0, poses))
+    )
     if is_watched:
         assert len(frame_times(recording, 15.0, 1.0)) == 3600 * 15 + 16
     else:
-        with pytest.raises(LogError, match=f"{poses} poses in 3,600 s are no episode to watch; raise --speed"):
+        with pytest.raises(
+            LogError, match=f"{poses} poses in 3,600 s are no episode to watch; raise --speed"
+        ):
             frame_times(recording, 15.0, 1.0)

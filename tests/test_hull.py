@@ -16,7 +16,8 @@ DISTANCE_TOL_M = 1e-3
 FLOAT_TOL_M = 2e-5
 """float32 at coordinates of a few metres, and the oracle's sampling"""
 SPEED_TOL_M_S = 5e-3
-"""central differences over 2 ms; where the axis is almost parallel to a face the nearest place jumps along it within that time"""
+"""central differences over 2 ms; where the axis is almost parallel to a face the nearest place jumps along it
+within that time"""
 
 VEHICLE = VehicleConfig()
 POOL = TankConfig()
@@ -53,7 +54,12 @@ def measure(
 @pytest.fixture(scope="module")
 def measured():
     """f(hulls (n, 6), kinds (n,), bodies (n, 7)) -> (n, 10) of ``measure``, n <= N."""
-    fields = ti.field(ti.f32, (N, 7)), ti.field(ti.f32, (N, 6)), ti.field(ti.i32, N), ti.field(ti.f32, (N, 10))
+    fields = (
+        ti.field(ti.f32, (N, 7)),
+        ti.field(ti.f32, (N, 6)),
+        ti.field(ti.i32, N),
+        ti.field(ti.f32, (N, 10)),
+    )
 
     def run(hulls, kinds, bodies):
         for field, values in zip(fields, (bodies, hulls, kinds), strict=False):
@@ -78,7 +84,10 @@ def random_scenes(seed, level=False):
     size[kinds != BOX, 1] = size[kinds != BOX, 0]
     size[kinds == SPHERE, 2] = size[kinds == SPHERE, 0]
     yaw = rng.uniform(-7, 7, (N, 1))
-    hulls, bodies = np.hstack([pos, axis]).astype(np.float32), np.hstack([center, size, yaw]).astype(np.float32)
+    hulls, bodies = (
+        np.hstack([pos, axis]).astype(np.float32),
+        np.hstack([center, size, yaw]).astype(np.float32),
+    )
     return hulls, kinds, bodies
 
 
@@ -91,7 +100,9 @@ def test_clearance_equals_dense_sampling(measured, level):
     hulls, kinds, bodies = random_scenes(1, level)
     got = measured(hulls, kinds, bodies)
     for i in range(N):
-        assert got[i, 0] == pytest.approx(oracle(hulls[i].astype(float), kinds[i], bodies[i].astype(float)), abs=DISTANCE_TOL_M)
+        assert got[i, 0] == pytest.approx(
+            oracle(hulls[i].astype(float), kinds[i], bodies[i].astype(float)), abs=DISTANCE_TOL_M
+        )
 
 
 def test_the_hull_s_nearest_place_and_direction_reach_the_body(measured):
@@ -113,7 +124,11 @@ def test_closing_speed_is_the_rate_at_which_clearance_shrinks(measured):
     hulls, bodies = hulls.astype(float), bodies.astype(float)
     got = measured(hulls, kinds, bodies)
     rng = np.random.default_rng(4)
-    vel, rate, body_vel = rng.uniform(-0.6, 0.6, (200, 3)), rng.uniform(-1, 1, (200, 3)), rng.uniform(-1, 1, (200, 3))
+    vel, rate, body_vel = (
+        rng.uniform(-0.6, 0.6, (200, 3)),
+        rng.uniform(-1, 1, (200, 3)),
+        rng.uniform(-1, 1, (200, 3)),
+    )
     dt = 1e-3
     checked = 0
     for i in range(200):

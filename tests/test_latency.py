@@ -1,4 +1,5 @@
-"""The paper's timing table, on a simulator that is a list of what its stages take: what each row is a mean of."""
+"""The paper's timing table, on a simulator that is a list of what its stages take: what each row is a mean
+of."""
 
 import pytest
 import torch
@@ -57,7 +58,9 @@ def test_the_planner_is_the_mean_over_steps_that_plan(samples):
 
 def test_the_full_loop_holds_the_networks_and_no_new_scenario(samples):
     bare, full = samples[latency.NO_NETWORKS], samples["Full loop"]
-    assert [b - a for a, b in zip(bare, full, strict=True)] == pytest.approx([200.0] * len(bare)), "two networks of 100 ms"
+    assert [b - a for a, b in zip(bare, full, strict=True)] == pytest.approx([200.0] * len(bare)), (
+        "two networks of 100 ms"
+    )
     assert max(bare) < 100.0, "a step that draws the next episode's scenario takes 5 s"
 
 

@@ -82,7 +82,10 @@ def test_bad_override_is_named_with_its_reason(override, says):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("world:\n  n_static: 3\n  n_static: 4\n", "mine.yaml:3: not valid YAML: key 'n_static' is given twice"),
+        (
+            "world:\n  n_static: 3\n  n_static: 4\n",
+            "mine.yaml:3: not valid YAML: key 'n_static' is given twice",
+        ),
         ("world:\n  n_statics: 3\n", "mine.yaml:2: unknown key 'world.n_statics'; did you mean 'n_static'?"),
         ("world:\n  n_static: [1, 2]\n", "mine.yaml:2: world.n_static"),
         ("a: &x 1\nb: *x\n", "aliases"),
@@ -120,7 +123,7 @@ def test_resolved_config_is_read_back(tmp_path):
     assert loader.load_resolved(path) == config
 
 
-# ---------------------------------------------------------------------------------------------------------------- training
+# --------------------------------------------------------------------------------------------------- training
 
 
 @pytest.mark.parametrize("preset", loader.preset_names("train"))
@@ -137,22 +140,46 @@ def test_paper_is_the_table_to_the_letter():
     assert (c.train.num_envs, c.train.iterations, c.episode.horizon_steps) == (8, 1200, 3000)
     assert (c.policy.hidden, c.policy.activation, c.ppo.rollout_steps) == ((256, 256), "elu", 64)
     assert (c.ppo.learning_rate, c.ppo.epochs, c.ppo.minibatches, c.ppo.clip) == (3e-4, 6, 4, 0.2)
-    assert (c.ppo.gamma, c.ppo.gae_lambda, c.ppo.entropy_weight, c.ppo.value_weight, c.ppo.max_grad_norm) == (0.99, 0.95, 0.003, 1.5, 1.0)
+    assert (c.ppo.gamma, c.ppo.gae_lambda, c.ppo.entropy_weight, c.ppo.value_weight, c.ppo.max_grad_norm) == (
+        0.99,
+        0.95,
+        0.003,
+        1.5,
+        1.0,
+    )
     assert (c.distill.batch, c.distill.steps, c.distill.learning_rate) == (1024, 2, 1.5e-4)
-    assert (c.world_model.latent, c.world_model.hidden, c.world_model.batch, c.world_model.steps) == (64, (128, 128), 2048, 2)
-    assert (c.world_model.learning_rate, c.world_model.reconstruction_weight, c.world_model.dynamics_weight) == (3e-4, 1.0, 0.2)
+    assert (c.world_model.latent, c.world_model.hidden, c.world_model.batch, c.world_model.steps) == (
+        64,
+        (128, 128),
+        2048,
+        2,
+    )
+    assert (
+        c.world_model.learning_rate,
+        c.world_model.reconstruction_weight,
+        c.world_model.dynamics_weight,
+    ) == (3e-4, 1.0, 0.2)
     assert (c.uncertainty.ema, c.uncertainty.gain, c.uncertainty.max_scale) == (0.05, 0.8, 2.0)
     beyond = ("predict_change", "normalise_targets", "stop_target_gradient", "beta_nll")
     assert not any(getattr(c.world_model, switch) for switch in beyond)
     assert not (c.policy.residual or c.risk.enabled)
     assert c.world_model.error_unit == "decoder"
     assert c.sensors == load_config("pool", "paper").sensors
-    assert (c.voronoi.use, c.clearance.inflate_m, c.route.rrt_clearance_m, c.tracking.horizon_s) == ("fused", 0.08, 0.1, 2.5)
-    assert not any(c.forecast.model_dump()[switch] for switch in ("use_turn_rate", "use_habits", "use_reflection", "use_coasting"))
+    assert (c.voronoi.use, c.clearance.inflate_m, c.route.rrt_clearance_m, c.tracking.horizon_s) == (
+        "fused",
+        0.08,
+        0.1,
+        2.5,
+    )
+    assert not any(
+        c.forecast.model_dump()[switch]
+        for switch in ("use_turn_rate", "use_habits", "use_reflection", "use_coasting")
+    )
 
 
 def test_the_paper_schedule_meets_the_equation():
-    """lambda_t: 1 up to 800, 0.2 (1 - (t - 800) / 800) up to 1600, then 0 (paper, equation of the staged schedule)."""
+    """lambda_t: 1 up to 800, 0.2 (1 - (t - 800) / 800) up to 1600, then 0 (paper, equation of the staged
+    schedule)."""
     from uuvtai.learn.schedule import piecewise_linear
 
     points = load_training("paper").distill.schedule
@@ -164,20 +191,30 @@ def test_the_paper_schedule_meets_the_equation():
 def test_the_rows_that_build_on_the_papers_training_have_the_defaults_stack():
     for preset in loader.preset_names("train"):
         if preset != "paper":
-            assert all(getattr(load_training(preset), name) == getattr(Config(), name) for name in loader.STACK_SECTIONS), preset
+            assert all(
+                getattr(load_training(preset), name) == getattr(Config(), name)
+                for name in loader.STACK_SECTIONS
+            ), preset
 
 
-# ------------------------------------------------------------------------------------------------------------------ stacks
+# ----------------------------------------------------------------------------------------------------- stacks
 
 
 def test_a_stack_is_one_word_wherever_a_config_is_made(tmp_path):
-    """By --set and by make's overrides; below what is set itself, above the presets; a null takes it off again."""
+    """By --set and by make's overrides; below what is set itself, above the presets; a null takes it off
+    again."""
     found = load_config("pool", overrides=["stack=paper"])
-    assert found == load_config("pool", overrides={"stack": "paper"}) == with_stack(load_config("pool"), "paper")
+    assert (
+        found == load_config("pool", overrides={"stack": "paper"}) == with_stack(load_config("pool"), "paper")
+    )
     assert found.voronoi.use == "fused" and found.world == load_config("pool").world
     mine = load_config("pool", overrides=["voronoi.use=static", "stack=paper"])
     assert mine.voronoi.use == "static" and mine.clearance.inflate_m == 0.08
-    assert load_training("curriculum", ["stack=paper"]).clearance == found.clearance == load_training("paper").clearance
+    assert (
+        load_training("curriculum", ["stack=paper"]).clearance
+        == found.clearance
+        == load_training("paper").clearance
+    )
     assert load_training("paper", ["stack=null"]).clearance == Config().clearance
     path = tmp_path / "config.yaml"
     path.write_text(to_yaml(load_config("pool")))
@@ -206,7 +243,10 @@ def test_a_bad_stack_is_named_with_its_line(tmp_path, text, says):
     assert says in str(error.value)
 
 
-@pytest.mark.parametrize(("value", "says"), [("papr", "did you mean 'paper'"), (3, "must be the name or path of a stack preset, got 3")])
+@pytest.mark.parametrize(
+    ("value", "says"),
+    [("papr", "did you mean 'paper'"), (3, "must be the name or path of a stack preset, got 3")],
+)
 def test_a_stack_that_does_not_exist_is_refused(value, says):
     with pytest.raises(ConfigError, match=says):
         load_config("pool", overrides={"stack": value})
@@ -217,7 +257,7 @@ def test_a_stack_that_is_to_drive_needs_a_tree(tmp_path):
         loader.tree_of_stack(write(tmp_path, "voronoi: {use: fused}\n"))
 
 
-# -------------------------------------------------------------------------------------------------------------------- rows
+# ------------------------------------------------------------------------------------------------------- rows
 
 
 def differing(config, base):
@@ -257,7 +297,10 @@ def test_a_training_preset_names_presets_and_changes_them(tmp_path):
     ("text", "says"),
     [
         ("world: {preset: pol}\n", "did you mean 'pool'"),
-        ("world:\n  preset: 3\n", "mine.yaml:2: world.preset must be the name or path of a world preset, got 3"),
+        (
+            "world:\n  preset: 3\n",
+            "mine.yaml:2: world.preset must be the name or path of a world preset, got 3",
+        ),
         ("ppo:\n  gama: 1\n", "mine.yaml:2: unknown key 'ppo.gama'; did you mean 'gamma'?"),
         ("distill: {schedule: [[1, 0], [0, 1]]}\n", "shares not falling"),
         ("train: {seed: 500000}\n", "must differ from train.seed"),

@@ -1,6 +1,8 @@
-"""Real recordings opened with the viewers' own reader, and every claim in them recomputed from the file alone.
+"""Real recordings opened with the viewers' own reader, and every claim in them recomputed from the file
+alone.
 
-The recomputation is ``tests/reference/log_alone.py``, which knows scenario.json's formulas and config.yaml and nothing of uuvtai.
+The recomputation is ``tests/reference/log_alone.py``, which knows scenario.json's formulas and config.yaml
+and nothing of uuvtai.
 """
 
 import ast
@@ -33,7 +35,8 @@ PAPER_RANGE_M, PAPER_DOPPLER_M_S = 0.02, 0.05
 SIGMAS = 5.0
 """bound of a mean and a sigma in standard errors of their estimates"""
 AGREEMENT, AGREEMENT_EACH = 0.999, 0.99
-"""share of touched cells over all logs and in each: a point within float32 of a cell's edge may fall in the next cell (1 in 10^5)"""
+"""share of touched cells over all logs and in each: a point within float32 of a cell's edge may fall in the
+next cell (1 in 10^5)"""
 DISTANCE_M = 1e-5
 """float32 of a distance of metres"""
 SAFETY_M, TTC_SHARE = 1e-3, 1e-2
@@ -46,7 +49,9 @@ def recorded(folder, *options):
         sys.executable, "-m", "uuvtai", "eval", *SmallSim.OPTIONS,
         "--set", f"episode.horizon_steps={HORIZON}", "--run-dir", str(folder), "--json", *options,
     ]  # fmt: skip
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=Path(__file__).parent.parent, timeout=600)
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False, cwd=Path(__file__).parent.parent, timeout=600
+    )
     assert done.returncode == 0, done.stderr
     return sorted((folder / "logs").glob("*.mcap")), json.loads(done.stdout)
 
@@ -55,8 +60,22 @@ def recorded(folder, *options):
 def recordings(tmp_path_factory):
     """Logs of real evaluations by their preset of sensors, and what the evaluation printed for 'paper'."""
     folder = tmp_path_factory.mktemp("recorded")
-    paper, printed = recorded(folder / "paper", "--controller", "straight,bt", "--seeds", "7,3", "--episodes", "2", "--record", "3")
-    clean, _ = recorded(folder / "clean", "--controller", "bt", "--sensors", "clean", "--seeds", "3", "--episodes", "1", "--record", "1")
+    paper, printed = recorded(
+        folder / "paper", "--controller", "straight,bt", "--seeds", "7,3", "--episodes", "2", "--record", "3"
+    )
+    clean, _ = recorded(
+        folder / "clean",
+        "--controller",
+        "bt",
+        "--sensors",
+        "clean",
+        "--seeds",
+        "3",
+        "--episodes",
+        "1",
+        "--record",
+        "1",
+    )
     return {"paper": paper, "clean": clean, "printed": printed}
 
 
@@ -76,7 +95,7 @@ def long_log(logs, recordings):
     return max((logs[path] for path in recordings["paper"]), key=lambda log: len(log.messages["/state"]))
 
 
-# ------------------------------------------------------------------------------------------------------------------- the file
+# --------------------------------------------------------------------------------------------------- the file
 
 
 def test_the_viewers_own_reader_decodes_every_message_against_its_schema(recordings):
@@ -85,16 +104,30 @@ def test_the_viewers_own_reader_decodes_every_message_against_its_schema(recordi
     if node is None or not (folder / "node_modules").is_dir():
         pytest.skip("needs node and `npm ci` in tests/js (bootstrap.py does it)")
     for path in [recordings["paper"][0], recordings["clean"][0]]:
-        done = subprocess.run([node, "read_log.mjs", str(path)], cwd=folder, capture_output=True, text=True, check=False, timeout=120)
+        done = subprocess.run(
+            [node, "read_log.mjs", str(path)],
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=120,
+        )
         assert done.returncode == 0, done.stderr
         found = json.loads(done.stdout)
         with path.open("rb") as file:
             summary = make_reader(file).get_summary()
         assert summary and summary.statistics
-        counts = {summary.channels[channel].topic: n for channel, n in summary.statistics.channel_message_counts.items() if n}
+        counts = {
+            summary.channels[channel].topic: n
+            for channel, n in summary.statistics.channel_message_counts.items()
+            if n
+        }
         assert found["counts"] == counts and len(counts) >= 22
         assert found["unlikeOfficial"] == []
-        assert found["metadata"] == ["uuv.run", "uuv.result"] and found["attachments"] == ["config.yaml", "scenario.json"]
+        assert found["metadata"] == ["uuv.run", "uuv.result"] and found["attachments"] == [
+            "config.yaml",
+            "scenario.json",
+        ]
 
 
 def test_what_describes_the_run_comes_before_data_and_loads(recordings, logs, tmp_path):
@@ -121,9 +154,13 @@ def test_every_topic_comes_at_its_rate(logs):
             assert log.steps(topic) == list(range(last + 1)), topic
         for topic in ("/goal", "/obstacles", "/obstacles/truth"):
             assert log.steps(topic) == sorted({*range(0, last + 1, 5), last}), topic
-        assert log.steps("/camera/line") == list(range(0, last + 1, log.config["sensors"]["depth"]["period_steps"]))
+        assert log.steps("/camera/line") == list(
+            range(0, last + 1, log.config["sensors"]["depth"]["period_steps"])
+        )
         replans = log.steps("/plan")
-        assert len(replans) == int(log.metadata["uuv.result"]["replans"]) and log.steps("/plan/info") == replans
+        assert (
+            len(replans) == int(log.metadata["uuv.result"]["replans"]) and log.steps("/plan/info") == replans
+        )
         assert log.steps("/log") == sorted([*replans, last])
         due, newest = [], -math.inf
         for step in range(last + 1):
@@ -134,7 +171,7 @@ def test_every_topic_comes_at_its_rate(logs):
             assert log.steps(topic) == due, topic
 
 
-# ---------------------------------------------------------------------------------------------------- the independent script
+# ------------------------------------------------------------------------------------- the independent script
 
 
 def test_the_script_imports_only_general_libraries():
@@ -148,7 +185,11 @@ def test_the_script_imports_only_general_libraries():
 def test_clean_scans_are_recast_from_the_true_obstacles(recordings, figures):
     for path in recordings["clean"]:
         found = figures[path]["sonar"]
-        assert found["beams"] > 40_000 and found["returns_of_moving_bodies"] > 500 and found["no_return_is_max_range"]
+        assert (
+            found["beams"] > 40_000
+            and found["returns_of_moving_bodies"] > 500
+            and found["no_return_is_max_range"]
+        )
         assert found["fitting_share"] >= FIT_SHARE
         assert found["range_within_2_mm"] >= FIT_SHARE and found["range_max_m"] < 0.15
         assert found["doppler_within_1e_3"] >= FIT_SHARE
@@ -215,7 +256,11 @@ def test_the_map_cannot_be_redone_without(spoil, long_log):
 
 def test_clearance_and_risk_follow_from_the_map(figures):
     for found in (each["map"]["clearance"] for each in figures.values()):
-        assert found["grids_with_their_map"] > 0 and found["max_error_m"] < DISTANCE_M and found["risk_max_error"] < DISTANCE_M
+        assert (
+            found["grids_with_their_map"] > 0
+            and found["max_error_m"] < DISTANCE_M
+            and found["risk_max_error"] < DISTANCE_M
+        )
         assert found["agreeing_share_from_scans"] >= AGREEMENT_EACH
 
 
@@ -228,7 +273,11 @@ def test_hull_clearance_and_time_to_collision_follow_at_every_step(figures):
 
 def test_the_outcome_follows_from_the_rules(recordings, logs, figures):
     for found in (each["safety"] for each in figures.values()):
-        assert found["outcome"] == found["outcome_told"] and found["ends_at_the_last_step"] and found["time_error_s"] < 1e-6
+        assert (
+            found["outcome"] == found["outcome_told"]
+            and found["ends_at_the_last_step"]
+            and found["time_error_s"] < 1e-6
+        )
     printed = {
         (method["name"], str(entry["seed"]), str(entry["episode"])): entry["outcome"]
         for method in recordings["printed"]["methods"]

@@ -1,4 +1,5 @@
-"""Episode logs: every message against its schema with independent readers, what survives a kill, hostile files, export."""
+"""Episode logs: every message against its schema with independent readers, what survives a kill, hostile
+files, export."""
 
 import base64
 import dataclasses
@@ -90,17 +91,21 @@ def strict_json(text):
 
 
 def messages(path):
-    """[(topic, schema, time_ns, publish_ns, data)] as the official Python reader sees them, checksums verified."""
+    """[(topic, schema, time_ns, publish_ns, data)] as the official Python reader sees them, checksums
+    verified."""
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
-        return [(c.topic, s, m.log_time, m.publish_time, m.data) for s, c, m in reader.iter_messages(log_time_order=False)]
+        return [
+            (c.topic, s, m.log_time, m.publish_time, m.data)
+            for s, c, m in reader.iter_messages(log_time_order=False)
+        ]
 
 
 def by_topic(path, topic):
     return [m.data for m in read_messages(path, [topic])]
 
 
-# ------------------------------------------------------------------------------------------------------------------ content
+# ---------------------------------------------------------------------------------------------------- content
 
 
 def test_every_topic_has_its_schema_and_every_message_fits_it(log_path):
@@ -119,9 +124,22 @@ def test_every_topic_has_its_schema_and_every_message_fits_it(log_path):
 
 def test_rates(log_path):
     counts = {entry["topic"]: entry["messages"] for entry in info(log_path)["topics"]}
-    every_step = ["/tf", "/pose", "/pose_estimate", "/sonar/scan", "/sonar/doppler", "/state", "/action", "/policy", "/safety", "/tree"]
+    every_step = [
+        "/tf",
+        "/pose",
+        "/pose_estimate",
+        "/sonar/scan",
+        "/sonar/doppler",
+        "/state",
+        "/action",
+        "/policy",
+        "/safety",
+        "/tree",
+    ]
     assert {counts[topic] for topic in every_step} == {N_STEP + 1}
-    assert {counts[topic] for topic in ("/obstacles", "/obstacles/truth", "/goal", "/camera/line")} == {N_STEP // 5 + 1}
+    assert {counts[topic] for topic in ("/obstacles", "/obstacles/truth", "/goal", "/camera/line")} == {
+        N_STEP // 5 + 1
+    }
     assert counts["/map/static"] == N_STEP // 25 + 2  # step 0, then 2 Hz, and the last step
     assert counts["/camera/depth"] == N_STEP // 25 + 1
     assert counts["/plan"] == counts["/plan/info"] == 2
@@ -155,7 +173,15 @@ def test_metadata_and_attachments_come_first_and_the_result_last(log_path):
     assert Metadata in behind and Attachment not in behind
     head = read_head(log_path)
     run, result = head.metadata["uuv.run"], head.metadata["uuv.result"]
-    assert {"version", "git_sha", "seed", "episode", "config_sha256", "checkpoint_sha256", "frames"} <= run.keys()
+    assert {
+        "version",
+        "git_sha",
+        "seed",
+        "episode",
+        "config_sha256",
+        "checkpoint_sha256",
+        "frames",
+    } <= run.keys()
     assert run["config_sha256"] == hashlib.sha256(head.attachments["config.yaml"]).hexdigest()
     assert {"outcome", "return", "time_s", "min_clearance_m", "replans"} <= result.keys()
     assert (result["outcome"], result["replans"], float(result["return"])) == ("success", "3", 12.5)
@@ -196,7 +222,12 @@ def test_a_late_scan_carries_the_time_of_its_ping(tmp_path, snaps):
 
 
 def test_maps_keep_exact_values_and_the_corner_of_their_first_cell(log_path, snaps):
-    for topic, name in (("/map/static", "static"), ("/map/dynamic", "dynamic"), ("/map/clearance", "clearance_m"), ("/map/risk", "risk")):
+    for topic, name in (
+        ("/map/static", "static"),
+        ("/map/dynamic", "dynamic"),
+        ("/map/clearance", "clearance_m"),
+        ("/map/risk", "risk"),
+    ):
         grid = by_topic(log_path, topic)[-1]
         np.testing.assert_array_equal(grid_values(grid), getattr(snaps[-1].maps, name))
         assert (grid["pose"]["position"]["x"], grid["pose"]["position"]["y"]) == episode.ORIGIN
@@ -208,7 +239,9 @@ def test_maps_keep_exact_values_and_the_corner_of_their_first_cell(log_path, sna
             ("value", 4, 7),
         ]
         assert grid["row_stride"] == grid["column_count"] * grid["cell_stride"]
-    red = np.frombuffer(base64.b64decode(by_topic(log_path, "/map/dynamic")[-1]["data"]), np.uint8).reshape(*episode.SHAPE, 8)
+    red = np.frombuffer(base64.b64decode(by_topic(log_path, "/map/dynamic")[-1]["data"]), np.uint8).reshape(
+        *episode.SHAPE, 8
+    )
     peak = np.unravel_index(snaps[-1].maps.dynamic.argmax(), episode.SHAPE)
     assert red[peak][0] > 200 and red[peak][3] > 100
 
@@ -218,7 +251,10 @@ def test_clearance_carries_the_time_of_its_map(tmp_path, snaps):
     with McapEpisodeLog(tmp_path / "a.mcap", episode.header()) as log:
         log.write(dataclasses.replace(snaps[33], maps=maps))
         log.close(episode.result(33))
-    stamps = {topic: by_topic(tmp_path / "a.mcap", f"/map/{topic}")[0]["timestamp"]["nsec"] for topic in ("static", "clearance", "risk")}
+    stamps = {
+        topic: by_topic(tmp_path / "a.mcap", f"/map/{topic}")[0]["timestamp"]["nsec"]
+        for topic in ("static", "clearance", "risk")
+    }
     assert stamps == {"static": 660_000_000, "clearance": 600_000_000, "risk": 600_000_000}
 
 
@@ -230,13 +266,19 @@ def test_depth_images_are_millimetres(log_path, snaps):
 
 def test_frames_chain_from_the_world_to_a_level_sonar_and_an_optical_camera(log_path, snaps):
     transforms = {t["child_frame_id"]: t for t in by_topic(log_path, "/tf")[77]["transforms"]}
-    assert {name: t["parent_frame_id"] for name, t in transforms.items()} == {"base": "world", "sonar": "base", "camera": "base"}
+    assert {name: t["parent_frame_id"] for name, t in transforms.items()} == {
+        "base": "world",
+        "sonar": "base",
+        "camera": "base",
+    }
     rotation = {name: _matrix(t["rotation"]) for name, t in transforms.items()}
     yaw = snaps[77].estimate_rpy[2]
     level = np.array([[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]])
     np.testing.assert_allclose(rotation["base"] @ rotation["sonar"], level, atol=1e-6)
     np.testing.assert_allclose(rotation["camera"] @ [0, 0, 1], [1, 0, 0], atol=1e-12)  # depth along body x
-    np.testing.assert_allclose(rotation["camera"] @ [1, 0, 0], [0, -1, 0], atol=1e-12)  # image right = body right
+    np.testing.assert_allclose(
+        rotation["camera"] @ [1, 0, 0], [0, -1, 0], atol=1e-12
+    )  # image right = body right
 
 
 def _matrix(q):
@@ -261,7 +303,9 @@ def test_the_scenario_gives_every_obstacle_at_any_time(log_path):
             assert seen["kind"] == body["kind"]
             if body["path"]:
                 np.testing.assert_allclose(at[:2], path_position(body["path"], message.time_s), atol=1e-12)
-                assert math.hypot(seen["vx"], seen["vy"]) == pytest.approx(body["path"]["speed_m_s"], abs=2e-3)
+                assert math.hypot(seen["vx"], seen["vy"]) == pytest.approx(
+                    body["path"]["speed_m_s"], abs=2e-3
+                )
 
 
 def test_null_stands_only_where_something_does_not_exist(log_path):
@@ -304,18 +348,26 @@ def test_kinds_are_those_of_the_simulator():
     assert KINDS == {geometry.SPHERE: "sphere", geometry.CYLINDER: "cylinder", geometry.BOX: "box"}
 
 
-@pytest.mark.parametrize("field", ["pos_w", "estimate_pos_w", "sonar_range_m", "rpm", "obstacle_pos_w", "tracks", "clearance_m"])
+@pytest.mark.parametrize(
+    "field", ["pos_w", "estimate_pos_w", "sonar_range_m", "rpm", "obstacle_pos_w", "tracks", "clearance_m"]
+)
 @pytest.mark.parametrize("bad", [np.nan, -np.inf])
 def test_numbers_that_are_not_finite_are_refused(tmp_path, snaps, field, bad):
     good = getattr(snaps[0], field)
     spoiled = bad if isinstance(good, float) else np.full_like(good, bad)
-    with McapEpisodeLog(tmp_path / "a.mcap", episode.header()) as log, pytest.raises(ValueError, match="not finite"):
+    with (
+        McapEpisodeLog(tmp_path / "a.mcap", episode.header()) as log,
+        pytest.raises(ValueError, match="not finite"),
+    ):
         log.write(dataclasses.replace(snaps[0], **{field: spoiled}))
 
 
 def test_maps_that_are_not_finite_are_refused(tmp_path, snaps):
     maps = dataclasses.replace(snaps[0].maps, static=np.full(episode.SHAPE, np.nan, np.float32))
-    with McapEpisodeLog(tmp_path / "a.mcap", episode.header()) as log, pytest.raises(ValueError, match="not finite"):
+    with (
+        McapEpisodeLog(tmp_path / "a.mcap", episode.header()) as log,
+        pytest.raises(ValueError, match="not finite"),
+    ):
         log.write(dataclasses.replace(snaps[0], maps=maps))
 
 
@@ -333,11 +385,12 @@ def test_due_asks_for_maps_at_2_hz_on_replans_and_at_the_end(tmp_path, snaps):
         assert not log.due(0).depth_image
 
 
-# ------------------------------------------------------------------------------------------------------------------ viewers
+# ---------------------------------------------------------------------------------------------------- viewers
 
 
 def test_schemas_keep_to_what_the_viewers_parse(log_path):
-    """Lichtblick's parser: one plain type per property, or a choice of numbers; lists of numbers, strings, booleans or objects."""
+    """Lichtblick's parser: one plain type per property, or a choice of numbers; lists of numbers, strings,
+    booleans or objects."""
 
     def check(schema, where):
         assert schema["type"] == "object", where
@@ -345,11 +398,17 @@ def test_schemas_keep_to_what_the_viewers_parse(log_path):
             if "oneOf" in inner:
                 assert all(isinstance(choice["const"], int) for choice in inner["oneOf"]), (where, name)
                 continue
-            assert inner["type"] in ("boolean", "string", "number", "integer", "object", "array"), (where, name)
+            assert inner["type"] in ("boolean", "string", "number", "integer", "object", "array"), (
+                where,
+                name,
+            )
             if inner["type"] == "object":
                 check(inner, f"{where}.{name}")
             if inner["type"] == "array":
-                assert inner["items"]["type"] in ("boolean", "string", "number", "integer", "object"), (where, name)
+                assert inner["items"]["type"] in ("boolean", "string", "number", "integer", "object"), (
+                    where,
+                    name,
+                )
                 if inner["items"]["type"] == "object":
                     check(inner["items"], f"{where}.{name}")
 
@@ -366,16 +425,28 @@ def test_the_viewers_own_reader_decodes_everything(log_path):
     node = shutil.which("node")
     if node is None or not (folder / "node_modules").is_dir():
         pytest.skip("needs node and `npm ci` in tests/js (bootstrap.py does it)")
-    done = subprocess.run([node, "read_log.mjs", str(log_path)], cwd=folder, capture_output=True, text=True, check=False, timeout=120)
+    done = subprocess.run(
+        [node, "read_log.mjs", str(log_path)],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert found["unlikeOfficial"] == []
     assert found["counts"] == {entry["topic"]: entry["messages"] for entry in info(log_path)["topics"]}
-    assert found["metadata"] == ["uuv.run", "uuv.result"] and found["attachments"] == ["config.yaml", "scenario.json"]
+    assert found["metadata"] == ["uuv.run", "uuv.result"] and found["attachments"] == [
+        "config.yaml",
+        "scenario.json",
+    ]
 
 
 def test_the_layout_shows_only_topics_that_exist():
-    layout = json.loads((Path(sys.modules["uuvtai"].__file__).parent / "presets/layout/navigation.json").read_text())
+    layout = json.loads(
+        (Path(sys.modules["uuvtai"].__file__).parent / "presets/layout/navigation.json").read_text()
+    )
     panels = layout["configById"]
     topics = set(panels["3D!scene"]["topics"])
     for panel in panels.values():
@@ -389,7 +460,7 @@ def _leaves(node):
     return {node} if isinstance(node, str) else _leaves(node["first"]) | _leaves(node["second"])
 
 
-# ------------------------------------------------------------------------------------------------------- kills and failures
+# ----------------------------------------------------------------------------------------- kills and failures
 
 
 def test_the_file_gets_its_name_only_when_it_is_complete(tmp_path, snaps):
@@ -438,7 +509,9 @@ def test_sigkill_loses_at_most_two_percent(tmp_path, maps, kill_at):
     path = tmp_path / "a.mcap"
     root = Path(__file__).parent.parent
     environment = {**os.environ, "PYTHONPATH": str(root)}
-    with subprocess.Popen([sys.executable, "-c", CHILD, str(path), maps], cwd=root, env=environment, stdout=subprocess.PIPE) as child:
+    with subprocess.Popen(
+        [sys.executable, "-c", CHILD, str(path), maps], cwd=root, env=environment, stdout=subprocess.PIPE
+    ) as child:
         for line in child.stdout:
             if int(line) >= kill_at:
                 child.send_signal(signal.SIGKILL)
@@ -450,7 +523,9 @@ def test_sigkill_loses_at_most_two_percent(tmp_path, maps, kill_at):
     assert saved.path == tmp_path / "a.repaired.mcap"
     assert part.read_bytes() == before
     assert saved.messages >= 0.98 * sent
-    assert len(messages(saved.path)) == saved.messages  # the official reader agrees, with indexes and checksums
+    assert (
+        len(messages(saved.path)) == saved.messages
+    )  # the official reader agrees, with indexes and checksums
     head = read_head(saved.path)
     assert next(iter(head.metadata)) == "uuv.run" and "uuv.result" not in head.metadata
     assert head.metadata["uuv.repair"]["messages"] == str(saved.messages)
@@ -461,9 +536,16 @@ def test_a_file_cut_anywhere_gives_back_a_prefix(log_path, tmp_path):
     """At least every chunk that is whole, and never anything that was not there."""
     whole, data = log_path.read_bytes(), [m[4] for m in messages(log_path)]
     with log_path.open("rb") as file:
-        ends = [(index.chunk_start_offset + index.chunk_length) for index in make_reader(file).get_summary().chunk_indexes]
+        ends = [
+            (index.chunk_start_offset + index.chunk_length)
+            for index in make_reader(file).get_summary().chunk_indexes
+        ]
     with log_path.open("rb") as file:
-        sizes = [len(breakup_chunk(record)) for record in StreamReader(file, emit_chunks=True).records if isinstance(record, Chunk)]
+        sizes = [
+            len(breakup_chunk(record))
+            for record in StreamReader(file, emit_chunks=True).records
+            if isinstance(record, Chunk)
+        ]
     recovered = []
     for i, cut in enumerate(np.linspace(ends[0], len(whole), 25).astype(int)):
         path = tmp_path / f"{i}.mcap"
@@ -514,7 +596,9 @@ def test_repair_never_overwrites(log_path, tmp_path):
     assert repair(log_path, tmp_path / "b.mcap", force=True).complete
 
 
-@pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r\n", b"not a log at all", b"\x89MCAP0\r\n" + b"\x07" * 300])
+@pytest.mark.parametrize(
+    "content", [b"", b"\x89MCAP0\r\n", b"not a log at all", b"\x89MCAP0\r\n" + b"\x07" * 300]
+)
 def test_files_without_anything_in_them(tmp_path, content):
     (tmp_path / "a.mcap").write_bytes(content)
     with pytest.raises(LogError, match=r"a\.mcap") as refused:
@@ -526,7 +610,10 @@ def test_files_without_anything_in_them(tmp_path, content):
     assert [entry.name for entry in tmp_path.iterdir()] == ["a.mcap"]
 
 
-@pytest.mark.parametrize("tool", [info, repair, lambda path: export(path, path.parent / "out"), lambda path: list(read_messages(path))])
+@pytest.mark.parametrize(
+    "tool",
+    [info, repair, lambda path: export(path, path.parent / "out"), lambda path: list(read_messages(path))],
+)
 def test_a_missing_file_is_named(tmp_path, tool):
     with pytest.raises(LogError, match=r"nowhere\.mcap.*cannot open"):
         tool(tmp_path / "nowhere.mcap")
@@ -537,7 +624,10 @@ def test_a_full_disk_leaves_nothing(tmp_path, snaps):
     """/dev/full takes the part file's place."""
     path = tmp_path / "a.mcap"
     (tmp_path / "a.mcap.part").symlink_to("/dev/full")
-    with pytest.raises(LogError, match=r"a\.mcap: cannot write the log \(No space left"), McapEpisodeLog(path, episode.header()) as log:
+    with (
+        pytest.raises(LogError, match=r"a\.mcap: cannot write the log \(No space left"),
+        McapEpisodeLog(path, episode.header()) as log,
+    ):
         for snap in snaps:
             log.write(snap)
     assert list(tmp_path.iterdir()) == []
@@ -556,11 +646,16 @@ def test_a_folder_that_cannot_be_made(tmp_path):
         McapEpisodeLog(tmp_path / "file" / "logs" / "a.mcap", episode.header())
 
 
-# ------------------------------------------------------------------------------------------------------------- hostile files
+# ---------------------------------------------------------------------------------------------- hostile files
 
 
 def chunk_record(data, unpacked_size, compression=b"zstd"):
-    content = struct.pack("<QQQII", 0, 0, unpacked_size, 0, len(compression)) + compression + struct.pack("<Q", len(data)) + data
+    content = (
+        struct.pack("<QQQII", 0, 0, unpacked_size, 0, len(compression))
+        + compression
+        + struct.pack("<Q", len(data))
+        + data
+    )
     return struct.pack("<BQ", 6, len(content)) + content
 
 
@@ -629,7 +724,7 @@ def test_records_of_other_writers_are_read(tmp_path):
     assert info(tmp_path / "a.mcap")["messages"] == 1
 
 
-# ------------------------------------------------------------------------------------------------------------------- export
+# ----------------------------------------------------------------------------------------------------- export
 
 
 def test_export_as_json_lines(log_path, tmp_path):
@@ -657,7 +752,8 @@ def test_export_as_arrays(log_path, tmp_path, snaps):
     topics = ["/sonar/scan", "/map/static", "/camera/depth", "/log", "/safety"]
     files = {path.name: path for path in export(log_path, tmp_path / "out", topics, fmt="npz")}
     scan, grid, image, events, safety = (
-        np.load(files[f"{name}.npz"]) for name in ("sonar_scan", "map_static", "camera_depth", "log", "safety")
+        np.load(files[f"{name}.npz"])
+        for name in ("sonar_scan", "map_static", "camera_depth", "log", "safety")
     )
     assert scan["ranges"].shape == (N_STEP + 1, episode.N_RAY)
     np.testing.assert_array_equal(grid["value"][-1], snaps[-1].maps.static)

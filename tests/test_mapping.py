@@ -1,4 +1,5 @@
-"""The two-layer map: against the oracle on random scans, known situations by hand, and what must hold for any scan."""
+"""The two-layer map: against the oracle on random scans, known situations by hand, and what must hold for any
+scan."""
 
 import numpy as np
 import pytest
@@ -33,9 +34,11 @@ N_ENV = 6
 TANK = TankConfig(x_m=(0.0, 6.0), y_m=(0.0, 4.0))
 POND = TankConfig(shape="circle", x_m=(0.0, 6.0), y_m=(0.0, 4.0))
 MAP = MappingConfig(period_steps=2, free_range_m=2.5, wall_margin_m=0.03)
-"""25 Hz, so that the rated gains (10 Hz) are scaled by 0.4; a small tank needs a short free range to show it, and range errors
-reach deeper than this wall margin"""
-SONAR = SonarConfig(n_ray=64, range_sigma_m=0.01, range_sigma_slope=0.005, range_quantum_m=0.01, doppler_sigma_m_s=0.04)
+"""25 Hz, so that the rated gains (10 Hz) are scaled by 0.4; a small tank needs a short free range to show it,
+and range errors reach deeper than this wall margin"""
+SONAR = SonarConfig(
+    n_ray=64, range_sigma_m=0.01, range_sigma_slope=0.005, range_quantum_m=0.01, doppler_sigma_m_s=0.04
+)
 DEPTH_CAMERA = DepthConfig(rows=6, cols=16, period_steps=4)
 EPISODE = EpisodeConfig()
 SCAN_S = 0.04
@@ -121,7 +124,9 @@ class Stage:
         self.tracks.moving.from_numpy(np.tile(np.array([1, 0, 0, 0], np.int32), (self.n_env, 1)))
         # untracked beams: half of them on a track that does not move
         still = np.tile(np.where(np.arange(SONAR.n_ray) % 2, 1, -1), (self.n_env, 1))
-        self.tracks.beam_track.from_numpy(np.where(np.stack([c["tracked"] for c in scans]), 0, still).astype(np.int32))
+        self.tracks.beam_track.from_numpy(
+            np.where(np.stack([c["tracked"] for c in scans]), 0, still).astype(np.int32)
+        )
 
     def put_images(self, images):
         self.image.fresh.fill(int(images is not None))
@@ -131,7 +136,16 @@ class Stage:
             self.image.shot_rpy.from_numpy(np.stack([i["rpy"] for i in images]).astype(np.float32))
 
     def update(self):
-        args = (self.grid_map, self.scratch, self.scan, self.image, self.tracks, self.clusters, self.mask, self.clock)
+        args = (
+            self.grid_map,
+            self.scratch,
+            self.scan,
+            self.image,
+            self.tracks,
+            self.clusters,
+            self.mask,
+            self.clock,
+        )
         mapping.update_map(io_for(MappingIO, *args, MAP, SONAR, DEPTH_CAMERA, self.tank, EPISODE))
 
     def run(self, scan_of, n_scan, first=0, image_of=None):
@@ -154,11 +168,12 @@ def _default_tank(stage):
     stage.set_tank(TANK)
 
 
-# ------------------------------------------------------------------------------------------------------------------- scenes
+# ----------------------------------------------------------------------------------------------------- scenes
 
 
 def ring(pos, bodies=(), yaw=0.0, vel=(0.0, 0.0, 0.0), noise=None):
-    """Scan of the rectangular tank with discs (x, y, radius, vx, vy): ranges, hits, Doppler with ego motion."""
+    """Scan of the rectangular tank with discs (x, y, radius, vx, vy): ranges, hits, Doppler with ego
+    motion."""
     pos = np.array([*pos, -0.8])
     angle = yaw + 2 * np.pi * np.arange(SONAR.n_ray) / SONAR.n_ray
     u = np.stack([np.cos(angle), np.sin(angle)], 1)
@@ -179,7 +194,10 @@ def ring(pos, bodies=(), yaw=0.0, vel=(0.0, 0.0, 0.0), noise=None):
     own = np.array([c * vel[0] - s * vel[1], s * vel[0] + c * vel[1]])
     doppler = np.sum((body_vel - own) * u, axis=1)
     if noise is not None:
-        best = np.maximum(0.05, best + noise.normal(0, 1, best.shape) * (SONAR.range_sigma_m + SONAR.range_sigma_slope * best))
+        best = np.maximum(
+            0.05,
+            best + noise.normal(0, 1, best.shape) * (SONAR.range_sigma_m + SONAR.range_sigma_slope * best),
+        )
     hit = np.ones(SONAR.n_ray, int)
     return {
         "pos": pos, "yaw": yaw, "range": best, "hit": hit, "doppler": doppler, "vel": np.array(vel),
@@ -209,7 +227,10 @@ def random_scan(rng, tank):
         pos = np.array([rng.uniform(*tank.x_m), rng.uniform(*tank.y_m)])
         if MapOracle(MAP, SONAR, DEPTH_CAMERA, tank, EPISODE).gap(pos) > 0.2:
             break
-    bodies = [(rng.uniform(0, 6), rng.uniform(0, 4), rng.uniform(0.1, 0.5), *rng.normal(0, 0.3, 2)) for _ in range(4)]
+    bodies = [
+        (rng.uniform(0, 6), rng.uniform(0, 4), rng.uniform(0.1, 0.5), *rng.normal(0, 0.3, 2))
+        for _ in range(4)
+    ]
     scan = ring(pos, bodies, rng.uniform(-7, 7), rng.normal(0, 0.3, 3), rng)
     if tank.shape == "circle":
         scan["range"] = np.minimum(scan["range"], rng.uniform(0.2, 4.0, SONAR.n_ray))
@@ -226,9 +247,9 @@ def random_scan(rng, tank):
     scan["vel"] = scan["vel"] + wrong
     scan["valid"] = rng.random() < 0.5
     scan["walls"] = (error.astype(np.float32), np.float32(rng.choice([0.0, 0.02, 0.2])), rng.random() < 0.5)
-    return {k: (v.astype(np.float32) if getattr(v, "dtype", None) == np.float64 else v) for k, v in scan.items()} | {
-        "yaw": np.float32(scan["yaw"])
-    }
+    return {
+        k: (v.astype(np.float32) if getattr(v, "dtype", None) == np.float64 else v) for k, v in scan.items()
+    } | {"yaw": np.float32(scan["yaw"])}
 
 
 def random_state(rng, outside):
@@ -239,14 +260,20 @@ def random_state(rng, outside):
         "dynamic": np.where(rng.random(SHAPE) < 0.15, rng.random(SHAPE), 0.0).astype(np.float32),
         "depth_hit": rng.random(SHAPE) < 0.1,
         "free_scans": np.where(
-            rng.random(SHAPE) < 0.5, rng.integers(0, CONFIDENT, SHAPE), rng.choice([0, CONFIDENT - 1, CONFIDENT], SHAPE)
+            rng.random(SHAPE) < 0.5,
+            rng.integers(0, CONFIDENT, SHAPE),
+            rng.choice([0, CONFIDENT - 1, CONFIDENT], SHAPE),
         ),
-        "dynamic_scans": np.where(rng.random(SHAPE) < 0.2, rng.choice([1, 2, 48, 49, 50, 51, 254, 255], SHAPE), 0),
+        "dynamic_scans": np.where(
+            rng.random(SHAPE) < 0.2, rng.choice([1, 2, 48, 49, 50, 51, 254, 255], SHAPE), 0
+        ),
     }
     # occupied patches leave room for cells that have no static neighbour
     state["static"][:, SHAPE[1] // 2 :] *= 0.6 * (rng.random((SHAPE[0], SHAPE[1] // 2)) < 0.95)
     state["seen"] = (state["free_scans"] > 0) | (rng.random(SHAPE) < 0.5)
-    return {name: np.where(outside, False if value.dtype == bool else 0, value) for name, value in state.items()}
+    return {
+        name: np.where(outside, False if value.dtype == bool else 0, value) for name, value in state.items()
+    }
 
 
 def random_image(rng, scan):
@@ -260,7 +287,7 @@ def random_image(rng, scan):
     }
 
 
-# ------------------------------------------------------------------------------------------------------------------- oracle
+# ----------------------------------------------------------------------------------------------------- oracle
 
 
 def check_against_oracle(stage, tank, seed):
@@ -284,10 +311,16 @@ def check_against_oracle(stage, tank, seed):
         for name in FIELDS:
             tolerance = OCCUPANCY_TOLERANCE if name in ("static", "dynamic") else 0
             off = np.abs(after[name][env].astype(float) - expected[name])
-            assert off[~doubtful].max() <= tolerance, (name, env, np.argwhere((off > tolerance) & ~doubtful)[:5])
+            assert off[~doubtful].max() <= tolerance, (
+                name,
+                env,
+                np.argwhere((off > tolerance) & ~doubtful)[:5],
+            )
         seen["dynamic"] += int((expected["dynamic_scans"] > before[env]["dynamic_scans"]).sum())
         seen["static"] += int((expected["static"] > before[env]["static"]).sum())
-        assert (after["static"][env][oracle.outside] == 0).all() and (after["dynamic"][env][oracle.outside] == 0).all()
+        assert (after["static"][env][oracle.outside] == 0).all() and (
+            after["dynamic"][env][oracle.outside] == 0
+        ).all()
     assert seen["doubtful"] < MAX_DOUBTFUL
     # the random scans exercise what they should
     assert seen["dynamic"] > 10 and seen["static"] > 20
@@ -302,7 +335,7 @@ def test_update_equals_the_oracle_in_a_circular_tank(stage):
     check_against_oracle(stage, POND, 7)
 
 
-# -------------------------------------------------------------------------------------------------------------------- gains
+# ------------------------------------------------------------------------------------------------------ gains
 
 
 def test_gain_per_second_is_kept_at_any_scan_rate():
@@ -316,7 +349,9 @@ def test_periods_follow_the_slower_clock():
     fast, slow = SonarConfig(), SonarConfig(period_steps=5)
     assert mapping.map_period_s(MappingConfig(period_steps=1), fast, EPISODE) == pytest.approx(0.02)
     assert mapping.map_period_s(MappingConfig(period_steps=6), slow, EPISODE) == pytest.approx(0.2)
-    assert mapping.depth_period_s(MappingConfig(), fast, DepthConfig(period_steps=10), EPISODE) == pytest.approx(0.2)
+    assert mapping.depth_period_s(
+        MappingConfig(), fast, DepthConfig(period_steps=10), EPISODE
+    ) == pytest.approx(0.2)
 
 
 def test_times_become_scans_and_too_long_ones_are_refused():
@@ -327,7 +362,7 @@ def test_times_become_scans_and_too_long_ones_are_refused():
         mapping.scans_in(10.0, 0.02)
 
 
-# --------------------------------------------------------------------------------------------------------------- situations
+# ------------------------------------------------------------------------------------------------- situations
 
 EYE = (1.55, 2.05)
 BODY = (3.55, 2.05, 0.3)
@@ -394,7 +429,8 @@ def misread(yaw, valid, walls):
 @pytest.mark.parametrize("yaw", [0.0, 21 * 2 * np.pi / SONAR.n_ray])
 @pytest.mark.parametrize(("valid", "same"), [(False, True), (False, False), (True, True)])
 def test_walls_that_show_a_wrong_own_velocity_keep_the_standing_at_rest(stage, yaw, valid, same):
-    """Bottom lost while the vehicle stopped: the walls' Doppler tells, in the tracked scan and, while the reading is held, after it."""
+    """Bottom lost while the vehicle stopped: the walls' Doppler tells, in the tracked scan and, while the
+    reading is held, after it."""
     stage.reset()
     after = stage.run(lambda k: misread(yaw, valid, (WRONG, 0.0 if valid else 0.01, same)), 1)
     assert after["dynamic"].max() == 0 and after["static"][cell(*FACE)] > 0
@@ -409,7 +445,8 @@ def test_a_valid_reading_is_not_mended_by_an_older_scan(stage):
 
 
 def test_without_a_reading_and_without_walls_doppler_proves_nothing(stage):
-    """Nobody knows the own velocity: what stands does not move by it. A body faster than all doubt still does."""
+    """Nobody knows the own velocity: what stands does not move by it. A body faster than all doubt still
+    does."""
     stage.reset()
     blindly = stage.run(lambda k: misread(0.0, False, ((0.0, 0.0), 1.0, True)), 1)
     assert blindly["dynamic"].max() == 0 and blindly["static"][cell(*FACE)] > 0
@@ -460,7 +497,9 @@ def test_noisy_edges_of_a_static_body_never_become_dynamic(stage):
     noise = np.random.default_rng(3)
     worst = 0.0
     for second in range(12):
-        after = stage.run(lambda k: ring(EYE, [(*BODY, 0, 0)], yaw=0.004 * k, noise=noise), 25, first=25 * second)
+        after = stage.run(
+            lambda k: ring(EYE, [(*BODY, 0, 0)], yaw=0.004 * k, noise=noise), 25, first=25 * second
+        )
         worst = max(worst, after["dynamic"].max())
     assert worst < MAP.occupied
     assert after["static"][cell(*FACE)] > MAP.occupied
@@ -484,20 +523,27 @@ def test_dynamic_layer_decays_to_exactly_nothing_unseen(stage):
 
 def test_beam_without_return_clears_only_near_water(stage):
     stage.reset()
-    after = stage.run(lambda k: ring(EYE) | {"hit": np.zeros(SONAR.n_ray, int), "range": np.full(SONAR.n_ray, 12.0)}, 1)
+    after = stage.run(
+        lambda k: ring(EYE) | {"hit": np.zeros(SONAR.n_ray, int), "range": np.full(SONAR.n_ray, 12.0)}, 1
+    )
     assert after["seen"][cell(EYE[0] + 2.4, EYE[1])] and not after["seen"][cell(EYE[0] + 2.6, EYE[1])]
     stage.reset()
     after = stage.run(lambda k: ring(EYE), 1)
     assert after["seen"][cell(EYE[0] + 4.0, EYE[1])]
 
 
-# -------------------------------------------------------------------------------------------------------------------- depth
+# ------------------------------------------------------------------------------------------------------ depth
 
 
 def wall_ahead(z_m):
-    """Image of a plane across the view, moved sideways by half a pixel so that one column looks along y = EYE[1]."""
+    """Image of a plane across the view, moved sideways by half a pixel so that one column looks along y =
+    EYE[1]."""
     pos = (EYE[0], EYE[1] - z_m * np.tan(np.radians(DEPTH_CAMERA.fov_deg / 2)) / DEPTH_CAMERA.cols, -0.8)
-    return {"depth": np.full((DEPTH_CAMERA.rows, DEPTH_CAMERA.cols), z_m), "pos": np.array(pos), "rpy": np.zeros(3)}
+    return {
+        "depth": np.full((DEPTH_CAMERA.rows, DEPTH_CAMERA.cols), z_m),
+        "pos": np.array(pos),
+        "rpy": np.zeros(3),
+    }
 
 
 PLANE_M = FACE[0] - EYE[0] - DEPTH_CAMERA.offset_b_m[0]
@@ -511,7 +557,9 @@ def test_depth_alone_maps_nothing_but_strengthens_what_the_sonar_saw(stage):
     stage.reset()
     without = stage.run(lambda k: ring(EYE, [(*BODY, 0, 0)]), 2)["static"][cell(*FACE)]
     stage.reset()
-    both = stage.run(lambda k: ring(EYE, [(*BODY, 0, 0)]), 2, image_of=lambda k: wall_ahead(PLANE_M))["static"][cell(*FACE)]
+    both = stage.run(lambda k: ring(EYE, [(*BODY, 0, 0)]), 2, image_of=lambda k: wall_ahead(PLANE_M))[
+        "static"
+    ][cell(*FACE)]
     # images come every fourth step, scans every second: gain per image is that of 12.5 Hz
     assert both - without == pytest.approx(2 * 0.8 * MAP.depth_hit, abs=1e-3)
 
@@ -536,10 +584,12 @@ def test_image_between_scans_waits_for_the_next_merge(stage):
     assert waiting["static"][0][cell(*FACE)] == before and waiting["depth_hit"][0][cell(*FACE)]
     after = stage.run(lambda k: ring(EYE, [(*BODY, 0, 0)]), 1, first=5)
     gain = 0.4 * MAP.static_hit + 0.8 * MAP.depth_hit
-    assert after["static"][cell(*FACE)] == pytest.approx(before * (1 - MAP.static_decay) ** 0.4 + gain, abs=OCCUPANCY_TOLERANCE)
+    assert after["static"][cell(*FACE)] == pytest.approx(
+        before * (1 - MAP.static_decay) ** 0.4 + gain, abs=OCCUPANCY_TOLERANCE
+    )
 
 
-# ------------------------------------------------------------------------------------------------------------- clock and rows
+# --------------------------------------------------------------------------------------------- clock and rows
 
 
 def test_scans_closer_than_the_period_stale_scans_and_sleeping_rows_change_nothing(stage):
@@ -584,7 +634,10 @@ def test_permuting_envs_permutes_maps(stage, order, seed):
 @settings(max_examples=3, deadline=None, derandomize=True)
 @given(changed=st.integers(0, N_ENV - 1), seed=st.integers(0, 1000))
 def test_one_env_never_touches_another(stage, changed, seed):
-    plain, twisted = random_run(stage, range(N_ENV), seed), random_run(stage, range(N_ENV), seed, twist=changed)
+    plain, twisted = (
+        random_run(stage, range(N_ENV), seed),
+        random_run(stage, range(N_ENV), seed, twist=changed),
+    )
     others = [env for env in range(N_ENV) if env != changed]
     assert (plain["static"][changed] != twisted["static"][changed]).any()
     for name in FIELDS:
@@ -601,9 +654,12 @@ def test_occupancy_stays_in_its_bounds(stage, seed, n_scan):
 
 
 def test_position_estimate_off_the_grid_is_harmless(stage):
-    """Dead reckoning may drift through a wall: nothing is written out of bounds, nothing off the tank is occupied."""
+    """Dead reckoning may drift through a wall: nothing is written out of bounds, nothing off the tank is
+    occupied."""
     stage.reset()
-    after = stage.run(lambda k: ring(EYE, [(*BODY, 0, 0)]) | {"pos": np.array([-3.0 + k, 9.0 - 2 * k, -0.8])}, 8)
+    after = stage.run(
+        lambda k: ring(EYE, [(*BODY, 0, 0)]) | {"pos": np.array([-3.0 + k, 9.0 - 2 * k, -0.8])}, 8
+    )
     outside = np.array(outside_cells(TANK, MAP.cell_m))
     assert after["static"][outside].max() == 0 and not after["seen"][outside].any()
 
@@ -616,19 +672,26 @@ def test_reset_empties_awake_rows_only(stage):
     after = stage.read()
     for env in range(N_ENV):
         for name in FIELDS:
-            np.testing.assert_array_equal(after[name][env], np.zeros(SHAPE) if awake[env] else before[name][env])
+            np.testing.assert_array_equal(
+                after[name][env], np.zeros(SHAPE) if awake[env] else before[name][env]
+            )
     # and a reset row starts to map at once, whatever its last scan was
     assert stage.run(lambda k: ring(EYE, [(*BODY, 0, 0)]), 1)["static"][cell(*FACE)] > 0
 
 
-# -------------------------------------------------------------------------------------------------------------------- stamp
+# ------------------------------------------------------------------------------------------------------ stamp
 
 
 def test_debugging_stamp_is_off_by_default_and_marks_moving_bodies_only(stage):
     assert MappingConfig().stamp == 0.0
     stage.reset()
     world = allocate(WorldState, {"n_env": N_ENV, "n_body": 4})
-    kind, pos, vel, size = np.zeros((N_ENV, 4), np.int32), np.zeros((N_ENV, 4, 3)), np.zeros((N_ENV, 4, 3)), np.zeros((N_ENV, 4, 3))
+    kind, pos, vel, size = (
+        np.zeros((N_ENV, 4), np.int32),
+        np.zeros((N_ENV, 4, 3)),
+        np.zeros((N_ENV, 4, 3)),
+        np.zeros((N_ENV, 4, 3)),
+    )
     kind[:] = (CYLINDER, CYLINDER, BOX, NONE)
     pos[:, :, :2] = ((1.0, 1.0), (3.0, 1.0), (5.0, 3.0), (3.0, 3.0))
     size[:] = ((0.3, 0.3, 1), (0.3, 0.3, 1), (0.5, 0.1, 1), (0.3, 0.3, 1))
@@ -647,4 +710,4 @@ def test_debugging_stamp_is_off_by_default_and_marks_moving_bodies_only(stage):
     check_bits(stage.grid_map, MAP.occupied, CONFIDENT)
 
 
-# ------------------------------------------------------------------------------------------------------------------ threads
+# ---------------------------------------------------------------------------------------------------- threads

@@ -1,4 +1,5 @@
-"""Pictures and videos are what their names say, judged by readers of others: Pillow, FFmpeg, an XML parser, poppler where it is."""
+"""Pictures and videos are what their names say, judged by readers of others: Pillow, FFmpeg, an XML parser,
+poppler where it is."""
 
 import io
 import shutil
@@ -48,7 +49,7 @@ def code(color):
     return "#" + "".join(f"{part:02x}" for part in reversed(color))
 
 
-# -------------------------------------------------------------------------------------------------------------- pictures
+# --------------------------------------------------------------------------------------------------- pictures
 
 
 def test_a_png_is_a_png(folder, logs):
@@ -59,13 +60,18 @@ def test_a_png_is_a_png(folder, logs):
 def test_an_svg_holds_paths_in_the_methods_colours_and_the_maps_as_images(folder, logs):
     root = ElementTree.fromstring(picture(logs, folder / "p.svg").read_bytes())
     assert root.tag == f"{SVG}svg"
-    strokes = {method: [e for e in root.iter(f"{SVG}path") if f"stroke: {colour}" in e.get("style", "")] for method, colour in COLOURS}
+    strokes = {
+        method: [e for e in root.iter(f"{SVG}path") if f"stroke: {colour}" in e.get("style", "")]
+        for method, colour in COLOURS
+    }
     for log in logs:  # the trajectory is one path with a corner for every pose
         recording = load_recording(log, PICTURE_TOPICS)
         corners = [e.get("d").count("L") for e in strokes[recording.method]]
         assert max(corners) == len(recording.positions) - 1
     images = list(root.iter(f"{SVG}image"))
-    assert len(images) == 3 and all(e.get("{http://www.w3.org/1999/xlink}href").startswith("data:image/png;base64,") for e in images)
+    assert len(images) == 3 and all(
+        e.get("{http://www.w3.org/1999/xlink}href").startswith("data:image/png;base64,") for e in images
+    )
     assert not list(root.iter(f"{SVG}script"))
 
 
@@ -80,19 +86,25 @@ def test_a_pdf_is_a_pdf_and_poppler_sees_what_the_png_shows(folder, logs):
         pytest.skip("poppler is not installed: the PDF's frame alone was looked at")
     told = subprocess.run(["pdftotext", str(out), "-"], capture_output=True, text=True, check=True).stdout
     assert {"bt", "straight"} <= set(told.split())
-    shown = subprocess.run(["pdftoppm", "-r", "100", "-png", str(out)], capture_output=True, check=True).stdout
+    shown = subprocess.run(
+        ["pdftoppm", "-r", "100", "-png", str(out)], capture_output=True, check=True
+    ).stdout
     paths = np.array(Image.open(io.BytesIO(shown)).convert("RGB"))[..., ::-1]
     pixels = draw_picture([load_recording(log, PICTURE_TOPICS) for log in logs])
     assert paths.shape == pixels.shape
     alone = draw_picture([load_recording(logs[0], PICTURE_TOPICS)])
-    assert unlike(paths, pixels) < 0.002 < 0.006 < unlike(alone, pixels), "without one trajectory it is another picture"
+    assert unlike(paths, pixels) < 0.002 < 0.006 < unlike(alone, pixels), (
+        "without one trajectory it is another picture"
+    )
 
 
 def unlike(one, other):
-    """Share of the map's squares of 4 x 4 pixels that differ; edges of lines do not count, nor text, whose font is another."""
+    """Share of the map's squares of 4 x 4 pixels that differ; edges of lines do not count, nor text, whose
+    font is another."""
     (x0, x1), (y0, y1) = (62, 1556), (96, 540)
     small = [
-        cv2.resize(image[y0:y1, x0:x1].astype(np.uint8), None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA) for image in (one, other)
+        cv2.resize(image[y0:y1, x0:x1].astype(np.uint8), None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+        for image in (one, other)
     ]
     return (np.abs(small[0].astype(int) - small[1]).max(axis=2) > 60).mean()
 
@@ -108,11 +120,18 @@ def test_a_ring_keeps_its_hole_on_either_canvas():
 
     outer, inner = (np.array([(-r, -r), (r, -r), (r, r), (-r, r)]) + 5.0 for r in (4.0, 2.0))
     for turn in (1, -1):
-        plain, paths = (kind((200, 200), (0.0, 0.0), 20.0, (0.0, 10.0), (0.0, 10.0)) for kind in (canvas.Canvas, VectorCanvas))
+        plain, paths = (
+            kind((200, 200), (0.0, 0.0), 20.0, (0.0, 10.0), (0.0, 10.0))
+            for kind in (canvas.Canvas, VectorCanvas)
+        )
         for one in (plain, paths):
             one.area_between(outer, inner[::turn], canvas.FAILED)
         assert tuple(plain.image[100, 100]) == canvas.PAPER and tuple(plain.image[40, 40]) == canvas.FAILED
-        (path,) = [e for e in ElementTree.fromstring(paths.document("svg")).iter(f"{SVG}path") if code(canvas.FAILED) in e.get("style", "")]
+        (path,) = [
+            e
+            for e in ElementTree.fromstring(paths.document("svg")).iter(f"{SVG}path")
+            if code(canvas.FAILED) in e.get("style", "")
+        ]
         assert _winding(path.get("d"), (72.0, 72.0)) == 0 and abs(_winding(path.get("d"), (26.0, 72.0))) == 1
 
 
@@ -127,15 +146,20 @@ def _winding(d, place):
     return round(total / (2 * np.pi))
 
 
-# ---------------------------------------------------------------------------------------------------------------- videos
+# ----------------------------------------------------------------------------------------------------- videos
 
 
 @pytest.mark.parametrize(
     ("name", "container", "codec"),
-    [("v.webm", "matroska,webm", "vp9"), ("v.mp4", "mov,mp4,m4a,3gp,3g2,mj2", "h264"), ("v.gif", "gif", "gif")],
+    [
+        ("v.webm", "matroska,webm", "vp9"),
+        ("v.mp4", "mov,mp4,m4a,3gp,3g2,mj2", "h264"),
+        ("v.gif", "gif", "gif"),
+    ],
 )
 def test_a_video_is_what_its_name_says(folder, logs, capfd, name, container, codec):
-    """Container, codec, size, rate and length by FFmpeg; what a frame shows by its pixels; nothing on stderr."""
+    """Container, codec, size, rate and length by FFmpeg; what a frame shows by its pixels; nothing on
+    stderr."""
     fps, speed = 10.0, 2.0
     out = video(logs[0], folder / name, fps=fps, speed=speed, width_px=640)
     assert capfd.readouterr().err == ""
@@ -148,7 +172,11 @@ def test_a_video_is_what_its_name_says(folder, logs, capfd, name, container, cod
         if codec == "h264":
             assert stream.codec_context.pix_fmt == "yuv420p", "the only one that every player knows"
     assert len(frames) == expected and frames[0].shape[1] == 640 and frames[0].shape[0] % 2 == 0
-    drawn = cv2.resize(FrameArtist(load_recording(logs[0])).frame(0.4), (640, frames[0].shape[0]), interpolation=cv2.INTER_AREA)
+    drawn = cv2.resize(
+        FrameArtist(load_recording(logs[0])).frame(0.4),
+        (640, frames[0].shape[0]),
+        interpolation=cv2.INTER_AREA,
+    )
     errors = [np.abs(frame - drawn).mean() for frame in frames]
     assert int(np.argmin(errors)) == 2 and errors[2] < 6
 
@@ -159,7 +187,8 @@ def test_an_mp4_can_be_played_while_it_loads(folder, logs):
 
 
 def test_a_gif_keeps_its_time_and_its_colours(folder, logs):
-    """Pillow counts: 15 frames a second are no whole hundredths, and the rare colours must not melt into the frequent ones."""
+    """Pillow counts: 15 frames a second are no whole hundredths, and the rare colours must not melt into the
+    frequent ones."""
     with Image.open(video(logs[0], folder / "t.gif", fps=15.0, speed=4.0)) as image:
         durations, seen = [], set()
         for i in range(image.n_frames):
@@ -172,7 +201,11 @@ def test_a_gif_keeps_its_time_and_its_colours(folder, logs):
 
 
 def test_what_cannot_be_written_is_refused_before_anything_is_read(tmp_path):
-    for draw, name, there in ((picture, "a.jpg", ".png, .pdf, .svg"), (video, "a.avi", ".webm, .mp4, .gif"), (video, "a", ".webm")):
+    for draw, name, there in (
+        (picture, "a.jpg", ".png, .pdf, .svg"),
+        (video, "a.avi", ".webm, .mp4, .gif"),
+        (video, "a", ".webm"),
+    ):
         with pytest.raises(UserError, match="can be") as told:
             draw(tmp_path / "nowhere.mcap", tmp_path / name)
         assert there in str(told.value)
@@ -180,7 +213,15 @@ def test_what_cannot_be_written_is_refused_before_anything_is_read(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"speed": 0.0}, {"speed": -1.0}, {"speed": float("nan")}, {"fps": 1e9}, {"fps": 0.5}, {"width_px": 100_000}]
+    "wrong",
+    [
+        {"speed": 0.0},
+        {"speed": -1.0},
+        {"speed": float("nan")},
+        {"fps": 1e9},
+        {"fps": 0.5},
+        {"width_px": 100_000},
+    ],
 )
 def test_values_without_sense_are_refused(tmp_path, logs, wrong):
     with pytest.raises(UserError, match="must be from"):
@@ -210,14 +251,16 @@ def test_the_command_takes_speed_rate_and_width_and_tells_its_progress(tmp_path,
     monkeypatch.setattr("uuvtai.show.progress._PERIOD_S", 0.0)
     out = tmp_path / "talk.gif"
     with pytest.raises(SystemExit) as left:
-        main(["log", "video", str(logs[0]), "--out", str(out), "--speed", "3", "--fps", "5", "--width", "400"])
+        main(
+            ["log", "video", str(logs[0]), "--out", str(out), "--speed", "3", "--fps", "5", "--width", "400"]
+        )
     said = capfd.readouterr()
     assert left.value.code == 0 and said.out.strip() == str(out) and "frames" in said.err
     with Image.open(out) as image:
         assert image.size[0] == 400
 
 
-# --------------------------------------------------------------------------------------------------------------- colours
+# ---------------------------------------------------------------------------------------------------- colours
 
 
 def test_a_method_has_one_colour_wherever_it_is_shown():
@@ -230,13 +273,17 @@ def test_a_method_has_one_colour_wherever_it_is_shown():
 def test_other_methods_take_what_is_free_in_their_order():
     names = ["bt", "a", "b", "c"]
     found = method_colours(names)
-    assert len(set(found.values())) == 4 and method_colours(["bt", "a"]) == {name: found[name] for name in ("bt", "a")}
+    assert len(set(found.values())) == 4 and method_colours(["bt", "a"]) == {
+        name: found[name] for name in ("bt", "a")
+    }
     many = method_colours([f"m{i}" for i in range(20)])
     assert set(many.values()) <= set(PALETTE) and len(set(many.values())) == 7
 
 
 def test_every_method_stands_out_from_what_a_map_shows():
-    for colour in method_colours(["straight", "planner", "bt", "paper", "best", "oracle", "bt+truth"]).values():
+    for colour in method_colours(
+        ["straight", "planner", "bt", "paper", "best", "oracle", "bt+truth"]
+    ).values():
         assert contrast(colour, "#ffffff") > 1.9
         for meaning in (canvas.DYNAMIC, canvas.MOVER):
             assert np.abs(np.array(canvas.bgr(colour)) - meaning).max() > 60

@@ -11,7 +11,8 @@ import pytest
 PACKAGE = Path(__file__).parent.parent / "uuvtai"
 PATHS = sorted(PACKAGE.rglob("*.py"))
 DECKS = ("config", "state", "bundles")
-"""what every room has: a file of the room's name in each of the first two, the last in its folder of kernels"""
+"""what every room has: a file of the room's name in each of the first two, the last in its folder of
+kernels"""
 
 
 def module_of(path):
@@ -43,12 +44,16 @@ def ours_in(module):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("uuvtai")
         for alias in node.names
     }
-    return (imported | {node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}) & set(CLASSES)
+    return (imported | {node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}) & set(
+        CLASSES
+    )
 
 
 def kind_of(annotation):
     """'RouteState' of RouteState, In[RouteState], state.RouteState, RouteState | None."""
-    match = re.fullmatch(r"(?:(?:In|Out|Const|Bundle)\[)?(?:\w+\.)?(\w+)\]?(?: \| None)?", ast.unparse(annotation).strip("'\""))
+    match = re.fullmatch(
+        r"(?:(?:In|Out|Const|Bundle)\[)?(?:\w+\.)?(\w+)\]?(?: \| None)?", ast.unparse(annotation).strip("'\"")
+    )
     return match.group(1) if match else ""
 
 
@@ -59,7 +64,11 @@ def names_of_types(trees):
         ours = ours_in(module)
         for node in ast.walk(TREES[module]):
             if isinstance(node, ast.FunctionDef):
-                given = [(kind_of(a.annotation), a.arg) for a in node.args.args + node.args.kwonlyargs if a.annotation is not None]
+                given = [
+                    (kind_of(a.annotation), a.arg)
+                    for a in node.args.args + node.args.kwonlyargs
+                    if a.annotation is not None
+                ]
                 count = Counter(kind for kind, _ in given)
                 for kind, name in given:
                     if kind in ours and count[kind] == 1:
@@ -70,11 +79,18 @@ def names_of_types(trees):
 def test_a_type_has_one_name_as_a_parameter():
     found = names_of_types(TREES)
     assert len(found) > 100
-    assert not {kind: {name: where[:3] for name, where in names.items()} for kind, names in found.items() if len(names) > 1}
+    assert not {
+        kind: {name: where[:3] for name, where in names.items()}
+        for kind, names in found.items()
+        if len(names) > 1
+    }
 
 
 def test_a_second_name_would_be_found(monkeypatch):
-    source = "from uuvtai.run_folder import RunFolder\ndef one(folder: RunFolder): ...\ndef two(held: 'RunFolder | None'): ..."
+    source = (
+        "from uuvtai.run_folder import RunFolder\ndef one(folder: RunFolder): ...\ndef two(held: "
+        "'RunFolder | None'): ..."
+    )
     monkeypatch.setitem(TREES, "made.up", ast.parse(source))
     assert set(names_of_types(["made.up"])["RunFolder"]) == {"folder", "held"}
 
@@ -101,7 +117,10 @@ def imports():
         named = set()
         for node in ast.walk(tree):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("uuvtai"):
-                named |= {f"{node.module}.{a.name}" if f"{node.module}.{a.name}" in TREES else node.module for a in node.names}
+                named |= {
+                    f"{node.module}.{a.name}" if f"{node.module}.{a.name}" in TREES else node.module
+                    for a in node.names
+                }
             elif isinstance(node, ast.Import):
                 named |= {a.name for a in node.names if a.name.startswith("uuvtai")}
         found[module] = named - {module}
@@ -123,7 +142,9 @@ def test_no_module_imports_itself_by_a_detour():
     assert not circle_in(graph)
 
 
-@pytest.mark.parametrize("graph", [{"a": {"b"}, "b": {"a"}}, {"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}])
+@pytest.mark.parametrize(
+    "graph", [{"a": {"b"}, "b": {"a"}}, {"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}]
+)
 def test_a_circle_would_be_found(graph):
     assert {"a", "b"} <= set(circle_in(graph))
 

@@ -1,4 +1,5 @@
-"""Random numbers: equal to plain integer arithmetic, equal in lanes, uniform, normal, and independent between streams."""
+"""Random numbers: equal to plain integer arithmetic, equal in lanes, uniform, normal, and independent between
+streams."""
 
 import math
 
@@ -15,13 +16,16 @@ BINS = 256
 CHI2_LIMIT = 374.0
 """99.9999 % point of chi-squared with 255 degrees of freedom: fails by chance once in a million."""
 POLYNOMIAL_ERROR = 1.0e-3
-"""the logarithm is off by at most 8e-5, which at the smallest radii (0.004) is 2 % of them; sine and cosine by 7e-6"""
+"""the logarithm is off by at most 8e-5, which at the smallest radii (0.004) is 2 % of them; sine and cosine
+by 7e-6"""
 SIGMAS = 5.0
 """bound of sample means and correlations in standard errors"""
 
 
 @ti.kernel
-def draw_scalar(word: ti.template(), unit: ti.template(), gauss: ti.template(), a: ti.i32, b: ti.i32, c: ti.i32, d: ti.i32):
+def draw_scalar(
+    word: ti.template(), unit: ti.template(), gauss: ti.template(), a: ti.i32, b: ti.i32, c: ti.i32, d: ti.i32
+):
     key = noise.stream_key(noise.episode_key(a, b), c, d)
     for i in word:
         word[i] = noise.bits(key, i)
@@ -30,7 +34,9 @@ def draw_scalar(word: ti.template(), unit: ti.template(), gauss: ti.template(), 
 
 
 @ti.kernel
-def draw_lanes(word: ti.template(), unit: ti.template(), gauss: ti.template(), a: ti.i32, b: ti.i32, c: ti.i32, d: ti.i32):
+def draw_lanes(
+    word: ti.template(), unit: ti.template(), gauss: ti.template(), a: ti.i32, b: ti.i32, c: ti.i32, d: ti.i32
+):
     key = noise.stream_key(noise.episode_key(a, b), c, d)
     for packet in range(ti.static(N // LANES)):
         words = noise.bits_lanes(key, packet * LANES)
@@ -121,17 +127,22 @@ def test_normals_have_the_moments_of_a_normal(drawn, lanes):
 
 
 def test_both_normals_of_a_pair_are_normal_and_independent(pairs):
-    """Kolmogorov-Smirnov: sqrt(N) D exceeds 2.5 once in 100,000; squares of independent normals are uncorrelated too."""
+    """Kolmogorov-Smirnov: sqrt(N) D exceeds 2.5 once in 100,000; squares of independent normals are
+    uncorrelated too."""
     one, other = pairs(3, 4, 5, 6)
     cdf = (np.arange(N) + 0.5) / N
     for gauss in (one, other):
-        assert np.sqrt(N) * np.abs(0.5 * (1 + np.vectorize(math.erf)(np.sort(gauss) / np.sqrt(2))) - cdf).max() < 2.5
+        assert (
+            np.sqrt(N) * np.abs(0.5 * (1 + np.vectorize(math.erf)(np.sort(gauss) / np.sqrt(2))) - cdf).max()
+            < 2.5
+        )
     for a, b in ((one, other), (one**2, other**2), (one, other**2)):
         assert abs(np.corrcoef(a, b)[0, 1]) < SIGMAS / np.sqrt(N)
 
 
 def test_every_radius_and_angle_of_a_pair(pairs):
-    """Each of the 2^16 uniforms of radius and angle gives Box-Muller's value: what the words of the draw say, in float64."""
+    """Each of the 2^16 uniforms of radius and angle gives Box-Muller's value: what the words of the draw say,
+    in float64."""
     one, other = pairs(3, 4, 5, 6)
     key = reference.stream_key(reference.episode_key(3, 4), 5, 6)
     word = np.array([reference.bits(key, i) for i in range(N)])
@@ -139,7 +150,9 @@ def test_every_radius_and_angle_of_a_pair(pairs):
     angle = 2.0 * np.pi * ((word & 0xFFFF) - 32767.5) / 65536.0
     np.testing.assert_allclose(one, radius * np.cos(angle), atol=POLYNOMIAL_ERROR)
     np.testing.assert_allclose(other, radius * np.sin(angle), atol=POLYNOMIAL_ERROR)
-    assert np.unique(word >> 16).size > 0.6 * N and (word >> 16).max() == 65535, "the radius next to 0 is among them"
+    assert np.unique(word >> 16).size > 0.6 * N and (word >> 16).max() == 65535, (
+        "the radius next to 0 is among them"
+    )
 
 
 @pytest.mark.parametrize("other", [(3, 4, 5, 7), (3, 4, 6, 6), (3, 5, 5, 6), (4, 4, 5, 6)])

@@ -1,4 +1,5 @@
-"""Running statistics: merging is exact, rows that are not finite leave no trace, and scaling can be undone."""
+"""Running statistics: merging is exact, rows that are not finite leave no trace, and scaling can be
+undone."""
 
 import math
 
@@ -16,7 +17,9 @@ FLOAT32 = 1e-5
 @pytest.fixture
 def samples():
     generator = torch.Generator().manual_seed(1)
-    return torch.randn(5000, 3, generator=generator) * torch.tensor([1.0, 50.0, 0.2]) + torch.tensor([0.0, 1000.0, -7.0])
+    return torch.randn(5000, 3, generator=generator) * torch.tensor([1.0, 50.0, 0.2]) + torch.tensor(
+        [0.0, 1000.0, -7.0]
+    )
 
 
 def assert_moments(found, rows):
@@ -71,7 +74,9 @@ def test_scaling_and_its_inverse(samples):
     norm.update(samples)
     y = norm(samples)
     assert y.dtype == torch.float32
-    assert torch.allclose(y.double().mean(0), torch.zeros(3, dtype=torch.float64), atol=1e-3)  # float32 holds 1000 +- 50 to 6e-5
+    assert torch.allclose(
+        y.double().mean(0), torch.zeros(3, dtype=torch.float64), atol=1e-3
+    )  # float32 holds 1000 +- 50 to 6e-5
     assert torch.allclose(y.std(0, correction=0), torch.ones(3), atol=1e-3)
     assert torch.allclose(norm.inverse(y), samples, rtol=FLOAT32, atol=FLOAT32)
     out = torch.empty_like(samples)

@@ -1,4 +1,5 @@
-"""The stack decides by observations alone: with every truth array poisoned from tracking to the teacher not one bit of it changes."""
+"""The stack decides by observations alone: with every truth array poisoned from tracking to the teacher not
+one bit of it changes."""
 
 import dataclasses
 
@@ -13,10 +14,12 @@ from uuvtai.loader import load_config
 from uuvtai.stages import SimState
 
 KNOWN = {
-    "clock", "mission", "ego", "scan", "image", "tracks", "clusters", "spots", "habits", "forecast", "mask", "grid_map", "map_scratch",
+    "clock", "mission", "ego", "scan", "image", "tracks", "clusters", "spots", "habits", "forecast", "mask",
+    "grid_map", "map_scratch",
     "clearance", "clearance_memory", "voronoi", "route", "features", "teacher", "table",
 }  # fmt: skip
-"""Structs of what the vehicle is told, senses, remembers and decides. Every other struct, a new one too, counts as truth."""
+"""Structs of what the vehicle is told, senses, remembers and decides. Every other struct, a new one too,
+counts as truth."""
 TRUTH = {f.name for f in dataclasses.fields(SimState)} - KNOWN
 STEPS, RESET_AT, RESET_ROWS = 60, 30, [2, 5]
 POISON = 77
@@ -56,7 +59,8 @@ class Poison:
             self.off()
 
         def seed_of(env):
-            """The fallback planner's random numbers come from the episode's key: a random number is no knowledge."""
+            """The fallback planner's random numbers come from the episode's key: a random number is no
+            knowledge."""
             poisoned = int(self.arrays["episode.key"][env])
             self.arrays["episode.key"][env] = self.kept["episode.key"][env]
             seed = planned_with(env)
@@ -70,7 +74,8 @@ class Poison:
 
 @pytest.fixture
 def watched(small, monkeypatch):
-    """The session's simulator, writing observations with all the columns there are: only their kernels are compiled for it."""
+    """The session's simulator, writing observations with all the columns there are: only their kernels are
+    compiled for it."""
     columns = small.config.features.model_copy(update={"n_track": 4, "teacher": True})
     configure(monkeypatch, small.sim, small.config.model_copy(update={"features": columns}))
     monkeypatch.setattr(small.sim, "observation", torch.zeros(small.N, features.observation_width(columns)))
@@ -81,7 +86,8 @@ def watched(small, monkeypatch):
 
 
 def driven(small, poison=None):
-    """(actions, observations, all arrays that a later step depends on) of an episode in every row, two of them begun anew on the way."""
+    """(actions, observations, all arrays that a later step depends on) of an episode in every row, two of
+    them begun anew on the way."""
     with pytest.MonkeyPatch.context() as patch:
         if poison:
             poison.during(small.sim, patch)
@@ -97,21 +103,41 @@ def driven(small, poison=None):
 
 
 def compared(small):
-    """(undisturbed actions, what differs from them under the poison, truth that somebody wrote between tracking and teacher)."""
-    driven(small)  # slots beyond what is counted keep what an earlier episode left: both runs follow equal ones
+    """(undisturbed actions, what differs from them under the poison, truth that somebody wrote between
+    tracking and teacher)."""
+    driven(
+        small
+    )  # slots beyond what is counted keep what an earlier episode left: both runs follow equal ones
     actions, observations, arrays = driven(small)
     poison = Poison(small.sim)
     others = driven(small, poison)
     differing = [name for name in arrays if arrays[name].tobytes() != others[2][name].tobytes()]
-    differing += ["action"] * (not torch.equal(actions, others[0])) + ["observation"] * (not torch.equal(observations, others[1]))
+    differing += ["action"] * (not torch.equal(actions, others[0])) + ["observation"] * (
+        not torch.equal(observations, others[1])
+    )
     assert actions.abs().mean() > 0.1 and observations.isfinite().all(), "they drive, and see something"
-    assert arrays["tracks.moving"].any() and arrays["route.n_way"].all() and (arrays["grid_map.static_occ"] > 0.5).any()
+    assert (
+        arrays["tracks.moving"].any()
+        and arrays["route.n_way"].all()
+        and (arrays["grid_map.static_occ"] > 0.5).any()
+    )
     return actions, differing, poison.written
 
 
 def test_every_struct_is_known_or_truth():
     assert {f.name for f in dataclasses.fields(SimState)} >= KNOWN
-    assert {"world", "vehicle", "params", "current", "path", "episode", "referee", "reward", "ego_memory", "sonar_memory"} <= TRUTH
+    assert {
+        "world",
+        "vehicle",
+        "params",
+        "current",
+        "path",
+        "episode",
+        "referee",
+        "reward",
+        "ego_memory",
+        "sonar_memory",
+    } <= TRUTH
 
 
 def with_sensors(small, monkeypatch, **changed):
@@ -130,7 +156,14 @@ def test_nor_with_dead_reckoning_and_harsh_readings(watched, monkeypatch):
     """Position, heading and speed are off: whoever took the true ones would do something else."""
     exact, _, _ = driven(watched)
     harsh = load_config("pool", "harsh").sensors
-    with_sensors(watched, monkeypatch, localization="dead_reckoning", dvl=harsh.dvl, imu=harsh.imu, pressure=harsh.pressure)
+    with_sensors(
+        watched,
+        monkeypatch,
+        localization="dead_reckoning",
+        dvl=harsh.dvl,
+        imu=harsh.imu,
+        pressure=harsh.pressure,
+    )
     actions, differing, written = compared(watched)
     assert (differing, written) == ([], set())
     assert not torch.equal(actions, exact), "the readings are others"
@@ -138,7 +171,7 @@ def test_nor_with_dead_reckoning_and_harsh_readings(watched, monkeypatch):
     assert apart.max() > 0.02
 
 
-# ------------------------------------------------------------------------------------------------------- the tests above can fail
+# ----------------------------------------------------------------------------------- the tests above can fail
 
 
 def test_the_poison_reaches_whoever_reads_the_truth(watched):
@@ -161,7 +194,10 @@ def test_the_true_pose_in_place_of_the_estimate_is_found(watched, monkeypatch):
     """With exact sensors the estimate equals the truth: nothing but the poison tells them apart."""
     from uuvtai.kernels.perception import elevation
 
-    honest, leaking = elevation.bound_heights, dataclasses.replace(watched.sim.io.heights, ego=watched.sim.s.vehicle)
+    honest, leaking = (
+        elevation.bound_heights,
+        dataclasses.replace(watched.sim.io.heights, ego=watched.sim.s.vehicle),
+    )
     monkeypatch.setattr("uuvtai.sim.elevation.bound_heights", lambda _io: honest(leaking))
     _, differing, _ = compared(watched)
     assert {"forecast.above_w", "observation"} & set(differing)

@@ -1,4 +1,5 @@
-"""Privileged yardsticks on hand-made scenarios: distances, what the referee forbids, earliest arrivals, blind rides, detection distance."""
+"""Privileged yardsticks on hand-made scenarios: distances, what the referee forbids, earliest arrivals, blind
+rides, detection distance."""
 
 import math
 
@@ -11,7 +12,14 @@ from uuvtai.measure import hindsight
 from uuvtai.privileged.blind_ride import ride_blindly
 from uuvtai.privileged.detection import required_detection, time_aside_s
 from uuvtai.privileged.lattice import CELL_M, MOVES, Referee, lattice_of
-from uuvtai.privileged.obstacles import Obstacle, level_excess, obstacles_of, path_positions, rounding_m, upright_excess
+from uuvtai.privileged.obstacles import (
+    Obstacle,
+    level_excess,
+    obstacles_of,
+    path_positions,
+    rounding_m,
+    upright_excess,
+)
 from uuvtai.privileged.oracle import earliest_arrival
 from uuvtai.scenario import path_position
 
@@ -23,7 +31,13 @@ GOAL_M = 1.0
 
 def line(a, b, speed, phase=0.0):
     """Path document of a body that goes back and forth."""
-    return {"shape": "polyline", "corners": [list(a), list(b)], "length_m": 2 * math.dist(a, b), "phase_m": phase, "speed_m_s": speed}
+    return {
+        "shape": "polyline",
+        "corners": [list(a), list(b)],
+        "length_m": 2 * math.dist(a, b),
+        "phase_m": phase,
+        "speed_m_s": speed,
+    }
 
 
 def body(kind, position, size, path=None, yaw=0.0):
@@ -42,14 +56,27 @@ def arrival(start, goal, *bodies, config=CONFIG):
     return earliest_arrival(scenario(start, goal, *bodies), config).time_s
 
 
-# ------------------------------------------------------------------------------------------------------------------ obstacles
+# -------------------------------------------------------------------------------------------------- obstacles
 
 
 @pytest.mark.parametrize(
     "path",
     [
-        {"shape": "circle", "center": [5.0, 3.0], "radius_m": -1.5, "length_m": 3 * math.pi, "phase_m": 2.0, "speed_m_s": 0.7},
-        {"shape": "polyline", "corners": [[1, 1], [4, 1], [4, 5]], "length_m": 12.0, "phase_m": 6.5, "speed_m_s": 1.5},
+        {
+            "shape": "circle",
+            "center": [5.0, 3.0],
+            "radius_m": -1.5,
+            "length_m": 3 * math.pi,
+            "phase_m": 2.0,
+            "speed_m_s": 0.7,
+        },
+        {
+            "shape": "polyline",
+            "corners": [[1, 1], [4, 1], [4, 5]],
+            "length_m": 12.0,
+            "phase_m": 6.5,
+            "speed_m_s": 1.5,
+        },
         line((2, 2), (6, 5), 0.6, phase=9.0),
     ],
 )
@@ -60,7 +87,8 @@ def test_many_positions_of_a_path_are_those_of_one_by_one(path):
 
 def test_bodies_move_with_the_speed_of_their_path():
     moving, still = obstacles_of(
-        scenario((2, 2, -0.8), (9, 2, -0.8), column(5, 1, path=line((5, 1), (5, 5), 0.5)), column(7, 2)), np.arange(0.1, 12.0, 0.5)
+        scenario((2, 2, -0.8), (9, 2, -0.8), column(5, 1, path=line((5, 1), (5, 5), 0.5)), column(7, 2)),
+        np.arange(0.1, 12.0, 0.5),
     )
     assert moving.moves and not still.moves
     assert np.linalg.norm(moving.vel_w, axis=1) == pytest.approx(np.full(24, 0.5), abs=1e-6)
@@ -79,23 +107,39 @@ def test_distances_are_those_of_the_hindsight(name, kind):
     ox, oy = level_excess(shape, off[:, 0], off[:, 1])
     gaps = np.sqrt(ox**2 + oy**2 + upright_excess(shape, off[:, 2]) ** 2) - rounding_m(shape) - 0.17
     axis = np.tile([1.0, 0.0, 0.0], (500, 1))
-    expected, _, _ = hindsight.hull_gaps(points, axis, np.array([kind]), np.tile(at, (500, 1, 1)), size[None], np.array([yaw]), 0.17, 0.0)
+    expected, _, _ = hindsight.hull_gaps(
+        points, axis, np.array([kind]), np.tile(at, (500, 1, 1)), size[None], np.array([yaw]), 0.17, 0.0
+    )
     assert gaps == pytest.approx(expected[:, 0], abs=1e-9)
 
 
 def test_the_referee_forbids_what_closes_too_fast_and_lets_flee():
-    """A column of radius 0.25 m comes at 1.5 m/s along -x: standing needs 0.27 m (0.18 s x 1.5), fleeing at 0.85 m/s 0.117 m."""
+    """A column of radius 0.25 m comes at 1.5 m/s along -x: standing needs 0.27 m (0.18 s x 1.5), fleeing at
+    0.85 m/s 0.117 m."""
     start = (6.0, 3.0, -0.8)
     grid = lattice_of(np.array(start), CONFIG)
     moves = {tuple(move): index for index, move in enumerate(MOVES)}
-    for gap, may_stay, may_flee, may_approach in ((0.09, 0, 0, 0), (0.2, 0, 1, 0), (0.35, 1, 1, 0), (0.5, 1, 1, 1)):
-        coming = Obstacle("cylinder", np.array([0.25, 0.25, 0.8]), 0.0, np.array([[6.0 + 0.42 + gap, 3.0, -0.8]]), np.array([[-1.5, 0.0]]))
-        blocked = Referee(grid, [], CONFIG).blocked([coming], 0, np.ones_like(grid.inside))[(slice(None), *grid.start)]
+    for gap, may_stay, may_flee, may_approach in (
+        (0.09, 0, 0, 0),
+        (0.2, 0, 1, 0),
+        (0.35, 1, 1, 0),
+        (0.5, 1, 1, 1),
+    ):
+        coming = Obstacle(
+            "cylinder",
+            np.array([0.25, 0.25, 0.8]),
+            0.0,
+            np.array([[6.0 + 0.42 + gap, 3.0, -0.8]]),
+            np.array([[-1.5, 0.0]]),
+        )
+        blocked = Referee(grid, [], CONFIG).blocked([coming], 0, np.ones_like(grid.inside))[
+            (slice(None), *grid.start)
+        ]
         found = [not blocked[moves[move]] for move in ((0, 0), (-1, 0), (1, 0))]
         assert found == [bool(may_stay), bool(may_flee), bool(may_approach)], gap
 
 
-# --------------------------------------------------------------------------------------------------------------------- oracle
+# ----------------------------------------------------------------------------------------------------- oracle
 
 
 def test_in_open_water_the_oracle_takes_distance_over_speed():
@@ -113,7 +157,9 @@ def test_height_takes_time_and_a_current_carries():
     found = arrival((5.0, 3.0, -1.4), (5.0, 3.0, -0.2), config=config)
     assert found == pytest.approx((1.2 - 0.2) / 0.4, abs=4 * STEP_S)
     carried = CONFIG.model_copy(update={"disturbance": DisturbanceConfig(current_m_s=(0.4, 0.0, 0.0))})
-    assert arrival((2.0, 3.0, -0.8), (14.0, 3.0, -0.8), config=carried) == pytest.approx(11.0 / (TOP_SPEED + 0.4), abs=STEP_S)
+    assert arrival((2.0, 3.0, -0.8), (14.0, 3.0, -0.8), config=carried) == pytest.approx(
+        11.0 / (TOP_SPEED + 0.4), abs=STEP_S
+    )
 
 
 def test_a_wall_without_a_gap_cannot_be_passed_and_a_door_can():
@@ -131,7 +177,8 @@ def test_a_low_wall_is_passed_above():
 
 
 def test_the_oracle_waits_for_a_door_that_a_body_blocks():
-    """The door is 1.2 m wide; a column creeps out of its middle at 2 cm/s and leaves room at its side from 9.5 to 11 s on (by hand)."""
+    """The door is 1.2 m wide; a column creeps out of its middle at 2 cm/s and leaves room at its side from
+    9.5 to 11 s on (by hand)."""
     start, goal = (6.0, 3.0, -0.8), (12.0, 3.0, -0.8)
     door = (body("box", (8, 1.2, -0.8), (0.1, 1.2, 0.8)), body("box", (8, 4.8, -0.8), (0.1, 1.2, 0.8)))
     free = arrival(start, goal, *door)
@@ -140,7 +187,10 @@ def test_the_oracle_waits_for_a_door_that_a_body_blocks():
     waited = arrival(start, goal, *door, column(8.0, 3.0, path=line((8.0, 3.0), (8.0, 6.0), 0.02)))
     assert 9.5 + rest_s - 0.6 <= waited <= 11.0 + rest_s + 0.6
     short = CONFIG.model_copy(update={"episode": CONFIG.episode.model_copy(update={"horizon_steps": 600})})
-    assert arrival(start, goal, *door, column(8.0, 3.0, path=line((8.0, 3.0), (8.0, 6.0), 0.02)), config=short) is None
+    assert (
+        arrival(start, goal, *door, column(8.0, 3.0, path=line((8.0, 3.0), (8.0, 6.0), 0.02)), config=short)
+        is None
+    )
 
 
 def test_who_is_run_over_in_a_corner_does_not_arrive():
@@ -149,7 +199,7 @@ def test_who_is_run_over_in_a_corner_does_not_arrive():
     assert arrival((2.0, 3.0, -0.8), (16.0, 3.0, -0.8), *sweep) is None
 
 
-# --------------------------------------------------------------------------------------------------------- how hard it is
+# --------------------------------------------------------------------------------------------- how hard it is
 
 
 def test_a_blind_ride_counts_the_bodies_that_come_too_near():
@@ -159,7 +209,9 @@ def test_a_blind_ride_counts_the_bodies_that_come_too_near():
     above = body("sphere", (4.0, 3.0, -0.2), (0.2, 0.2, 0.2), line((4.0, 3.0), (4.0, 3.1), 0.1))
     behind = column(10.5, 3.0, path=line((10.5, 3.0), (10.6, 3.0), 0.1))
     ride = ride_blindly(scenario(start, goal, crossing, beside, above, behind, column(6.0, 3.0)), CONFIG)
-    assert ride.threats == 1, "one crosses; beside, above and beyond the goal none comes near, and what stands still does not count"
+    assert ride.threats == 1, (
+        "one crosses; beside, above and beyond the goal none comes near, and what stands still does not count"
+    )
     assert ride.time_s == pytest.approx(6.0 / 0.6, abs=0.03)
 
 
@@ -188,5 +240,7 @@ def test_detection_distance_knows_what_moves():
     assert required_detection(CONFIG.model_copy(update={"world": WorldConfig(dynamic_speed_m_s=0.0)})) is None
     path = (Waypoint(x_m=5, y_m=1), Waypoint(x_m=5, y_m=5))
     swinging = FixedObstacle(kind="box", x_m=5, y_m=1, half_extents_m=(0.3, 0.4), path=path, speed_m_s=1.4)
-    found = required_detection(CONFIG.model_copy(update={"world": WorldConfig(n_dynamic=0, fixed=(swinging,))}))
+    found = required_detection(
+        CONFIG.model_copy(update={"world": WorldConfig(n_dynamic=0, fixed=(swinging,))})
+    )
     assert (found.closing_m_s, found.aside_m) == (pytest.approx(2.0), pytest.approx(0.5 + 0.27))

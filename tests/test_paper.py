@@ -1,4 +1,5 @@
-"""docs/paper.md says what the code does: every difference between the defaults and the preset ``paper``, with both values."""
+"""docs/paper.md says what the code does: every difference between the defaults and the preset ``paper``, with
+both values."""
 
 import json
 import re
@@ -11,18 +12,25 @@ from uuvtai.loader import STACK_SECTIONS, load_config, load_training, with_stack
 
 PAGE = (Path(__file__).parents[1] / "docs/paper.md").read_text()
 SAME = {"distill.schedule", "sensors.sonar"}
-"""keys that differ in writing only (shares of a run with eight digits), or by the sensor preset that every command takes"""
+"""keys that differ in writing only (shares of a run with eight digits), or by the sensor preset that every
+command takes"""
 
 
 def rows(heading):
     """{key: cells} of the table under a heading, the key itself left out."""
     part = PAGE.split(f"## {heading}\n")[1].split("\n## ")[0]
-    lines = [line.strip("|").split(" | ") for line in part.splitlines() if re.match(r"\| `\w+\.\w+` \|", line)]
+    lines = [
+        line.strip("|").split(" | ") for line in part.splitlines() if re.match(r"\| `\w+\.\w+` \|", line)
+    ]
     return {cells[0].strip(" `"): [cell.strip() for cell in cells[1:]] for cells in lines}
 
 
 def values(config):
-    return {f"{section}.{key}": value for section, keys in config.model_dump(mode="json").items() for key, value in keys.items()}
+    return {
+        f"{section}.{key}": value
+        for section, keys in config.model_dump(mode="json").items()
+        for key, value in keys.items()
+    }
 
 
 def differing(a, b):
@@ -37,7 +45,9 @@ def test_every_difference_is_listed_and_nothing_else():
     default, paper, curriculum = LearningConfig(), load_training("paper"), load_training("curriculum")
     assert not CLASSICAL.keys() & LEARNING.keys()
     assert set(CLASSICAL) == differing(load_config("pool"), with_stack(load_config("pool"), "paper"))
-    assert set(CLASSICAL) | set(LEARNING) == differing(default, paper) | differing(curriculum, paper) | differing(default, curriculum)
+    assert set(CLASSICAL) | set(LEARNING) == differing(default, paper) | differing(
+        curriculum, paper
+    ) | differing(default, curriculum)
     assert {key.partition(".")[0] for key in CLASSICAL} <= set(STACK_SECTIONS)
 
 
@@ -45,27 +55,51 @@ def test_every_difference_is_listed_and_nothing_else():
 def test_the_classical_half_is_as_listed(key):
     _paper, default, stack, _why = CLASSICAL[key]
     assert json.loads(default.strip("`")) == values(load_config("pool"))[key] == values(LearningConfig())[key]
-    assert json.loads(stack.strip("`")) == values(with_stack(load_config("pool"), "paper"))[key] == values(load_training("paper"))[key]
+    assert (
+        json.loads(stack.strip("`"))
+        == values(with_stack(load_config("pool"), "paper"))[key]
+        == values(load_training("paper"))[key]
+    )
 
 
 @pytest.mark.parametrize("key", LEARNING)
 def test_learning_is_as_listed(key):
     _paper, default, curriculum, paper, _why = LEARNING[key]
     told = [json.loads(cell.strip("`")) for cell in (default, curriculum, paper)]
-    assert told == [values(config)[key] for config in (LearningConfig(), load_training("curriculum"), load_training("paper"))]
+    assert told == [
+        values(config)[key]
+        for config in (LearningConfig(), load_training("curriculum"), load_training("paper"))
+    ]
 
 
 def test_the_papers_own_numbers_are_the_presets():
     """Table app_repro, where it gives one: vehicle, tank, safety, sensing and planner map."""
     c = load_training("paper")
     v, e, sonar, camera = c.vehicle, c.episode, c.sensors.sonar, c.sensors.depth
-    assert (v.gravity_m_s2, v.water_density_kg_m3, v.volume_m3, v.buoyancy_height_m) == (9.81, 997.0, 0.0113459, 0.01)
-    assert v.added_mass == (5.5, 12.7, 14.57, 0.12, 0.12, 0.12) and v.linear_damping == (4.03, 6.22, 5.18, 0.07, 0.07, 0.07)
+    assert (v.gravity_m_s2, v.water_density_kg_m3, v.volume_m3, v.buoyancy_height_m) == (
+        9.81,
+        997.0,
+        0.0113459,
+        0.01,
+    )
+    assert v.added_mass == (5.5, 12.7, 14.57, 0.12, 0.12, 0.12) and v.linear_damping == (
+        4.03,
+        6.22,
+        5.18,
+        0.07,
+        0.07,
+        0.07,
+    )
     assert v.quadratic_damping == (18.18, 21.66, 36.99, 1.55, 1.55, 1.55)
     assert (v.rotor_tau_s, v.rotor_max_rpm, v.thrust_scale, len(v.thrusters)) == (0.01, 3900.0, 1.0, 6)
     assert (e.control_dt_s, e.substeps, e.horizon_steps) == (0.02, 2, 3000)
     assert (e.goal_radius_m, e.collision_clearance_m, e.ttc_s) == (1.0, 0.1, 0.18)
     assert (sonar.n_ray, sonar.max_range_m) == (256, 12.0)
     assert (camera.cols, camera.rows, camera.fov_deg, camera.max_range_m) == (128, 72, 90.0, 10.0)
-    assert (c.clearance.inflate_m, c.route.rrt_clearance_m, c.mapping.stamp, c.tracking.horizon_s) == (0.08, 0.1, 0.0, 2.5)
+    assert (c.clearance.inflate_m, c.route.rrt_clearance_m, c.mapping.stamp, c.tracking.horizon_s) == (
+        0.08,
+        0.1,
+        0.0,
+        2.5,
+    )
     assert (c.disturbance, c.sensors.localization) == (LearningConfig().disturbance, "truth")

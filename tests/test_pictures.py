@@ -209,7 +209,12 @@ def test_video_is_a_readable_webm(folder, bt, capfd):
         drawn = artist.frame(time_s)
         assert frames[index].shape == drawn.shape and drawn.shape[1] == 1280
         assert np.abs(frames[index].astype(int) - drawn.astype(int)).mean() < 6
-    goal = map_canvas(episode.scenario()["tank"], 1280, (52, 28, 84, 212)).pixels([episode.GOAL])[0].round().astype(int)
+    goal = (
+        map_canvas(episode.scenario()["tank"], 1280, (52, 28, 84, 212))
+        .pixels([episode.GOAL])[0]
+        .round()
+        .astype(int)
+    )
     assert has(around(frames[-1], goal, 3), ink.GOAL, CODEC_ERROR)
 
 
@@ -226,10 +231,14 @@ def test_a_frame_shows_the_moment(bt):
         assert has(around(frame, rim, 2), ink.DYNAMIC, 30)
     early, late = artist.frame(0.0).astype(int), artist.frame(2.2).astype(int)
     assert np.abs(early - late).max() > 100
-    assert (artist.frame(0.3) == FrameArtist(recording).frame(0.3)).all()  # independent of what was drawn before
+    assert (
+        artist.frame(0.3) == FrameArtist(recording).frame(0.3)
+    ).all()  # independent of what was drawn before
 
 
-@pytest.mark.parametrize(("draw", "name"), [(picture, "out.png"), (picture, "out.svg"), (video, "out.webm"), (video, "out.gif")])
+@pytest.mark.parametrize(
+    ("draw", "name"), [(picture, "out.png"), (picture, "out.svg"), (video, "out.webm"), (video, "out.gif")]
+)
 def test_missing_files_and_bad_places(folder, bt, tmp_path, draw, name):
     with pytest.raises(LogError, match="cannot open"):
         draw(tmp_path / "nowhere.mcap", tmp_path / name)

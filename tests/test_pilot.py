@@ -1,4 +1,5 @@
-"""A policy at the wheel: the same decisions in any batch, memory per row, and checkpoints that do not fit are refused."""
+"""A policy at the wheel: the same decisions in any batch, memory per row, and checkpoints that do not fit are
+refused."""
 
 import itertools
 import json
@@ -25,7 +26,10 @@ def networks(n_obs=N_OBS, seed=0, **config):
     """A policy and a world model that have seen a batch and act decidedly."""
     learning = load_training("smoke", [(f"policy.{key}", value) for key, value in config.items()])
     rng = torch.Generator().manual_seed(seed)
-    policy, model = ActorCritic(n_obs + 2, learning.policy, None, rng), WorldModel(n_obs, learning.world_model, rng)
+    policy, model = (
+        ActorCritic(n_obs + 2, learning.policy, None, rng),
+        WorldModel(n_obs, learning.world_model, rng),
+    )
     policy.observation_norm.update(3.0 * torch.randn(500, n_obs + 2, generator=rng))
     model.observation_norm.update(3.0 * torch.randn(500, n_obs, generator=rng))
     model.change_norm.update(torch.randn(500, 24, generator=rng))
@@ -46,7 +50,12 @@ def head(n_obs=N_OBS, seed=5):
 
 def state_of(policy, model, n_obs):
     """What a checkpoint holds of them."""
-    return {"policy": policy.state_dict(), "world_model": model.state_dict(), "risk": head(n_obs).state_dict(), "env": {}}
+    return {
+        "policy": policy.state_dict(),
+        "world_model": model.state_dict(),
+        "risk": head(n_obs).state_dict(),
+        "env": {},
+    }
 
 
 def flown(policy, model, rows, steps=4):
@@ -72,7 +81,9 @@ def test_a_row_does_not_depend_on_its_batch_to_the_last_bit(threads):
         for rows in ([0], [7, 3], list(range(CHUNK, CHUNK + 50)), list(range(299, 0, -1))):
             found = flown(policy, model, rows)
             assert torch.equal(found[:, :, :7], expected[:, rows, :7])
-            assert torch.allclose(found[:, :, 7], expected[:, rows, 7], atol=1e-5), "only told, nothing depends on it"
+            assert torch.allclose(found[:, :, 7], expected[:, rows, 7], atol=1e-5), (
+                "only told, nothing depends on it"
+            )
     finally:
         torch.set_num_threads(before)
     assert expected[:, :, :4].std() > 0.1, "the actions do depend on the observations"
@@ -96,7 +107,8 @@ def test_memory_is_reset_by_row_and_deciding_again_changes_nothing():
 
 
 def test_what_it_thinks_of_the_world_model_is_about_its_own_last_action():
-    """Residual and uncertainty are those of the prediction from the last observation and the action chosen there."""
+    """Residual and uncertainty are those of the prediction from the last observation and the action chosen
+    there."""
     policy, model = networks()
     with torch.no_grad():
         model.decoder[-1].weight.mul_(100.0)  # or an untrained prediction would hardly depend on the action
@@ -124,10 +136,12 @@ def test_actions_are_means_within_the_limits_and_nan_does_not_spread():
     assert torch.isfinite(found).all()
     assert (found.abs() <= 1).all()
     x = torch.cat([obs[:1], torch.zeros(1, 2)], 1)
-    assert torch.allclose(found[0], policy.distribution(x)[0][0].clamp(-1, 1), atol=1e-5)  # other shapes sum in another order
+    assert torch.allclose(
+        found[0], policy.distribution(x)[0][0].clamp(-1, 1), atol=1e-5
+    )  # other shapes sum in another order
 
 
-# ------------------------------------------------------------------------------------------------------------ in a simulator
+# --------------------------------------------------------------------------------------------- in a simulator
 
 
 @pytest.fixture(scope="module")
@@ -140,7 +154,9 @@ def trained(small, tmp_path_factory):
     with torch.no_grad():
         policy.actor[-1].bias[2] = 3.0  # down or up until something stops it: short episodes
     state = state_of(policy, model, env.num_obs)
-    checkpoint.save(folder / "checkpoints", 5, state, config, env.observation_table, metrics={"distill/lambda": 0.25})
+    checkpoint.save(
+        folder / "checkpoints", 5, state, config, env.observation_table, metrics={"distill/lambda": 0.25}
+    )
     return folder, config
 
 
@@ -182,13 +198,17 @@ def test_the_log_tells_what_the_policy_thought(small, trained, tmp_path):
     assert thoughts[0]["wm_residual"] == 0.0
     assert all(t["wm_residual"] > 0 and t["wm_uncertainty"] > 0 for t in thoughts[1:])
     assert {"alive", "progress", "success"} <= set(thoughts[0])
-    assert all(b["applied"] == a["policy"] for a, b in itertools.pairwise(actions)), "what it chose is what was done next"
+    assert all(b["applied"] == a["policy"] for a, b in itertools.pairwise(actions)), (
+        "what it chose is what was done next"
+    )
     assert any(a["policy"] != a["teacher"] for a in actions)
 
 
 def test_another_observation_is_refused_before_driving(small, trained):
     method, _ = pilot_of(trained[0], small)
-    changed = method.checkpoint.manifest.model_copy(update={"observation_table": method.checkpoint.manifest.observation_table[:-1]})
+    changed = method.checkpoint.manifest.model_copy(
+        update={"observation_table": method.checkpoint.manifest.observation_table[:-1]}
+    )
     other = checkpoint.Checkpoint(method.checkpoint.path, changed, method.checkpoint.config, "")
     with pytest.raises(CheckpointError, match="another observation table"):
         Method("other", method.tree, other).driver_for(small.sim)
@@ -201,8 +221,14 @@ def test_another_observation_is_refused_before_driving(small, trained):
         (lambda state: state.pop("risk"), "its networks are not those of its config"),
         (lambda state: state["risk"].update(table=torch.full((241,), float("nan"))), "table is not finite"),
         (lambda state: state["policy"].pop("log_std"), "its networks are not those of its config"),
-        (lambda state: state["policy"].update(log_std=torch.zeros(3)), "its networks are not those of its config"),
-        (lambda state: state["policy"].update(log_std=torch.full((4,), float("nan"))), "log_std is not finite"),
+        (
+            lambda state: state["policy"].update(log_std=torch.zeros(3)),
+            "its networks are not those of its config",
+        ),
+        (
+            lambda state: state["policy"].update(log_std=torch.full((4,), float("nan"))),
+            "log_std is not finite",
+        ),
     ],
 )
 def test_networks_that_cannot_drive_are_refused(small, trained, tmp_path, change, says):
@@ -215,13 +241,17 @@ def test_networks_that_cannot_drive_are_refused(small, trained, tmp_path, change
         load_pilot(checkpoint.open_checkpoint(path), 4)
 
 
-# -------------------------------------------------------------------------------------------------------------------- names
+# ------------------------------------------------------------------------------------------------------ names
 
 
 def test_a_policy_is_found_by_run_and_by_checkpoint(trained):
     folder, config = trained
     by_run, by_step = find_policy(str(folder)), find_policy(str(folder / "checkpoints" / "step_000005"))
-    assert by_run.sha256 == by_step.sha256 == manifest.sha256_of(folder / "checkpoints" / "step_000005" / "manifest.json")
+    assert (
+        by_run.sha256
+        == by_step.sha256
+        == manifest.sha256_of(folder / "checkpoints" / "step_000005" / "manifest.json")
+    )
     assert policies_of([str(folder / "checkpoints" / "step_000005")], 64, print)[0].name == "mine-step_000005"
     assert features_of([str(folder)]) == [("features", config.features.model_dump(mode="json"))]
 

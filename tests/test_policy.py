@@ -1,4 +1,5 @@
-"""Policy: densities against torch.distributions, the teacher at birth, values that statistics do not change, and no hidden state."""
+"""Policy: densities against torch.distributions, the teacher at birth, values that statistics do not change,
+and no hidden state."""
 
 import math
 
@@ -17,7 +18,9 @@ FLOAT32 = 1e-5
 
 
 def make(seed=0, teacher_slice=None, **config):
-    return ActorCritic(N_IN, PolicyConfig(hidden=(16, 16), **config), teacher_slice, torch.Generator().manual_seed(seed))
+    return ActorCritic(
+        N_IN, PolicyConfig(hidden=(16, 16), **config), teacher_slice, torch.Generator().manual_seed(seed)
+    )
 
 
 @pytest.fixture
@@ -44,7 +47,9 @@ def test_a_step_is_a_draw_from_the_distribution(x):
     assert not any(tensor.requires_grad for tensor in step)
     many = policy.act(x[:1].expand(40_000, -1), torch.Generator().manual_seed(3))
     spread = many.action - many.mean
-    assert torch.allclose(spread.std(0), torch.full((4,), 0.6), rtol=0.02)  # 0.35 % is one standard error of 40,000
+    assert torch.allclose(
+        spread.std(0), torch.full((4,), 0.6), rtol=0.02
+    )  # 0.35 % is one standard error of 40,000
     assert float(spread.mean(0).abs().max()) < 0.015  # five standard errors
     again = policy.act(x, torch.Generator().manual_seed(9))
     assert all(torch.equal(a, b) for a, b in zip(step, again, strict=True))
@@ -95,7 +100,9 @@ def test_learning_returns_changes_the_statistics_but_no_value(x):
     before = policy.value(x)
     for returns in (torch.linspace(-50.0, 300.0, 40)[:, None], torch.linspace(900.0, 1000.0, 400)[:, None]):
         policy.learn_returns(moments_of(returns))
-        assert torch.allclose(policy.value(x), before, rtol=1e-4, atol=1e-3)  # in parts of returns of 1000 in float32
+        assert torch.allclose(
+            policy.value(x), before, rtol=1e-4, atol=1e-3
+        )  # in parts of returns of 1000 in float32
     assert float(policy.value_norm.mean) > 800
     normalised = policy.critic(policy.observation_norm(x)).squeeze(-1)
     assert torch.allclose(policy.value_norm(before), normalised, atol=1e-4)
@@ -115,7 +122,10 @@ def test_everything_random_comes_from_the_generator(x):
     policy, same, other = make(seed=4), make(seed=4), make(seed=5)
     policy.act(x, torch.Generator().manual_seed(0))
     assert torch.equal(torch.get_rng_state(), state)
-    assert all(torch.equal(a, b) for a, b in zip(policy.state_dict().values(), same.state_dict().values(), strict=True))
+    assert all(
+        torch.equal(a, b)
+        for a, b in zip(policy.state_dict().values(), same.state_dict().values(), strict=True)
+    )
     assert not torch.equal(policy.actor[0].weight, other.actor[0].weight)
 
 
@@ -133,7 +143,9 @@ def test_networks_have_the_widths_and_activations_asked_for(activation):
     net = mlp((5, 8, 3, 2), activation, torch.Generator().manual_seed(0), out_gain=0.5)
     linears = [layer for layer in net if isinstance(layer, nn.Linear)]
     assert [tuple(layer.weight.shape) for layer in linears] == [(8, 5), (3, 8), (2, 3)]
-    assert [type(layer).__name__.lower() for layer in net if not isinstance(layer, nn.Linear)] == [activation] * 2
+    assert [type(layer).__name__.lower() for layer in net if not isinstance(layer, nn.Linear)] == [
+        activation
+    ] * 2
     first, last = linears[0].weight, linears[-1].weight
     assert torch.allclose(first.T @ first, 2.0 * torch.eye(5), atol=FLOAT32)
     assert torch.allclose(last @ last.T, 0.25 * torch.eye(2), atol=FLOAT32)

@@ -21,13 +21,15 @@ def column(*values):
     return torch.tensor(values)[:, None]
 
 
-# -------------------------------------------------------------------------------------------------------------- advantages
+# ------------------------------------------------------------------------------------------------- advantages
 
 
 def test_gae_of_an_episode_that_goes_on():
     """gamma 0.5, lambda 0.5: deltas by hand, then A_t = delta_t + A_{t+1} / 4."""
     no = column(False, False, False)
-    advantage, returns = gae(column(1.0, 2.0, 3.0), column(2.0, 4.0, 8.0), column(4.0, 8.0, 6.0), no, no, 0.5, 0.5)
+    advantage, returns = gae(
+        column(1.0, 2.0, 3.0), column(2.0, 4.0, 8.0), column(4.0, 8.0, 6.0), no, no, 0.5, 0.5
+    )
     # deltas: 1 + 2 - 2 = 1; 2 + 4 - 4 = 2; 3 + 3 - 8 = -2
     assert advantage.flatten().tolist() == [1.0 + 0.25 * 1.5, 2.0 - 0.25 * 2.0, -2.0]
     assert returns.flatten().tolist() == [3.375, 5.5, 6.0]
@@ -53,7 +55,8 @@ def test_gae_with_several_endings_is_that_of_the_pieces():
     terminated[2] = False
     whole, _ = gae(reward, value, next_value, terminated, ended, 0.99, 0.95)
     pieces = [
-        gae(reward[a:b], value[a:b], next_value[a:b], terminated[a:b], ended[a:b], 0.99, 0.95)[0] for a, b in ((0, 3), (3, 7), (7, 9))
+        gae(reward[a:b], value[a:b], next_value[a:b], terminated[a:b], ended[a:b], 0.99, 0.95)[0]
+        for a, b in ((0, 3), (3, 7), (7, 9))
     ]
     assert torch.equal(whole, torch.cat(pieces))
 
@@ -64,12 +67,18 @@ def test_gae_with_lambda_one_is_the_discounted_return():
     assert returns.flatten().tolist() == [1 + 1 + 1 + 1, 2 + 2 + 2, 4 + 4]
 
 
-# ------------------------------------------------------------------------------------------------------------------ losses
+# ----------------------------------------------------------------------------------------------------- losses
 
 
 @pytest.mark.parametrize(
     ("ratio", "advantage", "loss", "slope"),
-    [(1.0, 2.0, -2.0, -2.0), (1.5, 2.0, -2.4, 0.0), (0.5, 2.0, -1.0, -1.0), (1.5, -2.0, 3.0, 3.0), (0.5, -2.0, 1.6, 0.0)],
+    [
+        (1.0, 2.0, -2.0, -2.0),
+        (1.5, 2.0, -2.4, 0.0),
+        (0.5, 2.0, -1.0, -1.0),
+        (1.5, -2.0, 3.0, 3.0),
+        (0.5, -2.0, 1.6, 0.0),
+    ],
 )
 def test_the_surrogate_is_clipped_where_it_would_gain(ratio, advantage, loss, slope):
     log_ratio = torch.tensor([math.log(ratio)], requires_grad=True)
@@ -80,7 +89,11 @@ def test_the_surrogate_is_clipped_where_it_would_gain(ratio, advantage, loss, sl
 
 
 def test_value_errors_by_hand():
-    value, target, old = torch.tensor([1.0, 3.0, 3.0]), torch.tensor([2.0, 2.0, 4.0]), torch.tensor([1.0, 1.0, 1.0])
+    value, target, old = (
+        torch.tensor([1.0, 3.0, 3.0]),
+        torch.tensor([2.0, 2.0, 4.0]),
+        torch.tensor([1.0, 1.0, 1.0]),
+    )
     assert value_loss(value, target).tolist() == [1.0, 1.0, 1.0]
     # clipped to 1 +- 0.5: 1, 1.5, 1.5, whose errors are 1, 0.25, 6.25
     assert value_loss(value, target, old, 0.5).tolist() == [1.0, 1.0, 6.25]
@@ -94,7 +107,9 @@ def test_the_divergence_is_that_of_two_gaussians():
     sample = approximate_kl(log_prob(action, new, new_log_std) - log_prob(action, old, log_std))
     pair = torch.distributions.Normal(old, log_std.exp()), torch.distributions.Normal(new, new_log_std.exp())
     assert float(sample.min()) >= 0
-    assert float(sample.mean()) == pytest.approx(float(torch.distributions.kl_divergence(*pair).sum()), rel=0.01)
+    assert float(sample.mean()) == pytest.approx(
+        float(torch.distributions.kl_divergence(*pair).sum()), rel=0.01
+    )
 
 
 def test_the_rate_follows_the_divergence():
@@ -105,15 +120,22 @@ def test_the_rate_follows_the_divergence():
     assert float(adapted_rate(torch.tensor(1e-2), torch.tensor(0.0), 0.01)) == pytest.approx(1e-2)
 
 
-# ----------------------------------------------------------------------------------------------------------------- rollout
+# ---------------------------------------------------------------------------------------------------- rollout
 
 
 def make_policy(seed=0, **config):
-    return ActorCritic(N_IN, PolicyConfig(hidden=(16, 16), **config), None, torch.Generator().manual_seed(seed))
+    return ActorCritic(
+        N_IN, PolicyConfig(hidden=(16, 16), **config), None, torch.Generator().manual_seed(seed)
+    )
 
 
 def make_ppo(seed=0, reduce=None, gather=None, **config):
-    return Ppo(make_policy(seed), PpoConfig(**{"rollout_steps": T, "epochs": 2, "minibatches": 4, **config}), reduce, gather)
+    return Ppo(
+        make_policy(seed),
+        PpoConfig(**{"rollout_steps": T, "epochs": 2, "minibatches": 4, **config}),
+        reduce,
+        gather,
+    )
 
 
 def fill(rollout, policy, seed=0):
@@ -126,7 +148,15 @@ def fill(rollout, policy, seed=0):
         terminated = ended & (torch.rand(rollout.num_envs, generator=generator) < 0.5)
         step = policy.act(x, generator)
         reward = -step.action.square().sum(-1) + x[:, 0]
-        rollout.add(x, step, reward, terminated, ended, final_value(policy, x + 1, terminated, ended), torch.zeros_like(step.action))
+        rollout.add(
+            x,
+            step,
+            reward,
+            terminated,
+            ended,
+            final_value(policy, x + 1, terminated, ended),
+            torch.zeros_like(step.action),
+        )
     rollout.close(policy.value(torch.randn(rollout.num_envs, N_IN, generator=generator)).detach())
     return rollout
 
@@ -144,10 +174,26 @@ def test_next_values_are_those_of_the_true_next_observation():
     for t in range(2):
         final = final_value(policy, x[3], terminated, ended)
         assert final.tolist() == pytest.approx([0.0, policy.value(x[3])[1].item(), 0.0], abs=FLOAT32)
-        rollout.add(x[t], policy.act(x[t], generator), torch.zeros(3), terminated, ended, final, torch.zeros(3, 4), weight=torch.ones(3))
+        rollout.add(
+            x[t],
+            policy.act(x[t], generator),
+            torch.zeros(3),
+            terminated,
+            ended,
+            final,
+            torch.zeros(3, 4),
+            weight=torch.ones(3),
+        )
     rollout.close(policy.value(x[2]).detach())
     with torch.no_grad():
-        expected = [policy.value(x[1])[0], policy.value(x[3])[1], 0.0, policy.value(x[2])[0], policy.value(x[3])[1], 0.0]
+        expected = [
+            policy.value(x[1])[0],
+            policy.value(x[3])[1],
+            0.0,
+            policy.value(x[2])[0],
+            policy.value(x[3])[1],
+            0.0,
+        ]
     assert rollout.flat("next_value").tolist() == pytest.approx([float(v) for v in expected], abs=FLOAT32)
     assert rollout.leaf.unique().tolist() == [-1]
 
@@ -169,7 +215,7 @@ def test_flat_views_share_memory_and_run_along_the_envs_first():
     assert torch.equal(rollout.flat("x")[N + 2], rollout.x[1, 2])
 
 
-# ------------------------------------------------------------------------------------------------------------------ update
+# ----------------------------------------------------------------------------------------------------- update
 
 
 @pytest.mark.parametrize("minibatches", [1, 4, 5, T * N])
@@ -190,7 +236,8 @@ def test_minibatches_cover_every_sample_once(minibatches, shuffle):
 
 
 def test_the_update_takes_the_step_of_the_losses_written_out(monkeypatch):
-    """One epoch of one minibatch, in passes of 7 rows, against the textbook formulas on the whole of it and torch's own Adam."""
+    """One epoch of one minibatch, in passes of 7 rows, against the textbook formulas on the whole of it and
+    torch's own Adam."""
     monkeypatch.setattr(ppo_module, "CACHE_ROWS", 7)
     ppo = make_ppo(epochs=1, minibatches=1, entropy_weight=0.01, normalise_values=False)
     reference = make_policy()
@@ -206,7 +253,10 @@ def test_the_update_takes_the_step_of_the_losses_written_out(monkeypatch):
     x = rollout.flat("x")
     optimiser = torch.optim.Adam(reference.parameters(), lr=3e-4, eps=ppo_module.ADAM_EPS)
     mean, log_std = reference.distribution(x)
-    ratio = (torch.distributions.Normal(mean, log_std.exp()).log_prob(rollout.flat("action")).sum(-1) - rollout.flat("log_prob")).exp()
+    ratio = (
+        torch.distributions.Normal(mean, log_std.exp()).log_prob(rollout.flat("action")).sum(-1)
+        - rollout.flat("log_prob")
+    ).exp()
     policy_loss = -torch.minimum(ratio * advantage, ratio.clamp(0.8, 1.2) * advantage).mean()
     value_error = (reference.value(x) - target.flatten()).square().mean()
     distill = (rollout.flat("weight") * (mean - rollout.flat("teacher_action")).square().sum(-1)).mean()
@@ -214,12 +264,15 @@ def test_the_update_takes_the_step_of_the_losses_written_out(monkeypatch):
     (policy_loss + 1.5 * value_error - 0.01 * spread + 0.3 * distill).backward()
     torch.nn.utils.clip_grad_norm_(reference.parameters(), 1.0)
     optimiser.step()
-    # where a gradient is near zero, Adam's first step of 3e-4 has the sign of its rounding; a thousandth of it bounds the rest
+    # where a gradient is near zero, Adam's first step of 3e-4 has the sign of its rounding; a thousandth of
+    # it bounds the rest
     assert torch.allclose(weights(ppo.policy), weights(reference), atol=3e-7)
     assert metrics["train/policy_loss"] == pytest.approx(policy_loss.item(), abs=FLOAT32)
     assert metrics["train/value_loss"] == pytest.approx(value_error.item(), rel=FLOAT32)
     assert metrics["train/distill_loss"] == pytest.approx(distill.item(), rel=FLOAT32)
-    assert metrics["train/approx_kl"] == pytest.approx(0.0, abs=FLOAT32)  # the ratio of the first minibatch is one
+    assert metrics["train/approx_kl"] == pytest.approx(
+        0.0, abs=FLOAT32
+    )  # the ratio of the first minibatch is one
     assert metrics["train/clip_fraction"] == 0.0
 
 
@@ -228,8 +281,10 @@ def test_metrics_have_their_names_and_statistics_follow_the_rollout():
     rollout = fill(Rollout(T, N, N_IN), ppo.policy)
     metrics = ppo.update(rollout)
     assert set(metrics) == {
-        "train/policy_loss", "train/value_loss", "train/entropy", "train/approx_kl", "train/clip_fraction", "train/explained_variance",
-        "train/learning_rate", "train/std", "train/skipped_updates", "train/invalid_samples", "train/distill_loss",
+        "train/policy_loss", "train/value_loss", "train/entropy", "train/approx_kl", "train/clip_fraction",
+        "train/explained_variance",
+        "train/learning_rate", "train/std", "train/skipped_updates", "train/invalid_samples",
+        "train/distill_loss",
     }  # fmt: skip
     assert all(math.isfinite(value) for value in metrics.values())
     assert ppo.updates == 8
@@ -239,7 +294,8 @@ def test_metrics_have_their_names_and_statistics_follow_the_rollout():
 
 
 def test_values_keep_their_meaning_while_their_statistics_move():
-    """Pop-Art: an update that hardly steps leaves every value where it was, however far off the returns are."""
+    """Pop-Art: an update that hardly steps leaves every value where it was, however far off the returns
+    are."""
     ppo = make_ppo(learning_rate=1e-12, epochs=1, minibatches=1, normalise_observations=False)
     rollout = fill(Rollout(T, N, N_IN), ppo.policy)
     for reward in (0.0, 50.0):
@@ -318,10 +374,12 @@ def test_a_saved_state_is_a_copy_of_the_rate():
     assert float(state["learning_rate"]) == pytest.approx(3e-4)
 
 
-# ------------------------------------------------------------------------------------------------------------------ guards
+# ----------------------------------------------------------------------------------------------------- guards
 
 
-@pytest.mark.parametrize("name", ["x", "reward", "action", "teacher_action", "log_prob", "value", "next_value", "weight"])
+@pytest.mark.parametrize(
+    "name", ["x", "reward", "action", "teacher_action", "log_prob", "value", "next_value", "weight"]
+)
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_samples_that_are_not_finite_have_no_part_and_are_counted(name, bad):
     ppo = make_ppo()
@@ -338,7 +396,9 @@ def test_samples_that_are_not_finite_have_no_part_and_are_counted(name, bad):
 def test_a_bad_reward_changes_nothing_but_its_own_episode():
     ppo = make_ppo()
     rollout = fill(Rollout(T, N, N_IN), ppo.policy)
-    clean = gae(rollout.reward, rollout.value, rollout.next_value, rollout.terminated, rollout.ended, 0.99, 0.95)[1]
+    clean = gae(
+        rollout.reward, rollout.value, rollout.next_value, rollout.terminated, rollout.ended, 0.99, 0.95
+    )[1]
     rollout.reward[3, 2] = math.nan
     ppo.policy.value_norm.count.zero_()
     ppo.config = ppo.config.model_copy(update={"normalise_values": False})
@@ -371,7 +431,9 @@ def test_a_gradient_that_is_not_finite_is_skipped_and_counted():
     assert metrics["train/skipped_updates"] == 2
     assert (ppo.updates, ppo.skipped) == (2, 2)
     assert torch.isfinite(weights(ppo.policy)).all()
-    assert all(torch.isfinite(value).all() for state in ppo.optimiser.state.values() for value in state.values())
+    assert all(
+        torch.isfinite(value).all() for state in ppo.optimiser.state.values() for value in state.values()
+    )
 
 
 def test_a_loss_that_is_not_finite_changes_nothing():
@@ -392,12 +454,15 @@ def test_what_cannot_be_learned_from_is_refused():
         make_ppo(shuffle=True).update(rollout)
 
 
-# --------------------------------------------------------------------------------------------------------- several processes
+# ------------------------------------------------------------------------------------------ several processes
 
 
 def test_every_gradient_and_the_divergence_pass_through_the_hook():
     seen = []
-    plain, hooked = make_ppo(), make_ppo(reduce=lambda tensors: seen.append([t.shape for t in tensors]), gather=lambda own: own)
+    plain, hooked = (
+        make_ppo(),
+        make_ppo(reduce=lambda tensors: seen.append([t.shape for t in tensors]), gather=lambda own: own),
+    )
     for ppo in (plain, hooked):
         ppo.update(fill(Rollout(T, N, N_IN), ppo.policy))
     assert torch.equal(weights(plain.policy), weights(hooked.policy))
@@ -406,7 +471,8 @@ def test_every_gradient_and_the_divergence_pass_through_the_hook():
 
 
 def test_the_hook_decides_what_is_stepped_along():
-    """Gradients are averaged before their norm is cut: a hook that zeroes them leaves the weights as they are."""
+    """Gradients are averaged before their norm is cut: a hook that zeroes them leaves the weights as they
+    are."""
     ppo = make_ppo(reduce=lambda tensors: [t.zero_() for t in tensors], normalise_values=False)
     before = weights(ppo.policy)
     ppo.update(fill(Rollout(T, N, N_IN), ppo.policy))
@@ -424,11 +490,12 @@ def test_statistics_are_those_of_all_processes():
     assert float(ppo.policy.value_norm.count) == 2 * T * N
 
 
-# -------------------------------------------------------------------------------------------------------------------- a task
+# ----------------------------------------------------------------------------------------------------- a task
 
 
 class PointTask:
-    """A point in the plane of four axes: the action moves it, the reward is minus its distance from the origin, episodes end by time."""
+    """A point in the plane of four axes: the action moves it, the reward is minus its distance from the
+    origin, episodes end by time."""
 
     n, length, speed = 64, 16, 0.25
 
@@ -460,7 +527,15 @@ def play(policy, ppo, task, generator, rollouts):
             x = task.place
             step = policy.act(x, generator)
             final, reward, ended = task.step(step.action)
-            rollout.add(x, step, reward, never, ended, final_value(policy, final, never, ended), torch.zeros(task.n, 4))
+            rollout.add(
+                x,
+                step,
+                reward,
+                never,
+                ended,
+                final_value(policy, final, never, ended),
+                torch.zeros(task.n, 4),
+            )
         rollout.close(policy.value(task.place).detach())
         means.append(float(rollout.reward.mean()))
         if ppo is not None:
@@ -474,7 +549,9 @@ def test_a_point_learns_to_go_home():
     def train():
         generator = torch.Generator().manual_seed(3)
         policy = ActorCritic(4, PolicyConfig(hidden=(32, 32), initial_std=0.5), None, generator)
-        ppo = Ppo(policy, PpoConfig(rollout_steps=32, learning_rate=3e-3, epochs=4, gamma=0.9, entropy_weight=0.0))
+        ppo = Ppo(
+            policy, PpoConfig(rollout_steps=32, learning_rate=3e-3, epochs=4, gamma=0.9, entropy_weight=0.0)
+        )
         return play(policy, ppo, PointTask(generator), generator, 25), weights(policy)
 
     means, trained = train()

@@ -1,4 +1,5 @@
-"""What is told of the time: no compiling in it, no recording, and no guess of what is left before it is worth one."""
+"""What is told of the time: no compiling in it, no recording, and no guess of what is left before it is worth
+one."""
 
 import numpy as np
 import pytest
@@ -61,7 +62,9 @@ def test_steps_of_real_episodes_are_counted_without_what_watches_them(small):
     watched, steps = run_episodes(small.sim, jobs, Dawdler(), lambda *a: told.append(a), clock=clock)
     plain, again = run_episodes(small.sim, jobs)
     small.sim.use_tree(small.trees["bt"])
-    assert steps == again and [(r.outcome, r.time_s) for r in watched] == [(r.outcome, r.time_s) for r in plain]
+    assert steps == again and [(r.outcome, r.time_s) for r in watched] == [
+        (r.outcome, r.time_s) for r in plain
+    ]
     assert clock.seconds == 0.0 and 0 < clock.env_steps < steps
     assert told[0] == (0, 10, 0, None) and told[1][0] == 0 and told[1][2] == small.N
     assert told[-1][0] == 10 and told[-1][3] == 0
@@ -142,7 +145,9 @@ def test_the_first_iteration_of_a_training_has_no_speed():
     metrics = samples.metrics(1)[0]
     assert "900" not in training_rows(metrics, None, None, True)["env-steps/s"]
     rows = training_rows(metrics, (0.1, 0.3), 150.0, False)
-    assert rows["env-steps/s"].startswith("900 (") and rows["ETA"] == "2 min" and "[10, 30]" in rows["success"]
+    assert (
+        rows["env-steps/s"].startswith("900 (") and rows["ETA"] == "2 min" and "[10, 30]" in rows["success"]
+    )
     assert "ETA" not in training_rows(metrics, None, None, False)
 
 

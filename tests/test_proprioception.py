@@ -11,7 +11,14 @@ from uuvtai.config import DvlConfig, EpisodeConfig, ImuConfig, PressureConfig, S
 from uuvtai.kernels.sensors import proprioception
 from uuvtai.kernels.sensors.bundles import ProprioceptionIO
 from uuvtai.loader import load_config
-from uuvtai.state import ClockState, EpisodeState, Proprioception, ProprioceptionMemory, VehicleState, allocate
+from uuvtai.state import (
+    ClockState,
+    EpisodeState,
+    Proprioception,
+    ProprioceptionMemory,
+    VehicleState,
+    allocate,
+)
 
 N_ENV = 2000
 SIZES = {"n_env": N_ENV, "n_thruster": 6}
@@ -22,7 +29,8 @@ ROUNDING = 2.0e-5
 """float32: angles and velocities of order one, forces of order 10 through a rotation matrix."""
 
 SIGMAS = 5.0
-"""Statistics over n draws may be off by this many standard errors; seeds are fixed, so a pass stays a pass."""
+"""Statistics over n draws may be off by this many standard errors; seeds are fixed, so a pass stays a
+pass."""
 
 READINGS = ("vel_b", "vel_valid", "rpy", "rate_b", "specific_force_b", "depth_m", "pos_w")
 
@@ -46,7 +54,13 @@ class Rig:
             field.from_numpy(np.broadcast_to(np.asarray(value, np.float32), (N_ENV, field.n)).copy())
 
     def start(self, sensors, key=1, **truth):
-        still = {"pos_w": (5, 3, -1), "quat_wb": (1, 0, 0, 0), "vel_b": (0, 0, 0), "rate_b": (0, 0, 0), "acc_b": (0, 0, 0)}
+        still = {
+            "pos_w": (5, 3, -1),
+            "quat_wb": (1, 0, 0, 0),
+            "vel_b": (0, 0, 0),
+            "rate_b": (0, 0, 0),
+            "acc_b": (0, 0, 0),
+        }
         self.move(**{**still, **truth})
         self.episode.key.from_numpy((np.arange(N_ENV) * 31 + key).astype(np.uint32))
         self.clock.awake.fill(1)
@@ -58,7 +72,17 @@ class Rig:
     def sense(self, sensors, step, names=READINGS):
         set_step(self.clock, step)
         proprioception.sense_proprioception(
-            io_for(ProprioceptionIO, self.ego, self.memory, self.vehicle, self.episode, self.clock, sensors, BODY, RULES)
+            io_for(
+                ProprioceptionIO,
+                self.ego,
+                self.memory,
+                self.vehicle,
+                self.episode,
+                self.clock,
+                sensors,
+                BODY,
+                RULES,
+            )
         )
         return {name: getattr(self.ego, name).to_numpy() for name in names}
 
@@ -115,7 +139,9 @@ def test_dvl_noise_scale_and_period(rig):
     assert_normal(scale - 1.0, 0.02)
     rig.move(vel_b=(10.0, 0.0, 0.0))
     fast = [rig.sense(sensors, step)["vel_b"][:, 0] / 10.0 for step in (10, 15)]
-    assert np.abs(np.mean(fast, axis=0) - scale).max() < 6 * 0.001, "the scale factor stays the same over an episode"
+    assert np.abs(np.mean(fast, axis=0) - scale).max() < 6 * 0.001, (
+        "the scale factor stays the same over an episode"
+    )
 
 
 def test_dvl_dropout_of_single_readings(rig):
@@ -131,7 +157,9 @@ def test_dvl_dropout_of_single_readings(rig):
             assert np.allclose(out["vel_b"][~lost[-1], 0], 0.01 * step)
             assert np.all(out["vel_b"][lost[-1], 0] < 0.01 * step - 0.04), "the last reading stays"
         else:
-            assert not lost or np.array_equal(out["vel_valid"] == 0, lost[-1]), "validity changes with readings only"
+            assert not lost or np.array_equal(out["vel_valid"] == 0, lost[-1]), (
+                "validity changes with readings only"
+            )
     share = np.mean(lost)
     assert abs(share - 0.017) < SIGMAS * np.sqrt(0.017 / np.size(lost))
 
@@ -221,9 +249,12 @@ def test_dead_reckoning_with_clean_sensors_is_the_integral_of_the_motion(rig):
 
 
 def test_dead_reckoning_coasts_without_the_bottom_and_takes_depth_from_pressure(rig):
-    """Bottom lost at step 1 and for ever: the estimate goes on with the velocity of step 0 along the heading of now."""
+    """Bottom lost at step 1 and for ever: the estimate goes on with the velocity of step 0 along the heading
+    of now."""
     sensors = SensorsConfig(
-        localization="dead_reckoning", dvl=DvlConfig(dropout=1.0, dropout_s=(10.0, 10.0)), pressure=PressureConfig(bias_m=0.5)
+        localization="dead_reckoning",
+        dvl=DvlConfig(dropout=1.0, dropout_s=(10.0, 10.0)),
+        pressure=PressureConfig(bias_m=0.5),
     )
     rig.start(sensors, vel_b=(0.5, 0, 0))
     rig.sense(sensors, 0)
@@ -237,7 +268,8 @@ def test_dead_reckoning_coasts_without_the_bottom_and_takes_depth_from_pressure(
 
 
 def test_dead_reckoning_zeroes_the_pressure_sensor_at_the_known_start(rig):
-    """Whatever the bias, depth begins at the start's and follows the truth; the first reading's noise is all that stays."""
+    """Whatever the bias, depth begins at the start's and follows the truth; the first reading's noise is all
+    that stays."""
     sensors = SensorsConfig(localization="dead_reckoning", pressure=PressureConfig(bias_m=0.5, sigma_m=0.02))
     z = np.array([-1.0, -0.9, -0.4, -1.5])
     rig.start(sensors)
@@ -258,7 +290,9 @@ def test_dead_reckoning_zeroes_the_pressure_sensor_at_the_known_start(rig):
     noise = np.stack(raw, 1) + z - bias[:, None]
     expected = [zeroed_depth(-1.0, z, b, n) for b, n in zip(bias, noise, strict=True)]
     assert np.abs(depth - expected).max() < ROUNDING
-    assert np.abs(np.stack(raw, 1)[:, 0] - 1.0).max() > 0.4, "where the position is given the reading stays as it is"
+    assert np.abs(np.stack(raw, 1)[:, 0] - 1.0).max() > 0.4, (
+        "where the position is given the reading stays as it is"
+    )
 
 
 def test_zeroing_changes_no_bit_of_a_perfect_pressure_sensor(rig):
@@ -272,8 +306,13 @@ def test_zeroing_changes_no_bit_of_a_perfect_pressure_sensor(rig):
 
 
 def test_dead_reckoning_error_grows_with_scale_error_and_drift(rig):
-    """5 s straight ahead at 0.5 m/s: along-track error = scale x distance, cross-track = drift x t x distance / 2."""
-    sensors = SensorsConfig(localization="dead_reckoning", dvl=DvlConfig(scale_error=0.01), imu=ImuConfig(heading_drift_rad_s=0.01))
+    """5 s straight ahead at 0.5 m/s: along-track error = scale x distance, cross-track = drift x t x distance
+    / 2."""
+    sensors = SensorsConfig(
+        localization="dead_reckoning",
+        dvl=DvlConfig(scale_error=0.01),
+        imu=ImuConfig(heading_drift_rad_s=0.01),
+    )
     rig.start(sensors, vel_b=(0.5, 0, 0))
     for step in range(251):
         out = rig.sense(sensors, step)
@@ -291,7 +330,9 @@ def test_rows_do_not_touch_each_other_and_sleepers_keep_everything(rig):
     def run(truth, keys):
         rig.start(sensors, **truth)
         rig.episode.key.from_numpy(keys)
-        proprioception.reset_proprioception(io_for(ProprioceptionIO, rig.ego, rig.memory, rig.vehicle, rig.episode, rig.clock, sensors))
+        proprioception.reset_proprioception(
+            io_for(ProprioceptionIO, rig.ego, rig.memory, rig.vehicle, rig.episode, rig.clock, sensors)
+        )
         for step in range(15):
             out = rig.sense(sensors, step)
         return out
@@ -302,7 +343,9 @@ def test_rows_do_not_touch_each_other_and_sleepers_keep_everything(rig):
     assert all(np.array_equal(first[name][order], permuted[name]) for name in READINGS)
     rig.clock.awake.from_numpy((np.arange(N_ENV) % 2).astype(np.int32))
     rig.move(vel_b=(3, 3, 3))
-    proprioception.reset_proprioception(io_for(ProprioceptionIO, rig.ego, rig.memory, rig.vehicle, rig.episode, rig.clock, sensors))
+    proprioception.reset_proprioception(
+        io_for(ProprioceptionIO, rig.ego, rig.memory, rig.vehicle, rig.episode, rig.clock, sensors)
+    )
     after = rig.sense(sensors, 20)
     assert all(np.array_equal(permuted[name][::2], after[name][::2]) for name in READINGS)
     assert not np.array_equal(permuted["rate_b"][1::2], after["rate_b"][1::2])

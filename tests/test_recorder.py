@@ -18,11 +18,17 @@ def record(run, done, iterations, factor=1.0):
 def test_every_iteration_is_a_line_and_an_event(tmp_path):
     record(tmp_path, 0, (1, 2, 3))
     lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
-    assert lines == [{"iteration": i, "rollout/ep_rew_mean": float(i), "train/policy_loss": -0.5} for i in (1, 2, 3)]
+    assert lines == [
+        {"iteration": i, "rollout/ep_rew_mean": float(i), "train/policy_loss": -0.5} for i in (1, 2, 3)
+    ]
     assert read_metrics(tmp_path) == lines
     events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
     assert sorted(events.Tags()["scalars"]) == ["rollout/ep_rew_mean", "train/policy_loss"]
-    assert [(e.step, e.value) for e in events.Scalars("rollout/ep_rew_mean")] == [(1, 1.0), (2, 2.0), (3, 3.0)]
+    assert [(e.step, e.value) for e in events.Scalars("rollout/ep_rew_mean")] == [
+        (1, 1.0),
+        (2, 2.0),
+        (3, 3.0),
+    ]
 
 
 def test_lines_are_readable_while_the_run_goes_on(tmp_path):
@@ -40,7 +46,13 @@ def test_a_resumed_run_forgets_what_came_after_its_checkpoint(tmp_path, cut_off)
     record(tmp_path, 2, (3, 4, 5), factor=10.0)
     assert [row["rollout/ep_rew_mean"] for row in read_metrics(tmp_path)] == [1.0, 2.0, 30.0, 40.0, 50.0]
     events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
-    assert [(e.step, e.value) for e in events.Scalars("rollout/ep_rew_mean")] == [(1, 1.0), (2, 2.0), (3, 30.0), (4, 40.0), (5, 50.0)]
+    assert [(e.step, e.value) for e in events.Scalars("rollout/ep_rew_mean")] == [
+        (1, 1.0),
+        (2, 2.0),
+        (3, 30.0),
+        (4, 40.0),
+        (5, 50.0),
+    ]
 
 
 def test_a_last_line_that_was_cut_off_is_lost_alone(tmp_path):

@@ -1,4 +1,5 @@
-"""The report: layout of heat maps, figures that follow the page's colours, and a page that says everything and trusts nothing."""
+"""The report: layout of heat maps, figures that follow the page's colours, and a page that says everything
+and trusts nothing."""
 
 import csv
 import hashlib
@@ -41,7 +42,7 @@ from uuvtai.run_folder import RunFolderError
 READABLE = 4.5
 """contrast of small text, WCAG 2.2 level AA"""
 
-# --------------------------------------------------------------------------------------------------- colours and layout
+# ----------------------------------------------------------------------------------------- colours and layout
 
 
 @given(st.floats(0, 1))
@@ -67,14 +68,24 @@ def test_the_papers_grid_has_a_row_for_every_s_and_d_and_no_speed_without_motion
     assert grid.row_names[:6] == ["4 · 0", "4 · 3", "4 · 6", "4 · 9", "4 · 15", "8 · 0"]
     assert grid.column_names == ["0.2", "0.4", "0.6", "0.8", "1.5", "3"]
     still = [place for place in grid.places if place.cell["D"] == 0]
-    assert [(place.row, place.first, place.n_columns) for place in still] == [(0, 0, 6), (5, 0, 6), (10, 0, 6)]
-    fast = next(place for place in grid.places if (place.cell["S"], place.cell["D"], place.cell["v_m_s"]) == (8, 6, 3.0))
+    assert [(place.row, place.first, place.n_columns) for place in still] == [
+        (0, 0, 6),
+        (5, 0, 6),
+        (10, 0, 6),
+    ]
+    fast = next(
+        place
+        for place in grid.places
+        if (place.cell["S"], place.cell["D"], place.cell["v_m_s"]) == (8, 6, 3.0)
+    )
     assert (fast.row, fast.first, fast.n_columns) == (7, 5, 1)
 
 
 def test_any_two_axes_make_a_heat_map():
     axes = {"world.current_m_s": [0.0, 0.2], "sensors": ["paper", "harsh"]}
-    cells = [{"world.current_m_s": c, "sensors": s, "episodes": 4} for c in (0.2, 0.0) for s in ("harsh", "paper")]
+    cells = [
+        {"world.current_m_s": c, "sensors": s, "episodes": 4} for c in (0.2, 0.0) for s in ("harsh", "paper")
+    ]
     grid = pivot(cells, axes)
     assert (grid.row_names, grid.column_names) == (["0", "0.2"], ["paper", "harsh"])
     turned = pivot(cells, axes, columns="world.current_m_s")
@@ -83,7 +94,11 @@ def test_any_two_axes_make_a_heat_map():
 
 def test_values_of_an_axis_may_be_lists():
     axes = {"disturbance.current_m_s": [[0.0, 0.1, 0.0], [0.0, 0.2, 0.0]], "D": [3, 6]}
-    cells = [{"disturbance.current_m_s": list(c), "D": d, "episodes": 4} for c in ((0.0, 0.2, 0.0), (0.0, 0.1, 0.0)) for d in (3, 6)]
+    cells = [
+        {"disturbance.current_m_s": list(c), "D": d, "episodes": 4}
+        for c in ((0.0, 0.2, 0.0), (0.0, 0.1, 0.0))
+        for d in (3, 6)
+    ]
     assert pivot(cells, axes).row_names == ["[0.0, 0.1, 0.0]", "[0.0, 0.2, 0.0]"]
 
 
@@ -115,32 +130,49 @@ def test_heat_maps_in_the_terminal_stand_side_by_side_and_are_read_without_colou
 
 def test_heat_maps_in_the_terminal_are_coloured_where_colours_are_shown():
     red, green, blue = (int(shade(6 / 16 / 6)[i : i + 2], 16) for i in (1, 3, 5))
-    assert f"48;2;{red};{green};{blue}m   6 % " in printed(samples.sweep_document(), 120, force_terminal=True, color_system="truecolor")
+    assert f"48;2;{red};{green};{blue}m   6 % " in printed(
+        samples.sweep_document(), 120, force_terminal=True, color_system="truecolor"
+    )
 
 
 def test_a_cell_without_episodes_is_a_dash():
     document = samples.sweep_document(axes={"S": [4], "D": [3], "v_m_s": [0.2, 0.4]})
-    document["cells"][0] |= {"success_rate": None, "collision_rate": None, "success_ci95": None, "time_to_success_mean_s": None}
+    document["cells"][0] |= {
+        "success_rate": None,
+        "collision_rate": None,
+        "success_ci95": None,
+        "time_to_success_mean_s": None,
+    }
     assert "-" in printed(document, 120)
     assert "0 %" in printed(document, 120)
     hover = drawn(heat_map(pivot(document["cells"], document["axes"]), "success_rate", "x"))[1]
-    assert hover["cell-0"] == "S = 4, D = 3, v m/s = 0.2\ncollision -\nmean time to success - s".replace("\ncollision -", "")
+    assert hover["cell-0"] == "S = 4, D = 3, v m/s = 0.2\ncollision -\nmean time to success - s".replace(
+        "\ncollision -", ""
+    )
 
 
 def test_nothing_draws_that_only_prints():
     heavy = ("matplotlib", "jinja2", "torch", "taichi")
-    code = f"import sys, uuvtai.report.terminal, uuvtai.report.build; print([m for m in {heavy} if m in sys.modules])"
+    code = (
+        f"import sys, uuvtai.report.terminal, uuvtai.report.build; print([m for m in {heavy} if m in "
+        "sys.modules])"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
 
-# -------------------------------------------------------------------------------------------------------------- figures
+# ---------------------------------------------------------------------------------------------------- figures
 
 
 def drawn(panel, prefix="f-"):
     """(root of the SVG, hover texts by id without the prefix)."""
     root = ElementTree.fromstring(ink.svg(panel, prefix, "what it shows"))
-    titles = {e.get("id").removeprefix(prefix): t.text for e in root.iter() for t in e if t.tag.endswith("}title") and e.get("id")}
+    titles = {
+        e.get("id").removeprefix(prefix): t.text
+        for e in root.iter()
+        for t in e
+        if t.tag.endswith("}title") and e.get("id")
+    }
     return root, titles
 
 
@@ -176,14 +208,17 @@ def test_every_cell_tells_its_count_and_interval_on_hover():
     assert len(hover) == len(document["cells"]) == 75
     corner = next(text for text in hover.values() if text.startswith("S = 12, D = 15, v m/s = 3\n"))
     assert corner.splitlines()[1:] == [
-        "success 1/16 = 6.2 % [1.1, 28.3]", "collision 7/16 = 43.8 % [23.1, 66.8]", "mean time to success 9.5 s",
+        "success 1/16 = 6.2 % [1.1, 28.3]", "collision 7/16 = 43.8 % [23.1, 66.8]", "mean time to success "
+                                                                                    "9.5 s",
     ]  # fmt: skip
     shown = [e.text for e in root.iter() if e.tag.endswith("}text")]
     assert {"6 %", "9.5 s", "100 %", "S · D", "v m/s"} <= set(shown)
 
 
 def test_names_are_drawn_as_they_are():
-    root, _ = drawn(curves([Line("$x^2$", [0, 1], [1, 2]), Line("</svg><script>", [0, 1], [1, 2])], "\\alpha & <b>", "x"))
+    root, _ = drawn(
+        curves([Line("$x^2$", [0, 1], [1, 2]), Line("</svg><script>", [0, 1], [1, 2])], "\\alpha & <b>", "x")
+    )
     texts = {e.text for e in root.iter() if e.tag.endswith("}text")}
     assert {"$x^2$", "</svg><script>", "\\alpha & <b>"} <= texts
 
@@ -193,13 +228,16 @@ def test_a_figure_on_disk_is_a_picture_with_both_panels():
 
     document = samples.sweep_document()
     grid = pivot(document["cells"], document["axes"])
-    one, two = (ink.png([heat_map(grid, key, "t") for key in keys]) for keys in (["success_rate"], ["collision_rate", "success_rate"]))
+    one, two = (
+        ink.png([heat_map(grid, key, "t") for key in keys])
+        for keys in (["success_rate"], ["collision_rate", "success_rate"])
+    )
     sizes = [cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR).shape for content in (one, two)]
     assert sizes[1][1] == pytest.approx(2 * sizes[0][1], abs=2)
     assert sizes[1][0] == sizes[0][0]
 
 
-# --------------------------------------------------------------------------------------------------------------- blocks
+# ----------------------------------------------------------------------------------------------------- blocks
 
 
 def tables(blocks):
@@ -213,21 +251,40 @@ def figures(blocks):
 def test_methods_are_shown_with_counts_intervals_and_both_times():
     blocks = evaluation(samples.evaluation_document())
     first = tables(blocks)[0]
-    assert first.rows[1] == ["bt", "6/8 = 75.0 % [40.9, 92.9]", "2/8 = 25.0 % [7.1, 59.1]", "2 / 0 / 0 / 0", "12.0", "16.0", "3.0", "0.30"]
+    assert first.rows[1] == [
+        "bt",
+        "6/8 = 75.0 % [40.9, 92.9]",
+        "2/8 = 25.0 % [7.1, 59.1]",
+        "2 / 0 / 0 / 0",
+        "12.0",
+        "16.0",
+        "3.0",
+        "0.30",
+    ]
     assert first.data.columns[:3] == ["method", "episodes", "success"]
     assert first.data.rows[1][:3] == ["bt", 8, 6]
 
 
 def test_a_method_without_episodes_is_dashes():
-    nobody = samples.method("bt") | samples.rates(0, 0, 1) | {"episodes": 0, "success_rate": None, "success_ci95": None}
+    nobody = (
+        samples.method("bt")
+        | samples.rates(0, 0, 1)
+        | {"episodes": 0, "success_rate": None, "success_ci95": None}
+    )
     nobody |= {"collision_rate": None, "collision_ci95": None}
     row = tables(evaluation(samples.evaluation_document(nobody)))[0].rows[0]
     assert row[1:3] == ["-", "-"]
 
 
 def test_causes_and_risk_are_shown_where_there_are_any():
-    blocks = evaluation(samples.evaluation_document(samples.method("best", risk=samples.RISK, causes=[samples.CAUSE], explain=[1, 2])))
-    assert tables(blocks)[-1].rows == [["unseen above", "2", "100 %", "50 %", "1.7", "-", "0.2", samples.CAUSE["meaning"]]]
+    blocks = evaluation(
+        samples.evaluation_document(
+            samples.method("best", risk=samples.RISK, causes=[samples.CAUSE], explain=[1, 2])
+        )
+    )
+    assert tables(blocks)[-1].rows == [
+        ["unseen above", "2", "100 %", "50 %", "1.7", "-", "0.2", samples.CAUSE["meaning"]]
+    ]
     said = [block.text for block in blocks if isinstance(block, Prose)][-1]
     assert "missed 1 of 9 accidents, 2.0 % to 44.0 % (promised 10.0 %)" in said
     figure = figures(blocks)["reliability_best"]
@@ -239,7 +296,10 @@ def test_a_sweep_over_two_axes_is_two_heat_maps_a_method():
     document = samples.sweep_document()
     document["cells"] += samples.sweep_document("best")["cells"]
     found = figures(sweep(document))
-    assert [(name, len(figure.panels)) for name, figure in found.items()] == [("heat_map_bt", 2), ("heat_map_best", 2)]
+    assert [(name, len(figure.panels)) for name, figure in found.items()] == [
+        ("heat_map_bt", 2),
+        ("heat_map_best", 2),
+    ]
     assert len(found["heat_map_bt"].data.rows) == 75
 
 
@@ -248,14 +308,19 @@ def test_a_sweep_over_one_axis_is_curves_with_intervals():
     blocks = sweep(document)
     figure = figures(blocks)["sweep_sensors"]
     hover = drawn(figure.panels[0])[1]
-    assert hover["interval-1-3"].splitlines()[:2] == ["best, sensors = harsh", "success 12/16 = 75.0 % [50.5, 89.8]"]
+    assert hover["interval-1-3"].splitlines()[:2] == [
+        "best, sensors = harsh",
+        "success 12/16 = 75.0 % [50.5, 89.8]",
+    ]
     assert tables(blocks)[0].rows[0][:3] == ["bt", "clean", "16/16 = 100.0 % [80.6, 100.0]"]
 
 
 def test_a_sweep_of_one_axis_at_a_time_is_a_figure_an_axis_around_what_is_unchanged():
     blocks = sweep(samples.robustness_sweep())
     found = figures(blocks)
-    assert {name: [row[0:4] for row in figure.data.rows if row[0] == "bt"] for name, figure in found.items()} == {
+    assert {
+        name: [row[0:4] for row in figure.data.rows if row[0] == "bt"] for name, figure in found.items()
+    } == {
         "sweep_D": [["bt", 8, 6, 0.6], ["bt", 8, 9, 0.6]],
         "sweep_disturbance.current_m_s": [["bt", 8, 6, 0.6], ["bt", 8, 6, 0.6]],
         "sweep_sensors": [["bt", 8, 6, 0.6]] * 3,
@@ -291,7 +356,10 @@ def test_a_profile_shows_rates_stages_and_the_papers_tables():
 
 
 def seeds_of(name, offsets, n=30, config="train:\n  seed: {}\n"):
-    return [Training(f"{name}_{i}", config.format(i), samples.metrics(n + i, offset)) for i, offset in enumerate(offsets)]
+    return [
+        Training(f"{name}_{i}", config.format(i), samples.metrics(n + i, offset))
+        for i, offset in enumerate(offsets)
+    ]
 
 
 def test_seeds_of_a_method_are_its_mean_and_its_range():
@@ -303,13 +371,22 @@ def test_seeds_of_a_method_are_its_mean_and_its_range():
 
 def test_only_the_seed_makes_no_other_method():
     other = Training("curriculum_0", "train:\n  seed: 0\n  iterations: 9\n", samples.metrics())
-    assert [(m.name, len(m.runs)) for m in grouped([*seeds_of("ppo", (0, 1)), other])] == [("ppo", 2), ("curriculum_0", 1)]
+    assert [(m.name, len(m.runs)) for m in grouped([*seeds_of("ppo", (0, 1)), other])] == [
+        ("ppo", 2),
+        ("curriculum_0", 1),
+    ]
     same = [Training(f"run{i}", f"a: {i}\n", samples.metrics(), "best") for i in range(2)]
-    assert [m.name for m in grouped(same)] == ["run0", "run1"], "a preset with two settings is told apart by its folders"
+    assert [m.name for m in grouped(same)] == ["run0", "run1"], (
+        "a preset with two settings is told apart by its folders"
+    )
 
 
 def test_an_evaluation_in_between_is_shown_with_its_count_and_interval():
-    run = Training("a", "train:\n  evaluate_episodes: 64\n", [*samples.metrics(9), {**samples.metrics(9)[-1], "eval/success_rate": 0.75}])
+    run = Training(
+        "a",
+        "train:\n  evaluate_episodes: 64\n",
+        [*samples.metrics(9), {**samples.metrics(9)[-1], "eval/success_rate": 0.75}],
+    )
     assert tables(training([run]))[0].rows[0][6] == "48/64 = 75.0 % [63.2, 84.0]"
 
 
@@ -321,8 +398,10 @@ def test_a_training_without_iterations_says_so():
 def recorded(tmp_path):
     """A run folder with pictures and videos, by their sizes only."""
     sizes = {
-        "pictures/seed0_episode0.png": 100, "pictures/seed0_episode7.png": 100, "videos/bt_seed0_episode0.webm": 300,
-        "videos/bt_seed0_episode7.webm": 300, "videos/bt_seed0_episode5.webm": 900, "explain/late_bt_seed0_episode7.webm": 301,
+        "pictures/seed0_episode0.png": 100, "pictures/seed0_episode7.png": 100,
+        "videos/bt_seed0_episode0.webm": 300,
+        "videos/bt_seed0_episode7.webm": 300, "videos/bt_seed0_episode5.webm": 900,
+        "explain/late_bt_seed0_episode7.webm": 301,
         "videos/unknown.webm": 50,
     }  # fmt: skip
     for name, size in sizes.items():
@@ -333,7 +412,10 @@ def recorded(tmp_path):
 
 def test_the_worst_episodes_come_first_and_once(recorded):
     pictures, videos = (block for block in media(*recorded) if isinstance(block, Gallery))
-    assert [item.caption.split(".")[0] for item in pictures.items] == ["Seed 0, episode 7", "Seed 0, episode 0"]
+    assert [item.caption.split(".")[0] for item in pictures.items] == [
+        "Seed 0, episode 7",
+        "Seed 0, episode 0",
+    ]
     assert [item.caption for item in videos.items] == [
         "Late, seed 0, episode 7. bt: collision after 17.0 s, closest 0.23 m",
         "Seed 0, episode 5. bt: success after 15.0 s, closest 0.25 m",
@@ -350,7 +432,7 @@ def test_what_does_not_fit_is_named(recorded):
     assert "videos/bt_seed0_episode5.webm (0.0 MB)" in videos.note and "run folder" in videos.note
 
 
-# ----------------------------------------------------------------------------------------------------------------- page
+# ------------------------------------------------------------------------------------------------------- page
 
 
 class Reader(HTMLParser):
@@ -378,7 +460,9 @@ EVIL = "</title><script>alert(1)</script>$x$\"'&"
 def evil(tmp_path_factory):
     """Page of an evaluation whose every name wants to be more than a name."""
     name = EVIL.replace("/", ":")
-    method = samples.method(EVIL, risk=samples.RISK, causes=[samples.CAUSE | {"label": EVIL, "meaning": EVIL}], explain=[1])
+    method = samples.method(
+        EVIL, risk=samples.RISK, causes=[samples.CAUSE | {"label": EVIL, "meaning": EVIL}], explain=[1]
+    )
     folder = tmp_path_factory.mktemp("evil") / name
     document = samples.evaluation_document(method) | {"world": EVIL}
     samples.write_run(folder, ("uuv", "eval", EVIL), EVIL, eval__result=document)
@@ -392,14 +476,24 @@ def test_everything_from_files_is_escaped(evil):
     assert not [key for _, attributes in page.tags for key in attributes if key.startswith("on")]
     text = "".join(page.words)
     assert text.count("alert(1)") > 5, "as words they are there"
-    assert [path.name for path in written.figures] == ["methods.png", "reliability_title_script_alert_1_script_x.png"]
+    assert [path.name for path in written.figures] == [
+        "methods.png",
+        "reliability_title_script_alert_1_script_x.png",
+    ]
 
 
 def test_a_page_needs_nothing_but_itself(evil):
     page = Reader(evil[1].page.read_text())
-    policy = next(meta["content"] for meta in page.of("meta") if meta.get("http-equiv") == "Content-Security-Policy")
+    policy = next(
+        meta["content"] for meta in page.of("meta") if meta.get("http-equiv") == "Content-Security-Policy"
+    )
     assert policy.startswith("default-src 'none'") and "script" not in policy
-    addresses = [value for _, attributes in page.tags for key, value in attributes.items() if key in ("src", "href", "xlink:href")]
+    addresses = [
+        value
+        for _, attributes in page.tags
+        for key, value in attributes.items()
+        if key in ("src", "href", "xlink:href")
+    ]
     assert addresses and all(address.startswith(("data:", "#")) for address in addresses)
     assert not re.search(r"@import|url\((?!#)", evil[1].page.read_text())
 
@@ -418,11 +512,19 @@ def test_the_data_of_a_figure_can_be_had_as_csv(tmp_path):
     assert "<h1>t</h1>" in html
     samples.write_run(tmp_path, sweep=samples.sweep_document())
     links = [a for a in Reader(report([tmp_path]).page.read_text()).of("a") if "download" in a]
-    head, *rows = csv.DictReader(io.StringIO(unquote(links[0]["href"].split(",", 1)[1]))), links[0]["download"]
+    head, *rows = (
+        csv.DictReader(io.StringIO(unquote(links[0]["href"].split(",", 1)[1]))),
+        links[0]["download"],
+    )
     cells = list(head)
     assert rows == ["heat_map_bt.csv"]
     assert len(cells) == 75
-    assert (cells[-1]["S"], cells[-1]["v_m_s"], cells[-1]["success"], cells[-1]["success_rate"]) == ("12", "3.0", "1", "0.0625")
+    assert (cells[-1]["S"], cells[-1]["v_m_s"], cells[-1]["success"], cells[-1]["success_rate"]) == (
+        "12",
+        "3.0",
+        "1",
+        "0.0625",
+    )
     assert data.csv() == 'name,value\n"a, b",0.1\n"""c""",\n'
 
 
@@ -447,7 +549,10 @@ def test_a_training_that_was_killed_while_it_wrote_is_shown_without_its_last_lin
 
 
 def test_several_trainings_are_one_page(tmp_path):
-    runs = [samples.write_run(tmp_path / f"ppo_{i}", config=f"train:\n  seed: {i}\n", metrics=samples.metrics(5)) for i in range(2)]
+    runs = [
+        samples.write_run(tmp_path / f"ppo_{i}", config=f"train:\n  seed: {i}\n", metrics=samples.metrics(5))
+        for i in range(2)
+    ]
     written = report(runs, tmp_path / "both.html")
     assert "ppo (2 seeds)" in written.page.read_text()
     assert written.figures == [tmp_path / "figures/training.png"] and written.figures[0].exists()
@@ -457,20 +562,29 @@ def test_several_trainings_are_one_page(tmp_path):
 
 
 def test_a_training_and_its_evaluations_are_one_page(tmp_path):
-    """The checkpoint's sha256 says which training an evaluation is of; figures of two folders do not overwrite each other."""
+    """The checkpoint's sha256 says which training an evaluation is of; figures of two folders do not
+    overwrite each other."""
     trained = samples.write_run(tmp_path / "first", metrics=samples.metrics(5))
     manifest = trained / "checkpoints/step_000005/manifest.json"
     manifest.parent.mkdir(parents=True)
     manifest.write_text('{"step": 5}')
     shas = {"first_eval": hashlib.sha256(manifest.read_bytes()).hexdigest(), "other_eval": "0" * 64}
     for name, sha in shas.items():
-        document = samples.evaluation_document(samples.method("bt"), samples.method("mine", checkpoint={"sha256": sha}))
+        document = samples.evaluation_document(
+            samples.method("bt"), samples.method("mine", checkpoint={"sha256": sha})
+        )
         samples.write_run(tmp_path / name, eval__result=document)
     written = report([trained, *(tmp_path / name for name in shas)], tmp_path / "page.html")
     page = Reader(written.page.read_text())
     titles = ["Training", "Evaluation: first_eval", "Evaluation: other_eval"]
-    assert [word for word in page.words if word in titles] == titles * 2, "in the list of sections and above them"
-    assert [path.name for path in written.figures] == ["training.png", "first_eval_methods.png", "other_eval_methods.png"]
+    assert [word for word in page.words if word in titles] == titles * 2, (
+        "in the list of sections and above them"
+    )
+    assert [path.name for path in written.figures] == [
+        "training.png",
+        "first_eval_methods.png",
+        "other_eval_methods.png",
+    ]
     text = " ".join(page.words)
     assert "mine is checkpoint step_000005 of the training first." in text
     assert "mine (checkpoint 0000000000000000) is none of the checkpoints" in text
@@ -479,9 +593,13 @@ def test_a_training_and_its_evaluations_are_one_page(tmp_path):
 def test_pairs_of_methods_are_told_with_p_and_interval():
     methods = [samples.method("straight", 3, 5), samples.method("bt", 8, 0)]
     (pairs,) = [
-        table for table in tables(evaluation(samples.evaluation_document(*methods) | {"paired": paired(methods)})) if table.n_left == 2
+        table
+        for table in tables(evaluation(samples.evaluation_document(*methods) | {"paired": paired(methods)}))
+        if table.n_left == 2
     ]
-    assert pairs.rows == [["straight", "bt", "8", "3", "0", "5", "0.062", "11.00", "11.00", "0.00 [0.00, 0.00]"]]
+    assert pairs.rows == [
+        ["straight", "bt", "8", "3", "0", "5", "0.062", "11.00", "11.00", "0.00 [0.00, 0.00]"]
+    ]
     assert pairs.data.rows[0][3:7] == [3, 0, 5, pytest.approx(0.0625)]
     assert paired_table([]) == []
     nobody = [samples.method(name, 0, 8) for name in "ab"]
@@ -508,7 +626,11 @@ def test_a_method_has_its_colour_in_charts_and_tables(tmp_path):
     for (identity, text), name in zip(hover.items(), names, strict=True):
         assert colours[name] in bars[identity], text
     samples.write_run(tmp_path, eval__result=document)
-    swatches = [span["style"] for span in Reader(report([tmp_path]).page.read_text()).of("span") if span.get("class") == "swatch"]
+    swatches = [
+        span["style"]
+        for span in Reader(report([tmp_path]).page.read_text()).of("span")
+        if span.get("class") == "swatch"
+    ]
     assert len(swatches) == 2 * len(names) and all(
         colours[name] in style for name, style in zip(names, swatches[: len(names)], strict=True)
     )
@@ -521,14 +643,18 @@ def test_every_colour_of_a_line_has_a_lighter_one_for_the_dark():
     lighter = dict(re.findall(r"--series-(\d): (#\w{6})", template))
     assert [int(i) for i in lighter] == list(range(len(PALETTE)))
     for i, colour in enumerate(PALETTE):
-        assert contrast(lighter[str(i)], "#12171d") > 5 and contrast(lighter[str(i)], "#12171d") >= contrast(colour, "#12171d")
+        assert contrast(lighter[str(i)], "#12171d") > 5 and contrast(lighter[str(i)], "#12171d") >= contrast(
+            colour, "#12171d"
+        )
 
 
 def test_a_page_of_many_videos_stays_below_ten_megabytes(tmp_path):
     """Also where it is of several runs, each of which would fit alone."""
     runs = []
     for i in range(2):
-        run = samples.write_run(tmp_path / f"run_{i}", eval__result=samples.evaluation_document(samples.method("bt")))
+        run = samples.write_run(
+            tmp_path / f"run_{i}", eval__result=samples.evaluation_document(samples.method("bt"))
+        )
         for place, name, n_files, size in (
             ("pictures", "seed0_episode{}.png", 8, 300_000),
             ("videos", "bt_seed0_episode{}.webm", 9, 900_000),
@@ -540,10 +666,13 @@ def test_a_page_of_many_videos_stays_below_ten_megabytes(tmp_path):
     for some in (runs[:1], runs):
         page = report(some, tmp_path / f"page_of_{len(some)}.html").page
         assert 7e6 < page.stat().st_size < 10e6
-        assert "Left out to keep this page small" in page.read_text() and "videos/bt_seed0_episode" in page.read_text()
+        assert (
+            "Left out to keep this page small" in page.read_text()
+            and "videos/bt_seed0_episode" in page.read_text()
+        )
 
 
-# --------------------------------------------------------------------------------------------------------- reproduction
+# ----------------------------------------------------------------------------------------------- reproduction
 
 
 def reproduced(folder, *blocks):
@@ -560,8 +689,17 @@ def test_a_reproduction_composes_verdicts_tables_and_runs(tmp_path):
     folder = reproduced(
         tmp_path,
         {"kind": "verdicts", "items": verdicts},
-        {"kind": "table", "columns": ["what", "paper", "ours"], "rows": [["bt", 0.8, None]], "caption": "Table main"},
-        {"kind": "trade_off", "series": [{"name": "bt", "points": [point]}], "marks": [{"name": "paper", **point}]},
+        {
+            "kind": "table",
+            "columns": ["what", "paper", "ours"],
+            "rows": [["bt", 0.8, None]],
+            "caption": "Table main",
+        },
+        {
+            "kind": "trade_off",
+            "series": [{"name": "bt", "points": [point]}],
+            "marks": [{"name": "paper", **point}],
+        },
         {"kind": "run", "path": "grid"},
         {"kind": "run", "path": "noise"},
         {"kind": "curves", "paths": ["a_0", "a_1"]},
@@ -572,7 +710,12 @@ def test_a_reproduction_composes_verdicts_tables_and_runs(tmp_path):
         samples.write_run(tmp_path / f"a_{i}", config=f"train:\n  seed: {i}\n", metrics=samples.metrics(5))
     written = report([folder])
     page = Reader(written.page.read_text())
-    assert [path.stem for path in written.figures] == ["trade_off", "grid_heat_map_bt", "noise_sweep_sensors", "training"]
+    assert [path.stem for path in written.figures] == [
+        "trade_off",
+        "grid_heat_map_bt",
+        "noise_sweep_sensors",
+        "training",
+    ]
     assert [item["class"] for item in page.of("li")] == ["holds", "fails"]
     assert "a (2 seeds)" in page.words
 
@@ -585,7 +728,10 @@ def test_a_reproduction_composes_verdicts_tables_and_runs(tmp_path):
         ({"kind": "run", "path": "nothing"}, "is no folder here"),
         ({"kind": "song"}, "'song' is no kind of block"),
         ({"kind": "prose"}, "KeyError: 'text'"),
-        ({"kind": "verdicts", "items": [{"claim": "a", "verdict": "maybe", "numbers": ""}]}, "'maybe' is no verdict"),
+        (
+            {"kind": "verdicts", "items": [{"claim": "a", "verdict": "maybe", "numbers": ""}]},
+            "'maybe' is no verdict",
+        ),
     ],
 )
 def test_a_reproduction_that_cannot_be_shown_says_why(tmp_path, block, says):
@@ -623,7 +769,7 @@ def test_a_page_that_cannot_be_written_leaves_the_old_one(tmp_path):
     assert (tmp_path / "report.html").read_bytes() == before
 
 
-# ------------------------------------------------------------------------------------------------------- where it may be written
+# ------------------------------------------------------------------------------------ where it may be written
 
 
 def test_the_default_page_may_be_renewed(tmp_path):
@@ -631,7 +777,9 @@ def test_the_default_page_may_be_renewed(tmp_path):
     assert report([run]).page == report([run]).page == report([run], run / "report.html").page
 
 
-@pytest.mark.parametrize("name", ["run/run.json", "run/config.yaml", "run/sweep.json", "run/../run/sweep.json", "link/sweep.json"])
+@pytest.mark.parametrize(
+    "name", ["run/run.json", "run/config.yaml", "run/sweep.json", "run/../run/sweep.json", "link/sweep.json"]
+)
 def test_a_page_never_replaces_a_file_of_the_run(tmp_path, name):
     run = samples.write_run(tmp_path / "run", sweep=samples.noise_sweep())
     (tmp_path / "link").symlink_to(run)
@@ -682,11 +830,19 @@ def test_a_page_of_several_trainings_is_none_of_theirs(tmp_path):
 @pytest.mark.parametrize(
     ("file", "document", "says"),
     [
-        ("eval/result.json", samples.evaluation_document() | {"methods": [samples.method("bt")] * 201}, "methods has 201 entries"),
+        (
+            "eval/result.json",
+            samples.evaluation_document() | {"methods": [samples.method("bt")] * 201},
+            "methods has 201 entries",
+        ),
         ("sweep.json", samples.noise_sweep() | {"cells": [{}] * 20_001}, "cells has 20,001 entries"),
         ("sweep.json", {"cells": [], "axes": {"S": [1] * 10_001}}, "axes.S has 10,001 entries"),
         ("profile.json", {"rows": [{}] * 201}, "rows has 201 entries"),
-        ("reproduce.json", {"title": "x", "sections": [{"title": "y", "blocks": [{"kind": "run", "path": "."}] * 1001}]}, "1,000 blocks"),
+        (
+            "reproduce.json",
+            {"title": "x", "sections": [{"title": "y", "blocks": [{"kind": "run", "path": "."}] * 1001}]},
+            "1,000 blocks",
+        ),
     ],
 )
 def test_a_small_file_cannot_make_a_page_without_end(tmp_path, file, document, says):

@@ -1,4 +1,5 @@
-"""The report in a real browser, opened from disk: nothing overflows, nothing fails, nothing is asked of the network, light and dark."""
+"""The report in a real browser, opened from disk: nothing overflows, nothing fails, nothing is asked of the
+network, light and dark."""
 
 import json
 import os
@@ -40,9 +41,16 @@ def page(tmp_path_factory):
     """A page with everything that a report can hold, with long names."""
     folder = tmp_path_factory.mktemp("browser") / "run"
     long = "a_method_with_a_name_that_is_far_longer_than_any_column_would_like_it_to_be"
-    methods = [samples.method(long, risk=samples.RISK, causes=[samples.CAUSE], explain=[1, 2]), samples.method("bt")]
+    methods = [
+        samples.method(long, risk=samples.RISK, causes=[samples.CAUSE], explain=[1, 2]),
+        samples.method("bt"),
+    ]
     verdict = {"claim": "it swims " * 30, "verdict": "holds", "numbers": "3 of 3"}
-    blocks = [{"kind": "verdicts", "items": [verdict]}, {"kind": "curves", "paths": ["t_0", "t_1"]}, {"kind": "run", "path": "noise"}]
+    blocks = [
+        {"kind": "verdicts", "items": [verdict]},
+        {"kind": "curves", "paths": ["t_0", "t_1"]},
+        {"kind": "run", "path": "noise"},
+    ]
     document = {"schema": 1, "title": "Everything", "sections": [{"title": "First", "blocks": blocks}]}
     result = samples.evaluation_document(*methods) | {"paired": paired(methods)}
     samples.write_run(
@@ -70,11 +78,16 @@ def seen(page, tmp_path_factory):
     with tempfile.TemporaryDirectory() as unpacked:
         command = [node, "look.mjs", str(page), str(bad)]
         environment = {**os.environ, "TMPDIR": unpacked}
-        done = subprocess.run(command, cwd=JS, env=environment, capture_output=True, text=True, check=False, timeout=120)
+        done = subprocess.run(
+            command, cwd=JS, env=environment, capture_output=True, text=True, check=False, timeout=120
+        )
     if done.returncode == 3:
         pytest.skip(f"Chromium does not start here: {done.stderr.strip().splitlines()[0]}")
     assert done.returncode == 0, done.stderr
-    return {(one["page"] == str(page), one["width"], one["scheme"]): one for one in json.loads(done.stdout)["seen"]}
+    return {
+        (one["page"] == str(page), one["width"], one["scheme"]): one
+        for one in json.loads(done.stdout)["seen"]
+    }
 
 
 VIEWS = [(width, scheme) for width in (1400, 390) for scheme in ("light", "dark")]
@@ -89,7 +102,13 @@ def test_a_report_is_whole_and_quiet_in_every_view(seen, width, scheme):
         assert found[folds]["scrollWidth"] <= width, f"the page overflows with its details {folds}"
     there = found["open"]
     assert there["title"] == "Everything"
-    assert (there["images"], there["videos"], there["scripts"], there["doubleIds"], there["deadLinks"]) == (1, 1, 0, [], 0)
+    assert (there["images"], there["videos"], there["scripts"], there["doubleIds"], there["deadLinks"]) == (
+        1,
+        1,
+        0,
+        [],
+        0,
+    )
     assert there["svgs"] > 10 and there["hovers"] > 150 and there["downloads"] > 5
 
 
@@ -97,7 +116,9 @@ def test_figures_follow_light_and_dark(seen):
     light, dark = (seen[True, 390, scheme]["open"] for scheme in ("light", "dark"))
     assert sum(channels(light["background"])) > 700 > 100 > sum(channels(dark["background"]))
     assert sum(channels(light["ink"])) < 200 < 600 < sum(channels(dark["ink"]))
-    assert light["inkedTexts"] == dark["inkedTexts"] > 100, "text of the figures has the page's colour in both"
+    assert light["inkedTexts"] == dark["inkedTexts"] > 100, (
+        "text of the figures has the page's colour in both"
+    )
 
 
 def test_a_dark_screen_prints_black_on_white(seen):

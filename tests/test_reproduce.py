@@ -20,13 +20,29 @@ def alone(finding):
 
 
 def entry(success, n=100, collision=0, time_s=10.0, **more):
-    outcomes = {"success": success, "collision": collision, "ttc": 0, "out_of_tank": 0, "timeout": n - success - collision}
-    return {"episodes": n, "outcomes": outcomes, "time_mean_s": time_s, "time_to_success_mean_s": time_s} | more
+    outcomes = {
+        "success": success,
+        "collision": collision,
+        "ttc": 0,
+        "out_of_tank": 0,
+        "timeout": n - success - collision,
+    }
+    return {
+        "episodes": n,
+        "outcomes": outcomes,
+        "time_mean_s": time_s,
+        "time_to_success_mean_s": time_s,
+    } | more
 
 
 @pytest.mark.parametrize(
     ("a", "b", "verdict"),
-    [((90, 100), (20, 100), HOLDS), ((20, 100), (90, 100), FAILS), ((50, 100), (45, 100), OPEN), ((0, 0), (5, 10), OPEN)],
+    [
+        ((90, 100), (20, 100), HOLDS),
+        ((20, 100), (90, 100), FAILS),
+        ((50, 100), (45, 100), OPEN),
+        ((0, 0), (5, 10), OPEN),
+    ],
 )
 def test_larger_needs_more_than_chance(a, b, verdict):
     assert alone(claims.larger(Share(*a), Share(*b))) == verdict
@@ -37,8 +53,12 @@ def test_a_printed_value_is_reached_missed_or_open():
     assert alone(claims.at_least(Share(83, 100), 0.828)) == OPEN, "the interval holds it"
     assert alone(claims.at_least(Share(60, 100), 0.828)) == FAILS
     assert alone(claims.at_most(Share(0, 1000), 0.011)) == HOLDS
-    assert alone(claims.at_most(Share(0, 20), 0.011)) == OPEN, "twenty episodes without a collision prove nothing"
-    assert alone(claims.at_most(Share(4, 512), 0.011)) == OPEN, "0.8 % of 512 is not below 1.1 %: its interval holds that"
+    assert alone(claims.at_most(Share(0, 20), 0.011)) == OPEN, (
+        "twenty episodes without a collision prove nothing"
+    )
+    assert alone(claims.at_most(Share(4, 512), 0.011)) == OPEN, (
+        "0.8 % of 512 is not below 1.1 %: its interval holds that"
+    )
     assert alone(claims.at_most(Share(20, 100), 0.011)) == FAILS
 
 
@@ -47,22 +67,28 @@ def test_coming_near_allows_ten_points():
     assert alone(claims.near(Share(4, 8), Share(8, 8))) == OPEN, "eight episodes prove nothing"
     assert alone(claims.near(Share(197, 200), Share(8, 8))) == OPEN, "neither do eight to compare with"
     assert alone(claims.near(Share(300, 500), Share(490, 500))) == FAILS
-    # by hand: 481/502 and 491/502, z = (0.9582 - 0.9781 + 0.1) / sqrt(0.9582 0.0418 / 502 + 0.9781 0.0219 / 502)
+    # by hand: 481/502 and 491/502, z = (0.9582 - 0.9781 + 0.1) / sqrt(0.9582 0.0418 / 502 + 0.9781 0.0219 /
+    # 502)
     z = (481 / 502 - 491 / 502 + 0.1) / math.sqrt((481 * 21 + 491 * 11) / 502**3)
     assert claims.near(Share(480, 500), Share(490, 500)).p == pytest.approx(math.erfc(z / math.sqrt(2)))
 
 
 def test_a_ratio_is_tested_on_its_logarithm():
     assert alone(claims.times_as_large(Share(870, 1000), Share(200, 1000), 3.5)) == HOLDS
-    assert alone(claims.times_as_large(Share(87, 100), Share(24, 100), 3.5)) == OPEN, "3.6 times, but of a hundred"
+    assert alone(claims.times_as_large(Share(87, 100), Share(24, 100), 3.5)) == OPEN, (
+        "3.6 times, but of a hundred"
+    )
     assert alone(claims.times_as_large(Share(300, 1000), Share(200, 1000), 3.5)) == FAILS
     assert claims.times_as_large(Share(5, 10), Share(0, 10), 3.5) == claims.Finding(OPEN, None)
     z = math.log(4.35 / 3.5) / math.sqrt(0.13 / 870 + 0.8 / 200)
-    assert claims.times_as_large(Share(870, 1000), Share(200, 1000), 3.5).p == pytest.approx(math.erfc(z / math.sqrt(2)))
+    assert claims.times_as_large(Share(870, 1000), Share(200, 1000), 3.5).p == pytest.approx(
+        math.erfc(z / math.sqrt(2))
+    )
 
 
 def test_holm_decides_over_the_whole_list():
-    """Four tests at 0.01, 0.02, 0.03, 0.04: alone each would decide, together only the first does (4 x 0.01, then 3 x 0.02)."""
+    """Four tests at 0.01, 0.02, 0.03, 0.04: alone each would decide, together only the first does (4 x 0.01,
+    then 3 x 0.02)."""
     found = [claims.Claim(str(p), "", "", HOLDS, p) for p in (0.03, 0.01, None, 0.04, 0.02)]
     told = claims.judged(found)
     assert [c.verdict for c in told] == [OPEN, HOLDS, HOLDS, OPEN, OPEN]
@@ -86,7 +112,9 @@ def test_claims_of_table_main_by_hand():
     found = claims.judged(claims.of_table_main(table_main))
     assert [claim.verdict for claim in found] == [HOLDS, OPEN, HOLDS, HOLDS, HOLDS, HOLDS, OPEN, HOLDS]
     assert "13.1 s against 114.2 s" in [claim.ours for claim in found]
-    swapped = claims.judged(claims.of_table_main(table_main | {"ppo": table_main["curriculum"], "curriculum": table_main["ppo"]}))
+    swapped = claims.judged(
+        claims.of_table_main(table_main | {"ppo": table_main["curriculum"], "curriculum": table_main["ppo"]})
+    )
     assert [claim.verdict for claim in swapped[:6]] == [FAILS] * 6
 
 
@@ -147,7 +175,9 @@ def test_time_to_success_is_the_papers_and_stands_beside_the_papers():
     """Mean time of all episodes / rate of success; the mean over successes stands apart, without a peer."""
     assert claims.tts_s([entry(50, time_s=10.0), entry(100, time_s=40.0)]) == pytest.approx(25.0 / 0.75)
     assert claims.tts_s([entry(0)]) is None and claims.tts_s([entry(5, time_s=None)]) is None
-    document = minimal() | {"table_main": {"curriculum": [entry(50, time_s=10.0) | {"time_to_success_mean_s": 7.0}]}}
+    document = minimal() | {
+        "table_main": {"curriculum": [entry(50, time_s=10.0) | {"time_to_success_mean_s": 7.0}]}
+    }
     (head,) = [line for line in results_page(document).splitlines() if line.startswith("| method | training")]
     (row,) = [line for line in results_page(document).splitlines() if line.startswith("| `curriculum`")]
     cells = dict(zip([c.strip() for c in head.split("|")], [c.strip() for c in row.split("|")], strict=True))
@@ -159,7 +189,9 @@ def test_time_to_success_is_the_papers_and_stands_beside_the_papers():
 def minimal():
     """A document with one claim and empty tables."""
     profile = {"paper_latency": [], "paper_density": [], "rows": []}
-    found = claims.judged([claims.Claim("it holds", "1", "2", HOLDS, 0.00001), claims.Claim("untested", "1", "2", FAILS)])
+    found = claims.judged(
+        [claims.Claim("it holds", "1", "2", HOLDS, 0.00001), claims.Claim("untested", "1", "2", FAILS)]
+    )
     return {
         "budget": "quick",
         "seed": 90007,
@@ -178,14 +210,19 @@ def minimal():
 
 def test_the_page_tells_p_values_and_an_evaluation_seed_that_was_tuned_on():
     text = results_page(minimal())
-    assert "| it holds | 1 | 2 | holds | < 0.0001 | < 0.0001 |" in text and "| untested | 1 | 2 | does not hold | - | - |" in text
+    assert (
+        "| it holds | 1 | 2 | holds | < 0.0001 | < 0.0001 |" in text
+        and "| untested | 1 | 2 | does not hold | - | - |" in text
+    )
     assert "seed, 90007, was never trained or tuned on" in text
     assert "seed, 90001, was looked at while tuning" in results_page(minimal() | {"seed": 90001})
     assert steps.EVALUATION_SEED not in steps.RETIRED_SEEDS
 
 
 def test_losses_must_fall():
-    falling = [{"world_model/reconstruction_loss": 10 - i, "world_model/dynamics_loss": 5.0} for i in range(8)]
+    falling = [
+        {"world_model/reconstruction_loss": 10 - i, "world_model/dynamics_loss": 5.0} for i in range(8)
+    ]
     assert [claim.verdict for claim in claims.of_training(falling)] == [HOLDS, FAILS]
     assert [claim.verdict for claim in claims.of_training([])] == [OPEN, OPEN]
 
@@ -199,7 +236,7 @@ def test_the_papers_own_time_to_success_is_as_inconsistent_as_we_say():
     assert off == {"distill_20": 29.2, "curriculum": 13.1, "bt": 18.1}
 
 
-# ------------------------------------------------------------------------------------------------------------------- steps
+# ------------------------------------------------------------------------------------------------------ steps
 
 
 @pytest.mark.parametrize("budget", list(steps.BUDGETS))
@@ -223,7 +260,9 @@ class Uuv:
     def __call__(self, arguments):
         self.ran.append(arguments)
         code = 130 if len(self.ran) == self.fail_at else 0
-        place = next((arguments[i + 1] for i, part in enumerate(arguments) if part in ("--run-dir", "--resume")), None)
+        place = next(
+            (arguments[i + 1] for i, part in enumerate(arguments) if part in ("--run-dir", "--resume")), None
+        )
         if place:
             folder = steps.Path(place)
             folder.mkdir(parents=True, exist_ok=True)
@@ -257,7 +296,8 @@ class Quiet:
 
 @pytest.fixture(autouse=True)
 def pages(monkeypatch):
-    """How the run stood whenever a page was made; it would be drawn from run folders that stand-ins do not write."""
+    """How the run stood whenever a page was made; it would be drawn from run folders that stand-ins do not
+    write."""
     states = []
 
     def page(folders):
@@ -287,7 +327,9 @@ def test_an_interrupted_reproduction_goes_on_and_runs_no_step_twice(tmp_path, mo
 
 
 def test_a_step_that_fails_says_which(tmp_path, monkeypatch):
-    monkeypatch.setattr(steps, "launch", lambda _arguments: type("Done", (), {"returncode": 2, "stdout": b""})())
+    monkeypatch.setattr(
+        steps, "launch", lambda _arguments: type("Done", (), {"returncode": 2, "stdout": b""})()
+    )
     with pytest.raises(RunFolderError, match="train ppo, seed 0: 'uuv train ppo"):
         reproduce("quick", tmp_path / "run", Quiet())
 

@@ -1,4 +1,5 @@
-"""An evaluation that is interrupted or killed goes on where it was, and ends as if nobody had disturbed it."""
+"""An evaluation that is interrupted or killed goes on where it was, and ends as if nobody had disturbed
+it."""
 
 import json
 from pathlib import Path
@@ -42,23 +43,37 @@ class Watch:
 
 @pytest.fixture(scope="module")
 def ask(small, tmp_path_factory):
-    """Requests of the session's simulator: nothing is compiled. The blind yardstick drives, twice: its episodes are short."""
+    """Requests of the session's simulator: nothing is compiled. The blind yardstick drives, twice: its
+    episodes are short."""
     second = tmp_path_factory.mktemp("trees") / "second.xml"
     second.write_text(preset_path("tree", "straight").read_text())
 
     def request(folder, **others):
-        given = {"controllers": ["straight", str(second)], "episodes": EPISODES, "seeds": [77], "num_envs": 2, "device": "cpu", "record": 2}
+        given = {
+            "controllers": ["straight", str(second)],
+            "episodes": EPISODES,
+            "seeds": [77],
+            "num_envs": 2,
+            "device": "cpu",
+            "record": 2,
+        }
         return Request(config=small.config, world="pool", sensors="paper", run_dir=folder, **given | others)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("uuvtai.sim.Sim", lambda _config, _num_envs, tree, _device: small.sim.use_tree(tree) or small.sim)
+        patch.setattr(
+            "uuvtai.sim.Sim", lambda _config, _num_envs, tree, _device: small.sim.use_tree(tree) or small.sim
+        )
         yield request
     small.sim.use_tree(small.trees["bt"])
 
 
 def outcome(result):
     """A document without the machine's times."""
-    return result | {"methods": [{name: value for name, value in m.items() if name not in TIMES} for m in result["methods"]]}
+    return result | {
+        "methods": [
+            {name: value for name, value in m.items() if name not in TIMES} for m in result["methods"]
+        ]
+    }
 
 
 @pytest.fixture(scope="module")
@@ -86,8 +101,12 @@ def test_an_interrupted_evaluation_ends_as_an_undisturbed_one(ask, whole, tmp_pa
     assert (run / ledger.FILE).read_bytes().startswith(kept), "nothing that is over is played again"
     assert watch.begun[method] is None or watch.begun[method] >= finished
     logs = sorted((run / "logs").iterdir())
-    assert [log.name for log in logs] == sorted(log.name for log in (whole[1] / "logs").iterdir()), "every log whole, no part left"
-    assert all((run / "logs" / name).stat().st_mtime_ns == time for name, time in old.items()), "finished logs are kept"
+    assert [log.name for log in logs] == sorted(log.name for log in (whole[1] / "logs").iterdir()), (
+        "every log whole, no part left"
+    )
+    assert all((run / "logs" / name).stat().st_mtime_ns == time for name, time in old.items()), (
+        "finished logs are kept"
+    )
     assert all(reader.info(log)["outcome"] for log in logs)
 
 
@@ -164,5 +183,8 @@ def test_paths_of_the_request_are_found_from_another_folder(ask, tmp_path, monke
 
 
 def test_a_folder_of_something_else_is_refused(tmp_path):
-    with pytest.raises(UserError, match=r"is no run folder, it has no plain file run\.json; give the folder that 'uuv eval' printed"):
+    with pytest.raises(
+        UserError,
+        match=r"is no run folder, it has no plain file run\.json; give the folder that 'uuv eval' printed",
+    ):
         resume(tmp_path, Watch())

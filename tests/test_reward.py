@@ -25,7 +25,14 @@ SIZES = defaultdict(lambda: 2, n_env=N, n_term=reward.N_TERM)
 
 class Bench:
     def __init__(self):
-        structs = (state.RewardState, state.RefereeState, state.VehicleState, state.RouteState, state.ActuationState, state.ClockState)
+        structs = (
+            state.RewardState,
+            state.RefereeState,
+            state.VehicleState,
+            state.RouteState,
+            state.ActuationState,
+            state.ClockState,
+        )
         self.structs = [state.allocate(struct, SIZES) for struct in structs]
         self.reward, self.referee, self.vehicle, self.route, self.actuation, self.clock = self.structs
         self.out = torch.zeros(N), torch.zeros(N, dtype=torch.int32), torch.zeros(N, dtype=torch.int32)
@@ -50,10 +57,23 @@ class Bench:
         """Every row upright at 10 m, driving ahead at 0.5 m/s on a route of old, one step in."""
         self.clock.awake.fill(1)
         reward.reset_reward(io_for(RewardIO, self.reward, self.clock))
-        rest = {"quat": (1, 0, 0, 0), "vel": (0.5, 0, 0), "pos": (10, 3, -0.8), "command": (0.5, 0, 0, 0), "lookahead": (11, 3, -0.8)}
+        rest = {
+            "quat": (1, 0, 0, 0),
+            "vel": (0.5, 0, 0),
+            "pos": (10, 3, -0.8),
+            "command": (0.5, 0, 0, 0),
+            "lookahead": (11, 3, -0.8),
+        }
         for name, value in rest.items():
             self.set(name, np.tile(value, (N, 1)))
-        for name, value in {"cross_track": 0, "heading_error": 0, "clearance": 5, "ttc": 1e6, "n_way": 4, "outcome": 0}.items():
+        for name, value in {
+            "cross_track": 0,
+            "heading_error": 0,
+            "clearance": 5,
+            "ttc": 1e6,
+            "n_way": 4,
+            "outcome": 0,
+        }.items():
             self.set(name, np.full(N, value))
         for name, value in {"remaining": 5, "plan_step": 0, "step": 1}.items():
             self.set(name, np.full(N, value))
@@ -61,7 +81,9 @@ class Bench:
 
     def set(self, name, values):
         field = self.target[name]
-        field.from_numpy(np.asarray(values, np.int32 if name in ("n_way", "outcome", "plan_step", "step") else np.float32))
+        field.from_numpy(
+            np.asarray(values, np.int32 if name in ("n_way", "outcome", "plan_step", "step") else np.float32)
+        )
 
     def compute(self):
         reward.compute_reward(io_for(RewardIO, *self.structs, CFG, VEHICLE, RULES), *self.out)
@@ -81,7 +103,11 @@ def bench(shared):
 def test_terms_are_config_keys_of_the_equation():
     assert len(reward.TERMS) == 13
     assert set(reward.TERMS) <= set(RewardConfig.model_fields)
-    assert set(RewardConfig.model_fields) - set(reward.TERMS) == {"soft_clearance_m", "soft_ttc_s", "safe_speed_m_s"}
+    assert set(RewardConfig.model_fields) - set(reward.TERMS) == {
+        "soft_clearance_m",
+        "soft_ttc_s",
+        "safe_speed_m_s",
+    }
 
 
 def random_rows(seed):
@@ -122,8 +148,12 @@ def test_total_is_the_sum_and_goes_out(bench):
     assert bench.out[0].numpy() == pytest.approx(total, abs=TOL)
     assert bench.reward.total.to_numpy() == pytest.approx(total, abs=TOL)
     bench.compute()
-    assert bench.reward.episode_return.to_numpy() == pytest.approx(2 * total, abs=0.02)  # the second step earns other progress
-    assert bench.reward.episode_sum.to_numpy().sum(axis=1) == pytest.approx(bench.reward.episode_return.to_numpy(), abs=TOL)
+    assert bench.reward.episode_return.to_numpy() == pytest.approx(
+        2 * total, abs=0.02
+    )  # the second step earns other progress
+    assert bench.reward.episode_sum.to_numpy().sum(axis=1) == pytest.approx(
+        bench.reward.episode_return.to_numpy(), abs=TOL
+    )
     reward.reset_reward(io_for(RewardIO, bench.reward, bench.clock))
     assert not bench.reward.episode_sum.to_numpy().any()
     assert not bench.reward.episode_return.to_numpy().any()
@@ -133,7 +163,9 @@ def test_ends_of_episodes(bench):
     bench.set("outcome", np.arange(N) % len(OUTCOMES))
     bench.compute()
     names = [OUTCOMES[i % len(OUTCOMES)] for i in range(N)]
-    assert bench.out[1].tolist() == [int(name in ("success", "collision", "ttc", "out_of_tank")) for name in names]
+    assert bench.out[1].tolist() == [
+        int(name in ("success", "collision", "ttc", "out_of_tank")) for name in names
+    ]
     assert bench.out[2].tolist() == [int(name == "timeout") for name in names]
 
 
@@ -157,7 +189,7 @@ def test_sleeping_rows_earn_nothing_and_keep_their_end(bench):
     assert np.array_equal(bench.reward.episode_return.to_numpy(), before)
 
 
-# --------------------------------------------------------------------------------------------------------------- progress
+# --------------------------------------------------------------------------------------------------- progress
 
 
 def progress(bench, remaining, plan_step=0, step=2):
@@ -196,7 +228,9 @@ def test_replanning_in_every_step_while_standing_still_pays_nothing(bench):
 
 
 def test_the_first_step_and_steps_without_a_route(bench):
-    assert progress(bench, 7.0, step=1) == pytest.approx(0.01, abs=1e-6)  # nothing known before: movement towards the look-ahead
+    assert progress(bench, 7.0, step=1) == pytest.approx(
+        0.01, abs=1e-6
+    )  # nothing known before: movement towards the look-ahead
     bench.set("n_way", np.zeros(N))
     assert progress(bench, 3.0) == 0.0
     bench.set("n_way", np.full(N, 4))
@@ -209,5 +243,10 @@ def test_progress_sums_to_the_way_driven(bench):
     for step in range(1, 101):
         x += 0.01
         replanned = step % 8 == 0
-        total += progress(bench, 50.0 - x + (0.7 if step >= 8 else 0.0), plan_step=step if replanned else step - step % 8, step=step)
+        total += progress(
+            bench,
+            50.0 - x + (0.7 if step >= 8 else 0.0),
+            plan_step=step if replanned else step - step % 8,
+            step=step,
+        )
     assert total == pytest.approx(x, abs=1e-3)  # float32 differences of 50 m: 4e-6 each

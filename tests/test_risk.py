@@ -1,4 +1,5 @@
-"""Risk head: labels, waiting for them, learning, isotonic calibration, conformal threshold, resume and bad input."""
+"""Risk head: labels, waiting for them, learning, isotonic calibration, conformal threshold, resume and bad
+input."""
 
 import copy
 import math
@@ -12,7 +13,15 @@ from scipy import optimize
 
 from uuvtai.config.learning import RiskConfig
 from uuvtai.learn.calibration import auroc, expected_calibration_error
-from uuvtai.learn.risk import STRIDE, RiskHead, RiskLearner, RiskMemory, conformal_threshold, isotonic, label_events
+from uuvtai.learn.risk import (
+    STRIDE,
+    RiskHead,
+    RiskLearner,
+    RiskMemory,
+    conformal_threshold,
+    isotonic,
+    label_events,
+)
 
 N_IN, DT_S = 6, 0.02
 SMALL = RiskConfig(hidden=(16,), batch=512, steps=4, learning_rate=3e-3, horizon_s=0.2)
@@ -20,7 +29,8 @@ HORIZON = 10
 """control steps of ``SMALL``"""
 
 SAMPLING = 0.03
-"""ECE of a calibrated forecast of 20,000 samples in 10 bins stays below four standard errors of a bin's frequency, 4 x 0.011 / 2."""
+"""ECE of a calibrated forecast of 20,000 samples in 10 bins stays below four standard errors of a bin's
+frequency, 4 x 0.011 / 2."""
 
 
 def generator(seed=0):
@@ -34,10 +44,12 @@ def columns(text):
 
 def labels_of(failed, ended, censored, horizon):
     found = label_events(columns(failed), columns(ended), columns(censored), horizon)
-    return "".join("?" if not k else str(int(e)) for e, k in zip(found.event[:, 0], found.known[:, 0], strict=True))
+    return "".join(
+        "?" if not k else str(int(e)) for e, k in zip(found.event[:, 0], found.known[:, 0], strict=True)
+    )
 
 
-# ------------------------------------------------------------------------------------------------------------------ labels
+# ----------------------------------------------------------------------------------------------------- labels
 
 
 @pytest.mark.parametrize(
@@ -57,7 +69,8 @@ def test_labels_by_hand(failed, ended, censored, expected):
 @settings(deadline=None, max_examples=50)
 @given(st.lists(st.sampled_from("..........fst"), min_size=12, max_size=60), st.integers(1, 8))
 def test_memory_returns_every_moment_once_with_the_label_of_the_whole_record(record, horizon):
-    """In rollouts of 6 steps: the same labels as from one long rollout, for every moment whose horizon has been seen."""
+    """In rollouts of 6 steps: the same labels as from one long rollout, for every moment whose horizon has
+    been seen."""
     record = record[: len(record) // 6 * 6]
     failed, ended, censored = (torch.tensor([[c in kinds] for c in record]) for kinds in ("f", "fst", "t"))
     whole = label_events(failed, ended, censored, horizon)
@@ -80,11 +93,12 @@ def test_a_horizon_of_no_step_is_refused():
         RiskLearner(RiskHead(N_IN, SMALL, generator()), SMALL, control_dt_s=1.0)
 
 
-# ---------------------------------------------------------------------------------------------------------------- learning
+# --------------------------------------------------------------------------------------------------- learning
 
 
 def rollout(seed=0, steps=40, n_env=64):
-    """x, failed, ended, censored: an env fails HORIZON / 2 steps after column 0 was 2, which it is at random."""
+    """x, failed, ended, censored: an env fails HORIZON / 2 steps after column 0 was 2, which it is at
+    random."""
     gen = generator(seed)
     x = torch.randn(steps, n_env, N_IN, generator=gen)
     warned = torch.rand(steps, n_env, generator=gen) < 0.02
@@ -144,13 +158,15 @@ def test_nan_is_left_out_and_no_label_changes_nothing():
     learner.memory = RiskMemory(HORIZON)
     metrics = learner.update(x * math.nan, *ends, generator())
     assert metrics == {"risk/skipped_updates": SMALL.steps}
-    metrics = learner.update(x[:1], *(part[:1] for part in ends), generator())  # one step more: few decided, all of them NaN
+    metrics = learner.update(
+        x[:1], *(part[:1] for part in ends), generator()
+    )  # one step more: few decided, all of them NaN
     assert metrics == {"risk/skipped_updates": SMALL.steps}
     assert all(torch.equal(a, b) for a, b in zip(before, head.parameters(), strict=True))
     assert torch.isfinite(head(x)).all()
 
 
-# ------------------------------------------------------------------------------------------------------------- calibration
+# ------------------------------------------------------------------------------------------------ calibration
 
 
 def test_pool_adjacent_violators_by_hand():
@@ -166,11 +182,14 @@ def test_isotonic_regression_agrees_with_scipy(pairs):
     distinct, value = isotonic(score, event)
     weight = np.array([(score == s).sum().item() for s in distinct])
     mean = np.array([event[score == s].mean().item() for s in distinct])
-    np.testing.assert_allclose(value, optimize.isotonic_regression(mean, weights=weight).x, atol=1e-6)  # means are float32 here
+    np.testing.assert_allclose(
+        value, optimize.isotonic_regression(mean, weights=weight).x, atol=1e-6
+    )  # means are float32 here
 
 
 def test_calibration_repairs_a_logit_that_is_far_too_sure():
-    """True probabilities are those of a third of the logit: uncalibrated far off, calibrated on other samples close."""
+    """True probabilities are those of a third of the logit: uncalibrated far off, calibrated on other samples
+    close."""
     head = RiskHead(N_IN, SMALL, generator())
     logit = 3.0 * torch.randn(40_000, generator=generator(1))
     event = torch.rand(40_000, generator=generator(2)) < torch.sigmoid(logit / 3.0)
@@ -186,17 +205,21 @@ def test_calibration_repairs_a_logit_that_is_far_too_sure():
 def test_table_is_the_logistic_function_at_birth_and_constant_beyond_its_ends():
     head = RiskHead(N_IN, SMALL, generator())
     logit = torch.tensor([-50.0, -12.0, -0.55, 0.0, 3.3, 12.0, 50.0], dtype=torch.float64)
-    np.testing.assert_allclose(head.calibrated(logit), torch.sigmoid(logit.clamp(-12, 12)), atol=2e-4)  # linear over 0.1 of a logit
+    np.testing.assert_allclose(
+        head.calibrated(logit), torch.sigmoid(logit.clamp(-12, 12)), atol=2e-4
+    )  # linear over 0.1 of a logit
 
 
-# --------------------------------------------------------------------------------------------------------------- conformal
+# -------------------------------------------------------------------------------------------------- conformal
 
 
 def test_threshold_is_the_score_of_the_finite_sample_rank():
     scores = torch.arange(1.0, 20.0)  # n = 19: the ceil(20 x 0.9) = 18th largest is 2
     assert conformal_threshold(scores, 0.1) == 2.0
     assert conformal_threshold(scores, 0.05) == 1.0
-    with pytest.raises(ValueError, match=r"19 dangerous moments are too few for a miss rate of 0\.04: it takes 24"):
+    with pytest.raises(
+        ValueError, match=r"19 dangerous moments are too few for a miss rate of 0\.04: it takes 24"
+    ):
         conformal_threshold(scores, 0.04)
     with pytest.raises(ValueError, match="finite"):
         conformal_threshold(torch.full((19,), math.nan), 0.1)
@@ -204,7 +227,8 @@ def test_threshold_is_the_score_of_the_finite_sample_rank():
 
 @pytest.mark.parametrize("miss_rate", [0.05, 0.2])
 def test_share_of_misses_among_new_moments_is_what_was_promised(miss_rate):
-    """Over many draws of 40 held-out and 100 new moments: expected misses are floor((n + 1) miss) / (n + 1)."""
+    """Over many draws of 40 held-out and 100 new moments: expected misses are floor((n + 1) miss) / (n +
+    1)."""
     gen, missed = generator(3), []
     for _ in range(400):
         held_out, new = torch.randn(40, generator=gen).exp(), torch.randn(100, generator=gen).exp()

@@ -1,4 +1,5 @@
-"""Triggers made to happen one by one, the queue, progress and the path-relative terms, and loading a path from the host."""
+"""Triggers made to happen one by one, the queue, progress and the path-relative terms, and loading a path
+from the host."""
 
 import numpy as np
 import pytest
@@ -44,19 +45,35 @@ def fire():
 def follow():
     s, c = stage(), CONFIG
     route.follow_route(
-        io_for(RouteIO, s.route, s.clearance, s.grid_map, s.ego, s.mission, s.clock, c.route, c.clearance, c.mapping, maps.TANK)
+        io_for(
+            RouteIO,
+            s.route,
+            s.clearance,
+            s.grid_map,
+            s.ego,
+            s.mission,
+            s.clock,
+            c.route,
+            c.clearance,
+            c.mapping,
+            maps.TANK,
+        )
     )
 
 
 def load(env, corners):
     s, c = stage(), CONFIG
     route.load_route(
-        io_for(RouteIO, s.route, s.clearance, s.clock, c.route, c.voronoi, c.mapping, maps.TANK), np.array(corners, np.float32), env
+        io_for(RouteIO, s.route, s.clearance, s.clock, c.route, c.voronoi, c.mapping, maps.TANK),
+        np.array(corners, np.float32),
+        env,
     )
 
 
 def set_step(step):
-    stage().clock.step.from_numpy(np.full(N_ENV, step, np.int32))  # fill() would compile a kernel for every value
+    stage().clock.step.from_numpy(
+        np.full(N_ENV, step, np.int32)
+    )  # fill() would compile a kernel for every value
 
 
 def with_routes():
@@ -154,7 +171,10 @@ def test_each_trigger_rests_by_itself_and_one_is_counted():
     s.scan.range_m[1, 5], s.scan.hit[1, 5] = 0.3, 1
     fire()
     assert held(1) == ["safety"]
-    put_maps([np.zeros(maps.SHAPE, bool), np.hypot(maps.X - 4.0, maps.Y - 3.0) < 0.3] + [np.zeros(maps.SHAPE, bool)] * (N_ENV - 2))
+    put_maps(
+        [np.zeros(maps.SHAPE, bool), np.hypot(maps.X - 4.0, maps.Y - 3.0) < 0.3]
+        + [np.zeros(maps.SHAPE, bool)] * (N_ENV - 2)
+    )
     set_step(1001)
     fire()
     assert held(1) == ["intersection"]
@@ -241,7 +261,9 @@ def test_the_queue_holds_awake_envs_in_order():
 
 def random_way(rng, n):
     turns = np.cumsum(rng.normal(0, 0.5, n))
-    return np.array([5.0, 3.0]) + np.cumsum(np.stack([np.cos(turns), np.sin(turns)], 1) * rng.uniform(0.1, 0.6, (n, 1)), 0)
+    return np.array([5.0, 3.0]) + np.cumsum(
+        np.stack([np.cos(turns), np.sin(turns)], 1) * rng.uniform(0.1, 0.6, (n, 1)), 0
+    )
 
 
 def test_loading_keeps_the_line_and_spaces_it():
@@ -279,12 +301,14 @@ def test_terms_along_random_routes_agree_with_the_oracle():
         load(env, ways[env])
     length = [oracle.corners_and_lengths(w)[1][-1] for w in ways]
     for travelled in np.linspace(0.0, 0.95, 14):
-        pos = np.array([oracle.point_at(w, travelled * total) for w, total in zip(ways, length, strict=True)]) + rng.normal(
-            0, 0.02, (N_ENV, 2)
-        )
+        pos = np.array(
+            [oracle.point_at(w, travelled * total) for w, total in zip(ways, length, strict=True)]
+        ) + rng.normal(0, 0.02, (N_ENV, 2))
         yaw = rng.uniform(-np.pi, np.pi, N_ENV).astype(np.float32)
         s.ego.pos_w.from_numpy(np.column_stack([pos, np.full(N_ENV, -0.5)]).astype(np.float32))
-        s.mission.goal_w.from_numpy(np.column_stack([[w[-1] for w in ways], np.full(N_ENV, -1.1)]).astype(np.float32))
+        s.mission.goal_w.from_numpy(
+            np.column_stack([[w[-1] for w in ways], np.full(N_ENV, -1.1)]).astype(np.float32)
+        )
         s.ego.rpy.from_numpy(np.column_stack([np.zeros((N_ENV, 2)), yaw]).astype(np.float32))
         before = s.route.arc.to_numpy()
         fire()
@@ -310,7 +334,9 @@ def test_cross_track_is_positive_on_the_left():
     s.route.arc.fill(14.0)
     fire()
     follow()
-    assert s.route.cross_track_m[0] == pytest.approx(0.4, abs=1e-5) and s.route.cross_track_m[1] == pytest.approx(-0.4, abs=1e-5)
+    assert s.route.cross_track_m[0] == pytest.approx(0.4, abs=1e-5) and s.route.cross_track_m[
+        1
+    ] == pytest.approx(-0.4, abs=1e-5)
     assert s.route.remaining_m[0] == pytest.approx(13.0, abs=1e-4)
     assert s.route.lookahead_w[0].to_numpy()[:2] == pytest.approx([6.0, 3.0], abs=1e-4)
     assert s.route.heading_error[0] == pytest.approx(np.arctan2(-0.4, 1.0), abs=1e-4)
@@ -359,7 +385,11 @@ def test_path_risk_is_the_mean_over_the_look_ahead_segment():
     rng = np.random.default_rng(5)
     static, dynamic = rng.random((2, *maps.SHAPE)).astype(np.float32)
     clearance = rng.uniform(0.1, 2.0, maps.SHAPE).astype(np.float32)
-    for field, values in ((s.grid_map.static_occ, static), (s.grid_map.dynamic_occ, dynamic), (s.clearance.clearance_m, clearance)):
+    for field, values in (
+        (s.grid_map.static_occ, static),
+        (s.grid_map.dynamic_occ, dynamic),
+        (s.clearance.clearance_m, clearance),
+    ):
         occ[2] = values
         field.from_numpy(occ)
     load(2, [(3.03, 1.04), (4.03, 2.04), (12.0, 2.04)])
@@ -368,10 +398,20 @@ def test_path_risk_is_the_mean_over_the_look_ahead_segment():
     c, points = CONFIG.clearance, s.route.ahead_w.to_numpy()[2][: s.route.n_ahead[2]]
     assert len(points) == round(R.risk_horizon_m / maps.CELL_M) + 1
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    assert steps.max() < maps.CELL_M + 1e-4 and np.allclose(points[-1], [4.03 + 3.0 - np.sqrt(2.0), 2.04], atol=1e-3)
+    assert steps.max() < maps.CELL_M + 1e-4 and np.allclose(
+        points[-1], [4.03 + 3.0 - np.sqrt(2.0), 2.04], atol=1e-3
+    )
     cells = [maps.cell_of(p) for p in points]
     risk = [
-        oracle.risk_at(static[k], dynamic[k], clearance[k], c.risk_static, c.risk_dynamic, c.risk_clearance, c.risk_epsilon_m)
+        oracle.risk_at(
+            static[k],
+            dynamic[k],
+            clearance[k],
+            c.risk_static,
+            c.risk_dynamic,
+            c.risk_clearance,
+            c.risk_epsilon_m,
+        )
         for k in cells
     ]
     assert s.route.path_risk[2] == pytest.approx(np.mean(risk), rel=1e-4)
@@ -381,7 +421,11 @@ def test_reset_clears_only_the_rows_that_are_awake():
     s = with_routes()
     fire()
     follow()
-    before = {name: getattr(s.route, name).to_numpy() for name in vars(s.route) if getattr(s.route, name).shape[:1] == (N_ENV,)}
+    before = {
+        name: getattr(s.route, name).to_numpy()
+        for name in vars(s.route)
+        if getattr(s.route, name).shape[:1] == (N_ENV,)
+    }
     s.clock.awake.from_numpy(np.array([1, 0, 1, 0, 0, 0, 0, 0], np.int32))
     route.reset_route(io_for(RouteIO, s.route, s.clock))
     for name, values in before.items():
@@ -397,7 +441,10 @@ def test_asleep_rows_are_left_alone():
     fire()
     follow()
     s.clock.awake.fill(0)
-    before = {name: getattr(s.route, name).to_numpy() for name in ("arc", "lookahead_w", "stuck_steps", "ahead_w", "path_risk", "fired")}
+    before = {
+        name: getattr(s.route, name).to_numpy()
+        for name in ("arc", "lookahead_w", "stuck_steps", "ahead_w", "path_risk", "fired")
+    }
     put_ends([(9.0, 2.0)] * N_ENV, [(3.0, 3.0)] * N_ENV)
     s.ego.vel_b.fill(0)
     fire()

@@ -1,4 +1,5 @@
-"""OMPL's RRT as the fallback: repeatable whatever ran before, safe, and taking over in every case in which Voronoi fails."""
+"""OMPL's RRT as the fallback: repeatable whatever ran before, safe, and taking over in every case in which
+Voronoi fails."""
 
 from itertools import pairwise
 from types import SimpleNamespace
@@ -22,7 +23,9 @@ EDGE_M = 1e-5
 
 
 def grid_of(occ, start, floor_m=FLOOR_M):
-    return rrt.ClearanceGrid(clearance_of(occ | maps.OUTSIDE, maps.CELL_M, 2.0)[0], tuple(maps.ORIGIN), maps.CELL_M, floor_m, start)
+    return rrt.ClearanceGrid(
+        clearance_of(occ | maps.OUTSIDE, maps.CELL_M, 2.0)[0], tuple(maps.ORIGIN), maps.CELL_M, floor_m, start
+    )
 
 
 def cluttered(seed):
@@ -103,14 +106,20 @@ def test_straightening_never_costs_more():
     is_valid = grid.checker((start, goal))
     raw = rrt.solve_rrt(start, goal, grid, is_valid, 4000, 11, 1.0)
     assert raw is not None
-    own = [sum(grid.line_cost(a, b, 0.1) for a, b in pairwise(p)) for p in (raw, rrt._straightened(raw, grid, 0.1))]
+    own = [
+        sum(grid.line_cost(a, b, 0.1) for a, b in pairwise(p))
+        for p in (raw, rrt._straightened(raw, grid, 0.1))
+    ]
     assert own[1] <= own[0] and len(rrt._straightened(raw, grid, 0.1)) < len(raw)
 
 
 def serve(s, config=CONFIG, seed=1):
     fallback = rrt.RouteFallback(config)
     parts = (s.route, s.clearance, s.grid_map, s.mask, s.forecast, s.mission, s.ego, s.clock, config)
-    return fallback.serve(SimpleNamespace(route=io_for(RouteIO, *parts), voronoi=io_for(VoronoiIO, *parts)), lambda env: seed + env)
+    return fallback.serve(
+        SimpleNamespace(route=io_for(RouteIO, *parts), voronoi=io_for(VoronoiIO, *parts)),
+        lambda env: seed + env,
+    )
 
 
 def narrow_gap():
@@ -156,7 +165,11 @@ def test_rrt_takes_over(reason):
         assert np.linalg.norm(np.diff(way, axis=0), axis=1).max() <= config.route.spacing_m * (1 + 2e-4)
         clearance = s.clearance.clearance_m.to_numpy()[env]
         assert (clearance[crossed_cells(way)] >= FLOOR_M - EDGE_M).all()
-        assert s.route.planner[env] == codes.PLANNER_RRT and s.route.planned_by[env, 1] == 1 and s.route.kept[env] == 0
+        assert (
+            s.route.planner[env] == codes.PLANNER_RRT
+            and s.route.planned_by[env, 1] == 1
+            and s.route.kept[env] == 0
+        )
     assert s.route.n_way[0] == 0
 
 

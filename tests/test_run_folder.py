@@ -75,7 +75,7 @@ def test_write_atomic_replaces(tmp_path):
     assert files_in(tmp_path) == ["deep/file.bin"]
 
 
-# ------------------------------------------------------------------------------------------------------- one process at a time
+# -------------------------------------------------------------------------------------- one process at a time
 
 
 def at_once(n, work):
@@ -121,7 +121,9 @@ def test_of_two_processes_that_begin_in_one_folder_exactly_one_does(tmp_path):
         sys.stdin.readline()
     """
     command = [sys.executable, "-c", script, str(tmp_path / "run")]
-    both = [subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    both = [
+        subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) for _ in range(2)
+    ]
     assert [one.stdout.readline() for one in both] == ["ready\n"] * 2
     for one in both:
         one.stdin.write("\n")
@@ -164,7 +166,9 @@ def test_an_evaluation_holds_its_folder(tmp_path, monkeypatch):
     from uuvtai.measure import compare
 
     made = []
-    monkeypatch.setattr(compare, "RunFolder", lambda *arguments: made.append(RunFolder(*arguments)) or made[0])
+    monkeypatch.setattr(
+        compare, "RunFolder", lambda *arguments: made.append(RunFolder(*arguments)) or made[0]
+    )
     monkeypatch.setattr(compare, "_methods", lambda *_: [])
     monkeypatch.setattr(compare, "_any_tree", lambda: None)
     monkeypatch.setattr("uuvtai.sim.Sim", lambda *_: SimpleNamespace(device=torch.device("cpu")))
@@ -179,7 +183,9 @@ def test_an_evaluation_holds_its_folder(tmp_path, monkeypatch):
         raise LookupError("seen")
 
     monkeypatch.setattr("uuvtai.measure.ceilings.scenarios_of", scenarios)
-    request = compare.Request(load_config("pool"), "pool", "paper", ["oracle"], [77], 1, run_dir=tmp_path / "run")
+    request = compare.Request(
+        load_config("pool"), "pool", "paper", ["oracle"], [77], 1, run_dir=tmp_path / "run"
+    )
     with pytest.raises(LookupError, match="seen"):
         compare.compare(request, Watch())
     RunFolder.held(tmp_path / "run").release()
@@ -200,7 +206,7 @@ def test_default_names_do_not_collide(tmp_path, monkeypatch):
         default_run_dir("pool")
 
 
-# ------------------------------------------------------------------------------------------------------------------- links
+# ------------------------------------------------------------------------------------------------------ links
 
 
 def test_the_temporary_neighbour_is_never_somebody_elses_file(tmp_path, monkeypatch):
@@ -227,7 +233,10 @@ def test_nothing_is_written_through_a_link_that_came_later(tmp_path, name):
 def test_what_a_kill_left_half_written_is_swept_when_the_run_goes_on(tmp_path):
     RunFolder(tmp_path / "run", load_config("pool"), [0]).finish("interrupted", 130)
     left = tmp_path / "run" / "eval" / ".result.json.4711.0a1b2c3d.tmp"
-    theirs = [tmp_path / "run" / name for name in (".notes.tmp", "result.json.4711.0a1b2c3d.tmp", ".a.1.0a1b2c3d.tmp.txt")]
+    theirs = [
+        tmp_path / "run" / name
+        for name in (".notes.tmp", "result.json.4711.0a1b2c3d.tmp", ".a.1.0a1b2c3d.tmp.txt")
+    ]
     left.parent.mkdir()
     for file in (left, *theirs):
         file.write_text("{")

@@ -6,7 +6,10 @@ from uuvtai.config.learning import DistillConfig
 from uuvtai.learn.schedule import piecewise_linear
 
 
-@pytest.mark.parametrize(("fraction", "value"), [(-1.0, 2.0), (0.0, 2.0), (0.25, 3.0), (0.5, 4.0), (0.75, 3.0), (1.0, 2.0), (5.0, 2.0)])
+@pytest.mark.parametrize(
+    ("fraction", "value"),
+    [(-1.0, 2.0), (0.0, 2.0), (0.25, 3.0), (0.5, 4.0), (0.75, 3.0), (1.0, 2.0), (5.0, 2.0)],
+)
 def test_linear_in_between_constant_outside(fraction, value):
     assert piecewise_linear([(0.0, 2.0), (0.5, 4.0), (1.0, 2.0)], fraction) == value
 
@@ -21,9 +24,12 @@ def test_one_point_is_a_constant():
     assert [piecewise_linear([(0.3, 0.2)], f) for f in (0.0, 0.3, 1.0)] == [0.2] * 3
 
 
-@pytest.mark.parametrize(("iteration", "value"), [(0, 1.0), (799, 1.0), (800, 0.2), (1200, 0.1), (1600, 0.0), (1700, 0.0)])
+@pytest.mark.parametrize(
+    ("iteration", "value"), [(0, 1.0), (799, 1.0), (800, 0.2), (1200, 0.1), (1600, 0.0), (1700, 0.0)]
+)
 def test_the_paper_s_schedule(iteration, value):
-    """Equation of lambda_t: 1 until 800, then from 0.2 down to 0 at 1600 of 1200 iterations, which a run never reaches."""
+    """Equation of lambda_t: 1 until 800, then from 0.2 down to 0 at 1600 of 1200 iterations, which a run
+    never reaches."""
     assert piecewise_linear(DistillConfig().schedule, iteration / 1200) == pytest.approx(value, abs=1e-12)
 
 

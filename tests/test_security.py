@@ -1,7 +1,8 @@
-"""No file can make uuv execute code, fill the memory, or write outside its folder by being opened: each way is tried.
+"""No file can make uuv execute code, fill the memory, or write outside its folder by being opened: each way
+is tried.
 
-Every attack that executes would leave the file ``executed`` behind. Bombs are checked by what refuses them: without it they would run for
-hours or take all memory.
+Every attack that executes would leave the file ``executed`` behind. Bombs are checked by what refuses them:
+without it they would run for hours or take all memory.
 """
 
 import ast
@@ -88,7 +89,8 @@ def test_the_exploit_would_work(tmp_path, monkeypatch):
 
 
 def test_nothing_in_the_package_can_execute_what_it_reads():
-    """Calls that turn data into code do not occur; YAML is loaded by our own safe loader alone, NumPy without pickles."""
+    """Calls that turn data into code do not occur; YAML is loaded by our own safe loader alone, NumPy without
+    pickles."""
     forbidden = {
         "eval",
         "exec",
@@ -103,7 +105,15 @@ def test_nothing_in_the_package_can_execute_what_it_reads():
         "os.popen",
         "torch.load",
     }
-    forbidden |= {"np.load", "yaml.unsafe_load", "yaml.full_load", "yaml.load_all", "torch.jit.load", "runpy", "tarfile"}
+    forbidden |= {
+        "np.load",
+        "yaml.unsafe_load",
+        "yaml.full_load",
+        "yaml.load_all",
+        "torch.jit.load",
+        "runpy",
+        "tarfile",
+    }
     found, yaml_loads, imports = [], [], []
     for path in PACKAGE.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
@@ -114,12 +124,19 @@ def test_nothing_in_the_package_can_execute_what_it_reads():
                 name = ast.unparse(node.func)
                 found += [f"{path.name}:{node.lineno} {name}"] if name in forbidden else []
                 yaml_loads += [ast.unparse(node)] if name == "yaml.load" else []
-                imports += [(path.name, ast.unparse(node.args[0]))] if name == "importlib.import_module" else []
+                imports += (
+                    [(path.name, ast.unparse(node.args[0]))] if name == "importlib.import_module" else []
+                )
                 assert not any(word.arg == "shell" for word in node.keywords), f"{path.name}:{node.lineno}"
-                assert not any(word.arg == "allow_pickle" and ast.unparse(word.value) != "False" for word in node.keywords)
+                assert not any(
+                    word.arg == "allow_pickle" and ast.unparse(word.value) != "False"
+                    for word in node.keywords
+                )
     assert not found
     assert yaml_loads == ["yaml.load(text, Loader=_SafeLoader)"]
-    assert {name for name, _ in imports} <= {"doctor.py", "convert.py", "__init__.py"}, "modules are never imported by names from files"
+    assert {name for name, _ in imports} <= {"doctor.py", "convert.py", "__init__.py"}, (
+        "modules are never imported by names from files"
+    )
 
 
 READERS = {
@@ -130,7 +147,11 @@ READERS = {
 """files that may open others themselves, and why"""
 SYSTEM = {"run_folder.py": "/proc/cpuinfo", "sizes.py": "/proc/meminfo"}
 """files that read one file of the system, by its name"""
-OWN_FILES = {"logs/container.py": "os.open", "logs/film.py": "os.open av.open", "deploy/export.py": "Path(run_policy.__file__).read_bytes"}
+OWN_FILES = {
+    "logs/container.py": "os.open",
+    "logs/film.py": "os.open av.open",
+    "deploy/export.py": "Path(run_policy.__file__).read_bytes",
+}
 """files that open what they have just written, or what lies in the package, by these calls"""
 OPENS = {
     "open",
@@ -166,8 +187,15 @@ def reads_of(tree):
         if isinstance(node, ast.Call):
             name = ast.unparse(node.func)
             last = name.rpartition(".")[2]
-            writes = last == "open" and any(isinstance(a, ast.Constant) and str(a.value).startswith("w") for a in node.args)
-            if name not in ours and not name.startswith("files.") and not writes and (last in OPENS or name in PARSES):
+            writes = last == "open" and any(
+                isinstance(a, ast.Constant) and str(a.value).startswith("w") for a in node.args
+            )
+            if (
+                name not in ours
+                and not name.startswith("files.")
+                and not writes
+                and (last in OPENS or name in PARSES)
+            ):
                 yield node.lineno, name
 
 
@@ -216,7 +244,7 @@ def test_yaml_is_loaded_in_one_place():
         assert "from yaml" not in path.read_text(), path
 
 
-# -------------------------------------------------------------------------------------------------------------------- YAML
+# ------------------------------------------------------------------------------------------------------- YAML
 
 TAGS = [
     "world: !!python/object/apply:builtins.open ['executed', 'w']",
@@ -246,7 +274,8 @@ def test_yaml_tags_are_refused_in_every_kind_of_file(here, text, capfd):
 
 
 YAML_BOMBS = {
-    "billion laughs": "a: &a [1]\n" + "\n".join(f"{chr(98 + i)}: &{chr(98 + i)} [{','.join([f'*{chr(97 + i)}'] * 9)}]" for i in range(9)),
+    "billion laughs": "a: &a [1]\n"
+    + "\n".join(f"{chr(98 + i)}: &{chr(98 + i)} [{','.join([f'*{chr(97 + i)}'] * 9)}]" for i in range(9)),
     "merged into itself": "a: &a\n  <<: *a\n",
     "nested": "[" * 200_000,
     "nested maps": "a: " + "{a: " * 100_000,
@@ -271,14 +300,16 @@ def test_yaml_from_elsewhere_is_bounded_too():
         parsed_yaml("#" * (2 << 20), "an attachment")
 
 
-# --------------------------------------------------------------------------------------------------------------------- XML
+# -------------------------------------------------------------------------------------------------------- XML
 
 TREE = '<root BTCPP_format="4"><BehaviorTree ID="m">{}</BehaviorTree></root>'
 ENTITIES = {
-    "billion laughs": '<!DOCTYPE r [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;"><!ENTITY c "&b;&b;&b;&b;">]>' + TREE.format("&c;"),
+    "billion laughs": '<!DOCTYPE r [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;"><!ENTITY c "&b;&b;&b;&b;">]>'
+    + TREE.format("&c;"),
     "a file from outside": '<!DOCTYPE r [<!ENTITY x SYSTEM "file:///etc/passwd">]>' + TREE.format("&x;"),
     "a DTD from outside": '<!DOCTYPE r SYSTEM "http://127.0.0.1:9/evil.dtd">' + TREE.format("<FollowRoute/>"),
-    "parameter entities": '<!DOCTYPE r [<!ENTITY % x SYSTEM "file:///etc/passwd"> %x;]>' + TREE.format("<FollowRoute/>"),
+    "parameter entities": '<!DOCTYPE r [<!ENTITY % x SYSTEM "file:///etc/passwd"> %x;]>'
+    + TREE.format("<FollowRoute/>"),
     "an undeclared entity": TREE.format("&x;"),
 }
 
@@ -310,13 +341,18 @@ def test_xml_bombs(here):
         read_tree(str(here / "big.xml"))
 
 
-# -------------------------------------------------------------------------------------------------------------- checkpoints
+# ------------------------------------------------------------------------------------------------ checkpoints
 
 
 def forged(path, name, content):
     """Other content for a file of a checkpoint, with the right size and sha256 in the manifest."""
     (path / name).write_bytes(content)
-    rewritten(path, lambda document: document["files"].update({name: {"bytes": len(content), "sha256": sha256_of(path / name)}}))
+    rewritten(
+        path,
+        lambda document: document["files"].update(
+            {name: {"bytes": len(content), "sha256": sha256_of(path / name)}}
+        ),
+    )
 
 
 def rewritten(path, change):
@@ -330,7 +366,10 @@ def torch_saved(folder):
     return (folder / "m.pt").read_bytes()
 
 
-@pytest.mark.parametrize("content", [lambda _f: pickle.dumps(Exploit()), torch_saved, lambda _f: pickle.dumps(Exploit(), protocol=0)])
+@pytest.mark.parametrize(
+    "content",
+    [lambda _f: pickle.dumps(Exploit()), torch_saved, lambda _f: pickle.dumps(Exploit(), protocol=0)],
+)
 @pytest.mark.parametrize("name", ["model.safetensors", "manifest.json"])
 def test_a_pickle_as_a_checkpoint(here, name, content, capfd):
     path = deployed.saved(here / "run").path
@@ -345,7 +384,8 @@ def test_a_pickle_as_a_checkpoint(here, name, content, capfd):
 
 
 def test_networks_wider_than_their_file_are_refused_before_they_are_made(here):
-    """A manifest of a few bytes must not make a network of terabytes, nor one whose initial weights take days."""
+    """A manifest of a few bytes must not make a network of terabytes, nor one whose initial weights take
+    days."""
     path = deployed.saved(here / "run").path
 
     def wide(document):
@@ -374,14 +414,17 @@ def test_a_compressed_simulator_state_cannot_unfold(here):
         read_stream(here / "s.zst", [("x", "uint8", [1000])])
 
 
-# -------------------------------------------------------------------------------------------------------------- run folders
+# ------------------------------------------------------------------------------------------------ run folders
 
 
 WRITTEN = [
-    ".lock", "run.json", "config.yaml", "metrics.jsonl", "cells.jsonl", "sweep.json", "sweep_request.json", "reproduce.json", "report.html",
+    ".lock", "run.json", "config.yaml", "metrics.jsonl", "cells.jsonl", "sweep.json", "sweep_request.json",
+    "reproduce.json", "report.html",
     "profile.json", "checkpoints", "checkpoints/step_000002", "checkpoints/step_000002/model.safetensors",
-    "checkpoints/.partial-step_000003.1", "eval", "eval/result.json", "eval/tree.json", "eval/trees", "eval/trees/bt.xml", "figures",
-    "figures/methods.png", "pictures", "pictures/x.png", "videos", "videos/x.webm", "explain", "explain/x.png", "logs", "logs/x.mcap",
+    "checkpoints/.partial-step_000003.1", "eval", "eval/result.json", "eval/tree.json", "eval/trees",
+    "eval/trees/bt.xml", "figures",
+    "figures/methods.png", "pictures", "pictures/x.png", "videos", "videos/x.webm", "explain",
+    "explain/x.png", "logs", "logs/x.mcap",
     "tensorboard", "tensorboard/events.out.tfevents.1", "anything/else",
 ]  # fmt: skip
 """what a run folder may hold, and what a resumed run, a report or an evaluation writes or deletes there"""
@@ -391,7 +434,14 @@ def precious(here):
     """A folder outside, and a file in it, that nobody may touch."""
     (here / "outside" / "step_000001").mkdir(parents=True)
     (here / "outside" / ".partial-x").mkdir()
-    for name in ("file", "methods.png", "result.json", "step_000001/manifest.json", ".partial-x/model.safetensors", "manifest.json"):
+    for name in (
+        "file",
+        "methods.png",
+        "result.json",
+        "step_000001/manifest.json",
+        ".partial-x/model.safetensors",
+        "manifest.json",
+    ):
         (here / "outside" / name).write_text('{"iteration": 9}\n{"cut')
     return here / "outside", here / "outside" / "file"
 
@@ -423,7 +473,15 @@ def with_link(here, name):
         lambda run: report([run], run.parent / "new.html"),
         lambda run: report([run, run], run.parent / "new.html", force=True),
     ],
-    ids=["reopen", "train --resume", "sweep --resume", "reproduce --resume", "report", "report --out", "several"],
+    ids=[
+        "reopen",
+        "train --resume",
+        "sweep --resume",
+        "reproduce --resume",
+        "report",
+        "report --out",
+        "several",
+    ],
 )
 def test_a_link_in_a_run_folder_is_neither_read_nor_written_nor_deleted_through(here, name, open_it):
     run, before = with_link(here, name)
@@ -478,7 +536,15 @@ def fill(path, kind):
     make[kind]()
 
 
-READ = ["run.json", "config.yaml", "metrics.jsonl", "sweep.json", "profile.json", "reproduce.json", "eval/result.json"]
+READ = [
+    "run.json",
+    "config.yaml",
+    "metrics.jsonl",
+    "sweep.json",
+    "profile.json",
+    "reproduce.json",
+    "eval/result.json",
+]
 
 
 @pytest.mark.parametrize("kind", ["pipe", "endless link", "folder", "sparse"])
@@ -514,13 +580,17 @@ def test_a_picture_that_is_a_link_is_never_embedded(here):
 
 
 ODD = {
-    "nothing": b"", "a list": b"[]", "a number": b"3", "deep": b'{"argv": ' + b"[" * 10_000 + b"]" * 10_000 + b"}",
+    "nothing": b"", "a list": b"[]", "a number": b"3",
+    "deep": b'{"argv": ' + b"[" * 10_000 + b"]" * 10_000 + b"}",
     "deep objects": b'{"a":' * 100_000 + b"1" + b"}" * 100_000,
-    "a pickle": pickle.dumps(Exploit()), "not UTF-8": b'{"started": "\xff"}', "infinite": b'{"wall_s": 1e999}', "NaN": b'{"wall_s": NaN}',
+    "a pickle": pickle.dumps(Exploit()), "not UTF-8": b'{"started": "\xff"}',
+    "infinite": b'{"wall_s": 1e999}', "NaN": b'{"wall_s": NaN}',
     "half a character": b'{"started": "\\ud800"}', "many digits": b'{"wall_s": ' + b"9" * 4000 + b"}",
     "wall_s": b'{"wall_s": [1]}', "argv": b'{"argv": 3}', "argv of lists": b'{"argv": [[1], {"a": 2}, null]}',
     "hardware": b'{"hardware": 3, "versions": "none"}', "hardware as a list": b'{"hardware": ["cpu"]}',
-    "seeds": b'{"seeds": 7}', "seeds null": b'{"seeds": null}', "resumed": b'{"resumed": [3]}', "status": b'{"status": {"a": []}}',
+    "seeds": b'{"seeds": 7}', "seeds null": b'{"seeds": null}', "resumed": b'{"resumed": '
+                                                                           b'[3]}',
+                                                                           "status": b'{"status": {"a": []}}',
     "a million lists": b'{"argv": [' + b"[]," * 2_000_000 + b"[]]}",
 }  # fmt: skip
 
@@ -539,13 +609,16 @@ def test_an_odd_record_is_one_line_or_a_page(here, content):
 
 def test_the_config_of_a_run_is_read_by_our_own_loader(here):
     """PyYAML's own loader takes hours over a number to the base of 60."""
-    run = samples.write_run(here / "run", metrics=samples.metrics(3), config="train:\n  seed: 1" + ":1" * 400_000)
+    run = samples.write_run(
+        here / "run", metrics=samples.metrics(3), config="train:\n  seed: 1" + ":1" * 400_000
+    )
     with pytest.raises(ConfigError, match=r"config\.yaml"):
         report([run])
 
 
 @pytest.mark.parametrize(
-    "content", [pickle.dumps(Exploit()), b"[" * 200_000, b'{"use": 3}', b'{"use": {"bt": [{"share": "much"}]}}', b"[]"]
+    "content",
+    [pickle.dumps(Exploit()), b"[" * 200_000, b'{"use": 3}', b'{"use": {"bt": [{"share": "much"}]}}', b"[]"],
 )
 def test_records_of_an_evaluation_are_read_without_trust(here, content, capfd):
     (here / "eval" / "trees").mkdir(parents=True)
@@ -556,7 +629,10 @@ def test_records_of_an_evaluation_are_read_without_trust(here, content, capfd):
 
 @pytest.mark.parametrize(
     "content",
-    [b'{"use": {"bt": [{"share": 1e999, "ticks": 1, "acted": 1}]}}', b'{"use": {"bt": [{"share": 1, "ticks": 1e999, "acted": 1}]}}'],
+    [
+        b'{"use": {"bt": [{"share": 1e999, "ticks": 1, "acted": 1}]}}',
+        b'{"use": {"bt": [{"share": 1, "ticks": 1e999, "acted": 1}]}}',
+    ],
 )
 def test_numbers_of_an_evaluation_are_numbers(here, content):
     (here / "eval" / "trees").mkdir(parents=True)
@@ -595,7 +671,7 @@ def test_the_record_of_a_run_is_read_without_trust(here, content):
         RunFolder.reopen(here, {})
 
 
-# --------------------------------------------------------------------------------------------------------- exported policies
+# ------------------------------------------------------------------------------------------ exported policies
 
 
 @pytest.fixture(scope="module")
@@ -625,7 +701,9 @@ def deflated_npz(path):
 def claiming_npz(path):
     """An array that claims to have 2^50 values."""
     with zipfile.ZipFile(path, "w") as archive, archive.open("obs.npy", "w") as member:
-        np.lib.format.write_array_header_1_0(member, {"descr": "<f4", "fortran_order": False, "shape": (1 << 50,)})
+        np.lib.format.write_array_header_1_0(
+            member, {"descr": "<f4", "fortran_order": False, "shape": (1 << 50,)}
+        )
 
 
 def lying_npz(path):
@@ -639,7 +717,14 @@ def lying_npz(path):
 
 
 @pytest.mark.parametrize(
-    "make", [objects_npz, deflated_npz, claiming_npz, lying_npz, lambda path: path.write_bytes(pickle.dumps(Exploit()))]
+    "make",
+    [
+        objects_npz,
+        deflated_npz,
+        claiming_npz,
+        lying_npz,
+        lambda path: path.write_bytes(pickle.dumps(Exploit())),
+    ],
 )
 def test_golden_pairs_are_neither_pickles_nor_bombs(folder, make, capfd):
     make(folder / "golden.npz")
@@ -656,7 +741,9 @@ def test_the_driver_of_a_folder_is_never_executed_by_its_check(folder):
 def test_files_outside_an_exported_folder_are_never_opened(folder, capfd):
     spec = json.loads((folder / "policy_spec.json").read_text())
     for name in ("../../etc/passwd", "/etc/passwd", "sub/policy.onnx"):
-        (folder / "policy_spec.json").write_text(json.dumps(spec | {"files": spec["files"] | {name: "0" * 64}}))
+        (folder / "policy_spec.json").write_text(
+            json.dumps(spec | {"files": spec["files"] | {name: "0" * 64}})
+        )
         assert run_cli("export", "--check", folder) == 2
         assert "lists other files" in capfd.readouterr().err
 
@@ -665,23 +752,33 @@ def test_graphs_that_reach_beyond_themselves_are_refused():
     onnx = pytest.importorskip("onnx", reason="needs the extra uuvtai[export]")
     helper, tensor = onnx.helper, onnx.TensorProto
     value = helper.make_tensor_value_info("obs", tensor.FLOAT, [1])
-    outside = onnx.TensorProto(name="w", data_type=tensor.FLOAT, dims=[1], data_location=onnx.TensorProto.EXTERNAL)
+    outside = onnx.TensorProto(
+        name="w", data_type=tensor.FLOAT, dims=[1], data_location=onnx.TensorProto.EXTERNAL
+    )
     outside.external_data.add(key="location", value="../../etc/passwd")
     body = helper.make_graph([], "b", [], [])
-    pairs = {f"pair_{name}": np.zeros((2, 4), np.float32) for name in ("obs", "last_obs", "last_action", "has_last")}
+    pairs = {
+        f"pair_{name}": np.zeros((2, 4), np.float32)
+        for name in ("obs", "last_obs", "last_action", "has_last")
+    }
     graphs = {
-        "evil.Run": helper.make_graph([helper.make_node("Run", ["obs"], ["out"], domain="evil")], "g", [value], []),
+        "evil.Run": helper.make_graph(
+            [helper.make_node("Run", ["obs"], ["out"], domain="evil")], "g", [value], []
+        ),
         "onnx.Loop": helper.make_graph([helper.make_node("Loop", ["", ""], [], body=body)], "g", [value], []),
         "has w": helper.make_graph([], "g", [value], [], initializer=[outside]),
     }
     for says, graph in graphs.items():
         with pytest.raises(RuntimeError, match=says):
-            of_onnx(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)]).SerializeToString(), pairs)
+            of_onnx(
+                helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)]).SerializeToString(),
+                pairs,
+            )
     with pytest.raises(RuntimeError, match="is no ONNX graph"):
         of_onnx(pickle.dumps(Exploit()), pairs)
 
 
-# -------------------------------------------------------------------------------------------------------------------- logs
+# ------------------------------------------------------------------------------------------------------- logs
 
 
 def chunk_of(data, unpacked_size):
@@ -692,7 +789,14 @@ def chunk_of(data, unpacked_size):
 END = struct.pack("<BQI", 0x0F, 4, 0)
 """end of the data"""
 
-COMMANDS = (("log", "info"), ("log", "export", "--out", "out"), ("log", "repair"), ("log", "picture"), ("log", "video"), ("log", "convert"))
+COMMANDS = (
+    ("log", "info"),
+    ("log", "export", "--out", "out"),
+    ("log", "repair"),
+    ("log", "picture"),
+    ("log", "video"),
+    ("log", "convert"),
+)
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command[1])
@@ -725,11 +829,25 @@ def test_many_chunks_that_unfold_together(here, monkeypatch):
 
 
 def test_names_of_attachments_and_topics_stay_inside(here, capfd):
-    names = ["../../evil", "/tmp/evil_absolute", "..\\..\\evil", "a/../../b", "..", ".", "", "\0x", "C:\\evil", "~/.bashrc", "x\n--flag"]
+    names = [
+        "../../evil",
+        "/tmp/evil_absolute",
+        "..\\..\\evil",
+        "a/../../b",
+        "..",
+        ".",
+        "",
+        "\0x",
+        "C:\\evil",
+        "~/.bashrc",
+        "x\n--flag",
+    ]
     file = McapFile(here / "a.mcap")
     for name in names:
         file.add_attachment(name, "text/plain", b"x")
-        file.add_message(file.add_channel(f"/{name}", file.add_schema("s", "jsonschema", b"{}")), 0, b'{"x": 1}')
+        file.add_message(
+            file.add_channel(f"/{name}", file.add_schema("s", "jsonschema", b"{}")), 0, b'{"x": 1}'
+        )
     file.finish()
     assert run_cli("log", "export", here / "a.mcap", "--out", here / "deep" / "out") == 0
     written = {path for path in here.rglob("*") if path.is_file()} - {here / "a.mcap"}
@@ -742,7 +860,9 @@ def test_names_of_attachments_and_topics_stay_inside(here, capfd):
 def log_with(path, scenario=None, attachments=(), poses=((0.0, 1.0),)):
     """A log with a scenario and poses (time [s], x)."""
     file = McapFile(path)
-    file.add_attachment("scenario.json", "application/json", json.dumps(scenario or episode.scenario()).encode())
+    file.add_attachment(
+        "scenario.json", "application/json", json.dumps(scenario or episode.scenario()).encode()
+    )
     for name, data in attachments:
         file.add_attachment(name, "", data)
     channel = file.add_channel("/pose", file.add_schema("foxglove.PoseInFrame", "jsonschema", b"{}"))
@@ -758,8 +878,12 @@ def changed(**keys):
 
 
 DRAWN = {
-    "a huge tank": changed(tank={"shape": "rectangle", "x_m": [0, 1e9], "y_m": [0, 6], "z_m": [-1, 0], "radius_m": 1}),
-    "a tank turned inside out": changed(tank={"shape": "rectangle", "x_m": [1, 0], "y_m": [0, 6], "z_m": [-1, 0], "radius_m": 1}),
+    "a huge tank": changed(
+        tank={"shape": "rectangle", "x_m": [0, 1e9], "y_m": [0, 6], "z_m": [-1, 0], "radius_m": 1}
+    ),
+    "a tank turned inside out": changed(
+        tank={"shape": "rectangle", "x_m": [1, 0], "y_m": [0, 6], "z_m": [-1, 0], "radius_m": 1}
+    ),
     "no tank": changed(tank={}),
     "a tank of words": changed(tank={"shape": "rectangle", "x_m": ["a", "b"], "y_m": [0, 6]}),
     "bodies at the end of the world": changed(bodies=[episode.BODIES[0] | {"position": [1e300, 0, 0]}]),
@@ -794,7 +918,12 @@ def png(width, height):
 
 @pytest.mark.parametrize(
     ("content", "says"),
-    [(png(40_000, 40_000), "claims 40000 x 40000"), (png(8, 8), "is damaged"), (b"GIF89a", "is not a PNG"), (b"", "is not a PNG")],
+    [
+        (png(40_000, 40_000), "claims 40000 x 40000"),
+        (png(8, 8), "is damaged"),
+        (b"GIF89a", "is not a PNG"),
+        (b"", "is not a PNG"),
+    ],
 )
 def test_images_that_unfold(content, says):
     with pytest.raises(LogError, match=says):
@@ -811,8 +940,15 @@ def test_a_config_within_a_log_is_yaml_without_tags(here, text, capfd):
 
 def test_names_in_a_log_cannot_steer_the_terminal(here, capfd):
     file = McapFile(here / "a.mcap")
-    for topic in ("/\x1b]52;c;ZXZpbA==\x07", "/[link=file:///etc/passwd]x[/link]", "/[/nothing]", "/\x9b31m\u202e"):
-        file.add_message(file.add_channel(topic, file.add_schema("\x1b[2J", "jsonschema", b"{}")), 0, b"not json")
+    for topic in (
+        "/\x1b]52;c;ZXZpbA==\x07",
+        "/[link=file:///etc/passwd]x[/link]",
+        "/[/nothing]",
+        "/\x9b31m\u202e",
+    ):
+        file.add_message(
+            file.add_channel(topic, file.add_schema("\x1b[2J", "jsonschema", b"{}")), 0, b"not json"
+        )
     file.add_metadata("uuv.result", {"outcome": "\x1b[31m[/x]"})
     file.finish()
     assert run_cli("log", "info", here / "a.mcap") == 0
@@ -824,6 +960,10 @@ def test_names_in_a_log_cannot_steer_the_terminal(here, capfd):
 
 def test_the_reader_of_safetensors_is_the_only_one_that_run_policy_has():
     """The driver that goes to the vehicle reads with NumPy; it must not have a way to load pickles."""
-    names = {ast.unparse(node.func) for node in ast.walk(ast.parse(Path(run_policy.__file__).read_text())) if isinstance(node, ast.Call)}
+    names = {
+        ast.unparse(node.func)
+        for node in ast.walk(ast.parse(Path(run_policy.__file__).read_text()))
+        if isinstance(node, ast.Call)
+    }
     assert not names & {"np.load", "np.lib.format.read_array", "pickle.load", "pickle.loads"}
     assert "np.frombuffer" in names

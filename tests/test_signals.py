@@ -1,4 +1,5 @@
-"""SIGINT and SIGTERM: heard from the first line on, alike, without a traceback, and nothing half-written stays."""
+"""SIGINT and SIGTERM: heard from the first line on, alike, without a traceback, and nothing half-written
+stays."""
 
 import json
 import os
@@ -24,7 +25,9 @@ BOTH = [signal.SIGINT, signal.SIGTERM]
 def started(folder, *arguments, program=None):
     """A command whose handlers are in place: what Python does before its first line is not ours."""
     command = [sys.executable, "-c", program] if program else [sys.executable, "-m", "uuvtai", *arguments]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder, env=ENVIRONMENT)
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder, env=ENVIRONMENT
+    )
     deadline = time.monotonic() + 60
     while process.poll() is None and not catches(process.pid, signal.SIGTERM) and time.monotonic() < deadline:
         time.sleep(0.001)
@@ -53,9 +56,12 @@ def ended(process, number):
 @pytest.mark.parametrize(
     "arguments",
     [
-        ("eval", "--episodes", "4", "--run-dir", "run"), ("train", "smoke", "--run-dir", "run"), ("simulate", "--seconds", "1"),
-        ("sweep", "--grid", "D=0,3", "--run-dir", "run"), ("profile",), ("report", "nowhere"), ("export", "best", "--out", "out"),
-        ("presets",), ("doctor",), ("tree",), ("log", "info", "nowhere.mcap"), ("reproduce", "--run-dir", "run"),
+        ("eval", "--episodes", "4", "--run-dir", "run"), ("train", "smoke", "--run-dir", "run"),
+        ("simulate", "--seconds", "1"),
+        ("sweep", "--grid", "D=0,3", "--run-dir", "run"), ("profile",), ("report", "nowhere"),
+        ("export", "best", "--out", "out"),
+        ("presets",), ("doctor",), ("tree",), ("log", "info", "nowhere.mcap"),
+        ("reproduce", "--run-dir", "run"),
     ],
 )  # fmt: skip
 def test_a_command_that_begins_ends_at_once_and_leaves_nothing(tmp_path, arguments, number):
@@ -65,14 +71,18 @@ def test_a_command_that_begins_ends_at_once_and_leaves_nothing(tmp_path, argumen
     code, err = ended(process, number)
     assert code in (128 + number, 0, 2), err
     assert not [
-        path for path in tmp_path.rglob("*") if path.is_file() and (path.name.endswith((".tmp", ".part")) or ".partial" in path.name)
+        path
+        for path in tmp_path.rglob("*")
+        if path.is_file() and (path.name.endswith((".tmp", ".part")) or ".partial" in path.name)
     ]
 
 
 @pytest.mark.parametrize("number", BOTH)
 def test_while_nothing_is_kept_it_ends_in_the_middle_of_an_import(tmp_path, number):
     program = "from uuvtai import signals; signals.install(); import slow"
-    (tmp_path / "slow.py").write_text("import time\ntry:\n    time.sleep(30)\nexcept BaseException:\n    pass\nprint('went on')\n")
+    (tmp_path / "slow.py").write_text(
+        "import time\ntry:\n    time.sleep(30)\nexcept BaseException:\n    pass\nprint('went on')\n"
+    )
     process = started(tmp_path, program=program)
     time.sleep(0.2)
     process.send_signal(number)
@@ -106,10 +116,15 @@ sys.exit(guarded(work))
 )
 def test_what_is_kept_is_tidied_up(tmp_path, number, work):
     (tmp_path / "slow.py").write_text(
-        "import time\ntry:\n    time.sleep(1)\nexcept BaseException:\n    print('swallowed')\n    raise ImportError\n"
+        "import time\ntry:\n    time.sleep(1)\nexcept BaseException:\n    print('swallowed')\n    raise "
+        "ImportError\n"
     )
-    (tmp_path / "collecting.py").write_text("import time\nclass Slow:\n    def __del__(self):\n        time.sleep(1)\nSlow()\n")
-    process = started(tmp_path, program=KEEPS.format(work=work + ("" if "sleep" in work else "; time.sleep(30)")))
+    (tmp_path / "collecting.py").write_text(
+        "import time\nclass Slow:\n    def __del__(self):\n        time.sleep(1)\nSlow()\n"
+    )
+    process = started(
+        tmp_path, program=KEEPS.format(work=work + ("" if "sleep" in work else "; time.sleep(30)"))
+    )
     time.sleep(0.4)
     process.send_signal(number)
     code, err = ended(process, number)
@@ -119,12 +134,17 @@ def test_what_is_kept_is_tidied_up(tmp_path, number, work):
 @pytest.mark.parametrize("number", BOTH)
 def test_the_second_one_does_not_wait_for_compiled_code(tmp_path, number):
     """A sleep in C that holds the interpreter, as Taichi's compiler does."""
-    work = "import ctypes; print('now', flush=True); ctypes.PyDLL(None).sleep(20); [ctypes.PyDLL(None).sleep(20) for _ in range(3)]"
+    work = (
+        "import ctypes; print('now', flush=True); ctypes.PyDLL(None).sleep(20); "
+        "[ctypes.PyDLL(None).sleep(20) for _ in range(3)]"
+    )
     process = started(tmp_path, program=KEEPS.format(work=work))
     assert process.stdout.readline() == "now\n"
     time.sleep(0.3)
     begun = time.monotonic()
-    process.send_signal(signal.SIGWINCH)  # PyDLL's sleep ends with any signal that has a handler; this one has none
+    process.send_signal(
+        signal.SIGWINCH
+    )  # PyDLL's sleep ends with any signal that has a handler; this one has none
     for _ in range(2):
         process.send_signal(number)
         time.sleep(0.1)
@@ -135,7 +155,9 @@ def test_the_second_one_does_not_wait_for_compiled_code(tmp_path, number):
 
 def test_an_ignored_signal_stays_ignored(tmp_path):
     """nohup, and a shell's background."""
-    program = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n" + KEEPS.format(work="time.sleep(1.5)")
+    program = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n" + KEEPS.format(
+        work="time.sleep(1.5)"
+    )
     process = started(tmp_path, program=program)
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=60)
@@ -154,8 +176,14 @@ def test_a_signal_at_the_very_end_does_not_change_the_exit_code(tmp_path):
 @pytest.mark.parametrize("number", BOTH)
 def test_nor_one_while_python_tidies_up_its_modules(tmp_path, number):
     """The interpreter gives the signals back to the system before that."""
-    program = "import sys, time\nfrom uuvtai import signals\nsignals.install(); signals.end_at_second(); signals.finish(0)\n"
-    program += "class Slow:\n    def __del__(self, sleep=time.sleep):\n        print('now', flush=True); sleep(1)\nslow = Slow()"
+    program = (
+        "import sys, time\nfrom uuvtai import signals\nsignals.install(); signals.end_at_second(); "
+        "signals.finish(0)\n"
+    )
+    program += (
+        "class Slow:\n    def __del__(self, sleep=time.sleep):\n        print('now', flush=True); "
+        "sleep(1)\nslow = Slow()"
+    )
     process = started(tmp_path, program=program)
     assert process.stdout.readline() == "now\n"
     process.send_signal(number)
@@ -165,7 +193,11 @@ def test_nor_one_while_python_tidies_up_its_modules(tmp_path, number):
 
 def test_nobody_is_told_by_a_library(tmp_path):
     """Importing the package installs nothing: that is the command line's affair."""
-    program = "import signal; before = signal.getsignal(2), signal.getsignal(15)\nimport uuvtai, uuvtai.cli, uuvtai.signals\n"
+    program = (
+        "import signal; before = signal.getsignal(2), signal.getsignal(15)\nimport uuvtai, "
+        "uuvtai.cli, "
+        "uuvtai.signals\n"
+    )
     program += "assert before == (signal.getsignal(2), signal.getsignal(15))"
     subprocess.run([sys.executable, "-c", program], env=ENVIRONMENT, check=True)
     assert not signals.was_received() and signals.exit_code() == 130
@@ -175,7 +207,11 @@ def test_sigterm_ends_a_training_as_ctrl_c_does(tmp_path):
     process = started(tmp_path, *SmallSim.TRAIN, "--iterations", "5000", "--run-dir", "run")
     metrics = tmp_path / "run/metrics.jsonl"
     deadline = time.monotonic() + 400
-    while process.poll() is None and not (metrics.exists() and metrics.stat().st_size) and time.monotonic() < deadline:
+    while (
+        process.poll() is None
+        and not (metrics.exists() and metrics.stat().st_size)
+        and time.monotonic() < deadline
+    ):
         time.sleep(0.05)
     process.send_signal(signal.SIGTERM)
     code, err = ended(process, signal.SIGTERM)
@@ -186,10 +222,25 @@ def test_sigterm_ends_a_training_as_ctrl_c_does(tmp_path):
 
 
 def test_the_workers_of_a_sweep_end_with_it(tmp_path):
-    grid = ["--grid", "D=0,3,6,9", "--grid", "v=0.5,1.5", "--controller", "bt", "--episodes", "64", "--workers", "2"]
-    process = started(tmp_path, "sweep", *grid, "--run-dir", "run", "--device", "cpu", "--num-envs", SmallSim.OPTIONS[1])
+    grid = [
+        "--grid",
+        "D=0,3,6,9",
+        "--grid",
+        "v=0.5,1.5",
+        "--controller",
+        "bt",
+        "--episodes",
+        "64",
+        "--workers",
+        "2",
+    ]
+    process = started(
+        tmp_path, "sweep", *grid, "--run-dir", "run", "--device", "cpu", "--num-envs", SmallSim.OPTIONS[1]
+    )
     deadline = time.monotonic() + 120
-    while len(children := children_of(process.pid)) < 2 and time.monotonic() < deadline:  # a worker and a resource tracker
+    while (
+        len(children := children_of(process.pid)) < 2 and time.monotonic() < deadline
+    ):  # a worker and a resource tracker
         time.sleep(0.05)
     assert len(children) >= 2
     os.kill(process.pid, signal.SIGTERM)

@@ -13,7 +13,13 @@ N = 4
 
 @quick_launch
 @ti.kernel
-def add_scaled(field: In[ti.Field], scale: Const[float], out: ti.types.ndarray(), shift: float, count: int):  # type: ignore[valid-type]
+def add_scaled(
+    field: In[ti.Field],
+    scale: Const[float],
+    out: ti.types.ndarray(),
+    shift: float,
+    count: int,  # type: ignore[valid-type]
+):
     """out += scale * field + shift + count."""
     for i in range(N):
         out[i] += scale * field[i] + shift + count
@@ -30,7 +36,8 @@ def fields():
 
 @pytest.mark.parametrize("new", [torch.zeros, lambda n: np.zeros(n, np.float32)], ids=["torch", "numpy"])
 def test_each_launch_works_on_what_it_is_given(fields, new):
-    """Again and again the same objects, then another field, constant, array, number one by one, then the first again."""
+    """Again and again the same objects, then another field, constant, array, number one by one, then the
+    first again."""
     first, other = new(N), new(N)
     ramp = np.arange(N)
     for turn in range(1, 4):
@@ -66,4 +73,7 @@ def test_wrong_arguments_are_still_refused(fields):
 
 
 def test_it_keeps_name_and_text_of_its_kernel():
-    assert (add_scaled.__name__, add_scaled.__doc__) == ("add_scaled", "out += scale * field + shift + count.")
+    assert (add_scaled.__name__, add_scaled.__doc__) == (
+        "add_scaled",
+        "out += scale * field + shift + count.",
+    )

@@ -7,8 +7,21 @@ import torch
 from uuvtai.loader import load_config
 from uuvtai.measure.evaluate import jobs_of, run_episodes
 
-SENSED = ("ego", "scan", "image", "tracks", "habits", "forecast", "grid_map", "clearance", "route", "features", "teacher")
-"""Structs of what the vehicle senses, remembers and decides (clusters are scratch of one scan: slots beyond their count are stale)."""
+SENSED = (
+    "ego",
+    "scan",
+    "image",
+    "tracks",
+    "habits",
+    "forecast",
+    "grid_map",
+    "clearance",
+    "route",
+    "features",
+    "teacher",
+)
+"""Structs of what the vehicle senses, remembers and decides (clusters are scratch of one scan: slots beyond
+their count are stale)."""
 
 
 LISTS = ("route.queue", "route.failed")
@@ -18,7 +31,11 @@ LISTS = ("route.queue", "route.failed")
 def equal(a, b, rows_a, rows_b):
     """Names of the arrays whose rows differ in any bit."""
     rows = [name for name in a if a[name].ndim and a[name].shape[0] == 8 and name not in LISTS]
-    return [name for name in rows if not np.array_equal(a[name][rows_a], b[name][rows_b], equal_nan=a[name].dtype.kind == "f")]
+    return [
+        name
+        for name in rows
+        if not np.array_equal(a[name][rows_a], b[name][rows_b], equal_nan=a[name].dtype.kind == "f")
+    ]
 
 
 def test_an_episode_is_the_same_in_any_row_and_company(small):
@@ -47,7 +64,8 @@ def test_a_reset_touches_only_its_rows(small):
 
 
 def test_the_camera_is_asked_about_heights_only_if_the_config_says_so(small, monkeypatch):
-    """The kernels that read this section of the config are left out: nothing is compiled again for the switch."""
+    """The kernels that read this section of the config are left out: nothing is compiled again for the
+    switch."""
     asked, sim = [], small.sim
     small.begin([0])
     monkeypatch.setattr("uuvtai.sim.tracking.track_bodies", lambda *_: None)

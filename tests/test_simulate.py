@@ -79,11 +79,14 @@ def test_command_drives_the_inner_loop():
 
 
 def test_double_precision_process():
-    """Without a runtime the function starts Taichi in double precision; 0.01 s agrees with RK4 far below single precision."""
+    """Without a runtime the function starts Taichi in double precision; 0.01 s agrees with RK4 far below
+    single precision."""
     code = (
-        "import json, sys\nfrom uuvtai.loader import load_config\nfrom uuvtai.measure.simulate import simulate\n"
+        "import json, sys\nfrom uuvtai.loader import load_config\nfrom uuvtai.measure.simulate import "
+        "simulate\n"
         "c = load_config('open', overrides={'vehicle.attitude_hold': 'none'})\n"
-        "print('RESULT' + json.dumps(simulate(c, seconds=1.0, dt=0.004, wrench=(1, 2, 3, 0, 0, 0.1))['nu'][-1]))"
+        "print('RESULT' + json.dumps(simulate(c, seconds=1.0, dt=0.004, wrench=(1, 2, 3, 0, 0, "
+        "0.1))['nu'][-1]))"
     )
     env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env, check=False)
@@ -95,7 +98,14 @@ def test_double_precision_process():
 
 @pytest.mark.parametrize(
     ("dt", "substeps", "control"),
-    [(0.01, 2, 0.02), (0.02, 1, 0.02), (0.005, 4, 0.02), (0.001, 20, 0.02), (0.008, 3, 0.024), (0.05, 1, 0.05)],
+    [
+        (0.01, 2, 0.02),
+        (0.02, 1, 0.02),
+        (0.005, 4, 0.02),
+        (0.001, 20, 0.02),
+        (0.008, 3, 0.024),
+        (0.05, 1, 0.05),
+    ],
 )
 def test_control_step_follows_the_substep(dt, substeps, control):
     got = control_step(dt)
@@ -142,6 +152,11 @@ def test_divergence_is_named():
 def test_vehicle_presets_have_the_published_drag(name):
     v = load_config("open", vehicle=name).vehicle
     drag = v.linear_damping[0] * 0.6 + v.quadratic_damping[0] * 0.36
-    published = {"bluerov2": 8.96, "bluerov2_heavy": 8.96, "bluerov2_li2020": 14.5, "bluerov2_vonbenzon2022": 59.0}[name]
+    published = {
+        "bluerov2": 8.96,
+        "bluerov2_heavy": 8.96,
+        "bluerov2_li2020": 14.5,
+        "bluerov2_vonbenzon2022": 59.0,
+    }[name]
     assert abs(drag - published) < 0.05
     assert len(v.thrusters) == (8 if v.attitude_hold == "thrusters" else 6)

@@ -15,7 +15,16 @@ from uuvtai.kernels.core.signature import Const
 from uuvtai.kernels.sensors import sonar, sonar_error
 from uuvtai.kernels.sensors.bundles import SonarIO
 from uuvtai.loader import load_config
-from uuvtai.state import ClockState, EpisodeState, Proprioception, SonarMemory, SonarScan, VehicleState, WorldState, allocate
+from uuvtai.state import (
+    ClockState,
+    EpisodeState,
+    Proprioception,
+    SonarMemory,
+    SonarScan,
+    VehicleState,
+    WorldState,
+    allocate,
+)
 
 N_ENV, N_BODY, N_RAY, N_BATCH = 125, 14, 256, 8
 SIZES = {"n_env": N_ENV, "n_body": N_BODY, "n_ray": N_RAY, "n_latency": 3, "n_cloud": 8, "n_thruster": 6}
@@ -24,20 +33,22 @@ RANGE_TOLERANCE_M = 2.0e-3
 """Asked for by the issue; float32 rounding itself is below 0.1 mm but for grazing hits."""
 
 GRAZING_RAD = 5.0e-6
-"""A beam whose answer changes when it is turned by this may give either answer: float32 holds directions to about 2e-7 and positions to
-1e-6 m at 20 m, which 0.2 m away is 5e-6 rad."""
+"""A beam whose answer changes when it is turned by this may give either answer: float32 holds directions to
+about 2e-7 and positions to 1e-6 m at 20 m, which 0.2 m away is 5e-6 rad."""
 
 GRAZING_SHARE = 1.0e-4
 """At most this share of the beams may need that allowance."""
 
 DOPPLER_TOLERANCE_M_S = 1.0e-4
-"""float32 products of speeds up to 4 m/s and truncation of the central difference (dt 1e-4 s, accelerations below 20 m/s^2)."""
+"""float32 products of speeds up to 4 m/s and truncation of the central difference (dt 1e-4 s, accelerations
+below 20 m/s^2)."""
 
 TANK, ROUND_TANK = TankConfig(), TankConfig(shape="circle", x_m=(0.0, 16.0), y_m=(0.0, 16.0))
 CLEAN, FLAT = SonarConfig(), SonarConfig(vertical_half_aperture_deg=0.0)
 RULES = EpisodeConfig()
 SIGMAS = 5.0
-"""Statistics over n draws may be off by this many standard errors; seeds are fixed, so a pass stays a pass."""
+"""Statistics over n draws may be off by this many standard errors; seeds are fixed, so a pass stays a
+pass."""
 
 
 class Rig:
@@ -64,9 +75,26 @@ class Rig:
         self.ego.pos_w.from_numpy(scene["pos"].astype(np.float32))
         sonar.reset_sonar(io_for(SonarIO, self.scan, self.memory, self.clock))
 
-    def cast(self, config=CLEAN, tank=TANK, names=("range_m", "doppler_m_s", "intensity", "hit", "fresh", "ping_step")):
+    def cast(
+        self,
+        config=CLEAN,
+        tank=TANK,
+        names=("range_m", "doppler_m_s", "intensity", "hit", "fresh", "ping_step"),
+    ):
         sonar.cast_sonar(
-            io_for(SonarIO, self.scan, self.memory, self.ego, self.vehicle, self.world, self.episode, self.clock, config, tank, RULES)
+            io_for(
+                SonarIO,
+                self.scan,
+                self.memory,
+                self.ego,
+                self.vehicle,
+                self.world,
+                self.episode,
+                self.clock,
+                config,
+                tank,
+                RULES,
+            )
         )
         return {name: getattr(self.scan, name).to_numpy() for name in names}
 
@@ -84,16 +112,21 @@ def batches():
 
 
 def assert_ranges(got, hit, lowest, truth, highest, max_range_m):
-    """Every beam within tolerance of the truth, but for a small share that lies between what its closest neighbours see."""
+    """Every beam within tolerance of the truth, but for a small share that lies between what its closest
+    neighbours see."""
     seen = np.where(truth > max_range_m, max_range_m, truth)
     wrong = (np.abs(got - seen) > RANGE_TOLERANCE_M) | (hit != (truth <= max_range_m))
-    low, high = np.minimum(lowest, max_range_m) - RANGE_TOLERANCE_M, np.minimum(highest, max_range_m) + RANGE_TOLERANCE_M
+    low, high = (
+        np.minimum(lowest, max_range_m) - RANGE_TOLERANCE_M,
+        np.minimum(highest, max_range_m) + RANGE_TOLERANCE_M,
+    )
     assert np.all((got[wrong] >= low[wrong]) & (got[wrong] <= high[wrong]))
     assert wrong.mean() < GRAZING_SHARE
 
 
 def test_1000_scenes_against_mujoco(rig, batches):
-    """Aperture 0: a beam is then a line in space, which MuJoCo casts at the spheres, cylinders and boxes themselves."""
+    """Aperture 0: a beam is then a line in space, which MuJoCo casts at the spheres, cylinders and boxes
+    themselves."""
     hits = 0
     for scene in batches:
         rig.start(scene)
@@ -108,7 +141,9 @@ def test_1000_scenes_against_mujoco(rig, batches):
             off |= out["hit"][env] != (truth <= CLEAN.max_range_m)
             low, high = truth.copy(), truth.copy()
             if off.any():
-                low[off], high[off] = scenes.envelope(lambda r, c=caster, s=scene["pos"][env]: c.distances(s, r), rays[off], GRAZING_RAD)
+                low[off], high[off] = scenes.envelope(
+                    lambda r, c=caster, s=scene["pos"][env]: c.distances(s, r), rays[off], GRAZING_RAD
+                )
             found.append((low, truth, high))
         low, truth, high = (np.array(column) for column in zip(*found, strict=True))
         assert_ranges(out["range_m"], out["hit"], low, truth, high, CLEAN.max_range_m)
@@ -117,17 +152,26 @@ def test_1000_scenes_against_mujoco(rig, batches):
 
 
 def test_1000_scenes_against_oracle_with_aperture(rig, batches):
-    """Range, hit flag, intensity and Doppler under the aperture rule; most bodies are above or below the beams' plane."""
+    """Range, hit flag, intensity and Doppler under the aperture rule; most bodies are above or below the
+    beams' plane."""
     different, bodies, compared = 0, 0, 0
     for scene in batches:
         rig.start(scene)
         out = rig.cast(CLEAN)
-        oracle = [[sonar_scan(scene, env, TANK, N_RAY, 10.0, turn) for env in range(N_ENV)] for turn in (0.0, GRAZING_RAD, -GRAZING_RAD)]
+        oracle = [
+            [sonar_scan(scene, env, TANK, N_RAY, 10.0, turn) for env in range(N_ENV)]
+            for turn in (0.0, GRAZING_RAD, -GRAZING_RAD)
+        ]
         ranges = np.array([[answer[0] for answer in row] for row in oracle])
-        assert_ranges(out["range_m"], out["hit"], ranges.min(axis=0), ranges[0], ranges.max(axis=0), CLEAN.max_range_m)
+        assert_ranges(
+            out["range_m"], out["hit"], ranges.min(axis=0), ranges[0], ranges.max(axis=0), CLEAN.max_range_m
+        )
         for env in range(N_ENV):
             truth, cosine, who = oracle[0][env]
-            same = np.all([(turned[env][2] == who) & (np.abs(turned[env][1] - cosine) < 1e-3) for turned in oracle[1:]], axis=0)
+            same = np.all(
+                [(turned[env][2] == who) & (np.abs(turned[env][1] - cosine) < 1e-3) for turned in oracle[1:]],
+                axis=0,
+            )
             steady = same & (np.abs(out["range_m"][env] - truth) < RANGE_TOLERANCE_M) & (out["hit"][env] == 1)
             compared += steady.sum()
             bearing = beam_headings(scene["quat"][env], N_RAY)
@@ -141,7 +185,9 @@ def test_1000_scenes_against_oracle_with_aperture(rig, batches):
             bodies += np.sum(who != WALL)
             different += np.sum(np.abs(truth - sonar_scan(scene, env, TANK, N_RAY, 0.0)[0]) > 0.1)
     assert compared > 0.9 * N_BATCH * N_ENV * N_RAY
-    assert bodies > 20000 and different > 5000, "the scenes must show bodies, many of them only thanks to the aperture"
+    assert bodies > 20000 and different > 5000, (
+        "the scenes must show bodies, many of them only thanks to the aperture"
+    )
 
 
 def test_round_tank_against_mujoco(rig):
@@ -154,17 +200,26 @@ def test_round_tank_against_mujoco(rig):
         bearing = beam_headings(scene["quat"][env], N_RAY)
         rays = np.stack([np.cos(bearing), np.sin(bearing), np.zeros(N_RAY)], axis=1)
         truth.append(caster.distances(scene["pos"][env], rays))
-        around = scenes.envelope(lambda r, c=caster, s=scene["pos"][env]: c.distances(s, r), rays, GRAZING_RAD)
+        around = scenes.envelope(
+            lambda r, c=caster, s=scene["pos"][env]: c.distances(s, r), rays, GRAZING_RAD
+        )
         low.append(around[0])
         high.append(around[1])
-    assert_ranges(out["range_m"], out["hit"], np.array(low), np.array(truth), np.array(high), FLAT.max_range_m)
+    assert_ranges(
+        out["range_m"], out["hit"], np.array(low), np.array(truth), np.array(high), FLAT.max_range_m
+    )
 
 
 @pytest.mark.parametrize("distance, seen", [(3.0, True), (1.5, False)])
 def test_body_above_the_beams_is_seen_from_afar_and_lost_close_by(rig, distance, seen):
     """A short cylinder whose lower end is 0.4 m above the beams: seen beyond 0.4 / tan 10 deg = 2.27 m."""
     scene = scenes.one_body_scene(
-        N_ENV, N_BODY, (5.0, 3.0, -1.2), kind=scenes.CYLINDER, body_pos=(5.0 + distance + 0.2, 3.0, -0.6), size=(0.2, 0.2, 0.2)
+        N_ENV,
+        N_BODY,
+        (5.0, 3.0, -1.2),
+        kind=scenes.CYLINDER,
+        body_pos=(5.0 + distance + 0.2, 3.0, -0.6),
+        size=(0.2, 0.2, 0.2),
     )
     rig.start(scene)
     ahead = rig.cast()["range_m"][0, 0]
@@ -180,7 +235,7 @@ def test_own_motion_along_the_beam_is_negative_doppler_of_everything_still(rig):
     assert np.abs(out["doppler_m_s"][0] + 0.5 * np.cos(bearing) + 0.2 * np.sin(bearing)).max() < 1e-5
 
 
-# --------------------------------------------------------------------------------------------------------------------- errors
+# ----------------------------------------------------------------------------------------------------- errors
 
 
 @ti.kernel
@@ -192,7 +247,8 @@ def apply_error(
     config: Const[SonarConfig],
     out: ti.types.ndarray(dtype=ti.f32, ndim=3),
 ):
-    """out[key, ray, (range, rate, brightness)] of one error source for beams that would tell (range_m, 1, cosine)."""
+    """out[key, ray, (range, rate, brightness)] of one error source for beams that would tell (range_m, 1,
+    cosine)."""
     for row, packet in ti.ndrange(out.shape[0], out.shape[1] // LANES):
         key, ray = ti.cast(row + 7, ti.u32), packet * LANES
         r, rate, bright = f16x(range_m), f16x(1.0), f16x(cosine)
@@ -202,7 +258,9 @@ def apply_error(
         elif ti.static(which == 1):
             told = sonar_error.missed(r, key, step, ray, io_for(SonarIO, config))
         elif ti.static(which == 2):
-            told, speed, lit = sonar_error.falsely_returned(r, rate, bright, key, step, ray, io_for(SonarIO, config))
+            told, speed, lit = sonar_error.falsely_returned(
+                r, rate, bright, key, step, ray, io_for(SonarIO, config)
+            )
         elif ti.static(which == 3):
             told = sonar_error.grazing_lost(r, bright, io_for(SonarIO, config))
         elif ti.static(which == 4):
@@ -235,14 +293,18 @@ def test_range_sigma_grows_with_range():
         sigma = 0.03 + 0.01 * range_m
         assert abs(error.mean()) < SIGMAS * sigma / np.sqrt(error.size)
         assert error.std() == pytest.approx(sigma, rel=SIGMAS / np.sqrt(2 * error.size))
-        assert abs(np.corrcoef(error[:, :-1].ravel(), error[:, 1:].ravel())[0, 1]) < SIGMAS / np.sqrt(error.size)
+        assert abs(np.corrcoef(error[:, :-1].ravel(), error[:, 1:].ravel())[0, 1]) < SIGMAS / np.sqrt(
+            error.size
+        )
 
 
 def test_range_noise_differs_between_steps_and_episodes_and_repeats():
     config = SonarConfig(range_sigma_m=0.03, range_sigma_slope=0.01)
     first, again, later = told(NOISE, config), told(NOISE, config), told(NOISE, config, step=4)
     assert np.array_equal(first, again)
-    assert abs(np.corrcoef(first[..., 0].ravel(), later[..., 0].ravel())[0, 1]) < SIGMAS / np.sqrt(first[..., 0].size)
+    assert abs(np.corrcoef(first[..., 0].ravel(), later[..., 0].ravel())[0, 1]) < SIGMAS / np.sqrt(
+        first[..., 0].size
+    )
     assert abs(np.corrcoef(first[0, :, 0], first[1, :, 0])[0, 1]) < SIGMAS / np.sqrt(N_RAY)
 
 
@@ -300,7 +362,8 @@ def test_every_error_is_absent_at_zero(which):
 
 
 def test_ghost_takes_the_mirrored_path(rig):
-    """Heading 0 in an empty tank: beam 32 (45 deg) bounces off the wall y = 6 and then meets x = 20 (or the range limit)."""
+    """Heading 0 in an empty tank: beam 32 (45 deg) bounces off the wall y = 6 and then meets x = 20 (or the
+    range limit)."""
     config = SonarConfig(ghost=1.0)
     scene = scenes.one_body_scene(N_ENV, N_BODY, (15.0, 4.0, -1.0))
     scene["vel_b"][:] = (0.3, 0.1, 0.0)
@@ -309,13 +372,23 @@ def test_ghost_takes_the_mirrored_path(rig):
     u = np.sqrt(0.5)
     assert out["range_m"][0, 32] == pytest.approx(5.0 / u, abs=1e-4)
     assert out["doppler_m_s"][0, 32] == pytest.approx(-(0.3 + 0.1) * u, abs=1e-5)
-    assert out["range_m"][0, 0] == pytest.approx(5.0, abs=1e-4), "back along the axis: 5 + 20 m is out of range, the direct return stays"
+    assert out["range_m"][0, 0] == pytest.approx(5.0, abs=1e-4), (
+        "back along the axis: 5 + 20 m is out of range, the direct return stays"
+    )
     moving = scenes.one_body_scene(
-        N_ENV, N_BODY, (10.0, 4.0, -1.0), kind=scenes.BOX, body_pos=(14.5, 4.0, -1.0), size=(0.5, 1.0, 0.5), body_vel=(-0.7, 0.2, 0.0)
+        N_ENV,
+        N_BODY,
+        (10.0, 4.0, -1.0),
+        kind=scenes.BOX,
+        body_pos=(14.5, 4.0, -1.0),
+        size=(0.5, 1.0, 0.5),
+        body_vel=(-0.7, 0.2, 0.0),
     )
     rig.start(moving)
     out = rig.cast(config)
-    assert out["range_m"][0, 32] == pytest.approx(4.0 / u, abs=1e-4), "wall at (12, 6), then the box's face x = 14 at (14, 4)"
+    assert out["range_m"][0, 32] == pytest.approx(4.0 / u, abs=1e-4), (
+        "wall at (12, 6), then the box's face x = 14 at (14, 4)"
+    )
     assert out["doppler_m_s"][0, 32] == pytest.approx((-0.7 - 0.2) * u, abs=1e-5)
     assert out["range_m"][0, 0] == pytest.approx(4.0, abs=1e-4)
 
@@ -334,29 +407,40 @@ def test_harsh_preset_shows_every_error_at_its_rate(rig):
         set_step(rig.clock, step)
         rig.cast(HARSH, names=())
         if rig.scan.fresh[0] == 1:
-            pings.append((rig.scan.hit.to_numpy(), rig.scan.range_m.to_numpy(), rig.scan.doppler_m_s.to_numpy()))
+            pings.append(
+                (rig.scan.hit.to_numpy(), rig.scan.range_m.to_numpy(), rig.scan.doppler_m_s.to_numpy())
+            )
     assert len(pings) == 41
     hit, range_m, doppler = (np.array(column) for column in zip(*pings, strict=True))
     lost_share, false_share = HARSH.missed_return, HARSH.false_return
     assert hit[:, :, heard].mean() == pytest.approx(1 - lost_share * (1 - false_share), abs=0.01)
-    assert np.any(~heard) and hit[:, :, ~heard].mean() < 0.35, "grazing beams hear ghosts, clouds and clutter only"
+    assert np.any(~heard) and hit[:, :, ~heard].mean() < 0.35, (
+        "grazing beams hear ghosts, clouds and clutter only"
+    )
     cells = range_m[hit == 1] / HARSH.range_quantum_m
     assert np.abs(cells - np.round(cells)).max() < 1e-3
     error = (range_m - clean)[:, :, heard]
     seen = hit[:, :, heard] == 1
     body = seen & (np.abs(error) < 1.0)
     sigma = np.hypot(0.10 + 0.01 * clean[heard].mean(), 0.1)
-    assert error[body].mean() == pytest.approx(HARSH.range_jitter_m, abs=0.01), "the jitter is positive on average"
+    assert error[body].mean() == pytest.approx(HARSH.range_jitter_m, abs=0.01), (
+        "the jitter is positive on average"
+    )
     assert error[body].std() == pytest.approx(sigma, rel=0.15)
     clutter = false_share * np.mean((clean[heard] - 1) / 12.0)
     clouds = 0.75 * 0.5 * 2.0 * 5.5 / N_RAY * np.mean((clean[heard] - 1.5) / 11.5)
-    assert np.mean(error[seen] < -1.0) == pytest.approx(clutter + clouds, rel=0.25), "clutter, and clouds (three quarters formed by then)"
+    assert np.mean(error[seen] < -1.0) == pytest.approx(clutter + clouds, rel=0.25), (
+        "clutter, and clouds (three quarters formed by then)"
+    )
     assert np.mean(error[seen] > 1.0) > 0.02, "ghosts"
-    assert np.mean(np.abs(doppler[hit == 1]) > 1.0) == pytest.approx(HARSH.doppler_outlier * 0.5, rel=0.1), "outliers within +-2 m/s"
+    assert np.mean(np.abs(doppler[hit == 1]) > 1.0) == pytest.approx(HARSH.doppler_outlier * 0.5, rel=0.1), (
+        "outliers within +-2 m/s"
+    )
 
 
 def test_bubble_clouds_come_last_and_hide_what_is_behind(rig):
-    """Only clouds on: share of covered beams = rate x mean duration x mean width / n_ray; each is a run of 3-8 beams at one range."""
+    """Only clouds on: share of covered beams = rate x mean duration x mean width / n_ray; each is a run of
+    3-8 beams at one range."""
     config = SonarConfig(bubble_clouds_per_s=0.5, period_steps=5)
     scene = scenes.one_body_scene(N_ENV, N_BODY, (10.0, 3.0, -0.8))
     rig.start(scene)
@@ -381,7 +465,7 @@ def test_bubble_clouds_come_last_and_hide_what_is_behind(rig):
     assert np.mean(covered[40:]) == pytest.approx(0.5 * 2.0 * 5.5 / N_RAY * shows, rel=0.15)
 
 
-# --------------------------------------------------------------------------------------------------------------------- timing
+# ----------------------------------------------------------------------------------------------------- timing
 
 
 def test_rate_latency_and_what_a_scan_is_labelled_with(rig):
@@ -404,7 +488,9 @@ def test_rate_latency_and_what_a_scan_is_labelled_with(rig):
             fresh[step] = out["ping_step"][0]
         last = fresh[max(fresh)]
         assert np.all(out["ping_step"] == last), "between deliveries the old scan stays"
-        assert out["range_m"][0, N_RAY // 2] == pytest.approx(10.0 - 0.1 * last, abs=1e-4), "what was true when it was pinged"
+        assert out["range_m"][0, N_RAY // 2] == pytest.approx(10.0 - 0.1 * last, abs=1e-4), (
+            "what was true when it was pinged"
+        )
         assert np.all(rig.scan.ping_pos_w.to_numpy() == last)
         assert np.all(rig.scan.ping_vel_b.to_numpy() == -last)
         assert np.all(rig.scan.ping_vel_valid.to_numpy() == (last % 4 == 0))

@@ -1,4 +1,5 @@
-"""A stack as a row of its own: which simulator it gets, that it meets the same episodes, and its entry in the table."""
+"""A stack as a row of its own: which simulator it gets, that it meets the same episodes, and its entry in the
+table."""
 
 import json
 
@@ -27,7 +28,11 @@ def test_a_stacks_name_is_a_controller_with_its_own_config_and_tree(tmp_path):
     assert (paper.name, paper.privileged, paper.tree.types) == ("paper", False, bt.tree.types)
     assert paper.document() == {"stack": {"preset": "paper", "tree": "bt"}}
     assert paper.config_of(config).voronoi.use == "fused" == told.config_of(config).voronoi.use
-    assert (told.name, told.privileged, own.name) == ("paper+truth", True, "mine") and own.tree.types != bt.tree.types
+    assert (told.name, told.privileged, own.name) == (
+        "paper+truth",
+        True,
+        "mine",
+    ) and own.tree.types != bt.tree.types
 
 
 def test_a_controller_that_is_neither_tree_nor_stack_is_refused():
@@ -42,17 +47,28 @@ def test_a_stack_touches_nothing_that_makes_an_episode():
     config = load_config("gauntlet", "harsh", overrides={"features.n_track": 2})
     other = with_stack(config, "paper")
     same = set(type(config).model_fields) - set(STACK_SECTIONS)
-    assert {"world", "vehicle", "actuation", "disturbance", "sensors", "features", "reward", "episode"} == same
+    assert {
+        "world",
+        "vehicle",
+        "actuation",
+        "disturbance",
+        "sensors",
+        "features",
+        "reward",
+        "episode",
+    } == same
     assert all(getattr(other, name) == getattr(config, name) for name in same)
     assert any(getattr(other, name) != getattr(config, name) for name in STACK_SECTIONS)
 
 
 @pytest.fixture(scope="module")
 def compared(small, tmp_path_factory):
-    """The session's simulator stands for both, which would take minutes to compile: what each row asked for is kept."""
+    """The session's simulator stands for both, which would take minutes to compile: what each row asked for
+    is kept."""
     asked = []
     request = Request(
-        config=small.config, world="pool", sensors="paper", controllers=["bt", "paper"], seeds=[5], episodes=3, num_envs=small.N,
+        config=small.config, world="pool", sensors="paper", controllers=["bt", "paper"], seeds=[5],
+        episodes=3, num_envs=small.N,
         record=1, device="cpu", run_dir=tmp_path_factory.mktemp("runs") / "run",
     )  # fmt: skip
 
@@ -75,13 +91,19 @@ def test_bt_and_paper_are_two_rows_of_one_table(compared):
     result, folder = compared
     bt, paper = result["methods"]
     assert (bt["name"], paper["name"], paper["stack"]["tree"]) == ("bt", "paper", tree_of_stack("paper"))
-    assert [(d["seed"], d["episode"]) for d in bt["episodes_detail"]] == [(d["seed"], d["episode"]) for d in paper["episodes_detail"]]
+    assert [(d["seed"], d["episode"]) for d in bt["episodes_detail"]] == [
+        (d["seed"], d["episode"]) for d in paper["episodes_detail"]
+    ]
     assert len(result["paired"]) == 1
     assert (folder / "eval/trees/paper.xml").read_text() == (folder / "eval/trees/bt.xml").read_text()
 
 
 def test_both_rows_are_recorded_and_say_what_they_ran_on(compared):
-    """One simulator drew both here; that scenarios are the same is ``test_a_stack_touches_nothing_that_makes_an_episode``."""
+    """One simulator drew both here; that scenarios are the same is
+    ``test_a_stack_touches_nothing_that_makes_an_episode``."""
     _, folder = compared
-    assert sorted(log.name for log in (folder / "logs").iterdir()) == ["bt_seed5_episode0.mcap", "paper_seed5_episode0.mcap"]
+    assert sorted(log.name for log in (folder / "logs").iterdir()) == [
+        "bt_seed5_episode0.mcap",
+        "paper_seed5_episode0.mcap",
+    ]
     assert json.loads((folder / "eval/result.json").read_text())["methods"][1]["stack"]["preset"] == "paper"

@@ -85,7 +85,9 @@ def test_fisher_by_hand():
 
 def test_fisher_and_binomial_agree_with_scipy():
     stats = pytest.importorskip("scipy.stats")
-    assert fisher_p(138, 200, 17, 200) == pytest.approx(stats.fisher_exact([[138, 62], [17, 183]]).pvalue, rel=1e-6)
+    assert fisher_p(138, 200, 17, 200) == pytest.approx(
+        stats.fisher_exact([[138, 62], [17, 183]]).pvalue, rel=1e-6
+    )
     assert fisher_p(28, 32, 38, 40) == pytest.approx(stats.fisher_exact([[28, 4], [38, 2]]).pvalue, rel=1e-6)
     for k, n, p in ((49, 2048, 0.011), (1976, 2048, 0.828), (4, 512, 0.011)):
         tails = stats.binom.cdf(k, n, p), stats.binom.sf(k - 1, n, p)
@@ -113,7 +115,9 @@ def test_bootstrap_interval_covers_the_mean_as_often_as_it_says():
     for _ in range(200):
         low, high = bootstrap_interval(list(rng.normal(0.0, 1.0, 40)), resamples=300)
         covered += low <= 0.0 <= high
-    assert 0.89 <= covered / 200 <= 0.985, "95 % nominal, a little less for 40 samples; 200 trials have an error of 1.5 %"
+    assert 0.89 <= covered / 200 <= 0.985, (
+        "95 % nominal, a little less for 40 samples; 200 trials have an error of 1.5 %"
+    )
 
 
 def test_holm_by_hand():
@@ -126,7 +130,8 @@ def _method(name, outcomes, times):
     return {
         "name": name,
         "episodes_detail": [
-            {"seed": 1, "episode": i, "outcome": o, "time_s": t} for i, (o, t) in enumerate(zip(outcomes, times, strict=True))
+            {"seed": 1, "episode": i, "outcome": o, "time_s": t}
+            for i, (o, t) in enumerate(zip(outcomes, times, strict=True))
         ],
     }
 

@@ -1,4 +1,5 @@
-"""Sweeps: cells of a grid, tasks, engines that lose workers, and folders that survive a kill at any moment."""
+"""Sweeps: cells of a grid, tasks, engines that lose workers, and folders that survive a kill at any
+moment."""
 
 import json
 import multiprocessing
@@ -44,7 +45,7 @@ class Quiet:
         pass
 
 
-# ------------------------------------------------------------------------------------------------------------------- grid
+# ------------------------------------------------------------------------------------------------------- grid
 
 
 def test_the_papers_grid_shares_what_does_not_move():
@@ -56,9 +57,12 @@ def test_the_papers_grid_shares_what_does_not_move():
 
 
 def test_axes_are_read_as_typed():
-    grid = grid_of(["S=4,8", "teacher.caution=0.5,1", "disturbance.current_m_s=[0.1,0,0]", "sensors=paper,harsh"])
+    grid = grid_of(
+        ["S=4,8", "teacher.caution=0.5,1", "disturbance.current_m_s=[0.1,0,0]", "sensors=paper,harsh"]
+    )
     assert grid.axes == {
-        "S": (4, 8), "teacher.caution": (0.5, 1), "disturbance.current_m_s": ([0.1, 0, 0],), "sensors": ("paper", "harsh"),
+        "S": (4, 8), "teacher.caution": (0.5, 1), "disturbance.current_m_s": ([0.1, 0, 0],),
+        "sensors": ("paper", "harsh"),
     }  # fmt: skip
     assert len(grid.cells()) == 8
 
@@ -88,7 +92,13 @@ def test_one_at_a_time_varies_each_axis_around_the_condition():
         (["S=[1"], "not valid YAML"),
         (["nosuch"], "nosuch"),
         (["paper", "caution"], "one preset at most"),
-        (["world.n_static=" + ",".join(map(str, range(200))), "world.n_dynamic=" + ",".join(map(str, range(200)))], "split it"),
+        (
+            [
+                "world.n_static=" + ",".join(map(str, range(200))),
+                "world.n_dynamic=" + ",".join(map(str, range(200))),
+            ],
+            "split it",
+        ),
     ],
 )
 def test_grids_that_cannot_be_are_refused(texts, said):
@@ -98,7 +108,11 @@ def test_grids_that_cannot_be_are_refused(texts, said):
 
 def test_a_grid_file_says_what_is_wrong(tmp_path):
     file = tmp_path / "g.yaml"
-    for text, said in [("axes: {S: 4}", "each a list"), ("axis: {S: [4]}", "axis is not known"), ("{}", "needs 'axes:'")]:
+    for text, said in [
+        ("axes: {S: 4}", "each a list"),
+        ("axis: {S: [4]}", "axis is not known"),
+        ("{}", "needs 'axes:'"),
+    ]:
         file.write_text(text)
         with pytest.raises(ConfigError, match=said):
             grid_of([str(file)])
@@ -111,19 +125,22 @@ def test_shipped_grids_load_and_every_cell_has_a_config(name):
     assert sum(len(task.labels) for task in tasks) == len(request.grid.cells())
 
 
-# ------------------------------------------------------------------------------------------------------------------ tasks
+# ------------------------------------------------------------------------------------------------------ tasks
 
 
 def asked(grid, **changes):
     given = {
-        "grid": grid, "world": "pool", "sensors": None, "vehicle": None, "overrides": (), "controllers": ("bt",), "policies": (),
+        "grid": grid, "world": "pool", "sensors": None, "vehicle": None, "overrides": (),
+        "controllers": ("bt",), "policies": (),
         "seeds": (3,), "episodes": 4,
     }  # fmt: skip
     return SweepRequest(**(given | changes))
 
 
 def test_one_simulator_serves_every_scene():
-    tasks = tasks_of(asked(grid_of(["paper"]), episodes=64), [("bt", "bt", None), ("straight", "straight", None)], set())
+    tasks = tasks_of(
+        asked(grid_of(["paper"]), episodes=64), [("bt", "bt", None), ("straight", "straight", None)], set()
+    )
     assert len({task.config.model_dump_json() for task in tasks}) == 1
     assert (tasks[0].config.world.static_slots, tasks[0].config.world.dynamic_slots) == (12, 15)
     assert all(64 * len(task.scenes) <= 1024 for task in tasks)
@@ -136,13 +153,22 @@ def test_other_axes_make_configs_of_their_own():
     request = asked(grid_of(["teacher.caution=0.5,2", "D=0,6"]))
     tasks = tasks_of(request, [("bt", "bt", None)], set())
     assert [task.config.teacher.caution for task in tasks] == [0.5, 2.0]
-    assert tasks[1].labels == ({"S": 8, "D": 0, "v_m_s": None, "teacher.caution": 2}, {"S": 8, "D": 6, "v_m_s": 0.6, "teacher.caution": 2})
+    assert tasks[1].labels == (
+        {"S": 8, "D": 0, "v_m_s": None, "teacher.caution": 2},
+        {"S": 8, "D": 6, "v_m_s": 0.6, "teacher.caution": 2},
+    )
 
 
 def test_one_axis_at_a_time_tells_what_is_unchanged(tmp_path):
-    grid = Grid({"D": (3,), "sensors": ("harsh",), "disturbance.current_m_s": ([0.1, 0.0, 0.0],)}, one_at_a_time=True)
+    grid = Grid(
+        {"D": (3,), "sensors": ("harsh",), "disturbance.current_m_s": ([0.1, 0.0, 0.0],)}, one_at_a_time=True
+    )
     document, folder = sweep(asked(grid), Canned(), tmp_path / "run", Quiet())
-    assert document["one_at_a_time"] and document["unchanged"] == {"D": 6, "sensors": None, "disturbance.current_m_s": [0.0, 0.0, 0.0]}
+    assert document["one_at_a_time"] and document["unchanged"] == {
+        "D": 6,
+        "sensors": None,
+        "disturbance.current_m_s": [0.0, 0.0, 0.0],
+    }
     assert json.loads((folder / "sweep.json").read_text())["unchanged"] == document["unchanged"]
 
 
@@ -154,7 +180,10 @@ def test_what_is_printed_of_one_axis_at_a_time_names_what_changes(capsys):
 
 
 def test_a_request_survives_its_json():
-    request = asked(grid_of(["S=4,8", "teacher.caution=0.5,1"]), overrides=("world.n_dynamic=3", ("features", {"n_track": 4})))
+    request = asked(
+        grid_of(["S=4,8", "teacher.caution=0.5,1"]),
+        overrides=("world.n_dynamic=3", ("features", {"n_track": 4})),
+    )
     assert request_of(json.loads(json.dumps(request.document()))) == request
 
 
@@ -167,7 +196,7 @@ def test_wrong_keys_are_refused_before_anything_is_written(tmp_path):
     assert not place.exists()
 
 
-# ----------------------------------------------------------------------------------------------------------------- folder
+# ----------------------------------------------------------------------------------------------------- folder
 
 
 def row(label, method):
@@ -175,7 +204,8 @@ def row(label, method):
 
 
 class Canned:
-    """An engine that knows the rows already and stops after some tasks as if it had been killed, or somebody had pressed Ctrl-C."""
+    """An engine that knows the rows already and stops after some tasks as if it had been killed, or somebody
+    had pressed Ctrl-C."""
 
     def __init__(self, stop_after=None, error=KeyboardInterrupt):
         self.stop_after, self.error, self.ran = stop_after, error, []
@@ -247,7 +277,7 @@ def test_two_processes_do_not_share_a_sweep(tmp_path, monkeypatch):
     assert resume(place, Nosy(), Quiet())[0]["cells"]
 
 
-# ---------------------------------------------------------------------------------------------------------------- engines
+# ---------------------------------------------------------------------------------------------------- engines
 
 
 def test_local_workers_give_every_result_once():
@@ -255,11 +285,15 @@ def test_local_workers_give_every_result_once():
 
 
 def test_a_lost_worker_costs_its_task_once_more(tmp_path):
-    assert list(LocalEngine(1).run(sweep_work.fall_once, [str(tmp_path / "a"), str(tmp_path / "b")])) == [(0, "a"), (1, "b")]
+    assert list(LocalEngine(1).run(sweep_work.fall_once, [str(tmp_path / "a"), str(tmp_path / "b")])) == [
+        (0, "a"),
+        (1, "b"),
+    ]
 
 
 def test_what_only_waited_is_not_counted_as_lost(tmp_path):
-    """Each of the first tasks kills its worker once; the last one, which waits meanwhile, must not use up its attempts."""
+    """Each of the first tasks kills its worker once; the last one, which waits meanwhile, must not use up its
+    attempts."""
     places = [str(tmp_path / name) for name in "abcde"]
     assert sorted(LocalEngine(1).run(sweep_work.fall_once, places)) == list(enumerate("abcde"))
 
@@ -322,7 +356,7 @@ def test_without_ray_the_error_says_what_to_install(monkeypatch):
         RayEngine()
 
 
-# --------------------------------------------------------------------------------------------------------- the real thing
+# --------------------------------------------------------------------------------------------- the real thing
 
 HORIZON_S = 8.0
 OPTIONS = [
@@ -340,14 +374,21 @@ OPTIONS = [
 
 
 def uuv(*arguments):
-    return subprocess.run([sys.executable, "-m", "uuvtai", *arguments], capture_output=True, text=True, check=False)
+    return subprocess.run(
+        [sys.executable, "-m", "uuvtai", *arguments], capture_output=True, text=True, check=False
+    )
 
 
 def test_a_killed_sweep_gives_what_an_evaluation_gives(small, tmp_path):
     """To the last digit, also after SIGKILL."""
-    place, command = tmp_path / "sweep", ["sweep", "--grid", "D=2,6", "--grid", "v=1.5", "--controller", "bt", *OPTIONS]
+    place, command = (
+        tmp_path / "sweep",
+        ["sweep", "--grid", "D=2,6", "--grid", "v=1.5", "--controller", "bt", *OPTIONS],
+    )
     child = subprocess.Popen(
-        [sys.executable, "-m", "uuvtai", *command, "--run-dir", str(place)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        [sys.executable, "-m", "uuvtai", *command, "--run-dir", str(place)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
     )
     while not (place / sweep_run.REQUEST).exists():
         assert child.poll() is None, "ended before it had begun"

@@ -1,4 +1,5 @@
-"""Tables of the command line at 80, 100 and 120 columns: columns go before cells are cut, and what is left out is said."""
+"""Tables of the command line at 80, 100 and 120 columns: columns go before cells are cut, and what is left
+out is said."""
 
 import io
 import re
@@ -24,7 +25,8 @@ from uuvtai.show.verdicts import show_claims
 WIDTHS = (80, 100, 120)
 CONDITION = {
     "detection": {"required_m": 1.9, "closing_m_s": 1.2, "aside_s": 1.1},
-    "rides": 64, "rides_threatened": 40, "rides_threatened_ci95": [0.5, 0.7], "threats_per_min": 3.1, "threats": 99, "ride_minutes": 32.0,
+    "rides": 64, "rides_threatened": 40, "rides_threatened_ci95": [0.5, 0.7], "threats_per_min": 3.1,
+    "threats": 99, "ride_minutes": 32.0,
 }  # fmt: skip
 
 
@@ -38,8 +40,15 @@ def shown(show, width, wide=False):
 def evaluation():
     """Four methods with the longest figures that there are, one of them privileged."""
     names = {"straight": 281, "planner": 290, "bt+truth": 500, "20261122-154501_curriculum": 0}
-    methods = [samples.method(name, k, 500 - k, 500, privileged=name == "bt+truth", env_steps_per_s=25123.4) for name, k in names.items()]
-    return samples.evaluation_document(*methods) | {"condition": CONDITION, "remainder": [], "paired": paired(methods)}
+    methods = [
+        samples.method(name, k, 500 - k, 500, privileged=name == "bt+truth", env_steps_per_s=25123.4)
+        for name, k in names.items()
+    ]
+    return samples.evaluation_document(*methods) | {
+        "condition": CONDITION,
+        "remainder": [],
+        "paired": paired(methods),
+    }
 
 
 def explained():
@@ -70,17 +79,24 @@ class Exported:
 
 
 LOG = {
-    "topics": [{"topic": f"/topic/{i}", "schema": "foxglove.CompressedImage", "messages": 10**i, "rate_hz": 50.0} for i in range(6)],
+    "topics": [{"topic": f"/topic/{i}", "schema": "foxglove.CompressedImage", "messages": 10**i,
+    "rate_hz": 50.0} for i in range(6)],
     "duration_s": 12.0, "outcome": "success",
 }  # fmt: skip
 CHECKS = [{"name": "kernel cache", "ok": False, "detail": "word " * 60}]
-CLAIMS = {"budget": "quick", "claims": [{"text": "word " * 30, "theirs": "82.8 %", "ours": "96.5 % [95.1, 97.5]", "verdict": "holds"}]}
+CLAIMS = {
+    "budget": "quick",
+    "claims": [{"text": "word " * 30, "theirs": "82.8 %", "ours": "96.5 % [95.1, 97.5]", "verdict": "holds"}],
+}
 SHOWS = {
     "eval": (lambda s: show_methods(s, evaluation()), ["method", "success [95 %]", "collision [95 %]"]),
     "pairs": (lambda s: show_pairs(s, evaluation()["paired"]), ["a : b", "only a", "only b", "(McNemar)"]),
     "causes": (lambda s: show_causes(s, explained()), ["cause", "n"]),
     "simulate": (lambda s: show_simulation(s, simulated(), "bluerov2"), ["t s", "x m", "y m", "z m"]),
-    "sweep": (lambda s: show_sweep(s, samples.robustness_sweep()), ["changed", "method", "success [95 %]", "collision [95 %]"]),
+    "sweep": (
+        lambda s: show_sweep(s, samples.robustness_sweep()),
+        ["changed", "method", "success [95 %]", "collision [95 %]"],
+    ),
     "profile": (lambda s: show_profile(s, PROFILE), ["us per env-step", "65536 env"]),
     "export": (lambda s: show_export(s, Exported), ["engine"]),
     "log": (lambda s: show_log(s, LOG, "x" * 200 + ".mcap"), ["topic", "messages", "Hz"]),
@@ -90,7 +106,15 @@ SHOWS = {
 }
 PROFILE = samples.PROFILE | {
     "rows": [samples.PROFILE["rows"][0] | {"num_envs": 4**i} for i in range(9)],
-    "real_time": {"p50_ms": 1.0, "p99_ms": 2.0, "max_ms": 3.0, "budget_ms": 20.0, "within": True, "late": 0, "steps": 500},
+    "real_time": {
+        "p50_ms": 1.0,
+        "p99_ms": 2.0,
+        "max_ms": 3.0,
+        "budget_ms": 20.0,
+        "within": True,
+        "late": 0,
+        "steps": 500,
+    },
 }
 
 
@@ -111,7 +135,9 @@ def test_rates_of_an_evaluation_stand_whole_in_one_line(width):
     lines = shown(lambda s: show_methods(s, result), width).splitlines()
     for m in result["methods"]:
         o = m["outcomes"]
-        (row,) = [line for line in lines if re.search(rf"\b{o['success']}/500 = .*\b{o['collision']}/500 = ", line)]
+        (row,) = [
+            line for line in lines if re.search(rf"\b{o['success']}/500 = .*\b{o['collision']}/500 = ", line)
+        ]
         assert row.count("[") == row.count("]") == 2
 
 
@@ -131,7 +157,14 @@ def test_a_wider_terminal_shows_more_and_what_is_left_out_is_said():
 def test_wide_shows_every_column(name):
     text = shown(SHOWS[name][0], 80, wide=True)
     assert "left out" not in text and "…" not in text
-    heads = {"eval": "steps/s", "simulate": "r rad/s", "profile": "64 env", "causes": "chance", "log": "schema", "export": "p99 ms"}
+    heads = {
+        "eval": "steps/s",
+        "simulate": "r rad/s",
+        "profile": "64 env",
+        "causes": "chance",
+        "log": "schema",
+        "export": "p99 ms",
+    }
     assert heads.get(name, "") in text
 
 
@@ -173,7 +206,9 @@ def test_heat_maps_come_in_pieces_where_they_are_wider_than_the_terminal():
 def test_long_values_of_an_axis_are_not_cut():
     axes = {"S": [4, 8], "sensors.localization": ["truth", "dead_reckoning_with_drift"]}
     cells = [
-        {"S": s, "sensors.localization": v, "method": "bt", **samples.rates(9, 3)} for s in axes["S"] for v in axes["sensors.localization"]
+        {"S": s, "sensors.localization": v, "method": "bt", **samples.rates(9, 3)}
+        for s in axes["S"]
+        for v in axes["sensors.localization"]
     ]
     text = shown(lambda s: show_sweep(s, {"world": "pool", "axes": axes, "cells": cells}), 80)
     assert "dead_reckoning_with_drift" in text and "…" not in text
@@ -182,4 +217,6 @@ def test_long_values_of_an_axis_are_not_cut():
 def test_every_preset_has_a_sentence():
     for kind, found in sentences().items():
         for name, said in found.items():
-            assert said.endswith(".") and 15 < len(said) < 250 and not said.startswith(("#", "<")), f"{kind}/{name}: {said}"
+            assert said.endswith(".") and 15 < len(said) < 250 and not said.startswith(("#", "<")), (
+                f"{kind}/{name}: {said}"
+            )

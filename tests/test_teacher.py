@@ -23,15 +23,23 @@ N_ENV, N_TRACK, N_RAY = 6, 4, 64
 TEACHER = {
     "cruise_m_s": 0.6, "decide_period_steps": 5, "lag_s": 0.35, "horizon_s": 2.5,
     "n_heading": 12, "n_speed": 3, "evade_m_s": 0.8, "heave_m_s": 0.35, "n_heave_heading": 7, "burst_s": 0.75,
-    "hull_reach_m": 0.22, "contact_m": 0.1, "margin_m": 0.25, "margin_growth_m_s": 0.1, "closing_s": 0.25, "vertical_weight": 1.4,
-    "caution": 1.2, "static_margin_m": 0.1, "static_horizon_s": 1.5, "static_dt_s": 0.25, "weight_peak": 6.0, "weight_mean": 6.0,
-    "weight_contact": 12.0, "weight_static": 12.0, "weight_static_contact": 30.0, "weight_deviation": 1.0, "weight_change": 0.3,
-    "softness": 0.05, "calm_s": 0.5, "conflict_within_s": 2.5, "emergency_ttc_s": 0.35, "emergency_range_m": 0.12,
-    "emergency_closing_m_s": 0.15, "back_off_m_s": 0.85, "blocked_clearance_m": 0.25, "goal_near_m": 1.5, "stuck_s": 4.0, "unstick_s": 1.5,
-    "unstick_m_s": 0.3, "slow_clearance_m": 0.6, "slow_fraction": 0.5, "edge_gap_m": 0.26, "depth_gain": 1.0, "yaw_gain": 1.5,
-    "gaze_m": 3.0, "gaze_level_m": 1.0, "gaze_clearance_m": 0.6, "askew_clearance_m": 0.5, "gaze_off_deg": 25.0,
+    "hull_reach_m": 0.22, "contact_m": 0.1, "margin_m": 0.25, "margin_growth_m_s": 0.1, "closing_s": 0.25,
+    "vertical_weight": 1.4,
+    "caution": 1.2, "static_margin_m": 0.1, "static_horizon_s": 1.5, "static_dt_s": 0.25, "weight_peak": 6.0,
+    "weight_mean": 6.0,
+    "weight_contact": 12.0, "weight_static": 12.0, "weight_static_contact": 30.0, "weight_deviation": 1.0,
+    "weight_change": 0.3,
+    "softness": 0.05, "calm_s": 0.5, "conflict_within_s": 2.5, "emergency_ttc_s": 0.35,
+    "emergency_range_m": 0.12,
+    "emergency_closing_m_s": 0.15, "back_off_m_s": 0.85, "blocked_clearance_m": 0.25, "goal_near_m": 1.5,
+    "stuck_s": 4.0, "unstick_s": 1.5,
+    "unstick_m_s": 0.3, "slow_clearance_m": 0.6, "slow_fraction": 0.5, "edge_gap_m": 0.26, "depth_gain": 1.0,
+    "yaw_gain": 1.5,
+    "gaze_m": 3.0, "gaze_level_m": 1.0, "gaze_clearance_m": 0.6, "askew_clearance_m": 0.5,
+    "gaze_off_deg": 25.0,
 }  # fmt: skip
-"""Every number of the stage, so that tuning the defaults breaks nothing here. The dashes end between two samples of the forecast."""
+"""Every number of the stage, so that tuning the defaults breaks nothing here. The dashes end between two
+samples of the forecast."""
 CFG = Config.model_validate(
     {
         "sensors": {"sonar": {"n_ray": N_RAY}},
@@ -55,11 +63,12 @@ SIZES = {
     "n_col": grid_shape(TANK, CELL)[1],
 }
 COST_TOLERANCE = 5e-3
-"""Costs are up to 60: float32 positions of 20 m (2e-6 m) times weights of 30 per metre and some hundred summed terms; and the kernel's
-distances are 1e-4 m too long at a mantle (a term under its root), which the weights of a body (24 per metre) turn into 2.4e-3."""
+"""Costs are up to 60: float32 positions of 20 m (2e-6 m) times weights of 30 per metre and some hundred
+summed terms; and the kernel's distances are 1e-4 m too long at a mantle (a term under its root), which the
+weights of a body (24 per metre) turn into 2.4e-3."""
 CLOSE_M = 1e-4
-"""A sample this close to a cell's border or to where a body's height begins may fall on its other side in float32; such candidates are not
-compared."""
+"""A sample this close to a cell's border or to where a body's height begins may fall on its other side in
+float32; such candidates are not compared."""
 OPEN_M = FAR_M
 """Height of free water that nothing bounds."""
 STRUCTS = {
@@ -136,7 +145,8 @@ def use(stage, name):
 
 
 def body(stage, env, track, pos, vel, radius=0.2, above=-0.8, below=-0.8):
-    """A forecast body in straight motion, at any height but the free water from ``below`` to ``above`` (default: level with -0.8 m)."""
+    """A forecast body in straight motion, at any height but the free water from ``below`` to ``above``
+    (default: level with -0.8 m)."""
     put(stage.forecast.pos_w, np.asarray(pos) + np.outer(TIMES, vel), env, track)
     put(stage.forecast.radius_m, radius, env, track)
     put(stage.forecast.above_w, above, env, track)
@@ -192,7 +202,17 @@ def decide(stage):
 def tick(stage):
     leaves.tick_tree(
         io_for(
-            TeacherIO, stage.t, stage.table, stage.route, stage.ego, stage.mission, stage.clock, CFG.teacher, CFG.vehicle, TANK, CFG.episode
+            TeacherIO,
+            stage.t,
+            stage.table,
+            stage.route,
+            stage.ego,
+            stage.mission,
+            stage.clock,
+            CFG.teacher,
+            CFG.vehicle,
+            TANK,
+            CFG.episode,
         ),
         stage.action,
     )
@@ -210,11 +230,12 @@ def step(stage, count=1):
         decide(stage)
 
 
-# -------------------------------------------------------------------------------------------------------------------- oracle
+# ----------------------------------------------------------------------------------------------------- oracle
 
 
 def test_packets_equal_the_scalar_oracle(scene):
-    """Costs of all candidates over random bodies, heights, maps and motions; how depth is changed; and what is made of the costs."""
+    """Costs of all candidates over random bodies, heights, maps and motions; how depth is changed; and what
+    is made of the costs."""
     rng = np.random.default_rng(3)
     bests = []
     for _ in range(2):
@@ -222,7 +243,10 @@ def test_packets_equal_the_scalar_oracle(scene):
         assess(scene)
         scene.t.want_evade.fill(1)
         plan(scene)
-        found, chosen, price = (getattr(scene.t, name).to_numpy().astype(float) for name in ("candidate_cost", "evade_vel_w", "evade_cost"))
+        found, chosen, price = (
+            getattr(scene.t, name).to_numpy().astype(float)
+            for name in ("candidate_cost", "evade_vel_w", "evade_cost")
+        )
         for env in range(N_ENV):
             view = View(scene, env)
             commands, bursts = view.candidates()
@@ -234,15 +258,22 @@ def test_packets_equal_the_scalar_oracle(scene):
             best = found[env].argmin()
             mean = oracle.mean_velocity(commands, found[env], CFG.teacher.softness)
             held = view.cost(mean, np.inf)[0]
-            taken = (mean, held) if held <= found[env].min() + CFG.teacher.softness else (commands[best], found[env].min())
+            taken = (
+                (mean, held)
+                if held <= found[env].min() + CFG.teacher.softness
+                else (commands[best], found[env].min())
+            )
             np.testing.assert_allclose(chosen[env], taken[0], atol=1e-3)
             assert price[env] == pytest.approx(taken[1], abs=COST_TOLERANCE)
             bests.append(best)
-    assert max(bests) >= CFG.teacher.first_burst and (np.array(bests) < 36).any()  # dashes and level ones have both been best
+    assert (
+        max(bests) >= CFG.teacher.first_burst and (np.array(bests) < 36).any()
+    )  # dashes and level ones have both been best
 
 
 def random_scene(scene, rng):
-    """Own motion, follow and last velocities, maps, and bodies that may be level, above, below, or on both sides of the free water."""
+    """Own motion, follow and last velocities, maps, and bodies that may be level, above, below, or on both
+    sides of the free water."""
     put(scene.ego.pos_w, rng.uniform([3, 1.5, -1.3], [17, 4.5, -0.3], (N_ENV, 3)))
     put(scene.ego.vel_b, rng.uniform(-0.4, 0.4, (N_ENV, 3)))
     put(scene.ego.rpy, np.c_[np.zeros((N_ENV, 2)), rng.uniform(-3, 3, N_ENV)])
@@ -257,7 +288,10 @@ def random_scene(scene, rng):
     radii = np.where(rng.random((N_ENV, N_TRACK)) < 0.75, rng.uniform(0.15, 0.4, (N_ENV, N_TRACK)), -1.0)
     put(scene.forecast.radius_m, np.repeat(radii[:, :, None], N_SAMPLE, 2))
     own_z, kind = pos[:, 2:], rng.integers(0, 4, (N_ENV, N_TRACK))
-    above, below = own_z + rng.uniform(0, 0.8, (N_ENV, N_TRACK)), own_z - rng.uniform(0, 0.8, (N_ENV, N_TRACK))
+    above, below = (
+        own_z + rng.uniform(0, 0.8, (N_ENV, N_TRACK)),
+        own_z - rng.uniform(0, 0.8, (N_ENV, N_TRACK)),
+    )
     put(scene.forecast.above_w, np.choose(kind, [own_z, above, OPEN_M, above]))
     put(scene.forecast.below_w, np.choose(kind, [own_z, -OPEN_M, below, below]))
 
@@ -266,19 +300,24 @@ class View:
     """What one env's search sees, in float64, and the oracle's answers."""
 
     def __init__(self, scene, env):
-        follow, last = (getattr(scene.t, name).to_numpy()[env].astype(float) for name in ("follow_vel_w", "last_vel_w"))
+        follow, last = (
+            getattr(scene.t, name).to_numpy()[env].astype(float) for name in ("follow_vel_w", "last_vel_w")
+        )
         yaw = float(scene.ego.rpy.to_numpy()[env, 2])
         turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
         self.follow, self.last, self.yaw = follow, last, yaw
         self.pos = scene.ego.pos_w.to_numpy()[env].astype(float)
         self.vel = turn @ scene.ego.vel_b.to_numpy()[env].astype(float)
         self.forecast = [
-            getattr(scene.forecast, name).to_numpy()[env].astype(float) for name in ("pos_w", "radius_m", "above_w", "below_w")
+            getattr(scene.forecast, name).to_numpy()[env].astype(float)
+            for name in ("pos_w", "radius_m", "above_w", "below_w")
         ]
         self.clearance = scene.clearance.clearance_m.to_numpy()[env].astype(float)
 
     def candidates(self):
-        return oracle.candidates(self.follow, self.last, self.yaw, self.pos[2], CFG.teacher, CFG.vehicle, TANK)
+        return oracle.candidates(
+            self.follow, self.last, self.yaw, self.pos[2], CFG.teacher, CFG.vehicle, TANK
+        )
 
     def cost(self, command, burst_s):
         origin, dt = grid_origin(TANK, CELL), CFG.tracking.forecast_dt_s
@@ -287,56 +326,81 @@ class View:
 
     def depths(self, command):
         return oracle.body_depths(
-            self.pos, self.vel, np.asarray(command, float), self.forecast, CFG.teacher, TANK, CFG.tracking.forecast_dt_s
+            self.pos,
+            self.vel,
+            np.asarray(command, float),
+            self.forecast,
+            CFG.teacher,
+            TANK,
+            CFG.tracking.forecast_dt_s,
         )
 
 
 def test_follow_changes_depth_only_where_that_comes_no_nearer(scene):
-    """Against the oracle: peaks with and without the heave towards the goal decide, and the conflict is that of what is chosen."""
+    """Against the oracle: peaks with and without the heave towards the goal decide, and the conflict is that
+    of what is chosen."""
     rng = np.random.default_rng(5)
     low, high = oracle.depth_band(TANK, CFG.teacher)
     heaves, held, seen = 0, 0, 0
     for _ in range(8):
         random_scene(scene, rng)
         assess(scene)
-        found = (getattr(scene.t, name).to_numpy().astype(float) for name in ("follow_vel_w", "conflict_s", "hold_conflict_s"))
+        found = (
+            getattr(scene.t, name).to_numpy().astype(float)
+            for name in ("follow_vel_w", "conflict_s", "hold_conflict_s")
+        )
         follow, conflict, staying = found
         for env in range(N_ENV):
             view = View(scene, env)
             error = np.clip(scene.mission.goal_w.to_numpy()[env, 2], low, high) - view.pos[2]
-            heave = np.clip(CFG.teacher.depth_gain * error, -CFG.vehicle.max_heave_m_s, CFG.vehicle.max_heave_m_s)
+            heave = np.clip(
+                CFG.teacher.depth_gain * error, -CFG.vehicle.max_heave_m_s, CFG.vehicle.max_heave_m_s
+            )
             level, changing = view.depths((*follow[env, :2], 0.0)), view.depths((*follow[env, :2], heave))
             if min(level[4], changing[4]) < CLOSE_M or 5e-4 < changing[0] - level[0] < 2e-3:
                 continue
             stop = view.depths((0.0, 0.0, 0.0))
-            assert stop[4] < CLOSE_M or staying[env] == (pytest.approx(stop[3], abs=1e-3) if np.isfinite(stop[3]) else FAR_M)
+            assert stop[4] < CLOSE_M or staying[env] == (
+                pytest.approx(stop[3], abs=1e-3) if np.isfinite(stop[3]) else FAR_M
+            )
             taken = changing if changing[0] <= level[0] + 1e-3 else level
             assert follow[env, 2] == pytest.approx(heave if taken is changing else 0.0, abs=1e-5)
             assert conflict[env] == (pytest.approx(taken[3], abs=1e-3) if np.isfinite(taken[3]) else FAR_M)
-            heaves, held, seen = heaves + (taken is changing), held + (taken is level), seen + np.isfinite(taken[3])
+            heaves, held, seen = (
+                heaves + (taken is changing),
+                held + (taken is level),
+                seen + np.isfinite(taken[3]),
+            )
     assert min(heaves, held, seen) > 5
 
 
-# ---------------------------------------------------------------------------------------------------------------- situations
+# ------------------------------------------------------------------------------------------------- situations
 
 
 def test_open_water_is_travelled_at_cruise_speed(scene):
     decide(scene)
     assert acting(scene) == ["FollowRoute"] * N_ENV
-    np.testing.assert_allclose(scene.action[0], [CFG.teacher.cruise_m_s / CFG.vehicle.max_surge_m_s, 0, 0, 0], atol=1e-5)
+    np.testing.assert_allclose(
+        scene.action[0], [CFG.teacher.cruise_m_s / CFG.vehicle.max_surge_m_s, 0, 0, 0], atol=1e-5
+    )
     assert scene.t.conflict_s.to_numpy()[0] == scene.t.ttc_s.to_numpy()[0] == FAR_M
 
 
 def test_head_on_body_is_evaded_with_room(scene):
-    """The follow velocity would be hit; the evasive velocity keeps more than contact over the whole horizon."""
+    """The follow velocity would be hit; the evasive velocity keeps more than contact over the whole
+    horizon."""
     body(scene, 0, 0, (7.2, 3.05), (-0.6, 0.0))
     decide(scene)
     assert acting(scene) == ["Evade"] + ["FollowRoute"] * (N_ENV - 1)
     where = scene.forecast.pos_w.to_numpy()[0, 0].astype(float)
 
     def closest(command):
-        at, _ = oracle.rolled_out((5.0, 3.0), (0, 0), np.asarray(command, float), CFG.teacher.lag_s, 0.1, N_SAMPLE - 1)
-        return np.hypot(*(at - where).T).min() - 0.2 - CFG.vehicle.hull_radius_m - CFG.vehicle.hull_half_length_m
+        at, _ = oracle.rolled_out(
+            (5.0, 3.0), (0, 0), np.asarray(command, float), CFG.teacher.lag_s, 0.1, N_SAMPLE - 1
+        )
+        return (
+            np.hypot(*(at - where).T).min() - 0.2 - CFG.vehicle.hull_radius_m - CFG.vehicle.hull_half_length_m
+        )
 
     assert closest(scene.t.follow_vel_w.to_numpy()[0, :2]) < 0
     assert closest(scene.t.evade_vel_w.to_numpy()[0, :2]) > CFG.teacher.contact_m
@@ -386,7 +450,8 @@ def closing_beams(scene, env, beams, range_m=0.45, speed=0.6):
 
 
 def test_sensed_emergency_backs_off_from_it(scene):
-    """Two neighbouring beams agree: retreat from them. One alone is an outlier. Turned since the ping: still the same place."""
+    """Two neighbouring beams agree: retreat from them. One alone is an outlier. Turned since the ping: still
+    the same place."""
     left = N_RAY // 4
     closing_beams(scene, 0, (left, left + 1))
     closing_beams(scene, 1, (left,))
@@ -399,7 +464,9 @@ def test_sensed_emergency_backs_off_from_it(scene):
     assert velocity[0, 1] < -0.8 and abs(velocity[0, 0]) < 0.15
     np.testing.assert_allclose(velocity[2], velocity[0], atol=1e-5)
     assert velocity[3, 0] < -0.8
-    assert scene.t.ttc_s.to_numpy()[0] == pytest.approx((0.45 - CFG.teacher.hull_reach_m - CFG.teacher.contact_m) / 0.6, rel=1e-4)
+    assert scene.t.ttc_s.to_numpy()[0] == pytest.approx(
+        (0.45 - CFG.teacher.hull_reach_m - CFG.teacher.contact_m) / 0.6, rel=1e-4
+    )
     assert scene.t.nearest_m.to_numpy()[1] == pytest.approx(0.45 - CFG.teacher.hull_reach_m, rel=1e-4)
 
 
@@ -451,7 +518,9 @@ def test_yardsticks_do_not_avoid_bodies(scene):
         use(scene, name)
         decide(scene)
         assert acting(scene) == [leaf] * N_ENV
-    assert scene.action[0, 1] > 0.99 and scene.action[0, 2] == 1.0 and scene.action[0, 3] > 0.9  # to port, up, turning there
+    assert (
+        scene.action[0, 1] > 0.99 and scene.action[0, 2] == 1.0 and scene.action[0, 3] > 0.9
+    )  # to port, up, turning there
 
 
 def test_depth_goes_to_the_goals_but_not_towards_a_body(scene):
@@ -466,7 +535,10 @@ def test_depth_goes_to_the_goals_but_not_towards_a_body(scene):
     body(scene, 5, 0, near, still, above=OPEN_M, below=-1.1)
     put(scene.mission.goal_w, (15.0, 3.0, -0.6), 5)
     lowest = TANK.z_m[0] + CFG.teacher.edge_gap_m
-    for guard, wanted in (("", (-0.4, 0.0, -0.4, -0.4, lowest + 1.2, 0.2)), (' depth_guard="0"', (-0.4, -0.4, -0.4, -0.4, -0.4, 0.2))):
+    for guard, wanted in (
+        ("", (-0.4, 0.0, -0.4, -0.4, lowest + 1.2, 0.2)),
+        (' depth_guard="0"', (-0.4, -0.4, -0.4, -0.4, -0.4, 0.2)),
+    ):
         xml = f'<root BTCPP_format="4"><BehaviorTree ID="main"><FollowRoute{guard}/></BehaviorTree></root>'
         scene.tree = parse_tree(xml)
         load_tree(scene.table, scene.tree)
@@ -483,7 +555,8 @@ def corridor(scene, half_width):
 
 
 def test_climbs_or_dives_past_what_fills_the_way(scene):
-    """In a corridor something faster than the vehicle comes: over it if it is known to be below, under it if above, not beyond the band."""
+    """In a corridor something faster than the vehicle comes: over it if it is known to be below, under it if
+    above, not beyond the band."""
     corridor(scene, 0.5)
     top = TANK.z_m[1] - CFG.teacher.edge_gap_m - 0.05
     for env, (above, below) in enumerate(((OPEN_M, -0.8), (-0.8, -OPEN_M), (OPEN_M, top), (-0.8, -0.8))):
@@ -509,13 +582,16 @@ def test_what_is_far_enough_below_is_no_conflict(scene):
 
 
 def test_stopping_is_safe_beside_the_path_of_a_body(scene):
-    """Something passes ahead: stop. It comes here: stopping helps nothing. A tree may ask for the next second only."""
+    """Something passes ahead: stop. It comes here: stopping helps nothing. A tree may ask for the next second
+    only."""
     body(scene, 0, 0, (6.3, 5.0), (0.0, -0.9))
     body(scene, 1, 0, (6.6, 3.0), (-0.9, 0.0))
     body(scene, 2, 0, (7.6, 3.0), (-0.9, 0.0))
     for port, waiting in (("", ("Hold", None, None)), (' within_s="1"', ("Hold", None, "Hold"))):
         text = f"<ReactiveSequence><SafeHere{port}/><Hold/></ReactiveSequence>"
-        scene.tree = parse_tree(f'<root BTCPP_format="4"><BehaviorTree ID="main">{text}</BehaviorTree></root>')
+        scene.tree = parse_tree(
+            f'<root BTCPP_format="4"><BehaviorTree ID="main">{text}</BehaviorTree></root>'
+        )
         load_tree(scene.table, scene.tree)
         decide(scene)
         assert acting(scene) == [*waiting, *["Hold"] * (N_ENV - 3)]
@@ -523,7 +599,8 @@ def test_stopping_is_safe_beside_the_path_of_a_body(scene):
 
 
 def test_conflicts_are_foreseen_at_cruise_speed_even_if_evasion_is_slower(scene):
-    """Bodies beyond the reach of every velocity are left out of the roll-out: following reaches farther than evading here."""
+    """Bodies beyond the reach of every velocity are left out of the roll-out: following reaches farther than
+    evading here."""
     body(scene, 0, 0, (6.7, 3.0), (0.0, 0.0))
     assess(scene)
     sooner = scene.t.conflict_s.to_numpy()[0]
@@ -532,9 +609,13 @@ def test_conflicts_are_foreseen_at_cruise_speed_even_if_evasion_is_slower(scene)
 
 
 def test_a_dash_gets_out_of_the_way_in_a_narrow_place(scene):
-    """Something crosses fast, and the water beside its path is soon at an end: only a short dash clears the one and stops at the other."""
+    """Something crosses fast, and the water beside its path is soon at an end: only a short dash clears the
+    one and stops at the other."""
     x = grid_origin(TANK, CELL)[0] + (np.arange(SIZES["n_col"]) + 0.5) * CELL
-    put(scene.clearance.clearance_m, np.broadcast_to((0.75 - np.abs(x - 5.0)).clip(0), scene.clearance.clearance_m.shape[1:]))
+    put(
+        scene.clearance.clearance_m,
+        np.broadcast_to((0.75 - np.abs(x - 5.0)).clip(0), scene.clearance.clearance_m.shape[1:]),
+    )
     body(scene, 0, 0, (5.0, 3.9), (0.0, -1.2), radius=0.25)
     decide(scene)
     cost = scene.t.candidate_cost.to_numpy()[0]
@@ -550,14 +631,18 @@ def test_candidates_fill_whole_packets():
     """Stop, last command and follow are always there; climbing, diving and dashes can be left out."""
     level = {"n_heading": 5, "n_speed": 3, "n_heave_heading": 4}
     held, first, count = (
-        [getattr(TeacherConfig(**level, heave_m_s=heave, burst_s=burst), name) for heave, burst in ((0, 0), (0, 0.5), (0.4, 0), (0.4, 0.5))]
+        [
+            getattr(TeacherConfig(**level, heave_m_s=heave, burst_s=burst), name)
+            for heave, burst in ((0, 0), (0, 0.5), (0.4, 0), (0.4, 0.5))
+        ]
         for name in ("n_held", "first_burst", "n_candidate")
     )
     assert held == [18, 18, 28, 28] and first == [32] * 4 and count == [32, 64, 32, 64]
 
 
 def test_actions_point_along_the_wanted_velocity(scene):
-    """At any attitude the action, scaled by the limits and turned into the world, is parallel to the velocity, never beyond a limit."""
+    """At any attitude the action, scaled by the limits and turned into the world, is parallel to the
+    velocity, never beyond a limit."""
     rng = np.random.default_rng(1)
     for _ in range(5):
         rpy = rng.uniform([-0.2, -0.2, -3.1], [0.2, 0.2, 3.1], (N_ENV, 3))
@@ -577,7 +662,10 @@ def test_actions_point_along_the_wanted_velocity(scene):
                     [-sp, cp * sr, cp * cr],
                 ]
             )
-            driven = R_wb @ (action[env, :3] * [CFG.vehicle.max_surge_m_s, CFG.vehicle.max_sway_m_s, CFG.vehicle.max_heave_m_s])
+            driven = R_wb @ (
+                action[env, :3]
+                * [CFG.vehicle.max_surge_m_s, CFG.vehicle.max_sway_m_s, CFG.vehicle.max_heave_m_s]
+            )
             np.testing.assert_allclose(driven, velocity[env], atol=2e-3)
 
 
@@ -592,7 +680,7 @@ def test_faster_than_the_axes_only_on_diagonals(scene):
     assert abs(off - round(off)) < 0.02 and round(off) % 2 == 1
 
 
-# ------------------------------------------------------------------------------------------------------------- narrow places
+# ---------------------------------------------------------------------------------------------- narrow places
 
 
 def blocks(scene, env, *ways, clearance_m=0.2):
@@ -603,7 +691,8 @@ def blocks(scene, env, *ways, clearance_m=0.2):
 
 
 def route_ahead(scene, way, lookahead):
-    """Own place off the borders of cells, points of the route at ``way`` [n, 2] from there, 0.1 m apart, and the look-ahead point."""
+    """Own place off the borders of cells, points of the route at ``way`` [n, 2] from there, 0.1 m apart, and
+    the look-ahead point."""
     own = np.array([5.05, 3.03])
     fill(scene.ego.pos_w, (*own, -0.8))
     put(scene.route.ahead_w, own + way)
@@ -612,7 +701,8 @@ def route_ahead(scene, way, lookahead):
 
 
 def test_round_a_corner_a_nearer_point_of_the_route_is_steered_for(scene):
-    """The route goes up and then right: the farthest of its points at 0.6, 0.4 and 0.2 m is taken if only the straight way is narrow."""
+    """The route goes up and then right: the farthest of its points at 0.6, 0.4 and 0.2 m is taken if only the
+    straight way is narrow."""
     up, right = np.minimum(np.arange(16), 4), np.maximum(np.arange(16) - 4, 0)
     route_ahead(scene, 0.1 * np.stack([right, up], 1), (1.0, 0.4))
     put(scene.route.n_ahead, 5, 3)
@@ -624,11 +714,15 @@ def test_round_a_corner_a_nearer_point_of_the_route_is_steered_for(scene):
     blocks(scene, 4, straight, clearance_m=0.43)
     assess(scene)
     steer, room = scene.t.steer_w.to_numpy(), scene.t.path_clearance_m.to_numpy()
-    np.testing.assert_allclose(steer, [(1.0, 0.4), (0.2, 0.4), (0.0, 0.4), (0.0, 0.4), (1.0, 0.4), (1.0, 0.4)], atol=1e-5)
+    np.testing.assert_allclose(
+        steer, [(1.0, 0.4), (0.2, 0.4), (0.0, 0.4), (0.0, 0.4), (1.0, 0.4), (1.0, 0.4)], atol=1e-5
+    )
     np.testing.assert_allclose(room, [2.0, 2.0, 2.0, 2.0, 0.43, 2.0], atol=1e-6)
     follow = scene.t.follow_vel_w.to_numpy()[:, :2]
     np.testing.assert_allclose(np.arctan2(*follow[:5].T), np.arctan2(*steer[:5].T), atol=1e-5)
-    np.testing.assert_allclose(np.hypot(*follow[[0, 1, 5]].T), [CFG.teacher.cruise_m_s, CFG.teacher.cruise_m_s, 0.0], atol=1e-5)
+    np.testing.assert_allclose(
+        np.hypot(*follow[[0, 1, 5]].T), [CFG.teacher.cruise_m_s, CFG.teacher.cruise_m_s, 0.0], atol=1e-5
+    )
 
 
 def test_where_every_way_is_narrow_the_widest_is_steered_for(scene):
@@ -640,12 +734,15 @@ def test_where_every_way_is_narrow_the_widest_is_steered_for(scene):
         for way, room_m in zip(((0.5, 0.0), (0.0, 0.53), (0.0, 0.32), (0.0, 0.12)), rooms, strict=True):
             blocks(scene, env, way, clearance_m=room_m)
     assess(scene)
-    np.testing.assert_allclose(scene.t.steer_w.to_numpy()[:4], [(0.0, 0.2), (0.0, 0.4), (1.0, 0.0), (0.0, 0.6)], atol=1e-5)
+    np.testing.assert_allclose(
+        scene.t.steer_w.to_numpy()[:4], [(0.0, 0.2), (0.0, 0.4), (1.0, 0.0), (0.0, 0.6)], atol=1e-5
+    )
     np.testing.assert_allclose(scene.t.path_clearance_m.to_numpy()[:4], [0.3, 0.32, 0.3, 0.35], atol=1e-6)
 
 
 def test_a_narrow_way_is_entered_lengthwise(scene):
-    """Across the way, 0.4 of the speed is left; head or tail along it, all of what the clearance here allows (0.5 + 0.5 x 0.13 / 0.6)."""
+    """Across the way, 0.4 of the speed is left; head or tail along it, all of what the clearance here allows
+    (0.5 + 0.5 x 0.13 / 0.6)."""
     turned = np.radians([0, 90, 180, 30, -90, 90])
     put(scene.ego.rpy, np.stack([0 * turned, 0 * turned, turned], 1))
     scene.clearance.clearance_m.fill(0.45)
@@ -653,14 +750,17 @@ def test_a_narrow_way_is_entered_lengthwise(scene):
     assess(scene)
     speed = np.hypot(*scene.t.follow_vel_w.to_numpy()[:, :2].T)
     here = 0.6 * (0.5 + 0.5 * 0.13 / 0.6)
-    np.testing.assert_allclose(speed, [here, 0.4 * here, here, 0.7 * here, 0.4 * here, 0.6 * (0.5 + 0.5 * 0.19 / 0.6)], atol=1e-5)
+    np.testing.assert_allclose(
+        speed, [here, 0.4 * here, here, 0.7 * here, 0.4 * here, 0.6 * (0.5 + 0.5 * 0.19 / 0.6)], atol=1e-5
+    )
 
 
-# ----------------------------------------------------------------------------------------------------------------------- gaze
+# ------------------------------------------------------------------------------------------------------- gaze
 
 
 def test_who_is_looked_at(scene):
-    """Above and below before level ones (which count as 1 m farther), the nearest first, nobody beyond 3 m, nobody from narrow places."""
+    """Above and below before level ones (which count as 1 m farther), the nearest first, nobody beyond 3 m,
+    nobody from narrow places."""
     reach = 0.2 + CFG.teacher.hull_reach_m
     still, over, under = (0.0, 0.0), {"above": -0.3, "below": -OPEN_M}, {"above": OPEN_M, "below": -1.3}
     cases = [
@@ -674,7 +774,9 @@ def test_who_is_looked_at(scene):
     for env, bodies in enumerate(cases):
         for track, (way, height) in enumerate(bodies):
             body(scene, env, track, np.add((5.0, 3.0), way), still, **height)
-    wanted = np.array([(0.0, 1.9), (1.0, 0.0), (-1.5, 0.0), (0.0, 1.95 + reach), (0.0, 0.0), (0.0, 2.95 + reach)])
+    wanted = np.array(
+        [(0.0, 1.9), (1.0, 0.0), (-1.5, 0.0), (0.0, 1.95 + reach), (0.0, 0.0), (0.0, 2.95 + reach)]
+    )
     assess(scene)
     np.testing.assert_allclose(scene.t.gaze_w.to_numpy(), wanted, atol=1e-5)
     nearest = np.array([1.0 - reach, 1.0 - reach, 1.5 - reach, 1.95, 2.05, 2.95])
@@ -683,21 +785,38 @@ def test_who_is_looked_at(scene):
     put(scene.clearance.clearance_m, 0.61, 3)
     blocks(scene, 5, (0.55, 0.05))
     assess(scene)
-    np.testing.assert_allclose(scene.t.gaze_w.to_numpy(), [*np.zeros((3, 2)), wanted[3], *np.zeros((2, 2))], atol=1e-5)
+    np.testing.assert_allclose(
+        scene.t.gaze_w.to_numpy(), [*np.zeros((3, 2)), wanted[3], *np.zeros((2, 2))], atol=1e-5
+    )
 
 
 def polar(degrees, length=1.0):
     return length * np.stack([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))], -1)
 
 
-def turns(scene, xml, yaw: Any = 0.0, gaze: Any = None, way: Any = None, way_of="follow_vel_w", speed=0.5, room_m=2.0):
-    """[degree] that the nose is told to turn by, with the blackboard set by hand: bearings of the gaze and of the velocity, None = none."""
+def turns(
+    scene,
+    xml,
+    yaw: Any = 0.0,
+    gaze: Any = None,
+    way: Any = None,
+    way_of="follow_vel_w",
+    speed=0.5,
+    room_m=2.0,
+):
+    """[degree] that the nose is told to turn by, with the blackboard set by hand: bearings of the gaze and of
+    the velocity, None = none."""
     for name, degrees, length in (("gaze_w", gaze, 1.5), (way_of, way, speed)):
         field = getattr(scene.t, name)
-        at = np.array([np.zeros(2) if d is None else polar(d, length) for d in np.broadcast_to(degrees, N_ENV)])
+        at = np.array(
+            [np.zeros(2) if d is None else polar(d, length) for d in np.broadcast_to(degrees, N_ENV)]
+        )
         put(field, np.pad(at, ((0, 0), (0, field.n - 2))))
     put(scene.t.path_clearance_m, room_m)
-    put(scene.ego.rpy, np.stack([np.zeros(N_ENV), np.zeros(N_ENV), np.radians(np.broadcast_to(yaw, N_ENV))], 1))
+    put(
+        scene.ego.rpy,
+        np.stack([np.zeros(N_ENV), np.zeros(N_ENV), np.radians(np.broadcast_to(yaw, N_ENV))], 1),
+    )
     scene.tree = parse_tree(f'<root BTCPP_format="4"><BehaviorTree ID="main">{xml}</BehaviorTree></root>')
     load_tree(scene.table, scene.tree)
     tick(scene)
@@ -708,14 +827,23 @@ MOST_DEG = np.degrees(CFG.vehicle.max_yaw_rate_rad_s / CFG.teacher.yaw_gain)
 """A larger angle saturates the yaw rate."""
 
 ANGLE_TOLERANCE = 1e-3
-"""[degree] float32 angles of up to 3 rad are good to 1e-5 degrees; the action stores them as a share of 38 degrees."""
+"""[degree] float32 angles of up to 3 rad are good to 1e-5 degrees; the action stores them as a share of 38
+degrees."""
 
 
 def test_following_the_nose_looks_at_the_body(scene):
     """Whatever the way; without one, along the way; the shorter way round."""
-    found = turns(scene, "<FollowRoute/>", yaw=[0, 0, 0, 170, 0, 0], gaze=[20, -30, None, -170, 120, -120], way=[0, 90, 10, 0, 0, 0])
+    found = turns(
+        scene,
+        "<FollowRoute/>",
+        yaw=[0, 0, 0, 170, 0, 0],
+        gaze=[20, -30, None, -170, 120, -120],
+        way=[0, 90, 10, 0, 0, 0],
+    )
     np.testing.assert_allclose(found, [20, -30, 10, 20, MOST_DEG, -MOST_DEG], atol=ANGLE_TOLERANCE)
-    np.testing.assert_allclose(np.hypot(*scene.t.last_vel_w.to_numpy()[:, :2].T), 0.5, atol=1e-6)  # the way itself stays
+    np.testing.assert_allclose(
+        np.hypot(*scene.t.last_vel_w.to_numpy()[:, :2].T), 0.5, atol=1e-6
+    )  # the way itself stays
 
 
 def test_waiting_the_nose_looks_at_the_body(scene):
@@ -728,31 +856,47 @@ def test_waiting_the_nose_looks_at_the_body(scene):
 
 
 def test_in_danger_a_diagonal_goes_along_the_way_near_the_gaze(scene):
-    """Gaze and way to turn: the diagonals are 45 degrees off the way (and 90 from each other); the nearest to the gaze, within 25 of it.
+    """Gaze and way to turn: the diagonals are 45 degrees off the way (and 90 from each other); the nearest to
+    the gaze, within 25 of it.
 
-    20/30: diagonals at -15 and 75, the nearest is 35 off, so 20 - 25. 10/60: at 15, taken. 5/90: at 45, 40 off, so 5 + 25. Without a gaze
-    the nearest to the present heading: 20 gives -25, 100 gives -35.
+    20/30: diagonals at -15 and 75, the nearest is 35 off, so 20 - 25. 10/60: at 15, taken. 5/90: at 45, 40
+    off, so 5 + 25. Without a gaze the nearest to the present heading: 20 gives -25, 100 gives -35.
     """
     gaze, way = [20, 10, 5, None, None, 0], [30, 60, 90, 20, 100, None]
     wanted = [-5, 15, 30, -25, -35, 0]
-    np.testing.assert_allclose(turns(scene, "<Evade/>", 0, gaze, way, "evade_vel_w"), wanted, atol=ANGLE_TOLERANCE)
+    np.testing.assert_allclose(
+        turns(scene, "<Evade/>", 0, gaze, way, "evade_vel_w"), wanted, atol=ANGLE_TOLERANCE
+    )
     again = turns(
-        scene, "<Evade/>", 150, [None if g is None else g + 150 for g in gaze], [None if w is None else w + 150 for w in way], "evade_vel_w"
+        scene,
+        "<Evade/>",
+        150,
+        [None if g is None else g + 150 for g in gaze],
+        [None if w is None else w + 150 for w in way],
+        "evade_vel_w",
     )
     np.testing.assert_allclose(again, wanted, atol=ANGLE_TOLERANCE)
     narrow = turns(scene, "<Evade/>", 0, None, [20, 100, 150, 200, -20, 0], "evade_vel_w", room_m=0.3)
-    np.testing.assert_allclose(narrow[:5], [-25, -35, 15, -25, 25], atol=ANGLE_TOLERANCE)  # no tail first: any diagonal is as good
+    np.testing.assert_allclose(
+        narrow[:5], [-25, -35, 15, -25, 25], atol=ANGLE_TOLERANCE
+    )  # no tail first: any diagonal is as good
 
 
 def test_backing_off_the_nose_keeps_to_the_diagonal_near_the_gaze(scene):
-    """The threat, ahead, is what is looked at: its retreat goes straight back, the nose 25 degrees towards the nearest diagonal."""
+    """The threat, ahead, is what is looked at: its retreat goes straight back, the nose 25 degrees towards
+    the nearest diagonal."""
     scene.t.threat_bearing.fill(0.0)
     scene.t.clearance_m.fill(2.0)
-    np.testing.assert_allclose(np.abs(turns(scene, "<BackOff/>", gaze=[0, 0, 0, 5, 5, 5])), [25, 25, 25, 30, 30, 30], atol=ANGLE_TOLERANCE)
+    np.testing.assert_allclose(
+        np.abs(turns(scene, "<BackOff/>", gaze=[0, 0, 0, 5, 5, 5])),
+        [25, 25, 25, 30, 30, 30],
+        atol=ANGLE_TOLERANCE,
+    )
 
 
 def test_in_narrow_places_tail_first_is_as_slim(scene):
-    """Following the route below 0.6 m of clearance, the nearer of nose and tail turns along the way; else the nose."""
+    """Following the route below 0.6 m of clearance, the nearer of nose and tail turns along the way; else the
+    nose."""
     way = [150, -150, 30, 80, 100, 180]
     nose = np.clip(way, -MOST_DEG, MOST_DEG)
     tail = turns(scene, "<FollowRoute/>", way=way, room_m=0.59)
@@ -760,24 +904,31 @@ def test_in_narrow_places_tail_first_is_as_slim(scene):
     np.testing.assert_allclose(tail[3:5], [MOST_DEG, -MOST_DEG], atol=ANGLE_TOLERANCE)
     assert abs(tail[5]) < ANGLE_TOLERANCE
     for room_m in (0.6, 2.0):
-        np.testing.assert_allclose(np.abs(turns(scene, "<FollowRoute/>", way=way, room_m=room_m)), np.abs(nose), atol=ANGLE_TOLERANCE)
+        np.testing.assert_allclose(
+            np.abs(turns(scene, "<FollowRoute/>", way=way, room_m=room_m)), np.abs(nose), atol=ANGLE_TOLERANCE
+        )
     put(scene.mission.goal_w, np.column_stack([np.array([5.0, 3.0]) + polar(way, 5.0), np.full(N_ENV, -0.8)]))
     straight = turns(scene, "<DriveStraight/>", way=way, room_m=0.3)
     np.testing.assert_allclose(straight[:5], nose[:5], atol=ANGLE_TOLERANCE)
 
 
 def test_yardsticks_look_at_nobody(scene):
-    """A route followed without guarding the depth, and straight driving: the nose goes along the way, whatever is beside it."""
+    """A route followed without guarding the depth, and straight driving: the nose goes along the way,
+    whatever is beside it."""
     way, gaze = [0, 10, 20, -10, 30, 0], [30, -30, 90, 180, 0, -5]
-    np.testing.assert_allclose(turns(scene, '<FollowRoute depth_guard="0"/>', gaze=gaze, way=way), way, atol=ANGLE_TOLERANCE)
+    np.testing.assert_allclose(
+        turns(scene, '<FollowRoute depth_guard="0"/>', gaze=gaze, way=way), way, atol=ANGLE_TOLERANCE
+    )
     put(scene.mission.goal_w, np.column_stack([np.array([5.0, 3.0]) + polar(way, 5.0), np.full(N_ENV, -0.8)]))
     np.testing.assert_allclose(turns(scene, "<DriveStraight/>", gaze=gaze), way, atol=ANGLE_TOLERANCE)
     np.testing.assert_allclose(
-        turns(scene, '<FollowRoute depth_guard="1"/>', gaze=gaze, way=way)[[0, 1, 5]], [30, -30, -5], atol=ANGLE_TOLERANCE
+        turns(scene, '<FollowRoute depth_guard="1"/>', gaze=gaze, way=way)[[0, 1, 5]],
+        [30, -30, -5],
+        atol=ANGLE_TOLERANCE,
     )
 
 
-# ---------------------------------------------------------------------------------------------------------------- discipline
+# ------------------------------------------------------------------------------------------------- discipline
 
 
 def contents(struct):
@@ -785,7 +936,8 @@ def contents(struct):
 
 
 def test_sleeping_rows_are_untouched_and_rows_do_not_meet(scene):
-    """Row 0 gives the same bits whatever its neighbours do; rows that sleep keep theirs; a reset forgets the last episode."""
+    """Row 0 gives the same bits whatever its neighbours do; rows that sleep keep theirs; a reset forgets the
+    last episode."""
 
     def drama(scene, others):
         scene.clock.awake.fill(1)

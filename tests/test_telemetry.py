@@ -1,4 +1,5 @@
-"""ONNX Runtime reports nothing to its makers: off by variable and by call, in one place; nothing is left outside the folder."""
+"""ONNX Runtime reports nothing to its makers: off by variable and by call, in one place; nothing is left
+outside the folder."""
 
 import ast
 import os
@@ -59,11 +60,27 @@ def watched(work, home):
     """Run ``work`` in a process of its own with an empty home and cache; what it printed."""
     for name in ("home", "cache", "state", "tmp"):
         (home / name).mkdir(parents=True, exist_ok=True)
-    places = {"HOME": home / "home", "XDG_CACHE_HOME": home / "cache", "XDG_STATE_HOME": home / "state", "XDG_DATA_HOME": home / "state"}
+    places = {
+        "HOME": home / "home",
+        "XDG_CACHE_HOME": home / "cache",
+        "XDG_STATE_HOME": home / "state",
+        "XDG_DATA_HOME": home / "state",
+    }
     environment = {name: value for name, value in os.environ.items() if name != onnx_session.VARIABLE}
-    environment |= {name: str(place) for name, place in places.items()} | {"TMPDIR": str(home / "tmp"), "PYTHONPATH": str(ROOT)}
+    environment |= {name: str(place) for name, place in places.items()} | {
+        "TMPDIR": str(home / "tmp"),
+        "PYTHONPATH": str(ROOT),
+    }
     code = WATCHED.replace("WORK", textwrap.indent(work, "    ").strip())
-    done = subprocess.run([sys.executable, "-c", code], cwd=home, env=environment, capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=home,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -74,12 +91,17 @@ def test_export_and_check_open_no_socket_and_write_nowhere_else(tmp_path):
         pytest.importorskip(name, reason="needs the extra uuvtai[export]")
     deployed.saved(tmp_path / "run")
     home, out = tmp_path / "elsewhere", tmp_path / "out"
-    command = "from uuvtai import cli\ntry:\n    cli.main({!r})\nexcept SystemExit as left:\n    assert left.code == 0, left.code"
+    command = (
+        "from uuvtai import cli\ntry:\n    cli.main({!r})\nexcept SystemExit as left:\n    assert "
+        "left.code == 0, left.code"
+    )
     told = watched(command.format(["export", str(tmp_path / "run"), "--out", str(out)]), home)
     assert "ONNX Runtime" in told and (out / "policy.onnx").exists()
     written = tree(out)
     told += watched(command.format(["export", "--check", str(out)]), home)
-    assert told.count("sockets: []") == 2 and told.count("variable: 1") == 2 and told.count("loaded: True") == 2, told
+    assert (
+        told.count("sockets: []") == 2 and told.count("variable: 1") == 2 and told.count("loaded: True") == 2
+    ), told
     assert [path for path in home.rglob("*") if path.is_file()] == []
     assert tree(out) == written, "the check wrote into the folder"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["elsewhere", "out", "run"]
@@ -87,7 +109,9 @@ def test_export_and_check_open_no_socket_and_write_nowhere_else(tmp_path):
 
 def test_the_watch_sees_a_socket_and_a_file(tmp_path):
     told = watched(
-        "import socket\nkept = socket.create_server(('127.0.0.1', 0))\nopen('left', 'w').close()\ntime.sleep(0.1)", tmp_path / "home"
+        "import socket\nkept = socket.create_server(('127.0.0.1', 0))\nopen('left', "
+        "'w').close()\ntime.sleep(0.1)",
+        tmp_path / "home",
     )
     assert "socket.bind" in told and "socket:[" in told
     assert (tmp_path / "home" / "left").exists()
@@ -97,8 +121,14 @@ def test_the_call_is_made_before_a_session(monkeypatch):
     onnxruntime = pytest.importorskip("onnxruntime", reason="needs the extra uuvtai[export]")
     order = []
     monkeypatch.delenv(onnx_session.VARIABLE, raising=False)
-    monkeypatch.setattr(onnxruntime, "disable_telemetry_events", lambda: order.append(f"off {os.environ.get(onnx_session.VARIABLE)}"))
-    monkeypatch.setattr(onnxruntime, "InferenceSession", lambda *_arguments, **_words: order.append("session"))
+    monkeypatch.setattr(
+        onnxruntime,
+        "disable_telemetry_events",
+        lambda: order.append(f"off {os.environ.get(onnx_session.VARIABLE)}"),
+    )
+    monkeypatch.setattr(
+        onnxruntime, "InferenceSession", lambda *_arguments, **_words: order.append("session")
+    )
     onnx_session.session(b"")
     assert order == ["off 1", "session"]
 
@@ -110,12 +140,17 @@ def test_one_place_imports_onnx_runtime():
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
                 names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
                 names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
-                places += [str(path.relative_to(ROOT))] if any(name.split(".")[0] == "onnxruntime" for name in names) else []
+                places += (
+                    [str(path.relative_to(ROOT))]
+                    if any(name.split(".")[0] == "onnxruntime" for name in names)
+                    else []
+                )
     assert places == ["uuvtai/deploy/onnx_session.py"]
 
 
 def test_only_versions_that_were_checked_are_installed():
-    """1.29 to 1.32 read the variable, versions before have no telemetry; a newer one has to be looked at first."""
+    """1.29 to 1.32 read the variable, versions before have no telemetry; a newer one has to be looked at
+    first."""
     wanted = re.findall(r'"(onnxruntime[^"]*)"', (ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     assert wanted == ["onnxruntime>=1.20,<1.33"]
 

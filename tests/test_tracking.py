@@ -10,7 +10,14 @@ from tests.bundles import io_for
 from tests.conftest import set_step
 from tests.reference import small_sonar
 from tests.reference import tracking as oracle
-from uuvtai.config import ElevationConfig, EpisodeConfig, ForecastConfig, SonarConfig, TankConfig, TrackingConfig
+from uuvtai.config import (
+    ElevationConfig,
+    EpisodeConfig,
+    ForecastConfig,
+    SonarConfig,
+    TankConfig,
+    TrackingConfig,
+)
 from uuvtai.kernels.core import kalman
 from uuvtai.kernels.perception import tracking
 from uuvtai.kernels.perception.bundles import TrackingIO
@@ -25,7 +32,8 @@ ELEVATION = ElevationConfig(memory_s=0.0)
 FORECAST = ForecastConfig(use_coasting=False)
 PAPER = SonarConfig(range_sigma_m=0.02, doppler_sigma_m_s=0.05)
 HARSH = SonarConfig(
-    period_steps=5, latency_steps=2, range_sigma_m=0.10, range_sigma_slope=0.01, range_quantum_m=0.024, range_jitter_m=0.10,
+    period_steps=5, latency_steps=2, range_sigma_m=0.10, range_sigma_slope=0.01, range_quantum_m=0.024,
+    range_jitter_m=0.10,
     missed_return=0.10, false_return=0.03, doppler_sigma_m_s=0.20, doppler_outlier=0.10,
 )  # fmt: skip
 SIZES = {
@@ -38,16 +46,20 @@ SIZES = {
 }
 
 STATE_TOLERANCE = 2e-4
-"""[m, m/s] one update: float32 bearings of up to 10 rad are good to 1e-6 rad, x 12 m = 1e-5 m, and gains in 1/s amplify it tenfold."""
+"""[m, m/s] one update: float32 bearings of up to 10 rad are good to 1e-6 rad, x 12 m = 1e-5 m, and gains in
+1/s amplify it tenfold."""
 
 RATE_TOLERANCE = 4e-3
-"""[rad/s] an angle of a velocity of 0.1 m/s is ten times less precise than the velocity, and it is divided by the scan period."""
+"""[rad/s] an angle of a velocity of 0.1 m/s is ten times less precise than the velocity, and it is divided by
+the scan period."""
 
 COV_TOLERANCE = 2e-4
-"""Relative to the variances: float32 rounds at 6e-8, some 30 operations and gains near 1 that subtract nearly equal numbers."""
+"""Relative to the variances: float32 rounds at 6e-8, some 30 operations and gains near 1 that subtract nearly
+equal numbers."""
 
 LONG_RUN_TOLERANCE = 0.02
-"""Relative to the variances: a variance that one scan shrinks 1e5 times (9 to 1e-4 m^2/s^2) keeps two or three of seven digits."""
+"""Relative to the variances: a variance that one scan shrinks 1e5 times (9 to 1e-4 m^2/s^2) keeps two or
+three of seven digits."""
 
 PERIOD_S = CONFIG.period_steps * DT_S
 
@@ -84,13 +96,28 @@ class Lab:
         self.track()
 
     def track(self):
-        parts = (self.tracks, self.clusters, self.habits, self.scan, self.clock, CONFIG, FORECAST, ELEVATION, self.sonar, TANK, RULES)
+        parts = (
+            self.tracks,
+            self.clusters,
+            self.habits,
+            self.scan,
+            self.clock,
+            CONFIG,
+            FORECAST,
+            ELEVATION,
+            self.sonar,
+            TANK,
+            RULES,
+        )
         tracking.track_bodies(io_for(TrackingIO, *parts))
 
     def sense(self, step, pos, yaw, vel_w, bodies, clean=False):
-        """Cast, spoil and track one scan of ``bodies`` = (centre, vel, radius, half, yaw); returns the true body of each beam."""
+        """Cast, spoil and track one scan of ``bodies`` = (centre, vel, radius, half, yaw); returns the true
+        body of each beam."""
         centre, vel, radius, half, body_yaw = bodies
-        range_m, doppler, hit, body = small_sonar.cast(pos, yaw, vel_w, centre, vel, radius, half, body_yaw, TANK)
+        range_m, doppler, hit, body = small_sonar.cast(
+            pos, yaw, vel_w, centre, vel, radius, half, body_yaw, TANK
+        )
         if not clean:
             range_m, doppler, hit = small_sonar.noisy(range_m, doppler, hit, self.rng, self.sonar)
         self.feed(step, pos, yaw, vel_w, range_m, doppler, hit)
@@ -138,15 +165,23 @@ def resting(rng, n, apart_m=1.7):
                 if all(np.hypot(*(centre[env, i] - other)) > apart_m for other in centre[env, :i]):
                     break
     radius = np.where(np.arange(n) % 2, rng.uniform(0.2, 0.4, (N_ENV, n)), 0.0)
-    return centre, np.zeros((N_ENV, n, 2)), radius, rng.uniform(0.2, 0.5, (N_ENV, n, 2)), rng.uniform(-np.pi, np.pi, (N_ENV, n))
+    return (
+        centre,
+        np.zeros((N_ENV, n, 2)),
+        radius,
+        rng.uniform(0.2, 0.5, (N_ENV, n, 2)),
+        rng.uniform(-np.pi, np.pi, (N_ENV, n)),
+    )
 
 
 def with_movers(still, centre, vel, radius):
     """Append circles to the resting bodies."""
     n = centre.shape[1]
     return (
-        np.concatenate([still[0], centre], 1), np.concatenate([still[1], vel], 1), np.concatenate([still[2], radius], 1),
-        np.concatenate([still[3], np.ones((N_ENV, n, 2))], 1), np.concatenate([still[4], np.zeros((N_ENV, n))], 1),
+        np.concatenate([still[0], centre], 1), np.concatenate([still[1], vel], 1),
+        np.concatenate([still[2], radius], 1),
+        np.concatenate([still[3], np.ones((N_ENV, n, 2))], 1),
+        np.concatenate([still[4], np.zeros((N_ENV, n))], 1),
     )  # fmt: skip
 
 
@@ -166,7 +201,11 @@ def at_rest(x=10.0, y=3.0, yaw=0.0):
 
 def lines(rng, n, v):
     """Movers back and forth on lines of 2 to 6 m: a function of time to (centre, vel)."""
-    length, way, phase = rng.uniform(2, 6, (N_ENV, n)), rng.uniform(-np.pi, np.pi, (N_ENV, n)), rng.uniform(0, 12, (N_ENV, n))
+    length, way, phase = (
+        rng.uniform(2, 6, (N_ENV, n)),
+        rng.uniform(-np.pi, np.pi, (N_ENV, n)),
+        rng.uniform(0, 12, (N_ENV, n)),
+    )
     middle = rng.uniform([3, 1.5], [17, 4.5], (N_ENV, n, 2))
     u = np.stack([np.cos(way), np.sin(way)], -1)
 
@@ -180,32 +219,42 @@ def lines(rng, n, v):
 
 def circles(rng, n, v):
     """Movers around circles of radius 0.5 to 2 m."""
-    radius, phase = rng.uniform(0.5, 2, (N_ENV, n)) * rng.choice([-1, 1], (N_ENV, n)), rng.uniform(-np.pi, np.pi, (N_ENV, n))
+    radius, phase = (
+        rng.uniform(0.5, 2, (N_ENV, n)) * rng.choice([-1, 1], (N_ENV, n)),
+        rng.uniform(-np.pi, np.pi, (N_ENV, n)),
+    )
     middle = rng.uniform([2, 1.5], [18, 4.5], (N_ENV, n, 2))
 
     def at(t):
         a = phase + v * t / radius
         out = np.stack([np.cos(a), np.sin(a)], -1)
-        return middle + np.abs(radius)[..., None] * out, v * np.sign(radius)[..., None] * np.stack([-np.sin(a), np.cos(a)], -1)
+        return middle + np.abs(radius)[..., None] * out, v * np.sign(radius)[..., None] * np.stack(
+            [-np.sin(a), np.cos(a)], -1
+        )
 
     return at
 
 
-# -------------------------------------------------------------------------------------------------------------------- oracle
+# ----------------------------------------------------------------------------------------------------- oracle
 
 
 def oracle_tracks(memory, env):
     """The stored rows of one env as oracle tracks."""
     out = {}
     for t in np.nonzero(memory["alive"][env])[0]:
-        m = {k: v[env, t].astype(float) if v.ndim > 1 and v.shape[1] == CONFIG.n_track else None for k, v in memory.items()}
+        m = {
+            k: v[env, t].astype(float) if v.ndim > 1 and v.shape[1] == CONFIG.n_track else None
+            for k, v in memory.items()
+        }
         P = np.zeros((5, 5))
         P[np.triu_indices(4)] = m["cov"]
         P[:, 4] = m["turn_cov"]
         P = P + np.triu(P, 1).T
         out[int(t)] = oracle.Track(
-            np.append(m["state"], m["turn_rate"]), P, m["radius_m"], m["radius_var"], m["z_m"], m["doppler_m_s"], m["doppler_var"],
-            m["sight_w"], int(m["seen_step"]), int(m["moving"]), m["shift_w"], m["sweep"], int(m["age"]), int(m["misses"]),
+            np.append(m["state"], m["turn_rate"]), P, m["radius_m"], m["radius_var"], m["z_m"],
+            m["doppler_m_s"], m["doppler_var"],
+            m["sight_w"], int(m["seen_step"]), int(m["moving"]), m["shift_w"], m["sweep"], int(m["age"]),
+            int(m["misses"]),
         )  # fmt: skip
     return out
 
@@ -216,24 +265,40 @@ def assert_equal_tracks(memory, env, expected):
         sigma = np.sqrt(np.diag(track.P))
         scale = np.outer(sigma, sigma)[np.triu_indices(4)]
         np.testing.assert_allclose(memory["state"][env, t], track.x[:4], atol=STATE_TOLERANCE)
-        np.testing.assert_allclose(memory["cov"][env, t] / scale, track.P[np.triu_indices(4)] / scale, atol=COV_TOLERANCE)
+        np.testing.assert_allclose(
+            memory["cov"][env, t] / scale, track.P[np.triu_indices(4)] / scale, atol=COV_TOLERANCE
+        )
         if track.P[4, 4] > 0:
-            np.testing.assert_allclose(memory["turn_cov"][env, t] / (sigma * sigma[4]), track.P[4] / (sigma * sigma[4]), atol=COV_TOLERANCE)
+            np.testing.assert_allclose(
+                memory["turn_cov"][env, t] / (sigma * sigma[4]),
+                track.P[4] / (sigma * sigma[4]),
+                atol=COV_TOLERANCE,
+            )
         else:
             assert not memory["turn_cov"][env, t].any()
         np.testing.assert_allclose(memory["turn_rate"][env, t], track.x[4], atol=RATE_TOLERANCE)
         for name, value in (
-            ("radius_m", track.radius), ("radius_var", track.radius_var), ("z_m", track.z), ("doppler_m_s", track.doppler),
-            ("doppler_var", track.doppler_var), ("shift_w", track.shift), ("sweep", track.sweep), ("sight_w", track.sight),
+            ("radius_m", track.radius), ("radius_var", track.radius_var), ("z_m", track.z),
+            ("doppler_m_s", track.doppler),
+            ("doppler_var", track.doppler_var), ("shift_w", track.shift), ("sweep", track.sweep),
+            ("sight_w", track.sight),
         ):  # fmt: skip
-            np.testing.assert_allclose(memory[name][env, t], value, atol=STATE_TOLERANCE, rtol=1e-4, err_msg=name)
-        for name, value in (("moving", track.moving), ("age", track.age), ("misses", track.misses), ("seen_step", track.seen)):
+            np.testing.assert_allclose(
+                memory[name][env, t], value, atol=STATE_TOLERANCE, rtol=1e-4, err_msg=name
+            )
+        for name, value in (
+            ("moving", track.moving),
+            ("age", track.age),
+            ("misses", track.misses),
+            ("seen_step", track.seen),
+        ):
             assert memory[name][env, t] == value, name
 
 
 @pytest.mark.parametrize("preset", ["paper", "harsh"])
 def test_one_scan_equals_oracle(preset, request):
-    """Every scan of a busy scene: the kernel's memory before it, put through the oracle, must come out as the kernel's memory after it."""
+    """Every scan of a busy scene: the kernel's memory before it, put through the oracle, must come out as the
+    kernel's memory after it."""
     lab = request.getfixturevalue(preset).begin(1)
     rng = np.random.default_rng(11)
     drive, still, at = Drive(rng), resting(rng, 8), lines(rng, 6, 1.0)
@@ -243,13 +308,28 @@ def test_one_scan_equals_oracle(preset, request):
         step = 5 * k
         before = lab.everything()
         centre, vel = at(step * DT_S)
-        lab.sense(step, drive.pos, drive.yaw, drive.vel, with_movers(still, centre, vel, np.full((N_ENV, 6), 0.25)))
-        after, scan = lab.everything(), {n: getattr(lab.scan, n).to_numpy().astype(float) for n in ("range_m", "doppler_m_s", "hit")}
-        pose = [getattr(lab.scan, n).to_numpy().astype(float) for n in ("ping_pos_w", "ping_yaw", "ping_vel_b")]
+        lab.sense(
+            step, drive.pos, drive.yaw, drive.vel, with_movers(still, centre, vel, np.full((N_ENV, 6), 0.25))
+        )
+        after, scan = (
+            lab.everything(),
+            {n: getattr(lab.scan, n).to_numpy().astype(float) for n in ("range_m", "doppler_m_s", "hit")},
+        )
+        pose = [
+            getattr(lab.scan, n).to_numpy().astype(float) for n in ("ping_pos_w", "ping_yaw", "ping_vel_b")
+        ]
         for env in range(0, N_ENV, 4):
-            sensed = oracle.Scan(scan["range_m"][env], scan["doppler_m_s"][env], scan["hit"][env], *(p[env] for p in pose), step)
+            sensed = oracle.Scan(
+                scan["range_m"][env],
+                scan["doppler_m_s"][env],
+                scan["hit"][env],
+                *(p[env] for p in pose),
+                step,
+            )
             expected = oracle_tracks(before, env)
-            clusters, beam_track = oracle.step(expected, before["scan_step"][env], sensed, CONFIG, lab.sonar, TANK, DT_S)
+            clusters, beam_track = oracle.step(
+                expected, before["scan_step"][env], sensed, CONFIG, lab.sonar, TANK, DT_S
+            )
             assert lab.clusters.count.to_numpy()[env] == len(clusters)
             np.testing.assert_array_equal(after["beam_track"][env], beam_track)
             assert_equal_tracks(after, env, expected)
@@ -263,11 +343,14 @@ def test_one_scan_equals_oracle(preset, request):
 
 
 def test_covariance_stays_positive_and_equals_joseph():
-    """A filter run for a thousand scans of bodies on circles in float32 equals the float64 one and never loses positive definiteness."""
+    """A filter run for a thousand scans of bodies on circles in float32 equals the float64 one and never
+    loses positive definiteness."""
     n_step, n_run = 1000, 8
     mean, cov, link = (ti.Vector.field(size, ti.f32, n_run) for size in (4, 10, 5))
     rate = ti.field(ti.f32, n_run)
-    data = ti.Vector.field(5, ti.f32, (n_step, n_run))  # bearing, position and velocity along it, variance, dt
+    data = ti.Vector.field(
+        5, ti.f32, (n_step, n_run)
+    )  # bearing, position and velocity along it, variance, dt
 
     @ti.kernel
     def run(k: int):
@@ -281,7 +364,11 @@ def test_covariance_stays_positive_and_equals_joseph():
 
     rng = np.random.default_rng(3)
     size = (n_step, n_run)
-    bearing, var, dt = rng.uniform(-3, 3, size), 10 ** rng.uniform(-4, -1, size), rng.choice([0.02, 0.06, 0.1], size)
+    bearing, var, dt = (
+        rng.uniform(-3, 3, size),
+        10 ** rng.uniform(-4, -1, size),
+        rng.choice([0.02, 0.06, 0.1], size),
+    )
     turn = np.linspace(-2, 2, n_run)
     along = np.cumsum(dt, 0) * turn
     u = np.stack([np.cos(bearing), np.sin(bearing)], -1)
@@ -300,7 +387,10 @@ def test_covariance_stays_positive_and_equals_joseph():
         for i in range(n_run):
             angle, at, way, var, dt = values[k, i].astype(float)
             x[i], P[i] = oracle.predicted(x[i], P[i], dt, 0.03, 0.005)
-            for h, z in ((np.append(oracle.unit(angle), [0, 0]), at), (np.append([0, 0], oracle.unit(angle)), way)):
+            for h, z in (
+                (np.append(oracle.unit(angle), [0, 0]), at),
+                (np.append([0, 0], oracle.unit(angle)), way),
+            ):
                 x[i], P[i] = oracle.corrected(x[i], P[i], h, z - h @ x[i][:4], var)
             full = np.zeros((5, 5))
             full[np.triu_indices(4)] = got[i]
@@ -308,18 +398,21 @@ def test_covariance_stays_positive_and_equals_joseph():
             full = full + np.triu(full, 1).T
             sigma = np.sqrt(np.diag(full))
             assert np.linalg.eigvalsh(full / np.outer(sigma, sigma))[0] > 0
-            np.testing.assert_allclose(full / np.outer(sigma, sigma), P[i] / np.outer(sigma, sigma), atol=LONG_RUN_TOLERANCE)
+            np.testing.assert_allclose(
+                full / np.outer(sigma, sigma), P[i] / np.outer(sigma, sigma), atol=LONG_RUN_TOLERANCE
+            )
     np.testing.assert_allclose(mean.to_numpy(), x[:, :4], atol=10 * STATE_TOLERANCE)
     np.testing.assert_allclose(rate.to_numpy(), x[:, 4], atol=RATE_TOLERANCE)
     assert np.abs(x[:, 4] - turn).max() < 0.3, "the circles were not followed"
 
 
-# -------------------------------------------------------------------------------------------------------------------- scenes
+# ----------------------------------------------------------------------------------------------------- scenes
 
 
 def errors(lab, rng, paths, seconds, settle_s=1.0):
-    """Errors of the movers in view (three beams or more) for ``settle_s``: rows of (velocity, position, called moving); and of the beams on
-    resting bodies, how many belong to moving tracks and how many there are (without bodies that a mover or the vehicle runs through).
+    """Errors of the movers in view (three beams or more) for ``settle_s``: rows of (velocity, position,
+    called moving); and of the beams on resting bodies, how many belong to moving tracks and how many there
+    are (without bodies that a mover or the vehicle runs through).
     """
     drive, still, n = Drive(rng), resting(rng, 8), 6
     radius = rng.uniform(0.15, 0.35, (N_ENV, n))
@@ -327,12 +420,16 @@ def errors(lab, rng, paths, seconds, settle_s=1.0):
     out, false, total = [], 0, 0
     for k in range(int(seconds / PERIOD_S)):
         centre, vel = paths(k * PERIOD_S)
-        body = lab.sense(k * CONFIG.period_steps, drive.pos, drive.yaw, drive.vel, with_movers(still, centre, vel, radius))
+        body = lab.sense(
+            k * CONFIG.period_steps, drive.pos, drive.yaw, drive.vel, with_movers(still, centre, vel, radius)
+        )
         beam_track, moving, state = lab.read("beam_track"), lab.read("moving"), lab.read("state")
         in_moving = (beam_track >= 0) & (np.take_along_axis(moving, np.maximum(beam_track, 0), 1) == 1)
         gap = np.linalg.norm(still[0][:, :, None] - centre[:, None], axis=-1).min(-1)
         crossed = np.where(gap < 1.2, k * PERIOD_S, crossed)
-        alone = (crossed < k * PERIOD_S - 1.0) & (np.linalg.norm(still[0] - drive.pos[:, None], axis=-1) > 0.9)
+        alone = (crossed < k * PERIOD_S - 1.0) & (
+            np.linalg.norm(still[0] - drive.pos[:, None], axis=-1) > 0.9
+        )
         at_rest = (body >= 0) & (body < 8) & np.take_along_axis(alone, np.clip(body, 0, 7), 1)
         false, total = false + (in_moving & at_rest).sum(), total + at_rest.sum()
         for i in range(n):
@@ -351,7 +448,8 @@ def errors(lab, rng, paths, seconds, settle_s=1.0):
 @pytest.mark.parametrize("paths", [lines, circles])
 @pytest.mark.parametrize("v", [0.2, 0.6, 1.5])
 def test_velocity_and_position_of_movers(paper, v, paths):
-    """Median errors among static boxes and cylinders, with own motion and yaw; movers pass through each other and turn back unannounced."""
+    """Median errors among static boxes and cylinders, with own motion and yaw; movers pass through each other
+    and turn back unannounced."""
     rng = np.random.default_rng(5)
     found, false, total = errors(paper.begin(2), rng, paths(rng, 6, v), 5.0)
     assert len(found) > 500
@@ -377,14 +475,19 @@ def test_static_scene_is_not_moving(paper):
 
 
 def test_slow_mover_recognised_within_a_second(paper):
-    """0.2 m/s at 3 m in sixteen directions, seen from a vehicle under way; the two that cross exactly have no Doppler to tell."""
+    """0.2 m/s at 3 m in sixteen directions, seen from a vehicle under way; the two that cross exactly have no
+    Doppler to tell."""
     lab, drive = paper.begin(4), Drive(np.random.default_rng(7), speed=0.3)
     drive.pos, course = np.tile([8.0, 3.0], (N_ENV, 1)), 2 * np.pi * np.arange(N_ENV) / N_ENV
     vel = 0.2 * np.stack([np.cos(course), np.sin(course)], -1)[:, None]
     for k in range(int(1.0 / PERIOD_S) + 1):
         centre = np.array([11.0, 3.0]) + vel * k * PERIOD_S
         body = lab.sense(
-            k * CONFIG.period_steps, drive.pos, drive.yaw, drive.vel, with_movers(no_bodies(), centre, vel, np.full((N_ENV, 1), 0.2))
+            k * CONFIG.period_steps,
+            drive.pos,
+            drive.yaw,
+            drive.vel,
+            with_movers(no_bodies(), centre, vel, np.full((N_ENV, 1), 0.2)),
         )
         drive.advance(PERIOD_S)
     owner = np.array([lab.read("beam_track")[env][body[env] == 0][0] for env in range(N_ENV)])
@@ -394,7 +497,13 @@ def test_slow_mover_recognised_within_a_second(paper):
     first = int(1.0 / PERIOD_S) + 1
     for k in range(first, first + int(0.6 / PERIOD_S)):
         centre = np.array([11.0, 3.0]) + vel * k * PERIOD_S
-        lab.sense(k * CONFIG.period_steps, drive.pos, drive.yaw, drive.vel, with_movers(no_bodies(), centre, vel, np.full((N_ENV, 1), 0.2)))
+        lab.sense(
+            k * CONFIG.period_steps,
+            drive.pos,
+            drive.yaw,
+            drive.vel,
+            with_movers(no_bodies(), centre, vel, np.full((N_ENV, 1), 0.2)),
+        )
         drive.advance(PERIOD_S)
     assert lab.read("moving")[np.arange(N_ENV), owner].all()
 
@@ -406,7 +515,8 @@ def only_track(lab):
 
 
 def test_track_survives_occlusion_and_dies_when_seen_through(paper):
-    """A mover passes behind a nearer cylinder and keeps its track; then it vanishes, beams see through, and the track is gone in 0.3 s."""
+    """A mover passes behind a nearer cylinder and keeps its track; then it vanishes, beams see through, and
+    the track is gone in 0.3 s."""
     lab, (pos, yaw, own) = paper.begin(5), at_rest(5.0, 3.0)
     screen = (np.array([[7.0, 3.0]]), np.zeros((1, 2)))
     unmatched = 0
@@ -414,7 +524,9 @@ def test_track_survives_occlusion_and_dies_when_seen_through(paper):
         mover = np.array([[9.0, 1.2]]) + 1.0 * np.array([[0.0, k * PERIOD_S]])
         centre = np.broadcast_to(np.concatenate([screen[0], mover]), (N_ENV, 2, 2))
         vel = np.broadcast_to([[0.0, 0.0], [0.0, 1.0]], (N_ENV, 2, 2))
-        lab.sense(3 * k, pos, yaw, own, with_movers(no_bodies(), centre, vel, np.tile([0.35, 0.2], (N_ENV, 1))))
+        lab.sense(
+            3 * k, pos, yaw, own, with_movers(no_bodies(), centre, vel, np.tile([0.35, 0.2], (N_ENV, 1)))
+        )
         if k == 15:
             name = lab.read("moving").argmax(1)
             assert (lab.read("moving").sum(1) == 1).all()
@@ -426,13 +538,20 @@ def test_track_survives_occlusion_and_dies_when_seen_through(paper):
     assert np.hypot(*(here[:, :2] - mover).T).max() < 0.1
     assert np.abs(here[:, 2:] - [0, 1]).max() < 0.2
     for k in range(60, 66):
-        lab.sense(3 * k, pos, yaw, own, with_movers(no_bodies(), centre[:, :1], vel[:, :1], np.full((N_ENV, 1), 0.35)))
+        lab.sense(
+            3 * k,
+            pos,
+            yaw,
+            own,
+            with_movers(no_bodies(), centre[:, :1], vel[:, :1], np.full((N_ENV, 1), 0.35)),
+        )
     assert not lab.read("moving").any()
     assert (lab.read("alive").sum(1) == 1).all()
 
 
 def test_what_the_camera_shows_is_not_seen_through(paper):
-    """Beams meet nothing where a track is expected: it lives as long as images show it, and 0.3 s longer; without any it ends at once.
+    """Beams meet nothing where a track is expected: it lives as long as images show it, and 0.3 s longer;
+    without any it ends at once.
 
     Alike for an older track (odd envs) and for one that has never been a scan's.
     """
@@ -441,7 +560,8 @@ def test_what_the_camera_shows_is_not_seen_through(paper):
     lab.feed(0, pos, yaw, own, *blank)
     older, stops = np.arange(N_ENV) % 2 == 1, np.choose(np.arange(N_ENV) // 2 % 4, [-1, 0, 60, 999])
     known = {
-        "alive": 1, "misses": 1, "state": [12.0, 3.0, 0.0, 0.0], "cov": [1e-3, 0, 0, 0, 1e-3, 0, 0, 1e-3, 0, 1e-3], "radius_m": 0.2,
+        "alive": 1, "misses": 1, "state": [12.0, 3.0, 0.0, 0.0],
+        "cov": [1e-3, 0, 0, 0, 1e-3, 0, 0, 1e-3, 0, 1e-3], "radius_m": 0.2,
         "age": np.where(older, 10, 0), "moving": older, "spot_step": -1,
     }  # fmt: skip
     for name, value in known.items():
@@ -463,16 +583,25 @@ def test_what_the_camera_shows_is_not_seen_through(paper):
 
 
 def test_partly_hidden_body_keeps_its_centre(paper):
-    """Half of a resting cylinder comes to lie behind a nearer one as the vehicle moves: its track stays at the centre and at rest."""
+    """Half of a resting cylinder comes to lie behind a nearer one as the vehicle moves: its track stays at
+    the centre and at rest."""
     lab, (pos, yaw, own) = paper.begin(6), at_rest(5.0, 3.6)
     centre = np.broadcast_to([[7.0, 3.0], [9.0, 3.55]], (N_ENV, 2, 2))
     own = own - [0.0, 0.4]
     hidden = 0
     for k in range(30):
-        lab.sense(3 * k, pos, yaw, own, with_movers(no_bodies(), centre, np.zeros((N_ENV, 2, 2)), np.full((N_ENV, 2), 0.3)))
+        lab.sense(
+            3 * k,
+            pos,
+            yaw,
+            own,
+            with_movers(no_bodies(), centre, np.zeros((N_ENV, 2, 2)), np.full((N_ENV, 2), 0.3)),
+        )
         hidden += (lab.clusters.hidden.to_numpy() > 0).any(1).sum()
         pos = pos + own * PERIOD_S
-        gap = np.hypot(*np.moveaxis(lab.read("state")[..., :2] - [9.0, 3.55], -1, 0)) + 10 * (1 - lab.read("alive"))
+        gap = np.hypot(*np.moveaxis(lab.read("state")[..., :2] - [9.0, 3.55], -1, 0)) + 10 * (
+            1 - lab.read("alive")
+        )
         assert gap.min(1).max() < 0.2
         assert not lab.read("moving").any()
     assert hidden > 10 * N_ENV
@@ -516,7 +645,8 @@ def test_own_velocity_error_does_not_move_the_world(paper):
 @pytest.mark.parametrize("preset", ["paper", "harsh"])
 @pytest.mark.parametrize("valid", [1, 0])
 def test_own_velocity_error_equals_the_oracle(preset, valid, request):
-    """What the walls say of the own velocity, and how sure that is: with the walls in sight, and with two thirds of the beams dead."""
+    """What the walls say of the own velocity, and how sure that is: with the walls in sight, and with two
+    thirds of the beams dead."""
     lab, rng = request.getfixturevalue(preset), np.random.default_rng(12)
     for dead in (0.0, 0.7):
         lab.begin(12)
@@ -526,7 +656,10 @@ def test_own_velocity_error_equals_the_oracle(preset, valid, request):
         hit[rng.random(hit.shape) < dead] = 0
         lab.feed(0, drive.pos, drive.yaw, drive.vel + wrong, range_m, doppler, hit, valid=valid)
         slip_w, sigma = lab.clusters.slip_w.to_numpy(), lab.clusters.own_sigma_m_s.to_numpy()
-        read = {n: getattr(lab.scan, n).to_numpy().astype(float) for n in ("range_m", "doppler_m_s", "hit", "ping_pos_w", "ping_vel_b")}
+        read = {
+            n: getattr(lab.scan, n).to_numpy().astype(float)
+            for n in ("range_m", "doppler_m_s", "hit", "ping_pos_w", "ping_vel_b")
+        }
         for env in range(N_ENV):
             beams = [read[n][env] for n in ("range_m", "doppler_m_s", "hit", "ping_pos_w")]
             yaw = float(lab.scan.ping_yaw.to_numpy()[env])
@@ -536,12 +669,14 @@ def test_own_velocity_error_equals_the_oracle(preset, valid, request):
         if valid:
             assert (sigma == 0).all()
         else:
-            assert (sigma > 0.9 * lab.sonar.doppler_sigma_m_s / np.sqrt(0.5 * hit.sum(1))).all() and (sigma < 0.2).all()
+            assert (sigma > 0.9 * lab.sonar.doppler_sigma_m_s / np.sqrt(0.5 * hit.sum(1))).all() and (
+                sigma < 0.2
+            ).all()
 
 
 def test_a_held_velocity_is_left_to_the_walls_and_a_reading_is_not(paper):
-    """One beam says that its wall moves by 0.6 m/s: a reading that is good to 0.05 m/s is half believed, a held one is not at all; without
-    any wall the error is unknown, and how much of it is left says so."""
+    """One beam says that its wall moves by 0.6 m/s: a reading that is good to 0.05 m/s is half believed, a
+    held one is not at all; without any wall the error is unknown, and how much of it is left says so."""
     lab, (pos, yaw, own) = paper.begin(13), at_rest()
     range_m, doppler, hit, _ = small_sonar.cast(pos, yaw, own, *no_bodies(), TANK)
     doppler[:, 0], hit[:, 1:] = 0.6, 0
@@ -550,20 +685,29 @@ def test_a_held_velocity_is_left_to_the_walls_and_a_reading_is_not(paper):
         lab.begin(13).feed(0, pos, yaw, own, range_m, doppler, hit, valid=valid)
         found[valid] = lab.clusters.slip_w.to_numpy()[0] @ (np.cos(yaw[0]), np.sin(yaw[0]))
     assert found[1] == pytest.approx(0.3) and found[0] == pytest.approx(0.6, rel=0.01)
-    assert lab.clusters.own_sigma_m_s.to_numpy()[0] == pytest.approx(1.0, rel=1e-4), "nothing is known across the one beam"
+    assert lab.clusters.own_sigma_m_s.to_numpy()[0] == pytest.approx(1.0, rel=1e-4), (
+        "nothing is known across the one beam"
+    )
     hit[:] = 0
     lab.begin(13).feed(0, pos, yaw, own, range_m, doppler, hit, valid=0)
-    assert (lab.clusters.slip_w.to_numpy() == 0).all() and lab.clusters.own_sigma_m_s.to_numpy()[0] == pytest.approx(1.0, rel=1e-4)
+    assert (lab.clusters.slip_w.to_numpy() == 0).all() and lab.clusters.own_sigma_m_s.to_numpy()[
+        0
+    ] == pytest.approx(1.0, rel=1e-4)
 
 
-# -------------------------------------------------------------------------------------------------------------------- slots
+# ------------------------------------------------------------------------------------------------------ slots
 
 
 def ring_of(n, radius=0.15, at_m=2.4):
     """n small cylinders on a circle around the middle of the tank."""
     angle = 2 * np.pi * np.arange(n) / n
     centre = np.array([10.0, 3.0]) + at_m * np.stack([np.cos(angle), np.sin(angle)], -1)
-    return with_movers(no_bodies(), np.broadcast_to(centre, (N_ENV, n, 2)), np.zeros((N_ENV, n, 2)), np.full((N_ENV, n), radius))
+    return with_movers(
+        no_bodies(),
+        np.broadcast_to(centre, (N_ENV, n, 2)),
+        np.zeros((N_ENV, n, 2)),
+        np.full((N_ENV, n), radius),
+    )
 
 
 def test_more_bodies_than_slots_and_slot_reuse(paper):
@@ -573,7 +717,11 @@ def test_more_bodies_than_slots_and_slot_reuse(paper):
     assert (lab.clusters.count.to_numpy() > CONFIG.n_track).all()
     assert (lab.read("alive").sum(1) == CONFIG.n_track).all()
     assert not lab.read("moving").any()
-    comer = with_movers(ring_of(30), *(np.broadcast_to(v, (N_ENV, 1, 2)) for v in ([[11.2, 3.0]], [[-0.5, 0.0]])), np.full((N_ENV, 1), 0.2))
+    comer = with_movers(
+        ring_of(30),
+        *(np.broadcast_to(v, (N_ENV, 1, 2)) for v in ([[11.2, 3.0]], [[-0.5, 0.0]])),
+        np.full((N_ENV, 1), 0.2),
+    )
     for k in range(5, 10):
         lab.sense(3 * k, pos, yaw, own, (comer[0] + comer[1] * k * PERIOD_S, *comer[1:]))
     assert (lab.read("moving").sum(1) == 1).all()  # a mover displaces a resting track
@@ -599,7 +747,15 @@ def test_clutter_everywhere_stays_bounded(harsh):
     rng = np.random.default_rng(13)
     moving = []
     for k in range(40):
-        lab.feed(5 * k, pos, yaw, own, rng.uniform(0, 12, (N_ENV, 256)), rng.normal(0, 0.2, (N_ENV, 256)), np.ones((N_ENV, 256)))
+        lab.feed(
+            5 * k,
+            pos,
+            yaw,
+            own,
+            rng.uniform(0, 12, (N_ENV, 256)),
+            rng.normal(0, 0.2, (N_ENV, 256)),
+            np.ones((N_ENV, 256)),
+        )
         memory = lab.everything()
         assert all(np.isfinite(v).all() for v in memory.values())
         assert (lab.clusters.count.to_numpy() <= CONFIG.n_cluster).all()
@@ -620,7 +776,7 @@ def test_nothing_moves_in_harsh_static_scene(harsh):
     assert false <= 0.03 * total  # three times what paper sensing is held to: sigma is five times as large
 
 
-# ------------------------------------------------------------------------------------------------------------------ contract
+# --------------------------------------------------------------------------------------------------- contract
 
 
 def busy_run(lab, order, awake=None, n_scan=12):
@@ -631,7 +787,9 @@ def busy_run(lab, order, awake=None, n_scan=12):
     place = np.argsort(order)
     for k in range(n_scan):
         centre, vel = at(k * PERIOD_S)
-        truth = small_sonar.cast(drive.pos, drive.yaw, drive.vel, *with_movers(still, centre, vel, np.full((N_ENV, 4), 0.2)), TANK)
+        truth = small_sonar.cast(
+            drive.pos, drive.yaw, drive.vel, *with_movers(still, centre, vel, np.full((N_ENV, 4), 0.2)), TANK
+        )
         seen = small_sonar.noisy(*truth[:3], rng, PAPER)
         if awake is not None:
             lab.clock.awake.from_numpy(awake[place].astype(np.int32))
@@ -677,9 +835,13 @@ def test_scans_between_periods_and_stale_scans_are_left_out(paper):
         assert (lab.clusters.fresh.to_numpy() == due).all()
         assert (lab.read("age")[:, 0] - before == (due if step else 0)).all()
     truth = small_sonar.cast(*at_rest(), *one_circle([12.0, 3.0], [0.0, 0.0]), TANK)[3]
-    turned = lab.sense(7, pos, yaw + 3 * 2 * np.pi / 256, own, one_circle([12.0, 3.0], [0.0, 0.0]), clean=True)
+    turned = lab.sense(
+        7, pos, yaw + 3 * 2 * np.pi / 256, own, one_circle([12.0, 3.0], [0.0, 0.0]), clean=True
+    )
     assert (lab.clusters.fresh.to_numpy() == 0).all()
-    assert (lab.read("beam_track")[turned >= 0] == 0).mean() > 0.9  # names go with the bearing, not with the beam
+    assert (
+        lab.read("beam_track")[turned >= 0] == 0
+    ).mean() > 0.9  # names go with the bearing, not with the beam
     assert (lab.read("beam_track")[turned < 0] == -1).all()
     assert (np.roll(truth, -3, 1) == turned).all()
     lab.scan.fresh.fill(0)
@@ -698,7 +860,13 @@ def test_turn_rate_of_a_circle_is_learnt(paper):
         out = np.stack([np.cos(a), np.sin(a)], -1)
         vel = (sign * 0.8)[:, None] * np.stack([-np.sin(a), np.cos(a)], -1)
         centre = np.array([10.0, 3.0]) + out
-        lab.sense(3 * k, pos, yaw, own, with_movers(no_bodies(), centre[:, None], vel[:, None], np.full((N_ENV, 1), 0.2)))
+        lab.sense(
+            3 * k,
+            pos,
+            yaw,
+            own,
+            with_movers(no_bodies(), centre[:, None], vel[:, None], np.full((N_ENV, 1), 0.2)),
+        )
     track = only_track(lab)
     assert np.abs(lab.read("turn_rate")[np.arange(N_ENV), track] - 0.8 * sign).max() < 0.15
     assert np.median(np.abs(lab.read("turn_rate")[np.arange(N_ENV), track] - 0.8 * sign)) < 0.04

@@ -1,4 +1,5 @@
-"""The trainer: learns, goes on bit for bit from its state, neither spreads nor hides what is not finite, and is one with two processes."""
+"""The trainer: learns, goes on bit for bit from its state, neither spreads nor hides what is not finite, and
+is one with two processes."""
 
 import math
 from pathlib import Path
@@ -17,7 +18,8 @@ from uuvtai.learn.train import Trainer
 ROOT = Path(__file__).parent.parent
 WALL_TIMES = "time/simulate_s", "time/infer_s", "time/learn_s", "time/env_steps_per_s"
 SUMMED_APART = 1e-4
-"""float32 gradients of one minibatch added up in another order, over two iterations of a few Adam steps each"""
+"""float32 gradients of one minibatch added up in another order, over two iterations of a few Adam steps
+each"""
 
 
 def config_of(**sections):
@@ -29,7 +31,9 @@ def config_of(**sections):
         "world_model": {"hidden": [16], "latent": 8, "batch": 64},
         "train": {"iterations": 8},
     }
-    return LearningConfig.model_validate({name: small.get(name, {}) | sections.get(name, {}) for name in {**small, **sections}})
+    return LearningConfig.model_validate(
+        {name: small.get(name, {}) | sections.get(name, {}) for name in {**small, **sections}}
+    )
 
 
 def same(a, b):
@@ -38,7 +42,8 @@ def same(a, b):
     assert plain_a == plain_b
     for name, tensor in tensors_a.items():
         assert torch.equal(
-            tensor.view(torch.uint8) if tensor.dim() else tensor, tensors_b[name].view(torch.uint8) if tensor.dim() else tensors_b[name]
+            tensor.view(torch.uint8) if tensor.dim() else tensor,
+            tensors_b[name].view(torch.uint8) if tensor.dim() else tensors_b[name],
         ), name
 
 
@@ -64,7 +69,14 @@ def test_it_learns_the_task_from_its_teacher_and_says_so():
 
 
 @pytest.mark.parametrize(
-    "more", [{}, {"risk": {"enabled": True, "batch": 64}, "ppo": {"shuffle": True, "target_kl": 0.01, "rollout_steps": 16}}]
+    "more",
+    [
+        {},
+        {
+            "risk": {"enabled": True, "batch": 64},
+            "ppo": {"shuffle": True, "target_kl": 0.01, "rollout_steps": 16},
+        },
+    ],
 )
 def test_four_iterations_equal_two_and_two_more_after_a_resume(more):
     config = config_of(**more)
@@ -90,7 +102,12 @@ def test_nothing_draws_from_the_global_generator():
 
 @pytest.mark.parametrize(
     ("poison", "metric"),
-    [("obs", "non_finite/position"), ("final_obs", None), ("reward", "non_finite/reward"), ("teacher_action", "non_finite/teacher_action")],
+    [
+        ("obs", "non_finite/position"),
+        ("final_obs", None),
+        ("reward", "non_finite/reward"),
+        ("teacher_action", "non_finite/teacher_action"),
+    ],
 )
 def test_what_is_not_finite_is_told_and_does_not_spread(poison, metric):
     env = PointEnv()
@@ -103,7 +120,9 @@ def test_what_is_not_finite_is_told_and_does_not_spread(poison, metric):
     assert metrics["train/invalid_samples"] >= 15
     assert metrics["train/skipped_updates"] == 0
     for name in ("policy", "world_model", "uncertainty", "ppo"):
-        assert all(bool(t.isfinite().all()) for t in pack(getattr(trainer, name).state_dict())[1].values()), name
+        assert all(bool(t.isfinite().all()) for t in pack(getattr(trainer, name).state_dict())[1].values()), (
+            name
+        )
     assert all(math.isfinite(value) for value in metrics.values())
     env.poison = set()
     trainer.iterate()  # its first sample is what the last poisoned step told
@@ -118,7 +137,9 @@ def test_bad_iterations_in_a_row_are_an_error_that_names_them():
     env.poison = {"reward"}
     trainer.iterate()
     trainer.iterate()
-    with pytest.raises(TrainingError, match=r"iterations 2 to 4 .* reward .* env 1 \(seed 4, episode \d+\).*learning_rate"):
+    with pytest.raises(
+        TrainingError, match=r"iterations 2 to 4 .* reward .* env 1 \(seed 4, episode \d+\).*learning_rate"
+    ):
         trainer.iterate()
 
 
@@ -144,7 +165,9 @@ def test_critic_warm_up_leaves_the_policy_alone_without_distillation():
 
 
 def test_the_risk_head_learns_beside_and_weighs_the_distillation():
-    config = config_of(risk={"enabled": True, "horizon_s": 0.2, "batch": 64, "hidden": [8]}, distill={"weighting": "risk"})
+    config = config_of(
+        risk={"enabled": True, "horizon_s": 0.2, "batch": 64, "hidden": [8]}, distill={"weighting": "risk"}
+    )
     trainer = Trainer(PointEnv(), config)
     metrics = [trainer.iterate() for _ in range(4)][-1]
     assert 0 <= metrics["risk/brier"] <= 1
@@ -176,14 +199,15 @@ def test_first_inputs_of_an_episode_have_no_prediction_behind_them():
     assert not x[ended][:, -2:].any() and (x[~ended][:, -1] > 0).all()
 
 
-# ------------------------------------------------------------------------------------------------------------- processes
+# -------------------------------------------------------------------------------------------------- processes
 
 WHOLE = 16
 """envs of the one process, half of them in each of the two"""
 
 
 class Part(PointEnv):
-    """Rows ``first``, ``first`` + 1, ... of the whole: the same scenarios, whatever seed the trainer asks for."""
+    """Rows ``first``, ``first`` + 1, ... of the whole: the same scenarios, whatever seed the trainer asks
+    for."""
 
     def __init__(self, first, num_envs):
         super().__init__(num_envs)
@@ -200,8 +224,11 @@ class Part(PointEnv):
 
 
 def trained(first, num_envs, processes):
-    """Parameters and statistics after two iterations of these rows. Teacher batches and world model draw rows at random: left out."""
-    config = config_of(ppo={"rollout_steps": 16, "minibatches": 1}, distill={"steps": 0}, world_model={"enabled": False})
+    """Parameters and statistics after two iterations of these rows. Teacher batches and world model draw rows
+    at random: left out."""
+    config = config_of(
+        ppo={"rollout_steps": 16, "minibatches": 1}, distill={"steps": 0}, world_model={"enabled": False}
+    )
     trainer = Trainer(Part(first, num_envs), config, processes)
     trainer.generator.manual_seed(5)
     act = trainer.policy.act
@@ -227,6 +254,14 @@ def test_two_processes_train_one_policy_the_same_as_one_process_with_all_envs():
     assert metrics == others
     whole, expected = trained(0, WHOLE, Processes())
     for name, values in whole.items():
-        assert torch.allclose(torch.tensor(first[name]), torch.tensor(values), rtol=SUMMED_APART, atol=SUMMED_APART), name
-    for name in ("rollout/episodes", "rollout/ep_rew_mean", "reward/progress", "time/env_steps", "distill/loss"):
+        assert torch.allclose(
+            torch.tensor(first[name]), torch.tensor(values), rtol=SUMMED_APART, atol=SUMMED_APART
+        ), name
+    for name in (
+        "rollout/episodes",
+        "rollout/ep_rew_mean",
+        "reward/progress",
+        "time/env_steps",
+        "distill/loss",
+    ):
         assert metrics[name] == pytest.approx(expected[name], rel=SUMMED_APART), name

@@ -1,4 +1,5 @@
-"""A training run: its folder, going on bit for bit, interrupts that save, failures that are marked, evaluations that leave no trace."""
+"""A training run: its folder, going on bit for bit, interrupts that save, failures that are marked,
+evaluations that leave no trace."""
 
 import json
 import os
@@ -24,7 +25,8 @@ from uuvtai.measure.training import TrainRequest, evaluate_now, train
 from uuvtai.run_folder import RunFolder, RunFolderError
 
 TINY = {
-    "policy.hidden": [8, 8], "world_model.hidden": [8], "world_model.latent": 4, "risk.hidden": [8], "ppo.rollout_steps": 8,
+    "policy.hidden": [8, 8], "world_model.hidden": [8], "world_model.latent": 4, "risk.hidden": [8],
+    "ppo.rollout_steps": 8,
     "ppo.epochs": 1, "train.evaluate_every": 0, "train.checkpoint_every": 2,
 }  # fmt: skip
 
@@ -75,7 +77,11 @@ def content_of(path):
 def told(folder):
     """The metrics of a run, but for wall times."""
     return [
-        {name: value for name, value in row.items() if not name.startswith("time/") or name == "time/env_steps"}
+        {
+            name: value
+            for name, value in row.items()
+            if not name.startswith("time/") or name == "time/env_steps"
+        }
         for row in read_metrics(folder)
     ]
 
@@ -85,9 +91,17 @@ def test_a_run_leaves_a_complete_folder(points, tmp_path):
     document, folder = train(TrainRequest(config=config_of(), run_dir=tmp_path / "run"), watch)
     assert (document["iterations"], document["run"]) == (6, str(folder))
     assert (run_json(folder)["status"], run_json(folder)["exit"]) == ("finished", 0)
-    assert [row["iteration"] for row in read_metrics(folder)] == [1, 2, 3, 4, 5, 6] == [row[0] for row in watch.rows]
+    assert (
+        [row["iteration"] for row in read_metrics(folder)]
+        == [1, 2, 3, 4, 5, 6]
+        == [row[0] for row in watch.rows]
+    )
     assert list((folder / "tensorboard").glob("events.*"))
-    assert sorted(p.name for p in (folder / "checkpoints").iterdir()) == ["step_000002", "step_000004", "step_000006"]
+    assert sorted(p.name for p in (folder / "checkpoints").iterdir()) == [
+        "step_000002",
+        "step_000004",
+        "step_000006",
+    ]
     assert checkpoint.newest(folder).config == config_of()
     rates = [(metrics.get("rollout/success_rate"), interval) for _, metrics, interval in watch.rows]
     assert all((rate is None) == (interval is None) for rate, interval in rates)
@@ -166,7 +180,11 @@ def test_a_run_that_cannot_go_on_says_why_and_loses_nothing(points, tmp_path, mo
     train(TrainRequest(config=config_of(), run_dir=run, iterations=2), Quiet())
     before = {p: p.read_bytes() for p in run.rglob("*") if p.is_file()}
     for request, error, says in (
-        (TrainRequest(resume=run, iterations=2), ConfigError, "has done 2 of 2 iterations; to go on give more: --iterations 4"),
+        (
+            TrainRequest(resume=run, iterations=2),
+            ConfigError,
+            "has done 2 of 2 iterations; to go on give more: --iterations 4",
+        ),
         (TrainRequest(resume=run, iterations=0), ConfigError, "at least 1"),
         (TrainRequest(resume=tmp_path), ConfigError, "is no run folder"),
         (TrainRequest(resume=run, overrides=["ppo.gama=1"]), ConfigError, "did you mean 'gamma'"),
@@ -204,7 +222,10 @@ def test_two_processes_do_not_train_in_one_folder(points, tmp_path):
         sys.stdin.read()
     """
     holder = subprocess.Popen(
-        [sys.executable, "-c", script, str(tmp_path / "run")], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", script, str(tmp_path / "run")],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
     )
     assert holder.stdout.readline() == "held\n"
     with pytest.raises(RunFolderError, match="another process is working in this folder"):
@@ -213,13 +234,15 @@ def test_two_processes_do_not_train_in_one_folder(points, tmp_path):
     train(TrainRequest(resume=tmp_path / "run"), Quiet())
 
 
-# ------------------------------------------------------------------------------------------------------------ the real thing
+# --------------------------------------------------------------------------------------------- the real thing
 
 
 def test_an_evaluation_in_between_leaves_no_trace(small):
     """Training shares its simulator with the evaluation, and goes on as if nothing had been."""
     scenes = [[8, 6, 0.6], [3, 0, 0.6], [8, 9, 1.5]]
-    config = load_training("smoke", TINY | {"world.dynamic_capacity": 9, "train.evaluate_episodes": 2, "train.scenes": scenes})
+    config = load_training(
+        "smoke", TINY | {"world.dynamic_capacity": 9, "train.evaluate_episodes": 2, "train.scenes": scenes}
+    )
     states = []
     small.sim.set_scenes(config.train.scenes)
     for is_evaluated in (False, True):
@@ -238,7 +261,10 @@ def test_an_evaluation_in_between_leaves_no_trace(small):
     assert dealt[:4] == [6, 0, 9, 6]
     (plain, tensors), (other_plain, other) = states
     assert plain == other_plain
-    assert all(torch.equal(tensor.view(-1).view(torch.uint8), other[name].view(-1).view(torch.uint8)) for name, tensor in tensors.items())
+    assert all(
+        torch.equal(tensor.view(-1).view(torch.uint8), other[name].view(-1).view(torch.uint8))
+        for name, tensor in tensors.items()
+    )
 
 
 RUN = SmallSim.TRAIN
@@ -252,16 +278,24 @@ LONGEST_S = 900.0
 
 def uuv(*arguments):
     """(stdout, stderr) of a command that must succeed; it is stopped when it takes too long."""
-    done = subprocess.run([*UUV, *arguments], capture_output=True, text=True, env=QUIET, timeout=LONGEST_S, check=False)
+    done = subprocess.run(
+        [*UUV, *arguments], capture_output=True, text=True, env=QUIET, timeout=LONGEST_S, check=False
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout, done.stderr
 
 
 def killed_between_checkpoints(folder, *arguments):
     """Run a training and kill it as soon as it has written two checkpoints."""
-    with subprocess.Popen([*UUV, *arguments, "--run-dir", str(folder)], stderr=subprocess.DEVNULL, env=QUIET) as process:
+    with subprocess.Popen(
+        [*UUV, *arguments, "--run-dir", str(folder)], stderr=subprocess.DEVNULL, env=QUIET
+    ) as process:
         deadline = time.monotonic() + LONGEST_S
-        while len(list((folder / "checkpoints").glob("step_*"))) < 2 and process.poll() is None and time.monotonic() < deadline:
+        while (
+            len(list((folder / "checkpoints").glob("step_*"))) < 2
+            and process.poll() is None
+            and time.monotonic() < deadline
+        ):
             time.sleep(0.01)
         process.kill()
 

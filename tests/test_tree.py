@@ -18,7 +18,19 @@ from uuvtai.kernels.teacher.tree_tick import tick_with_given_statuses
 from uuvtai.loader import ConfigError, preset_names, preset_path
 from uuvtai.show.screen import Screen
 from uuvtai.show.trees import show_tree
-from uuvtai.tree import CONTROLS, DECORATORS, LEAVES, FlatTree, TreeError, load_tree, node_use, parse_tree, read_tree, tree_dot, tree_text
+from uuvtai.tree import (
+    CONTROLS,
+    DECORATORS,
+    LEAVES,
+    FlatTree,
+    TreeError,
+    load_tree,
+    node_use,
+    parse_tree,
+    read_tree,
+    tree_dot,
+    tree_text,
+)
 
 N_BOARD = 20
 """Random blackboards per tree: one env each."""
@@ -29,15 +41,21 @@ PRESETS = ("straight", "planner", "bt")
 
 
 def xml(body: str, extra: str = "") -> str:
-    return f'<root BTCPP_format="4" main_tree_to_execute="main"><BehaviorTree ID="main">{body}</BehaviorTree>{extra}</root>'
+    return (
+        '<root BTCPP_format="4" main_tree_to_execute="main"><BehaviorTree '
+        f'ID="main">{body}</BehaviorTree>{extra}</root>'
+    )
 
 
-# ------------------------------------------------------------------------------------------------------------------- reading
+# ---------------------------------------------------------------------------------------------------- reading
 
 
 def test_flattening_is_preorder_with_ends_and_parents():
     flat = parse_tree(
-        xml('<Fallback name="top"><Sequence><HasRoute/><FollowRoute speed_m_s="0.4"/></Sequence><Inverter><Hold/></Inverter></Fallback>')
+        xml(
+            '<Fallback name="top"><Sequence><HasRoute/><FollowRoute '
+            'speed_m_s="0.4"/></Sequence><Inverter><Hold/></Inverter></Fallback>'
+        )
     )
     assert flat.types == ("Fallback", "Sequence", "HasRoute", "FollowRoute", "Inverter", "Hold")
     assert flat.names[0] == "top" and flat.names[1] == "Sequence"
@@ -50,14 +68,19 @@ def test_flattening_is_preorder_with_ends_and_parents():
 
 def test_subtrees_are_put_in_place():
     flat = parse_tree(
-        xml('<Sequence><SubTree ID="go" _autoremap="true"/><SubTree ID="go"/></Sequence>', '<BehaviorTree ID="go"><Hold/></BehaviorTree>')
+        xml(
+            '<Sequence><SubTree ID="go" _autoremap="true"/><SubTree ID="go"/></Sequence>',
+            '<BehaviorTree ID="go"><Hold/></BehaviorTree>',
+        )
     )
     assert flat.types == ("Sequence", "Hold", "Hold")
 
 
 def test_explicit_elements_are_the_same_as_compact_ones():
     compact = parse_tree(xml('<Sequence><Stuck seconds="2"/><Unstick/></Sequence>'))
-    explicit = parse_tree(xml('<Control ID="Sequence"><Condition ID="Stuck" seconds="2"/><Action ID="Unstick"/></Control>'))
+    explicit = parse_tree(
+        xml('<Control ID="Sequence"><Condition ID="Stuck" seconds="2"/><Action ID="Unstick"/></Control>')
+    )
     assert compact == explicit
 
 
@@ -85,12 +108,18 @@ def test_explicit_elements_are_the_same_as_compact_ones():
         ('<root BTCPP_format="4"/>', ("no <BehaviorTree>",)),
         ('<root BTCPP_format="4"><include path="a.xml"/></root>', ("not included",)),
         (
-            '<root BTCPP_format="4"><BehaviorTree ID="a"><Hold/></BehaviorTree><BehaviorTree ID="b"><Hold/></BehaviorTree></root>',
+            '<root BTCPP_format="4"><BehaviorTree ID="a"><Hold/></BehaviorTree><BehaviorTree '
+            'ID="b"><Hold/></BehaviorTree></root>',
             ("main_tree",),
         ),
-        ('<root BTCPP_format="4" main_tree_to_execute="z"><BehaviorTree ID="a"><Hold/></BehaviorTree></root>', ("'z'",)),
         (
-            '<root BTCPP_format="4"><BehaviorTree ID="a"><Hold/></BehaviorTree><BehaviorTree ID="a"><Hold/></BehaviorTree></root>',
+            '<root BTCPP_format="4" main_tree_to_execute="z"><BehaviorTree '
+            'ID="a"><Hold/></BehaviorTree></root>',
+            ("'z'",),
+        ),
+        (
+            '<root BTCPP_format="4"><BehaviorTree ID="a"><Hold/></BehaviorTree><BehaviorTree '
+            'ID="a"><Hold/></BehaviorTree></root>',
             ("twice",),
         ),
         ('<!DOCTYPE r [<!ENTITY a "b">]>' + xml("<Hold/>"), ("DTD",)),
@@ -118,13 +147,20 @@ def test_unknown_or_missing_files_are_refused(tmp_path):
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_presets_open_in_groot(name):
-    """Groot 2 needs format 4, a main tree that exists, and every custom leaf in the palette with its kind and ports."""
+    """Groot 2 needs format 4, a main tree that exists, and every custom leaf in the palette with its kind and
+    ports."""
     assert set(preset_names("tree")) >= set(PRESETS)
     root = ET.parse(preset_path("tree", name)).getroot()
     assert root.attrib["BTCPP_format"] == "4"
     assert root.attrib["main_tree_to_execute"] in {tree.attrib["ID"] for tree in root.findall("BehaviorTree")}
-    palette = {(entry.attrib["ID"], entry.tag, tuple(port.attrib["name"] for port in entry)) for entry in root.find("TreeNodesModel")}
-    wanted = {(leaf, "Action" if spec.kind == codes.ACTION else "Condition", spec.ports) for leaf, spec in LEAVES.items()}
+    palette = {
+        (entry.attrib["ID"], entry.tag, tuple(port.attrib["name"] for port in entry))
+        for entry in root.find("TreeNodesModel")
+    }
+    wanted = {
+        (leaf, "Action" if spec.kind == codes.ACTION else "Condition", spec.ports)
+        for leaf, spec in LEAVES.items()
+    }
     assert palette == wanted
     used = {node.tag for tree in root.findall("BehaviorTree") for node in tree.iter()} - {"BehaviorTree"}
     assert used <= {*LEAVES, *CONTROLS, *DECORATORS}
@@ -167,7 +203,7 @@ def test_text_and_dot_name_every_node_and_its_use():
     assert '\\"b\\"' in tree_dot(quoted)
 
 
-# -------------------------------------------------------------------------------------------------------------------- engine
+# ----------------------------------------------------------------------------------------------------- engine
 
 
 @pytest.fixture(scope="module")
@@ -197,7 +233,9 @@ def random_tree(rng) -> FlatTree:
     def grow(above, depth):
         here = len(kind)
         leaf = depth >= 5 or len(kind) > MAX_NODE - 14 or (depth > 0 and rng.random() < 0.35)
-        kind.append(int(rng.integers(codes.CONDITION, codes.ACTION + 1) if leaf else rng.integers(0, codes.CONDITION)))
+        kind.append(
+            int(rng.integers(codes.CONDITION, codes.ACTION + 1) if leaf else rng.integers(0, codes.CONDITION))
+        )
         parent.append(above)
         end.append(0)
         if not leaf:
@@ -210,11 +248,14 @@ def random_tree(rng) -> FlatTree:
 
     grow(-1, 0)
     n = len(kind)
-    return FlatTree(("",) * n, ("",) * n, tuple(kind), tuple(end), tuple(parent), (-1,) * n, ((-1.0,) * 4,) * n)
+    return FlatTree(
+        ("",) * n, ("",) * n, tuple(kind), tuple(end), tuple(parent), (-1,) * n, ((-1.0,) * 4,) * n
+    )
 
 
 def test_engine_equals_py_trees_node_by_node(engine):
-    """250 random trees x 20 blackboards x 6 ticks: every node's status, every tick count and the acting leaf are equal."""
+    """250 random trees x 20 blackboards x 6 ticks: every node's status, every tick count and the acting leaf
+    are equal."""
     rng = np.random.default_rng(7)
     compared = 0
     for _ in range(N_TREE):
@@ -231,7 +272,9 @@ def test_engine_equals_py_trees_node_by_node(engine):
                 for node in visited:
                     counts[env, node] += 1
                 assert tree.statuses() == found[env, :n].tolist(), (flat, answers[env])
-                did = [i for i in visited if flat.kind[i] == codes.ACTION and answers[env, i] != codes.FAILURE]
+                did = [
+                    i for i in visited if flat.kind[i] == codes.ACTION and answers[env, i] != codes.FAILURE
+                ]
                 assert acting[env] == (did[-1] if did else -1)
                 compared += n
         np.testing.assert_array_equal(engine[0].ticks.to_numpy()[:, :n], counts)
@@ -258,7 +301,10 @@ R, S, F, IDLE = codes.RUNNING, codes.SUCCESS, codes.FAILURE, codes.IDLE
 def test_memory_goes_on_and_reactive_begins_anew(engine):
     ticks = [{"Stuck": S, "Unstick": R}, {"Stuck": F, "Unstick": R}]
     assert walk(engine, "<Sequence><Stuck/><Unstick/></Sequence>", ticks)[1] == ([R, S, R], "Unstick")
-    assert walk(engine, "<ReactiveSequence><Stuck/><Unstick/></ReactiveSequence>", ticks)[1] == ([F, F, IDLE], None)
+    assert walk(engine, "<ReactiveSequence><Stuck/><Unstick/></ReactiveSequence>", ticks)[1] == (
+        [F, F, IDLE],
+        None,
+    )
 
 
 def test_priority_halts_what_ran_below(engine):

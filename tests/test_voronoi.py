@@ -20,23 +20,31 @@ N_MAP = 300
 COST_BOUND = 1.15
 """Demanded by the design: cost <= 1.15 x the exact optimum."""
 MEAN_BOUND = 1.05
-"""The trial's mean was 3.8 % above; straight chords, which the 8-connected optimum cannot use, bring it below 1."""
+"""The trial's mean was 3.8 % above; straight chords, which the 8-connected optimum cannot use, bring it below
+1."""
 EDGE_M = 1e-5
-"""float32 waypoints lie this close to where they should at 20 m; a line along a cell's edge may belong to either side."""
+"""float32 waypoints lie this close to where they should at 20 m; a line along a cell's edge may belong to
+either side."""
 SUM_TOLERANCE = 0.1
-"""The paper's sum takes the clearance at each first point only: against the integral it errs by up to a cell's change at the ends."""
+"""The paper's sum takes the clearance at each first point only: against the integral it errs by up to a
+cell's change at the ends."""
 SPACING_TOLERANCE = 2e-4
 
 V = CONFIG.voronoi
 STRICT = CONFIG.model_copy(
-    update={"voronoi": V.model_copy(update={"avoid_forecast": True, "use": "fused", "min_clearance_m": 0.3, "max_pops": 5000})}
+    update={
+        "voronoi": V.model_copy(
+            update={"avoid_forecast": True, "use": "fused", "min_clearance_m": 0.3, "max_pops": 5000}
+        )
+    }
 )
 """One other compiled variant for all switches: forecast avoided, both layers, another d_min, small budget."""
 
 
 @lru_cache(maxsize=1)
 def planned_maps():
-    """(seed, exact cost, reason, waypoints, reported cost, second passes, clearance, omega) of N_MAP random maps."""
+    """(seed, exact cost, reason, waypoints, reported cost, second passes, clearance, omega) of N_MAP random
+    maps."""
     out = []
     for first in range(0, N_MAP, N_ENV):
         drawn = [maps.random_map(first + i) for i in range(N_ENV)]
@@ -48,7 +56,10 @@ def planned_maps():
             blocked = drawn[env][0] | maps.OUTSIDE
             clearance, _, _ = oracle.clearance_of(blocked, maps.CELL_M, 2.0)
             omega = oracle.traversable(blocked, clearance, V.min_clearance_m)
-            ends = [maps.cell_of(s.ego.pos_w[env].to_numpy()[:2]), maps.cell_of(s.mission.goal_w[env].to_numpy()[:2])]
+            ends = [
+                maps.cell_of(s.ego.pos_w[env].to_numpy()[:2]),
+                maps.cell_of(s.mission.goal_w[env].to_numpy()[:2]),
+            ]
             exact = oracle.least_cost(omega, clearance, V.cost_epsilon_m, maps.CELL_M, *ends)
             row = (
                 first + env,
@@ -68,7 +79,9 @@ def test_a_route_is_found_exactly_where_there_is_one():
     solvable = [row for row in planned_maps() if np.isfinite(row[1])]
     assert 200 < len(solvable) < len(planned_maps())
     for seed, exact, reason, way, *_ in planned_maps():
-        assert (reason == plan_codes.FAIL_NONE) == np.isfinite(exact), f"map {seed}: reason {reason}, exact cost {exact}"
+        assert (reason == plan_codes.FAIL_NONE) == np.isfinite(exact), (
+            f"map {seed}: reason {reason}, exact cost {exact}"
+        )
         assert reason in (plan_codes.FAIL_NONE, plan_codes.FAIL_DISCONNECTED)
         assert (len(way) > 0) == np.isfinite(exact)
 
@@ -111,7 +124,8 @@ def test_the_skeleton_alone_serves_nearly_every_map():
 
 
 def test_the_skeleton_is_where_the_nearest_sites_of_neighbours_lie_apart():
-    """By the distance between sites, never by whose they are: every cell that a plan asked about, on a few maps."""
+    """By the distance between sites, never by whose they are: every cell that a plan asked about, on a few
+    maps."""
     asked = on_it = 0
     for first in range(0, 12, N_PLAN):
         drawn = [maps.random_map(first + i) for i in range(N_ENV)]
@@ -121,7 +135,9 @@ def test_the_skeleton_is_where_the_nearest_sites_of_neighbours_lie_apart():
         plan(range(N_PLAN))  # one env a slot: its cells are not used again
         for env in range(N_PLAN):
             bits = s.voronoi.cell.to_numpy()[env]
-            clearance, row, col = oracle.clearance_of(drawn[env][0] | maps.OUTSIDE, maps.CELL_M, CONFIG.clearance.max_m)
+            clearance, row, col = oracle.clearance_of(
+                drawn[env][0] | maps.OUTSIDE, maps.CELL_M, CONFIG.clearance.max_m
+            )
             expected = clearance >= CONFIG.clearance.max_m - 1e-4
             for axis, step in ((0, 1), (0, -1), (1, 1), (1, -1)):
                 other_row, other_col = np.roll(row, step, axis), np.roll(col, step, axis)
@@ -136,7 +152,9 @@ def test_the_skeleton_is_where_the_nearest_sites_of_neighbours_lie_apart():
 def test_the_papers_sum_agrees_with_the_cost():
     for _, exact, _, way, cost, *_, clearance, _ in planned_maps()[:60]:
         if np.isfinite(exact) and exact > 2.0:
-            assert oracle.hopped_cost(way, clearance, V.cost_epsilon_m, maps.ORIGIN, maps.CELL_M) == pytest.approx(cost, rel=SUM_TOLERANCE)
+            assert oracle.hopped_cost(
+                way, clearance, V.cost_epsilon_m, maps.ORIGIN, maps.CELL_M
+            ) == pytest.approx(cost, rel=SUM_TOLERANCE)
 
 
 def test_the_first_plan_knows_nothing():
@@ -173,7 +191,10 @@ def wall(x, gap_low, gap_high):
 
 
 def test_a_gap_of_exactly_d_min_is_passable_and_a_cell_less_is_not():
-    wide, tight = wall(18.75, 2.0, 2.5), wall(18.75, 2.0, 2.4)  # 5 and 4 free cells: 0.3 and 0.25 m to the wall's cells at best
+    wide, tight = (
+        wall(18.75, 2.0, 2.5),
+        wall(18.75, 2.0, 2.4),
+    )  # 5 and 4 free cells: 0.3 and 0.25 m to the wall's cells at best
     s = clean()
     put_maps([wide, tight] + [wide] * (N_ENV - 2))
     put_ends([(18.2, 2.25)] * N_ENV, [(19.4, 2.25)] * N_ENV)
@@ -185,7 +206,10 @@ def test_a_gap_of_exactly_d_min_is_passable_and_a_cell_less_is_not():
 
 def test_start_or_goal_outside_is_named():
     s = clean()
-    put_ends([(2.0, 0.2), (2.0, 3.0), (-5.0, 3.0)] + [(2.0, 3.0)] * 5, [(18.0, 3.0), (18.0, 5.9)] + [(18.0, 3.0)] * 6)
+    put_ends(
+        [(2.0, 0.2), (2.0, 3.0), (-5.0, 3.0)] + [(2.0, 3.0)] * 5,
+        [(18.0, 3.0), (18.0, 5.9)] + [(18.0, 3.0)] * 6,
+    )
     plan([0, 1, 2, 3])
     start, goal, none = plan_codes.FAIL_START_OUTSIDE, plan_codes.FAIL_GOAL_OUTSIDE, plan_codes.FAIL_NONE
     assert [s.route.fallback_reason[env] for env in range(4)] == [start, goal, start, none]
@@ -214,7 +238,10 @@ def test_the_forecast_blocks_only_where_it_is_avoided():
     plan([0, 1])
     assert [s.route.fallback_reason[env] for env in (0, 1)] == [plan_codes.FAIL_NONE] * 2
     plan([0, 1], STRICT)
-    assert [s.route.fallback_reason[env] for env in (0, 1)] == [plan_codes.FAIL_FORECAST, plan_codes.FAIL_NONE]
+    assert [s.route.fallback_reason[env] for env in (0, 1)] == [
+        plan_codes.FAIL_FORECAST,
+        plan_codes.FAIL_NONE,
+    ]
 
 
 def test_the_forecast_is_gone_around_where_there_is_room():
@@ -224,7 +251,9 @@ def test_the_forecast_is_gone_around_where_there_is_room():
     put_ends([(1.0, 3.0)] * N_ENV, [(6.0, 3.0)] * N_ENV)
     plan([0], STRICT)
     assert s.route.fallback_reason[0] == plan_codes.FAIL_NONE
-    assert np.linalg.norm(oracle.line_points(way_of(0), 0.01)[0] - 3.0, axis=1).min() > 0.3 + 0.3 - maps.CELL_M
+    assert (
+        np.linalg.norm(oracle.line_points(way_of(0), 0.01)[0] - 3.0, axis=1).min() > 0.3 + 0.3 - maps.CELL_M
+    )
 
 
 def test_the_dynamic_layer_counts_only_when_asked_for():
@@ -239,7 +268,9 @@ def test_the_dynamic_layer_counts_only_when_asked_for():
 
 def test_the_budget_ends_the_search():
     s = clean()
-    put_maps([np.abs(maps.X - 18.6) < 0.2] * N_ENV)  # the search runs from the goal and visits all of its side
+    put_maps(
+        [np.abs(maps.X - 18.6) < 0.2] * N_ENV
+    )  # the search runs from the goal and visits all of its side
     put_ends([(19.4, 3.0)] * N_ENV, [(2.0, 3.0)] * N_ENV)
     plan([0], STRICT)
     assert s.route.fallback_reason[0] == plan_codes.FAIL_BUDGET
@@ -272,7 +303,11 @@ def test_start_and_goal_in_one_cell():
 
 
 @ti.kernel
-def sorted_by_heap(voronoi: Out[VoronoiState], key: ti.types.ndarray(dtype=ti.f32, ndim=1), out: ti.types.ndarray(dtype=ti.i32, ndim=1)):  # type: ignore[valid-type]
+def sorted_by_heap(
+    voronoi: Out[VoronoiState],
+    key: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    out: ti.types.ndarray(dtype=ti.i32, ndim=1),
+):  # type: ignore[valid-type]
     """Push two, pop one, and so on; then pop the rest."""
     for _ in range(1):
         size, taken = 0, 0

@@ -1,4 +1,5 @@
-"""What a user installs: the wheel made from the source distribution, in an environment of its own, in any folder, without a network."""
+"""What a user installs: the wheel made from the source distribution, in an environment of its own, in any
+folder, without a network."""
 
 import json
 import os
@@ -17,27 +18,32 @@ from tests.conftest import SmallSim
 ROOT = Path(__file__).parent.parent
 KEPT = ("uuvtai", "tests", "benchmarks", "examples", "docs", "runs/README.md", ".ci", ".github")
 """of the checkout, beside the files at its top"""
-PRESETS = {path.relative_to(ROOT).as_posix() for path in (ROOT / "uuvtai" / "presets").rglob("*") if path.is_file()}
+PRESETS = {
+    path.relative_to(ROOT).as_posix() for path in (ROOT / "uuvtai" / "presets").rglob("*") if path.is_file()
+}
 MODULES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "uuvtai").rglob("*.py")}
 
 NO_NETWORK = """
 import pathlib, sys
 
 def refuse(event, arguments):
-    reaches_out = event in ("socket.connect", "socket.sendto", "socket.sendmsg") and isinstance(arguments[1], tuple)
-    if reaches_out or event in ("socket.getaddrinfo", "socket.gethostbyname"):
+    sends = event in ("socket.connect", "socket.sendto", "socket.sendmsg")
+    if sends and isinstance(arguments[1], tuple) or event in ("socket.getaddrinfo", "socket.gethostbyname"):
         with open(pathlib.Path(__file__).with_suffix(".log"), "a") as log:
             log.write(f"{event} {arguments}\\n")
         raise OSError(f"no network in this environment: {event}")
 
 sys.addaudithook(refuse)
 """
-"""Module of the wheel's environment: whatever reaches for another machine fails, and is written down in case nobody tells."""
+"""Module of the wheel's environment: whatever reaches for another machine fails, and is written down in case
+nobody tells."""
 
 
 def run(*command, **options):
     """One command that must succeed; its stdout."""
-    done = subprocess.run([str(part) for part in command], capture_output=True, text=True, check=False, **options)
+    done = subprocess.run(
+        [str(part) for part in command], capture_output=True, text=True, check=False, **options
+    )
     assert done.returncode == 0, f"{command}: {done.stderr[-3000:]}"
     return done.stdout
 
@@ -47,7 +53,10 @@ def built(tmp_path_factory):
     """(source distribution, wheel made from it), built from a copy of the checkout."""
     place = tmp_path_factory.mktemp("built")
     copy, dist = place / "checkout", place / "dist"
-    for name in [*KEPT, *(path.name for path in ROOT.iterdir() if path.is_file() and not path.name.startswith(".coverage"))]:
+    for name in [
+        *KEPT,
+        *(path.name for path in ROOT.iterdir() if path.is_file() and not path.name.startswith(".coverage")),
+    ]:
         source = ROOT / name
         (copy / name).parent.mkdir(parents=True, exist_ok=True)
         if source.is_dir():
@@ -55,22 +64,54 @@ def built(tmp_path_factory):
         elif source.exists():
             shutil.copy(source, copy / name)
     dist.mkdir()
-    run(sys.executable, "-c", "import sys, setuptools.build_meta as b; b.build_sdist(sys.argv[1])", dist, cwd=copy)
+    run(
+        sys.executable,
+        "-c",
+        "import sys, setuptools.build_meta as b; b.build_sdist(sys.argv[1])",
+        dist,
+        cwd=copy,
+    )
     (sdist,) = dist.glob("*.tar.gz")
-    run(sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--no-index", "-w", dist, sdist, cwd=place)
+    run(
+        sys.executable,
+        "-m",
+        "pip",
+        "wheel",
+        "--quiet",
+        "--no-deps",
+        "--no-build-isolation",
+        "--no-index",
+        "-w",
+        dist,
+        sdist,
+        cwd=place,
+    )
     (wheel,) = dist.glob("*.whl")
     return sdist, wheel
 
 
 @pytest.fixture(scope="module")
 def installed(built, tmp_path_factory):
-    """(packages, interpreter) of a fresh environment with the wheel, lent what it needs by the tests' own; no network there."""
+    """(packages, interpreter) of a fresh environment with the wheel, lent what it needs by the tests' own; no
+    network there."""
     place = tmp_path_factory.mktemp("installed")
     run(sys.executable, "-m", "venv", "--without-pip", place)
     python = next(place.glob("*/python"), None) or place / "Scripts" / "python.exe"
     own = Path(run(python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))").strip())
     (own / "lent.pth").write_text(sysconfig.get_path("purelib") + "\n")
-    run(python, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--ignore-installed", built[1], env=clean(), cwd=place)
+    run(
+        python,
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--no-deps",
+        "--no-index",
+        "--ignore-installed",
+        built[1],
+        env=clean(),
+        cwd=place,
+    )
     (own / "no_network.py").write_text(NO_NETWORK)
     (own / "no_network.pth").write_text("import no_network\n")
     return own, python
@@ -78,12 +119,17 @@ def installed(built, tmp_path_factory):
 
 def clean(**more):
     """The environment of a user: nothing of the checkout in it."""
-    return {name: value for name, value in os.environ.items() if name != "PYTHONPATH" and not name.startswith("COV")} | more
+    return {
+        name: value
+        for name, value in os.environ.items()
+        if name != "PYTHONPATH" and not name.startswith("COV")
+    } | more
 
 
 @pytest.fixture
 def uuv(installed, tmp_path):
-    """Run ``uuv`` of the wheel in an empty folder; its stdout. Fails where anything reached for the network."""
+    """Run ``uuv`` of the wheel in an empty folder; its stdout. Fails where anything reached for the
+    network."""
     own, python = installed
 
     def call(*arguments, **more):
@@ -111,9 +157,26 @@ def test_presets_of_every_kind_are_among_them():
 def test_the_source_distribution_can_be_tested_and_carries_no_litter(built):
     with tarfile.open(built[0]) as packed:
         names = {name.partition("/")[2] for name in packed.getnames()}
-    wanted = {"LICENSE", "README.md", "CHANGELOG.md", "CONTRIBUTING.md", "pyproject.toml", "bootstrap.py", "tests/conftest.py", ".ci/run"}
-    assert names >= wanted | MODULES | PRESETS | {"tests/reference/world.py", "examples/judge.py", "benchmarks/run.py"}
-    assert not [name for name in names if "node_modules" in name or "__pycache__" in name or name.startswith(("build/", "runs/2"))]
+    wanted = {
+        "LICENSE",
+        "README.md",
+        "CHANGELOG.md",
+        "CONTRIBUTING.md",
+        "pyproject.toml",
+        "bootstrap.py",
+        "tests/conftest.py",
+        ".ci/run",
+    }
+    assert names >= wanted | MODULES | PRESETS | {
+        "tests/reference/world.py",
+        "examples/judge.py",
+        "benchmarks/run.py",
+    }
+    assert not [
+        name
+        for name in names
+        if "node_modules" in name or "__pycache__" in name or name.startswith(("build/", "runs/2"))
+    ]
 
 
 def test_the_installed_command_is_the_wheels_and_works_in_any_folder(installed, uuv, tmp_path):
@@ -127,7 +190,8 @@ def test_the_installed_command_is_the_wheels_and_works_in_any_folder(installed, 
 
 
 def test_who_reaches_for_the_network_is_found_out(installed, tmp_path):
-    """What the other tests rely on: name look-ups and connections fail and are written down, though their errors be swallowed."""
+    """What the other tests rely on: name look-ups and connections fail and are written down, though their
+    errors be swallowed."""
     own, python = installed
     tries = (
         "s.create_connection(('192.0.2.1', 9), 1)",
@@ -149,5 +213,7 @@ def test_doctor_asks_no_server(uuv, tmp_path):
 
 
 def test_an_evaluation_asks_no_server(uuv):
-    result = json.loads(uuv("eval", "--controller", "bt", "--episodes", "2", "--seeds", "3", *SmallSim.OPTIONS, "--json"))
+    result = json.loads(
+        uuv("eval", "--controller", "bt", "--episodes", "2", "--seeds", "3", *SmallSim.OPTIONS, "--json")
+    )
     assert sum(result["methods"][0]["outcomes"].values()) == 2

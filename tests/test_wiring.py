@@ -1,4 +1,5 @@
-"""What the trainer learns from, against hand computations on a scripted environment: losses as the optimiser sees them, samples, labels."""
+"""What the trainer learns from, against hand computations on a scripted environment: losses as the optimiser
+sees them, samples, labels."""
 
 import copy
 from dataclasses import dataclass, field
@@ -39,9 +40,16 @@ class Watched(Processes):
 
 
 def trainer_of(script=SCRIPT, **sections):
-    """(trainer, env): one epoch of one minibatch, no teacher batches, values as they are; the running uncertainty is the newest one."""
+    """(trainer, env): one epoch of one minibatch, no teacher batches, values as they are; the running
+    uncertainty is the newest one."""
     own = {
-        "ppo": {"rollout_steps": STEPS, "epochs": 1, "minibatches": 1, "normalise_values": False, "entropy_weight": 0.01},
+        "ppo": {
+            "rollout_steps": STEPS,
+            "epochs": 1,
+            "minibatches": 1,
+            "normalise_values": False,
+            "entropy_weight": 0.01,
+        },
         "distill": {"steps": 0, "schedule": [[0, 1], [1, 0.2]]},
         "uncertainty": {"ema": 1.0, "max_scale": 50.0},
         "train": {"iterations": ITERATIONS},
@@ -65,7 +73,8 @@ def close(found, expected):
 
 
 def residual_and_uncertainty(model, obs, action, next_obs):
-    """Both (T, N), from the paper's equations, each error and variance in the running deviation of that target's change."""
+    """Both (T, N), from the paper's equations, each error and variance in the running deviation of that
+    target's change."""
     with torch.no_grad():
         predicted = model.predict(obs, action)
     unit = (model.change_norm.m2 / model.change_norm.count).sqrt().float()
@@ -73,7 +82,7 @@ def residual_and_uncertainty(model, obs, action, next_obs):
     return residual, (predicted.log_var.exp() / unit**2).mean(-1)
 
 
-# -------------------------------------------------------------------------------------------------- what the actor's loss is made of
+# --------------------------------------------------------------------------- what the actor's loss is made of
 
 
 def advantages(rollout, gamma=0.99, lam=0.95):
@@ -90,7 +99,8 @@ def advantages(rollout, gamma=0.99, lam=0.95):
 
 
 def gradients(policy, rollout, distilled):
-    """Of the actor and of log_std by the textbook; ``distilled`` (T, N) is what each sample's imitation error is multiplied by."""
+    """Of the actor and of log_std by the textbook; ``distilled`` (T, N) is what each sample's imitation error
+    is multiplied by."""
     policy = copy.deepcopy(policy)
     advantage = advantages(rollout)
     mean, log_std = policy.distribution(rollout.x)
@@ -103,11 +113,16 @@ def gradients(policy, rollout, distilled):
 
 
 def seen_by_the_optimiser(trainer):
-    """The same gradients as they came to PPO's optimiser in the newest iteration, before their norm is cut."""
+    """The same gradients as they came to PPO's optimiser in the newest iteration, before their norm is
+    cut."""
     names = [name for name, _ in trainer.policy.named_parameters()]
-    (lists,) = [tensors for tensors in trainer.processes.seen if len(tensors) == len(names) + 1]  # the divergence comes last
+    (lists,) = [
+        tensors for tensors in trainer.processes.seen if len(tensors) == len(names) + 1
+    ]  # the divergence comes last
     of = dict(zip(names, lists, strict=False))
-    return torch.cat([of["log_std"], *(tensor.flatten() for name, tensor in of.items() if name.startswith("actor."))])
+    return torch.cat(
+        [of["log_std"], *(tensor.flatten() for name, tensor in of.items() if name.startswith("actor."))]
+    )
 
 
 def learned_once(trainer, env):
@@ -121,10 +136,13 @@ def learned_once(trainer, env):
 
 @pytest.mark.parametrize("gain", [0.0, 0.8])
 def test_the_distillation_is_weighed_by_lambda_times_the_scale_of_the_uncertainty(gain):
-    """The gradient of the whole loss; with lambda alone, with no distillation or with the residual in sigma's place it is another."""
+    """The gradient of the whole loss; with lambda alone, with no distillation or with the residual in sigma's
+    place it is another."""
     trainer, env = trainer_of(uncertainty={"ema": 1.0, "gain": gain, "max_scale": 50.0})
     policy, model, moments = learned_once(trainer, env)
-    residual, sigma = residual_and_uncertainty(model, *(joined(moments, name) for name in ("obs", "action", "final_obs")))
+    residual, sigma = residual_and_uncertainty(
+        model, *(joined(moments, name) for name in ("obs", "action", "final_obs"))
+    )
     ones, found = torch.ones_like(sigma), seen_by_the_optimiser(trainer)
     strength = LAMBDA[1] * (1.0 + gain * float(sigma.mean()))
     assert close(found, gradients(policy, trainer.rollout, strength * ones))
@@ -136,12 +154,19 @@ def test_the_scale_is_capped_and_follows_the_running_mean():
     trainer, env = trainer_of(uncertainty={"ema": 0.25, "gain": 0.8, "max_scale": 50.0})
     _, sigma = (t.mean() for t in first_features(trainer, env))
     first, (policy, model, moments) = float(sigma), learned_once(trainer, env)
-    _, sigma = residual_and_uncertainty(model, *(joined(moments, name) for name in ("obs", "action", "final_obs")))
+    _, sigma = residual_and_uncertainty(
+        model, *(joined(moments, name) for name in ("obs", "action", "final_obs"))
+    )
     strength = LAMBDA[1] * (1.0 + 0.8 * (0.75 * first + 0.25 * float(sigma.mean())))
-    assert close(seen_by_the_optimiser(trainer), gradients(policy, trainer.rollout, torch.full_like(sigma, strength)))
+    assert close(
+        seen_by_the_optimiser(trainer), gradients(policy, trainer.rollout, torch.full_like(sigma, strength))
+    )
     capped, env = trainer_of(uncertainty={"ema": 1.0, "gain": 0.8, "max_scale": 1.1})
     policy, _, _ = learned_once(capped, env)
-    assert close(seen_by_the_optimiser(capped), gradients(policy, capped.rollout, torch.full_like(sigma, 1.1 * LAMBDA[1])))
+    assert close(
+        seen_by_the_optimiser(capped),
+        gradients(policy, capped.rollout, torch.full_like(sigma, 1.1 * LAMBDA[1])),
+    )
 
 
 def first_features(trainer, env):
@@ -155,46 +180,64 @@ def first_features(trainer, env):
 
     twin.collector.collect = note
     twin.iterate()
-    return residual_and_uncertainty(models[0], *(joined(env.log[-STEPS:], name) for name in ("obs", "action", "final_obs")))
+    return residual_and_uncertainty(
+        models[0], *(joined(env.log[-STEPS:], name) for name in ("obs", "action", "final_obs"))
+    )
 
 
 def test_samples_are_weighed_by_their_own_uncertainty_where_that_is_asked_for():
-    trainer, env = trainer_of(distill={"steps": 0, "schedule": [[0, 1], [1, 0.2]], "weighting": "uncertainty"})
+    trainer, env = trainer_of(
+        distill={"steps": 0, "schedule": [[0, 1], [1, 0.2]], "weighting": "uncertainty"}
+    )
     with torch.no_grad():  # or all samples are nearly as uncertain as each other
         trainer.world_model.decoder[-1].weight[N_TARGET:].mul_(300.0)
     policy, model, moments = learned_once(trainer, env)
-    _, sigma = residual_and_uncertainty(model, *(joined(moments, name) for name in ("obs", "action", "final_obs")))
+    _, sigma = residual_and_uncertainty(
+        model, *(joined(moments, name) for name in ("obs", "action", "final_obs"))
+    )
     weight = (sigma / sigma.mean()).clamp(0.25, 4.0)
     weight = weight / weight.mean()
     assert weight.std() > 0.05
     strength = LAMBDA[1] * (1.0 + 0.8 * float(sigma.mean()))
     assert close(seen_by_the_optimiser(trainer), gradients(policy, trainer.rollout, strength * weight))
-    assert not close(seen_by_the_optimiser(trainer), gradients(policy, trainer.rollout, strength * torch.ones_like(weight)))
+    assert not close(
+        seen_by_the_optimiser(trainer), gradients(policy, trainer.rollout, strength * torch.ones_like(weight))
+    )
 
 
-# --------------------------------------------------------------------------------------------------------------------- the rollout
+# ------------------------------------------------------------------------------------------------ the rollout
 
 
 def test_the_rollout_is_what_happened():
     trainer, env = trainer_of()
     policy, model, moments = learned_once(trainer, env)
     rollout = trainer.rollout
-    for name, of_log in (("teacher_action", "teacher"), *((n, n) for n in ("action", "reward", "terminated", "ended"))):
+    for name, of_log in (
+        ("teacher_action", "teacher"),
+        *((n, n) for n in ("action", "reward", "terminated", "ended")),
+    ):
         assert torch.equal(getattr(rollout, name), joined(moments, of_log)), name
     assert torch.equal(rollout.x[..., :-2], joined(moments, "obs"))
     assert rollout.ended.any() and (rollout.ended & ~rollout.terminated).any()
-    features = torch.stack(residual_and_uncertainty(model, *(joined(moments, name) for name in ("obs", "action", "final_obs"))), -1)
+    features = torch.stack(
+        residual_and_uncertainty(model, *(joined(moments, name) for name in ("obs", "action", "final_obs"))),
+        -1,
+    )
     led_to = torch.cat([joined(moments, "final_obs"), features], -1)
     with torch.no_grad():
         expected = policy.value(led_to) * ~rollout.terminated
-    assert torch.allclose(rollout.next_value, expected, atol=1e-4), "a timeout is bootstrapped from the observation it ended in"
+    assert torch.allclose(rollout.next_value, expected, atol=1e-4), (
+        "a timeout is bootstrapped from the observation it ended in"
+    )
     assert rollout.ended[-1].any() and expected.std() > 0.01
 
 
 def test_the_world_models_columns_come_from_the_policys_own_action():
     trainer, env = trainer_of()
     _, model, moments = learned_once(trainer, env)
-    obs, action, teacher, final = (joined(moments, name) for name in ("obs", "action", "teacher", "final_obs"))
+    obs, action, teacher, final = (
+        joined(moments, name) for name in ("obs", "action", "teacher", "final_obs")
+    )
     found, on = trainer.rollout.x[1:, :, -2:], ~trainer.rollout.ended[:-1]
 
     def columns(by):
@@ -205,7 +248,7 @@ def test_the_world_models_columns_come_from_the_policys_own_action():
     assert not found[~on].any() and (~on).any(), "an episode begins with no prediction behind it"
 
 
-# ----------------------------------------------------------------------------------------------------------------- the world model
+# -------------------------------------------------------------------------------------------- the world model
 
 
 def test_the_world_model_learns_from_transitions_that_took_place_and_from_none_across_an_ending():
@@ -224,7 +267,9 @@ def test_the_world_model_learns_from_transitions_that_took_place_and_from_none_a
         last_of_rollout = t % STEPS == STEPS - 1
         for row in range(env.num_envs):
             if not moment.ended[row] and not last_of_rollout:
-                happened[float(moment.obs[row, -1])] = tuple(getattr(moment, name)[row] for name in ("obs", "action", "final_obs"))
+                happened[float(moment.obs[row, -1])] = tuple(
+                    getattr(moment, name)[row] for name in ("obs", "action", "final_obs")
+                )
     learned = set()
     for obs, action, next_obs, valid in batches:
         for row in valid.nonzero().flatten().tolist():
@@ -233,17 +278,27 @@ def test_the_world_model_learns_from_transitions_that_took_place_and_from_none_a
             for found, expected in zip((obs, action, next_obs), happened[moment], strict=True):
                 assert torch.equal(found[row], expected)
             learned.add(moment)
-    assert len(learned) > 0.95 * len(happened), "all that took place is drawn from: the tree's rollout and both of the policy's"
+    assert len(learned) > 0.95 * len(happened), (
+        "all that took place is drawn from: the tree's rollout and both of the policy's"
+    )
     unit = (trainer.world_model.change_norm.m2 / trainer.world_model.change_norm.count).sqrt()
     assert unit.max() < 0.2 < JUMP, "changes between two episodes are none"
 
 
-# ----------------------------------------------------------------------------------------------------------------- the risk's labels
+# ------------------------------------------------------------------------------------------ the risk's labels
 
 ENDS_AT = 7
 """control step of the policy's rollout in which all but one of the envs end"""
-LABELS = {"collision": True, "ttc": True, "success": False, "out_of_tank": False, "timeout": None, None: False}
-"""of a moment two steps before that ending, at a horizon of three: None = not known, since the time was over"""
+LABELS = {
+    "collision": True,
+    "ttc": True,
+    "success": False,
+    "out_of_tank": False,
+    "timeout": None,
+    None: False,
+}
+"""of a moment two steps before that ending, at a horizon of three: None = not known, since the time was
+over"""
 
 
 def test_accidents_are_events_timeouts_are_not_known_and_other_endings_are_safe():
@@ -251,13 +306,17 @@ def test_accidents_are_events_timeouts_are_not_known_and_other_endings_are_safe(
     script = [[(STEPS + ENDS_AT, how)] if how else [] for how in LABELS]
     risk = {"enabled": True, "horizon_s": 0.06, "batch": 64, "hidden": [8]}
     trainer, env = trainer_of(script, risk=risk)
-    with torch.no_grad():  # an opinion of its own on every moment, but not by its running number, which would drown the rest
+    with (
+        torch.no_grad()
+    ):  # an opinion of its own on every moment, but not by its running number, which would drown the rest
         trainer.risk.net[-1].weight.mul_(100.0)
         trainer.risk.net[0].weight[:, N_TARGET] = 0.0
     head = copy.deepcopy(trainer.risk)
     metrics = trainer.iterate()
     assert env.log[STEPS + ENDS_AT - 1].ended.sum() == len(LABELS) - 1
-    samples = [(t, row, label if t == 5 else False) for t in (0, 5, 10) for row, label in enumerate(LABELS.values())]
+    samples = [
+        (t, row, label if t == 5 else False) for t in (0, 5, 10) for row, label in enumerate(LABELS.values())
+    ]
     samples = [(t, row, label) for t, row, label in samples if label is not None]
     errors = [(float(head(trainer.rollout.x[t, row])) - label) ** 2 for t, row, label in samples]
     assert len(samples) == 17 and metrics["risk/event_rate"] == pytest.approx(2 / 17)
@@ -267,9 +326,13 @@ def test_accidents_are_events_timeouts_are_not_known_and_other_endings_are_safe(
 
 
 def test_rates_count_every_ending_by_what_it_was():
-    """A collision, a stop for the time to collision and leaving the tank are collisions; the env that goes on is no episode."""
+    """A collision, a stop for the time to collision and leaving the tank are collisions; the env that goes on
+    is no episode."""
     endings = ["success"] * 4 + ["timeout"] * 2 + ["collision", "ttc", "out_of_tank", None]
     trainer, _ = trainer_of([[(STEPS + ENDS_AT, how)] if how else [] for how in endings])
     metrics = trainer.iterate()
-    rates = [metrics[f"rollout/{name}"] for name in ("episodes", "success_rate", "collision_rate", "timeout_rate", "ep_len_mean")]
+    rates = [
+        metrics[f"rollout/{name}"]
+        for name in ("episodes", "success_rate", "collision_rate", "timeout_rate", "ep_len_mean")
+    ]
     assert rates == pytest.approx([9, 4 / 9, 3 / 9, 2 / 9, STEPS + ENDS_AT])

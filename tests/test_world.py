@@ -1,4 +1,5 @@
-"""Scenarios of every world: ranges, counts, gaps, joined free space, paths; and that they are a pure function of (world, seed, episode)."""
+"""Scenarios of every world: ranges, counts, gaps, joined free space, paths; and that they are a pure function
+of (world, seed, episode)."""
 
 import functools
 import os
@@ -57,7 +58,9 @@ class Drawn:
         self.cfg, self.n_env = cfg, n_env
         sizes = {"n_env": n_env, **scenario.scenario_sizes(cfg)}
         self.structs = [state.allocate(struct, sizes) for struct in STRUCTS]
-        self.world, self.path, self.mission, _, self.scene, self.fixed, self.episode, self.clock = self.structs
+        self.world, self.path, self.mission, _, self.scene, self.fixed, self.episode, self.clock = (
+            self.structs
+        )
         self.slots = scenario.body_slots(cfg)
         scenario.load_fixed(self.fixed, cfg)
 
@@ -87,7 +90,9 @@ class Drawn:
         """(kind, pos, size, yaw) in float64 of the bodies in a range of slots."""
         rows = [drawn[name][env].astype(float) for name in ("kind", "pos_w", "size", "yaw")]
         slots = range(self.slots.n_body)[first:last]
-        return [(int(rows[0][i]), rows[1][i], rows[2][i], float(rows[3][i])) for i in slots if rows[0][i] != NONE]
+        return [
+            (int(rows[0][i]), rows[1][i], rows[2][i], float(rows[3][i])) for i in slots if rows[0][i] != NONE
+        ]
 
     def still(self, drawn, env):
         return self.bodies(drawn, env, 0, self.slots.first_dynamic)
@@ -96,7 +101,11 @@ class Drawn:
 @functools.cache
 def drawn_world(name):
     # one set of slots serves the preset's S and D and every other (S, D)
-    cfg = world_config("pool", static_capacity=12, dynamic_capacity=15) if name == "pool" else world_config(name)
+    cfg = (
+        world_config("pool", static_capacity=12, dynamic_capacity=15)
+        if name == "pool"
+        else world_config(name)
+    )
     world_of = Drawn(cfg)
     return world_of, world_of.draw()
 
@@ -110,7 +119,7 @@ def within(values, interval, margin=FLOAT_TOL_M):
     return np.all(values >= interval[0] - margin) and np.all(values <= interval[1] + margin)
 
 
-# ------------------------------------------------------------------------------------------------------------ every world
+# ------------------------------------------------------------------------------------------------ every world
 
 
 def test_every_scenario_is_placed_as_asked(any_world):
@@ -141,7 +150,10 @@ def test_static_obstacles_keep_sizes_and_gaps(any_world):
         bodies = of.still(drawn, env)
         for i, body in enumerate(bodies):
             kind, pos, size, _ = body
-            ends = [reference.plan_distances(drawn[end][env, :2].astype(float), *body) for end in ("start_w", "goal_w")]
+            ends = [
+                reference.plan_distances(drawn[end][env, :2].astype(float), *body)
+                for end in ("start_w", "goal_w")
+            ]
             assert min(ends) >= cfg.static.endpoint_gap_m - FLOAT_TOL_M
             if i < n_fixed:
                 continue
@@ -207,7 +219,10 @@ def test_paths_keep_their_shapes_within_the_walls(any_world):
             n_way, way = drawn["path_n_way"][env, lane], drawn["path_way_w"][env, lane].astype(float)
             radius, length = drawn["path_radius_m"][env, lane], drawn["path_length_m"][env, lane]
             points = reference.path_points(n_way, way, radius, length)
-            assert reference.wall_distances(points, of.cfg.tank).min() >= drawn["size"][env, first + lane, 0] - FLOAT_TOL_M
+            assert (
+                reference.wall_distances(points, of.cfg.tank).min()
+                >= drawn["size"][env, first + lane, 0] - FLOAT_TOL_M
+            )
             legs = np.linalg.norm(np.diff([*way[:n_way], way[0]], axis=0), axis=1)
             if n_way == 0:
                 assert within(abs(radius), cfg.circle_radius_m)
@@ -216,7 +231,10 @@ def test_paths_keep_their_shapes_within_the_walls(any_world):
             assert length == pytest.approx(legs.sum(), rel=1e-6)
             if cfg.motion == "waypoints" or (cfg.motion == "mixed" and n_way > 2):
                 assert cfg.corners[0] <= n_way <= cfg.corners[1]
-                assert min(np.hypot(*(a - b)) for i, a in enumerate(way[:n_way]) for b in way[:i]) >= cfg.corner_gap_m - FLOAT_TOL_M
+                assert (
+                    min(np.hypot(*(a - b)) for i, a in enumerate(way[:n_way]) for b in way[:i])
+                    >= cfg.corner_gap_m - FLOAT_TOL_M
+                )
             else:
                 assert n_way == 2
                 assert within(legs, cfg.line_length_m)
@@ -240,7 +258,11 @@ def test_paths_keep_clear_of_static_obstacles_or_are_counted(any_world):
 
 def _row(drawn, env, lane):
     n_way = int(drawn["path_n_way"][env, lane])
-    return n_way, drawn["path_way_w"][env, lane].astype(float), *(float(drawn[f"path_{k}"][env, lane]) for k in ("radius_m", "length_m"))
+    return (
+        n_way,
+        drawn["path_way_w"][env, lane].astype(float),
+        *(float(drawn[f"path_{k}"][env, lane]) for k in ("radius_m", "length_m")),
+    )
 
 
 def test_moving_obstacles_keep_constant_speed_on_their_paths(any_world):
@@ -257,7 +279,9 @@ def test_moving_obstacles_keep_constant_speed_on_their_paths(any_world):
         vel = now["vel_w"][:, first : first + n].astype(float)
         assert np.allclose(np.linalg.norm(vel, axis=-1), v, atol=1e-5)
         ahead, behind = (pos[2] - pos[1]) / dt, (pos[1] - pos[0]) / dt
-        off_corners = np.abs(ahead - behind).max(axis=-1) < SPEED_TOL_M_S  # the tightest circle changes the velocity by 0.014 m/s
+        off_corners = (
+            np.abs(ahead - behind).max(axis=-1) < SPEED_TOL_M_S
+        )  # the tightest circle changes the velocity by 0.014 m/s
         assert off_corners.mean() > 0.95
         assert np.abs(0.5 * (ahead + behind) - vel)[off_corners].max() < SPEED_TOL_M_S
         assert np.all(pos[0][..., 2] == pos[2][..., 2])
@@ -267,16 +291,20 @@ def test_the_log_s_closed_form_gives_the_same_positions(any_world):
     of, _ = any_world
     drawn = of.at(777)
     for env in range(0, N, 16):
-        document = scenario.describe_scenario(lambda field, env=env: field.to_numpy()[env], of.world, of.path, of.mission)
+        document = scenario.describe_scenario(
+            lambda field, env=env: field.to_numpy()[env], of.world, of.path, of.mission
+        )
         assert len(document["bodies"]) == np.sum(drawn["kind"][env] != NONE)
         for body in document["bodies"]:
             assert scenario.KIND_NAMES[drawn["kind"][env, body["slot"]]] == body["kind"]
             if body["path"] is not None:
                 at = scenario.path_position(body["path"], 777 * EpisodeConfig().control_dt_s)
-                assert at == pytest.approx(drawn["pos_w"][env, body["slot"], :2], abs=1e-3)  # float32 arcs of up to 10 m
+                assert at == pytest.approx(
+                    drawn["pos_w"][env, body["slot"], :2], abs=1e-3
+                )  # float32 arcs of up to 10 m
 
 
-# ------------------------------------------------------------------------------------------------- distributions of the pool
+# ---------------------------------------------------------------------------------- distributions of the pool
 
 
 def share_in_lower_half(values, low, high):
@@ -317,7 +345,7 @@ def test_most_pool_paths_keep_clear():
     assert drawn["unclear_paths"].sum() < 0.02 * N * of.cfg.n_dynamic
 
 
-# -------------------------------------------------------------------------------------------------------------- pure function
+# ---------------------------------------------------------------------------------------------- pure function
 
 
 PURE = ("kind", "pos_w", "vel_w", "size", "yaw", "start_w", "goal_w", "start_yaw", "draws", "unclear_paths")
@@ -402,23 +430,34 @@ def test_batch_size_and_thread_count_change_nothing(tmp_path):
     with np.load(out) as other:
         for name in PURE:
             mine = drawn[name][:7]
-            if mine.ndim > 1 and mine.shape[1] == of.slots.n_body:  # the same slots, where capacities are not larger than counts
+            if (
+                mine.ndim > 1 and mine.shape[1] == of.slots.n_body
+            ):  # the same slots, where capacities are not larger than counts
                 mine = np.concatenate([mine[:, : of.cfg.n_static], mine[:, first : first + n]], axis=1)
             assert np.array_equal(other[name], mine), name
 
 
-# ---------------------------------------------------------------------------------------------------------- a user's own world
+# ----------------------------------------------------------------------------------------- a user's own world
 
 
 def test_explicit_obstacles_stand_and_move_as_written():
-    """A wall across the pool, a box that shuttles, a sphere on a triangle; start and goal always share a side of the wall."""
+    """A wall across the pool, a box that shuttles, a sphere on a triangle; start and goal always share a side
+    of the wall."""
     cfg = WorldConfig.model_validate(
         {
             "n_static": 0,
             "n_dynamic": 0,
             "fixed": [
                 {"kind": "box", "x_m": 10, "y_m": 3, "half_extents_m": [0.1, 3.0]},
-                {"kind": "box", "x_m": 0, "y_m": 0, "half_extents_m": [0.2, 0.1], "yaw_deg": 30, "height_m": 0.4, "z_m": -1.0}
+                {
+                    "kind": "box",
+                    "x_m": 0,
+                    "y_m": 0,
+                    "half_extents_m": [0.2, 0.1],
+                    "yaw_deg": 30,
+                    "height_m": 0.4,
+                    "z_m": -1.0,
+                }
                 | {"path": [{"x_m": 2, "y_m": 2}, {"x_m": 5, "y_m": 2}], "speed_m_s": 1.5},
                 {"kind": "cylinder", "x_m": 19, "y_m": 0.5, "radius_m": 0.3},
                 {"kind": "sphere", "x_m": 0, "y_m": 0, "radius_m": 0.2, "z_m": -0.5}
@@ -439,25 +478,35 @@ def test_explicit_obstacles_stand_and_move_as_written():
     assert later["vel_w"][:, 2] == pytest.approx(np.tile([-1.5, 0, 0], (64, 1)), abs=1e-5)
     assert later["yaw"][:, 2] == pytest.approx(np.radians(30))
     assert later["size"][0, 2] == pytest.approx([0.2, 0.1, 0.2])
-    assert later["pos_w"][:, 3] == pytest.approx(np.tile([12 + 0.6 * 150 * dt, 1, -0.5], (64, 1)), abs=FLOAT_TOL_M)
+    assert later["pos_w"][:, 3] == pytest.approx(
+        np.tile([12 + 0.6 * 150 * dt, 1, -0.5], (64, 1)), abs=FLOAT_TOL_M
+    )
     assert later["size"][0, 0] == pytest.approx([0.1, 3.0, 0.8])
 
 
 def test_a_world_that_cannot_be_placed_is_told():
-    of = Drawn(WorldConfig.model_validate({"n_static": 12, "n_dynamic": 0, "static": {"gap_m": 4.0}}), n_env=4)
+    of = Drawn(
+        WorldConfig.model_validate({"n_static": 12, "n_dynamic": 0, "static": {"gap_m": 4.0}}), n_env=4
+    )
     with pytest.raises(RuntimeError, match=r"4 of 4 scenarios.*static obstacles find no place"):
         scenario.check_scenarios(of.draw()["faults"])
     assert not of.draw(scene=(1, 0, 0.6))["faults"].any()
-    crowded = WorldConfig.model_validate({"n_static": 0, "n_dynamic": 1, "dynamic": {"line_length_m": [30, 40], "circle_fraction": 0}})
+    crowded = WorldConfig.model_validate(
+        {"n_static": 0, "n_dynamic": 1, "dynamic": {"line_length_m": [30, 40], "circle_fraction": 0}}
+    )
     with pytest.raises(RuntimeError, match="moving obstacle finds no path"):
         scenario.check_scenarios(Drawn(crowded, n_env=4).draw()["faults"])
     walled = {"kind": "box", "x_m": 10, "y_m": 3, "half_extents_m": [4.1, 3.0]}
-    far = WorldConfig.model_validate({"n_static": 0, "n_dynamic": 0, "start_goal_gap_m": 9, "fixed": [walled]})
+    far = WorldConfig.model_validate(
+        {"n_static": 0, "n_dynamic": 0, "start_goal_gap_m": 9, "fixed": [walled]}
+    )
     with pytest.raises(RuntimeError, match="no layout joins start and goal"):
         scenario.check_scenarios(Drawn(far, n_env=4).draw()["faults"])
 
 
-@pytest.mark.parametrize("scene", [(9, 0, 0.6), (0, 7, 0.6), (-1, 0, 0.6), (0, 0, float("nan")), (0, 0, -1.0)])
+@pytest.mark.parametrize(
+    "scene", [(9, 0, 0.6), (0, 7, 0.6), (-1, 0, 0.6), (0, 0, float("nan")), (0, 0, -1.0)]
+)
 def test_scenes_that_do_not_fit_are_refused(scene):
     of = drawn_world("gauntlet")[0]
     with pytest.raises(ValueError, match=r"slots|speed"):
@@ -475,7 +524,17 @@ def test_scenes_that_do_not_fit_are_refused(scene):
         {"dynamic": {"corners": [3, 6]}},
         {"dynamic": {"cylinder_fraction": 0.2, "full_column_fraction": 0.3}},
         {"fixed": [{"kind": "sphere", "x_m": 1, "y_m": 1}]},
-        {"fixed": [{"kind": "sphere", "x_m": 1, "y_m": 1, "radius_m": 0.1, "path": [{"x_m": 1, "y_m": 1}, {"x_m": 1, "y_m": 1}]}]},
+        {
+            "fixed": [
+                {
+                    "kind": "sphere",
+                    "x_m": 1,
+                    "y_m": 1,
+                    "radius_m": 0.1,
+                    "path": [{"x_m": 1, "y_m": 1}, {"x_m": 1, "y_m": 1}],
+                }
+            ]
+        },
     ],
 )
 def test_worlds_that_make_no_sense_are_refused(wrong):

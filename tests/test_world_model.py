@@ -1,4 +1,5 @@
-"""World model: losses against a NumPy oracle, each switch, units, learning, resume, NaN, and memory of the online features."""
+"""World model: losses against a NumPy oracle, each switch, units, learning, resume, NaN, and memory of the
+online features."""
 
 import copy
 import math
@@ -21,7 +22,8 @@ ROUNDING = 2e-5
 """Relative: float32 sums of a few hundred terms against float64."""
 
 SAMPLING = 0.2
-"""Around a mean square of one: what the issue allows; the variance of 24 x 2000 held-out residuals alone gives 0.01."""
+"""Around a mean square of one: what the issue allows; the variance of 24 x 2000 held-out residuals alone
+gives 0.01."""
 
 
 def generator(seed=0):
@@ -29,7 +31,8 @@ def generator(seed=0):
 
 
 def transitions(seed=0, steps=STEPS, n_env=N_ENV, unit=1.0):
-    """obs, action, next_obs of a system whose targets follow the action, with noise ten times stronger where column 24 is positive."""
+    """obs, action, next_obs of a system whose targets follow the action, with noise ten times stronger where
+    column 24 is positive."""
     gen = generator(seed)
     obs = torch.randn(steps, n_env, N_OBS, generator=gen)
     action = torch.rand(steps, n_env, 4, generator=gen) * 2 - 1
@@ -71,28 +74,39 @@ def test_losses_are_those_of_the_oracle(switches):
     action = 2.0 * action  # half of them beyond what the environment clamps
     valid = torch.arange(N_ENV) % 3 > 0
     losses = model.loss(obs, action, next_obs, valid)
-    reconstruction, dynamics = reference.losses(model, *(part.double().numpy() for part in (obs, action, next_obs)))
+    reconstruction, dynamics = reference.losses(
+        model, *(part.double().numpy() for part in (obs, action, next_obs))
+    )
     kept = valid.numpy()
     expected = reconstruction[kept].mean(), dynamics[kept].mean()
-    np.testing.assert_allclose([losses.reconstruction.item(), losses.dynamics.item()], expected, rtol=ROUNDING)
+    np.testing.assert_allclose(
+        [losses.reconstruction.item(), losses.dynamics.item()], expected, rtol=ROUNDING
+    )
     assert losses.total.item() == pytest.approx(0.7 * expected[0] + 0.3 * expected[1], rel=ROUNDING)
 
 
 def test_prediction_is_the_decoders_in_si_units():
-    """Likelihoods of the same targets in the decoder's unit and in SI units differ by the logarithm of the units."""
+    """Likelihoods of the same targets in the decoder's unit and in SI units differ by the logarithm of the
+    units."""
     for config in (SMALL, SMALL.model_copy(update={"predict_change": False})):
         plain = config.model_copy(update={"beta_nll": 0.0})
         model, _, _ = trained(2, plain)
         obs, action, next_obs = (part[0] for part in transitions(1))
         predicted = model.predict(obs, action)
-        nll = 0.5 * ((next_obs[:, :N_TARGET] - predicted.mean) ** 2 / predicted.log_var.exp() + predicted.log_var).sum(1).mean()
+        nll = (
+            0.5
+            * ((next_obs[:, :N_TARGET] - predicted.mean) ** 2 / predicted.log_var.exp() + predicted.log_var)
+            .sum(1)
+            .mean()
+        )
         inside = model.loss(obs, action, next_obs, torch.ones(N_ENV, dtype=torch.bool)).reconstruction
         assert (nll - inside).item() == pytest.approx(model.scale().log().sum().item(), rel=1e-4)
 
 
 @pytest.mark.parametrize("stopped", [True, False])
 def test_no_gradient_reaches_the_encoder_through_the_target_when_it_is_stopped(stopped):
-    """With dynamics that ignore their input, the target's encoding is the only way from the latent loss to the encoder."""
+    """With dynamics that ignore their input, the target's encoding is the only way from the latent loss to
+    the encoder."""
     config = SMALL.model_copy(update={"reconstruction_weight": 0.0, "stop_target_gradient": stopped})
     model = WorldModel(N_OBS, config, generator())
     with torch.no_grad():
@@ -123,7 +137,9 @@ def test_it_learns_the_change_and_where_it_is_uncertain():
     target = next_obs[:, :N_TARGET]
     error, before = ((target - other).square().mean(dim=0) for other in (predicted.mean, obs[:, :N_TARGET]))
     assert (error < before).all()
-    assert mean_squared_standardised_residual(predicted.mean, predicted.log_var, target) == pytest.approx(1.0, abs=SAMPLING)
+    assert mean_squared_standardised_residual(predicted.mean, predicted.log_var, target) == pytest.approx(
+        1.0, abs=SAMPLING
+    )
     assert metrics["world_model/standardised_residual"] == pytest.approx(1.0, abs=SAMPLING)
     assert metrics["world_model/coverage_90"] == pytest.approx(0.9, abs=SAMPLING)
     assert metrics["world_model/latent_std"] > 0.1
@@ -133,7 +149,8 @@ def test_it_learns_the_change_and_where_it_is_uncertain():
 
 
 def test_features_do_not_depend_on_units():
-    """Lengths in eighths of a metre: exact in binary, so that only roundings of roots and logarithms differ."""
+    """Lengths in eighths of a metre: exact in binary, so that only roundings of roots and logarithms
+    differ."""
     metres, _, _ = trained(3)
     eighths, _, _ = trained(3, data=transitions(unit=8.0))
     obs, action, next_obs = (part[0] for part in transitions(5))
@@ -151,12 +168,20 @@ def test_residual_is_the_error_in_deviations_of_the_change():
     expected = ((next_obs[:, :N_TARGET] - predicted.mean) / change).square().mean(dim=1).sqrt()
     sigma = (predicted.log_var.exp() / change**2).mean(dim=1)
     drawn_twice = 0.1  # statistics are of drawn samples, not of all of them
-    torch.testing.assert_close(model.features(obs, action, next_obs), torch.stack([expected, sigma], 1), rtol=drawn_twice, atol=0.0)
+    torch.testing.assert_close(
+        model.features(obs, action, next_obs), torch.stack([expected, sigma], 1), rtol=drawn_twice, atol=0.0
+    )
 
 
 def test_in_the_decoders_unit_the_uncertainty_is_the_papers_to_the_letter():
-    """sigma_t = mean(exp(log variance)) as the decoder says it, whatever the targets' one-step changes are."""
-    for switches in ({}, {"normalise_targets": False}, {"predict_change": False}, {"predict_change": False, "normalise_targets": False}):
+    """sigma_t = mean(exp(log variance)) as the decoder says it, whatever the targets' one-step changes
+    are."""
+    for switches in (
+        {},
+        {"normalise_targets": False},
+        {"predict_change": False},
+        {"predict_change": False, "normalise_targets": False},
+    ):
         model, _, _ = trained(3, SMALL.model_copy(update={"error_unit": "decoder", **switches}))
         obs, action, next_obs = (part[0] for part in transitions(5))
         with torch.no_grad():
@@ -167,10 +192,13 @@ def test_in_the_decoders_unit_the_uncertainty_is_the_papers_to_the_letter():
 
 
 def test_sure_of_small_raw_targets_the_paper_scales_little_and_the_change_to_the_cap():
-    """A decoder that says "0.2 m give or take" of targets that change by 0.01 m: sigma_t is 0.04 in its own unit, 400 in changes."""
+    """A decoder that says "0.2 m give or take" of targets that change by 0.01 m: sigma_t is 0.04 in its own
+    unit, 400 in changes."""
     scales = {}
     for unit in ("decoder", "change"):
-        config = SMALL.model_copy(update={"predict_change": False, "normalise_targets": False, "error_unit": unit})
+        config = SMALL.model_copy(
+            update={"predict_change": False, "normalise_targets": False, "error_unit": unit}
+        )
         model = WorldModel(N_OBS, config, generator())
         rows = 0.01 * torch.randn(4000, N_TARGET, generator=generator(3))
         model.observe(moments_of(torch.zeros(10, N_OBS)), moments_of(rows))
@@ -178,9 +206,14 @@ def test_sure_of_small_raw_targets_the_paper_scales_little_and_the_change_to_the
             model.decoder[-1].weight.zero_()
             model.decoder[-1].bias[N_TARGET:] = math.log(0.04)
         uncertainty = Uncertainty(UncertaintyConfig())
-        uncertainty.update(model.features(torch.zeros(5, N_OBS), torch.zeros(5, 4), torch.zeros(5, N_OBS))[:, 1])
+        uncertainty.update(
+            model.features(torch.zeros(5, N_OBS), torch.zeros(5, 4), torch.zeros(5, N_OBS))[:, 1]
+        )
         scales[unit] = uncertainty.scale
-    assert scales["decoder"] == pytest.approx(1 + 0.8 * 0.04, rel=0.02) and scales["change"] == UncertaintyConfig().max_scale
+    assert (
+        scales["decoder"] == pytest.approx(1 + 0.8 * 0.04, rel=0.02)
+        and scales["change"] == UncertaintyConfig().max_scale
+    )
 
 
 def test_memory_gives_the_features_of_the_last_step_and_forgets_where_it_is_told_to():
@@ -198,7 +231,7 @@ def test_memory_gives_the_features_of_the_last_step_and_forgets_where_it_is_told
     assert (memory.features(obs)[:, 1] > 0).all()
 
 
-# -------------------------------------------------------------------------------------------------------------- random, resume
+# --------------------------------------------------------------------------------------------- random, resume
 
 
 def test_only_the_handed_generator_is_drawn_from():
@@ -228,7 +261,7 @@ def test_resume_is_bit_exact():
         assert torch.equal(mine, theirs)
 
 
-# -------------------------------------------------------------------------------------------------------------------- bad input
+# -------------------------------------------------------------------------------------------------- bad input
 
 
 def test_rows_that_are_not_finite_count_like_rows_that_are_not_valid():
@@ -288,7 +321,9 @@ def test_processes_share_gradients_and_statistics():
     learner = WorldModelLearner(model, SMALL, to_zero, lambda m: Moments(m.mean, 2 * m.m2, 2 * m.count))
     learner.update(*transitions(), draws)
     assert torch.equal(parameters(model), before)
-    assert model.observation_norm.count.item() == model.change_norm.count.item() == 2 * SMALL.steps * SMALL.batch
+    assert (
+        model.observation_norm.count.item() == model.change_norm.count.item() == 2 * SMALL.steps * SMALL.batch
+    )
 
 
 def test_too_narrow_an_observation_is_refused():

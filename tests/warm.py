@@ -1,6 +1,8 @@
-"""Compile the kernels of the tests' small simulator once, for every process that will need them: ``python -m tests.warm``.
+"""Compile the kernels of the tests' small simulator once, for every process that will need them: ``python -m
+tests.warm``.
 
-Taichi writes what it has compiled when a process ends; test processes that run side by side would each compile everything.
+Taichi writes what it has compiled when a process ends; test processes that run side by side would each
+compile everything.
 """
 
 from tests.conftest import SmallSim

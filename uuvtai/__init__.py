@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 
-TYPE_CHECKING = False  # without typing, which takes longer to import than this file: signals are not heard before it is done
+# without typing, which takes longer to import than this file: signals are not heard before it is done
+TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
@@ -29,12 +30,13 @@ def make(
     teacher: str = "bt",
     check_actions: bool | None = None,
 ) -> VectorEnv:
-    """Torch-native batch of ``num_envs`` vehicles in a world; presets are names or paths of files (see ``uuv presets``).
+    """Torch-native batch of ``num_envs`` vehicles in a world; presets are names or paths of files (see ``uuv
+    presets``).
 
-    ``overrides`` maps dotted config keys to values, ``{"world.n_dynamic": 9}``; ``teacher`` is the behaviour tree behind
-    ``info["teacher_action"]``; ``device`` is 'cpu', 'cuda' or 'auto'. Raises ConfigError, a ValueError, for presets, keys and values
-    that do not exist or fit, ValueError or MemoryError for impossible sizes, RuntimeError for a missing device. The rest is told at
-    ``uuvtai.env.VectorEnv``.
+    ``overrides`` maps dotted config keys to values, ``{"world.n_dynamic": 9}``; ``teacher`` is the behaviour
+    tree behind ``info["teacher_action"]``; ``device`` is 'cpu', 'cuda' or 'auto'. Raises ConfigError, a
+    ValueError, for presets, keys and values that do not exist or fit, ValueError or MemoryError for
+    impossible sizes, RuntimeError for a missing device. The rest is told at ``uuvtai.env.VectorEnv``.
     """
     from uuvtai.env import VectorEnv, checked_seed
     from uuvtai.loader import load_config
@@ -45,4 +47,6 @@ def make(
         raise TypeError(f"num_envs must be an int, got {num_envs!r}")
     checked_seed(seed)
     config = load_config(world, sensors, vehicle, overrides)
-    return VectorEnv(Sim(config, num_envs, read_tree(teacher, config.teacher.max_node), device), seed, check_actions)
+    return VectorEnv(
+        Sim(config, num_envs, read_tree(teacher, config.teacher.max_node), device), seed, check_actions
+    )

@@ -1,4 +1,5 @@
-"""Thruster geometry: which wrench each thruster gives, and the least-squares way back over the axes that the frame can command."""
+"""Thruster geometry: which wrench each thruster gives, and the least-squares way back over the axes that the
+frame can command."""
 
 from __future__ import annotations
 
@@ -11,11 +12,13 @@ _AXIS_ORDER = (0, 1, 2, 5, 3, 4)
 """Who comes first where a frame cannot command all axes: surge, sway, heave, yaw, then roll, then pitch."""
 
 _RANK_TOLERANCE = 0.02
-"""An axis whose lever over the axes before it is smaller than this (m, or 1 for forces) would ask for absurd thrusts: left out."""
+"""An axis whose lever over the axes before it is smaller than this (m, or 1 for forces) would ask for absurd
+thrusts: left out."""
 
 
 def allocation_matrices(vehicle_cfg: VehicleConfig) -> tuple[np.ndarray, np.ndarray]:
-    """(wrench_of_thrust (6, n), thrust_of_wrench (n, 6)), float64; columns of axes that cannot be commanded are zero.
+    """(wrench_of_thrust (6, n), thrust_of_wrench (n, 6)), float64; columns of axes that cannot be commanded
+    are zero.
 
     The 6-thruster frame cannot pitch: its moment about y is always -0.0725 F_x - 0.0025 F_z.
     """
@@ -23,7 +26,10 @@ def allocation_matrices(vehicle_cfg: VehicleConfig) -> tuple[np.ndarray, np.ndar
     direction = np.array([t.direction for t in vehicle_cfg.thrusters])
     lengths = np.linalg.norm(direction, axis=1, keepdims=True)
     if (lengths < 1e-6).any():
-        raise SettingError(f"vehicle.thrusters.{int(np.argmin(lengths))}.direction is zero: give the way positive thrust pushes")
+        raise SettingError(
+            f"vehicle.thrusters.{int(np.argmin(lengths))}.direction is zero: give the way positive thrust "
+            "pushes"
+        )
     direction = direction / lengths
     wrench_of_thrust = np.vstack([direction.T, np.cross(position, direction).T])
     axes = controllable_axes(wrench_of_thrust)

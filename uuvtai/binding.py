@@ -1,4 +1,5 @@
-"""Fills the bundles of the stages, once, by type: a kernel's ``io`` says what it reads and writes, and here it gets it."""
+"""Fills the bundles of the stages, once, by type: a kernel's ``io`` says what it reads and writes, and here
+it gets it."""
 
 from __future__ import annotations
 
@@ -17,8 +18,9 @@ _MARKED = re.compile(r"(?:In|Out|Const)\[(\w+)\]")
 def bind(bundle: type[_T], *sources: object, partial: bool = False) -> _T:
     """A bundle whose members are those parts of the sources that have their types.
 
-    ``sources`` are structs, config sections (searched with all their parts), bundles, and dataclasses of structs. Raises TypeError for a
-    member that two sources have, and for one that none has; where ``partial`` is set that one stays None, and what uses it cannot compile.
+    ``sources`` are structs, config sections (searched with all their parts), bundles, and dataclasses of
+    structs. Raises TypeError for a member that two sources have, and for one that none has; where ``partial``
+    is set that one stays None, and what uses it cannot compile.
     """
     parts = _parts_of(sources)
     if partial:
@@ -38,7 +40,9 @@ def members_of(bundle: type) -> dict[str, str]:
     for member in dataclasses.fields(bundle):  # type: ignore[arg-type]
         marked = _MARKED.fullmatch(str(member.type))
         if marked is None:
-            raise TypeError(f"{bundle.__name__}.{member.name}: {member.type} is none of In[..], Out[..] and Const[..]")
+            raise TypeError(
+                f"{bundle.__name__}.{member.name}: {member.type} is none of In[..], Out[..] and Const[..]"
+            )
         found[member.name] = marked.group(1)
     return found
 

@@ -1,8 +1,8 @@
 """The command line ``uuv``: parse, load the preset, call one function, print.
 
-Results go to stdout, progress and messages to stderr. Exit codes: 0 ok, 1 failed (a bug of ours, or the machine: a full disk), 2 refused,
-with what to type instead, 3 a gate was not met, 130 or 143 interrupted (SIGINT, SIGTERM). Heavy packages are imported inside the commands,
-so that ``uuv --help`` is quick.
+Results go to stdout, progress and messages to stderr. Exit codes: 0 ok, 1 failed (a bug of ours, or the
+machine: a full disk), 2 refused, with what to type instead, 3 a gate was not met, 130 or 143 interrupted
+(SIGINT, SIGTERM). Heavy packages are imported inside the commands, so that ``uuv --help`` is quick.
 """
 
 from __future__ import annotations
@@ -33,7 +33,9 @@ app = typer.Typer(
     epilog="Example: uuv eval --world gauntlet --episodes 16 --record 1",
 )
 log_app = typer.Typer(
-    help="Look into recorded episodes (MCAP).", no_args_is_help=True, epilog="Example: uuv log info runs/first/logs/bt_seed0_episode0.mcap"
+    help="Look into recorded episodes (MCAP).",
+    no_args_is_help=True,
+    epilog="Example: uuv log info runs/first/logs/bt_seed0_episode0.mcap",
 )
 app.add_typer(log_app, name="log")
 
@@ -42,7 +44,12 @@ _NAME = "NAME|FILE"
 
 World = Annotated[
     str,
-    typer.Option("--world", metavar=_NAME, help=f"World: {_WORLDS}, or a YAML file.", autocompletion=choices.presets("world")),
+    typer.Option(
+        "--world",
+        metavar=_NAME,
+        help=f"World: {_WORLDS}, or a YAML file.",
+        autocompletion=choices.presets("world"),
+    ),
 ]
 Sensors = Annotated[
     str | None,
@@ -70,19 +77,27 @@ Stack = Annotated[
     typer.Option(
         "--stack",
         metavar=_NAME,
-        help=f"How the classical half works: {choices.names('stack')} (as in the paper), or a YAML file \\[default: ours].",
+        help=f"How the classical half works: {choices.names('stack')} (as in the paper), or a YAML file "
+        "\\[default: ours].",
         autocompletion=choices.presets("stack"),
     ),
 ]
-Set = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a config key: key.sub=value (repeatable).")]
+Set = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Override a config key: key.sub=value (repeatable)."),
+]
 Device = Annotated[str, choices.device()]
-RunDir = Annotated[Path | None, typer.Option("--run-dir", help="The run's folder \\[default: runs/TIME_PRESET].")]
+RunDir = Annotated[
+    Path | None, typer.Option("--run-dir", help="The run's folder \\[default: runs/TIME_PRESET].")
+]
 WithReport = Annotated[bool, typer.Option("--report", help="Also write the run's report.html.")]
-Wide = Annotated[bool, typer.Option("--wide", help="Show every column of a table, though the terminal be narrower.")]
+Wide = Annotated[
+    bool, typer.Option("--wide", help="Show every column of a table, though the terminal be narrower.")
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else on stdout.")]
 
 
-# -------------------------------------------------------------------------------------------------------------------- eval
+# ------------------------------------------------------------------------------------------------------- eval
 
 
 @app.command("eval", epilog="Example: uuv eval best --world gauntlet -D 9 -v 1.5 --episodes 64 --seeds 7")
@@ -92,7 +107,8 @@ def evaluate(
         list[str] | None,
         typer.Argument(
             metavar="RUN",
-            help=f"Trained policies: run folders, checkpoint folders or shipped names ({choices.names('policy')}).",
+            help="Trained policies: run folders, checkpoint folders or shipped names "
+            f"({choices.names('policy')}).",
             autocompletion=choices.policies,
         ),
     ] = None,
@@ -102,9 +118,11 @@ def evaluate(
             "--controller",
             metavar="NAME|FILE",
             autocompletion=choices.controllers,
-            help="straight, planner, bt or a tree's XML (repeatable); paper = bt on the paper's own stack, a row of its own; "
+            help="straight, planner, bt or a tree's XML (repeatable); paper = bt on the paper's own stack, a "
+            "row of its own; "
             "none = policies alone \\[default: straight, planner, bt, beside a RUN bt]. "
-            "Privileged yardsticks: NAME+truth (a tree that knows where every moving body is), oracle (knows the future: an upper bound).",
+            "Privileged yardsticks: NAME+truth (a tree that knows where every moving body is), oracle (knows "
+            "the future: an upper bound).",
         ),
     ] = None,
     world: World = "pool",
@@ -116,19 +134,41 @@ def evaluate(
     n_static: Static = None,
     n_dynamic: Dynamic = None,
     speed: Speed = None,
-    num_envs: Annotated[int | None, typer.Option("--num-envs", help="Episodes played together \\[default: as many as sensible].")] = None,
-    record: Annotated[int, typer.Option("--record", help="Record the first K episodes of every method as MCAP with a picture.")] = 0,
-    video: Annotated[bool, typer.Option("--video", help="Also a top-down video of every recorded episode.")] = False,
-    depth_images: Annotated[bool, typer.Option("--depth-images", help="Also record the depth camera (2 Hz).")] = False,
+    num_envs: Annotated[
+        int | None,
+        typer.Option("--num-envs", help="Episodes played together \\[default: as many as sensible]."),
+    ] = None,
+    record: Annotated[
+        int,
+        typer.Option("--record", help="Record the first K episodes of every method as MCAP with a picture."),
+    ] = 0,
+    video: Annotated[
+        bool, typer.Option("--video", help="Also a top-down video of every recorded episode.")
+    ] = False,
+    depth_images: Annotated[
+        bool, typer.Option("--depth-images", help="Also record the depth camera (2 Hz).")
+    ] = False,
     explain: Annotated[
-        bool, typer.Option("--explain", help="Label the cause of every failure, judged from the truth: which sense or decision failed.")
+        bool,
+        typer.Option(
+            "--explain",
+            help="Label the cause of every failure, judged from the truth: which sense or decision failed.",
+        ),
     ] = False,
     explain_record: Annotated[
         int | None,
-        typer.Option("--explain-record", help="With --explain: log, picture, video of N of the worst failures per method \\[default: 3]."),
+        typer.Option(
+            "--explain-record",
+            help="With --explain: log, picture, video of N of the worst failures per method \\[default: 3].",
+        ),
     ] = None,
     resume: Annotated[
-        Path | None, typer.Option("--resume", help="Run folder of an interrupted evaluation to go on with.", autocompletion=choices.runs)
+        Path | None,
+        typer.Option(
+            "--resume",
+            help="Run folder of an interrupted evaluation to go on with.",
+            autocompletion=choices.runs,
+        ),
     ] = None,
     device: Device = "auto",
     overrides: Set = None,
@@ -153,7 +193,16 @@ def evaluate(
         if not explain:
             raise UsageError("--explain-record: give --explain too, it says which episodes to record")
     policies = runs or []
-    config = _config(world, sensors, vehicle, n_static, n_dynamic, speed, overrides, [*_policy_features(policies), *_stack(stack)])
+    config = _config(
+        world,
+        sensors,
+        vehicle,
+        n_static,
+        n_dynamic,
+        speed,
+        overrides,
+        [*_policy_features(policies), *_stack(stack)],
+    )
 
     from uuvtai.loader import sensors_of
     from uuvtai.measure.compare import Request, compare
@@ -179,7 +228,9 @@ def evaluate(
     _finish_evaluation(result, folder, as_json, wide, with_report)
 
 
-def _finish_evaluation(result: dict[str, Any], folder: Path, as_json: bool, wide: bool, with_report: bool) -> None:
+def _finish_evaluation(
+    result: dict[str, Any], folder: Path, as_json: bool, wide: bool, with_report: bool
+) -> None:
     _print_evaluation(result, folder, as_json, wide)
     if with_report:
         _say(f"report: {_write_report([folder], None).page}")
@@ -224,10 +275,14 @@ def _print_evaluation(result: dict[str, Any], folder: Path, as_json: bool, wide:
     _say(f"run folder: {folder}")
 
 
-# ------------------------------------------------------------------------------------------------------------------- train
+# ------------------------------------------------------------------------------------------------------ train
 
 
-@app.command("train", epilog="Example: uuv train curriculum --iterations 20 --set ppo.learning_rate=0.0005 --run-dir runs/first")
+@app.command(
+    "train",
+    epilog="Example: uuv train curriculum --iterations 20 --set ppo.learning_rate=0.0005 --run-dir "
+    "runs/first",
+)
 def train_policy(
     preset: Annotated[
         str | None,
@@ -239,14 +294,23 @@ def train_policy(
     ] = None,
     resume: Annotated[
         Path | None,
-        typer.Option("--resume", help="Run folder to go on with, with its own config.", autocompletion=choices.runs),
+        typer.Option(
+            "--resume", help="Run folder to go on with, with its own config.", autocompletion=choices.runs
+        ),
     ] = None,
     iterations: Annotated[
         int | None,
-        typer.Option("--iterations", help="Stop when so many are done in all; schedules run over train.iterations in any case."),
+        typer.Option(
+            "--iterations",
+            help="Stop when so many are done in all; schedules run over train.iterations in any case.",
+        ),
     ] = None,
-    num_envs: Annotated[int | None, typer.Option("--num-envs", help="Envs stepped together (train.num_envs).")] = None,
-    seed: Annotated[int | None, typer.Option("--seed", help="Seed of networks, exploration and scenarios (train.seed).")] = None,
+    num_envs: Annotated[
+        int | None, typer.Option("--num-envs", help="Envs stepped together (train.num_envs).")
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option("--seed", help="Seed of networks, exploration and scenarios (train.seed).")
+    ] = None,
     world: Annotated[
         str | None,
         typer.Option(
@@ -281,16 +345,30 @@ def train_policy(
     from uuvtai.show.dashboard import TrainingProgress
 
     if resume is None:
-        sizes = [(f"train.{key}", value) for key, value in (("num_envs", num_envs), ("seed", seed)) if value is not None]
+        sizes = [
+            (f"train.{key}", value)
+            for key, value in (("num_envs", num_envs), ("seed", seed))
+            if value is not None
+        ]
         chosen = preset or "best"
         typed = [*sizes, *_stack(stack), *_scene_flags(n_static, n_dynamic, speed), *(overrides or [])]
         config = load_training(chosen, typed, world, sensors)
-        request = TrainRequest(config=config, preset=chosen, iterations=iterations, device=device, run_dir=run_dir)
+        request = TrainRequest(
+            config=config, preset=chosen, iterations=iterations, device=device, run_dir=run_dir
+        )
     else:
-        given = {"PRESET": preset, "--num-envs": num_envs, "--seed": seed, "--world": world, "--sensors": sensors}
+        given = {
+            "PRESET": preset,
+            "--num-envs": num_envs,
+            "--seed": seed,
+            "--world": world,
+            "--sensors": sensors,
+        }
         given |= {"--stack": stack, "-S": n_static, "-D": n_dynamic, "-v": speed, "--run-dir": run_dir}
         _refuse_beside_resume(given)
-        request = TrainRequest(resume=resume, overrides=list(overrides or []), iterations=iterations, device=device)
+        request = TrainRequest(
+            resume=resume, overrides=list(overrides or []), iterations=iterations, device=device
+        )
     result, folder = train(request, TrainingProgress())
     if with_report:
         _say(f"report: {_write_report([folder], None).page}")
@@ -301,7 +379,10 @@ def train_policy(
 def _refuse_beside_resume(given: dict[str, Any]) -> None:
     for option, value in given.items():
         if value is not None:
-            raise UsageError(f"{option} {value}: a resumed run keeps its own; leave it out, or begin a new run without --resume")
+            raise UsageError(
+                f"{option} {value}: a resumed run keeps its own; leave it out, or begin a new run without "
+                "--resume"
+            )
 
 
 def _refuse_all_beside_resume(ctx: typer.Context, allowed: tuple[str, ...]) -> None:
@@ -310,10 +391,12 @@ def _refuse_all_beside_resume(ctx: typer.Context, allowed: tuple[str, ...]) -> N
         name = parameter.name or ""
         source = ctx.get_parameter_source(name)
         if name not in ("resume", *allowed) and source is not None and source.name == "COMMANDLINE":
-            _refuse_beside_resume({parameter.opts[0] if parameter.param_type_name == "option" else "RUN": ctx.params[name]})
+            _refuse_beside_resume(
+                {parameter.opts[0] if parameter.param_type_name == "option" else "RUN": ctx.params[name]}
+            )
 
 
-# ---------------------------------------------------------------------------------------------------------------- simulate
+# --------------------------------------------------------------------------------------------------- simulate
 
 
 @app.command(epilog="Example: uuv simulate --seconds 5 --wrench 10,0,0,0,0,0 --vehicle bluerov2_heavy")
@@ -321,19 +404,35 @@ def simulate(
     seconds: Annotated[float, typer.Option("--seconds", help="Duration \\[s].")],
     vehicle: Annotated[
         str,
-        typer.Option("--vehicle", metavar=_NAME, help=f"Vehicle: {_VEHICLES}, or a YAML file.", autocompletion=choices.presets("vehicle")),
+        typer.Option(
+            "--vehicle",
+            metavar=_NAME,
+            help=f"Vehicle: {_VEHICLES}, or a YAML file.",
+            autocompletion=choices.presets("vehicle"),
+        ),
     ] = "bluerov2",
     attitude_hold: Annotated[
         str | None,
-        choices.choice("--attitude-hold", ("ideal", "thrusters", "none"), "What holds roll and pitch \\[default: the vehicle's own]."),
+        choices.choice(
+            "--attitude-hold",
+            ("ideal", "thrusters", "none"),
+            "What holds roll and pitch \\[default: the vehicle's own].",
+        ),
     ] = None,
-    wrench: Annotated[str | None, typer.Option("--wrench", help="Constant body wrench fx,fy,fz,mx,my,mz [N, N m].")] = None,
+    wrench: Annotated[
+        str | None, typer.Option("--wrench", help="Constant body wrench fx,fy,fz,mx,my,mz [N, N m].")
+    ] = None,
     command: Annotated[
-        str | None, typer.Option("--command", help="Body velocity command u,v,w,r \\[m/s, rad/s] for the inner loop.")
+        str | None,
+        typer.Option("--command", help="Body velocity command u,v,w,r \\[m/s, rad/s] for the inner loop."),
     ] = None,
     current: Annotated[str | None, typer.Option("--current", help="Water velocity x,y,z \\[m/s].")] = None,
-    initial_rpy_deg: Annotated[str | None, typer.Option("--initial-rpy-deg", help="Roll, pitch, yaw \\[deg].")] = None,
-    initial_velocity: Annotated[str | None, typer.Option("--initial-velocity", help="u,v,w,p,q,r \\[m/s, rad/s].")] = None,
+    initial_rpy_deg: Annotated[
+        str | None, typer.Option("--initial-rpy-deg", help="Roll, pitch, yaw \\[deg].")
+    ] = None,
+    initial_velocity: Annotated[
+        str | None, typer.Option("--initial-velocity", help="u,v,w,p,q,r \\[m/s, rad/s].")
+    ] = None,
     neutral: Annotated[bool, typer.Option("--neutral", help="Buoyancy equal to weight.")] = False,
     dt: Annotated[float, typer.Option("--dt", help="Dynamics substep \\[s].")] = 0.01,
     overrides: Set = None,
@@ -365,13 +464,16 @@ def simulate(
     show_simulation(Screen(wide), result, f"{vehicle}: {seconds:g} s, substep {dt:g} s")
 
 
-# ------------------------------------------------------------------------------------------------------------------- sweep
+# ------------------------------------------------------------------------------------------------------ sweep
 
 
 @app.command(epilog="Example: uuv sweep best --grid D=0,6 --grid v=0.4,1.5 --episodes 16 --workers 2")
 def sweep(
     runs: Annotated[
-        list[str] | None, typer.Argument(metavar="[RUN]...", help="Trained policies, as for eval.", autocompletion=choices.policies)
+        list[str] | None,
+        typer.Argument(
+            metavar="[RUN]...", help="Trained policies, as for eval.", autocompletion=choices.policies
+        ),
     ] = None,
     controller: Annotated[
         list[str] | None,
@@ -401,12 +503,21 @@ def sweep(
     speed: Speed = None,
     episodes: Annotated[int, typer.Option("--episodes", help="Episodes per seed, cell and method.")] = 64,
     seeds: Annotated[str, typer.Option("--seeds", "--seed", help="Seeds, separated by commas.")] = "0",
-    num_envs: Annotated[int | None, typer.Option("--num-envs", help="Episodes played together \\[default: as many as sensible].")] = None,
-    engine: Annotated[str, choices.choice("--engine", ("local", "ray"), "Who works: processes on this machine, or a cluster.")] = "local",
+    num_envs: Annotated[
+        int | None,
+        typer.Option("--num-envs", help="Episodes played together \\[default: as many as sensible]."),
+    ] = None,
+    engine: Annotated[
+        str,
+        choices.choice("--engine", ("local", "ray"), "Who works: processes on this machine, or a cluster."),
+    ] = "local",
     workers: Annotated[int, typer.Option("--workers", help="Processes of the local engine.")] = 1,
-    address: Annotated[str, typer.Option("--address", help="Ray cluster: host:port, auto, or local (inside this process).")] = "auto",
+    address: Annotated[
+        str, typer.Option("--address", help="Ray cluster: host:port, auto, or local (inside this process).")
+    ] = "auto",
     resume: Annotated[
-        Path | None, typer.Option("--resume", help="Run folder of a sweep to go on with.", autocompletion=choices.runs)
+        Path | None,
+        typer.Option("--resume", help="Run folder of a sweep to go on with.", autocompletion=choices.runs),
     ] = None,
     device: Device = "auto",
     with_report: WithReport = False,
@@ -424,8 +535,22 @@ def sweep(
     _at_least("--episodes", episodes, 1)
     _at_least("--workers", workers, 1)
     if resume is not None:
-        given = {"RUN": runs, "--controller": controller, "--grid": grid, "--set": overrides, "--run-dir": run_dir, "--num-envs": num_envs}
-        given |= {"--sensors": sensors, "--vehicle": vehicle, "--stack": stack, "-S": n_static, "-D": n_dynamic, "-v": speed}
+        given = {
+            "RUN": runs,
+            "--controller": controller,
+            "--grid": grid,
+            "--set": overrides,
+            "--run-dir": run_dir,
+            "--num-envs": num_envs,
+        }
+        given |= {
+            "--sensors": sensors,
+            "--vehicle": vehicle,
+            "--stack": stack,
+            "-S": n_static,
+            "-D": n_dynamic,
+            "-v": speed,
+        }
         _refuse_beside_resume(given)
         result, folder = go_on(resume, _engine(engine, workers, address), _Progress("cells"))
     else:
@@ -461,12 +586,14 @@ def _engine(name: str, workers: int, address: str) -> Any:
     return LocalEngine(workers) if name == "local" else RayEngine(address)
 
 
-# ----------------------------------------------------------------------------------------------------------------- profile
+# ---------------------------------------------------------------------------------------------------- profile
 
 
 @app.command(epilog="Example: uuv profile --num-envs 1,64 --seconds 5")
 def profile(
-    num_envs: Annotated[str, typer.Option("--num-envs", help="Batch sizes, separated by commas.")] = "1,64,1024",
+    num_envs: Annotated[
+        str, typer.Option("--num-envs", help="Batch sizes, separated by commas.")
+    ] = "1,64,1024",
     controller: Annotated[
         str,
         typer.Option(
@@ -498,14 +625,20 @@ def profile(
     wide: Wide = False,
     as_json: AsJson = False,
 ) -> None:
-    """Time per stage, env-steps per second (simulated, with inference, with training), memory, and the paper's timing tables."""
+    """Time per stage, env-steps per second (simulated, with inference, with training), memory, and the
+    paper's timing tables."""
     sizes = [_integer("--num-envs", text) for text in num_envs.split(",")]
     if not math.isfinite(seconds) or seconds <= 0:
         raise UsageError(f"--seconds {seconds}: must be a positive number, for example --seconds 10")
     from uuvtai.loader import load_training
     from uuvtai.measure.profiling import profile as run
 
-    config = load_training(preset, [*_stack(stack), *_scene_flags(n_static, n_dynamic, speed), *(overrides or [])], world, sensors)
+    config = load_training(
+        preset,
+        [*_stack(stack), *_scene_flags(n_static, n_dynamic, speed), *(overrides or [])],
+        world,
+        sensors,
+    )
 
     result = run(config, sizes, controller, device, seconds, density, _say)
     if as_json:
@@ -516,14 +649,20 @@ def profile(
     show_profile(Screen(wide), result)
 
 
-# --------------------------------------------------------------------------------------------------------------- reproduce
+# -------------------------------------------------------------------------------------------------- reproduce
 
 
 @app.command(epilog="Example: uuv reproduce --budget quick --run-dir runs/reproduction")
 def reproduce(
-    budget: Annotated[str, choices.choice("--budget", ("quick", "full"), "How much: half an hour on two cores, or overnight.")] = "quick",
+    budget: Annotated[
+        str,
+        choices.choice("--budget", ("quick", "full"), "How much: half an hour on two cores, or overnight."),
+    ] = "quick",
     resume: Annotated[
-        Path | None, typer.Option("--resume", help="Run folder of a reproduction to go on with.", autocompletion=choices.runs)
+        Path | None,
+        typer.Option(
+            "--resume", help="Run folder of a reproduction to go on with.", autocompletion=choices.runs
+        ),
     ] = None,
     run_dir: RunDir = None,
     wide: Wide = False,
@@ -547,22 +686,32 @@ def reproduce(
     _say(f"run folder: {folder}")
 
 
-# ------------------------------------------------------------------------------------------------------------------ report
+# ----------------------------------------------------------------------------------------------------- report
 
 
 @app.command("report", epilog="Example: uuv report runs/first")
 def report_run(
     runs: Annotated[
-        list[Path], typer.Argument(metavar="RUN...", help="Run folders; several make one page: trainings are compared, the rest follows.")
+        list[Path],
+        typer.Argument(
+            metavar="RUN...",
+            help="Run folders; several make one page: trainings are compared, the rest follows.",
+        ),
     ],
-    out: Annotated[Path | None, typer.Option("--out", help="The page \\[default: RUN/report.html]; figures/ is made beside it.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="The page \\[default: RUN/report.html]; figures/ is made beside it."),
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace files that are there already.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write one self-contained HTML page of a run: tables, figures, pictures, videos, and where they come from."""
+    """Write one self-contained HTML page of a run: tables, figures, pictures, videos, and where they come
+    from."""
     written = _write_report(runs, out, force)
     if as_json:
-        _print_json({"schema": 1, "report": str(written.page), "figures": [str(path) for path in written.figures]})
+        _print_json(
+            {"schema": 1, "report": str(written.page), "figures": [str(path) for path in written.figures]}
+        )
     else:
         typer.echo(str(written.page))
 
@@ -573,26 +722,40 @@ def _write_report(runs: list[Path], out: Path | None, force: bool = False) -> An
     return report(runs, out, force)
 
 
-# ------------------------------------------------------------------------------------------------------------------ export
+# ----------------------------------------------------------------------------------------------------- export
 
 
 @app.command("export", epilog="Example: uuv export best --out runs/best_export")
 def export_policy(
     run: Annotated[
         str | None,
-        typer.Argument(metavar="[RUN]", help="Run folder, checkpoint folder or shipped name (best).", autocompletion=choices.policies),
+        typer.Argument(
+            metavar="[RUN]",
+            help="Run folder, checkpoint folder or shipped name (best).",
+            autocompletion=choices.policies,
+        ),
     ] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="New folder \\[default: runs/NAME_export].")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="New folder \\[default: runs/NAME_export].")
+    ] = None,
     evaluation: Annotated[
         list[Path] | None,
-        typer.Option("--evaluation", help="Run folder of 'uuv eval RUN': counts for the model card (repeatable)."),
+        typer.Option(
+            "--evaluation", help="Run folder of 'uuv eval RUN': counts for the model card (repeatable)."
+        ),
     ] = None,
-    check: Annotated[Path | None, typer.Option("--check", help="Verify an exported folder instead: sha256 and golden pairs.")] = None,
+    check: Annotated[
+        Path | None,
+        typer.Option("--check", help="Verify an exported folder instead: sha256 and golden pairs."),
+    ] = None,
     wide: Wide = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace the exported policy that --out names.")] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace the exported policy that --out names.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write a policy that drives without uuvtai (NumPy alone, or ONNX), or check such a folder. Exit code 3: it disagrees."""
+    """Write a policy that drives without uuvtai (NumPy alone, or ONNX), or check such a folder. Exit code 3:
+    it disagrees."""
     if (run is None) == (check is None):
         raise UsageError("give the RUN to export, or --check DIR for a folder that was exported")
     from uuvtai.deploy import export as deploy
@@ -605,7 +768,9 @@ def export_policy(
         assert run is not None
         checkpoint = find_policy(run, _say)
         name = policy_name(run, checkpoint)
-        found = deploy.export(checkpoint, name, out or Path("runs") / f"{name}_export", evaluation or [], _say, force)
+        found = deploy.export(
+            checkpoint, name, out or Path("runs") / f"{name}_export", evaluation or [], _say, force
+        )
     if as_json:
         _print_json(found.document())
     else:
@@ -622,13 +787,18 @@ def _print_export(found: Any, wide: bool) -> None:
     show_export(Screen(wide), found)
 
 
-# --------------------------------------------------------------------------------------------------------- presets, doctor
+# -------------------------------------------------------------------------------------------- presets, doctor
 
 
 @app.command(epilog="Example: uuv presets show gauntlet")
 def presets(
     action: Annotated[
-        str | None, typer.Argument(metavar="show", help="'show' to print one preset as it is written.", autocompletion=lambda: ["show"])
+        str | None,
+        typer.Argument(
+            metavar="show",
+            help="'show' to print one preset as it is written.",
+            autocompletion=lambda: ["show"],
+        ),
     ] = None,
     name: Annotated[
         str | None,
@@ -639,7 +809,11 @@ def presets(
         ),
     ] = None,
     everything: Annotated[
-        bool, typer.Option("--all", help="With show: every key that the preset gives, its own, those it builds on, and the defaults.")
+        bool,
+        typer.Option(
+            "--all",
+            help="With show: every key that the preset gives, its own, those it builds on, and the defaults.",
+        ),
     ] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -696,7 +870,8 @@ def _print_resolved(kind: str, name: str, as_json: bool) -> None:
 
 
 def _preset_kind(name: str) -> tuple[str, str]:
-    """(kind, name) of 'NAME' or 'KIND/NAME'; a path is taken for a world's. UsageError for a name that no kind has."""
+    """(kind, name) of 'NAME' or 'KIND/NAME'; a path is taken for a world's. UsageError for a name that no
+    kind has."""
     from uuvtai.show.presets import near
 
     kind, slash, rest = name.partition("/")
@@ -742,14 +917,18 @@ def doctor(as_json: AsJson = False) -> None:
         raise typer.Exit(FAILED)
 
 
-# -------------------------------------------------------------------------------------------------------------- tree, log
+# -------------------------------------------------------------------------------------------------- tree, log
 
 
 @app.command(epilog="Example: uuv tree --controller planner --dot")
 def tree(
     run: Annotated[
         Path | None,
-        typer.Argument(metavar="RUN", help="Run folder of an evaluation; without one, the tree alone.", autocompletion=choices.evaluations),
+        typer.Argument(
+            metavar="RUN",
+            help="Run folder of an evaluation; without one, the tree alone.",
+            autocompletion=choices.evaluations,
+        ),
     ] = None,
     controller: Annotated[
         str,
@@ -797,15 +976,24 @@ def log_info(file: LogFile, wide: Wide = False, as_json: AsJson = False) -> None
 
     show_log(Screen(wide), found, file)
     if found["converted_from"]:
-        typer.echo(f"output of uuv log convert (protobuf); for every other command use {plain(found['converted_from'])}")
+        typer.echo(
+            "output of uuv log convert (protobuf); for every other command use "
+            f"{plain(found['converted_from'])}"
+        )
 
 
-@log_app.command("export", epilog="Example: uuv log export runs/first/logs/bt_seed0_episode0.mcap --out exported")
+@log_app.command(
+    "export", epilog="Example: uuv log export runs/first/logs/bt_seed0_episode0.mcap --out exported"
+)
 def log_export(
     file: LogFile,
     out: Annotated[Path, typer.Option("--out", help="New or empty folder for the exported files.")],
-    topic: Annotated[list[str] | None, typer.Option("--topic", help="Only these topics (repeatable).")] = None,
-    fmt: Annotated[str, typer.Option("--format", help="json (a line a message), csv or npz (NumPy arrays).")] = "json",
+    topic: Annotated[
+        list[str] | None, typer.Option("--topic", help="Only these topics (repeatable).")
+    ] = None,
+    fmt: Annotated[
+        str, typer.Option("--format", help="json (a line a message), csv or npz (NumPy arrays).")
+    ] = "json",
 ) -> None:
     """Write every topic as a file, and the attachments below attachments/."""
     from uuvtai.logs import log_export
@@ -817,7 +1005,9 @@ def log_export(
 @log_app.command("repair", epilog="Example: uuv log repair runs/first/logs/bt_seed0_episode0.mcap")
 def log_repair(
     file: LogFile,
-    out: Annotated[Path | None, typer.Option("--out", help="Repaired file \\[default: NAME.repaired.mcap].")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Repaired file \\[default: NAME.repaired.mcap].")
+    ] = None,
     force: Force = False,
 ) -> None:
     """Recover the messages of a log whose writing was cut off."""
@@ -832,10 +1022,13 @@ def log_repair(
 @log_app.command("convert", epilog="Example: uuv log convert runs/first/logs/bt_seed0_episode0.mcap")
 def log_convert(
     file: LogFile,
-    out: Annotated[Path | None, typer.Option("--out", help="New file \\[default: NAME.protobuf.mcap].")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="New file \\[default: NAME.protobuf.mcap].")
+    ] = None,
     force: Force = False,
 ) -> None:
-    """Write a log with protobuf messages and point clouds, for Rerun and other viewers that do not read JSON."""
+    """Write a log with protobuf messages and point clouds, for Rerun and other viewers that do not read
+    JSON."""
     from uuvtai.logs import convert
 
     target = out or file.with_suffix(".protobuf.mcap")
@@ -846,11 +1039,19 @@ def log_convert(
 def log_video(
     file: LogFile,
     out: Annotated[
-        Path | None, typer.Option("--out", help="Its ending says the format: .webm, .mp4 or .gif \\[default: the log's name, .webm].")
+        Path | None,
+        typer.Option(
+            "--out",
+            help="Its ending says the format: .webm, .mp4 or .gif \\[default: the log's name, .webm].",
+        ),
     ] = None,
     speed: Annotated[float, typer.Option("--speed", help="Times as fast as it was.")] = 1.0,
-    fps: Annotated[float | None, typer.Option("--fps", help="Frames per second \\[default: 15, GIF 10].")] = None,
-    width: Annotated[int | None, typer.Option("--width", help="Width \\[px] \\[default: 1280, GIF 800].")] = None,
+    fps: Annotated[
+        float | None, typer.Option("--fps", help="Frames per second \\[default: 15, GIF 10].")
+    ] = None,
+    width: Annotated[
+        int | None, typer.Option("--width", help="Width \\[px] \\[default: 1280, GIF 800].")
+    ] = None,
     force: Force = False,
 ) -> None:
     """Render a top-down video of a recorded episode as WebM, MP4 or GIF."""
@@ -877,7 +1078,11 @@ def log_video(
 def log_picture(
     file: Annotated[list[Path], typer.Argument(help="Logs of the same episode; trajectories are overlaid.")],
     out: Annotated[
-        Path | None, typer.Option("--out", help="Its ending says the format: .png, .pdf or .svg \\[default: the first log's name, .png].")
+        Path | None,
+        typer.Option(
+            "--out",
+            help="Its ending says the format: .png, .pdf or .svg \\[default: the first log's name, .png].",
+        ),
     ] = None,
     clearance: Annotated[bool, typer.Option("--clearance", help="Colour the clearance field.")] = False,
     force: Force = False,
@@ -892,14 +1097,16 @@ def log_picture(
     typer.echo(str(target))
 
 
-# ------------------------------------------------------------------------------------------------------- parsing and output
+# ----------------------------------------------------------------------------------------- parsing and output
 
 
 def _config(world, sensors, vehicle, n_static, n_dynamic, speed, overrides, first=()):
     """Config of presets, then ``first``, then -S -D -v, then --set."""
     from uuvtai.loader import load_config
 
-    return load_config(world, sensors, vehicle, [*first, *_scene_flags(n_static, n_dynamic, speed), *(overrides or [])])
+    return load_config(
+        world, sensors, vehicle, [*first, *_scene_flags(n_static, n_dynamic, speed), *(overrides or [])]
+    )
 
 
 def _scene_flags(n_static: int | None, n_dynamic: int | None, speed: float | None) -> list[tuple[str, Any]]:
@@ -919,7 +1126,9 @@ def _integer(option: str, text: str) -> int:
     try:
         value = int(text)
     except ValueError:
-        raise UsageError(f"{option} {text!r}: whole numbers separated by commas, for example {option} 0,1,2") from None
+        raise UsageError(
+            f"{option} {text!r}: whole numbers separated by commas, for example {option} 0,1,2"
+        ) from None
     if not -(2**31) <= value < 2**31:
         raise UsageError(f"{option} {text}: must fit 32 bits")
     return value
@@ -933,7 +1142,9 @@ def _numbers(option: str, text: str | None, count: int) -> list[float] | None:
     except ValueError:
         values = []
     if len(values) != count or not all(math.isfinite(value) for value in values):
-        raise UsageError(f"{option} {text!r}: give {count} finite numbers separated by commas, without spaces")
+        raise UsageError(
+            f"{option} {text!r}: give {count} finite numbers separated by commas, without spaces"
+        )
     return values
 
 
@@ -950,13 +1161,23 @@ _Progress = Progress
 
 
 @app.callback(invoke_without_command=True)
-def _root(ctx: typer.Context, version: Annotated[bool, typer.Option("--version", help="Print the version and leave.")] = False) -> None:
+def _root(
+    ctx: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Print the version and leave.")] = False,
+) -> None:
     if version:
         typer.echo(__version__)
         raise typer.Exit
-    if ctx.invoked_subcommand in ("report", "export", "log", "doctor"):  # others have nothing to tidy up before they have a run folder
+    if ctx.invoked_subcommand in (
+        "report",
+        "export",
+        "log",
+        "doctor",
+    ):  # others have nothing to tidy up before they have a run folder
         signals.engage()
-    gc.set_threshold(50_000, 50, 1000)  # building kernels makes millions of objects, few of them garbage: half a second of a start
+    gc.set_threshold(
+        50_000, 50, 1000
+    )  # building kernels makes millions of objects, few of them garbage: half a second of a start
 
 
 def main(arguments: list[str] | None = None) -> None:

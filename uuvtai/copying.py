@@ -21,7 +21,9 @@ _TORCH_DTYPE = {
 def copied_rows(field: ti.Field, chosen: torch.Tensor) -> np.ndarray:
     """Host copy of the rows ``chosen`` (int32, on the field's device), shape (len(chosen), ...)."""
     inner = (field.n,) if hasattr(field, "n") else ()
-    out = torch.empty((len(chosen), *field.shape[1:], *inner), dtype=_TORCH_DTYPE[field.dtype], device=chosen.device)
+    out = torch.empty(
+        (len(chosen), *field.shape[1:], *inner), dtype=_TORCH_DTYPE[field.dtype], device=chosen.device
+    )
     copy_rows(field, chosen, out)
     return out.cpu().numpy()
 

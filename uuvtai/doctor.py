@@ -53,7 +53,10 @@ def _taichi() -> str:
     field.fill(2.0)
     if float(field.to_numpy().sum()) != 32.0:
         raise RuntimeError("a kernel gave a wrong sum; reinstall taichi")
-    return f"{'.'.join(map(str, ti.__version__))}, {runtime.device}, {os.environ.get('UUV_NUM_THREADS', os.cpu_count())} threads"
+    return (
+        f"{'.'.join(map(str, ti.__version__))}, {runtime.device}, "
+        f"{os.environ.get('UUV_NUM_THREADS', os.cpu_count())} threads"
+    )
 
 
 def _torch() -> str:
@@ -101,7 +104,11 @@ def _mcap() -> str:
 def _cuda() -> str:
     import torch
 
-    return torch.cuda.get_device_name(0) if torch.cuda.is_available() else "no CUDA device: everything runs on the CPU"
+    return (
+        torch.cuda.get_device_name(0)
+        if torch.cuda.is_available()
+        else "no CUDA device: everything runs on the CPU"
+    )
 
 
 def _cache() -> str:
@@ -111,7 +118,9 @@ def _cache() -> str:
 
     path = Path(default_cfg().offline_cache_file_path)
     for lock in stale_locks():
-        raise RuntimeError(f"{lock} was left by a process that was killed, so every run compiles again; delete this file")
+        raise RuntimeError(
+            f"{lock} was left by a process that was killed, so every run compiles again; delete this file"
+        )
     size = sum(f.stat().st_size for f in path.rglob("*") if f.is_file()) if path.exists() else 0
     return f"{path}, {size / 2**20:.1f} MB (empty = the next run compiles for about a minute)"
 

@@ -22,7 +22,20 @@ OK, FAILED, USAGE, GATE, INTERRUPTED = 0, 1, 2, 3, 130
 UsageError: Any = typer.BadParameter.__base__
 """Typer carries its own copy of click from 0.26 on, so the class is taken from what Typer exports."""
 
-_SYSTEM_NAMES = ("ENOSPC", "EDQUOT", "EFBIG", "EIO", "EROFS", "EMFILE", "ENFILE", "ENOMEM", "EAGAIN", "EACCES", "EPERM", "ESTALE")
+_SYSTEM_NAMES = (
+    "ENOSPC",
+    "EDQUOT",
+    "EFBIG",
+    "EIO",
+    "EROFS",
+    "EMFILE",
+    "ENFILE",
+    "ENOMEM",
+    "EAGAIN",
+    "EACCES",
+    "EPERM",
+    "ESTALE",
+)
 _SYSTEM = tuple(getattr(errno, name) for name in _SYSTEM_NAMES if hasattr(errno, name))
 """what the system may refuse at any moment, whatever was typed and however right the program is"""
 
@@ -76,15 +89,25 @@ def _ended_by(error: BaseException) -> int:
         _settle_output()
         return told(f"uuv: {_one_line(error)}; make room, or choose another place", FAILED)
     if _is_out_of_memory(error):
-        return told(f"uuv: out of memory ({_one_line(error) or 'no more is known'}); try a smaller --num-envs", FAILED)
+        return told(
+            f"uuv: out of memory ({_one_line(error) or 'no more is known'}); try a smaller --num-envs", FAILED
+        )
     if isinstance(error, SystemExit):
-        return error.code if isinstance(error.code, int) else OK if error.code is None else told(str(error.code), FAILED)
+        return (
+            error.code
+            if isinstance(error.code, int)
+            else OK
+            if error.code is None
+            else told(str(error.code), FAILED)
+        )
     return _bug(error)
 
 
 def _is_out_of_memory(error: BaseException) -> bool:
     """Python's own, and torch's on a GPU and on a CPU, without importing torch."""
-    is_told = isinstance(error, RuntimeError) and ("can't allocate memory" in str(error) or "not enough memory" in str(error))
+    is_told = isinstance(error, RuntimeError) and (
+        "can't allocate memory" in str(error) or "not enough memory" in str(error)
+    )
     return isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError" or is_told
 
 
@@ -110,7 +133,9 @@ def _bug(error: BaseException) -> int:
         with os.fdopen(handle, "w", encoding="utf-8", errors="backslashreplace") as file:
             file.write(about + told_by)
     except OSError as reason:
-        return told(f"{what}; its traceback could not be kept ({reason.strerror}): UUV_DEBUG=1 shows it", FAILED)
+        return told(
+            f"{what}; its traceback could not be kept ({reason.strerror}): UUV_DEBUG=1 shows it", FAILED
+        )
     return told(f"{what}; please report it with {name}", FAILED)
 
 
@@ -120,7 +145,8 @@ def _one_line(error: BaseException) -> str:
 
 
 def _flush() -> None:
-    """See the results out while an error can still be told; Python's own flush at the very end prints tracebacks."""
+    """See the results out while an error can still be told; Python's own flush at the very end prints
+    tracebacks."""
     if sys.stdout is not None:
         sys.stdout.flush()
 

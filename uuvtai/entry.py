@@ -1,4 +1,5 @@
-"""What ``uuv`` runs first: signals are heard and the standard streams are there before anything that takes time is imported."""
+"""What ``uuv`` runs first: signals are heard and the standard streams are there before anything that takes
+time is imported."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ def main() -> None:
 
 
 def _fill_streams() -> None:
-    """Put the null device where a standard stream was closed (``>&-``): else the next file opened would get its number, and its text."""
+    """Put the null device where a standard stream was closed (``>&-``): else the next file opened would get
+    its number, and its text."""
     import os
     import sys
 

@@ -1,7 +1,8 @@
-"""Vectorised environment on top of the simulator: reset and step, automatic resets, the table of the observation.
+"""Vectorised environment on top of the simulator: reset and step, automatic resets, the table of the
+observation.
 
-Every tensor is torch's own memory, written by the kernels: nothing is copied, and the same tensors come back from every call. Clone what
-must outlive the next ``step`` or ``reset``.
+Every tensor is torch's own memory, written by the kernels: nothing is copied, and the same tensors come back
+from every call. Clone what must outlive the next ``step`` or ``reset``.
 """
 
 from __future__ import annotations
@@ -46,19 +47,25 @@ class ObservationColumn:
 
 
 def observation_sha256(table: tuple[ObservationColumn, ...]) -> str:
-    """Fingerprint of names, widths, units and frames in their order: policies of another one cannot read this observation."""
-    rows = [(column.name, column.slice.stop - column.slice.start, column.unit, column.frame) for column in table]
+    """Fingerprint of names, widths, units and frames in their order: policies of another one cannot read this
+    observation."""
+    rows = [
+        (column.name, column.slice.stop - column.slice.start, column.unit, column.frame) for column in table
+    ]
     return hashlib.sha256(json.dumps(rows).encode()).hexdigest()
 
 
 class VectorEnv:
-    """``num_envs`` episodes side by side; an env whose episode ends begins its next one in the same step (``autoreset``).
+    """``num_envs`` episodes side by side; an env whose episode ends begins its next one in the same step
+    (``autoreset``).
 
-    Env i plays the episodes i, i + num_envs, i + 2 num_envs, ... of its seed, the same scenarios whatever is done in them. Actions are
-    float32 (num_envs, 4): surge, sway, heave, yaw rate in parts of the vehicle's limits, body frame; beyond [-1, 1] they are clamped.
-    Observations are float32 (num_envs, num_obs) in raw SI units, as ``observation_table`` says: scaling is the policy's business.
+    Env i plays the episodes i, i + num_envs, i + 2 num_envs, ... of its seed, the same scenarios whatever is
+    done in them. Actions are float32 (num_envs, 4): surge, sway, heave, yaw rate in parts of the vehicle's
+    limits, body frame; beyond [-1, 1] they are clamped. Observations are float32 (num_envs, num_obs) in raw
+    SI units, as ``observation_table`` says: scaling is the policy's business.
 
-    ``sim`` may be shared, for example with an evaluation: whoever else has reset it, call ``reset`` before the next ``step``.
+    ``sim`` may be shared, for example with an evaluation: whoever else has reset it, call ``reset`` before
+    the next ``step``.
     """
 
     outcomes = OUTCOMES
@@ -66,17 +73,22 @@ class VectorEnv:
     reward_terms = TERMS
     """names of the columns of ``info["reward_terms"]`` and ``info["episode_terms"]``"""
 
-    def __init__(self, sim: Sim, seed: int = 0, check_actions: bool | None = None, autoreset: bool = True) -> None:
-        """``check_actions``: refuse actions that are not finite (default: on the CPU; a GPU would wait). Unchecked, NaN = stop.
+    def __init__(
+        self, sim: Sim, seed: int = 0, check_actions: bool | None = None, autoreset: bool = True
+    ) -> None:
+        """``check_actions``: refuse actions that are not finite (default: on the CPU; a GPU would wait).
+        Unchecked, NaN = stop.
 
-        Without ``autoreset`` an env whose episode has ended rests: it earns 0 and tells its end again in every step, until a ``reset``
-        with a mask begins its next episode.
+        Without ``autoreset`` an env whose episode has ended rests: it earns 0 and tells its end again in
+        every step, until a ``reset`` with a mask begins its next episode.
         """
         self.sim, self.num_envs, self.device = sim, sim.num_envs, sim.device
         self.config, self.autoreset = sim.config, autoreset
         self.check_actions = sim.device.type == "cpu" if check_actions is None else check_actions
         self.observation_table = tuple(
-            ObservationColumn(column.name, slice(first, first + width), column.unit, column.frame, column.meaning)
+            ObservationColumn(
+                column.name, slice(first, first + width), column.unit, column.frame, column.meaning
+            )
             for column, first, width in placed_columns(sim.config.features)
         )
         self.columns = {column.name: column.slice for column in self.observation_table}
@@ -86,7 +98,9 @@ class VectorEnv:
         self._first_number = torch.arange(self.num_envs, dtype=torch.int32, device=self.device)
         self._seed = torch.full_like(self._first_number, checked_seed(seed))
         self._number = self._first_number.clone()
-        self._terminated, self._truncated = (torch.zeros(self.num_envs, dtype=torch.bool, device=self.device) for _ in range(2))
+        self._terminated, self._truncated = (
+            torch.zeros(self.num_envs, dtype=torch.bool, device=self.device) for _ in range(2)
+        )
         self._info = {
             "teacher_action": sim.action,
             "leaf": torch.full_like(self._number, -1),
@@ -101,11 +115,14 @@ class VectorEnv:
         }
         self._begun = self._closed = False
 
-    def reset(self, seed: int | None = None, mask: torch.Tensor | None = None) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Begin an episode in every env, or in those where ``mask`` (num_envs,) is true; returns (obs, info) as ``step`` does.
+    def reset(
+        self, seed: int | None = None, mask: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Begin an episode in every env, or in those where ``mask`` (num_envs,) is true; returns (obs, info)
+        as ``step`` does.
 
-        With a ``seed``, env i begins at episode i of it. Without, the first reset begins at episode i of the constructor's seed, later
-        ones go on with each env's next episode.
+        With a ``seed``, env i begins at episode i of it. Without, the first reset begins at episode i of the
+        constructor's seed, later ones go on with each env's next episode.
         """
         self._require_open()
         rows = self._rows_of(mask)
@@ -127,16 +144,20 @@ class VectorEnv:
         torch.where(rows[:, None], self._obs, self._info["final_obs"], out=self._info["final_obs"])
         return self._obs, dict(self._info)
 
-    def step(self, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
+    def step(
+        self, action: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
         """Apply ``action`` for one control step: (obs, reward, terminated, truncated, info).
 
-        terminated: success, or a stop by the referee; truncated: the horizon was reached; both bool (num_envs,). Envs that ended have
-        already begun their next episode: obs, ``info["teacher_action"]`` (what the behaviour tree would do now), ``info["leaf"]`` (which of
-        its nodes says so, an index into ``node_names``, -1 = none), ``info["seed"]`` and ``info["episode"]`` belong to it. To the step
-        itself belong reward and ``info["final_obs"]`` (the observation the step led to, of every env: the next state to bootstrap from),
-        ``info["outcome"]`` (index into ``outcomes``), ``info["reward_terms"]`` (num_envs, number of terms: what each weighted term of
-        ``reward_terms`` adds to the reward), and ``info["episode_terms"]`` (their sums), ``info["episode_return"]`` and
-        ``info["episode_steps"]`` of the episode so far, whole where it ended.
+        terminated: success, or a stop by the referee; truncated: the horizon was reached; both bool
+        (num_envs,). Envs that ended have already begun their next episode: obs, ``info["teacher_action"]``
+        (what the behaviour tree would do now), ``info["leaf"]`` (which of its nodes says so, an index into
+        ``node_names``, -1 = none), ``info["seed"]`` and ``info["episode"]`` belong to it. To the step itself
+        belong reward and ``info["final_obs"]`` (the observation the step led to, of every env: the next state
+        to bootstrap from), ``info["outcome"]`` (index into ``outcomes``), ``info["reward_terms"]`` (num_envs,
+        number of terms: what each weighted term of ``reward_terms`` adds to the reward), and
+        ``info["episode_terms"]`` (their sums), ``info["episode_return"]`` and ``info["episode_steps"]`` of
+        the episode so far, whole where it ended.
         """
         self._require_open()
         if not self._begun:
@@ -155,14 +176,20 @@ class VectorEnv:
         sim.read_into(sim.s.teacher.leaf, info["leaf"])
         return self._obs, sim.reward, self._terminated, self._truncated, dict(info)
 
-    def not_finite(self, obs: torch.Tensor | None = None, reward: torch.Tensor | None = None) -> dict[str, int]:
-        """How many values are NaN or infinite, by column of the observation and for 'reward'; empty = none is.
+    def not_finite(
+        self, obs: torch.Tensor | None = None, reward: torch.Tensor | None = None
+    ) -> dict[str, int]:
+        """How many values are NaN or infinite, by column of the observation and for 'reward'; empty = none
+        is.
 
-        ``obs`` (..., num_obs) and ``reward`` may be those of a whole rollout (default: the newest): one pass over them, one wait.
+        ``obs`` (..., num_obs) and ``reward`` may be those of a whole rollout (default: the newest): one pass
+        over them, one wait.
         """
         values = self._obs if obs is None else obs
         rewards = self.sim.reward if reward is None else reward
-        if bool(torch.isfinite(values.sum() + rewards.sum())):  # whatever is not finite makes a sum so; large numbers may too
+        if bool(
+            torch.isfinite(values.sum() + rewards.sum())
+        ):  # whatever is not finite makes a sum so; large numbers may too
             return {}
         counts = (~torch.isfinite(values)).reshape(-1, self.num_obs).sum(dim=0)
         found = {name: int(counts[place].sum()) for name, place in self.columns.items()}
@@ -175,7 +202,8 @@ class VectorEnv:
         return self.sim.tree.names
 
     def capture(self) -> dict[str, np.ndarray]:
-        """All that the next steps depend on, as arrays that a file can hold: ``restore`` goes on from them bit for bit (on the CPU).
+        """All that the next steps depend on, as arrays that a file can hold: ``restore`` goes on from them
+        bit for bit (on the CPU).
 
         About 0.3 MB an env, most of it maps that compress well. Copies; the environment is not changed.
         """
@@ -187,17 +215,23 @@ class VectorEnv:
         return out | {"setting": np.frombuffer(self._setting().encode(), dtype=np.uint8).copy()}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Go on from what ``capture`` gave, here or in another process; returns (obs, info) as they were. No ``reset`` is needed before.
+        """Go on from what ``capture`` gave, here or in another process; returns (obs, info) as they were. No
+        ``reset`` is needed before.
 
-        ValueError, with nothing changed, for arrays that are missing, unknown or of another size, and for another config or tree.
+        ValueError, with nothing changed, for arrays that are missing, unknown or of another size, and for
+        another config or tree.
         """
         self._require_open()
         arrays = dict(arrays)
         check_setting(arrays.pop("setting", None), self._setting())
         own = self._carried()
-        of_env = {name.removeprefix("env."): array for name, array in arrays.items() if name.startswith("env.")}
+        of_env = {
+            name.removeprefix("env."): array for name, array in arrays.items() if name.startswith("env.")
+        }
         check_arrays(of_env, {name: tensor.cpu().numpy() for name, tensor in own.items()})
-        of_sim = {name.removeprefix("sim."): array for name, array in arrays.items() if not name.startswith("env.")}
+        of_sim = {
+            name.removeprefix("sim."): array for name, array in arrays.items() if not name.startswith("env.")
+        }
         self.sim.memory().restore(of_sim)
         for name, tensor in own.items():
             tensor.copy_(torch.from_numpy(of_env[name]))
@@ -215,7 +249,11 @@ class VectorEnv:
         for told in ("source", "xml"):  # where it was read from changes nothing
             tree.pop(told)
         return json.dumps(
-            {"num_envs": self.num_envs, "tree": tree, **self.config.model_dump(mode="json", include=set(Config.model_fields))}
+            {
+                "num_envs": self.num_envs,
+                "tree": tree,
+                **self.config.model_dump(mode="json", include=set(Config.model_fields)),
+            }
         )
 
     def close(self) -> None:
@@ -254,21 +292,34 @@ class VectorEnv:
         if not isinstance(mask, torch.Tensor) or mask.dtype not in (torch.bool, torch.int32):
             raise TypeError(f"mask must be a torch tensor of bool or int32, got {_described(mask)}")
         if mask.shape != (self.num_envs,) or mask.device.type != self.device.type:
-            raise ValueError(f"mask must have shape ({self.num_envs},) on {self.device}, got {_described(mask)}")
+            raise ValueError(
+                f"mask must have shape ({self.num_envs},) on {self.device}, got {_described(mask)}"
+            )
         return mask != 0
 
     def _check_action(self, action: torch.Tensor) -> None:
         if not isinstance(action, torch.Tensor) or action.dtype != torch.float32:
-            raise TypeError(f"action must be a float32 torch tensor, got {_described(action)}; use torch.as_tensor(action).float()")
+            raise TypeError(
+                f"action must be a float32 torch tensor, got {_described(action)}; use "
+                "torch.as_tensor(action).float()"
+            )
         if action.layout != torch.strided:
-            raise TypeError(f"action must be a dense tensor, got one of layout {action.layout}; use action.to_dense()")
+            raise TypeError(
+                f"action must be a dense tensor, got one of layout {action.layout}; use action.to_dense()"
+            )
         if action.shape != (self.num_envs, NUM_ACTIONS):
-            raise ValueError(f"action must have shape ({self.num_envs}, {NUM_ACTIONS}), got {_described(action)}")
+            raise ValueError(
+                f"action must have shape ({self.num_envs}, {NUM_ACTIONS}), got {_described(action)}"
+            )
         if action.device.type != self.device.type:
-            raise ValueError(f"action must be on {self.device}, got {_described(action)}; use action.to(env.device)")
+            raise ValueError(
+                f"action must be on {self.device}, got {_described(action)}; use action.to(env.device)"
+            )
         if self.check_actions and not bool(torch.isfinite(action).all()):
             bad = (~torch.isfinite(action).all(dim=1)).nonzero().flatten().tolist()
-            raise ValueError(f"action is not finite in env {', '.join(map(str, bad[:8]))}{' ...' if len(bad) > 8 else ''}")
+            raise ValueError(
+                f"action is not finite in env {', '.join(map(str, bad[:8]))}{' ...' if len(bad) > 8 else ''}"
+            )
 
 
 def _described(value: Any) -> str:

@@ -1,4 +1,5 @@
-"""The one way in for files that a run folder or a stranger brings: regular files only, bounded in size, no link that leads elsewhere."""
+"""The one way in for files that a run folder or a stranger brings: regular files only, bounded in size, no
+link that leads elsewhere."""
 
 from __future__ import annotations
 
@@ -25,8 +26,15 @@ _MAX_INTEGER = 1 << 128
 _MAX_ENTRIES = 1_000_000
 """files and folders of one run folder: more are not counted"""
 
-_NO_FOLLOW = getattr(os, "O_NOFOLLOW", 0)  # absent on Windows, where making a link takes rights that a stranger does not have
-_ALWAYS = getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)
+_NO_FOLLOW = getattr(
+    os, "O_NOFOLLOW", 0
+)  # absent on Windows, where making a link takes rights that a stranger does not have
+_ALWAYS = (
+    getattr(os, "O_CLOEXEC", 0)
+    | getattr(os, "O_BINARY", 0)
+    | getattr(os, "O_NONBLOCK", 0)
+    | getattr(os, "O_NOCTTY", 0)
+)
 _OPEN, _CHANGE = os.O_RDONLY | _ALWAYS, os.O_RDWR | _ALWAYS
 _CREATE = os.O_WRONLY | os.O_CREAT | _NO_FOLLOW | _ALWAYS
 _FOLDER = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_CLOEXEC", 0)
@@ -42,8 +50,9 @@ class FileError(UserError):
 def open_file(path: Path, limit: int = MAX_BYTES, folder: Path | None = None) -> BinaryIO:
     """Open a regular file of at most ``limit`` bytes for reading; neither a FIFO nor a device is waited for.
 
-    ``folder``: the file must lie below it, with no link among the names in between; without it a link counts as the user's own, who typed
-    the path. Raises FileError for what is refused, OSError (FileNotFoundError, PermissionError, ...) for what cannot be opened.
+    ``folder``: the file must lie below it, with no link among the names in between; without it a link counts
+    as the user's own, who typed the path. Raises FileError for what is refused, OSError (FileNotFoundError,
+    PermissionError, ...) for what cannot be opened.
     """
     handle = _open(path, folder, _OPEN)
     try:
@@ -51,7 +60,9 @@ def open_file(path: Path, limit: int = MAX_BYTES, folder: Path | None = None) ->
         if not stat.S_ISREG(found.st_mode):
             raise FileError(f"{path}: is {_kind(found.st_mode)}; give a plain file")
         if found.st_size > limit:
-            raise FileError(f"{path}: has {found.st_size:,} bytes, more than the {limit:,} that such a file may have")
+            raise FileError(
+                f"{path}: has {found.st_size:,} bytes, more than the {limit:,} that such a file may have"
+            )
         return os.fdopen(handle, "rb")
     except BaseException:
         os.close(handle)
@@ -59,7 +70,8 @@ def open_file(path: Path, limit: int = MAX_BYTES, folder: Path | None = None) ->
 
 
 def read_bytes(path: Path, limit: int = MAX_BYTES, folder: Path | None = None) -> bytes:
-    """Content of a file, as ``open_file`` opens it; never more than ``limit`` bytes, also where the file grows meanwhile."""
+    """Content of a file, as ``open_file`` opens it; never more than ``limit`` bytes, also where the file
+    grows meanwhile."""
     with open_file(path, limit, folder) as file:
         content = file.read(limit + 1)
     if len(content) > limit:
@@ -81,51 +93,69 @@ def read_json(path: Path, limit: int = MAX_JSON_BYTES, folder: Path | None = Non
 
 
 def parsed_json(content: bytes | str, where: str) -> Any:
-    """Value of a JSON text from elsewhere: finite numbers, integers of 128 bits, no more than fits 1 GiB of memory.
+    """Value of a JSON text from elsewhere: finite numbers, integers of 128 bits, no more than fits 1 GiB of
+    memory.
 
     Raises FileError, which names ``where``.
     """
     try:
         text = content.decode("utf-8") if isinstance(content, bytes) else content
         if text.count("{") + text.count("[") > _MAX_JSON_CONTAINERS or text.count(",") > _MAX_JSON_VALUES:
-            raise FileError(f"{where}: holds more than {_MAX_JSON_CONTAINERS:,} lists and objects or {_MAX_JSON_VALUES:,} values")
+            raise FileError(
+                f"{where}: holds more than {_MAX_JSON_CONTAINERS:,} lists and objects or "
+                f"{_MAX_JSON_VALUES:,} values"
+            )
         value = json.loads(text, parse_constant=_no_constant, parse_float=_finite, parse_int=_whole)
         if _SURROGATE.search(text):
-            json.dumps(value, ensure_ascii=False).encode()  # half a character cannot be written anywhere again
+            json.dumps(
+                value, ensure_ascii=False
+            ).encode()  # half a character cannot be written anywhere again
     except (ValueError, RecursionError) as error:
         raise FileError(f"{where}: is not valid JSON ({error})") from None
     return value
 
 
-def read_lines(path: Path, limit: int = MAX_BYTES, folder: Path | None = None, longest: int = 1 << 20) -> Iterator[bytes]:
+def read_lines(
+    path: Path, limit: int = MAX_BYTES, folder: Path | None = None, longest: int = 1 << 20
+) -> Iterator[bytes]:
     """Lines of a file one by one, with their ends; FileError for one of more than ``longest`` bytes."""
     with open_file(path, limit, folder) as file:
         left = limit
         while line := file.readline(longest + 1):
             left -= len(line)
             if len(line) > longest or left < 0:
-                raise FileError(f"{path}: has a line of more than {longest:,} bytes, or more than {limit:,} in all")
+                raise FileError(
+                    f"{path}: has a line of more than {longest:,} bytes, or more than {limit:,} in all"
+                )
             yield line
 
 
 def refuse_links(folder: Path, path: Path) -> None:
-    """Raise FileError where ``path``, which lies below ``folder``, is a link or lies behind one; what does not exist is no link."""
+    """Raise FileError where ``path``, which lies below ``folder``, is a link or lies behind one; what does
+    not exist is no link."""
     place = folder
     for part in _parts_below(folder, path):
         place = place / part
         if place.is_symlink():
-            raise FileError(f"{place}: is a link; what a link leads to is not ours to read, write or delete: remove the link")
+            raise FileError(
+                f"{place}: is a link; what a link leads to is not ours to read, write or delete: remove the "
+                "link"
+            )
 
 
 def refuse_links_in(folder: Path) -> None:
-    """Raise FileError for any link below ``folder``: all that lies there may be read, written and deleted. Raises OSError."""
+    """Raise FileError for any link below ``folder``: all that lies there may be read, written and deleted.
+    Raises OSError."""
     waiting, count = [str(folder)], 0
     while waiting:
         with os.scandir(waiting.pop()) as entries:
             for entry in entries:
                 count += 1
                 if entry.is_symlink() or _is_junction(entry):
-                    raise FileError(f"{entry.path}: is a link; what a link leads to is not ours to read, write or delete: remove the link")
+                    raise FileError(
+                        f"{entry.path}: is a link; what a link leads to is not ours to read, write or "
+                        "delete: remove the link"
+                    )
                 if count > _MAX_ENTRIES:
                     raise FileError(f"{folder}: holds more than {_MAX_ENTRIES:,} files; no run folder does")
                 if entry.is_dir(follow_symlinks=False):
@@ -133,12 +163,14 @@ def refuse_links_in(folder: Path) -> None:
 
 
 def open_new(path: Path) -> BinaryIO:
-    """Open a file for writing that did not exist; whatever is there already, a link too, is a FileExistsError. Raises OSError."""
+    """Open a file for writing that did not exist; whatever is there already, a link too, is a
+    FileExistsError. Raises OSError."""
     return os.fdopen(os.open(path, _CREATE | os.O_EXCL, 0o666), "wb")
 
 
 def open_to_append(path: Path, folder: Path) -> BinaryIO:
-    """Open a file below ``folder`` for writing at its end, made if it is missing. Raises FileError for what is not ours, OSError.
+    """Open a file below ``folder`` for writing at its end, made if it is missing. Raises FileError for what
+    is not ours, OSError.
 
     A file with a second name (hard link) is refused: what is written would turn up under the other name too.
     """
@@ -164,7 +196,8 @@ def flush(path: Path) -> None:
 
 
 def refuse_output(out: Path, inputs: Iterable[Path], force: bool) -> None:
-    """Raise FileError where ``out`` must not be written: one of ``inputs``, or already there and ``force`` is not set.
+    """Raise FileError where ``out`` must not be written: one of ``inputs``, or already there and ``force`` is
+    not set.
 
     A link, a folder or a device there is refused with ``force`` too, and so is an input by another name.
     """
@@ -207,7 +240,8 @@ def _is_junction(entry: os.DirEntry[str]) -> bool:
 
 
 def _same(one: Path, other: Path) -> bool:
-    """Whether two paths name one file, by whatever links; a name that nothing has yet counts by where it would lie."""
+    """Whether two paths name one file, by whatever links; a name that nothing has yet counts by where it
+    would lie."""
     try:
         return one.samefile(other)
     except OSError:
@@ -221,7 +255,9 @@ def _open_to_change(path: Path, folder: Path, flags: int) -> int:
         if not stat.S_ISREG(found.st_mode):
             raise FileError(f"{path}: is {_kind(found.st_mode)}; a run folder holds plain files: remove it")
         if found.st_nlink > 1:
-            raise FileError(f"{path}: has a second name (a hard link), which would change too; put a copy in its place")
+            raise FileError(
+                f"{path}: has a second name (a hard link), which would change too; put a copy in its place"
+            )
     except BaseException:
         os.close(handle)
         raise
@@ -238,7 +274,8 @@ def _open(path: Path, folder: Path | None, flags: int) -> int:
 
 
 def _open_below(folder: Path, path: Path, flags: int) -> int:
-    """File descriptor of ``path``, opened name by name from ``folder`` on, so that no name can turn into a link meanwhile."""
+    """File descriptor of ``path``, opened name by name from ``folder`` on, so that no name can turn into a
+    link meanwhile."""
     parts = _parts_below(folder, path)
     if os.open not in os.supports_dir_fd:
         refuse_links(folder, path)
@@ -247,7 +284,9 @@ def _open_below(folder: Path, path: Path, flags: int) -> int:
     try:
         for i, part in enumerate(parts):
             try:
-                inner = os.open(part, _NO_FOLLOW | (flags if i == len(parts) - 1 else _FOLDER), 0o666, dir_fd=place)
+                inner = os.open(
+                    part, _NO_FOLLOW | (flags if i == len(parts) - 1 else _FOLDER), 0o666, dir_fd=place
+                )
             except OSError:
                 refuse_links(folder, path)  # the likely reason, in words
                 raise

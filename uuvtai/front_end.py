@@ -1,10 +1,12 @@
-"""Taichi's front end with a memory: what it works out again for every call of a ``ti.func`` is worked out once.
+"""Taichi's front end with a memory: what it works out again for every call of a ``ti.func`` is worked out
+once.
 
-Taichi inlines: it transforms a func's source anew wherever it is called, thousands of times before the first step of a simulator. Each
-time it looks the source up and wraps its lines, which are pure functions of the source; and it words a position that quotes the source for
-every node of the syntax tree, errors or not: a fifth of a warm start. Here the quotation is made when there is an error, a source is
-parsed once, and a field keeps the line that declared it instead of a stack trace. Positions are no part of what Taichi's cache is asked
-for, so it finds kernels that were compiled without this.
+Taichi inlines: it transforms a func's source anew wherever it is called, thousands of times before the first
+step of a simulator. Each time it looks the source up and wraps its lines, which are pure functions of the
+source; and it words a position that quotes the source for every node of the syntax tree, errors or not: a
+fifth of a warm start. Here the quotation is made when there is an error, a source is parsed once, and a field
+keeps the line that declared it instead of a stack trace. Positions are no part of what Taichi's cache is
+asked for, so it finds kernels that were compiled without this.
 """
 
 from __future__ import annotations
@@ -21,8 +23,11 @@ from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
 
 def remember_sources() -> None:
-    """Give this process's Taichi the memory; once is enough. A Taichi without these names is left as it is."""
-    if hasattr(ASTTransformerContext, "get_pos_info") and not hasattr(ASTTransformerContext.get_pos_info, "__wrapped__"):
+    """Give this process's Taichi the memory; once is enough. A Taichi without these names is left as it
+    is."""
+    if hasattr(ASTTransformerContext, "get_pos_info") and not hasattr(
+        ASTTransformerContext.get_pos_info, "__wrapped__"
+    ):
         ASTTransformerContext.get_pos_info = _short_unless_raised(ASTTransformerContext.get_pos_info)
     for name in ("getsourcefile", "getsourcelines"):
         if hasattr(kernel_impl, name) and not hasattr(getattr(kernel_impl, name), "__wrapped__"):
@@ -30,13 +35,18 @@ def remember_sources() -> None:
     if hasattr(kernel_impl, "_inside_class"):
         kernel_impl._inside_class = _inside_class  # type: ignore[attr-defined]
     if getattr(kernel_impl, "textwrap", None) is textwrap:
-        kernel_impl.textwrap = types.SimpleNamespace(fill=functools.cache(textwrap.fill), dedent=functools.cache(textwrap.dedent))  # type: ignore[attr-defined]
+        kernel_impl.textwrap = types.SimpleNamespace(
+            fill=functools.cache(textwrap.fill), dedent=functools.cache(textwrap.dedent)
+        )  # type: ignore[attr-defined]
     if getattr(kernel_impl, "ast", None) is ast:
-        kernel_impl.ast = types.SimpleNamespace(**{**vars(ast), "parse": _parse})  # type: ignore[attr-defined]
+        ours = types.SimpleNamespace(**{**vars(ast), "parse": _parse})
+        kernel_impl.ast = ours  # type: ignore[attr-defined]
     for module in (impl, snode):
         if hasattr(module, "get_traceback"):
             module.get_traceback = _caller
-    if hasattr(kernel_impl.Kernel, "materialize") and not hasattr(kernel_impl.Kernel.materialize, "__wrapped__"):
+    if hasattr(kernel_impl.Kernel, "materialize") and not hasattr(
+        kernel_impl.Kernel.materialize, "__wrapped__"
+    ):
         kernel_impl.Kernel.materialize = _counted(kernel_impl.Kernel.materialize)
 
 
@@ -44,7 +54,8 @@ _made = [0]
 
 
 def kernels_made() -> int:
-    """How many kernels were compiled, or found in the cache, since this process began: time in which this grows is no working time."""
+    """How many kernels were compiled, or found in the cache, since this process began: time in which this
+    grows is no working time."""
     return _made[0]
 
 
@@ -52,7 +63,9 @@ def _counted(materialize: Any) -> Any:
     @functools.wraps(materialize)
     def counted(kernel: Any, *arguments: Any, **named: Any) -> Any:
         before, tracer = len(kernel.compiled_kernels), sys.gettrace()
-        if tracer is not None:  # nobody debugs Taichi's front end, or measures its coverage: a third of the time under either
+        if (
+            tracer is not None
+        ):  # nobody debugs Taichi's front end, or measures its coverage: a third of the time under either
             sys.settrace(None)
         try:
             result = materialize(kernel, *arguments, **named)
@@ -66,9 +79,11 @@ def _counted(materialize: Any) -> Any:
 
 
 def _inside_class(level_of_class_stackframe: int) -> bool:
-    """Whether a decorator is at work in the body of a class; ``level_of_class_stackframe`` is the frame that executes the class statement.
+    """Whether a decorator is at work in the body of a class; ``level_of_class_stackframe`` is the frame that
+    executes the class statement.
 
-    Taichi reads that frame's source and searches all loaded modules for it, for each of our funcs and kernels when it is imported.
+    Taichi reads that frame's source and searches all loaded modules for it, for each of our funcs and kernels
+    when it is imported.
     """
     return "__qualname__" in sys._getframe(level_of_class_stackframe - 1).f_locals
 
@@ -80,14 +95,16 @@ def _tree(source: str) -> tuple[ast.Module, list[ast.arg]]:
 
 
 def _parse(source: str) -> ast.Module:
-    """The tree of a function's source, as good as new: Taichi takes a kernel's parameters out, and what it notes at nodes it overwrites."""
+    """The tree of a function's source, as good as new: Taichi takes a kernel's parameters out, and what it
+    notes at nodes it overwrites."""
     tree, parameters = _tree(source)
     tree.body[0].args.args = list(parameters)  # type: ignore[attr-defined]
     return tree
 
 
 def _caller(stacklevel: int = 1) -> str:
-    """Where a field is declared: the frame that asked Taichi for it; Taichi's ``stacklevel`` has no meaning here."""
+    """Where a field is declared: the frame that asked Taichi for it; Taichi's ``stacklevel`` has no meaning
+    here."""
     frame = sys._getframe(1)
     while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("taichi."):
         frame = frame.f_back
@@ -95,12 +112,16 @@ def _caller(stacklevel: int = 1) -> str:
 
 
 def _short_unless_raised(get_pos_info: Any) -> Any:
-    """``get_pos_info(context, node)`` that quotes the source only while an exception is being handled, and else names file and line."""
+    """``get_pos_info(context, node)`` that quotes the source only while an exception is being handled, and
+    else names file and line."""
 
     @functools.wraps(get_pos_info)
     def position(context: Any, node: Any) -> str:
         if sys.exc_info()[0] is not None:
             return get_pos_info(context, node)
-        return f'File "{context.file}", line {node.lineno + context.lineno_offset}, in {context.func.func.__name__}:\n'
+        return (
+            f'File "{context.file}", line {node.lineno + context.lineno_offset}, in '
+            f"{context.func.func.__name__}:\n"
+        )
 
     return position

@@ -1,10 +1,12 @@
-"""Presets and YAML: load a config from named or user-given files, apply overrides, and say precisely what is wrong and where.
+"""Presets and YAML: load a config from named or user-given files, apply overrides, and say precisely what is
+wrong and where.
 
-A preset is a YAML file that states differences only. Its top-level keys are config sections, plus ``extends`` (another preset of the same
-kind) and, in a world, ``sensors: NAME`` or ``vehicle: NAME`` in place of a section. A training preset may name all three, ``world: NAME``
-or, to change something in it, ``world: {preset: NAME, ...}``, and ``stack: NAME``. A stack preset says how the classical half works
-(``STACK_SECTIONS``) and names a ``tree``; ``--set stack=NAME`` puts one below everything else that is set. Loading never executes code:
-safe YAML, no tags, no aliases, no duplicate keys, at most 1 MiB.
+A preset is a YAML file that states differences only. Its top-level keys are config sections, plus ``extends``
+(another preset of the same kind) and, in a world, ``sensors: NAME`` or ``vehicle: NAME`` in place of a
+section. A training preset may name all three, ``world: NAME`` or, to change something in it, ``world:
+{preset: NAME, ...}``, and ``stack: NAME``. A stack preset says how the classical half works
+(``STACK_SECTIONS``) and names a ``tree``; ``--set stack=NAME`` puts one below everything else that is set.
+Loading never executes code: safe YAML, no tags, no aliases, no duplicate keys, at most 1 MiB.
 """
 
 from __future__ import annotations
@@ -27,14 +29,26 @@ from uuvtai.shipped import preset_names, shipped_file
 
 DEFAULT_WORLD, DEFAULT_SENSORS = "pool", "paper"
 _SCENE_KINDS = ("world", "sensors", "vehicle")
-STACK_SECTIONS = ("tracking", "forecast", "elevation", "spotting", "mapping", "clearance", "voronoi", "route", "teacher")
-"""what a stack preset may set: nothing that a scenario, a sensor, the referee or the observation's columns depend on"""
+STACK_SECTIONS = (
+    "tracking",
+    "forecast",
+    "elevation",
+    "spotting",
+    "mapping",
+    "clearance",
+    "voronoi",
+    "route",
+    "teacher",
+)
+"""what a stack preset may set: nothing that a scenario, a sensor, the referee or the observation's columns
+depend on"""
 _LEARNING_SECTIONS = LearningConfig.model_fields.keys() - Config.model_fields.keys()
 MAX_BYTES = 1 << 20
 """of a YAML file"""
 _MAX_EXTENDS = 8
 _MAX_SCALAR, _MAX_NODES = 1000, 50_000
-"""characters of one value, values of one file: some of YAML's own readers take the square of a value's length"""
+"""characters of one value, values of one file: some of YAML's own readers take the square of a value's
+length"""
 
 
 Overrides = dict[str, Any] | list[str | tuple[str, Any]]
@@ -65,8 +79,9 @@ def load_config(
 ) -> Config:
     """Config of a world (preset name or path) with a sensor and a vehicle preset on top, then overrides.
 
-    ``overrides`` maps dotted keys to values, or lists (key, value) pairs and ``key.sub=value`` texts as typed on the command line;
-    ``stack`` among them names a stack preset. Without ``sensors`` the world's own choice counts, else ``paper``. Raises ConfigError.
+    ``overrides`` maps dotted keys to values, or lists (key, value) pairs and ``key.sub=value`` texts as typed
+    on the command line; ``stack`` among them names a stack preset. Without ``sensors`` the world's own choice
+    counts, else ``paper``. Raises ConfigError.
     """
     typed = _overrides(overrides or {})
     merged = _scene(world, sensors, vehicle)
@@ -84,14 +99,20 @@ def load_training(
 ) -> LearningConfig:
     """Config of a training preset (name or path), then overrides as for ``load_config``; raises ConfigError.
 
-    ``world``, ``sensors`` and ``vehicle`` replace the presets that the training preset names; what it changes in those sections stays.
+    ``world``, ``sensors`` and ``vehicle`` replace the presets that the training preset names; what it changes
+    in those sections stays.
     """
     layer = _read_preset("train", preset)
-    named = {kind: layer.tree[kind].pop("preset", None) for kind in _SCENE_KINDS if isinstance(layer.tree.get(kind), dict)}
+    named = {
+        kind: layer.tree[kind].pop("preset", None)
+        for kind in _SCENE_KINDS
+        if isinstance(layer.tree.get(kind), dict)
+    }
     for kind, name in named.items():
         if name is not None and not isinstance(name, str):
             raise ConfigError(
-                f"{layer.origin.get(f'{kind}.preset', preset)}: {kind}.preset must be the name or path of a {kind} preset, got {name!r}"
+                f"{layer.origin.get(f'{kind}.preset', preset)}: {kind}.preset must be the name or path of a "
+                f"{kind} preset, got {name!r}"
             )
     chosen_world = world or named.get("world") or DEFAULT_WORLD
     typed = _overrides(overrides or {})
@@ -114,7 +135,10 @@ def tree_of_stack(stack: str) -> str:
     """Name of the tree that drives a stack (name or path of its preset). Raises ConfigError."""
     tree = _read_preset("stack", stack).tree.get("tree")
     if not isinstance(tree, str):
-        raise ConfigError(f"{preset_path('stack', stack)}: needs 'tree:', the name of the behaviour tree that drives, for example tree: bt")
+        raise ConfigError(
+            f"{preset_path('stack', stack)}: needs 'tree:', the name of the behaviour tree that drives, for "
+            "example tree: bt"
+        )
     return tree
 
 
@@ -124,7 +148,10 @@ def _stack_of(layer: _Layer) -> _Layer:
     if name is None:
         return _Layer()
     if not isinstance(name, str):
-        raise ConfigError(f"{layer.origin.get('stack', 'stack')}: stack must be the name or path of a stack preset, got {name!r}")
+        raise ConfigError(
+            f"{layer.origin.get('stack', 'stack')}: stack must be the name or path of a stack preset, got "
+            f"{name!r}"
+        )
     return _read_stack(name)
 
 
@@ -133,7 +160,9 @@ def _read_stack(name: str) -> _Layer:
     layer = _read_preset("stack", name)
     layer.tree.pop("tree", None)
     for key in layer.tree.keys() - set(STACK_SECTIONS):
-        raise ConfigError(f"{layer.origin[key]}: a stack cannot set '{key}'; it has {', '.join(STACK_SECTIONS)} and tree")
+        raise ConfigError(
+            f"{layer.origin[key]}: a stack cannot set '{key}'; it has {', '.join(STACK_SECTIONS)} and tree"
+        )
     return layer
 
 
@@ -146,7 +175,9 @@ def scene_of(preset: str) -> dict[str, str | None]:
 def _scene(world: str, sensors: str | None, vehicle: str | None) -> _Layer:
     """A world with its sensors and its vehicle, the ones given before the ones that it names itself."""
     layer = _read_preset("world", world)
-    named = {kind: layer.tree.pop(kind) for kind in ("sensors", "vehicle") if isinstance(layer.tree.get(kind), str)}
+    named = {
+        kind: layer.tree.pop(kind) for kind in ("sensors", "vehicle") if isinstance(layer.tree.get(kind), str)
+    }
     merged = _read_preset("sensors", sensors or named.get("sensors", DEFAULT_SENSORS))
     if chosen := vehicle or named.get("vehicle"):
         merged.merge(_read_preset("vehicle", chosen))
@@ -157,13 +188,15 @@ def _scene(world: str, sensors: str | None, vehicle: str | None) -> _Layer:
 
 
 def sensors_of(world: str, sensors: str | None) -> str:
-    """Name of the sensor preset that ``load_config`` takes: the one given, else the world's own, else ``paper``."""
+    """Name of the sensor preset that ``load_config`` takes: the one given, else the world's own, else
+    ``paper``."""
     own = _read_preset("world", world).tree.get("sensors")
     return sensors or (own if isinstance(own, str) else DEFAULT_SENSORS)
 
 
 def validated(tree: dict[str, Any], origin: dict[str, str] | None = None) -> Config:
-    """Config from a nested dict; ConfigError names the key, its origin, the reason and the nearest known name."""
+    """Config from a nested dict; ConfigError names the key, its origin, the reason and the nearest known
+    name."""
     return _checked(Config, tree, origin or {})
 
 
@@ -177,12 +210,15 @@ def _checked(model: type[AnyConfig], tree: dict[str, Any], origin: dict[str, str
 
 
 def load_resolved(path: Path, overrides: Overrides | None = None) -> Config:
-    """Config from a run folder's ``config.yaml`` (complete, no presets), then overrides; of a training run, a LearningConfig."""
+    """Config from a run folder's ``config.yaml`` (complete, no presets), then overrides; of a training run, a
+    LearningConfig."""
     layer = _read_yaml(path, path.parent)
     typed = _overrides(overrides or {})
     layer.merge(_stack_of(typed))
     layer.merge(typed)
-    return _checked(LearningConfig if _LEARNING_SECTIONS & layer.tree.keys() else Config, layer.tree, layer.origin)
+    return _checked(
+        LearningConfig if _LEARNING_SECTIONS & layer.tree.keys() else Config, layer.tree, layer.origin
+    )
 
 
 def to_yaml(config: Config) -> str:
@@ -212,11 +248,15 @@ def preset_path(kind: str, name: str) -> Path:
     if name.endswith((suffix, ".yml")) or "/" in name:
         path = Path(name)
         if not path.is_file():
-            raise ConfigError(f"{kind} {name!r}: no such file; give a {suffix} file or one of: {', '.join(preset_names(kind))}")
+            raise ConfigError(
+                f"{kind} {name!r}: no such file; give a {suffix} file or one of: "
+                f"{', '.join(preset_names(kind))}"
+            )
         return path
     if name not in preset_names(kind):
         raise ConfigError(
-            f"{kind} {name!r} is no preset{nearest(name, preset_names(kind))}; there are: {', '.join(preset_names(kind))} "
+            f"{kind} {name!r} is no preset{nearest(name, preset_names(kind))}; there are: "
+            f"{', '.join(preset_names(kind))} "
             f"(see 'uuv presets'), or give the path of a {suffix} file"
         )
     return shipped_file(kind, name)
@@ -229,7 +269,9 @@ def read_preset(kind: str, name: str) -> dict[str, Any]:
 
 def _read_preset(kind: str, name: str, depth: int = 0) -> _Layer:
     if depth > _MAX_EXTENDS:
-        raise ConfigError(f"{kind} {name!r}: 'extends' is nested more than {_MAX_EXTENDS} deep; is it a circle?")
+        raise ConfigError(
+            f"{kind} {name!r}: 'extends' is nested more than {_MAX_EXTENDS} deep; is it a circle?"
+        )
     path = preset_path(kind, name)
     own = _read_yaml(path)
     if kind == "train":
@@ -246,18 +288,20 @@ def _read_preset(kind: str, name: str, depth: int = 0) -> _Layer:
 
 
 def _spell_out(layer: _Layer) -> None:
-    """``world: NAME`` as ``world: {preset: NAME}``: a preset that extends this one can change the section without losing the name."""
+    """``world: NAME`` as ``world: {preset: NAME}``: a preset that extends this one can change the section
+    without losing the name."""
     for kind in _SCENE_KINDS:
         if isinstance(layer.tree.get(kind), str):
             layer.tree[kind] = {"preset": layer.tree[kind]}
             layer.origin[f"{kind}.preset"] = layer.origin[kind]
 
 
-# ------------------------------------------------------------------------------------------------------------------- YAML
+# ------------------------------------------------------------------------------------------------------- YAML
 
 
 class _SafeLoader(yaml.SafeLoader):
-    """Safe YAML that reads 3e-4 as a number and refuses aliases, duplicate keys and what no config is as long as."""
+    """Safe YAML that reads 3e-4 as a number and refuses aliases, duplicate keys and what no config is as long
+    as."""
 
     nodes = 0
 
@@ -265,11 +309,17 @@ class _SafeLoader(yaml.SafeLoader):
         event = self.peek_event()
         self.nodes += 1
         if isinstance(event, yaml.events.AliasEvent):
-            raise yaml.MarkedYAMLError(problem="aliases (*name) are not allowed here", problem_mark=event.start_mark)
+            raise yaml.MarkedYAMLError(
+                problem="aliases (*name) are not allowed here", problem_mark=event.start_mark
+            )
         if isinstance(event, yaml.events.ScalarEvent) and len(event.value) > _MAX_SCALAR:
-            raise yaml.MarkedYAMLError(problem=f"a value of {len(event.value)} characters", problem_mark=event.start_mark)
+            raise yaml.MarkedYAMLError(
+                problem=f"a value of {len(event.value)} characters", problem_mark=event.start_mark
+            )
         if self.nodes > _MAX_NODES:
-            raise yaml.MarkedYAMLError(problem=f"more than {_MAX_NODES} values", problem_mark=event.start_mark)
+            raise yaml.MarkedYAMLError(
+                problem=f"more than {_MAX_NODES} values", problem_mark=event.start_mark
+            )
         return super().compose_node(parent, index)
 
     def construct_mapping(self, node, deep=False):  # type: ignore[override]
@@ -277,14 +327,20 @@ class _SafeLoader(yaml.SafeLoader):
         for key_node, _ in node.value:
             key = self.construct_object(key_node, deep=True)
             if not isinstance(key, str):
-                raise yaml.MarkedYAMLError(problem=f"key {key!r} is not a name", problem_mark=key_node.start_mark)
+                raise yaml.MarkedYAMLError(
+                    problem=f"key {key!r} is not a name", problem_mark=key_node.start_mark
+                )
             if key in seen:
-                raise yaml.MarkedYAMLError(problem=f"key {key!r} is given twice", problem_mark=key_node.start_mark)
+                raise yaml.MarkedYAMLError(
+                    problem=f"key {key!r} is given twice", problem_mark=key_node.start_mark
+                )
             seen.add(key)
         return super().construct_mapping(node, deep)
 
 
-_SafeLoader.add_implicit_resolver("tag:yaml.org,2002:float", re.compile(r"^[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$"), list("-+0123456789."))
+_SafeLoader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"^[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$"), list("-+0123456789.")
+)
 
 
 def parsed_yaml(text: str, where: str) -> Any:
@@ -307,10 +363,14 @@ def _read_yaml(path: Path, folder: Path | None = None) -> _Layer:
     except FileError as error:
         raise ConfigError(f"{error}; a config is a small YAML file") from None
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from None
+        raise ConfigError(
+            f"{path}: cannot be read ({error.strerror}); check the path and its permissions"
+        ) from None
     tree = parsed_yaml(text, str(path)) or {}
     if not isinstance(tree, dict):
-        raise ConfigError(f"{path}: must be a mapping of sections such as 'world:', got {type(tree).__name__}")
+        raise ConfigError(
+            f"{path}: must be a mapping of sections such as 'world:', got {type(tree).__name__}"
+        )
     node = yaml.compose(text, Loader=_SafeLoader)
     return _Layer(tree, dict(_lines(node, str(path), ())) if node is not None else {})
 
@@ -328,7 +388,7 @@ def _lines(node: yaml.Node, file: str, prefix: tuple[str, ...]):
             yield from _lines(item, file, dotted)
 
 
-# --------------------------------------------------------------------------------------------------------------- overrides
+# -------------------------------------------------------------------------------------------------- overrides
 
 
 def _overrides(overrides: Overrides) -> _Layer:
@@ -341,7 +401,9 @@ def _overrides(overrides: Overrides) -> _Layer:
         for parent in parents:
             node = node.setdefault(parent, {})
             if not isinstance(node, dict):
-                raise ConfigError(f"--set {key}: '{parent}' was already set to a plain value; set its keys one by one")
+                raise ConfigError(
+                    f"--set {key}: '{parent}' was already set to a plain value; set its keys one by one"
+                )
         node[leaf] = value
         layer.origin[key] = f"--set {key}"
     return layer
@@ -362,7 +424,7 @@ def _merge(into: dict[str, Any], other: dict[str, Any]) -> None:
             into[key] = value
 
 
-# ----------------------------------------------------------------------------------------------------------------- messages
+# --------------------------------------------------------------------------------------------------- messages
 
 
 def _explained(error: ValidationError, origin: dict[str, str], model: type[BaseModel]) -> str:
@@ -371,7 +433,10 @@ def _explained(error: ValidationError, origin: dict[str, str], model: type[BaseM
         dotted = ".".join(str(part) for part in problem["loc"])
         where = _origin_of(dotted, origin)
         if problem["type"] == "extra_forbidden":
-            lines.append(f"{where}unknown key '{dotted}'{nearest(dotted.rsplit('.', 1)[-1], _siblings(problem['loc'], model))}")
+            lines.append(
+                f"{where}unknown key "
+                f"'{dotted}'{nearest(dotted.rsplit('.', 1)[-1], _siblings(problem['loc'], model))}"
+            )
         else:
             got = problem.get("input")
             lines.append(f"{where}{dotted}: {problem['msg']} (got {got!r})")
@@ -392,7 +457,11 @@ def _origin_of(dotted: str, origin: dict[str, str]) -> str:
 def _siblings(location: tuple[Any, ...], root: type[BaseModel]) -> list[str]:
     model: Any = root
     for part in location[:-1]:
-        model = _inner_model(model.model_fields[part].annotation) if isinstance(part, str) and part in model.model_fields else model
+        model = (
+            _inner_model(model.model_fields[part].annotation)
+            if isinstance(part, str) and part in model.model_fields
+            else model
+        )
         if model is None:
             return []
     return list(model.model_fields)

@@ -7,6 +7,7 @@ RUNNING, SUCCESS, COLLISION, TTC, OUT_OF_TANK, TIMEOUT = range(len(OUTCOMES))
 ENDINGS = OUTCOMES[1:]
 """exclusive; every finished episode has one"""
 COLLIDED = ("collision", "ttc", "out_of_tank")
-"""what counts as a collision in every rate: contact, a stop for the time to collision, and leaving the tank"""
+"""what counts as a collision in every rate: contact, a stop for the time to collision, and leaving the
+tank"""
 FORESEEABLE = ("collision", "ttc")
 """what the risk head foresees"""

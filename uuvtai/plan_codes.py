@@ -1,4 +1,5 @@
-"""Codes of planning: why a plan was wanted, who planned, why the Voronoi planner failed. Names are what reports and logs print."""
+"""Codes of planning: why a plan was wanted, who planned, why the Voronoi planner failed. Names are what
+reports and logs print."""
 
 TRIGGERS = ("initial", "stuck", "safety", "intersection")
 """In order of priority: exactly one is counted per replan. Code = index + 1, counter's column = index."""
@@ -10,7 +11,10 @@ N_PLANNER = len(PLANNERS)
 PLANNER_NONE, PLANNER_VORONOI, PLANNER_RRT = range(N_PLANNER + 1)
 
 REASONS = ("start_outside", "goal_outside", "disconnected", "forecast", "budget")
-"""Why the Voronoi planner found nothing: the start or the goal is not traversable, the traversable set does not join them (gaps below
-d_min), only the forecast of moving bodies parts them, or the search ran out of pops or memory."""
+"""Why the Voronoi planner found nothing: the start or the goal is not traversable, the traversable set does
+not join them (gaps below d_min), only the forecast of moving bodies parts them, or the search ran out of pops
+or memory."""
 N_REASON = len(REASONS)
-FAIL_NONE, FAIL_START_OUTSIDE, FAIL_GOAL_OUTSIDE, FAIL_DISCONNECTED, FAIL_FORECAST, FAIL_BUDGET = range(N_REASON + 1)
+FAIL_NONE, FAIL_START_OUTSIDE, FAIL_GOAL_OUTSIDE, FAIL_DISCONNECTED, FAIL_FORECAST, FAIL_BUDGET = range(
+    N_REASON + 1
+)

@@ -1,4 +1,5 @@
-"""The vehicle alone: actuation and dynamics in endless water, for experiments on the physics. No world, no sensors."""
+"""The vehicle alone: actuation and dynamics in endless water, for experiments on the physics. No world, no
+sensors."""
 
 from __future__ import annotations
 
@@ -62,7 +63,8 @@ class Plant:
         field.from_numpy(np.ascontiguousarray(np.broadcast_to(np.asarray(value, dtype=dtype), shape)))
 
     def reset(self, keys: np.ndarray | None = None) -> None:
-        """All vehicles at rest at the origin; ``keys`` (n_env) are the episodes' random keys (default: 0, 1, 2, ..)."""
+        """All vehicles at rest at the origin; ``keys`` (n_env) are the episodes' random keys (default: 0, 1,
+        2, ..)."""
         self.clock.active.fill(1)
         self.clock.awake.fill(1)
         self._set_time(0)
@@ -70,8 +72,11 @@ class Plant:
         dynamics.reset_vehicle(self.dynamics_io)
         actuation.reset_actuation(self.actuation_io)
 
-    def step(self, action: np.ndarray | None = None, substeps: int | None = None, dt_s: float | None = None) -> None:
-        """One control step, driven by the inner loop on exact measurements where ``action`` (n_env, 4) is given."""
+    def step(
+        self, action: np.ndarray | None = None, substeps: int | None = None, dt_s: float | None = None
+    ) -> None:
+        """One control step, driven by the inner loop on exact measurements where ``action`` (n_env, 4) is
+        given."""
         rules = self.config.episode
         if action is not None:
             proprioception.sense_exactly(self.senses_io)
@@ -82,7 +87,9 @@ class Plant:
 
     def _set_time(self, steps: int) -> None:
         self.steps = steps
-        self.clock.step.from_numpy(np.full(self.n_env, steps, dtype=np.int32))  # fill() would compile a kernel for every value
+        self.clock.step.from_numpy(
+            np.full(self.n_env, steps, dtype=np.int32)
+        )  # fill() would compile a kernel for every value
 
     def command(self, action: np.ndarray) -> None:
         """The inner loop alone, on whatever ``ego`` holds."""
@@ -93,4 +100,6 @@ def check_thruster_index(config: Config) -> None:
     """ValueError where ``disturbance.dead_thruster`` names a thruster that the vehicle does not have."""
     dead, count = config.disturbance.dead_thruster, len(config.vehicle.thrusters)
     if dead is not None and dead >= count:
-        raise SettingError(f"disturbance.dead_thruster is {dead}, but the vehicle has thrusters 0 to {count - 1}")
+        raise SettingError(
+            f"disturbance.dead_thruster is {dead}, but the vehicle has thrusters 0 to {count - 1}"
+        )

@@ -1,9 +1,10 @@
 """RRT (OMPL) on the host: takes over where the Voronoi planner fails, with the paper's lower clearance floor.
 
-Deterministic per call: OMPL draws the seed of every generator it creates from one global sequence. ``RNG.setSeed`` restarts that sequence
-(OMPL logs an error when it is not the first call, because older generators keep their state), and everything below is created after it, so
-a path depends on nothing that ran before. Bounded by iterations, never by time, so it does not depend on the machine either.
-OMPL is imported lazily: it has no Windows wheel.
+Deterministic per call: OMPL draws the seed of every generator it creates from one global sequence.
+``RNG.setSeed`` restarts that sequence (OMPL logs an error when it is not the first call, because older
+generators keep their state), and everything below is created after it, so a path depends on nothing that ran
+before. Bounded by iterations, never by time, so it does not depend on the machine either. OMPL is imported
+lazily: it has no Windows wheel.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ _STEP_CELLS = 0.5
 """States along a motion are checked this often [cells]."""
 
 _PAD = 0.51 * _STEP_CELLS
-"""A state is valid when all cells within this [cells] are: so no cell between two checked states is missed."""
+"""A state is valid when all cells within this [cells] are: so no cell between two checked states is
+missed."""
 
 _GOAL_M = 1e-3
 """The goal counts as reached within this."""
@@ -38,12 +40,16 @@ _MAX_SEED = 0x7FFFFFFF
 
 
 class ClearanceGrid:
-    """Where the fallback may pass: cells with at least ``floor_m``, and the free cells next to the start, so that it can leave.
+    """Where the fallback may pass: cells with at least ``floor_m``, and the free cells next to the start, so
+    that it can leave.
 
-    clearance_m: (n_row, n_col) [m], 0 where occupied or outside; origin: world (x, y) [m] of the outer corner of cell [0, 0].
+    clearance_m: (n_row, n_col) [m], 0 where occupied or outside; origin: world (x, y) [m] of the outer corner
+    of cell [0, 0].
     """
 
-    def __init__(self, clearance_m: np.ndarray, origin: Point, cell_m: float, floor_m: float, start_xy: Point) -> None:
+    def __init__(
+        self, clearance_m: np.ndarray, origin: Point, cell_m: float, floor_m: float, start_xy: Point
+    ) -> None:
         self.clearance_m = np.asarray(clearance_m, dtype=np.float64)
         self.origin, self.cell_m = (float(origin[0]), float(origin[1])), float(cell_m)
         self.open = self.clearance_m >= floor_m - 1e-5
@@ -70,8 +76,15 @@ class ClearanceGrid:
         return low, (x0 + self.cell_m * float(cols.max() + 1), y0 + self.cell_m * float(rows.max() + 1))
 
     def checker(self, ends: Sequence[Point]) -> Callable:
-        """OMPL validity function of a state; the ends themselves are judged by their own cell only. Plain Python inside: 0.6 us a call."""
-        rows, (n_row, n_col), (x0, y0), scale, pad = self._rows, self._size, self.origin, 1.0 / self.cell_m, _PAD
+        """OMPL validity function of a state; the ends themselves are judged by their own cell only. Plain
+        Python inside: 0.6 us a call."""
+        rows, (n_row, n_col), (x0, y0), scale, pad = (
+            self._rows,
+            self._size,
+            self.origin,
+            1.0 / self.cell_m,
+            _PAD,
+        )
         near2 = (2.0 * pad * self.cell_m) ** 2
         (ax, ay), (bx, by) = ends
 
@@ -90,24 +103,35 @@ class ClearanceGrid:
         return is_valid
 
     def line_cost(self, a: np.ndarray, b: np.ndarray, epsilon_m: float) -> float:
-        """Integral of 1 / max(clearance, eps) along a straight line, infinite where it meets a closed cell."""
+        """Integral of 1 / max(clearance, eps) along a straight line, infinite where it meets a closed
+        cell."""
         length = float(np.hypot(*(b - a)))
         n = max(1, int(np.ceil(length / (_STEP_CELLS * self.cell_m))))
         points = (a + (b - a) * ((np.arange(n) + 0.5) / n)[:, None] - self.origin) / self.cell_m
         for d_row in (-_PAD, _PAD):
             for d_col in (-_PAD, _PAD):
-                if not self.open[(points[:, 1] + d_row).astype(int), (points[:, 0] + d_col).astype(int)].all():
+                if not self.open[
+                    (points[:, 1] + d_row).astype(int), (points[:, 0] + d_col).astype(int)
+                ].all():
                     return np.inf
         clearance = self.clearance_m[points[:, 1].astype(int), points[:, 0].astype(int)]
         return length / n * float(np.sum(1.0 / np.maximum(clearance, epsilon_m)))
 
 
 def plan_rrt(
-    start_xy: Point, goal_xy: Point, grid: ClearanceGrid, iterations: int, seed: int, range_m: float = 1.0, epsilon_m: float = 0.1
+    start_xy: Point,
+    goal_xy: Point,
+    grid: ClearanceGrid,
+    iterations: int,
+    seed: int,
+    range_m: float = 1.0,
+    epsilon_m: float = 0.1,
 ) -> np.ndarray | None:
-    """Corners (n, 2) [m] of a path from start to goal through open cells, or None where ``iterations`` found none.
+    """Corners (n, 2) [m] of a path from start to goal through open cells, or None where ``iterations`` found
+    none.
 
-    The same arguments give the same path, whatever was planned before. Raises ImportError where OMPL is missing.
+    The same arguments give the same path, whatever was planned before. Raises ImportError where OMPL is
+    missing.
     """
     start, goal = (float(start_xy[0]), float(start_xy[1])), (float(goal_xy[0]), float(goal_xy[1]))
     is_valid = grid.checker((start, goal))
@@ -118,7 +142,13 @@ def plan_rrt(
 
 
 def solve_rrt(
-    start: Point, goal: Point, grid: ClearanceGrid, is_valid: Callable, iterations: int, seed: int, range_m: float
+    start: Point,
+    goal: Point,
+    grid: ClearanceGrid,
+    is_valid: Callable,
+    iterations: int,
+    seed: int,
+    range_m: float,
 ) -> np.ndarray | None:
     """OMPL's RRT from a fresh state of its random numbers: its path (n, 2) [m] as it is, or None."""
     from ompl import base, geometric, util
@@ -160,7 +190,8 @@ def solve_rrt(
 
 
 def _straightened(path: np.ndarray, grid: ClearanceGrid, epsilon_m: float) -> np.ndarray:
-    """Best choice among the path's corners by dynamic programming over chords of 1, 2, 4, ... corners: never costs more than the path."""
+    """Best choice among the path's corners by dynamic programming over chords of 1, 2, 4, ... corners: never
+    costs more than the path."""
     n = len(path)
     cost, following = np.zeros(n), np.zeros(n, dtype=int)
     for i in reversed(range(n - 1)):
@@ -179,13 +210,16 @@ def _straightened(path: np.ndarray, grid: ClearanceGrid, epsilon_m: float) -> np
 @lru_cache(maxsize=1)
 def _has_ompl() -> bool:
     if importlib.util.find_spec("ompl") is None:
-        warnings.warn("OMPL is not installed: where the Voronoi planner fails, the last route is kept", stacklevel=2)
+        warnings.warn(
+            "OMPL is not installed: where the Voronoi planner fails, the last route is kept", stacklevel=2
+        )
         return False
     return True
 
 
 class RouteFallback:
-    """Serves the envs whose Voronoi plan failed: fetch one clearance grid, run RRT, load the route or keep the old one."""
+    """Serves the envs whose Voronoi plan failed: fetch one clearance grid, run RRT, load the route or keep
+    the old one."""
 
     def __init__(self, config: Config) -> None:
         self.config = config
@@ -194,7 +228,8 @@ class RouteFallback:
         self.origin = grid_origin(tank, cell_m)
 
     def serve(self, stages: Stages, seed_of: Callable[[int], int]) -> int:
-        """Plan for ``route.failed``; returns how many there were. ``seed_of(env)`` gives the env's number of (seed, episode, step)."""
+        """Plan for ``route.failed``; returns how many there were. ``seed_of(env)`` gives the env's number of
+        (seed, episode, step)."""
         from uuvtai.kernels.planning.route import keep_route, load_route
         from uuvtai.kernels.planning.voronoi import overlay_clearance
 
@@ -212,9 +247,14 @@ class RouteFallback:
         return n_failed
 
     def plan(self, start_xy: Point, goal_xy: Point, seed: int) -> np.ndarray | None:
-        """RRT on ``self.overlay`` with the config's floor and budget; None (with one warning) where OMPL is not installed."""
+        """RRT on ``self.overlay`` with the config's floor and budget; None (with one warning) where OMPL is
+        not installed."""
         r = self.config.route
         if not _has_ompl():
             return None
-        grid = ClearanceGrid(self.overlay, self.origin, self.config.mapping.cell_m, r.rrt_clearance_m, start_xy)
-        return plan_rrt(start_xy, goal_xy, grid, r.rrt_iterations, seed, r.rrt_range_m, self.config.voronoi.cost_epsilon_m)
+        grid = ClearanceGrid(
+            self.overlay, self.origin, self.config.mapping.cell_m, r.rrt_clearance_m, start_xy
+        )
+        return plan_rrt(
+            start_xy, goal_xy, grid, r.rrt_iterations, seed, r.rrt_range_m, self.config.voronoi.cost_epsilon_m
+        )

@@ -35,7 +35,8 @@ class RunFolderError(UserError, RuntimeError):
 
 
 def default_run_dir(preset: str) -> Path:
-    """A new folder ``runs/<time>_<preset>``, with a number behind it where the name is taken. Raises RunFolderError."""
+    """A new folder ``runs/<time>_<preset>``, with a number behind it where the name is taken. Raises
+    RunFolderError."""
     name, number = f"{time.strftime('%Y%m%d-%H%M%S')}_{Path(preset).stem}", 1
     try:
         _RUNS.mkdir(exist_ok=True)
@@ -48,11 +49,14 @@ def default_run_dir(preset: str) -> Path:
             else:
                 return path
     except OSError as error:
-        raise RunFolderError(f"{_RUNS}: cannot make a folder there ({error.strerror}); give a place: --run-dir DIR") from None
+        raise RunFolderError(
+            f"{_RUNS}: cannot make a folder there ({error.strerror}); give a place: --run-dir DIR"
+        ) from None
 
 
 def refuse_place(path: Path | None) -> None:
-    """Raise RunFolderError at once where a run folder plainly cannot be made, not after minutes of compiling; nothing is written.
+    """Raise RunFolderError at once where a run folder plainly cannot be made, not after minutes of compiling;
+    nothing is written.
 
     None is the default place, whose name is not chosen yet.
     """
@@ -62,20 +66,26 @@ def refuse_place(path: Path | None) -> None:
     nearest = next(place for place in (path, *path.absolute().parents) if place.exists())
     if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
         reason = "Permission denied" if nearest.is_dir() else "Not a directory"
-        raise RunFolderError(f"{path}: cannot make it in {nearest} ({reason}); give a folder that can be written: --run-dir DIR")
+        raise RunFolderError(
+            f"{path}: cannot make it in {nearest} ({reason}); give a folder that can be written: --run-dir "
+            "DIR"
+        )
 
 
 class RunFolder:
-    """Creates ``path`` with config.yaml and run.json and holds it; ``finish`` records how the run ended and lets go of it.
+    """Creates ``path`` with config.yaml and run.json and holds it; ``finish`` records how the run ended and
+    lets go of it.
 
-    Whoever holds a folder is the only one that writes into it: other processes are refused until this one ends, however it ends.
+    Whoever holds a folder is the only one that writes into it: other processes are refused until this one
+    ends, however it ends.
     """
 
     _lock: Any = None
     _record: dict[str, Any]
 
     def __init__(self, path: Path, config: Config, seeds: list[int]) -> None:
-        """Raises RunFolderError where the folder exists with content, another process has just taken it, or it cannot be written."""
+        """Raises RunFolderError where the folder exists with content, another process has just taken it, or
+        it cannot be written."""
         refuse_place(path)
         self.path = path
         self._started = time.time()
@@ -96,7 +106,8 @@ class RunFolder:
 
     @classmethod
     def reopen(cls, path: Path, since: dict[str, Any]) -> RunFolder:
-        """Hold and go on with a run that ended or was killed; ``since`` says from where. Raises RunFolderError."""
+        """Hold and go on with a run that ended or was killed; ``since`` says from where. Raises
+        RunFolderError."""
         folder = cls.held(path)
         try:
             folder.go_on(since)
@@ -107,15 +118,20 @@ class RunFolder:
 
     @classmethod
     def held(cls, path: Path, command: str = "uuv") -> RunFolder:
-        """The folder of a run that ended or was killed, held, and nothing read or changed in it yet; ``go_on`` comes next.
+        """The folder of a run that ended or was killed, held, and nothing read or changed in it yet;
+        ``go_on`` comes next.
 
         ``command`` makes such folders, for the message.
-        Raises RunFolderError for what is no run folder, for one that another process works in, and for one with a link anywhere in it.
+        Raises RunFolderError for what is no run folder, for one that another process works in, and for one
+        with a link anywhere in it.
         """
         folder = cls.__new__(cls)
         folder.path, folder._started = path, time.time()
         if not _is_plain(path / _RECORD):
-            raise RunFolderError(f"{path}: is no run folder, it has no plain file {_RECORD}; give the folder that '{command}' printed")
+            raise RunFolderError(
+                f"{path}: is no run folder, it has no plain file {_RECORD}; give the folder that '{command}' "
+                "printed"
+            )
         folder.hold()
         try:
             folder._guarded("read it", lambda: refuse_links_in(path))
@@ -126,15 +142,22 @@ class RunFolder:
         return folder
 
     def _sweep(self) -> None:
-        """Remove what a kill left half-written; whoever holds the folder is the only one that writes there."""
+        """Remove what a kill left half-written; whoever holds the folder is the only one that writes
+        there."""
         for place in self.path.rglob(".*.tmp"):
             if _TEMPORARY.fullmatch(place.name):
                 place.unlink()
 
     def go_on(self, since: dict[str, Any]) -> None:
-        """Mark a held folder's run as running again; ``since`` says from where. Raises RunFolderError for a record that is none."""
+        """Mark a held folder's run as running again; ``since`` says from where. Raises RunFolderError for a
+        record that is none."""
         self._record = self._read_record()
-        resumed = {"argv": sys.argv, "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"), "versions": versions(), **since}
+        resumed = {
+            "argv": sys.argv,
+            "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+            "versions": versions(),
+            **since,
+        }
         self._record |= {"status": "running", "resumed": [*self._record.get("resumed", []), resumed]}
         self._record.pop("exit", None)
         self.write_json(_RECORD, self._record)
@@ -152,11 +175,14 @@ class RunFolder:
             or not isinstance(record.get("resumed", []), list)
             or type(record.get("wall_s", 0.0)) not in (int, float)
         ):
-            raise RunFolderError(f"{file}: cannot be read ({why}); give the folder that 'uuv train' printed") from None
+            raise RunFolderError(
+                f"{file}: cannot be read ({why}); give the folder that 'uuv train' printed"
+            ) from None
         return record
 
     def hold(self) -> None:
-        """Keep other processes from writing into the same run until this one ends. Raises RunFolderError where one does."""
+        """Keep other processes from writing into the same run until this one ends. Raises RunFolderError
+        where one does."""
         try:
             import fcntl
         except ImportError:  # not on this system: nothing to hold it by
@@ -168,7 +194,9 @@ class RunFolder:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             self.release()
-            raise RunFolderError(f"{self.path}: another process is working in this folder; wait for it, or stop it") from None
+            raise RunFolderError(
+                f"{self.path}: another process is working in this folder; wait for it, or stop it"
+            ) from None
 
     def release(self) -> None:
         """Let other processes write into the folder."""
@@ -181,19 +209,24 @@ class RunFolder:
         self._lock = open_to_append(self.path / _LOCK, self.path)
 
     def _take(self) -> None:
-        """Hold a new folder. The lock is the first file in it, and of several processes that want to begin here one makes it."""
+        """Hold a new folder. The lock is the first file in it, and of several processes that want to begin
+        here one makes it."""
         self._guarded("hold it", self._make_lock)
         self.hold()
         if any(place.name != _LOCK for place in self.path.iterdir()):
             self.release()
-            raise RunFolderError(f"{self.path}: is already there and not empty; give another --run-dir or remove it")
+            raise RunFolderError(
+                f"{self.path}: is already there and not empty; give another --run-dir or remove it"
+            )
 
     def _make_lock(self) -> None:
         signals.engage()
         try:
             self._lock = open_new(self.path / _LOCK)
         except FileExistsError:
-            raise RunFolderError(f"{self.path}: another process has just begun a run there; give another --run-dir") from None
+            raise RunFolderError(
+                f"{self.path}: another process has just begun a run there; give another --run-dir"
+            ) from None
 
     def write(self, name: str, text: str) -> Path:
         """Write a text file atomically; RunFolderError names the file and the reason."""
@@ -237,15 +270,19 @@ class RunFolder:
             raise RunFolderError(str(error)) from None
         except OSError as error:
             raise RunFolderError(
-                f"{self.path}: cannot {what} ({error.strerror}); give a folder that can be written: --run-dir DIR"
+                f"{self.path}: cannot {what} ({error.strerror}); give a folder that can be written: "
+                "--run-dir DIR"
             ) from None
 
 
 def write_atomic(target: Path, content: bytes) -> None:
-    """Write to a new temporary neighbour, flush it to disk, rename; on any error nothing is left behind. Raises OSError."""
+    """Write to a new temporary neighbour, flush it to disk, rename; on any error nothing is left behind.
+    Raises OSError."""
     signals.engage()
     target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.{secrets.token_hex(4)}.tmp")  # nobody can have put a link there before
+    temporary = target.with_name(
+        f".{target.name}.{os.getpid()}.{secrets.token_hex(4)}.tmp"
+    )  # nobody can have put a link there before
     try:
         with open_new(temporary) as file:
             file.write(content)
@@ -280,7 +317,11 @@ def hardware() -> dict[str, Any]:
     cpu = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
-        names = [line.partition(":")[2].strip() for line in cpuinfo.read_text().splitlines() if line.startswith("model name")]
+        names = [
+            line.partition(":")[2].strip()
+            for line in cpuinfo.read_text().splitlines()
+            if line.startswith("model name")
+        ]
         cpu = names[0] if names else cpu
     return {"cpu": cpu, "cores": os.cpu_count(), "system": platform.platform()}
 
@@ -289,7 +330,13 @@ def git_sha() -> str | None:
     """Commit of the source tree this package runs from; None outside a checkout."""
     here = Path(__file__).resolve().parent.parent
     try:
-        done = subprocess.run(["git", "-C", str(here), "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5, check=False)
+        done = subprocess.run(
+            ["git", "-C", str(here), "rev-parse", "HEAD"],
+            capture_output=True,
+            text=True,
+            timeout=5,
+            check=False,
+        )
     except (OSError, subprocess.TimeoutExpired):
         return None
     return done.stdout.strip() or None if done.returncode == 0 else None

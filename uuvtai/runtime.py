@@ -33,16 +33,19 @@ class Runtime:
 _started: list[Runtime] = []
 
 _LOCKED_S = 60.0
-"""Taichi locks its cache by a file, for as long as it reads or writes there: one older than this belongs to a process that was killed"""
+"""Taichi locks its cache by a file, for as long as it reads or writes there: one older than this belongs to a
+process that was killed"""
 
 _MAX_THREADS = 1024
 
 _CACHE_BYTES = 1 << 30
-"""Taichi's own limit, 100 MB, is about twelve sizes of simulator (6 to 9 MB each): a sweep and a training push each other's kernels out"""
+"""Taichi's own limit, 100 MB, is about twelve sizes of simulator (6 to 9 MB each): a sweep and a training
+push each other's kernels out"""
 
 
 def stale_locks() -> list[Path]:
-    """Locks of the kernel cache that nobody holds any more: with one of them every process compiles everything again."""
+    """Locks of the kernel cache that nobody holds any more: with one of them every process compiles
+    everything again."""
     cache = Path(os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or default_cfg().offline_cache_file_path)
     return [lock for lock in cache.rglob("*.lock") if time.time() - lock.stat().st_mtime > _LOCKED_S]
 
@@ -50,15 +53,18 @@ def stale_locks() -> list[Path]:
 def start_taichi(device: str = "cpu", precision: str = "f32", fast_math: bool = False) -> Runtime:
     """Start Taichi on ``device`` ('auto', 'cpu' or 'cuda'), or return the runtime that is already up.
 
-    A second ``ti.init`` would destroy every field, so a process has one runtime; asking for another kind is an error.
-    ``UUV_NUM_THREADS`` bounds the CPU threads. Raises DeviceError where the device is missing, SettingError for others.
+    A second ``ti.init`` would destroy every field, so a process has one runtime; asking for another kind is
+    an error. ``UUV_NUM_THREADS`` bounds the CPU threads. Raises DeviceError where the device is missing,
+    SettingError for others.
     """
     wanted = Runtime(_resolved(device), precision)
     if _started:
         if _started[0] != wanted:
             raise RuntimeError(f"Taichi already runs as {_started[0]}; start a new process for {wanted}")
         return wanted
-    with contextlib.suppress(OSError):  # another process was faster, or may do so in our place: ``uuv doctor`` tells
+    with contextlib.suppress(
+        OSError
+    ):  # another process was faster, or may do so in our place: ``uuv doctor`` tells
         for lock in stale_locks():
             lock.unlink()
     options = {}
@@ -71,7 +77,8 @@ def start_taichi(device: str = "cpu", precision: str = "f32", fast_math: bool = 
             fast_math=fast_math,
             offline_cache=True,
             offline_cache_max_size_of_files=_CACHE_BYTES,
-            cfg_optimization=wanted.device == "cuda",  # on the CPU LLVM does that work again: half of the time to compile, equal results
+            cfg_optimization=wanted.device
+            == "cuda",  # on the CPU LLVM does that work again: half of the time to compile, equal results
             log_level=ti.WARN,
             **options,
         )
@@ -86,7 +93,10 @@ def _thread_count(text: str) -> int:
     except ValueError:
         count = 0
     if not 1 <= count <= _MAX_THREADS:
-        raise SettingError(f"UUV_NUM_THREADS={text!r}: must be a whole number of CPU threads from 1 to {_MAX_THREADS}; unset it to use all")
+        raise SettingError(
+            f"UUV_NUM_THREADS={text!r}: must be a whole number of CPU threads from 1 to {_MAX_THREADS}; "
+            "unset it to use all"
+        )
     return count
 
 

@@ -1,4 +1,5 @@
-"""Scenarios seen from the host: body slots, the table of explicit obstacles, faults, and one scenario in plain Python for logs."""
+"""Scenarios seen from the host: body slots, the table of explicit obstacles, faults, and one scenario in
+plain Python for logs."""
 
 from __future__ import annotations
 
@@ -25,10 +26,14 @@ KIND_NAMES = {SPHERE: "sphere", CYLINDER: "cylinder", BOX: "box"}
 _KINDS = {name: kind for kind, name in KIND_NAMES.items()}
 
 FAULTS = {
-    FAULT_ENDPOINTS: "start and goal find no place with their gaps: widen spawn_*_m or shrink start_goal_gap_m",
-    FAULT_STATIC: "the static obstacles find no place with their gaps: ask for fewer or smaller ones, or a smaller static.gap_m",
-    FAULT_JOINED: "no layout joins start and goal by free space: ask for fewer static obstacles or a smaller static.joined_clearance_m",
-    FAULT_MOVING: "a moving obstacle finds no path within the walls and away from the start: shrink its size, path or start_gap_m",
+    FAULT_ENDPOINTS: "start and goal find no place with their gaps: widen spawn_*_m or shrink "
+    "start_goal_gap_m",
+    FAULT_STATIC: "the static obstacles find no place with their gaps: ask for fewer or smaller ones, or a "
+    "smaller static.gap_m",
+    FAULT_JOINED: "no layout joins start and goal by free space: ask for fewer static obstacles or a smaller "
+    "static.joined_clearance_m",
+    FAULT_MOVING: "a moving obstacle finds no path within the walls and away from the start: shrink its "
+    "size, path or start_gap_m",
 }
 
 
@@ -38,7 +43,8 @@ class SceneError(UserError, RuntimeError):
 
 @dataclass(frozen=True)
 class BodySlots:
-    """Layout of a body list: explicit obstacles at rest, random static ones, explicit moving ones, random moving ones."""
+    """Layout of a body list: explicit obstacles at rest, random static ones, explicit moving ones, random
+    moving ones."""
 
     n_fixed_static: int
     n_static: int
@@ -61,7 +67,9 @@ class BodySlots:
 
 def body_slots(world_cfg: WorldConfig) -> BodySlots:
     """Slots of every env's body list."""
-    return BodySlots(world_cfg.n_fixed_static, world_cfg.static_slots, world_cfg.n_fixed_moving, world_cfg.dynamic_slots)
+    return BodySlots(
+        world_cfg.n_fixed_static, world_cfg.static_slots, world_cfg.n_fixed_moving, world_cfg.dynamic_slots
+    )
 
 
 def scenario_sizes(world_cfg: WorldConfig) -> dict[str, int]:
@@ -93,7 +101,9 @@ def load_fixed(table: FixedTable, world_cfg: WorldConfig) -> None:
             table.way_w[i, j] = (way.x_m, way.y_m)
 
 
-def _center_and_size(obstacle: FixedObstacle, world_cfg: WorldConfig) -> tuple[float, tuple[float, float, float]]:
+def _center_and_size(
+    obstacle: FixedObstacle, world_cfg: WorldConfig
+) -> tuple[float, tuple[float, float, float]]:
     floor, surface = world_cfg.tank.z_m
     z = 0.5 * (floor + surface) if obstacle.z_m is None else obstacle.z_m
     half_height = 0.5 * (surface - floor if obstacle.height_m is None else obstacle.height_m)
@@ -110,12 +120,21 @@ Scene = tuple[int, int, float]
 """(S, D, v [m/s])"""
 
 
-def set_scenes(scene: SceneState, world_cfg: WorldConfig, scenes: Sequence[Scene], put: Put = put_by_kernel) -> None:
-    """Deal the scenes out to the envs in turn, for their next scenarios. SettingError where one does not fit the slots of ``world``."""
+def set_scenes(
+    scene: SceneState, world_cfg: WorldConfig, scenes: Sequence[Scene], put: Put = put_by_kernel
+) -> None:
+    """Deal the scenes out to the envs in turn, for their next scenarios. SettingError where one does not fit
+    the slots of ``world``."""
     for n_static, n_dynamic, speed_m_s in scenes:
-        for name, wanted, slots in (("static", n_static, world_cfg.static_slots), ("dynamic", n_dynamic, world_cfg.dynamic_slots)):
+        for name, wanted, slots in (
+            ("static", n_static, world_cfg.static_slots),
+            ("dynamic", n_dynamic, world_cfg.dynamic_slots),
+        ):
             if not 0 <= wanted <= slots:
-                raise SettingError(f"{wanted} {name} obstacles do not fit {slots} slots: set world.{name}_capacity to at least {wanted}")
+                raise SettingError(
+                    f"{wanted} {name} obstacles do not fit {slots} slots: set world.{name}_capacity to at "
+                    f"least {wanted}"
+                )
         if not (math.isfinite(speed_m_s) and speed_m_s >= 0):
             raise SettingError(f"the obstacles' speed must be finite and not negative, got {speed_m_s}")
     dealt = np.resize(np.array(scenes, dtype=np.float32), (scene.n_static.shape[0], 3))
@@ -125,7 +144,8 @@ def set_scenes(scene: SceneState, world_cfg: WorldConfig, scenes: Sequence[Scene
 
 
 def check_scenarios(faults: np.ndarray) -> None:
-    """Raise SceneError where a scenario could not be placed as asked; ``faults`` is ``WorldState.faults`` of the rows just drawn."""
+    """Raise SceneError where a scenario could not be placed as asked; ``faults`` is ``WorldState.faults`` of
+    the rows just drawn."""
     bad = np.flatnonzero(faults)
     if len(bad) == 0:
         return
@@ -137,14 +157,20 @@ Read = Callable[[ti.Field], np.ndarray]
 """Reads one env's row of a field."""
 
 
-def describe_scenario(read: Read, world: WorldState, path: PathState, mission: MissionState) -> dict[str, Any]:
+def describe_scenario(
+    read: Read, world: WorldState, path: PathState, mission: MissionState
+) -> dict[str, Any]:
     """One scenario in closed form: where every body is at any time follows from this (see ``path_position``).
 
-    ``read(field)`` gives the env's row of a field. Positions [m] in the world frame, angles [rad], times from the episode's start.
+    ``read(field)`` gives the env's row of a field. Positions [m] in the world frame, angles [rad], times from
+    the episode's start.
     """
     kind, pos, size, yaw = read(world.kind), read(world.pos_w), read(world.size), read(world.yaw)
     first_dynamic = len(kind) - path.n_way.shape[1]
-    paths = {name: read(getattr(path, name)) for name in ("n_way", "way_w", "radius_m", "length_m", "phase_m", "speed_m_s")}
+    paths = {
+        name: read(getattr(path, name))
+        for name in ("n_way", "way_w", "radius_m", "length_m", "phase_m", "speed_m_s")
+    }
     bodies = []
     for slot in np.flatnonzero(kind != NONE):
         body: dict[str, Any] = {
@@ -156,7 +182,9 @@ def describe_scenario(read: Read, world: WorldState, path: PathState, mission: M
             "path": None,
         }
         if slot >= first_dynamic:
-            body["path"] = _path_document({name: values[slot - first_dynamic] for name, values in paths.items()})
+            body["path"] = _path_document(
+                {name: values[slot - first_dynamic] for name, values in paths.items()}
+            )
         bodies.append(body)
     return {
         "start": [float(v) for v in read(mission.start_w)],
@@ -172,7 +200,12 @@ def describe_scenario(read: Read, world: WorldState, path: PathState, mission: M
 def _path_document(row: dict[str, Any]) -> dict[str, Any]:
     common = {key: float(row[key]) for key in ("length_m", "phase_m", "speed_m_s")}
     if row["n_way"] == 0:
-        return {"shape": "circle", "center": [float(v) for v in row["way_w"][0]], "radius_m": float(row["radius_m"]), **common}
+        return {
+            "shape": "circle",
+            "center": [float(v) for v in row["way_w"][0]],
+            "radius_m": float(row["radius_m"]),
+            **common,
+        }
     corners = [[float(v) for v in way] for way in row["way_w"][: int(row["n_way"])]]
     return {"shape": "polyline", "corners": corners, **common}
 

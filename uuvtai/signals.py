@@ -1,9 +1,11 @@
-"""SIGINT and SIGTERM, heard alike from the first line on: at once while there is nothing to lose, else by an exception that tidies up.
+"""SIGINT and SIGTERM, heard alike from the first line on: at once while there is nothing to lose, else by an
+exception that tidies up.
 
-Standard library only, and little of it: the entry point imports this before anything else. Until ``engage`` is called (a run folder, a
-file under way) a signal says "interrupted" and ends the process on the spot. From then on it raises ``Interrupted``, a KeyboardInterrupt,
-so that ``finally`` clauses do their work; not in the middle of an import or of a finaliser, where exceptions get lost, but right after.
-The second signal of a kind is the system's own affair: it ends the process at once, even while compiled code holds the interpreter.
+Standard library only, and little of it: the entry point imports this before anything else. Until ``engage``
+is called (a run folder, a file under way) a signal says "interrupted" and ends the process on the spot. From
+then on it raises ``Interrupted``, a KeyboardInterrupt, so that ``finally`` clauses do their work; not in the
+middle of an import or of a finaliser, where exceptions get lost, but right after. The second signal of a kind
+is the system's own affair: it ends the process at once, even while compiled code holds the interpreter.
 """
 
 from __future__ import annotations
@@ -46,7 +48,8 @@ def was_received() -> bool:
 
 
 def install() -> None:
-    """Hear both signals from now on, also where a library has set its own handlers meanwhile; one that is ignored stays so (nohup)."""
+    """Hear both signals from now on, also where a library has set its own handlers meanwhile; one that is
+    ignored stays so (nohup)."""
     for number in STOPPING:
         if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, _hear)
@@ -69,7 +72,8 @@ def engage() -> None:
 
 
 class Noted:
-    """Context in which the first signal sets ``event``, in place of what it does otherwise; the next one ends at once, or interrupts."""
+    """Context in which the first signal sets ``event``, in place of what it does otherwise; the next one ends
+    at once, or interrupts."""
 
     def __init__(self) -> None:
         import threading
@@ -103,13 +107,20 @@ class Noted:
 
 
 def finish(code: int) -> None:
-    """The command is over and the interpreter tidies up: a signal can only shorten that, with this exit code."""
+    """The command is over and the interpreter tidies up: a signal can only shorten that, with this exit
+    code."""
     _finished[:] = [code]
 
 
 def end_at_second() -> None:
-    """Leave the second signal of a kind to the system, whose answer does not wait for the interpreter (Linux)."""
-    if not _installed or sys.platform != "linux" or sys.maxsize < 2**32 or os.uname().machine not in ("x86_64", "aarch64"):
+    """Leave the second signal of a kind to the system, whose answer does not wait for the interpreter
+    (Linux)."""
+    if (
+        not _installed
+        or sys.platform != "linux"
+        or sys.maxsize < 2**32
+        or os.uname().machine not in ("x86_64", "aarch64")
+    ):
         return
     import ctypes
 
@@ -146,7 +157,8 @@ def _deliver(_number: int, frame: FrameType | None) -> None:
 
 
 def _is_deaf(frame: FrameType | None) -> bool:
-    """Whether an exception would get lost here: in an import (extension modules make other errors of it), in a finaliser."""
+    """Whether an exception would get lost here: in an import (extension modules make other errors of it), in
+    a finaliser."""
     if not hasattr(signal, "setitimer"):
         return False
     while frame is not None:
@@ -168,7 +180,8 @@ def _unraisable(unraisable: Any) -> None:
 
 
 def _rest() -> None:
-    """Python is about to put the system's own handlers back: in what little is left a signal would change the exit code, and only that."""
+    """Python is about to put the system's own handlers back: in what little is left a signal would change the
+    exit code, and only that."""
     for number in STOPPING:
         signal.signal(number, signal.SIG_IGN)
 

@@ -1,8 +1,8 @@
 """The simulator: allocates every struct and runs the stages in order. ``Sim.step`` is the page to read first.
 
-Data goes one way: action -> actuation -> dynamics -> world -> referee -> sensing -> tracking -> mapping -> clearance -> planning ->
-features -> teacher -> reward. A pass works on the rows whose ``clock.awake`` is 1: all running rows in a step, only the rows being reset
-in a reset.
+Data goes one way: action -> actuation -> dynamics -> world -> referee -> sensing -> tracking -> mapping ->
+clearance -> planning -> features -> teacher -> reward. A pass works on the rows whose ``clock.awake`` is 1:
+all running rows in a step, only the rows being reset in a reset.
 """
 
 from __future__ import annotations
@@ -40,9 +40,10 @@ from uuvtai.tree import FlatTree, load_tree
 class Sim:
     """Thousands of vehicles in their worlds, stepped together.
 
-    ``action`` is a torch tensor (n_env, 4) in [-1, 1] on the simulator's device: the behaviour tree writes its choice there, the next
-    ``step`` reads it; overwrite it to drive otherwise. ``observation`` is None until somebody asks by ``observe``. While ``privileged`` is
-    on (a yardstick, off in a new simulator), the tracks of moving bodies are the truth.
+    ``action`` is a torch tensor (n_env, 4) in [-1, 1] on the simulator's device: the behaviour tree writes
+    its choice there, the next ``step`` reads it; overwrite it to drive otherwise. ``observation`` is None
+    until somebody asks by ``observe``. While ``privileged`` is on (a yardstick, off in a new simulator), the
+    tracks of moving bodies are the truth.
     """
 
     def __init__(self, config: Config, num_envs: int, tree: FlatTree, device: str = "cpu") -> None:
@@ -67,26 +68,34 @@ class Sim:
         self.set_scenes()
         fill_constants(self.s, config, self._put)
 
-    # ------------------------------------------------------------------------------------------------------------ set-up
+    # ------------------------------------------------------------------------------------------------- set-up
 
     def use_tree(self, tree: FlatTree) -> None:
-        """Drive by another behaviour tree from the next tick on (trees are data: nothing is compiled again)."""
+        """Drive by another behaviour tree from the next tick on (trees are data: nothing is compiled
+        again)."""
         self.tree = tree
         load_tree(self.s.table, tree, self._put)
 
     def set_scenes(self, scenes: Sequence[Scene] = ()) -> None:
-        """Deal (S, D, v) out to the envs in turn, for their next scenarios; none = the world's own. ValueError where slots are too few."""
+        """Deal (S, D, v) out to the envs in turn, for their next scenarios; none = the world's own.
+        ValueError where slots are too few."""
         world = self.config.world
-        set_scenes(self.s.scene, world, scenes or [(world.n_static, world.n_dynamic, world.dynamic_speed_m_s)], self._put)
+        set_scenes(
+            self.s.scene,
+            world,
+            scenes or [(world.n_static, world.n_dynamic, world.dynamic_speed_m_s)],
+            self._put,
+        )
 
     def observe(self) -> torch.Tensor:
-        """From the next pass on, write every awake row's observation into the tensor returned, (n_env, n_obs) (``features.columns``)."""
+        """From the next pass on, write every awake row's observation into the tensor returned, (n_env, n_obs)
+        (``features.columns``)."""
         if self.observation is None:
             width = features.observation_width(self.config.features)
             self.observation = torch.zeros(self.num_envs, width, device=self.device)
         return self.observation
 
-    # -------------------------------------------------------------------------------------------------------------- step
+    # --------------------------------------------------------------------------------------------------- step
 
     def step(self, action: torch.Tensor | None = None) -> None:
         """One control step of every running env, driven by ``action`` (default: what the tree chose)."""
@@ -97,7 +106,8 @@ class Sim:
         self._reward()
 
     def reset(self, mask: torch.Tensor, seed: torch.Tensor, number: torch.Tensor) -> None:
-        """Begin episode ``number`` of ``seed`` in the rows where ``mask`` is 1 (all int32, shape (n_env,)), up to the first observation."""
+        """Begin episode ``number`` of ``seed`` in the rows where ``mask`` is 1 (all int32, shape (n_env,)),
+        up to the first observation."""
         io = self.io
         self.draw(mask, seed, number)
         dynamics.reset_vehicle(io.dynamics)
@@ -116,7 +126,8 @@ class Sim:
         episode.wake(io.episode)
 
     def draw(self, mask: torch.Tensor, seed: torch.Tensor, number: torch.Tensor) -> None:
-        """Draw the scenarios of a ``reset`` and nothing more: to look at them; their rows are not ready to be stepped."""
+        """Draw the scenarios of a ``reset`` and nothing more: to look at them; their rows are not ready to be
+        stepped."""
         io = self.io
         episode.begin_episodes(io.episode, mask, seed, number)
         with self._stage("world"):
@@ -207,11 +218,14 @@ class Sim:
         with self._stage("reward"):
             reward.compute_reward(self.io.reward, self.reward, self.terminated, self.truncated)
 
-    # ------------------------------------------------------------------------------------------------------ observation
+    # -------------------------------------------------------------------------------------------- observation
 
     def rows(self, field: ti.Field, envs: list[int] | None = None) -> np.ndarray:
-        """Host copy of a field's rows, shape (len(envs), ...) (default: all envs); only these rows are copied."""
-        chosen = self._every_row if envs is None else torch.tensor(envs, dtype=torch.int32, device=self.device)
+        """Host copy of a field's rows, shape (len(envs), ...) (default: all envs); only these rows are
+        copied."""
+        chosen = (
+            self._every_row if envs is None else torch.tensor(envs, dtype=torch.int32, device=self.device)
+        )
         return copied_rows(field, chosen)
 
     def read_into(self, field: ti.Field, out: torch.Tensor) -> None:
@@ -226,7 +240,8 @@ class Sim:
         episode_steps: torch.Tensor,
         outcome: torch.Tensor,
     ) -> None:
-        """Write how the step went into the caller's tensors: float32 (n_env, n_term) twice, float32 (n_env,), int32 (n_env,) twice."""
+        """Write how the step went into the caller's tensors: float32 (n_env, n_term) twice, float32 (n_env,),
+        int32 (n_env,) twice."""
         reward.tell_step(self.io.reward, terms, episode_terms, episode_return, episode_steps, outcome)
 
     def memory(self) -> Memory:

@@ -1,4 +1,5 @@
-"""How long every array axis is, and how much memory a simulator of that size takes: known before anything is allocated."""
+"""How long every array axis is, and how much memory a simulator of that size takes: known before anything is
+allocated."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ _MAX_ENVS = 1 << 20
 _PLAN_SLOTS = 64
 """Plans under way at once: far more than a CPU has cores, and the planner's scratch stays small."""
 _MAP_SLOTS = 64
-"""Maps under way at once on a CPU: more than it has cores, and their scratch stays in its caches. On a GPU every env has its own."""
+"""Maps under way at once on a CPU: more than it has cores, and their scratch stays in its caches. On a GPU
+every env has its own."""
 
 
 def array_sizes(config: Config, n_env: int, device: str = "cpu") -> dict[str, int]:
@@ -72,15 +74,19 @@ def memory_bytes(config: Config, n_env: int, device: str = "cpu") -> int:
 
 
 def check_size(config: Config, n_env: int, device: str) -> None:
-    """Refuse sizes that cannot work before anything is allocated: SettingError or SizeError with the estimate and what to type."""
+    """Refuse sizes that cannot work before anything is allocated: SettingError or SizeError with the estimate
+    and what to type."""
     if n_env < 1:
         raise SettingError(f"--num-envs {n_env}: at least 1 env is needed, for example --num-envs 64")
     if n_env > _MAX_ENVS:
-        raise SizeError(f"--num-envs {n_env}: more than {_MAX_ENVS} envs are not supported; use a smaller number")
+        raise SizeError(
+            f"--num-envs {n_env}: more than {_MAX_ENVS} envs are not supported; use a smaller number"
+        )
     needed, free = memory_bytes(config, n_env, device), free_memory_bytes(device)
     if free is not None and needed > 0.9 * free:
         raise SizeError(
-            f"--num-envs {n_env} needs about {needed / 2**30:.1f} GiB, {free / 2**30:.1f} GiB are free on {device}: "
+            f"--num-envs {n_env} needs about {needed / 2**30:.1f} GiB, {free / 2**30:.1f} GiB are free on "
+            f"{device}: "
             f"{_smaller(config, n_env, device, free)}"
         )
     _check_kernels(config)
@@ -90,15 +96,22 @@ def _smaller(config: Config, n_env: int, device: str, free: int) -> str:
     """What to type where the memory is too small."""
     alone = memory_bytes(config, 1, device)
     if alone > 0.9 * free:
-        return "not even one env fits; make the map coarser (--set mapping.cell_m=...), the tank smaller, or free memory"
+        return (
+            "not even one env fits; make the map coarser (--set mapping.cell_m=...), the tank smaller, "
+            "or "
+            "free memory"
+        )
     fitting = int(n_env * 0.9 * free / memory_bytes(config, n_env, device))
-    while fitting > 1 and memory_bytes(config, fitting, device) > 0.9 * free:  # what all envs share takes its part too
+    while (
+        fitting > 1 and memory_bytes(config, fitting, device) > 0.9 * free
+    ):  # what all envs share takes its part too
         fitting = fitting * 9 // 10
     return f"use --num-envs {max(1, fitting)} or fewer"
 
 
 def _check_kernels(config: Config) -> None:
-    """SettingError for what the kernels' counters and keys cannot hold; else Taichi would say so, in the middle of compiling."""
+    """SettingError for what the kernels' counters and keys cannot hold; else Taichi would say so, in the
+    middle of compiling."""
     mapping, sensors = config.mapping, config.sensors
     try:
         offset_bits(config.clearance, mapping)

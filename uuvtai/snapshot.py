@@ -1,7 +1,8 @@
 """One env at one control step as plain NumPy arrays: what the simulator hands to whoever records it.
 
-Nothing here knows Taichi, torch or files. Arrays are copies of one env's rows, SI units, frames as in ``state`` (``_w`` world, ``_b``
-body). A value that does not exist (no policy, no depth image in this step) is None.
+Nothing here knows Taichi, torch or files. Arrays are copies of one env's rows, SI units, frames as in
+``state`` (``_w`` world, ``_b`` body). A value that does not exist (no policy, no depth image in this step) is
+None.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ RUNNING = "running"
 """outcome of an episode that has not ended"""
 
 KINDS = {1: "sphere", 2: "cylinder", 3: "box"}
-"""names of ``EpisodeSnapshot.obstacle_kind``, the codes of ``kernels.geometry``; other codes are empty slots"""
+"""names of ``EpisodeSnapshot.obstacle_kind``, the codes of ``kernels.geometry``; other codes are empty
+slots"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +67,8 @@ class MapLayers:
 
 @dataclass(frozen=True, eq=False)
 class DepthLine:
-    """What the map takes from a depth image: of every column that has one, the nearest pixel at the vehicle's own depth."""
+    """What the map takes from a depth image: of every column that has one, the nearest pixel at the vehicle's
+    own depth."""
 
     column: np.ndarray
     """(n,)"""
@@ -164,7 +167,8 @@ class EpisodeSnapshot:
     """(3,) [m] point being steered at"""
     path_risk: float = 0.0
     tracks: np.ndarray | None = None
-    """(n, 6) x, y, z [m], vx, vy [m/s], radius [m] of the moving bodies being tracked; looked at when sonar_fresh"""
+    """(n, 6) x, y, z [m], vx, vy [m/s], radius [m] of the moving bodies being tracked; looked at when
+    sonar_fresh"""
     track_beams: np.ndarray | None = None
     """indices of the beams that a moving body explains"""
 

@@ -1,4 +1,5 @@
-"""Codes of a behaviour tree's statuses, kinds of nodes and leaves: plain numbers, so that a tree can be read without Taichi."""
+"""Codes of a behaviour tree's statuses, kinds of nodes and leaves: plain numbers, so that a tree can be read
+without Taichi."""
 
 # statuses, numbered as in BehaviorTree.CPP
 IDLE = 0

@@ -10,7 +10,12 @@ from py_trees.common import Status
 from uuvtai import tree_codes as codes
 from uuvtai.tree import FlatTree
 
-_CODE = {Status.INVALID: codes.IDLE, Status.RUNNING: codes.RUNNING, Status.SUCCESS: codes.SUCCESS, Status.FAILURE: codes.FAILURE}
+_CODE = {
+    Status.INVALID: codes.IDLE,
+    Status.RUNNING: codes.RUNNING,
+    Status.SUCCESS: codes.SUCCESS,
+    Status.FAILURE: codes.FAILURE,
+}
 _STATUS = {code: status for status, code in _CODE.items()}
 _DECORATORS = {
     codes.INVERTER: py_trees.decorators.Inverter,
@@ -41,7 +46,11 @@ class PyTree:
     def _built(self, flat: FlatTree, node: int) -> py_trees.behaviour.Behaviour:
         kind, place = flat.kind[node], len(self.nodes)
         self.nodes.append(None)  # type: ignore[arg-type]
-        children = [self._built(flat, child) for child in range(node + 1, flat.end[node]) if flat.parent[child] == node]
+        children = [
+            self._built(flat, child)
+            for child in range(node + 1, flat.end[node])
+            if flat.parent[child] == node
+        ]
         if kind >= codes.CONDITION:
             made = _Given(node, self)
         elif kind in (codes.SEQUENCE, codes.REACTIVE_SEQUENCE):

@@ -1,6 +1,8 @@
-"""Inner loop and Fossen's equations on whole arrays, for NumPy or torch: what a user of either would write for many vehicles.
+"""Inner loop and Fossen's equations on whole arrays, for NumPy or torch: what a user of either would write
+for many vehicles.
 
-The same equations as the kernels (midpoint rule, exact rotor lag, ideal attitude hold), on arrays (component, n_env) in single precision.
+The same equations as the kernels (midpoint rule, exact rotor lag, ideal attitude hold), on arrays (component,
+n_env) in single precision.
 """
 
 from __future__ import annotations
@@ -16,13 +18,17 @@ from uuvtai.kernels.vehicle.rotor import KGF, edge_rpm, thrust_at, thrust_limits
 
 
 class Vehicles:
-    """``n_env`` vehicles at rest; ``xp`` is ``numpy`` or ``torch``. Only the paths of the default vehicle (ideal hold, no delay)."""
+    """``n_env`` vehicles at rest; ``xp`` is ``numpy`` or ``torch``. Only the paths of the default vehicle
+    (ideal hold, no delay)."""
 
     def __init__(self, config: Config, n_env: int, xp: Any, device: str = "cpu") -> None:
         self.xp, self.config, self.device = xp, config, device
         v = config.vehicle
         wrench_of_thrust, thrust_of_wrench = allocation_matrices(v)
-        self.wrench_of_thrust, self.thrust_of_wrench = self._array(wrench_of_thrust), self._array(thrust_of_wrench)
+        self.wrench_of_thrust, self.thrust_of_wrench = (
+            self._array(wrench_of_thrust),
+            self._array(thrust_of_wrench),
+        )
         full = np.ones(n_env, np.float32)
         self.added, self.linear, self.quadratic = (
             self._array(np.outer(p, full)) for p in (v.added_mass, v.linear_damping, v.quadratic_damping)
@@ -43,14 +49,18 @@ class Vehicles:
     def _column(self, values: Any) -> Any:
         return self._array(np.reshape(values, (-1, 1)))
 
-    # -------------------------------------------------------------------------------------------------------- inner loop
+    # --------------------------------------------------------------------------------------------- inner loop
 
     def control(self, action: Any) -> None:
         """Rotor commands for ``action`` (4, n_env) in [-1, 1], from the true motion."""
         xp, c, v = self.xp, self.config.actuation, self.config.vehicle
         loops = axis_loops(c)
-        gain, integral_gain, band, bound, limit = (self._column(values) for values in zip(*loops, strict=True))
-        command = xp.clip(action, -1, 1) * self._column([v.max_surge_m_s, v.max_sway_m_s, v.max_heave_m_s, v.max_yaw_rate_rad_s])
+        gain, integral_gain, band, bound, limit = (
+            self._column(values) for values in zip(*loops, strict=True)
+        )
+        command = xp.clip(action, -1, 1) * self._column(
+            [v.max_surge_m_s, v.max_sway_m_s, v.max_heave_m_s, v.max_yaw_rate_rad_s]
+        )
         vel, rate = self.vel, self.rate
         momentum = self._column(v.mass_kg + np.array(v.added_mass[:3])) * vel
         spin = self._column(np.array(v.inertia_kg_m2) + np.array(v.added_mass[3:])) * rate
@@ -79,15 +89,24 @@ class Vehicles:
         """Rotor speed of a thrust, both branches of the curve."""
         xp, v = self.xp, self.config.vehicle
         rpm = thrust * 0.0
-        for curve, dead, sign in ((v.thrust_forward, v.dead_band_rpm[0], 1.0), (v.thrust_reverse, v.dead_band_rpm[1], -1.0)):
+        for curve, dead, sign in (
+            (v.thrust_forward, v.dead_band_rpm[0], 1.0),
+            (v.thrust_reverse, v.dead_band_rpm[1], -1.0),
+        ):
             edge = edge_rpm(curve, dead, sign)
             least = sign * thrust_at(curve, edge, v.thrust_scale)
-            root = (curve[1] ** 2 - 4 * curve[0] * (curve[2] - thrust / (KGF * v.thrust_scale))).clip(0.0) ** 0.5
-            branch = xp.where(sign * thrust >= least, (root - curve[1]) / (2 * curve[0]), xp.where(sign * thrust >= 0.5 * least, edge, 0.0))
+            root = (curve[1] ** 2 - 4 * curve[0] * (curve[2] - thrust / (KGF * v.thrust_scale))).clip(
+                0.0
+            ) ** 0.5
+            branch = xp.where(
+                sign * thrust >= least,
+                (root - curve[1]) / (2 * curve[0]),
+                xp.where(sign * thrust >= 0.5 * least, edge, 0.0),
+            )
             rpm = xp.where((thrust > 0) if sign > 0 else (thrust <= 0), branch, rpm)
         return xp.clip(rpm, -v.rotor_max_rpm, v.rotor_max_rpm)
 
-    # ---------------------------------------------------------------------------------------------------------- dynamics
+    # ----------------------------------------------------------------------------------------------- dynamics
 
     def move(self) -> None:
         """One control step in the config's substeps."""
@@ -112,7 +131,10 @@ class Vehicles:
     def _thrust_of(self, rpm: Any) -> Any:
         xp, v = self.xp, self.config.vehicle
         (f2, f1, f0), (r2, r1, r0) = v.thrust_forward, v.thrust_reverse
-        ahead, back = edge_rpm(v.thrust_forward, v.dead_band_rpm[0], 1.0), edge_rpm(v.thrust_reverse, v.dead_band_rpm[1], -1.0)
+        ahead, back = (
+            edge_rpm(v.thrust_forward, v.dead_band_rpm[0], 1.0),
+            edge_rpm(v.thrust_reverse, v.dead_band_rpm[1], -1.0),
+        )
         backward = xp.where(rpm <= back, (r2 * rpm + r1) * rpm + r0, 0.0)
         return KGF * v.thrust_scale * xp.where(rpm >= ahead, (f2 * rpm + f1) * rpm + f0, backward)
 
@@ -122,7 +144,12 @@ class Vehicles:
         v_r = v - self._turned(q * self._column([1, -1, -1, -1]), self.current)
         momentum = self.added[:3] * v_r
         tau_v = wrench[:3] + (self.buoyancy - self.mass * c.vehicle.gravity_m_s2) * up
-        tau_v = tau_v - self.mass * self._cross(w, v) - self._cross(w, momentum) - (self.linear[:3] + self.quadratic[:3] * abs(v_r)) * v_r
+        tau_v = (
+            tau_v
+            - self.mass * self._cross(w, v)
+            - self._cross(w, momentum)
+            - (self.linear[:3] + self.quadratic[:3] * abs(v_r)) * v_r
+        )
         tau_w = wrench[3:] - self._cross(w, (self.inertia + self.added[3:]) * w) - self._cross(v_r, momentum)
         tau_w = tau_w - (self.linear[3:] + self.quadratic[3:] * abs(w)) * w
         lever = c.vehicle.buoyancy_height_m * self.buoyancy
@@ -132,14 +159,19 @@ class Vehicles:
 
     def _hold(self, up: Any, w: Any) -> tuple[Any, Any]:
         c = self.config.actuation
-        roll, pitch = -c.hold_gain_n_m * up[1] - c.hold_damping * w[0], c.hold_gain_n_m * up[0] - c.hold_damping * w[1]
+        roll, pitch = (
+            -c.hold_gain_n_m * up[1] - c.hold_damping * w[0],
+            c.hold_gain_n_m * up[0] - c.hold_damping * w[1],
+        )
         share = (c.hold_limit_n_m / ((roll * roll + pitch * pitch) ** 0.5).clip(1e-6)).clip(None, 1.0)
         return share * roll, share * pitch
 
-    # ---------------------------------------------------------------------------------------------------------- geometry
+    # ----------------------------------------------------------------------------------------------- geometry
 
     def _cross(self, a: Any, b: Any) -> Any:
-        return self.xp.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+        return self.xp.stack(
+            [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+        )
 
     def _up(self, q: Any) -> Any:
         w, x, y, z = q

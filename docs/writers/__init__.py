@@ -1,4 +1,5 @@
-"""Pages that say what the code says: commands, configuration, log topics, stages. Written anew by every build, never committed."""
+"""Pages that say what the code says: commands, configuration, log topics, stages. Written anew by every
+build, never committed."""
 
 from __future__ import annotations
 
@@ -13,7 +14,12 @@ Pages = dict[str, str]
 
 def pages() -> Pages:
     """Every generated page."""
-    return {**commands.pages(), **configuration.pages(), "topics.md": topics.page(), "stages.md": stages.page()}
+    return {
+        **commands.pages(),
+        **configuration.pages(),
+        "topics.md": topics.page(),
+        "stages.md": stages.page(),
+    }
 
 
 def write_reference(folder: Path) -> None:

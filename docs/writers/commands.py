@@ -28,10 +28,21 @@ SEE = {
 
 EXIT_CODES = (
     (endings.OK, "done"),
-    (endings.FAILED, "failed while running: a file that cannot be read or written, a device that is missing, a worker lost too often"),
-    (endings.USAGE, "usage or configuration: nothing was begun, nothing was written; the message says what to type instead"),
+    (
+        endings.FAILED,
+        "failed while running: a file that cannot be read or written, a device that is missing, a worker "
+        "lost too often",
+    ),
+    (
+        endings.USAGE,
+        "usage or configuration: nothing was begun, nothing was written; the message says what to type "
+        "instead",
+    ),
     (endings.GATE, "finished, but a gate was not met: `uuv export` found that an exported policy disagrees"),
-    (endings.INTERRUPTED, "interrupted (Ctrl-C); what was finished is kept, and the message names the command that goes on"),
+    (
+        endings.INTERRUPTED,
+        "interrupted (Ctrl-C); what was finished is kept, and the message names the command that goes on",
+    ),
 )
 
 
@@ -50,24 +61,34 @@ def pages() -> dict[str, str]:
 
 def _page(name: str) -> str:
     root = app()
-    text = words(get_docs_for_click(obj=root.commands[name], ctx=typer.Context(root, info_name="uuv"), name=f"uuv {name}"))
+    text = words(
+        get_docs_for_click(
+            obj=root.commands[name], ctx=typer.Context(root, info_name="uuv"), name=f"uuv {name}"
+        )
+    )
     links = ", ".join(f"[{page.rpartition('/')[2]}](../../{page}.md)" for page in SEE[name])
     return f"{text.rstrip()}\n\nMore: {links}. Exit codes: [commands](../commands.md#exit-codes).\n"
 
 
 def words(text: str) -> str:
-    """Markdown in which ``<time>`` of a help text stays words: outside of code an angle bracket would begin a tag, which no page shows."""
-    return re.sub(r"```.*?```|`[^`\n]*`|<", lambda found: found[0] if found[0] != "<" else r"\<", text, flags=re.S)
+    """Markdown in which ``<time>`` of a help text stays words: outside of code an angle bracket would begin a
+    tag, which no page shows."""
+    return re.sub(
+        r"```.*?```|`[^`\n]*`|<", lambda found: found[0] if found[0] != "<" else r"\<", text, flags=re.S
+    )
 
 
 def _list() -> str:
     root = app()
-    rows = [[f"[`uuv {name}`](commands/{name}.md)", command.help or ""] for name, command in root.commands.items()]
+    rows = [
+        [f"[`uuv {name}`](commands/{name}.md)", command.help or ""] for name, command in root.commands.items()
+    ]
     codes = [[str(code), meaning] for code, meaning in EXIT_CODES]
     return "\n\n".join(
         [
             "# Commands",
-            "Results go to stdout, progress and messages to stderr. `--json` prints one document and nothing else on stdout.",
+            "Results go to stdout, progress and messages to stderr. `--json` prints one document and nothing "
+            "else on stdout.",
             table(["command", "does"], rows),
             "## Exit codes",
             table(["code", "meaning"], codes),

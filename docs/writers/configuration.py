@@ -1,4 +1,5 @@
-"""Reference of the configuration, from the pydantic models: a page per section with key, type, default, unit and meaning."""
+"""Reference of the configuration, from the pydantic models: a page per section with key, type, default, unit
+and meaning."""
 
 from __future__ import annotations
 
@@ -23,8 +24,10 @@ KINDS = ("world", "sensors", "vehicle", "stack", "train")
 """of presets that set config keys"""
 
 UNITS = {
-    "kg_m2": "kg m^2", "kg_m3": "kg/m^3", "rad_s_rthz": "rad/s/rtHz", "m_s2": "m/s^2", "rad_s": "rad/s", "m_s": "m/s", "n_m": "N m",
-    "per_s": "1/s", "m3": "m^3", "kg": "kg", "deg": "deg", "rad": "rad", "rpm": "rpm", "steps": "steps", "n": "N", "m": "m", "s": "s",
+    "kg_m2": "kg m^2", "kg_m3": "kg/m^3", "rad_s_rthz": "rad/s/rtHz", "m_s2": "m/s^2", "rad_s": "rad/s",
+    "m_s": "m/s", "n_m": "N m",
+    "per_s": "1/s", "m3": "m^3", "kg": "kg", "deg": "deg", "rad": "rad", "rpm": "rpm", "steps": "steps",
+    "n": "N", "m": "m", "s": "s",
 }  # fmt: skip
 """by the end of a key, longest first"""
 
@@ -46,13 +49,19 @@ def section(name: str) -> Model:
 
 
 def _list() -> str:
-    rows = [[f"[`{name}`](configuration/{name}.md)", _about(section(name))] for name in LearningConfig.model_fields]
+    rows = [
+        [f"[`{name}`](configuration/{name}.md)", _about(section(name))]
+        for name in LearningConfig.model_fields
+    ]
     return "\n\n".join(
         [
             "# Configuration",
-            "Every key can be set in a preset or a YAML file of your own, and on the command line by `--set section.key=value`. Unknown"
-            " keys, wrong types and values out of range are refused with the nearest name. Configurations are immutable once they are "
-            "loaded. `uuv presets show NAME --all` prints a preset with every key. Steps are control steps (`episode.control_dt_s`).",
+            "Every key can be set in a preset or a YAML file of your own, and on the command line by `--set "
+            "section.key=value`. Unknown"
+            " keys, wrong types and values out of range are refused with the nearest name. Configurations "
+            "are immutable once they are "
+            "loaded. `uuv presets show NAME --all` prints a preset with every key. Steps are control steps "
+            "(`episode.control_dt_s`).",
             table(["section", "holds"], rows),
             contents([f"configuration/{name}" for name in LearningConfig.model_fields]),
         ]
@@ -61,25 +70,37 @@ def _list() -> str:
 
 def _page(name: str) -> str:
     parts = [f"# `{name}`", *_tables(name, section(name))]
-    rows = [[f"`{key}`", f"`{value}`", ", ".join(presets)] for (key, value), presets in sorted(_set_by(name).items())]
+    rows = [
+        [f"`{key}`", f"`{value}`", ", ".join(presets)]
+        for (key, value), presets in sorted(_set_by(name).items())
+    ]
     if rows:
         parts += ["## Presets that set it", table(["key", "value", "presets"], rows)]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
 def _about(model: Model) -> str:
-    return inspect.cleandoc(model.__doc__) if model.__doc__ and "Base of every section" not in model.__doc__ else ""
+    return (
+        inspect.cleandoc(model.__doc__)
+        if model.__doc__ and "Base of every section" not in model.__doc__
+        else ""
+    )
 
 
 def _tables(path: str, model: Model) -> list[str]:
     """The section's own keys, then the sections inside it."""
     told, schema = meanings(model), _schemas()[model.__name__]["properties"]
-    inner = {key: found for key, field in model.model_fields.items() if (found := _model_in(field.annotation))}
+    inner = {
+        key: found for key, field in model.model_fields.items() if (found := _model_in(field.annotation))
+    }
     single = [key for key, found in inner.items() if model.model_fields[key].annotation is found]
     rows = [_row(key, schema[key], told.get(key, "")) for key in model.model_fields if key not in single]
     parts = [_about(model)] + ([table(["key", "type", "default", "unit", "meaning"], rows)] if rows else [])
     for key, found in inner.items():
-        parts += [f"## `{path}.{key}`" + ("" if key in single else ", each"), *_tables(f"{path}.{key}", found)]
+        parts += [
+            f"## `{path}.{key}`" + ("" if key in single else ", each"),
+            *_tables(f"{path}.{key}", found),
+        ]
     return parts
 
 
@@ -106,7 +127,7 @@ def _plain(value: Any) -> str:
     return text if len(text) <= LONGEST_DEFAULT or not isinstance(value, list) else f"list of {len(value)}"
 
 
-# ------------------------------------------------------------------------------------------------------------ what a key is
+# ---------------------------------------------------------------------------------------------- what a key is
 
 
 def meanings(model: Model) -> dict[str, str]:
@@ -115,7 +136,11 @@ def meanings(model: Model) -> dict[str, str]:
     assert isinstance(body, ast.ClassDef)
     found = {}
     for field, text in zip(body.body, body.body[1:], strict=False):
-        if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
+        if (
+            isinstance(field, ast.AnnAssign)
+            and isinstance(text, ast.Expr)
+            and isinstance(text.value, ast.Constant)
+        ):
             found[ast.unparse(field.target)] = " ".join(str(text.value.value).split())
     return found
 
@@ -137,7 +162,13 @@ def type_text(schema: Schema) -> str:
         return ", ".join(f"`{value}`" for value in schema["enum"])
     if schema["type"] == "array":
         return _list_text(schema)
-    names = {"number": "number", "integer": "whole number", "boolean": "true or false", "string": "text", "null": "null"}
+    names = {
+        "number": "number",
+        "integer": "whole number",
+        "boolean": "true or false",
+        "string": "text",
+        "null": "null",
+    }
     return names[schema["type"]] + _bounds(schema)
 
 
@@ -154,13 +185,17 @@ _GUARDS = (SMALLEST, LARGEST, MOST)
 
 def _bounds(schema: Schema) -> str:
     signs = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
-    told = [f"{sign} {schema[name]:.10g}" for name, sign in signs.items() if name in schema and abs(schema[name]) not in _GUARDS]
+    told = [
+        f"{sign} {schema[name]:.10g}"
+        for name, sign in signs.items()
+        if name in schema and abs(schema[name]) not in _GUARDS
+    ]
     told = ["> 0", *told] if schema.get("minimum") == SMALLEST else told
     told += [f"multiple of {schema['multipleOf']}"] if "multipleOf" in schema else []
     return f" {', '.join(told)}" if told else ""
 
 
-# ----------------------------------------------------------------------------------------------------------------- presets
+# ---------------------------------------------------------------------------------------------------- presets
 
 
 def _set_by(name: str) -> dict[tuple[str, str], list[str]]:
@@ -175,7 +210,11 @@ def _set_by(name: str) -> dict[tuple[str, str], list[str]]:
 @functools.cache
 def _presets() -> list[tuple[str, dict[str, Any]]]:
     """Every shipped preset of ``KINDS``: 'kind name', and what it says."""
-    return [(f"{kind} `{name}`", loader.read_preset(kind, name)) for kind in KINDS for name in loader.preset_names(kind)]
+    return [
+        (f"{kind} `{name}`", loader.read_preset(kind, name))
+        for kind in KINDS
+        for name in loader.preset_names(kind)
+    ]
 
 
 def _leaves(path: str, tree: dict[str, Any]) -> list[tuple[str, Any]]:

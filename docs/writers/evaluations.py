@@ -1,8 +1,9 @@
 """Play every evaluation that README and docs show: ``python -m docs.writers.evaluations --seeds 90007``.
 
-Each row is one ``uuv eval`` (or ``uuv sweep``) on one thread, two of them at a time. A row is in ``docs/data/evaluations_SEED.json`` as
-soon as it is played; a second start plays what is missing (same seed, same episodes, same last commit of ``uuvtai/``). Afterwards
-``python -m docs.writers.figures --evaluations evaluations_SEED.json`` renews the text.
+Each row is one ``uuv eval`` (or ``uuv sweep``) on one thread, two of them at a time. A row is in
+``docs/data/evaluations_SEED.json`` as soon as it is played; a second start plays what is missing (same seed,
+same episodes, same last commit of ``uuvtai/``). Afterwards ``python -m docs.writers.figures --evaluations
+evaluations_SEED.json`` renews the text.
 """
 
 from __future__ import annotations
@@ -25,7 +26,12 @@ from docs.writers.figure_sources import ROOT
 from uuvtai.run_folder import hardware, write_atomic
 
 EPISODES = 500
-ONE_THREAD = {"UUV_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+ONE_THREAD = {
+    "UUV_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+}
 
 
 @dataclass(frozen=True)
@@ -55,7 +61,11 @@ ROWS = (
     Row("netpen", "`netpen` (its own D, v)", "--world netpen"),
     Row("transfer", "`transfer` (its own D, v)", "--world transfer"),
     Row("pool_6_nominal", "`pool` (6, 0.6), nominal sensing", f"--world pool {_MOVING} --sensors nominal"),
-    Row("pool_6_harsh", "`pool` (6, 0.6), harsh sensing, position known", f"--world pool {_MOVING} --sensors harsh"),
+    Row(
+        "pool_6_harsh",
+        "`pool` (6, 0.6), harsh sensing, position known",
+        f"--world pool {_MOVING} --sensors harsh",
+    ),
     Row(
         "pool_6_harsh_dead_reckoning",
         "`pool` (6, 0.6), harsh sensing, dead reckoning",
@@ -77,11 +87,12 @@ SWEEPS = {
     "robustness": "best --controller bt --grid robustness --episodes 100",
     "dead_reckoning": "best --controller bt --grid dead_reckoning --episodes 100",
 }
-"""options of ``uuv sweep`` by the name of its file; ``pool`` is played by default, the others by ``--only``"""
+"""options of ``uuv sweep`` by the name of its file; ``pool`` is played by default, the others by
+``--only``"""
 BY_DEFAULT = (*(row.name for row in ROWS), "sweep/pool")
 
 
-# ------------------------------------------------------------------------------------------------------------------ results
+# ---------------------------------------------------------------------------------------------------- results
 
 
 def file_of(seed: int, root: Path = ROOT) -> Path:
@@ -90,12 +101,15 @@ def file_of(seed: int, root: Path = ROOT) -> Path:
 
 
 def read(path: Path, seed: int, episodes: int) -> dict[str, Any]:
-    """What was played so far; an empty document where nothing was. Raises ValueError for a file of another seed or number of episodes."""
+    """What was played so far; an empty document where nothing was. Raises ValueError for a file of another
+    seed or number of episodes."""
     if not path.exists():
         return {"schema": 1, "seed": seed, "episodes": episodes, "rows": []}
     document = json.loads(path.read_text(encoding="utf-8"))
     if (document["seed"], document["episodes"]) != (seed, episodes):
-        raise ValueError(f"{path}: holds {document['episodes']} episodes of seed {document['seed']}; give another --out")
+        raise ValueError(
+            f"{path}: holds {document['episodes']} episodes of seed {document['seed']}; give another --out"
+        )
     return document
 
 
@@ -122,11 +136,16 @@ def entry_of(row: Row, command: str, result: dict[str, Any], commit: str, date: 
 
 def _method(method: dict[str, Any]) -> dict[str, Any]:
     kept = {name: method[name] for name in ("episodes", "outcomes", "time_mean_s", "time_to_success_mean_s")}
-    return kept | {"causes": [{"label": cause["label"], "count": cause["count"]} for cause in method.get("causes", [])]}
+    return kept | {
+        "causes": [{"label": cause["label"], "count": cause["count"]} for cause in method.get("causes", [])]
+    }
 
 
 def _pair(pair: dict[str, Any]) -> dict[str, Any]:
-    kept = {name: pair[name] for name in ("a", "b", "both", "only_a", "only_b", "mcnemar_p", "time_difference_mean_s")}
+    kept = {
+        name: pair[name]
+        for name in ("a", "b", "both", "only_a", "only_b", "mcnemar_p", "time_difference_mean_s")
+    }
     a, b = pair["time_a_mean_s"], pair["time_b_mean_s"]
     return kept | {"time_ratio": b / a if a and b else None}
 
@@ -140,21 +159,32 @@ def add(path: Path, document: dict[str, Any], entry: dict[str, Any]) -> None:
 
 
 def commit_of_package(root: Path = ROOT) -> str:
-    """The last commit that changed ``uuvtai/``, with '+' where files of it differ from that: documents may be committed in between."""
+    """The last commit that changed ``uuvtai/``, with '+' where files of it differ from that: documents may be
+    committed in between."""
     commit = _git(root, "log", "-1", "--format=%H", "--", "uuvtai")
     return commit + ("+" if _git(root, "status", "--porcelain", "--untracked-files=no", "uuvtai") else "")
 
 
 def _git(root: Path, *arguments: str) -> str:
-    return subprocess.run(["git", "-C", str(root), *arguments], capture_output=True, text=True, check=True).stdout.strip()
+    return subprocess.run(
+        ["git", "-C", str(root), *arguments], capture_output=True, text=True, check=True
+    ).stdout.strip()
 
 
-# ------------------------------------------------------------------------------------------------------------------ playing
+# ---------------------------------------------------------------------------------------------------- playing
 
 
 def command_of(row: Row, seed: int, episodes: int) -> list[str]:
     """Arguments of ``uuv`` for a row."""
-    return ["eval", *row.methods.split(), *row.options.split(), "--seeds", str(seed), "--episodes", str(episodes)]
+    return [
+        "eval",
+        *row.methods.split(),
+        *row.options.split(),
+        "--seeds",
+        str(seed),
+        "--episodes",
+        str(episodes),
+    ]
 
 
 def _play(row: Row, seed: int, episodes: int, commit: str) -> dict[str, Any]:
@@ -171,7 +201,11 @@ def _sweep(name: str, seed: int) -> None:
     """Play a sweep and write its CSV; a sweep of this seed that was cut off goes on where it was."""
     run = ROOT / f"runs/evaluations_{seed}_sweep_{name}"
     begun = (run / "sweep_request.json").exists()
-    options = ["--resume", str(run)] if begun else [*SWEEPS[name].split(), "--seeds", str(seed), "--run-dir", str(run)]
+    options = (
+        ["--resume", str(run)]
+        if begun
+        else [*SWEEPS[name].split(), "--seeds", str(seed), "--run-dir", str(run)]
+    )
     if not (run / "sweep.json").exists():
         _run(["sweep", *options])
     sweeps.keep(run, name)
@@ -183,7 +217,10 @@ _lock = threading.Lock()
 
 def _run(arguments: list[str]) -> None:
     process = subprocess.Popen(
-        [sys.executable, "-m", "uuvtai", *arguments], cwd=ROOT, env={**os.environ, **ONE_THREAD}, stdout=subprocess.DEVNULL
+        [sys.executable, "-m", "uuvtai", *arguments],
+        cwd=ROOT,
+        env={**os.environ, **ONE_THREAD},
+        stdout=subprocess.DEVNULL,
     )
     with _lock:
         _running.add(process)
@@ -194,11 +231,22 @@ def _run(arguments: list[str]) -> None:
         raise RuntimeError(f"'uuv {' '.join(arguments)}' ended with {code}; its message is above")
 
 
-def play_all(rows: list[Row], sweep_names: list[str], seed: int, document: dict[str, Any], path: Path, commit: str, jobs: int) -> list[str]:
-    """Play rows and sweeps, ``jobs`` at a time; what went wrong, in words. The others are played and kept all the same."""
+def play_all(
+    rows: list[Row],
+    sweep_names: list[str],
+    seed: int,
+    document: dict[str, Any],
+    path: Path,
+    commit: str,
+    jobs: int,
+) -> list[str]:
+    """Play rows and sweeps, ``jobs`` at a time; what went wrong, in words. The others are played and kept all
+    the same."""
     failed: list[str] = []
     with ThreadPoolExecutor(jobs) as pool:
-        waiting: dict[Future[Any], str] = {pool.submit(_play, row, seed, document["episodes"], commit): row.name for row in rows}
+        waiting: dict[Future[Any], str] = {
+            pool.submit(_play, row, seed, document["episodes"], commit): row.name for row in rows
+        }
         waiting |= {pool.submit(_sweep, name, seed): f"sweep/{name}" for name in sweep_names}
         try:
             for future in as_completed(waiting):
@@ -220,11 +268,21 @@ def play_all(rows: list[Row], sweep_names: list[str], seed: int, document: dict[
 
 def main(arguments: list[str] | None = None) -> int:
     """Play what is missing; 1 where a row failed, 130 where it was interrupted, 2 for an unknown name."""
-    parser = argparse.ArgumentParser(prog="python -m docs.writers.evaluations", description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m docs.writers.evaluations", description=(__doc__ or "").split("\n\n")[0]
+    )
     parser.add_argument("--seeds", type=int, required=True, help="the one seed of every row")
-    parser.add_argument("--episodes", type=int, default=EPISODES, help=f"per row and method (default {EPISODES})")
-    parser.add_argument("--only", default="", help=f"names, parted by commas (default: {', '.join(BY_DEFAULT)}; also sweep/NAME)")
-    parser.add_argument("--jobs", type=int, default=2, help="rows played at a time, one thread each (default 2)")
+    parser.add_argument(
+        "--episodes", type=int, default=EPISODES, help=f"per row and method (default {EPISODES})"
+    )
+    parser.add_argument(
+        "--only",
+        default="",
+        help=f"names, parted by commas (default: {', '.join(BY_DEFAULT)}; also sweep/NAME)",
+    )
+    parser.add_argument(
+        "--jobs", type=int, default=2, help="rows played at a time, one thread each (default 2)"
+    )
     parser.add_argument("--out", type=Path, help="results file (default docs/data/evaluations_SEED.json)")
     chosen = parser.parse_args(arguments)
     names = chosen.only.split(",") if chosen.only else list(BY_DEFAULT)
@@ -240,13 +298,21 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     rows = missing(document, tuple(row for row in ROWS if row.name in names), commit)
     wanted = [name.removeprefix("sweep/") for name in names if name.startswith("sweep/")]
-    print(f"{len(rows)} rows and {len(wanted)} sweeps to play, {chosen.jobs} at a time", file=sys.stderr, flush=True)
+    print(
+        f"{len(rows)} rows and {len(wanted)} sweeps to play, {chosen.jobs} at a time",
+        file=sys.stderr,
+        flush=True,
+    )
     try:
         failed = play_all(rows, wanted, chosen.seeds, document, path, commit, chosen.jobs)
     except KeyboardInterrupt:
         print("interrupted; what is played is kept: give the same command again", file=sys.stderr)
         return 130
-    print("\n".join(failed) or f"all played; show them: python -m docs.writers.figures --evaluations {path.name}", file=sys.stderr)
+    print(
+        "\n".join(failed)
+        or f"all played; show them: python -m docs.writers.figures --evaluations {path.name}",
+        file=sys.stderr,
+    )
     return 1 if failed else 0
 
 

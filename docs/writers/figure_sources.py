@@ -1,19 +1,28 @@
-"""Where figures in the text come from: committed results, read by a path such as ``evaluations.pool_6.bt.success_rate``.
+"""Where figures in the text come from: committed results, read by a path such as
+``evaluations.pool_6.bt.success_rate``.
 
-=========================================  ===========================================================================================
-``evaluations.ROW.METHOD.FIELD``           ``docs/data/evaluations_SEED.json`` (the one that ``docs/data/shown.json`` names)
+=========================================
+===========================================================================================
+``evaluations.ROW.METHOD.FIELD``           ``docs/data/evaluations_SEED.json`` (the one that
+``docs/data/shown.json`` names)
 ``evaluations.seed``                       the seed of those
-``sweep.NAME[METHOD;AXIS<=VALUE].FIELD``   ``docs/data/sweep_NAME.csv``, the cells that fit, pooled; ``sweep.NAME.about.KEY``: its entry
+``sweep.NAME[METHOD;AXIS<=VALUE].FIELD``   ``docs/data/sweep_NAME.csv``, the cells that fit, pooled;
+``sweep.NAME.about.KEY``: its entry
                                            in ``docs/data/sweeps.json``
-``bench.WHAT[TEXT].FIELD``                 newest ``benchmarks/results/*_WHAT.json``: the one row whose ``what`` holds TEXT (commas part
-                                           several texts); without brackets a list, for ``min(...)`` and ``max(...)``; FIELD may be
-                                           ``note/PATTERN/``, a number within the note
-``paper.NAME``                             what the paper prints: a constant of ``uuvtai/measure/reproduce/paper.py``
-=========================================  ===========================================================================================
+``bench.WHAT[TEXT].FIELD``                 newest ``benchmarks/results/*_WHAT.json``: the one row whose
+``what`` holds TEXT (commas part
+                                           several texts); without brackets a list, for ``min(...)`` and
+                                           ``max(...)``; FIELD may be ``note/PATTERN/``, a number within the
+                                           note
+``paper.NAME``                             what the paper prints: a constant of
+``uuvtai/measure/reproduce/paper.py``
+=========================================
+===========================================================================================
 
-FIELD of counts is ``success``, ``episodes``, ``success_rate``, ``success_low``, ``success_high``, the same of ``collision`` and of each
-ending, ``success_of`` ("490/500"), ``time_s`` (mean of the successes); of a sweep also ``cells``, ``spotless`` (cells without a collision)
-and ``weighted_success_rate`` (as the paper's 40 conditions). The condition ``moderate`` stands for those over which the paper gives means.
+FIELD of counts is ``success``, ``episodes``, ``success_rate``, ``success_low``, ``success_high``, the same of
+``collision`` and of each ending, ``success_of`` ("490/500"), ``time_s`` (mean of the successes); of a sweep
+also ``cells``, ``spotless`` (cells without a collision) and ``weighted_success_rate`` (as the paper's 40
+conditions). The condition ``moderate`` stands for those over which the paper gives means.
 """
 
 from __future__ import annotations
@@ -33,7 +42,13 @@ from uuvtai.outcomes import COLLIDED
 
 ROOT = Path(__file__).resolve().parents[2]
 COMPARISONS: dict[str, Callable[[Any, Any], bool]] = {"<=": operator.le, ">=": operator.ge, "=": operator.eq}
-_CELL_COUNTS = {"success": "success", "contact": "collision", "ttc_stop": "ttc", "out_of_tank": "out_of_tank", "timeout": "timeout"}
+_CELL_COUNTS = {
+    "success": "success",
+    "contact": "collision",
+    "ttc_stop": "ttc",
+    "out_of_tank": "out_of_tank",
+    "timeout": "timeout",
+}
 """columns of a sweep's CSV and the endings that they count"""
 
 
@@ -64,17 +79,25 @@ class Counts:
             if self.time_s is None:
                 raise SourceError("the times were not kept")
             return self.time_s
-        ending, _, kind = name.partition("_") if not name.startswith("out_of_tank") else ("out_of_tank", "", name[12:])
+        ending, _, kind = (
+            name.partition("_") if not name.startswith("out_of_tank") else ("out_of_tank", "", name[12:])
+        )
         ending = {"collision": "collided", "contact": "collision"}.get(ending, ending)
         k = self.count(ending)
         interval = wilson_interval(k, self.episodes) or (0.0, 1.0)
-        values = {"": k, "rate": k / self.episodes, "low": interval[0], "high": interval[1], "of": f"{k}/{self.episodes}"}
+        values = {
+            "": k,
+            "rate": k / self.episodes,
+            "low": interval[0],
+            "high": interval[1],
+            "of": f"{k}/{self.episodes}",
+        }
         if kind not in values:
             raise SourceError(f"no field {name!r}")
         return values[kind]
 
 
-# -------------------------------------------------------------------------------------------------------------------- files
+# ------------------------------------------------------------------------------------------------------ files
 
 
 class Sources:
@@ -118,14 +141,20 @@ class Sources:
             raise SourceError(f"no results of benchmark {what!r}")
         return self.json(str(found[-1].relative_to(self.root)))
 
-    # ---------------------------------------------------------------------------------------------------------------- paths
+    # -------------------------------------------------------------------------------------------------- paths
 
     def value(self, expression: str) -> Any:
-        """What an expression stands for: a path, or ``min(path)``, ``max(path)`` of a list. Raises SourceError."""
+        """What an expression stands for: a path, or ``min(path)``, ``max(path)`` of a list. Raises
+        SourceError."""
         if call := re.fullmatch(r"(min|max)\((.+)\)", expression):
             return {"min": min, "max": max}[call[1]](self.value(call[2]))
         kind, _, rest = expression.partition(".")
-        readers = {"evaluations": self._of_evaluations, "sweep": self._of_sweep, "bench": self._of_benchmark, "paper": _of_paper}
+        readers = {
+            "evaluations": self._of_evaluations,
+            "sweep": self._of_sweep,
+            "bench": self._of_benchmark,
+            "paper": _of_paper,
+        }
         if kind not in readers:
             raise SourceError(f"{expression!r}: begins with none of {', '.join(readers)}")
         try:
@@ -175,7 +204,9 @@ class Sources:
         texts = [text.strip() for text in parts[2].split(",")]
         found = [row for row in rows if all(text in f"{row['what']} | {row['peer_name']}" for text in texts)]
         if len(found) != 1:
-            raise SourceError(f"{len(found)} rows hold {parts[2]!r}; there are {[row['what'] for row in rows]}")
+            raise SourceError(
+                f"{len(found)} rows hold {parts[2]!r}; there are {[row['what'] for row in rows]}"
+            )
         value = _pick({**found[0], **found[0]["details"]}, parts[3], "field")
         return value if parts[4] is None else _searched(parts[4], str(value))
 
@@ -200,7 +231,7 @@ def _of_paper(name: str) -> Any:
     return getattr(paper, name)
 
 
-# -------------------------------------------------------------------------------------------------------------------- cells
+# ------------------------------------------------------------------------------------------------------ cells
 
 
 MODERATE = ("S<=8", "D<=9", "v_m_s<=1.5")
@@ -210,9 +241,15 @@ MODERATE = ("S<=8", "D<=9", "v_m_s<=1.5")
 def fitting(cells: Sequence[dict[str, str]], conditions: Sequence[str]) -> list[dict[str, str]]:
     """Cells that meet every condition: a method's name, or ``AXIS<=VALUE``, ``AXIS>=VALUE``, ``AXIS=VALUE``.
 
-    An empty cell (nothing moves, nothing is changed) is small: it meets every ``<=``. ``AXIS=`` asks for an empty one.
+    An empty cell (nothing moves, nothing is changed) is small: it meets every ``<=``. ``AXIS=`` asks for an
+    empty one.
     """
-    wanted = [part for condition in conditions for part in (MODERATE if condition == "moderate" else (condition,)) if part]
+    wanted = [
+        part
+        for condition in conditions
+        for part in (MODERATE if condition == "moderate" else (condition,))
+        if part
+    ]
     found = [cell for cell in cells if all(_meets(cell, condition) for condition in wanted)]
     if not found:
         raise SourceError(f"no cell meets {'; '.join(conditions)}")
@@ -232,13 +269,24 @@ def _meets(cell: dict[str, str], condition: str) -> bool:
 
 def pooled(cells: Sequence[dict[str, str]]) -> Counts:
     """All episodes of these cells together; the time is the mean over their successes."""
-    outcomes: dict[str, int | None] = {ending: sum(int(cell[column]) for cell in cells) for column, ending in _CELL_COUNTS.items()}
-    arrived = [(int(cell["success"]), float(cell["time_to_success_mean_s"])) for cell in cells if cell["time_to_success_mean_s"]]
+    outcomes: dict[str, int | None] = {
+        ending: sum(int(cell[column]) for cell in cells) for column, ending in _CELL_COUNTS.items()
+    }
+    arrived = [
+        (int(cell["success"]), float(cell["time_to_success_mean_s"]))
+        for cell in cells
+        if cell["time_to_success_mean_s"]
+    ]
     n = sum(k for k, _ in arrived)
-    return Counts(sum(int(cell["episodes"]) for cell in cells), outcomes, sum(k * t for k, t in arrived) / n if n else None)
+    return Counts(
+        sum(int(cell["episodes"]) for cell in cells),
+        outcomes,
+        sum(k * t for k, t in arrived) / n if n else None,
+    )
 
 
 def weighted(cells: Sequence[dict[str, str]]) -> Counts:
-    """Pooled with a cell in which nothing moves counted once per speed, which makes the paper's 40 conditions of our 32."""
+    """Pooled with a cell in which nothing moves counted once per speed, which makes the paper's 40 conditions
+    of our 32."""
     speeds = len({cell["v_m_s"] for cell in cells if cell["v_m_s"]})
     return pooled([cell for cell in cells for _ in range(1 if cell["v_m_s"] else speeds)])

@@ -1,4 +1,5 @@
-"""Tables in README and docs that are written from committed results; each is named in the text by ``<!-- table: NAME -->``."""
+"""Tables in README and docs that are written from committed results; each is named in the text by ``<!--
+table: NAME -->``."""
 
 from __future__ import annotations
 
@@ -27,7 +28,7 @@ def rated(counts: Counts, ending: str) -> str:
     return f"{100 * counts.field(ending + '_rate'):.1f} % [{low:.1f}, {high:.1f}]"
 
 
-# -------------------------------------------------------------------------------------------------------------- evaluations
+# ------------------------------------------------------------------------------------------------ evaluations
 
 
 def measured(sources: Sources) -> str:
@@ -40,8 +41,10 @@ def measured(sources: Sources) -> str:
     )
     kept = f" {shown['note']}" if "note" in shown else ""
     return (
-        f"Measured here, {shown['episodes']} episodes a row of seed {shown['seed']}, paper sensing, S = 8. This seed {seen}. "
-        f"`python -m docs.writers.evaluations` plays all rows; commands and counts: `docs/data/`. `-` = not played or not kept.{kept}"
+        f"Measured here, {shown['episodes']} episodes a row of seed {shown['seed']}, paper sensing, S = 8. "
+        f"This seed {seen}. "
+        "`python -m docs.writers.evaluations` plays all rows; commands and counts: `docs/data/`. `-` = not "
+        f"played or not kept.{kept}"
     )
 
 
@@ -64,8 +67,18 @@ def _evaluated(entry: dict[str, Any]) -> list[str]:
     name = entry.get("shows", "bt")
     own = methods[name]
     ends = " / ".join(str(own.count(ending)) for ending in ("collision", "ttc", "out_of_tank", "timeout"))
-    others = [f"{100 * methods[other].field('success_rate'):.1f} %" if other in methods else DASH for other in ("planner", "straight")]
-    return [entry["title"], share(own, "success"), rated(own, "collision"), ends, *others, _causes(entry["methods"][name])]
+    others = [
+        f"{100 * methods[other].field('success_rate'):.1f} %" if other in methods else DASH
+        for other in ("planner", "straight")
+    ]
+    return [
+        entry["title"],
+        share(own, "success"),
+        rated(own, "collision"),
+        ends,
+        *others,
+        _causes(entry["methods"][name]),
+    ]
 
 
 def _causes(method: dict[str, Any]) -> str:
@@ -88,24 +101,40 @@ def policy(sources: Sources) -> str:
     rows = []
     for entry in sources.evaluations()["rows"]:
         methods = {name: Counts(m["episodes"], m["outcomes"]) for name, m in entry["methods"].items()}
-        pair = next((p for p in entry["paired"] if {p["a"], p["b"]} == {"bt", "best"} and "only_a" in p), None)
+        pair = next(
+            (p for p in entry["paired"] if {p["a"], p["b"]} == {"bt", "best"} and "only_a" in p), None
+        )
         if pair is None:
             continue
         only = (pair["only_a"], pair["only_b"]) if pair["a"] == "bt" else (pair["only_b"], pair["only_a"])
-        cells = [rated(methods[name], ending) for ending in ("success", "collision") for name in ("bt", "best")]
+        cells = [
+            rated(methods[name], ending) for ending in ("success", "collision") for name in ("bt", "best")
+        ]
         rows.append([entry["title"], *cells, f"{only[0]}, {only[1]}", f"{pair['mcnemar_p']:.2g}"])
     return table(head, rows) if rows else "Not among the evaluations that are shown."
 
 
-# ------------------------------------------------------------------------------------------------------------------- sweeps
+# ----------------------------------------------------------------------------------------------------- sweeps
 
 
 def grid(sources: Sources) -> str:
     """The paper's grid, pooled as the paper pools it, for both methods and both worlds."""
-    head = ["", "success [95 %]", "collision [95 %]", "weighted as the paper's 40 conditions", "cells without a collision"]
+    head = [
+        "",
+        "success [95 %]",
+        "collision [95 %]",
+        "weighted as the paper's 40 conditions",
+        "cells without a collision",
+    ]
     spotless = f"{paper.WITHOUT_COLLISION} of {paper.MODERATE_CONDITIONS}"
     rows = [
-        ["`pool`, S <= 8, D <= 9, v <= 1.5: the paper", f"{paper.MODERATE_SUCCESS}", f"{paper.MODERATE_COLLISION}", "", spotless],
+        [
+            "`pool`, S <= 8, D <= 9, v <= 1.5: the paper",
+            f"{paper.MODERATE_SUCCESS}",
+            f"{paper.MODERATE_COLLISION}",
+            "",
+            spotless,
+        ],
         *_pooled_rows(sources, "pool", "", ("moderate",), True),
         ["`pool`, D <= 3, all S and v: the paper", "", f"below {paper.FEW_MOVERS_COLLISION}", "", ""],
         *_pooled_rows(sources, "pool", "", ("D<=3",)),
@@ -116,7 +145,9 @@ def grid(sources: Sources) -> str:
     return table(head, rows)
 
 
-def _pooled_rows(sources: Sources, sweep: str, title: str, conditions: Sequence[str], is_weighted: bool = False) -> list[list[str]]:
+def _pooled_rows(
+    sources: Sources, sweep: str, title: str, conditions: Sequence[str], is_weighted: bool = False
+) -> list[list[str]]:
     rows = []
     for method in ("bt", "best"):
         cells = fitting(sources.cells(sweep), [method, *conditions])
@@ -124,13 +155,23 @@ def _pooled_rows(sources: Sources, sweep: str, title: str, conditions: Sequence[
         paper_like = weighted(cells) if is_weighted else None
         both = "" if paper_like is None else _both(paper_like, 1)
         counts = pooled(cells)
-        rows.append([f"{title}`{method}`", share(counts, "success"), share(counts, "collision"), both, f"{spotless} of {len(cells)}"])
+        rows.append(
+            [
+                f"{title}`{method}`",
+                share(counts, "success"),
+                share(counts, "collision"),
+                both,
+                f"{spotless} of {len(cells)}",
+            ]
+        )
     return rows
 
 
 def _both(counts: Counts, digits: int = 0) -> str:
     """success / collision in %."""
-    return f"{100 * counts.field('success_rate'):.{digits}f} / {100 * counts.field('collision_rate'):.{digits}f}"
+    return (
+        f"{100 * counts.field('success_rate'):.{digits}f} / {100 * counts.field('collision_rate'):.{digits}f}"
+    )
 
 
 def sweep_commands(sources: Sources) -> str:
@@ -145,7 +186,9 @@ def sweep_commands_alone(sources: Sources) -> str:
 
 def _commands(sources: Sources, names: Sequence[str]) -> str:
     about = sources.json("docs/data/sweeps.json")
-    lines = [f"{about[name]['command']}  # {about[name]['wall_s'] / 60:.0f} min on one thread" for name in names]
+    lines = [
+        f"{about[name]['command']}  # {about[name]['wall_s'] / 60:.0f} min on one thread" for name in names
+    ]
     return "\n".join(["```sh", *lines, "```"])
 
 
@@ -157,8 +200,24 @@ def caution(sources: Sources) -> str:
         own = fitting(cells, [f"teacher.caution={value}"])
         counts = pooled(own)
         name = f"{value} (default)" if value == "1.0" else value
-        rows.append([name, share(counts, "success"), rated(counts, "collision"), _both(weighted(own), 1), f"{counts.time_s:.1f} s"])
-    rows.append(["the paper", f"{100 * paper.MODERATE_SUCCESS:.1f} %", f"{100 * paper.MODERATE_COLLISION:.1f} %", "", ""])
+        rows.append(
+            [
+                name,
+                share(counts, "success"),
+                rated(counts, "collision"),
+                _both(weighted(own), 1),
+                f"{counts.time_s:.1f} s",
+            ]
+        )
+    rows.append(
+        [
+            "the paper",
+            f"{100 * paper.MODERATE_SUCCESS:.1f} %",
+            f"{100 * paper.MODERATE_COLLISION:.1f} %",
+            "",
+            "",
+        ]
+    )
     return table(["caution", "success [95 %]", "collision [95 %]", "weighted", "time to success"], rows)
 
 
@@ -167,8 +226,20 @@ def alone(sources: Sources) -> str:
     found: dict[str, dict[str, Counts]] = {}
     for sweep in ("robustness", "dead_reckoning"):
         for cell in sources.cells(sweep):
-            axes = [name for name in cell if name not in ("method", "episodes", "success", "contact", "ttc_stop", "out_of_tank", "timeout")]
-            told = ", ".join(f"`{name}={cell[name]}`" for name in axes if cell[name] and name != "time_to_success_mean_s") or "nothing"
+            axes = [
+                name
+                for name in cell
+                if name
+                not in ("method", "episodes", "success", "contact", "ttc_stop", "out_of_tank", "timeout")
+            ]
+            told = (
+                ", ".join(
+                    f"`{name}={cell[name]}`"
+                    for name in axes
+                    if cell[name] and name != "time_to_success_mean_s"
+                )
+                or "nothing"
+            )
             found.setdefault(told, {})[cell["method"]] = pooled([cell])
     head = [
         "changed",
@@ -181,7 +252,10 @@ def alone(sources: Sources) -> str:
         "timeouts",
         "time",
     ]
-    return table(head, [[told, *_alone(methods.get("bt")), *_alone(methods.get("best"))] for told, methods in found.items()])
+    return table(
+        head,
+        [[told, *_alone(methods.get("bt")), *_alone(methods.get("best"))] for told, methods in found.items()],
+    )
 
 
 def _alone(counts: Counts | None) -> list[str]:
@@ -191,18 +265,26 @@ def _alone(counts: Counts | None) -> list[str]:
     return [rated(counts, "success"), rated(counts, "collision"), str(counts.count("timeout")), time]
 
 
-# --------------------------------------------------------------------------------------------------------------- benchmarks
+# ------------------------------------------------------------------------------------------------- benchmarks
 
 
 def learning_cost(sources: Sources) -> str:
     """Rates of training beside Stable-Baselines3's."""
     rows = []
     for row in sources.benchmark("learning")["rows"]:
-        sensing = row["what"].partition(" sensing")[0] + (", `ppo.bfloat16=true`" if "bfloat16" in row["what"] else "")
+        sensing = row["what"].partition(" sensing")[0] + (
+            ", `ppo.bfloat16=true`" if "bfloat16" in row["what"] else ""
+        )
         floor = f"{row['floor']:,.0f}: {'met' if row['met'] else 'not met'}"
         us = row["details"]["us_per_env_step"]
         rows.append(
-            [sensing, f"{row['ours']:,.0f}", floor, *(f"{us[k]:.0f} us" for k in ("simulate", "infer", "learn")), f"{row['peer']:,.0f}"]
+            [
+                sensing,
+                f"{row['ours']:,.0f}",
+                floor,
+                *(f"{us[k]:.0f} us" for k in ("simulate", "infer", "learn")),
+                f"{row['peer']:,.0f}",
+            ]
         )
     return table(["sensing", "env-steps/s", "floor", "simulate", "infer", "learn", "Stable-Baselines3"], rows)
 
@@ -213,10 +295,21 @@ def world_model_errors(sources: Sources) -> str:
     for row in sources.benchmark("world_model")["rows"]:
         if row["peer_name"] != "as before":
             continue
-        found = _noted(r"([\d.]+) of its error, 95 % in ([\d.]+) \.\. ([\d.]+); squared standardised residual ([\d.]+)", row)
+        found = _noted(
+            r"([\d.]+) of its error, 95 % in ([\d.]+) \.\. ([\d.]+); squared standardised residual ([\d.]+)",
+            row,
+        )
         unit = "" if row["unit"] == "1" else f" {row['unit']}"
         error, before = (f"{row[side]:.3g}{unit}" for side in ("ours", "peer"))
-        rows.append([row["what"].removeprefix("RMSE "), error, before, f"{found[1]} ({found[2]} .. {found[3]})", found[4]])
+        rows.append(
+            [
+                row["what"].removeprefix("RMSE "),
+                error,
+                before,
+                f"{found[1]} ({found[2]} .. {found[3]})",
+                found[4],
+            ]
+        )
     return table(["targets", "RMSE", '"as before"', "ratio, 95 %", "squared standardised residual"], rows)
 
 
@@ -246,7 +339,8 @@ def _short(value: float) -> str:
 def risk(sources: Sources) -> str:
     """What the risk head knows, beside what stands next to it."""
     brier, ece, auroc, miss = (
-        _row(sources, "world_model", f"risk: {what}") for what in ("Brier score", "ECE", "AUROC", "conformal miss rate")
+        _row(sources, "world_model", f"risk: {what}")
+        for what in ("Brier score", "ECE", "AUROC", "conformal miss rate")
     )
     found = _noted(
         r"(\d+ of \d+) accidents, 95 % in ([\d.]+) \.\. ([\d.]+); promised ([\d.]+) from (\d+) accidents; "
@@ -271,7 +365,9 @@ def risk(sources: Sources) -> str:
 def risk_bins(sources: Sources) -> str:
     """The reliability diagram as numbers."""
     columns = _row(sources, "world_model", "risk: ECE")["details"]["table"]
-    rows = [[name, *(f"{value:.2f}" for value in columns[name].values())] for name in ("predicted", "observed")]
+    rows = [
+        [name, *(f"{value:.2f}" for value in columns[name].values())] for name in ("predicted", "observed")
+    ]
     rows.append(["moments", *(f"{value:.0f}" for value in columns["moments"].values())])
     return table(rows[0], rows[1:])
 

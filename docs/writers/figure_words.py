@@ -1,9 +1,10 @@
 """Which numbers in the text are figures, and which of them do not say where they come from.
 
-A figure is a number with the unit of a result, a count (490/500), an interval ([96.3, 98.9]), success / collision, or a number alone in the
-cell of a table. It is marked by a source (``figures.py``), or it says what else it is: ``60 s<!-- parameter -->`` for the figures before it
-on the line, ``<!-- figures: parameter -->`` on a line of its own for all figures down to the next heading or the next such line.
-Code, addresses and generated tables are not looked at.
+A figure is a number with the unit of a result, a count (490/500), an interval ([96.3, 98.9]), success /
+collision, or a number alone in the cell of a table. It is marked by a source (``figures.py``), or it says
+what else it is: ``60 s<!-- parameter -->`` for the figures before it on the line, ``<!-- figures: parameter
+-->`` on a line of its own for all figures down to the next heading or the next such line. Code, addresses and
+generated tables are not looked at.
 """
 
 from __future__ import annotations
@@ -25,18 +26,30 @@ LOGS = {
 """pages that are logs as a whole, and say so under their title"""
 GENERATED = {"docs/results.md": "python -m docs.writers.reproduction"}
 """pages that are written as a whole; a test compares them with their data"""
-PARAMETER_PAGES = ("docs/deployment.md", "docs/determinism.md", "docs/paper.md", "docs/security.md", "docs/simulator.md", "docs/viewers.md")
-"""pages without results: their seconds, sizes and cells are parameters; a rate there must be marked as anywhere"""
+PARAMETER_PAGES = (
+    "docs/deployment.md",
+    "docs/determinism.md",
+    "docs/paper.md",
+    "docs/security.md",
+    "docs/simulator.md",
+    "docs/viewers.md",
+)
+"""pages without results: their seconds, sizes and cells are parameters; a rate there must be marked as
+anywhere"""
 NOT_KEPT = re.compile(r"raw files? (?:was|were) not kept")
 """what a page with figures of kind ``log`` says"""
 
 _N = r"(?<![\w.,])-?\d+(?:,\d{3})*(?:\.\d+)?"
 RATES = re.compile(
-    rf"{_N}\s?%|(?<![\w./])\d+/\d+(?![\w/])|\[(?!-){_N}\s?%?, {_N}\s?%?\]|{_N} \.\. {_N}|{_N} / {_N}(?![ ]?/|\w)"
-    rf"|{_N} (?!m/s|rad/s)(?:[\w-]+/s\b|times\b|points?\b|x\b(?! \(?\d))|\bp = {_N}|\bAUROC {_N}|{_N} (?:of|against) {_N}"
+    rf"{_N}\s?%|(?<![\w./])\d+/\d+(?![\w/])|\[(?!-){_N}\s?%?, {_N}\s?%?\]|{_N} \.\. {_N}|{_N} / {_N}(?![ "
+    r"]?/|\w)"
+    rf"|{_N} (?!m/s|rad/s)(?:[\w-]+/s\b|times\b|points?\b|x\b(?! \(?\d))|\bp = {_N}|\bAUROC {_N}|{_N} "
+    rf"(?:of|against) {_N}"
 )
 """numbers that are results wherever they stand"""
-SIZES = re.compile(rf"{_N}\s?(?:s|ms|us|ns|min|h|hours?|minutes?|seconds?|kB|MB|GB|MiB|GiB|TiB|core-hours)\b(?!/)")
+SIZES = re.compile(
+    rf"{_N}\s?(?:s|ms|us|ns|min|h|hours?|minutes?|seconds?|kB|MB|GB|MiB|GiB|TiB|core-hours)\b(?!/)"
+)
 """times and amounts of memory; speeds, lengths and angles are the scene's and the vehicle's"""
 CELL = re.compile(rf"^[*†\s]*{_N}(?:[\s/,]+{_N}|\s*\[[^\]]*\])*[*†\s]*$")
 """a cell of a table that holds nothing but numbers"""
@@ -58,7 +71,8 @@ def _blank(found: re.Match[str]) -> str:
 
 
 def unmarked(name: str, text: str) -> Iterator[tuple[int, str]]:
-    """(number of the line, what is wrong) for each figure that says nothing of itself; ``name`` is the page's path."""
+    """(number of the line, what is wrong) for each figure that says nothing of itself; ``name`` is the page's
+    path."""
     if name in GENERATED:
         return
     if name in LOGS:
@@ -79,7 +93,10 @@ def unmarked(name: str, text: str) -> Iterator[tuple[int, str]]:
         if line.startswith("#"):
             told = ""
         if told in ("", "marked"):
-            yield from ((number, f"{figure!r} does not say where it comes from") for figure in _figures(line, name in PARAMETER_PAGES))
+            yield from (
+                (number, f"{figure!r} does not say where it comes from")
+                for figure in _figures(line, name in PARAMETER_PAGES)
+            )
         logged |= "<!-- log" in line
     if logged and not NOT_KEPT.search(" ".join(text.split())):
         yield 1, "has figures of kind 'log', but nowhere says that the raw files were not kept"
@@ -87,28 +104,45 @@ def unmarked(name: str, text: str) -> Iterator[tuple[int, str]]:
 
 def _figures(line: str, rates_alone: bool) -> list[str]:
     """Figures of a line that no comment covers."""
-    comments = [found for found in _COMMENT.finditer(line) if found["text"].startswith("= ") or found["text"].split()[0] in KINDS]
+    comments = [
+        found
+        for found in _COMMENT.finditer(line)
+        if found["text"].startswith("= ") or found["text"].split()[0] in KINDS
+    ]
     plain = _LEVEL.sub(_blank, _SCENE.sub(_blank, _COMMENT.sub(_blank, line)))
     covered = _covered(plain, comments)
-    found = [match for pattern in ((RATES,) if rates_alone else (RATES, SIZES)) for match in pattern.finditer(plain)]
+    found = [
+        match
+        for pattern in ((RATES,) if rates_alone else (RATES, SIZES))
+        for match in pattern.finditer(plain)
+    ]
     loose = [match[0].strip() for match in found if not all(_inside(span, covered) for span in _spans(match))]
     return loose + ([] if rates_alone else _cells(plain, covered))
 
 
 def _covered(plain: str, comments: list[re.Match[str]]) -> list[tuple[int, int]]:
-    """Where the numbers stand that comments speak for: as many as it has expressions, or all since the comment before it."""
+    """Where the numbers stand that comments speak for: as many as it has expressions, or all since the
+    comment before it."""
     covered, begin = [], 0
     for comment in comments:
-        numbers = [(n.start(), n.end()) for n in re.finditer(r"(?<![\w.])-?\d+(?:,\d{3})*(?:\.\d+)?(?:/\d+)?", plain[: comment.start()])]
+        numbers = [
+            (n.start(), n.end())
+            for n in re.finditer(r"(?<![\w.])-?\d+(?:,\d{3})*(?:\.\d+)?(?:/\d+)?", plain[: comment.start()])
+        ]
         numbers = [span for span in numbers if span[0] >= begin]
-        covered += numbers[-len(comment["text"].split(" ; ")) :] if comment["text"].startswith("= ") else numbers
+        covered += (
+            numbers[-len(comment["text"].split(" ; ")) :] if comment["text"].startswith("= ") else numbers
+        )
         begin = comment.end()
     return covered
 
 
 def _spans(match: re.Match[str]) -> list[tuple[int, int]]:
     """Where the numbers of a figure stand."""
-    return [(match.start() + n.start(), match.start() + n.end()) for n in re.finditer(r"\d+(?:,\d{3})*(?:\.\d+)?", match[0])]
+    return [
+        (match.start() + n.start(), match.start() + n.end())
+        for n in re.finditer(r"\d+(?:,\d{3})*(?:\.\d+)?", match[0])
+    ]
 
 
 def _inside(span: tuple[int, int], covered: list[tuple[int, int]]) -> bool:

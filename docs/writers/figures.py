@@ -1,9 +1,11 @@
-"""Figures in README and docs, from committed results: ``python -m docs.writers.figures`` renews them, ``--check`` says what is wrong.
+"""Figures in README and docs, from committed results: ``python -m docs.writers.figures`` renews them,
+``--check`` says what is wrong.
 
-A number ends with an invisible comment that says where it comes from: ``98.0 %<!-- = evaluations.pool_6.bt.success_rate:.1% -->``. A
-comment with N expressions (parted by ``;``) stands for the last N numbers before it. What follows ``:`` is Python's format. Paths are told
-in ``figure_sources.py``. Tables between ``<!-- table: NAME -->`` and ``<!-- end -->`` are written by ``figure_tables.py``. Numbers that are
-no results of ours say what they are, see ``figure_words.py``.
+A number ends with an invisible comment that says where it comes from: ``98.0 %<!-- =
+evaluations.pool_6.bt.success_rate:.1% -->``. A comment with N expressions (parted by ``;``) stands for the
+last N numbers before it. What follows ``:`` is Python's format. Paths are told in ``figure_sources.py``.
+Tables between ``<!-- table: NAME -->`` and ``<!-- end -->`` are written by ``figure_tables.py``. Numbers that
+are no results of ours say what they are, see ``figure_words.py``.
 """
 
 from __future__ import annotations
@@ -19,7 +21,9 @@ from docs.writers.figure_tables import TABLES
 from docs.writers.figure_words import unmarked
 
 MARK = re.compile(r"<!-- = (?P<what>.*?) -->")
-TABLE = re.compile(r"(?P<head><!-- table: (?P<name>\w+) -->\n)(?P<body>.*?)(?P<foot>^<!-- end -->)", re.M | re.S)
+TABLE = re.compile(
+    r"(?P<head><!-- table: (?P<name>\w+) -->\n)(?P<body>.*?)(?P<foot>^<!-- end -->)", re.M | re.S
+)
 NUMBER = re.compile(r"(?<![\w.])-?\d+(?:,\d{3})*(?:\.\d+)?(?:/\d+)?")
 
 
@@ -54,14 +58,17 @@ def _before(text: str, what: str, sources: Sources) -> str:
     values = [shown(part.strip(), sources) for part in what.split(" ; ")]
     numbers = list(NUMBER.finditer(text))[-len(values) :]
     if len(numbers) < len(values):
-        raise SourceError(f"{len(values)} figures are marked by {what!r}, but only {len(numbers)} numbers stand before it")
+        raise SourceError(
+            f"{len(values)} figures are marked by {what!r}, but only {len(numbers)} numbers stand before it"
+        )
     for number, value in reversed(list(zip(numbers, values, strict=True))):
         text = text[: number.start()] + value + text[number.end() :]
     return text
 
 
 def shown(part: str, sources: Sources) -> str:
-    """``path:format`` as it stands in the text; ``%`` formats lose their sign, which the text has with its space."""
+    """``path:format`` as it stands in the text; ``%`` formats lose their sign, which the text has with its
+    space."""
     path, _, form = part.partition(":")
     value = sources.value(path)
     if isinstance(value, str):
@@ -71,11 +78,12 @@ def shown(part: str, sources: Sources) -> str:
     return format(value, form).removesuffix("%")
 
 
-# ------------------------------------------------------------------------------------------------------------------ command
+# ---------------------------------------------------------------------------------------------------- command
 
 
 def faults(path: Path, sources: Sources) -> list[str]:
-    """What is wrong with a page: stale figures and tables, marks that lead nowhere, figures without a mark."""
+    """What is wrong with a page: stale figures and tables, marks that lead nowhere, figures without a
+    mark."""
     text, name = path.read_text(encoding="utf-8"), str(path.relative_to(sources.root))
     try:
         wanted = renewed(text, sources)
@@ -83,7 +91,9 @@ def faults(path: Path, sources: Sources) -> list[str]:
         return [f"{name}: {error}"]
     stale = [
         f"{name}:{number}: is {is_!r}, the results say {should!r}"
-        for number, (is_, should) in enumerate(zip(text.split("\n"), wanted.split("\n"), strict=False), start=1)
+        for number, (is_, should) in enumerate(
+            zip(text.split("\n"), wanted.split("\n"), strict=False), start=1
+        )
         if is_ != should
     ]
     if not stale and text != wanted:
@@ -93,12 +103,18 @@ def faults(path: Path, sources: Sources) -> list[str]:
 
 def main(arguments: list[str] | None = None) -> int:
     """Renew or check; 1 where ``--check`` finds something."""
-    parser = argparse.ArgumentParser(prog="python -m docs.writers.figures", description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m docs.writers.figures", description=(__doc__ or "").split("\n\n")[0]
+    )
     parser.add_argument("--check", action="store_true", help="change nothing, list what is wrong")
-    parser.add_argument("--evaluations", metavar="FILE", help="show these evaluations from now on (a file in docs/data)")
+    parser.add_argument(
+        "--evaluations", metavar="FILE", help="show these evaluations from now on (a file in docs/data)"
+    )
     chosen = parser.parse_args(arguments)
     if chosen.evaluations:
-        (ROOT / "docs/data/shown.json").write_text(json.dumps({"evaluations": Path(chosen.evaluations).name}) + "\n", encoding="utf-8")
+        (ROOT / "docs/data/shown.json").write_text(
+            json.dumps({"evaluations": Path(chosen.evaluations).name}) + "\n", encoding="utf-8"
+        )
     sources, wrong = Sources(), 0
     for path in pages():
         if not chosen.check:

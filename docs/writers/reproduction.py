@@ -1,4 +1,5 @@
-"""A reproduction as a committed page: ``python -m docs.writers.reproduction RUN`` writes ``docs/data/reproduce.json``, ``docs/results.md``.
+"""A reproduction as a committed page: ``python -m docs.writers.reproduction RUN`` writes
+``docs/data/reproduce.json``, ``docs/results.md``.
 
 Without RUN the page is written again from the committed file.
 """
@@ -17,7 +18,19 @@ from uuvtai.report.heatmap import cell_name
 
 DATA, PAGE = "docs/data/reproduce.json", "docs/results.md"
 
-_KEPT = ("schema", "budget", "seed", "notes", "started", "git_sha", "hardware", "commands", "table_main", "claims", "inconsistencies")
+_KEPT = (
+    "schema",
+    "budget",
+    "seed",
+    "notes",
+    "started",
+    "git_sha",
+    "hardware",
+    "commands",
+    "table_main",
+    "claims",
+    "inconsistencies",
+)
 _ENTRY = ("name", "episodes", "outcomes", "time_mean_s", "time_to_success_mean_s")
 """of a method or a cell, what the page needs"""
 
@@ -25,12 +38,20 @@ _ENTRY = ("name", "episodes", "outcomes", "time_mean_s", "time_to_success_mean_s
 def kept(document: dict[str, Any]) -> dict[str, Any]:
     """What the page needs of a ``uuv reproduce --json`` document, small enough to be committed beside it."""
     small = {name: document[name] for name in _KEPT if name in document}
-    small["table_main"] = {name: [_entry(entry) for entry in entries] for name, entries in document["table_main"].items()}
+    small["table_main"] = {
+        name: [_entry(entry) for entry in entries] for name, entries in document["table_main"].items()
+    }
     small["ceilings"] = {"methods": [_entry(entry) for entry in document["ceilings"]["methods"]]}
     small["sweeps"] = {name: _small_sweep(sweep) for name, sweep in document["sweeps"].items()}
     profile = document["profile"]
-    rows = [{"num_envs": row["num_envs"], "env_steps_per_s": row["env_steps_per_s"]} for row in profile["rows"]]
-    small["profile"] = {"paper_latency": profile["paper_latency"], "paper_density": profile["paper_density"], "rows": rows}
+    rows = [
+        {"num_envs": row["num_envs"], "env_steps_per_s": row["env_steps_per_s"]} for row in profile["rows"]
+    ]
+    small["profile"] = {
+        "paper_latency": profile["paper_latency"],
+        "paper_density": profile["paper_density"],
+        "rows": rows,
+    }
     return small
 
 
@@ -41,7 +62,9 @@ def _entry(entry: dict[str, Any]) -> dict[str, Any]:
 def _small_sweep(sweep: dict[str, Any]) -> dict[str, Any]:
     axes = {cell_name(axis) for axis in sweep["axes"]} | {"S", "D", "v_m_s", "method"}
     rest = {name: sweep[name] for name in ("axes", "one_at_a_time", "unchanged") if name in sweep}
-    return rest | {"cells": [{k: cell[k] for k in cell if k in axes or k in _ENTRY} for cell in sweep["cells"]]}
+    return rest | {
+        "cells": [{k: cell[k] for k in cell if k in axes or k in _ENTRY} for cell in sweep["cells"]]
+    }
 
 
 def page(root: Path = ROOT) -> str:
@@ -51,7 +74,9 @@ def page(root: Path = ROOT) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Keep a reproduction and write its page; 1 where the folder is none."""
-    parser = argparse.ArgumentParser(prog="python -m docs.writers.reproduction", description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m docs.writers.reproduction", description=(__doc__ or "").split("\n\n")[0]
+    )
     parser.add_argument("run", type=Path, nargs="?", help="run folder of a finished uuv reproduce")
     chosen = parser.parse_args(arguments)
     if chosen.run:

@@ -1,4 +1,5 @@
-"""A sweep's run folder as a committed file: ``python -m docs.writers.sweeps RUN NAME`` writes ``docs/data/sweep_NAME.csv``.
+"""A sweep's run folder as a committed file: ``python -m docs.writers.sweeps RUN NAME`` writes
+``docs/data/sweep_NAME.csv``.
 
 Counts of every cell go into the CSV; command, seeds, commit, date and machine into ``docs/data/sweeps.json``.
 """
@@ -15,12 +16,19 @@ from typing import Any
 
 from docs.writers.figure_sources import ROOT
 
-ENDINGS = {"success": "success", "contact": "collision", "ttc_stop": "ttc", "out_of_tank": "out_of_tank", "timeout": "timeout"}
+ENDINGS = {
+    "success": "success",
+    "contact": "collision",
+    "ttc_stop": "ttc",
+    "out_of_tank": "out_of_tank",
+    "timeout": "timeout",
+}
 """columns of the CSV and the endings of an episode that they count"""
 
 
 def keep(run: Path, name: str, root: Path = ROOT) -> Path:
-    """Write the CSV and the entry of a finished sweep; the CSV's path. Raises OSError, ValueError or KeyError for another folder."""
+    """Write the CSV and the entry of a finished sweep; the CSV's path. Raises OSError, ValueError or KeyError
+    for another folder."""
     sweep = json.loads((run / "sweep.json").read_text(encoding="utf-8"))
     record = json.loads((run / "run.json").read_text(encoding="utf-8"))
     axes = ["v_m_s" if axis == "v" else axis for axis in sweep["axes"]]
@@ -34,8 +42,12 @@ def keep(run: Path, name: str, root: Path = ROOT) -> Path:
 
 
 def _row(cell: dict[str, Any], axes: list[str], unchanged: dict[str, Any]) -> list[Any]:
-    """One line; an axis at which a sweep of one axis at a time changes nothing is empty, and so is the speed where nothing moves."""
-    held = ["" if cell.get(axis) is None or (axis in unchanged and cell[axis] == unchanged[axis]) else cell[axis] for axis in axes]
+    """One line; an axis at which a sweep of one axis at a time changes nothing is empty, and so is the speed
+    where nothing moves."""
+    held = [
+        "" if cell.get(axis) is None or (axis in unchanged and cell[axis] == unchanged[axis]) else cell[axis]
+        for axis in axes
+    ]
     time = cell["time_to_success_mean_s"]
     return [
         *held,
@@ -73,9 +85,13 @@ def _shown(argv: list[str]) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Keep a sweep; 1 where the folder is none."""
-    parser = argparse.ArgumentParser(prog="python -m docs.writers.sweeps", description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m docs.writers.sweeps", description=(__doc__ or "").split("\n\n")[0]
+    )
     parser.add_argument("run", type=Path, help="run folder of a finished uuv sweep")
-    parser.add_argument("name", help="what the text calls it: pool, gauntlet, caution, robustness, dead_reckoning")
+    parser.add_argument(
+        "name", help="what the text calls it: pool, gauntlet, caution, robustness, dead_reckoning"
+    )
     chosen = parser.parse_args(arguments)
     try:
         print(keep(chosen.run, chosen.name))

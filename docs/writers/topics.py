@@ -46,19 +46,29 @@ def page() -> str:
     """All topics: when and by which schema; then the fields of our own."""
     found = topic_schemas((), (), (), depth_images=True)
     if found.keys() != WHEN.keys():
-        raise ValueError(f"docs/writers/topics.py does not say when these topics are written: {sorted(found.keys() ^ WHEN.keys())}")
+        raise ValueError(
+            "docs/writers/topics.py does not say when these topics are written: "
+            f"{sorted(found.keys() ^ WHEN.keys())}"
+        )
     rows = [[f"`{topic}`", f"{schema['title']}", WHEN[topic]] for topic, schema in found.items()]
     own = {topic: schema for topic, schema in found.items() if schema["title"].startswith("uuv.")}
     parts = [
         "# Log topics",
-        "`uuv eval --record K` writes one MCAP file per episode: JSON messages, zstd chunks, simulation time from 0, SI units, world "
-        "frame z-up, body frame forward-left-up. `foxglove.*` schemas are those of <https://docs.foxglove.dev/docs/sdk/schemas>; our "
-        "own follow below. Attachments: `config.yaml`, `scenario.json`. Metadata: `uuv.run`, `uuv.result`. What opens a log: "
+        "`uuv eval --record K` writes one MCAP file per episode: JSON messages, zstd chunks, simulation time "
+        "from 0, SI units, world "
+        "frame z-up, body frame forward-left-up. `foxglove.*` schemas are those of "
+        "<https://docs.foxglove.dev/docs/sdk/schemas>; our "
+        "own follow below. Attachments: `config.yaml`, `scenario.json`. Metadata: `uuv.run`, `uuv.result`. "
+        "What opens a log: "
         "[viewers](../viewers.md).",
         table(["topic", "schema", "written"], rows),
     ]
     for topic, schema in own.items():
-        parts += [f"## `{schema['title']}`", f"`{topic}`. {schema.get('description', '')}".strip(), *_fields(topic, schema)]
+        parts += [
+            f"## `{schema['title']}`",
+            f"`{topic}`. {schema.get('description', '')}".strip(),
+            *_fields(topic, schema),
+        ]
     return "\n\n".join(parts) + "\n"
 
 

@@ -13,7 +13,9 @@ def thrust_of_rpm(rpm, cfg):
     return 9.81 * cfg.thrust_scale * kgf
 
 
-def control(cfg, gains, dt, command, integral, vel, rate, rpy, wrench_of_thrust, thrust_of_wrench, vel_valid=True):
+def control(
+    cfg, gains, dt, command, integral, vel, rate, rpy, wrench_of_thrust, thrust_of_wrench, vel_valid=True
+):
     """(thrusts (n,) wanted after the limits, new integral (4,)) of the velocity loop."""
     if not vel_valid:
         vel = command[:3]
@@ -21,11 +23,19 @@ def control(cfg, gains, dt, command, integral, vel, rate, rpy, wrench_of_thrust,
     inertia = np.array(cfg.inertia_kg_m2) + np.array(cfg.added_mass[3:])
     up = np.array([-np.sin(rpy[1]), np.sin(rpy[0]) * np.cos(rpy[1]), np.cos(rpy[0]) * np.cos(rpy[1])])
     net = cfg.gravity_m_s2 * (cfg.water_density_kg_m3 * cfg.volume_m3 - cfg.mass_kg)
-    drag = np.array([(cfg.linear_damping[i] + cfg.quadratic_damping[i] * abs(c)) * c for i, c in zip((0, 1, 2, 5), command, strict=True)])
+    drag = np.array(
+        [
+            (cfg.linear_damping[i] + cfg.quadratic_damping[i] * abs(c)) * c
+            for i, c in zip((0, 1, 2, 5), command, strict=True)
+        ]
+    )
     force = np.cross(rate, mass * vel) + drag[:3] - net * up
     moment = np.cross(rate, inertia * rate) + np.cross(vel, mass * vel) + np.array([0, 0, drag[3]])
     error = command - np.array([*vel, rate[2]])
-    kp, ki = np.array([*gains.velocity_gain, gains.yaw_rate_gain]), np.array([*gains.velocity_integral, gains.yaw_rate_integral])
+    kp, ki = (
+        np.array([*gains.velocity_gain, gains.yaw_rate_gain]),
+        np.array([*gains.velocity_integral, gains.yaw_rate_integral]),
+    )
     limit = np.array([*gains.max_force_n, gains.max_moment_n_m])
     asked = np.array([*force, moment[2]]) + kp * error + integral
     given = np.clip(asked, -limit, limit)
@@ -40,6 +50,8 @@ def control(cfg, gains, dt, command, integral, vel, rate, rpy, wrench_of_thrust,
     band = np.array([gains.integral_band_m_s] * 3 + [gains.integral_band_rad_s])
     bound = np.array([gains.max_integral_n] * 3 + [gains.max_integral_n_m])
     starved = (share < 1) | (given != asked)
-    part = np.where(error * integral < 0, 1.0, np.where(starved, 0.0, np.maximum(0, 1 - np.abs(error) / band)))
+    part = np.where(
+        error * integral < 0, 1.0, np.where(starved, 0.0, np.maximum(0, 1 - np.abs(error) / band))
+    )
     new = np.clip(integral + ki * part * error * dt, -bound, bound)
     return share * thrust, np.where(vel_valid | (np.arange(4) == 3), new, integral)

@@ -1,4 +1,5 @@
-"""NumPy float64 oracle of the clean depth camera: every surface of every body on its own, nearest one seen from outside."""
+"""NumPy float64 oracle of the clean depth camera: every surface of every body on its own, nearest one seen
+from outside."""
 
 import numpy as np
 
@@ -18,7 +19,8 @@ def camera_position(scene, env, depth):
 
 
 def z_depths(scene, env, tank, rays, eye):
-    """z-depth [n] along rays from ``eye``, without the limit of range; the eye is outside every body and inside the walls."""
+    """z-depth [n] along rays from ``eye``, without the limit of range; the eye is outside every body and
+    inside the walls."""
     best = walls(eye, rays, tank)
     for body in np.flatnonzero(scene["kind"][env]):
         kind, size, yaw = scene["kind"][env, body], scene["size"][env, body], scene["yaw"][env, body]
@@ -27,7 +29,11 @@ def z_depths(scene, env, tank, rays, eye):
         if kind == SPHERE:
             found = [round_surface(start, d, size[0])]
         elif kind == BOX:
-            found = [flat_face(start, d, axis, side * size[axis], size, False) for axis in range(3) for side in (-1, 1)]
+            found = [
+                flat_face(start, d, axis, side * size[axis], size, False)
+                for axis in range(3)
+                for side in (-1, 1)
+            ]
         else:
             side = round_surface(start[:2], d[:, :2], size[0])
             side[np.abs(start[2] + np.where(np.isinf(side), 0.0, side) * d[:, 2]) > size[2]] = np.inf

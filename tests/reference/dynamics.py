@@ -1,6 +1,7 @@
 """Fossen's equation in float64 with full 6 x 6 matrices and RK4: written apart from the kernel, to check it.
 
-(M_RB + M_A) dnu/dt + C_RB(nu) nu + C_A(nu_r) nu_r + D(nu_r) nu_r + g(eta) = tau; state = (position, rotation matrix, nu).
+(M_RB + M_A) dnu/dt + C_RB(nu) nu + C_A(nu_r) nu_r + D(nu_r) nu_r + g(eta) = tau; state = (position, rotation
+matrix, nu).
 """
 
 from __future__ import annotations
@@ -17,7 +18,14 @@ def cross_matrix(a):
 
 def euler_rotation(roll, pitch, yaw):
     """R_wb of Z-Y-X angles [rad]."""
-    cr, sr, cp, sp, cy, sy = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw)
+    cr, sr, cp, sp, cy, sy = (
+        np.cos(roll),
+        np.sin(roll),
+        np.cos(pitch),
+        np.sin(pitch),
+        np.cos(yaw),
+        np.sin(yaw),
+    )
     z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
     y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
     x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
@@ -32,7 +40,9 @@ def quaternion_rotation(q):
 
 def euler_angles(r):
     """Z-Y-X angles [rad] of R_wb."""
-    return np.array([np.arctan2(r[2, 1], r[2, 2]), -np.arcsin(np.clip(r[2, 0], -1, 1)), np.arctan2(r[1, 0], r[0, 0])])
+    return np.array(
+        [np.arctan2(r[2, 1], r[2, 2]), -np.arcsin(np.clip(r[2, 0], -1, 1)), np.arctan2(r[1, 0], r[0, 0])]
+    )
 
 
 @dataclass
@@ -72,18 +82,33 @@ def nu_dot(body, rotation, nu, wrench, current_w):
     """d nu / dt by solving with the full mass matrix; ``wrench`` may be a function of (rotation, nu)."""
     nu_r = nu - np.concatenate([rotation.T @ current_w, np.zeros(3)])
     up = rotation.T @ np.array([0.0, 0.0, 1.0])
-    restoring = np.concatenate([-(body.buoyancy - body.mass * body.gravity) * up, -np.cross([0, 0, body.height], body.buoyancy * up)])
+    restoring = np.concatenate(
+        [-(body.buoyancy - body.mass * body.gravity) * up, -np.cross([0, 0, body.height], body.buoyancy * up)]
+    )
     damping = (body.linear + body.quadratic * np.abs(nu_r)) * nu_r
     tau = wrench(rotation, nu) if callable(wrench) else wrench
-    right = tau - coriolis_matrix(body.rigid_mass_matrix, nu) @ nu - coriolis_matrix(np.diag(body.added), nu_r) @ nu_r - damping - restoring
+    right = (
+        tau
+        - coriolis_matrix(body.rigid_mass_matrix, nu) @ nu
+        - coriolis_matrix(np.diag(body.added), nu_r) @ nu_r
+        - damping
+        - restoring
+    )
     return np.linalg.solve(body.mass_matrix, right)
 
 
-def simulate(body, seconds, dt=1e-3, wrench=None, current=(0, 0, 0), rpy_deg=(0, 0, 0), nu=None, sample_s=None):
-    """RK4 trajectory: arrays position (n, 3), rpy_deg (n, 3), nu (n, 6), sampled every ``sample_s`` (default: only start and end)."""
+def simulate(
+    body, seconds, dt=1e-3, wrench=None, current=(0, 0, 0), rpy_deg=(0, 0, 0), nu=None, sample_s=None
+):
+    """RK4 trajectory: arrays position (n, 3), rpy_deg (n, 3), nu (n, 6), sampled every ``sample_s`` (default:
+    only start and end)."""
     wrench = np.zeros(6) if wrench is None else wrench if callable(wrench) else np.asarray(wrench, float)
     current = np.asarray(current, float)
-    x = (np.zeros(3), euler_rotation(*np.radians(rpy_deg)), np.zeros(6) if nu is None else np.array(nu, float))
+    x = (
+        np.zeros(3),
+        euler_rotation(*np.radians(rpy_deg)),
+        np.zeros(6) if nu is None else np.array(nu, float),
+    )
     n_step = round(seconds / dt)
     every = n_step if sample_s is None else round(sample_s / dt)
     samples = [x]
@@ -100,7 +125,9 @@ def simulate(body, seconds, dt=1e-3, wrench=None, current=(0, 0, 0), rpy_deg=(0,
         k2 = rate(moved(x, k1, dt / 2))
         k3 = rate(moved(x, k2, dt / 2))
         k4 = rate(moved(x, k3, dt))
-        x = tuple(a + dt / 6 * (p + 2 * q + 2 * r + s) for a, p, q, r, s in zip(x, k1, k2, k3, k4, strict=True))
+        x = tuple(
+            a + dt / 6 * (p + 2 * q + 2 * r + s) for a, p, q, r, s in zip(x, k1, k2, k3, k4, strict=True)
+        )
         u, _, vt = np.linalg.svd(x[1])
         x = (x[0], u @ vt, x[2])
         if step % every == 0:
@@ -114,4 +141,8 @@ def simulate(body, seconds, dt=1e-3, wrench=None, current=(0, 0, 0), rpy_deg=(0,
 
 def energy(body, z, rotation, nu):
     """Kinetic energy of body and added water plus potential of weight and buoyancy [J]."""
-    return 0.5 * nu @ body.mass_matrix @ nu + (body.mass * body.gravity - body.buoyancy) * z - body.buoyancy * body.height * rotation[2, 2]
+    return (
+        0.5 * nu @ body.mass_matrix @ nu
+        + (body.mass * body.gravity - body.buoyancy) * z
+        - body.buoyancy * body.height * rotation[2, 2]
+    )

@@ -9,7 +9,8 @@ from tests.reference.habits import expected_turn_rate
 
 
 def sectors(range_m, doppler_m_s, hit, turned, n_sector, max_range_m, ttc_cap_s):
-    """(range, ttc, closing, valid), each (n_sector,): beams binned by their bearing after a turn of ``turned`` [rad] since."""
+    """(range, ttc, closing, valid), each (n_sector,): beams binned by their bearing after a turn of
+    ``turned`` [rad] since."""
     n_ray = len(range_m)
     position = np.arange(n_ray) * n_sector / n_ray - turned * n_sector / (2 * np.pi)
     sector = np.floor(position + 0.5).astype(int) % n_sector
@@ -56,23 +57,31 @@ def observation(values):
 
 
 def closest_approach(pos, radius, own, vel, dt):
-    """(distance to the surface, time) at the closest approach of two points that move straight between samples; pos (n, 2)."""
+    """(distance to the surface, time) at the closest approach of two points that move straight between
+    samples; pos (n, 2)."""
     t = dt * np.arange(len(pos))
     away = pos - own - np.outer(t, vel)
     course = np.diff(away, axis=0)
     share = np.clip(-(away[:-1] * course).sum(axis=1) / (course**2).sum(axis=1).clip(1e-9), 0, 1)
-    gap = np.linalg.norm(away[:-1] + share[:, None] * course, axis=1) - (radius[:-1] + share * np.diff(radius))
+    gap = np.linalg.norm(away[:-1] + share[:, None] * course, axis=1) - (
+        radius[:-1] + share * np.diff(radius)
+    )
     best = int(np.argmin(gap))
     return gap[best], t[best] + share[best] * dt
 
 
 def bodies(v, n_body, forecast_cfg, tracking, tank, rules):
-    """Columns of the moving bodies of one env, closest approach first, as arrays (n_body, width); ``v`` by 'struct.array'."""
+    """Columns of the moving bodies of one env, closest approach first, as arrays (n_body, width); ``v`` by
+    'struct.array'."""
     yaw, own = v["ego.rpy"][2], v["ego.pos_w"]
     vel = (rotation_wb(*v["ego.rpy"]) @ v["ego.vel_b"])[:2]
     rows = []
     for track in np.flatnonzero(v["forecast.radius_m"][:, 0] >= 0):
-        pos, radius, state = v["forecast.pos_w"][track], v["forecast.radius_m"][track], v["tracks.state"][track]
+        pos, radius, state = (
+            v["forecast.pos_w"][track],
+            v["forecast.radius_m"][track],
+            v["tracks.state"][track],
+        )
         gap, time = closest_approach(pos, radius, own[:2], vel, tracking.forecast_dt_s)
         rate, rate_var = v["tracks.turn_rate"][track], v["tracks.turn_cov"][track, 4]
         water = np.array([v["forecast.above_w"][track] - own[2], own[2] - v["forecast.below_w"][track]])
@@ -91,7 +100,17 @@ def bodies(v, n_body, forecast_cfg, tracking, tank, rules):
         )
     rows = sorted(rows, key=lambda row: row["body_closest"][0])[:n_body]
     widths = {"body_position": 2, "body_velocity": 2, "body_free_water": 2}
-    names = ("valid", "position", "velocity", "turn_rate", "radius", "free_water", "age", "closest", "closest_time")
+    names = (
+        "valid",
+        "position",
+        "velocity",
+        "turn_rate",
+        "radius",
+        "free_water",
+        "age",
+        "closest",
+        "closest_time",
+    )
     out = {f"body_{name}": np.zeros((n_body, widths.get(f"body_{name}", 1))) for name in names}
     for slot, row in enumerate(rows):
         for name, value in row.items():

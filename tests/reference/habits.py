@@ -1,4 +1,5 @@
-"""NumPy float64 oracle of the habits: a list of turns per env, one track at a time. Written from the description of the method."""
+"""NumPy float64 oracle of the habits: a list of turns per env, one track at a time. Written from the
+description of the method."""
 
 from dataclasses import dataclass
 
@@ -22,7 +23,8 @@ def unit(v):
 
 
 def expected_turn_rate(rate, rate_var, cfg, tracking):
-    """Two models of one track: no turn rate, or one from the filter's prior; by Bayes' rule with the densities of 0."""
+    """Two models of one track: no turn rate, or one from the filter's prior; by Bayes' rule with the
+    densities of 0."""
     if not cfg.use_turn_rate or rate_var == 0:
         return 0.0
     prior = np.exp(0.0) / tracking.turn_rate_sigma_rad_s
@@ -37,7 +39,8 @@ def is_straight(x, P, rate, rate_var):
 
 
 def corner(p0, d0, p1, d1, way):
-    """(corner, misfit, way before it, way after it): least squares of p0 + a d0 = p1 - b d1 with a + b = way."""
+    """(corner, misfit, way before it, way after it): least squares of p0 + a d0 = p1 - b d1 with a + b =
+    way."""
     # unknown: s = a - b; p1 - p0 = way / 2 (d0 + d1) + s / 2 (d0 - d1)
     s = np.linalg.lstsq(0.5 * (d0 - d1)[:, None], p1 - p0 - 0.5 * way * (d0 + d1), rcond=None)[0][0]
     a, b = 0.5 * (way + s), 0.5 * (way - s)
@@ -46,7 +49,8 @@ def corner(p0, d0, p1, d1, way):
 
 
 def learn(turns, next_slot, leg, leg_time, x, now, cfg):
-    """A track on a straight leg at state x; ``leg`` is its last straight state at ``leg_time`` [s] or None. Returns the next slot."""
+    """A track on a straight leg at state x; ``leg`` is its last straight state at ``leg_time`` [s] or None.
+    Returns the next slot."""
     if leg is None or now - leg_time >= LONGEST_S:
         return next_slot
     d0, d1 = unit(leg[2:]), unit(x[2:])
@@ -54,10 +58,16 @@ def learn(turns, next_slot, leg, leg_time, x, now, cfg):
         moved = np.hypot(*x[2:]) * (now - leg_time)
         for turn in turns:
             along, across = offset(turn, x[:2], d1)
-            if turn.weight > 0 and -cfg.passed_m - moved <= along < -cfg.passed_m and across < 0.5 * cfg.across_m:
+            if (
+                turn.weight > 0
+                and -cfg.passed_m - moved <= along < -cfg.passed_m
+                and across < 0.5 * cfg.across_m
+            ):
                 turn.weight -= 1
         return next_slot
-    pos, misfit, a, b = corner(leg[:2], d0, x[:2], d1, 0.5 * (np.hypot(*leg[2:]) + np.hypot(*x[2:])) * (now - leg_time))
+    pos, misfit, a, b = corner(
+        leg[:2], d0, x[:2], d1, 0.5 * (np.hypot(*leg[2:]) + np.hypot(*x[2:])) * (now - leg_time)
+    )
     if misfit >= MISFIT_M or min(a, b) <= -MISFIT_M:
         return next_slot
     for turn in turns:
@@ -75,7 +85,11 @@ def learn(turns, next_slot, leg, leg_time, x, now, cfg):
 def offset(turn, pos, course):
     """(way ahead, distance aside) of a turn; never beside where it is taken on another course."""
     off = turn.pos - pos
-    across = abs(off[0] * course[1] - off[1] * course[0]) if turn.came @ course > ALIKE_COS and turn.weight > 0 else 1e9
+    across = (
+        abs(off[0] * course[1] - off[1] * course[0])
+        if turn.came @ course > ALIKE_COS and turn.weight > 0
+        else 1e9
+    )
     return off @ course, across
 
 

@@ -1,6 +1,8 @@
-"""Recompute what a log claims, from the log alone: ``python log_alone.py episode.mcap`` prints how far its figures are from ours.
+"""Recompute what a log claims, from the log alone: ``python log_alone.py episode.mcap`` prints how far its
+figures are from ours.
 
-Written from scenario.json's ``formulas`` and config.yaml as an outsider would, in float64; it knows the file and nothing of uuvtai.
+Written from scenario.json's ``formulas`` and config.yaml as an outsider would, in float64; it knows the file
+and nothing of uuvtai.
 """
 
 import base64
@@ -26,7 +28,9 @@ class Log:
             self.metadata = {record.name: record.metadata for record in reader.iter_metadata()}
             attachments = {record.name: record.data for record in reader.iter_attachments()}
             for _, channel, message in reader.iter_messages():
-                self.messages[channel.topic].append((message.log_time, json.loads(message.data, parse_constant=refuse)))
+                self.messages[channel.topic].append(
+                    (message.log_time, json.loads(message.data, parse_constant=refuse))
+                )
         self.config_text = attachments["config.yaml"]
         self.config = yaml.safe_load(self.config_text)
         self.scenario = json.loads(attachments["scenario.json"])
@@ -53,7 +57,7 @@ def refuse(name):
     raise ValueError(f"{name} is not a finite number")
 
 
-# --------------------------------------------------------------------------------------------------------------------- truth
+# ------------------------------------------------------------------------------------------------------ truth
 
 
 def rotations(quat):
@@ -100,7 +104,7 @@ def body_motion(body, times):
     return pos, vel
 
 
-# --------------------------------------------------------------------------------------------------------------------- sonar
+# ------------------------------------------------------------------------------------------------------ sonar
 
 
 def wall_ranges(tank, x, y, ux, uy):
@@ -116,7 +120,8 @@ def wall_ranges(tank, x, y, ux, uy):
 
 
 def outline_ranges(body, yaw, rel, slope, ux, uy):
-    """[m] to the horizontal outline of a body whose centre lies at ``rel`` (n, 3) from the sonar; inf where a beam misses it."""
+    """[m] to the horizontal outline of a body whose centre lies at ``rel`` (n, 3) from the sonar; inf where a
+    beam misses it."""
     size, far = body["size"], np.hypot(rel[:, 0], rel[:, 1])
     if body["kind"] == "box":
         c, s = math.cos(yaw), math.sin(yaw)
@@ -125,7 +130,10 @@ def outline_ranges(body, yaw, rel, slope, ux, uy):
             middle = (rel[:, 0] * axis_x + rel[:, 1] * axis_y)[:, None]
             with np.errstate(divide="ignore"):
                 one, other = (np.add(middle, side * half) / (ux * axis_x + uy * axis_y) for side in (-1, 1))
-            enter, leave = np.maximum(enter, np.minimum(one, other)), np.minimum(leave, np.maximum(one, other))
+            enter, leave = (
+                np.maximum(enter, np.minimum(one, other)),
+                np.minimum(leave, np.maximum(one, other)),
+            )
     else:
         squared = np.full(len(rel), size[0] ** 2)
         if body["kind"] == "sphere":
@@ -144,7 +152,9 @@ def recast(log):
     scenario, sonar, truth = log.scenario, log.config["sensors"]["sonar"], vehicle(log)
     steps = np.array([log.stamp_step(data) for _, data in log.messages["/sonar/scan"]])
     pos, vel, R = truth.pos[steps], truth.vel[steps], truth.R[steps]
-    bearing = np.arctan2(R[:, 1, 0], R[:, 0, 0])[:, None] + 2 * np.pi * np.arange(sonar["n_ray"]) / sonar["n_ray"]
+    bearing = (
+        np.arctan2(R[:, 1, 0], R[:, 0, 0])[:, None] + 2 * np.pi * np.arange(sonar["n_ray"]) / sonar["n_ray"]
+    )
     ux, uy = np.cos(bearing), np.sin(bearing)
     slope = math.tan(math.radians(sonar["vertical_half_aperture_deg"]))
     best, away = wall_ranges(scenario["tank"], pos[:, :1], pos[:, 1:2], ux, uy), np.zeros_like(ux)
@@ -160,7 +170,8 @@ def recast(log):
 
 
 def sonar_figures(log, gate_m):
-    """Residuals of every return that lies within ``gate_m`` of the recast one; the others, and wrong hits and misses, count as edges."""
+    """Residuals of every return that lies within ``gate_m`` of the recast one; the others, and wrong hits and
+    misses, count as edges."""
     true_range, true_doppler, moves = recast(log)
     told, hit = log.column("/sonar/scan", "ranges"), log.column("/sonar/scan", "intensities") > 0
     reach = log.config["sensors"]["sonar"]["max_range_m"]
@@ -186,13 +197,15 @@ def sonar_figures(log, gate_m):
     }
 
 
-# ----------------------------------------------------------------------------------------------------------------------- map
+# -------------------------------------------------------------------------------------------------------- map
 
 
 def grid_values(data):
     """``value`` of every cell (n_row, n_col)."""
     offset = next(field["offset"] for field in data["fields"] if field["name"] == "value")
-    raw = np.frombuffer(base64.b64decode(data["data"]), np.uint8).reshape(-1, data["column_count"], data["cell_stride"])
+    raw = np.frombuffer(base64.b64decode(data["data"]), np.uint8).reshape(
+        -1, data["column_count"], data["cell_stride"]
+    )
     return np.ascontiguousarray(raw[:, :, offset : offset + 4]).view("<f4")[:, :, 0].astype(float)
 
 
@@ -209,19 +222,27 @@ class Mapper:
 
     def __init__(self, log):
         self.log, self.tank = log, log.scenario["tank"]
-        self.m, self.sonar, self.depth = log.config["mapping"], log.config["sensors"]["sonar"], log.config["sensors"]["depth"]
+        self.m, self.sonar, self.depth = (
+            log.config["mapping"],
+            log.config["sensors"]["sonar"],
+            log.config["sensors"]["depth"],
+        )
         self.tracking = log.config["tracking"]
         first = log.messages["/map/static"][0][1]
         self.cell = first["cell_size"]["x"]
         self.origin = np.array([first["pose"]["position"][axis] for axis in "xy"])
         shape = grid_values(first).shape
-        centre_y, centre_x = ((np.arange(n) + 0.5) * self.cell + low for n, low in zip(shape, self.origin[::-1], strict=True))
+        centre_y, centre_x = (
+            (np.arange(n) + 0.5) * self.cell + low for n, low in zip(shape, self.origin[::-1], strict=True)
+        )
         self.outside = wall_gap(self.tank, centre_x[None, :], centre_y[:, None]) < 0
         self.static, self.dynamic = np.zeros(shape), np.zeros(shape)
         self.free_scans, self.dynamic_scans = np.zeros(shape, int), np.zeros(shape, int)
         self.depth_mark = np.zeros(shape, bool)
         self.last_mapped = self.last_tracked = None
-        scan_steps = self.sonar["period_steps"] * math.ceil(self.m["period_steps"] / self.sonar["period_steps"])
+        scan_steps = self.sonar["period_steps"] * math.ceil(
+            self.m["period_steps"] / self.sonar["period_steps"]
+        )
         self.period = scan_steps * log.dt
         self.depth_period = max(self.period, self.depth["period_steps"] * log.dt)
         poses = log.messages["/pose_estimate"]
@@ -238,9 +259,13 @@ class Mapper:
         for step in range(len(self.pos)):
             if step in lines:
                 self.mark_depth(lines[step])
-            if step in scans and (self.last_tracked is None or step - self.last_tracked >= self.tracking["period_steps"]):
+            if step in scans and (
+                self.last_tracked is None or step - self.last_tracked >= self.tracking["period_steps"]
+            ):
                 self.last_tracked = step
-            if step in scans and (self.last_mapped is None or step - self.last_mapped >= self.m["period_steps"]):
+            if step in scans and (
+                self.last_mapped is None or step - self.last_mapped >= self.m["period_steps"]
+            ):
                 self.fold(scans[step], dopplers[step], tracked.get(step, []))
                 self.last_mapped = step
             found[step] = self.static, self.dynamic
@@ -248,7 +273,10 @@ class Mapper:
 
     def cells(self, x, y):
         """(row, column) of points, and which of them lie in the tank's cells."""
-        row, col = (np.floor((v - low) / self.cell).astype(int) for v, low in ((y, self.origin[1]), (x, self.origin[0])))
+        row, col = (
+            np.floor((v - low) / self.cell).astype(int)
+            for v, low in ((y, self.origin[1]), (x, self.origin[0]))
+        )
         on = (row >= 0) & (row < self.outside.shape[0]) & (col >= 0) & (col < self.outside.shape[1])
         row, col = np.where(on, row, 0), np.where(on, col, 0)
         return row, col, on & ~self.outside[row, col]
@@ -257,7 +285,10 @@ class Mapper:
         step, d = self.log.stamp_step(line), self.depth
         column, row, z = (np.array(line[key], float) for key in ("column", "row", "depth"))
         focal = d["cols"] / 2 / math.tan(math.radians(d["fov_deg"] / 2))
-        ray = np.stack([np.ones_like(z), (d["cols"] / 2 - 0.5 - column) / focal, (d["rows"] / 2 - 0.5 - row) / focal], axis=-1)
+        ray = np.stack(
+            [np.ones_like(z), (d["cols"] / 2 - 0.5 - column) / focal, (d["rows"] / 2 - 0.5 - row) / focal],
+            axis=-1,
+        )
         point = self.pos[step] + (np.array(d["offset_b_m"]) + z[:, None] * ray) @ self.R[step].T
         row, col, counts = self.cells(point[:, 0], point[:, 1])
         self.depth_mark[row[counts], col[counts]] = True
@@ -271,7 +302,9 @@ class Mapper:
         beams = SimpleNamespace(
             range=np.array(scan["ranges"]),
             hit=np.array(scan["intensities"]) > 0,
-            through=np.array(doppler["velocity"]) + np.cos(angle) * doppler["own_velocity"][0] + np.sin(angle) * doppler["own_velocity"][1],
+            through=np.array(doppler["velocity"])
+            + np.cos(angle) * doppler["own_velocity"][0]
+            + np.sin(angle) * doppler["own_velocity"][1],
             tracked=np.isin(np.arange(n), tracked),
             ux=np.cos(bearing),
             uy=np.sin(bearing),
@@ -280,7 +313,9 @@ class Mapper:
         )
         beams.wall = wall_ranges(self.tank, beams.x, beams.y, beams.ux, beams.uy)
         beams.sigma = self.sonar["range_sigma_m"] + self.sonar["range_sigma_slope"] * beams.range
-        beams.spread = np.sqrt(beams.sigma**2 + self.sonar["range_jitter_m"] ** 2 + self.sonar["range_quantum_m"] ** 2 / 12)
+        beams.spread = np.sqrt(
+            beams.sigma**2 + self.sonar["range_jitter_m"] ** 2 + self.sonar["range_quantum_m"] ** 2 / 12
+        )
         if self.last_tracked == step:  # a valid reading between tracked scans is taken as it is
             beams.through = beams.through - self.slip(beams)
         static_hit, moving_hit = self.returns(beams)
@@ -304,8 +339,12 @@ class Mapper:
         self.depth_mark = np.zeros_like(self.depth_mark)
 
     def slip(self, b):
-        """[m/s] along every beam: the error of the own velocity by which the known walls would move; a prior keeps it small."""
-        near = wall_gap(self.tank, b.x + b.range * b.ux, b.y + b.range * b.uy) < self.tracking["wall_margin_m"] + 2 * b.spread
+        """[m/s] along every beam: the error of the own velocity by which the known walls would move; a prior
+        keeps it small."""
+        near = (
+            wall_gap(self.tank, b.x + b.range * b.ux, b.y + b.range * b.uy)
+            < self.tracking["wall_margin_m"] + 2 * b.spread
+        )
         wall, sigma = b.hit & near, max(self.sonar["doppler_sigma_m_s"], 0.01)
         u = np.stack([b.ux, b.uy], 1)
         prior = (sigma / self.tracking["own_speed_sigma_m_s"]) ** 2 * np.eye(2)
@@ -315,9 +354,14 @@ class Mapper:
         silent = min(self.m["free_range_m"], self.sonar["max_range_m"])
         reach = np.maximum(np.where(b.hit, b.range - self.cell - b.sigma, silent), 0)
         legs, between = np.minimum(reach, np.roll(reach, -1)), 2 * np.pi / len(reach)
-        y, x = ((np.arange(n) + 0.5) * self.cell + low for n, low in zip(self.outside.shape, self.origin[::-1], strict=True))
+        y, x = (
+            (np.arange(n) + 0.5) * self.cell + low
+            for n, low in zip(self.outside.shape, self.origin[::-1], strict=True)
+        )
         dx, dy = np.broadcast_arrays(x[None, :] - b.x, y[:, None] - b.y)
-        beam = np.floor((np.arctan2(dy, dx) - math.atan2(b.uy[0], b.ux[0])) / between).astype(int) % len(reach)
+        beam = np.floor((np.arctan2(dy, dx) - math.atan2(b.uy[0], b.ux[0])) / between).astype(int) % len(
+            reach
+        )
         after = (beam + 1) % len(reach)
         # the far side of the triangle is at right angles to the line halfway between its beams
         ahead = (dx * (b.ux[beam] + b.ux[after]) + dy * (b.uy[beam] + b.uy[after])) / 2
@@ -329,13 +373,19 @@ class Mapper:
         error = 3 * (b.sigma + s["range_jitter_m"]) + s["range_quantum_m"]
         x, y = b.x + b.range * b.ux, b.y + b.range * b.uy
         row, col, inside = self.cells(x, y)
-        counts = b.hit & inside & (wall_gap(self.tank, x, y) >= m["wall_margin_m"]) & (b.range <= b.wall - error)
+        counts = (
+            b.hit & inside & (wall_gap(self.tank, x, y) >= m["wall_margin_m"]) & (b.range <= b.wall - error)
+        )
         moves = (np.abs(b.through) > max(m["doppler_evidence_m_s"], 3 * s["doppler_sigma_m_s"])) | b.tracked
-        confident, promote = (math.ceil(m[key] / self.period - 1e-6) for key in ("free_confident_s", "promote_s"))
+        confident, promote = (
+            math.ceil(m[key] / self.period - 1e-6) for key in ("free_confident_s", "promote_s")
+        )
         against = (self.free_scans >= confident) | ((self.dynamic_scans > 0) & (self.dynamic_scans < promote))
         for i in np.flatnonzero(counts & ~moves & against[row, col]):
             reach = min(4, 1 + int((2 * math.pi / s["n_ray"] * b.range[i] + error[i]) / self.cell))
-            near = self.static[max(row[i] - reach, 0) : row[i] + reach + 1, max(col[i] - reach, 0) : col[i] + reach + 1]
+            near = self.static[
+                max(row[i] - reach, 0) : row[i] + reach + 1, max(col[i] - reach, 0) : col[i] + reach + 1
+            ]
             moves[i] = not np.any(near >= m["occupied"])
         static_hit, moving_hit = np.zeros_like(self.outside), np.zeros_like(self.outside)
         static_hit[row[counts & ~moves], col[counts & ~moves]] = True
@@ -362,7 +412,10 @@ def map_figures(log, same):
         grids = [(log.step(time), grid_values(data)) for time, data in log.messages[f"/map/{name}"]]
         wrong = [np.abs(values - redone[step][i]) > same for step, values in grids]
         touched = [(values > 0) | (redone[step][i] > 0) for step, values in grids]
-        sides = [(values >= mapper.m["occupied"]) != (redone[step][i] >= mapper.m["occupied"]) for step, values in grids]
+        sides = [
+            (values >= mapper.m["occupied"]) != (redone[step][i] >= mapper.m["occupied"])
+            for step, values in grids
+        ]
         found[name] = {
             "grids": len(grids),
             "touched_cells": int(np.sum(touched)),
@@ -377,8 +430,12 @@ def map_figures(log, same):
 
 
 def clearance_figures(log, mapper, redone):
-    """/map/clearance against the distance transform of the logged map of its time, where there is one, and of the redone map always."""
-    maps = {log.step(time): (grid_values(data), grid_values(other)) for (time, data), (_, other) in layer_pairs(log)}
+    """/map/clearance against the distance transform of the logged map of its time, where there is one, and of
+    the redone map always."""
+    maps = {
+        log.step(time): (grid_values(data), grid_values(other))
+        for (time, data), (_, other) in layer_pairs(log)
+    }
     worst, from_logged, other_sites, cells = 0.0, 0, 0, 0
     for _, data in log.messages["/map/clearance"]:
         step, told = log.stamp_step(data), grid_values(data)
@@ -389,7 +446,12 @@ def clearance_figures(log, mapper, redone):
         other_sites += int(np.sum(np.abs(told - mapper.clearance(*redone[step])) > 1e-5))
     c = log.config["clearance"]
     risk = [
-        grid_values(risk) - (c["risk_static"] * static + c["risk_dynamic"] * dynamic + c["risk_clearance"] / (told + c["risk_epsilon_m"]))
+        grid_values(risk)
+        - (
+            c["risk_static"] * static
+            + c["risk_dynamic"] * dynamic
+            + c["risk_clearance"] / (told + c["risk_epsilon_m"])
+        )
         for (_, risk), (_, near), (static, dynamic) in zip(
             log.messages["/map/risk"], log.messages["/map/clearance"], maps.values(), strict=True
         )
@@ -408,18 +470,26 @@ def layer_pairs(log):
     return zip(log.messages["/map/static"], log.messages["/map/dynamic"], strict=True)
 
 
-# -------------------------------------------------------------------------------------------------------------------- camera
+# ----------------------------------------------------------------------------------------------------- camera
 
 
 def camera_figures(log, same_m):
-    """Pixels of every third image against the depth at which a ray marched through the true world meets something."""
+    """Pixels of every third image against the depth at which a ray marched through the true world meets
+    something."""
     truth, depth = vehicle(log), log.config["sensors"]["depth"]
     focal = depth["cols"] / 2 / math.tan(math.radians(depth["fov_deg"] / 2))
     error, rise = [], []
     for _, line in log.messages["/camera/line"][::3]:
         step = log.stamp_step(line)
         column, row, z = (np.array(line[key], float) for key in ("column", "row", "depth"))
-        ray = np.stack([np.ones_like(z), (depth["cols"] / 2 - 0.5 - column) / focal, (depth["rows"] / 2 - 0.5 - row) / focal], axis=-1)
+        ray = np.stack(
+            [
+                np.ones_like(z),
+                (depth["cols"] / 2 - 0.5 - column) / focal,
+                (depth["rows"] / 2 - 0.5 - row) / focal,
+            ],
+            axis=-1,
+        )
         length = np.linalg.norm(ray, axis=1)
         eye = truth.R[step] @ np.array(depth["offset_b_m"])
         ray = ray @ truth.R[step].T
@@ -436,7 +506,10 @@ def camera_figures(log, same_m):
 
 def marched(log, start, unit, time):
     """[m] along unit vectors to the nearest body or side wall: as far as nothing can be, again and again."""
-    along, bodies = np.zeros(len(unit)), [(body, body_motion(body, np.array([time]))[0][0]) for body in log.scenario["bodies"]]
+    along, bodies = (
+        np.zeros(len(unit)),
+        [(body, body_motion(body, np.array([time]))[0][0]) for body in log.scenario["bodies"]],
+    )
     for _ in range(100):
         point = start + along[:, None] * unit
         room = wall_gap(log.scenario["tank"], point[:, 0], point[:, 1])
@@ -446,7 +519,7 @@ def marched(log, start, unit, time):
     return along
 
 
-# -------------------------------------------------------------------------------------------------------------------- safety
+# ----------------------------------------------------------------------------------------------------- safety
 
 
 def own_axes(body):
@@ -462,11 +535,14 @@ def core_distance(body, q):
         return np.linalg.norm(q, axis=1) - size[0]
     if body["kind"] == "box":
         return np.linalg.norm(np.maximum(np.abs(q) - size, 0), axis=1)
-    return np.hypot(np.maximum(np.hypot(q[:, 0], q[:, 1]) - size[0], 0), np.maximum(np.abs(q[:, 2]) - size[2], 0))
+    return np.hypot(
+        np.maximum(np.hypot(q[:, 0], q[:, 1]) - size[0], 0), np.maximum(np.abs(q[:, 2]) - size[2], 0)
+    )
 
 
 def hull_distance(hull, body, rel, axis):
-    """[m] from the hull's surface to a body; rel (n, 3) = hull's centre seen from the body's. Ternary search along the hull's axis."""
+    """[m] from the hull's surface to a body; rel (n, 3) = hull's centre seen from the body's. Ternary search
+    along the hull's axis."""
     rel, axis = rel @ own_axes(body).T, axis @ own_axes(body).T
     low, high = np.full(len(rel), -hull["hull_half_length_m"]), np.full(len(rel), hull["hull_half_length_m"])
     for _ in range(40):
@@ -477,7 +553,8 @@ def hull_distance(hull, body, rel, axis):
 
 
 def threats(log):
-    """(clearance [m] to bodies and side walls, time to collision [s] with inf = none, whether a closing speed is at its threshold)."""
+    """(clearance [m] to bodies and side walls, time to collision [s] with inf = none, whether a closing speed
+    is at its threshold)."""
     truth, hull, rules = vehicle(log), log.config["vehicle"], log.config["episode"]
     times = np.arange(len(truth.pos)) * log.dt
     axis, spin = truth.R[:, :, 0], np.cross(truth.rates, truth.R[:, :, 0])
@@ -489,9 +566,12 @@ def threats(log):
         pos, vel = body_motion(body, times)
         rel, drift = truth.pos - pos, truth.vel - vel
         gap = hull_distance(hull, body, rel, axis)
-        # a little later and a little earlier along the present motion: no formula for nearest points or normals
+        # a little later and a little earlier along the present motion: no formula for nearest points or
+        # normals
         blink = 1e-5
-        later, earlier = (hull_distance(hull, body, rel + t * drift, axis + t * spin) for t in (blink, -blink))
+        later, earlier = (
+            hull_distance(hull, body, rel + t * drift, axis + t * spin) for t in (blink, -blink)
+        )
         closing = (earlier - later) / (2 * blink)
         clearance = np.minimum(clearance, gap)
         closes = closing > rules["ttc_closing_m_s"]
@@ -502,7 +582,12 @@ def threats(log):
 
 def outcome(log, clearance, ttc):
     """(name, step) of the first rule that holds."""
-    truth, tank, hull, rules = vehicle(log), log.scenario["tank"], log.config["vehicle"], log.config["episode"]
+    truth, tank, hull, rules = (
+        vehicle(log),
+        log.scenario["tank"],
+        log.config["vehicle"],
+        log.config["episode"],
+    )
     z_low, z_high = tank["z_m"]
     for step in range(1, len(truth.pos)):
         x, y, z = truth.pos[step]
@@ -549,7 +634,10 @@ def obstacle_error(log):
     for i, body in enumerate(log.scenario["bodies"]):
         pos, vel = body_motion(body, times)
         told = np.array(
-            [[data["obstacles"][i][key] for key in ("x", "y", "z", "vx", "vy", "vz")] for _, data in log.messages["/obstacles/truth"]]
+            [
+                [data["obstacles"][i][key] for key in ("x", "y", "z", "vx", "vy", "vz")]
+                for _, data in log.messages["/obstacles/truth"]
+            ]
         )
         place = max(place, float(np.abs(told[:, :3] - pos).max()))
         # at a corner of a path either direction is right

@@ -1,4 +1,5 @@
-"""A synthetic episode for the tests of logs and pictures: plain NumPy, no simulator. A vehicle passes resting and moving bodies."""
+"""A synthetic episode for the tests of logs and pictures: plain NumPy, no simulator. A vehicle passes resting
+and moving bodies."""
 
 from __future__ import annotations
 
@@ -22,9 +23,30 @@ NODES = ("Root", "Emergency", "Back off", "Evade", "Follow", "Follow")
 START, GOAL = (2.0, 1.5, -0.8), (17.0, 4.5, -0.8)
 
 BODIES = [
-    {"slot": 0, "kind": "cylinder", "position": [6.0, 3.6, -0.8], "size": [0.35, 0.35, 0.8], "yaw": 0.0, "path": None},
-    {"slot": 1, "kind": "box", "position": [10.0, 1.5, -0.8], "size": [0.5, 0.3, 0.8], "yaw": 0.6, "path": None},
-    {"slot": 2, "kind": "cylinder", "position": [13.5, 4.6, -0.8], "size": [0.25, 0.25, 0.8], "yaw": 0.0, "path": None},
+    {
+        "slot": 0,
+        "kind": "cylinder",
+        "position": [6.0, 3.6, -0.8],
+        "size": [0.35, 0.35, 0.8],
+        "yaw": 0.0,
+        "path": None,
+    },
+    {
+        "slot": 1,
+        "kind": "box",
+        "position": [10.0, 1.5, -0.8],
+        "size": [0.5, 0.3, 0.8],
+        "yaw": 0.6,
+        "path": None,
+    },
+    {
+        "slot": 2,
+        "kind": "cylinder",
+        "position": [13.5, 4.6, -0.8],
+        "size": [0.25, 0.25, 0.8],
+        "yaw": 0.0,
+        "path": None,
+    },
     {
         "slot": 4,
         "kind": "sphere",
@@ -62,7 +84,14 @@ def config() -> Config:
 
 
 def scenario(episode: int = 3) -> dict:
-    described = {"start": list(START), "start_yaw": 0.2, "goal": list(GOAL), "layout_draws": 1, "faults": 0, "bodies": BODIES}
+    described = {
+        "start": list(START),
+        "start_yaw": 0.2,
+        "goal": list(GOAL),
+        "layout_draws": 1,
+        "faults": 0,
+        "bodies": BODIES,
+    }
     return scenario_document(config(), described, world="pool", seed=7, episode=episode)
 
 
@@ -100,12 +129,21 @@ def snapshots(
             **_planned(step, pos, _pose(min(share + 0.06, 1.0), sway)[0]),
             tracks=np.column_stack([bodies[3:], np.zeros((2, 2)), [0.22, 0.2]]).astype(np.float32),
             track_beams=np.flatnonzero(which >= 3),
-            depth_image_m=rng.uniform(0.5, 10, (72, 128)).astype(np.float32) if depth and step % 25 == 0 else None,
+            depth_image_m=rng.uniform(0.5, 10, (72, 128)).astype(np.float32)
+            if depth and step % 25 == 0
+            else None,
             maps=layers(static, dynamic) if maps and (step % 25 == 0 or step == n_step) else None,
         )
 
 
-def _truth(step: int, pos: np.ndarray, yaw: float, bodies: np.ndarray, nearest_m: np.floating, rng: np.random.Generator) -> dict:
+def _truth(
+    step: int,
+    pos: np.ndarray,
+    yaw: float,
+    bodies: np.ndarray,
+    nearest_m: np.floating,
+    rng: np.random.Generator,
+) -> dict:
     """Slot 3 is empty."""
     later = np.array([body_positions(body, step * DT + 1e-3)[0] for body in BODIES])
     return {
@@ -122,12 +160,16 @@ def _truth(step: int, pos: np.ndarray, yaw: float, bodies: np.ndarray, nearest_m
         "obstacle_kind": np.array([2, 3, 2, 0, 1, 2], np.int32),
         "obstacle_pos_w": np.insert(bodies, 3, 0.0, axis=0).astype(np.float32),
         "obstacle_vel_w": np.insert((later - bodies) / 1e-3, 3, 0.0, axis=0).astype(np.float32),
-        "obstacle_size": np.insert(np.array([body["size"] for body in BODIES]), 3, 0.0, axis=0).astype(np.float32),
+        "obstacle_size": np.insert(np.array([body["size"] for body in BODIES]), 3, 0.0, axis=0).astype(
+            np.float32
+        ),
         "obstacle_yaw": np.array([0, 0.6, 0, 0, 0, 0], np.float32),
     }
 
 
-def _sensed(step: int, pos: np.ndarray, yaw: float, ranges: np.ndarray, hit: np.ndarray, rng: np.random.Generator) -> dict:
+def _sensed(
+    step: int, pos: np.ndarray, yaw: float, ranges: np.ndarray, hit: np.ndarray, rng: np.random.Generator
+) -> dict:
     return {
         "estimate_pos_w": (pos + 0.01).astype(np.float32),
         "estimate_rpy": np.array([0.02, -0.03, yaw], np.float32),
@@ -142,7 +184,9 @@ def _sensed(step: int, pos: np.ndarray, yaw: float, ranges: np.ndarray, hit: np.
         "sonar_intensity": rng.uniform(0.01, 1, N_RAY).astype(np.float32),
         "sonar_hit": hit.astype(np.int32),
         "sonar_ping_vel_b": np.array([0.5, 0.02, 0.0], np.float32),
-        "depth_line": DepthLine(COLUMNS, COLUMNS // 4, 1.0 + COLUMNS / np.float32(64)) if step % 5 == 0 else None,
+        "depth_line": DepthLine(COLUMNS, COLUMNS // 4, 1.0 + COLUMNS / np.float32(64))
+        if step % 5 == 0
+        else None,
     }
 
 
@@ -190,7 +234,9 @@ def cast(pos: np.ndarray, yaw: float, bodies: np.ndarray) -> tuple[np.ndarray, n
     angle = yaw + 2 * np.pi * np.arange(N_RAY) / N_RAY
     ux, uy = np.cos(angle), np.sin(angle)
     with np.errstate(divide="ignore"):
-        wall = np.minimum(np.where(ux > 0, 20 - pos[0], -pos[0]) / ux, np.where(uy > 0, 6 - pos[1], -pos[1]) / uy)
+        wall = np.minimum(
+            np.where(ux > 0, 20 - pos[0], -pos[0]) / ux, np.where(uy > 0, 6 - pos[1], -pos[1]) / uy
+        )
     best, which = wall, np.full(N_RAY, -1)
     for i, (body, at) in enumerate(zip(BODIES, bodies, strict=True)):
         dx, dy = at[0] - pos[0], at[1] - pos[1]
@@ -225,5 +271,10 @@ def _pose(share: float, sway: float) -> tuple[np.ndarray, float]:
 
 def _quaternion(roll: float, pitch: float, yaw: float) -> np.ndarray:
     (cr, sr), (cp, sp), (cy, sy) = ((math.cos(0.5 * a), math.sin(0.5 * a)) for a in (roll, pitch, yaw))
-    values = [cr * cp * cy + sr * sp * sy, sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy]
+    values = [
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    ]
     return np.array(values, np.float32)

@@ -1,4 +1,5 @@
-"""NumPy float64 oracle of what a depth image says about the height of one tracked body, pixel by pixel and hypothesis by hypothesis."""
+"""NumPy float64 oracle of what a depth image says about the height of one tracked body, pixel by pixel and
+hypothesis by hypothesis."""
 
 import numpy as np
 
@@ -13,7 +14,8 @@ LEAST = 0.05
 
 
 def column_through(pos, rpy, at, depth):
-    """(rays [rows, 3] with body-x component 1, camera [3], distance ahead [m], column, how near the next column is [pixel])."""
+    """(rays [rows, 3] with body-x component 1, camera [3], distance ahead [m], column, how near the next
+    column is [pixel])."""
     attitude = rotation(quaternions(np.array([rpy]))[0])
     eye = pos + attitude @ np.array(depth.offset_b_m)
     ahead = (at - eye[:2]) @ [np.cos(rpy[2]), np.sin(rpy[2])]
@@ -22,18 +24,24 @@ def column_through(pos, rpy, at, depth):
     place = depth.cols / 2 - focal * left / max(ahead, 1e-3)
     col = int(np.floor(place))
     up = (depth.rows / 2 - 0.5 - np.arange(depth.rows)) / focal
-    rays = np.stack([np.ones(depth.rows), np.full(depth.rows, (depth.cols / 2 - 0.5 - col) / focal), up], 1) @ attitude.T
+    rays = (
+        np.stack([np.ones(depth.rows), np.full(depth.rows, (depth.cols / 2 - 0.5 - col) / focal), up], 1)
+        @ attitude.T
+    )
     return rays, eye, ahead, col, abs(place - np.round(place))
 
 
 def look(share, present, image, pos, rpy, at, radius, cfg, depth, tank):
-    """(shares, presence, doubt) after an image [rows, cols]; ``doubt`` = how near anything is to being decided otherwise by float32."""
+    """(shares, presence, doubt) after an image [rows, cols]; ``doubt`` = how near anything is to being
+    decided otherwise by float32."""
     rays, eye, ahead, col, doubt = column_through(pos, rpy, at, depth)
     doubt = min(doubt, abs(ahead - radius - SLACK_M), abs(depth.max_range_m - SLACK_M - ahead))
     if not radius + SLACK_M < ahead < depth.max_range_m - SLACK_M or not 0 <= col < depth.cols:
         return share, present, doubt
     away = image[:, col]
-    doubt = min(doubt, np.abs(away - (ahead - radius - SLACK_M)).min(), np.abs(away - (ahead + SLACK_M)).min())
+    doubt = min(
+        doubt, np.abs(away - (ahead - radius - SLACK_M)).min(), np.abs(away - (ahead + SLACK_M)).min()
+    )
     hides, past = away <= ahead - radius - SLACK_M, away >= ahead + SLACK_M
     body = np.flatnonzero(~hides & ~past)
     z = elevation.heights(tank)

@@ -1,7 +1,9 @@
-"""NumPy float64 oracle of one map update: sectors between beams, returns beam by beam, and the paper's equations.
+"""NumPy float64 oracle of one map update: sectors between beams, returns beam by beam, and the paper's
+equations.
 
-Where float32 may rightly land in the other cell (a point within ``DOUBT`` of a cell's edge, a comparison within ``DOUBT`` of its
-threshold), the cells concerned are reported as doubtful, so that a test can leave out exactly those.
+Where float32 may rightly land in the other cell (a point within ``DOUBT`` of a cell's edge, a comparison
+within ``DOUBT`` of its threshold), the cells concerned are reported as doubtful, so that a test can leave out
+exactly those.
 """
 
 import math
@@ -11,7 +13,8 @@ import numpy as np
 from uuvtai.kernels.core.grid import grid_origin, outside_cells
 
 DOUBT = 3e-4
-"""[cells, or the threshold's own unit] float32 positions of tens of metres are good to 1e-5 m = 1e-4 cells; with a margin."""
+"""[cells, or the threshold's own unit] float32 positions of tens of metres are good to 1e-5 m = 1e-4 cells;
+with a margin."""
 
 STATIC, DYNAMIC, DEPTH = 1, 2, 4
 
@@ -41,7 +44,8 @@ class MapOracle:
         return min(p[0] - t.x_m[0], t.x_m[1] - p[0], p[1] - t.y_m[0], t.y_m[1] - p[1])
 
     def wall_range(self, pos, unit):
-        """Range of the wall along a beam from inside, by bisection of ``gap`` (no formula shared with the kernel)."""
+        """Range of the wall along a beam from inside, by bisection of ``gap`` (no formula shared with the
+        kernel)."""
         low, high = 0.0, 100.0
         for _ in range(80):
             middle = 0.5 * (low + high)
@@ -51,7 +55,11 @@ class MapOracle:
     def cells(self, p):
         """(cell of a point, every cell that float32 might take for it)."""
         exact = (np.asarray(p)[:2] - self.origin) / self.cell
-        options = {(math.floor(exact[1] + dy), math.floor(exact[0] + dx)) for dy in (-DOUBT, DOUBT) for dx in (-DOUBT, DOUBT)}
+        options = {
+            (math.floor(exact[1] + dy), math.floor(exact[0] + dx))
+            for dy in (-DOUBT, DOUBT)
+            for dx in (-DOUBT, DOUBT)
+        }
         return (math.floor(exact[1]), math.floor(exact[0])), options
 
     def error(self, r):
@@ -63,15 +71,24 @@ class MapOracle:
     def reach(self, r, hit):
         """[cells] up to which a beam proves free water."""
         s = self.sonar
-        proved = r - self.cell - (s.range_sigma_m + s.range_sigma_slope * r) if hit else min(self.m.free_range_m, s.max_range_m)
+        proved = (
+            r - self.cell - (s.range_sigma_m + s.range_sigma_slope * r)
+            if hit
+            else min(self.m.free_range_m, s.max_range_m)
+        )
         return max(proved, 0.0) / self.cell
 
     def free_water(self, pos, yaw, scan, doubtful):
-        """Cells whose centre lies in the triangle between two neighbouring beams, both as long as the smaller of their reaches."""
-        reach = np.array([self.reach(float(r), hit) for r, hit in zip(scan["range"], scan["hit"], strict=True)])
+        """Cells whose centre lies in the triangle between two neighbouring beams, both as long as the smaller
+        of their reaches."""
+        reach = np.array(
+            [self.reach(float(r), hit) for r, hit in zip(scan["range"], scan["hit"], strict=True)]
+        )
         legs, between = np.minimum(reach, np.roll(reach, -1)), 2 * math.pi / self.sonar.n_ray
         row, col = np.indices(self.outside.shape)
-        x, y = (index + 0.5 - (pos[axis] - self.origin[axis]) / self.cell for axis, index in ((0, col), (1, row)))
+        x, y = (
+            index + 0.5 - (pos[axis] - self.origin[axis]) / self.cell for axis, index in ((0, col), (1, row))
+        )
         sector = (np.arctan2(y, x) - yaw) / between
         slack = DOUBT / np.maximum(np.hypot(x, y), 1e-9) / between
 
@@ -79,7 +96,9 @@ class MapOracle:
             """How far inside its triangle's far side each centre lies."""
             number = np.floor(of).astype(int)
             middle = yaw + (number + 0.5) * between
-            return legs[number % len(legs)] * math.cos(between / 2) - (x * np.cos(middle) + y * np.sin(middle))
+            return legs[number % len(legs)] * math.cos(between / 2) - (
+                x * np.cos(middle) + y * np.sin(middle)
+            )
 
         free = depth(sector) > 0
         for shifted in (sector - slack, sector, sector + slack):
@@ -88,16 +107,21 @@ class MapOracle:
         return free & ~self.outside
 
     def near_static(self, static, cell, r):
-        """(whether a statically occupied cell is within reach of this return, whether the reach is doubtful)."""
+        """(whether a statically occupied cell is within reach of this return, whether the reach is
+        doubtful)."""
         extent = (2 * math.pi / self.sonar.n_ray * r + self.error(r)) / self.cell
         reach = min(4, 1 + int(extent))
-        near = static[max(0, cell[0] - reach) : cell[0] + reach + 1, max(0, cell[1] - reach) : cell[1] + reach + 1]
+        near = static[
+            max(0, cell[0] - reach) : cell[0] + reach + 1, max(0, cell[1] - reach) : cell[1] + reach + 1
+        ]
         return bool((near >= self.m.occupied).any()), abs(extent - round(extent)) < DOUBT and reach < 4
 
     def own_motion(self, scan, yaw):
-        """(own velocity ahead and left, Doppler that counts as motion): the reading, mended by what the walls told the tracking.
+        """(own velocity ahead and left, Doppler that counts as motion): the reading, mended by what the walls
+        told the tracking.
 
-        ``walls``: None = this scan was not tracked and the one before told nothing; else (error in the world, sigma left, same scan?).
+        ``walls``: None = this scan was not tracked and the one before told nothing; else (error in the world,
+        sigma left, same scan?).
         """
         own, threshold = np.array(scan["vel"][:2], float), self.threshold
         if scan.get("walls") is None:
@@ -122,7 +146,11 @@ class MapOracle:
         own, threshold = self.own_motion(scan, float(yaw))
         through_water = scan["doppler"][ray] + own[0] * math.cos(angle) + own[1] * math.sin(angle)
         moves = abs(through_water) > threshold or tracked
-        unsure = len(options) > 1 or min(abs(gap), abs(wall)) < DOUBT or (not tracked and abs(abs(through_water) - threshold) < DOUBT)
+        unsure = (
+            len(options) > 1
+            or min(abs(gap), abs(wall)) < DOUBT
+            or (not tracked and abs(abs(through_water) - threshold) < DOUBT)
+        )
         if gap < -DOUBT or wall < -DOUBT or self.outside[cell]:
             return None
         held = 0 < state["dynamic_scans"][cell] < self.promote
@@ -144,7 +172,9 @@ class MapOracle:
             best, unsure = None, set()
             for row in range(d.rows):
                 z = float(image[row, col])
-                offset_b = np.array(d.offset_b_m) + z * np.array([1, (d.cols / 2 - col - 0.5) / focal, (d.rows / 2 - row - 0.5) / focal])
+                offset_b = np.array(d.offset_b_m) + z * np.array(
+                    [1, (d.cols / 2 - col - 0.5) / focal, (d.rows / 2 - row - 0.5) / focal]
+                )
                 point = R @ offset_b
                 cell, options = self.cells(pos + point)
                 if 0 < z < 0.999 * d.max_range_m and abs(point[2]) <= self.m.depth_gate_m + DOUBT:
@@ -156,7 +186,11 @@ class MapOracle:
                 cells.add(best[1])
             elif best:
                 doubtful.update(unsure | best[2])
-        return {c for c in cells if 0 <= c[0] < self.outside.shape[0] and 0 <= c[1] < self.outside.shape[1] and not self.outside[c]}
+        return {
+            c
+            for c in cells
+            if 0 <= c[0] < self.outside.shape[0] and 0 <= c[1] < self.outside.shape[1] and not self.outside[c]
+        }
 
     # -- update
 
@@ -172,7 +206,9 @@ class MapOracle:
                 if found:
                     bits[found[0]] |= found[1]
         if image is not None:
-            for cell in self.depth_cells(image["depth"], image["pos"].astype(float), image["rpy"].astype(float), doubtful):
+            for cell in self.depth_cells(
+                image["depth"], image["pos"].astype(float), image["rpy"].astype(float), doubtful
+            ):
                 bits[cell] |= DEPTH
         mask = np.zeros(shape, bool)
         for cell in doubtful:
@@ -203,7 +239,9 @@ class MapOracle:
             "dynamic": np.clip(dynamic, 0, 1),
             "depth_hit": np.zeros(free.shape, bool),
             "seen": state["seen"] | free | (bits > 0),
-            "free_scans": np.where(hit, 0, np.minimum(self.confident, state["free_scans"].astype(int) + free)),
+            "free_scans": np.where(
+                hit, 0, np.minimum(self.confident, state["free_scans"].astype(int) + free)
+            ),
             "dynamic_scans": np.where(free, 0, np.minimum(255, state["dynamic_scans"].astype(int) + d_hit)),
         }
 
@@ -211,5 +249,8 @@ class MapOracle:
 def rotation(roll, pitch, yaw):
     """R_wb of yaw-pitch-roll angles."""
     cr, sr, cp, sp, cy, sy = (f(a) for a in (roll, pitch, yaw) for f in (math.cos, math.sin))
-    Rz, Ry = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]]), np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    Rz, Ry = (
+        np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]]),
+        np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]]),
+    )
     return Rz @ Ry @ np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])

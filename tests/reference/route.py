@@ -17,7 +17,11 @@ def nearest_on(way, pos):
         off = pos - way[i] - share * along
         gap = np.linalg.norm(off)
         if gap < best[0]:
-            best = (gap, at[i] + share * np.linalg.norm(along), np.copysign(gap, along[0] * off[1] - along[1] * off[0]))
+            best = (
+                gap,
+                at[i] + share * np.linalg.norm(along),
+                np.copysign(gap, along[0] * off[1] - along[1] * off[0]),
+            )
     return best[1], best[2]
 
 

@@ -10,12 +10,15 @@ NOTHING_M = 1.0e6
 def random_scenes(rng, n_env, n_body, tank, tilt=0.5):
     """Scenes as float64 arrays that float32 holds exactly, vehicle outside every body.
 
-    pos, vel_b [n_env, 3], quat [n_env, 4]; kind, yaw [n_env, n_body]; body_pos, body_vel, size [n_env, n_body, 3]. A third of the bodies
-    spans the water column; kind 0 = empty slot. Bodies may overlap each other, the walls, and the vehicle's column above or below it.
+    pos, vel_b [n_env, 3], quat [n_env, 4]; kind, yaw [n_env, n_body]; body_pos, body_vel, size [n_env,
+    n_body, 3]. A third of the bodies spans the water column; kind 0 = empty slot. Bodies may overlap each
+    other, the walls, and the vehicle's column above or below it.
     """
     (x0, x1), (y0, y1), (z0, z1) = tank.x_m, tank.y_m, tank.z_m
     pos = rng.uniform(
-        (x0 + 0.3 * (x1 - x0), y0 + 0.3 * (y1 - y0), z0 + 0.2), (x0 + 0.7 * (x1 - x0), y0 + 0.7 * (y1 - y0), z1 - 0.2), (n_env, 3)
+        (x0 + 0.3 * (x1 - x0), y0 + 0.3 * (y1 - y0), z0 + 0.2),
+        (x0 + 0.7 * (x1 - x0), y0 + 0.7 * (y1 - y0), z1 - 0.2),
+        (n_env, 3),
     )
     rpy = rng.uniform((-tilt, -tilt, -np.pi), (tilt, tilt, np.pi), (n_env, 3))
     kind = rng.choice([0, SPHERE, CYLINDER, BOX], (n_env, n_body), p=[0.1, 0.3, 0.3, 0.3])
@@ -38,14 +41,23 @@ def random_scenes(rng, n_env, n_body, tank, tilt=0.5):
         "size": size,
         "yaw": rng.uniform(-np.pi, np.pi, (n_env, n_body)),
     }
-    return {"kind": kind, **{name: value.astype(np.float32).astype(np.float64) for name, value in exact.items()}}
+    return {
+        "kind": kind,
+        **{name: value.astype(np.float32).astype(np.float64) for name, value in exact.items()},
+    }
 
 
 def quaternions(rpy):
     """Unit quaternions (w, x, y, z) of Z-Y-X angles [n, 3]."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(0.5 * rpy).T, np.sin(0.5 * rpy).T
     return np.stack(
-        [cr * cp * cy + sr * sp * sy, sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy], axis=1
+        [
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ],
+        axis=1,
     )
 
 
@@ -57,17 +69,24 @@ def rotation(q):
 
 
 class Caster:
-    """One scene compiled to a MuJoCo model; the tank is one big geom seen from the inside (no floor or surface within reach)."""
+    """One scene compiled to a MuJoCo model; the tank is one big geom seen from the inside (no floor or
+    surface within reach)."""
 
     def __init__(self, scene, env, tank):
         spec = mujoco.MjSpec()
         centre = [0.5 * (tank.x_m[0] + tank.x_m[1]), 0.5 * (tank.y_m[0] + tank.y_m[1]), 0.0]
         if tank.shape == "circle":
-            spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_CYLINDER, pos=centre, size=[tank.radius_m, 1.0e4, 0])
+            spec.worldbody.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_CYLINDER, pos=centre, size=[tank.radius_m, 1.0e4, 0]
+            )
         else:
             half = [0.5 * (tank.x_m[1] - tank.x_m[0]), 0.5 * (tank.y_m[1] - tank.y_m[0]), 1.0e4]
             spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, pos=centre, size=half)
-        shapes = {SPHERE: mujoco.mjtGeom.mjGEOM_SPHERE, CYLINDER: mujoco.mjtGeom.mjGEOM_CYLINDER, BOX: mujoco.mjtGeom.mjGEOM_BOX}
+        shapes = {
+            SPHERE: mujoco.mjtGeom.mjGEOM_SPHERE,
+            CYLINDER: mujoco.mjtGeom.mjGEOM_CYLINDER,
+            BOX: mujoco.mjtGeom.mjGEOM_BOX,
+        }
         for body in np.flatnonzero(scene["kind"][env]):
             kind, size, yaw = scene["kind"][env, body], scene["size"][env, body], scene["yaw"][env, body]
             spec.worldbody.add_geom(
@@ -81,17 +100,21 @@ class Caster:
         mujoco.mj_kinematics(self.model, self.data)
 
     def distances(self, start, rays):
-        """Distance in units of each ray's own length [n] for rays [n, 3] from one point; NOTHING_M = nothing met."""
+        """Distance in units of each ray's own length [n] for rays [n, 3] from one point; NOTHING_M = nothing
+        met."""
         length = np.linalg.norm(rays, axis=1)
         n = len(rays)
         geom, found = np.zeros(n, np.int32), np.zeros(n)
         unit = np.ascontiguousarray(rays / length[:, None]).ravel()
-        mujoco.mj_multiRay(self.model, self.data, np.array(start), unit, None, 1, -1, geom, found, None, n, NOTHING_M)
+        mujoco.mj_multiRay(
+            self.model, self.data, np.array(start), unit, None, 1, -1, geom, found, None, n, NOTHING_M
+        )
         return np.where(geom < 0, NOTHING_M, found / length)
 
 
 def envelope(cast, rays, jitter):
-    """(lowest, highest) distance over a ray and its neighbours turned by ``jitter`` [rad] in both directions across it."""
+    """(lowest, highest) distance over a ray and its neighbours turned by ``jitter`` [rad] in both directions
+    across it."""
     across = np.cross(rays, [0.0, 0.0, 1.0])
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     upward = np.cross(across, rays / np.linalg.norm(rays, axis=1, keepdims=True))
@@ -108,7 +131,12 @@ def load(scene, vehicle, world):
     vehicle.quat_wb.from_numpy(single["quat"])
     vehicle.vel_b.from_numpy(single["vel_b"])
     world.kind.from_numpy(scene["kind"].astype(np.int32))
-    for field, name in ((world.pos_w, "body_pos"), (world.vel_w, "body_vel"), (world.size, "size"), (world.yaw, "yaw")):
+    for field, name in (
+        (world.pos_w, "body_pos"),
+        (world.vel_w, "body_vel"),
+        (world.size, "size"),
+        (world.yaw, "yaw"),
+    ):
         field.from_numpy(single[name])
 
 

@@ -1,6 +1,8 @@
-"""A small NumPy sonar for scenes of the tracking tests: horizontal plane only, circles, yawed boxes and the walls of a rectangular tank.
+"""A small NumPy sonar for scenes of the tracking tests: horizontal plane only, circles, yawed boxes and the
+walls of a rectangular tank.
 
-Written apart from the product's sonar. All arrays lead with the env: positions (E, 2), bodies (E, B, ...). Radius 0 = box.
+Written apart from the product's sonar. All arrays lead with the env: positions (E, 2), bodies (E, B, ...).
+Radius 0 = box.
 """
 
 import numpy as np
@@ -10,13 +12,17 @@ MAX_RANGE_M = 12.0
 
 
 def cast(pos, yaw, vel_w, centre, body_vel, radius, half, body_yaw, tank):
-    """Ranges, Doppler (receding positive, own motion included), hit flags and body hit (-1 = wall or nothing), each (E, 256)."""
+    """Ranges, Doppler (receding positive, own motion included), hit flags and body hit (-1 = wall or
+    nothing), each (E, 256)."""
     bearing = yaw[:, None] + np.arange(N_RAY) * (2 * np.pi / N_RAY)
     u = np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
     to_body = np.stack([_circle(pos, u, centre, radius), _box(pos, u, centre, half, body_yaw)])
     to_body = np.where(radius[:, None, :] > 0, to_body[0], to_body[1])
     none = np.full((*to_body.shape[:2], 1), np.inf)  # a body that is never hit, so that there may be none
-    to_body, body_vel = np.concatenate([to_body, none], -1), np.concatenate([body_vel, np.zeros((len(pos), 1, 2))], 1)
+    to_body, body_vel = (
+        np.concatenate([to_body, none], -1),
+        np.concatenate([body_vel, np.zeros((len(pos), 1, 2))], 1),
+    )
     nearest = to_body.argmin(axis=-1)
     to_nearest = np.take_along_axis(to_body, nearest[..., None], -1)[..., 0]
     to_wall = _walls(pos, u, tank)
@@ -25,16 +31,28 @@ def cast(pos, yaw, vel_w, centre, body_vel, radius, half, body_yaw, tank):
     surface_vel = np.where((body >= 0)[..., None], np.take_along_axis(body_vel, nearest[..., None], 1), 0.0)
     doppler = ((surface_vel - vel_w[:, None, :]) * u).sum(-1)
     hit = reach < MAX_RANGE_M
-    return np.where(hit, reach, MAX_RANGE_M), np.where(hit, doppler, 0.0), hit.astype(np.int32), np.where(hit, body, -1)
+    return (
+        np.where(hit, reach, MAX_RANGE_M),
+        np.where(hit, doppler, 0.0),
+        hit.astype(np.int32),
+        np.where(hit, body, -1),
+    )
 
 
 def noisy(range_m, doppler, hit, rng, sonar):
-    """The errors of a SonarConfig that matter to tracking: range, Doppler with outliers, missed and false returns."""
+    """The errors of a SonarConfig that matter to tracking: range, Doppler with outliers, missed and false
+    returns."""
     sigma = sonar.range_sigma_m + sonar.range_sigma_slope * range_m
-    told = range_m + sigma * rng.standard_normal(range_m.shape) + rng.exponential(sonar.range_jitter_m, range_m.shape)
+    told = (
+        range_m
+        + sigma * rng.standard_normal(range_m.shape)
+        + rng.exponential(sonar.range_jitter_m, range_m.shape)
+    )
     rate = doppler + sonar.doppler_sigma_m_s * rng.standard_normal(range_m.shape)
     wild = rng.uniform(size=range_m.shape) < sonar.doppler_outlier
-    rate = np.where(wild, rng.uniform(-sonar.doppler_outlier_m_s, sonar.doppler_outlier_m_s, range_m.shape), rate)
+    rate = np.where(
+        wild, rng.uniform(-sonar.doppler_outlier_m_s, sonar.doppler_outlier_m_s, range_m.shape), rate
+    )
     seen = hit * (rng.uniform(size=range_m.shape) >= sonar.missed_return)
     false = rng.uniform(size=range_m.shape) < sonar.false_return
     told = np.where(false, rng.uniform(0, MAX_RANGE_M, range_m.shape), told)

@@ -1,4 +1,5 @@
-"""NumPy float64 oracle of the clean sonar, written from the rules on the design page: segments and quadratics, no spans."""
+"""NumPy float64 oracle of the clean sonar, written from the rules on the design page: segments and
+quadratics, no spans."""
 
 import numpy as np
 
@@ -14,7 +15,8 @@ def beam_headings(quat, n_ray):
 
 
 def sonar_scan(scene, env, tank, n_ray, aperture_deg, turn=0.0):
-    """(range [n_ray], cosine of incidence, index of the body hit or WALL), without the limit of range; bearings off by ``turn`` [rad]."""
+    """(range [n_ray], cosine of incidence, index of the body hit or WALL), without the limit of range;
+    bearings off by ``turn`` [rad]."""
     pos = scene["pos"][env]
     bearing = beam_headings(scene["quat"][env], n_ray) + turn
     u = np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
@@ -24,7 +26,11 @@ def sonar_scan(scene, env, tank, n_ray, aperture_deg, turn=0.0):
     for body in np.flatnonzero(scene["kind"][env]):
         r, c = body_hits(scene, env, body, pos, u, slope)
         nearer = r < best
-        best, cosine, who = np.where(nearer, r, best), np.where(nearer, c, cosine), np.where(nearer, body, who)
+        best, cosine, who = (
+            np.where(nearer, r, best),
+            np.where(nearer, c, cosine),
+            np.where(nearer, body, who),
+        )
     return best, cosine, who
 
 
@@ -42,7 +48,8 @@ def wall_hits(start, u, tank):
 
 
 def body_hits(scene, env, body, pos, u, slope):
-    """(range, cosine) where beams enter one body's horizontal outline and the vertical gap allows it, else inf."""
+    """(range, cosine) where beams enter one body's horizontal outline and the vertical gap allows it, else
+    inf."""
     kind, size = scene["kind"][env, body], scene["size"][env, body]
     rel = scene["body_pos"][env, body] - pos
     if kind == BOX:
@@ -68,7 +75,8 @@ def circle_entry(centre, radius_squared, u):
 
 
 def box_entry(centre, half, yaw, u):
-    """First crossing of a yawed rectangle from outside: nearest of its four edges, and only if the start is not inside."""
+    """First crossing of a yawed rectangle from outside: nearest of its four edges, and only if the start is
+    not inside."""
     c, s = np.cos(yaw), np.sin(yaw)
     axes = np.array([[c, s], [-s, c]])
     best, cosine = np.full(len(u), np.inf), np.zeros(len(u))

@@ -1,7 +1,8 @@
-"""NumPy float64 oracle of bodies followed by the camera: image to columns pixel by pixel, columns to spots as lists, spots to tracks.
+"""NumPy float64 oracle of bodies followed by the camera: image to columns pixel by pixel, columns to spots as
+lists, spots to tracks.
 
-Written from the description of the method, with the product's constants passed in or restated here. A track's correction takes both
-numbers of a spot at once, in matrices and Joseph's form.
+Written from the description of the method, with the product's constants passed in or restated here. A track's
+correction takes both numbers of a spot at once, in matrices and Joseph's form.
 """
 
 from dataclasses import dataclass
@@ -79,20 +80,28 @@ def unit(bearing):
 
 
 def columns(image, view, cfg, depth, tank):
-    """(distance [cols], distance in the first and last row looked at [cols], doubt [cols]) of one image [rows, cols].
+    """(distance [cols], distance in the first and last row looked at [cols], doubt [cols]) of one image
+    [rows, cols].
 
-    ``doubt`` [m] = how near any pixel that could change the answer is to a bound of range, height or wall. A column's wall is that along
-    its direction at the height of the optical axis.
+    ``doubt`` [m] = how near any pixel that could change the answer is to a bound of range, height or wall. A
+    column's wall is that along its direction at the height of the optical axis.
     """
     rows = np.arange(0, depth.rows, ROW_STRIDE)
     pixels = np.stack(np.meshgrid(rows, np.arange(depth.cols), indexing="ij"), -1).reshape(-1, 2)
     rays = camera_rays(view.quat, pixels, depth).reshape(len(rows), depth.cols, 3)
-    axis = camera_rays(view.quat, np.stack([np.full(depth.cols, depth.rows / 2 - 0.5), np.arange(depth.cols)], -1), depth)
+    axis = camera_rays(
+        view.quat, np.stack([np.full(depth.cols, depth.rows / 2 - 0.5), np.arange(depth.cols)], -1), depth
+    )
     wall = walls(view.eye(depth), axis / np.hypot(axis[:, :1], axis[:, 1:2]), tank)
     away = image[rows]
     level, height = away * np.hypot(rays[..., 0], rays[..., 1]), np.abs(away * rays[..., 2])
     margins = np.stack(
-        [NO_RETURN_SHARE * depth.max_range_m - away, cfg.band_m - height, wall - cfg.wall_margin_m - level, cfg.range_m - level]
+        [
+            NO_RETURN_SHARE * depth.max_range_m - away,
+            cfg.band_m - height,
+            wall - cfg.wall_margin_m - level,
+            cfg.range_m - level,
+        ]
     )
     seen = np.where((margins > 0).all(0), level, FAR_M)
     near, edge = seen.min(0), seen[[0, -1]].min(0)
@@ -124,7 +133,8 @@ def explained(seen, scan, split_m, n_ray):
 
 
 def corrected(track, offset, along, cut, cut_high, cfg):
-    """Correct a track by what was seen ``offset`` from its place; returns how near the case is to being taken for a turn (or not)."""
+    """Correct a track by what was seen ``offset`` from its place; returns how near the case is to being taken
+    for a turn (or not)."""
     H = np.zeros((2, 5))
     H[:, :2] = along, (-along[1], along[0])
     loose = track.radius**2 * np.array([cut_high, cut])
@@ -145,11 +155,22 @@ def corrected(track, offset, along, cut, cut_high, cfg):
 def begun(seen, along, radius, height, step, cfg, tracking):
     place, speed_var = seen + radius * along, tracking.birth_speed_sigma_m_s**2
     P = np.diag([cfg.sigma_m**2, cfg.sigma_m**2, speed_var, speed_var, 0.0])
-    return Track(np.append(place, [0.0, 0.0, 0.0]), P, radius, tracking.min_radius_m**2 / 4, 0, step, step, PRESENT, height)
+    return Track(
+        np.append(place, [0.0, 0.0, 0.0]),
+        P,
+        radius,
+        tracking.min_radius_m**2 / 4,
+        0,
+        step,
+        step,
+        PRESENT,
+        height,
+    )
 
 
 def follow(tracks, n_track, near, edge, view, scan, step, scan_step, cfg, depth, sonar, tracking, dt_s):
-    """Bring ``tracks`` {slot: Track} up to one image's columns; returns (what was done with each spot, doubt)."""
+    """Bring ``tracks`` {slot: Track} up to one image's columns; returns (what was done with each spot,
+    doubt)."""
     late, eye, n_col = (step - scan_step) * dt_s, view.eye(depth), len(near)
     spots, doubt = spots_of(near, cfg.split_m)
     done, doubts = [], [doubt]
@@ -172,19 +193,26 @@ def follow(tracks, n_track, near, edge, view, scan, step, scan_step, cfg, depth,
                 way = track.speed * (step - max(track.seen, track.spot)) * dt_s
                 gaps[slot] = np.hypot(*offsets[slot]) - min(cfg.gate_m + 2 * way, cfg.max_gate_m)
         ranked = sorted(gaps.values())
-        doubts += [abs(gap) for gap in ranked[:1]] + [ranked[1] - ranked[0] for _ in ranked[1:2] if ranked[0] < 0]
+        doubts += [abs(gap) for gap in ranked[:1]] + [
+            ranked[1] - ranked[0] for _ in ranked[1:2] if ranked[0] < 0
+        ]
         cut = cols[0] == 0 or cols[-1] == n_col - 1
         if ranked and ranked[0] < 0:
             slot = min(gaps, key=lambda s: gaps[s])
             doubts += [abs(highest - distance - cfg.split_m)]
-            doubts += [corrected(tracks[slot], offsets[slot], along, cut, highest < distance + cfg.split_m, cfg)]
+            doubts += [
+                corrected(tracks[slot], offsets[slot], along, cut, highest < distance + cfg.split_m, cfg)
+            ]
             tracks[slot].spot = step
             done.append("corrected")
         elif cut or scan.step < 0:
             done.append("cut")
         else:
             radius = max(opening * distance / 2, tracking.min_radius_m)
-            room = [np.hypot(*(t.place(late) - seen - radius * along)) - t.radius - cfg.apart_m for t in tracks.values()]
+            room = [
+                np.hypot(*(t.place(late) - seen - radius * along)) - t.radius - cfg.apart_m
+                for t in tracks.values()
+            ]
             doubts += [abs(r) for r in room]
             free = [slot for slot in range(n_track) if slot not in tracks]
             done.append("begun" if free and min([1.0, *room]) >= 0 else "known")

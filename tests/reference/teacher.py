@@ -1,10 +1,12 @@
-"""NumPy float64 oracle of the evasion's roll-outs and costs: one candidate, one body and one sample at a time."""
+"""NumPy float64 oracle of the evasion's roll-outs and costs: one candidate, one body and one sample at a
+time."""
 
 import numpy as np
 
 
 def rolled_out(pos, vel, command, lag_s, dt_s, n, burst_s=np.inf):
-    """Positions and velocities [n + 1, axes] of a vehicle that follows ``command`` until ``burst_s`` and then 0, with a first-order lag.
+    """Positions and velocities [n + 1, axes] of a vehicle that follows ``command`` until ``burst_s`` and then
+    0, with a first-order lag.
 
     The equation of motion is solved exactly over every step, in two pieces where the command ends within it.
     """
@@ -29,10 +31,12 @@ def depth_band(tank, cfg):
 
 
 def distance_to(body, radius, above, below, at, cfg):
-    """(distance [m] of a point to an upright cylinder, its slope along the level direction away from the axis, doubt [m]).
+    """(distance [m] of a point to an upright cylinder, its slope along the level direction away from the
+    axis, doubt [m]).
 
-    Between ``below`` and ``above`` the water is free: the cylinder may be anywhere above or anywhere below that slab, whichever is nearer.
-    Level with it, a point inside is as far below zero as it is from the mantle. ``doubt`` is how near the case is to flipping.
+    Between ``below`` and ``above`` the water is free: the cylinder may be anywhere above or anywhere below
+    that slab, whichever is nearer. Level with it, a point inside is as far below zero as it is from the
+    mantle. ``doubt`` is how near the case is to flipping.
     """
     level = np.hypot(*(at[:2] - body)) - radius
     room = min(above - at[2], at[2] - below)
@@ -47,8 +51,8 @@ def distance_to(body, radius, above, below, at, cfg):
 def body_depths(pos, vel, command, forecast, cfg, tank, dt_s, burst_s=np.inf):
     """(peak, mean, contact, first, doubt) of one command [m/s, 3].
 
-    ``forecast`` = (places [track, k, 2], radii [track, k], negative = nothing, above [track], below [track]); ``doubt`` [m] = how near any
-    sample is to a case that float32 may decide otherwise.
+    ``forecast`` = (places [track, k, 2], radii [track, k], negative = nothing, above [track], below [track]);
+    ``doubt`` [m] = how near any sample is to a case that float32 may decide otherwise.
     """
     n = round(cfg.horizon_s / dt_s)
     at, moving = rolled_out(pos, vel, command, cfg.lag_s, dt_s, n, burst_s)
@@ -88,19 +92,24 @@ def static_depths(pos, vel, command, clearance, origin, cell_m, cfg, burst_s=np.
 
 
 def level_velocity(angle, share, yaw, cfg, vehicle):
-    """(x, y) [m/s] towards a world bearing at a share of the speed that surge and sway, limited one by one, allow there."""
+    """(x, y) [m/s] towards a world bearing at a share of the speed that surge and sway, limited one by one,
+    allow there."""
     body = np.array([np.cos(angle - yaw) / vehicle.max_surge_m_s, np.sin(angle - yaw) / vehicle.max_sway_m_s])
     top = min(cfg.evade_m_s, 1 / np.abs(body).max())
     return top * share * np.array([np.cos(angle), np.sin(angle)])
 
 
 def candidates(follow, last, yaw, own_z, cfg, vehicle, tank):
-    """(velocities [n, 3], durations [n]) in their order: level, stop, last, follow, climbing and diving, padding, dashes."""
+    """(velocities [n, 3], durations [n]) in their order: level, stop, last, follow, climbing and diving,
+    padding, dashes."""
     ahead, heave = np.arctan2(follow[1], follow[0]), follow[2]
     low, high = depth_band(tank, cfg)
     up, down = min(cfg.heave_m_s, max(high - own_z, 0.0)), max(-cfg.heave_m_s, min(low - own_z, 0.0))
     held = [
-        (*level_velocity(ahead + 2 * np.pi * h / cfg.n_heading, (s + 1) / cfg.n_speed, yaw, cfg, vehicle), heave)
+        (
+            *level_velocity(ahead + 2 * np.pi * h / cfg.n_heading, (s + 1) / cfg.n_speed, yaw, cfg, vehicle),
+            heave,
+        )
         for s in range(cfg.n_speed)
         for h in range(cfg.n_heading)
     ]
@@ -114,14 +123,19 @@ def candidates(follow, last, yaw, own_z, cfg, vehicle, tank):
     held += [(0.0, 0.0, 0.0)] * (-len(held) % 16)
     dashes = []
     if cfg.burst_s > 0:
-        dashes = [(*level_velocity(ahead + 2 * np.pi * h / 32, 1.0, yaw, cfg, vehicle), heave) for h in range(32)]
+        dashes = [
+            (*level_velocity(ahead + 2 * np.pi * h / 32, 1.0, yaw, cfg, vehicle), heave) for h in range(32)
+        ]
     return np.array(held + dashes), np.array([np.inf] * len(held) + [cfg.burst_s] * len(dashes))
 
 
 def cost(pos, vel, command, burst_s, follow, last, forecast, clearance, origin, cell_m, cfg, tank, dt_s):
-    """(cost of one command, how near any of its samples is to a case or cell that float32 may decide otherwise [m])."""
+    """(cost of one command, how near any of its samples is to a case or cell that float32 may decide
+    otherwise [m])."""
     peak, mean, contact, _, doubt = body_depths(pos, vel, command, forecast, cfg, tank, dt_s, burst_s)
-    static_mean, static_contact, border = static_depths(pos, vel, command, clearance, origin, cell_m, cfg, burst_s)
+    static_mean, static_contact, border = static_depths(
+        pos, vel, command, clearance, origin, cell_m, cfg, burst_s
+    )
     total = cfg.weight_peak * peak + cfg.weight_mean * mean + cfg.weight_contact * contact
     total += cfg.weight_static * static_mean + cfg.weight_static_contact * static_contact
     total += cfg.weight_deviation * np.linalg.norm(command - follow) / cfg.cruise_m_s
@@ -129,7 +143,8 @@ def cost(pos, vel, command, burst_s, follow, last, forecast, clearance, origin, 
 
 
 def mean_velocity(velocities, costs, softness):
-    """Mean of the velocities weighted by exp(-cost / softness); what weighs less than exp(-12) is left out."""
+    """Mean of the velocities weighted by exp(-cost / softness); what weighs less than exp(-12) is left
+    out."""
     excess = (costs - costs.min()) / softness
     weight = np.where(excess < 12, np.exp(-excess), 0.0)
     return weight @ velocities / weight.sum()

@@ -1,5 +1,5 @@
-"""NumPy float64 oracle of the tracking stage, one env at a time: full 5 x 5 covariances (x, y, vx, vy, turn rate) in Joseph's form,
-Jacobians by differences, greedy pairs by sorting.
+"""NumPy float64 oracle of the tracking stage, one env at a time: full 5 x 5 covariances (x, y, vx, vy, turn
+rate) in Joseph's form, Jacobians by differences, greedy pairs by sorting.
 
 Written from the description of the method, with the product's constants passed in or restated here.
 """
@@ -63,14 +63,18 @@ def unit(angle):
 
 
 def range_variance(r, sonar):
-    return (sonar.range_sigma_m + sonar.range_sigma_slope * r) ** 2 + sonar.range_jitter_m**2 + sonar.range_quantum_m**2 / 12
+    return (
+        (sonar.range_sigma_m + sonar.range_sigma_slope * r) ** 2
+        + sonar.range_jitter_m**2
+        + sonar.range_quantum_m**2 / 12
+    )
 
 
 def split_distance(r, cfg, sonar):
     return max(cfg.split_m + cfg.split_slope * r, 4 * np.sqrt(range_variance(r, sonar)))
 
 
-# ------------------------------------------------------------------------------------------------------------------ clusters
+# --------------------------------------------------------------------------------------------------- clusters
 
 
 def labelled(scan, cfg, sonar, tank):
@@ -84,7 +88,10 @@ def labelled(scan, cfg, sonar, tank):
         centre = np.array([sum(tank.x_m) / 2, sum(tank.y_m) / 2])
         gap = tank.radius_m - np.hypot(*(p - centre).T)
     else:
-        gap = np.minimum(np.minimum(p[:, 0] - tank.x_m[0], tank.x_m[1] - p[:, 0]), np.minimum(p[:, 1] - tank.y_m[0], tank.y_m[1] - p[:, 1]))
+        gap = np.minimum(
+            np.minimum(p[:, 0] - tank.x_m[0], tank.x_m[1] - p[:, 0]),
+            np.minimum(p[:, 1] - tank.y_m[0], tank.y_m[1] - p[:, 1]),
+        )
     near_wall = gap < cfg.wall_margin_m + 2 * np.sqrt([range_variance(r, sonar) for r in scan.range_m])
     wall = (scan.hit == 1) & near_wall
     slip, _left = velocity_error(u[wall], still[wall], cfg, sonar, scan.vel_valid)
@@ -92,9 +99,12 @@ def labelled(scan, cfg, sonar, tank):
 
 
 def velocity_error(u, still, cfg, sonar, valid):
-    """(error of the own velocity that explains the walls' Doppler, its largest standard deviation afterwards; 0 for a valid reading)."""
+    """(error of the own velocity that explains the walls' Doppler, its largest standard deviation afterwards;
+    0 for a valid reading)."""
     sigma = max(sonar.doppler_sigma_m_s, 0.01)
-    trust = cfg.own_speed_sigma_m_s if valid else 1.0  # m/s: a held reading may be off by the vehicle's whole speed
+    trust = (
+        cfg.own_speed_sigma_m_s if valid else 1.0
+    )  # m/s: a held reading may be off by the vehicle's whole speed
     information = u.T @ u / sigma**2 + np.eye(2) / trust**2
     left = np.linalg.inv(information)
     return left @ (u.T @ still) / sigma**2, 0.0 if valid else np.sqrt(np.linalg.eigvalsh(left).max())
@@ -106,7 +116,12 @@ def clusters_of(scan, cfg, sonar, tank):
 
     def joined(a, b):
         close = abs(r[b] - r[a]) <= split_distance(r[a], cfg, sonar)
-        return candidate[a] and candidate[b] and close and abs(still[b] - still[a]) <= cfg.split_doppler_m_s + 6 * sonar.doppler_sigma_m_s
+        return (
+            candidate[a]
+            and candidate[b]
+            and close
+            and abs(still[b] - still[a]) <= cfg.split_doppler_m_s + 6 * sonar.doppler_sigma_m_s
+        )
 
     def follower(a):
         for ahead in (1, 2):
@@ -126,7 +141,9 @@ def clusters_of(scan, cfg, sonar, tank):
         run = [k]
         while (ahead := follower((start + run[-1]) % n)) and run[-1] + ahead < n:
             run.append(run[-1] + ahead)
-        cluster = cluster_from([(start + i) % n for i in run], run[-1] - run[0], scan, still, slip, cfg, sonar)
+        cluster = cluster_from(
+            [(start + i) % n for i in run], run[-1] - run[0], scan, still, slip, cfg, sonar
+        )
         if cluster and len(out) < cfg.n_cluster:
             out.append(cluster)
         k = run[-1] + 1
@@ -168,11 +185,12 @@ def cluster_from(beams, steps, scan, still, slip, cfg, sonar):
     )  # fmt: skip
 
 
-# -------------------------------------------------------------------------------------------------------------------- filter
+# ----------------------------------------------------------------------------------------------------- filter
 
 
 def arc(x, dt):
-    """State (x, y, vx, vy, turn rate) after dt: along the chord of the middle course, then with the velocity turned."""
+    """State (x, y, vx, vy, turn rate) after dt: along the chord of the middle course, then with the velocity
+    turned."""
     mid, late = turned(x[2:4], 0.5 * dt * x[4]), turned(x[2:4], dt * x[4])
     return np.array([x[0] + dt * mid[0], x[1] + dt * mid[1], *late, x[4]])
 
@@ -201,7 +219,10 @@ def turned(v, angle):
 
 
 def centre_variances(c, radius, radius_var, sonar):
-    radial, cross = c.range_var + ARC**2 * radius_var, (0.25 * 2 * np.pi / sonar.n_ray * c.range_m) ** 2 + 0.02**2
+    radial, cross = (
+        c.range_var + ARC**2 * radius_var,
+        (0.25 * 2 * np.pi / sonar.n_ray * c.range_m) ** 2 + 0.02**2,
+    )
     if c.hidden:
         radial, cross = radial + (0.3 * radius) ** 2, cross + (0.5 * radius) ** 2 + radius_var
     return radial, cross
@@ -211,7 +232,9 @@ def surprise_of(track, c, along, centre, sonar):
     """(squared normalised innovations of range, cross range, Doppler), their variances."""
     across = np.array([-along[1], along[0]])
     radial_var, cross_var = centre_variances(c, track.radius, track.radius_var, sonar)
-    s = np.array([along @ track.P[:2, :2] @ along + radial_var, across @ track.P[:2, :2] @ across + cross_var])
+    s = np.array(
+        [along @ track.P[:2, :2] @ along + radial_var, across @ track.P[:2, :2] @ across + cross_var]
+    )
     s = np.append(s, along @ track.P[2:4, 2:4] @ along + c.doppler_var)
     offset = centre - track.x[:2]
     e = np.array([offset @ along, offset @ across, c.doppler - along @ track.x[2:4]])
@@ -226,7 +249,7 @@ def sight_of_centre(c, radius, sonar):
     return bearing, distance / (1 - half**2 / 6), half
 
 
-# --------------------------------------------------------------------------------------------------------------------- track
+# ------------------------------------------------------------------------------------------------------ track
 
 
 def associate(tracks, clusters, dt, cfg, sonar):
@@ -293,10 +316,15 @@ def is_moving(track, c, dt, cfg, sonar):
     v = track.x[2:4]
     fast = np.hypot(*v) > cfg.moving_speed_m_s
     shown = abs(track.doppler) > max(cfg.moving_doppler_m_s, 4 * np.sqrt(track.doppler_var))
-    noise = np.sqrt(np.linalg.eigvalsh(track.P[:2, :2])[-1] + centre_variances(c, track.radius, track.radius_var, sonar)[1])
+    noise = np.sqrt(
+        np.linalg.eigvalsh(track.P[:2, :2])[-1]
+        + centre_variances(c, track.radius, track.radius_var, sonar)[1]
+    )
     reach = cfg.moving_shift_m + 0.5 * cfg.max_width_m * abs(track.sweep) + 2 * noise
     length = np.hypot(*track.shift)
-    shown = shown or (length > reach and track.shift @ v > 0.8 * length * np.hypot(*v) and track.age * dt > cfg.shift_s)
+    shown = shown or (
+        length > reach and track.shift @ v > 0.8 * length * np.hypot(*v) and track.age * dt > cfg.shift_s
+    )
     return int((fast and shown and track.age >= CONFIRMED - 1) or (track.moving and (fast or shown)))
 
 
@@ -333,7 +361,10 @@ def prune(tracks, scan, cfg, sonar, dt_s):
         sight = sight_of(track, scan, cfg, sonar)
         gone = sight == "through" and (track.age < CONFIRMED or unseen >= cfg.see_through_s)
         lost = unseen > (cfg.hidden_s if sight == "blocked" else cfg.max_misses * 0.1)
-        double = any(o.misses == 0 and np.hypot(*(o.x[:2] - track.x[:2])) < 0.5 * (o.radius + track.radius) for o in tracks.values())
+        double = any(
+            o.misses == 0 and np.hypot(*(o.x[:2] - track.x[:2])) < 0.5 * (o.radius + track.radius)
+            for o in tracks.values()
+        )
         if gone or lost or double:
             del tracks[t]
 
@@ -345,7 +376,11 @@ def spawn(tracks, clusters, matched, scan, cfg, sonar):
         for t in sorted(tracks):
             track = tracks[t]
             near = np.hypot(*(c.pos - track.x[:2])) < track.radius + cfg.min_radius_m
-            if track.misses == 0 and near and abs(c.doppler - track.doppler) < cfg.split_doppler_m_s + 3 * sonar.doppler_sigma_m_s:
+            if (
+                track.misses == 0
+                and near
+                and abs(c.doppler - track.doppler) < cfg.split_doppler_m_s + 3 * sonar.doppler_sigma_m_s
+            ):
                 c.match = t
         if c.match < 0:
             c.match = slot_for(tracks, c, scan, cfg)

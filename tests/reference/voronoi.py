@@ -1,4 +1,5 @@
-"""NumPy / SciPy float64 oracles of the planner: clearance with sites, the traversable set, exact least cost on the full grid."""
+"""NumPy / SciPy float64 oracles of the planner: clearance with sites, the traversable set, exact least cost
+on the full grid."""
 
 from itertools import pairwise
 
@@ -12,7 +13,8 @@ SLACK_M = 1e-5
 
 
 def clearance_of(blocked, cell_m, max_m):
-    """(clearance [m], site row, site col) of a grid of blocked cells; sites are -1 where clearance saturates at ``max_m``."""
+    """(clearance [m], site row, site col) of a grid of blocked cells; sites are -1 where clearance saturates
+    at ``max_m``."""
     distance, (site_row, site_col) = distance_transform_edt(~blocked, return_indices=True)
     far = distance * cell_m >= max_m
     return np.minimum(distance * cell_m, max_m), np.where(far, -1, site_row), np.where(far, -1, site_col)
@@ -23,9 +25,11 @@ def traversable(blocked, clearance_m, min_m):
 
 
 def least_cost(omega, clearance_m, epsilon_m, cell_m, start, goal):
-    """Exact least cost from cell start to cell goal, inf where there is no way. Eight neighbours, no corner cut.
+    """Exact least cost from cell start to cell goal, inf where there is no way. Eight neighbours, no corner
+    cut.
 
-    An edge costs |dp| times the mean of 1 / max(clearance, eps) over its two cells: the integral of the paper's density along it.
+    An edge costs |dp| times the mean of 1 / max(clearance, eps) over its two cells: the integral of the
+    paper's density along it.
     """
     n_row, n_col = omega.shape
     ids = np.arange(omega.size).reshape(omega.shape)
@@ -40,7 +44,9 @@ def least_cost(omega, clearance_m, epsilon_m, cell_m, start, goal):
         rows.append(ids[a][is_open])
         cols.append(ids[b][is_open])
         costs.append(np.hypot(d_row, d_col) * cell_m * 0.5 * (density[a] + density[b])[is_open])
-    graph = csr_matrix((np.concatenate(costs), (np.concatenate(rows), np.concatenate(cols))), shape=(omega.size, omega.size))
+    graph = csr_matrix(
+        (np.concatenate(costs), (np.concatenate(rows), np.concatenate(cols))), shape=(omega.size, omega.size)
+    )
     return dijkstra(graph, directed=False, indices=ids[start])[ids[goal]]
 
 
@@ -62,7 +68,8 @@ def line_cost(way_w, clearance_m, epsilon_m, origin, cell_m, step_m=0.005):
 
 
 def hopped_cost(way_w, clearance_m, epsilon_m, origin, cell_m):
-    """The paper's sum as written: segments (here bounded by the cell), each with the clearance at its first point."""
+    """The paper's sum as written: segments (here bounded by the cell), each with the clearance at its first
+    point."""
     total = 0.0
     for a, b in pairwise(way_w):
         n = max(1, int(np.ceil(np.linalg.norm(b - a) / cell_m)))

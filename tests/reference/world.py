@@ -1,4 +1,5 @@
-"""Independent float64 checks of scenarios: gaps between plan views, free space on a fine grid, positions along paths."""
+"""Independent float64 checks of scenarios: gaps between plan views, free space on a fine grid, positions
+along paths."""
 
 from itertools import pairwise
 
@@ -31,7 +32,8 @@ def plan_distances(points, kind, pos, size, yaw):
 
 
 def gap(a, b):
-    """Smallest distance between the plan views of two bodies (kind, pos, size, yaw) [m], within 1 mm above the exact one."""
+    """Smallest distance between the plan views of two bodies (kind, pos, size, yaw) [m], within 1 mm above
+    the exact one."""
     return float(min(plan_distances(outline(*a), *b).min(), plan_distances(outline(*b), *a).min()))
 
 
@@ -44,7 +46,8 @@ def wall_distances(points, tank):
 
 
 def is_joined(start, goal, bodies, tank, clearance):
-    """Whether start and goal lie in one region of cells (8 neighbours) whose centre has the clearance, less half a cell's diagonal."""
+    """Whether start and goal lie in one region of cells (8 neighbours) whose centre has the clearance, less
+    half a cell's diagonal."""
     cols = np.arange(tank.x_m[0] + GRID_M / 2, tank.x_m[1], GRID_M)
     rows = np.arange(tank.y_m[0] + GRID_M / 2, tank.y_m[1], GRID_M)
     points = np.stack(np.meshgrid(cols, rows), axis=-1)
@@ -52,7 +55,9 @@ def is_joined(start, goal, bodies, tank, clearance):
     for body in bodies:
         free = np.minimum(free, plan_distances(points, *body))
     label, _ = ndimage.label(free >= clearance - GRID_M * np.sqrt(0.5), np.ones((3, 3)))
-    cells = [label[int((p[1] - tank.y_m[0]) / GRID_M), int((p[0] - tank.x_m[0]) / GRID_M)] for p in (start, goal)]
+    cells = [
+        label[int((p[1] - tank.y_m[0]) / GRID_M), int((p[0] - tank.x_m[0]) / GRID_M)] for p in (start, goal)
+    ]
     return cells[0] == cells[1] > 0
 
 

@@ -1,18 +1,39 @@
-"""Configuration: one frozen section per stage noun. Unknown keys, wrong types, NaN and nonsense sizes are errors.
+"""Configuration: one frozen section per stage noun. Unknown keys, wrong types, NaN and nonsense sizes are
+errors.
 
 YAML in and out, and presets, live in ``loader.py``; what training adds is in ``config/learning.py``.
 """
 
 from __future__ import annotations
 
-from uuvtai.config.perception import ElevationConfig, ForecastConfig, MappingConfig, SpottingConfig, TrackingConfig
+from uuvtai.config.perception import (
+    ElevationConfig,
+    ForecastConfig,
+    MappingConfig,
+    SpottingConfig,
+    TrackingConfig,
+)
 from uuvtai.config.planning import ClearanceConfig, FeaturesConfig, RouteConfig, VoronoiConfig
 from uuvtai.config.section import Section
-from uuvtai.config.sensors import DepthConfig, DvlConfig, ImuConfig, PressureConfig, SensorsConfig, SonarConfig
+from uuvtai.config.sensors import (
+    DepthConfig,
+    DvlConfig,
+    ImuConfig,
+    PressureConfig,
+    SensorsConfig,
+    SonarConfig,
+)
 from uuvtai.config.task import EpisodeConfig, RewardConfig
 from uuvtai.config.teacher import TeacherConfig
 from uuvtai.config.vehicle import ActuationConfig, DisturbanceConfig, Thruster, VehicleConfig
-from uuvtai.config.world import DynamicObstacles, FixedObstacle, StaticObstacles, TankConfig, Waypoint, WorldConfig
+from uuvtai.config.world import (
+    DynamicObstacles,
+    FixedObstacle,
+    StaticObstacles,
+    TankConfig,
+    Waypoint,
+    WorldConfig,
+)
 
 
 class Config(Section):

@@ -1,6 +1,8 @@
-"""What training adds to a run: policy, PPO, distillation, world model, risk and the schedule of the run itself.
+"""What training adds to a run: policy, PPO, distillation, world model, risk and the schedule of the run
+itself.
 
-Defaults are Table app_repro of the paper where it gives a number; the rest says why. Presets (``presets/train``) state differences only.
+Defaults are Table app_repro of the paper where it gives a number; the rest says why. Presets
+(``presets/train``) state differences only.
 """
 
 from __future__ import annotations
@@ -32,8 +34,9 @@ class PolicyConfig(Section):
     residual_limit: Positive = 0.5
     """largest addition, in parts of the vehicle's limits"""
     hold_steps: PositiveCount = 1
-    """control steps that a decision is held: the action, or what a residual policy adds to the tree's newest one. Noise drawn anew every
-    0.02 s averages out before the vehicle has moved; held, it explores, and the networks run that much less often"""
+    """control steps that a decision is held: the action, or what a residual policy adds to the tree's newest
+    one. Noise drawn anew every 0.02 s averages out before the vehicle has moved; held, it explores, and the
+    networks run that much less often"""
     clip_observation: Positive = 10.0
     """standard deviations beyond which an observation is cut off"""
 
@@ -58,7 +61,8 @@ class PpoConfig(Section):
     shuffle: bool = False
     """draw minibatches at random instead of as contiguous blocks, each of all envs in a span of steps"""
     bfloat16: bool = False
-    """products of the hidden layers in bfloat16 during the update: faster where the CPU has the instructions, the gradient is coarser"""
+    """products of the hidden layers in bfloat16 during the update: faster where the CPU has the instructions,
+    the gradient is coarser"""
     normalise_observations: bool = True
     normalise_values: bool = True
 
@@ -73,7 +77,8 @@ class DistillConfig(Section):
     """gradient steps on teacher batches after every update; 0 = none"""
     learning_rate: Positive = 1.5e-4
     critic_warmup_iterations: Count = 0
-    """iterations in which only critic and distillation learn: an untrained critic destroys a distilled policy"""
+    """iterations in which only critic and distillation learn: an untrained critic destroys a distilled
+    policy"""
     weighting: Literal["none", "uncertainty", "risk"] = "none"
     """weight of a sample: equal, or by the world model's uncertainty, or by the predicted risk (mean one)"""
 
@@ -81,7 +86,9 @@ class DistillConfig(Section):
     @classmethod
     def _in_order(cls, value: Points) -> Points:
         if not value or any(a[0] > b[0] for a, b in itertools.pairwise(value)):
-            raise ValueError("needs at least one (share, value) point, shares not falling, for example [[0, 1], [1, 0]]")
+            raise ValueError(
+                "needs at least one (share, value) point, shares not falling, for example [[0, 1], [1, 0]]"
+            )
         return value
 
 
@@ -111,8 +118,8 @@ class WorldModelConfig(Section):
     dynamics_weight: NonNegative = 0.2
     """beta"""
     predict_change: bool = True
-    """the decoder says how the targets change (residual decoder); false = their values, as in the paper, which is further off than saying
-    "as before": in one step of 0.02 s little changes"""
+    """the decoder says how the targets change (residual decoder); false = their values, as in the paper,
+    which is further off than saying "as before": in one step of 0.02 s little changes"""
     likelihood: bool = True
     """Gaussian negative log-likelihood; false = mean squared error"""
     beta_nll: Fraction = 0.5
@@ -120,8 +127,9 @@ class WorldModelConfig(Section):
     normalise_targets: bool = True
     """metres, radians and m/s do not average: targets by their running mean and deviation"""
     error_unit: Literal["change", "decoder"] = "change"
-    """what the features, residual and uncertainty, count errors in: deviations of each target's one-step change, in which an uncertainty
-    of 1 is no better than "as before"; or the decoder's own unit, as in the paper: mean(exp(log variance)) as the decoder says it"""
+    """what the features, residual and uncertainty, count errors in: deviations of each target's one-step
+    change, in which an uncertainty of 1 is no better than "as before"; or the decoder's own unit, as in the
+    paper: mean(exp(log variance)) as the decoder says it"""
     stop_target_gradient: bool = True
     """no gradient through the encoding of the next observation, or the latent collapses"""
 
@@ -150,7 +158,8 @@ class TrainConfig(Section):
     num_envs: PositiveCount = 8
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
     scenes: tuple[tuple[Count, Count, NonNegative], ...] = ()
-    """(S, D, v [m/s]) dealt out to the envs in turn, slots permitting; none = the world's own, which evaluations play in any case"""
+    """(S, D, v [m/s]) dealt out to the envs in turn, slots permitting; none = the world's own, which
+    evaluations play in any case"""
     checkpoint_every: PositiveCount = 50
     """iterations between checkpoints"""
     keep_checkpoints: PositiveCount = 3
@@ -167,7 +176,9 @@ class TrainConfig(Section):
     @classmethod
     def _apart(cls, value: int, info) -> int:
         if value == info.data.get("seed"):
-            raise ValueError("must differ from train.seed: an evaluation on training scenarios proves nothing")
+            raise ValueError(
+                "must differ from train.seed: an evaluation on training scenarios proves nothing"
+            )
         return value
 
 

@@ -10,7 +10,8 @@ from uuvtai.config.section import Fraction, NonNegative, Packets, Positive, Posi
 
 
 class TrackingConfig(Section):
-    """Clusters of beams to tracks of moving bodies, and their forecast. Every constant is in seconds, not in scans (values EC, tuned)."""
+    """Clusters of beams to tracks of moving bodies, and their forecast. Every constant is in seconds, not in
+    scans (values EC, tuned)."""
 
     n_track: PositiveCount = 24
     n_cluster: PositiveCount = 48
@@ -35,7 +36,8 @@ class TrackingConfig(Section):
     turn_density: NonNegative = 0.005
     """[rad^2/s^3] spectral density of the turn rate's changes"""
     gate_m: Positive = 0.3
-    """a cluster this close to a prediction (plus one scan of its speed) may always match, however sure the filter is"""
+    """a cluster this close to a prediction (plus one scan of its speed) may always match, however sure the
+    filter is"""
     turn_gate: Positive = 20.0
     """squared normalised innovation (3 values) beyond which a body is taken to have turned"""
     moving_speed_m_s: NonNegative = 0.08
@@ -65,7 +67,8 @@ class ForecastConfig(Section):
     use_turn_rate: bool = True
     """bodies keep their turn rate; off: straight ahead"""
     straight_odds: Positive = 4.0
-    """prior odds that a body goes straight: a turn rate is used where its evidence against 0 outweighs them"""
+    """prior odds that a body goes straight: a turn rate is used where its evidence against 0 outweighs
+    them"""
     use_habits: bool = True
     """bodies turn where one was seen to turn"""
     n_turn: Packets = 48
@@ -88,7 +91,8 @@ class ElevationConfig(Section):
     """Memory in 3-D of bodies that left the sonar's fan (values EC, tuned)."""
 
     memory_s: NonNegative = 8.0
-    """time constant with which an unseen body is forgotten; 0 = a body that beams see through is forgotten at once"""
+    """time constant with which an unseen body is forgotten; 0 = a body that beams see through is forgotten at
+    once"""
     half_height_m: NonNegative = 0.2
     """half height assumed of a body that is no wider"""
     least_half_height_m: NonNegative = 0.1
@@ -115,7 +119,8 @@ class ElevationConfig(Section):
     def _is_somewhere(self) -> ElevationConfig:
         if 15 * self.tail_share + self.column_tail_share >= 1:
             raise ValueError(
-                f"tail_share {self.tail_share} of 15 heights and column_tail_share {self.column_tail_share} must sum to less than 1: "
+                f"tail_share {self.tail_share} of 15 heights and column_tail_share {self.column_tail_share} "
+                "must sum to less than 1: "
                 "else a body could be taken to be nowhere"
             )
         return self
@@ -146,12 +151,13 @@ class SpottingConfig(Section):
 
 
 class MappingConfig(Section):
-    """Two-layer occupancy map. Gains are per scan at 10 Hz; at another scan rate they are scaled so that gain per second is kept."""
+    """Two-layer occupancy map. Gains are per scan at 10 Hz; at another scan rate they are scaled so that gain
+    per second is kept."""
 
     cell_m: Positive = 0.1
     period_steps: PositiveCount = 1
-    """control steps between mapped scans, at least: 1 maps every scan, as in the paper; 5 (10 Hz, for which the gains were chosen) costs a
-    fifth and drives as well"""
+    """control steps between mapped scans, at least: 1 maps every scan, as in the paper; 5 (10 Hz, for which
+    the gains were chosen) costs a fifth and drives as well"""
     static_hit: Fraction = 0.15
     """eta_occ"""
     static_free: Fraction = 0.08
@@ -176,8 +182,10 @@ class MappingConfig(Section):
     depth_gate_m: Positive = 0.3
     """depth pixels count when their point lies within this of the vehicle's own depth"""
     free_range_m: Positive = 6.0
-    """a beam without return clears no farther: a missed return looks the same, and far out no second beam sees the cell (EC)"""
+    """a beam without return clears no farther: a missed return looks the same, and far out no second beam
+    sees the cell (EC)"""
     wall_margin_m: NonNegative = 0.15
-    """returns this close to a known wall are not mapped: the wall is the boundary term already, and no hull fits in between (EC)"""
+    """returns this close to a known wall are not mapped: the wall is the boundary term already, and no hull
+    fits in between (EC)"""
     occupied: Fraction = 0.5
     """tau_occ"""

@@ -14,7 +14,8 @@ class ClearanceConfig(Section):
     """distances are exact up to here"""
     period_steps: PositiveCount = 5
     inflate_m: NonNegative = 0.0
-    """obstacles, not the tank's bounds, count as so much larger: 0.08 in the paper's planner map; margins do the same here"""
+    """obstacles, not the tank's bounds, count as so much larger: 0.08 in the paper's planner map; margins do
+    the same here"""
     risk_static: NonNegative = 1.0
     """alpha_m"""
     risk_dynamic: NonNegative = 1.0

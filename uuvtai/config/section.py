@@ -1,7 +1,7 @@
 """Base of every section and the kinds of numbers they hold.
 
-Units stand in the names: ``_m``, ``_s``, ``_m_s``, ``_rad`` and so on; angles that a person types end in ``_deg``. Numbers with neither a
-source nor a design page behind them are engineering choices (EC).
+Units stand in the names: ``_m``, ``_s``, ``_m_s``, ``_rad`` and so on; angles that a person types end in
+``_deg``. Numbers with neither a source nor a design page behind them are engineering choices (EC).
 """
 
 from __future__ import annotations
@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 LARGEST, SMALLEST = 1e12, 1e-12
-"""no quantity here is larger, nor smaller where it must not be 0: quotients and squares of them stay numbers"""
+"""no quantity here is larger, nor smaller where it must not be 0: quotients and squares of them stay
+numbers"""
 MOST = 2**31 - 1
 """kernels count in 32 bits"""
 
@@ -49,5 +50,6 @@ class Section(BaseModel):
     if not TYPE_CHECKING:
 
         def __getattr__(self, name):
-            # Taichi asks every argument of every launch for an attribute that no section has: pydantic takes five times as long to say so
+            # Taichi asks every argument of every launch for an attribute that no section has: pydantic takes
+            # five times as long to say so
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")

@@ -6,7 +6,17 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from uuvtai.config.section import Count, Fraction, Interval, NonNegative, Packets, Positive, PositiveCount, Section, Vector3
+from uuvtai.config.section import (
+    Count,
+    Fraction,
+    Interval,
+    NonNegative,
+    Packets,
+    Positive,
+    PositiveCount,
+    Section,
+    Vector3,
+)
 
 
 class SonarConfig(Section):

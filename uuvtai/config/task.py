@@ -10,9 +10,11 @@ from uuvtai.config.section import NonNegative, Positive, PositiveCount, Real, Se
 
 
 class RewardConfig(Section):
-    """Weights of the paper's r_t, one per term and named like it (the paper gives no values: EC), and the bounds of the soft terms.
+    """Weights of the paper's r_t, one per term and named like it (the paper gives no values: EC), and the
+    bounds of the soft terms.
 
-    Scale: driving at 0.6 m/s along the route earns about 0.015 a step, 20 over a typical episode: as much as one success.
+    Scale: driving at 0.6 m/s along the route earns about 0.015 a step, 20 over a typical episode: as much as
+    one success.
     """
 
     alive: Real = 0.01

@@ -6,7 +6,8 @@ from uuvtai.config.section import Fraction, NonNegative, Positive, PositiveCount
 
 
 class TeacherConfig(Section):
-    """Behaviour tree's leaves: assessment of threats, evasion and driving. Ports of a tree override the numbers that are a leaf's own."""
+    """Behaviour tree's leaves: assessment of threats, evasion and driving. Ports of a tree override the
+    numbers that are a leaf's own."""
 
     cruise_m_s: Positive = 0.6
     decide_period_steps: PositiveCount = 5
@@ -19,7 +20,8 @@ class TeacherConfig(Section):
     n_heading: PositiveCount = 24
     n_speed: PositiveCount = 4
     evade_m_s: Positive = 0.85
-    """fastest candidate; the limits of surge and sway are separate, so diagonals of the body are faster than its axes"""
+    """fastest candidate; the limits of surge and sway are separate, so diagonals of the body are faster than
+    its axes"""
 
     heave_m_s: NonNegative = 0.4
     """vertical speed of the candidates that dive or climb; 0 = evade level only"""
@@ -39,7 +41,8 @@ class TeacherConfig(Section):
     closing_s: NonNegative = 0.25
     """effective clearance is reduced by this times the closing speed (the referee stops at 0.18 s)"""
     vertical_weight: Positive = 1.5
-    """free water above or below a body counts this many times: the hull is slimmer upwards (0.17 m) and heights carry their own margin"""
+    """free water above or below a body counts this many times: the hull is slimmer upwards (0.17 m) and
+    heights carry their own margin"""
     caution: Positive = 1.0
     """factor of both margins from moving bodies: more trades time and success for fewer collisions"""
     static_margin_m: NonNegative = 0.1
@@ -87,7 +90,8 @@ class TeacherConfig(Section):
     depth_gain: Positive = 1.0
     """[1/s] heave per metre of depth error"""
     gaze_m: NonNegative = 3.0
-    """the nose, and with it the camera, turns to the nearest moving body this close: near ones leave the sonar's fan; 0 = along the way"""
+    """the nose, and with it the camera, turns to the nearest moving body this close: near ones leave the
+    sonar's fan; 0 = along the way"""
     gaze_level_m: NonNegative = 1.0
     """bodies level with the vehicle count as so much farther: the sonar sees them"""
     gaze_clearance_m: NonNegative = 0.6
@@ -102,7 +106,8 @@ class TeacherConfig(Section):
 
     @property
     def n_held(self) -> int:
-        """Evasive velocities to be held: level headings times speeds; stop, last command, follow; diving and climbing ones."""
+        """Evasive velocities to be held: level headings times speeds; stop, last command, follow; diving and
+        climbing ones."""
         return self.n_heading * self.n_speed + 3 + (2 * self.n_heave_heading + 2 if self.heave_m_s > 0 else 0)
 
     @property

@@ -6,7 +6,17 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from uuvtai.config.section import Count, Fraction, NonNegative, NonNegative6, Positive, Real, Section, Spread, Vector3
+from uuvtai.config.section import (
+    Count,
+    Fraction,
+    NonNegative,
+    NonNegative6,
+    Positive,
+    Real,
+    Section,
+    Spread,
+    Vector3,
+)
 
 _S = 0.7071067811865476
 
@@ -29,7 +39,8 @@ _BLUEROV2_THRUSTERS = (
 
 
 class VehicleConfig(Section):
-    """Rigid body, hydrodynamics and thrusters (MarineGym BlueROV asset; Wu 2018 coefficients). Origin = centre of mass."""
+    """Rigid body, hydrodynamics and thrusters (MarineGym BlueROV asset; Wu 2018 coefficients). Origin =
+    centre of mass."""
 
     mass_kg: Positive = 11.26
     inertia_kg_m2: tuple[Positive, Positive, Positive] = (0.30375, 0.626, 0.5769)
@@ -39,8 +50,9 @@ class VehicleConfig(Section):
     buoyancy_height_m: Real = 0.01
     added_mass: NonNegative6 = (5.5, 12.7, 14.57, 0.12, 0.12, 0.12)
     added_mass_follows: Literal["ground", "water"] = "ground"
-    """whose acceleration the added mass resists: "ground" is M_A dnu/dt, the design's equation; "water" is M_A dnu_r/dt (Fossen 2011),
-    which makes motion in a uniform current equal to motion in still water plus drift. They differ only where it turns in a current"""
+    """whose acceleration the added mass resists: "ground" is M_A dnu/dt, the design's equation; "water" is
+    M_A dnu_r/dt (Fossen 2011), which makes motion in a uniform current equal to motion in still water plus
+    drift. They differ only where it turns in a current"""
     linear_damping: NonNegative6 = (4.03, 6.22, 5.18, 0.07, 0.07, 0.07)
     quadratic_damping: NonNegative6 = (18.18, 21.66, 36.99, 1.55, 1.55, 1.55)
     thrusters: Annotated[tuple[Thruster, ...], Field(min_length=1)] = _BLUEROV2_THRUSTERS
@@ -51,8 +63,9 @@ class VehicleConfig(Section):
     thrust_reverse: Vector3 = (-3.8442e-7, -1.6186e-4, -3.9139e-2)
     """[kgf] quadratic in rpm for n < 0"""
     dead_band_rpm: tuple[NonNegative, NonNegative] = (203.5, 210.5)
-    """no thrust below this speed, forward and reverse: where the quadratic fit turns round. MarineGym's throttle dead band of 7.5 % is
-    (620, 696): possible here too, slow motion then becomes a limit cycle of about 1 cm/s"""
+    """no thrust below this speed, forward and reverse: where the quadratic fit turns round. MarineGym's
+    throttle dead band of 7.5 % is (620, 696): possible here too, slow motion then becomes a limit cycle of
+    about 1 cm/s"""
     thrust_scale: Positive = 1.0
     """the paper's K_F / 4.4e-7"""
     attitude_hold: Literal["ideal", "thrusters", "none"] = "ideal"
@@ -71,9 +84,14 @@ class VehicleConfig(Section):
         ):
             edge = sign * max(dead, -sign * curve[1] / (2 * curve[0])) if sign * curve[0] > 0 else 0.0
             if sign * curve[0] <= 0 or sign * (curve[0] * edge * edge + curve[1] * edge + curve[2]) < 0:
-                raise ValueError(f"{name} must push its own way and harder with speed outside the dead band, got {curve}")
+                raise ValueError(
+                    f"{name} must push its own way and harder with speed outside the dead band, got {curve}"
+                )
             if abs(edge) >= self.rotor_max_rpm:
-                raise ValueError(f"rotor_max_rpm must exceed the dead band of {name} ({abs(edge):.0f} rpm), got {self.rotor_max_rpm}")
+                raise ValueError(
+                    f"rotor_max_rpm must exceed the dead band of {name} ({abs(edge):.0f} rpm), got "
+                    f"{self.rotor_max_rpm}"
+                )
         return self
 
 
@@ -85,7 +103,8 @@ class ActuationConfig(Section):
     velocity_integral: tuple[NonNegative, NonNegative, NonNegative] = (40.0, 40.0, 40.0)
     """[N/m]"""
     integral_band_m_s: Positive = 0.3
-    """errors beyond this do not build up the integral: they are a step under way or a blocked vehicle, and both would overshoot later"""
+    """errors beyond this do not build up the integral: they are a step under way or a blocked vehicle, and
+    both would overshoot later"""
     yaw_rate_gain: NonNegative = 4.0
     """[N m s]"""
     yaw_rate_integral: NonNegative = 4.0
@@ -104,7 +123,8 @@ class ActuationConfig(Section):
     hold_limit_n_m: NonNegative = 5.0
     """bound of the stabilising moment"""
     thruster_hold_gain_n_m: NonNegative = 20.0
-    """[N m/rad] roll and pitch, hold by thrusters: lower, since it acts one control step and a rotor lag late"""
+    """[N m/rad] roll and pitch, hold by thrusters: lower, since it acts one control step and a rotor lag
+    late"""
     thruster_hold_damping: NonNegative = 5.0
     """[N m s] hold by thrusters"""
 
@@ -122,6 +142,7 @@ class DisturbanceConfig(Section):
     dead_thruster: Count | None = None
     """index of a thruster that gives nothing"""
     mass_spread: Spread = 0.0
-    """each parameter is scaled by a factor drawn from [1 - spread, 1 + spread] per episode; inertia and buoyancy follow the mass"""
+    """each parameter is scaled by a factor drawn from [1 - spread, 1 + spread] per episode; inertia and
+    buoyancy follow the mass"""
     damping_spread: Spread = 0.0
     added_mass_spread: Spread = 0.0

@@ -6,7 +6,17 @@ from typing import Literal
 
 from pydantic import model_validator
 
-from uuvtai.config.section import Count, Fraction, Interval, NonNegative, OrderedInterval, Positive, PositiveInterval, Real, Section
+from uuvtai.config.section import (
+    Count,
+    Fraction,
+    Interval,
+    NonNegative,
+    OrderedInterval,
+    Positive,
+    PositiveInterval,
+    Real,
+    Section,
+)
 from uuvtai.truth import Truth
 
 
@@ -34,7 +44,8 @@ class TankConfig(Section):
 
 
 class StaticObstacles(Section):
-    """Random static obstacles: vertical cylinders and boxes through the full water column, anywhere within the side walls."""
+    """Random static obstacles: vertical cylinders and boxes through the full water column, anywhere within
+    the side walls."""
 
     radius_m: PositiveInterval = (0.2, 0.4)
     half_extent_m: PositiveInterval = (0.2, 0.5)
@@ -57,7 +68,8 @@ class DynamicObstacles(Section):
     cylinder_fraction: Fraction = 0.5
     """the others are spheres"""
     full_column_fraction: Fraction = 0.0
-    """share of the moving bodies that are cylinders through the full water column (counted within cylinder_fraction)"""
+    """share of the moving bodies that are cylinders through the full water column (counted within
+    cylinder_fraction)"""
     motion: Literal["line_circle", "waypoints", "mixed"] = "line_circle"
     """mixed: each body by a throw of a coin"""
     circle_fraction: Fraction = 0.5
@@ -68,7 +80,8 @@ class DynamicObstacles(Section):
     corner_gap_m: NonNegative = 2.0
     """between any two corners of one path"""
     keep_clear_draws: Count = 16
-    """draws of a path that keeps clear of static obstacles before the last one is taken as it is (0: the first); walls are always kept"""
+    """draws of a path that keeps clear of static obstacles before the last one is taken as it is (0: the
+    first); walls are always kept"""
     start_gap_m: NonNegative = 1.5
     """horizontal, centre to centre, at t = 0; always kept"""
 
@@ -90,7 +103,8 @@ class Waypoint(Section):
 
 
 class FixedObstacle(Section):
-    """An obstacle that is always there, given explicitly; with ``path`` it moves along the closed polyline."""
+    """An obstacle that is always there, given explicitly; with ``path`` it moves along the closed
+    polyline."""
 
     kind: Literal["sphere", "cylinder", "box"]
     x_m: Real
@@ -150,7 +164,9 @@ class WorldConfig(Section, Truth):
         for axis in ("x", "y", "z"):
             (low, high), (start, end) = getattr(self.tank, f"{axis}_m"), getattr(self, f"spawn_{axis}_m")
             if start < low or end > high:
-                raise ValueError(f"spawn_{axis}_m ({start}, {end}) reaches out of tank.{axis}_m ({low}, {high})")
+                raise ValueError(
+                    f"spawn_{axis}_m ({start}, {end}) reaches out of tank.{axis}_m ({low}, {high})"
+                )
         return self
 
     @property

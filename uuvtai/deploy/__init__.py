@@ -1,1 +1,2 @@
-"""Policies that leave the simulator: a folder with the networks, what they read and write, and a driver that needs NumPy alone."""
+"""Policies that leave the simulator: a folder with the networks, what they read and write, and a driver that
+needs NumPy alone."""

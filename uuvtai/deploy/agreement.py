@@ -1,4 +1,5 @@
-"""Do torch, NumPy and ONNX Runtime say the same to the golden pairs, and how long does each take for a decision."""
+"""Do torch, NumPy and ONNX Runtime say the same to the golden pairs, and how long does each take for a
+decision."""
 
 from __future__ import annotations
 
@@ -45,13 +46,16 @@ def of_numpy(policy: run_policy.Policy, golden: Arrays) -> Agreement:
 
 
 def of_torch(decision: OneDecision, golden: Arrays) -> Agreement:
-    """The networks themselves, one decision at a time without memory, against the pilot that flew the golden mission with its own."""
+    """The networks themselves, one decision at a time without memory, against the pilot that flew the golden
+    mission with its own."""
     tensors = [torch.from_numpy(array) for array in inputs_of(golden).values()]
     rows = [[tensor[i : i + 1] for tensor in tensors] for i in range(len(tensors[0]))]
     with torch.inference_mode():
         outputs = [torch.cat(parts).numpy() for parts in zip(*(decision(*row) for row in rows), strict=True)]
         time_ms = _in_turn(lambda row: decision(*row), rows)
-    return Agreement("torch", _differences(dict(zip(decision.outputs, outputs, strict=True)), golden), **time_ms)
+    return Agreement(
+        "torch", _differences(dict(zip(decision.outputs, outputs, strict=True)), golden), **time_ms
+    )
 
 
 def of_onnx(graph: bytes, golden: Arrays) -> Agreement:
@@ -74,7 +78,10 @@ def of_onnx(graph: bytes, golden: Arrays) -> Agreement:
 def _differences(found: Arrays, golden: Arrays) -> dict[str, float]:
     """Of every output that the golden pairs have; one that is missing differs without end."""
     wanted = [name for name in OUTPUTS if f"pair_{name}" in golden]
-    return {name: run_policy.difference(found[name], golden[f"pair_{name}"]) if name in found else np.inf for name in wanted}
+    return {
+        name: run_policy.difference(found[name], golden[f"pair_{name}"]) if name in found else np.inf
+        for name in wanted
+    }
 
 
 def _in_turn(step: Callable[[Any], Any], rows: list[Any]) -> dict[str, float]:

@@ -1,4 +1,5 @@
-"""How often a policy arrived and collided, from the evaluations that are at hand: the counts behind every rate of the model card."""
+"""How often a policy arrived and collided, from the evaluations that are at hand: the counts behind every
+rate of the model card."""
 
 from __future__ import annotations
 
@@ -43,7 +44,8 @@ def during_training(checkpoint: Checkpoint) -> Evaluation | None:
         return None
     n, world = config.train.evaluate_episodes, config.world
     where = (
-        f"the training's own world and sensing, S = {world.n_static}, D = {world.n_dynamic}, v = {world.dynamic_speed_m_s:g} m/s, "
+        f"the training's own world and sensing, S = {world.n_static}, D = {world.n_dynamic}, v = "
+        f"{world.dynamic_speed_m_s:g} m/s, "
         f"seed {config.train.evaluate_seed}"
     )
     return Evaluation(where, n, round(success * n), round(collision * n))
@@ -59,7 +61,10 @@ def evaluations_of(checkpoint: Checkpoint, folders: Iterable[Path]) -> list[Eval
     for folder in folders:
         rows = _rows(folder / RESULT, folder, checkpoint.sha256)
         if not rows:
-            raise ConfigError(f"--evaluation {folder}: does not evaluate this checkpoint; give the run folder that 'uuv eval RUN' printed")
+            raise ConfigError(
+                f"--evaluation {folder}: does not evaluate this checkpoint; give the run folder that 'uuv "
+                "eval RUN' printed"
+            )
         found += rows
     return found
 
@@ -72,19 +77,23 @@ def _own_results(checkpoint: Checkpoint) -> list[Path]:
 
 
 def _rows(file: Path, folder: Path, sha256: str) -> list[Evaluation]:
-    """Rows of the methods that this checkpoint drove. Raises ConfigError for a file below ``folder`` that is no result."""
+    """Rows of the methods that this checkpoint drove. Raises ConfigError for a file below ``folder`` that is
+    no result."""
     try:
         result = read_json(file, _MAX_BYTES, folder)
         return [_row(result, m) for m in result["methods"] if m.get("checkpoint", {}).get("sha256") == sha256]
     except (UserError, OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ConfigError(f"{file}: is no result of uuv eval ({error!r}); give the run folder that 'uuv eval RUN' printed") from None
+        raise ConfigError(
+            f"{file}: is no result of uuv eval ({error!r}); give the run folder that 'uuv eval RUN' printed"
+        ) from None
 
 
 def _row(result: dict[str, Any], method: dict[str, Any]) -> Evaluation:
     speed = f", v = {float(result['v_m_s']):g} m/s" if result["D"] else ""
     seeds = ", ".join(str(int(seed)) for seed in result["seeds"])
     where = (
-        f"{_word(result['world'])}, S = {int(result['S'])}, D = {int(result['D'])}{speed}, {_word(result['sensors'])} sensing, seed {seeds}"
+        f"{_word(result['world'])}, S = {int(result['S'])}, D = {int(result['D'])}{speed}, "
+        f"{_word(result['sensors'])} sensing, seed {seeds}"
     )
     k, n = int(method["outcomes"]["success"]), int(method["episodes"])
     collisions = sum(int(method["outcomes"][name]) for name in COLLIDED)
@@ -100,4 +109,8 @@ def _word(name: Any) -> str:
 
 def _rate(k: int, n: int) -> str:
     bounds = wilson_interval(k, n)
-    return "-" if bounds is None else f"{k}/{n} = {100 * k / n:.1f} % [{100 * bounds[0]:.1f}, {100 * bounds[1]:.1f}]"
+    return (
+        "-"
+        if bounds is None
+        else f"{k}/{n} = {100 * k / n:.1f} % [{100 * bounds[0]:.1f}, {100 * bounds[1]:.1f}]"
+    )

@@ -1,4 +1,5 @@
-"""``uuv export``: a policy as a folder that drives without uuvtai, written whole or not at all, and the check of such a folder."""
+"""``uuv export``: a policy as a folder that drives without uuvtai, written whole or not at all, and the check
+of such a folder."""
 
 from __future__ import annotations
 
@@ -36,7 +37,8 @@ EXTRA = "uuvtai[export]"
 
 
 class ExportError(UserError, PolicyError):
-    """What a folder lacks to be an exported policy (``run_policy.PolicyError``, whose module knows nothing of this package)."""
+    """What a folder lacks to be an exported policy (``run_policy.PolicyError``, whose module knows nothing of
+    this package)."""
 
 
 @dataclass(frozen=True)
@@ -56,19 +58,32 @@ class Export:
     def document(self) -> dict[str, Any]:
         """What ``uuv export --json`` prints."""
         engines = [found.document() for found in self.agreements]
-        return {"schema": 1, "folder": str(self.folder), "agrees": self.agrees, "damages": list(self.damages), "engines": engines}
+        return {
+            "schema": 1,
+            "folder": str(self.folder),
+            "agrees": self.agrees,
+            "damages": list(self.damages),
+            "engines": engines,
+        }
 
 
-def export(checkpoint: Checkpoint, name: str, out: Path, evaluations: Iterable[Path], note: Note, force: bool = False) -> Export:
-    """Write the policy of a checkpoint into a new folder ``out``; ``note`` is told what it lacks. ``force`` replaces an exported policy.
+def export(
+    checkpoint: Checkpoint, name: str, out: Path, evaluations: Iterable[Path], note: Note, force: bool = False
+) -> Export:
+    """Write the policy of a checkpoint into a new folder ``out``; ``note`` is told what it lacks. ``force``
+    replaces an exported policy.
 
-    Raises ConfigError for a place that is taken, CheckpointError for networks that cannot drive, RunFolderError where the disk refuses.
+    Raises ConfigError for a place that is taken, CheckpointError for networks that cannot drive,
+    RunFolderError where the disk refuses.
     """
     _refuse_place(out, force)
     pilot, rows = load_pilot(checkpoint, 1), evaluations_of(checkpoint, evaluations)
     decision, golden, graph = OneDecision(pilot).eval(), golden_of(pilot), None
     if missing := missing_packages():
-        note(f"left out {ONNX}: {', '.join(missing)} not installed. For an ONNX graph: pip install '{EXTRA}', then export again")
+        note(
+            f"left out {ONNX}: {', '.join(missing)} not installed. For an ONNX graph: pip install '{EXTRA}', "
+            "then export again"
+        )
     else:
         graph = onnx_bytes(decision)
     spec = specification(checkpoint, pilot, name, graph is not None)
@@ -83,7 +98,8 @@ def export(checkpoint: Checkpoint, name: str, out: Path, evaluations: Iterable[P
 
 
 def check(folder: Path, note: Note) -> Export:
-    """Verify the sha256 of every file of an exported policy and replay its golden pairs; nothing in it is executed.
+    """Verify the sha256 of every file of an exported policy and replay its golden pairs; nothing in it is
+    executed.
 
     Raises ExportError for a folder that is no exported policy.
     """
@@ -106,20 +122,29 @@ def _replayed(folder: Path, spec: dict[str, Any], note: Note) -> list[Agreement]
         if onnx_session.is_installed():
             return [*found, of_onnx(run_policy.content_of(folder / ONNX), golden)]
     except (LookupError, ValueError, TypeError, AttributeError, ArithmeticError) as error:
-        raise PolicyError(f"{folder}: its golden pairs do not fit its policy ({error!r}); export it again") from None
+        raise PolicyError(
+            f"{folder}: its golden pairs do not fit its policy ({error!r}); export it again"
+        ) from None
     note(f"{ONNX} was not replayed: {onnx_session.NAME} is not installed; pip install '{EXTRA}'")
     return found
 
 
 def _refuse_place(out: Path, force: bool) -> None:
-    """Raise ConfigError for a place that is taken; with ``force`` a folder that holds an exported policy and nothing else may be."""
+    """Raise ConfigError for a place that is taken; with ``force`` a folder that holds an exported policy and
+    nothing else may be."""
     if not out.exists() and not out.is_symlink():
         return
     if not force:
-        raise ConfigError(f"{out}: is already there; give another folder with --out DIR, or --force to replace an exported policy")
+        raise ConfigError(
+            f"{out}: is already there; give another folder with --out DIR, or --force to replace an exported "
+            "policy"
+        )
     ours = out.is_dir() and not out.is_symlink() and {path.name for path in out.iterdir()} <= {SPEC, *FILES}
     if not ours or not (out / SPEC).is_file():
-        raise ConfigError(f"{out}: is not just an exported policy, so it is not replaced; give another folder with --out DIR")
+        raise ConfigError(
+            f"{out}: is not just an exported policy, so it is not replaced; give another folder with --out "
+            "DIR"
+        )
 
 
 def _publish(out: Path, files: dict[str, bytes], spec: dict[str, Any]) -> None:
@@ -136,7 +161,9 @@ def _publish(out: Path, files: dict[str, bytes], spec: dict[str, Any]) -> None:
         partial.rename(out)
         sync_folder(out.parent)
     except OSError as error:
-        raise RunFolderError(f"{out}: cannot be written ({error.strerror}); give a folder that can be: --out DIR") from None
+        raise RunFolderError(
+            f"{out}: cannot be written ({error.strerror}); give a folder that can be: --out DIR"
+        ) from None
     finally:
         shutil.rmtree(partial, ignore_errors=True)
         if out.exists():

@@ -1,4 +1,5 @@
-"""Golden pairs: a made-up mission that the pilot answers, step by step with its memory and decision by decision without."""
+"""Golden pairs: a made-up mission that the pilot answers, step by step with its memory and decision by
+decision without."""
 
 from __future__ import annotations
 
@@ -15,7 +16,8 @@ from uuvtai.learn.policy import NUM_ACTIONS
 from uuvtai.learn.world_model import N_FEATURES, N_TARGET, deviation
 
 TOLERANCE = 1e-5
-"""largest difference between torch, NumPy and ONNX Runtime, in parts of the output's largest value where that is beyond 1"""
+"""largest difference between torch, NumPy and ONNX Runtime, in parts of the output's largest value where that
+is beyond 1"""
 _DECISIONS, _SEED = 64, 6
 
 Arrays = dict[str, np.ndarray]
@@ -23,17 +25,22 @@ Row = dict[str, Tensor]
 
 
 def golden_of(pilot: Pilot) -> Arrays:
-    """A mission of T steps and what the pilot (of one row) does in it, and its decisions as pairs for the graph.
+    """A mission of T steps and what the pilot (of one row) does in it, and its decisions as pairs for the
+    graph.
 
-    ``obs`` (T, n_obs), ``begins`` (T,): another mission begins here; outputs ``action`` (T, 4), ``value``, ``residual``, ``uncertainty``
-    and, with a head, ``risk`` (T,). ``pair_<input>`` and ``pair_<output>`` have a row per decision. Some values are not finite, as a
-    sensor that fails may give them.
+    ``obs`` (T, n_obs), ``begins`` (T,): another mission begins here; outputs ``action`` (T, 4), ``value``,
+    ``residual``, ``uncertainty`` and, with a head, ``risk`` (T,). ``pair_<input>`` and ``pair_<output>`` have
+    a row per decision. Some values are not finite, as a sensor that fails may give them.
     """
     obs = _mission(pilot)
     begins = torch.zeros(len(obs), dtype=torch.bool)
     begins[[0, len(obs) // 2 + 1]] = True
     told, pairs = _flown(pilot, obs, begins)
-    found = {"obs": obs, "begins": begins} | _stacked(told) | {f"pair_{name}": tensor for name, tensor in _stacked(pairs).items()}
+    found = (
+        {"obs": obs, "begins": begins}
+        | _stacked(told)
+        | {f"pair_{name}": tensor for name, tensor in _stacked(pairs).items()}
+    )
     return {name: tensor.numpy() for name, tensor in found.items()}
 
 
@@ -54,8 +61,13 @@ def inputs_of(golden: Arrays) -> Arrays:
 
 
 def _mission(pilot: Pilot) -> Tensor:
-    """(T, n_obs) observations as training had them: spread like the normaliser's columns, the world model's targets step by step."""
-    norm, n_obs, hold = pilot.policy.observation_norm, pilot.policy.n_in - N_FEATURES, pilot.policy.config.hold_steps
+    """(T, n_obs) observations as training had them: spread like the normaliser's columns, the world model's
+    targets step by step."""
+    norm, n_obs, hold = (
+        pilot.policy.observation_norm,
+        pilot.policy.n_in - N_FEATURES,
+        pilot.policy.config.hold_steps,
+    )
     rng, steps = torch.Generator().manual_seed(_SEED), _DECISIONS + hold * (_DECISIONS // 4)
     mean, std = norm.mean[:n_obs].float(), norm.std()[:n_obs].float()
     obs = mean + std * torch.randn(steps, n_obs, generator=rng)
@@ -90,11 +102,17 @@ def _said(pilot: Pilot, obs: Tensor) -> Row:
     said = pilot.decide(obs[None])
     pilot.advance()
     found = {name: getattr(said, name)[0].clone() for name in ("action", "value", "residual", "uncertainty")}
-    return found if pilot.risk is None else found | {"risk": pilot.risk.calibrated(said.risk_logit)[0].float()}
+    return (
+        found if pilot.risk is None else found | {"risk": pilot.risk.calibrated(said.risk_logit)[0].float()}
+    )
 
 
 def _pair_outputs(pilot: Pilot, row: Row) -> Row:
     """The same decision under the names of the graph's outputs."""
     found = {"mean_action": pilot.mean_action[0].clone(), "value": row["value"]}
     found["features"] = torch.stack([row["residual"], row["uncertainty"]])
-    return found if pilot.risk is None else found | {"risk_logit": pilot.decision.risk_logit[0].clone(), "risk": row["risk"]}
+    return (
+        found
+        if pilot.risk is None
+        else found | {"risk_logit": pilot.decision.risk_logit[0].clone(), "risk": row["risk"]}
+    )

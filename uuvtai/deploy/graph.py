@@ -1,4 +1,5 @@
-"""One decision without memory as a torch module and as an ONNX graph; whoever calls it remembers the last decision."""
+"""One decision without memory as a torch module and as an ONNX graph; whoever calls it remembers the last
+decision."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ from uuvtai.learn.policy import NUM_ACTIONS
 from uuvtai.learn.world_model import N_FEATURES
 
 INPUTS = {
-    "obs": "(N, n_obs) float32: the newest observation, raw SI units; what is not finite counts as the training's mean",
+    "obs": "(N, n_obs) float32: the newest observation, raw SI units; what is not finite counts as the "
+    "training's mean",
     "last_obs": "(N, n_obs) float32: the observation of the last decision; anything where has_last is false",
     "last_action": "(N, 4) float32: the action of the step in which the last decision was made",
     "has_last": "(N,) bool: there was a decision before in this mission",
@@ -36,7 +38,8 @@ OPSET = 20
 
 
 class OneDecision(nn.Module):
-    """``Pilot`` for one decision: outputs by the names of OUTPUTS, without the last two where there is no risk head."""
+    """``Pilot`` for one decision: outputs by the names of OUTPUTS, without the last two where there is no
+    risk head."""
 
     fill: Tensor
     """(n_obs,) what counts where a value is not finite"""
@@ -44,19 +47,25 @@ class OneDecision(nn.Module):
     def __init__(self, pilot: Pilot) -> None:
         super().__init__()
         self.policy, self.world_model, self.risk = pilot.policy, pilot.world_model, pilot.risk
-        self.register_buffer("fill", pilot.policy.observation_norm.mean[: pilot.policy.n_in - N_FEATURES].float())
+        self.register_buffer(
+            "fill", pilot.policy.observation_norm.mean[: pilot.policy.n_in - N_FEATURES].float()
+        )
 
     @property
     def outputs(self) -> list[str]:
         """Names of what ``forward`` returns."""
         return list(OUTPUTS)[: 5 if self.risk is not None else 3]
 
-    def forward(self, obs: Tensor, last_obs: Tensor, last_action: Tensor, has_last: Tensor) -> tuple[Tensor, ...]:
+    def forward(
+        self, obs: Tensor, last_obs: Tensor, last_action: Tensor, has_last: Tensor
+    ) -> tuple[Tensor, ...]:
         """Shapes as INPUTS says."""
         obs, last_obs = (torch.where(torch.isfinite(seen), seen, self.fill) for seen in (obs, last_obs))
         features = obs.new_zeros(obs.shape[0], N_FEATURES)
         if self.world_model is not None:
-            features = torch.where(has_last[:, None], self.world_model.features(last_obs, last_action, obs), features)
+            features = torch.where(
+                has_last[:, None], self.world_model.features(last_obs, last_action, obs), features
+            )
         x = torch.cat([obs, features], dim=1)
         mean, _ = self.policy.distribution(x)
         said = mean, self.policy.value(x), features
@@ -75,7 +84,12 @@ def onnx_bytes(decision: OneDecision) -> bytes:
     """The ONNX graph with its weights inside, any number of rows at once. Needs PACKAGES."""
     without_telemetry()
     n_obs = decision.policy.n_in - N_FEATURES
-    example = torch.zeros(2, n_obs), torch.zeros(2, n_obs), torch.zeros(2, NUM_ACTIONS), torch.tensor([True, False])
+    example = (
+        torch.zeros(2, n_obs),
+        torch.zeros(2, n_obs),
+        torch.zeros(2, NUM_ACTIONS),
+        torch.tensor([True, False]),
+    )
     rows = torch.export.Dim("rows", min=1)
     with _quiet():
         program = torch.onnx.export(

@@ -1,4 +1,5 @@
-"""What an ONNX graph of a stranger may hold before ONNX Runtime sees it: our operators, and memory and work that are reckoned first."""
+"""What an ONNX graph of a stranger may hold before ONNX Runtime sees it: our operators, and memory and work
+that are reckoned first."""
 
 from __future__ import annotations
 
@@ -9,17 +10,17 @@ from typing import Any
 from uuvtai.errors import UserError
 
 _OURS = """
-Add And Cast Clip Concat ConstantOfShape Div Elu Exp Floor GatherND Gemm Greater IsInf IsNaN Less Min Mul Not Pow ReduceMean Relu
-Shape Slice Softplus Split Sqrt Squeeze Sub Tanh Unsqueeze Where
+Add And Cast Clip Concat ConstantOfShape Div Elu Exp Floor GatherND Gemm Greater IsInf IsNaN Less Min Mul Not
+Pow ReduceMean Relu Shape Slice Softplus Split Sqrt Squeeze Sub Tanh Unsqueeze Where
 """
 _LIKE_OURS = """
-Abs Constant Equal Flatten Gather GreaterOrEqual Identity LessOrEqual Log MatMul Max Neg Or ReduceSum Reshape Sigmoid Sign
-Transpose
+Abs Constant Equal Flatten Gather GreaterOrEqual Identity LessOrEqual Log MatMul Max Neg Or ReduceSum Reshape
+Sigmoid Sign Transpose
 """
 OPERATORS = frozenset((_OURS + _LIKE_OURS).split())
-"""What torch's exporter makes of a policy, and what other versions of it make of the same. No loops, branches, random numbers or functions,
-and nothing that repeats or resizes. ConstantOfShape is ours too (features before the first decision): what it makes is bounded like all
-else, by its shape."""
+"""What torch's exporter makes of a policy, and what other versions of it make of the same. No loops,
+branches, random numbers or functions, and nothing that repeats or resizes. ConstantOfShape is ours too
+(features before the first decision): what it makes is bounded like all else, by its shape."""
 OPSETS = range(17, 27)
 MAX_NODES = 5000
 MAX_BYTES = 64 << 20
@@ -40,9 +41,11 @@ class GraphError(UserError, RuntimeError):
 
 
 def refuse_strange(graph: bytes, inputs: dict[str, tuple[int, ...]], single_calls: int) -> None:
-    """Raise GraphError for a graph that reaches beyond itself or may take more memory or time than a policy does.
+    """Raise GraphError for a graph that reaches beyond itself or may take more memory or time than a policy
+    does.
 
-    ``inputs``: shapes (rows, ...) with which it will run once; it will run ``single_calls`` times with one row.
+    ``inputs``: shapes (rows, ...) with which it will run once; it will run ``single_calls`` times with one
+    row.
     """
     model = _parsed(graph)
     _refuse_parts(model)
@@ -69,20 +72,42 @@ def _parsed(graph: bytes) -> Any:
 def _refuse_parts(model: Any) -> None:
     """Operators, domains, functions, graphs within graphs, other files."""
     graph = model.graph
-    strange = {f"{node.domain or 'onnx'}.{node.op_type}" for node in graph.node if node.domain or node.op_type not in OPERATORS}
-    strange |= {f"a graph in {node.op_type}" for node in graph.node for a in node.attribute if a.HasField("g") or a.graphs}
+    strange = {
+        f"{node.domain or 'onnx'}.{node.op_type}"
+        for node in graph.node
+        if node.domain or node.op_type not in OPERATORS
+    }
+    strange |= {
+        f"a graph in {node.op_type}"
+        for node in graph.node
+        for a in node.attribute
+        if a.HasField("g") or a.graphs
+    }
     strange |= {tensor.name for tensor in _tensors(graph) if tensor.external_data or tensor.data_location}
     strange |= {function.name for function in model.functions}
     strange |= {"training" for _ in model.training_info}
     strange |= {"sparse weights" for _ in graph.sparse_initializer}
-    strange |= {"sparse weights" for node in graph.node for a in node.attribute if a.HasField("sparse_tensor") or a.sparse_tensors}
-    strange |= {f"opset {o.domain or 'onnx'} {o.version}" for o in model.opset_import if o.domain or o.version not in OPSETS}
+    strange |= {
+        "sparse weights"
+        for node in graph.node
+        for a in node.attribute
+        if a.HasField("sparse_tensor") or a.sparse_tensors
+    }
+    strange |= {
+        f"opset {o.domain or 'onnx'} {o.version}"
+        for o in model.opset_import
+        if o.domain or o.version not in OPSETS
+    }
     if strange:
         raise GraphError(f"was not written by uuv export, it has {', '.join(sorted(strange)[:5])}")
     if len(graph.node) > MAX_NODES or len(graph.initializer) > MAX_NODES:
         raise GraphError(f"has more than {MAX_NODES:,} operators or weights")
     for tensor in _tensors(graph):
-        if len(tensor.dims) > _RANK or not all(size >= 0 for size in tensor.dims) or math.prod(tensor.dims) > MAX_BYTES:
+        if (
+            len(tensor.dims) > _RANK
+            or not all(size >= 0 for size in tensor.dims)
+            or math.prod(tensor.dims) > MAX_BYTES
+        ):
             raise GraphError(f"has weights {tensor.name} of shape {list(tensor.dims)[:_RANK]}")
 
 
@@ -100,11 +125,14 @@ def _refuse_interface(model: Any, wanted: set[str]) -> None:
     weights = {tensor.name for tensor in model.graph.initializer}
     found = {value.name for value in model.graph.input} - weights
     if found != wanted:
-        raise GraphError(f"takes {', '.join(sorted(found)) or 'nothing'} instead of {', '.join(sorted(wanted))}")
+        raise GraphError(
+            f"takes {', '.join(sorted(found)) or 'nothing'} instead of {', '.join(sorted(wanted))}"
+        )
 
 
 def _shapes(model: Any, inputs: dict[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
-    """Shape of every value for these inputs, reckoned without what the file itself says about them; GraphError where one is unknown."""
+    """Shape of every value for these inputs, reckoned without what the file itself says about them;
+    GraphError where one is unknown."""
     import onnx
     from onnx import shape_inference
 

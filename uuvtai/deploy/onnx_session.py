@@ -1,4 +1,5 @@
-"""The one place that imports ONNX Runtime: its telemetry is off before it is loaded, and its sessions run on one thread."""
+"""The one place that imports ONNX Runtime: its telemetry is off before it is loaded, and its sessions run on
+one thread."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ def is_installed() -> bool:
 
 
 def without_telemetry() -> None:
-    """Set the variable; whoever may cause ONNX Runtime to be loaded, torch's exporter included, calls this first."""
+    """Set the variable; whoever may cause ONNX Runtime to be loaded, torch's exporter included, calls this
+    first."""
     os.environ[VARIABLE] = "1"
 
 

@@ -1,12 +1,15 @@
-"""Drive by an exported policy with NumPy alone: no torch, no Taichi, no uuvtai. ``uuv export`` puts a copy of this file in its folder.
+"""Drive by an exported policy with NumPy alone: no torch, no Taichi, no uuvtai. ``uuv export`` puts a copy of
+this file in its folder.
 
     from run_policy import load
     policy = load("FOLDER")               # checks the sha256 of every file
     policy.reset()                        # at the start of a mission
-    decision = policy.act(observation)    # every control step: (n_obs,) in raw SI units, as policy_spec.json says
+    decision = policy.act(observation)    # every control step: (n_obs,) in raw SI units, as policy_spec.json
+    says
 
-``python run_policy.py [FOLDER]`` replays the golden pairs, prints the differences and the latency, and exits 3 where they differ. Nothing
-in the folder can make this file execute code: safetensors and npz are read as bytes of checked length, never as pickles.
+``python run_policy.py [FOLDER]`` replays the golden pairs, prints the differences and the latency, and exits
+3 where they differ. Nothing in the folder can make this file execute code: safetensors and npz are read as
+bytes of checked length, never as pickles.
 """
 
 from __future__ import annotations
@@ -73,21 +76,31 @@ class Decision(NamedTuple):
 
 
 class Policy:
-    """One vehicle's policy with its memory. ``act`` once per control step; ``reset`` when a mission begins."""
+    """One vehicle's policy with its memory. ``act`` once per control step; ``reset`` when a mission
+    begins."""
 
     def __init__(self, spec: dict[str, Any], arrays: Arrays) -> None:
-        """``spec`` is policy_spec.json, ``arrays`` policy.safetensors. Raises PolicyError where they do not fit together."""
+        """``spec`` is policy_spec.json, ``arrays`` policy.safetensors. Raises PolicyError where they do not
+        fit together."""
         try:
-            self._network, self._limits = spec["network"], np.array([row["limit"] for row in spec["action"]], np.float32)
+            self._network, self._limits = (
+                spec["network"],
+                np.array([row["limit"] for row in spec["action"]], np.float32),
+            )
             self.n_obs, self.hold_steps = int(spec["observation"]["width"]), int(spec["rate"]["hold_steps"])
             self.control_dt_s = float(spec["rate"]["control_dt_s"])
             teacher = self._network["teacher_columns"]
             self._teacher = None if teacher is None else slice(int(teacher[0]), int(teacher[1]))
             self._a = arrays
-            self._nets = {name: _layers(arrays, name) for name in ("actor", "critic", "encoder", "dynamics", "decoder", "risk")}
+            self._nets = {
+                name: _layers(arrays, name)
+                for name in ("actor", "critic", "encoder", "dynamics", "decoder", "risk")
+            }
             self._check_widths()
         except (KeyError, TypeError, ValueError, IndexError) as error:
-            raise PolicyError(f"{SPEC} and {WEIGHTS} do not fit together ({error!r}); export the policy again") from None
+            raise PolicyError(
+                f"{SPEC} and {WEIGHTS} do not fit together ({error!r}); export the policy again"
+            ) from None
         self.work = sum(weight.size for layers in self._nets.values() for weight, _ in layers)
         """multiplications of a decision"""
         self.reset()
@@ -99,10 +112,14 @@ class Policy:
         self._offset, self._said = np.zeros(N_ACTION, np.float32), np.zeros(4, np.float32)
 
     def act(self, observation: Any) -> Decision:
-        """Decision for the newest observation (n_obs,), carried out: call it every control step, also while a decision is held."""
+        """Decision for the newest observation (n_obs,), carried out: call it every control step, also while a
+        decision is held."""
         obs = np.asarray(observation, np.float32)
         if obs.shape != (self.n_obs,):
-            raise ValueError(f"the observation must have shape ({self.n_obs},), got {obs.shape}; its columns are listed in {SPEC}")
+            raise ValueError(
+                f"the observation must have shape ({self.n_obs},), got {obs.shape}; its columns are listed "
+                f"in {SPEC}"
+            )
         obs = self._filled(obs)
         if self._age % self.hold_steps == 0:
             self._think(obs)
@@ -140,11 +157,14 @@ class Policy:
             tree = self._base(obs)
             self._offset = (tree + np.float32(self._network["residual_limit"]) * np.tanh(out)) - tree
         value = self._a["value.mean"][0] + self._through("critic", scaled)[0] * self._a["value.std"][0]
-        logit = self._through("risk", self._scaled(x, "risk.norm"))[0] if self._nets["risk"] else np.float32(0)
+        logit = (
+            self._through("risk", self._scaled(x, "risk.norm"))[0] if self._nets["risk"] else np.float32(0)
+        )
         self._said = np.array([value, x[-2], x[-1], logit], np.float32)
 
     def _features(self, obs: np.ndarray) -> np.ndarray:
-        """(2,) residual and uncertainty of the world model's prediction from the last decision; 0 where there is none."""
+        """(2,) residual and uncertainty of the world model's prediction from the last decision; 0 where there
+        is none."""
         if self._last is None or not self._nets["encoder"]:
             return np.zeros(2, np.float32)
         last, action = self._last
@@ -152,7 +172,9 @@ class Policy:
         latent = self._through("encoder", self._scaled(last, "world_norm"))
         ahead = self._through("dynamics", np.concatenate([latent, np.clip(action, -1.0, 1.0)]))
         mean, raw = np.split(self._through("decoder", ahead), 2)
-        spread = np.float32(highest) - _softplus(np.float32(highest - lowest) - _softplus(raw - np.float32(lowest)))
+        spread = np.float32(highest) - _softplus(
+            np.float32(highest - lowest) - _softplus(raw - np.float32(lowest))
+        )
         log_var = spread + 2.0 * np.log(a["target.scale"])
         base = last[:N_TARGET] if self._network["predict_change"] else a["target.base"]
         error = (obs[:N_TARGET] - (base + a["target.scale"] * mean)) / a["change.unit"]
@@ -180,7 +202,11 @@ class Policy:
         wanted = {"actor": (n_in, N_ACTION), "critic": (n_in, 1)}
         if nets["encoder"]:
             latent = len(nets["encoder"][-1][1])
-            wanted |= {"encoder": (self.n_obs, latent), "dynamics": (latent + N_ACTION, latent), "decoder": (latent, 2 * N_TARGET)}
+            wanted |= {
+                "encoder": (self.n_obs, latent),
+                "dynamics": (latent + N_ACTION, latent),
+                "decoder": (latent, 2 * N_TARGET),
+            }
         if nets["risk"]:
             wanted["risk"] = (n_in, 1)
         for name, (first, last) in wanted.items():
@@ -205,15 +231,19 @@ def _softplus(x: np.ndarray) -> np.ndarray:
 
 def _layers(arrays: Arrays, name: str) -> list[tuple[np.ndarray, np.ndarray]]:
     """(weight, bias) of a network's layers in order; ValueError where one does not follow the other."""
-    numbers = sorted(int(key.split(".")[1]) for key in arrays if key.startswith(f"{name}.") and key.endswith(".weight"))
+    numbers = sorted(
+        int(key.split(".")[1]) for key in arrays if key.startswith(f"{name}.") and key.endswith(".weight")
+    )
     layers = [(arrays[f"{name}.{i}.weight"], arrays[f"{name}.{i}.bias"]) for i in numbers]
     widths = [weight.shape[1] for weight, _ in layers[1:]]
-    if any(weight.ndim != 2 or bias.shape != weight.shape[:1] for weight, bias in layers) or widths != [len(b) for _, b in layers[:-1]]:
+    if any(weight.ndim != 2 or bias.shape != weight.shape[:1] for weight, bias in layers) or widths != [
+        len(b) for _, b in layers[:-1]
+    ]:
         raise ValueError(f"layers of {name}")
     return layers
 
 
-# ------------------------------------------------------------------------------------------------------- reading without trust
+# -------------------------------------------------------------------------------------- reading without trust
 
 
 def load(folder: str | Path = ".") -> Policy:
@@ -233,15 +263,21 @@ def read_spec(folder: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise PolicyError(f"{file}: is not JSON ({error}); export the policy again") from None
     if not isinstance(spec, dict) or spec.get("schema") != SCHEMA:
-        raise PolicyError(f"{file}: is not the specification of an exported policy of schema {SCHEMA}; give a folder of uuv export")
+        raise PolicyError(
+            f"{file}: is not the specification of an exported policy of schema {SCHEMA}; give a folder of "
+            "uuv export"
+        )
     return spec
 
 
 def changed_files(folder: Path, spec: dict[str, Any]) -> list[str]:
-    """What is not as the spec says, in words; empty = every file is there and has its sha256. Raises PolicyError."""
+    """What is not as the spec says, in words; empty = every file is there and has its sha256. Raises
+    PolicyError."""
     listed = spec.get("files")
     if not isinstance(listed, dict) or not {WEIGHTS, GOLDEN} <= listed.keys() <= set(FILES):
-        raise PolicyError(f"{folder / SPEC}: lists other files than an exported policy has ({', '.join(FILES)})")
+        raise PolicyError(
+            f"{folder / SPEC}: lists other files than an exported policy has ({', '.join(FILES)})"
+        )
     found = []
     for name, sha256 in listed.items():
         try:
@@ -255,7 +291,8 @@ def changed_files(folder: Path, spec: dict[str, Any]) -> list[str]:
 
 
 def content_of(file: Path) -> bytes:
-    """Bytes of a plain file of bearable size; no link is followed and neither a pipe nor a device is waited for. Raises PolicyError."""
+    """Bytes of a plain file of bearable size; no link is followed and neither a pipe nor a device is waited
+    for. Raises PolicyError."""
     try:
         if file.is_symlink():
             raise PolicyError(f"{file}: is missing or no plain file; give a folder of uuv export")
@@ -281,7 +318,8 @@ def read_safetensors(file: Path) -> Arrays:
 
 
 def _tensors(content: bytes) -> Arrays:
-    """Source of the format: https://huggingface.co/docs/safetensors (8 bytes of length, JSON header, raw bytes without gaps)."""
+    """Source of the format: https://huggingface.co/docs/safetensors (8 bytes of length, JSON header, raw
+    bytes without gaps)."""
     length = int.from_bytes(content[:8], "little")
     if len(content) < 8 or length > min(len(content) - 8, _MAX_HEADER):
         raise ValueError("its header is longer than the file or than any of ours")
@@ -291,7 +329,11 @@ def _tensors(content: bytes) -> Arrays:
     for name, entry in sorted(header.items(), key=lambda pair: pair[1]["data_offsets"]):
         first, last = entry["data_offsets"]
         dtype, shape = _DTYPES[entry["dtype"]], entry["shape"]
-        if not all(type(n) is int and n >= 0 for n in (first, last, *shape)) or first != end or last > len(data):
+        if (
+            not all(type(n) is int and n >= 0 for n in (first, last, *shape))
+            or first != end
+            or last > len(data)
+        ):
             raise ValueError(f"{name} lies outside the file or over another array")
         if last - first != math.prod(shape) * dtype.itemsize:
             raise ValueError(f"{name} has {last - first} bytes, its shape {shape} needs others")
@@ -305,10 +347,14 @@ def _tensors(content: bytes) -> Arrays:
 
 
 def read_golden(file: Path) -> Arrays:
-    """Arrays of golden.npz: members must be stored, not compressed, so that nothing unfolds. Raises PolicyError."""
+    """Arrays of golden.npz: members must be stored, not compressed, so that nothing unfolds. Raises
+    PolicyError."""
     try:
         with zipfile.ZipFile(io.BytesIO(content_of(file))) as archive:
-            return {member.filename.removesuffix(".npy"): _member(archive, member) for member in archive.infolist()}
+            return {
+                member.filename.removesuffix(".npy"): _member(archive, member)
+                for member in archive.infolist()
+            }
     except (ValueError, zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError) as error:
         raise PolicyError(f"{file}: is not the golden pairs of an exported policy ({error})") from None
 
@@ -325,7 +371,7 @@ def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
     return np.frombuffer(stream.read(), dtype).reshape(shape)
 
 
-# -------------------------------------------------------------------------------------------------------------- golden pairs
+# ----------------------------------------------------------------------------------------------- golden pairs
 
 
 def replayed(policy: Policy, golden: Arrays) -> Arrays:
@@ -334,7 +380,11 @@ def replayed(policy: Policy, golden: Arrays) -> Arrays:
     Raises PolicyError for golden pairs of another shape, or that would take minutes.
     """
     steps = golden["obs"].shape[:1]
-    if golden["obs"].shape != (*steps, policy.n_obs) or golden["begins"].shape != steps or not 0 < steps[0] <= MAX_STEPS:
+    if (
+        golden["obs"].shape != (*steps, policy.n_obs)
+        or golden["begins"].shape != steps
+        or not 0 < steps[0] <= MAX_STEPS
+    ):
         raise PolicyError(f"{GOLDEN}: has no missions of this policy; export the policy again")
     if policy.work * (steps[0] // policy.hold_steps + golden["begins"].sum() + CALLS) > MAX_WORK:
         raise PolicyError(f"{GOLDEN}: would take minutes to replay; no exported policy does")
@@ -348,7 +398,8 @@ def replayed(policy: Policy, golden: Arrays) -> Arrays:
 
 
 def difference(found: np.ndarray, expected: np.ndarray) -> float:
-    """Largest difference, in parts of the largest expected number where that is beyond 1; infinite for other shapes or NaN."""
+    """Largest difference, in parts of the largest expected number where that is beyond 1; infinite for other
+    shapes or NaN."""
     if found.shape != expected.shape or not (np.isfinite(found).all() and np.isfinite(expected).all()):
         return math.inf
     return float(np.max(np.abs(found - expected), initial=0.0) / np.max(np.abs(expected), initial=1.0))
@@ -361,7 +412,10 @@ def latency_ms(step: Callable[[], Any], count: int = CALLS - 30, warm_up: int = 
         begun = time.perf_counter()
         step()
         times.append(1e3 * (time.perf_counter() - begun))
-    return {"p50_ms": float(np.percentile(times[warm_up:], 50)), "p99_ms": float(np.percentile(times[warm_up:], 99))}
+    return {
+        "p50_ms": float(np.percentile(times[warm_up:], 50)),
+        "p99_ms": float(np.percentile(times[warm_up:], 99)),
+    }
 
 
 def decision_latency_ms(policy: Policy, obs: Iterable[np.ndarray]) -> dict[str, float]:
@@ -387,7 +441,15 @@ def main(arguments: list[str]) -> int:
         found = replayed(policy, golden)
         worst = {name: difference(values, golden[name]) for name, values in found.items()}
         tolerance = float(spec["golden"]["tolerance"])
-    except (PolicyError, KeyError, TypeError, ValueError, AttributeError, IndexError, ArithmeticError) as error:
+    except (
+        PolicyError,
+        KeyError,
+        TypeError,
+        ValueError,
+        AttributeError,
+        IndexError,
+        ArithmeticError,
+    ) as error:
         print(f"{folder}: {error}", file=sys.stderr)
         return 1
     steps = len(golden["obs"])

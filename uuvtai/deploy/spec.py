@@ -1,4 +1,5 @@
-"""policy_spec.json: what every column of the observation is, what an action means, how often to decide, and what the files hold."""
+"""policy_spec.json: what every column of the observation is, what an action means, how often to decide, and
+what the files hold."""
 
 from __future__ import annotations
 
@@ -15,13 +16,17 @@ from uuvtai.learn.world_model import N_FEATURES
 ONNX = "policy.onnx"
 
 _OBSERVATION = (
-    "float32, raw SI units, in this order; the scaling is inside the policy. A value that is not finite counts as the mean of training. "
-    "Frames: body is the vehicle's (x ahead, y left, z up); level is the same without roll and pitch; route follows the planned path; "
+    "float32, raw SI units, in this order; the scaling is inside the policy. A value that is not finite "
+    "counts as the mean of training. "
+    "Frames: body is the vehicle's (x ahead, y left, z up); level is the same without roll and pitch; route "
+    "follows the planned path; "
     "world has z up and 0 at the surface."
 )
 _HOLD = (
-    "The networks decide at the first control step of a mission and then at every hold_steps-th one. In between the decision is held: the "
-    "action itself, or, for a residual policy, its difference from the tree's action, which is added to the newest tree action in the "
+    "The networks decide at the first control step of a mission and then at every hold_steps-th one. In "
+    "between the decision is held: the "
+    "action itself, or, for a residual policy, its difference from the tree's action, which is added to the "
+    "newest tree action in the "
     "observation. The result is cut off to [-1, 1]. last_obs and last_action are those of the last decision."
 )
 
@@ -33,11 +38,20 @@ def specification(checkpoint: Checkpoint, pilot: Pilot, name: str, has_onnx: boo
         "schema": SCHEMA,
         "name": name,
         "uuvtai": __version__,
-        "checkpoint": {"sha256": checkpoint.sha256, "step": checkpoint.step, "created": checkpoint.manifest.created},
-        "observation": {"width": policy.n_in - N_FEATURES, "meaning": _OBSERVATION, "columns": _columns(checkpoint, pilot)},
+        "checkpoint": {
+            "sha256": checkpoint.sha256,
+            "step": checkpoint.step,
+            "created": checkpoint.manifest.created,
+        },
+        "observation": {
+            "width": policy.n_in - N_FEATURES,
+            "meaning": _OBSERVATION,
+            "columns": _columns(checkpoint, pilot),
+        },
         "features": _features(pilot),
         "action": checkpoint.manifest.action,
-        "action_meaning": "parts of the limits within [-1, 1]; velocities in the body frame, wanted of the inner velocity loop",
+        "action_meaning": "parts of the limits within [-1, 1]; velocities in the body frame, wanted of the "
+        "inner velocity loop",
         "rate": _rate(config.episode.control_dt_s, policy.config.hold_steps),
         "network": _network(pilot),
         "risk": _risk(pilot),
@@ -57,7 +71,16 @@ def _columns(checkpoint: Checkpoint, pilot: Pilot) -> list[dict[str, Any]]:
         for i in range(width):
             at = row["first"] + i
             name = row["name"] if width == 1 else f"{row['name']}[{i}]"
-            found.append({"index": at, "name": name, "unit": row["unit"], "frame": row["frame"], "mean": mean[at], "std": std[at]})
+            found.append(
+                {
+                    "index": at,
+                    "name": name,
+                    "unit": row["unit"],
+                    "frame": row["frame"],
+                    "mean": mean[at],
+                    "std": std[at],
+                }
+            )
     return found
 
 
@@ -66,7 +89,10 @@ def _features(pilot: Pilot) -> list[dict[str, Any]]:
     norm = pilot.policy.observation_norm
     names = ("residual", "uncertainty")
     rows = zip(names, norm.mean[-N_FEATURES:].tolist(), norm.std()[-N_FEATURES:].tolist(), strict=True)
-    return [{"name": name, "unit": "1", "mean": mean, "std": std, "used": pilot.world_model is not None} for name, mean, std in rows]
+    return [
+        {"name": name, "unit": "1", "mean": mean, "std": std, "used": pilot.world_model is not None}
+        for name, mean, std in rows
+    ]
 
 
 def _rate(control_dt_s: float, hold_steps: int) -> dict[str, Any]:
@@ -98,9 +124,18 @@ def _risk(pilot: Pilot) -> dict[str, Any] | None:
     if head is None:
         return None
     threshold = float(head.threshold) if head.has_threshold else None
-    return {"horizon_s": head.config.horizon_s, "alarm_threshold_logit": threshold, "miss_rate": head.config.miss_rate}
+    return {
+        "horizon_s": head.config.horizon_s,
+        "alarm_threshold_logit": threshold,
+        "miss_rate": head.config.miss_rate,
+    }
 
 
 def _graph(pilot: Pilot) -> dict[str, Any]:
     names = OneDecision(pilot).outputs
-    return {"file": ONNX, "opset": OPSET, "inputs": INPUTS, "outputs": {name: OUTPUTS[name] for name in names}}
+    return {
+        "file": ONNX,
+        "opset": OPSET,
+        "inputs": INPUTS,
+        "outputs": {name: OUTPUTS[name] for name in names},
+    }

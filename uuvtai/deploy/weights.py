@@ -1,4 +1,5 @@
-"""The networks of a pilot as float32 arrays under plain names, with everything that they scale by: what ``run_policy.py`` computes with."""
+"""The networks of a pilot as float32 arrays under plain names, with everything that they scale by: what
+``run_policy.py`` computes with."""
 
 from __future__ import annotations
 
@@ -40,7 +41,10 @@ def _world_model(world_model: WorldModel) -> Iterator[tuple[str, Tensor]]:
         yield from _net(name, getattr(world_model, name))
     yield from _norm("world_norm", world_model.observation_norm)
     yield "target.scale", world_model.scale()
-    yield "target.base", world_model.base(torch.zeros(world_model.n_obs, device=world_model.change_norm.mean.device))
+    yield (
+        "target.base",
+        world_model.base(torch.zeros(world_model.n_obs, device=world_model.change_norm.mean.device)),
+    )
     yield "change.unit", world_model.error_unit()
 
 

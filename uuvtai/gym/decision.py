@@ -11,7 +11,8 @@ from uuvtai.outcomes import SUCCESS
 
 
 class Transition(NamedTuple):
-    """What came of a decision in every env. ``obs`` and ``info`` are the simulator's memory: the next step or reset writes there."""
+    """What came of a decision in every env. ``obs`` and ``info`` are the simulator's memory: the next step or
+    reset writes there."""
 
     obs: torch.Tensor
     reward: torch.Tensor
@@ -29,7 +30,8 @@ def checked_hold_steps(hold_steps: int) -> int:
 
 
 def carry_out(env: VectorEnv, action: torch.Tensor, hold_steps: int) -> Transition:
-    """Hold ``action`` (n_env, 4); rows whose episode ends on the way rest from there on and earn no more (``autoreset`` is off)."""
+    """Hold ``action`` (n_env, 4); rows whose episode ends on the way rest from there on and earn no more
+    (``autoreset`` is off)."""
     obs, reward, terminated, truncated, info = env.step(action)
     total = reward.clone()
     for _ in range(hold_steps - 1):
@@ -41,7 +43,11 @@ def carry_out(env: VectorEnv, action: torch.Tensor, hold_steps: int) -> Transiti
 def told(info: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """What an env of this package tells in its info, each (n_env, ...), in the simulator's memory.
 
-    The number of the episode is not called "episode", which wrappers of Gymnasium and trainers keep for their statistics.
+    The number of the episode is not called "episode", which wrappers of Gymnasium and trainers keep for their
+    statistics.
     """
-    out = {name: info[name] for name in ("teacher_action", "seed", "outcome", "episode_return", "episode_steps", "episode_terms")}
+    out = {
+        name: info[name]
+        for name in ("teacher_action", "seed", "outcome", "episode_return", "episode_steps", "episode_terms")
+    }
     return out | {"episode_number": info["episode"], "is_success": info["outcome"] == SUCCESS}

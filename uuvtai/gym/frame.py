@@ -19,14 +19,19 @@ _MARGINS = (12, 12, 12, 12)
 
 
 def draw_frame(sim: Sim, row: int, width_px: int = 640) -> np.ndarray:
-    """(height, width, 3) uint8, red green blue: what the vehicle of this row has mapped, its route and goal, and the true bodies."""
+    """(height, width, 3) uint8, red green blue: what the vehicle of this row has mapped, its route and goal,
+    and the true bodies."""
     s, config = sim.s, sim.config
 
     def read(field):
         return sim.rows(field, [row])[0]
 
     scenario = scenario_document(config, describe_scenario(read, s.world, s.path, s.mission), "", 0, 0)
-    time_s, pos_w, cell_m = int(read(s.clock.step)) * config.episode.control_dt_s, read(s.vehicle.pos_w), config.mapping.cell_m
+    time_s, pos_w, cell_m = (
+        int(read(s.clock.step)) * config.episode.control_dt_s,
+        read(s.vehicle.pos_w),
+        config.mapping.cell_m,
+    )
     static, dynamic = (
         Layer(time_s, read(occupancy), grid_origin(config.world.tank, cell_m), cell_m)
         for occupancy in (s.grid_map.static_occ, s.grid_map.dynamic_occ)

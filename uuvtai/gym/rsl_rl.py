@@ -16,9 +16,13 @@ class RslRlVecEnv(VecEnv):
     """``UuvVectorEnv`` for rsl_rl's runners; the observations are the group "policy"."""
 
     def __init__(self, envs: UuvVectorEnv, seed: int | None = None) -> None:
-        """Begins the first episodes. ValueError for an env not in mode SAME_STEP with torch results: that is what rsl_rl assumes."""
+        """Begins the first episodes. ValueError for an env not in mode SAME_STEP with torch results: that is
+        what rsl_rl assumes."""
         if envs.autoreset_mode is not AutoresetMode.SAME_STEP or envs.backend != "torch":
-            raise ValueError(f"rsl_rl needs SAME_STEP and backend 'torch', got {envs.autoreset_mode.name} and {envs.backend!r}")
+            raise ValueError(
+                f"rsl_rl needs SAME_STEP and backend 'torch', got {envs.autoreset_mode.name} and "
+                f"{envs.backend!r}"
+            )
         self.envs, self.device, self.cfg = envs, envs.device, {}
         self.num_envs, self.num_actions = envs.num_envs, envs.native.num_actions
         self.max_episode_length = -(-envs.native.config.episode.horizon_steps // envs.hold_steps)
@@ -39,7 +43,8 @@ class RslRlVecEnv(VecEnv):
         return TensorDict({"policy": self._obs}, batch_size=[self.num_envs])
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """One step of all envs; ``extras["time_outs"]`` tells ends by the horizon apart, ``extras["log"]`` how the ended episodes went."""
+        """One step of all envs; ``extras["time_outs"]`` tells ends by the horizon apart, ``extras["log"]``
+        how the ended episodes went."""
         self._obs, reward, terminated, truncated, info = self.envs.step(actions)
         ended = terminated | truncated
         self._steps = (self._steps + 1) * ~ended

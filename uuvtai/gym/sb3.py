@@ -15,9 +15,13 @@ class Sb3VecEnv(VecEnv):
     """``UuvVectorEnv`` for Stable-Baselines3's trainers, with the returns of episodes that they log."""
 
     def __init__(self, envs: UuvVectorEnv) -> None:
-        """ValueError for an env that is not in mode SAME_STEP with NumPy results: that is what SB3 assumes."""
+        """ValueError for an env that is not in mode SAME_STEP with NumPy results: that is what SB3
+        assumes."""
         if envs.autoreset_mode is not AutoresetMode.SAME_STEP or envs.backend != "numpy":
-            raise ValueError(f"Stable-Baselines3 needs SAME_STEP and backend 'numpy', got {envs.autoreset_mode.name} and {envs.backend!r}")
+            raise ValueError(
+                f"Stable-Baselines3 needs SAME_STEP and backend 'numpy', got {envs.autoreset_mode.name} and "
+                f"{envs.backend!r}"
+            )
         self.envs = envs
         self._action = np.zeros(envs.action_space.shape or (), np.float32)
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
@@ -33,7 +37,8 @@ class Sb3VecEnv(VecEnv):
         self._action = actions
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """One step of all envs; infos of those that ended tell what SB3 looks for: last observation, kind of end, return and length."""
+        """One step of all envs; infos of those that ended tell what SB3 looks for: last observation, kind of
+        end, return and length."""
         obs, reward, terminated, truncated, info = self.envs.step(self._action)
         ended = terminated | truncated
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
@@ -43,7 +48,10 @@ class Sb3VecEnv(VecEnv):
                 "terminal_observation": info["final_obs"][row],
                 "TimeLimit.truncated": bool(truncated[row] and not terminated[row]),
                 "is_success": bool(final["is_success"][row]),
-                "episode": {"r": float(final["episode_return"][row]), "l": -(-int(final["episode_steps"][row]) // self.envs.hold_steps)},
+                "episode": {
+                    "r": float(final["episode_return"][row]),
+                    "l": -(-int(final["episode_steps"][row]) // self.envs.hold_steps),
+                },
             }
         return obs, reward, ended, infos
 

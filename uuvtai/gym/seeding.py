@@ -16,8 +16,9 @@ _SEEDS = 2**31
 def episode_seed(env: gymnasium.Env | gymnasium.vector.VectorEnv, seed: Any) -> int | None:
     """Seed whose episodes ``env`` is to begin with; None = go on with the episodes that follow.
 
-    An int is that seed. None goes on where the env has been seeded, and draws a seed where it has not. The env's generator is seeded
-    along. Raises TypeError or ValueError for what is no seed; lists are refused, since env i plays episode i of one seed.
+    An int is that seed. None goes on where the env has been seeded, and draws a seed where it has not. The
+    env's generator is seeded along. Raises TypeError or ValueError for what is no seed; lists are refused,
+    since env i plays episode i of one seed.
     """
     if seed is not None:
         number = checked_seed(_integer(seed))
@@ -32,5 +33,8 @@ def _integer(seed: Any) -> int:
     try:
         return operator.index(seed)
     except TypeError:
-        told = f"seed must be an int or None, got a {type(seed).__name__}; one seed serves all envs: env i begins at its episode i"
+        told = (
+            f"seed must be an int or None, got a {type(seed).__name__}; one seed serves all envs: env i "
+            "begins at its episode i"
+        )
         raise TypeError(told) from None

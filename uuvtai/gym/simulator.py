@@ -10,7 +10,13 @@ from uuvtai.tree import read_tree
 
 
 def simulator(
-    world: str, num_envs: int, sensors: str | None, vehicle: str | None, overrides: dict[str, Any] | None, device: str, teacher: str
+    world: str,
+    num_envs: int,
+    sensors: str | None,
+    vehicle: str | None,
+    overrides: dict[str, Any] | None,
+    device: str,
+    teacher: str,
 ) -> Sim:
     """A new simulator; arguments and errors are those of ``uuvtai.make``."""
     if type(num_envs) is not int:

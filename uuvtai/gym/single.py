@@ -18,11 +18,12 @@ from uuvtai.sim import Sim
 
 
 class UuvEnv(gymnasium.Env[np.ndarray, np.ndarray]):
-    """One vehicle that plays the episodes 0, 1, 2, ... of its seed (of a simulator with n envs: 0, n, 2n, ..., in its first row).
+    """One vehicle that plays the episodes 0, 1, 2, ... of its seed (of a simulator with n envs: 0, n, 2n,
+    ..., in its first row).
 
-    Observation float32 (n_obs,) in raw SI units (``native.observation_table`` names the columns), action float32 (4,): surge, sway,
-    heave, yaw rate in parts of the vehicle's limits. Thousands of vehicles step at once in ``UuvVectorEnv``, at hundreds of times the
-    speed of as many of these.
+    Observation float32 (n_obs,) in raw SI units (``native.observation_table`` names the columns), action
+    float32 (4,): surge, sway, heave, yaw rate in parts of the vehicle's limits. Thousands of vehicles step at
+    once in ``UuvVectorEnv``, at hundreds of times the speed of as many of these.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 50}
@@ -40,21 +41,28 @@ class UuvEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         render_mode: str | None = None,
         sim: Sim | None = None,
     ) -> None:
-        """As ``UuvVectorEnv``; ``render_mode`` 'rgb_array': ``render`` draws the pool from above. ValueError for other modes."""
+        """As ``UuvVectorEnv``; ``render_mode`` 'rgb_array': ``render`` draws the pool from above. ValueError
+        for other modes."""
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode {render_mode!r} does not exist; there are: None, 'rgb_array'")
         self.render_mode, self.hold_steps = render_mode, checked_hold_steps(hold_steps)
-        self.native = VectorEnv(sim or simulator(world, 1, sensors, vehicle, overrides, device, teacher), autoreset=False)
+        self.native = VectorEnv(
+            sim or simulator(world, 1, sensors, vehicle, overrides, device, teacher), autoreset=False
+        )
         config, n = self.native.config, self.native.num_envs
-        self.metadata = {**self.metadata, "render_fps": round(1 / (config.episode.control_dt_s * hold_steps))}  # type: ignore[misc]
+        fps = round(1 / (config.episode.control_dt_s * hold_steps))
+        self.metadata = {**self.metadata, "render_fps": fps}  # type: ignore[misc]
         self.observation_space = observation_space(self.native.observation_table, config)
         self.action_space = action_space()
         self._actions = torch.zeros(n, self.native.num_actions, device=self.native.device)
         self._first = torch.arange(n, device=self.native.device) == 0
         self._begun = self._over = False
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin episode 0 of ``seed``, or, with None, the next one (the first time of a random seed); (obs, info). There are no options."""
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begin episode 0 of ``seed``, or, with None, the next one (the first time of a random seed); (obs,
+        info). There are no options."""
         if options:
             raise ValueError(f"reset options {sorted(options)} do not exist; there are none")
         obs, info = self.native.reset(episode_seed(self, seed), self._first if self._begun else None)
@@ -62,9 +70,11 @@ class UuvEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._row(obs), self._info(info)
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Hold ``action`` (4,) for ``hold_steps``: (obs, reward, terminated, truncated, info); info as ``UuvVectorEnv.step`` names it.
+        """Hold ``action`` (4,) for ``hold_steps``: (obs, reward, terminated, truncated, info); info as
+        ``UuvVectorEnv.step`` names it.
 
-        Raises RuntimeError before the first reset, after the end of an episode and after close, ValueError for unfit actions.
+        Raises RuntimeError before the first reset, after the end of an episode and after close, ValueError
+        for unfit actions.
         """
         if self._over:
             raise RuntimeError("step after the end of the episode: call reset() first")
@@ -77,7 +87,8 @@ class UuvEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._row(obs), float(reward[0]), bool(terminated[0]), bool(truncated[0]), self._info(info)
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
-        """The tank from above: map, true bodies, route, goal and vehicle, (height, width, 3) uint8; None without a render mode."""
+        """The tank from above: map, true bodies, route, goal and vehicle, (height, width, 3) uint8; None
+        without a render mode."""
         if self.render_mode is None:
             return None
         return draw_frame(self.native.sim, 0)
@@ -87,7 +98,10 @@ class UuvEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.native.close()
 
     def _info(self, info: dict[str, torch.Tensor]) -> dict[str, Any]:
-        out = {name: value[0].item() if value.ndim == 1 else self._row(value) for name, value in told(info).items()}
+        out = {
+            name: value[0].item() if value.ndim == 1 else self._row(value)
+            for name, value in told(info).items()
+        }
         return out | {"outcome": self.native.outcomes[int(out["outcome"])]}
 
     @staticmethod

@@ -1,4 +1,5 @@
-"""``gymnasium.vector.VectorEnv`` on top of the batched environment: three autoreset modes, results as NumPy arrays or torch tensors."""
+"""``gymnasium.vector.VectorEnv`` on top of the batched environment: three autoreset modes, results as NumPy
+arrays or torch tensors."""
 
 from __future__ import annotations
 
@@ -21,16 +22,18 @@ BACKENDS = ("numpy", "torch")
 
 
 class UuvVectorEnv(gymnasium.vector.VectorEnv):
-    """``num_envs`` vehicles in their worlds; env i plays the episodes i, i + num_envs, i + 2 num_envs, ... of the seed.
+    """``num_envs`` vehicles in their worlds; env i plays the episodes i, i + num_envs, i + 2 num_envs, ... of
+    the seed.
 
-    Observations are float32 (num_envs, n_obs) in raw SI units (``native.observation_table`` names the columns), actions float32
-    (num_envs, 4): surge, sway, heave, yaw rate in parts of the vehicle's limits. Every result is in memory of its own: no later call
-    writes into it. Who wants tensors without copies takes ``uuvtai.make`` or ``native``.
+    Observations are float32 (num_envs, n_obs) in raw SI units (``native.observation_table`` names the
+    columns), actions float32 (num_envs, 4): surge, sway, heave, yaw rate in parts of the vehicle's limits.
+    Every result is in memory of its own: no later call writes into it. Who wants tensors without copies takes
+    ``uuvtai.make`` or ``native``.
 
-    Episodes end as ``metadata["autoreset_mode"]`` says. SAME_STEP: an env that ends begins its next episode in the same step, its last
-    observation and info are ``info["final_obs"]`` and ``info["final_info"]`` where ``info["_final_obs"]``. NEXT_STEP: the step after the
-    last one ignores the action and begins the episode with reward 0. DISABLED: the user does, by
-    ``reset(options={"reset_mask": mask})``.
+    Episodes end as ``metadata["autoreset_mode"]`` says. SAME_STEP: an env that ends begins its next episode
+    in the same step, its last observation and info are ``info["final_obs"]`` and ``info["final_info"]`` where
+    ``info["_final_obs"]``. NEXT_STEP: the step after the last one ignores the action and begins the episode
+    with reward 0. DISABLED: the user does, by ``reset(options={"reset_mask": mask})``.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
@@ -50,10 +53,11 @@ class UuvVectorEnv(gymnasium.vector.VectorEnv):
         backend: str = "numpy",
         sim: Sim | None = None,
     ) -> None:
-        """World to teacher as in ``uuvtai.make``, with its errors; ``sim`` = a simulator that is there already, with its own of these.
+        """World to teacher as in ``uuvtai.make``, with its errors; ``sim`` = a simulator that is there
+        already, with its own of these.
 
-        ``hold_steps``: control steps (0.02 s) that an action is held for, one step to the user; ``backend``: 'numpy' or 'torch' results.
-        ValueError for modes and backends that do not exist.
+        ``hold_steps``: control steps (0.02 s) that an action is held for, one step to the user; ``backend``:
+        'numpy' or 'torch' results. ValueError for modes and backends that do not exist.
         """
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}  # type: ignore[misc]
@@ -67,11 +71,14 @@ class UuvVectorEnv(gymnasium.vector.VectorEnv):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._ended = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode in every env, or where ``options["reset_mask"]`` (num_envs,) is true; (obs, info).
 
-        With an int ``seed``, env i begins at episode i of it; with None each goes on with its next episode, the first time of a random
-        seed. Raises TypeError or ValueError for other seeds (lists too), options and masks.
+        With an int ``seed``, env i begins at episode i of it; with None each goes on with its next episode,
+        the first time of a random seed. Raises TypeError or ValueError for other seeds (lists too), options
+        and masks.
         """
         rows = self._rows(options)
         obs, info = self.native.reset(episode_seed(self, seed), rows)
@@ -79,15 +86,19 @@ class UuvVectorEnv(gymnasium.vector.VectorEnv):
         return self._given(obs), self._info(told(info), rows)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Hold ``actions`` (num_envs, 4), NumPy or torch, for ``hold_steps``: (obs, reward, terminated, truncated, info).
+        """Hold ``actions`` (num_envs, 4), NumPy or torch, for ``hold_steps``: (obs, reward, terminated,
+        truncated, info).
 
-        info holds arrays (num_envs, ...) with their masks: ``outcome`` (index into ``native.outcomes``), ``is_success``,
-        ``episode_return``, ``episode_steps`` (control steps), ``episode_terms`` (sums by ``native.reward_terms``), ``seed``,
-        ``episode_number`` and ``teacher_action`` (what the behaviour tree would do now). Raises RuntimeError before the first reset,
-        after close, and in mode DISABLED while an env that has ended is not reset; ValueError or TypeError for unfit actions.
+        info holds arrays (num_envs, ...) with their masks: ``outcome`` (index into ``native.outcomes``),
+        ``is_success``, ``episode_return``, ``episode_steps`` (control steps), ``episode_terms`` (sums by
+        ``native.reward_terms``), ``seed``, ``episode_number`` and ``teacher_action`` (what the behaviour tree
+        would do now). Raises RuntimeError before the first reset, after close, and in mode DISABLED while an
+        env that has ended is not reset; ValueError or TypeError for unfit actions.
         """
         self._refuse_ended()
-        obs, reward, terminated, truncated, info = carry_out(self.native, self._action(actions), self.hold_steps)
+        obs, reward, terminated, truncated, info = carry_out(
+            self.native, self._action(actions), self.hold_steps
+        )
         ended, final = terminated | truncated, {}
         if self.autoreset_mode is AutoresetMode.SAME_STEP and bool(ended.any()):
             final = self._final(obs, info, ended)
@@ -105,7 +116,8 @@ class UuvVectorEnv(gymnasium.vector.VectorEnv):
         self.native.close()
 
     def _final(self, obs: torch.Tensor, info: dict[str, torch.Tensor], ended: torch.Tensor) -> dict[str, Any]:
-        """Last observation and info of the rows that ended; as objects, None elsewhere, where Gymnasium's own NumPy envs do so."""
+        """Last observation and info of the rows that ended; as objects, None elsewhere, where Gymnasium's own
+        NumPy envs do so."""
         last = self._given(obs)
         if self.backend == "numpy":
             rows, last = last, np.full(self.num_envs, None, dtype=object)
@@ -132,20 +144,29 @@ class UuvVectorEnv(gymnasium.vector.VectorEnv):
         given = dict(options or {})
         mask = given.pop("reset_mask", None)
         if given:
-            raise ValueError(f"reset options {sorted(given)} do not exist; there is 'reset_mask', a bool array of shape ({self.num_envs},)")
+            raise ValueError(
+                f"reset options {sorted(given)} do not exist; there is 'reset_mask', a bool array of shape "
+                f"({self.num_envs},)"
+            )
         if mask is None:
             return torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         rows = torch.as_tensor(mask, device=self.device)
         if rows.dtype != torch.bool:
             raise TypeError(f"reset_mask must be bool, got {rows.dtype}")
         if rows.shape != (self.num_envs,) or not bool(rows.any()):
-            raise ValueError(f"reset_mask must have shape ({self.num_envs},) and be true somewhere, got {tuple(rows.shape)}")
+            raise ValueError(
+                f"reset_mask must have shape ({self.num_envs},) and be true somewhere, got "
+                f"{tuple(rows.shape)}"
+            )
         return rows
 
     def _refuse_ended(self) -> None:
         if self.autoreset_mode is AutoresetMode.DISABLED and bool(self._ended.any()):
             rows = ", ".join(map(str, self._ended.nonzero().flatten().tolist()[:8]))
-            raise RuntimeError(f'step after the end of env {rows}: call reset(options={{"reset_mask": terminated | truncated}}) first')
+            raise RuntimeError(
+                f'step after the end of env {rows}: call reset(options={{"reset_mask": terminated | '
+                f"truncated}}) first"
+            )
 
 
 def _checked_backend(backend: str) -> str:

@@ -1,1 +1,2 @@
-"""Learning: PPO distilled from the behaviour tree, with a latent world model. Torch only; its world is the vectorised environment."""
+"""Learning: PPO distilled from the behaviour tree, with a latent world model. Torch only; its world is the
+vectorised environment."""

@@ -1,6 +1,8 @@
-"""How far predicted spreads and probabilities can be believed: residuals, coverage, reliability, Brier, ECE and rank statistics.
+"""How far predicted spreads and probabilities can be believed: residuals, coverage, reliability, Brier, ECE
+and rank statistics.
 
-Pure functions of tensors, computed in float64. Bad shapes and samples that a figure is not defined for raise ValueError.
+Pure functions of tensors, computed in float64. Bad shapes and samples that a figure is not defined for raise
+ValueError.
 """
 
 from __future__ import annotations
@@ -23,7 +25,8 @@ def mean_squared_standardised_residual(mean: Tensor, log_var: Tensor, target: Te
 
 
 def coverage(mean: Tensor, log_var: Tensor, target: Tensor, levels: Tensor) -> Tensor:
-    """Share of targets inside the central Gaussian interval of each nominal level, (n_level,): equals ``levels`` if calibrated."""
+    """Share of targets inside the central Gaussian interval of each nominal level, (n_level,): equals
+    ``levels`` if calibrated."""
     if bool(((levels <= 0) | (levels >= 1)).any()):
         raise ValueError(f"coverage levels must lie between 0 and 1, got {levels.tolist()}")
     size = standardised_residual(mean, log_var, target).abs().flatten()
@@ -31,7 +34,7 @@ def coverage(mean: Tensor, log_var: Tensor, target: Tensor, levels: Tensor) -> T
     return torch.stack([(size <= width).double().mean() for width in half_width])
 
 
-# ----------------------------------------------------------------------------------------------------- probabilities of an event
+# ---------------------------------------------------------------------------------- probabilities of an event
 
 
 class Reliability(NamedTuple):
@@ -55,18 +58,22 @@ def reliability(probability: Tensor, event: Tensor, bins: int) -> Reliability:
 
 
 def expected_calibration_error(probability: Tensor, event: Tensor, bins: int) -> float:
-    """Mean gap between predicted and observed frequency over the bins, weighted by their samples (Naeini 2015)."""
+    """Mean gap between predicted and observed frequency over the bins, weighted by their samples (Naeini
+    2015)."""
     diagram = reliability(probability, event, bins)
-    return float((diagram.samples * (diagram.predicted - diagram.observed).abs()).sum() / diagram.samples.sum())
+    return float(
+        (diagram.samples * (diagram.predicted - diagram.observed).abs()).sum() / diagram.samples.sum()
+    )
 
 
 def brier(probability: Tensor, event: Tensor) -> float:
-    """Mean squared error of the probability (Brier 1950); predicting the base rate r always gives r (1 - r)."""
+    """Mean squared error of the probability (Brier 1950); predicting the base rate r always gives r (1 -
+    r)."""
     p, y = _forecast(probability, event)
     return float((p - y).square().mean())
 
 
-# ------------------------------------------------------------------------------------------------------------- rank statistics
+# -------------------------------------------------------------------------------------------- rank statistics
 
 
 def average_rank(value: Tensor) -> Tensor:
@@ -77,7 +84,8 @@ def average_rank(value: Tensor) -> Tensor:
 
 
 def auroc(score: Tensor, event: Tensor) -> float:
-    """Probability that an event's score exceeds a non-event's, ties counting half (area under the ROC curve)."""
+    """Probability that an event's score exceeds a non-event's, ties counting half (area under the ROC
+    curve)."""
     y = _column(event) > 0
     _same_length(score, event)
     n_event, n_other = int(y.sum()), int((~y).sum())

@@ -1,9 +1,11 @@
-"""Checkpoints: safetensors and a JSON manifest, whole or not at all, verified before anything is used; opening one executes nothing.
+"""Checkpoints: safetensors and a JSON manifest, whole or not at all, verified before anything is used;
+opening one executes nothing.
 
-``checkpoints/step_000050/`` holds ``manifest.json`` (what it is, for which observation and action, sha256 of every file),
-``model.safetensors`` (the networks with their normalisers: all that driving needs), ``training.safetensors`` (optimisers, generators,
-counters) and ``simulator.zst`` (the envs themselves, large, so only beside the newest ones). A shipped policy is the same folder without
-the last two. The folder is written under another name, flushed to disk and renamed: a process killed at any moment leaves the newest
+``checkpoints/step_000050/`` holds ``manifest.json`` (what it is, for which observation and action, sha256 of
+every file), ``model.safetensors`` (the networks with their normalisers: all that driving needs),
+``training.safetensors`` (optimisers, generators, counters) and ``simulator.zst`` (the envs themselves, large,
+so only beside the newest ones). A shipped policy is the same folder without the last two. The folder is
+written under another name, flushed to disk and renamed: a process killed at any moment leaves the newest
 verified one usable.
 """
 
@@ -87,29 +89,38 @@ class Checkpoint:
         return self._part(MODEL, self.manifest.model)
 
     def state(self, like: Mapping[str, Any]) -> dict[str, Any]:
-        """The trainer's whole state. ``like`` is the state of the trainer it is meant for: a simulator of another size is refused."""
+        """The trainer's whole state. ``like`` is the state of the trainer it is meant for: a simulator of
+        another size is refused."""
         if not self.is_resumable:
-            raise CheckpointError(f"{self.path}: has networks only and cannot be trained on; resume the run's newest checkpoint")
+            raise CheckpointError(
+                f"{self.path}: has networks only and cannot be trained on; resume the run's newest checkpoint"
+            )
         state = self.model() | self._part(TRAINING, self.manifest.training)
         plain, expected = pack(like[SIMULATOR_PART], SIMULATOR_PART, copy=False)
         layout = self.manifest.simulator_layout
         if _structure(plain) != _structure(self.manifest.simulator) or layout != layout_of(expected):
             raise CheckpointError(
-                f"{self.path}: the simulator's state has other arrays than this simulator; resume with the run's own config, number of "
+                f"{self.path}: the simulator's state has other arrays than this simulator; resume with the "
+                "run's own config, number of "
                 "envs and version of uuvtai"
             )
         with refused(self.path / SIMULATOR):
-            state[SIMULATOR_PART] = unpack(self.manifest.simulator, read_stream(self.path / SIMULATOR, layout_of(expected)))
+            state[SIMULATOR_PART] = unpack(
+                self.manifest.simulator, read_stream(self.path / SIMULATOR, layout_of(expected))
+            )
         return state
 
     def check_table(self, table: Sequence[DescribedColumn], config: Any) -> None:
-        """Raise CheckpointError where an environment's observation or action is not what the policy was trained for."""
+        """Raise CheckpointError where an environment's observation or action is not what the policy was
+        trained for."""
         for what, own, theirs in (
             ("observation", self.manifest.observation_table, table_rows(table)),
             ("action", self.manifest.action, action_rows(config)),
         ):
             if own != theirs:
-                raise CheckpointError(f"{self.path}: made for another {what} table: {difference(own, theirs)}")
+                raise CheckpointError(
+                    f"{self.path}: made for another {what} table: {difference(own, theirs)}"
+                )
 
     def _part(self, name: str, plain: Any) -> dict[str, Any]:
         with refused(self.path / name):
@@ -119,7 +130,7 @@ class Checkpoint:
             return unpack(plain, safetensors.torch.load(content))
 
 
-# ------------------------------------------------------------------------------------------------------------------ writing
+# ---------------------------------------------------------------------------------------------------- writing
 
 
 def save(
@@ -131,10 +142,12 @@ def save(
     metrics: Mapping[str, Any] | None = None,
     score: float | None = None,
 ) -> Path:
-    """Write ``checkpoints/step_N`` and thin out older ones (newest ``train.keep_checkpoints`` and the best stay).
+    """Write ``checkpoints/step_N`` and thin out older ones (newest ``train.keep_checkpoints`` and the best
+    stay).
 
-    ``state`` is what ``Trainer.state`` gives: MODEL_PARTS, SIMULATOR_PART and whatever else training needs, nested. ``score``: higher is
-    better. Raises CheckpointError where the disk refuses; then nothing half-written is taken for a checkpoint.
+    ``state`` is what ``Trainer.state`` gives: MODEL_PARTS, SIMULATOR_PART and whatever else training needs,
+    nested. ``score``: higher is better. Raises CheckpointError where the disk refuses; then nothing
+    half-written is taken for a checkpoint.
     """
     target = checkpoints / f"{_STEP}{step:06d}"
     try:
@@ -164,16 +177,24 @@ def save(
         raise CheckpointError(str(error)) from None
     except OSError as error:
         sweep(checkpoints)
-        raise CheckpointError(f"{target}: cannot be written ({error.strerror}); make room or mend the folder, then: --resume") from None
+        raise CheckpointError(
+            f"{target}: cannot be written ({error.strerror}); make room or mend the folder, then: --resume"
+        ) from None
     return target
 
 
 def ship(checkpoint: Checkpoint, target: Path) -> None:
-    """Copy the networks of a checkpoint into a new folder ``target``: a policy that drives but cannot be trained on."""
+    """Copy the networks of a checkpoint into a new folder ``target``: a policy that drives but cannot be
+    trained on."""
     partial = target.with_name(f"{_PARTIAL}{target.name}")
     partial.mkdir(parents=True)
     _write(partial / MODEL, read_bytes(checkpoint.path / MODEL, LARGEST[MODEL], checkpoint.path))
-    kept = {"training": None, "simulator": None, "simulator_layout": None, "files": {MODEL: checkpoint.manifest.files[MODEL]}}
+    kept = {
+        "training": None,
+        "simulator": None,
+        "simulator_layout": None,
+        "files": {MODEL: checkpoint.manifest.files[MODEL]},
+    }
     _publish(partial, target, checkpoint.manifest.model_copy(update=kept))
 
 
@@ -242,7 +263,7 @@ def _entry(path: Path) -> FileEntry:
     return FileEntry(bytes=path.stat().st_size, sha256=sha256_of(path))
 
 
-# ------------------------------------------------------------------------------------------------------------------ reading
+# ---------------------------------------------------------------------------------------------------- reading
 
 
 def open_checkpoint(path: Path) -> Checkpoint:
@@ -250,20 +271,27 @@ def open_checkpoint(path: Path) -> Checkpoint:
     content = manifest_content(path)
     with refused(path / MANIFEST):
         manifest = parsed(content)
-        # keys that are younger than this config get their defaults, which mean what was done before there was a choice
+        # keys that are younger than this config get their defaults, which mean what was done before there was
+        # a choice
         config = LearningConfig.model_validate_json(json.dumps(manifest.config), strict=True)
         if config_sha256(manifest.config) != manifest.config_sha256:
             raise PackingError("its config does not have the sha256 that it states")
     for name in manifest.files:
         if name not in (MODEL, *OPTIONAL):
-            raise CheckpointError(f"{path / MANIFEST}: lists the file {name!r}, which no checkpoint has; it was not written by uuvtai")
+            raise CheckpointError(
+                f"{path / MANIFEST}: lists the file {name!r}, which no checkpoint has; it was not written by "
+                "uuvtai"
+            )
     for name in (MODEL, *OPTIONAL):
         verify(path / name, manifest.files.get(name), name in OPTIONAL)
     return Checkpoint(path, manifest, config, hashlib.sha256(content).hexdigest())
 
 
-def newest(run: Path, note: Callable[[str], None] = lambda _text: None, resumable: bool = False) -> Checkpoint:
-    """Newest checkpoint of a run folder that passes verification; ``note`` is told of newer ones that do not. Raises CheckpointError."""
+def newest(
+    run: Path, note: Callable[[str], None] = lambda _text: None, resumable: bool = False
+) -> Checkpoint:
+    """Newest checkpoint of a run folder that passes verification; ``note`` is told of newer ones that do not.
+    Raises CheckpointError."""
     checkpoints = run / "checkpoints"
     for path in _folders(checkpoints):
         try:
@@ -274,7 +302,9 @@ def newest(run: Path, note: Callable[[str], None] = lambda _text: None, resumabl
         if not resumable or found.is_resumable:
             return found
         note(f"left out: {path} has no simulator state to go on from")
-    raise CheckpointError(f"{checkpoints}: holds no usable checkpoint; give the folder of a run that 'uuv train' has written")
+    raise CheckpointError(
+        f"{checkpoints}: holds no usable checkpoint; give the folder of a run that 'uuv train' has written"
+    )
 
 
 def best(run: Path, note: Callable[[str], None] = lambda _text: None) -> Checkpoint:

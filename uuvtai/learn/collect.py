@@ -1,4 +1,5 @@
-"""Rollouts: the policy drives the envs for T steps; what it met is kept, ended episodes are counted, what is not finite is left out."""
+"""Rollouts: the policy drives the envs for T steps; what it met is kept, ended episodes are counted, what is
+not finite is left out."""
 
 from __future__ import annotations
 
@@ -21,7 +22,8 @@ if TYPE_CHECKING:
     from uuvtai.learn.world_model import WorldModel
 
 N_FEATURES = 2
-"""columns of the policy's input behind the observation: the world model's residual and uncertainty, zero without one"""
+"""columns of the policy's input behind the observation: the world model's residual and uncertainty, zero
+without one"""
 
 
 class Collector:
@@ -37,10 +39,16 @@ class Collector:
         generator: torch.Generator,
         as_features: bool = True,
     ) -> None:
-        """``generator`` (CPU) draws the exploration; without ``as_features`` the world model's columns stay zero, but its uncertainty is
-        noted all the same. Call ``begin`` before the first rollout.
+        """``generator`` (CPU) draws the exploration; without ``as_features`` the world model's columns stay
+        zero, but its uncertainty is noted all the same. Call ``begin`` before the first rollout.
         """
-        self.env, self.policy, self.world_model, self.rollout, self.guard = env, policy, world_model, rollout, guard
+        self.env, self.policy, self.world_model, self.rollout, self.guard = (
+            env,
+            policy,
+            world_model,
+            rollout,
+            guard,
+        )
         self.as_features, self.generator = as_features, generator
         n, device = env.num_envs, env.device
         self.x, self.final_x = (torch.zeros(n, rollout.n_in, device=device) for _ in range(2))
@@ -51,7 +59,10 @@ class Collector:
         self._failures = torch.tensor([name in FORESEEABLE for name in env.outcomes], device=device)
         self.leaf_errors = LeafErrors(env.node_names, device)
         self.hold = Hold(env, policy)
-        self._teacher, self._reward = torch.zeros(n, NUM_ACTIONS, device=device), torch.zeros(n, device=device)
+        self._teacher, self._reward = (
+            torch.zeros(n, NUM_ACTIONS, device=device),
+            torch.zeros(n, device=device),
+        )
         self._leaf = torch.zeros(n, dtype=torch.int32, device=device)
         self._bad = torch.zeros(n, dtype=torch.bool, device=device)
         self._features = torch.zeros(n, N_FEATURES, device=device)
@@ -68,7 +79,8 @@ class Collector:
 
     @torch.no_grad()
     def look_around(self) -> None:
-        """Let the behaviour tree drive for T steps and keep inputs, actions and endings: what the statistics begin with."""
+        """Let the behaviour tree drive for T steps and keep inputs, actions and endings: what the statistics
+        begin with."""
         rollout = self.rollout
         for t in range(rollout.steps):
             self._note_teacher()
@@ -80,7 +92,8 @@ class Collector:
 
     @torch.no_grad()
     def recall_features(self) -> None:
-        """Fill in the world-model columns of what ``look_around`` saw, by what the model has learned from it."""
+        """Fill in the world-model columns of what ``look_around`` saw, by what the model has learned from
+        it."""
         if self.world_model is None or not self.as_features:
             return
         x, n = self.rollout.x, self.env.num_obs
@@ -102,7 +115,9 @@ class Collector:
             end = self._drive(step.action, tally)
             self.uncertainty[t].copy_(self._features[:, -1])
             last_value = final_value(self.policy, self.final_x, end.terminated, end.ended)
-            rollout.add(self.x, step, self._reward, end.terminated, end.ended, last_value, self._teacher, self._leaf)
+            rollout.add(
+                self.x, step, self._reward, end.terminated, end.ended, last_value, self._teacher, self._leaf
+            )
             self.failed[t] = end.ended & self._failures[end.outcome]
             self._move_on(end.ended)
         rollout.close(self.policy.value(self.x))
@@ -117,7 +132,9 @@ class Collector:
     def _drive(self, action: torch.Tensor, tally: Tally | None = None) -> Stretch:
         """Hold a decision; fills the reward, NaN for samples with anything bad, and the input it led to."""
         began = time.perf_counter()
-        end = self.hold.drive(action, self._teacher, None if tally is None else lambda ended, info: _count(tally, ended, info))
+        end = self.hold.drive(
+            action, self._teacher, None if tally is None else lambda ended, info: _count(tally, ended, info)
+        )
         self._obs, self.info = end.obs, end.info
         self.simulate_s += time.perf_counter() - began
         self._bad |= self.guard.values("reward", end.reward, self._reward)
@@ -135,12 +152,16 @@ class Collector:
                 self.final_x[:, n:] = self._features
 
     def _move_on(self, ended: torch.Tensor) -> None:
-        """The input that was led to becomes the present one; where an episode ended, the first of the next."""
+        """The input that was led to becomes the present one; where an episode ended, the first of the
+        next."""
         self.x.copy_(self.final_x).masked_fill_(ended[:, None], 0.0)
         self._bad.copy_(self._cleaned(self._obs, self.x))
 
-    def _cleaned(self, obs: torch.Tensor, x: torch.Tensor, counted: torch.Tensor | None = None) -> torch.Tensor:
-        """Write the observation into an input, the column's mean in place of what is not finite; which rows were bad."""
+    def _cleaned(
+        self, obs: torch.Tensor, x: torch.Tensor, counted: torch.Tensor | None = None
+    ) -> torch.Tensor:
+        """Write the observation into an input, the column's mean in place of what is not finite; which rows
+        were bad."""
         n = self.env.num_obs
         return self.guard.observation(obs, self.policy.observation_norm.mean[:n].float(), x[:, :n], counted)
 

@@ -1,8 +1,10 @@
-"""Distillation: the policy's mean is drawn towards the behaviour tree's action, more strongly where the world model is unsure.
+"""Distillation: the policy's mean is drawn towards the behaviour tree's action, more strongly where the world
+model is unsure.
 
-The paper's term is lambda_t E ||mu(x) - a_BT||^2 with the squared norm over the four actions. It stands in the PPO loss, with
-lambda_t = lambda(share of the run) times the scale s_t of ``uncertainty``, and again in separate teacher batches with an Adam of their own.
-Adam forgets a constant factor of the loss, so in these batches lambda_t scales the learning rate instead.
+The paper's term is lambda_t E ||mu(x) - a_BT||^2 with the squared norm over the four actions. It stands in
+the PPO loss, with lambda_t = lambda(share of the run) times the scale s_t of ``uncertainty``, and again in
+separate teacher batches with an Adam of their own. Adam forgets a constant factor of the loss, so in these
+batches lambda_t scales the learning rate instead.
 """
 
 from __future__ import annotations
@@ -17,27 +19,31 @@ from uuvtai.config.learning import DistillConfig
 from uuvtai.errors import SettingError
 
 MAX_WEIGHT_RATIO = 4.0
-"""a sample counts at most this many times the mean signal, and at least its inverse, before the weights' mean is made one"""
+"""a sample counts at most this many times the mean signal, and at least its inverse, before the weights' mean
+is made one"""
 
 Reduce = Callable[[list[torch.Tensor]], None]
 """average tensors over the processes, in place"""
 
 
 def imitation_error(mean: torch.Tensor, teacher_action: torch.Tensor) -> torch.Tensor:
-    """||mean - teacher_action||^2 of every sample: (..., 4) and (..., 4) to (...,), in squared parts of the vehicle's limits."""
+    """||mean - teacher_action||^2 of every sample: (..., 4) and (..., 4) to (...,), in squared parts of the
+    vehicle's limits."""
     return (mean - teacher_action).square().sum(dim=-1)
 
 
 def distillation_loss(mean: torch.Tensor, teacher_action: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-    """Weighted mean of the imitation error, a scalar: means (B, 4), teacher actions (B, 4), weights (B,) of mean one."""
+    """Weighted mean of the imitation error, a scalar: means (B, 4), teacher actions (B, 4), weights (B,) of
+    mean one."""
     return (weight * imitation_error(mean, teacher_action)).mean()
 
 
 def sample_weight(signal: torch.Tensor) -> torch.Tensor:
-    """Weight of every sample in proportion to a signal >= 0 (uncertainty, risk) of any shape: mean one, bounded.
+    """Weight of every sample in proportion to a signal >= 0 (uncertainty, risk) of any shape: mean one,
+    bounded.
 
-    Weights differ by at most ``MAX_WEIGHT_RATIO`` squared; a sample whose signal is not finite counts as an average one; where the signal
-    is zero everywhere all weights are one.
+    Weights differ by at most ``MAX_WEIGHT_RATIO`` squared; a sample whose signal is not finite counts as an
+    average one; where the signal is zero everywhere all weights are one.
     """
     known = torch.isfinite(signal)
     mean = torch.where(known, signal, 0.0).sum() / known.sum().clamp(min=1)
@@ -52,13 +58,19 @@ Weighting = Literal["none", "uncertainty", "risk"]
 def check_weighting(kind: Weighting, has_world_model: bool, has_risk: bool) -> None:
     """Raise ValueError for a ``distill.weighting`` whose signal this run does not have."""
     if kind == "risk" and not has_risk:
-        raise SettingError("distill.weighting=risk needs the risk head: set risk.enabled=true, or distill.weighting=none")
+        raise SettingError(
+            "distill.weighting=risk needs the risk head: set risk.enabled=true, or distill.weighting=none"
+        )
     if kind == "uncertainty" and not has_world_model:
-        raise SettingError("distill.weighting=uncertainty needs the world model: set world_model.enabled=true, or distill.weighting=none")
+        raise SettingError(
+            "distill.weighting=uncertainty needs the world model: set world_model.enabled=true, or "
+            "distill.weighting=none"
+        )
 
 
 def weights_of(kind: Weighting, uncertainty: torch.Tensor, risk: torch.Tensor | None) -> torch.Tensor:
-    """Weights by ``distill.weighting``, of the shape of the uncertainties; ``risk`` may be None where the kind does not ask for it."""
+    """Weights by ``distill.weighting``, of the shape of the uncertainties; ``risk`` may be None where the
+    kind does not ask for it."""
     if kind == "uncertainty":
         return sample_weight(uncertainty)
     return torch.ones_like(uncertainty) if kind == "none" or risk is None else sample_weight(risk)
@@ -68,16 +80,23 @@ class TeacherBatches:
     """Gradient steps on batches of (input, teacher action) beside those of PPO."""
 
     def __init__(self, policy: nn.Module, config: DistillConfig, reduce: Reduce | None = None) -> None:
-        """``policy.distribution(x)`` gives the means; ``reduce`` averages the gradients over the processes."""
+        """``policy.distribution(x)`` gives the means; ``reduce`` averages the gradients over the
+        processes."""
         self.policy, self.config, self.reduce = policy, config, reduce
         self.optimiser = torch.optim.Adam(policy.parameters(), lr=config.learning_rate)
         self.skipped = 0
         """steps left out because the gradient was not finite"""
 
     def update(
-        self, x: torch.Tensor, teacher_action: torch.Tensor, weight: torch.Tensor, strength: float, generator: torch.Generator
+        self,
+        x: torch.Tensor,
+        teacher_action: torch.Tensor,
+        weight: torch.Tensor,
+        strength: float,
+        generator: torch.Generator,
     ) -> None:
-        """``config.steps`` steps on random batches of the rows of x (M, n_in), teacher_action (M, 4), weight (M,).
+        """``config.steps`` steps on random batches of the rows of x (M, n_in), teacher_action (M, 4), weight
+        (M,).
 
         ``strength`` is lambda_t; at 0 nothing happens, and nothing is drawn from the (CPU) generator.
         """
@@ -90,7 +109,9 @@ class TeacherBatches:
             self._step(x[rows], teacher_action[rows], weight[rows])
 
     def _step(self, x: torch.Tensor, teacher_action: torch.Tensor, weight: torch.Tensor) -> None:
-        self.optimiser.zero_grad(set_to_none=True)  # the critic has no part in this loss: without a gradient Adam passes it over
+        self.optimiser.zero_grad(
+            set_to_none=True
+        )  # the critic has no part in this loss: without a gradient Adam passes it over
         mean = self.policy.distribution(x)[0]  # type: ignore[operator]
         distillation_loss(mean, teacher_action, weight).backward()
         gradients = [p.grad for p in self.policy.parameters() if p.grad is not None]
@@ -113,22 +134,28 @@ class TeacherBatches:
 
 
 class LeafErrors:
-    """Imitation error by the leaf of the behaviour tree that acted, summed over a rollout without a wait for the device."""
+    """Imitation error by the leaf of the behaviour tree that acted, summed over a rollout without a wait for
+    the device."""
 
     def __init__(self, names: Sequence[str], device: torch.device) -> None:
-        """``names``: of every node of the tree, by its preorder index, as ``info["leaf"]`` counts; equal names are one entry."""
+        """``names``: of every node of the tree, by its preorder index, as ``info["leaf"]`` counts; equal
+        names are one entry."""
         self.names = tuple(names)
-        self._error, self._count = (torch.zeros(len(names) + 1, dtype=torch.float64, device=device) for _ in range(2))
+        self._error, self._count = (
+            torch.zeros(len(names) + 1, dtype=torch.float64, device=device) for _ in range(2)
+        )
 
     def add(self, error: torch.Tensor, leaf: torch.Tensor) -> None:
-        """Errors (N,) of samples in which node ``leaf`` (N,) acted; a leaf outside the tree (-1: none acted) counts in the total only."""
+        """Errors (N,) of samples in which node ``leaf`` (N,) acted; a leaf outside the tree (-1: none acted)
+        counts in the total only."""
         node = torch.where((leaf >= 0) & (leaf < len(self.names)), leaf, len(self.names)).long()
         finite = torch.isfinite(error)
         self._error.index_add_(0, node, torch.where(finite, error, 0.0).double())
         self._count.index_add_(0, node, finite.double())
 
     def take(self) -> dict[str, float]:
-        """``distill/loss`` (over all samples) and ``distill/leaf/<name>`` of the leaves that acted; the sums begin anew."""
+        """``distill/loss`` (over all samples) and ``distill/leaf/<name>`` of the leaves that acted; the sums
+        begin anew."""
         error, count = self._error.tolist(), self._count.tolist()
         found: dict[str, list[float]] = {}
         for name, of_node, n in zip(self.names, error, count[:-1], strict=False):

@@ -1,7 +1,7 @@
 """Several processes train one policy: torch.distributed under ``torchrun``, gloo on the CPU and nccl on CUDA.
 
-Every process steps its own envs on its own scenarios; gradients are averaged, sums and moments are added up, rank 0 writes. A process
-without ``torchrun`` is ``Processes()``, for which all of this does nothing.
+Every process steps its own envs on its own scenarios; gradients are averaged, sums and moments are added up,
+rank 0 writes. A process without ``torchrun`` is ``Processes()``, for which all of this does nothing.
 """
 
 from __future__ import annotations
@@ -17,14 +17,16 @@ import torch.distributed as dist
 from uuvtai.errors import DeviceError
 
 SEED_STRIDE = 1_000_003
-"""between the env seeds of neighbouring ranks: a prime far above the seeds that people type, so that streams of scenarios stay apart"""
+"""between the env seeds of neighbouring ranks: a prime far above the seeds that people type, so that streams
+of scenarios stay apart"""
 _SEEDS = 2**31
 _CPU = torch.device("cpu")
 
 
 @dataclass(frozen=True)
 class Processes:
-    """Which process this is, of how many, and what they do together. Every method must be called by all of them in the same order."""
+    """Which process this is, of how many, and what they do together. Every method must be called by all of
+    them in the same order."""
 
     rank: int = 0
     size: int = 1
@@ -36,7 +38,8 @@ class Processes:
         return self.rank == 0
 
     def seed(self, seed: int) -> int:
-        """This rank's seed of the envs: rank 0 has the seed itself, the others' scenarios are disjoint from it."""
+        """This rank's seed of the envs: rank 0 has the seed itself, the others' scenarios are disjoint from
+        it."""
         return (seed + SEED_STRIDE * self.rank) % _SEEDS
 
     def average(self, tensors: Iterable[torch.Tensor]) -> None:
@@ -97,10 +100,12 @@ def is_writer(environ: Mapping[str, str] = os.environ) -> bool:
 
 
 def claim_gpu(environ: MutableMapping[str, str] = os.environ) -> None:
-    """Under torchrun, show this process its own GPU only: by LOCAL_RANK, among those of CUDA_VISIBLE_DEVICES where that is set.
+    """Under torchrun, show this process its own GPU only: by LOCAL_RANK, among those of CUDA_VISIBLE_DEVICES
+    where that is set.
 
-    Taichi always takes the first GPU it sees, so call this once, before Taichi or CUDA starts. RuntimeError where it is too late, or
-    where CUDA_VISIBLE_DEVICES names fewer GPUs than there are processes. An empty CUDA_VISIBLE_DEVICES (no GPU wanted) stays.
+    Taichi always takes the first GPU it sees, so call this once, before Taichi or CUDA starts. RuntimeError
+    where it is too late, or where CUDA_VISIBLE_DEVICES names fewer GPUs than there are processes. An empty
+    CUDA_VISIBLE_DEVICES (no GPU wanted) stays.
     """
     local, visible = environ.get("LOCAL_RANK"), environ.get("CUDA_VISIBLE_DEVICES")
     if local is None or visible == "":
@@ -120,7 +125,8 @@ def claim_gpu(environ: MutableMapping[str, str] = os.environ) -> None:
 
 
 def join_processes(device: torch.device | str = "cpu") -> Processes:
-    """Join the group that torchrun set up (RANK, WORLD_SIZE, MASTER_ADDR, MASTER_PORT); without torchrun, the one process there is."""
+    """Join the group that torchrun set up (RANK, WORLD_SIZE, MASTER_ADDR, MASTER_PORT); without torchrun, the
+    one process there is."""
     device = torch.device(device)
     size = int(os.environ.get("WORLD_SIZE", "1"))
     if size == 1:

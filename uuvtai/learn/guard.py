@@ -1,4 +1,5 @@
-"""What is not a finite number neither spreads nor stays silent: it is replaced, counted by name, and iteration after iteration an error."""
+"""What is not a finite number neither spreads nor stays silent: it is replaced, counted by name, and
+iteration after iteration an error."""
 
 from __future__ import annotations
 
@@ -20,17 +21,25 @@ class TrainingError(UserError, RuntimeError):
 class Guard:
     """Replaces values that are not finite and counts them, without a wait for the device."""
 
-    def __init__(self, columns: Sequence[tuple[str, slice]], num_envs: int, patience: int, device: torch.device) -> None:
-        """``columns``: names of the observation's columns; ``patience``: iterations in a row with something bad before it is an error."""
+    def __init__(
+        self, columns: Sequence[tuple[str, slice]], num_envs: int, patience: int, device: torch.device
+    ) -> None:
+        """``columns``: names of the observation's columns; ``patience``: iterations in a row with something
+        bad before it is an error."""
         self.columns, self.patience = tuple(columns), patience
         width = max((place.stop for _, place in self.columns), default=0)
         self._observation = torch.zeros(width, dtype=torch.int64, device=device)
         self._rows = torch.zeros(num_envs, dtype=torch.bool, device=device)
-        self._other: dict[str, torch.Tensor] = {name: torch.zeros((), dtype=torch.int64, device=device) for name in _NAMES}
+        self._other: dict[str, torch.Tensor] = {
+            name: torch.zeros((), dtype=torch.int64, device=device) for name in _NAMES
+        }
         self.bad_in_a_row = 0
 
-    def observation(self, obs: torch.Tensor, fill: torch.Tensor, out: torch.Tensor, counted: torch.Tensor | None = None) -> torch.Tensor:
-        """Copy obs (N, n_obs) into ``out``, with ``fill`` (n_obs,) in place of what is not finite; returns which rows were bad, (N,).
+    def observation(
+        self, obs: torch.Tensor, fill: torch.Tensor, out: torch.Tensor, counted: torch.Tensor | None = None
+    ) -> torch.Tensor:
+        """Copy obs (N, n_obs) into ``out``, with ``fill`` (n_obs,) in place of what is not finite; returns
+        which rows were bad, (N,).
 
         ``counted`` (N,): rows that count (default: all).
         """
@@ -43,7 +52,8 @@ class Guard:
         return rows
 
     def values(self, name: str, values: torch.Tensor, out: torch.Tensor) -> torch.Tensor:
-        """Copy ``values`` (N, ...) into ``out`` with 0 in place of what is not finite; returns which rows were bad, (N,)."""
+        """Copy ``values`` (N, ...) into ``out`` with 0 in place of what is not finite; returns which rows
+        were bad, (N,)."""
         bad = ~torch.isfinite(values)
         out.copy_(values).masked_fill_(bad, 0.0)
         rows = bad if bad.dim() == 1 else bad.any(dim=1)
@@ -52,15 +62,20 @@ class Guard:
         return rows
 
     def take(self) -> dict[str, float]:
-        """Counts since the last call by name, those above zero only: ``non_finite/<column>``, ``non_finite/reward`` and so on."""
+        """Counts since the last call by name, those above zero only: ``non_finite/<column>``,
+        ``non_finite/reward`` and so on."""
         counts = self._observation.tolist()
-        found = {name: sum(counts[place]) for name, place in self.columns} | {n: int(t) for n, t in self._other.items()}
+        found = {name: sum(counts[place]) for name, place in self.columns} | {
+            n: int(t) for n, t in self._other.items()
+        }
         self._observation.zero_()
         for counter in self._other.values():
             counter.zero_()
         return {f"{PREFIX}{name}": float(count) for name, count in found.items() if count}
 
-    def judge(self, iteration: int, complaints: Sequence[str], seed: torch.Tensor, episode: torch.Tensor) -> None:
+    def judge(
+        self, iteration: int, complaints: Sequence[str], seed: torch.Tensor, episode: torch.Tensor
+    ) -> None:
         """Count an iteration with or without complaints; TrainingError after ``patience`` in a row with some.
 
         ``seed`` and ``episode`` (N,): which scenarios the envs are in, for the message.
@@ -70,21 +85,30 @@ class Guard:
         self.bad_in_a_row = self.bad_in_a_row + 1 if complaints else 0
         if self.bad_in_a_row < self.patience:
             return
-        envs = "".join(f"; env {row} (seed {int(seed[row])}, episode {int(episode[row])})" for row in rows[:_ROWS_TOLD])
+        envs = "".join(
+            f"; env {row} (seed {int(seed[row])}, episode {int(episode[row])})" for row in rows[:_ROWS_TOLD]
+        )
         raise TrainingError(
-            f"iterations {iteration - self.bad_in_a_row + 1} to {iteration} were all bad: {'; '.join(complaints)}{envs}. What was bad did "
+            f"iterations {iteration - self.bad_in_a_row + 1} to {iteration} were all bad: "
+            f"{'; '.join(complaints)}{envs}. What was bad did "
             "not change the networks. If updates were left out, go on with smaller steps: "
-            "uuv train --resume RUN --set ppo.learning_rate=1e-4. If an observation or a reward is not finite, the simulator is at fault: "
+            "uuv train --resume RUN --set ppo.learning_rate=1e-4. If an observation or a reward is not "
+            "finite, the simulator is at fault: "
             "please report seed and episode"
         )
 
 
 def guarded_step(
-    loss: torch.Tensor, module: torch.nn.Module, optimiser: torch.optim.Optimizer, reduce: Callable[[list[torch.Tensor]], None] | None
+    loss: torch.Tensor,
+    module: torch.nn.Module,
+    optimiser: torch.optim.Optimizer,
+    reduce: Callable[[list[torch.Tensor]], None] | None,
 ) -> bool:
-    """One gradient step on ``loss`` (a scalar); False where the gradient is zero or not finite, and nothing was changed.
+    """One gradient step on ``loss`` (a scalar); False where the gradient is zero or not finite, and nothing
+    was changed.
 
-    ``reduce`` unites the gradients of several processes; it comes before the judgement, so that all of them decide alike.
+    ``reduce`` unites the gradients of several processes; it comes before the judgement, so that all of them
+    decide alike.
     """
     optimiser.zero_grad(set_to_none=True)
     loss.backward()

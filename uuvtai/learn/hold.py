@@ -19,7 +19,8 @@ Watch = Callable[[torch.Tensor, Info], None]
 
 
 class Stretch(NamedTuple):
-    """What came of a decision, all (N, ...); rows whose episode ended on the way tell of that episode, ``obs`` and ``info`` of the next."""
+    """What came of a decision, all (N, ...); rows whose episode ended on the way tell of that episode,
+    ``obs`` and ``info`` of the next."""
 
     obs: torch.Tensor
     """observation of the next decision"""
@@ -52,7 +53,9 @@ class Hold:
             watch(end.ended, end.info)
         if self.steps == 1:
             return end
-        end = end._replace(final_obs=end.final_obs.clone(), reward=end.reward.clone(), terminated=end.terminated.clone())
+        end = end._replace(
+            final_obs=end.final_obs.clone(), reward=end.reward.clone(), terminated=end.terminated.clone()
+        )
         offset = action - teacher if self._residual else action
         for _ in range(self.steps - 1):
             newest = end.info["teacher_action"].nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
@@ -65,7 +68,9 @@ class Hold:
 
     def _step(self, action: torch.Tensor) -> Stretch:
         obs, reward, terminated, truncated, info = self._env.step(action)
-        return Stretch(obs, info["final_obs"], reward, terminated, terminated | truncated, info["outcome"].long(), info)
+        return Stretch(
+            obs, info["final_obs"], reward, terminated, terminated | truncated, info["outcome"].long(), info
+        )
 
 
 def _joined(first: Stretch, then: Stretch) -> Stretch:

@@ -1,4 +1,5 @@
-"""The manifest of a checkpoint: what it is, for which observation and action, and the sha256 of every file. Read without trust."""
+"""The manifest of a checkpoint: what it is, for which observation and action, and the sha256 of every file.
+Read without trust."""
 
 from __future__ import annotations
 
@@ -23,12 +24,18 @@ SCHEMA = 1
 READABLE_VERSIONS = ("0.1",)
 """uuvtai's series whose checkpoints mean the same to this one: same networks, same columns, same units"""
 
-MANIFEST, MODEL, TRAINING, SIMULATOR = "manifest.json", "model.safetensors", "training.safetensors", "simulator.zst"
+MANIFEST, MODEL, TRAINING, SIMULATOR = (
+    "manifest.json",
+    "model.safetensors",
+    "training.safetensors",
+    "simulator.zst",
+)
 OPTIONAL = (TRAINING, SIMULATOR)
 """files that a policy drives without"""
 _MAX_BYTES = 8 << 20
 LARGEST = {MODEL: 256 << 20, TRAINING: 512 << 20, SIMULATOR: 8 << 30}
-"""[bytes] most that a file may have; the first two are read into memory, the last one as far as its reader expects"""
+"""[bytes] most that a file may have; the first two are read into memory, the last one as far as its reader
+expects"""
 _CHUNK_BYTES = 1 << 20
 
 
@@ -81,14 +88,17 @@ class Manifest(BaseModel):
     simulator_layout: list[tuple[str, str, list[int]]] | None = None
 
 
-# --------------------------------------------------------------------------------------------------------- reading without trust
+# -------------------------------------------------------------------------------------- reading without trust
 
 
 def manifest_content(path: Path) -> bytes:
     """Bytes of a checkpoint folder's manifest. Raises CheckpointError."""
     file = path / MANIFEST
     if not path.is_dir():
-        raise CheckpointError(f"{path}: no such folder; give a run folder, one of its checkpoints/step_N, or a shipped policy's name")
+        raise CheckpointError(
+            f"{path}: no such folder; give a run folder, one of its checkpoints/step_N, or a shipped "
+            "policy's name"
+        )
     if file.is_symlink() or not file.is_file():
         raise CheckpointError(f"{file}: is missing; the folder is no checkpoint, or its writing was cut off")
     with refused(file):
@@ -96,7 +106,8 @@ def manifest_content(path: Path) -> bytes:
 
 
 def parsed(content: bytes) -> Manifest:
-    """The manifest itself. Raises PackingError for another schema or version before anything else is looked at, ValueError for nonsense."""
+    """The manifest itself. Raises PackingError for another schema or version before anything else is looked
+    at, ValueError for nonsense."""
     try:
         raw = parsed_json(content, MANIFEST)
     except FileError as error:
@@ -104,10 +115,15 @@ def parsed(content: bytes) -> Manifest:
     if not isinstance(raw, dict) or "schema" not in raw:
         raise PackingError("is not a manifest of uuvtai")
     if raw["schema"] != SCHEMA:
-        raise PackingError(f"has schema {raw['schema']!r}, this uuvtai reads {SCHEMA}; use the version that wrote it: {raw.get('version')}")
+        raise PackingError(
+            f"has schema {raw['schema']!r}, this uuvtai reads {SCHEMA}; use the version that wrote it: "
+            f"{raw.get('version')}"
+        )
     version = str(raw.get("version"))
     if version.rpartition(".")[0] not in READABLE_VERSIONS:
-        raise PackingError(f"was written by uuvtai {version}, this is {__version__}; use that version, or train again")
+        raise PackingError(
+            f"was written by uuvtai {version}, this is {__version__}; use that version, or train again"
+        )
     return Manifest.model_validate_json(content)
 
 
@@ -125,9 +141,14 @@ def verify(file: Path, entry: FileEntry | None, is_optional: bool) -> None:
     if size > most:
         raise CheckpointError(f"{file}: has {size:,} bytes, more than the {most:,} that such a file may have")
     if size != entry.bytes:
-        raise CheckpointError(f"{file}: has {size} bytes instead of {entry.bytes}, it was cut off; take another checkpoint of the run")
+        raise CheckpointError(
+            f"{file}: has {size} bytes instead of {entry.bytes}, it was cut off; take another checkpoint of "
+            "the run"
+        )
     if sha256_of(file) != entry.sha256:
-        raise CheckpointError(f"{file}: is damaged, its sha256 is not that of {MANIFEST}; take another checkpoint of the run")
+        raise CheckpointError(
+            f"{file}: is damaged, its sha256 is not that of {MANIFEST}; take another checkpoint of the run"
+        )
 
 
 @contextlib.contextmanager
@@ -136,30 +157,47 @@ def refused(file: Path) -> Iterator[None]:
     try:
         yield
     except SafetensorError as error:
-        raise CheckpointError(f"{file}: is not a safetensors file ({error}); pickles and other formats are never opened") from None
+        raise CheckpointError(
+            f"{file}: is not a safetensors file ({error}); pickles and other formats are never opened"
+        ) from None
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
-        raise CheckpointError(f"{file}: {where}: {first['msg']}; it was not written by this version of uuvtai") from None
+        raise CheckpointError(
+            f"{file}: {where}: {first['msg']}; it was not written by this version of uuvtai"
+        ) from None
     except (PackingError, FileError) as error:
         raise CheckpointError(f"{file}: {str(error).removeprefix(f'{file}: ')}") from None
     except (ValueError, RecursionError, OSError) as error:
-        raise CheckpointError(f"{file}: cannot be read ({error}); take another checkpoint of the run") from None
+        raise CheckpointError(
+            f"{file}: cannot be read ({error}); take another checkpoint of the run"
+        ) from None
 
 
-# ------------------------------------------------------------------------------------------------------------------- tables
+# ----------------------------------------------------------------------------------------------------- tables
 
 
 def table_rows(table: Sequence[DescribedColumn]) -> list[dict[str, Any]]:
     """An observation table as the manifest keeps it."""
-    return [{"name": c.name, "first": c.slice.start, "stop": c.slice.stop, "unit": c.unit, "frame": c.frame} for c in table]
+    return [
+        {"name": c.name, "first": c.slice.start, "stop": c.slice.stop, "unit": c.unit, "frame": c.frame}
+        for c in table
+    ]
 
 
 def action_rows(config: Any) -> list[dict[str, Any]]:
     """What an action of 1 means, for every component: the vehicle's limits."""
     v = config.vehicle
-    limits = (("surge", v.max_surge_m_s), ("sway", v.max_sway_m_s), ("heave", v.max_heave_m_s), ("yaw_rate", v.max_yaw_rate_rad_s))
-    return [{"name": name, "limit": limit, "unit": "rad/s" if name == "yaw_rate" else "m/s"} for name, limit in limits]
+    limits = (
+        ("surge", v.max_surge_m_s),
+        ("sway", v.max_sway_m_s),
+        ("heave", v.max_heave_m_s),
+        ("yaw_rate", v.max_yaw_rate_rad_s),
+    )
+    return [
+        {"name": name, "limit": limit, "unit": "rad/s" if name == "yaw_rate" else "m/s"}
+        for name, limit in limits
+    ]
 
 
 def config_sha256(config: dict[str, Any]) -> str:
@@ -171,13 +209,22 @@ def difference(own: list[dict[str, Any]], theirs: list[dict[str, Any]]) -> str:
     """First place where two tables differ, in words."""
     for mine, other in zip(own, theirs, strict=False):
         if mine != other:
-            return f"it expects {mine}, this environment gives {other}; evaluate it with the config it was trained with"
-    return f"it expects {len(own)} rows, this environment gives {len(theirs)}; evaluate it with the config it was trained with"
+            return (
+                f"it expects {mine}, this environment gives {other}; evaluate it with the config it was "
+                "trained with"
+            )
+    return (
+        f"it expects {len(own)} rows, this environment gives {len(theirs)}; evaluate it with the config "
+        "it was trained with"
+    )
 
 
 def finite(metrics: Mapping[str, Any]) -> dict[str, Any]:
     """Metrics as JSON can hold them: NaN and infinity become None."""
-    return {name: None if isinstance(value, float) and not math.isfinite(value) else value for name, value in metrics.items()}
+    return {
+        name: None if isinstance(value, float) and not math.isfinite(value) else value
+        for name, value in metrics.items()
+    }
 
 
 def sha256_of(file: Path) -> str:

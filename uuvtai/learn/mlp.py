@@ -16,11 +16,14 @@ _ACTIVATIONS = {"elu": lambda: nn.ELU(inplace=True), "tanh": nn.Tanh, "relu": la
 _HIDDEN_GAIN = math.sqrt(2.0)
 
 
-def mlp(sizes: Sequence[int], activation: Activation, generator: torch.Generator, out_gain: float = 1.0) -> nn.Sequential:
-    """Layers of these widths (input, hidden ..., output), an activation after every one but the last, biases zero.
+def mlp(
+    sizes: Sequence[int], activation: Activation, generator: torch.Generator, out_gain: float = 1.0
+) -> nn.Sequential:
+    """Layers of these widths (input, hidden ..., output), an activation after every one but the last, biases
+    zero.
 
-    Weights are orthogonal with gain sqrt 2, the last layer's with ``out_gain`` (0 = its output is zero at birth). ``generator`` is a CPU
-    generator. ValueError for fewer than two widths.
+    Weights are orthogonal with gain sqrt 2, the last layer's with ``out_gain`` (0 = its output is zero at
+    birth). ``generator`` is a CPU generator. ValueError for fewer than two widths.
     """
     if len(sizes) < 2:
         raise ValueError(f"an mlp needs at least an input and an output width, got {list(sizes)}")
@@ -34,7 +37,9 @@ def mlp(sizes: Sequence[int], activation: Activation, generator: torch.Generator
 
 def linear(n_in: int, n_out: int, gain: float, generator: torch.Generator) -> nn.Linear:
     """One layer, weights orthogonal with this gain, bias zero."""
-    layer = nn.Linear(n_in, n_out, device="meta").to_empty(device="cpu")  # its own initial weights come from the global generator
+    layer = nn.Linear(n_in, n_out, device="meta").to_empty(
+        device="cpu"
+    )  # its own initial weights come from the global generator
     nn.init.orthogonal_(layer.weight, gain, generator=generator)
     nn.init.zeros_(layer.bias)
     return layer

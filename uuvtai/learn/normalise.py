@@ -1,4 +1,5 @@
-"""Running mean and deviation in float64, merged batch by batch exactly (Chan, Golub, LeVeque 1979), and the scaling they give."""
+"""Running mean and deviation in float64, merged batch by batch exactly (Chan, Golub, LeVeque 1979), and the
+scaling they give."""
 
 from __future__ import annotations
 
@@ -11,7 +12,8 @@ from torch import nn
 _ROWS_AT_ONCE = 2048
 """a float64 copy of a whole rollout would not fit the caches"""
 MIN_STD = 1e-2
-"""a column's deviation counts as at least this much (in its own unit): a constant column must not become noise"""
+"""a column's deviation counts as at least this much (in its own unit): a constant column must not become
+noise"""
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,8 @@ def combined(a: Moments, b: Moments) -> Moments:
 
 
 class RunningNorm(nn.Module):
-    """Scales columns to mean 0 and deviation 1 by the moments of all samples seen so far; before the first one it changes nothing."""
+    """Scales columns to mean 0 and deviation 1 by the moments of all samples seen so far; before the first
+    one it changes nothing."""
 
     mean: torch.Tensor
     m2: torch.Tensor

@@ -1,4 +1,5 @@
-"""Nested state as named tensors and plain JSON, and back to the last bit; big arrays as one compressed stream of known size."""
+"""Nested state as named tensors and plain JSON, and back to the last bit; big arrays as one compressed stream
+of known size."""
 
 from __future__ import annotations
 
@@ -27,10 +28,11 @@ class PackingError(UserError, ValueError):
 
 
 def pack(state: Any, name: str = "state", copy: bool = True) -> tuple[Any, dict[str, torch.Tensor]]:
-    """(plain, tensors): ``plain`` is JSON with references to ``tensors`` on the host, contiguous, by default copies apart from each other.
+    """(plain, tensors): ``plain`` is JSON with references to ``tensors`` on the host, contiguous, by default
+    copies apart from each other.
 
-    Dictionaries, lists, tuples, tensors, NumPy arrays, numbers, texts, booleans and None are kept as they are; anything else is a
-    PackingError that names the place.
+    Dictionaries, lists, tuples, tensors, NumPy arrays, numbers, texts, booleans and None are kept as they
+    are; anything else is a PackingError that names the place.
     """
     tensors: dict[str, torch.Tensor] = {}
     return _packed(state, name, tensors, copy), tensors
@@ -56,7 +58,10 @@ def _packed(node: Any, place: str, tensors: dict[str, torch.Tensor], copy: bool)
         if all(isinstance(key, str) and not key.startswith("$") for key in node):
             return {key: _packed(value, f"{place}.{key}", tensors, copy) for key, value in node.items()}
         return {
-            "$items": [[_packed(key, place, tensors, copy), _packed(value, f"{place}.{key}", tensors, copy)] for key, value in node.items()]
+            "$items": [
+                [_packed(key, place, tensors, copy), _packed(value, f"{place}.{key}", tensors, copy)]
+                for key, value in node.items()
+            ]
         }
     if isinstance(node, list | tuple):
         items = [_packed(value, f"{place}.{i}", tensors, copy) for i, value in enumerate(node)]
@@ -88,7 +93,7 @@ def _unpacked(node: Any, tensors: dict[str, torch.Tensor]) -> Any:
             return {key: _unpacked(value, tensors) for key, value in items}
 
 
-# ----------------------------------------------------------------------------------------------------------------- streams
+# ---------------------------------------------------------------------------------------------------- streams
 
 
 def layout_of(tensors: dict[str, torch.Tensor]) -> Layout:
@@ -106,10 +111,14 @@ def write_stream(path: Path, tensors: dict[str, torch.Tensor]) -> None:
 
 
 def read_stream(path: Path, layout: Layout) -> dict[str, torch.Tensor]:
-    """Read exactly what ``layout`` says, so that a file cannot unfold to more than its reader expects. Raises PackingError."""
+    """Read exactly what ``layout`` says, so that a file cannot unfold to more than its reader expects. Raises
+    PackingError."""
     tensors = {}
     try:
-        with open_file(path, MAX_STREAM_BYTES, path.parent) as file, zstandard.ZstdDecompressor().stream_reader(file) as stream:
+        with (
+            open_file(path, MAX_STREAM_BYTES, path.parent) as file,
+            zstandard.ZstdDecompressor().stream_reader(file) as stream,
+        ):
             for name, dtype, shape in layout:
                 array = np.empty(shape, dtype)
                 _fill(_bytes_of(array), stream, name)

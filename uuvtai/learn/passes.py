@@ -1,7 +1,9 @@
-"""Forward and backward pass of an mlp by hand, block of rows by block of rows, in memory that is allocated once.
+"""Forward and backward pass of an mlp by hand, block of rows by block of rows, in memory that is allocated
+once.
 
-Autograd would allocate every activation anew: a tenth of an update's time went into page faults, and whole minibatches do not fit the
-caches. The mathematics is the chain rule of ``mlp`` and nothing else; tests compare it with autograd.
+Autograd would allocate every activation anew: a tenth of an update's time went into page faults, and whole
+minibatches do not fit the caches. The mathematics is the chain rule of ``mlp`` and nothing else; tests
+compare it with autograd.
 """
 
 from __future__ import annotations
@@ -11,13 +13,14 @@ from torch import nn
 
 
 class Passes:
-    """Passes of at most ``rows`` rows through one ``mlp``; gradients add up in tensors that ``begin`` makes the parameters' ``grad``."""
+    """Passes of at most ``rows`` rows through one ``mlp``; gradients add up in tensors that ``begin`` makes
+    the parameters' ``grad``."""
 
     def __init__(self, net: nn.Sequential, rows: int, dtype: torch.dtype = torch.float32) -> None:
         """``net`` as ``mlp`` builds it, with its parameters where they will stay.
 
-        ``dtype`` is that of the products of all layers but the last, whose output is what the losses see; weights and their gradients
-        stay float32.
+        ``dtype`` is that of the products of all layers but the last, whose output is what the losses see;
+        weights and their gradients stay float32.
         """
         self.rows = rows
         self.layers = [layer for layer in net if isinstance(layer, nn.Linear)]
@@ -51,7 +54,8 @@ class Passes:
 
     @torch.no_grad()
     def backward(self, x: torch.Tensor, gradient: torch.Tensor) -> None:
-        """Add the gradients of a loss whose gradient by the output of the last ``forward`` (of the same x) is (B, n_out)."""
+        """Add the gradients of a loss whose gradient by the output of the last ``forward`` (of the same x) is
+        (B, n_out)."""
         for number in range(len(self.layers) - 1, -1, -1):
             below = self._out[number - 1][: len(x)] if number else x
             gradient = gradient.to(self._dtypes[number])
@@ -64,7 +68,9 @@ class Passes:
     def _rounded(self) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
         """Weights and biases in the layers' dtypes: themselves where that is float32."""
         pairs = list(zip(self.layers, self._dtypes, strict=True))
-        return [layer.weight.detach().to(t) for layer, t in pairs], [layer.bias.detach().to(t) for layer, t in pairs]
+        return [layer.weight.detach().to(t) for layer, t in pairs], [
+            layer.bias.detach().to(t) for layer, t in pairs
+        ]
 
 
 def _elu_slope(gradient: torch.Tensor, out: torch.Tensor) -> torch.Tensor:

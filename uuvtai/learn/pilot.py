@@ -1,7 +1,9 @@
-"""A trained policy at the wheel: the mean action without exploration noise, with the world model's memory of every row.
+"""A trained policy at the wheel: the mean action without exploration noise, with the world model's memory of
+every row.
 
-What a row does must not depend on its neighbours, the batch's size or the number of threads. The networks therefore always see
-``CHUNK`` rows at once, the last chunk filled up: equal shapes take equal paths through the matrix products.
+What a row does must not depend on its neighbours, the batch's size or the number of threads. The networks
+therefore always see ``CHUNK`` rows at once, the last chunk filled up: equal shapes take equal paths through
+the matrix products.
 """
 
 from __future__ import annotations
@@ -43,7 +45,8 @@ class PilotDecision(NamedTuple):
 
 
 class Pilot:
-    """Drives ``num_envs`` rows. ``decide`` looks, ``advance`` goes on to the next step; ``reset`` when a row begins another episode."""
+    """Drives ``num_envs`` rows. ``decide`` looks, ``advance`` goes on to the next step; ``reset`` when a row
+    begins another episode."""
 
     def __init__(
         self,
@@ -53,11 +56,19 @@ class Pilot:
         device: torch.device | str = "cpu",
         head: RiskHead | None = None,
     ) -> None:
-        """``world_model``: None where the policy was trained without its features. The networks are used, not copied."""
-        self.policy, self.world_model, self.risk, self.device = policy, world_model, head, torch.device(device)
+        """``world_model``: None where the policy was trained without its features. The networks are used, not
+        copied."""
+        self.policy, self.world_model, self.risk, self.device = (
+            policy,
+            world_model,
+            head,
+            torch.device(device),
+        )
         self._n_obs = policy.n_in - N_FEATURES
         rows = num_envs
-        self._x, self._last_obs = (torch.zeros(rows, width, device=device) for width in (policy.n_in, self._n_obs))
+        self._x, self._last_obs = (
+            torch.zeros(rows, width, device=device) for width in (policy.n_in, self._n_obs)
+        )
         self._action, self._last_action = (torch.zeros(rows, NUM_ACTIONS, device=device) for _ in range(2))
         self._has_last = torch.zeros(rows, dtype=torch.bool, device=device)
         self._hold, self._age = policy.config.hold_steps, torch.zeros(rows, dtype=torch.int64, device=device)
@@ -67,7 +78,8 @@ class Pilot:
 
     @property
     def mean_action(self) -> torch.Tensor:
-        """(num_envs, 4) action of the last decision before it was cut off to [-1, 1]: what the difference that is held was taken from."""
+        """(num_envs, 4) action of the last decision before it was cut off to [-1, 1]: what the difference
+        that is held was taken from."""
         return self._action
 
     def reset(self, rows: torch.Tensor) -> None:
@@ -124,12 +136,16 @@ class Pilot:
         mean = _by_chunk(lambda part: self.policy.distribution(part)[0], x)
         self._offset[rows] = mean if teacher is None else mean - teacher
         risk_logit = x.new_zeros(len(x)) if self.risk is None else _by_chunk(self.risk.logit, x)
-        self._said[rows] = torch.stack([_by_chunk(self.policy.value, x), x[:, -2], x[:, -1], risk_logit], dim=1)
+        self._said[rows] = torch.stack(
+            [_by_chunk(self.policy.value, x), x[:, -2], x[:, -1], risk_logit], dim=1
+        )
 
     def _features(self, rows: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
         if self.world_model is None:
             return x.new_zeros(len(x), N_FEATURES)
-        found = _by_chunk(self.world_model.features, self._last_obs[rows], self._last_action[rows], x[:, : self._n_obs])
+        found = _by_chunk(
+            self.world_model.features, self._last_obs[rows], self._last_action[rows], x[:, : self._n_obs]
+        )
         return torch.where(self._has_last[rows, None], found, 0.0)
 
 
@@ -139,17 +155,28 @@ def _by_chunk(function: Callable[..., torch.Tensor], *inputs: torch.Tensor) -> t
     for i in range(0, len(inputs[0]), CHUNK):
         chunk = [tensor[i : i + CHUNK] for tensor in inputs]
         missing = CHUNK - len(chunk[0])
-        parts.append(function(*(torch.cat([t, t[:1].expand(missing, -1)]) if missing else t.contiguous() for t in chunk)))
+        parts.append(
+            function(
+                *(torch.cat([t, t[:1].expand(missing, -1)]) if missing else t.contiguous() for t in chunk)
+            )
+        )
     return torch.cat(parts)[: len(inputs[0])]
 
 
 def _check_sizes(parts: dict[str, Any], config: LearningConfig, n_obs: int) -> None:
-    """Raise ValueError where the networks of a config are not as wide as the tensors that came with it, before anything is made so wide."""
+    """Raise ValueError where the networks of a config are not as wide as the tensors that came with it,
+    before anything is made so wide."""
     n_in, latent = n_obs + N_FEATURES, config.world_model.latent
-    nets = [("policy", "actor", (n_in, *config.policy.hidden)), ("policy", "critic", (n_in, *config.policy.hidden))]
+    nets = [
+        ("policy", "actor", (n_in, *config.policy.hidden)),
+        ("policy", "critic", (n_in, *config.policy.hidden)),
+    ]
     if config.world_model.enabled and config.world_model.as_features:
         hidden = config.world_model.hidden
-        nets += [("world_model", "encoder", (n_obs, *hidden, latent)), ("world_model", "dynamics", (latent + NUM_ACTIONS, *hidden, latent))]
+        nets += [
+            ("world_model", "encoder", (n_obs, *hidden, latent)),
+            ("world_model", "dynamics", (latent + NUM_ACTIONS, *hidden, latent)),
+        ]
         nets += [("world_model", "decoder", (latent, *hidden))]
     if config.risk.enabled:
         nets += [("risk", "net", (n_in, *config.risk.hidden))]
@@ -157,16 +184,21 @@ def _check_sizes(parts: dict[str, Any], config: LearningConfig, n_obs: int) -> N
         for number, (first, last) in enumerate(itertools.pairwise(widths)):
             name = f"{net}.{2 * number}.weight"
             if parts[part][name].shape != (last, first):
-                raise ValueError(f"{part}.{name} is {tuple(parts[part][name].shape)} instead of {(last, first)}")
+                raise ValueError(
+                    f"{part}.{name} is {tuple(parts[part][name].shape)} instead of {(last, first)}"
+                )
 
 
 def load_pilot(checkpoint: Checkpoint, num_envs: int, device: torch.device | str = "cpu") -> Pilot:
-    """Pilot with the networks of a checkpoint. Raises CheckpointError where they do not fit what its config says."""
+    """Pilot with the networks of a checkpoint. Raises CheckpointError where they do not fit what its config
+    says."""
     config, rows = checkpoint.config, checkpoint.manifest.observation_table
     parts, generator = checkpoint.model(), torch.Generator()
     try:
         n_obs = max(row["stop"] for row in rows)
-        teacher = next((slice(row["first"], row["stop"]) for row in rows if row["name"] == TEACHER_COLUMN), None)
+        teacher = next(
+            (slice(row["first"], row["stop"]) for row in rows if row["name"] == TEACHER_COLUMN), None
+        )
         _check_sizes(parts, config, n_obs)
         policy = ActorCritic(n_obs + N_FEATURES, config.policy, teacher, generator)
         policy.load_state_dict(parts["policy"])
@@ -179,11 +211,16 @@ def load_pilot(checkpoint: Checkpoint, num_envs: int, device: torch.device | str
             risk = RiskHead(n_obs + N_FEATURES, config.risk, generator)
             risk.load_state_dict(parts["risk"])
     except (KeyError, ValueError, RuntimeError, TypeError, AttributeError) as error:
-        raise CheckpointError(f"{checkpoint.path / MODEL}: its networks are not those of its config ({error}); take another one") from None
+        raise CheckpointError(
+            f"{checkpoint.path / MODEL}: its networks are not those of its config ({error}); take another one"
+        ) from None
     modules = [module for module in (policy, world_model, risk) if module is not None]
     for module in modules:
         for name, tensor in module.state_dict().items():
             if not bool(torch.isfinite(tensor).all()):
-                raise CheckpointError(f"{checkpoint.path / MODEL}: {name} is not finite: the training failed; take an older checkpoint")
+                raise CheckpointError(
+                    f"{checkpoint.path / MODEL}: {name} is not finite: the training failed; take an older "
+                    "checkpoint"
+                )
         module.to(device).eval()
     return Pilot(policy, world_model, num_envs, device, risk)

@@ -1,7 +1,8 @@
-"""Proximal policy optimisation (Schulman et al. 2017) with generalised advantages, an optional distillation term and a guard against NaN.
+"""Proximal policy optimisation (Schulman et al. 2017) with generalised advantages, an optional distillation
+term and a guard against NaN.
 
-Statistics of the normalisers stand still from the first step of a rollout to the last minibatch of its update, so that the ratio of the
-first minibatch is one; only then do they take in the rollout.
+Statistics of the normalisers stand still from the first step of a rollout to the last minibatch of its
+update, so that the ratio of the first minibatch is one; only then do they take in the rollout.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ ADAM_EPS = 1e-5
 RATE_FACTOR, RATE_BOUNDS = 1.5, (1e-5, 1e-2)
 """steps and bounds of the KL-adaptive learning rate (rsl_rl)"""
 CACHE_ROWS = 2048
-"""rows of a minibatch in one pass on a CPU: their activations stay in the cache, and the gradients add up to the same sum"""
+"""rows of a minibatch in one pass on a CPU: their activations stay in the cache, and the gradients add up to
+the same sum"""
 
 
 def gae(
@@ -42,10 +44,12 @@ def gae(
     gamma: float,
     lam: float,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """(advantage, return), both (T, N), by generalised advantage estimation (Schulman et al. 2016, equation 16).
+    """(advantage, return), both (T, N), by generalised advantage estimation (Schulman et al. 2016, equation
+    16).
 
-    All inputs are (T, N). ``next_value[t]`` is the value of the true next observation: after a timeout (ended, not terminated) it is
-    bootstrapped from, after a termination it is not; past an ending nothing is carried back.
+    All inputs are (T, N). ``next_value[t]`` is the value of the true next observation: after a timeout
+    (ended, not terminated) it is bootstrapped from, after a termination it is not; past an ending nothing is
+    carried back.
     """
     delta = reward + gamma * next_value * ~terminated - value
     carried = gamma * lam * ~ended
@@ -62,8 +66,11 @@ def surrogate_loss(log_ratio: torch.Tensor, advantage: torch.Tensor, clip: float
     return -torch.minimum(ratio * advantage, ratio.clamp(1.0 - clip, 1.0 + clip) * advantage)
 
 
-def value_loss(value: torch.Tensor, target: torch.Tensor, old_value: torch.Tensor | None = None, clip: float = 0.0) -> torch.Tensor:
-    """(B,) squared error of every sample; with ``old_value`` the worse of it and that of the value clipped to old_value +- clip."""
+def value_loss(
+    value: torch.Tensor, target: torch.Tensor, old_value: torch.Tensor | None = None, clip: float = 0.0
+) -> torch.Tensor:
+    """(B,) squared error of every sample; with ``old_value`` the worse of it and that of the value clipped to
+    old_value +- clip."""
     error = (value - target).square()
     if old_value is None:
         return error
@@ -77,14 +84,18 @@ def approximate_kl(log_ratio: torch.Tensor) -> torch.Tensor:
 
 
 def adapted_rate(rate: torch.Tensor, kl: torch.Tensor, target_kl: float) -> torch.Tensor:
-    """Learning rate after a minibatch of this mean KL divergence: slower above twice the target, faster below half of it (rsl_rl)."""
+    """Learning rate after a minibatch of this mean KL divergence: slower above twice the target, faster below
+    half of it (rsl_rl)."""
     slower, faster = rate / RATE_FACTOR, rate * RATE_FACTOR
-    return torch.where(kl > 2.0 * target_kl, slower, torch.where(kl < 0.5 * target_kl, faster, rate)).clamp(*RATE_BOUNDS)
+    return torch.where(kl > 2.0 * target_kl, slower, torch.where(kl < 0.5 * target_kl, faster, rate)).clamp(
+        *RATE_BOUNDS
+    )
 
 
 @dataclass(frozen=True)
 class Minibatch:
-    """Samples of a rollout as the losses want them: rows (M, ...), finite, with ``valid`` 1 or 0 for those that were not finite."""
+    """Samples of a rollout as the losses want them: rows (M, ...), finite, with ``valid`` 1 or 0 for those
+    that were not finite."""
 
     normalised: torch.Tensor
     prior: torch.Tensor
@@ -112,8 +123,15 @@ _SUMS = ("policy_loss", "value_loss", "approx_kl", "clip_fraction", "distill", "
 class Ppo:
     """Adam on the clipped surrogate, the value error, the entropy and the distillation term of one policy."""
 
-    def __init__(self, policy: ActorCritic, config: PpoConfig, reduce: Reduce | None = None, gather: Gather | None = None) -> None:
-        """``reduce`` averages gradients over the processes in place, between backward and step; ``gather`` unites their moments."""
+    def __init__(
+        self,
+        policy: ActorCritic,
+        config: PpoConfig,
+        reduce: Reduce | None = None,
+        gather: Gather | None = None,
+    ) -> None:
+        """``reduce`` averages gradients over the processes in place, between backward and step; ``gather``
+        unites their moments."""
         self.policy, self.config, self.reduce, self.gather = policy, config, reduce, gather
         device = policy.log_std.device
         self.rate = torch.tensor(config.learning_rate, device=device)
@@ -126,18 +144,25 @@ class Ppo:
         self._passes: tuple[Passes, Passes] | None = None
 
     def update(
-        self, rollout: Rollout, distill_weight: float = 0.0, surrogate: bool = True, generator: torch.Generator | None = None
+        self,
+        rollout: Rollout,
+        distill_weight: float = 0.0,
+        surrogate: bool = True,
+        generator: torch.Generator | None = None,
     ) -> dict[str, float]:
-        """Learn from a closed rollout; metrics by their names in metrics.jsonl, means over all minibatches of the update.
+        """Learn from a closed rollout; metrics by their names in metrics.jsonl, means over all minibatches of
+        the update.
 
-        ``distill_weight`` is lambda_t s_t of weight ||mean - teacher_action||^2; without ``surrogate`` only the critic and the distillation
-        learn (critic warm-up). ``generator`` (CPU) draws the minibatches of ``config.shuffle``. Samples that are not finite have no
-        part in any of it and are counted. ValueError for more minibatches than samples.
+        ``distill_weight`` is lambda_t s_t of weight ||mean - teacher_action||^2; without ``surrogate`` only
+        the critic and the distillation learn (critic warm-up). ``generator`` (CPU) draws the minibatches of
+        ``config.shuffle``. Samples that are not finite have no part in any of it and are counted. ValueError
+        for more minibatches than samples.
         """
         batch, metrics = self._prepared(rollout)
         if self.config.minibatches > len(batch.valid):
             raise SettingError(
-                f"ppo.minibatches={self.config.minibatches}, but a rollout has only {len(batch.valid)} samples: "
+                f"ppo.minibatches={self.config.minibatches}, but a rollout has only {len(batch.valid)} "
+                "samples: "
                 "raise ppo.rollout_steps or train.num_envs"
             )
         skipped, sums = self.skipped, torch.zeros(len(_SUMS), dtype=torch.float64, device=batch.valid.device)
@@ -149,7 +174,8 @@ class Ppo:
         return metrics | self._metrics(sums, skipped)
 
     def observe(self, x: torch.Tensor) -> None:
-        """Take inputs x (..., n_in) into the normaliser's statistics; before the first rollout, so that it does not begin unscaled."""
+        """Take inputs x (..., n_in) into the normaliser's statistics; before the first rollout, so that it
+        does not begin unscaled."""
         self.policy.observation_norm.merge(self._gathered(moments_of(x)))
 
     def state_dict(self) -> dict[str, Any]:
@@ -169,14 +195,22 @@ class Ppo:
             group["lr"] = self.rate
         self.updates, self.skipped = int(state["updates"]), int(state["skipped"])
 
-    # ------------------------------------------------------------------------------------------------ what is learned from
+    # ----------------------------------------------------------------------------------- what is learned from
 
     @torch.no_grad()
     def _prepared(self, rollout: Rollout) -> tuple[Minibatch, dict[str, float]]:
         valid = _valid(rollout)
-        reward, value, next_value = (torch.where(valid, getattr(rollout, name), 0.0) for name in ("reward", "value", "next_value"))
+        reward, value, next_value = (
+            torch.where(valid, getattr(rollout, name), 0.0) for name in ("reward", "value", "next_value")
+        )
         advantage, returns = gae(
-            reward, value, next_value, rollout.terminated, rollout.ended | ~valid, self.config.gamma, self.config.gae_lambda
+            reward,
+            value,
+            next_value,
+            rollout.terminated,
+            rollout.ended | ~valid,
+            self.config.gamma,
+            self.config.gae_lambda,
         )
         kept = returns[valid]
         metrics = {
@@ -188,14 +222,18 @@ class Ppo:
         norm = self.policy.value_norm
         flat_valid = valid.flatten()
         zero_where_invalid = {
-            name: torch.where(flat_valid.view(-1, *[1] * (rollout.flat(name).ndim - 1)), rollout.flat(name), 0.0)
+            name: torch.where(
+                flat_valid.view(-1, *[1] * (rollout.flat(name).ndim - 1)), rollout.flat(name), 0.0
+            )
             for name in ("action", "log_prob", "teacher_action", "weight")
         }
         prior = self.policy.teacher_action(rollout.flat("x"))
         return Minibatch(
             normalised=self._normalise(rollout.flat("x")),
             prior=flat_valid.new_empty(len(flat_valid), 0) if prior is None else prior,
-            advantage=_standardised(advantage, valid, self._gathered(moments_of(advantage[valid][:, None]))).flatten(),
+            advantage=_standardised(
+                advantage, valid, self._gathered(moments_of(advantage[valid][:, None]))
+            ).flatten(),
             target=norm(returns.flatten()),
             value=norm(value.flatten()),
             valid=flat_valid.float(),
@@ -222,7 +260,7 @@ class Ppo:
         for first, last in itertools.pairwise(bounds):
             yield batch.rows(slice(first, last) if order is None else order[first:last])
 
-    # ------------------------------------------------------------------------------------------------------------ one minibatch
+    # ------------------------------------------------------------------------------------------ one minibatch
 
     def _learn(self, batch: Minibatch, distill_weight: float, surrogate: bool, sums: torch.Tensor) -> None:
         self.optimiser.zero_grad(set_to_none=True)
@@ -260,7 +298,8 @@ class Ppo:
         surrogate: bool,
         sums: torch.Tensor,
     ) -> torch.Tensor:
-        """This block's share of the minibatch's loss by the networks' outputs; its sums are added to ``sums`` in the order of ``_SUMS``."""
+        """This block's share of the minibatch's loss by the networks' outputs; its sums are added to ``sums``
+        in the order of ``_SUMS``."""
         config, share = self.config, batch.valid / count
         old_value = batch.value if config.clip_value else None
         value_error = value_loss(value_out.squeeze(-1), batch.target, old_value, config.clip)
@@ -271,7 +310,11 @@ class Ppo:
         if surrogate:
             log_ratio = log_prob(batch.action, mean, self.policy.log_std) - batch.log_prob
             policy_loss = surrogate_loss(log_ratio, batch.advantage, config.clip)
-            loss = loss + (share * policy_loss).sum() - config.entropy_weight * share.sum() * entropy(self.policy.log_std)
+            loss = (
+                loss
+                + (share * policy_loss).sum()
+                - config.entropy_weight * share.sum() * entropy(self.policy.log_std)
+            )
             with torch.no_grad():
                 kl, clipped = approximate_kl(log_ratio), (log_ratio.expm1().abs() > config.clip).float()
         if distill_weight:
@@ -283,7 +326,8 @@ class Ppo:
         return loss
 
     def _step(self, kl: torch.Tensor, surrogate: bool) -> None:
-        """Unite the processes, adapt the rate, cut the gradient's norm, step; or skip all of it where the gradient is not finite."""
+        """Unite the processes, adapt the rate, cut the gradient's norm, step; or skip all of it where the
+        gradient is not finite."""
         parameters = [p for p in self.policy.parameters() if p.grad is not None]
         if self.reduce is not None:
             self.reduce([*(p.grad for p in parameters if p.grad is not None), kl])

@@ -1,4 +1,5 @@
-"""The record of a run: ``metrics.jsonl``, one object an iteration, and the same as TensorBoard events under the usual names."""
+"""The record of a run: ``metrics.jsonl``, one object an iteration, and the same as TensorBoard events under
+the usual names."""
 
 from __future__ import annotations
 
@@ -16,11 +17,13 @@ METRICS, EVENTS = "metrics.jsonl", "tensorboard"
 class MetricsRecorder:
     """Writes what every iteration gave; each line is on its way to the disk before ``write`` returns.
 
-    A resumed run goes on behind the iteration of its checkpoint: what came later is cut off, and TensorBoard is told to forget it.
+    A resumed run goes on behind the iteration of its checkpoint: what came later is cut off, and TensorBoard
+    is told to forget it.
     """
 
     def __init__(self, run: Path, iteration: int = 0) -> None:
-        """``iteration``: how many are done already. Raises OSError, and FileError for what is no plain file of the run."""
+        """``iteration``: how many are done already. Raises OSError, and FileError for what is no plain file
+        of the run."""
         from torch.utils.tensorboard import SummaryWriter  # takes a second to import
 
         _cut(run, iteration)
@@ -44,7 +47,8 @@ class MetricsRecorder:
 
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:
-    """Every whole line of a run's ``metrics.jsonl``; a last line that was cut off is left out. Raises OSError, FileError."""
+    """Every whole line of a run's ``metrics.jsonl``; a last line that was cut off is left out. Raises
+    OSError, FileError."""
     return list(_whole_rows(run))
 
 
@@ -74,4 +78,8 @@ def _row(line: bytes) -> dict[str, Any] | None:
         row = parsed_json(line, METRICS)
     except FileError:
         return None
-    return row if line[-1:] == b"\n" and isinstance(row, dict) and isinstance(row.get("iteration"), int) else None
+    return (
+        row
+        if line[-1:] == b"\n" and isinstance(row, dict) and isinstance(row.get("iteration"), int)
+        else None
+    )

@@ -1,8 +1,10 @@
-"""Risk head: calibrated probability that the episode ends in a collision or TTC stop within ``risk.horizon_s``, from the policy's input.
+"""Risk head: calibrated probability that the episode ends in a collision or TTC stop within
+``risk.horizon_s``, from the policy's input.
 
-Goes beyond the paper, which says that its uncertainty is no collision probability. Labels come from rollouts; moments whose future the
-rollouts do not show (yet) have none. Probabilities are calibrated on held-out episodes, and split conformal prediction gives the alarm
-threshold whose share of missed dangerous moments is bounded.
+Goes beyond the paper, which says that its uncertainty is no collision probability. Labels come from rollouts;
+moments whose future the rollouts do not show (yet) have none. Probabilities are calibrated on held-out
+episodes, and split conformal prediction gives the alarm threshold whose share of missed dangerous moments is
+bounded.
 """
 
 from __future__ import annotations
@@ -38,10 +40,12 @@ Gather = Callable[[Moments], Moments]
 
 
 class RiskHead(nn.Module):
-    """Logit of the event by a small network on the normalised input, and a monotonic table from logit to calibrated probability."""
+    """Logit of the event by a small network on the normalised input, and a monotonic table from logit to
+    calibrated probability."""
 
     table: Tensor
-    """(N_KNOT,) float64 calibrated probability at logits from -12 to 12; the logistic function until ``calibrate``"""
+    """(N_KNOT,) float64 calibrated probability at logits from -12 to 12; the logistic function until
+    ``calibrate``"""
     threshold: Tensor
     """logit from which on to raise an alarm; ``NO_THRESHOLD`` until ``set_threshold``"""
 
@@ -71,7 +75,8 @@ class RiskHead(nn.Module):
 
     @torch.no_grad()
     def calibrate(self, logit: Tensor, event: Tensor) -> None:
-        """Fit the table to held-out logits (n,) and events (n,) by isotonic regression. Raises ValueError where one outcome is missing."""
+        """Fit the table to held-out logits (n,) and events (n,) by isotonic regression. Raises ValueError
+        where one outcome is missing."""
         _require_both(event)
         score, value = isotonic(logit.double(), event.double())
         self.table.copy_(interpolated(_knots().to(score.device), score, value))
@@ -90,7 +95,7 @@ def _knots() -> Tensor:
     return torch.linspace(-MAX_LOGIT, MAX_LOGIT, N_KNOT, dtype=torch.float64)
 
 
-# ------------------------------------------------------------------------------------------------------------------ labels
+# ----------------------------------------------------------------------------------------------------- labels
 
 
 class Labels(NamedTuple):
@@ -105,8 +110,9 @@ class Labels(NamedTuple):
 def label_events(failed: Tensor, ended: Tensor, censored: Tensor, horizon_steps: int) -> Labels:
     """Labels of the moments before each step of a rollout; all tensors (T, N) bool.
 
-    An event is an ending with ``failed`` (collision or TTC stop) in this step or one of the next ``horizon_steps`` - 1. Not known: the
-    rollout stops before, or the episode was cut off (``censored``: its time was over) before the horizon.
+    An event is an ending with ``failed`` (collision or TTC stop) in this step or one of the next
+    ``horizon_steps`` - 1. Not known: the rollout stops before, or the episode was cut off (``censored``: its
+    time was over) before the horizon.
     """
     labels = Labels(torch.zeros_like(ended), torch.zeros_like(ended))
     steps, num_envs = ended.shape
@@ -117,17 +123,24 @@ def label_events(failed: Tensor, ended: Tensor, censored: Tensor, horizon_steps:
         fails, cut = torch.where(ended[t], failed[t], fails), torch.where(ended[t], censored[t], cut)
         soon = to_end < horizon_steps
         labels.event[t] = soon & fails
-        labels.known[t] = torch.where(soon, fails | ~cut, torch.tensor(steps - t >= horizon_steps, device=ended.device))
+        labels.known[t] = torch.where(
+            soon, fails | ~cut, torch.tensor(steps - t >= horizon_steps, device=ended.device)
+        )
     return labels
 
 
 class RiskMemory:
-    """Recent moments that wait for their label: the horizon may be longer than a rollout, whose end must not choose what is learned."""
+    """Recent moments that wait for their label: the horizon may be longer than a rollout, whose end must not
+    choose what is learned."""
 
     def __init__(self, horizon_steps: int, stride: int = STRIDE) -> None:
-        """``horizon_steps``: steps of a rollout that make up the horizon; ``stride``: steps between the moments."""
+        """``horizon_steps``: steps of a rollout that make up the horizon; ``stride``: steps between the
+        moments."""
         if horizon_steps < 1:
-            raise SettingError(f"the risk horizon must be at least one step of a rollout, got {horizon_steps}: raise risk.horizon_s")
+            raise SettingError(
+                f"the risk horizon must be at least one step of a rollout, got {horizon_steps}: raise "
+                "risk.horizon_s"
+            )
         self.horizon_steps, self.stride = horizon_steps, stride
         self.x: list[Tensor] = []
         """(N, n_in) inputs of the moments that wait, oldest first"""
@@ -137,9 +150,11 @@ class RiskMemory:
         """(3, T, N) failed, ended, censored of the steps since the oldest moment"""
 
     def add(self, x: Tensor, failed: Tensor, ended: Tensor, censored: Tensor) -> tuple[Tensor, Tensor]:
-        """Take in a rollout: x (T, N, n_in), others (T, N); returns (x (M, n_in), event (M,)) of the moments that are decided now.
+        """Take in a rollout: x (T, N, n_in), others (T, N); returns (x (M, n_in), event (M,)) of the moments
+        that are decided now.
 
-        Every ``stride``-th step of a rollout is a moment; each is returned once, when all of its horizon has been seen.
+        Every ``stride``-th step of a rollout is a moment; each is returned once, when all of its horizon has
+        been seen.
         """
         new = torch.stack([failed, ended, censored])
         before = self.ends.shape[1]
@@ -172,11 +187,14 @@ class RiskMemory:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """What ``state_dict`` gave."""
-        self.x, self.places = [x.to(state["ends"].device) for x in state["x"]], [int(place) for place in state["places"]]
+        self.x, self.places = (
+            [x.to(state["ends"].device) for x in state["x"]],
+            [int(place) for place in state["places"]],
+        )
         self.ends = state["ends"].clone()
 
 
-# ------------------------------------------------------------------------------------------------------------------ learning
+# --------------------------------------------------------------------------------------------------- learning
 
 
 class RiskLearner:
@@ -191,20 +209,26 @@ class RiskLearner:
         gather: Gather | None = None,
         hold_steps: int = 1,
     ) -> None:
-        """``control_dt_s``: length of a control step, ``hold_steps`` of which are a step of a rollout; ``reduce`` averages gradients over
-        the processes, ``gather`` unites moments.
+        """``control_dt_s``: length of a control step, ``hold_steps`` of which are a step of a rollout;
+        ``reduce`` averages gradients over the processes, ``gather`` unites moments.
         """
         self.head, self.config, self.reduce, self.gather = head, config, reduce, gather
-        self.memory = RiskMemory(round(config.horizon_s / (control_dt_s * hold_steps)), max(1, STRIDE // hold_steps))
+        self.memory = RiskMemory(
+            round(config.horizon_s / (control_dt_s * hold_steps)), max(1, STRIDE // hold_steps)
+        )
         self.optimiser = torch.optim.Adam(head.parameters(), lr=config.learning_rate, fused=True)
         self.skipped = 0
         """steps left out because the gradient was not finite, or zero for want of labels"""
 
-    def update(self, x: Tensor, failed: Tensor, ended: Tensor, censored: Tensor, generator: torch.Generator) -> dict[str, float]:
-        """``config.steps`` gradient steps on the moments that a rollout decides: x (T, N, n_in), others (T, N) bool.
+    def update(
+        self, x: Tensor, failed: Tensor, ended: Tensor, censored: Tensor, generator: torch.Generator
+    ) -> dict[str, float]:
+        """``config.steps`` gradient steps on the moments that a rollout decides: x (T, N, n_in), others (T,
+        N) bool.
 
-        ``failed``: the step ended in a collision or TTC stop, ``censored``: in a timeout. Moments that are not finite are left out. Returns
-        metrics by their names in metrics.jsonl: those of the probabilities before anything was learned from these moments.
+        ``failed``: the step ended in a collision or TTC stop, ``censored``: in a timeout. Moments that are
+        not finite are left out. Returns metrics by their names in metrics.jsonl: those of the probabilities
+        before anything was learned from these moments.
         """
         moment, event = self.memory.add(x, failed, ended, censored)
         good = torch.isfinite(moment).all(dim=1)
@@ -219,7 +243,11 @@ class RiskLearner:
 
     def state_dict(self) -> dict[str, Any]:
         """Adam's moments, what waits for its label and the counter; the head keeps its own."""
-        return {"optimiser": self.optimiser.state_dict(), "memory": self.memory.state_dict(), "skipped": self.skipped}
+        return {
+            "optimiser": self.optimiser.state_dict(),
+            "memory": self.memory.state_dict(),
+            "skipped": self.skipped,
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """What ``state_dict`` gave."""
@@ -239,17 +267,25 @@ class RiskLearner:
 
     def _learn(self, moment: Tensor, event: Tensor, generator: torch.Generator) -> None:
         """One step; without labels the gradient is zero, so that all processes take part in the reduction."""
-        rows = torch.randint(len(event), (self.config.batch,), generator=generator).to(event.device) if len(event) else slice(0)
+        rows = (
+            torch.randint(len(event), (self.config.batch,), generator=generator).to(event.device)
+            if len(event)
+            else slice(0)
+        )
         logit = self.head.logit(moment[rows])
-        loss = fn.binary_cross_entropy_with_logits(logit, event[rows].float(), reduction="sum") / self.config.batch
+        loss = (
+            fn.binary_cross_entropy_with_logits(logit, event[rows].float(), reduction="sum")
+            / self.config.batch
+        )
         self.skipped += not guarded_step(loss, self.head, self.optimiser, self.reduce)
 
 
-# --------------------------------------------------------------------------------------------------------------- calibration
+# ------------------------------------------------------------------------------------------------ calibration
 
 
 def isotonic(score: Tensor, event: Tensor) -> tuple[Tensor, Tensor]:
-    """Isotonic regression of events on scores by pool-adjacent-violators (Barlow 1972): (distinct scores, fitted values), float64.
+    """Isotonic regression of events on scores by pool-adjacent-violators (Barlow 1972): (distinct scores,
+    fitted values), float64.
 
     Scores ascend, values do not fall, their squared error is least.
     """
@@ -276,17 +312,22 @@ def interpolated(at: Tensor, x: Tensor, y: Tensor) -> Tensor:
 
 
 def conformal_threshold(scores: Tensor, miss_rate: float) -> float:
-    """Alarm threshold from the scores (n,) of held-out dangerous moments: a new one scores below it with probability <= ``miss_rate``.
+    """Alarm threshold from the scores (n,) of held-out dangerous moments: a new one scores below it with
+    probability <= ``miss_rate``.
 
-    Split conformal prediction: the ceil((n + 1) (1 - miss_rate))-th largest score (Vovk 2005; Angelopoulos and Bates 2021). It holds for
-    moments that are exchangeable with the held-out ones, so take one per episode: those of one episode are not independent. Raises
-    ValueError for scores that are too few for the rate.
+    Split conformal prediction: the ceil((n + 1) (1 - miss_rate))-th largest score (Vovk 2005; Angelopoulos
+    and Bates 2021). It holds for moments that are exchangeable with the held-out ones, so take one per
+    episode: those of one episode are not independent. Raises ValueError for scores that are too few for the
+    rate.
     """
     n = scores.numel()
     rank = n + 1 - math.floor((n + 1) * miss_rate + _ROUNDING)
     if rank > n:
         least = math.ceil(1.0 / miss_rate - _ROUNDING) - 1
-        raise ValueError(f"{n} dangerous moments are too few for a miss rate of {miss_rate:g}: it takes {least}; evaluate more episodes")
+        raise ValueError(
+            f"{n} dangerous moments are too few for a miss rate of {miss_rate:g}: it takes {least}; evaluate "
+            "more episodes"
+        )
     if not bool(torch.isfinite(scores).all()):
         raise ValueError("scores of dangerous moments must be finite")
     return float(scores.flatten().sort(descending=True).values[rank - 1])
@@ -295,4 +336,7 @@ def conformal_threshold(scores: Tensor, miss_rate: float) -> float:
 def _require_both(event: Tensor) -> None:
     count = int(event.sum())
     if count in (0, event.numel()):
-        raise ValueError(f"calibration needs both outcomes: {count} events among {event.numel()} moments; evaluate more episodes")
+        raise ValueError(
+            f"calibration needs both outcomes: {count} events among {event.numel()} moments; evaluate more "
+            "episodes"
+        )

@@ -8,14 +8,22 @@ from uuvtai.learn.policy import NUM_ACTIONS, ActorCritic, PolicyStep
 
 
 class Rollout:
-    """Tensors (T, N, ...) in order of time; ``flat`` views them as (T N, ...), so that a run of rows is a block of memory.
+    """Tensors (T, N, ...) in order of time; ``flat`` views them as (T N, ...), so that a run of rows is a
+    block of memory.
 
-    Row t of env n: input ``x``, what was done (``action``, ``log_prob``, ``value``) and what came of it (``reward``, ``next_value`` of the
-    true next observation, ``terminated``, ``ended``), the teacher's action in x, the leaf of the tree that gave it (-1: none), and the
-    weight of the sample in the distillation.
+    Row t of env n: input ``x``, what was done (``action``, ``log_prob``, ``value``) and what came of it
+    (``reward``, ``next_value`` of the true next observation, ``terminated``, ``ended``), the teacher's action
+    in x, the leaf of the tree that gave it (-1: none), and the weight of the sample in the distillation.
     """
 
-    def __init__(self, steps: int, num_envs: int, n_in: int, device: torch.device | str = "cpu", num_actions: int = NUM_ACTIONS) -> None:
+    def __init__(
+        self,
+        steps: int,
+        num_envs: int,
+        n_in: int,
+        device: torch.device | str = "cpu",
+        num_actions: int = NUM_ACTIONS,
+    ) -> None:
         """``steps`` = T, ``num_envs`` = N."""
         self.steps, self.num_envs, self.n_in = steps, num_envs, n_in
 
@@ -49,11 +57,14 @@ class Rollout:
     ) -> None:
         """Copy one step of all envs.
 
-        ``final_value`` (N,), as ``final_value(policy, x)`` gives it, is the value of the observation in which an episode ended, read where
-        ``ended``; elsewhere the next step's value takes its place (``close`` gives the last step's). Raises RuntimeError when full.
+        ``final_value`` (N,), as ``final_value(policy, x)`` gives it, is the value of the observation in which
+        an episode ended, read where ``ended``; elsewhere the next step's value takes its place (``close``
+        gives the last step's). Raises RuntimeError when full.
         """
         if self.filled == self.steps:
-            raise RuntimeError(f"the rollout is full ({self.steps} steps): close and clear it before the next step")
+            raise RuntimeError(
+                f"the rollout is full ({self.steps} steps): close and clear it before the next step"
+            )
         t = self.filled
         if t > 0:
             self._bridge(t - 1, step.value)
@@ -71,9 +82,12 @@ class Rollout:
         self.filled += 1
 
     def close(self, last_value: torch.Tensor) -> None:
-        """Give the value (N,) of the observations after the last step. Raises RuntimeError while steps are missing."""
+        """Give the value (N,) of the observations after the last step. Raises RuntimeError while steps are
+        missing."""
         if self.filled != self.steps:
-            raise RuntimeError(f"the rollout has {self.filled} of {self.steps} steps: add the others before it is closed")
+            raise RuntimeError(
+                f"the rollout has {self.filled} of {self.steps} steps: add the others before it is closed"
+            )
         self._bridge(self.steps - 1, last_value)
 
     def flat(self, name: str) -> torch.Tensor:
@@ -86,8 +100,11 @@ class Rollout:
 
 
 @torch.no_grad()
-def final_value(policy: ActorCritic, final_x: torch.Tensor, terminated: torch.Tensor, ended: torch.Tensor) -> torch.Tensor:
-    """(N,) value of the inputs final_x (N, n_in) in which episodes were cut off, zero elsewhere: few rows, so only they are computed."""
+def final_value(
+    policy: ActorCritic, final_x: torch.Tensor, terminated: torch.Tensor, ended: torch.Tensor
+) -> torch.Tensor:
+    """(N,) value of the inputs final_x (N, n_in) in which episodes were cut off, zero elsewhere: few rows, so
+    only they are computed."""
     value = torch.zeros(len(final_x), device=final_x.device)
     rows = (ended & ~terminated).nonzero().flatten()
     if len(rows):

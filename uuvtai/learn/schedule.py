@@ -9,12 +9,15 @@ from collections.abc import Sequence
 def piecewise_linear(points: Sequence[tuple[float, float]], fraction: float) -> float:
     """Value at ``fraction`` of (fraction, value) ``points``: linear in between, constant outside.
 
-    Two points at the same fraction are a jump, and at the jump itself the later value holds. ValueError for no points or points out of
-    order.
+    Two points at the same fraction are a jump, and at the jump itself the later value holds. ValueError for
+    no points or points out of order.
     """
     places = [place for place, _ in points]
     if not places or places != sorted(places):
-        raise ValueError(f"a schedule needs at least one (fraction, value) point, fractions not falling, got {list(points)}")
+        raise ValueError(
+            "a schedule needs at least one (fraction, value) point, fractions not falling, got "
+            f"{list(points)}"
+        )
     after = bisect.bisect_right(places, fraction)
     if after == 0:
         return float(points[0][1])

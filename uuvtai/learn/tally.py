@@ -31,7 +31,12 @@ class Tally:
     @classmethod
     def zeros(cls, n_outcome: int, n_term: int, device: torch.device) -> Tally:
         """Nothing counted yet."""
-        return cls(*(torch.zeros(size, dtype=torch.float64, device=device) for size in ((n_outcome,), (), (), (n_term,), ())))
+        return cls(
+            *(
+                torch.zeros(size, dtype=torch.float64, device=device)
+                for size in ((n_outcome,), (), (), (n_term,), ())
+            )
+        )
 
     def tensors(self) -> list[torch.Tensor]:
         """All of them, to be added up over the processes."""
@@ -48,11 +53,15 @@ class Recent:
         """[return, steps, one count per outcome] of every iteration in the window, oldest first"""
 
     def add(self, tally: Tally) -> dict[str, float]:
-        """Take in a rollout; ``rollout/*`` over the window (none before the first episode has ended), ``reward/*`` over the rollout."""
+        """Take in a rollout; ``rollout/*`` over the window (none before the first episode has ended),
+        ``reward/*`` over the rollout."""
         self.rows.append([float(tally.episode_return), float(tally.episode_steps), *tally.outcomes.tolist()])
         while sum(self._episodes(row) for row in self.rows[1:]) >= WINDOW:
             self.rows.pop(0)
-        metrics = {f"reward/{n}": v / float(tally.samples) for n, v in zip(self.terms, tally.terms.tolist(), strict=True)}
+        metrics = {
+            f"reward/{n}": v / float(tally.samples)
+            for n, v in zip(self.terms, tally.terms.tolist(), strict=True)
+        }
         total, steps, *counts = (sum(column) for column in zip(*self.rows, strict=True))
         episodes = sum(counts)
         if not episodes:

@@ -1,4 +1,5 @@
-"""The trainer: one iteration after the other, a rollout and what is learned from it. ``Trainer.iterate`` is the page to read first."""
+"""The trainer: one iteration after the other, a rollout and what is learned from it. ``Trainer.iterate`` is
+the page to read first."""
 
 from __future__ import annotations
 
@@ -34,7 +35,8 @@ TEACHER_COLUMN = "teacher_action"
 class Trainer:
     """Everything that training carries from one iteration to the next.
 
-    All that is random draws from one CPU generator: equal states, configs and libraries give equal runs on a CPU, bit for bit.
+    All that is random draws from one CPU generator: equal states, configs and libraries give equal runs on a
+    CPU, bit for bit.
     """
 
     def __init__(self, env: VectorEnv, config: LearningConfig, processes: Processes | None = None) -> None:
@@ -44,19 +46,29 @@ class Trainer:
         self.processes = processes or Processes(device=env.device)
         self.generator = torch.Generator().manual_seed(config.train.seed)
         n_in, device = env.num_obs + N_FEATURES, env.device
-        self.policy = ActorCritic(n_in, config.policy, _columns(env, TEACHER_COLUMN), self.generator).to(device)
+        self.policy = ActorCritic(n_in, config.policy, _columns(env, TEACHER_COLUMN), self.generator).to(
+            device
+        )
         self.uncertainty = Uncertainty(config.uncertainty).to(device)
         self.rollout = Rollout(config.ppo.rollout_steps, env.num_envs, n_in, device)
-        self.guard = Guard([(c.name, c.slice) for c in env.observation_table], env.num_envs, config.train.patience, device)
+        self.guard = Guard(
+            [(c.name, c.slice) for c in env.observation_table], env.num_envs, config.train.patience, device
+        )
         self.ppo = Ppo(self.policy, config.ppo, self._reduce, self._united)
         self.teacher_batches = TeacherBatches(self.policy, config.distill, self._reduce)
         world = config.world_model
-        self.world_model = WorldModel(env.num_obs, world, self.generator).to(device) if world.enabled else None
-        self.world_learner = self.world_model and WorldModelLearner(self.world_model, world, self._reduce, self._united)
+        self.world_model = (
+            WorldModel(env.num_obs, world, self.generator).to(device) if world.enabled else None
+        )
+        self.world_learner = self.world_model and WorldModelLearner(
+            self.world_model, world, self._reduce, self._united
+        )
         risk, dt_s, hold = config.risk, config.episode.control_dt_s, config.policy.hold_steps
         self.risk = RiskHead(n_in, risk, self.generator).to(device) if risk.enabled else None
         self.risk_learner = self.risk and RiskLearner(self.risk, risk, dt_s, self._reduce, self._united, hold)
-        self.collector = Collector(env, self.policy, self.world_model, self.rollout, self.guard, self.generator, world.as_features)
+        self.collector = Collector(
+            env, self.policy, self.world_model, self.rollout, self.guard, self.generator, world.as_features
+        )
         self.recent = Recent(env.outcomes, env.reward_terms)
         self.iteration = self.env_steps = 0
         if self.processes.rank:  # equal networks, different exploration
@@ -66,9 +78,10 @@ class Trainer:
     def iterate(self) -> dict[str, float]:
         """One iteration; its metrics by their names in metrics.jsonl.
 
-        Order: rollout, all statistics standing still; running uncertainty; PPO with the distillation term (value statistics before its
-        minibatches, observation statistics after them); teacher batches; world model; risk head. Before the first iteration the behaviour
-        tree drives for one rollout, which only the statistics see. TrainingError after too many bad iterations in a row.
+        Order: rollout, all statistics standing still; running uncertainty; PPO with the distillation term
+        (value statistics before its minibatches, observation statistics after them); teacher batches; world
+        model; risk head. Before the first iteration the behaviour tree drives for one rollout, which only the
+        statistics see. TrainingError after too many bad iterations in a row.
         """
         if self.iteration == 0:
             self._look_around()
@@ -79,23 +92,30 @@ class Trainer:
         self.iteration += 1
         self.env_steps += self._samples
         self.processes.total(tally.tensors())
-        metrics = self.processes.mean_metrics(metrics | self.guard.take() | self._times(learn_s)) | self.recent.add(tally)
+        metrics = self.processes.mean_metrics(
+            metrics | self.guard.take() | self._times(learn_s)
+        ) | self.recent.add(tally)
         self._judge(metrics)
         return metrics | {"time/env_steps": float(self.env_steps)}
 
-    # ---------------------------------------------------------------------------------------------------------------- resume
+    # ------------------------------------------------------------------------------------------------- resume
 
     def state(self) -> dict[str, Any]:
         """Copy of all that the next iterations depend on, nested; what ``checkpoint.save`` takes."""
         return {name: copy.deepcopy(part.state_dict()) for name, part in self._parts().items()} | {
             "generator": self.generator.get_state(),
             "recent": list(self.recent.rows),
-            "counters": {"iteration": self.iteration, "env_steps": self.env_steps, "bad_in_a_row": self.guard.bad_in_a_row},
+            "counters": {
+                "iteration": self.iteration,
+                "env_steps": self.env_steps,
+                "bad_in_a_row": self.guard.bad_in_a_row,
+            },
             "env": self.env.capture(),
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Go on from what ``state`` gave, bit for bit on a CPU. ValueError, with nothing changed, for the state of another env."""
+        """Go on from what ``state`` gave, bit for bit on a CPU. ValueError, with nothing changed, for the
+        state of another env."""
         obs, info = self.env.restore(state["env"])
         for name, part in self._parts().items():
             part.load_state_dict(state[name])
@@ -103,7 +123,9 @@ class Trainer:
         self.collector.resume(obs, info)
         self.recent.rows = [list(row) for row in state["recent"]]
         counters = state["counters"]
-        self.iteration, self.env_steps, self.guard.bad_in_a_row = (int(counters[n]) for n in ("iteration", "env_steps", "bad_in_a_row"))
+        self.iteration, self.env_steps, self.guard.bad_in_a_row = (
+            int(counters[n]) for n in ("iteration", "env_steps", "bad_in_a_row")
+        )
 
     def _parts(self) -> dict[str, Any]:
         """Everything with a state of its own, by its name in a checkpoint."""
@@ -120,7 +142,7 @@ class Trainer:
         }
         return {name: part for name, part in parts.items() if part is not None}
 
-    # ------------------------------------------------------------------------------------------------------------ an iteration
+    # ------------------------------------------------------------------------------------------- an iteration
 
     def _learn(self, share: float) -> dict[str, float]:
         """Everything that learns from the rollout; ``share`` of the run is over."""
@@ -131,11 +153,14 @@ class Trainer:
         metrics |= self.ppo.update(rollout, strength, surrogate, self.generator)
         metrics |= self.collector.leaf_errors.take()
         kept = torch.where(torch.isfinite(rollout.reward), rollout.weight, 0.0)
-        self.teacher_batches.update(rollout.flat("x"), rollout.flat("teacher_action"), kept.flatten(), strength, self.generator)
+        self.teacher_batches.update(
+            rollout.flat("x"), rollout.flat("teacher_action"), kept.flatten(), strength, self.generator
+        )
         return metrics | self._learn_world() | self._learn_risk()
 
     def _look_around(self) -> None:
-        """Statistics begin with what the behaviour tree meets: networks that begin unscaled learn from their first rollout in vain."""
+        """Statistics begin with what the behaviour tree meets: networks that begin unscaled learn from their
+        first rollout in vain."""
         self.collector.look_around()
         self._learn_world()
         self.collector.recall_features()
@@ -155,34 +180,55 @@ class Trainer:
             return {}
         rollout = self.rollout
         censored = rollout.ended & ~rollout.terminated
-        return self.risk_learner.update(rollout.x, self.collector.failed, rollout.ended, censored, self.generator)
+        return self.risk_learner.update(
+            rollout.x, self.collector.failed, rollout.ended, censored, self.generator
+        )
 
     def _foreseen(self) -> torch.Tensor | None:
-        """(T, N) probability of a failure soon at every moment of the rollout, where the weights ask for it."""
-        return self.risk(self.rollout.x) if self.risk is not None and self.config.distill.weighting == "risk" else None
+        """(T, N) probability of a failure soon at every moment of the rollout, where the weights ask for
+        it."""
+        return (
+            self.risk(self.rollout.x)
+            if self.risk is not None and self.config.distill.weighting == "risk"
+            else None
+        )
 
     def _strength(self, share: float) -> tuple[float, dict[str, float]]:
-        """lambda_t s_t, and both for the log. All processes scale by the mean of their uncertainties, or their steps would differ."""
+        """lambda_t s_t, and both for the log. All processes scale by the mean of their uncertainties, or
+        their steps would differ."""
         mean = self.collector.uncertainty.nanmean().nan_to_num()[None]
         self.processes.average([mean])
         self.uncertainty.update(mean)
         weight, scale = piecewise_linear(self.config.distill.schedule, share), self.uncertainty.scale
-        return weight * scale, {"distill/lambda": weight, "distill/scale": scale, "distill/lambda_risk": weight * scale}
+        return weight * scale, {
+            "distill/lambda": weight,
+            "distill/scale": scale,
+            "distill/lambda_risk": weight * scale,
+        }
 
     def _times(self, learn_s: float) -> dict[str, float]:
         simulate_s, infer_s = self.collector.simulate_s, self.collector.infer_s
         rate = self._samples / (simulate_s + infer_s + learn_s)
-        return {"time/simulate_s": simulate_s, "time/infer_s": infer_s, "time/learn_s": learn_s, "time/env_steps_per_s": rate}
+        return {
+            "time/simulate_s": simulate_s,
+            "time/infer_s": infer_s,
+            "time/learn_s": learn_s,
+            "time/env_steps_per_s": rate,
+        }
 
     def _judge(self, metrics: dict[str, float]) -> None:
         """Tell the guard what was bad in this iteration."""
         complaints = [
-            f"{int(v)} values of {name.removeprefix(PREFIX)} not finite" for name, v in metrics.items() if name.startswith(PREFIX)
+            f"{int(v)} values of {name.removeprefix(PREFIX)} not finite"
+            for name, v in metrics.items()
+            if name.startswith(PREFIX)
         ]
         skipped = metrics["train/skipped_updates"]
         if skipped:
             complaints.append(f"{int(skipped)} updates left out because loss or gradient was not finite")
-        self.guard.judge(self.iteration, complaints, self.collector.info["seed"], self.collector.info["episode"])
+        self.guard.judge(
+            self.iteration, complaints, self.collector.info["seed"], self.collector.info["episode"]
+        )
 
     @property
     def _samples(self) -> int:
@@ -193,7 +239,8 @@ class Trainer:
         self.processes.average(tensors)
 
     def _united(self, moments: Moments) -> Moments:
-        """Moments of all processes' samples, merged in the order of ranks so that every process gets the same bits."""
+        """Moments of all processes' samples, merged in the order of ranks so that every process gets the same
+        bits."""
         width = len(moments.mean)
         rows = self.processes.gather(torch.cat([moments.mean, moments.m2, moments.count[None]]))
         parts = [Moments(row[:width], row[width:-1], row[-1]) for row in rows]

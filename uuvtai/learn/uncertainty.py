@@ -1,4 +1,5 @@
-"""Running uncertainty of the world model and the scale it gives the distillation (paper, Sec. "Latent World Model")."""
+"""Running uncertainty of the world model and the scale it gives the distillation (paper, Sec. "Latent World
+Model")."""
 
 from __future__ import annotations
 
@@ -11,8 +12,8 @@ from uuvtai.config.learning import UncertaintyConfig
 class Uncertainty(nn.Module):
     """Exponential moving average of the batch's uncertainty proxy and the distillation scale s_t.
 
-    sigma_bar <- (1 - rho) sigma_bar + rho sigma_t, s_t = clip(1 + alpha sigma_bar, 1, s_max). sigma_bar begins at the first value that is
-    seen, not at zero, which would take some 1 / rho iterations to wear off.
+    sigma_bar <- (1 - rho) sigma_bar + rho sigma_t, s_t = clip(1 + alpha sigma_bar, 1, s_max). sigma_bar
+    begins at the first value that is seen, not at zero, which would take some 1 / rho iterations to wear off.
     """
 
     mean: Tensor
@@ -26,7 +27,8 @@ class Uncertainty(nn.Module):
 
     @torch.no_grad()
     def update(self, sigma: Tensor) -> None:
-        """Take in the uncertainty of a batch, any shape; values that are not finite are left out, a batch of none changes nothing."""
+        """Take in the uncertainty of a batch, any shape; values that are not finite are left out, a batch of
+        none changes nothing."""
         finite = torch.isfinite(sigma)
         if not bool(finite.any()):
             return

@@ -1,7 +1,10 @@
-"""Latent world model: predicts the next observation's first 24 columns and how sure it is (paper, Sec. "Latent World Model").
+"""Latent world model: predicts the next observation's first 24 columns and how sure it is (paper, Sec.
+"Latent World Model").
 
-z = f(o), z' = g(z, a), o' = h(z') with a mean and a log-variance per target. Loss: reconstruction of the true next observation plus beta
-|f(o') - z'|^2, both summed over their dimensions. What goes beyond the paper is a switch of ``WorldModelConfig`` each.
+z = f(o), z' = g(z, a), o' = h(z') with a mean and a log-variance per target. Loss: reconstruction of the true
+next observation plus beta
+|f(o') - z'|^2, both summed over their dimensions. What goes beyond the paper is a switch of
+``WorldModelConfig`` each.
 """
 
 from __future__ import annotations
@@ -61,17 +64,23 @@ class Losses(NamedTuple):
 
 
 class WorldModel(nn.Module):
-    """Encoder, latent dynamics and decoder with the statistics they scale by; inputs are raw observations in SI units.
+    """Encoder, latent dynamics and decoder with the statistics they scale by; inputs are raw observations in
+    SI units.
 
-    The decoder's unit is the running deviation of what it decodes, the one-step change (``predict_change``) or the target itself, so that
-    metres, radians and m/s weigh the same; 1 without ``normalise_targets``. Actions are clamped to [-1, 1], as the environment does.
+    The decoder's unit is the running deviation of what it decodes, the one-step change (``predict_change``)
+    or the target itself, so that metres, radians and m/s weigh the same; 1 without ``normalise_targets``.
+    Actions are clamped to [-1, 1], as the environment does.
     """
 
     def __init__(self, n_obs: int, config: WorldModelConfig, generator: torch.Generator) -> None:
-        """``n_obs`` columns of the observation, at least 24 (ValueError); initial weights come from the CPU ``generator``."""
+        """``n_obs`` columns of the observation, at least 24 (ValueError); initial weights come from the CPU
+        ``generator``."""
         super().__init__()
         if n_obs < N_TARGET:
-            raise SettingError(f"the world model predicts the first {N_TARGET} columns of the observation, but it has only {n_obs}")
+            raise SettingError(
+                f"the world model predicts the first {N_TARGET} columns of the observation, but it has only "
+                f"{n_obs}"
+            )
         self.n_obs, self.config = n_obs, config
         self.encoder = mlp((n_obs, *config.hidden, config.latent), "elu", generator)
         self.dynamics = mlp((config.latent + N_ACTION, *config.hidden, config.latent), "elu", generator)
@@ -101,14 +110,17 @@ class WorldModel(nn.Module):
 
     @torch.no_grad()
     def features(self, obs: Tensor, action: Tensor, next_obs: Tensor) -> Tensor:
-        """Columns of the policy's input at ``next_obs``, (N, 2): one-step residual and uncertainty of the prediction made before it.
+        """Columns of the policy's input at ``next_obs``, (N, 2): one-step residual and uncertainty of the
+        prediction made before it.
 
-        Errors are counted in ``error_unit``: the residual is the root mean square of the errors, the uncertainty
-        sigma_t = mean(exp(log_var)) the mean predicted variance. In deviations of the one-step change 1 = no better than saying "as
-        before". What is not finite becomes 0.
+        Errors are counted in ``error_unit``: the residual is the root mean square of the errors, the
+        uncertainty sigma_t = mean(exp(log_var)) the mean predicted variance. In deviations of the one-step
+        change 1 = no better than saying "as before". What is not finite becomes 0.
         """
         predicted = self.predict(obs, action)
-        error = ((next_obs[..., :N_TARGET] - predicted.mean) / self.error_unit()).clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS)
+        error = ((next_obs[..., :N_TARGET] - predicted.mean) / self.error_unit()).clamp(
+            -MAX_DEVIATIONS, MAX_DEVIATIONS
+        )
         residual = error.square().mean(dim=-1).sqrt()
         return torch.stack([residual, self.uncertainty(predicted)], dim=-1).nan_to_num_(0.0, 0.0, 0.0)
 
@@ -117,11 +129,14 @@ class WorldModel(nn.Module):
         return torch.exp(predicted.log_var - 2.0 * self.error_unit().log()).mean(dim=-1)
 
     def loss(self, obs: Tensor, action: Tensor, next_obs: Tensor, valid: Tensor) -> Losses:
-        """Losses of a batch: obs, next_obs (B, n_obs), action (B, 4), valid (B,) bool. ``next_obs`` is the true one, also at an end."""
+        """Losses of a batch: obs, next_obs (B, n_obs), action (B, 4), valid (B,) bool. ``next_obs`` is the
+        true one, also at an end."""
         config, weight = self.config, valid / valid.sum().clamp(min=1)
         ahead = self.advance(self.encode(obs), action)
         mean, log_var = self.decode(ahead)
-        target = ((next_obs[:, :N_TARGET] - self.base(obs)) / self.scale()).clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS)
+        target = ((next_obs[:, :N_TARGET] - self.base(obs)) / self.scale()).clamp(
+            -MAX_DEVIATIONS, MAX_DEVIATIONS
+        )
         with torch.set_grad_enabled(torch.is_grad_enabled() and not config.stop_target_gradient):
             following = self.encode(next_obs)
         reconstruction = self._reconstruction(mean, log_var, target).sum(dim=-1) @ weight
@@ -130,7 +145,8 @@ class WorldModel(nn.Module):
         return Losses(total, reconstruction, dynamics)
 
     def observe(self, obs: Moments, change: Moments) -> None:
-        """Take in the moments of observations (n_obs columns) and of one-step changes of the targets (24 columns)."""
+        """Take in the moments of observations (n_obs columns) and of one-step changes of the targets (24
+        columns)."""
         self.observation_norm.merge(obs)
         self.change_norm.merge(change)
 
@@ -145,7 +161,11 @@ class WorldModel(nn.Module):
         """What the decoder's mean is added to."""
         if self.config.predict_change:
             return obs[..., :N_TARGET]
-        return self.observation_norm.mean[:N_TARGET].float() if self.config.normalise_targets else obs.new_zeros(N_TARGET)
+        return (
+            self.observation_norm.mean[:N_TARGET].float()
+            if self.config.normalise_targets
+            else obs.new_zeros(N_TARGET)
+        )
 
     def scale(self) -> Tensor:
         """(24,) decoder's unit in SI units."""
@@ -172,7 +192,8 @@ def mean_of(values: Iterable[Tensor]) -> float:
 
 
 class Recollection:
-    """Last observation and action of every env, for the features of the next step; ``reset`` forgets envs that begin an episode."""
+    """Last observation and action of every env, for the features of the next step; ``reset`` forgets envs
+    that begin an episode."""
 
     def __init__(self, world_model: WorldModel, num_envs: int, device: torch.device | str = "cpu") -> None:
         self.model = world_model
@@ -186,7 +207,8 @@ class Recollection:
         self.known &= ~mask
 
     def features(self, obs: Tensor) -> Tensor:
-        """``WorldModel.features`` (num_envs, 2) at the present observations; 0 where an episode has just begun."""
+        """``WorldModel.features`` (num_envs, 2) at the present observations; 0 where an episode has just
+        begun."""
         return torch.where(self.known[:, None], self.model.features(self.obs, self.action, obs), 0.0)
 
     def remember(self, obs: Tensor, action: Tensor) -> None:
@@ -200,7 +222,11 @@ class WorldModelLearner:
     """Adam on batches drawn from rollouts, with a guard against NaN."""
 
     def __init__(
-        self, world_model: WorldModel, config: WorldModelConfig, reduce: Reduce | None = None, gather: Gather | None = None
+        self,
+        world_model: WorldModel,
+        config: WorldModelConfig,
+        reduce: Reduce | None = None,
+        gather: Gather | None = None,
     ) -> None:
         """``reduce`` averages gradients over the processes in place; ``gather`` unites their moments."""
         self.model, self.config, self.reduce, self.gather = world_model, config, reduce, gather
@@ -209,15 +235,25 @@ class WorldModelLearner:
         """steps left out because the gradient was not finite, or zero for want of valid samples"""
 
     def update(
-        self, obs: Tensor, action: Tensor, next_obs: Tensor, generator: torch.Generator, valid: Tensor | None = None
+        self,
+        obs: Tensor,
+        action: Tensor,
+        next_obs: Tensor,
+        generator: torch.Generator,
+        valid: Tensor | None = None,
     ) -> dict[str, float]:
-        """``config.steps`` gradient steps on a rollout: obs, next_obs (T, N, n_obs), action (T, N, 4), valid (T, N) (default: all).
+        """``config.steps`` gradient steps on a rollout: obs, next_obs (T, N, n_obs), action (T, N, 4), valid
+        (T, N) (default: all).
 
-        ``next_obs`` is the observation each step led to, ``info["final_obs"]``. Rows that are not finite are left out. ``generator`` (CPU)
-        draws the batches. Returns metrics by their names in metrics.jsonl; calibration is that of the first batch before its step: the
-        model has not learned from this rollout yet.
+        ``next_obs`` is the observation each step led to, ``info["final_obs"]``. Rows that are not finite are
+        left out. ``generator`` (CPU) draws the batches. Returns metrics by their names in metrics.jsonl;
+        calibration is that of the first batch before its step: the model has not learned from this rollout
+        yet.
         """
-        skipped, batches = self.skipped, [self._drawn(obs, action, next_obs, valid, generator) for _ in range(self.config.steps)]
+        skipped, batches = (
+            self.skipped,
+            [self._drawn(obs, action, next_obs, valid, generator) for _ in range(self.config.steps)],
+        )
         self._observe(batches)
         metrics = self._calibration(batches[0])
         learned = [self._learn(batch) for batch in batches]
@@ -236,7 +272,9 @@ class WorldModelLearner:
         self.optimiser.load_state_dict(state["optimiser"])
         self.skipped = int(state["skipped"])
 
-    def _drawn(self, obs: Tensor, action: Tensor, next_obs: Tensor, valid: Tensor | None, generator: torch.Generator) -> ModelBatch:
+    def _drawn(
+        self, obs: Tensor, action: Tensor, next_obs: Tensor, valid: Tensor | None, generator: torch.Generator
+    ) -> ModelBatch:
         """Random samples; rows with anything that is not finite are zero and not valid."""
         steps, num_envs = action.shape[:2]
         drawn = torch.randint(steps * num_envs, (self.config.batch,), generator=generator).to(obs.device)
@@ -249,7 +287,8 @@ class WorldModelLearner:
         return ModelBatch(kept[0], kept[1], kept[2], good)
 
     def _observe(self, batches: list[ModelBatch]) -> None:
-        """Statistics of what was drawn: a rollout's neighbouring steps are alike, so that all of it would say little more."""
+        """Statistics of what was drawn: a rollout's neighbouring steps are alike, so that all of it would say
+        little more."""
         obs = torch.cat([batch.obs[batch.valid] for batch in batches])
         following = torch.cat([batch.next_obs[batch.valid, :N_TARGET] for batch in batches])
         moments = moments_of(obs), moments_of(following - obs[:, :N_TARGET])
@@ -263,9 +302,13 @@ class WorldModelLearner:
         obs = batch.obs[kept]
         predicted = self.model.predict(obs, batch.action[kept])
         target = batch.next_obs[kept, :N_TARGET]
-        inside = coverage(predicted.mean, predicted.log_var, target, torch.tensor([0.9], device=target.device))
+        inside = coverage(
+            predicted.mean, predicted.log_var, target, torch.tensor([0.9], device=target.device)
+        )
         return {
-            "world_model/standardised_residual": mean_squared_standardised_residual(predicted.mean, predicted.log_var, target),
+            "world_model/standardised_residual": mean_squared_standardised_residual(
+                predicted.mean, predicted.log_var, target
+            ),
             "world_model/coverage_90": float(inside),
             "world_model/uncertainty": float(self.model.uncertainty(predicted).mean()),
             "world_model/latent_std": float(self.model.encode(obs).std(dim=0, correction=0).mean()),

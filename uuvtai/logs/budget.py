@@ -1,4 +1,5 @@
-"""What one log may ask of whoever reads it: records, bytes of attachments, schemas and metadata, bytes that chunks unpack to."""
+"""What one log may ask of whoever reads it: records, bytes of attachments, schemas and metadata, bytes that
+chunks unpack to."""
 
 from __future__ import annotations
 
@@ -11,9 +12,11 @@ MAX_RECORDS = 1_000_000
 MAX_UNPACKED = 512 << 20
 """[bytes] most that all chunks of a file may unpack to: four times the longest log that was seen"""
 UNPACKED_BASE, UNPACKED_RATIO = 64 << 20, 64
-"""[bytes, 1] a small file may unpack to the first and as often its own size as the second says; logs unpack to ten times their size"""
+"""[bytes, 1] a small file may unpack to the first and as often its own size as the second says; logs unpack
+to ten times their size"""
 MAX_MESSAGE = 8 << 20
-"""[bytes] of a message or a JSON attachment: a hundred times our largest; read as JSON it takes thirty times that"""
+"""[bytes] of a message or a JSON attachment: a hundred times our largest; read as JSON it takes thirty times
+that"""
 
 _TOTALS: dict[int, tuple[int, str]] = {
     Opcode.ATTACHMENT: (64 << 20, "attachments"),
@@ -31,7 +34,8 @@ class BudgetError(LogError):
 
 
 class LogBudget:
-    """What is left for a file of ``size`` bytes; each method takes from it and raises BudgetError where it does not suffice."""
+    """What is left for a file of ``size`` bytes; each method takes from it and raises BudgetError where it
+    does not suffice."""
 
     def __init__(self, name: str, size: int) -> None:
         self._name = name
@@ -66,4 +70,6 @@ class LogBudget:
             self._refuse(f"has chunks that unpack to more than {self._unpacked_limit >> 20} MiB together")
 
     def _refuse(self, reason: str) -> None:
-        raise BudgetError(f"{self._name}: {reason}, which no log of uuv eval --record does; it is not read any further")
+        raise BudgetError(
+            f"{self._name}: {reason}, which no log of uuv eval --record does; it is not read any further"
+        )

@@ -1,4 +1,5 @@
-"""scenario.json: everything true about an episode's world in closed form, and how to recompute what the log claims from it."""
+"""scenario.json: everything true about an episode's world in closed form, and how to recompute what the log
+claims from it."""
 
 from __future__ import annotations
 
@@ -9,27 +10,37 @@ import numpy as np
 FRAMES = {
     "world": "z up, x along the tank, y across, z = 0 at the surface [m]",
     "base": "vehicle at its centre of mass, x ahead, y left, z up",
-    "sonar": "at the vehicle, turned with its yaw only, always level: the beams lie in its x-y plane, beam 0 along x, counter-clockwise",
+    "sonar": "at the vehicle, turned with its yaw only, always level: the beams lie in its x-y plane, beam 0 "
+    "along x, counter-clockwise",
     "camera": "optical: z along the vehicle's x, x to its right, y down; depth is along z",
 }
 """of /tf"""
 
 FORMULAS = {
     "obstacle_position": (
-        "z stays. Without a path a body rests. arc(t) = (phase_m + speed_m_s * t) mod length_m. circle: angle = arc / radius_m "
-        "(radius_m < 0 is clockwise), (x, y) = center + |radius_m| (cos angle, sin angle). polyline: the point at arc along "
-        "corners[0], corners[1], .., back to corners[0]; with two corners that is back and forth. Velocity = speed_m_s along "
+        "z stays. Without a path a body rests. arc(t) = (phase_m + speed_m_s * t) mod length_m. circle: "
+        "angle = arc / radius_m "
+        "(radius_m < 0 is clockwise), (x, y) = center + |radius_m| (cos angle, sin angle). polyline: the "
+        "point at arc along "
+        "corners[0], corners[1], .., back to corners[0]; with two corners that is back and forth. Velocity = "
+        "speed_m_s along "
         "the path. t = step * control_dt_s."
     ),
     "size": (
-        "sphere (r, r, r); vertical cylinder (r, r, half height); box half extents along its own axes before it is turned by yaw about z"
+        "sphere (r, r, r); vertical cylinder (r, r, half height); box half extents along its own axes before "
+        "it is turned by yaw about z"
     ),
     "sonar": (
-        "Beam i of n looks along the true yaw + 2 pi i / n in the horizontal plane of the true position at the scan's own "
-        "timestamp. A body is met where the beam enters its horizontal outline (of a sphere: the circle of radius sqrt(r^2 - "
-        "g^2), g = max(|dz| - d tan(a), 0), d = horizontal distance of its centre) if the vertical gap is at most range * "
-        "tan(a); a = sensors.sonar.vertical_half_aperture_deg. Side walls are always met, floor and surface never; nothing beyond "
-        "sensors.sonar.max_range_m returns. Doppler = (velocity of the body or wall that is met - own velocity) . beam: how fast "
+        "Beam i of n looks along the true yaw + 2 pi i / n in the horizontal plane of the true position at "
+        "the scan's own "
+        "timestamp. A body is met where the beam enters its horizontal outline (of a sphere: the circle of "
+        "radius sqrt(r^2 - "
+        "g^2), g = max(|dz| - d tan(a), 0), d = horizontal distance of its centre) if the vertical gap is at "
+        "most range * "
+        "tan(a); a = sensors.sonar.vertical_half_aperture_deg. Side walls are always met, floor and surface "
+        "never; nothing beyond "
+        "sensors.sonar.max_range_m returns. Doppler = (velocity of the body or wall that is met - own "
+        "velocity) . beam: how fast "
         "that piece of surface recedes. Errors as in sensors.sonar."
     ),
     "clearance": (
@@ -37,63 +48,93 @@ FORMULAS = {
         "vehicle.hull_radius_m). clearance_m = smallest distance of its surface to any body or side wall."
     ),
     "ttc": (
-        "Smallest clearance / closing speed over the bodies whose closing speed exceeds episode.ttc_closing_m_s; closing speed "
-        "= rate at which that body's clearance shrinks, from the velocities of both nearest points. null = none."
+        "Smallest clearance / closing speed over the bodies whose closing speed exceeds "
+        "episode.ttc_closing_m_s; closing speed "
+        "= rate at which that body's clearance shrinks, from the velocities of both nearest points. null = "
+        "none."
     ),
     "outcome": (
-        "The first that holds after a control step: out_of_tank (hull centre outside the tank), collision (clearance < "
-        "episode.collision_clearance_m, or hull beyond floor or surface), ttc (< episode.ttc_s), success (3-D distance to the "
+        "The first that holds after a control step: out_of_tank (hull centre outside the tank), collision "
+        "(clearance < "
+        "episode.collision_clearance_m, or hull beyond floor or surface), ttc (< episode.ttc_s), success "
+        "(3-D distance to the "
         "goal at most episode.goal_radius_m), timeout (episode.horizon_steps)."
     ),
     "map": (
-        "Per mapped scan and cell, with indicators of 0 or 1: static = clip((1 - l_s) static + g_hit [static return] - g_free "
-        "[free] + g_depth [depth], 0, 1); dynamic = clip((1 - l_d) dynamic + d_hit [moving return] - d_free [free], 0, 1); what "
-        "falls below 1e-6 is 0. Both start at 0. Gains of `mapping` hold at 10 Hz: per scan min(1, 10 P gain), decays 1 - (1 - "
-        "decay)^(10 P). P = control_dt_s * sonar.period_steps * ceil(mapping.period_steps / sonar.period_steps); for depth_hit "
-        "the longer of P and control_dt_s * depth.period_steps. A scan is mapped at its log time if the last mapped one is at "
-        "least mapping.period_steps steps older. Own position and yaw: /pose_estimate at the scan's timestamp. The layers of a "
+        "Per mapped scan and cell, with indicators of 0 or 1: static = clip((1 - l_s) static + g_hit [static "
+        "return] - g_free "
+        "[free] + g_depth [depth], 0, 1); dynamic = clip((1 - l_d) dynamic + d_hit [moving return] - d_free "
+        "[free], 0, 1); what "
+        "falls below 1e-6 is 0. Both start at 0. Gains of `mapping` hold at 10 Hz: per scan min(1, 10 P "
+        "gain), decays 1 - (1 - "
+        "decay)^(10 P). P = control_dt_s * sonar.period_steps * ceil(mapping.period_steps / "
+        "sonar.period_steps); for depth_hit "
+        "the longer of P and control_dt_s * depth.period_steps. A scan is mapped at its log time if the last "
+        "mapped one is at "
+        "least mapping.period_steps steps older. Own position and yaw: /pose_estimate at the scan's "
+        "timestamp. The layers of a "
         "log time include that step's scan."
     ),
     "map_free": (
-        "[free]: cells of the tank that have no return in this scan and whose centre lies in the triangle between two "
-        "neighbouring beams, its two sides along them both as long as the smaller of their reaches. reach = range - cell_m - "
-        "sigma for a return, sigma = range_sigma_m + range_sigma_slope * range; min(free_range_m, max_range_m) without one; at "
+        "[free]: cells of the tank that have no return in this scan and whose centre lies in the triangle "
+        "between two "
+        "neighbouring beams, its two sides along them both as long as the smaller of their reaches. reach = "
+        "range - cell_m - "
+        "sigma for a return, sigma = range_sigma_m + range_sigma_slope * range; min(free_range_m, "
+        "max_range_m) without one; at "
         "least 0."
     ),
     "map_returns": (
-        "A return counts in the cell of its point, but not within wall_margin_m of a side wall or beyond, nor where range > wall "
-        "- error; error = 3 (sigma + range_jitter_m) + range_quantum_m, wall = range of the known side wall along the beam. It is "
+        "A return counts in the cell of its point, but not within wall_margin_m of a side wall or beyond, "
+        "nor where range > wall "
+        "- error; error = 3 (sigma + range_jitter_m) + range_quantum_m, wall = range of the known side wall "
+        "along the beam. It is "
         "a moving one if |velocity + own_velocity . beam| "
-        "(/sonar/doppler, beam in body axes) > max(doppler_evidence_m_s, 3 doppler_sigma_m_s), or if the beam is listed in "
-        "/tracks, or if the cell speaks against a body at rest: (free_scans >= ceil(free_confident_s / P) or 0 < dynamic_scans "
-        "< ceil(promote_s / P)) and no cell within m rows and columns has static >= occupied, m = min(4, 1 + floor((2 pi / n * "
-        "range + error) / cell_m)). All of this as of before the scan. Counters of a cell, to 255: free: free_scans + 1, "
+        "(/sonar/doppler, beam in body axes) > max(doppler_evidence_m_s, 3 doppler_sigma_m_s), or if the "
+        "beam is listed in "
+        "/tracks, or if the cell speaks against a body at rest: (free_scans >= ceil(free_confident_s / P) or "
+        "0 < dynamic_scans "
+        "< ceil(promote_s / P)) and no cell within m rows and columns has static >= occupied, m = min(4, 1 + "
+        "floor((2 pi / n * "
+        "range + error) / cell_m)). All of this as of before the scan. Counters of a cell, to 255: free: "
+        "free_scans + 1, "
         "dynamic_scans = 0; any return: free_scans = 0; a moving one: dynamic_scans + 1."
     ),
     "map_depth": (
-        "/camera/line has, per image column, the nearest pixel that sees something within mapping.depth_gate_m of the vehicle's "
-        "own depth. Its point is p + R (offset_b_m + depth (1, (cols / 2 - 0.5 - column) / f, (rows / 2 - 0.5 - row) / f)), f = "
-        "cols / 2 / tan(fov_deg / 2), p and R of /pose_estimate at its timestamp. [depth] holds in the cell of such a point at "
-        "the next mapped scan (the same step's included) if the cell is not free, has no moving return and dynamic < occupied, "
+        "/camera/line has, per image column, the nearest pixel that sees something within "
+        "mapping.depth_gate_m of the vehicle's "
+        "own depth. Its point is p + R (offset_b_m + depth (1, (cols / 2 - 0.5 - column) / f, (rows / 2 - "
+        "0.5 - row) / f)), f = "
+        "cols / 2 / tan(fov_deg / 2), p and R of /pose_estimate at its timestamp. [depth] holds in the cell "
+        "of such a point at "
+        "the next mapped scan (the same step's included) if the cell is not free, has no moving return and "
+        "dynamic < occupied, "
         "and if it has a static return or static > 0 already."
     ),
     "map_risk": (
-        "risk_static * static + risk_dynamic * dynamic + risk_clearance / (clearance + risk_epsilon_m) of the layers with the same "
+        "risk_static * static + risk_dynamic * dynamic + risk_clearance / (clearance + risk_epsilon_m) of "
+        "the layers with the same "
         "log time; names are keys of `clearance`."
     ),
     "map_clearance": (
-        "Distance between the centre of a cell and the centre of the nearest cell that is occupied (>= mapping.occupied in the "
-        "layers named by voronoi.use), less clearance.inflate_m, or whose centre lies outside the tank; clearance.max_m stands for 'at "
+        "Distance between the centre of a cell and the centre of the nearest cell that is occupied (>= "
+        "mapping.occupied in the "
+        "layers named by voronoi.use), less clearance.inflate_m, or whose centre lies outside the tank; "
+        "clearance.max_m stands for 'at "
         "least'. Computed "
-        "every clearance.period_steps from the map of that step: its time is the timestamp of /map/clearance and /map/risk, "
+        "every clearance.period_steps from the map of that step: its time is the timestamp of /map/clearance "
+        "and /map/risk, "
         "which on a replan may lie before their log time."
     ),
 }
 """How an outsider recomputes the log's figures; names such as mapping.occupied are keys of config.yaml."""
 
 
-def scenario_document(config: Any, described: dict[str, Any], world: str, seed: int, episode: int) -> dict[str, Any]:
-    """Content of scenario.json. ``config`` is a Config, ``described`` comes from ``uuvtai.scenario.describe_scenario`` at step 0."""
+def scenario_document(
+    config: Any, described: dict[str, Any], world: str, seed: int, episode: int
+) -> dict[str, Any]:
+    """Content of scenario.json. ``config`` is a Config, ``described`` comes from
+    ``uuvtai.scenario.describe_scenario`` at step 0."""
     wanted, tank = config.world, config.world.tank
     moving = sum(body["path"] is not None for body in described["bodies"])
     return {
@@ -106,7 +147,13 @@ def scenario_document(config: Any, described: dict[str, Any], world: str, seed: 
         "v_m_s": wanted.dynamic_speed_m_s,
         "control_dt_s": config.episode.control_dt_s,
         "goal_radius_m": config.episode.goal_radius_m,
-        "tank": {"shape": tank.shape, "x_m": list(tank.x_m), "y_m": list(tank.y_m), "z_m": list(tank.z_m), "radius_m": tank.radius_m},
+        "tank": {
+            "shape": tank.shape,
+            "x_m": list(tank.x_m),
+            "y_m": list(tank.y_m),
+            "z_m": list(tank.z_m),
+            "radius_m": tank.radius_m,
+        },
         **described,
         "frames": FRAMES,
         "formulas": FORMULAS,
@@ -114,7 +161,8 @@ def scenario_document(config: Any, described: dict[str, Any], world: str, seed: 
 
 
 def body_positions(body: dict[str, Any], times_s: np.ndarray) -> np.ndarray:
-    """Centres (n, 3) [m] of a body of scenario.json at these times (float64), by the formula ``obstacle_position``."""
+    """Centres (n, 3) [m] of a body of scenario.json at these times (float64), by the formula
+    ``obstacle_position``."""
     times = np.atleast_1d(np.asarray(times_s, float))
     path = body["path"]
     x, y, z = body["position"]

@@ -1,4 +1,5 @@
-"""What viewers without grids and scans can draw all the same: occupied cells and sonar returns as point clouds, waypoints as poses."""
+"""What viewers without grids and scans can draw all the same: occupied cells and sonar returns as point
+clouds, waypoints as poses."""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ _STRIDE = 12
 
 
 def occupied_cells(grid: Message, occupied: float) -> Message:
-    """foxglove.PointCloud of the centres of the cells of a foxglove.Grid whose value is at least ``occupied``, in the grid's frame."""
+    """foxglove.PointCloud of the centres of the cells of a foxglove.Grid whose value is at least
+    ``occupied``, in the grid's frame."""
     rows, columns = np.nonzero(grid_values(grid) >= occupied)
     origin, cell = grid["pose"]["position"], grid["cell_size"]
     x = origin["x"] + (columns + 0.5) * cell["x"]
@@ -29,16 +31,22 @@ def occupied_cells(grid: Message, occupied: float) -> Message:
 
 
 def sonar_returns(scan: Message) -> Message:
-    """foxglove.PointCloud of the returns of a foxglove.LaserScan, in its frame; beams without a return are left out."""
+    """foxglove.PointCloud of the returns of a foxglove.LaserScan, in its frame; beams without a return are
+    left out."""
     ranges, hit = np.array(scan["ranges"], float), np.array(scan["intensities"], float) > 0
     bearing = np.linspace(scan["start_angle"], scan["end_angle"], len(ranges))
-    return _cloud(scan, np.column_stack([ranges * np.cos(bearing), ranges * np.sin(bearing), np.zeros(len(ranges))])[hit])
+    return _cloud(
+        scan,
+        np.column_stack([ranges * np.cos(bearing), ranges * np.sin(bearing), np.zeros(len(ranges))])[hit],
+    )
 
 
 def waypoints(plan: Message, time_ns: int) -> Message:
     """foxglove.PosesInFrame of a uuv.Plan: each waypoint looks to the next one."""
     points = [(point["x"], point["y"], point["z"]) for point in plan["points"]]
-    half_yaws = [0.5 * math.atan2(ahead[1] - here[1], ahead[0] - here[0]) for here, ahead in itertools.pairwise(points)]
+    half_yaws = [
+        0.5 * math.atan2(ahead[1] - here[1], ahead[0] - here[0]) for here, ahead in itertools.pairwise(points)
+    ]
     half_yaws += half_yaws[-1:] or [0.0]  # the last one looks where the one before it did
     poses = [_pose(point, half) for point, half in zip(points, half_yaws, strict=False)]
     sec, nsec = divmod(time_ns, 1_000_000_000)
@@ -57,7 +65,10 @@ def _cloud(source: Message, points: np.ndarray) -> Message:
 
 
 def _pose(position: tuple[float, ...], half_yaw: float) -> Message:
-    return {"position": _xyz(position), "orientation": {"x": 0, "y": 0, "z": math.sin(half_yaw), "w": math.cos(half_yaw)}}
+    return {
+        "position": _xyz(position),
+        "orientation": {"x": 0, "y": 0, "z": math.sin(half_yaw), "w": math.cos(half_yaw)},
+    }
 
 
 def _xyz(position: tuple[float, ...]) -> Message:

@@ -1,8 +1,9 @@
 """MCAP container written so that a killed process loses almost nothing.
 
-A chunk goes to disk while it grows: its header stands in the file with a length that has not been reached yet, behind it the zstd frame
-block by block; when the chunk is full the header is completed in place. So chunks have a useful size from the first byte on, and what
-was written of an unfinished one can be unpacked again (``repair.py``). Other readers see an unfinished chunk as a file that ends early.
+A chunk goes to disk while it grows: its header stands in the file with a length that has not been reached
+yet, behind it the zstd frame block by block; when the chunk is full the header is completed in place. So
+chunks have a useful size from the first byte on, and what was written of an unfinished one can be unpacked
+again (``repair.py``). Other readers see an unfinished chunk as a file that ends early.
 
 Format: https://mcap.dev/spec
 """
@@ -39,7 +40,8 @@ from uuvtai import __version__
 
 MAGIC = b"\x89MCAP0\r\n"
 CHUNK_MIN, CHUNK_MAX = 64 * 1024, 256 * 1024
-"""[bytes] uncompressed; a chunk is closed above the first and never grows beyond the second unless a single message does"""
+"""[bytes] uncompressed; a chunk is closed above the first and never grows beyond the second unless a single
+message does"""
 LOSS_SHARE = 0.01
 """messages that may be in memory only, as a share of those written"""
 OPEN_LENGTH = 1 << 26
@@ -47,13 +49,15 @@ OPEN_LENGTH = 1 << 26
 
 _MESSAGE = struct.Struct("<BQHIQQ")
 _CHUNK = struct.Struct("<BQQQQII4sQ")
-"""opcode, record length, first and last time, size, CRC, length and name of the compression, length of the data"""
+"""opcode, record length, first and last time, size, CRC, length and name of the compression, length of the
+data"""
 CHUNK_HEAD = _CHUNK.size - 9
 """[bytes] of a chunk record's content before its data"""
 
 
 class McapFile:
-    """One MCAP file under way as ``<path>.part``; ``finish`` makes it whole, durable and gives it its name."""
+    """One MCAP file under way as ``<path>.part``; ``finish`` makes it whole, durable and gives it its
+    name."""
 
     def __init__(self, path: Path, suffix: str = ".part") -> None:
         """Raises OSError."""
@@ -81,7 +85,9 @@ class McapFile:
     def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
         """A file within the file. Lies between chunks."""
         self._close_chunk()
-        offset, length = self._put(Attachment(create_time=0, log_time=0, name=name, media_type=media_type, data=data))
+        offset, length = self._put(
+            Attachment(create_time=0, log_time=0, name=name, media_type=media_type, data=data)
+        )
         self._attachments.append(AttachmentIndex(offset, length, 0, 0, len(data), name, media_type))
 
     def add_schema(self, name: str, encoding: str, data: bytes) -> int:
@@ -91,8 +97,11 @@ class McapFile:
         self._put(self._schemas[-1])
         return len(self._schemas)
 
-    def add_channel(self, topic: str, schema_id: int, encoding: str = "json", metadata: dict[str, str] | None = None) -> int:
-        """Its id, from 1 on. Schemas and channels stand before the chunks, so that every chunk can be read alone."""
+    def add_channel(
+        self, topic: str, schema_id: int, encoding: str = "json", metadata: dict[str, str] | None = None
+    ) -> int:
+        """Its id, from 1 on. Schemas and channels stand before the chunks, so that every chunk can be read
+        alone."""
         self._close_chunk()
         channel = Channel(len(self._channels) + 1, topic, encoding, metadata or {}, schema_id)
         self._channels.append(channel)
@@ -100,7 +109,14 @@ class McapFile:
         self._counts[channel.id] = 0
         return channel.id
 
-    def add_message(self, channel_id: int, time_ns: int, data: bytes, publish_ns: int | None = None, sequence: int | None = None) -> None:
+    def add_message(
+        self,
+        channel_id: int,
+        time_ns: int,
+        data: bytes,
+        publish_ns: int | None = None,
+        sequence: int | None = None,
+    ) -> None:
         """One message; it may stay in memory until ``settle``."""
         number = self._counts[channel_id] if sequence is None else sequence
         publish = time_ns if publish_ns is None else publish_ns
@@ -119,7 +135,8 @@ class McapFile:
             self._close_chunk()
 
     def settle(self) -> None:
-        """Hand over what is in memory when it has become more than its share: call it once per control step."""
+        """Hand over what is in memory when it has become more than its share: call it once per control
+        step."""
         if self._chunk and self._unsettled > LOSS_SHARE * self._messages:
             self._chunk.flush()
             self._unsettled = 0
@@ -148,7 +165,7 @@ class McapFile:
             self._file.close()
         self.part.unlink(missing_ok=True)
 
-    # -------------------------------------------------------------------------------------------------------------- inside
+    # ------------------------------------------------------------------------------------------------- inside
 
     def _put(self, record) -> tuple[int, int]:
         offset = self._file.tell()
@@ -165,7 +182,14 @@ class McapFile:
 
     def _write_summary(self) -> None:
         start = self._file.tell()
-        groups = [self._schemas, self._channels, [self._statistics()], self._chunks, self._attachments, self._metadata]
+        groups = [
+            self._schemas,
+            self._channels,
+            [self._statistics()],
+            self._chunks,
+            self._attachments,
+            self._metadata,
+        ]
         codes = [
             Opcode.SCHEMA,
             Opcode.CHANNEL,
@@ -209,7 +233,19 @@ class _OpenChunk:
         self._crc, self._compressed = 0, 0
         self._first_time, self._last_time = time_ns, time_ns
         self.size = 0
-        file.write(_CHUNK.pack(Opcode.CHUNK, OPEN_LENGTH + CHUNK_HEAD, time_ns, time_ns, OPEN_LENGTH, 0, 4, b"zstd", OPEN_LENGTH))
+        file.write(
+            _CHUNK.pack(
+                Opcode.CHUNK,
+                OPEN_LENGTH + CHUNK_HEAD,
+                time_ns,
+                time_ns,
+                OPEN_LENGTH,
+                0,
+                4,
+                b"zstd",
+                OPEN_LENGTH,
+            )
+        )
 
     def add(self, record: bytes, channel_id: int, time_ns: int) -> None:
         self._indexes.setdefault(channel_id, []).append((time_ns, self.size))
@@ -226,7 +262,17 @@ class _OpenChunk:
         self._write(zstandard.COMPRESSOBJ_FLUSH_FINISH)
         end = self._file.tell()
         length = CHUNK_HEAD + self._compressed
-        header = _CHUNK.pack(Opcode.CHUNK, length, self._first_time, self._last_time, self.size, self._crc, 4, b"zstd", self._compressed)
+        header = _CHUNK.pack(
+            Opcode.CHUNK,
+            length,
+            self._first_time,
+            self._last_time,
+            self.size,
+            self._crc,
+            4,
+            b"zstd",
+            self._compressed,
+        )
         self._file.seek(self._begin)
         self._file.write(header)
         self._file.seek(end)

@@ -1,7 +1,8 @@
 """A recorded log with Foxglove's messages as protobuf, for viewers that do not read JSON, such as Rerun.
 
-Topics with a ``foxglove.*`` schema keep their names and become protobuf; ``uuv.*`` topics, metadata and attachments are carried over as
-they are. What Rerun cannot draw is added in a form that it can: ``clouds.py``. Needs the extra ``uuvtai[viz]``.
+Topics with a ``foxglove.*`` schema keep their names and become protobuf; ``uuv.*`` topics, metadata and
+attachments are carried over as they are. What Rerun cannot draw is added in a form that it can:
+``clouds.py``. Needs the extra ``uuvtai[viz]``.
 """
 
 from __future__ import annotations
@@ -29,7 +30,16 @@ EXTRA = "uuvtai[viz]"
 _PACKAGES = ("google.protobuf", "foxglove_schemas_protobuf", "mcap_protobuf")
 
 _CONVERTED = frozenset(
-    f"foxglove.{name}" for name in ("FrameTransforms", "PoseInFrame", "LaserScan", "CompressedImage", "Grid", "SceneUpdate", "Log")
+    f"foxglove.{name}"
+    for name in (
+        "FrameTransforms",
+        "PoseInFrame",
+        "LaserScan",
+        "CompressedImage",
+        "Grid",
+        "SceneUpdate",
+        "Log",
+    )
 )
 """schemas that become protobuf; nothing is imported by a name that a file gives"""
 
@@ -37,16 +47,29 @@ Make = Callable[[dict[str, Any], int, float], dict[str, Any]]
 """another message from one, its time [ns] and the value from which on a cell is occupied"""
 
 ADDED: dict[str, tuple[str, str, Make]] = {
-    "/map/static": ("/map/static/cells", "PointCloud", lambda data, _time_ns, occupied: occupied_cells(data, occupied)),
-    "/map/dynamic": ("/map/dynamic/cells", "PointCloud", lambda data, _time_ns, occupied: occupied_cells(data, occupied)),
+    "/map/static": (
+        "/map/static/cells",
+        "PointCloud",
+        lambda data, _time_ns, occupied: occupied_cells(data, occupied),
+    ),
+    "/map/dynamic": (
+        "/map/dynamic/cells",
+        "PointCloud",
+        lambda data, _time_ns, occupied: occupied_cells(data, occupied),
+    ),
     "/sonar/scan": ("/sonar/points", "PointCloud", lambda data, _time_ns, _occupied: sonar_returns(data)),
-    "/plan/info": ("/plan/waypoints", "PosesInFrame", lambda data, time_ns, _occupied: waypoints(data, time_ns)),
+    "/plan/info": (
+        "/plan/waypoints",
+        "PosesInFrame",
+        lambda data, time_ns, _occupied: waypoints(data, time_ns),
+    ),
 }
 """topic: (topic made of it, foxglove schema, how)"""
 
 
 def convert(path: Path, out: Path, force: bool = False) -> int:
-    """Write ``path`` with protobuf messages to the new file ``out``; how many messages. Raises LogError, and then nothing is left.
+    """Write ``path`` with protobuf messages to the new file ``out``; how many messages. Raises LogError, and
+    then nothing is left.
 
     Raises FileError where ``out`` is the input, or exists and ``force`` is not set.
     """
@@ -57,10 +80,23 @@ def convert(path: Path, out: Path, force: bool = False) -> int:
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         return _converted(path, McapFile(out), occupied)
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError, RecursionError) as error:
-        raise LogError(f"{path}: a message is not as its schema says ({error!r}); see what is in it with: uuv log info {path}") from None
+    except (
+        KeyError,
+        TypeError,
+        ValueError,
+        IndexError,
+        AttributeError,
+        OverflowError,
+        RecursionError,
+    ) as error:
+        raise LogError(
+            f"{path}: a message is not as its schema says ({error!r}); see what is in it with: uuv log info "
+            f"{path}"
+        ) from None
     except OSError as error:
-        raise LogError(f"{out}: cannot write ({error.strerror}); choose another place with --out FILE") from None
+        raise LogError(
+            f"{out}: cannot write ({error.strerror}); choose another place with --out FILE"
+        ) from None
 
 
 def _converted(path: Path, file: McapFile, occupied: float) -> int:
@@ -94,7 +130,9 @@ def _occupied(path: Path) -> float:
         config = parsed_yaml(text.decode(), f"{path}: config.yaml")
         return float(config.get("mapping", {}).get("occupied", default))
     except (ConfigError, ValueError, TypeError, AttributeError) as error:
-        raise LogError(f"{path}: its config.yaml cannot be read ({error}); convert a log that uuv eval --record wrote") from None
+        raise LogError(
+            f"{path}: its config.yaml cannot be read ({error}); convert a log that uuv eval --record wrote"
+        ) from None
 
 
 class _Conversion:
@@ -130,10 +168,14 @@ class _Conversion:
         if self._is_converted(channel):
             assert schema is not None
             number = self._protobuf_schema(schema.name)
-            self._carried[channel.id] = self.file.add_channel(channel.topic, number, "protobuf", channel.metadata)
+            self._carried[channel.id] = self.file.add_channel(
+                channel.topic, number, "protobuf", channel.metadata
+            )
         else:
             number = 0 if schema is None else self._schema(schema.name, schema.encoding, schema.data)
-            self._carried[channel.id] = self.file.add_channel(channel.topic, number, channel.message_encoding, channel.metadata)
+            self._carried[channel.id] = self.file.add_channel(
+                channel.topic, number, channel.message_encoding, channel.metadata
+            )
         if channel.topic in ADDED and channel.message_encoding == "json":
             topic, kind, make = ADDED[channel.topic]
             made = self.file.add_channel(topic, self._protobuf_schema(f"foxglove.{kind}"), "protobuf")
@@ -143,7 +185,9 @@ class _Conversion:
         data, channel = record.data, self._channels[record.channel_id]
         if self._is_converted(channel):
             data = serialised(_message_class(self._schemas[channel.schema_id].name), json.loads(record.data))
-        self.file.add_message(self._carried[channel.id], record.log_time, data, record.publish_time, record.sequence)
+        self.file.add_message(
+            self._carried[channel.id], record.log_time, data, record.publish_time, record.sequence
+        )
         self.messages += 1
         if channel.id in self._added:
             made, kind, make = self._added[channel.id]
@@ -159,7 +203,9 @@ class _Conversion:
     def _protobuf_schema(self, name: str) -> int:
         from mcap_protobuf.schema import build_file_descriptor_set
 
-        return self._schema(name, "protobuf", build_file_descriptor_set(_message_class(name)).SerializeToString())
+        return self._schema(
+            name, "protobuf", build_file_descriptor_set(_message_class(name)).SerializeToString()
+        )
 
     def _schema(self, name: str, encoding: str, data: bytes) -> int:
         if name not in self._schema_ids:
@@ -168,7 +214,8 @@ class _Conversion:
 
 
 def serialised(kind: Any, message: dict[str, Any]) -> bytes:
-    """A Foxglove message of JSON as protobuf of the class ``kind``. Raises ValueError where it does not fit."""
+    """A Foxglove message of JSON as protobuf of the class ``kind``. Raises ValueError where it does not
+    fit."""
     from google.protobuf import json_format
 
     try:

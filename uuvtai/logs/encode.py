@@ -1,8 +1,8 @@
 """Snapshots as JSON text of Foxglove and uuv messages.
 
-Numbers are printed with nine significant digits, which is exact for float32: an outsider recomputes from the very values that the
-simulator had. Messages at control rate are printed from templates, several times faster than ``json.dumps``; the rest are dicts.
-Whatever is not finite is refused with a ValueError.
+Numbers are printed with nine significant digits, which is exact for float32: an outsider recomputes from the
+very values that the simulator had. Messages at control rate are printed from templates, several times faster
+than ``json.dumps``; the rest are dicts. Whatever is not finite is refused with a ValueError.
 """
 
 from __future__ import annotations
@@ -32,7 +32,13 @@ CAMERA_OPTICAL = (0.5, -0.5, 0.5, -0.5)
 _XYZ = '{"x":%.9g,"y":%.9g,"z":%.9g}'
 _WXYZ = '{"w":%.9g,"x":%.9g,"y":%.9g,"z":%.9g}'
 _POSE = '{"position":' + _XYZ + ',"orientation":' + _WXYZ + "}"
-_TRANSFORM = '{"timestamp":%s,"parent_frame_id":"%s","child_frame_id":"%s","translation":' + _XYZ + ',"rotation":' + _WXYZ + "}"
+_TRANSFORM = (
+    '{"timestamp":%s,"parent_frame_id":"%s","child_frame_id":"%s","translation":'
+    + _XYZ
+    + ',"rotation":'
+    + _WXYZ
+    + "}"
+)
 
 
 @functools.cache
@@ -81,11 +87,12 @@ def dumped(message: dict[str, Any]) -> bytes:
         raise ValueError(f"a number that is not finite: {str(message)[:200]}") from None
 
 
-# ------------------------------------------------------------------------------------------------------------------- poses
+# ------------------------------------------------------------------------------------------------------ poses
 
 
 def level_rotation(quat_wb: Vector) -> tuple[float, float, float, float]:
-    """Quaternion (w, x, y, z) that turns a level frame with the vehicle's yaw into the body frame: undoes roll and pitch."""
+    """Quaternion (w, x, y, z) that turns a level frame with the vehicle's yaw into the body frame: undoes
+    roll and pitch."""
     w, x, y, z = (float(v) for v in quat_wb)
     half = 0.5 * math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     c, s = math.cos(half), math.sin(half)
@@ -96,7 +103,12 @@ def quaternion_of(rpy: Vector) -> tuple[float, float, float, float]:
     """Quaternion (w, x, y, z) of roll, pitch, yaw (Z-Y-X)."""
     cr, cp, cy = (math.cos(0.5 * v) for v in rpy)
     sr, sp, sy = (math.sin(0.5 * v) for v in rpy)
-    return cr * cp * cy + sr * sp * sy, sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
 
 
 def frame_transforms(stamp: str, snapshot: EpisodeSnapshot, camera_offset_b_m: Vector) -> bytes:
@@ -117,18 +129,21 @@ def finite_pose(position: Vector, quat: Vector) -> str:
     return _checked(_POSE % (*map(float, position), *map(float, quat)))
 
 
-# ------------------------------------------------------------------------------------------------------------------ sensing
+# ---------------------------------------------------------------------------------------------------- sensing
 
 
 def laser_scan(stamp: str, snapshot: EpisodeSnapshot, max_range_m: float) -> bytes:
     """Ranges as sensed; where nothing returned: maximum range with intensity 0, which no return has."""
     hit = snapshot.sonar_hit != 0
     ranges = np.where(hit, snapshot.sonar_range_m, np.float32(max_range_m))
-    thousandths = np.where(hit, np.clip(np.rint(snapshot.sonar_intensity * 1000), 1, 1000), 0).astype(np.int32)
+    thousandths = np.where(hit, np.clip(np.rint(snapshot.sonar_intensity * 1000), 1, 1000), 0).astype(
+        np.int32
+    )
     intensities = ",".join(map(_THOUSANDTHS.__getitem__, thousandths.tolist()))
     end_angle = 2 * math.pi * (len(hit) - 1) / len(hit)
     return (
-        f'{{"timestamp":{stamp},"frame_id":"sonar","pose":{_IDENTITY_TEXT},"start_angle":0,"end_angle":{end_angle!r},'
+        f'{{"timestamp":{stamp},"frame_id":"sonar","pose":{_IDENTITY_TEXT},"start_angle":0,'
+        f'"end_angle":{end_angle!r},'
         f'"ranges":{numbers(ranges)},"intensities":[{intensities}]}}'
     ).encode()
 
@@ -142,35 +157,40 @@ _IDENTITY_TEXT = json.dumps(IDENTITY, separators=(",", ":"))
 def sonar_doppler(stamp: str, snapshot: EpisodeSnapshot) -> bytes:
     """Doppler of every beam and the own velocity it has to be compensated with."""
     velocity = np.where(snapshot.sonar_hit != 0, snapshot.sonar_doppler_m_s, np.float32(0))
-    return f'{{"timestamp":{stamp},"velocity":{numbers(velocity)},"own_velocity":{numbers(snapshot.sonar_ping_vel_b)}}}'.encode()
+    own = numbers(snapshot.sonar_ping_vel_b)
+    return f'{{"timestamp":{stamp},"velocity":{numbers(velocity)},"own_velocity":{own}}}'.encode()
 
 
 def depth_line(stamp: str, line: DepthLine) -> bytes:
     """The part of a depth image that the map takes."""
     columns, rows = (",".join(map(str, indices.tolist())) for indices in (line.column, line.row))
-    return f'{{"timestamp":{stamp},"column":[{columns}],"row":[{rows}],"depth":{numbers(line.depth_m)}}}'.encode()
+    depth = numbers(line.depth_m)
+    return f'{{"timestamp":{stamp},"column":[{columns}],"row":[{rows}],"depth":{depth}}}'.encode()
 
 
 def depth_png(stamp: str, depth_m: np.ndarray) -> bytes:
     """16-bit PNG in millimetres."""
     millimetres = np.clip(np.rint(np.asarray(depth_m, np.float64) * 1000.0), 0, 65535).astype(np.uint16)
-    png = cv2.imencode(".png", millimetres)[1].tobytes()
-    return f'{{"timestamp":{stamp},"frame_id":"camera","data":"{base64.b64encode(png).decode()}","format":"png"}}'.encode()
+    png = base64.b64encode(cv2.imencode(".png", millimetres)[1].tobytes()).decode()
+    return f'{{"timestamp":{stamp},"frame_id":"camera","data":"{png}","format":"png"}}'.encode()
 
 
-# --------------------------------------------------------------------------------------------------------------------- maps
+# ------------------------------------------------------------------------------------------------------- maps
 
 Paint = Callable[[np.ndarray], tuple[Any, Any, Any, Any]]
 """red, green, blue, alpha of a layer's values"""
 
 _CELL = np.dtype([("red", "u1"), ("green", "u1"), ("blue", "u1"), ("alpha", "u1"), ("value", "<f4")])
-_FIELDS = [{"name": name, "offset": i, "type": schemas.UINT8} for i, name in enumerate(("red", "green", "blue", "alpha"))]
+_FIELDS = [
+    {"name": name, "offset": i, "type": schemas.UINT8}
+    for i, name in enumerate(("red", "green", "blue", "alpha"))
+]
 _FIELDS.append({"name": "value", "offset": 4, "type": schemas.FLOAT32})
 
 
 def grids(stamp: str, clearance_stamp: str, maps: MapLayers) -> dict[str, bytes]:
-    """Messages by topic. Colours are for viewers, ``value`` is what the vehicle has; ``clearance_stamp`` = time of the map that clearance
-    and risk were computed from."""
+    """Messages by topic. Colours are for viewers, ``value`` is what the vehicle has; ``clearance_stamp`` =
+    time of the map that clearance and risk were computed from."""
     layers: dict[str, tuple[np.ndarray, Paint]] = {
         "/map/static": (maps.static, _static_colors),
         "/map/dynamic": (maps.dynamic, _dynamic_colors),
@@ -201,7 +221,13 @@ def _grid(stamp: str, maps: MapLayers, values: np.ndarray, paint: Paint) -> byte
         "cell_stride": _CELL.itemsize,
         "fields": _FIELDS,
     }
-    return f'{{"timestamp":{stamp},'.encode() + dumped(head)[1:-1] + b',"data":"' + base64.b64encode(cells.tobytes()) + b'"}'
+    return (
+        f'{{"timestamp":{stamp},'.encode()
+        + dumped(head)[1:-1]
+        + b',"data":"'
+        + base64.b64encode(cells.tobytes())
+        + b'"}'
+    )
 
 
 def _static_colors(values: np.ndarray):
@@ -232,7 +258,7 @@ def _color_mapped(share: np.ndarray, color_map: int) -> tuple[np.ndarray, ...]:
     return image[..., 0], image[..., 1], image[..., 2]
 
 
-# -------------------------------------------------------------------------------------------------------- truth for viewers
+# ------------------------------------------------------------------------------------------ truth for viewers
 
 
 def scene_entity(time_ns: int, name: str, **primitives: list) -> dict[str, Any]:
@@ -250,7 +276,9 @@ def scene_entity(time_ns: int, name: str, **primitives: list) -> dict[str, Any]:
     }
 
 
-def line(points: Iterable[Vector], rgba: Sequence[float], thickness: float, kind: int = schemas.LINE_STRIP) -> dict[str, Any]:
+def line(
+    points: Iterable[Vector], rgba: Sequence[float], thickness: float, kind: int = schemas.LINE_STRIP
+) -> dict[str, Any]:
     """foxglove.LinePrimitive, thickness in metres."""
     return {
         "type": kind,
@@ -282,7 +310,10 @@ def color(rgba: Sequence[float]) -> dict[str, float]:
 
 def upright_pose(position: Vector, yaw: float = 0.0) -> dict[str, Any]:
     """foxglove.Pose turned about z."""
-    return {"position": vector(position), "orientation": {"x": 0, "y": 0, "z": math.sin(0.5 * yaw), "w": math.cos(0.5 * yaw)}}
+    return {
+        "position": vector(position),
+        "orientation": {"x": 0, "y": 0, "z": math.sin(0.5 * yaw), "w": math.cos(0.5 * yaw)},
+    }
 
 
 _RESTING, _MOVING = (0.44, 0.5, 0.58, 0.9), (0.95, 0.45, 0.2, 0.9)
@@ -294,7 +325,9 @@ def obstacle_scene(time_ns: int, snapshot: EpisodeSnapshot, n_rest: int) -> byte
     for i, slot in enumerate(body_slots(snapshot)):
         kind, size = KINDS[int(snapshot.obstacle_kind[slot])], snapshot.obstacle_size[slot]
         shape = {
-            "pose": upright_pose(snapshot.obstacle_pos_w[slot], float(snapshot.obstacle_yaw[slot]) if kind == "box" else 0.0),
+            "pose": upright_pose(
+                snapshot.obstacle_pos_w[slot], float(snapshot.obstacle_yaw[slot]) if kind == "box" else 0.0
+            ),
             "size": vector(2 * size),
             "color": color(_RESTING if i < n_rest else _MOVING),
         }

@@ -36,12 +36,19 @@ _GIF_TICKS = 100
 """per second: a GIF counts hundredths"""
 
 
-def write_film(part: Path, frames: Frames, fps: float, samples: Sequence[np.ndarray], inks: Sequence[Color]) -> int:
+def write_film(
+    part: Path, frames: Frames, fps: float, samples: Sequence[np.ndarray], inks: Sequence[Color]
+) -> int:
     """Write frames into ``part``, as its name ends; gives their number. Raises OSError.
 
-    A GIF gets the colours of ``samples``, which are frames, and the ``inks``, which may be rare and must stay what they are.
+    A GIF gets the colours of ``samples``, which are frames, and the ``inks``, which may be rare and must stay
+    what they are.
     """
-    return _write_gif(part, frames, fps, samples, inks) if part.suffix == ".gif" else _write_video(part, frames, fps)
+    return (
+        _write_gif(part, frames, fps, samples, inks)
+        if part.suffix == ".gif"
+        else _write_video(part, frames, fps)
+    )
 
 
 def check_whole(part: Path, n_frames: int, out: Path) -> None:
@@ -52,7 +59,10 @@ def check_whole(part: Path, n_frames: int, out: Path) -> None:
     except OSError:
         found = -1
     if found != n_frames:
-        raise LogError(f"{out}: the video could not be written whole; is the disk full? Make room or choose another place with --out FILE")
+        raise LogError(
+            f"{out}: the video could not be written whole; is the disk full? Make room or choose another "
+            "place with --out FILE"
+        )
     handle = os.open(part, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -76,8 +86,11 @@ def _write_video(part: Path, frames: Frames, fps: float) -> int:
     return _write(part, frames, start, picture, {"movflags": "+faststart"} if part.suffix == ".mp4" else {})
 
 
-def _write_gif(part: Path, frames: Frames, fps: float, samples: Sequence[np.ndarray], inks: Sequence[Color]) -> int:
-    """One palette for all frames and no dithering: what stands still stays the same pixel, which costs nothing."""
+def _write_gif(
+    part: Path, frames: Frames, fps: float, samples: Sequence[np.ndarray], inks: Sequence[Color]
+) -> int:
+    """One palette for all frames and no dithering: what stands still stays the same pixel, which costs
+    nothing."""
     known = _palette(samples, inks)
     colors = Image.new("P", (1, 1))
     colors.putpalette(known.tobytes())
@@ -101,7 +114,10 @@ def _write_gif(part: Path, frames: Frames, fps: float, samples: Sequence[np.ndar
 
 def _palette(samples: Sequence[np.ndarray], inks: Sequence[Color]) -> np.ndarray:
     """(256, 3) red green blue."""
-    found = _image(np.concatenate(samples)).quantize(256 - len(inks), dither=Image.Dither.NONE).getpalette("RGB") or []
+    found = (
+        _image(np.concatenate(samples)).quantize(256 - len(inks), dither=Image.Dither.NONE).getpalette("RGB")
+        or []
+    )
     known = [*(ink[::-1] for ink in inks), *np.reshape(found, (-1, 3))]
     return np.array([*known, *[known[0]] * (256 - len(known))], np.uint8)
 
@@ -111,7 +127,11 @@ def _image(frame: np.ndarray) -> Image.Image:
 
 
 def _write(
-    part: Path, frames: Frames, start: Callable[[Any, np.ndarray], Any], picture: Callable[[np.ndarray, int], Any], options: dict[str, str]
+    part: Path,
+    frames: Frames,
+    start: Callable[[Any, np.ndarray], Any],
+    picture: Callable[[np.ndarray, int], Any],
+    options: dict[str, str],
 ) -> int:
     n_frames, stream = 0, None
     with _refused(), av.open(str(part), "w", format=part.suffix.lstrip("."), options=options) as container:

@@ -39,16 +39,28 @@ _MAX_PIXELS = 1 << 24
 _RESERVED = re.compile(r"(con|prn|aux|nul|com[0-9]|lpt[0-9])(\..*)?", re.IGNORECASE)
 """names that open a device on some systems"""
 _MAX_NAME = 100
-_ODD = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError, struct.error, csv.Error, cv2.error)
+_ODD = (
+    LookupError,
+    TypeError,
+    ValueError,
+    AttributeError,
+    ArithmeticError,
+    RecursionError,
+    struct.error,
+    csv.Error,
+    cv2.error,
+)
 """what a message unlike its schema can raise"""
 
 
 def export(path: Path, out_dir: Path, topics: Collection[str] | None = None, fmt: str = "json") -> list[Path]:
-    """Write each topic's messages into the new or empty folder ``out_dir`` and the attachments below it; the files' paths.
+    """Write each topic's messages into the new or empty folder ``out_dir`` and the attachments below it; the
+    files' paths.
 
-    ``json``: NAME.jsonl, one message a line with its time under ``t``. ``csv``: a column for every number (grids and images are left out).
-    ``npz``: arrays with the message as first axis; grids as ``value`` (n, row, col), depth images as ``depth_mm``. The folder appears whole
-    or not at all. Raises LogError, and FileError where ``out_dir`` is anything but a folder.
+    ``json``: NAME.jsonl, one message a line with its time under ``t``. ``csv``: a column for every number
+    (grids and images are left out). ``npz``: arrays with the message as first axis; grids as ``value`` (n,
+    row, col), depth images as ``depth_mm``. The folder appears whole or not at all. Raises LogError, and
+    FileError where ``out_dir`` is anything but a folder.
     """
     path, out_dir = Path(path), Path(out_dir)
     if fmt not in FORMATS:
@@ -56,7 +68,9 @@ def export(path: Path, out_dir: Path, topics: Collection[str] | None = None, fmt
     _refuse_place(out_dir)
     found = info(path)
     if found["converted_from"]:
-        raise LogError(f"{path}: is the output of uuv log convert (protobuf); use the original: {original(path)}")
+        raise LogError(
+            f"{path}: is the output of uuv log convert (protobuf); use the original: {original(path)}"
+        )
     known = [entry["topic"] for entry in found["topics"] if entry["messages"]]
     if missing := [topic for topic in topics or () if topic not in known]:
         raise LogError(f"{path}: no messages on {', '.join(missing)}; it has {', '.join(known)}")
@@ -75,7 +89,8 @@ def export(path: Path, out_dir: Path, topics: Collection[str] | None = None, fmt
 
 
 def _refuse_place(out: Path) -> None:
-    """Raise LogError or FileError for a place that is taken: a log's own names must not meet anybody's files."""
+    """Raise LogError or FileError for a place that is taken: a log's own names must not meet anybody's
+    files."""
     if out.is_symlink() or not out.is_dir():
         refuse_output(out, [], force=False)
     elif any(out.iterdir()):
@@ -88,9 +103,14 @@ def _told(path: Path, out: Path) -> Iterator[None]:
     try:
         yield
     except _ODD as error:
-        raise LogError(f"{path}: a message is not as its schema says ({error!r}); see what is in it with: uuv log info {path}") from error
+        raise LogError(
+            f"{path}: a message is not as its schema says ({error!r}); see what is in it with: uuv log info "
+            f"{path}"
+        ) from error
     except OSError as error:
-        raise LogError(f"{out}: cannot write the export ({error.strerror}); choose another folder with --out DIR") from error
+        raise LogError(
+            f"{out}: cannot write the export ({error.strerror}); choose another folder with --out DIR"
+        ) from error
 
 
 @contextlib.contextmanager
@@ -103,13 +123,19 @@ def _removed(folder: Path) -> Iterator[None]:
 
 
 def file_name(name: str) -> str:
-    """A plain file name from a topic or an attachment's name, which may be anything: no folders, hidden files, options or devices."""
-    plain = re.sub(r"[^A-Za-z0-9._-]+", "_", name.replace("\\", "/").strip("/")).lstrip(".-")[:_MAX_NAME].rstrip(".")
+    """A plain file name from a topic or an attachment's name, which may be anything: no folders, hidden
+    files, options or devices."""
+    plain = (
+        re.sub(r"[^A-Za-z0-9._-]+", "_", name.replace("\\", "/").strip("/"))
+        .lstrip(".-")[:_MAX_NAME]
+        .rstrip(".")
+    )
     return f"_{plain}" if _RESERVED.fullmatch(plain) else plain or "unnamed"
 
 
 class _Names:
-    """Paths below a folder, none given out twice: neither on systems where a and A are one file, nor for topics that give one name."""
+    """Paths below a folder, none given out twice: neither on systems where a and A are one file, nor for
+    topics that give one name."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -139,7 +165,9 @@ def _files(topics: list[str], ending: str, names: _Names) -> Iterator[dict[str, 
     """One open file a topic."""
     with contextlib.ExitStack() as stack:
         yield {
-            topic: stack.enter_context(names.fresh(f"{file_name(topic)}.{ending}").open("w", encoding="utf-8", newline=""))
+            topic: stack.enter_context(
+                names.fresh(f"{file_name(topic)}.{ending}").open("w", encoding="utf-8", newline="")
+            )
             for topic in topics
         }
 
@@ -147,11 +175,14 @@ def _files(topics: list[str], ending: str, names: _Names) -> Iterator[dict[str, 
 def _write_jsonl(path: Path, topics: list[str], names: _Names) -> None:
     with _files(topics, "jsonl", names) as files:
         for message in read_messages(path, topics):
-            files[message.topic].write(json.dumps({"t": message.time_s, **message.data}, separators=(",", ":")) + "\n")
+            files[message.topic].write(
+                json.dumps({"t": message.time_s, **message.data}, separators=(",", ":")) + "\n"
+            )
 
 
 def _write_csv(path: Path, topics: list[str], names: _Names) -> None:
-    """Columns are those of all messages of the topic: the widest list decides; what a message lacks stays empty."""
+    """Columns are those of all messages of the topic: the widest list decides; what a message lacks stays
+    empty."""
     columns: dict[str, dict[str, None]] = {topic: {} for topic in topics}
     counts = dict.fromkeys(topics, 0)
     for message in read_messages(path, topics):
@@ -159,11 +190,17 @@ def _write_csv(path: Path, topics: list[str], names: _Names) -> None:
         found.update(dict.fromkeys(("t", *flattened(message.data))))
         counts[message.topic] += 1
         if len(found) > MAX_COLUMNS:
-            raise LogError(f"{path}: {message.topic} has more than {MAX_COLUMNS:,} columns; use --format json")
+            raise LogError(
+                f"{path}: {message.topic} has more than {MAX_COLUMNS:,} columns; use --format json"
+            )
     if sum(counts[topic] * len(columns[topic]) for topic in topics) > MAX_CELLS:
-        raise LogError(f"{path}: makes more than {MAX_CELLS:,} cells; use --format json, or fewer topics with --topic")
+        raise LogError(
+            f"{path}: makes more than {MAX_CELLS:,} cells; use --format json, or fewer topics with --topic"
+        )
     with _files(topics, "csv", names) as files:
-        writers = {topic: csv.DictWriter(files[topic], list(columns[topic]), lineterminator="\n") for topic in topics}
+        writers = {
+            topic: csv.DictWriter(files[topic], list(columns[topic]), lineterminator="\n") for topic in topics
+        }
         for writer in writers.values():
             writer.writeheader()
         for message in read_messages(path, topics):
@@ -174,10 +211,15 @@ def _write_npz(path: Path, topics: list[str], names: _Names) -> None:
     rows: dict[str, list[dict[str, np.ndarray]]] = {topic: [] for topic in topics}
     size = 0
     for message in read_messages(path, topics):
-        row = {name: np.asarray(value) for name, value in {"t": message.time_s, **_arrays(message.data)}.items()}
+        row = {
+            name: np.asarray(value) for name, value in {"t": message.time_s, **_arrays(message.data)}.items()
+        }
         size += sum(array.nbytes + _OVERHEAD for array in row.values())
         if size > MAX_ARRAYS:
-            raise LogError(f"{path}: has arrays of more than {MAX_ARRAYS >> 20} MiB; use --format json, or fewer topics with --topic")
+            raise LogError(
+                f"{path}: has arrays of more than {MAX_ARRAYS >> 20} MiB; use --format json, or fewer topics "
+                "with --topic"
+            )
         rows[message.topic].append(row)
     for topic in topics:
         # not np.savez: its own parameter names would collide with fields such as "file"
@@ -190,7 +232,8 @@ def _write_npz(path: Path, topics: list[str], names: _Names) -> None:
 
 
 def _stacked(rows: list[dict[str, np.ndarray]]) -> Iterator[tuple[str, np.ndarray]]:
-    """(field, values with the message as first axis) of the fields that all messages have in one shape, as numbers or words."""
+    """(field, values with the message as first axis) of the fields that all messages have in one shape, as
+    numbers or words."""
     for name in rows[0]:
         if all(name in row for row in rows) and len({row[name].shape for row in rows}) == 1:
             values = np.array([row[name] for row in rows])
@@ -202,9 +245,17 @@ def flattened(value: Any, name: str = "") -> dict[str, Any]:
     """Dotted names to plain values; packed bytes are left out."""
     if isinstance(value, dict):
         items = {f"{name}.{key}" if name else key: inner for key, inner in value.items() if key != "data"}
-        return {key: leaf for inner_name, inner in items.items() for key, leaf in flattened(inner, inner_name).items()}
+        return {
+            key: leaf
+            for inner_name, inner in items.items()
+            for key, leaf in flattened(inner, inner_name).items()
+        }
     if isinstance(value, list):
-        return {key: leaf for i, inner in enumerate(value) for key, leaf in flattened(inner, f"{name}.{i}").items()}
+        return {
+            key: leaf
+            for i, inner in enumerate(value)
+            for key, leaf in flattened(inner, f"{name}.{i}").items()
+        }
     return {name: value}
 
 
@@ -212,7 +263,11 @@ def _arrays(data: dict[str, Any]) -> dict[str, Any]:
     """One message's arrays: lists of numbers as they are, grids and images unpacked, null as NaN."""
     if "cell_stride" in data:
         origin = data["pose"]["position"]
-        return {"value": grid_values(data), "origin_m": [origin["x"], origin["y"]], "cell_m": data["cell_size"]["x"]}
+        return {
+            "value": grid_values(data),
+            "origin_m": [origin["x"], origin["y"]],
+            "cell_m": data["cell_size"]["x"],
+        }
     if data.get("format") == "png":
         return {"depth_mm": depth_image(data)}
     found: dict[str, Any] = {}
@@ -241,7 +296,9 @@ def depth_image(data: dict[str, Any]) -> np.ndarray:
     if signature != b"\x89PNG\r\n\x1a\n" or name != b"IHDR":
         raise LogError("a depth image of the log cannot be decoded: it is not a PNG")
     if width * height > _MAX_PIXELS:
-        raise LogError(f"a depth image of the log claims {width} x {height} pixels: no camera of ours has so many")
+        raise LogError(
+            f"a depth image of the log claims {width} x {height} pixels: no camera of ours has so many"
+        )
     image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None:
         raise LogError("a depth image of the log cannot be decoded: it is damaged")

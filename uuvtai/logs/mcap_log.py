@@ -1,11 +1,12 @@
 """Record one episode as MCAP: every topic of the interface, from snapshots.
 
     with McapEpisodeLog(path, header) as log:
-        log.write(snapshot)          # step 0, then after every control step; maps and depth images where ``log.due`` asks for them
-        log.close(result)
+        log.write(snapshot)          # step 0, then after every control step; maps and depth images where
+        ``log.due`` asks for them log.close(result)
 
-The file grows as ``<path>.part`` and gets its name when it is complete. A killed process leaves the ``.part`` file, which lacks at most the
-messages of the last control step or the last hundredth, whichever is more; ``uuv log repair`` makes it whole.
+The file grows as ``<path>.part`` and gets its name when it is complete. A killed process leaves the ``.part``
+file, which lacks at most the messages of the last control step or the last hundredth, whichever is more;
+``uuv log repair`` makes it whole.
 """
 
 from __future__ import annotations
@@ -28,7 +29,11 @@ from uuvtai.snapshot import RUNNING, EpisodeEnd, EpisodeHeader, EpisodeSnapshot
 
 MAP_HZ, DEPTH_HZ, OBSTACLE_HZ = 2.0, 2.0, 10.0
 
-_GOAL_COLOR, _ROUTE_COLOR, _TANK_COLOR = (0.98, 0.75, 0.14, 1.0), (0.13, 0.55, 0.9, 1.0), (0.3, 0.38, 0.46, 1.0)
+_GOAL_COLOR, _ROUTE_COLOR, _TANK_COLOR = (
+    (0.98, 0.75, 0.14, 1.0),
+    (0.13, 0.55, 0.9, 1.0),
+    (0.3, 0.38, 0.46, 1.0),
+)
 
 
 @dataclass(frozen=True)
@@ -40,7 +45,8 @@ class Due:
 
 
 class McapEpisodeLog:
-    """One episode's log. Raises LogError where the file cannot be written; nothing half-written is left then."""
+    """One episode's log. Raises LogError where the file cannot be written; nothing half-written is left
+    then."""
 
     def __init__(self, path: Path, header: EpisodeHeader, depth_images: bool = False) -> None:
         self.path, self.header = Path(path), header
@@ -59,7 +65,8 @@ class McapEpisodeLog:
             self._channels = {topic: self._channel(topic, schema) for topic, schema in topics.items()}
 
     def due(self, step: int, replanned: bool = False, final: bool = False) -> Due:
-        """What the snapshot of this step should carry: maps at 2 Hz, on a replan and at the end; depth images at 2 Hz if they are wanted.
+        """What the snapshot of this step should carry: maps at 2 Hz, on a replan and at the end; depth images
+        at 2 Hz if they are wanted.
 
         A depth image counts only where it is fresh; hand over the first fresh one from then on.
         """
@@ -92,10 +99,12 @@ class McapEpisodeLog:
     def __enter__(self) -> McapEpisodeLog:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self.abandon()
 
-    # ---------------------------------------------------------------------------------------------------------------- head
+    # --------------------------------------------------------------------------------------------------- head
 
     def _write_head(self) -> None:
         self._file.add_metadata("uuv.run", _run_metadata(self.header))
@@ -106,10 +115,12 @@ class McapEpisodeLog:
     def _channel(self, topic: str, schema: schemas.Schema) -> int:
         name = schema["title"]
         if name not in self._schema_ids:
-            self._schema_ids[name] = self._file.add_schema(name, "jsonschema", json.dumps(schema, separators=(",", ":")).encode())
+            self._schema_ids[name] = self._file.add_schema(
+                name, "jsonschema", json.dumps(schema, separators=(",", ":")).encode()
+            )
         return self._file.add_channel(topic, self._schema_ids[name])
 
-    # --------------------------------------------------------------------------------------------------------------- steps
+    # -------------------------------------------------------------------------------------------------- steps
 
     def _write_step(self, snapshot: EpisodeSnapshot) -> None:
         self._time_s = snapshot.step * self.header.control_dt_s
@@ -140,16 +151,21 @@ class McapEpisodeLog:
         self._put(
             "/state",
             (
-                f'{{"position":{encode.numbers(snapshot.pos_w)},"orientation":{encode.numbers(snapshot.quat_wb)},'
+                f'{{"position":{encode.numbers(snapshot.pos_w)},'
+                f'"orientation":{encode.numbers(snapshot.quat_wb)},'
                 f'"velocity":{encode.numbers(snapshot.vel_b)},"rates":{encode.numbers(snapshot.rate_b)},'
                 f'"current":{encode.numbers(snapshot.current_w)},"rpm":{encode.numbers(snapshot.rpm)},'
                 f'"measured":{{"velocity":{encode.numbers(snapshot.measured_vel_b)},"velocity_valid":{valid},'
-                f'"rates":{encode.numbers(snapshot.measured_rate_b)},"depth_m":{encode.number(snapshot.depth_m)}}}}}'
+                f'"rates":{encode.numbers(snapshot.measured_rate_b)},'
+                f'"depth_m":{encode.number(snapshot.depth_m)}}}}}'
             ).encode(),
         )
         self._put("/tf", encode.frame_transforms(stamp, snapshot, self.header.camera_offset_b_m))
         self._put("/pose", encode.pose_in_frame(stamp, snapshot.pos_w, snapshot.quat_wb))
-        self._put("/pose_estimate", encode.pose_in_frame(stamp, snapshot.estimate_pos_w, encode.quaternion_of(snapshot.estimate_rpy)))
+        self._put(
+            "/pose_estimate",
+            encode.pose_in_frame(stamp, snapshot.estimate_pos_w, encode.quaternion_of(snapshot.estimate_rpy)),
+        )
 
     def _write_sonar(self, snapshot: EpisodeSnapshot) -> None:
         stamp = self._stamp(snapshot.sonar_ping_step)
@@ -164,13 +180,22 @@ class McapEpisodeLog:
             points = np.column_stack([points, np.full(len(points), self.header.scenario["goal"][2])])
         strip = encode.scene_entity(self._time_ns, "route", lines=[encode.line(points, _ROUTE_COLOR, 0.04)])
         self._put("/plan", encode.dumped({"deletions": [], "entities": [strip]}))
-        plan = {"points": [encode.vector(point) for point in points], "planner": snapshot.route_planner, "trigger": snapshot.replan_trigger}
+        plan = {
+            "points": [encode.vector(point) for point in points],
+            "planner": snapshot.route_planner,
+            "trigger": snapshot.replan_trigger,
+        }
         self._put("/plan/info", encode.dumped({**plan, "fallback": snapshot.route_fallback}))
         found = f"replan ({snapshot.replan_trigger}): {snapshot.route_planner}, {len(points)} waypoints"
         level = schemas.WARNING if snapshot.route_fallback else schemas.INFO
         self._put(
             "/log",
-            _log_line(stamp, level, "uuv.route", found + (f"; voronoi: {snapshot.route_fallback}" if snapshot.route_fallback else "")),
+            _log_line(
+                stamp,
+                level,
+                "uuv.route",
+                found + (f"; voronoi: {snapshot.route_fallback}" if snapshot.route_fallback else ""),
+            ),
         )
 
     def _write_truth(self, snapshot: EpisodeSnapshot) -> None:
@@ -180,7 +205,11 @@ class McapEpisodeLog:
         self._put("/obstacles/truth", encode.obstacle_truth(snapshot))
         diameter = 2 * scenario["goal_radius_m"]
         spheres = [
-            {"pose": encode.upright_pose(scenario["goal"]), "size": {"x": size, "y": size, "z": size}, "color": encode.color(rgba)}
+            {
+                "pose": encode.upright_pose(scenario["goal"]),
+                "size": {"x": size, "y": size, "z": size},
+                "color": encode.color(rgba),
+            }
             for size, rgba in ((0.25, _GOAL_COLOR), (diameter, (*_GOAL_COLOR[:3], 0.15)))
         ]
         entities = [
@@ -195,8 +224,10 @@ class McapEpisodeLog:
         self._put(
             "/action",
             (
-                f'{{"policy":{encode.numbers_or_null(snapshot.action_policy)},"teacher":{encode.numbers_or_null(snapshot.action_teacher)},'
-                f'"applied":{encode.numbers(snapshot.action_applied)},"thrust":{encode.numbers(snapshot.thrust_n)},"leaf":{json.dumps(leaf)}}}'
+                f'{{"policy":{encode.numbers_or_null(snapshot.action_policy)},'
+                f'"teacher":{encode.numbers_or_null(snapshot.action_teacher)},'
+                f'"applied":{encode.numbers(snapshot.action_applied)},'
+                f'"thrust":{encode.numbers(snapshot.thrust_n)},"leaf":{json.dumps(leaf)}}}'
             ).encode(),
         )
         self._put("/policy", self._policy(snapshot))
@@ -205,7 +236,8 @@ class McapEpisodeLog:
             "/safety",
             (
                 f'{{"clearance_m":{encode.number(snapshot.clearance_m)},"ttc_s":{encode.number_or_null(ttc)},'
-                f'"path_risk":{encode.number(snapshot.path_risk)},"replan_trigger":"{snapshot.replan_trigger}"}}'
+                f'"path_risk":{encode.number(snapshot.path_risk)},'
+                f'"replan_trigger":"{snapshot.replan_trigger}"}}'
             ).encode(),
         )
         if snapshot.tree_status is not None:
@@ -216,11 +248,16 @@ class McapEpisodeLog:
 
     def _policy(self, snapshot: EpisodeSnapshot) -> bytes:
         terms = np.zeros(len(self.header.reward_terms)) if snapshot.reward is None else snapshot.reward
-        rewards = ",".join(f'"{name}":{encode.number(value)}' for name, value in zip(self.header.reward_terms, terms, strict=True))
+        rewards = ",".join(
+            f'"{name}":{encode.number(value)}'
+            for name, value in zip(self.header.reward_terms, terms, strict=True)
+        )
         return (
-            f'{{"value":{encode.number_or_null(snapshot.policy_value)},"std":{encode.numbers_or_null(snapshot.policy_std)},'
+            f'{{"value":{encode.number_or_null(snapshot.policy_value)},'
+            f'"std":{encode.numbers_or_null(snapshot.policy_std)},'
             f'"reward":{encode.number(float(np.sum(terms)))},{rewards}{"," if rewards else ""}'
-            f'"lambda":{encode.number_or_null(snapshot.distill_lambda)},"wm_residual":{encode.number_or_null(snapshot.wm_residual)},'
+            f'"lambda":{encode.number_or_null(snapshot.distill_lambda)},'
+            f'"wm_residual":{encode.number_or_null(snapshot.wm_residual)},'
             f'"wm_uncertainty":{encode.number_or_null(snapshot.wm_uncertainty)}}}'
         ).encode()
 
@@ -326,7 +363,10 @@ def _result_metadata(result: EpisodeEnd) -> dict[str, str]:
 
 
 def _log_line(stamp: str, level: int, name: str, message: str) -> bytes:
-    return (f'{{"timestamp":{stamp},"level":{level},"message":{json.dumps(message)},"name":"{name}","file":"","line":0}}').encode()
+    return (
+        f'{{"timestamp":{stamp},"level":{level},"message":{json.dumps(message)},"name":"{name}","file":"",'
+        f'"line":0}}'
+    ).encode()
 
 
 def _tank_lines(tank: dict) -> list[dict]:
@@ -335,5 +375,10 @@ def _tank_lines(tank: dict) -> list[dict]:
     flat = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
     if tank["shape"] == "circle":
         angles = np.linspace(0, 2 * np.pi, 64, endpoint=False)
-        flat = [(0.5 * (x0 + x1) + tank["radius_m"] * np.cos(a), 0.5 * (y0 + y1) + tank["radius_m"] * np.sin(a)) for a in angles]
-    return [encode.line([(x, y, z) for x, y in flat], _TANK_COLOR, 0.03, schemas.LINE_LOOP) for z in tank["z_m"]]
+        flat = [
+            (0.5 * (x0 + x1) + tank["radius_m"] * np.cos(a), 0.5 * (y0 + y1) + tank["radius_m"] * np.sin(a))
+            for a in angles
+        ]
+    return [
+        encode.line([(x, y, z) for x, y in flat], _TANK_COLOR, 0.03, schemas.LINE_LOOP) for z in tank["z_m"]
+    ]

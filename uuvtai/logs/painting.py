@@ -1,4 +1,5 @@
-"""What pictures and videos have in common: the tank, maps, true bodies, ruler, all on a canvas in world coordinates."""
+"""What pictures and videos have in common: the tank, maps, true bodies, ruler, all on a canvas in world
+coordinates."""
 
 from __future__ import annotations
 
@@ -19,7 +20,9 @@ _HULL_RADIUS_M = 0.17
 """half the height of the hull that ``Canvas.vehicle`` draws"""
 
 
-def map_canvas(tank: dict[str, Any], width_px: int, margins: tuple[int, int, int, int], kind: type[AnyCanvas] = Canvas) -> AnyCanvas:
+def map_canvas(
+    tank: dict[str, Any], width_px: int, margins: tuple[int, int, int, int], kind: type[AnyCanvas] = Canvas
+) -> AnyCanvas:
     """A canvas that fits the tank between margins (left, right, top, bottom), with even sizes."""
     left, right, top, bottom = margins
     across, along = tank["x_m"][1] - tank["x_m"][0], tank["y_m"][1] - tank["y_m"][0]
@@ -58,13 +61,18 @@ def paint_layers(canvas: Canvas, static: Layer, dynamic: Layer, faint: np.ndarra
     canvas.cells(np.array(STATIC), np.clip(static.values, 0, 1) ** 0.8 * 0.92, static.origin_m, static.cell_m)
     if faint is not None:
         canvas.cells(np.array(DYNAMIC), np.clip(faint, 0, 1) * 0.22, dynamic.origin_m, dynamic.cell_m)
-    canvas.cells(np.array(DYNAMIC), np.clip(dynamic.values, 0, 1) ** 0.8 * 0.95, dynamic.origin_m, dynamic.cell_m)
+    canvas.cells(
+        np.array(DYNAMIC), np.clip(dynamic.values, 0, 1) ** 0.8 * 0.95, dynamic.origin_m, dynamic.cell_m
+    )
 
 
-def paint_truth(canvas: Canvas, scenario: dict[str, Any], time_s: float, own_z_m: float | None = None) -> None:
+def paint_truth(
+    canvas: Canvas, scenario: dict[str, Any], time_s: float, own_z_m: float | None = None
+) -> None:
     """True bodies as thin outlines where they are at this time, and the paths of those that move.
 
-    With the vehicle's height, bodies that pass wholly above or below its hull are dashed: from above they seem to be in its way.
+    With the vehicle's height, bodies that pass wholly above or below its hull are dashed: from above they
+    seem to be in its way.
     """
     for body in scenario["bodies"]:
         at = body_positions(body, np.array([time_s]))[0]
@@ -72,7 +80,9 @@ def paint_truth(canvas: Canvas, scenario: dict[str, Any], time_s: float, own_z_m
         if body["path"] is not None:
             color = MOVER
             period = body["path"]["length_m"] / max(body["path"]["speed_m_s"], 1e-6)
-            canvas.dashes(body_positions(body, np.linspace(0, period, 181))[:, :2], mixed(MOVER, WATER, 0.45), 1)
+            canvas.dashes(
+                body_positions(body, np.linspace(0, period, 181))[:, :2], mixed(MOVER, WATER, 0.45), 1
+            )
         outline = body_outline(body, at)
         if own_z_m is not None and abs(at[2] - own_z_m) > body["size"][2] + _HULL_RADIUS_M:
             canvas.dashes(np.vstack([outline, outline[:1]]), color, 1)

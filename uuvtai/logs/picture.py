@@ -1,4 +1,5 @@
-"""One picture per episode: what the vehicle mapped, every method's trajectory, the goal, the truth as thin lines."""
+"""One picture per episode: what the vehicle mapped, every method's trajectory, the goal, the truth as thin
+lines."""
 
 from __future__ import annotations
 
@@ -9,9 +10,30 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from uuvtai.logs.canvas import DYNAMIC, FAILED, GREY, INK, MOVER, PAPER, STATIC, WATER, Canvas, Color, method_inks
+from uuvtai.logs.canvas import (
+    DYNAMIC,
+    FAILED,
+    GREY,
+    INK,
+    MOVER,
+    PAPER,
+    STATIC,
+    WATER,
+    Canvas,
+    Color,
+    method_inks,
+)
 from uuvtai.logs.log_errors import LogError, checked_suffix
-from uuvtai.logs.painting import AnyCanvas, map_canvas, mixed, paint_layers, paint_ruler, paint_truth, paint_walls, paint_water
+from uuvtai.logs.painting import (
+    AnyCanvas,
+    map_canvas,
+    mixed,
+    paint_layers,
+    paint_ruler,
+    paint_truth,
+    paint_walls,
+    paint_water,
+)
 from uuvtai.logs.recording import PICTURE_TOPICS, Recording, drawing, load_recording
 from uuvtai.logs.video import video
 from uuvtai.outcomes import COLLIDED
@@ -36,11 +58,13 @@ def picture(
     remark: str = "",
     methods: Sequence[str] = (),
 ) -> Path:
-    """Draw logs of the same episode into one PNG, PDF or SVG, as the name of ``out`` ends: trajectories overlaid, a colour per method.
+    """Draw logs of the same episode into one PNG, PDF or SVG, as the name of ``out`` ends: trajectories
+    overlaid, a colour per method.
 
-    ``clearance`` shows the distance to mapped obstacles as colours; ``obstacles`` the true bodies and their paths as thin lines;
-    ``remark`` stands beside the title; ``methods``: all that are compared with each other, in order, so that each keeps its colour.
-    In PDF and SVG everything but the map is lines, shapes and text. Raises LogError; the file appears whole or not at all.
+    ``clearance`` shows the distance to mapped obstacles as colours; ``obstacles`` the true bodies and their
+    paths as thin lines; ``remark`` stands beside the title; ``methods``: all that are compared with each
+    other, in order, so that each keeps its colour. In PDF and SVG everything but the map is lines, shapes and
+    text. Raises LogError; the file appears whole or not at all.
     """
     out = Path(out)
     suffix = checked_suffix(out, FORMATS, "picture")
@@ -55,13 +79,21 @@ def picture(
 
 
 def _drawn(
-    recordings: list[Recording], suffix: str, clearance: bool, obstacles: bool, width_px: int, remark: str, methods: Sequence[str]
+    recordings: list[Recording],
+    suffix: str,
+    clearance: bool,
+    obstacles: bool,
+    width_px: int,
+    remark: str,
+    methods: Sequence[str],
 ) -> bytes:
     if suffix == ".png":
         return png_bytes(draw_picture(recordings, clearance, obstacles, width_px, remark, methods))
     from uuvtai.logs.vector_graphics import VectorCanvas  # matplotlib, which takes a second
 
-    return _painted(VectorCanvas, recordings, clearance, obstacles, width_px, remark, methods).document(suffix.lstrip("."))
+    return _painted(VectorCanvas, recordings, clearance, obstacles, width_px, remark, methods).document(
+        suffix.lstrip(".")
+    )
 
 
 def check_same_episode(recordings: list[Recording]) -> None:
@@ -70,7 +102,10 @@ def check_same_episode(recordings: list[Recording]) -> None:
     first = recordings[0]
     for other in recordings[1:]:
         if any(first.scenario.get(name) != other.scenario.get(name) for name in names):
-            raise LogError(f"{other.path}: is another episode than {first.path}; give logs of one episode, or draw one picture each")
+            raise LogError(
+                f"{other.path}: is another episode than {first.path}; give logs of one episode, or draw one "
+                "picture each"
+            )
 
 
 def save_image(image: np.ndarray, out: Path) -> Path:
@@ -91,7 +126,9 @@ def write_whole(content: bytes, out: Path) -> Path:
         part.write_bytes(content)
         os.replace(part, out)
     except OSError as error:
-        raise LogError(f"{out}: cannot write the picture ({error.strerror}); choose another place with --out FILE") from error
+        raise LogError(
+            f"{out}: cannot write the picture ({error.strerror}); choose another place with --out FILE"
+        ) from error
     finally:
         if part.parent.is_dir():
             part.unlink(missing_ok=True)
@@ -138,7 +175,8 @@ def _painted(
 
 
 def _inks(recordings: list[Recording], methods: Sequence[str]) -> list[Color]:
-    """Colour of each recording: its method's; logs of one method (of several policies, say) are told apart by their place."""
+    """Colour of each recording: its method's; logs of one method (of several policies, say) are told apart by
+    their place."""
     names = [recording.method for recording in recordings]
     if len(set(names)) < len(names):
         names = [f"{i} {name}" for i, name in enumerate(names)]
@@ -146,7 +184,7 @@ def _inks(recordings: list[Recording], methods: Sequence[str]) -> list[Color]:
     return [found[name] for name in names]
 
 
-# ------------------------------------------------------------------------------------------------------------------- parts
+# ------------------------------------------------------------------------------------------------------ parts
 
 
 def _paint_occupancy(canvas: Canvas, recording: Recording, trace: bool) -> None:
@@ -163,23 +201,30 @@ def _paint_clearance(canvas: Canvas, recordings: list[Recording], side: int) -> 
         return
     layer = series.values[-1]
     top = max(float(layer.values.max()), 1e-6)
-    colors = cv2.applyColorMap((np.clip(layer.values / top, 0, 1) * 255).astype(np.uint8), cv2.COLORMAP_VIRIDIS)
+    colors = cv2.applyColorMap(
+        (np.clip(layer.values / top, 0, 1) * 255).astype(np.uint8), cv2.COLORMAP_VIRIDIS
+    )
     canvas.cells(colors, np.full(layer.values.shape, 0.85), layer.origin_m, layer.cell_m)
     _paint_color_bar(canvas, top)
 
 
 def _paint_color_bar(canvas: Canvas, top_m: float) -> None:
-    (x, y0), (_, y1) = canvas.pixels([(canvas.x_m[1], canvas.y_m[1]), (canvas.x_m[1], canvas.y_m[0])]).round().astype(int)
+    (x, y0), (_, y1) = (
+        canvas.pixels([(canvas.x_m[1], canvas.y_m[1]), (canvas.x_m[1], canvas.y_m[0])]).round().astype(int)
+    )
     ramp = cv2.applyColorMap(np.linspace(255, 0, y1 - y0).astype(np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)
     canvas.paste((x + 26, y0), np.repeat(ramp, 18, axis=1))
     canvas.strip(np.array([(x + 26, y0), (x + 44, y0), (x + 44, y1), (x + 26, y1)]), GREY, 1, closed=True)
     for share in (0.0, 0.5, 1.0):
-        canvas.text((x + 50, y1 - share * (y1 - y0) + (4 if share < 1 else 14)), f"{share * top_m:.1f} m", 15, GREY)
+        canvas.text(
+            (x + 50, y1 - share * (y1 - y0) + (4 if share < 1 else 14)), f"{share * top_m:.1f} m", 15, GREY
+        )
     canvas.text((x + 26, y0 - 12), "clearance", 15, GREY)
 
 
 def _paint_trajectories(canvas: Canvas, recordings: list[Recording], inks: list[Color]) -> None:
-    """The first method on top; the others below it a little wider each, so that their edges show where all go the same way."""
+    """The first method on top; the others below it a little wider each, so that their edges show where all go
+    the same way."""
     wide = [3 + 3 * min(i, 3) for i in range(len(recordings))]
     for recording, width in zip(recordings, wide, strict=True):
         canvas.line(recording.positions[:, :2], PAPER, width + 3)
@@ -201,13 +246,20 @@ def _paint_ends(canvas: Canvas, recordings: list[Recording], inks: list[Color]) 
             canvas.cross(recording.positions[-1][:2], 9, inks[i])
 
 
-def _paint_frame(canvas: Canvas, recordings: list[Recording], inks: list[Color], trace: bool, remark: str) -> None:
+def _paint_frame(
+    canvas: Canvas, recordings: list[Recording], inks: list[Color], trace: bool, remark: str
+) -> None:
     scenario = recordings[0].scenario
     title = f"{scenario['world']} · seed {scenario['seed']} · episode {scenario['episode']}"
     width = canvas.text((_LEFT - 2, 40), title, 27, INK, bold=True)
     canvas.text((_LEFT - 2 + width + 24, 40), remark, 19, FAILED)
     moving = f", {scenario['D']} moving at {scenario['v_m_s']:g} m/s" if scenario["D"] else ""
-    canvas.text((_LEFT - 2, 70), f"{scenario['S']} resting obstacles{moving}; map and bodies when {recordings[0].method} ends", 18, GREY)
+    canvas.text(
+        (_LEFT - 2, 70),
+        f"{scenario['S']} resting obstacles{moving}; map and bodies when {recordings[0].method} ends",
+        18,
+        GREY,
+    )
     paint_ruler(canvas)
     base = canvas.pixels([(canvas.x_m[0], canvas.y_m[0])])[0][1] + 62
     for i, recording in enumerate(recordings):

@@ -1,4 +1,5 @@
-"""Read logs, whole or damaged, without trusting them: every length is checked against the file and a bound before it is used."""
+"""Read logs, whole or damaged, without trusting them: every length is checked against the file and a bound
+before it is used."""
 
 from __future__ import annotations
 
@@ -42,8 +43,8 @@ _PARSED: dict[int, Callable[[ReadDataStream], Any]] = {
 
 
 class DamageError(Exception):
-    """A place where a file stops making sense. ``records`` are the whole ones of a chunk that is cut off there; ``can_go_on``: the next
-    record starts at a known place."""
+    """A place where a file stops making sense. ``records`` are the whole ones of a chunk that is cut off
+    there; ``can_go_on``: the next record starts at a known place."""
 
     def __init__(self, reason: str, records: list[Any] | None = None, can_go_on: bool = False) -> None:
         super().__init__(reason)
@@ -73,7 +74,8 @@ class LogHead:
 
 
 def read_messages(path: Path, topics: Collection[str] | None = None) -> Iterator[LogMessage]:
-    """Messages in file order, decoded; all topics or these. Raises LogError, also for the output of ``uuv log convert``."""
+    """Messages in file order, decoded; all topics or these. Raises LogError, also for the output of ``uuv log
+    convert``."""
     channels: dict[int, Channel] = {}
     for record in records(path):
         if isinstance(record, Channel):
@@ -84,7 +86,9 @@ def read_messages(path: Path, topics: Collection[str] | None = None) -> Iterator
                 raise _unreadable(path, f"a message of channel {record.channel_id}, which was never declared")
             if topics is None or channel.topic in topics:
                 refuse_converted(path, channel)
-                yield LogMessage(channel.topic, record.log_time / 1e9, _decoded(path, channel.topic, record.data))
+                yield LogMessage(
+                    channel.topic, record.log_time / 1e9, _decoded(path, channel.topic, record.data)
+                )
 
 
 def read_head(path: Path) -> LogHead:
@@ -104,7 +108,10 @@ def json_attachment(head: LogHead, name: str) -> Any:
         raise LogError(f"the log has no attachment {name}: it was not written by uuv eval --record")
     content = head.attachments[name]
     if len(content) > MAX_MESSAGE:
-        raise LogError(f"the log's attachment {name} has {len(content):,} bytes; a log of ours has fewer, and more cannot be drawn")
+        raise LogError(
+            f"the log's attachment {name} has {len(content):,} bytes; a log of ours has fewer, and more "
+            "cannot be drawn"
+        )
     try:
         return json.loads(content)
     except (ValueError, RecursionError) as error:
@@ -112,9 +119,11 @@ def json_attachment(head: LogHead, name: str) -> Any:
 
 
 def info(path: Path) -> dict[str, Any]:
-    """What is in a log: topics with schema, messages and rate; duration, metadata, attachments, outcome. Raises LogError.
+    """What is in a log: topics with schema, messages and rate; duration, metadata, attachments, outcome.
+    Raises LogError.
 
-    ``converted_from``: the log to use instead where this one is in protobuf, as ``uuv log convert`` writes it; else None.
+    ``converted_from``: the log to use instead where this one is in protobuf, as ``uuv log convert`` writes
+    it; else None.
     """
     path = Path(path)
     schemas: dict[int, Schema] = {}
@@ -153,7 +162,9 @@ def info(path: Path) -> dict[str, Any]:
         "metadata": head.metadata,
         "attachments": {name: len(data) for name, data in head.attachments.items()},
         "outcome": result.get("outcome"),
-        "converted_from": next((original(path) for channel in channels.values() if channel.message_encoding == PROTOBUF), None),
+        "converted_from": next(
+            (original(path) for channel in channels.values() if channel.message_encoding == PROTOBUF), None
+        ),
     }
 
 
@@ -169,17 +180,20 @@ def original(path: Path) -> str:
 
 
 def refuse_converted(path: Path, channel: Channel) -> None:
-    """Raise LogError for a channel that ``uuv log convert`` wrote: what is in it stands in the original too."""
+    """Raise LogError for a channel that ``uuv log convert`` wrote: what is in it stands in the original
+    too."""
     if channel.message_encoding == PROTOBUF:
-        raise LogError(f"{path}: is the output of uuv log convert (protobuf); use the original: {original(path)}")
+        raise LogError(
+            f"{path}: is the output of uuv log convert (protobuf); use the original: {original(path)}"
+        )
 
 
-# ---------------------------------------------------------------------------------------------------------------- records
+# ---------------------------------------------------------------------------------------------------- records
 
 
 def records(path: Path, skip_chunks: bool = False) -> Iterator[Any]:
-    """Schema, Channel, Message, Metadata and Attachment records of a whole file. Raises LogError at the first damage, and for more than a
-    log may ask of its reader."""
+    """Schema, Channel, Message, Metadata and Attachment records of a whole file. Raises LogError at the first
+    damage, and for more than a log may ask of its reader."""
     path = Path(path)
     with opened(path) as file:
         scanner = Scanner(file, str(path))
@@ -187,14 +201,19 @@ def records(path: Path, skip_chunks: bool = False) -> Iterator[Any]:
             yield from scanner.records(skip_chunks)
         except DamageError as damage:
             if scanner.at == 0:
-                raise LogError(f"{path}: is not an MCAP file (no magic bytes); give a log that uuv eval --record wrote") from None
+                raise LogError(
+                    f"{path}: is not an MCAP file (no magic bytes); give a log that uuv eval --record wrote"
+                ) from None
             raise _unreadable(path, f"{damage.reason} at byte {scanner.at}") from None
         if not scanner.finished:
-            raise _unreadable(path, f"it ends at byte {scanner.at} without the end mark: its writing was cut off")
+            raise _unreadable(
+                path, f"it ends at byte {scanner.at} without the end mark: its writing was cut off"
+            )
 
 
 def opened(path: Path) -> BinaryIO:
-    """The file, open for reading. Raises LogError for what cannot be opened, FileError for what is no plain file."""
+    """The file, open for reading. Raises LogError for what cannot be opened, FileError for what is no plain
+    file."""
     try:
         return open_file(path)
     except OSError as error:
@@ -202,8 +221,8 @@ def opened(path: Path) -> BinaryIO:
 
 
 class Scanner:
-    """Walks through a file's records; ``at`` is the place of the newest, ``sure`` that of the last one before it that was whole,
-    ``finished`` says whether the end mark was met."""
+    """Walks through a file's records; ``at`` is the place of the newest, ``sure`` that of the last one before
+    it that was whole, ``finished`` says whether the end mark was met."""
 
     def __init__(self, file: BinaryIO, name: str) -> None:
         self._file = file
@@ -216,7 +235,8 @@ class Scanner:
         self.budget = LogBudget(name, self.size)
 
     def records(self, skip_chunks: bool = False) -> Iterator[Any]:
-        """Records up to the end of the data section. Raises DamageError; iterate again to go on behind it where it ``can_go_on``.
+        """Records up to the end of the data section. Raises DamageError; iterate again to go on behind it
+        where it ``can_go_on``.
 
         Raises BudgetError where the file asks for too much.
         """
@@ -254,10 +274,12 @@ class Scanner:
                 raise DamageError(f"no record of MCAP begins with byte {opcode}")
 
     def resume(self) -> bool:
-        """After damage whose end is unknown: go on at the next place that can be trusted; False where there is none.
+        """After damage whose end is unknown: go on at the next place that can be trusted; False where there
+        is none.
 
-        A chunk whose own length lies is read once more with the length that its data says. Otherwise the next whole chunk is searched,
-        from behind the last record that was passed: its length may have been the lie.
+        A chunk whose own length lies is read once more with the length that its data says. Otherwise the next
+        whole chunk is searched, from behind the last record that was passed: its length may have been the
+        lie.
         """
         if self.at == 0:
             return False
@@ -280,12 +302,17 @@ class Scanner:
             raise DamageError(f"a record of {length} bytes is longer than any we write")
         body = self._file.read(length)
         try:
-            return _message(body) if opcode == Opcode.MESSAGE else _PARSED[opcode](ReadDataStream(io.BytesIO(body)))
+            return (
+                _message(body)
+                if opcode == Opcode.MESSAGE
+                else _PARSED[opcode](ReadDataStream(io.BytesIO(body)))
+            )
         except (EndOfFile, OverflowError, struct.error, UnicodeDecodeError) as error:
             raise self._behind(length, f"a record cannot be read ({error or type(error).__name__})") from None
 
     def _chunk(self, length: int, rest: int) -> list[Any]:
-        """Records of a chunk. What fails its checksum is not evidence of anything: only a chunk that is cut off is used in part."""
+        """Records of a chunk. What fails its checksum is not evidence of anything: only a chunk that is cut
+        off is used in part."""
         cut, true = length > rest, true_length(self._file, self.at, self.size)
         if true is not None and true != length:
             raise DamageError(f"a chunk of {true} bytes claims to have {length}")
@@ -298,10 +325,16 @@ class Scanner:
         except (EndOfFile, OverflowError, struct.error, UnicodeDecodeError):
             chunk = None
         if chunk is None or (not chunk.data and chunk.uncompressed_size):
-            raise DamageError("a chunk is cut off before its data") if cut else self._behind(length, "a chunk without data")
+            raise (
+                DamageError("a chunk is cut off before its data")
+                if cut
+                else self._behind(length, "a chunk without data")
+            )
         if not cut and chunk.uncompressed_size > MAX_CHUNK:
             raise self._behind(length, f"a chunk claims to unpack to {chunk.uncompressed_size} bytes")
-        plain, trouble = unpacked(chunk.data, chunk.compression, MAX_CHUNK if cut else chunk.uncompressed_size, self.budget)
+        plain, trouble = unpacked(
+            chunk.data, chunk.compression, MAX_CHUNK if cut else chunk.uncompressed_size, self.budget
+        )
         found, used = split_records(plain, self.budget) if cut or trouble is None else ([], 0)
         if cut:
             raise DamageError("a chunk is cut off", found)
@@ -323,7 +356,8 @@ class Scanner:
 
 
 def unpacked(data: bytes, compression: str, limit: int, budget: LogBudget) -> tuple[bytes, str | None]:
-    """(what can be unpacked, what went wrong); of a frame that is cut off, all that was written before. Never more than ``limit`` bytes."""
+    """(what can be unpacked, what went wrong); of a frame that is cut off, all that was written before. Never
+    more than ``limit`` bytes."""
     if compression == "":
         budget.take_unpacked(len(data))
         return data, None
@@ -379,4 +413,6 @@ def _decoded(path: Path, topic: str, data: bytes) -> dict[str, Any]:
 
 
 def _unreadable(path: Path, reason: str) -> LogError:
-    return LogError(f"{path}: the log cannot be read: {reason}. Recover what is in it with: uuv log repair {path}")
+    return LogError(
+        f"{path}: the log cannot be read: {reason}. Recover what is in it with: uuv log repair {path}"
+    )

@@ -120,23 +120,35 @@ def load_recording(path: Path, topics: tuple[str, ...] = VIDEO_TOPICS) -> Record
         for message in read_messages(path, topics):
             size += _take(found, message) + _OVERHEAD
             if size > _MAX_ARRAYS:
-                raise LogError(f"{path}: holds more than {_MAX_ARRAYS >> 20} MiB to draw; no episode of ours does")
+                raise LogError(
+                    f"{path}: holds more than {_MAX_ARRAYS >> 20} MiB to draw; no episode of ours does"
+                )
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
-        raise LogError(f"{path}: a message is not as its schema says ({error!r}); see what is in it with: uuv log info {path}") from error
+        raise LogError(
+            f"{path}: a message is not as its schema says ({error!r}); see what is in it with: uuv log info "
+            f"{path}"
+        ) from error
     if not found.pose.times:
-        raise LogError(f"{path}: the log has no messages on /pose, so there is nothing to draw; see uuv log info {path}")
+        raise LogError(
+            f"{path}: the log has no messages on /pose, so there is nothing to draw; see uuv log info {path}"
+        )
     if not found.duration_s <= _MAX_DURATION_S:
-        raise LogError(f"{path}: claims to last {found.duration_s:g} s; no episode is longer than {_MAX_DURATION_S:g} s")
+        raise LogError(
+            f"{path}: claims to last {found.duration_s:g} s; no episode is longer than {_MAX_DURATION_S:g} s"
+        )
     return found
 
 
 @contextlib.contextmanager
 def drawing(path: Path) -> Iterator[None]:
-    """Turn everything that a scenario or a message unlike ours can raise while it is drawn into a LogError."""
+    """Turn everything that a scenario or a message unlike ours can raise while it is drawn into a
+    LogError."""
     try:
         yield
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError, cv2.error) as error:
-        raise LogError(f"{path}: cannot be drawn ({error!r}); give a log that uuv eval --record wrote") from None
+        raise LogError(
+            f"{path}: cannot be drawn ({error!r}); give a log that uuv eval --record wrote"
+        ) from None
 
 
 def _check_scenario(path: Path, scenario: Any) -> None:
@@ -146,11 +158,19 @@ def _check_scenario(path: Path, scenario: Any) -> None:
         extents = [float(tank[axis][1]) - float(tank[axis][0]) for axis in ("x_m", "y_m")]
         if not all(0 < extent <= _MAX_EXTENT_M for extent in extents):
             raise ValueError(f"a tank of {extents[0]:g} x {extents[1]:g} m")
-        numbers = list(itertools.islice(_numbers([tank, bodies, scenario["goal"], scenario["start"]]), _MAX_NUMBERS + 1))
-        if len(numbers) > _MAX_NUMBERS or len(bodies) > _MAX_BODIES or not all(abs(number) <= _FARTHEST_M for number in numbers):
+        numbers = list(
+            itertools.islice(_numbers([tank, bodies, scenario["goal"], scenario["start"]]), _MAX_NUMBERS + 1)
+        )
+        if (
+            len(numbers) > _MAX_NUMBERS
+            or len(bodies) > _MAX_BODIES
+            or not all(abs(number) <= _FARTHEST_M for number in numbers)
+        ):
             raise ValueError("bodies beyond all bounds")
     except (KeyError, TypeError, ValueError, IndexError, OverflowError, RecursionError) as error:
-        raise LogError(f"{path}: its scenario.json cannot be drawn ({error!r}); give a log that uuv eval --record wrote") from None
+        raise LogError(
+            f"{path}: its scenario.json cannot be drawn ({error!r}); give a log that uuv eval --record wrote"
+        ) from None
 
 
 def _numbers(value: Any) -> Iterator[float]:

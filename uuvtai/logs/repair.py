@@ -34,19 +34,28 @@ MAX_DAMAGES = 100
 
 
 def repair(path: Path, out: Path | None = None, force: bool = False) -> Repair:
-    """Write every message that can still be read to ``out``, with indexes and summary; the input is never changed.
+    """Write every message that can still be read to ``out``, with indexes and summary; the input is never
+    changed.
 
-    Default for ``out``: NAME.repaired.mcap. The new file says in its metadata ``uuv.repair`` what was found. Raises LogError, also where
-    nothing at all can be recovered, and FileError where ``out`` is the input, or exists and ``force`` is not set.
+    Default for ``out``: NAME.repaired.mcap. The new file says in its metadata ``uuv.repair`` what was found.
+    Raises LogError, also where nothing at all can be recovered, and FileError where ``out`` is the input, or
+    exists and ``force`` is not set.
     """
     path = Path(path)
-    out = path.with_name(path.name.removesuffix(".part").removesuffix(".mcap") + ".repaired.mcap") if out is None else Path(out)
+    out = (
+        path.with_name(path.name.removesuffix(".part").removesuffix(".mcap") + ".repaired.mcap")
+        if out is None
+        else Path(out)
+    )
     with opened(path) as source:
         refuse_output(out, [path], force)
         try:
             return _copied(path, Scanner(source, str(path)), out)
         except OSError as error:
-            raise LogError(f"{out}: cannot write the repaired log ({error.strerror}); choose another place with --out FILE") from error
+            raise LogError(
+                f"{out}: cannot write the repaired log ({error.strerror}); choose another place with --out "
+                "FILE"
+            ) from error
 
 
 def _copied(path: Path, scanner: Scanner, out: Path) -> Repair:
@@ -59,10 +68,14 @@ def _copied(path: Path, scanner: Scanner, out: Path) -> Repair:
             copy.add(record)
         if not copy.messages:
             reason = damages.told[0] if damages.told else "it holds no messages"
-            raise LogError(f"{path}: nothing can be recovered: {reason}; record the episode again with uuv eval --record")
+            raise LogError(
+                f"{path}: nothing can be recovered: {reason}; record the episode again with uuv eval --record"
+            )
         told = damages.document()
         if told:
-            copy.file.add_metadata("uuv.repair", {"messages": str(copy.messages), "damages": json.dumps(told)})
+            copy.file.add_metadata(
+                "uuv.repair", {"messages": str(copy.messages), "damages": json.dumps(told)}
+            )
         copy.file.finish()
     except BaseException:
         copy.file.discard()
@@ -120,7 +133,9 @@ class _Copy:
             self._schemas[record.id] = self.file.add_schema(record.name, record.encoding, record.data)
         elif isinstance(record, Channel) and record.id not in self._channels:
             schema = self._schemas.get(record.schema_id, 0)
-            self._channels[record.id] = self.file.add_channel(record.topic, schema, record.message_encoding, record.metadata)
+            self._channels[record.id] = self.file.add_channel(
+                record.topic, schema, record.message_encoding, record.metadata
+            )
         elif isinstance(record, Message) and record.channel_id in self._channels:
             channel = self._channels[record.channel_id]
             self.file.add_message(channel, record.log_time, record.data, record.publish_time, record.sequence)

@@ -1,11 +1,12 @@
 """JSON schemas of every topic: the Foxglove messages that viewers know, and our own ``uuv.*``.
 
-The Foxglove messages follow https://docs.foxglove.dev/docs/sdk/schemas field by field, so that Foxglove, Lichtblick and PlotJuggler
-show them without a plug-in. Times are {sec, nsec} of simulation time; byte fields are base64.
+The Foxglove messages follow https://docs.foxglove.dev/docs/sdk/schemas field by field, so that Foxglove,
+Lichtblick and PlotJuggler show them without a plug-in. Times are {sec, nsec} of simulation time; byte fields
+are base64.
 
-Our own keep to what those viewers' JSON schema parsers accept: below ``properties`` every field has one plain type and lists hold numbers,
-strings or objects. A field that may be null has no plain type, so it stands under ``patternProperties``, which validators honour and
-viewers skip: they still show it.
+Our own keep to what those viewers' JSON schema parsers accept: below ``properties`` every field has one plain
+type and lists hold numbers, strings or objects. A field that may be null has no plain type, so it stands
+under ``patternProperties``, which validators honour and viewers skip: they still show it.
 """
 
 from __future__ import annotations
@@ -23,17 +24,29 @@ UINT: Schema = {"type": "integer", "minimum": 0}
 _NSEC: Schema = {"type": "integer", "minimum": 0, "maximum": 999_999_999}
 
 
-def record(title: str, description: str = "", nullable: Mapping[str, Schema] | None = None, /, **properties: Schema) -> Schema:
-    """Schema of an object that has all these properties, and perhaps more; those in ``nullable`` may be null."""
-    schema: Schema = {"title": title, "type": "object", "properties": properties, "required": [*properties, *(nullable or {})]}
+def record(
+    title: str, description: str = "", nullable: Mapping[str, Schema] | None = None, /, **properties: Schema
+) -> Schema:
+    """Schema of an object that has all these properties, and perhaps more; those in ``nullable`` may be
+    null."""
+    schema: Schema = {
+        "title": title,
+        "type": "object",
+        "properties": properties,
+        "required": [*properties, *(nullable or {})],
+    }
     if nullable:
-        schema["patternProperties"] = {f"^{name}$": {"anyOf": [inner, {"type": "null"}]} for name, inner in nullable.items()}
+        schema["patternProperties"] = {
+            f"^{name}$": {"anyOf": [inner, {"type": "null"}]} for name, inner in nullable.items()
+        }
     return {**schema, "description": description} if description else schema
 
 
 def array_of(items: Schema, length: int | None = None) -> Schema:
     """Schema of a list, of fixed length where one is given."""
-    return {"type": "array", "items": items} | ({} if length is None else {"minItems": length, "maxItems": length})
+    return {"type": "array", "items": items} | (
+        {} if length is None else {"minItems": length, "maxItems": length}
+    )
 
 
 def described(schema: Schema, text: str) -> Schema:
@@ -45,10 +58,14 @@ def _choice(title: str, **names: int) -> Schema:
     return {"title": title, "oneOf": [{"title": name, "const": value} for name, value in names.items()]}
 
 
-# -------------------------------------------------------------------------------------------------------------- Foxglove
+# --------------------------------------------------------------------------------------------------- Foxglove
 
 TIME: Schema = {"type": "object", "title": "time", "properties": {"sec": UINT, "nsec": _NSEC}}
-DURATION: Schema = {"type": "object", "title": "duration", "properties": {"sec": {"type": "integer"}, "nsec": _NSEC}}
+DURATION: Schema = {
+    "type": "object",
+    "title": "duration",
+    "properties": {"sec": {"type": "integer"}, "nsec": _NSEC},
+}
 VECTOR2 = record("foxglove.Vector2", x=NUMBER, y=NUMBER)
 VECTOR3 = record("foxglove.Vector3", x=NUMBER, y=NUMBER, z=NUMBER)
 POINT3 = record("foxglove.Point3", x=NUMBER, y=NUMBER, z=NUMBER)
@@ -92,7 +109,18 @@ PACKED_FIELD = record(
     "foxglove.PackedElementField",
     name=STRING,
     offset=UINT,
-    type=_choice("foxglove.NumericType", UNKNOWN=0, UINT8=1, INT8=2, UINT16=3, INT16=4, UINT32=5, INT32=6, FLOAT32=7, FLOAT64=8),
+    type=_choice(
+        "foxglove.NumericType",
+        UNKNOWN=0,
+        UINT8=1,
+        INT8=2,
+        UINT16=3,
+        INT16=4,
+        UINT32=5,
+        INT32=6,
+        FLOAT32=7,
+        FLOAT64=8,
+    ),
 )
 GRID = record(
     "foxglove.Grid",
@@ -143,7 +171,9 @@ _ARROW = record(
 )
 _CUBE = record("foxglove.CubePrimitive", pose=POSE, size=VECTOR3, color=COLOR)
 _SPHERE = record("foxglove.SpherePrimitive", pose=POSE, size=VECTOR3, color=COLOR)
-_CYLINDER = record("foxglove.CylinderPrimitive", pose=POSE, size=VECTOR3, bottom_scale=NUMBER, top_scale=NUMBER, color=COLOR)
+_CYLINDER = record(
+    "foxglove.CylinderPrimitive", pose=POSE, size=VECTOR3, bottom_scale=NUMBER, top_scale=NUMBER, color=COLOR
+)
 _TRIANGLES = record(
     "foxglove.TriangleListPrimitive",
     pose=POSE,
@@ -201,7 +231,7 @@ SCENE_UPDATE = record(
     entities=array_of(SCENE_ENTITY),
 )
 
-# ------------------------------------------------------------------------------------------------------------------- ours
+# ------------------------------------------------------------------------------------------------------- ours
 
 _THREE = array_of(NUMBER, 3)
 _FOUR = array_of(NUMBER, 4)
@@ -209,12 +239,18 @@ _FOUR = array_of(NUMBER, 4)
 SONAR_DOPPLER = record(
     "uuv.SonarDoppler",
     timestamp=described(TIME, "when the ping was taken"),
-    velocity=described(array_of(NUMBER), "[m/s] how fast what a beam met recedes, own motion included; 0 where nothing returned"),
-    own_velocity=described(_THREE, "[m/s] own velocity in the body frame as measured when the ping was taken"),
+    velocity=described(
+        array_of(NUMBER),
+        "[m/s] how fast what a beam met recedes, own motion included; 0 where nothing returned",
+    ),
+    own_velocity=described(
+        _THREE, "[m/s] own velocity in the body frame as measured when the ping was taken"
+    ),
 )
 DEPTH_LINE = record(
     "uuv.DepthLine",
-    "What the camera tells the map: per image column the nearest pixel at the vehicle's own depth; columns without one are left out.",
+    "What the camera tells the map: per image column the nearest pixel at the vehicle's own depth; columns "
+    "without one are left out.",
     timestamp=described(TIME, "when the image was taken"),
     column=described(array_of(UINT), "0 = left"),
     row=described(array_of(UINT), "0 = top"),

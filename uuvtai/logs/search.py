@@ -1,4 +1,5 @@
-"""Where the next whole chunk of a damaged log begins: lengths that lie cannot be followed, so its bytes are searched."""
+"""Where the next whole chunk of a damaged log begins: lengths that lie cannot be followed, so its bytes are
+searched."""
 
 from __future__ import annotations
 
@@ -10,7 +11,8 @@ from mcap.opcode import Opcode
 from uuvtai.logs.container import CHUNK_HEAD
 
 _HEAD = struct.Struct("<BQQQQII4sQ")
-"""opcode, record length, first and last time, size, CRC, length and name of the compression, length of the data"""
+"""opcode, record length, first and last time, size, CRC, length and name of the compression, length of the
+data"""
 _MARK = struct.pack("<I4s", 4, b"zstd")
 _MARK_AT = 37
 """[bytes] from the beginning of a chunk record to the mark"""
@@ -18,7 +20,8 @@ _BLOCK = 1 << 20
 
 
 def next_chunk(file: BinaryIO, start: int, size: int) -> int | None:
-    """Place of the first zstd chunk at or behind ``start`` that fits the file of ``size`` bytes and whose two lengths agree; or None."""
+    """Place of the first zstd chunk at or behind ``start`` that fits the file of ``size`` bytes and whose two
+    lengths agree; or None."""
     at = start + _MARK_AT
     while at < size:
         file.seek(at)
@@ -34,7 +37,8 @@ def next_chunk(file: BinaryIO, start: int, size: int) -> int | None:
 
 
 def true_length(file: BinaryIO, place: int, size: int) -> int | None:
-    """Length that a chunk record at ``place`` should have by the length of its data; None where no zstd chunk begins or it does not fit."""
+    """Length that a chunk record at ``place`` should have by the length of its data; None where no zstd chunk
+    begins or it does not fit."""
     head = _head(file, place)
     if head is None:
         return None

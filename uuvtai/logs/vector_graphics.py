@@ -1,4 +1,5 @@
-"""The canvas of PDF and SVG: the shapes of ``Canvas`` as paths and text, maps as embedded images. Imports matplotlib."""
+"""The canvas of PDF and SVG: the shapes of ``Canvas`` as paths and text, maps as embedded images. Imports
+matplotlib."""
 
 from __future__ import annotations
 
@@ -40,7 +41,9 @@ class VectorCanvas(Canvas):
 
     def begin(self) -> None:
         with _style():
-            self._figure = Figure(figsize=(self.size[0] / _DPI, self.size[1] / _DPI), dpi=_DPI, facecolor=_code(PAPER))
+            self._figure = Figure(
+                figsize=(self.size[0] / _DPI, self.size[1] / _DPI), dpi=_DPI, facecolor=_code(PAPER)
+            )
             self._axes = self._figure.add_axes((0.0, 0.0, 1.0, 1.0))
             self._axes.set_axis_off()
             self._axes.set(xlim=(0, self.size[0]), ylim=(self.size[1], 0))
@@ -56,13 +59,24 @@ class VectorCanvas(Canvas):
 
     def strip(self, pixels: Any, color: Color, width: int = 2, closed: bool = False) -> None:
         at = np.asarray(pixels, float)
-        self._add(Shape(np.vstack([at, at[:1]]) if closed else at, closed=closed), edgecolor=_code(color), fill=False, **_pen(width))
-
-    def dot(self, pixel: Sequence[float] | np.ndarray, radius_px: float, color: Color, width: int = -1) -> None:
-        look: dict[str, Any] = (
-            {"facecolor": _code(color), "edgecolor": "none"} if width < 0 else {"edgecolor": _code(color), "fill": False, **_pen(width)}
+        self._add(
+            Shape(np.vstack([at, at[:1]]) if closed else at, closed=closed),
+            edgecolor=_code(color),
+            fill=False,
+            **_pen(width),
         )
-        self._axes.add_patch(Circle((float(pixel[0]), float(pixel[1])), radius_px, zorder=self._above(), **look))
+
+    def dot(
+        self, pixel: Sequence[float] | np.ndarray, radius_px: float, color: Color, width: int = -1
+    ) -> None:
+        look: dict[str, Any] = (
+            {"facecolor": _code(color), "edgecolor": "none"}
+            if width < 0
+            else {"edgecolor": _code(color), "fill": False, **_pen(width)}
+        )
+        self._axes.add_patch(
+            Circle((float(pixel[0]), float(pixel[1])), radius_px, zorder=self._above(), **look)
+        )
 
     def filled(self, pixels: np.ndarray, color: Color, hole: np.ndarray | None = None) -> None:
         rings = [pixels] if hole is None else [_turning(pixels, 1), _turning(hole, -1)]
@@ -72,16 +86,21 @@ class VectorCanvas(Canvas):
     def paste(self, corner: tuple[int, int], colors: np.ndarray) -> None:
         height, width = colors.shape[:2]
         extent = (corner[0], corner[0] + width, corner[1] + height, corner[1])
-        self._axes.imshow(colors[..., ::-1], extent=extent, interpolation="none", aspect="auto", zorder=self._above())
+        self._axes.imshow(
+            colors[..., ::-1], extent=extent, interpolation="none", aspect="auto", zorder=self._above()
+        )
         self._keep_view()
 
-    def cells(self, colors: np.ndarray, opacity: np.ndarray, origin_m: Sequence[float], cell_m: float) -> None:
+    def cells(
+        self, colors: np.ndarray, opacity: np.ndarray, origin_m: Sequence[float], cell_m: float
+    ) -> None:
         rows, cols = opacity.shape
         end = (origin_m[0] + cols * cell_m, origin_m[1] + rows * cell_m)
         (left, bottom), (right, top) = self.pixels([origin_m[:2], end])
         ink = np.broadcast_to(np.asarray(colors, float), (rows, cols, 3))[..., ::-1] / 255.0
         image = self._axes.imshow(
-            np.dstack([ink, np.clip(opacity, 0.0, 1.0)]), extent=(left, right, bottom, top), origin="lower", interpolation="none",
+            np.dstack([ink, np.clip(opacity, 0.0, 1.0)]), extent=(left, right, bottom, top), origin="lower",
+            interpolation="none",
             aspect="auto", zorder=self._above(),
         )  # fmt: skip
         (x0, y0), (x1, y1) = self.area_pixels()
@@ -89,12 +108,27 @@ class VectorCanvas(Canvas):
         self._keep_view()
 
     def text(
-        self, place: tuple[float, float], text: str, size: int = 16, color: Color = INK, bold: bool = False, align: str = "left"
+        self,
+        place: tuple[float, float],
+        text: str,
+        size: int = 16,
+        color: Color = INK,
+        bold: bool = False,
+        align: str = "left",
     ) -> int:
         with _style():
-            font = FontProperties(family="DejaVu Sans", weight="bold" if bold else "normal", size=_TEXT * size * _POINTS)
+            font = FontProperties(
+                family="DejaVu Sans", weight="bold" if bold else "normal", size=_TEXT * size * _POINTS
+            )
             self._axes.text(
-                place[0], place[1], text, color=_code(color), fontproperties=font, ha=align, va="baseline", zorder=self._above()
+                place[0],
+                place[1],
+                text,
+                color=_code(color),
+                fontproperties=font,
+                ha=align,
+                va="baseline",
+                zorder=self._above(),
             )
             width, _, _ = TextToPath().get_text_width_height_descent(text, font, ismath=False)
         return round(width / _POINTS)

@@ -1,4 +1,5 @@
-"""Top-down video of an episode: what the vehicle senses, maps, plans and does, with the truth as thin lines."""
+"""Top-down video of an episode: what the vehicle senses, maps, plans and does, with the truth as thin
+lines."""
 
 from __future__ import annotations
 
@@ -11,7 +12,21 @@ from typing import Any
 import cv2
 import numpy as np
 
-from uuvtai.logs.canvas import DYNAMIC, FAILED, FAINT, GOAL, GREY, INK, MOVER, PAPER, ROUTE, STATIC, Color, bgr, method_inks
+from uuvtai.logs.canvas import (
+    DYNAMIC,
+    FAILED,
+    FAINT,
+    GOAL,
+    GREY,
+    INK,
+    MOVER,
+    PAPER,
+    ROUTE,
+    STATIC,
+    Color,
+    bgr,
+    method_inks,
+)
 from uuvtai.logs.log_errors import LogError, checked_suffix
 from uuvtai.logs.painting import (
     map_canvas,
@@ -29,7 +44,12 @@ _MARGINS = (52, 28, 84, 212)
 _PANEL = 160
 """[px] height of the panel below the map"""
 _ECHO, _GOOD = bgr("#0b7a75"), bgr("#2b8a3e")
-_TRIGGER_COLORS = {"initial": GREY, "stuck": bgr("#ae3ec9"), "safety": bgr("#e8590c"), "intersection": bgr("#1971c2")}
+_TRIGGER_COLORS = {
+    "initial": GREY,
+    "stuck": bgr("#ae3ec9"),
+    "safety": bgr("#e8590c"),
+    "intersection": bgr("#1971c2"),
+}
 _LEGEND = (
     (ROUTE, "route"),
     (_ECHO, "sonar"),
@@ -50,7 +70,8 @@ SMALL: dict[str, Any] = {"width_px": 960, "speed": 2.0}
 """what a run folder holds, so that several fit a page: some 40 kB per second of the episode"""
 _MOST_FRAMES = 100_000
 _FEW_FRAMES, _FRAMES_PER_POSE = 1000, 10
-"""a small file must not cost minutes: beyond so many frames a log has to hold something new for them (ours hold 50 poses a second)"""
+"""a small file must not cost minutes: beyond so many frames a log has to hold something new for them (ours
+hold 50 poses a second)"""
 
 Progress = Callable[[int, int], None]
 """Called with (frames done, frames in all)."""
@@ -66,10 +87,12 @@ def video(
     remark: str = "",
     methods: Sequence[str] = (),
 ) -> Path:
-    """Render a log as WebM, MP4 or GIF, as the name of ``out`` ends; ``width_px`` and ``fps`` default to what ``FORMATS`` says of it.
+    """Render a log as WebM, MP4 or GIF, as the name of ``out`` ends; ``width_px`` and ``fps`` default to what
+    ``FORMATS`` says of it.
 
-    ``speed`` 2 shows it twice as fast as it was, ``remark`` stands beside the title; ``methods``: all that are compared with each other,
-    in order, so that each has the colour of the picture of them all. Raises LogError; the file appears whole or not at all.
+    ``speed`` 2 shows it twice as fast as it was, ``remark`` stands beside the title; ``methods``: all that
+    are compared with each other, in order, so that each has the colour of the picture of them all. Raises
+    LogError; the file appears whole or not at all.
     """
     out = Path(out)
     suffix = checked_suffix(out, tuple(FORMATS), "video")
@@ -90,7 +113,9 @@ def video(
         check_whole(part, n_frames, out)
         os.replace(part, out)
     except OSError as error:
-        raise LogError(f"{out}: cannot write the video ({error.strerror}); choose another place with --out FILE") from error
+        raise LogError(
+            f"{out}: cannot write the video ({error.strerror}); choose another place with --out FILE"
+        ) from error
     finally:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
@@ -98,26 +123,37 @@ def video(
 
 
 def _check(width_px: int, fps: float, speed: float) -> None:
-    for name, value, (least, most) in (("--width", width_px, WIDTHS), ("--fps", fps, FPS), ("--speed", speed, SPEEDS)):
+    for name, value, (least, most) in (
+        ("--width", width_px, WIDTHS),
+        ("--fps", fps, FPS),
+        ("--speed", speed, SPEEDS),
+    ):
         if not least <= value <= most:
             raise LogError(f"{name} {value:g}: must be from {least:g} to {most:g}")
 
 
 def frame_times(recording: Recording, fps: float, speed: float) -> np.ndarray:
-    """Moments [s] of the frames; the last one stays for a while. Raises LogError for more frames than anybody waits for."""
+    """Moments [s] of the frames; the last one stays for a while. Raises LogError for more frames than anybody
+    waits for."""
     n_frames = recording.duration_s * fps / speed
     if n_frames > _MOST_FRAMES:
-        raise LogError(f"{recording.path}: {n_frames:,.0f} frames, more than {_MOST_FRAMES:,}; raise --speed or lower --fps")
+        raise LogError(
+            f"{recording.path}: {n_frames:,.0f} frames, more than {_MOST_FRAMES:,}; raise --speed or lower "
+            "--fps"
+        )
     poses = len(recording.pose.times)
     if n_frames > _FEW_FRAMES and n_frames > _FRAMES_PER_POSE * poses:
         raise LogError(
-            f"{recording.path}: {poses} poses in {recording.duration_s:,.0f} s are no episode to watch; raise --speed or lower --fps"
+            f"{recording.path}: {poses} poses in {recording.duration_s:,.0f} s are no episode to watch; "
+            "raise --speed or lower --fps"
         )
     times = np.arange(0.0, recording.duration_s, speed / fps)
     return np.concatenate([times, np.full(1 + round(_HOLD_S * fps), recording.duration_s)])
 
 
-def _frames(artist: FrameArtist, times: np.ndarray, width_px: int, progress: Progress | None) -> Iterator[np.ndarray]:
+def _frames(
+    artist: FrameArtist, times: np.ndarray, width_px: int, progress: Progress | None
+) -> Iterator[np.ndarray]:
     for i, time_s in enumerate(times):
         with drawing(artist.recording.path):
             frame = _sized(artist.frame(float(time_s)), width_px)
@@ -130,13 +166,19 @@ def _sized(frame: np.ndarray, width_px: int) -> np.ndarray:
     """The frame in this width (one less where that is odd), with an even height, as the codecs want it."""
     height, width = frame.shape[:2]
     wanted = width_px - width_px % 2
-    return frame if wanted == width else cv2.resize(frame, (wanted, 2 * round(height * wanted / width / 2)), interpolation=cv2.INTER_AREA)
+    return (
+        frame
+        if wanted == width
+        else cv2.resize(frame, (wanted, 2 * round(height * wanted / width / 2)), interpolation=cv2.INTER_AREA)
+    )
 
 
 class FrameArtist:
     """Draws the frame of any moment of a recording; what stays between two maps is drawn once."""
 
-    def __init__(self, recording: Recording, width_px: int = 1280, remark: str = "", methods: Sequence[str] = ()) -> None:
+    def __init__(
+        self, recording: Recording, width_px: int = 1280, remark: str = "", methods: Sequence[str] = ()
+    ) -> None:
         self.recording, self.remark = recording, remark
         self._ink = method_inks([*methods, recording.method])[recording.method]
         self._canvas = map_canvas(recording.scenario["tank"], width_px - width_px % 2, _MARGINS)
@@ -171,7 +213,9 @@ class FrameArtist:
         return canvas.image
 
     def _background(self, time_s: float) -> np.ndarray:
-        layers = [series.at(time_s) for name in ("static", "dynamic") if (series := self.recording.layers.get(name))]
+        layers = [
+            series.at(time_s) for name in ("static", "dynamic") if (series := self.recording.layers.get(name))
+        ]
         static, dynamic = layers if len(layers) == 2 else (None, None)
         key = static.time_s if static else -1.0
         if key != self._base_time:
@@ -186,7 +230,11 @@ class FrameArtist:
         return self._base
 
     def _paint_plan(self, time_s: float) -> None:
-        canvas, route, ahead = self._canvas, self.recording.route.at(time_s), self.recording.lookahead.at(time_s)
+        canvas, route, ahead = (
+            self._canvas,
+            self.recording.route.at(time_s),
+            self.recording.lookahead.at(time_s),
+        )
         if route is not None and len(route) > 1:
             canvas.line(route, PAPER, 5)
             canvas.line(route, ROUTE, 2)
@@ -202,11 +250,17 @@ class FrameArtist:
         ranges, hit, ping_s = scan
         x, y, _, yaw = self.recording.pose.at(ping_s) or self._track[0]
         bearing = yaw + 2 * np.pi * np.arange(len(ranges)) / len(ranges)
-        for echo in (np.array([x, y]) + ranges[:, None] * np.column_stack([np.cos(bearing), np.sin(bearing)]))[hit]:
+        for echo in (
+            np.array([x, y]) + ranges[:, None] * np.column_stack([np.cos(bearing), np.sin(bearing)])
+        )[hit]:
             self._canvas.disc(echo, 2.4, _ECHO)
 
     def _paint_goal(self) -> None:
-        canvas, goal, radius = self._canvas, self.recording.scenario["goal"], self.recording.scenario["goal_radius_m"]
+        canvas, goal, radius = (
+            self._canvas,
+            self.recording.scenario["goal"],
+            self.recording.scenario["goal_radius_m"],
+        )
         angles = np.linspace(0, 2 * np.pi, 72)
         canvas.dashes(np.array(goal[:2]) + radius * np.column_stack([np.cos(angles), np.sin(angles)]), INK, 1)
         canvas.star(goal, 14)
@@ -214,17 +268,27 @@ class FrameArtist:
     def _paint_head(self, time_s: float) -> None:
         canvas, recording, scenario = self._canvas, self.recording, self.recording.scenario
         width = canvas.image.shape[1]
-        title = f"{recording.method} · {scenario['world']} · seed {scenario['seed']} · episode {scenario['episode']}"
+        title = (
+            f"{recording.method} · {scenario['world']} · seed {scenario['seed']} · episode "
+            f"{scenario['episode']}"
+        )
         end = 24 + canvas.text((24, 34), title, 22, INK, bold=True)
         canvas.text((end + 20, 34), self.remark, 17, FAILED)
         moving = f", {scenario['D']} moving at {scenario['v_m_s']:g} m/s" if scenario["D"] else ""
-        canvas.text((24, 60), f"{scenario['S']} resting obstacles{moving}; dashed while wholly above or below the vehicle", 16, GREY)
+        canvas.text(
+            (24, 60),
+            f"{scenario['S']} resting obstacles{moving}; dashed while wholly above or below the vehicle",
+            16,
+            GREY,
+        )
         canvas.text((width - 28, 36), f"{time_s:5.1f} s", 26, INK, bold=True, align="right")
         if time_s >= recording.duration_s:
             good = recording.outcome == "success"
-            canvas.text((width - 150, 36), recording.ending, 24, _GOOD if good else FAILED, bold=True, align="right")
+            canvas.text(
+                (width - 150, 36), recording.ending, 24, _GOOD if good else FAILED, bold=True, align="right"
+            )
 
-    # --------------------------------------------------------------------------------------------------------- panel below
+    # -------------------------------------------------------------------------------------------- panel below
 
     def _paint_panel(self, time_s: float, i: int) -> None:
         canvas, recording = self._canvas, self.recording
@@ -233,8 +297,16 @@ class FrameArtist:
         speed = recording.speed.at(time_s)
         clearance = None if safety is None else safety[0]
         near = clearance is not None and clearance < 0.3
-        self._figure(24, top, "clearance", "-" if clearance is None else f"{clearance:.2f} m", FAILED if near else INK)
-        self._figure(164, top, "time to collision", "-" if not safety or safety[1] is None else f"{safety[1]:.1f} s", INK)
+        self._figure(
+            24, top, "clearance", "-" if clearance is None else f"{clearance:.2f} m", FAILED if near else INK
+        )
+        self._figure(
+            164,
+            top,
+            "time to collision",
+            "-" if not safety or safety[1] is None else f"{safety[1]:.1f} s",
+            INK,
+        )
         self._figure(320, top, "speed", "-" if speed is None else f"{speed:.2f} m/s", INK)
         canvas.text((24, top + 86), "tree", 15, GREY)
         canvas.text((24, top + 112), leaf or "-", 21, INK, bold=True)
@@ -275,7 +347,9 @@ class FrameArtist:
         if len(curve):
             canvas.dot(curve[min(i, len(curve) - 1)], 4, self._ink)
 
-    def _paint_replans(self, place: Callable[[np.ndarray, np.ndarray], np.ndarray], time_s: float, low: int) -> None:
+    def _paint_replans(
+        self, place: Callable[[np.ndarray, np.ndarray], np.ndarray], time_s: float, low: int
+    ) -> None:
         canvas, x = self._canvas, 700.0
         for name, color in _TRIGGER_COLORS.items():
             count = sum(trigger == name and at <= time_s for at, trigger in self.recording.replans)
@@ -285,4 +359,11 @@ class FrameArtist:
         for at, trigger in self.recording.replans:
             if at <= time_s:
                 px = round(float(place(np.array([at]), np.zeros(1))[0, 0]))
-                cv2.line(canvas.image, (px, low), (px, low - 12), _TRIGGER_COLORS.get(trigger, GREY), 2, cv2.LINE_AA)
+                cv2.line(
+                    canvas.image,
+                    (px, low),
+                    (px, low - 12),
+                    _TRIGGER_COLORS.get(trigger, GREY),
+                    2,
+                    cv2.LINE_AA,
+                )

@@ -1,8 +1,10 @@
-"""Why an episode failed: one label from the facts of its last seconds, and remarks. Pure NumPy, nothing runs here.
+"""Why an episode failed: one label from the facts of its last seconds, and remarks. Pure NumPy, nothing runs
+here.
 
-Every failed episode gets exactly one label, the first of ``CAUSES`` whose condition holds. The order asks what a developer would ask:
-was there a chance at all, did the vehicle *know* of what killed it (sensing, tracking, forecast: the first half), and if it did, what
-did the pilot make of it (the second half). Remarks add what may have contributed; any number of them may hold.
+Every failed episode gets exactly one label, the first of ``CAUSES`` whose condition holds. The order asks
+what a developer would ask: was there a chance at all, did the vehicle *know* of what killed it (sensing,
+tracking, forecast: the first half), and if it did, what did the pilot make of it (the second half). Remarks
+add what may have contributed; any number of them may hold.
 """
 
 from __future__ import annotations
@@ -16,24 +18,29 @@ from uuvtai.measure.facts import LAST_S, LEAD_S, Killer, Scene, killer_facts, ti
 from uuvtai.measure.history import Bodies, History
 
 START_S = 2.0
-"""A younger episode starts in danger: track, forecast and evasion take about a second, and bodies start 1.5 m away."""
+"""A younger episode starts in danger: track, forecast and evasion take about a second, and bodies start 1.5 m
+away."""
 UNSEEN_S = 0.3
-"""Unseen: out of the sonar's vertical fan all through this time before the end (the design's measure: no track 0.3 s before)."""
+"""Unseen: out of the sonar's vertical fan all through this time before the end (the design's measure: no
+track 0.3 s before)."""
 TURN_S = 1.2
-"""An unannounced turn lies within this before the end (7-methods.md), and the forecast made just before it was off by more than
-MISS_M at the end, or there was none."""
+"""An unannounced turn lies within this before the end (7-methods.md), and the forecast made just before it
+was off by more than MISS_M at the end, or there was none."""
 CLEAR_M = 0.1
-"""A body that is remembered farther above or below than this counts as clear of the own depth (what the referee calls contact)."""
+"""A body that is remembered farther above or below than this counts as clear of the own depth (what the
+referee calls contact)."""
 LATELY_S = 2.5
 """Remarks look back this far."""
 MISS_M = 0.35
 """A forecast missed when it was farther off than the pilot's margin at one second (0.25 m + 0.1 m/s)."""
 REACH_M = 0.4
-"""Squeezed: something static is nearer to the hull at the end: no room to give way (hull 0.17 m + contact 0.1 m + margin)."""
+"""Squeezed: something static is nearer to the hull at the end: no room to give way (hull 0.17 m + contact 0.1
+m + margin)."""
 CROWD_M = 0.6
 """Crowded: a second moving body came nearer to the hull in the last CROWD_S."""
 NEAR_M = 1.0
-"""Contact with something static is no accident of its own when a moving body came this near to the hull in the last NEAR_S."""
+"""Contact with something static is no accident of its own when a moving body came this near to the hull in
+the last NEAR_S."""
 PROGRESS_M = 1.0
 """A timeout that came this much nearer to the goal in that time was only slow."""
 STUCK_M = 0.5
@@ -43,13 +50,15 @@ CAUSES: dict[str, str] = {
     "out_of_tank": "left the tank",
     "hit_floor": "touched the floor",
     "hit_surface": "touched the surface",
-    "pushed_into_static": f"touched a static or wall while evading, or with a moving body within {NEAR_M:g} m",
+    "pushed_into_static": f"touched a static or wall while evading, or with a moving body within {NEAR_M:g} "
+    "m",
     "hit_static": "touched a static obstacle, no moving body near",
     "hit_wall": "touched a side wall, no moving body near",
     "start_in_danger": f"killed in the first {START_S:g} s",
     "unseen_above": f"killer above the sonar's fan all through the last {UNSEEN_S:g} s",
     "unseen_below": f"killer below the sonar's fan all through the last {UNSEEN_S:g} s",
-    "unannounced_turn": f"killer turned a corner in the last {TURN_S:g} s and the forecast before it was wrong",
+    "unannounced_turn": f"killer turned a corner in the last {TURN_S:g} s and the forecast before it was "
+    "wrong",
     "seen_late": f"killer came into the sonar's fan less than {LEAD_S:g} s before the end",
     "hidden": f"killer was behind something else until {LEAD_S:g} s before the end",
     "untracked": f"killer seen, but no forecast of it {LEAD_S:g} s before the end",
@@ -68,7 +77,8 @@ CAUSES: dict[str, str] = {
     "stuck": f"timeout: drove < {STUCK_M:g} m in the last {LAST_S:g} s",
     "circling": f"timeout: drove on without coming nearer in the last {LAST_S:g} s",
 }
-"""Every label with its meaning, in order of precedence (forecasts are judged LEAD_S before the end, escapes too)."""
+"""Every label with its meaning, in order of precedence (forecasts are judged LEAD_S before the end, escapes
+too)."""
 
 
 Fact = dict[str, Any]
@@ -77,14 +87,19 @@ REMARKS: dict[str, Callable[[Fact], bool]] = {
     "second body near": lambda f: _within(f["second_body_m"], CROWD_M),
     "static near": lambda f: f["static_near_m"] < REACH_M,
     "turned lately": lambda f: _within(f["turned_ago_s"], LATELY_S),
-    "corner passed in reach before": lambda f: _within(f["turned_ago_s"], TURN_S) and bool(f["turns_in_reach_before"]),
+    "corner passed in reach before": lambda f: (
+        _within(f["turned_ago_s"], TURN_S) and bool(f["turns_in_reach_before"])
+    ),
     "remembered to the end": lambda f: _is_unseen(f) and f["belief_error_m"] is not None,
     "remembered clear of the own depth": lambda f: _is_unseen(f) and (f["believed_gap_m"] or 0.0) > CLEAR_M,
     "taken as static": lambda f: _within(f["taken_as_static_ago_s"], LATELY_S),
-    "backed off before the last chance": lambda f: f["leaf"] == "BackOff" and f["leaf_s"] > (f["last_chance_s"] or 0.0),
+    "backed off before the last chance": lambda f: (
+        f["leaf"] == "BackOff" and f["leaf_s"] > (f["last_chance_s"] or 0.0)
+    ),
     "only heave escaped": lambda f: not f["escapes"] and bool(f["escapes_by_heave"]),
 }
-"""What may have contributed, where the killer moves. "Corner passed in reach before": the turn could have been learnt."""
+"""What may have contributed, where the killer moves. "Corner passed in reach before": the turn could have
+been learnt."""
 
 _IMPLIED = {
     ("unannounced_turn", "turned lately"),
@@ -123,7 +138,7 @@ def explain(outcome: str, history: History, bodies: Bodies, config: Config) -> E
     return Explanation(label, killer, facts, remarks)
 
 
-# -------------------------------------------------------------------------------------------------------------------- labels
+# ----------------------------------------------------------------------------------------------------- labels
 
 
 def label_of(outcome: str, killer: Killer, facts: Fact) -> str:
@@ -147,7 +162,13 @@ def _knowledge_label(facts: Fact) -> str | None:
     if _within(facts["turned_ago_s"], TURN_S) and not _within(facts["turn_error_m"], MISS_M):
         return "unannounced_turn"
     if facts["forecast_error_m"] is None:
-        return "seen_late" if facts["fan_share"] < 0.5 else "hidden" if facts["seen_share"] < 0.5 else "untracked"
+        return (
+            "seen_late"
+            if facts["fan_share"] < 0.5
+            else "hidden"
+            if facts["seen_share"] < 0.5
+            else "untracked"
+        )
     if facts["forecast_error_m"] > MISS_M:
         return "curving" if facts["circle_m"] else "forecast_missed"
     return None

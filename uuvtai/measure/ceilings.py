@@ -1,4 +1,5 @@
-"""Privileged yardsticks beside the methods: the oracle's row of the table; threat rate and detection distance of the condition."""
+"""Privileged yardsticks beside the methods: the oracle's row of the table; threat rate and detection distance
+of the condition."""
 
 from __future__ import annotations
 
@@ -21,7 +22,13 @@ from uuvtai.privileged.oracle import earliest_arrival
 from uuvtai.scenario import describe_scenario
 from uuvtai.sim import Sim
 
-_UNKNOWN = ("return_mean", "min_clearance_mean_m", "path_length_mean_m", "replans_per_episode", "env_steps_per_s")
+_UNKNOWN = (
+    "return_mean",
+    "min_clearance_mean_m",
+    "path_length_mean_m",
+    "replans_per_episode",
+    "env_steps_per_s",
+)
 """What the oracle does not tell: it drives no vehicle."""
 
 _UNKNOWN_OF_EPISODE = ("return", "min_clearance_m", "path_length_m", "replans")
@@ -29,7 +36,11 @@ _UNKNOWN_OF_EPISODE = ("return", "min_clearance_m", "path_length_m", "replans")
 
 def scenarios_of(sim: Sim, jobs: list[Job]) -> list[dict[str, Any]]:
     """``describe_scenario``'s document of every job. No row of the simulator runs afterwards."""
-    found = [scenario for first in range(0, len(jobs), sim.num_envs) for scenario in _drawn(sim, jobs[first : first + sim.num_envs])]
+    found = [
+        scenario
+        for first in range(0, len(jobs), sim.num_envs)
+        for scenario in _drawn(sim, jobs[first : first + sim.num_envs])
+    ]
     sim.sleep()
     return found
 
@@ -50,8 +61,11 @@ def _drawn(sim: Sim, jobs: list[Job]) -> Iterator[dict[str, Any]]:
         yield describe_scenario(values, sim.s.world, sim.s.path, sim.s.mission)
 
 
-def oracle_entry(config: Config, jobs: list[Job], scenarios: list[dict[str, Any]], progress: Progress | None = None) -> dict[str, Any]:
-    """The oracle's entry of ``uuv eval --json``: success with the earliest arrival, or timeout, which here means "not reachable"."""
+def oracle_entry(
+    config: Config, jobs: list[Job], scenarios: list[dict[str, Any]], progress: Progress | None = None
+) -> dict[str, Any]:
+    """The oracle's entry of ``uuv eval --json``: success with the earliest arrival, or timeout, which here
+    means "not reachable"."""
     begun, results = time.perf_counter(), []
     for job, scenario in zip(jobs, scenarios, strict=True):
         results.append(_result(job, earliest_arrival(scenario, config).time_s, config))
@@ -83,8 +97,9 @@ def _result(job: Job, time_s: float | None, config: Config) -> EpisodeResult:
 def condition_of(config: Config, scenarios: list[dict[str, Any]]) -> dict[str, Any]:
     """How hard the condition is, from the truth: ``condition`` of ``uuv eval --json``.
 
-    The threat rate is the number of moving bodies per minute that come within the collision clearance of a vehicle that rides the straight
-    line from start to goal at cruise speed and does not look (``privileged.blind_ride``), over all these scenarios.
+    The threat rate is the number of moving bodies per minute that come within the collision clearance of a
+    vehicle that rides the straight line from start to goal at cruise speed and does not look
+    (``privileged.blind_ride``), over all these scenarios.
     """
     rides = [ride_blindly(scenario, config) for scenario in scenarios]
     threats, minutes = sum(ride.threats for ride in rides), sum(ride.time_s for ride in rides) / 60.0
@@ -104,11 +119,13 @@ def condition_of(config: Config, scenarios: list[dict[str, Any]]) -> dict[str, A
 
 
 def remainder_of(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """What each method lacks of 100 %, split: ``remainder`` of ``uuv eval --json``, for methods whose ``+truth`` and the oracle are there.
+    """What each method lacks of 100 %, split: ``remainder`` of ``uuv eval --json``, for methods whose
+    ``+truth`` and the oracle are there.
 
-    Episodes, as differences of successes that add up to ``missed``: sensing = with the true tracks less without, forecast_decision = the
-    oracle's less that (with the vehicle's inertia, which the oracle has not), physics = what the oracle cannot reach either. A part may be
-    negative where knowing more did not help; ``lost_with_truth`` counts the episodes that the method won and its ``+truth`` did not.
+    Episodes, as differences of successes that add up to ``missed``: sensing = with the true tracks less
+    without, forecast_decision = the oracle's less that (with the vehicle's inertia, which the oracle has
+    not), physics = what the oracle cannot reach either. A part may be negative where knowing more did not
+    help; ``lost_with_truth`` counts the episodes that the method won and its ``+truth`` did not.
     """
     won = {entry["name"]: _won(entry) for entry in entries}
     if ORACLE not in won:
@@ -130,4 +147,8 @@ def remainder_of(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _won(entry: dict[str, Any]) -> set[tuple[int, int]]:
-    return {(detail["seed"], detail["episode"]) for detail in entry["episodes_detail"] if detail["outcome"] == "success"}
+    return {
+        (detail["seed"], detail["episode"])
+        for detail in entry["episodes_detail"]
+        if detail["outcome"] == "success"
+    }

@@ -1,4 +1,5 @@
-"""Compare controllers and trained policies on paired scenarios in one run folder: results, logs, pictures, videos."""
+"""Compare controllers and trained policies on paired scenarios in one run folder: results, logs, pictures,
+videos."""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ if TYPE_CHECKING:
     """by the stack that drives; None = the request's own"""
 
 _BATCH = 256
-"""Episodes played together by default: enough to fill the cores, few enough that the last stragglers cost little."""
+"""Episodes played together by default: enough to fill the cores, few enough that the last stragglers cost
+little."""
 
 _STARTING = "starting {} envs (sizes not used before compile their kernels first, about half a minute)"
 
@@ -55,13 +57,18 @@ class _Played:
 def compare(request: Request, watch: EvaluationWatch) -> tuple[dict[str, Any], Path]:
     """Play every method's episodes; the ``uuv eval --json`` document and the run folder.
 
-    Everything that can be refused is refused before anything is written. Raises ConfigError, ValueError, MemoryError, RunFolderError,
-    CheckpointError.
+    Everything that can be refused is refused before anything is written. Raises ConfigError, ValueError,
+    MemoryError, RunFolderError, CheckpointError.
     """
     if request.num_envs is not None and request.num_envs < 1:
-        raise SettingError(f"--num-envs {request.num_envs}: at least 1 env is needed, for example --num-envs 64")
+        raise SettingError(
+            f"--num-envs {request.num_envs}: at least 1 env is needed, for example --num-envs 64"
+        )
     if len(set(request.seeds)) != len(request.seeds):
-        raise ConfigError(f"--seeds {','.join(map(str, request.seeds))}: a seed is given twice; its episodes would be the same")
+        raise ConfigError(
+            f"--seeds {','.join(map(str, request.seeds))}: a seed is given twice; its episodes would be the "
+            "same"
+        )
     refuse_place(request.run_dir)
     methods = _methods(request, watch)
     num_envs = request.num_envs or min(len(request.seeds) * request.episodes, _BATCH)
@@ -70,15 +77,17 @@ def compare(request: Request, watch: EvaluationWatch) -> tuple[dict[str, Any], P
     policies = {method.name: method.driver_for(sims[method.stack]) for method in methods}
     folder = RunFolder(request.run_dir or default_run_dir(request.world), request.config, request.seeds)
     with _going_on(folder, watch):
-        folder.write_json(REQUEST, document_of(request, num_envs, _any_of(sims).device.type, drivers_of(methods)))
+        folder.write_json(
+            REQUEST, document_of(request, num_envs, _any_of(sims).device.type, drivers_of(methods))
+        )
         return _compared(request, sims, methods, policies, folder, watch), folder.path
 
 
 def resume(place: Path, watch: EvaluationWatch) -> tuple[dict[str, Any], Path]:
     """Go on with an evaluation that was interrupted or killed: episodes that are over stay as they are.
 
-    The document is that of an undisturbed evaluation, times of the machine excepted. Raises RunFolderError, FileError, ConfigError,
-    CheckpointError.
+    The document is that of an undisturbed evaluation, times of the machine excepted. Raises RunFolderError,
+    FileError, ConfigError, CheckpointError.
     """
     folder = RunFolder.held(place, "uuv eval")
     try:
@@ -107,14 +116,18 @@ def _going_on(folder: RunFolder, watch: EvaluationWatch) -> Iterator[None]:
         watch.stop()
         watch.note(f"finished episodes are kept; go on with: uuv eval --resume {folder.path}")
         if any((folder.path / "logs").glob("*.part")):
-            watch.note(f"{folder.path / 'logs'}: .part files end where it was interrupted; --resume records them anew, or: uuv log repair")
+            watch.note(
+                f"{folder.path / 'logs'}: .part files end where it was interrupted; --resume records them "
+                "anew, or: uuv log repair"
+            )
         raise
     finally:
         watch.stop()
 
 
 def _simulators(request: Request, num_envs: int, methods: list[Method]) -> Simulators:
-    """A simulator for the request's own config and one for every stack that drives a row; the episodes are the same in all."""
+    """A simulator for the request's own config and one for every stack that drives a row; the episodes are
+    the same in all."""
     from uuvtai.sim import Sim
 
     configs = {method.stack: method.config_of(request.config) for method in methods} or {None: request.config}
@@ -146,13 +159,26 @@ def _compared(
     ledger = Ledger(folder.path)
     try:
         for method in methods:
-            _play(request, sims[method.stack], method, policies[method.name], jobs, folder, ledger, watch, played, entries)
+            _play(
+                request,
+                sims[method.stack],
+                method,
+                policies[method.name],
+                jobs,
+                folder,
+                ledger,
+                watch,
+                played,
+                entries,
+            )
     finally:
         ledger.close()
     scenarios = scenarios_of(_any_of(sims), jobs)
     if ORACLE in request.controllers:
         entries.append(_ask_oracle(request, jobs, scenarios, watch))
-    result = document(request.config, request.world, request.sensors, request.seeds, request.episodes, entries)
+    result = document(
+        request.config, request.world, request.sensors, request.seeds, request.episodes, entries
+    )
     result |= {"condition": condition_of(request.config, scenarios), "remainder": remainder_of(entries)}
     _write_results(folder, result, played)
     if request.explain:
@@ -169,9 +195,14 @@ def _methods(request: Request, watch: EvaluationWatch) -> list[Method]:
     methods = [*trees_of(trees, max_node), *policies_of(list(request.policies), max_node, watch.note)]
     names = [method.name for method in methods] + [ORACLE] * (ORACLE in request.controllers)
     if len(set(names)) != len(names):
-        raise ConfigError(f"{', '.join(names)}: a policy and a controller have the same name; rename the run's folder")
+        raise ConfigError(
+            f"{', '.join(names)}: a policy and a controller have the same name; rename the run's folder"
+        )
     if not methods and (request.record or request.explain):
-        raise ConfigError("--record, --explain: the oracle drives no vehicle; add who does, for example --controller bt,oracle")
+        raise ConfigError(
+            "--record, --explain: the oracle drives no vehicle; add who does, for example --controller "
+            "bt,oracle"
+        )
     for method in methods:
         if told := differences(method, request.config):
             watch.note(f"note: {told}")
@@ -211,7 +242,9 @@ def _play(
             sim,
             left,
             Recorders([recorder, foresight, keeper]),
-            lambda done, _total, env_steps, to_come: watch.update(before + done, len(jobs), env_steps, to_come),
+            lambda done, _total, env_steps, to_come: watch.update(
+                before + done, len(jobs), env_steps, to_come
+            ),
             policy.pilot if policy else None,
             clock,
         )
@@ -223,7 +256,11 @@ def _play(
     dt = request.config.episode.control_dt_s
     env_steps, wall_s = sum(round(r.time_s / dt) for r in results), keeper.wall_s if left else keeper.before_s
     entry = summary(method.name, results, env_steps, wall_s, clock.env_steps_per_s)
-    entry |= {"privileged": method.privileged} | method.document() | told(foresight, _moments(foresight, [over[job] for job in jobs], dt))
+    entry |= (
+        {"privileged": method.privileged}
+        | method.document()
+        | told(foresight, _moments(foresight, [over[job] for job in jobs], dt))
+    )
     entries.append(entry)
     played.append(_Played(method, policy, results, tree_use(sim, results), logs))
 
@@ -246,7 +283,9 @@ def _any_tree() -> FlatTree:
     return read_tree(TRAINING_TREE)
 
 
-def _ask_oracle(request: Request, jobs: list[Job], scenarios: list[dict[str, Any]], watch: EvaluationWatch) -> dict[str, Any]:
+def _ask_oracle(
+    request: Request, jobs: list[Job], scenarios: list[dict[str, Any]], watch: EvaluationWatch
+) -> dict[str, Any]:
     from uuvtai.measure.ceilings import oracle_entry
 
     watch.start(ORACLE, len(jobs))
@@ -266,10 +305,22 @@ def _write_results(folder: RunFolder, result: dict[str, Any], played: list[_Play
 
 
 def _explain(
-    request: Request, sims: Simulators, played: list[_Played], result: dict[str, Any], folder: RunFolder, watch: EvaluationWatch
+    request: Request,
+    sims: Simulators,
+    played: list[_Played],
+    result: dict[str, Any],
+    folder: RunFolder,
+    watch: EvaluationWatch,
 ) -> None:
-    """Replay what failed, add the causes to the document, record the worst. What is known is written before the next long step begins."""
-    from uuvtai.measure.explain import chosen_for_recording, explain_failures, failures, record_worst, table_of
+    """Replay what failed, add the causes to the document, record the worst. What is known is written before
+    the next long step begins."""
+    from uuvtai.measure.explain import (
+        chosen_for_recording,
+        explain_failures,
+        failures,
+        record_worst,
+        table_of,
+    )
 
     explained = {}
     driven = [entry for entry in result["methods"] if entry["name"] != ORACLE]
@@ -277,7 +328,9 @@ def _explain(
         label, sim = entry["name"], sims[p.method.stack]
         sim.privileged = p.method.privileged
         watch.start(f"{label}: replaying failures", len(failures(p.results)))
-        explained[label] = explain_failures(sim, p.method.tree, p.results, watch.update, p.policy.pilot if p.policy else None)
+        explained[label] = explain_failures(
+            sim, p.method.tree, p.results, watch.update, p.policy.pilot if p.policy else None
+        )
         watch.stop()
         entry["causes"] = table_of(explained[label])
         entry["explain"] = [row.document() for row in explained[label]]
@@ -287,7 +340,17 @@ def _explain(
         sim.privileged = p.method.privileged
         chosen = chosen_for_recording(explained[label], request.explain_record)
         names = [one["name"] for one in driven]
-        paths = record_worst(sim, p.method.tree, chosen, folder.path / "explain", request.world, label, watch.note, p.policy, names)
+        paths = record_worst(
+            sim,
+            p.method.tree,
+            chosen,
+            folder.path / "explain",
+            request.world,
+            label,
+            watch.note,
+            p.policy,
+            names,
+        )
         for row, path in zip(chosen, paths, strict=True):
             entry["explain"][explained[label].index(row)]["log"] = str(path.relative_to(folder.path))
     _write_causes(folder, result)
@@ -295,16 +358,24 @@ def _explain(
 
 def _write_causes(folder: RunFolder, result: dict[str, Any]) -> None:
     folder.write_json("eval/result.json", result)
-    methods = [{"name": m["name"], "causes": m["causes"], "explain": m["explain"]} for m in result["methods"] if "explain" in m]
+    methods = [
+        {"name": m["name"], "causes": m["causes"], "explain": m["explain"]}
+        for m in result["methods"]
+        if "explain" in m
+    ]
     folder.write_json("eval/explain.json", {"schema": 1, "methods": methods})
 
 
-def _recorder(request: Request, folder: Path, label: str, jobs: list[Job], policy: PolicyNote | None) -> EpisodeRecorder | None:
+def _recorder(
+    request: Request, folder: Path, label: str, jobs: list[Job], policy: PolicyNote | None
+) -> EpisodeRecorder | None:
     from uuvtai.measure.log_recorder import EpisodeRecorder
 
     if not request.record:
         return None
-    return EpisodeRecorder(folder / "logs", Path(request.world).stem, label, jobs[: request.record], request.depth_images, policy)
+    return EpisodeRecorder(
+        folder / "logs", Path(request.world).stem, label, jobs[: request.record], request.depth_images, policy
+    )
 
 
 def _draw(request: Request, folder: Path, logs: list[dict[Any, Path]], watch: EvaluationWatch) -> None:

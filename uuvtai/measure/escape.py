@@ -1,4 +1,5 @@
-"""Could the vehicle still have got away? Velocities held from some time before the end on, rolled out against the true motion of all."""
+"""Could the vehicle still have got away? Velocities held from some time before the end on, rolled out against
+the true motion of all."""
 
 from __future__ import annotations
 
@@ -17,11 +18,13 @@ AFTER_S = 0.5
 
 
 def escapes(history: History, bodies: Bodies, config: Config, lead_s: float) -> tuple[int, int]:
-    """How many velocities, chosen ``lead_s`` before the end and held, keep clear of everything: (at constant depth, with heave).
+    """How many velocities, chosen ``lead_s`` before the end and held, keep clear of everything: (at constant
+    depth, with heave).
 
-    Candidates are ``N_HEADING`` headings x ``SPEEDS`` and stopping, each at constant depth and with full heave up and down, within the
-    limits of the body axes; the vehicle follows them with the pilot's lag and keeps its yaw. Bodies move as they did, after the end
-    straight on. Clear means the referee's rules: clearance, time to collision, tank.
+    Candidates are ``N_HEADING`` headings x ``SPEEDS`` and stopping, each at constant depth and with full
+    heave up and down, within the limits of the body axes; the vehicle follows them with the pilot's lag and
+    keeps its yaw. Bodies move as they did, after the end straight on. Clear means the referee's rules:
+    clearance, time to collision, tank.
     """
     end = float(history.t_s[-1])
     start = int(np.abs(history.t_s - (end - lead_s)).argmin())
@@ -37,7 +40,9 @@ def escapes(history: History, bodies: Bodies, config: Config, lead_s: float) -> 
 def candidates(config: Config, yaw: float) -> Array:
     """(n, 3) world velocities [m/s] of a vehicle with this yaw."""
     heading = 2 * np.pi * np.arange(N_HEADING) / N_HEADING
-    limits = np.abs([np.cos(heading) / config.vehicle.max_surge_m_s, np.sin(heading) / config.vehicle.max_sway_m_s])
+    limits = np.abs(
+        [np.cos(heading) / config.vehicle.max_surge_m_s, np.sin(heading) / config.vehicle.max_sway_m_s]
+    )
     top = np.minimum(config.teacher.evade_m_s, 1.0 / limits.max(0))
     ring = np.stack([np.cos(heading + yaw), np.sin(heading + yaw)], -1) * top[:, None]
     level = np.concatenate([np.zeros((1, 2)), *(ring * share for share in SPEEDS)])
@@ -46,7 +51,8 @@ def candidates(config: Config, yaw: float) -> Array:
 
 
 def rolled_out(pos: Array, vel: Array, command: Array, t: Array, lag_s: float) -> tuple[Array, Array]:
-    """(n, n_t, 3) positions and velocities of a vehicle that approaches each commanded velocity with a first-order lag."""
+    """(n, n_t, 3) positions and velocities of a vehicle that approaches each commanded velocity with a
+    first-order lag."""
     left = np.exp(-t / lag_s)[:, None]
     off = (vel - command)[:, None]
     return pos + command[:, None] * t[:, None] + off * lag_s * (1.0 - left), command[:, None] + off * left
@@ -55,22 +61,32 @@ def rolled_out(pos: Array, vel: Array, command: Array, t: Array, lag_s: float) -
 def motion(history: History, at_s: Array) -> tuple[Array, Array]:
     """(n_t, nb, 3) true positions and velocities of the bodies; straight on after the last sample."""
     flat = history.body_w.reshape(len(history.t_s), -1)
-    inside = np.stack([np.interp(at_s, history.t_s, column) for column in flat.T], -1).reshape(len(at_s), -1, 3)
+    inside = np.stack([np.interp(at_s, history.t_s, column) for column in flat.T], -1).reshape(
+        len(at_s), -1, 3
+    )
     vel = history.body_vel_w[np.clip(np.searchsorted(history.t_s, at_s), 0, len(history.t_s) - 1)]
     return inside + np.maximum(at_s - history.t_s[-1], 0.0)[:, None, None] * history.body_vel_w[-1], vel
 
 
-def is_clear(pos: Array, vel: Array, axis_w: Array, body_w: Array, body_vel_w: Array, bodies: Bodies, config: Config) -> Array:
+def is_clear(
+    pos: Array, vel: Array, axis_w: Array, body_w: Array, body_vel_w: Array, bodies: Bodies, config: Config
+) -> Array:
     """(n,) bool: paths (n, n_t, 3) along which the referee would stop nothing."""
     rules, hull = config.episode, (config.vehicle.hull_radius_m, config.vehicle.hull_half_length_m)
     n, n_t = pos.shape[:2]
     flat, axis = pos.reshape(-1, 3), np.broadcast_to(axis_w, (n * n_t, 3))
     floor, surface = hindsight.floor_and_surface_gaps(flat, axis, config.world.tank, *hull)
-    clear = (hindsight.wall_gaps(flat, axis, config.world.tank, *hull) >= rules.collision_clearance_m) & (floor >= 0) & (surface >= 0)
+    clear = (
+        (hindsight.wall_gaps(flat, axis, config.world.tank, *hull) >= rules.collision_clearance_m)
+        & (floor >= 0)
+        & (surface >= 0)
+    )
     for body in np.flatnonzero((bodies.kind > 0) & (_nearest(pos, body_w) < _reach(pos, bodies))):
         there = np.broadcast_to(body_w[:, body], pos.shape).reshape(-1, 1, 3)
         one = slice(body, body + 1)
-        gap, normal, _ = hindsight.hull_gaps(flat, axis, bodies.kind[one], there, bodies.size[one], bodies.yaw[one], *hull)
+        gap, normal, _ = hindsight.hull_gaps(
+            flat, axis, bodies.kind[one], there, bodies.size[one], bodies.yaw[one], *hull
+        )
         closing = ((vel - body_vel_w[:, body]).reshape(-1, 3) * normal[:, 0]).sum(-1)
         clear &= gap[:, 0] >= np.maximum(rules.collision_clearance_m, rules.ttc_s * closing)
     return np.asarray(clear.reshape(n, n_t).all(1))

@@ -1,4 +1,5 @@
-"""What ``uuv eval`` was asked for, as an object and as the file from which an interrupted evaluation goes on."""
+"""What ``uuv eval`` was asked for, as an object and as the file from which an interrupted evaluation goes
+on."""
 
 from __future__ import annotations
 
@@ -77,13 +78,24 @@ class _Document(BaseModel):
 
 def document_of(request: Request, num_envs: int, device: str, drivers: dict[str, str]) -> dict[str, Any]:
     """The request with what was chosen for it, as JSON; ``drivers``: sha256 of what drives, by method."""
-    told = {field.name: getattr(request, field.name) for field in dataclasses.fields(request) if field.name not in ("config", "run_dir")}
+    told = {
+        field.name: getattr(request, field.name)
+        for field in dataclasses.fields(request)
+        if field.name not in ("config", "run_dir")
+    }
     told |= {"policies": list(request.policies), "num_envs": num_envs, "device": device}
-    return {"schema": 1, **told, "config": request.config.model_dump(mode="json"), "cwd": os.getcwd(), "drivers": drivers}
+    return {
+        "schema": 1,
+        **told,
+        "config": request.config.model_dump(mode="json"),
+        "cwd": os.getcwd(),
+        "drivers": drivers,
+    }
 
 
 def read_request(place: Path) -> tuple[Request, dict[str, str]]:
-    """The request of a run folder, and the sha256 of what drove by method. Raises RunFolderError, FileError."""
+    """The request of a run folder, and the sha256 of what drove by method. Raises RunFolderError,
+    FileError."""
     file = place / FILE
     try:
         found = _Document.model_validate_json(read_text(file, _MAX_BYTES, place))
@@ -91,8 +103,12 @@ def read_request(place: Path) -> tuple[Request, dict[str, str]]:
     except OSError as error:
         raise RunFolderError(f"{file}: cannot be read ({error.strerror}); {_GIVE}") from None
     except (ValidationError, ConfigError) as error:
-        reason = error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error).splitlines()[0]
-        raise RunFolderError(f"{file}: is no request of this version of 'uuv eval' ({reason}); {_GIVE}") from None
+        reason = (
+            error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error).splitlines()[0]
+        )
+        raise RunFolderError(
+            f"{file}: is no request of this version of 'uuv eval' ({reason}); {_GIVE}"
+        ) from None
     given = found.model_dump(exclude={"schema_", "config", "cwd", "drivers"})
     request = Request(config=config, **given)
     return _found_again(replace(request, policies=tuple(found.policies)), Path(found.cwd)), found.drivers
@@ -103,24 +119,35 @@ def _found_again(request: Request, cwd: Path) -> Request:
 
     def seen(kind: str, name: str) -> str:
         file = name.removesuffix("+truth")
-        is_path = file not in preset_names(kind) and (kind == "policy" or file.endswith((".xml", ".yaml", ".yml")))
+        is_path = file not in preset_names(kind) and (
+            kind == "policy" or file.endswith((".xml", ".yaml", ".yml"))
+        )
         return str(cwd / name) if is_path and not Path(file).exists() else name
 
     controllers = [seen("tree", name) for name in request.controllers]
-    return replace(request, controllers=controllers, policies=tuple(seen("policy", name) for name in request.policies))
+    return replace(
+        request, controllers=controllers, policies=tuple(seen("policy", name) for name in request.policies)
+    )
 
 
 def drivers_of(methods: list[Method]) -> dict[str, str]:
-    """sha256 of what drives, by method: of a policy's checkpoint, of a tree as it is played, with its stack."""
-    return {method.name: method.checkpoint.sha256 if method.checkpoint else _tree_sha256(method) for method in methods}
+    """sha256 of what drives, by method: of a policy's checkpoint, of a tree as it is played, with its
+    stack."""
+    return {
+        method.name: method.checkpoint.sha256 if method.checkpoint else _tree_sha256(method)
+        for method in methods
+    }
 
 
 def refuse_others(place: Path, before: dict[str, str], now: dict[str, str]) -> None:
-    """RunFolderError where another tree or policy has a method's name by now: episodes of both under one name would prove nothing."""
+    """RunFolderError where another tree or policy has a method's name by now: episodes of both under one name
+    would prove nothing."""
     changed = [name for name in {**before, **now} if before.get(name) != now.get(name)]
     if changed:
         what = ", ".join(changed)
-        raise RunFolderError(f"{place}: {what} has changed since this evaluation began; begin a new one with another --run-dir")
+        raise RunFolderError(
+            f"{place}: {what} has changed since this evaluation began; begin a new one with another --run-dir"
+        )
 
 
 def _tree_sha256(method: Method) -> str:

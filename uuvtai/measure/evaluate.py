@@ -1,4 +1,5 @@
-"""Evaluate controllers on fixed scenarios: every method meets exactly the same episodes, whatever the batch size or order."""
+"""Evaluate controllers on fixed scenarios: every method meets exactly the same episodes, whatever the batch
+size or order."""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ if TYPE_CHECKING:
     from uuvtai.learn.pilot import PilotDecision
 
 _REFILL_SHARE = 16
-"""Ended rows wait until this part of the batch can be reset together, or until nothing runs: fewer reset passes, same results."""
+"""Ended rows wait until this part of the batch can be reset together, or until nothing runs: fewer reset
+passes, same results."""
 
 
 _TOLD_EVERY = 50
@@ -37,7 +39,8 @@ class Job:
     seed: int
     episode: int
     scene: Scene | None = None
-    """(S, D, v [m/s]) of its scenario; None = the simulator's own. One of ``run_episodes``'s jobs has one only if all have"""
+    """(S, D, v [m/s]) of its scenario; None = the simulator's own. One of ``run_episodes``'s jobs has one
+    only if all have"""
 
 
 @dataclass(frozen=True)
@@ -109,8 +112,8 @@ class Driver(Protocol):
 
 
 Progress = Callable[[int, int, int, int | None], None]
-"""Called with (episodes done, episodes in all, env steps done, env steps still to come); (0, n, 0, None) before the first pass, which may
-compile; the last is None where it is too early to guess."""
+"""Called with (episodes done, episodes in all, env steps done, env steps still to come); (0, n, 0, None)
+before the first pass, which may compile; the last is None where it is too early to guess."""
 
 
 def jobs_of(seeds: Iterable[int], episodes: int) -> list[Job]:
@@ -126,7 +129,8 @@ def run_episodes(
     driver: Driver | None = None,
     clock: StepClock | None = None,
 ) -> tuple[list[EpisodeResult], int]:
-    """Play every job; results in the order of ``jobs``, and the env steps it took. Without a driver the simulator's tree drives.
+    """Play every job; results in the order of ``jobs``, and the env steps it took. Without a driver the
+    simulator's tree drives.
 
     ``clock`` is told the time of simulating, without what the recorder takes.
     """
@@ -165,7 +169,9 @@ def run_episodes(
         ended = [row for row in sorted(playing) if outcome[row] != RUNNING]
         if not ended:
             continue
-        for row, result in zip(ended, _results(sim, ended, [jobs[playing[row]] for row in ended]), strict=True):
+        for row, result in zip(
+            ended, _results(sim, ended, [jobs[playing[row]] for row in ended]), strict=True
+        ):
             results[playing.pop(row)] = result
             free.append(row)
             if recorder:
@@ -204,7 +210,9 @@ class _Wheel:
         self._action = driver.decide(self._obs).action
 
 
-def _refill(sim: Sim, wheel: _Wheel, jobs: list[Job], waiting: list, free: list[int], playing: dict[int, int]) -> list[int]:
+def _refill(
+    sim: Sim, wheel: _Wheel, jobs: list[Job], waiting: list, free: list[int], playing: dict[int, int]
+) -> list[int]:
     """Begin as many jobs as there are free rows; the rows."""
     mask, seed, number = (torch.zeros(sim.num_envs, dtype=torch.int32) for _ in range(3))
     begun: list[tuple[int, Job]] = []
@@ -220,7 +228,8 @@ def _refill(sim: Sim, wheel: _Wheel, jobs: list[Job], waiting: list, free: list[
 
 
 def _set_scenes(sim: Sim, begun: list[tuple[int, Job]]) -> None:
-    """Give the rows about to be reset the scenes of their jobs; the others have drawn their scenarios already."""
+    """Give the rows about to be reset the scenes of their jobs; the others have drawn their scenarios
+    already."""
     scenes = {row: job.scene for row, job in begun if job.scene is not None}
     if scenes:
         any_scene = next(iter(scenes.values()))
@@ -267,18 +276,29 @@ def _named(names: tuple[str, ...], counts: np.ndarray) -> dict[str, int]:
     return {name: int(count) for name, count in zip(names, counts, strict=True)}
 
 
-# ------------------------------------------------------------------------------------------------------------------ summary
+# ---------------------------------------------------------------------------------------------------- summary
 
 
-def summary(name: str, results: list[EpisodeResult], env_steps: int, wall_s: float, env_steps_per_s: float | None = None) -> dict[str, Any]:
-    """One method's entry of ``uuv eval --json`` (docs: interfaces); rates without episodes are None, never NaN.
+def summary(
+    name: str,
+    results: list[EpisodeResult],
+    env_steps: int,
+    wall_s: float,
+    env_steps_per_s: float | None = None,
+) -> dict[str, Any]:
+    """One method's entry of ``uuv eval --json`` (docs: interfaces); rates without episodes are None, never
+    NaN.
 
-    ``env_steps_per_s`` is a ``StepClock``'s: of simulating alone, where ``wall_s`` is all the time that the method took.
+    ``env_steps_per_s`` is a ``StepClock``'s: of simulating alone, where ``wall_s`` is all the time that the
+    method took.
     """
     n = len(results)
     outcomes = {outcome: sum(r.outcome == outcome for r in results) for outcome in ENDINGS}
     collided = sum(outcomes[o] for o in COLLIDED)
-    time_mean, to_goal = mean([r.time_s for r in results]), [r.time_s for r in results if r.outcome == "success"]
+    time_mean, to_goal = (
+        mean([r.time_s for r in results]),
+        [r.time_s for r in results if r.outcome == "success"],
+    )
     return {
         "name": name,
         "episodes": n,
@@ -319,12 +339,17 @@ def summary(name: str, results: list[EpisodeResult], env_steps: int, wall_s: flo
 
 
 def tree_use(sim: Sim, results: list[EpisodeResult]) -> list[dict[str, Any]]:
-    """Per node of the tree: the share of episodes that ticked it, its ticks, and the control steps in which it set the action."""
-    ticks, acted = (np.stack([getattr(r, which) for r in results]).astype(np.int64) for which in ("ticks", "acted"))
+    """Per node of the tree: the share of episodes that ticked it, its ticks, and the control steps in which
+    it set the action."""
+    ticks, acted = (
+        np.stack([getattr(r, which) for r in results]).astype(np.int64) for which in ("ticks", "acted")
+    )
     return [vars(use) for use in node_use(ticks, acted, len(sim.tree.names))]
 
 
-def document(config: Config, world: str, sensors: str, seeds: list[int], episodes: int, methods: list[dict[str, Any]]) -> dict[str, Any]:
+def document(
+    config: Config, world: str, sensors: str, seeds: list[int], episodes: int, methods: list[dict[str, Any]]
+) -> dict[str, Any]:
     """The whole ``uuv eval --json`` document."""
     return {
         "schema": 1,

@@ -1,7 +1,8 @@
-"""Explain failed episodes: play them again, keep the truth and the vehicle's beliefs of their last seconds, label each (``causes.py``).
+"""Explain failed episodes: play them again, keep the truth and the vehicle's beliefs of their last seconds,
+label each (``causes.py``).
 
-An episode is the same in any batch, so only the failed ones are replayed, and their ends are known beforehand: nothing is kept of the
-time before the last ``facts.WINDOW_S`` but a coarse diary.
+An episode is the same in any batch, so only the failed ones are replayed, and their ends are known
+beforehand: nothing is kept of the time before the last ``facts.WINDOW_S`` but a coarse diary.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ EXAMPLES = 3
 """Episodes named per label in the table."""
 
 _SAMPLE_S, _DIARY_S = 0.1, 0.5
-"""Time between samples of the window and between entries of the diary; counted from the start, so that rows are read together."""
+"""Time between samples of the window and between entries of the diary; counted from the start, so that rows
+are read together."""
 
 _WINDOW_FIELDS = {
     "vehicle": ("pos_w", "quat_wb", "vel_b", "rate_b"),
@@ -58,7 +60,14 @@ class Row:
     def document(self) -> dict[str, Any]:
         """One entry of ``explain`` in ``uuv eval --json``."""
         r, e = self.result, self.explanation
-        told = {"seed": r.seed, "episode": r.episode, "outcome": r.outcome, "label": e.label, "remarks": e.remarks, "log": None}
+        told = {
+            "seed": r.seed,
+            "episode": r.episode,
+            "outcome": r.outcome,
+            "label": e.label,
+            "remarks": e.remarks,
+            "log": None,
+        }
         return told | {"killer": vars(e.killer)} | e.facts
 
 
@@ -74,7 +83,8 @@ class _Watched:
 
 
 class Coroner:
-    """Recorder that watches failed episodes as they are replayed; ``found`` maps each job to its explanation."""
+    """Recorder that watches failed episodes as they are replayed; ``found`` maps each job to its
+    explanation."""
 
     def __init__(self, config: Config, tree: FlatTree, failed: list[EpisodeResult]) -> None:
         self._config, self._tree = config, tree
@@ -100,13 +110,16 @@ class Coroner:
             self._rows[row].diary.append(read | {"step": np.array(self._rows[row].step)})
 
     def end(self, sim: Sim, row: int, result: EpisodeResult) -> None:
-        """Explain the episode and forget its history. Raises RuntimeError where the replay ended differently."""
+        """Explain the episode and forget its history. Raises RuntimeError where the replay ended
+        differently."""
         job, watched = Job(result.seed, result.episode), self._rows.pop(row)
         expected = self._expected[job]
         if (result.outcome, result.time_s) != (expected.outcome, expected.time_s):
             raise RuntimeError(
-                f"replay of seed {job.seed} episode {job.episode} ended with {result.outcome} at {result.time_s} s instead of "
-                f"{expected.outcome} at {expected.time_s} s: episodes must be the same in any batch, please report this"
+                f"replay of seed {job.seed} episode {job.episode} ended with {result.outcome} at "
+                f"{result.time_s} s instead of "
+                f"{expected.outcome} at {expected.time_s} s: episodes must be the same in any batch, please "
+                "report this"
             )
         assert watched.bodies is not None  # read after the first step
         self.found[job] = causes.explain(result.outcome, self._history(watched), watched.bodies, self._config)
@@ -161,9 +174,14 @@ class Coroner:
 
 
 def explain_failures(
-    sim: Sim, tree: FlatTree, results: list[EpisodeResult], progress: Progress | None = None, driver: Driver | None = None
+    sim: Sim,
+    tree: FlatTree,
+    results: list[EpisodeResult],
+    progress: Progress | None = None,
+    driver: Driver | None = None,
 ) -> list[Row]:
-    """Replay the failed episodes of one method and explain them; in the order of ``results``. Raises RuntimeError (see ``Coroner.end``).
+    """Replay the failed episodes of one method and explain them; in the order of ``results``. Raises
+    RuntimeError (see ``Coroner.end``).
 
     Where a ``driver`` drives, the facts about leaves and actions are those of the tree beside it.
     """
@@ -217,7 +235,8 @@ def _median(found: list[Explanation], name: str, beyond: float) -> float | None:
 
 
 def worst_of(rows: list[Row], label: str) -> list[Row]:
-    """Episodes of a label, the worst first: the hardest hits, of timeouts those that ended farthest from the goal."""
+    """Episodes of a label, the worst first: the hardest hits, of timeouts those that ended farthest from the
+    goal."""
 
     def badness(row: Row) -> tuple[float, float]:
         return (row.explanation.killer.closing_m_s or 0.0, row.explanation.facts.get("goal_m", 0.0))
@@ -226,7 +245,8 @@ def worst_of(rows: list[Row], label: str) -> list[Row]:
 
 
 def chosen_for_recording(rows: list[Row], wanted: int) -> list[Row]:
-    """The worst episode of the most frequent label, then of the second, ...; after the last label the next worst of the first."""
+    """The worst episode of the most frequent label, then of the second, ...; after the last label the next
+    worst of the first."""
     queues = [worst_of(rows, entry["label"]) for entry in table_of(rows)]
     rounds = [queue[i] for i in range(max(map(len, queues), default=0)) for queue in queues if i < len(queue)]
     return rounds[:wanted]
@@ -243,7 +263,8 @@ def record_worst(
     policy: PolicyNote | None = None,
     methods: Sequence[str] = (),
 ) -> list[Path]:
-    """Play these episodes once more into ``folder``: an MCAP log each, named after the cause, with a picture and a video beside it.
+    """Play these episodes once more into ``folder``: an MCAP log each, named after the cause, with a picture
+    and a video beside it.
 
     ``methods``: all that are compared, in order, so that each keeps its colour.
     """
@@ -260,7 +281,9 @@ def record_worst(
         run_episodes(sim, jobs, recorder, driver=policy.pilot if policy else None)
     finally:
         recorder.abort()
-    paths = [_renamed(recorder.paths[job], row.explanation.label) for job, row in zip(jobs, rows, strict=True)]
+    paths = [
+        _renamed(recorder.paths[job], row.explanation.label) for job, row in zip(jobs, rows, strict=True)
+    ]
     for path, row in zip(paths, rows, strict=True):
         note(f"drawing {path.stem}")
         label = row.explanation.label
@@ -274,11 +297,17 @@ def _renamed(path: Path, label: str) -> Path:
     return path.rename(path.with_name(f"{label}_{path.name}"))
 
 
-def _read_rows(sim: Sim, fields: dict[str, tuple[str, ...]], rows: list[int]) -> dict[int, dict[str, np.ndarray]]:
+def _read_rows(
+    sim: Sim, fields: dict[str, tuple[str, ...]], rows: list[int]
+) -> dict[int, dict[str, np.ndarray]]:
     """Row -> 'struct.field' -> its values."""
     if not rows:
         return {}
-    read = {f"{struct}.{name}": sim.rows(getattr(getattr(sim.s, struct), name), rows) for struct, names in fields.items() for name in names}
+    read = {
+        f"{struct}.{name}": sim.rows(getattr(getattr(sim.s, struct), name), rows)
+        for struct, names in fields.items()
+        for name in names
+    }
     return {row: {name: values[i].copy() for name, values in read.items()} for i, row in enumerate(rows)}
 
 

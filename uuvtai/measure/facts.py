@@ -1,8 +1,10 @@
-"""What was true in the last seconds of a failed episode, as numbers with names. Pure NumPy; ``causes.py`` makes labels of them.
+"""What was true in the last seconds of a failed episode, as numbers with names. Pure NumPy; ``causes.py``
+makes labels of them.
 
-The killer is what the referee stopped the episode for: the body with the least time to collision of a ``ttc`` stop, otherwise what the
-hull touches. "Seen" means that a beam of a delivered scan met the body, "believed" that a forecast lies within ``BELIEF_M`` of it. Facts
-that end in ``_ago_s`` count back from the end; None = not within ``WINDOW_S``.
+The killer is what the referee stopped the episode for: the body with the least time to collision of a ``ttc``
+stop, otherwise what the hull touches. "Seen" means that a beam of a delivered scan met the body, "believed"
+that a forecast lies within ``BELIEF_M`` of it. Facts that end in ``_ago_s`` count back from the end; None =
+not within ``WINDOW_S``.
 """
 
 from __future__ import annotations
@@ -23,15 +25,18 @@ from uuvtai.scenario import KIND_NAMES
 WINDOW_S = 4.0
 """How far back the facts look; a time "ago" that is None lies farther back or never was."""
 LEAD_S = 1.0
-"""Forecasts are judged by what they said this long before the end: half a second to react, half a second to get out of the way."""
+"""Forecasts are judged by what they said this long before the end: half a second to react, half a second to
+get out of the way."""
 SIGHT_S = (1.5, 0.5)
-"""Without a forecast LEAD_S before the end, this interval tells why: mostly out of the fan, mostly hidden, or seen but not tracked."""
+"""Without a forecast LEAD_S before the end, this interval tells why: mostly out of the fan, mostly hidden, or
+seen but not tracked."""
 TURN_RAD = math.radians(30.0)
 """A corner: the body's course changes by more between two samples."""
 BEFORE_TURN_S = 0.1
 """The forecast that a turn is judged by was made this long before it."""
 BELIEF_M = 0.5
-"""A forecast or track belongs to a body when its present position is this close to the truth, in the plane."""
+"""A forecast or track belongs to a body when its present position is this close to the truth, in the
+plane."""
 BEAM_M = 0.1
 """A beam met the body when its range agrees with the truth within this plus four sigma."""
 CROWD_S = 0.5
@@ -39,7 +44,8 @@ CROWD_S = 0.5
 NEAR_S = 1.5
 """Any moving body counts as near when it was so in this time before the end."""
 CHANCES_S = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0)
-"""The last chance is the latest of these times before the end from which some velocity still escaped (``escape.py``)."""
+"""The last chance is the latest of these times before the end from which some velocity still escaped
+(``escape.py``)."""
 BREAK_S = 0.3
 """A leaf that lost charge for no longer than this still counts as in charge."""
 LAST_S = 10.0
@@ -47,7 +53,8 @@ LAST_S = 10.0
 EVADING = ("Evade", "BackOff")
 """Leaves that give way to something."""
 WAITING = ("Hold",)
-"""Leaves that stay in place on purpose; further ones are recognised by a name that begins with Wait, Yield or Shelter."""
+"""Leaves that stay in place on purpose; further ones are recognised by a name that begins with Wait, Yield or
+Shelter."""
 
 
 @dataclass
@@ -79,7 +86,9 @@ class Scene:
             history.pos_w, self.axis_w, bodies.kind, history.body_w, bodies.size, bodies.yaw, radius, half
         )
         self.wall = hindsight.wall_gaps(history.pos_w, self.axis_w, config.world.tank, radius, half)
-        self.floor, self.surface = hindsight.floor_and_surface_gaps(history.pos_w, self.axis_w, config.world.tank, radius, half)
+        self.floor, self.surface = hindsight.floor_and_surface_gaps(
+            history.pos_w, self.axis_w, config.world.tank, radius, half
+        )
         vel_w = np.einsum("nij,nj->ni", R_wb, history.vel_b)
         swing_w = np.cross(np.einsum("nij,nj->ni", R_wb, history.rate_b), self.axis_w)
         point_vel = vel_w[:, None, :] + self.along[..., None] * swing_w[:, None, :]
@@ -91,11 +100,16 @@ class Scene:
         rules, gap, closing = self.config.episode, self.gap[-1], self.closing[-1]
         if outcome == "ttc":
             approaching = closing > rules.ttc_closing_m_s
-            time_left = np.where(approaching, np.maximum(gap, 0.0) / np.where(approaching, closing, 1.0), np.inf)
+            time_left = np.where(
+                approaching, np.maximum(gap, 0.0) / np.where(approaching, closing, 1.0), np.inf
+            )
             return self._body(int(time_left.argmin()))
         nearest = int(gap.argmin())
         solids = {"wall": self.wall[-1], "floor": self.floor[-1], "surface": self.surface[-1]}
-        excess = {name: float(value) - (rules.collision_clearance_m if name == "wall" else 0.0) for name, value in solids.items()}
+        excess = {
+            name: float(value) - (rules.collision_clearance_m if name == "wall" else 0.0)
+            for name, value in solids.items()
+        }
         name = min(excess, key=lambda key: excess[key])
         if outcome != "out_of_tank" and gap[nearest] - rules.collision_clearance_m <= excess[name]:
             return self._body(nearest)
@@ -142,7 +156,11 @@ def _sight_facts(history: History, bodies: Bodies, slot: int, config: Config) ->
     yaw = np.arctan2(R_wb[:, 1, 0], R_wb[:, 0, 0]) - history.rate_b[:, 2] * history.ping_age_s
     entry = hindsight.beam_entries(then_w, yaw, kind, body_then_w, size, float(bodies.yaw[slot]), sonar)
     reached = np.isfinite(entry)
-    tolerance = BEAM_M + 4 * (sonar.range_sigma_m + sonar.range_sigma_slope * np.where(reached, entry, 0.0)) + sonar.range_jitter_m
+    tolerance = (
+        BEAM_M
+        + 4 * (sonar.range_sigma_m + sonar.range_sigma_slope * np.where(reached, entry, 0.0))
+        + sonar.range_jitter_m
+    )
     met = reached & (np.abs(history.range_m - np.where(reached, entry, 0.0)) < tolerance)
     in_fan, seen = np.asarray(reached.any(1)), np.asarray(met.any(1))
     before = (ago <= SIGHT_S[0]) & (ago >= SIGHT_S[1])
@@ -151,10 +169,14 @@ def _sight_facts(history: History, bodies: Bodies, slot: int, config: Config) ->
         "seen_ago_s": _last_ago(ago, seen),
         "fan_share": _round(in_fan[before].mean()) if before.any() else 0.0,
         "seen_share": _round(seen[before].sum() / max(1, in_fan[before].sum())),
-        "vertical_gap_m": _round(hindsight.vertical_gap(history.pos_w[-1:], kind, history.body_w[-1:, slot], size)[0]),
+        "vertical_gap_m": _round(
+            hindsight.vertical_gap(history.pos_w[-1:], kind, history.body_w[-1:, slot], size)[0]
+        ),
         "killer_speed_m_s": _round(np.linalg.norm(history.body_vel_w[-1, slot])),
         "killer_radius_m": _round(size[0]),
-        "full_height": bool(kind != BOX and size[2] > 0.49 * (config.world.tank.z_m[1] - config.world.tank.z_m[0])),
+        "full_height": bool(
+            kind != BOX and size[2] > 0.49 * (config.world.tank.z_m[1] - config.world.tank.z_m[0])
+        ),
         "circle_m": _round(abs(bodies.circle_m[slot])) if bodies.circle_m[slot] else None,
     }
 
@@ -163,7 +185,9 @@ def _belief_facts(history: History, slot: int, turned_ago_s: float | None, confi
     """What the vehicle believed about the killer."""
     ago = history.t_s[-1] - history.t_s
     truth = history.body_w[:, slot, :2]
-    away = np.where(history.forecast_m >= 0, np.linalg.norm(history.forecast_w[:, :, 0] - truth[:, None], axis=-1), np.inf)
+    away = np.where(
+        history.forecast_m >= 0, np.linalg.norm(history.forecast_w[:, :, 0] - truth[:, None], axis=-1), np.inf
+    )
     belief, distance = away.argmin(1), away.min(1)
     believed = distance <= BELIEF_M
     tracked = np.linalg.norm(history.track_w - truth[:, None], axis=-1)
@@ -174,7 +198,9 @@ def _belief_facts(history: History, slot: int, turned_ago_s: float | None, confi
         at = int(np.abs(ago - back_s).argmin())
         if not believed[at]:
             return None
-        foreseen = _foreseen(history.forecast_w[at, belief[at]], float(ago[at]), config.tracking.forecast_dt_s)
+        foreseen = _foreseen(
+            history.forecast_w[at, belief[at]], float(ago[at]), config.tracking.forecast_dt_s
+        )
         return _round(np.linalg.norm(foreseen - truth[-1]))
 
     return {
@@ -188,43 +214,71 @@ def _belief_facts(history: History, slot: int, turned_ago_s: float | None, confi
 
 
 def _believed_gap(history: History, slot: int, track: int) -> float:
-    """Vertical gap [m] that the vehicle believed in at the end, on the side where the killer was; 0 = it may be level."""
+    """Vertical gap [m] that the vehicle believed in at the end, on the side where the killer was; 0 = it may
+    be level."""
     own, above = history.pos_w[-1, 2], history.body_w[-1, slot, 2] > history.pos_w[-1, 2]
-    return _round(max(0.0, history.forecast_above_w[-1, track] - own if above else own - history.forecast_below_w[-1, track]))
+    return _round(
+        max(
+            0.0,
+            history.forecast_above_w[-1, track] - own if above else own - history.forecast_below_w[-1, track],
+        )
+    )
 
 
 def _foreseen(forecast_w: Array, lead_s: float, dt_s: float) -> Array:
-    """Position (2,) that a forecast (n_forecast, 2) gave for ``lead_s`` after it was made (at most its horizon)."""
+    """Position (2,) that a forecast (n_forecast, 2) gave for ``lead_s`` after it was made (at most its
+    horizon)."""
     steps = np.arange(len(forecast_w)) * dt_s
     return np.array([np.interp(lead_s, steps, forecast_w[:, axis]) for axis in range(2)])
 
 
 def _course_facts(history: History, bodies: Bodies, slot: int, config: Config) -> dict[str, Any]:
-    """When the killer last turned a corner (a circle has none), and how often it had turned there before within the sonar's reach."""
+    """When the killer last turned a corner (a circle has none), and how often it had turned there before
+    within the sonar's reach."""
     vel = history.body_vel_w[:, slot, :2]
     turn = np.abs(np.angle(np.exp(1j * np.diff(np.arctan2(vel[:, 1], vel[:, 0])))))
     corner = (turn > TURN_RAD) & (bodies.circle_m[slot] == 0)
     ago = _last_ago(history.t_s[-1] - history.t_s[1:], corner)
-    return {"turned_ago_s": ago, "turns_in_reach_before": None if ago is None else _turns_in_reach(history, bodies, slot, ago, config)}
+    return {
+        "turned_ago_s": ago,
+        "turns_in_reach_before": None if ago is None else _turns_in_reach(history, bodies, slot, ago, config),
+    }
 
 
 def _turns_in_reach(history: History, bodies: Bodies, slot: int, ago_s: float, config: Config) -> int:
-    """Earlier passes of the corner turned ``ago_s`` before the end that lay within the sonar's fan: could it have been learnt?"""
+    """Earlier passes of the corner turned ``ago_s`` before the end that lay within the sonar's fan: could it
+    have been learnt?"""
     turned_s = float(history.t_s[-1]) - ago_s
     place = history.body_w[int(np.abs(history.t_s - turned_s).argmin()), slot]
     passes = np.arange(turned_s - bodies.lap_s[slot], 0.0, -bodies.lap_s[slot])
-    here = np.stack([np.interp(passes, history.diary.t_s, history.diary.pos_w[:, axis]) for axis in range(3)], -1)
-    gap = np.abs(hindsight.vertical_gap(here, int(bodies.kind[slot]), np.broadcast_to(place, here.shape), bodies.size[slot]))
+    here = np.stack(
+        [np.interp(passes, history.diary.t_s, history.diary.pos_w[:, axis]) for axis in range(3)], -1
+    )
+    gap = np.abs(
+        hindsight.vertical_gap(
+            here, int(bodies.kind[slot]), np.broadcast_to(place, here.shape), bodies.size[slot]
+        )
+    )
     away = np.linalg.norm(here[:, :2] - place[:2], axis=1)
     sonar = config.sensors.sonar
-    return int(((away <= sonar.max_range_m) & (gap <= away * math.tan(math.radians(sonar.vertical_half_aperture_deg)))).sum())
+    return int(
+        (
+            (away <= sonar.max_range_m)
+            & (gap <= away * math.tan(math.radians(sonar.vertical_half_aperture_deg)))
+        ).sum()
+    )
 
 
 def killer_facts(history: History, bodies: Bodies, slot: int, config: Config) -> dict[str, Any]:
     """What holds where a moving body in this slot was the killer."""
     course = _course_facts(history, bodies, slot, config)
     beliefs = _belief_facts(history, slot, course["turned_ago_s"], config)
-    return _sight_facts(history, bodies, slot, config) | course | beliefs | _escape_facts(history, bodies, config)
+    return (
+        _sight_facts(history, bodies, slot, config)
+        | course
+        | beliefs
+        | _escape_facts(history, bodies, config)
+    )
 
 
 def _escape_facts(history: History, bodies: Bodies, config: Config) -> dict[str, Any]:

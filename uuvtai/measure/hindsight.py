@@ -1,7 +1,9 @@
-"""What the truth looked like, in NumPy: distances of the hull to every body, what the sonar could reach, what its beams met.
+"""What the truth looked like, in NumPy: distances of the hull to every body, what the sonar could reach, what
+its beams met.
 
-For explanations after the fact only; nothing that drives a vehicle may import it. Same geometry as ``kernels/core/hull.py`` and
-``kernels/sensors/raycast.py``. Arrays of one episode have the samples first, shape (n, ...); bodies are on the next axis.
+For explanations after the fact only; nothing that drives a vehicle may import it. Same geometry as
+``kernels/core/hull.py`` and ``kernels/sensors/raycast.py``. Arrays of one episode have the samples first,
+shape (n, ...); bodies are on the next axis.
 """
 
 from __future__ import annotations
@@ -16,7 +18,8 @@ from uuvtai.kernels.core.geometry import BOX, CYLINDER, NONE, SPHERE
 Array = np.ndarray
 
 _AXIS_SAMPLES = 9
-"""Points along the hull's axis: 25 mm apart, which overestimates the clearance by less than 1 mm (0.0125^2 / (2 x 0.27 m + clearance))."""
+"""Points along the hull's axis: 25 mm apart, which overestimates the clearance by less than 1 mm (0.0125^2 /
+(2 x 0.27 m + clearance))."""
 
 
 def rotation(quat_wb: Array) -> Array:
@@ -30,20 +33,38 @@ def rotation(quat_wb: Array) -> Array:
     return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
 
 
-def hull_gaps(pos_w: Array, axis_w: Array, kind: Array, body_w: Array, size: Array, yaw: Array, radius_m: float, half_m: float):
-    """(gap [m], unit vector hull to body, place on the axis [m]) of the capsule to every body: (n, nb), (n, nb, 3), (n, nb).
+def hull_gaps(
+    pos_w: Array,
+    axis_w: Array,
+    kind: Array,
+    body_w: Array,
+    size: Array,
+    yaw: Array,
+    radius_m: float,
+    half_m: float,
+):
+    """(gap [m], unit vector hull to body, place on the axis [m]) of the capsule to every body: (n, nb), (n,
+    nb, 3), (n, nb).
 
-    ``pos_w``, ``axis_w`` (n, 3); ``body_w`` (n, nb, 3); ``kind``, ``yaw`` (nb,), ``size`` (nb, 3). Empty slots are infinitely far.
+    ``pos_w``, ``axis_w`` (n, 3); ``body_w`` (n, nb, 3); ``kind``, ``yaw`` (nb,), ``size`` (nb, 3). Empty
+    slots are infinitely far.
     """
     along = np.linspace(-half_m, half_m, _AXIS_SAMPLES)
     point = pos_w[:, None, :] + along[:, None] * axis_w[:, None, :]
     away = point[:, None, :, :] - np.asarray(body_w, float)[:, :, None, :]
-    c, s = (turn[None, :, None] for turn in (np.cos(np.where(kind == BOX, yaw, 0.0)), np.sin(np.where(kind == BOX, yaw, 0.0))))
+    c, s = (
+        turn[None, :, None]
+        for turn in (np.cos(np.where(kind == BOX, yaw, 0.0)), np.sin(np.where(kind == BOX, yaw, 0.0)))
+    )
     q = np.stack([c * away[..., 0] + s * away[..., 1], c * away[..., 1] - s * away[..., 0], away[..., 2]], -1)
     outside = q - _core_point(q, kind[None, :, None], size[None, :, None, :])
     distance = np.linalg.norm(outside, axis=-1)
     best = distance.argmin(-1)
-    gap = np.take_along_axis(distance, best[..., None], -1)[..., 0] - radius_m - np.where(kind == SPHERE, size[:, 0], 0.0)
+    gap = (
+        np.take_along_axis(distance, best[..., None], -1)[..., 0]
+        - radius_m
+        - np.where(kind == SPHERE, size[:, 0], 0.0)
+    )
     toward = -np.take_along_axis(outside, best[..., None, None], 2)[..., 0, :]
     toward = np.stack(
         [
@@ -77,7 +98,9 @@ def wall_gaps(pos_w: Array, axis_w: Array, tank_cfg: TankConfig, radius_m: float
     return np.minimum(ends[..., :2] - low, high - ends[..., :2]).min((0, -1)) - radius_m
 
 
-def floor_and_surface_gaps(pos_w: Array, axis_w: Array, tank_cfg: TankConfig, radius_m: float, half_m: float) -> tuple[Array, Array]:
+def floor_and_surface_gaps(
+    pos_w: Array, axis_w: Array, tank_cfg: TankConfig, radius_m: float, half_m: float
+) -> tuple[Array, Array]:
     """(n,) clearance of the hull to the floor and to the surface [m]."""
     low, high = tank_cfg.z_m
     reach = np.abs(axis_w[:, 2]) * half_m + radius_m
@@ -85,14 +108,18 @@ def floor_and_surface_gaps(pos_w: Array, axis_w: Array, tank_cfg: TankConfig, ra
 
 
 def vertical_gap(pos_w: Array, kind: int, body_w: Array, size: Array) -> Array:
-    """(n,) signed gap [m] from the sonar's plane to a body's vertical extent: positive = the body is above, 0 = it crosses the plane."""
+    """(n,) signed gap [m] from the sonar's plane to a body's vertical extent: positive = the body is above, 0
+    = it crosses the plane."""
     rise = body_w[:, 2] - pos_w[:, 2]
     half = size[0] if kind == SPHERE else size[2]
     return np.where(np.abs(rise) > half, rise - np.sign(rise) * half, 0.0)
 
 
-def beam_entries(pos_w: Array, yaw: Array, kind: int, body_w: Array, size: Array, body_yaw: float, sonar_cfg: SonarConfig) -> Array:
-    """(n, n_ray) range at which each beam enters one body's outline within the sonar's vertical fan; inf = it does not (4-sensing.md)."""
+def beam_entries(
+    pos_w: Array, yaw: Array, kind: int, body_w: Array, size: Array, body_yaw: float, sonar_cfg: SonarConfig
+) -> Array:
+    """(n, n_ray) range at which each beam enters one body's outline within the sonar's vertical fan; inf = it
+    does not (4-sensing.md)."""
     slope = math.tan(math.radians(sonar_cfg.vertical_half_aperture_deg))
     bearing = yaw[:, None] + 2 * np.pi * np.arange(sonar_cfg.n_ray) / sonar_cfg.n_ray
     ux, uy = np.cos(bearing), np.sin(bearing)

@@ -1,4 +1,5 @@
-"""What is kept of a failed episode to explain it: its bodies, its last seconds sample by sample, and a coarse diary of all of it."""
+"""What is kept of a failed episode to explain it: its bodies, its last seconds sample by sample, and a coarse
+diary of all of it."""
 
 from __future__ import annotations
 
@@ -45,7 +46,8 @@ class Diary:
 
 @dataclass(frozen=True)
 class History:
-    """The last seconds of an episode, oldest sample first, the end last; ``diary`` is a coarse account of all of it."""
+    """The last seconds of an episode, oldest sample first, the end last; ``diary`` is a coarse account of all
+    of it."""
 
     t_s: Array
     """(n,) since the start"""
@@ -69,7 +71,8 @@ class History:
     forecast_m: Array
     """(n, n_track) present radius, negative = no forecast"""
     forecast_above_w: Array
-    """(n, n_track) z of the lowest edge of what it may hold above the vehicle; the vehicle's own z where it may be level with it"""
+    """(n, n_track) z of the lowest edge of what it may hold above the vehicle; the vehicle's own z where it
+    may be level with it"""
     forecast_below_w: Array
     """(n, n_track) z of the highest edge of what it may hold below"""
     conflict: Array

@@ -1,8 +1,9 @@
 """The paper's timing table for one vehicle: every row, mean and max, and whether the loop keeps 50 Hz.
 
-"Global planner" is the mean over steps in which a route is planned, as a planner's time is meant; "Planner stage, every step" is the mean
-over all steps, most of which only check whether to plan. "Full loop" is a whole step of the simulator (truth, sensing, mapping, planning,
-tree) and one decision of the networks (world model and policy); "Loop without networks" is the step alone.
+"Global planner" is the mean over steps in which a route is planned, as a planner's time is meant; "Planner
+stage, every step" is the mean over all steps, most of which only check whether to plan. "Full loop" is a
+whole step of the simulator (truth, sensing, mapping, planning, tree) and one decision of the networks (world
+model and policy); "Loop without networks" is the step alone.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ PAPER_MS: dict[str, tuple[float, float | None]] = {
     "Global planner": (5.22, 9.89),
     "Full loop": (28.63, 39.88),
 }
-"""(mean, max [ms]) of the paper's table "Workstation deployability timing", as printed (RTX 5090 workstation); None = not given"""
+"""(mean, max [ms]) of the paper's table "Workstation deployability timing", as printed (RTX 5090
+workstation); None = not given"""
 PAPER_REPLANS = {"paper_hz": 6.21, "paper_replans_per_episode": 52.1}
 _CALLS, _WARM_CALLS = 2000, 200
 EVERY_STEP, NO_NETWORKS = "Planner stage, every step", "Loop without networks"
@@ -38,11 +40,13 @@ _LEAST_STEPS = 4
 _ENOUGH_PLANS = 20
 
 
-def latency_rows(batch: SimBatch, config: LearningConfig, seconds: float) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+def latency_rows(
+    batch: SimBatch, config: LearningConfig, seconds: float
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Rows of the paper's table for a batch of one env, and the loop against its real-time budget.
 
-    The loop is one control step driven by the tree, all stages; its stages are timed in every second step, the whole in the others, since
-    waiting after every stage costs time itself.
+    The loop is one control step driven by the tree, all stages; its stages are timed in every second step,
+    the whole in the others, since waiting after every stage costs time itself.
     """
     networks = _networks(config)
     samples = {name: _times_ms(call) for name, call in networks.items()}
@@ -80,17 +84,24 @@ def _real_time(loop_ms: list[float], budget_ms: float) -> dict[str, Any]:
     p50, p99 = (float(value) for value in np.quantile(loop_ms, (0.5, 0.99)))
     late = sum(value > budget_ms for value in loop_ms)
     return {
-        "budget_ms": budget_ms, "p50_ms": p50, "p99_ms": p99, "max_ms": max(loop_ms), "steps": len(loop_ms), "late": late,
+        "budget_ms": budget_ms, "p50_ms": p50, "p99_ms": p99, "max_ms": max(loop_ms), "steps": len(loop_ms),
+        "late": late,
         "within": p99 < budget_ms,
     }  # fmt: skip
 
 
-def _loop_samples(batch: SimBatch, seconds: float, networks: list[Callable[[], Any]]) -> dict[str, list[float]]:
-    """[ms] of the stages that the table names, of the planner in steps that plan, and of whole steps without and with the networks.
+def _loop_samples(
+    batch: SimBatch, seconds: float, networks: list[Callable[[], Any]]
+) -> dict[str, list[float]]:
+    """[ms] of the stages that the table names, of the planner in steps that plan, and of whole steps without
+    and with the networks.
 
-    Routes are planned once in hundreds of steps: where ``seconds`` saw few of them, stages are timed for up to twice as long again.
+    Routes are planned once in hundreds of steps: where ``seconds`` saw few of them, stages are timed for up
+    to twice as long again.
     """
-    found: dict[str, list[float]] = {name: [] for name in (*_STAGES, "Global planner", NO_NETWORKS, "Full loop")}
+    found: dict[str, list[float]] = {
+        name: [] for name in (*_STAGES, "Global planner", NO_NETWORKS, "Full loop")
+    }
     batch.replans = batch.episodes = batch.env_steps = 0
     end = time.perf_counter() + seconds
     while time.perf_counter() < end or len(found["Full loop"]) < _LEAST_STEPS:
@@ -116,7 +127,8 @@ def _time_stages(batch: SimBatch, found: dict[str, list[float]]) -> None:
 
 
 def _time_loop(batch: SimBatch, networks: list[Callable[[], Any]], found: dict[str, list[float]]) -> None:
-    """One whole step, then the networks; drawing the next episode's scenario is no part of a control loop and not counted."""
+    """One whole step, then the networks; drawing the next episode's scenario is no part of a control loop and
+    not counted."""
     ended, begun = batch.episodes, time.perf_counter()
     batch.step()
     stepped = time.perf_counter()
@@ -134,14 +146,17 @@ def _replans(batch: SimBatch) -> int:
 
 
 def _networks(config: LearningConfig) -> dict[str, Callable[[], Any]]:
-    """One call of each network for one vehicle on the CPU, of the sizes that ``config`` gives; their weights do not matter."""
+    """One call of each network for one vehicle on the CPU, of the sizes that ``config`` gives; their weights
+    do not matter."""
     from uuvtai.kernels.planning.features import observation_width
     from uuvtai.learn.policy import ActorCritic
     from uuvtai.learn.world_model import N_FEATURES, WorldModel
 
     generator, n_obs = torch.Generator().manual_seed(0), observation_width(config.features)
     model = WorldModel(n_obs, config.world_model, generator)
-    policy = ActorCritic(n_obs + N_FEATURES, config.policy.model_copy(update={"residual": False}), None, generator)
+    policy = ActorCritic(
+        n_obs + N_FEATURES, config.policy.model_copy(update={"residual": False}), None, generator
+    )
     obs, action, x = torch.randn(1, n_obs), torch.rand(1, 4), torch.randn(1, n_obs + N_FEATURES)
     latent = torch.randn(1, config.world_model.latent)
     return {

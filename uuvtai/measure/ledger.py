@@ -1,4 +1,5 @@
-"""Finished episodes of an evaluation, on disk as soon as each is over: what an interrupted ``uuv eval`` need not play again."""
+"""Finished episodes of an evaluation, on disk as soon as each is over: what an interrupted ``uuv eval`` need
+not play again."""
 
 from __future__ import annotations
 
@@ -22,10 +23,20 @@ if TYPE_CHECKING:
 FILE = "eval/episodes.jsonl"
 
 _SYNC_S = 1.0
-"""a kill of the process loses nothing that was flushed; against a failing machine the disk is asked this often"""
+"""a kill of the process loses nothing that was flushed; against a failing machine the disk is asked this
+often"""
 
 _COUNTS = ("replans", "planned_by", "fallbacks")
-_PLAIN = ("seed", "episode", "outcome", "time_s", "episode_return", "min_clearance_m", "path_length_m", *_COUNTS)
+_PLAIN = (
+    "seed",
+    "episode",
+    "outcome",
+    "time_s",
+    "episode_return",
+    "min_clearance_m",
+    "path_length_m",
+    *_COUNTS,
+)
 
 
 class Finished(NamedTuple):
@@ -61,12 +72,15 @@ class _Line(BaseModel):
 
     def finished(self) -> Finished:
         plain: dict[str, Any] = {name: getattr(self, name) for name in _PLAIN}
-        counts: dict[str, Any] = {name: np.array(getattr(self, name), dtype=np.int32) for name in ("ticks", "acted")}
+        counts: dict[str, Any] = {
+            name: np.array(getattr(self, name), dtype=np.int32) for name in ("ticks", "acted")
+        }
         return Finished(EpisodeResult(**plain, **counts), self.said, self.wall_s)
 
 
 class Ledger:
-    """The file ``eval/episodes.jsonl`` of a run folder that this process holds. Raises RunFolderError, FileError."""
+    """The file ``eval/episodes.jsonl`` of a run folder that this process holds. Raises RunFolderError,
+    FileError."""
 
     def __init__(self, folder: Path) -> None:
         """Reads what is there; a last line that a kill cut off is removed."""
@@ -112,14 +126,17 @@ class Ledger:
                 found = _Line.model_validate_json(line)
             except ValidationError as error:
                 reason = error.errors()[0]["msg"]
-                raise RunFolderError(f"{self._path}, line {number}: is no finished episode ({reason}); take that line out") from None
+                raise RunFolderError(
+                    f"{self._path}, line {number}: is no finished episode ({reason}); take that line out"
+                ) from None
             self.finished(found.method)[Job(found.seed, found.episode)] = found.finished()
             kept += len(line)
         return kept
 
 
 class Keeper:
-    """Recorder that writes a method's episodes into the ledger as they end; behind those whose work an episode needs to be whole."""
+    """Recorder that writes a method's episodes into the ledger as they end; behind those whose work an
+    episode needs to be whole."""
 
     def __init__(self, ledger: Ledger, method: str, foresight: Foresight | None) -> None:
         self._ledger, self._method, self._foresight = ledger, method, foresight
@@ -139,4 +156,7 @@ class Keeper:
 
     def end(self, sim: Sim, row: int, result: EpisodeResult) -> None:
         """Keep the episode."""
-        self._ledger.add(self._method, Finished(result, self._foresight.newest_said if self._foresight else None, self.wall_s))
+        self._ledger.add(
+            self._method,
+            Finished(result, self._foresight.newest_said if self._foresight else None, self.wall_s),
+        )

@@ -1,4 +1,5 @@
-"""Record chosen episodes: read their rows from the simulator after every step and hand them to the log writer."""
+"""Record chosen episodes: read their rows from the simulator after every step and hand them to the log
+writer."""
 
 from __future__ import annotations
 
@@ -33,7 +34,16 @@ _STEP_FIELDS = {
     "world": ("kind", "pos_w", "vel_w", "size", "yaw"),
     "ego": ("pos_w", "rpy", "vel_b", "vel_valid", "rate_b", "depth_m"),
     "scan": ("fresh", "ping_step", "ping_vel_b", "range_m", "doppler_m_s", "intensity", "hit"),
-    "route": ("n_way", "way_w", "plan_step", "planner", "fallback_reason", "trigger", "lookahead_w", "path_risk"),
+    "route": (
+        "n_way",
+        "way_w",
+        "plan_step",
+        "planner",
+        "fallback_reason",
+        "trigger",
+        "lookahead_w",
+        "path_risk",
+    ),
     "tracks": ("alive", "moving", "state", "z_m", "radius_m", "beam_track"),
     "teacher": ("status", "leaf", "action"),
     "reward": ("term",),
@@ -58,10 +68,22 @@ class EpisodeRecorder:
     """Writes one MCAP file per recorded job; ``paths`` maps each to its file."""
 
     def __init__(
-        self, folder: Path, world: str, controller: str, jobs: list[Job], depth_images: bool = False, policy: PolicyNote | None = None
+        self,
+        folder: Path,
+        world: str,
+        controller: str,
+        jobs: list[Job],
+        depth_images: bool = False,
+        policy: PolicyNote | None = None,
     ) -> None:
         """``policy``: who drives; None = the simulator's tree."""
-        self._world, self._controller, self._wanted, self._depth, self._policy = world, controller, set(jobs), depth_images, policy
+        self._world, self._controller, self._wanted, self._depth, self._policy = (
+            world,
+            controller,
+            set(jobs),
+            depth_images,
+            policy,
+        )
         self._logs: dict[int, McapEpisodeLog] = {}
         self._applied: dict[int, np.ndarray] = {}
         self.paths = {job: folder / f"{controller}_seed{job.seed}_episode{job.episode}.mcap" for job in jobs}
@@ -117,12 +139,21 @@ class EpisodeRecorder:
 
     def _write(self, sim: Sim, rows: list[int]) -> None:
         read = _read(sim, _STEP_FIELDS, rows)
-        due = {row: self._due(row, {name: values[i] for name, values in read.items()}) for i, row in enumerate(rows)}
+        due = {
+            row: self._due(row, {name: values[i] for name, values in read.items()})
+            for i, row in enumerate(rows)
+        }
         maps = _read_rows(sim, _MAP_FIELDS, [row for row in rows if due[row].maps])
-        images = _read_rows(sim, {"image": ("depth_m", "shot_rpy")}, [row for i, row in enumerate(rows) if read["image.fresh"][i]])
+        images = _read_rows(
+            sim,
+            {"image": ("depth_m", "shot_rpy")},
+            [row for i, row in enumerate(rows) if read["image.fresh"][i]],
+        )
         for i, row in enumerate(rows):
             layers = _layers(sim.config, maps[row], int(read["clock.step"][i])) if row in maps else None
-            snapshot = _snapshot(sim, {name: values[i] for name, values in read.items()}, self._applied[row], layers)
+            snapshot = _snapshot(
+                sim, {name: values[i] for name, values in read.items()}, self._applied[row], layers
+            )
             if row in images:
                 snapshot = _with_image(sim.config, snapshot, images[row], due[row].depth_image)
             thoughts = _thoughts(self._policy, row) if self._policy else {}
@@ -148,10 +179,16 @@ def _thoughts(policy: PolicyNote, row: int) -> dict[str, Any]:
 
 
 def _read(sim: Sim, fields: dict[str, tuple[str, ...]], rows: list[int]) -> dict[str, np.ndarray]:
-    return {f"{struct}.{name}": sim.rows(getattr(getattr(sim.s, struct), name), rows) for struct, names in fields.items() for name in names}
+    return {
+        f"{struct}.{name}": sim.rows(getattr(getattr(sim.s, struct), name), rows)
+        for struct, names in fields.items()
+        for name in names
+    }
 
 
-def _read_rows(sim: Sim, fields: dict[str, tuple[str, ...]], rows: list[int]) -> dict[int, dict[str, np.ndarray]]:
+def _read_rows(
+    sim: Sim, fields: dict[str, tuple[str, ...]], rows: list[int]
+) -> dict[int, dict[str, np.ndarray]]:
     read = _read(sim, fields, rows) if rows else {}
     return {row: {name: values[i] for name, values in read.items()} for i, row in enumerate(rows)}
 
@@ -161,7 +198,11 @@ def _is_fresh(r: dict[str, Any]) -> bool:
 
 
 def _layers(config: Config, maps: dict[str, np.ndarray], step: int) -> MapLayers:
-    static, dynamic, clearance = maps["grid_map.static_occ"], maps["grid_map.dynamic_occ"], maps["clearance.clearance_m"]
+    static, dynamic, clearance = (
+        maps["grid_map.static_occ"],
+        maps["grid_map.dynamic_occ"],
+        maps["clearance.clearance_m"],
+    )
     c = config.clearance
     return MapLayers(
         origin_m=grid_origin(config.world.tank, config.mapping.cell_m),
@@ -170,11 +211,15 @@ def _layers(config: Config, maps: dict[str, np.ndarray], step: int) -> MapLayers
         dynamic=dynamic,
         clearance_m=clearance,
         clearance_step=step - step % c.period_steps,
-        risk=c.risk_static * static + c.risk_dynamic * dynamic + c.risk_clearance / (clearance + c.risk_epsilon_m),
+        risk=c.risk_static * static
+        + c.risk_dynamic * dynamic
+        + c.risk_clearance / (clearance + c.risk_epsilon_m),
     )
 
 
-def _with_image(config: Config, snapshot: EpisodeSnapshot, image: dict[str, np.ndarray], whole: bool) -> EpisodeSnapshot:
+def _with_image(
+    config: Config, snapshot: EpisodeSnapshot, image: dict[str, np.ndarray], whole: bool
+) -> EpisodeSnapshot:
     depth_m = image["image.depth_m"]
     line = depth_line(depth_m, image["image.shot_rpy"], config.sensors.depth, config.mapping)
     return replace(snapshot, depth_line=line, depth_image_m=depth_m if whole else None)
@@ -219,7 +264,10 @@ def _sensed(r: dict[str, Any]) -> dict[str, Any]:
         "depth_m": float(r["ego.depth_m"]),
         "sonar_fresh": bool(r["scan.fresh"]),
         "sonar_ping_step": int(r["scan.ping_step"]),
-        **{f"sonar_{name}": r[f"scan.{name}"] for name in ("range_m", "doppler_m_s", "intensity", "hit", "ping_vel_b")},
+        **{
+            f"sonar_{name}": r[f"scan.{name}"]
+            for name in ("range_m", "doppler_m_s", "intensity", "hit", "ping_vel_b")
+        },
     }
 
 
@@ -227,7 +275,9 @@ def _tracked(r: dict[str, Any]) -> dict[str, Any]:
     moving = (r["tracks.alive"] == 1) & (r["tracks.moving"] == 1)
     state, explained = r["tracks.state"][moving], r["tracks.beam_track"]
     return {
-        "tracks": np.column_stack([state[:, :2], r["tracks.z_m"][moving], state[:, 2:], r["tracks.radius_m"][moving]]),
+        "tracks": np.column_stack(
+            [state[:, :2], r["tracks.z_m"][moving], state[:, 2:], r["tracks.radius_m"][moving]]
+        ),
         "track_beams": np.flatnonzero((explained >= 0) & moving[np.maximum(explained, 0)]),
     }
 

@@ -1,4 +1,5 @@
-"""What drives an evaluation: behaviour trees and stacks by name, trained policies by run folder, checkpoint folder or shipped name."""
+"""What drives an evaluation: behaviour trees and stacks by name, trained policies by run folder, checkpoint
+folder or shipped name."""
 
 from __future__ import annotations
 
@@ -23,7 +24,18 @@ TRAINING_TREE = "bt"
 TRUTH = "truth"
 """suffix of a tree's name: a privileged yardstick whose tracks of moving bodies are the truth"""
 
-_STACK = ("tracking", "forecast", "elevation", "mapping", "clearance", "voronoi", "route", "teacher", "actuation", "episode")
+_STACK = (
+    "tracking",
+    "forecast",
+    "elevation",
+    "mapping",
+    "clearance",
+    "voronoi",
+    "route",
+    "teacher",
+    "actuation",
+    "episode",
+)
 """sections that shape what a policy sees and does; differences from its training are told, not refused"""
 
 
@@ -41,11 +53,13 @@ class Method:
     """stack preset (name or path) that this row alone drives with; None = the request's own"""
 
     def config_of(self, config: Config) -> Config:
-        """What this method's simulator runs on; scenarios, sensors and referee are those of ``config``. Raises ConfigError."""
+        """What this method's simulator runs on; scenarios, sensors and referee are those of ``config``.
+        Raises ConfigError."""
         return config if self.stack is None else with_stack(config, self.stack)
 
     def driver_for(self, sim: Sim) -> PolicyNote | None:
-        """The policy ready for this simulator's rows; None where the tree drives. Raises CheckpointError for one that does not fit."""
+        """The policy ready for this simulator's rows; None where the tree drives. Raises CheckpointError for
+        one that does not fit."""
         if self.checkpoint is None:
             return None
         from uuvtai.env import VectorEnv
@@ -60,13 +74,25 @@ class Method:
     def document(self) -> dict[str, Any]:
         """What ``uuv eval --json`` says of a policy or a stack beside its results."""
         if self.checkpoint is None:
-            return {} if self.stack is None else {"stack": {"preset": self.stack, "tree": tree_of_stack(self.stack)}}
+            return (
+                {}
+                if self.stack is None
+                else {"stack": {"preset": self.stack, "tree": tree_of_stack(self.stack)}}
+            )
         found = self.checkpoint
-        return {"checkpoint": {"path": str(found.path), "sha256": found.sha256, "step": found.step, "version": found.manifest.version}}
+        return {
+            "checkpoint": {
+                "path": str(found.path),
+                "sha256": found.sha256,
+                "step": found.step,
+                "version": found.manifest.version,
+            }
+        }
 
 
 def trees_of(names: list[str], max_node: int) -> list[Method]:
-    """Methods that a tree drives, by names of trees or stacks or paths of their XML or YAML, each perhaps with ``+truth``. ConfigError."""
+    """Methods that a tree drives, by names of trees or stacks or paths of their XML or YAML, each perhaps
+    with ``+truth``. ConfigError."""
     found = {}
     for name in names:
         driver, privileged = _parted(name)
@@ -78,7 +104,8 @@ def trees_of(names: list[str], max_node: int) -> list[Method]:
 
 
 def _is_stack(name: str) -> bool:
-    """Whether a controller's name is that of a stack preset, or a path of one; ConfigError for what is neither tree nor stack."""
+    """Whether a controller's name is that of a stack preset, or a path of one; ConfigError for what is
+    neither tree nor stack."""
     if name.endswith((".yaml", ".yml")):
         preset_path("stack", name)
         return True
@@ -87,19 +114,28 @@ def _is_stack(name: str) -> bool:
         return True
     if name not in trees and not name.endswith(".xml") and "/" not in name:
         raise ConfigError(
-            f"--controller: {name!r} is no preset of a tree or a stack{nearest(name, [*trees, *stacks])}; trees: {', '.join(trees)}; "
+            f"--controller: {name!r} is no preset of a tree or a stack{nearest(name, [*trees, *stacks])}; "
+            f"trees: {', '.join(trees)}; "
             f"stacks: {', '.join(stacks)}; or give the path of a tree's .xml or a stack's .yaml"
         )
     return False
 
 
 def policies_of(names: list[str], max_node: int, note: Callable[[str], None]) -> list[Method]:
-    """Methods that a trained policy drives; ``note`` is told of checkpoints that were left out. Raises ConfigError, CheckpointError."""
+    """Methods that a trained policy drives; ``note`` is told of checkpoints that were left out. Raises
+    ConfigError, CheckpointError."""
     tree = read_tree(TRAINING_TREE, max_node) if names else None
-    found = [Method(policy_name(name, checkpoint), tree, checkpoint) for name in names if (checkpoint := find_policy(name, note)) and tree]
+    found = [
+        Method(policy_name(name, checkpoint), tree, checkpoint)
+        for name in names
+        if (checkpoint := find_policy(name, note)) and tree
+    ]
     doubled = {method.name for method in found if [other.name for other in found].count(method.name) > 1}
     if doubled:
-        raise ConfigError(f"{', '.join(sorted(doubled))}: given twice, or two runs with the same name; evaluate them one by one")
+        raise ConfigError(
+            f"{', '.join(sorted(doubled))}: given twice, or two runs with the same name; evaluate them one "
+            "by one"
+        )
     return found
 
 
@@ -119,13 +155,15 @@ def find_policy(name: str, note: Callable[[str], None] = lambda _text: None) -> 
     if (path / "checkpoints").is_dir():
         return checkpoint.best(path, note)
     raise ConfigError(
-        f"{name!r} is no trained policy: give the run folder of 'uuv train', one of its checkpoints/step_N, or a shipped policy's name "
+        f"{name!r} is no trained policy: give the run folder of 'uuv train', one of its checkpoints/step_N, "
+        "or a shipped policy's name "
         f"({', '.join(shipped) or 'none is shipped'})"
     )
 
 
 def features_of(names: list[str]) -> list[tuple[str, Any]]:
-    """Overrides that give the observation the columns these policies were trained with. ConfigError where they differ among themselves."""
+    """Overrides that give the observation the columns these policies were trained with. ConfigError where
+    they differ among themselves."""
     sections = {name: find_policy(name).config.features.model_dump(mode="json") for name in names}
     for name, section in sections.items():
         if section != next(iter(sections.values())):
@@ -164,7 +202,10 @@ def _parted(name: str) -> tuple[str, bool]:
         return name, False
     tree, _, suffix = name.rpartition("+")
     if suffix != TRUTH:
-        raise ConfigError(f"--controller {name}: '+{suffix}' is unknown; the one suffix is +{TRUTH}, for example {tree}+{TRUTH}")
+        raise ConfigError(
+            f"--controller {name}: '+{suffix}' is unknown; the one suffix is +{TRUTH}, for example "
+            f"{tree}+{TRUTH}"
+        )
     return tree, True
 
 

@@ -1,4 +1,5 @@
-"""Methods compared on the same episodes: who alone arrives, how sure that is, and the difference in time where both do."""
+"""Methods compared on the same episodes: who alone arrives, how sure that is, and the difference in time
+where both do."""
 
 from __future__ import annotations
 
@@ -13,7 +14,8 @@ Episode = dict[str, Any]
 
 
 def paired(methods: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Every pair of methods (entries of ``uuv eval --json``): only_a and only_b arrive, McNemar's exact p, times where both arrive.
+    """Every pair of methods (entries of ``uuv eval --json``): only_a and only_b arrive, McNemar's exact p,
+    times where both arrive.
 
     ``time_difference_mean_s`` is a's time minus b's, with a bootstrap interval over episodes.
     """
@@ -23,7 +25,11 @@ def paired(methods: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 def _compared(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
     pairs = _pairs(a["episodes_detail"], b["episodes_detail"])
     arrived = [tuple(e["outcome"] == "success" for e in pair) for pair in pairs]
-    times = [(one["time_s"], other["time_s"]) for (one, other), both in zip(pairs, arrived, strict=True) if all(both)]
+    times = [
+        (one["time_s"], other["time_s"])
+        for (one, other), both in zip(pairs, arrived, strict=True)
+        if all(both)
+    ]
     only_a, only_b = arrived.count((True, False)), arrived.count((False, True))
     differences = [one - other for one, other in times]
     interval = bootstrap_interval(differences)

@@ -23,13 +23,21 @@ _MAX_STEPS = 100_000
 _DENSITY = (0, 3, 6, 9, 15)
 
 PAPER_DENSITY = {0: (19.7, 51.9), 3: (25.2, 62.7), 6: (28.6, 54.4), 9: (31.6, 48.8), 15: (38.0, 42.7)}
-"""D: (loop [ms], replans an episode) of the paper's table "Runtime versus dynamic-obstacle density", as printed"""
+"""D: (loop [ms], replans an episode) of the paper's table "Runtime versus dynamic-obstacle density", as
+printed"""
 
 
 def profile(
-    config: LearningConfig, sizes: list[int], controller: str, device: str, seconds: float, density: bool, say: Callable[[str], None]
+    config: LearningConfig,
+    sizes: list[int],
+    controller: str,
+    device: str,
+    seconds: float,
+    density: bool,
+    say: Callable[[str], None],
 ) -> dict[str, Any]:
-    """The ``uuv profile --json`` document; raises ValueError or MemoryError for sizes that cannot work, before anything runs."""
+    """The ``uuv profile --json`` document; raises ValueError or MemoryError for sizes that cannot work,
+    before anything runs."""
     from uuvtai.tree import read_tree
 
     tree = read_tree(controller, config.teacher.max_node)
@@ -60,7 +68,8 @@ def profile(
 
 
 def _learning_rates(config: LearningConfig, sim: Sim) -> dict[str, float]:
-    """Env-steps per second with a policy that decides, and with everything that learns as well: one iteration of the training preset."""
+    """Env-steps per second with a policy that decides, and with everything that learns as well: one iteration
+    of the training preset."""
     from uuvtai.env import VectorEnv
     from uuvtai.learn.train import Trainer
 
@@ -73,7 +82,9 @@ def _learning_rates(config: LearningConfig, sim: Sim) -> dict[str, float]:
     return {"step_inference": samples / driving_s, "train": samples / (driving_s + told["time/learn_s"])}
 
 
-def _row(config: Config, batch: SimBatch, controller: str, seconds: float, compile_s: float) -> dict[str, Any]:
+def _row(
+    config: Config, batch: SimBatch, controller: str, seconds: float, compile_s: float
+) -> dict[str, Any]:
     sim = batch.sim
     step = env_steps_per_s(batch, seconds, lambda: 2 * torch.rand(sim.num_envs, 4, device=sim.device) - 1)
     driven = env_steps_per_s(batch, seconds, lambda: None)
@@ -107,7 +118,9 @@ def env_steps_per_s(batch: SimBatch, seconds: float, action: Callable[[], torch.
     return batch.env_steps / elapsed
 
 
-def _density(config: Config, tree: Any, device: str, seconds: float, say: Callable[[str], None]) -> list[dict[str, Any]]:
+def _density(
+    config: Config, tree: Any, device: str, seconds: float, say: Callable[[str], None]
+) -> list[dict[str, Any]]:
     """Loop time of one env and replans per episode against D: one simulator, D as data."""
     room = config.world.model_copy(update={"dynamic_capacity": max(_DENSITY)})
     sim = Sim(config.model_copy(update={"world": room}), 1, tree, device)

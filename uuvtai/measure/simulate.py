@@ -1,4 +1,5 @@
-"""Open-loop physics in endless water: what ``uuv simulate`` runs, to hold a vehicle against theory or one's own data."""
+"""Open-loop physics in endless water: what ``uuv simulate`` runs, to hold a vehicle against theory or one's
+own data."""
 
 from __future__ import annotations
 
@@ -45,12 +46,14 @@ def simulate(
     dt: float = 0.01,
     runtime: Runtime | None = None,
 ) -> dict[str, list]:
-    """Trajectory of one vehicle that starts at the origin, sampled at every control step, the initial state first.
+    """Trajectory of one vehicle that starts at the origin, sampled at every control step, the initial state
+    first.
 
-    ``wrench`` is a constant body-frame force and moment on top of the thrusters, which are off unless ``command`` (body velocity and yaw
-    rate) drives them through the inner loop; ``dt`` is the substep; ``neutral`` sets buoyancy equal to weight. Starts Taichi in double
-    precision unless ``runtime`` says what is running. Returns {"t" [s], "position" [m], "rpy_deg", "nu" [m/s, rad/s], "rpm"}.
-    Raises SettingError for input that makes no sense, DivergenceError where the integration diverges.
+    ``wrench`` is a constant body-frame force and moment on top of the thrusters, which are off unless
+    ``command`` (body velocity and yaw rate) drives them through the inner loop; ``dt`` is the substep;
+    ``neutral`` sets buoyancy equal to weight. Starts Taichi in double precision unless ``runtime`` says what
+    is running. Returns {"t" [s], "position" [m], "rpy_deg", "nu" [m/s, rad/s], "rpm"}. Raises SettingError
+    for input that makes no sense, DivergenceError where the integration diverges.
     """
     given = {
         "wrench": wrench,
@@ -72,11 +75,14 @@ def simulate(
         plant.step(action)
         samples.append(_sample(plant, k * control_dt))
         if not math.isfinite(sum(samples[-1]["nu"])):
-            raise DivergenceError(f"the integration diverged at t = {k * control_dt:.2f} s: use a smaller substep, --dt {dt / 4:g}")
+            raise DivergenceError(
+                f"the integration diverged at t = {k * control_dt:.2f} s: use a smaller substep, --dt "
+                f"{dt / 4:g}"
+            )
     return {key: [s[key] for s in samples] for key in samples[0]}
 
 
-# --------------------------------------------------------------------------------------------------------------------- input
+# ------------------------------------------------------------------------------------------------------ input
 
 
 def checked_vector(name: str, value: Sequence[float]) -> np.ndarray:
@@ -89,14 +95,20 @@ def checked_vector(name: str, value: Sequence[float]) -> np.ndarray:
         raise SettingError(f"{flag} must be {length} numbers ({what}), got {value!r}") from None
     example = ",".join(["0.1"] + ["0"] * (length - 1))
     if vector.shape != (length,):
-        raise SettingError(f"{flag} must be {length} numbers ({what}), got {vector.size}: for example {flag} {example}")
+        raise SettingError(
+            f"{flag} must be {length} numbers ({what}), got {vector.size}: for example {flag} {example}"
+        )
     if not np.isfinite(vector).all() or np.abs(vector).max() > _MAX_COMPONENT:
-        raise SettingError(f"{flag} must be finite numbers below {_MAX_COMPONENT:g} ({what}), got {value!r}: for example {flag} {example}")
+        raise SettingError(
+            f"{flag} must be finite numbers below {_MAX_COMPONENT:g} ({what}), got {value!r}: for example "
+            f"{flag} {example}"
+        )
     return vector
 
 
 def control_step(dt: float) -> tuple[int, float]:
-    """(substeps, control step [s]) for a substep of ``dt``: 0.02 s where dt divides it, else the next multiple of dt."""
+    """(substeps, control step [s]) for a substep of ``dt``: 0.02 s where dt divides it, else the next
+    multiple of dt."""
     if not (isinstance(dt, (int, float)) and math.isfinite(dt) and dt > 0):
         raise SettingError(f"--dt must be a positive number of seconds, got {dt!r}: for example --dt 0.01")
     ratio = CONTROL_DT_S / dt
@@ -112,7 +124,8 @@ def checked_steps(seconds: float, control_dt: float, substeps: int) -> int:
         raise SettingError(f"--seconds must be a positive number, got {seconds!r}: for example --seconds 10")
     if seconds / control_dt * substeps > _MAX_STEPS:
         raise SettingError(
-            f"--seconds {seconds:g} at --dt {control_dt / substeps:g} is more than {_MAX_STEPS} substeps: use fewer seconds or larger --dt"
+            f"--seconds {seconds:g} at --dt {control_dt / substeps:g} is more than {_MAX_STEPS} substeps: "
+            "use fewer seconds or larger --dt"
         )
     return max(1, math.ceil(seconds / control_dt - 1e-6))
 
@@ -124,23 +137,28 @@ def _action(config: Config, command: np.ndarray) -> np.ndarray:
     for name, value, limit in zip(names, command, limits, strict=True):
         if abs(value) > limit * (1 + 1e-9):
             raise SettingError(
-                f"--command asks for {value:g}, above vehicle.{name} = {limit:g}: ask for less, or --set vehicle.{name}={abs(value):g}"
+                f"--command asks for {value:g}, above vehicle.{name} = {limit:g}: ask for less, or --set "
+                f"vehicle.{name}={abs(value):g}"
             )
     return (command / limits).astype(np.float32)[None, :]
 
 
-def _experiment(config: Config, vectors: dict[str, np.ndarray], neutral: bool, control_dt: float, substeps: int) -> Config:
+def _experiment(
+    config: Config, vectors: dict[str, np.ndarray], neutral: bool, control_dt: float, substeps: int
+) -> Config:
     """The config with the experiment's settings in it."""
     vehicle, disturbance = config.vehicle, config.disturbance
     if neutral:
         vehicle = vehicle.model_copy(update={"volume_m3": vehicle.mass_kg / vehicle.water_density_kg_m3})
     if "current" in vectors:
-        disturbance = disturbance.model_copy(update={"current_m_s": tuple(float(x) for x in vectors["current"])})
+        disturbance = disturbance.model_copy(
+            update={"current_m_s": tuple(float(x) for x in vectors["current"])}
+        )
     episode = config.episode.model_copy(update={"control_dt_s": control_dt, "substeps": substeps})
     return config.model_copy(update={"vehicle": vehicle, "disturbance": disturbance, "episode": episode})
 
 
-# ----------------------------------------------------------------------------------------------------------------- trajectory
+# ------------------------------------------------------------------------------------------------- trajectory
 
 
 def _set_start(plant: Plant, vectors: dict[str, np.ndarray]) -> None:
@@ -155,7 +173,9 @@ def _set_start(plant: Plant, vectors: dict[str, np.ndarray]) -> None:
 
 def _sample(plant: Plant, time_s: float) -> dict[str, Any]:
     v = plant.vehicle
-    position, q, vel, rate = (field.to_numpy()[0].astype(float) for field in (v.pos_w, v.quat_wb, v.vel_b, v.rate_b))
+    position, q, vel, rate = (
+        field.to_numpy()[0].astype(float) for field in (v.pos_w, v.quat_wb, v.vel_b, v.rate_b)
+    )
     return {
         "t": time_s,
         "position": position.tolist(),

@@ -1,4 +1,5 @@
-"""Intervals for rates and means, paired comparison of methods, and the two time figures. Hand-checked in tests/test_statistics.py."""
+"""Intervals for rates and means, paired comparison of methods, and the two time figures. Hand-checked in
+tests/test_statistics.py."""
 
 from __future__ import annotations
 
@@ -62,7 +63,8 @@ def bootstrap_interval(values: Sequence[float], resamples: int = _RESAMPLES) -> 
 
 
 def mcnemar_p(only_a: int, only_b: int) -> float:
-    """Two-sided exact p value of McNemar's test (1947): pairs in which only one of two methods succeeded, binomial with p = 1/2.
+    """Two-sided exact p value of McNemar's test (1947): pairs in which only one of two methods succeeded,
+    binomial with p = 1/2.
 
     1 where there is no such pair. Raises ValueError for negative counts.
     """
@@ -74,7 +76,8 @@ def mcnemar_p(only_a: int, only_b: int) -> float:
 
 
 def binomial_p(k: int, n: int, p: float) -> float:
-    """Two-sided exact p value of k successes in n trials against the rate p: twice the smaller tail (Clopper and Pearson 1934).
+    """Two-sided exact p value of k successes in n trials against the rate p: twice the smaller tail (Clopper
+    and Pearson 1934).
 
     1 without trials. Raises ValueError unless 0 <= k <= n and 0 < p < 1.
     """
@@ -85,14 +88,19 @@ def binomial_p(k: int, n: int, p: float) -> float:
 
 
 def fisher_p(k_a: int, n_a: int, k_b: int, n_b: int) -> float:
-    """Two-sided p value of Fisher's exact test (1922) that two rates are one: all tables at most as probable as the one at hand.
+    """Two-sided p value of Fisher's exact test (1922) that two rates are one: all tables at most as probable
+    as the one at hand.
 
-    1 where either has no trials. Raises ValueError for impossible counts. On paired episodes it errs on the safe side.
+    1 where either has no trials. Raises ValueError for impossible counts. On paired episodes it errs on the
+    safe side.
     """
     if not (0 <= k_a <= n_a and 0 <= k_b <= n_b):
         raise ValueError(f"want 0 <= k <= n, got {k_a}/{n_a} and {k_b}/{n_b}")
     total = k_a + k_b
-    logs = {i: _log_choose(n_a, i) + _log_choose(n_b, total - i) for i in range(max(0, total - n_b), min(n_a, total) + 1)}
+    logs = {
+        i: _log_choose(n_a, i) + _log_choose(n_b, total - i)
+        for i in range(max(0, total - n_b), min(n_a, total) + 1)
+    }
     whole = _log_choose(n_a + n_b, total)
     limit = logs[k_a] + 1e-9  # rounding must not part tables that are equally probable
     return min(1.0, math.fsum(math.exp(value - whole) for value in logs.values() if value <= limit))
@@ -108,7 +116,8 @@ def normal_p(z: float) -> float:
 
 
 def holm_adjusted(p_values: Sequence[float]) -> list[float]:
-    """p values of several tests made together, adjusted by Holm (1979) so that the chance of any false alarm stays bounded."""
+    """p values of several tests made together, adjusted by Holm (1979) so that the chance of any false alarm
+    stays bounded."""
     order = sorted(range(len(p_values)), key=lambda i: p_values[i])
     adjusted, largest = [0.0] * len(p_values), 0.0
     for rank, i in enumerate(order):

@@ -1,4 +1,5 @@
-"""Time of simulating alone: compiling, recording and drawing are no part of it; and how many steps are still to come."""
+"""Time of simulating alone: compiling, recording and drawing are no part of it; and how many steps are still
+to come."""
 
 from __future__ import annotations
 
@@ -10,9 +11,12 @@ from uuvtai.front_end import kernels_made
 
 
 class StepClock:
-    """Sums up the time of passes through the simulator. A pass in which a kernel was made does not count, nor the first of its kind."""
+    """Sums up the time of passes through the simulator. A pass in which a kernel was made does not count, nor
+    the first of its kind."""
 
-    def __init__(self, now: Callable[[], float] = time.perf_counter, made: Callable[[], int] = kernels_made) -> None:
+    def __init__(
+        self, now: Callable[[], float] = time.perf_counter, made: Callable[[], int] = kernels_made
+    ) -> None:
         """``made``: how many kernels there are by now."""
         self._now, self._made = now, made
         self._known: set[str] = set()
@@ -37,12 +41,13 @@ class StepClock:
 _WORTH_SHARE = 0.1
 """of the episodes must be over before their length says something of the others'"""
 _LEAST_SHARE = 0.25
-"""of the mean length lies before an episode that is longer than that already: it may end at any time, but the last ones take long"""
+"""of the mean length lies before an episode that is longer than that already: it may end at any time, but the
+last ones take long"""
 
 
 def env_steps_left(lengths: Iterable[int], ages: Iterable[int], waiting: int) -> int | None:
-    """Env steps still to come, a guess: from the ``lengths`` of the episodes that are over, the ``ages`` of those that run, and the number
-    that wait for their turn. None where too few are over.
+    """Env steps still to come, a guess: from the ``lengths`` of the episodes that are over, the ``ages`` of
+    those that run, and the number that wait for their turn. None where too few are over.
     """
     over, running = list(lengths), list(ages)
     if not over or len(over) < _WORTH_SHARE * (len(over) + len(running) + waiting):

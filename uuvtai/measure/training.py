@@ -1,4 +1,5 @@
-"""``uuv train``: a run folder, iterations one after the other, checkpoints and evaluations in between, and how it all ends."""
+"""``uuv train``: a run folder, iterations one after the other, checkpoints and evaluations in between, and
+how it all ends."""
 
 from __future__ import annotations
 
@@ -30,7 +31,8 @@ SCORE = "eval/success_rate"
 
 @dataclass(frozen=True)
 class TrainRequest:
-    """What ``uuv train`` was asked for: a new run with ``config``, or to go on with the run folder ``resume``."""
+    """What ``uuv train`` was asked for: a new run with ``config``, or to go on with the run folder
+    ``resume``."""
 
     config: LearningConfig | None = None
     preset: str = "run"
@@ -39,7 +41,8 @@ class TrainRequest:
     overrides: Overrides | None = None
     """changes of the resumed run's config"""
     iterations: int | None = None
-    """stop when so many are done in all; None = ``train.iterations``, over which the schedules run in any case"""
+    """stop when so many are done in all; None = ``train.iterations``, over which the schedules run in any
+    case"""
     device: str = "auto"
     run_dir: Path | None = None
 
@@ -56,9 +59,9 @@ class TrainWatch(Protocol):
 def train(request: TrainRequest, watch: TrainWatch) -> tuple[dict[str, Any], Path]:
     """Train or go on training; what ``uuv train --json`` prints, and the run folder.
 
-    Everything that can be refused is refused before anything is written. An interrupt (SIGINT, SIGTERM) lets the iteration end, saves and
-    raises KeyboardInterrupt; a second one ends at once. Under torchrun rank 0 writes. Raises ConfigError, ValueError, MemoryError,
-    RunFolderError, CheckpointError, TrainingError.
+    Everything that can be refused is refused before anything is written. An interrupt (SIGINT, SIGTERM) lets
+    the iteration end, saves and raises KeyboardInterrupt; a second one ends at once. Under torchrun rank 0
+    writes. Raises ConfigError, ValueError, MemoryError, RunFolderError, CheckpointError, TrainingError.
     """
     from uuvtai.learn.distributed import is_writer
 
@@ -70,7 +73,9 @@ def train(request: TrainRequest, watch: TrainWatch) -> tuple[dict[str, Any], Pat
     _refuse_no_run(request.resume)
     if not is_writer():
         return _train(request, None, watch)
-    held = RunFolder.held(request.resume, "uuv train")  # before anything is read: what another process writes meanwhile must not count
+    held = RunFolder.held(
+        request.resume, "uuv train"
+    )  # before anything is read: what another process writes meanwhile must not count
     try:
         return _train(request, held, watch)
     finally:
@@ -85,10 +90,14 @@ def _train(request: TrainRequest, folder: RunFolder | None, watch: TrainWatch) -
     total = request.iterations or config.train.iterations
     if found and found.step >= total:
         raise ConfigError(
-            f"{request.resume}: has done {found.step} of {total} iterations; to go on give more: --iterations {2 * found.step}"
+            f"{request.resume}: has done {found.step} of {total} iterations; to go on give more: "
+            f"--iterations {2 * found.step}"
         )
     claim_gpu()
-    watch.note(f"starting {config.train.num_envs} envs (sizes not used before compile their kernels first, about half a minute)")
+    watch.note(
+        f"starting {config.train.num_envs} envs (sizes not used before compile their kernels first, about "
+        "half a minute)"
+    )
     trainer = _trainer(_env(config, request.device), config, found)
     place = _folder(request, config, found, folder) if trainer.processes.writes else None
     run = _Run(trainer, config, place, watch, total)
@@ -125,7 +134,9 @@ def _begin(request: TrainRequest, watch: TrainWatch) -> tuple[Checkpoint | None,
 
 def _refuse_no_run(place: Path) -> None:
     if not (place / CONFIG).is_file():
-        raise ConfigError(f"{place}: is no run folder, it has no {CONFIG}; give the folder that 'uuv train' printed")
+        raise ConfigError(
+            f"{place}: is no run folder, it has no {CONFIG}; give the folder that 'uuv train' printed"
+        )
 
 
 def _env(config: LearningConfig, device: str) -> VectorEnv:
@@ -156,7 +167,9 @@ def _trainer(env: VectorEnv, config: LearningConfig, checkpoint: Checkpoint | No
     return trainer
 
 
-def _folder(request: TrainRequest, config: LearningConfig, checkpoint: Checkpoint | None, folder: RunFolder | None) -> RunFolder:
+def _folder(
+    request: TrainRequest, config: LearningConfig, checkpoint: Checkpoint | None, folder: RunFolder | None
+) -> RunFolder:
     if folder is None or checkpoint is None:
         return RunFolder(request.run_dir or default_run_dir(request.preset), config, [config.train.seed])
     folder.go_on({"iteration": checkpoint.step, "checkpoint_sha256": checkpoint.sha256})
@@ -166,12 +179,26 @@ def _folder(request: TrainRequest, config: LearningConfig, checkpoint: Checkpoin
 
 
 class _Run:
-    """The iterations of a run, and what is written about them. ``folder`` is None in processes that do not write."""
+    """The iterations of a run, and what is written about them. ``folder`` is None in processes that do not
+    write."""
 
-    def __init__(self, trainer: Trainer, config: LearningConfig, folder: RunFolder | None, watch: TrainWatch, total: int) -> None:
+    def __init__(
+        self,
+        trainer: Trainer,
+        config: LearningConfig,
+        folder: RunFolder | None,
+        watch: TrainWatch,
+        total: int,
+    ) -> None:
         from uuvtai.learn.recorder import MetricsRecorder
 
-        self._trainer, self._config, self._folder, self._watch, self._total = trainer, config, folder, watch, total
+        self._trainer, self._config, self._folder, self._watch, self._total = (
+            trainer,
+            config,
+            folder,
+            watch,
+            total,
+        )
         self._recorder = MetricsRecorder(folder.path, trainer.iteration) if folder else None
         self._metrics: Metrics = {}
         self._saved = trainer.iteration if trainer.iteration else None
@@ -226,7 +253,15 @@ class _Run:
 
         trainer, table = self._trainer, self._trainer.env.observation_table
         score = self._metrics.get(SCORE)
-        checkpoint.save(folder.path / "checkpoints", trainer.iteration, trainer.state(), self._config, table, self._metrics, score)
+        checkpoint.save(
+            folder.path / "checkpoints",
+            trainer.iteration,
+            trainer.state(),
+            self._config,
+            table,
+            self._metrics,
+            score,
+        )
         self._saved = trainer.iteration
 
     def _success_interval(self) -> tuple[float, float] | None:
@@ -236,9 +271,11 @@ class _Run:
 
 
 def evaluate_now(trainer: Trainer, config: LearningConfig) -> Metrics:
-    """``eval/*``: the policy as it is, without exploration, on scenarios of its own; training goes on as if nothing had been.
+    """``eval/*``: the policy as it is, without exploration, on scenarios of its own; training goes on as if
+    nothing had been.
 
-    Half of these episodes calibrate the risk head, where there is one and they hold enough accidents; the others judge it.
+    Half of these episodes calibrate the risk head, where there is one and they hold enough accidents; the
+    others judge it.
     """
     from uuvtai.learn.pilot import Pilot
     from uuvtai.measure.evaluate import Recorders, jobs_of, run_episodes, summary
@@ -267,7 +304,8 @@ _RISK_FIGURES = ("event_rate", "brier", "brier_base_rate", "ece", "auroc", "alar
 
 
 def _calibrated(foresight: Foresight) -> Metrics:
-    """Calibrate on every second episode, ``eval/risk_*`` on the others; nothing where accidents are too few for the promised miss rate."""
+    """Calibrate on every second episode, ``eval/risk_*`` on the others; nothing where accidents are too few
+    for the promised miss rate."""
     from uuvtai.measure.foresight import fit, judged
 
     moments = foresight.moments()
@@ -278,5 +316,7 @@ def _calibrated(foresight: Foresight) -> Metrics:
     figures = judged(foresight.head, moments.of_episodes(1))
     if figures is None:
         return {}
-    rates = {"miss_rate": figures["missed"] / figures["accidents"]} | {name: figures[name] for name in _RISK_FIGURES}
+    rates = {"miss_rate": figures["missed"] / figures["accidents"]} | {
+        name: figures[name] for name in _RISK_FIGURES
+    }
     return {f"eval/risk_{name}": float(value) for name, value in rates.items()}

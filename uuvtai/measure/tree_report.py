@@ -28,11 +28,16 @@ def tree_report(controller: str, run: Path | None) -> TreeReport:
     if run is not None:
         used = _record(run)
         if controller not in used:
-            raise ConfigError(f"{run}: has no controller {controller!r}; there are: {', '.join(used)} (--controller NAME)")
+            raise ConfigError(
+                f"{run}: has no controller {controller!r}; there are: {', '.join(used)} (--controller NAME)"
+            )
         tree = read_tree_file(run / "eval" / "trees" / f"{controller}.xml", folder=run)
         use = used[controller]
         if len(use) != len(tree.names):
-            raise ConfigError(f"{run}: the tree {controller!r} has changed since that evaluation; run it again with 'uuv eval'")
+            raise ConfigError(
+                f"{run}: the tree {controller!r} has changed since that evaluation; run it again with 'uuv "
+                "eval'"
+            )
     else:
         tree = read_tree(controller)
     return TreeReport(tree_text(tree), tree_dot(tree, use), _document(controller, tree, use))
@@ -42,25 +47,34 @@ def _record(run: Path) -> dict[str, list[NodeUse]]:
     """Use of every node by controller."""
     path = run / "eval" / "tree.json"
     if not run.is_dir():
-        shipped = f"; the tree alone: 'uuv tree --controller {run}'" if str(run) in preset_names("tree") else ""
-        raise ConfigError(f"{run}: is no run folder; give one of an evaluation ('uuv eval' prints it){shipped}")
+        shipped = (
+            f"; the tree alone: 'uuv tree --controller {run}'" if str(run) in preset_names("tree") else ""
+        )
+        raise ConfigError(
+            f"{run}: is no run folder; give one of an evaluation ('uuv eval' prints it){shipped}"
+        )
     try:
         record = read_json(path, folder=run)
         return {name: [_use(node) for node in nodes] for name, nodes in record["use"].items()}
     except OSError as error:
         raise ConfigError(
-            f"{path}: cannot be read ({error.strerror}); give the run folder of an evaluation ('uuv eval' prints it)"
+            f"{path}: cannot be read ({error.strerror}); give the run folder of an evaluation ('uuv eval' "
+            "prints it)"
         ) from None
     except FileError as error:
         raise ConfigError(f"{error}; run the evaluation again with 'uuv eval'") from None
     except (ValueError, OverflowError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ConfigError(f"{path}: is not what 'uuv eval' writes ({error!r}); run the evaluation again with 'uuv eval'") from None
+        raise ConfigError(
+            f"{path}: is not what 'uuv eval' writes ({error!r}); run the evaluation again with 'uuv eval'"
+        ) from None
 
 
 def _use(node: dict[str, Any]) -> NodeUse:
     share, ticks, acted = node["share"], int(node["ticks"]), int(node["acted"])
     if not (isinstance(share, int | float) and 0.0 <= share <= 1.0 and 0 <= acted <= ticks):
-        raise ValueError(f"a node ticked in {share!r:.40} of the episodes, {ticks} times, {acted} of which acted")
+        raise ValueError(
+            f"a node ticked in {share!r:.40} of the episodes, {ticks} times, {acted} of which acted"
+        )
     return NodeUse(float(share), ticks, acted)
 
 

@@ -16,12 +16,12 @@ class Detection:
 
     required = closing x aside_s + margin + nose:
     closing = cruise speed + v, for a body that comes straight at the vehicle with the condition's speed v;
-    aside_s = time T to move aside by ``aside_m`` = largest radius of a moving body + hull radius + collision clearance, at the sway limit w
-    reached with the pilot's lag tau: aside_m = w (T - tau (1 - exp(-T / tau)));
-    margin = the clearance at which the referee still lets a head-on approach go: collision clearance, or TTC x closing if that is more;
-    nose = hull radius + half length.
-    It is on the safe side: what is passed on one side closes more slowly, and diagonals of the body, diving and climbing are faster ways
-    out. The time to become sure of a track (three scans) is not in it.
+    aside_s = time T to move aside by ``aside_m`` = largest radius of a moving body + hull radius + collision
+    clearance, at the sway limit w reached with the pilot's lag tau: aside_m = w (T - tau (1 - exp(-T /
+    tau))); margin = the clearance at which the referee still lets a head-on approach go: collision clearance,
+    or TTC x closing if that is more; nose = hull radius + half length. It is on the safe side: what is passed
+    on one side closes more slowly, and diagonals of the body, diving and climbing are faster ways out. The
+    time to become sure of a track (three scans) is not in it.
     """
 
     required_m: float
@@ -34,7 +34,11 @@ class Detection:
 def required_detection(config: Config) -> Detection | None:
     """Required detection distance of a condition; None where nothing moves."""
     world, vehicle, rules = config.world, config.vehicle, config.episode
-    movers = [(body.radius_m or math.hypot(*(body.half_extents_m or (0.0, 0.0))), body.speed_m_s) for body in world.fixed if body.path]
+    movers = [
+        (body.radius_m or math.hypot(*(body.half_extents_m or (0.0, 0.0))), body.speed_m_s)
+        for body in world.fixed
+        if body.path
+    ]
     if world.n_dynamic:
         movers.append((world.dynamic.radius_m[1], None))
     speeds = [world.dynamic_speed_m_s if speed is None else speed for _, speed in movers]
@@ -49,7 +53,8 @@ def required_detection(config: Config) -> Detection | None:
 
 
 def time_aside_s(way_m: float, speed_m_s: float, lag_s: float) -> float:
-    """T with way = speed (T - lag (1 - exp(-T / lag))): from rest to a speed that is approached with a first-order lag."""
+    """T with way = speed (T - lag (1 - exp(-T / lag))): from rest to a speed that is approached with a
+    first-order lag."""
     low, high = 0.0, way_m / speed_m_s + lag_s
     for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)

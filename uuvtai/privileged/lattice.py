@@ -1,4 +1,5 @@
-"""Nodes in space at which a kinematic point may be, and which of them the referee's rules forbid at a time, for every way to leave them.
+"""Nodes in space at which a kinematic point may be, and which of them the referee's rules forbid at a time,
+for every way to leave them.
 
 The hull is a ball of its own radius: the slimmest that the capsule can look, whatever its heading.
 """
@@ -49,15 +50,25 @@ class Lattice:
 def lattice_of(start: Array, config: Config) -> Lattice:
     """Lattice around a start (3,) [m] whose time step is one node at the vehicle's full speed.
 
-    Full speed is that along the diagonal of the body axes, surge and sway together, plus the current with 3 sigma: nothing is faster.
+    Full speed is that along the diagonal of the body axes, surge and sway together, plus the current with 3
+    sigma: nothing is faster.
     """
     vehicle, water, tank = config.vehicle, config.disturbance, config.world.tank
-    speed = float(np.hypot(vehicle.max_surge_m_s, vehicle.max_sway_m_s) + np.hypot(*water.current_m_s[:2]) + 3 * water.current_sigma_m_s)
+    speed = float(
+        np.hypot(vehicle.max_surge_m_s, vehicle.max_sway_m_s)
+        + np.hypot(*water.current_m_s[:2])
+        + 3 * water.current_sigma_m_s
+    )
     dt = CELL_M / speed
     wall = vehicle.hull_radius_m + config.episode.collision_clearance_m
     x, col = _axis(start[0], tank.x_m, CELL_M, wall)
     y, row = _axis(start[1], tank.y_m, CELL_M, wall)
-    z, layer = _axis(start[2], tank.z_m, (vehicle.max_heave_m_s + abs(water.current_m_s[2])) * dt * HEAVE_EVERY, vehicle.hull_radius_m)
+    z, layer = _axis(
+        start[2],
+        tank.z_m,
+        (vehicle.max_heave_m_s + abs(water.current_m_s[2])) * dt * HEAVE_EVERY,
+        vehicle.hull_radius_m,
+    )
     inside = np.ones((len(z), len(y), len(x)), bool)
     if tank.shape == "circle":
         middle = 0.5 * (tank.x_m[0] + tank.x_m[1]), 0.5 * (tank.y_m[0] + tank.y_m[1])
@@ -67,15 +78,18 @@ def lattice_of(start: Array, config: Config) -> Lattice:
 
 def _axis(start: float, bounds: tuple[float, float], step: float, margin: float) -> tuple[Array, int]:
     """(coordinates of the nodes within the bounds less a margin, index of the start)."""
-    below, above = (max(0, int(np.floor((gap - margin) / step + 1e-9))) for gap in (start - bounds[0], bounds[1] - start))
+    below, above = (
+        max(0, int(np.floor((gap - margin) / step + 1e-9))) for gap in (start - bounds[0], bounds[1] - start)
+    )
     return start + step * np.arange(-below, above + 1), below
 
 
 class Referee:
     """Which nodes a hull may not be at, per move: ``blocked`` (n_move, n_z, n_y, n_x) bool.
 
-    A node is forbidden to who leaves or reaches it by a move if the clearance there is below the collision clearance, or lasts for less
-    than the time to collision at the speed with which that move at full speed, and the body, close it.
+    A node is forbidden to who leaves or reaches it by a move if the clearance there is below the collision
+    clearance, or lasts for less than the time to collision at the speed with which that move at full speed,
+    and the body, close it.
     """
 
     def __init__(self, lattice: Lattice, still: list[Obstacle], config: Config) -> None:
@@ -88,7 +102,8 @@ class Referee:
             self._forbid(self._base, body, 0, None)
 
     def blocked(self, moving: list[Obstacle], step: int, near: Array) -> Array:
-        """Masks at a time step, right wherever ``near`` (n_z, n_y, n_x) and its neighbours are; elsewhere bodies may be left out."""
+        """Masks at a time step, right wherever ``near`` (n_z, n_y, n_x) and its neighbours are; elsewhere
+        bodies may be left out."""
         out = self._base.copy()
         for body in moving:
             self._forbid(out, body, step, near)
@@ -96,7 +111,9 @@ class Referee:
 
     def _forbid(self, out: Array, body: Obstacle, step: int, near: Array | None) -> None:
         box = self._box(body, step)
-        if any(part.start >= part.stop for part in box) or (near is not None and not near[_widened(box)].any()):
+        if any(part.start >= part.stop for part in box) or (
+            near is not None and not near[_widened(box)].any()
+        ):
             return
         grid, at, vel = self._grid, body.pos_w[step], body.vel_w[step]
         ox, oy = level_excess(body, grid.x_m[box[2]] - at[0], (grid.y_m[box[1]] - at[1])[:, None])
@@ -104,8 +121,14 @@ class Referee:
         away = np.sqrt(ox**2 + oy**2 + oz**2)
         gap = away - rounding_m(body) - self._hull_m
         # closing speed = -(move - body) . (ox, oy) / away; both sides times ``away``
-        fastest = np.maximum(gap / self._rules.ttc_s, self._rules.ttc_closing_m_s) if self._rules.ttc_s > 0 else np.inf
-        allowed = np.where(gap < self._rules.collision_clearance_m, -np.inf, fastest * away - (vel[0] * ox + vel[1] * oy))
+        fastest = (
+            np.maximum(gap / self._rules.ttc_s, self._rules.ttc_closing_m_s)
+            if self._rules.ttc_s > 0
+            else np.inf
+        )
+        allowed = np.where(
+            gap < self._rules.collision_clearance_m, -np.inf, fastest * away - (vel[0] * ox + vel[1] * oy)
+        )
         for move, velocity in enumerate(self._velocity):
             out[(move, *box)] |= -(velocity[0] * ox + velocity[1] * oy) > allowed
 
@@ -116,7 +139,10 @@ class Referee:
         spans = (body.size[2] + reach, body.radius_m + reach, body.radius_m + reach)
         axes = (self._grid.z_m, self._grid.y_m, self._grid.x_m)
         low_high = zip(axes, body.pos_w[step][::-1], spans, strict=True)
-        z, y, x = (slice(int(np.searchsorted(axis, at - span)), int(np.searchsorted(axis, at + span))) for axis, at, span in low_high)
+        z, y, x = (
+            slice(int(np.searchsorted(axis, at - span)), int(np.searchsorted(axis, at + span)))
+            for axis, at, span in low_high
+        )
         return z, y, x
 
 

@@ -58,7 +58,9 @@ def path_positions(path: dict[str, Any], t_s: Array) -> Array:
     arc = (path["phase_m"] + path["speed_m_s"] * np.asarray(t_s, float)) % path["length_m"]
     if path["shape"] == "circle":
         angle = arc / path["radius_m"]
-        return np.array(path["center"]) + abs(path["radius_m"]) * np.column_stack([np.cos(angle), np.sin(angle)])
+        return np.array(path["center"]) + abs(path["radius_m"]) * np.column_stack(
+            [np.cos(angle), np.sin(angle)]
+        )
     corners = np.array(path["corners"], float)
     legs = np.roll(corners, -1, axis=0) - corners
     length = np.linalg.norm(legs, axis=1)
@@ -69,7 +71,8 @@ def path_positions(path: dict[str, Any], t_s: Array) -> Array:
 
 
 def level_excess(body: Obstacle, dx: Array, dy: Array) -> tuple[Array, Array]:
-    """(x, y) parts [m] of the way from the body's core to points at (dx, dy) from its middle; the core of a sphere is its centre."""
+    """(x, y) parts [m] of the way from the body's core to points at (dx, dy) from its middle; the core of a
+    sphere is its centre."""
     if body.kind == "sphere":
         return dx, dy
     if body.kind == "cylinder":

@@ -1,4 +1,5 @@
-"""A sweep of one axis at a time: which cells change which axis, around the cell that changes nothing. Pure."""
+"""A sweep of one axis at a time: which cells change which axis, around the cell that changes nothing.
+Pure."""
 
 from __future__ import annotations
 
@@ -21,7 +22,11 @@ def is_alone(document: dict[str, Any]) -> bool:
 def changed(cell: Cell, document: dict[str, Any]) -> dict[str, Any]:
     """What the cell changes, by the axis's name in cells: nothing or one axis."""
     own = _unchanged(document)
-    return {name: cell[name] for name in own if cell.get(name) is not None and (name not in _SCENE or cell[name] != own[name])}
+    return {
+        name: cell[name]
+        for name in own
+        if cell.get(name) is not None and (name not in _SCENE or cell[name] != own[name])
+    }
 
 
 def _unchanged(document: dict[str, Any]) -> dict[str, Any]:
@@ -57,4 +62,9 @@ def _tick(value: Any) -> str:
 
 def told(cell: Cell, document: dict[str, Any]) -> str:
     """'sensors = harsh', or 'nothing'."""
-    return ", ".join(f"{axis_name(name)} = {value_name(value)}" for name, value in changed(cell, document).items()) or "nothing"
+    return (
+        ", ".join(
+            f"{axis_name(name)} = {value_name(value)}" for name, value in changed(cell, document).items()
+        )
+        or "nothing"
+    )

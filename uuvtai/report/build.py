@@ -1,4 +1,5 @@
-"""``uuv report``: find what a run folder holds, compose its sections, draw, and write the page and its figures, whole or not at all."""
+"""``uuv report``: find what a run folder holds, compose its sections, draw, and write the page and its
+figures, whole or not at all."""
 
 from __future__ import annotations
 
@@ -24,7 +25,10 @@ from uuvtai.report.sweep import sweep
 from uuvtai.report.timing import timing
 from uuvtai.run_folder import RunFolderError, write_atomic
 
-_NOTHING = "has nothing to report yet: no eval/result.json, metrics.jsonl, sweep.json, profile.json or reproduce.json"
+_NOTHING = (
+    "has nothing to report yet: no eval/result.json, metrics.jsonl, sweep.json, profile.json or "
+    "reproduce.json"
+)
 
 
 PAGE, FIGURES = "report.html", "figures"
@@ -39,21 +43,27 @@ class Report:
 
 
 def report(runs: list[Path], out: Path | None = None, force: bool = False) -> Report:
-    """Write the page of a run folder to ``out`` (default: its report.html) and its figures as PNG to ``figures/`` beside the page.
+    """Write the page of a run folder to ``out`` (default: its report.html) and its figures as PNG to
+    ``figures/`` beside the page.
 
-    Several folders make one page, for which ``out`` must be given: trainings (seeds of a method, or methods) are compared in one section,
-    what the other folders hold follows, an evaluation beside the training that it is of. Everything is read and drawn before anything is
-    written. The default page and its figures are renewed; elsewhere files are replaced with ``force`` only, and files of the run never.
-    Raises ConfigError for a folder without anything to report or with a damaged file, FileError for a link in it or for a file that would
-    be replaced, RunFolderError where the page cannot be written.
+    Several folders make one page, for which ``out`` must be given: trainings (seeds of a method, or methods)
+    are compared in one section, what the other folders hold follows, an evaluation beside the training that
+    it is of. Everything is read and drawn before anything is written. The default page and its figures are
+    renewed; elsewhere files are replaced with ``force`` only, and files of the run never. Raises ConfigError
+    for a folder without anything to report or with a damaged file, FileError for a link in it or for a file
+    that would be replaced, RunFolderError where the page cannot be written.
     """
     if len(runs) > 1 and out is None:
-        raise ConfigError(f"{len(runs)} run folders: say where their common page is to be written: --out FILE")
+        raise ConfigError(
+            f"{len(runs)} run folders: say where their common page is to be written: --out FILE"
+        )
     for run in runs:
         _refuse(run)
     target = out or runs[0] / PAGE
     if target.is_dir():
-        raise ConfigError(f"{target}: is a folder; give the page a name, for example --out {target / 'report.html'}")
+        raise ConfigError(
+            f"{target}: is a folder; give the page a name, for example --out {target / 'report.html'}"
+        )
     _refuse_place(target, runs, force)
     with _told(runs[0] if len(runs) == 1 else target):
         page = _of_several(runs) if len(runs) > 1 else _of_run(runs[0])
@@ -66,7 +76,9 @@ def report(runs: list[Path], out: Path | None = None, force: bool = False) -> Re
 
 def _refuse(run: Path) -> None:
     if not run.is_dir():
-        raise ConfigError(f"{run}: is no run folder; give one that 'uuv eval', 'uuv train' or 'uuv sweep' printed")
+        raise ConfigError(
+            f"{run}: is no run folder; give one that 'uuv eval', 'uuv train' or 'uuv sweep' printed"
+        )
     try:
         refuse_links_in(run)
     except OSError as error:
@@ -74,7 +86,8 @@ def _refuse(run: Path) -> None:
 
 
 def _refuse_place(target: Path, runs: list[Path], force: bool) -> None:
-    """Raise FileError where a file must not be written: what the report of a run wrote before may be renewed, no other file of a run."""
+    """Raise FileError where a file must not be written: what the report of a run wrote before may be renewed,
+    no other file of a run."""
     place, renewed = Path(os.path.realpath(target)), force
     for run in (Path(os.path.realpath(run)) for run in runs):
         if place == run / PAGE or place.parent == run / FIGURES:
@@ -92,11 +105,13 @@ def _write(target: Path, html: str, figures: dict[Path, bytes]) -> Report:
             write_atomic(path, content)
         write_atomic(target, html.encode())
     except OSError as error:
-        raise RunFolderError(f"{target}: cannot write it ({error.strerror}); give a place that can be written: --out FILE") from None
+        raise RunFolderError(
+            f"{target}: cannot write it ({error.strerror}); give a place that can be written: --out FILE"
+        ) from None
     return Report(target, list(figures))
 
 
-# ----------------------------------------------------------------------------------------------------------------- compose
+# ---------------------------------------------------------------------------------------------------- compose
 
 
 def _of_run(run: Path) -> Page:
@@ -105,9 +120,13 @@ def _of_run(run: Path) -> Page:
     sections = reproduction(document, run, _nested, _curves_of) if document else []
     sections += content(run)
     if not sections:
-        raise ConfigError(f"{run}: {_NOTHING}; give a run folder that 'uuv eval', 'uuv train' or 'uuv sweep' printed")
+        raise ConfigError(
+            f"{run}: {_NOTHING}; give a run folder that 'uuv eval', 'uuv train' or 'uuv sweep' printed"
+        )
     title = str(document["title"]) if document else run.resolve().name
-    closing = PageSection("Where this comes from", [*provenance(record), *checkpoints(run), *config_text(run)])
+    closing = PageSection(
+        "Where this comes from", [*provenance(record), *checkpoints(run), *config_text(run)]
+    )
     return Page(title, _subtitle(record), status_notice(record), [*sections, closing])
 
 
@@ -118,29 +137,42 @@ def _of_several(runs: list[Path]) -> Page:
     sections = [PageSection("Training", _curves_of(trainings))] if trainings else []
     for run in others:
         sections += _named_after(run, trainings)
-    closing = [block for run in runs for block in (Heading(run.name), *provenance(read_json(run, "run.json") or {}), *config_text(run))]
+    closing = [
+        block
+        for run in runs
+        for block in (Heading(run.name), *provenance(read_json(run, "run.json") or {}), *config_text(run))
+    ]
     title = ", ".join(run.resolve().name for run in runs) if others else f"{len(runs)} trainings"
     return Page(title, "", [], [*sections, PageSection("Where this comes from", closing)])
 
 
 def _named_after(run: Path, trainings: list[Path]) -> list[PageSection]:
-    """Sections of one of several folders. An evaluation says which of the trainings its policies come from."""
+    """Sections of one of several folders. An evaluation says which of the trainings its policies come
+    from."""
     with _told(run):
         sections = content(run)
         methods = (read_json(run, "eval/result.json") or {}).get("methods", [])
     if not sections:
         raise ConfigError(f"{run}: {_NOTHING}")
     origin = origins(methods, trainings)
-    named = [replace(section, title=f"{section.title}: {run.name}", blocks=_figures_of(run, section.blocks)) for section in sections]
+    named = [
+        replace(section, title=f"{section.title}: {run.name}", blocks=_figures_of(run, section.blocks))
+        for section in sections
+    ]
     return [replace(named[0], blocks=[*origin, *named[0].blocks]), *named[1:]]
 
 
 def _figures_of(run: Path, blocks: Sequence[Block]) -> list[Block]:
-    return [replace(block, name=f"{run.name}_{block.name}") if isinstance(block, Figure) else block for block in blocks]
+    return [
+        replace(block, name=f"{run.name}_{block.name}") if isinstance(block, Figure) else block
+        for block in blocks
+    ]
 
 
 def _subtitle(record: dict[str, Any]) -> str:
-    return ", ".join(str(part) for part in (record.get("started"), record.get("hardware", {}).get("cpu")) if part)
+    return ", ".join(
+        str(part) for part in (record.get("started"), record.get("hardware", {}).get("cpu")) if part
+    )
 
 
 def content(run: Path) -> list[PageSection]:
@@ -151,7 +183,9 @@ def content(run: Path) -> list[PageSection]:
         PageSection("Evaluation", evaluation(result, command) if result else []),
         PageSection("Sweep", sweep(document, command) if (document := read_json(run, "sweep.json")) else []),
         PageSection("Training", _curves_of([run]) if (run / "metrics.jsonl").exists() else []),
-        PageSection("Time", timing(document, command) if (document := read_json(run, "profile.json")) else []),
+        PageSection(
+            "Time", timing(document, command) if (document := read_json(run, "profile.json")) else []
+        ),
         PageSection("Episodes", media(run, result)),
     ]
     return [section for section in found if section.blocks]
@@ -186,6 +220,17 @@ def _told(run: Path) -> Iterator[None]:
         yield
     except UserError:
         raise
-    except (ArithmeticError, AssertionError, AttributeError, LookupError, RecursionError, SyntaxError, TypeError, ValueError) as error:
+    except (
+        ArithmeticError,
+        AssertionError,
+        AttributeError,
+        LookupError,
+        RecursionError,
+        SyntaxError,
+        TypeError,
+        ValueError,
+    ) as error:
         what = f"{type(error).__name__}: {error}"
-        raise ConfigError(f"{run}: a result file there is not as this version writes it ({what}); make the run again") from error
+        raise ConfigError(
+            f"{run}: a result file there is not as this version writes it ({what}); make the run again"
+        ) from error

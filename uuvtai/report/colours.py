@@ -1,11 +1,13 @@
-"""Colours that page, figures, pictures, videos and terminal share, of methods too; the colour-blind can tell them apart."""
+"""Colours that page, figures, pictures, videos and terminal share, of methods too; the colour-blind can tell
+them apart."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 _ANCHORS = ("440154", "472d7b", "3b528b", "2c728e", "21918c", "28ae80", "5ec962", "addc30", "fde725")
-"""Viridis (Smith and van der Walt 2015) at every eighth: its lightness rises evenly, also in grey and to every kind of colour vision."""
+"""Viridis (Smith and van der Walt 2015) at every eighth: its lightness rises evenly, also in grey and to
+every kind of colour vision."""
 
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 """Okabe and Ito 2008 without black and yellow, which a dark or a light page would swallow."""
@@ -14,24 +16,36 @@ PALETTE = (*SERIES, "#8d5524", "#6a3d9a")
 """Every colour that a line or a swatch can have; the page has a lighter one for each on a dark screen."""
 
 _BLUE, _VERMILLION, _GREEN, _PURPLE, _ORANGE, _SKY, _BROWN, _VIOLET = PALETTE
-_METHODS = {"bt": _BLUE, "planner": _ORANGE, "straight": _GREEN, "best": _PURPLE, "paper": _BROWN, "oracle": _VIOLET}
+_METHODS = {
+    "bt": _BLUE,
+    "planner": _ORANGE,
+    "straight": _GREEN,
+    "best": _PURPLE,
+    "paper": _BROWN,
+    "oracle": _VIOLET,
+}
 _TRUTH = "+truth"
 _SPARE = (_PURPLE, _BROWN, _VIOLET, _SKY, _GREEN, _ORANGE, _BLUE)
-"""For methods without a colour of their own, in this order. Vermillion means moving bodies in pictures, so no method has it."""
+"""For methods without a colour of their own, in this order. Vermillion means moving bodies in pictures, so no
+method has it."""
 
 DARK, LIGHT = "#000000", "#ffffff"
 
 
 def shade(share: float) -> str:
-    """'#rrggbb' of a share in [0, 1]: dark is little, bright is much. Shares outside are taken as the nearest end."""
+    """'#rrggbb' of a share in [0, 1]: dark is little, bright is much. Shares outside are taken as the nearest
+    end."""
     place = min(max(share, 0.0), 1.0) * (len(_ANCHORS) - 1)
     below = min(int(place), len(_ANCHORS) - 2)
     low, high = _channels(_ANCHORS[below]), _channels(_ANCHORS[below + 1])
-    return "#" + "".join(f"{round(a + (place - below) * (b - a)):02x}" for a, b in zip(low, high, strict=True))
+    return "#" + "".join(
+        f"{round(a + (place - below) * (b - a)):02x}" for a, b in zip(low, high, strict=True)
+    )
 
 
 def method_colours(names: Sequence[str]) -> dict[str, str]:
-    """Name -> '#rrggbb'. A known method has the same colour everywhere; the others take, in their order, what is free, then begin anew."""
+    """Name -> '#rrggbb'. A known method has the same colour everywhere; the others take, in their order, what
+    is free, then begin anew."""
     known = {name: colour for name in names if (colour := _known(name)) is not None}
     free = [colour for colour in _SPARE if colour not in known.values()] or list(_SPARE)
     others = list(dict.fromkeys(name for name in names if name not in known))
@@ -59,7 +73,10 @@ def contrast(one: str, other: str) -> float:
 
 
 def _luminance(colour: str) -> float:
-    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in (x / 255 for x in _channels(colour.lstrip("#")))]
+    linear = [
+        c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4
+        for c in (x / 255 for x in _channels(colour.lstrip("#")))
+    ]
     return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
 
 

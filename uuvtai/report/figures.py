@@ -1,4 +1,5 @@
-"""What the figures show, panel by panel: heat maps, curves with seed bands, intervals, reliability, time per stage.
+"""What the figures show, panel by panel: heat maps, curves with seed bands, intervals, reliability, time per
+stage.
 
 Every function gives a ``Panel`` whose drawing is done later; the hover texts carry counts and intervals.
 """
@@ -30,7 +31,8 @@ _GOLDEN = 0.618034
 
 @dataclass(frozen=True)
 class Line:
-    """A named curve; ``low`` and ``high`` bound its band or its error bars, ``said`` is shown while the pointer is over a point."""
+    """A named curve; ``low`` and ``high`` bound its band or its error bars, ``said`` is shown while the
+    pointer is over a point."""
 
     name: str
     x: Sequence[float]
@@ -42,11 +44,12 @@ class Line:
     """'#rrggbb' of a method; none = by the order of the lines"""
 
 
-# --------------------------------------------------------------------------------------------------------------- heat maps
+# -------------------------------------------------------------------------------------------------- heat maps
 
 
 def heat_map(chosen: HeatMap, key: str, title: str) -> Panel:
-    """Rate ``key`` of every cell in per cent, below it the mean time to success [s]; bright is good in both maps of a pair."""
+    """Rate ``key`` of every cell in per cent, below it the mean time to success [s]; bright is good in both
+    maps of a pair."""
 
     def draw(axes: Axes) -> Hover:
         axes.set_title(title, loc="left")
@@ -74,11 +77,22 @@ def _draw_cell(axes: Axes, place: Place, key: str, identity: str) -> tuple[str, 
     value = place.cell.get(key)
     ground = "none" if value is None else shade(value if key == "success_rate" else 1.0 - value)
     corner, gap = (place.first + 0.02, place.row + 0.03), (0.04, 0.06)
-    box = Rectangle(corner, place.n_columns - gap[0], 1 - gap[1], facecolor=ground, edgecolor="none", gid=identity)
+    box = Rectangle(
+        corner, place.n_columns - gap[0], 1 - gap[1], facecolor=ground, edgecolor="none", gid=identity
+    )
     axes.add_patch(box)
     ink = INK if value is None else ink_on(ground)
     middle = place.first + place.n_columns / 2
-    axes.text(middle, place.row + 0.34, percent(value, 0), color=ink, ha="center", va="center", fontsize=8.5, fontweight="bold")
+    axes.text(
+        middle,
+        place.row + 0.34,
+        percent(value, 0),
+        color=ink,
+        ha="center",
+        va="center",
+        fontsize=8.5,
+        fontweight="bold",
+    )
     mean_s = place.cell.get("time_to_success_mean_s")
     below = "" if mean_s is None else f"{number(mean_s)} s"
     axes.text(middle, place.row + 0.73, below, color=ink, ha="center", va="center", fontsize=7)
@@ -109,8 +123,10 @@ def place_of(cell: dict[str, Any]) -> dict[str, Any]:
 
 
 _RESULTS = {
-    "method", "episodes", "outcomes", "k", "n", "success_rate", "success_ci95", "collision_rate", "collision_ci95", "time_mean_s",
-    "tts_s", "time_to_success_mean_s", "return_mean", "env_steps", "wall_s", "env_steps_per_s", "min_clearance_mean_m",
+    "method", "episodes", "outcomes", "k", "n", "success_rate", "success_ci95", "collision_rate",
+    "collision_ci95", "time_mean_s",
+    "tts_s", "time_to_success_mean_s", "return_mean", "env_steps", "wall_s", "env_steps_per_s",
+    "min_clearance_mean_m",
     "path_length_mean_m", "replans_per_episode",
 }  # fmt: skip
 
@@ -123,7 +139,7 @@ def _group_begins(chosen: HeatMap) -> list[int]:
     return [row for row in range(1, len(first)) if first[row] != first[row - 1]]
 
 
-# ------------------------------------------------------------------------------------------------------------------ curves
+# ----------------------------------------------------------------------------------------------------- curves
 
 
 def curves(lines: Sequence[Line], title: str, x_label: str, share: bool = False, zero: bool = False) -> Panel:
@@ -139,7 +155,12 @@ def curves(lines: Sequence[Line], title: str, x_label: str, share: bool = False,
             axes.plot(line.x, [scale * y for y in line.y], color=colour, label=line.name, **few)
             if line.low is not None and line.high is not None:
                 axes.fill_between(
-                    line.x, [scale * y for y in line.low], [scale * y for y in line.high], color=colour, alpha=0.2, linewidth=0
+                    line.x,
+                    [scale * y for y in line.low],
+                    [scale * y for y in line.high],
+                    color=colour,
+                    alpha=0.2,
+                    linewidth=0,
                 )
         _frame(axes, lines, share, zero)
         return {}
@@ -147,8 +168,11 @@ def curves(lines: Sequence[Line], title: str, x_label: str, share: bool = False,
     return Panel(draw)
 
 
-def intervals(lines: Sequence[Line], names: Sequence[str], title: str, x_label: str, joined: bool = True) -> Panel:
-    """Shares with their intervals at named places, joined where these are values of one axis. ``x`` of a line counts places.
+def intervals(
+    lines: Sequence[Line], names: Sequence[str], title: str, x_label: str, joined: bool = True
+) -> Panel:
+    """Shares with their intervals at named places, joined where these are values of one axis. ``x`` of a line
+    counts places.
 
     Lines that are not joined have a place of their own each, which names them.
     """
@@ -182,9 +206,24 @@ def _top(lines: Sequence[Line]) -> float:
 def _draw_intervals(axes: Axes, i: int, line: Line, shift: float, joined: bool) -> Hover:
     """Points and error bars of one line, moved aside by ``shift`` so that lines do not cover each other."""
     colour, places = _colour(line, i), [x + shift for x in line.x]
-    axes.plot(places, [100 * y for y in line.y], color=colour, marker="o", markersize=5, linewidth=0.8 if joined else 0, label=line.name)
+    axes.plot(
+        places,
+        [100 * y for y in line.y],
+        color=colour,
+        marker="o",
+        markersize=5,
+        linewidth=0.8 if joined else 0,
+        label=line.name,
+    )
     for k, (x, low, high) in enumerate(zip(places, line.low or line.y, line.high or line.y, strict=True)):
-        axes.plot([x, x], [100 * low, 100 * high], color=colour, linewidth=2.4, solid_capstyle="butt", gid=f"interval-{i}-{k}")
+        axes.plot(
+            [x, x],
+            [100 * low, 100 * high],
+            color=colour,
+            linewidth=2.4,
+            solid_capstyle="butt",
+            gid=f"interval-{i}-{k}",
+        )
     return {f"interval-{i}-{k}": text for k, text in enumerate(line.said)}
 
 
@@ -205,7 +244,8 @@ def _spans_decades(values: Sequence[float]) -> bool:
 
 
 def reliability(bins: dict[str, Sequence[float]], title: str) -> Panel:
-    """What came against what was said; the diagonal is a forecast that can be taken at its word. Area grows with the number of moments."""
+    """What came against what was said; the diagonal is a forecast that can be taken at its word. Area grows
+    with the number of moments."""
 
     def draw(axes: Axes) -> Hover:
         axes.set_title(title, loc="left")
@@ -214,9 +254,20 @@ def reliability(bins: dict[str, Sequence[float]], title: str) -> Panel:
         axes.plot([0, 1], [0, 1], color=INK, linewidth=0.8, linestyle=(0, (4, 3)))
         most = max(bins["samples"], default=1.0)
         hover: Hover = {}
-        for i, (said, came, n) in enumerate(zip(bins["predicted"], bins["observed"], bins["samples"], strict=True)):
+        for i, (said, came, n) in enumerate(
+            zip(bins["predicted"], bins["observed"], bins["samples"], strict=True)
+        ):
             size = 3.0 + 9.0 * (n / most) ** 0.5
-            axes.plot([said], [came], marker="o", markersize=size, color=SERIES[0], alpha=0.75, linestyle="none", gid=f"bin-{i}")
+            axes.plot(
+                [said],
+                [came],
+                marker="o",
+                markersize=size,
+                color=SERIES[0],
+                alpha=0.75,
+                linestyle="none",
+                gid=f"bin-{i}",
+            )
             hover[f"bin-{i}"] = f"said {said:.3f}, came {came:.3f}, {n:,.0f} moments"
         axes.set_xlim(-0.03, 1.03)
         axes.set_ylim(-0.03, 1.03)
@@ -226,7 +277,8 @@ def reliability(bins: dict[str, Sequence[float]], title: str) -> Panel:
 
 
 def trade_off(series: Sequence[Line], marks: Sequence[tuple[str, float, float]]) -> Panel:
-    """Success over collision [shares] along one setting per line; ``marks`` are single points (name, collision, success)."""
+    """Success over collision [shares] along one setting per line; ``marks`` are single points (name,
+    collision, success)."""
 
     def draw(axes: Axes) -> Hover:
         axes.set_xlabel("collision %")
@@ -242,7 +294,15 @@ def trade_off(series: Sequence[Line], marks: Sequence[tuple[str, float, float]])
                 label=line.name,
             )
         for name, collision, success in marks:
-            axes.plot([100 * collision], [100 * success], marker="*", markersize=12, linestyle="none", color=colours[name], label=name)
+            axes.plot(
+                [100 * collision],
+                [100 * success],
+                marker="*",
+                markersize=12,
+                linestyle="none",
+                color=colours[name],
+                label=name,
+            )
         axes.set_xlim(left=0)
         axes.legend(loc="best")
         return {}
@@ -250,11 +310,12 @@ def trade_off(series: Sequence[Line], marks: Sequence[tuple[str, float, float]])
     return Panel(draw, 4.4, 3.4)
 
 
-# -------------------------------------------------------------------------------------------------------------------- time
+# ------------------------------------------------------------------------------------------------------- time
 
 
 def stages(rows: Sequence[tuple[str, dict[str, float]]], title: str) -> Panel:
-    """Time per stage as one bar a row, widest stage first, like a flame graph's floor: (row's name, stage -> us per env-step)."""
+    """Time per stage as one bar a row, widest stage first, like a flame graph's floor: (row's name, stage ->
+    us per env-step)."""
 
     def draw(axes: Axes) -> Hover:
         axes.set_title(title, loc="left")
@@ -280,7 +341,15 @@ def _stage_bar(axes: Axes, row: int, spent: dict[str, float], longest: float) ->
         gid, ground = f"stage-{row}-{i}", shade(0.1 + 0.85 * (i * _GOLDEN % 1.0))
         axes.barh(row, us, left=left, height=0.7, color=ground)[0].set_gid(gid)
         if us > _ROOM * longest:
-            axes.text(left + us / 2, row, f"{stage}\n{us:.1f}", ha="center", va="center", fontsize=7, color=ink_on(ground))
+            axes.text(
+                left + us / 2,
+                row,
+                f"{stage}\n{us:.1f}",
+                ha="center",
+                va="center",
+                fontsize=7,
+                color=ink_on(ground),
+            )
         hover[gid] = f"{stage}: {us:.2f} us per env-step, {percent(us / whole if whole else None)}"
         left += us
     return hover

@@ -57,8 +57,8 @@ class HeatMap:
 def pivot(cells: Iterable[Cell], axes: dict[str, list[Any]], columns: str | None = None) -> HeatMap:
     """Lay cells out over ``axes`` (name -> values in order): ``columns`` across, every other axis down.
 
-    Without ``columns``, the speed of the moving obstacles where it varies, else the last axis that does. Raises ValueError for a column
-    axis that is none, and for two cells in one place.
+    Without ``columns``, the speed of the moving obstacles where it varies, else the last axis that does.
+    Raises ValueError for a column axis that is none, and for two cells in one place.
     """
     named = {cell_name(name): list(values) for name, values in axes.items()}
     across = cell_name(columns) if columns else _default_columns(named)
@@ -67,7 +67,9 @@ def pivot(cells: Iterable[Cell], axes: dict[str, list[Any]], columns: str | None
     down = tuple(name for name in named if name != across)
     found = list(cells)
     rows = [tuple(cell.get(name) for name in down) for cell in found]
-    row_values = tuple(sorted({repr(row): row for row in rows}.values(), key=lambda row: _order(row, down, named)))  # values may be lists
+    row_values = tuple(
+        sorted({repr(row): row for row in rows}.values(), key=lambda row: _order(row, down, named))
+    )  # values may be lists
     places = tuple(_place(cell, down, across, row_values, named[across]) for cell in found)
     _refuse_doubles(places)
     return HeatMap(down, across, row_values, tuple(named[across]), places)
@@ -87,10 +89,15 @@ def _default_columns(axes: dict[str, list[Any]]) -> str:
 
 def _order(row: tuple[Any, ...], down: tuple[str, ...], axes: dict[str, list[Any]]) -> list[int]:
     """Where a row stands: by the axes' own order; values that no axis names come last."""
-    return [axes[name].index(value) if value in axes[name] else len(axes[name]) for name, value in zip(down, row, strict=True)]
+    return [
+        axes[name].index(value) if value in axes[name] else len(axes[name])
+        for name, value in zip(down, row, strict=True)
+    ]
 
 
-def _place(cell: Cell, down: tuple[str, ...], across: str, rows: tuple[tuple[Any, ...], ...], columns: list[Any]) -> Place:
+def _place(
+    cell: Cell, down: tuple[str, ...], across: str, rows: tuple[tuple[Any, ...], ...], columns: list[Any]
+) -> Place:
     row = rows.index(tuple(cell.get(name) for name in down))
     value = cell.get(across)
     if value is None:

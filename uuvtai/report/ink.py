@@ -1,4 +1,5 @@
-"""From panels to SVG for the page and PNG for the disk. matplotlib is imported here and in ``figures.py`` only, when something is drawn."""
+"""From panels to SVG for the page and PNG for the disk. matplotlib is imported here and in ``figures.py``
+only, when something is drawn."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ _SVG = "http://www.w3.org/2000/svg"
 _XLINK = "http://www.w3.org/1999/xlink"
 _INCH_PX = 96
 _SMALLEST = 0.8
-"""A panel is never shown smaller than this share of its size, or its text could not be read: it scrolls in its box instead"""
+"""A panel is never shown smaller than this share of its size, or its text could not be read: it scrolls in
+its box instead"""
 
 _STYLE = {
     "text.parse_math": False,  # a name with dollars is a name
@@ -42,13 +44,23 @@ _STYLE = {
     "legend.fontsize": 8.5,
     "lines.linewidth": 1.6,
     **dict.fromkeys(
-        ("text.color", "axes.labelcolor", "axes.edgecolor", "axes.titlecolor", "xtick.color", "ytick.color", "grid.color"), INK
+        (
+            "text.color",
+            "axes.labelcolor",
+            "axes.edgecolor",
+            "axes.titlecolor",
+            "xtick.color",
+            "ytick.color",
+            "grid.color",
+        ),
+        INK,
     ),
 }
 
 
 def svg(panel: Panel, prefix: str, label: str) -> str:
-    """The panel as an inline ``<svg>``: text in the page's colour, ids that begin with ``prefix``, hover texts as ``<title>``."""
+    """The panel as an inline ``<svg>``: text in the page's colour, ids that begin with ``prefix``, hover
+    texts as ``<title>``."""
     with _style():
         from matplotlib.figure import Figure
 
@@ -108,7 +120,8 @@ def _strip(root: ElementTree.Element) -> None:
 
 
 def _recolour(root: ElementTree.Element) -> None:
-    """The ink becomes the page's text colour, the series' colours variables of the page, which has lighter ones for the dark."""
+    """The ink becomes the page's text colour, the series' colours variables of the page, which has lighter
+    ones for the dark."""
     named = {INK: "currentColor"} | {colour: on_page(colour) for colour in PALETTE}
     for element in root.iter():
         style = element.get("style")

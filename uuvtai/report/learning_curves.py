@@ -1,4 +1,5 @@
-"""Blocks of trainings: reward, success, reconstruction and dynamics loss; several seeds of one method as a mean line with a band."""
+"""Blocks of trainings: reward, success, reconstruction and dynamics loss; several seeds of one method as a
+mean line with a band."""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ PANELS = (
     ("world_model/reconstruction_loss", "reconstruction loss", False),
     ("world_model/dynamics_loss", "dynamics loss", False),
 )
-"""(metric, title, is a share): the paper's four curves, collision, and the evaluations in between where there are any"""
+"""(metric, title, is a share): the paper's four curves, collision, and the evaluations in between where there
+are any"""
 
 
 @dataclass(frozen=True)
@@ -60,8 +62,16 @@ def training(runs: Sequence[Training], command: str = "") -> list[Block]:
     if not panels:
         return [Prose("No iteration was recorded.")]
     data = Data(["method", "metric", "million_env_steps", "mean", "lowest", "highest"], rows)
-    seeds = "the line is the mean over seeds, the band reaches from the lowest to the highest seed; " if _several(methods) else ""
-    caption = f"Training curves: {seeds}shares and rewards over the episodes that ended last, as the trainer records them"
+    seeds = (
+        "the line is the mean over seeds, the band reaches from the lowest to the highest seed; "
+        if _several(methods)
+        else ""
+    )
+    caption = (
+        f"Training curves: {seeds}shares and rewards over the episodes that ended last, as the "
+        "trainer "
+        "records them"
+    )
     return [Figure("training", panels, caption, data, command), _last_table(methods)]
 
 
@@ -73,7 +83,10 @@ def grouped(runs: Sequence[Training]) -> list[MethodRuns]:
     groups = list(by_config.values())
     names = [_method_name(group) for group in groups]
     unique = len(set(names)) == len(names)
-    return [MethodRuns(name if unique else group[0].name, group) for name, group in zip(names, groups, strict=True)]
+    return [
+        MethodRuns(name if unique else group[0].name, group)
+        for name, group in zip(names, groups, strict=True)
+    ]
 
 
 def _config_of(run: Training) -> dict[str, Any]:
@@ -110,7 +123,10 @@ def _several(methods: Sequence[MethodRuns]) -> bool:
 
 def _line(method: MethodRuns, key: str, colour: str) -> Line | None:
     """Mean over the seeds at the iterations that all of them have; None where the metric is missing."""
-    by_iteration = [{row["iteration"]: row for row in run.metrics if _is_number(row.get(key)) and _STEPS in row} for run in method.runs]
+    by_iteration = [
+        {row["iteration"]: row for row in run.metrics if _is_number(row.get(key)) and _STEPS in row}
+        for run in method.runs
+    ]
     common = sorted(set.intersection(*(set(rows) for rows in by_iteration)))
     if not common:
         return None
@@ -126,11 +142,22 @@ def _is_number(value: object) -> bool:
 
 
 def _points(line: Line) -> list[list[float]]:
-    return [list(point) for point in zip(line.x, line.y, line.low or line.y, line.high or line.y, strict=True)]
+    return [
+        list(point) for point in zip(line.x, line.y, line.low or line.y, line.high or line.y, strict=True)
+    ]
 
 
 def _last_table(methods: Sequence[MethodRuns]) -> Table:
-    columns = ["training", "iterations", "env-steps", "reward", "success", "collision", "success in evaluation", "env-steps/s"]
+    columns = [
+        "training",
+        "iterations",
+        "env-steps",
+        "reward",
+        "success",
+        "collision",
+        "success in evaluation",
+        "env-steps/s",
+    ]
     rows = []
     for method in methods:
         for run in method.runs:
@@ -149,11 +176,14 @@ def _last_table(methods: Sequence[MethodRuns]) -> Table:
             )
     colours = method_colours([method.name for method in methods])
     swatches = [colours[method.name] for method in methods for _ in method.runs]
-    return Table(columns, rows, "Where each training ended: the record of its last iteration", swatches=swatches)
+    return Table(
+        columns, rows, "Where each training ended: the record of its last iteration", swatches=swatches
+    )
 
 
 def _judged(run: Training) -> str:
-    """Success in the last evaluation in between, with its count and interval; the config says of how many episodes."""
+    """Success in the last evaluation in between, with its count and interval; the config says of how many
+    episodes."""
     shares = [row["eval/success_rate"] for row in run.metrics if _is_number(row.get("eval/success_rate"))]
     n = _section(_config_of(run)).get("evaluate_episodes")
     if not shares or not isinstance(n, int):

@@ -1,4 +1,5 @@
-"""Blocks of pictures and videos: trajectories over the occupancy map, the worst episodes first, as many as the page may hold."""
+"""Blocks of pictures and videos: trajectories over the occupancy map, the worst episodes first, as many as
+the page may hold."""
 
 from __future__ import annotations
 
@@ -13,7 +14,8 @@ from uuvtai.report.blocks import Block, Gallery, Heading, Media, PageSection
 from uuvtai.report.wording import megabytes, number
 
 MEDIA_BYTES, PICTURE_BYTES = 6_600_000, 2_200_000
-"""What all pictures and videos of a page, and the pictures of a run among them, may weigh: in base64 8.8 MB of a page's 10 MB"""
+"""What all pictures and videos of a page, and the pictures of a run among them, may weigh: in base64 8.8 MB
+of a page's 10 MB"""
 
 _NAME = re.compile(r"(?P<label>.*?)_?seed(?P<seed>-?\d+)_episode(?P<episode>\d+)(?P<rest>.*)")
 _SUCCESS = "success"
@@ -37,12 +39,17 @@ class _Shown:
     def badness(self) -> tuple[bool, bool, float]:
         """Sorts the worst first: failures, then what came closest; what is not known comes last."""
         failed = any(detail["outcome"] != _SUCCESS for _, detail in self.details)
-        closest = [detail["min_clearance_m"] for _, detail in self.details if detail.get("min_clearance_m") is not None]
+        closest = [
+            detail["min_clearance_m"]
+            for _, detail in self.details
+            if detail.get("min_clearance_m") is not None
+        ]
         return (not self.details, not failed, min(closest, default=float("inf")))
 
 
 def media(folder: Path, result: dict[str, Any] | None, budget: int = MEDIA_BYTES) -> list[Block]:
-    """Pictures, then videos, of a run folder; ``result`` is its ``uuv eval --json`` document, ``budget`` in bytes."""
+    """Pictures, then videos, of a run folder; ``result`` is its ``uuv eval --json`` document, ``budget`` in
+    bytes."""
     methods = (result or {}).get("methods", [])
     pictures = _worst_first(sorted([*folder.glob("pictures/*.png"), *folder.glob("explain/*.png")]), methods)
     videos = _worst_first(sorted([*folder.glob("explain/*.webm"), *folder.glob("videos/*.webm")]), methods)
@@ -67,22 +74,34 @@ def _gallery(folder: Path, shown: Iterable[_Shown], mime: str, budget: int) -> G
             left_out.append(f"{one.path.relative_to(folder)} ({megabytes(size)})")
             continue
         budget -= size
-        items.append(Media(mime, read_bytes(one.path, size, folder), _caption(one), str(one.path.relative_to(folder))))
+        items.append(
+            Media(mime, read_bytes(one.path, size, folder), _caption(one), str(one.path.relative_to(folder)))
+        )
     return Gallery(items, _note(left_out))
 
 
 def _note(left_out: Sequence[str]) -> str:
-    return f"Left out to keep this page small, to be found in the run folder: {', '.join(left_out)}." if left_out else ""
+    return (
+        f"Left out to keep this page small, to be found in the run folder: {', '.join(left_out)}."
+        if left_out
+        else ""
+    )
 
 
 def shared(sections: Sequence[PageSection], budget: int = MEDIA_BYTES) -> list[PageSection]:
-    """The same sections with what the page's budget [bytes] holds: pictures of every run first, then videos, in the page's order."""
+    """The same sections with what the page's budget [bytes] holds: pictures of every run first, then videos,
+    in the page's order."""
     kept: dict[int, Gallery] = {}
     galleries = [block for section in sections for block in section.blocks if isinstance(block, Gallery)]
-    for gallery in sorted(galleries, key=lambda one: any(item.mime.startswith("video/") for item in one.items)):
+    for gallery in sorted(
+        galleries, key=lambda one: any(item.mime.startswith("video/") for item in one.items)
+    ):
         kept[id(gallery)] = _trimmed(gallery, budget)
         budget -= sum(len(item.content) for item in kept[id(gallery)].items)
-    return [replace(section, blocks=[kept.get(id(block), block) for block in section.blocks]) for section in sections]
+    return [
+        replace(section, blocks=[kept.get(id(block), block) for block in section.blocks])
+        for section in sections
+    ]
 
 
 def _trimmed(gallery: Gallery, budget: int) -> Gallery:
@@ -93,7 +112,9 @@ def _trimmed(gallery: Gallery, budget: int) -> Gallery:
             continue
         budget -= len(item.content)
         items.append(item)
-    return replace(gallery, items=items, note=" ".join(part for part in (gallery.note, _note(left_out)) if part))
+    return replace(
+        gallery, items=items, note=" ".join(part for part in (gallery.note, _note(left_out)) if part)
+    )
 
 
 def _worst_first(paths: Iterable[Path], methods: list[dict[str, Any]]) -> list[_Shown]:
@@ -114,7 +135,9 @@ def _shown(path: Path, methods: list[dict[str, Any]]) -> _Shown:
     method = _method_of(label, methods)
     remark = label.removesuffix(method).strip("_") if method else found["rest"].strip("_")
     own = [m for m in methods if not label or m["name"] == method]
-    details = tuple((m["name"], d) for m in own for d in m["episodes_detail"] if (d["seed"], d["episode"]) == episode)
+    details = tuple(
+        (m["name"], d) for m in own for d in m["episodes_detail"] if (d["seed"], d["episode"]) == episode
+    )
     return _Shown(path, method, episode, details, remark.replace("_", " "))
 
 
@@ -135,4 +158,6 @@ def _caption(one: _Shown) -> str:
 
 def _outcome(detail: Detail) -> str:
     outcome = _OUTCOMES.get(detail["outcome"], detail["outcome"])
-    return f"{outcome} after {number(detail['time_s'])} s, closest {number(detail.get('min_clearance_m'), 2)} m"
+    return (
+        f"{outcome} after {number(detail['time_s'])} s, closest {number(detail.get('min_clearance_m'), 2)} m"
+    )

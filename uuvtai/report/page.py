@@ -1,4 +1,5 @@
-"""From blocks to one self-contained HTML page: no script, no address, nothing but what stands in it; everything from files is escaped."""
+"""From blocks to one self-contained HTML page: no script, no address, nothing but what stands in it;
+everything from files is escaped."""
 
 from __future__ import annotations
 
@@ -47,7 +48,9 @@ class _Drawing:
         name = self._free_name(figure.name)
         self.pngs[name] = ink.png(figure.panels)
         # safe: ElementTree wrote it from matplotlib's own drawing and escaped every text in it
-        return [Markup(ink.svg(panel, f"{name}-{i}-", figure.caption)) for i, panel in enumerate(figure.panels)]
+        return [
+            Markup(ink.svg(panel, f"{name}-{i}-", figure.caption)) for i, panel in enumerate(figure.panels)
+        ]
 
     def _free_name(self, wanted: str) -> str:
         plain = re.sub(r"[^a-z0-9]+", "_", wanted.lower()).strip("_") or "figure"
@@ -59,7 +62,8 @@ def render(page: Page) -> tuple[str, dict[str, bytes]]:
     """(the page's HTML, name -> PNG of every figure)."""
     drawing = _Drawing()
     html = _template().render(
-        page=page, version=__version__, svgs=drawing.svgs, kind=lambda block: type(block).__name__, max_rows=_MAX_SHOWN_ROWS,
+        page=page, version=__version__, svgs=drawing.svgs, kind=lambda block: type(block).__name__,
+        max_rows=_MAX_SHOWN_ROWS,
         on_page=on_page, csv_uri=_csv_uri, file_name=_file_name, data_uri=_data_uri, text=_text,
     )  # fmt: skip
     return html, drawing.pngs
@@ -69,8 +73,12 @@ def render(page: Page) -> tuple[str, dict[str, bytes]]:
 def _template() -> Template:
     from jinja2 import Environment, StrictUndefined
 
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    return environment.from_string((files("uuvtai") / "presets" / "report" / "page.html.j2").read_text(encoding="utf-8"))
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    return environment.from_string(
+        (files("uuvtai") / "presets" / "report" / "page.html.j2").read_text(encoding="utf-8")
+    )
 
 
 def _csv_uri(data: Data) -> str:

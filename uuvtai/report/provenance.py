@@ -27,7 +27,9 @@ def status_notice(record: dict[str, Any]) -> list[Block]:
     status = record.get("status", "unknown")
     if status == "finished":
         return []
-    return [Notice(f"The run is marked '{status}': what follows is what was there when this page was written.")]
+    return [
+        Notice(f"The run is marked '{status}': what follows is what was there when this page was written.")
+    ]
 
 
 def provenance(record: dict[str, Any]) -> list[Block]:
@@ -62,22 +64,43 @@ def checkpoints(folder: Path) -> list[Block]:
         manifest = read_json(folder, str(path.relative_to(folder))) or {}
         files = manifest.get("files", {})
         digest = (files.get("model.safetensors") or {}).get("sha256", "-")
-        rows.append([path.parent.name, str(manifest.get("step", "-")), number(manifest.get("score"), 3), str(digest)[:16]])
+        rows.append(
+            [
+                path.parent.name,
+                str(manifest.get("step", "-")),
+                number(manifest.get("score"), 3),
+                str(digest)[:16],
+            ]
+        )
     if not rows:
         return []
-    return [Table(["checkpoint", "iteration", "score", "sha256 of the model (first 16 digits)"], rows, "Checkpoints")]
+    return [
+        Table(
+            ["checkpoint", "iteration", "score", "sha256 of the model (first 16 digits)"], rows, "Checkpoints"
+        )
+    ]
 
 
 def origins(methods: list[dict[str, Any]], trainings: list[Path]) -> list[Block]:
-    """For every policy of an evaluation the training that made it, by the sha256 of its checkpoint's manifest; [] without trainings."""
-    kept = {_sha256(path, run): (run.name, path.parent.name) for run in trainings for path in (run / "checkpoints").glob("*/manifest.json")}
+    """For every policy of an evaluation the training that made it, by the sha256 of its checkpoint's
+    manifest; [] without trainings."""
+    kept = {
+        _sha256(path, run): (run.name, path.parent.name)
+        for run in trainings
+        for path in (run / "checkpoints").glob("*/manifest.json")
+    }
     told = []
     for method in methods if trainings else []:
         digest = str(method.get("checkpoint", {}).get("sha256", ""))
         if digest in kept:
-            told.append("{} is checkpoint {} of the training {}.".format(method["name"], *reversed(kept[digest])))
+            told.append(
+                "{} is checkpoint {} of the training {}.".format(method["name"], *reversed(kept[digest]))
+            )
         elif digest:
-            told.append(f"{method['name']} (checkpoint {digest[:16]}) is none of the checkpoints that these trainings keep.")
+            told.append(
+                f"{method['name']} (checkpoint {digest[:16]}) is none of the checkpoints that these "
+                "trainings keep."
+            )
     return [Prose(" ".join(told))] if told else []
 
 

@@ -4,11 +4,15 @@
 
 - ``{"kind": "prose" | "heading" | "notice", "text": ".."}``
 - ``{"kind": "table", "columns": [..], "rows": [[..], ..], "caption": "..", "n_left": 1}``
-- ``{"kind": "verdicts", "items": [{"claim": "..", "verdict": "holds" | "does not hold" | "cannot be judged", "numbers": ".."}]}``
+- ``{"kind": "verdicts", "items": [{"claim": "..", "verdict": "holds" | "does not hold" | "cannot be judged",
+  "numbers": ".."}]}``
 - ``{"kind": "trade_off", "series": [{"name": "..", "points": [{"collision_rate": 0, "success_rate": 0}]}],
-  "marks": [{"name": "paper", "collision_rate": 0.011, "success_rate": 0.828}], "caption": "..", "command": ".."}``
-- ``{"kind": "run", "path": ".."}``: what a run folder inside this one has to show (evaluation, sweep, profile, pictures, videos)
-- ``{"kind": "curves", "paths": ["..", ..]}``: training curves of run folders inside this one, seeds of one method as a band
+  "marks": [{"name": "paper", "collision_rate": 0.011, "success_rate": 0.828}], "caption": "..", "command":
+  ".."}``
+- ``{"kind": "run", "path": ".."}``: what a run folder inside this one has to show (evaluation, sweep,
+  profile, pictures, videos)
+- ``{"kind": "curves", "paths": ["..", ..]}``: training curves of run folders inside this one, seeds of one
+  method as a band
 """
 
 from __future__ import annotations
@@ -18,7 +22,18 @@ from pathlib import Path
 from typing import Any
 
 from uuvtai.loader import ConfigError
-from uuvtai.report.blocks import Block, Data, Figure, Heading, Notice, PageSection, Prose, Table, Verdict, Verdicts
+from uuvtai.report.blocks import (
+    Block,
+    Data,
+    Figure,
+    Heading,
+    Notice,
+    PageSection,
+    Prose,
+    Table,
+    Verdict,
+    Verdicts,
+)
 from uuvtai.report.figures import Line, trade_off
 from uuvtai.report.wording import value_name
 
@@ -32,12 +47,20 @@ OfCurves = Callable[[list[Path]], list[Block]]
 
 
 def reproduction(document: Described, folder: Path, of_run: OfRun, of_curves: OfCurves) -> list[PageSection]:
-    """Sections of a reproduction; ``of_run`` and ``of_curves`` give the blocks of run folders. Raises ConfigError."""
+    """Sections of a reproduction; ``of_run`` and ``of_curves`` give the blocks of run folders. Raises
+    ConfigError."""
     if sum(len(section["blocks"]) for section in document["sections"]) > _MAX_BLOCKS:
-        raise ConfigError(f"{folder / 'reproduce.json'}: has more than the {_MAX_BLOCKS:,} blocks that a page has room for")
+        raise ConfigError(
+            f"{folder / 'reproduce.json'}: has more than the {_MAX_BLOCKS:,} blocks that a page has room for"
+        )
     return [
         PageSection(
-            str(section["title"]), [block for described in section["blocks"] for block in _blocks(described, folder, of_run, of_curves)]
+            str(section["title"]),
+            [
+                block
+                for described in section["blocks"]
+                for block in _blocks(described, folder, of_run, of_curves)
+            ],
         )
         for section in document["sections"]
     ]
@@ -50,7 +73,10 @@ def _blocks(described: Described, folder: Path, of_run: OfRun, of_curves: OfCurv
     if kind == "curves":
         return of_curves([_inside(folder, path) for path in described["paths"]])
     if kind not in _SIMPLE:
-        raise ConfigError(f"{folder / 'reproduce.json'}: {kind!r} is no kind of block; there are: run, curves, {', '.join(_SIMPLE)}")
+        raise ConfigError(
+            f"{folder / 'reproduce.json'}: {kind!r} is no kind of block; there are: run, curves, "
+            f"{', '.join(_SIMPLE)}"
+        )
     return [_SIMPLE[kind](described)]
 
 
@@ -58,9 +84,13 @@ def _inside(folder: Path, path: str) -> Path:
     """A run folder within this one: a report never reads elsewhere."""
     found = (folder / path).resolve()
     if not found.is_relative_to(folder.resolve()):
-        raise ConfigError(f"{folder / 'reproduce.json'}: {path!r} lies outside this run folder; name a folder inside it")
+        raise ConfigError(
+            f"{folder / 'reproduce.json'}: {path!r} lies outside this run folder; name a folder inside it"
+        )
     if not found.is_dir():
-        raise ConfigError(f"{folder / 'reproduce.json'}: {path!r} is no folder here; run 'uuv reproduce' again to make it")
+        raise ConfigError(
+            f"{folder / 'reproduce.json'}: {path!r} is no folder here; run 'uuv reproduce' again to make it"
+        )
     return found
 
 
@@ -71,20 +101,33 @@ def _table(described: Described) -> Table:
 
 
 def _verdicts(described: Described) -> Verdicts:
-    items = [Verdict(str(item["claim"]), str(item["verdict"]), str(item["numbers"])) for item in described["items"]]
+    items = [
+        Verdict(str(item["claim"]), str(item["verdict"]), str(item["numbers"])) for item in described["items"]
+    ]
     for item in items:
         if item.ruling not in RULINGS:
-            raise ConfigError(f"reproduce.json: {item.ruling!r} is no verdict; there are: {', '.join(RULINGS)}")
+            raise ConfigError(
+                f"reproduce.json: {item.ruling!r} is no verdict; there are: {', '.join(RULINGS)}"
+            )
     return Verdicts(items)
 
 
 def _trade_off(described: Described) -> Figure:
     series = [
-        Line(str(one["name"]), [p["collision_rate"] for p in one["points"]], [p["success_rate"] for p in one["points"]])
+        Line(
+            str(one["name"]),
+            [p["collision_rate"] for p in one["points"]],
+            [p["success_rate"] for p in one["points"]],
+        )
         for one in described["series"]
     ]
-    marks = [(str(mark["name"]), mark["collision_rate"], mark["success_rate"]) for mark in described.get("marks", [])]
-    rows = [[line.name, *point] for line in series for point in zip(line.x, line.y, strict=True)] + [list(mark) for mark in marks]
+    marks = [
+        (str(mark["name"]), mark["collision_rate"], mark["success_rate"])
+        for mark in described.get("marks", [])
+    ]
+    rows = [[line.name, *point] for line in series for point in zip(line.x, line.y, strict=True)] + [
+        list(mark) for mark in marks
+    ]
     data = Data(["series", "collision_rate", "success_rate"], rows)
     caption = described.get("caption", "Success against collision along one setting")
     return Figure("trade_off", [trade_off(series, marks)], caption, data, described.get("command", ""))

@@ -11,14 +11,22 @@ from uuvtai.loader import MAX_BYTES as MAX_YAML_BYTES
 from uuvtai.loader import ConfigError
 
 _MAX_LINES = 1_000_000
-_MOST = {"methods": 200, "cells": 20_000, "rows": 200, "paper_latency": 1000, "paper_density": 1000, "sections": 200}
+_MOST = {
+    "methods": 200,
+    "cells": 20_000,
+    "rows": 200,
+    "paper_latency": 1000,
+    "paper_density": 1000,
+    "sections": 200,
+}
 """entries of a result's lists that a page has room for: each is drawn, and drawing takes time"""
 _MOST_VALUES = 10_000
 """of an axis of a sweep"""
 
 
 def read_json(run: Path, name: str) -> dict[str, Any] | None:
-    """The document ``name`` of a run folder, or None where there is no such file. Raises ConfigError for one that is no JSON object."""
+    """The document ``name`` of a run folder, or None where there is no such file. Raises ConfigError for one
+    that is no JSON object."""
     path = run / name
     try:
         document = files.read_json(path, folder=run)
@@ -38,19 +46,31 @@ def _refuse_many(document: dict[str, Any], path: Path) -> None:
     """Raise ConfigError for a document that would be drawn for hours."""
     axes = document.get("axes")
     lists = [(name, document.get(name), most) for name, most in _MOST.items()]
-    lists += [(f"axes.{name:.40}", values, _MOST_VALUES) for name, values in axes.items()] if isinstance(axes, dict) else []
+    lists += (
+        [(f"axes.{name:.40}", values, _MOST_VALUES) for name, values in axes.items()]
+        if isinstance(axes, dict)
+        else []
+    )
     for name, entries, most in [*lists, ("axes", axes, _MOST["methods"])]:
         if isinstance(entries, list | dict) and len(entries) > most:
-            raise ConfigError(f"{path}: {name} has {len(entries):,} entries, more than the {most:,} that a page has room for")
+            raise ConfigError(
+                f"{path}: {name} has {len(entries):,} entries, more than the {most:,} that a page has room "
+                "for"
+            )
 
 
 def read_lines(run: Path, name: str) -> list[dict[str, Any]]:
-    """Objects of a JSONL file, [] where there is none; a last line that a kill cut off is left out. Raises ConfigError."""
+    """Objects of a JSONL file, [] where there is none; a last line that a kill cut off is left out. Raises
+    ConfigError."""
     path, found, damaged = run / name, [], 0
     try:
         for i, line in enumerate(files.read_lines(path, files.MAX_JSON_BYTES, run), start=1):
             if damaged or i > _MAX_LINES:
-                why = "is no JSON object; take that line out to go on without it" if damaged else f"is one of more than {_MAX_LINES:,}"
+                why = (
+                    "is no JSON object; take that line out to go on without it"
+                    if damaged
+                    else f"is one of more than {_MAX_LINES:,}"
+                )
                 raise ConfigError(f"{path}, line {damaged or i}: {why}")
             row = _object(line)
             if row is None:
@@ -73,7 +93,9 @@ def _object(line: bytes) -> dict[str, Any] | None:
         return None
     if not isinstance(row, dict):
         return None
-    return {key: value for key, value in row.items() if not isinstance(value, list | dict)}  # a record of figures
+    return {
+        key: value for key, value in row.items() if not isinstance(value, list | dict)
+    }  # a record of figures
 
 
 def read_config(run: Path) -> str | None:

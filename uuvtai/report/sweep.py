@@ -1,4 +1,5 @@
-"""Blocks of a sweep (the document of ``uuv sweep --json``): heat maps over two or more axes, curves with intervals over one."""
+"""Blocks of a sweep (the document of ``uuv sweep --json``): heat maps over two or more axes, curves with
+intervals over one."""
 
 from __future__ import annotations
 
@@ -20,11 +21,17 @@ def sweep(document: dict[str, Any], command: str = "") -> list[Block]:
     cells, axes = document["cells"], document["axes"]
     if not cells:
         return [Notice("No cell of this sweep is finished yet.")]
-    spans = "; ".join(f"{axis_name(name)} in {{{', '.join(map(value_name, values))}}}" for name, values in axes.items())
+    spans = "; ".join(
+        f"{axis_name(name)} in {{{', '.join(map(value_name, values))}}}" for name, values in axes.items()
+    )
     episodes = sum(cell["episodes"] for cell in cells)
     said = f"World {document.get('world', '-')}, {spans}: {len(cells)} cells, {episodes:,} episodes in all."
     if is_alone(document):
-        return [Prose(f"{said} One axis at a time, all else unchanged."), *_each_axis(document, command), cells_table(cells, "Every cell")]
+        return [
+            Prose(f"{said} One axis at a time, all else unchanged."),
+            *_each_axis(document, command),
+            cells_table(cells, "Every cell"),
+        ]
     drawn = _curves(cells, axes, command) if len(varying(axes)) < 2 else _maps(cells, axes, command)
     return [Prose(said), *drawn]
 
@@ -32,7 +39,9 @@ def sweep(document: dict[str, Any], command: str = "") -> list[Block]:
 def _each_axis(document: dict[str, Any], command: str) -> list[Block]:
     """Success and collision along every axis; the unchanged condition stands first."""
     return [
-        _axis_figure(of_axis(axis, document), axis, places(axis, document), place_names(axis, document), command)
+        _axis_figure(
+            of_axis(axis, document), axis, places(axis, document), place_names(axis, document), command
+        )
         for axis in axes_of(document)
     ]
 
@@ -44,10 +53,15 @@ def _maps(cells: list[Cell], axes: dict[str, list[Any]], command: str) -> list[B
         chosen = pivot(own, axes)
         panels = [heat_map(chosen, f"{key}_rate", f"{method}: {key}") for key in ("collision", "success")]
         caption = (
-            f"{method}: collision (left) and success (right) in per cent of the episodes, below each the mean time of the successes. "
-            "Bright is good in both. A cell that spans the row does not depend on the column. Counts and intervals: on hover and below"
+            f"{method}: collision (left) and success (right) in per cent of the episodes, below each the "
+            "mean time of the successes. "
+            "Bright is good in both. A cell that spans the row does not depend on the column. Counts and "
+            "intervals: on hover and below"
         )
-        blocks += [Figure(f"heat_map_{method}", panels, caption, cells_data(own), command), cells_table(own, f"Every cell of {method}")]
+        blocks += [
+            Figure(f"heat_map_{method}", panels, caption, cells_data(own), command),
+            cells_table(own, f"Every cell of {method}"),
+        ]
     return blocks
 
 
@@ -56,14 +70,22 @@ def _curves(cells: list[Cell], axes: dict[str, list[Any]], command: str) -> list
     named = varying(axes)
     axis = named[0] if named else next(iter(axes), "")
     values = list({repr(cell.get(axis)): cell.get(axis) for cell in cells}.values())  # they may be lists
-    return [_axis_figure(cells, axis, values, list(map(value_name, values)), command), cells_table(cells, "Every cell")]
+    return [
+        _axis_figure(cells, axis, values, list(map(value_name, values)), command),
+        cells_table(cells, "Every cell"),
+    ]
 
 
 def _axis_figure(cells: list[Cell], axis: str, places: list[Any], names: list[str], command: str) -> Figure:
     own = by_method(cells)
     colours = method_colours(list(own))
     panels = [
-        intervals([_line(method, own[method], key, axis, places, colours[method]) for method in own], names, key, axis_name(axis))
+        intervals(
+            [_line(method, own[method], key, axis, places, colours[method]) for method in own],
+            names,
+            key,
+            axis_name(axis),
+        )
         for key in ("success", "collision")
     ]
     caption = f"Success and collision over {axis_name(axis)}, with 95 % Wilson intervals"
@@ -75,7 +97,15 @@ def _line(method: str, own: list[Cell], key: str, axis: str, places: list[Any], 
     bounds = [cell.get(f"{key}_ci95") or [cell[f"{key}_rate"]] * 2 for cell in known]
     x = [places.index(cell.get(axis)) for cell in known]
     said = [f"{method}, {hover_text(cell)}" for cell in known]
-    return Line(method, x, [cell[f"{key}_rate"] for cell in known], [low for low, _ in bounds], [high for _, high in bounds], said, colour)
+    return Line(
+        method,
+        x,
+        [cell[f"{key}_rate"] for cell in known],
+        [low for low, _ in bounds],
+        [high for _, high in bounds],
+        said,
+        colour,
+    )
 
 
 def by_method(cells: list[Cell]) -> dict[str, list[Cell]]:
@@ -89,10 +119,25 @@ def by_method(cells: list[Cell]) -> dict[str, list[Cell]]:
 def cells_table(cells: list[Cell], caption: str) -> Table:
     """One row a cell: rates with counts and intervals, how the rest ended, times."""
     axes = _axes_of(cells)
-    columns = ["method", *map(axis_name, axes), "success", "collision", "contact / TTC / out / timeout", "time to goal s", "TTS s"]
+    columns = [
+        "method",
+        *map(axis_name, axes),
+        "success",
+        "collision",
+        "contact / TTC / out / timeout",
+        "time to goal s",
+        "TTS s",
+    ]
     colours = method_colours(list(by_method(cells)))
     swatches = [colours[cell.get("method", "policy")] for cell in cells]
-    return Table(columns, [_row(cell, axes) for cell in cells], caption, n_left=1 + len(axes), folded=True, swatches=swatches)
+    return Table(
+        columns,
+        [_row(cell, axes) for cell in cells],
+        caption,
+        n_left=1 + len(axes),
+        folded=True,
+        swatches=swatches,
+    )
 
 
 def _axes_of(cells: list[Cell]) -> list[str]:
@@ -102,7 +147,9 @@ def _axes_of(cells: list[Cell]) -> list[str]:
 def _row(cell: Cell, axes: list[str]) -> list[str]:
     n, outcomes = cell["episodes"], cell.get("outcomes") or {}
     k_success, k_collision = _count(cell, "success"), _count(cell, "collision")
-    split = " / ".join(str(outcomes.get(name, "-")) for name in ("collision", "ttc", "out_of_tank", "timeout"))
+    split = " / ".join(
+        str(outcomes.get(name, "-")) for name in ("collision", "ttc", "out_of_tank", "timeout")
+    )
     return [
         str(cell.get("method", "policy")),
         *("-" if cell.get(name) is None else value_name(cell[name]) for name in axes),
@@ -126,11 +173,15 @@ def cells_data(cells: list[Cell]) -> Data:
     """Every cell as numbers."""
     axes = _axes_of(cells)
     bounds = [f"{key}_ci95_{end}" for key in ("success", "collision") for end in ("low", "high")]
-    return Data(["method", *axes, "episodes", *ENDINGS, *bounds, *_NUMBERS], [_numbers(cell, axes) for cell in cells])
+    return Data(
+        ["method", *axes, "episodes", *ENDINGS, *bounds, *_NUMBERS], [_numbers(cell, axes) for cell in cells]
+    )
 
 
 def _numbers(cell: Cell, axes: list[str]) -> list[Any]:
     outcomes = cell.get("outcomes") or {}
-    bounds = [bound for key in ("success", "collision") for bound in (cell.get(f"{key}_ci95") or (None, None))]
+    bounds = [
+        bound for key in ("success", "collision") for bound in (cell.get(f"{key}_ci95") or (None, None))
+    ]
     head = [cell.get("method"), *(cell.get(name) for name in axes), cell["episodes"]]
     return [*head, *(outcomes.get(name) for name in ENDINGS), *bounds, *(cell.get(name) for name in _NUMBERS)]

@@ -1,4 +1,5 @@
-"""Heat maps in the terminal: coloured unicode with rich, collision left, success right; the numbers are there without colour too."""
+"""Heat maps in the terminal: coloured unicode with rich, collision left, success right; the numbers are there
+without colour too."""
 
 from __future__ import annotations
 
@@ -15,27 +16,36 @@ from uuvtai.report.heatmap import HeatMap, pivot
 from uuvtai.report.wording import axis_name, number
 
 _LEGEND = (
-    "per cent of the episodes, below it the mean time to success in s; bright is good. One cell across = it does not depend on the column"
+    "per cent of the episodes, below it the mean time to success in s; bright is good. One cell "
+    "across "
+    "= it does not depend on the column"
 )
 
 _WIDTH = 7
 """of a cell at least: with it both maps of the paper's grid stand side by side in 120 columns"""
 
 
-def print_heat_maps(document: dict[str, Any], console: Console, columns: str | None = None, is_whole: bool = False) -> None:
-    """Print both heat maps of every method of a ``uuv sweep --json`` document. Raises ValueError like ``heatmap.pivot``.
+def print_heat_maps(
+    document: dict[str, Any], console: Console, columns: str | None = None, is_whole: bool = False
+) -> None:
+    """Print both heat maps of every method of a ``uuv sweep --json`` document. Raises ValueError like
+    ``heatmap.pivot``.
 
-    A map that is wider than the console comes in pieces, one below the other, unless it shall be ``is_whole``.
+    A map that is wider than the console comes in pieces, one below the other, unless it shall be
+    ``is_whole``.
     """
     cells = document["cells"]
     for method in dict.fromkeys(cell.get("method", "") for cell in cells):
-        chosen = pivot([cell for cell in cells if cell.get("method", "") == method], document["axes"], columns)
+        chosen = pivot(
+            [cell for cell in cells if cell.get("method", "") == method], document["axes"], columns
+        )
         n = len(chosen.column_names)
         step = n if is_whole else max(1, (console.width - _row_width(chosen)) // _cell_width(chosen))
         for first in range(0, n, step):
             piece = range(first, min(n, first + step))
             tables = [
-                heat_table(chosen, key, f"{method}: {key.removesuffix('_rate')}", piece) for key in ("collision_rate", "success_rate")
+                heat_table(chosen, key, f"{method}: {key.removesuffix('_rate')}", piece)
+                for key in ("collision_rate", "success_rate")
             ]
             if is_whole:
                 for table in tables:
@@ -73,7 +83,9 @@ def heat_table(chosen: HeatMap, key: str, title: str, piece: range) -> Table:
     table = Table(title=Text(title), title_justify="left", box=None, padding=0)
     table.add_column(Text(_corner(chosen)), no_wrap=True)
     for column in piece:
-        table.add_column(Text(chosen.column_names[column]), justify="center", no_wrap=True, width=_cell_width(chosen))
+        table.add_column(
+            Text(chosen.column_names[column]), justify="center", no_wrap=True, width=_cell_width(chosen)
+        )
     for row, name in enumerate(chosen.row_names):
         table.add_row(Text(f"{name} "), *_row(chosen, row, key)[piece.start : piece.stop])
     return table
@@ -98,4 +110,6 @@ def _texts(cell: dict[str, Any], key: str, width: int) -> tuple[Text, Text]:
     ground = shade(rate if key == "success_rate" else 1.0 - rate)
     style = f"{ink_on(ground)} on {ground}"
     lines = (f"{100 * rate:.0f} %", number(cell.get("time_to_success_mean_s")))
-    return Text("\n".join(f"{line:^{width}}" for line in lines), style=style), Text("\n".join(" " * width for _ in lines), style=style)
+    return Text("\n".join(f"{line:^{width}}" for line in lines), style=style), Text(
+        "\n".join(" " * width for _ in lines), style=style
+    )

@@ -1,4 +1,5 @@
-"""Blocks of a profile (the document of ``uuv profile --json``): rates, time per stage, the paper's two timing tables beside ours."""
+"""Blocks of a profile (the document of ``uuv profile --json``): rates, time per stage, the paper's two timing
+tables beside ours."""
 
 from __future__ import annotations
 
@@ -12,7 +13,10 @@ from uuvtai.report.wording import number
 def timing(document: dict[str, Any], command: str = "") -> list[Block]:
     """Everything that a profile has to show."""
     machine, rows = document.get("machine", {}), document.get("rows", [])
-    said = f"Measured on {machine.get('cpu', 'an unnamed processor')}, {machine.get('cores', '-')} cores, {machine.get('device', 'cpu')}."
+    said = (
+        f"Measured on {machine.get('cpu', 'an unnamed processor')}, {machine.get('cores', '-')} cores, "
+        f"{machine.get('device', 'cpu')}."
+    )
     blocks: list[Block] = [Prose(said)]
     if rows:
         blocks += [_rates_table(rows), _stages_figure(rows, command)]
@@ -21,13 +25,31 @@ def timing(document: dict[str, Any], command: str = "") -> list[Block]:
 
 
 def _rates_table(rows: list[dict[str, Any]]) -> Table:
-    columns = ["envs", "controller", "S", "D", "env-steps/s", "+ inference", "+ training", "memory MB", "compile s"]
+    columns = [
+        "envs",
+        "controller",
+        "S",
+        "D",
+        "env-steps/s",
+        "+ inference",
+        "+ training",
+        "memory MB",
+        "compile s",
+    ]
     shown = []
     for row in rows:
         rates = row["env_steps_per_s"]
         speeds = [number(rates.get(name), 0) for name in ("step", "step_inference", "train")]
         scene = [str(row.get(name, "-")) for name in ("controller", "S", "D")]
-        shown.append([number(row["num_envs"], 0), *scene, *speeds, number(row.get("memory_mb")), number(row.get("compile_s"))])
+        shown.append(
+            [
+                number(row["num_envs"], 0),
+                *scene,
+                *speeds,
+                number(row.get("memory_mb")),
+                number(row.get("compile_s")),
+            ]
+        )
     return Table(columns, shown, "Env-steps per second, resets included")
 
 
@@ -38,7 +60,13 @@ def _stages_figure(rows: list[dict[str, Any]], command: str) -> Figure:
         [[row["num_envs"], *item] for row in rows for item in row["stages_us_per_env_step"].items()],
     )
     panels = [_alone(bar, i, len(bars)) for i, bar in enumerate(bars)]
-    return Figure("stages", panels, "Time per stage, the longest first; names of short stages on hover and in the data", data, command)
+    return Figure(
+        "stages",
+        panels,
+        "Time per stage, the longest first; names of short stages on hover and in the data",
+        data,
+        command,
+    )
 
 
 def _alone(bar: tuple[str, dict[str, float]], i: int, n_bars: int) -> Panel:

@@ -1,4 +1,5 @@
-"""Numbers as the report writes them: every rate with its count and its interval, and what is not known as a dash."""
+"""Numbers as the report writes them: every rate with its count and its interval, and what is not known as a
+dash."""
 
 from __future__ import annotations
 

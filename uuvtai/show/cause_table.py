@@ -25,8 +25,10 @@ _REMARKABLE_SHARE = 0.2
 """Remarks on fewer of a cause's episodes are left to the JSON."""
 
 _LEGEND = (
-    "knew: share whose forecast of the killer, made 1 s before the end, was right. Medians before the end: unseen = since a beam last met "
-    "the killer, evading = since evasion began, chance = until when some velocity still escaped. worst: seed:episode of the hardest hit"
+    "knew: share whose forecast of the killer, made 1 s before the end, was right. Medians before the end: "
+    "unseen = since a beam last met "
+    "the killer, evading = since evasion began, chance = until when some velocity still escaped. worst: "
+    "seed:episode of the hardest hit"
 )
 
 
@@ -45,9 +47,15 @@ def _show_method(screen: Screen, m: dict[str, Any]) -> None:
     if not failed:
         screen.line(f"{m['name']}: no episode failed, nothing to explain")
         return
-    screen.table(_CAUSES, [_cause(c) for c in m["causes"]], f"{m['name']}: why {failed} of {m['episodes']} episodes failed")
+    screen.table(
+        _CAUSES,
+        [_cause(c) for c in m["causes"]],
+        f"{m['name']}: why {failed} of {m['episodes']} episodes failed",
+    )
     for c in m["causes"]:
-        remarks = ", ".join(f"{k} {remark}" for remark, k in c["remarks"].items() if k >= _REMARKABLE_SHARE * c["count"])
+        remarks = ", ".join(
+            f"{k} {remark}" for remark, k in c["remarks"].items() if k >= _REMARKABLE_SHARE * c["count"]
+        )
         meaning = Text(plain(c["label"]), style="bold").append(plain(f": {c['meaning']}"), style="not bold")
         screen.line(meaning.append(plain(f" ({remarks})"), style="not bold dim") if remarks else meaning)
 
@@ -55,4 +63,11 @@ def _show_method(screen: Screen, m: dict[str, Any]) -> None:
 def _cause(c: dict[str, Any]) -> list[str]:
     medians = (c["unseen_median_s"], c["evading_median_s"], c["last_chance_median_s"])
     worst = ":".join(map(str, c["examples"][0]))
-    return [c["label"], str(c["count"]), percent(c["share"]), percent(c["knew_share"]), *map(seconds, medians), worst]
+    return [
+        c["label"],
+        str(c["count"]),
+        percent(c["share"]),
+        percent(c["knew_share"]),
+        *map(seconds, medians),
+        worst,
+    ]

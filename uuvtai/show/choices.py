@@ -1,4 +1,5 @@
-"""What may be typed where: values beside an option, names that the shell completes, refusals that say what was meant."""
+"""What may be typed where: values beside an option, names that the shell completes, refusals that say what
+was meant."""
 
 from __future__ import annotations
 
@@ -21,16 +22,21 @@ Complete = Callable[[str], list[str]]
 
 
 def choice(option: str, values: tuple[str, ...], help_text: str, meant: dict[str, str] | None = None) -> Any:
-    """Option whose values are listed in the help, completed by the shell, and checked as soon as the command line is read."""
+    """Option whose values are listed in the help, completed by the shell, and checked as soon as the command
+    line is read."""
 
     def check(value: str | None) -> str | None:
         if value is not None and value not in values:
-            close = (meant or {}).get(value) or next(iter(difflib.get_close_matches(value, values, n=1, cutoff=0.5)), None)
+            close = (meant or {}).get(value) or next(
+                iter(difflib.get_close_matches(value, values, n=1, cutoff=0.5)), None
+            )
             told = f"; did you mean '{close}'?" if close else ""
             raise UsageError(f"{option} {value}: use {', '.join(values[:-1])} or {values[-1]}{told}")
         return value
 
-    return typer.Option(option, metavar="|".join(values), help=help_text, callback=check, autocompletion=_among(values))
+    return typer.Option(
+        option, metavar="|".join(values), help=help_text, callback=check, autocompletion=_among(values)
+    )
 
 
 def device() -> Any:
@@ -47,18 +53,21 @@ def presets(kind: str, *more: str, suffix: str = ".yaml") -> Complete:
     """Names of the presets of a kind, ``more`` words, and files."""
 
     def complete(incomplete: str) -> list[str]:
-        return _starting([*preset_names(kind), *more], incomplete) + _paths(incomplete, lambda path: path.suffix == suffix)
+        return _starting([*preset_names(kind), *more], incomplete) + _paths(
+            incomplete, lambda path: path.suffix == suffix
+        )
 
     return complete
 
 
 def controllers(incomplete: str) -> list[str]:
-    """Trees, stacks, yardsticks that are told the truth, and files of trees and stacks; after a comma the next one."""
+    """Trees, stacks, yardsticks that are told the truth, and files of trees and stacks; after a comma the
+    next one."""
     before, comma, last = incomplete.rpartition(",")
     trees = preset_names("tree")
-    found = _starting([*trees, *preset_names("stack"), *(f"{tree}+truth" for tree in trees), "oracle", "none"], last) + _paths(
-        last, lambda path: path.suffix in (".xml", ".yaml")
-    )
+    found = _starting(
+        [*trees, *preset_names("stack"), *(f"{tree}+truth" for tree in trees), "oracle", "none"], last
+    ) + _paths(last, lambda path: path.suffix in (".xml", ".yaml"))
     return [f"{before}{comma}{name}" for name in found]
 
 
@@ -110,7 +119,8 @@ def _runs(incomplete: str, holds: str) -> list[str]:
 
 
 def _paths(incomplete: str, wanted: Callable[[Path], bool]) -> list[str]:
-    """Paths that begin like this: those that are ``wanted``, and folders with a slash, to be typed further."""
+    """Paths that begin like this: those that are ``wanted``, and folders with a slash, to be typed
+    further."""
     folder, slash, start = incomplete.rpartition("/")
     try:
         entries = sorted(Path(folder or slash or ".").iterdir())
@@ -118,4 +128,6 @@ def _paths(incomplete: str, wanted: Callable[[Path], bool]) -> list[str]:
         return []
     found = [path for path in entries if path.name.startswith(start) and (start or path.name[0] != ".")]
     texts = {path: f"{folder}{slash}{path.name}" for path in found}
-    return [text if wanted(path) else f"{text}/" for path, text in texts.items() if wanted(path) or path.is_dir()]
+    return [
+        text if wanted(path) else f"{text}/" for path, text in texts.items() if wanted(path) or path.is_dir()
+    ]

@@ -19,7 +19,8 @@ _PERIOD_S = 5.0
 
 
 class TrainingProgress:
-    """What ``measure.training`` tells while it runs. The first iteration compiles: it is no part of the speed and of the time left."""
+    """What ``measure.training`` tells while it runs. The first iteration compiles: it is no part of the speed
+    and of the time left."""
 
     def __init__(self) -> None:
         self._live = None
@@ -33,7 +34,10 @@ class TrainingProgress:
         say(f"run folder: {folder}")
         self._folder, self._total, self._pace = folder, total, None
         world = config.world
-        self._title = f"{config.train.num_envs} envs, S = {world.n_static}, D = {world.n_dynamic}, v = {world.dynamic_speed_m_s} m/s"
+        self._title = (
+            f"{config.train.num_envs} envs, S = {world.n_static}, D = {world.n_dynamic}, v = "
+            f"{world.dynamic_speed_m_s} m/s"
+        )
         if sys.stderr.isatty():
             from rich.live import Live
 
@@ -59,10 +63,14 @@ class TrainingProgress:
         self._evaluated |= {name: value for name, value in metrics.items() if name.startswith("eval/")}
         rows = training_rows(self._evaluated | metrics, success_ci95, self._pace.left_s(done), is_first)
         if self._live is not None:
-            self._live.update(_dashboard(f"{self._folder}: iteration {done} of {self._total}, {self._title}", rows))
+            self._live.update(
+                _dashboard(f"{self._folder}: iteration {done} of {self._total}, {self._title}", rows)
+            )
         elif now - self._last >= _PERIOD_S or done == self._total:
             self._last = now
-            say(f"{done}/{self._total}: " + ", ".join(f"{name} {text}".strip() for name, text in rows.items()))
+            say(
+                f"{done}/{self._total}: " + ", ".join(f"{name} {text}".strip() for name, text in rows.items())
+            )
 
     def stop(self) -> None:
         """The run is over."""
@@ -83,21 +91,28 @@ def _dashboard(title: str, rows: dict[str, str]) -> Group:
 def training_rows(
     metrics: dict[str, float], success_ci95: tuple[float, float] | None, left_s: float | None, is_first: bool
 ) -> dict[str, str]:
-    """What the dashboard shows: name -> text. ``is_first``: the iteration has compiled, so its speed is none."""
+    """What the dashboard shows: name -> text. ``is_first``: the iteration has compiled, so its speed is
+    none."""
     of = metrics.get
     interval = f" [{100 * success_ci95[0]:.0f}, {100 * success_ci95[1]:.0f}]" if success_ci95 else ""
     times = {name: of(f"time/{name}_s", 0.0) for name in ("simulate", "infer", "learn")}
-    split = " / ".join(f"{name} {100 * spent / max(1e-9, sum(times.values())):.0f} %" for name, spent in times.items())
+    split = " / ".join(
+        f"{name} {100 * spent / max(1e-9, sum(times.values())):.0f} %" for name, spent in times.items()
+    )
     rows = {
         "reward": number(of("rollout/ep_rew_mean"), 2),
         "success": percent(of("rollout/success_rate")) + interval,
         "collision": percent(of("rollout/collision_rate")),
-        "env-steps/s": "from the second iteration on" if is_first else f"{of('time/env_steps_per_s', 0.0):,.0f} ({split})",
+        "env-steps/s": "from the second iteration on"
+        if is_first
+        else f"{of('time/env_steps_per_s', 0.0):,.0f} ({split})",
         "env-steps": f"{of('time/env_steps', 0.0):,.0f}",
         "lambda": number(of("distill/lambda_risk"), 3),
     }
     if left_s is not None:
         rows["ETA"] = told_left(left_s).removeprefix("ETA ")
     if "eval/success_rate" in metrics:
-        rows["evaluation"] = f"success {percent(of('eval/success_rate'))}, collision {percent(of('eval/collision_rate'))}"
+        rows["evaluation"] = (
+            f"success {percent(of('eval/success_rate'))}, collision {percent(of('eval/collision_rate'))}"
+        )
     return rows

@@ -1,4 +1,5 @@
-"""An evaluation in the terminal: the table of methods, how hard the condition is, pairs of methods, and the risk head."""
+"""An evaluation in the terminal: the table of methods, how hard the condition is, pairs of methods, and the
+risk head."""
 
 from __future__ import annotations
 
@@ -36,7 +37,8 @@ def show_methods(screen: Screen, result: dict[str, Any]) -> None:
     speed = f"v = {result['v_m_s']} m/s, " if result["D"] else ""
     title = (
         f"{result['world']}: S = {result['S']}, D = {result['D']}, {speed}{result['sensors']} sensing, "
-        f"{len(result['seeds'])} {'seed' if len(result['seeds']) == 1 else 'seeds'} x {result['episodes_per_seed']} episodes"
+        f"{len(result['seeds'])} {'seed' if len(result['seeds']) == 1 else 'seeds'} x "
+        f"{result['episodes_per_seed']} episodes"
     )
     screen.table(_METHODS, [_method(m) for m in result["methods"]], title)
     _show_condition(screen, result["condition"])
@@ -62,11 +64,16 @@ def _method(m: dict[str, Any]) -> list[str]:
 
 
 def show_pairs(screen: Screen, pairs: list[dict[str, Any]]) -> None:
-    """Every two methods on the episodes that both played (``measure.paired``); nothing where one method played alone."""
+    """Every two methods on the episodes that both played (``measure.paired``); nothing where one method
+    played alone."""
     if not pairs:
         return
     screen.line("")
-    screen.table(_PAIRS, [_pair(pair) for pair in pairs], f"the same {pairs[0]['episodes']} episodes, two methods at a time")
+    screen.table(
+        _PAIRS,
+        [_pair(pair) for pair in pairs],
+        f"the same {pairs[0]['episodes']} episodes, two methods at a time",
+    )
 
 
 def _pair(pair: dict[str, Any]) -> list[str]:
@@ -82,27 +89,36 @@ def _pair(pair: dict[str, Any]) -> list[str]:
 
 def _show_remainder(screen: Screen, part: dict[str, Any]) -> None:
     screen.line(
-        f"{part['method']} misses {part['missed']} of {part['episodes']}: {part['sensing']} by sensing (told of the moving bodies it "
-        f"arrives), {part['forecast_decision']} by forecast, decision and inertia (a point had a way), {part['physics']} by physics "
+        f"{part['method']} misses {part['missed']} of {part['episodes']}: {part['sensing']} by sensing (told "
+        "of the moving bodies it "
+        f"arrives), {part['forecast_decision']} by forecast, decision and inertia (a point had a way), "
+        f"{part['physics']} by physics "
         "(the oracle finds none)"
     )
 
 
 def _privilege(name: str) -> str:
     if name == "oracle":
-        return "it knows the future and has no inertia; timeout = not reachable. An upper bound, no controller"
+        return (
+            "it knows the future and has no inertia; timeout = not reachable. An upper bound, no controller"
+        )
     return "it is told where every moving body is and how it moves; what stands still it senses"
 
 
 def _show_condition(screen: Screen, condition: dict[str, Any]) -> None:
     """How hard the condition is, in one line."""
-    detection, rides = condition["detection"], rate(condition["rides_threatened"], condition["rides"], condition["rides_threatened_ci95"])
+    detection, rides = (
+        condition["detection"],
+        rate(condition["rides_threatened"], condition["rides"], condition["rides_threatened_ci95"]),
+    )
     if detection is None:
         return
     screen.line(
         f"threat rate {condition['threats_per_min']:.2f} per minute ({condition['threats']} moving bodies in "
-        f"{condition['ride_minutes']:.1f} min of blind rides; {rides} of the rides meet one), required detection distance "
-        f"{detection['required_m']:.1f} m (closing {detection['closing_m_s']:.1f} m/s, {detection['aside_s']:.1f} s to move aside)"
+        f"{condition['ride_minutes']:.1f} min of blind rides; {rides} of the rides meet one), required "
+        "detection distance "
+        f"{detection['required_m']:.1f} m (closing {detection['closing_m_s']:.1f} m/s, "
+        f"{detection['aside_s']:.1f} s to move aside)"
     )
 
 
@@ -118,6 +134,8 @@ def show_risk(screen: Screen, name: str, risk: dict[str, Any]) -> None:
     if "accidents" in risk:
         low, high = risk["missed_ci95"]
         screen.line(
-            f"  alarm: missed {risk['missed']} of {risk['accidents']} accidents, {100 * low:.1f} to {100 * high:.1f} % "
-            f"(promised {100 * risk['promised_miss_rate']:g} %), raised in {100 * risk['alarm_rate_safe']:.1f} % of the safe moments"
+            f"  alarm: missed {risk['missed']} of {risk['accidents']} accidents, {100 * low:.1f} to "
+            f"{100 * high:.1f} % "
+            f"(promised {100 * risk['promised_miss_rate']:g} %), raised in "
+            f"{100 * risk['alarm_rate_safe']:.1f} % of the safe moments"
         )

@@ -21,6 +21,14 @@ def show_export(screen: Screen, found: Any) -> None:
     for one in found.agreements:
         worst = max(one.difference, key=lambda name: one.difference[name])
         told = f"{one.difference[worst]:.1e} ({worst})"
-        rows.append([one.engine, "agrees" if one.agrees else "DIFFERS", told, f"{one.p50_ms:.3f}", f"{one.p99_ms:.3f}"])
+        rows.append(
+            [
+                one.engine,
+                "agrees" if one.agrees else "DIFFERS",
+                told,
+                f"{one.p50_ms:.3f}",
+                f"{one.p99_ms:.3f}",
+            ]
+        )
     if rows:
         screen.table(_ENGINES, rows, str(found.folder))

@@ -13,5 +13,8 @@ _CHECKS = (Column("", left=True), Column("", left=True), Column("", prose=True))
 
 def show_checks(screen: Screen, found: list[dict[str, Any]]) -> None:
     """One row per check: whether it went well, its name, what was found."""
-    rows = [[Text("ok", style="green") if c["ok"] else Text("BAD", style="red"), c["name"], c["detail"]] for c in found]
+    rows = [
+        [Text("ok", style="green") if c["ok"] else Text("BAD", style="red"), c["name"], c["detail"]]
+        for c in found
+    ]
     screen.table(_CHECKS, rows)

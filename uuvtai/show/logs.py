@@ -13,6 +13,11 @@ _TOPICS = (Column("topic", left=True), Column("messages"), Column("Hz"), Column(
 
 def show_log(screen: Screen, found: dict[str, Any], file: Path) -> None:
     """Topics of a ``uuv log info --json`` document."""
-    rows = [[topic["topic"], str(topic["messages"]), number(topic["rate_hz"]), topic["schema"]] for topic in found["topics"]]
+    rows = [
+        [topic["topic"], str(topic["messages"]), number(topic["rate_hz"]), topic["schema"]]
+        for topic in found["topics"]
+    ]
     screen.table(_TOPICS, rows, str(file))
-    screen.line(f"duration {found['duration_s']:.2f} s, outcome {found['outcome'] or 'none: the log was cut off'}")
+    screen.line(
+        f"duration {found['duration_s']:.2f} s, outcome {found['outcome'] or 'none: the log was cut off'}"
+    )

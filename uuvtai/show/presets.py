@@ -1,4 +1,5 @@
-"""The shipped presets in the terminal: a sentence for each, and what one of them states, with its comments, units and sources."""
+"""The shipped presets in the terminal: a sentence for each, and what one of them states, with its comments,
+units and sources."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ _SENTENCE = re.compile(r"(.+?[.])(?:\s+(?=[A-Z0-9])|$)", re.S)
 
 
 def sentence(kind: str, name: str) -> str:
-    """What a shipped preset says of itself first: its first comment's first sentence; a policy's model card."""
+    """What a shipped preset says of itself first: its first comment's first sentence; a policy's model
+    card."""
     text = read_text(shipped_file(kind, name), _MAX_BYTES)
     if kind == "policy":
         said = text.split("\n", 1)[1].strip().partition("\n\n")[0]
@@ -47,7 +49,11 @@ def show_presets(screen: Screen) -> None:
         screen.line(Text(kind, style="bold"))
         screen.table(_PRESETS, [[f"  {name}", said] for name, said in found.items()])
     screen.line("")
-    screen.line("one of them as it is written: uuv presets show NAME; every key that it gives: uuv presets show NAME --all", "dim")
+    screen.line(
+        "one of them as it is written: uuv presets show NAME; every key that it gives: uuv presets show NAME "
+        "--all",
+        "dim",
+    )
 
 
 def stated(path: Path) -> str:

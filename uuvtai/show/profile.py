@@ -1,4 +1,5 @@
-"""A profile in the terminal: time per stage, rates, one bar per batch size, and the paper's timing tables beside ours."""
+"""A profile in the terminal: time per stage, rates, one bar per batch size, and the paper's timing tables
+beside ours."""
 
 from __future__ import annotations
 
@@ -9,9 +10,25 @@ from rich.text import Text
 from uuvtai.show.screen import Column, Screen
 from uuvtai.show.words import number
 
-_RATES = {"step": "random actions", "tree": "driven by the tree", "step_inference": "+ policy", "train": "+ training"}
+_RATES = {
+    "step": "random actions",
+    "tree": "driven by the tree",
+    "step_inference": "+ policy",
+    "train": "+ training",
+}
 _FLAME_WIDTH = 100
-_FLAME_COLORS = ("blue", "cyan", "green", "yellow", "magenta", "red", "bright_blue", "bright_cyan", "bright_green", "bright_yellow")
+_FLAME_COLORS = (
+    "blue",
+    "cyan",
+    "green",
+    "yellow",
+    "magenta",
+    "red",
+    "bright_blue",
+    "bright_cyan",
+    "bright_green",
+    "bright_yellow",
+)
 
 _LATENCY = (
     Column("component", left=True),
@@ -33,13 +50,19 @@ def show_profile(screen: Screen, result: dict[str, Any]) -> None:
     """Tables of a ``uuv profile --json`` document."""
     rows = result["rows"]
     machine = f"{result['machine']['cpu']}, {result['machine']['cores']} cores, {result['machine']['device']}"
-    # the largest batch is what most people come for, the first one what a vehicle would do; sizes between them go first
+    # the largest batch is what most people come for, the first one what a vehicle would do; sizes between
+    # them go first
     priorities = [0 if i == len(rows) - 1 else 1 if i == 0 else 2 for i in range(len(rows))]
     columns = [Column("us per env-step", left=True)]
-    columns += [Column(f"{row['num_envs']} env", priority) for row, priority in zip(rows, priorities, strict=True)]
+    columns += [
+        Column(f"{row['num_envs']} env", priority) for row, priority in zip(rows, priorities, strict=True)
+    ]
     stages = list(rows[0]["stages_us_per_env_step"])
     table = [[stage, *(f"{row['stages_us_per_env_step'][stage]:.2f}" for row in rows)] for stage in stages]
-    table += [[f"env-steps/s: {told}", *(_rate(row["env_steps_per_s"].get(name)) for row in rows)] for name, told in _RATES.items()]
+    table += [
+        [f"env-steps/s: {told}", *(_rate(row["env_steps_per_s"].get(name)) for row in rows)]
+        for name, told in _RATES.items()
+    ]
     table.append(["memory MB", *(f"{row['memory_mb']:,.0f}" for row in rows)])
     table.append(["compile s", *(f"{row['compile_s']:.1f}" for row in rows)])
     screen.table(columns, table, machine, sections=[len(stages) - 1])

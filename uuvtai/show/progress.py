@@ -1,4 +1,5 @@
-"""How far a job is: a bar on a terminal, a plain line every few seconds elsewhere, and no guess of the time left too early."""
+"""How far a job is: a bar on a terminal, a plain line every few seconds elsewhere, and no guess of the time
+left too early."""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ _WORTH_SHARE = 0.1
 
 
 class Pace:
-    """Time left, from the work done since the clock began. Compiling comes before that and is no part of it."""
+    """Time left, from the work done since the clock began. Compiling comes before that and is no part of
+    it."""
 
     def __init__(self, total: float, done: float = 0.0, now: Callable[[], float] = time.perf_counter) -> None:
         """``done`` of ``total`` is over as the clock begins."""
@@ -49,7 +51,8 @@ def told_left(left_s: float | None) -> str:
 class Progress:
     """Rich progress with ETA on a terminal, one plain line every few seconds otherwise.
 
-    A job that tells that nothing is done yet, in no steps, is compiling: that is shown, and the clock begins with what it tells next.
+    A job that tells that nothing is done yet, in no steps, is compiling: that is shown, and the clock begins
+    with what it tells next.
     """
 
     def __init__(self, what: str = "episodes") -> None:
@@ -76,7 +79,8 @@ class Progress:
             say(text)
 
     def update(self, done: int, total: int, env_steps: int = 0, left: int | None = None) -> None:
-        """``done`` of ``total`` things are over after ``env_steps`` env steps; ``left``: env steps still to come, where that is known."""
+        """``done`` of ``total`` things are over after ``env_steps`` env steps; ``left``: env steps still to
+        come, where that is known."""
         if done == self._done and env_steps == 0:
             self._pace = None
             self._show(done, "compiling")
@@ -85,10 +89,13 @@ class Progress:
             self._pace, self._done, self._env_steps = Pace(total, done), done, env_steps
         spent, steps = self._pace.elapsed_s, env_steps - self._env_steps
         speed = f"{steps / spent:,.0f} env-steps/s" if steps and spent > 0 else ""
-        self._show(done, ", ".join(part for part in (speed, told_left(self._left_s(done, env_steps, left))) if part))
+        self._show(
+            done, ", ".join(part for part in (speed, told_left(self._left_s(done, env_steps, left))) if part)
+        )
 
     def _left_s(self, done: int, env_steps: int, left: int | None) -> float | None:
-        """Time left [s]. Of episodes, from their steps: played together they end together, and their count tells nothing until then."""
+        """Time left [s]. Of episodes, from their steps: played together they end together, and their count
+        tells nothing until then."""
         assert self._pace is not None
         if not env_steps:
             return self._pace.left_s(done)
@@ -111,7 +118,8 @@ class Progress:
 
 
 def _bar():
-    """Bar of a job; what it says beside the count is ours: Rich would guess the time left from the first moment on."""
+    """Bar of a job; what it says beside the count is ours: Rich would guess the time left from the first
+    moment on."""
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
 

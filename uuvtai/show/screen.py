@@ -39,7 +39,8 @@ class Column:
 
 
 class Screen:
-    """Where results are shown. ``wide`` shows every column, however narrow the terminal; a file is wide in any case."""
+    """Where results are shown. ``wide`` shows every column, however narrow the terminal; a file is wide in
+    any case."""
 
     def __init__(self, wide: bool = False, console: Console | None = None) -> None:
         """``console``: stdout, unless it is given."""
@@ -51,15 +52,26 @@ class Screen:
         """A line of prose, wrapped between words; no markup."""
         self.console.print(_text(text, style), highlight=False, soft_wrap=False, overflow="fold")
 
-    def table(self, columns: Sequence[Column], rows: Sequence[Sequence[Cell]], title: str = "", sections: Sequence[int] = ()) -> None:
+    def table(
+        self,
+        columns: Sequence[Column],
+        rows: Sequence[Sequence[Cell]],
+        title: str = "",
+        sections: Sequence[int] = (),
+    ) -> None:
         """A table with a title; a rule is drawn after each row named in ``sections``.
 
-        Where it is wider than the terminal, the columns of highest ``priority`` are left out and named in a line below.
+        Where it is wider than the terminal, the columns of highest ``priority`` are left out and named in a
+        line below.
         """
         if title:
             self.line(title, "italic")
         shown, left_out = list(range(len(columns))), []
-        while not self.wide and (found := _dispensable(columns, shown)) is not None and not self._fits(columns, rows, shown):
+        while (
+            not self.wide
+            and (found := _dispensable(columns, shown)) is not None
+            and not self._fits(columns, rows, shown)
+        ):
             shown.remove(found)
             left_out.append(found)
         kept, cells = [columns[i] for i in shown], [[row[i] for i in shown] for row in rows]
@@ -70,13 +82,24 @@ class Screen:
             names = ", ".join(columns[i].head.replace("\n", " ") for i in sorted(left_out))
             self.line(f"left out, for want of room: {names}; --wide shows all", "dim")
 
-    def _fits(self, columns: Sequence[Column], rows: Sequence[Sequence[Cell]], shown: Sequence[int], folded: str = "") -> bool:
-        """Whether these columns have room where prose, and what else is ``folded``, is as narrow as it may become."""
+    def _fits(
+        self,
+        columns: Sequence[Column],
+        rows: Sequence[Sequence[Cell]],
+        shown: Sequence[int],
+        folded: str = "",
+    ) -> bool:
+        """Whether these columns have room where prose, and what else is ``folded``, is as narrow as it may
+        become."""
         kept = [columns[i] for i in shown]
-        narrowed = [[_narrowed(column, row[i], folded) for column, i in zip(kept, shown, strict=True)] for row in rows]
+        narrowed = [
+            [_narrowed(column, row[i], folded) for column, i in zip(kept, shown, strict=True)] for row in rows
+        ]
         return needed(self.console, _table(kept, narrowed)) <= self.console.width
 
-    def _foldable(self, columns: Sequence[Column], rows: Sequence[Sequence[Cell]], shown: Sequence[int]) -> str:
+    def _foldable(
+        self, columns: Sequence[Column], rows: Sequence[Sequence[Cell]], shown: Sequence[int]
+    ) -> str:
         """What goes on in the next line where it has no room, beside prose: nothing, names, or everything."""
         if self.wide or self._fits(columns, rows, shown):
             return ""
@@ -85,7 +108,8 @@ class Screen:
 
 @contextlib.contextmanager
 def roomy(console: Console, table: Table | None) -> Iterator[None]:
-    """Whatever is printed inside has as many columns as ``table`` needs, though the terminal may have fewer; None changes nothing."""
+    """Whatever is printed inside has as many columns as ``table`` needs, though the terminal may have fewer;
+    None changes nothing."""
     before = console.width
     if table is not None:
         console.width = max(before, needed(console, table))
@@ -96,7 +120,8 @@ def roomy(console: Console, table: Table | None) -> Iterator[None]:
 
 
 def _dispensable(columns: Sequence[Column], shown: Sequence[int]) -> int | None:
-    """The column to leave out next: of highest priority, the rightmost of equals; None = all are essential."""
+    """The column to leave out next: of highest priority, the rightmost of equals; None = all are
+    essential."""
     priority, index = max((columns[i].priority, i) for i in shown)
     return index if priority > 0 else None
 
@@ -110,12 +135,22 @@ def _folds(column: Column, folded: str) -> bool:
     return column.prose or folded == "all" or (folded == "names" and column.left)
 
 
-def _table(columns: Sequence[Column], rows: Sequence[Sequence[Cell]], folded: str = "", sections: Sequence[int] = ()) -> Table:
+def _table(
+    columns: Sequence[Column], rows: Sequence[Sequence[Cell]], folded: str = "", sections: Sequence[int] = ()
+) -> Table:
     """A cell of a column that folds goes on in the next line, whole; the others keep their width."""
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False, show_header=any(column.head for column in columns))
+    table = Table(
+        box=SIMPLE_HEAD, pad_edge=False, show_edge=False, show_header=any(column.head for column in columns)
+    )
     for column in columns:
         justify = "left" if column.left or column.prose else "right"
-        table.add_column(Text(column.head), justify=justify, no_wrap=not _folds(column, folded), overflow="fold", vertical="top")
+        table.add_column(
+            Text(column.head),
+            justify=justify,
+            no_wrap=not _folds(column, folded),
+            overflow="fold",
+            vertical="top",
+        )
     for number, row in enumerate(rows):
         table.add_row(*[_text(cell) for cell in row], end_section=number in sections)
     return table

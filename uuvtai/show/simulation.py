@@ -25,7 +25,8 @@ _STATE = (
 
 
 def show_simulation(screen: Screen, result: dict[str, Any], title: str) -> None:
-    """Position, attitude and body velocities of a ``uuv simulate --json`` document at moments evenly spread."""
+    """Position, attitude and body velocities of a ``uuv simulate --json`` document at moments evenly
+    spread."""
     rows = []
     for i in _picked(len(result["t"]), _ROWS):
         values = [result["t"][i], *result["position"][i], *result["rpy_deg"][i], *result["nu"][i]]

@@ -8,12 +8,19 @@ from uuvtai.show.screen import Column, Screen
 from uuvtai.tree.nodes import LEAVES
 from uuvtai.tree_codes import ACTION
 
-_NODES = (Column("node", left=True), Column("episodes"), Column("ticks", 3), Column("acted", 2), Column("acted %", 1))
+_NODES = (
+    Column("node", left=True),
+    Column("episodes"),
+    Column("ticks", 3),
+    Column("acted", 2),
+    Column("acted %", 1),
+)
 _LEGEND = "episodes: share that ticked the node; acted: control steps whose action the leaf set"
 
 
 def show_tree(screen: Screen, text: str, nodes: list[dict[str, Any]]) -> None:
-    """One row per line of ``text``, for ``nodes`` of a ``uuv tree RUN --json`` document. Actions alone can act."""
+    """One row per line of ``text``, for ``nodes`` of a ``uuv tree RUN --json`` document. Actions alone can
+    act."""
     total = max(1, sum(node["acted"] for node in nodes))
     rows = []
     for line, node in zip(text.split("\n"), nodes, strict=True):

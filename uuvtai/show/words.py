@@ -1,4 +1,5 @@
-"""Figures as the terminal writes them: short, every rate with its count and its interval, and what is not known as a dash."""
+"""Figures as the terminal writes them: short, every rate with its count and its interval, and what is not
+known as a dash."""
 
 from __future__ import annotations
 
@@ -37,4 +38,6 @@ def with_interval(value: float | None, interval: Sequence[float] | None, digits:
     """'-0.15 [-0.28, -0.02]'."""
     if value is None:
         return "-"
-    return f"{value:.{digits}f}" + (f" [{interval[0]:.{digits}f}, {interval[1]:.{digits}f}]" if interval else "")
+    return f"{value:.{digits}f}" + (
+        f" [{interval[0]:.{digits}f}, {interval[1]:.{digits}f}]" if interval else ""
+    )

@@ -1,15 +1,26 @@
-"""Every array of the simulator, one struct per stage: shape, dtype, unit and frame are written here and nowhere else.
+"""Every array of the simulator, one struct per stage: shape, dtype, unit and frame are written here and
+nowhere else.
 
-Frames: ``_w`` world (z up, origin at the tank's corner, z = 0 at the surface), ``_b`` body (x forward, y left, z up). SI units, radians.
-Structs hold arrays only: a Python number in a struct would go stale silently. ``n_env`` is always the first index.
-Truth (what the simulator knows) and sensed or remembered data (what the vehicle knows) never share a struct.
-The files group the stages as ``config/`` does; everybody imports the structs from here.
+Frames: ``_w`` world (z up, origin at the tank's corner, z = 0 at the surface), ``_b`` body (x forward, y
+left, z up). SI units, radians. Structs hold arrays only: a Python number in a struct would go stale silently.
+``n_env`` is always the first index. Truth (what the simulator knows) and sensed or remembered data (what the
+vehicle knows) never share a struct. The files group the stages as ``config/`` does; everybody imports the
+structs from here.
 """
 
 from __future__ import annotations
 
 from uuvtai.state.arrays import PACKET, REAL, WORD, allocate, array, bytes_of
-from uuvtai.state.perception import ClusterState, ForecastState, GridMask, HabitState, MapScratch, MapState, SpotState, TrackState
+from uuvtai.state.perception import (
+    ClusterState,
+    ForecastState,
+    GridMask,
+    HabitState,
+    MapScratch,
+    MapState,
+    SpotState,
+    TrackState,
+)
 from uuvtai.state.planning import ClearanceMemory, ClearanceState, FeatureState, RouteState, VoronoiState
 from uuvtai.state.sensors import DepthImage, Proprioception, ProprioceptionMemory, SonarMemory, SonarScan
 from uuvtai.state.task import ClockState, EpisodeState, MissionState, RefereeState, RewardState

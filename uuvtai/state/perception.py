@@ -56,7 +56,8 @@ class TrackState:
     scan_step: ti.Field = array("n_env", dtype=ti.i32)
     """episode step of the ping that the states refer to, -1 = no scan yet"""
     beam_track: ti.Field = array("n_env", "n_ray", dtype=ti.i32)
-    """track that explains this beam of the newest scan, -1 = none (carried over by bearing where that scan was not tracked)"""
+    """track that explains this beam of the newest scan, -1 = none (carried over by bearing where that scan
+    was not tracked)"""
     pick: ti.Field = array("n_env", "n_track", dtype=ti.i32, scratch=True)
     """scratch of one scan: cluster matched to this track, -1 = none"""
     pick_cost: ti.Field = array("n_env", "n_track", scratch=True)
@@ -76,7 +77,8 @@ class ClusterState:
     slip_w: ti.Field = array("n_env", vec=2)
     """[m/s] error of the own measured velocity, as the known walls show it"""
     own_sigma_m_s: ti.Field = array("n_env")
-    """[m/s] what is left of that error along its worst direction, where the velocity was no valid reading; 0 where it was one"""
+    """[m/s] what is left of that error along its worst direction, where the velocity was no valid reading; 0
+    where it was one"""
     count: ti.Field = array("n_env", dtype=ti.i32)
     """clusters found"""
     pos_w: ti.Field = array("n_env", "n_cluster", vec=2)
@@ -114,14 +116,16 @@ class SpotState:
     """What the camera shows that the sonar does not."""
 
     column_m: ti.Field = array("n_env", "n_pixel_col", lanes=True)
-    """[m] horizontal distance of the nearest thing in every column of the newest image, geometry.FAR_M = none"""
+    """[m] horizontal distance of the nearest thing in every column of the newest image, geometry.FAR_M =
+    none"""
     edge_m: ti.Field = array("n_env", "n_pixel_col", lanes=True)
     """[m] the same in the column's first and last pixel: what reaches there goes on beyond the image"""
 
 
 @dataclass(frozen=True, eq=False)
 class HabitState:
-    """Remembered: places where moving bodies turned in this episode, of whichever track; and each track's last straight leg."""
+    """Remembered: places where moving bodies turned in this episode, of whichever track; and each track's
+    last straight leg."""
 
     turn_x: ti.Field = array("n_env", "n_turn", packed=True)
     """[m] place of the turn, world"""
@@ -158,14 +162,16 @@ class ForecastState:
     turn_out_w: ti.Field = array("n_env", "n_track", vec=2)
     """course after it, unit vector"""
     above_w: ti.Field = array("n_env", "n_track")
-    """[m] world z of the lowest edge of what may be above the own height; the own height where the body may be level with the vehicle"""
+    """[m] world z of the lowest edge of what may be above the own height; the own height where the body may
+    be level with the vehicle"""
     below_w: ti.Field = array("n_env", "n_track")
     """[m] world z of the highest edge of what may be below"""
 
 
 @dataclass(frozen=True, eq=False)
 class GridMask:
-    """The known bounds on the grid, the same for all envs. Cell [row, col] has its centre at origin + (col + 0.5, row + 0.5) * cell."""
+    """The known bounds on the grid, the same for all envs. Cell [row, col] has its centre at origin + (col +
+    0.5, row + 0.5) * cell."""
 
     outside: ti.Field = array("n_row", "n_col", dtype=ti.i32)
     """1 = outside the tank (the grid has a border of such cells)"""
@@ -175,7 +181,8 @@ class GridMask:
 
 @dataclass(frozen=True, eq=False)
 class MapState:
-    """Remembered: the two-layer occupancy map. Row = y, column = x. What is asked of many cells at once is kept in bits."""
+    """Remembered: the two-layer occupancy map. Row = y, column = x. What is asked of many cells at once is
+    kept in bits."""
 
     static_occ: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.f32, beside="layers")
     """[0, 1] persistent layer M^s"""
@@ -184,7 +191,8 @@ class MapState:
     dynamic_scans: ti.Field = array("n_env", "n_row", "n_col", dtype=ti.u8)
     """scans with dynamic evidence since the cell was last seen free (saturating): promotion to static"""
     free_scans: ti.Field = array("n_env", "n_row", "n_col", vec=8, bits=True)
-    """scans that saw the cell free since its last return, up to what makes it confident: a number of eight bits, one word for each"""
+    """scans that saw the cell free since its last return, up to what makes it confident: a number of eight
+    bits, one word for each"""
     confident: ti.Field = array("n_env", "n_row", "n_col", bits=True, beside="words")
     """seen free long enough that a return is a surprise"""
     held: ti.Field = array("n_env", "n_row", "n_col", bits=True, beside="words")
@@ -207,7 +215,8 @@ class MapState:
 
 @dataclass(frozen=True, eq=False)
 class MapScratch:
-    """Scratch: what one env's scan says about the cells. Slots are shared by all envs: few serve many and stay in the cache.
+    """Scratch: what one env's scan says about the cells. Slots are shared by all envs: few serve many and
+    stay in the cache.
 
     Marks are taken back as they are read: between two scans there are none.
     """

@@ -25,7 +25,8 @@ class ClearanceState:
 
 @dataclass(frozen=True, eq=False)
 class ClearanceMemory:
-    """What the newest clearance was computed from: the next one redoes only what changed. And scratch, its slots shared by all envs."""
+    """What the newest clearance was computed from: the next one redoes only what changed. And scratch, its
+    slots shared by all envs."""
 
     sites: ti.Field = array("n_env", "n_row", "n_col", bits=True)
     """occupied cells and cells outside"""
@@ -45,14 +46,16 @@ class ClearanceMemory:
 
 @dataclass(frozen=True, eq=False)
 class VoronoiState:
-    """Scratch of the global planner. Slots are shared by the queue (slot s plans its items s, s + n_plan, ...): few serve many envs."""
+    """Scratch of the global planner. Slots are shared by the queue (slot s plans its items s, s + n_plan,
+    ...): few serve many envs."""
 
     weight: ti.Field = array("n_plan", "n_row", "n_col", dtype=ti.f32, scratch=True)
     """[1/m] 1 / max(clearance, eps_r) of a traversable cell, 0 = not traversable"""
     cost: ti.Field = array("n_plan", "n_row", "n_col", dtype=ti.f32, scratch=True)
     """cost-to-go of the cells reached by the search"""
     cell: ti.Field = array("n_plan", "n_row", "n_col", dtype=ti.u8, scratch=True)
-    """bits of voronoi.py: on the skeleton or not (filled on demand), reached, direction of the next cell towards the goal"""
+    """bits of voronoi.py: on the skeleton or not (filled on demand), reached, direction of the next cell
+    towards the goal"""
     heap: ti.Field = array("n_plan", "n_heap", dtype=ti.u64, scratch=True)
     """binary heap of open cells: bits of the estimated total cost, then the cell (row * n_col + col)"""
     path_cell: ti.Field = array("n_plan", "n_path", dtype=ti.i32, scratch=True)
@@ -80,7 +83,8 @@ class RouteState:
     planner: ti.Field = array("n_env", dtype=ti.i32)
     """who planned it: plan_codes.PLANNER_NONE, PLANNER_VORONOI, PLANNER_RRT"""
     trigger: ti.Field = array("n_env", dtype=ti.i32)
-    """trigger of this step's replan, plan_codes.TRIGGER_NONE if none (a bit set of the triggers that fired in `fired`)"""
+    """trigger of this step's replan, plan_codes.TRIGGER_NONE if none (a bit set of the triggers that fired in
+    `fired`)"""
     fired: ti.Field = array("n_env", dtype=ti.i32)
     """bit set of every trigger that holds in this step"""
     want_plan: ti.Field = array("n_env", dtype=ti.i32, scratch=True)
@@ -131,7 +135,8 @@ class RouteState:
 
 @dataclass(frozen=True, eq=False)
 class FeatureState:
-    """What the policy and the tree see of the surroundings, by sector (sector 0 centred ahead, counter-clockwise)."""
+    """What the policy and the tree see of the surroundings, by sector (sector 0 centred ahead,
+    counter-clockwise)."""
 
     sector_range_m: ti.Field = array("n_env", "n_sector")
     """[m] smallest range in the sector"""
@@ -142,6 +147,7 @@ class FeatureState:
     sector_valid: ti.Field = array("n_env", "n_sector", dtype=ti.i32)
     """1 = at least one beam of the sector returned"""
     closest_m: ti.Field = array("n_env", "n_track", scratch=True)
-    """[m] closest approach of each moving track within its forecast, FAR_M = does not move; written where the observation shows bodies"""
+    """[m] closest approach of each moving track within its forecast, FAR_M = does not move; written where the
+    observation shows bodies"""
     closest_s: ti.Field = array("n_env", "n_track", scratch=True)
     """[s] time until then"""

@@ -12,7 +12,8 @@ from uuvtai.truth import Truth
 
 @dataclass(frozen=True, eq=False)
 class Proprioception:
-    """Sensed: DVL, IMU, pressure and the pose estimate. Values hold their last reading where the flag says invalid."""
+    """Sensed: DVL, IMU, pressure and the pose estimate. Values hold their last reading where the flag says
+    invalid."""
 
     vel_b: ti.Field = array("n_env", vec=3)
     """[m/s] DVL"""
@@ -37,7 +38,8 @@ class ProprioceptionMemory(Truth):
     pressure_bias_m: ti.Field = array("n_env")
     """[m] constant over an episode"""
     pressure_zero_m: ti.Field = array("n_env")
-    """[m] what the sensor is zeroed by: its first reading less the known start's depth; 0 where the position is given"""
+    """[m] what the sensor is zeroed by: its first reading less the known start's depth; 0 where the position
+    is given"""
     dvl_scale: ti.Field = array("n_env")
     """1 + scale error, constant over an episode"""
     heading_error: ti.Field = array("n_env")

@@ -17,14 +17,16 @@ class ClockState:
     active: ti.Field = array("n_env", dtype=ti.i32)
     """1 = running; 0 = ended, waiting for a reset"""
     awake: ti.Field = array("n_env", dtype=ti.i32)
-    """1 = processed by the kernels of this pass: the running rows in a step, the rows being reset in a reset"""
+    """1 = processed by the kernels of this pass: the running rows in a step, the rows being reset in a
+    reset"""
     step: ti.Field = array("n_env", dtype=ti.i32)
     """control steps done since the episode's start; time = step * control_dt_s"""
 
 
 @dataclass(frozen=True, eq=False)
 class EpisodeState(Truth):
-    """Which episode each env plays. Its key opens every random stream, so only the simulator's side (world, vehicle, sensors) gets it."""
+    """Which episode each env plays. Its key opens every random stream, so only the simulator's side (world,
+    vehicle, sensors) gets it."""
 
     seed: ti.Field = array("n_env", dtype=ti.i32)
     """seed of the scenario"""
@@ -64,7 +66,8 @@ class RewardState:
 
 @dataclass(frozen=True, eq=False)
 class RefereeState(Truth):
-    """How each episode stands, judged from the truth. Never an input of mapping, planning, teacher or policy."""
+    """How each episode stands, judged from the truth. Never an input of mapping, planning, teacher or
+    policy."""
 
     outcome: ti.Field = array("n_env", dtype=ti.i32)
     """episode.RUNNING, SUCCESS, COLLISION, TTC, OUT_OF_TANK or TIMEOUT"""

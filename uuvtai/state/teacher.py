@@ -60,7 +60,8 @@ class TeacherState:
     body_near_m: ti.Field = array("n_env")
     """[m] distance to the nearest forecast body now, hull to surface"""
     steer_w: ti.Field = array("n_env", vec=2)
-    """[m] horizontal way to the point that is steered for: the look-ahead point, or a nearer one where the straight way there is narrow"""
+    """[m] horizontal way to the point that is steered for: the look-ahead point, or a nearer one where the
+    straight way there is narrow"""
     gaze_w: ti.Field = array("n_env", vec=2)
     """[m] horizontal way to the body that the camera should look at, zero = none near"""
     calm_steps: ti.Field = array("n_env", dtype=ti.i32)
@@ -73,7 +74,8 @@ class TeacherState:
 
 @dataclass(frozen=True, eq=False)
 class TreeTable:
-    """A behaviour tree flattened to preorder arrays, the same for all envs: trees are data, no tree needs a recompilation."""
+    """A behaviour tree flattened to preorder arrays, the same for all envs: trees are data, no tree needs a
+    recompilation."""
 
     n_node: ti.Field = array(dtype=ti.i32)
     """nodes in use"""

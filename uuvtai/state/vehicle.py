@@ -23,14 +23,16 @@ class VehicleState(Truth):
     rate_b: ti.Field = array("n_env", vec=3)
     """[rad/s]"""
     acc_b: ti.Field = array("n_env", vec=3)
-    """[m/s^2] inertial acceleration in body axes over the last substep (what an IMU feels, without gravity)"""
+    """[m/s^2] inertial acceleration in body axes over the last substep (what an IMU feels, without
+    gravity)"""
     rpm: ti.Field = array("n_env", "n_thruster")
     """[rpm] rotor speed after the lag"""
 
 
 @dataclass(frozen=True, eq=False)
 class VehicleParams(Truth):
-    """Truth: physical parameters of each vehicle (equal unless randomised). Diagonals in the order of Fossen's nu."""
+    """Truth: physical parameters of each vehicle (equal unless randomised). Diagonals in the order of
+    Fossen's nu."""
 
     mass_kg: ti.Field = array("n_env")
     """[kg]"""

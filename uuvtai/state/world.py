@@ -24,7 +24,8 @@ class SceneState(Truth):
 
 @dataclass(frozen=True, eq=False)
 class WorldState(Truth):
-    """Truth: obstacles as a list per env, fixed and static ones first, moving ones from ``first_dynamic`` on. kind NONE = empty slot."""
+    """Truth: obstacles as a list per env, fixed and static ones first, moving ones from ``first_dynamic`` on.
+    kind NONE = empty slot."""
 
     kind: ti.Field = array("n_env", "n_body", dtype=ti.i32)
     """geometry.SPHERE, CYLINDER, BOX or NONE"""
@@ -41,12 +42,14 @@ class WorldState(Truth):
     unclear_paths: ti.Field = array("n_env", dtype=ti.i32)
     """paths of moving obstacles taken as they were: no draw kept clear of static obstacles"""
     faults: ti.Field = array("n_env", dtype=ti.i32)
-    """0 = the scenario is as asked; else a bit set of scenario.FAULTS: draws ran out, the world cannot be placed"""
+    """0 = the scenario is as asked; else a bit set of scenario.FAULTS: draws ran out, the world cannot be
+    placed"""
 
 
 @dataclass(frozen=True, eq=False)
 class PathState(Truth):
-    """Truth: how the moving obstacles move. A closed polyline of 2 to 5 waypoints (2 = back and forth), or a circle (n_way = 0)."""
+    """Truth: how the moving obstacles move. A closed polyline of 2 to 5 waypoints (2 = back and forth), or a
+    circle (n_way = 0)."""
 
     n_way: ti.Field = array("n_env", "n_dynamic", dtype=ti.i32)
     """waypoints of the closed polyline; 0 = circle"""
@@ -64,7 +67,8 @@ class PathState(Truth):
 
 @dataclass(frozen=True, eq=False)
 class FixedTable(Truth):
-    """Obstacles given explicitly by the world's YAML, the same for all envs; moving ones fill the first slots of the moving list."""
+    """Obstacles given explicitly by the world's YAML, the same for all envs; moving ones fill the first slots
+    of the moving list."""
 
     kind: ti.Field = array("n_fixed", dtype=ti.i32)
     """geometry kind"""

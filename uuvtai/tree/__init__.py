@@ -1,4 +1,5 @@
-"""Behaviour trees: BehaviorTree.CPP format 4 XML in, flat preorder arrays for the kernels out, and trees as text or Graphviz DOT.
+"""Behaviour trees: BehaviorTree.CPP format 4 XML in, flat preorder arrays for the kernels out, and trees as
+text or Graphviz DOT.
 
 A tree is data: every controller (straight, planner, bt, a user's file) runs on the same compiled kernels.
 """

@@ -1,4 +1,5 @@
-"""Reading XML strictly and safely: no DTD, no entities, no loose text, bounded size and depth; every error names file and line."""
+"""Reading XML strictly and safely: no DTD, no entities, no loose text, bounded size and depth; every error
+names file and line."""
 
 from __future__ import annotations
 
@@ -12,7 +13,8 @@ MAX_BYTES = 1 << 20
 """of a tree's file"""
 _MAX_DEPTH = 64
 _ENCODINGS = (None, "utf-8", "us-ascii", "iso-8859-1", "utf-16")
-"""that the parser itself knows; for others it would ask Python, which knows some that are no character sets"""
+"""that the parser itself knows; for others it would ask Python, which knows some that are no character
+sets"""
 _MAX_WORD = 1000
 """characters of a name or an attribute: looking for the nearest known name takes the square of it"""
 
@@ -39,9 +41,14 @@ def read_elements(text: bytes, source: str) -> Element:
 
     def begin(tag: str, attributes: dict[str, str]) -> None:
         if len(stack) > _MAX_DEPTH:
-            raise TreeError(f"{source}:{parser.CurrentLineNumber}: <{tag[:40]}> is nested more than {_MAX_DEPTH} deep")
+            raise TreeError(
+                f"{source}:{parser.CurrentLineNumber}: <{tag[:40]}> is nested more than {_MAX_DEPTH} deep"
+            )
         if any(len(word) > _MAX_WORD for word in (tag, *attributes, *attributes.values())):
-            raise TreeError(f"{source}:{parser.CurrentLineNumber}: <{tag[:40]}> has a name or attribute longer than {_MAX_WORD} characters")
+            raise TreeError(
+                f"{source}:{parser.CurrentLineNumber}: <{tag[:40]}> has a name or attribute longer than "
+                f"{_MAX_WORD} characters"
+            )
         element = Element(tag, attributes, parser.CurrentLineNumber)
         stack[-1].children.append(element)
         stack.append(element)
@@ -55,7 +62,9 @@ def read_elements(text: bytes, source: str) -> Element:
 
     def words(data: str) -> None:
         if data.strip() and not _described(stack):
-            raise TreeError(f"{source}:{parser.CurrentLineNumber}: text {data.strip()[:20]!r} inside <{stack[-1].tag}>")
+            raise TreeError(
+                f"{source}:{parser.CurrentLineNumber}: text {data.strip()[:20]!r} inside <{stack[-1].tag}>"
+            )
 
     parser.XmlDeclHandler = declared
     parser.StartElementHandler = begin
@@ -65,7 +74,9 @@ def read_elements(text: bytes, source: str) -> Element:
     try:
         parser.Parse(text, True)
     except expat.ExpatError as error:
-        raise TreeError(f"{source}:{error.lineno}: not well-formed XML: {expat.errors.messages[error.code]}") from None
+        raise TreeError(
+            f"{source}:{error.lineno}: not well-formed XML: {expat.errors.messages[error.code]}"
+        ) from None
     return holder.children[0]
 
 

@@ -46,13 +46,21 @@ class FlatTree:
 
 
 def load_tree(table: TreeTable, tree: FlatTree, put: Put | None = None) -> None:
-    """Copy a flat tree into the simulator's table by ``put`` (default: ``put_by_kernel``). Raises TreeError when it does not fit."""
+    """Copy a flat tree into the simulator's table by ``put`` (default: ``put_by_kernel``). Raises TreeError
+    when it does not fit."""
     if put is None:
         from uuvtai.capture import put_by_kernel as put
     n, capacity = len(tree.kind), table.kind.shape[0]
     if n > capacity:
-        raise TreeError(f"{tree.source}: {n} nodes do not fit the {capacity} that were allocated (teacher.max_node)")
-    for array, values in ((table.kind, tree.kind), (table.end, tree.end), (table.parent, tree.parent), (table.leaf, tree.leaf)):
+        raise TreeError(
+            f"{tree.source}: {n} nodes do not fit the {capacity} that were allocated (teacher.max_node)"
+        )
+    for array, values in (
+        (table.kind, tree.kind),
+        (table.end, tree.end),
+        (table.parent, tree.parent),
+        (table.leaf, tree.leaf),
+    ):
         padded = np.zeros(capacity, np.int32)
         padded[:n] = values
         put(array, padded)

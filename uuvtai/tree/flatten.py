@@ -1,4 +1,5 @@
-"""From BehaviorTree.CPP format 4 XML to a flat tree: subtrees in place, ports as numbers; every error names file, line, node and reason."""
+"""From BehaviorTree.CPP format 4 XML to a flat tree: subtrees in place, ports as numbers; every error names
+file, line, node and reason."""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ _WRAPPERS = ("Action", "Condition", "Control", "Decorator")
 
 
 def read_tree(name: str, max_node: int = 64) -> FlatTree:
-    """Tree of a preset (straight, planner, bt) or of an XML file. Raises TreeError, or ConfigError for an unknown name."""
+    """Tree of a preset (straight, planner, bt) or of an XML file. Raises TreeError, or ConfigError for an
+    unknown name."""
     return read_tree_file(preset_path("tree", name), max_node)
 
 
@@ -57,7 +59,11 @@ class _Flattener:
                 self._fail(element, f"has {len(self.trees)} trees: name one in main_tree_to_execute")
             self.main = next(iter(self.trees))
         if self.main not in self.trees:
-            self._fail(element, f"main_tree_to_execute={self.main!r} is no BehaviorTree here{_nearest(self.main, self.trees)}")
+            self._fail(
+                element,
+                f"main_tree_to_execute={self.main!r} is no BehaviorTree "
+                f"here{_nearest(self.main, self.trees)}",
+            )
 
     def flat(self) -> FlatTree:
         """Flatten from the main tree on."""
@@ -77,7 +83,11 @@ class _Flattener:
             if child.tag == "TreeNodesModel":
                 continue
             if child.tag != "BehaviorTree":
-                self._fail(child, "only <BehaviorTree> and <TreeNodesModel> may stand inside <root>; files are not included")
+                self._fail(
+                    child,
+                    "only <BehaviorTree> and <TreeNodesModel> may stand inside <root>; files are not "
+                    "included",
+                )
             name = child.attributes.get("ID")
             if not name or name in trees:
                 self._fail(child, "needs an ID" if not name else f"ID {name!r} is given twice")
@@ -103,7 +113,9 @@ class _Flattener:
             self._add(child, here, inside)
         self.end[here] = len(self.rows)
 
-    def _add_subtree(self, element: Element, attributes: dict[str, str], parent: int, inside: tuple[str, ...]) -> None:
+    def _add_subtree(
+        self, element: Element, attributes: dict[str, str], parent: int, inside: tuple[str, ...]
+    ) -> None:
         name = attributes.pop("ID", "")
         if name not in self.trees:
             self._fail(element, f"no BehaviorTree has the ID {name!r}{_nearest(name, self.trees)}")
@@ -113,23 +125,32 @@ class _Flattener:
             self._fail(element, f"subtrees are nested more than {self.max_node} deep")
         for port in attributes:
             if port not in ("name", "_autoremap"):
-                self._fail(element, f"port {port!r}: ports of subtrees are not supported, give numbers to the leaves")
+                self._fail(
+                    element, f"port {port!r}: ports of subtrees are not supported, give numbers to the leaves"
+                )
         self._add(self.trees[name].children[0], parent, (*inside, name))
 
     def _type_of(self, element: Element) -> tuple[str, dict[str, str]]:
-        """Name of the node's type and its attributes; both compact and explicit (<Action ID="Evade"/>) forms."""
+        """Name of the node's type and its attributes; both compact and explicit (<Action ID="Evade"/>)
+        forms."""
         attributes = dict(element.attributes)
         name = element.tag
         if name in _WRAPPERS:
             name = attributes.pop("ID", "")
         known = [*CONTROLS, *DECORATORS, *LEAVES, "SubTree"]
         if name not in known:
-            self._fail(element, f"{name or 'no ID'!s} is no known node{_nearest(name, known)}; leaves are: {', '.join(LEAVES)}")
+            self._fail(
+                element,
+                f"{name or 'no ID'!s} is no known node{_nearest(name, known)}; leaves are: "
+                f"{', '.join(LEAVES)}",
+            )
         if element.tag in _WRAPPERS and name != "SubTree" and element.tag != _wrapper_of(name):
             self._fail(element, f"{name} is no {element.tag} but a {_wrapper_of(name)}")
         return name, attributes
 
-    def _row(self, element: Element, kind_name: str, attributes: dict[str, str]) -> tuple[str, str, int, int, tuple[float, ...]]:
+    def _row(
+        self, element: Element, kind_name: str, attributes: dict[str, str]
+    ) -> tuple[str, str, int, int, tuple[float, ...]]:
         label = attributes.pop("name", "") or kind_name
         count = len(element.children)
         if kind_name in LEAVES:
@@ -138,7 +159,11 @@ class _Flattener:
             leaf = LEAVES[kind_name]
             return label, kind_name, leaf.kind, leaf.code, self._ports(element, leaf, attributes)
         if attributes:
-            self._fail(element, f"unknown attribute {next(iter(attributes))!r}: it takes only a name (scripts are not supported)")
+            self._fail(
+                element,
+                f"unknown attribute {next(iter(attributes))!r}: it takes only a name (scripts are not "
+                "supported)",
+            )
         if kind_name in CONTROLS and not count:
             self._fail(element, "needs at least one child")
         if kind_name in DECORATORS and count != 1:

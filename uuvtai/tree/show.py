@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,7 +37,10 @@ def node_use(ticks: np.ndarray, acted: np.ndarray, n_node: int) -> list[NodeUse]
     """Use of every node from counts of shape (n_episode, >= n_node)."""
     if not len(ticks):
         return [NodeUse(0.0, 0, 0)] * n_node
-    return [NodeUse(float((ticks[:, i] > 0).mean()), int(ticks[:, i].sum()), int(acted[:, i].sum())) for i in range(n_node)]
+    return [
+        NodeUse(float((ticks[:, i] > 0).mean()), int(ticks[:, i].sum()), int(acted[:, i].sum()))
+        for i in range(n_node)
+    ]
 
 
 def tree_text(tree: FlatTree) -> str:
@@ -70,12 +73,12 @@ def _branches(tree: FlatTree) -> list[str]:
 
 def tree_dot(tree: FlatTree, use: Sequence[NodeUse] | None = None) -> str:
     """The tree as Graphviz DOT; with ``use`` nodes carry the share of episodes that ticked them."""
-    shape: Callable[[int], str] = lambda kind: {codes.CONDITION: "ellipse", codes.ACTION: "box"}.get(kind, "plaintext")  # noqa: E731
+    shapes = {codes.CONDITION: "ellipse", codes.ACTION: "box"}
     lines = ["digraph tree {", "  ordering=out; node [fontname=sans];"]
     for node, kind in enumerate(tree.kind):
         share = f"\\n{100 * use[node].share:.1f} %" if use else ""
         label = _label(tree, node).replace("\\", "\\\\").replace('"', '\\"')
-        lines.append(f'  n{node} [label="{label}{share}", shape={shape(kind)}];')
+        lines.append(f'  n{node} [label="{label}{share}", shape={shapes.get(kind, "plaintext")}];')
         if tree.parent[node] >= 0:
             lines.append(f"  n{tree.parent[node]} -> n{node};")
     return "\n".join([*lines, "}"])

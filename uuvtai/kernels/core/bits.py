@@ -1,4 +1,5 @@
-"""Sets of cells as bits: sixty-four neighbours of a row share a word, so that one operation asks or changes all of them."""
+"""Sets of cells as bits: sixty-four neighbours of a row share a word, so that one operation asks or changes
+all of them."""
 
 import taichi as ti
 

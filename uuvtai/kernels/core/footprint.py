@@ -1,9 +1,11 @@
-"""Plan view of bodies: rectangles with rounded corners, and how far apart they are. Floor of the scenario's drawing.
+"""Plan view of bodies: rectangles with rounded corners, and how far apart they are. Floor of the scenario's
+drawing.
 
-A footprint is seven numbers (centre x, y; direction x, y; half extents along and across, in units of the direction's length; rounding
-radius [m]): a disc has no extents, a box no rounding, a straight stroke of a moving disc has length and rounding. What is decided here
-must be decided alike on every device, so distances are compared as squares and directions come from a fixed polynomial: no square root,
-sine or cosine, which differ in the last bit between devices.
+A footprint is seven numbers (centre x, y; direction x, y; half extents along and across, in units of the
+direction's length; rounding radius [m]): a disc has no extents, a box no rounding, a straight stroke of a
+moving disc has length and rounding. What is decided here must be decided alike on every device, so distances
+are compared as squares and directions come from a fixed polynomial: no square root, sine or cosine, which
+differ in the last bit between devices.
 """
 
 import taichi as ti
@@ -17,7 +19,8 @@ _TINY = 1e-12
 
 @ti.func
 def steady_direction(angle):
-    """(cos, sin) of an angle [rad] by Taylor polynomials on +-pi/4, the same bits on every device; error below 4e-7."""
+    """(cos, sin) of an angle [rad] by Taylor polynomials on +-pi/4, the same bits on every device; error
+    below 4e-7."""
     quarters = ti.floor(angle * (2.0 / PI) + 0.5)
     x = angle - quarters * (0.5 * PI)
     x2 = x * x
@@ -61,7 +64,9 @@ def corner_of(shape, i):
     """Corner 0 to 3 of the unrounded rectangle."""
     along = shape[4] * (1.0 - 2.0 * ti.cast(i & 1, ti.f32))
     across = shape[5] * (1.0 - ti.cast(i & 2, ti.f32))
-    return ti.Vector([shape[0] + along * shape[2] - across * shape[3], shape[1] + along * shape[3] + across * shape[2]])
+    return ti.Vector(
+        [shape[0] + along * shape[2] - across * shape[3], shape[1] + along * shape[3] + across * shape[2]]
+    )
 
 
 @ti.func
@@ -99,7 +104,8 @@ def half_width(shape, axis):
 
 @ti.func
 def between_squared(a, b):
-    """Squared distance [m^2] between two unrounded rectangles, 0 where they meet (separating axes; else some corner is nearest)."""
+    """Squared distance [m^2] between two unrounded rectangles, 0 where they meet (separating axes; else some
+    corner is nearest)."""
     offset = ti.Vector([b[0] - a[0], b[1] - a[1]])
     split = 0
     out = FAR_M + 0.0
@@ -137,7 +143,9 @@ def is_inside(shape, margin_m, tank_cfg: Const[TankConfig]):
     """1 where the whole footprint lies within the side walls, ``margin_m`` off them."""
     out = 0
     if ti.static(tank_cfg.shape == "circle"):
-        center = ti.Vector([0.5 * (tank_cfg.x_m[0] + tank_cfg.x_m[1]), 0.5 * (tank_cfg.y_m[0] + tank_cfg.y_m[1])])
+        center = ti.Vector(
+            [0.5 * (tank_cfg.x_m[0] + tank_cfg.x_m[1]), 0.5 * (tank_cfg.y_m[0] + tank_cfg.y_m[1])]
+        )
         room = tank_cfg.radius_m - margin_m - shape[6]
         out = ti.cast(room > 0.0 and farthest_squared(shape, center) <= room * room, ti.i32)
     else:

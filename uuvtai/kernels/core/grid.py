@@ -1,7 +1,8 @@
-"""The map's grid: cell [row, col] with row along y and col along x, padded by cells outside the tank on every side.
+"""The map's grid: cell [row, col] with row along y and col along x, padded by cells outside the tank on every
+side.
 
-Columns are padded to a multiple of the packet width, rows by two on each side, so that packets need no special cases at the border and
-the border's cells are the sites of the known bounds.
+Columns are padded to a multiple of the packet width, rows by two on each side, so that packets need no
+special cases at the border and the border's cells are the sites of the known bounds.
 """
 
 import taichi as ti
@@ -34,7 +35,10 @@ def outside_cells(tank, cell_m):
     """Rows of booleans [n_row][n_col]: True where the cell's centre lies outside the tank."""
     n_row, n_col = grid_shape(tank, cell_m)
     x0, y0 = grid_origin(tank, cell_m)
-    return [[not _inside(tank, x0 + (col + 0.5) * cell_m, y0 + (row + 0.5) * cell_m) for col in range(n_col)] for row in range(n_row)]
+    return [
+        [not _inside(tank, x0 + (col + 0.5) * cell_m, y0 + (row + 0.5) * cell_m) for col in range(n_col)]
+        for row in range(n_row)
+    ]
 
 
 def _inside(tank, x, y):
@@ -48,7 +52,12 @@ def _inside(tank, x, y):
 def cell_of(pos_w, tank_cfg: Const[TankConfig], cell_m: Const[float]):
     """(row, col) of a world position [m]; may lie off the grid."""
     x0, y0 = ti.static(grid_origin(tank_cfg, cell_m))
-    return ti.Vector([ti.cast(ti.floor((pos_w[1] - y0) / cell_m), ti.i32), ti.cast(ti.floor((pos_w[0] - x0) / cell_m), ti.i32)])
+    return ti.Vector(
+        [
+            ti.cast(ti.floor((pos_w[1] - y0) / cell_m), ti.i32),
+            ti.cast(ti.floor((pos_w[0] - x0) / cell_m), ti.i32),
+        ]
+    )
 
 
 @ti.func

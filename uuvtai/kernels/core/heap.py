@@ -1,6 +1,7 @@
 """Binary min-heap of cells, one per slot. Old entries of a cell stay until they surface.
 
-An entry is one number that sorts as it should: the key's bits (those of a float32 that is not negative are in its order), then the cell.
+An entry is one number that sorts as it should: the key's bits (those of a float32 that is not negative are in
+its order), then the cell.
 """
 
 import taichi as ti
@@ -32,14 +33,18 @@ def heap_after_push(voronoi: Out[VoronoiState], slot, size, cell, key):
 def heap_after_pop(voronoi: Out[VoronoiState], slot, size):
     """Remove the top (read it before); returns the new size.
 
-    The hole sinks to the bottom along the smaller children without asking where the last entry would stop: it almost always belongs down
-    there, and a comparison that cannot be predicted costs more than a step up again.
+    The hole sinks to the bottom along the smaller children without asking where the last entry would stop: it
+    almost always belongs down there, and a comparison that cannot be predicted costs more than a step up
+    again.
     """
     last = size - 1
     moved = voronoi.heap[slot, last]
     place, below = 0, 1
     while below < last:
-        left, right = voronoi.heap[slot, below], voronoi.heap[slot, below + 1]  # at the end of the heap right is ``moved``: harmless
+        left, right = (
+            voronoi.heap[slot, below],
+            voronoi.heap[slot, below + 1],
+        )  # at the end of the heap right is ``moved``: harmless
         below += ti.cast(right < left, ti.i32)
         voronoi.heap[slot, place] = ti.min(left, right)
         place = below

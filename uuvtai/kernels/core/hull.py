@@ -1,7 +1,9 @@
-"""Distances of the hull, a capsule along body x, to bodies and side walls: clearance, where, and in which direction.
+"""Distances of the hull, a capsule along body x, to bodies and side walls: clearance, where, and in which
+direction.
 
-The capsule follows the full attitude (roll does not matter). Distance to a convex body is a convex function along the capsule's axis, so
-bisection on the sign of its slope finds the nearest point: an end of the axis in most cases, else to 2^-16 of the axis's length.
+The capsule follows the full attitude (roll does not matter). Distance to a convex body is a convex function
+along the capsule's axis, so bisection on the sign of its slope finds the nearest point: an end of the axis in
+most cases, else to 2^-16 of the axis's length.
 """
 
 import taichi as ti
@@ -18,7 +20,8 @@ _TINY = 1e-9
 
 @ti.func
 def nearest_point(kind, q, size):
-    """Point of a body's core nearest to q; body frame. The core of a sphere is its centre, other bodies are their own core."""
+    """Point of a body's core nearest to q; body frame. The core of a sphere is its centre, other bodies are
+    their own core."""
     out = ti.Vector([0.0, 0.0, 0.0])
     if kind == BOX:
         out = ti.math.clamp(q, -size, size)
@@ -68,8 +71,8 @@ def body_frame(v, kind, yaw):
 def hull_to_body(pos_w, axis_w, kind, body_pos_w, size, yaw, vehicle_cfg: Const[VehicleConfig]):
     """(clearance [m], unit vector from hull to body, place on the axis [m from the middle]).
 
-    ``axis_w`` is the hull's unit x axis. With the body's axis inside the other body the clearance stays at minus the hull's radius.
-    The clearance shrinks at ``-(v_body - v_hull_point) . normal``.
+    ``axis_w`` is the hull's unit x axis. With the body's axis inside the other body the clearance stays at
+    minus the hull's radius. The clearance shrinks at ``-(v_body - v_hull_point) . normal``.
     """
     center = body_frame(pos_w - body_pos_w, kind, yaw)
     axis = body_frame(axis_w, kind, yaw)
@@ -90,7 +93,8 @@ def hull_to_body(pos_w, axis_w, kind, body_pos_w, size, yaw, vehicle_cfg: Const[
 
 @ti.func
 def hull_to_side_wall(pos_w, axis_w, vehicle_cfg: Const[VehicleConfig], tank_cfg: Const[TankConfig]):
-    """Clearance to the nearest side wall [m], negative beyond it; the walls are flat or curve inwards, so an end of the axis is nearest."""
+    """Clearance to the nearest side wall [m], negative beyond it; the walls are flat or curve inwards, so an
+    end of the axis is nearest."""
     half = vehicle_cfg.hull_half_length_m * axis_w
     gap = 0.0
     if ti.static(tank_cfg.shape == "circle"):

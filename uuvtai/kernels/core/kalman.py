@@ -1,10 +1,13 @@
-"""Extended Kalman filter of a planar body that keeps its speed and turns at a constant rate; measurements one number at a time.
+"""Extended Kalman filter of a planar body that keeps its speed and turns at a constant rate; measurements one
+number at a time.
 
-Mean (x, y, vx, vy) with covariance as its upper triangle row by row; beside it the turn rate with its ``link``: covariance with each of
-the four, and its own variance. A link of zeros is a plain filter of constant velocity: what a body at rest gets.
+Mean (x, y, vx, vy) with covariance as its upper triangle row by row; beside it the turn rate with its
+``link``: covariance with each of the four, and its own variance. A link of zeros is a plain filter of
+constant velocity: what a body at rest gets.
 
-The covariance is symmetric by storage. A measurement of one number needs no inverse; its update P - (Ph)(Ph)' / s equals Joseph's form for
-the optimal gain. Variances are kept above a floor: float32 rounds P to 1e-7 of itself, far below the least measurement variance (1e-4).
+The covariance is symmetric by storage. A measurement of one number needs no inverse; its update P - (Ph)(Ph)'
+/ s equals Joseph's form for the optimal gain. Variances are kept above a floor: float32 rounds P to 1e-7 of
+itself, far below the least measurement variance (1e-4).
 """
 
 import taichi as ti
@@ -22,7 +25,8 @@ _FLOOR = 1.0e-7
 def predicted(mean, cov, rate, link, dt, density, rate_density):
     """(mean, covariance, link) after dt [s] on an arc of constant speed and turn rate; the rate itself stays.
 
-    The velocity's noise is white acceleration of spectral density [m^2/s^3], that of the turn rate [rad^2/s^3].
+    The velocity's noise is white acceleration of spectral density [m^2/s^3], that of the turn rate
+    [rad^2/s^3].
     """
     vel = ti.Vector([mean[2], mean[3]])
     chord, late = dt * turned_z(vel, 0.5 * dt * rate), turned_z(vel, dt * rate)
@@ -40,7 +44,9 @@ def predicted(mean, cov, rate, link, dt, density, rate_density):
     for i in ti.static(range(4)):
         row = _carried(ti.Vector([half[i, j] for j in range(4)]), dt, c0, c1)
         for j in ti.static(range(i, 4)):
-            grown[ti.static(_AT[i][j])] = row[j] + linked[i] * turn[j] + turn[i] * linked[j] + link[4] * turn[i] * turn[j]
+            grown[ti.static(_AT[i][j])] = (
+                row[j] + linked[i] * turn[j] + turn[i] * linked[j] + link[4] * turn[i] * turn[j]
+            )
     q0, q1, q2 = density * dt * dt * dt / 3.0, density * dt * dt / 2.0, density * dt
     noise = ti.Vector([q0, 0.0, q1, 0.0, q0, 0.0, q1, q2, 0.0, q2])
     reach = linked + link[4] * turn
@@ -50,7 +56,8 @@ def predicted(mean, cov, rate, link, dt, density, rate_density):
 
 @ti.func
 def _carried(u, dt, c0, c1):
-    """A small change of (x, y, vx, vy) one step later; c0, c1: cosine and sine of half and of the whole step's turn."""
+    """A small change of (x, y, vx, vy) one step later; c0, c1: cosine and sine of half and of the whole
+    step's turn."""
     return ti.Vector(
         [
             u[0] + dt * (c0[0] * u[2] - c0[1] * u[3]),
@@ -63,7 +70,8 @@ def _carried(u, dt, c0, c1):
 
 @ti.func
 def corrected(mean, cov, rate, link, h, residual, variance):
-    """(mean, covariance, rate, link) after measuring h' (x, y, vx, vy) with the given variance; residual = measured - h' mean."""
+    """(mean, covariance, rate, link) after measuring h' (x, y, vx, vy) with the given variance; residual =
+    measured - h' mean."""
     ph = ti.Vector([0.0, 0.0, 0.0, 0.0])
     pl = 0.0
     for i in ti.static(range(4)):
@@ -96,7 +104,8 @@ def velocity_variance(cov, along):
 
 @ti.func
 def largest_position_variance(cov, dt):
-    """Variance [m^2] of the position dt [s] ahead along the axis where it is largest, without new acceleration."""
+    """Variance [m^2] of the position dt [s] ahead along the axis where it is largest, without new
+    acceleration."""
     xx = cov[0] + dt * (2.0 * cov[2] + dt * cov[7])
     yy = cov[4] + dt * (2.0 * cov[6] + dt * cov[9])
     xy = cov[1] + dt * (cov[3] + cov[5] + dt * cov[8])
@@ -106,7 +115,8 @@ def largest_position_variance(cov, dt):
 
 @ti.func
 def born(pos, along, radial_var, cross_var, speed, speed_var, cross_speed_var):
-    """Mean and covariance of a body first seen at ``pos``, moving with ``speed`` along the unit vector ``along``."""
+    """Mean and covariance of a body first seen at ``pos``, moving with ``speed`` along the unit vector
+    ``along``."""
     xx, yy, xy = along[0] * along[0], along[1] * along[1], along[0] * along[1]
     mean = ti.Vector([pos[0], pos[1], speed * along[0], speed * along[1]])
     cov = ti.Vector(

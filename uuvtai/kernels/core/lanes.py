@@ -1,11 +1,13 @@
-"""Vector code from Taichi 1.7.4, which never turns a loop over rows of fields into vectors by itself. Two ways (measured):
+"""Vector code from Taichi 1.7.4, which never turns a loop over rows of fields into vectors by itself. Two
+ways (measured):
 
-1. Sixteen-lane packets. Expressions of fixed vectors become vector code. Fill lanes with ``ti.static`` loops; never rebind a lane vector
-   to its own name inside a loop (``b = ti.sqrt(b)`` can silently keep the old lanes): use a new name. Good for few quantities and long
-   loops.
-2. Columns. Copy what some rows need into local matrices (a row per quantity, a column per lane), then loop over the columns with a plain
-   ``for lane in range(lanes)`` whose body is scalar code on ``column(...)`` and touches nothing but local variables: LLVM turns that loop
-   into vectors, branches included. One load of a field in the loop, or a loop inside it, and it stays scalar. Good for much work per row.
+1. Sixteen-lane packets. Expressions of fixed vectors become vector code. Fill lanes with ``ti.static`` loops;
+   never rebind a lane vector to its own name inside a loop (``b = ti.sqrt(b)`` can silently keep the old
+   lanes): use a new name. Good for few quantities and long loops.
+2. Columns. Copy what some rows need into local matrices (a row per quantity, a column per lane), then loop
+   over the columns with a plain ``for lane in range(lanes)`` whose body is scalar code on ``column(...)`` and
+   touches nothing but local variables: LLVM turns that loop into vectors, branches included. One load of a
+   field in the loop, or a loop inside it, and it stays scalar. Good for much work per row.
 
 Test every packet kernel against a scalar reference.
 """
@@ -26,7 +28,8 @@ u16x = ti.types.vector(LANES, ti.u32)
 
 
 _COLUMNS = 8
-"""Columns on a CPU: LLVM prefers vectors of 256 bits even where there are longer ones, and every element costs compile time."""
+"""Columns on a CPU: LLVM prefers vectors of 256 bits even where there are longer ones, and every element
+costs compile time."""
 
 
 def n_column() -> int:

@@ -1,7 +1,8 @@
 """Counter-based random numbers: every draw is a pure function of (key, step, stream, index).
 
-``ti.random`` depends on the thread count, so it is never used. A key stands for one (seed, episode); the streams below keep draws of
-different purposes apart. The mixer is the 32-bit finaliser "lowbias32" (C. Wellons, hash-prospector, bias 0.17).
+``ti.random`` depends on the thread count, so it is never used. A key stands for one (seed, episode); the
+streams below keep draws of different purposes apart. The mixer is the 32-bit finaliser "lowbias32" (C.
+Wellons, hash-prospector, bias 0.17).
 """
 
 import taichi as ti
@@ -56,13 +57,17 @@ def mixed(x):
 @ti.func
 def episode_key(seed, episode):
     """Key of one episode of one seed."""
-    return mixed(mixed(ti.cast(seed, ti.u32) + ti.u32(_GOLDEN)) ^ (ti.cast(episode, ti.u32) * ti.u32(0x85EBCA6B)))
+    return mixed(
+        mixed(ti.cast(seed, ti.u32) + ti.u32(_GOLDEN)) ^ (ti.cast(episode, ti.u32) * ti.u32(0x85EBCA6B))
+    )
 
 
 @ti.func
 def stream_key(key, step, stream):
     """Key of one stream at one step; feed it to the draws below with an index."""
-    return mixed(mixed(key ^ (ti.cast(step, ti.u32) * ti.u32(_GOLDEN))) + ti.cast(stream, ti.u32) * ti.u32(0xC2B2AE35))
+    return mixed(
+        mixed(key ^ (ti.cast(step, ti.u32) * ti.u32(_GOLDEN))) + ti.cast(stream, ti.u32) * ti.u32(0xC2B2AE35)
+    )
 
 
 @ti.func
@@ -103,7 +108,8 @@ def mixed_lanes(x):
 
 @ti.func
 def bits_lanes(key, first_index):
-    """32 random bits per lane for indices first_index .. first_index + 15; lane i equals ``bits(key, first_index + i)``."""
+    """32 random bits per lane for indices first_index .. first_index + 15; lane i equals ``bits(key,
+    first_index + i)``."""
     counter = u16x(0)
     for i in ti.static(range(LANES)):
         counter[i] = ti.cast(first_index + i, ti.u32) + ti.u32(_GOLDEN)
@@ -131,9 +137,11 @@ def polynomial(x, coefficients: Const[tuple]):
 
 @ti.func
 def normal_pair_lanes(key, first_index):
-    """Two independent standard normals per lane from one word of 32 bits: Box-Muller with polynomials, |x| <= 4.9.
+    """Two independent standard normals per lane from one word of 32 bits: Box-Muller with polynomials, |x| <=
+    4.9.
 
-    Taichi does not vectorise log, sin and cos. The upper half of the word is the radius's uniform (k + 1/2) / 2^16, the lower the angle's.
+    Taichi does not vectorise log, sin and cos. The upper half of the word is the radius's uniform (k + 1/2) /
+    2^16, the lower the angle's.
     """
     word = bits_lanes(key, first_index)
     odd = ti.cast(((word >> 15) & ti.u32(0x1FFFE)) | ti.u32(1), ti.f32)  # 2 k + 1, exact
@@ -142,7 +150,9 @@ def normal_pair_lanes(key, first_index):
     fraction = ti.bit_cast((raw & 0x7FFFFF) | 0x3F800000, ti.f32) - 1.0
     log_fraction = fraction * (_LN2 + (1.0 - fraction) * polynomial(fraction, _LOGARITHM))
     radius = ti.sqrt(exponent * (-2.0 * _LN2) - 2.0 * log_fraction)
-    half = (ti.cast(word & ti.u32(0xFFFF), ti.f32) - 32767.5) * (_PI / 65536.0)  # half of the angle, within +- pi / 2
+    half = (ti.cast(word & ti.u32(0xFFFF), ti.f32) - 32767.5) * (
+        _PI / 65536.0
+    )  # half of the angle, within +- pi / 2
     square = half * half
     sine = half * polynomial(square, _SINE)
     cosine = polynomial(square, _COSINE)

@@ -1,10 +1,11 @@
 """Markers for kernel parameters, and the loop helper every per-env kernel uses.
 
-A bundle says what a stage reads and what it writes: ``In[Struct]``, ``Out[Struct]``, ``Const[Section]`` (a frozen config section whose
-numbers become constants of the compiled kernel); its kernels take ``io: Bundle[..]`` and what changes from call to call, functions that
-serve one stage end in ``io``, and those that several stages share take the structs and sections that they need, marked in the same way.
-For the type checker these are the plain classes; for Taichi they are ``ti.template()``. Tensors of the caller are ``FloatMatrix`` and the
-like. ``tests/test_architecture.py`` reads all of this to prove who sees what.
+A bundle says what a stage reads and what it writes: ``In[Struct]``, ``Out[Struct]``, ``Const[Section]`` (a
+frozen config section whose numbers become constants of the compiled kernel); its kernels take ``io:
+Bundle[..]`` and what changes from call to call, functions that serve one stage end in ``io``, and those that
+several stages share take the structs and sections that they need, marked in the same way. For the type
+checker these are the plain classes; for Taichi they are ``ti.template()``. Tensors of the caller are
+``FloatMatrix`` and the like. ``tests/test_architecture.py`` reads all of this to prove who sees what.
 ``quick_launch`` makes launching cheap.
 """
 
@@ -51,7 +52,8 @@ _BLOCKS = 16
 
 
 def spread(n_env: int) -> int:
-    """Loop items per env that make ``ti.ndrange(n_env, spread(n_env))`` fill every core; use only the items with ``pad == 0``."""
+    """Loop items per env that make ``ti.ndrange(n_env, spread(n_env))`` fill every core; use only the items
+    with ``pad == 0``."""
     return max(1, min(_CPU_BLOCK, -(-_CPU_BLOCK * _BLOCKS // n_env)))
 
 
@@ -75,9 +77,10 @@ _MOST_LAUNCHES = 64
 def quick_launch(launch: _T) -> _T:
     """Decorator above Taichi's: launch again with the very same objects without looking at them again.
 
-    Taichi inspects every argument and hashes every section at every launch, which costs more than many kernels do. Here the first launch
-    goes through Taichi; later ones with the same structs, sections, numbers and tensors go straight to the compiled kernel. For kernels
-    whose arguments live as long as the simulator: they are kept alive.
+    Taichi inspects every argument and hashes every section at every launch, which costs more than many
+    kernels do. Here the first launch goes through Taichi; later ones with the same structs, sections, numbers
+    and tensors go straight to the compiled kernel. For kernels whose arguments live as long as the simulator:
+    they are kept alive.
     """
     kernel, known = launch._primal, {}  # type: ignore[attr-defined]
 
@@ -89,7 +92,9 @@ def quick_launch(launch: _T) -> _T:
             if len(known) >= _MOST_LAUNCHES:
                 known.clear()
             given = [
-                (d.annotation, a) for a, d in zip(arguments, kernel.arguments, strict=True) if not isinstance(d.annotation, ti.template)
+                (d.annotation, a)
+                for a, d in zip(arguments, kernel.arguments, strict=True)
+                if not isinstance(d.annotation, ti.template)
             ]
             if all(declared in (int, float) or hasattr(value, "data_ptr") for declared, value in given):
                 known[key] = _compiled(kernel, arguments, given)

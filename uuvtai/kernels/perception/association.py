@@ -15,8 +15,9 @@ _REACH_M = 2.0
 def associate(env, dt, io: Bundle[TrackingIO]):
     """Pair tracks and clusters, cheapest pair first.
 
-    Each track asks for its cheapest cluster; a cluster keeps the cheapest of the tracks that ask, and who is turned away asks for its next.
-    With a cost both sides agree on, that ends in the pairs of the greedy rule, without sorting (Gale and Shapley).
+    Each track asks for its cheapest cluster; a cluster keeps the cheapest of the tracks that ask, and who is
+    turned away asks for its next. With a cost both sides agree on, that ends in the pairs of the greedy rule,
+    without sorting (Gale and Shapley).
     """
     for track in range(io.tracks.alive.shape[1]):
         io.tracks.pick_cost[env, track] = -FAR_M

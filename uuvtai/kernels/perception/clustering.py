@@ -1,8 +1,10 @@
-"""From one sonar scan to clusters: runs of neighbouring beams that hit the same body (part of the tracking stage).
+"""From one sonar scan to clusters: runs of neighbouring beams that hit the same body (part of the tracking
+stage).
 
-Returns from the known walls are left out, runs split at jumps of range or Doppler, a missed or false beam inside a body is bridged, and
-runs wider than a body is expected to be are dropped. A body's outline is taken for a circle: its half-angle a gives the radius R = d sin a,
-and the mean range of the visible arc, d - (pi / 4) R for small angles, gives the centre at the distance d.
+Returns from the known walls are left out, runs split at jumps of range or Doppler, a missed or false beam
+inside a body is bridged, and runs wider than a body is expected to be are dropped. A body's outline is taken
+for a circle: its half-angle a gives the radius R = d sin a, and the mean range of the visible arc, d - (pi /
+4) R for small angles, gives the centre at the distance d.
 """
 
 import math
@@ -15,7 +17,8 @@ from uuvtai.kernels.core.signature import Bundle
 from uuvtai.kernels.perception.bundles import TrackingIO
 
 ARC = 0.25 * math.pi
-"""Mean over the beams of a far circle's visible arc of sqrt(1 - x^2): how many radii its mean range lies before the centre."""
+"""Mean over the beams of a far circle's visible arc of sqrt(1 - x^2): how many radii its mean range lies
+before the centre."""
 
 _CANDIDATE = 1 << 20
 """Label of a beam that may belong to a body and is in no cluster yet."""
@@ -27,7 +30,8 @@ _MODEL_SIGMA_M = 0.01
 """What remains of a range's error however many beams are averaged: bodies are not circles (EC)."""
 
 HELD_SIGMA_M_S = 1.0
-"""Trust in the own velocity's last reading while the DVL has lost the bottom: it may be off by as much as the vehicle can change (EC)."""
+"""Trust in the own velocity's last reading while the DVL has lost the bottom: it may be off by as much as the
+vehicle can change (EC)."""
 
 _SLIP_SIGMA_M_S = 0.01
 """What remains of a Doppler's error however many beams are averaged: the own velocity's error (EC)."""
@@ -43,7 +47,10 @@ def range_variance(range_m, io: Bundle[TrackingIO]):
 @ti.func
 def split_distance(range_m, io: Bundle[TrackingIO]):
     """Jump of range [m] between two beams that ends a body: the design's rule, or what noise alone can do."""
-    return ti.max(io.tracking_cfg.split_m + io.tracking_cfg.split_slope * range_m, 4.0 * ti.sqrt(range_variance(range_m, io)))
+    return ti.max(
+        io.tracking_cfg.split_m + io.tracking_cfg.split_slope * range_m,
+        4.0 * ti.sqrt(range_variance(range_m, io)),
+    )
 
 
 @ti.func
@@ -60,14 +67,16 @@ def find_clusters(env, io: Bundle[TrackingIO]):
         k += 1
 
 
-# ---------------------------------------------------------------------------------------------------------------------- beams
+# ------------------------------------------------------------------------------------------------------ beams
 
 
 @ti.func
 def label_beams(env, io: Bundle[TrackingIO]):
-    """Label every beam _CANDIDATE or -1, compensate its Doppler, and learn the own velocity's error from the walls: they do not move.
+    """Label every beam _CANDIDATE or -1, compensate its Doppler, and learn the own velocity's error from the
+    walls: they do not move.
 
-    ``normal`` = (sum ux ux, sum ux uy, sum uy uy, sum ux e, sum uy e) over the walls' beams, u = beam, e = compensated Doppler.
+    ``normal`` = (sum ux ux, sum ux uy, sum uy uy, sum ux e, sum uy e) over the walls' beams, u = beam, e =
+    compensated Doppler.
     """
     pos, yaw = io.scan.ping_pos_w[env], io.scan.ping_yaw[env]
     vel = turned_z(io.scan.ping_vel_b[env], yaw)
@@ -88,7 +97,9 @@ def label_beams(env, io: Bundle[TrackingIO]):
         body = hit - wall
         wx = wall * ux
         wy = wall * uy
-        normal += ti.Vector([(wx * ux).sum(), (wx * uy).sum(), (wy * uy).sum(), (error * ux).sum(), (error * uy).sum()])
+        normal += ti.Vector(
+            [(wx * ux).sum(), (wx * uy).sum(), (wy * uy).sum(), (error * ux).sum(), (error * uy).sum()]
+        )
         for i in ti.static(range(LANES)):
             io.clusters.beam_doppler[env, packet * LANES + i] = still[i]
             io.clusters.beam_cluster[env, packet * LANES + i] = ti.select(body[i] > 0.5, _CANDIDATE, -1)
@@ -111,7 +122,10 @@ def packet_directions(first_bearing, io: Bundle[TrackingIO]):
 @ti.func
 def wall_distance(x, y, io: Bundle[TrackingIO]):
     """Distance [m] from the nearest side wall, positive inside; lanes."""
-    out = ti.min(ti.min(x - io.tank_cfg.x_m[0], io.tank_cfg.x_m[1] - x), ti.min(y - io.tank_cfg.y_m[0], io.tank_cfg.y_m[1] - y))
+    out = ti.min(
+        ti.min(x - io.tank_cfg.x_m[0], io.tank_cfg.x_m[1] - x),
+        ti.min(y - io.tank_cfg.y_m[0], io.tank_cfg.y_m[1] - y),
+    )
     if ti.static(io.tank_cfg.shape == "circle"):
         dx = x - ti.static(0.5 * (io.tank_cfg.x_m[0] + io.tank_cfg.x_m[1]))
         dy = y - ti.static(0.5 * (io.tank_cfg.y_m[0] + io.tank_cfg.y_m[1]))
@@ -121,13 +135,18 @@ def wall_distance(x, y, io: Bundle[TrackingIO]):
 
 @ti.func
 def velocity_slip(normal, valid, io: Bundle[TrackingIO]):
-    """Error of the own measured velocity [m/s, world] by which known walls would move: least squares with the own measurement as prior.
+    """Error of the own measured velocity [m/s, world] by which known walls would move: least squares with the
+    own measurement as prior.
 
-    Also the standard deviation [m/s] of what is left of it along the worst direction; 0 where the measurement is ``valid``. A reading that
-    is only held is hardly trusted: the walls decide, as far as they are seen.
+    Also the standard deviation [m/s] of what is left of it along the worst direction; 0 where the measurement
+    is ``valid``. A reading that is only held is hardly trusted: the walls decide, as far as they are seen.
     """
     sigma = ti.static(max(io.sonar_cfg.doppler_sigma_m_s, 0.01))
-    prior = ti.select(valid == 1, ti.static((sigma / io.tracking_cfg.own_speed_sigma_m_s) ** 2), ti.static((sigma / HELD_SIGMA_M_S) ** 2))
+    prior = ti.select(
+        valid == 1,
+        ti.static((sigma / io.tracking_cfg.own_speed_sigma_m_s) ** 2),
+        ti.static((sigma / HELD_SIGMA_M_S) ** 2),
+    )
     xx, xy, yy = normal[0] + prior, normal[1], normal[2] + prior
     det = xx * yy - xy * xy
     slip_w = ti.Vector([yy * normal[3] - xy * normal[4], xx * normal[4] - xy * normal[3]]) / det
@@ -135,14 +154,17 @@ def velocity_slip(normal, valid, io: Bundle[TrackingIO]):
     return slip_w, ti.select(valid == 1, 0.0, sigma / ti.sqrt(ti.max(weakest, prior)))
 
 
-# ----------------------------------------------------------------------------------------------------------------------- runs
+# ------------------------------------------------------------------------------------------------------- runs
 
 
 @ti.func
 def joined(env, a, b, io: Bundle[TrackingIO]):
     """Whether two beams may lie on one body."""
     out = False
-    if io.clusters.beam_cluster[env, a] == _CANDIDATE or io.clusters.beam_cluster[env, a] == io.clusters.count[env]:
+    if (
+        io.clusters.beam_cluster[env, a] == _CANDIDATE
+        or io.clusters.beam_cluster[env, a] == io.clusters.count[env]
+    ):
         if io.clusters.beam_cluster[env, b] == _CANDIDATE:
             jump = ti.abs(io.scan.range_m[env, b] - io.scan.range_m[env, a])
             swing = ti.abs(io.clusters.beam_doppler[env, b] - io.clusters.beam_doppler[env, a])
@@ -186,7 +208,8 @@ def quiet_beam(env, io: Bundle[TrackingIO]):
 
 @ti.func
 def walk_run(env, start, first, io: Bundle[TrackingIO]):
-    """Follow a run from offset ``first``; returns its last offset and (beams, sum of range, sum of Doppler). Labels its beams."""
+    """Follow a run from offset ``first``; returns its last offset and (beams, sum of range, sum of Doppler).
+    Labels its beams."""
     label = io.clusters.count[env]
     k = first
     sums = ti.Vector([0.0, 0.0, 0.0])
@@ -212,7 +235,11 @@ def store_run(env, start, first, last, sums, io: Bundle[TrackingIO]):
     range_m = sums[1] / sums[0] - io.sonar_cfg.range_jitter_m
     hidden = open_edges(env, a, b, io)
     expected = io.tracking_cfg.min_radius_m / (ti.max(range_m, 0.1) * ti.static(TWO_PI / io.sonar_cfg.n_ray))
-    if c < io.clusters.match.shape[1] and is_narrow(env, a, b, last - first, io) and (hidden > 0 or sums[0] >= expected):
+    if (
+        c < io.clusters.match.shape[1]
+        and is_narrow(env, a, b, last - first, io)
+        and (hidden > 0 or sums[0] >= expected)
+    ):
         io.clusters.first_beam[env, c] = a
         io.clusters.span[env, c] = last - first + 1
         io.clusters.n_beam[env, c] = ti.cast(sums[0], ti.i32)
@@ -232,12 +259,17 @@ def is_narrow(env, a, b, steps, io: Bundle[TrackingIO]):
     ra, rb = io.scan.range_m[env, a], io.scan.range_m[env, b]
     half = ti.sin(ti.min(steps, io.sonar_cfg.n_ray // 2) * ti.static(0.5 * TWO_PI / io.sonar_cfg.n_ray))
     slack = ti.max(io.tracking_cfg.max_width_m, 4.0 * ti.sqrt(range_variance(ra, io)))
-    return steps < io.sonar_cfg.n_ray // 2 and 4.0 * ra * rb * half * half < io.tracking_cfg.max_width_m**2 and ti.abs(ra - rb) < slack
+    return (
+        steps < io.sonar_cfg.n_ray // 2
+        and 4.0 * ra * rb * half * half < io.tracking_cfg.max_width_m**2
+        and ti.abs(ra - rb) < slack
+    )
 
 
 @ti.func
 def open_edges(env, a, b, io: Bundle[TrackingIO]):
-    """Bit set of the edges (1 = first, 2 = last) that border a nearer return or go on as something else at the same range."""
+    """Bit set of the edges (1 = first, 2 = last) that border a nearer return or go on as something else at
+    the same range."""
     return edge_open(env, a, -1, io) + 2 * edge_open(env, b, 1, io)
 
 
@@ -261,22 +293,31 @@ def place_cluster(env, c, range_m, io: Bundle[TrackingIO]):
     """Circle through the visible arc: bearing, radius, centre, and the variance of the mean range."""
     step = ti.static(TWO_PI / io.sonar_cfg.n_ray)
     half = 0.5 * step * io.clusters.span[env, c]
-    bearing = io.scan.ping_yaw[env] + step * (io.clusters.first_beam[env, c] + 0.5 * (io.clusters.span[env, c] - 1))
+    bearing = io.scan.ping_yaw[env] + step * (
+        io.clusters.first_beam[env, c] + 0.5 * (io.clusters.span[env, c] - 1)
+    )
     radius = ti.math.clamp(
-        range_m * ti.sin(half) / (1.0 - ARC * ti.sin(half)), io.tracking_cfg.min_radius_m, 0.5 * io.tracking_cfg.max_width_m
+        range_m * ti.sin(half) / (1.0 - ARC * ti.sin(half)),
+        io.tracking_cfg.min_radius_m,
+        0.5 * io.tracking_cfg.max_width_m,
     )
     distance = range_m + ARC * radius
     pos = io.scan.ping_pos_w[env]
     io.clusters.bearing_w[env, c] = bearing
     io.clusters.radius_m[env, c] = radius
     io.clusters.range_m[env, c] = range_m
-    io.clusters.range_var[env, c] = range_variance(range_m, io) / io.clusters.n_beam[env, c] + ti.static(_MODEL_SIGMA_M**2)
-    io.clusters.pos_w[env, c] = ti.Vector([pos[0] + distance * ti.cos(bearing), pos[1] + distance * ti.sin(bearing)])
+    io.clusters.range_var[env, c] = range_variance(range_m, io) / io.clusters.n_beam[env, c] + ti.static(
+        _MODEL_SIGMA_M**2
+    )
+    io.clusters.pos_w[env, c] = ti.Vector(
+        [pos[0] + distance * ti.cos(bearing), pos[1] + distance * ti.sin(bearing)]
+    )
 
 
 @ti.func
 def weigh_doppler(env, c, sums, io: Bundle[TrackingIO]):
-    """Mean compensated Doppler of a cluster, outliers pulled in where the sonar is known to have them, and its variance."""
+    """Mean compensated Doppler of a cluster, outliers pulled in where the sonar is known to have them, and
+    its variance."""
     mean = sums[2] / sums[0]
     spread_m_s = ti.static(max(io.sonar_cfg.doppler_sigma_m_s, 0.01))
     if ti.static(io.sonar_cfg.doppler_outlier > 0):

@@ -1,9 +1,11 @@
-"""How high a tracked body may be, and whether it is still where it is expected: a memory in 3-D of what a horizontal sonar cannot show.
+"""How high a tracked body may be, and whether it is still where it is expected: a memory in 3-D of what a
+horizontal sonar cannot show.
 
-The fan opens by a known angle: a body that is hit at a distance lies within the fan there, one that is expected there and is not hit lies
-above or below it, or has gone elsewhere. Per track sixteen hypotheses are weighed by Bayes' rule: the centre at one of fifteen heights
-from floor to surface, or a body through the full water column; beside them the probability that the body is where it is expected at all.
-Neither sign of the height is known from the sonar alone; it shows when the own depth changes. Sees sensor data and tracks only.
+The fan opens by a known angle: a body that is hit at a distance lies within the fan there, one that is
+expected there and is not hit lies above or below it, or has gone elsewhere. Per track sixteen hypotheses are
+weighed by Bayes' rule: the centre at one of fifteen heights from floor to surface, or a body through the full
+water column; beside them the probability that the body is where it is expected at all. Neither sign of the
+height is known from the sonar alone; it shows when the own depth changes. Sees sensor data and tracks only.
 """
 
 import math
@@ -19,13 +21,15 @@ from uuvtai.kernels.perception.bundles import HeightsIO
 from uuvtai.state import TrackState
 
 COLUMN = LANES - 1
-"""Lane of the hypothesis "through the full water column"; the others are centre heights from floor to surface."""
+"""Lane of the hypothesis "through the full water column"; the others are centre heights from floor to
+surface."""
 
 _LEAST = 0.01
 """Likelihood of what cannot be, for one scan may be wrong."""
 
 _LEAST_SHARE = 1.0e-3
-"""Share that every hypothesis keeps: many scans may be wrong (two bodies that cross swap their tracks), and nothing comes back from 0."""
+"""Share that every hypothesis keeps: many scans may be wrong (two bodies that cross swap their tracks), and
+nothing comes back from 0."""
 
 _WELL_THERE = 0.95
 """Probability of a body that has just been matched to be where it is expected."""
@@ -33,7 +37,8 @@ _WELL_THERE = 0.95
 
 @ti.func
 def heights(tank_cfg: Const[TankConfig]):
-    """[m] centre heights of the hypotheses, world z; the last lane (full column) holds the middle of the water."""
+    """[m] centre heights of the hypotheses, world z; the last lane (full column) holds the middle of the
+    water."""
     floor, top = ti.static(tank_cfg.z_m)
     step = ti.static((tank_cfg.z_m[1] - tank_cfg.z_m[0]) / COLUMN)
     out = ramp_lanes(0.5) * step + floor
@@ -61,7 +66,8 @@ def begin_height(env, track, tracks: Out[TrackState], elevation_cfg: Const[Eleva
 
 @ti.func
 def half_height(env, track, tracks: In[TrackState], elevation_cfg: Const[ElevationConfig]):
-    """[m] half height of a body that is no column: that of a ball of the tracked radius, or the configured usual one."""
+    """[m] half height of a body that is no column: that of a ball of the tracked radius, or the configured
+    usual one."""
     return ti.max(tracks.radius_m[env, track], ti.static(elevation_cfg.half_height_m))
 
 
@@ -78,8 +84,8 @@ def in_fan(
 ):
     """Per hypothesis the probability that a beam from ``own`` [m, world] hits the body where it is expected.
 
-    ``half`` = its half height [m], guessed: large for hits and small for misses, so that neither says more than it knows. Soft at the fan's
-    edge.
+    ``half`` = its half height [m], guessed: large for hits and small for misses, so that neither says more
+    than it knows. Soft at the fan's edge.
     """
     mean = tracks.state[env, track]
     away = ti.Vector([mean[0] - own[0], mean[1] - own[1]]).norm()
@@ -88,7 +94,9 @@ def in_fan(
     at = heights(tank_cfg)
     out = f16x(0.0)
     for i in ti.static(range(LANES)):
-        out[i] = ti.math.clamp((reach - ti.abs(at[i] - own[2])) * ti.static(0.5 / elevation_cfg.edge_m) + 0.5, 0.0, 1.0)
+        out[i] = ti.math.clamp(
+            (reach - ti.abs(at[i] - own[2])) * ti.static(0.5 / elevation_cfg.edge_m) + 0.5, 0.0, 1.0
+        )
     out[COLUMN] = 1.0
     return out
 
@@ -105,7 +113,14 @@ def weigh_seen(
 ):
     """The sonar at ``own`` hit it: it is there, and within the fan."""
     likely = in_fan(
-        env, track, own, half_height(env, track, tracks, elevation_cfg) + elevation_cfg.edge_m, tracks, elevation_cfg, sonar_cfg, tank_cfg
+        env,
+        track,
+        own,
+        half_height(env, track, tracks, elevation_cfg) + elevation_cfg.edge_m,
+        tracks,
+        elevation_cfg,
+        sonar_cfg,
+        tank_cfg,
     )
     weighed = tracks.height[env, track, 0] * ti.max(likely, _LEAST)
     tracks.height[env, track, 0] = shared(weighed)
@@ -125,14 +140,23 @@ def weigh_unseen(
 ):
     """Beams from ``own`` went through where it is expected: it is above or below the fan, or elsewhere.
 
-    The less surely the filter knows where it is, the less it says that beams through the middle of that place met nothing; and neighbouring
-    scans say the same again, so only one in ``evidence_s`` counts in full.
+    The less surely the filter knows where it is, the less it says that beams through the middle of that place
+    met nothing; and neighbouring scans say the same again, so only one in ``evidence_s`` counts in full.
     """
     radius = tracks.radius_m[env, track]
     spread_var = largest_position_variance(tracks.cov[env, track], 0.0)
     sure = ti.static(elevation_cfg.hit_share) * radius * radius / (radius * radius + spread_var)
     hit = 1.0 - (1.0 - sure) ** ti.min(dt * ti.static(1.0 / elevation_cfg.evidence_s), 1.0)
-    likely = in_fan(env, track, own, elevation_cfg.least_half_height_m - elevation_cfg.edge_m, tracks, elevation_cfg, sonar_cfg, tank_cfg)
+    likely = in_fan(
+        env,
+        track,
+        own,
+        elevation_cfg.least_half_height_m - elevation_cfg.edge_m,
+        tracks,
+        elevation_cfg,
+        sonar_cfg,
+        tank_cfg,
+    )
     weighed = tracks.height[env, track, 0] * ti.max(1.0 - likely * hit, _LEAST)
     total = weighed.sum()
     tracks.height[env, track, 0] = shared(weighed)
@@ -142,7 +166,8 @@ def weigh_unseen(
 
 @ti.func
 def weigh_camera(env, track, likely, missing, tracks: Out[TrackState]):
-    """An image's likelihood per hypothesis; where it shows no body (``missing`` 1) the body is also less surely where it is expected."""
+    """An image's likelihood per hypothesis; where it shows no body (``missing`` 1) the body is also less
+    surely where it is expected."""
     weighed = tracks.height[env, track, 0] * likely
     total = weighed.sum()
     tracks.height[env, track, 0] = shared(weighed)
@@ -154,15 +179,19 @@ def weigh_camera(env, track, likely, missing, tracks: Out[TrackState]):
 @quick_launch
 @ti.kernel
 def bound_heights(io: Bundle[HeightsIO]):
-    """Free water above and below the own height: ``above_w`` is the lowest edge of what may be above, ``below_w`` the highest edge of what
-    may be below; both are the own height where the body may be level with the vehicle, and for tracks that do not move.
+    """Free water above and below the own height: ``above_w`` is the lowest edge of what may be above,
+    ``below_w`` the highest edge of what may be below; both are the own height where the body may be level
+    with the vehicle, and for tracks that do not move.
     """
     n, n_track = ti.static(io.tracks.alive.shape[0], io.tracks.alive.shape[1])
     for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n * n_track))):
         if pad == 0 and io.clock.awake[env] == 1:
             own_z = io.ego.pos_w[env][2]
             above, below = own_z, own_z
-            if ti.static(io.elevation_cfg.memory_s > 0) and io.tracks.alive[env, track] * io.tracks.moving[env, track] == 1:
+            if (
+                ti.static(io.elevation_cfg.memory_s > 0)
+                and io.tracks.alive[env, track] * io.tracks.moving[env, track] == 1
+            ):
                 above, below = free_water(env, track, own_z, io)
             io.forecast.above_w[env, track] = above
             io.forecast.below_w[env, track] = below

@@ -1,7 +1,8 @@
-"""What a scan and a depth image say about the cells of the map: a return that stays or moves, a point seen by the camera.
+"""What a scan and a depth image say about the cells of the map: a return that stays or moves, a point seen by
+the camera.
 
-Each is a bit per cell, set by the one thread that has all of an env's returns; ``fan.py`` adds free water, ``mapping.py`` merges all of
-it into the two layers.
+Each is a bit per cell, set by the one thread that has all of an env's returns; ``fan.py`` adds free water,
+``mapping.py`` merges all of it into the two layers.
 """
 
 import math
@@ -25,33 +26,48 @@ NO_RETURN_SHARE = 0.999
 
 
 def doppler_threshold(mapping, sonar):
-    """[m/s] compensated Doppler that counts as motion: the configured value, or 3 sigma of the sensor's noise."""
+    """[m/s] compensated Doppler that counts as motion: the configured value, or 3 sigma of the sensor's
+    noise."""
     return max(mapping.doppler_evidence_m_s, 3.0 * sonar.doppler_sigma_m_s)
 
 
 def pinhole(depth):
-    """(focal length, middle row, middle column) [pixels]: pixel [row, col] looks along (1, (middle_col - col)/f, (middle_row - row)/f)."""
-    return 0.5 * depth.cols / math.tan(math.radians(0.5 * depth.fov_deg)), 0.5 * depth.rows - 0.5, 0.5 * depth.cols - 0.5
+    """(focal length, middle row, middle column) [pixels]: pixel [row, col] looks along (1, (middle_col -
+    col)/f, (middle_row - row)/f)."""
+    return (
+        0.5 * depth.cols / math.tan(math.radians(0.5 * depth.fov_deg)),
+        0.5 * depth.rows - 0.5,
+        0.5 * depth.cols - 0.5,
+    )
 
 
-# ------------------------------------------------------------------------------------------------------------------------ walls
+# ------------------------------------------------------------------------------------------------------ walls
 
 
 @ti.func
 def range_error(range_m, io: Bundle[MappingIO]):
-    """[m] error that a return at this range may have: 3 sigma of its noise, jitter and quantum (data sheet)."""
+    """[m] error that a return at this range may have: 3 sigma of its noise, jitter and quantum (data
+    sheet)."""
     return (
-        3.0 * (io.sonar_cfg.range_sigma_m + io.sonar_cfg.range_sigma_slope * range_m + io.sonar_cfg.range_jitter_m)
+        3.0
+        * (
+            io.sonar_cfg.range_sigma_m
+            + io.sonar_cfg.range_sigma_slope * range_m
+            + io.sonar_cfg.range_jitter_m
+        )
         + io.sonar_cfg.range_quantum_m
     )
 
 
 @ti.func
 def wall_lanes(pos, unit_x, unit_y, tank_cfg: Const[TankConfig]):
-    """[m] along sixteen horizontal beams to the known side wall through which each leaves the tank; negative where it misses the tank."""
+    """[m] along sixteen horizontal beams to the known side wall through which each leaves the tank; negative
+    where it misses the tank."""
     leave = f16x(0.0)
     if ti.static(tank_cfg.shape == "circle"):
-        off = pos - ti.Vector([0.5 * (tank_cfg.x_m[0] + tank_cfg.x_m[1]), 0.5 * (tank_cfg.y_m[0] + tank_cfg.y_m[1])])
+        off = pos - ti.Vector(
+            [0.5 * (tank_cfg.x_m[0] + tank_cfg.x_m[1]), 0.5 * (tank_cfg.y_m[0] + tank_cfg.y_m[1])]
+        )
         along = unit_x * off[0] + unit_y * off[1]
         # distance of the line from the centre by a cross product: along^2 - off^2 would cancel badly
         across = unit_y * off[0] - unit_x * off[1]
@@ -71,17 +87,25 @@ def wall_gaps(x, y, io: Bundle[MappingIO]):
     """[m] from sixteen points to the nearest side wall, negative outside."""
     gap = f16x(0.0)
     if ti.static(io.tank_cfg.shape == "circle"):
-        off_x, off_y = x - 0.5 * (io.tank_cfg.x_m[0] + io.tank_cfg.x_m[1]), y - 0.5 * (io.tank_cfg.y_m[0] + io.tank_cfg.y_m[1])
+        off_x, off_y = (
+            x - 0.5 * (io.tank_cfg.x_m[0] + io.tank_cfg.x_m[1]),
+            y - 0.5 * (io.tank_cfg.y_m[0] + io.tank_cfg.y_m[1]),
+        )
         squared = off_x * off_x + off_y * off_y
         for i in ti.static(range(LANES)):
             gap[i] = ti.static(io.tank_cfg.radius_m) - ti.sqrt(squared[i])
     else:
         for i in ti.static(range(LANES)):
-            gap[i] = ti.min(x[i] - io.tank_cfg.x_m[0], io.tank_cfg.x_m[1] - x[i], y[i] - io.tank_cfg.y_m[0], io.tank_cfg.y_m[1] - y[i])
+            gap[i] = ti.min(
+                x[i] - io.tank_cfg.x_m[0],
+                io.tank_cfg.x_m[1] - x[i],
+                y[i] - io.tank_cfg.y_m[0],
+                io.tank_cfg.y_m[1] - y[i],
+            )
     return gap
 
 
-# ------------------------------------------------------------------------------------------------------------------------- hits
+# ------------------------------------------------------------------------------------------------------- hits
 
 
 @ti.func
@@ -103,25 +127,33 @@ def edge_of_static(env, row, col, reach, io: Bundle[MappingIO]):
     window = cell_bit(col + reach + 1 - first_col) - ti.cast(1, ti.u64)
     found = ti.cast(0, ti.u64)
     r, end = ti.max(row - reach, 0), ti.min(row + reach + 1, n_row)
-    while r < end and found == 0:  # a second way out keeps LLVM from unrolling it: half of the time to compile the whole kernel
+    while (
+        r < end and found == 0
+    ):  # a second way out keeps LLVM from unrolling it: half of the time to compile the whole kernel
         found |= (io.grid_map.static_occupied[env, r, word] >> shift) & window
         if shift > 0 and word + 1 < n_word:
-            found |= (io.grid_map.static_occupied[env, r, word + 1] << (ti.cast(WORD, ti.u64) - shift)) & window
+            found |= (
+                io.grid_map.static_occupied[env, r, word + 1] << (ti.cast(WORD, ti.u64) - shift)
+            ) & window
         r += 1
     return ti.cast(found != 0, ti.i32)
 
 
 @ti.func
 def is_inconsistent(env, row, col, range_m, promote_scans: Const[int], io: Bundle[MappingIO]):
-    """1 where a return contradicts a cell that was confidently free, or one that such evidence holds and has not yet promoted.
+    """1 where a return contradicts a cell that was confidently free, or one that such evidence holds and has
+    not yet promoted.
 
-    The edge of a static body does this too: range noise and the gap between beams move its returns into cells that other beams
-    cleared. So nothing counts near a statically occupied cell: within one cell plus beam spacing plus range error.
+    The edge of a static body does this too: range noise and the gap between beams move its returns into cells
+    that other beams cleared. So nothing counts near a statically occupied cell: within one cell plus beam
+    spacing plus range error.
     """
     confident = bit_of(io.grid_map.confident[env, row, col // WORD], col % WORD)
     held = bit_of(io.grid_map.held[env, row, col // WORD], col % WORD)
     inconsistent = 0
-    if confident == 1 or (held == 1 and ti.cast(io.grid_map.dynamic_scans[env, row, col], ti.i32) < promote_scans):
+    if confident == 1 or (
+        held == 1 and ti.cast(io.grid_map.dynamic_scans[env, row, col], ti.i32) < promote_scans
+    ):
         spacing = ti.static(TWO_PI / io.sonar_cfg.n_ray) * range_m
         reach = 1 + ti.cast((spacing + range_error(range_m, io)) / io.mapping_cfg.cell_m, ti.i32)
         inconsistent = 1 - edge_of_static(env, row, col, ti.min(reach, _MAX_REACH), io)
@@ -130,11 +162,13 @@ def is_inconsistent(env, row, col, range_m, promote_scans: Const[int], io: Bundl
 
 @ti.func
 def own_motion(env, io: Bundle[MappingIO]):
-    """Own velocity (ahead, left) [m/s] at the ping, as the tracking knows it, and the Doppler [m/s] beyond which a return then moves.
+    """Own velocity (ahead, left) [m/s] at the ping, as the tracking knows it, and the Doppler [m/s] beyond
+    which a return then moves.
 
-    It is the measured velocity less the error that the known walls show in the same scan. A scan between tracked ones takes the error of
-    the last of them as long as the reading is only held, and trusts a valid reading as it is. Where neither a reading nor the walls tell
-    the own velocity, Doppler proves little: the threshold is three standard deviations of what is left.
+    It is the measured velocity less the error that the known walls show in the same scan. A scan between
+    tracked ones takes the error of the last of them as long as the reading is only held, and trusts a valid
+    reading as it is. Where neither a reading nor the walls tell the own velocity, Doppler proves little: the
+    threshold is three standard deviations of what is left.
     """
     vel, threshold = (
         ti.Vector([io.scan.ping_vel_b[env][0], io.scan.ping_vel_b[env][1]]),
@@ -145,15 +179,19 @@ def own_motion(env, io: Bundle[MappingIO]):
         vel -= turned_z(io.clusters.slip_w[env], -io.scan.ping_yaw[env])
     if held:
         sigma = io.clusters.own_sigma_m_s[env]
-        threshold = ti.max(threshold, 3.0 * ti.sqrt(ti.static(io.sonar_cfg.doppler_sigma_m_s**2) + sigma * sigma))
+        threshold = ti.max(
+            threshold, 3.0 * ti.sqrt(ti.static(io.sonar_cfg.doppler_sigma_m_s**2) + sigma * sigma)
+        )
     return vel, threshold
 
 
 @ti.func
 def mapped_lanes(env, first_ray, pos, vel, threshold, io: Bundle[MappingIO]):
-    """Of sixteen beams: kind of return (0 = none or from a known wall, 1 = at rest, 2 = moving by its Doppler), row, column, range [m].
+    """Of sixteen beams: kind of return (0 = none or from a known wall, 1 = at rest, 2 = moving by its
+    Doppler), row, column, range [m].
 
-    ``vel`` [m/s] is the own velocity along x and y of the body, ``threshold`` [m/s] the compensated Doppler that counts as motion.
+    ``vel`` [m/s] is the own velocity along x and y of the body, ``threshold`` [m/s] the compensated Doppler
+    that counts as motion.
     """
     n_row, n_col = ti.static(grid_shape(io.tank_cfg, io.mapping_cfg.cell_m))
     x0, y0 = ti.static(grid_origin(io.tank_cfg, io.mapping_cfg.cell_m))
@@ -166,7 +204,10 @@ def mapped_lanes(env, first_ray, pos, vel, threshold, io: Bundle[MappingIO]):
     ahead_x, ahead_y = beam_lanes(0.0, first_ray, io.sonar_cfg.n_ray)
     x, y = pos[0] + unit_x * range_m, pos[1] + unit_y * range_m
     # noise along a slanting beam reaches deeper into the tank than the margin
-    gap, short = wall_gaps(x, y, io), wall_lanes(pos, unit_x, unit_y, io.tank_cfg) - range_error(range_m, io) - range_m
+    gap, short = (
+        wall_gaps(x, y, io),
+        wall_lanes(pos, unit_x, unit_y, io.tank_cfg) - range_error(range_m, io) - range_m,
+    )
     # measured rate of range plus own velocity along the beam: motion through the water
     moves = doppler + ahead_x * vel[0] + ahead_y * vel[1]
     kind, row, col = i16x(0), i16x(0), i16x(0)
@@ -183,7 +224,8 @@ def mapped_lanes(env, first_ray, pos, vel, threshold, io: Bundle[MappingIO]):
 
 @ti.func
 def mark_hits(env, slot, promote_scans: Const[int], io: Bundle[MappingIO]):
-    """Bit of every return's cell: what moves is a dynamic hit only, the rest static hits; returns from known walls are left out."""
+    """Bit of every return's cell: what moves is a dynamic hit only, the rest static hits; returns from known
+    walls are left out."""
     pos = ti.Vector([io.scan.ping_pos_w[env][0], io.scan.ping_pos_w[env][1]])
     vel, threshold = own_motion(env, io)
     for packet in range(ti.static(io.sonar_cfg.n_ray // LANES)):
@@ -199,15 +241,20 @@ def mark_hits(env, slot, promote_scans: Const[int], io: Bundle[MappingIO]):
                     put_bit(io.map_scratch.static_hit, slot, row[i], col[i])
 
 
-# ------------------------------------------------------------------------------------------------------------------------ depth
+# ------------------------------------------------------------------------------------------------------ depth
 
 
 @ti.func
 def nearest_in_gate(env, first_col, R_wb, gate_m: Const[float], io: Bundle[MappingIO]):
-    """Per image column, sixteen of them: smallest depth [m] whose point lies within ``gate_m`` of the vehicle's own depth, and its row."""
+    """Per image column, sixteen of them: smallest depth [m] whose point lies within ``gate_m`` of the
+    vehicle's own depth, and its row."""
     focal, middle_row, middle_col = ti.static(pinhole(io.depth_cfg))
     left = (middle_col - ramp_lanes(float(first_col))) / focal
-    mount = R_wb[2, 0] * io.depth_cfg.offset_b_m[0] + R_wb[2, 1] * io.depth_cfg.offset_b_m[1] + R_wb[2, 2] * io.depth_cfg.offset_b_m[2]
+    mount = (
+        R_wb[2, 0] * io.depth_cfg.offset_b_m[0]
+        + R_wb[2, 1] * io.depth_cfg.offset_b_m[1]
+        + R_wb[2, 2] * io.depth_cfg.offset_b_m[2]
+    )
     nearest, nearest_row = f16x(FAR_M), i16x(0)
     for row in range(ti.static(io.image.depth_m.shape[1])):
         z = f16x(0.0)
@@ -216,7 +263,11 @@ def nearest_in_gate(env, first_col, R_wb, gate_m: Const[float], io: Bundle[Mappi
         climb = R_wb[2, 0] + R_wb[2, 2] * (middle_row - row) / focal + R_wb[2, 1] * left
         rise = mount + z * climb
         for i in ti.static(range(LANES)):
-            seen = (ti.abs(rise[i]) <= gate_m) & (z[i] < ti.static(io.depth_cfg.max_range_m * NO_RETURN_SHARE)) & (z[i] > 0.0)
+            seen = (
+                (ti.abs(rise[i]) <= gate_m)
+                & (z[i] < ti.static(io.depth_cfg.max_range_m * NO_RETURN_SHARE))
+                & (z[i] > 0.0)
+            )
             nearer = seen & (z[i] < nearest[i])
             nearest[i] = ti.select(nearer, z[i], nearest[i])
             nearest_row[i] = ti.select(nearer, row, nearest_row[i])
@@ -225,7 +276,8 @@ def nearest_in_gate(env, first_col, R_wb, gate_m: Const[float], io: Bundle[Mappi
 
 @ti.func
 def mark_depth(env, io: Bundle[MappingIO]):
-    """Depth hit in the cell of the nearest point at the vehicle's own depth, per image column; it waits there for the next merge."""
+    """Depth hit in the cell of the nearest point at the vehicle's own depth, per image column; it waits there
+    for the next merge."""
     focal, middle_row, middle_col = ti.static(pinhole(io.depth_cfg))
     n_row, n_col = ti.static(grid_shape(io.tank_cfg, io.mapping_cfg.cell_m))
     rpy = io.image.shot_rpy[env]
@@ -235,7 +287,9 @@ def mark_depth(env, io: Bundle[MappingIO]):
         nearest, nearest_row = nearest_in_gate(env, packet * LANES, R_wb, io.mapping_cfg.depth_gate_m, io)
         for i in range(LANES):
             if nearest[i] < FAR_M:
-                ray_b = ti.Vector([1.0, (middle_col - packet * LANES - i) / focal, (middle_row - nearest_row[i]) / focal])
+                ray_b = ti.Vector(
+                    [1.0, (middle_col - packet * LANES - i) / focal, (middle_row - nearest_row[i]) / focal]
+                )
                 point = io.image.shot_pos_w[env] + R_wb @ (offset + nearest[i] * ray_b)
                 cell = cell_of(point, io.tank_cfg, io.mapping_cfg.cell_m)
                 if cell[0] >= 0 and cell[0] < n_row and cell[1] >= 0 and cell[1] < n_col:

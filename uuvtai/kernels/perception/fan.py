@@ -1,10 +1,11 @@
 """The fan of free water around a ping: what two neighbouring beams both prove free is free between them.
 
-Each beam proves free water up to a reach. Between beam b and b + 1 lies a triangle with its tip at the ping and both legs as long as the
-smaller of their reaches; a cell is free where its centre lies in one of these triangles. Their union is one star-shaped polygon,
-so it is filled the way printers fill polygons: every edge leaves a bit where it crosses a column of cell centres (``fan_edge``), and
-whoever goes up a column is inside after an odd number of bits. That takes some 600 bits where walking 256 beams cell by cell takes
-10,000 stores, and far out, where beams are several cells apart, it leaves no gaps between them.
+Each beam proves free water up to a reach. Between beam b and b + 1 lies a triangle with its tip at the ping
+and both legs as long as the smaller of their reaches; a cell is free where its centre lies in one of these
+triangles. Their union is one star-shaped polygon, so it is filled the way printers fill polygons: every edge
+leaves a bit where it crosses a column of cell centres (``fan_edge``), and whoever goes up a column is inside
+after an odd number of bits. That takes some 600 bits where walking 256 beams cell by cell takes 10,000
+stores, and far out, where beams are several cells apart, it leaves no gaps between them.
 """
 
 import math
@@ -21,7 +22,8 @@ from uuvtai.kernels.perception.bundles import MappingIO
 
 @ti.func
 def beam_lanes(yaw, first_ray, n_ray: Const[int]):
-    """Horizontal unit vectors (x lanes, y lanes) of sixteen neighbouring beams (``yaw`` 0: in the body's frame)."""
+    """Horizontal unit vectors (x lanes, y lanes) of sixteen neighbouring beams (``yaw`` 0: in the body's
+    frame)."""
     bearing = yaw + ti.static(TWO_PI / n_ray) * first_ray
     c, s = ti.cos(bearing), ti.sin(bearing)
     x, y = f16x(0.0), f16x(0.0)
@@ -33,15 +35,28 @@ def beam_lanes(yaw, first_ray, n_ray: Const[int]):
 
 @ti.func
 def free_reach(env, ray, io: Bundle[MappingIO]):
-    """[m] up to which a beam proves free water: one cell and one sigma before its return, ``free_range_m`` without one; at least 0."""
+    """[m] up to which a beam proves free water: one cell and one sigma before its return, ``free_range_m``
+    without one; at least 0."""
     range_m = io.scan.range_m[env, ray]
-    before = range_m - io.mapping_cfg.cell_m - (io.sonar_cfg.range_sigma_m + io.sonar_cfg.range_sigma_slope * range_m)
-    return ti.max(0.0, ti.select(io.scan.hit[env, ray] == 1, before, ti.static(min(io.mapping_cfg.free_range_m, io.sonar_cfg.max_range_m))))
+    before = (
+        range_m
+        - io.mapping_cfg.cell_m
+        - (io.sonar_cfg.range_sigma_m + io.sonar_cfg.range_sigma_slope * range_m)
+    )
+    return ti.max(
+        0.0,
+        ti.select(
+            io.scan.hit[env, ray] == 1,
+            before,
+            ti.static(min(io.mapping_cfg.free_range_m, io.sonar_cfg.max_range_m)),
+        ),
+    )
 
 
 @ti.func
 def triangle_legs(env, first_ray, io: Bundle[MappingIO]):
-    """[cells] legs of the sixteen triangles from beam ``first_ray`` on: the smaller of two neighbours' reaches."""
+    """[cells] legs of the sixteen triangles from beam ``first_ray`` on: the smaller of two neighbours'
+    reaches."""
     reach = f16x(0.0)
     for i in ti.static(range(LANES)):
         reach[i] = free_reach(env, first_ray + i, io)
@@ -55,10 +70,11 @@ def triangle_legs(env, first_ray, io: Bundle[MappingIO]):
 
 @ti.func
 def mark_edge(slot, begin, end, first_col, end_col, n_col: Const[int], io: Bundle[MappingIO]):
-    """A bit in the lowest cell of each column whose centres lie on or above the edge; ends are (x, y) [cells], centres whole numbers.
+    """A bit in the lowest cell of each column whose centres lie on or above the edge; ends are (x, y)
+    [cells], centres whole numbers.
 
-    ``first_col`` and ``end_col`` are the rounded-up x of both ends: whole numbers shared by neighbouring edges, so that no column can be
-    crossed by one of two edges that meet in it and missed by the other.
+    ``first_col`` and ``end_col`` are the rounded-up x of both ends: whole numbers shared by neighbouring
+    edges, so that no column can be crossed by one of two edges that meet in it and missed by the other.
     """
     n_row = ti.static(io.map_scratch.fan_edge.shape[1])
     if first_col != end_col:
@@ -66,16 +82,22 @@ def mark_edge(slot, begin, end, first_col, end_col, n_col: Const[int], io: Bundl
         for col in range(ti.max(ti.min(first_col, end_col), 0), ti.min(ti.max(first_col, end_col), n_col)):
             row = ti.max(ti.cast(ti.ceil(begin[1] + (col - begin[0]) * slope), ti.i32), 0)
             if row < n_row:
-                io.map_scratch.fan_edge[slot, row, col // WORD] = io.map_scratch.fan_edge[slot, row, col // WORD] ^ cell_bit(col)
+                io.map_scratch.fan_edge[slot, row, col // WORD] = io.map_scratch.fan_edge[
+                    slot, row, col // WORD
+                ] ^ cell_bit(col)
 
 
 @ti.func
 def mark_fan(env, slot, io: Bundle[MappingIO]):
-    """Bits of the fan's outline, triangle after triangle: along each chord, then along the beam to the next triangle's leg."""
+    """Bits of the fan's outline, triangle after triangle: along each chord, then along the beam to the next
+    triangle's leg."""
     n_ray, n_col = ti.static(io.sonar_cfg.n_ray, grid_shape(io.tank_cfg, io.mapping_cfg.cell_m)[1])
     x0, y0 = ti.static(grid_origin(io.tank_cfg, io.mapping_cfg.cell_m))
     ping = ti.Vector(
-        [(io.scan.ping_pos_w[env][0] - x0) / io.mapping_cfg.cell_m - 0.5, (io.scan.ping_pos_w[env][1] - y0) / io.mapping_cfg.cell_m - 0.5]
+        [
+            (io.scan.ping_pos_w[env][0] - x0) / io.mapping_cfg.cell_m - 0.5,
+            (io.scan.ping_pos_w[env][1] - y0) / io.mapping_cfg.cell_m - 0.5,
+        ]
     )
     first, last = ti.Vector([0.0, 0.0]), ti.Vector([0.0, 0.0])
     first_col, last_col = 0, 0

@@ -1,4 +1,5 @@
-"""Forecast: where every moving track will be from now to the horizon, and how surely. Sees tracks only, never the truth."""
+"""Forecast: where every moving track will be from now to the horizon, and how surely. Sees tracks only, never
+the truth."""
 
 import taichi as ti
 
@@ -22,7 +23,10 @@ def reset_forecast(io: Bundle[ForecastIO]):
             forget_habits(env, io)
             for track in range(io.forecast.radius_m.shape[1]):
                 clear_forecast(env, track, io)
-                io.forecast.turn_m[env, track], io.forecast.turn_out_w[env, track] = FAR_M, ti.Vector([0.0, 0.0])
+                io.forecast.turn_m[env, track], io.forecast.turn_out_w[env, track] = (
+                    FAR_M,
+                    ti.Vector([0.0, 0.0]),
+                )
                 for k in range(io.forecast.pos_w.shape[2]):
                     io.forecast.pos_w[env, track, k] = ti.Vector([0.0, 0.0])
 
@@ -43,14 +47,17 @@ def learn_habits(io: Bundle[ForecastIO]):
 def forecast_tracks(io: Bundle[ForecastIO]):
     """From now to the horizon, for the moving tracks of the awake rows; the others get a negative radius.
 
-    The radius grows by ``growth_sigmas`` standard deviations of the predicted position along its worst axis, as the filter knows it today:
-    turns to come are not in it (the planner's own growing margin is for them). At most ``max_growth_m``.
+    The radius grows by ``growth_sigmas`` standard deviations of the predicted position along its worst axis,
+    as the filter knows it today: turns to come are not in it (the planner's own growing margin is for them).
+    At most ``max_growth_m``.
     """
     n = ti.static(io.clock.awake.shape[0])
     n_track = ti.static(io.tracks.alive.shape[1])
     for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n * n_track))):
         if pad == 0 and io.clock.awake[env] == 1:
-            changed = io.clusters.fresh[env] + io.image.fresh[env] > 0  # only a tracked scan or an image changes tracks and habits
+            changed = (
+                io.clusters.fresh[env] + io.image.fresh[env] > 0
+            )  # only a tracked scan or an image changes tracks and habits
             if io.tracks.alive[env, track] * io.tracks.moving[env, track] == 1:
                 if expected_turn_rate(env, track, io.tracks, io.forecast_cfg, io.tracking_cfg) != 0.0:
                     follow_arc(env, track, io)
@@ -80,14 +87,17 @@ def follow_arc(env, track, io: Bundle[ForecastIO]):
         ahead = late + k * io.tracking_cfg.forecast_dt_s
         growth = io.tracking_cfg.growth_sigmas * ti.sqrt(largest_position_variance(cov, ahead))
         io.forecast.pos_w[env, track, k] = pos
-        io.forecast.radius_m[env, track, k] = io.tracks.radius_m[env, track] + ti.min(growth, io.tracking_cfg.max_growth_m)
+        io.forecast.radius_m[env, track, k] = io.tracks.radius_m[env, track] + ti.min(
+            growth, io.tracking_cfg.max_growth_m
+        )
         pos += step * turned_z(vel, 0.5 * rate * io.tracking_cfg.forecast_dt_s)
         vel = turned_z(vel, rate * io.tracking_cfg.forecast_dt_s)
 
 
 @ti.func
 def follow_legs(env, track, changed, io: Bundle[ForecastIO]):
-    """Constant speed on straight legs, from turn to turn; the search for the first turn is kept until something has ``changed``."""
+    """Constant speed on straight legs, from turn to turn; the search for the first turn is kept until
+    something has ``changed``."""
     mean, cov, radius = io.tracks.state[env, track], io.tracks.cov[env, track], io.tracks.radius_m[env, track]
     pos, speed = ti.Vector([mean[0], mean[1]]), ti.max(ti.sqrt(mean[2] * mean[2] + mean[3] * mean[3]), 1e-6)
     course = ti.Vector([mean[2], mean[3]]) / speed

@@ -1,12 +1,14 @@
-"""Habits of moving bodies, learnt within the episode: places where one turned, from which course to which. Sees tracks only.
+"""Habits of moving bodies, learnt within the episode: places where one turned, from which course to which.
+Sees tracks only.
 
-A body on a line turns back at the same two ends, one on a loop turns at the same corners; who reaches a remembered turn on its course will
-turn there again. The memory belongs to the env, not to a track: a body that was lost and found again, or one never seen to turn while it
-was tracked, is known by where it goes. Circles need no memory, their turn rate is in the filter.
+A body on a line turns back at the same two ends, one on a loop turns at the same corners; who reaches a
+remembered turn on its course will turn there again. The memory belongs to the env, not to a track: a body
+that was lost and found again, or one never seen to turn while it was tracked, is known by where it goes.
+Circles need no memory, their turn rate is in the filter.
 
-A turn is what lies between two straight legs of one track. Their ends p0, p1 [m], unit courses d0, d1 and the way L = speed x time between
-give the corner p0 + a d0 = p1 - b d1 by least squares along d0 - d1 under a + b = L: the speed is kept through a turn, which is what places
-a reversal, where both legs lie on one line.
+A turn is what lies between two straight legs of one track. Their ends p0, p1 [m], unit courses d0, d1 and the
+way L = speed x time between give the corner p0 + a d0 = p1 - b d1 by least squares along d0 - d1 under a + b
+= L: the speed is kept through a turn, which is what places a reversal, where both legs lie on one line.
 """
 
 import math
@@ -21,7 +23,8 @@ from uuvtai.kernels.perception.bundles import ForecastIO
 from uuvtai.state import HabitState, TrackState
 
 _STRAIGHT_SIGMA = 0.4
-"""[rad/s] a body is on a straight leg where its turn rate is known to this and less than its standard deviation."""
+"""[rad/s] a body is on a straight leg where its turn rate is known to this and less than its standard
+deviation."""
 
 _SETTLED = 0.05
 """... and where its velocity's variance is below this share of its square."""
@@ -61,23 +64,33 @@ def forget_habits(env, io: Bundle[ForecastIO]):
         io.habits.leg_step[env, track] = -1
 
 
-# --------------------------------------------------------------------------------------------------------------------- learn
+# ------------------------------------------------------------------------------------------------------ learn
 
 
 @ti.func
 def learn_habit(env, track, io: Bundle[ForecastIO]):
-    """Where a track is on a straight leg: remember the turn since its last one, and forget a turn that it went past."""
+    """Where a track is on a straight leg: remember the turn since its last one, and forget a turn that it
+    went past."""
     if io.tracks.alive[env, track] == 0 or io.tracks.age[env, track] == 0:
         io.habits.leg_step[env, track] = -1
-    elif io.tracks.moving[env, track] == 1 and io.tracks.misses[env, track] == 0 and on_straight_leg(env, track, io):
+    elif (
+        io.tracks.moving[env, track] == 1
+        and io.tracks.misses[env, track] == 0
+        and on_straight_leg(env, track, io)
+    ):
         now, leg = io.tracks.state[env, track], io.habits.leg[env, track]
         time = (io.tracks.scan_step[env] - io.habits.leg_step[env, track]) * io.episode_cfg.control_dt_s
         if io.habits.leg_step[env, track] >= 0 and time < _LONGEST_S:
             speed, leg_speed = ti.sqrt(now[2] ** 2 + now[3] ** 2), ti.sqrt(leg[2] ** 2 + leg[3] ** 2)
-            course, leg_course = ti.Vector([now[2] / speed, now[3] / speed]), ti.Vector([leg[2] / leg_speed, leg[3] / leg_speed])
+            course, leg_course = (
+                ti.Vector([now[2] / speed, now[3] / speed]),
+                ti.Vector([leg[2] / leg_speed, leg[3] / leg_speed]),
+            )
             if course.dot(leg_course) < _TURNED_COS:
                 way = 0.5 * time * (speed + leg_speed)
-                place_turn(env, ti.Vector([leg[0], leg[1]]), leg_course, ti.Vector([now[0], now[1]]), course, way, io)
+                place_turn(
+                    env, ti.Vector([leg[0], leg[1]]), leg_course, ti.Vector([now[0], now[1]]), course, way, io
+                )
             else:
                 drop_passed(env, ti.Vector([now[0], now[1]]), course, speed * time, io)
         io.habits.leg[env, track] = now
@@ -114,9 +127,18 @@ def store_turn(env, pos, d0, d1, io: Bundle[ForecastIO]):
     for packet in range(n_packet):
         for lane in range(LANES):
             if known == 0 and io.habits.weight[env, packet][lane] > 0.0:
-                off = ti.Vector([io.habits.turn_x[env, packet][lane], io.habits.turn_y[env, packet][lane]]) - pos
-                alike_in = io.habits.in_x[env, packet][lane] * d0[0] + io.habits.in_y[env, packet][lane] * d0[1] > _ALIKE_COS
-                alike_out = io.habits.out_x[env, packet][lane] * d1[0] + io.habits.out_y[env, packet][lane] * d1[1] > _ALIKE_COS
+                off = (
+                    ti.Vector([io.habits.turn_x[env, packet][lane], io.habits.turn_y[env, packet][lane]])
+                    - pos
+                )
+                alike_in = (
+                    io.habits.in_x[env, packet][lane] * d0[0] + io.habits.in_y[env, packet][lane] * d0[1]
+                    > _ALIKE_COS
+                )
+                alike_out = (
+                    io.habits.out_x[env, packet][lane] * d1[0] + io.habits.out_y[env, packet][lane] * d1[1]
+                    > _ALIKE_COS
+                )
                 if alike_in and alike_out and off.norm_sqr() < ti.static(_SAME_M**2):
                     known, slot = 1, packet * LANES + lane
     packet, lane = slot // LANES, slot % LANES
@@ -125,8 +147,14 @@ def store_turn(env, pos, d0, d1, io: Bundle[ForecastIO]):
     else:
         io.habits.next_slot[env] = (slot + 1) % ti.static(LANES * n_packet)
     keep, gain = 1.0 - 1.0 / weight, 1.0 / weight
-    came = keep * known * ti.Vector([io.habits.in_x[env, packet][lane], io.habits.in_y[env, packet][lane]]) + gain * d0
-    went = keep * known * ti.Vector([io.habits.out_x[env, packet][lane], io.habits.out_y[env, packet][lane]]) + gain * d1
+    came = (
+        keep * known * ti.Vector([io.habits.in_x[env, packet][lane], io.habits.in_y[env, packet][lane]])
+        + gain * d0
+    )
+    went = (
+        keep * known * ti.Vector([io.habits.out_x[env, packet][lane], io.habits.out_y[env, packet][lane]])
+        + gain * d1
+    )
     came, went = came.normalized(), went.normalized()
     io.habits.turn_x[env, packet][lane] = keep * io.habits.turn_x[env, packet][lane] * known + gain * pos[0]
     io.habits.turn_y[env, packet][lane] = keep * io.habits.turn_y[env, packet][lane] * known + gain * pos[1]
@@ -139,21 +167,29 @@ def store_turn(env, pos, d0, d1, io: Bundle[ForecastIO]):
 
 @ti.func
 def drop_passed(env, pos, course, moved, io: Bundle[ForecastIO]):
-    """A body that was expected to turn and has gone straight on past the place, in the last ``moved`` [m], takes one off its weight."""
+    """A body that was expected to turn and has gone straight on past the place, in the last ``moved`` [m],
+    takes one off its weight."""
     for packet in range(io.habits.weight.shape[1]):
         along, across = offsets(env, packet, pos, course, io.habits)
         for lane in ti.static(range(LANES)):
-            behind = along[lane] < -io.forecast_cfg.passed_m and along[lane] + moved >= -io.forecast_cfg.passed_m
-            if behind and across[lane] < ti.static(0.5 * io.forecast_cfg.across_m) and io.habits.weight[env, packet][lane] > 0.0:
+            behind = (
+                along[lane] < -io.forecast_cfg.passed_m and along[lane] + moved >= -io.forecast_cfg.passed_m
+            )
+            if (
+                behind
+                and across[lane] < ti.static(0.5 * io.forecast_cfg.across_m)
+                and io.habits.weight[env, packet][lane] > 0.0
+            ):
                 io.habits.weight[env, packet][lane] -= 1.0
 
 
-# -------------------------------------------------------------------------------------------------------------------- recall
+# ----------------------------------------------------------------------------------------------------- recall
 
 
 @ti.func
 def offsets(env, packet, pos, course, habits: In[HabitState]):
-    """Lanes: how far ahead along the course a remembered turn lies, and how far aside; FAR_M aside for those on another course."""
+    """Lanes: how far ahead along the course a remembered turn lies, and how far aside; FAR_M aside for those
+    on another course."""
     dx, dy = habits.turn_x[env, packet] - pos[0], habits.turn_y[env, packet] - pos[1]
     along = dx * course[0] + dy * course[1]
     aside = dx * course[1] - dy * course[0]
@@ -172,24 +208,35 @@ def next_turn(env, pos, course, habits: In[HabitState], forecast_cfg: Const[Fore
     for packet in range(habits.weight.shape[1]):
         along, across = offsets(env, packet, pos, course, habits)
         for lane in ti.static(range(LANES)):
-            meets = across[lane] < forecast_cfg.across_m + forecast_cfg.across_slope * along[lane] and along[lane] > -forecast_cfg.overdue_m
+            meets = (
+                across[lane] < forecast_cfg.across_m + forecast_cfg.across_slope * along[lane]
+                and along[lane] > -forecast_cfg.overdue_m
+            )
             if meets and along[lane] < gap:
                 gap, slot = along[lane], packet * LANES + lane
     out = course
     if gap < FAR_M:
         gap = ti.max(gap, 0.0)
-        out = ti.Vector([habits.out_x[env, slot // LANES][slot % LANES], habits.out_y[env, slot // LANES][slot % LANES]])
+        out = ti.Vector(
+            [habits.out_x[env, slot // LANES][slot % LANES], habits.out_y[env, slot // LANES][slot % LANES]]
+        )
     return gap, out
 
 
 @ti.func
 def wall_ahead(pos, course, radius, tank_cfg: Const[TankConfig]):
-    """Distance [m] along the course at which a body of that radius touches a side wall; it may be negative."""
+    """Distance [m] along the course at which a body of that radius touches a side wall; it may be
+    negative."""
     gap = FAR_M
     if ti.static(tank_cfg.shape == "circle"):
-        off = pos - ti.Vector([0.5 * (tank_cfg.x_m[0] + tank_cfg.x_m[1]), 0.5 * (tank_cfg.y_m[0] + tank_cfg.y_m[1])])
+        off = pos - ti.Vector(
+            [0.5 * (tank_cfg.x_m[0] + tank_cfg.x_m[1]), 0.5 * (tank_cfg.y_m[0] + tank_cfg.y_m[1])]
+        )
         half = off.dot(course)
-        gap = ti.sqrt(ti.max(half * half + ti.max(tank_cfg.radius_m - radius, 0.0) ** 2 - off.norm_sqr(), 0.0)) - half
+        gap = (
+            ti.sqrt(ti.max(half * half + ti.max(tank_cfg.radius_m - radius, 0.0) ** 2 - off.norm_sqr(), 0.0))
+            - half
+        )
     else:
         for side in ti.static(range(2)):
             low, high = ti.static((tank_cfg.x_m, tank_cfg.y_m)[side])
@@ -200,11 +247,20 @@ def wall_ahead(pos, course, radius, tank_cfg: Const[TankConfig]):
 
 
 @ti.func
-def next_event(env, pos, course, radius, habits: In[HabitState], forecast_cfg: Const[ForecastConfig], tank_cfg: Const[TankConfig]):
-    """(distance [m] to the next turn on a straight course, course after it): a remembered one, or the wall if that comes first.
+def next_event(
+    env,
+    pos,
+    course,
+    radius,
+    habits: In[HabitState],
+    forecast_cfg: Const[ForecastConfig],
+    tank_cfg: Const[TankConfig],
+):
+    """(distance [m] to the next turn on a straight course, course after it): a remembered one, or the wall if
+    that comes first.
 
-    At a wall bodies are expected to turn back: right for lines, and nearer than a mirrored course to what loops do, whose next leg goes
-    anywhere into the tank.
+    At a wall bodies are expected to turn back: right for lines, and nearer than a mirrored course to what
+    loops do, whose next leg goes anywhere into the tank.
     """
     gap, out = FAR_M, course
     if ti.static(forecast_cfg.use_habits):
@@ -217,11 +273,19 @@ def next_event(env, pos, course, radius, habits: In[HabitState], forecast_cfg: C
 
 
 @ti.func
-def expected_turn_rate(env, track, tracks: In[TrackState], forecast_cfg: Const[ForecastConfig], tracking_cfg: Const[TrackingConfig]):
-    """[rad/s] the filter's turn rate, where that explains the track better than none: most bodies go straight.
+def expected_turn_rate(
+    env,
+    track,
+    tracks: In[TrackState],
+    forecast_cfg: Const[ForecastConfig],
+    tracking_cfg: Const[TrackingConfig],
+):
+    """[rad/s] the filter's turn rate, where that explains the track better than none: most bodies go
+    straight.
 
-    Odds for a turn = density of rate 0 in the prior over that in the posterior (Savage-Dickey): an uncertain rate must stand out of its
-    noise by little, a well known one by more, for a prior as wide as this one makes small rates unlikely.
+    Odds for a turn = density of rate 0 in the prior over that in the posterior (Savage-Dickey): an uncertain
+    rate must stand out of its noise by little, a well known one by more, for a prior as wide as this one
+    makes small rates unlikely.
     """
     rate = 0.0
     if ti.static(forecast_cfg.use_turn_rate and tracking_cfg.turn_rate_sigma_rad_s > 0):
@@ -236,12 +300,28 @@ def expected_turn_rate(env, track, tracks: In[TrackState], forecast_cfg: Const[F
 
 @ti.func
 def coasted(
-    env, track, mean, time, habits: In[HabitState], tracks: In[TrackState], forecast_cfg: Const[ForecastConfig], tank_cfg: Const[TankConfig]
+    env,
+    track,
+    mean,
+    time,
+    habits: In[HabitState],
+    tracks: In[TrackState],
+    forecast_cfg: Const[ForecastConfig],
+    tank_cfg: Const[TankConfig],
 ):
-    """Mean (x, y, vx, vy) of an unseen body on a straight leg after ``time`` [s]: it turns where bodies turn."""
+    """Mean (x, y, vx, vy) of an unseen body on a straight leg after ``time`` [s]: it turns where bodies
+    turn."""
     speed = ti.max(ti.sqrt(mean[2] ** 2 + mean[3] ** 2), 1e-6)
     course, way = ti.Vector([mean[2] / speed, mean[3] / speed]), speed * time
-    gap, out = next_event(env, ti.Vector([mean[0], mean[1]]), course, tracks.radius_m[env, track], habits, forecast_cfg, tank_cfg)
+    gap, out = next_event(
+        env,
+        ti.Vector([mean[0], mean[1]]),
+        course,
+        tracks.radius_m[env, track],
+        habits,
+        forecast_cfg,
+        tank_cfg,
+    )
     before = ti.min(gap, way)
     after = way - before
     late = course

@@ -1,8 +1,9 @@
-"""What the camera says about the height of a tracked body: the column of pixels through its middle shows where it begins and ends.
+"""What the camera says about the height of a tracked body: the column of pixels through its middle shows
+where it begins and ends.
 
-Only what lies in the image and at the body's distance counts; a body cut by the image's edge or by something nearer tells one end, a
-column through which the camera sees farther tells where no body is. Feeds the height hypotheses of ``elevation.py``; sees the image and
-tracks only.
+Only what lies in the image and at the body's distance counts; a body cut by the image's edge or by something
+nearer tells one end, a column through which the camera sees farther tells where no body is. Feeds the height
+hypotheses of ``elevation.py``; sees the image and tracks only.
 """
 
 import taichi as ti
@@ -21,12 +22,14 @@ _TRUNCATED_M = 0.4
 """[m] farthest that the middle of a body may be from its one visible end."""
 
 _EDGE_M = 0.1
-"""[m] a column through the full water column must reach this close to floor and surface, and a middle is known this well."""
+"""[m] a column through the full water column must reach this close to floor and surface, and a middle is
+known this well."""
 
 _LEAST = 0.05
 """Likelihood of a height that the image contradicts."""
 
-# what a pixel of the column shows: something nearer than the body (or the image's edge), the body, something beyond it
+# what a pixel of the column shows: something nearer than the body (or the image's edge), the body, something
+# beyond it
 _HIDES = 0
 _BODY = 1
 _PAST = 2
@@ -56,7 +59,9 @@ def look_at(env, track, at, io: Bundle[LookIO]):
     focal, _, middle_col = ti.static(pinhole(io.depth_cfg))
     rpy = io.image.shot_rpy[env]
     R_wb = rotation_wb(quaternion_wb(rpy[0], rpy[1], rpy[2]))
-    eye = io.image.shot_pos_w[env] + R_wb @ ti.Vector([io.depth_cfg.offset_b_m[0], io.depth_cfg.offset_b_m[1], io.depth_cfg.offset_b_m[2]])
+    eye = io.image.shot_pos_w[env] + R_wb @ ti.Vector(
+        [io.depth_cfg.offset_b_m[0], io.depth_cfg.offset_b_m[1], io.depth_cfg.offset_b_m[2]]
+    )
     yaw_c, yaw_s = ti.cos(rpy[2]), ti.sin(rpy[2])
     off = at - ti.Vector([eye[0], eye[1]])
     ahead, left = yaw_c * off[0] + yaw_s * off[1], yaw_c * off[1] - yaw_s * off[0]
@@ -81,8 +86,8 @@ def look_at(env, track, at, io: Bundle[LookIO]):
 def column_ends(env, col, ahead, radius, eye_z, R_wb, io: Bundle[LookIO]):
     """What one column of pixels shows of a body ``ahead`` [m] of the camera.
 
-    (lowest, highest) z of its pixels, low > high where there are none; and whether it goes on unseen at its (lower, upper) end: beyond the
-    image's edge or behind something nearer.
+    (lowest, highest) z of its pixels, low > high where there are none; and whether it goes on unseen at its
+    (lower, upper) end: beyond the image's edge or behind something nearer.
     """
     focal, middle_row, middle_col = ti.static(pinhole(io.depth_cfg))
     left = (middle_col - col) / focal
@@ -111,7 +116,8 @@ def column_ends(env, col, ahead, radius, eye_z, R_wb, io: Bundle[LookIO]):
 
 @ti.func
 def shown_heights(ends, cut, io: Bundle[LookIO]):
-    """Likelihood per hypothesis of a body that shows between ends[0] and ends[1] and goes on beyond an edge where ``cut``."""
+    """Likelihood per hypothesis of a body that shows between ends[0] and ends[1] and goes on beyond an edge
+    where ``cut``."""
     step = ti.static((io.tank_cfg.z_m[1] - io.tank_cfg.z_m[0]) / COLUMN)
     middle = 0.5 * (ends[0] + ends[1])
     first, last = middle, middle
@@ -135,7 +141,8 @@ def shown_heights(ends, cut, io: Bundle[LookIO]):
 
 @ti.func
 def missing_heights(env, col, ahead, radius, eye_z, R_wb, io: Bundle[LookIO]):
-    """Likelihood per hypothesis of a body that does not show: less where the camera sees past the place of its middle."""
+    """Likelihood per hypothesis of a body that does not show: less where the camera sees past the place of
+    its middle."""
     focal, middle_row, middle_col = ti.static(pinhole(io.depth_cfg))
     tilt = R_wb[2, 0] + R_wb[2, 1] * (middle_col - col) / focal
     front = ahead - 0.5 * radius

@@ -1,21 +1,25 @@
 """Two-layer occupancy map from sonar and depth: M^s (what stays) and M^d (what moves), fused by max.
 
-One scan becomes binary indicators per cell (``fan.py``, ``evidence.py``), then the paper's two equations apply:
+One scan becomes binary indicators per cell (``fan.py``, ``evidence.py``), then the paper's two equations
+apply:
 
     M^s = clip((1 - lambda_s) M^s + eta_occ I^s-hit - eta_free I^free + eta_depth I^depth, 0, 1)
     M^d = clip((1 - lambda_d) M^d + eta_dyn I^d-hit - eta_dyn,free I^free, 0, 1)
 
-A return of either kind cancels I^free in its cell. What moves is told from observations only: compensated Doppler, a moving track, or a
-return where the map was confident of free water; it feeds M^d alone. A body that stops is promoted after ``promote_s``: without newer
-evidence of motion its returns then count as static ones, and M^d decays.
+A return of either kind cancels I^free in its cell. What moves is told from observations only: compensated
+Doppler, a moving track, or a return where the map was confident of free water; it feeds M^d alone. A body
+that stops is promoted after ``promote_s``: without newer evidence of motion its returns then count as static
+ones, and M^d decays.
 
-I^depth is "depth-gated consistency": a camera point at the vehicle's own depth counts where the sonar supports it (the cell is not free of
-static occupancy, or has a static return in this scan) and does not contradict it (no beam passed through), and where nothing moves (no
-dynamic return, M^d below the threshold): the camera alone cannot tell a passing body from a standing one.
+I^depth is "depth-gated consistency": a camera point at the vehicle's own depth counts where the sonar
+supports it (the cell is not free of static occupancy, or has a static return in this scan) and does not
+contradict it (no beam passed through), and where nothing moves (no dynamic return, M^d below the threshold):
+the camera alone cannot tell a passing body from a standing one.
 
-Nearly all of a map is water where both layers are 0 and stay so. Indicators and facts about cells are bits therefore, sixty-four cells a
-word; counters of free water are numbers written vertically (bit k of sixty-four counters is a word), and the equations run over the few
-cells that have a return, a point, or a layer that is not 0.
+Nearly all of a map is water where both layers are 0 and stay so. Indicators and facts about cells are bits
+therefore, sixty-four cells a word; counters of free water are numbers written vertically (bit k of sixty-four
+counters is a word), and the equations run over the few cells that have a return, a point, or a layer that is
+not 0.
 """
 
 import math
@@ -38,11 +42,12 @@ VANISHED = 1e-6
 _NO_SCAN = -(1 << 20)
 
 
-# ----------------------------------------------------------------------------------- plain Python, evaluated when a kernel is compiled
+# ---------------------------------------------------------- plain Python, evaluated when a kernel is compiled
 
 
 def map_period_s(mapping, sonar, episode):
-    """[s] between two mapped scans: the first multiple of the sonar's period that is no shorter than the map's own."""
+    """[s] between two mapped scans: the first multiple of the sonar's period that is no shorter than the
+    map's own."""
     return sonar.period_steps * math.ceil(mapping.period_steps / sonar.period_steps) * episode.control_dt_s
 
 
@@ -62,11 +67,13 @@ def decay_per_scan(decay, period_s):
 
 
 def scans_in(seconds, period_s):
-    """Scans that span ``seconds``, at least 1. Raises ValueError where the map's counters could not hold them."""
+    """Scans that span ``seconds``, at least 1. Raises ValueError where the map's counters could not hold
+    them."""
     count = max(1, math.ceil(seconds / period_s - 1e-6))
     if count > COUNTER_MAX:
         raise ValueError(
-            f"mapping: {seconds} s are {count} mapped scans, but the counters end at {COUNTER_MAX}: raise mapping.period_steps"
+            f"mapping: {seconds} s are {count} mapped scans, but the counters end at {COUNTER_MAX}: raise "
+            "mapping.period_steps"
         )
     return count
 
@@ -77,7 +84,7 @@ def bit_fields(grid_map):
     return m.confident, m.held, m.alive, m.seen, m.static_occupied, m.dynamic_occupied, m.depth_hit
 
 
-# ------------------------------------------------------------------------------------------------------------------------ merge
+# ------------------------------------------------------------------------------------------------------ merge
 
 
 @ti.func
@@ -99,7 +106,8 @@ def clipped(value):
 
 @ti.func
 def count_free(env, row, word, free, returned, confident_scans: Const[int], io: Bundle[MappingIO]):
-    """Counters of free water: one more where a cell is free and not yet confident, 0 where it has a return."""
+    """Counters of free water: one more where a cell is free and not yet confident, 0 where it has a
+    return."""
     sure = io.grid_map.confident[env, row, word]
     more = free & ~sure
     reset = returned & io.grid_map.seen[env, row, word]
@@ -134,11 +142,21 @@ def count_dynamic(env, row, word, free, dynamics, io: Bundle[MappingIO]):
 
 @ti.func
 def folded(
-    static_old, dynamic_old, static_hit, dynamic_hit, free, point, scan_s: Const[float], depth_s: Const[float], io: Bundle[MappingIO]
+    static_old,
+    dynamic_old,
+    static_hit,
+    dynamic_hit,
+    free,
+    point,
+    scan_s: Const[float],
+    depth_s: Const[float],
+    io: Bundle[MappingIO],
 ):
     """Both equations for one cell; indicators are 0 or 1."""
     supported = (static_hit == 1) | (static_old > 0.0)
-    depth_hit = ti.select(supported & (dynamic_old < io.mapping_cfg.occupied), point & ~dynamic_hit & ~free, 0)
+    depth_hit = ti.select(
+        supported & (dynamic_old < io.mapping_cfg.occupied), point & ~dynamic_hit & ~free, 0
+    )
     static_new = clipped(
         ti.static(1.0 - decay_per_scan(io.mapping_cfg.static_decay, scan_s)) * static_old
         + ti.static(per_scan(io.mapping_cfg.static_hit, scan_s)) * static_hit
@@ -154,12 +172,26 @@ def folded(
 
 
 @ti.func
-def fold_cells(env, row, word, statics, dynamics, free, points, scan_s: Const[float], depth_s: Const[float], io: Bundle[MappingIO]):
+def fold_cells(
+    env,
+    row,
+    word,
+    statics,
+    dynamics,
+    free,
+    points,
+    scan_s: Const[float],
+    depth_s: Const[float],
+    io: Bundle[MappingIO],
+):
     """Both equations for the cells of a word that have anything to fold, and what is then true of them."""
     alive = io.grid_map.alive[env, row, word]
     left = alive | statics | dynamics | points
     if left != 0:
-        static_occupied, dynamic_occupied = io.grid_map.static_occupied[env, row, word], io.grid_map.dynamic_occupied[env, row, word]
+        static_occupied, dynamic_occupied = (
+            io.grid_map.static_occupied[env, row, word],
+            io.grid_map.dynamic_occupied[env, row, word],
+        )
         while left != 0:
             i = lowest_bit(left)
             left = without_lowest(left)
@@ -175,17 +207,24 @@ def fold_cells(env, row, word, statics, dynamics, free, points, scan_s: Const[fl
                 depth_s,
                 io,
             )
-            io.grid_map.static_occ[env, row, col], io.grid_map.dynamic_occ[env, row, col] = static_new, dynamic_new
+            io.grid_map.static_occ[env, row, col], io.grid_map.dynamic_occ[env, row, col] = (
+                static_new,
+                dynamic_new,
+            )
             alive = with_bit(alive, i, (static_new > 0.0) | (dynamic_new > 0.0))
             static_occupied = with_bit(static_occupied, i, static_new >= io.mapping_cfg.occupied)
             dynamic_occupied = with_bit(dynamic_occupied, i, dynamic_new >= io.mapping_cfg.occupied)
         io.grid_map.alive[env, row, word] = alive
-        io.grid_map.static_occupied[env, row, word], io.grid_map.dynamic_occupied[env, row, word] = static_occupied, dynamic_occupied
+        io.grid_map.static_occupied[env, row, word], io.grid_map.dynamic_occupied[env, row, word] = (
+            static_occupied,
+            dynamic_occupied,
+        )
 
 
 @ti.func
 def fetch_cells(env, slot, io: Bundle[MappingIO]):
-    """Read one number of every word that holds something, so that memory answers many of them at once and not one after another."""
+    """Read one number of every word that holds something, so that memory answers many of them at once and not
+    one after another."""
     fetched = 0.0
     for row in range(ti.static(io.grid_map.alive.shape[1])):
         for word in range(ti.static(io.grid_map.alive.shape[2])):
@@ -196,7 +235,9 @@ def fetch_cells(env, slot, io: Bundle[MappingIO]):
 
 
 @ti.func
-def merge_scan(env, slot, scan_s: Const[float], depth_s: Const[float], confident_scans: Const[int], io: Bundle[MappingIO]):
+def merge_scan(
+    env, slot, scan_s: Const[float], depth_s: Const[float], confident_scans: Const[int], io: Bundle[MappingIO]
+):
     """Fold everything marked in the slot's scratch into an env's map, word by word; the marks are used up.
 
     Each strip of sixty-four columns goes upwards: an odd number of the fan's edges below means inside.
@@ -223,17 +264,20 @@ def merge_scan(env, slot, scan_s: Const[float], depth_s: Const[float], confident
     io.grid_map.depth_waits[env] = 0
 
 
-# ---------------------------------------------------------------------------------------------------------------------- kernels
+# ---------------------------------------------------------------------------------------------------- kernels
 
 
 @quick_launch
 @ti.kernel
 def update_map(io: Bundle[MappingIO]):
-    """Take a fresh image's points and fold a fresh scan that is due into both layers; else the map stays as it is."""
+    """Take a fresh image's points and fold a fresh scan that is due into both layers; else the map stays as
+    it is."""
     n_env, n_slot = ti.static(io.clock.awake.shape[0], io.map_scratch.fan_edge.shape[0])
     scan_s = ti.static(map_period_s(io.mapping_cfg, io.sonar_cfg, io.episode_cfg))
     depth_s = ti.static(depth_period_s(io.mapping_cfg, io.sonar_cfg, io.depth_cfg, io.episode_cfg))
-    confident, promote = ti.static(scans_in(io.mapping_cfg.free_confident_s, scan_s), scans_in(io.mapping_cfg.promote_s, scan_s))
+    confident, promote = ti.static(
+        scans_in(io.mapping_cfg.free_confident_s, scan_s), scans_in(io.mapping_cfg.promote_s, scan_s)
+    )
     # one thread has all of an env's bits, and does all of it while its scratch is in the cache
     for slot, pad in ti.ndrange(n_slot, ti.static(spread(n_slot))):
         if pad == 0:
@@ -263,6 +307,8 @@ def reset_map(io: Bundle[MappingIO]):
                 io.grid_map.dynamic_occ[env, row, col] = 0.0
                 io.grid_map.dynamic_scans[env, row, col] = ti.u8(0)
             for word in range(ti.static(io.grid_map.seen.shape[2])):
-                io.grid_map.free_scans[env, row, word] = ti.Vector.zero(ti.u64, ti.static(io.grid_map.free_scans.n))
+                io.grid_map.free_scans[env, row, word] = ti.Vector.zero(
+                    ti.u64, ti.static(io.grid_map.free_scans.n)
+                )
                 for words in ti.static(bit_fields(io.grid_map)):
                     words[env, row, word] = ti.cast(0, ti.u64)

@@ -1,4 +1,5 @@
-"""What a cluster says about a body of known radius: where its centre is, how surely, how well it fits a track (part of tracking)."""
+"""What a cluster says about a body of known radius: where its centre is, how surely, how well it fits a track
+(part of tracking)."""
 
 import taichi as ti
 
@@ -12,7 +13,8 @@ _CROSS_SIGMA_M = 0.02
 """Error of a centre across the beam beside that of its edges (EC)."""
 
 _EDGE_SIGMA = 0.25
-"""Error of the middle of two edges, in beam spacings: each is uniform within one spacing, sqrt(1 / 24) = 0.2, plus grazing loss."""
+"""Error of the middle of two edges, in beam spacings: each is uniform within one spacing, sqrt(1 / 24) = 0.2,
+plus grazing loss."""
 
 
 @ti.func
@@ -22,7 +24,8 @@ def bearing_vector(bearing):
 
 @ti.func
 def centre_sight(env, c, radius, io: Bundle[TrackingIO]):
-    """(bearing [rad], distance [m], half-angle [rad]) of the centre of a body of known radius; the open edge stands in for a hidden one."""
+    """(bearing [rad], distance [m], half-angle [rad]) of the centre of a body of known radius; the open edge
+    stands in for a hidden one."""
     distance = io.clusters.range_m[env, c] + ARC * radius
     half = radius / distance
     distance /= 1.0 - half * half / 6.0
@@ -56,11 +59,14 @@ def radius_variance(env, c, io: Bundle[TrackingIO]):
 
 @ti.func
 def pair_surprise(env, track, c, offset, io: Bundle[TrackingIO]):
-    """(squared normalised innovation of range, cross range and Doppler; product of their variances; the part of the position alone)."""
+    """(squared normalised innovation of range, cross range and Doppler; product of their variances; the part
+    of the position alone)."""
     mean, cov = io.tracks.state[env, track], io.tracks.cov[env, track]
     along = bearing_vector(io.clusters.bearing_w[env, c])
     across = ti.Vector([-along[1], along[0]])
-    radial_var, cross_var = centre_variances(env, c, io.tracks.radius_m[env, track], io.tracks.radius_var[env, track], io)
+    radial_var, cross_var = centre_variances(
+        env, c, io.tracks.radius_m[env, track], io.tracks.radius_var[env, track], io
+    )
     s_radial = position_variance(cov, along) + radial_var
     s_cross = position_variance(cov, across) + cross_var
     s_doppler = velocity_variance(cov, along) + io.clusters.doppler_var[env, c]

@@ -1,8 +1,10 @@
-"""Tracked bodies that the camera shows while the sonar does not: above or below the fan they are followed by the image.
+"""Tracked bodies that the camera shows while the sonar does not: above or below the fan they are followed by
+the image.
 
-Per column of the image the nearest thing before the known walls, at a height that matters; neighbouring columns make a spot. A spot
-that the sonar's beams show too is the sonar's affair; of the others each corrects the moving track that is expected nearest to it, by a
-position only: a depth camera measures no speed. Spots that are nobody's begin tracks. Sees the image, the scan and tracks only.
+Per column of the image the nearest thing before the known walls, at a height that matters; neighbouring
+columns make a spot. A spot that the sonar's beams show too is the sonar's affair; of the others each corrects
+the moving track that is expected nearest to it, by a position only: a depth camera measures no speed. Spots
+that are nobody's begin tracks. Sees the image, the scan and tracks only.
 """
 
 import taichi as ti
@@ -18,7 +20,8 @@ from uuvtai.kernels.perception.sighting import bearing_vector
 from uuvtai.kernels.perception.track_slots import clear_track
 
 _ROW_STRIDE = 2
-"""Rows of the image that are looked at: every second one; a body fills several within the range that matters."""
+"""Rows of the image that are looked at: every second one; a body fills several within the range that
+matters."""
 
 _ROUNDING_M = 1.0e-3
 """Far more than float32 rounds a distance by."""
@@ -33,7 +36,8 @@ _NEWLY_SEEN_S = 0.15
 @quick_launch
 @ti.kernel
 def scan_columns(io: Bundle[SpottingIO]):
-    """Horizontal distance of the nearest thing in every column of a fresh image, FAR_M = none within range, height band and walls."""
+    """Horizontal distance of the nearest thing in every column of a fresh image, FAR_M = none within range,
+    height band and walls."""
     n, n_packet = ti.static(io.clock.awake.shape[0], io.depth_cfg.cols // LANES)
     for env, packet, pad in ti.ndrange(n, n_packet, ti.static(spread(n * n_packet))):
         if pad == 0 and io.clock.awake[env] == 1 and io.image.fresh[env] == 1:
@@ -55,7 +59,8 @@ def eye_of(env, io: Bundle[SpottingIO]):
 
 @ti.func
 def column_distances(env, first_col, io: Bundle[SpottingIO]):
-    """(nearest thing, nearest thing in the first or last row looked at): horizontal distances [m] of sixteen columns, FAR_M = none."""
+    """(nearest thing, nearest thing in the first or last row looked at): horizontal distances [m] of sixteen
+    columns, FAR_M = none."""
     focal, middle_row, middle_col = ti.static(pinhole(io.depth_cfg))
     eye, R_wb = eye_of(env, io)
     left = ramp_lanes(ti.cast(first_col, ti.f32) - middle_col) * ti.static(-1.0 / focal)
@@ -76,17 +81,29 @@ def column_distances(env, first_col, io: Bundle[SpottingIO]):
         for i in ti.static(range(LANES)):
             away[i] = io.image.depth_m[env, row, first_col + i]
             spare[i] = limit[i] - away[i] * (length[i] - sway * ti.abs(up))
-        # a tilt changes a ray's level length by no more than ``sway``: most packets show nothing that is near enough
+        # a tilt changes a ray's level length by no more than ``sway``: most packets show nothing that is near
+        # enough
         if spare.max() > -_ROUNDING_M:
             for i in ti.static(range(LANES)):
                 x = R_wb[0, 0] + R_wb[0, 1] * left[i] + R_wb[0, 2] * up
                 y = R_wb[1, 0] + R_wb[1, 1] * left[i] + R_wb[1, 2] * up
                 z = R_wb[2, 0] + R_wb[2, 1] * left[i] + R_wb[2, 2] * up
                 level = away[i] * ti.sqrt(x * x + y * y)
-                shown = (away[i] < ti.static(NO_RETURN_SHARE * io.depth_cfg.max_range_m)) & (ti.abs(away[i] * z) < io.spotting_cfg.band_m)
-                shown = shown & (level < wall[i] - io.spotting_cfg.wall_margin_m) & (level < io.spotting_cfg.range_m)
+                shown = (away[i] < ti.static(NO_RETURN_SHARE * io.depth_cfg.max_range_m)) & (
+                    ti.abs(away[i] * z) < io.spotting_cfg.band_m
+                )
+                shown = (
+                    shown
+                    & (level < wall[i] - io.spotting_cfg.wall_margin_m)
+                    & (level < io.spotting_cfg.range_m)
+                )
                 near[i] = ti.min(near[i], ti.select(shown, level, FAR_M))
-                edge[i] = ti.min(edge[i], ti.select(shown & (row == 0 or row >= ti.static(io.depth_cfg.rows - _ROW_STRIDE)), level, FAR_M))
+                edge[i] = ti.min(
+                    edge[i],
+                    ti.select(
+                        shown & (row == 0 or row >= ti.static(io.depth_cfg.rows - _ROW_STRIDE)), level, FAR_M
+                    ),
+                )
     return near, edge
 
 
@@ -131,7 +148,8 @@ def bearing_of(col, R_wb, io: Bundle[SpottingIO]):
 def use_spot(env, first, last, near, edge, eye, R_wb, io: Bundle[SpottingIO]):
     """Match one spot with a track and correct that; a spot that is nobody's begins a track.
 
-    The spot: columns first..last; ``near`` [m] its smallest horizontal distance, ``edge`` [m] that in the image's first and last rows.
+    The spot: columns first..last; ``near`` [m] its smallest horizontal distance, ``edge`` [m] that in the
+    image's first and last rows.
     """
     from_left, from_right = bearing_of(first - 0.5, R_wb, io), bearing_of(last + 0.5, R_wb, io)
     width = wrapped_angle(from_left - from_right)
@@ -152,7 +170,8 @@ def use_spot(env, first, last, near, edge, eye, R_wb, io: Bundle[SpottingIO]):
 
 @ti.func
 def match_of(env, seen, along, late, io: Bundle[SpottingIO]):
-    """(track that most easily is what shows at ``seen`` [m], its centre minus where it is expected [m]); -1 where none is within reach.
+    """(track that most easily is what shows at ``seen`` [m], its centre minus where it is expected [m]); -1
+    where none is within reach.
 
     ``late`` [s] = how much newer the image is than the states.
     """
@@ -160,7 +179,11 @@ def match_of(env, seen, along, late, io: Bundle[SpottingIO]):
     for track in range(io.tracks.alive.shape[1]):
         if is_wanted(env, track, io) == 1:
             mean = io.tracks.state[env, track]
-            offset = seen + io.tracks.radius_m[env, track] * along - ti.Vector([mean[0] + late * mean[2], mean[1] + late * mean[3]])
+            offset = (
+                seen
+                + io.tracks.radius_m[env, track] * along
+                - ti.Vector([mean[0] + late * mean[2], mean[1] + late * mean[3]])
+            )
             gap = offset.norm() - reach_of(env, track, io)
             if gap < best_gap:
                 best, best_gap, best_offset = track, gap, offset
@@ -169,7 +192,8 @@ def match_of(env, seen, along, late, io: Bundle[SpottingIO]):
 
 @ti.func
 def is_off_fan(seen, env, io: Bundle[SpottingIO]):
-    """1 where the sonar's beams towards a place met nothing near it: what is there lies above or below the fan."""
+    """1 where the sonar's beams towards a place met nothing near it: what is there lies above or below the
+    fan."""
     own = io.scan.ping_pos_w[env]
     x, y = seen[0] - own[0], seen[1] - own[1]
     distance = ti.sqrt(x * x + y * y)
@@ -178,25 +202,38 @@ def is_off_fan(seen, env, io: Bundle[SpottingIO]):
     off = 1
     for k in range(-1, 2):
         ray = (middle + k + 2 * io.sonar_cfg.n_ray) % io.sonar_cfg.n_ray
-        if io.scan.hit[env, ray] == 1 and ti.abs(io.scan.range_m[env, ray] - distance) < io.spotting_cfg.split_m:
+        if (
+            io.scan.hit[env, ray] == 1
+            and ti.abs(io.scan.range_m[env, ray] - distance) < io.spotting_cfg.split_m
+        ):
             off = 0
     return off
 
 
 @ti.func
 def is_wanted(env, track, io: Bundle[SpottingIO]):
-    """1 for a track that moves, or was begun by the camera, and that neither the sonar saw lately nor this image already."""
-    moving = io.tracks.alive[env, track] == 1 and (io.tracks.moving[env, track] == 1 or io.tracks.spot_step[env, track] >= 0)
-    unseen = (io.clock.step[env] - io.tracks.seen_step[env, track]) * io.episode_cfg.control_dt_s > _NEWLY_SEEN_S
+    """1 for a track that moves, or was begun by the camera, and that neither the sonar saw lately nor this
+    image already."""
+    moving = io.tracks.alive[env, track] == 1 and (
+        io.tracks.moving[env, track] == 1 or io.tracks.spot_step[env, track] >= 0
+    )
+    unseen = (
+        io.clock.step[env] - io.tracks.seen_step[env, track]
+    ) * io.episode_cfg.control_dt_s > _NEWLY_SEEN_S
     return ti.cast(moving and unseen and io.tracks.spot_step[env, track] != io.clock.step[env], ti.i32)
 
 
 @ti.func
 def reach_of(env, track, io: Bundle[SpottingIO]):
-    """[m] how far from its place a track may be found: as far as it went unseen, if it has turned, within bounds."""
+    """[m] how far from its place a track may be found: as far as it went unseen, if it has turned, within
+    bounds."""
     seen = ti.max(io.tracks.seen_step[env, track], io.tracks.spot_step[env, track])
     mean = io.tracks.state[env, track]
-    way = ti.sqrt(mean[2] * mean[2] + mean[3] * mean[3]) * (io.clock.step[env] - seen) * io.episode_cfg.control_dt_s
+    way = (
+        ti.sqrt(mean[2] * mean[2] + mean[3] * mean[3])
+        * (io.clock.step[env] - seen)
+        * io.episode_cfg.control_dt_s
+    )
     return ti.min(io.spotting_cfg.gate_m + 2.0 * way, io.spotting_cfg.max_gate_m)
 
 
@@ -211,9 +248,13 @@ def correct_track(env, track, offset, along, cut, cut_high, io: Bundle[SpottingI
         + io.tracks.radius_var[env, track]
         + ti.select(cut_high, io.tracks.radius_m[env, track] ** 2, 0.0)
     )
-    cross_var = ti.static(io.spotting_cfg.sigma_m**2) + ti.select(cut, io.tracks.radius_m[env, track] ** 2, 0.0)
+    cross_var = ti.static(io.spotting_cfg.sigma_m**2) + ti.select(
+        cut, io.tracks.radius_m[env, track] ** 2, 0.0
+    )
     radial, cross = offset.dot(along), offset.dot(across)
-    surprise = radial * radial / (position_variance(cov, along) + radial_var) + cross * cross / (position_variance(cov, across) + cross_var)
+    surprise = radial * radial / (position_variance(cov, along) + radial_var) + cross * cross / (
+        position_variance(cov, across) + cross_var
+    )
     if surprise > io.spotting_cfg.turn_gate:
         speed = ti.sqrt(mean[2] * mean[2] + mean[3] * mean[3])
         cov[7] += ti.max(speed, 0.5) ** 2
@@ -224,7 +265,9 @@ def correct_track(env, track, offset, along, cut, cut_high, io: Bundle[SpottingI
     mean_r, cov_r, rate_r, link_r = corrected(mean, cov, rate, link, h, radial, radial_var)
     left = offset - ti.Vector([mean_r[0] - mean[0], mean_r[1] - mean[1]])
     h_cross = ti.Vector([across[0], across[1], 0.0, 0.0])
-    mean_c, cov_c, rate_c, link_c = corrected(mean_r, cov_r, rate_r, link_r, h_cross, left.dot(across), cross_var)
+    mean_c, cov_c, rate_c, link_c = corrected(
+        mean_r, cov_r, rate_r, link_r, h_cross, left.dot(across), cross_var
+    )
     io.tracks.state[env, track] = mean_c
     io.tracks.cov[env, track] = cov_c
     io.tracks.turn_rate[env, track] = rate_c
@@ -235,7 +278,8 @@ def correct_track(env, track, offset, along, cut, cut_high, io: Bundle[SpottingI
 
 @ti.func
 def begin_spotted(env, at, along, radius, late, height, io: Bundle[SpottingIO]):
-    """A track of a body that only the camera has seen yet, in a free slot, unless one is there already. It rests until it is seen again."""
+    """A track of a body that only the camera has seen yet, in a free slot, unless one is there already. It
+    rests until it is seen again."""
     slot = -1
     known = False
     for track in range(io.tracks.alive.shape[1]):

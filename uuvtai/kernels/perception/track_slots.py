@@ -1,4 +1,5 @@
-"""Which slot holds which body: lost tracks end, new ones begin, beams get the names of their tracks (part of the tracking stage)."""
+"""Which slot holds which body: lost tracks end, new ones begin, beams get the names of their tracks (part of
+the tracking stage)."""
 
 import taichi as ti
 
@@ -23,7 +24,8 @@ _SPOTTED_S = 0.3
 """[s] a body that the camera showed this lately is there, though beams pass above or below it."""
 
 _PEEKING_RADIUS_M = 0.2
-"""Least radius given to a body first seen past something nearer: half the size of the design's typical body."""
+"""Least radius given to a body first seen past something nearer: half the size of the design's typical
+body."""
 
 
 @ti.func
@@ -52,18 +54,27 @@ def clear_track(env, track, tracks: Out[TrackState]):
     tracks.spot_step[env, track] = -1
 
 
-# --------------------------------------------------------------------------------------------------------------------- prune
+# ------------------------------------------------------------------------------------------------------ prune
 
 
 @ti.func
 def prune_tracks(env, dt, io: Bundle[TrackingIO]):
-    """Weigh how high moving bodies may be, and end unmatched tracks that are not where they are expected, or doubled a matched one."""
+    """Weigh how high moving bodies may be, and end unmatched tracks that are not where they are expected, or
+    doubled a matched one."""
     for track in range(io.tracks.alive.shape[1]):
         if io.tracks.alive[env, track] == 1:
             remembered = ti.static(io.elevation_cfg.memory_s > 0) and io.tracks.moving[env, track] == 1
             if io.tracks.misses[env, track] == 0:
                 if remembered:
-                    weigh_seen(env, track, io.scan.ping_pos_w[env], io.tracks, io.elevation_cfg, io.sonar_cfg, io.tank_cfg)
+                    weigh_seen(
+                        env,
+                        track,
+                        io.scan.ping_pos_w[env],
+                        io.tracks,
+                        io.elevation_cfg,
+                        io.sonar_cfg,
+                        io.tank_cfg,
+                    )
             elif is_double(env, track, io):
                 clear_track(env, track, io.tracks)
             else:
@@ -79,9 +90,12 @@ def prune_tracks(env, dt, io: Bundle[TrackingIO]):
 
 @ti.func
 def is_forgotten(env, track, sight, dt, io: Bundle[TrackingIO]):
-    """1 where a moving body is hardly where it is expected any more: seen through within the fan, or unseen for long."""
+    """1 where a moving body is hardly where it is expected any more: seen through within the fan, or unseen
+    for long."""
     if sight == SEEN_THROUGH:
-        weigh_unseen(env, track, io.scan.ping_pos_w[env], dt, io.tracks, io.elevation_cfg, io.sonar_cfg, io.tank_cfg)
+        weigh_unseen(
+            env, track, io.scan.ping_pos_w[env], dt, io.tracks, io.elevation_cfg, io.sonar_cfg, io.tank_cfg
+        )
     io.tracks.present[env, track] *= ti.exp(-dt * ti.static(1.0 / max(io.elevation_cfg.memory_s, 1e-3)))
     return ti.cast(io.tracks.present[env, track] < io.elevation_cfg.gone_share, ti.i32)
 
@@ -90,17 +104,26 @@ def is_forgotten(env, track, sight, dt, io: Bundle[TrackingIO]):
 def is_lost(env, track, sight, io: Bundle[TrackingIO]):
     """1 where an unmatched track is seen through, or was unseen for too long (longer where hidden)."""
     unseen = (io.scan.ping_step[env] - io.tracks.seen_step[env, track]) * io.episode_cfg.control_dt_s
-    longest = ti.select(sight == BLOCKED, io.tracking_cfg.hidden_s, ti.static(io.tracking_cfg.max_misses * _MISS_S))
+    longest = ti.select(
+        sight == BLOCKED, io.tracking_cfg.hidden_s, ti.static(io.tracking_cfg.max_misses * _MISS_S)
+    )
     if io.tracks.spot_step[env, track] >= 0:  # the camera shows it
-        unseen = ti.min(unseen, (io.scan.ping_step[env] - io.tracks.spot_step[env, track]) * io.episode_cfg.control_dt_s)
+        unseen = ti.min(
+            unseen, (io.scan.ping_step[env] - io.tracks.spot_step[env, track]) * io.episode_cfg.control_dt_s
+        )
     spotted = io.tracks.spot_step[env, track] >= 0 and unseen < _SPOTTED_S
-    through = sight == SEEN_THROUGH and not spotted and (io.tracks.age[env, track] < CONFIRMED or unseen >= io.tracking_cfg.see_through_s)
+    through = (
+        sight == SEEN_THROUGH
+        and not spotted
+        and (io.tracks.age[env, track] < CONFIRMED or unseen >= io.tracking_cfg.see_through_s)
+    )
     return ti.cast(through or unseen > longest, ti.i32)
 
 
 @ti.func
 def sight_of(env, track, io: Bundle[TrackingIO]):
-    """What most beams through the middle of the predicted body say: SEEN_THROUGH, BLOCKED by something nearer, or 0 = neither."""
+    """What most beams through the middle of the predicted body say: SEEN_THROUGH, BLOCKED by something
+    nearer, or 0 = neither."""
     step = ti.static(TWO_PI / io.sonar_cfg.n_ray)
     own, mean, radius = io.scan.ping_pos_w[env], io.tracks.state[env, track], io.tracks.radius_m[env, track]
     dx, dy = mean[0] - own[0], mean[1] - own[1]
@@ -114,7 +137,9 @@ def sight_of(env, track, io: Bundle[TrackingIO]):
         past = io.scan.hit[env, ray] == 0 or io.scan.range_m[env, ray] > distance + slack
         through += ti.cast(past, ti.i32)
         before += ti.cast(io.scan.hit[env, ray] == 1 and io.scan.range_m[env, ray] < distance - slack, ti.i32)
-    return ti.select(2 * through > 2 * half + 1, SEEN_THROUGH, ti.select(2 * before > 2 * half + 1, BLOCKED, 0))
+    return ti.select(
+        2 * through > 2 * half + 1, SEEN_THROUGH, ti.select(2 * before > 2 * half + 1, BLOCKED, 0)
+    )
 
 
 @ti.func
@@ -130,12 +155,13 @@ def is_double(env, track, io: Bundle[TrackingIO]):
     return out
 
 
-# --------------------------------------------------------------------------------------------------------------------- spawn
+# ------------------------------------------------------------------------------------------------------ spawn
 
 
 @ti.func
 def spawn_tracks(env, io: Bundle[TrackingIO]):
-    """Begin a track for every unmatched cluster, unless it is a splinter of a body that is tracked already."""
+    """Begin a track for every unmatched cluster, unless it is a splinter of a body that is tracked
+    already."""
     for c in range(io.clusters.count[env]):
         if io.clusters.match[env, c] < 0:
             owner = owner_of(env, c, io)
@@ -153,17 +179,23 @@ def owner_of(env, c, io: Bundle[TrackingIO]):
     here = io.clusters.pos_w[env, c]
     for track in range(io.tracks.alive.shape[1]):
         if io.tracks.alive[env, track] == 1 and io.tracks.misses[env, track] == 0:
-            there, reach = io.tracks.state[env, track], io.tracks.radius_m[env, track] + io.tracking_cfg.min_radius_m
+            there, reach = (
+                io.tracks.state[env, track],
+                io.tracks.radius_m[env, track] + io.tracking_cfg.min_radius_m,
+            )
             close = (here[0] - there[0]) ** 2 + (here[1] - there[1]) ** 2 < reach * reach
             swing = ti.abs(io.clusters.doppler_m_s[env, c] - io.tracks.doppler_m_s[env, track])
-            if close and swing < ti.static(io.tracking_cfg.split_doppler_m_s + 3 * io.sonar_cfg.doppler_sigma_m_s):
+            if close and swing < ti.static(
+                io.tracking_cfg.split_doppler_m_s + 3 * io.sonar_cfg.doppler_sigma_m_s
+            ):
                 out = track
     return out
 
 
 @ti.func
 def free_slot(env, c, io: Bundle[TrackingIO]):
-    """A dead slot; else that of the least useful resting track: lost ones first, then the farthest if it is farther than the newcomer.
+    """A dead slot; else that of the least useful resting track: lost ones first, then the farthest if it is
+    farther than the newcomer.
 
     A newcomer with clear Doppler displaces any resting track. -1 = none.
     """
@@ -186,7 +218,8 @@ def free_slot(env, c, io: Bundle[TrackingIO]):
 
 @ti.func
 def begin_track(env, track, c, io: Bundle[TrackingIO]):
-    """A new track from one cluster: velocity along the bearing from the Doppler, unknown across. Displaces whoever had the slot."""
+    """A new track from one cluster: velocity along the bearing from the Doppler, unknown across. Displaces
+    whoever had the slot."""
     if io.tracks.alive[env, track] == 1 and io.tracks.pick[env, track] >= 0:
         io.clusters.match[env, io.tracks.pick[env, track]] = -1
     clear_track(env, track, io.tracks)
@@ -199,7 +232,13 @@ def begin_track(env, track, c, io: Bundle[TrackingIO]):
     radial_var, cross_var = centre_variances(env, c, radius, radius_var, io)
     cross_speed_var = ti.static(io.tracking_cfg.birth_speed_sigma_m_s**2)
     mean, cov = born(
-        centre, along, radial_var, cross_var, io.clusters.doppler_m_s[env, c], io.clusters.doppler_var[env, c], cross_speed_var
+        centre,
+        along,
+        radial_var,
+        cross_var,
+        io.clusters.doppler_m_s[env, c],
+        io.clusters.doppler_var[env, c],
+        cross_speed_var,
     )
     io.tracks.alive[env, track] = 1
     io.tracks.state[env, track] = mean
@@ -226,14 +265,19 @@ def name_beams(env, io: Bundle[TrackingIO]):
 
 @ti.func
 def carry_names(env, io: Bundle[TrackingIO]):
-    """Name the beams of a scan that is not tracked after the last one that was: same bearing, and a range at which that body can be."""
+    """Name the beams of a scan that is not tracked after the last one that was: same bearing, and a range at
+    which that body can be."""
     step = ti.static(TWO_PI / io.sonar_cfg.n_ray)
-    shift = ti.cast(ti.floor(wrapped_angle(io.scan.ping_yaw[env] - io.clusters.scan_yaw[env]) / step + 0.5), ti.i32)
+    shift = ti.cast(
+        ti.floor(wrapped_angle(io.scan.ping_yaw[env] - io.clusters.scan_yaw[env]) / step + 0.5), ti.i32
+    )
     for ray in range(io.sonar_cfg.n_ray):
         c = io.clusters.beam_cluster[env, (ray + shift + io.sonar_cfg.n_ray) % io.sonar_cfg.n_ray]
         name = -1
         if c >= 0 and io.scan.hit[env, ray] == 1:
             range_m = io.scan.range_m[env, ray]
-            if ti.abs(range_m - io.clusters.range_m[env, c]) < io.clusters.radius_m[env, c] + split_distance(range_m, io):
+            if ti.abs(range_m - io.clusters.range_m[env, c]) < io.clusters.radius_m[env, c] + split_distance(
+                range_m, io
+            ):
                 name = io.clusters.match[env, c]
         io.tracks.beam_track[env, ray] = name

@@ -1,8 +1,9 @@
 """Tracking: from clusters of beams to tracks of moving bodies. Sees sensor data and its own memory only.
 
-One scan: label beams - find clusters - predict - associate - update - prune - spawn - name beams. One Kalman filter per track on position
-and mean Doppler; all states refer to the ping of the newest tracked scan (``scan_step``). Static obstacles get tracks too, which must never
-be called moving: motion needs a speed and, as evidence, Doppler averaged over beams and time or a displacement seen between unhidden edges.
+One scan: label beams - find clusters - predict - associate - update - prune - spawn - name beams. One Kalman
+filter per track on position and mean Doppler; all states refer to the ping of the newest tracked scan
+(``scan_step``). Static obstacles get tracks too, which must never be called moving: motion needs a speed and,
+as evidence, Doppler averaged over beams and time or a displacement seen between unhidden edges.
 """
 
 import math
@@ -15,7 +16,13 @@ from uuvtai.kernels.perception.association import associate
 from uuvtai.kernels.perception.bundles import TrackingIO
 from uuvtai.kernels.perception.clustering import HELD_SIGMA_M_S, find_clusters, label_beams
 from uuvtai.kernels.perception.habits import coasted, expected_turn_rate
-from uuvtai.kernels.perception.track_slots import carry_names, clear_track, name_beams, prune_tracks, spawn_tracks
+from uuvtai.kernels.perception.track_slots import (
+    carry_names,
+    clear_track,
+    name_beams,
+    prune_tracks,
+    spawn_tracks,
+)
 from uuvtai.kernels.perception.track_update import update_tracks
 
 
@@ -39,14 +46,17 @@ def reset_tracks(io: Bundle[TrackingIO]):
 
 
 def tracked_period_s(tracking, sonar, rules):
-    """[s] between two tracked scans: the first multiple of the sonar's period that is no shorter than the tracking's own."""
+    """[s] between two tracked scans: the first multiple of the sonar's period that is no shorter than the
+    tracking's own."""
     return sonar.period_steps * math.ceil(tracking.period_steps / sonar.period_steps) * rules.control_dt_s
 
 
 def track_bodies(io: TrackingIO) -> None:
-    """Bring the tracks of the awake rows to the newest scan, where one has come and the last tracked one is ``period_steps`` old.
+    """Bring the tracks of the awake rows to the newest scan, where one has come and the last tracked one is
+    ``period_steps`` old.
 
-    Four kernels, launched in turn: as one they compile three times as long, for the compiler's time grows faster than a kernel's size.
+    Four kernels, launched in turn: as one they compile three times as long, for the compiler's time grows
+    faster than a kernel's size.
     """
     take_scan(io)
     cluster_beams(io)
@@ -104,17 +114,21 @@ def keep_slots(io: Bundle[TrackingIO]):
             carry_names(env, io)
 
 
-# --------------------------------------------------------------------------------------------------------------------- clock
+# ------------------------------------------------------------------------------------------------------ clock
 
 
 @ti.func
 def is_due(env, io: Bundle[TrackingIO]):
     """1 where a scan has come that is to be tracked."""
     last = io.clusters.scan_step[env]
-    return ti.cast(io.scan.fresh[env] == 1 and (last < 0 or io.scan.ping_step[env] - last >= io.tracking_cfg.period_steps), ti.i32)
+    return ti.cast(
+        io.scan.fresh[env] == 1
+        and (last < 0 or io.scan.ping_step[env] - last >= io.tracking_cfg.period_steps),
+        ti.i32,
+    )
 
 
-# ------------------------------------------------------------------------------------------------------------------- predict
+# ---------------------------------------------------------------------------------------------------- predict
 
 
 @ti.func
@@ -138,8 +152,20 @@ def predict_tracks(env, io: Bundle[TrackingIO]):
             )
             if ti.static(io.forecast_cfg.use_coasting):
                 unseen = io.tracks.moving[env, track] == 1 and io.tracks.misses[env, track] > 0
-                if unseen and expected_turn_rate(env, track, io.tracks, io.forecast_cfg, io.tracking_cfg) == 0.0:
-                    mean = coasted(env, track, io.tracks.state[env, track], dt, io.habits, io.tracks, io.forecast_cfg, io.tank_cfg)
+                if (
+                    unseen
+                    and expected_turn_rate(env, track, io.tracks, io.forecast_cfg, io.tracking_cfg) == 0.0
+                ):
+                    mean = coasted(
+                        env,
+                        track,
+                        io.tracks.state[env, track],
+                        dt,
+                        io.habits,
+                        io.tracks,
+                        io.forecast_cfg,
+                        io.tank_cfg,
+                    )
             io.tracks.state[env, track] = mean
             io.tracks.cov[env, track] = cov
             io.tracks.turn_cov[env, track] = link

@@ -1,4 +1,5 @@
-"""Columns of what the behaviour tree says: its action, and why. It sees sensor data and memory only, so whoever reads it does too."""
+"""Columns of what the behaviour tree says: its action, and why. It sees sensor data and memory only, so
+whoever reads it does too."""
 
 import taichi as ti
 
@@ -7,7 +8,13 @@ from uuvtai.kernels.core.columns import ColumnGroup
 from uuvtai.kernels.core.signature import Bundle
 from uuvtai.kernels.planning.bundles import FeaturesIO
 
-CLASSES = ((codes.BACK_OFF,), (codes.EVADE,), (codes.HOLD,), (codes.UNSTICK,), (codes.FOLLOW_ROUTE, codes.DRIVE_STRAIGHT))
+CLASSES = (
+    (codes.BACK_OFF,),
+    (codes.EVADE,),
+    (codes.HOLD,),
+    (codes.UNSTICK,),
+    (codes.FOLLOW_ROUTE, codes.DRIVE_STRAIGHT),
+)
 """Leaves by class: emergency, evade, wait, unstick, travel."""
 
 N_CLASS = len(CLASSES)
@@ -49,8 +56,31 @@ def _class(env, io: Bundle[FeaturesIO]):
 
 
 TEACHER_COLUMNS = (
-    ColumnGroup("teacher_action", 4, "1", "body", "surge, sway, heave, yaw rate of the tree, in parts of the vehicle's limits", _action),
-    ColumnGroup("teacher_conflict", 1, "s", "route", "until following the route comes too close to a forecast body, capped", _conflict),
-    ColumnGroup("teacher_evade_cost", 1, "1", "route", "cost of the evasion that is driven; 0 = none is", _evade_cost),
-    ColumnGroup("teacher_class", N_CLASS, "1", "route", "1 = acts: emergency, evade, wait, unstick, travel; all 0 = no leaf", _class),
+    ColumnGroup(
+        "teacher_action",
+        4,
+        "1",
+        "body",
+        "surge, sway, heave, yaw rate of the tree, in parts of the vehicle's limits",
+        _action,
+    ),
+    ColumnGroup(
+        "teacher_conflict",
+        1,
+        "s",
+        "route",
+        "until following the route comes too close to a forecast body, capped",
+        _conflict,
+    ),
+    ColumnGroup(
+        "teacher_evade_cost", 1, "1", "route", "cost of the evasion that is driven; 0 = none is", _evade_cost
+    ),
+    ColumnGroup(
+        "teacher_class",
+        N_CLASS,
+        "1",
+        "route",
+        "1 = acts: emergency, evade, wait, unstick, travel; all 0 = no leaf",
+        _class,
+    ),
 )

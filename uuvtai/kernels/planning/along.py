@@ -1,4 +1,5 @@
-"""Where things are along a route: the vehicle's foot, and points ahead of it. Lengths are measured back from the goal (way_left_m)."""
+"""Where things are along a route: the vehicle's foot, and points ahead of it. Lengths are measured back from
+the goal (way_left_m)."""
 
 import taichi as ti
 
@@ -30,12 +31,15 @@ def foot_of(route: In[RouteState], env, arc):
 def left_of_foot(route: In[RouteState], env):
     """Route length from the foot to the goal [m]."""
     i = segment_of(route, env, route.arc[env])
-    return route.way_left_m[env, i] + (route.way_left_m[env, i + 1] - route.way_left_m[env, i]) * (route.arc[env] - i)
+    return route.way_left_m[env, i] + (route.way_left_m[env, i + 1] - route.way_left_m[env, i]) * (
+        route.arc[env] - i
+    )
 
 
 @ti.func
 def point_left(route: In[RouteState], env, first, left_m):
-    """(point, its segment) with route length ``left_m`` still to go [m], from segment ``first`` on; beyond the goal: the goal."""
+    """(point, its segment) with route length ``left_m`` still to go [m], from segment ``first`` on; beyond
+    the goal: the goal."""
     i = first
     while i < route.n_way[env] - 2 and route.way_left_m[env, i + 1] > left_m:
         i += 1
@@ -46,12 +50,15 @@ def point_left(route: In[RouteState], env, first, left_m):
 
 @ti.func
 def advanced_arc(route: In[RouteState], env, pos_w, route_cfg: Const[RouteConfig]):
-    """Foot of the vehicle: the nearest point of the route from the last foot on, within progress_window_m. It never moves back."""
+    """Foot of the vehicle: the nearest point of the route from the last foot on, within progress_window_m. It
+    never moves back."""
     arc = route.arc[env]
     first = segment_of(route, env, arc)
     nearest = (pos_w - foot_of(route, env, arc)).norm_sqr()
     out, i = arc, first
-    while i < route.n_way[env] - 1 and route.way_left_m[env, first] - route.way_left_m[env, i] <= ti.static(route_cfg.progress_window_m):
+    while i < route.n_way[env] - 1 and route.way_left_m[env, first] - route.way_left_m[env, i] <= ti.static(
+        route_cfg.progress_window_m
+    ):
         a, along = route.way_w[env, i], route.way_w[env, i + 1] - route.way_w[env, i]
         share = ti.math.clamp((pos_w - a).dot(along) / ti.max(along.norm_sqr(), 1e-12), 0.0, 1.0)
         if i == first:
@@ -64,8 +71,11 @@ def advanced_arc(route: In[RouteState], env, pos_w, route_cfg: Const[RouteConfig
 
 
 @ti.func
-def look_along(route: Out[RouteState], env, pos_w, route_cfg: Const[RouteConfig], mapping_cfg: Const[MappingConfig]):
-    """Fill ``ahead_w``: points of the route one cell apart, from the foot to risk_horizon_m ahead or the goal. No route: own place."""
+def look_along(
+    route: Out[RouteState], env, pos_w, route_cfg: Const[RouteConfig], mapping_cfg: Const[MappingConfig]
+):
+    """Fill ``ahead_w``: points of the route one cell apart, from the foot to risk_horizon_m ahead or the
+    goal. No route: own place."""
     route.ahead_w[env, 0] = pos_w
     route.n_ahead[env] = 1
     if route.n_way[env] > 0:
@@ -75,6 +85,8 @@ def look_along(route: Out[RouteState], env, pos_w, route_cfg: Const[RouteConfig]
         route.n_ahead[env] = ti.min(count, ti.static(route.ahead_w.shape[1]))
         i = segment_of(route, env, route.arc[env])
         for k in range(route.n_ahead[env]):
-            point, i_found = point_left(route, env, i, left - ti.min(k * ti.static(mapping_cfg.cell_m), length))
+            point, i_found = point_left(
+                route, env, i, left - ti.min(k * ti.static(mapping_cfg.cell_m), length)
+            )
             route.ahead_w[env, k] = point
             i = i_found

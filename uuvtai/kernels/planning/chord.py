@@ -1,7 +1,8 @@
 """Straightening a path of cells: chords that stay traversable and cost less replace runs of cells.
 
-Positions here are in cells, (col, row) = (x, y) from the grid's outer corner. The cost of a line is the integral of the weight
-1 / max(clearance, eps) of the cells it passes: the paper's sum with every segment bounded by one cell, so that long hops cannot cheat it.
+Positions here are in cells, (col, row) = (x, y) from the grid's outer corner. The cost of a line is the
+integral of the weight 1 / max(clearance, eps) of the cells it passes: the paper's sum with every segment
+bounded by one cell, so that long hops cannot cheat it.
 """
 
 import taichi as ti
@@ -27,7 +28,8 @@ _GAIN = 1.0e-4
 
 @ti.func
 def chord_cost(slot, a, b, bound, io: Bundle[VoronoiIO]):
-    """Cost [cells / m] of the straight line a to b, cell by cell; FAR_M where it leaves the traversable cells or exceeds ``bound``."""
+    """Cost [cells / m] of the straight line a to b, cell by cell; FAR_M where it leaves the traversable cells
+    or exceeds ``bound``."""
     along = b - a
     length = along.norm()
     row, col = ti.cast(ti.floor(a[1]), ti.i32), ti.cast(ti.floor(a[0]), ti.i32)
@@ -54,7 +56,10 @@ def chord_cost(slot, a, b, bound, io: Bundle[VoronoiIO]):
             walking = 0
         else:
             at_corner = ti.abs(to_col - to_row) < near_corner
-            if at_corner and (io.voronoi.weight[slot, row + step_row, col] <= 0 or io.voronoi.weight[slot, row, col + step_col] <= 0):
+            if at_corner and (
+                io.voronoi.weight[slot, row + step_row, col] <= 0
+                or io.voronoi.weight[slot, row, col + step_col] <= 0
+            ):
                 open_cells = 0
             if to_col <= to_row:
                 col += step_col
@@ -72,7 +77,8 @@ def chord_cost(slot, a, b, bound, io: Bundle[VoronoiIO]):
 
 @ti.func
 def path_cells(slot, start, goal, io: Bundle[VoronoiIO]):
-    """Write the cells from start to goal; returns how many (at least 2: both ends may be the same cell), 0 where they do not fit."""
+    """Write the cells from start to goal; returns how many (at least 2: both ends may be the same cell), 0
+    where they do not fit."""
     n_col, room = ti.static(io.voronoi.cost.shape[2], io.voronoi.path_cell.shape[1])
     row, col = start[0], start[1]
     io.voronoi.path_cell[slot, 0] = row * n_col + col
@@ -109,7 +115,8 @@ def _cost_to_go(slot, i, io: Bundle[VoronoiIO]):
 
 @ti.func
 def _cells_cost(slot, i, j, n_cell, start_at, goal_at, io: Bundle[VoronoiIO]):
-    """Cost of going along the cells from path index i to j. At the ends the way to the cell's centre is added: an upper bound."""
+    """Cost of going along the cells from path index i to j. At the ends the way to the cell's centre is
+    added: an upper bound."""
     cost = _cost_to_go(slot, i, io) - _cost_to_go(slot, j, io)
     if i == 0:
         cost += _detour(slot, start_at, io)
@@ -126,7 +133,8 @@ def _detour(slot, at, io: Bundle[VoronoiIO]):
 
 @ti.func
 def straightened_cost(slot, n_cell, start_at, goal_at, io: Bundle[VoronoiIO]):
-    """Choose for every node of the path (every fourth cell) the best continuation by dynamic programming from the goal; total cost."""
+    """Choose for every node of the path (every fourth cell) the best continuation by dynamic programming from
+    the goal; total cost."""
     last = (n_cell - 2) // STRIDE + 1
     io.voronoi.node_cost[slot, last] = 0.0
     for back in range(last):
@@ -134,7 +142,9 @@ def straightened_cost(slot, n_cell, start_at, goal_at, io: Bundle[VoronoiIO]):
         i = node * STRIDE
         here = _point(slot, i, n_cell, start_at, goal_at, io)
         j = ti.min(i + STRIDE, n_cell - 1)
-        best = (1.0 + _GAIN) * _cells_cost(slot, i, j, n_cell, start_at, goal_at, io) + io.voronoi.node_cost[slot, node + 1]
+        best = (1.0 + _GAIN) * _cells_cost(slot, i, j, n_cell, start_at, goal_at, io) + io.voronoi.node_cost[
+            slot, node + 1
+        ]
         chosen, span = 0, 1
         while span > 0:
             k = ti.min((node + span) * STRIDE, n_cell - 1)
@@ -157,8 +167,11 @@ def _next_span(span, longest):
 
 
 @ti.func
-def count_of_waypoints(slot, env, n_cell, start_at, goal_at, origin, cell_m, spacing, write, io: Bundle[VoronoiIO]):
-    """Go along the chosen chords and cells; returns the number of waypoints, and writes them where ``write`` is 1."""
+def count_of_waypoints(
+    slot, env, n_cell, start_at, goal_at, origin, cell_m, spacing, write, io: Bundle[VoronoiIO]
+):
+    """Go along the chosen chords and cells; returns the number of waypoints, and writes them where ``write``
+    is 1."""
     last = (n_cell - 2) // STRIDE + 1
     at = origin + start_at * cell_m
     if write == 1:

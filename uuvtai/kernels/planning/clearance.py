@@ -1,20 +1,25 @@
-"""Clearance delta = min(d_occ, d_bnd): exact Euclidean distance transform, truncated at ``max_m``, with the nearest site of every cell.
+"""Clearance delta = min(d_occ, d_bnd): exact Euclidean distance transform, truncated at ``max_m``, with the
+nearest site of every cell.
 
-Sites are the occupied cells and the cells outside the tank, so one transform gives the minimum of both distances. Two passes (the
-separation of Felzenszwalb and Huttenlocher): the nearest site within each row, then the best row of each cell's window, sixteen columns at
-a time (rows are the short way across the tank, and packets of one column range stay aligned). Both carry one integer key per cell that
-orders candidates by distance and holds the site, so that taking the smallest key settles everything:
+Sites are the occupied cells and the cells outside the tank, so one transform gives the minimum of both
+distances. Two passes (the separation of Felzenszwalb and Huttenlocher): the nearest site within each row,
+then the best row of each cell's window, sixteen columns at a time (rows are the short way across the tank,
+and packets of one column range stay aligned). Both carry one integer key per cell that orders candidates by
+distance and holds the site, so that taking the smallest key settles everything:
 
-    key = (2 * d^2 + right) << bits | row offset + reach      [cells]; right = 1 where the site's column is the larger one
+    key = (2 * d^2 + right) << bits | row offset + reach      [cells]; right = 1 where the site's column is
+    the larger one
 
-Equally near sites: one to the left (or straight above or below) wins over one to the right, then the one in the lower row.
+Equally near sites: one to the left (or straight above or below) wins over one to the right, then the one in
+the lower row.
 
-Most of the water is far from everything, and little changes from one map to the next. So packets without a site in reach of their row
-cost nothing in the second pass (``near_up``, ``near_down``: a bit a row), and of a map that changed only those packets are redone that a
-new or a vanished site can concern: those it lies no farther from than the farthest of their own sites. The result is the same.
+Most of the water is far from everything, and little changes from one map to the next. So packets without a
+site in reach of their row cost nothing in the second pass (``near_up``, ``near_down``: a bit a row), and of a
+map that changed only those packets are redone that a new or a vanished site can concern: those it lies no
+farther from than the farthest of their own sites. The result is the same.
 
-``inflate_m`` shortens the distance to a nearest site that is an obstacle. Where the boundary is nearest it alone counts, though a
-little beyond it, by less than ``inflate_m``, an inflated obstacle may be nearer.
+``inflate_m`` shortens the distance to a nearest site that is an obstacle. Where the boundary is nearest it
+alone counts, though a little beyond it, by less than ``inflate_m``, an inflated obstacle may be nearer.
 """
 
 import math
@@ -33,7 +38,7 @@ _MAX_CHANGES = 48
 """Sites that may change before redoing everything is cheaper than finding what they concern."""
 
 
-# ----------------------------------------------------------------------------------- plain Python, evaluated when a kernel is compiled
+# ---------------------------------------------------------- plain Python, evaluated when a kernel is compiled
 
 
 def squared_limit(cfg, mapping):
@@ -59,7 +64,7 @@ def no_site(cfg, mapping):
     return 2 * (squared_limit(cfg, mapping) + 1) << offset_bits(cfg, mapping)
 
 
-# ------------------------------------------------------------------------------------------------------------------------ sites
+# ------------------------------------------------------------------------------------------------------ sites
 
 
 @ti.func
@@ -93,17 +98,20 @@ def take_sites(env, slot, limit: Const[int], io: Bundle[ClearanceIO]):
 
 @ti.func
 def mark_stale(env, slot, site_row, site_col, limit: Const[int], io: Bundle[ClearanceIO]):
-    """Mark the packets that a changed site may concern: it lies no farther from them than the farthest of their sites."""
+    """Mark the packets that a changed site may concern: it lies no farther from them than the farthest of
+    their sites."""
     n_row, n_packet = ti.static(io.clearance_memory.farthest.shape[1:])
     reach = ti.static(math.isqrt(limit))
-    for packet in range(ti.max(site_col - reach, 0) // LANES, ti.min((site_col + reach) // LANES, n_packet - 1) + 1):
+    for packet in range(
+        ti.max(site_col - reach, 0) // LANES, ti.min((site_col + reach) // LANES, n_packet - 1) + 1
+    ):
         cols = ti.max(packet * LANES - site_col, site_col - packet * LANES - (LANES - 1), 0)
         for row in range(ti.max(site_row - reach, 0), ti.min(site_row + reach + 1, n_row)):
             if (row - site_row) ** 2 + cols * cols <= io.clearance_memory.farthest[env, row, packet]:
                 put_bit(io.clearance_memory.stale, slot, packet, row)
 
 
-# ----------------------------------------------------------------------------------------------------------------------- passes
+# ----------------------------------------------------------------------------------------------------- passes
 
 
 @ti.func
@@ -113,7 +121,9 @@ def next_site(env, row, first_col, io: Bundle[ClearanceIO]):
     word = first_col // WORD
     found = ti.cast(0, ti.u64)
     if word < n_word:
-        found = io.clearance_memory.sites[env, row, word] & (~ti.cast(0, ti.u64) << ti.cast(first_col % WORD, ti.u64))
+        found = io.clearance_memory.sites[env, row, word] & (
+            ~ti.cast(0, ti.u64) << ti.cast(first_col % WORD, ti.u64)
+        )
     while found == 0 and word + 1 < n_word:
         word += 1
         found = io.clearance_memory.sites[env, row, word]
@@ -122,8 +132,11 @@ def next_site(env, row, first_col, io: Bundle[ClearanceIO]):
 
 @ti.func
 def row_keys(sites, left_gap, right_gap, io: Bundle[ClearanceIO]):
-    """Keys of the nearest site in the same row for sixteen cells; gaps [cells] lie between their ends and the sites beyond."""
-    reach, bits = ti.static(window_reach(io.clearance_cfg, io.mapping_cfg), offset_bits(io.clearance_cfg, io.mapping_cfg))
+    """Keys of the nearest site in the same row for sixteen cells; gaps [cells] lie between their ends and the
+    sites beyond."""
+    reach, bits = ti.static(
+        window_reach(io.clearance_cfg, io.mapping_cfg), offset_bits(io.clearance_cfg, io.mapping_cfg)
+    )
     to_left, to_right = i16x(0), i16x(0)
     left, right = left_gap - 1, right_gap - 1
     for i in ti.static(range(LANES)):
@@ -149,7 +162,9 @@ def scan_row(env, slot, row, io: Bundle[ClearanceIO]):
     for packet in range(n_packet):
         first = packet * LANES
         sites = ti.cast(
-            (io.clearance_memory.sites[env, row, first // WORD] >> ti.cast(first % WORD, ti.u64)) & ti.cast(0xFFFF, ti.u64), ti.i32
+            (io.clearance_memory.sites[env, row, first // WORD] >> ti.cast(first % WORD, ti.u64))
+            & ti.cast(0xFFFF, ti.u64),
+            ti.i32,
         )
         left_gap, right_gap = first - last, next_site(env, row, first + LANES, io) - (first + LANES - 1)
         if sites != 0 or ti.min(left_gap, right_gap) <= reach:
@@ -157,7 +172,9 @@ def scan_row(env, slot, row, io: Bundle[ClearanceIO]):
             put_bit(io.clearance_memory.near_up, slot, packet, row)
             put_bit(io.clearance_memory.near_down, slot, packet, n_row - 1 - row)
         else:
-            io.clearance_memory.row_key[slot, row, packet] = i16x(ti.static(no_site(io.clearance_cfg, io.mapping_cfg)))
+            io.clearance_memory.row_key[slot, row, packet] = i16x(
+                ti.static(no_site(io.clearance_cfg, io.mapping_cfg))
+            )
         if sites != 0:
             last = first + highest_bit(ti.cast(sites, ti.u64))
 
@@ -175,7 +192,8 @@ def bits_from(words: In[ti.Field], slot, packet, first):
 
 @ti.func
 def keys_at(slot, row, packet, offset, io: Bundle[ClearanceIO]):
-    """Keys of the rows ``offset`` below and above; beyond the grid its last row stands in, taken for farther than it is."""
+    """Keys of the rows ``offset`` below and above; beyond the grid its last row stands in, taken for farther
+    than it is."""
     last = ti.static(io.clearance_memory.farthest.shape[1] - 1)
     farther = 2 * offset * offset << ti.static(offset_bits(io.clearance_cfg, io.mapping_cfg))
     below = io.clearance_memory.row_key[slot, ti.max(row - offset, 0), packet] + (farther - offset)
@@ -185,9 +203,12 @@ def keys_at(slot, row, packet, offset, io: Bundle[ClearanceIO]):
 
 @ti.func
 def best_keys(slot, row, packet, io: Bundle[ClearanceIO]):
-    """Smallest keys over the rows with a site, nearest first; it ends where no farther row can be better for any of the sixteen cells."""
+    """Smallest keys over the rows with a site, nearest first; it ends where no farther row can be better for
+    any of the sixteen cells."""
     n_row = ti.static(io.clearance_memory.farthest.shape[1])
-    reach, bits = ti.static(window_reach(io.clearance_cfg, io.mapping_cfg), offset_bits(io.clearance_cfg, io.mapping_cfg))
+    reach, bits = ti.static(
+        window_reach(io.clearance_cfg, io.mapping_cfg), offset_bits(io.clearance_cfg, io.mapping_cfg)
+    )
     offsets = bits_from(io.clearance_memory.near_up, slot, packet, row) | bits_from(
         io.clearance_memory.near_down, slot, packet, n_row - 1 - row
     )
@@ -223,12 +244,18 @@ def write_packet(env, slot, row, packet, io: Bundle[ClearanceIO]):
     signed_cols = cols * (2 * ((key >> bits) & 1) - 1)
     for i in ti.static(range(LANES)):
         distance = ti.sqrt(ti.cast(squared[i], ti.f32)) * io.mapping_cfg.cell_m
-        io.clearance.clearance_m[env, row, packet * LANES + i] = ti.select(squared[i] <= limit, distance, io.clearance_cfg.max_m)
+        io.clearance.clearance_m[env, row, packet * LANES + i] = ti.select(
+            squared[i] <= limit, distance, io.clearance_cfg.max_m
+        )
     for i in ti.static(range(LANES)):
-        io.clearance.site_row[env, row, packet * LANES + i] = ti.cast(ti.select(squared[i] <= limit, row + rows[i], -1), ti.i16)
+        io.clearance.site_row[env, row, packet * LANES + i] = ti.cast(
+            ti.select(squared[i] <= limit, row + rows[i], -1), ti.i16
+        )
     for i in ti.static(range(LANES)):
         col = packet * LANES + i + signed_cols[i]
-        io.clearance.site_col[env, row, packet * LANES + i] = ti.cast(ti.select(squared[i] <= limit, col, -1), ti.i16)
+        io.clearance.site_col[env, row, packet * LANES + i] = ti.cast(
+            ti.select(squared[i] <= limit, col, -1), ti.i16
+        )
     if ti.static(io.clearance_cfg.inflate_m > 0):
         shorten(env, row, packet, io)
 
@@ -237,12 +264,17 @@ def write_packet(env, slot, row, packet, io: Bundle[ClearanceIO]):
 def shorten(env, row, packet, io: Bundle[ClearanceIO]):
     """Take the inflation off the distances of sixteen cells to obstacles."""
     for col in range(packet * LANES, (packet + 1) * LANES):
-        site_row, site_col = ti.cast(io.clearance.site_row[env, row, col], ti.i32), ti.cast(io.clearance.site_col[env, row, col], ti.i32)
+        site_row, site_col = (
+            ti.cast(io.clearance.site_row[env, row, col], ti.i32),
+            ti.cast(io.clearance.site_col[env, row, col], ti.i32),
+        )
         if site_row >= 0 and io.mask.outside[site_row, site_col] == 0:
-            io.clearance.clearance_m[env, row, col] = ti.max(io.clearance.clearance_m[env, row, col] - io.clearance_cfg.inflate_m, 0.0)
+            io.clearance.clearance_m[env, row, col] = ti.max(
+                io.clearance.clearance_m[env, row, col] - io.clearance_cfg.inflate_m, 0.0
+            )
 
 
-# ----------------------------------------------------------------------------------------------------------------------- kernel
+# ----------------------------------------------------------------------------------------------------- kernel
 
 
 @ti.func
@@ -257,7 +289,9 @@ def transform(env, slot, changed, io: Bundle[ClearanceIO]):
         scan_row(env, slot, row, io)
     for packet in range(n_packet):
         for word in range(ti.static(io.clearance_memory.stale.shape[2])):
-            rows = ti.select(changed > _MAX_CHANGES, ~ti.cast(0, ti.u64), io.clearance_memory.stale[slot, packet, word])
+            rows = ti.select(
+                changed > _MAX_CHANGES, ~ti.cast(0, ti.u64), io.clearance_memory.stale[slot, packet, word]
+            )
             io.clearance_memory.stale[slot, packet, word] = ti.cast(0, ti.u64)
             while rows != 0:
                 row = word * WORD + lowest_bit(rows)
@@ -269,13 +303,16 @@ def transform(env, slot, changed, io: Bundle[ClearanceIO]):
 @ti.func
 def is_due(env, io: Bundle[ClearanceIO]):
     """1 where the clearance is computed in this step."""
-    return ti.cast(io.clock.awake[env] == 1 and io.clock.step[env] % io.clearance_cfg.period_steps == 0, ti.i32)
+    return ti.cast(
+        io.clock.awake[env] == 1 and io.clock.step[env] % io.clearance_cfg.period_steps == 0, ti.i32
+    )
 
 
 @quick_launch
 @ti.kernel
 def compute_clearance(io: Bundle[ClearanceIO]):
-    """Clearance of every cell from the layer that the planner must avoid (``voronoi.use``), where it is due."""
+    """Clearance of every cell from the layer that the planner must avoid (``voronoi.use``), where it is
+    due."""
     n_env, n_slot = ti.static(io.clock.awake.shape[0], io.clearance_memory.row_key.shape[0])
     for slot, pad in ti.ndrange(n_slot, ti.static(spread(n_slot))):
         if pad == 0:
@@ -283,7 +320,9 @@ def compute_clearance(io: Bundle[ClearanceIO]):
                 if io.clock.awake[env] == 1:
                     io.clearance.fresh[env] = is_due(env, io)
                 if is_due(env, io) == 1:
-                    changed = take_sites(env, slot, ti.static(squared_limit(io.clearance_cfg, io.mapping_cfg)), io)
+                    changed = take_sites(
+                        env, slot, ti.static(squared_limit(io.clearance_cfg, io.mapping_cfg)), io
+                    )
                     if changed > 0:
                         transform(env, slot, changed, io)
 

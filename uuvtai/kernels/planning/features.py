@@ -1,4 +1,5 @@
-"""Sector features of the newest sonar scan (nearest range, fastest approach, smallest time to collision), and the policy's observation.
+"""Sector features of the newest sonar scan (nearest range, fastest approach, smallest time to collision), and
+the policy's observation.
 
 ``columns`` declares the observation once: the kernels write by it and the environment's table is read off it.
 """
@@ -17,24 +18,35 @@ from uuvtai.kernels.planning.bundles import FeaturesIO
 @quick_launch
 @ti.kernel
 def sense_sectors(io: Bundle[FeaturesIO]):
-    """Sector s is centred at s * 360 / n_sector degrees from ahead, counter-clockwise. One work item per sector."""
+    """Sector s is centred at s * 360 / n_sector degrees from ahead, counter-clockwise. One work item per
+    sector."""
     n, n_sector = ti.static(io.features.sector_range_m.shape[0], io.features.sector_range_m.shape[1])
     for env, sector in ti.ndrange(n, n_sector):
         if io.clock.awake[env] == 1:
-            first, last = sector_beams(sector, io.ego.rpy[env][2] - io.scan.ping_yaw[env], n_sector, ti.static(io.scan.range_m.shape[1]))
+            first, last = sector_beams(
+                sector,
+                io.ego.rpy[env][2] - io.scan.ping_yaw[env],
+                n_sector,
+                ti.static(io.scan.range_m.shape[1]),
+            )
             _summarise(env, sector, first, last, io)
 
 
 @ti.func
 def _summarise(env, sector, first, last, io: Bundle[FeaturesIO]):
-    """Doppler already holds the own motion, so a beam's time to collision is its range over its closing speed."""
+    """Doppler already holds the own motion, so a beam's time to collision is its range over its closing
+    speed."""
     n_ray = ti.static(io.scan.range_m.shape[1])
     nearest, ttc, closing, hits = 0.0 + io.sonar_cfg.max_range_m, 0.0 + io.features_cfg.ttc_cap_s, -FAR_M, 0
     begin = first % n_ray
     for i in range(last - first):  # no branches: signs of noisy rates cannot be predicted
         beam = begin + i
         beam -= ti.select(beam >= n_ray, n_ray, 0)
-        hit, gap, rate = io.scan.hit[env, beam] == 1, io.scan.range_m[env, beam], -io.scan.doppler_m_s[env, beam]
+        hit, gap, rate = (
+            io.scan.hit[env, beam] == 1,
+            io.scan.range_m[env, beam],
+            -io.scan.doppler_m_s[env, beam],
+        )
         hits += ti.cast(hit, ti.i32)
         closing = ti.max(closing, ti.select(hit, rate, -FAR_M))
         nearest = ti.min(nearest, ti.select(hit, gap, io.sonar_cfg.max_range_m))
@@ -47,7 +59,8 @@ def _summarise(env, sector, first, last, io: Bundle[FeaturesIO]):
 
 @ti.func
 def sector_beams(sector, turned, n_sector, n_ray):
-    """Half-open range of beams in a sector now, after the vehicle has turned by ``turned`` [rad] since the ping; take it modulo n_ray."""
+    """Half-open range of beams in a sector now, after the vehicle has turned by ``turned`` [rad] since the
+    ping; take it modulo n_ray."""
     shift = turned * n_sector / TWO_PI
     per_sector = n_ray / n_sector
     first = ti.ceil((sector - 0.5 + shift) * per_sector)
@@ -55,7 +68,7 @@ def sector_beams(sector, turned, n_sector, n_ray):
     return ti.cast(first, ti.i32), ti.cast(last, ti.i32)
 
 
-# -------------------------------------------------------------------------------------------------------------- observation
+# ------------------------------------------------------------------------------------------------ observation
 
 
 @ti.func
@@ -136,36 +149,78 @@ def _sector_closing(env, sector, io: Bundle[FeaturesIO]):
 
 COLUMNS = (
     ColumnGroup("goal", 3, "m", "body", "from the position estimate to the goal", _goal),
-    ColumnGroup("heading_error", 2, "1", "level", "sine, cosine of the look-ahead point's bearing, left positive", _heading_error),
+    ColumnGroup(
+        "heading_error",
+        2,
+        "1",
+        "level",
+        "sine, cosine of the look-ahead point's bearing, left positive",
+        _heading_error,
+    ),
     ColumnGroup("velocity", 3, "m/s", "body", "over ground, as the DVL measured it last", _velocity),
     ColumnGroup("yaw_rate", 1, "rad/s", "body", "of the gyro", _yaw_rate),
     ColumnGroup("depth", 1, "m", "world", "pressure depth, positive down", _depth),
     ColumnGroup("tilt", 2, "rad", "level", "roll, pitch of the IMU", _tilt),
-    ColumnGroup("sector_range", 1, "m", "body", "smallest range; maximum range where nothing returned", _sector_range, "sector"),
-    ColumnGroup("lookahead", 3, "m", "body", "to the look-ahead point of the route; zero without a route", _lookahead),
-    ColumnGroup("cross_track", 1, "m", "route", "distance from the route, positive = left of it", _cross_track),
-    ColumnGroup("remaining", 1, "m", "route", "route length still ahead; the straight distance without a route", _remaining),
+    ColumnGroup(
+        "sector_range",
+        1,
+        "m",
+        "body",
+        "smallest range; maximum range where nothing returned",
+        _sector_range,
+        "sector",
+    ),
+    ColumnGroup(
+        "lookahead", 3, "m", "body", "to the look-ahead point of the route; zero without a route", _lookahead
+    ),
+    ColumnGroup(
+        "cross_track", 1, "m", "route", "distance from the route, positive = left of it", _cross_track
+    ),
+    ColumnGroup(
+        "remaining",
+        1,
+        "m",
+        "route",
+        "route length still ahead; the straight distance without a route",
+        _remaining,
+    ),
     ColumnGroup("path_risk", 1, "1", "route", "mean risk over the look-ahead segment", _path_risk),
     ColumnGroup("tilt_rate", 2, "rad/s", "body", "roll rate, pitch rate of the gyro", _tilt_rate),
     ColumnGroup("sector_ttc", 1, "s", "body", "smallest time to collision, capped", _sector_ttc, "sector"),
-    ColumnGroup("sector_closing", 1, "m/s", "body", "largest closing speed, own motion included; 0 = no return", _sector_closing, "sector"),
+    ColumnGroup(
+        "sector_closing",
+        1,
+        "m/s",
+        "body",
+        "largest closing speed, own motion included; 0 = no return",
+        _sector_closing,
+        "sector",
+    ),
 )
-"""The observation, in order: the paper's phi and what it names as the world model's targets, which are the first 24 (with 12 sectors).
+"""The observation, in order: the paper's phi and what it names as the world model's targets, which are the
+first 24 (with 12 sectors).
 
 A config may add columns behind them (``columns``).
 """
 
 
 def columns(features_cfg: FeaturesConfig) -> tuple[ColumnGroup, ...]:
-    """The groups of a config's observation: ``COLUMNS``, then the bodies' where any are asked for, then the tree's."""
-    return COLUMNS + (BODY_COLUMNS if features_cfg.n_track > 0 else ()) + (TEACHER_COLUMNS if features_cfg.teacher else ())
+    """The groups of a config's observation: ``COLUMNS``, then the bodies' where any are asked for, then the
+    tree's."""
+    return (
+        COLUMNS
+        + (BODY_COLUMNS if features_cfg.n_track > 0 else ())
+        + (TEACHER_COLUMNS if features_cfg.teacher else ())
+    )
 
 
 def placed_columns(features_cfg: FeaturesConfig) -> list[tuple[ColumnGroup, int, int]]:
     """(group, first column, number of columns) of every group."""
     out, first = [], 0
     for column in columns(features_cfg):
-        width = column.width * {"": 1, "sector": features_cfg.n_sector, "body": features_cfg.n_track}[column.per]
+        width = (
+            column.width * {"": 1, "sector": features_cfg.n_sector, "body": features_cfg.n_track}[column.per]
+        )
         out.append((column, first, width))
         first += width
     return out
@@ -177,14 +232,18 @@ def observation_width(features_cfg: FeaturesConfig) -> int:
 
 
 def _sources(group, cfg):
-    """(source, first column, width of one) of the groups of ``group`` (a tuple of columns); plain Python, unrolled by the kernels."""
+    """(source, first column, width of one) of the groups of ``group`` (a tuple of columns); plain Python,
+    unrolled by the kernels."""
     return [(c.source, first, c.width) for c, first, _width in placed_columns(cfg) if c in group]
 
 
 def _body_places(cfg):
-    """(place in ``body_values``, first column of the first body, width of one) of the groups of BODY_COLUMNS; plain Python."""
+    """(place in ``body_values``, first column of the first body, width of one) of the groups of BODY_COLUMNS;
+    plain Python."""
     widths = [column.width for column in BODY_COLUMNS]
-    return [(sum(widths[:n]), first, width) for n, (_, first, width) in enumerate(_sources(BODY_COLUMNS, cfg))]
+    return [
+        (sum(widths[:n]), first, width) for n, (_, first, width) in enumerate(_sources(BODY_COLUMNS, cfg))
+    ]
 
 
 _BODY_WIDTH = sum(column.width for column in BODY_COLUMNS)
@@ -211,7 +270,8 @@ def write_observation(io: Bundle[FeaturesIO], obs: FloatMatrix):
 @quick_launch
 @ti.kernel
 def write_bodies(io: Bundle[FeaturesIO], obs: FloatMatrix):
-    """Columns of the ``n_track`` moving bodies that come closest to the awake rows, in the order of ``BODY_COLUMNS``."""
+    """Columns of the ``n_track`` moving bodies that come closest to the awake rows, in the order of
+    ``BODY_COLUMNS``."""
     n, n_track = ti.static(io.tracks.alive.shape[0], io.tracks.alive.shape[1])
     for env, track in ti.ndrange(n, n_track):
         if io.clock.awake[env] == 1:

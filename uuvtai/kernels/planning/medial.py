@@ -1,8 +1,9 @@
 """The medial axis as a graph: which cells are on it, and the cheapest way along it (A* with a binary heap).
 
-A cell is on the skeleton when the nearest site of a neighbour is more than ``site_gap_cells`` away from its own, never by which obstacle
-the sites belong to: walls with baffles are one obstacle, yet have a medial axis. Cells farther than clearance.max_m from everything form
-plateaus that belong to the skeleton. Neighbours are the eight around a cell; a diagonal step needs both cells beside it (no corner is cut).
+A cell is on the skeleton when the nearest site of a neighbour is more than ``site_gap_cells`` away from its
+own, never by which obstacle the sites belong to: walls with baffles are one obstacle, yet have a medial axis.
+Cells farther than clearance.max_m from everything form plateaus that belong to the skeleton. Neighbours are
+the eight around a cell; a diagonal step needs both cells beside it (no corner is cut).
 """
 
 import taichi as ti
@@ -26,7 +27,8 @@ NOT_FOUND = 0
 OUT_OF_BUDGET = -1
 
 _STRETCH = 1.02
-"""The estimate is stretched by this, so that of the many nearly equal ways over open water few are followed up (cost at most + 2 %)."""
+"""The estimate is stretched by this, so that of the many nearly equal ways over open water few are followed
+up (cost at most + 2 %)."""
 
 _BETTER = 1.0 - 1.0e-6
 """A way must be cheaper by more than rounding to replace another: equal ways would fill the heap."""
@@ -55,7 +57,8 @@ def next_direction(slot, row, col, io: Bundle[VoronoiIO]):
 
 @ti.func
 def on_skeleton(slot, env, row, col, io: Bundle[VoronoiIO]):
-    """True for skeleton cells; found out once per plan and kept. The cell must be traversable (so it is not at the grid's edge)."""
+    """True for skeleton cells; found out once per plan and kept. The cell must be traversable (so it is not
+    at the grid's edge)."""
     bits = bits_at(slot, row, col, io)
     if bits & KNOWN == 0:
         bits |= KNOWN
@@ -86,13 +89,18 @@ def _step_is_open(slot, row, col, step, io: Bundle[VoronoiIO]):
     """True where a step may be made: the cell is traversable, and so are both beside a diagonal step."""
     is_open = io.voronoi.weight[slot, row + step[0], col + step[1]] > 0
     if step[0] != 0 and step[1] != 0:
-        is_open = is_open and io.voronoi.weight[slot, row + step[0], col] > 0 and io.voronoi.weight[slot, row, col + step[1]] > 0
+        is_open = (
+            is_open
+            and io.voronoi.weight[slot, row + step[0], col] > 0
+            and io.voronoi.weight[slot, row, col + step[1]] > 0
+        )
     return is_open
 
 
 @ti.func
 def join_skeleton(slot, env, start, goal, io: Bundle[VoronoiIO]):
-    """Join both ends to the skeleton: one way uphill in clearance, and eight straight ways, so that the search chooses the side."""
+    """Join both ends to the skeleton: one way uphill in clearance, and eight straight ways, so that the
+    search chooses the side."""
     for joint in range(18):
         way = joint % 9
         row, col = ti.select(joint < 9, start[0], goal[0]), ti.select(joint < 9, start[1], goal[1])
@@ -134,17 +142,20 @@ def _estimate(cost, row, col, start_row, start_col, floor_weight):
 
 @ti.func
 def search_cells(slot, env, start, goal, everywhere, io: Bundle[VoronoiIO]):
-    """Cheapest way from the goal back to the start (so that the next cell leads to the goal), along the skeleton or ``everywhere``.
+    """Cheapest way from the goal back to the start (so that the next cell leads to the goal), along the
+    skeleton or ``everywhere``.
 
-    An edge costs its length times the mean weight of its two cells [cells / m]: the paper's sum with segments bounded by the cells.
-    Returns FOUND, NOT_FOUND or OUT_OF_BUDGET.
+    An edge costs its length times the mean weight of its two cells [cells / m]: the paper's sum with segments
+    bounded by the cells. Returns FOUND, NOT_FOUND or OUT_OF_BUDGET.
     """
     n_col = ti.static(io.voronoi.cost.shape[2])
     floor_weight = ti.static(_STRETCH / max(io.clearance_cfg.max_m, io.voronoi_cfg.cost_epsilon_m))
     size, status, budget = 0, NOT_FOUND, io.voronoi.pops[env] + ti.static(io.voronoi_cfg.max_pops)
     if io.voronoi.weight[slot, goal[0], goal[1]] > 0:
         io.voronoi.cost[slot, goal[0], goal[1]] = 0.0
-        io.voronoi.cell[slot, goal[0], goal[1]] = ti.cast(bits_at(slot, goal[0], goal[1], io) | REACHED, ti.u8)
+        io.voronoi.cell[slot, goal[0], goal[1]] = ti.cast(
+            bits_at(slot, goal[0], goal[1], io) | REACHED, ti.u8
+        )
         key = _estimate(0.0, goal[0], goal[1], start[0], start[1], floor_weight)
         size = heap_after_push(io.voronoi, slot, size, goal[0] * n_col + goal[1], key)
     while size > 0 and status == NOT_FOUND:
@@ -177,12 +188,16 @@ def _size_after_expansion(slot, env, size, row, col, start, everywhere, floor_we
                 medial = on_skeleton(slot, env, to_row, to_col, io)
                 bits = bits_at(slot, to_row, to_col, io)
                 length = ti.select(step[0] != 0 and step[1] != 0, 1.41421356, 1.0)
-                offer = ti.cast(here + 0.5 * length * (weight + io.voronoi.weight[slot, to_row, to_col]), ti.f32)
+                offer = ti.cast(
+                    here + 0.5 * length * (weight + io.voronoi.weight[slot, to_row, to_col]), ti.f32
+                )
                 if everywhere > 0 or medial or bits & JOINED != 0:
                     if bits & REACHED == 0 or offer < _BETTER * io.voronoi.cost[slot, to_row, to_col]:
                         io.voronoi.cost[slot, to_row, to_col] = offer
                         kept = bits & (KNOWN | SKELETON | JOINED)
-                        io.voronoi.cell[slot, to_row, to_col] = ti.cast(kept | REACHED | ((7 - k) << _NEXT_SHIFT), ti.u8)
+                        io.voronoi.cell[slot, to_row, to_col] = ti.cast(
+                            kept | REACHED | ((7 - k) << _NEXT_SHIFT), ti.u8
+                        )
                         key = _estimate(offer, to_row, to_col, start[0], start[1], floor_weight)
                         new_size = heap_after_push(io.voronoi, slot, new_size, to_row * n_col + to_col, key)
     return new_size

@@ -1,4 +1,5 @@
-"""Writing a polyline into the route: waypoints at most a spacing apart, every corner kept, so that the geometry never changes."""
+"""Writing a polyline into the route: waypoints at most a spacing apart, every corner kept, so that the
+geometry never changes."""
 
 import taichi as ti
 
@@ -16,7 +17,8 @@ MAX_WIDENINGS = 16
 
 @ti.func
 def count_after_segment(route: Out[RouteState], env, count, a, b, spacing, write):
-    """Append the waypoints of the segment from a (already there) to b; returns the new count. ``write`` == 0 only counts."""
+    """Append the waypoints of the segment from a (already there) to b; returns the new count. ``write`` == 0
+    only counts."""
     pieces = ti.max(1, ti.cast(ti.ceil((b - a).norm() / spacing - _ROUNDING), ti.i32))
     if write == 1:
         for i in range(pieces):

@@ -1,4 +1,5 @@
-"""The route from the vehicle's view: look-ahead point, heading and cross-track error, length left, risk of what lies ahead."""
+"""The route from the vehicle's view: look-ahead point, heading and cross-track error, length left, risk of
+what lies ahead."""
 
 import taichi as ti
 
@@ -66,7 +67,8 @@ def reset_route(io: Bundle[RouteIO]):
 @quick_launch
 @ti.kernel
 def follow_route(io: Bundle[RouteIO]):
-    """Path-relative terms of the awake rows, from the foot that ``fire_triggers`` moved or from the start of a route planned since."""
+    """Path-relative terms of the awake rows, from the foot that ``fire_triggers`` moved or from the start of
+    a route planned since."""
     n = ti.static(io.clock.awake.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
         if pad == 0 and io.clock.awake[env] == 1:
@@ -83,13 +85,15 @@ def follow_route(io: Bundle[RouteIO]):
 
 @ti.func
 def _aim(env, io: Bundle[RouteIO]):
-    """Look-ahead point and errors against the route. The depth runs straight from the present one to the goal's over the length left,
-    so that it arrives in time from wherever an evasion has left the vehicle."""
+    """Look-ahead point and errors against the route. The depth runs straight from the present one to the
+    goal's over the length left, so that it arrives in time from wherever an evasion has left the vehicle."""
     pos, goal, arc = io.ego.pos_w[env], io.mission.goal_w[env], io.route.arc[env]
     i = segment_of(io.route, env, arc)
     left = left_of_foot(io.route, env)
     point, _i = point_left(io.route, env, i, left - ti.static(io.route_cfg.lookahead_m))
-    depth = pos[2] + (goal[2] - pos[2]) * ti.min(1.0, ti.static(io.route_cfg.lookahead_m) / ti.max(left, 1e-6))
+    depth = pos[2] + (goal[2] - pos[2]) * ti.min(
+        1.0, ti.static(io.route_cfg.lookahead_m) / ti.max(left, 1e-6)
+    )
     io.route.lookahead_w[env] = ti.Vector([point[0], point[1], depth])
     ahead = point - level(pos)
     io.route.heading_error[env] = 0.0
@@ -97,7 +101,9 @@ def _aim(env, io: Bundle[RouteIO]):
         io.route.heading_error[env] = wrapped_angle(ti.atan2(ahead[1], ahead[0]) - io.ego.rpy[env][2])
     along = io.route.way_w[env, i + 1] - io.route.way_w[env, i]
     off = level(pos) - foot_of(io.route, env, arc)
-    io.route.cross_track_m[env] = ti.select(along[0] * off[1] - along[1] * off[0] >= 0, off.norm(), -off.norm())
+    io.route.cross_track_m[env] = ti.select(
+        along[0] * off[1] - along[1] * off[0] >= 0, off.norm(), -off.norm()
+    )
     io.route.remaining_m[env] = left
 
 
@@ -130,9 +136,15 @@ def _risk(env, pos_w, io: Bundle[RouteIO]):
 
 @ti.kernel
 def load_route(io: Bundle[RouteIO], way_w: FloatMatrix, env: int):
-    """Take the host's path (n >= 2 corners, (n, 2) [m]) as the env's route, spaced and counted like the kernel's own, planner RRT."""
+    """Take the host's path (n >= 2 corners, (n, 2) [m]) as the env's route, spaced and counted like the
+    kernel's own, planner RRT."""
     for _ in range(1):
-        spacing, writing, tries, room = ti.static(io.route_cfg.spacing_m) * 1.0, 0, 0, ti.static(io.route.way_w.shape[1])
+        spacing, writing, tries, room = (
+            ti.static(io.route_cfg.spacing_m) * 1.0,
+            0,
+            0,
+            ti.static(io.route.way_w.shape[1]),
+        )
         while tries < MAX_WIDENINGS:
             count = 1
             for i in range(1, way_w.shape[0]):
@@ -160,7 +172,9 @@ def _route_cost(env, n_way, io: Bundle[RouteIO]):
         pieces = ti.cast(ti.ceil(along.norm() / ti.static(0.5 * io.mapping_cfg.cell_m)), ti.i32)
         for k in range(pieces):  # type: ignore[arg-type]
             cell = _cell_on_grid(a + along * ((k + 0.5) / pieces), io)
-            room = ti.max(io.clearance.clearance_m[env, cell[0], cell[1]], ti.static(io.voronoi_cfg.cost_epsilon_m))
+            room = ti.max(
+                io.clearance.clearance_m[env, cell[0], cell[1]], ti.static(io.voronoi_cfg.cost_epsilon_m)
+            )
             cost += along.norm() / pieces / room
     return cost
 

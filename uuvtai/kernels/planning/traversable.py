@@ -1,4 +1,5 @@
-"""The traversable set: cells that are not occupied, lie inside the tank and keep d_min (the paper's Omega)."""
+"""The traversable set: cells that are not occupied, lie inside the tank and keep d_min (the paper's
+Omega)."""
 
 import taichi as ti
 
@@ -7,7 +8,8 @@ from uuvtai.kernels.core.signature import Const, In
 from uuvtai.state import ClearanceState, GridMask, MapState
 
 _SLACK_M = 1.0e-5
-"""A cell exactly d_min away counts; rounding of the root must not decide. Distances on the grid differ by far more than this."""
+"""A cell exactly d_min away counts; rounding of the root must not decide. Distances on the grid differ by far
+more than this."""
 
 
 @ti.func

@@ -1,10 +1,12 @@
-"""When to plan again (the paper, Sec. III-B). Each trigger rests for min_replan_s after it was served; one of them is counted per replan.
+"""When to plan again (the paper, Sec. III-B). Each trigger rests for min_replan_s after it was served; one of
+them is counted per replan.
 
 - initial: there is no route.
 - stuck: slower than stuck_speed_m_s for stuck_s, farther from the goal than its radius.
 - safety: a sonar return nearer than safety_range_m, or range / closing speed below safety_ttc_s.
-- intersection: a point of the look-ahead segment is not traversable any more, or a forecast body comes closer to the segment than
-  forecast_clearance_m at a time when the vehicle could be there: the part of the segment within reach_speed_m_s times that time.
+- intersection: a point of the look-ahead segment is not traversable any more, or a forecast body comes closer
+  to the segment than forecast_clearance_m at a time when the vehicle could be there: the part of the segment
+  within reach_speed_m_s times that time.
 """
 
 import taichi as ti
@@ -29,7 +31,8 @@ from uuvtai.plan_codes import (
 @quick_launch
 @ti.kernel
 def fire_triggers(io: Bundle[TriggersIO]):
-    """Move the foot along the route, find the triggers that hold, and queue the envs that plan in this step in the order of their ids."""
+    """Move the foot along the route, find the triggers that hold, and queue the envs that plan in this step
+    in the order of their ids."""
     n = ti.static(io.clock.awake.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
         if pad == 0 and io.clock.awake[env] == 1:
@@ -69,11 +72,15 @@ def _held_triggers(env, io: Bundle[TriggersIO]):
             if ti.static(trigger == TRIGGER_INITIAL):
                 holds = io.route.n_way[env] == 0
             elif ti.static(trigger == TRIGGER_STUCK):
-                holds = io.route.stuck_steps[env] * dt >= ti.static(io.route_cfg.stuck_s - 0.5 * io.episode_cfg.control_dt_s)
+                holds = io.route.stuck_steps[env] * dt >= ti.static(
+                    io.route_cfg.stuck_s - 0.5 * io.episode_cfg.control_dt_s
+                )
             elif ti.static(trigger == TRIGGER_SAFETY):
                 holds = _feels_near(env, io)
             elif ti.static(trigger == TRIGGER_INTERSECTION):
-                holds = io.route.n_way[env] > 0 and (_path_is_closed(env, io) or _path_meets_forecast(env, io))
+                holds = io.route.n_way[env] > 0 and (
+                    _path_is_closed(env, io) or _path_meets_forecast(env, io)
+                )
         bits |= ti.select(holds, 1 << (trigger - 1), 0)
     return bits
 
@@ -88,7 +95,10 @@ def _feels_near(env, io: Bundle[TriggersIO]):
             beam = packet * LANES + i
             gap = io.scan.range_m[env, beam]
             soon = -io.scan.doppler_m_s[env, beam] * ti.static(io.route_cfg.safety_ttc_s) > gap
-            urgent[i] = ti.cast((io.scan.hit[env, beam] == 1) & (soon | (gap < ti.static(io.route_cfg.safety_range_m))), ti.i32)
+            urgent[i] = ti.cast(
+                (io.scan.hit[env, beam] == 1) & (soon | (gap < ti.static(io.route_cfg.safety_range_m))),
+                ti.i32,
+            )
         near |= urgent.max()
     return near == 1
 
@@ -101,24 +111,34 @@ def _path_is_closed(env, io: Bundle[TriggersIO]):
         cell = cell_of(io.route.ahead_w[env, k], io.tank_cfg, io.mapping_cfg.cell_m)
         row = ti.math.clamp(cell[0], 0, ti.static(io.mask.outside.shape[0] - 1))
         col = ti.math.clamp(cell[1], 0, ti.static(io.mask.outside.shape[1] - 1))
-        if not is_traversable(io.clearance, io.grid_map, io.mask, env, row, col, io.voronoi_cfg, io.mapping_cfg):
+        if not is_traversable(
+            io.clearance, io.grid_map, io.mask, env, row, col, io.voronoi_cfg, io.mapping_cfg
+        ):
             closed = True
     return closed
 
 
 @ti.func
 def _path_meets_forecast(env, io: Bundle[TriggersIO]):
-    """True where a body comes too close to the part of the look-ahead segment that the vehicle can have reached by then."""
+    """True where a body comes too close to the part of the look-ahead segment that the vehicle can have
+    reached by then."""
     meets = False
     per_step = ti.static(io.route_cfg.reach_speed_m_s * io.tracking_cfg.forecast_dt_s)
     for track in range(io.forecast.radius_m.shape[1]):
-        if io.forecast.radius_m[env, track, 0] >= 0 and not meets:  # a track is forecast at all steps or at none
+        if (
+            io.forecast.radius_m[env, track, 0] >= 0 and not meets
+        ):  # a track is forecast at all steps or at none
             for k in range(io.forecast.radius_m.shape[2]):
                 limit = io.forecast.radius_m[env, track, k] + ti.static(io.route_cfg.forecast_clearance_m)
                 body = io.forecast.pos_w[env, track, k]
                 reach = k * per_step
-                if (body - io.route.ahead_w[env, 0]).norm() < reach + ti.static(io.mapping_cfg.cell_m) + limit:
-                    last = ti.min(ti.cast(reach / ti.static(io.mapping_cfg.cell_m), ti.i32) + 1, io.route.n_ahead[env] - 1)
+                if (body - io.route.ahead_w[env, 0]).norm() < reach + ti.static(
+                    io.mapping_cfg.cell_m
+                ) + limit:
+                    last = ti.min(
+                        ti.cast(reach / ti.static(io.mapping_cfg.cell_m), ti.i32) + 1,
+                        io.route.n_ahead[env] - 1,
+                    )
                     for j in range(last + 1):
                         if (body - io.route.ahead_w[env, j]).norm() < limit:
                             meets = True

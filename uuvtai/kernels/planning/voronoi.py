@@ -1,8 +1,10 @@
-"""Global planner: the cheapest way along the medial axis of the traversable set, straightened, for the envs whose turn it is.
+"""Global planner: the cheapest way along the medial axis of the traversable set, straightened, for the envs
+whose turn it is.
 
-Cost (the paper, Sec. III-B): sum |dp| / max(clearance, eps_r), with every segment bounded by the map's cell. Should the skeleton not join
-start and goal though the traversable set does, a second pass searches all traversable cells (counted). Only where that fails too, or an
-end of the way is not traversable, the plan fails with a reason, and the host's RRT takes over.
+Cost (the paper, Sec. III-B): sum |dp| / max(clearance, eps_r), with every segment bounded by the map's cell.
+Should the skeleton not join start and goal though the traversable set does, a second pass searches all
+traversable cells (counted). Only where that fails too, or an end of the way is not traversable, the plan
+fails with a reason, and the host's RRT takes over.
 """
 
 import taichi as ti
@@ -28,7 +30,8 @@ from uuvtai.plan_codes import (
 @quick_launch
 @ti.kernel
 def plan_routes(io: Bundle[VoronoiIO]):
-    """Plan for the queued envs; those for which it fails are listed in ``route.failed`` and keep their old route."""
+    """Plan for the queued envs; those for which it fails are listed in ``route.failed`` and keep their old
+    route."""
     n = ti.static(io.voronoi.cost.shape[0])
     for slot, pad in ti.ndrange(n, ti.static(spread(n))):
         if pad == 0:
@@ -80,8 +83,12 @@ def _weigh_cells(slot, env, io: Bundle[VoronoiIO]):
     for row in range(io.voronoi.weight.shape[1]):
         for col in range(io.voronoi.weight.shape[2]):
             weight = 0.0
-            if is_traversable(io.clearance, io.grid_map, io.mask, env, row, col, io.voronoi_cfg, io.mapping_cfg):
-                weight = 1.0 / ti.max(io.clearance.clearance_m[env, row, col], ti.static(io.voronoi_cfg.cost_epsilon_m))
+            if is_traversable(
+                io.clearance, io.grid_map, io.mask, env, row, col, io.voronoi_cfg, io.mapping_cfg
+            ):
+                weight = 1.0 / ti.max(
+                    io.clearance.clearance_m[env, row, col], ti.static(io.voronoi_cfg.cost_epsilon_m)
+                )
             io.voronoi.weight[slot, row, col] = weight
             io.voronoi.cell[slot, row, col] = ti.cast(0, ti.u8)
 
@@ -109,7 +116,8 @@ def _weight_at(slot, cell, io: Bundle[VoronoiIO]):
 
 @ti.func
 def _block_forecast(slot, env, start_w, io: Bundle[VoronoiIO]):
-    """Close every cell that a moving body is expected to come closer to than d_min within the horizon; the own cell stays open."""
+    """Close every cell that a moving body is expected to come closer to than d_min within the horizon; the
+    own cell stays open."""
     own = _cell(start_w, io)
     own_weight = io.voronoi.weight[slot, own[0], own[1]]
     n_row, n_col = ti.static(io.voronoi.weight.shape[1:])
@@ -129,8 +137,14 @@ def _block_forecast(slot, env, start_w, io: Bundle[VoronoiIO]):
 
 @ti.func
 def _search_reason(slot, env, start, goal, io: Bundle[VoronoiIO]):
-    """Search the skeleton, then everything, then (where the forecast was avoided) everything as if nothing moved, to name the reason."""
-    status, attempt, attempts, reason = NOT_FOUND, 0, ti.static(3 if io.voronoi_cfg.avoid_forecast else 2), FAIL_NONE
+    """Search the skeleton, then everything, then (where the forecast was avoided) everything as if nothing
+    moved, to name the reason."""
+    status, attempt, attempts, reason = (
+        NOT_FOUND,
+        0,
+        ti.static(3 if io.voronoi_cfg.avoid_forecast else 2),
+        FAIL_NONE,
+    )
     while status == NOT_FOUND and attempt < attempts:
         if attempt == 0:
             join_skeleton(slot, env, start, goal, io)
@@ -161,7 +175,11 @@ def _forget_search(slot, io: Bundle[VoronoiIO]):
 def _write_reason(slot, env, start_w, goal_w, io: Bundle[VoronoiIO]):
     """Turn the search's result into waypoints; FAIL_BUDGET where they do not fit."""
     x0, y0 = ti.static(grid_origin(io.tank_cfg, io.mapping_cfg.cell_m))
-    origin, cell_m, room = ti.Vector([x0, y0], dt=ti.f32), ti.static(io.mapping_cfg.cell_m), ti.static(io.route.way_w.shape[1])
+    origin, cell_m, room = (
+        ti.Vector([x0, y0], dt=ti.f32),
+        ti.static(io.mapping_cfg.cell_m),
+        ti.static(io.route.way_w.shape[1]),
+    )
     start_at, goal_at = _grid_position(start_w, io), _grid_position(goal_w, io)
     start, goal = _cell(start_w, io), _cell(goal_w, io)
     n_cell = path_cells(slot, start, goal, io)
@@ -184,16 +202,22 @@ def _write_reason(slot, env, start_w, goal_w, io: Bundle[VoronoiIO]):
 
 @ti.kernel
 def overlay_clearance(io: Bundle[VoronoiIO], out: FloatMatrix, env: int):
-    """Clearance (n_row, n_col) [m] of one env for the host's fallback: 0 where occupied or outside, lowered by the forecast if avoided."""
+    """Clearance (n_row, n_col) [m] of one env for the host's fallback: 0 where occupied or outside, lowered
+    by the forecast if avoided."""
     for row, col in ti.ndrange(out.shape[0], out.shape[1]):
         room = io.clearance.clearance_m[env, row, col]
-        if occupancy(io.grid_map, env, row, col, io.voronoi_cfg) >= ti.static(io.mapping_cfg.occupied) or io.mask.outside[row, col] == 1:
+        if (
+            occupancy(io.grid_map, env, row, col, io.voronoi_cfg) >= ti.static(io.mapping_cfg.occupied)
+            or io.mask.outside[row, col] == 1
+        ):
             room = 0.0
         if ti.static(io.voronoi_cfg.avoid_forecast):
             centre = centre_of(row, col, io.tank_cfg, io.mapping_cfg.cell_m)
             for track in range(io.forecast.radius_m.shape[1]):
                 for k in range(io.forecast.radius_m.shape[2]):
                     if io.forecast.radius_m[env, track, k] >= 0:
-                        gap = (centre - io.forecast.pos_w[env, track, k]).norm() - io.forecast.radius_m[env, track, k]
+                        gap = (centre - io.forecast.pos_w[env, track, k]).norm() - io.forecast.radius_m[
+                            env, track, k
+                        ]
                         room = ti.max(ti.min(room, gap), 0.0)
         out[row, col] = room

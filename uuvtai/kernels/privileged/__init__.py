@@ -1,1 +1,2 @@
-"""Yardsticks: what perception would know if it knew the truth. The only kernels that read the truth and write what the stack reads."""
+"""Yardsticks: what perception would know if it knew the truth. The only kernels that read the truth and write
+what the stack reads."""

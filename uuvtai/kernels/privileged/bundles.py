@@ -6,7 +6,16 @@ from dataclasses import dataclass
 
 from uuvtai.config import ElevationConfig, EpisodeConfig, MappingConfig, SonarConfig, TankConfig
 from uuvtai.kernels.core.signature import Const, In, Out
-from uuvtai.state import ClockState, ClusterState, MapState, PathState, Proprioception, SonarScan, TrackState, WorldState
+from uuvtai.state import (
+    ClockState,
+    ClusterState,
+    MapState,
+    PathState,
+    Proprioception,
+    SonarScan,
+    TrackState,
+    WorldState,
+)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,5 @@
-"""Debugging aid: writes moving bodies into the dynamic layer from the truth. Never part of a preset: it breaks observation-only sensing.
+"""Debugging aid: writes moving bodies into the dynamic layer from the truth. Never part of a preset: it
+breaks observation-only sensing.
 
 Launched only where ``mapping.stamp`` > 0 (default 0).
 """
@@ -26,7 +27,8 @@ def covers(env, body, point, io: Bundle[TrueMapIO]):
 
 @ti.kernel
 def stamp_truth(io: Bundle[TrueMapIO]):
-    """Add ``stamp`` to the dynamic occupancy of every cell whose centre a moving body covers, clipped at 1."""
+    """Add ``stamp`` to the dynamic occupancy of every cell whose centre a moving body covers, clipped at
+    1."""
     n_env, n_row, n_col = ti.static(io.grid_map.dynamic_occ.shape)
     n_body = ti.static(io.world.kind.shape[1])
     for env, row in ti.ndrange(n_env, n_row):

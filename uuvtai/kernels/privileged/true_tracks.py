@@ -1,7 +1,8 @@
-"""Privileged reference: the tracks of moving bodies, taken from the truth instead of from tracking. It breaks observation-only sensing.
+"""Privileged reference: the tracks of moving bodies, taken from the truth instead of from tracking. It breaks
+observation-only sensing.
 
-Launched only while ``Sim.privileged`` is on, which no config key and no preset can do. What reads tracks (forecast, heights, threats,
-planning) works on as it does; what stands still is sensed and mapped as ever.
+Launched only while ``Sim.privileged`` is on, which no config key and no preset can do. What reads tracks
+(forecast, heights, threats, planning) works on as it does; what stands still is sensed and mapped as ever.
 """
 
 import taichi as ti
@@ -26,7 +27,8 @@ _COLUMN_SHARE = 0.9
 
 
 def take_true_tracks(io: TrueTracksIO) -> None:
-    """Tracks of the awake rows as they truly are in this very step, and which of them every beam of a fresh scan hit."""
+    """Tracks of the awake rows as they truly are in this very step, and which of them every beam of a fresh
+    scan hit."""
     know_bodies(io)
     name_beams_truly(io)
 
@@ -34,7 +36,8 @@ def take_true_tracks(io: TrueTracksIO) -> None:
 @quick_launch
 @ti.kernel
 def know_bodies(io: Bundle[TrueTracksIO]):
-    """One track for every moving body, in the order of the bodies; the nearest bodies where the tracks are too few."""
+    """One track for every moving body, in the order of the bodies; the nearest bodies where the tracks are
+    too few."""
     n, n_track = ti.static(io.tracks.alive.shape)
     for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n * n_track))):
         if pad == 0 and io.clock.awake[env] == 1:
@@ -58,7 +61,10 @@ def lane_of(env, track, n_track: Const[int], io: Bundle[TrueTracksIO]):
                 found = track
     else:
         for lane in range(n_lane):
-            if io.world.kind[env, first_moving(io.world, io.path) + lane] != NONE and rank_of(env, lane, io) == track:
+            if (
+                io.world.kind[env, first_moving(io.world, io.path) + lane] != NONE
+                and rank_of(env, lane, io) == track
+            ):
                 found = lane
     return found
 
@@ -70,7 +76,10 @@ def rank_of(env, lane, io: Bundle[TrueTracksIO]):
     own = (io.world.pos_w[env, first + lane] - io.ego.pos_w[env]).norm_sqr()
     for other in range(ti.static(io.path.n_way.shape[1])):
         away = (io.world.pos_w[env, first + other] - io.ego.pos_w[env]).norm_sqr()
-        nearer += ti.cast(io.world.kind[env, first + other] != NONE and (away < own or (away == own and other < lane)), ti.i32)
+        nearer += ti.cast(
+            io.world.kind[env, first + other] != NONE and (away < own or (away == own and other < lane)),
+            ti.i32,
+        )
     return nearer
 
 
@@ -85,7 +94,9 @@ def know_motion(env, track, lane, io: Bundle[TrueTracksIO]):
     for diagonal in ti.static((0, 4, 7, 9)):
         io.tracks.cov[env, track][diagonal] = _VARIANCE
     io.tracks.z_m[env, track] = pos[2]
-    io.tracks.radius_m[env, track] = ti.select(io.world.kind[env, body] == BOX, ti.sqrt(size[0] ** 2 + size[1] ** 2), size[0])
+    io.tracks.radius_m[env, track] = ti.select(
+        io.world.kind[env, body] == BOX, ti.sqrt(size[0] ** 2 + size[1] ** 2), size[0]
+    )
     io.tracks.radius_var[env, track] = _VARIANCE
     io.tracks.turn_cov[env, track][4] = _VARIANCE
     if io.path.n_way[env, lane] == 0:
@@ -97,7 +108,8 @@ def know_motion(env, track, lane, io: Bundle[TrueTracksIO]):
 
 @ti.func
 def know_height(env, track, body, io: Bundle[TrueTracksIO]):
-    """Equal shares for the fewest neighbouring heights whose bodies, as high as the stack takes them to be, cover this one."""
+    """Equal shares for the fewest neighbouring heights whose bodies, as high as the stack takes them to be,
+    cover this one."""
     step = ti.static((io.tank_cfg.z_m[1] - io.tank_cfg.z_m[0]) / COLUMN)
     half = io.world.size[env, body][2]
     beyond = ti.max(half - half_height(env, track, io.tracks, io.elevation_cfg), 0.0)
@@ -115,7 +127,8 @@ def know_height(env, track, body, io: Bundle[TrueTracksIO]):
 @quick_launch
 @ti.kernel
 def name_beams_truly(io: Bundle[TrueTracksIO]):
-    """Every return of a fresh scan within ``_NAMED_M`` of a body's outline, where it was at the ping, belongs to the nearest such body."""
+    """Every return of a fresh scan within ``_NAMED_M`` of a body's outline, where it was at the ping, belongs
+    to the nearest such body."""
     n, n_ray = ti.static(io.tracks.beam_track.shape)
     for env, ray, pad in ti.ndrange(n, n_ray, ti.static(spread(n * n_ray))):
         if pad == 0 and io.clock.awake[env] == 1 and io.scan.fresh[env] == 1:

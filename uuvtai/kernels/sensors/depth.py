@@ -1,8 +1,10 @@
-"""Forward depth camera: a pinhole with the vehicle's full attitude, cast analytically in packets of sixteen columns.
+"""Forward depth camera: a pinhole with the vehicle's full attitude, cast analytically in packets of sixteen
+columns.
 
-Optical axis = body x, image right = -y, down = -z; square pixels, fx = fy = cols / 2 / tan(fov / 2), principal point in the middle of the
-image, pixel centres at + 0.5. z-depth = the parameter of a ray whose body-x component is 1. It sees bodies (caps and faces too) and side
-walls (without vertical bound), not floor and surface. Each body is tested only inside the rectangle that bounds it in the image.
+Optical axis = body x, image right = -y, down = -z; square pixels, fx = fy = cols / 2 / tan(fov / 2),
+principal point in the middle of the image, pixel centres at + 0.5. z-depth = the parameter of a ray whose
+body-x component is 1. It sees bodies (caps and faces too) and side walls (without vertical bound), not floor
+and surface. Each body is tested only inside the rectangle that bounds it in the image.
 """
 
 import math
@@ -23,7 +25,8 @@ _BLOCK_GPU = 4
 """Rows per loop item where items are threads and thousands of them must be there."""
 
 _NEAR_M = 0.02
-"""A bounding corner nearer than this to the camera's plane is not projected: the body is then tested in the whole image."""
+"""A bounding corner nearer than this to the camera's plane is not projected: the body is then tested in the
+whole image."""
 
 _MARGIN = 0.01
 """[pixel] added around the bounding rectangle against rounding."""
@@ -53,7 +56,8 @@ def reset_depth(io: Bundle[DepthIO]):
 @quick_launch
 @ti.kernel
 def cast_depth(io: Bundle[DepthIO]):
-    """New image in the rows whose step is a multiple of period_steps (step 0 included); the others keep theirs with ``fresh`` = 0."""
+    """New image in the rows whose step is a multiple of period_steps (step 0 included); the others keep
+    theirs with ``fresh`` = 0."""
     n = ti.static(io.clock.awake.shape[0])
     block_rows = ti.static(rows_per_item())
     n_block = ti.static(-(-io.depth_cfg.rows // block_rows))
@@ -83,9 +87,12 @@ def label_image(env, due, io: Bundle[DepthIO]):
 
 @ti.func
 def fill_block(env, first_row, io: Bundle[DepthIO]):
-    """Noise-free depth of _BLOCK rows: walls first, then every body over them inside its bounding rectangle."""
+    """Noise-free depth of _BLOCK rows: walls first, then every body over them inside its bounding
+    rectangle."""
     R_wb = rotation_wb(io.vehicle.quat_wb[env]).cast(ti.f32)
-    offset_b = ti.Vector([io.depth_cfg.offset_b_m[0], io.depth_cfg.offset_b_m[1], io.depth_cfg.offset_b_m[2]], ti.f32)
+    offset_b = ti.Vector(
+        [io.depth_cfg.offset_b_m[0], io.depth_cfg.offset_b_m[1], io.depth_cfg.offset_b_m[2]], ti.f32
+    )
     eye = Eye(pos=io.vehicle.pos_w[env].cast(ti.f32) + R_wb @ offset_b, R_wb=R_wb)
     last_row = ti.min(first_row + ti.static(rows_per_item()), io.depth_cfg.rows)
     for row in range(first_row, last_row):
@@ -107,10 +114,13 @@ def paint(env, row, first_col, seen, io: Bundle[DepthIO]):
 
 @ti.func
 def paint_nearer(env, row, first_col, enter, io: Bundle[DepthIO]):
-    """Write those of sixteen pixels in which ``enter`` lies before the camera and nearer than what is there."""
+    """Write those of sixteen pixels in which ``enter`` lies before the camera and nearer than what is
+    there."""
     for i in ti.static(range(LANES)):
         behind = io.image.depth_m[env, row, first_col + i]
-        io.image.depth_m[env, row, first_col + i] = ti.select((enter[i] > 0.0) & (enter[i] < behind), enter[i], behind)
+        io.image.depth_m[env, row, first_col + i] = ti.select(
+            (enter[i] > 0.0) & (enter[i] < behind), enter[i], behind
+        )
 
 
 @ti.func
@@ -142,9 +152,11 @@ def wall_depth(eye, dx, dy, io: Bundle[DepthIO]):
 
 @ti.func
 def nearness(direction, low, high):
-    """Inverse of the ray parameter at which a coordinate between two walls, ``low`` < 0 and ``high`` > 0 away, meets the one ahead of it.
+    """Inverse of the ray parameter at which a coordinate between two walls, ``low`` < 0 and ``high`` > 0
+    away, meets the one ahead of it.
 
-    Division by a scalar once instead of by every lane. Beyond a wall that lies ahead: larger than any that matters.
+    Division by a scalar once instead of by every lane. Beyond a wall that lies ahead: larger than any that
+    matters.
     """
     return ti.max(direction * (1.0 / ti.max(high, _POKED_M)), direction * (1.0 / ti.min(low, -_POKED_M)))
 
@@ -168,7 +180,8 @@ def draw_body(env, body, first_row, last_row, eye, io: Bundle[DepthIO]):
 
 @ti.func
 def may_be_seen(offset, radius, R_wb, io: Bundle[DepthIO]):
-    """Whether a ball of this radius around -offset (relative to the camera) reaches into the view and its range."""
+    """Whether a ball of this radius around -offset (relative to the camera) reaches into the view and its
+    range."""
     centre_b = -(R_wb.transpose() @ offset)
     half_width = ti.static(math.tan(math.radians(0.5 * io.depth_cfg.fov_deg)))
     half_height = ti.static(half_height_tangent(io.depth_cfg))
@@ -189,10 +202,11 @@ def half_height_tangent(depth):
 
 @ti.func
 def image_rectangle(offset, size, c, s, R_wb, io: Bundle[DepthIO]):
-    """Columns and rows (left, right, top, bottom; inclusive, inside the image) that a box of half extents ``size`` can cover.
+    """Columns and rows (left, right, top, bottom; inclusive, inside the image) that a box of half extents
+    ``size`` can cover.
 
-    (c, s) turns the box about z; ``offset`` is the camera relative to its centre in the world. The whole image where a corner
-    is not well in front of the camera.
+    (c, s) turns the box about z; ``offset`` is the camera relative to its centre in the world. The whole
+    image where a corner is not well in front of the camera.
     """
     focal = ti.static(0.5 * io.depth_cfg.cols / math.tan(math.radians(0.5 * io.depth_cfg.fov_deg)))
     low_u, high_u, low_v, high_v = FAR_M, -FAR_M, FAR_M, -FAR_M
@@ -205,7 +219,12 @@ def image_rectangle(offset, size, c, s, R_wb, io: Bundle[DepthIO]):
         in_front = in_front and corner_b[0] > _NEAR_M
         scale = focal / ti.max(corner_b[0], _NEAR_M)
         u, v = -corner_b[1] * scale, -corner_b[2] * scale
-        low_u, high_u, low_v, high_v = ti.min(low_u, u), ti.max(high_u, u), ti.min(low_v, v), ti.max(high_v, v)
+        low_u, high_u, low_v, high_v = (
+            ti.min(low_u, u),
+            ti.max(high_u, u),
+            ti.min(low_v, v),
+            ti.max(high_v, v),
+        )
     left, right, top, bottom = 0, ti.static(io.depth_cfg.cols - 1), 0, ti.static(io.depth_cfg.rows - 1)
     if in_front:
         left, right = pixel_span(low_u, high_u, io.depth_cfg.cols)
@@ -215,7 +234,8 @@ def image_rectangle(offset, size, c, s, R_wb, io: Bundle[DepthIO]):
 
 @ti.func
 def pixel_span(low, high, count):
-    """First and last pixel of ``count`` whose centres lie within image coordinates [low, high], counted from the image's middle."""
+    """First and last pixel of ``count`` whose centres lie within image coordinates [low, high], counted from
+    the image's middle."""
     first = ti.ceil(ti.max(low - _MARGIN + 0.5 * count - 0.5, 0.0))
     last = ti.floor(ti.min(high + _MARGIN + 0.5 * count - 0.5, count - 1.0))
     return ti.cast(ti.min(first, count), ti.i32), ti.cast(ti.max(last, -1.0), ti.i32)
@@ -249,7 +269,9 @@ def disturb_block(env, first_row, step, io: Bundle[DepthIO]):
         key = stream_key(io.episode.key[env], step, STREAM_DEPTH)
         n_packet = ti.static(io.depth_cfg.cols // LANES)
         for row in range(first_row, ti.min(first_row + ti.static(rows_per_item()), io.depth_cfg.rows)):
-            for pair in range(ti.static(-(-n_packet // 2))):  # the two normals of a draw go to neighbouring packets
+            for pair in range(
+                ti.static(-(-n_packet // 2))
+            ):  # the two normals of a draw go to neighbouring packets
                 one, other = normal_pair_lanes(key, row * io.depth_cfg.cols + pair * LANES)
                 paint_noisy(env, row, 2 * pair * LANES, one, io)
                 if ti.static(n_packet % 2 == 0) or 2 * pair + 1 < n_packet:

@@ -1,15 +1,25 @@
 """Proprioception: DVL, IMU, pressure, and the pose estimate that mapping and planning use.
 
-Every error is a config number, compiled away at zero. Heading error = constant drift rate of the episode plus the integrated noise of the
-yaw gyro. Position is the truth (as in the paper), or dead reckoning: DVL velocity turned by the IMU's attitude, summed up from the known
-start, z from pressure; while the DVL has lost the bottom it goes on with the last velocity. Where depth is found by pressure the sensor is
-zeroed at the known start: its first reading is taken for the start's depth, so that the bias drops out and one reading's noise stays.
+Every error is a config number, compiled away at zero. Heading error = constant drift rate of the episode plus
+the integrated noise of the yaw gyro. Position is the truth (as in the paper), or dead reckoning: DVL velocity
+turned by the IMU's attitude, summed up from the known start, z from pressure; while the DVL has lost the
+bottom it goes on with the last velocity. Where depth is found by pressure the sensor is zeroed at the known
+start: its first reading is taken for the start's depth, so that the bias drops out and one reading's noise
+stays.
 """
 
 import taichi as ti
 
 from uuvtai.kernels.core.geometry import quaternion_wb, roll_pitch_yaw, rotation_wb, wrapped_angle
-from uuvtai.kernels.core.noise import STREAM_DVL, STREAM_IMU, STREAM_PRESSURE, normal, stream_key, uniform, uniform_in
+from uuvtai.kernels.core.noise import (
+    STREAM_DVL,
+    STREAM_IMU,
+    STREAM_PRESSURE,
+    normal,
+    stream_key,
+    uniform,
+    uniform_in,
+)
 from uuvtai.kernels.core.signature import Bundle, quick_launch, spread
 from uuvtai.kernels.sensors.bundles import ExactProprioceptionIO, ProprioceptionIO
 
@@ -20,7 +30,8 @@ _EPISODE_DRAW = 1000
 @quick_launch
 @ti.kernel
 def reset_proprioception(io: Bundle[ProprioceptionIO]):
-    """Draw the errors that stay constant over an episode; the estimate starts at the true position. Awake rows only."""
+    """Draw the errors that stay constant over an episode; the estimate starts at the true position. Awake
+    rows only."""
     n = ti.static(io.clock.awake.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
         if pad == 0 and io.clock.awake[env] == 1:
@@ -31,7 +42,8 @@ def reset_proprioception(io: Bundle[ProprioceptionIO]):
 @quick_launch
 @ti.kernel
 def sense_exactly(io: Bundle[ExactProprioceptionIO]):
-    """Perfect velocity, attitude and rates for the inner loop: experiments on the plant alone have no sensors."""
+    """Perfect velocity, attitude and rates for the inner loop: experiments on the plant alone have no
+    sensors."""
     for env in range(ti.static(io.clock.awake.shape[0])):
         if io.clock.awake[env] == 1:
             io.ego.vel_b[env] = io.vehicle.vel_b[env]
@@ -51,13 +63,20 @@ def draw_constants(env, io: Bundle[ProprioceptionIO]):
     io.ego_memory.dropout_until[env] = 0
     io.ego_memory.pressure_zero_m[env] = 0.0
     bias = io.sensors_cfg.pressure.bias_m
-    io.ego_memory.pressure_bias_m[env] = uniform_in(stream_key(key, 0, STREAM_PRESSURE), _EPISODE_DRAW, -bias, bias)
+    io.ego_memory.pressure_bias_m[env] = uniform_in(
+        stream_key(key, 0, STREAM_PRESSURE), _EPISODE_DRAW, -bias, bias
+    )
 
 
 @ti.func
 def clear_readings(env, io: Bundle[ProprioceptionIO]):
     zero = ti.zero(io.ego.vel_b[env])
-    io.ego.vel_b[env], io.ego.rpy[env], io.ego.rate_b[env], io.ego.specific_force_b[env] = zero, zero, zero, zero
+    io.ego.vel_b[env], io.ego.rpy[env], io.ego.rate_b[env], io.ego.specific_force_b[env] = (
+        zero,
+        zero,
+        zero,
+        zero,
+    )
     io.ego.vel_valid[env] = 0
     io.ego.depth_m[env] = 0.0
     io.ego.pos_w[env] = io.vehicle.pos_w[env]
@@ -86,11 +105,14 @@ def normal_vector(key, first):
 
 @ti.func
 def read_imu(env, key, step, io: Bundle[ProprioceptionIO]):
-    """Attitude with heading error, angular rate, and specific force = acceleration minus gravity, in body axes."""
+    """Attitude with heading error, angular rate, and specific force = acceleration minus gravity, in body
+    axes."""
     stream = stream_key(key, step, STREAM_IMU)
     rate, heading_rate = io.vehicle.rate_b[env], io.ego_memory.heading_rate[env]
     if ti.static(io.sensors_cfg.imu.gyro_noise_rad_s_rthz > 0):
-        error = ti.static(io.sensors_cfg.imu.gyro_noise_rad_s_rthz / io.episode_cfg.control_dt_s**0.5) * normal_vector(stream, 0)
+        error = ti.static(
+            io.sensors_cfg.imu.gyro_noise_rad_s_rthz / io.episode_cfg.control_dt_s**0.5
+        ) * normal_vector(stream, 0)
         rate += error
         heading_rate += error[2]
     if step > 0:
@@ -98,7 +120,9 @@ def read_imu(env, key, step, io: Bundle[ProprioceptionIO]):
     rpy = roll_pitch_yaw(io.vehicle.quat_wb[env])
     if ti.static(io.sensors_cfg.imu.attitude_sigma_rad > 0):
         rpy += io.sensors_cfg.imu.attitude_sigma_rad * normal_vector(stream, 3)
-    force = io.vehicle.acc_b[env] + rotation_wb(io.vehicle.quat_wb[env]).transpose() @ ti.Vector([0.0, 0.0, io.vehicle_cfg.gravity_m_s2])
+    force = io.vehicle.acc_b[env] + rotation_wb(io.vehicle.quat_wb[env]).transpose() @ ti.Vector(
+        [0.0, 0.0, io.vehicle_cfg.gravity_m_s2]
+    )
     if ti.static(io.sensors_cfg.imu.accel_sigma_m_s2 > 0):
         force += io.sensors_cfg.imu.accel_sigma_m_s2 * normal_vector(stream, 6)
     io.ego.rpy[env] = ti.Vector([rpy[0], rpy[1], wrapped_angle(rpy[2] + io.ego_memory.heading_error[env])])
@@ -108,13 +132,16 @@ def read_imu(env, key, step, io: Bundle[ProprioceptionIO]):
 
 @ti.func
 def read_dvl(env, key, step, io: Bundle[ProprioceptionIO]):
-    """Velocity over ground; no reading while the bottom is lost. An episode starts with it in sight, so there always is a last reading."""
+    """Velocity over ground; no reading while the bottom is lost. An episode starts with it in sight, so there
+    always is a last reading."""
     stream = stream_key(key, step, STREAM_DVL)
     lost = step < io.ego_memory.dropout_until[env]
     if ti.static(io.sensors_cfg.dvl.dropout > 0):
         if not lost and step > 0 and uniform(stream, 20) < io.sensors_cfg.dvl.dropout:
             lasts = uniform_in(stream, 21, io.sensors_cfg.dvl.dropout_s[0], io.sensors_cfg.dvl.dropout_s[1])
-            io.ego_memory.dropout_until[env] = step + ti.cast(ti.ceil(lasts / io.episode_cfg.control_dt_s), ti.i32)
+            io.ego_memory.dropout_until[env] = step + ti.cast(
+                ti.ceil(lasts / io.episode_cfg.control_dt_s), ti.i32
+            )
             lost = True
     io.ego.vel_valid[env] = ti.select(lost, 0, 1)
     if not lost:
@@ -126,7 +153,8 @@ def read_dvl(env, key, step, io: Bundle[ProprioceptionIO]):
 
 @ti.func
 def read_pressure(env, key, step, io: Bundle[ProprioceptionIO]):
-    """Depth, positive down; in dead reckoning less what the first reading was off the known start, where ``ego.pos_w`` is at step 0."""
+    """Depth, positive down; in dead reckoning less what the first reading was off the known start, where
+    ``ego.pos_w`` is at step 0."""
     reading = io.ego_memory.pressure_bias_m[env] - io.vehicle.pos_w[env][2]
     if ti.static(io.sensors_cfg.pressure.sigma_m > 0):
         reading += io.sensors_cfg.pressure.sigma_m * normal(stream_key(key, step, STREAM_PRESSURE), 0)
@@ -145,6 +173,10 @@ def estimate_position(env, step, io: Bundle[ProprioceptionIO]):
     else:
         pos, rpy = io.ego.pos_w[env], io.ego.rpy[env]
         if step > 0:
-            pos += rotation_wb(quaternion_wb(rpy[0], rpy[1], rpy[2])) @ io.ego.vel_b[env] * io.episode_cfg.control_dt_s
+            pos += (
+                rotation_wb(quaternion_wb(rpy[0], rpy[1], rpy[2]))
+                @ io.ego.vel_b[env]
+                * io.episode_cfg.control_dt_s
+            )
         pos[2] = -io.ego.depth_m[env]
         io.ego.pos_w[env] = pos

@@ -1,7 +1,9 @@
-"""Rays against convex primitives: each function returns the span (enter, leave) of the ray parameter inside the primitive.
+"""Rays against convex primitives: each function returns the span (enter, leave) of the ray parameter inside
+the primitive.
 
-A body is an intersection of such sets, so its own span is (largest enter, smallest leave); it is hit from outside where
-0 < enter <= leave. Arguments may be scalars or 16-lane packets: a scalar start with packet directions is the usual mix.
+A body is an intersection of such sets, so its own span is (largest enter, smallest leave); it is hit from
+outside where 0 < enter <= leave. Arguments may be scalars or 16-lane packets: a scalar start with packet
+directions is the usual mix.
 """
 
 import taichi as ti
@@ -18,7 +20,8 @@ _SKIN_M = 1.0e-4
 """A ray that starts on a surface (after a bounce) does not meet that surface again within this."""
 
 Echo = ti.types.struct(range_m=f16x, normal_x=f16x, normal_y=f16x, vel_x=f16x, vel_y=f16x)
-"""What sixteen level rays meet: range [m] (FAR_M = nothing), outward unit normal and velocity [m/s] of the surface."""
+"""What sixteen level rays meet: range [m] (FAR_M = nothing), outward unit normal and velocity [m/s] of the
+surface."""
 
 
 @ti.func
@@ -32,9 +35,11 @@ def slab_span(start, direction, half):
 
 @ti.func
 def disc_span(x, y, dx, dy, radius_squared):
-    """Span inside a circle (or an infinite cylinder) around the origin; (x, y) = ray's start, (dx, dy) = direction of any length.
+    """Span inside a circle (or an infinite cylinder) around the origin; (x, y) = ray's start, (dx, dy) =
+    direction of any length.
 
-    The distance of the line to the centre comes from a cross product: b^2 - c would cancel badly in float32 at 12 m.
+    The distance of the line to the centre comes from a cross product: b^2 - c would cancel badly in float32
+    at 12 m.
     """
     length_squared = ti.max(dx * dx + dy * dy, _TINY)
     cross = x * dy - y * dx
@@ -62,7 +67,8 @@ def _span(room, middle, length_squared):
 
 @ti.func
 def plane_distance(start, direction, low, high):
-    """Ray parameter at which a coordinate that starts within [low, high] leaves it; 0 if it starts beyond that end."""
+    """Ray parameter at which a coordinate that starts within [low, high] leaves it; 0 if it starts beyond
+    that end."""
     safe = ti.select(ti.abs(direction) < _TINY, _TINY, direction)
     return ti.max(ti.select(safe > 0.0, high - start, low - start) / safe, 0.0)
 
@@ -74,12 +80,13 @@ def rim_distance(x, y, dx, dy, radius):
     return ti.select(enter > leave, FAR_M, ti.max(leave, 0.0))
 
 
-# -------------------------------------------------------------------------------------- level rays in the world
+# ------------------------------------------------------------------------------------ level rays in the world
 
 
 @ti.func
 def place_bodies(env, x, y, io: Bundle[SonarIO]):
-    """Write centre and reach of every body's outline, as seen from (x, y), for ``bodies_in_wedge``; an empty slot reaches nowhere."""
+    """Write centre and reach of every body's outline, as seen from (x, y), for ``bodies_in_wedge``; an empty
+    slot reaches nowhere."""
     n_body = ti.static(io.world.kind.shape[1])
     for slot in range(io.sonar_memory.body_reach_m.shape[1]):
         reach = -FAR_M
@@ -89,13 +96,16 @@ def place_bodies(env, x, y, io: Bundle[SonarIO]):
                 size = io.world.size[env, slot]
                 io.sonar_memory.body_x_m[env, slot] = io.world.pos_w[env, slot][0] - x
                 io.sonar_memory.body_y_m[env, slot] = io.world.pos_w[env, slot][1] - y
-                reach = ti.cast(size[0] + ti.select(kind == BOX, size[1], 0.0), ti.f32)  # no less than half a box's diagonal
+                reach = ti.cast(
+                    size[0] + ti.select(kind == BOX, size[1], 0.0), ti.f32
+                )  # no less than half a box's diagonal
         io.sonar_memory.body_reach_m[env, slot] = reach
 
 
 @ti.func
 def bodies_in_wedge(env, first, wedge, io: Bundle[SonarIO]):
-    """Bit set of those among sixteen bodies whose outline may reach into a wedge at the sensor (conservative).
+    """Bit set of those among sixteen bodies whose outline may reach into a wedge at the sensor
+    (conservative).
 
     ``wedge`` = (x, y) of its middle direction, then (cos, sin) of its half angle.
     """
@@ -129,10 +139,12 @@ def lane_bits(condition):
 
 @ti.func
 def nearest_echo(env, x, y, z, ux, uy, travelled, slope, wedge, direct: Const[bool], io: Bundle[SonarIO]):
-    """Nearest surface along level rays (ux, uy) from (x, y) in the plane z, after a path already ``travelled`` [m].
+    """Nearest surface along level rays (ux, uy) from (x, y) in the plane z, after a path already
+    ``travelled`` [m].
 
-    A body counts where its vertical gap is at most slope x path. (x, y) and ``travelled`` are scalars, or lanes after a bounce.
-    ``direct`` rays start at the sensor, where only bodies in their ``wedge`` need a test.
+    A body counts where its vertical gap is at most slope x path. (x, y) and ``travelled`` are scalars, or
+    lanes after a bounce. ``direct`` rays start at the sensor, where only bodies in their ``wedge`` need a
+    test.
     """
     echo = wall_echo(x, y, ux, uy, io)
     for group in range(ti.static(io.sonar_memory.body_reach_m.shape[1] // LANES)):
@@ -154,7 +166,9 @@ def nearer_echo(env, body, echo, x, y, z, ux, uy, travelled, slope, io: Bundle[S
     out = echo
     kind = io.world.kind[env, body]
     pos, size = io.world.pos_w[env, body].cast(ti.f32), io.world.size[env, body].cast(ti.f32)
-    enter, normal_x, normal_y = outline_entry(env, body, kind, size, pos[2] - z, x - pos[0], y - pos[1], ux, uy, travelled, slope, io)
+    enter, normal_x, normal_y = outline_entry(
+        env, body, kind, size, pos[2] - z, x - pos[0], y - pos[1], ux, uy, travelled, slope, io
+    )
     gap = ti.select(kind == SPHERE, 0.0, ti.max(ti.abs(pos[2] - z) - size[2], 0.0))
     nearer = (enter > _SKIN_M) & (enter < echo.range_m) & ((enter + travelled) * slope >= gap)
     vel = io.world.vel_w[env, body].cast(ti.f32)
@@ -168,7 +182,8 @@ def nearer_echo(env, body, echo, x, y, z, ux, uy, travelled, slope, io: Bundle[S
 
 @ti.func
 def outline_entry(env, body, kind, size, rise, sx, sy, ux, uy, travelled, slope, io: Bundle[SonarIO]):
-    """(range, normal x, normal y) where rays from (sx, sy), relative to the body's centre, enter its horizontal outline."""
+    """(range, normal x, normal y) where rays from (sx, sy), relative to the body's centre, enter its
+    horizontal outline."""
     range_m, normal_x, normal_y = f16x(FAR_M), f16x(0.0), f16x(0.0)
     if kind == BOX:
         yaw = ti.cast(io.world.yaw[env, body], ti.f32)

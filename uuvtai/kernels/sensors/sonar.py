@@ -1,8 +1,10 @@
-"""Sonar: a level ring of beams at the body origin, cast analytically in packets of sixteen neighbouring beams.
+"""Sonar: a level ring of beams at the body origin, cast analytically in packets of sixteen neighbouring
+beams.
 
-Beam i looks along the true yaw + 2 pi i / n_ray. A body is seen where the beam enters its horizontal outline and the vertical
-gap is within range x tan(half aperture); the side walls are always seen, floor and surface never. Every error source is a switch that
-is compiled away at zero. Order: geometry, ghost, grazing loss, bubble cloud, missed return, range noise, false return, quantisation.
+Beam i looks along the true yaw + 2 pi i / n_ray. A body is seen where the beam enters its horizontal outline
+and the vertical gap is within range x tan(half aperture); the side walls are always seen, floor and surface
+never. Every error source is a switch that is compiled away at zero. Order: geometry, ghost, grazing loss,
+bubble cloud, missed return, range noise, false return, quantisation.
 """
 
 import math
@@ -27,7 +29,8 @@ from uuvtai.kernels.sensors.sonar_error import (
 )
 
 _FALLOFF = 0.9
-"""Intensity = cosine of incidence x (1 - 0.9 r / maximum range): Lambert's law and what gain control leaves of the range loss (EC)."""
+"""Intensity = cosine of incidence x (1 - 0.9 r / maximum range): Lambert's law and what gain control leaves
+of the range loss (EC)."""
 
 _DIMMEST = 0.01
 """Floor of the cosine in the intensity, so that a return is never 0."""
@@ -39,7 +42,8 @@ Mount = ti.types.struct(pos=ti.math.vec3, vel=ti.math.vec2, heading=ti.math.vec2
 @quick_launch
 @ti.kernel
 def reset_sonar(io: Bundle[SonarIO]):
-    """Forget scans and clouds of the awake rows: no return anywhere, nothing fresh or under way (step 0 then fills the scan)."""
+    """Forget scans and clouds of the awake rows: no return anywhere, nothing fresh or under way (step 0 then
+    fills the scan)."""
     n = ti.static(io.clock.awake.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
         if pad == 0 and io.clock.awake[env] == 1:
@@ -75,8 +79,9 @@ def clear_memory(env, io: Bundle[SonarIO]):
 def cast_sonar(io: Bundle[SonarIO]):
     """Ping where a ping is due, deliver what is due; ``scan.fresh`` is 1 only in the step of delivery.
 
-    A ping at step s is delivered at s + latency_steps. The first ping of an episode is delivered at once (and only then), so that the first
-    observation is not empty. ``memory`` needs n_latency > latency_steps / period_steps.
+    A ping at step s is delivered at s + latency_steps. The first ping of an episode is delivered at once (and
+    only then), so that the first observation is not empty. ``memory`` needs n_latency > latency_steps /
+    period_steps.
     """
     n = ti.static(io.clock.awake.shape[0])
     n_packet = ti.static(io.sonar_cfg.n_ray // LANES)
@@ -172,7 +177,7 @@ def deliver(env, packet, step, io: Bundle[SonarIO]):
                 io.scan.hit[env, ray] = io.sonar_memory.hit[env, slot, ray]
 
 
-# ---------------------------------------------------------------------------------------------------------------- measurement
+# ------------------------------------------------------------------------------------------------ measurement
 
 
 @ti.func
@@ -194,7 +199,9 @@ def measured(env, packet, step, io: Bundle[SonarIO]):
     told, speed, lit = falsely_returned(noisy, still, bright, key, step, ray, io)
     final = cut_off(told, io)
     doppler = doppler_noisy(speed - own, key, step, ray, io)
-    intensity = ti.max(lit, _DIMMEST) * (1.0 - _FALLOFF / io.sonar_cfg.max_range_m * ti.min(final, io.sonar_cfg.max_range_m))
+    intensity = ti.max(lit, _DIMMEST) * (
+        1.0 - _FALLOFF / io.sonar_cfg.max_range_m * ti.min(final, io.sonar_cfg.max_range_m)
+    )
     return final, doppler, intensity
 
 
@@ -223,7 +230,8 @@ def sonar_mount(env, io: Bundle[SonarIO]):
 
 @ti.func
 def direction_before(packet, heading, io: Bundle[SonarIO]):
-    """Direction (x, y) one beam before a packet's first, where no cosine or sine of a lane's turn is 0 or 1, so that all lanes stay alike.
+    """Direction (x, y) one beam before a packet's first, where no cosine or sine of a lane's turn is 0 or 1,
+    so that all lanes stay alike.
 
     The packet's turn comes from a table of constants.
     """
@@ -251,7 +259,8 @@ def beam_directions(packet, heading, io: Bundle[SonarIO]):
 
 @ti.func
 def packet_wedge(packet, heading, io: Bundle[SonarIO]):
-    """(x, y) of the middle direction of a packet's beams, then (cos, sin) of the half angle between its outermost beams."""
+    """(x, y) of the middle direction of a packet's beams, then (cos, sin) of the half angle between its
+    outermost beams."""
     half = ti.static((LANES - 1) * math.pi / io.sonar_cfg.n_ray)
     middle = ti.static(half + 2.0 * math.pi / io.sonar_cfg.n_ray)
     c, s = ti.static(math.cos(middle), math.sin(middle))

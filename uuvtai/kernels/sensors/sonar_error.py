@@ -1,4 +1,5 @@
-"""What goes wrong in a sonar beam, error by error; each is compiled away at zero. Packets of sixteen beams, FAR_M = no return."""
+"""What goes wrong in a sonar beam, error by error; each is compiled away at zero. Packets of sixteen beams,
+FAR_M = no return."""
 
 import taichi as ti
 
@@ -30,9 +31,11 @@ _CLOUD_NEAREST_M = 0.5
 
 @ti.func
 def ghosted(env, echo, cosine, ux, uy, pos, slope, wedge, key, step, ray, io: Bundle[SonarIO]):
-    """(range, rate of change of range from the surfaces' motion), where one specular bounce replaces the direct return in chosen beams.
+    """(range, rate of change of range from the surfaces' motion), where one specular bounce replaces the
+    direct return in chosen beams.
 
-    The path is sensor - p1 - p2 with p2 along the mirrored direction m; its length changes by v1.u + (v2 - v1).m - v_sensor.u.
+    The path is sensor - p1 - p2 with p2 along the mirrored direction m; its length changes by v1.u + (v2 -
+    v1).m - v_sensor.u.
     """
     range_m = echo.range_m
     away = ux * echo.vel_x + uy * echo.vel_y
@@ -68,10 +71,13 @@ def grazing_lost(range_m, cosine, io: Bundle[SonarIO]):
 
 @ti.func
 def start_cloud(env, io: Bundle[SonarIO]):
-    """A bubble cloud may form in a free slot; it keeps its range and its bearing in the world (beam counted from the x axis)."""
+    """A bubble cloud may form in a free slot; it keeps its range and its bearing in the world (beam counted
+    from the x axis)."""
     key = stream_key(io.episode.key[env], io.clock.step[env], STREAM_SONAR_CLUTTER)
     first = ti.static(3 * io.sonar_cfg.n_ray)
-    if uniform(key, first) < ti.static(io.sonar_cfg.bubble_clouds_per_s * io.sonar_cfg.period_steps * io.episode_cfg.control_dt_s):
+    if uniform(key, first) < ti.static(
+        io.sonar_cfg.bubble_clouds_per_s * io.sonar_cfg.period_steps * io.episode_cfg.control_dt_s
+    ):
         free = -1
         for cloud in range(io.sonar_memory.cloud_until.shape[1]):
             if free < 0 and io.sonar_memory.cloud_until[env, cloud] <= io.clock.step[env]:
@@ -80,23 +86,34 @@ def start_cloud(env, io: Bundle[SonarIO]):
             width = uniform_in(key, first + 1, io.sonar_cfg.bubble_beams[0], io.sonar_cfg.bubble_beams[1] + 1)
             lasts = uniform_in(key, first + 2, io.sonar_cfg.bubble_s[0], io.sonar_cfg.bubble_s[1])
             io.sonar_memory.cloud_width[env, free] = ti.cast(width, ti.i32)
-            io.sonar_memory.cloud_beam[env, free] = ti.cast(uniform_in(key, first + 3, 0.0, io.sonar_cfg.n_ray), ti.i32)
-            io.sonar_memory.cloud_range_m[env, free] = uniform_in(key, first + 4, _CLOUD_NEAREST_M, io.sonar_cfg.max_range_m)
-            io.sonar_memory.cloud_until[env, free] = io.clock.step[env] + ti.cast(ti.ceil(lasts / io.episode_cfg.control_dt_s), ti.i32)
+            io.sonar_memory.cloud_beam[env, free] = ti.cast(
+                uniform_in(key, first + 3, 0.0, io.sonar_cfg.n_ray), ti.i32
+            )
+            io.sonar_memory.cloud_range_m[env, free] = uniform_in(
+                key, first + 4, _CLOUD_NEAREST_M, io.sonar_cfg.max_range_m
+            )
+            io.sonar_memory.cloud_until[env, free] = io.clock.step[env] + ti.cast(
+                ti.ceil(lasts / io.episode_cfg.control_dt_s), ti.i32
+            )
 
 
 @ti.func
 def cloud_covered(env, range_m, away, cosine, heading, ray, step, io: Bundle[SonarIO]):
-    """(range, surface's rate, brightness) where bubble clouds, still in the water, hide what is behind them."""
+    """(range, surface's rate, brightness) where bubble clouds, still in the water, hide what is behind
+    them."""
     out_range, out_away, out_bright = range_m + 0.0, away + 0.0, cosine + 0.0
     if ti.static(io.sonar_cfg.bubble_clouds_per_s > 0):
-        turn = ti.cast(ti.round(ti.atan2(heading[1], heading[0]) * ti.static(io.sonar_cfg.n_ray / TWO_PI)), ti.i32)
+        turn = ti.cast(
+            ti.round(ti.atan2(heading[1], heading[0]) * ti.static(io.sonar_cfg.n_ray / TWO_PI)), ti.i32
+        )
         index = i16x(0)
         for i in ti.static(range(LANES)):
             index[i] = ray + turn + i
         for cloud in range(io.sonar_memory.cloud_until.shape[1]):
             if step < io.sonar_memory.cloud_until[env, cloud]:
-                offset = (index - io.sonar_memory.cloud_beam[env, cloud] + 2 * io.sonar_cfg.n_ray) % io.sonar_cfg.n_ray
+                offset = (
+                    index - io.sonar_memory.cloud_beam[env, cloud] + 2 * io.sonar_cfg.n_ray
+                ) % io.sonar_cfg.n_ray
                 distance = ti.cast(io.sonar_memory.cloud_range_m[env, cloud], ti.f32)
                 covered = (offset < io.sonar_memory.cloud_width[env, cloud]) & (out_range > distance)
                 out_range = ti.select(covered, distance, out_range)
@@ -110,7 +127,11 @@ def missed(range_m, key, step, ray, io: Bundle[SonarIO]):
     """Range, or FAR_M where the return is missed."""
     out = range_m + 0.0
     if ti.static(io.sonar_cfg.missed_return > 0):
-        out = ti.select(uniform_lanes(stream_key(key, step, STREAM_SONAR_DROP), ray) < io.sonar_cfg.missed_return, FAR_M, range_m)
+        out = ti.select(
+            uniform_lanes(stream_key(key, step, STREAM_SONAR_DROP), ray) < io.sonar_cfg.missed_return,
+            FAR_M,
+            range_m,
+        )
     return out
 
 
@@ -129,12 +150,15 @@ def range_noisy(range_m, key, step, ray, io: Bundle[SonarIO]):
 
 @ti.func
 def falsely_returned(range_m, away, bright, key, step, ray, io: Bundle[SonarIO]):
-    """(range, surface's rate, brightness) where clutter at any range, still in the water, replaces whatever the beam would have told."""
+    """(range, surface's rate, brightness) where clutter at any range, still in the water, replaces whatever
+    the beam would have told."""
     out_range, out_away, out_bright = range_m + 0.0, away + 0.0, bright + 0.0
     if ti.static(io.sonar_cfg.false_return > 0):
         stream = stream_key(key, step, STREAM_SONAR_CLUTTER)
         chosen = uniform_lanes(stream, ray) < io.sonar_cfg.false_return
-        out_range = ti.select(chosen, io.sonar_cfg.max_range_m * uniform_lanes(stream, io.sonar_cfg.n_ray + ray), range_m)
+        out_range = ti.select(
+            chosen, io.sonar_cfg.max_range_m * uniform_lanes(stream, io.sonar_cfg.n_ray + ray), range_m
+        )
         out_away = ti.select(chosen, 0.0, away)
         out_bright = ti.select(chosen, uniform_lanes(stream, 2 * io.sonar_cfg.n_ray + ray), bright)
     return out_range, out_away, out_bright
@@ -145,13 +169,17 @@ def cut_off(range_m, io: Bundle[SonarIO]):
     """Range rounded to the quantum and not negative; FAR_M beyond the maximum range."""
     told = ti.max(range_m, 0.0)
     if ti.static(io.sonar_cfg.range_quantum_m > 0):
-        told = ti.floor(ti.max(range_m, 0.0) * ti.static(1.0 / io.sonar_cfg.range_quantum_m) + 0.5) * io.sonar_cfg.range_quantum_m
+        told = (
+            ti.floor(ti.max(range_m, 0.0) * ti.static(1.0 / io.sonar_cfg.range_quantum_m) + 0.5)
+            * io.sonar_cfg.range_quantum_m
+        )
     return ti.select(told > io.sonar_cfg.max_range_m, FAR_M, told)
 
 
 @ti.func
 def doppler_noisy(doppler, key, step, ray, io: Bundle[SonarIO]):
-    """Doppler with its normal error, the other of the range's pair (one draw serves both); an outlier is uniform within +- a limit."""
+    """Doppler with its normal error, the other of the range's pair (one draw serves both); an outlier is
+    uniform within +- a limit."""
     out = doppler + 0.0
     stream = stream_key(key, step, STREAM_SONAR_DOPPLER)
     if ti.static(io.sonar_cfg.doppler_sigma_m_s > 0):
@@ -160,6 +188,8 @@ def doppler_noisy(doppler, key, step, ray, io: Bundle[SonarIO]):
     noisy = out + 0.0
     if ti.static(io.sonar_cfg.doppler_outlier > 0):
         chosen = uniform_lanes(stream, io.sonar_cfg.n_ray + ray) < io.sonar_cfg.doppler_outlier
-        wild = io.sonar_cfg.doppler_outlier_m_s * (2.0 * uniform_lanes(stream, 2 * io.sonar_cfg.n_ray + ray) - 1.0)
+        wild = io.sonar_cfg.doppler_outlier_m_s * (
+            2.0 * uniform_lanes(stream, 2 * io.sonar_cfg.n_ray + ray) - 1.0
+        )
         noisy = ti.select(chosen, wild, out)
     return noisy

@@ -1,4 +1,5 @@
-"""Clock, begin and end of episodes: the referee judges every control step from the truth, in the order of the rules."""
+"""Clock, begin and end of episodes: the referee judges every control step from the truth, in the order of the
+rules."""
 
 import taichi as ti
 
@@ -59,7 +60,8 @@ def sleep_ended(io: Bundle[EpisodeIO]):
 
 @ti.func
 def nearest_threat(env, io: Bundle[EpisodeIO]):
-    """(clearance [m] to the nearest obstacle or side wall, smallest time to collision [s] with an obstacle)."""
+    """(clearance [m] to the nearest obstacle or side wall, smallest time to collision [s] with an
+    obstacle)."""
     pos_w = io.vehicle.pos_w[env]
     R_wb = rotation_wb(io.vehicle.quat_wb[env])
     axis_w = ti.Vector([R_wb[0, 0], R_wb[1, 0], R_wb[2, 0]])
@@ -71,7 +73,13 @@ def nearest_threat(env, io: Bundle[EpisodeIO]):
         kind = io.world.kind[env, body]
         if kind != NONE:
             gap, normal, along = hull_to_body(
-                pos_w, axis_w, kind, io.world.pos_w[env, body], io.world.size[env, body], io.world.yaw[env, body], io.vehicle_cfg
+                pos_w,
+                axis_w,
+                kind,
+                io.world.pos_w[env, body],
+                io.world.size[env, body],
+                io.world.yaw[env, body],
+                io.vehicle_cfg,
             )
             hull_vel = vel_w + along * rate_w.cross(axis_w)
             closing = (hull_vel - io.world.vel_w[env, body]).dot(normal)
@@ -124,7 +132,8 @@ def reset_referee(io: Bundle[EpisodeIO]):
 @quick_launch
 @ti.kernel
 def judge(io: Bundle[EpisodeIO]):
-    """Clearance, time to collision, way driven and outcome of the awake rows after they and the obstacles have moved."""
+    """Clearance, time to collision, way driven and outcome of the awake rows after they and the obstacles
+    have moved."""
     n = ti.static(io.clock.awake.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
         if pad == 0 and io.clock.awake[env] == 1:

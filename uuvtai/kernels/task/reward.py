@@ -1,6 +1,7 @@
 """The paper's reward, term by term:
 
-r = r_alive + w_p ds - w_d d - w_ct |e_ct| - w_c C - w_ttc T - w_v |v|_over^2 + w_u U + w_h H + w_s succ - w_f fail - w_tilt Theta - w_eff E
+r = r_alive + w_p ds - w_d d - w_ct |e_ct| - w_c C - w_ttc T - w_v |v|_over^2 + w_u U + w_h H + w_s succ - w_f
+fail - w_tilt Theta - w_eff E
 
 Safety terms come from the referee (truth), which the reward may use; the policy never sees them.
 """
@@ -8,7 +9,16 @@ Safety terms come from the referee (truth), which the reward may use; the policy
 import taichi as ti
 
 from uuvtai.kernels.core.geometry import rotation_wb
-from uuvtai.kernels.core.signature import AnyVector, Bundle, Const, FloatMatrix, FloatVector, IntVector, quick_launch, spread
+from uuvtai.kernels.core.signature import (
+    AnyVector,
+    Bundle,
+    Const,
+    FloatMatrix,
+    FloatVector,
+    IntVector,
+    quick_launch,
+    spread,
+)
 from uuvtai.kernels.task.bundles import RewardIO
 from uuvtai.outcomes import COLLISION, OUT_OF_TANK, SUCCESS, TIMEOUT
 
@@ -27,7 +37,8 @@ TERMS = (
     "tilt",
     "effort",
 )
-"""Names of the terms, in the order of ``RewardState.term``; their weights are the config keys of the same names."""
+"""Names of the terms, in the order of ``RewardState.term``; their weights are the config keys of the same
+names."""
 
 _PENALTIES = ("path_distance", "cross_track", "clearance", "ttc", "overspeed", "failure", "tilt", "effort")
 """Terms that the equation subtracts."""
@@ -39,7 +50,9 @@ _UNKNOWN_M = -1.0
 
 def signed_weights(reward_cfg):
     """Weight of every term with the sign of the equation; ``reward_cfg`` is a RewardConfig."""
-    return tuple(-getattr(reward_cfg, name) if name in _PENALTIES else getattr(reward_cfg, name) for name in TERMS)
+    return tuple(
+        -getattr(reward_cfg, name) if name in _PENALTIES else getattr(reward_cfg, name) for name in TERMS
+    )
 
 
 @ti.func
@@ -64,10 +77,11 @@ def reset_reward(io: Bundle[RewardIO]):
 
 @ti.func
 def route_progress(env, dt_s: Const[float], io: Bundle[RewardIO]):
-    """Route length gained in this step [m], never more than the vehicle moved, so that no jump of the route or of the foot on it pays.
+    """Route length gained in this step [m], never more than the vehicle moved, so that no jump of the route
+    or of the foot on it pays.
 
-    Where a new route was just adopted (or none is known from before), lengths of two routes would be compared: the movement towards the
-    look-ahead point stands in.
+    Where a new route was just adopted (or none is known from before), lengths of two routes would be
+    compared: the movement towards the look-ahead point stands in.
     """
     R_wb = rotation_wb(io.vehicle.quat_wb[env])
     vel_w = R_wb @ io.vehicle.vel_b[env]
@@ -138,7 +152,8 @@ def compute_reward(
     terminated: AnyVector,
     truncated: AnyVector,
 ):
-    """Reward of the step, weighted terms, their sums, and how the step ended. Rows that sleep earn 0 and keep their end."""
+    """Reward of the step, weighted terms, their sums, and how the step ended. Rows that sleep earn 0 and keep
+    their end."""
     weights = ti.Vector(ti.static(list(signed_weights(io.reward_cfg))))
     n = ti.static(io.clock.awake.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
@@ -171,7 +186,8 @@ def tell_step(
     episode_steps: IntVector,
     outcome: IntVector,
 ):
-    """How the step and the episode so far went, for whoever learns from it: weighted terms, their sums, return, steps and outcome."""
+    """How the step and the episode so far went, for whoever learns from it: weighted terms, their sums,
+    return, steps and outcome."""
     for env in range(ti.static(io.clock.awake.shape[0])):
         for i in ti.static(range(N_TERM)):
             terms[env, i] = ti.cast(io.reward.term[env, i], ti.f32)

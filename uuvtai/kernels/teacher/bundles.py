@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from uuvtai.config import EpisodeConfig, MappingConfig, TankConfig, TeacherConfig, TrackingConfig, VehicleConfig
+from uuvtai.config import (
+    EpisodeConfig,
+    MappingConfig,
+    TankConfig,
+    TeacherConfig,
+    TrackingConfig,
+    VehicleConfig,
+)
 from uuvtai.kernels.core.signature import Const, In, Out
 from uuvtai.state import (
     ClearanceState,

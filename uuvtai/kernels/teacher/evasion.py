@@ -1,4 +1,5 @@
-"""Search for an evasive velocity: headings times speeds, stop, the last command and the follow velocity, rolled out in packets."""
+"""Search for an evasive velocity: headings times speeds, stop, the last command and the follow velocity,
+rolled out in packets."""
 
 import taichi as ti
 
@@ -12,7 +13,8 @@ from uuvtai.kernels.teacher.trajectories import body_depths, depth_band, static_
 @quick_launch
 @ti.kernel
 def plan_evasion(io: Bundle[EvasionIO]):
-    """Best evasive velocity of the envs with ``want_evade``: the softmax mean of the candidates where that is as good as the best one."""
+    """Best evasive velocity of the envs with ``want_evade``: the softmax mean of the candidates where that is
+    as good as the best one."""
     n, n_packet = ti.static(io.clock.awake.shape[0], io.teacher.candidate_cost.shape[1] // LANES)
     for env, packet in ti.ndrange(n, n_packet):
         if io.clock.awake[env] == 1 and io.teacher.want_evade[env] == 1:
@@ -47,12 +49,16 @@ def candidate_lanes(env, first, io: Bundle[EvasionIO]):
 
 @ti.func
 def candidate(env, index, io: Bundle[EvasionIO]):
-    """World velocity of one candidate. Heading 0 is the follow direction, so that slowing down on the route is among them.
+    """World velocity of one candidate. Heading 0 is the follow direction, so that slowing down on the route
+    is among them.
 
-    First the level ones (they keep the heave of following), then stop, last command and follow, then those that climb and those that dive,
-    and from ``first_burst`` on the level dashes, which last ``burst_s`` only. Padding repeats standing still.
+    First the level ones (they keep the heave of following), then stop, last command and follow, then those
+    that climb and those that dive, and from ``first_burst`` on the level dashes, which last ``burst_s`` only.
+    Padding repeats standing still.
     """
-    n_level, n_heave = ti.static(io.teacher_cfg.n_heading * io.teacher_cfg.n_speed, io.teacher_cfg.n_heave_heading)
+    n_level, n_heave = ti.static(
+        io.teacher_cfg.n_heading * io.teacher_cfg.n_speed, io.teacher_cfg.n_heave_heading
+    )
     follow = io.teacher.follow_vel_w[env]
     out = ti.Vector([0.0, 0.0, 0.0])
     if index >= ti.static(io.teacher_cfg.first_burst):
@@ -69,7 +75,9 @@ def candidate(env, index, io: Bundle[EvasionIO]):
         out = follow
     elif index > n_level + 2 and index < ti.static(io.teacher_cfg.n_held):
         nth = index - n_level - 3
-        heave = edge_limited(ti.select(nth % 2 == 0, 1.0, -1.0) * io.teacher_cfg.heave_m_s, io.ego.pos_w[env][2], io)
+        heave = edge_limited(
+            ti.select(nth % 2 == 0, 1.0, -1.0) * io.teacher_cfg.heave_m_s, io.ego.pos_w[env][2], io
+        )
         turn = ti.static(TWO_PI / io.teacher_cfg.n_heave_heading) * (nth // 2)
         out = _towards(env, turn, ti.select(nth >= 2 * n_heave, 0.0, 1.0), heave, io)
     return out
@@ -93,7 +101,8 @@ def edge_limited(heave, own_z, io: Bundle[EvasionIO]):
 
 @ti.func
 def speed_limit(angle, io: Bundle[EvasionIO]):
-    """Fastest level speed in a direction of the body frame: surge and sway are limited one by one, so diagonals are faster."""
+    """Fastest level speed in a direction of the body frame: surge and sway are limited one by one, so
+    diagonals are faster."""
     along = ti.abs(ti.cos(angle)) / ti.static(io.vehicle_cfg.max_surge_m_s)
     across = ti.abs(ti.sin(angle)) / ti.static(io.vehicle_cfg.max_sway_m_s)
     return 1.0 / ti.max(along, across)
@@ -101,17 +110,26 @@ def speed_limit(angle, io: Bundle[EvasionIO]):
 
 @ti.func
 def cost_lanes(env, cx, cy, cz, burst_s, io: Bundle[EvasionIO]):
-    """Cost of sixteen commanded velocities. Violations count by depth: a flat penalty drives straight on when every candidate is bad."""
+    """Cost of sixteen commanded velocities. Violations count by depth: a flat penalty drives straight on when
+    every candidate is bad."""
     pos, vel = io.ego.pos_w[env], turned_z3(io.ego.vel_b[env], io.ego.rpy[env][2])
     level, level_vel = ti.Vector([pos[0], pos[1]]), ti.Vector([vel[0], vel[1]])
-    peak, mean, contact, _ = body_depths(env, cx, cy, cz, burst_s, pos, vel, io.forecast, io.teacher_cfg, io.tracking_cfg, io.tank_cfg)
+    peak, mean, contact, _ = body_depths(
+        env, cx, cy, cz, burst_s, pos, vel, io.forecast, io.teacher_cfg, io.tracking_cfg, io.tank_cfg
+    )
     static_mean, static_contact = static_depths(
         env, cx, cy, burst_s, level, level_vel, io.clearance, io.teacher_cfg, io.tank_cfg, io.mapping_cfg
     )
-    off = _distance_lanes(cx, cy, cz, io.teacher.follow_vel_w[env]) * ti.static(io.teacher_cfg.weight_deviation / io.teacher_cfg.cruise_m_s)
-    change = _distance_lanes(cx, cy, cz, io.teacher.last_vel_w[env]) * ti.static(io.teacher_cfg.weight_change / io.teacher_cfg.cruise_m_s)
+    off = _distance_lanes(cx, cy, cz, io.teacher.follow_vel_w[env]) * ti.static(
+        io.teacher_cfg.weight_deviation / io.teacher_cfg.cruise_m_s
+    )
+    change = _distance_lanes(cx, cy, cz, io.teacher.last_vel_w[env]) * ti.static(
+        io.teacher_cfg.weight_change / io.teacher_cfg.cruise_m_s
+    )
     moving = peak * ti.static(io.teacher_cfg.weight_peak) + mean * ti.static(io.teacher_cfg.weight_mean)
-    touching = contact * ti.static(io.teacher_cfg.weight_contact) + static_contact * ti.static(io.teacher_cfg.weight_static_contact)
+    touching = contact * ti.static(io.teacher_cfg.weight_contact) + static_contact * ti.static(
+        io.teacher_cfg.weight_static_contact
+    )
     return moving + touching + static_mean * ti.static(io.teacher_cfg.weight_static) + off + change
 
 
@@ -125,7 +143,8 @@ def _distance_lanes(cx, cy, cz, velocity):
 
 @ti.func
 def _chosen(env, io: Bundle[EvasionIO]):
-    """Candidate of least cost (first of equals), and the mean of the candidates weighted by exp(-cost / softness)."""
+    """Candidate of least cost (first of equals), and the mean of the candidates weighted by exp(-cost /
+    softness)."""
     n_used = ti.static(io.teacher_cfg.n_candidate)
     best_cost, best = FAR_M, 0
     for index in range(n_used):
@@ -134,7 +153,9 @@ def _chosen(env, io: Bundle[EvasionIO]):
             best = index
     total, mean = 0.0, ti.Vector([0.0, 0.0, 0.0])
     for index in range(n_used):
-        excess = (io.teacher.candidate_cost[env, index] - best_cost) * ti.static(1.0 / io.teacher_cfg.softness)
+        excess = (io.teacher.candidate_cost[env, index] - best_cost) * ti.static(
+            1.0 / io.teacher_cfg.softness
+        )
         if excess < 12.0:
             weight = ti.exp(-excess)
             total += weight

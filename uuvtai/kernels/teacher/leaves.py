@@ -44,14 +44,19 @@ def _reset_blackboard(env, io: Bundle[TeacherIO]):
     io.teacher.clearance_m[env], io.teacher.path_clearance_m[env] = 0.0, 0.0
     level = ti.Vector([0.0, 0.0])
     io.teacher.away_w[env], io.teacher.gaze_w[env], io.teacher.steer_w[env] = level, level, level
-    io.teacher.conflict_s[env], io.teacher.hold_conflict_s[env], io.teacher.body_near_m[env] = FAR_M, FAR_M, FAR_M
+    io.teacher.conflict_s[env], io.teacher.hold_conflict_s[env], io.teacher.body_near_m[env] = (
+        FAR_M,
+        FAR_M,
+        FAR_M,
+    )
     io.teacher.calm_steps[env], io.teacher.evading_steps[env] = 0, 0
 
 
 @quick_launch
 @ti.kernel
 def tick_tree(io: Bundle[TeacherIO], action: AnyTensor):
-    """Tick the tree of every awake env once and write its action, here and into ``action`` (n_env, 4) [-1, 1]."""
+    """Tick the tree of every awake env once and write its action, here and into ``action`` (n_env, 4) [-1,
+    1]."""
     n = ti.static(io.clock.awake.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
         if pad == 0 and io.clock.awake[env] == 1:
@@ -65,10 +70,19 @@ def tick_tree(io: Bundle[TeacherIO], action: AnyTensor):
                 leaf = io.table.leaf[acting]
                 io.teacher.acted[env, acting] += 1
             io.teacher.leaf[env] = acting
-            io.teacher.evading_steps[env] = ti.select(leaf == codes.EVADE, io.teacher.evading_steps[env] + 1, 0)
+            io.teacher.evading_steps[env] = ti.select(
+                leaf == codes.EVADE, io.teacher.evading_steps[env] + 1, 0
+            )
             velocity = _wanted_velocity(env, leaf, acting, io)
             io.teacher.last_vel_w[env] = velocity
-            turn = _turn(leaf, velocity, _gaze(env, leaf, acting, io), io.ego.rpy[env][2], io.teacher.path_clearance_m[env], io)
+            turn = _turn(
+                leaf,
+                velocity,
+                _gaze(env, leaf, acting, io),
+                io.ego.rpy[env][2],
+                io.teacher.path_clearance_m[env],
+                io,
+            )
             io.teacher.action[env] = _action_of(env, velocity, turn, io)
             for i in ti.static(range(4)):
                 action[env, i] = ti.cast(io.teacher.action[env][i], ti.f32)
@@ -90,7 +104,11 @@ def _answer(env, node, io: Bundle[TeacherIO]):
     if leaf == codes.EMERGENCY_TTC:
         near = io.teacher.nearest_m[env] < _port(node, 1, ti.static(io.teacher_cfg.emergency_range_m), io)
         closing = io.teacher.ttc_s[env] < FAR_M
-        holds = ti.cast(io.teacher.ttc_s[env] < _port(node, 0, ti.static(io.teacher_cfg.emergency_ttc_s), io) or (near and closing), ti.i32)
+        holds = ti.cast(
+            io.teacher.ttc_s[env] < _port(node, 0, ti.static(io.teacher_cfg.emergency_ttc_s), io)
+            or (near and closing),
+            ti.i32,
+        )
     elif leaf == codes.PREDICTED_CONFLICT:
         seen = io.teacher.conflict_s[env] <= _port(node, 0, ti.static(io.teacher_cfg.conflict_within_s), io)
         lately = io.teacher.evading_steps[env] > 0 and io.teacher.calm_steps[env] * dt <= _port(
@@ -98,10 +116,14 @@ def _answer(env, node, io: Bundle[TeacherIO]):
         )
         holds = ti.cast(seen or lately, ti.i32)
     elif leaf == codes.ROUTE_BLOCKED:
-        blocked = io.teacher.path_clearance_m[env] < _port(node, 0, ti.static(io.teacher_cfg.blocked_clearance_m), io)
+        blocked = io.teacher.path_clearance_m[env] < _port(
+            node, 0, ti.static(io.teacher_cfg.blocked_clearance_m), io
+        )
         holds = ti.cast(io.route.n_way[env] > 0 and blocked, ti.i32)
     elif leaf == codes.STUCK:
-        holds = ti.cast(io.route.stuck_steps[env] * dt >= _port(node, 0, ti.static(io.teacher_cfg.stuck_s), io), ti.i32)
+        holds = ti.cast(
+            io.route.stuck_steps[env] * dt >= _port(node, 0, ti.static(io.teacher_cfg.stuck_s), io), ti.i32
+        )
     elif leaf == codes.HAS_ROUTE:
         holds = ti.cast(io.route.n_way[env] > 0, ti.i32)
     elif leaf == codes.SAFE_HERE:
@@ -134,12 +156,16 @@ def _wanted_velocity(env, leaf, node, io: Bundle[TeacherIO]):
         )
         out[2] = io.teacher.follow_vel_w[env][2]
         if _port(node, 1, 1.0, io) < 0.5:
-            out[2] = held_heave(io.mission.goal_w[env][2] - io.ego.pos_w[env][2], io.teacher_cfg, io.vehicle_cfg)
+            out[2] = held_heave(
+                io.mission.goal_w[env][2] - io.ego.pos_w[env][2], io.teacher_cfg, io.vehicle_cfg
+            )
     elif leaf == codes.EVADE:
         out = io.teacher.evade_vel_w[env]
     elif leaf == codes.BACK_OFF:
         back = turned_z(ti.Vector([-1.0, 0.0]), io.teacher.threat_bearing[env] + io.ego.rpy[env][2])
-        out = _retreat(back, away, io.teacher.clearance_m[env], io) * _port(node, 0, ti.static(io.teacher_cfg.back_off_m_s), io)
+        out = _retreat(back, away, io.teacher.clearance_m[env], io) * _port(
+            node, 0, ti.static(io.teacher_cfg.back_off_m_s), io
+        )
     elif leaf == codes.HOLD:
         crowd = ti.math.clamp(
             ti.static(io.teacher_cfg.hull_reach_m + io.teacher_cfg.contact_m + io.teacher_cfg.static_margin_m)
@@ -154,15 +180,20 @@ def _wanted_velocity(env, leaf, node, io: Bundle[TeacherIO]):
         ahead = io.mission.goal_w[env] - io.ego.pos_w[env]
         level = ti.Vector([ahead[0], ahead[1]])
         speed = _port(node, 0, ti.static(io.teacher_cfg.cruise_m_s), io) / ti.max(level.norm(), 1.0e-6)
-        out = ti.Vector([level[0] * speed, level[1] * speed, held_heave(ahead[2], io.teacher_cfg, io.vehicle_cfg)])
+        out = ti.Vector(
+            [level[0] * speed, level[1] * speed, held_heave(ahead[2], io.teacher_cfg, io.vehicle_cfg)]
+        )
     return out
 
 
 @ti.func
 def _retreat(back, away, clearance_m, io: Bundle[TeacherIO]):
-    """Direction of retreat: not into mapped obstacles; near one, what of the direction points into it is taken out."""
+    """Direction of retreat: not into mapped obstacles; near one, what of the direction points into it is
+    taken out."""
     into = ti.min(back.dot(away), 0.0)
-    near = clearance_m < ti.static(io.teacher_cfg.hull_reach_m + io.teacher_cfg.contact_m + 2.0 * io.teacher_cfg.static_margin_m)
+    near = clearance_m < ti.static(
+        io.teacher_cfg.hull_reach_m + io.teacher_cfg.contact_m + 2.0 * io.teacher_cfg.static_margin_m
+    )
     slid = back - ti.select(near, into, 0.0) * away
     unit = slid / ti.max(slid.norm(), 1.0e-3)
     return ti.Vector([unit[0], unit[1], 0.0])
@@ -170,19 +201,26 @@ def _retreat(back, away, clearance_m, io: Bundle[TeacherIO]):
 
 @ti.func
 def _action_of(env, velocity, turn, io: Bundle[TeacherIO]):
-    """Normalised action of a world velocity and an angle to turn by: body axes, direction kept where an axis saturates."""
+    """Normalised action of a world velocity and an angle to turn by: body axes, direction kept where an axis
+    saturates."""
     rpy = io.ego.rpy[env]
     body = rotation_wb(quaternion_wb(rpy[0], rpy[1], rpy[2])).transpose() @ velocity
-    surge, sway = body[0] / ti.static(io.vehicle_cfg.max_surge_m_s), body[1] / ti.static(io.vehicle_cfg.max_sway_m_s)
+    surge, sway = (
+        body[0] / ti.static(io.vehicle_cfg.max_surge_m_s),
+        body[1] / ti.static(io.vehicle_cfg.max_sway_m_s),
+    )
     excess = ti.max(1.0, ti.max(ti.abs(surge), ti.abs(sway)))
     heave = ti.math.clamp(body[2] / ti.static(io.vehicle_cfg.max_heave_m_s), -1.0, 1.0)
-    rate = ti.math.clamp(turn * ti.static(io.teacher_cfg.yaw_gain / io.vehicle_cfg.max_yaw_rate_rad_s), -1.0, 1.0)
+    rate = ti.math.clamp(
+        turn * ti.static(io.teacher_cfg.yaw_gain / io.vehicle_cfg.max_yaw_rate_rad_s), -1.0, 1.0
+    )
     return ti.Vector([surge / excess, sway / excess, heave, rate])
 
 
 @ti.func
 def _gaze(env, leaf, node, io: Bundle[TeacherIO]):
-    """[m] horizontal way to what is to be looked at, zero = nothing; the yardsticks, which heed no bodies, look at none."""
+    """[m] horizontal way to what is to be looked at, zero = nothing; the yardsticks, which heed no bodies,
+    look at none."""
     blind = leaf == codes.DRIVE_STRAIGHT
     if leaf == codes.FOLLOW_ROUTE:
         blind = _port(node, 1, 1.0, io) < 0.5
@@ -191,10 +229,12 @@ def _gaze(env, leaf, node, io: Bundle[TeacherIO]):
 
 @ti.func
 def _turn(leaf, velocity, gaze, yaw, room, io: Bundle[TeacherIO]):
-    """Angle to turn by: nose towards what is to be looked at, else along the way (where that is narrow, tail first is as slim).
+    """Angle to turn by: nose towards what is to be looked at, else along the way (where that is narrow, tail
+    first is as slim).
 
-    In danger a diagonal of the body goes along the way, because diagonals are faster: that whose nose is nearest to what is to be looked
-    at, not farther off than the camera sees well, or else nearest to the present heading.
+    In danger a diagonal of the body goes along the way, because diagonals are faster: that whose nose is
+    nearest to what is to be looked at, not farther off than the camera sees well, or else nearest to the
+    present heading.
     """
     gazes = gaze[0] * gaze[0] + gaze[1] * gaze[1] > 0.0
     look = wrapped_angle(ti.atan2(gaze[1], gaze[0]) - yaw)

@@ -1,4 +1,5 @@
-"""Assessment of threats for the behaviour tree: what the sonar feels, what the map holds, and whether following the route conflicts."""
+"""Assessment of threats for the behaviour tree: what the sonar feels, what the map holds, and whether
+following the route conflicts."""
 
 import taichi as ti
 
@@ -33,7 +34,8 @@ def assess_threats(io: Bundle[ThreatsIO]):
 
 @ti.func
 def _sense_contact(env, io: Bundle[ThreatsIO]):
-    """Smallest time to contact and nearest return. Two neighbouring beams must agree on a time, so that one outlier is no emergency."""
+    """Smallest time to contact and nearest return. Two neighbouring beams must agree on a time, so that one
+    outlier is no emergency."""
     n_ray = ti.static(io.scan.range_m.shape[1])
     ttc, threat, nearest, nearest_beam = FAR_M, 0, FAR_M, 0
     before = _beam_ttc(env, n_ray - 1, io)
@@ -62,7 +64,14 @@ def _beam_ttc(env, beam, io: Bundle[ThreatsIO]):
     closing = -io.scan.doppler_m_s[env, beam]
     out = FAR_M
     if io.scan.hit[env, beam] == 1 and closing > ti.static(io.teacher_cfg.emergency_closing_m_s):
-        out = ti.max(io.scan.range_m[env, beam] - ti.static(io.teacher_cfg.hull_reach_m + io.teacher_cfg.contact_m), 0.0) / closing
+        out = (
+            ti.max(
+                io.scan.range_m[env, beam]
+                - ti.static(io.teacher_cfg.hull_reach_m + io.teacher_cfg.contact_m),
+                0.0,
+            )
+            / closing
+        )
     return out
 
 
@@ -84,13 +93,19 @@ def _read_clearance(env, io: Bundle[ThreatsIO]):
         away = _unit(ti.Vector([pos[0] - site[0], pos[1] - site[1]]))
     io.teacher.away_w[env] = away
     here = ti.Vector([pos[0], pos[1]])
-    steer, room = ti.Vector([io.route.lookahead_w[env][0], io.route.lookahead_w[env][1]]), io.teacher.clearance_m[env]
+    steer, room = (
+        ti.Vector([io.route.lookahead_w[env][0], io.route.lookahead_w[env][1]]),
+        io.teacher.clearance_m[env],
+    )
     if io.route.n_way[env] > 0:
         room = _room_to(env, here, steer, io.teacher.clearance_m[env], io)
         for nearer in range(_NEARER):
             nth = (_NEARER - nearer) * ti.static(round(_NEARER_M / io.mapping_cfg.cell_m))
             if (
-                room < ti.static(io.teacher_cfg.hull_reach_m + io.teacher_cfg.contact_m + io.teacher_cfg.static_margin_m)
+                room
+                < ti.static(
+                    io.teacher_cfg.hull_reach_m + io.teacher_cfg.contact_m + io.teacher_cfg.static_margin_m
+                )
                 and nth < io.route.n_ahead[env]
             ):
                 point = io.route.ahead_w[env, nth]
@@ -127,10 +142,12 @@ def _unit(v):
 def _follow_velocity(env, io: Bundle[ThreatsIO]):
     """Level velocity towards the point that is steered for, slower in narrow places; zero without a route."""
     level = io.teacher.steer_w[env]
-    room = (io.teacher.clearance_m[env] - ti.static(io.teacher_cfg.hull_reach_m + io.teacher_cfg.contact_m)) / ti.static(
-        io.teacher_cfg.slow_clearance_m
-    )
-    share = ti.static(io.teacher_cfg.slow_fraction) + ti.static(1.0 - io.teacher_cfg.slow_fraction) * ti.math.clamp(room, 0.0, 1.0)
+    room = (
+        io.teacher.clearance_m[env] - ti.static(io.teacher_cfg.hull_reach_m + io.teacher_cfg.contact_m)
+    ) / ti.static(io.teacher_cfg.slow_clearance_m)
+    share = ti.static(io.teacher_cfg.slow_fraction) + ti.static(
+        1.0 - io.teacher_cfg.slow_fraction
+    ) * ti.math.clamp(room, 0.0, 1.0)
     askew = ti.abs(ti.sin(ti.atan2(level[1], level[0]) - io.ego.rpy[env][2]))
     if io.teacher.path_clearance_m[env] < ti.static(
         io.teacher_cfg.askew_clearance_m
@@ -143,9 +160,11 @@ def _follow_velocity(env, io: Bundle[ThreatsIO]):
 
 @ti.func
 def _foresee_conflict(env, io: Bundle[ThreatsIO]):
-    """Roll the follow velocity out against the forecasts, in decision steps only, with and without a change of depth; and a stop.
+    """Roll the follow velocity out against the forecasts, in decision steps only, with and without a change
+    of depth; and a stop.
 
-    Depth is changed towards the goal's only where that comes no nearer to any body: what is above or below is easily forgotten.
+    Depth is changed towards the goal's only where that comes no nearer to any body: what is above or below is
+    easily forgotten.
     """
     io.teacher.want_evade[env] = 0
     io.teacher.calm_steps[env] += 1
@@ -153,19 +172,25 @@ def _foresee_conflict(env, io: Bundle[ThreatsIO]):
         pos, vel = io.ego.pos_w[env], turned_z3(io.ego.vel_b[env], io.ego.rpy[env][2])
         follow = io.teacher.follow_vel_w[env]
         low, high = ti.static(depth_band(io.tank_cfg, io.teacher_cfg))
-        heave = held_heave(ti.math.clamp(io.mission.goal_w[env][2], low, high) - pos[2], io.teacher_cfg, io.vehicle_cfg)
+        heave = held_heave(
+            ti.math.clamp(io.mission.goal_w[env][2], low, high) - pos[2], io.teacher_cfg, io.vehicle_cfg
+        )
         cz = f16x(0.0)
         cz[1] = heave
         cx, cy = f16x(follow[0]), f16x(follow[1])
         cx[2], cy[2] = 0.0, 0.0
-        peak, _, _, first = body_depths(env, cx, cy, cz, FAR_M, pos, vel, io.forecast, io.teacher_cfg, io.tracking_cfg, io.tank_cfg)
+        peak, _, _, first = body_depths(
+            env, cx, cy, cz, FAR_M, pos, vel, io.forecast, io.teacher_cfg, io.tracking_cfg, io.tank_cfg
+        )
         climbs = peak[1] <= peak[0] + 1.0e-3
         io.teacher.follow_vel_w[env][2] = ti.select(climbs, heave, 0.0)
         io.teacher.conflict_s[env] = ti.select(climbs, first[1], first[0])
         io.teacher.hold_conflict_s[env] = first[2]
         gap, way = _nearest_body(env, pos, io)
         io.teacher.body_near_m[env] = gap
-        io.teacher.gaze_w[env] = way * ti.cast(io.teacher.path_clearance_m[env] > ti.static(io.teacher_cfg.gaze_clearance_m), ti.f32)
+        io.teacher.gaze_w[env] = way * ti.cast(
+            io.teacher.path_clearance_m[env] > ti.static(io.teacher_cfg.gaze_clearance_m), ti.f32
+        )
         if io.teacher.conflict_s[env] < FAR_M:
             io.teacher.calm_steps[env] = 0
         calm = io.teacher.calm_steps[env] * ti.static(io.episode_cfg.control_dt_s)
@@ -180,7 +205,8 @@ def _foresee_conflict(env, io: Bundle[ThreatsIO]):
 
 @ti.func
 def _nearest_body(env, pos, io: Bundle[ThreatsIO]):
-    """(distance [m] from the hull to the nearest forecast body, horizontal way [m] to the one that needs to be looked at).
+    """(distance [m] from the hull to the nearest forecast body, horizontal way [m] to the one that needs to
+    be looked at).
 
     A body above or below the sonar's fan needs it most. FAR_M and zero where there is none.
     """

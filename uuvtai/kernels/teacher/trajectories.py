@@ -1,8 +1,8 @@
 """Roll-outs of sixteen commanded velocities at once against forecast bodies and the mapped clearance.
 
 A commanded velocity c is reached with a first-order lag tau, so from velocity v0 the vehicle drives
-x(t) = x0 + v0 A(t) + c B(t), A(t) = tau (1 - exp(-t / tau)), B(t) = t - A(t): linear in c, which is all the lanes differ in.
-A burst that ends after T commands -c on top from then on: c (B(t) - B(t - T)).
+x(t) = x0 + v0 A(t) + c B(t), A(t) = tau (1 - exp(-t / tau)), B(t) = t - A(t): linear in c, which is all the
+lanes differ in. A burst that ends after T commands -c on top from then on: c (B(t) - B(t - T)).
 """
 
 import taichi as ti
@@ -29,15 +29,19 @@ def body_depths(
     tracking_cfg: Const[TrackingConfig],
     tank_cfg: Const[TankConfig],
 ):
-    """How deep each commanded velocity (lanes cx, cy, cz [m/s]) violates the wanted clearance from the forecast bodies.
+    """How deep each commanded velocity (lanes cx, cy, cz [m/s]) violates the wanted clearance from the
+    forecast bodies.
 
-    The velocities are commanded for ``burst_s`` [s], then stop. ``pos``, ``vel``: own position [m] and velocity [m/s] now, world.
-    Returns lanes: largest depth [m]; depth averaged over the horizon and summed over bodies [m]; largest depth below contact [m]; time of
-    the first violation [s], FAR_M = none. The clearance is reduced by closing_s times the closing speed, as the referee also stops at a
-    small time to collision. Bodies are upright cylinders; water known to be free above or below them (``above_w``, ``below_w``) adds to
-    the distance.
+    The velocities are commanded for ``burst_s`` [s], then stop. ``pos``, ``vel``: own position [m] and
+    velocity [m/s] now, world. Returns lanes: largest depth [m]; depth averaged over the horizon and summed
+    over bodies [m]; largest depth below contact [m]; time of the first violation [s], FAR_M = none. The
+    clearance is reduced by closing_s times the closing speed, as the referee also stops at a small time to
+    collision. Bodies are upright cylinders; water known to be free above or below them (``above_w``,
+    ``below_w``) adds to the distance.
     """
-    n_track, n_sample = ti.static(forecast.radius_m.shape[1], _samples(forecast.radius_m.shape[2], teacher_cfg, tracking_cfg))
+    n_track, n_sample = ti.static(
+        forecast.radius_m.shape[1], _samples(forecast.radius_m.shape[2], teacher_cfg, tracking_cfg)
+    )
     dt = ti.static(tracking_cfg.forecast_dt_s)
     low, high = ti.static(depth_band(tank_cfg, teacher_cfg))
     peak, mean, contact, first = f16x(0.0), f16x(0.0), f16x(0.0), f16x(FAR_M)
@@ -62,7 +66,12 @@ def body_depths(
                 margin = teacher_cfg.margin_m + teacher_cfg.margin_growth_m_s * time
                 wanted = teacher_cfg.contact_m + teacher_cfg.caution * margin
                 radius = forecast.radius_m[env, track, k]
-                bound = radius + ti.static(teacher_cfg.hull_reach_m) + wanted + ti.static(_fastest(teacher_cfg)) * gain
+                bound = (
+                    radius
+                    + ti.static(teacher_cfg.hull_reach_m)
+                    + wanted
+                    + ti.static(_fastest(teacher_cfg)) * gain
+                )
                 bound += ti.static(teacher_cfg.closing_s) * (reach_speed + body_vel.norm())
                 if radius >= 0 and start.norm_sqr() < bound * bound:
                     z = ti.math.clamp(cz * gain + (pos[2] + vel[2] * settle), low, high)
@@ -71,7 +80,9 @@ def body_depths(
                     for i in ti.static(range(LANES)):
                         depth = ti.max(wanted - free[i], 0.0)
                         peak[i] = ti.max(peak[i], depth)
-                        mean[i] += depth * ti.static(1.0 / (_samples(forecast.radius_m.shape[2], teacher_cfg, tracking_cfg) - 1))
+                        mean[i] += depth * ti.static(
+                            1.0 / (_samples(forecast.radius_m.shape[2], teacher_cfg, tracking_cfg) - 1)
+                        )
                         contact[i] = ti.max(contact[i], ti.static(teacher_cfg.contact_m) - free[i])
                         first[i] = ti.min(first[i], ti.select(depth > 0.0, time, FAR_M))
     return peak, mean, contact, first
@@ -79,10 +90,11 @@ def body_depths(
 
 @ti.func
 def _free_lanes(cx, cy, gap, start, drift, gain, share, radius, teacher_cfg: Const[TeacherConfig]):
-    """Surface-to-surface distance less closing_s times the closing speed, per lane; ``gap`` = weighted free water above or below.
+    """Surface-to-surface distance less closing_s times the closing speed, per lane; ``gap`` = weighted free
+    water above or below.
 
-    Position relative to the body is start + c gain, relative velocity drift + c share. Level with the body (gap 0) the distance goes on
-    below zero inside its radius, so that deeper is worse.
+    Position relative to the body is start + c gain, relative velocity drift + c share. Level with the body
+    (gap 0) the distance goes on below zero inside its radius, so that deeper is worse.
     """
     dx = cx * gain + start[0]
     dy = cy * gain + start[1]
@@ -92,7 +104,9 @@ def _free_lanes(cx, cy, gap, start, drift, gain, share, radius, teacher_cfg: Con
     distance = ti.sqrt(beyond * beyond + gap * gap + 1.0e-8)
     approach = -(dx * (cx * share + drift[0]) + dy * (cy * share + drift[1])) / middle
     closing = ti.max(approach, 0.0) * ti.select(gap > 0.0, beyond / distance, 1.0)
-    return distance + within - ti.static(teacher_cfg.hull_reach_m) - ti.static(teacher_cfg.closing_s) * closing
+    return (
+        distance + within - ti.static(teacher_cfg.hull_reach_m) - ti.static(teacher_cfg.closing_s) * closing
+    )
 
 
 @ti.func
@@ -108,7 +122,8 @@ def static_depths(
     tank_cfg: Const[TankConfig],
     mapping_cfg: Const[MappingConfig],
 ):
-    """How deep each commanded velocity violates the wanted static clearance: lanes mean depth and largest depth below contact [m]."""
+    """How deep each commanded velocity violates the wanted static clearance: lanes mean depth and largest
+    depth below contact [m]."""
     mean, contact = f16x(0.0), f16x(0.0)
     n_sample = ti.static(max(1, round(teacher_cfg.static_horizon_s / teacher_cfg.static_dt_s)))
     touch = ti.static(teacher_cfg.hull_reach_m + teacher_cfg.contact_m)
@@ -118,7 +133,12 @@ def static_depths(
         over = ti.max(time - burst_s, 0.0)
         gain = time - settle - over + settling(over, teacher_cfg)
         free = clearance_lanes(
-            env, cx * gain + (pos[0] + vel[0] * settle), cy * gain + (pos[1] + vel[1] * settle), clearance, tank_cfg, mapping_cfg
+            env,
+            cx * gain + (pos[0] + vel[0] * settle),
+            cy * gain + (pos[1] + vel[1] * settle),
+            clearance,
+            tank_cfg,
+            mapping_cfg,
         )
         for i in ti.static(range(LANES)):
             below = touch - free[i]
@@ -134,8 +154,11 @@ def settling(time, teacher_cfg: Const[TeacherConfig]):
 
 
 @ti.func
-def clearance_lanes(env, x, y, clearance: In[ClearanceState], tank_cfg: Const[TankConfig], mapping_cfg: Const[MappingConfig]):
-    """Mapped clearance [m] of the cells that hold the lanes' positions; positions off the grid take its border, which is 0."""
+def clearance_lanes(
+    env, x, y, clearance: In[ClearanceState], tank_cfg: Const[TankConfig], mapping_cfg: Const[MappingConfig]
+):
+    """Mapped clearance [m] of the cells that hold the lanes' positions; positions off the grid take its
+    border, which is 0."""
     x0, y0 = ti.static(grid_origin(tank_cfg, mapping_cfg.cell_m))
     n_row, n_col = ti.static(clearance.clearance_m.shape[1], clearance.clearance_m.shape[2])
     at_col = (x - x0) * ti.static(1.0 / mapping_cfg.cell_m)
@@ -166,7 +189,9 @@ def _decay(dt_s, lag_s):
 
 def _fastest(teacher_cfg):
     """[m/s] no level velocity that is ever rolled out is faster."""
-    return max(teacher_cfg.evade_m_s, teacher_cfg.cruise_m_s, teacher_cfg.back_off_m_s, teacher_cfg.unstick_m_s)
+    return max(
+        teacher_cfg.evade_m_s, teacher_cfg.cruise_m_s, teacher_cfg.back_off_m_s, teacher_cfg.unstick_m_s
+    )
 
 
 def _samples(n_forecast, teacher_cfg, tracking_cfg):

@@ -1,9 +1,10 @@
 """Tick of a behaviour tree stored as preorder arrays, for one env, without recursion.
 
-Returned statuses and ticked leaves follow BehaviorTree.CPP 4: ``Sequence`` and ``Fallback`` go on with the child that was running, their
-``Reactive`` forms begin at the first child in every tick and halt the siblings after the one that decides. Kept statuses follow py_trees
-(2.x), node by node: a finished node keeps its status until its parent enters it anew or a sibling halts it, where BehaviorTree.CPP resets
-the children of a finished node to IDLE at once. The kept form shows in a log what the newest tick found.
+Returned statuses and ticked leaves follow BehaviorTree.CPP 4: ``Sequence`` and ``Fallback`` go on with the
+child that was running, their ``Reactive`` forms begin at the first child in every tick and halt the siblings
+after the one that decides. Kept statuses follow py_trees (2.x), node by node: a finished node keeps its
+status until its parent enters it anew or a sibling halts it, where BehaviorTree.CPP resets the children of a
+finished node to IDLE at once. The kept form shows in a log what the newest tick found.
 """
 
 import taichi as ti
@@ -29,7 +30,8 @@ from uuvtai.tree_codes import (
 
 @ti.func
 def tick_nodes(env, io: Bundle[TeacherIO]):
-    """Tick the tree once; leaves answer ``teacher.result``. Returns the last action that was ticked and did not fail, -1 if none."""
+    """Tick the tree once; leaves answer ``teacher.result``. Returns the last action that was ticked and did
+    not fail, -1 if none."""
     node = 0
     acting = -1
     while node >= 0:
@@ -77,7 +79,8 @@ def _first_child(env, node, kind, io: Bundle[TeacherIO]):
 
 @ti.func
 def _next_child(env, child, parent, answer, io: Bundle[TeacherIO]):
-    """(sibling to tick after ``child`` answered, or -1 when that decides its parent, status of the parent, which is then set)."""
+    """(sibling to tick after ``child`` answered, or -1 when that decides its parent, status of the parent,
+    which is then set)."""
     following, decided = -1, answer
     kind, end = io.table.kind[parent], io.table.end[child]
     is_sequence = kind <= REACTIVE_SEQUENCE
@@ -114,7 +117,8 @@ def _decorated(kind, answer):
 @quick_launch
 @ti.kernel
 def tick_with_given_statuses(io: Bundle[TeacherIO], result: AnyTensor):  # pyright: ignore
-    """Tick every env with leaf answers given from outside, result[env, node]: for tests of the engine against another one."""
+    """Tick every env with leaf answers given from outside, result[env, node]: for tests of the engine against
+    another one."""
     for env in range(ti.static(io.teacher.leaf.shape[0])):
         for node in range(io.table.n_node[None]):
             io.teacher.result[env, node] = ti.cast(result[env, node], ti.i8)

@@ -1,7 +1,8 @@
-"""Inner loop: commanded body velocity and yaw rate -> wrench -> thrusts -> rotor commands, from measured motion only.
+"""Inner loop: commanded body velocity and yaw rate -> wrench -> thrusts -> rotor commands, from measured
+motion only.
 
-The vehicle knows its nominal parameters (vehicle section): drag, Coriolis and net buoyancy are fed forward, PI feedback does the rest.
-Vehicles are driven in packets of neighbouring rows (lanes.py, second way).
+The vehicle knows its nominal parameters (vehicle section): drag, Coriolis and net buoyancy are fed forward,
+PI feedback does the rest. Vehicles are driven in packets of neighbouring rows (lanes.py, second way).
 """
 
 from typing import Any, NamedTuple
@@ -17,7 +18,8 @@ from uuvtai.kernels.vehicle.rotor import rpm_of_thrust, thrust_limits
 @quick_launch
 @ti.kernel
 def command_thrusters(io: Bundle[ActuationIO], action: FloatMatrix):
-    """action (n_env, 4): surge, sway, heave, yaw rate in [-1, 1] of the vehicle's limits -> actuation.rpm_command."""
+    """action (n_env, 4): surge, sway, heave, yaw rate in [-1, 1] of the vehicle's limits ->
+    actuation.rpm_command."""
     n, lanes = ti.static(io.clock.awake.shape[0], n_column())
     n_packet = ti.static(-(-n // lanes))
     for packet, pad in ti.ndrange(n_packet, ti.static(spread(n_packet))):
@@ -63,15 +65,29 @@ class AxisLoop(NamedTuple):
 def axis_loops(cfg):
     """Loops of surge, sway, heave and yaw rate; plain Python, constants of the kernel."""
     linear = zip(cfg.velocity_gain, cfg.velocity_integral, cfg.max_force_n, strict=True)
-    yaw = AxisLoop(cfg.yaw_rate_gain, cfg.yaw_rate_integral, cfg.integral_band_rad_s, cfg.max_integral_n_m, cfg.max_moment_n_m)
-    return (*(AxisLoop(p, i, cfg.integral_band_m_s, cfg.max_integral_n, limit) for p, i, limit in linear), yaw)
+    yaw = AxisLoop(
+        cfg.yaw_rate_gain,
+        cfg.yaw_rate_integral,
+        cfg.integral_band_rad_s,
+        cfg.max_integral_n_m,
+        cfg.max_moment_n_m,
+    )
+    return (
+        *(AxisLoop(p, i, cfg.integral_band_m_s, cfg.max_integral_n, limit) for p, i, limit in linear),
+        yaw,
+    )
 
 
 @ti.func
 def scaled_command(action, io: Bundle[ActuationIO]):
     """[m/s, m/s, m/s, rad/s] of an action, clamped to [-1, 1]; NaN asks for nothing."""
     limits = ti.Vector(
-        [io.vehicle_cfg.max_surge_m_s, io.vehicle_cfg.max_sway_m_s, io.vehicle_cfg.max_heave_m_s, io.vehicle_cfg.max_yaw_rate_rad_s]
+        [
+            io.vehicle_cfg.max_surge_m_s,
+            io.vehicle_cfg.max_sway_m_s,
+            io.vehicle_cfg.max_heave_m_s,
+            io.vehicle_cfg.max_yaw_rate_rad_s,
+        ]
     )
     out = ti.Vector([0.0] * 4)
     for axis in ti.static(range(4)):
@@ -86,7 +102,8 @@ def scaled_command(action, io: Bundle[ActuationIO]):
 
 @ti.func
 def _drive(first, lanes: Const[int], io: Bundle[ActuationIO]):
-    """Rotor speeds of the velocity loop for the packet of vehicles that begins with ``first``, into this step's slot of the queue."""
+    """Rotor speeds of the velocity loop for the packet of vehicles that begins with ``first``, into this
+    step's slot of the queue."""
     n, n_thruster = ti.static(io.actuation.rpm_command.shape[0], io.actuation.rpm_command.shape[1])
     fleet = ti.Struct(
         command=ti.Matrix([[0.0] * lanes for _ in range(4)]),
@@ -99,7 +116,9 @@ def _drive(first, lanes: Const[int], io: Bundle[ActuationIO]):
     )
     for lane in range(lanes):
         _embark(lane, ti.min(first + lane, n - 1), fleet, io)
-    inverse = ti.Matrix([[io.allocation.thrust_of_wrench[i, axis] for axis in range(6)] for i in range(n_thruster)])
+    inverse = ti.Matrix(
+        [[io.allocation.thrust_of_wrench[i, axis] for axis in range(6)] for i in range(n_thruster)]
+    )
     for lane in range(lanes):
         _control(lane, fleet, inverse, io)
     for lane in range(lanes):
@@ -111,7 +130,8 @@ def _drive(first, lanes: Const[int], io: Bundle[ActuationIO]):
 def _embark(lane, env, fleet: Out[Any], io: Bundle[ActuationIO]):
     """Copy what one vehicle wants and senses into its column."""
     command, vel = io.actuation.command[env], io.ego.vel_b[env]
-    # a lost DVL holds an old velocity: feeding that back would run away, so the feed-forward drives alone until it is back
+    # a lost DVL holds an old velocity: feeding that back would run away, so the feed-forward drives alone
+    # until it is back
     seen = io.ego.vel_valid[env] == 1
     for axis in ti.static(range(3)):
         fleet.vel[axis, lane] = ti.select(seen, vel[axis], command[axis])
@@ -124,7 +144,8 @@ def _embark(lane, env, fleet: Out[Any], io: Bundle[ActuationIO]):
 
 @ti.func
 def _disembark(lane, env, fleet: In[Any], io: Bundle[ActuationIO]):
-    """Copy one vehicle's column back. What left the queue's tail reaches the rotors: the command of delay_steps control steps ago."""
+    """Copy one vehicle's column back. What left the queue's tail reaches the rotors: the command of
+    delay_steps control steps ago."""
     io.actuation.integral[env] = column(fleet.integral, lane)
     n_slot = ti.static(io.actuation.rpm_queue.shape[1])
     slot = io.clock.step[env] % n_slot
@@ -137,7 +158,8 @@ def _disembark(lane, env, fleet: In[Any], io: Bundle[ActuationIO]):
 
 @ti.func
 def _control(lane, fleet: Out[Any], inverse: In[Any], io: Bundle[ActuationIO]):
-    """Velocity loop of one column. It touches local variables only, so that the loop over columns becomes vector code."""
+    """Velocity loop of one column. It touches local variables only, so that the loop over columns becomes
+    vector code."""
     command, vel, rate = column(fleet.command, lane), column(fleet.vel, lane), column(fleet.rate, lane)
     integral, up = column(fleet.integral, lane), column(fleet.up, lane)
     error = ti.Vector([command[0] - vel[0], command[1] - vel[1], command[2] - vel[2], command[3] - rate[2]])
@@ -157,7 +179,9 @@ def _control(lane, fleet: Out[Any], inverse: In[Any], io: Bundle[ActuationIO]):
     for axis in ti.static(range(4)):
         starved = share < 1.0 or given[axis] != asked[axis]
         per_step = loops[axis].integral_gain * io.episode_cfg.control_dt_s
-        after = integrated(integral[axis], error[axis], starved, per_step, loops[axis].band, loops[axis].bound)
+        after = integrated(
+            integral[axis], error[axis], starved, per_step, loops[axis].band, loops[axis].bound
+        )
         fleet.integral[axis, lane] = ti.select(fleet.seen[0, lane] == 1.0 or axis == 3, after, integral[axis])
 
 
@@ -165,7 +189,8 @@ def _control(lane, fleet: Out[Any], inverse: In[Any], io: Bundle[ActuationIO]):
 def integrated(integral, error, starved, gain, band, bound):
     """Integral part [N or N m] after one control step; ``gain`` is per step. It never winds up:
 
-    it shrinks freely, but grows only on errors smaller than ``band`` that the actuators can serve (``starved``: they give less than asked).
+    it shrinks freely, but grows only on errors smaller than ``band`` that the actuators can serve
+    (``starved``: they give less than asked).
     """
     share = 0.0 if starved else ti.max(0.0, 1.0 - abs(error) / band)
     if error * integral < 0.0:
@@ -175,24 +200,34 @@ def integrated(integral, error, starved, gain, band, bound):
 
 @ti.func
 def feed_forward(command, vel, rate, up, io: Bundle[ActuationIO]):
-    """Force and moment that hold the commanded velocity in still water: drag of the command, Coriolis of the motion, net buoyancy."""
+    """Force and moment that hold the commanded velocity in still water: drag of the command, Coriolis of the
+    motion, net buoyancy."""
     mass, added, linear, quadratic = ti.static(
-        io.vehicle_cfg.mass_kg, io.vehicle_cfg.added_mass, io.vehicle_cfg.linear_damping, io.vehicle_cfg.quadratic_damping
+        io.vehicle_cfg.mass_kg,
+        io.vehicle_cfg.added_mass,
+        io.vehicle_cfg.linear_damping,
+        io.vehicle_cfg.quadratic_damping,
     )
     momentum = ti.Vector([(mass + added[0]) * vel[0], (mass + added[1]) * vel[1], (mass + added[2]) * vel[2]])
-    spin = ti.Vector([(io.vehicle_cfg.inertia_kg_m2[i] + added[3 + i]) * rate[i] for i in ti.static(range(3))])
+    spin = ti.Vector(
+        [(io.vehicle_cfg.inertia_kg_m2[i] + added[3 + i]) * rate[i] for i in ti.static(range(3))]
+    )
     force = rate.cross(momentum)
     moment = rate.cross(spin) + vel.cross(momentum)
     for axis in ti.static(range(3)):
         force[axis] += (linear[axis] + quadratic[axis] * abs(command[axis])) * command[axis]
     moment[2] += (linear[5] + quadratic[5] * abs(command[3])) * command[3]
-    net = ti.static(io.vehicle_cfg.gravity_m_s2 * (io.vehicle_cfg.water_density_kg_m3 * io.vehicle_cfg.volume_m3 - io.vehicle_cfg.mass_kg))
+    net = ti.static(
+        io.vehicle_cfg.gravity_m_s2
+        * (io.vehicle_cfg.water_density_kg_m3 * io.vehicle_cfg.volume_m3 - io.vehicle_cfg.mass_kg)
+    )
     return force - net * up, moment
 
 
 @ti.func
 def stabilising_moment(up, rate, coriolis, io: Bundle[ActuationIO]):
-    """[N m] roll and pitch moment of the hold by thrusters: upright, damped, Munk moment fed forward, bounded."""
+    """[N m] roll and pitch moment of the hold by thrusters: upright, damped, Munk moment fed forward,
+    bounded."""
     k, d = io.actuation_cfg.thruster_hold_gain_n_m, io.actuation_cfg.thruster_hold_damping
     roll, pitch = coriolis[0] - k * up[1] - d * rate[0], coriolis[1] + k * up[0] - d * rate[1]
     share = ti.min(1.0, io.actuation_cfg.hold_limit_n_m / ti.max(ti.sqrt(roll * roll + pitch * pitch), 1e-6))
@@ -207,9 +242,11 @@ def _up_b(rpy):
 
 @ti.func
 def _allocate(lane, wrench, fleet: Out[Any], inverse: In[Any], io: Bundle[ActuationIO]):
-    """Least-squares thrusts to rotor speeds; returns the share <= 1 by which all thrusts are scaled so that none exceeds its limit.
+    """Least-squares thrusts to rotor speeds; returns the share <= 1 by which all thrusts are scaled so that
+    none exceeds its limit.
 
-    One factor for all keeps the wrench's direction: a vehicle that clips single thrusters turns and drifts where it should only be slower.
+    One factor for all keeps the wrench's direction: a vehicle that clips single thrusters turns and drifts
+    where it should only be slower.
     """
     forward, reverse = ti.static(thrust_limits(io.vehicle_cfg))
     thrust = ti.Vector([0.0] * ti.static(len(io.vehicle_cfg.thrusters)))

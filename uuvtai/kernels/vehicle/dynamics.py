@@ -1,12 +1,16 @@
-"""Rigid body in water: Fossen's six degrees of freedom with current, added mass, damping, buoyancy and rotors.
+"""Rigid body in water: Fossen's six degrees of freedom with current, added mass, damping, buoyancy and
+rotors.
 
-(M_RB + M_A) dnu/dt + C_RB(nu) nu + C_A(nu_r) nu_r + D(nu_r) nu_r + g(eta) = tau   (T. Fossen, Handbook of Marine Craft, 2011)
+(M_RB + M_A) dnu/dt + C_RB(nu) nu + C_A(nu_r) nu_r + D(nu_r) nu_r + g(eta) = tau   (T. Fossen, Handbook of
+Marine Craft, 2011)
 
-Origin at the centre of mass and diagonal added mass make the full mass matrix diagonal, so it is solved exactly; the acceleration is never
-filtered (that is unstable when M_A > M_RB). Each substep is one explicit midpoint step, second order in dt.
+Origin at the centre of mass and diagonal added mass make the full mass matrix diagonal, so it is solved
+exactly; the acceleration is never filtered (that is unstable when M_A > M_RB). Each substep is one explicit
+midpoint step, second order in dt.
 
-Vehicles move in packets of neighbouring rows (lanes.py, second way): a packet is copied into a local ``fleet``, whose matrices have a
-column per vehicle, moved by a loop over the columns that touches nothing else, and copied back.
+Vehicles move in packets of neighbouring rows (lanes.py, second way): a packet is copied into a local
+``fleet``, whose matrices have a column per vehicle, moved by a loop over the columns that touches nothing
+else, and copied back.
 """
 
 from typing import Any
@@ -15,7 +19,14 @@ import taichi as ti
 
 from uuvtai.kernels.core.geometry import quaternion_wb, rotation_wb
 from uuvtai.kernels.core.lanes import column, is_awake, n_awake, n_column, put_column
-from uuvtai.kernels.core.noise import STREAM_CURRENT, STREAM_THRUSTER, STREAM_VEHICLE, normal, stream_key, uniform_in
+from uuvtai.kernels.core.noise import (
+    STREAM_CURRENT,
+    STREAM_THRUSTER,
+    STREAM_VEHICLE,
+    normal,
+    stream_key,
+    uniform_in,
+)
 from uuvtai.kernels.core.signature import Bundle, Const, In, Out, quick_launch, spread
 from uuvtai.kernels.vehicle.bundles import DynamicsIO
 from uuvtai.kernels.vehicle.rotor import lag_kept, thrust_of_rpm
@@ -30,7 +41,8 @@ _DRAW_QUADRATIC = 13
 @quick_launch
 @ti.kernel
 def move_vehicle(io: Bundle[DynamicsIO], dt_s: float, n_substep: int):
-    """One control step of dt_s [s] in n_substep substeps; then the current moves on to the end of the step."""
+    """One control step of dt_s [s] in n_substep substeps; then the current moves on to the end of the
+    step."""
     n, lanes = ti.static(io.clock.awake.shape[0], n_column())
     n_packet = ti.static(-(-n // lanes))
     for packet, pad in ti.ndrange(n_packet, ti.static(spread(n_packet))):
@@ -40,7 +52,9 @@ def move_vehicle(io: Bundle[DynamicsIO], dt_s: float, n_substep: int):
                 for env in range(packet * lanes, (packet + 1) * lanes):
                     if is_awake(env, io.clock):
                         key = stream_key(io.episode.key[env], io.clock.step[env], STREAM_CURRENT)
-                        io.current.vel_w[env] = current_after(io.current.mean_w[env], io.current.vel_w[env], key, dt_s, io)
+                        io.current.vel_w[env] = current_after(
+                            io.current.mean_w[env], io.current.vel_w[env], key, dt_s, io
+                        )
 
 
 @quick_launch
@@ -58,7 +72,7 @@ def reset_vehicle(io: Bundle[DynamicsIO]):
             _draw_current(env, io)
 
 
-# ------------------------------------------------------------------------------------------------------------------ one step
+# --------------------------------------------------------------------------------------------------- one step
 
 
 @ti.func
@@ -87,7 +101,9 @@ def _move(first, lanes: Const[int], dt, n_substep, io: Bundle[DynamicsIO]):
     )
     for lane in range(lanes):
         _embark(lane, ti.min(first + lane, n - 1), fleet, io)
-    geometry = ti.Matrix([[io.allocation.wrench_of_thrust[axis, i] for i in range(n_thruster)] for axis in range(6)])
+    geometry = ti.Matrix(
+        [[io.allocation.wrench_of_thrust[axis, i] for i in range(n_thruster)] for axis in range(6)]
+    )
     kept = lag_kept(0.5 * dt, io.vehicle_cfg.rotor_tau_s)
     for _ in range(n_substep):
         for lane in range(lanes):
@@ -137,11 +153,17 @@ def _disembark(lane, env, fleet: In[Any], io: Bundle[DynamicsIO]):
 
 @ti.func
 def _advance(lane, fleet: Out[Any], geometry: In[Any], kept, dt, io: Bundle[DynamicsIO]):
-    """One midpoint step of one column. It touches local variables only, so that the loop over columns becomes vector code."""
+    """One midpoint step of one column. It touches local variables only, so that the loop over columns becomes
+    vector code."""
     body = body_of(lane, fleet, io)
     current_w = column(fleet.current, lane)
     force, moment = _rotor_wrench(lane, fleet, geometry, kept, io)
-    pos, q, v, w = column(fleet.pos, lane), column(fleet.quat, lane), column(fleet.vel, lane), column(fleet.rate, lane)
+    pos, q, v, w = (
+        column(fleet.pos, lane),
+        column(fleet.quat, lane),
+        column(fleet.vel, lane),
+        column(fleet.rate, lane),
+    )
     dv, dw = acceleration(q, v, w, force, moment, current_w, body, io)
     q_mid = turned(q, w, 0.5 * dt)
     v_mid, w_mid = v + 0.5 * dt * dv, w + 0.5 * dt * dw
@@ -159,10 +181,11 @@ def _advance(lane, fleet: Out[Any], geometry: In[Any], kept, dt, io: Bundle[Dyna
 
 @ti.func
 def _rotor_wrench(lane, fleet: Out[Any], geometry: In[Any], kept, io: Bundle[DynamicsIO]):
-    """Force and moment of all thrusters at the middle of the substep, plus what acts from outside; the rotors move on by a substep.
+    """Force and moment of all thrusters at the middle of the substep, plus what acts from outside; the rotors
+    move on by a substep.
 
-    ``kept`` is what the lag leaves of the distance to the command after half a substep. The middle value keeps the midpoint rule second
-    order although the lag is as short as a substep.
+    ``kept`` is what the lag leaves of the distance to the command after half a substep. The middle value
+    keeps the midpoint rule second order although the lag is as short as a substep.
     """
     force = ti.Vector([fleet.outside[0, lane], fleet.outside[1, lane], fleet.outside[2, lane]])
     moment = ti.Vector([fleet.outside[3, lane], fleet.outside[4, lane], fleet.outside[5, lane]])
@@ -178,7 +201,7 @@ def _rotor_wrench(lane, fleet: Out[Any], geometry: In[Any], kept, io: Bundle[Dyn
     return force, moment
 
 
-# ------------------------------------------------------------------------------------------------------------ equation of motion
+# ----------------------------------------------------------------------------------------- equation of motion
 
 
 @ti.func
@@ -229,7 +252,8 @@ def acceleration(q, v, w, force, moment, current_w, body: In[Any], io: Bundle[Dy
 
 @ti.func
 def hold_moment(up, w, io: Bundle[DynamicsIO]):
-    """[N m] ideal attitude hold: pulls body z upright and damps roll and pitch rate, bounded; yaw stays free."""
+    """[N m] ideal attitude hold: pulls body z upright and damps roll and pitch rate, bounded; yaw stays
+    free."""
     k, d = io.actuation_cfg.hold_gain_n_m, io.actuation_cfg.hold_damping
     roll, pitch = -k * up[1] - d * w[0], k * up[0] - d * w[1]
     share = ti.min(1.0, io.actuation_cfg.hold_limit_n_m / ti.max(ti.sqrt(roll * roll + pitch * pitch), 1e-6))
@@ -271,7 +295,7 @@ def current_after(mean, velocity, key, dt_s, io: Bundle[DynamicsIO]):
     return mean + keep * (velocity - mean) + kick * noise
 
 
-# --------------------------------------------------------------------------------------------------------------------- reset
+# ------------------------------------------------------------------------------------------------------ reset
 
 
 @ti.func
@@ -287,7 +311,8 @@ def _place(env, io: Bundle[DynamicsIO]):
 
 @ti.func
 def _draw_body(env, io: Bundle[DynamicsIO]):
-    """Nominal values times the factors of this episode. Buoyancy follows the mass: the vehicle is trimmed again, not sunk."""
+    """Nominal values times the factors of this episode. Buoyancy follows the mass: the vehicle is trimmed
+    again, not sunk."""
     key = stream_key(io.episode.key[env], 0, STREAM_VEHICLE)
     heavier = _factor(key, _DRAW_MASS, io.disturbance_cfg.mass_spread)
     io.params.mass_kg[env] = heavier * io.vehicle_cfg.mass_kg
@@ -325,8 +350,15 @@ def _draw_thrusters(env, io: Bundle[DynamicsIO]):
 
 @ti.func
 def _draw_current(env, io: Bundle[DynamicsIO]):
-    """Mean plus a draw of the stationary distribution, so that the statistics are the same at every time of an episode."""
-    mean = ti.Vector([io.disturbance_cfg.current_m_s[0], io.disturbance_cfg.current_m_s[1], io.disturbance_cfg.current_m_s[2]])
+    """Mean plus a draw of the stationary distribution, so that the statistics are the same at every time of
+    an episode."""
+    mean = ti.Vector(
+        [
+            io.disturbance_cfg.current_m_s[0],
+            io.disturbance_cfg.current_m_s[1],
+            io.disturbance_cfg.current_m_s[2],
+        ]
+    )
     key = stream_key(io.episode.key[env], 0, STREAM_CURRENT)
     noise = ti.Vector([normal(key, 2), normal(key, 3), 0.0])  # draws 0 and 1 belong to the first step
     io.current.mean_w[env] = mean

@@ -1,6 +1,8 @@
-"""Thruster: rotor lag, thrust curve and its inverse. Floor file: actuation asks for thrusts, dynamics produces them.
+"""Thruster: rotor lag, thrust curve and its inverse. Floor file: actuation asks for thrusts, dynamics
+produces them.
 
-The curve is the T200 fit of MarineGym's BlueROV asset: one quadratic in rotor speed per direction, nothing inside a dead band.
+The curve is the T200 fit of MarineGym's BlueROV asset: one quadratic in rotor speed per direction, nothing
+inside a dead band.
 """
 
 import taichi as ti
@@ -13,7 +15,8 @@ KGF = 9.81
 
 
 def edge_rpm(curve, dead_rpm, sign):
-    """Smallest speed [rpm, signed] that pushes: the dead band's edge, or the vertex below which the fit turns round."""
+    """Smallest speed [rpm, signed] that pushes: the dead band's edge, or the vertex below which the fit turns
+    round."""
     return sign * max(dead_rpm, -sign * curve[1] / (2.0 * curve[0]))
 
 
@@ -42,20 +45,29 @@ def thrust_of_rpm(rpm, vehicle_cfg: Const[VehicleConfig]):
     forward, reverse = ti.static(vehicle_cfg.thrust_forward, vehicle_cfg.thrust_reverse)
     thrust = 0.0 * rpm
     if rpm >= ti.static(edge_rpm(vehicle_cfg.thrust_forward, vehicle_cfg.dead_band_rpm[0], 1.0)):
-        thrust = ti.static(KGF * vehicle_cfg.thrust_scale) * ((forward[0] * rpm + forward[1]) * rpm + forward[2])
+        thrust = ti.static(KGF * vehicle_cfg.thrust_scale) * (
+            (forward[0] * rpm + forward[1]) * rpm + forward[2]
+        )
     elif rpm <= ti.static(edge_rpm(vehicle_cfg.thrust_reverse, vehicle_cfg.dead_band_rpm[1], -1.0)):
-        thrust = ti.static(KGF * vehicle_cfg.thrust_scale) * ((reverse[0] * rpm + reverse[1]) * rpm + reverse[2])
+        thrust = ti.static(KGF * vehicle_cfg.thrust_scale) * (
+            (reverse[0] * rpm + reverse[1]) * rpm + reverse[2]
+        )
     return thrust
 
 
 @ti.func
 def rpm_of_thrust(thrust, vehicle_cfg: Const[VehicleConfig]):
-    """Rotor speed [rpm] that gives a thrust [N]; a thrust below the smallest one is rounded to it or to nothing, whichever is nearer."""
+    """Rotor speed [rpm] that gives a thrust [N]; a thrust below the smallest one is rounded to it or to
+    nothing, whichever is nearer."""
     rpm = 0.0 * thrust
     if thrust > 0:
-        rpm = _branch_rpm(thrust, vehicle_cfg.thrust_forward, vehicle_cfg.dead_band_rpm[0], 1.0, vehicle_cfg.thrust_scale)
+        rpm = _branch_rpm(
+            thrust, vehicle_cfg.thrust_forward, vehicle_cfg.dead_band_rpm[0], 1.0, vehicle_cfg.thrust_scale
+        )
     else:
-        rpm = _branch_rpm(thrust, vehicle_cfg.thrust_reverse, vehicle_cfg.dead_band_rpm[1], -1.0, vehicle_cfg.thrust_scale)
+        rpm = _branch_rpm(
+            thrust, vehicle_cfg.thrust_reverse, vehicle_cfg.dead_band_rpm[1], -1.0, vehicle_cfg.thrust_scale
+        )
     return ti.math.clamp(rpm, -vehicle_cfg.rotor_max_rpm, vehicle_cfg.rotor_max_rpm)
 
 
@@ -67,7 +79,9 @@ def _branch_rpm(thrust, curve: Const[tuple], dead_rpm: Const[float], sign: Const
     if sign * thrust >= ti.static(sign * least):
         offset = curve[2] - thrust / ti.static(KGF * scale)
         root = ti.sqrt(ti.max(curve[1] * curve[1] - 4.0 * curve[0] * offset, 0.0))
-        rpm = (root - curve[1]) / ti.static(2.0 * curve[0])  # the root on the outer side of the vertex, for either sign of curve[0]
+        rpm = (root - curve[1]) / ti.static(
+            2.0 * curve[0]
+        )  # the root on the outer side of the vertex, for either sign of curve[0]
     elif sign * thrust >= ti.static(0.5 * sign * least):
         rpm = edge
     return rpm

@@ -1,4 +1,5 @@
-"""The list of bodies of each env: how slots are written and which of them move. Floor of the scenario's drawing."""
+"""The list of bodies of each env: how slots are written and which of them move. Floor of the scenario's
+drawing."""
 
 import taichi as ti
 
@@ -25,5 +26,6 @@ def first_moving(world: In[WorldState], path: In[PathState]):
 
 @ti.func
 def is_chosen(i, fraction: Const[float]):
-    """1 for the indices that make up a fraction of any run of indices as evenly as can be: of an even number, half are exactly half."""
+    """1 for the indices that make up a fraction of any run of indices as evenly as can be: of an even number,
+    half are exactly half."""
     return ti.cast(ti.floor((i + 1) * fraction) > ti.floor(i * fraction), ti.i32)

@@ -6,7 +6,16 @@ from dataclasses import dataclass
 
 from uuvtai.config import EpisodeConfig, WorldConfig
 from uuvtai.kernels.core.signature import Const, In, Out
-from uuvtai.state import ClockState, EpisodeState, FixedTable, MissionState, PathState, ScenarioScratch, SceneState, WorldState
+from uuvtai.state import (
+    ClockState,
+    EpisodeState,
+    FixedTable,
+    MissionState,
+    PathState,
+    ScenarioScratch,
+    SceneState,
+    WorldState,
+)
 
 
 @dataclass(frozen=True, eq=False)

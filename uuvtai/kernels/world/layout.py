@@ -1,6 +1,8 @@
-"""Layout of a scenario: start, goal and static obstacles, drawn again until free space joins start and goal. Floor of ``world.py``.
+"""Layout of a scenario: start, goal and static obstacles, drawn again until free space joins start and goal.
+Floor of ``world.py``.
 
-Every search is bounded; where its draws run out, ``WorldState.faults`` says so and the scenario counts as not placed.
+Every search is bounded; where its draws run out, ``WorldState.faults`` says so and the scenario counts as not
+placed.
 """
 
 import taichi as ti
@@ -91,7 +93,9 @@ def draw_endpoints(env, pair, io: Bundle[WorldIO]):
 def keeps_endpoints(env, shape, io: Bundle[WorldIO]):
     """1 where a footprint's surface keeps its gap from start and goal."""
     reach = io.world_cfg.static.endpoint_gap_m + shape[6]
-    nearest = ti.min(nearest_squared(shape, io.mission.start_w[env]), nearest_squared(shape, io.mission.goal_w[env]))
+    nearest = ti.min(
+        nearest_squared(shape, io.mission.start_w[env]), nearest_squared(shape, io.mission.goal_w[env])
+    )
     return ti.cast(nearest > 0.0 and nearest >= reach * reach, ti.i32)
 
 
@@ -122,8 +126,12 @@ def draw_static_body(env, slot, i, key, io: Bundle[WorldIO]):
     yaw = 0.0
     if is_chosen(i, io.world_cfg.static.box_fraction) == 1:
         kind = BOX
-        size[0] = uniform_in(key, first + 1, io.world_cfg.static.half_extent_m[0], io.world_cfg.static.half_extent_m[1])
-        size[1] = uniform_in(key, first + 2, io.world_cfg.static.half_extent_m[0], io.world_cfg.static.half_extent_m[1])
+        size[0] = uniform_in(
+            key, first + 1, io.world_cfg.static.half_extent_m[0], io.world_cfg.static.half_extent_m[1]
+        )
+        size[1] = uniform_in(
+            key, first + 2, io.world_cfg.static.half_extent_m[0], io.world_cfg.static.half_extent_m[1]
+        )
         yaw = TWO_PI * uniform(key, first + 3)
     found = 0
     draw = 0
@@ -151,15 +159,16 @@ def keeps_gaps(env, shape, n_body, gap_m, io: Bundle[WorldIO]):
     return kept
 
 
-# ------------------------------------------------------------------------------------------- is the goal joined to the start
+# ---------------------------------------------------------------------------- is the goal joined to the start
 
 
 @ti.func
 def is_joined(env, io: Bundle[WorldIO]):
     """1 where free space with the wanted clearance joins start and goal.
 
-    Conservative: cells are neighbours over their edges, and a cell is free where its centre has half a cell more clearance than wanted,
-    so that the straight way between neighbours has what is wanted (distance is 1-Lipschitz).
+    Conservative: cells are neighbours over their edges, and a cell is free where its centre has half a cell
+    more clearance than wanted, so that the straight way between neighbours has what is wanted (distance is
+    1-Lipschitz).
     """
     block_cells(env, io.world_cfg.static.joined_clearance_m + 0.5 * COARSE_M, io)
     start = coarse_cell(io.mission.start_w[env], io)
@@ -181,15 +190,27 @@ def coarse_cell(pos_w, io: Bundle[WorldIO]):
     """(row, col) of the coarse cell that holds a position."""
     row = ti.cast((pos_w[1] - io.world_cfg.tank.y_m[0]) * (1.0 / COARSE_M), ti.i32)
     col = ti.cast((pos_w[0] - io.world_cfg.tank.x_m[0]) * (1.0 / COARSE_M), ti.i32)
-    return ti.Vector([ti.math.clamp(row, 0, io.scratch.reach.shape[1] - 1), ti.math.clamp(col, 0, io.scratch.reach.shape[2] - 1)])
+    return ti.Vector(
+        [
+            ti.math.clamp(row, 0, io.scratch.reach.shape[1] - 1),
+            ti.math.clamp(col, 0, io.scratch.reach.shape[2] - 1),
+        ]
+    )
 
 
 @ti.func
 def block_cells(env, clearance_m, io: Bundle[WorldIO]):
     """Mark the cells whose centre is nearer than ``clearance_m`` to a wall or static obstacle."""
     for row, col in ti.ndrange(io.scratch.reach.shape[1], io.scratch.reach.shape[2]):
-        center = ti.Vector([io.world_cfg.tank.x_m[0] + (col + 0.5) * COARSE_M, io.world_cfg.tank.y_m[0] + (row + 0.5) * COARSE_M])
-        io.scratch.reach[env, row, col] = ti.cast(1 - is_inside(disc(center, 0.0), clearance_m, io.world_cfg.tank), ti.u8)
+        center = ti.Vector(
+            [
+                io.world_cfg.tank.x_m[0] + (col + 0.5) * COARSE_M,
+                io.world_cfg.tank.y_m[0] + (row + 0.5) * COARSE_M,
+            ]
+        )
+        io.scratch.reach[env, row, col] = ti.cast(
+            1 - is_inside(disc(center, 0.0), clearance_m, io.world_cfg.tank), ti.u8
+        )
     for slot in range(ti.static(io.world_cfg.n_fixed_static + io.world_cfg.static_slots)):
         if io.world.kind[env, slot] != NONE:
             shape = io.scratch.footprint[env, slot]
@@ -200,7 +221,10 @@ def block_cells(env, clearance_m, io: Bundle[WorldIO]):
             for row in range(low[0], high[0] + 1):
                 for col in range(low[1], high[1] + 1):
                     center = ti.Vector(
-                        [io.world_cfg.tank.x_m[0] + (col + 0.5) * COARSE_M, io.world_cfg.tank.y_m[0] + (row + 0.5) * COARSE_M]
+                        [
+                            io.world_cfg.tank.x_m[0] + (col + 0.5) * COARSE_M,
+                            io.world_cfg.tank.y_m[0] + (row + 0.5) * COARSE_M,
+                        ]
                     )
                     if nearest_squared(shape, center) < reach * reach:
                         io.scratch.reach[env, row, col] = ti.u8(1)

@@ -1,4 +1,5 @@
-"""Moving obstacles: how they and their paths are drawn, and where they are at any time. Floor of ``world.py``."""
+"""Moving obstacles: how they and their paths are drawn, and where they are at any time. Floor of
+``world.py``."""
 
 import taichi as ti
 
@@ -39,7 +40,9 @@ def path_point(env, lane, arc_m, io: Bundle[WorldIO]):
         turn = io.path.radius_m[env, lane]  # negative = clockwise
         ahead = steady_direction(rest / turn)
         sign = 1.0 if turn > 0.0 else -1.0
-        out += ti.Vector([ti.abs(turn) * ahead[0], ti.abs(turn) * ahead[1], -sign * ahead[1], sign * ahead[0]])
+        out += ti.Vector(
+            [ti.abs(turn) * ahead[0], ti.abs(turn) * ahead[1], -sign * ahead[1], sign * ahead[0]]
+        )
     else:
         on_it = 0
         for j in range(n_way):
@@ -80,7 +83,12 @@ def draw_moving_body(env, slot, i, key, io: Bundle[WorldIO]):
         size[2] = 0.5 * uniform_in(key, 1, io.world_cfg.dynamic.height_m[0], io.world_cfg.dynamic.height_m[1])
         if ti.static(io.world_cfg.dynamic.full_column_fraction > 0):
             nth = ti.cast(ti.floor(i * io.world_cfg.dynamic.cylinder_fraction), ti.i32)
-            if is_chosen(nth, io.world_cfg.dynamic.full_column_fraction / io.world_cfg.dynamic.cylinder_fraction) == 1:
+            if (
+                is_chosen(
+                    nth, io.world_cfg.dynamic.full_column_fraction / io.world_cfg.dynamic.cylinder_fraction
+                )
+                == 1
+            ):
                 z = 0.5 * (io.world_cfg.tank.z_m[0] + io.world_cfg.tank.z_m[1])
                 size[2] = 0.5 * (io.world_cfg.tank.z_m[1] - io.world_cfg.tank.z_m[0])
     put_body(env, slot, kind, ti.Vector([0.0, 0.0, z]), size, 0.0, io)
@@ -88,7 +96,8 @@ def draw_moving_body(env, slot, i, key, io: Bundle[WorldIO]):
 
 @ti.func
 def draw_clear_path(env, lane, slot, i, key, io: Bundle[WorldIO]):
-    """Draw paths until one keeps clear of static obstacles, or the draws for that are used up; walls and the start's gap always hold."""
+    """Draw paths until one keeps clear of static obstacles, or the draws for that are used up; walls and the
+    start's gap always hold."""
     radius = io.world.size[env, slot][0]
     found = 0
     draw = 0
@@ -110,7 +119,8 @@ def draw_clear_path(env, lane, slot, i, key, io: Bundle[WorldIO]):
 
 @ti.func
 def crossed(i):
-    """Index with its last two bits crossed, so that half of the spheres and half of the cylinders go around circles."""
+    """Index with its last two bits crossed, so that half of the spheres and half of the cylinders go around
+    circles."""
     return i ^ ((i >> 1) & 1)
 
 
@@ -152,7 +162,8 @@ def point_within(key, first, reach_x, reach_y, io: Bundle[WorldIO]):
 
 @ti.func
 def draw_line(env, lane, radius, key, first, io: Bundle[WorldIO]):
-    """Back and forth on a line. The length is drawn once per obstacle, so that short lines are not favoured."""
+    """Back and forth on a line. The length is drawn once per obstacle, so that short lines are not
+    favoured."""
     length = uniform_in(key, 3, io.world_cfg.dynamic.line_length_m[0], io.world_cfg.dynamic.line_length_m[1])
     half = 0.5 * length * steady_direction(0.5 * TWO_PI * uniform(key, first + 1))
     center = point_within(key, first + 2, ti.abs(half[0]) + radius, ti.abs(half[1]) + radius, io)
@@ -167,7 +178,9 @@ def draw_line(env, lane, radius, key, first, io: Bundle[WorldIO]):
 @ti.func
 def draw_circle(env, lane, radius, key, first, io: Bundle[WorldIO]):
     """Around a circle, either way. Radius and direction are drawn once per obstacle."""
-    circle = uniform_in(key, 3, io.world_cfg.dynamic.circle_radius_m[0], io.world_cfg.dynamic.circle_radius_m[1])
+    circle = uniform_in(
+        key, 3, io.world_cfg.dynamic.circle_radius_m[0], io.world_cfg.dynamic.circle_radius_m[1]
+    )
     center = point_within(key, first + 2, circle + radius, circle + radius, io)
     io.path.n_way[env, lane] = 0
     io.path.radius_m[env, lane] = circle if bits(key, 4) & 1 == 1 else -circle
@@ -178,7 +191,8 @@ def draw_circle(env, lane, radius, key, first, io: Bundle[WorldIO]):
 
 @ti.func
 def draw_loop(env, lane, radius, key, first, io: Bundle[WorldIO]):
-    """Closed loop of sharp corners, any two of them at least ``corner_gap_m`` apart; 0 where a corner finds no place."""
+    """Closed loop of sharp corners, any two of them at least ``corner_gap_m`` apart; 0 where a corner finds
+    no place."""
     choices = io.world_cfg.dynamic.corners[1] - io.world_cfg.dynamic.corners[0] + 1
     n_way = io.world_cfg.dynamic.corners[0] + ti.cast(choices * uniform(key, 5), ti.i32)
     placed = 1
@@ -210,7 +224,9 @@ def is_path_clear(env, lane, radius, io: Bundle[WorldIO]):
         if clear == 1 and io.world.kind[env, slot] != NONE:
             shape = io.scratch.footprint[env, slot]
             if n_way == 0:
-                clear = is_off_ring(shape, io.path.way_w[env, lane, 0], ti.abs(io.path.radius_m[env, lane]), radius)
+                clear = is_off_ring(
+                    shape, io.path.way_w[env, lane, 0], ti.abs(io.path.radius_m[env, lane]), radius
+                )
             for j in range(n_way):
                 along = stroke(io.path.way_w[env, lane, j], io.path.way_w[env, lane, (j + 1) % n_way], radius)
                 clear &= is_apart(along, shape, 0.0)

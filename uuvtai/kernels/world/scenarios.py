@@ -1,8 +1,10 @@
-"""Scenarios and moving obstacles: all that is true of the world as a pure function of (world preset, seed, episode, time).
+"""Scenarios and moving obstacles: all that is true of the world as a pure function of (world preset, seed,
+episode, time).
 
-Draws of different purposes have keys of their own, so that the number of moving obstacles or their speed changes neither the static
-obstacles nor start and goal, and obstacle i of S is drawn alike for every S. Every search is bounded; where its draws run out,
-``WorldState.faults`` says so: a scenario is never silently made easier.
+Draws of different purposes have keys of their own, so that the number of moving obstacles or their speed
+changes neither the static obstacles nor start and goal, and obstacle i of S is drawn alike for every S. Every
+search is bounded; where its draws run out, ``WorldState.faults`` says so: a scenario is never silently made
+easier.
 """
 
 import taichi as ti
@@ -19,7 +21,8 @@ from uuvtai.kernels.world.paths import draw_moving_bodies, path_point, polyline_
 @quick_launch
 @ti.kernel
 def generate_scenarios(io: Bundle[WorldIO]):
-    """Draw start, goal, static and moving obstacles of every awake row; ``move_obstacles`` then puts the moving ones in place."""
+    """Draw start, goal, static and moving obstacles of every awake row; ``move_obstacles`` then puts the
+    moving ones in place."""
     n = ti.static(io.clock.awake.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
         if pad == 0 and io.clock.awake[env] == 1:
@@ -54,18 +57,23 @@ def place_fixed(env, io: Bundle[WorldIO]):
             io.path.n_way[env, lane] = io.fixed.n_way[i]
             io.path.radius_m[env, lane] = 0.0
             io.path.phase_m[env, lane] = 0.0
-            io.path.speed_m_s[env, lane] = io.fixed.speed_m_s[i] if io.fixed.speed_m_s[i] >= 0.0 else io.scene.speed_m_s[env]
+            io.path.speed_m_s[env, lane] = (
+                io.fixed.speed_m_s[i] if io.fixed.speed_m_s[i] >= 0.0 else io.scene.speed_m_s[env]
+            )
             for j in range(io.path.way_w.shape[2]):
                 io.path.way_w[env, lane, j] = io.fixed.way_w[i, j]
             io.path.length_m[env, lane] = polyline_length(env, lane, io)
         put_body(env, slot, io.fixed.kind[i], io.fixed.pos_w[i], io.fixed.size[i], io.fixed.yaw[i], io)
-        io.scratch.footprint[env, slot] = footprint_of(io.fixed.kind[i], io.fixed.pos_w[i], io.fixed.size[i], io.fixed.yaw[i])
+        io.scratch.footprint[env, slot] = footprint_of(
+            io.fixed.kind[i], io.fixed.pos_w[i], io.fixed.size[i], io.fixed.yaw[i]
+        )
 
 
 @quick_launch
 @ti.kernel
 def move_obstacles(io: Bundle[WorldIO]):
-    """Put every moving body of the awake rows where it is at time step * dt, with its velocity; depth stays."""
+    """Put every moving body of the awake rows where it is at time step * dt, with its velocity; depth
+    stays."""
     n = ti.static(io.clock.awake.shape[0])
     for env, lane in ti.ndrange(n, ti.static(io.path.n_way.shape[1])):
         slot = first_moving(io.world, io.path) + lane

@@ -1,7 +1,9 @@
-"""The paper's claims against our results: each holds, does not hold, or cannot be judged, always with the numbers.
+"""The paper's claims against our results: each holds, does not hold, or cannot be judged, always with the
+numbers.
 
-A claim about rates has a test; all tests of a reproduction are one family, and Holm's adjustment (``judged``) bounds the chance that any of
-its verdicts is a false alarm by ``LEVEL``. Claims that set one number beside another have no test and no p value.
+A claim about rates has a test; all tests of a reproduction are one family, and Holm's adjustment (``judged``)
+bounds the chance that any of its verdicts is a false alarm by ``LEVEL``. Claims that set one number beside
+another have no test and no p value.
 """
 
 from __future__ import annotations
@@ -12,7 +14,15 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from uuvtai.measure.reproduce import paper
-from uuvtai.measure.statistics import binomial_p, fisher_p, holm_adjusted, normal_p, rate, time_to_success_s, wilson_interval
+from uuvtai.measure.statistics import (
+    binomial_p,
+    fisher_p,
+    holm_adjusted,
+    normal_p,
+    rate,
+    time_to_success_s,
+    wilson_interval,
+)
 from uuvtai.outcomes import COLLIDED
 
 HOLDS, FAILS, OPEN = "holds", "does not hold", "cannot be judged"
@@ -22,7 +32,8 @@ LEVEL = 0.05
 
 @dataclass(frozen=True)
 class Finding:
-    """Which way the numbers point, and how probable that would be by chance; p = None where nothing was tested."""
+    """Which way the numbers point, and how probable that would be by chance; p = None where nothing was
+    tested."""
 
     points_to: str
     p: float | None
@@ -48,7 +59,8 @@ def claim(text: str, theirs: str, ours: str, finding: Finding) -> Claim:
 
 
 def judged(claims: Sequence[Claim]) -> list[Claim]:
-    """The claims with final verdicts: a test decides where its p value, adjusted by Holm (1979) over all of them, is below ``LEVEL``."""
+    """The claims with final verdicts: a test decides where its p value, adjusted by Holm (1979) over all of
+    them, is below ``LEVEL``."""
     adjusted = iter(holm_adjusted([c.p for c in claims if c.p is not None]))
     return [_judged(c, next(adjusted)) if c.p is not None else c for c in claims]
 
@@ -81,8 +93,11 @@ class Share:
 
 
 def pooled(methods: Sequence[dict[str, Any]], *outcomes: str) -> Share:
-    """Share of the episodes of all these entries (of ``uuv eval`` or a sweep) that ended in one of ``outcomes``."""
-    return Share(sum(m["outcomes"][o] for m in methods for o in outcomes), sum(m["episodes"] for m in methods))
+    """Share of the episodes of all these entries (of ``uuv eval`` or a sweep) that ended in one of
+    ``outcomes``."""
+    return Share(
+        sum(m["outcomes"][o] for m in methods for o in outcomes), sum(m["episodes"] for m in methods)
+    )
 
 
 def larger(a: Share, b: Share) -> Finding:
@@ -105,9 +120,11 @@ _MARGIN = 0.1
 
 
 def near(a: Share, b: Share) -> Finding:
-    """Whether a's rate comes near b's or above: not inferior by more than 10 points, or else plainly the smaller one (Fisher).
+    """Whether a's rate comes near b's or above: not inferior by more than 10 points, or else plainly the
+    smaller one (Fisher).
 
-    The margin is tested by z with the variances of Agresti and Caffo (2000), which small and one-sided samples have too.
+    The margin is tested by z with the variances of Agresti and Caffo (2000), which small and one-sided
+    samples have too.
     """
     if a.rate < b.rate - _MARGIN:
         return Finding(FAILS, fisher_p(a.k, a.n, b.k, b.n))
@@ -122,18 +139,22 @@ def _softened(a: Share) -> tuple[float, float]:
 
 
 def times_as_large(a: Share, b: Share, factor: float) -> Finding:
-    """Whether a's rate is at least ``factor`` times b's: z of the logarithm of their ratio (Katz and others 1978)."""
+    """Whether a's rate is at least ``factor`` times b's: z of the logarithm of their ratio (Katz and others
+    1978)."""
     if not a.k or not b.k:
         return Finding(OPEN, None)
-    z = (math.log(a.rate / b.rate) - math.log(factor)) / math.sqrt((1 - a.rate) / a.k + (1 - b.rate) / b.k or 1e-12)
+    z = (math.log(a.rate / b.rate) - math.log(factor)) / math.sqrt(
+        (1 - a.rate) / a.k + (1 - b.rate) / b.k or 1e-12
+    )
     return Finding(HOLDS if z >= 0 else FAILS, normal_p(z))
 
 
-# -------------------------------------------------------------------------------------------------------------- Table main
+# ------------------------------------------------------------------------------------------------- Table main
 
 
 def of_table_main(by_preset: dict[str, list[dict[str, Any]]]) -> list[Claim]:
-    """Claims about the four methods and the ablations; entries of ``uuv eval`` by preset, one per training seed."""
+    """Claims about the four methods and the ablations; entries of ``uuv eval`` by preset, one per training
+    seed."""
     success = {name: pooled(entries, "success") for name, entries in by_preset.items()}
     collision = {name: pooled(entries, *COLLIDED) for name, entries in by_preset.items()}
     ours, plain = success["curriculum"], success["ppo"]
@@ -165,7 +186,8 @@ def of_table_main(by_preset: dict[str, list[dict[str, Any]]]) -> list[Claim]:
             larger(collision["ppo"], collision["curriculum"]),
         ),
         claim(
-            "Time to success (mean time / success rate) falls far below (under half) that of PPO without distillation",
+            "Time to success (mean time / success rate) falls far below (under half) that of PPO without "
+            "distillation",
             "15.8 s against 114.2 s",
             f"{_seconds(fast)} against {_seconds(slow)}",
             _far_below(fast, slow, larger(ours, plain)),
@@ -177,7 +199,12 @@ def of_table_main(by_preset: dict[str, list[dict[str, Any]]]) -> list[Claim]:
             near(ours, success["bt"]),
         ),
         *[
-            claim(text, "no table", f"{success['curriculum']} against {success[name]}", larger(success["curriculum"], success[name]))
+            claim(
+                text,
+                "no table",
+                f"{success['curriculum']} against {success[name]}",
+                larger(success["curriculum"], success[name]),
+            )
             for name, text in _ABLATIONS.items()
         ],
     ]
@@ -185,19 +212,22 @@ def of_table_main(by_preset: dict[str, list[dict[str, Any]]]) -> list[Claim]:
 
 _NEARLY_FOUR = 3.5
 _ABLATIONS = {
-    "no_risk_scaling": "Scaling the distillation by the world model's uncertainty raises success (ablation 'LWM risk')",
+    "no_risk_scaling": "Scaling the distillation by the world model's uncertainty raises success (ablation "
+    "'LWM risk')",
     "no_world_model": "The world model's features raise success (ablation 'LWM')",
 }
 
 
 def _far_below(ours_s: float | None, theirs_s: float | None, finding: Finding) -> Finding:
-    """Less than half; None = nobody ever arrived, as slow as can be. How sure that is follows from the rates of success."""
+    """Less than half; None = nobody ever arrived, as slow as can be. How sure that is follows from the rates
+    of success."""
     slower = ours_s is None or (theirs_s is not None and ours_s >= theirs_s / 2)
     return Finding(FAILS if slower else finding.points_to, finding.p)
 
 
 def tts_s(entries: Sequence[dict[str, Any]]) -> float | None:
-    """The paper's TTS [s] over all these entries: mean time of all episodes / rate of success; None without success or times."""
+    """The paper's TTS [s] over all these entries: mean time of all episodes / rate of success; None without
+    success or times."""
     n = sum(entry["episodes"] for entry in entries)
     times = [entry["time_mean_s"] for entry in entries]
     if not n or any(time is None for time in times):
@@ -210,13 +240,16 @@ def _seconds(value: float | None) -> str:
     return "-" if value is None else f"{value:.1f} s"
 
 
-# ----------------------------------------------------------------------------------------------------------------- training
+# --------------------------------------------------------------------------------------------------- training
 
 
 def of_training(metrics: Sequence[dict[str, Any]]) -> list[Claim]:
     """Whether the world model's losses fall; rows of ``metrics.jsonl`` of the curriculum."""
     claims = []
-    for key, name in (("world_model/reconstruction_loss", "Reconstruction"), ("world_model/dynamics_loss", "Dynamics")):
+    for key, name in (
+        ("world_model/reconstruction_loss", "Reconstruction"),
+        ("world_model/dynamics_loss", "Dynamics"),
+    ):
         values = [row[key] for row in metrics if key in row]
         part = max(1, len(values) // 5)
         if len(values) < 4:
@@ -224,17 +257,21 @@ def of_training(metrics: Sequence[dict[str, Any]]) -> list[Claim]:
             continue
         first, last = sum(values[:part]) / part, sum(values[-part:]) / part
         text = f"first fifth {first:.3g}, last fifth {last:.3g}"
-        claims.append(Claim(f"{name} loss falls and settles", "curve", text, HOLDS if last < 0.9 * first else FAILS))
+        claims.append(
+            Claim(f"{name} loss falls and settles", "curve", text, HOLDS if last < 0.9 * first else FAILS)
+        )
     return claims
 
 
-# -------------------------------------------------------------------------------------------------------------------- sweep
+# ------------------------------------------------------------------------------------------------------ sweep
 
 
 def of_sweep(cells: Sequence[dict[str, Any]], method: str) -> list[Claim]:
     """Claims about the grid of conditions, for one method of a sweep."""
     own = [cell for cell in cells if cell["method"] == method]
-    moderate = [cell for cell in own if all((cell[name] or 0) <= most for name, most in paper.MODERATE.items())]
+    moderate = [
+        cell for cell in own if all((cell[name] or 0) <= most for name, most in paper.MODERATE.items())
+    ]
     few = [cell for cell in own if cell["D"] <= paper.FEW_MOVERS]
     corner = [cell for cell in own if all(cell[name] == value for name, value in paper.CORNER.items())]
     success, collision = pooled(moderate, "success"), pooled(moderate, *COLLIDED)
@@ -247,13 +284,19 @@ def of_sweep(cells: Sequence[dict[str, Any]], method: str) -> list[Claim]:
             at_least(success, paper.MODERATE_SUCCESS),
         ),
         claim(
-            f"{method}: mean collision there", f"{paper.MODERATE_COLLISION}", str(collision), at_most(collision, paper.MODERATE_COLLISION)
+            f"{method}: mean collision there",
+            f"{paper.MODERATE_COLLISION}",
+            str(collision),
+            at_most(collision, paper.MODERATE_COLLISION),
         ),
         claim(
             f"{method}: conditions without any collision there",
             f"{paper.WITHOUT_COLLISION} of {paper.MODERATE_CONDITIONS}",
-            f"{spotless} of {len(moderate)} (D = 0 once per S), {moderate[0]['episodes'] if moderate else 0} episodes each",
-            _as_many(Share(spotless, len(moderate)), Share(paper.WITHOUT_COLLISION, paper.MODERATE_CONDITIONS)),
+            f"{spotless} of {len(moderate)} (D = 0 once per S), {moderate[0]['episodes'] if moderate else 0} "
+            "episodes each",
+            _as_many(
+                Share(spotless, len(moderate)), Share(paper.WITHOUT_COLLISION, paper.MODERATE_CONDITIONS)
+            ),
         ),
         claim(
             f"{method}: collision for D <= 3 over all S and v",
@@ -275,11 +318,12 @@ def _as_many(a: Share, b: Share) -> Finding:
     return Finding(HOLDS if a.rate >= b.rate else FAILS, fisher_p(a.k, a.n, b.k, b.n))
 
 
-# ------------------------------------------------------------------------------------------------------------------- timing
+# ----------------------------------------------------------------------------------------------------- timing
 
 
 def of_timing(profile: dict[str, Any]) -> list[Claim]:
-    """Claims about time, from ``uuv profile --json`` with one env and density. Means of one machine: nothing is tested."""
+    """Claims about time, from ``uuv profile --json`` with one env and density. Means of one machine: nothing
+    is tested."""
     rows = {row["component"]: row["mean_ms"] for row in profile["paper_latency"]}
     if "Full loop" not in rows:
         return []
@@ -315,11 +359,13 @@ def of_timing(profile: dict[str, Any]) -> list[Claim]:
 
 
 def of_transfer(here: dict[str, Any], there: dict[str, Any]) -> list[Claim]:
-    """Whether the policy, untouched, drives in the second scene as well; entries of ``uuv eval`` of the same policy."""
+    """Whether the policy, untouched, drives in the second scene as well; entries of ``uuv eval`` of the same
+    policy."""
     a, b = pooled([here], "success"), pooled([there], "success")
     return [
         claim(
-            "The policy transfers to another pool-style scene with other geometry and noise (within 10 points)",
+            "The policy transfers to another pool-style scene with other geometry and noise (within 10 "
+            "points)",
             "shown, not counted",
             f"{b} there, {a} in pool",
             near(b, a),

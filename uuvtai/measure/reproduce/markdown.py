@@ -19,12 +19,21 @@ def results_page(document: dict[str, Any]) -> str:
     tuned = "was looked at while tuning" if seed in RETIRED_SEEDS else "was never trained or tuned on"
     head = [
         "# Results",
-        f"`uuv reproduce --budget {document['budget']}`, {document['started']}, commit {document['git_sha'] or 'unknown'}, "
-        f"{machine['cpu']}, {machine['cores']} cores. Intervals are 95 % (Wilson). RUN is the reproduction's folder; the evaluations' "
+        f"`uuv reproduce --budget {document['budget']}`, {document['started']}, commit "
+        f"{document['git_sha'] or 'unknown'}, "
+        f"{machine['cpu']}, {machine['cores']} cores. Intervals are 95 % (Wilson). RUN is the reproduction's "
+        "folder; the evaluations' "
         f"seed, {seed}, {tuned}.",
         *document.get("notes", []),
     ]
-    parts = [_claims(document), _main(document), _ceilings(document), _sweeps(document), _timing(document), _paper_notes(document)]
+    parts = [
+        _claims(document),
+        _main(document),
+        _ceilings(document),
+        _sweeps(document),
+        _timing(document),
+        _paper_notes(document),
+    ]
     return "\n\n".join(["\n".join(head), *parts]) + "\n"
 
 
@@ -35,13 +44,20 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def _claims(document: dict[str, Any]) -> str:
-    rows = [[c["text"], c["theirs"], c["ours"], c["verdict"], _p(c["p"]), _p(c["p_holm"])] for c in document["claims"]]
+    rows = [
+        [c["text"], c["theirs"], c["ours"], c["verdict"], _p(c["p"]), _p(c["p_holm"])]
+        for c in document["claims"]
+    ]
     note = (
-        f"A claim with a p value is decided where that value, adjusted by Holm for all tests of this page, is below {LEVEL}; else it "
-        "cannot be judged. Rates are compared by Fisher's exact test, with a printed value by the exact binomial test. Claims without a p "
+        "A claim with a p value is decided where that value, adjusted by Holm for all tests of this page, "
+        f"is below {LEVEL}; else it "
+        "cannot be judged. Rates are compared by Fisher's exact test, with a printed value by the exact "
+        "binomial test. Claims without a p "
         "value set one number beside another: one run, one machine, no test."
     )
-    return f"## The paper's claims\n{note}\n\n" + table(["claim", "the paper", "here", "verdict", "p", "p (Holm)"], rows)
+    return f"## The paper's claims\n{note}\n\n" + table(
+        ["claim", "the paper", "here", "verdict", "p", "p (Holm)"], rows
+    )
 
 
 def _p(value: float | None) -> str:
@@ -53,25 +69,41 @@ def _main(document: dict[str, Any]) -> str:
     for name, entries in document["table_main"].items():
         printed = paper.TABLE_MAIN.get(name)
         theirs = (
-            [f"{printed.success:.2f} / {printed.collision:.2f}", f"{printed.tts_s} s", f"{printed.mean_time_s} s"] if printed else ["-"] * 3
+            [
+                f"{printed.success:.2f} / {printed.collision:.2f}",
+                f"{printed.tts_s} s",
+                f"{printed.mean_time_s} s",
+            ]
+            if printed
+            else ["-"] * 3
         )
         rates = [str(pooled(entries, "success")), str(pooled(entries, *COLLIDED))]
         mean_s = mean([m["time_mean_s"] for m in entries if m["time_mean_s"] is not None])
-        arrived = mean([m["time_to_success_mean_s"] for m in entries if m["time_to_success_mean_s"] is not None])
+        arrived = mean(
+            [m["time_to_success_mean_s"] for m in entries if m["time_to_success_mean_s"] is not None]
+        )
         times = [_seconds(tts_s(entries)), theirs[1], _seconds(mean_s), theirs[2], _seconds(arrived)]
         rows.append([f"`{name}`", str(len(entries)), *rates, theirs[0], *times])
     note = (
-        "TTS is the paper's: mean time of all episodes / rate of success. The last column, the mean over the episodes that arrive, has no "
+        "TTS is the paper's: mean time of all episodes / rate of success. The last column, the mean over the "
+        "episodes that arrive, has no "
         "peer in the paper."
     )
     heads = ["method", "training seeds", "success", "collision", "the paper: success / collision"]
     heads += ["TTS", "the paper: TTS", "mean time", "the paper: mean time", "mean time of successes"]
-    return f"## Table main and ablations\n`{document['commands']['eval/main']}`\n\n{note}\n\n" + table(heads, rows)
+    return f"## Table main and ablations\n`{document['commands']['eval/main']}`\n\n{note}\n\n" + table(
+        heads, rows
+    )
 
 
 def _ceilings(document: dict[str, Any]) -> str:
     rows = [
-        [f"`{m['name']}`", str(pooled([m], "success")), str(pooled([m], *COLLIDED)), _seconds(m["time_to_success_mean_s"])]
+        [
+            f"`{m['name']}`",
+            str(pooled([m], "success")),
+            str(pooled([m], *COLLIDED)),
+            _seconds(m["time_to_success_mean_s"]),
+        ]
         for m in document["ceilings"]["methods"]
     ]
     note = "`bt+truth` is told the true bodies, `oracle` knows the future: privileged, no methods."
@@ -82,7 +114,8 @@ def _ceilings(document: dict[str, Any]) -> str:
 
 def _sweeps(document: dict[str, Any]) -> str:
     return "\n\n".join(
-        f"## Sweep: {name}\n`{document['commands'][f'sweep/{name}']}`\n\n{_sweep(sweep)}" for name, sweep in document["sweeps"].items()
+        f"## Sweep: {name}\n`{document['commands'][f'sweep/{name}']}`\n\n{_sweep(sweep)}"
+        for name, sweep in document["sweeps"].items()
     )
 
 
@@ -98,8 +131,14 @@ def _sweep(sweep: dict[str, Any]) -> str:
     for cell in sweep["cells"]:
         key = (cell["method"], *(str(cell.get(name, "")) for name in down))
         lines.setdefault(key, {})[str(cell.get(across))] = _both(cell)
-    heads = ["method", *down, *("nothing moves" if value is None else f"{across} = {value}" for value in values)]
-    rows = [[*map(str, key), *(found.get(str(value), "") for value in values)] for key, found in lines.items()]
+    heads = [
+        "method",
+        *down,
+        *("nothing moves" if value is None else f"{across} = {value}" for value in values),
+    ]
+    rows = [
+        [*map(str, key), *(found.get(str(value), "") for value in values)] for key, found in lines.items()
+    ]
     return "success / collision in %\n\n" + table(heads, rows)
 
 
@@ -125,16 +164,28 @@ def _timing(document: dict[str, Any]) -> str:
         if r["mean_ms"] is not None
     ]
     density = [
-        [str(r["D"]), _ms(r["loop_ms"]), _ms(r["paper_loop_ms"]), _one(r["replans_per_episode"]), _one(r["paper_replans"])]
+        [
+            str(r["D"]),
+            _ms(r["loop_ms"]),
+            _ms(r["paper_loop_ms"]),
+            _one(r["replans_per_episode"]),
+            _one(r["paper_replans"]),
+        ]
         for r in profile["paper_density"]
     ]
     rates = [
-        [f"{r['num_envs']:,}", *(f"{r['env_steps_per_s'][k]:,.0f}" for k in ("step", "step_inference", "train"))] for r in profile["rows"]
+        [
+            f"{r['num_envs']:,}",
+            *(f"{r['env_steps_per_s'][k]:,.0f}" for k in ("step", "step_inference", "train")),
+        ]
+        for r in profile["rows"]
     ]
     note = (
-        '"Global planner" is the mean over the steps that plan a route; "Planner stage, every step" over all steps, most of which '
+        '"Global planner" is the mean over the steps that plan a route; "Planner stage, every step" over all '
+        "steps, most of which "
         "plan none. "
-        '"Full loop" is a whole step (simulated truth and sensing, mapping, planning, behaviour tree) and one decision of world model and '
+        '"Full loop" is a whole step (simulated truth and sensing, mapping, planning, behaviour tree) and '
+        "one decision of world model and "
         "policy; what the paper's loop contains it does not say."
     )
     return "\n\n".join(
@@ -149,7 +200,9 @@ def _timing(document: dict[str, Any]) -> str:
 
 
 def _paper_notes(document: dict[str, Any]) -> str:
-    return "## Where the paper's figures do not add up\n" + "\n".join(f"- {text}" for text in document["inconsistencies"])
+    return "## Where the paper's figures do not add up\n" + "\n".join(
+        f"- {text}" for text in document["inconsistencies"]
+    )
 
 
 def _seconds(value: float | None) -> str:

@@ -14,7 +14,17 @@ from uuvtai.loader import load_config, preset_names
 from uuvtai.measure.reproduce import claims, paper
 from uuvtai.measure.reproduce.markdown import results_page
 from uuvtai.measure.reproduce.sections import sections_of
-from uuvtai.measure.reproduce.steps import BUDGETS, EVALUATION_SEED, TRAINED, Budget, Step, is_done, result_file, run_step, steps_of
+from uuvtai.measure.reproduce.steps import (
+    BUDGETS,
+    EVALUATION_SEED,
+    TRAINED,
+    Budget,
+    Step,
+    is_done,
+    result_file,
+    run_step,
+    steps_of,
+)
 from uuvtai.report.build import report
 from uuvtai.run_folder import RunFolder, RunFolderError, default_run_dir, refuse_place
 
@@ -28,7 +38,8 @@ class ReproductionWatch(Protocol):
 
 
 def reproduce(budget: str, run_dir: Path | None, watch: ReproductionWatch) -> tuple[dict[str, Any], Path]:
-    """Begin a reproduction: its document and its folder. Raises ValueError for an unknown budget, RunFolderError."""
+    """Begin a reproduction: its document and its folder. Raises ValueError for an unknown budget,
+    RunFolderError."""
     if budget not in BUDGETS:
         raise SettingError(f"--budget {budget!r}: {' or '.join(BUDGETS)}")
     refuse_place(run_dir)
@@ -40,7 +51,8 @@ def reproduce(budget: str, run_dir: Path | None, watch: ReproductionWatch) -> tu
 
 
 def resume(place: Path, watch: ReproductionWatch) -> tuple[dict[str, Any], Path]:
-    """Go on with a reproduction that was killed or interrupted; finished steps stay as they are. Raises RunFolderError."""
+    """Go on with a reproduction that was killed or interrupted; finished steps stay as they are. Raises
+    RunFolderError."""
     root = place.absolute()
     folder = RunFolder.held(root, "uuv reproduce")
     try:
@@ -58,7 +70,9 @@ def _request(root: Path) -> dict[str, Any]:
         request = read_json(file, folder=root)
         known = request["budget"] in BUDGETS and isinstance(request["policy"], str | None)
     except (FileError, OSError, KeyError, TypeError) as error:
-        raise RunFolderError(f"{file}: cannot be read ({error}); give the folder that 'uuv reproduce' printed") from None
+        raise RunFolderError(
+            f"{file}: cannot be read ({error}); give the folder that 'uuv reproduce' printed"
+        ) from None
     if not known:
         raise RunFolderError(f"{file}: no budget of this version; begin a new reproduction")
     return request
@@ -90,7 +104,7 @@ def _step(step: Step, name: str, folder: RunFolder, watch: ReproductionWatch) ->
     watch.note(f"{name}: {time.perf_counter() - began:.0f} s")
 
 
-# ---------------------------------------------------------------------------------------------------------------- gathering
+# -------------------------------------------------------------------------------------------------- gathering
 
 
 def document_of(root: Path, request: dict[str, Any], steps: Sequence[Step]) -> dict[str, Any]:
@@ -109,13 +123,19 @@ def document_of(root: Path, request: dict[str, Any], steps: Sequence[Step]) -> d
         "hardware": record["hardware"],
         "versions": record["versions"],
         "python": sys.version.split()[0],
-        "commands": {step.folder: "uuv " + " ".join(_shown(part, root) for part in step.argv(root)) for step in steps},
+        "commands": {
+            step.folder: "uuv " + " ".join(_shown(part, root) for part in step.argv(root)) for step in steps
+        },
         "table_main": by_preset,
         "claims": [vars(claim) for claim in _claims(root, results, by_preset, request["policy"])],
         "inconsistencies": list(paper.INCONSISTENCIES),
         "ceilings": results["eval/ceilings"],
         "transfer": results["eval/transfer"],
-        "sweeps": {folder.removeprefix("sweep/"): found for folder, found in results.items() if folder.startswith("sweep/")},
+        "sweeps": {
+            folder.removeprefix("sweep/"): found
+            for folder, found in results.items()
+            if folder.startswith("sweep/")
+        },
         "profile": results["profile"],
     }
     return document | {"sections": sections_of(document, budget)}
@@ -128,12 +148,18 @@ def _shown(part: str, root: Path) -> str:
 
 def _by_preset(main: dict[str, Any], budget: Budget) -> dict[str, list[dict[str, Any]]]:
     """Entries of the methods' table by preset, without their single episodes."""
-    entries = {entry["name"]: {k: v for k, v in entry.items() if k != "episodes_detail"} for entry in main["methods"]}
-    trained = {preset: [entries[f"{preset}-{seed}"] for seed in range(budget.training_seeds)] for preset in TRAINED}
+    entries = {
+        entry["name"]: {k: v for k, v in entry.items() if k != "episodes_detail"} for entry in main["methods"]
+    }
+    trained = {
+        preset: [entries[f"{preset}-{seed}"] for seed in range(budget.training_seeds)] for preset in TRAINED
+    }
     return trained | {name: [entries[name]] for name in ("bt", "planner", "straight")}
 
 
-def _claims(root: Path, results: dict[str, Any], by_preset: dict[str, Any], policy: str | None) -> list[claims.Claim]:
+def _claims(
+    root: Path, results: dict[str, Any], by_preset: dict[str, Any], policy: str | None
+) -> list[claims.Claim]:
     cells = results["sweep/pool"]["cells"]
     names = list(dict.fromkeys(cell["method"] for cell in cells))
     pilot = next(name for name in names if name != "bt")
@@ -151,7 +177,11 @@ def _claims(root: Path, results: dict[str, Any], by_preset: dict[str, Any], poli
 
 def _cell_of(cells: Sequence[dict[str, Any]], method: str) -> dict[str, Any]:
     """The pool's own condition in the sweep."""
-    return next(cell for cell in cells if cell["method"] == method and (cell["S"], cell["D"], cell["v_m_s"]) == (8, 6, 0.6))
+    return next(
+        cell
+        for cell in cells
+        if cell["method"] == method and (cell["S"], cell["D"], cell["v_m_s"]) == (8, 6, 0.6)
+    )
 
 
 def _metrics(run: Path) -> list[dict[str, Any]]:

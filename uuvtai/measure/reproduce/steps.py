@@ -1,4 +1,5 @@
-"""The steps of a reproduction: each is one command of ours in a folder of its own, so that every figure names the command that made it."""
+"""The steps of a reproduction: each is one command of ours in a folder of its own, so that every figure names
+the command that made it."""
 
 from __future__ import annotations
 
@@ -15,11 +16,14 @@ from uuvtai.files import FileError, read_json
 from uuvtai.run_folder import RunFolderError, write_atomic
 
 TRAINED = ("ppo", "distill_20", "curriculum", "no_risk_scaling", "no_world_model")
-"""presets that are trained; ``full`` is the curriculum and ``no_distill`` is ppo under the names of the ablation"""
+"""presets that are trained; ``full`` is the curriculum and ``no_distill`` is ppo under the names of the
+ablation"""
 EVALUATION_SEED = 90007
-"""never trained or tuned on; it is for published figures alone, so do not look at it while you change anything"""
+"""never trained or tuned on; it is for published figures alone, so do not look at it while you change
+anything"""
 RETIRED_SEEDS = (90001,)
-"""were evaluation seeds until somebody looked at their failures while tuning; now they are tuning seeds like any other"""
+"""were evaluation seeds until somebody looked at their failures while tuning; now they are tuning seeds like
+any other"""
 
 
 @dataclass(frozen=True)
@@ -67,11 +71,17 @@ class Step:
 
 
 def steps_of(budget: Budget, policy: str | None, root: Path) -> list[Step]:
-    """All steps in their order; ``policy``: name of the shipped policy, None = the trained curriculum stands for it."""
+    """All steps in their order; ``policy``: name of the shipped policy, None = the trained curriculum stands
+    for it."""
     seeds = range(budget.training_seeds)
     runs = {preset: [f"train/{preset}-{seed}" for seed in seeds] for preset in TRAINED}
     trainings = [
-        Step(f"train {preset}, seed {seed}", _train(preset, seed, budget), f"train/{preset}-{seed}", resumes=True)
+        Step(
+            f"train {preset}, seed {seed}",
+            _train(preset, seed, budget),
+            f"train/{preset}-{seed}",
+            resumes=True,
+        )
         for seed in seeds
         for preset in TRAINED
     ]
@@ -84,10 +94,22 @@ def steps_of(budget: Budget, policy: str | None, root: Path) -> list[Step]:
     steps = [
         *trainings,
         Step("Table main and ablations", judged, "eval/main"),
-        Step("ceilings", ("eval", *_controllers("bt", "bt+truth", "oracle"), *at, str(budget.ceiling_episodes)), "eval/ceilings"),
-        Step("transfer", ("eval", pilot, *_controllers("bt"), "--world", "transfer", *at, str(budget.episodes)), "eval/transfer"),
+        Step(
+            "ceilings",
+            ("eval", *_controllers("bt", "bt+truth", "oracle"), *at, str(budget.ceiling_episodes)),
+            "eval/ceilings",
+        ),
+        Step(
+            "transfer",
+            ("eval", pilot, *_controllers("bt"), "--world", "transfer", *at, str(budget.episodes)),
+            "eval/transfer",
+        ),
         Step("scenario A", ("eval", *methods, *_controllers("bt"), *recorded, "--video"), "eval/scenario_a"),
-        Step("scenario B", ("eval", *methods, *_controllers("bt"), "-S", "12", "-D", "9", *recorded, "--video"), "eval/scenario_b"),
+        Step(
+            "scenario B",
+            ("eval", *methods, *_controllers("bt"), "-S", "12", "-D", "9", *recorded, "--video"),
+            "eval/scenario_b",
+        ),
         Step("sweep", _sweep(pilot, "paper", budget.sweep_episodes), "sweep/pool", resumes=True),
         Step(
             "profile",
@@ -112,9 +134,24 @@ def _beyond(pilot: str, budget: Budget) -> list[Step]:
     few = max(1, budget.sweep_episodes // 2)
     return [
         Step("gauntlet", _sweep(pilot, "paper", few, "--world", "gauntlet"), "sweep/gauntlet", resumes=True),
-        Step("trade-off", ("sweep", *_controllers("bt"), "--grid", "caution", "--episodes", str(few)), "sweep/caution", resumes=True),
-        Step("robustness", _sweep(pilot, "robustness", 4 * budget.sweep_episodes), "sweep/robustness", resumes=True),
-        Step("dead reckoning", _sweep(pilot, "dead_reckoning", 4 * budget.sweep_episodes), "sweep/dead_reckoning", resumes=True),
+        Step(
+            "trade-off",
+            ("sweep", *_controllers("bt"), "--grid", "caution", "--episodes", str(few)),
+            "sweep/caution",
+            resumes=True,
+        ),
+        Step(
+            "robustness",
+            _sweep(pilot, "robustness", 4 * budget.sweep_episodes),
+            "sweep/robustness",
+            resumes=True,
+        ),
+        Step(
+            "dead reckoning",
+            _sweep(pilot, "dead_reckoning", 4 * budget.sweep_episodes),
+            "sweep/dead_reckoning",
+            resumes=True,
+        ),
     ]
 
 
@@ -122,7 +159,7 @@ def _controllers(*names: str) -> tuple[str, ...]:
     return tuple(part for name in names for part in ("--controller", name))
 
 
-# ------------------------------------------------------------------------------------------------------------------ running
+# ---------------------------------------------------------------------------------------------------- running
 
 
 def is_done(step: Step, root: Path) -> bool:
@@ -144,7 +181,8 @@ _INTERRUPTED = (130, 143, -signal.SIGINT, -signal.SIGTERM)
 
 
 def run_step(step: Step, root: Path) -> None:
-    """Run what is not done; what was begun goes on or begins anew. KeyboardInterrupt and RunFolderError as the command ends."""
+    """Run what is not done; what was begun goes on or begins anew. KeyboardInterrupt and RunFolderError as
+    the command ends."""
     place = root / step.folder
     begun = place.exists() and any(place.iterdir())
     resume = begun and step.resumes and _can_resume(step, place)
@@ -154,7 +192,10 @@ def run_step(step: Step, root: Path) -> None:
     if done.returncode in _INTERRUPTED:
         raise KeyboardInterrupt
     if done.returncode:
-        raise RunFolderError(f"{step.name}: 'uuv {' '.join(step.argv(root, resume))}' ended with {done.returncode}; its message is above")
+        raise RunFolderError(
+            f"{step.name}: 'uuv {' '.join(step.argv(root, resume))}' ended with {done.returncode}; its "
+            "message is above"
+        )
     write_atomic(result_file(step, root), done.stdout)
 
 
@@ -163,7 +204,12 @@ def launch(arguments: list[str]) -> subprocess.CompletedProcess[bytes]:
     command = [sys.executable, "-m", "uuvtai", *arguments]
     before = _die_with_parent if os.name == "posix" else None
     # a session of its own: what a terminal tells us it hears once, from us, and can save
-    child = subprocess.Popen(command, stdout=subprocess.PIPE, preexec_fn=before, start_new_session=True)  # noqa: PLW1509
+    child = subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        preexec_fn=before,  # noqa: PLW1509
+        start_new_session=True,
+    )
     try:
         printed, _ = child.communicate()
     except KeyboardInterrupt:
@@ -174,10 +220,15 @@ def launch(arguments: list[str]) -> subprocess.CompletedProcess[bytes]:
 
 
 def _can_resume(step: Step, place: Path) -> bool:
-    return any((place / "checkpoints").glob("step_*")) if step.command[0] == "train" else (place / "sweep_request.json").exists()
+    return (
+        any((place / "checkpoints").glob("step_*"))
+        if step.command[0] == "train"
+        else (place / "sweep_request.json").exists()
+    )
 
 
 def _die_with_parent() -> None:
-    """A killed reproduction leaves no training behind that would fight with the next one (Linux; elsewhere it runs to its end)."""
+    """A killed reproduction leaves no training behind that would fight with the next one (Linux; elsewhere it
+    runs to its end)."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG

@@ -27,19 +27,23 @@ Cell = dict[str, Value]
 
 @dataclass(frozen=True)
 class Grid:
-    """Axes by name; ``one_at_a_time``: each axis alone around the unchanged condition, instead of all combinations."""
+    """Axes by name; ``one_at_a_time``: each axis alone around the unchanged condition, instead of all
+    combinations."""
 
     axes: dict[str, tuple[Value, ...]]
     one_at_a_time: bool = False
 
     def cells(self) -> list[Cell]:
-        """Every cell once; where nothing moves (D = 0) the obstacles' speed means nothing and stands for all its values."""
+        """Every cell once; where nothing moves (D = 0) the obstacles' speed means nothing and stands for all
+        its values."""
         found = self._alone() if self.one_at_a_time else self._combined()
         kept: dict[str, Cell] = {repr(sorted(cell.items())): cell for cell in map(_without_speed, found)}
         return list(kept.values())
 
     def _combined(self) -> list[Cell]:
-        return [dict(zip(self.axes, values, strict=True)) for values in itertools.product(*self.axes.values())]
+        return [
+            dict(zip(self.axes, values, strict=True)) for values in itertools.product(*self.axes.values())
+        ]
 
     def _alone(self) -> list[Cell]:
         return [{}, *({name: value} for name, values in self.axes.items() for value in values)]
@@ -54,7 +58,8 @@ def _without_speed(cell: Cell) -> Cell:
 
 
 def grid_of(texts: Sequence[str]) -> Grid:
-    """Grid of ``--grid`` texts: ``AXIS=value,value,..`` (repeatable), or the name or path of one grid preset, whose axes they then replace.
+    """Grid of ``--grid`` texts: ``AXIS=value,value,..`` (repeatable), or the name or path of one grid preset,
+    whose axes they then replace.
 
     Raises ConfigError.
     """
@@ -78,25 +83,32 @@ def read_grid(name: str) -> Grid:
             f"grid {name}: needs 'axes:', each a list of values, and may have 'one_at_a_time: true'"
             + (f"; {', '.join(sorted(unknown))} is not known" if unknown else "")
         )
-    return Grid({str(axis): tuple(values) for axis, values in axes.items()}, bool(tree.get("one_at_a_time", False)))
+    return Grid(
+        {str(axis): tuple(values) for axis, values in axes.items()}, bool(tree.get("one_at_a_time", False))
+    )
 
 
 def _axis(text: str) -> tuple[str, tuple[Value, ...]]:
     name, _equals, values = text.partition("=")
     parsed = parsed_yaml(f"[{values}]", f"--grid {name}")
     if not isinstance(parsed, list):
-        raise ConfigError(f"--grid {text!r}: write AXIS=value,value,.. for example --grid S=4,8 --grid teacher.caution=0.5,1,2")
+        raise ConfigError(
+            f"--grid {text!r}: write AXIS=value,value,.. for example --grid S=4,8 --grid "
+            "teacher.caution=0.5,1,2"
+        )
     return name.strip(), tuple(parsed)
 
 
 def checked(grid: Grid) -> Grid:
-    """The grid itself. Raises ConfigError where an axis is unknown, empty, has a value twice, or the cells are too many."""
+    """The grid itself. Raises ConfigError where an axis is unknown, empty, has a value twice, or the cells
+    are too many."""
     if not grid.axes:
         raise ConfigError("the grid has no axes; for example --grid S=4,8,12 --grid D=0,6")
     for name, values in grid.axes.items():
         if name not in SCENE_AXES and name not in PRESET_AXES and not _KEY.fullmatch(name):
             raise ConfigError(
-                f"--grid {name}: no such axis; it is S, D, v, {', '.join(PRESET_AXES)} or a dotted config key such as teacher.caution"
+                f"--grid {name}: no such axis; it is S, D, v, {', '.join(PRESET_AXES)} or a dotted config "
+                "key such as teacher.caution"
             )
         if not values:
             raise ConfigError(f"--grid {name}: has no values; for example --grid {name}=1,2")
@@ -107,7 +119,9 @@ def checked(grid: Grid) -> Grid:
     for values in grid.axes.values():
         count *= len(values)
     if not grid.one_at_a_time and count > MAX_CELLS:
-        raise ConfigError(f"the grid has {count:,} cells, more than {MAX_CELLS:,}: split it into several sweeps")
+        raise ConfigError(
+            f"the grid has {count:,} cells, more than {MAX_CELLS:,}: split it into several sweeps"
+        )
     return grid
 
 
@@ -115,8 +129,16 @@ def _check_values(name: str, values: Sequence[Value]) -> None:
     for value in values:
         number = isinstance(value, int | float) and not isinstance(value, bool)
         if name in ("S", "D") and (not isinstance(value, int) or isinstance(value, bool) or value < 0):
-            raise ConfigError(f"--grid {name}: {value!r} is no number of obstacles; give whole numbers from 0")
+            raise ConfigError(
+                f"--grid {name}: {value!r} is no number of obstacles; give whole numbers from 0"
+            )
         if name == "v" and (not number or not 0 <= value < float("inf")):
-            raise ConfigError(f"--grid v: {value!r} is no speed; give numbers in m/s, for example --grid v=0.2,0.6")
-        if name in PRESET_AXES and not (isinstance(value, str) and (value in preset_names(name) or Path(value).suffix)):
-            raise ConfigError(f"--grid {name}: {value!r} is no {name} preset; there are {', '.join(preset_names(name))}")
+            raise ConfigError(
+                f"--grid v: {value!r} is no speed; give numbers in m/s, for example --grid v=0.2,0.6"
+            )
+        if name in PRESET_AXES and not (
+            isinstance(value, str) and (value in preset_names(name) or Path(value).suffix)
+        ):
+            raise ConfigError(
+                f"--grid {name}: {value!r} is no {name} preset; there are {', '.join(preset_names(name))}"
+            )

@@ -1,4 +1,5 @@
-"""Who does the work of a sweep: processes on this machine, or a Ray cluster. A worker that is lost costs its task once more."""
+"""Who does the work of a sweep: processes on this machine, or a Ray cluster. A worker that is lost costs its
+task once more."""
 
 from __future__ import annotations
 
@@ -33,7 +34,8 @@ class Engine(Protocol):
     """Runs tasks somewhere."""
 
     def run(self, work: Work, items: Sequence[Item]) -> Iterator[tuple[int, Any]]:
-        """(number of the item, result) as they come. Errors of the work itself are raised; EngineError where workers keep dying."""
+        """(number of the item, result) as they come. Errors of the work itself are raised; EngineError where
+        workers keep dying."""
         ...
 
 
@@ -56,12 +58,17 @@ class LocalEngine:
                 tries[number] += 1
                 if tries[number] >= ATTEMPTS:
                     raise EngineError(
-                        f"task {number + 1} of {len(items)} lost its worker {ATTEMPTS} times (killed, or out of memory): "
-                        "try fewer --workers or a smaller --num-envs; what is finished is kept, go on with --resume"
+                        f"task {number + 1} of {len(items)} lost its worker {ATTEMPTS} times (killed, or out "
+                        "of memory): "
+                        "try fewer --workers or a smaller --num-envs; what is finished is kept, go on with "
+                        "--resume"
                     )
 
-    def _round(self, work: Work, items: Sequence[Item], todo: list[int]) -> Generator[tuple[int, Any], None, list[int]]:
-        """Run what is ``todo``, taken from its front, until all is done or a worker dies; returns the numbers that ran then."""
+    def _round(
+        self, work: Work, items: Sequence[Item], todo: list[int]
+    ) -> Generator[tuple[int, Any], None, list[int]]:
+        """Run what is ``todo``, taken from its front, until all is done or a worker dies; returns the numbers
+        that ran then."""
         threads = max(1, (os.cpu_count() or 1) // self._workers)
         context = multiprocessing.get_context("spawn")
         pool = ProcessPoolExecutor(min(self._workers, len(todo)), context, _begin_worker, (threads,))
@@ -70,7 +77,9 @@ class LocalEngine:
         try:
             while todo or running:
                 try:
-                    while todo and len(running) < self._workers:  # no more than run: what waits inside a broken pool is lost too
+                    while (
+                        todo and len(running) < self._workers
+                    ):  # no more than run: what waits inside a broken pool is lost too
                         with _ctrl_c_held():
                             future = pool.submit(work, items[todo[0]])
                         running[future] = todo.pop(0)
@@ -96,7 +105,8 @@ class LocalEngine:
 
 @contextlib.contextmanager
 def _ctrl_c_held() -> Iterator[None]:
-    """Processes that are started inside do not hear Ctrl-C, which a terminal sends to all of them, before they can leave it to us."""
+    """Processes that are started inside do not hear Ctrl-C, which a terminal sends to all of them, before
+    they can leave it to us."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -123,21 +133,30 @@ def _end_with_parent() -> None:
 
 
 class RayEngine:
-    """Tasks on a Ray cluster that runs already, or on one inside this process; Ray itself runs lost tasks again."""
+    """Tasks on a Ray cluster that runs already, or on one inside this process; Ray itself runs lost tasks
+    again."""
 
     def __init__(self, address: str = "auto", cpus_per_task: float = 2.0) -> None:
-        """``address``: of the cluster, ``auto`` = the one that this machine belongs to, ``local`` = one inside this process."""
+        """``address``: of the cluster, ``auto`` = the one that this machine belongs to, ``local`` = one
+        inside this process."""
         try:
             import ray  # type: ignore[import-not-found]  # an extra
         except ImportError:
-            raise EngineError("--engine ray: the package ray is missing; install it: pip install 'uuvtai[cluster]'") from None
+            raise EngineError(
+                "--engine ray: the package ray is missing; install it: pip install 'uuvtai[cluster]'"
+            ) from None
         self._ray = ray
         try:
             ray.init(
-                address=None if address == "local" else address, ignore_reinit_error=True, log_to_driver=False, logging_level=logging.ERROR
+                address=None if address == "local" else address,
+                ignore_reinit_error=True,
+                log_to_driver=False,
+                logging_level=logging.ERROR,
             )
         except (ConnectionError, ValueError, RuntimeError) as error:
-            raise EngineError(f"--engine ray: no cluster at {address!r} ({error}); start one: ray start --head") from None
+            raise EngineError(
+                f"--engine ray: no cluster at {address!r} ({error}); start one: ray start --head"
+            ) from None
         signals.reinstall()  # Ray has put its own handler of SIGTERM in their place
         self._cpus = min(cpus_per_task, ray.cluster_resources().get("CPU", 1.0))
 
@@ -158,6 +177,8 @@ class RayEngine:
             try:
                 yield number, self._ray.get(done)
             except (self._ray.exceptions.WorkerCrashedError, self._ray.exceptions.NodeDiedError) as error:
-                raise EngineError(f"task {number + 1} of {total} lost its worker {ATTEMPTS} times: {error}") from None
+                raise EngineError(
+                    f"task {number + 1} of {total} lost its worker {ATTEMPTS} times: {error}"
+                ) from None
             except self._ray.exceptions.RayTaskError as error:
                 raise error.as_instanceof_cause() from None

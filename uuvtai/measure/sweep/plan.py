@@ -1,4 +1,5 @@
-"""From a request to tasks: which cells there are, which of them one simulator can serve, and how they are cut into tasks."""
+"""From a request to tasks: which cells there are, which of them one simulator can serve, and how they are cut
+into tasks."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ from uuvtai.measure.sweep.tasks import Row, Task
 BATCH = 256
 """episodes side by side in one simulator"""
 TASK_EPISODES = 1024
-"""episodes of a task, about: what a kill costs at most, and enough that the last stragglers of a batch cost little"""
+"""episodes of a task, about: what a kill costs at most, and enough that the last stragglers of a batch cost
+little"""
 
 Overrides = list[Any]
 
@@ -46,7 +48,8 @@ class SweepRequest:
 
 
 def request_of(document: dict[str, Any]) -> SweepRequest:
-    """The request that ``document`` came from. Raises KeyError or TypeError for another document, ConfigError for another grid."""
+    """The request that ``document`` came from. Raises KeyError or TypeError for another document, ConfigError
+    for another grid."""
     one_at_a_time, axes = document["grid"]["one_at_a_time"], document["grid"]["axes"]
     grid = checked(Grid({name: tuple(values) for name, values in axes.items()}, _typed(one_at_a_time, bool)))
     lists = {name: tuple(document[name]) for name in ("controllers", "policies", "seeds")}
@@ -75,10 +78,13 @@ def _typed(value: Any, of: Any) -> Any:
 
 
 def base_config(request: SweepRequest, cell: Cell | None = None) -> Config:
-    """Config of a cell, or of none, with the scene as data and room for the grid's largest. Raises ConfigError."""
+    """Config of a cell, or of none, with the scene as data and room for the grid's largest. Raises
+    ConfigError."""
     cell = cell or {}
     presets = {kind: cell.get(kind, getattr(request, kind)) for kind in PRESET_AXES}
-    keys = [(name, value) for name, value in cell.items() if name not in PRESET_AXES and name not in SCENE_AXES]
+    keys = [
+        (name, value) for name, value in cell.items() if name not in PRESET_AXES and name not in SCENE_AXES
+    ]
     overrides = [*request.overrides, *keys]
     config = load_config(presets["world"], presets["sensors"], presets["vehicle"], overrides)
     axes = request.grid.axes
@@ -90,10 +96,15 @@ def base_config(request: SweepRequest, cell: Cell | None = None) -> Config:
 
 
 def label_of(cell: Cell, config: Config) -> dict[str, Any]:
-    """What a row says of its cell: S, D, v_m_s (None where nothing moves) and every other axis by its name."""
+    """What a row says of its cell: S, D, v_m_s (None where nothing moves) and every other axis by its
+    name."""
     world = config.world
     n_dynamic = cell.get("D", world.n_dynamic)
-    scene = {"S": cell.get("S", world.n_static), "D": n_dynamic, "v_m_s": cell.get("v", world.dynamic_speed_m_s) if n_dynamic else None}
+    scene = {
+        "S": cell.get("S", world.n_static),
+        "D": n_dynamic,
+        "v_m_s": cell.get("v", world.dynamic_speed_m_s) if n_dynamic else None,
+    }
     return {**scene, **{name: value for name, value in cell.items() if name not in SCENE_AXES}}
 
 
@@ -103,7 +114,10 @@ def unchanged(request: SweepRequest) -> dict[str, Any]:
     world = config.world
     known: dict[str, Any] = {"S": world.n_static, "D": world.n_dynamic, "v": world.dynamic_speed_m_s}
     known |= {kind: getattr(request, kind) for kind in PRESET_AXES}
-    own = {name: known[name] if name in known else functools.reduce(getattr, name.split("."), config) for name in request.grid.axes}
+    own = {
+        name: known[name] if name in known else functools.reduce(getattr, name.split("."), config)
+        for name in request.grid.axes
+    }
     return json.loads(json.dumps(own))
 
 
@@ -112,8 +126,11 @@ def row_key(label: dict[str, Any], method: str) -> str:
     return hashlib.sha256(json.dumps([sorted(label.items(), key=str), method]).encode()).hexdigest()
 
 
-def tasks_of(request: SweepRequest, methods: Sequence[tuple[str, str | None, str | None]], done: set[str]) -> list[Task]:
-    """Tasks for the rows that are not ``done`` (keys). ``methods``: (name, controller, policy), exactly one of the two. ConfigError."""
+def tasks_of(
+    request: SweepRequest, methods: Sequence[tuple[str, str | None, str | None]], done: set[str]
+) -> list[Task]:
+    """Tasks for the rows that are not ``done`` (keys). ``methods``: (name, controller, policy), exactly one
+    of the two. ConfigError."""
     each = len(request.seeds) * request.episodes
     per_task = max(1, TASK_EPISODES // each)
     found = []
@@ -125,7 +142,17 @@ def tasks_of(request: SweepRequest, methods: Sequence[tuple[str, str | None, str
                 scenes = tuple((label["S"], label["D"], label["v_m_s"] or 0.0) for label in part)
                 num_envs = request.num_envs or min(BATCH, each * len(cells))
                 found.append(
-                    Task(config, controller, policy, scenes, tuple(part), request.seeds, request.episodes, num_envs, request.device)
+                    Task(
+                        config,
+                        controller,
+                        policy,
+                        scenes,
+                        tuple(part),
+                        request.seeds,
+                        request.episodes,
+                        num_envs,
+                        request.device,
+                    )
                 )
     return found
 
@@ -140,10 +167,19 @@ def _by_config(request: SweepRequest) -> list[tuple[Config, list[Cell]]]:
 
 
 def check_rows(request: SweepRequest, methods: Sequence[str]) -> list[str]:
-    """Keys of all rows in the order of the document. Raises ConfigError where two cells could not be told apart."""
-    keys = [row_key(label_of(cell, config), name) for config, cells in _by_config(request) for cell in cells for name in methods]
+    """Keys of all rows in the order of the document. Raises ConfigError where two cells could not be told
+    apart."""
+    keys = [
+        row_key(label_of(cell, config), name)
+        for config, cells in _by_config(request)
+        for cell in cells
+        for name in methods
+    ]
     if len(set(keys)) != len(keys):
-        raise ConfigError("the grid has the same cell twice: an axis repeats what the condition has already; leave that value out")
+        raise ConfigError(
+            "the grid has the same cell twice: an axis repeats what the condition has already; leave that "
+            "value out"
+        )
     return keys
 
 

@@ -1,4 +1,5 @@
-"""A sweep's run folder: every finished row is on disk at once, so that a sweep killed at any moment goes on where it was."""
+"""A sweep's run folder: every finished row is on disk at once, so that a sweep killed at any moment goes on
+where it was."""
 
 from __future__ import annotations
 
@@ -12,7 +13,16 @@ from typing import Any, Protocol
 from uuvtai.files import FileError, open_to_append, parsed_json, read_json, read_lines, truncate
 from uuvtai.measure.sweep.cells import Grid
 from uuvtai.measure.sweep.engines import Engine
-from uuvtai.measure.sweep.plan import SweepRequest, base_config, check_rows, ordered, request_of, row_key, tasks_of, unchanged
+from uuvtai.measure.sweep.plan import (
+    SweepRequest,
+    base_config,
+    check_rows,
+    ordered,
+    request_of,
+    row_key,
+    tasks_of,
+    unchanged,
+)
 from uuvtai.measure.sweep.tasks import Row, play
 from uuvtai.run_folder import RunFolder, RunFolderError, default_run_dir, refuse_place
 
@@ -31,8 +41,11 @@ class SweepWatch(Protocol):
     def stop(self) -> None: ...
 
 
-def sweep(request: SweepRequest, engine: Engine, run_dir: Path | None, watch: SweepWatch) -> tuple[dict[str, Any], Path]:
-    """Begin a sweep: the ``uuv sweep --json`` document and the run folder. Whatever can be refused is refused before anything is written.
+def sweep(
+    request: SweepRequest, engine: Engine, run_dir: Path | None, watch: SweepWatch
+) -> tuple[dict[str, Any], Path]:
+    """Begin a sweep: the ``uuv sweep --json`` document and the run folder. Whatever can be refused is refused
+    before anything is written.
 
     Raises ConfigError, CheckpointError, RunFolderError, EngineError.
     """
@@ -41,12 +54,15 @@ def sweep(request: SweepRequest, engine: Engine, run_dir: Path | None, watch: Sw
     keys = check_rows(request, [name for name, _controller, _policy in methods])
     place = run_dir or default_run_dir(f"sweep-{Path(request.world).stem}")
     folder = RunFolder(place, base_config(request), list(request.seeds))
-    folder.write_json(REQUEST, {"schema": 1, **request.document(), "methods": methods, "checkpoints": checkpoints})
+    folder.write_json(
+        REQUEST, {"schema": 1, **request.document(), "methods": methods, "checkpoints": checkpoints}
+    )
     return _play(request, methods, keys, engine, folder, watch), folder.path
 
 
 def resume(place: Path, engine: Engine, watch: SweepWatch) -> tuple[dict[str, Any], Path]:
-    """Go on with a sweep that was killed or interrupted: rows that are finished stay as they are. Raises RunFolderError."""
+    """Go on with a sweep that was killed or interrupted: rows that are finished stay as they are. Raises
+    RunFolderError."""
     folder = RunFolder.held(place, "uuv sweep")
     try:
         try:
@@ -54,7 +70,9 @@ def resume(place: Path, engine: Engine, watch: SweepWatch) -> tuple[dict[str, An
             request, methods = request_of(document), [_method_key(method) for method in document["methods"]]
             checkpoints = dict(document["checkpoints"])
         except (FileError, OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise RunFolderError(f"{place / REQUEST}: cannot be read ({error}); give the folder that 'uuv sweep' printed") from None
+            raise RunFolderError(
+                f"{place / REQUEST}: cannot be read ({error}); give the folder that 'uuv sweep' printed"
+            ) from None
         _refuse_other_policies(place, request, checkpoints, watch)
         keys = check_rows(request, [name for name, _controller, _policy in methods])
         folder.go_on({"rows": len(read_rows(place))})
@@ -71,19 +89,28 @@ def _method_key(given: Any) -> MethodKey:
     return name, controller, policy
 
 
-def _refuse_other_policies(place: Path, request: SweepRequest, checkpoints: dict[str, str], watch: SweepWatch) -> None:
-    """RunFolderError where a policy is another one by now: cells of two policies under one name would prove nothing."""
+def _refuse_other_policies(
+    place: Path, request: SweepRequest, checkpoints: dict[str, str], watch: SweepWatch
+) -> None:
+    """RunFolderError where a policy is another one by now: cells of two policies under one name would prove
+    nothing."""
     from uuvtai.measure.methods import policies_of
 
     trained = policies_of(list(request.policies), base_config(request).teacher.max_node, watch.note)
     now = {method.name: method.checkpoint.sha256 for method in trained if method.checkpoint}
     changed = [name for name, sha256 in checkpoints.items() if now.get(name) != sha256]
     if changed:
-        raise RunFolderError(f"{place}: {', '.join(changed)} has changed since this sweep began; begin a new sweep with another --run-dir")
+        raise RunFolderError(
+            f"{place}: {', '.join(changed)} has changed since this sweep began; begin a new sweep with "
+            "another --run-dir"
+        )
 
 
-def resolved(request: SweepRequest, watch: SweepWatch) -> tuple[SweepRequest, list[MethodKey], dict[str, str]]:
-    """The request with the columns that its policies see, its methods by their names in the table, and the sha256 of every policy.
+def resolved(
+    request: SweepRequest, watch: SweepWatch
+) -> tuple[SweepRequest, list[MethodKey], dict[str, str]]:
+    """The request with the columns that its policies see, its methods by their names in the table, and the
+    sha256 of every policy.
 
     Paths are made absolute. Raises ConfigError, CheckpointError.
     """
@@ -93,16 +120,30 @@ def resolved(request: SweepRequest, watch: SweepWatch) -> tuple[SweepRequest, li
     trees = trees_of(list(request.controllers), limit)
     policies = tuple(str(Path(name).resolve()) if Path(name).exists() else name for name in request.policies)
     trained = policies_of(list(policies), limit, watch.note)
-    controllers = [str(Path(name).resolve()) if name.endswith((".xml", ".yaml", ".yml")) else name for name in request.controllers]
-    methods: list[MethodKey] = [(tree.name, name, None) for tree, name in zip(trees, controllers, strict=True)]
+    controllers = [
+        str(Path(name).resolve()) if name.endswith((".xml", ".yaml", ".yml")) else name
+        for name in request.controllers
+    ]
+    methods: list[MethodKey] = [
+        (tree.name, name, None) for tree, name in zip(trees, controllers, strict=True)
+    ]
     methods += [(method.name, None, name) for method, name in zip(trained, policies, strict=True)]
     features = features_of(list(policies)) if policies else []
     checkpoints = {method.name: method.checkpoint.sha256 for method in trained if method.checkpoint}
-    return replace(request, overrides=(*features, *request.overrides), policies=policies), methods, checkpoints
+    return (
+        replace(request, overrides=(*features, *request.overrides), policies=policies),
+        methods,
+        checkpoints,
+    )
 
 
 def _play(
-    request: SweepRequest, methods: Sequence[MethodKey], keys: list[str], engine: Engine, folder: RunFolder, watch: SweepWatch
+    request: SweepRequest,
+    methods: Sequence[MethodKey],
+    keys: list[str],
+    engine: Engine,
+    folder: RunFolder,
+    watch: SweepWatch,
 ) -> dict[str, Any]:
     rows = _by_key(folder.path, request.grid)
     tasks = tasks_of(request, methods, set(rows))
@@ -130,7 +171,9 @@ def _by_key(place: Path, grid: Grid) -> dict[str, Row]:
     try:
         return {row_key(_label(row, grid), row["method"]): row for row in read_rows(place)}
     except (KeyError, TypeError) as error:
-        raise RunFolderError(f"{place / ROWS}: holds a row that is not of this sweep ({error!r}); take it out to go on") from None
+        raise RunFolderError(
+            f"{place / ROWS}: holds a row that is not of this sweep ({error!r}); take it out to go on"
+        ) from None
 
 
 def _label(row: Row, grid: Grid) -> dict[str, Any]:
@@ -156,7 +199,7 @@ def _document(request: SweepRequest, rows: list[Row]) -> dict[str, Any]:
     }
 
 
-# ------------------------------------------------------------------------------------------------------------------- file
+# ------------------------------------------------------------------------------------------------------- file
 
 
 def append_row(place: Path, row: Row) -> None:

@@ -1,4 +1,5 @@
-"""What a worker of a sweep is given and what it gives back: plain data, so that it may run in any process on any machine."""
+"""What a worker of a sweep is given and what it gives back: plain data, so that it may run in any process on
+any machine."""
 
 from __future__ import annotations
 
@@ -53,15 +54,26 @@ def play(task: Task) -> list[Row]:
     from uuvtai.measure.methods import policies_of, trees_of
 
     limit = task.config.teacher.max_node
-    found = trees_of([task.controller], limit) if task.controller else policies_of([task.policy or ""], limit, lambda _text: None)
+    found = (
+        trees_of([task.controller], limit)
+        if task.controller
+        else policies_of([task.policy or ""], limit, lambda _text: None)
+    )
     method = found[0]
     sim = _sim_of(task, method.config_of(task.config))
     sim.use_tree(method.tree)
-    jobs = [Job(seed, episode, scene) for scene in task.scenes for seed in task.seeds for episode in range(task.episodes)]
+    jobs = [
+        Job(seed, episode, scene)
+        for scene in task.scenes
+        for seed in task.seeds
+        for episode in range(task.episodes)
+    ]
     note = method.driver_for(sim)
     results, _env_steps = run_episodes(sim, jobs, driver=note.pilot if note else None)
     each = len(task.seeds) * task.episodes
-    return [row_of(method.name, label, results[i * each : (i + 1) * each]) for i, label in enumerate(task.labels)]
+    return [
+        row_of(method.name, label, results[i * each : (i + 1) * each]) for i, label in enumerate(task.labels)
+    ]
 
 
 def _sim_of(task: Task, config: Config) -> Sim:
@@ -78,11 +90,20 @@ def _sim_of(task: Task, config: Config) -> Sim:
 
 
 def row_of(method: str, label: dict[str, Any], results: list[EpisodeResult]) -> Row:
-    """One method in one cell: what ``uuv eval`` says of a method, without what a clock measured, and every episode's end."""
+    """One method in one cell: what ``uuv eval`` says of a method, without what a clock measured, and every
+    episode's end."""
     from uuvtai.measure.evaluate import summary
 
     found = summary(method, results, 0, 0.0)
-    for name in ("name", "env_steps", "wall_s", "env_steps_per_s", "replans_by_trigger", "planned_by", "fallbacks_by_reason"):
+    for name in (
+        "name",
+        "env_steps",
+        "wall_s",
+        "env_steps_per_s",
+        "replans_by_trigger",
+        "planned_by",
+        "fallbacks_by_reason",
+    ):
         found.pop(name)
     details = found.pop("episodes_detail")
     return {
