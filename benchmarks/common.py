@@ -22,6 +22,8 @@ class Job:
     """batch sizes asked for by ``--num-envs``; empty: the benchmark's own"""
     seconds: float = 4.0
     """measured time per side of a comparison"""
+    against: str = ""
+    """commit that ``before`` compares with; empty: the last one"""
     say: Callable[[str], None] = print
     """shows progress"""
 

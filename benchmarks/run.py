@@ -30,7 +30,7 @@ if sys.path[0] == str(HERE):
 
 from benchmarks.common import Job, Row  # noqa: E402
 
-NOT_BENCHMARKS = ("__init__", "common", "mutations", "run")
+NOT_BENCHMARKS = ("__init__", "common", "mutations", "played", "run")
 PEERS = (
     "mujoco",
     "opencv-python-headless",
@@ -63,6 +63,7 @@ def main() -> int:
     parser.add_argument(
         "--seconds", type=float, help="measured time per side of a comparison [s] (default 4)"
     )
+    parser.add_argument("--against", default="", help="commit for before (default: HEAD)")
     parser.add_argument("--out", type=Path, help="folder of the results (default benchmarks/results)")
     parser.add_argument("--worker", help=argparse.SUPPRESS)
     chosen = parser.parse_args()
@@ -141,6 +142,7 @@ def _work(chosen: argparse.Namespace) -> int:
         chosen.quick,
         sizes,
         seconds,
+        chosen.against,
         say=lambda text: print(f"  {text}", file=sys.stderr, flush=True),
     )
     module = importlib.import_module(f"benchmarks.{name}")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import dynamics, mutants, mutations, run, tick
+from benchmarks import before, dynamics, mutants, mutations, run, tick
 from benchmarks.common import Job, Row, seconds_per_call
 from benchmarks.peers.vehicle_arrays import Vehicles
 from uuvtai.config import Config
@@ -120,3 +120,10 @@ def test_unknown_names_are_refused():
         [sys.executable, str(FOLDER / "run.py"), "sonra"], capture_output=True, text=True, check=False
     )
     assert done.returncode == 2 and "sonra" in done.stderr and "tick" in done.stderr
+
+
+def test_what_differs_from_a_commit_is_counted_on_both_sides():
+    same = before._equal("arrays", {"a": "1"}, {"a": "1"}, "abc")
+    assert (same.ours, same.met) == (0, True)
+    row = before._equal("arrays", {"a": "1", "b": "2", "new": "3"}, {"a": "1", "b": "x", "gone": "3"}, "abc")
+    assert (row.ours, row.met, row.details["differ"]) == (3, False, ["b", "gone", "new"])

@@ -1,0 +1,208 @@
+"""This tree against another commit of it (``--against``, default HEAD): are the bits equal, is it as fast?
+
+A refactoring shows here that it is one: 300 steps of 256 vehicles in three worlds, a recorded log, four
+iterations of training and the keys of the cached kernels, compared bit by bit; then steps per second and the
+start with warm kernels, in turns. Both sides run in this environment, each with its own package and caches.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from mcap.reader import make_reader
+
+from benchmarks.common import Job, Row
+
+LONGEST_S = 5400
+ROOT = Path(__file__).resolve().parent.parent
+_WORLDS = (("pool", "paper"), ("gauntlet", "harsh"), ("maze", "nominal"))
+_EVAL = ["eval", "--controller", "bt", "--episodes", "2", "--seeds", "77", "--num-envs", "4", "--record", "2"]
+_TRAIN = ["train", "smoke", "--device", "cpu", "--iterations", "4"]
+_ROUNDS = 9
+_STARTS = 5
+
+
+class _Side:
+    """A tree with folders of its own for kernels and runs."""
+
+    def __init__(self, tree: Path, folder: Path) -> None:
+        self.tree, self.folder = tree, folder
+        places = {"HOME": folder / "home", "XDG_CACHE_HOME": folder / "cache", "PYTHONPATH": tree}
+        for place in ("home", "cache"):
+            (folder / place).mkdir(parents=True)
+        self.environment = {**os.environ, **{name: str(place) for name, place in places.items()}}
+
+    def played(self, *arguments: str) -> list[str]:
+        """The command of ``played.py`` for this side."""
+        return [sys.executable, str(ROOT / "benchmarks" / "played.py"), *arguments]
+
+    def bits(self, world: str, sensors: str, num_envs: int, steps: int) -> dict[str, str]:
+        """sha256 by name: see ``played.bits``."""
+        command = self.played("bits", world, sensors, str(num_envs), str(steps))
+        done = subprocess.run(
+            command, env=self.environment, cwd=self.tree, check=True, stdout=subprocess.PIPE, text=True
+        )
+        return json.loads(done.stdout.splitlines()[-1])
+
+    def uuv(self, arguments: list[str], run: str) -> Path:
+        """Run a command of the tree's own CLI; the folder that it wrote."""
+        place = self.folder / run
+        command = [sys.executable, "-m", "uuvtai", *arguments, "--run-dir", str(place)]
+        subprocess.run(
+            command,
+            env=self.environment,
+            cwd=self.tree,
+            check=True,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        return place
+
+    def kernels(self) -> set[str]:
+        """Names of the kernels in this side's cache: Taichi's keys."""
+        return {path.name for path in self.folder.rglob("*.tic")}
+
+
+def measure(job: Job) -> list[Row]:
+    """Arrays, topics and files that differ, kernels that have other keys, and the ratios of speed."""
+    steps, num_envs = (20, 16) if job.quick else (300, 256)
+    horizon = ["--set", f"episode.horizon_steps={100 if job.quick else 400}"]
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        commit, tree = stack.enter_context(_checked_out(job.against or "HEAD", folder / "tree"))
+        ours, theirs = _Side(ROOT, folder / "ours"), _Side(tree, folder / "theirs")
+        rows = []
+        for world, sensors in _WORLDS[: 1 if job.quick else None]:
+            one, other = (side.bits(world, sensors, num_envs, steps) for side in (ours, theirs))
+            what = f"{world}, {sensors} sensing, {num_envs} vehicles, {steps} steps: arrays that differ"
+            rows.append(_equal(what, one, other, commit))
+        one, other = (_topics(side.uuv([*_EVAL, *horizon], "eval")) for side in (ours, theirs))
+        rows.append(_equal("two recorded episodes: topics that differ", one, other, commit))
+        one, other = (_weights(side.uuv(_TRAIN, "train")) for side in (ours, theirs))
+        rows.append(
+            _equal("four iterations of training: files of checkpoints that differ", one, other, commit)
+        )
+        rows.append(_keys(ours, theirs, commit))
+        return rows + _speed(job, ours, theirs, commit, num_envs)
+
+
+@contextlib.contextmanager
+def _checked_out(commit: str, place: Path) -> Iterator[tuple[str, Path]]:
+    """(short name, folder) of a commit, in a work tree that is taken away again."""
+    git = ["git", "-C", str(ROOT)]
+    name = subprocess.run(
+        [*git, "rev-parse", "--short", commit], check=True, stdout=subprocess.PIPE, text=True
+    )
+    subprocess.run([*git, "worktree", "add", "--quiet", "--detach", str(place), commit], check=True)
+    try:
+        yield name.stdout.strip(), place
+    finally:
+        subprocess.run([*git, "worktree", "remove", "--force", str(place)], check=False)
+
+
+def _equal(what: str, ours: dict[str, str], theirs: dict[str, str], commit: str) -> Row:
+    """How many of the names have other bits, or are on one side alone."""
+    wrong = sorted(name for name in ours.keys() | theirs.keys() if ours.get(name) != theirs.get(name))
+    note = f"of {len(theirs)} at {commit}" + (f": {', '.join(wrong[:5])}" if wrong else "")
+    return Row(what, len(wrong), "", less_is_better=True, floor=0, note=note, details={"differ": wrong})
+
+
+def _topics(run: Path) -> dict[str, str]:
+    """sha256 of the times and bytes of all messages of a topic, by log and topic."""
+    found: dict[str, str] = {}
+    for log in sorted((run / "logs").glob("*.mcap")):
+        hashes = {}
+        with log.open("rb") as stream:
+            for _schema, channel, message in make_reader(stream).iter_messages(log_time_order=False):
+                topic = hashes.setdefault(channel.topic, hashlib.sha256())
+                topic.update(message.log_time.to_bytes(8, "little") + message.data)
+        found |= {f"{log.stem}{topic}": value.hexdigest() for topic, value in hashes.items()}
+    return found
+
+
+def _weights(run: Path) -> dict[str, str]:
+    files = sorted((run / "checkpoints").glob("step_*/*.safetensors"))
+    return {
+        f"{file.parent.name}/{file.name}": hashlib.sha256(file.read_bytes()).hexdigest() for file in files
+    }
+
+
+def _keys(ours: _Side, theirs: _Side, commit: str) -> Row:
+    """Kernels of the commit that this tree compiles anew; a changed body is a reason: no floor."""
+    before, now = theirs.kernels(), ours.kernels()
+    note = f"of {len(before)} at {commit}; {len(now)} now"
+    return Row("kernels of the commit that have another key now", len(before - now), "", note=note)
+
+
+def _speed(job: Job, ours: _Side, theirs: _Side, commit: str, num_envs: int) -> list[Row]:
+    """Steps and starts, in turns; medians. Kernels are compiled by then."""
+    world, sensors = _WORLDS[0]
+    steps, starts = (5, 1) if job.quick else (40, _STARTS)
+    samples: dict[_Side, list[float]] = {ours: [], theirs: []}
+    begun: dict[_Side, list[float]] = {ours: [], theirs: []}
+    for _ in range(starts):
+        for side in samples:
+            player = _Player(side, world, sensors, num_envs)
+            begun[side].append(player.start_s)
+            player.close()
+    players = {side: _Player(side, world, sensors, num_envs) for side in samples}
+    for _ in range(2 if job.quick else _ROUNDS):
+        for side, player in players.items():
+            samples[side].append(steps * num_envs / player.seconds(steps))
+    for player in players.values():
+        player.close()
+    rate, start = (
+        [statistics.median(values[side]) for side in (ours, theirs)] for values in (samples, begun)
+    )
+    return [
+        Row(f"{world}, {num_envs} vehicles, tree alone", rate[0], "env-steps/s", rate[1], commit, floor=0.98,
+            floor_on="ratio", details={"ours": samples[ours], "theirs": samples[theirs]}),
+        Row("start with cached kernels, to the end of the first step", start[0], "s", start[1], commit,
+            less_is_better=True, floor=0.98, floor_on="ratio",
+            details={"ours": begun[ours], "theirs": begun[theirs]}),
+    ]  # fmt: skip
+
+
+class _Player:
+    """A process that steps when it is asked to."""
+
+    def __init__(self, side: _Side, world: str, sensors: str, num_envs: int) -> None:
+        begun = time.perf_counter()
+        self.process = subprocess.Popen(
+            side.played("speed", world, sensors, str(num_envs)),
+            env=side.environment,
+            cwd=side.tree,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        self._answer("ready")
+        self.start_s = time.perf_counter() - begun
+
+    def seconds(self, steps: int) -> float:
+        """Time of so many steps [s]."""
+        assert self.process.stdin
+        self.process.stdin.write(f"{steps}\n")
+        self.process.stdin.flush()
+        return self._answer("steps")
+
+    def close(self) -> None:
+        """End the process."""
+        self.process.communicate()
+
+    def _answer(self, word: str) -> float:
+        assert self.process.stdout
+        for line in self.process.stdout:
+            if line.startswith(word):
+                return float(line.split()[1])
+        raise RuntimeError(f"played.py ended with {self.process.wait()}")
