@@ -8,8 +8,8 @@ import time
 
 from benchmarks.common import Job, Row
 from uuvtai.loader import load_config
-from uuvtai.measure.profiling import PAPER_DENSITY, WARM_STEPS
-from uuvtai.measure.sim_batch import SimBatch
+from uuvtai.measure.profile.profiling import PAPER_DENSITY, WARM_STEPS
+from uuvtai.measure.profile.sim_batch import SimBatch
 from uuvtai.sim import Sim
 from uuvtai.tree import read_tree
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 from benchmarks.common import Job, Row
 from uuvtai.loader import load_config
-from uuvtai.measure.sim_batch import SimBatch
+from uuvtai.measure.profile.sim_batch import SimBatch
 from uuvtai.sim import Sim
 from uuvtai.sizes import memory_bytes
 from uuvtai.tree import read_tree

@@ -239,7 +239,7 @@ LEARNING = (
 STATISTICS = (
     Mutation(
         "wilson_half_width",
-        "uuvtai/measure/statistics.py",
+        "uuvtai/statistics.py",
         "z * z / (4 * n * n)",
         "z * z / (4 * n)",
         "tests/test_statistics.py",
@@ -247,7 +247,7 @@ STATISTICS = (
     ),
     Mutation(
         "mcnemar_one_sided",
-        "uuvtai/measure/statistics.py",
+        "uuvtai/statistics.py",
         "min(1.0, 2.0 * tail / 2**n)",
         "min(1.0, tail / 2**n)",
         "tests/test_statistics.py",
@@ -255,7 +255,7 @@ STATISTICS = (
     ),
     Mutation(
         "bootstrap_of_90_percent",
-        "uuvtai/measure/statistics.py",
+        "uuvtai/statistics.py",
         "(0.025, 0.975)",
         "(0.05, 0.95)",
         "tests/test_statistics.py",
@@ -263,7 +263,7 @@ STATISTICS = (
     ),
     Mutation(
         "paired_times_of_either",
-        "uuvtai/measure/paired.py",
+        "uuvtai/measure/evaluate/paired.py",
         "strict=True)\n        if all(both)\n",
         "strict=True)\n        if any(both)\n",
         "tests/test_statistics.py",
@@ -271,7 +271,7 @@ STATISTICS = (
     ),
     Mutation(
         "paired_sides_swapped",
-        "uuvtai/measure/paired.py",
+        "uuvtai/measure/evaluate/paired.py",
         "arrived.count((True, False)), arrived.count((False, True))",
         "arrived.count((False, True)), arrived.count((True, False))",
         "tests/test_statistics.py",

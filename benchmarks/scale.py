@@ -7,8 +7,8 @@ import time
 
 from benchmarks.common import Job, Row
 from uuvtai.loader import load_config
-from uuvtai.measure.profiling import WARM_STEPS, env_steps_per_s
-from uuvtai.measure.sim_batch import SimBatch
+from uuvtai.measure.profile.profiling import WARM_STEPS, env_steps_per_s
+from uuvtai.measure.profile.sim_batch import SimBatch
 from uuvtai.sim import Sim
 from uuvtai.sizes import memory_bytes
 from uuvtai.stages import STAGES

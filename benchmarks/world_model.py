@@ -28,7 +28,7 @@ from uuvtai.learn.risk import (
     label_events,
 )
 from uuvtai.learn.world_model import N_TARGET, WorldModel, WorldModelLearner, deviation
-from uuvtai.measure.statistics import wilson_interval
+from uuvtai.statistics import wilson_interval
 
 TRAIN_SEED, HELD_OUT_SEED = 1, 200_003
 MAX_NOISE = 1.2

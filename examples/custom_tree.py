@@ -8,7 +8,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import uuvtai
-from uuvtai.measure.evaluate import jobs_of, run_episodes, summary
+from uuvtai.measure.episodes.playing import jobs_of, run_episodes
+from uuvtai.measure.evaluate.summary import summary
 from uuvtai.sim import Sim
 from uuvtai.tree import read_tree
 

@@ -7,9 +7,9 @@ import pytest
 
 from tests.conftest import SmallSim
 from uuvtai.cli import main
-from uuvtai.measure.ceilings import condition_of, remainder_of, scenarios_of
-from uuvtai.measure.evaluate import Job, jobs_of
-from uuvtai.measure.methods import trees_of
+from uuvtai.measure.episodes.methods import trees_of
+from uuvtai.measure.episodes.playing import Job, jobs_of
+from uuvtai.measure.evaluate.ceilings import condition_of, remainder_of, scenarios_of
 
 SEED = 3
 

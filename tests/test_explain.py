@@ -10,11 +10,12 @@ from tests.reference import hull as hull_reference
 from tests.reference import sonar as sonar_reference
 from uuvtai.config import Config, TankConfig
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, NONE, SPHERE
-from uuvtai.measure import hindsight
-from uuvtai.measure.causes import CAUSES, REMARKS, Explanation, Killer, explain, timeout_label
-from uuvtai.measure.escape import candidates, escapes, motion, rolled_out
-from uuvtai.measure.evaluate import EpisodeResult, jobs_of, run_episodes
-from uuvtai.measure.explain import (
+from uuvtai.measure.episodes.playing import EpisodeResult, jobs_of, run_episodes
+from uuvtai.measure.explain import hindsight
+from uuvtai.measure.explain.causes import CAUSES, REMARKS, Explanation, Killer, explain, timeout_label
+from uuvtai.measure.explain.escape import candidates, escapes, motion, rolled_out
+from uuvtai.measure.explain.facts import WINDOW_S
+from uuvtai.measure.explain.failures import (
     Row,
     chosen_for_recording,
     explain_failures,
@@ -22,8 +23,7 @@ from uuvtai.measure.explain import (
     record_worst,
     table_of,
 )
-from uuvtai.measure.facts import WINDOW_S
-from uuvtai.measure.history import Bodies, Diary, History
+from uuvtai.measure.explain.history import Bodies, Diary, History
 
 CONFIG = Config()
 HERE = np.array([10.0, 3.0, -0.8])
@@ -642,7 +642,7 @@ class _Silent:
 @pytest.fixture
 def request_of(small, tmp_path, monkeypatch):
     """A request for a short comparison that runs on the session's simulator."""
-    from uuvtai.measure.compare import Request
+    from uuvtai.measure.evaluate.compare import Request
 
     monkeypatch.setattr("uuvtai.sim.Sim", lambda *_: small.sim)
 
@@ -664,7 +664,7 @@ def request_of(small, tmp_path, monkeypatch):
 
 
 def test_a_comparison_carries_its_causes(request_of):
-    from uuvtai.measure.compare import compare
+    from uuvtai.measure.evaluate.compare import compare
 
     result, folder = compare(request_of(explain_record=1), _Silent())
     method = result["methods"][0]
@@ -683,7 +683,7 @@ def test_a_comparison_carries_its_causes(request_of):
 
 
 def test_without_explain_the_document_has_no_causes(request_of):
-    from uuvtai.measure.compare import compare
+    from uuvtai.measure.evaluate.compare import compare
 
     result, folder = compare(request_of(explain=False), _Silent())
     assert not {"causes", "explain"} & set(result["methods"][0])
@@ -691,12 +691,12 @@ def test_without_explain_the_document_has_no_causes(request_of):
 
 
 def test_an_interrupted_explanation_leaves_the_results(request_of, monkeypatch):
-    from uuvtai.measure.compare import compare
+    from uuvtai.measure.evaluate.compare import compare
 
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("uuvtai.measure.explain.explain_failures", interrupted)
+    monkeypatch.setattr("uuvtai.measure.explain.failures.explain_failures", interrupted)
     request = request_of()
     with pytest.raises(KeyboardInterrupt):
         compare(request, _Silent())

@@ -7,8 +7,16 @@ import torch
 
 from uuvtai.config.learning import RiskConfig
 from uuvtai.learn.risk import NO_THRESHOLD, STRIDE, RiskHead
-from uuvtai.measure.evaluate import Job, Recorders
-from uuvtai.measure.foresight import Foresight, RiskMoments, fit, foresight_of, judged, moments_of, told
+from uuvtai.measure.episodes.playing import Job, Recorders
+from uuvtai.measure.evaluate.foresight import (
+    Foresight,
+    RiskMoments,
+    fit,
+    foresight_of,
+    judged,
+    moments_of,
+    told,
+)
 
 HORIZON = 20
 

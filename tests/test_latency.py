@@ -4,8 +4,8 @@ of."""
 import pytest
 import torch
 
-from uuvtai.measure import latency
-from uuvtai.measure.sim_batch import SimBatch
+from uuvtai.measure.profile import latency
+from uuvtai.measure.profile.sim_batch import SimBatch
 
 PLANNING = [0.010, 0.0, 0.020, 0.0, 0.0, 0.030]
 """[s] of the planning stage, step after step; where it is not 0 a route is planned"""

@@ -8,7 +8,7 @@ import pytest
 
 from uuvtai.config import Config, DisturbanceConfig, FixedObstacle, Waypoint, WorldConfig
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, SPHERE
-from uuvtai.measure import hindsight
+from uuvtai.measure.explain import hindsight
 from uuvtai.privileged.blind_ride import ride_blindly
 from uuvtai.privileged.detection import required_detection, time_aside_s
 from uuvtai.privileged.lattice import CELL_M, MOVES, Referee, lattice_of

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from tests import report_samples as samples
-from uuvtai.measure.evaluate import jobs_of, run_episodes
-from uuvtai.measure.stopwatch import StepClock, env_steps_left
+from uuvtai.measure.episodes.playing import jobs_of, run_episodes
+from uuvtai.measure.episodes.stopwatch import StepClock, env_steps_left
 from uuvtai.show import progress as module
 from uuvtai.show.dashboard import training_rows
 from uuvtai.show.progress import Pace, Progress, told_left

@@ -23,7 +23,7 @@ from rich.console import Console
 from tests import report_samples as samples
 from uuvtai.errors import UserError
 from uuvtai.loader import ConfigError
-from uuvtai.measure.paired import paired
+from uuvtai.measure.evaluate.paired import paired
 from uuvtai.report import ink
 from uuvtai.report.blocks import Data, Figure, Gallery, Prose, Table
 from uuvtai.report.build import report

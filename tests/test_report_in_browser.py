@@ -15,7 +15,7 @@ import pytest
 
 from tests import report_samples as samples
 from uuvtai.logs.film import write_film
-from uuvtai.measure.paired import paired
+from uuvtai.measure.evaluate.paired import paired
 from uuvtai.report.build import report
 
 JS = Path(__file__).parent / "js"

@@ -9,9 +9,9 @@ import pytest
 from uuvtai.errors import UserError
 from uuvtai.loader import preset_path
 from uuvtai.logs import reader
-from uuvtai.measure import ledger
-from uuvtai.measure.compare import Request, compare, resume
-from uuvtai.measure.eval_request import FILE as REQUEST
+from uuvtai.measure.evaluate import ledger
+from uuvtai.measure.evaluate.compare import Request, compare, resume
+from uuvtai.measure.evaluate.eval_request import FILE as REQUEST
 
 TIMES = ("wall_s", "env_steps_per_s")
 """of the machine, not of the vehicles"""

@@ -163,7 +163,7 @@ def test_a_folder_that_cannot_be_gone_on_with_is_let_go(tmp_path):
 
 def test_an_evaluation_holds_its_folder(tmp_path, monkeypatch):
     """Of 25 pairs of evaluations that began in one folder all 50 succeeded, and their files were mixed."""
-    from uuvtai.measure import compare
+    from uuvtai.measure.evaluate import compare
 
     made = []
     monkeypatch.setattr(
@@ -182,7 +182,7 @@ def test_an_evaluation_holds_its_folder(tmp_path, monkeypatch):
             RunFolder.held(tmp_path / "run")
         raise LookupError("seen")
 
-    monkeypatch.setattr("uuvtai.measure.ceilings.scenarios_of", scenarios)
+    monkeypatch.setattr("uuvtai.measure.evaluate.ceilings.scenarios_of", scenarios)
     request = compare.Request(
         load_config("pool"), "pool", "paper", ["oracle"], [77], 1, run_dir=tmp_path / "run"
     )

@@ -34,6 +34,7 @@ from uuvtai.learn.manifest import config_sha256, sha256_of
 from uuvtai.learn.packing import PackingError, read_stream
 from uuvtai.learn.pilot import load_pilot
 from uuvtai.learn.recorder import MetricsRecorder
+from uuvtai.learn.run import TrainRequest, train
 from uuvtai.loader import ConfigError, load_config, load_resolved, parsed_yaml
 from uuvtai.logs import budget
 from uuvtai.logs.container import MAGIC, McapFile
@@ -42,10 +43,10 @@ from uuvtai.logs.log_export import depth_image
 from uuvtai.logs.picture import picture
 from uuvtai.logs.reader import info
 from uuvtai.logs.recording import load_recording
+from uuvtai.measure.evaluate.tree_report import tree_report
+from uuvtai.measure.evaluate.while_training import evaluate_now
 from uuvtai.measure.reproduce.paper_run import resume as resume_reproduction
 from uuvtai.measure.sweep.play import resume as resume_sweep
-from uuvtai.measure.training import TrainRequest, train
-from uuvtai.measure.tree_report import tree_report
 from uuvtai.report.build import report
 from uuvtai.report.media import media
 from uuvtai.run_folder import RunFolder, RunFolderError
@@ -466,7 +467,7 @@ def with_link(here, name):
     "open_it",
     [
         lambda run: RunFolder.reopen(run, {}),
-        lambda run: train(TrainRequest(resume=run), Quiet()),
+        lambda run: train(TrainRequest(resume=run), Quiet(), evaluate_now),
         lambda run: resume_sweep(run, None, Quiet()),
         lambda run: resume_reproduction(run, Quiet()),
         lambda run: report([run]),

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from uuvtai.loader import load_config
-from uuvtai.measure.evaluate import jobs_of, run_episodes
+from uuvtai.measure.episodes.playing import jobs_of, run_episodes
 
 SENSED = (
     "ego",

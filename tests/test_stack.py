@@ -6,8 +6,8 @@ import json
 import pytest
 
 from uuvtai.loader import STACK_SECTIONS, ConfigError, load_config, tree_of_stack, with_stack
-from uuvtai.measure.compare import Request, compare
-from uuvtai.measure.methods import trees_of
+from uuvtai.measure.episodes.methods import trees_of
+from uuvtai.measure.evaluate.compare import Request, compare
 
 
 class Quiet:

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from uuvtai.measure.paired import paired
-from uuvtai.measure.statistics import (
+from uuvtai.measure.evaluate.paired import paired
+from uuvtai.statistics import (
     binomial_p,
     bootstrap_interval,
     fisher_p,

@@ -15,7 +15,7 @@ from tests import sweep_work
 from tests.conftest import SmallSim
 from tests.report_samples import robustness_sweep
 from uuvtai.loader import ConfigError
-from uuvtai.measure.evaluate import Job, run_episodes
+from uuvtai.measure.episodes.playing import Job, run_episodes
 from uuvtai.measure.sweep import play as sweep_run
 from uuvtai.measure.sweep.cells import Grid, grid_of
 from uuvtai.measure.sweep.engines import EngineError, LocalEngine, RayEngine

@@ -9,7 +9,7 @@ from rich.cells import cell_len
 from rich.console import Console
 
 from tests import report_samples as samples
-from uuvtai.measure.paired import paired
+from uuvtai.measure.evaluate.paired import paired
 from uuvtai.show.cause_table import show_causes
 from uuvtai.show.evaluation import show_methods, show_pairs
 from uuvtai.show.exports import show_export

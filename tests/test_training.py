@@ -15,13 +15,14 @@ from tests.conftest import SmallSim
 from tests.point_env import PointEnv
 from uuvtai.env import VectorEnv
 from uuvtai.learn import checkpoint
+from uuvtai.learn import run as training
 from uuvtai.learn.guard import TrainingError
 from uuvtai.learn.packing import pack
 from uuvtai.learn.recorder import read_metrics
+from uuvtai.learn.run import TrainRequest
 from uuvtai.learn.train import Trainer
 from uuvtai.loader import ConfigError, load_training
-from uuvtai.measure import training
-from uuvtai.measure.training import TrainRequest, evaluate_now, train
+from uuvtai.measure.evaluate.while_training import evaluate_now
 from uuvtai.run_folder import RunFolder, RunFolderError
 
 TINY = {
@@ -63,6 +64,10 @@ def points(monkeypatch):
 
 def config_of(**overrides):
     return load_training("smoke", TINY | {key.replace("__", "."): value for key, value in overrides.items()})
+
+
+def train(request, watch):
+    return training.train(request, watch, evaluate_now)
 
 
 def run_json(folder):

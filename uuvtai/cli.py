@@ -179,7 +179,7 @@ def evaluate(
 ) -> None:
     """Play the same episodes with every controller and trained policy and print the table of methods."""
     if resume is not None:
-        from uuvtai.measure.compare import resume as go_on
+        from uuvtai.measure.evaluate.compare import resume as go_on
 
         _refuse_all_beside_resume(ctx, ("with_report", "as_json", "wide"))
         result, folder = go_on(resume, _Progress())
@@ -205,7 +205,7 @@ def evaluate(
     )
 
     from uuvtai.loader import sensors_of
-    from uuvtai.measure.compare import Request, compare
+    from uuvtai.measure.evaluate.compare import Request, compare
 
     request = Request(
         config=config,
@@ -251,7 +251,7 @@ def _policy_features(policies: list[str]) -> list[tuple[str, Any]]:
     """Settings of the observation that the policies were trained with."""
     if not policies:
         return []
-    from uuvtai.measure.methods import features_of
+    from uuvtai.measure.episodes.methods import features_of
 
     return features_of(policies)
 
@@ -340,8 +340,9 @@ def train_policy(
     as_json: AsJson = False,
 ) -> None:
     """Train a policy into a run folder, or go on with one. Ctrl-C saves; --resume goes on."""
+    from uuvtai.learn.run import TrainRequest, train
     from uuvtai.loader import load_training
-    from uuvtai.measure.training import TrainRequest, train
+    from uuvtai.measure.evaluate.while_training import evaluate_now
     from uuvtai.show.dashboard import TrainingProgress
 
     if resume is None:
@@ -369,7 +370,7 @@ def train_policy(
         request = TrainRequest(
             resume=resume, overrides=list(overrides or []), iterations=iterations, device=device
         )
-    result, folder = train(request, TrainingProgress())
+    result, folder = train(request, TrainingProgress(), evaluate_now)
     if with_report:
         _say(f"report: {_write_report([folder], None).page}")
     if as_json:
@@ -631,7 +632,7 @@ def profile(
     if not math.isfinite(seconds) or seconds <= 0:
         raise UsageError(f"--seconds {seconds}: must be a positive number, for example --seconds 10")
     from uuvtai.loader import load_training
-    from uuvtai.measure.profiling import profile as run
+    from uuvtai.measure.profile.profiling import profile as run
 
     config = load_training(
         preset,
@@ -763,7 +764,7 @@ def export_policy(
     if check is not None:
         found = deploy.check(check, _say)
     else:
-        from uuvtai.measure.methods import find_policy, policy_name
+        from uuvtai.measure.episodes.methods import find_policy, policy_name
 
         assert run is not None
         checkpoint = find_policy(run, _say)
@@ -893,7 +894,7 @@ def _shown(kind: str, name: str) -> Any:
     if kind == "train":
         return loader.load_training(name)
     if kind == "policy":
-        from uuvtai.measure.methods import find_policy
+        from uuvtai.measure.episodes.methods import find_policy
 
         return find_policy(name).config
     chosen = {"world": "pool", kind: name}
@@ -944,7 +945,7 @@ def tree(
     as_json: AsJson = False,
 ) -> None:
     """Print a behaviour tree, with the share of episodes and ticks per node after an evaluation."""
-    from uuvtai.measure.tree_report import tree_report
+    from uuvtai.measure.evaluate.tree_report import tree_report
 
     report = tree_report(controller, run)
     if as_json:

@@ -16,6 +16,8 @@ KINDS = {
     "policy": "policies",
 }
 """kind -> folder in ``PRESET_DIR``"""
+TRAINING_TREE = "bt"
+"""tree beside a policy: what it was distilled from, and what its observation's teacher columns come from"""
 
 
 def preset_names(kind: str) -> list[str]:

@@ -37,8 +37,8 @@ from pathlib import Path
 from typing import Any
 
 from uuvtai.measure.reproduce import paper
-from uuvtai.measure.statistics import wilson_interval
 from uuvtai.outcomes import COLLIDED
+from uuvtai.statistics import wilson_interval
 
 ROOT = Path(__file__).resolve().parents[2]
 COMPARISONS: dict[str, Callable[[Any, Any], bool]] = {"<=": operator.le, ">=": operator.ge, "=": operator.eq}

@@ -12,8 +12,8 @@ from uuvtai.errors import UserError
 from uuvtai.files import read_json
 from uuvtai.learn.checkpoint import Checkpoint
 from uuvtai.loader import ConfigError
-from uuvtai.measure.statistics import wilson_interval
 from uuvtai.outcomes import COLLIDED
+from uuvtai.statistics import wilson_interval
 
 RESULT = Path("eval/result.json")
 """what ``uuv eval`` leaves in its run folder"""

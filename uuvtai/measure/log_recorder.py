@@ -17,7 +17,7 @@ from uuvtai.loader import to_yaml
 from uuvtai.logs.closed_form import scenario_document
 from uuvtai.logs.mcap_log import Due, McapEpisodeLog
 from uuvtai.measure.depth_line import depth_line
-from uuvtai.measure.evaluate import EpisodeResult, Job
+from uuvtai.measure.episodes.playing import EpisodeResult, Job
 from uuvtai.outcomes import OUTCOMES, RUNNING
 from uuvtai.plan_codes import PLANNERS, REASONS, TRIGGERS
 from uuvtai.run_folder import git_sha

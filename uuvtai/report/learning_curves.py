@@ -10,11 +10,11 @@ from functools import lru_cache
 from typing import Any
 
 from uuvtai.loader import parsed_yaml
-from uuvtai.measure.statistics import wilson_interval
 from uuvtai.report.blocks import Block, Data, Figure, Prose, Table
 from uuvtai.report.colours import method_colours
 from uuvtai.report.figures import Line, curves
 from uuvtai.report.wording import number, percent, rate
+from uuvtai.statistics import wilson_interval
 
 Metrics = list[dict[str, Any]]
 

@@ -19,7 +19,7 @@ _PERIOD_S = 5.0
 
 
 class TrainingProgress:
-    """What ``measure.training`` tells while it runs. The first iteration compiles: it is no part of the speed
+    """What ``learn.run`` tells while it runs. The first iteration compiles: it is no part of the speed
     and of the time left."""
 
     def __init__(self) -> None:

@@ -64,8 +64,8 @@ def _method(m: dict[str, Any]) -> list[str]:
 
 
 def show_pairs(screen: Screen, pairs: list[dict[str, Any]]) -> None:
-    """Every two methods on the episodes that both played (``measure.paired``); nothing where one method
-    played alone."""
+    """Every two methods on the episodes that both played (``measure.evaluate.paired``); nothing where one
+    method played alone."""
     if not pairs:
         return
     screen.line("")

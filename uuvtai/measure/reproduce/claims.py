@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from uuvtai.measure.reproduce import paper
-from uuvtai.measure.statistics import (
+from uuvtai.outcomes import COLLIDED
+from uuvtai.statistics import (
     binomial_p,
     fisher_p,
     holm_adjusted,
@@ -23,7 +24,6 @@ from uuvtai.measure.statistics import (
     time_to_success_s,
     wilson_interval,
 )
-from uuvtai.outcomes import COLLIDED
 
 HOLDS, FAILS, OPEN = "holds", "does not hold", "cannot be judged"
 LEVEL = 0.05

@@ -8,9 +8,9 @@ from typing import Any
 from uuvtai.measure.reproduce import paper
 from uuvtai.measure.reproduce.claims import LEVEL, pooled, tts_s
 from uuvtai.measure.reproduce.steps import RETIRED_SEEDS
-from uuvtai.measure.statistics import mean
 from uuvtai.outcomes import COLLIDED
 from uuvtai.report.alone import is_alone, told
+from uuvtai.statistics import mean
 
 
 def results_page(document: dict[str, Any]) -> str:

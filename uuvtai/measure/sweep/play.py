@@ -94,7 +94,7 @@ def _refuse_other_policies(
 ) -> None:
     """RunFolderError where a policy is another one by now: cells of two policies under one name would prove
     nothing."""
-    from uuvtai.measure.methods import policies_of
+    from uuvtai.measure.episodes.methods import policies_of
 
     trained = policies_of(list(request.policies), base_config(request).teacher.max_node, watch.note)
     now = {method.name: method.checkpoint.sha256 for method in trained if method.checkpoint}
@@ -114,7 +114,7 @@ def resolved(
 
     Paths are made absolute. Raises ConfigError, CheckpointError.
     """
-    from uuvtai.measure.methods import features_of, policies_of, trees_of
+    from uuvtai.measure.episodes.methods import features_of, policies_of, trees_of
 
     limit = base_config(request).teacher.max_node
     trees = trees_of(list(request.controllers), limit)

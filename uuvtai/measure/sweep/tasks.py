@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from uuvtai.config import Config
 
 if TYPE_CHECKING:
-    from uuvtai.measure.evaluate import EpisodeResult
+    from uuvtai.measure.episodes.playing import EpisodeResult
     from uuvtai.scenario import Scene
     from uuvtai.sim import Sim
 
@@ -50,8 +50,8 @@ _kept = _Kept()
 
 def play(task: Task) -> list[Row]:
     """Play all episodes of the task's cells; one row per cell, in their order."""
-    from uuvtai.measure.evaluate import Job, run_episodes
-    from uuvtai.measure.methods import policies_of, trees_of
+    from uuvtai.measure.episodes.methods import policies_of, trees_of
+    from uuvtai.measure.episodes.playing import Job, run_episodes
 
     limit = task.config.teacher.max_node
     found = (
@@ -77,7 +77,7 @@ def play(task: Task) -> list[Row]:
 
 
 def _sim_of(task: Task, config: Config) -> Sim:
-    from uuvtai.measure.methods import TRAINING_TREE
+    from uuvtai.shipped import TRAINING_TREE
     from uuvtai.sim import Sim
     from uuvtai.tree import read_tree
 
@@ -92,7 +92,7 @@ def _sim_of(task: Task, config: Config) -> Sim:
 def row_of(method: str, label: dict[str, Any], results: list[EpisodeResult]) -> Row:
     """One method in one cell: what ``uuv eval`` says of a method, without what a clock measured, and every
     episode's end."""
-    from uuvtai.measure.evaluate import summary
+    from uuvtai.measure.evaluate.summary import summary
 
     found = summary(method, results, 0, 0.0)
     for name in (

@@ -11,16 +11,23 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from uuvtai.errors import SettingError
 from uuvtai.loader import ConfigError
-from uuvtai.measure.eval_request import FILE as REQUEST
-from uuvtai.measure.eval_request import ORACLE, Request, document_of, drivers_of, read_request, refuse_others
+from uuvtai.measure.evaluate.eval_request import FILE as REQUEST
+from uuvtai.measure.evaluate.eval_request import (
+    ORACLE,
+    Request,
+    document_of,
+    drivers_of,
+    read_request,
+    refuse_others,
+)
 from uuvtai.run_folder import RunFolder, default_run_dir, refuse_place
 
 if TYPE_CHECKING:
-    from uuvtai.measure.evaluate import EpisodeResult, Job
-    from uuvtai.measure.foresight import Foresight, RiskMoments
-    from uuvtai.measure.ledger import Finished, Ledger
+    from uuvtai.measure.episodes.methods import Method
+    from uuvtai.measure.episodes.playing import EpisodeResult, Job
+    from uuvtai.measure.evaluate.foresight import Foresight, RiskMoments
+    from uuvtai.measure.evaluate.ledger import Finished, Ledger
     from uuvtai.measure.log_recorder import EpisodeRecorder, PolicyNote
-    from uuvtai.measure.methods import Method
     from uuvtai.sim import Sim
     from uuvtai.tree import FlatTree
 
@@ -149,9 +156,10 @@ def _compared(
     watch: EvaluationWatch,
 ) -> dict[str, Any]:
     """Play what is not over yet; the whole document, and all that is written and drawn of it."""
-    from uuvtai.measure.ceilings import condition_of, remainder_of, scenarios_of
-    from uuvtai.measure.evaluate import document, jobs_of
-    from uuvtai.measure.ledger import Ledger
+    from uuvtai.measure.episodes.playing import jobs_of
+    from uuvtai.measure.evaluate.ceilings import condition_of, remainder_of, scenarios_of
+    from uuvtai.measure.evaluate.ledger import Ledger
+    from uuvtai.measure.evaluate.summary import document
 
     jobs = jobs_of(request.seeds, request.episodes)
     played: list[_Played] = []
@@ -188,7 +196,7 @@ def _compared(
 
 
 def _methods(request: Request, watch: EvaluationWatch) -> list[Method]:
-    from uuvtai.measure.methods import differences, policies_of, trees_of
+    from uuvtai.measure.episodes.methods import differences, policies_of, trees_of
 
     max_node = request.config.teacher.max_node
     trees = [name for name in request.controllers if name != ORACLE]
@@ -222,10 +230,11 @@ def _play(
     entries: list[dict[str, Any]],
 ) -> None:
     """Play one method's episodes, as far as they are not over, and add them to ``played`` and ``entries``."""
-    from uuvtai.measure.evaluate import Recorders, run_episodes, summary, tree_use
-    from uuvtai.measure.foresight import foresight_of, told
-    from uuvtai.measure.ledger import Keeper
-    from uuvtai.measure.stopwatch import StepClock
+    from uuvtai.measure.episodes.playing import Recorders, run_episodes
+    from uuvtai.measure.episodes.stopwatch import StepClock
+    from uuvtai.measure.evaluate.foresight import foresight_of, told
+    from uuvtai.measure.evaluate.ledger import Keeper
+    from uuvtai.measure.evaluate.summary import summary, tree_use
 
     sim.use_tree(method.tree)
     sim.privileged = method.privileged
@@ -267,7 +276,7 @@ def _play(
 
 def _moments(foresight: Foresight | None, finished: list[Finished], dt: float) -> RiskMoments | None:
     """What the risk head said along the episodes, in their order, whoever has played them."""
-    from uuvtai.measure.foresight import joined, moments_of
+    from uuvtai.measure.evaluate.foresight import joined, moments_of
 
     if foresight is None:
         return None
@@ -277,7 +286,7 @@ def _moments(foresight: Foresight | None, finished: list[Finished], dt: float) -
 
 def _any_tree() -> FlatTree:
     """The oracle drives no vehicle, but a simulator wants a tree."""
-    from uuvtai.measure.methods import TRAINING_TREE
+    from uuvtai.shipped import TRAINING_TREE
     from uuvtai.tree import read_tree
 
     return read_tree(TRAINING_TREE)
@@ -286,7 +295,7 @@ def _any_tree() -> FlatTree:
 def _ask_oracle(
     request: Request, jobs: list[Job], scenarios: list[dict[str, Any]], watch: EvaluationWatch
 ) -> dict[str, Any]:
-    from uuvtai.measure.ceilings import oracle_entry
+    from uuvtai.measure.evaluate.ceilings import oracle_entry
 
     watch.start(ORACLE, len(jobs))
     try:
@@ -314,7 +323,7 @@ def _explain(
 ) -> None:
     """Replay what failed, add the causes to the document, record the worst. What is known is written before
     the next long step begins."""
-    from uuvtai.measure.explain import (
+    from uuvtai.measure.explain.failures import (
         chosen_for_recording,
         explain_failures,
         failures,

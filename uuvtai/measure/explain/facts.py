@@ -17,9 +17,9 @@ import numpy as np
 
 from uuvtai.config import Config
 from uuvtai.kernels.core.geometry import BOX, NONE
-from uuvtai.measure import hindsight
-from uuvtai.measure.escape import escapes
-from uuvtai.measure.history import Array, Bodies, Diary, History
+from uuvtai.measure.explain import hindsight
+from uuvtai.measure.explain.escape import escapes
+from uuvtai.measure.explain.history import Array, Bodies, Diary, History
 from uuvtai.scenario import KIND_NAMES
 
 WINDOW_S = 4.0

@@ -4,6 +4,7 @@ how it all ends."""
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -11,15 +12,14 @@ from typing import TYPE_CHECKING, Any, Protocol
 from uuvtai import signals
 from uuvtai.config.learning import LearningConfig
 from uuvtai.loader import ConfigError, Overrides, load_resolved, to_yaml
-from uuvtai.measure.methods import TRAINING_TREE
-from uuvtai.measure.statistics import wilson_interval
 from uuvtai.run_folder import RunFolder, default_run_dir, refuse_place
+from uuvtai.shipped import TRAINING_TREE
+from uuvtai.statistics import wilson_interval
 
 if TYPE_CHECKING:
     from uuvtai.env import VectorEnv
     from uuvtai.learn.checkpoint import Checkpoint
     from uuvtai.learn.train import Trainer
-    from uuvtai.measure.foresight import Foresight
 
 Metrics = dict[str, float]
 
@@ -56,8 +56,14 @@ class TrainWatch(Protocol):
     def stop(self) -> None: ...
 
 
-def train(request: TrainRequest, watch: TrainWatch) -> tuple[dict[str, Any], Path]:
-    """Train or go on training; what ``uuv train --json`` prints, and the run folder.
+Evaluate = Callable[["Trainer", LearningConfig], Metrics]
+"""``eval/*`` of the policy as it is; training goes on as if nothing had been
+(``measure.evaluate.while_training.evaluate_now``, which knows what learning does not)"""
+
+
+def train(request: TrainRequest, watch: TrainWatch, evaluate: Evaluate) -> tuple[dict[str, Any], Path]:
+    """Train or go on training; what ``uuv train --json`` prints, and the run folder. Every
+    ``train.evaluate_every`` iterations ``evaluate`` is asked.
 
     Everything that can be refused is refused before anything is written. An interrupt (SIGINT, SIGTERM) lets
     the iteration end, saves and raises KeyboardInterrupt; a second one ends at once. Under torchrun rank 0
@@ -69,20 +75,22 @@ def train(request: TrainRequest, watch: TrainWatch) -> tuple[dict[str, Any], Pat
         raise ConfigError(f"--iterations {request.iterations}: at least 1, for example --iterations 100")
     if request.resume is None:
         refuse_place(request.run_dir)
-        return _train(request, None, watch)
+        return _train(request, None, watch, evaluate)
     _refuse_no_run(request.resume)
     if not is_writer():
-        return _train(request, None, watch)
+        return _train(request, None, watch, evaluate)
     held = RunFolder.held(
         request.resume, "uuv train"
     )  # before anything is read: what another process writes meanwhile must not count
     try:
-        return _train(request, held, watch)
+        return _train(request, held, watch, evaluate)
     finally:
         held.release()
 
 
-def _train(request: TrainRequest, folder: RunFolder | None, watch: TrainWatch) -> tuple[dict[str, Any], Path]:
+def _train(
+    request: TrainRequest, folder: RunFolder | None, watch: TrainWatch, evaluate: Evaluate
+) -> tuple[dict[str, Any], Path]:
     """As ``train``; ``folder`` is the folder of the run to go on with, where this process writes."""
     from uuvtai.learn.distributed import claim_gpu
 
@@ -100,7 +108,7 @@ def _train(request: TrainRequest, folder: RunFolder | None, watch: TrainWatch) -
     )
     trainer = _trainer(_env(config, request.device), config, found)
     place = _folder(request, config, found, folder) if trainer.processes.writes else None
-    run = _Run(trainer, config, place, watch, total)
+    run = _Run(trainer, config, place, watch, evaluate, total)
     status, code = "failed", 1
     try:
         with signals.Noted() as pressed:
@@ -188,17 +196,13 @@ class _Run:
         config: LearningConfig,
         folder: RunFolder | None,
         watch: TrainWatch,
+        evaluate: Evaluate,
         total: int,
     ) -> None:
         from uuvtai.learn.recorder import MetricsRecorder
 
-        self._trainer, self._config, self._folder, self._watch, self._total = (
-            trainer,
-            config,
-            folder,
-            watch,
-            total,
-        )
+        self._trainer, self._config, self._folder = trainer, config, folder
+        self._watch, self._evaluate, self._total = watch, evaluate, total
         self._recorder = MetricsRecorder(folder.path, trainer.iteration) if folder else None
         self._metrics: Metrics = {}
         self._saved = trainer.iteration if trainer.iteration else None
@@ -241,7 +245,7 @@ class _Run:
         done, train = self._trainer.iteration, self._config.train
         is_evaluated = not is_stopped and train.evaluate_every > 0 and done % train.evaluate_every == 0
         if is_evaluated:
-            self._metrics |= evaluate_now(self._trainer, self._config)
+            self._metrics |= self._evaluate(self._trainer, self._config)
         if self._recorder:
             self._recorder.write(done, self._metrics)
         self._watch.update(done, self._metrics, self._success_interval())
@@ -268,55 +272,3 @@ class _Run:
         """95 % interval of ``rollout/success_rate`` over the episodes that it is the mean of."""
         rate, episodes = self._metrics.get("rollout/success_rate"), self._trainer.recent.episodes
         return None if rate is None else wilson_interval(round(rate * episodes), round(episodes))
-
-
-def evaluate_now(trainer: Trainer, config: LearningConfig) -> Metrics:
-    """``eval/*``: the policy as it is, without exploration, on scenarios of its own; training goes on as if
-    nothing had been.
-
-    Half of these episodes calibrate the risk head, where there is one and they hold enough accidents; the
-    others judge it.
-    """
-    from uuvtai.learn.pilot import Pilot
-    from uuvtai.measure.evaluate import Recorders, jobs_of, run_episodes, summary
-    from uuvtai.measure.foresight import foresight_of
-
-    env = trainer.env
-    model = trainer.world_model if config.world_model.as_features else None
-    pilot = Pilot(trainer.policy, model, env.num_envs, env.device, trainer.risk)
-    foresight = foresight_of(pilot, config.episode.control_dt_s)
-    held = env.capture()
-    try:
-        env.sim.sleep()
-        env.sim.set_scenes()
-        jobs = jobs_of([config.train.evaluate_seed], config.train.evaluate_episodes)
-        results, env_steps = run_episodes(env.sim, jobs, Recorders([foresight]), driver=pilot)
-    finally:
-        env.sim.set_scenes(config.train.scenes)
-        env.restore(held)
-    told = summary("policy", results, env_steps, 0.0)
-    names = ("success_rate", "collision_rate", "return_mean", "time_to_success_mean_s")
-    metrics = {f"eval/{name}": told[name] for name in names if told[name] is not None}
-    return metrics | (_calibrated(foresight) if foresight else {})
-
-
-_RISK_FIGURES = ("event_rate", "brier", "brier_base_rate", "ece", "auroc", "alarm_rate_safe")
-
-
-def _calibrated(foresight: Foresight) -> Metrics:
-    """Calibrate on every second episode, ``eval/risk_*`` on the others; nothing where accidents are too few
-    for the promised miss rate."""
-    from uuvtai.measure.foresight import fit, judged
-
-    moments = foresight.moments()
-    try:
-        fit(foresight.head, moments.of_episodes(0))
-    except ValueError:
-        return {}
-    figures = judged(foresight.head, moments.of_episodes(1))
-    if figures is None:
-        return {}
-    rates = {"miss_rate": figures["missed"] / figures["accidents"]} | {
-        name: figures[name] for name in _RISK_FIGURES
-    }
-    return {f"eval/risk_{name}": float(value) for name, value in rates.items()}

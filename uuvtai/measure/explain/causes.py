@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from uuvtai.config import Config
-from uuvtai.measure.facts import LAST_S, LEAD_S, Killer, Scene, killer_facts, timeout_facts
-from uuvtai.measure.history import Bodies, History
+from uuvtai.measure.explain.facts import LAST_S, LEAD_S, Killer, Scene, killer_facts, timeout_facts
+from uuvtai.measure.explain.history import Bodies, History
 
 START_S = 2.0
 """A younger episode starts in danger: track, forecast and evasion take about a second, and bodies start 1.5 m

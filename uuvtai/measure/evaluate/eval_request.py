@@ -19,7 +19,7 @@ from uuvtai.loader import ConfigError, preset_names, read_preset, validated
 from uuvtai.run_folder import RunFolderError
 
 if TYPE_CHECKING:
-    from uuvtai.measure.methods import Method
+    from uuvtai.measure.episodes.methods import Method
 
 FILE = "eval/request.json"
 ORACLE = "oracle"

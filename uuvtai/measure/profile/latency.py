@@ -18,7 +18,7 @@ import torch
 from uuvtai.config.learning import LearningConfig
 
 if TYPE_CHECKING:
-    from uuvtai.measure.sim_batch import SimBatch
+    from uuvtai.measure.profile.sim_batch import SimBatch
 
 PAPER_MS: dict[str, tuple[float, float | None]] = {
     "WM encoder": (0.015, None),

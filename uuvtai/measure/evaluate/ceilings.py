@@ -11,16 +11,17 @@ import numpy as np
 import torch
 
 from uuvtai.config import Config
-from uuvtai.measure.eval_request import ORACLE
-from uuvtai.measure.evaluate import EpisodeResult, Job, Progress, summary
-from uuvtai.measure.methods import TRUTH
-from uuvtai.measure.statistics import rate, wilson_interval
+from uuvtai.measure.episodes.methods import TRUTH
+from uuvtai.measure.episodes.playing import EpisodeResult, Job, Progress
+from uuvtai.measure.evaluate.eval_request import ORACLE
+from uuvtai.measure.evaluate.summary import summary
 from uuvtai.plan_codes import PLANNERS, REASONS, TRIGGERS
 from uuvtai.privileged.blind_ride import ride_blindly
 from uuvtai.privileged.detection import required_detection
 from uuvtai.privileged.oracle import earliest_arrival
 from uuvtai.scenario import describe_scenario
 from uuvtai.sim import Sim
+from uuvtai.statistics import rate, wilson_interval
 
 _UNKNOWN = (
     "return_mean",

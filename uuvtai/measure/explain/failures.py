@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from uuvtai.config import Config
-from uuvtai.measure import causes, facts
-from uuvtai.measure.causes import Explanation
-from uuvtai.measure.evaluate import Driver, EpisodeResult, Job, Progress, run_episodes
-from uuvtai.measure.history import Bodies, Diary, History
-from uuvtai.measure.statistics import mean
+from uuvtai.measure.episodes.playing import Driver, EpisodeResult, Job, Progress, run_episodes
+from uuvtai.measure.explain import causes, facts
+from uuvtai.measure.explain.causes import Explanation
+from uuvtai.measure.explain.history import Bodies, Diary, History
 from uuvtai.scenario import body_slots
 from uuvtai.sim import Sim
+from uuvtai.statistics import mean
 from uuvtai.tree import FlatTree
 
 if TYPE_CHECKING:

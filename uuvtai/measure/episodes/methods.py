@@ -10,16 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 from uuvtai.config import Config
 from uuvtai.loader import ConfigError, nearest, preset_path, tree_of_stack, with_stack
-from uuvtai.shipped import PRESET_DIR, preset_names
+from uuvtai.shipped import PRESET_DIR, TRAINING_TREE, preset_names
 from uuvtai.tree import FlatTree, read_tree
 
 if TYPE_CHECKING:
     from uuvtai.learn.checkpoint import Checkpoint
     from uuvtai.measure.log_recorder import PolicyNote
     from uuvtai.sim import Sim
-
-TRAINING_TREE = "bt"
-"""tree beside a policy: what it was distilled from, and what its observation's teacher columns come from"""
 
 TRUTH = "truth"
 """suffix of a tree's name: a privileged yardstick whose tracks of moving bodies are the truth"""

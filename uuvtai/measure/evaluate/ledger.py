@@ -13,11 +13,11 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from uuvtai.files import open_to_append, read_bytes, refuse_links, truncate
-from uuvtai.measure.evaluate import EpisodeResult, Job
+from uuvtai.measure.episodes.playing import EpisodeResult, Job
 from uuvtai.run_folder import RunFolderError
 
 if TYPE_CHECKING:
-    from uuvtai.measure.foresight import Foresight
+    from uuvtai.measure.evaluate.foresight import Foresight
     from uuvtai.sim import Sim
 
 FILE = "eval/episodes.jsonl"

@@ -7,7 +7,7 @@ import itertools
 from collections.abc import Sequence
 from typing import Any
 
-from uuvtai.measure.statistics import bootstrap_interval, mcnemar_p, mean
+from uuvtai.statistics import bootstrap_interval, mcnemar_p, mean
 
 Episode = dict[str, Any]
 """an entry of ``episodes_detail``: seed, episode, outcome, time_s at least"""

@@ -10,12 +10,12 @@ from torch import Tensor
 
 from uuvtai.learn.calibration import auroc, brier, expected_calibration_error, reliability
 from uuvtai.learn.risk import STRIDE, RiskHead, conformal_threshold
-from uuvtai.measure.statistics import wilson_interval
 from uuvtai.outcomes import FORESEEABLE
+from uuvtai.statistics import wilson_interval
 
 if TYPE_CHECKING:
     from uuvtai.learn.pilot import Pilot
-    from uuvtai.measure.evaluate import EpisodeResult, Job
+    from uuvtai.measure.episodes.playing import EpisodeResult, Job
     from uuvtai.sim import Sim
 
 

@@ -10,8 +10,8 @@ import torch
 
 from uuvtai.config import Config
 from uuvtai.config.learning import LearningConfig
-from uuvtai.measure.latency import latency_rows
-from uuvtai.measure.sim_batch import SimBatch
+from uuvtai.measure.profile.latency import latency_rows
+from uuvtai.measure.profile.sim_batch import SimBatch
 from uuvtai.run_folder import hardware, versions
 from uuvtai.sim import Sim
 from uuvtai.sizes import check_size, memory_bytes

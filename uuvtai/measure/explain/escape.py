@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 
 from uuvtai.config import Config
-from uuvtai.measure import hindsight
-from uuvtai.measure.history import Array, Bodies, History
+from uuvtai.measure.explain import hindsight
+from uuvtai.measure.explain.history import Array, Bodies, History
 
 N_HEADING = 16
 SPEEDS = (0.5, 1.0)

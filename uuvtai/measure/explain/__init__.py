@@ -1,0 +1,1 @@
+"""``uuv eval --explain``: failed episodes played again, and why each failed."""
