@@ -9,6 +9,7 @@ import pytest
 from rich.console import Console
 
 from benchmarks.peers.tick_py_trees import PyTree
+from docs.writers.palettes import with_palette
 from tests.bundles import io_for
 from uuvtai import state
 from uuvtai import tree_codes as codes
@@ -162,6 +163,8 @@ def test_presets_open_in_groot(name):
         for leaf, spec in LEAVES.items()
     }
     assert palette == wanted
+    text = preset_path("tree", name).read_text()
+    assert with_palette(text) == text
     used = {node.tag for tree in root.findall("BehaviorTree") for node in tree.iter()} - {"BehaviorTree"}
     assert used <= {*LEAVES, *CONTROLS, *DECORATORS}
     assert len(read_tree(name, TeacherConfig().max_node).kind) <= TeacherConfig().max_node

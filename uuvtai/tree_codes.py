@@ -1,5 +1,9 @@
-"""Codes of a behaviour tree's statuses, kinds of nodes and leaves: plain numbers, so that a tree can be read
-without Taichi."""
+"""What a behaviour tree may hold, leaves with their ports, control nodes and decorators, and the codes of its
+statuses: plain numbers, so that a tree can be read without Taichi."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
 
 # statuses, numbered as in BehaviorTree.CPP
 IDLE = 0
@@ -32,3 +36,65 @@ HOLD = 18
 UNSTICK = 19
 FOLLOW_ROUTE = 20
 DRIVE_STRAIGHT = 21
+
+MAX_PORTS = 4
+"""Numbers that a leaf can be given."""
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """What a tree may contain as a leaf."""
+
+    code: int
+    kind: int
+    ports: tuple[str, ...]
+    meaning: str
+
+
+def _condition(code: int, ports: str, meaning: str) -> Leaf:
+    return Leaf(code, CONDITION, tuple(ports.split()), meaning)
+
+
+def _action(code: int, ports: str, meaning: str) -> Leaf:
+    return Leaf(code, ACTION, tuple(ports.split()), meaning)
+
+
+LEAVES = {
+    "EmergencyTtc": _condition(
+        EMERGENCY_TTC, "ttc_s range_m", "sonar: contact sooner than ttc_s, or closing in within range_m"
+    ),
+    "PredictedConflict": _condition(
+        PREDICTED_CONFLICT, "within_s calm_s", "a forecast body comes too close; holds calm_s longer"
+    ),
+    "RouteBlocked": _condition(
+        ROUTE_BLOCKED, "clearance_m", "mapped clearance on the way to the look-ahead point is too small"
+    ),
+    "Stuck": _condition(STUCK, "seconds", "hardly any motion for this long, away from the goal"),
+    "HasRoute": _condition(HAS_ROUTE, "", "a route exists"),
+    "GoalNear": _condition(GOAL_NEAR, "distance_m", "the goal is closer than distance_m"),
+    "SafeHere": _condition(
+        SAFE_HERE,
+        "within_s",
+        "stopping here conflicts with no forecast body within within_s, or at all",
+    ),
+    "BackOff": _action(BACK_OFF, "speed_m_s", "retreat from the sensed threat"),
+    "Evade": _action(EVADE, "", "drive the evasive velocity of least cost"),
+    "Hold": _action(HOLD, "", "stay in place, away from mapped obstacles"),
+    "Unstick": _action(UNSTICK, "seconds speed_m_s", "creep away from the nearest mapped obstacle"),
+    "FollowRoute": _action(
+        FOLLOW_ROUTE, "speed_m_s depth_guard", "pursue the look-ahead point; fails without a route"
+    ),
+    "DriveStraight": _action(DRIVE_STRAIGHT, "speed_m_s", "drive at the goal, blind"),
+}
+
+CONTROLS = {
+    "Sequence": SEQUENCE,
+    "Fallback": FALLBACK,
+    "ReactiveSequence": REACTIVE_SEQUENCE,
+    "ReactiveFallback": REACTIVE_FALLBACK,
+}
+DECORATORS = {
+    "Inverter": INVERTER,
+    "ForceSuccess": FORCE_SUCCESS,
+    "ForceFailure": FORCE_FAILURE,
+}

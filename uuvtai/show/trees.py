@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from uuvtai.show.screen import Column, Screen
-from uuvtai.tree.nodes import LEAVES
-from uuvtai.tree_codes import ACTION
+from uuvtai.tree_codes import ACTION, LEAVES
 
 _NODES = (
     Column("node", left=True),

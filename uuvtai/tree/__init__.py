@@ -9,8 +9,8 @@ from __future__ import annotations
 from uuvtai.tree.elements import TreeError
 from uuvtai.tree.flat import FlatTree, load_tree
 from uuvtai.tree.flatten import parse_tree, read_tree, read_tree_file
-from uuvtai.tree.nodes import CONTROLS, DECORATORS, LEAVES, Leaf
 from uuvtai.tree.show import NodeUse, node_use, tree_dot, tree_text
+from uuvtai.tree_codes import CONTROLS, DECORATORS, LEAVES, Leaf
 
 __all__ = [
     "CONTROLS",

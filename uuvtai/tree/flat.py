@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uuvtai.tree.elements import TreeError
-from uuvtai.tree.nodes import MAX_PORTS
+from uuvtai.tree_codes import MAX_PORTS
 
 if TYPE_CHECKING:  # a tree is read and printed without Taichi and torch
     from uuvtai.capture import Put

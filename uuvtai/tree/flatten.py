@@ -15,7 +15,7 @@ from uuvtai.files import FileError, read_bytes
 from uuvtai.loader import preset_path
 from uuvtai.tree.elements import MAX_BYTES, Element, TreeError, read_elements
 from uuvtai.tree.flat import UNSET, FlatTree
-from uuvtai.tree.nodes import CONTROLS, DECORATORS, LEAVES, MAX_PORTS, Leaf
+from uuvtai.tree_codes import CONTROLS, DECORATORS, LEAVES, MAX_PORTS, Leaf
 
 _WRAPPERS = ("Action", "Condition", "Control", "Decorator")
 

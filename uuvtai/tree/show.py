@@ -9,7 +9,7 @@ import numpy as np
 
 from uuvtai import tree_codes as codes
 from uuvtai.tree.flat import UNSET, FlatTree
-from uuvtai.tree.nodes import LEAVES
+from uuvtai.tree_codes import LEAVES
 
 _SYMBOLS = {
     "Sequence": "->",
