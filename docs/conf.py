@@ -15,6 +15,9 @@ release = __version__
 extensions = ["myst_parser", "sphinx.ext.autodoc"]
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
+autodoc_preserve_defaults = True
+python_maximum_signature_line_length = 80
+"""longer signatures have a line per parameter"""
 myst_heading_anchors = 3
 """links to headings are checked too"""
 exclude_patterns = ["writers", "static"]

@@ -1,6 +1,8 @@
 """The documentation: the site builds without a warning, no page is missing, what readers are told to type
 works, the tutorial runs."""
 
+import ast
+import importlib
 import itertools
 import re
 import shlex
@@ -11,10 +13,16 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
+from PIL import Image
 
 from docs.writers import commands, configuration, stages, topics
+from docs.writers.figure_words import GENERATED
+from docs.writers.markdown import FENCE, shell_blocks
+from docs.writers.pictures import PAGE, PICTURES, renewed
+from tests.browser import brightness, look
 from uuvtai.cli import main
 from uuvtai.config.learning import LearningConfig
+from uuvtai.env import VectorEnv
 
 ROOT = Path(__file__).parents[1]
 PROSE = sorted(
@@ -27,7 +35,6 @@ PROSE = sorted(
 )
 NOTEBOOK = ROOT / "examples/tutorial.ipynb"
 
-FENCE = re.compile(r"^(<!-- (?P<mark>run) -->\n)?```(?P<language>\w*)\n(?P<body>.*?)^```", re.M | re.S)
 SPAN = re.compile(r"`(uuv [^`]+)`")
 PATH = re.compile(r"`((?:docs|examples|tests|uuvtai|benchmarks)/[\w./-]+\.\w+)`")
 ADDRESS = re.compile(r"https?://[^\s<>)\]`\"']+")
@@ -39,32 +46,62 @@ NUMBERS = {"N", "K", "S"}
 # ------------------------------------------------------------------------------------------------------- site
 
 
-def test_the_site_builds_without_a_warning_and_lacks_no_page(tmp_path):
-    """Broken internal links and anchors are warnings of Sphinx, and warnings are errors here."""
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """The site's folder. Broken internal links and anchors are warnings of Sphinx, and warnings are errors
+    here."""
     pytest.importorskip("myst_parser", reason="the extra docs is not installed")
-    shutil.copytree(
-        ROOT / "docs", tmp_path / "docs", ignore=shutil.ignore_patterns("reference", "__pycache__")
-    )
+    folder = tmp_path_factory.mktemp("site")
+    shutil.copytree(ROOT / "docs", folder / "docs", ignore=shutil.ignore_patterns("reference", "__pycache__"))
     done = subprocess.run(
         [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "docs", "site"],
-        cwd=tmp_path, capture_output=True, text=True, check=False,
+        cwd=folder, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    built = {
-        str(page.relative_to(tmp_path / "site").with_suffix(""))
-        for page in (tmp_path / "site").rglob("*.html")
-    }
+    return folder / "site"
+
+
+def test_the_site_builds_without_a_warning_and_lacks_no_page(site):
+    built = {str(page.relative_to(site).with_suffix("")) for page in site.rglob("*.html")}
     assert {f"reference/commands/{name}" for name in commands.app().commands} <= built
     assert {f"reference/configuration/{name}" for name in LearningConfig.model_fields} <= built
     assert {path.stem for path in (ROOT / "docs").glob("*.md")} <= built
-    of_eval = (tmp_path / "site/reference/commands/eval.html").read_text()
+    of_eval = (site / "reference/commands/eval.html").read_text()
     assert "[default: runs/TIME_PRESET]" in of_eval and "With --explain:" in of_eval, (
         "help texts are shown as they are"
     )
-    assert (
-        "overflow-x: auto" in (tmp_path / "site/_static/custom.css").read_text() and "custom.css" in of_eval
-    )
-    assert 'id="uuvtai.make"' in (tmp_path / "site/python.html").read_text()
+    assert "overflow-x: auto" in (site / "_static/custom.css").read_text() and "custom.css" in of_eval
+    assert "search" in built and "gauntlet" in (site / "searchindex.js").read_text()
+
+
+def test_the_page_of_the_python_api_has_what_programs_use(site):
+    page = (site / "python.html").read_text()
+    for name in (
+        "uuvtai.make",
+        "uuvtai.env.VectorEnv.step",
+        "uuvtai.gym.UuvVectorEnv.step",
+        "uuvtai.gym.UuvEnv.step",
+        "uuvtai.learn.pilot.Pilot.act",
+        "uuvtai.deploy.run_policy.Policy.act",
+        "uuvtai.logs.reader.read_messages",
+    ):
+        described = page.partition(f'id="{name}"')[2].partition("</dl>")[0]
+        assert "<p>" in described, f"{name} has no text"
+
+
+def test_the_site_is_whole_and_quiet_on_every_screen(site):
+    pages = [site / f"{name}.html" for name in ("index", "gallery", "python", "reference/commands/eval")]
+    seen = look(*pages)
+    for view, found in seen.items():
+        shown = found["closed"]
+        assert shown["scrollWidth"] <= shown["innerWidth"], f"{view} overflows"
+        assert found["errors"] == [] and shown["deadLinks"] == 0, view
+        assert all(request.startswith(site.as_uri()) for request in found["requests"]), view
+    gallery = str(pages[1])
+    assert seen[gallery, 390, "light"]["open"]["images"] == len(list((ROOT / PICTURES).iterdir()))
+    light, dark = (seen[gallery, 390, scheme]["closed"] for scheme in ("light", "dark"))
+    assert brightness(light["background"]) > 700 and brightness(dark["background"]) < 100
+    assert brightness(light["ink"]) < 100 and brightness(dark["ink"]) > 500
 
 
 def test_generated_pages_are_not_committed():
@@ -138,16 +175,6 @@ def test_a_topic_without_its_rate_is_refused(monkeypatch):
 # ------------------------------------------------------------------------------------------------------ lines
 
 
-def blocks(text):
-    """(mark, lines) of every shell block; comments and continued lines as the shell sees them."""
-    for fence in FENCE.finditer(text):
-        if fence["language"] == "sh":
-            yield (
-                fence["mark"],
-                [line for line in fence["body"].replace("\\\n", " ").splitlines() if line.strip()],
-            )
-
-
 def variants(usage):
     """Lines that a line of usage stands for: 'log info|export FILE [--out X]' is two."""
     words = [word.strip("[]") for word in usage.replace("\\|", "|").replace("...", "").split()]
@@ -183,7 +210,7 @@ def fault(words, whole=True):
 @pytest.mark.parametrize("path", PROSE, ids=lambda path: path.stem)
 def test_every_command_line_can_be_parsed(path):
     text = path.read_text()
-    for _mark, lines in blocks(text):
+    for _mark, lines in shell_blocks(text):
         for line in lines:
             first, *words = shlex.split(line, comments=True) or [""]
             assert first != "uuv" or not fault(words), f"{path.name}: {line}: {fault(words)}"
@@ -196,7 +223,7 @@ def test_the_command_lines_are_found_and_a_wrong_one_is_seen():
     lines = [
         line
         for path in PROSE
-        for _mark, found in blocks(path.read_text())
+        for _mark, found in shell_blocks(path.read_text())
         for line in found
         if line.startswith("uuv ")
     ]
@@ -211,7 +238,7 @@ def test_the_command_lines_are_found_and_a_wrong_one_is_seen():
     ]
 
 
-MARKED = [line for path in PROSE for mark, lines in blocks(path.read_text()) if mark for line in lines]
+MARKED = [line for path in PROSE for mark, lines in shell_blocks(path.read_text()) if mark for line in lines]
 """lines of blocks below ``<!-- run -->``"""
 
 
@@ -227,6 +254,56 @@ def test_marked_lines_run(line, tmp_path, monkeypatch, capfd):
     out, err = capfd.readouterr()
     assert left.value.code == 0, err
     assert out
+
+
+# ---------------------------------------------------------------------------------------------------- gallery
+
+
+GALLERY = (ROOT / PAGE).read_text()
+
+
+def test_every_picture_of_the_gallery_has_its_command_and_is_small():
+    lines = [shlex.split(line) for _mark, lines in shell_blocks(GALLERY) for line in lines]
+    made = [words[words.index("--out") + 1] for words in lines if "--out" in words]
+    there = {path.relative_to(ROOT).as_posix(): path.stat().st_size for path in (ROOT / PICTURES).iterdir()}
+    assert sorted(made) == sorted(there)
+    assert {f"docs/{target}" for target in LINK.findall(GALLERY)} >= set(there), "all are shown"
+    assert max(there.values()) <= 1e6 and sum(there.values()) <= 3e6
+    evals = [words for words in lines if words[1] == "eval"]
+    assert len(evals) > 3 and all(words[words.index("--seeds") + 1] == "77" for words in evals)
+
+
+def test_the_gifs_are_those_of_their_commands():
+    for _mark, lines in shell_blocks(GALLERY):
+        for words in (shlex.split(line) for line in lines if line.startswith("uuv log video ")):
+            chosen = dict(zip(words[4::2], words[5::2], strict=True))
+            with Image.open(ROOT / chosen["--out"]) as gif:
+                assert gif.width == int(chosen["--width"]) and gif.n_frames > 10
+                assert gif.info["duration"] == pytest.approx(1000 / int(chosen["--fps"]), abs=10)
+
+
+def test_commands_are_run_and_what_they_print_is_put_into_the_page(tmp_path):
+    """The text from ``uuv tree`` alone: the rest plays for minutes."""
+    page = "```sh\nuuv tree \\\n  --controller planner\n```\n\n<!-- printed -->\n```text\nold\n```\nend\n"
+    text = renewed(page, tmp_path)
+    assert "FollowRoute" in text and "old" not in text and text.startswith(page[:30])
+    assert text.endswith("```\nend\n") and renewed(text, tmp_path) == text
+
+
+# ------------------------------------------------------------------------------------------------------ width
+
+ONE_PIECE = re.compile(r"\s*[(]?(`[^`]*`|\[[^\]]*\]\(\S*\))\W?")
+"""a line that cannot be broken: one command, one link"""
+
+
+@pytest.mark.parametrize("path", PROSE, ids=lambda path: path.stem)
+def test_no_line_is_longer_than_140_characters(path):
+    """Rows of tables cannot be wrapped, and marks of figures are not seen."""
+    if f"docs/{path.name}" in GENERATED:
+        return
+    shown = re.sub(r"(`[^`\n]*`)|<!--.*?-->", lambda found: found[1] or "", path.read_text())
+    long = [line for line in shown.splitlines() if len(line) > 140 and not line.startswith(("|", "!["))]
+    assert [line for line in long if not ONE_PIECE.fullmatch(line)] == []
 
 
 # ------------------------------------------------------------------------------------------------------ links
@@ -251,6 +328,45 @@ def test_external_addresses_are_well_formed(path):
         assert parts.scheme in ("http", "https") and re.fullmatch(
             r"[\w-]+(\.[\w-]+)+(:\d+)?", parts.netloc
         ), f"{path.name}: {address}"
+
+
+# ----------------------------------------------------------------------------------------------------- Python
+
+
+def snippets():
+    """(page, code) of every Python block."""
+    for path in PROSE:
+        for fence in FENCE.finditer(path.read_text()):
+            if fence["language"] == "python":
+                yield path.name, fence["body"]
+
+
+@pytest.mark.parametrize(("page", "code"), snippets())
+def test_what_a_snippet_imports_of_ours_is_there(page, code):
+    for node in ast.walk(ast.parse(code, page)):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("uuvtai"):
+            found = importlib.import_module(str(node.module))
+            missing = [name.name for name in node.names if not hasattr(found, name.name)]
+            assert missing == [], f"{page}: {node.module} has no {missing}"
+
+
+def test_the_tables_of_the_python_page_are_those_of_the_environment(small):
+    """Every tensor with its shape and type; N, M, K as the page names them."""
+    small.sim.use_tree(small.trees["bt"])
+    with VectorEnv(small.sim) as env:
+        obs, info = env.reset()
+        action = info["teacher_action"]
+        obs, reward, terminated, truncated, info = env.step(action)
+        sizes = {"N": env.num_envs, "M": env.num_obs, "K": len(env.reward_terms), "4": env.num_actions}
+    named = {"action": action, "obs": obs, "reward": reward, "terminated": terminated, "truncated": truncated}
+    wanted = named | {f'info["{name}"]': value for name, value in info.items()}
+    rows = re.findall(
+        r"^\| `([^`]+)` \| \(([^)]*)\) \| (\w+) \|", (ROOT / "docs/python.md").read_text(), re.M
+    )
+    told = {name: (tuple(sizes[n] for n in re.findall(r"\w+", shape)), kind) for name, shape, kind in rows}
+    assert told == {
+        name: (tuple(value.shape), str(value.dtype).removeprefix("torch.")) for name, value in wanted.items()
+    }
 
 
 # --------------------------------------------------------------------------------------------------- notebook

@@ -1,24 +1,15 @@
 """The report in a real browser, opened from disk: nothing overflows, nothing fails, nothing is asked of the
 network, light and dark."""
 
-import json
-import os
-import platform
-import shutil
-import subprocess
-import tempfile
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
 
 from tests import report_samples as samples
+from tests.browser import VIEWS, brightness, look
 from uuvtai.logs.film import write_film
 from uuvtai.measure.evaluate.paired import paired
 from uuvtai.report.build import report
-
-JS = Path(__file__).parent / "js"
 
 BAD = """<!DOCTYPE html><title>bad</title><div id="a" style="width: 3000px">wide</div><p id="a"></p>
 <img src="http://uuvtai.invalid/picture.png"><script>throw new Error("broken")</script>"""
@@ -68,29 +59,9 @@ def page(tmp_path_factory):
 @pytest.fixture(scope="module")
 def seen(page, tmp_path_factory):
     """What the browser met in the page and in one that is wrong in every way, by (is good, width, scheme)."""
-    node = shutil.which("node")
-    if node is None or not (JS / "node_modules/@sparticuz").is_dir():
-        pytest.skip("needs node and `npm ci` in tests/js (bootstrap.py does it)")
-    if (platform.system(), platform.machine()) != ("Linux", "x86_64") and "CHROME_PATH" not in os.environ:
-        pytest.skip("the packed Chromium is for Linux on x86_64: set CHROME_PATH to another one")
     bad = tmp_path_factory.mktemp("bad") / "bad.html"
     bad.write_text(BAD)
-    with tempfile.TemporaryDirectory() as unpacked:
-        command = [node, "look.mjs", str(page), str(bad)]
-        environment = {**os.environ, "TMPDIR": unpacked}
-        done = subprocess.run(
-            command, cwd=JS, env=environment, capture_output=True, text=True, check=False, timeout=120
-        )
-    if done.returncode == 3:
-        pytest.skip(f"Chromium does not start here: {done.stderr.strip().splitlines()[0]}")
-    assert done.returncode == 0, done.stderr
-    return {
-        (one["page"] == str(page), one["width"], one["scheme"]): one
-        for one in json.loads(done.stdout)["seen"]
-    }
-
-
-VIEWS = [(width, scheme) for width in (1400, 390) for scheme in ("light", "dark")]
+    return {(name == str(page), *view): one for (name, *view), one in look(page, bad).items()}
 
 
 @pytest.mark.parametrize(("width", "scheme"), VIEWS)
@@ -114,8 +85,8 @@ def test_a_report_is_whole_and_quiet_in_every_view(seen, width, scheme):
 
 def test_figures_follow_light_and_dark(seen):
     light, dark = (seen[True, 390, scheme]["open"] for scheme in ("light", "dark"))
-    assert sum(channels(light["background"])) > 700 > 100 > sum(channels(dark["background"]))
-    assert sum(channels(light["ink"])) < 200 < 600 < sum(channels(dark["ink"]))
+    assert brightness(light["background"]) > 700 > 100 > brightness(dark["background"])
+    assert brightness(light["ink"]) < 200 < 600 < brightness(dark["ink"])
     assert light["inkedTexts"] == dark["inkedTexts"] > 100, (
         "text of the figures has the page's colour in both"
     )
@@ -123,12 +94,8 @@ def test_figures_follow_light_and_dark(seen):
 
 def test_a_dark_screen_prints_black_on_white(seen):
     printed = seen[True, 1400, "dark"]["printed"]
-    assert sum(channels(printed["background"])) > 700 and sum(channels(printed["ink"])) < 200
+    assert brightness(printed["background"]) > 700 and brightness(printed["ink"]) < 200
     assert printed["scrollWidth"] <= 1400
-
-
-def channels(colour):
-    return [int(part) for part in colour.removeprefix("rgb(").removesuffix(")").split(",")]
 
 
 def test_the_check_finds_fault_with_a_bad_page(seen):

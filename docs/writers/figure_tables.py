@@ -37,14 +37,15 @@ def measured(sources: Sources) -> str:
     seen = (
         "was looked at while tuning (figures of a seed that was not will replace these)"
         if shown["seed"] in RETIRED_SEEDS
-        else "was never tuned on and looked at once, for these figures"
+        else "was never used for tuning and looked at once, for these figures"
     )
     kept = f" {shown['note']}" if "note" in shown else ""
     return (
-        f"Measured here, {shown['episodes']} episodes a row of seed {shown['seed']}, paper sensing, S = 8. "
-        f"This seed {seen}. "
-        "`python -m docs.writers.evaluations` plays all rows; commands and counts: `docs/data/`. `-` = not "
-        f"played or not kept.{kept}"
+        f"Measured here: {shown['episodes']} episodes of seed {shown['seed']} in each row, paper sensing, "
+        f"S = 8.\nThis seed {seen}. "
+        "Success, collision and endings are\nthose of `bt`, in the last row of `paper`. `-` = not played or "
+        f"not kept.{kept}\n"
+        "`python -m docs.writers.evaluations` plays all rows; commands and counts: `docs/data/`."
     )
 
 
@@ -57,7 +58,7 @@ def evaluations(sources: Sources) -> str:
         "contact / TTC stop / out / timeout",
         "`planner`",
         "`straight`",
-        "what ended most of the rest",
+        "most frequent causes of failure",
     ]
     return table(head, [_evaluated(entry) for entry in sources.evaluations()["rows"]])
 

@@ -29,7 +29,9 @@ GENERATED = {"docs/results.md": "python -m docs.writers.reproduction"}
 PARAMETER_PAGES = (
     "docs/deployment.md",
     "docs/determinism.md",
+    "docs/gallery.md",
     "docs/paper.md",
+    "docs/python.md",
     "docs/security.md",
     "docs/simulator.md",
     "docs/viewers.md",

@@ -1,0 +1,38 @@
+"""Pages from disk in headless Chromium, at two widths, light and dark (``js/look.mjs``)."""
+
+import json
+import os
+import platform
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+import pytest
+
+JS = Path(__file__).parent / "js"
+VIEWS = [(width, scheme) for width in (1400, 390) for scheme in ("light", "dark")]
+
+
+def look(*pages):
+    """What the browser met, by (page, width, scheme). Skips where there is no browser."""
+    node = shutil.which("node")
+    if node is None or not (JS / "node_modules/@sparticuz").is_dir():
+        pytest.skip("needs node and `npm ci` in tests/js (bootstrap.py does it)")
+    if (platform.system(), platform.machine()) != ("Linux", "x86_64") and "CHROME_PATH" not in os.environ:
+        pytest.skip("the packed Chromium is for Linux on x86_64: set CHROME_PATH to another one")
+    with tempfile.TemporaryDirectory() as unpacked:
+        command = [node, "look.mjs", *map(str, pages)]
+        environment = {**os.environ, "TMPDIR": unpacked}
+        done = subprocess.run(
+            command, cwd=JS, env=environment, capture_output=True, text=True, check=False, timeout=120
+        )
+    if done.returncode == 3:
+        pytest.skip(f"Chromium does not start here: {done.stderr.strip().splitlines()[0]}")
+    assert done.returncode == 0, done.stderr
+    return {(one["page"], one["width"], one["scheme"]): one for one in json.loads(done.stdout)["seen"]}
+
+
+def brightness(colour):
+    """Sum of the channels of a CSS colour, 0 (black) to 765 (white)."""
+    return sum(int(part) for part in colour.removeprefix("rgb(").removesuffix(")").split(","))
