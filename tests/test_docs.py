@@ -85,7 +85,7 @@ def test_the_page_of_the_python_api_has_what_programs_use(site):
         "uuvtai.deploy.run_policy.Policy.act",
         "uuvtai.logs.reader.read_messages",
     ):
-        described = page.partition(f'id="{name}"')[2].partition("</dl>")[0]
+        described = page.partition(f'id="{name}"')[2].partition('id="uuvtai.')[0]
         assert "<p>" in described, f"{name} has no text"
 
 
@@ -284,9 +284,9 @@ def test_the_gifs_are_those_of_their_commands():
 
 def test_commands_are_run_and_what_they_print_is_put_into_the_page(tmp_path):
     """The text from ``uuv tree`` alone: the rest plays for minutes."""
-    page = "```sh\nuuv tree \\\n  --controller planner\n```\n\n<!-- printed -->\n```text\nold\n```\nend\n"
+    page = "```sh\nuuv tree \\\n  --controller planner\n```\n\n<!-- printed -->\n```text\nSTALE\n```\nend\n"
     text = renewed(page, tmp_path)
-    assert "FollowRoute" in text and "old" not in text and text.startswith(page[:30])
+    assert "FollowRoute" in text and "STALE" not in text and text.startswith(page[:30])
     assert text.endswith("```\nend\n") and renewed(text, tmp_path) == text
 
 

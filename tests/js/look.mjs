@@ -60,7 +60,7 @@ function measure(tab) {
       downloads: document.querySelectorAll("a[download]").length,
       scripts: document.scripts.length,
       doubleIds: ids.filter((id, i) => ids.indexOf(id) !== i),
-      deadLinks: [...document.querySelectorAll('a[href^="#"]:not([href="#"])')].filter((one) => !document.querySelector(one.getAttribute("href"))).length,
+      deadLinks: [...document.querySelectorAll('a[href^="#"]:not([href="#"])')].filter((one) => !document.getElementById(decodeURIComponent(one.hash.slice(1)))).length,
     };
   });
 }
