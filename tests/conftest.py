@@ -50,6 +50,12 @@ def configure(monkeypatch, sim, config):
     monkeypatch.setattr(sim, "io", Stages(**(new | same)))
 
 
+def near_horizon(env, rows, steps_left):
+    """Put the clocks of these rows of a VectorEnv shortly before the horizon."""
+    for row in rows:
+        env.sim.s.clock.step[row] = env.config.episode.horizon_steps - steps_left
+
+
 _built = []
 
 

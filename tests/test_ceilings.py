@@ -5,20 +5,13 @@ import json
 
 import pytest
 
+from tests.command import uuv
 from tests.conftest import SmallSim
-from uuvtai.cli import main
 from uuvtai.measure.episodes.methods import trees_of
 from uuvtai.measure.episodes.playing import Job, jobs_of
 from uuvtai.measure.evaluate.ceilings import condition_of, remainder_of, scenarios_of
 
 SEED = 3
-
-
-def uuv(capfd, *arguments):
-    with pytest.raises(SystemExit) as left:
-        main(list(arguments))
-    out, err = capfd.readouterr()
-    return left.value.code, out, err
 
 
 @pytest.fixture

@@ -18,18 +18,10 @@ from mcap.reader import make_reader
 from taichi.lang.impl import default_cfg
 
 import uuvtai
+from tests.command import uuv
 from tests.conftest import SmallSim
 from uuvtai import cli, doctor, endings, loader
-from uuvtai.cli import main
 from uuvtai.errors import SettingError, SizeError
-
-
-def uuv(capfd, *arguments):
-    """(exit code, stdout, stderr) of one command in this process."""
-    with pytest.raises(SystemExit) as left:
-        main(list(arguments))
-    out, err = capfd.readouterr()
-    return left.value.code, out, err
 
 
 @pytest.mark.parametrize(

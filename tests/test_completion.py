@@ -10,8 +10,8 @@ import sys
 import pytest
 
 from docs.writers import commands
+from tests.command import uuv
 from tests.test_docs import fault
-from uuvtai.cli import main
 from uuvtai.shipped import KINDS, preset_names
 from uuvtai.show import choices
 
@@ -67,10 +67,8 @@ def test_every_help_has_an_example_that_can_be_parsed(words):
 
 @pytest.mark.parametrize("words", COMMANDS, ids=lambda words: " ".join(words) or "uuv")
 def test_h_is_help(words, capfd):
-    with pytest.raises(SystemExit) as left:
-        main([*words, "-h"])
-    out = capfd.readouterr().out
-    assert left.value.code == 0 and "Usage: uuv" in out and "Example: uuv" in out
+    code, out, _err = uuv(capfd, *words, "-h")
+    assert code == 0 and "Usage: uuv" in out and "Example: uuv" in out
 
 
 @pytest.mark.parametrize("words", COMMANDS, ids=lambda words: " ".join(words) or "uuv")
@@ -107,10 +105,8 @@ def test_a_wrong_word_is_refused_at_once_and_the_right_one_named(
     arguments, says, capfd, tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as left:
-        main(arguments)
-    out, err = capfd.readouterr()
-    assert left.value.code == 2 and says in err
+    code, out, err = uuv(capfd, *arguments)
+    assert code == 2 and says in err
     assert out == "" and "starting" not in err and not list(tmp_path.iterdir())
 
 

@@ -10,8 +10,8 @@ import pytest
 from google.protobuf import json_format
 from mcap.reader import make_reader
 
+from tests.command import run_cli
 from tests.reference import logs as episode
-from uuvtai import cli
 from uuvtai.config import Config
 from uuvtai.logs import convert as module
 from uuvtai.logs.container import McapFile
@@ -180,12 +180,6 @@ def test_rerun_draws_poses_transforms_images_and_clouds(converted, recorded):
 
 
 # ----------------------------------------------------------------------------------------------------- errors
-
-
-def run_cli(*arguments):
-    with pytest.raises(SystemExit) as left:
-        cli.main([str(argument) for argument in arguments])
-    return left.value.code
 
 
 def test_the_command(recorded, tmp_path, capfd):

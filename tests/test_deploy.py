@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from uuvtai import cli
+from tests.command import run_cli
 from uuvtai.deploy import export as deploy
 from uuvtai.deploy import run_policy
 from uuvtai.deploy.agreement import of_torch
@@ -399,12 +399,6 @@ def test_evaluations_of_something_else_are_refused(tmp_path):
 
 
 # ---------------------------------------------------------------------------------------------------- command
-
-
-def run_cli(*arguments):
-    with pytest.raises(SystemExit) as left:
-        cli.main([str(argument) for argument in arguments])
-    return left.value.code
 
 
 @pytest.fixture(scope="module")

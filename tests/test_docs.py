@@ -20,7 +20,7 @@ from docs.writers.figure_words import GENERATED
 from docs.writers.markdown import FENCE, shell_blocks
 from docs.writers.pictures import PAGE, PICTURES, renewed
 from tests.browser import brightness, look
-from uuvtai.cli import main
+from tests.command import uuv
 from uuvtai.config.learning import LearningConfig
 from uuvtai.env import VectorEnv
 
@@ -249,10 +249,8 @@ def test_lines_are_marked():
 @pytest.mark.parametrize("line", MARKED)
 def test_marked_lines_run(line, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as left:
-        main(shlex.split(line, comments=True)[1:])
-    out, err = capfd.readouterr()
-    assert left.value.code == 0, err
+    code, out, err = uuv(capfd, *shlex.split(line, comments=True)[1:])
+    assert code == 0, err
     assert out
 
 

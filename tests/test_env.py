@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import uuvtai
-from tests.conftest import configure
+from tests.conftest import configure, near_horizon
 from uuvtai.env import VectorEnv, observation_sha256
 from uuvtai.loader import ConfigError
 from uuvtai.outcomes import OUTCOMES
@@ -36,12 +36,6 @@ def full(action):
 
 def column(env, obs, name):
     return obs[:, next(c.slice for c in env.observation_table if c.name == name)]
-
-
-def near_horizon(env, rows, steps_left):
-    """Put the clocks of these rows shortly before the horizon."""
-    for row in rows:
-        env.sim.s.clock.step[row] = env.config.episode.horizon_steps - steps_left
 
 
 def test_reset_begins_the_episodes_of_the_seed(env):

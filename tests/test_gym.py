@@ -13,6 +13,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
+from tests.conftest import near_horizon
 from uuvtai.env import VectorEnv
 from uuvtai.gym import ENV_ID, UuvEnv, UuvVectorEnv, single, vector
 from uuvtai.gym.spaces import bounds, observation_space
@@ -57,11 +58,6 @@ def registered(small, monkeypatch):
     return asked
 
 
-def near_horizon(envs, rows, steps_left):
-    for row in rows:
-        envs.native.sim.s.clock.step[row] = envs.native.config.episode.horizon_steps - steps_left
-
-
 def random_actions(steps, seed=0):
     return np.random.default_rng(seed).uniform(-1, 1, (steps, N, 4)).astype(np.float32)
 
@@ -96,7 +92,7 @@ def test_torchrl_checks_specs_and_keeps_the_last_observations(small, make, mode)
         return
     wrapped.set_seed(0)
     first = wrapped.reset()
-    near_horizon(env, [2], steps_left=3)
+    near_horizon(env.native, [2], steps_left=3)
     rollout = wrapped.rollout(6, break_when_any_done=False, auto_reset=False, tensordict=first)
     assert rollout["next", "truncated"][2].flatten().tolist() == [False, False, True, False, False, False]
     goal = env.native.columns["goal"]
@@ -160,7 +156,7 @@ def test_the_docs_list_the_columns(small):
 def test_same_step_tells_the_end_beside_the_next_beginning(make):
     envs = make()
     envs.reset(seed=SEED)
-    near_horizon(envs, [2, 5], steps_left=2)
+    near_horizon(envs.native, [2, 5], steps_left=2)
     *_rest, info = envs.step(FORWARD)
     assert not any(key.lstrip("_").startswith("final") for key in info), "told only where an episode ends"
     _obs, reward, _terminated, truncated, info = envs.step(FORWARD)
@@ -189,7 +185,7 @@ def test_same_step_tells_the_end_beside_the_next_beginning(make):
 def test_next_step_ignores_the_action_after_an_end(make):
     envs = make(autoreset_mode="NextStep")
     first, _info = envs.reset(seed=SEED)
-    near_horizon(envs, [2], steps_left=1)
+    near_horizon(envs.native, [2], steps_left=1)
     obs, _reward, terminated, truncated, info = envs.step(FORWARD)
     assert truncated[2] and envs.native.outcomes[info["outcome"][2]] == "timeout" and "final_obs" not in info
     goal = envs.native.columns["goal"]
@@ -209,7 +205,7 @@ def test_next_step_ignores_the_action_after_an_end(make):
 def test_disabled_leaves_resets_to_the_user(make):
     envs = make(autoreset_mode=AutoresetMode.DISABLED)
     before, _info = envs.reset(seed=SEED)
-    near_horizon(envs, [2], steps_left=1)
+    near_horizon(envs.native, [2], steps_left=1)
     before, _reward, _terminated, truncated, _info = envs.step(FORWARD)
     with pytest.raises(RuntimeError, match=r"after the end of env 2: call reset\(options="):
         envs.step(FORWARD)
@@ -263,7 +259,7 @@ def test_gymnasiums_statistics_agree_with_ours(make, mode):
     envs = RecordEpisodeStatistics(make(autoreset_mode=mode))
     envs.reset(seed=SEED)
     steps = np.zeros(N, int)
-    near_horizon(envs.unwrapped, [1, 6], steps_left=12)
+    near_horizon(envs.unwrapped.native, [1, 6], steps_left=12)
     found = []
     for _ in range(13):
         _obs, _reward, terminated, truncated, info = envs.step(FORWARD)
@@ -315,7 +311,7 @@ def test_envs_do_not_influence_each_other(make):
 
     def play(actions):
         envs.reset(seed=SEED)
-        near_horizon(envs, [5], steps_left=20)
+        near_horizon(envs.native, [5], steps_left=20)
         return np.stack([np.column_stack(envs.step(action)[:4]) for action in actions])
 
     plain, changed = play(actions), actions.copy()
@@ -335,7 +331,7 @@ def test_results_are_memory_of_their_own(make, backend):
         return [*result[:-1], *result[-1].values(), *final.values()]
 
     results = [envs.reset(seed=SEED)]
-    near_horizon(envs, [0], steps_left=2)
+    near_horizon(envs.native, [0], steps_left=2)
     for action in random_actions(4):
         results.append(envs.step(torch.from_numpy(action) if backend == "torch" else action))
         plain.append(
@@ -385,7 +381,7 @@ def test_a_held_action_is_so_many_steps_in_one(make):
         np.testing.assert_array_equal(newest, obs[turn])
         np.testing.assert_allclose(reward, rewards[turn], atol=RETURN_ROUNDING)
     assert (info["episode_steps"] == 20).all()
-    near_horizon(held, [6], steps_left=2)
+    near_horizon(held.native, [6], steps_left=2)
     _obs, reward, _terminated, truncated, info = held.step(actions[0])
     assert (
         truncated[6]
@@ -447,7 +443,7 @@ def test_the_single_env_plays_the_first_row(small):
     actions = random_actions(20)
     obs, info = env.reset(seed=SEED)
     told = [(obs, 0.0)]
-    near_horizon(env, [0], steps_left=20)
+    near_horizon(env.native, [0], steps_left=20)
     for action in actions[:, 0]:
         obs, reward, terminated, truncated, info = env.step(action)
         told.append((obs, reward))
@@ -463,7 +459,7 @@ def test_the_single_env_plays_the_first_row(small):
     assert env.reset()[1]["episode_number"] == N
     obs, _info = batch.reset()
     np.testing.assert_array_equal(told[0][0], obs[0])
-    near_horizon(env, [0], steps_left=20)
+    near_horizon(env.native, [0], steps_left=20)
     for (wanted, wanted_reward), action in zip(told[1:], actions, strict=True):
         _obs, reward, *_rest, info = batch.step(torch.from_numpy(action))
         np.testing.assert_array_equal(info["final_obs"][0], wanted)

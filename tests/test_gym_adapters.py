@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.conftest import near_horizon
 from uuvtai.gym import UuvVectorEnv
 
 sb3 = pytest.importorskip("stable_baselines3", reason="stable_baselines3 is not installed")
@@ -24,11 +25,6 @@ def batch(small):
     return lambda **options: UuvVectorEnv(sim=small.sim, **options)
 
 
-def near_horizon(envs, rows, steps_left):
-    for row in rows:
-        envs.native.sim.s.clock.step[row] = envs.native.config.episode.horizon_steps - steps_left
-
-
 def test_sb3_gets_last_observations_and_statistics(batch):
     envs = batch(hold_steps=2)
     adapter = Sb3VecEnv(envs)
@@ -37,7 +33,7 @@ def test_sb3_gets_last_observations_and_statistics(batch):
     np.testing.assert_array_equal(first, batch().reset(seed=SEED)[0])
     adapter.seed(SEED)
     adapter.reset()
-    near_horizon(envs, [5], steps_left=4)
+    near_horizon(envs.native, [5], steps_left=4)
     assert adapter.step(np.zeros((N, 4), np.float32))[3] == [{}] * N
     obs, reward, ended, infos = adapter.step(np.zeros((N, 4), np.float32))
     assert ended.tolist() == [i == 5 for i in range(N)] and reward.shape == (N,)
@@ -69,7 +65,7 @@ def test_rsl_rl_gets_time_outs_apart(batch):
     assert adapter.max_episode_length == envs.native.config.episode.horizon_steps // 2
     before = adapter.get_observations()["policy"]
     kept = before.clone()
-    near_horizon(envs, [5], steps_left=4)
+    near_horizon(envs.native, [5], steps_left=4)
     _obs, _reward, ended, extras = adapter.step(torch.zeros(N, 4))
     assert not ended.any() and extras["log"] == {} and torch.equal(before, kept)
     obs, reward, ended, extras = adapter.step(torch.zeros(N, 4))

@@ -15,8 +15,8 @@ import pytest
 import zstandard
 
 from tests import test_deploy as deployed
+from tests.command import run_cli
 from tests.reference import logs as episode
-from uuvtai import cli
 from uuvtai.deploy import graph_check, run_policy
 from uuvtai.deploy.agreement import of_onnx
 from uuvtai.deploy.graph_check import GraphError, refuse_strange
@@ -48,12 +48,6 @@ def log_path(tmp_path_factory):
             log.write(snap)
         log.close(episode.result(N_STEP))
     return path
-
-
-def run_cli(*arguments):
-    with pytest.raises(SystemExit) as left:
-        cli.main([str(argument) for argument in arguments])
-    return left.value.code
 
 
 def bounded(work, tmp_path):

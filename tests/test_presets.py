@@ -5,17 +5,9 @@ import json
 import pytest
 import yaml
 
-from uuvtai.cli import main
+from tests.command import uuv
 from uuvtai.shipped import KINDS, preset_names, shipped_file
 from uuvtai.show.presets import near, sentences
-
-
-def uuv(capfd, *arguments):
-    """(exit code, stdout, stderr) of one command in this process."""
-    with pytest.raises(SystemExit) as left:
-        main(list(arguments))
-    out, err = capfd.readouterr()
-    return left.value.code, out, err
 
 
 def test_the_list_has_every_preset_with_its_sentence(capfd):

@@ -23,8 +23,8 @@ import zstandard
 
 from tests import report_samples as samples
 from tests import test_deploy as deployed
+from tests.command import run_cli
 from tests.reference import logs as episode
-from uuvtai import cli
 from uuvtai.deploy import run_policy
 from uuvtai.deploy.agreement import of_onnx
 from uuvtai.errors import UserError
@@ -68,12 +68,6 @@ class Quiet:
 
     def __getattr__(self, _name):
         return lambda *_arguments: None
-
-
-def run_cli(*arguments):
-    with pytest.raises(SystemExit) as left:
-        cli.main([str(argument) for argument in arguments])
-    return left.value.code
 
 
 class Exploit:
