@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from uuvtai.loader import load_config
-from uuvtai.measure.simulate import simulate
+from uuvtai.measure.simulate import Trial, simulate
 from uuvtai.runtime import Runtime
 
 VEHICLES = ("bluerov2", str(Path(__file__).with_name("heavy_pack.yaml")))
@@ -18,14 +18,9 @@ TIMES_S = (0.2, 0.5, 1.0, 2.0, 4.0)
 
 def surge_m_s(vehicle: str, runtime: Runtime | None) -> list[float]:
     """Forward speed at ``TIMES_S`` after the command of 0.6 m/s, through the inner loop and the thrusters."""
-    told = simulate(
-        load_config("open", vehicle=vehicle),
-        seconds=TIMES_S[-1],
-        command=(0.6, 0, 0, 0),
-        neutral=True,
-        runtime=runtime,
-    )
-    return [told["nu"][round(time_s / told["t"][1])][0] for time_s in TIMES_S]
+    trial = Trial(seconds=TIMES_S[-1], command=(0.6, 0, 0, 0), neutral=True)
+    found = simulate(load_config("open", vehicle=vehicle), trial, runtime)
+    return [found["nu"][round(time_s / found["t"][1])][0] for time_s in TIMES_S]
 
 
 def main(runtime: Runtime | None = None) -> str:

@@ -575,7 +575,7 @@ def played(small):
     small.sim.use_tree(small.trees["straight"])
     small.sim.set_scenes([(8, 9, 1.5)])
     results, _ = run_episodes(small.sim, jobs_of([7], 12))
-    rows = explain_failures(small.sim, small.trees["straight"], results)
+    rows = explain_failures(small.sim, results)
     yield small, results, rows
     small.sim.set_scenes()
     small.sim.use_tree(small.trees["bt"])
@@ -609,21 +609,21 @@ def test_the_killer_is_what_the_referee_saw(played):
 def test_a_replay_that_ends_differently_is_an_error(played):
     small, results, _ = played
     wrong = replace(failures(results)[0], time_s=failures(results)[0].time_s + 0.04)
+    small.sim.use_tree(small.trees["straight"])
     with pytest.raises(RuntimeError, match="instead of"):
-        explain_failures(small.sim, small.trees["straight"], [wrong])
+        explain_failures(small.sim, [wrong])
 
 
 def test_nothing_failed_means_nothing_is_replayed(small):
-    assert explain_failures(small.sim, small.trees["bt"], []) == []
+    assert explain_failures(small.sim, []) == []
 
 
 def test_the_worst_are_recorded_with_picture_and_video(played, tmp_path):
     small, _, rows = played
     shortest = min(rows, key=lambda row: row.result.time_s)
     notes = []
-    paths = record_worst(
-        small.sim, small.trees["straight"], [shortest], tmp_path, "pool", "straight", notes.append
-    )
+    small.sim.use_tree(small.trees["straight"])
+    paths = record_worst(small.sim, [shortest], tmp_path, "pool", "straight", notes.append)
     stem = (
         f"{shortest.explanation.label}_straight_seed{shortest.result.seed}_episode{shortest.result.episode}"
     )

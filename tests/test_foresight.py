@@ -15,7 +15,7 @@ from uuvtai.measure.evaluate.foresight import (
     foresight_of,
     judged,
     moments_of,
-    told,
+    risk_entry,
 )
 
 HORIZON = 20
@@ -105,7 +105,7 @@ def test_an_episode_too_short_for_a_moment_is_counted_all_the_same():
     rows.run(2)
     rows.end(0, "collision")
     assert len(rows.foresight.moments().logit) == 0
-    assert told(rows.foresight) == {}
+    assert risk_entry(rows.foresight) == {}
     rows.begin(0)
     rows.run(6)
     rows.end(0, "collision")
@@ -162,7 +162,7 @@ def test_too_few_accidents_change_nothing():
 
 def test_a_pilot_without_a_head_is_not_asked():
     assert foresight_of(SimpleNamespace(risk=None), 0.02) is None
-    assert told(None) == {}
+    assert risk_entry(None) == {}
 
 
 def test_what_was_said_does_not_depend_on_when_the_episode_began():

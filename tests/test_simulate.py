@@ -12,7 +12,7 @@ import pytest
 
 from tests.reference import dynamics as oracle
 from uuvtai.loader import load_config
-from uuvtai.measure.simulate import control_step, quaternion, roll_pitch_yaw, simulate
+from uuvtai.measure.simulate import Trial, control_step, quaternion, roll_pitch_yaw, simulate
 from uuvtai.runtime import start_taichi
 
 F32_POSITION_M = 2e-3
@@ -24,7 +24,7 @@ def raw(**overrides):
 
 
 def run(config, **kwargs):
-    return simulate(config, runtime=start_taichi("cpu"), **kwargs)
+    return simulate(config, Trial(**kwargs), start_taichi("cpu"))
 
 
 @pytest.fixture(scope="module")
@@ -83,10 +83,10 @@ def test_double_precision_process():
     single precision."""
     code = (
         "import json, sys\nfrom uuvtai.loader import load_config\nfrom uuvtai.measure.simulate import "
-        "simulate\n"
+        "Trial, simulate\n"
         "c = load_config('open', overrides={'vehicle.attitude_hold': 'none'})\n"
-        "print('RESULT' + json.dumps(simulate(c, seconds=1.0, dt=0.004, wrench=(1, 2, 3, 0, 0, "
-        "0.1))['nu'][-1]))"
+        "print('RESULT' + json.dumps(simulate(c, Trial(1.0, dt=0.004, wrench=(1, 2, 3, 0, 0, "
+        "0.1)))['nu'][-1]))"
     )
     env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env, check=False)

@@ -444,10 +444,11 @@ def simulate(
     extra = [f"vehicle.attitude_hold={attitude_hold}"] if attitude_hold else []
     config = _config("open", "clean", vehicle, None, None, None, [*(overrides or []), *extra])
 
+    from uuvtai.measure.simulate import Trial
     from uuvtai.measure.simulate import simulate as run
 
-    result = run(
-        config,
+    trial = Trial(
+        seconds,
         wrench=_numbers("--wrench", wrench, 6),
         command=_numbers("--command", command, 4),
         current=_numbers("--current", current, 3),
@@ -455,8 +456,8 @@ def simulate(
         initial_velocity=_numbers("--initial-velocity", initial_velocity, 6),
         neutral=neutral,
         dt=dt,
-        seconds=seconds,
     )
+    result = run(config, trial)
     if as_json:
         _print_json(result)
         return

@@ -20,7 +20,7 @@ import torch
 from uuvtai.capture import check_arrays, check_setting
 from uuvtai.config import Config
 from uuvtai.kernels.planning.features import placed_columns
-from uuvtai.kernels.task.reward import TERMS
+from uuvtai.kernels.task.reward import TERMS, tell_step
 from uuvtai.outcomes import OUTCOMES
 from uuvtai.sim import Sim
 
@@ -30,7 +30,7 @@ NUM_ACTIONS = 4
 _MAX_SEED = 2**31 - 1
 
 _TOLD = ("reward_terms", "episode_terms", "episode_return", "episode_steps", "outcome")
-"""What ``Sim.tell_step`` writes, in its order."""
+"""What ``tell_step`` writes, in its order."""
 
 Slice = slice
 
@@ -167,7 +167,7 @@ class VectorEnv:
         sim.observation = self._obs
         sim.step(action.detach())
         info["final_obs"].copy_(self._obs)
-        sim.tell_step(*(info[name] for name in _TOLD))
+        tell_step(sim.io.reward, *(info[name] for name in _TOLD))
         torch.ne(sim.terminated, 0, out=self._terminated)
         torch.ne(sim.truncated, 0, out=self._truncated)
         ended = self._terminated | self._truncated

@@ -7,9 +7,8 @@ all running rows in a step, only the rows being reset in a reset.
 
 from __future__ import annotations
 
-import contextlib
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 
 import numpy as np
 import taichi as ti
@@ -33,7 +32,7 @@ from uuvtai.rrt import RouteFallback
 from uuvtai.runtime import start_taichi
 from uuvtai.scenario import Scene, check_scenarios, set_scenes
 from uuvtai.sizes import array_sizes, check_size
-from uuvtai.stages import Stages
+from uuvtai.stages import Stages, timed_stage
 from uuvtai.tree import FlatTree, load_tree
 
 
@@ -68,11 +67,8 @@ class Sim:
         self.set_scenes()
         fill_constants(self.s, config, self._put)
 
-    # ------------------------------------------------------------------------------------------------- set-up
-
     def use_tree(self, tree: FlatTree) -> None:
-        """Drive by another behaviour tree from the next tick on (trees are data: nothing is compiled
-        again)."""
+        """Drive by another behaviour tree from the next tick on: nothing is compiled again."""
         self.tree = tree
         load_tree(self.s.table, tree, self._put)
 
@@ -80,16 +76,11 @@ class Sim:
         """Deal (S, D, v) out to the envs in turn, for their next scenarios; none = the world's own.
         ValueError where slots are too few."""
         world = self.config.world
-        set_scenes(
-            self.s.scene,
-            world,
-            scenes or [(world.n_static, world.n_dynamic, world.dynamic_speed_m_s)],
-            self._put,
-        )
+        own = (world.n_static, world.n_dynamic, world.dynamic_speed_m_s)
+        set_scenes(self.s.scene, world, scenes or [own], self._put)
 
     def observe(self) -> torch.Tensor:
-        """From the next pass on, write every awake row's observation into the tensor returned, (n_env, n_obs)
-        (``features.columns``)."""
+        """(n_env, n_obs), from the next pass on written for every awake row (``features.columns``)."""
         if self.observation is None:
             width = features.observation_width(self.config.features)
             self.observation = torch.zeros(self.num_envs, width, device=self.device)
@@ -101,50 +92,6 @@ class Sim:
         """One control step of every running env, driven by ``action`` (default: what the tree chose)."""
         if action is not None:
             self.action.copy_(action)
-        self._move()
-        self._perceive()
-        self._reward()
-
-    def reset(self, mask: torch.Tensor, seed: torch.Tensor, number: torch.Tensor) -> None:
-        """Begin episode ``number`` of ``seed`` in the rows where ``mask`` is 1 (all int32, shape (n_env,)),
-        up to the first observation."""
-        io = self.io
-        self.draw(mask, seed, number)
-        dynamics.reset_vehicle(io.dynamics)
-        actuation.reset_actuation(io.actuation)
-        proprioception.reset_proprioception(io.proprioception)
-        sonar.reset_sonar(io.sonar)
-        depth.reset_depth(io.depth)
-        tracking.reset_tracks(io.tracking)
-        forecast.reset_forecast(io.forecast)
-        mapping.reset_map(io.mapping)
-        route.reset_route(io.route)
-        leaves.reset_teacher(io.teacher)
-        reward.reset_reward(io.reward)
-        episode.reset_referee(io.episode)
-        self._perceive()
-        episode.wake(io.episode)
-
-    def draw(self, mask: torch.Tensor, seed: torch.Tensor, number: torch.Tensor) -> None:
-        """Draw the scenarios of a ``reset`` and nothing more: to look at them; their rows are not ready to be
-        stepped."""
-        io = self.io
-        episode.begin_episodes(io.episode, mask, seed, number)
-        with self._stage("world"):
-            scenarios.generate_scenarios(io.world)
-            scenarios.move_obstacles(io.world)
-        check_scenarios(self.rows(self.s.world.faults)[mask.cpu().numpy() == 1])
-
-    def sleep_ended(self) -> None:
-        """Put the rows whose episode has ended to sleep; they cost nothing until their next reset."""
-        episode.sleep_ended(self.io.episode)
-
-    def sleep(self) -> None:
-        """Put every row to sleep, as in a new simulator."""
-        self.s.clock.active.fill(0)
-        self.s.clock.awake.fill(0)
-
-    def _move(self) -> None:
         io, rules = self.io, self.config.episode
         with self._stage("dynamics"):
             actuation.command_thrusters(io.actuation, self.action)
@@ -153,6 +100,9 @@ class Sim:
             episode.advance_clock(io.episode)
             scenarios.move_obstacles(io.world)
             episode.judge(io.episode)
+        self._perceive()
+        with self._stage("reward"):
+            reward.compute_reward(io.reward, self.reward, self.terminated, self.truncated)
 
     def _perceive(self) -> None:
         """Sensing to teacher for the rows that are awake."""
@@ -210,52 +160,61 @@ class Sim:
         if c.teacher:
             features.write_advice(io.features, obs)
 
+    def reset(self, mask: torch.Tensor, seed: torch.Tensor, number: torch.Tensor) -> None:
+        """Begin episode ``number`` of ``seed`` in the rows where ``mask`` is 1 (all int32, shape (n_env,)),
+        up to the first observation."""
+        io = self.io
+        self.draw(mask, seed, number)
+        dynamics.reset_vehicle(io.dynamics)
+        actuation.reset_actuation(io.actuation)
+        proprioception.reset_proprioception(io.proprioception)
+        sonar.reset_sonar(io.sonar)
+        depth.reset_depth(io.depth)
+        tracking.reset_tracks(io.tracking)
+        forecast.reset_forecast(io.forecast)
+        mapping.reset_map(io.mapping)
+        route.reset_route(io.route)
+        leaves.reset_teacher(io.teacher)
+        reward.reset_reward(io.reward)
+        episode.reset_referee(io.episode)
+        self._perceive()
+        episode.wake(io.episode)
+
+    def draw(self, mask: torch.Tensor, seed: torch.Tensor, number: torch.Tensor) -> None:
+        """Draw the scenarios of a ``reset`` to look at them, and nothing more: no row is ready for a step."""
+        episode.begin_episodes(self.io.episode, mask, seed, number)
+        with self._stage("world"):
+            scenarios.generate_scenarios(self.io.world)
+            scenarios.move_obstacles(self.io.world)
+        check_scenarios(self.rows(self.s.world.faults)[mask.cpu().numpy() == 1])
+
+    def sleep_ended(self) -> None:
+        """Put the rows whose episode has ended to sleep; they cost nothing until their next reset."""
+        episode.sleep_ended(self.io.episode)
+
+    def sleep(self) -> None:
+        """Put every row to sleep, as in a new simulator."""
+        self.s.clock.active.fill(0)
+        self.s.clock.awake.fill(0)
+
     def _plan_seed(self, env: int) -> int:
         """Seed of the fallback planner's random numbers: a function of the episode's key and step alone."""
         return (int(self.s.episode.key[env]) + 0x9E3779B1 * int(self.s.clock.step[env])) & 0x7FFFFFFF
 
-    def _reward(self) -> None:
-        with self._stage("reward"):
-            reward.compute_reward(self.io.reward, self.reward, self.terminated, self.truncated)
-
-    # -------------------------------------------------------------------------------------------- observation
+    # ----------------------------------------------------------------------------------------------- reading
 
     def rows(self, field: ti.Field, envs: list[int] | None = None) -> np.ndarray:
-        """Host copy of a field's rows, shape (len(envs), ...) (default: all envs); only these rows are
-        copied."""
-        chosen = (
-            self._every_row if envs is None else torch.tensor(envs, dtype=torch.int32, device=self.device)
-        )
-        return copied_rows(field, chosen)
+        """Host copy of these rows of a field alone, shape (len(envs), ...); None = all envs."""
+        rows = self._every_row if envs is None else torch.tensor(envs, dtype=torch.int32, device=self.device)
+        return copied_rows(field, rows)
 
     def read_into(self, field: ti.Field, out: torch.Tensor) -> None:
         """Copy a whole field into ``out`` on the device, without a wait or a copy through the host."""
         copy_rows(field, self._every_row, out)
 
-    def tell_step(
-        self,
-        terms: torch.Tensor,
-        episode_terms: torch.Tensor,
-        episode_return: torch.Tensor,
-        episode_steps: torch.Tensor,
-        outcome: torch.Tensor,
-    ) -> None:
-        """Write how the step went into the caller's tensors: float32 (n_env, n_term) twice, float32 (n_env,),
-        int32 (n_env,) twice."""
-        reward.tell_step(self.io.reward, terms, episode_terms, episode_return, episode_steps, outcome)
-
     def memory(self) -> Memory:
         """Where every array lies, when all kernels are done: for a capture."""
         return Memory(self.s, self.s.clock.active, address_of(self.s.clock.active, self.device), self.device)
 
-    @contextlib.contextmanager
-    def _stage(self, name: str) -> Iterator[None]:
-        """Time a stage when somebody asked for it (``stage_s`` is a dict); costs nothing otherwise."""
-        if self.stage_s is None:
-            yield
-            return
-        ti.sync()
-        begin = time.perf_counter()
-        yield
-        ti.sync()
-        self.stage_s[name] = self.stage_s.get(name, 0.0) + time.perf_counter() - begin
+    def _stage(self, name: str) -> AbstractContextManager[None]:
+        return timed_stage(name, self.stage_s)

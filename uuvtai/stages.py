@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import time
+from collections.abc import Iterator
 from dataclasses import dataclass
+
+import taichi as ti
 
 from uuvtai import state
 from uuvtai.kernels.perception.bundles import (
@@ -26,6 +31,19 @@ STAGES = (
     "mapping", "clearance", "planning", "features", "teacher", "reward",
 )  # fmt: skip
 """what is timed apart, in order"""
+
+
+@contextlib.contextmanager
+def timed_stage(name: str, stage_s: dict[str, float] | None) -> Iterator[None]:
+    """Add the time that a stage takes [s], all its kernels done, to ``stage_s``; None costs nothing."""
+    if stage_s is None:
+        yield
+        return
+    ti.sync()
+    begin = time.perf_counter()
+    yield
+    ti.sync()
+    stage_s[name] = stage_s.get(name, 0.0) + time.perf_counter() - begin
 
 
 @dataclass(frozen=True)

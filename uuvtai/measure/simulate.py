@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -33,40 +34,40 @@ _WHAT = {
 }
 
 
-def simulate(
-    config: Config,
-    *,
-    seconds: float,
-    wrench: Sequence[float] | None = None,
-    command: Sequence[float] | None = None,
-    current: Sequence[float] | None = None,
-    initial_rpy_deg: Sequence[float] | None = None,
-    initial_velocity: Sequence[float] | None = None,
-    neutral: bool = False,
-    dt: float = 0.01,
-    runtime: Runtime | None = None,
-) -> dict[str, list]:
-    """Trajectory of one vehicle that starts at the origin, sampled at every control step, the initial state
-    first.
+@dataclass(frozen=True)
+class Trial:
+    """What one vehicle that starts at the origin is exposed to; None = nothing, rest, level."""
 
-    ``wrench`` is a constant body-frame force and moment on top of the thrusters, which are off unless
-    ``command`` (body velocity and yaw rate) drives them through the inner loop; ``dt`` is the substep;
-    ``neutral`` sets buoyancy equal to weight. Starts Taichi in double precision unless ``runtime`` says what
-    is running. Returns {"t" [s], "position" [m], "rpy_deg", "nu" [m/s, rad/s], "rpm"}. Raises SettingError
-    for input that makes no sense, DivergenceError where the integration diverges.
+    seconds: float
+    wrench: Sequence[float] | None = None
+    """constant force and moment [N, N m], body frame, on top of the thrusters, which are off without
+    ``command``"""
+    command: Sequence[float] | None = None
+    """velocity and yaw rate [m/s, rad/s], body frame, for the inner loop"""
+    current: Sequence[float] | None = None
+    """[m/s], world frame"""
+    initial_rpy_deg: Sequence[float] | None = None
+    initial_velocity: Sequence[float] | None = None
+    """u,v,w,p,q,r [m/s, rad/s], body frame"""
+    neutral: bool = False
+    """buoyancy equal to weight"""
+    dt: float = 0.01
+    """substep [s]"""
+
+
+def simulate(config: Config, trial: Trial, runtime: Runtime | None = None) -> dict[str, list]:
+    """Trajectory sampled at every control step, the initial state first: {"t" [s], "position" [m], "rpy_deg",
+    "nu" [m/s, rad/s], "rpm"}.
+
+    Starts Taichi in double precision unless ``runtime`` says what is running. Raises SettingError for input
+    that makes no sense, DivergenceError where the integration diverges.
     """
-    given = {
-        "wrench": wrench,
-        "command": command,
-        "current": current,
-        "initial_rpy_deg": initial_rpy_deg,
-        "initial_velocity": initial_velocity,
-    }
+    given = {name: getattr(trial, name) for name in _WHAT}
     vectors = {name: checked_vector(name, value) for name, value in given.items() if value is not None}
-    substeps, control_dt = control_step(dt)
-    n_step = checked_steps(seconds, control_dt, substeps)
-    config = _experiment(config, vectors, neutral, control_dt, substeps)
-    action = None if command is None else _action(config, vectors["command"])
+    substeps, control_dt = control_step(trial.dt)
+    n_step = checked_steps(trial.seconds, control_dt, substeps)
+    config = _experiment(config, vectors, trial.neutral, control_dt, substeps)
+    action = None if trial.command is None else _action(config, vectors["command"])
     plant = Plant(config, runtime or start_taichi(precision="f64"))
     plant.reset()
     _set_start(plant, vectors)
@@ -77,7 +78,7 @@ def simulate(
         if not math.isfinite(sum(samples[-1]["nu"])):
             raise DivergenceError(
                 f"the integration diverged at t = {k * control_dt:.2f} s: use a smaller substep, --dt "
-                f"{dt / 4:g}"
+                f"{trial.dt / 4:g}"
             )
     return {key: [s[key] for s in samples] for key in samples[0]}
 

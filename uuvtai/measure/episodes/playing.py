@@ -23,8 +23,8 @@ _REFILL_SHARE = 16
 passes, same results."""
 
 
-_TOLD_EVERY = 50
-"""passes between two words about the progress while no episode ends"""
+_PROGRESS_EVERY = 50
+"""passes between two calls of ``progress`` while no episode ends"""
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def run_episodes(
     ``clock`` is told the time of simulating, without what the recorder takes.
     """
     observed = sim.observation
-    wheel = _Wheel(sim, driver)
+    stepper = _Stepper(sim, driver)
     waiting = list(enumerate(jobs))[::-1]
     playing: dict[int, int] = {}
     results: dict[int, EpisodeResult] = {}
@@ -148,18 +148,18 @@ def run_episodes(
     while waiting or playing:
         if waiting and free and (len(free) * _REFILL_SHARE >= sim.num_envs or not playing):
             with clock.counting("reset"):
-                rows = _refill(sim, wheel, jobs, waiting, free, playing)
+                rows = _refill(sim, stepper, jobs, waiting, free, playing)
             begun |= dict.fromkeys(rows, passes)
             if recorder:
                 for row in rows:
                     recorder.begin(sim, row, jobs[playing[row]])
         passes, env_steps = passes + 1, env_steps + len(playing)
         with clock.counting("step", len(playing)):
-            wheel.step()
+            stepper.step()
             outcome = sim.rows(sim.s.referee.outcome)
         if recorder:
             recorder.step(sim)
-        if progress and passes % _TOLD_EVERY == 1:
+        if progress and passes % _PROGRESS_EVERY == 1:
             progress(len(results), len(jobs), env_steps, left())
         ended = [row for row in sorted(playing) if outcome[row] != RUNNING]
         if not ended:
@@ -178,7 +178,7 @@ def run_episodes(
     return [results[i] for i in range(len(jobs))], env_steps
 
 
-class _Wheel:
+class _Stepper:
     """Steps the simulator by a driver, or by its tree where there is none."""
 
     def __init__(self, sim: Sim, driver: Driver | None) -> None:
@@ -206,7 +206,7 @@ class _Wheel:
 
 
 def _refill(
-    sim: Sim, wheel: _Wheel, jobs: list[Job], waiting: list, free: list[int], playing: dict[int, int]
+    sim: Sim, stepper: _Stepper, jobs: list[Job], waiting: list, free: list[int], playing: dict[int, int]
 ) -> list[int]:
     """Begin as many jobs as there are free rows; the rows."""
     mask, seed, number = (torch.zeros(sim.num_envs, dtype=torch.int32) for _ in range(3))
@@ -218,7 +218,7 @@ def _refill(
         mask[row], seed[row], number[row] = 1, job.seed, job.episode
         begun.append((row, job))
     _set_scenes(sim, begun)
-    wheel.reset(mask.to(sim.device), seed.to(sim.device), number.to(sim.device))
+    stepper.reset(mask.to(sim.device), seed.to(sim.device), number.to(sim.device))
     return [row for row, _job in begun]
 
 

@@ -119,7 +119,7 @@ def foresight_of(pilot: Pilot, control_dt_s: float) -> Foresight | None:
     )
 
 
-def told(foresight: Foresight | None, moments: RiskMoments | None = None) -> dict[str, Any]:
+def risk_entry(foresight: Foresight | None, moments: RiskMoments | None = None) -> dict[str, Any]:
     """What ``uuv eval --json`` says of a method's risk head beside its results; empty where there is nothing
     to say.
 
