@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import os
 
+from uuvtai.version import __version__ as __version__
+
 # without typing, which takes longer to import than this file: signals are not heard before it is done
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
     from uuvtai.env import VectorEnv
-
-__version__ = "0.1.0"
 
 # Taichi prints a banner to stdout when it is imported; stdout belongs to results
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")

@@ -16,13 +16,14 @@ from typing import Annotated, Any
 
 import typer
 
-from uuvtai import __version__, signals
+from uuvtai import signals
 from uuvtai.endings import FAILED, GATE, UsageError, guarded, plain
 from uuvtai.endings import say as _say
 from uuvtai.shipped import KINDS, preset_names
 from uuvtai.show import choices
 from uuvtai.show.progress import Progress
 from uuvtai.show.screen import Screen
+from uuvtai.version import __version__
 
 app = typer.Typer(
     name="uuv",

@@ -14,8 +14,9 @@ from typing import Any
 
 import typer
 
-from uuvtai import __version__, signals
+from uuvtai import signals
 from uuvtai.errors import UserError
+from uuvtai.version import __version__
 
 OK, FAILED, USAGE, GATE, INTERRUPTED = 0, 1, 2, 3, 130
 

@@ -166,12 +166,6 @@ def _read_stack(name: str) -> _Layer:
     return layer
 
 
-def scene_of(preset: str) -> dict[str, str | None]:
-    """Names of the world, sensors and vehicle presets that a training preset names; None = it names none."""
-    tree = _read_preset("train", preset).tree
-    return {kind: tree.get(kind, {}).get("preset") for kind in _SCENE_KINDS}
-
-
 def _scene(world: str, sensors: str | None, vehicle: str | None) -> _Layer:
     """A world with its sensors and its vehicle, the ones given before the ones that it names itself."""
     layer = _read_preset("world", world)

@@ -17,11 +17,12 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from uuvtai import __version__, signals
+from uuvtai import signals
 from uuvtai.config import Config
 from uuvtai.errors import UserError
 from uuvtai.files import FileError, open_new, open_to_append, read_json, refuse_links, refuse_links_in
 from uuvtai.loader import to_yaml
+from uuvtai.version import __version__
 
 _TEMPORARY = re.compile(r"\..+\.\d+\.[0-9a-f]{8}\.tmp")
 """names that ``write_atomic`` gives"""

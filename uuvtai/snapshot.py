@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from uuvtai import __version__
+from uuvtai.version import __version__
 
 RUNNING = "running"
 """outcome of an episode that has not ended"""

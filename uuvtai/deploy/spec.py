@@ -5,13 +5,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from uuvtai import __version__
 from uuvtai.deploy.golden import TOLERANCE
 from uuvtai.deploy.graph import INPUTS, OPSET, OUTPUTS, OneDecision
 from uuvtai.deploy.run_policy import GOLDEN, SCHEMA, WEIGHTS
 from uuvtai.learn.checkpoint import Checkpoint
 from uuvtai.learn.pilot import Pilot
 from uuvtai.learn.world_model import N_FEATURES
+from uuvtai.version import __version__
 
 ONNX = "policy.onnx"
 

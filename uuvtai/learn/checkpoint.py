@@ -25,7 +25,6 @@ from typing import Any
 import safetensors.torch
 import torch
 
-from uuvtai import __version__
 from uuvtai.config.learning import LearningConfig
 from uuvtai.errors import UserError
 from uuvtai.files import FileError, flush, open_new, read_bytes, refuse_links, refuse_links_in
@@ -53,6 +52,7 @@ from uuvtai.learn.manifest import (
     verify,
 )
 from uuvtai.learn.packing import PackingError, layout_of, pack, read_stream, unpack, write_stream
+from uuvtai.version import __version__
 
 MODEL_PARTS = ("policy", "world_model", "risk")
 """parts of a trainer's state that go into model.safetensors"""

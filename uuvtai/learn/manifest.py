@@ -14,10 +14,10 @@ from typing import Any, Protocol
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from safetensors import SafetensorError
 
-from uuvtai import __version__
 from uuvtai.errors import UserError
 from uuvtai.files import FileError, open_file, parsed_json, read_bytes
 from uuvtai.learn.packing import PackingError
+from uuvtai.version import __version__
 
 SCHEMA = 1
 """of the folder; another one is refused"""

@@ -36,7 +36,7 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from uuvtai import __version__
+from uuvtai.version import __version__
 
 MAGIC = b"\x89MCAP0\r\n"
 CHUNK_MIN, CHUNK_MAX = 64 * 1024, 256 * 1024

@@ -12,10 +12,10 @@ from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-from uuvtai import __version__
 from uuvtai.report import ink
 from uuvtai.report.blocks import Block, Data, Figure, PageSection
 from uuvtai.report.colours import on_page
+from uuvtai.version import __version__
 
 if TYPE_CHECKING:
     from jinja2 import Template
