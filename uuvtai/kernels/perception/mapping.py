@@ -148,11 +148,11 @@ def folded(
     dynamic_hit,
     free,
     point,
-    scan_s: Const[float],
-    depth_s: Const[float],
     io: Bundle[MappingIO],
 ):
     """Both equations for one cell; indicators are 0 or 1."""
+    scan_s = ti.static(map_period_s(io.mapping_cfg, io.sonar_cfg, io.episode_cfg))
+    depth_s = ti.static(depth_period_s(io.mapping_cfg, io.sonar_cfg, io.depth_cfg, io.episode_cfg))
     supported = (static_hit == 1) | (static_old > 0.0)
     depth_hit = ti.select(
         supported & (dynamic_old < io.mapping_cfg.occupied), point & ~dynamic_hit & ~free, 0
@@ -180,8 +180,6 @@ def fold_cells(
     dynamics,
     free,
     points,
-    scan_s: Const[float],
-    depth_s: Const[float],
     io: Bundle[MappingIO],
 ):
     """Both equations for the cells of a word that have anything to fold, and what is then true of them."""
@@ -203,8 +201,6 @@ def fold_cells(
                 bit_of(dynamics, i),
                 bit_of(free, i),
                 bit_of(points, i),
-                scan_s,
-                depth_s,
                 io,
             )
             io.grid_map.static_occ[env, row, col], io.grid_map.dynamic_occ[env, row, col] = (
@@ -235,9 +231,7 @@ def fetch_cells(env, slot, io: Bundle[MappingIO]):
 
 
 @ti.func
-def merge_scan(
-    env, slot, scan_s: Const[float], depth_s: Const[float], confident_scans: Const[int], io: Bundle[MappingIO]
-):
+def merge_scan(env, slot, confident_scans: Const[int], io: Bundle[MappingIO]):
     """Fold everything marked in the slot's scratch into an env's map, word by word; the marks are used up.
 
     Each strip of sixty-four columns goes upwards: an odd number of the fan's edges below means inside.
@@ -257,7 +251,7 @@ def merge_scan(
             free = in_fan & inside & ~(statics | dynamics)
             count_free(env, row, word, free, statics | dynamics, confident_scans, io)
             count_dynamic(env, row, word, free, dynamics, io)
-            fold_cells(env, row, word, statics, dynamics, free, points, scan_s, depth_s, io)
+            fold_cells(env, row, word, statics, dynamics, free, points, io)
             seen = io.grid_map.seen[env, row, word]
             if (free | statics | dynamics | points) & ~seen != 0:
                 io.grid_map.seen[env, row, word] = seen | free | statics | dynamics | points
@@ -274,7 +268,6 @@ def update_map(io: Bundle[MappingIO]):
     it is."""
     n_env, n_slot = ti.static(io.clock.awake.shape[0], io.map_scratch.fan_edge.shape[0])
     scan_s = ti.static(map_period_s(io.mapping_cfg, io.sonar_cfg, io.episode_cfg))
-    depth_s = ti.static(depth_period_s(io.mapping_cfg, io.sonar_cfg, io.depth_cfg, io.episode_cfg))
     confident, promote = ti.static(
         scans_in(io.mapping_cfg.free_confident_s, scan_s), scans_in(io.mapping_cfg.promote_s, scan_s)
     )
@@ -289,7 +282,7 @@ def update_map(io: Bundle[MappingIO]):
                     fetch_cells(env, slot, io)
                     mark_fan(env, slot, io)
                     mark_hits(env, slot, promote, io)
-                    merge_scan(env, slot, scan_s, depth_s, confident, io)
+                    merge_scan(env, slot, confident, io)
                     io.grid_map.map_step[env] = io.clock.step[env]
 
 

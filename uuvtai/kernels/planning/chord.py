@@ -8,6 +8,7 @@ bounded by one cell, so that long hops cannot cheat it.
 import taichi as ti
 
 from uuvtai.kernels.core.geometry import FAR_M
+from uuvtai.kernels.core.grid import grid_origin
 from uuvtai.kernels.core.signature import Bundle
 from uuvtai.kernels.planning.bundles import VoronoiIO
 from uuvtai.kernels.planning.medial import next_direction, step_of
@@ -167,11 +168,11 @@ def _next_span(span, longest):
 
 
 @ti.func
-def count_of_waypoints(
-    slot, env, n_cell, start_at, goal_at, origin, cell_m, spacing, write, io: Bundle[VoronoiIO]
-):
+def count_of_waypoints(slot, env, n_cell, start_at, goal_at, spacing, write, io: Bundle[VoronoiIO]):
     """Go along the chosen chords and cells; returns the number of waypoints, and writes them where ``write``
     is 1."""
+    x0, y0 = ti.static(grid_origin(io.tank_cfg, io.mapping_cfg.cell_m))
+    origin, cell_m = ti.Vector([x0, y0], dt=ti.f32), ti.static(io.mapping_cfg.cell_m)
     last = (n_cell - 2) // STRIDE + 1
     at = origin + start_at * cell_m
     if write == 1:

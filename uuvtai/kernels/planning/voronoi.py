@@ -174,21 +174,16 @@ def _forget_search(slot, io: Bundle[VoronoiIO]):
 @ti.func
 def _write_reason(slot, env, start_w, goal_w, io: Bundle[VoronoiIO]):
     """Turn the search's result into waypoints; FAIL_BUDGET where they do not fit."""
-    x0, y0 = ti.static(grid_origin(io.tank_cfg, io.mapping_cfg.cell_m))
-    origin, cell_m, room = (
-        ti.Vector([x0, y0], dt=ti.f32),
-        ti.static(io.mapping_cfg.cell_m),
-        ti.static(io.route.way_w.shape[1]),
-    )
+    room = ti.static(io.route.way_w.shape[1])
     start_at, goal_at = _grid_position(start_w, io), _grid_position(goal_w, io)
     start, goal = _cell(start_w, io), _cell(goal_w, io)
     n_cell = path_cells(slot, start, goal, io)
     spacing, writing, tries, reason = ti.cast(ti.static(io.route_cfg.spacing_m), ti.f32), 0, 0, FAIL_BUDGET
     cost = 0.0
     if n_cell > 0:
-        cost = straightened_cost(slot, n_cell, start_at, goal_at, io) * cell_m
+        cost = straightened_cost(slot, n_cell, start_at, goal_at, io) * io.mapping_cfg.cell_m
     while n_cell > 0 and tries < MAX_WIDENINGS:  # count, widen the spacing until it fits, then write
-        count = count_of_waypoints(slot, env, n_cell, start_at, goal_at, origin, cell_m, spacing, writing, io)
+        count = count_of_waypoints(slot, env, n_cell, start_at, goal_at, spacing, writing, io)
         tries += 1
         if writing == 1:
             install_route(io.route, io.clock, env, count, cost, PLANNER_VORONOI)

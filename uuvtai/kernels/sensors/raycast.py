@@ -6,6 +6,8 @@ outside where 0 < enter <= leave. Arguments may be scalars or 16-lane packets: a
 directions is the usual mix.
 """
 
+import math
+
 import taichi as ti
 
 from uuvtai.kernels.core.geometry import BOX, FAR_M, NONE, SPHERE
@@ -138,13 +140,13 @@ def lane_bits(condition):
 
 
 @ti.func
-def nearest_echo(env, x, y, z, ux, uy, travelled, slope, wedge, direct: Const[bool], io: Bundle[SonarIO]):
-    """Nearest surface along level rays (ux, uy) from (x, y) in the plane z, after a path already
+def nearest_echo(env, x, y, ux, uy, travelled, wedge, direct: Const[bool], io: Bundle[SonarIO]):
+    """Nearest surface along level rays (ux, uy) from (x, y) in the sonar's plane, after a path already
     ``travelled`` [m].
 
-    A body counts where its vertical gap is at most slope x path. (x, y) and ``travelled`` are scalars, or
-    lanes after a bounce. ``direct`` rays start at the sensor, where only bodies in their ``wedge`` need a
-    test.
+    A body counts where its vertical gap is at most ``fan_slope`` x path. (x, y) and ``travelled`` are
+    scalars, or lanes after a bounce. ``direct`` rays start at the sensor, where only bodies in their
+    ``wedge`` need a test.
     """
     echo = wall_echo(x, y, ux, uy, io)
     for group in range(ti.static(io.sonar_memory.body_reach_m.shape[1] // LANES)):
@@ -156,20 +158,26 @@ def nearest_echo(env, x, y, z, ux, uy, travelled, slope, wedge, direct: Const[bo
         while waiting != 0:
             body = group * LANES + 31 - ti.math.clz(waiting & -waiting)  # the lowest bit
             waiting &= waiting - 1
-            echo = nearer_echo(env, body, echo, x, y, z, ux, uy, travelled, slope, io)
+            echo = nearer_echo(env, body, echo, x, y, ux, uy, travelled, io)
     return echo
 
 
 @ti.func
-def nearer_echo(env, body, echo, x, y, z, ux, uy, travelled, slope, io: Bundle[SonarIO]):
+def nearer_echo(env, body, echo, x, y, ux, uy, travelled, io: Bundle[SonarIO]):
     """The echo, or a body's where that is nearer."""
     out = echo
+    slope = ti.static(fan_slope(io.sonar_cfg))
     kind = io.world.kind[env, body]
     pos, size = io.world.pos_w[env, body].cast(ti.f32), io.world.size[env, body].cast(ti.f32)
-    enter, normal_x, normal_y = outline_entry(
-        env, body, kind, size, pos[2] - z, x - pos[0], y - pos[1], ux, uy, travelled, slope, io
-    )
-    gap = ti.select(kind == SPHERE, 0.0, ti.max(ti.abs(pos[2] - z) - size[2], 0.0))
+    sx, sy, rise = x - pos[0], y - pos[1], pos[2] - ti.cast(io.sonar_memory.mount_w[env][2], ti.f32)
+    enter, normal_x, normal_y = f16x(FAR_M), f16x(0.0), f16x(0.0)
+    if kind == BOX:
+        enter, normal_x, normal_y = box_entry(sx, sy, ux, uy, size, ti.cast(io.world.yaw[env, body], ti.f32))
+    else:
+        lost = ti.max(ti.abs(rise) - (ti.sqrt(sx * sx + sy * sy) + travelled) * slope, 0.0)
+        radius_squared = size[0] * size[0] - ti.select(kind == SPHERE, 1.0, 0.0) * lost * lost
+        enter, normal_x, normal_y = disc_entry(sx, sy, ux, uy, radius_squared)
+    gap = ti.select(kind == SPHERE, 0.0, ti.max(ti.abs(rise) - size[2], 0.0))
     nearer = (enter > _SKIN_M) & (enter < echo.range_m) & ((enter + travelled) * slope >= gap)
     vel = io.world.vel_w[env, body].cast(ti.f32)
     out.range_m = ti.select(nearer, enter, echo.range_m)
@@ -181,31 +189,31 @@ def nearer_echo(env, body, echo, x, y, z, ux, uy, travelled, slope, io: Bundle[S
 
 
 @ti.func
-def outline_entry(env, body, kind, size, rise, sx, sy, ux, uy, travelled, slope, io: Bundle[SonarIO]):
-    """(range, normal x, normal y) where rays from (sx, sy), relative to the body's centre, enter its
-    horizontal outline."""
-    range_m, normal_x, normal_y = f16x(FAR_M), f16x(0.0), f16x(0.0)
-    if kind == BOX:
-        yaw = ti.cast(io.world.yaw[env, body], ti.f32)
-        c, s = ti.cos(yaw), ti.sin(yaw)
-        dx, dy = ux * c + uy * s, uy * c - ux * s
-        in_x, out_x = slab_span(sx * c + sy * s, dx, size[0])
-        in_y, out_y = slab_span(sy * c - sx * s, dy, size[1])
-        enter, leave = ti.max(in_x, in_y), ti.min(out_x, out_y)
-        face_x = ti.select(in_x > in_y, ti.select(dx > 0.0, -1.0, 1.0), 0.0)
-        face_y = ti.select(in_x > in_y, 0.0, ti.select(dy > 0.0, -1.0, 1.0))
-        range_m = ti.select(enter <= leave, enter, FAR_M)
-        normal_x = face_x * c - face_y * s
-        normal_y = face_x * s + face_y * c
-    else:
-        lost = ti.max(ti.abs(rise) - (ti.sqrt(sx * sx + sy * sy) + travelled) * slope, 0.0)
-        radius_squared = size[0] * size[0] - ti.select(kind == SPHERE, 1.0, 0.0) * lost * lost
-        enter, leave = disc_span(sx, sy, ux, uy, radius_squared)
-        inverse = 1.0 / ti.sqrt(ti.max(radius_squared, 1.0e-12))
-        range_m = enter
-        normal_x = (sx + enter * ux) * inverse
-        normal_y = (sy + enter * uy) * inverse
-    return range_m, normal_x, normal_y
+def box_entry(sx, sy, ux, uy, size, yaw):
+    """(range, normal x, normal y) where rays from (sx, sy), relative to an upright box's centre, enter it;
+    FAR_M where they do not."""
+    c, s = ti.cos(yaw), ti.sin(yaw)
+    dx, dy = ux * c + uy * s, uy * c - ux * s
+    in_x, out_x = slab_span(sx * c + sy * s, dx, size[0])
+    in_y, out_y = slab_span(sy * c - sx * s, dy, size[1])
+    enter, leave = ti.max(in_x, in_y), ti.min(out_x, out_y)
+    face_x = ti.select(in_x > in_y, ti.select(dx > 0.0, -1.0, 1.0), 0.0)
+    face_y = ti.select(in_x > in_y, 0.0, ti.select(dy > 0.0, -1.0, 1.0))
+    range_m = ti.select(enter <= leave, enter, FAR_M)
+    return range_m, face_x * c - face_y * s, face_x * s + face_y * c
+
+
+@ti.func
+def disc_entry(sx, sy, ux, uy, radius_squared):
+    """(range, normal x, normal y) where rays from (sx, sy) enter a circle around the origin."""
+    enter, _ = disc_span(sx, sy, ux, uy, radius_squared)
+    inverse = 1.0 / ti.sqrt(ti.max(radius_squared, 1.0e-12))
+    return enter, (sx + enter * ux) * inverse, (sy + enter * uy) * inverse
+
+
+def fan_slope(sonar_cfg):
+    """Rise per metre at the edge of the sonar's vertical fan."""
+    return math.tan(math.radians(sonar_cfg.vertical_half_aperture_deg))
 
 
 @ti.func

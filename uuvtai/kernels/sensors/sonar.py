@@ -186,12 +186,11 @@ def measured(env, packet, step, io: Bundle[SonarIO]):
     mount = sonar_mount(env, io)
     ux, uy = beam_directions(packet, mount.heading, io)
     wedge = packet_wedge(packet, mount.heading, io)
-    slope = ti.static(math.tan(math.radians(io.sonar_cfg.vertical_half_aperture_deg)))
-    echo = nearest_echo(env, mount.pos[0], mount.pos[1], mount.pos[2], ux, uy, 0.0, slope, wedge, True, io)
+    echo = nearest_echo(env, mount.pos[0], mount.pos[1], ux, uy, 0.0, wedge, True, io)
     cosine = -(ux * echo.normal_x + uy * echo.normal_y)
     own = ux * mount.vel[0] + uy * mount.vel[1]
     key, ray = io.episode.key[env], packet * LANES
-    bounced, away = ghosted(env, echo, cosine, ux, uy, mount.pos, slope, wedge, key, step, ray, io)
+    bounced, away = ghosted(env, echo, ux, uy, mount.pos, wedge, step, ray, io)
     clear = grazing_lost(bounced, cosine, io)
     clouded, still, bright = cloud_covered(env, clear, away, cosine, mount.heading, ray, step, io)
     heard = missed(clouded, key, step, ray, io)

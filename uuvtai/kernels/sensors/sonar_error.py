@@ -30,7 +30,7 @@ _CLOUD_NEAREST_M = 0.5
 
 
 @ti.func
-def ghosted(env, echo, cosine, ux, uy, pos, slope, wedge, key, step, ray, io: Bundle[SonarIO]):
+def ghosted(env, echo, ux, uy, pos, wedge, step, ray, io: Bundle[SonarIO]):
     """(range, rate of change of range from the surfaces' motion), where one specular bounce replaces the
     direct return in chosen beams.
 
@@ -41,11 +41,13 @@ def ghosted(env, echo, cosine, ux, uy, pos, slope, wedge, key, step, ray, io: Bu
     away = ux * echo.vel_x + uy * echo.vel_y
     out_range, out_away = range_m + 0.0, away + 0.0
     if ti.static(io.sonar_cfg.ghost > 0):
-        chosen = uniform_lanes(stream_key(key, step, STREAM_SONAR_GHOST), ray) < io.sonar_cfg.ghost
+        stream = stream_key(io.episode.key[env], step, STREAM_SONAR_GHOST)
+        chosen = uniform_lanes(stream, ray) < io.sonar_cfg.ghost
         if any_lane(chosen):
+            cosine = -(ux * echo.normal_x + uy * echo.normal_y)
             mx, my = ux + 2.0 * cosine * echo.normal_x, uy + 2.0 * cosine * echo.normal_y
             x, y = pos[0] + range_m * ux, pos[1] + range_m * uy
-            second = nearest_echo(env, x, y, pos[2], mx, my, range_m, slope, wedge, False, io)
+            second = nearest_echo(env, x, y, mx, my, range_m, wedge, False, io)
             path = range_m + second.range_m
             heard = chosen & (path <= io.sonar_cfg.max_range_m)
             extra = mx * (second.vel_x - echo.vel_x) + my * (second.vel_y - echo.vel_y)
