@@ -38,7 +38,6 @@ def _ordered_interval(value: Interval) -> Interval:
 OrderedInterval = Annotated[Interval, AfterValidator(_ordered_interval)]
 PositiveInterval = Annotated[tuple[Positive, Positive], AfterValidator(_ordered_interval)]
 Vector3 = tuple[Real, Real, Real]
-Vector6 = tuple[Real, Real, Real, Real, Real, Real]
 NonNegative6 = tuple[NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative]
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from uuvtai.files import open_to_append, read_bytes, refuse_links, truncate
-from uuvtai.measure.episodes.playing import EpisodeResult, Job
+from uuvtai.measure.episodes.playing import EpisodeObserver, EpisodeResult, Job
 from uuvtai.run_folder import RunFolderError
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ class Ledger:
         return kept
 
 
-class Keeper:
+class Keeper(EpisodeObserver):
     """Recorder that writes a method's episodes into the ledger as they end; behind those whose work an
     episode needs to be whole."""
 
@@ -147,12 +147,6 @@ class Keeper:
     def wall_s(self) -> float:
         """Time that the method has taken, that of earlier processes included."""
         return self.before_s + time.perf_counter() - self._begun
-
-    def begin(self, sim: Sim, row: int, job: Job) -> None:
-        """Nothing to do."""
-
-    def step(self, sim: Sim) -> None:
-        """Nothing to do."""
 
     def end(self, sim: Sim, row: int, result: EpisodeResult) -> None:
         """Keep the episode."""

@@ -77,12 +77,7 @@ class LocalEngine:
         try:
             while todo or running:
                 try:
-                    while (
-                        todo and len(running) < self._workers
-                    ):  # no more than run: what waits inside a broken pool is lost too
-                        with _ctrl_c_held():
-                            future = pool.submit(work, items[todo[0]])
-                        running[future] = todo.pop(0)
+                    self._submit(pool, work, items, todo, running)
                 except BrokenProcessPool:
                     return list(running.values())
                 done, _rest = wait(running, return_when=FIRST_COMPLETED)
@@ -101,6 +96,20 @@ class LocalEngine:
             for process in list((pool._processes or {}).values()):
                 process.terminate()
             pool.shutdown(wait=True, cancel_futures=True)
+
+    def _submit(
+        self,
+        pool: ProcessPoolExecutor,
+        work: Work,
+        items: Sequence[Item],
+        todo: list[int],
+        running: dict[Future, int],
+    ) -> None:
+        """Give every free worker a task, and no more: what waits inside a broken pool is lost too."""
+        while todo and len(running) < self._workers:
+            with _ctrl_c_held():
+                future = pool.submit(work, items[todo[0]])
+            running[future] = todo.pop(0)
 
 
 @contextlib.contextmanager
