@@ -20,8 +20,10 @@ from taichi.lang.impl import default_cfg
 import uuvtai
 from tests.command import uuv
 from tests.conftest import SmallSim
-from uuvtai import cli, doctor, endings, loader
+from uuvtai import doctor, endings, loader
 from uuvtai.errors import SettingError, SizeError
+from uuvtai.show.evaluation import show_evaluation
+from uuvtai.show.screen import Screen
 
 
 @pytest.mark.parametrize(
@@ -167,7 +169,7 @@ def test_text_from_outside_is_never_markup(tmp_path, monkeypatch, capfd, evaluat
     odd["world"] = odd["sensors"] = "[/x]"
     for method in odd["methods"]:
         method["name"] = "[/x]" + method["name"]
-    cli._print_evaluation(odd, Path("[/x]"), as_json=False, wide=False)
+    show_evaluation(Screen(), odd, Path("[/x]"))
     monkeypatch.chdir(tmp_path)
     Path("a[/x]").mkdir(parents=True)
     shutil.copy(folder / "logs/bt_seed3_episode0.mcap", "a[/x]/log.mcap")

@@ -9,7 +9,7 @@ from uuvtai.measure.episodes.playing import jobs_of, run_episodes
 from uuvtai.measure.episodes.stopwatch import StepClock, env_steps_left
 from uuvtai.show import progress as module
 from uuvtai.show.dashboard import training_rows
-from uuvtai.show.progress import Pace, Progress, told_left
+from uuvtai.show.progress import Pace, Progress, time_left
 
 
 class Time:
@@ -90,7 +90,7 @@ def test_no_time_left_is_told_before_it_is_worth_one():
     resumed = Pace(100, 90, time)
     time.s += 4.0
     assert resumed.left_s(92) == pytest.approx(16.0), "what was done before took none of this time"
-    assert told_left(None) == "" and told_left(34.2) == "ETA 34 s" and told_left(600.0) == "ETA 10 min"
+    assert time_left(None) == "" and time_left(34.2) == "ETA 34 s" and time_left(600.0) == "ETA 10 min"
 
 
 @pytest.fixture

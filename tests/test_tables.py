@@ -76,12 +76,13 @@ class Exported:
         difference = {"action": 1.2e-7, "uncertainty": 3.4e-6}
 
     agreements = [One, One]
+    damages = []
 
 
 LOG = {
     "topics": [{"topic": f"/topic/{i}", "schema": "foxglove.CompressedImage", "messages": 10**i,
     "rate_hz": 50.0} for i in range(6)],
-    "duration_s": 12.0, "outcome": "success",
+    "duration_s": 12.0, "outcome": "success", "converted_from": None,
 }  # fmt: skip
 CHECKS = [{"name": "kernel cache", "ok": False, "detail": "word " * 60}]
 CLAIMS = {

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from uuvtai.env import VectorEnv
     from uuvtai.learn.checkpoint import Checkpoint
     from uuvtai.learn.train import Trainer
+    from uuvtai.scene_options import SceneOptions
 
 Metrics = dict[str, float]
 
@@ -45,6 +46,15 @@ class TrainRequest:
     case"""
     device: str = "auto"
     run_dir: Path | None = None
+
+    @classmethod
+    def typed(
+        cls, scene: SceneOptions, preset: str, num_envs: int | None, seed: int | None, **rest: Any
+    ) -> TrainRequest:
+        """What a command line asks of a new run, with the scene as it was typed. Raises ConfigError."""
+        sizes = {"train.num_envs": num_envs, "train.seed": seed}
+        given = [(key, value) for key, value in sizes.items() if value is not None]
+        return cls(config=scene.training(preset, given), preset=preset, **rest)
 
 
 class TrainWatch(Protocol):

@@ -30,8 +30,8 @@ def choice(option: str, values: tuple[str, ...], help_text: str, meant: dict[str
             close = (meant or {}).get(value) or next(
                 iter(difflib.get_close_matches(value, values, n=1, cutoff=0.5)), None
             )
-            told = f"; did you mean '{close}'?" if close else ""
-            raise UsageError(f"{option} {value}: use {', '.join(values[:-1])} or {values[-1]}{told}")
+            hint = f"; did you mean '{close}'?" if close else ""
+            raise UsageError(f"{option} {value}: use {', '.join(values[:-1])} or {values[-1]}{hint}")
         return value
 
     return typer.Option(
@@ -61,7 +61,7 @@ def presets(kind: str, *more: str, suffix: str = ".yaml") -> Complete:
 
 
 def controllers(incomplete: str) -> list[str]:
-    """Trees, stacks, yardsticks that are told the truth, and files of trees and stacks; after a comma the
+    """Trees, stacks, yardsticks that know the truth, and files of trees and stacks; after a comma the
     next one."""
     before, comma, last = incomplete.rpartition(",")
     trees = preset_names("tree")

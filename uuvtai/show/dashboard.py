@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from uuvtai.endings import plain, say
-from uuvtai.show.progress import Pace, told_left
+from uuvtai.show.progress import Pace, time_left
 from uuvtai.show.words import number, percent
 
 _PERIOD_S = 5.0
@@ -110,7 +110,7 @@ def training_rows(
         "lambda": number(of("distill/lambda_risk"), 3),
     }
     if left_s is not None:
-        rows["ETA"] = told_left(left_s).removeprefix("ETA ")
+        rows["ETA"] = time_left(left_s).removeprefix("ETA ")
     if "eval/success_rate" in metrics:
         rows["evaluation"] = (
             f"success {percent(of('eval/success_rate'))}, collision {percent(of('eval/collision_rate'))}"

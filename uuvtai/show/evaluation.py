@@ -3,9 +3,12 @@ risk head."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+from uuvtai.endings import say
 from uuvtai.outcomes import COLLIDED
+from uuvtai.show.cause_table import show_causes
 from uuvtai.show.screen import Column, Screen
 from uuvtai.show.words import number, probability, rate, with_interval
 
@@ -30,6 +33,18 @@ _PAIRS = (
     Column("time a - b, where both\narrive: s [95 %]", 1),
     Column("both\narrive", 2),
 )
+
+
+def show_evaluation(screen: Screen, result: dict[str, Any], folder: Path) -> None:
+    """All of a ``uuv eval --json`` document: methods, pairs, risk, and why episodes failed."""
+    show_methods(screen, result)
+    show_pairs(screen, result["paired"])
+    for method in result["methods"]:
+        if "risk" in method:
+            show_risk(screen, method["name"], method["risk"])
+    if any("causes" in method for method in result["methods"]):
+        show_causes(screen, result)
+        say(f"facts of every failure, and which of them are recorded: {folder / 'eval/explain.json'}")
 
 
 def show_methods(screen: Screen, result: dict[str, Any]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from uuvtai.endings import say
 from uuvtai.show.screen import Column, Screen
 
 _ENGINES = (
@@ -16,16 +17,18 @@ _ENGINES = (
 
 
 def show_export(screen: Screen, found: Any) -> None:
-    """One row per engine of a ``deploy.export`` result; nothing where none could run."""
+    """One row per engine of a ``deploy.export`` result, where any could run, and what is damaged."""
+    for damage in found.damages:
+        say(damage)
     rows = []
     for one in found.agreements:
         worst = max(one.difference, key=lambda name: one.difference[name])
-        told = f"{one.difference[worst]:.1e} ({worst})"
+        largest = f"{one.difference[worst]:.1e} ({worst})"
         rows.append(
             [
                 one.engine,
                 "agrees" if one.agrees else "DIFFERS",
-                told,
+                largest,
                 f"{one.p50_ms:.3f}",
                 f"{one.p99_ms:.3f}",
             ]

@@ -4,12 +4,14 @@ units and sources."""
 from __future__ import annotations
 
 import difflib
+import json
 import re
 from pathlib import Path
 
+import typer
 from rich.text import Text
 
-from uuvtai.endings import plain
+from uuvtai.endings import UsageError, plain, say
 from uuvtai.files import read_text
 from uuvtai.shipped import KINDS, preset_names, shipped_file
 from uuvtai.show.screen import Column, Screen
@@ -56,9 +58,36 @@ def show_presets(screen: Screen) -> None:
     )
 
 
-def stated(path: Path) -> str:
-    """A preset as it is written, its comments included. Raises FileError, OSError."""
-    return plain(read_text(path, _MAX_BYTES)).rstrip("\n")
+def show_stated(kind: str, name: str, as_json: bool) -> None:
+    """A preset as it is written, its comments included. Raises ConfigError, FileError, OSError."""
+    from uuvtai import loader
+
+    path = loader.preset_path(kind, name)
+    if as_json and path.suffix not in (".xml", ".md"):
+        typer.echo(json.dumps(loader.stated(path), allow_nan=False))
+        return
+    text = plain(read_text(path, _MAX_BYTES)).rstrip("\n")
+    if as_json:
+        typer.echo(json.dumps({"schema": 1, "text": text}, allow_nan=False))
+        return
+    typer.echo(text)
+    if (base := loader.base_of(path)) is not None:
+        say(f"it changes these keys of {base} (uuv presets show {kind}/{base}); every key: --all")
+
+
+def kind_and_name(name: str) -> tuple[str, str]:
+    """(kind, name) of 'NAME' or 'KIND/NAME'; a path is taken for a world's. UsageError for a name that no
+    kind has."""
+    kind, slash, rest = name.partition("/")
+    if slash and kind in KINDS:
+        return kind, rest
+    kinds = [kind for kind in KINDS if name in preset_names(kind)]
+    for other in kinds[1:]:
+        say(f"there is another one: uuv presets show {other}/{name}")
+    if not kinds and not slash and not Path(name).suffix:
+        known = "; ".join(f"{kind}: {', '.join(names)}" for kind in KINDS if (names := preset_names(kind)))
+        raise UsageError(f"{name!r} is no preset{near(name) or '.'} There are {known}")
+    return (kinds[0] if kinds else "world"), name
 
 
 def near(name: str) -> str:

@@ -60,8 +60,8 @@ def show_profile(screen: Screen, result: dict[str, Any]) -> None:
     stages = list(rows[0]["stages_us_per_env_step"])
     table = [[stage, *(f"{row['stages_us_per_env_step'][stage]:.2f}" for row in rows)] for stage in stages]
     table += [
-        [f"env-steps/s: {told}", *(_rate(row["env_steps_per_s"].get(name)) for row in rows)]
-        for name, told in _RATES.items()
+        [f"env-steps/s: {meaning}", *(_rate(row["env_steps_per_s"].get(name)) for row in rows)]
+        for name, meaning in _RATES.items()
     ]
     table.append(["memory MB", *(f"{row['memory_mb']:,.0f}" for row in rows)])
     table.append(["compile s", *(f"{row['compile_s']:.1f}" for row in rows)])

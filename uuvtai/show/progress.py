@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 from rich.console import Console
 from rich.text import Text
@@ -41,7 +42,7 @@ class Pace:
         return spent / since * todo if since > 0 and is_worth_it else None
 
 
-def told_left(left_s: float | None) -> str:
+def time_left(left_s: float | None) -> str:
     """'ETA 34 s', 'ETA 5 min', or nothing."""
     if left_s is None:
         return ""
@@ -69,7 +70,7 @@ class Progress:
         if sys.stderr.isatty():
             self._bar = _bar()
             self._bar.start()
-            self._task = self._bar.add_task(name, total=total, completed=done, told="")
+            self._task = self._bar.add_task(name, total=total, completed=done, remark="")
 
     def note(self, text: str) -> None:
         """A message for the person who waits."""
@@ -90,7 +91,7 @@ class Progress:
         spent, steps = self._pace.elapsed_s, env_steps - self._env_steps
         speed = f"{steps / spent:,.0f} env-steps/s" if steps and spent > 0 else ""
         self._show(
-            done, ", ".join(part for part in (speed, told_left(self._left_s(done, env_steps, left))) if part)
+            done, ", ".join(part for part in (speed, time_left(self._left_s(done, env_steps, left))) if part)
         )
 
     def _left_s(self, done: int, env_steps: int, left: int | None) -> float | None:
@@ -102,19 +103,35 @@ class Progress:
         steps = env_steps - self._env_steps
         return self._pace.elapsed_s / steps * left if left is not None and steps > 0 else None
 
-    def _show(self, done: int, told: str) -> None:
+    def _show(self, done: int, remark: str) -> None:
         now = time.perf_counter()
         if self._bar is not None:
-            self._bar.update(self._task, completed=done, told=told)
+            self._bar.update(self._task, completed=done, remark=remark)
         elif now - self._last >= _PERIOD_S:
             self._last = now
-            say(f"{self._name}: {done}/{self._total} {self._what}" + (f", {told}" if told else ""))
+            say(f"{self._name}: {done}/{self._total} {self._what}" + (f", {remark}" if remark else ""))
 
     def stop(self) -> None:
         """The job is done."""
         if self._bar is not None:
             self._bar.stop()
             self._bar = None
+
+
+@contextmanager
+def counted(name: str, what: str) -> Iterator[Callable[[int, int], None]]:
+    """A call (done, total) that shows a job whose total is known with its first piece."""
+    progress = Progress(what)
+
+    def update(done: int, total: int) -> None:
+        if done == 1:
+            progress.start(name, total)
+        progress.update(done, total)
+
+    try:
+        yield update
+    finally:
+        progress.stop()
 
 
 def _bar():
@@ -128,7 +145,7 @@ def _bar():
         BarColumn(bar_width=20),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
-        TextColumn("{task.fields[told]}", markup=False),
+        TextColumn("{task.fields[remark]}", markup=False),
         console=Console(stderr=True),
         transient=True,
     )

@@ -15,11 +15,12 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from uuvtai.config import Config
 from uuvtai.files import read_text
-from uuvtai.loader import ConfigError, preset_names, read_preset, validated
+from uuvtai.loader import ConfigError, preset_names, read_preset, sensors_of, validated
 from uuvtai.run_folder import RunFolderError
 
 if TYPE_CHECKING:
     from uuvtai.measure.episodes.methods import Method
+    from uuvtai.scene_options import SceneOptions
 
 FILE = "eval/request.json"
 ORACLE = "oracle"
@@ -50,6 +51,16 @@ class Request:
     explain_record: int = 3
     device: str = "auto"
     run_dir: Path | None = None
+
+    @classmethod
+    def typed(cls, scene: SceneOptions, world: str, policies: list[str], **rest: Any) -> Request:
+        """What a command line asks for: the scene as it was typed, observed as the policies were trained.
+        Raises ConfigError, CheckpointError."""
+        from uuvtai.measure.episodes.methods import features_of
+
+        config = scene.config(features_of(policies) if policies else [])
+        sensors = sensors_of(world, scene.sensors)
+        return cls(config=config, world=world, sensors=sensors, policies=tuple(policies), **rest)
 
 
 class _Document(BaseModel):

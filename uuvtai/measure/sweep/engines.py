@@ -191,3 +191,8 @@ class RayEngine:
                 ) from None
             except self._ray.exceptions.RayTaskError as error:
                 raise error.as_instanceof_cause() from None
+
+
+def engine_of(name: str, workers: int, address: str) -> Engine:
+    """The engine of ``uuv sweep --engine``: 'local' with so many ``workers``, or 'ray' at ``address``."""
+    return LocalEngine(workers) if name == "local" else RayEngine(address)

@@ -8,12 +8,15 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from uuvtai.config import Config
 from uuvtai.loader import ConfigError, load_config
 from uuvtai.measure.sweep.cells import PRESET_AXES, SCENE_AXES, Cell, Grid, checked
 from uuvtai.measure.sweep.tasks import Row, Task
+
+if TYPE_CHECKING:
+    from uuvtai.scene_options import SceneOptions
 
 BATCH = 256
 """episodes side by side in one simulator"""
@@ -41,6 +44,18 @@ class SweepRequest:
     """per seed, cell and method"""
     num_envs: int | None = None
     device: str = "auto"
+
+    @classmethod
+    def typed(cls, scene: SceneOptions, world: str, policies: list[str], **rest: Any) -> SweepRequest:
+        """What a command line asks for, with the scene as it was typed."""
+        return cls(
+            world=world,
+            sensors=scene.sensors,
+            vehicle=scene.vehicle,
+            overrides=tuple(scene.settings),
+            policies=tuple(policies),
+            **rest,
+        )
 
     def document(self) -> dict[str, Any]:
         """As JSON, for the run folder; ``request_of`` reads it."""

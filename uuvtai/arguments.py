@@ -1,0 +1,78 @@
+"""What was typed on the command line as values, or UsageError; which options a resumed run refuses."""
+
+from __future__ import annotations
+
+import math
+
+import typer
+
+from uuvtai.endings import UsageError
+
+
+def seeds(text: str) -> list[int]:
+    """Seeds of ``--seeds``."""
+    return [integer("--seeds", item) for item in text.split(",")]
+
+
+def integer(option: str, text: str) -> int:
+    """A whole number of 32 bits."""
+    try:
+        value = int(text)
+    except ValueError:
+        raise UsageError(
+            f"{option} {text!r}: whole numbers separated by commas, for example {option} 0,1,2"
+        ) from None
+    if not -(2**31) <= value < 2**31:
+        raise UsageError(f"{option} {text}: must fit 32 bits")
+    return value
+
+
+def numbers(option: str, text: str | None, count: int) -> list[float] | None:
+    """``count`` finite numbers, or None where none were typed."""
+    if text is None:
+        return None
+    try:
+        values = [float(item) for item in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != count or not all(math.isfinite(value) for value in values):
+        raise UsageError(
+            f"{option} {text!r}: give {count} finite numbers separated by commas, without spaces"
+        )
+    return values
+
+
+def refuse_less(option: str, value: int, least: int) -> None:
+    """UsageError for a value below ``least``."""
+    if value < least:
+        raise UsageError(f"{option} {value}: must be at least {least}")
+
+
+def controllers(given: list[str] | None, has_policies: bool) -> list[str]:
+    """Names typed with --controller; without any all three, or the tree alone beside a policy."""
+    default = ["bt"] if has_policies else ["straight", "planner", "bt"]
+    names = [name for item in given or default for name in item.split(",") if name]
+    if has_policies and names == ["none"]:
+        return []
+    if not names:
+        raise UsageError("--controller: name at least one of straight, planner, bt or a tree's XML")
+    return names
+
+
+_OF_EVERY_RESUME = ("resume", "with_report", "wide", "as_json")
+
+
+def refuse_beside_resume(ctx: typer.Context, kept: tuple[str, ...] = ()) -> None:
+    """UsageError for what was typed, be it a default's value, that a resumed run keeps as it was; ``kept``:
+    parameters of the command that count for the rest of the run."""
+    for parameter in ctx.command.params:
+        name = parameter.name or ""
+        source = ctx.get_parameter_source(name)
+        if name in (*_OF_EVERY_RESUME, *kept) or source is None or source.name != "COMMANDLINE":
+            continue
+        is_option = parameter.param_type_name == "option"
+        what = parameter.opts[0] if is_option else str(getattr(parameter, "metavar", "")).strip("[].")
+        raise UsageError(
+            f"{what} {ctx.params[name]}: a resumed run keeps its own; leave it out, or begin a new run "
+            "without --resume"
+        )

@@ -1,0 +1,313 @@
+"""What may be typed after a command of ``uuv``: each argument and option once, with help and completion."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from typer import Argument, Option
+
+from uuvtai.show import choices
+
+_WORLDS, _SENSORS, _VEHICLES = (choices.names(kind) for kind in ("world", "sensors", "vehicle"))
+_NAME = "NAME|FILE"
+
+
+def _preset(option: str, kind: str, help_text: str) -> Any:
+    return Option(option, metavar=_NAME, help=help_text, autocompletion=choices.presets(kind))
+
+
+def _tree(help_text: str) -> Any:
+    complete = choices.presets("tree", suffix=".xml")
+    text = f"{help_text}: {choices.names('tree')}, or an XML file."
+    return Option("--controller", metavar=_NAME, help=text, autocompletion=complete)
+
+
+def _resume(help_text: str) -> Any:
+    return Option("--resume", help=help_text, autocompletion=choices.runs)
+
+
+def _players(metavar: str, help_text: str) -> Any:
+    return Argument(metavar=metavar, help=help_text, autocompletion=choices.policies)
+
+
+def _controllers(help_text: str) -> Any:
+    return Option("--controller", metavar=_NAME, help=help_text, autocompletion=choices.controllers)
+
+
+# ------------------------------------------------------------------------------------------------ of several
+
+World = Annotated[str, _preset("--world", "world", f"World: {_WORLDS}, or a YAML file.")]
+Sensors = Annotated[
+    str | None,
+    _preset(
+        "--sensors",
+        "sensors",
+        f"Sensors: {_SENSORS}, or a YAML file \\[default: the world's own, else paper].",
+    ),
+]
+Vehicle = Annotated[
+    str | None,
+    _preset(
+        "--vehicle",
+        "vehicle",
+        f"Vehicle: {_VEHICLES}, or a YAML file \\[default: the world's own, else bluerov2].",
+    ),
+]
+Static = Annotated[int | None, Option("-S", help="Static obstacles.")]
+Dynamic = Annotated[int | None, Option("-D", help="Moving obstacles.")]
+Speed = Annotated[float | None, Option("-v", help="Speed of the moving obstacles \\[m/s].")]
+Stack = Annotated[
+    str | None,
+    _preset(
+        "--stack",
+        "stack",
+        f"How the classical half works: {choices.names('stack')} (as in the paper), or a YAML file "
+        "\\[default: ours].",
+    ),
+]
+Set = Annotated[
+    list[str] | None,
+    Option("--set", metavar="KEY=VALUE", help="Override a config key: key.sub=value (repeatable)."),
+]
+Device = Annotated[str, choices.device()]
+RunDir = Annotated[Path | None, Option("--run-dir", help="The run's folder \\[default: runs/TIME_PRESET].")]
+WithReport = Annotated[bool, Option("--report", help="Also write the run's report.html.")]
+Wide = Annotated[
+    bool, Option("--wide", help="Show every column of a table, though the terminal be narrower.")
+]
+AsJson = Annotated[bool, Option("--json", help="Print one JSON document and nothing else on stdout.")]
+Seeds = Annotated[str, Option("--seeds", "--seed", help="Seeds, separated by commas.")]
+Batch = Annotated[
+    int | None, Option("--num-envs", help="Episodes played together \\[default: as many as sensible].")
+]
+
+# ------------------------------------------------------------------------------------------------------- eval
+
+EvalRuns = Annotated[
+    list[str] | None,
+    _players(
+        "RUN",
+        f"Trained policies: run folders, checkpoint folders or shipped names ({choices.names('policy')}).",
+    ),
+]
+EvalControllers = Annotated[
+    list[str] | None,
+    _controllers(
+        "straight, planner, bt or a tree's XML (repeatable); paper = bt on the paper's own stack, a "
+        "row of its own; "
+        "none = policies alone \\[default: straight, planner, bt, beside a RUN bt]. "
+        "Privileged yardsticks: NAME+truth (a tree that knows where every moving body is), oracle (knows "
+        "the future: an upper bound).",
+    ),
+]
+EvalEpisodes = Annotated[int, Option("--episodes", help="Episodes per seed.")]
+Record = Annotated[
+    int, Option("--record", help="Record the first K episodes of every method as MCAP with a picture.")
+]
+Video = Annotated[bool, Option("--video", help="Also a top-down video of every recorded episode.")]
+DepthImages = Annotated[bool, Option("--depth-images", help="Also record the depth camera (2 Hz).")]
+Explain = Annotated[
+    bool,
+    Option(
+        "--explain",
+        help="Label the cause of every failure, judged from the truth: which sense or decision failed.",
+    ),
+]
+ExplainRecord = Annotated[
+    int | None,
+    Option(
+        "--explain-record",
+        help="With --explain: log, picture, video of N of the worst failures per method \\[default: 3].",
+    ),
+]
+EvalResume = Annotated[Path | None, _resume("Run folder of an interrupted evaluation to go on with.")]
+
+# ------------------------------------------------------------------------------------------------------ train
+
+TrainPreset = Annotated[
+    str | None,
+    Argument(
+        metavar="PRESET",
+        help=f"Training preset: {choices.names('train')}, or a YAML file \\[default: best].",
+        autocompletion=choices.presets("train"),
+    ),
+]
+TrainResume = Annotated[Path | None, _resume("Run folder to go on with, with its own config.")]
+Iterations = Annotated[
+    int | None,
+    Option(
+        "--iterations",
+        help="Stop when so many are done in all; schedules run over train.iterations in any case.",
+    ),
+]
+TrainEnvs = Annotated[int | None, Option("--num-envs", help="Envs stepped together (train.num_envs).")]
+TrainSeed = Annotated[
+    int | None, Option("--seed", help="Seed of networks, exploration and scenarios (train.seed).")
+]
+TrainWorld = Annotated[
+    str | None,
+    _preset("--world", "world", f"World: {_WORLDS}, or a YAML file \\[default: the training preset's]."),
+]
+TrainSensors = Annotated[
+    str | None,
+    _preset(
+        "--sensors", "sensors", f"Sensors: {_SENSORS}, or a YAML file \\[default: the training preset's]."
+    ),
+]
+
+# --------------------------------------------------------------------------------------------------- simulate
+
+SimulateSeconds = Annotated[float, Option("--seconds", help="Duration \\[s].")]
+SimulateVehicle = Annotated[str, _preset("--vehicle", "vehicle", f"Vehicle: {_VEHICLES}, or a YAML file.")]
+AttitudeHold = Annotated[
+    str | None,
+    choices.choice(
+        "--attitude-hold",
+        ("ideal", "thrusters", "none"),
+        "What holds roll and pitch \\[default: the vehicle's own].",
+    ),
+]
+Wrench = Annotated[str | None, Option("--wrench", help="Constant body wrench fx,fy,fz,mx,my,mz [N, N m].")]
+Command = Annotated[
+    str | None, Option("--command", help="Body velocity command u,v,w,r \\[m/s, rad/s] for the inner loop.")
+]
+Current = Annotated[str | None, Option("--current", help="Water velocity x,y,z \\[m/s].")]
+InitialRpy = Annotated[str | None, Option("--initial-rpy-deg", help="Roll, pitch, yaw \\[deg].")]
+InitialVelocity = Annotated[str | None, Option("--initial-velocity", help="u,v,w,p,q,r \\[m/s, rad/s].")]
+Neutral = Annotated[bool, Option("--neutral", help="Buoyancy equal to weight.")]
+Substep = Annotated[float, Option("--dt", help="Dynamics substep \\[s].")]
+
+# ------------------------------------------------------------------------------------------------------ sweep
+
+SweepRuns = Annotated[list[str] | None, _players("[RUN]...", "Trained policies, as for eval.")]
+SweepControllers = Annotated[
+    list[str] | None,
+    _controllers("straight, planner, bt or a tree's XML (repeatable) \\[default: bt]."),
+]
+GridAxes = Annotated[
+    list[str] | None,
+    Option(
+        "--grid",
+        metavar="NAME|AXIS=VALUES",
+        help="AXIS=value,value,.. (repeatable: S, D, v, sensors, vehicle, any config key) or a preset: "
+        f"{choices.names('grid')} \\[default: paper].",
+        autocompletion=choices.grids,
+    ),
+]
+SweepEpisodes = Annotated[int, Option("--episodes", help="Episodes per seed, cell and method.")]
+EngineName = Annotated[
+    str, choices.choice("--engine", ("local", "ray"), "Who works: processes on this machine, or a cluster.")
+]
+Workers = Annotated[int, Option("--workers", help="Processes of the local engine.")]
+Address = Annotated[
+    str, Option("--address", help="Ray cluster: host:port, auto, or local (inside this process).")
+]
+SweepResume = Annotated[Path | None, _resume("Run folder of a sweep to go on with.")]
+
+# ----------------------------------------------------------------------------------------- profile, reproduce
+
+BatchSizes = Annotated[str, Option("--num-envs", help="Batch sizes, separated by commas.")]
+TickedTree = Annotated[str, _tree("Tree that is ticked")]
+ProfilePreset = Annotated[
+    str,
+    _preset(
+        "--preset",
+        "train",
+        f"What learns in the rate with training: {choices.names('train')}, or a YAML file.",
+    ),
+]
+ProfileSeconds = Annotated[float, Option("--seconds", help="Measured time per batch size \\[s].")]
+Density = Annotated[bool, Option("--density", help="Also loop time against D.")]
+BudgetName = Annotated[
+    str, choices.choice("--budget", ("quick", "full"), "How much: half an hour on two cores, or overnight.")
+]
+ReproduceResume = Annotated[Path | None, _resume("Run folder of a reproduction to go on with.")]
+
+# --------------------------------------------------------------------------------------------- report, export
+
+ReportRuns = Annotated[
+    list[Path],
+    Argument(
+        metavar="RUN...",
+        help="Run folders; several make one page: trainings are compared, the rest follows.",
+    ),
+]
+ReportOut = Annotated[
+    Path | None, Option("--out", help="The page \\[default: RUN/report.html]; figures/ is made beside it.")
+]
+ReportForce = Annotated[bool, Option("--force", help="Replace files that are there already.")]
+ExportRun = Annotated[str | None, _players("[RUN]", "Run folder, checkpoint folder or shipped name (best).")]
+ExportOut = Annotated[Path | None, Option("--out", help="New folder \\[default: runs/NAME_export].")]
+ExportEvaluation = Annotated[
+    list[Path] | None,
+    Option("--evaluation", help="Run folder of 'uuv eval RUN': counts for the model card (repeatable)."),
+]
+ExportCheck = Annotated[
+    Path | None, Option("--check", help="Verify an exported folder instead: sha256 and golden pairs.")
+]
+ExportForce = Annotated[bool, Option("--force", help="Replace the exported policy that --out names.")]
+
+# ---------------------------------------------------------------------------------------------- presets, tree
+
+PresetsAction = Annotated[
+    str | None,
+    Argument(
+        metavar="show",
+        help="'show' to print one preset as it is written.",
+        autocompletion=lambda: ["show"],
+    ),
+]
+PresetName = Annotated[
+    str | None,
+    Argument(
+        metavar="NAME",
+        help="Preset to show; KIND/NAME where two kinds have one of that name.",
+        autocompletion=choices.shown,
+    ),
+]
+Everything = Annotated[
+    bool,
+    Option(
+        "--all",
+        help="With show: every key that the preset gives, its own, those it builds on, and the defaults.",
+    ),
+]
+EvaluatedRun = Annotated[
+    Path | None,
+    Argument(
+        metavar="RUN",
+        help="Run folder of an evaluation; without one, the tree alone.",
+        autocompletion=choices.evaluations,
+    ),
+]
+ShownTree = Annotated[str, _tree("Tree")]
+Dot = Annotated[bool, Option("--dot", help="Print Graphviz DOT instead.")]
+
+# -------------------------------------------------------------------------------------------------------- log
+
+LogFile = Annotated[Path, Argument(help="An .mcap file.")]
+LogFiles = Annotated[list[Path], Argument(help="Logs of the same episode; trajectories are overlaid.")]
+LogForce = Annotated[bool, Option("--force", help="Replace the file that --out names.")]
+LogExportOut = Annotated[Path, Option("--out", help="New or empty folder for the exported files.")]
+Topics = Annotated[list[str] | None, Option("--topic", help="Only these topics (repeatable).")]
+LogFormat = Annotated[str, Option("--format", help="json (a line a message), csv or npz (NumPy arrays).")]
+RepairOut = Annotated[Path | None, Option("--out", help="Repaired file \\[default: NAME.repaired.mcap].")]
+ConvertOut = Annotated[Path | None, Option("--out", help="New file \\[default: NAME.protobuf.mcap].")]
+VideoOut = Annotated[
+    Path | None,
+    Option(
+        "--out", help="Its ending says the format: .webm, .mp4 or .gif \\[default: the log's name, .webm]."
+    ),
+]
+VideoSpeed = Annotated[float, Option("--speed", help="Times as fast as it was.")]
+VideoFps = Annotated[float | None, Option("--fps", help="Frames per second \\[default: 15, GIF 10].")]
+VideoWidth = Annotated[int | None, Option("--width", help="Width \\[px] \\[default: 1280, GIF 800].")]
+PictureOut = Annotated[
+    Path | None,
+    Option(
+        "--out",
+        help="Its ending says the format: .png, .pdf or .svg \\[default: the first log's name, .png].",
+    ),
+]
+WithClearance = Annotated[bool, Option("--clearance", help="Colour the clearance field.")]
