@@ -9,9 +9,10 @@ from tests.report_samples import robustness_sweep
 from uuvtai.loader import preset_names
 from uuvtai.measure.reproduce import claims, paper, paper_run, steps
 from uuvtai.measure.reproduce.claims import FAILS, HOLDS, OPEN, Share
-from uuvtai.measure.reproduce.markdown import _sweep, results_page, table
+from uuvtai.measure.reproduce.markdown import _sweep, results_page
 from uuvtai.measure.reproduce.paper_run import reproduce, resume
 from uuvtai.run_folder import RunFolderError
+from uuvtai.tables.table import text_table
 
 
 def alone(finding):
@@ -353,4 +354,4 @@ def test_a_sweep_of_one_axis_at_a_time_is_a_row_a_change():
 
 
 def test_tables_are_markdown():
-    assert table(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | --- |\n| 1 | 2 |"
+    assert text_table(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | --- |\n| 1 | 2 |"

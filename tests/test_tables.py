@@ -17,10 +17,11 @@ from uuvtai.show.health import show_checks
 from uuvtai.show.logs import show_log
 from uuvtai.show.presets import sentences, show_presets
 from uuvtai.show.profile import show_profile
-from uuvtai.show.screen import Column, Screen
+from uuvtai.show.screen import Screen
 from uuvtai.show.simulation import show_simulation
 from uuvtai.show.sweeping import show_sweep
-from uuvtai.show.verdicts import show_claims
+from uuvtai.tables.claim_table import claim_table
+from uuvtai.tables.table import PAGE, TERMINAL, Cell, Column, Table, markdown
 
 WIDTHS = (80, 100, 120)
 CONDITION = {
@@ -102,7 +103,7 @@ SHOWS = {
     "export": (lambda s: show_export(s, Exported), ["engine"]),
     "log": (lambda s: show_log(s, LOG, "x" * 200 + ".mcap"), ["topic", "messages", "Hz"]),
     "doctor": (lambda s: show_checks(s, CHECKS), []),
-    "claims": (lambda s: show_claims(s, CLAIMS), ["claim", "the paper", "here", "verdict"]),
+    "claims": (lambda s: s.table(claim_table(CLAIMS)), ["claim", "the paper", "here", "verdict"]),
     "presets": (show_presets, ["gauntlet", "policy"]),
 }
 PROFILE = samples.PROFILE | {
@@ -176,18 +177,22 @@ def test_a_file_is_wide(capsys):
 
 
 def test_essential_cells_that_have_no_room_go_on_in_the_next_line():
-    text = shown(lambda s: s.table([Column("a", left=True), Column("b")], [["x" * 50, "1"], ["y", "2"]]), 30)
+    text = shown(
+        lambda s: s.table(Table([Column("a", left=True), Column("b")], [["x" * 50, "1"], ["y", "2"]])), 30
+    )
     assert text.count("x") == 50 and max(map(len, text.splitlines())) <= 30 and "…" not in text
 
 
 def test_prose_is_wrapped_before_columns_are_left_out():
     columns = [Column("name", left=True), Column("n", 1), Column("meaning", 0, prose=True)]
-    text = shown(lambda s: s.table(columns, [["a", "12345", "some words " * 12]]), 60)
+    text = shown(lambda s: s.table(Table(columns, [["a", "12345", "some words " * 12]])), 60)
     assert "12345" in text and text.count("words") == 12
 
 
 def test_what_a_file_brought_along_is_no_markup_and_steers_nothing():
-    text = shown(lambda s: s.table([Column("[red]", left=True)], [["[/x] \x1b[2J"]], "[/no] [bold]"), 80)
+    text = shown(
+        lambda s: s.table(Table([Column("[red]", left=True)], [["[/x] \x1b[2J"]], "[/no] [bold]")), 80
+    )
     assert "[/x] ?[2J" in text and "[red]" in text and "[/no] [bold]" in text
 
 
@@ -221,3 +226,24 @@ def test_every_preset_has_a_sentence():
             assert said.endswith(".") and 15 < len(said) < 250 and not said.startswith(("#", "<")), (
                 f"{kind}/{name}: {said}"
             )
+
+
+def test_one_table_is_shown_in_the_terminal_and_on_a_page_each_in_its_way():
+    columns = [
+        Column("name", left=True, of=lambda row: row["name"]),
+        Column("time to goal s", short="time", of=lambda row: Cell(row["time"], "short")),
+        Column("terminal's", only=TERMINAL, of=lambda row: row["terminal"]),
+        Column("page's", only=PAGE, of=lambda row: row["page"]),
+    ]
+    row = {"name": "a|b", "time": "in full"}
+    assert markdown(Table(columns, [row | {"page": "p"}], "title")) == (
+        "| name | time to goal s | page's |\n| --- | --- | --- |\n| a\\|b | in full | p |"
+    )
+    title, head, _rule, line = shown(
+        lambda s: s.table(Table(columns, [row | {"terminal": "t"}], "title")), 80
+    ).splitlines()
+    assert (title.strip(), head.split(), line.split()) == (
+        "title",
+        ["name", "time", "terminal's"],
+        ["a|b", "short", "t"],
+    )

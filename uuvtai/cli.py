@@ -296,14 +296,14 @@ def reproduce(
 ) -> None:
     """Train, evaluate, sweep and profile whatever the paper shows, and judge each of its claims."""
     from uuvtai.measure.reproduce import paper_run
-    from uuvtai.show.verdicts import show_claims
+    from uuvtai.tables.claim_table import claim_table
 
     if resume is not None:
         arguments.refuse_beside_resume(ctx, ("budget",))
         result, folder = paper_run.resume(resume, Progress())
     else:
         result, folder = paper_run.reproduce(budget, run_dir, Progress())
-    _print(result, as_json, lambda: show_claims(Screen(wide), result), folder)
+    _print(result, as_json, lambda: Screen(wide).table(claim_table(result)), folder)
 
 
 # --------------------------------------------------------------------------------------------- report, export

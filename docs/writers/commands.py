@@ -7,8 +7,9 @@ import re
 import typer
 from typer.cli import get_docs_for_click
 
-from docs.writers.markdown import contents, table
+from docs.writers.markdown import contents
 from uuvtai import cli, endings
+from uuvtai.tables.table import text_table
 
 SEE = {
     "eval": ("quickstart", "ceilings", "viewers", "determinism"),
@@ -89,9 +90,9 @@ def _list() -> str:
             "# Commands",
             "Results go to stdout, progress and messages to stderr. `--json` prints one document and nothing "
             "else on stdout.",
-            table(["command", "does"], rows),
+            text_table(["command", "does"], rows),
             "## Exit codes",
-            table(["code", "meaning"], codes),
+            text_table(["code", "meaning"], codes),
             contents([f"commands/{name}" for name in root.commands]),
         ]
     )

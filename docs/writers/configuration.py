@@ -12,10 +12,11 @@ from typing import Any, get_args
 
 from pydantic import BaseModel
 
-from docs.writers.markdown import contents, table
+from docs.writers.markdown import contents
 from uuvtai import loader
 from uuvtai.config.learning import LearningConfig
 from uuvtai.config.section import LARGEST, MOST, SMALLEST
+from uuvtai.tables.table import text_table
 
 Schema = dict[str, Any]
 Model = type[BaseModel]
@@ -62,7 +63,7 @@ def _list() -> str:
             "are immutable once they are "
             "loaded. `uuv presets show NAME --all` prints a preset with every key. Steps are control steps "
             "(`episode.control_dt_s`).",
-            table(["section", "holds"], rows),
+            text_table(["section", "holds"], rows),
             contents([f"configuration/{name}" for name in LearningConfig.model_fields]),
         ]
     )
@@ -75,7 +76,7 @@ def _page(name: str) -> str:
         for (key, value), presets in sorted(_set_by(name).items())
     ]
     if rows:
-        parts += ["## Presets that set it", table(["key", "value", "presets"], rows)]
+        parts += ["## Presets that set it", text_table(["key", "value", "presets"], rows)]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
@@ -95,7 +96,9 @@ def _tables(path: str, model: Model) -> list[str]:
     }
     single = [key for key, found in inner.items() if model.model_fields[key].annotation is found]
     rows = [_row(key, schema[key], told.get(key, "")) for key in model.model_fields if key not in single]
-    parts = [_about(model)] + ([table(["key", "type", "default", "unit", "meaning"], rows)] if rows else [])
+    parts = [_about(model)] + (
+        [text_table(["key", "type", "default", "unit", "meaning"], rows)] if rows else []
+    )
     for key, found in inner.items():
         parts += [
             f"## `{path}.{key}`" + ("" if key in single else ", each"),

@@ -9,9 +9,9 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from docs.writers.figure_sources import Counts, SourceError, Sources, fitting, pooled, weighted
-from docs.writers.markdown import table
 from uuvtai.measure.reproduce import paper
 from uuvtai.measure.reproduce.steps import RETIRED_SEEDS
+from uuvtai.tables.table import text_table
 
 DASH = "-"
 """what was not measured or not kept"""
@@ -60,7 +60,7 @@ def evaluations(sources: Sources) -> str:
         "`straight`",
         "most frequent causes of failure",
     ]
-    return table(head, [_evaluated(entry) for entry in sources.evaluations()["rows"]])
+    return text_table(head, [_evaluated(entry) for entry in sources.evaluations()["rows"]])
 
 
 def _evaluated(entry: dict[str, Any]) -> list[str]:
@@ -112,7 +112,7 @@ def policy(sources: Sources) -> str:
             rated(methods[name], ending) for ending in ("success", "collision") for name in ("bt", "best")
         ]
         rows.append([entry["title"], *cells, f"{only[0]}, {only[1]}", f"{pair['mcnemar_p']:.2g}"])
-    return table(head, rows) if rows else "Not among the evaluations that are shown."
+    return text_table(head, rows) if rows else "Not among the evaluations that are shown."
 
 
 # ----------------------------------------------------------------------------------------------------- sweeps
@@ -143,7 +143,7 @@ def grid(sources: Sources) -> str:
         *_pooled_rows(sources, "gauntlet", "`gauntlet`, S <= 8, D <= 9, v <= 1.5: ", ("moderate",), True),
         *_pooled_rows(sources, "gauntlet", "`gauntlet`, all cells: ", ()),
     ]
-    return table(head, rows)
+    return text_table(head, rows)
 
 
 def _pooled_rows(
@@ -219,7 +219,7 @@ def caution(sources: Sources) -> str:
             "",
         ]
     )
-    return table(["caution", "success [95 %]", "collision [95 %]", "weighted", "time to success"], rows)
+    return text_table(["caution", "success [95 %]", "collision [95 %]", "weighted", "time to success"], rows)
 
 
 def alone(sources: Sources) -> str:
@@ -253,7 +253,7 @@ def alone(sources: Sources) -> str:
         "timeouts",
         "time",
     ]
-    return table(
+    return text_table(
         head,
         [[told, *_alone(methods.get("bt")), *_alone(methods.get("best"))] for told, methods in found.items()],
     )
@@ -287,7 +287,9 @@ def learning_cost(sources: Sources) -> str:
                 f"{row['peer']:,.0f}",
             ]
         )
-    return table(["sensing", "env-steps/s", "floor", "simulate", "infer", "learn", "Stable-Baselines3"], rows)
+    return text_table(
+        ["sensing", "env-steps/s", "floor", "simulate", "infer", "learn", "Stable-Baselines3"], rows
+    )
 
 
 def world_model_errors(sources: Sources) -> str:
@@ -311,7 +313,9 @@ def world_model_errors(sources: Sources) -> str:
                 found[4],
             ]
         )
-    return table(["targets", "RMSE", '"as before"', "ratio, 95 %", "squared standardised residual"], rows)
+    return text_table(
+        ["targets", "RMSE", '"as before"', "ratio, 95 %", "squared standardised residual"], rows
+    )
 
 
 _SWITCHES = {
@@ -330,7 +334,7 @@ def world_model_switches(sources: Sources) -> str:
     columns = _row(sources, "world_model", "switches")["details"]["table"]
     traits = [*list(columns["all on"])[:9], "latent spread"]
     rows = [[title, *(_short(columns[name][trait]) for trait in traits)] for name, title in _SWITCHES.items()]
-    return table(["", *(trait.removeprefix("RMSE ") for trait in traits)], rows)
+    return text_table(["", *(trait.removeprefix("RMSE ") for trait in traits)], rows)
 
 
 def _short(value: float) -> str:
@@ -360,7 +364,7 @@ def risk(sources: Sources) -> str:
         ],
         ["alarm in safe moments", f"{found[7]} %", ""],
     ]
-    return table(["", "head", "beside"], rows)
+    return text_table(["", "head", "beside"], rows)
 
 
 def risk_bins(sources: Sources) -> str:
@@ -370,7 +374,7 @@ def risk_bins(sources: Sources) -> str:
         [name, *(f"{value:.2f}" for value in columns[name].values())] for name in ("predicted", "observed")
     ]
     rows.append(["moments", *(f"{value:.0f}" for value in columns["moments"].values())])
-    return table(rows[0], rows[1:])
+    return text_table(rows[0], rows[1:])
 
 
 def _row(sources: Sources, what: str, text: str) -> dict[str, Any]:

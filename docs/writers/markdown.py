@@ -1,4 +1,4 @@
-"""Markdown, the MyST kind: tables and lists of pages to write, shell blocks to read."""
+"""Markdown, the MyST kind: lists of pages to write, shell blocks to read."""
 
 from __future__ import annotations
 
@@ -6,16 +6,6 @@ import re
 from collections.abc import Iterator, Sequence
 
 FENCE = re.compile(r"^(<!-- (?P<mark>run) -->\n)?```(?P<language>\w*)\n(?P<body>.*?)^```", re.M | re.S)
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table; what would break its cells is escaped."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(_cell(cell) for cell in line) + " |" for line in lines)
-
-
-def _cell(text: str) -> str:
-    return " ".join(text.split()).replace("|", r"\|")
 
 
 def contents(names: Sequence[str]) -> str:

@@ -14,7 +14,7 @@ from typing import Any
 
 from docs.writers.figure_sources import ROOT
 from uuvtai.measure.reproduce.markdown import results_page
-from uuvtai.report.heatmap import cell_name
+from uuvtai.tables.heatmap import cell_name
 
 DATA, PAGE = "docs/data/reproduce.json", "docs/results.md"
 

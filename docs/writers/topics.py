@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from docs.writers.markdown import table
 from uuvtai.logs import schemas
 from uuvtai.logs.mcap_log import DEPTH_HZ, MAP_HZ, OBSTACLE_HZ, topic_schemas
+from uuvtai.tables.table import text_table
 
 STEP, SCAN, MAPS = "every control step", "every new scan", f"{MAP_HZ:g} Hz, on every replan, and at the end"
 WHEN = {
@@ -61,7 +61,7 @@ def page() -> str:
         "own follow below. Attachments: `config.yaml`, `scenario.json`. Metadata: `uuv.run`, `uuv.result`. "
         "What opens a log: "
         "[viewers](../viewers.md).",
-        table(["topic", "schema", "written"], rows),
+        text_table(["topic", "schema", "written"], rows),
     ]
     for topic, schema in own.items():
         parts += [
@@ -77,7 +77,7 @@ def _fields(topic: str, schema: schemas.Schema) -> list[str]:
     for pattern, field in schema.get("patternProperties", {}).items():
         inner = field["anyOf"][0]
         rows.append([f"`{pattern.strip('^$')}`", f"{_type(inner)} or null", _told(inner)])
-    fixed = [table(["field", "type", "meaning"], rows)] if rows else []
+    fixed = [text_table(["field", "type", "meaning"], rows)] if rows else []
     return fixed + ([VARIABLE[topic]] if topic in VARIABLE else [])
 
 

@@ -2,33 +2,17 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from uuvtai.tables.table import Data, Table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 Hover = dict[str, str]
 """id of a drawn thing -> what is shown while the pointer is over it"""
-
-
-@dataclass(frozen=True)
-class Data:
-    """Numbers behind a figure or a table, as a spreadsheet would take them."""
-
-    columns: Sequence[str]
-    rows: Sequence[Sequence[Any]]
-
-    def csv(self) -> str:
-        """The numbers as CSV (RFC 4180) with a header line; None is an empty field."""
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(self.columns)
-        writer.writerows(self.rows)
-        return text.getvalue()
 
 
 @dataclass(frozen=True)
@@ -50,22 +34,6 @@ class Notice:
     """A paragraph that must not be overlooked."""
 
     text: str
-
-
-@dataclass(frozen=True)
-class Table:
-    """Cells as they are shown; the first ``n_left`` columns hold words and are set flush left."""
-
-    columns: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    caption: str = ""
-    n_left: int = 1
-    data: Data | None = None
-    """the same as numbers, for download"""
-    folded: bool = False
-    """long: shown when asked for"""
-    swatches: Sequence[str] = ()
-    """colour of each row, '#rrggbb': the one that its method has in the figures; none = no colours"""
 
 
 @dataclass(frozen=True)

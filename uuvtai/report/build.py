@@ -24,6 +24,7 @@ from uuvtai.report.run_files import read_config, read_json, read_lines
 from uuvtai.report.sweep import sweep
 from uuvtai.report.timing import timing
 from uuvtai.run_folder import RunFolderError, write_atomic
+from uuvtai.tables.table import Table
 
 _NOTHING = (
     "has nothing to report yet: no eval/result.json, metrics.jsonl, sweep.json, profile.json or "
@@ -65,7 +66,7 @@ def report(runs: list[Path], out: Path | None = None, force: bool = False) -> Re
             f"{target}: is a folder; give the page a name, for example --out {target / 'report.html'}"
         )
     _refuse_place(target, runs, force)
-    with _told(runs[0] if len(runs) == 1 else target):
+    with _damage_named(runs[0] if len(runs) == 1 else target):
         page = _of_several(runs) if len(runs) > 1 else _of_run(runs[0])
         html, pngs = render(replace(page, sections=shared(page.sections)))
     figures = [target.parent / FIGURES / f"{name}.png" for name in pngs]
@@ -149,7 +150,7 @@ def _of_several(runs: list[Path]) -> Page:
 def _named_after(run: Path, trainings: list[Path]) -> list[PageSection]:
     """Sections of one of several folders. An evaluation says which of the trainings its policies come
     from."""
-    with _told(run):
+    with _damage_named(run):
         sections = content(run)
         methods = (read_json(run, "eval/result.json") or {}).get("methods", [])
     if not sections:
@@ -188,12 +189,17 @@ def content(run: Path) -> list[PageSection]:
         ),
         PageSection("Episodes", media(run, result)),
     ]
-    return [section for section in found if section.blocks]
+    return [replace(one, blocks=_filled(one.blocks)) for one in found if one.blocks]
+
+
+def _filled(blocks: Sequence[Block]) -> list[Block]:
+    """Cells are made here, where a damaged document is refused with the folder that it lies in."""
+    return [block.filled("page") if isinstance(block, Table) else block for block in blocks]
 
 
 def _nested(run: Path) -> list[Block]:
     """Blocks of a run folder within a reproduction, the figures named after it."""
-    with _told(run):
+    with _damage_named(run):
         blocks = [block for section in content(run) for block in section.blocks]
     if not blocks:
         raise ConfigError(f"{run}: {_NOTHING}")
@@ -214,8 +220,8 @@ def _training_of(run: Path) -> Training:
 
 
 @contextmanager
-def _told(run: Path) -> Iterator[None]:
-    """A document that lacks what its schema promises is told as such, with the folder that it lies in."""
+def _damage_named(run: Path) -> Iterator[None]:
+    """A document that lacks what its schema promises is refused with the folder that it lies in."""
     try:
         yield
     except UserError:

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 from uuvtai.report.blocks import Hover, Panel
 from uuvtai.report.colours import SERIES, ink_on, method_colours, shade
-from uuvtai.report.heatmap import HeatMap, Place
 from uuvtai.report.ink import INK
-from uuvtai.report.wording import axis_name, number, percent, rate, value_name
+from uuvtai.tables.heatmap import HeatMap, Place, place_of
+from uuvtai.tables.wording import axis_name, number, percent, rate, value_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -114,21 +114,6 @@ def rates_text(cell: dict[str, Any]) -> str:
         if (share := cell.get(f"{name}_rate")) is not None
     ]
     return "\n".join([*rates, f"mean time to success {number(cell.get('time_to_success_mean_s'))} s"])
-
-
-def place_of(cell: dict[str, Any]) -> dict[str, Any]:
-    """Axes of a cell with their values: every key that is no result (values of config keys may be lists)."""
-    plain = {key: value for key, value in cell.items() if "." in key or not isinstance(value, dict | list)}
-    return {key: value for key, value in plain.items() if key not in _RESULTS and value is not None}
-
-
-_RESULTS = {
-    "method", "episodes", "outcomes", "k", "n", "success_rate", "success_ci95", "collision_rate",
-    "collision_ci95", "time_mean_s",
-    "tts_s", "time_to_success_mean_s", "return_mean", "env_steps", "wall_s", "env_steps_per_s",
-    "min_clearance_mean_m",
-    "path_length_mean_m", "replans_per_episode",
-}  # fmt: skip
 
 
 def _group_begins(chosen: HeatMap) -> list[int]:

@@ -4,17 +4,18 @@ mean line with a band."""
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 from uuvtai.loader import parsed_yaml
-from uuvtai.report.blocks import Block, Data, Figure, Prose, Table
+from uuvtai.report.blocks import Block, Figure, Prose
 from uuvtai.report.colours import method_colours
 from uuvtai.report.figures import Line, curves
-from uuvtai.report.wording import number, percent, rate
 from uuvtai.statistics import wilson_interval
+from uuvtai.tables.table import Cell, Column, Data, Table
+from uuvtai.tables.wording import number, percent, rate
 
 Metrics = list[dict[str, Any]]
 
@@ -147,41 +148,7 @@ def _points(line: Line) -> list[list[float]]:
     ]
 
 
-def _last_table(methods: Sequence[MethodRuns]) -> Table:
-    columns = [
-        "training",
-        "iterations",
-        "env-steps",
-        "reward",
-        "success",
-        "collision",
-        "success in evaluation",
-        "env-steps/s",
-    ]
-    rows = []
-    for method in methods:
-        for run in method.runs:
-            last = run.metrics[-1]
-            rows.append(
-                [
-                    run.name,
-                    number(last.get("iteration"), 0),
-                    number(last.get(_STEPS), 0),
-                    number(last.get("rollout/ep_rew_mean"), 2),
-                    percent(last.get("rollout/success_rate")),
-                    percent(last.get("rollout/collision_rate")),
-                    _judged(run),
-                    number(last.get("time/env_steps_per_s"), 0),
-                ]
-            )
-    colours = method_colours([method.name for method in methods])
-    swatches = [colours[method.name] for method in methods for _ in method.runs]
-    return Table(
-        columns, rows, "Where each training ended: the record of its last iteration", swatches=swatches
-    )
-
-
-def _judged(run: Training) -> str:
+def _judged(run: Training) -> str | Cell:
     """Success in the last evaluation in between, with its count and interval; the config says of how many
     episodes."""
     shares = [row["eval/success_rate"] for row in run.metrics if _is_number(row.get("eval/success_rate"))]
@@ -190,3 +157,28 @@ def _judged(run: Training) -> str:
         return percent(shares[-1] if shares else None)
     k = round(shares[-1] * n)
     return rate(k, n, wilson_interval(k, n))
+
+
+def _last(key: str, form: Callable[..., str], *digits: int) -> Callable[[Training], str]:
+    return lambda run: form(run.metrics[-1].get(key), *digits)
+
+
+_LAST = (
+    Column("training", left=True, of=lambda run: run.name),
+    Column("iterations", of=_last("iteration", number, 0)),
+    Column("env-steps", of=_last(_STEPS, number, 0)),
+    Column("reward", of=_last("rollout/ep_rew_mean", number, 2)),
+    Column("success", of=_last("rollout/success_rate", percent)),
+    Column("collision", of=_last("rollout/collision_rate", percent)),
+    Column("success in evaluation", of=_judged),
+    Column("env-steps/s", of=_last("time/env_steps_per_s", number, 0)),
+)
+
+
+def _last_table(methods: Sequence[MethodRuns]) -> Table:
+    colours = method_colours([method.name for method in methods])
+    swatches = [colours[method.name] for method in methods for _ in method.runs]
+    runs = [run for method in methods for run in method.runs]
+    return Table(
+        _LAST, runs, "Where each training ended: the record of its last iteration", swatches=swatches
+    )

@@ -11,7 +11,7 @@ from typing import Any
 
 from uuvtai.files import read_bytes
 from uuvtai.report.blocks import Block, Gallery, Heading, Media, PageSection
-from uuvtai.report.wording import megabytes, number
+from uuvtai.tables.wording import megabytes, number
 
 MEDIA_BYTES, PICTURE_BYTES = 6_600_000, 2_200_000
 """What all pictures and videos of a page, and the pictures of a run among them, may weigh: in base64 8.8 MB

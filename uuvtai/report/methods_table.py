@@ -6,10 +6,12 @@ from __future__ import annotations
 from typing import Any
 
 from uuvtai.outcomes import ENDINGS
-from uuvtai.report.blocks import Block, Data, Figure, Heading, Prose, Table
+from uuvtai.report.blocks import Block, Figure, Heading, Prose
 from uuvtai.report.colours import method_colours
 from uuvtai.report.figures import Line, intervals, rates_text, reliability
-from uuvtai.report.wording import accidents, number, percent, rate
+from uuvtai.tables.method_tables import causes_table, methods_table, paired_table
+from uuvtai.tables.table import Column, Data, Table
+from uuvtai.tables.wording import number, percent
 
 Method = dict[str, Any]
 
@@ -17,14 +19,21 @@ Method = dict[str, Any]
 def evaluation(result: dict[str, Any], command: str = "") -> list[Block]:
     """Everything that an evaluation has to show but its pictures."""
     methods = result["methods"]
-    blocks: list[Block] = [Prose(conditions(result)), methods_table(methods)]
+    table = methods_table(methods, _METHODS, data=_methods_data(methods), swatches=_swatches(methods))
+    blocks: list[Block] = [Prose(conditions(result)), table]
     if methods:
         blocks.append(_rates_figure(methods, command))
-    blocks += paired_table(result.get("paired", []))
-    blocks.append(_planning_table(methods))
+    blocks += _paired(result.get("paired", []))
+    blocks.append(Table(_PLANNING, methods, "Planning", swatches=_swatches(methods)))
     for method in methods:
         blocks += [*_causes(method), *_risk(method, command)]
     return blocks
+
+
+_METHODS = (
+    "Methods. Collision counts contacts, TTC stops and episodes out of the tank; intervals are 95 % Wilson. "
+    "Time to goal: mean over successes; TTS: mean time over success rate."
+)
 
 
 def conditions(result: dict[str, Any]) -> str:
@@ -38,50 +47,10 @@ def conditions(result: dict[str, Any]) -> str:
     )
 
 
-def methods_table(methods: list[Method]) -> Table:
-    """One row a method: rates with counts and 95 % Wilson intervals, how the rest ended, both times."""
-    columns = [
-        "method",
-        "success",
-        "collision",
-        "contact / TTC / out / timeout",
-        "time to goal s",
-        "TTS s",
-        "return",
-        "closest m",
-    ]
-    caption = (
-        "Methods. Collision counts contacts, TTC stops and episodes out of the tank; intervals are 95 % "
-        "Wilson. "
-        "Time to goal: mean over successes; TTS: mean time over success rate."
-    )
-    return Table(
-        columns,
-        [_method_row(m) for m in methods],
-        caption,
-        data=_methods_data(methods),
-        swatches=_swatches(methods),
-    )
-
-
 def _swatches(methods: list[Method]) -> list[str]:
     names = [m["name"] for m in methods]
     colours = method_colours(names)
     return [colours[name] for name in names]
-
-
-def _method_row(method: Method) -> list[str]:
-    o = method["outcomes"]
-    return [
-        method["name"],
-        rate(o["success"], method["episodes"], method["success_ci95"]),
-        rate(accidents(o), method["episodes"], method["collision_ci95"]),
-        f"{o['collision']} / {o['ttc']} / {o['out_of_tank']} / {o['timeout']}",
-        number(method["time_to_success_mean_s"]),
-        number(method["tts_s"]),
-        number(method.get("return_mean")),
-        number(method.get("min_clearance_mean_m"), 2),
-    ]
 
 
 _PLAIN = (
@@ -159,89 +128,40 @@ _PAIRED = (
 )
 
 
-def paired_table(pairs: list[dict[str, Any]]) -> list[Block]:
-    """Who alone arrives, how sure that is, and the difference in time where both do; [] without two
-    methods."""
+_BOUNDS = "time_difference_ci95"
+
+
+def _paired(pairs: list[dict[str, Any]]) -> list[Block]:
+    """[] without two methods."""
     if not pairs:
         return []
-    columns = [
-        "a",
-        "b",
-        "episodes",
-        "both arrive",
-        "only a",
-        "only b",
-        "McNemar's p",
-        "time of a s",
-        "time of b s",
-        "a - b s",
-    ]
-    rows = [_pair_row(pair) for pair in pairs]
     caption = (
         "Pairs of methods on the same episodes: who alone arrives, with McNemar's exact p, and the mean "
         "times where both arrive, their "
         "difference with its 95 % bootstrap interval. The values of p are not adjusted for the number of "
         "pairs"
     )
-    bounds = [
-        [*pair[:-1], *(pair[-1] or (None, None))]
-        for pair in ([*(p.get(k) for k in _PAIRED), p.get(_BOUNDS)] for p in pairs)
-    ]
-    data = Data(
-        ["a", "b", "episodes", *_PAIRED, f"{_BOUNDS}_low", f"{_BOUNDS}_high"],
-        [[p["a"], p["b"], p["episodes"], *numbers] for p, numbers in zip(pairs, bounds, strict=True)],
-    )
-    return [Table(columns, rows, caption, n_left=2, data=data)]
+    keys = ("a", "b", "episodes", *_PAIRED)
+    rows = [[*map(pair.get, keys), *(pair.get(_BOUNDS) or (None, None))] for pair in pairs]
+    data = Data([*keys, f"{_BOUNDS}_low", f"{_BOUNDS}_high"], rows)
+    return [paired_table(pairs, caption, data=data)]
 
 
-_BOUNDS = "time_difference_ci95"
+def _counts(method: Method, key: str, *names: str) -> str:
+    return " / ".join(str(method.get(key, {}).get(name, "-")) for name in names)
 
 
-def _pair_row(pair: dict[str, Any]) -> list[str]:
-    bounds = pair.get(_BOUNDS)
-    interval = f" [{bounds[0]:.2f}, {bounds[1]:.2f}]" if bounds else ""
-    counts = [str(pair[key]) for key in ("episodes", "both", "only_a", "only_b")]
-    times = [number(pair.get(key), 2) for key in ("time_a_mean_s", "time_b_mean_s")]
-    return [
-        pair["a"],
-        pair["b"],
-        *counts,
-        _p_value(pair["mcnemar_p"]),
-        *times,
-        number(pair.get("time_difference_mean_s"), 2) + interval,
-    ]
-
-
-def _p_value(p: float | None) -> str:
-    """Two digits; what is smaller than anybody distinguishes is told as a bound."""
-    return "-" if p is None else "< 0.0001" if p < 1e-4 else f"{p:.2g}"
-
-
-def _planning_table(methods: list[Method]) -> Table:
-    columns = [
-        "method",
-        "replans an episode",
+_PLANNING = (
+    Column("method", left=True, of=lambda m: m["name"]),
+    Column("replans an episode", of=lambda m: number(m.get("replans_per_episode"))),
+    Column(
         "initial / stuck / safety / intersection",
-        "Voronoi / RRT",
-        "path m",
-        "env-steps/s",
-    ]
-    rows = []
-    for m in methods:
-        triggers, planners = m.get("replans_by_trigger", {}), m.get("planned_by", {})
-        rows.append(
-            [
-                m["name"],
-                number(m.get("replans_per_episode")),
-                " / ".join(
-                    str(triggers.get(name, "-")) for name in ("initial", "stuck", "safety", "intersection")
-                ),
-                " / ".join(str(planners.get(name, "-")) for name in ("voronoi", "rrt")),
-                number(m.get("path_length_mean_m")),
-                number(m.get("env_steps_per_s"), 0),
-            ]
-        )
-    return Table(columns, rows, "Planning", swatches=_swatches(methods))
+        of=lambda m: _counts(m, "replans_by_trigger", "initial", "stuck", "safety", "intersection"),
+    ),
+    Column("Voronoi / RRT", of=lambda m: _counts(m, "planned_by", "voronoi", "rrt")),
+    Column("path m", of=lambda m: number(m.get("path_length_mean_m"))),
+    Column("env-steps/s", of=lambda m: number(m.get("env_steps_per_s"), 0)),
+)
 
 
 # -------------------------------------------------------------------------------------------- causes and risk
@@ -250,24 +170,12 @@ def _planning_table(methods: list[Method]) -> Table:
 def _causes(method: Method) -> list[Block]:
     if not method.get("causes"):
         return []
-    columns = ["cause", "n", "share", "knew", "unseen s", "evading s", "last chance s", "meaning"]
-    rows = [
-        [
-            c["label"].replace("_", " "),
-            str(c["count"]),
-            percent(c["share"], 0),
-            percent(c["knew_share"], 0),
-            *(number(c[key]) for key in ("unseen_median_s", "evading_median_s", "last_chance_median_s")),
-            c["meaning"],
-        ]
-        for c in method["causes"]
-    ]
     caption = (
         f"Why {len(method['explain'])} of {method['episodes']} episodes of {method['name']} failed. "
         "Knew: share whose forecast of the killer 1 s before the end was right; the times are medians before "
         "the end"
     )
-    return [Table(columns, rows, caption)]
+    return [causes_table(method, caption)]
 
 
 def _risk(method: Method, command: str) -> list[Block]:

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from uuvtai.report import ink
-from uuvtai.report.blocks import Block, Data, Figure, PageSection
+from uuvtai.report.blocks import Block, Figure, PageSection
 from uuvtai.report.colours import on_page
+from uuvtai.tables.table import Data
 from uuvtai.version import __version__
 
 if TYPE_CHECKING:

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from uuvtai.files import read_bytes
-from uuvtai.report.blocks import Block, Code, Facts, Notice, Prose, Table
+from uuvtai.report.blocks import Block, Code, Facts, Notice, Prose
 from uuvtai.report.run_files import read_config, read_json
-from uuvtai.report.wording import number
+from uuvtai.tables.table import Table, heads
+from uuvtai.tables.wording import number
 
 MANIFEST_BYTES = 16 << 20
 """[bytes] more than any manifest of a checkpoint has"""
@@ -74,11 +75,8 @@ def checkpoints(folder: Path) -> list[Block]:
         )
     if not rows:
         return []
-    return [
-        Table(
-            ["checkpoint", "iteration", "score", "sha256 of the model (first 16 digits)"], rows, "Checkpoints"
-        )
-    ]
+    columns = heads("checkpoint", "iteration", "score", "sha256 of the model (first 16 digits)")
+    return [Table(columns, rows, "Checkpoints")]
 
 
 def origins(methods: list[dict[str, Any]], trainings: list[Path]) -> list[Block]:
@@ -89,19 +87,19 @@ def origins(methods: list[dict[str, Any]], trainings: list[Path]) -> list[Block]
         for run in trainings
         for path in (run / "checkpoints").glob("*/manifest.json")
     }
-    told = []
+    sentences = []
     for method in methods if trainings else []:
         digest = str(method.get("checkpoint", {}).get("sha256", ""))
         if digest in kept:
-            told.append(
+            sentences.append(
                 "{} is checkpoint {} of the training {}.".format(method["name"], *reversed(kept[digest]))
             )
         elif digest:
-            told.append(
+            sentences.append(
                 f"{method['name']} (checkpoint {digest[:16]}) is none of the checkpoints that these "
                 "trainings keep."
             )
-    return [Prose(" ".join(told))] if told else []
+    return [Prose(" ".join(sentences))] if sentences else []
 
 
 def _sha256(path: Path, run: Path) -> str:

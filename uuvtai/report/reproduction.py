@@ -24,18 +24,17 @@ from typing import Any
 from uuvtai.loader import ConfigError
 from uuvtai.report.blocks import (
     Block,
-    Data,
     Figure,
     Heading,
     Notice,
     PageSection,
     Prose,
-    Table,
     Verdict,
     Verdicts,
 )
 from uuvtai.report.figures import Line, trade_off
-from uuvtai.report.wording import value_name
+from uuvtai.tables.table import Data, Table, heads
+from uuvtai.tables.wording import value_name
 
 RULINGS = ("holds", "does not hold", "cannot be judged")
 
@@ -97,7 +96,8 @@ def _inside(folder: Path, path: str) -> Path:
 def _table(described: Described) -> Table:
     rows = [["-" if cell is None else value_name(cell) for cell in row] for row in described["rows"]]
     data = Data(described["columns"], described["rows"])
-    return Table(described["columns"], rows, described.get("caption", ""), described.get("n_left", 1), data)
+    columns = heads(*described["columns"], n_left=described.get("n_left", 1))
+    return Table(columns, rows, described.get("caption", ""), data=data)
 
 
 def _verdicts(described: Described) -> Verdicts:

@@ -6,12 +6,14 @@ from __future__ import annotations
 from typing import Any
 
 from uuvtai.outcomes import ENDINGS
-from uuvtai.report.alone import axes_of, is_alone, of_axis, place_names, places
-from uuvtai.report.blocks import Block, Data, Figure, Notice, Prose, Table
+from uuvtai.report.blocks import Block, Figure, Notice, Prose
 from uuvtai.report.colours import method_colours
-from uuvtai.report.figures import Line, heat_map, hover_text, intervals, place_of
-from uuvtai.report.heatmap import Cell, pivot, varying
-from uuvtai.report.wording import accidents, axis_name, number, rate, value_name
+from uuvtai.report.figures import Line, heat_map, hover_text, intervals
+from uuvtai.tables.cell_table import axes_of_cells, cell_table, method_of
+from uuvtai.tables.heatmap import Cell, pivot, varying
+from uuvtai.tables.one_at_a_time import axes_of, of_axis, place_names, places, varies_alone
+from uuvtai.tables.table import Data, Table
+from uuvtai.tables.wording import axis_name, value_name
 
 _NUMBERS = ("success_rate", "collision_rate", "time_mean_s", "tts_s", "time_to_success_mean_s")
 
@@ -26,13 +28,13 @@ def sweep(document: dict[str, Any], command: str = "") -> list[Block]:
     )
     episodes = sum(cell["episodes"] for cell in cells)
     said = f"World {document.get('world', '-')}, {spans}: {len(cells)} cells, {episodes:,} episodes in all."
-    if is_alone(document):
+    if varies_alone(document):
         return [
             Prose(f"{said} One axis at a time, all else unchanged."),
             *_each_axis(document, command),
-            cells_table(cells, "Every cell"),
+            _cells(cells, document, "Every cell"),
         ]
-    drawn = _curves(cells, axes, command) if len(varying(axes)) < 2 else _maps(cells, axes, command)
+    drawn = _curves(document, command) if len(varying(axes)) < 2 else _maps(document, command)
     return [Prose(said), *drawn]
 
 
@@ -46,8 +48,9 @@ def _each_axis(document: dict[str, Any], command: str) -> list[Block]:
     ]
 
 
-def _maps(cells: list[Cell], axes: dict[str, list[Any]], command: str) -> list[Block]:
+def _maps(document: dict[str, Any], command: str) -> list[Block]:
     """Two heat maps a method, like the paper's figure."""
+    cells, axes = document["cells"], document["axes"]
     blocks: list[Block] = []
     for method, own in by_method(cells).items():
         chosen = pivot(own, axes)
@@ -60,19 +63,20 @@ def _maps(cells: list[Cell], axes: dict[str, list[Any]], command: str) -> list[B
         )
         blocks += [
             Figure(f"heat_map_{method}", panels, caption, cells_data(own), command),
-            cells_table(own, f"Every cell of {method}"),
+            _cells(own, document, f"Every cell of {method}"),
         ]
     return blocks
 
 
-def _curves(cells: list[Cell], axes: dict[str, list[Any]], command: str) -> list[Block]:
+def _curves(document: dict[str, Any], command: str) -> list[Block]:
     """Success and collision along the one axis that varies, every method a line."""
+    cells, axes = document["cells"], document["axes"]
     named = varying(axes)
     axis = named[0] if named else next(iter(axes), "")
     values = list({repr(cell.get(axis)): cell.get(axis) for cell in cells}.values())  # they may be lists
     return [
         _axis_figure(cells, axis, values, list(map(value_name, values)), command),
-        cells_table(cells, "Every cell"),
+        _cells(cells, document, "Every cell"),
     ]
 
 
@@ -112,66 +116,19 @@ def by_method(cells: list[Cell]) -> dict[str, list[Cell]]:
     """Cells of each method, in the order in which they come."""
     found: dict[str, list[Cell]] = {}
     for cell in cells:
-        found.setdefault(cell.get("method", "policy"), []).append(cell)
+        found.setdefault(method_of(cell), []).append(cell)
     return found
 
 
-def cells_table(cells: list[Cell], caption: str) -> Table:
-    """One row a cell: rates with counts and intervals, how the rest ended, times."""
-    axes = _axes_of(cells)
-    columns = [
-        "method",
-        *map(axis_name, axes),
-        "success",
-        "collision",
-        "contact / TTC / out / timeout",
-        "time to goal s",
-        "TTS s",
-    ]
+def _cells(cells: list[Cell], document: dict[str, Any], caption: str) -> Table:
     colours = method_colours(list(by_method(cells)))
-    swatches = [colours[cell.get("method", "policy")] for cell in cells]
-    return Table(
-        columns,
-        [_row(cell, axes) for cell in cells],
-        caption,
-        n_left=1 + len(axes),
-        folded=True,
-        swatches=swatches,
-    )
-
-
-def _axes_of(cells: list[Cell]) -> list[str]:
-    return list(dict.fromkeys(name for cell in cells for name in place_of(cell)))
-
-
-def _row(cell: Cell, axes: list[str]) -> list[str]:
-    n, outcomes = cell["episodes"], cell.get("outcomes") or {}
-    k_success, k_collision = _count(cell, "success"), _count(cell, "collision")
-    split = " / ".join(
-        str(outcomes.get(name, "-")) for name in ("collision", "ttc", "out_of_tank", "timeout")
-    )
-    return [
-        str(cell.get("method", "policy")),
-        *("-" if cell.get(name) is None else value_name(cell[name]) for name in axes),
-        rate(k_success, n, cell.get("success_ci95")),
-        rate(k_collision, n, cell.get("collision_ci95")),
-        split,
-        number(cell.get("time_to_success_mean_s")),
-        number(cell.get("tts_s")),
-    ]
-
-
-def _count(cell: Cell, key: str) -> int | None:
-    """Episodes behind a rate: as counted, else as the rate says."""
-    if outcomes := cell.get("outcomes"):
-        return outcomes["success"] if key == "success" else accidents(outcomes)
-    share = cell.get(f"{key}_rate")
-    return None if share is None else round(share * cell["episodes"])
+    swatches = [colours[method_of(cell)] for cell in cells]
+    return cell_table(cells, document, caption, folded=True, swatches=swatches)
 
 
 def cells_data(cells: list[Cell]) -> Data:
     """Every cell as numbers."""
-    axes = _axes_of(cells)
+    axes = axes_of_cells(cells)
     bounds = [f"{key}_ci95_{end}" for key in ("success", "collision") for end in ("low", "high")]
     return Data(
         ["method", *axes, "episodes", *ENDINGS, *bounds, *_NUMBERS], [_numbers(cell, axes) for cell in cells]

@@ -5,9 +5,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from uuvtai.report.blocks import Block, Data, Figure, Panel, Prose, Table
+from uuvtai.report.blocks import Block, Figure, Panel, Prose
 from uuvtai.report.figures import Line, curves, stages
-from uuvtai.report.wording import number
+from uuvtai.tables.table import Column, Data, Table
+from uuvtai.tables.timing_tables import ENVS, SPEEDS, density_data, density_table, latency_table
+from uuvtai.tables.wording import number
 
 
 def timing(document: dict[str, Any], command: str = "") -> list[Block]:
@@ -19,38 +21,21 @@ def timing(document: dict[str, Any], command: str = "") -> list[Block]:
     )
     blocks: list[Block] = [Prose(said)]
     if rows:
-        blocks += [_rates_table(rows), _stages_figure(rows, command)]
+        table = Table(_RATES, rows, "Env-steps per second, resets included")
+        blocks += [table, _stages_figure(rows, command)]
     blocks += _latency(document.get("paper_latency", []))
     return blocks + _density(document.get("paper_density", []), command)
 
 
-def _rates_table(rows: list[dict[str, Any]]) -> Table:
-    columns = [
-        "envs",
-        "controller",
-        "S",
-        "D",
-        "env-steps/s",
-        "+ inference",
-        "+ training",
-        "memory MB",
-        "compile s",
-    ]
-    shown = []
-    for row in rows:
-        rates = row["env_steps_per_s"]
-        speeds = [number(rates.get(name), 0) for name in ("step", "step_inference", "train")]
-        scene = [str(row.get(name, "-")) for name in ("controller", "S", "D")]
-        shown.append(
-            [
-                number(row["num_envs"], 0),
-                *scene,
-                *speeds,
-                number(row.get("memory_mb")),
-                number(row.get("compile_s")),
-            ]
-        )
-    return Table(columns, shown, "Env-steps per second, resets included")
+_RATES = (
+    ENVS,
+    Column("controller", of=lambda row: str(row.get("controller", "-"))),
+    Column("S", of=lambda row: str(row.get("S", "-"))),
+    Column("D", of=lambda row: str(row.get("D", "-"))),
+    *SPEEDS,
+    Column("memory MB", of=lambda row: number(row.get("memory_mb"))),
+    Column("compile s", of=lambda row: number(row.get("compile_s"))),
+)
 
 
 def _stages_figure(rows: list[dict[str, Any]], command: str) -> Figure:
@@ -78,27 +63,20 @@ def _latency(rows: list[dict[str, Any]]) -> list[Block]:
     timed = [row for row in rows if "mean_ms" in row]
     if not timed:
         return []
-    keys = ("mean_ms", "max_ms", "paper_mean_ms", "paper_max_ms")
-    shown = [[str(row["component"]), *(number(row.get(key), 3) for key in keys)] for row in timed]
-    data = Data(["component", *keys], [[row["component"], *(row.get(key) for key in keys)] for row in timed])
-    columns = ["component", "mean ms", "max ms", "paper: mean ms", "paper: max ms"]
     caption = "Beside the paper's table 'Workstation deployability timing' (its machine has an RTX 5090)"
-    return [Table(columns, shown, caption, data=data)]
+    return [latency_table(timed, caption)]
 
 
 def _density(rows: list[dict[str, Any]], command: str) -> list[Block]:
     if not rows:
         return []
-    keys = ("D", "loop_ms", "replans_per_episode", "paper_loop_ms", "paper_replans")
-    data = Data(keys, [[row.get(key) for key in keys] for row in rows])
     lines = [
         Line(name, [row["D"] for row in rows], [row[key] for row in rows])
         for name, key in (("here", "loop_ms"), ("paper", "paper_loop_ms"))
     ]
     panel = curves(lines, "Loop time over moving obstacles", "D", zero=True)
-    shown = [[number(row.get(key), 0 if key == "D" else 2) for key in keys] for row in rows]
-    columns = ["D", "loop ms", "replans an episode", "paper: loop ms", "paper: replans"]
+    caption = "Loop time [ms] over D, beside the paper's"
     return [
-        Figure("density", [panel], "Loop time [ms] over D, beside the paper's", data, command),
-        Table(columns, shown, "Runtime versus obstacle density"),
+        Figure("density", [panel], caption, density_data(rows), command),
+        density_table(rows, "Runtime versus obstacle density"),
     ]

@@ -7,19 +7,8 @@ from typing import Any
 from rich.text import Text
 
 from uuvtai.endings import plain
-from uuvtai.show.screen import Column, Screen
-from uuvtai.show.words import percent, seconds
-
-_CAUSES = (
-    Column("cause", left=True),
-    Column("n"),
-    Column("share"),
-    Column("knew", 2),
-    Column("unseen", 3),
-    Column("evading", 4),
-    Column("chance", 5),
-    Column("worst", 1, left=True),
-)
+from uuvtai.show.screen import Screen
+from uuvtai.tables.method_tables import causes_table
 
 _REMARKABLE_SHARE = 0.2
 """Remarks on fewer of a cause's episodes are left to the JSON."""
@@ -47,27 +36,10 @@ def _show_method(screen: Screen, m: dict[str, Any]) -> None:
     if not failed:
         screen.line(f"{m['name']}: no episode failed, nothing to explain")
         return
-    screen.table(
-        _CAUSES,
-        [_cause(c) for c in m["causes"]],
-        f"{m['name']}: why {failed} of {m['episodes']} episodes failed",
-    )
+    screen.table(causes_table(m, f"{m['name']}: why {failed} of {m['episodes']} episodes failed"))
     for c in m["causes"]:
         remarks = ", ".join(
             f"{k} {remark}" for remark, k in c["remarks"].items() if k >= _REMARKABLE_SHARE * c["count"]
         )
         meaning = Text(plain(c["label"]), style="bold").append(plain(f": {c['meaning']}"), style="not bold")
         screen.line(meaning.append(plain(f" ({remarks})"), style="not bold dim") if remarks else meaning)
-
-
-def _cause(c: dict[str, Any]) -> list[str]:
-    medians = (c["unseen_median_s"], c["evading_median_s"], c["last_chance_median_s"])
-    worst = ":".join(map(str, c["examples"][0]))
-    return [
-        c["label"],
-        str(c["count"]),
-        percent(c["share"]),
-        percent(c["knew_share"]),
-        *map(seconds, medians),
-        worst,
-    ]

@@ -13,7 +13,7 @@ from rich.text import Text
 
 from uuvtai.endings import plain, say
 from uuvtai.show.progress import Pace, time_left
-from uuvtai.show.words import number, percent
+from uuvtai.tables.wording import number, percent
 
 _PERIOD_S = 5.0
 
@@ -101,8 +101,8 @@ def training_rows(
     )
     rows = {
         "reward": number(of("rollout/ep_rew_mean"), 2),
-        "success": percent(of("rollout/success_rate")) + interval,
-        "collision": percent(of("rollout/collision_rate")),
+        "success": percent(of("rollout/success_rate"), 0) + interval,
+        "collision": percent(of("rollout/collision_rate"), 0),
         "env-steps/s": "from the second iteration on"
         if is_first
         else f"{of('time/env_steps_per_s', 0.0):,.0f} ({split})",

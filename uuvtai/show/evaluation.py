@@ -7,32 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from uuvtai.endings import say
-from uuvtai.outcomes import COLLIDED
 from uuvtai.show.cause_table import show_causes
-from uuvtai.show.screen import Column, Screen
-from uuvtai.show.words import number, probability, rate, with_interval
-
-_DAGGER = "\u2020"
-
-_METHODS = (
-    Column("method", left=True),
-    Column("success [95 %]"),
-    Column("collision [95 %]"),
-    Column("contact/ttc/\nout/timeout", 1),
-    Column("time to\ngoal s", 2),
-    Column("TTS s", 4),
-    Column("replans", 3),
-    Column("steps/s", 5),
-)
-
-_PAIRS = (
-    Column("a : b", left=True),
-    Column("only a\narrives"),
-    Column("only b\narrives"),
-    Column("p\n(McNemar)"),
-    Column("time a - b, where both\narrive: s [95 %]", 1),
-    Column("both\narrive", 2),
-)
+from uuvtai.show.screen import Screen
+from uuvtai.tables.method_tables import DAGGER, methods_table, paired_table
+from uuvtai.tables.wording import number, rate
 
 
 def show_evaluation(screen: Screen, result: dict[str, Any], folder: Path) -> None:
@@ -55,27 +33,13 @@ def show_methods(screen: Screen, result: dict[str, Any]) -> None:
         f"{len(result['seeds'])} {'seed' if len(result['seeds']) == 1 else 'seeds'} x "
         f"{result['episodes_per_seed']} episodes"
     )
-    screen.table(_METHODS, [_method(m) for m in result["methods"]], title)
+    screen.table(methods_table(result["methods"], title))
     _show_condition(screen, result["condition"])
     for part in result["remainder"]:
         _show_remainder(screen, part)
     for m in result["methods"]:
         if m["privileged"]:
-            screen.line(f"{_DAGGER} {m['name']} is privileged: {_privilege(m['name'])}", "dim")
-
-
-def _method(m: dict[str, Any]) -> list[str]:
-    o = m["outcomes"]
-    return [
-        f"{m['name']} {_DAGGER}" if m["privileged"] else m["name"],
-        rate(o["success"], m["episodes"], m["success_ci95"]),
-        rate(sum(o[name] for name in COLLIDED), m["episodes"], m["collision_ci95"]),
-        f"{o['collision']}/{o['ttc']}/{o['out_of_tank']}/{o['timeout']}",
-        number(m["time_to_success_mean_s"]),
-        number(m["tts_s"]),
-        number(m["replans_per_episode"]),
-        "-" if m["env_steps_per_s"] is None else f"{m['env_steps_per_s']:,.0f}",
-    ]
+            screen.line(f"{DAGGER} {m['name']} is privileged: {_privilege(m['name'])}", "dim")
 
 
 def show_pairs(screen: Screen, pairs: list[dict[str, Any]]) -> None:
@@ -84,22 +48,7 @@ def show_pairs(screen: Screen, pairs: list[dict[str, Any]]) -> None:
     if not pairs:
         return
     screen.line("")
-    screen.table(
-        _PAIRS,
-        [_pair(pair) for pair in pairs],
-        f"the same {pairs[0]['episodes']} episodes, two methods at a time",
-    )
-
-
-def _pair(pair: dict[str, Any]) -> list[str]:
-    return [
-        f"{pair['a']} : {pair['b']}",
-        str(pair["only_a"]),
-        str(pair["only_b"]),
-        probability(pair["mcnemar_p"]),
-        with_interval(pair["time_difference_mean_s"], pair["time_difference_ci95"]),
-        str(pair["both"]),
-    ]
+    screen.table(paired_table(pairs, f"the same {pairs[0]['episodes']} episodes, two methods at a time"))
 
 
 def _show_remainder(screen: Screen, part: dict[str, Any]) -> None:
@@ -122,12 +71,10 @@ def _privilege(name: str) -> str:
 
 def _show_condition(screen: Screen, condition: dict[str, Any]) -> None:
     """How hard the condition is, in one line."""
-    detection, rides = (
-        condition["detection"],
-        rate(condition["rides_threatened"], condition["rides"], condition["rides_threatened_ci95"]),
-    )
+    detection, threatened = condition["detection"], condition["rides_threatened"]
     if detection is None:
         return
+    rides = rate(threatened, condition["rides"], condition["rides_threatened_ci95"]).brief
     screen.line(
         f"threat rate {condition['threats_per_min']:.2f} per minute ({condition['threats']} moving bodies in "
         f"{condition['ride_minutes']:.1f} min of blind rides; {rides} of the rides meet one), required "

@@ -5,14 +5,21 @@ from __future__ import annotations
 from typing import Any
 
 from uuvtai.endings import say
-from uuvtai.show.screen import Column, Screen
+from uuvtai.show.screen import Screen
+from uuvtai.tables.table import Column, Table
+
+
+def _largest(agreement: Any) -> str:
+    worst = max(agreement.difference, key=lambda name: agreement.difference[name])
+    return f"{agreement.difference[worst]:.1e} ({worst})"
+
 
 _ENGINES = (
-    Column("engine", left=True),
-    Column("", left=True),
-    Column("largest difference", 1),
-    Column("p50 ms", 2),
-    Column("p99 ms", 3),
+    Column("engine", left=True, of=lambda one: one.engine),
+    Column("", left=True, of=lambda one: "agrees" if one.agrees else "DIFFERS"),
+    Column("largest difference", 1, of=_largest),
+    Column("p50 ms", 2, of=lambda one: f"{one.p50_ms:.3f}"),
+    Column("p99 ms", 3, of=lambda one: f"{one.p99_ms:.3f}"),
 )
 
 
@@ -20,18 +27,5 @@ def show_export(screen: Screen, found: Any) -> None:
     """One row per engine of a ``deploy.export`` result, where any could run, and what is damaged."""
     for damage in found.damages:
         say(damage)
-    rows = []
-    for one in found.agreements:
-        worst = max(one.difference, key=lambda name: one.difference[name])
-        largest = f"{one.difference[worst]:.1e} ({worst})"
-        rows.append(
-            [
-                one.engine,
-                "agrees" if one.agrees else "DIFFERS",
-                largest,
-                f"{one.p50_ms:.3f}",
-                f"{one.p99_ms:.3f}",
-            ]
-        )
-    if rows:
-        screen.table(_ENGINES, rows, str(found.folder))
+    if found.agreements:
+        screen.table(Table(_ENGINES, found.agreements, str(found.folder)))

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from typing import Any
 
-from rich.text import Text
+from uuvtai.show.screen import Screen
+from uuvtai.tables.table import Cell, Column, Table
 
-from uuvtai.show.screen import Column, Screen
-
-_CHECKS = (Column("", left=True), Column("", left=True), Column("", prose=True))
+_OK, _BAD = Cell("ok", style="green"), Cell("BAD", style="red")
+_CHECKS = (
+    Column("", left=True, of=lambda check: _OK if check["ok"] else _BAD),
+    Column("", left=True, of=lambda check: check["name"]),
+    Column("", prose=True, of=lambda check: check["detail"]),
+)
 
 
 def show_checks(screen: Screen, found: list[dict[str, Any]]) -> None:
     """One row per check: whether it went well, its name, what was found."""
-    rows = [
-        [Text("ok", style="green") if c["ok"] else Text("BAD", style="red"), c["name"], c["detail"]]
-        for c in found
-    ]
-    screen.table(_CHECKS, rows)
+    screen.table(Table(_CHECKS, found))

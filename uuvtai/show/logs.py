@@ -8,19 +8,21 @@ from typing import Any
 import typer
 
 from uuvtai.endings import plain
-from uuvtai.show.screen import Column, Screen
-from uuvtai.show.words import number
+from uuvtai.show.screen import Screen
+from uuvtai.tables.table import Column, Table
+from uuvtai.tables.wording import number
 
-_TOPICS = (Column("topic", left=True), Column("messages"), Column("Hz"), Column("schema", 1, left=True))
+_TOPICS = (
+    Column("topic", left=True, of=lambda topic: topic["topic"]),
+    Column("messages", of=lambda topic: str(topic["messages"])),
+    Column("Hz", of=lambda topic: number(topic["rate_hz"])),
+    Column("schema", 1, left=True, of=lambda topic: topic["schema"]),
+)
 
 
 def show_log(screen: Screen, found: dict[str, Any], file: Path) -> None:
     """Topics of a ``uuv log info --json`` document."""
-    rows = [
-        [topic["topic"], str(topic["messages"]), number(topic["rate_hz"]), topic["schema"]]
-        for topic in found["topics"]
-    ]
-    screen.table(_TOPICS, rows, str(file))
+    screen.table(Table(_TOPICS, found["topics"], str(file)))
     screen.line(
         f"duration {found['duration_s']:.2f} s, outcome {found['outcome'] or 'none: the log was cut off'}"
     )

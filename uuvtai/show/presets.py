@@ -14,7 +14,8 @@ from rich.text import Text
 from uuvtai.endings import UsageError, plain, say
 from uuvtai.files import read_text
 from uuvtai.shipped import KINDS, preset_names, shipped_file
-from uuvtai.show.screen import Column, Screen
+from uuvtai.show.screen import Screen
+from uuvtai.tables.table import Column, Table
 
 _PRESETS = (Column("", left=True), Column("", prose=True))
 _MAX_BYTES = 1 << 20
@@ -49,7 +50,7 @@ def show_presets(screen: Screen) -> None:
         if number:
             screen.line("")
         screen.line(Text(kind, style="bold"))
-        screen.table(_PRESETS, [[f"  {name}", said] for name, said in found.items()])
+        screen.table(Table(_PRESETS, [[f"  {name}", said] for name, said in found.items()]))
     screen.line("")
     screen.line(
         "one of them as it is written: uuv presets show NAME; every key that it gives: uuv presets show NAME "

@@ -7,8 +7,10 @@ from typing import Any
 
 from rich.text import Text
 
-from uuvtai.show.screen import Column, Screen
-from uuvtai.show.words import number
+from uuvtai.show.screen import Screen
+from uuvtai.tables.table import Column, Table
+from uuvtai.tables.timing_tables import density_table, latency_table
+from uuvtai.tables.wording import number
 
 _RATES = {
     "step": "random actions",
@@ -30,53 +32,39 @@ _FLAME_COLORS = (
     "bright_yellow",
 )
 
-_LATENCY = (
-    Column("component", left=True),
-    Column("mean ms"),
-    Column("max ms", 1),
-    Column("paper\nmean ms"),
-    Column("paper\nmax ms", 1),
-)
-_DENSITY = (
-    Column("D"),
-    Column("loop ms"),
-    Column("paper ms"),
-    Column("replans an\nepisode", 1),
-    Column("paper\nreplans", 1),
-)
-
 
 def show_profile(screen: Screen, result: dict[str, Any]) -> None:
     """Tables of a ``uuv profile --json`` document."""
     rows = result["rows"]
     machine = f"{result['machine']['cpu']}, {result['machine']['cores']} cores, {result['machine']['device']}"
-    # the largest batch is what most people come for, the first one what a vehicle would do; sizes between
-    # them go first
-    priorities = [0 if i == len(rows) - 1 else 1 if i == 0 else 2 for i in range(len(rows))]
-    columns = [Column("us per env-step", left=True)]
-    columns += [
-        Column(f"{row['num_envs']} env", priority) for row, priority in zip(rows, priorities, strict=True)
-    ]
     stages = list(rows[0]["stages_us_per_env_step"])
-    table = [[stage, *(f"{row['stages_us_per_env_step'][stage]:.2f}" for row in rows)] for stage in stages]
-    table += [
-        [f"env-steps/s: {meaning}", *(_rate(row["env_steps_per_s"].get(name)) for row in rows)]
-        for name, meaning in _RATES.items()
-    ]
-    table.append(["memory MB", *(f"{row['memory_mb']:,.0f}" for row in rows)])
-    table.append(["compile s", *(f"{row['compile_s']:.1f}" for row in rows)])
-    screen.table(columns, table, machine, sections=[len(stages) - 1])
+    screen.table(_by_batch_size(rows, stages, machine))
     screen.line("")
     for row in rows:
         _show_flame(screen, row)
     if result["paper_latency"]:
         _show_latency(screen, result)
     if result["paper_density"]:
-        _show_density(screen, result["paper_density"])
+        screen.line("")
+        title = "loop time against moving obstacles (one env)"
+        screen.table(density_table(result["paper_density"], title))
 
 
-def _rate(env_steps_per_s: float | None) -> str:
-    return "-" if env_steps_per_s is None else f"{env_steps_per_s:,.0f}"
+def _by_batch_size(rows: list[dict[str, Any]], stages: list[str], title: str) -> Table:
+    # the largest batch is what most people come for, the first one what a vehicle would do; sizes between
+    # them go first
+    priorities = [0 if i == len(rows) - 1 else 1 if i == 0 else 2 for i in range(len(rows))]
+    sizes = [
+        Column(f"{row['num_envs']} env", priority) for row, priority in zip(rows, priorities, strict=True)
+    ]
+    lines = [[stage, *(f"{row['stages_us_per_env_step'][stage]:.2f}" for row in rows)] for stage in stages]
+    lines += [
+        [f"env-steps/s: {meaning}", *(number(row["env_steps_per_s"].get(name), 0) for row in rows)]
+        for name, meaning in _RATES.items()
+    ]
+    lines.append(["memory MB", *(f"{row['memory_mb']:,.0f}" for row in rows)])
+    lines.append(["compile s", *(f"{row['compile_s']:.1f}" for row in rows)])
+    return Table([Column("us per env-step", left=True), *sizes], lines, title, sections=[len(stages) - 1])
 
 
 def _show_flame(screen: Screen, row: dict[str, Any]) -> None:
@@ -94,12 +82,11 @@ def _show_flame(screen: Screen, row: dict[str, Any]) -> None:
 
 def _show_latency(screen: Screen, result: dict[str, Any]) -> None:
     rows = [row for row in result["paper_latency"] if row["component"] != "Replanning rate"]
-    names = ("mean_ms", "max_ms", "paper_mean_ms", "paper_max_ms")
     screen.line("")
     screen.table(
-        _LATENCY,
-        [[row["component"], *(number(row[name], 3) for name in names)] for row in rows],
-        "beside the paper's timing table (one env; theirs on a workstation with an RTX 5090)",
+        latency_table(
+            rows, "beside the paper's timing table (one env; theirs on a workstation with an RTX 5090)"
+        )
     )
     for row in result["paper_latency"]:
         if row["component"] == "Replanning rate":
@@ -109,18 +96,3 @@ def _show_latency(screen: Screen, result: dict[str, Any]) -> None:
     times = ", ".join(f"{name} {loop[f'{name}_ms']:.2f}" for name in ("p50", "p99", "max"))
     verdict = f"{loop['budget_ms']:.0f} ms a step {'kept' if loop['within'] else 'NOT kept'}"
     screen.line(f"{verdict}: {times} ms; {loop['late']} of {loop['steps']} steps late")
-
-
-def _show_density(screen: Screen, rows: list[dict[str, Any]]) -> None:
-    table = [
-        [
-            str(row["D"]),
-            number(row["loop_ms"], 2),
-            number(row["paper_loop_ms"]),
-            number(row["replans_per_episode"]),
-            number(row["paper_replans"]),
-        ]
-        for row in rows
-    ]
-    screen.line("")
-    screen.table(_DENSITY, table, "loop time against moving obstacles (one env)")

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from uuvtai.show.screen import Column, Screen
+from uuvtai.show.screen import Screen
+from uuvtai.tables.table import Column, Table
 
 _ROWS = 12
 _STATE = (
@@ -31,7 +32,7 @@ def show_simulation(screen: Screen, result: dict[str, Any], title: str) -> None:
     for i in _picked(len(result["t"]), _ROWS):
         values = [result["t"][i], *result["position"][i], *result["rpy_deg"][i], *result["nu"][i]]
         rows.append([f"{value:.3f}" for value in values])
-    screen.table(_STATE, rows, title)
+    screen.table(Table(_STATE, rows, title))
 
 
 def _picked(n: int, wanted: int) -> list[int]:

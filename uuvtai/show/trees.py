@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from uuvtai.show.screen import Column, Screen
+from uuvtai.show.screen import Screen
+from uuvtai.tables.table import Column, Table
 from uuvtai.tree_codes import ACTION, LEAVES
 
 _NODES = (
@@ -27,5 +28,5 @@ def show_tree(screen: Screen, text: str, nodes: list[dict[str, Any]]) -> None:
         is_action = leaf is not None and leaf.kind == ACTION
         acted = [str(node["acted"]), f"{100 * node['acted'] / total:.1f} %"] if is_action else ["", ""]
         rows.append([line, f"{100 * node['share']:.1f} %", str(node["ticks"]), *acted])
-    screen.table(_NODES, rows)
+    screen.table(Table(_NODES, rows))
     screen.line(_LEGEND, "dim")

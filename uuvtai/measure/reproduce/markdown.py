@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 from uuvtai.measure.reproduce import paper
 from uuvtai.measure.reproduce.claims import LEVEL, pooled, tts_s
 from uuvtai.measure.reproduce.steps import RETIRED_SEEDS
 from uuvtai.outcomes import COLLIDED
-from uuvtai.report.alone import is_alone, told
 from uuvtai.statistics import mean
+from uuvtai.tables.claim_table import claim_table
+from uuvtai.tables.one_at_a_time import change_name, varies_alone
+from uuvtai.tables.table import Table, markdown, text_table
+from uuvtai.tables.timing_tables import ENVS, SPEEDS, density_table, latency_table
+from uuvtai.tables.wording import seconds
 
 
 def results_page(document: dict[str, Any]) -> str:
@@ -37,17 +40,7 @@ def results_page(document: dict[str, Any]) -> str:
     return "\n\n".join(["\n".join(head), *parts]) + "\n"
 
 
-def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table."""
-    lines = [heads, ["---"] * len(heads), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
 def _claims(document: dict[str, Any]) -> str:
-    rows = [
-        [c["text"], c["theirs"], c["ours"], c["verdict"], _p(c["p"]), _p(c["p_holm"])]
-        for c in document["claims"]
-    ]
     note = (
         "A claim with a p value is decided where that value, adjusted by Holm for all tests of this page, "
         f"is below {LEVEL}; else it "
@@ -55,13 +48,7 @@ def _claims(document: dict[str, Any]) -> str:
         "binomial test. Claims without a p "
         "value set one number beside another: one run, one machine, no test."
     )
-    return f"## The paper's claims\n{note}\n\n" + table(
-        ["claim", "the paper", "here", "verdict", "p", "p (Holm)"], rows
-    )
-
-
-def _p(value: float | None) -> str:
-    return "-" if value is None else "< 0.0001" if value < 1e-4 else f"{value:.4f}"
+    return f"## The paper's claims\n{note}\n\n{markdown(claim_table(document))}"
 
 
 def _main(document: dict[str, Any]) -> str:
@@ -82,17 +69,17 @@ def _main(document: dict[str, Any]) -> str:
         arrived = mean(
             [m["time_to_success_mean_s"] for m in entries if m["time_to_success_mean_s"] is not None]
         )
-        times = [_seconds(tts_s(entries)), theirs[1], _seconds(mean_s), theirs[2], _seconds(arrived)]
+        times = [seconds(tts_s(entries)), theirs[1], seconds(mean_s), theirs[2], seconds(arrived)]
         rows.append([f"`{name}`", str(len(entries)), *rates, theirs[0], *times])
     note = (
         "TTS is the paper's: mean time of all episodes / rate of success. The last column, the mean over the "
         "episodes that arrive, has no "
         "peer in the paper."
     )
-    heads = ["method", "training seeds", "success", "collision", "the paper: success / collision"]
-    heads += ["TTS", "the paper: TTS", "mean time", "the paper: mean time", "mean time of successes"]
-    return f"## Table main and ablations\n`{document['commands']['eval/main']}`\n\n{note}\n\n" + table(
-        heads, rows
+    columns = ["method", "training seeds", "success", "collision", "the paper: success / collision"]
+    columns += ["TTS", "the paper: TTS", "mean time", "the paper: mean time", "mean time of successes"]
+    return f"## Table main and ablations\n`{document['commands']['eval/main']}`\n\n{note}\n\n" + text_table(
+        columns, rows
     )
 
 
@@ -102,12 +89,12 @@ def _ceilings(document: dict[str, Any]) -> str:
             f"`{m['name']}`",
             str(pooled([m], "success")),
             str(pooled([m], *COLLIDED)),
-            _seconds(m["time_to_success_mean_s"]),
+            seconds(m["time_to_success_mean_s"]),
         ]
         for m in document["ceilings"]["methods"]
     ]
     note = "`bt+truth` is told the true bodies, `oracle` knows the future: privileged, no methods."
-    return f"## Ceilings\n{note} `{document['commands']['eval/ceilings']}`\n\n" + table(
+    return f"## Ceilings\n{note} `{document['commands']['eval/ceilings']}`\n\n" + text_table(
         ["", "success", "collision", "mean time of successes"], rows
     )
 
@@ -121,7 +108,7 @@ def _sweeps(document: dict[str, Any]) -> str:
 
 def _sweep(sweep: dict[str, Any]) -> str:
     """Rows: method and every axis but the speed; columns: speeds; cells: success / collision in %."""
-    if is_alone(sweep):
+    if varies_alone(sweep):
         return _alone(sweep)
     axes = [("v_m_s" if name == "v" else name) for name in sweep["axes"]]
     across = "v_m_s" if "v_m_s" in axes else axes[-1]
@@ -131,7 +118,7 @@ def _sweep(sweep: dict[str, Any]) -> str:
     for cell in sweep["cells"]:
         key = (cell["method"], *(str(cell.get(name, "")) for name in down))
         lines.setdefault(key, {})[str(cell.get(across))] = _both(cell)
-    heads = [
+    columns = [
         "method",
         *down,
         *("nothing moves" if value is None else f"{across} = {value}" for value in values),
@@ -139,7 +126,7 @@ def _sweep(sweep: dict[str, Any]) -> str:
     rows = [
         [*map(str, key), *(found.get(str(value), "") for value in values)] for key, found in lines.items()
     ]
-    return "success / collision in %\n\n" + table(heads, rows)
+    return "success / collision in %\n\n" + text_table(columns, rows)
 
 
 def _alone(sweep: dict[str, Any]) -> str:
@@ -147,9 +134,9 @@ def _alone(sweep: dict[str, Any]) -> str:
     methods = list(dict.fromkeys(cell["method"] for cell in sweep["cells"]))
     lines: dict[str, dict[str, str]] = {}
     for cell in sweep["cells"]:
-        lines.setdefault(told(cell, sweep), {})[cell["method"]] = _both(cell)
+        lines.setdefault(change_name(cell, sweep), {})[cell["method"]] = _both(cell)
     rows = [[name, *(found.get(method, "") for method in methods)] for name, found in lines.items()]
-    return "success / collision in %, one axis at a time\n\n" + table(["changed", *methods], rows)
+    return "success / collision in %, one axis at a time\n\n" + text_table(["changed", *methods], rows)
 
 
 def _both(cell: dict[str, Any]) -> str:
@@ -158,28 +145,7 @@ def _both(cell: dict[str, Any]) -> str:
 
 def _timing(document: dict[str, Any]) -> str:
     profile = document["profile"]
-    rows = [
-        [r["component"], _ms(r["mean_ms"]), _ms(r["max_ms"]), _ms(r["paper_mean_ms"]), _ms(r["paper_max_ms"])]
-        for r in profile["paper_latency"]
-        if r["mean_ms"] is not None
-    ]
-    density = [
-        [
-            str(r["D"]),
-            _ms(r["loop_ms"]),
-            _ms(r["paper_loop_ms"]),
-            _one(r["replans_per_episode"]),
-            _one(r["paper_replans"]),
-        ]
-        for r in profile["paper_density"]
-    ]
-    rates = [
-        [
-            f"{r['num_envs']:,}",
-            *(f"{r['env_steps_per_s'][k]:,.0f}" for k in ("step", "step_inference", "train")),
-        ]
-        for r in profile["rows"]
-    ]
+    timed = [row for row in profile["paper_latency"] if row["mean_ms"] is not None]
     note = (
         '"Global planner" is the mean over the steps that plan a route; "Planner stage, every step" over all '
         "steps, most of which "
@@ -192,9 +158,9 @@ def _timing(document: dict[str, Any]) -> str:
         [
             f"## Timing\n`{document['commands']['profile']}`",
             note,
-            table(["one vehicle", "mean ms", "max ms", "paper mean ms", "paper max ms"], rows),
-            table(["D", "loop ms", "paper ms", "replans an episode", "paper"], density),
-            table(["envs", "env-steps/s", "+ inference", "+ training"], rates),
+            markdown(latency_table(timed, "")),
+            markdown(density_table(profile["paper_density"], "")),
+            markdown(Table((ENVS, *SPEEDS), profile["rows"])),
         ]
     )
 
@@ -203,15 +169,3 @@ def _paper_notes(document: dict[str, Any]) -> str:
     return "## Where the paper's figures do not add up\n" + "\n".join(
         f"- {text}" for text in document["inconsistencies"]
     )
-
-
-def _seconds(value: float | None) -> str:
-    return "-" if value is None else f"{value:.1f} s"
-
-
-def _ms(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3f}"
-
-
-def _one(value: float | None) -> str:
-    return "-" if value is None else f"{value:.1f}"

@@ -5,16 +5,16 @@ from __future__ import annotations
 
 from typing import Any
 
-from uuvtai.report.heatmap import Cell, cell_name
-from uuvtai.report.wording import axis_name, value_name
+from uuvtai.tables.heatmap import Cell, cell_name
+from uuvtai.tables.wording import axis_name, value_name
 
 _SCENE = ("S", "D", "v_m_s")
-"""every cell tells these, changed or not"""
+"""every cell states these, changed or not"""
 _TICK = 14
 """characters that fit under a tick"""
 
 
-def is_alone(document: dict[str, Any]) -> bool:
+def varies_alone(document: dict[str, Any]) -> bool:
     """Whether a ``uuv sweep --json`` document is of this kind."""
     return bool(document.get("one_at_a_time"))
 
@@ -60,11 +60,7 @@ def _tick(value: Any) -> str:
     return name if len(name) <= _TICK else name.replace("_", "\n")
 
 
-def told(cell: Cell, document: dict[str, Any]) -> str:
+def change_name(cell: Cell, document: dict[str, Any]) -> str:
     """'sensors = harsh', or 'nothing'."""
-    return (
-        ", ".join(
-            f"{axis_name(name)} = {value_name(value)}" for name, value in changed(cell, document).items()
-        )
-        or "nothing"
-    )
+    changes = changed(cell, document).items()
+    return ", ".join(f"{axis_name(name)} = {value_name(value)}" for name, value in changes) or "nothing"

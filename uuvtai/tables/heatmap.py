@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from uuvtai.errors import SettingError
-from uuvtai.report.wording import axis_name, value_name
+from uuvtai.tables.wording import axis_name, value_name
 
 SPEED = "v_m_s"
 Cell = dict[str, Any]
@@ -16,6 +16,21 @@ Cell = dict[str, Any]
 def cell_name(axis: str) -> str:
     """What cells call an axis that a sweep may name shorter."""
     return SPEED if axis == "v" else axis
+
+
+_RESULTS = {
+    "method", "episodes", "outcomes", "k", "n", "success_rate", "success_ci95", "collision_rate",
+    "collision_ci95", "time_mean_s",
+    "tts_s", "time_to_success_mean_s", "return_mean", "env_steps", "wall_s", "env_steps_per_s",
+    "min_clearance_mean_m",
+    "path_length_mean_m", "replans_per_episode",
+}  # fmt: skip
+
+
+def place_of(cell: Cell) -> dict[str, Any]:
+    """Axes of a cell with their values: every key that is no result (values of config keys may be lists)."""
+    plain = {key: value for key, value in cell.items() if "." in key or not isinstance(value, dict | list)}
+    return {key: value for key, value in plain.items() if key not in _RESULTS and value is not None}
 
 
 @dataclass(frozen=True)

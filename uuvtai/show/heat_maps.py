@@ -12,12 +12,12 @@ from rich.table import Table
 from rich.text import Text
 
 from uuvtai.report.colours import ink_on, shade
-from uuvtai.report.heatmap import HeatMap, pivot
-from uuvtai.report.wording import axis_name, number
+from uuvtai.show.screen import roomy
+from uuvtai.tables.heatmap import HeatMap, pivot
+from uuvtai.tables.wording import axis_name, number
 
 _LEGEND = (
-    "per cent of the episodes, below it the mean time to success in s; bright is good. One cell "
-    "across "
+    "per cent of the episodes, below it the mean time to success in s; bright is good. One cell across "
     "= it does not depend on the column"
 )
 
@@ -48,19 +48,11 @@ def print_heat_maps(
                 for key in ("collision_rate", "success_rate")
             ]
             if is_whole:
-                for table in tables:
-                    _print_whole(table, console, _row_width(chosen))
+                with roomy(console, _row_width(chosen) + n * _cell_width(chosen)):
+                    console.print(*tables, sep="\n")
             else:
                 console.print(Columns(tables, padding=(0, 4)))
     console.print(Text(_LEGEND, style="dim"))
-
-
-def _print_whole(table: Table, console: Console, row_width: int) -> None:
-    """However wide it is."""
-    before = console.width
-    console.width = max(before, row_width + sum(column.width or 0 for column in table.columns))
-    console.print(table)
-    console.width = before
 
 
 def _row_width(chosen: HeatMap) -> int:
