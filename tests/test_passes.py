@@ -1,10 +1,15 @@
-"""Hand-made passes against autograd, for every activation, blocks of any size and both precisions."""
+"""Hand-written back-propagation against autograd: for every activation, blocks of any size, both precisions,
+and in a whole minibatch of PPO."""
 
 import pytest
 import torch
 
+from benchmarks.backward import PpoByHand, filled_rollout
+from benchmarks.peers.passes import Passes
+from uuvtai.config.learning import PolicyConfig, PpoConfig
 from uuvtai.learn.mlp import mlp
-from uuvtai.learn.passes import Passes
+from uuvtai.learn.policy import ActorCritic
+from uuvtai.learn.ppo import CACHE_ROWS, Ppo
 
 FLOAT32 = 1e-5
 """relative to the norm; sums of a few hundred products in another order"""
@@ -70,3 +75,18 @@ def test_one_layer_is_a_network_too():
     assert_close([passes.forward(x)], [out], FLOAT32)
     passes.backward(x, by_output)
     assert_close(gradients(net), expected, FLOAT32)
+
+
+@pytest.mark.parametrize("surrogate", [True, False])
+@pytest.mark.parametrize(("bfloat16", "tolerance"), [(False, FLOAT32), (True, BFLOAT16)])
+def test_a_minibatch_of_ppo_has_the_gradients_of_the_hand_written_passes(bfloat16, tolerance, surrogate):
+    """Two blocks, the second one shorter; without the surrogate and distillation the actor has none."""
+    found = {}
+    for kind in (Ppo, PpoByHand):
+        policy = ActorCritic(9, PolicyConfig(hidden=(32, 24)), None, torch.Generator().manual_seed(0))
+        config = PpoConfig(epochs=1, minibatches=1, bfloat16=bfloat16)
+        kind(policy, config).update(filled_rollout(16, CACHE_ROWS // 16 + 9, 9), surrogate=surrogate)
+        found[kind] = {name: p.grad for name, p in policy.named_parameters() if p.grad is not None}
+    assert found[Ppo].keys() == found[PpoByHand].keys()
+    assert any(name.startswith("actor") for name in found[Ppo]) == surrogate
+    assert_close(found[Ppo].values(), found[PpoByHand].values(), tolerance)

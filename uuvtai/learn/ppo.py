@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from torch import nn
 
 from uuvtai.config.learning import PpoConfig
 from uuvtai.errors import SettingError
 from uuvtai.learn.distill import Reduce, imitation_error
 from uuvtai.learn.normalise import Moments, moments_of
-from uuvtai.learn.passes import Passes
 from uuvtai.learn.policy import ActorCritic, entropy, log_prob
 from uuvtai.learn.rollout import Rollout
 
@@ -31,8 +31,8 @@ ADAM_EPS = 1e-5
 RATE_FACTOR, RATE_BOUNDS = 1.5, (1e-5, 1e-2)
 """steps and bounds of the KL-adaptive learning rate (rsl_rl)"""
 CACHE_ROWS = 2048
-"""rows of a minibatch in one pass on a CPU: their activations stay in the cache, and the gradients add up to
-the same sum"""
+"""rows of a minibatch in one pass on a CPU: their activations stay in the cache and in memory that is used
+again, and the gradients add up to the same sum"""
 
 
 def gae(
@@ -141,7 +141,6 @@ class Ppo:
         self.skipped = 0
         """minibatches left out because loss or gradient was not finite"""
         self._normalised = torch.empty(0, device=device)
-        self._passes: tuple[Passes, Passes] | None = None
 
     def update(
         self,
@@ -264,29 +263,26 @@ class Ppo:
 
     def _learn(self, batch: Minibatch, distill_weight: float, surrogate: bool, sums: torch.Tensor) -> None:
         self.optimiser.zero_grad(set_to_none=True)
-        actor, critic = self._networks(len(batch.valid))
-        critic.begin()
-        if acting := surrogate or distill_weight != 0.0:
-            actor.begin()
         count = batch.valid.sum().clamp(min=1.0)
         kl_before = sums[_SUMS.index("approx_kl")].clone()
-        for first in range(0, len(batch.valid), critic.rows):
-            block = batch.rows(slice(first, first + critic.rows))
-            value = critic.forward(block.normalised).requires_grad_()
-            out = actor.forward(block.normalised).requires_grad_() if acting else block.action
-            self._loss(block, value, out, count, distill_weight, surrogate, sums).backward()
-            critic.backward(block.normalised, _gradient(value))
-            if acting:
-                actor.backward(block.normalised, _gradient(out))
+        rows = CACHE_ROWS if self.rate.device.type == "cpu" else len(batch.valid)
+        for first in range(0, len(batch.valid), rows):
+            block = batch.rows(slice(first, first + rows))
+            self._add_gradients(block, count, distill_weight, surrogate, sums)
         self._step((sums[_SUMS.index("approx_kl")] - kl_before).float() / count, surrogate)
 
-    def _networks(self, samples: int) -> tuple[Passes, Passes]:
-        """Passes through actor and critic for minibatches of this size."""
-        rows = min(samples, CACHE_ROWS) if self.rate.device.type == "cpu" else samples
-        if self._passes is None or self._passes[0].rows < rows:
-            dtype = torch.bfloat16 if self.config.bfloat16 else torch.float32
-            self._passes = Passes(self.policy.actor, rows, dtype), Passes(self.policy.critic, rows, dtype)
-        return self._passes
+    def _add_gradients(
+        self,
+        block: Minibatch,
+        count: torch.Tensor,
+        distill_weight: float,
+        surrogate: bool,
+        sums: torch.Tensor,
+    ) -> None:
+        value = _output(self.policy.critic, block.normalised, self.config.bfloat16)
+        acting = surrogate or distill_weight != 0.0
+        out = _output(self.policy.actor, block.normalised, self.config.bfloat16) if acting else block.action
+        self._loss(block, value, out, count, distill_weight, surrogate, sums).backward()
 
     def _loss(
         self,
@@ -359,9 +355,14 @@ class Ppo:
         }
 
 
-def _gradient(leaf: torch.Tensor) -> torch.Tensor:
-    assert leaf.grad is not None
-    return leaf.grad
+def _output(net: nn.Sequential, x: torch.Tensor, bfloat16: bool) -> torch.Tensor:
+    """Output (B, n_out) float32 of an ``mlp``; ``bfloat16``: the products of all layers but the last, whose
+    output is what the losses see, in half of the width."""
+    if not bfloat16:
+        return net(x)
+    with torch.autocast(x.device.type, torch.bfloat16):
+        hidden = net[:-1](x)
+    return net[-1](hidden.float())
 
 
 def _valid(rollout: Rollout) -> torch.Tensor:

@@ -1,0 +1,115 @@
+"""Seconds of a whole PPO update by autograd, beside the same update with back-propagation written by hand
+(`peers/passes.py`), in turns.
+
+Sizes are those of `uuv train best`: 1,024 envs x 64 steps, its networks, epochs and minibatches; the rollout
+is random numbers. The hand-written passes were ours until autograd over blocks of rows was as fast.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+
+import torch
+
+from benchmarks.common import Job, Row
+from benchmarks.peers.passes import Passes
+from uuvtai.kernels.planning.features import observation_width
+from uuvtai.learn.collect import N_FEATURES
+from uuvtai.learn.policy import NUM_ACTIONS, ActorCritic
+from uuvtai.learn.ppo import CACHE_ROWS, Minibatch, Ppo
+from uuvtai.learn.rollout import Rollout
+from uuvtai.loader import load_training
+
+THREADS = 1
+FLOORS = {False: 1 / 1.03, True: 1.0}
+"""at least this ratio, by ``ppo.bfloat16``: autograd may cost 3 % more in float32, nothing in bfloat16"""
+ROUNDS = 15
+"""updates of each side"""
+
+
+class PpoByHand(Ppo):
+    """PPO whose gradients are those of ``Passes``: one pass through each network per block of rows."""
+
+    _passes: tuple[Passes, Passes] | None = None
+
+    def _add_gradients(
+        self,
+        block: Minibatch,
+        count: torch.Tensor,
+        distill_weight: float,
+        surrogate: bool,
+        sums: torch.Tensor,
+    ) -> None:
+        if self._passes is None:
+            dtype = torch.bfloat16 if self.config.bfloat16 else torch.float32
+            rows = max(CACHE_ROWS, len(block.valid))
+            self._passes = (
+                Passes(self.policy.actor, rows, dtype),
+                Passes(self.policy.critic, rows, dtype),
+            )
+        (actor, critic), acting = self._passes, surrogate or distill_weight != 0.0
+        if critic.layers[0].weight.grad is None:  # a new minibatch
+            critic.begin()
+            if acting:
+                actor.begin()
+        value = critic.forward(block.normalised).requires_grad_()
+        out = actor.forward(block.normalised).requires_grad_() if acting else block.action
+        self._loss(block, value, out, count, distill_weight, surrogate, sums).backward()
+        for passes, output in ((critic, value), (actor, out)):
+            if output.grad is not None:
+                passes.backward(block.normalised, output.grad)
+
+
+def filled_rollout(steps: int, num_envs: int, n_in: int) -> Rollout:
+    """A rollout of random numbers, always the same ones."""
+    rollout, generator = Rollout(steps, num_envs, n_in), torch.Generator().manual_seed(0)
+    for name in ("x", "action", "teacher_action", "log_prob", "value", "reward", "next_value"):
+        getattr(rollout, name).normal_(generator=generator)
+    rollout.log_prob.sub_(5.0)  # about what the first policy's actions have
+    rollout.weight.fill_(1.0)
+    return rollout
+
+
+def measure(job: Job) -> list[Row]:
+    """A row for either width of the products: medians, and the quartiles of the ratio over pairs of
+    neighbouring updates, since what disturbs the machine meets both."""
+    num_envs, rounds = (8, 2) if job.quick else (1024, ROUNDS)
+    config = load_training("best", {"train.num_envs": num_envs})
+    n_in = observation_width(config.features) + N_FEATURES
+    rollout = filled_rollout(config.ppo.rollout_steps, num_envs, n_in)
+    rows = []
+    for bfloat16 in FLOORS:
+        ppo = config.ppo.model_copy(update={"bfloat16": bfloat16})
+        sides = []
+        for kind in (Ppo, PpoByHand):
+            policy = ActorCritic(n_in, config.policy, slice(NUM_ACTIONS), torch.Generator().manual_seed(0))
+            sides.append(kind(policy, ppo))
+        job.say(f"{'bfloat16' if bfloat16 else 'float32'}: {rounds} rounds")
+        rows.append(_row(sides, rollout, bfloat16, rounds, job.quick))
+    return rows
+
+
+def _row(sides: list[Ppo], rollout: Rollout, bfloat16: bool, rounds: int, quick: bool) -> Row:
+    times: list[list[float]] = [[] for _ in sides]
+    for number in range(rounds + 1):  # the first round allocates; who begins takes turns
+        for side in (0, 1) if number % 2 else (1, 0):
+            begun = time.process_time()
+            sides[side].update(rollout, distill_weight=0.5)
+            times[side].append(time.process_time() - begun)
+    ours, by_hand = (taken[1:] for taken in times)
+    ratios = sorted(theirs / own for own, theirs in zip(ours, by_hand, strict=True))
+    low, middle, high = statistics.quantiles(ratios, n=4)
+    config, samples = sides[0].config, len(rollout.flat("value"))
+    return Row(
+        what=f"PPO update, {samples:,} samples, {'bfloat16' if bfloat16 else 'float32'} products",
+        ours=statistics.median(ours),
+        unit="s CPU",
+        peer=statistics.median(by_hand),
+        peer_name="by hand",
+        less_is_better=True,
+        floor=None if quick else FLOORS[bfloat16],
+        floor_on="ratio",
+        note=f"in pairs {middle:.3f} x, quartiles {low:.3f} to {high:.3f}; {config.epochs} epochs, one core",
+        details={"ratios": ratios, "autograd_s": ours, "by_hand_s": by_hand},
+    )
