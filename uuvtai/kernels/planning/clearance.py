@@ -301,6 +301,17 @@ def transform(env, slot, changed, io: Bundle[ClearanceIO]):
 
 
 @ti.func
+def bring_up_to_date(env, slot, io: Bundle[ClearanceIO]):
+    """One env's turn: where it is due, everything that changed since its last one."""
+    if io.clock.awake[env] == 1:
+        io.clearance.fresh[env] = is_due(env, io)
+    if is_due(env, io) == 1:
+        changed = take_sites(env, slot, ti.static(squared_limit(io.clearance_cfg, io.mapping_cfg)), io)
+        if changed > 0:
+            transform(env, slot, changed, io)
+
+
+@ti.func
 def is_due(env, io: Bundle[ClearanceIO]):
     """1 where the clearance is computed in this step."""
     return ti.cast(
@@ -317,14 +328,7 @@ def compute_clearance(io: Bundle[ClearanceIO]):
     for slot, pad in ti.ndrange(n_slot, ti.static(spread(n_slot))):
         if pad == 0:
             for env in range(slot * n_env // n_slot, (slot + 1) * n_env // n_slot):
-                if io.clock.awake[env] == 1:
-                    io.clearance.fresh[env] = is_due(env, io)
-                if is_due(env, io) == 1:
-                    changed = take_sites(
-                        env, slot, ti.static(squared_limit(io.clearance_cfg, io.mapping_cfg)), io
-                    )
-                    if changed > 0:
-                        transform(env, slot, changed, io)
+                bring_up_to_date(env, slot, io)
 
 
 @ti.kernel

@@ -9,7 +9,7 @@ import taichi as ti
 from uuvtai.config import FeaturesConfig
 from uuvtai.kernels.core.columns import ColumnGroup
 from uuvtai.kernels.core.geometry import FAR_M, TWO_PI, quaternion_wb, rotation_wb
-from uuvtai.kernels.core.signature import Bundle, FloatMatrix, quick_launch, spread
+from uuvtai.kernels.core.signature import Bundle, FloatMatrix, Out, quick_launch, spread
 from uuvtai.kernels.planning.advice import TEACHER_COLUMNS
 from uuvtai.kernels.planning.approach import BODY_COLUMNS, body_values, closest_approach, next_body
 from uuvtai.kernels.planning.bundles import FeaturesIO
@@ -289,9 +289,15 @@ def write_bodies(io: Bundle[FeaturesIO], obs: FloatMatrix):
                 value = ti.Vector.zero(ti.f32, ti.static(_BODY_WIDTH))
                 if used == 1:
                     value = body_values(env, track, io)
-                for at, first, width in ti.static(_body_places(io.features_cfg)):
-                    for i in ti.static(range(width)):
-                        obs[env, first + slot * width + i] = ti.cast(value[at + i], ti.f32)
+                put_body_columns(env, slot, value, obs, io)
+
+
+@ti.func
+def put_body_columns(env, slot, value, obs: Out[FloatMatrix], io: Bundle[FeaturesIO]):
+    """One body's values into the columns of its slot."""
+    for at, first, width in ti.static(_body_places(io.features_cfg)):
+        for i in ti.static(range(width)):
+            obs[env, first + slot * width + i] = ti.cast(value[at + i], ti.f32)
 
 
 @quick_launch

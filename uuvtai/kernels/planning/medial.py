@@ -191,13 +191,13 @@ def _size_after_expansion(slot, env, size, row, col, start, everywhere, floor_we
                 offer = ti.cast(
                     here + 0.5 * length * (weight + io.voronoi.weight[slot, to_row, to_col]), ti.f32
                 )
-                if everywhere > 0 or medial or bits & JOINED != 0:
-                    if bits & REACHED == 0 or offer < _BETTER * io.voronoi.cost[slot, to_row, to_col]:
-                        io.voronoi.cost[slot, to_row, to_col] = offer
-                        kept = bits & (KNOWN | SKELETON | JOINED)
-                        io.voronoi.cell[slot, to_row, to_col] = ti.cast(
-                            kept | REACHED | ((7 - k) << _NEXT_SHIFT), ti.u8
-                        )
-                        key = _estimate(offer, to_row, to_col, start[0], start[1], floor_weight)
-                        new_size = heap_after_push(io.voronoi, slot, new_size, to_row * n_col + to_col, key)
+                better = bits & REACHED == 0 or offer < _BETTER * io.voronoi.cost[slot, to_row, to_col]
+                if better and (everywhere > 0 or medial or bits & JOINED != 0):
+                    io.voronoi.cost[slot, to_row, to_col] = offer
+                    kept = bits & (KNOWN | SKELETON | JOINED)
+                    io.voronoi.cell[slot, to_row, to_col] = ti.cast(
+                        kept | REACHED | ((7 - k) << _NEXT_SHIFT), ti.u8
+                    )
+                    key = _estimate(offer, to_row, to_col, start[0], start[1], floor_weight)
+                    new_size = heap_after_push(io.voronoi, slot, new_size, to_row * n_col + to_col, key)
     return new_size

@@ -123,25 +123,34 @@ def _path_meets_forecast(env, io: Bundle[TriggersIO]):
     """True where a body comes too close to the part of the look-ahead segment that the vehicle can have
     reached by then."""
     meets = False
-    per_step = ti.static(io.route_cfg.reach_speed_m_s * io.tracking_cfg.forecast_dt_s)
     for track in range(io.forecast.radius_m.shape[1]):
-        if (
-            io.forecast.radius_m[env, track, 0] >= 0 and not meets
-        ):  # a track is forecast at all steps or at none
+        # a track is forecast at all steps or at none
+        if io.forecast.radius_m[env, track, 0] >= 0 and not meets:
             for k in range(io.forecast.radius_m.shape[2]):
-                limit = io.forecast.radius_m[env, track, k] + ti.static(io.route_cfg.forecast_clearance_m)
-                body = io.forecast.pos_w[env, track, k]
-                reach = k * per_step
-                if (body - io.route.ahead_w[env, 0]).norm() < reach + ti.static(
-                    io.mapping_cfg.cell_m
-                ) + limit:
-                    last = ti.min(
-                        ti.cast(reach / ti.static(io.mapping_cfg.cell_m), ti.i32) + 1,
-                        io.route.n_ahead[env] - 1,
-                    )
-                    for j in range(last + 1):
-                        if (body - io.route.ahead_w[env, j]).norm() < limit:
-                            meets = True
+                if _body_meets_path(env, track, k, io):
+                    meets = True
+    return meets
+
+
+@ti.func
+def _body_meets_path(env, track, k, io: Bundle[TriggersIO]):
+    """The same for one body at forecast step k.
+
+    Points of the segment lie a cell apart, so those with an arc up to reach + one cell are looked at. None of
+    them is farther from the first one than that: a body beyond reach + cell + limit of it meets none.
+    """
+    meets = False
+    limit = io.forecast.radius_m[env, track, k] + ti.static(io.route_cfg.forecast_clearance_m)
+    body = io.forecast.pos_w[env, track, k]
+    reach = k * ti.static(io.route_cfg.reach_speed_m_s * io.tracking_cfg.forecast_dt_s)
+    if (body - io.route.ahead_w[env, 0]).norm() < reach + ti.static(io.mapping_cfg.cell_m) + limit:
+        last = ti.min(
+            ti.cast(reach / ti.static(io.mapping_cfg.cell_m), ti.i32) + 1,
+            io.route.n_ahead[env] - 1,
+        )
+        for j in range(last + 1):
+            if (body - io.route.ahead_w[env, j]).norm() < limit:
+                meets = True
     return meets
 
 

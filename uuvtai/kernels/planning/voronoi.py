@@ -37,22 +37,7 @@ def plan_routes(io: Bundle[VoronoiIO]):
         if pad == 0:
             item = slot
             while item < io.route.n_queue[None]:
-                env = io.route.queue[item]
-                start_w = ti.cast(ti.Vector([io.ego.pos_w[env][0], io.ego.pos_w[env][1]]), ti.f32)
-                goal_w = ti.cast(ti.Vector([io.mission.goal_w[env][0], io.mission.goal_w[env][1]]), ti.f32)
-                _weigh_cells(slot, env, io)
-                reason = _endpoint_reason(slot, start_w, goal_w, io)
-                io.voronoi.pops[env] = 0
-                if reason == FAIL_NONE:
-                    if ti.static(io.voronoi_cfg.avoid_forecast):
-                        _block_forecast(slot, env, start_w, io)
-                    start, goal = _cell(start_w, io), _cell(goal_w, io)
-                    reason = _search_reason(slot, env, start, goal, io)
-                if reason == FAIL_NONE:
-                    reason = _write_reason(slot, env, start_w, goal_w, io)
-                io.route.fallback_reason[env] = reason
-                if reason != FAIL_NONE:
-                    io.route.fallbacks[env, reason - 1] += 1
+                _plan(slot, io.route.queue[item], io)
                 item += n
     for _ in range(1):
         count = 0
@@ -61,6 +46,26 @@ def plan_routes(io: Bundle[VoronoiIO]):
                 io.route.failed[count] = io.route.queue[item]
                 count += 1
         io.route.n_failed[None] = count
+
+
+@ti.func
+def _plan(slot, env, io: Bundle[VoronoiIO]):
+    """Plan for one env in a slot of the scratch memory; why it failed is kept and counted."""
+    start_w = ti.cast(ti.Vector([io.ego.pos_w[env][0], io.ego.pos_w[env][1]]), ti.f32)
+    goal_w = ti.cast(ti.Vector([io.mission.goal_w[env][0], io.mission.goal_w[env][1]]), ti.f32)
+    _weigh_cells(slot, env, io)
+    reason = _endpoint_reason(slot, start_w, goal_w, io)
+    io.voronoi.pops[env] = 0
+    if reason == FAIL_NONE:
+        if ti.static(io.voronoi_cfg.avoid_forecast):
+            _block_forecast(slot, env, start_w, io)
+        start, goal = _cell(start_w, io), _cell(goal_w, io)
+        reason = _search_reason(slot, env, start, goal, io)
+    if reason == FAIL_NONE:
+        reason = _write_reason(slot, env, start_w, goal_w, io)
+    io.route.fallback_reason[env] = reason
+    if reason != FAIL_NONE:
+        io.route.fallbacks[env, reason - 1] += 1
 
 
 @ti.func
@@ -120,19 +125,25 @@ def _block_forecast(slot, env, start_w, io: Bundle[VoronoiIO]):
     own cell stays open."""
     own = _cell(start_w, io)
     own_weight = io.voronoi.weight[slot, own[0], own[1]]
-    n_row, n_col = ti.static(io.voronoi.weight.shape[1:])
     for track in range(io.forecast.radius_m.shape[1]):
         if io.forecast.radius_m[env, track, 0] >= 0:  # a track is forecast at all steps or at none
             for k in range(io.forecast.radius_m.shape[2]):
                 pos_w = ti.cast(io.forecast.pos_w[env, track, k], ti.f32)
                 reach = io.forecast.radius_m[env, track, k] + ti.static(io.voronoi_cfg.min_clearance_m)
-                low, high = _cell(pos_w - reach, io), _cell(pos_w + reach, io)
-                for row in range(ti.max(low[0], 0), ti.min(high[0] + 1, n_row)):
-                    for col in range(ti.max(low[1], 0), ti.min(high[1] + 1, n_col)):
-                        away = centre_of(row, col, io.tank_cfg, io.mapping_cfg.cell_m) - pos_w
-                        if away.dot(away) < reach**2:  # type: ignore[misc]
-                            io.voronoi.weight[slot, row, col] = 0.0
+                _close_disc(slot, pos_w, reach, io)
     io.voronoi.weight[slot, own[0], own[1]] = own_weight
+
+
+@ti.func
+def _close_disc(slot, pos_w, reach, io: Bundle[VoronoiIO]):
+    """Close every cell whose centre lies nearer than ``reach`` [m] to a point."""
+    n_row, n_col = ti.static(io.voronoi.weight.shape[1:])
+    low, high = _cell(pos_w - reach, io), _cell(pos_w + reach, io)
+    for row in range(ti.max(low[0], 0), ti.min(high[0] + 1, n_row)):
+        for col in range(ti.max(low[1], 0), ti.min(high[1] + 1, n_col)):
+            away = centre_of(row, col, io.tank_cfg, io.mapping_cfg.cell_m) - pos_w
+            if away.dot(away) < reach**2:  # type: ignore[misc]
+                io.voronoi.weight[slot, row, col] = 0.0
 
 
 @ti.func
@@ -207,12 +218,19 @@ def overlay_clearance(io: Bundle[VoronoiIO], out: FloatMatrix, env: int):
         ):
             room = 0.0
         if ti.static(io.voronoi_cfg.avoid_forecast):
-            centre = centre_of(row, col, io.tank_cfg, io.mapping_cfg.cell_m)
-            for track in range(io.forecast.radius_m.shape[1]):
-                for k in range(io.forecast.radius_m.shape[2]):
-                    if io.forecast.radius_m[env, track, k] >= 0:
-                        gap = (centre - io.forecast.pos_w[env, track, k]).norm() - io.forecast.radius_m[
-                            env, track, k
-                        ]
-                        room = ti.max(ti.min(room, gap), 0.0)
+            room = _room_beside_forecast(env, row, col, room, io)
         out[row, col] = room
+
+
+@ti.func
+def _room_beside_forecast(env, row, col, room, io: Bundle[VoronoiIO]):
+    """``room`` [m] of a cell, at most the gap to any forecast body at any step; never below 0."""
+    least = room
+    centre = centre_of(row, col, io.tank_cfg, io.mapping_cfg.cell_m)
+    for track in range(io.forecast.radius_m.shape[1]):
+        for k in range(io.forecast.radius_m.shape[2]):
+            radius = io.forecast.radius_m[env, track, k]
+            if radius >= 0:
+                gap = (centre - io.forecast.pos_w[env, track, k]).norm() - radius
+                least = ti.max(ti.min(least, gap), 0.0)
+    return least

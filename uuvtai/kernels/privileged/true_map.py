@@ -25,22 +25,33 @@ def covers(env, body, point, io: Bundle[TrueMapIO]):
     return inside and io.world.kind[env, body] != NONE and io.world.vel_w[env, body].norm() > 0.0
 
 
+@ti.func
+def is_covered(env, point, io: Bundle[TrueMapIO]):
+    """1 where any moving body does."""
+    covered = 0
+    for body in range(ti.static(io.world.kind.shape[1])):
+        if covers(env, body, point, io):
+            covered = 1
+    return covered
+
+
+@ti.func
+def stamp(env, row, col, io: Bundle[TrueMapIO]):
+    """Add to one cell's occupancy, and keep the bits that follow from it."""
+    stamped_occ = ti.min(1.0, io.grid_map.dynamic_occ[env, row, col] + io.mapping_cfg.stamp)
+    io.grid_map.dynamic_occ[env, row, col] = stamped_occ
+    put_bit(io.grid_map.alive, env, row, col)
+    if stamped_occ >= io.mapping_cfg.occupied:
+        put_bit(io.grid_map.dynamic_occupied, env, row, col)
+
+
 @ti.kernel
 def stamp_truth(io: Bundle[TrueMapIO]):
     """Add ``stamp`` to the dynamic occupancy of every cell whose centre a moving body covers, clipped at
     1."""
     n_env, n_row, n_col = ti.static(io.grid_map.dynamic_occ.shape)
-    n_body = ti.static(io.world.kind.shape[1])
     for env, row in ti.ndrange(n_env, n_row):
         if io.clock.awake[env] == 1:
             for col in range(n_col):
-                stamped = 0
-                for body in range(n_body):
-                    if covers(env, body, centre_of(row, col, io.tank_cfg, io.mapping_cfg.cell_m), io):
-                        stamped = 1
-                if stamped == 1:
-                    stamped_occ = ti.min(1.0, io.grid_map.dynamic_occ[env, row, col] + io.mapping_cfg.stamp)
-                    io.grid_map.dynamic_occ[env, row, col] = stamped_occ
-                    put_bit(io.grid_map.alive, env, row, col)
-                    if stamped_occ >= io.mapping_cfg.occupied:
-                        put_bit(io.grid_map.dynamic_occupied, env, row, col)
+                if is_covered(env, centre_of(row, col, io.tank_cfg, io.mapping_cfg.cell_m), io) == 1:
+                    stamp(env, row, col, io)

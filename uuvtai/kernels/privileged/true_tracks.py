@@ -136,12 +136,21 @@ def name_beams_truly(io: Bundle[TrueTracksIO]):
             bearing = io.scan.ping_yaw[env] + ray * ti.static(TWO_PI / io.sonar_cfg.n_ray)
             hit_x = io.scan.ping_pos_w[env][0] + io.scan.range_m[env, ray] * ti.cos(bearing)
             hit_y = io.scan.ping_pos_w[env][1] + io.scan.range_m[env, ray] * ti.sin(bearing)
-            named, nearest = -1, _NAMED_M
-            for track in range(ti.static(io.tracks.alive.shape[1])):
-                if io.tracks.alive[env, track] == 1 and io.scan.hit[env, ray] == 1:
-                    body = io.tracks.state[env, track]
-                    off = ti.Vector([hit_x - body[0] + ago * body[2], hit_y - body[1] + ago * body[3]])
-                    gap = off.norm() - io.tracks.radius_m[env, track]
-                    if gap < nearest:
-                        named, nearest = track, gap
+            named = -1
+            if io.scan.hit[env, ray] == 1:
+                named = nearest_track(env, hit_x, hit_y, ago, io)
             io.tracks.beam_track[env, ray] = named
+
+
+@ti.func
+def nearest_track(env, hit_x, hit_y, ago, io: Bundle[TrueTracksIO]):
+    """The track whose outline lay nearest to a return ``ago`` [s], within ``_NAMED_M``; -1 = none."""
+    named, nearest = -1, _NAMED_M
+    for track in range(ti.static(io.tracks.alive.shape[1])):
+        if io.tracks.alive[env, track] == 1:
+            body = io.tracks.state[env, track]
+            off = ti.Vector([hit_x - body[0] + ago * body[2], hit_y - body[1] + ago * body[3]])
+            gap = off.norm() - io.tracks.radius_m[env, track]
+            if gap < nearest:
+                named, nearest = track, gap
+    return named

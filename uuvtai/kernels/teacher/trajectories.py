@@ -5,13 +5,15 @@ x(t) = x0 + v0 A(t) + c B(t), A(t) = tau (1 - exp(-t / tau)), B(t) = t - A(t): l
 lanes differ in. A burst that ends after T commands -c on top from then on: c (B(t) - B(t - T)).
 """
 
+from typing import Any
+
 import taichi as ti
 
 from uuvtai.config import MappingConfig, TankConfig, TeacherConfig, TrackingConfig, VehicleConfig
 from uuvtai.kernels.core.geometry import FAR_M
 from uuvtai.kernels.core.grid import grid_origin
 from uuvtai.kernels.core.lanes import LANES, f16x
-from uuvtai.kernels.core.signature import Const, In
+from uuvtai.kernels.core.signature import Const, In, Out
 from uuvtai.state import ClearanceState, ForecastState
 
 
@@ -44,7 +46,7 @@ def body_depths(
     )
     dt = ti.static(tracking_cfg.forecast_dt_s)
     low, high = ti.static(depth_band(tank_cfg, teacher_cfg))
-    peak, mean, contact, first = f16x(0.0), f16x(0.0), f16x(0.0), f16x(FAR_M)
+    found = ti.Struct(peak=f16x(0.0), mean=f16x(0.0), contact=f16x(0.0), first=f16x(FAR_M))
     level, level_vel = ti.Vector([pos[0], pos[1]]), ti.Vector([vel[0], vel[1]])
     reach_speed = level_vel.norm() + ti.static(_fastest(teacher_cfg))
     for track in range(n_track):
@@ -63,29 +65,35 @@ def body_depths(
                 body_vel = (body - forecast.pos_w[env, track, k - 1]) / dt
                 start = level + level_vel * settle - body
                 drift = level_vel * decay - body_vel
-                margin = teacher_cfg.margin_m + teacher_cfg.margin_growth_m_s * time
-                wanted = teacher_cfg.contact_m + teacher_cfg.caution * margin
+                wanted = _wanted_m(time, teacher_cfg)
                 radius = forecast.radius_m[env, track, k]
-                bound = (
-                    radius
-                    + ti.static(teacher_cfg.hull_reach_m)
-                    + wanted
-                    + ti.static(_fastest(teacher_cfg)) * gain
-                )
+                bound = radius + ti.static(teacher_cfg.hull_reach_m) + wanted
+                bound += ti.static(_fastest(teacher_cfg)) * gain
                 bound += ti.static(teacher_cfg.closing_s) * (reach_speed + body_vel.norm())
                 if radius >= 0 and start.norm_sqr() < bound * bound:
                     z = ti.math.clamp(cz * gain + (pos[2] + vel[2] * settle), low, high)
                     gap = ti.max(ti.min(above - z, z - below), 0.0) * ti.static(teacher_cfg.vertical_weight)
                     free = _free_lanes(cx, cy, gap, start, drift, gain, rest - decay, radius, teacher_cfg)
-                    for i in ti.static(range(LANES)):
-                        depth = ti.max(wanted - free[i], 0.0)
-                        peak[i] = ti.max(peak[i], depth)
-                        mean[i] += depth * ti.static(
-                            1.0 / (_samples(forecast.radius_m.shape[2], teacher_cfg, tracking_cfg) - 1)
-                        )
-                        contact[i] = ti.max(contact[i], ti.static(teacher_cfg.contact_m) - free[i])
-                        first[i] = ti.min(first[i], ti.select(depth > 0.0, time, FAR_M))
-    return peak, mean, contact, first
+                    _deepen(found, wanted, free, time, n_sample - 1, teacher_cfg)
+    return found.peak, found.mean, found.contact, found.first
+
+
+@ti.func
+def _deepen(found: Out[Any], wanted, free, time, n_ahead: Const[int], teacher_cfg: Const[TeacherConfig]):
+    """Take one sample of one body into the lanes' largest and mean depths and first violations."""
+    for i in ti.static(range(LANES)):
+        depth = ti.max(wanted - free[i], 0.0)
+        found.peak[i] = ti.max(found.peak[i], depth)
+        found.mean[i] += depth * ti.static(1.0 / n_ahead)
+        found.contact[i] = ti.max(found.contact[i], ti.static(teacher_cfg.contact_m) - free[i])
+        found.first[i] = ti.min(found.first[i], ti.select(depth > 0.0, time, FAR_M))
+
+
+@ti.func
+def _wanted_m(time, teacher_cfg: Const[TeacherConfig]):
+    """Clearance [m] wanted ``time`` [s] ahead: it grows as the forecast's error does."""
+    margin = teacher_cfg.margin_m + teacher_cfg.margin_growth_m_s * time
+    return teacher_cfg.contact_m + teacher_cfg.caution * margin
 
 
 @ti.func

@@ -49,12 +49,7 @@ def move_vehicle(io: Bundle[DynamicsIO], dt_s: float, n_substep: int):
         if pad == 0 and n_awake(packet * lanes, lanes, io.clock) > 0:
             _move(packet * lanes, lanes, dt_s / n_substep, n_substep, io)
             if ti.static(io.disturbance_cfg.current_sigma_m_s > 0):
-                for env in range(packet * lanes, (packet + 1) * lanes):
-                    if is_awake(env, io.clock):
-                        key = stream_key(io.episode.key[env], io.clock.step[env], STREAM_CURRENT)
-                        io.current.vel_w[env] = current_after(
-                            io.current.mean_w[env], io.current.vel_w[env], key, dt_s, io
-                        )
+                _change_currents(packet * lanes, lanes, dt_s, io)
 
 
 @quick_launch
@@ -284,6 +279,17 @@ def quaternion_product_pure(q, w):
 def turned(q, w, dt):
     """Unit quaternion after dt [s] of body rates w [rad/s], to first order."""
     return (q + 0.5 * dt * quaternion_product_pure(q, w)).normalized()
+
+
+@ti.func
+def _change_currents(first, lanes: Const[int], dt_s, io: Bundle[DynamicsIO]):
+    """Move the current of a packet of envs on by dt_s [s]."""
+    for env in range(first, first + lanes):
+        if is_awake(env, io.clock):
+            key = stream_key(io.episode.key[env], io.clock.step[env], STREAM_CURRENT)
+            io.current.vel_w[env] = current_after(
+                io.current.mean_w[env], io.current.vel_w[env], key, dt_s, io
+            )
 
 
 @ti.func

@@ -199,35 +199,37 @@ def coarse_cell(pos_w, io: Bundle[WorldIO]):
 
 
 @ti.func
+def coarse_centre(row, col, io: Bundle[WorldIO]):
+    """World (x, y) [m] of a coarse cell's centre."""
+    x = io.world_cfg.tank.x_m[0] + (col + 0.5) * COARSE_M
+    y = io.world_cfg.tank.y_m[0] + (row + 0.5) * COARSE_M
+    return ti.Vector([x, y])
+
+
+@ti.func
 def block_cells(env, clearance_m, io: Bundle[WorldIO]):
     """Mark the cells whose centre is nearer than ``clearance_m`` to a wall or static obstacle."""
     for row, col in ti.ndrange(io.scratch.reach.shape[1], io.scratch.reach.shape[2]):
-        center = ti.Vector(
-            [
-                io.world_cfg.tank.x_m[0] + (col + 0.5) * COARSE_M,
-                io.world_cfg.tank.y_m[0] + (row + 0.5) * COARSE_M,
-            ]
-        )
+        center = coarse_centre(row, col, io)
         io.scratch.reach[env, row, col] = ti.cast(
             1 - is_inside(disc(center, 0.0), clearance_m, io.world_cfg.tank), ti.u8
         )
     for slot in range(ti.static(io.world_cfg.n_fixed_static + io.world_cfg.static_slots)):
         if io.world.kind[env, slot] != NONE:
             shape = io.scratch.footprint[env, slot]
-            reach = clearance_m + shape[6]
-            span = ti.Vector([1.0, 1.0]) * (reach + shape[4] + shape[5])  # bounds the turned rectangle
-            low = coarse_cell(ti.Vector([shape[0], shape[1]]) - span, io)
-            high = coarse_cell(ti.Vector([shape[0], shape[1]]) + span, io)
-            for row in range(low[0], high[0] + 1):
-                for col in range(low[1], high[1] + 1):
-                    center = ti.Vector(
-                        [
-                            io.world_cfg.tank.x_m[0] + (col + 0.5) * COARSE_M,
-                            io.world_cfg.tank.y_m[0] + (row + 0.5) * COARSE_M,
-                        ]
-                    )
-                    if nearest_squared(shape, center) < reach * reach:
-                        io.scratch.reach[env, row, col] = ti.u8(1)
+            block_around(env, shape, clearance_m + shape[6], io)
+
+
+@ti.func
+def block_around(env, shape, reach, io: Bundle[WorldIO]):
+    """Mark the cells whose centre is nearer than ``reach`` [m] to a footprint's core."""
+    span = ti.Vector([1.0, 1.0]) * (reach + shape[4] + shape[5])  # bounds the turned rectangle
+    low = coarse_cell(ti.Vector([shape[0], shape[1]]) - span, io)
+    high = coarse_cell(ti.Vector([shape[0], shape[1]]) + span, io)
+    for row in range(low[0], high[0] + 1):
+        for col in range(low[1], high[1] + 1):
+            if nearest_squared(shape, coarse_centre(row, col, io)) < reach * reach:
+                io.scratch.reach[env, row, col] = ti.u8(1)
 
 
 @ti.func
