@@ -38,7 +38,7 @@ class PpoByHand(Ppo):
 
     def _add_gradients(
         self,
-        block: Minibatch,
+        batch: Minibatch,
         count: torch.Tensor,
         distill_weight: float,
         surrogate: bool,
@@ -46,7 +46,7 @@ class PpoByHand(Ppo):
     ) -> None:
         if self._passes is None:
             dtype = torch.bfloat16 if self.config.bfloat16 else torch.float32
-            rows = max(CACHE_ROWS, len(block.valid))
+            rows = max(CACHE_ROWS, len(batch.valid))
             self._passes = (
                 Passes(self.policy.actor, rows, dtype),
                 Passes(self.policy.critic, rows, dtype),
@@ -56,12 +56,12 @@ class PpoByHand(Ppo):
             critic.begin()
             if acting:
                 actor.begin()
-        value = critic.forward(block.normalised).requires_grad_()
-        out = actor.forward(block.normalised).requires_grad_() if acting else block.action
-        self._loss(block, value, out, count, distill_weight, surrogate, sums).backward()
+        value = critic.forward(batch.normalised).requires_grad_()
+        out = actor.forward(batch.normalised).requires_grad_() if acting else batch.action
+        self._loss(batch, value, out, count, distill_weight, surrogate, sums).backward()
         for passes, output in ((critic, value), (actor, out)):
             if output.grad is not None:
-                passes.backward(block.normalised, output.grad)
+                passes.backward(batch.normalised, output.grad)
 
 
 def filled_rollout(steps: int, num_envs: int, n_in: int) -> Rollout:

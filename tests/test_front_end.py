@@ -12,8 +12,8 @@ import taichi as ti
 from taichi.lang import kernel_impl
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
-from uuvtai import front_end
-from uuvtai.front_end import remember_sources
+from uuvtai.taichi_patches import front_end
+from uuvtai.taichi_patches.front_end import remember_sources
 
 
 @ti.func
@@ -117,7 +117,7 @@ def test_a_taichi_without_these_names_is_left_alone():
         "from taichi.lang import impl, snode\n"
         "del C.get_pos_info, k.getsourcefile, k.getsourcelines, k._inside_class, k.textwrap, k.ast\n"
         "del impl.get_traceback, snode.get_traceback\n"
-        "from uuvtai.front_end import remember_sources\n"
+        "from uuvtai.taichi_patches.front_end import remember_sources\n"
         "remember_sources()\n"
         "assert not any(hasattr(k, n) for n in ('getsourcefile', 'getsourcelines', '_inside_class', "
         "'textwrap', 'ast'))"

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from tests.conftest import configure
+from uuvtai.capture import capture
 from uuvtai.kernels.planning import features
 from uuvtai.kernels.sensors import proprioception
 from uuvtai.loader import load_config
@@ -99,7 +100,7 @@ def driven(small, poison=None):
             small.sim.step()
             actions.append(small.sim.action.clone())
             observations.append(small.sim.observation.clone())
-        return torch.stack(actions), torch.stack(observations), small.sim.memory().capture()
+        return torch.stack(actions), torch.stack(observations), capture(small.sim.memory())
 
 
 def compared(small):

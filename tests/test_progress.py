@@ -154,7 +154,7 @@ def test_the_first_iteration_of_a_training_has_no_speed():
 def test_made_kernels_are_counted():
     import taichi as ti
 
-    from uuvtai.front_end import kernels_made
+    from uuvtai.taichi_patches.front_end import kernels_made
 
     @ti.kernel
     def fill(x: ti.types.ndarray(dtype=ti.f32, ndim=1), value: ti.f32):  # pyright: ignore

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from uuvtai.capture import Put, put_by_kernel
 from uuvtai.kernels.core.bits import WORD
 from uuvtai.state import GridMask
+from uuvtai.taichi_patches.memory import Put, put_by_kernel
 
 
 def load_bounds(mask: GridMask, outside: np.ndarray, put: Put = put_by_kernel) -> None:

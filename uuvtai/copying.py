@@ -1,4 +1,4 @@
-"""Chosen rows of Taichi's arrays as NumPy copies, and where an array lies."""
+"""Chosen rows of Taichi's arrays as NumPy copies."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import taichi as ti
 import torch
 
-from uuvtai.kernels.core.rows import copy_rows, tell_address
+from uuvtai.kernels.core.rows import copy_rows
 
 _TORCH_DTYPE = {
     ti.f32: torch.float32,
@@ -26,11 +26,3 @@ def copied_rows(field: ti.Field, chosen: torch.Tensor) -> np.ndarray:
     )
     copy_rows(field, chosen, out)
     return out.cpu().numpy()
-
-
-def address_of(field: ti.Field, device: torch.device) -> int:
-    """Address of a field's first element, when all kernels are done."""
-    address = torch.zeros(1, dtype=torch.int64, device=device)
-    tell_address(field, address)
-    ti.sync()
-    return int(address[0])

@@ -114,7 +114,7 @@ def _cuda() -> str:
 def _cache() -> str:
     from taichi.lang.impl import default_cfg
 
-    from uuvtai.runtime import stale_locks
+    from uuvtai.taichi_patches.cache import stale_locks
 
     path = Path(default_cfg().offline_cache_file_path)
     for lock in stale_locks():

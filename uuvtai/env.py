@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from uuvtai.capture import check_arrays, check_setting
+from uuvtai.capture import capture, check_arrays, check_setting, restore
 from uuvtai.config import Config
 from uuvtai.kernels.planning.features import placed_columns
 from uuvtai.kernels.task.reward import TERMS, tell_step
@@ -210,7 +210,7 @@ class VectorEnv:
         self._require_open()
         if not self._begun:
             raise RuntimeError("capture before reset: call reset() first")
-        out = {f"sim.{name}": array for name, array in self.sim.memory().capture().items()}
+        out = {f"sim.{name}": array for name, array in capture(self.sim.memory()).items()}
         out |= {f"env.{name}": tensor.cpu().numpy().copy() for name, tensor in self._carried().items()}
         return out | {"setting": np.frombuffer(self._setting().encode(), dtype=np.uint8).copy()}
 
@@ -232,7 +232,7 @@ class VectorEnv:
         of_sim = {
             name.removeprefix("sim."): array for name, array in arrays.items() if not name.startswith("env.")
         }
-        self.sim.memory().restore(of_sim)
+        restore(self.sim.memory(), of_sim)
         for name, tensor in own.items():
             tensor.copy_(torch.from_numpy(of_env[name]))
         self._begun = True

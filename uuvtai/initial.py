@@ -9,11 +9,11 @@ import numpy as np
 from uuvtai import state
 from uuvtai.allocation import allocation_matrices
 from uuvtai.bounds import load_bounds
-from uuvtai.capture import Put
 from uuvtai.config import Config
 from uuvtai.kernels.core.grid import outside_cells
 from uuvtai.scenario import load_fixed
 from uuvtai.stages import SimState
+from uuvtai.taichi_patches.memory import Put
 
 
 def allocate_state(sizes: dict[str, int]) -> SimState:

@@ -5,14 +5,12 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-import time
 from dataclasses import dataclass
-from pathlib import Path
 
 import taichi as ti
-from taichi.lang.impl import default_cfg
 
 from uuvtai.errors import DeviceError, SettingError
+from uuvtai.taichi_patches.cache import CACHE_BYTES, stale_locks
 
 
 @dataclass(frozen=True)
@@ -32,22 +30,7 @@ class Runtime:
 
 _started: list[Runtime] = []
 
-_LOCKED_S = 60.0
-"""Taichi locks its cache by a file, for as long as it reads or writes there: one older than this belongs to a
-process that was killed"""
-
 _MAX_THREADS = 1024
-
-_CACHE_BYTES = 1 << 30
-"""Taichi's own limit, 100 MB, is about twelve sizes of simulator (6 to 9 MB each): a sweep and a training
-push each other's kernels out"""
-
-
-def stale_locks() -> list[Path]:
-    """Locks of the kernel cache that nobody holds any more: with one of them every process compiles
-    everything again."""
-    cache = Path(os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or default_cfg().offline_cache_file_path)
-    return [lock for lock in cache.rglob("*.lock") if time.time() - lock.stat().st_mtime > _LOCKED_S]
 
 
 def start_taichi(device: str = "cpu", precision: str = "f32", fast_math: bool = False) -> Runtime:
@@ -76,7 +59,7 @@ def start_taichi(device: str = "cpu", precision: str = "f32", fast_math: bool = 
             default_fp=wanted.real,
             fast_math=fast_math,
             offline_cache=True,
-            offline_cache_max_size_of_files=_CACHE_BYTES,
+            offline_cache_max_size_of_files=CACHE_BYTES,
             cfg_optimization=wanted.device
             == "cuda",  # on the CPU LLVM does that work again: half of the time to compile, equal results
             log_level=ti.WARN,

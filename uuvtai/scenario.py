@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from uuvtai.capture import Put, put_by_kernel
 from uuvtai.config import FixedObstacle, WorldConfig
 from uuvtai.errors import SettingError, UserError
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, NONE, SPHERE
 from uuvtai.kernels.world.layout import COARSE_M, FAULT_ENDPOINTS, FAULT_JOINED, FAULT_STATIC
 from uuvtai.kernels.world.paths import FAULT_MOVING
 from uuvtai.state import FixedTable, MissionState, PathState, SceneState, WorldState
+from uuvtai.taichi_patches.memory import Put, put_by_kernel
 
 N_CORNER = 5
 """Most waypoints of one path."""

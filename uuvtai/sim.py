@@ -15,9 +15,8 @@ import taichi as ti
 import torch
 
 from uuvtai.binding import bind_all
-from uuvtai.capture import Memory
 from uuvtai.config import Config
-from uuvtai.copying import address_of, copied_rows
+from uuvtai.copying import copied_rows
 from uuvtai.initial import allocate_state, fill_constants
 from uuvtai.kernels.core.rows import copy_rows
 from uuvtai.kernels.perception import elevation, forecast, look, mapping, spotting, tracking
@@ -33,6 +32,7 @@ from uuvtai.runtime import start_taichi
 from uuvtai.scenario import Scene, check_scenarios, set_scenes
 from uuvtai.sizes import array_sizes, check_size
 from uuvtai.stages import Stages, timed_stage
+from uuvtai.taichi_patches.memory import Memory, address_of
 from uuvtai.tree import FlatTree, load_tree
 
 

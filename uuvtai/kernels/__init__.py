@@ -1,5 +1,5 @@
 """Taichi kernels, one file per stage. Stages never import each other; all of them may import the floor."""
 
-from uuvtai.front_end import remember_sources
+from uuvtai.taichi_patches.front_end import remember_sources
 
 remember_sources()

@@ -273,16 +273,16 @@ class Ppo:
 
     def _add_gradients(
         self,
-        block: Minibatch,
+        batch: Minibatch,
         count: torch.Tensor,
         distill_weight: float,
         surrogate: bool,
         sums: torch.Tensor,
     ) -> None:
-        value = _output(self.policy.critic, block.normalised, self.config.bfloat16)
+        value = _output(self.policy.critic, batch.normalised, self.config.bfloat16)
         acting = surrogate or distill_weight != 0.0
-        out = _output(self.policy.actor, block.normalised, self.config.bfloat16) if acting else block.action
-        self._loss(block, value, out, count, distill_weight, surrogate, sums).backward()
+        out = _output(self.policy.actor, batch.normalised, self.config.bfloat16) if acting else batch.action
+        self._loss(batch, value, out, count, distill_weight, surrogate, sums).backward()
 
     def _loss(
         self,

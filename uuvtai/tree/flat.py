@@ -11,8 +11,8 @@ from uuvtai.tree.elements import TreeError
 from uuvtai.tree_codes import MAX_PORTS
 
 if TYPE_CHECKING:  # a tree is read and printed without Taichi and torch
-    from uuvtai.capture import Put
     from uuvtai.state import TreeTable
+    from uuvtai.taichi_patches.memory import Put
 
 UNSET = -1.0
 """Value of a port that is not given: the leaf takes the number of the config's teacher section."""
@@ -49,7 +49,7 @@ def load_tree(table: TreeTable, tree: FlatTree, put: Put | None = None) -> None:
     """Copy a flat tree into the simulator's table by ``put`` (default: ``put_by_kernel``). Raises TreeError
     when it does not fit."""
     if put is None:
-        from uuvtai.capture import put_by_kernel as put
+        from uuvtai.taichi_patches.memory import put_by_kernel as put
     n, capacity = len(tree.kind), table.kind.shape[0]
     if n > capacity:
         raise TreeError(

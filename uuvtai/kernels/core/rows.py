@@ -2,7 +2,7 @@
 
 import taichi as ti
 
-from uuvtai.kernels.core.signature import AnyTensor, In, IntVector, LongVector, Out
+from uuvtai.kernels.core.signature import AnyTensor, In, IntVector, Out
 
 
 @ti.kernel
@@ -45,9 +45,3 @@ def _copy_cell_3(field: In[ti.Field], out: Out[ti.Field], env, i, j, k):
             out[i, j, k, c] = field[env, j, k][c]
     else:
         out[i, j, k] = field[env, j, k]
-
-
-@ti.kernel
-def tell_address(field: In[ti.Field], out: LongVector):
-    """out[0] = address in memory of the first element of a field of rank 1."""
-    out[0] = ti.cast(ti.get_addr(field, 0), ti.i64)

@@ -27,10 +27,11 @@ import math
 import taichi as ti
 
 from uuvtai.kernels.core.bits import WORD, bit_of, lowest_bit, taken, with_bit, without_lowest
-from uuvtai.kernels.core.signature import Bundle, Const, quick_launch, spread
+from uuvtai.kernels.core.signature import Bundle, Const, spread
 from uuvtai.kernels.perception.bundles import MappingIO
 from uuvtai.kernels.perception.evidence import mark_depth, mark_hits
 from uuvtai.kernels.perception.fan import mark_fan
+from uuvtai.taichi_patches.launch import quick_launch
 
 RATED_HZ = 10.0
 """Scan rate for which the gains of MappingConfig are given."""

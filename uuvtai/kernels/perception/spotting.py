@@ -12,12 +12,13 @@ import taichi as ti
 from uuvtai.kernels.core.geometry import FAR_M, TWO_PI, quaternion_wb, rotation_wb, wrapped_angle
 from uuvtai.kernels.core.kalman import born, corrected, position_variance
 from uuvtai.kernels.core.lanes import LANES, f16x, ramp_lanes
-from uuvtai.kernels.core.signature import Bundle, quick_launch, spread
+from uuvtai.kernels.core.signature import Bundle, spread
 from uuvtai.kernels.perception.bundles import SpottingIO
 from uuvtai.kernels.perception.elevation import begin_height
 from uuvtai.kernels.perception.evidence import NO_RETURN_SHARE, pinhole, wall_lanes
 from uuvtai.kernels.perception.sighting import bearing_vector
 from uuvtai.kernels.perception.track_slots import clear_track
+from uuvtai.taichi_patches.launch import quick_launch
 
 _ROW_STRIDE = 2
 """Rows of the image that are looked at: every second one; a body fills several within the range that

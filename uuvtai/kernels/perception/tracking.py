@@ -11,7 +11,7 @@ import math
 import taichi as ti
 
 from uuvtai.kernels.core.kalman import predicted
-from uuvtai.kernels.core.signature import Bundle, quick_launch, spread
+from uuvtai.kernels.core.signature import Bundle, spread
 from uuvtai.kernels.perception.association import associate
 from uuvtai.kernels.perception.bundles import TrackingIO
 from uuvtai.kernels.perception.clustering import HELD_SIGMA_M_S, find_clusters, label_beams
@@ -24,6 +24,7 @@ from uuvtai.kernels.perception.track_slots import (
     spawn_tracks,
 )
 from uuvtai.kernels.perception.track_update import update_tracks
+from uuvtai.taichi_patches.launch import quick_launch
 
 
 @quick_launch

@@ -28,8 +28,9 @@ import taichi as ti
 
 from uuvtai.kernels.core.bits import WORD, highest_bit, lowest_bit, put_bit, without_lowest
 from uuvtai.kernels.core.lanes import LANES, i16x
-from uuvtai.kernels.core.signature import Bundle, Const, In, quick_launch, spread
+from uuvtai.kernels.core.signature import Bundle, Const, In, spread
 from uuvtai.kernels.planning.bundles import ClearanceIO
+from uuvtai.taichi_patches.launch import quick_launch
 
 _FAR_COLS = 1 << 12
 """[cells] stands for "no site in this row"; its square fits an int32."""

@@ -9,10 +9,11 @@ import taichi as ti
 from uuvtai.config import FeaturesConfig
 from uuvtai.kernels.core.columns import ColumnGroup
 from uuvtai.kernels.core.geometry import FAR_M, TWO_PI, quaternion_wb, rotation_wb
-from uuvtai.kernels.core.signature import Bundle, FloatMatrix, Out, quick_launch, spread
+from uuvtai.kernels.core.signature import Bundle, FloatMatrix, Out, spread
 from uuvtai.kernels.planning.advice import TEACHER_COLUMNS
 from uuvtai.kernels.planning.approach import BODY_COLUMNS, body_values, closest_approach, next_body
 from uuvtai.kernels.planning.bundles import FeaturesIO
+from uuvtai.taichi_patches.launch import quick_launch
 
 
 @quick_launch

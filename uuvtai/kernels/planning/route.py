@@ -5,7 +5,7 @@ import taichi as ti
 
 from uuvtai.kernels.core.geometry import wrapped_angle
 from uuvtai.kernels.core.grid import cell_of
-from uuvtai.kernels.core.signature import Bundle, FloatMatrix, quick_launch, spread
+from uuvtai.kernels.core.signature import Bundle, FloatMatrix, spread
 from uuvtai.kernels.planning.along import foot_of, left_of_foot, level, look_along, point_left, segment_of
 from uuvtai.kernels.planning.bundles import RouteIO
 from uuvtai.kernels.planning.polyline import MAX_WIDENINGS, WIDENING, count_after_segment, install_route
@@ -15,6 +15,7 @@ from uuvtai.plan_codes import (
     N_TRIGGER,
     PLANNER_RRT,
 )
+from uuvtai.taichi_patches.launch import quick_launch
 
 _LONG_AGO = -(1 << 20)
 """Step at which no trigger has been served yet."""

@@ -13,7 +13,7 @@ import taichi as ti
 
 from uuvtai.kernels.core.grid import cell_of
 from uuvtai.kernels.core.lanes import LANES, i16x
-from uuvtai.kernels.core.signature import Bundle, quick_launch, spread
+from uuvtai.kernels.core.signature import Bundle, spread
 from uuvtai.kernels.planning.along import advanced_arc, level, look_along
 from uuvtai.kernels.planning.bundles import TriggersIO
 from uuvtai.kernels.planning.traversable import is_traversable
@@ -26,6 +26,7 @@ from uuvtai.plan_codes import (
     TRIGGER_SAFETY,
     TRIGGER_STUCK,
 )
+from uuvtai.taichi_patches.launch import quick_launch
 
 
 @quick_launch

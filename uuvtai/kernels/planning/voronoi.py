@@ -10,7 +10,7 @@ fails with a reason, and the host's RRT takes over.
 import taichi as ti
 
 from uuvtai.kernels.core.grid import centre_of, grid_origin
-from uuvtai.kernels.core.signature import Bundle, FloatMatrix, quick_launch, spread
+from uuvtai.kernels.core.signature import Bundle, FloatMatrix, spread
 from uuvtai.kernels.planning.bundles import VoronoiIO
 from uuvtai.kernels.planning.chord import count_of_waypoints, path_cells, straightened_cost
 from uuvtai.kernels.planning.medial import FOUND, NOT_FOUND, join_skeleton, search_cells
@@ -25,6 +25,7 @@ from uuvtai.plan_codes import (
     FAIL_START_OUTSIDE,
     PLANNER_VORONOI,
 )
+from uuvtai.taichi_patches.launch import quick_launch
 
 
 @quick_launch

@@ -14,9 +14,10 @@ import taichi as ti
 from uuvtai.kernels.core.geometry import BOX, FAR_M, NONE, SPHERE, rotation_wb
 from uuvtai.kernels.core.lanes import LANES, f16x, ramp_lanes
 from uuvtai.kernels.core.noise import STREAM_DEPTH, normal_pair_lanes, stream_key
-from uuvtai.kernels.core.signature import Bundle, quick_launch, spread
+from uuvtai.kernels.core.signature import Bundle, spread
 from uuvtai.kernels.sensors.bundles import DepthIO
 from uuvtai.kernels.sensors.raycast import ball_span, disc_span, rim_distance, slab_span
+from uuvtai.taichi_patches.launch import quick_launch
 
 _BLOCK = 36
 """Image rows per loop item on a CPU: bodies are projected once per item."""

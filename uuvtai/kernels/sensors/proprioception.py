@@ -20,8 +20,9 @@ from uuvtai.kernels.core.noise import (
     uniform,
     uniform_in,
 )
-from uuvtai.kernels.core.signature import Bundle, quick_launch, spread
+from uuvtai.kernels.core.signature import Bundle, spread
 from uuvtai.kernels.sensors.bundles import ExactProprioceptionIO, ProprioceptionIO
+from uuvtai.taichi_patches.launch import quick_launch
 
 _EPISODE_DRAW = 1000
 """Index of draws made once per episode, apart from those of step 0."""

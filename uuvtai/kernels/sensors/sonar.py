@@ -13,7 +13,7 @@ import taichi as ti
 
 from uuvtai.kernels.core.geometry import FAR_M, rotation_wb
 from uuvtai.kernels.core.lanes import LANES, f16x
-from uuvtai.kernels.core.signature import Bundle, quick_launch, spread
+from uuvtai.kernels.core.signature import Bundle, spread
 from uuvtai.kernels.sensors.bundles import SonarIO
 from uuvtai.kernels.sensors.raycast import nearest_echo, place_bodies
 from uuvtai.kernels.sensors.sonar_error import (
@@ -27,6 +27,7 @@ from uuvtai.kernels.sensors.sonar_error import (
     range_noisy,
     start_cloud,
 )
+from uuvtai.taichi_patches.launch import quick_launch
 
 _FALLOFF = 0.9
 """Intensity = cosine of incidence x (1 - 0.9 r / maximum range): Lambert's law and what gain control leaves

@@ -16,11 +16,11 @@ from uuvtai.kernels.core.signature import (
     FloatMatrix,
     FloatVector,
     IntVector,
-    quick_launch,
     spread,
 )
 from uuvtai.kernels.task.bundles import RewardIO
 from uuvtai.outcomes import COLLISION, OUT_OF_TANK, SUCCESS, TIMEOUT
+from uuvtai.taichi_patches.launch import quick_launch
 
 TERMS = (
     "alive",

@@ -5,9 +5,10 @@ import taichi as ti
 
 from uuvtai.kernels.core.geometry import FAR_M, TWO_PI, turned_z3
 from uuvtai.kernels.core.lanes import LANES, f16x, put_column
-from uuvtai.kernels.core.signature import Bundle, quick_launch, spread
+from uuvtai.kernels.core.signature import Bundle, spread
 from uuvtai.kernels.teacher.bundles import EvasionIO
 from uuvtai.kernels.teacher.trajectories import body_depths, depth_band, static_depths
+from uuvtai.taichi_patches.launch import quick_launch
 
 
 @quick_launch

@@ -6,10 +6,11 @@ import taichi as ti
 
 from uuvtai import tree_codes as codes
 from uuvtai.kernels.core.geometry import FAR_M, PI, quaternion_wb, rotation_wb, turned_z, wrapped_angle
-from uuvtai.kernels.core.signature import AnyTensor, Bundle, quick_launch, spread
+from uuvtai.kernels.core.signature import AnyTensor, Bundle, spread
 from uuvtai.kernels.teacher.bundles import TeacherIO
 from uuvtai.kernels.teacher.trajectories import held_heave
 from uuvtai.kernels.teacher.tree_tick import tick_nodes
+from uuvtai.taichi_patches.launch import quick_launch
 
 
 @quick_launch

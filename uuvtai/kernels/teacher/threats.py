@@ -6,9 +6,10 @@ import taichi as ti
 from uuvtai.kernels.core.geometry import FAR_M, TWO_PI, turned_z3, wrapped_angle
 from uuvtai.kernels.core.grid import cell_of, centre_of
 from uuvtai.kernels.core.lanes import f16x
-from uuvtai.kernels.core.signature import Bundle, quick_launch, spread
+from uuvtai.kernels.core.signature import Bundle, spread
 from uuvtai.kernels.teacher.bundles import ThreatsIO
 from uuvtai.kernels.teacher.trajectories import body_depths, depth_band, held_heave
+from uuvtai.taichi_patches.launch import quick_launch
 
 _PATH_SAMPLES = 8
 

@@ -9,8 +9,9 @@ finished node to IDLE at once. The kept form shows in a log what the newest tick
 
 import taichi as ti
 
-from uuvtai.kernels.core.signature import AnyTensor, Bundle, quick_launch
+from uuvtai.kernels.core.signature import AnyTensor, Bundle
 from uuvtai.kernels.teacher.bundles import TeacherIO
+from uuvtai.taichi_patches.launch import quick_launch
 from uuvtai.tree_codes import (
     ACTION,
     CONDITION,

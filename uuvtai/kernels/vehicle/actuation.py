@@ -10,9 +10,10 @@ from typing import Any, NamedTuple
 import taichi as ti
 
 from uuvtai.kernels.core.lanes import column, is_awake, n_awake, n_column, put_column
-from uuvtai.kernels.core.signature import Bundle, Const, FloatMatrix, In, Out, quick_launch, spread
+from uuvtai.kernels.core.signature import Bundle, Const, FloatMatrix, In, Out, spread
 from uuvtai.kernels.vehicle.bundles import ActuationIO
 from uuvtai.kernels.vehicle.rotor import rpm_of_thrust, thrust_limits
+from uuvtai.taichi_patches.launch import quick_launch
 
 
 @quick_launch

@@ -11,11 +11,12 @@ import taichi as ti
 
 from uuvtai.kernels.core.footprint import footprint_of
 from uuvtai.kernels.core.geometry import NONE
-from uuvtai.kernels.core.signature import Bundle, quick_launch, spread
+from uuvtai.kernels.core.signature import Bundle, spread
 from uuvtai.kernels.world.bodies import first_moving, put_body
 from uuvtai.kernels.world.bundles import WorldIO
 from uuvtai.kernels.world.layout import draw_layout
 from uuvtai.kernels.world.paths import draw_moving_bodies, path_point, polyline_length
+from uuvtai.taichi_patches.launch import quick_launch
 
 
 @quick_launch

@@ -7,7 +7,7 @@ import contextlib
 import time
 from collections.abc import Callable, Iterable, Iterator
 
-from uuvtai.front_end import kernels_made
+from uuvtai.taichi_patches.front_end import kernels_made
 
 
 class StepClock:

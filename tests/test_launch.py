@@ -5,8 +5,9 @@ import pytest
 import taichi as ti
 import torch
 
-from uuvtai.kernels.core.signature import Const, In, quick_launch
+from uuvtai.kernels.core.signature import Const, In
 from uuvtai.runtime import start_taichi
+from uuvtai.taichi_patches.launch import quick_launch
 
 N = 4
 

@@ -1,0 +1,127 @@
+"""Where a simulator's arrays lie in memory, and views of them.
+
+Taichi keeps them in one block (a tree of SNodes), and its nodes tell where in the block each array lies. So
+one address is enough, and nothing is compiled: ``Field.to_numpy`` and ``from_numpy`` would compile two
+kernels for each of some 270 arrays.
+"""
+
+import ctypes
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import taichi as ti
+import torch
+
+from uuvtai.state import PACKET
+
+Put = Callable[[Any, np.ndarray], None]
+"""Fills a field from an array of its shape (vectors add a last axis) and dtype."""
+
+
+def put_by_kernel(field: Any, values: np.ndarray) -> None:
+    """Fill a field wherever it lies; Taichi compiles a kernel for every field."""
+    if field.shape == ():
+        field[None] = values.item()
+    else:
+        field.from_numpy(values)
+
+
+@ti.kernel
+def _tell_address(field: ti.template(), out: ti.types.ndarray(dtype=ti.i64, ndim=1)):  # type: ignore[valid-type]
+    """out[0] = address in memory of the first element of a field of rank 1."""
+    out[0] = ti.cast(ti.get_addr(field, 0), ti.i64)
+
+
+def address_of(field: ti.Field, device: torch.device) -> int:
+    """Address of a field's first element, when all kernels are done."""
+    address = torch.zeros(1, dtype=torch.int64, device=device)
+    _tell_address(field, address)
+    ti.sync()
+    return int(address[0])
+
+
+class Memory:
+    """The arrays of ``structs`` (a dataclass of them) as they lie in memory. Valid while the simulator lives;
+    no kernel may be running."""
+
+    def __init__(self, structs: Any, anchor: Any, address: int, device: torch.device) -> None:
+        """``address`` is that of the first element of the field ``anchor``, from which all others are
+        found."""
+        root = _path(anchor)[-1]
+        self.structs, self.device = structs, device
+        self.address, self.n_bytes = address - _offset(anchor), root.cell_size_bytes
+
+    def views(self, content: np.ndarray, scratch: bool = False) -> dict[str, np.ndarray]:
+        """Every array (``scratch`` too, if asked for) as a view of what ``read`` gave.
+
+        Shapes are those of ``state``, with a last axis for vectors; arrays in lanes are as long as their
+        memory, whole packets.
+        """
+        return {
+            f"{struct.name}.{declared.name}": _view(
+                self._field(struct.name, declared.name), declared.metadata["lanes"], content
+            )
+            for struct in dataclasses.fields(self.structs)
+            for declared in dataclasses.fields(getattr(self.structs, struct.name))
+            if scratch or not declared.metadata["scratch"]
+        }
+
+    def _field(self, struct: str, name: str) -> Any:
+        return getattr(getattr(self.structs, struct), name)
+
+    def read(self) -> np.ndarray:
+        """Bytes (n_bytes,): on the CPU the memory itself, on a GPU a copy."""
+        if self.device.type == "cpu":
+            return np.ctypeslib.as_array((ctypes.c_uint8 * self.n_bytes).from_address(self.address))
+        return self._on_device().cpu().numpy()
+
+    def write(self, content: np.ndarray) -> None:
+        """Put back what ``read`` gave and what was changed in it."""
+        if self.device.type != "cpu":
+            self._on_device().copy_(torch.from_numpy(content))
+
+    def put(self, field: Any, values: np.ndarray) -> None:
+        """Fill a field that is not in lanes; ``values`` has its shape (vectors add a last axis) and dtype."""
+        if self.device.type == "cpu":
+            view = _view(field, False, self.read())
+            if values.shape != view.shape or values.dtype != view.dtype:
+                raise ValueError(
+                    f"the field is {view.dtype} {view.shape}, but got {values.dtype} {values.shape}"
+                )
+            view[...] = values
+        else:
+            put_by_kernel(field, values)
+
+    def _on_device(self) -> torch.Tensor:
+        interface = {"shape": (self.n_bytes,), "typestr": "|u1", "data": (self.address, False), "version": 3}
+        return torch.as_tensor(
+            type("Bytes", (), {"__cuda_array_interface__": interface})(), device=self.device
+        )
+
+
+def _path(field: Any) -> list[Any]:
+    """Nodes from a field's first component up to the root of its tree."""
+    nodes = [field.vars[0].ptr.snode()]
+    while nodes[-1].parent is not None:
+        nodes.append(nodes[-1].parent)
+    return nodes
+
+
+def _offset(field: Any) -> int:
+    """Where the first element lies in the block [bytes]."""
+    return sum(node.offset_bytes_in_parent_cell for node in _path(field))
+
+
+def _view(field: Any, lanes: bool, content: np.ndarray) -> np.ndarray:
+    kind, bits = str(field.dtype)[0], int(str(field.dtype)[1:])
+    shape, dtype = tuple(field.shape), np.dtype(f"{kind}{bits // 8}")
+    if lanes:
+        shape = (*shape[:-1], PACKET * -(-shape[-1] // PACKET))
+    cell = _path(field)[1].cell_size_bytes
+    strides = tuple(cell * math.prod(shape[axis + 1 :]) for axis in range(len(shape)))
+    if len(field.vars) > 1:
+        shape, strides = (*shape, len(field.vars)), (*strides, dtype.itemsize)
+    return np.ndarray(shape, dtype, buffer=content, offset=_offset(field), strides=strides)
