@@ -30,7 +30,7 @@ def put_by_kernel(field: Any, values: np.ndarray) -> None:
 
 
 @ti.kernel
-def _tell_address(field: ti.template(), out: ti.types.ndarray(dtype=ti.i64, ndim=1)):  # type: ignore[valid-type]
+def _tell(field: ti.template(), out: ti.types.ndarray(dtype=ti.i64, ndim=1)):  # type: ignore[valid-type]
     """out[0] = address in memory of the first element of a field of rank 1."""
     out[0] = ti.cast(ti.get_addr(field, 0), ti.i64)
 
@@ -38,7 +38,7 @@ def _tell_address(field: ti.template(), out: ti.types.ndarray(dtype=ti.i64, ndim
 def address_of(field: ti.Field, device: torch.device) -> int:
     """Address of a field's first element, when all kernels are done."""
     address = torch.zeros(1, dtype=torch.int64, device=device)
-    _tell_address(field, address)
+    _tell(field, address)
     ti.sync()
     return int(address[0])
 

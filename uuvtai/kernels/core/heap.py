@@ -37,6 +37,7 @@ def heap_after_pop(voronoi: Out[VoronoiState], slot, size):
     almost always belongs down there, and a comparison that cannot be predicted costs more than a step up
     again.
     """
+    # Bottom-up heapsort's sift (Wegener 1993, Theoretical Computer Science 118)
     last = size - 1
     moved = voronoi.heap[slot, last]
     place, below = 0, 1

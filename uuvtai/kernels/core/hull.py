@@ -41,6 +41,9 @@ def distance_slope(kind, q, axis, size):
 @ti.func
 def nearest_along(kind, center, axis, half_length, size):
     """Where on the axis the body is nearest [m from the middle]; body frame."""
+    # f(s) = |c + s axis - nearest point|^2 is convex, as the distance to a convex set is; its slope is 2 (q
+    # - nearest point)'axis. Rising at the lower end or falling at the upper one, that end is nearest; else
+    # the slope changes its sign in between.
     low = -half_length
     high = half_length
     if distance_slope(kind, center + low * axis, axis, size) >= 0.0:

@@ -28,6 +28,11 @@ def predicted(mean, cov, rate, link, dt, density, rate_density):
     The velocity's noise is white acceleration of spectral density [m^2/s^3], that of the turn rate
     [rad^2/s^3].
     """
+    # With a = rate dt and R(a) a turn by a, the state u = (p, v) becomes (p + dt R(a/2) v, R(a) v): the
+    # chord points half-way through the turn (its length is taken for the arc's: off by a^2 / 24). The
+    # derivatives are F = [[1, dt R(a/2)], [0, R(a)]] by u (``_carried``) and g by the rate (``turn``), so of
+    # the whole covariance [[P, l], [l', s]] remain P <- F P F' + F l g' + g (F l)' + s g g' + Q, l <- F l + s
+    # g and s <- s + q dt. Q: white acceleration over dt (Bar-Shalom, Li, Kirubarajan 2001, section 6.2).
     vel = ti.Vector([mean[2], mean[3]])
     chord, late = dt * turned_z(vel, 0.5 * dt * rate), turned_z(vel, dt * rate)
     moved = ti.Vector([mean[0] + chord[0], mean[1] + chord[1], late[0], late[1]])
@@ -72,6 +77,9 @@ def _carried(u, dt, c0, c1):
 def corrected(mean, cov, rate, link, h, residual, variance):
     """(mean, covariance, rate, link) after measuring h' (x, y, vx, vy) with the given variance; residual =
     measured - h' mean."""
+    # The Kalman gain of one number measured by (h, 0), the rate being unmeasured: K = (P h, l'h) / (h'P h +
+    # r). P <- P - (P h)(P h)' / (h'P h + r), and so for the link (P h)(l'h) and for the rate's variance
+    # (l'h)^2.
     ph = ti.Vector([0.0, 0.0, 0.0, 0.0])
     pl = 0.0
     for i in ti.static(range(4)):

@@ -141,6 +141,9 @@ def velocity_slip(normal, valid, io: Bundle[TrackingIO]):
     Also the standard deviation [m/s] of what is left of it along the worst direction; 0 where the measurement
     is ``valid``. A reading that is only held is hardly trusted: the walls decide, as far as they are seen.
     """
+    # Least d of sum (e - u'd)^2 / sigma^2 + |d|^2 / prior sigma^2: (sum u u' + prior I) d = sum u e, by
+    # Cramer's rule. Its covariance is sigma^2 times the inverse of that matrix: worst along the smallest
+    # eigenvalue.
     sigma = ti.static(max(io.sonar_cfg.doppler_sigma_m_s, 0.01))
     prior = ti.select(
         valid == 1,
@@ -296,6 +299,9 @@ def place_cluster(env, c, range_m, io: Bundle[TrackingIO]):
     bearing = io.scan.ping_yaw[env] + step * (
         io.clusters.first_beam[env, c] + 0.5 * (io.clusters.span[env, c] - 1)
     )
+    # The outermost beams touch the circle: sin(half) = radius / distance. The mean range lies ARC radii
+    # before the centre, distance = range + ARC radius; together radius = range sin(half) / (1 - ARC
+    # sin(half)).
     radius = ti.math.clamp(
         range_m * ti.sin(half) / (1.0 - ARC * ti.sin(half)),
         io.tracking_cfg.min_radius_m,

@@ -249,6 +249,8 @@ def nearest_in_gate(env, first_col, R_wb, gate_m: Const[float], io: Bundle[Mappi
     """Per image column, sixteen of them: smallest depth [m] whose point lies within ``gate_m`` of the
     vehicle's own depth, and its row."""
     focal, middle_row, middle_col = ti.static(pinhole(io.depth_cfg))
+    # Pinhole: the pixel (row, col) at depth z shows the point offset + z (1, left, up) in body axes. Its
+    # height over the vehicle is the third row of R_wb times that: mount + z climb.
     left = (middle_col - ramp_lanes(float(first_col))) / focal
     mount = (
         R_wb[2, 0] * io.depth_cfg.offset_b_m[0]

@@ -109,6 +109,8 @@ def on_straight_leg(env, track, io: Bundle[ForecastIO]):
 @ti.func
 def place_turn(env, p0, d0, p1, d1, way, io: Bundle[ForecastIO]):
     """Remember the turn between two legs, unless they do not meet."""
+    # With a = (L + u) / 2 and b = (L - u) / 2 the legs' ends p0 + a d0 and p1 - b d1 differ by p0 - p1 + L
+    # (d0 + d1) / 2 + u (d0 - d1) / 2; ``uneven`` is the u that makes this least.
     fold = d0 - d1
     uneven = 2.0 * (p1 - p0 - 0.5 * way * (d0 + d1)).dot(fold) / fold.norm_sqr()
     before, after = 0.5 * (way + uneven), 0.5 * (way - uneven)
@@ -289,6 +291,8 @@ def expected_turn_rate(
     """
     rate = 0.0
     if ti.static(forecast_cfg.use_turn_rate and tracking_cfg.turn_rate_sigma_rad_s > 0):
+        # prior N(0, S), posterior N(rate, s): odds = sqrt(s / S) exp(rate^2 / 2 s), so they exceed k where
+        # rate^2 / s > ln(S / s) + 2 ln k
         known, var = tracks.turn_rate[env, track], tracks.turn_cov[env, track][4]
         bar = ti.log(ti.static(tracking_cfg.turn_rate_sigma_rad_s**2) / ti.max(var, 1e-9)) + ti.static(
             2.0 * math.log(forecast_cfg.straight_odds)

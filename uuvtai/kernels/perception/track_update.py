@@ -84,6 +84,9 @@ def update_filter(env, track, c, io: Bundle[TrackingIO]):
         speed = ti.sqrt(mean[2] * mean[2] + mean[3] * mean[3])
         cov[7] += ti.max(speed, 0.5) ** 2
         cov[9] += ti.max(speed, 0.5) ** 2
+    # Three numbers one after another, which is exact as their errors are independent: range (h = along on
+    # the position), cross range, Doppler (h = along on the velocity). The mean Doppler over the visible half
+    # angle a is v'along times the mean cosine, sin(a) / a = 1 - a^2 / 6.
     h = ti.Vector([along[0], along[1], 0.0, 0.0])
     rate, link = io.tracks.turn_rate[env, track], io.tracks.turn_cov[env, track]
     mean_r, cov_r, rate_r, link_r = corrected(mean, cov, rate, link, h, offset.dot(along), radial_var)

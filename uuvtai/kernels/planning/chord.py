@@ -31,6 +31,10 @@ _GAIN = 1.0e-4
 def chord_cost(slot, a, b, bound, io: Bundle[VoronoiIO]):
     """Cost [cells / m] of the straight line a to b, cell by cell; FAR_M where it leaves the traversable cells
     or exceeds ``bound``."""
+    # Cell by cell along a line (Amanatides and Woo 1987, A fast voxel traversal algorithm): ``to_col``,
+    # ``to_row`` are the parameters of the line, 0 at a and 1 at b, at the next border of a column and of a
+    # row, ``per_col``, ``per_row`` from one border to the next. The nearer border is crossed; the part before
+    # it costs length x weight.
     along = b - a
     length = along.norm()
     row, col = ti.cast(ti.floor(a[1]), ti.i32), ti.cast(ti.floor(a[0]), ti.i32)
@@ -136,6 +140,9 @@ def _detour(slot, at, io: Bundle[VoronoiIO]):
 def straightened_cost(slot, n_cell, start_at, goal_at, io: Bundle[VoronoiIO]):
     """Choose for every node of the path (every fourth cell) the best continuation by dynamic programming from
     the goal; total cost."""
+    # Backwards from the goal: J(n) = min over spans s of cost(n, n + s) + J(n + s), where s = 0 stands for
+    # the cells up to the next node. Only spans 1, 2, 4, ... and the whole rest are tried: n log n lines, not
+    # n^2.
     last = (n_cell - 2) // STRIDE + 1
     io.voronoi.node_cost[slot, last] = 0.0
     for back in range(last):

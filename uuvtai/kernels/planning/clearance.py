@@ -210,6 +210,9 @@ def best_keys(slot, row, packet, io: Bundle[ClearanceIO]):
     reach, bits = ti.static(
         window_reach(io.clearance_cfg, io.mapping_cfg), offset_bits(io.clearance_cfg, io.mapping_cfg)
     )
+    # d^2 = min over rows k of gap_k^2 + (k - row)^2 (Felzenszwalb and Huttenlocher 2012, Theory of Computing
+    # 8), in keys: row_key[k] plus 2 (k - row)^2, shifted. Rows are taken by growing |k - row|. No key is
+    # negative, so once that term alone exceeds the worst of the sixteen, no farther row can win.
     offsets = bits_from(io.clearance_memory.near_up, slot, packet, row) | bits_from(
         io.clearance_memory.near_down, slot, packet, n_row - 1 - row
     )
@@ -239,6 +242,7 @@ def write_packet(env, slot, row, packet, io: Bundle[ClearanceIO]):
     )
     key, worst = best_keys(slot, row, packet, io)
     io.clearance_memory.farthest[env, row, packet] = worst >> (bits + 1)
+    # d^2 = rows^2 + cols^2 gives the site's column back; the bit below d^2 says on which side it lies
     squared = key >> (bits + 1)
     rows = (key & ti.static((1 << bits) - 1)) - reach
     cols = ti.cast(ti.sqrt(ti.cast(squared - rows * rows, ti.f32)), ti.i32)

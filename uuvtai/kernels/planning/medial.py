@@ -71,6 +71,8 @@ def on_skeleton(slot, env, row, col, io: Bundle[VoronoiIO]):
 @ti.func
 def _is_medial(env, row, col, io: Bundle[VoronoiIO]):
     """True on a plateau and where a neighbour's nearest site is far from the own one."""
+    # The integer medial axis (Hesselink and Roerdink 2008, IEEE PAMI 30): where the nearest site jumps by
+    # more than a threshold from one cell to the next, the two cells lie on either side of the axis.
     medial = io.clearance.clearance_m[env, row, col] >= ti.static(io.clearance_cfg.max_m - _FLAT_M)
     site_row = ti.cast(io.clearance.site_row[env, row, col], ti.i32)
     site_col = ti.cast(io.clearance.site_col[env, row, col], ti.i32)
@@ -150,6 +152,8 @@ def search_cells(slot, env, start, goal, everywhere, io: Bundle[VoronoiIO]):
     """
     n_col = ti.static(io.voronoi.cost.shape[2])
     floor_weight = ti.static(_STRETCH / max(io.clearance_cfg.max_m, io.voronoi_cfg.cost_epsilon_m))
+    # A* with the estimate stretched by w = _STRETCH (Pohl 1970): what it finds costs at most w times the
+    # least.
     size, status, budget = 0, NOT_FOUND, io.voronoi.pops[env] + ti.static(io.voronoi_cfg.max_pops)
     if io.voronoi.weight[slot, goal[0], goal[1]] > 0:
         io.voronoi.cost[slot, goal[0], goal[1]] = 0.0
@@ -180,6 +184,8 @@ def _size_after_expansion(slot, env, size, row, col, start, everywhere, floor_we
     here, weight = io.voronoi.cost[slot, row, col], io.voronoi.weight[slot, row, col]
     new_size = size
     for k in range(8):
+        # The integral of the weight along the edge by the trapezoid rule: length x mean of both weights. Off
+        # the skeleton a cell counts only on a way that joins an end to it, or where everywhere is searched.
         step = step_of(k)
         to_row, to_col = row + step[0], col + step[1]
         known = bits_at(slot, to_row, to_col, io)

@@ -186,6 +186,8 @@ def may_be_seen(offset, radius, R_wb, io: Bundle[DepthIO]):
     centre_b = -(R_wb.transpose() @ offset)
     half_width = ti.static(math.tan(math.radians(0.5 * io.depth_cfg.fov_deg)))
     half_height = ti.static(half_height_tangent(io.depth_cfg))
+    # the sides of the view are planes |y| = w x through the camera: a centre lies
+    # (|y| - w x) / sqrt(1 + w^2) outside of one
     beyond_x = ti.abs(centre_b[1]) - half_width * centre_b[0]
     beyond_z = ti.abs(centre_b[2]) - half_height * centre_b[0]
     return (

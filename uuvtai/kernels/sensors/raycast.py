@@ -60,6 +60,8 @@ def ball_span(x, y, z, dx, dy, dz, radius_squared):
 
 @ti.func
 def _span(room, middle, length_squared):
+    # |p + t d|^2 = r^2 is solved by t = (-p'd +- sqrt(r^2 |d|^2 - |p x d|^2)) / |d|^2, since
+    # (p'd)^2 + |p x d|^2 = |p|^2 |d|^2 (Lagrange); ``room`` stands below the root, ``middle`` = -p'd.
     root = ti.sqrt(ti.max(room, 0.0))
     inverse = 1.0 / length_squared
     enter = ti.select(room < 0.0, FAR_M, (middle - root) * inverse)
@@ -194,6 +196,7 @@ def box_entry(sx, sy, ux, uy, size, yaw):
     FAR_M where they do not."""
     c, s = ti.cos(yaw), ti.sin(yaw)
     dx, dy = ux * c + uy * s, uy * c - ux * s
+    # in the box's own axes: the ray is inside from the later of both entries on; that one's face is hit
     in_x, out_x = slab_span(sx * c + sy * s, dx, size[0])
     in_y, out_y = slab_span(sy * c - sx * s, dy, size[1])
     enter, leave = ti.max(in_x, in_y), ti.min(out_x, out_y)

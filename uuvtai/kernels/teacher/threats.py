@@ -176,6 +176,7 @@ def _foresee_conflict(env, io: Bundle[ThreatsIO]):
         heave = held_heave(
             ti.math.clamp(io.mission.goal_w[env][2], low, high) - pos[2], io.teacher_cfg, io.vehicle_cfg
         )
+        # lanes 0 to 2: follow at this depth, follow and change depth, stop; the others repeat lane 0
         cz = f16x(0.0)
         cz[1] = heave
         cx, cy = f16x(follow[0]), f16x(follow[1])

@@ -54,6 +54,8 @@ def body_depths(
             above, below = forecast.above_w[env, track], forecast.below_w[env, track]
             decay, rest = 1.0, 1.0
             for k in range(1, n_sample):
+                # exp(-t / tau) by one factor a sample: settle = A(t), gain = B(t) - B(t - T), and the
+                # velocity is v0 decay + c (rest - decay), the derivative of x(t)
                 decay *= ti.static(_decay(tracking_cfg.forecast_dt_s, teacher_cfg.lag_s))
                 time = k * dt
                 over = ti.max(time - burst_s, 0.0)
@@ -67,15 +69,22 @@ def body_depths(
                 drift = level_vel * decay - body_vel
                 wanted = _wanted_m(time, teacher_cfg)
                 radius = forecast.radius_m[env, track, k]
-                bound = radius + ti.static(teacher_cfg.hull_reach_m) + wanted
-                bound += ti.static(_fastest(teacher_cfg)) * gain
-                bound += ti.static(teacher_cfg.closing_s) * (reach_speed + body_vel.norm())
+                bound = _bound_m(radius, wanted, gain, reach_speed + body_vel.norm(), teacher_cfg)
                 if radius >= 0 and start.norm_sqr() < bound * bound:
                     z = ti.math.clamp(cz * gain + (pos[2] + vel[2] * settle), low, high)
                     gap = ti.max(ti.min(above - z, z - below), 0.0) * ti.static(teacher_cfg.vertical_weight)
                     free = _free_lanes(cx, cy, gap, start, drift, gain, rest - decay, radius, teacher_cfg)
                     _deepen(found, wanted, free, time, n_sample - 1, teacher_cfg)
     return found.peak, found.mean, found.contact, found.first
+
+
+@ti.func
+def _bound_m(radius, wanted, gain, closing, teacher_cfg: Const[TeacherConfig]):
+    """Distance [m] of ``start`` beyond which no lane's depth is above 0: however c is chosen, a lane comes no
+    nearer than |start| - fastest x gain and closes no faster than ``closing`` [m/s]."""
+    bound = radius + ti.static(teacher_cfg.hull_reach_m) + wanted
+    bound += ti.static(_fastest(teacher_cfg)) * gain
+    return bound + ti.static(teacher_cfg.closing_s) * closing
 
 
 @ti.func

@@ -160,6 +160,8 @@ def _advance(lane, fleet: Out[Any], geometry: In[Any], kept, dt, io: Bundle[Dyna
         column(fleet.vel, lane),
         column(fleet.rate, lane),
     )
+    # Explicit midpoint: x <- x + dt f(x + dt/2 f(x)), with dq/dt = q (0, w) / 2. acc is what an
+    # accelerometer has from the motion, dv + w x v.
     dv, dw = acceleration(q, v, w, force, moment, current_w, body, io)
     q_mid = turned(q, w, 0.5 * dt)
     v_mid, w_mid = v + 0.5 * dt * dv, w + 0.5 * dt * dw
@@ -229,6 +231,11 @@ def body_of(lane, fleet: In[Any], io: Bundle[DynamicsIO]):
 @ti.func
 def acceleration(q, v, w, force, moment, current_w, body: In[Any], io: Bundle[DynamicsIO]):
     """(dv/dt, dw/dt) in body axes [m/s^2, rad/s^2]: Fossen's equation solved for the derivative of nu."""
+    # Kirchhoff's equations of a body in a uniform current (Fossen 2011, chapter 6), v_r = v - current:
+    #   force   m (dv + w x v) + A dv_r + w x (A v_r) = tau - D(v_r) v_r + (B - W) up
+    #   moment  (I + A_w) dw + w x ((I + A_w) w) + v_r x (A v_r) = tau - D(w) w + (0, 0, height) x B up
+    # dv_r = dv + w x current, as the current stands still in the world (or dv, by ``added_mass_follows``);
+    # the cross products are C_RB and C_A.
     up = up_b(q)
     current_b = rotation_wb(q).transpose() @ current_w
     v_r = v - current_b

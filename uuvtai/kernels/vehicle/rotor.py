@@ -77,11 +77,11 @@ def _branch_rpm(thrust, curve: Const[tuple], dead_rpm: Const[float], sign: Const
     least = ti.static(thrust_at(curve, edge, scale))
     rpm = 0.0 * thrust
     if sign * thrust >= ti.static(sign * least):
+        # a n^2 + b n + c = T has the roots (-b +- sqrt(b^2 - 4 a (c - T))) / 2 a: the upper sign is that on
+        # the outer side of the vertex, for either sign of a
         offset = curve[2] - thrust / ti.static(KGF * scale)
         root = ti.sqrt(ti.max(curve[1] * curve[1] - 4.0 * curve[0] * offset, 0.0))
-        rpm = (root - curve[1]) / ti.static(
-            2.0 * curve[0]
-        )  # the root on the outer side of the vertex, for either sign of curve[0]
+        rpm = (root - curve[1]) / ti.static(2.0 * curve[0])
     elif sign * thrust >= ti.static(0.5 * sign * least):
         rpm = edge
     return rpm
