@@ -176,6 +176,8 @@ def nearer_echo(env, body, echo, x, y, ux, uy, travelled, io: Bundle[SonarIO]):
     if kind == BOX:
         enter, normal_x, normal_y = box_entry(sx, sy, ux, uy, size, ti.cast(io.world.yaw[env, body], ti.f32))
     else:
+        # a sphere's slice at height h over its centre is a disc of radius sqrt(R^2 - h^2); the beam, as high
+        # as its path times the slope, meets the slice that is ``lost`` = rise less that height away
         lost = ti.max(ti.abs(rise) - (ti.sqrt(sx * sx + sy * sy) + travelled) * slope, 0.0)
         radius_squared = size[0] * size[0] - ti.select(kind == SPHERE, 1.0, 0.0) * lost * lost
         enter, normal_x, normal_y = disc_entry(sx, sy, ux, uy, radius_squared)
