@@ -125,7 +125,7 @@ def _samples(folder: Path) -> dict[str, list[bytes]]:
     from uuvtai.logs.mcap_log import McapEpisodeLog
 
     with McapEpisodeLog(folder / "a.mcap", episode.header(), depth_images=True) as log:
-        for snap in episode.snapshots(20, depth=True):
+        for snap in episode.snapshots(20):
             log.write(snap)
         log.close(episode.result(20))
     saved = deployed.saved(folder / "run")

@@ -17,9 +17,9 @@ from uuvtai.logs import convert as module
 from uuvtai.logs.container import McapFile
 from uuvtai.logs.convert import ADDED, convert, serialised
 from uuvtai.logs.log_errors import LogError
-from uuvtai.logs.log_export import grid_values
 from uuvtai.logs.mcap_log import McapEpisodeLog
 from uuvtai.logs.reader import info, read_head, read_messages
+from uuvtai.logs.topics.map_topics import grid_values
 
 N_STEP = 60
 FLOAT32 = 1e-6
@@ -33,7 +33,7 @@ if any(importlib.util.find_spec(name) is None for name in ("foxglove_schemas_pro
 def recorded(tmp_path_factory):
     path = tmp_path_factory.mktemp("logs") / "a.mcap"
     with McapEpisodeLog(path, episode.header(), depth_images=True) as log:
-        for snap in episode.snapshots(N_STEP, depth=True):
+        for snap in episode.snapshots(N_STEP):
             log.write(snap)
         log.close(episode.result(N_STEP))
     return path

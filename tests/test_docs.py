@@ -23,6 +23,7 @@ from tests.browser import brightness, look
 from tests.command import uuv
 from uuvtai.config.learning import LearningConfig
 from uuvtai.env import VectorEnv
+from uuvtai.logs.topics import TOPICS
 
 ROOT = Path(__file__).parents[1]
 PROSE = sorted(
@@ -166,10 +167,12 @@ def test_every_stage_of_the_simulator_is_told():
     assert tuple(stages.FILES) == STAGES
 
 
-def test_a_topic_without_its_rate_is_refused(monkeypatch):
-    monkeypatch.delitem(topics.WHEN, "/tracks")
-    with pytest.raises(ValueError, match="/tracks"):
-        topics.page()
+def test_every_topic_of_a_log_is_on_its_page():
+    page = topics.page()
+    assert len(TOPICS) >= 24
+    for topic in TOPICS:
+        assert f"| `{topic.name}` |" in page and topic.when.text + topic.note in page
+    assert "| `/tracks` | uuv.Tracks | every new scan |" in page and "`/tracks`. Moving bodies" in page
 
 
 # ------------------------------------------------------------------------------------------------------ lines

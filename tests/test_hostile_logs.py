@@ -8,7 +8,6 @@ import subprocess
 import sys
 import textwrap
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -29,8 +28,8 @@ from uuvtai.logs.log_errors import LogError
 from uuvtai.logs.log_export import export
 from uuvtai.logs.mcap_log import McapEpisodeLog
 from uuvtai.logs.picture import picture
-from uuvtai.logs.reader import info, read_messages
-from uuvtai.logs.recording import load_recording
+from uuvtai.logs.reader import LogHead, info, read_messages
+from uuvtai.logs.recording import Recording, load_recording
 from uuvtai.logs.repair import repair
 from uuvtai.logs.video import frame_times, video
 
@@ -577,9 +576,8 @@ def test_only_an_exported_policy_is_replaced(folder, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(("poses", "is_watched"), [(2, False), (100, False), (180_000, True)])
 def test_a_small_file_cannot_order_an_hour_of_frames(poses, is_watched):
-    recording = SimpleNamespace(
-        path="x.mcap", duration_s=3600.0, pose=SimpleNamespace(times=np.linspace(0.0, 3600.0, poses))
-    )
+    recording = Recording(Path("x.mcap"), LogHead(), {})
+    recording["/pose"].times.extend(np.linspace(0.0, 3600.0, poses))
     if is_watched:
         assert len(frame_times(recording, 15.0, 1.0)) == 3600 * 15 + 16
     else:

@@ -6,6 +6,8 @@ import math
 import numpy as np
 import pytest
 
+from tests.reference.world import path_position
+from uuvtai.closed_form import path_positions
 from uuvtai.config import Config, DisturbanceConfig, FixedObstacle, Waypoint, WorldConfig
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, SPHERE
 from uuvtai.measure.explain import hindsight
@@ -16,12 +18,10 @@ from uuvtai.privileged.obstacles import (
     Obstacle,
     level_excess,
     obstacles_of,
-    path_positions,
     rounding_m,
     upright_excess,
 )
 from uuvtai.privileged.oracle import earliest_arrival
-from uuvtai.scenario import path_position
 
 CONFIG = Config()
 TOP_SPEED = math.hypot(0.6, 0.6)

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from tests.reference import logs as episode
+from uuvtai.closed_form import body_positions
 from uuvtai.logs import canvas as ink
 from uuvtai.logs.canvas import Canvas
-from uuvtai.logs.closed_form import body_positions
 from uuvtai.logs.log_errors import LogError
 from uuvtai.logs.mcap_log import McapEpisodeLog
 from uuvtai.logs.painting import map_canvas, paint_truth, paint_walls, paint_water
@@ -62,7 +62,7 @@ def has(pixels, color, tolerance=12):
 def test_picture_has_what_it_should_where_it_should(folder, bt, straight):
     image = cv2.imread(str(picture([bt, straight], folder / "p.png")))
     assert image.shape[1] == 1600 and image.shape[0] % 2 == 0
-    last = load_recording(bt, PICTURE_TOPICS).layers["dynamic"].values[-1]
+    last = load_recording(bt, PICTURE_TOPICS)["/map/dynamic"].values[-1]
     row, col = np.unravel_index(last.values.argmax(), last.values.shape)
     assert last.values[row, col] > 0.9
     spot = (last.origin_m[0] + (col + 0.5) * last.cell_m, last.origin_m[1] + (row + 0.5) * last.cell_m)
@@ -79,7 +79,7 @@ def test_picture_has_what_it_should_where_it_should(folder, bt, straight):
 
 def test_static_occupancy_is_dark_where_the_map_says_so(folder, bt):
     image = cv2.imread(str(picture(bt, folder / "s.png", obstacles=False)))
-    layer = load_recording(bt, PICTURE_TOPICS).layers["static"].values[-1]
+    layer = load_recording(bt, PICTURE_TOPICS)["/map/static"].values[-1]
     inside = layer.values.copy()
     inside[:4], inside[-4:], inside[:, :6], inside[:, -10:] = 0, 0, 0, 0  # not the walls
     row, col = np.unravel_index(inside.argmax(), inside.shape)
@@ -224,9 +224,9 @@ def test_a_frame_shows_the_moment(bt):
     canvas = map_canvas(recording.scenario["tank"], 1280, (52, 28, 84, 212))
     for time_s in (0.3, 1.7):
         frame = artist.frame(time_s)
-        hull = canvas.pixels([recording.pose.at(time_s)])[0].round().astype(int)
+        hull = canvas.pixels([recording["/pose"].at(time_s)])[0].round().astype(int)
         assert has(around(frame, hull, 1), INKS["bt"])
-        x, y, radius = recording.tracks.at(time_s)[0]
+        x, y, radius = recording["/tracks"].at(time_s)[0]
         rim = canvas.pixels([(x, y + radius + 0.06)])[0].round().astype(int)
         assert has(around(frame, rim, 2), ink.DYNAMIC, 30)
     early, late = artist.frame(0.0).astype(int), artist.frame(2.2).astype(int)

@@ -15,9 +15,9 @@ from uuvtai.learn.policy import ActorCritic
 from uuvtai.learn.risk import RiskHead
 from uuvtai.learn.world_model import WorldModel
 from uuvtai.loader import load_training, preset_names
+from uuvtai.logs.log_recorder import EpisodeRecorder
 from uuvtai.measure.episodes.methods import Method, features_of, find_policy, policies_of
 from uuvtai.measure.episodes.playing import jobs_of, run_episodes
-from uuvtai.measure.log_recorder import EpisodeRecorder
 
 N_OBS = 60
 

@@ -39,10 +39,10 @@ from uuvtai.loader import ConfigError, load_config, load_resolved, parsed_yaml
 from uuvtai.logs import budget
 from uuvtai.logs.container import MAGIC, McapFile
 from uuvtai.logs.log_errors import LogError
-from uuvtai.logs.log_export import depth_image
 from uuvtai.logs.picture import picture
 from uuvtai.logs.reader import info
 from uuvtai.logs.recording import load_recording
+from uuvtai.logs.topics.camera_topics import depth_image
 from uuvtai.measure.evaluate.tree_report import tree_report
 from uuvtai.measure.evaluate.while_training import evaluate_now
 from uuvtai.measure.reproduce.paper_run import resume as resume_reproduction

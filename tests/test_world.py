@@ -5,6 +5,7 @@ import functools
 import os
 import subprocess
 import sys
+from operator import attrgetter
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from tests.bundles import io_for
 from tests.conftest import set_step
 from tests.reference import world as reference
 from uuvtai import scenario, state
+from uuvtai.closed_form import KIND_NAMES, describe_scenario, path_positions
 from uuvtai.config import EpisodeConfig, WorldConfig
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, NONE, SPHERE
 from uuvtai.kernels.task import episode
@@ -291,14 +293,12 @@ def test_the_log_s_closed_form_gives_the_same_positions(any_world):
     of, _ = any_world
     drawn = of.at(777)
     for env in range(0, N, 16):
-        document = scenario.describe_scenario(
-            lambda field, env=env: field.to_numpy()[env], of.world, of.path, of.mission
-        )
+        document = describe_scenario(lambda name, env=env: attrgetter(name)(of).to_numpy()[env])
         assert len(document["bodies"]) == np.sum(drawn["kind"][env] != NONE)
         for body in document["bodies"]:
-            assert scenario.KIND_NAMES[drawn["kind"][env, body["slot"]]] == body["kind"]
+            assert KIND_NAMES[drawn["kind"][env, body["slot"]]] == body["kind"]
             if body["path"] is not None:
-                at = scenario.path_position(body["path"], 777 * EpisodeConfig().control_dt_s)
+                (at,) = path_positions(body["path"], np.array([777 * EpisodeConfig().control_dt_s]))
                 assert at == pytest.approx(
                     drawn["pos_w"][env, body["slot"], :2], abs=1e-3
                 )  # float32 arcs of up to 10 m

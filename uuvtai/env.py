@@ -19,8 +19,9 @@ import torch
 
 from uuvtai.capture import capture, check_arrays, check_setting, restore
 from uuvtai.config import Config
+from uuvtai.config.task import TERMS
 from uuvtai.kernels.planning.features import placed_columns
-from uuvtai.kernels.task.reward import TERMS, tell_step
+from uuvtai.kernels.task.reward import tell_step
 from uuvtai.outcomes import OUTCOMES
 from uuvtai.sim import Sim
 

@@ -1,28 +1,24 @@
-"""Scenarios seen from the host: body slots, the table of explicit obstacles, faults, and one scenario in
-plain Python for logs."""
+"""Scenarios seen from the host: body slots, the table of explicit obstacles, faults."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import taichi as ti
 
+from uuvtai.closed_form import KIND_NAMES
 from uuvtai.config import FixedObstacle, WorldConfig
 from uuvtai.errors import SettingError, UserError
-from uuvtai.kernels.core.geometry import BOX, CYLINDER, NONE, SPHERE
 from uuvtai.kernels.world.layout import COARSE_M, FAULT_ENDPOINTS, FAULT_JOINED, FAULT_STATIC
 from uuvtai.kernels.world.paths import FAULT_MOVING
-from uuvtai.state import FixedTable, MissionState, PathState, SceneState, WorldState
+from uuvtai.state import FixedTable, SceneState
 from uuvtai.taichi_patches.memory import Put, put_by_kernel
 
 N_CORNER = 5
 """Most waypoints of one path."""
 
-KIND_NAMES = {SPHERE: "sphere", CYLINDER: "cylinder", BOX: "box"}
 _KINDS = {name: kind for kind, name in KIND_NAMES.items()}
 
 FAULTS = {
@@ -151,77 +147,3 @@ def check_scenarios(faults: np.ndarray) -> None:
         return
     reasons = [text for bit, text in FAULTS.items() if np.any(faults & bit)]
     raise SceneError(f"{len(bad)} of {len(faults)} scenarios cannot be placed: " + "; ".join(reasons))
-
-
-Read = Callable[[ti.Field], np.ndarray]
-"""Reads one env's row of a field."""
-
-
-def describe_scenario(
-    read: Read, world: WorldState, path: PathState, mission: MissionState
-) -> dict[str, Any]:
-    """One scenario in closed form: where every body is at any time follows from this (see ``path_position``).
-
-    ``read(field)`` gives the env's row of a field. Positions [m] in the world frame, angles [rad], times from
-    the episode's start.
-    """
-    kind, pos, size, yaw = read(world.kind), read(world.pos_w), read(world.size), read(world.yaw)
-    first_dynamic = len(kind) - path.n_way.shape[1]
-    paths = {
-        name: read(getattr(path, name))
-        for name in ("n_way", "way_w", "radius_m", "length_m", "phase_m", "speed_m_s")
-    }
-    bodies = []
-    for slot in np.flatnonzero(kind != NONE):
-        body: dict[str, Any] = {
-            "slot": int(slot),
-            "kind": KIND_NAMES[int(kind[slot])],
-            "position": [float(v) for v in pos[slot]],
-            "size": [float(v) for v in size[slot]],
-            "yaw": float(yaw[slot]),
-            "path": None,
-        }
-        if slot >= first_dynamic:
-            body["path"] = _path_document(
-                {name: values[slot - first_dynamic] for name, values in paths.items()}
-            )
-        bodies.append(body)
-    return {
-        "start": [float(v) for v in read(mission.start_w)],
-        "start_yaw": float(read(mission.start_yaw)),
-        "goal": [float(v) for v in read(mission.goal_w)],
-        "layout_draws": int(read(world.draws)),
-        "unclear_paths": int(read(world.unclear_paths)),
-        "faults": int(read(world.faults)),
-        "bodies": bodies,
-    }
-
-
-def _path_document(row: dict[str, Any]) -> dict[str, Any]:
-    common = {key: float(row[key]) for key in ("length_m", "phase_m", "speed_m_s")}
-    if row["n_way"] == 0:
-        return {
-            "shape": "circle",
-            "center": [float(v) for v in row["way_w"][0]],
-            "radius_m": float(row["radius_m"]),
-            **common,
-        }
-    corners = [[float(v) for v in way] for way in row["way_w"][: int(row["n_way"])]]
-    return {"shape": "polyline", "corners": corners, **common}
-
-
-def path_position(path: dict[str, Any], time_s: float) -> tuple[float, float]:
-    """(x, y) [m] of a moving body at a time, from ``describe_scenario``'s path (float64)."""
-    arc = (path["phase_m"] + path["speed_m_s"] * time_s) % path["length_m"]
-    if path["shape"] == "circle":
-        angle = arc / path["radius_m"]
-        x, y = path["center"]
-        return x + abs(path["radius_m"]) * math.cos(angle), y + abs(path["radius_m"]) * math.sin(angle)
-    corners = path["corners"]
-    i = 0
-    while i < len(corners) - 1 and arc > (leg := math.dist(corners[i], corners[i + 1])):
-        arc -= leg
-        i += 1
-    a, b = corners[i], corners[(i + 1) % len(corners)]
-    share = min(1.0, arc / math.dist(a, b))
-    return a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1])

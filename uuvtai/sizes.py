@@ -10,12 +10,12 @@ from pathlib import Path
 
 from uuvtai import state
 from uuvtai.config import Config
+from uuvtai.config.task import TERMS
 from uuvtai.errors import SettingError, SizeError
 from uuvtai.kernels.core.grid import grid_shape
 from uuvtai.kernels.core.lanes import LANES
 from uuvtai.kernels.perception.mapping import map_period_s, scans_in
 from uuvtai.kernels.planning.clearance import offset_bits
-from uuvtai.kernels.task.reward import TERMS
 from uuvtai.plan_codes import N_PLANNER, N_REASON, N_TRIGGER
 from uuvtai.scenario import scenario_sizes
 

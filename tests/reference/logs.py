@@ -5,17 +5,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
+from uuvtai.closed_form import body_positions
 from uuvtai.config import Config
-from uuvtai.logs.closed_form import body_positions, scenario_document
-from uuvtai.snapshot import DepthLine, EpisodeEnd, EpisodeHeader, EpisodeSnapshot, MapLayers
+from uuvtai.logs.moment import EpisodeHeader
+from uuvtai.logs.scenario_document import scenario_document
+from uuvtai.outcomes import OUTCOMES
+from uuvtai.plan_codes import (
+    FAIL_DISCONNECTED,
+    FAIL_NONE,
+    PLANNER_RRT,
+    PLANNER_VORONOI,
+    TRIGGER_INITIAL,
+    TRIGGER_NONE,
+    TRIGGER_STUCK,
+)
 
 DT = 0.02
 N_RAY = 256
-COLUMNS = np.arange(3, 128, 2)
-"""columns of the camera that see something at the vehicle's depth"""
 MAX_RANGE_M = 12.0
 CELL_M, ORIGIN, SHAPE = 0.1, (-0.4, -0.2), (64, 208)
 TERMS = ("alive", "progress", "clearance", "ttc")
@@ -98,10 +109,9 @@ def scenario(episode: int = 3) -> dict:
 def header(controller: str = "bt", episode: int = 3) -> EpisodeHeader:
     return EpisodeHeader(
         controller=controller,
+        config=config(),
         config_yaml="world:\n  n_static: 3\n",
         scenario=scenario(episode),
-        control_dt_s=DT,
-        sonar_max_range_m=MAX_RANGE_M,
         reward_terms=TERMS,
         tree_nodes=NODES,
         git_sha="0" * 40,
@@ -109,31 +119,31 @@ def header(controller: str = "bt", episode: int = 3) -> EpisodeHeader:
 
 
 def snapshots(
-    n_step: int, sway: float = 1.0, outcome: str = "success", maps: bool = True, depth: bool = False
-) -> Iterator[EpisodeSnapshot]:
-    """Steps 0 .. n_step; the vehicle drives from start to goal with a sideways swing of ``sway`` metres."""
+    n_step: int, sway: float = 1.0, outcome: str = "success", maps: bool = True
+) -> Iterator[dict[str, Any]]:
+    """Values of steps 0 .. n_step; the vehicle drives from start to goal with a sideways swing of ``sway``
+    metres. Without ``maps`` none is handed over."""
     rng = np.random.default_rng(0)
     static, dynamic = np.zeros(SHAPE, np.float32), np.zeros(SHAPE, np.float32)
     for step in range(n_step + 1):
         share = step / max(n_step, 1)
         pos, yaw = _pose(share, sway)
-        bodies = np.array([body_positions(body, step * DT)[0] for body in BODIES])
+        bodies = np.array([body_positions(body, np.array([step * DT]))[0] for body in BODIES])
         ranges, hit, which = cast(pos, yaw, bodies)
         ranges = np.where(hit, ranges + rng.normal(0, 0.02, N_RAY), ranges).astype(np.float32)
         dynamic *= 0.99
         _mark(static, dynamic, pos, yaw, ranges, hit, which)
-        yield EpisodeSnapshot(
-            outcome=outcome if step == n_step else "running",
+        due = maps and (step % 25 == 0 or step == n_step)
+        yield {
+            "clock.step": np.int32(step),
+            "referee.outcome": np.int32(OUTCOMES.index(outcome if step == n_step else "running")),
             **_truth(step, pos, yaw, bodies, ranges.min(), rng),
             **_sensed(step, pos, yaw, ranges, hit, rng),
+            **_tracked(bodies, which),
             **_planned(step, pos, _pose(min(share + 0.06, 1.0), sway)[0]),
-            tracks=np.column_stack([bodies[3:], np.zeros((2, 2)), [0.22, 0.2]]).astype(np.float32),
-            track_beams=np.flatnonzero(which >= 3),
-            depth_image_m=rng.uniform(0.5, 10, (72, 128)).astype(np.float32)
-            if depth and step % 25 == 0
-            else None,
-            maps=layers(static, dynamic) if maps and (step % 25 == 0 or step == n_step) else None,
-        )
+            **_driven(step),
+            **(layers(static, dynamic) if due else {}),
+        }
 
 
 def _truth(
@@ -143,77 +153,110 @@ def _truth(
     bodies: np.ndarray,
     nearest_m: np.floating,
     rng: np.random.Generator,
-) -> dict:
+) -> dict[str, Any]:
     """Slot 3 is empty."""
-    later = np.array([body_positions(body, step * DT + 1e-3)[0] for body in BODIES])
+    later = np.array([body_positions(body, np.array([step * DT + 1e-3]))[0] for body in BODIES])
+    sizes = np.array([body["size"] for body in BODIES])
     return {
-        "step": step,
-        "pos_w": pos.astype(np.float32),
-        "quat_wb": _quaternion(0.02, -0.03, yaw),
-        "vel_b": np.array([0.5, 0.02, 0.0], np.float32),
-        "rate_b": rng.normal(0, 0.01, 3).astype(np.float32),
-        "current_w": np.zeros(3, np.float32),
-        "rpm": rng.normal(500, 20, 6).astype(np.float32),
-        "thrust_n": rng.normal(2, 0.1, 6).astype(np.float32),
-        "clearance_m": float(np.float32(max(nearest_m - 0.17, 0.01))),
-        "ttc_s": None if step % 3 else float(np.float32(2.3)),
-        "obstacle_kind": np.array([2, 3, 2, 0, 1, 2], np.int32),
-        "obstacle_pos_w": np.insert(bodies, 3, 0.0, axis=0).astype(np.float32),
-        "obstacle_vel_w": np.insert((later - bodies) / 1e-3, 3, 0.0, axis=0).astype(np.float32),
-        "obstacle_size": np.insert(np.array([body["size"] for body in BODIES]), 3, 0.0, axis=0).astype(
-            np.float32
-        ),
-        "obstacle_yaw": np.array([0, 0.6, 0, 0, 0, 0], np.float32),
+        "vehicle.pos_w": pos.astype(np.float32),
+        "vehicle.quat_wb": _quaternion(0.02, -0.03, yaw),
+        "vehicle.vel_b": np.array([0.5, 0.02, 0.0], np.float32),
+        "vehicle.rate_b": rng.normal(0, 0.01, 3).astype(np.float32),
+        "current.vel_w": np.zeros(3, np.float32),
+        "vehicle.rpm": rng.normal(500, 20, 6).astype(np.float32),
+        "actuation.thrust_n": rng.normal(2, 0.1, 6).astype(np.float32),
+        "referee.clearance_m": np.float32(max(nearest_m - 0.17, 0.01)),
+        "referee.ttc_s": np.float32(1e6 if step % 3 else 2.3),
+        "world.kind": np.array([2, 3, 2, 0, 1, 2], np.int32),
+        "world.pos_w": np.insert(bodies, 3, 0.0, axis=0).astype(np.float32),
+        "world.vel_w": np.insert((later - bodies) / 1e-3, 3, 0.0, axis=0).astype(np.float32),
+        "world.size": np.insert(sizes, 3, 0.0, axis=0).astype(np.float32),
+        "world.yaw": np.array([0, 0.6, 0, 0, 0, 0], np.float32),
     }
 
 
 def _sensed(
     step: int, pos: np.ndarray, yaw: float, ranges: np.ndarray, hit: np.ndarray, rng: np.random.Generator
-) -> dict:
+) -> dict[str, Any]:
+    camera = config().sensors.depth
     return {
-        "estimate_pos_w": (pos + 0.01).astype(np.float32),
-        "estimate_rpy": np.array([0.02, -0.03, yaw], np.float32),
-        "measured_vel_b": np.array([0.5, 0.02, 0.0], np.float32),
-        "measured_vel_valid": True,
-        "measured_rate_b": np.zeros(3, np.float32),
-        "depth_m": -float(pos[2]),
-        "sonar_fresh": True,
-        "sonar_ping_step": step,
-        "sonar_range_m": ranges,
-        "sonar_doppler_m_s": rng.normal(-0.3, 0.05, N_RAY).astype(np.float32),
-        "sonar_intensity": rng.uniform(0.01, 1, N_RAY).astype(np.float32),
-        "sonar_hit": hit.astype(np.int32),
-        "sonar_ping_vel_b": np.array([0.5, 0.02, 0.0], np.float32),
-        "depth_line": DepthLine(COLUMNS, COLUMNS // 4, 1.0 + COLUMNS / np.float32(64))
-        if step % 5 == 0
-        else None,
+        "ego.pos_w": (pos + 0.01).astype(np.float32),
+        "ego.rpy": np.array([0.02, -0.03, yaw], np.float32),
+        "ego.vel_b": np.array([0.5, 0.02, 0.0], np.float32),
+        "ego.vel_valid": np.int32(1),
+        "ego.rate_b": np.zeros(3, np.float32),
+        "ego.depth_m": -pos[2].astype(np.float32),
+        "scan.fresh": np.int32(1),
+        "scan.ping_step": np.int32(step),
+        "scan.range_m": ranges,
+        "scan.doppler_m_s": rng.normal(-0.3, 0.05, N_RAY).astype(np.float32),
+        "scan.intensity": rng.uniform(0.01, 1, N_RAY).astype(np.float32),
+        "scan.hit": hit.astype(np.int32),
+        "scan.ping_vel_b": np.array([0.5, 0.02, 0.0], np.float32),
+        "image.fresh": np.int32(step % 5 == 0),
+        "image.shot_rpy": np.array([0.02, -0.03, yaw], np.float32),
+        "image.depth_m": rng.uniform(0.5, 10, (camera.rows, camera.cols)).astype(np.float32),
     }
 
 
-def _planned(step: int, pos: np.ndarray, ahead: np.ndarray) -> dict:
-    """A new route every 200 steps, the second one by RRT; the tree evades in the last 30 of every 100."""
+def _tracked(bodies: np.ndarray, which: np.ndarray) -> dict[str, Any]:
+    """The two that move, in slots 0 and 2; slot 1 is dead, slot 3 rests."""
+    state = np.zeros((4, 4), np.float32)
+    state[[0, 2], :2] = bodies[3:, :2]
+    return {
+        "tracks.alive": np.array([1, 0, 1, 1], np.int32),
+        "tracks.moving": np.array([1, 1, 1, 0], np.int32),
+        "tracks.state": state,
+        "tracks.z_m": np.array([bodies[3, 2], 0, bodies[4, 2], 0], np.float32),
+        "tracks.radius_m": np.array([0.22, 0, 0.2, 0.5], np.float32),
+        "tracks.beam_track": np.select([which == 3, which == 4], [0, 2], -1).astype(np.int32),
+    }
+
+
+def _planned(step: int, pos: np.ndarray, ahead: np.ndarray) -> dict[str, Any]:
+    """A new route every 200 steps, the second one by RRT."""
+    return {
+        "route.way_w": np.linspace(pos[:2], GOAL[:2], 64).astype(np.float32),
+        "route.n_way": np.int32(40),
+        "route.plan_step": np.int32(step - step % 200),
+        "route.planner": np.int32(PLANNER_RRT if step == 200 else PLANNER_VORONOI),
+        "route.fallback_reason": np.int32(FAIL_DISCONNECTED if step == 200 else FAIL_NONE),
+        "route.trigger": np.int32(
+            TRIGGER_NONE if step % 200 else (TRIGGER_INITIAL if step == 0 else TRIGGER_STUCK)
+        ),
+        "route.lookahead_w": np.array([*ahead[:2], -0.8], np.float32),
+        "route.path_risk": np.float32(0.4),
+    }
+
+
+def _driven(step: int) -> dict[str, Any]:
+    """By a tree, which evades in the last 30 of every 100 steps."""
     follows = step % 100 < 70
+    thoughts = ("action", "value", "std", "distill_lambda", "residual", "uncertainty")
     return {
-        "action_applied": np.array([0.8, 0.0, 0.1, -0.2], np.float32),
-        "action_teacher": np.array([0.8, 0.0, 0.1, -0.2], np.float32),
-        "route_w": np.linspace(pos[:2], GOAL[:2], 40).astype(np.float32),
-        "route_fresh": step % 200 == 0,
-        "route_planner": "rrt" if step == 200 else "voronoi",
-        "route_fallback": "no_path" if step == 200 else "",
-        "replan_trigger": "none" if step % 200 else ("initial" if step == 0 else "stuck"),
-        "lookahead_w": np.array([*ahead[:2], -0.8], np.float32),
-        "path_risk": 0.4,
-        "tree_status": np.array([2, 3, 0, 3, 2, 0] if follows else [1, 3, 0, 1, 0, 0], np.int32),
-        "tree_leaf": 4 if follows else 3,
-        "reward": np.array([0.01, 0.02, -0.001, 0.0], np.float32),
+        "teacher.action": np.array([0.8, 0.0, 0.1, -0.2], np.float32),
+        "teacher.status": np.array(
+            [2, 3, 0, 3, 2, 0, 9, 9] if follows else [1, 3, 0, 1, 0, 0, 9, 9], np.int32
+        ),
+        "teacher.leaf": np.int32(4 if follows else 3),
+        "reward.term": np.array([0.01, 0.02, -0.001, 0.0], np.float32),
+        "driver.applied": np.array([0.8, 0.0, 0.1, -0.2], np.float32),
+        **{f"driver.{name}": None for name in thoughts},
     }
 
 
-def result(n_step: int, outcome: str = "success") -> EpisodeEnd:
-    return EpisodeEnd(outcome, 12.5, n_step * DT, 0.31, {"initial": 1, "stuck": 2}, {"voronoi": 2, "rrt": 1})
+def result(n_step: int, outcome: str = "success") -> SimpleNamespace:
+    return SimpleNamespace(
+        outcome=outcome,
+        episode_return=12.5,
+        time_s=n_step * DT,
+        min_clearance_m=0.31,
+        replans={"initial": 1, "stuck": 2},
+        planned_by={"voronoi": 2, "rrt": 1},
+    )
 
 
-def layers(static: np.ndarray, dynamic: np.ndarray) -> MapLayers:
+def layers(static: np.ndarray, dynamic: np.ndarray) -> dict[str, np.ndarray]:
     """Layers with a clearance computed the slow and simple way, up to 1 m."""
     rows, cols = np.indices(SHAPE)
     occupied = np.maximum(static, dynamic) >= 0.5
@@ -224,9 +267,11 @@ def layers(static: np.ndarray, dynamic: np.ndarray) -> MapLayers:
         for dc in range(-10, 11):
             source = np.roll(occupied, (dr, dc), (0, 1))
             clearance = np.where(source, np.minimum(clearance, CELL_M * math.hypot(dr, dc)), clearance)
-    clearance = clearance.astype(np.float32)
-    risk = (static + dynamic + 0.1 / (clearance + 0.1)).astype(np.float32)
-    return MapLayers(ORIGIN, CELL_M, static.copy(), dynamic.copy(), clearance, risk)
+    return {
+        "grid_map.static_occ": static.copy(),
+        "grid_map.dynamic_occ": dynamic.copy(),
+        "clearance.clearance_m": clearance.astype(np.float32),
+    }
 
 
 def cast(pos: np.ndarray, yaw: float, bodies: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

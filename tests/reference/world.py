@@ -1,6 +1,7 @@
 """Independent float64 checks of scenarios: gaps between plan views, free space on a fine grid, positions
 along paths."""
 
+import math
 from itertools import pairwise
 
 import numpy as np
@@ -69,3 +70,20 @@ def path_points(n_way, way, radius, length, spacing=0.02):
     closed = [*way[:n_way], way[0]]
     legs = [np.linspace(a, b, int(np.hypot(*(b - a)) / spacing) + 2) for a, b in pairwise(closed)]
     return np.concatenate(legs)
+
+
+def path_position(path, time_s):
+    """(x, y) [m] of a moving body at a time, from its path in scenario.json."""
+    arc = (path["phase_m"] + path["speed_m_s"] * time_s) % path["length_m"]
+    if path["shape"] == "circle":
+        angle = arc / path["radius_m"]
+        x, y = path["center"]
+        return x + abs(path["radius_m"]) * math.cos(angle), y + abs(path["radius_m"]) * math.sin(angle)
+    corners = path["corners"]
+    i = 0
+    while i < len(corners) - 1 and arc > (leg := math.dist(corners[i], corners[i + 1])):
+        arc -= leg
+        i += 1
+    a, b = corners[i], corners[(i + 1) % len(corners)]
+    share = min(1.0, arc / math.dist(a, b))
+    return a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1])

@@ -8,6 +8,24 @@ from pydantic import Field
 
 from uuvtai.config.section import NonNegative, Positive, PositiveCount, Real, Section
 
+TERMS = (
+    "alive",
+    "progress",
+    "path_distance",
+    "cross_track",
+    "clearance",
+    "ttc",
+    "overspeed",
+    "upright",
+    "heading",
+    "success",
+    "failure",
+    "tilt",
+    "effort",
+)
+"""Names of the reward's terms, in the order of ``RewardState.term``; their weights are the config keys of the
+same names."""
+
 
 class RewardConfig(Section):
     """Weights of the paper's r_t, one per term and named like it (the paper gives no values: EC), and the

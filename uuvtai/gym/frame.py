@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+from operator import attrgetter
 
 import numpy as np
 
+from uuvtai.closed_form import describe_scenario
 from uuvtai.kernels.core.grid import grid_origin
 from uuvtai.logs.canvas import ROUTE, method_inks
-from uuvtai.logs.closed_form import scenario_document
 from uuvtai.logs.painting import map_canvas, paint_layers, paint_truth, paint_walls, paint_water
-from uuvtai.logs.recording import Layer
-from uuvtai.scenario import describe_scenario
+from uuvtai.logs.scenario_document import scenario_document
+from uuvtai.logs.topics.map_topics import Layer
 from uuvtai.sim import Sim
 
 _MARGINS = (12, 12, 12, 12)
@@ -21,29 +22,26 @@ _MARGINS = (12, 12, 12, 12)
 def draw_frame(sim: Sim, row: int, width_px: int = 640) -> np.ndarray:
     """(height, width, 3) uint8, red green blue: what the vehicle of this row has mapped, its route and goal,
     and the true bodies."""
-    s, config = sim.s, sim.config
+    config = sim.config
 
-    def read(field):
-        return sim.rows(field, [row])[0]
+    def read(name: str) -> np.ndarray:
+        return sim.rows(attrgetter(name)(sim.s), [row])[0]
 
-    scenario = scenario_document(config, describe_scenario(read, s.world, s.path, s.mission), "", 0, 0)
-    time_s, pos_w, cell_m = (
-        int(read(s.clock.step)) * config.episode.control_dt_s,
-        read(s.vehicle.pos_w),
-        config.mapping.cell_m,
-    )
+    scenario = scenario_document(config, describe_scenario(read), "", 0, 0)
+    time_s = int(read("clock.step")) * config.episode.control_dt_s
+    pos_w, cell_m = read("vehicle.pos_w"), config.mapping.cell_m
     static, dynamic = (
-        Layer(time_s, read(occupancy), grid_origin(config.world.tank, cell_m), cell_m)
-        for occupancy in (s.grid_map.static_occ, s.grid_map.dynamic_occ)
+        Layer(read(occupancy), grid_origin(config.world.tank, cell_m), cell_m)
+        for occupancy in ("grid_map.static_occ", "grid_map.dynamic_occ")
     )
     canvas = map_canvas(scenario["tank"], width_px, _MARGINS)
     paint_water(canvas, scenario["tank"])
     paint_layers(canvas, static, dynamic)
     paint_truth(canvas, scenario, time_s, float(pos_w[2]))
     paint_walls(canvas, scenario["tank"])
-    canvas.line(read(s.route.way_w)[: int(read(s.route.n_way))], ROUTE, 2)
+    canvas.line(read("route.way_w")[: int(read("route.n_way"))], ROUTE, 2)
     canvas.star(scenario["goal"], 12)
-    canvas.vehicle([*pos_w, _yaw(read(s.vehicle.quat_wb))], method_inks(["bt"])["bt"])
+    canvas.vehicle([*pos_w, _yaw(read("vehicle.quat_wb"))], method_inks(["bt"])["bt"])
     return canvas.image[:, :, ::-1].copy()
 
 

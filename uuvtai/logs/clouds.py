@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from uuvtai.logs.encode import IDENTITY
-from uuvtai.logs.log_export import grid_values
 from uuvtai.logs.schemas import FLOAT32
+from uuvtai.logs.topics.map_topics import grid_values
 
 Message = dict[str, Any]
 

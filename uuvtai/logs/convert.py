@@ -24,22 +24,16 @@ from uuvtai.logs.clouds import occupied_cells, sonar_returns, waypoints
 from uuvtai.logs.container import McapFile
 from uuvtai.logs.log_errors import LogError
 from uuvtai.logs.reader import read_head, records, refuse_converted
+from uuvtai.logs.topics import TOPICS
 
 EXTRA = "uuvtai[viz]"
 """extra that brings the protobuf schemas"""
 _PACKAGES = ("google.protobuf", "foxglove_schemas_protobuf", "mcap_protobuf")
 
 _CONVERTED = frozenset(
-    f"foxglove.{name}"
-    for name in (
-        "FrameTransforms",
-        "PoseInFrame",
-        "LaserScan",
-        "CompressedImage",
-        "Grid",
-        "SceneUpdate",
-        "Log",
-    )
+    topic.schema["title"]
+    for topic in TOPICS
+    if not callable(topic.schema) and topic.schema["title"].startswith("foxglove.")
 )
 """schemas that become protobuf; nothing is imported by a name that a file gives"""
 

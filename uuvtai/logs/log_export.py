@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import contextlib
 import csv
 import itertools
@@ -22,6 +21,8 @@ import numpy as np
 from uuvtai.files import refuse_output
 from uuvtai.logs.log_errors import LogError
 from uuvtai.logs.reader import info, original, read_head, read_messages
+from uuvtai.logs.topics.camera_topics import depth_image
+from uuvtai.logs.topics.map_topics import grid_values
 
 FORMATS = ("json", "csv", "npz")
 ATTACHMENTS = "attachments"
@@ -32,10 +33,6 @@ MAX_ARRAYS = 256 << 20
 """[bytes] arrays of one export, which wait in memory"""
 _OVERHEAD = 64
 """[bytes] an array or a number takes beyond its values"""
-_PNG_HEAD = struct.Struct(">8s4x4sII")
-"""signature, first chunk's name, width, height"""
-_MAX_PIXELS = 1 << 24
-"""of a depth image: a thousand times the camera's, and far below what a small file can claim"""
 _RESERVED = re.compile(r"(con|prn|aux|nul|com[0-9]|lpt[0-9])(\..*)?", re.IGNORECASE)
 """names that open a device on some systems"""
 _MAX_NAME = 100
@@ -277,29 +274,3 @@ def _arrays(data: dict[str, Any]) -> dict[str, Any]:
         elif not isinstance(value, list) or all(isinstance(item, int | float) for item in value):
             found[key] = np.nan if value is None else value
     return found
-
-
-def grid_values(data: dict[str, Any]) -> np.ndarray:
-    """``value`` of a foxglove.Grid as an array (row, col)."""
-    cells = base64.b64decode(data["data"])
-    offset = next((entry["offset"] for entry in data["fields"] if entry["name"] == "value"), None)
-    if offset is None:
-        raise ValueError("a grid without a field named value")
-    packed = np.frombuffer(cells, np.uint8).reshape(-1, data["column_count"], data["cell_stride"])
-    return packed[..., offset : offset + 4].copy().view("<f4")[..., 0]
-
-
-def depth_image(data: dict[str, Any]) -> np.ndarray:
-    """Depth image of a foxglove.CompressedImage [mm], uint16 (row, col)."""
-    png = base64.b64decode(data["data"])
-    signature, name, width, height = _PNG_HEAD.unpack_from(png.ljust(_PNG_HEAD.size, b"\0"))
-    if signature != b"\x89PNG\r\n\x1a\n" or name != b"IHDR":
-        raise LogError("a depth image of the log cannot be decoded: it is not a PNG")
-    if width * height > _MAX_PIXELS:
-        raise LogError(
-            f"a depth image of the log claims {width} x {height} pixels: no camera of ours has so many"
-        )
-    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
-    if image is None:
-        raise LogError("a depth image of the log cannot be decoded: it is damaged")
-    return image

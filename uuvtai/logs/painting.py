@@ -8,9 +8,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from uuvtai.closed_form import body_positions
 from uuvtai.logs.canvas import DYNAMIC, FAINT, GREY, INK, MOVER, PAPER, STATIC, WATER, Canvas, Color
-from uuvtai.logs.closed_form import body_positions
-from uuvtai.logs.recording import Layer
+from uuvtai.logs.topics.map_topics import Layer
 
 AnyCanvas = TypeVar("AnyCanvas", bound=Canvas)
 

@@ -189,15 +189,15 @@ def _inks(recordings: list[Recording], methods: Sequence[str]) -> list[Color]:
 
 def _paint_occupancy(canvas: Canvas, recording: Recording, trace: bool) -> None:
     """The last map; ``trace`` adds in pink where anything moving was ever mapped."""
-    static, dynamic = recording.layers.get("static"), recording.layers.get("dynamic")
-    if static and dynamic:
+    static, dynamic = recording["/map/static"], recording["/map/dynamic"]
+    if static.values and dynamic.values:
         ever = np.max([layer.values for layer in dynamic.values], axis=0) if trace else None
         paint_layers(canvas, static.values[-1], dynamic.values[-1], ever)
 
 
 def _paint_clearance(canvas: Canvas, recordings: list[Recording], side: int) -> None:
-    series = recordings[0].layers.get("clearance")
-    if not series:
+    series = recordings[0]["/map/clearance"]
+    if not series.values:
         return
     layer = series.values[-1]
     top = max(float(layer.values.max()), 1e-6)

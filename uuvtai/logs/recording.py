@@ -5,7 +5,7 @@ from __future__ import annotations
 import bisect
 import contextlib
 import itertools
-import math
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,18 +15,9 @@ import cv2
 import numpy as np
 
 from uuvtai.logs.log_errors import LogError
-from uuvtai.logs.log_export import grid_values
-from uuvtai.logs.reader import LogHead, LogMessage, read_head, read_messages
-
-
-@dataclass(frozen=True)
-class Layer:
-    """One map of the vehicle."""
-
-    time_s: float
-    values: np.ndarray
-    origin_m: tuple[float, float]
-    cell_m: float
+from uuvtai.logs.reader import LogHead, read_head, read_messages
+from uuvtai.logs.topics import TOPICS
+from uuvtai.logs.topics.map_topics import Layer
 
 
 @dataclass
@@ -53,23 +44,11 @@ class Recording:
     path: Path
     head: LogHead
     scenario: dict[str, Any]
-    pose: Series = field(default_factory=Series)
-    """(x, y, z, yaw)"""
-    layers: dict[str, Series] = field(default_factory=dict)
-    """Layer by 'static', 'dynamic', 'clearance', 'risk'"""
-    scan: Series = field(default_factory=Series)
-    """(ranges (n,), hit (n,), when it was taken)"""
-    route: Series = field(default_factory=Series)
-    """(n, 2) points"""
-    lookahead: Series = field(default_factory=Series)
-    safety: Series = field(default_factory=Series)
-    """(clearance_m, ttc_s or None, replan trigger)"""
-    speed: Series = field(default_factory=Series)
-    leaf: Series = field(default_factory=Series)
-    tracks: Series = field(default_factory=Series)
-    """(n, 3) x, y, radius"""
-    replans: list[tuple[float, str]] = field(default_factory=list)
-    """when and why"""
+    series: dict[str, Series] = field(default_factory=lambda: defaultdict(Series))
+    """what the table of topics reads of each topic's messages"""
+
+    def __getitem__(self, topic: str) -> Series:
+        return self.series[topic]
 
     @property
     def method(self) -> str:
@@ -86,16 +65,16 @@ class Recording:
 
     @property
     def duration_s(self) -> float:
-        return self.pose.times[-1]
+        return self["/pose"].times[-1]
 
     @property
     def positions(self) -> np.ndarray:
         """(n, 4) x, y, z, yaw at every control step."""
-        return np.array(self.pose.values)
+        return np.array(self["/pose"].values)
 
     @property
     def min_clearance_m(self) -> float | None:
-        return min((value[0] for value in self.safety.values), default=None)
+        return min((value[0] for value in self["/safety"].values), default=None)
 
 
 _ENDINGS = {"ttc": "TTC stop"}
@@ -105,8 +84,9 @@ _MAX_NUMBERS = 100_000
 """of a scenario: corners of paths are drawn in every frame"""
 _MAX_ARRAYS, _OVERHEAD = 384 << 20, 200
 """[bytes] all that is drawn together, and what a message takes beyond its arrays"""
-PICTURE_TOPICS = ("/pose", "/safety", "/map/static", "/map/dynamic", "/map/clearance", "/plan/info")
-VIDEO_TOPICS = (*PICTURE_TOPICS, "/sonar/scan", "/plan/lookahead", "/state", "/action", "/tracks")
+_READERS = {topic.name: topic.read for topic in TOPICS if topic.read is not None}
+VIDEO_TOPICS = tuple(_READERS)
+PICTURE_TOPICS = tuple(topic.name for topic in TOPICS if topic.in_picture)
 
 
 def load_recording(path: Path, topics: tuple[str, ...] = VIDEO_TOPICS) -> Recording:
@@ -118,7 +98,9 @@ def load_recording(path: Path, topics: tuple[str, ...] = VIDEO_TOPICS) -> Record
     size = 0
     try:
         for message in read_messages(path, topics):
-            size += _take(found, message) + _OVERHEAD
+            value = _READERS[message.topic](message.data)
+            found[message.topic].add(message.time_s, value)
+            size += _taken(value) + _OVERHEAD
             if size > _MAX_ARRAYS:
                 raise LogError(
                     f"{path}: holds more than {_MAX_ARRAYS >> 20} MiB to draw; no episode of ours does"
@@ -128,7 +110,7 @@ def load_recording(path: Path, topics: tuple[str, ...] = VIDEO_TOPICS) -> Record
             f"{path}: a message is not as its schema says ({error!r}); see what is in it with: uuv log info "
             f"{path}"
         ) from error
-    if not found.pose.times:
+    if not found["/pose"].times:
         raise LogError(
             f"{path}: the log has no messages on /pose, so there is nothing to draw; see uuv log info {path}"
         )
@@ -182,40 +164,7 @@ def _numbers(value: Any) -> Iterator[float]:
             yield from _numbers(inner)
 
 
-def _take(recording: Recording, message: LogMessage) -> int:
-    """Add a message; bytes of the arrays that it brings."""
-    time_s, data = message.time_s, message.data
-    match message.topic:
-        case "/pose":
-            place, q = data["pose"]["position"], data["pose"]["orientation"]
-            yaw = math.atan2(2 * (q["w"] * q["z"] + q["x"] * q["y"]), 1 - 2 * (q["y"] ** 2 + q["z"] ** 2))
-            recording.pose.add(time_s, (place["x"], place["y"], place["z"], yaw))
-        case "/sonar/scan":
-            ping_s = data["timestamp"]["sec"] + data["timestamp"]["nsec"] / 1e9
-            ranges, hit = np.array(data["ranges"]), np.array(data["intensities"]) > 0
-            recording.scan.add(time_s, (ranges, hit, ping_s))
-            return ranges.nbytes + hit.nbytes
-        case "/plan/info":
-            route = np.array([(point["x"], point["y"]) for point in data["points"]]).reshape(-1, 2)
-            recording.route.add(time_s, route)
-            recording.replans.append((time_s, data["trigger"]))
-            return route.nbytes
-        case "/plan/lookahead":
-            place = data["pose"]["position"]
-            recording.lookahead.add(time_s, (place["x"], place["y"]))
-        case "/safety":
-            recording.safety.add(time_s, (data["clearance_m"], data["ttc_s"], data["replan_trigger"]))
-        case "/state":
-            recording.speed.add(time_s, math.hypot(*data["velocity"]))
-        case "/action":
-            recording.leaf.add(time_s, data.get("leaf", ""))
-        case "/tracks":
-            tracks = np.array([(t["x"], t["y"], t["radius"]) for t in data["tracks"]]).reshape(-1, 3)
-            recording.tracks.add(time_s, tracks)
-            return tracks.nbytes
-        case topic:
-            origin = data["pose"]["position"]
-            layer = Layer(time_s, grid_values(data), (origin["x"], origin["y"]), data["cell_size"]["x"])
-            recording.layers.setdefault(topic.rpartition("/")[2], Series()).add(time_s, layer)
-            return layer.values.nbytes
-    return 0
+def _taken(value: Any) -> int:
+    """Bytes of the arrays that a message's value holds."""
+    parts = value if isinstance(value, tuple) else (value,)
+    return sum(part.nbytes for part in parts if isinstance(part, np.ndarray | Layer))

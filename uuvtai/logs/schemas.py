@@ -1,4 +1,4 @@
-"""JSON schemas of every topic: the Foxglove messages that viewers know, and our own ``uuv.*``.
+"""JSON schemas: the Foxglove messages that viewers know, and what our own ``uuv.*`` are made of.
 
 The Foxglove messages follow https://docs.foxglove.dev/docs/sdk/schemas field by field, so that Foxglove,
 Lichtblick and PlotJuggler show them without a plug-in. Times are {sec, nsec} of simulation time; byte fields
@@ -11,7 +11,7 @@ under ``patternProperties``, which validators honour and viewers skip: they stil
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 Schema = dict[str, Any]
@@ -21,6 +21,8 @@ STRING: Schema = {"type": "string"}
 BOOLEAN: Schema = {"type": "boolean"}
 BASE64: Schema = {"type": "string", "contentEncoding": "base64"}
 UINT: Schema = {"type": "integer", "minimum": 0}
+THREE: Schema = {"type": "array", "items": NUMBER, "minItems": 3, "maxItems": 3}
+FOUR: Schema = {"type": "array", "items": NUMBER, "minItems": 4, "maxItems": 4}
 _NSEC: Schema = {"type": "integer", "minimum": 0, "maximum": 999_999_999}
 
 
@@ -42,11 +44,9 @@ def record(
     return {**schema, "description": description} if description else schema
 
 
-def array_of(items: Schema, length: int | None = None) -> Schema:
-    """Schema of a list, of fixed length where one is given."""
-    return {"type": "array", "items": items} | (
-        {} if length is None else {"minItems": length, "maxItems": length}
-    )
+def array_of(items: Schema) -> Schema:
+    """Schema of a list."""
+    return {"type": "array", "items": items}
 
 
 def described(schema: Schema, text: str) -> Schema:
@@ -230,112 +230,3 @@ SCENE_UPDATE = record(
     ),
     entities=array_of(SCENE_ENTITY),
 )
-
-# ------------------------------------------------------------------------------------------------------- ours
-
-_THREE = array_of(NUMBER, 3)
-_FOUR = array_of(NUMBER, 4)
-
-SONAR_DOPPLER = record(
-    "uuv.SonarDoppler",
-    timestamp=described(TIME, "when the ping was taken"),
-    velocity=described(
-        array_of(NUMBER),
-        "[m/s] how fast what a beam met recedes, own motion included; 0 where nothing returned",
-    ),
-    own_velocity=described(
-        _THREE, "[m/s] own velocity in the body frame as measured when the ping was taken"
-    ),
-)
-DEPTH_LINE = record(
-    "uuv.DepthLine",
-    "What the camera tells the map: per image column the nearest pixel at the vehicle's own depth; columns "
-    "without one are left out.",
-    timestamp=described(TIME, "when the image was taken"),
-    column=described(array_of(UINT), "0 = left"),
-    row=described(array_of(UINT), "0 = top"),
-    depth=described(array_of(NUMBER), "[m] along the camera's axis"),
-)
-PLAN = record(
-    "uuv.Plan",
-    points=described(array_of(POINT3), "[m] waypoints in the world frame"),
-    planner=described(STRING, "who planned: voronoi or rrt; none = both failed"),
-    trigger=described(STRING, "why: initial, stuck, safety or intersection"),
-    fallback=described(STRING, "why the Voronoi planner failed, empty = it did not"),
-)
-_OBSTACLE: Schema = {
-    "title": "uuv.Obstacle",
-    "type": "object",
-    "properties": {
-        "kind": {"type": "string", "enum": ["sphere", "cylinder", "box"]},
-        "x": NUMBER,
-        "y": NUMBER,
-        "z": described(NUMBER, "[m] centre"),
-        "radius": described(NUMBER, "[m] of a sphere or a vertical cylinder"),
-        "half_height": described(NUMBER, "[m] of a cylinder"),
-        "half_extents": described(_THREE, "[m] of a box, before it is turned by yaw"),
-        "yaw": described(NUMBER, "[rad]"),
-        "vx": NUMBER,
-        "vy": NUMBER,
-        "vz": described(NUMBER, "[m/s]"),
-    },
-    "required": ["kind", "x", "y", "z", "yaw", "vx", "vy", "vz"],
-    "oneOf": [{"required": ["radius"]}, {"required": ["half_extents"]}],
-}
-OBSTACLES = record("uuv.Obstacles", "Truth. In the order of scenario.json.", obstacles=array_of(_OBSTACLE))
-TRACKS = record(
-    "uuv.Tracks",
-    "Moving bodies that the vehicle believes in.",
-    tracks=array_of(record("uuv.Track", x=NUMBER, y=NUMBER, z=NUMBER, vx=NUMBER, vy=NUMBER, radius=NUMBER)),
-    beams=described(array_of(UINT), "beams of the newest scan that a moving body explains"),
-)
-STATE = record(
-    "uuv.State",
-    "Truth, and under `measured` what the instruments say.",
-    position=described(_THREE, "[m] world"),
-    orientation=described(_FOUR, "unit quaternion w, x, y, z, body to world"),
-    velocity=described(_THREE, "[m/s] over ground, body frame"),
-    rates=described(_THREE, "[rad/s] body frame"),
-    current=described(_THREE, "[m/s] of the water, world frame"),
-    rpm=described(array_of(NUMBER), "of each thruster"),
-    measured=record(
-        "uuv.Measured",
-        velocity=described(_THREE, "[m/s] DVL, body frame; the last reading where invalid"),
-        velocity_valid=BOOLEAN,
-        rates=described(_THREE, "[rad/s] gyro"),
-        depth_m=described(NUMBER, "pressure depth, positive down"),
-    ),
-)
-ACTION = record(
-    "uuv.Action",
-    "Surge, sway, heave and yaw rate, each in [-1, 1].",
-    {"policy": _FOUR, "teacher": _FOUR},
-    applied=described(_FOUR, "what drove the step that led here"),
-    thrust=described(array_of(NUMBER), "[N] of each thruster"),
-    leaf=described(STRING, "node of the tree that sets the teacher's action"),
-)
-SAFETY = record(
-    "uuv.Safety",
-    "As the referee judges it, from the truth; path_risk and replan_trigger are the vehicle's own.",
-    {"ttc_s": described(NUMBER, "null = nothing closes in")},
-    clearance_m=described(NUMBER, "hull to the nearest obstacle or wall"),
-    path_risk=NUMBER,
-    replan_trigger=described(STRING, "none, initial, stuck, safety or intersection"),
-)
-
-
-def policy_schema(reward_terms: Sequence[str]) -> Schema:
-    """Schema of /policy: value and spread of the policy, every reward term under its own name."""
-    return record(
-        "uuv.Policy",
-        "Null where there is no policy or world model. Reward terms are weighted; `reward` is their sum.",
-        {"value": NUMBER, "std": _FOUR, "lambda": NUMBER, "wm_residual": NUMBER, "wm_uncertainty": NUMBER},
-        reward=NUMBER,
-        **dict.fromkeys(reward_terms, NUMBER),
-    )
-
-
-def tree_schema(nodes: Sequence[str], statuses: Sequence[str]) -> Schema:
-    """Schema of /tree: the status of every node of the behaviour tree by its name."""
-    status: Schema = {"type": "string", "enum": list(statuses)}
-    return record("uuv.Tree", "The behaviour tree's tick.", **dict.fromkeys(nodes, status))

@@ -38,6 +38,7 @@ from uuvtai.logs.painting import (
     paint_water,
 )
 from uuvtai.logs.recording import Recording, drawing, load_recording
+from uuvtai.logs.topics.map_topics import Layer
 
 _MARGINS = (52, 28, 84, 212)
 """[px] left, right, top, bottom"""
@@ -141,7 +142,7 @@ def frame_times(recording: Recording, fps: float, speed: float) -> np.ndarray:
             f"{recording.path}: {n_frames:,.0f} frames, more than {_MOST_FRAMES:,}; raise --speed or lower "
             "--fps"
         )
-    poses = len(recording.pose.times)
+    poses = len(recording["/pose"].times)
     if n_frames > _FEW_FRAMES and n_frames > _FRAMES_PER_POSE * poses:
         raise LogError(
             f"{recording.path}: {poses} poses in {recording.duration_s:,.0f} s are no episode to watch; "
@@ -182,11 +183,11 @@ class FrameArtist:
         self.recording, self.remark = recording, remark
         self._ink = method_inks([*methods, recording.method])[recording.method]
         self._canvas = map_canvas(recording.scenario["tank"], width_px - width_px % 2, _MARGINS)
-        self._base_time: float | None = None
-        self._base = self._canvas.image
+        self._base: np.ndarray | None = None
+        self._base_map: Layer | None = None
         self._track = recording.positions
-        self._times = np.array(recording.pose.times)
-        self._clearance = np.array([value[0] for value in recording.safety.values])
+        self._times = np.array(recording["/pose"].times)
+        self._clearance = np.array([value[0] for value in recording["/safety"].values])
 
     @property
     def inks(self) -> list[Color]:
@@ -203,7 +204,7 @@ class FrameArtist:
         self._paint_plan(time_s)
         canvas.line(self._track[: i + 1, :2], self._ink, 2)
         self._paint_echoes(time_s)
-        tracks = recording.tracks.at(time_s)
+        tracks = recording["/tracks"].at(time_s)
         for x, y, radius in () if tracks is None else tracks:
             canvas.disc((x, y), (radius + 0.06) * canvas.scale, DYNAMIC, 2)
         self._paint_goal()
@@ -213,12 +214,8 @@ class FrameArtist:
         return canvas.image
 
     def _background(self, time_s: float) -> np.ndarray:
-        layers = [
-            series.at(time_s) for name in ("static", "dynamic") if (series := self.recording.layers.get(name))
-        ]
-        static, dynamic = layers if len(layers) == 2 else (None, None)
-        key = static.time_s if static else -1.0
-        if key != self._base_time:
+        static, dynamic = (self.recording[f"/map/{name}"].at(time_s) for name in ("static", "dynamic"))
+        if self._base is None or static is not self._base_map:
             canvas = self._canvas
             canvas.image = np.full_like(canvas.image, PAPER)
             paint_water(canvas, self.recording.scenario["tank"])
@@ -226,16 +223,13 @@ class FrameArtist:
                 paint_layers(canvas, static, dynamic)
             paint_walls(canvas, self.recording.scenario["tank"])
             paint_ruler(canvas)
-            self._base, self._base_time = canvas.image, key
+            self._base, self._base_map = canvas.image, static
         return self._base
 
     def _paint_plan(self, time_s: float) -> None:
-        canvas, route, ahead = (
-            self._canvas,
-            self.recording.route.at(time_s),
-            self.recording.lookahead.at(time_s),
-        )
-        if route is not None and len(route) > 1:
+        canvas, plan = self._canvas, self.recording["/plan/info"].at(time_s)
+        route, ahead = () if plan is None else plan[0], self.recording["/plan/lookahead"].at(time_s)
+        if len(route) > 1:
             canvas.line(route, PAPER, 5)
             canvas.line(route, ROUTE, 2)
         if ahead is not None:
@@ -244,11 +238,11 @@ class FrameArtist:
 
     def _paint_echoes(self, time_s: float) -> None:
         """Returns of the newest scan, seen from where it was taken."""
-        scan = self.recording.scan.at(time_s)
+        scan = self.recording["/sonar/scan"].at(time_s)
         if scan is None:
             return
         ranges, hit, ping_s = scan
-        x, y, _, yaw = self.recording.pose.at(ping_s) or self._track[0]
+        x, y, _, yaw = self.recording["/pose"].at(ping_s) or self._track[0]
         bearing = yaw + 2 * np.pi * np.arange(len(ranges)) / len(ranges)
         for echo in (
             np.array([x, y]) + ranges[:, None] * np.column_stack([np.cos(bearing), np.sin(bearing)])
@@ -293,8 +287,7 @@ class FrameArtist:
     def _paint_panel(self, time_s: float, i: int) -> None:
         canvas, recording = self._canvas, self.recording
         top = canvas.image.shape[0] - _PANEL
-        safety, leaf = recording.safety.at(time_s), recording.leaf.at(time_s)
-        speed = recording.speed.at(time_s)
+        safety, leaf, speed = (recording[name].at(time_s) for name in ("/safety", "/action", "/state"))
         clearance = None if safety is None else safety[0]
         near = clearance is not None and clearance < 0.3
         self._figure(
@@ -340,7 +333,7 @@ class FrameArtist:
             canvas.text((left - 8, y + 5), f"{value:g}", 13, GREY, align="right")
         canvas.text((left, top + 12), "clearance [m]", 14, GREY)
         self._paint_replans(place, time_s, low)
-        curve = place(np.array(recording.safety.times), self._clearance)
+        curve = place(np.array(recording["/safety"].times), self._clearance)
         canvas.strip(curve, mixed(self._ink, PAPER, 0.25), 2)
         if i > 0:
             canvas.strip(curve[: i + 1], self._ink, 2)
@@ -350,13 +343,14 @@ class FrameArtist:
     def _paint_replans(
         self, place: Callable[[np.ndarray, np.ndarray], np.ndarray], time_s: float, low: int
     ) -> None:
-        canvas, x = self._canvas, 700.0
+        canvas, x, plans = self._canvas, 700.0, self.recording["/plan/info"]
+        replans = [(at, trigger) for at, (_, trigger) in zip(plans.times, plans.values, strict=True)]
         for name, color in _TRIGGER_COLORS.items():
-            count = sum(trigger == name and at <= time_s for at, trigger in self.recording.replans)
+            count = sum(trigger == name and at <= time_s for at, trigger in replans)
             label = f"{name} {count}"
             x += 14 + canvas.text((x, low + 22), label, 14, color, bold=True) + 10
         canvas.text((560, low + 22), "replans by trigger:", 14, GREY)
-        for at, trigger in self.recording.replans:
+        for at, trigger in replans:
             if at <= time_s:
                 px = round(float(place(np.array([at]), np.zeros(1))[0, 0]))
                 cv2.line(

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from uuvtai.closed_form import body_positions, path_positions
+
 Array = np.ndarray
 
 _BEFORE_S = 1e-4
@@ -47,27 +49,9 @@ def _obstacle(body: dict[str, Any], t_s: Array) -> Obstacle:
     pos, vel = np.array([body["position"]], float), np.zeros((1, 2))
     path = body["path"]
     if path is not None and path["speed_m_s"] > 0:
-        level = path_positions(path, t_s)
-        pos = np.column_stack([level, np.full(len(t_s), pos[0, 2])])
-        vel = (level - path_positions(path, t_s - _BEFORE_S)) / _BEFORE_S
+        pos = body_positions(body, t_s)
+        vel = (pos[:, :2] - path_positions(path, t_s - _BEFORE_S)) / _BEFORE_S
     return Obstacle(body["kind"], np.array(body["size"], float), float(body["yaw"]), pos, vel)
-
-
-def path_positions(path: dict[str, Any], t_s: Array) -> Array:
-    """(n_t, 2) [m]: ``scenario.path_position`` of many times at once."""
-    arc = (path["phase_m"] + path["speed_m_s"] * np.asarray(t_s, float)) % path["length_m"]
-    if path["shape"] == "circle":
-        angle = arc / path["radius_m"]
-        return np.array(path["center"]) + abs(path["radius_m"]) * np.column_stack(
-            [np.cos(angle), np.sin(angle)]
-        )
-    corners = np.array(path["corners"], float)
-    legs = np.roll(corners, -1, axis=0) - corners
-    length = np.linalg.norm(legs, axis=1)
-    begun = np.concatenate([[0.0], np.cumsum(length)[:-1]])
-    leg = np.searchsorted(begun, arc, side="right") - 1
-    share = np.minimum((arc - begun[leg]) / length[leg], 1.0)
-    return corners[leg] + share[:, None] * legs[leg]
 
 
 def level_excess(body: Obstacle, dx: Array, dy: Array) -> tuple[Array, Array]:

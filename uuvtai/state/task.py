@@ -53,7 +53,7 @@ class RewardState:
     """Reward of the step, term by term."""
 
     term: ti.Field = array("n_env", "n_term")
-    """weighted terms, in the order of reward.TERMS"""
+    """weighted terms, in the order of TERMS"""
     episode_sum: ti.Field = array("n_env", "n_term")
     """their sums over the episode"""
     total: ti.Field = array("n_env")

@@ -8,6 +8,7 @@ Safety terms come from the referee (truth), which the reward may use; the policy
 
 import taichi as ti
 
+from uuvtai.config.task import TERMS
 from uuvtai.kernels.core.geometry import rotation_wb
 from uuvtai.kernels.core.signature import (
     AnyVector,
@@ -21,24 +22,6 @@ from uuvtai.kernels.core.signature import (
 from uuvtai.kernels.task.bundles import RewardIO
 from uuvtai.outcomes import COLLISION, OUT_OF_TANK, SUCCESS, TIMEOUT
 from uuvtai.taichi_patches.launch import quick_launch
-
-TERMS = (
-    "alive",
-    "progress",
-    "path_distance",
-    "cross_track",
-    "clearance",
-    "ttc",
-    "overspeed",
-    "upright",
-    "heading",
-    "success",
-    "failure",
-    "tilt",
-    "effort",
-)
-"""Names of the terms, in the order of ``RewardState.term``; their weights are the config keys of the same
-names."""
 
 _PENALTIES = ("path_distance", "cross_track", "clearance", "ttc", "overspeed", "failure", "tilt", "effort")
 """Terms that the equation subtracts."""

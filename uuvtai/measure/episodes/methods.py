@@ -15,7 +15,7 @@ from uuvtai.tree import FlatTree, read_tree
 
 if TYPE_CHECKING:
     from uuvtai.learn.checkpoint import Checkpoint
-    from uuvtai.measure.log_recorder import PolicyNote
+    from uuvtai.logs.log_recorder import PolicyNote
     from uuvtai.sim import Sim
 
 TRUTH = "truth"
@@ -61,7 +61,7 @@ class Method:
             return None
         from uuvtai.env import VectorEnv
         from uuvtai.learn.pilot import load_pilot
-        from uuvtai.measure.log_recorder import PolicyNote
+        from uuvtai.logs.log_recorder import PolicyNote
 
         self.checkpoint.check_table(VectorEnv(sim).observation_table, sim.config)
         weight = self.checkpoint.manifest.metrics.get("distill/lambda")

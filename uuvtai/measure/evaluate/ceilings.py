@@ -5,11 +5,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
 import torch
 
+from uuvtai.closed_form import describe_scenario
 from uuvtai.config import Config
 from uuvtai.measure.episodes.methods import TRUTH
 from uuvtai.measure.episodes.playing import EpisodeResult, Job, Progress
@@ -19,7 +21,6 @@ from uuvtai.plan_codes import PLANNERS, REASONS, TRIGGERS
 from uuvtai.privileged.blind_ride import ride_blindly
 from uuvtai.privileged.detection import required_detection
 from uuvtai.privileged.oracle import earliest_arrival
-from uuvtai.scenario import describe_scenario
 from uuvtai.sim import Sim
 from uuvtai.statistics import rate, wilson_interval
 
@@ -54,12 +55,12 @@ def _drawn(sim: Sim, jobs: list[Job]) -> Iterator[dict[str, Any]]:
     rows, read = list(range(len(jobs))), {}
     for row in rows:
 
-        def values(field: Any, row: int = row) -> np.ndarray:
-            if id(field) not in read:
-                read[id(field)] = sim.rows(field, rows)
-            return read[id(field)][row]
+        def values(name: str, row: int = row) -> np.ndarray:
+            if name not in read:
+                read[name] = sim.rows(attrgetter(name)(sim.s), rows)
+            return read[name][row]
 
-        yield describe_scenario(values, sim.s.world, sim.s.path, sim.s.mission)
+        yield describe_scenario(values)
 
 
 def oracle_entry(

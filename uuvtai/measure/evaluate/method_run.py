@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+from uuvtai.logs.log_recorder import EpisodeRecorder, PolicyNote
 from uuvtai.measure.episodes.methods import Method
 from uuvtai.measure.episodes.playing import EpisodeResult, Job, Recorders, run_episodes
 from uuvtai.measure.episodes.stopwatch import StepClock
@@ -20,7 +21,6 @@ from uuvtai.measure.evaluate.foresight import (
 )
 from uuvtai.measure.evaluate.ledger import Finished, Keeper, Ledger
 from uuvtai.measure.evaluate.summary import summary, tree_use
-from uuvtai.measure.log_recorder import EpisodeRecorder, PolicyNote
 from uuvtai.sim import Sim
 
 

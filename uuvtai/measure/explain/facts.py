@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 
+from uuvtai.closed_form import KIND_NAMES
 from uuvtai.config import Config
 from uuvtai.kernels.core.geometry import BOX, NONE
 from uuvtai.measure.explain import hindsight
 from uuvtai.measure.explain.escape import escapes
 from uuvtai.measure.explain.history import Array, Bodies, Diary, History
-from uuvtai.scenario import KIND_NAMES
 
 WINDOW_S = 4.0
 """How far back the facts look; a time "ago" that is None lies farther back or never was."""

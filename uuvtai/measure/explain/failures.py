@@ -18,7 +18,7 @@ from uuvtai.sim import Sim
 from uuvtai.statistics import mean
 
 if TYPE_CHECKING:
-    from uuvtai.measure.log_recorder import PolicyNote
+    from uuvtai.logs.log_recorder import PolicyNote
 
 EXAMPLES = 3
 """Episodes named per label in the table."""
@@ -137,9 +137,9 @@ def record_worst(
 
     ``methods``: all that are compared, in order, so that each keeps its colour.
     """
+    from uuvtai.logs.log_recorder import EpisodeRecorder
     from uuvtai.logs.picture import picture
     from uuvtai.logs.video import SMALL, video
-    from uuvtai.measure.log_recorder import EpisodeRecorder
 
     if not rows:
         return []

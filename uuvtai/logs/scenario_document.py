@@ -1,11 +1,9 @@
-"""scenario.json: everything true about an episode's world in closed form, and how to recompute what the log
-claims from it."""
+"""scenario.json: everything true about an episode's world in closed form, and how an outsider recomputes from
+it what the log claims."""
 
 from __future__ import annotations
 
 from typing import Any
-
-import numpy as np
 
 FRAMES = {
     "world": "z up, x along the tank, y across, z = 0 at the surface [m]",
@@ -134,7 +132,7 @@ def scenario_document(
     config: Any, described: dict[str, Any], world: str, seed: int, episode: int
 ) -> dict[str, Any]:
     """Content of scenario.json. ``config`` is a Config, ``described`` comes from
-    ``uuvtai.scenario.describe_scenario`` at step 0."""
+    ``closed_form.describe_scenario`` at step 0."""
     wanted, tank = config.world, config.world.tank
     moving = sum(body["path"] is not None for body in described["bodies"])
     return {
@@ -158,27 +156,3 @@ def scenario_document(
         "frames": FRAMES,
         "formulas": FORMULAS,
     }
-
-
-def body_positions(body: dict[str, Any], times_s: np.ndarray) -> np.ndarray:
-    """Centres (n, 3) [m] of a body of scenario.json at these times (float64), by the formula
-    ``obstacle_position``."""
-    times = np.atleast_1d(np.asarray(times_s, float))
-    path = body["path"]
-    x, y, z = body["position"]
-    if path is None:
-        return np.tile([x, y, z], (len(times), 1))
-    arc = (path["phase_m"] + path["speed_m_s"] * times) % path["length_m"]
-    flat = _on_circle(path, arc) if path["shape"] == "circle" else _on_polyline(path, arc)
-    return np.column_stack([flat, np.full(len(times), z)])
-
-
-def _on_circle(path: dict[str, Any], arc: np.ndarray) -> np.ndarray:
-    angle = arc / path["radius_m"]
-    return np.array(path["center"]) + abs(path["radius_m"]) * np.column_stack([np.cos(angle), np.sin(angle)])
-
-
-def _on_polyline(path: dict[str, Any], arc: np.ndarray) -> np.ndarray:
-    corners = np.array([*path["corners"], path["corners"][0]])
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
-    return np.column_stack([np.interp(arc, along, corners[:, axis]) for axis in (0, 1)])

@@ -1,0 +1,85 @@
+"""One scenario in closed form: what is in it, and where its bodies are at any time.
+
+Plain Python and NumPy in float64. The simulator moves its bodies by the same formula in float32
+(``kernels/world/paths.py``); logs, pictures and the privileged yardsticks take it from here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+KIND_NAMES = {1: "sphere", 2: "cylinder", 3: "box"}
+"""by code of ``kernels.core.geometry``; other codes are empty slots"""
+
+Read = Callable[[str], np.ndarray]
+"""One env's row of a field of the state, by 'struct.field'."""
+
+
+def describe_scenario(read: Read) -> dict[str, Any]:
+    """One scenario as a document: where every body is at any time follows from this (``body_positions``).
+
+    Positions [m] in the world frame, angles [rad], times from the episode's start.
+    """
+    kind, pos, size, yaw = (read(f"world.{name}") for name in ("kind", "pos_w", "size", "yaw"))
+    path = {
+        name: read(f"path.{name}")
+        for name in ("n_way", "way_w", "radius_m", "length_m", "phase_m", "speed_m_s")
+    }
+    first_moving = len(kind) - len(path["n_way"])
+    bodies = []
+    for slot in range(len(kind)):
+        if kind[slot] in KIND_NAMES:
+            lane = slot - first_moving
+            body = {
+                "slot": slot,
+                "kind": KIND_NAMES[int(kind[slot])],
+                "position": pos[slot].tolist(),
+                "size": size[slot].tolist(),
+                "yaw": float(yaw[slot]),
+                "path": None if lane < 0 else _path({name: rows[lane] for name, rows in path.items()}),
+            }
+            bodies.append(body)
+    return {
+        "start": read("mission.start_w").tolist(),
+        "start_yaw": float(read("mission.start_yaw")),
+        "goal": read("mission.goal_w").tolist(),
+        "layout_draws": int(read("world.draws")),
+        "unclear_paths": int(read("world.unclear_paths")),
+        "faults": int(read("world.faults")),
+        "bodies": bodies,
+    }
+
+
+def _path(row: dict[str, Any]) -> dict[str, Any]:
+    common = {key: float(row[key]) for key in ("length_m", "phase_m", "speed_m_s")}
+    if row["n_way"] == 0:
+        circle = {"shape": "circle", "center": row["way_w"][0].tolist(), "radius_m": float(row["radius_m"])}
+        return circle | common
+    return {"shape": "polyline", "corners": row["way_w"][: int(row["n_way"])].tolist(), **common}
+
+
+def path_positions(path: dict[str, Any], times_s: np.ndarray) -> np.ndarray:
+    """(n, 2) [m] along a document's path at these times (n,) [s]."""
+    arc = (path["phase_m"] + path["speed_m_s"] * np.asarray(times_s, float)) % path["length_m"]
+    if path["shape"] == "circle":
+        angle = arc / path["radius_m"]  # negative = clockwise
+        ahead = np.column_stack([np.cos(angle), np.sin(angle)])
+        return np.array(path["center"]) + abs(path["radius_m"]) * ahead
+    corners = np.array(path["corners"], float)
+    legs = np.roll(corners, -1, axis=0) - corners
+    length = np.linalg.norm(legs, axis=1)
+    begun = np.concatenate([[0.0], np.cumsum(length)[:-1]])
+    leg = np.searchsorted(begun, arc, side="right") - 1
+    share = np.minimum((arc - begun[leg]) / np.maximum(length[leg], 1e-9), 1.0)
+    return corners[leg] + share[:, None] * legs[leg]
+
+
+def body_positions(body: dict[str, Any], times_s: np.ndarray) -> np.ndarray:
+    """Centres (n, 3) [m] of a document's body at these times (n,) [s]."""
+    if body["path"] is None:
+        return np.tile(np.array(body["position"], float), (len(times_s), 1))
+    level = path_positions(body["path"], times_s)
+    return np.column_stack([level, np.full(len(level), float(body["position"][2]))])

@@ -1,0 +1,101 @@
+"""What the camera sees: on request whole images, and always what the map takes from them, without which
+nobody could redo the map."""
+
+from __future__ import annotations
+
+import base64
+import math
+import struct
+from typing import Any
+
+import cv2
+import numpy as np
+
+from uuvtai.config import Config
+from uuvtai.logs.encode import numbers
+from uuvtai.logs.log_errors import LogError
+from uuvtai.logs.moment import Moment
+from uuvtai.logs.schemas import COMPRESSED_IMAGE, NUMBER, TIME, UINT, array_of, described, record
+from uuvtai.logs.topic import IMAGES, NEW_IMAGE, Topic
+
+_NO_RETURN_SHARE = 0.999
+"""As in ``kernels.evidence``: a pixel beyond this share of the camera's range saw nothing."""
+_PNG_HEAD = struct.Struct(">8s4x4sII")
+"""signature, first chunk's name, width, height"""
+_MAX_PIXELS = 1 << 24
+"""of a depth image: a thousand times the camera's, and far below what a small file can claim"""
+
+_DEPTH_LINE = record(
+    "uuv.DepthLine",
+    "What the camera tells the map: per image column the nearest pixel at the vehicle's own depth; columns "
+    "without one are left out.",
+    timestamp=described(TIME, "when the image was taken"),
+    column=described(array_of(UINT), "0 = left"),
+    row=described(array_of(UINT), "0 = top"),
+    depth=described(array_of(NUMBER), "[m] along the camera's axis"),
+)
+
+
+def _line(moment: Moment) -> bytes:
+    depth_m = moment["image.depth_m"]
+    column, row = depth_line(depth_m, moment["image.shot_rpy"], moment.header.config)
+    columns, rows = (",".join(map(str, indices.tolist())) for indices in (column, row))
+    depth = numbers(depth_m[row, column])
+    return f'{{"timestamp":{moment.stamp},"column":[{columns}],"row":[{rows}],"depth":{depth}}}'.encode()
+
+
+def depth_line(depth_m: np.ndarray, rpy: np.ndarray, config: Config) -> tuple[np.ndarray, np.ndarray]:
+    """(columns, rows): in every column of a depth image (rows, cols) that has one, the nearest pixel within
+    ``mapping.depth_gate_m`` of the vehicle's own depth; ``rpy`` [rad] is its attitude estimate."""
+    camera = config.sensors.depth
+    rows, cols = depth_m.shape
+    focal = 0.5 * camera.cols / math.tan(math.radians(0.5 * camera.fov_deg))
+    left = (0.5 * camera.cols - 0.5 - np.arange(cols)) / focal
+    up = (0.5 * camera.rows - 0.5 - np.arange(rows))[:, None] / focal
+    roll, pitch = (float(v) for v in rpy[:2])
+    ahead_z, left_z, up_z = (
+        -math.sin(pitch),
+        math.sin(roll) * math.cos(pitch),
+        math.cos(roll) * math.cos(pitch),
+    )
+    mount = np.dot((ahead_z, left_z, up_z), camera.offset_b_m)
+    rise = mount + depth_m * (ahead_z + left_z * left + up_z * up)
+    counts = (
+        (np.abs(rise) <= config.mapping.depth_gate_m)
+        & (depth_m > 0)
+        & (depth_m < camera.max_range_m * _NO_RETURN_SHARE)
+    )
+    gated = np.where(counts, depth_m, np.inf)
+    row = np.argmin(gated, axis=0)
+    column = np.flatnonzero(np.isfinite(gated[row, np.arange(cols)]))
+    return column, row[column]
+
+
+def _png(moment: Moment) -> bytes:
+    """16-bit PNG in millimetres."""
+    depth_m = np.asarray(moment["image.depth_m"], np.float64)
+    millimetres = np.clip(np.rint(depth_m * 1000.0), 0, 65535).astype(np.uint16)
+    png = base64.b64encode(cv2.imencode(".png", millimetres)[1].tobytes()).decode()
+    return f'{{"timestamp":{moment.stamp},"frame_id":"camera","data":"{png}","format":"png"}}'.encode()
+
+
+def depth_image(data: dict[str, Any]) -> np.ndarray:
+    """Depth image of a foxglove.CompressedImage [mm], uint16 (row, col). Raises LogError."""
+    png = base64.b64decode(data["data"])
+    signature, name, width, height = _PNG_HEAD.unpack_from(png.ljust(_PNG_HEAD.size, b"\0"))
+    if signature != b"\x89PNG\r\n\x1a\n" or name != b"IHDR":
+        raise LogError("a depth image of the log cannot be decoded: it is not a PNG")
+    if width * height > _MAX_PIXELS:
+        raise LogError(
+            f"a depth image of the log claims {width} x {height} pixels: no camera of ours has so many"
+        )
+    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise LogError("a depth image of the log cannot be decoded: it is damaged")
+    return image
+
+
+ROWS = (
+    Topic("/camera/line", NEW_IMAGE, _DEPTH_LINE, _line, ("image.depth_m", "image.shot_rpy")),
+    Topic("/camera/depth", IMAGES, COMPRESSED_IMAGE, _png, ("image.depth_m",), on_request=True),
+)

@@ -1,0 +1,138 @@
+"""What drives: action, policy, safety, behaviour tree."""
+
+from __future__ import annotations
+
+import functools
+import json
+
+import numpy as np
+
+from uuvtai.logs.encode import dumped, number, number_or_null, numbers, numbers_or_null
+from uuvtai.logs.moment import EpisodeHeader, Moment
+from uuvtai.logs.schemas import FOUR, NUMBER, STRING, Schema, array_of, described, record
+from uuvtai.logs.topic import EVERY_STEP, Topic
+from uuvtai.logs.topics.plan_topics import trigger_of
+
+_FAR = 1e5
+"""A time to collision beyond stands for "nothing closes in" in the simulator."""
+_STATUSES = ("IDLE", "RUNNING", "SUCCESS", "FAILURE")
+"""by the codes of ``tree_codes``"""
+
+_ACTION = record(
+    "uuv.Action",
+    "Surge, sway, heave and yaw rate, each in [-1, 1].",
+    {"policy": FOUR, "teacher": FOUR},
+    applied=described(FOUR, "what drove the step that led here"),
+    thrust=described(array_of(NUMBER), "[N] of each thruster"),
+    leaf=described(STRING, "node of the tree that sets the teacher's action"),
+)
+_SAFETY = record(
+    "uuv.Safety",
+    "As the referee judges it, from the truth; path_risk and replan_trigger are the vehicle's own.",
+    {"ttc_s": described(NUMBER, "null = nothing closes in")},
+    clearance_m=described(NUMBER, "hull to the nearest obstacle or wall"),
+    path_risk=NUMBER,
+    replan_trigger=described(STRING, "none, initial, stuck, safety or intersection"),
+)
+
+
+def _policy_schema(header: EpisodeHeader) -> Schema:
+    return record(
+        "uuv.Policy",
+        "Null where there is no policy or world model. Reward terms are weighted; `reward` is their sum.",
+        {"value": NUMBER, "std": FOUR, "lambda": NUMBER, "wm_residual": NUMBER, "wm_uncertainty": NUMBER},
+        reward=NUMBER,
+        **dict.fromkeys(header.reward_terms, NUMBER),
+    )
+
+
+def _tree_schema(header: EpisodeHeader) -> Schema:
+    status: Schema = {"type": "string", "enum": list(_STATUSES)}
+    return record("uuv.Tree", "The behaviour tree's tick.", **dict.fromkeys(header.nodes, status))
+
+
+def _action(moment: Moment) -> bytes:
+    node = int(moment["teacher.leaf"])
+    leaf = "" if node < 0 else moment.header.nodes[node]
+    return (
+        f'{{"policy":{numbers_or_null(moment["driver.action"])},'
+        f'"teacher":{numbers(moment["teacher.action"])},'
+        f'"applied":{numbers(moment["driver.applied"])},'
+        f'"thrust":{numbers(moment["actuation.thrust_n"])},"leaf":{json.dumps(leaf)}}}'
+    ).encode()
+
+
+def _policy(moment: Moment) -> bytes:
+    terms = moment["reward.term"]
+    rewards = "".join(
+        f'"{name}":{number(value)},' for name, value in zip(moment.header.reward_terms, terms, strict=True)
+    )
+    return (
+        f'{{"value":{number_or_null(moment["driver.value"])},'
+        f'"std":{numbers_or_null(moment["driver.std"])},'
+        f'"reward":{number(float(np.sum(terms)))},{rewards}'
+        f'"lambda":{number_or_null(moment["driver.distill_lambda"])},'
+        f'"wm_residual":{number_or_null(moment["driver.residual"])},'
+        f'"wm_uncertainty":{number_or_null(moment["driver.uncertainty"])}}}'
+    ).encode()
+
+
+def _safety(moment: Moment) -> bytes:
+    ttc_s = float(moment["referee.ttc_s"])
+    return (
+        f'{{"clearance_m":{number(moment["referee.clearance_m"])},'
+        f'"ttc_s":{number_or_null(None if ttc_s > _FAR else ttc_s)},'
+        f'"path_risk":{number(moment["route.path_risk"])},"replan_trigger":"{trigger_of(moment)}"}}'
+    ).encode()
+
+
+def _tree(moment: Moment) -> bytes:
+    nodes = moment.header.nodes
+    return _tree_text(nodes, tuple(moment["teacher.status"][: len(nodes)].tolist()))
+
+
+@functools.lru_cache(maxsize=4096)
+def _tree_text(nodes: tuple[str, ...], codes: tuple[int, ...]) -> bytes:
+    """The same few ticks come again and again: their texts are kept."""
+    return dumped(dict(zip(nodes, (_STATUSES[code] for code in codes), strict=True)))
+
+
+ROWS = (
+    Topic(
+        "/action",
+        EVERY_STEP,
+        _ACTION,
+        _action,
+        ("driver.action", "driver.applied", "teacher.action", "teacher.leaf", "actuation.thrust_n"),
+        lambda data: data.get("leaf", ""),
+    ),
+    Topic(
+        "/policy",
+        EVERY_STEP,
+        _policy_schema,
+        _policy,
+        (
+            "reward.term",
+            *(f"driver.{name}" for name in ("value", "std", "distill_lambda", "residual", "uncertainty")),
+        ),
+        varies="Each term of the reward under its own name ([`reward`](configuration/reward.md)): number",
+    ),
+    Topic(
+        "/safety",
+        EVERY_STEP,
+        _SAFETY,
+        _safety,
+        ("referee.clearance_m", "referee.ttc_s", "route.path_risk", "route.trigger"),
+        lambda data: (data["clearance_m"], data["ttc_s"], data["replan_trigger"]),
+        in_picture=True,
+        note="; truth",
+    ),
+    Topic(
+        "/tree",
+        EVERY_STEP,
+        _tree_schema,
+        _tree,
+        ("teacher.status",),
+        varies="Each node of the behaviour tree by its name: its status as text",
+    ),
+)

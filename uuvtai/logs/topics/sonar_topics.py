@@ -1,0 +1,76 @@
+"""What the sonar hears."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+
+from uuvtai.logs.encode import IDENTITY, numbers
+from uuvtai.logs.moment import Moment
+from uuvtai.logs.schemas import LASER_SCAN, NUMBER, THREE, TIME, array_of, described, record
+from uuvtai.logs.topic import NEW_SCAN, Topic
+
+_THOUSANDTHS = [f"{i / 1000:g}" for i in range(1001)]
+"""Intensities are printed to three digits; nothing is computed from them."""
+_IDENTITY_TEXT = json.dumps(IDENTITY, separators=(",", ":"))
+
+_DOPPLER = record(
+    "uuv.SonarDoppler",
+    timestamp=described(TIME, "when the ping was taken"),
+    velocity=described(
+        array_of(NUMBER),
+        "[m/s] how fast what a beam met recedes, own motion included; 0 where nothing returned",
+    ),
+    own_velocity=described(THREE, "[m/s] own velocity in the body frame as measured when the ping was taken"),
+)
+
+
+def _scan(moment: Moment) -> bytes:
+    """Ranges as sensed; where nothing returned: maximum range with intensity 0, which no return has."""
+    hit = moment["scan.hit"] != 0
+    max_range_m = np.float32(moment.header.config.sensors.sonar.max_range_m)
+    ranges = np.where(hit, moment["scan.range_m"], max_range_m)
+    thousandths = np.where(hit, np.clip(np.rint(moment["scan.intensity"] * 1000), 1, 1000), 0)
+    intensities = ",".join(map(_THOUSANDTHS.__getitem__, thousandths.astype(np.int32).tolist()))
+    end_angle = 2 * math.pi * (len(hit) - 1) / len(hit)
+    return (
+        f'{{"timestamp":{moment.stamp_of(int(moment["scan.ping_step"]))},"frame_id":"sonar",'
+        f'"pose":{_IDENTITY_TEXT},"start_angle":0,"end_angle":{end_angle!r},'
+        f'"ranges":{numbers(ranges)},"intensities":[{intensities}]}}'
+    ).encode()
+
+
+def _doppler(moment: Moment) -> bytes:
+    """Doppler of every beam and the own velocity it has to be compensated with."""
+    stamp = moment.stamp_of(int(moment["scan.ping_step"]))
+    velocity = np.where(moment["scan.hit"] != 0, moment["scan.doppler_m_s"], np.float32(0))
+    own = numbers(moment["scan.ping_vel_b"])
+    return f'{{"timestamp":{stamp},"velocity":{numbers(velocity)},"own_velocity":{own}}}'.encode()
+
+
+def _read_scan(data: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, float]:
+    """(ranges (n,), hit (n,), when it was taken)."""
+    ping_s = data["timestamp"]["sec"] + data["timestamp"]["nsec"] / 1e9
+    return np.array(data["ranges"]), np.array(data["intensities"]) > 0, ping_s
+
+
+ROWS = (
+    Topic(
+        "/sonar/scan",
+        NEW_SCAN,
+        LASER_SCAN,
+        _scan,
+        ("scan.ping_step", "scan.hit", "scan.range_m", "scan.intensity"),
+        _read_scan,
+    ),
+    Topic(
+        "/sonar/doppler",
+        NEW_SCAN,
+        _DOPPLER,
+        _doppler,
+        ("scan.ping_step", "scan.hit", "scan.doppler_m_s", "scan.ping_vel_b"),
+    ),
+)
