@@ -17,7 +17,7 @@ from uuvtai.cli import main
 from uuvtai.errors import UserError
 from uuvtai.logs import canvas, film
 from uuvtai.logs.mcap_log import McapEpisodeLog
-from uuvtai.logs.picture import draw_picture, picture
+from uuvtai.logs.picture import paint_picture, picture
 from uuvtai.logs.recording import PICTURE_TOPICS, load_recording
 from uuvtai.logs.video import FrameArtist, video
 from uuvtai.report.colours import PALETTE, contrast, method_colours
@@ -90,9 +90,9 @@ def test_a_pdf_is_a_pdf_and_poppler_sees_what_the_png_shows(folder, logs):
         ["pdftoppm", "-r", "100", "-png", str(out)], capture_output=True, check=True
     ).stdout
     paths = np.array(Image.open(io.BytesIO(shown)).convert("RGB"))[..., ::-1]
-    pixels = draw_picture([load_recording(log, PICTURE_TOPICS) for log in logs])
+    pixels = paint_picture([load_recording(log, PICTURE_TOPICS) for log in logs]).image
     assert paths.shape == pixels.shape
-    alone = draw_picture([load_recording(logs[0], PICTURE_TOPICS)])
+    alone = paint_picture([load_recording(logs[0], PICTURE_TOPICS)]).image
     assert unlike(paths, pixels) < 0.002 < 0.006 < unlike(alone, pixels), (
         "without one trajectory it is another picture"
     )
@@ -301,5 +301,5 @@ def test_methods_of_a_user_keep_the_colour_that_they_have_beside_each_other(tmp_
     names = ["bt", "first", "second"]
     pixels = set(map(tuple, FrameArtist(load_recording(path), methods=names).frame(1.0).reshape(-1, 3)))
     assert tuple(canvas.method_inks(names)["second"]) in pixels
-    image = draw_picture([load_recording(path, PICTURE_TOPICS)], methods=names)
+    image = paint_picture([load_recording(path, PICTURE_TOPICS)], methods=names).image
     assert tuple(canvas.method_inks(names)["second"]) in set(map(tuple, image.reshape(-1, 3)))

@@ -11,7 +11,7 @@ from uuvtai.logs.canvas import Canvas
 from uuvtai.logs.log_errors import LogError
 from uuvtai.logs.mcap_log import McapEpisodeLog
 from uuvtai.logs.painting import map_canvas, paint_truth, paint_walls, paint_water
-from uuvtai.logs.picture import draw_picture, picture
+from uuvtai.logs.picture import paint_picture, picture
 from uuvtai.logs.recording import PICTURE_TOPICS, load_recording
 from uuvtai.logs.video import FrameArtist, video
 
@@ -96,7 +96,9 @@ def test_clearance_is_coloured_from_dark_at_the_wall_to_bright_in_the_open(folde
 
 def test_the_end_shows_the_outcome(bt, straight):
     loaded = [load_recording(path, PICTURE_TOPICS) for path in (bt, straight)]
-    crash, arrival = (draw_picture([recording], obstacles=False) for recording in (loaded[1], loaded[0]))
+    crash, arrival = (
+        paint_picture([recording], obstacles=False).image for recording in (loaded[1], loaded[0])
+    )
     at = place(loaded[1].positions[-1])
     difference = np.abs(crash.astype(int) - arrival.astype(int)).max(axis=2)
     assert difference[at[1] - 9 : at[1] + 10, at[0] - 9 : at[0] + 10].max() > 100
@@ -105,7 +107,7 @@ def test_the_end_shows_the_outcome(bt, straight):
 def test_where_methods_go_the_same_way_both_are_seen(folder, bt):
     twin = record(folder / "twin.mcap", "twin")
     loaded = [load_recording(path, PICTURE_TOPICS) for path in (bt, twin)]
-    image = draw_picture(loaded, obstacles=False)
+    image = paint_picture(loaded, obstacles=False).image
     path = loaded[0].positions
     assert has(around(image, place(path[len(path) // 4]), 2), INKS["bt"])
     assert has(
@@ -124,7 +126,7 @@ def test_true_bodies_are_as_old_as_the_map(folder, bt):
     body = episode.BODIES[4]
     then, later = (body_positions(body, np.array([recording.duration_s]))[0] for recording in (first, second))
     assert np.linalg.norm(then - later) > 1.0
-    alone, both = draw_picture([first]), draw_picture([first, second])
+    alone, both = paint_picture([first]).image, paint_picture([first, second]).image
     for center, there in ((then, True), (later, False)):
         rim = place((center[0], center[1] + body["size"][0]))
         assert has(around(alone, rim, 2), ink.MOVER, 60) is has(around(both, rim, 2), ink.MOVER, 60) is there
@@ -133,7 +135,7 @@ def test_true_bodies_are_as_old_as_the_map(folder, bt):
 def test_remarks_stand_in_red_beside_the_title(bt):
     recording = load_recording(bt)
     for plain, marked in (
-        (draw_picture([recording]), draw_picture([recording], remark="unseen above")),
+        (paint_picture([recording]).image, paint_picture([recording], remark="unseen above").image),
         (FrameArtist(recording).frame(1.0), FrameArtist(recording, remark="unseen above").frame(1.0)),
     ):
         rows, cols = np.nonzero((plain != marked).any(axis=2))

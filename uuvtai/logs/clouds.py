@@ -20,7 +20,7 @@ _FIELDS = [{"name": name, "offset": 4 * i, "type": FLOAT32} for i, name in enume
 _STRIDE = 12
 
 
-def occupied_cells(grid: Message, occupied: float) -> Message:
+def occupied_cells(grid: Message, _time_ns: int, occupied: float) -> Message:
     """foxglove.PointCloud of the centres of the cells of a foxglove.Grid whose value is at least
     ``occupied``, in the grid's frame."""
     rows, columns = np.nonzero(grid_values(grid) >= occupied)
@@ -30,7 +30,7 @@ def occupied_cells(grid: Message, occupied: float) -> Message:
     return _cloud(grid, np.column_stack([x, y, np.full(len(x), origin["z"])]))
 
 
-def sonar_returns(scan: Message) -> Message:
+def sonar_returns(scan: Message, _time_ns: int, _occupied: float) -> Message:
     """foxglove.PointCloud of the returns of a foxglove.LaserScan, in its frame; beams without a return are
     left out."""
     ranges, hit = np.array(scan["ranges"], float), np.array(scan["intensities"], float) > 0
@@ -41,7 +41,7 @@ def sonar_returns(scan: Message) -> Message:
     )
 
 
-def waypoints(plan: Message, time_ns: int) -> Message:
+def waypoints(plan: Message, time_ns: int, _occupied: float) -> Message:
     """foxglove.PosesInFrame of a uuv.Plan: each waypoint looks to the next one."""
     points = [(point["x"], point["y"], point["z"]) for point in plan["points"]]
     half_yaws = [

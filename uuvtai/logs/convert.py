@@ -41,22 +41,10 @@ Make = Callable[[dict[str, Any], int, float], dict[str, Any]]
 """another message from one, its time [ns] and the value from which on a cell is occupied"""
 
 ADDED: dict[str, tuple[str, str, Make]] = {
-    "/map/static": (
-        "/map/static/cells",
-        "PointCloud",
-        lambda data, _time_ns, occupied: occupied_cells(data, occupied),
-    ),
-    "/map/dynamic": (
-        "/map/dynamic/cells",
-        "PointCloud",
-        lambda data, _time_ns, occupied: occupied_cells(data, occupied),
-    ),
-    "/sonar/scan": ("/sonar/points", "PointCloud", lambda data, _time_ns, _occupied: sonar_returns(data)),
-    "/plan/info": (
-        "/plan/waypoints",
-        "PosesInFrame",
-        lambda data, time_ns, _occupied: waypoints(data, time_ns),
-    ),
+    "/map/static": ("/map/static/cells", "PointCloud", occupied_cells),
+    "/map/dynamic": ("/map/dynamic/cells", "PointCloud", occupied_cells),
+    "/sonar/scan": ("/sonar/points", "PointCloud", sonar_returns),
+    "/plan/info": ("/plan/waypoints", "PosesInFrame", waypoints),
 }
 """topic: (topic made of it, foxglove schema, how)"""
 

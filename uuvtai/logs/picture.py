@@ -35,10 +35,7 @@ from uuvtai.logs.painting import (
     paint_water,
 )
 from uuvtai.logs.recording import PICTURE_TOPICS, Recording, drawing, load_recording
-from uuvtai.logs.video import video
 from uuvtai.outcomes import COLLIDED
-
-__all__ = ["draw_picture", "picture", "video"]
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 62, 44, 96, 62
 _ROW = 30
@@ -74,26 +71,14 @@ def picture(
     recordings = [load_recording(path, PICTURE_TOPICS) for path in found]
     check_same_episode(recordings)
     with drawing(found[0]):
-        content = _drawn(recordings, suffix, clearance, obstacles, width_px, remark, methods)
+        style = (clearance, obstacles, width_px, remark, methods)
+        if suffix == ".png":
+            content = png_bytes(paint_picture(recordings, *style).image)
+        else:
+            from uuvtai.logs.vector_graphics import VectorCanvas  # matplotlib, which takes a second
+
+            content = paint_picture(recordings, *style, VectorCanvas).document(suffix.lstrip("."))
     return write_whole(content, out)
-
-
-def _drawn(
-    recordings: list[Recording],
-    suffix: str,
-    clearance: bool,
-    obstacles: bool,
-    width_px: int,
-    remark: str,
-    methods: Sequence[str],
-) -> bytes:
-    if suffix == ".png":
-        return png_bytes(draw_picture(recordings, clearance, obstacles, width_px, remark, methods))
-    from uuvtai.logs.vector_graphics import VectorCanvas  # matplotlib, which takes a second
-
-    return _painted(VectorCanvas, recordings, clearance, obstacles, width_px, remark, methods).document(
-        suffix.lstrip(".")
-    )
 
 
 def check_same_episode(recordings: list[Recording]) -> None:
@@ -135,27 +120,16 @@ def write_whole(content: bytes, out: Path) -> Path:
     return out
 
 
-def draw_picture(
+def paint_picture(
     recordings: list[Recording],
     clearance: bool = False,
     obstacles: bool = True,
     width_px: int = 1600,
     remark: str = "",
     methods: Sequence[str] = (),
-) -> np.ndarray:
-    """The picture as an image (height, width, 3), blue green red."""
-    return _painted(Canvas, recordings, clearance, obstacles, width_px, remark, methods).image
-
-
-def _painted(
-    kind: type[AnyCanvas],
-    recordings: list[Recording],
-    clearance: bool,
-    obstacles: bool,
-    width_px: int,
-    remark: str,
-    methods: Sequence[str],
+    kind: type[AnyCanvas] = Canvas,
 ) -> AnyCanvas:
+    """The picture on a canvas; the other arguments as of ``picture``."""
     tank = recordings[0].scenario["tank"]
     rows = len(recordings)
     side = 92 if clearance else 0
