@@ -86,13 +86,13 @@ def measure(job: Job) -> list[Row]:
             ends: Counter[str] = Counter()
             for i in range(number):
                 generator = random.Random(f"{_SEED} {kind} {i}")
-                end, told = (_by_command if kind == "command line" else worker.judged)(
+                end, output = (_by_command if kind == "command line" else worker.judged)(
                     kind, samples, generator, Path(folder)
                 )
                 ends[end] += 1
                 if end in _BAD:
-                    job.say(f"{kind} {i}: {end}: {told[-300:]}")
-                    _keep(kept, Path(folder) / "case", f"{kind.replace(' ', '_')}_{i}", told)
+                    job.say(f"{kind} {i}: {end}: {output[-300:]}")
+                    _keep(kept, Path(folder) / "case", f"{kind.replace(' ', '_')}_{i}", output)
             found[kind] = dict(ends)
             job.say(f"{kind}: {dict(ends)}")
         worker.stop()
@@ -253,16 +253,16 @@ class _Worker:
         before, outside = self._peak(reset=True), _tree(folder, case)
         self._pipe.send((kind, path, folder / "exported"))
         try:
-            end, told = self._pipe.recv() if self._pipe.poll(_LONGEST_S) else ("hang", "")
+            end, output = self._pipe.recv() if self._pipe.poll(_LONGEST_S) else ("hang", "")
         except EOFError:
-            end, told = "memory", "the process died"
+            end, output = "memory", "the process died"
         if end in ("hang", "memory"):
             self.stop(kill=True)
             self._start()
-            return end, told
+            return end, output
         if self._peak() - before > _MOST_BYTES:
             return "memory", f"{self._peak() - before} bytes"
-        return ("wrote outside", str(path)) if _tree(folder, case) != outside else (end, told)
+        return ("wrote outside", str(path)) if _tree(folder, case) != outside else (end, output)
 
     def stop(self, kill: bool = False) -> None:
         """End the process."""
@@ -330,12 +330,12 @@ def _by_command(
         )
     except subprocess.TimeoutExpired:
         return "hang", json.dumps(words)
-    told = json.dumps([words, done.returncode, round(time.monotonic() - begun, 1), done.stderr[-2000:]])
+    output = json.dumps([words, done.returncode, round(time.monotonic() - begun, 1), done.stderr[-2000:]])
     if _tree(folder, case) != outside:
-        return "wrote outside", told
+        return "wrote outside", output
     if done.returncode not in (0, 2, 3) or "Traceback" in done.stderr:
-        return "bug", told
-    return ("accepted" if done.returncode == 0 else "refused"), told
+        return "bug", output
+    return ("accepted" if done.returncode == 0 else "refused"), output
 
 
 # ---------------------------------------------------------------------------------------------------- folders
@@ -357,8 +357,8 @@ def _tree(folder: Path, without: Path) -> dict[Path, tuple[int, int]]:
     return {path: (found.st_size, found.st_mtime_ns) for path, found in files.items()}
 
 
-def _keep(kept: Path, case: Path, name: str, told: str) -> None:
+def _keep(kept: Path, case: Path, name: str, output: str) -> None:
     import shutil
 
     shutil.copytree(case, kept / name, dirs_exist_ok=True)
-    (kept / name / "told.txt").write_text(told)
+    (kept / name / "told.txt").write_text(output)

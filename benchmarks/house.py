@@ -29,7 +29,7 @@ def measure(job: Job) -> list[Row]:
     kernels = [(path, node) for path, node in functions if _is_taichi(node)]
     counts = sorted(_arguments(node) for _, node in kernels)
     places = [(PACKAGE / "kernels", "*/*.py"), (PACKAGE, "sim.py")]
-    told = {path for folder, pattern in places for path in folder.glob(pattern)}
+    counted = {path for folder, pattern in places for path in folder.glob(pattern)}
     many = {
         f"{path.stem}.{node.name}": _arguments(node)
         for path, node in functions
@@ -44,7 +44,7 @@ def measure(job: Job) -> list[Row]:
         _row("arguments of Taichi functions, 90th percentile", counts[int(0.9 * len(counts))], 7),
         _row(
             "signature lines in kernels and sim.py",
-            sum(_signature(node) for path, node in functions if path in told),
+            sum(_signature(node) for path, node in functions if path in counted),
             850,
         ),
         _row(

@@ -43,10 +43,10 @@ def _row(job: Job, sensors: str, sim: Sim, config: LearningConfig, theirs: float
     num_envs = sim.num_envs
     trainer = Trainer(VectorEnv(sim), config)
     trainer.iterate()  # allocates
-    begun, told = time.perf_counter(), [trainer.iterate() for _ in range(iterations)]
+    begun, done = time.perf_counter(), [trainer.iterate() for _ in range(iterations)]
     samples = iterations * config.ppo.rollout_steps * num_envs
     ours = samples / (time.perf_counter() - begun)
-    parts = {name: 1e6 * sum(metrics[key] for metrics in told) / samples for name, key in _PARTS.items()}
+    parts = {name: 1e6 * sum(metrics[key] for metrics in done) / samples for name, key in _PARTS.items()}
     products = " with ppo.bfloat16=true" if config.ppo.bfloat16 else ""
     return Row(
         what=f"{sensors} sensing, all of `uuv train curriculum`{products}, {num_envs:,} envs",

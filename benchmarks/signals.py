@@ -210,9 +210,9 @@ class _Bench:
                 commands[i % len(commands)],
                 (signal.SIGINT, signal.SIGTERM)[i // len(commands) % 2],
             )
-            code, told = self._signal(command, number, times)
+            code, wrongs = self._signal(command, number, times)
             interrupted += code == 128 + number
-            wrong += [f"{' '.join(command)}: {what}" for what in told]
+            wrong += [f"{' '.join(command)}: {what}" for what in wrongs]
         return [
             self._row(
                 f"{count} signals, every command in turn: tracebacks, other exit codes, halves, inconsistent "
@@ -229,7 +229,7 @@ class _Bench:
             out.mkdir()
         key, begun = " ".join(command[:2]), time.monotonic()
         child = self._begun(command)
-        while child.poll() is None and not _hears(
+        while child.poll() is None and not _on_main_thread(
             child.pid
         ):  # what Python does before our first line is not ours
             time.sleep(0.002)
@@ -247,16 +247,16 @@ class _Bench:
                 child.kill()
                 return -9, ["did not end"]
             wanted = [128 + number, 0]
-        told = (
+        wrongs = (
             [f"exit code {child.returncode} after {moment:.2f} s: {err[-300:]}"]
             if child.returncode not in wanted
             else []
         )
-        told += (
+        wrongs += (
             [f"after {moment:.2f} s: {err[-600:]}"] if "Traceback" in err or "a bug of ours" in err else []
         )
-        told += _half_written(out, parts=command[0] == "eval") + _inconsistent(out, child.returncode)
-        return child.returncode, told
+        wrongs += _half_written(out, parts=command[0] == "eval") + _inconsistent(out, child.returncode)
+        return child.returncode, wrongs
 
     # ----------------------------------------------------------------------------------------------- commands
 
@@ -354,7 +354,7 @@ def _inconsistent(place: Path, code: int) -> list[str]:
     return wrong
 
 
-def _hears(pid: int) -> bool:
+def _on_main_thread(pid: int) -> bool:
     """Whether a process has a handler of SIGTERM (Linux)."""
     try:
         lines = Path(f"/proc/{pid}/status").read_text().splitlines()

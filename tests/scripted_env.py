@@ -58,13 +58,13 @@ class ScriptedEnv:
             0,
         )
         self.log.clear()
-        return self._obs(), self._told() | {
+        return self._obs(), self._info() | {
             "outcome": torch.zeros(n, dtype=torch.int32),
             "reward_terms": torch.zeros(n, 1),
         }
 
     def step(self, action):
-        obs, teacher = self._obs(), self._told()["teacher_action"]
+        obs, teacher = self._obs(), self._info()["teacher_action"]
         self._targets = self._targets + 0.1 * action.clamp(-1, 1).repeat(1, N_TARGET // 4)
         self._age += 1
         self._t += 1
@@ -83,7 +83,7 @@ class ScriptedEnv:
             reward.clone(),
             ended & ~truncated,
             truncated,
-            self._told() | final | {"outcome": outcome, "reward_terms": reward[:, None]},
+            self._info() | final | {"outcome": outcome, "reward_terms": reward[:, None]},
         )
 
     def _due(self, env):
@@ -96,7 +96,7 @@ class ScriptedEnv:
         moment = 1000.0 * torch.arange(self.num_envs) + self._t
         return torch.cat([self._targets, moment[:, None]], 1)
 
-    def _told(self):
+    def _info(self):
         teacher = torch.sin(self._obs()[:, -1:] + torch.arange(4.0))
         zeros = torch.zeros(self.num_envs, dtype=torch.int32)
         return {"teacher_action": teacher, "leaf": zeros, "seed": zeros, "episode": self._episode.clone()}

@@ -91,7 +91,7 @@ def test_the_stack_never_names_the_truth(path):
 def test_what_knows_the_truth_writes_nothing_that_the_stack_reads_but_readings():
     """Simulated instruments, the clock and the mission are what the vehicle may know; the yardsticks say what
     they are."""
-    told = {
+    known = {
         kind
         for name in BUNDLES
         if name in ("EpisodeIO", "WorldIO")
@@ -104,13 +104,13 @@ def test_what_knows_the_truth_writes_nothing_that_the_stack_reads_but_readings()
         if room_of_bundle(name) in STACK
         for kind in members_of(bundle).values()
     }
-    assert readings | told <= of_the_stack
+    assert readings | known <= of_the_stack
     for name, bundle in BUNDLES.items():
         outputs = {
             members_of(bundle)[f.name] for f in dataclasses.fields(bundle) if str(f.type).startswith("Out")
         }
         if set(members_of(bundle).values()) & TRUTH and room_of_bundle(name) != "privileged":
-            assert outputs & of_the_stack <= readings | told, f"{name} writes {outputs & of_the_stack}"
+            assert outputs & of_the_stack <= readings | known, f"{name} writes {outputs & of_the_stack}"
 
 
 def room_of_bundle(name):

@@ -131,9 +131,9 @@ def test_a_damaged_newest_one_is_left_out_and_told(tmp_path):
     content = bytearray(damaged.read_bytes())
     content[len(content) // 2] ^= 1
     damaged.write_bytes(content)
-    told = []
-    assert checkpoint.newest(tmp_path, told.append, resumable=True).step == 1
-    assert "simulator.zst: is damaged" in told[0]
+    answer = []
+    assert checkpoint.newest(tmp_path, answer.append, resumable=True).step == 1
+    assert "simulator.zst: is damaged" in answer[0]
 
 
 def test_a_run_without_checkpoints(tmp_path):

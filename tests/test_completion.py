@@ -76,10 +76,10 @@ def test_what_may_be_typed_stands_beside_every_option(words):
     """Presets and words are listed; no free <str> where there are only so many."""
     listed = {"--world": "world", "--sensors": "sensors", "--vehicle": "vehicle", "--preset": "train"}
     for parameter in COMMANDS[words].params:
-        told = f"{parameter.metavar or ''} {getattr(parameter, 'help', '') or ''}"
+        answer = f"{parameter.metavar or ''} {getattr(parameter, 'help', '') or ''}"
         for option in parameter.opts:
             if option in listed:
-                assert all(name in told for name in preset_names(listed[option])), f"{words} {option}"
+                assert all(name in answer for name in preset_names(listed[option])), f"{words} {option}"
             if option in ("--device", "--engine", "--budget", "--attitude-hold"):
                 assert "|" in parameter.metavar
 

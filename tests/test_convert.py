@@ -71,12 +71,12 @@ def test_every_message_is_there_and_says_the_same(recorded, converted):
         assert counts.pop(topic["topic"]) == (topic["schema"], topic["messages"])
     assert set(counts) == {topic for topic, _kind, _make in ADDED.values()}
     assert read_head(recorded) == read_head(converted)
-    told = decoded(converted)
+    answer = decoded(converted)
     assert {
         topic["topic"] for topic in before["topics"] if topic["schema"].startswith("foxglove.")
-    } == told.keys() - counts.keys()
-    for topic in told.keys() - counts.keys():
-        for (time_ns, message), original in zip(told[topic], read_messages(recorded, [topic]), strict=True):
+    } == answer.keys() - counts.keys()
+    for topic in answer.keys() - counts.keys():
+        for (time_ns, message), original in zip(answer[topic], read_messages(recorded, [topic]), strict=True):
             assert time_ns == round(original.time_s * 1e9)
             assert_same(message, original.data)
 
@@ -167,9 +167,11 @@ def test_rerun_draws_poses_transforms_images_and_clouds(converted, recorded):
             if name in batch.schema.names:
                 values.setdefault((entity, name), []).extend(batch.column(name).to_pylist())
     cells = values["/map/static/cells", "Points3D:positions"]
-    told = decoded(converted)
-    np.testing.assert_allclose(np.array(cells[-1]), cloud_of(told["/map/static/cells"][-1][1]), atol=FLOAT32)
-    assert len(values["/sonar/points", "Points3D:positions"]) == len(told["/sonar/points"])
+    answer = decoded(converted)
+    np.testing.assert_allclose(
+        np.array(cells[-1]), cloud_of(answer["/map/static/cells"][-1][1]), atol=FLOAT32
+    )
+    assert len(values["/sonar/points", "Points3D:positions"]) == len(answer["/sonar/points"])
     positions = np.array(values["/pose", "InstancePoses3D:translations"]).reshape(-1, 3)
     expected = [list(data["pose"]["position"].values()) for data in by_topic(recorded, "/pose")]
     np.testing.assert_allclose(positions, expected, atol=FLOAT32)

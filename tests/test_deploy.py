@@ -129,13 +129,13 @@ def test_numpy_and_a_decision_without_memory_agree_with_the_pilot(tmp_path, chan
         "network": deploy.specification(found, pilot, "mine", False)["network"],
     }
     policy = run_policy.Policy(spec, {name: tensor.numpy() for name, tensor in weights_of(pilot).items()})
-    told = run_policy.replayed(policy, golden)
-    for name, values in told.items():
+    answer = run_policy.replayed(policy, golden)
+    for name, values in answer.items():
         assert run_policy.difference(values, golden[name]) <= TOLERANCE, name
     assert of_torch(OneDecision(pilot), golden).agrees
     has_model, has_risk = pilot.world_model is not None, pilot.risk is not None
     assert golden["action"].std() > 0.1 and np.abs(golden["action"]).max() <= 1.0
-    assert (golden["residual"] > 0).any() == has_model and ("risk" in told) == has_risk
+    assert (golden["residual"] > 0).any() == has_model and ("risk" in answer) == has_risk
     assert not has_risk or np.ptp(golden["risk"]) > 0.1
     first, hold = len(golden["obs"]) // 2 + 1, found.config.policy.hold_steps
     assert len(golden["pair_obs"]) == -(-first // hold) + -(-(len(golden["obs"]) - first) // hold)
@@ -160,8 +160,8 @@ def test_networks_that_have_seen_nothing_agree_too():
         "residual_limit": 0.5,
     }
     policy = run_policy.Policy(spec, {name: tensor.numpy() for name, tensor in weights_of(pilot).items()})
-    told = run_policy.replayed(policy, golden)
-    assert max(run_policy.difference(values, golden[name]) for name, values in told.items()) <= TOLERANCE
+    answer = run_policy.replayed(policy, golden)
+    assert max(run_policy.difference(values, golden[name]) for name, values in answer.items()) <= TOLERANCE
 
 
 def test_a_held_residual_follows_the_newest_tree_action(tmp_path, no_onnx):
@@ -420,10 +420,10 @@ def folder(whole, tmp_path):
 def test_the_command_exports_prints_and_checks(tmp_path, no_onnx, capfd):
     saved(tmp_path / "run")
     assert run_cli("export", tmp_path / "run", "--out", tmp_path / "out", "--json") == 0
-    told = capfd.readouterr()
-    document = json.loads(told.out)
+    answer = capfd.readouterr()
+    document = json.loads(answer.out)
     assert document["agrees"] and [engine["engine"] for engine in document["engines"]] == ["torch", "NumPy"]
-    assert "left out policy.onnx" in told.err
+    assert "left out policy.onnx" in answer.err
     assert run_cli("export", "--check", tmp_path / "out") == 0
     assert "agrees" in capfd.readouterr().out
 

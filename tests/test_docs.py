@@ -153,8 +153,8 @@ def test_every_key_has_a_row_with_type_default_unit_and_meaning():
         ("hold_gain_n_m", "[N m/rad] roll and pitch", "N m/rad"),
     ],
 )
-def test_units_come_from_the_text_or_the_name(key, told, unit):
-    assert configuration.unit_of(key, told) == unit
+def test_units_come_from_the_text_or_the_name(key, answer, unit):
+    assert configuration.unit_of(key, answer) == unit
 
 
 def test_what_a_help_text_says_is_no_markup():
@@ -364,8 +364,8 @@ def test_the_tables_of_the_python_page_are_those_of_the_environment(small):
     rows = re.findall(
         r"^\| `([^`]+)` \| \(([^)]*)\) \| (\w+) \|", (ROOT / "docs/python.md").read_text(), re.M
     )
-    told = {name: (tuple(sizes[n] for n in re.findall(r"\w+", shape)), kind) for name, shape, kind in rows}
-    assert told == {
+    answer = {name: (tuple(sizes[n] for n in re.findall(r"\w+", shape)), kind) for name, shape, kind in rows}
+    assert answer == {
         name: (tuple(value.shape), str(value.dtype).removeprefix("torch.")) for name, value in wanted.items()
     }
 

@@ -102,16 +102,16 @@ def test_a_watched_batch_keeps_every_return_once(short, example, mode):
     """They are what the simulator itself summed up over the episode."""
     envs = example("judge").Watched(sim=short, hold_steps=5, autoreset_mode=mode)
     envs.reset(seed=1)
-    told = []
+    answer = []
     for decision in range(1, 2 + SHORT // 5):
         *_, terminated, truncated, info = envs.step(np.zeros((N, 4), np.float32))
         ended = info["final_info"] if mode == "SameStep" and "final_info" in info else info
-        told += [
+        answer += [
             (decision * N, float(ended["episode_return"][env]))
             for env in np.flatnonzero(terminated | truncated)
         ]
-    assert len(told) >= N
-    np.testing.assert_allclose(envs.curve, told, rtol=1e-4, atol=1e-4)
+    assert len(answer) >= N
+    np.testing.assert_allclose(envs.curve, answer, rtol=1e-4, atol=1e-4)
 
 
 def test_curves_are_drawn_from_what_was_kept(example, tmp_path):
@@ -159,8 +159,8 @@ def test_custom_controller_turns_and_stops(small, example):
 
 
 def test_custom_world_is_played_and_drawn(short, example, tmp_path):
-    told = example("custom_world").main(tmp_path / "new" / "harbour.png", short)
-    assert told.startswith("harbour.yaml: timeout") and told.endswith("harbour.png")
+    answer = example("custom_world").main(tmp_path / "new" / "harbour.png", short)
+    assert answer.startswith("harbour.yaml: timeout") and answer.endswith("harbour.png")
     assert cv2.imread(str(tmp_path / "new" / "harbour.png")).std() > 1
 
 

@@ -23,7 +23,7 @@ from uuvtai.measure.explain.failures import (
     record_worst,
     table_of,
 )
-from uuvtai.measure.explain.history import Bodies, Diary, History
+from uuvtai.measure.explain.history import Bodies, CoarseHistory, History
 
 CONFIG = Config()
 HERE = np.array([10.0, 3.0, -0.8])
@@ -64,7 +64,7 @@ class Story:
         self.leaf = ["Evade"] * self.n
         self.conflict = np.ones(self.n, bool)
         self.believed_gap = 0.0
-        self.diary = None
+        self.coarse = None
 
     def turn(self, ago_s, before=(0.0, -1.0)):
         """The killer moved along ``before`` until ``ago_s`` before the end; forecasts went on straight."""
@@ -117,8 +117,10 @@ class Story:
             leaf=self.leaf,
             action=np.zeros((self.n, 4)),
             map_clearance_m=np.ones(self.n),
-            diary=self.diary
-            or Diary(np.array([0.0, END_S]), np.stack([HERE, HERE]), np.ones(2), np.ones(2, bool), ["", ""]),
+            coarse=self.coarse
+            or CoarseHistory(
+                np.array([0.0, END_S]), np.stack([HERE, HERE]), np.ones(2), np.ones(2, bool), ["", ""]
+            ),
         )
 
     def explained(self, outcome="collision", config=CONFIG):
@@ -328,18 +330,18 @@ def test_a_forgotten_body_and_a_seen_corner_are_told():
     # the turn was at 12.9 s, a lap lasts 8 s: it passed the same corner once before, and the vehicle stood
     # within reach
     assert facts["turns_in_reach_before"] == 1
-    far = Diary(
+    far = CoarseHistory(
         np.array([0.0, END_S]), np.stack([at(-13.0, 0, 0), HERE]), np.ones(2), np.ones(2, bool), ["", ""]
     )
-    assert change(story, diary=far).explained().facts["turns_in_reach_before"] == 1
-    above = Diary(
+    assert change(story, coarse=far).explained().facts["turns_in_reach_before"] == 1
+    above = CoarseHistory(
         np.array([0.0, END_S]),
         np.stack([at(0, 0, 0.7), at(0, 0, 0.7)]),
         np.ones(2),
         np.ones(2, bool),
         ["", ""],
     )
-    assert change(story, diary=above).explained().facts["turns_in_reach_before"] == 0
+    assert change(story, coarse=above).explained().facts["turns_in_reach_before"] == 0
 
 
 @pytest.mark.parametrize("rise", [0.35, -0.35])
@@ -379,11 +381,11 @@ def test_a_scan_is_compared_with_the_moment_of_its_ping():
     assert explain("collision", unchanged, story.bodies(), CONFIG).facts["seen_ago_s"] is None
 
 
-def test_timeout_facts_from_a_diary():
+def test_timeout_facts_from_the_coarse_history():
     t = np.arange(0.0, 60.1, 0.5)
     pos = np.stack([0.05 * t, 0 * t, 0 * t - 1], -1)
-    diary = Diary(t, pos, 8.0 - 0.05 * t, t < 52, ["Hold" if s > 56 else "FollowRoute" for s in t])
-    facts = change(Story(), diary=diary).explained("timeout").facts
+    coarse = CoarseHistory(t, pos, 8.0 - 0.05 * t, t < 52, ["Hold" if s > 56 else "FollowRoute" for s in t])
+    facts = change(Story(), coarse=coarse).explained("timeout").facts
     assert facts["progress_m"] == pytest.approx(0.5)
     assert facts["driven_m"] == pytest.approx(0.5)
     assert facts["goal_m"] == pytest.approx(5.0)

@@ -64,8 +64,8 @@ def test_a_figure_that_was_rounded_up_is_caught(copy):
     mark = "<!-- = sweep.pool[bt;moderate].success_rate:.1% -->"
     right = f"{100 * SOURCES.value('sweep.pool[bt;moderate].success_rate'):.1f}"
     assert right in (copy / "README.md").read_text()
-    told = changed(copy, "README.md", f"{right}{mark}", f"{float(right) + 0.1:.1f}{mark}")
-    assert "README.md" in told and f"{right}<!-- =" in told and "the results say" in told
+    answer = changed(copy, "README.md", f"{right}{mark}", f"{float(right) + 0.1:.1f}{mark}")
+    assert "README.md" in answer and f"{right}<!-- =" in answer and "the results say" in answer
 
 
 def test_a_cell_of_a_table_that_was_changed_by_hand_is_caught(copy):
@@ -82,20 +82,20 @@ def test_results_that_move_on_leave_the_text_behind(copy):
     newer.write_text(json.dumps(document | {"rows": rows}))
     before = SOURCES.value("bench.scale[paper sensing].ours")
     sources = Sources(copy)
-    told = "\n".join(figures.faults(copy / "README.md", sources))
-    assert f"{before:,.0f}" in told and f"{2 * before:,.0f}" in told
+    answer = "\n".join(figures.faults(copy / "README.md", sources))
+    assert f"{before:,.0f}" in answer and f"{2 * before:,.0f}" in answer
     (copy / "README.md").write_text(figures.renewed((copy / "README.md").read_text(), sources))
     assert figures.faults(copy / "README.md", sources) == []
 
 
 def test_a_mark_that_leads_nowhere_says_what_there_is(copy):
-    told = changed(
+    answer = changed(
         copy,
         "README.md",
         "evaluations.pool_0.straight/bt.time_ratio",
         "evaluations.pol_0.straight/bt.time_ratio",
     )
-    assert "no row 'pol_0'" in told and "pool_0" in told
+    assert "no row 'pol_0'" in answer and "pool_0" in answer
 
 
 def test_the_page_of_results_changed_by_hand_is_caught(copy):
@@ -128,7 +128,7 @@ def test_the_page_of_results_changed_by_hand_is_caught(copy):
     ],
 )
 def test_figures_without_a_source_are_seen(line):
-    assert [number for number, _told in unmarked("docs/x.md", f"# Title\n\n{line}\n")] == [3] * len(
+    assert [number for number, _answer in unmarked("docs/x.md", f"# Title\n\n{line}\n")] == [3] * len(
         list(unmarked("docs/x.md", line))
     )
     assert list(unmarked("docs/x.md", line)), line
@@ -155,7 +155,7 @@ def test_what_is_marked_or_no_result_is_left_alone(line):
 
 def test_a_kind_holds_until_the_next_heading():
     text = "# A\n<!-- figures: parameter -->\n5 s\n\n6 s\n\n## B\n7 s\n"
-    assert [number for number, _told in unmarked("docs/x.md", text)] == [8]
+    assert [number for number, _answer in unmarked("docs/x.md", text)] == [8]
     assert "no kind 'guess'" in next(unmarked("docs/x.md", "<!-- figures: guess -->"))[1]
     assert {"parameter", "definition", "theirs", "log"} <= KINDS.keys()
 
@@ -293,8 +293,8 @@ def test_paths(part, shown):
         ("bench.world_model[conformal].note/nowhere (\\d+)/", "is not in"),
     ],
 )
-def test_wrong_paths_say_why(path, told):
-    with pytest.raises(SourceError, match=told):
+def test_wrong_paths_say_why(path, answer):
+    with pytest.raises(SourceError, match=answer):
         SOURCES.value(path)
 
 

@@ -167,9 +167,9 @@ def test_json_comes_back_as_it_was(tmp_path, value):
     ids=range(14),
 )  # fmt: skip
 def test_json_that_cannot_be_used_is_refused_in_one_line(text):
-    with pytest.raises(FileError, match=r"^x\.json: ") as told:
+    with pytest.raises(FileError, match=r"^x\.json: ") as answer:
         parsed_json(text, "x.json")
-    assert "\n" not in str(told.value) and len(str(told.value)) < 300
+    assert "\n" not in str(answer.value) and len(str(answer.value)) < 300
 
 
 # --------------------------------------------------------------------------------------------------- in place

@@ -175,7 +175,7 @@ def test_what_was_said_does_not_depend_on_when_the_episode_began():
         rows.begin(0)
         rows.run(17)
         rows.end(0, "success")
-        said.append([value - late for value in rows.foresight.newest_said])
+        said.append([value - late for value in rows.foresight.newest_logits])
     assert said == [[5.0, 10.0, 15.0]] * 2
 
 
@@ -185,5 +185,5 @@ def test_moments_of_what_was_kept_are_those_that_were_seen():
     rows.begin(1)
     rows.run(43)
     rows.end(1, "ttc")
-    kept = moments_of(rows.foresight.newest_said, 43, "ttc", HORIZON, 0)
+    kept = moments_of(rows.foresight.newest_logits, 43, "ttc", HORIZON, 0)
     assert all(torch.equal(a, b) for a, b in zip(kept, rows.foresight.moments(), strict=True))

@@ -67,9 +67,9 @@ def random_actions(steps, seed=0):
 
 def test_gymnasium_checks_the_env_that_make_gives(registered):
     env = gymnasium.make(ENV_ID, world="pool", overrides={"world.n_dynamic": 3}, render_mode="rgb_array")
-    with pytest.warns(UserWarning) as told:
+    with pytest.warns(UserWarning) as answer:
         check_env(env.unwrapped)
-    assert all("infinity" in str(warning.message) for warning in told), (
+    assert all("infinity" in str(warning.message) for warning in answer), (
         "position errors and velocities have no bounds; no other complaint"
     )
     assert registered[0] == ("pool", 1, None, None, {"world.n_dynamic": 3}, "cpu", "bt")
@@ -148,9 +148,9 @@ def test_the_docs_list_the_columns(small):
         f"{column.meaning} |"
         for column, _first, _width in placed_columns(features)
     ]
-    told = (Path(__file__).parents[1] / "docs" / "gym.md").read_text().splitlines()
-    first = told.index(rows[0])
-    assert told[first : first + len(rows)] == rows
+    answer = (Path(__file__).parents[1] / "docs" / "gym.md").read_text().splitlines()
+    first = answer.index(rows[0])
+    assert answer[first : first + len(rows)] == rows
 
 
 def test_same_step_tells_the_end_beside_the_next_beginning(make):
@@ -442,11 +442,11 @@ def test_the_single_env_plays_the_first_row(small):
     env, batch = UuvEnv(sim=small.sim), VectorEnv(small.sim, seed=SEED)
     actions = random_actions(20)
     obs, info = env.reset(seed=SEED)
-    told = [(obs, 0.0)]
+    answer = [(obs, 0.0)]
     near_horizon(env.native, [0], steps_left=20)
     for action in actions[:, 0]:
         obs, reward, terminated, truncated, info = env.step(action)
-        told.append((obs, reward))
+        answer.append((obs, reward))
     assert (
         truncated
         and not terminated
@@ -458,9 +458,9 @@ def test_the_single_env_plays_the_first_row(small):
         env.step(actions[0, 0])
     assert env.reset()[1]["episode_number"] == N
     obs, _info = batch.reset()
-    np.testing.assert_array_equal(told[0][0], obs[0])
+    np.testing.assert_array_equal(answer[0][0], obs[0])
     near_horizon(env.native, [0], steps_left=20)
-    for (wanted, wanted_reward), action in zip(told[1:], actions, strict=True):
+    for (wanted, wanted_reward), action in zip(answer[1:], actions, strict=True):
         _obs, reward, *_rest, info = batch.step(torch.from_numpy(action))
         np.testing.assert_array_equal(info["final_obs"][0], wanted)
         assert reward[0] == pytest.approx(wanted_reward, abs=RETURN_ROUNDING)

@@ -41,12 +41,12 @@ def test_sb3_gets_last_observations_and_statistics(batch):
         ["TimeLimit.truncated", "episode", "is_success", "terminal_observation"] if i == 5 else []
         for i in range(N)
     ]
-    told = infos[5]
-    assert told["TimeLimit.truncated"] and not told["is_success"]
-    assert told["episode"]["l"] == envs.native.config.episode.horizon_steps // 2
+    answer = infos[5]
+    assert answer["TimeLimit.truncated"] and not answer["is_success"]
+    assert answer["episode"]["l"] == envs.native.config.episode.horizon_steps // 2
     goal = envs.native.columns["goal"]
     assert (
-        np.abs(told["terminal_observation"][goal] - first[5, goal]).max()
+        np.abs(answer["terminal_observation"][goal] - first[5, goal]).max()
         < 0.2
         < np.abs(obs[5, goal] - first[5, goal]).max()
     )

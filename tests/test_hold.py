@@ -84,8 +84,8 @@ def test_a_training_counts_control_steps_and_goes_on_bit_for_bit():
 
     config = config_of(policy={"hidden": [16, 16], "hold_steps": 3})
     whole, first = Trainer(PointEnv(), config), Trainer(PointEnv(), config)
-    told = [whole.iterate() for _ in range(4)]
-    assert told[-1]["time/env_steps"] == 5 * 16 * 3 * 16, "four rollouts and one of the teacher's"
+    answer = [whole.iterate() for _ in range(4)]
+    assert answer[-1]["time/env_steps"] == 5 * 16 * 3 * 16, "four rollouts and one of the teacher's"
     for _ in range(2):
         first.iterate()
     second = Trainer(PointEnv(), config)

@@ -74,9 +74,9 @@ def bounded(work, tmp_path):
         cwd=tmp_path,
     )
     assert done.returncode == 0, done.stderr
-    *told, mib = done.stdout.splitlines()
+    *answer, mib = done.stdout.splitlines()
     assert int(mib) < BOUND_MIB
-    return "\n".join(told)
+    return "\n".join(answer)
 
 
 def chunks(path):
@@ -390,10 +390,10 @@ def test_the_output_of_convert_is_called_by_its_name(log_path, tmp_path, command
     convert(log_path, tmp_path / "a.protobuf.mcap")
     out = tmp_path / {"picture": "out.png", "video": "out.webm"}.get(command, "out")
     assert run_cli("log", command, tmp_path / "a.protobuf.mcap", "--out", out) == 2
-    told = capfd.readouterr().err
+    answer = capfd.readouterr().err
     assert (
-        "is the output of uuv log convert (protobuf); use the original: a.mcap" in told
-        and len(told.splitlines()) == 1
+        "is the output of uuv log convert (protobuf); use the original: a.mcap" in answer
+        and len(answer.splitlines()) == 1
     )
     assert run_cli("log", "info", tmp_path / "a.protobuf.mcap") == 0
     assert "output of uuv log convert (protobuf)" in capfd.readouterr().out

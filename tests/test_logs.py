@@ -418,9 +418,9 @@ def test_due_asks_for_maps_at_2_hz_on_replans_and_at_the_end(tmp_path, snaps):
 def test_every_topic_reads_what_the_state_has():
     """A name that is wrong would leave its topic out of logs written by hand; here it is found."""
     structs = typing.get_type_hints(SimState)
-    thoughts = {"driver.applied", *NO_POLICY}
+    outputs = {"driver.applied", *NO_POLICY}
     for topic in TOPICS:
-        for name in {*topic.reads, *topic.when.reads} - thoughts:
+        for name in {*topic.reads, *topic.when.reads} - outputs:
             struct, field = name.split(".")
             fields = {f.name for f in dataclasses.fields(structs[struct])}
             assert field in fields, f"{topic.name} reads {name}"

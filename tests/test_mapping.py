@@ -422,8 +422,12 @@ WRONG = (0.5, -0.3)
 def misread(yaw, valid, walls):
     """A scan at rest whose own velocity is said to be ``WRONG``, beside a body that stands still."""
     c, s = np.cos(yaw), np.sin(yaw)
-    told = (c * WRONG[0] + s * WRONG[1], -s * WRONG[0] + c * WRONG[1], 0.0)
-    return ring(EYE, [(*BODY, 0.0, 0.0)], yaw=yaw) | {"vel": np.array(told), "valid": valid, "walls": walls}
+    measured = (c * WRONG[0] + s * WRONG[1], -s * WRONG[0] + c * WRONG[1], 0.0)
+    return ring(EYE, [(*BODY, 0.0, 0.0)], yaw=yaw) | {
+        "vel": np.array(measured),
+        "valid": valid,
+        "walls": walls,
+    }
 
 
 @pytest.mark.parametrize("yaw", [0.0, 21 * 2 * np.pi / SONAR.n_ray])

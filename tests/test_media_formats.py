@@ -84,8 +84,8 @@ def test_a_pdf_is_a_pdf_and_poppler_sees_what_the_png_shows(folder, logs):
     assert content.startswith(b"%PDF-") and content.rstrip().endswith(b"%%EOF")
     if shutil.which("pdftoppm") is None:
         pytest.skip("poppler is not installed: the PDF's frame alone was looked at")
-    told = subprocess.run(["pdftotext", str(out), "-"], capture_output=True, text=True, check=True).stdout
-    assert {"bt", "straight"} <= set(told.split())
+    answer = subprocess.run(["pdftotext", str(out), "-"], capture_output=True, text=True, check=True).stdout
+    assert {"bt", "straight"} <= set(answer.split())
     shown = subprocess.run(
         ["pdftoppm", "-r", "100", "-png", str(out)], capture_output=True, check=True
     ).stdout
@@ -206,9 +206,9 @@ def test_what_cannot_be_written_is_refused_before_anything_is_read(tmp_path):
         (video, "a.avi", ".webm, .mp4, .gif"),
         (video, "a", ".webm"),
     ):
-        with pytest.raises(UserError, match="can be") as told:
+        with pytest.raises(UserError, match="can be") as answer:
             draw(tmp_path / "nowhere.mcap", tmp_path / name)
-        assert there in str(told.value)
+        assert there in str(answer.value)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -65,8 +65,8 @@ def test_the_classical_half_is_as_listed(key):
 @pytest.mark.parametrize("key", LEARNING)
 def test_learning_is_as_listed(key):
     _paper, default, curriculum, paper, _why = LEARNING[key]
-    told = [json.loads(cell.strip("`")) for cell in (default, curriculum, paper)]
-    assert told == [
+    answer = [json.loads(cell.strip("`")) for cell in (default, curriculum, paper)]
+    assert answer == [
         values(config)[key]
         for config in (LearningConfig(), load_training("curriculum"), load_training("paper"))
     ]

@@ -195,8 +195,8 @@ def test_text_is_drawn_with_any_opencv(monkeypatch, font):
 
 
 def test_video_is_a_readable_webm(folder, bt, capfd):
-    told = []
-    out = video(bt, folder / "v.webm", fps=10.0, progress=lambda done, total: told.append((done, total)))
+    answer = []
+    out = video(bt, folder / "v.webm", fps=10.0, progress=lambda done, total: answer.append((done, total)))
     assert out.read_bytes()[:4] == b"\x1a\x45\xdf\xa3"
     assert capfd.readouterr().err == ""
     reader = cv2.VideoCapture(str(out))
@@ -204,7 +204,7 @@ def test_video_is_a_readable_webm(folder, bt, capfd):
     while (got := reader.read())[0]:
         frames.append(got[1])
     expected = round(N_STEP * episode.DT * 10) + 11
-    assert len(frames) == expected and told[-1] == (expected, expected)
+    assert len(frames) == expected and answer[-1] == (expected, expected)
     assert reader.get(cv2.CAP_PROP_FPS) == 10.0
     artist = FrameArtist(load_recording(bt))
     for index, time_s in ((5, 0.5), (expected - 1, N_STEP * episode.DT)):

@@ -174,9 +174,11 @@ def test_episodes_do_not_depend_on_order_or_neighbours(small, trained):
     results, _ = run_episodes(small.sim, jobs, driver=note.pilot)
     backwards, _ = run_episodes(small.sim, jobs[::-1], driver=load_pilot(method.checkpoint, small.N))
     alone, _ = run_episodes(small.sim, jobs[4:5], driver=note.pilot)
-    told = [vars(r) | {"ticks": r.ticks.tolist(), "acted": r.acted.tolist()} for r in results]
-    assert [vars(r) | {"ticks": r.ticks.tolist(), "acted": r.acted.tolist()} for r in backwards[::-1]] == told
-    assert vars(alone[0]) | {"ticks": alone[0].ticks.tolist(), "acted": alone[0].acted.tolist()} == told[4]
+    answer = [vars(r) | {"ticks": r.ticks.tolist(), "acted": r.acted.tolist()} for r in results]
+    assert [
+        vars(r) | {"ticks": r.ticks.tolist(), "acted": r.acted.tolist()} for r in backwards[::-1]
+    ] == answer
+    assert vars(alone[0]) | {"ticks": alone[0].ticks.tolist(), "acted": alone[0].acted.tolist()} == answer[4]
     assert not {r.outcome for r in results} & {"success", "timeout"}, "the policy drove, not the tree"
     assert small.sim.observation is None, "nobody else is made to pay for observations"
 
@@ -192,12 +194,12 @@ def test_the_log_tells_what_the_policy_thought(small, trained, tmp_path):
     run = read_head(log).metadata["uuv.run"]
     assert (run["controller"], run["checkpoint_sha256"]) == ("mine", method.checkpoint.sha256)
     messages = list(read_messages(log, ("/policy", "/action")))
-    thoughts = [m.data for m in messages if m.topic == "/policy"]
+    outputs = [m.data for m in messages if m.topic == "/policy"]
     actions = [m.data for m in messages if m.topic == "/action"]
-    assert all(t["lambda"] == 0.25 and len(t["std"]) == 4 for t in thoughts)
-    assert thoughts[0]["wm_residual"] == 0.0
-    assert all(t["wm_residual"] > 0 and t["wm_uncertainty"] > 0 for t in thoughts[1:])
-    assert {"alive", "progress", "success"} <= set(thoughts[0])
+    assert all(t["lambda"] == 0.25 and len(t["std"]) == 4 for t in outputs)
+    assert outputs[0]["wm_residual"] == 0.0
+    assert all(t["wm_residual"] > 0 and t["wm_uncertainty"] > 0 for t in outputs[1:])
+    assert {"alive", "progress", "success"} <= set(outputs[0])
     assert all(b["applied"] == a["policy"] for a, b in itertools.pairwise(actions)), (
         "what it chose is what was done next"
     )

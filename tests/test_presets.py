@@ -13,11 +13,11 @@ from uuvtai.show.presets import near, sentences
 def test_the_list_has_every_preset_with_its_sentence(capfd):
     code, out, _ = uuv(capfd, "presets")
     assert code == 0
-    told = " ".join(out.split())
+    answer = " ".join(out.split())
     for kind, found in sentences().items():
         assert list(found) == preset_names(kind)
         for name, said in found.items():
-            assert f"{name} {said}" in told
+            assert f"{name} {said}" in answer
     code, out, _ = uuv(capfd, "presets", "--json")
     assert code == 0 and json.loads(out) == sentences()
 

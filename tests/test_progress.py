@@ -57,18 +57,20 @@ def test_steps_of_real_episodes_are_counted_without_what_watches_them(small):
         def end(self, *_):
             time.s += 10.0
 
-    told = []
+    answer = []
     jobs = jobs_of([77], 10)
-    watched, steps = run_episodes(small.sim, jobs, Dawdler(), lambda *a: told.append(a), clock=clock)
+    watched, steps = run_episodes(small.sim, jobs, Dawdler(), lambda *a: answer.append(a), clock=clock)
     plain, again = run_episodes(small.sim, jobs)
     small.sim.use_tree(small.trees["bt"])
     assert steps == again and [(r.outcome, r.time_s) for r in watched] == [
         (r.outcome, r.time_s) for r in plain
     ]
     assert clock.seconds == 0.0 and 0 < clock.env_steps < steps
-    assert told[0] == (0, 10, 0, None) and told[1][0] == 0 and told[1][2] == small.N
-    assert told[-1][0] == 10 and told[-1][3] == 0
-    assert all(0 <= left <= 10 * small.config.episode.horizon_steps for *_, left in told if left is not None)
+    assert answer[0] == (0, 10, 0, None) and answer[1][0] == 0 and answer[1][2] == small.N
+    assert answer[-1][0] == 10 and answer[-1][3] == 0
+    assert all(
+        0 <= left <= 10 * small.config.episode.horizon_steps for *_, left in answer if left is not None
+    )
 
 
 def test_steps_that_are_left_are_guessed_from_episodes_that_are_over():

@@ -274,12 +274,12 @@ def test_dead_reckoning_zeroes_the_pressure_sensor_at_the_known_start(rig):
     z = np.array([-1.0, -0.9, -0.4, -1.5])
     rig.start(sensors)
     bias = rig.memory.pressure_bias_m.to_numpy()
-    told = []
+    outputs = []
     for step, height in enumerate(z):
         rig.move(pos_w=(5.0, 3.0, height))
-        told.append(rig.sense(sensors, step))
-        assert np.array_equal(told[-1]["pos_w"][:, 2], -told[-1]["depth_m"])
-    depth = np.stack([out["depth_m"] for out in told], 1)
+        outputs.append(rig.sense(sensors, step))
+        assert np.array_equal(outputs[-1]["pos_w"][:, 2], -outputs[-1]["depth_m"])
+    depth = np.stack([out["depth_m"] for out in outputs], 1)
     assert np.allclose(depth[:, 0], 1.0, atol=1e-6)
     assert_normal(depth[:, 3] - 1.5, 0.02 * np.sqrt(2.0))
     rig.start(SensorsConfig(pressure=sensors.pressure))

@@ -25,7 +25,7 @@ from uuvtai.errors import UserError
 from uuvtai.loader import ConfigError
 from uuvtai.measure.evaluate.paired import paired
 from uuvtai.report import ink
-from uuvtai.report.blocks import Figure, Gallery, Prose
+from uuvtai.report.blocks import Figure, Gallery, Paragraph
 from uuvtai.report.build import report
 from uuvtai.report.colours import contrast, ink_on, shade
 from uuvtai.report.figures import Line, curves, heat_map, intervals
@@ -292,7 +292,7 @@ def test_causes_and_risk_are_shown_where_there_are_any():
     assert rows(tables(blocks)[-1]) == [
         ["unseen above", "2", "100 %", "50 %", "1.7", "-", "0.2", samples.CAUSE["meaning"]]
     ]
-    said = [block.text for block in blocks if isinstance(block, Prose)][-1]
+    said = [block.text for block in blocks if isinstance(block, Paragraph)][-1]
     assert "missed 1 of 9 accidents, 2.0 % to 44.0 % (promised 10.0 %)" in said
     figure = figures(blocks)["reliability_best"]
     assert figure.data.rows == [(0.005, 0.004, 1200.0), (0.13, 0.1, 80.0), (0.6, 0.5, 20.0)]
@@ -771,9 +771,9 @@ def test_a_damaged_file_is_one_clear_error_and_nothing_is_written(tmp_path, file
     samples.write_run(tmp_path)
     (tmp_path / file).parent.mkdir(exist_ok=True)
     (tmp_path / file).write_text(content)
-    with pytest.raises(ConfigError, match=re.escape(says)) as told:
+    with pytest.raises(ConfigError, match=re.escape(says)) as answer:
         report([tmp_path])
-    assert str(tmp_path) in str(told.value)
+    assert str(tmp_path) in str(answer.value)
     assert not (tmp_path / "report.html").exists() and not (tmp_path / "figures").exists()
 
 

@@ -91,10 +91,10 @@ def test_holm_decides_over_the_whole_list():
     """Four tests at 0.01, 0.02, 0.03, 0.04: alone each would decide, together only the first does (4 x 0.01,
     then 3 x 0.02)."""
     found = [claims.Claim(str(p), "", "", HOLDS, p) for p in (0.03, 0.01, None, 0.04, 0.02)]
-    told = claims.judged(found)
-    assert [c.verdict for c in told] == [OPEN, HOLDS, HOLDS, OPEN, OPEN]
-    assert [c.p_holm for c in told] == pytest.approx([0.06, 0.04, None, 0.06, 0.06])
-    assert [c.p for c in told] == [0.03, 0.01, None, 0.04, 0.02]
+    answer = claims.judged(found)
+    assert [c.verdict for c in answer] == [OPEN, HOLDS, HOLDS, OPEN, OPEN]
+    assert [c.p_holm for c in answer] == pytest.approx([0.06, 0.04, None, 0.06, 0.06])
+    assert [c.p for c in answer] == [0.03, 0.01, None, 0.04, 0.02]
 
 
 def verdicts(found):
@@ -289,10 +289,10 @@ def printed(arguments):
 
 class Quiet:
     def __init__(self):
-        self.told = []
+        self.answer = []
 
     def note(self, text):
-        self.told.append(text)
+        self.answer.append(text)
 
 
 @pytest.fixture(autouse=True)
@@ -314,7 +314,7 @@ def test_an_interrupted_reproduction_goes_on_and_runs_no_step_twice(tmp_path, mo
     first = Uuv(monkeypatch, fail_at=3)
     with pytest.raises(KeyboardInterrupt):
         reproduce("quick", place, watch)
-    assert any(f"--resume {place}" in text for text in watch.told)
+    assert any(f"--resume {place}" in text for text in watch.answer)
     second = Uuv(monkeypatch)
     document, _ = resume(place, Quiet())
     wanted = steps.steps_of(steps.BUDGETS["quick"], document.get("policy"), place)

@@ -313,8 +313,8 @@ ENTITIES = {
 def test_xml_entities_are_refused(here, text, capfd):
     (here / "evil.xml").write_text(text)
     assert run_cli("tree", "--controller", here / "evil.xml") == 2
-    told = capfd.readouterr()
-    assert told.out == "" and "root:" not in told.err and "evil.xml:1" in told.err
+    answer = capfd.readouterr()
+    assert answer.out == "" and "root:" not in answer.err and "evil.xml:1" in answer.err
 
 
 def test_xml_bombs(here):
@@ -948,9 +948,9 @@ def test_names_in_a_log_cannot_steer_the_terminal(here, capfd):
     file.finish()
     assert run_cli("log", "info", here / "a.mcap") == 0
     assert run_cli("log", "export", here / "a.mcap", "--out", here / "out", "--topic", "\x1b[2J") == 2
-    told = capfd.readouterr()
-    assert not any(bad in told.out + told.err for bad in ("\x1b", "\x07", "\x9b", "\u202e"))
-    assert "[link=file:///etc/passwd]" in told.out, "shown as it is, not as a link"
+    answer = capfd.readouterr()
+    assert not any(bad in answer.out + answer.err for bad in ("\x1b", "\x07", "\x9b", "\u202e"))
+    assert "[link=file:///etc/passwd]" in answer.out, "shown as it is, not as a link"
 
 
 def test_the_reader_of_safetensors_is_the_only_one_that_run_policy_has():

@@ -252,23 +252,23 @@ def apply_error(
     for row, packet in ti.ndrange(out.shape[0], out.shape[1] // LANES):
         key, ray = ti.cast(row + 7, ti.u32), packet * LANES
         r, rate, bright = f16x(range_m), f16x(1.0), f16x(cosine)
-        told, speed, lit = r + 0.0, rate + 0.0, bright + 0.0
+        reported, speed, lit = r + 0.0, rate + 0.0, bright + 0.0
         if ti.static(which == 0):
-            told = sonar_error.range_noisy(r, key, step, ray, io_for(SonarIO, config))
+            reported = sonar_error.range_noisy(r, key, step, ray, io_for(SonarIO, config))
         elif ti.static(which == 1):
-            told = sonar_error.missed(r, key, step, ray, io_for(SonarIO, config))
+            reported = sonar_error.missed(r, key, step, ray, io_for(SonarIO, config))
         elif ti.static(which == 2):
-            told, speed, lit = sonar_error.falsely_returned(
+            reported, speed, lit = sonar_error.falsely_returned(
                 r, rate, bright, key, step, ray, io_for(SonarIO, config)
             )
         elif ti.static(which == 3):
-            told = sonar_error.grazing_lost(r, bright, io_for(SonarIO, config))
+            reported = sonar_error.grazing_lost(r, bright, io_for(SonarIO, config))
         elif ti.static(which == 4):
-            told = sonar_error.cut_off(r, io_for(SonarIO, config))
+            reported = sonar_error.cut_off(r, io_for(SonarIO, config))
         else:
             speed = sonar_error.doppler_noisy(rate, key, step, ray, io_for(SonarIO, config))
         for i in ti.static(range(LANES)):
-            out[row, ray + i, 0] = told[i]
+            out[row, ray + i, 0] = reported[i]
             out[row, ray + i, 1] = speed[i]
             out[row, ray + i, 2] = lit[i]
 
@@ -276,7 +276,7 @@ def apply_error(
 NOISE, MISSED, FALSE, GRAZING, CUT, DOPPLER = range(6)
 
 
-def told(which, config, range_m=5.0, cosine=0.5, step=3):
+def reported(which, config, range_m=5.0, cosine=0.5, step=3):
     out = np.zeros((64, N_RAY, 3), np.float32)
     apply_error(which, range_m, cosine, step, config, out)
     return out
@@ -289,7 +289,7 @@ def assert_share(mask, share):
 def test_range_sigma_grows_with_range():
     config = SonarConfig(range_sigma_m=0.03, range_sigma_slope=0.01)
     for range_m in (2.0, 8.0):
-        error = told(NOISE, config, range_m)[..., 0] - range_m
+        error = reported(NOISE, config, range_m)[..., 0] - range_m
         sigma = 0.03 + 0.01 * range_m
         assert abs(error.mean()) < SIGMAS * sigma / np.sqrt(error.size)
         assert error.std() == pytest.approx(sigma, rel=SIGMAS / np.sqrt(2 * error.size))
@@ -300,7 +300,7 @@ def test_range_sigma_grows_with_range():
 
 def test_range_noise_differs_between_steps_and_episodes_and_repeats():
     config = SonarConfig(range_sigma_m=0.03, range_sigma_slope=0.01)
-    first, again, later = told(NOISE, config), told(NOISE, config), told(NOISE, config, step=4)
+    first, again, later = reported(NOISE, config), reported(NOISE, config), reported(NOISE, config, step=4)
     assert np.array_equal(first, again)
     assert abs(np.corrcoef(first[..., 0].ravel(), later[..., 0].ravel())[0, 1]) < SIGMAS / np.sqrt(
         first[..., 0].size
@@ -309,18 +309,18 @@ def test_range_noise_differs_between_steps_and_episodes_and_repeats():
 
 
 def test_jitter_is_exponential():
-    error = told(NOISE, SonarConfig(range_jitter_m=0.1))[..., 0] - 5.0
+    error = reported(NOISE, SonarConfig(range_jitter_m=0.1))[..., 0] - 5.0
     assert error.min() >= 0
     assert error.mean() == pytest.approx(0.1, rel=SIGMAS / np.sqrt(error.size))
     assert_share(error > 0.1, np.exp(-1.0))
 
 
 def test_missed_returns():
-    assert_share(told(MISSED, SonarConfig(missed_return=0.1))[..., 0] == FAR_M, 0.1)
+    assert_share(reported(MISSED, SonarConfig(missed_return=0.1))[..., 0] == FAR_M, 0.1)
 
 
 def test_false_returns_are_uniform_and_still():
-    out = told(FALSE, SonarConfig(false_return=0.03))
+    out = reported(FALSE, SonarConfig(false_return=0.03))
     chosen = out[..., 1] == 0.0
     assert_share(chosen, 0.03)
     false = out[chosen]
@@ -331,26 +331,26 @@ def test_false_returns_are_uniform_and_still():
 
 def test_grazing_loss_is_sharp():
     config = SonarConfig(grazing_cosine=0.25)
-    assert np.all(told(GRAZING, config, cosine=0.24)[..., 0] == FAR_M)
-    assert np.all(told(GRAZING, config, cosine=0.26)[..., 0] == 5.0)
+    assert np.all(reported(GRAZING, config, cosine=0.24)[..., 0] == FAR_M)
+    assert np.all(reported(GRAZING, config, cosine=0.26)[..., 0] == 5.0)
 
 
 def test_quantum_range_limit_and_sign():
     config = SonarConfig(range_quantum_m=0.024)
     for range_m in (0.011, 3.333, 11.9):
-        got = told(CUT, config, range_m)[0, 0, 0]
+        got = reported(CUT, config, range_m)[0, 0, 0]
         assert abs(got - range_m) <= 0.012 + 1e-6
         assert got / 0.024 == pytest.approx(round(got / 0.024), abs=1e-3)
-    assert told(CUT, config, 12.1)[0, 0, 0] == np.float32(FAR_M)
-    assert told(CUT, CLEAN, -0.1)[0, 0, 0] == 0.0
-    assert told(CUT, CLEAN, 3.333)[0, 0, 0] == np.float32(3.333)
+    assert reported(CUT, config, 12.1)[0, 0, 0] == np.float32(FAR_M)
+    assert reported(CUT, CLEAN, -0.1)[0, 0, 0] == 0.0
+    assert reported(CUT, CLEAN, 3.333)[0, 0, 0] == np.float32(3.333)
 
 
 def test_doppler_sigma_and_outliers():
-    error = told(DOPPLER, SonarConfig(doppler_sigma_m_s=0.2))[..., 1] - 1.0
+    error = reported(DOPPLER, SonarConfig(doppler_sigma_m_s=0.2))[..., 1] - 1.0
     assert abs(error.mean()) < SIGMAS * 0.2 / np.sqrt(error.size)
     assert error.std() == pytest.approx(0.2, rel=SIGMAS / np.sqrt(2 * error.size))
-    wild = told(DOPPLER, SonarConfig(doppler_outlier=0.1))[..., 1]
+    wild = reported(DOPPLER, SonarConfig(doppler_outlier=0.1))[..., 1]
     assert_share(wild != 1.0, 0.1)
     assert np.abs(wild).max() <= 2.0
     assert wild[wild != 1.0].std() == pytest.approx(2 / np.sqrt(3), rel=0.1)
@@ -358,7 +358,7 @@ def test_doppler_sigma_and_outliers():
 
 @pytest.mark.parametrize("which", [NOISE, MISSED, FALSE, GRAZING, CUT, DOPPLER])
 def test_every_error_is_absent_at_zero(which):
-    assert np.all(told(which, CLEAN, 5.0, 0.001) == np.float32([5.0, 1.0, 0.001]))
+    assert np.all(reported(which, CLEAN, 5.0, 0.001) == np.float32([5.0, 1.0, 0.001]))
 
 
 def test_ghost_takes_the_mirrored_path(rig):

@@ -22,13 +22,13 @@ class Quiet:
 def test_a_stacks_name_is_a_controller_with_its_own_config_and_tree(tmp_path):
     mine = tmp_path / "mine.yaml"
     mine.write_text("extends: paper\ntree: planner\n")
-    bt, paper, told, own = trees_of(["bt", "paper", "paper+truth", str(mine)], 64)
+    bt, paper, with_truth, own = trees_of(["bt", "paper", "paper+truth", str(mine)], 64)
     config = load_config("pool")
     assert (bt.name, bt.stack, bt.document()) == ("bt", None, {}) and bt.config_of(config) is config
     assert (paper.name, paper.privileged, paper.tree.types) == ("paper", False, bt.tree.types)
     assert paper.document() == {"stack": {"preset": "paper", "tree": "bt"}}
-    assert paper.config_of(config).voronoi.use == "fused" == told.config_of(config).voronoi.use
-    assert (told.name, told.privileged, own.name) == (
+    assert paper.config_of(config).voronoi.use == "fused" == with_truth.config_of(config).voronoi.use
+    assert (with_truth.name, with_truth.privileged, own.name) == (
         "paper+truth",
         True,
         "mine",

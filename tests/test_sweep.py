@@ -30,13 +30,13 @@ class Quiet:
     """Watches without a word."""
 
     def __init__(self):
-        self.told = []
+        self.answer = []
 
     def start(self, name, total, done=0):
         self.total = total
 
     def note(self, text):
-        self.told.append(text)
+        self.answer.append(text)
 
     def update(self, done, total, env_steps):
         self.done = done
@@ -227,7 +227,7 @@ def test_an_interrupted_sweep_goes_on_where_it_was(tmp_path):
     place, watch = tmp_path / "cut", Quiet()
     with pytest.raises(KeyboardInterrupt):
         sweep(request, Canned(stop_after=1), place, watch)
-    assert any(f"--resume {place}" in text for text in watch.told)
+    assert any(f"--resume {place}" in text for text in watch.answer)
     assert json.loads((place / "run.json").read_text())["status"] == "interrupted"
     rest = Canned()
     assert resume(place, rest, Quiet())[0] == whole

@@ -149,8 +149,8 @@ def test_a_wider_terminal_shows_more_and_what_is_left_out_is_said():
     assert "steps/s" in found[200].split("left out")[0] and "left out" not in found[200]
     for width in WIDTHS:
         before, _, after = found[width].partition("left out, for want of room: ")
-        told = after.partition("; --wide shows all")[0]
-        assert "steps/s" in told and "steps/s" not in before, "the least important goes first"
+        answer = after.partition("; --wide shows all")[0]
+        assert "steps/s" in answer and "steps/s" not in before, "the least important goes first"
     assert "contact/ttc/" in found[120] and "contact/ttc/" not in found[80].split("left out")[0]
     assert "contact/ttc/ out/timeout" in re.sub(r"\s+", " ", found[80])
 

@@ -95,25 +95,27 @@ def test_export_and_check_open_no_socket_and_write_nowhere_else(tmp_path):
         "from uuvtai import cli\ntry:\n    cli.main({!r})\nexcept SystemExit as left:\n    assert "
         "left.code == 0, left.code"
     )
-    told = watched(command.format(["export", str(tmp_path / "run"), "--out", str(out)]), home)
-    assert "ONNX Runtime" in told and (out / "policy.onnx").exists()
+    answer = watched(command.format(["export", str(tmp_path / "run"), "--out", str(out)]), home)
+    assert "ONNX Runtime" in answer and (out / "policy.onnx").exists()
     written = tree(out)
-    told += watched(command.format(["export", "--check", str(out)]), home)
+    answer += watched(command.format(["export", "--check", str(out)]), home)
     assert (
-        told.count("sockets: []") == 2 and told.count("variable: 1") == 2 and told.count("loaded: True") == 2
-    ), told
+        answer.count("sockets: []") == 2
+        and answer.count("variable: 1") == 2
+        and answer.count("loaded: True") == 2
+    ), answer
     assert [path for path in home.rglob("*") if path.is_file()] == []
     assert tree(out) == written, "the check wrote into the folder"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["elsewhere", "out", "run"]
 
 
 def test_the_watch_sees_a_socket_and_a_file(tmp_path):
-    told = watched(
+    answer = watched(
         "import socket\nkept = socket.create_server(('127.0.0.1', 0))\nopen('left', "
         "'w').close()\ntime.sleep(0.1)",
         tmp_path / "home",
     )
-    assert "socket.bind" in told and "socket:[" in told
+    assert "socket.bind" in answer and "socket:[" in answer
     assert (tmp_path / "home" / "left").exists()
 
 

@@ -47,7 +47,7 @@ def same(a, b):
         ), name
 
 
-def told(metrics):
+def comparable(metrics):
     """All metrics but wall times."""
     return {name: value for name, value in metrics.items() if name not in WALL_TIMES}
 
@@ -81,15 +81,15 @@ def test_it_learns_the_task_from_its_teacher_and_says_so():
 def test_four_iterations_equal_two_and_two_more_after_a_resume(more):
     config = config_of(**more)
     whole = Trainer(PointEnv(), config)
-    metrics = [told(whole.iterate()) for _ in range(4)]
+    metrics = [comparable(whole.iterate()) for _ in range(4)]
     first = Trainer(PointEnv(), config)
-    assert [told(first.iterate()) for _ in range(2)] == metrics[:2]
+    assert [comparable(first.iterate()) for _ in range(2)] == metrics[:2]
     state = first.state()
     first.iterate()
     second = Trainer(PointEnv(seed=9), config)
     second.iterate()
     second.load_state(state)
-    assert [told(second.iterate()) for _ in range(2)] == metrics[2:]
+    assert [comparable(second.iterate()) for _ in range(2)] == metrics[2:]
     same(second.state(), whole.state())
 
 
@@ -241,7 +241,9 @@ def trained(first, num_envs, processes):
 
     trainer.policy.act = act_as_part_of_the_whole
     metrics = [trainer.iterate() for _ in range(2)][-1]
-    return {name: tensor.tolist() for name, tensor in trainer.policy.state_dict().items()}, told(metrics)
+    return {name: tensor.tolist() for name, tensor in trainer.policy.state_dict().items()}, comparable(
+        metrics
+    )
 
 
 def half(processes):

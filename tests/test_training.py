@@ -36,13 +36,13 @@ class Quiet:
     """Watches without a word; ``press_at``: iteration after which somebody presses Ctrl-C."""
 
     def __init__(self, press_at=None, times=1):
-        self.press_at, self.times, self.told, self.rows = press_at, times, [], []
+        self.press_at, self.times, self.notes, self.rows = press_at, times, [], []
 
     def start(self, folder, config, done, total):
         self.began = (done, total)
 
     def note(self, text):
-        self.told.append(text)
+        self.notes.append(text)
 
     def update(self, done, metrics, success_ci95):
         self.rows.append((done, metrics, success_ci95))
@@ -79,7 +79,7 @@ def content_of(path):
     return {p.name: p.read_bytes() for p in path.iterdir() if p.name != "manifest.json"}
 
 
-def told(folder):
+def notes(folder):
     """The metrics of a run, but for wall times."""
     return [
         {
@@ -119,7 +119,7 @@ def test_2n_iterations_are_n_and_a_resumed_n_bit_for_bit(points, tmp_path):
     train(TrainRequest(config=config_of(), run_dir=half, iterations=3), Quiet())
     train(TrainRequest(resume=half, iterations=6), Quiet())
     assert content_of(whole / "checkpoints/step_000006") == content_of(half / "checkpoints/step_000006")
-    assert told(whole) == told(half)
+    assert notes(whole) == notes(half)
     assert [entry["iteration"] for entry in run_json(half)["resumed"]] == [3]
 
 
@@ -130,11 +130,11 @@ def test_an_interrupt_finishes_the_iteration_and_saves(points, tmp_path):
         train(TrainRequest(config=config_of(), run_dir=cut), watch)
     assert (run_json(cut)["status"], run_json(cut)["exit"]) == ("interrupted", 130)
     assert checkpoint.newest(cut, resumable=True).step >= 3
-    assert f"uuv train --resume {cut}" in watch.told[-1]
+    assert f"uuv train --resume {cut}" in watch.notes[-1]
     train(TrainRequest(resume=cut), Quiet())
     train(TrainRequest(config=config_of(), run_dir=whole), Quiet())
     assert content_of(whole / "checkpoints/step_000006") == content_of(cut / "checkpoints/step_000006")
-    assert told(whole) == told(cut)
+    assert notes(whole) == notes(cut)
     assert run_json(cut)["status"] == "finished"
 
 
@@ -166,11 +166,11 @@ def test_a_damaged_checkpoint_is_told_and_the_one_before_goes_on(points, tmp_pat
         file.truncate(100)
     watch = Quiet()
     train(TrainRequest(resume=cut), watch)
-    assert any("was cut off" in text for text in watch.told)
+    assert any("was cut off" in text for text in watch.notes)
     assert watch.began == (2, 6)
     train(TrainRequest(config=config_of(), run_dir=whole), Quiet())
     assert content_of(whole / "checkpoints/step_000006") == content_of(cut / "checkpoints/step_000006")
-    assert told(whole) == told(cut)
+    assert notes(whole) == notes(cut)
 
 
 def test_settings_may_change_as_a_run_goes_on(points, tmp_path):
@@ -315,4 +315,4 @@ def test_a_killed_run_goes_on_bit_for_bit_in_another_process(tmp_path):
     assert checkpoint.newest(killed, resumable=True).step in (2, 3, 4)
     uuv("train", "--resume", str(killed), "--device", "cpu")
     assert content_of(whole / "checkpoints/step_000006") == content_of(killed / "checkpoints/step_000006")
-    assert told(whole) == told(killed)
+    assert notes(whole) == notes(killed)

@@ -86,8 +86,8 @@ def built(tmp_path_factory):
         sdist,
         cwd=place,
     )
-    (wheel,) = dist.glob("*.whl")
-    return sdist, wheel
+    (stepper,) = dist.glob("*.whl")
+    return sdist, stepper
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from uuvtai.config.learning import UncertaintyConfig, WorldModelConfig
 from uuvtai.learn.calibration import mean_squared_standardised_residual, spearman
 from uuvtai.learn.normalise import Moments, moments_of
 from uuvtai.learn.uncertainty import Uncertainty
-from uuvtai.learn.world_model import LOG_VAR_BOUNDS, N_TARGET, Recollection, WorldModel, WorldModelLearner
+from uuvtai.learn.world_model import LOG_VAR_BOUNDS, N_TARGET, WorldModel, WorldModelLearner
 
 N_OBS, STEPS, N_ENV = 30, 16, 32
 SMALL = WorldModelConfig(hidden=(32, 32), latent=16, batch=256, steps=2, learning_rate=3e-3)
@@ -214,21 +214,6 @@ def test_sure_of_small_raw_targets_the_paper_scales_little_and_the_change_to_the
         scales["decoder"] == pytest.approx(1 + 0.8 * 0.04, rel=0.02)
         and scales["change"] == UncertaintyConfig().max_scale
     )
-
-
-def test_memory_gives_the_features_of_the_last_step_and_forgets_where_it_is_told_to():
-    model, _, _ = trained(2)
-    obs, action, next_obs = (part[0, :4] for part in transitions(3))
-    memory = Recollection(model, 4)
-    assert memory.features(obs).tolist() == [[0.0, 0.0]] * 4, "nothing to compare with yet"
-    memory.remember(obs, action)
-    expected = model.features(obs, action, next_obs)
-    assert torch.equal(memory.features(next_obs), expected)
-    memory.reset(torch.tensor([False, True, False, False]))
-    found = memory.features(next_obs)
-    assert found[1].tolist() == [0.0, 0.0] and torch.equal(found[[0, 2, 3]], expected[[0, 2, 3]])
-    memory.remember(next_obs, action)
-    assert (memory.features(obs)[:, 1] > 0).all()
 
 
 # --------------------------------------------------------------------------------------------- random, resume

@@ -59,7 +59,7 @@ def guarded(run: Callable[[], Any]) -> int:
         return _ended_by(error)
 
 
-def told(text: str, code: int) -> int:
+def reported(text: str, code: int) -> int:
     """Say it on stderr; the code."""
     say(text)
     return code
@@ -80,17 +80,17 @@ def _ended_by(error: BaseException) -> int:
         error.show()
         return USAGE
     if isinstance(error, UserError):
-        return told(f"uuv: {error}", USAGE)
+        return reported(f"uuv: {error}", USAGE)
     if isinstance(error, BrokenPipeError):  # the reader of our output has gone (| head): not an error of ours
         _drop_output()
         return OK
     if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
-        return told(f"uuv: {_one_line(error)}; give a shorter path", USAGE)
+        return reported(f"uuv: {_one_line(error)}; give a shorter path", USAGE)
     if isinstance(error, OSError) and error.errno in _SYSTEM:
         _settle_output()
-        return told(f"uuv: {_one_line(error)}; make room, or choose another place", FAILED)
+        return reported(f"uuv: {_one_line(error)}; make room, or choose another place", FAILED)
     if _is_out_of_memory(error):
-        return told(
+        return reported(
             f"uuv: out of memory ({_one_line(error) or 'no more is known'}); try a smaller --num-envs", FAILED
         )
     if isinstance(error, SystemExit):
@@ -99,7 +99,7 @@ def _ended_by(error: BaseException) -> int:
             if isinstance(error.code, int)
             else OK
             if error.code is None
-            else told(str(error.code), FAILED)
+            else reported(str(error.code), FAILED)
         )
     return _bug(error)
 
@@ -118,26 +118,26 @@ def _interrupted() -> int:
 
         signal.setitimer(signal.ITIMER_REAL, 0.0)
     _settle_output()
-    return told("interrupted", signals.exit_code())
+    return reported("interrupted", signals.exit_code())
 
 
 def _bug(error: BaseException) -> int:
     """One line, and all that a report needs in a file; with UUV_DEBUG=1 in the terminal."""
-    told_by = "".join(traceback.format_exception(type(error), error, error.__traceback__))
+    trace = "".join(traceback.format_exception(type(error), error, error.__traceback__))
     what = f"uuv: a bug of ours: {type(error).__name__}: {_one_line(error)}"
     if os.environ.get("UUV_DEBUG") == "1":
-        sys.stderr.write(plain(told_by))
-        return told(what, FAILED)
+        sys.stderr.write(plain(trace))
+        return reported(what, FAILED)
     about = f"uuvtai {__version__}, Python {platform.python_version()}, {platform.platform()}\n{sys.argv}\n"
     try:
         handle, name = tempfile.mkstemp(prefix=f"uuv-bug-{time.strftime('%Y%m%d-%H%M%S')}-", suffix=".txt")
         with os.fdopen(handle, "w", encoding="utf-8", errors="backslashreplace") as file:
-            file.write(about + told_by)
+            file.write(about + trace)
     except OSError as reason:
-        return told(
+        return reported(
             f"{what}; its traceback could not be kept ({reason.strerror}): UUV_DEBUG=1 shows it", FAILED
         )
-    return told(f"{what}; please report it with {name}", FAILED)
+    return reported(f"{what}; please report it with {name}", FAILED)
 
 
 def _one_line(error: BaseException) -> str:

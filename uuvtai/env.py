@@ -21,7 +21,7 @@ from uuvtai.capture import capture, check_arrays, check_setting, restore
 from uuvtai.config import Config
 from uuvtai.config.task import TERMS
 from uuvtai.kernels.planning.features import placed_columns
-from uuvtai.kernels.task.reward import tell_step
+from uuvtai.kernels.task.reward import write_results
 from uuvtai.outcomes import OUTCOMES
 from uuvtai.sim import Sim
 
@@ -30,7 +30,7 @@ NUM_ACTIONS = 4
 
 _MAX_SEED = 2**31 - 1
 
-_TOLD = ("reward_terms", "episode_terms", "episode_return", "episode_steps", "outcome")
+_STEP_RESULTS = ("reward_terms", "episode_terms", "episode_return", "episode_steps", "outcome")
 """What ``tell_step`` writes, in its order."""
 
 Slice = slice
@@ -168,7 +168,7 @@ class VectorEnv:
         sim.observation = self._obs
         sim.step(action.detach())
         info["final_obs"].copy_(self._obs)
-        tell_step(sim.io.reward, *(info[name] for name in _TOLD))
+        write_results(sim.io.reward, *(info[name] for name in _STEP_RESULTS))
         torch.ne(sim.terminated, 0, out=self._terminated)
         torch.ne(sim.truncated, 0, out=self._truncated)
         ended = self._terminated | self._truncated
@@ -247,8 +247,8 @@ class VectorEnv:
     def _setting(self) -> str:
         """JSON of what a captured state fits to."""
         tree = dataclasses.asdict(self.sim.tree)
-        for told in ("source", "xml"):  # where it was read from changes nothing
-            tree.pop(told)
+        for origin in ("source", "xml"):  # where it was read from changes nothing
+            tree.pop(origin)
         return json.dumps(
             {
                 "num_envs": self.num_envs,

@@ -52,7 +52,7 @@ def install() -> None:
     ignored stays so (nohup)."""
     for number in STOPPING:
         if signal.getsignal(number) != signal.SIG_IGN:
-            signal.signal(number, _hear)
+            signal.signal(number, _on_signal)
     if not _installed:  # what is registered first runs last
         atexit.register(_rest)
     _installed[:] = [True]
@@ -71,7 +71,7 @@ def engage() -> None:
     _engaged[:] = [True]
 
 
-class Noted:
+class StopEvent:
     """Context in which the first signal sets ``event``, in place of what it does otherwise; the next one ends
     at once, or interrupts."""
 
@@ -80,12 +80,12 @@ class Noted:
 
         self.event = threading.Event()
         self._before: dict[signal.Signals, Any] = {}
-        self._hears = threading.current_thread() is threading.main_thread()
+        self._on_main_thread = threading.current_thread() is threading.main_thread()
         """signals go to the main thread; whoever runs this elsewhere stops it otherwise"""
 
     def __enter__(self) -> Event:
         """Listen."""
-        if self._hears:
+        if self._on_main_thread:
             self._before = {number: signal.signal(number, self._note) for number in STOPPING}
             end_at_second()
         return self.event
@@ -135,7 +135,7 @@ def end_at_second() -> None:
             libc.sigaction(int(number), action, None)
 
 
-def _hear(number: int, frame: FrameType | None) -> None:
+def _on_signal(number: int, frame: FrameType | None) -> None:
     _received.append(number)
     if _finished:
         os._exit(_finished[0])
@@ -149,14 +149,14 @@ def _deliver(_number: int, frame: FrameType | None) -> None:
     """Raise, or look again soon."""
     if _finished:
         return
-    if _is_deaf(frame):
+    if _ignores_signals(frame):
         signal.signal(signal.SIGALRM, _deliver)
         signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
         return
     raise Interrupted
 
 
-def _is_deaf(frame: FrameType | None) -> bool:
+def _ignores_signals(frame: FrameType | None) -> bool:
     """Whether an exception would get lost here: in an import (extension modules make other errors of it), in
     a finaliser."""
     if not hasattr(signal, "setitimer"):

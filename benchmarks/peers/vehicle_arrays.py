@@ -79,8 +79,8 @@ class Vehicles:
         room = xp.where(thrust > 0, forward, reverse) / xp.where(thrust == 0, reverse, thrust)
         share = (room.min(0) if xp is np else room.amin(0)).clip(None, 1.0)
         self.rpm_command = self._rpm_of(share * thrust)
-        starved = (share < 1) | (given != asked)
-        part = xp.where(starved, 0.0, (1.0 - abs(error) / band).clip(0.0))
+        saturated = (share < 1) | (given != asked)
+        part = xp.where(saturated, 0.0, (1.0 - abs(error) / band).clip(0.0))
         part = xp.where(error * self.integral < 0, 1.0, part)
         after = self.integral + integral_gain * self.config.episode.control_dt_s * part * error
         self.integral = xp.minimum(xp.maximum(after, -bound), bound)

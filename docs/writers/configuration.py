@@ -90,12 +90,12 @@ def _about(model: Model) -> str:
 
 def _tables(path: str, model: Model) -> list[str]:
     """The section's own keys, then the sections inside it."""
-    told, schema = meanings(model), _schemas()[model.__name__]["properties"]
+    explained, schema = meanings(model), _schemas()[model.__name__]["properties"]
     inner = {
         key: found for key, field in model.model_fields.items() if (found := _model_in(field.annotation))
     }
     single = [key for key, found in inner.items() if model.model_fields[key].annotation is found]
-    rows = [_row(key, schema[key], told.get(key, "")) for key in model.model_fields if key not in single]
+    rows = [_row(key, schema[key], explained.get(key, "")) for key in model.model_fields if key not in single]
     parts = [_about(model)] + (
         [text_table(["key", "type", "default", "unit", "meaning"], rows)] if rows else []
     )
@@ -119,10 +119,10 @@ def _model_in(annotation: Any) -> Model | None:
     return next((found for inner in get_args(annotation) if (found := _model_in(inner))), None)
 
 
-def _row(key: str, schema: Schema, told: str) -> list[str]:
+def _row(key: str, schema: Schema, explained: str) -> list[str]:
     default = f"`{_plain(schema['default'])}`" if "default" in schema else "needed"
-    unit = unit_of(key, told)
-    return [f"`{key}`", type_text(schema), default, unit, told.removeprefix(f"[{unit}]")]
+    unit = unit_of(key, explained)
+    return [f"`{key}`", type_text(schema), default, unit, explained.removeprefix(f"[{unit}]")]
 
 
 def _plain(value: Any) -> str:
@@ -148,9 +148,9 @@ def meanings(model: Model) -> dict[str, str]:
     return found
 
 
-def unit_of(key: str, told: str) -> str:
+def unit_of(key: str, explained: str) -> str:
     """Unit: in brackets at the start of the text, or by the end of the name."""
-    if stated := re.match(r"(?:\w+ )?\[([^\]\d][^\]]*|1/[^\]]+)\]", told):
+    if stated := re.match(r"(?:\w+ )?\[([^\]\d][^\]]*|1/[^\]]+)\]", explained):
         return stated[1]
     return next((unit for end, unit in UNITS.items() if key.endswith(f"_{end}")), "")
 
@@ -188,14 +188,14 @@ _GUARDS = (SMALLEST, LARGEST, MOST)
 
 def _bounds(schema: Schema) -> str:
     signs = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
-    told = [
+    explained = [
         f"{sign} {schema[name]:.10g}"
         for name, sign in signs.items()
         if name in schema and abs(schema[name]) not in _GUARDS
     ]
-    told = ["> 0", *told] if schema.get("minimum") == SMALLEST else told
-    told += [f"multiple of {schema['multipleOf']}"] if "multipleOf" in schema else []
-    return f" {', '.join(told)}" if told else ""
+    explained = ["> 0", *explained] if schema.get("minimum") == SMALLEST else explained
+    explained += [f"multiple of {schema['multipleOf']}"] if "multipleOf" in schema else []
+    return f" {', '.join(explained)}" if explained else ""
 
 
 # ---------------------------------------------------------------------------------------------------- presets

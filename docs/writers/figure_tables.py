@@ -84,8 +84,8 @@ def _evaluated(entry: dict[str, Any]) -> list[str]:
 
 def _causes(method: dict[str, Any]) -> str:
     """The two most frequent labels of ``uuv eval --explain`` with their counts."""
-    told = [f"{cause['label']} {cause['count']}" for cause in method["causes"][:2]]
-    return ", ".join(told) or ("" if method["outcomes"]["success"] == method["episodes"] else DASH)
+    caption = [f"{cause['label']} {cause['count']}" for cause in method["causes"][:2]]
+    return ", ".join(caption) or ("" if method["outcomes"]["success"] == method["episodes"] else DASH)
 
 
 def policy(sources: Sources) -> str:
@@ -233,7 +233,7 @@ def alone(sources: Sources) -> str:
                 if name
                 not in ("method", "episodes", "success", "contact", "ttc_stop", "out_of_tank", "timeout")
             ]
-            told = (
+            caption = (
                 ", ".join(
                     f"`{name}={cell[name]}`"
                     for name in axes
@@ -241,7 +241,7 @@ def alone(sources: Sources) -> str:
                 )
                 or "nothing"
             )
-            found.setdefault(told, {})[cell["method"]] = pooled([cell])
+            found.setdefault(caption, {})[cell["method"]] = pooled([cell])
     head = [
         "changed",
         "`bt`: success [95 %]",
@@ -255,7 +255,10 @@ def alone(sources: Sources) -> str:
     ]
     return text_table(
         head,
-        [[told, *_alone(methods.get("bt")), *_alone(methods.get("best"))] for told, methods in found.items()],
+        [
+            [caption, *_alone(methods.get("bt")), *_alone(methods.get("best"))]
+            for caption, methods in found.items()
+        ],
     )
 
 

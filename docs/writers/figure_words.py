@@ -81,20 +81,20 @@ def unmarked(name: str, text: str) -> Iterator[tuple[int, str]]:
         if "log of past measurements" not in " ".join(text.split())[:800]:
             yield 1, "is a log (figure_words.LOGS), but does not say so under its title"
         return
-    told = ""
+    noted = ""
     for pattern in (_FENCE, _TABLE, _CODE, _ADDRESS):
         text = pattern.sub(_blank, text)
     logged = False
     for number, line in enumerate(text.split("\n"), start=1):
         if alone := re.fullmatch(r"<!-- figures: (?P<kind>\w+).* -->", line.strip()):
-            told = alone["kind"]
-            logged |= told == "log"
-            if told not in KINDS:
-                yield number, f"no kind {told!r}; there are {', '.join(KINDS)}"
+            noted = alone["kind"]
+            logged |= noted == "log"
+            if noted not in KINDS:
+                yield number, f"no kind {noted!r}; there are {', '.join(KINDS)}"
             continue
         if line.startswith("#"):
-            told = ""
-        if told in ("", "marked"):
+            noted = ""
+        if noted in ("", "marked"):
             yield from (
                 (number, f"{figure!r} does not say where it comes from")
                 for figure in _figures(line, name in PARAMETER_PAGES)

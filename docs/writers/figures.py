@@ -98,7 +98,7 @@ def faults(path: Path, sources: Sources) -> list[str]:
     ]
     if not stale and text != wanted:
         stale = [f"{name}: a table has other rows than the results"]
-    return stale + [f"{name}:{number}: {told}" for number, told in unmarked(name, text)]
+    return stale + [f"{name}:{number}: {fault}" for number, fault in unmarked(name, text)]
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -122,9 +122,9 @@ def main(arguments: list[str] | None = None) -> int:
                 path.write_text(renewed(path.read_text(encoding="utf-8"), sources), encoding="utf-8")
             except SourceError as error:
                 print(f"{path.relative_to(ROOT)}: not renewed: {error}", file=sys.stderr)
-        for told in faults(path, sources):
+        for fault in faults(path, sources):
             wrong += 1
-            print(told, file=sys.stderr)
+            print(fault, file=sys.stderr)
     return 1 if wrong else 0
 
 

@@ -49,9 +49,9 @@ def control(
     share = min(1.0, *(top / t if t > 0 else bottom / t for t in thrust if t != 0))
     band = np.array([gains.integral_band_m_s] * 3 + [gains.integral_band_rad_s])
     bound = np.array([gains.max_integral_n] * 3 + [gains.max_integral_n_m])
-    starved = (share < 1) | (given != asked)
+    saturated = (share < 1) | (given != asked)
     part = np.where(
-        error * integral < 0, 1.0, np.where(starved, 0.0, np.maximum(0, 1 - np.abs(error) / band))
+        error * integral < 0, 1.0, np.where(saturated, 0.0, np.maximum(0, 1 - np.abs(error) / band))
     )
     new = np.clip(integral + ki * part * error * dt, -bound, bound)
     return share * thrust, np.where(vel_valid | (np.arange(4) == 3), new, integral)

@@ -173,11 +173,11 @@ def sonar_figures(log, gate_m):
     """Residuals of every return that lies within ``gate_m`` of the recast one; the others, and wrong hits and
     misses, count as edges."""
     true_range, true_doppler, moves = recast(log)
-    told, hit = log.column("/sonar/scan", "ranges"), log.column("/sonar/scan", "intensities") > 0
+    answer, hit = log.column("/sonar/scan", "ranges"), log.column("/sonar/scan", "intensities") > 0
     reach = log.config["sensors"]["sonar"]["max_range_m"]
     clear = np.abs(true_range - reach) > gate_m
     expected = true_range < reach
-    error = told - true_range
+    error = answer - true_range
     fits = np.where(expected, hit & (np.abs(error) <= gate_m), ~hit)
     used = fits & expected & clear
     slip = (log.column("/sonar/doppler", "velocity") - true_doppler)[used]
@@ -185,7 +185,7 @@ def sonar_figures(log, gate_m):
         "beams": int(clear.sum()),
         "returns": int(used.sum()),
         "fitting_share": float(fits[clear].mean()),
-        "no_return_is_max_range": bool(np.all(told[~hit] == reach)),
+        "no_return_is_max_range": bool(np.all(answer[~hit] == reach)),
         "range_mean_m": float(error[used].mean()),
         "range_sigma_m": float(error[used].std()),
         "range_within_2_mm": float(np.mean(np.abs(error[used]) <= 2e-3)),
@@ -438,24 +438,24 @@ def clearance_figures(log, mapper, redone):
     }
     worst, from_logged, other_sites, cells = 0.0, 0, 0, 0
     for _, data in log.messages["/map/clearance"]:
-        step, told = log.stamp_step(data), grid_values(data)
+        step, answer = log.stamp_step(data), grid_values(data)
         if step in maps:
             from_logged += 1
-            worst = max(worst, float(np.abs(told - mapper.clearance(*maps[step])).max()))
-        cells += told.size
-        other_sites += int(np.sum(np.abs(told - mapper.clearance(*redone[step])) > 1e-5))
+            worst = max(worst, float(np.abs(answer - mapper.clearance(*maps[step])).max()))
+        cells += answer.size
+        other_sites += int(np.sum(np.abs(answer - mapper.clearance(*redone[step])) > 1e-5))
     c = log.config["clearance"]
     risk = [
         grid_values(risk)
         - (
             c["risk_static"] * static
             + c["risk_dynamic"] * dynamic
-            + c["risk_clearance"] / (told + c["risk_epsilon_m"])
+            + c["risk_clearance"] / (answer + c["risk_epsilon_m"])
         )
         for (_, risk), (_, near), (static, dynamic) in zip(
             log.messages["/map/risk"], log.messages["/map/clearance"], maps.values(), strict=True
         )
-        for told in [grid_values(near)]
+        for answer in [grid_values(near)]
     ]
     return {
         "grids": len(log.messages["/map/clearance"]),
@@ -607,14 +607,14 @@ def outcome(log, clearance, ttc):
 
 def safety_figures(log):
     clearance, ttc, doubtful = threats(log)
-    told = [data for _, data in log.messages["/safety"]]
-    told_ttc = np.array([np.inf if data["ttc_s"] is None else data["ttc_s"] for data in told])
+    answer = [data for _, data in log.messages["/safety"]]
+    told_ttc = np.array([np.inf if data["ttc_s"] is None else data["ttc_s"] for data in answer])
     both = np.isfinite(told_ttc) & np.isfinite(ttc) & ~doubtful
     name, step = outcome(log, clearance, ttc)
     result = log.metadata["uuv.result"]
     return {
-        "steps": len(told),
-        "clearance_max_error_m": float(np.abs(clearance - [data["clearance_m"] for data in told]).max()),
+        "steps": len(answer),
+        "clearance_max_error_m": float(np.abs(clearance - [data["clearance_m"] for data in answer]).max()),
         "min_clearance_error_m": abs(float(clearance.min()) - float(result["min_clearance_m"])),
         "ttc_compared": int(both.sum()),
         "ttc_max_relative_error": float(np.max(np.abs(ttc / told_ttc - 1)[both], initial=0.0)),
@@ -622,7 +622,7 @@ def safety_figures(log):
         "ttc_doubtful": int(doubtful.sum()),
         "outcome": name,
         "outcome_told": result["outcome"],
-        "ends_at_the_last_step": step == len(told) - 1,
+        "ends_at_the_last_step": step == len(answer) - 1,
         "time_error_s": abs(step * log.dt - float(result["time_s"])),
     }
 
@@ -633,15 +633,15 @@ def obstacle_error(log):
     times = np.array(log.steps("/obstacles/truth")) * log.dt
     for i, body in enumerate(log.scenario["bodies"]):
         pos, vel = body_motion(body, times)
-        told = np.array(
+        answer = np.array(
             [
                 [data["obstacles"][i][key] for key in ("x", "y", "z", "vx", "vy", "vz")]
                 for _, data in log.messages["/obstacles/truth"]
             ]
         )
-        place = max(place, float(np.abs(told[:, :3] - pos).max()))
+        place = max(place, float(np.abs(answer[:, :3] - pos).max()))
         # at a corner of a path either direction is right
-        speed = max(speed, float(np.sort(np.abs(told[:, 3:] - vel).max(axis=1))[-2]))
+        speed = max(speed, float(np.sort(np.abs(answer[:, 3:] - vel).max(axis=1))[-2]))
     return {"position_m": place, "velocity_m_s": speed}
 
 

@@ -232,7 +232,7 @@ def _planned(step: int, pos: np.ndarray, ahead: np.ndarray) -> dict[str, Any]:
 def _driven(step: int) -> dict[str, Any]:
     """By a tree, which evades in the last 30 of every 100 steps."""
     follows = step % 100 < 70
-    thoughts = ("action", "value", "std", "distill_lambda", "residual", "uncertainty")
+    outputs = ("action", "value", "std", "distill_lambda", "residual", "uncertainty")
     return {
         "teacher.action": np.array([0.8, 0.0, 0.1, -0.2], np.float32),
         "teacher.status": np.array(
@@ -241,7 +241,7 @@ def _driven(step: int) -> dict[str, Any]:
         "teacher.leaf": np.int32(4 if follows else 3),
         "reward.term": np.array([0.01, 0.02, -0.001, 0.0], np.float32),
         "driver.applied": np.array([0.8, 0.0, 0.1, -0.2], np.float32),
-        **{f"driver.{name}": None for name in thoughts},
+        **{f"driver.{name}": None for name in outputs},
     }
 
 

@@ -43,7 +43,7 @@ def noisy(range_m, doppler, hit, rng, sonar):
     """The errors of a SonarConfig that matter to tracking: range, Doppler with outliers, missed and false
     returns."""
     sigma = sonar.range_sigma_m + sonar.range_sigma_slope * range_m
-    told = (
+    answer = (
         range_m
         + sigma * rng.standard_normal(range_m.shape)
         + rng.exponential(sonar.range_jitter_m, range_m.shape)
@@ -55,9 +55,13 @@ def noisy(range_m, doppler, hit, rng, sonar):
     )
     seen = hit * (rng.uniform(size=range_m.shape) >= sonar.missed_return)
     false = rng.uniform(size=range_m.shape) < sonar.false_return
-    told = np.where(false, rng.uniform(0, MAX_RANGE_M, range_m.shape), told)
-    seen = np.where(false, 1, seen) * (told < MAX_RANGE_M)
-    return np.where(seen, np.maximum(told, 0), MAX_RANGE_M), np.where(seen, rate, 0.0), seen.astype(np.int32)
+    answer = np.where(false, rng.uniform(0, MAX_RANGE_M, range_m.shape), answer)
+    seen = np.where(false, 1, seen) * (answer < MAX_RANGE_M)
+    return (
+        np.where(seen, np.maximum(answer, 0), MAX_RANGE_M),
+        np.where(seen, rate, 0.0),
+        seen.astype(np.int32),
+    )
 
 
 def _circle(pos, u, centre, radius):

@@ -104,8 +104,8 @@ def _tank(config: LearningConfig) -> str:
 def _obstacles(config: LearningConfig) -> str:
     world = config.world
     scenes = config.train.scenes or ((world.n_static, world.n_dynamic, world.dynamic_speed_m_s),)
-    told = "; ".join(f"S = {s}, D = {d}, v = {v:g} m/s" for s, d, v in scenes)
-    return f"Resting obstacles S, moving ones D, their speed v: {told}."
+    conditions = "; ".join(f"S = {s}, D = {d}, v = {v:g} m/s" for s, d, v in scenes)
+    return f"Resting obstacles S, moving ones D, their speed v: {conditions}."
 
 
 def _results(checkpoint: Checkpoint, evaluations: list[Evaluation]) -> str:

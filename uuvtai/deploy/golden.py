@@ -35,10 +35,10 @@ def golden_of(pilot: Pilot) -> Arrays:
     obs = _mission(pilot)
     begins = torch.zeros(len(obs), dtype=torch.bool)
     begins[[0, len(obs) // 2 + 1]] = True
-    told, pairs = _flown(pilot, obs, begins)
+    decisions, pairs = _flown(pilot, obs, begins)
     found = (
         {"obs": obs, "begins": begins}
-        | _stacked(told)
+        | _stacked(decisions)
         | {f"pair_{name}": tensor for name, tensor in _stacked(pairs).items()}
     )
     return {name: tensor.numpy() for name, tensor in found.items()}
@@ -81,23 +81,23 @@ def _mission(pilot: Pilot) -> Tensor:
 
 def _flown(pilot: Pilot, obs: Tensor, begins: Tensor) -> tuple[list[Row], list[Row]]:
     """What the pilot says at every step, and inputs and outputs of every decision."""
-    told, pairs, age = [], [], 0
+    decisions, pairs, age = [], [], 0
     nothing = torch.zeros(obs.shape[1]), torch.zeros(NUM_ACTIONS)
     last = nothing
     for row, is_first in zip(obs, begins.tolist(), strict=True):
         if is_first:
             pilot.reset(torch.ones(1))
             age, last = 0, nothing
-        told.append(_said(pilot, row))
+        decisions.append(_outputs_of(pilot, row))
         if age % pilot.policy.config.hold_steps == 0:
             inputs = dict(zip(INPUTS, (row, *last, torch.tensor(age > 0)), strict=True))
-            pairs.append(inputs | _pair_outputs(pilot, told[-1]))
+            pairs.append(inputs | _pair_outputs(pilot, decisions[-1]))
             last = row, pilot.mean_action[0].clone()
         age += 1
-    return told, pairs
+    return decisions, pairs
 
 
-def _said(pilot: Pilot, obs: Tensor) -> Row:
+def _outputs_of(pilot: Pilot, obs: Tensor) -> Row:
     """One control step: outputs under their golden names."""
     said = pilot.decide(obs[None])
     pilot.advance()

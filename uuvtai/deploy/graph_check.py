@@ -149,11 +149,11 @@ def _shapes(model: Any, inputs: dict[str, tuple[int, ...]]) -> dict[str, tuple[i
             for size in inputs[value.name]:
                 shape.dim.add().dim_value = size
     try:
-        told = shape_inference.infer_shapes(bare, check_type=True, strict_mode=True, data_prop=True).graph
+        inferred = shape_inference.infer_shapes(bare, check_type=True, strict_mode=True, data_prop=True).graph
     except Exception as error:  # onnx's own, or protobuf's
         raise GraphError(f"does not fit together ({str(error).strip().splitlines()[-1][:200]})") from None
     found = {tensor.name: tuple(tensor.dims) for tensor in graph.initializer} | dict(inputs)
-    for value in (*told.value_info, *told.output):
+    for value in (*inferred.value_info, *inferred.output):
         shape = value.type.tensor_type.shape
         if value.type.tensor_type.HasField("shape") and all(size.HasField("dim_value") for size in shape.dim):
             found[value.name] = tuple(size.dim_value for size in shape.dim)

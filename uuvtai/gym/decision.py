@@ -40,7 +40,7 @@ def carry_out(env: VectorEnv, action: torch.Tensor, hold_steps: int) -> Transiti
     return Transition(obs, total, terminated.clone(), truncated.clone(), info)
 
 
-def told(info: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+def public_info(info: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """What an env of this package tells in its info, each (n_env, ...), in the simulator's memory.
 
     The number of the episode is not called "episode", which wrappers of Gymnasium and trainers keep for their

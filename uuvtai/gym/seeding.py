@@ -33,8 +33,8 @@ def _integer(seed: Any) -> int:
     try:
         return operator.index(seed)
     except TypeError:
-        told = (
+        message = (
             f"seed must be an int or None, got a {type(seed).__name__}; one seed serves all envs: env i "
             "begins at its episode i"
         )
-        raise TypeError(told) from None
+        raise TypeError(message) from None

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from uuvtai.env import VectorEnv
-from uuvtai.gym.decision import carry_out, checked_hold_steps, told
+from uuvtai.gym.decision import carry_out, checked_hold_steps, public_info
 from uuvtai.gym.frame import draw_frame
 from uuvtai.gym.seeding import episode_seed
 from uuvtai.gym.simulator import simulator
@@ -100,7 +100,7 @@ class UuvEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def _info(self, info: dict[str, torch.Tensor]) -> dict[str, Any]:
         out = {
             name: value[0].item() if value.ndim == 1 else self._row(value)
-            for name, value in told(info).items()
+            for name, value in public_info(info).items()
         }
         return out | {"outcome": self.native.outcomes[int(out["outcome"])]}
 

@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from uuvtai.env import VectorEnv
-from uuvtai.gym.decision import carry_out, checked_hold_steps, told
+from uuvtai.gym.decision import carry_out, checked_hold_steps, public_info
 from uuvtai.gym.seeding import episode_seed
 from uuvtai.gym.simulator import simulator
 from uuvtai.gym.spaces import action_space, observation_space
@@ -83,7 +83,7 @@ class UuvVectorEnv(gymnasium.vector.VectorEnv):
         rows = self._rows(options)
         obs, info = self.native.reset(episode_seed(self, seed), rows)
         self._ended = self._ended & ~rows
-        return self._given(obs), self._info(told(info), rows)
+        return self._given(obs), self._info(public_info(info), rows)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Hold ``actions`` (num_envs, 4), NumPy or torch, for ``hold_steps``: (obs, reward, terminated,
@@ -109,7 +109,7 @@ class UuvVectorEnv(gymnasium.vector.VectorEnv):
         self._ended = (terminated | truncated) & (self.autoreset_mode is not AutoresetMode.SAME_STEP)
         everyone = torch.ones_like(ended)
         results = (self._given(value) for value in (obs, reward, terminated, truncated))
-        return *results, self._info(told(info), everyone) | final  # type: ignore[return-value]
+        return *results, self._info(public_info(info), everyone) | final  # type: ignore[return-value]
 
     def close_extras(self, **_kwargs: Any) -> None:
         """Let go of the simulator."""
@@ -124,7 +124,7 @@ class UuvVectorEnv(gymnasium.vector.VectorEnv):
             for row in np.flatnonzero(self._given(ended)):
                 last[row] = rows[row].copy()
         mask = {"_final_obs": self._given(ended), "_final_info": self._given(ended)}
-        return {"final_obs": last, "final_info": self._info(told(info), ended), **mask}
+        return {"final_obs": last, "final_info": self._info(public_info(info), ended), **mask}
 
     def _info(self, values: dict[str, torch.Tensor], rows: torch.Tensor) -> dict[str, Any]:
         """Every value with the mask of the rows that have it."""

@@ -11,10 +11,10 @@ import torch
 
 from uuvtai.learn.distill import LeafErrors, imitation_error
 from uuvtai.learn.guard import Guard
-from uuvtai.learn.hold import Hold, Info, Stretch
+from uuvtai.learn.hold import HeldResult, Hold, Info
 from uuvtai.learn.policy import NUM_ACTIONS, ActorCritic
 from uuvtai.learn.rollout import Rollout, final_value
-from uuvtai.learn.tally import Tally
+from uuvtai.learn.rollout_sums import RolloutSums
 from uuvtai.outcomes import FORESEEABLE
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ class Collector:
             self._move_on(end.ended)
 
     @torch.no_grad()
-    def recall_features(self) -> None:
+    def fill_model_features(self) -> None:
         """Fill in the world-model columns of what ``look_around`` saw, by what the model has learned from
         it."""
         if self.world_model is None or not self.as_features:
@@ -102,17 +102,17 @@ class Collector:
             x[t, :, n:] = torch.where(self.rollout.ended[t - 1, :, None], 0.0, found)
 
     @torch.no_grad()
-    def collect(self) -> Tally:
+    def collect(self) -> RolloutSums:
         """Fill the rollout, all but the samples' weights."""
         began, self.simulate_s = time.perf_counter(), 0.0
         env, rollout = self.env, self.rollout
-        tally = Tally.zeros(len(env.outcomes), len(env.reward_terms), env.device)
+        sums = RolloutSums.zeros(len(env.outcomes), len(env.reward_terms), env.device)
         rollout.clear()
         for t in range(rollout.steps):
             step = self.policy.act(self.x, self.generator)
             self._note_teacher()
             self.leaf_errors.add(imitation_error(step.mean, self._teacher), self._leaf)
-            end = self._drive(step.action, tally)
+            end = self._drive(step.action, sums)
             self.uncertainty[t].copy_(self._features[:, -1])
             last_value = final_value(self.policy, self.final_x, end.terminated, end.ended)
             rollout.add(
@@ -122,18 +122,18 @@ class Collector:
             self._move_on(end.ended)
         rollout.close(self.policy.value(self.x))
         self.infer_s = time.perf_counter() - began - self.simulate_s
-        return tally
+        return sums
 
     def _note_teacher(self) -> None:
         """Copy what the tree would do now: the next step overwrites it."""
         self._bad |= self.guard.values("teacher_action", self.info["teacher_action"], self._teacher)
         self._leaf.copy_(self.info["leaf"])
 
-    def _drive(self, action: torch.Tensor, tally: Tally | None = None) -> Stretch:
+    def _drive(self, action: torch.Tensor, sums: RolloutSums | None = None) -> HeldResult:
         """Hold a decision; fills the reward, NaN for samples with anything bad, and the input it led to."""
         began = time.perf_counter()
         end = self.hold.drive(
-            action, self._teacher, None if tally is None else lambda ended, info: _count(tally, ended, info)
+            action, self._teacher, None if sums is None else lambda ended, info: _count(sums, ended, info)
         )
         self._obs, self.info = end.obs, end.info
         self.simulate_s += time.perf_counter() - began
@@ -179,11 +179,11 @@ class Collector:
         self._obs, self.info = obs, info
 
 
-def _count(tally: Tally, ended: torch.Tensor, info: Info) -> None:
-    """Add one control step of all envs to the tally."""
+def _count(sums: RolloutSums, ended: torch.Tensor, info: Info) -> None:
+    """Add one control step of all envs to the sums."""
     weight = ended.double()
-    tally.outcomes.index_add_(0, info["outcome"].long(), weight)
-    tally.episode_return += torch.where(ended, info["episode_return"], 0.0).nansum()
-    tally.episode_steps += (info["episode_steps"] * ended).sum()
-    tally.terms += info["reward_terms"].nansum(dim=0)
-    tally.samples += len(ended)
+    sums.outcomes.index_add_(0, info["outcome"].long(), weight)
+    sums.episode_return += torch.where(ended, info["episode_return"], 0.0).nansum()
+    sums.episode_steps += (info["episode_steps"] * ended).sum()
+    sums.terms += info["reward_terms"].nansum(dim=0)
+    sums.samples += len(ended)

@@ -60,9 +60,9 @@ class Processes:
 
     def any(self, flag: bool) -> bool:
         """Whether the flag is set in any process."""
-        told = torch.tensor([float(flag)], device=self.device)
-        self.total([told])
-        return bool(told > 0)
+        raised = torch.tensor([float(flag)], device=self.device)
+        self.total([raised])
+        return bool(raised > 0)
 
     def mean_metrics(self, metrics: dict[str, float]) -> dict[str, float]:
         """Mean of every metric over the processes that have it; keys may differ between them."""

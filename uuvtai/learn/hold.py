@@ -18,7 +18,7 @@ Watch = Callable[[torch.Tensor, Info], None]
 """called after every control step with the rows (N,) whose episode ended in it, and its info"""
 
 
-class Stretch(NamedTuple):
+class HeldResult(NamedTuple):
     """What came of a decision, all (N, ...); rows whose episode ended on the way tell of that episode,
     ``obs`` and ``info`` of the next."""
 
@@ -46,7 +46,7 @@ class Hold:
         """What is held is the policy's action, or its difference from the tree's for a residual policy."""
         self._env, self.steps, self._residual = env, policy.config.hold_steps, policy.config.residual
 
-    def drive(self, action: torch.Tensor, teacher: torch.Tensor, watch: Watch | None = None) -> Stretch:
+    def drive(self, action: torch.Tensor, teacher: torch.Tensor, watch: Watch | None = None) -> HeldResult:
         """Carry out ``action`` (N, 4), decided where the tree would have done ``teacher`` (N, 4)."""
         end = self._step(action)
         if watch:
@@ -66,17 +66,17 @@ class Hold:
             end = _joined(end, step)
         return end
 
-    def _step(self, action: torch.Tensor) -> Stretch:
+    def _step(self, action: torch.Tensor) -> HeldResult:
         obs, reward, terminated, truncated, info = self._env.step(action)
-        return Stretch(
+        return HeldResult(
             obs, info["final_obs"], reward, terminated, terminated | truncated, info["outcome"].long(), info
         )
 
 
-def _joined(first: Stretch, then: Stretch) -> Stretch:
+def _joined(first: HeldResult, then: HeldResult) -> HeldResult:
     """One stretch after the other; rows that ended in the first keep what it told."""
     on = ~first.ended
-    return Stretch(
+    return HeldResult(
         obs=then.obs,
         final_obs=torch.where(on[:, None], then.final_obs, first.final_obs),
         reward=torch.where(on, first.reward + then.reward, first.reward),

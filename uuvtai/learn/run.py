@@ -121,7 +121,7 @@ def _train(
     run = _Run(trainer, config, place, watch, evaluate, total)
     status, code = "failed", 1
     try:
-        with signals.Noted() as pressed:
+        with signals.StopEvent() as pressed:
             is_complete = run.go(pressed)
         status, code = ("finished", 0) if is_complete else ("interrupted", signals.exit_code())
     except KeyboardInterrupt:

@@ -20,8 +20,8 @@ from uuvtai.learn.policy import ActorCritic
 from uuvtai.learn.ppo import Ppo
 from uuvtai.learn.risk import RiskHead, RiskLearner
 from uuvtai.learn.rollout import Rollout
+from uuvtai.learn.rollout_sums import Recent
 from uuvtai.learn.schedule import piecewise_linear
-from uuvtai.learn.tally import Recent
 from uuvtai.learn.uncertainty import Uncertainty
 from uuvtai.learn.world_model import WorldModel, WorldModelLearner
 
@@ -85,16 +85,16 @@ class Trainer:
         """
         if self.iteration == 0:
             self._look_around()
-        tally = self.collector.collect()
+        sums = self.collector.collect()
         began = time.perf_counter()
         metrics = self._learn(self.iteration / self.config.train.iterations)
         learn_s = time.perf_counter() - began
         self.iteration += 1
         self.env_steps += self._samples
-        self.processes.total(tally.tensors())
+        self.processes.total(sums.tensors())
         metrics = self.processes.mean_metrics(
             metrics | self.guard.take() | self._times(learn_s)
-        ) | self.recent.add(tally)
+        ) | self.recent.add(sums)
         self._judge(metrics)
         return metrics | {"time/env_steps": float(self.env_steps)}
 
@@ -163,7 +163,7 @@ class Trainer:
         first rollout in vain."""
         self.collector.look_around()
         self._learn_world()
-        self.collector.recall_features()
+        self.collector.fill_model_features()
         self.ppo.observe(self.rollout.x)
         self.env_steps += self._samples
 

@@ -191,33 +191,6 @@ def mean_of(values: Iterable[Tensor]) -> float:
     return float(torch.stack([value.detach() for value in values]).mean())
 
 
-class Recollection:
-    """Last observation and action of every env, for the features of the next step; ``reset`` forgets envs
-    that begin an episode."""
-
-    def __init__(self, world_model: WorldModel, num_envs: int, device: torch.device | str = "cpu") -> None:
-        self.model = world_model
-        self.obs = torch.zeros(num_envs, world_model.n_obs, device=device)
-        self.action = torch.zeros(num_envs, N_ACTION, device=device)
-        self.known = torch.zeros(num_envs, dtype=torch.bool, device=device)
-        """(num_envs,) there is a last step"""
-
-    def reset(self, mask: Tensor) -> None:
-        """Forget the envs where ``mask`` (num_envs,) is true: their next features are 0."""
-        self.known &= ~mask
-
-    def features(self, obs: Tensor) -> Tensor:
-        """``WorldModel.features`` (num_envs, 2) at the present observations; 0 where an episode has just
-        begun."""
-        return torch.where(self.known[:, None], self.model.features(self.obs, self.action, obs), 0.0)
-
-    def remember(self, obs: Tensor, action: Tensor) -> None:
-        """Keep copies of what the next features are about."""
-        self.obs.copy_(obs)
-        self.action.copy_(action)
-        self.known.fill_(True)
-
-
 class WorldModelLearner:
     """Adam on batches drawn from rollouts, with a guard against NaN."""
 

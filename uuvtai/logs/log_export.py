@@ -73,7 +73,7 @@ def export(path: Path, out_dir: Path, topics: Collection[str] | None = None, fmt
         raise LogError(f"{path}: no messages on {', '.join(missing)}; it has {', '.join(known)}")
     wanted = list(dict.fromkeys(topics or known))
     staging = out_dir.with_name(f".{out_dir.name}.{os.getpid()}.partial")
-    with _told(path, out_dir), _removed(staging):
+    with _as_log_error(path, out_dir), _removed(staging):
         out_dir.parent.mkdir(parents=True, exist_ok=True)
         staging.mkdir()
         names = _Names(staging)
@@ -95,7 +95,7 @@ def _refuse_place(out: Path) -> None:
 
 
 @contextlib.contextmanager
-def _told(path: Path, out: Path) -> Iterator[None]:
+def _as_log_error(path: Path, out: Path) -> Iterator[None]:
     """What a log unlike its schemas, or the disk, raises, as LogError."""
     try:
         yield

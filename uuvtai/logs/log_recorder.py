@@ -53,7 +53,7 @@ class PolicyNote:
     distill_lambda: float | None
     """weight of the distillation when the checkpoint was written"""
 
-    def thoughts(self, row: int) -> dict[str, Any]:
+    def outputs(self, row: int) -> dict[str, Any]:
         """What the policy chooses and expects in this row."""
         decision, foresees = self.pilot.decision, self.pilot.world_model is not None
         return {
@@ -131,7 +131,7 @@ class EpisodeRecorder:
         values = {
             row: {
                 "driver.applied": self._applied[row],
-                **(self._policy.thoughts(row) if self._policy else NO_POLICY),
+                **(self._policy.outputs(row) if self._policy else NO_POLICY),
             }
             for row in rows
         }

@@ -245,8 +245,8 @@ def _legend_row(canvas: Canvas, y: float, recording: Recording, color: Color) ->
     canvas.filled(np.array([(_LEFT, y - 8), (_LEFT + 34, y - 8), (_LEFT + 34, y - 3), (_LEFT, y - 3)]), color)
     width = canvas.text((_LEFT + 46, y), recording.method, 19, INK, bold=True)
     closest = "" if recording.min_clearance_m is None else f", closest {recording.min_clearance_m:.2f} m"
-    told = f"{recording.ending} after {recording.duration_s:.1f} s{closest}"
-    canvas.text((_LEFT + 46 + max(width, 90) + 14, y), told, 18, GREY)
+    summary = f"{recording.ending} after {recording.duration_s:.1f} s{closest}"
+    canvas.text((_LEFT + 46 + max(width, 90) + 14, y), summary, 18, GREY)
 
 
 def _legend_symbols(canvas: Canvas, base: float, trace: bool) -> None:

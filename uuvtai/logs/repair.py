@@ -67,37 +67,37 @@ def _copied(path: Path, scanner: Scanner, out: Path) -> Repair:
                 refuse_converted(path, record)
             copy.add(record)
         if not copy.messages:
-            reason = damages.told[0] if damages.told else "it holds no messages"
+            reason = damages.listed[0] if damages.listed else "it holds no messages"
             raise LogError(
                 f"{path}: nothing can be recovered: {reason}; record the episode again with uuv eval --record"
             )
-        told = damages.document()
-        if told:
+        listed = damages.document()
+        if listed:
             copy.file.add_metadata(
-                "uuv.repair", {"messages": str(copy.messages), "damages": json.dumps(told)}
+                "uuv.repair", {"messages": str(copy.messages), "damages": json.dumps(listed)}
             )
         copy.file.finish()
     except BaseException:
         copy.file.discard()
         raise
-    return Repair(out, copy.messages, copy.last_ns / 1e9, not told, tuple(told))
+    return Repair(out, copy.messages, copy.last_ns / 1e9, not listed, tuple(listed))
 
 
 class _Damages:
     """What was wrong, the first in words and the others counted."""
 
     def __init__(self) -> None:
-        self.told: list[str] = []
+        self.listed: list[str] = []
         self._more = 0
 
     def add(self, text: str) -> None:
-        if len(self.told) < MAX_DAMAGES:
-            self.told.append(text)
+        if len(self.listed) < MAX_DAMAGES:
+            self.listed.append(text)
         else:
             self._more += 1
 
     def document(self) -> list[str]:
-        return self.told + ([f"and {self._more} more"] if self._more else [])
+        return self.listed + ([f"and {self._more} more"] if self._more else [])
 
 
 def _recovered(scanner: Scanner, damages: _Damages) -> Iterator[Any]:
@@ -111,7 +111,7 @@ def _recovered(scanner: Scanner, damages: _Damages) -> Iterator[Any]:
             damages.add(f"{damage.reason} (byte {scanner.at})")
             yield from damage.records
             going = damage.can_go_on or scanner.resume()
-    if not scanner.finished and not damages.told:
+    if not scanner.finished and not damages.listed:
         damages.add(f"no end mark (byte {scanner.at})")
 
 

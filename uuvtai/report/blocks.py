@@ -16,7 +16,7 @@ Hover = dict[str, str]
 
 
 @dataclass(frozen=True)
-class Prose:
+class Paragraph:
     """A paragraph of plain text."""
 
     text: str
@@ -106,7 +106,7 @@ class Gallery:
     note: str = ""
 
 
-Block = Prose | Heading | Notice | Table | Facts | Code | Verdicts | Figure | Gallery
+Block = Paragraph | Heading | Notice | Table | Facts | Code | Verdicts | Figure | Gallery
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from functools import lru_cache
 from typing import Any
 
 from uuvtai.loader import parsed_yaml
-from uuvtai.report.blocks import Block, Figure, Prose
+from uuvtai.report.blocks import Block, Figure, Paragraph
 from uuvtai.report.colours import method_colours
 from uuvtai.report.figures import Line, curves
 from uuvtai.statistics import wilson_interval
@@ -61,7 +61,7 @@ def training(runs: Sequence[Training], command: str = "") -> list[Block]:
             panels.append(curves(lines, title, "million env-steps", share))
             rows += [[line.name, key, *point] for line in lines for point in _points(line)]
     if not panels:
-        return [Prose("No iteration was recorded.")]
+        return [Paragraph("No iteration was recorded.")]
     data = Data(["method", "metric", "million_env_steps", "mean", "lowest", "highest"], rows)
     seeds = (
         "the line is the mean over seeds, the band reaches from the lowest to the highest seed; "

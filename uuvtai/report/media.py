@@ -36,7 +36,7 @@ class _Shown:
     remark: str
 
     @property
-    def badness(self) -> tuple[bool, bool, float]:
+    def severity(self) -> tuple[bool, bool, float]:
         """Sorts the worst first: failures, then what came closest; what is not known comes last."""
         failed = any(detail["outcome"] != _SUCCESS for _, detail in self.details)
         closest = [
@@ -118,7 +118,7 @@ def _trimmed(gallery: Gallery, budget: int) -> Gallery:
 
 
 def _worst_first(paths: Iterable[Path], methods: list[dict[str, Any]]) -> list[_Shown]:
-    return sorted((_shown(path, methods) for path in paths), key=lambda one: one.badness)
+    return sorted((_shown(path, methods) for path in paths), key=lambda one: one.severity)
 
 
 def _once(shown: list[_Shown]) -> list[_Shown]:

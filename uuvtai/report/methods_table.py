@@ -6,7 +6,7 @@ from __future__ import annotations
 from typing import Any
 
 from uuvtai.outcomes import ENDINGS
-from uuvtai.report.blocks import Block, Figure, Heading, Prose
+from uuvtai.report.blocks import Block, Figure, Heading, Paragraph
 from uuvtai.report.colours import method_colours
 from uuvtai.report.figures import Line, intervals, rates_text, reliability
 from uuvtai.tables.method_tables import causes_table, methods_table, paired_table
@@ -20,7 +20,7 @@ def evaluation(result: dict[str, Any], command: str = "") -> list[Block]:
     """Everything that an evaluation has to show but its pictures."""
     methods = result["methods"]
     table = methods_table(methods, _METHODS, data=_methods_data(methods), swatches=_swatches(methods))
-    blocks: list[Block] = [Prose(conditions(result)), table]
+    blocks: list[Block] = [Paragraph(conditions(result)), table]
     if methods:
         blocks.append(_rates_figure(methods, command))
     blocks += _paired(result.get("paired", []))
@@ -207,6 +207,6 @@ def _risk(method: Method, command: str) -> list[Block]:
     panel = reliability(bins, method["name"])
     return [
         Heading(f"Risk: {method['name']}"),
-        Prose(said),
+        Paragraph(said),
         Figure(f"reliability_{method['name']}", [panel], caption, data, command),
     ]

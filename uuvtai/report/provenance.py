@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from uuvtai.files import read_bytes
-from uuvtai.report.blocks import Block, Code, Facts, Notice, Prose
+from uuvtai.report.blocks import Block, Code, Facts, Notice, Paragraph
 from uuvtai.report.run_files import read_config, read_json
 from uuvtai.tables.table import Table, heads
 from uuvtai.tables.wording import number
@@ -99,7 +99,7 @@ def origins(methods: list[dict[str, Any]], trainings: list[Path]) -> list[Block]
                 f"{method['name']} (checkpoint {digest[:16]}) is none of the checkpoints that these "
                 "trainings keep."
             )
-    return [Prose(" ".join(sentences))] if sentences else []
+    return [Paragraph(" ".join(sentences))] if sentences else []
 
 
 def _sha256(path: Path, run: Path) -> str:

@@ -28,7 +28,7 @@ from uuvtai.report.blocks import (
     Heading,
     Notice,
     PageSection,
-    Prose,
+    Paragraph,
     Verdict,
     Verdicts,
 )
@@ -134,7 +134,7 @@ def _trade_off(described: Described) -> Figure:
 
 
 _SIMPLE: dict[str, Callable[[Described], Block]] = {
-    "prose": lambda described: Prose(str(described["text"])),
+    "prose": lambda described: Paragraph(str(described["text"])),
     "heading": lambda described: Heading(str(described["text"])),
     "notice": lambda described: Notice(str(described["text"])),
     "table": _table,

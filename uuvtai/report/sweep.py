@@ -6,7 +6,7 @@ from __future__ import annotations
 from typing import Any
 
 from uuvtai.outcomes import ENDINGS
-from uuvtai.report.blocks import Block, Figure, Notice, Prose
+from uuvtai.report.blocks import Block, Figure, Notice, Paragraph
 from uuvtai.report.colours import method_colours
 from uuvtai.report.figures import Line, heat_map, hover_text, intervals
 from uuvtai.tables.cell_table import axes_of_cells, cell_table, method_of
@@ -30,12 +30,12 @@ def sweep(document: dict[str, Any], command: str = "") -> list[Block]:
     said = f"World {document.get('world', '-')}, {spans}: {len(cells)} cells, {episodes:,} episodes in all."
     if varies_alone(document):
         return [
-            Prose(f"{said} One axis at a time, all else unchanged."),
+            Paragraph(f"{said} One axis at a time, all else unchanged."),
             *_each_axis(document, command),
             _cells(cells, document, "Every cell"),
         ]
     drawn = _curves(document, command) if len(varying(axes)) < 2 else _maps(document, command)
-    return [Prose(said), *drawn]
+    return [Paragraph(said), *drawn]
 
 
 def _each_axis(document: dict[str, Any], command: str) -> list[Block]:

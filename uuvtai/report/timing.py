@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from uuvtai.report.blocks import Block, Figure, Panel, Prose
+from uuvtai.report.blocks import Block, Figure, Panel, Paragraph
 from uuvtai.report.figures import Line, curves, stages
 from uuvtai.tables.table import Column, Data, Table
 from uuvtai.tables.timing_tables import ENVS, SPEEDS, density_data, density_table, latency_table
@@ -19,7 +19,7 @@ def timing(document: dict[str, Any], command: str = "") -> list[Block]:
         f"Measured on {machine.get('cpu', 'an unnamed processor')}, {machine.get('cores', '-')} cores, "
         f"{machine.get('device', 'cpu')}."
     )
-    blocks: list[Block] = [Prose(said)]
+    blocks: list[Block] = [Paragraph(said)]
     if rows:
         table = Table(_RATES, rows, "Env-steps per second, resets included")
         blocks += [table, _stages_figure(rows, command)]

@@ -114,8 +114,8 @@ def bits_lanes(key, first_index):
     for i in ti.static(range(LANES)):
         counter[i] = ti.cast(first_index + i, ti.u32) + ti.u32(_GOLDEN)
     inner = mixed_lanes(counter)
-    salted = inner ^ key
-    return mixed_lanes(salted)
+    keyed = inner ^ key
+    return mixed_lanes(keyed)
 
 
 @ti.func

@@ -23,7 +23,7 @@ def associate(env, dt, io: Bundle[TrackingIO]):
         io.tracks.pick_cost[env, track] = -FAR_M
         asking = ti.select(io.tracks.alive[env, track] == 1, track, -1)
         while asking >= 0:
-            ask_next(env, asking, dt, io)
+            propose_next(env, asking, dt, io)
             wanted = io.tracks.pick[env, asking]
             if wanted < 0:
                 asking = -1
@@ -35,7 +35,7 @@ def associate(env, dt, io: Bundle[TrackingIO]):
 
 
 @ti.func
-def ask_next(env, track, dt, io: Bundle[TrackingIO]):
+def propose_next(env, track, dt, io: Bundle[TrackingIO]):
     """Set ``pick`` to the cheapest cluster that costs more than the last one asked for, -1 = none."""
     best, best_cost = -1, FAR_M
     for c in range(io.clusters.count[env]):

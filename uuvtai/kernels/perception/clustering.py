@@ -153,8 +153,8 @@ def velocity_slip(normal, valid, io: Bundle[TrackingIO]):
     xx, xy, yy = normal[0] + prior, normal[1], normal[2] + prior
     det = xx * yy - xy * xy
     slip_w = ti.Vector([yy * normal[3] - xy * normal[4], xx * normal[4] - xy * normal[3]]) / det
-    weakest = 0.5 * (xx + yy) - ti.sqrt(0.25 * (xx - yy) * (xx - yy) + xy * xy)
-    return slip_w, ti.select(valid == 1, 0.0, sigma / ti.sqrt(ti.max(weakest, prior)))
+    smallest_eigenvalue = 0.5 * (xx + yy) - ti.sqrt(0.25 * (xx - yy) * (xx - yy) + xy * xy)
+    return slip_w, ti.select(valid == 1, 0.0, sigma / ti.sqrt(ti.max(smallest_eigenvalue, prior)))
 
 
 # ------------------------------------------------------------------------------------------------------- runs

@@ -77,7 +77,7 @@ def _held_triggers(env, io: Bundle[TriggersIO]):
                     io.route_cfg.stuck_s - 0.5 * io.episode_cfg.control_dt_s
                 )
             elif ti.static(trigger == TRIGGER_SAFETY):
-                holds = _feels_near(env, io)
+                holds = _is_return_near(env, io)
             elif ti.static(trigger == TRIGGER_INTERSECTION):
                 holds = io.route.n_way[env] > 0 and (
                     _path_is_closed(env, io) or _path_meets_forecast(env, io)
@@ -87,7 +87,7 @@ def _held_triggers(env, io: Bundle[TriggersIO]):
 
 
 @ti.func
-def _feels_near(env, io: Bundle[TriggersIO]):
+def _is_return_near(env, io: Bundle[TriggersIO]):
     """True where a return is near or will soon be reached."""
     near = 0
     for packet in range(ti.static(io.scan.range_m.shape[1] // LANES)):

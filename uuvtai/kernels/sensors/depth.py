@@ -35,7 +35,7 @@ _MARGIN = 0.01
 _POKED_M = 1.0e-6
 """A camera nearer to a wall than this pokes through it."""
 
-Eye = ti.types.struct(pos=ti.math.vec3, R_wb=ti.math.mat3)
+CameraPose = ti.types.struct(pos=ti.math.vec3, R_wb=ti.math.mat3)
 """Truth of the camera as float32: world position [m], body to world."""
 
 
@@ -94,7 +94,7 @@ def fill_block(env, first_row, io: Bundle[DepthIO]):
     offset_b = ti.Vector(
         [io.depth_cfg.offset_b_m[0], io.depth_cfg.offset_b_m[1], io.depth_cfg.offset_b_m[2]], ti.f32
     )
-    eye = Eye(pos=io.vehicle.pos_w[env].cast(ti.f32) + R_wb @ offset_b, R_wb=R_wb)
+    eye = CameraPose(pos=io.vehicle.pos_w[env].cast(ti.f32) + R_wb @ offset_b, R_wb=R_wb)
     last_row = ti.min(first_row + ti.static(rows_per_item()), io.depth_cfg.rows)
     for row in range(first_row, last_row):
         for packet in range(ti.static(io.depth_cfg.cols // LANES)):
@@ -287,5 +287,5 @@ def paint_noisy(env, row, first_col, error, io: Bundle[DepthIO]):
     for i in ti.static(range(LANES)):
         true_m = io.image.depth_m[env, row, first_col + i]
         noisy = true_m + (io.depth_cfg.sigma_m + io.depth_cfg.sigma_slope * true_m) * error[i]
-        told = ti.min(ti.max(noisy, 0.0), io.depth_cfg.max_range_m)
-        io.image.depth_m[env, row, first_col + i] = ti.select(true_m < io.depth_cfg.max_range_m, told, true_m)
+        kept = ti.min(ti.max(noisy, 0.0), io.depth_cfg.max_range_m)
+        io.image.depth_m[env, row, first_col + i] = ti.select(true_m < io.depth_cfg.max_range_m, kept, true_m)

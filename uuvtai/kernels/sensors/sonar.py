@@ -196,8 +196,8 @@ def measured(env, packet, step, io: Bundle[SonarIO]):
     clouded, still, bright = cloud_covered(env, clear, away, cosine, mount.heading, ray, step, io)
     heard = missed(clouded, key, step, ray, io)
     noisy = range_noisy(heard, key, step, ray, io)
-    told, speed, lit = falsely_returned(noisy, still, bright, key, step, ray, io)
-    final = cut_off(told, io)
+    measured, speed, lit = falsely_returned(noisy, still, bright, key, step, ray, io)
+    final = cut_off(measured, io)
     doppler = doppler_noisy(speed - own, key, step, ray, io)
     intensity = ti.max(lit, _DIMMEST) * (
         1.0 - _FALLOFF / io.sonar_cfg.max_range_m * ti.min(final, io.sonar_cfg.max_range_m)

@@ -169,13 +169,13 @@ def falsely_returned(range_m, away, bright, key, step, ray, io: Bundle[SonarIO])
 @ti.func
 def cut_off(range_m, io: Bundle[SonarIO]):
     """Range rounded to the quantum and not negative; FAR_M beyond the maximum range."""
-    told = ti.max(range_m, 0.0)
+    clipped = ti.max(range_m, 0.0)
     if ti.static(io.sonar_cfg.range_quantum_m > 0):
-        told = (
+        clipped = (
             ti.floor(ti.max(range_m, 0.0) * ti.static(1.0 / io.sonar_cfg.range_quantum_m) + 0.5)
             * io.sonar_cfg.range_quantum_m
         )
-    return ti.select(told > io.sonar_cfg.max_range_m, FAR_M, told)
+    return ti.select(clipped > io.sonar_cfg.max_range_m, FAR_M, clipped)
 
 
 @ti.func

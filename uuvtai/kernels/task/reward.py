@@ -161,7 +161,7 @@ def compute_reward(
 
 @quick_launch
 @ti.kernel
-def tell_step(
+def write_results(
     io: Bundle[RewardIO],
     terms: FloatMatrix,
     episode_terms: FloatMatrix,

@@ -149,11 +149,11 @@ def _follow_velocity(env, io: Bundle[ThreatsIO]):
     share = ti.static(io.teacher_cfg.slow_fraction) + ti.static(
         1.0 - io.teacher_cfg.slow_fraction
     ) * ti.math.clamp(room, 0.0, 1.0)
-    askew = ti.abs(ti.sin(ti.atan2(level[1], level[0]) - io.ego.rpy[env][2]))
+    sideways = ti.abs(ti.sin(ti.atan2(level[1], level[0]) - io.ego.rpy[env][2]))
     if io.teacher.path_clearance_m[env] < ti.static(
         io.teacher_cfg.askew_clearance_m
     ):  # across the way the hull is wider: let it turn first
-        share *= 1.0 - 0.6 * askew
+        share *= 1.0 - 0.6 * sideways
     speed = ti.select(io.route.n_way[env] > 0, ti.static(io.teacher_cfg.cruise_m_s) * share, 0.0)
     wanted = _unit(level) * speed
     io.teacher.follow_vel_w[env] = ti.Vector([wanted[0], wanted[1], io.teacher.follow_vel_w[env][2]])

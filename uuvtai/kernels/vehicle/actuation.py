@@ -116,7 +116,7 @@ def _drive(first, lanes: Const[int], io: Bundle[ActuationIO]):
         rpm=ti.Matrix([[0.0] * lanes for _ in range(n_thruster)]),
     )
     for lane in range(lanes):
-        _embark(lane, ti.min(first + lane, n - 1), fleet, io)
+        _load_vehicle(lane, ti.min(first + lane, n - 1), fleet, io)
     inverse = ti.Matrix(
         [[io.allocation.thrust_of_wrench[i, axis] for axis in range(6)] for i in range(n_thruster)]
     )
@@ -124,11 +124,11 @@ def _drive(first, lanes: Const[int], io: Bundle[ActuationIO]):
         _control(lane, fleet, inverse, io)
     for lane in range(lanes):
         if is_awake(first + lane, io.clock):
-            _disembark(lane, first + lane, fleet, io)
+            _store_vehicle(lane, first + lane, fleet, io)
 
 
 @ti.func
-def _embark(lane, env, fleet: Out[Any], io: Bundle[ActuationIO]):
+def _load_vehicle(lane, env, fleet: Out[Any], io: Bundle[ActuationIO]):
     """Copy what one vehicle wants and senses into its column."""
     command, vel = io.actuation.command[env], io.ego.vel_b[env]
     # a lost DVL holds an old velocity: feeding that back would run away, so the feed-forward drives alone
@@ -144,7 +144,7 @@ def _embark(lane, env, fleet: Out[Any], io: Bundle[ActuationIO]):
 
 
 @ti.func
-def _disembark(lane, env, fleet: In[Any], io: Bundle[ActuationIO]):
+def _store_vehicle(lane, env, fleet: In[Any], io: Bundle[ActuationIO]):
     """Copy one vehicle's column back. What left the queue's tail reaches the rotors: the command of
     delay_steps control steps ago."""
     io.actuation.integral[env] = column(fleet.integral, lane)
@@ -178,22 +178,22 @@ def _control(lane, fleet: Out[Any], inverse: In[Any], io: Bundle[ActuationIO]):
     wrench = ti.Vector([given[0], given[1], given[2], roll_moment, pitch_moment, given[3]])
     share = _allocate(lane, wrench, fleet, inverse, io)
     for axis in ti.static(range(4)):
-        starved = share < 1.0 or given[axis] != asked[axis]
+        saturated = share < 1.0 or given[axis] != asked[axis]
         per_step = loops[axis].integral_gain * io.episode_cfg.control_dt_s
         after = integrated(
-            integral[axis], error[axis], starved, per_step, loops[axis].band, loops[axis].bound
+            integral[axis], error[axis], saturated, per_step, loops[axis].band, loops[axis].bound
         )
         fleet.integral[axis, lane] = ti.select(fleet.seen[0, lane] == 1.0 or axis == 3, after, integral[axis])
 
 
 @ti.func
-def integrated(integral, error, starved, gain, band, bound):
+def integrated(integral, error, saturated, gain, band, bound):
     """Integral part [N or N m] after one control step; ``gain`` is per step. It never winds up:
 
     it shrinks freely, but grows only on errors smaller than ``band`` that the actuators can serve
-    (``starved``: they give less than asked).
+    (``saturated``: they give less than asked).
     """
-    share = 0.0 if starved else ti.max(0.0, 1.0 - abs(error) / band)
+    share = 0.0 if saturated else ti.max(0.0, 1.0 - abs(error) / band)
     if error * integral < 0.0:
         share = 1.0
     return ti.math.clamp(integral + gain * share * error, -bound, bound)

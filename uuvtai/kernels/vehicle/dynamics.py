@@ -96,7 +96,7 @@ def _move(first, lanes: Const[int], dt, n_substep, io: Bundle[DynamicsIO]):
         lift=ti.Matrix([[0.0] * lanes for _ in range(2)]),
     )
     for lane in range(lanes):
-        _embark(lane, ti.min(first + lane, n - 1), fleet, io)
+        _load_vehicle(lane, ti.min(first + lane, n - 1), fleet, io)
     geometry = ti.Matrix(
         [[io.allocation.wrench_of_thrust[axis, i] for i in range(n_thruster)] for axis in range(6)]
     )
@@ -106,11 +106,11 @@ def _move(first, lanes: Const[int], dt, n_substep, io: Bundle[DynamicsIO]):
             _advance(lane, fleet, geometry, kept, dt, io)
     for lane in range(lanes):
         if is_awake(first + lane, io.clock):
-            _disembark(lane, first + lane, fleet, io)
+            _store_vehicle(lane, first + lane, fleet, io)
 
 
 @ti.func
-def _embark(lane, env, fleet: Out[Any], io: Bundle[DynamicsIO]):
+def _load_vehicle(lane, env, fleet: Out[Any], io: Bundle[DynamicsIO]):
     """Copy what moves one vehicle into its column."""
     put_column(fleet.pos, lane, io.vehicle.pos_w[env])
     put_column(fleet.quat, lane, io.vehicle.quat_wb[env])
@@ -133,7 +133,7 @@ def _embark(lane, env, fleet: Out[Any], io: Bundle[DynamicsIO]):
 
 
 @ti.func
-def _disembark(lane, env, fleet: In[Any], io: Bundle[DynamicsIO]):
+def _store_vehicle(lane, env, fleet: In[Any], io: Bundle[DynamicsIO]):
     """Copy one vehicle's column back."""
     io.vehicle.pos_w[env] = column(fleet.pos, lane)
     io.vehicle.quat_wb[env] = column(fleet.quat, lane)

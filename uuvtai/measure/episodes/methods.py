@@ -176,13 +176,13 @@ def differences(method: Method, config: Config) -> str:
     if method.checkpoint is None:
         return ""
     ours, trained = config.model_dump(mode="json"), method.checkpoint.config.model_dump(mode="json")
-    told = [
+    parts = [
         f"{section}.{key} = {value} (trained with {trained[section].get(key)})"
         for section in _STACK
         for key, value in ours[section].items()
         if value != trained[section].get(key)
     ]
-    return f"{method.name}: {', '.join(told)}" if told else ""
+    return f"{method.name}: {', '.join(parts)}" if parts else ""
 
 
 def policy_name(name: str, checkpoint: Checkpoint) -> str:

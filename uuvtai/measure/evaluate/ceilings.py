@@ -138,13 +138,13 @@ def remainder_of(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
             "method": name,
             "episodes": entries[0]["episodes"],
             "missed": entries[0]["episodes"] - len(own),
-            "sensing": len(told) - len(own),
-            "forecast_decision": len(ceiling) - len(told),
+            "sensing": len(with_truth) - len(own),
+            "forecast_decision": len(ceiling) - len(with_truth),
             "physics": entries[0]["episodes"] - len(ceiling),
-            "lost_with_truth": len(own - told),
+            "lost_with_truth": len(own - with_truth),
         }
         for name, own in won.items()
-        if (told := won.get(f"{name}+{TRUTH}")) is not None
+        if (with_truth := won.get(f"{name}+{TRUTH}")) is not None
     ]
 
 

@@ -114,8 +114,8 @@ def _methods(request: Request, watch: EvaluationWatch) -> list[Method]:
             "bt,oracle"
         )
     for method in methods:
-        if told := differences(method, request.config):
-            watch.note(f"note: {told}")
+        if changes := differences(method, request.config):
+            watch.note(f"note: {changes}")
     return methods
 
 

@@ -89,15 +89,15 @@ class _Document(BaseModel):
 
 def document_of(request: Request, num_envs: int, device: str, drivers: dict[str, str]) -> dict[str, Any]:
     """The request with what was chosen for it, as JSON; ``drivers``: sha256 of what drives, by method."""
-    told = {
+    document = {
         field.name: getattr(request, field.name)
         for field in dataclasses.fields(request)
         if field.name not in ("config", "run_dir")
     }
-    told |= {"policies": list(request.policies), "num_envs": num_envs, "device": device}
+    document |= {"policies": list(request.policies), "num_envs": num_envs, "device": device}
     return {
         "schema": 1,
-        **told,
+        **document,
         "config": request.config.model_dump(mode="json"),
         "cwd": os.getcwd(),
         "drivers": drivers,

@@ -50,9 +50,9 @@ class Foresight:
         """``pilot`` drives and asks the head at every step; ``horizon_steps``: control steps of
         ``risk.horizon_s``."""
         self.head, self._pilot, self.horizon_steps = head, pilot, horizon_steps
-        self.newest_said: list[float] = []
+        self.newest_logits: list[float] = []
         """of the episode that ended last"""
-        self._said: list[Tensor] = []
+        self._logits: list[Tensor] = []
         """(N,) logits of all rows after every step, as far back as the oldest running episode"""
         self._forgotten = 0
         """steps before them"""
@@ -66,18 +66,18 @@ class Foresight:
 
     def step(self, sim: Sim) -> None:
         """Note what the head says of the state that the step led to."""
-        self._said.append(self._pilot.decision.risk_logit.clone())
+        self._logits.append(self._pilot.decision.risk_logit.clone())
 
     def end(self, sim: Sim, row: int, result: EpisodeResult) -> None:
         """An episode is over: its moments get their labels."""
         steps = self._now - self._first[row]
-        own = self._said[self._first.pop(row) - self._forgotten :][STRIDE - 1 :: STRIDE]
-        self.newest_said = torch.stack([entry[row] for entry in own]).cpu().tolist() if own else []
+        own = self._logits[self._first.pop(row) - self._forgotten :][STRIDE - 1 :: STRIDE]
+        self.newest_logits = torch.stack([entry[row] for entry in own]).cpu().tolist() if own else []
         self._ended.append(
-            moments_of(self.newest_said, steps, result.outcome, self.horizon_steps, len(self._ended))
+            moments_of(self.newest_logits, steps, result.outcome, self.horizon_steps, len(self._ended))
         )
         unused = min(self._first.values(), default=self._now) - self._forgotten
-        del self._said[:unused]
+        del self._logits[:unused]
         self._forgotten += unused
 
     def moments(self) -> RiskMoments:
@@ -86,7 +86,7 @@ class Foresight:
 
     @property
     def _now(self) -> int:
-        return self._forgotten + len(self._said)
+        return self._forgotten + len(self._logits)
 
 
 def moments_of(said: list[float], steps: int, outcome: str, horizon_steps: int, number: int) -> RiskMoments:

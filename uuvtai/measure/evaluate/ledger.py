@@ -134,7 +134,7 @@ class Ledger:
         return kept
 
 
-class Keeper(EpisodeObserver):
+class LedgerWriter(EpisodeObserver):
     """Recorder that writes a method's episodes into the ledger as they end; behind those whose work an
     episode needs to be whole."""
 
@@ -152,5 +152,5 @@ class Keeper(EpisodeObserver):
         """Keep the episode."""
         self._ledger.add(
             self._method,
-            Finished(result, self._foresight.newest_said if self._foresight else None, self.wall_s),
+            Finished(result, self._foresight.newest_logits if self._foresight else None, self.wall_s),
         )

@@ -19,7 +19,7 @@ from uuvtai.measure.evaluate.foresight import (
     moments_of,
     risk_entry,
 )
-from uuvtai.measure.evaluate.ledger import Finished, Keeper, Ledger
+from uuvtai.measure.evaluate.ledger import Finished, Ledger, LedgerWriter
 from uuvtai.measure.evaluate.summary import summary, tree_use
 from uuvtai.sim import Sim
 
@@ -83,12 +83,12 @@ def play(comparison: Comparison, method: Method, jobs: list[Job], ledger: Ledger
     left = [job for job in jobs if job not in over or (job in logs and not logs[job].exists())]
     before = len(jobs) - len(left)
     watch.start(method.name, len(jobs))
-    keeper, clock = Keeper(ledger, method.name, foresight), StepClock()
+    writer, clock = LedgerWriter(ledger, method.name, foresight), StepClock()
     try:
         run_episodes(
             sim,
             left,
-            Recorders([recorder, foresight, keeper]),
+            Recorders([recorder, foresight, writer]),
             lambda done, _total, env_steps, to_come: watch.update(
                 before + done, len(jobs), env_steps, to_come
             ),
@@ -100,7 +100,7 @@ def play(comparison: Comparison, method: Method, jobs: list[Job], ledger: Ledger
         if recorder:
             recorder.abort()
     results = [over[job].result for job in jobs]
-    env_steps, wall_s = sum(round(r.time_s / dt) for r in results), keeper.wall_s if left else keeper.before_s
+    env_steps, wall_s = sum(round(r.time_s / dt) for r in results), writer.wall_s if left else writer.before_s
     entry = summary(method.name, results, env_steps, wall_s, clock.env_steps_per_s)
     entry |= {"privileged": method.privileged} | method.document()
     entry |= risk_entry(foresight, _moments(foresight, [over[job] for job in jobs], dt))

@@ -37,9 +37,9 @@ def evaluate_now(trainer: Trainer, config: LearningConfig) -> Metrics:
     finally:
         env.sim.set_scenes(config.train.scenes)
         env.restore(held)
-    told = summary("policy", results, env_steps, 0.0)
+    results_document = summary("policy", results, env_steps, 0.0)
     names = ("success_rate", "collision_rate", "return_mean", "time_to_success_mean_s")
-    metrics = {f"eval/{name}": told[name] for name in names if told[name] is not None}
+    metrics = {f"eval/{name}": results_document[name] for name in names if results_document[name] is not None}
     return metrics | (_calibrated(foresight) if foresight else {})
 
 

@@ -123,7 +123,7 @@ class Explanation:
 def explain(outcome: str, history: History, bodies: Bodies, config: Config) -> Explanation:
     """Label and facts of an episode that ended with ``outcome`` (collision, ttc, out_of_tank or timeout)."""
     if outcome == "timeout":
-        facts = timeout_facts(history.diary)
+        facts = timeout_facts(history.coarse)
         return Explanation(timeout_label(facts), Killer(""), facts)
     scene = Scene(history, bodies, config)
     killer = scene.killer(outcome)

@@ -20,7 +20,7 @@ from uuvtai.config import Config
 from uuvtai.kernels.core.geometry import BOX, NONE
 from uuvtai.measure.explain import hindsight
 from uuvtai.measure.explain.escape import escapes
-from uuvtai.measure.explain.history import Array, Bodies, Diary, History
+from uuvtai.measure.explain.history import Array, Bodies, CoarseHistory, History
 
 WINDOW_S = 4.0
 """How far back the facts look; a time "ago" that is None lies farther back or never was."""
@@ -252,7 +252,7 @@ def _turns_in_reach(history: History, bodies: Bodies, slot: int, ago_s: float, c
     place = history.body_w[int(np.abs(history.t_s - turned_s).argmin()), slot]
     passes = np.arange(turned_s - bodies.lap_s[slot], 0.0, -bodies.lap_s[slot])
     here = np.stack(
-        [np.interp(passes, history.diary.t_s, history.diary.pos_w[:, axis]) for axis in range(3)], -1
+        [np.interp(passes, history.coarse.t_s, history.coarse.pos_w[:, axis]) for axis in range(3)], -1
     )
     gap = np.abs(
         hindsight.vertical_gap(
@@ -288,17 +288,17 @@ def _escape_facts(history: History, bodies: Bodies, config: Config) -> dict[str,
     return {"escapes": level, "escapes_by_heave": heaving, "last_chance_s": next(chances, None)}
 
 
-def timeout_facts(diary: Diary) -> dict[str, Any]:
-    last = diary.t_s >= diary.t_s[-1] - LAST_S
+def timeout_facts(coarse: CoarseHistory) -> dict[str, Any]:
+    last = coarse.t_s >= coarse.t_s[-1] - LAST_S
     first = int(last.argmax())
-    leaf = [name for name, counts in zip(diary.leaf, last, strict=True) if counts]
+    leaf = [name for name, counts in zip(coarse.leaf, last, strict=True) if counts]
     return {
-        "age_s": _round(diary.t_s[-1]),
-        "leaf": diary.leaf[-1],
-        "goal_m": _round(diary.goal_m[-1]),
-        "progress_m": _round(diary.goal_m[first] - diary.goal_m[-1]),
-        "driven_m": _round(np.linalg.norm(np.diff(diary.pos_w[first:], axis=0), axis=1).sum()),
-        "no_route_share": _round(1.0 - diary.has_route[last].mean()),
+        "age_s": _round(coarse.t_s[-1]),
+        "leaf": coarse.leaf[-1],
+        "goal_m": _round(coarse.goal_m[-1]),
+        "progress_m": _round(coarse.goal_m[first] - coarse.goal_m[-1]),
+        "driven_m": _round(np.linalg.norm(np.diff(coarse.pos_w[first:], axis=0), axis=1).sum()),
+        "no_route_share": _round(1.0 - coarse.has_route[last].mean()),
         "waiting_share": _round(np.mean([is_waiting(name) for name in leaf])),
         "evading_share": _round(np.mean([name in EVADING for name in leaf])),
     }

@@ -34,7 +34,7 @@ class Row:
     def document(self) -> dict[str, Any]:
         """One entry of ``explain`` in ``uuv eval --json``."""
         r, e = self.result, self.explanation
-        told = {
+        shared = {
             "seed": r.seed,
             "episode": r.episode,
             "outcome": r.outcome,
@@ -42,7 +42,7 @@ class Row:
             "remarks": e.remarks,
             "log": None,
         }
-        return told | {"killer": vars(e.killer)} | e.facts
+        return shared | {"killer": vars(e.killer)} | e.facts
 
 
 def explain_failures(
@@ -108,10 +108,10 @@ def worst_of(rows: list[Row], label: str) -> list[Row]:
     """Episodes of a label, the worst first: the hardest hits, of timeouts those that ended farthest from the
     goal."""
 
-    def badness(row: Row) -> tuple[float, float]:
+    def severity(row: Row) -> tuple[float, float]:
         return (row.explanation.killer.closing_m_s or 0.0, row.explanation.facts.get("goal_m", 0.0))
 
-    return sorted((row for row in rows if row.explanation.label == label), key=badness, reverse=True)
+    return sorted((row for row in rows if row.explanation.label == label), key=severity, reverse=True)
 
 
 def chosen_for_recording(rows: list[Row], wanted: int) -> list[Row]:

@@ -1,5 +1,5 @@
-"""What is kept of a failed episode to explain it: its bodies, its last seconds sample by sample, and a coarse
-diary of all of it."""
+"""What is kept of a failed episode to explain it: its bodies, its last seconds sample by sample, and all of
+it coarsely."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Bodies:
 
 
 @dataclass(frozen=True)
-class Diary:
+class CoarseHistory:
     """The whole episode at a coarse rate."""
 
     t_s: Array
@@ -46,8 +46,8 @@ class Diary:
 
 @dataclass(frozen=True)
 class History:
-    """The last seconds of an episode, oldest sample first, the end last; ``diary`` is a coarse account of all
-    of it."""
+    """The last seconds of an episode, oldest sample first, the end last; ``coarse`` is a coarse account of
+    all of it."""
 
     t_s: Array
     """(n,) since the start"""
@@ -83,4 +83,4 @@ class History:
     """(n, 4)"""
     map_clearance_m: Array
     """(n,) what the vehicle's own map says"""
-    diary: Diary
+    coarse: CoarseHistory

@@ -16,12 +16,12 @@ from uuvtai.config import Config
 from uuvtai.measure.episodes.playing import EpisodeResult, Job
 from uuvtai.measure.explain import causes, facts
 from uuvtai.measure.explain.causes import Explanation
-from uuvtai.measure.explain.history import Bodies, Diary, History
+from uuvtai.measure.explain.history import Bodies, CoarseHistory, History
 from uuvtai.scenario import body_slots
 from uuvtai.sim import Sim
 from uuvtai.tree import FlatTree
 
-_SAMPLE_S, _DIARY_S = 0.1, 0.5
+_SAMPLE_S, _COARSE_S = 0.1, 0.5
 """Time between samples of the window and between entries of the diary; counted from the start, so that rows
 are read together."""
 
@@ -33,7 +33,7 @@ _WINDOW_FIELDS = {
     "forecast": ("pos_w", "radius_m", "above_w", "below_w"),
     "teacher": ("leaf", "conflict_s", "action", "clearance_m"),
 }
-_DIARY_FIELDS = {"vehicle": ("pos_w",), "mission": ("goal_w",), "route": ("n_way",), "teacher": ("leaf",)}
+_COARSE_FIELDS = {"vehicle": ("pos_w",), "mission": ("goal_w",), "route": ("n_way",), "teacher": ("leaf",)}
 _BODY_FIELDS = {"world": ("kind", "size", "yaw"), "path": ("n_way", "radius_m", "length_m", "speed_m_s")}
 
 _FORESEEN_S = 1.0e3
@@ -48,7 +48,7 @@ class _Watched:
     step: int = 0
     bodies: Bodies | None = None
     window: list[dict[str, np.ndarray]] = field(default_factory=list)
-    diary: list[dict[str, np.ndarray]] = field(default_factory=list)
+    coarse: list[dict[str, np.ndarray]] = field(default_factory=list)
 
 
 class FailureRecorder:
@@ -75,8 +75,8 @@ class FailureRecorder:
             self._rows[row].bodies = _bodies(sim.config, read)
         for row, read in _read_rows(sim, _WINDOW_FIELDS, self._due(self._is_in_window)).items():
             self._rows[row].window.append(read | {"step": np.array(self._rows[row].step)})
-        for row, read in _read_rows(sim, _DIARY_FIELDS, self._due(self._is_diary_due)).items():
-            self._rows[row].diary.append(read | {"step": np.array(self._rows[row].step)})
+        for row, read in _read_rows(sim, _COARSE_FIELDS, self._due(self._is_coarse_due)).items():
+            self._rows[row].coarse.append(read | {"step": np.array(self._rows[row].step)})
 
     def end(self, sim: Sim, row: int, result: EpisodeResult) -> None:
         """Explain the episode and forget its history. Raises RuntimeError where the replay ended
@@ -100,14 +100,14 @@ class FailureRecorder:
         left = watched.end_step - watched.step
         return left == 0 or (left * self._dt <= facts.WINDOW_S and self._is_multiple(watched.step, _SAMPLE_S))
 
-    def _is_diary_due(self, watched: _Watched) -> bool:
-        return watched.step in (1, watched.end_step) or self._is_multiple(watched.step, _DIARY_S)
+    def _is_coarse_due(self, watched: _Watched) -> bool:
+        return watched.step in (1, watched.end_step) or self._is_multiple(watched.step, _COARSE_S)
 
     def _is_multiple(self, step: int, period_s: float) -> bool:
         return step % max(1, round(period_s / self._dt)) == 0
 
     def _history(self, watched: _Watched) -> History:
-        w, d = _stacked(watched.window), _stacked(watched.diary)
+        w, d = _stacked(watched.window), _stacked(watched.coarse)
         state = w["tracks.state"]
         return History(
             t_s=w["step"] * self._dt,
@@ -129,7 +129,7 @@ class FailureRecorder:
             leaf=self._leaves(w["teacher.leaf"]),
             action=w["teacher.action"].astype(float),
             map_clearance_m=w["teacher.clearance_m"].astype(float),
-            diary=Diary(
+            coarse=CoarseHistory(
                 t_s=d["step"] * self._dt,
                 pos_w=d["vehicle.pos_w"].astype(float),
                 goal_m=np.linalg.norm(d["mission.goal_w"] - d["vehicle.pos_w"], axis=1),

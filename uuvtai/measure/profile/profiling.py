@@ -76,10 +76,10 @@ def _learning_rates(config: LearningConfig, sim: Sim) -> dict[str, float]:
     with VectorEnv(sim) as env:
         trainer = Trainer(env, config)
         trainer.iterate()  # allocates
-        told = trainer.iterate()
+        timed = trainer.iterate()
     samples = config.ppo.rollout_steps * config.policy.hold_steps * sim.num_envs
-    driving_s = told["time/simulate_s"] + told["time/infer_s"]
-    return {"step_inference": samples / driving_s, "train": samples / (driving_s + told["time/learn_s"])}
+    driving_s = timed["time/simulate_s"] + timed["time/infer_s"]
+    return {"step_inference": samples / driving_s, "train": samples / (driving_s + timed["time/learn_s"])}
 
 
 def _row(

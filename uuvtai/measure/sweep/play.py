@@ -154,7 +154,7 @@ def _play(
                 for row in played:
                     append_row(folder.path, row)
                     rows[row_key(_label(row, request.grid), row["method"])] = row
-                watch.note(f"{_told(tasks[number].labels[0])} .. {_told(tasks[number].labels[-1])}: done")
+                watch.note(f"{_words(tasks[number].labels[0])} .. {_words(tasks[number].labels[-1])}: done")
                 watch.update(len(rows), len(keys), 0)
             document = _document(request, ordered(rows, keys))
             folder.write_json(RESULT, document)
@@ -182,7 +182,7 @@ def _label(row: Row, grid: Grid) -> dict[str, Any]:
     return {name: row[name] for name in names}
 
 
-def _told(label: dict[str, Any]) -> str:
+def _words(label: dict[str, Any]) -> str:
     return ", ".join(f"{name} = {value}" for name, value in label.items() if value is not None)
 
 

@@ -14,7 +14,7 @@ WINDOW = 100
 
 
 @dataclass
-class Tally:
+class RolloutSums:
     """Sums over one rollout, kept on the device until its end."""
 
     outcomes: torch.Tensor
@@ -29,7 +29,7 @@ class Tally:
     """() steps taken"""
 
     @classmethod
-    def zeros(cls, n_outcome: int, n_term: int, device: torch.device) -> Tally:
+    def zeros(cls, n_outcome: int, n_term: int, device: torch.device) -> RolloutSums:
         """Nothing counted yet."""
         return cls(
             *(
@@ -47,20 +47,20 @@ class Recent:
     """The newest iterations that together hold at least ``WINDOW`` ended episodes."""
 
     def __init__(self, outcomes: Sequence[str], terms: Sequence[str]) -> None:
-        """Names of the outcomes and of the reward's terms, in the order of the tally."""
+        """Names of the outcomes and of the reward's terms, in the order of the sums."""
         self.outcomes, self.terms = tuple(outcomes), tuple(terms)
         self.rows: list[list[float]] = []
         """[return, steps, one count per outcome] of every iteration in the window, oldest first"""
 
-    def add(self, tally: Tally) -> dict[str, float]:
+    def add(self, sums: RolloutSums) -> dict[str, float]:
         """Take in a rollout; ``rollout/*`` over the window (none before the first episode has ended),
         ``reward/*`` over the rollout."""
-        self.rows.append([float(tally.episode_return), float(tally.episode_steps), *tally.outcomes.tolist()])
+        self.rows.append([float(sums.episode_return), float(sums.episode_steps), *sums.outcomes.tolist()])
         while sum(self._episodes(row) for row in self.rows[1:]) >= WINDOW:
             self.rows.pop(0)
         metrics = {
-            f"reward/{n}": v / float(tally.samples)
-            for n, v in zip(self.terms, tally.terms.tolist(), strict=True)
+            f"reward/{n}": v / float(sums.samples)
+            for n, v in zip(self.terms, sums.terms.tolist(), strict=True)
         }
         total, steps, *counts = (sum(column) for column in zip(*self.rows, strict=True))
         episodes = sum(counts)
