@@ -142,7 +142,7 @@ def test_every_key_has_a_row_with_type_default_unit_and_meaning():
 
 
 @pytest.mark.parametrize(
-    ("key", "told", "unit"),
+    ("key", "answer", "unit"),
     [
         ("gate_m", "", "m"),
         ("decay", "lambda", ""),

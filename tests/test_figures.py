@@ -281,7 +281,7 @@ def test_paths(part, shown):
 
 
 @pytest.mark.parametrize(
-    ("path", "told"),
+    ("path", "answer"),
     [
         ("paper.NOTHING", "has no NOTHING"),
         ("guess.x", "begins with none of"),

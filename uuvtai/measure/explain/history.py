@@ -1,5 +1,5 @@
-"""What is kept of a failed episode to explain it: its bodies, its last seconds sample by sample, and all of
-it coarsely."""
+"""What is kept of a failed episode to explain it: its bodies, its last seconds sample by sample, all of it
+coarsely."""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ class CoarseHistory:
 
 @dataclass(frozen=True)
 class History:
-    """The last seconds of an episode, oldest sample first, the end last; ``coarse`` is a coarse account of
-    all of it."""
+    """The last seconds of an episode, oldest sample first, the end last; ``coarse`` is the account of all of
+    it."""
 
     t_s: Array
     """(n,) since the start"""
