@@ -374,9 +374,8 @@ def risk_rows(
     low, high = wilson_interval(missed, n) or (0.0, 1.0)
     note = (
         f"{missed} of {n} accidents, 95 % in {low:.3f} .. {high:.3f}; promised {config.miss_rate:g} from "
-        f"{int(first_fit.sum())} accidents; "
-        f"threshold {threshold:.4f}, alarm in {100 * float((p[~event] >= threshold).double().mean()):.0f} % "
-        "of the safe moments"
+        f"{int(first_fit.sum())} accidents; threshold {threshold:.4f}, alarm in "
+        f"{100 * float((p[~event] >= threshold).double().mean()):.0f} % of the safe moments"
     )
     return [
         *rows,

@@ -250,8 +250,7 @@ def preset_path(kind: str, name: str) -> Path:
     if name not in preset_names(kind):
         raise ConfigError(
             f"{kind} {name!r} is no preset{nearest(name, preset_names(kind))}; there are: "
-            f"{', '.join(preset_names(kind))} "
-            f"(see 'uuv presets'), or give the path of a {suffix} file"
+            f"{', '.join(preset_names(kind))} (see 'uuv presets'), or give the path of a {suffix} file"
         )
     return shipped_file(kind, name)
 

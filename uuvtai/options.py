@@ -94,11 +94,10 @@ EvalRuns = Annotated[
 EvalControllers = Annotated[
     list[str] | None,
     _controllers(
-        "straight, planner, bt or a tree's XML (repeatable); paper = bt on the paper's own stack, a "
-        "row of its own; "
-        "none = policies alone \\[default: straight, planner, bt, beside a RUN bt]. "
-        "Privileged yardsticks: NAME+truth (a tree that knows where every moving body is), oracle (knows "
-        "the future: an upper bound).",
+        "straight, planner, bt or a tree's XML (repeatable); paper = bt on the paper's own stack, a row of "
+        "its own; none = policies alone \\[default: straight, planner, bt, beside a RUN bt]. Privileged "
+        "yardsticks: NAME+truth (a tree that knows where every moving body is), oracle (knows the future: an "
+        "upper bound).",
     ),
 ]
 EvalEpisodes = Annotated[int, Option("--episodes", help="Episodes per seed.")]

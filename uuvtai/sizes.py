@@ -86,8 +86,7 @@ def check_size(config: Config, n_env: int, device: str) -> None:
     if free is not None and needed > 0.9 * free:
         raise SizeError(
             f"--num-envs {n_env} needs about {needed / 2**30:.1f} GiB, {free / 2**30:.1f} GiB are free on "
-            f"{device}: "
-            f"{_smaller(config, n_env, device, free)}"
+            f"{device}: {_smaller(config, n_env, device, free)}"
         )
     _check_kernels(config)
 
@@ -97,8 +96,7 @@ def _smaller(config: Config, n_env: int, device: str, free: int) -> str:
     alone = memory_bytes(config, 1, device)
     if alone > 0.9 * free:
         return (
-            "not even one env fits; make the map coarser (--set mapping.cell_m=...), the tank smaller, "
-            "or "
+            "not even one env fits; make the map coarser (--set mapping.cell_m=...), the tank smaller, or "
             "free memory"
         )
     fitting = int(n_env * 0.9 * free / memory_bytes(config, n_env, device))

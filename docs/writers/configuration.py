@@ -60,9 +60,8 @@ def _list() -> str:
             "Every key can be set in a preset or a YAML file of your own, and on the command line by `--set "
             "section.key=value`. Unknown"
             " keys, wrong types and values out of range are refused with the nearest name. Configurations "
-            "are immutable once they are "
-            "loaded. `uuv presets show NAME --all` prints a preset with every key. Steps are control steps "
-            "(`episode.control_dt_s`).",
+            "are immutable once they are loaded. `uuv presets show NAME --all` prints a preset with every "
+            "key. Steps are control steps (`episode.control_dt_s`).",
             text_table(["section", "holds"], rows),
             contents([f"configuration/{name}" for name in LearningConfig.model_fields]),
         ]

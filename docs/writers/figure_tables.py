@@ -41,10 +41,9 @@ def measured(sources: Sources) -> str:
     )
     kept = f" {shown['note']}" if "note" in shown else ""
     return (
-        f"Measured here: {shown['episodes']} episodes of seed {shown['seed']} in each row, paper sensing, "
-        f"S = 8.\nThis seed {seen}. "
-        "Success, collision and endings are\nthose of `bt`, in the last row of `paper`. `-` = not played or "
-        f"not kept.{kept}\n"
+        f"Measured here: {shown['episodes']} episodes of seed {shown['seed']} in each row, paper sensing, S "
+        f"= 8.\nThis seed {seen}. Success, collision and endings are\nthose of `bt`, in the last row of "
+        f"`paper`. `-` = not played or not kept.{kept}\n"
         "`python -m docs.writers.evaluations` plays all rows; commands and counts: `docs/data/`."
     )
 

@@ -31,9 +31,8 @@ def page() -> str:
     parts = [
         "# Stages of a step",
         "One control step runs these stages in this order; a row of `uuv profile` carries the same name. The "
-        "text is that of the files in "
-        "`uuvtai/kernels/`. What they stand on, and what is assumed: [how the simulator "
-        "works](../simulator.md).",
+        "text is that of the files in `uuvtai/kernels/`. What they stand on, and what is assumed: [how the "
+        "simulator works](../simulator.md).",
     ]
     for stage, files in FILES.items():
         parts.append(f"## {stage}")

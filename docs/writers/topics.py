@@ -21,12 +21,9 @@ def page() -> str:
     parts = [
         "# Log topics",
         "`uuv eval --record K` writes one MCAP file per episode: JSON messages, zstd chunks, simulation time "
-        "from 0, SI units, world "
-        "frame z-up, body frame forward-left-up. `foxglove.*` schemas are those of "
-        "<https://docs.foxglove.dev/docs/sdk/schemas>; our "
-        "own follow below. Attachments: `config.yaml`, `scenario.json`. Metadata: `uuv.run`, `uuv.result`. "
-        "What opens a log: "
-        "[viewers](../viewers.md).",
+        "from 0, SI units, world frame z-up, body frame forward-left-up. `foxglove.*` schemas are those of "
+        "<https://docs.foxglove.dev/docs/sdk/schemas>; our own follow below. Attachments: `config.yaml`, "
+        "`scenario.json`. Metadata: `uuv.run`, `uuv.result`. What opens a log: [viewers](../viewers.md).",
         text_table(["topic", "schema", "written"], rows),
     ]
     for topic in TOPICS:

@@ -120,8 +120,7 @@ class ElevationConfig(Section):
         if 15 * self.tail_share + self.column_tail_share >= 1:
             raise ValueError(
                 f"tail_share {self.tail_share} of 15 heights and column_tail_share {self.column_tail_share} "
-                "must sum to less than 1: "
-                "else a body could be taken to be nowhere"
+                "must sum to less than 1: else a body could be taken to be nowhere"
             )
         return self
 

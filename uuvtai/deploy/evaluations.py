@@ -45,8 +45,7 @@ def during_training(checkpoint: Checkpoint) -> Evaluation | None:
     n, world = config.train.evaluate_episodes, config.world
     where = (
         f"the training's own world and sensing, S = {world.n_static}, D = {world.n_dynamic}, v = "
-        f"{world.dynamic_speed_m_s:g} m/s, "
-        f"seed {config.train.evaluate_seed}"
+        f"{world.dynamic_speed_m_s:g} m/s, seed {config.train.evaluate_seed}"
     )
     return Evaluation(where, n, round(success * n), round(collision * n))
 

@@ -17,17 +17,14 @@ ONNX = "policy.onnx"
 
 _OBSERVATION = (
     "float32, raw SI units, in this order; the scaling is inside the policy. A value that is not finite "
-    "counts as the mean of training. "
-    "Frames: body is the vehicle's (x ahead, y left, z up); level is the same without roll and pitch; route "
-    "follows the planned path; "
-    "world has z up and 0 at the surface."
+    "counts as the mean of training. Frames: body is the vehicle's (x ahead, y left, z up); level is the "
+    "same without roll and pitch; route follows the planned path; world has z up and 0 at the surface."
 )
 _HOLD = (
     "The networks decide at the first control step of a mission and then at every hold_steps-th one. In "
-    "between the decision is held: the "
-    "action itself, or, for a residual policy, its difference from the tree's action, which is added to the "
-    "newest tree action in the "
-    "observation. The result is cut off to [-1, 1]. last_obs and last_action are those of the last decision."
+    "between the decision is held: the action itself, or, for a residual policy, its difference from the "
+    "tree's action, which is added to the newest tree action in the observation. The result is cut off to "
+    "[-1, 1]. last_obs and last_action are those of the last decision."
 )
 
 

@@ -101,8 +101,7 @@ class Checkpoint:
         if _structure(plain) != _structure(self.manifest.simulator) or layout != layout_of(expected):
             raise CheckpointError(
                 f"{self.path}: the simulator's state has other arrays than this simulator; resume with the "
-                "run's own config, number of "
-                "envs and version of uuvtai"
+                "run's own config, number of envs and version of uuvtai"
             )
         with refused(self.path / SIMULATOR):
             state[SIMULATOR_PART] = unpack(

@@ -90,11 +90,9 @@ class Guard:
         )
         raise TrainingError(
             f"iterations {iteration - self.bad_in_a_row + 1} to {iteration} were all bad: "
-            f"{'; '.join(complaints)}{envs}. What was bad did "
-            "not change the networks. If updates were left out, go on with smaller steps: "
-            "uuv train --resume RUN --set ppo.learning_rate=1e-4. If an observation or a reward is not "
-            "finite, the simulator is at fault: "
-            "please report seed and episode"
+            f"{'; '.join(complaints)}{envs}. What was bad did not change the networks. If updates were left "
+            "out, go on with smaller steps: uuv train --resume RUN --set ppo.learning_rate=1e-4. If an "
+            "observation or a reward is not finite, the simulator is at fault: please report seed and episode"
         )
 
 

@@ -69,8 +69,7 @@ class ActorCritic(nn.Module):
         if config.residual and (teacher_slice is None or len(range(n_in)[teacher_slice]) != num_actions):
             raise SettingError(
                 f"policy.residual adds to the teacher's {num_actions} commands, but the observation has no "
-                "such columns "
-                f"(got {teacher_slice}): set features.teacher=true or policy.residual=false"
+                f"such columns (got {teacher_slice}): set features.teacher=true or policy.residual=false"
             )
         if config.initial_std < config.min_std:
             raise SettingError(

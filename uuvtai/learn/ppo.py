@@ -161,8 +161,7 @@ class Ppo:
         if self.config.minibatches > len(batch.valid):
             raise SettingError(
                 f"ppo.minibatches={self.config.minibatches}, but a rollout has only {len(batch.valid)} "
-                "samples: "
-                "raise ppo.rollout_steps or train.num_envs"
+                "samples: raise ppo.rollout_steps or train.num_envs"
             )
         skipped, sums = self.skipped, torch.zeros(len(_SUMS), dtype=torch.float64, device=batch.valid.device)
         for _ in range(self.config.epochs):

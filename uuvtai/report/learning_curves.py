@@ -69,8 +69,7 @@ def training(runs: Sequence[Training], command: str = "") -> list[Block]:
         else ""
     )
     caption = (
-        f"Training curves: {seeds}shares and rewards over the episodes that ended last, as the "
-        "trainer "
+        f"Training curves: {seeds}shares and rewards over the episodes that ended last, as the trainer "
         "records them"
     )
     return [Figure("training", panels, caption, data, command), _last_table(methods)]

@@ -42,8 +42,8 @@ def conditions(result: dict[str, Any]) -> str:
     seeds = ", ".join(map(str, result["seeds"]))
     return (
         f"World {result['world']}, S = {result['S']} resting and D = {result['D']} moving obstacles{speed}, "
-        f"{result['sensors']} sensing; "
-        f"seeds {seeds}, {result['episodes_per_seed']} episodes each, the same ones for every method."
+        f"{result['sensors']} sensing; seeds {seeds}, {result['episodes_per_seed']} episodes each, the same "
+        "ones for every method."
     )
 
 
@@ -137,9 +137,8 @@ def _paired(pairs: list[dict[str, Any]]) -> list[Block]:
         return []
     caption = (
         "Pairs of methods on the same episodes: who alone arrives, with McNemar's exact p, and the mean "
-        "times where both arrive, their "
-        "difference with its 95 % bootstrap interval. The values of p are not adjusted for the number of "
-        "pairs"
+        "times where both arrive, their difference with its 95 % bootstrap interval. The values of p are not "
+        "adjusted for the number of pairs"
     )
     keys = ("a", "b", "episodes", *_PAIRED)
     rows = [[*map(pair.get, keys), *(pair.get(_BOUNDS) or (None, None))] for pair in pairs]
@@ -185,17 +184,15 @@ def _risk(method: Method, command: str) -> list[Block]:
     bins = risk["reliability"]
     said = (
         f"At {risk['moments']:,} moments the risk head of {method['name']} gave the probability of an "
-        "accident soon: Brier score "
-        f"{number(risk['brier'], 4)} (base rate alone {number(risk['brier_base_rate'], 4)}), expected "
-        "calibration error "
-        f"{number(risk['ece'], 4)}, area under the ROC curve {number(risk.get('auroc'), 3)}."
+        f"accident soon: Brier score {number(risk['brier'], 4)} (base rate alone "
+        f"{number(risk['brier_base_rate'], 4)}), expected calibration error {number(risk['ece'], 4)}, area "
+        f"under the ROC curve {number(risk.get('auroc'), 3)}."
     )
     if "accidents" in risk:
         low, high = risk["missed_ci95"]
         said += (
             f" The alarm missed {risk['missed']} of {risk['accidents']} accidents, {percent(low)} to "
-            f"{percent(high)} "
-            f"(promised {percent(risk['promised_miss_rate'])}), and was raised in "
+            f"{percent(high)} (promised {percent(risk['promised_miss_rate'])}), and was raised in "
             f"{percent(risk['alarm_rate_safe'])} of the safe moments."
         )
     columns = ["said", "came", "moments"]

@@ -57,9 +57,8 @@ def _maps(document: dict[str, Any], command: str) -> list[Block]:
         panels = [heat_map(chosen, f"{key}_rate", f"{method}: {key}") for key in ("collision", "success")]
         caption = (
             f"{method}: collision (left) and success (right) in per cent of the episodes, below each the "
-            "mean time of the successes. "
-            "Bright is good in both. A cell that spans the row does not depend on the column. Counts and "
-            "intervals: on hover and below"
+            "mean time of the successes. Bright is good in both. A cell that spans the row does not depend "
+            "on the column. Counts and intervals: on hover and below"
         )
         blocks += [
             Figure(f"heat_map_{method}", panels, caption, cells_data(own), command),

@@ -54,10 +54,8 @@ def show_pairs(screen: Screen, pairs: list[dict[str, Any]]) -> None:
 def _show_remainder(screen: Screen, part: dict[str, Any]) -> None:
     screen.line(
         f"{part['method']} misses {part['missed']} of {part['episodes']}: {part['sensing']} by sensing (told "
-        "of the moving bodies it "
-        f"arrives), {part['forecast_decision']} by forecast, decision and inertia (a point had a way), "
-        f"{part['physics']} by physics "
-        "(the oracle finds none)"
+        f"of the moving bodies it arrives), {part['forecast_decision']} by forecast, decision and inertia (a "
+        f"point had a way), {part['physics']} by physics (the oracle finds none)"
     )
 
 
@@ -78,8 +76,7 @@ def _show_condition(screen: Screen, condition: dict[str, Any]) -> None:
     screen.line(
         f"threat rate {condition['threats_per_min']:.2f} per minute ({condition['threats']} moving bodies in "
         f"{condition['ride_minutes']:.1f} min of blind rides; {rides} of the rides meet one), required "
-        "detection distance "
-        f"{detection['required_m']:.1f} m (closing {detection['closing_m_s']:.1f} m/s, "
+        f"detection distance {detection['required_m']:.1f} m (closing {detection['closing_m_s']:.1f} m/s, "
         f"{detection['aside_s']:.1f} s to move aside)"
     )
 
@@ -97,7 +94,6 @@ def show_risk(screen: Screen, name: str, risk: dict[str, Any]) -> None:
         low, high = risk["missed_ci95"]
         screen.line(
             f"  alarm: missed {risk['missed']} of {risk['accidents']} accidents, {100 * low:.1f} to "
-            f"{100 * high:.1f} % "
-            f"(promised {100 * risk['promised_miss_rate']:g} %), raised in "
+            f"{100 * high:.1f} % (promised {100 * risk['promised_miss_rate']:g} %), raised in "
             f"{100 * risk['alarm_rate_safe']:.1f} % of the safe moments"
         )

@@ -86,9 +86,8 @@ class FailureRecorder:
         if (result.outcome, result.time_s) != (expected.outcome, expected.time_s):
             raise RuntimeError(
                 f"replay of seed {job.seed} episode {job.episode} ended with {result.outcome} at "
-                f"{result.time_s} s instead of "
-                f"{expected.outcome} at {expected.time_s} s: episodes must be the same in any batch, please "
-                "report this"
+                f"{result.time_s} s instead of {expected.outcome} at {expected.time_s} s: episodes must be "
+                "the same in any batch, please report this"
             )
         assert watched.bodies is not None  # read after the first step
         self.found[job] = causes.explain(result.outcome, self._history(watched), watched.bodies, self._config)

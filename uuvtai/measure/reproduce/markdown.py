@@ -23,10 +23,8 @@ def results_page(document: dict[str, Any]) -> str:
     head = [
         "# Results",
         f"`uuv reproduce --budget {document['budget']}`, {document['started']}, commit "
-        f"{document['git_sha'] or 'unknown'}, "
-        f"{machine['cpu']}, {machine['cores']} cores. Intervals are 95 % (Wilson). RUN is the reproduction's "
-        "folder; the evaluations' "
-        f"seed, {seed}, {tuned}.",
+        f"{document['git_sha'] or 'unknown'}, {machine['cpu']}, {machine['cores']} cores. Intervals are 95 % "
+        f"(Wilson). RUN is the reproduction's folder; the evaluations' seed, {seed}, {tuned}.",
         *document.get("notes", []),
     ]
     parts = [
@@ -42,11 +40,10 @@ def results_page(document: dict[str, Any]) -> str:
 
 def _claims(document: dict[str, Any]) -> str:
     note = (
-        "A claim with a p value is decided where that value, adjusted by Holm for all tests of this page, "
-        f"is below {LEVEL}; else it "
-        "cannot be judged. Rates are compared by Fisher's exact test, with a printed value by the exact "
-        "binomial test. Claims without a p "
-        "value set one number beside another: one run, one machine, no test."
+        "A claim with a p value is decided where that value, adjusted by Holm for all tests of this page, is "
+        f"below {LEVEL}; else it cannot be judged. Rates are compared by Fisher's exact test, with a printed "
+        "value by the exact binomial test. Claims without a p value set one number beside another: one run, "
+        "one machine, no test."
     )
     return f"## The paper's claims\n{note}\n\n{markdown(claim_table(document))}"
 
@@ -73,8 +70,7 @@ def _main(document: dict[str, Any]) -> str:
         rows.append([f"`{name}`", str(len(entries)), *rates, theirs[0], *times])
     note = (
         "TTS is the paper's: mean time of all episodes / rate of success. The last column, the mean over the "
-        "episodes that arrive, has no "
-        "peer in the paper."
+        "episodes that arrive, has no peer in the paper."
     )
     columns = ["method", "training seeds", "success", "collision", "the paper: success / collision"]
     columns += ["TTS", "the paper: TTS", "mean time", "the paper: mean time", "mean time of successes"]
@@ -148,11 +144,9 @@ def _timing(document: dict[str, Any]) -> str:
     timed = [row for row in profile["paper_latency"] if row["mean_ms"] is not None]
     note = (
         '"Global planner" is the mean over the steps that plan a route; "Planner stage, every step" over all '
-        "steps, most of which "
-        "plan none. "
+        "steps, most of which plan none. "
         '"Full loop" is a whole step (simulated truth and sensing, mapping, planning, behaviour tree) and '
-        "one decision of world model and "
-        "policy; what the paper's loop contains it does not say."
+        "one decision of world model and policy; what the paper's loop contains it does not say."
     )
     return "\n\n".join(
         [

@@ -59,9 +59,8 @@ class LocalEngine:
                 if tries[number] >= ATTEMPTS:
                     raise EngineError(
                         f"task {number + 1} of {len(items)} lost its worker {ATTEMPTS} times (killed, or out "
-                        "of memory): "
-                        "try fewer --workers or a smaller --num-envs; what is finished is kept, go on with "
-                        "--resume"
+                        "of memory): try fewer --workers or a smaller --num-envs; what is finished is kept, "
+                        "go on with --resume"
                     )
 
     def _round(
