@@ -2,6 +2,8 @@
 streams."""
 
 import math
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -177,3 +179,20 @@ def test_keys_of_episodes_do_not_collide():
     keys = {reference.episode_key(seed, episode) for seed in range(50) for episode in range(400)}
     expected_collisions = (50 * 400) ** 2 / 2 / 2**32  # 0.05
     assert 50 * 400 - len(keys) <= expected_collisions + 3
+
+
+def streams_of(sources):
+    """{number: names} of the constants STREAM_... in these texts."""
+    found = {}
+    for source in sources:
+        for name, number in re.findall(r"^(STREAM_\w+) = (\d+)", source, re.MULTILINE):
+            found.setdefault(int(number), []).append(name)
+    return found
+
+
+def test_no_two_streams_have_one_number():
+    """A sensor may keep its stream in its own file."""
+    assert streams_of(["STREAM_A = 3\n", "STREAM_B = 3\n"]) == {3: ["STREAM_A", "STREAM_B"]}
+    kernels = Path(noise.__file__).parents[1]
+    streams = streams_of(path.read_text() for path in kernels.rglob("*.py"))
+    assert len(streams) > 10 and [names for names in streams.values() if len(names) > 1] == []

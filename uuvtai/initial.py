@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from typing import get_type_hints
 
 import numpy as np
 
@@ -18,8 +18,7 @@ from uuvtai.taichi_patches.memory import Put
 
 def allocate_state(sizes: dict[str, int]) -> SimState:
     """Every struct, with the lengths of ``sizes.array_sizes``."""
-    kinds = {member.name: getattr(state, str(member.type).rpartition(".")[2]) for member in fields(SimState)}
-    return SimState(**{name: state.allocate(kind, sizes) for name, kind in kinds.items()})
+    return SimState(**{name: state.allocate(kind, sizes) for name, kind in get_type_hints(SimState).items()})
 
 
 def fill_constants(s: SimState, config: Config, put: Put) -> None:

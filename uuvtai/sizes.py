@@ -3,10 +3,10 @@ allocated."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import os
 from pathlib import Path
+from typing import get_type_hints
 
 from uuvtai import state
 from uuvtai.config import Config
@@ -18,6 +18,7 @@ from uuvtai.kernels.perception.mapping import map_period_s, scans_in
 from uuvtai.kernels.planning.clearance import offset_bits
 from uuvtai.plan_codes import N_PLANNER, N_REASON, N_TRIGGER
 from uuvtai.scenario import scenario_sizes
+from uuvtai.stages import SimState
 
 _MAX_ENVS = 1 << 20
 _PLAN_SLOTS = 64
@@ -69,8 +70,7 @@ def array_sizes(config: Config, n_env: int, device: str = "cpu") -> dict[str, in
 def memory_bytes(config: Config, n_env: int, device: str = "cpu") -> int:
     """Memory that the simulator's arrays take [bytes]."""
     sizes = array_sizes(config, n_env, device)
-    structs = (s for s in vars(state).values() if isinstance(s, type) and dataclasses.is_dataclass(s))
-    return sum(state.bytes_of(struct, sizes) for struct in structs)
+    return sum(state.bytes_of(struct, sizes) for struct in get_type_hints(SimState).values())
 
 
 def check_size(config: Config, n_env: int, device: str) -> None:
