@@ -3,6 +3,8 @@ traceback?"""
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 import json
 import random
 import shutil
@@ -18,6 +20,9 @@ from benchmarks.common import Job, Row
 
 LONGEST_S = 14400
 """the whole of it, on two cores"""
+_ROOT = Path(__file__).resolve().parent.parent
+_DONE = _ROOT / "build" / "signals.jsonl"
+"""one finished part a line"""
 _SEED = 20261122
 _KILLS = {"train": 100, "eval": 50, "export": 25, "report": 25, "signals": 100}
 _QUICK = {"train": 3, "eval": 3, "export": 2, "report": 2, "signals": 12}
@@ -40,17 +45,45 @@ _TIMES = ("wall_s", "env_steps_per_s")
 
 
 def measure(job: Job) -> list[Row]:
-    """Violations of each kind; a violation is told as it is found."""
+    """Violations of each kind; a violation is shown as it is found. Parts that an earlier run finished are
+    not done again while the package and this file are as they were."""
     counts = _QUICK if job.quick else _KILLS
     with tempfile.TemporaryDirectory() as folder:
         bench = _Bench(Path(folder), job)
-        rows = bench.killed_train(counts["train"]) + bench.killed_eval(counts["eval"])
-        return (
-            rows
-            + bench.killed_export(counts["export"])
-            + bench.killed_report(counts["report"])
-            + bench.signalled(counts["signals"])
-        )
+        parts = {
+            "train": bench.killed_train, "eval": bench.killed_eval, "export": bench.killed_export,
+            "report": bench.killed_report, "signals": bench.signalled,
+        }  # fmt: skip
+        key, found = _key(), []
+        done = {} if job.quick else _finished(key)
+        for name, part in parts.items():
+            if name in done:
+                job.say(f"{name}: known from an earlier run")
+                rows = [Row(**row) for row in done[name]]
+            else:
+                rows = part(counts[name])
+                if not job.quick:
+                    _keep({"key": key, "part": name, "rows": [dataclasses.asdict(row) for row in rows]})
+            found += rows
+        return found
+
+
+def _key() -> str:
+    """sha256 of what the results are about."""
+    files = [Path(__file__), *sorted((_ROOT / "uuvtai").rglob("*.py"))]
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+
+
+def _finished(key: str) -> dict[str, list[dict[str, Any]]]:
+    lines = _DONE.read_text().splitlines() if _DONE.exists() else []
+    kept = [json.loads(line) for line in lines]
+    return {part["part"]: part["rows"] for part in kept if part["key"] == key}
+
+
+def _keep(part: dict[str, Any]) -> None:
+    _DONE.parent.mkdir(exist_ok=True)
+    with _DONE.open("a") as stream:
+        stream.write(json.dumps(part) + "\n")
 
 
 class _Bench:
@@ -160,7 +193,7 @@ class _Bench:
     def killed_report(self, kills: int) -> list[Row]:
         """The page is whole or not there, and the next try succeeds."""
         whole_s, wrong, page = (
-            self._whole(["report", "played"], "page.html", "--out"),
+            self._whole(["report", self._played()], "page.html", "--out", "--force"),
             [],
             self.folder / "played/report.html",
         )
@@ -190,7 +223,7 @@ class _Bench:
 
     def signalled(self, count: int) -> list[Row]:
         """Every command in turn, one of the two signals at a random moment of it."""
-        log = next((self.folder / "played/logs").glob("*.mcap"))
+        log = next((self.folder / self._played() / "logs").glob("*.mcap"))
         commands = [
             [*_EVAL, "--episodes", "8", "--record", "1", *_HORIZON, "--run-dir", "out"],
             [*_TRAIN, "--iterations", "10", "--run-dir", "out"],
@@ -279,12 +312,18 @@ class _Bench:
         if code:
             raise RuntimeError(f"uuv {' '.join(command)}: exit code {code}\n{err}")
 
-    def _whole(self, command: list[str], place: str, option: str = "--run-dir") -> float:
+    def _played(self) -> str:
+        """Folder of an evaluation, played where no part before has done so."""
+        if not (self.folder / "played").exists():
+            self._uuv([*_EVAL, "--episodes", "8", "--record", "2", *_HORIZON, "--run-dir", "played"])
+        return "played"
+
+    def _whole(self, command: list[str], place: str, option: str = "--run-dir", *again: str) -> float:
         """Time of an undisturbed run [s]. It is run twice, into ``place`` and another one: the first run may
-        compile kernels."""
+        compile kernels. ``again``: what the second one needs more."""
         self._uuv([*command, option, place])
         begun = time.monotonic()
-        self._uuv([*command, option, f"timed_{place}"])
+        self._uuv([*command, option, f"timed_{place}", *again])
         took = time.monotonic() - begun
         self.job.say(f"undisturbed: uuv {' '.join(command[:2])}: {took:.0f} s")
         return took

@@ -34,10 +34,8 @@ class Policy(GaussianMixin, Model):
     def __init__(self, **spaces) -> None:
         Model.__init__(self, **spaces)
         GaussianMixin.__init__(self)
-        self.net, self.log_std = (
-            network(self.num_observations, self.num_actions),
-            nn.Parameter(torch.full((self.num_actions,), -0.7)),
-        )
+        self.net = network(self.num_observations, self.num_actions)
+        self.log_std = nn.Parameter(torch.full((self.num_actions,), -0.7))
 
     def compute(self, inputs, role=""):
         """(mean, log of the spread)."""
@@ -61,23 +59,16 @@ def make(sim: Sim):
     """(envs, untrained agent); observations and values are scaled by skrl's own preprocessors."""
     set_seed(0)
     envs = wrap_env(Watched(sim=sim, hold_steps=HOLD_STEPS), wrapper="gymnasium", verbose=False)
-    spaces = {
-        "observation_space": envs.observation_space,
-        "action_space": envs.action_space,
-        "device": envs.device,
-    }
+    spaces = {name: getattr(envs, name) for name in ("observation_space", "action_space", "device")}
     config = PPO_CFG(
-        rollouts=ROLLOUT_STEPS, learning_epochs=5, mini_batches=4, learning_rate=1e-3,
-        time_limit_bootstrap=True,
-        observation_preprocessor=RunningStandardScaler,
-        observation_preprocessor_kwargs={"size": envs.observation_space},
-        value_preprocessor=RunningStandardScaler, value_preprocessor_kwargs={"size": 1},
-        experiment={"write_interval": 0, "checkpoint_interval": 0},
+        rollouts=ROLLOUT_STEPS, learning_epochs=5, time_limit_bootstrap=True,
+        observation_preprocessor=RunningStandardScaler, value_preprocessor=RunningStandardScaler,
+        observation_preprocessor_kwargs={"size": envs.observation_space}, mini_batches=4, learning_rate=1e-3,
+        value_preprocessor_kwargs={"size": 1}, experiment={"write_interval": 0, "checkpoint_interval": 0},
     )  # fmt: skip
     memory = RandomMemory(memory_size=ROLLOUT_STEPS, num_envs=envs.num_envs, device=envs.device)
-    return envs, PPO(
-        models={"policy": Policy(**spaces), "value": Value(**spaces)}, memory=memory, cfg=config, **spaces
-    )
+    models = {"policy": Policy(**spaces), "value": Value(**spaces)}
+    return envs, PPO(models=models, memory=memory, cfg=config, **spaces)
 
 
 def train(sim: Sim, iterations: int, out: Path | None = None) -> Act:
@@ -98,9 +89,9 @@ def play(sim: Sim, folder: Path) -> Act:
 
 
 def _acting(agent: PPO) -> Act:
+    @torch.no_grad()
     def act(obs: np.ndarray) -> np.ndarray:
-        with torch.no_grad():
-            return agent.act(torch.from_numpy(obs), None, timestep=0, timesteps=0)[1]["mean_actions"].numpy()
+        return agent.act(torch.from_numpy(obs), None, timestep=0, timesteps=0)[1]["mean_actions"].numpy()
 
     return act
 
