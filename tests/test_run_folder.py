@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from uuvtai import signals
 from uuvtai.errors import UserError
 from uuvtai.loader import load_config, load_resolved
 from uuvtai.run_folder import RunFolder, RunFolderError, default_run_dir, refuse_place, write_atomic
@@ -242,3 +243,21 @@ def test_what_a_kill_left_half_written_is_swept_when_the_run_goes_on(tmp_path):
         file.write_text("{")
     RunFolder.held(tmp_path / "run").release()
     assert not left.exists() and all(file.exists() for file in theirs)
+
+
+@pytest.mark.parametrize(
+    ("received", "raised", "left", "status", "code"),
+    [
+        ([], RuntimeError, RuntimeError, "failed", 1),
+        ([], KeyboardInterrupt, KeyboardInterrupt, "interrupted", 130),
+        ([15], RuntimeError, KeyboardInterrupt, "interrupted", 143),
+    ],
+    ids=["error", "interrupt", "interrupt that compiled code made an error of"],
+)
+def test_how_a_recorded_run_ends(tmp_path, monkeypatch, received, raised, left, status, code):
+    monkeypatch.setattr(signals, "_received", received)
+    folder = RunFolder(tmp_path / "run", load_config("pool"), [0])
+    with pytest.raises(left), folder.recorded():
+        raise raised
+    run = json.loads((folder.path / "run.json").read_text())
+    assert (run["status"], run["exit"]) == (status, code)

@@ -253,7 +253,8 @@ class RunFolder:
 
     @contextmanager
     def recorded(self) -> Iterator[None]:
-        """Record how the work inside ends: finished, interrupted by Ctrl-C, or failed."""
+        """Record how the work inside ends: finished, interrupted by Ctrl-C, or failed. What compiled code has
+        made of an interrupt, an error of another kind, leaves here as an interrupt again."""
         status, code = "failed", 1
         try:
             yield
@@ -261,6 +262,11 @@ class RunFolder:
         except KeyboardInterrupt:
             status, code = "interrupted", signals.exit_code()
             raise
+        except Exception as error:
+            if not signals.was_received():
+                raise
+            status, code = "interrupted", signals.exit_code()
+            raise signals.Interrupted from error
         finally:
             self.finish(status, code)
 
