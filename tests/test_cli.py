@@ -290,7 +290,9 @@ def test_presets_are_listed_and_shown(capfd):
     code, out, _ = uuv(capfd, "presets", "--json")
     listed = json.loads(out)
     assert code == 0
-    assert {"pool", "gauntlet", "mixed", "maze", "netpen", "transfer", "open"} <= set(listed["world"])
+    assert {"pool", "gauntlet", "column", "mixed", "maze", "netpen", "transfer", "open"} <= set(
+        listed["world"]
+    )
     assert {"clean", "paper", "nominal", "harsh"} == set(listed["sensors"])
     assert {
         "paper",

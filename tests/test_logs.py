@@ -119,6 +119,28 @@ def by_topic(path, topic):
 # ---------------------------------------------------------------------------------------------------- content
 
 
+def test_a_track_says_how_sure_it_is(log_path):
+    """Covariance, turn rate, heights and other futures, in the order of the moving slots; null = free."""
+    first, second = by_topic(log_path, "/tracks")[0]["tracks"]
+    assert first["covariance"] == pytest.approx(np.arange(1, 11) * 1e-3)
+    assert second["covariance"] == pytest.approx(np.arange(1, 11) * 2e-3)
+    assert (first["turn_rate"], first["turn_variance"]) == pytest.approx((0.3, 0.04))
+    assert (first["above"], first["below"]) == (None, -1.0)
+    assert second["above"] == pytest.approx(-0.4) and second["below"] is None
+    assert second["futures"] == pytest.approx([0.1, 0.25])
+    assert (first["present"], second["present"]) == pytest.approx((0.95, 0.6))
+
+
+def test_an_evasion_is_told_where_one_is_looked_for(log_path, snaps):
+    """Only in the decisions that look for one; null = no conflict."""
+    found = by_topic(log_path, "/evasion")
+    assert len(found) == sum(int(snap["teacher.want_evade"]) for snap in snaps) > 0
+    assert all(message["hold_conflict_s"] is None for message in found)
+    assert {message["candidate"] for message in found} == {-1, 17}
+    assert {message["conflict_s"] is None for message in found} == {True, False}
+    assert found[0]["velocity"] == pytest.approx([0.1, 0.6, 0.2]) and found[0]["cost"] == 2.5
+
+
 def test_every_topic_has_its_schema_and_every_message_fits_it(log_path):
     seen, validators = {}, {}
     for topic, schema, _, _, data in messages(log_path):

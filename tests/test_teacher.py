@@ -36,7 +36,7 @@ TEACHER = {
     "unstick_m_s": 0.3, "slow_clearance_m": 0.6, "slow_fraction": 0.5, "edge_gap_m": 0.26, "depth_gain": 1.0,
     "yaw_gain": 1.5,
     "gaze_m": 3.0, "gaze_level_m": 1.0, "gaze_clearance_m": 0.6, "askew_clearance_m": 0.5,
-    "gaze_off_deg": 25.0,
+    "gaze_off_deg": 25.0, "free_depth": False, "least_share": 0.02, "heed_share": 0.2, "future_margin": 0.6,
 }  # fmt: skip
 """Every number of the stage, so that tuning the defaults breaks nothing here. The dashes end between two
 samples of the forecast."""
@@ -44,6 +44,7 @@ CFG = Config.model_validate(
     {
         "sensors": {"sonar": {"n_ray": N_RAY}},
         "tracking": {"n_track": N_TRACK, "horizon_s": 2.5, "forecast_dt_s": 0.1},
+        "forecast": {"turn_back_s": [0.5, 1.5]},
         "teacher": TEACHER,
     }
 )
@@ -57,6 +58,8 @@ SIZES = {
     "n_candidate": CFG.teacher.n_candidate,
     "n_track": N_TRACK,
     "n_forecast": N_SAMPLE,
+    "n_future": 2,
+    "n_height": 16,
     "n_ray": N_RAY,
     "n_ahead": 16,
     "n_row": grid_shape(TANK, CELL)[0],
@@ -75,6 +78,8 @@ STRUCTS = {
     "t": state.TeacherState,
     "route": state.RouteState,
     "forecast": state.ForecastState,
+    "futures": state.FutureState,
+    "tracks": state.TrackState,
     "scan": state.SonarScan,
     "clearance": state.ClearanceState,
     "ego": state.Proprioception,
@@ -115,6 +120,8 @@ def scene(stage):
     stage.forecast.pos_w.fill(0.0)
     stage.forecast.above_w.fill(-0.8)
     stage.forecast.below_w.fill(-0.8)
+    stage.futures.share.fill(0.0)
+    stage.tracks.alive.fill(0)
     stage.scan.fresh.fill(1)
     stage.scan.hit.fill(0)
     stage.scan.range_m.fill(12.0)
@@ -124,7 +131,7 @@ def scene(stage):
     stage.clearance.site_row.fill(-1)
     stage.clearance.site_col.fill(-1)
     use(stage, "bt")
-    leaves.reset_teacher(io_for(TeacherIO, stage.t, stage.clock))
+    leaves.reset_teacher(io_for(TeacherIO, stage.t, stage.mission, stage.clock))
     return stage
 
 
@@ -160,12 +167,17 @@ def assess(stage, cfg=CFG.teacher):
             stage.t,
             stage.route,
             stage.forecast,
+            stage.futures,
+            stage.tracks,
             stage.scan,
             stage.clearance,
             stage.ego,
             stage.mission,
             stage.clock,
             cfg,
+            CFG.forecast,
+            CFG.elevation,
+            CFG.traffic,
             CFG.vehicle,
             CFG.tracking,
             TANK,
@@ -181,9 +193,11 @@ def plan(stage):
             EvasionIO,
             stage.t,
             stage.forecast,
+            stage.futures,
             stage.clearance,
             stage.ego,
             stage.clock,
+            CFG.forecast,
             CFG.teacher,
             CFG.vehicle,
             CFG.tracking,
@@ -287,6 +301,13 @@ def random_scene(scene, rng):
     put(scene.forecast.pos_w, start[:, :, None] + speed[:, :, None] * TIMES[:, None])
     radii = np.where(rng.random((N_ENV, N_TRACK)) < 0.75, rng.uniform(0.15, 0.4, (N_ENV, N_TRACK)), -1.0)
     put(scene.forecast.radius_m, np.repeat(radii[:, :, None], N_SAMPLE, 2))
+    turned_s, angle = rng.uniform(0.2, 2.0, (N_ENV, N_TRACK, 2)), rng.uniform(-3, 3, (N_ENV, N_TRACK, 2))
+    after = (speed[..., 0] + 1j * speed[..., 1])[..., None] * np.exp(1j * angle)
+    before_s = np.minimum(TIMES, turned_s[..., None])[..., None]
+    after_w = np.stack([after.real, after.imag], -1)[:, :, :, None]
+    way = speed[:, :, None, None] * before_s + after_w * (TIMES[:, None] - before_s)
+    put(scene.futures.pos_w, start[:, :, None, None] + way)
+    put(scene.futures.share, rng.choice([0.0, 0.015, 0.1, 0.3], (N_ENV, N_TRACK, 2)))
     own_z, kind = pos[:, 2:], rng.integers(0, 4, (N_ENV, N_TRACK))
     above, below = (
         own_z + rng.uniform(0, 0.8, (N_ENV, N_TRACK)),
@@ -311,7 +332,7 @@ class View:
         self.forecast = [
             getattr(scene.forecast, name).to_numpy()[env].astype(float)
             for name in ("pos_w", "radius_m", "above_w", "below_w")
-        ]
+        ] + [getattr(scene.futures, name).to_numpy()[env].astype(float) for name in ("pos_w", "share")]
         self.clearance = scene.clearance.clearance_m.to_numpy()[env].astype(float)
 
     def candidates(self):
@@ -943,7 +964,7 @@ def test_sleeping_rows_are_untouched_and_rows_do_not_meet(scene):
         scene.clock.awake.fill(1)
         scene.clock.step.fill(0)
         scene.forecast.radius_m.fill(-1.0)
-        leaves.reset_teacher(io_for(TeacherIO, scene.t, scene.clock))
+        leaves.reset_teacher(io_for(TeacherIO, scene.t, scene.mission, scene.clock))
         body(scene, 0, 0, (7.0, 3.1), (-0.6, 0.0))
         for env in range(1, N_ENV):
             if others:

@@ -22,7 +22,8 @@ from uuvtai.kernels.task import episode
 from uuvtai.kernels.task.bundles import EpisodeIO
 from uuvtai.kernels.world import scenarios
 from uuvtai.kernels.world.bundles import WorldIO
-from uuvtai.shipped import PRESET_DIR
+from uuvtai.loader import load_config
+from uuvtai.shipped import PRESET_DIR, preset_names
 
 N = 192
 """Episodes drawn per world."""
@@ -540,3 +541,18 @@ def test_scenes_that_do_not_fit_are_refused(scene):
 def test_worlds_that_make_no_sense_are_refused(wrong):
     with pytest.raises(ValueError):
         WorldConfig.model_validate(wrong)
+
+
+@pytest.mark.parametrize("world", sorted(preset_names("world")))
+def test_what_is_known_beforehand_is_true_of_the_world(world):
+    """The prior that a world's preset gives the vehicle says of its moving bodies what the world draws."""
+    config = load_config(world)
+    bodies, known = config.world.dynamic, config.traffic
+    if config.world.n_dynamic == 0:
+        return
+    assert known.z_m == bodies.z_m
+    assert abs(config.elevation.column_share - bodies.full_column_fraction) <= 0.051
+    drawn = [*(2 * radius for radius in bodies.radius_m), *bodies.height_m]
+    assert min(drawn) <= known.height_m[0] <= known.height_m[1] <= max(drawn)
+    if bodies.motion == "line_circle" and bodies.circle_fraction < 1:
+        assert known.leg_m == bodies.line_length_m

@@ -19,7 +19,7 @@ from uuvtai.config import Config
 from uuvtai.copying import copied_rows
 from uuvtai.initial import allocate_state, fill_constants
 from uuvtai.kernels.core.rows import copy_rows
-from uuvtai.kernels.perception import elevation, forecast, look, mapping, spotting, tracking
+from uuvtai.kernels.perception import elevation, forecast, futures, look, mapping, spotting, tracking
 from uuvtai.kernels.planning import clearance, features, route, triggers, voronoi
 from uuvtai.kernels.privileged import true_map, true_tracks
 from uuvtai.kernels.sensors import depth, proprioception, sonar
@@ -150,6 +150,8 @@ class Sim:
                 look.look_at_bodies(io.look)
         forecast.learn_habits(io.forecast)
         forecast.forecast_tracks(io.forecast)
+        if c.forecast.turn_back_s:
+            futures.weigh_futures(io.futures)
         elevation.bound_heights(io.heights)
 
     def _observe(self, obs: torch.Tensor) -> None:

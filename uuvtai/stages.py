@@ -12,6 +12,7 @@ import taichi as ti
 from uuvtai import state
 from uuvtai.kernels.perception.bundles import (
     ForecastIO,
+    FuturesIO,
     HeightsIO,
     LookIO,
     MappingIO,
@@ -74,6 +75,7 @@ class SimState:
     spots: state.SpotState
     habits: state.HabitState
     forecast: state.ForecastState
+    futures: state.FutureState
     mask: state.GridMask
     grid_map: state.MapState
     map_scratch: state.MapScratch
@@ -103,6 +105,7 @@ class Stages:
     look: LookIO
     true_tracks: TrueTracksIO
     forecast: ForecastIO
+    futures: FuturesIO
     heights: HeightsIO
     mapping: MappingIO
     true_map: TrueMapIO

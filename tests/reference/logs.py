@@ -209,6 +209,13 @@ def _tracked(bodies: np.ndarray, which: np.ndarray) -> dict[str, Any]:
         "tracks.state": state,
         "tracks.z_m": np.array([bodies[3, 2], 0, bodies[4, 2], 0], np.float32),
         "tracks.radius_m": np.array([0.22, 0, 0.2, 0.5], np.float32),
+        "tracks.cov": np.outer([1.0, 0.0, 2.0, 1.0], np.arange(1, 11) * 1e-3).astype(np.float32),
+        "tracks.turn_rate": np.array([0.3, 0, 0, 0], np.float32),
+        "tracks.turn_cov": np.outer([1.0, 0, 0, 0], [1e-3, 0, 0, 0, 0.04]).astype(np.float32),
+        "tracks.present": np.array([0.95, 0, 0.6, 0.95], np.float32),
+        "forecast.above_w": np.array([1e6, 0, -0.4, 0], np.float32),
+        "forecast.below_w": np.array([-1.0, 0, -1e6, 0], np.float32),
+        "futures.share": np.array([[0.0, 0.0], [0, 0], [0.1, 0.25], [0, 0]], np.float32),
         "tracks.beam_track": np.select([which == 3, which == 4], [0, 2], -1).astype(np.int32),
     }
 
@@ -239,6 +246,14 @@ def _driven(step: int) -> dict[str, Any]:
             [2, 3, 0, 3, 2, 0, 9, 9] if follows else [1, 3, 0, 1, 0, 0, 9, 9], np.int32
         ),
         "teacher.leaf": np.int32(4 if follows else 3),
+        "teacher.want_evade": np.int32(not follows and step % 5 == 0),
+        "teacher.conflict_s": np.float32(1e6 if step % 2 else 0.9),
+        "teacher.hold_conflict_s": np.float32(1e6),
+        "teacher.follow_vel_w": np.array([0.6, 0.1, 0.0], np.float32),
+        "teacher.cruise_z_m": np.float32(-0.2),
+        "teacher.evade_vel_w": np.array([0.1, 0.6, 0.2], np.float32),
+        "teacher.evade_cost": np.float32(2.5),
+        "teacher.evade_candidate": np.int32(-1 if step % 2 else 17),
         "reward.term": np.array([0.01, 0.02, -0.001, 0.0], np.float32),
         "driver.applied": np.array([0.8, 0.0, 0.1, -0.2], np.float32),
         **{f"driver.{name}": None for name in outputs},

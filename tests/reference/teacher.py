@@ -51,28 +51,37 @@ def distance_to(body, radius, above, below, at, cfg):
 def body_depths(pos, vel, command, forecast, cfg, tank, dt_s, burst_s=np.inf):
     """(peak, mean, contact, first, doubt) of one command [m/s, 3].
 
-    ``forecast`` = (places [track, k, 2], radii [track, k], negative = nothing, above [track], below [track]);
-    ``doubt`` [m] = how near any sample is to a case that float32 may decide otherwise.
+    ``forecast`` = (places [track, k, 2], radii [track, k], negative = nothing, above [track], below [track],
+    other futures' places [track, future, k, 2], their shares [track, future]); ``doubt`` [m] = how near any
+    sample is to a case that float32 may decide otherwise.
     """
     n = round(cfg.horizon_s / dt_s)
     at, moving = rolled_out(pos, vel, command, cfg.lag_s, dt_s, n, burst_s)
     at[:, 2] = np.clip(at[:, 2], *depth_band(tank, cfg))
     peak, mean, contact, first, doubt = 0.0, 0.0, 0.0, np.inf, np.inf
-    for body, radius, above, below in zip(*forecast, strict=True):
+    for body, radius, above, below, others, shares in zip(*forecast, strict=True):
         if radius[0] < 0:
             continue
-        for k in range(1, n + 1):
-            distance, slope, unsure = distance_to(body[k], radius[k], above, below, at[k], cfg)
-            outward = (at[k, :2] - body[k]) / np.hypot(*(at[k, :2] - body[k]))
-            closing = max(0.0, -(moving[k, :2] - (body[k] - body[k - 1]) / dt_s) @ outward)
-            free = distance - cfg.hull_reach_m - cfg.closing_s * closing * slope
-            wanted = cfg.contact_m + cfg.caution * (cfg.margin_m + cfg.margin_growth_m_s * k * dt_s)
-            depth = max(0.0, wanted - free)
-            peak, contact = max(peak, depth), max(contact, cfg.contact_m - free)
-            mean += depth / n
-            doubt = min(doubt, unsure)
-            if depth > 0:
-                first = min(first, k * dt_s)
+        heeded = [(other, share, cfg.future_margin) for other, share in zip(others, shares, strict=True)]
+        heeded = [future for future in heeded if future[1] > cfg.least_share]
+        heeded.append((body, 1.0 - sum(future[1] for future in heeded), 1.0))
+        expected = np.zeros(2)
+        for places, share, margin in heeded:
+            deepest, nearest = 0.0, 0.0
+            for k in range(1, n + 1):
+                distance, slope, unsure = distance_to(places[k], radius[k], above, below, at[k], cfg)
+                outward = (at[k, :2] - places[k]) / np.hypot(*(at[k, :2] - places[k]))
+                closing = max(0.0, -(moving[k, :2] - (places[k] - places[k - 1]) / dt_s) @ outward)
+                free = distance - cfg.hull_reach_m - cfg.closing_s * closing * slope
+                wanted = margin * cfg.caution * (cfg.margin_m + cfg.margin_growth_m_s * k * dt_s)
+                depth = max(0.0, cfg.contact_m + wanted - free)
+                deepest, nearest = max(deepest, depth), max(nearest, cfg.contact_m - free)
+                mean += share * depth / n
+                doubt = min(doubt, unsure)
+                if depth > 0 and share >= cfg.heed_share:
+                    first = min(first, k * dt_s)
+            expected += share * np.array([deepest, nearest])
+        peak, contact = max(peak, expected[0]), max(contact, expected[1])
     return peak, mean, contact, first, doubt
 
 

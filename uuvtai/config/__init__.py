@@ -25,6 +25,7 @@ from uuvtai.config.sensors import (
 )
 from uuvtai.config.task import EpisodeConfig, RewardConfig
 from uuvtai.config.teacher import TeacherConfig
+from uuvtai.config.traffic import TrafficConfig
 from uuvtai.config.vehicle import ActuationConfig, DisturbanceConfig, Thruster, VehicleConfig
 from uuvtai.config.world import (
     DynamicObstacles,
@@ -44,6 +45,7 @@ class Config(Section):
     actuation: ActuationConfig = ActuationConfig()
     disturbance: DisturbanceConfig = DisturbanceConfig()
     sensors: SensorsConfig = SensorsConfig()
+    traffic: TrafficConfig = TrafficConfig()
     tracking: TrackingConfig = TrackingConfig()
     forecast: ForecastConfig = ForecastConfig()
     elevation: ElevationConfig = ElevationConfig()
@@ -85,6 +87,7 @@ __all__ = [
     "TeacherConfig",
     "Thruster",
     "TrackingConfig",
+    "TrafficConfig",
     "VehicleConfig",
     "VoronoiConfig",
     "Waypoint",

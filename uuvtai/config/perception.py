@@ -42,6 +42,8 @@ class TrackingConfig(Section):
     """squared normalised innovation (3 values) beyond which a body is taken to have turned"""
     moving_speed_m_s: NonNegative = 0.08
     moving_doppler_m_s: NonNegative = 0.03
+    sight_doppler_m_s: Positive = 0.2
+    """a body moves from its first scan on where its Doppler is larger"""
     moving_shift_m: NonNegative = 0.12
     """displacement (forgotten over shift_memory_s) that shows motion across the beams"""
     shift_memory_s: Positive = 2.0
@@ -85,6 +87,16 @@ class ForecastConfig(Section):
     """bodies turn back at the tank's walls"""
     use_coasting: bool = True
     """unseen bodies go on by their habits; off: straight on, or along their arc"""
+    turn_back_s: tuple[Positive, ...] = ()
+    """[s] a body on a straight way may turn back within the first of these times, between the first and the
+    second, and so on: one future each, with its probability, (0.4, 0.8) for example; () = it goes on for
+    sure (in trials futures cost more in timeouts than they saved in collisions)"""
+
+    @model_validator(mode="after")
+    def _rising(self) -> ForecastConfig:
+        if list(self.turn_back_s) != sorted(set(self.turn_back_s)):
+            raise ValueError(f"turn_back_s must rise, got {self.turn_back_s}: for example (0.5, 1.2, 2.2)")
+        return self
 
 
 class ElevationConfig(Section):

@@ -9,7 +9,9 @@ class TeacherConfig(Section):
     """Behaviour tree's leaves: assessment of threats, evasion and driving. Ports of a tree override the
     numbers that are a leaf's own."""
 
-    cruise_m_s: Positive = 0.6
+    cruise_m_s: Positive = 0.85
+    """where there is room for a body diagonal along the way; in narrow places no more than ``max_surge_m_s``,
+    and 0.6 drives nose first everywhere, as in the paper"""
     decide_period_steps: PositiveCount = 5
     """control steps between decisions of the evasion (10 Hz: more made no difference in a trial)"""
     lag_s: Positive = 0.35
@@ -40,9 +42,15 @@ class TeacherConfig(Section):
     """the margin grows with prediction time"""
     closing_s: NonNegative = 0.25
     """effective clearance is reduced by this times the closing speed (the referee stops at 0.18 s)"""
-    vertical_weight: Positive = 1.5
+    vertical_weight: Positive = 2.0
     """free water above or below a body counts this many times: the hull is slimmer upwards (0.17 m) and
     heights carry their own margin"""
+    least_share: Fraction = 0.02
+    """futures that are less probable are left out,"""
+    heed_share: Fraction = 0.2
+    """and those that are less probable than this cost, but are no reason to evade"""
+    future_margin: Fraction = 1.0
+    """margin kept from a body that does something else than is forecast, as a share of the usual one"""
     caution: Positive = 1.0
     """factor of both margins from moving bodies: more trades time and success for fewer collisions"""
     static_margin_m: NonNegative = 0.1
@@ -85,8 +93,27 @@ class TeacherConfig(Section):
     """speed falls below cruise where the static clearance is smaller than this"""
     slow_fraction: Fraction = 0.75
     """share of cruise speed left at contact"""
-    edge_gap_m: NonNegative = 0.26
-    """hull centre to surface or floor, at least"""
+    edge_gap_m: NonNegative = 0.2
+    """hull centre to surface or floor, at least: the hull's radius of 0.17 m and 0.03 m,"""
+    edge_sigmas: NonNegative = 3.0
+    """and so many standard deviations of the own depth"""
+    free_depth: bool = True
+    """cruise at the depth where the fewest bodies are to be met, as far as the goal's depth can still be
+    reached in time; false = at the goal's depth"""
+    depth_choices: PositiveCount = 8
+    """depths to choose among, from edge to edge"""
+    depth_reach_m: Positive = 3.0
+    """tracked bodies count by reach / (reach + distance)"""
+    weight_traffic: NonNegative = 1.0
+    """of the bodies that are expected but not seen (``traffic``), by the share of them that is level"""
+    weight_seen: NonNegative = 0.0
+    """per tracked body level with the vehicle"""
+    weight_goal_depth: NonNegative = 0.05
+    """[1/m] of the way to the goal's depth"""
+    weight_depth_change: NonNegative = 0.1
+    """[1/m] of leaving the depth chosen before"""
+    return_slope: NonNegative = 0.3
+    """[m/m] how much farther from the goal's depth the vehicle may be per metre from the goal"""
     depth_gain: Positive = 1.0
     """[1/s] heave per metre of depth error"""
     gaze_m: NonNegative = 3.0

@@ -21,6 +21,7 @@ STRING: Schema = {"type": "string"}
 BOOLEAN: Schema = {"type": "boolean"}
 BASE64: Schema = {"type": "string", "contentEncoding": "base64"}
 UINT: Schema = {"type": "integer", "minimum": 0}
+INT: Schema = {"type": "integer"}
 THREE: Schema = {"type": "array", "items": NUMBER, "minItems": 3, "maxItems": 3}
 FOUR: Schema = {"type": "array", "items": NUMBER, "minItems": 4, "maxItems": 4}
 _NSEC: Schema = {"type": "integer", "minimum": 0, "maximum": 999_999_999}

@@ -73,6 +73,11 @@ IMAGES = When(
     ("image.fresh",),
     hertz=2.0,
 )
+EVADING = When(
+    "every decision that looks for an evasion",
+    lambda moment, waited: bool(moment["teacher.want_evade"]),
+    ("teacher.want_evade",),
+)
 EVENTS = When(
     "replans, end of the episode",
     lambda moment, waited: moment.replanned or moment.ended,

@@ -14,6 +14,7 @@ from uuvtai.state.arrays import PACKET, REAL, WORD, allocate, array, bytes_of
 from uuvtai.state.perception import (
     ClusterState,
     ForecastState,
+    FutureState,
     GridMask,
     HabitState,
     MapScratch,
@@ -44,6 +45,7 @@ __all__ = [
     "FeatureState",
     "FixedTable",
     "ForecastState",
+    "FutureState",
     "GridMask",
     "HabitState",
     "MapScratch",

@@ -147,6 +147,10 @@ class HabitState:
     """[m, m, m/s, m/s] state of the track when it was last on a straight leg"""
     leg_step: ti.Field = array("n_env", "n_track", dtype=ti.i32)
     """episode step of that, -1 = never"""
+    run_from_w: ti.Field = array("n_env", "n_track", vec=2)
+    """[m] where the present straight way began, or was first seen"""
+    run_kind: ti.Field = array("n_env", "n_track", dtype=ti.i32)
+    """0 = on none yet, 1 = its begin was not seen, 2 = it began with a turn that was seen"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,6 +170,20 @@ class ForecastState:
     be level with the vehicle"""
     below_w: ti.Field = array("n_env", "n_track")
     """[m] world z of the highest edge of what may be below"""
+
+
+@dataclass(frozen=True, eq=False)
+class FutureState:
+    """What each moving track may do instead of what is forecast, and how probable that is.
+
+    Whoever fills it (a learned forecast, say) gives probabilities that sum to 1 at most; what is left is the
+    forecast's own. A body begins all its futures where the forecast does, and is never faster than there.
+    """
+
+    share: ti.Field = array("n_env", "n_track", "n_future")
+    """probability of this future, 0 = none"""
+    pos_w: ti.Field = array("n_env", "n_track", "n_future", "n_forecast", vec=2)
+    """[m] where the body then is, at the forecast's times"""
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,11 +30,17 @@ class TeacherState:
     leaf: ti.Field = array("n_env", dtype=ti.i32)
     """node that set the action, -1 = none (then the vehicle is told to stop)"""
     follow_vel_w: ti.Field = array("n_env", vec=3)
-    """[m/s] velocity that following the route asks for (level)"""
+    """[m/s] velocity that following the route asks for"""
+    speed_share: ti.Field = array("n_env")
+    """share of the cruising speed that narrow places leave"""
+    cruise_z_m: ti.Field = array("n_env")
+    """[m] world z to cruise at"""
     evade_vel_w: ti.Field = array("n_env", vec=3)
     """[m/s] best evasive velocity found"""
     evade_cost: ti.Field = array("n_env")
     """cost of that velocity"""
+    evade_candidate: ti.Field = array("n_env", dtype=ti.i32)
+    """its number among the candidates; -1 = the mean of the best ones"""
     candidate_cost: ti.Field = array("n_env", "n_candidate", scratch=True)
     """cost of every candidate of the newest decision"""
     want_evade: ti.Field = array("n_env", dtype=ti.i32)

@@ -13,7 +13,9 @@ from uuvtai.config import (
     SonarConfig,
     SpottingConfig,
     TankConfig,
+    TeacherConfig,
     TrackingConfig,
+    TrafficConfig,
 )
 from uuvtai.kernels.core.signature import Const, In, Out
 from uuvtai.state import (
@@ -21,6 +23,7 @@ from uuvtai.state import (
     ClusterState,
     DepthImage,
     ForecastState,
+    FutureState,
     GridMask,
     HabitState,
     MapScratch,
@@ -46,6 +49,22 @@ class ForecastIO:
     forecast_cfg: Const[ForecastConfig]
     tank_cfg: Const[TankConfig]
     tracking_cfg: Const[TrackingConfig]
+
+
+@dataclass(frozen=True, eq=False)
+class FuturesIO:
+    """What else the bodies may do."""
+
+    futures: Out[FutureState]
+    clock: In[ClockState]
+    forecast: In[ForecastState]
+    habits: In[HabitState]
+    tracks: In[TrackState]
+    forecast_cfg: Const[ForecastConfig]
+    tank_cfg: Const[TankConfig]
+    teacher_cfg: Const[TeacherConfig]
+    tracking_cfg: Const[TrackingConfig]
+    traffic_cfg: Const[TrafficConfig]
 
 
 @dataclass(frozen=True, eq=False)

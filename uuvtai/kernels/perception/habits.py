@@ -62,6 +62,8 @@ def forget_habits(env, io: Bundle[ForecastIO]):
     for track in range(io.habits.leg_step.shape[1]):
         io.habits.leg[env, track] = ti.zero(io.habits.leg[env, track])
         io.habits.leg_step[env, track] = -1
+        io.habits.run_from_w[env, track] = ti.Vector([0.0, 0.0])
+        io.habits.run_kind[env, track] = 0
 
 
 # ------------------------------------------------------------------------------------------------------ learn
@@ -73,6 +75,7 @@ def learn_habit(env, track, io: Bundle[ForecastIO]):
     went past."""
     if io.tracks.alive[env, track] == 0 or io.tracks.age[env, track] == 0:
         io.habits.leg_step[env, track] = -1
+        io.habits.run_kind[env, track] = 0
     elif (
         io.tracks.moving[env, track] == 1
         and io.tracks.misses[env, track] == 0
@@ -80,6 +83,9 @@ def learn_habit(env, track, io: Bundle[ForecastIO]):
     ):
         now, leg = io.tracks.state[env, track], io.habits.leg[env, track]
         time = (io.tracks.scan_step[env] - io.habits.leg_step[env, track]) * io.episode_cfg.control_dt_s
+        begin, kind = io.habits.run_from_w[env, track], io.habits.run_kind[env, track]
+        if kind == 0 or time >= _LONGEST_S:
+            begin, kind = ti.Vector([now[0], now[1]]), 1
         if io.habits.leg_step[env, track] >= 0 and time < _LONGEST_S:
             speed, leg_speed = ti.sqrt(now[2] ** 2 + now[3] ** 2), ti.sqrt(leg[2] ** 2 + leg[3] ** 2)
             course, leg_course = (
@@ -88,13 +94,14 @@ def learn_habit(env, track, io: Bundle[ForecastIO]):
             )
             if course.dot(leg_course) < _TURNED_COS:
                 way = 0.5 * time * (speed + leg_speed)
-                place_turn(
+                begin, kind = place_turn(
                     env, ti.Vector([leg[0], leg[1]]), leg_course, ti.Vector([now[0], now[1]]), course, way, io
                 )
             else:
                 drop_passed(env, ti.Vector([now[0], now[1]]), course, speed * time, io)
         io.habits.leg[env, track] = now
         io.habits.leg_step[env, track] = io.tracks.scan_step[env]
+        io.habits.run_from_w[env, track], io.habits.run_kind[env, track] = begin, kind
 
 
 @ti.func
@@ -108,7 +115,8 @@ def on_straight_leg(env, track, io: Bundle[ForecastIO]):
 
 @ti.func
 def place_turn(env, p0, d0, p1, d1, way, io: Bundle[ForecastIO]):
-    """Remember the turn between two legs, unless they do not meet."""
+    """Remember the turn between two legs, unless they do not meet. Returns where the second leg began as far
+    as is known, and its ``run_kind``."""
     # With a = (L + u) / 2 and b = (L - u) / 2 the legs' ends p0 + a d0 and p1 - b d1 differ by p0 - p1 + L
     # (d0 + d1) / 2 + u (d0 - d1) / 2; ``uneven`` is the u that makes this least.
     fold = d0 - d1
@@ -116,8 +124,11 @@ def place_turn(env, p0, d0, p1, d1, way, io: Bundle[ForecastIO]):
     before, after = 0.5 * (way + uneven), 0.5 * (way - uneven)
     corner = p0 + before * d0
     misfit = (p1 - after * d1 - corner).norm()
+    begin, kind = p1, 1
     if ti.min(before, after) > -_MISFIT_M and misfit < _MISFIT_M:
-        store_turn(env, 0.5 * (corner + p1 - after * d1), d0, d1, io)
+        begin, kind = 0.5 * (corner + p1 - after * d1), 2
+        store_turn(env, begin, d0, d1, io)
+    return begin, kind
 
 
 @ti.func

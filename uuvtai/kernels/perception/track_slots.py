@@ -17,6 +17,10 @@ from uuvtai.state import TrackState
 SEEN_THROUGH = 1
 BLOCKED = 2
 
+_SIGHT_SIGMAS = 6.0
+_SIGHT_BEAMS = 3
+"""What is moving at first sight: a mean Doppler of so many standard deviations over so many beams."""
+
 _MISS_S = 0.1
 """One "miss" of the config: a nominal 10 Hz scan."""
 
@@ -251,6 +255,18 @@ def begin_track(env, track, c, io: Bundle[TrackingIO]):
     io.tracks.doppler_var[env, track] = io.clusters.doppler_var[env, c]
     io.tracks.seen_step[env, track] = io.scan.ping_step[env]
     begin_height(env, track, io.tracks, io.elevation_cfg)
+    io.tracks.moving[env, track] = moves_at_sight(env, c, io)
+
+
+@ti.func
+def moves_at_sight(env, c, io: Bundle[TrackingIO]):
+    """1 where the first scan's Doppler alone shows motion: for this, several beams must agree, and it must be
+    far beyond what noise and the own velocity's error can feign."""
+    bar = ti.max(
+        ti.static(io.tracking_cfg.sight_doppler_m_s), _SIGHT_SIGMAS * ti.sqrt(io.clusters.doppler_var[env, c])
+    )
+    several = io.clusters.n_beam[env, c] >= _SIGHT_BEAMS
+    return ti.cast(several and ti.abs(io.clusters.doppler_m_s[env, c]) > bar, ti.i32)
 
 
 @ti.func

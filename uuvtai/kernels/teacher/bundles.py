@@ -5,11 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from uuvtai.config import (
+    ElevationConfig,
     EpisodeConfig,
+    ForecastConfig,
     MappingConfig,
     TankConfig,
     TeacherConfig,
     TrackingConfig,
+    TrafficConfig,
     VehicleConfig,
 )
 from uuvtai.kernels.core.signature import Const, In, Out
@@ -17,11 +20,13 @@ from uuvtai.state import (
     ClearanceState,
     ClockState,
     ForecastState,
+    FutureState,
     MissionState,
     Proprioception,
     RouteState,
     SonarScan,
     TeacherState,
+    TrackState,
     TreeTable,
 )
 
@@ -35,6 +40,8 @@ class EvasionIO:
     clock: In[ClockState]
     ego: In[Proprioception]
     forecast: In[ForecastState]
+    futures: In[FutureState]
+    forecast_cfg: Const[ForecastConfig]
     mapping_cfg: Const[MappingConfig]
     tank_cfg: Const[TankConfig]
     teacher_cfg: Const[TeacherConfig]
@@ -66,12 +73,17 @@ class ThreatsIO:
     clock: In[ClockState]
     ego: In[Proprioception]
     forecast: In[ForecastState]
+    futures: In[FutureState]
     mission: In[MissionState]
     route: In[RouteState]
     scan: In[SonarScan]
+    tracks: In[TrackState]
+    elevation_cfg: Const[ElevationConfig]
     episode_cfg: Const[EpisodeConfig]
+    forecast_cfg: Const[ForecastConfig]
     mapping_cfg: Const[MappingConfig]
     tank_cfg: Const[TankConfig]
     teacher_cfg: Const[TeacherConfig]
     tracking_cfg: Const[TrackingConfig]
+    traffic_cfg: Const[TrafficConfig]
     vehicle_cfg: Const[VehicleConfig]

@@ -26,13 +26,14 @@ def plan_evasion(io: Bundle[EvasionIO]):
                 io.teacher.candidate_cost[env, packet * LANES + i] = cost[i]
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
         if pad == 0 and io.clock.awake[env] == 1 and io.teacher.want_evade[env] == 1:
-            best, best_cost, mean = _chosen(env, io)
+            index, best_cost, mean = _chosen(env, io)
             cx, cy, cz = f16x(0.0), f16x(0.0), f16x(0.0)
             for i in ti.static(range(LANES)):
                 cx[i], cy[i], cz[i] = mean[0], mean[1], mean[2]
             cost = cost_lanes(env, cx, cy, cz, FAR_M, io)
             good = cost[0] <= best_cost + ti.static(io.teacher_cfg.softness)
-            io.teacher.evade_vel_w[env] = ti.select(good, mean, best)
+            io.teacher.evade_vel_w[env] = ti.select(good, mean, candidate(env, index, io))
+            io.teacher.evade_candidate[env] = ti.select(good, -1, index)
             io.teacher.evade_cost[env] = ti.select(good, cost[0], best_cost)
 
 
@@ -115,9 +116,7 @@ def cost_lanes(env, cx, cy, cz, burst_s, io: Bundle[EvasionIO]):
     every candidate is bad."""
     pos, vel = io.ego.pos_w[env], turned_z3(io.ego.vel_b[env], io.ego.rpy[env][2])
     level, level_vel = ti.Vector([pos[0], pos[1]]), ti.Vector([vel[0], vel[1]])
-    peak, mean, contact, _ = body_depths(
-        env, cx, cy, cz, burst_s, pos, vel, io.forecast, io.teacher_cfg, io.tracking_cfg, io.tank_cfg
-    )
+    peak, mean, contact, _ = body_depths(env, cx, cy, cz, burst_s, pos, vel, io)
     static_mean, static_contact = static_depths(
         env, cx, cy, burst_s, level, level_vel, io.clearance, io.teacher_cfg, io.tank_cfg, io.mapping_cfg
     )
@@ -162,4 +161,4 @@ def _chosen(env, io: Bundle[EvasionIO]):
             total += weight
             mean += weight * candidate(env, index, io)
     average = ti.Vector([mean[i] / total for i in range(3)])
-    return candidate(env, best, io), best_cost, average
+    return best, best_cost, average

@@ -8,6 +8,7 @@ from uuvtai import tree_codes as codes
 from uuvtai.kernels.core.geometry import FAR_M, PI, quaternion_wb, rotation_wb, turned_z, wrapped_angle
 from uuvtai.kernels.core.signature import AnyTensor, Bundle, spread
 from uuvtai.kernels.teacher.bundles import TeacherIO
+from uuvtai.kernels.teacher.threats import cruising_speed
 from uuvtai.kernels.teacher.trajectories import held_heave
 from uuvtai.kernels.teacher.tree_tick import tick_nodes
 from uuvtai.taichi_patches.launch import quick_launch
@@ -39,6 +40,7 @@ def _reset_blackboard(env, io: Bundle[TeacherIO]):
     io.teacher.leaf[env] = -1
     io.teacher.follow_vel_w[env], io.teacher.evade_vel_w[env], io.teacher.last_vel_w[env] = zero, zero, zero
     io.teacher.evade_cost[env] = 0.0
+    io.teacher.evade_candidate[env] = -1
     io.teacher.want_evade[env] = 0
     io.teacher.ttc_s[env], io.teacher.nearest_m[env] = FAR_M, FAR_M
     io.teacher.threat_bearing[env], io.teacher.nearest_bearing[env] = 0.0, 0.0
@@ -51,6 +53,7 @@ def _reset_blackboard(env, io: Bundle[TeacherIO]):
         FAR_M,
     )
     io.teacher.calm_steps[env], io.teacher.evading_steps[env] = 0, 0
+    io.teacher.speed_share[env], io.teacher.cruise_z_m[env] = 0.0, io.mission.goal_w[env][2]
 
 
 @quick_launch
@@ -152,10 +155,11 @@ def _wanted_velocity(env, leaf, node, io: Bundle[TeacherIO]):
     out = ti.Vector([0.0, 0.0, 0.0])
     away = io.teacher.away_w[env]
     if leaf == codes.FOLLOW_ROUTE:
-        out = io.teacher.follow_vel_w[env] * (
-            _port(node, 0, ti.static(io.teacher_cfg.cruise_m_s), io) / ti.static(io.teacher_cfg.cruise_m_s)
-        )
-        out[2] = io.teacher.follow_vel_w[env][2]
+        out = io.teacher.follow_vel_w[env]
+        if io.table.param[node][0] >= 0.0:
+            usual = cruising_speed(env, ti.static(io.teacher_cfg.cruise_m_s), io)
+            share = cruising_speed(env, io.table.param[node][0], io) / ti.max(usual, 1.0e-6)
+            out[0], out[1] = share * out[0], share * out[1]
         if _port(node, 1, 1.0, io) < 0.5:
             out[2] = held_heave(
                 io.mission.goal_w[env][2] - io.ego.pos_w[env][2], io.teacher_cfg, io.vehicle_cfg
@@ -233,7 +237,8 @@ def _turn(leaf, velocity, gaze, yaw, room, io: Bundle[TeacherIO]):
     """Angle to turn by: nose towards what is to be looked at, else along the way (where that is narrow, tail
     first is as slim).
 
-    In danger a diagonal of the body goes along the way, because diagonals are faster: that whose nose is
+    In danger, and to cruise faster than the nose drives ahead, a diagonal of the body goes along the way,
+    because diagonals are faster: that whose nose is
     nearest to what is to be looked at, not farther off than the camera sees well, or else nearest to the
     present heading.
     """
@@ -242,7 +247,9 @@ def _turn(leaf, velocity, gaze, yaw, room, io: Bundle[TeacherIO]):
     turn = ti.select(gazes, look, 0.0)
     if velocity[0] * velocity[0] + velocity[1] * velocity[1] > 0.01:
         way = wrapped_angle(ti.atan2(velocity[1], velocity[0]) - yaw)
-        if leaf >= codes.BACK_OFF and leaf <= codes.EVADE:
+        level_m_s = ti.sqrt(velocity[0] * velocity[0] + velocity[1] * velocity[1])
+        fast = leaf == codes.FOLLOW_ROUTE and level_m_s > ti.static(1.01 * io.vehicle_cfg.max_surge_m_s)
+        if fast or (leaf >= codes.BACK_OFF and leaf <= codes.EVADE):
             off, quarter = wrapped_angle(way - turn), 0.5 * PI
             aside = off - quarter * (ti.floor(off / quarter) + 0.5)
             most = ti.select(gazes, ti.static(math.radians(io.teacher_cfg.gaze_off_deg)), PI)

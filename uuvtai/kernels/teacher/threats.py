@@ -1,6 +1,8 @@
 """Assessment of threats for the behaviour tree: what the sonar feels, what the map holds, and whether
 following the route conflicts."""
 
+from typing import Any
+
 import taichi as ti
 
 from uuvtai.kernels.core.geometry import FAR_M, TWO_PI, turned_z3, wrapped_angle
@@ -8,7 +10,8 @@ from uuvtai.kernels.core.grid import cell_of, centre_of
 from uuvtai.kernels.core.lanes import f16x
 from uuvtai.kernels.core.signature import Bundle, spread
 from uuvtai.kernels.teacher.bundles import ThreatsIO
-from uuvtai.kernels.teacher.trajectories import body_depths, depth_band, held_heave
+from uuvtai.kernels.teacher.cruise_depth import choose_depth
+from uuvtai.kernels.teacher.trajectories import body_depths, held_heave
 from uuvtai.taichi_patches.launch import quick_launch
 
 _PATH_SAMPLES = 8
@@ -154,9 +157,19 @@ def _follow_velocity(env, io: Bundle[ThreatsIO]):
         io.teacher_cfg.askew_clearance_m
     ):  # across the way the hull is wider: let it turn first
         share *= 1.0 - 0.6 * sideways
-    speed = ti.select(io.route.n_way[env] > 0, ti.static(io.teacher_cfg.cruise_m_s) * share, 0.0)
-    wanted = _unit(level) * speed
+    io.teacher.speed_share[env] = ti.select(io.route.n_way[env] > 0, share, 0.0)
+    wanted = _unit(level) * cruising_speed(env, ti.static(io.teacher_cfg.cruise_m_s), io)
     io.teacher.follow_vel_w[env] = ti.Vector([wanted[0], wanted[1], io.teacher.follow_vel_w[env][2]])
+
+
+@ti.func
+def cruising_speed(env, top_m_s, io: Bundle[Any]):
+    """[m/s] along the route: at most ``top_m_s``, slower in narrow places, where the nose lies along the way
+    and no diagonal of the body is faster."""
+    speed = top_m_s * io.teacher.speed_share[env]
+    if io.teacher.path_clearance_m[env] <= ti.static(io.teacher_cfg.gaze_clearance_m):
+        speed = ti.min(speed, ti.static(io.vehicle_cfg.max_surge_m_s))
+    return speed
 
 
 @ti.func
@@ -164,26 +177,20 @@ def _foresee_conflict(env, io: Bundle[ThreatsIO]):
     """Roll the follow velocity out against the forecasts, in decision steps only, with and without a change
     of depth; and a stop.
 
-    Depth is changed towards the goal's only where that comes no nearer to any body: what is above or below is
-    easily forgotten.
+    Depth is changed only where that comes no nearer to any body: what is above or below is easily forgotten.
     """
     io.teacher.want_evade[env] = 0
     io.teacher.calm_steps[env] += 1
     if io.clock.step[env] % ti.static(io.teacher_cfg.decide_period_steps) == 0:
         pos, vel = io.ego.pos_w[env], turned_z3(io.ego.vel_b[env], io.ego.rpy[env][2])
         follow = io.teacher.follow_vel_w[env]
-        low, high = ti.static(depth_band(io.tank_cfg, io.teacher_cfg))
-        heave = held_heave(
-            ti.math.clamp(io.mission.goal_w[env][2], low, high) - pos[2], io.teacher_cfg, io.vehicle_cfg
-        )
+        heave = held_heave(choose_depth(env, io) - pos[2], io.teacher_cfg, io.vehicle_cfg)
         # lanes 0 to 2: follow at this depth, follow and change depth, stop; the others repeat lane 0
         cz = f16x(0.0)
         cz[1] = heave
         cx, cy = f16x(follow[0]), f16x(follow[1])
         cx[2], cy[2] = 0.0, 0.0
-        peak, _, _, first = body_depths(
-            env, cx, cy, cz, FAR_M, pos, vel, io.forecast, io.teacher_cfg, io.tracking_cfg, io.tank_cfg
-        )
+        peak, _, _, first = body_depths(env, cx, cy, cz, FAR_M, pos, vel, io)
         climbs = peak[1] <= peak[0] + 1.0e-3
         io.teacher.follow_vel_w[env][2] = ti.select(climbs, heave, 0.0)
         io.teacher.conflict_s[env] = ti.select(climbs, first[1], first[0])

@@ -7,7 +7,17 @@ from typing import Any
 import numpy as np
 
 from uuvtai.closed_form import KIND_NAMES
-from uuvtai.logs.encode import checked, color, line, scene_entity, scene_update, upright_pose, vector
+from uuvtai.logs.encode import (
+    checked,
+    color,
+    line,
+    number_or_null,
+    numbers,
+    scene_entity,
+    scene_update,
+    upright_pose,
+    vector,
+)
 from uuvtai.logs.moment import Moment
 from uuvtai.logs.schemas import (
     LINE_LOOP,
@@ -45,10 +55,29 @@ _OBSTACLE: Schema = {
     "oneOf": [{"required": ["radius"]}, {"required": ["half_extents"]}],
 }
 _OBSTACLES = record("uuv.Obstacles", "Truth. In the order of scenario.json.", obstacles=array_of(_OBSTACLE))
+_TRACK = record(
+    "uuv.Track",
+    "State at the newest tracked scan.",
+    {
+        "above": described(NUMBER, "[m] world z of the lowest edge of what may be above; null = free"),
+        "below": described(NUMBER, "[m] world z of the highest edge of what may be below; null = free"),
+    },
+    x=NUMBER,
+    y=NUMBER,
+    z=NUMBER,
+    vx=NUMBER,
+    vy=NUMBER,
+    radius=NUMBER,
+    covariance=described(array_of(NUMBER), "of x, y, vx, vy: upper triangle, row by row"),
+    turn_rate=described(NUMBER, "[rad/s], 0 = unknown"),
+    turn_variance=described(NUMBER, "[rad^2/s^2], 0 = not estimated"),
+    present=described(NUMBER, "probability that it is where it is expected"),
+    futures=described(array_of(NUMBER), "probability of each future beside the forecast"),
+)
 _TRACKS = record(
     "uuv.Tracks",
     "Moving bodies that the vehicle believes in.",
-    tracks=array_of(record("uuv.Track", x=NUMBER, y=NUMBER, z=NUMBER, vx=NUMBER, vy=NUMBER, radius=NUMBER)),
+    tracks=array_of(_TRACK),
     beams=described(array_of(UINT), "beams of the newest scan that a moving body explains"),
 )
 
@@ -60,7 +89,10 @@ _TRUTH = {
 }
 _SIZES = {"sphere": [0], "cylinder": [0, 2], "box": [0, 1, 2]}
 _SHAPES = {"sphere": "spheres", "cylinder": "cylinders", "box": "cubes"}
-_TRACK = '{"x":%.9g,"y":%.9g,"z":%.9g,"vx":%.9g,"vy":%.9g,"radius":%.9g}'
+_TRACK_TEXT = '{"x":%.9g,"y":%.9g,"z":%.9g,"vx":%.9g,"vy":%.9g,"radius":%.9g,'
+_BELIEF_TEXT = '"turn_rate":%.9g,"turn_variance":%.9g,"present":%.9g,"above":%s,"below":%s,'
+_FREE_M = 1e5
+"""Bounds beyond are no bounds."""
 
 
 def _goal(moment: Moment) -> bytes:
@@ -129,10 +161,28 @@ def _tracks(moment: Moment) -> bytes:
     moving = (moment["tracks.alive"] == 1) & (moment["tracks.moving"] == 1)
     state, explained = moment["tracks.state"][moving], moment["tracks.beam_track"]
     z_m, radius_m = moment["tracks.z_m"][moving], moment["tracks.radius_m"][moving]
-    rows = np.column_stack([state[:, :2], z_m, state[:, 2:], radius_m])
+    rows = np.column_stack([state[:, :2], z_m, state[:, 2:], radius_m]).tolist()
+    beliefs = [
+        moment[name][moving]
+        for name in (
+            *("tracks.turn_rate", "tracks.turn_cov", "tracks.present"),
+            *("forecast.above_w", "forecast.below_w"),
+        )
+    ]
+    lists = moment["tracks.cov"][moving], moment["futures.share"][moving]
     beams = np.flatnonzero((explained >= 0) & moving[np.maximum(explained, 0)])
-    text = ",".join(_TRACK % tuple(row) for row in rows.tolist())
+    text = ",".join(
+        _TRACK_TEXT % tuple(row)
+        + _belief(*belief)
+        + f'"covariance":{numbers(cov)},"futures":{numbers(futures)}}}'
+        for row, belief, cov, futures in zip(rows, zip(*beliefs, strict=True), *lists, strict=True)
+    )
     return f'{{"tracks":[{checked(text)}],"beams":[{",".join(map(str, beams.tolist()))}]}}'.encode()
+
+
+def _belief(rate: float, rate_cov: np.ndarray, present: float, above: float, below: float) -> str:
+    bounds = [number_or_null(None if abs(z) > _FREE_M else float(z)) for z in (above, below)]
+    return _BELIEF_TEXT % (rate, rate_cov[4], present, *bounds)
 
 
 def _read_tracks(data: dict[str, Any]) -> np.ndarray:
@@ -151,7 +201,11 @@ ROWS = (
         NEW_SCAN,
         _TRACKS,
         _tracks,
-        tuple(f"tracks.{name}" for name in ("alive", "moving", "state", "z_m", "radius_m", "beam_track")),
+        (
+            *(f"tracks.{name}" for name in ("alive", "moving", "state", "z_m", "radius_m", "beam_track")),
+            *(f"tracks.{name}" for name in ("cov", "turn_rate", "turn_cov", "present")),
+            *("forecast.above_w", "forecast.below_w", "futures.share"),
+        ),
         _read_tracks,
     ),
 )

@@ -9,8 +9,8 @@ import numpy as np
 
 from uuvtai.logs.encode import dumped, number, number_or_null, numbers, numbers_or_null
 from uuvtai.logs.moment import EpisodeHeader, Moment
-from uuvtai.logs.schemas import FOUR, NUMBER, STRING, Schema, array_of, described, record
-from uuvtai.logs.topic import EVERY_STEP, Topic
+from uuvtai.logs.schemas import FOUR, INT, NUMBER, STRING, THREE, Schema, array_of, described, record
+from uuvtai.logs.topic import EVADING, EVERY_STEP, Topic
 from uuvtai.logs.topics.plan_topics import trigger_of
 
 _FAR = 1e5
@@ -33,6 +33,21 @@ _SAFETY = record(
     clearance_m=described(NUMBER, "hull to the nearest obstacle or wall"),
     path_risk=NUMBER,
     replan_trigger=described(STRING, "none, initial, stuck, safety or intersection"),
+)
+
+
+_EVASION = record(
+    "uuv.Evasion",
+    "What the behaviour tree weighs where following the route conflicts, or lately did. Velocities: world.",
+    {
+        "conflict_s": described(NUMBER, "first conflict of following the route; null = none"),
+        "hold_conflict_s": described(NUMBER, "first conflict of stopping here; null = none"),
+    },
+    follow=described(THREE, "[m/s] velocity that follows the route"),
+    cruise_z=described(NUMBER, "[m] world z that is cruised at"),
+    velocity=described(THREE, "[m/s] evasive velocity of least cost"),
+    cost=described(NUMBER, "of that velocity"),
+    candidate=described(INT, "its number among the candidates; -1 = the mean of the best ones"),
 )
 
 
@@ -77,6 +92,20 @@ def _policy(moment: Moment) -> bytes:
     ).encode()
 
 
+def _evasion(moment: Moment) -> bytes:
+    first, hold = (
+        number_or_null(None if moment[f"teacher.{name}"] > _FAR else float(moment[f"teacher.{name}"]))
+        for name in ("conflict_s", "hold_conflict_s")
+    )
+    return (
+        f'{{"conflict_s":{first},"hold_conflict_s":{hold},'
+        f'"follow":{numbers(moment["teacher.follow_vel_w"])},'
+        f'"cruise_z":{number(moment["teacher.cruise_z_m"])},'
+        f'"velocity":{numbers(moment["teacher.evade_vel_w"])},'
+        f'"cost":{number(moment["teacher.evade_cost"])},"candidate":{int(moment["teacher.evade_candidate"])}}}'
+    ).encode()
+
+
 def _safety(moment: Moment) -> bytes:
     ttc_s = float(moment["referee.ttc_s"])
     return (
@@ -97,6 +126,8 @@ def _tree_text(nodes: tuple[str, ...], codes: tuple[int, ...]) -> bytes:
     return dumped(dict(zip(nodes, (_STATUSES[code] for code in codes), strict=True)))
 
 
+_DECISION = ("conflict_s", "hold_conflict_s", "follow_vel_w", "cruise_z_m", "evade_vel_w", "evade_cost")
+
 ROWS = (
     Topic(
         "/action",
@@ -116,6 +147,13 @@ ROWS = (
             *(f"driver.{name}" for name in ("value", "std", "distill_lambda", "residual", "uncertainty")),
         ),
         varies="Each term of the reward under its own name ([`reward`](configuration/reward.md)): number",
+    ),
+    Topic(
+        "/evasion",
+        EVADING,
+        _EVASION,
+        _evasion,
+        tuple(f"teacher.{name}" for name in (*_DECISION, "evade_candidate")),
     ),
     Topic(
         "/safety",

@@ -1,0 +1,120 @@
+"""Which depth is cruised at: the prior against a drawn population, the choice in hand-made situations."""
+
+import numpy as np
+import pytest
+import taichi as ti
+
+from tests.bundles import io_for
+from uuvtai.config import Config
+from uuvtai.kernels.core.lanes import LANES
+from uuvtai.kernels.core.signature import Bundle
+from uuvtai.kernels.perception.elevation import COLUMN
+from uuvtai.kernels.teacher.bundles import ThreatsIO
+from uuvtai.kernels.teacher.cruise_depth import choose_depth, level_share
+from uuvtai.state import MissionState, Proprioception, TeacherState, TrackState, allocate
+
+N_ENV = 6
+SIZES = {"n_env": N_ENV, "n_track": 1, "n_ray": 16, "n_height": LANES, "n_node": 1, "n_candidate": LANES}
+POOL = {"z_m": [-1.2, -0.4], "height_m": [0.3, 0.5]}
+LOW, HIGH = -1.4, -0.2
+"""Edges of the band: 0.2 m off the floor at -1.6 m and off the surface."""
+
+
+def config(column_share=0.0, **teacher):
+    numbers = {"edge_gap_m": 0.2, "depth_choices": 7, "weight_seen": 0.0} | teacher
+    prior = {"column_share": column_share}
+    return Config.model_validate({"traffic": POOL, "elevation": prior, "teacher": numbers})
+
+
+@ti.kernel
+def _shares(z: ti.types.ndarray(), out: ti.types.ndarray(), io: Bundle[ThreatsIO]):
+    for i in z:
+        out[i] = level_share(z[i], io.traffic_cfg, io.elevation_cfg, io.teacher_cfg, io.vehicle_cfg)
+
+
+@ti.kernel
+def _choose(out: ti.types.ndarray(), io: Bundle[ThreatsIO]):
+    for env in range(N_ENV):
+        out[env] = choose_depth(env, io)
+
+
+class Stage:
+    def __init__(self):
+        kinds = (TeacherState, TrackState, Proprioception, MissionState)
+        self.teacher, self.tracks, self.ego, self.mission = (allocate(kind, SIZES) for kind in kinds)
+
+    def choose(self, goal_z, away_m=10.0, before_z=-0.8, cfg=None):
+        """Depth to steer for of vehicles at -0.8 m whose goals lie so far ahead."""
+        cfg = cfg or config()
+        n = np.zeros(N_ENV, np.float32)
+        self.ego.pos_w.from_numpy(np.stack([n + 4, n + 3, n - 0.8], 1))
+        goal = np.stack([n + 4 + np.float32(away_m), n + 3, n + np.asarray(goal_z, np.float32)], 1)
+        self.mission.goal_w.from_numpy(goal.astype(np.float32))
+        self.teacher.cruise_z_m.from_numpy((n + np.asarray(before_z)).astype(np.float32))
+        out = np.zeros(N_ENV, np.float32)
+        _choose(out, io_for(ThreatsIO, *vars(self).values(), *sections(cfg)))
+        return out
+
+
+def sections(cfg):
+    return cfg.traffic, cfg.teacher, cfg.vehicle, cfg.world.tank, cfg.elevation, cfg.episode
+
+
+@pytest.fixture(scope="module")
+def stage():
+    return Stage()
+
+
+@pytest.mark.parametrize("column_share", [0.0, 0.5])
+def test_expected_share_is_that_of_a_drawn_population(column_share):
+    """Bodies with centres anywhere in the band and half heights of 0.2 m on average; the band's ends are soft
+    by 0.05 m, which moves no share by more than that over the band's length."""
+    rng, z = np.random.default_rng(7), np.linspace(-1.5, -0.1, 15).astype(np.float32)
+    centre, half = rng.uniform(-1.2, -0.4, (200_000, 1)), rng.uniform(0.15, 0.25, (200_000, 1))
+    column = rng.random((200_000, 1)) < column_share
+    drawn = ((np.abs(centre - z) < half + 0.17 + 0.1) | column).mean(0)
+    out, cfg = np.zeros_like(z), config(column_share)
+    _shares(z, out, io_for(ThreatsIO, *sections(cfg)))
+    np.testing.assert_allclose(out, drawn, atol=0.07)
+    assert out.max() > 0.99 and out.min() < 0.25 + 0.75 * column_share
+
+
+def test_cruises_at_the_edge_nearer_the_goals_depth(stage):
+    goal_z = np.array([-1.2, -1.0, -0.9, -0.7, -0.6, -0.4])
+    np.testing.assert_allclose(stage.choose(goal_z), [LOW] * 3 + [HIGH] * 3, atol=1e-6)
+
+
+def test_comes_back_to_the_goals_depth_in_time(stage):
+    """0.7 of the goal's radius may be left at the goal, and 0.3 m more per metre before it."""
+    away = np.array([0.5, 1.0, 1.5, 2.0, 2.2, 10.0])
+    off = np.minimum(0.7 + 0.3 * np.maximum(away - 1.0, 0), 1.0)
+    np.testing.assert_allclose(stage.choose(-1.2, away, HIGH), np.full(6, -1.2) + off, atol=1e-5)
+
+
+def test_keeps_what_it_has_chosen_where_both_edges_are_as_good(stage):
+    """The other edge is nearer to the goal by 0.1 m: not worth 1.2 m of diving."""
+    np.testing.assert_allclose(stage.choose(-0.85, before_z=HIGH), HIGH, atol=1e-6)
+    np.testing.assert_allclose(stage.choose(-0.85, before_z=LOW), LOW, atol=1e-6)
+
+
+def test_stays_at_the_goals_depth_where_bodies_fill_the_water(stage):
+    full = config(1.0, weight_depth_change=0.0)
+    np.testing.assert_allclose(stage.choose(-0.6, cfg=full), -0.6, atol=1e-6)
+    np.testing.assert_allclose(stage.choose(-0.4, cfg=config(free_depth=False)), -0.4, atol=1e-6)
+
+
+def test_a_tracked_body_drives_it_to_the_other_edge(stage):
+    """Heights of tracked bodies count where they are weighed; one through the full column for no depth."""
+    for field in vars(stage.tracks).values():
+        field.fill(0)
+    height = np.zeros((N_ENV, 1, 1, LANES), np.float32)
+    at = -1.6 + (np.arange(COLUMN) + 0.5) * 1.6 / COLUMN
+    height[:3, 0, 0, np.abs(at + 0.3).argmin()] = 1.0
+    height[3:, 0, 0, COLUMN] = 1.0
+    stage.tracks.height.from_numpy(height.reshape(stage.tracks.height.to_numpy().shape))
+    stage.tracks.state.from_numpy(np.full((N_ENV, 1, 4), (5.0, 3.0, 0.0, 0.0), np.float32))
+    for field, value in ((stage.tracks.alive, 1), (stage.tracks.moving, 1), (stage.tracks.present, 1.0)):
+        field.fill(value)
+    found = stage.choose(-0.6, before_z=HIGH, cfg=config(weight_seen=1.0))
+    np.testing.assert_allclose(found, [LOW] * 3 + [HIGH] * 3, atol=1e-6)
+    stage.tracks.alive.fill(0)
