@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from uuvtai.config import (
     ElevationConfig,
     EpisodeConfig,
-    ForecastConfig,
     MappingConfig,
     TankConfig,
     TeacherConfig,
@@ -41,7 +40,6 @@ class EvasionIO:
     ego: In[Proprioception]
     forecast: In[ForecastState]
     futures: In[FutureState]
-    forecast_cfg: Const[ForecastConfig]
     mapping_cfg: Const[MappingConfig]
     tank_cfg: Const[TankConfig]
     teacher_cfg: Const[TeacherConfig]
@@ -80,7 +78,6 @@ class ThreatsIO:
     tracks: In[TrackState]
     elevation_cfg: Const[ElevationConfig]
     episode_cfg: Const[EpisodeConfig]
-    forecast_cfg: Const[ForecastConfig]
     mapping_cfg: Const[MappingConfig]
     tank_cfg: Const[TankConfig]
     teacher_cfg: Const[TeacherConfig]

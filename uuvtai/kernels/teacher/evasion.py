@@ -116,7 +116,10 @@ def cost_lanes(env, cx, cy, cz, burst_s, io: Bundle[EvasionIO]):
     every candidate is bad."""
     pos, vel = io.ego.pos_w[env], turned_z3(io.ego.vel_b[env], io.ego.rpy[env][2])
     level, level_vel = ti.Vector([pos[0], pos[1]]), ti.Vector([vel[0], vel[1]])
-    peak, mean, contact, _ = body_depths(env, cx, cy, cz, burst_s, pos, vel, io)
+    drive = ti.Struct(x=cx, y=cy, z=cz, burst_s=burst_s, pos=pos, vel=vel)
+    peak, mean, contact, _ = body_depths(
+        env, drive, io.forecast, io.futures, io.teacher_cfg, io.tracking_cfg, io.tank_cfg
+    )
     static_mean, static_contact = static_depths(
         env, cx, cy, burst_s, level, level_vel, io.clearance, io.teacher_cfg, io.tank_cfg, io.mapping_cfg
     )

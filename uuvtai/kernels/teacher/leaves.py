@@ -157,8 +157,10 @@ def _wanted_velocity(env, leaf, node, io: Bundle[TeacherIO]):
     if leaf == codes.FOLLOW_ROUTE:
         out = io.teacher.follow_vel_w[env]
         if io.table.param[node][0] >= 0.0:
-            usual = cruising_speed(env, ti.static(io.teacher_cfg.cruise_m_s), io)
-            share = cruising_speed(env, io.table.param[node][0], io) / ti.max(usual, 1.0e-6)
+            left, room = io.teacher.speed_share[env], io.teacher.path_clearance_m[env]
+            usual = cruising_speed(io.teacher_cfg.cruise_m_s, left, room, io.teacher_cfg, io.vehicle_cfg)
+            asked = cruising_speed(io.table.param[node][0], left, room, io.teacher_cfg, io.vehicle_cfg)
+            share = asked / ti.max(usual, 1.0e-6)
             out[0], out[1] = share * out[0], share * out[1]
         if _port(node, 1, 1.0, io) < 0.5:
             out[2] = held_heave(

@@ -1,14 +1,13 @@
 """Assessment of threats for the behaviour tree: what the sonar feels, what the map holds, and whether
 following the route conflicts."""
 
-from typing import Any
-
 import taichi as ti
 
+from uuvtai.config import TeacherConfig, VehicleConfig
 from uuvtai.kernels.core.geometry import FAR_M, TWO_PI, turned_z3, wrapped_angle
 from uuvtai.kernels.core.grid import cell_of, centre_of
 from uuvtai.kernels.core.lanes import f16x
-from uuvtai.kernels.core.signature import Bundle, spread
+from uuvtai.kernels.core.signature import Bundle, Const, spread
 from uuvtai.kernels.teacher.bundles import ThreatsIO
 from uuvtai.kernels.teacher.cruise_depth import choose_depth
 from uuvtai.kernels.teacher.trajectories import body_depths, held_heave
@@ -158,17 +157,25 @@ def _follow_velocity(env, io: Bundle[ThreatsIO]):
     ):  # across the way the hull is wider: let it turn first
         share *= 1.0 - 0.6 * sideways
     io.teacher.speed_share[env] = ti.select(io.route.n_way[env] > 0, share, 0.0)
-    wanted = _unit(level) * cruising_speed(env, ti.static(io.teacher_cfg.cruise_m_s), io)
+    wanted = _unit(level) * cruising_speed(
+        ti.static(io.teacher_cfg.cruise_m_s),
+        io.teacher.speed_share[env],
+        io.teacher.path_clearance_m[env],
+        io.teacher_cfg,
+        io.vehicle_cfg,
+    )
     io.teacher.follow_vel_w[env] = ti.Vector([wanted[0], wanted[1], io.teacher.follow_vel_w[env][2]])
 
 
 @ti.func
-def cruising_speed(env, top_m_s, io: Bundle[Any]):
-    """[m/s] along the route: at most ``top_m_s``, slower in narrow places, where the nose lies along the way
-    and no diagonal of the body is faster."""
-    speed = top_m_s * io.teacher.speed_share[env]
-    if io.teacher.path_clearance_m[env] <= ti.static(io.teacher_cfg.gaze_clearance_m):
-        speed = ti.min(speed, ti.static(io.vehicle_cfg.max_surge_m_s))
+def cruising_speed(
+    top_m_s, share, room_m, teacher_cfg: Const[TeacherConfig], vehicle_cfg: Const[VehicleConfig]
+):
+    """[m/s] along the route: a ``share`` of the wanted speed, and in narrow places, where the nose lies along
+    the way and no diagonal of the body is faster, no more than the nose drives ahead."""
+    speed = top_m_s * share
+    if room_m <= ti.static(teacher_cfg.gaze_clearance_m):
+        speed = ti.min(speed, ti.static(vehicle_cfg.max_surge_m_s))
     return speed
 
 
@@ -190,7 +197,10 @@ def _foresee_conflict(env, io: Bundle[ThreatsIO]):
         cz[1] = heave
         cx, cy = f16x(follow[0]), f16x(follow[1])
         cx[2], cy[2] = 0.0, 0.0
-        peak, _, _, first = body_depths(env, cx, cy, cz, FAR_M, pos, vel, io)
+        drive = ti.Struct(x=cx, y=cy, z=cz, burst_s=FAR_M, pos=pos, vel=vel)
+        peak, _, _, first = body_depths(
+            env, drive, io.forecast, io.futures, io.teacher_cfg, io.tracking_cfg, io.tank_cfg
+        )
         climbs = peak[1] <= peak[0] + 1.0e-3
         io.teacher.follow_vel_w[env][2] = ti.select(climbs, heave, 0.0)
         io.teacher.conflict_s[env] = ti.select(climbs, first[1], first[0])

@@ -9,46 +9,56 @@ from typing import Any
 
 import taichi as ti
 
-from uuvtai.config import MappingConfig, TankConfig, TeacherConfig, VehicleConfig
+from uuvtai.config import MappingConfig, TankConfig, TeacherConfig, TrackingConfig, VehicleConfig
 from uuvtai.kernels.core.geometry import FAR_M
 from uuvtai.kernels.core.grid import grid_origin
 from uuvtai.kernels.core.lanes import LANES, f16x
-from uuvtai.kernels.core.signature import Bundle, Const, In, Out
-from uuvtai.state import ClearanceState
+from uuvtai.kernels.core.signature import Const, In, Out
+from uuvtai.state import ClearanceState, ForecastState, FutureState
 
 
 @ti.func
-def body_depths(env, cx, cy, cz, burst_s, pos, vel, io: Bundle[Any]):
-    """How deep each commanded velocity (lanes cx, cy, cz [m/s]) violates the wanted clearance from the
-    forecast bodies.
+def body_depths(
+    env,
+    drive,
+    forecast: In[ForecastState],
+    futures: In[FutureState],
+    teacher_cfg: Const[TeacherConfig],
+    tracking_cfg: Const[TrackingConfig],
+    tank_cfg: Const[TankConfig],
+):
+    """How deep each commanded velocity violates the wanted clearance from the forecast bodies.
 
-    The velocities are commanded for ``burst_s`` [s], then stop. ``pos``, ``vel``: own position [m] and
-    velocity [m/s] now, world. Returns lanes: largest depth [m]; depth averaged over the horizon and summed
-    over bodies [m]; largest depth below contact [m]; time of the first violation [s], FAR_M = none. Each body
-    counts with the mean of its futures, weighted by their probabilities; a future that is less probable than
-    ``heed_share`` has no first violation. The clearance is reduced by closing_s times the closing speed, as
-    the referee also stops at a small time to collision. Bodies are upright cylinders; water known to be free
-    above or below them (``above_w``, ``below_w``) adds to the distance.
+    ``drive``: struct of the velocities (lanes x, y, z [m/s]), which are commanded for ``burst_s`` [s], then
+    stop, and of the own position ``pos`` [m] and velocity ``vel`` [m/s] now, world. Returns lanes: largest
+    depth [m]; depth averaged over the horizon and summed over bodies [m]; largest depth below contact [m];
+    time of the first violation [s], FAR_M = none. Each body counts with the mean of its futures, weighted by
+    their probabilities; a future that is less probable than ``heed_share`` has no first violation. The
+    clearance is reduced by closing_s times the closing speed, as the referee also stops at a small time to
+    collision. Bodies are upright cylinders; water known to be free above or below them (``above_w``,
+    ``below_w``) adds to the distance.
     """
     found = ti.Struct(peak=f16x(0.0), mean=f16x(0.0), contact=f16x(0.0), first=f16x(FAR_M))
-    level, reach_speed = ti.Vector([pos[0], pos[1]]), ti.Vector([vel[0], vel[1]]).norm()
-    reach_speed += ti.static(_fastest(io.teacher_cfg))
-    for track in range(ti.static(io.forecast.radius_m.shape[1])):
-        if io.forecast.radius_m[env, track, 0] >= 0 and _within_reach(env, track, level, reach_speed, io):
-            share, peak, contact = 1.0, f16x(0.0), f16x(0.0)
-            if ti.static(len(io.forecast_cfg.turn_back_s) > 0):
-                for future in range(ti.static(io.futures.share.shape[2])):
-                    likely = io.futures.share[env, track, future]
-                    if likely > ti.static(io.teacher_cfg.least_share):
-                        one = _future_depths(env, track, future, cx, cy, cz, burst_s, pos, vel, io)
-                        _take_share(found, one, likely, io)
-                        peak += likely * one.peak
-                        contact += likely * one.contact
-                        share -= likely
-            one = _future_depths(env, track, -1, cx, cy, cz, burst_s, pos, vel, io)
-            _take_share(found, one, share, io)
-            peak += share * one.peak
-            contact += share * one.contact
+    for track in range(ti.static(forecast.radius_m.shape[1])):
+        near = forecast.radius_m[env, track, 0] >= 0
+        if near and _within_reach(env, track, drive, forecast, teacher_cfg, tracking_cfg):
+            left, peak, contact = 1.0, f16x(0.0), f16x(0.0)
+            for nth in range(ti.static(futures.share.shape[2] + 1)):
+                future = ti.static(futures.share.shape[2]) - 1 - nth  # the forecast itself comes last: -1
+                likely = left
+                if future >= 0:
+                    likely = futures.share[env, track, future]
+                if likely > ti.static(teacher_cfg.least_share):
+                    left -= likely
+                    one = _future_depths(
+                        env, track, future, drive, forecast, futures, teacher_cfg, tracking_cfg, tank_cfg
+                    )
+                    found.mean += likely * one.mean
+                    peak += likely * one.peak
+                    contact += likely * one.contact
+                    if likely >= ti.static(teacher_cfg.heed_share):
+                        for i in ti.static(range(LANES)):
+                            found.first[i] = ti.min(found.first[i], one.first[i])
             for i in ti.static(range(LANES)):
                 found.peak[i] = ti.max(found.peak[i], peak[i])
                 found.contact[i] = ti.max(found.contact[i], contact[i])
@@ -56,76 +66,72 @@ def body_depths(env, cx, cy, cz, burst_s, pos, vel, io: Bundle[Any]):
 
 
 @ti.func
-def _within_reach(env, track, level, reach_speed, io: Bundle[Any]):
+def _within_reach(
+    env,
+    track,
+    drive,
+    forecast: In[ForecastState],
+    teacher_cfg: Const[TeacherConfig],
+    tracking_cfg: Const[TrackingConfig],
+):
     """Whether a body can come so near within the horizon that any of its futures counts for any lane."""
-    first, second = io.forecast.pos_w[env, track, 0], io.forecast.pos_w[env, track, 1]
-    speed = (second - first).norm() * ti.static(1.05 / io.tracking_cfg.forecast_dt_s)
-    n = ti.static(_samples(io.forecast.radius_m.shape[2], io.teacher_cfg, io.tracking_cfg))
-    time = ti.static((n - 1) * io.tracking_cfg.forecast_dt_s)
-    bound = io.forecast.radius_m[env, track, n - 1] + ti.static(io.teacher_cfg.hull_reach_m)
-    bound += _wanted_m(time, io.teacher_cfg) + (reach_speed + speed) * (
-        time + ti.static(io.teacher_cfg.closing_s)
-    )
-    return (first - level).norm_sqr() < bound * bound
+    first, second = forecast.pos_w[env, track, 0], forecast.pos_w[env, track, 1]
+    n = ti.static(_samples(forecast.radius_m.shape[2], teacher_cfg, tracking_cfg))
+    time = ti.static((n - 1) * tracking_cfg.forecast_dt_s)
+    closing = (second - first).norm() * ti.static(1.05 / tracking_cfg.forecast_dt_s)
+    closing += ti.Vector([drive.vel[0], drive.vel[1]]).norm() + ti.static(_fastest(teacher_cfg))
+    bound = forecast.radius_m[env, track, n - 1] + ti.static(teacher_cfg.hull_reach_m)
+    bound += _wanted_m(time, teacher_cfg) + closing * (time + ti.static(teacher_cfg.closing_s))
+    return (first - ti.Vector([drive.pos[0], drive.pos[1]])).norm_sqr() < bound * bound
 
 
 @ti.func
-def _take_share(found: Out[Any], one, share, io: Bundle[Any]):
-    """Add one future of a body to the lanes' mean depths and first violations."""
-    found.mean += share * one.mean
-    if share >= ti.static(io.teacher_cfg.heed_share):
-        for i in ti.static(range(LANES)):
-            found.first[i] = ti.min(found.first[i], one.first[i])
-
-
-@ti.func
-def _future_depths(env, track, future, cx, cy, cz, burst_s, pos, vel, io: Bundle[Any]):
+def _future_depths(
+    env,
+    track,
+    future,
+    drive,
+    forecast: In[ForecastState],
+    futures: In[FutureState],
+    teacher_cfg: Const[TeacherConfig],
+    tracking_cfg: Const[TrackingConfig],
+    tank_cfg: Const[TankConfig],
+):
     """The lanes' depths for one future of one body; -1 = its forecast."""
-    n_sample = ti.static(_samples(io.forecast.radius_m.shape[2], io.teacher_cfg, io.tracking_cfg))
-    dt = ti.static(io.tracking_cfg.forecast_dt_s)
-    low, high = ti.static(depth_band(io.tank_cfg, io.teacher_cfg))
+    n_sample = ti.static(_samples(forecast.radius_m.shape[2], teacher_cfg, tracking_cfg))
+    dt = ti.static(tracking_cfg.forecast_dt_s)
+    low, high = ti.static(depth_band(tank_cfg, teacher_cfg))
     found = ti.Struct(peak=f16x(0.0), mean=f16x(0.0), contact=f16x(0.0), first=f16x(FAR_M))
-    level, level_vel = ti.Vector([pos[0], pos[1]]), ti.Vector([vel[0], vel[1]])
-    reach_speed = level_vel.norm() + ti.static(_fastest(io.teacher_cfg))
-    above, below = io.forecast.above_w[env, track], io.forecast.below_w[env, track]
-    decay, rest, before = 1.0, 1.0, _future_pos(env, track, future, 0, io)
+    level, level_vel = ti.Vector([drive.pos[0], drive.pos[1]]), ti.Vector([drive.vel[0], drive.vel[1]])
+    reach_speed = level_vel.norm() + ti.static(_fastest(teacher_cfg))
+    above, below = forecast.above_w[env, track], forecast.below_w[env, track]
+    decay, rest, before = 1.0, 1.0, forecast.pos_w[env, track, 0]
     for k in range(1, n_sample):
         # exp(-t / tau) by one factor a sample: settle = A(t), gain = B(t) - B(t - T), and the
         # velocity is v0 decay + c (rest - decay), the derivative of x(t)
-        decay *= ti.static(_decay(io.tracking_cfg.forecast_dt_s, io.teacher_cfg.lag_s))
+        decay *= ti.static(_decay(tracking_cfg.forecast_dt_s, teacher_cfg.lag_s))
         time = k * dt
-        over = ti.max(time - burst_s, 0.0)
+        over = ti.max(time - drive.burst_s, 0.0)
         if over > 0.0:
-            rest = ti.exp(over * ti.static(-1.0 / io.teacher_cfg.lag_s))
-        settle = ti.static(io.teacher_cfg.lag_s) * (1.0 - decay)
-        gain = time - settle - over + ti.static(io.teacher_cfg.lag_s) * (1.0 - rest)
-        body = _future_pos(env, track, future, k, io)
+            rest = ti.exp(over * ti.static(-1.0 / teacher_cfg.lag_s))
+        settle = ti.static(teacher_cfg.lag_s) * (1.0 - decay)
+        gain = time - settle - over + ti.static(teacher_cfg.lag_s) * (1.0 - rest)
+        body, wanted = forecast.pos_w[env, track, k], _wanted_m(time, teacher_cfg)
+        if future >= 0:
+            body = futures.pos_w[env, track, future, k]
+            wanted -= ti.static(1.0 - teacher_cfg.future_margin) * (wanted - teacher_cfg.contact_m)
         body_vel = (body - before) / dt
         before = body
         start = level + level_vel * settle - body
         drift = level_vel * decay - body_vel
-        wanted = _wanted_m(time, io.teacher_cfg)
-        if future >= 0:
-            wanted = io.teacher_cfg.contact_m + ti.static(io.teacher_cfg.future_margin) * (
-                wanted - io.teacher_cfg.contact_m
-            )
-        radius = io.forecast.radius_m[env, track, k]
-        bound = _bound_m(radius, wanted, gain, reach_speed + body_vel.norm(), io.teacher_cfg)
+        radius = forecast.radius_m[env, track, k]
+        bound = _bound_m(radius, wanted, gain, reach_speed + body_vel.norm(), teacher_cfg)
         if radius >= 0 and start.norm_sqr() < bound * bound:
-            z = ti.math.clamp(cz * gain + (pos[2] + vel[2] * settle), low, high)
-            gap = ti.max(ti.min(above - z, z - below), 0.0) * ti.static(io.teacher_cfg.vertical_weight)
-            free = _free_lanes(cx, cy, gap, start, drift, gain, rest - decay, radius, io.teacher_cfg)
-            _deepen(found, wanted, free, time, n_sample - 1, io.teacher_cfg)
+            z = ti.math.clamp(drive.z * gain + (drive.pos[2] + drive.vel[2] * settle), low, high)
+            gap = ti.max(ti.min(above - z, z - below), 0.0) * ti.static(teacher_cfg.vertical_weight)
+            free = _free_lanes(drive.x, drive.y, gap, start, drift, gain, rest - decay, radius, teacher_cfg)
+            _deepen(found, wanted, free, time, n_sample - 1, teacher_cfg)
     return found
-
-
-@ti.func
-def _future_pos(env, track, future, k, io: Bundle[Any]):
-    pos = io.forecast.pos_w[env, track, k]
-    if ti.static(len(io.forecast_cfg.turn_back_s) > 0):
-        if future >= 0:
-            pos = io.futures.pos_w[env, track, future, k]
-    return pos
 
 
 @ti.func
