@@ -7,7 +7,7 @@ import taichi as ti
 from tests.bundles import io_for
 from uuvtai.config import Config
 from uuvtai.kernels.core.lanes import LANES
-from uuvtai.kernels.core.signature import Bundle
+from uuvtai.kernels.core.signature import AnyTensor, Bundle
 from uuvtai.kernels.perception.elevation import COLUMN
 from uuvtai.kernels.teacher.bundles import ThreatsIO
 from uuvtai.kernels.teacher.cruise_depth import choose_depth, level_share
@@ -27,21 +27,21 @@ def config(column_share=0.0, **teacher):
 
 
 @ti.kernel
-def _shares(z: ti.types.ndarray(), out: ti.types.ndarray(), io: Bundle[ThreatsIO]):
+def _shares(z: AnyTensor, out: AnyTensor, io: Bundle[ThreatsIO]):
     for i in z:
         out[i] = level_share(z[i], io.traffic_cfg, io.elevation_cfg, io.teacher_cfg, io.vehicle_cfg)
 
 
 @ti.kernel
-def _choose(out: ti.types.ndarray(), io: Bundle[ThreatsIO]):
+def _choose(out: AnyTensor, io: Bundle[ThreatsIO]):
     for env in range(N_ENV):
         out[env] = choose_depth(env, io)
 
 
 class Stage:
     def __init__(self):
-        kinds = (TeacherState, TrackState, Proprioception, MissionState)
-        self.teacher, self.tracks, self.ego, self.mission = (allocate(kind, SIZES) for kind in kinds)
+        self.teacher, self.tracks = allocate(TeacherState, SIZES), allocate(TrackState, SIZES)
+        self.ego, self.mission = allocate(Proprioception, SIZES), allocate(MissionState, SIZES)
 
     def choose(self, goal_z, away_m=10.0, before_z=-0.8, cfg=None):
         """Depth to steer for of vehicles at -0.8 m whose goals lie so far ahead."""

@@ -30,10 +30,9 @@ class Stage:
     they have come."""
 
     def __init__(self):
-        kinds = (TrackState, HabitState, ForecastState, FutureState, ClockState)
-        self.tracks, self.habits, self.forecast, self.futures, self.clock = (
-            allocate(kind, SIZES) for kind in kinds
-        )
+        self.tracks, self.habits = allocate(TrackState, SIZES), allocate(HabitState, SIZES)
+        self.forecast, self.futures = allocate(ForecastState, SIZES), allocate(FutureState, SIZES)
+        self.clock = allocate(ClockState, SIZES)
 
     def begin(self):
         for struct in (self.tracks, self.futures, self.clock):
