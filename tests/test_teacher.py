@@ -81,6 +81,7 @@ STRUCTS = {
     "clock": state.ClockState,
     "mission": state.MissionState,
     "table": state.TreeTable,
+    "baselines": state.BaselineState,
 }
 
 
@@ -204,6 +205,7 @@ def tick(stage):
         io_for(
             TeacherIO,
             stage.t,
+            stage.baselines,
             stage.table,
             stage.route,
             stage.ego,

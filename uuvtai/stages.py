@@ -10,6 +10,12 @@ from dataclasses import dataclass
 import taichi as ti
 
 from uuvtai import state
+from uuvtai.kernels.baselines.bundles import (
+    DynamicWindowIO,
+    PathIntegralIO,
+    PotentialFieldIO,
+    VelocityObstacleIO,
+)
 from uuvtai.kernels.perception.bundles import (
     ForecastIO,
     HeightsIO,
@@ -85,6 +91,7 @@ class SimState:
     teacher: state.TeacherState
     table: state.TreeTable
     reward: state.RewardState
+    baselines: state.BaselineState
 
 
 @dataclass(frozen=True)
@@ -113,5 +120,9 @@ class Stages:
     route: RouteIO
     threats: ThreatsIO
     evasion: EvasionIO
+    dynamic_window: DynamicWindowIO
+    potential_field: PotentialFieldIO
+    velocity_obstacle: VelocityObstacleIO
+    path_integral: PathIntegralIO
     teacher: TeacherIO
     reward: RewardIO
