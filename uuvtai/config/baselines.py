@@ -8,7 +8,9 @@ from uuvtai.config.section import Fraction, NonNegative, Positive, PositiveCount
 class DynamicWindowConfig(Section):
     """Dynamic window approach (Fox, Burgard, Thrun 1997)."""
 
-    horizon_s: Positive = 2.0
+    window_s: Positive = 0.4
+    """velocities that can be reached within this are tried"""
+    horizon_s: Positive = 2.5
     """of the roll-out of a velocity"""
     margin_m: NonNegative = 0.15
     """wanted clearance beyond contact from moving bodies; closer counts as a collision"""
@@ -16,10 +18,10 @@ class DynamicWindowConfig(Section):
     """clearance beyond the margin from which on more is worth nothing"""
     weight_heading: NonNegative = 2.0
     """of the angle to the wanted velocity, as a share of 180 degrees"""
-    weight_clearance: NonNegative = 2.0
+    weight_clearance: NonNegative = 5.0
     """of time and distance to what is nearest, as a share"""
     weight_speed: NonNegative = 1.0
-    """of the speed, as a share of cruise speed"""
+    """of the speed up to the wanted one, as a share of cruise speed"""
 
 
 class PotentialFieldConfig(Section):
@@ -40,9 +42,11 @@ class PotentialFieldConfig(Section):
 class VelocityObstacleConfig(Section):
     """Velocity obstacles (Fiorini and Shiller 1998)."""
 
+    window_s: Positive = 0.8
+    """velocities that can be reached within this are tried"""
     horizon_s: Positive = 3.0
     """collisions later than this are none"""
-    margin_m: NonNegative = 0.2
+    margin_m: NonNegative = 0.4
     """wanted clearance beyond contact from moving bodies"""
     static_horizon_s: Positive = 1.5
     """the same for mapped obstacles and walls"""
@@ -86,10 +90,8 @@ class BaselinesConfig(Section):
     """control steps between decisions"""
     acceleration_m_s2: Positive = 1.7
     """of the vehicle: cruise speed over the time constant of its velocity"""
-    window_s: Positive = 0.4
-    """velocities that can be reached within this are tried (dynamic window, velocity obstacle)"""
     n_axis: PositiveCount = 11
-    """of them along surge and along sway"""
+    """velocities along surge and along sway of a window of reachable ones"""
     heave_m_s: NonNegative = 0.4
     """vertical speed of those that climb or dive; 0 = depth is not used to evade (also in the potential
     field)"""

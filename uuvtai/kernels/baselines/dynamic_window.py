@@ -4,7 +4,7 @@ Avoidance", IEEE Robotics & Automation Magazine 4(1), 1997.
 Of the velocities that can be reached within a short time those are admissible that come to rest before they
 touch anything, and of these the best has the largest weighted sum of heading, clearance and speed. Adapted:
 the vehicle moves sideways too (``reachable.py``); bodies move, so a velocity is rolled out with the
-vehicle's lag against their forecast; speed beyond cruise speed is worth nothing more; where nothing is
+vehicle's lag against their forecast; speed beyond the wanted one is worth nothing more; where nothing is
 admissible, the velocity that touches least and latest is driven.
 """
 
@@ -33,7 +33,7 @@ def plan_dynamic_window(io: Bundle[DynamicWindowIO]):
         if pad == 0 and decides(env, io.clock, io.baselines_cfg):
             best = 0
             for trial in range(1, n_trial):
-                if io.baselines.score[env, trial] > io.baselines.score[env, best]:
+                if io.baselines.score[env, trial] >= io.baselines.score[env, best]:
                     best = trial
             io.baselines.vel_w[env] = _trial(env, best, io)
 
@@ -48,7 +48,15 @@ def _wanted(env, io: Bundle[DynamicWindowIO]):
 @ti.func
 def _trial(env, trial, io: Bundle[DynamicWindowIO]):
     return reachable_velocity(
-        env, trial, _wanted(env, io), io.ego, io.baselines_cfg, io.tank_cfg, io.teacher_cfg, io.vehicle_cfg
+        env,
+        trial,
+        _wanted(env, io),
+        io.ego,
+        ti.static(io.dwa_cfg.window_s),
+        io.baselines_cfg,
+        io.tank_cfg,
+        io.teacher_cfg,
+        io.vehicle_cfg,
     )
 
 
@@ -58,7 +66,7 @@ def _score(env, wanted, velocity, io: Bundle[DynamicWindowIO]):
     room, touch_s = _rolled_out(env, velocity, io)
     horizon = ti.static(io.dwa_cfg.horizon_s)
     speed = velocity.norm()
-    level = ti.sqrt(velocity[0] * velocity[0] + velocity[1] * velocity[1])
+    fast = ti.min(ti.Vector([velocity[0], velocity[1]]).norm(), ti.Vector([wanted[0], wanted[1]]).norm())
     heading = 0.5
     if speed > 0.02 and wanted.norm() > 0.02:
         heading = 1.0 - ti.acos(ti.math.clamp(velocity.dot(wanted) / (speed * wanted.norm()), -1.0, 1.0)) * (
@@ -70,7 +78,7 @@ def _score(env, wanted, velocity, io: Bundle[DynamicWindowIO]):
     out = (
         ti.static(io.dwa_cfg.weight_heading) * heading
         + ti.static(io.dwa_cfg.weight_clearance) * free
-        + ti.static(io.dwa_cfg.weight_speed) * ti.min(level / ti.static(io.teacher_cfg.cruise_m_s), 1.0)
+        + ti.static(io.dwa_cfg.weight_speed) * fast * ti.static(1.0 / io.teacher_cfg.cruise_m_s)
     )
     # v^2 <= 2 a d with d = v t: in time to come to rest
     if touch_s < 0.5 * speed * ti.static(1.0 / io.baselines_cfg.acceleration_m_s2):

@@ -21,6 +21,7 @@ def reachable_velocity(
     trial,
     wanted,
     ego: In[Proprioception],
+    window_s: Const[float],
     baselines_cfg: Const[BaselinesConfig],
     tank_cfg: Const[TankConfig],
     teacher_cfg: Const[TeacherConfig],
@@ -30,8 +31,8 @@ def reachable_velocity(
     both as near as the window allows."""
     n, first_extra = ti.static(baselines_cfg.n_axis, baselines_cfg.n_reachable - 2)
     yaw, own = ego.rpy[env][2], ti.Vector([ego.vel_b[env][0], ego.vel_b[env][1]])
-    low = window_edge(own, -1.0, baselines_cfg, vehicle_cfg)
-    high = window_edge(own, 1.0, baselines_cfg, vehicle_cfg)
+    low = window_edge(own, -1.0, window_s, baselines_cfg, vehicle_cfg)
+    high = window_edge(own, 1.0, window_s, baselines_cfg, vehicle_cfg)
     cell, layer = trial % (n * n), trial // (n * n)
     share = ti.Vector([ti.cast(cell % n, ti.f32), ti.cast(cell // n, ti.f32)]) / ti.static(max(n - 1, 1))
     level, heave = low + share * (high - low), wanted[2]
@@ -46,9 +47,15 @@ def reachable_velocity(
 
 
 @ti.func
-def window_edge(own, side, baselines_cfg: Const[BaselinesConfig], vehicle_cfg: Const[VehicleConfig]):
+def window_edge(
+    own,
+    side,
+    window_s: Const[float],
+    baselines_cfg: Const[BaselinesConfig],
+    vehicle_cfg: Const[VehicleConfig],
+):
     """Surge and sway [m/s] of the window's lower (``side`` -1) or upper (1) corner around one's own."""
-    reach = ti.static(baselines_cfg.acceleration_m_s2 * baselines_cfg.window_s)
+    reach = ti.static(baselines_cfg.acceleration_m_s2 * window_s)
     surge, sway = ti.static(vehicle_cfg.max_surge_m_s), ti.static(vehicle_cfg.max_sway_m_s)
     return ti.Vector(
         [

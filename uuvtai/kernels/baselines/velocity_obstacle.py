@@ -53,7 +53,15 @@ def _wanted(env, io: Bundle[VelocityObstacleIO]):
 @ti.func
 def _trial(env, trial, io: Bundle[VelocityObstacleIO]):
     return reachable_velocity(
-        env, trial, _wanted(env, io), io.ego, io.baselines_cfg, io.tank_cfg, io.teacher_cfg, io.vehicle_cfg
+        env,
+        trial,
+        _wanted(env, io),
+        io.ego,
+        ti.static(io.obstacle_cfg.window_s),
+        io.baselines_cfg,
+        io.tank_cfg,
+        io.teacher_cfg,
+        io.vehicle_cfg,
     )
 
 
@@ -72,32 +80,35 @@ def _cost(env, velocity, io: Bundle[VelocityObstacleIO]):
 
 @ti.func
 def _body_hit_s(env, track, velocity, io: Bundle[VelocityObstacleIO]):
-    """Time [s] at which a velocity meets a body's grown outline within the horizon; FAR_M = outside its
-    cone."""
+    """Time [s] at which a velocity meets a body's grown outline within the horizon; FAR_M = outside its cone.
+
+    Where it is inside at once: the depth [m] below 0, so that the least deep is the best of bad ones. Who is
+    nearer than the margin already keeps what is left of it.
+    """
     pos, own = io.ego.pos_w[env], turned_z3(io.ego.vel_b[env], io.ego.rpy[env][2])
     begin = pos + (own - velocity) * ti.static(io.teacher_cfg.lag_s)
-    state = io.tracks.state[env, track]
-    ahead = io.forecast.pos_w[env, track, 0] - ti.Vector([begin[0], begin[1]])
+    state, body = io.tracks.state[env, track], io.forecast.pos_w[env, track, 0]
+    ahead = body - ti.Vector([begin[0], begin[1]])
     closing = ti.Vector([velocity[0] - state[2], velocity[1] - state[3]])
-    reach = io.forecast.radius_m[env, track, 0] + ti.static(
-        io.teacher_cfg.hull_reach_m + io.teacher_cfg.contact_m + io.obstacle_cfg.margin_m
+    touch = io.forecast.radius_m[env, track, 0] + ti.static(
+        io.teacher_cfg.hull_reach_m + io.teacher_cfg.contact_m
     )
-    now = (ahead - ti.Vector([pos[0] - begin[0], pos[1] - begin[1]])).norm() - reach
+    kept = (body - ti.Vector([pos[0], pos[1]])).norm() - touch
+    reach = touch + ti.math.clamp(kept, 0.0, ti.static(io.obstacle_cfg.margin_m))
     speed2, along = closing.norm_sqr(), ahead.dot(closing)
-    miss = along * along - speed2 * (ahead.norm_sqr() - reach * reach)
+    depth = reach - ahead.norm()
+    root = along * along - speed2 * (ahead.norm_sqr() - reach * reach)
     out = FAR_M
-    if miss > 0.0 and speed2 > 1.0e-8:
-        enters, leaves = (along - ti.sqrt(miss)) / speed2, (along + ti.sqrt(miss)) / speed2
-        first, last = ti.max(enters, 0.0), ti.min(leaves, ti.static(io.obstacle_cfg.horizon_s))
-        is_leaving = now < 0.0 and along <= 0.0  # too near already: away from it is the way out
-        if (
-            first <= last
-            and not is_leaving
-            and not _passes(env, track, begin[2], velocity[2], first, last, io)
-        ):
-            out = first
-    elif ahead.norm() < reach:
-        out = 0.0
+    if depth > 0.0:
+        if along > 0.0 or speed2 < 1.0e-8:
+            out = -depth
+    elif root > 0.0 and along > 0.0:
+        out = (along - ti.sqrt(root)) / speed2
+    if out < FAR_M:
+        last = (along + ti.sqrt(ti.max(root, 0.0))) / ti.max(speed2, 1.0e-8)
+        until = ti.min(last, ti.static(io.obstacle_cfg.horizon_s))
+        if out > until or _passes(env, track, begin[2], velocity[2], ti.max(out, 0.0), until, io):
+            out = FAR_M
     return out
 
 
