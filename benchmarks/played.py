@@ -1,7 +1,7 @@
 """One side of ``before.py``, in a process of its own with one tree's package: plays and answers on stdout.
 
 python played.py bits WORLD SENSORS NUM_ENVS STEPS   sha256 of the steps and of every array, as JSON
-python played.py speed WORLD SENSORS NUM_ENVS        for every number read: seconds that so many steps took
+python played.py speed WORLD SENSORS NUM_ENVS        for every number read: CPU seconds of so many steps
 """
 
 from __future__ import annotations
@@ -42,18 +42,17 @@ def bits(world: str, sensors: str, num_envs: int, steps: int) -> dict[str, str]:
 
 
 def speed(world: str, sensors: str, num_envs: int) -> None:
-    """Answer every number of steps with the seconds that they took; the first answer says: ready."""
-    begun = time.perf_counter()
+    """Answer every number of steps with the CPU seconds they took; the first answer: those of the start."""
     import uuvtai
 
     env = uuvtai.make(world, num_envs, _SEED, sensors=sensors)
     _observation, info = env.reset()
     info = _steps(env, info, 1)
-    print(f"ready {time.perf_counter() - begun}", flush=True)
+    print(f"ready {time.process_time()}", flush=True)
     for line in sys.stdin:
-        begun = time.perf_counter()
+        begun = time.process_time()
         info = _steps(env, info, int(line))
-        print(f"steps {time.perf_counter() - begun}", flush=True)
+        print(f"steps {time.process_time() - begun}", flush=True)
 
 
 def _steps(env: Any, info: dict[str, Any], count: int) -> dict[str, Any]:

@@ -23,7 +23,7 @@ KNOWS = {"world", "vehicle", "sensors", "task", "privileged"}
 """Rooms that may see the truth; the others are the stack."""
 BELOW = ("state", "config", "kernels", "taichi_patches", "tree_codes", "plan_codes", "outcomes")
 """What kernels may import of the package."""
-STACK = {"core", "perception", "planning", "teacher"}
+STACK = {"core", "perception", "planning", "teacher", "baselines"}
 TRUTH = {
     kind.__name__
     for module in (state, config)

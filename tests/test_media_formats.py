@@ -263,8 +263,12 @@ def test_the_command_takes_speed_rate_and_width_and_tells_its_progress(tmp_path,
 # ---------------------------------------------------------------------------------------------------- colours
 
 
+METHODS = ["straight", "planner", "bt", "paper", "best", "oracle", "bt+truth"]
+METHODS += ["dwa", "potential_field", "velocity_obstacle", "mppi"]
+
+
 def test_a_method_has_one_colour_wherever_it_is_shown():
-    known = method_colours(["straight", "planner", "bt", "paper", "best", "oracle", "bt+truth"])
+    known = method_colours(METHODS)
     assert len(set(known.values())) == len(known)
     for name, colour in known.items():
         assert method_colours([name]) == {name: colour} and method_colours(["mine", name])[name] == colour
@@ -281,9 +285,7 @@ def test_other_methods_take_what_is_free_in_their_order():
 
 
 def test_every_method_stands_out_from_what_a_map_shows():
-    for colour in method_colours(
-        ["straight", "planner", "bt", "paper", "best", "oracle", "bt+truth"]
-    ).values():
+    for colour in method_colours(METHODS).values():
         assert contrast(colour, "#ffffff") > 1.9
         for meaning in (canvas.DYNAMIC, canvas.MOVER):
             assert np.abs(np.array(canvas.bgr(colour)) - meaning).max() > 60

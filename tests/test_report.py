@@ -657,7 +657,7 @@ def test_every_colour_of_a_line_has_a_lighter_one_for_the_dark():
     from uuvtai.report.colours import PALETTE
 
     template = (files("uuvtai") / "presets/report/page.html.j2").read_text()
-    lighter = dict(re.findall(r"--series-(\d): (#\w{6})", template))
+    lighter = dict(re.findall(r"--series-(\d+): (#\w{6})", template))
     assert [int(i) for i in lighter] == list(range(len(PALETTE)))
     for i, colour in enumerate(PALETTE):
         assert contrast(lighter[str(i)], "#12171d") > 5 and contrast(lighter[str(i)], "#12171d") >= contrast(

@@ -86,6 +86,7 @@ STRUCTS = {
     "clock": state.ClockState,
     "mission": state.MissionState,
     "table": state.TreeTable,
+    "baselines": state.BaselineState,
 }
 
 
@@ -216,6 +217,7 @@ def tick(stage):
         io_for(
             TeacherIO,
             stage.t,
+            stage.baselines,
             stage.table,
             stage.route,
             stage.ego,

@@ -39,6 +39,7 @@ STACK_SECTIONS = (
     "voronoi",
     "route",
     "teacher",
+    "baselines",
 )
 """what a stack preset may set: nothing that a scenario, a sensor, the referee or the observation's columns
 depend on"""

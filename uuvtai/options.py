@@ -94,7 +94,8 @@ EvalRuns = Annotated[
 EvalControllers = Annotated[
     list[str] | None,
     _controllers(
-        "straight, planner, bt or a tree's XML (repeatable); paper = bt on the paper's own stack, a row of "
+        "straight, planner, bt or a tree's XML (repeatable); dwa, potential_field, velocity_obstacle, mppi = "
+        "local planners of the literature; paper = bt on the paper's own stack, a row of "
         "its own; none = policies alone \\[default: straight, planner, bt, beside a RUN bt]. Privileged "
         "yardsticks: NAME+truth (a tree that knows where every moving body is), oracle (knows the future: an "
         "upper bound).",

@@ -14,10 +14,12 @@ import numpy as np
 import taichi as ti
 import torch
 
+from uuvtai import tree_codes as codes
 from uuvtai.binding import bind_all
 from uuvtai.config import Config
 from uuvtai.copying import copied_rows
 from uuvtai.initial import allocate_state, fill_constants
+from uuvtai.kernels.baselines import dynamic_window, path_integral, potential_field, velocity_obstacle
 from uuvtai.kernels.core.rows import copy_rows
 from uuvtai.kernels.perception import elevation, forecast, futures, look, mapping, spotting, tracking
 from uuvtai.kernels.planning import clearance, features, route, triggers, voronoi
@@ -71,6 +73,8 @@ class Sim:
         """Drive by another behaviour tree from the next tick on: nothing is compiled again."""
         self.tree = tree
         load_tree(self.s.table, tree, self._put)
+        for field in (self.s.baselines.vel_w, self.s.baselines.plan_w) if self._has_baseline() else ():
+            self._put(field, np.zeros((*field.shape, 3), np.float32))
 
     def set_scenes(self, scenes: Sequence[Scene] = ()) -> None:
         """Deal (S, D, v) out to the envs in turn, for their next scenarios; none = the world's own.
@@ -131,6 +135,8 @@ class Sim:
         with self._stage("teacher"):
             threats.assess_threats(io.threats)
             evasion.plan_evasion(io.evasion)
+            if self._has_baseline():
+                self._plan_by_baseline()
             leaves.tick_tree(io.teacher, self.action)
         if self.observation is not None:
             with self._stage("features"):
@@ -153,6 +159,21 @@ class Sim:
         if c.forecast.turn_back_s:
             futures.weigh_futures(io.futures)
         elevation.bound_heights(io.heights)
+
+    def _has_baseline(self) -> bool:
+        return max(self.tree.leaf) >= codes.FIRST_BASELINE
+
+    def _plan_by_baseline(self) -> None:
+        """The local planners of the literature whose leaves are in the tree."""
+        io, used = self.io, self.tree.leaf
+        if codes.DYNAMIC_WINDOW in used:
+            dynamic_window.plan_dynamic_window(io.dynamic_window)
+        if codes.POTENTIAL_FIELD in used:
+            potential_field.plan_potential_field(io.potential_field)
+        if codes.VELOCITY_OBSTACLE in used:
+            velocity_obstacle.plan_velocity_obstacle(io.velocity_obstacle)
+        if codes.PATH_INTEGRAL in used:
+            path_integral.plan_path_integral(io.path_integral)
 
     def _observe(self, obs: torch.Tensor) -> None:
         io, c = self.io, self.config.features

@@ -64,8 +64,16 @@ def array_sizes(config: Config, n_env: int, device: str = "cpu") -> dict[str, in
         "n_sector": config.features.n_sector,
         "n_node": config.teacher.max_node,
         "n_candidate": config.teacher.n_candidate,
+        "n_trial": config.baselines.n_trial,
+        "n_control": _n_control(config),
         "n_term": len(TERMS),
     }
+
+
+def _n_control(config: Config) -> int:
+    """Decisions within the horizon of MPPI."""
+    decision_s = config.baselines.period_steps * config.episode.control_dt_s
+    return max(1, round(config.baselines.mppi.horizon_s / decision_s))
 
 
 def memory_bytes(config: Config, n_env: int, device: str = "cpu") -> int:

@@ -10,6 +10,12 @@ from dataclasses import dataclass
 import taichi as ti
 
 from uuvtai import state
+from uuvtai.kernels.baselines.bundles import (
+    DynamicWindowIO,
+    PathIntegralIO,
+    PotentialFieldIO,
+    VelocityObstacleIO,
+)
 from uuvtai.kernels.perception.bundles import (
     ForecastIO,
     FuturesIO,
@@ -87,6 +93,7 @@ class SimState:
     teacher: state.TeacherState
     table: state.TreeTable
     reward: state.RewardState
+    baselines: state.BaselineState
 
 
 @dataclass(frozen=True)
@@ -116,5 +123,9 @@ class Stages:
     route: RouteIO
     threats: ThreatsIO
     evasion: EvasionIO
+    dynamic_window: DynamicWindowIO
+    potential_field: PotentialFieldIO
+    velocity_obstacle: VelocityObstacleIO
+    path_integral: PathIntegralIO
     teacher: TeacherIO
     reward: RewardIO

@@ -36,6 +36,12 @@ HOLD = 18
 UNSTICK = 19
 FOLLOW_ROUTE = 20
 DRIVE_STRAIGHT = 21
+FIRST_BASELINE = 32
+"""Codes from here on are local planners of the literature."""
+DYNAMIC_WINDOW = FIRST_BASELINE
+POTENTIAL_FIELD = 33
+VELOCITY_OBSTACLE = 34
+PATH_INTEGRAL = 35
 
 MAX_PORTS = 4
 """Numbers that a leaf can be given."""
@@ -85,6 +91,14 @@ LEAVES = {
         FOLLOW_ROUTE, "speed_m_s depth_guard", "pursue the look-ahead point; fails without a route"
     ),
     "DriveStraight": _action(DRIVE_STRAIGHT, "speed_m_s", "drive at the goal, blind"),
+    "DynamicWindow": _action(
+        DYNAMIC_WINDOW, "", "dynamic window approach along the route; fails without one"
+    ),
+    "PotentialField": _action(POTENTIAL_FIELD, "", "potential field along the route; fails without one"),
+    "VelocityObstacle": _action(
+        VELOCITY_OBSTACLE, "", "velocity obstacles along the route; fails without one"
+    ),
+    "PathIntegral": _action(PATH_INTEGRAL, "", "sampling MPC (MPPI) along the route; fails without one"),
 }
 
 CONTROLS = {

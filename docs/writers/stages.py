@@ -20,7 +20,15 @@ FILES = {
     "clearance": ("clearance",),
     "planning": ("triggers", "voronoi", "medial", "route"),
     "features": ("features",),
-    "teacher": ("threats", "evasion", "leaves"),
+    "teacher": (
+        "threats",
+        "evasion",
+        "dynamic_window",
+        "potential_field",
+        "velocity_obstacle",
+        "path_integral",
+        "leaves",
+    ),
     "reward": ("reward",),
 }
 """kernel files of each stage, by the names of ``uuvtai.stages.STAGES``"""

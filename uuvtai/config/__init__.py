@@ -6,6 +6,13 @@ YAML in and out, and presets, live in ``loader.py``; what training adds is in ``
 
 from __future__ import annotations
 
+from uuvtai.config.baselines import (
+    BaselinesConfig,
+    DynamicWindowConfig,
+    PathIntegralConfig,
+    PotentialFieldConfig,
+    VelocityObstacleConfig,
+)
 from uuvtai.config.perception import (
     ElevationConfig,
     ForecastConfig,
@@ -56,18 +63,21 @@ class Config(Section):
     route: RouteConfig = RouteConfig()
     features: FeaturesConfig = FeaturesConfig()
     teacher: TeacherConfig = TeacherConfig()
+    baselines: BaselinesConfig = BaselinesConfig()
     reward: RewardConfig = RewardConfig()
     episode: EpisodeConfig = EpisodeConfig()
 
 
 __all__ = [
     "ActuationConfig",
+    "BaselinesConfig",
     "ClearanceConfig",
     "Config",
     "DepthConfig",
     "DisturbanceConfig",
     "DvlConfig",
     "DynamicObstacles",
+    "DynamicWindowConfig",
     "ElevationConfig",
     "EpisodeConfig",
     "FeaturesConfig",
@@ -75,6 +85,8 @@ __all__ = [
     "ForecastConfig",
     "ImuConfig",
     "MappingConfig",
+    "PathIntegralConfig",
+    "PotentialFieldConfig",
     "PressureConfig",
     "RewardConfig",
     "RouteConfig",
@@ -89,6 +101,7 @@ __all__ = [
     "TrackingConfig",
     "TrafficConfig",
     "VehicleConfig",
+    "VelocityObstacleConfig",
     "VoronoiConfig",
     "Waypoint",
     "WorldConfig",

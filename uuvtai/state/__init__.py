@@ -11,6 +11,7 @@ structs from here.
 from __future__ import annotations
 
 from uuvtai.state.arrays import PACKET, REAL, WORD, allocate, array, bytes_of
+from uuvtai.state.baselines import BaselineState
 from uuvtai.state.perception import (
     ClusterState,
     ForecastState,
@@ -35,6 +36,7 @@ __all__ = [
     "WORD",
     "ActuationState",
     "Allocation",
+    "BaselineState",
     "ClearanceMemory",
     "ClearanceState",
     "ClockState",

@@ -16,6 +16,7 @@ from uuvtai.config import (
 )
 from uuvtai.kernels.core.signature import Const, In, Out
 from uuvtai.state import (
+    BaselineState,
     ClearanceState,
     ClockState,
     ForecastState,
@@ -52,6 +53,7 @@ class TeacherIO:
     """The behaviour tree and its action."""
 
     teacher: Out[TeacherState]
+    baselines: In[BaselineState]
     clock: In[ClockState]
     ego: In[Proprioception]
     mission: In[MissionState]

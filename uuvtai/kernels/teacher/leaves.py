@@ -138,7 +138,7 @@ def _answer(env, node, io: Bundle[TeacherIO]):
     out = ti.select(holds == 1, codes.SUCCESS, codes.FAILURE)
     if io.table.kind[node] == codes.ACTION:
         out = codes.RUNNING
-        if leaf == codes.FOLLOW_ROUTE and io.route.n_way[env] == 0:
+        if (leaf == codes.FOLLOW_ROUTE or leaf >= codes.FIRST_BASELINE) and io.route.n_way[env] == 0:
             out = codes.FAILURE
         if io.teacher.status[env, node] != codes.RUNNING:
             io.teacher.since_step[env, node] = io.clock.step[env]
@@ -183,6 +183,8 @@ def _wanted_velocity(env, leaf, node, io: Bundle[TeacherIO]):
         out = ti.Vector([away[0], away[1], 0.0]) * crowd
     elif leaf == codes.UNSTICK:
         out = ti.Vector([away[0], away[1], 0.0]) * _port(node, 1, ti.static(io.teacher_cfg.unstick_m_s), io)
+    elif leaf >= codes.FIRST_BASELINE:
+        out = io.baselines.vel_w[env]
     elif leaf == codes.DRIVE_STRAIGHT:
         ahead = io.mission.goal_w[env] - io.ego.pos_w[env]
         level = ti.Vector([ahead[0], ahead[1]])
