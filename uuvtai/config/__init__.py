@@ -10,6 +10,7 @@ from uuvtai.config.perception import (
     ElevationConfig,
     ForecastConfig,
     MappingConfig,
+    PoseConfig,
     SpottingConfig,
     TrackingConfig,
 )
@@ -44,6 +45,7 @@ class Config(Section):
     actuation: ActuationConfig = ActuationConfig()
     disturbance: DisturbanceConfig = DisturbanceConfig()
     sensors: SensorsConfig = SensorsConfig()
+    pose: PoseConfig = PoseConfig()
     tracking: TrackingConfig = TrackingConfig()
     forecast: ForecastConfig = ForecastConfig()
     elevation: ElevationConfig = ElevationConfig()
@@ -73,6 +75,7 @@ __all__ = [
     "ForecastConfig",
     "ImuConfig",
     "MappingConfig",
+    "PoseConfig",
     "PressureConfig",
     "RewardConfig",
     "RouteConfig",

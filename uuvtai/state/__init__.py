@@ -18,6 +18,7 @@ from uuvtai.state.perception import (
     HabitState,
     MapScratch,
     MapState,
+    PoseState,
     SpotState,
     TrackState,
 )
@@ -50,6 +51,7 @@ __all__ = [
     "MapState",
     "MissionState",
     "PathState",
+    "PoseState",
     "Proprioception",
     "ProprioceptionMemory",
     "RefereeState",
