@@ -28,7 +28,7 @@ class PoseConfig(Section):
     """error of the known place of a wall"""
     bearing_sigma_rad: NonNegative = 0.001
     """error of a beam's direction"""
-    inflation: Annotated[float, Field(ge=1, le=1000)] = 2.5
+    inflation: Annotated[float, Field(ge=1, le=1000)] = 2.2
     """a beam's variance is taken this many times larger: bodies close to a wall pass the gate in many
     neighbouring beams and scans"""
 

@@ -157,7 +157,7 @@ def take_dvl(env, io: Bundle[PoseIO]):
     rpy = io.ego.rpy[env]
     reading = rotation_wb(quaternion_wb(rpy[0], rpy[1], 0.0)) @ io.ego.vel_b[env]
     mean, cov = io.pose.mean[env], io.pose.cov[env]
-    for axis in ti.static(range(2)):
+    for axis in range(2):
         h = ti.Vector([0.0] * _N)
         h[3 + axis], h[6] = 1.0 + mean[6], mean[3 + axis]
         residual = reading[axis] - (1.0 + mean[6]) * mean[3 + axis]
@@ -196,18 +196,20 @@ def take_walls(env, io: Bundle[PoseIO]):
     back_y = late * ti.sin(io.scan.ping_yaw[env])
     speed_cov = ti.Vector([cov[ti.static(place(i, j, _N))] for i, j in ti.static(((3, 3), (3, 4), (4, 4)))])
     fix = seen_walls(env, place_cov(cov, back_x, back_y), ti.Vector([mean[3], mean[4]]), speed_cov, io)
-    now = mean + 0.0
-    root, found = halved(fix.pose, fix.pose_part)
+    rows, found = ti.Matrix.zero(ti.f32, 5, _N), ti.Vector([0.0] * 5)
+    root, seen = halved(fix.pose, fix.pose_part)
     for k in ti.static(range(3)):
-        a, b, t = root[0, k], root[1, k], root[2, k]
-        h = ti.Vector([a, b, t, -a * back_x - b * back_y, a * back_y - b * back_x, 0.0, 0.0])
-        moved, shrunk = measured(now, cov, h, found[k] - h.dot(now - mean), 1.0)
-        now, cov = moved, shrunk
-    info, part = blurred(fix.velocity, fix.velocity_part, ti.static(io.pose_cfg.accel_density) * late)
+        a, b = root[0, k], root[1, k]
+        rows[k, 0], rows[k, 1], rows[k, 2], found[k] = a, b, root[2, k], seen[k]
+        rows[k, 3], rows[k, 4] = -a * back_x - b * back_y, a * back_y - b * back_x
+    info, part = blurred(fix.velocity, fix.velocity_part, io.pose_cfg.accel_density * late)
     half, slip = halved(info, part)
     for k in ti.static(range(2)):
-        h = ti.Vector([0.0, 0.0, 0.0, half[0, k], half[1, k], 0.0, 0.0])
-        moved, shrunk = measured(now, cov, h, slip[k] - h.dot(now - mean), 1.0)
+        rows[3 + k, 3], rows[3 + k, 4], found[3 + k] = half[0, k], half[1, k], slip[k]
+    now = mean + 0.0
+    for k in range(5):  # not unrolled: that compiles five times as long
+        h = ti.Vector([rows[k, j] for j in range(_N)])
+        moved, shrunk = measured(now, cov, h, found[k] - h.dot(now - mean), 1.0)
         now, cov = moved, shrunk
     io.pose.mean[env], io.pose.cov[env] = now, cov
 

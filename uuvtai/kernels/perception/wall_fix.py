@@ -43,9 +43,16 @@ def seen_walls(env, place_cov, speed, speed_cov, io: Bundle[PoseIO]):
         lever = r * (ny * ux - nx * uy)
         cosine = -(nx * ux + ny * uy)
         e = cosine * (beams.range_m - r)
-        var = place_variance(r, cosine, lever, io)
+        along = range_variance(r, io)
+        var = (
+            cosine * cosine * along
+            + lever * lever * ti.static(aim_variance(io.sensors_cfg, io.pose_cfg))
+            + ti.static(io.pose_cfg.wall_sigma_m**2)
+        )
         gate = var + form3(place_cov, nx, ny, lever)
-        good = beams.hit * ti.select(e * e < ti.static(io.pose_cfg.gate_sigmas**2) * gate, 1.0, 0.0)
+        near = r + io.pose_cfg.gate_sigmas * ti.sqrt(along) < ti.static(surest_range(io.sensors_cfg))
+        fits = e * e < ti.static(io.pose_cfg.gate_sigmas**2) * gate
+        good = beams.hit * ti.select(near & fits, 1.0, 0.0)
         weight = good / (var * io.pose_cfg.inflation)
         wx, wy, wt = weight * nx, weight * ny, weight * lever
         fix.pose += ti.Vector(
@@ -108,17 +115,18 @@ def expected_wall(x, y, ux, uy, io: Bundle[PoseIO]):
 
 
 @ti.func
-def place_variance(range_m, cosine, lever, io: Bundle[PoseIO]):
-    """Variance [m^2] of a beam's end across the wall: errors of range and direction, and of the wall."""
+def range_variance(range_m, io: Bundle[PoseIO]):
+    """Variance [m^2] of one beam's range."""
     sigma = io.sensors_cfg.sonar.range_sigma_m + io.sensors_cfg.sonar.range_sigma_slope * range_m
-    constant = ti.static(
+    return sigma * sigma + ti.static(
         io.sensors_cfg.sonar.range_jitter_m**2 + io.sensors_cfg.sonar.range_quantum_m**2 / 12.0
     )
-    return (
-        cosine * cosine * (sigma * sigma + constant)
-        + lever * lever * ti.static(aim_variance(io.sensors_cfg, io.pose_cfg))
-        + ti.static(io.pose_cfg.wall_sigma_m**2)
-    )
+
+
+def surest_range(sensors_cfg):
+    """[m] beyond which errors push returns out of the sonar's reach: of such walls only the returns that came
+    out too short are seen. Plain Python."""
+    return sensors_cfg.sonar.max_range_m - sensors_cfg.sonar.range_jitter_m
 
 
 def aim_variance(sensors_cfg, pose_cfg):
