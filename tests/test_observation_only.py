@@ -16,8 +16,8 @@ from uuvtai.loader import load_config
 from uuvtai.stages import SimState
 
 KNOWN = {
-    "clock", "mission", "ego", "scan", "image", "pose", "tracks", "clusters", "spots", "habits", "forecast", "mask",
-    "grid_map", "map_scratch",
+    "clock", "mission", "ego", "scan", "image", "pose", "tracks", "clusters", "spots", "habits", "forecast",
+    "mask", "grid_map", "map_scratch",
     "clearance", "clearance_memory", "voronoi", "route", "features", "teacher", "table",
 }  # fmt: skip
 """Structs of what the vehicle is told, senses, remembers and decides. Every other struct, a new one too,
