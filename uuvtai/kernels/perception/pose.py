@@ -207,7 +207,7 @@ def take_walls(env, io: Bundle[PoseIO]):
     for k in ti.static(range(2)):
         rows[3 + k, 3], rows[3 + k, 4], found[3 + k] = half[0, k], half[1, k], slip[k]
     now = mean + 0.0
-    for k in range(5):  # not unrolled: that compiles five times as long
+    for k in range(5):  # not unrolled, so that it is compiled once
         h = ti.Vector([rows[k, j] for j in range(_N)])
         moved, shrunk = measured(now, cov, h, found[k] - h.dot(now - mean), 1.0)
         now, cov = moved, shrunk
