@@ -443,6 +443,22 @@ KERNELS = (
         "zeroes_the_pressure",
     ),
     Mutation(
+        "lost_velocity_believed",
+        "uuvtai/kernels/perception/pose.py",
+        "if step % io.sensors_cfg.dvl.period_steps == 0 and io.ego.vel_valid[env] == 1:",
+        "if step % io.sensors_cfg.dvl.period_steps == 0:",
+        "tests/test_pose.py",
+        "dvl_is_lost",
+    ),
+    Mutation(
+        "heading_by_walls_reversed",
+        "uuvtai/kernels/perception/wall_fix.py",
+        "lever = r * (ny * ux - nx * uy)",
+        "lever = r * (nx * uy - ny * ux)",
+        "tests/test_pose.py",
+        "float64",
+    ),
+    Mutation(
         "decay_unscaled",
         "uuvtai/kernels/perception/mapping.py",
         "return 1.0 - (1.0 - decay) ** (period_s * RATED_HZ)",

@@ -57,6 +57,7 @@ SCHEMAS = {
     "/tf": "foxglove.FrameTransforms",
     "/pose": "foxglove.PoseInFrame",
     "/pose_estimate": "foxglove.PoseInFrame",
+    "/pose_covariance": "uuv.PoseCovariance",
     "/sonar/scan": "foxglove.LaserScan",
     "/sonar/doppler": "uuv.SonarDoppler",
     "/camera/line": "uuv.DepthLine",
@@ -155,12 +156,23 @@ def test_every_topic_has_its_schema_and_every_message_fits_it(log_path):
     assert seen.keys() == {topic.name for topic in TOPICS} >= {"/tracks", "/plan/lookahead"}
 
 
+def test_how_sure_the_pose_is_stands_beside_how_far_off_it_is(log_path, snaps):
+    message, snap = by_topic(log_path, "/pose_covariance")[20], snaps[20]
+    matrix, cov = np.reshape(message["covariance"], (6, 6)), snap["ego.pose_cov"]
+    assert np.array_equal(matrix, matrix.T)
+    assert matrix[0, 5] == pytest.approx(cov[2]) and matrix[1, 5] == pytest.approx(cov[4])
+    assert np.diag(matrix) == pytest.approx([cov[0], cov[3], snap["ego.z_var"], 0, 0, cov[5]])
+    assert message["sigma"] == pytest.approx(np.sqrt(np.diag(matrix)[[0, 1, 2, 5]]))
+    assert message["error"] == pytest.approx([0.01, 0.01, 0.01, 0.0], abs=2e-6)
+
+
 def test_rates(log_path):
     counts = {entry["topic"]: entry["messages"] for entry in info(log_path)["topics"]}
     every_step = [
         "/tf",
         "/pose",
         "/pose_estimate",
+        "/pose_covariance",
         "/sonar/scan",
         "/sonar/doppler",
         "/state",

@@ -9,14 +9,15 @@ import torch
 
 from tests.conftest import configure
 from uuvtai.capture import capture
+from uuvtai.kernels.perception import pose
 from uuvtai.kernels.planning import features
 from uuvtai.kernels.sensors import proprioception
 from uuvtai.loader import load_config
 from uuvtai.stages import SimState
 
 KNOWN = {
-    "clock", "mission", "ego", "scan", "image", "tracks", "clusters", "spots", "habits", "forecast", "mask",
-    "grid_map", "map_scratch",
+    "clock", "mission", "ego", "scan", "image", "pose", "tracks", "clusters", "spots", "habits", "forecast",
+    "futures", "mask", "grid_map", "map_scratch",
     "clearance", "clearance_memory", "voronoi", "route", "features", "teacher", "table", "baselines",
 }  # fmt: skip
 """Structs of what the vehicle is told, senses, remembers and decides. Every other struct, a new one too,
@@ -50,6 +51,17 @@ class Poison:
     def during(self, sim, patch):
         """From now on be on from the first kernel of tracking to the last that writes the observation."""
         track, observe, planned_with = sim._track, sim._observe, sim._plan_seed
+        predict, correct = pose.predict_pose, pose.correct_pose
+
+        def poisoned(stage):
+            """The pose filter runs before and after the sonar, which needs the truth."""
+
+            def run(io):
+                self.on()
+                stage(io)
+                self.off()
+
+            return run
 
         def poisoned_track():
             self.on()
@@ -68,6 +80,8 @@ class Poison:
             self.arrays["episode.key"][env] = poisoned
             return seed
 
+        patch.setattr(pose, "predict_pose", poisoned(predict))
+        patch.setattr(pose, "correct_pose", poisoned(correct))
         patch.setattr(sim, "_track", poisoned_track)
         patch.setattr(sim, "_observe", poisoned_observe)
         patch.setattr(sim, "_plan_seed", seed_of)
@@ -142,7 +156,7 @@ def test_every_struct_is_known_or_truth():
 
 
 def with_sensors(small, monkeypatch, **changed):
-    """Another reading of pose and speed: only the two kernels of proprioception are compiled for it."""
+    """Another reading of pose and speed: only the kernels of proprioception and pose are compiled for it."""
     sensors = small.config.sensors.model_copy(update=changed)
     configure(monkeypatch, small.sim, small.sim.config.model_copy(update={"sensors": sensors}))
 
@@ -153,14 +167,14 @@ def test_no_decision_observation_or_memory_depends_on_the_truth(watched):
     assert written == set(), "truth belongs to the simulator: nobody else writes it"
 
 
-def test_nor_with_dead_reckoning_and_harsh_readings(watched, monkeypatch):
+def test_nor_with_an_estimated_pose_and_harsh_readings(watched, monkeypatch):
     """Position, heading and speed are off: whoever took the true ones would do something else."""
     exact, _, _ = driven(watched)
     harsh = load_config("pool", "harsh").sensors
     with_sensors(
         watched,
         monkeypatch,
-        localization="dead_reckoning",
+        localization="estimated",
         dvl=harsh.dvl,
         imu=harsh.imu,
         pressure=harsh.pressure,
@@ -169,7 +183,8 @@ def test_nor_with_dead_reckoning_and_harsh_readings(watched, monkeypatch):
     assert (differing, written) == ([], set())
     assert not torch.equal(actions, exact), "the readings are others"
     apart = np.abs(watched.sim.s.ego.pos_w.to_numpy() - watched.sim.s.vehicle.pos_w.to_numpy())
-    assert apart.max() > 0.02
+    assert apart.max() > 0.005
+    assert (watched.sim.s.ego.z_var.to_numpy() > 0).all() and watched.sim.s.pose.mean.to_numpy().any()
 
 
 # ----------------------------------------------------------------------------------- the tests above can fail

@@ -226,7 +226,7 @@ def test_pressure_bias_and_sigma(rig):
 
 
 def test_truth_localization_ignores_the_errors_of_the_readings(rig):
-    sensors = load_config("pool", "harsh").sensors
+    sensors = load_config("pool", "harsh", overrides={"sensors.localization": "truth"}).sensors
     rig.start(sensors)
     for step in range(20):
         rig.move(pos_w=(5 + 0.1 * step, 3, -1))
@@ -358,4 +358,4 @@ def test_presets_load_and_get_worse(name):
     assert (sensors.dvl.sigma_m_s > 0) == (rank >= 2)
     assert sensors.sonar.latency_steps == max(0, rank - 1)
     assert (sensors.sonar.range_sigma_m > 0) == (rank >= 1)
-    assert sensors.localization == "truth"
+    assert sensors.localization == ("truth" if rank < 2 else "estimated")

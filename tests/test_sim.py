@@ -11,6 +11,7 @@ SENSED = (
     "ego",
     "scan",
     "image",
+    "pose",
     "tracks",
     "habits",
     "forecast",

@@ -22,6 +22,7 @@ from uuvtai.show.simulation import show_simulation
 from uuvtai.show.sweeping import show_sweep
 from uuvtai.tables.claim_table import claim_table
 from uuvtai.tables.table import PAGE, TERMINAL, Cell, Column, Table, markdown
+from uuvtai.tables.wording import sensing
 
 WIDTHS = (80, 100, 120)
 CONDITION = {
@@ -247,3 +248,16 @@ def test_one_table_is_shown_in_the_terminal_and_on_a_page_each_in_its_way():
         ["name", "time", "terminal's"],
         ["a|b", "short", "t"],
     )
+
+
+@pytest.mark.parametrize(
+    ("found", "said"),
+    [
+        ({"localization": "truth"}, "harsh sensing, position known"),
+        ({"localization": "dead_reckoning"}, "harsh sensing, dead reckoning"),
+        ({"localization": "estimated"}, "harsh sensing, position estimated"),
+        ({}, "harsh sensing"),
+    ],
+)
+def test_what_was_sensed_says_how_the_position_was_found(found, said):
+    assert sensing({"sensors": "harsh", **found}) == said

@@ -30,6 +30,7 @@ from uuvtai.shipped import preset_names, shipped_file
 DEFAULT_WORLD, DEFAULT_SENSORS = "pool", "paper"
 _SCENE_KINDS = ("world", "sensors", "vehicle")
 STACK_SECTIONS = (
+    "pose",
     "tracking",
     "forecast",
     "elevation",

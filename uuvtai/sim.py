@@ -1,8 +1,8 @@
 """The simulator: allocates every struct and runs the stages in order. ``Sim.step`` is the page to read first.
 
-Data goes one way: action -> actuation -> dynamics -> world -> referee -> sensing -> tracking -> mapping ->
-clearance -> planning -> features -> teacher -> reward. A pass works on the rows whose ``clock.awake`` is 1:
-all running rows in a step, only the rows being reset in a reset.
+Data goes one way: action -> actuation -> dynamics -> world -> referee -> sensing -> pose -> tracking ->
+mapping -> clearance -> planning -> features -> teacher -> reward. A pass works on the rows whose
+``clock.awake`` is 1: all running rows in a step, only the rows being reset in a reset.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from uuvtai.copying import copied_rows
 from uuvtai.initial import allocate_state, fill_constants
 from uuvtai.kernels.baselines import dynamic_window, path_integral, potential_field, velocity_obstacle
 from uuvtai.kernels.core.rows import copy_rows
-from uuvtai.kernels.perception import elevation, forecast, futures, look, mapping, spotting, tracking
+from uuvtai.kernels.perception import elevation, forecast, futures, look, mapping, pose, spotting, tracking
 from uuvtai.kernels.planning import clearance, features, route, triggers, voronoi
 from uuvtai.kernels.privileged import true_map, true_tracks
 from uuvtai.kernels.sensors import depth, proprioception, sonar
@@ -113,8 +113,15 @@ class Sim:
         io, c = self.io, self.config
         with self._stage("proprioception"):
             proprioception.sense_proprioception(io.proprioception)
+        estimated = c.sensors.localization == "estimated"
+        if estimated:
+            with self._stage("pose"):
+                pose.predict_pose(io.pose)
         with self._stage("sonar"):
             sonar.cast_sonar(io.sonar)
+        if estimated and c.pose.use_walls:
+            with self._stage("pose"):
+                pose.correct_pose(io.pose)
         with self._stage("depth"):
             depth.cast_depth(io.depth)
         with self._stage("tracking"):
@@ -191,6 +198,8 @@ class Sim:
         dynamics.reset_vehicle(io.dynamics)
         actuation.reset_actuation(io.actuation)
         proprioception.reset_proprioception(io.proprioception)
+        if self.config.sensors.localization == "estimated":
+            pose.reset_pose(io.pose)
         sonar.reset_sonar(io.sonar)
         depth.reset_depth(io.depth)
         tracking.reset_tracks(io.tracking)

@@ -22,6 +22,7 @@ from uuvtai.kernels.perception.bundles import (
     HeightsIO,
     LookIO,
     MappingIO,
+    PoseIO,
     SpottingIO,
     TrackingIO,
 )
@@ -34,7 +35,7 @@ from uuvtai.kernels.vehicle.bundles import ActuationIO, DynamicsIO
 from uuvtai.kernels.world.bundles import WorldIO
 
 STAGES = (
-    "dynamics", "world", "proprioception", "sonar", "depth", "tracking",
+    "dynamics", "world", "proprioception", "sonar", "pose", "depth", "tracking",
     "mapping", "clearance", "planning", "features", "teacher", "reward",
 )  # fmt: skip
 """what is timed apart, in order"""
@@ -76,6 +77,7 @@ class SimState:
     scan: state.SonarScan
     sonar_memory: state.SonarMemory
     image: state.DepthImage
+    pose: state.PoseState
     tracks: state.TrackState
     clusters: state.ClusterState
     spots: state.SpotState
@@ -107,6 +109,7 @@ class Stages:
     proprioception: ProprioceptionIO
     sonar: SonarIO
     depth: DepthIO
+    pose: PoseIO
     tracking: TrackingIO
     spotting: SpottingIO
     look: LookIO

@@ -50,6 +50,7 @@ class Row:
 
 _MOVING = "-S 8 -D 6 -v 0.6"
 _FAST = "-S 8 -D 9 -v 1.5"
+_KNOWN = "--set sensors.localization=truth"
 ROWS = (
     Row("pool_0", "`pool` (0)", "--world pool -S 8 -D 0"),
     Row("pool_6", "`pool` (6, 0.6)", f"--world pool {_MOVING}", f"best {Row.methods}"),
@@ -59,11 +60,25 @@ ROWS = (
     Row("maze_0", "`maze` (0)", "--world maze -S 8 -D 0"),
     Row("maze_6", "`maze` (6, 0.6)", f"--world maze {_MOVING}"),
     Row("netpen", "`netpen` (its own D, v)", "--world netpen"),
-    Row("transfer", "`transfer` (its own D, v)", "--world transfer"),
-    Row("pool_6_nominal", "`pool` (6, 0.6), nominal sensing", f"--world pool {_MOVING} --sensors nominal"),
+    Row("transfer", "`transfer` (its own D, v), position estimated", "--world transfer"),
+    Row(
+        "pool_6_nominal",
+        "`pool` (6, 0.6), nominal sensing, position known",
+        f"--world pool {_MOVING} --sensors nominal {_KNOWN}",
+    ),
+    Row(
+        "pool_6_nominal_estimated",
+        "`pool` (6, 0.6), nominal sensing, position estimated",
+        f"--world pool {_MOVING} --sensors nominal",
+    ),
     Row(
         "pool_6_harsh",
         "`pool` (6, 0.6), harsh sensing, position known",
+        f"--world pool {_MOVING} --sensors harsh {_KNOWN}",
+    ),
+    Row(
+        "pool_6_harsh_estimated",
+        "`pool` (6, 0.6), harsh sensing, position estimated",
         f"--world pool {_MOVING} --sensors harsh",
     ),
     Row(

@@ -14,6 +14,7 @@ FILES = {
     "world": ("scenarios", "episode"),
     "proprioception": ("proprioception",),
     "sonar": ("sonar", "sonar_error", "raycast"),
+    "pose": ("pose", "wall_fix"),
     "depth": ("depth",),
     "tracking": ("tracking", "habits", "elevation", "look", "forecast", "spotting"),
     "mapping": ("mapping",),

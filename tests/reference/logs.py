@@ -186,6 +186,8 @@ def _sensed(
         "ego.vel_valid": np.int32(1),
         "ego.rate_b": np.zeros(3, np.float32),
         "ego.depth_m": -pos[2].astype(np.float32),
+        "ego.pose_cov": np.array([4e-4, -1e-4, 2e-5, 9e-4, -3e-5, 4e-6], np.float32),
+        "ego.z_var": np.float32(2.5e-5),
         "scan.fresh": np.int32(1),
         "scan.ping_step": np.int32(step),
         "scan.range_m": ranges,

@@ -17,6 +17,7 @@ from uuvtai.config.perception import (
     ElevationConfig,
     ForecastConfig,
     MappingConfig,
+    PoseConfig,
     SpottingConfig,
     TrackingConfig,
 )
@@ -53,6 +54,7 @@ class Config(Section):
     disturbance: DisturbanceConfig = DisturbanceConfig()
     sensors: SensorsConfig = SensorsConfig()
     traffic: TrafficConfig = TrafficConfig()
+    pose: PoseConfig = PoseConfig()
     tracking: TrackingConfig = TrackingConfig()
     forecast: ForecastConfig = ForecastConfig()
     elevation: ElevationConfig = ElevationConfig()
@@ -86,6 +88,7 @@ __all__ = [
     "ImuConfig",
     "MappingConfig",
     "PathIntegralConfig",
+    "PoseConfig",
     "PotentialFieldConfig",
     "PressureConfig",
     "RewardConfig",

@@ -1,4 +1,4 @@
-"""Moving bodies, their forecast and height, and the map."""
+"""The own pose, moving bodies, their forecast and height, and the map."""
 
 from __future__ import annotations
 
@@ -7,6 +7,30 @@ from typing import Annotated
 from pydantic import Field, model_validator
 
 from uuvtai.config.section import Fraction, NonNegative, Packets, Positive, PositiveCount, Section
+
+
+class PoseConfig(Section):
+    """Filter of the own pose, where ``sensors.localization`` is ``estimated`` (values EC, tuned). What the
+    sensors do wrong it takes from their own sections."""
+
+    accel_density: Positive = 0.04
+    """[m^2/s^3] spectral density of the own horizontal acceleration, which carries the velocity from one
+    reading of the DVL to the next"""
+    heave_density: Positive = 0.03
+    """[m^2/s^3] the same of the vertical acceleration"""
+    use_walls: bool = True
+    """correct the pose by the beams that end on a known wall, and the velocity by their Doppler; off: dead
+    reckoning that knows how uncertain it is"""
+    gate_sigmas: Positive = 3.0
+    """a beam counts if it ends within so many standard deviations of where the wall is expected; likewise its
+    Doppler"""
+    wall_sigma_m: Positive = 0.003
+    """error of the known place of a wall"""
+    bearing_sigma_rad: NonNegative = 0.001
+    """error of a beam's direction"""
+    inflation: Annotated[float, Field(ge=1, le=1000)] = 2.2
+    """a beam's variance is taken this many times larger: bodies close to a wall pass the gate in many
+    neighbouring beams and scans"""
 
 
 class TrackingConfig(Section):

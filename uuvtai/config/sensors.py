@@ -96,4 +96,6 @@ class SensorsConfig(Section):
     dvl: DvlConfig = DvlConfig()
     imu: ImuConfig = ImuConfig()
     pressure: PressureConfig = PressureConfig()
-    localization: Literal["truth", "dead_reckoning"] = "truth"
+    localization: Literal["truth", "dead_reckoning", "estimated"] = "truth"
+    """truth: the position is given, as in the paper. dead_reckoning: DVL, IMU and pressure alone, from the
+    known start. estimated: the pose filter (section pose) corrects these by the walls that the sonar sees"""

@@ -14,6 +14,7 @@ from uuvtai.learn.checkpoint import Checkpoint
 from uuvtai.loader import ConfigError
 from uuvtai.outcomes import COLLIDED
 from uuvtai.statistics import wilson_interval
+from uuvtai.tables.wording import sensing
 
 RESULT = Path("eval/result.json")
 """what ``uuv eval`` leaves in its run folder"""
@@ -92,7 +93,7 @@ def _row(result: dict[str, Any], method: dict[str, Any]) -> Evaluation:
     seeds = ", ".join(str(int(seed)) for seed in result["seeds"])
     where = (
         f"{_word(result['world'])}, S = {int(result['S'])}, D = {int(result['D'])}{speed}, "
-        f"{_word(result['sensors'])} sensing, seed {seeds}"
+        f"{sensing({**result, 'sensors': _word(result['sensors'])})}, seed {seeds}"
     )
     k, n = int(method["outcomes"]["success"]), int(method["episodes"])
     collisions = sum(int(method["outcomes"][name]) for name in COLLIDED)

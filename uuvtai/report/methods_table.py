@@ -11,7 +11,7 @@ from uuvtai.report.colours import method_colours
 from uuvtai.report.figures import Line, intervals, rates_text, reliability
 from uuvtai.tables.method_tables import causes_table, methods_table, paired_table
 from uuvtai.tables.table import Column, Data, Table
-from uuvtai.tables.wording import number, percent
+from uuvtai.tables.wording import number, percent, sensing
 
 Method = dict[str, Any]
 
@@ -42,7 +42,7 @@ def conditions(result: dict[str, Any]) -> str:
     seeds = ", ".join(map(str, result["seeds"]))
     return (
         f"World {result['world']}, S = {result['S']} resting and D = {result['D']} moving obstacles{speed}, "
-        f"{result['sensors']} sensing; seeds {seeds}, {result['episodes_per_seed']} episodes each, the same "
+        f"{sensing(result)}; seeds {seeds}, {result['episodes_per_seed']} episodes each, the same "
         "ones for every method."
     )
 

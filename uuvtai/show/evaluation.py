@@ -10,7 +10,7 @@ from uuvtai.endings import say
 from uuvtai.show.cause_table import show_causes
 from uuvtai.show.screen import Screen
 from uuvtai.tables.method_tables import DAGGER, methods_table, paired_table
-from uuvtai.tables.wording import number, rate
+from uuvtai.tables.wording import number, rate, sensing
 
 
 def show_evaluation(screen: Screen, result: dict[str, Any], folder: Path) -> None:
@@ -29,7 +29,7 @@ def show_methods(screen: Screen, result: dict[str, Any]) -> None:
     """Table of methods of a ``uuv eval --json`` document, and what belongs below it."""
     speed = f"v = {result['v_m_s']} m/s, " if result["D"] else ""
     title = (
-        f"{result['world']}: S = {result['S']}, D = {result['D']}, {speed}{result['sensors']} sensing, "
+        f"{result['world']}: S = {result['S']}, D = {result['D']}, {speed}{sensing(result)}, "
         f"{len(result['seeds'])} {'seed' if len(result['seeds']) == 1 else 'seeds'} x "
         f"{result['episodes_per_seed']} episodes"
     )

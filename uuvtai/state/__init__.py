@@ -20,6 +20,7 @@ from uuvtai.state.perception import (
     HabitState,
     MapScratch,
     MapState,
+    PoseState,
     SpotState,
     TrackState,
 )
@@ -54,6 +55,7 @@ __all__ = [
     "MapState",
     "MissionState",
     "PathState",
+    "PoseState",
     "Proprioception",
     "ProprioceptionMemory",
     "RefereeState",

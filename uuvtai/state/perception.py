@@ -1,4 +1,4 @@
-"""Moving bodies, where they will be, and the map: what is remembered of what was sensed."""
+"""The own pose, moving bodies, where they will be, and the map: what is remembered of what was sensed."""
 
 from __future__ import annotations
 
@@ -7,6 +7,21 @@ from dataclasses import dataclass
 import taichi as ti
 
 from uuvtai.state.arrays import array
+
+
+@dataclass(frozen=True, eq=False)
+class PoseState:
+    """Remembered: two Kalman filters, of the horizontal pose and of the depth."""
+
+    mean: ti.Field = array("n_env", vec=7)
+    """[m, m, rad, m/s, m/s, rad/s, 1] x, y, heading less the IMU's, velocity ahead and to the left in the
+    level body frame, rate of the heading's correction, scale error of the DVL"""
+    cov: ti.Field = array("n_env", vec=28)
+    """upper triangle of the 7 x 7 covariance, row by row"""
+    depth: ti.Field = array("n_env", vec=3)
+    """[m, m/s, m] z, heave, and how much too deep the zeroed pressure sensor reads"""
+    depth_cov: ti.Field = array("n_env", vec=6)
+    """upper triangle of their covariance"""
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,19 +16,24 @@ class Proprioception:
     invalid."""
 
     vel_b: ti.Field = array("n_env", vec=3)
-    """[m/s] DVL"""
+    """[m/s] DVL; where it is invalid the last reading, or what the pose filter makes of it"""
     vel_valid: ti.Field = array("n_env", dtype=ti.i32)
     """1 = the DVL has a reading no older than its own period"""
     rpy: ti.Field = array("n_env", vec=3)
-    """[rad] roll, pitch, yaw of the IMU"""
+    """[rad] roll, pitch, yaw of the IMU; yaw corrected where the pose is estimated"""
     rate_b: ti.Field = array("n_env", vec=3)
     """[rad/s] gyro"""
     specific_force_b: ti.Field = array("n_env", vec=3)
     """[m/s^2] accelerometer: acceleration minus gravity, in body axes"""
     depth_m: ti.Field = array("n_env")
-    """[m] pressure depth, positive down; zeroed at the known start in dead reckoning"""
+    """[m] pressure depth, positive down; zeroed at the known start unless the position is given"""
     pos_w: ti.Field = array("n_env", vec=3)
-    """[m] position estimate (truth or dead reckoning; z from pressure in dead reckoning)"""
+    """[m] position: the truth, dead reckoning (z from pressure) or the pose filter's estimate"""
+    pose_cov: ti.Field = array("n_env", vec=6)
+    """[m^2, m^2, m rad, m^2, m rad, rad^2] covariance of x, y and heading, its upper triangle row by row; 0
+    where the pose is not estimated"""
+    z_var: ti.Field = array("n_env")
+    """[m^2] variance of z; 0 where the position is given"""
 
 
 @dataclass(frozen=True, eq=False)

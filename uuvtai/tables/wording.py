@@ -3,12 +3,18 @@ as a dash."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from uuvtai.outcomes import COLLIDED
 from uuvtai.tables.table import Cell
 
 _NAMES = {"v_m_s": "v m/s"}
+_LOCALIZED = {
+    "truth": "position known",
+    "dead_reckoning": "dead reckoning",
+    "estimated": "position estimated",
+}
 
 
 def rate(k: int | None, n: int, interval: Sequence[float] | None) -> Cell:
@@ -20,6 +26,12 @@ def rate(k: int | None, n: int, interval: Sequence[float] | None) -> Cell:
         return Cell(share)
     low, high = (100 * bound for bound in interval)
     return Cell(f"{share} [{low:.1f}, {high:.1f}]", f"{share} [{low:.0f}, {high:.0f}]")
+
+
+def sensing(result: Mapping[str, Any]) -> str:
+    """'harsh sensing, position estimated'; results of old versions do not say how the position was found."""
+    where = _LOCALIZED.get(str(result.get("localization")))
+    return f"{result['sensors']} sensing" + (f", {where}" if where else "")
 
 
 def number(value: float | None, digits: int = 1) -> str:

@@ -10,6 +10,8 @@ from uuvtai.config import (
     EpisodeConfig,
     ForecastConfig,
     MappingConfig,
+    PoseConfig,
+    SensorsConfig,
     SonarConfig,
     SpottingConfig,
     TankConfig,
@@ -28,6 +30,7 @@ from uuvtai.state import (
     HabitState,
     MapScratch,
     MapState,
+    PoseState,
     Proprioception,
     SonarScan,
     SpotState,
@@ -108,6 +111,20 @@ class MappingIO:
     episode_cfg: Const[EpisodeConfig]
     mapping_cfg: Const[MappingConfig]
     sonar_cfg: Const[SonarConfig]
+    tank_cfg: Const[TankConfig]
+
+
+@dataclass(frozen=True, eq=False)
+class PoseIO:
+    """Where the vehicle is."""
+
+    ego: Out[Proprioception]
+    pose: Out[PoseState]
+    clock: In[ClockState]
+    scan: In[SonarScan]
+    episode_cfg: Const[EpisodeConfig]
+    pose_cfg: Const[PoseConfig]
+    sensors_cfg: Const[SensorsConfig]
     tank_cfg: Const[TankConfig]
 
 

@@ -1,11 +1,11 @@
-"""Proprioception: DVL, IMU, pressure, and the pose estimate that mapping and planning use.
+"""Proprioception: DVL, IMU, pressure, and a position.
 
 Every error is a config number, compiled away at zero. Heading error = constant drift rate of the episode plus
-the integrated noise of the yaw gyro. Position is the truth (as in the paper), or dead reckoning: DVL velocity
+the integrated noise of the yaw gyro. Position is the truth (as in the paper), dead reckoning (DVL velocity
 turned by the IMU's attitude, summed up from the known start, z from pressure; while the DVL has lost the
-bottom it goes on with the last velocity. Where depth is found by pressure the sensor is zeroed at the known
-start: its first reading is taken for the start's depth, so that the bias drops out and one reading's noise
-stays.
+bottom it goes on with the last velocity), or left to the pose filter (perception/pose.py). Where depth is
+found by pressure the sensor is zeroed at the known start: its first reading is taken for the start's depth,
+so that the bias drops out and one reading's noise stays.
 """
 
 import taichi as ti
@@ -81,6 +81,10 @@ def clear_readings(env, io: Bundle[ProprioceptionIO]):
     io.ego.vel_valid[env] = 0
     io.ego.depth_m[env] = 0.0
     io.ego.pos_w[env] = io.vehicle.pos_w[env]
+    io.ego.pose_cov[env] = 0.0
+    io.ego.z_var[env] = 0.0
+    if ti.static(io.sensors_cfg.localization == "dead_reckoning"):  # a reading's noise, and that of the zero
+        io.ego.z_var[env] = ti.static(2.0 * io.sensors_cfg.pressure.sigma_m**2)
 
 
 @quick_launch
@@ -154,12 +158,12 @@ def read_dvl(env, key, step, io: Bundle[ProprioceptionIO]):
 
 @ti.func
 def read_pressure(env, key, step, io: Bundle[ProprioceptionIO]):
-    """Depth, positive down; in dead reckoning less what the first reading was off the known start, where
-    ``ego.pos_w`` is at step 0."""
+    """Depth, positive down; unless the position is given less what the first reading was off the known
+    start, where ``ego.pos_w`` is at step 0."""
     reading = io.ego_memory.pressure_bias_m[env] - io.vehicle.pos_w[env][2]
     if ti.static(io.sensors_cfg.pressure.sigma_m > 0):
         reading += io.sensors_cfg.pressure.sigma_m * normal(stream_key(key, step, STREAM_PRESSURE), 0)
-    if ti.static(io.sensors_cfg.localization == "dead_reckoning"):
+    if ti.static(io.sensors_cfg.localization != "truth"):
         if step == 0:
             io.ego_memory.pressure_zero_m[env] = reading + io.ego.pos_w[env][2]
         reading -= io.ego_memory.pressure_zero_m[env]
@@ -168,10 +172,11 @@ def read_pressure(env, key, step, io: Bundle[ProprioceptionIO]):
 
 @ti.func
 def estimate_position(env, step, io: Bundle[ProprioceptionIO]):
-    """Position estimate: truth, or one step of dead reckoning from what was just measured."""
+    """Position: truth, or one step of dead reckoning from what was just measured; the pose filter writes its
+    own."""
     if ti.static(io.sensors_cfg.localization == "truth"):
         io.ego.pos_w[env] = io.vehicle.pos_w[env]
-    else:
+    elif ti.static(io.sensors_cfg.localization == "dead_reckoning"):
         pos, rpy = io.ego.pos_w[env], io.ego.rpy[env]
         if step > 0:
             pos += (

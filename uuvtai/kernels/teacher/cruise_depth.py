@@ -21,7 +21,7 @@ _BLUR_M = 0.1
 @ti.func
 def choose_depth(env, io: Bundle[ThreatsIO]):
     """Set ``cruise_z_m``: the cheapest of ``depth_choices`` depths from edge to edge."""
-    low, high = ti.static(depth_band(io.tank_cfg, io.teacher_cfg))
+    low, high = depth_band(io.ego.z_var[env], io.tank_cfg, io.teacher_cfg)
     goal, pos = io.mission.goal_w[env], io.ego.pos_w[env]
     wanted = ti.math.clamp(goal[2], low, high)
     if ti.static(io.teacher_cfg.free_depth):

@@ -72,14 +72,13 @@ def candidate(env, index, io: Bundle[EvasionIO]):
         out = _towards(env, turn, speed, follow[2], io)
     elif index == n_level + 1:
         out = io.teacher.last_vel_w[env]
-        out[2] = edge_limited(out[2], io.ego.pos_w[env][2], io)
+        out[2] = edge_limited(out[2], io.ego.pos_w[env][2], io.ego.z_var[env], io)
     elif index == n_level + 2:
         out = follow
     elif index > n_level + 2 and index < ti.static(io.teacher_cfg.n_held):
         nth = index - n_level - 3
-        heave = edge_limited(
-            ti.select(nth % 2 == 0, 1.0, -1.0) * io.teacher_cfg.heave_m_s, io.ego.pos_w[env][2], io
-        )
+        heave = ti.select(nth % 2 == 0, 1.0, -1.0) * io.teacher_cfg.heave_m_s
+        heave = edge_limited(heave, io.ego.pos_w[env][2], io.ego.z_var[env], io)
         turn = ti.static(TWO_PI / io.teacher_cfg.n_heave_heading) * (nth // 2)
         out = _towards(env, turn, ti.select(nth >= 2 * n_heave, 0.0, 1.0), heave, io)
     return out
@@ -95,9 +94,9 @@ def _towards(env, turn, share, heave, io: Bundle[EvasionIO]):
 
 
 @ti.func
-def edge_limited(heave, own_z, io: Bundle[EvasionIO]):
+def edge_limited(heave, own_z, z_var, io: Bundle[EvasionIO]):
     """Heave [m/s] that stops at the band's edges instead of running into floor or surface."""
-    low, high = ti.static(depth_band(io.tank_cfg, io.teacher_cfg))
+    low, high = depth_band(z_var, io.tank_cfg, io.teacher_cfg)
     return ti.math.clamp(heave, ti.min(low - own_z, 0.0), ti.max(high - own_z, 0.0))
 
 
@@ -116,7 +115,7 @@ def cost_lanes(env, cx, cy, cz, burst_s, io: Bundle[EvasionIO]):
     every candidate is bad."""
     pos, vel = io.ego.pos_w[env], turned_z3(io.ego.vel_b[env], io.ego.rpy[env][2])
     level, level_vel = ti.Vector([pos[0], pos[1]]), ti.Vector([vel[0], vel[1]])
-    drive = ti.Struct(x=cx, y=cy, z=cz, burst_s=burst_s, pos=pos, vel=vel)
+    drive = ti.Struct(x=cx, y=cy, z=cz, burst_s=burst_s, pos=pos, vel=vel, z_var=io.ego.z_var[env])
     peak, mean, contact, _ = body_depths(
         env, drive, io.forecast, io.futures, io.teacher_cfg, io.tracking_cfg, io.tank_cfg
     )

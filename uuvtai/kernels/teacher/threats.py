@@ -197,7 +197,7 @@ def _foresee_conflict(env, io: Bundle[ThreatsIO]):
         cz[1] = heave
         cx, cy = f16x(follow[0]), f16x(follow[1])
         cx[2], cy[2] = 0.0, 0.0
-        drive = ti.Struct(x=cx, y=cy, z=cz, burst_s=FAR_M, pos=pos, vel=vel)
+        drive = ti.Struct(x=cx, y=cy, z=cz, burst_s=FAR_M, pos=pos, vel=vel, z_var=io.ego.z_var[env])
         peak, _, _, first = body_depths(
             env, drive, io.forecast, io.futures, io.teacher_cfg, io.tracking_cfg, io.tank_cfg
         )

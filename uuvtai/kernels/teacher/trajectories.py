@@ -30,7 +30,8 @@ def body_depths(
     """How deep each commanded velocity violates the wanted clearance from the forecast bodies.
 
     ``drive``: struct of the velocities (lanes x, y, z [m/s]), which are commanded for ``burst_s`` [s], then
-    stop, and of the own position ``pos`` [m] and velocity ``vel`` [m/s] now, world. Returns lanes: largest
+    stop, and of the own position ``pos`` [m], velocity ``vel`` [m/s] and variance of z ``z_var`` [m^2] now,
+    world. Returns lanes: largest
     depth [m]; depth averaged over the horizon and summed over bodies [m]; largest depth below contact [m];
     time of the first violation [s], FAR_M = none. Each body counts with the mean of its futures, weighted by
     their probabilities; a future that is less probable than ``heed_share`` has no first violation. The
@@ -100,7 +101,7 @@ def _future_depths(
     """The lanes' depths for one future of one body; -1 = its forecast."""
     n_sample = ti.static(_samples(forecast.radius_m.shape[2], teacher_cfg, tracking_cfg))
     dt = ti.static(tracking_cfg.forecast_dt_s)
-    low, high = ti.static(depth_band(tank_cfg, teacher_cfg))
+    low, high = depth_band(drive.z_var, tank_cfg, teacher_cfg)
     found = ti.Struct(peak=f16x(0.0), mean=f16x(0.0), contact=f16x(0.0), first=f16x(FAR_M))
     level, level_vel = ti.Vector([drive.pos[0], drive.pos[1]]), ti.Vector([drive.vel[0], drive.vel[1]])
     reach_speed = level_vel.norm() + ti.static(_fastest(teacher_cfg))
@@ -251,9 +252,14 @@ def held_heave(error_m, teacher_cfg: Const[TeacherConfig], vehicle_cfg: Const[Ve
     return ti.math.clamp(error_m * ti.static(teacher_cfg.depth_gain), -top, top)
 
 
-def depth_band(tank_cfg, teacher_cfg):
-    """(lowest, highest) own z [m] that the teacher steers for."""
-    return tank_cfg.z_m[0] + teacher_cfg.edge_gap_m, tank_cfg.z_m[1] - teacher_cfg.edge_gap_m
+@ti.func
+def depth_band(z_var, tank_cfg: Const[TankConfig], teacher_cfg: Const[TeacherConfig]):
+    """(lowest, highest) own z [m] that the teacher steers for, the less sure of it (``z_var`` [m^2]) the
+    farther from floor and surface."""
+    floor, top = ti.static(tank_cfg.z_m)
+    gap = teacher_cfg.edge_gap_m + teacher_cfg.edge_sigmas * ti.sqrt(z_var)
+    gap = ti.min(gap, ti.static(0.5 * (tank_cfg.z_m[1] - tank_cfg.z_m[0])))
+    return floor + gap, top - gap
 
 
 def _decay(dt_s, lag_s):

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from uuvtai.logs.encode import pose_in_frame, transform
+from uuvtai.logs.encode import numbers, pose_in_frame, transform
 from uuvtai.logs.moment import Moment
-from uuvtai.logs.schemas import FRAME_TRANSFORMS, POSE_IN_FRAME
-from uuvtai.logs.topic import EVERY_STEP, Topic
+from uuvtai.logs.schemas import FOUR, FRAME_TRANSFORMS, NUMBER, POSE_IN_FRAME, array_of, described, record
+from uuvtai.logs.topic import EVERY_STEP, Topic, When
 
 _CAMERA_OPTICAL = (0.5, -0.5, 0.5, -0.5)
 """Quaternion (w, x, y, z) from optical axes (x right, y down, z ahead) to the body's."""
@@ -45,6 +45,41 @@ def _quaternion_of(rpy: Any) -> tuple[float, float, float, float]:
     )
 
 
+_ESTIMATED = When(
+    "every new scan, where the pose is estimated",
+    lambda moment, waited: bool(moment["scan.fresh"]) and moment["ego.pose_cov"][0] > 0,
+    ("scan.fresh", "ego.pose_cov"),
+)
+
+_COVARIANCE = record(
+    "uuv.PoseCovariance",
+    "How sure the pose filter is of `/pose_estimate`, and how far off that is.",
+    covariance=described(
+        {**array_of(NUMBER), "minItems": 36, "maxItems": 36},
+        "[m^2, m rad, rad^2] row by row of x, y, z, roll, pitch, yaw, as in ROS PoseWithCovariance; roll and "
+        "pitch are measured: 0",
+    ),
+    sigma=described(FOUR, "[m, m, m, rad] standard deviations of x, y, z, yaw"),
+    error=described(FOUR, "[m, m, m, rad] estimate less truth of x, y, z, yaw"),
+)
+_ROW_OF = (0, 1, 5)
+"""rows of x, y and heading among x, y, z, roll, pitch, yaw"""
+
+
+def _covariance(moment: Moment) -> bytes:
+    level, z_var = moment["ego.pose_cov"].tolist(), float(moment["ego.z_var"])
+    full = [0.0] * 36
+    full[6 * 2 + 2] = z_var
+    for value, (i, j) in zip(level, ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)), strict=True):
+        full[6 * _ROW_OF[i] + _ROW_OF[j]] = full[6 * _ROW_OF[j] + _ROW_OF[i]] = value
+    sigma = [math.sqrt(max(var, 0.0)) for var in (level[0], level[3], z_var, level[5])]
+    w, x, y, z = moment["vehicle.quat_wb"].tolist()
+    turn = float(moment["ego.rpy"][2]) - math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    off = (moment["ego.pos_w"] - moment["vehicle.pos_w"]).tolist()
+    error = numbers([*off, math.remainder(turn, 2 * math.pi)])
+    return f'{{"covariance":{numbers(full)},"sigma":{numbers(sigma)},"error":{error}}}'.encode()
+
+
 def _read_pose(data: dict[str, Any]) -> tuple[float, float, float, float]:
     """(x, y, z, yaw)."""
     place, q = data["pose"]["position"], data["pose"]["orientation"]
@@ -76,5 +111,13 @@ ROWS = (
         POSE_IN_FRAME,
         lambda moment: pose_in_frame(moment.stamp, moment["ego.pos_w"], _quaternion_of(moment["ego.rpy"])),
         ("ego.pos_w", "ego.rpy"),
+    ),
+    Topic(
+        "/pose_covariance",
+        _ESTIMATED,
+        _COVARIANCE,
+        _covariance,
+        ("ego.pose_cov", "ego.z_var", "ego.pos_w", "ego.rpy", "vehicle.pos_w", "vehicle.quat_wb"),
+        note="; with the error against the truth",
     ),
 )

@@ -20,7 +20,9 @@ _STATE = record(
     rpm=described(array_of(NUMBER), "of each thruster"),
     measured=record(
         "uuv.Measured",
-        velocity=described(THREE, "[m/s] DVL, body frame; the last reading where invalid"),
+        velocity=described(
+            THREE, "[m/s] DVL, body frame; where invalid the last reading, or the pose filter's"
+        ),
         velocity_valid=BOOLEAN,
         rates=described(THREE, "[rad/s] gyro"),
         depth_m=described(NUMBER, "pressure depth, positive down"),

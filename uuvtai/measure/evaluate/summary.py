@@ -95,6 +95,7 @@ def document(
         "D": config.world.n_dynamic,
         "v_m_s": config.world.dynamic_speed_m_s,
         "sensors": sensors,
+        "localization": config.sensors.localization,
         "seeds": seeds,
         "episodes_per_seed": episodes,
         "methods": methods,

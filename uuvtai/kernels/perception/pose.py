@@ -1,0 +1,279 @@
+"""Where the vehicle is: two Kalman filters on sensor data and the known bounds of the water.
+
+Horizontal, extended: x, y, the heading's correction, velocity ahead and to the left in the level body frame,
+the correction's rate (the gyro drifts) and the DVL's scale error. The velocity carries the position from step
+to step and wanders between the readings of the DVL; while that has lost the bottom it wanders on. Every fresh
+scan corrects pose and velocity by the beams that end on a known wall (wall_fix.py). Depth: z, heave and the
+error that zeroing the pressure sensor at the known start has left. The start itself is known.
+
+Errors of a scan refer to its ping: the pose there is off by the pose's error of now less the latency times
+the velocity's. S. Thrun, W. Burgard, D. Fox, Probabilistic Robotics (2005), chapters 3 and 7.
+"""
+
+import taichi as ti
+
+from uuvtai.kernels.core.gaussian import halved, measured, place
+from uuvtai.kernels.core.geometry import quaternion_wb, rotation_wb, wrapped_angle
+from uuvtai.kernels.core.signature import Bundle, spread
+from uuvtai.kernels.perception.bundles import PoseIO
+from uuvtai.kernels.perception.wall_fix import seen_walls
+from uuvtai.taichi_patches.launch import quick_launch
+
+_N = 7
+"""Numbers of the horizontal filter."""
+
+_START_SPEED_M_S = 0.1
+"""Standard deviation of the velocity before the first reading: vehicles start at rest, or nearly (EC)."""
+
+_LEAST_SPEED_SIGMA_M_S = 0.002
+_LEAST_DEPTH_SIGMA_M = 0.001
+"""What a reading's error is taken for where the sensor has none: float32 and the midpoint rule leave that."""
+
+
+@quick_launch
+@ti.kernel
+def reset_pose(io: Bundle[PoseIO]):
+    """At the known start, where ``ego.pos_w`` is, with the heading that the IMU says. Awake rows only."""
+    n = ti.static(io.clock.awake.shape[0])
+    for env, pad in ti.ndrange(n, ti.static(spread(n))):
+        if pad == 0 and io.clock.awake[env] == 1:
+            pos = io.ego.pos_w[env]
+            io.pose.mean[env] = ti.Vector([pos[0], pos[1], 0.0, 0.0, 0.0, 0.0, 0.0])
+            io.pose.depth[env] = ti.Vector([pos[2], 0.0, 0.0])
+            io.pose.cov[env] = 0.0
+            io.pose.depth_cov[env] = 0.0
+            drift, scale = io.sensors_cfg.imu.heading_drift_rad_s, io.sensors_cfg.dvl.scale_error
+            for axis in ti.static((3, 4)):
+                io.pose.cov[env][ti.static(place(axis, axis, _N))] = _START_SPEED_M_S * _START_SPEED_M_S
+            io.pose.cov[env][ti.static(place(5, 5, _N))] = drift * drift
+            io.pose.cov[env][ti.static(place(6, 6, _N))] = scale * scale
+            zeroed = io.sensors_cfg.pressure.sigma_m * io.sensors_cfg.pressure.sigma_m
+            io.pose.depth_cov[env][ti.static(place(1, 1, 3))] = _START_SPEED_M_S * _START_SPEED_M_S
+            io.pose.depth_cov[env][ti.static(place(2, 2, 3))] = zeroed
+
+
+@quick_launch
+@ti.kernel
+def predict_pose(io: Bundle[PoseIO]):
+    """Move both filters to this step, take in DVL and pressure, and say where the vehicle is: the sonar's
+    ping is noted there. Awake rows only."""
+    n = ti.static(io.clock.awake.shape[0])
+    for env, pad in ti.ndrange(n, ti.static(spread(n))):
+        if pad == 0 and io.clock.awake[env] == 1:
+            step = io.clock.step[env]
+            if step > 0:
+                move_on(env, io)
+                sink_on(env, io)
+            if step % io.sensors_cfg.dvl.period_steps == 0 and io.ego.vel_valid[env] == 1:
+                take_dvl(env, io)
+            if step > 0:
+                take_pressure(env, io)
+            tell_pose(env, 0.0, io)
+
+
+@quick_launch
+@ti.kernel
+def correct_pose(io: Bundle[PoseIO]):
+    """Take in the walls of a scan that has just come. Awake rows only."""
+    n = ti.static(io.clock.awake.shape[0])
+    for env, pad in ti.ndrange(n, ti.static(spread(n))):
+        if pad == 0 and io.clock.awake[env] == 1 and io.scan.fresh[env] == 1:
+            before = io.pose.mean[env][2]
+            take_walls(env, io)
+            tell_pose(env, before, io)
+
+
+# --------------------------------------------------------------------------------------------------- predict
+
+
+@ti.func
+def move_on(env, io: Bundle[PoseIO]):
+    """Predict the horizontal filter by one control step: the velocity stays as it is in the level body
+    frame."""
+    dt = ti.static(io.episode_cfg.control_dt_s)
+    mean, cov = io.pose.mean[env], io.pose.cov[env]
+    yaw = io.ego.rpy[env][2] + mean[2] - 0.5 * dt * io.ego.rate_b[env][2]  # half-way through the step
+    c, s = dt * ti.cos(yaw), dt * ti.sin(yaw)
+    way = ti.Vector([c * mean[3] - s * mean[4], s * mean[3] + c * mean[4]])
+    half = ti.Matrix.zero(ti.f32, _N, _N)
+    for j in ti.static(range(_N)):
+        column = carried(ti.Vector([cov[ti.static(place(i, j, _N))] for i in range(_N)]), way, c, s, dt)
+        for i in ti.static(range(_N)):
+            half[i, j] = column[i]
+    for i in ti.static(range(_N)):
+        row = carried(ti.Vector([half[i, j] for j in range(_N)]), way, c, s, dt)
+        for j in ti.static(range(i, _N)):
+            cov[ti.static(place(i, j, _N))] = row[j]
+    cov[ti.static(place(2, 2, _N))] += ti.static(io.sensors_cfg.imu.gyro_noise_rad_s_rthz**2) * dt
+    for axis in ti.static((3, 4)):
+        cov[ti.static(place(axis, axis, _N))] += ti.static(io.pose_cfg.accel_density) * dt
+    io.pose.mean[env] = mean + ti.Vector([way[0], way[1], dt * mean[5], 0.0, 0.0, 0.0, 0.0])
+    io.pose.cov[env] = cov
+
+
+@ti.func
+def carried(u, way, c, s, dt):
+    """A small change of the horizontal filter's numbers one step of dt later: ``way`` the step's displacement
+    (2), (c, s) its direction ahead times dt."""
+    return ti.Vector(
+        [
+            u[0] - way[1] * u[2] + c * u[3] - s * u[4],
+            u[1] + way[0] * u[2] + s * u[3] + c * u[4],
+            u[2] + dt * u[5],
+            u[3],
+            u[4],
+            u[5],
+            u[6],
+        ]
+    )
+
+
+@ti.func
+def sink_on(env, io: Bundle[PoseIO]):
+    """Predict the depth's filter by one control step."""
+    dt = ti.static(io.episode_cfg.control_dt_s)
+    mean, cov = io.pose.depth[env], io.pose.depth_cov[env]
+    # upper triangle of (z, heave, error): 0 zz, 1 zw, 2 ze, 3 ww, 4 we, 5 ee
+    io.pose.depth[env] = ti.Vector([mean[0] + dt * mean[1], mean[1], mean[2]])
+    io.pose.depth_cov[env] = ti.Vector(
+        [
+            cov[0] + dt * (2.0 * cov[1] + dt * cov[3]),
+            cov[1] + dt * cov[3],
+            cov[2] + dt * cov[4],
+            cov[3] + ti.static(io.pose_cfg.heave_density) * dt,
+            cov[4],
+            cov[5],
+        ]
+    )
+
+
+# --------------------------------------------------------------------------------------------------- correct
+
+
+@ti.func
+def take_dvl(env, io: Bundle[PoseIO]):
+    """A fresh reading of the DVL: (1 + scale error) x velocity, turned level."""
+    variance = ti.static(max(io.sensors_cfg.dvl.sigma_m_s, _LEAST_SPEED_SIGMA_M_S) ** 2)
+    rpy = io.ego.rpy[env]
+    reading = rotation_wb(quaternion_wb(rpy[0], rpy[1], 0.0)) @ io.ego.vel_b[env]
+    mean, cov = io.pose.mean[env], io.pose.cov[env]
+    for axis in range(2):
+        h = ti.Vector([0.0] * _N)
+        h[3 + axis], h[6] = 1.0 + mean[6], mean[3 + axis]
+        residual = reading[axis] - (1.0 + mean[6]) * mean[3 + axis]
+        moved, shrunk = measured(mean, cov, h, residual, variance)
+        mean, cov = moved, shrunk
+    io.pose.mean[env], io.pose.cov[env] = mean, cov
+    depth, depth_cov = measured(
+        io.pose.depth[env],
+        io.pose.depth_cov[env],
+        ti.Vector([0.0, 1.0, 0.0]),
+        reading[2] - io.pose.depth[env][1],
+        variance,
+    )
+    io.pose.depth[env], io.pose.depth_cov[env] = depth, depth_cov
+
+
+@ti.func
+def take_pressure(env, io: Bundle[PoseIO]):
+    """A reading of the pressure sensor: -z + what the first reading was off."""
+    depth, depth_cov = measured(
+        io.pose.depth[env],
+        io.pose.depth_cov[env],
+        ti.Vector([-1.0, 0.0, 1.0]),
+        io.ego.depth_m[env] + io.pose.depth[env][0] - io.pose.depth[env][2],
+        ti.static(max(io.sensors_cfg.pressure.sigma_m, _LEAST_DEPTH_SIGMA_M) ** 2),
+    )
+    io.pose.depth[env], io.pose.depth_cov[env] = depth, depth_cov
+
+
+@ti.func
+def take_walls(env, io: Bundle[PoseIO]):
+    """The newest scan: pose at the ping by its ranges, velocity by their Doppler."""
+    mean, cov = io.pose.mean[env], io.pose.cov[env]
+    late = (io.clock.step[env] - io.scan.ping_step[env]) * ti.static(io.episode_cfg.control_dt_s)
+    back_x = late * ti.cos(io.scan.ping_yaw[env])
+    back_y = late * ti.sin(io.scan.ping_yaw[env])
+    speed_cov = ti.Vector([cov[ti.static(place(i, j, _N))] for i, j in ti.static(((3, 3), (3, 4), (4, 4)))])
+    fix = seen_walls(env, place_cov(cov, back_x, back_y), ti.Vector([mean[3], mean[4]]), speed_cov, io)
+    rows, found = ti.Matrix.zero(ti.f32, 5, _N), ti.Vector([0.0] * 5)
+    root, seen = halved(fix.pose, fix.pose_part)
+    for k in ti.static(range(3)):
+        a, b = root[0, k], root[1, k]
+        rows[k, 0], rows[k, 1], rows[k, 2], found[k] = a, b, root[2, k], seen[k]
+        rows[k, 3], rows[k, 4] = -a * back_x - b * back_y, a * back_y - b * back_x
+    info, part = blurred(fix.velocity, fix.velocity_part, io.pose_cfg.accel_density * late)
+    half, slip = halved(info, part)
+    for k in ti.static(range(2)):
+        rows[3 + k, 3], rows[3 + k, 4], found[3 + k] = half[0, k], half[1, k], slip[k]
+    now = mean + 0.0
+    for k in range(5):  # not unrolled, so that it is compiled once
+        h = ti.Vector([rows[k, j] for j in range(_N)])
+        moved, shrunk = measured(now, cov, h, found[k] - h.dot(now - mean), 1.0)
+        now, cov = moved, shrunk
+    io.pose.mean[env], io.pose.cov[env] = now, cov
+
+
+@ti.func
+def blurred(info, part, variance):
+    """Information (upper triangle, vector) on two numbers that have wandered by ``variance`` each since they
+    were measured."""
+    # (J^-1 + w I)^-1 = (I + w J)^-1 J, and the same factor for the vector; for w > 0 and J >= 0 there is no
+    # division by zero
+    xx, xy, yy = 1.0 + variance * info[0], variance * info[1], 1.0 + variance * info[2]
+    det = xx * yy - xy * xy
+    spread_out = ti.Vector(
+        [
+            (yy * info[0] - xy * info[1]) / det,
+            (yy * info[1] - xy * info[2]) / det,
+            (xx * info[2] - xy * info[1]) / det,
+        ]
+    )
+    return spread_out, ti.Vector([yy * part[0] - xy * part[1], xx * part[1] - xy * part[0]]) / det
+
+
+@ti.func
+def place_cov(cov, back_x, back_y):
+    """Covariance (upper triangle) of x, y and heading at the ping, where the pose is off by that of now less
+    the latency times the velocity's error."""
+    # the products H P, then H P H' of them
+    reach = ti.Matrix.zero(ti.f32, 3, _N)
+    for j in ti.static(range(_N)):
+        u, v = cov[ti.static(place(3, j, _N))], cov[ti.static(place(4, j, _N))]
+        reach[0, j] = cov[ti.static(place(0, j, _N))] - back_x * u + back_y * v
+        reach[1, j] = cov[ti.static(place(1, j, _N))] - back_y * u - back_x * v
+        reach[2, j] = cov[ti.static(place(2, j, _N))]
+    out = ti.Vector([0.0] * 6)
+    for i in ti.static(range(3)):
+        along = ti.Vector(
+            [
+                reach[i, 0] - back_x * reach[i, 3] + back_y * reach[i, 4],
+                reach[i, 1] - back_y * reach[i, 3] - back_x * reach[i, 4],
+                reach[i, 2],
+            ]
+        )
+        for j in ti.static(range(i, 3)):
+            out[ti.static(place(i, j, 3))] = along[j]
+    return out
+
+
+# ------------------------------------------------------------------------------------------------------ tell
+
+
+@ti.func
+def tell_pose(env, before, io: Bundle[PoseIO]):
+    """Write what the stack takes for the own pose, its covariance, and the velocity where the DVL is lost.
+
+    ``before``: the heading's correction that ``ego.rpy`` already has in it.
+    """
+    mean, cov, rpy = io.pose.mean[env], io.pose.cov[env], io.ego.rpy[env]
+    io.ego.pos_w[env] = ti.Vector([mean[0], mean[1], io.pose.depth[env][0]])
+    io.ego.rpy[env] = ti.Vector([rpy[0], rpy[1], wrapped_angle(rpy[2] + mean[2] - before)])
+    for i in ti.static(range(3)):
+        for j in ti.static(range(i, 3)):
+            io.ego.pose_cov[env][ti.static(place(i, j, 3))] = cov[ti.static(place(i, j, _N))]
+    io.ego.pose_cov[env][5] += ti.static(io.sensors_cfg.imu.attitude_sigma_rad**2)
+    io.ego.z_var[env] = io.pose.depth_cov[env][0]
+    if io.ego.vel_valid[env] == 0:
+        level = ti.Vector([mean[3], mean[4], io.pose.depth[env][1]])
+        io.ego.vel_b[env] = rotation_wb(quaternion_wb(rpy[0], rpy[1], 0.0)).transpose() @ level
