@@ -43,10 +43,11 @@ class Stage:
         self.teacher, self.tracks = allocate(TeacherState, SIZES), allocate(TrackState, SIZES)
         self.ego, self.mission = allocate(Proprioception, SIZES), allocate(MissionState, SIZES)
 
-    def choose(self, goal_z, away_m=10.0, before_z=-0.8, cfg=None):
+    def choose(self, goal_z, away_m=10.0, before_z=-0.8, sigma_m=0.0, cfg=None):
         """Depth to steer for of vehicles at -0.8 m whose goals lie so far ahead."""
         cfg = cfg or config()
         n = np.zeros(N_ENV, np.float32)
+        self.ego.z_var.fill(sigma_m**2)
         self.ego.pos_w.from_numpy(np.stack([n + 4, n + 3, n - 0.8], 1))
         goal = np.stack([n + 4 + np.float32(away_m), n + 3, n + np.asarray(goal_z, np.float32)], 1)
         self.mission.goal_w.from_numpy(goal.astype(np.float32))
@@ -82,6 +83,14 @@ def test_expected_share_is_that_of_a_drawn_population(column_share):
 def test_cruises_at_the_edge_nearer_the_goals_depth(stage):
     goal_z = np.array([-1.2, -1.0, -0.9, -0.7, -0.6, -0.4])
     np.testing.assert_allclose(stage.choose(goal_z), [LOW] * 3 + [HIGH] * 3, atol=1e-6)
+
+
+def test_the_less_sure_of_its_depth_the_farther_from_the_edges(stage):
+    """Three standard deviations, at most to the middle of the water."""
+    goal_z = np.array([-1.2] * 3 + [-0.4] * 3)
+    expected = np.array([LOW + 0.15] * 3 + [HIGH - 0.15] * 3)
+    np.testing.assert_allclose(stage.choose(goal_z, sigma_m=0.05), expected, atol=1e-5)
+    np.testing.assert_allclose(stage.choose(goal_z, sigma_m=1.0), -0.8, atol=1e-5)
 
 
 def test_comes_back_to_the_goals_depth_in_time(stage):
