@@ -3,7 +3,6 @@ the whole stack."""
 
 import signal
 
-import numpy as np
 import pytest
 import torch
 
@@ -46,8 +45,8 @@ def taichi_runtime(request):
 
 
 def set_step(clock, step):
-    """Every env's step number. ``fill`` would compile a kernel for every value."""
-    clock.step.from_numpy(np.full(clock.step.shape, step, dtype=np.int32))
+    """Every env's step number."""
+    clock.step.fill(step)
 
 
 def configure(monkeypatch, sim, config):

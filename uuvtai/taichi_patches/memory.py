@@ -93,7 +93,7 @@ class Memory:
         known = self._looked_at.get(id(field))
         if known is None:  # the field is kept with its view, for an identity may be given again
             known = self._looked_at[id(field)] = field, _view(field, False, self.read())
-        return known[1].copy() if rows is None else known[1][rows]
+        return known[1].copy() if rows is None else known[1][np.asarray(rows, np.intp)]
 
     def put(self, field: Any, values: np.ndarray) -> None:
         """Fill a field that is not in lanes; ``values`` has its shape (vectors add a last axis) and dtype."""
