@@ -17,8 +17,17 @@ VENV = ROOT / ".venv"
 BIN = VENV / ("Scripts" if os.name == "nt" else "bin")
 JS = ROOT / "tests" / "js"
 
-IN_FULL = ["-n", "2", "--dist", "worksteal", "--cov", "--cov-report=term:skip-covered"]
-"""Two processes: what takes long is compiling kernels, which one process does on one thread."""
+IN_FULL = [
+    "-n",
+    "2",
+    "--dist",
+    "loadfile",
+    "--no-loadscope-reorder",
+    "--cov",
+    "--cov-report=term:skip-covered",
+]
+"""Two processes: what takes long is compiling kernels, which one process does on one thread. Each takes whole
+files in the order of ``tests/conftest.py``: what the tests of a file share is made once."""
 
 DEMO = ["eval", "--world", "pool", "--record", "2", "--video"]
 

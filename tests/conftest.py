@@ -1,12 +1,25 @@
 """Fixtures shared by the tests. Taichi is started once per session; one small simulator serves every test of
 the whole stack."""
 
-import dataclasses
 import signal
 
-import numpy as np
 import pytest
 import torch
+
+from tests.field_memory import look_in_memory
+
+BEGUN_FIRST = """
+cli tracking training world signals log_alone security sonar docs report deploy mapping media_formats
+resume_eval proprioception sweep dynamics completion telemetry explain examples stack hostile_logs
+"""
+"""files of tests that take long, longest first: a process takes whole files, and none shall work alone at the
+end"""
+
+
+def pytest_collection_modifyitems(items):
+    """Long files first, the others as they were found."""
+    order = {f"test_{name}": number for number, name in enumerate(BEGUN_FIRST.split())}
+    items.sort(key=lambda item: order.get(item.path.stem, len(order)))
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -26,13 +39,14 @@ def taichi_runtime(request):
     from uuvtai.runtime import start_taichi
 
     start_taichi("cpu")
+    look_in_memory()
     if any("small" in getattr(item, "fixturenames", ()) for item in request.session.items):
         _built.append(SmallSim())
 
 
 def set_step(clock, step):
-    """Every env's step number. ``fill`` would compile a kernel for every value."""
-    clock.step.from_numpy(np.full(clock.step.shape, step, dtype=np.int32))
+    """Every env's step number."""
+    clock.step.fill(step)
 
 
 def configure(monkeypatch, sim, config):
@@ -98,14 +112,9 @@ class SmallSim:
     def arrays(self, *nouns):
         """NumPy copies of every array of these structs but scratch, which keeps what earlier tests left in
         it, by 'struct.field'."""
-        structs = {noun: getattr(self.sim.s, noun) for noun in nouns}
-        kept = {
-            noun: [f.name for f in dataclasses.fields(struct) if not f.metadata["scratch"]]
-            for noun, struct in structs.items()
-        }
-        return {
-            f"{noun}.{name}": getattr(structs[noun], name).to_numpy() for noun in nouns for name in kept[noun]
-        }
+        memory = self.sim.memory()
+        views = memory.views(memory.read())
+        return {name: view.copy() for name, view in views.items() if name.partition(".")[0] in nouns}
 
 
 @pytest.fixture(scope="session")

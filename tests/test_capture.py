@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 import torch
 
+from tests.field_memory import copied_by_taichi, view_of
+from uuvtai.copying import copied_rows
 from uuvtai.env import VectorEnv
 from uuvtai.outcomes import OUTCOMES
 
@@ -100,9 +102,28 @@ def test_views_show_every_layout_as_taichi_does(small):
     for name, field in fields.items():
         values = rng.integers(0, 99, views[name].shape).astype(views[name].dtype)
         views[name][...] = values
-        np.testing.assert_array_equal(field.to_numpy(), values, err_msg=name)
+        np.testing.assert_array_equal(copied_by_taichi(field), values, err_msg=name)
+        np.testing.assert_array_equal(field.to_numpy(), values, err_msg=f"tests see another {name}")
+        field.from_numpy(np.asarray(values + 1))
+        np.testing.assert_array_equal(
+            copied_by_taichi(field), values + 1, err_msg=f"tests wrote another {name}"
+        )
     for name, values in before.items():
         views[name][...] = values
+
+
+def test_rows_are_what_a_kernel_copies(small):
+    """On a GPU rows come by a kernel, on the CPU from memory: one array of each layout that is recorded."""
+    s, rows = small.sim.s, [5, 0, 2]
+    rng = np.random.default_rng(1)
+    for field in (s.clock.step, s.vehicle.quat_wb, s.scan.range_m, s.tracks.height, s.grid_map.dynamic_occ):
+        before = field.to_numpy()
+        field.from_numpy(rng.integers(0, 99, before.shape).astype(before.dtype))
+        found, copied = small.sim.rows(field, rows), copied_rows(field, torch.tensor(rows, dtype=torch.int32))
+        assert found.dtype == copied.dtype and not np.shares_memory(found, view_of(field))
+        np.testing.assert_array_equal(found, copied)
+        np.testing.assert_array_equal(small.sim.rows(field)[rows], copied)
+        field.from_numpy(before)
 
 
 def test_put_writes_what_taichi_reads_and_refuses_what_does_not_fit(small):
@@ -117,11 +138,11 @@ def test_put_writes_what_taichi_reads_and_refuses_what_does_not_fit(small):
         s.scene.n_static,
     ]
     for number, field in enumerate(fields):
-        before = np.asarray(field[None]) if field.shape == () else field.to_numpy()
+        before = np.asarray(field[None]) if field.shape == () else copied_by_taichi(field)
         before = before.astype(np.int32) if field.shape == () else before
         other = (before + number + 1).astype(before.dtype)
         put(field, other)
-        found = np.asarray(field[None]) if field.shape == () else field.to_numpy()
+        found = np.asarray(field[None]) if field.shape == () else copied_by_taichi(field)
         np.testing.assert_array_equal(found, other)
         with pytest.raises(ValueError, match="the field is"):
             put(field, np.zeros(other.shape, np.int8))

@@ -5,6 +5,7 @@ import ast
 import errno
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -22,6 +23,7 @@ from tests.command import uuv
 from tests.conftest import SmallSim
 from uuvtai import doctor, endings, loader
 from uuvtai.errors import SettingError, SizeError
+from uuvtai.runtime import _thread_count
 from uuvtai.show.evaluation import show_evaluation
 from uuvtai.show.screen import Screen
 
@@ -121,10 +123,6 @@ def test_missing_and_corrupt_logs_are_refused(capfd, tmp_path, command, content)
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (
-            ["simulate", "--seconds", "4", "--dt", "0.5", "--wrench", "90,0,0,0,0,5"],
-            "use a smaller substep, --dt 0.125",
-        ),
         (["simulate", "--seconds", "1", "--vehicle", "[/x].yaml"], "[/x].yaml"),
         (["log", "info", "[/x].mcap"], "[/x].mcap: cannot open"),
         (["report", "[/x]"], "[/x]: is no run folder"),
@@ -136,12 +134,24 @@ def test_missing_and_corrupt_logs_are_refused(capfd, tmp_path, command, content)
         (["train", "smoke", "--set", "policy.initial_std=0.01"], "lies below the floor"),
     ],
 )
-def test_what_once_was_a_traceback_or_passed_for_a_failure_is_refused(tmp_path, arguments, says):
-    code, out, err = in_a_process(tmp_path, *arguments)
+def test_what_once_was_a_traceback_or_passed_for_a_failure_is_refused(
+    capfd, tmp_path, monkeypatch, arguments, says
+):
+    monkeypatch.chdir(tmp_path)
+    assert_refused(uuv(capfd, *arguments), says, tmp_path)
+
+
+def test_a_simulation_that_diverges_is_refused_with_what_to_type(tmp_path):
+    steps = ["simulate", "--seconds", "4", "--dt", "0.5", "--wrench", "90,0,0,0,0,5"]
+    assert_refused(in_a_process(tmp_path, *steps), "use a smaller substep, --dt 0.125", tmp_path)
+
+
+def assert_refused(ended, says, folder):
+    code, out, err = ended
     assert (code, out) == (2, "")
     assert says in " ".join(err.split())
     assert "Traceback" not in err and "a bug of ours" not in err
-    assert not list(tmp_path.iterdir())
+    assert not list(folder.iterdir())
 
 
 def in_a_process(folder, *arguments, environment=None, stdout=subprocess.PIPE):
@@ -154,11 +164,16 @@ def in_a_process(folder, *arguments, environment=None, stdout=subprocess.PIPE):
 
 
 @pytest.mark.parametrize("text", ["abc", "0", "-1", "1.5", "99999999999999999999"])
-def test_a_nonsense_thread_count_is_named(tmp_path, text):
+def test_a_nonsense_thread_count_is_named(text):
+    with pytest.raises(SettingError, match=re.escape(f"UUV_NUM_THREADS='{text}'")):
+        _thread_count(text)
+
+
+def test_a_command_refuses_a_nonsense_thread_count(tmp_path):
     code, _, err = in_a_process(
-        tmp_path, "simulate", "--seconds", "0.1", environment={"UUV_NUM_THREADS": text}
+        tmp_path, "simulate", "--seconds", "0.1", environment={"UUV_NUM_THREADS": "0"}
     )
-    assert code == 2 and f"UUV_NUM_THREADS='{text}'" in err
+    assert code == 2 and "UUV_NUM_THREADS='0'" in err
 
 
 def test_text_from_outside_is_never_markup(tmp_path, monkeypatch, capfd, evaluation):
@@ -521,7 +536,7 @@ def _parts_with_messages(folder: Path) -> list[Path]:
     ]
 
 
-def test_interrupt_leaves_a_marked_run_and_repairable_logs(evaluation, tmp_path):
+def test_interrupt_leaves_a_marked_run_and_repairable_logs(evaluation, tmp_path, capfd):
     """The same sizes and rules as ``evaluation``, whose kernels are compiled by now: a compiling process does
     not listen."""
     folder = tmp_path / "run"
@@ -541,11 +556,6 @@ def test_interrupt_leaves_a_marked_run_and_repairable_logs(evaluation, tmp_path)
     assert "Traceback" not in err
     assert json.loads((folder / "run.json").read_text())["status"] == "interrupted"
     part = _parts_with_messages(folder)[0]
-    done = subprocess.run(
-        [sys.executable, "-m", "uuvtai", "log", "repair", str(part)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert "messages recovered" in done.stdout
+    code, out, err = uuv(capfd, "log", "repair", part)
+    assert code == 0, err
+    assert "messages recovered" in out

@@ -1,7 +1,6 @@
 """Every config key at its extremes: accepted, with sizes that can be told, or refused in words; nothing
 overflows."""
 
-import copy
 import math
 
 import pytest
@@ -57,13 +56,18 @@ def candidates(value):
         yield from ([*value[:i], x, *value[i + 1 :]] for i in range(len(value)) for x in numbers)
 
 
+def changed(tree, key, value):
+    """The tree with another value at a dotted key; all else is shared with the old one, for thousands are
+    made."""
+    name, _, rest = key.partition(".")
+    return tree | {name: changed(tree[name], rest, value) if rest else value}
+
+
 def taken(model, key, value):
     """Config with this value, None where it is refused. UserError is the only error that there may be."""
-    tree = copy.deepcopy({name: TREE[name] for name in model.model_fields})
-    parents, _, leaf = key.rpartition(".")
-    at(tree, parents)[leaf] = value
+    tree = {name: TREE[name] for name in model.model_fields}
     try:
-        return _checked(model, tree, {})
+        return _checked(model, changed(tree, key, value), {})
     except UserError:
         return None
 

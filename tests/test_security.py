@@ -7,6 +7,7 @@ without it they would run for hours or take all memory.
 
 import ast
 import base64
+import functools
 import json
 import os
 import pickle
@@ -77,6 +78,18 @@ class Exploit:
         return (open, ("executed", "w"))
 
 
+@functools.cache
+def tree_of(path):
+    """A file of the package, parsed once for all tests that search it."""
+    return ast.parse(path.read_text())
+
+
+@functools.cache
+def called(call):
+    """What a call calls, as text."""
+    return ast.unparse(call.func)
+
+
 def test_the_exploit_would_work(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     pickle.loads(pickle.dumps(Exploit())).close()
@@ -111,12 +124,12 @@ def test_nothing_in_the_package_can_execute_what_it_reads():
     }
     found, yaml_loads, imports = [], [], []
     for path in PACKAGE.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in ast.walk(tree_of(path)):
             if isinstance(node, ast.Import | ast.ImportFrom):
                 names = [alias.name for alias in node.names] + [getattr(node, "module", None) or ""]
                 found += [f"{path.name}: import {name}" for name in names if name.split(".")[0] in forbidden]
             elif isinstance(node, ast.Call):
-                name = ast.unparse(node.func)
+                name = called(node)
                 found += [f"{path.name}:{node.lineno} {name}"] if name in forbidden else []
                 yaml_loads += [ast.unparse(node)] if name == "yaml.load" else []
                 imports += (
@@ -180,7 +193,7 @@ def reads_of(tree):
     ours = {"files"} | ({"read_text", "read_bytes", "read_json"} & imported)
     for node in ast.walk(tree):
         if isinstance(node, ast.Call):
-            name = ast.unparse(node.func)
+            name = called(node)
             last = name.rpartition(".")[2]
             writes = last == "open" and any(
                 isinstance(a, ast.Constant) and str(a.value).startswith("w") for a in node.args
@@ -201,7 +214,7 @@ def test_whatever_is_read_goes_through_the_one_reader():
         name = str(path.relative_to(PACKAGE))
         if name in READERS:
             continue
-        for line, call in reads_of(ast.parse(path.read_text())):
+        for line, call in reads_of(tree_of(path)):
             system = name in SYSTEM and SYSTEM[name] in path.read_text() and call.endswith(".read_text")
             own = name in OWN_JSON | BOUNDED_JSON and call == "json.loads"
             own |= call in OWN_FILES.get(name, "").split()
@@ -233,10 +246,12 @@ def test_yaml_is_loaded_in_one_place():
         "loader.py": {"yaml.load(text, Loader=_SafeLoader)", "yaml.compose(text, Loader=_SafeLoader)"},
     }
     for path in PACKAGE.rglob("*.py"):
-        calls = {ast.unparse(n) for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Call)}
+        text = path.read_text()
+        found = ast.walk(tree_of(path)) if "yaml" in text else ()
+        calls = {ast.unparse(node) for node in found if isinstance(node, ast.Call)}
         reads = {call for call in calls if re.match(r"yaml\.(?!safe_dump\b|MarkedYAMLError\b)", call)}
         assert reads <= allowed.get(str(path.relative_to(PACKAGE)), set()), path
-        assert "from yaml" not in path.read_text(), path
+        assert "from yaml" not in text, path
 
 
 # ------------------------------------------------------------------------------------------------------- YAML

@@ -25,6 +25,8 @@ from uuvtai.kernels.world.bundles import WorldIO
 from uuvtai.loader import load_config
 from uuvtai.shipped import PRESET_DIR, preset_names
 
+RULES = EpisodeConfig()
+"""one object: a kernel is compiled anew for another"""
 N = 192
 """Episodes drawn per world."""
 N_FLOOD = 24
@@ -83,7 +85,7 @@ class Drawn:
         if not keep_awake:
             episode.wake(io_for(EpisodeIO, self.clock))
         set_step(self.clock, step)
-        scenarios.move_obstacles(io_for(WorldIO, self.world, self.path, self.clock, EpisodeConfig()))
+        scenarios.move_obstacles(io_for(WorldIO, self.world, self.path, self.clock, RULES))
         out = {f"path_{name}": field.to_numpy() for name, field in vars(self.path).items()}
         for struct in (self.world, self.mission):
             out |= {name: field.to_numpy() for name, field in vars(struct).items()}
@@ -275,7 +277,7 @@ def test_moving_obstacles_keep_constant_speed_on_their_paths(any_world):
     if n == 0:
         assert not (drawn["kind"][:, first:] != NONE).any()
         return
-    dt, v = EpisodeConfig().control_dt_s, of.cfg.dynamic_speed_m_s
+    dt, v = RULES.control_dt_s, of.cfg.dynamic_speed_m_s
     for step in (1, 500, 2999):
         before, now, after = (of.at(step + shift) for shift in (-1, 0, 1))
         pos = [snap["pos_w"][:, first : first + n].astype(float) for snap in (before, now, after)]
@@ -299,7 +301,7 @@ def test_the_log_s_closed_form_gives_the_same_positions(any_world):
         for body in document["bodies"]:
             assert KIND_NAMES[drawn["kind"][env, body["slot"]]] == body["kind"]
             if body["path"] is not None:
-                (at,) = path_positions(body["path"], np.array([777 * EpisodeConfig().control_dt_s]))
+                (at,) = path_positions(body["path"], np.array([777 * RULES.control_dt_s]))
                 assert at == pytest.approx(
                     drawn["pos_w"][env, body["slot"], :2], abs=1e-3
                 )  # float32 arcs of up to 10 m
@@ -473,7 +475,7 @@ def test_explicit_obstacles_stand_and_move_as_written():
     side = (drawn["start_w"][:, 0] - 10) * (drawn["goal_w"][:, 0] - 10)
     assert np.all(side > 0)
     assert [kind for kind, *_ in of.bodies(drawn, 0)] == [BOX, CYLINDER, BOX, SPHERE]
-    dt = EpisodeConfig().control_dt_s
+    dt = RULES.control_dt_s
     later = of.at(150)  # 3 s: the box is 1.5 m back on its way, the sphere 1.8 m along
     assert later["pos_w"][:, 2] == pytest.approx(np.tile([3.5, 2, -1.0], (64, 1)), abs=FLOAT_TOL_M)
     assert later["vel_w"][:, 2] == pytest.approx(np.tile([-1.5, 0, 0], (64, 1)), abs=1e-5)

@@ -1,4 +1,4 @@
-"""Chosen rows of Taichi's arrays as NumPy copies."""
+"""Chosen rows of Taichi's arrays as NumPy copies, by a kernel: for devices whose memory NumPy cannot see."""
 
 from __future__ import annotations
 

@@ -64,7 +64,8 @@ class Sim:
         self.fallback = RouteFallback(config)
         self.stage_s: dict[str, float] | None = None
         self.privileged = False
-        self._put = self.memory().put
+        self._memory = self.memory()
+        self._put = self._memory.put
         self.use_tree(tree)
         self.set_scenes()
         fill_constants(self.s, config, self._put)
@@ -237,6 +238,8 @@ class Sim:
 
     def rows(self, field: ti.Field, envs: list[int] | None = None) -> np.ndarray:
         """Host copy of these rows of a field alone, shape (len(envs), ...); None = all envs."""
+        if self.device.type == "cpu":
+            return self._memory.rows(field, envs)
         rows = self._every_row if envs is None else torch.tensor(envs, dtype=torch.int32, device=self.device)
         return copied_rows(field, rows)
 

@@ -24,7 +24,8 @@ committed results file measures the gain of a part alone, so no figure stands he
 
 ``memory``
     ``Memory`` finds every array in Taichi's one block of memory, by the offsets that SNodes hold, because
-    ``to_numpy`` and ``from_numpy`` compile two kernels for each field. Can go when fields show their memory.
+    ``to_numpy`` and ``from_numpy`` compile two kernels for each field; a log reads its rows there. Can go
+    when fields show their memory.
 
 ``cache``
     ``stale_locks``: a process that is killed leaves its lock, and from then on nobody uses the cache. Can go

@@ -53,6 +53,7 @@ class Memory:
         root = _path(anchor)[-1]
         self.structs, self.device = structs, device
         self.address, self.n_bytes = address - _offset(anchor), root.cell_size_bytes
+        self._looked_at: dict[int, tuple[Any, np.ndarray]] = {}
 
     def views(self, content: np.ndarray, scratch: bool = False) -> dict[str, np.ndarray]:
         """Every array (``scratch`` too, if asked for) as a view of what ``read`` gave.
@@ -82,6 +83,17 @@ class Memory:
         """Put back what ``read`` gave and what was changed in it."""
         if self.device.type != "cpu":
             self._on_device().copy_(torch.from_numpy(content))
+
+    def rows(self, field: Any, rows: list[int] | None = None) -> np.ndarray:
+        """Copy of these rows of a field (None = all), shape (len(rows), ...), vectors with a last axis. CPU
+        only, where a kernel is done when its launch returns.
+
+        Nothing is compiled and nothing launched, so that a step can be looked at as often as one likes.
+        """
+        known = self._looked_at.get(id(field))
+        if known is None:  # the field is kept with its view, for an identity may be given again
+            known = self._looked_at[id(field)] = field, _view(field, False, self.read())
+        return known[1].copy() if rows is None else known[1][np.asarray(rows, np.intp)]
 
     def put(self, field: Any, values: np.ndarray) -> None:
         """Fill a field that is not in lanes; ``values`` has its shape (vectors add a last axis) and dtype."""
