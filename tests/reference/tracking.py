@@ -414,7 +414,10 @@ def begun(c, scan, cfg, sonar):
     P[:2, :2] = turn_in @ np.diag(centre_variances(c, radius, radius_var, sonar)) @ turn_in.T
     P[2:4, 2:4] = turn_in @ np.diag([c.doppler_var, cfg.birth_speed_sigma_m_s**2]) @ turn_in.T
     x = np.concatenate([scan.pos[:2] + distance * along, c.doppler * along, [0.0]])
-    return Track(x, P, radius, radius_var, scan.pos[2], c.doppler, c.doppler_var, c.bearing, scan.step)
+    track = Track(x, P, radius, radius_var, scan.pos[2], c.doppler, c.doppler_var, c.bearing, scan.step)
+    clear = max(cfg.sight_doppler_m_s, 6 * np.sqrt(c.doppler_var))
+    track.moving = int(len(c.beams) >= 3 and abs(c.doppler) > clear)
+    return track
 
 
 def step(tracks, last_step, scan, cfg, sonar, tank, dt_s):
