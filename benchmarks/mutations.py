@@ -557,8 +557,8 @@ KERNELS = (
     Mutation(
         "heave_unforecast",
         "uuvtai/kernels/teacher/trajectories.py",
-        "z = ti.math.clamp(cz * gain + (pos[2] + vel[2] * settle), low, high)",
-        "z = ti.math.clamp(cz * gain + pos[2], low, high)",
+        "z = ti.math.clamp(drive.z * gain + (drive.pos[2] + drive.vel[2] * settle), low, high)",
+        "z = ti.math.clamp(drive.z * gain + drive.pos[2], low, high)",
         "tests/test_teacher.py",
         "packets_equal",
     ),

@@ -230,9 +230,9 @@ def test_required_detection_distance_by_hand():
     assert 0.6 * (t - 0.35 * (1 - math.exp(-t / 0.35))) == pytest.approx(0.52, abs=1e-9)
     found = required_detection(CONFIG)
     assert found.aside_m == pytest.approx(0.25 + 0.17 + 0.1)
-    assert found.closing_m_s == pytest.approx(1.2)
-    assert found.margin_m == pytest.approx(0.18 * 1.2)
-    assert found.required_m == pytest.approx(1.2 * t + 0.216 + 0.27)
+    assert found.closing_m_s == pytest.approx(0.85 + 0.6)
+    assert found.margin_m == pytest.approx(0.18 * 1.45)
+    assert found.required_m == pytest.approx(1.45 * t + 0.261 + 0.27)
 
 
 def test_detection_distance_knows_what_moves():
@@ -243,4 +243,4 @@ def test_detection_distance_knows_what_moves():
     found = required_detection(
         CONFIG.model_copy(update={"world": WorldConfig(n_dynamic=0, fixed=(swinging,))})
     )
-    assert (found.closing_m_s, found.aside_m) == (pytest.approx(2.0), pytest.approx(0.5 + 0.27))
+    assert (found.closing_m_s, found.aside_m) == (pytest.approx(2.25), pytest.approx(0.5 + 0.27))

@@ -53,6 +53,7 @@ def test_a_stack_touches_nothing_that_makes_an_episode():
         "actuation",
         "disturbance",
         "sensors",
+        "traffic",
         "features",
         "reward",
         "episode",

@@ -30,14 +30,15 @@ class BlindRide:
 
 
 def ride_blindly(scenario: dict[str, Any], config: Config) -> BlindRide:
-    """Ride through a scenario (``describe_scenario``'s document): nose ahead, at full cruise speed at once,
+    """Ride through a scenario (``describe_scenario``'s document): nose ahead, as fast as it drives so at once,
     through whatever is met."""
     start, goal, rules = np.array(scenario["start"]), np.array(scenario["goal"]), config.episode
     away = float(np.linalg.norm(goal - start))
     way = max(away - rules.goal_radius_m, 0.0)
     course = (goal - start) / max(away, 1e-9)
-    t = np.arange(0.0, way / config.teacher.cruise_m_s + rules.control_dt_s, rules.control_dt_s)
-    middle = start + config.teacher.cruise_m_s * t[:, None] * course
+    speed_m_s = min(config.teacher.cruise_m_s, config.vehicle.max_surge_m_s)
+    t = np.arange(0.0, way / speed_m_s + rules.control_dt_s, rules.control_dt_s)
+    middle = start + speed_m_s * t[:, None] * course
     moving = [body for body in obstacles_of(scenario, t) if body.moves]
     return BlindRide(
         float(t[-1]),

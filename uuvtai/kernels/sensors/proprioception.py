@@ -84,7 +84,7 @@ def clear_readings(env, io: Bundle[ProprioceptionIO]):
     io.ego.pose_cov[env] = 0.0
     io.ego.z_var[env] = 0.0
     if ti.static(io.sensors_cfg.localization == "dead_reckoning"):  # a reading's noise, and that of the zero
-        io.ego.z_var[env] = ti.static(2.0 * io.sensors_cfg.pressure.sigma_m**2)
+        io.ego.z_var[env] = 2.0 * io.sensors_cfg.pressure.sigma_m * io.sensors_cfg.pressure.sigma_m
 
 
 @quick_launch
