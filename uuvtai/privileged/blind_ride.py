@@ -30,7 +30,7 @@ class BlindRide:
 
 
 def ride_blindly(scenario: dict[str, Any], config: Config) -> BlindRide:
-    """Ride through a scenario (``describe_scenario``'s document): nose ahead, as fast as it drives so at once,
+    """Ride through a scenario (``describe_scenario``'s document): nose ahead, at full speed at once,
     through whatever is met."""
     start, goal, rules = np.array(scenario["start"]), np.array(scenario["goal"]), config.episode
     away = float(np.linalg.norm(goal - start))
