@@ -16,7 +16,7 @@ from tests.conftest import set_step
 from tests.reference import world as reference
 from uuvtai import scenario, state
 from uuvtai.closed_form import KIND_NAMES, describe_scenario, path_positions
-from uuvtai.config import EpisodeConfig, WorldConfig
+from uuvtai.config import EpisodeConfig, TrafficConfig, WorldConfig
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, NONE, SPHERE
 from uuvtai.kernels.task import episode
 from uuvtai.kernels.task.bundles import EpisodeIO
@@ -551,6 +551,7 @@ def test_what_is_known_beforehand_is_true_of_the_world(world):
     config = load_config(world)
     bodies, known = config.world.dynamic, config.traffic
     if config.world.n_dynamic == 0:
+        assert known == TrafficConfig()  # nothing is said of what is not there
         return
     assert known.z_m == bodies.z_m
     assert config.elevation.column_share <= max(0.05, bodies.full_column_fraction)

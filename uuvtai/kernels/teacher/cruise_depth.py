@@ -33,7 +33,8 @@ def choose_depth(env, io: Bundle[ThreatsIO]):
             cost = ti.static(io.teacher_cfg.weight_traffic) * level_share(
                 z, io.traffic_cfg, io.elevation_cfg, io.teacher_cfg, io.vehicle_cfg
             )
-            cost += ti.static(io.teacher_cfg.weight_seen) * _level_bodies(env, z, io)
+            if ti.static(io.teacher_cfg.weight_seen > 0):
+                cost += ti.static(io.teacher_cfg.weight_seen) * _level_bodies(env, z, io)
             cost += ti.static(io.teacher_cfg.weight_goal_depth) * ti.abs(z - goal[2])
             cost += ti.static(io.teacher_cfg.weight_depth_change) * ti.abs(z - before)
             if cost < best_cost:

@@ -1,0 +1,78 @@
+"""Tables of trials in the docs say what the committed outcomes of single episodes say."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from uuvtai.statistics import mcnemar_p
+
+DOCS = Path(__file__).parents[1] / "docs"
+COLLIDED = set("cxo")
+PILOTS = [
+    "the pilot before",
+    "free depth, edges at 0.2 m, vertical_weight 2, diagonal cruise; weight_seen 0",
+    "and motion at first sight",
+    "free depth, edges at 0.2 m, vertical_weight 2, diagonal cruise; weight_seen 0.3",
+    "and turn_back_s (0.5, 1.2, 2.2), future_margin 1, heed_share 0.2",
+    "and turn_back_s (0.5, 1.2, 2.2), future_margin 0.3, heed_share 0.2",
+    "and motion at first sight, turn_back_s (0.4, 0.8), heed_share 0.5",
+]
+"""rows of the table of pilots, in its order"""
+
+
+def table(page, heading, header):
+    """Cells of the first table below a heading whose header begins so."""
+    text = (DOCS / page).read_text()
+    text = text[text.index(heading) :]
+    lines = text[text.index(header) :].split("\n\n")[0].splitlines()[2:]
+    return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines]
+
+
+def rates(outcomes):
+    return [100 * share / len(outcomes) for share in (outcomes.count("s"), count_collided(outcomes))]
+
+
+def count_collided(outcomes):
+    return sum(outcome in COLLIDED for outcome in outcomes)
+
+
+def paired(one, other):
+    """(episodes that ``one`` alone arrives in, that ``other`` alone does)."""
+    both = list(zip(one, other, strict=True))
+    return sum(a == "s" != b for a, b in both), sum(b == "s" != a for a, b in both)
+
+
+def told(cell):
+    """(success, collision) of '90.3 / 6.0 ...'."""
+    first, second = cell.split(" / ")[:2]
+    return [float(first), float(second.split(",")[0].split(" (")[0])]
+
+
+@pytest.mark.parametrize(("column", "cell"), [(1, "pool15"), (2, "gaunt15")])
+def test_pilots_are_as_their_episodes_say(column, cell):
+    rows = json.loads((DOCS / "data/pilot_trials_77001.json").read_text())["rows"]
+    kept = {row["pilot"]: row["outcomes"][:300] for row in rows if row["cell"] == cell}
+    cells = [row[column] for row in table("tuning.md", "## Depth, diagonal", "| step |")]
+    for name, text in zip(PILOTS, cells, strict=True):
+        if text.strip(" |") == "-":
+            continue
+        assert told(text.strip(" |")) == pytest.approx(rates(kept[name]), abs=0.051), name
+        if "(+" in text:
+            won, lost = paired(kept[name], kept[PILOTS[0]])
+            assert f"(+{won} -{lost}, p < 0.001)" in text and mcnemar_p(won, lost) < 0.001
+
+
+def test_local_planners_are_as_their_episodes_say():
+    rows = json.loads((DOCS / "data/baselines_90001.json").read_text())["rows"]
+    kept = {(row["method"], row["cell"]): row["outcomes"] for row in rows}
+    names = ["pool (8, 6, 0.6)", "pool (8, 9, 1.5)", "gauntlet (8, 9, 1.5)"]
+    found = table("baselines.md", "## What came out", "| | pool")
+    assert len(found) * len(names) == len(kept)
+    for method, *cells in found:
+        for cell, name in zip(cells, names, strict=True):
+            outcomes, tree = kept[method.strip("`"), name], kept["bt", name]
+            assert told(cell.strip(" |")) == pytest.approx(rates(outcomes), abs=0.051), (method, name)
+            if "p = " in cell:
+                p = float(cell.split("p = ")[1].strip(" |"))
+                assert p == pytest.approx(mcnemar_p(*paired(outcomes, tree)), rel=0.15, abs=0.006)
