@@ -52,6 +52,31 @@ def ended(process, number):
     return process.returncode, err
 
 
+_SWALLOWED = """
+import os, signal
+from uuvtai import signals
+signals.install()
+signals.engage()
+try:
+    os.kill(os.getpid(), signal.{name})
+    for _ in range(1000):
+        pass
+except BaseException:
+    pass
+assert signals.was_received()
+with signals.StopEvent() as pressed:
+    print(pressed.is_set())
+"""
+
+
+@pytest.mark.parametrize("number", BOTH)
+def test_a_signal_whose_exception_was_swallowed_still_stops_a_training(tmp_path, number):
+    """Else a training would go on to its end, and whoever waits for it would wait as long."""
+    process = started(tmp_path, program=_SWALLOWED.format(name=number.name))
+    out, err = process.communicate(timeout=60)
+    assert (out.strip(), process.returncode) == ("True", 0), err
+
+
 @pytest.mark.parametrize("number", BOTH)
 @pytest.mark.parametrize(
     "arguments",

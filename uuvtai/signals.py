@@ -73,7 +73,7 @@ def engage() -> None:
 
 class StopEvent:
     """Context in which the first signal sets ``event``, in place of what it does otherwise; the next one ends
-    at once, or interrupts."""
+    at once, or interrupts. A signal that came before, and whose exception something has swallowed, counts."""
 
     def __init__(self) -> None:
         import threading
@@ -88,6 +88,8 @@ class StopEvent:
         if self._on_main_thread:
             self._before = {number: signal.signal(number, self._note) for number in STOPPING}
             end_at_second()
+        if was_received():
+            self.event.set()
         return self.event
 
     def __exit__(self, *_error: object) -> None:

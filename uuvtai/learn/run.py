@@ -224,7 +224,8 @@ class _Run:
         trainer, is_stopped = self._trainer, False
         while trainer.iteration < self._total and not is_stopped:
             self._metrics = trainer.iterate()
-            is_stopped = trainer.processes.any(pressed.is_set())
+            # an interrupt that something has swallowed within the iteration was received all the same
+            is_stopped = trainer.processes.any(pressed.is_set() or signals.was_received())
             if self._folder:
                 self._note_iteration(self._folder, is_stopped)
         if self._folder and self._saved != trainer.iteration:
