@@ -8,7 +8,7 @@ import subprocess
 
 import pytest
 
-from docs.writers import evaluations, figure_tables, figures, reproduction, sweeps
+from docs.writers import evaluations, figure_tables, figures, pieces, reproduction, sweeps
 from docs.writers.figure_sources import ROOT, Counts, SourceError, Sources, fitting, pooled, weighted
 from docs.writers.figure_words import GENERATED, KINDS, LOGS, PARAMETER_PAGES, unmarked
 from tests.test_docs import fault
@@ -408,6 +408,65 @@ def test_what_was_played_by_this_code_is_not_played_again(tmp_path, monkeypatch)
     )
     monkeypatch.setattr(evaluations, "commit_of_package", lambda: "def")
     assert evaluations.main(arguments) == 0 and len(played) == 7, "other code, other results"
+
+
+def played_alone(outcomes):
+    """What ``uuv eval --json`` says of one method, an episode a letter of the kept file."""
+    names = {letter: name for name, letter in pieces.LETTERS.items()}
+    detail = [{"outcome": names[letter]} for letter in outcomes]
+    return {"methods": [{"episodes_detail": detail, "time_to_success_mean_s": 12.0}]}
+
+
+@pytest.mark.parametrize(
+    "turn", pieces.turns_of([], [], ROOT, "abc"), ids=lambda turn: f"{turn.piece.name}-{turn.cell.name}"
+)
+def test_every_piece_is_a_command_that_can_be_parsed(turn):
+    assert fault(pieces.command_of(turn.piece, turn.cell, 77, 5)) is None
+
+
+def test_a_piece_switched_off_stands_beside_the_whole_pilot(tmp_path):
+    path = tmp_path / "docs/data/pieces_77.json"
+    path.parent.mkdir(parents=True)
+    document = pieces.read(path, 77)
+    for piece, outcomes in (("all", "ssstc"), ("depth", "sstxo"), ("all", "ssssc")):
+        pieces.add(path, document, pieces.entry_of(piece, "pool_6", ["eval"], played_alone(outcomes), "abc"))
+    (path.parent / "shown.json").write_text(json.dumps({"pieces": path.name}))
+    lines = figure_tables.switched_off(Sources(tmp_path)).splitlines()[2:]
+    assert [line.split(" | ")[-1].strip(" |") for line in lines] == [
+        "80.0 / 20.0",
+        "40.0 / 40.0 (+0 -2, p = 0.5)",
+    ]
+    assert [row["piece"] for row in pieces.read(path, 77)["rows"]] == ["depth", "all"], "the newer counts"
+
+
+def test_only_pieces_that_this_code_did_not_play_are_played(tmp_path, monkeypatch):
+    path, played = tmp_path / "pieces.json", []
+
+    def play(turn, seed, episodes):
+        played.append(turn.piece.name)
+        if len(played) == 2:
+            raise RuntimeError("killed")
+        return pieces.entry_of(turn.piece.name, turn.cell.name, [], played_alone("s" * episodes), turn.commit)
+
+    monkeypatch.setattr(pieces.Turn, "play", play)
+    monkeypatch.setattr(pieces, "commit_of_package", lambda: "abc")
+    given = [
+        "--seeds",
+        "77",
+        "--episodes",
+        "3",
+        "--only",
+        "all,depth,diagonal",
+        "--cells",
+        "pool_6",
+        "--jobs",
+        "1",
+        "--out",
+    ]
+    assert pieces.main([*given, str(path)]) == 1, "one row failed; the others are kept"
+    assert pieces.main([*given, str(path)]) == 0 and played == ["all", "depth", "diagonal", "depth"]
+    assert pieces.main([*given, str(path), "--episodes", "4"]) == 0 and len(played) == 7, "fewer were played"
+    assert pieces.main(["--seeds", "77", "--only", "deep", "--out", str(path)]) == 2
 
 
 def test_a_file_of_another_seed_and_unknown_names_are_refused(tmp_path, capsys):

@@ -25,7 +25,7 @@ from docs.writers import sweeps
 from docs.writers.figure_sources import ROOT
 from uuvtai.run_folder import hardware, write_atomic
 
-EPISODES = 500
+EPISODES = 1000
 ONE_THREAD = {
     "UUV_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
@@ -43,22 +43,26 @@ class Row:
     """as the table has it, Markdown"""
     options: str
     """of ``uuv eval``"""
-    methods: str = "--controller straight --controller planner --controller bt"
+    methods: str = "--controller straight --controller planner --controller bt --controller capped"
     shows: str = "bt"
     """the method whose counts stand in the table's row"""
 
 
 _MOVING = "-S 8 -D 6 -v 0.6"
 _FAST = "-S 8 -D 9 -v 1.5"
+_LOCAL = "--controller mppi --controller dwa --controller potential_field --controller velocity_obstacle"
 _KNOWN = "--set sensors.localization=truth"
 ROWS = (
     Row("pool_0", "`pool` (0)", "--world pool -S 8 -D 0"),
-    Row("pool_6", "`pool` (6, 0.6)", f"--world pool {_MOVING}", f"best {Row.methods}"),
-    Row("pool_9_fast", "`pool` (9, 1.5)", f"--world pool {_FAST}", f"best {Row.methods}"),
+    Row("pool_6", "`pool` (6, 0.6)", f"--world pool {_MOVING}", f"best {Row.methods} {_LOCAL}"),
+    Row("pool_9_fast", "`pool` (9, 1.5)", f"--world pool {_FAST}", f"best {Row.methods} {_LOCAL}"),
     Row("gauntlet_6", "`gauntlet` (6, 0.4)", "--world gauntlet -S 8 -D 6 -v 0.4"),
-    Row("gauntlet_9_fast", "`gauntlet` (9, 1.5)", f"--world gauntlet {_FAST}", f"best {Row.methods}"),
+    Row(
+        "gauntlet_9_fast", "`gauntlet` (9, 1.5)", f"--world gauntlet {_FAST}", f"best {Row.methods} {_LOCAL}"
+    ),
     Row("maze_0", "`maze` (0)", "--world maze -S 8 -D 0"),
     Row("maze_6", "`maze` (6, 0.6)", f"--world maze {_MOVING}"),
+    Row("column_9_fast", "`column` (9, 1.5)", f"--world column {_FAST}"),
     Row("netpen", "`netpen` (its own D, v)", "--world netpen"),
     Row("transfer", "`transfer` (its own D, v), position estimated", "--world transfer"),
     Row(
@@ -96,7 +100,7 @@ ROWS = (
 )
 
 SWEEPS = {
-    "pool": "best --controller bt --grid paper --episodes 64",
+    "pool": "best --controller bt --controller capped --grid paper --episodes 64",
     "gauntlet": "best --controller bt --grid paper --world gauntlet --episodes 32",
     "caution": "--controller bt --grid caution --episodes 16",
     "robustness": "best --controller bt --grid robustness --episodes 100",

@@ -118,6 +118,10 @@ class Sources:
         """The evaluations that README shows."""
         return self.json(f"docs/data/{self.json('docs/data/shown.json')['evaluations']}")
 
+    def pieces(self) -> dict[str, Any]:
+        """The pilot with each piece off, as ``docs/tuning.md`` shows it."""
+        return self.json(f"docs/data/{self.json('docs/data/shown.json')['pieces']}")
+
     def evaluation(self, row: str, method: str) -> Counts:
         """One method in one row of the evaluations."""
         rows = {entry["name"]: entry for entry in self.evaluations()["rows"]}

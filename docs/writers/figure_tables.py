@@ -9,8 +9,11 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from docs.writers.figure_sources import Counts, SourceError, Sources, fitting, pooled, weighted
+from docs.writers.pieces import BEFORE, CELLS, LETTERS, PIECES
 from uuvtai.measure.reproduce import paper
 from uuvtai.measure.reproduce.steps import RETIRED_SEEDS
+from uuvtai.outcomes import COLLIDED
+from uuvtai.statistics import mcnemar_p
 from uuvtai.tables.table import text_table
 
 DASH = "-"
@@ -55,6 +58,7 @@ def evaluations(sources: Sources) -> str:
         "success",
         "collision",
         "contact / TTC stop / out / timeout",
+        "`capped`: success / collision",
         "`planner`",
         "`straight`",
         "most frequent causes of failure",
@@ -71,11 +75,13 @@ def _evaluated(entry: dict[str, Any]) -> list[str]:
         f"{100 * methods[other].field('success_rate'):.1f} %" if other in methods else DASH
         for other in ("planner", "straight")
     ]
+    capped = _both(methods["capped"], 1) if "capped" in methods else DASH
     return [
         entry["title"],
         share(own, "success"),
         rated(own, "collision"),
         ends,
+        capped,
         *others,
         _causes(entry["methods"][name]),
     ]
@@ -85,6 +91,28 @@ def _causes(method: dict[str, Any]) -> str:
     """The two most frequent labels of ``uuv eval --explain`` with their counts."""
     caption = [f"{cause['label']} {cause['count']}" for cause in method["causes"][:2]]
     return ", ".join(caption) or ("" if method["outcomes"]["success"] == method["episodes"] else DASH)
+
+
+LOCAL_PLANNERS = ("bt", "capped", "mppi", "dwa", "potential_field", "velocity_obstacle")
+
+
+def local_planners(sources: Sources) -> str:
+    """Local planners of the literature beside the tree, wherever they were played: success / collision, time
+    to success, p of McNemar's exact test against ``bt``, success for success."""
+    entries = [entry for entry in sources.evaluations()["rows"] if "mppi" in entry["methods"]]
+    if not entries:
+        return "Not among the evaluations that are shown."
+    rows = [[f"`{name}`", *(_beside_tree(entry, name) for entry in entries)] for name in LOCAL_PLANNERS]
+    return text_table(["", *(entry["title"] for entry in entries)], rows)
+
+
+def _beside_tree(entry: dict[str, Any], name: str) -> str:
+    method = entry["methods"][name]
+    time = method["time_to_success_mean_s"]
+    pair = next((pair for pair in entry["paired"] if {pair["a"], pair["b"]} == {"bt", name}), None)
+    p = "" if pair is None else f", p = {pair['mcnemar_p']:.2g}"
+    counts = Counts(method["episodes"], method["outcomes"])
+    return f"{_both(counts, 1)}, {DASH if time is None else f'{time:.1f} s'}{p}"
 
 
 def policy(sources: Sources) -> str:
@@ -112,6 +140,34 @@ def policy(sources: Sources) -> str:
         ]
         rows.append([entry["title"], *cells, f"{only[0]}, {only[1]}", f"{pair['mcnemar_p']:.2g}"])
     return text_table(head, rows) if rows else "Not among the evaluations that are shown."
+
+
+def switched_off(sources: Sources) -> str:
+    """The pilot with each piece off, on the same episodes: success / collision, and against the first row's
+    successes who alone arrives and p of McNemar's exact test."""
+    rows = sources.pieces()["rows"]
+    played = {(row["piece"], row["cell"]): row["outcomes"] for row in rows}
+    cells = [cell for cell in CELLS if any(found == cell.name for _piece, found in played)]
+    table = []
+    for piece in (*PIECES, BEFORE):
+        shown = [_beside_all(played, piece.name, cell.name) for cell in cells]
+        if any(text != DASH for text in shown):
+            table.append([piece.title, *(f"`{key}`" if key else "" for key in [piece.settings]), *shown])
+    return text_table(["off", "by", *(cell.title for cell in cells)], table)
+
+
+def _beside_all(played: dict[tuple[str, str], str], piece: str, cell: str) -> str:
+    """One place of the table; the episodes that both rows played are compared."""
+    if (piece, cell) not in played:
+        return DASH
+    own, whole = played[piece, cell], played.get(("all", cell), "")
+    collided = sum(own.count(LETTERS[ending]) for ending in COLLIDED)
+    rates = f"{100 * own.count('s') / len(own):.1f} / {100 * collided / len(own):.1f}"
+    if piece == "all" or not whole:
+        return rates
+    pairs = list(zip(own, whole, strict=False))
+    won, lost = (sum(a == "s" != b for a, b in pairs), sum(b == "s" != a for a, b in pairs))
+    return f"{rates} (+{won} -{lost}, p = {mcnemar_p(won, lost):.2g})"
 
 
 # ----------------------------------------------------------------------------------------------------- sweeps
@@ -396,6 +452,8 @@ TABLES: dict[str, Callable[[Sources], str]] = {
     for made in (
         measured,
         evaluations,
+        local_planners,
+        switched_off,
         policy,
         grid,
         sweep_commands,

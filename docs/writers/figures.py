@@ -110,11 +110,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--evaluations", metavar="FILE", help="show these evaluations from now on (a file in docs/data)"
     )
+    parser.add_argument("--pieces", metavar="FILE", help="show these pieces of the pilot from now on")
     chosen = parser.parse_args(arguments)
-    if chosen.evaluations:
-        (ROOT / "docs/data/shown.json").write_text(
-            json.dumps({"evaluations": Path(chosen.evaluations).name}) + "\n", encoding="utf-8"
-        )
+    given = {"evaluations": chosen.evaluations, "pieces": chosen.pieces}
+    if named := {what: Path(file).name for what, file in given.items() if file}:
+        place = ROOT / "docs/data/shown.json"
+        named = json.loads(place.read_text(encoding="utf-8")) | named
+        place.write_text(json.dumps(named) + "\n", encoding="utf-8")
     sources, wrong = Sources(), 0
     for path in pages():
         if not chosen.check:
