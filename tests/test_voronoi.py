@@ -35,10 +35,12 @@ STRICT = CONFIG.model_copy(
     update={
         "voronoi": V.model_copy(
             update={"avoid_forecast": True, "use": "fused", "min_clearance_m": 0.3, "max_pops": 5000}
-        )
+        ),
+        "quiet": CONFIG.quiet.model_copy(update={"room_m": 0.7, "weight_seen": 5.0}),
     }
 )
-"""One other compiled variant for all switches: forecast avoided, both layers, another d_min, small budget."""
+"""One other compiled variant for all switches: forecast avoided, both layers, another d_min, small budget,
+quiet water."""
 
 
 @lru_cache(maxsize=1)

@@ -22,7 +22,7 @@ from uuvtai.initial import allocate_state, fill_constants
 from uuvtai.kernels.baselines import dynamic_window, path_integral, potential_field, velocity_obstacle
 from uuvtai.kernels.core.rows import copy_rows
 from uuvtai.kernels.perception import elevation, forecast, futures, look, mapping, pose, spotting, tracking
-from uuvtai.kernels.planning import clearance, features, route, triggers, voronoi
+from uuvtai.kernels.planning import clearance, exposure, features, route, triggers, voronoi
 from uuvtai.kernels.privileged import true_map, true_tracks
 from uuvtai.kernels.sensors import depth, proprioception, sonar
 from uuvtai.kernels.task import episode, reward
@@ -133,6 +133,8 @@ class Sim:
                 true_map.stamp_truth(io.true_map)
         with self._stage("clearance"):
             clearance.compute_clearance(io.clearance)
+            if c.quiet.weight_seen > 0:
+                exposure.average_traffic(io.exposure)
         with self._stage("features"):
             features.sense_sectors(io.features)
         with self._stage("planning"):
@@ -206,6 +208,8 @@ class Sim:
         tracking.reset_tracks(io.tracking)
         forecast.reset_forecast(io.forecast)
         mapping.reset_map(io.mapping)
+        if self.config.quiet.weight_seen > 0:
+            exposure.reset_exposure(io.exposure)
         route.reset_route(io.route)
         leaves.reset_teacher(io.teacher)
         reward.reset_reward(io.reward)

@@ -16,6 +16,7 @@ from uuvtai.kernels.core.grid import grid_shape
 from uuvtai.kernels.core.lanes import LANES
 from uuvtai.kernels.perception.mapping import map_period_s, scans_in
 from uuvtai.kernels.planning.clearance import offset_bits
+from uuvtai.kernels.planning.exposure import block_shape
 from uuvtai.plan_codes import N_PLANNER, N_REASON, N_TRIGGER
 from uuvtai.scenario import scenario_sizes
 from uuvtai.stages import SimState
@@ -32,6 +33,7 @@ def array_sizes(config: Config, n_env: int, device: str = "cpu") -> dict[str, in
     """Length of every named axis in ``state``."""
     tank, sensors = config.world.tank, config.sensors
     n_row, n_col = grid_shape(tank, config.mapping.cell_m)
+    n_block_row, n_block_col = block_shape((n_row, n_col), config.quiet)
     return {
         "n_env": n_env,
         "n_thruster": len(config.vehicle.thrusters),
@@ -52,6 +54,8 @@ def array_sizes(config: Config, n_env: int, device: str = "cpu") -> dict[str, in
         "n_row": n_row,
         "n_col": n_col,
         "n_packet": n_col // LANES,
+        "n_block_row": n_block_row,
+        "n_block_col": n_block_col,
         "n_slot": n_env if device == "cuda" else min(n_env, _MAP_SLOTS),
         "n_plan": min(n_env, _PLAN_SLOTS),
         "n_heap": n_row * n_col,

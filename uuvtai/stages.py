@@ -26,7 +26,14 @@ from uuvtai.kernels.perception.bundles import (
     SpottingIO,
     TrackingIO,
 )
-from uuvtai.kernels.planning.bundles import ClearanceIO, FeaturesIO, RouteIO, TriggersIO, VoronoiIO
+from uuvtai.kernels.planning.bundles import (
+    ClearanceIO,
+    ExposureIO,
+    FeaturesIO,
+    RouteIO,
+    TriggersIO,
+    VoronoiIO,
+)
 from uuvtai.kernels.privileged.bundles import TrueMapIO, TrueTracksIO
 from uuvtai.kernels.sensors.bundles import DepthIO, ProprioceptionIO, SonarIO
 from uuvtai.kernels.task.bundles import EpisodeIO, RewardIO
@@ -89,6 +96,7 @@ class SimState:
     map_scratch: state.MapScratch
     clearance: state.ClearanceState
     clearance_memory: state.ClearanceMemory
+    exposure: state.ExposureState
     voronoi: state.VoronoiState
     route: state.RouteState
     features: state.FeatureState
@@ -120,6 +128,7 @@ class Stages:
     mapping: MappingIO
     true_map: TrueMapIO
     clearance: ClearanceIO
+    exposure: ExposureIO
     features: FeaturesIO
     triggers: TriggersIO
     voronoi: VoronoiIO

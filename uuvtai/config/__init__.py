@@ -21,7 +21,7 @@ from uuvtai.config.perception import (
     SpottingConfig,
     TrackingConfig,
 )
-from uuvtai.config.planning import ClearanceConfig, FeaturesConfig, RouteConfig, VoronoiConfig
+from uuvtai.config.planning import ClearanceConfig, FeaturesConfig, QuietConfig, RouteConfig, VoronoiConfig
 from uuvtai.config.section import Section
 from uuvtai.config.sensors import (
     DepthConfig,
@@ -62,6 +62,7 @@ class Config(Section):
     mapping: MappingConfig = MappingConfig()
     clearance: ClearanceConfig = ClearanceConfig()
     voronoi: VoronoiConfig = VoronoiConfig()
+    quiet: QuietConfig = QuietConfig()
     route: RouteConfig = RouteConfig()
     features: FeaturesConfig = FeaturesConfig()
     teacher: TeacherConfig = TeacherConfig()
@@ -91,6 +92,7 @@ __all__ = [
     "PoseConfig",
     "PotentialFieldConfig",
     "PressureConfig",
+    "QuietConfig",
     "RewardConfig",
     "RouteConfig",
     "Section",

@@ -41,6 +41,20 @@ class VoronoiConfig(Section):
     """plan around the forecast of moving bodies too (no gain found in trials)"""
 
 
+class QuietConfig(Section):
+    """Quiet water: routes keep out of the traffic where that is cheap. Clearance floors stay."""
+
+    room_m: Positive = 2.0
+    """clearance beyond this is worth nothing more, and water so wide belongs to the planner's graph; at most
+    ``clearance.max_m``"""
+    weight_prior: NonNegative = 0.0
+    """how much dearer a metre is where the most bodies are expected before any is seen; 0 = off"""
+    weight_seen: NonNegative = 0.0
+    """how much dearer a metre is where something moved all the time lately; 0 = off"""
+    memory_s: Positive = 10.0
+    """time constant of "lately" """
+
+
 class RouteConfig(Section):
     """Route, triggers, look-ahead and the RRT fallback."""
 

@@ -24,7 +24,14 @@ from uuvtai.state.perception import (
     SpotState,
     TrackState,
 )
-from uuvtai.state.planning import ClearanceMemory, ClearanceState, FeatureState, RouteState, VoronoiState
+from uuvtai.state.planning import (
+    ClearanceMemory,
+    ClearanceState,
+    ExposureState,
+    FeatureState,
+    RouteState,
+    VoronoiState,
+)
 from uuvtai.state.sensors import DepthImage, Proprioception, ProprioceptionMemory, SonarMemory, SonarScan
 from uuvtai.state.task import ClockState, EpisodeState, MissionState, RefereeState, RewardState
 from uuvtai.state.teacher import TeacherState, TreeTable
@@ -45,6 +52,7 @@ __all__ = [
     "CurrentState",
     "DepthImage",
     "EpisodeState",
+    "ExposureState",
     "FeatureState",
     "FixedTable",
     "ForecastState",

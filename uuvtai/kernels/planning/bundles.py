@@ -10,10 +10,12 @@ from uuvtai.config import (
     FeaturesConfig,
     ForecastConfig,
     MappingConfig,
+    QuietConfig,
     RouteConfig,
     SonarConfig,
     TankConfig,
     TrackingConfig,
+    TrafficConfig,
     VoronoiConfig,
 )
 from uuvtai.kernels.core.signature import Const, In, Out
@@ -21,6 +23,7 @@ from uuvtai.state import (
     ClearanceMemory,
     ClearanceState,
     ClockState,
+    ExposureState,
     FeatureState,
     ForecastState,
     GridMask,
@@ -48,6 +51,19 @@ class ClearanceIO:
     clearance_cfg: Const[ClearanceConfig]
     mapping_cfg: Const[MappingConfig]
     voronoi_cfg: Const[VoronoiConfig]
+
+
+@dataclass(frozen=True, eq=False)
+class ExposureIO:
+    """Where something moved lately."""
+
+    exposure: Out[ExposureState]
+    clock: In[ClockState]
+    grid_map: In[MapState]
+    episode_cfg: Const[EpisodeConfig]
+    mapping_cfg: Const[MappingConfig]
+    quiet_cfg: Const[QuietConfig]
+    sonar_cfg: Const[SonarConfig]
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,12 +135,15 @@ class VoronoiIO:
     clearance: In[ClearanceState]
     clock: In[ClockState]
     ego: In[Proprioception]
+    exposure: In[ExposureState]
     forecast: In[ForecastState]
     grid_map: In[MapState]
     mask: In[GridMask]
     mission: In[MissionState]
     clearance_cfg: Const[ClearanceConfig]
     mapping_cfg: Const[MappingConfig]
+    quiet_cfg: Const[QuietConfig]
     route_cfg: Const[RouteConfig]
     tank_cfg: Const[TankConfig]
+    traffic_cfg: Const[TrafficConfig]
     voronoi_cfg: Const[VoronoiConfig]

@@ -11,6 +11,7 @@ import taichi as ti
 from uuvtai.kernels.core.heap import heap_after_pop, heap_after_push, top_cell
 from uuvtai.kernels.core.signature import Bundle
 from uuvtai.kernels.planning.bundles import VoronoiIO
+from uuvtai.kernels.planning.exposure import widest_m
 
 # bits of VoronoiState.cell; bits 4 to 6 hold the direction of the next cell towards the goal
 KNOWN = 1
@@ -73,7 +74,9 @@ def _is_medial(env, row, col, io: Bundle[VoronoiIO]):
     """True on a plateau and where a neighbour's nearest site is far from the own one."""
     # The integer medial axis (Hesselink and Roerdink 2008, IEEE PAMI 30): where the nearest site jumps by
     # more than a threshold from one cell to the next, the two cells lie on either side of the axis.
-    medial = io.clearance.clearance_m[env, row, col] >= ti.static(io.clearance_cfg.max_m - _FLAT_M)
+    medial = io.clearance.clearance_m[env, row, col] >= ti.static(
+        widest_m(io.clearance_cfg, io.quiet_cfg, io.voronoi_cfg) - _FLAT_M
+    )
     site_row = ti.cast(io.clearance.site_row[env, row, col], ti.i32)
     site_col = ti.cast(io.clearance.site_col[env, row, col], ti.i32)
     for k in range(4):
@@ -151,7 +154,7 @@ def search_cells(slot, env, start, goal, everywhere, io: Bundle[VoronoiIO]):
     bounded by the cells. Returns FOUND, NOT_FOUND or OUT_OF_BUDGET.
     """
     n_col = ti.static(io.voronoi.cost.shape[2])
-    floor_weight = ti.static(_STRETCH / max(io.clearance_cfg.max_m, io.voronoi_cfg.cost_epsilon_m))
+    floor_weight = ti.static(_STRETCH / widest_m(io.clearance_cfg, io.quiet_cfg, io.voronoi_cfg))
     # A* with the estimate stretched by w = _STRETCH (Pohl 1970): what it finds costs at most w times the
     # least.
     size, status, budget = 0, NOT_FOUND, io.voronoi.pops[env] + ti.static(io.voronoi_cfg.max_pops)

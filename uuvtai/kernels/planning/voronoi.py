@@ -13,6 +13,7 @@ from uuvtai.kernels.core.grid import centre_of, grid_origin
 from uuvtai.kernels.core.signature import Bundle, FloatMatrix, spread
 from uuvtai.kernels.planning.bundles import VoronoiIO
 from uuvtai.kernels.planning.chord import count_of_waypoints, path_cells, straightened_cost
+from uuvtai.kernels.planning.exposure import dearness, widest_m
 from uuvtai.kernels.planning.medial import FOUND, NOT_FOUND, join_skeleton, search_cells
 from uuvtai.kernels.planning.polyline import MAX_WIDENINGS, WIDENING, install_route
 from uuvtai.kernels.planning.traversable import is_traversable, occupancy
@@ -92,8 +93,10 @@ def _weigh_cells(slot, env, io: Bundle[VoronoiIO]):
             if is_traversable(
                 io.clearance, io.grid_map, io.mask, env, row, col, io.voronoi_cfg, io.mapping_cfg
             ):
-                weight = 1.0 / ti.max(
-                    io.clearance.clearance_m[env, row, col], ti.static(io.voronoi_cfg.cost_epsilon_m)
+                weight = dearness(env, row, col, io) / ti.math.clamp(
+                    io.clearance.clearance_m[env, row, col],
+                    ti.static(io.voronoi_cfg.cost_epsilon_m),
+                    ti.static(widest_m(io.clearance_cfg, io.quiet_cfg, io.voronoi_cfg)),
                 )
             io.voronoi.weight[slot, row, col] = weight
             io.voronoi.cell[slot, row, col] = ti.cast(0, ti.u8)
