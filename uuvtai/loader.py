@@ -38,6 +38,7 @@ STACK_SECTIONS = (
     "mapping",
     "clearance",
     "voronoi",
+    "quiet",
     "route",
     "teacher",
     "baselines",

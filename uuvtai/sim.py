@@ -133,11 +133,11 @@ class Sim:
                 true_map.stamp_truth(io.true_map)
         with self._stage("clearance"):
             clearance.compute_clearance(io.clearance)
-            if c.quiet.weight_seen > 0:
-                exposure.average_traffic(io.exposure)
         with self._stage("features"):
             features.sense_sectors(io.features)
         with self._stage("planning"):
+            if c.quiet.weight_seen > 0:
+                exposure.average_traffic(io.exposure)
             triggers.fire_triggers(io.triggers)
             voronoi.plan_routes(io.voronoi)
             self.fallback.serve(io, self._plan_seed)

@@ -28,6 +28,7 @@ _STACK = (
     "mapping",
     "clearance",
     "voronoi",
+    "quiet",
     "route",
     "teacher",
     "actuation",
