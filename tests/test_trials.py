@@ -20,6 +20,17 @@ PILOTS = [
 ]
 """rows of the table of pilots, in its order"""
 
+QUIET = [
+    (77001, "off"),
+    (77001, "seen 20"),
+    (77001, "seen 60"),
+    (77001, "seen 20, room 0.7"),
+    (77001, "prior 3, room 0.7"),
+    (77002, "off"),
+    (77002, "seen 20"),
+]
+"""rows of the table of quiet water, in its order: seed, weights"""
+
 
 def table(page, heading, header):
     """Cells of the first table below a heading whose header begins so."""
@@ -61,6 +72,24 @@ def test_pilots_are_as_their_episodes_say(column, cell):
         if "(+" in text:
             won, lost = paired(kept[name], kept[PILOTS[0]])
             assert f"(+{won} -{lost}, p < 0.001)" in text and mcnemar_p(won, lost) < 0.001
+
+
+@pytest.mark.parametrize(("column", "cell"), [(1, "pool15"), (2, "gaunt15")])
+def test_quiet_water_is_as_its_episodes_say(column, cell):
+    rows = json.loads((DOCS / "data/quiet_trials.json").read_text())["rows"]
+    kept = {(row["seed"], row["quiet"]): row["outcomes"] for row in rows if row["cell"] == cell}
+    found = table("tuning.md", "## Quiet water", "| seed |")
+    for (seed, name), cells in zip(QUIET, found, strict=True):
+        text = cells[column + 1].strip(" |")
+        if text == "-":
+            assert (seed, name) not in kept
+            continue
+        own = kept[seed, name]
+        assert cells[0].strip(" |") == str(seed) and len(own) == 300
+        assert told(text) == pytest.approx(rates(own), abs=0.051), name
+        won, lost = paired(own, kept[seed, "off"])
+        expected = "" if name == "off" else f" (+{won} -{lost}, p = {mcnemar_p(won, lost):.2f})"
+        assert text.endswith(expected) and ("(" in text) == (name != "off"), name
 
 
 def test_local_planners_are_as_their_episodes_say():
