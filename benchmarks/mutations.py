@@ -491,6 +491,14 @@ KERNELS = (
         "joseph",
     ),
     Mutation(
+        "turning_back_is_certain",
+        "uuvtai/kernels/perception/unseen.py",
+        "= row[j] + noise",
+        "= row[j]",
+        "tests/test_unseen.py",
+        "oracle",
+    ),
+    Mutation(
         "dearest_pair_first",
         "uuvtai/kernels/perception/association.py",
         "io.tracks.pick_cost[env, asking] < io.tracks.pick_cost[env, holder]",

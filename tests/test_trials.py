@@ -92,6 +92,38 @@ def test_quiet_water_is_as_its_episodes_say(column, cell):
         assert text.endswith(expected) and ("(" in text) == (name != "off"), name
 
 
+def test_first_seconds_are_as_their_episodes_say():
+    kept = json.loads((DOCS / "data/first_seconds_77001.json").read_text())
+    starts = {(row["pilot"], row["cell"]): row for row in kept["starts"]}
+    found = table("tuning.md", "## The first seconds", "| first action |")
+    for first, *cells in found:
+        name = first.strip(" |").removeprefix("the same, ")
+        for cell, text in zip(("pool15", "gaunt15"), cells, strict=True):
+            row = starts.get((name, cell))
+            assert text.strip(" |") == ("-" if row is None else str(len(row["collided"]))), (name, cell)
+            assert row is None or row["episodes"] == 1500
+    assert sum(text.strip(" |") != "-" for _, *cells in found for text in cells) == len(starts)
+
+
+def test_unseen_bodies_are_as_measured():
+    kept = json.loads((DOCS / "data/first_seconds_77001.json").read_text())
+    outcomes = {(row["pilot"], row["cell"]): row["outcomes"] for row in kept["rows"]}
+    for name, *cells in table("tuning.md", "## The first seconds", "| who may have"):
+        pilot = "as it is" if name == "off" else name
+        for cell, text in zip(("pool15", "gaunt15"), cells, strict=True):
+            assert told(text.strip(" |")) == pytest.approx(rates(outcomes[pilot, cell]), abs=0.051), name
+            won, lost = paired(outcomes[pilot, cell], outcomes["as it is", cell])
+            assert pilot == "as it is" or text.strip(" |").endswith(f"(+{won} -{lost})")
+    bins = {row["pilot"]: row["bins"] for row in kept["calibration"]}
+    names = ["as it is", "bodies above or below the fan", "all bodies out of sight"]
+    for nth, (_, *cells) in enumerate(table("tuning.md", "## The first seconds", "| unseen for |")):
+        for name, text in zip(names, cells, strict=True):
+            measured = bins[name][nth]
+            share, error = text.strip(" |").split(" %, ")
+            assert float(share) == pytest.approx(100 * measured["within_95"], abs=0.51)
+            assert float(error) == pytest.approx(measured["nees_mean"], abs=0.051)
+
+
 def test_local_planners_are_as_their_episodes_say():
     rows = json.loads((DOCS / "data/baselines_90001.json").read_text())["rows"]
     kept = {(row["method"], row["cell"]): row["outcomes"] for row in rows}

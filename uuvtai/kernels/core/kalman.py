@@ -14,7 +14,7 @@ import taichi as ti
 
 from uuvtai.kernels.core.geometry import turned_z
 
-_AT = ((0, 1, 2, 3), (1, 4, 5, 6), (2, 5, 7, 8), (3, 6, 8, 9))
+AT = ((0, 1, 2, 3), (1, 4, 5, 6), (2, 5, 7, 8), (3, 6, 8, 9))
 """Place of element [i][j] in the stored triangle."""
 
 _FLOOR = 1.0e-7
@@ -42,14 +42,14 @@ def predicted(mean, cov, rate, link, dt, density, rate_density):
     linked = _carried(ti.Vector([link[0], link[1], link[2], link[3]]), dt, c0, c1)
     half = ti.Matrix.zero(ti.f32, 4, 4)
     for j in ti.static(range(4)):
-        column = _carried(ti.Vector([cov[ti.static(_AT[i][j])] for i in range(4)]), dt, c0, c1)
+        column = _carried(ti.Vector([cov[ti.static(AT[i][j])] for i in range(4)]), dt, c0, c1)
         for i in ti.static(range(4)):
             half[i, j] = column[i]
     grown = cov + 0.0
     for i in ti.static(range(4)):
         row = _carried(ti.Vector([half[i, j] for j in range(4)]), dt, c0, c1)
         for j in ti.static(range(i, 4)):
-            grown[ti.static(_AT[i][j])] = (
+            grown[ti.static(AT[i][j])] = (
                 row[j] + linked[i] * turn[j] + turn[i] * linked[j] + link[4] * turn[i] * turn[j]
             )
     q0, q1, q2 = density * dt * dt * dt / 3.0, density * dt * dt / 2.0, density * dt
@@ -85,14 +85,14 @@ def corrected(mean, cov, rate, link, h, residual, variance):
     for i in ti.static(range(4)):
         pl += link[i] * h[i]
         for j in ti.static(range(4)):
-            ph[i] += cov[ti.static(_AT[i][j])] * h[j]
+            ph[i] += cov[ti.static(AT[i][j])] * h[j]
     scale = 1.0 / (ph.dot(h) + variance)
     moved = mean + ph * (residual * scale)
     shrunk = cov + 0.0
     for i in ti.static(range(4)):
         for j in ti.static(range(i, 4)):
-            shrunk[ti.static(_AT[i][j])] -= ph[i] * ph[j] * scale
-        shrunk[ti.static(_AT[i][i])] = ti.max(shrunk[ti.static(_AT[i][i])], _FLOOR)
+            shrunk[ti.static(AT[i][j])] -= ph[i] * ph[j] * scale
+        shrunk[ti.static(AT[i][i])] = ti.max(shrunk[ti.static(AT[i][i])], _FLOOR)
     bound = link - ti.Vector([ph[0], ph[1], ph[2], ph[3], pl]) * (pl * scale)
     bound[4] = ti.select(link[4] > 0.0, ti.max(bound[4], _FLOOR), 0.0)
     return moved, shrunk, rate + pl * residual * scale, bound

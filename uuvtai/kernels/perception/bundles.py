@@ -161,3 +161,4 @@ class TrackingIO:
     sonar_cfg: Const[SonarConfig]
     tank_cfg: Const[TankConfig]
     tracking_cfg: Const[TrackingConfig]
+    traffic_cfg: Const[TrafficConfig]

@@ -11,11 +11,12 @@ through a wall: only turns before the next one count. Sees tracks only.
 
 import taichi as ti
 
-from uuvtai.config import TrafficConfig
+from uuvtai.config import ForecastConfig, TrackingConfig, TrafficConfig
 from uuvtai.kernels.core.geometry import FAR_M
-from uuvtai.kernels.core.signature import Bundle, Const, spread
+from uuvtai.kernels.core.signature import Bundle, Const, In, spread
 from uuvtai.kernels.perception.bundles import FuturesIO
 from uuvtai.kernels.perception.habits import expected_turn_rate, next_turn, wall_ahead
+from uuvtai.state import TrackState
 from uuvtai.taichi_patches.launch import quick_launch
 
 _SLOWEST_M_S = 0.1
@@ -59,7 +60,9 @@ def _turn_backs(env, track, io: Bundle[FuturesIO]):
             wall = ti.max(wall_ahead(pos, course, io.tracks.radius_m[env, track], io.tank_cfg), 0.0)
             first = longer_share(begun, known, io.traffic_cfg)
             rest = first - longer_share(begun + wall, known, io.traffic_cfg)
-            straight = straight_share(env, track, io) / ti.max(rest, 1.0e-3)
+            straight = straight_share(env, track, io.tracks, io.forecast_cfg, io.tracking_cfg) / ti.max(
+                rest, 1.0e-3
+            )
             gone = 0.0
             for future in ti.static(range(len(io.forecast_cfg.turn_back_s))):
                 end = ti.min(speed * ti.static(io.forecast_cfg.turn_back_s[future]), wall)
@@ -88,13 +91,19 @@ def longer_share(way_m, known, traffic_cfg: Const[TrafficConfig]):
 
 
 @ti.func
-def straight_share(env, track, io: Bundle[FuturesIO]):
+def straight_share(
+    env,
+    track,
+    tracks: In[TrackState],
+    forecast_cfg: Const[ForecastConfig],
+    tracking_cfg: Const[TrackingConfig],
+):
     """Probability that the body goes straight rather than in a circle (``habits.expected_turn_rate``)."""
     share = 1.0
-    if ti.static(io.forecast_cfg.use_turn_rate and io.tracking_cfg.turn_rate_sigma_rad_s > 0):
-        rate, var = io.tracks.turn_rate[env, track], io.tracks.turn_cov[env, track][4]
+    if ti.static(forecast_cfg.use_turn_rate and tracking_cfg.turn_rate_sigma_rad_s > 0):
+        rate, var = tracks.turn_rate[env, track], tracks.turn_cov[env, track][4]
         if var > 0.0:
-            turns = ti.sqrt(var) * ti.static(1.0 / io.tracking_cfg.turn_rate_sigma_rad_s)
+            turns = ti.sqrt(var) * ti.static(1.0 / tracking_cfg.turn_rate_sigma_rad_s)
             turns *= ti.exp(ti.min(0.5 * rate * rate / var, 20.0))
-            share = io.forecast_cfg.straight_odds / (io.forecast_cfg.straight_odds + turns)
+            share = forecast_cfg.straight_odds / (forecast_cfg.straight_odds + turns)
     return share

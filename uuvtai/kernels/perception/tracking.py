@@ -17,13 +17,16 @@ from uuvtai.kernels.perception.bundles import TrackingIO
 from uuvtai.kernels.perception.clustering import HELD_SIGMA_M_S, find_clusters, label_beams
 from uuvtai.kernels.perception.habits import coasted, expected_turn_rate
 from uuvtai.kernels.perception.track_slots import (
+    SEEN_THROUGH,
     carry_names,
     clear_track,
     name_beams,
     prune_tracks,
+    sight_of,
     spawn_tracks,
 )
 from uuvtai.kernels.perception.track_update import update_tracks
+from uuvtai.kernels.perception.unseen import turn_back_rate, turned_back
 from uuvtai.taichi_patches.launch import quick_launch
 
 
@@ -151,12 +154,9 @@ def predict_tracks(env, io: Bundle[TrackingIO]):
                 io.tracking_cfg.accel_density,
                 io.tracking_cfg.turn_density,
             )
-            if ti.static(io.forecast_cfg.use_coasting):
-                unseen = io.tracks.moving[env, track] == 1 and io.tracks.misses[env, track] > 0
-                if (
-                    unseen
-                    and expected_turn_rate(env, track, io.tracks, io.forecast_cfg, io.tracking_cfg) == 0.0
-                ):
+            unseen = io.tracks.moving[env, track] == 1 and io.tracks.misses[env, track] > 0
+            if unseen and expected_turn_rate(env, track, io.tracks, io.forecast_cfg, io.tracking_cfg) == 0.0:
+                if ti.static(io.forecast_cfg.use_coasting):
                     mean = coasted(
                         env,
                         track,
@@ -167,6 +167,10 @@ def predict_tracks(env, io: Bundle[TrackingIO]):
                         io.forecast_cfg,
                         io.tank_cfg,
                     )
+                if ti.static(io.forecast_cfg.use_turning_back):
+                    if sight_of(env, track, io) == SEEN_THROUGH:  # what is hidden may be level
+                        rate = turn_back_rate(env, track, dt, io)
+                        mean, cov, link = turned_back(mean, cov, link, rate, dt)
             io.tracks.state[env, track] = mean
             io.tracks.cov[env, track] = cov
             io.tracks.turn_cov[env, track] = link
