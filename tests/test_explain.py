@@ -64,6 +64,8 @@ class Story:
         self.leaf = ["Evade"] * self.n
         self.conflict = np.ones(self.n, bool)
         self.believed_gap = 0.0
+        self.place_error = np.zeros(3)
+        self.turn_back_share = 0.0
         self.coarse = None
 
     def turn(self, ago_s, before=(0.0, -1.0)):
@@ -100,6 +102,7 @@ class Story:
         return History(
             t_s=self.t,
             pos_w=self.pos,
+            believed_pos_w=self.pos + self.place_error,
             quat_wb=np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], -1),
             vel_b=self.hull_vel,
             rate_b=np.zeros((self.n, 3)),
@@ -113,6 +116,7 @@ class Story:
             forecast_m=np.where(self.believes, 0.2, -1.0)[:, None],
             forecast_above_w=self.pos[:, 2:] + self.believed_gap,
             forecast_below_w=self.pos[:, 2:] - self.believed_gap,
+            turn_back_share=np.full((self.n, 1), self.turn_back_share),
             conflict=self.conflict,
             leaf=self.leaf,
             action=np.zeros((self.n, 4)),
@@ -183,8 +187,28 @@ def late_into_the_fan():
     return story
 
 
+def diving_into_it():
+    """The vehicle dives for its last second; the killer stays below the fan."""
+    story = below(-0.35)
+    story.pos[:, 2] += 0.3 * np.minimum(story.ago, 1.0)
+    return story
+
+
+def above_the_floor():
+    """In a corridor, too near to the floor to dive below what comes over the whole width at its height."""
+    story = corridor(Story(speed=2.0, rise=0.25, gap=-0.05))
+    for places in (story.pos, *np.moveaxis(story.body, 1, 0)):
+        places[:, 2] -= 0.5
+    return story
+
+
 STORIES = {
     "out_of_tank": (lambda: change(at_wall(Story()), pos=np.tile([-0.1, 3.0, -0.8], (41, 1))), "out_of_tank"),
+    "depth_misjudged": (lambda: change(at_depth(-1.5), place_error=np.array([0, 0, 0.06])), "collision"),
+    "lost_place": (lambda: change(hit_static(), place_error=np.array([0.08, 0.08, 0])), "collision"),
+    "depth_change": (diving_into_it, "collision"),
+    "turned_back": (lambda: Story().turn(1.1, before=(1.0, 0.1)), "collision"),
+    "depth_edge": (above_the_floor, "collision"),
     "hit_floor": (lambda: at_depth(-1.5), "collision"),
     "hit_surface": (lambda: at_depth(-0.1), "collision"),
     "hit_static": (hit_static, "collision"),
@@ -262,6 +286,11 @@ def test_a_timeout_gets_its_label(label):
             "wrong_evasion",
         ),  # the last chance was 0.5 s before the end
         (lambda: with_second(Story(speed=5.0), y=1.5), "fast_crossing"),
+        (lambda: change(at_depth(-1.5), place_error=np.array([0, 0, 0.04])), "hit_floor"),
+        (lambda: change(at_depth(-1.5), place_error=np.array([0, 0, -0.06])), "hit_floor"),  # the safe way
+        (lambda: change(at_depth(-0.1), place_error=np.array([0, 0, -0.06])), "depth_misjudged"),
+        (lambda: change(hit_static(), place_error=np.array([0.06, 0.07, 0])), "hit_static"),
+        (lambda: Story().turn(1.1, before=(0.5, -0.9)), "unannounced_turn"),  # by less than 120 degrees
     ],
 )
 def test_just_past_a_threshold_the_label_changes(make, label):
@@ -295,6 +324,7 @@ REMARKABLE = {
     "static near": lambda: corridor(Story()),
     "turned lately": lambda: Story().turn(2.4),
     "corner passed in reach before": lambda: Story().turn(1.1),
+    "changed its depth": lambda: change(Story(), pos=diving_into_it().pos),
     "remembered to the end": lambda: below(0.35),
     "remembered clear of the own depth": lambda: change(below(0.35), believed_gap=0.2),
     "taken as static": lambda: lately(Story(), 2.0, "believes", False),
@@ -305,8 +335,27 @@ REMARKABLE = {
 }
 
 
+TURNED_BACK = {"turn back foreseen by no hypothesis", "turn back given little weight"}
+
+
+@pytest.mark.parametrize(
+    ("share", "turn_back_s", "remarks"),
+    [
+        (0.0, (0.4, 0.8), {"turn back foreseen by no hypothesis"}),
+        (0.3, (0.4, 0.8), {"turn back given little weight"}),
+        (0.6, (0.4, 0.8), set()),
+        (0.0, (), set()),  # nobody was asked
+    ],
+)
+def test_a_turn_back_says_how_probable_it_was_thought(share, turn_back_s, remarks):
+    config = Config.model_validate({"forecast": {"turn_back_s": turn_back_s}})
+    found = change(Story().turn(1.1, before=(1.0, 0.1)), turn_back_share=share).explained(config=config)
+    assert found.label == "turned_back"
+    assert TURNED_BACK & set(found.remarks) == remarks
+
+
 def test_every_remark_has_its_story_and_a_plain_one_has_none():
-    assert set(REMARKABLE) == set(REMARKS)
+    assert set(REMARKABLE) | TURNED_BACK == set(REMARKS)
     assert Story().explained().remarks == []
     for remark, make in REMARKABLE.items():
         assert remark in make().explained().remarks, remark

@@ -15,6 +15,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from mcap.reader import make_reader
@@ -22,7 +23,7 @@ from mcap.records import Attachment, Chunk, Metadata
 from mcap.stream_reader import StreamReader
 
 from tests.conftest import SmallSim
-from tests.reference import log_alone
+from tests.reference import decision_alone, log_alone
 from uuvtai.loader import load_config, load_resolved
 
 HORIZON = 200
@@ -40,6 +41,9 @@ next cell (1 in 10^5)"""
 DISTANCE_M = 1e-5
 """float32 of a distance of metres"""
 SAFETY_M, TTC_SHARE = 1e-3, 1e-2
+VELOCITY_M_S, COST_SHARE = 1e-5, 1e-3
+"""float32 of headings and of roll-outs; a cost may differ by more where a place falls within float32 of a
+cell's edge or a body's height"""
 CLOSED_FORM = 1e-5
 """[m] and [m/s], float32 of arcs of tens of metres"""
 
@@ -289,3 +293,43 @@ def test_the_outcome_follows_from_the_rules(recordings, logs, figures):
         outcomes.add(figures[path]["safety"]["outcome"])
         assert figures[path]["safety"]["outcome"] == printed[run["controller"], run["seed"], run["episode"]]
     assert outcomes == {"success", "collision", "ttc", "timeout"}
+
+
+def test_the_choice_among_evasions_is_redone(logs):
+    """From the logged costs: the least candidate or the mean of the best ones, by its velocity."""
+    means = least = 0
+    for log in logs.values():
+        softness = log.config["teacher"]["softness"]
+        for own in decision_alone.decisions(log):
+            velocities, _ = decision_alone.candidates(log, own)
+            assert len(velocities) == len(own.costs)
+            if own.candidate < 0:
+                chosen = decision_alone.mean_of_the_best(log, own, velocities)
+                assert own.cost <= own.costs.min() + softness + 1e-6
+                means += 1
+            else:
+                assert own.candidate == own.costs.argmin() and own.cost == own.costs.min()
+                chosen = velocities[int(own.candidate)]
+                least += 1
+            np.testing.assert_allclose(own.velocity, chosen, atol=VELOCITY_M_S)
+    assert means > 10 and least > 0
+
+
+def test_costs_of_evasions_are_redone_from_the_tracks_and_the_map(logs):
+    """Of every candidate, and of the mean where it was chosen: equal where the clearance of the decision's
+    own step is in the log, and never more elsewhere, where what stands still is left out."""
+    equal, rest, n_track = [], [], 0
+    for log in logs.values():
+        for own in decision_alone.decisions(log):
+            velocities, lasts = decision_alone.candidates(log, own)
+            if own.candidate < 0:
+                velocities, lasts = np.vstack([velocities, own.velocity]), np.append(lasts, np.inf)
+                own.costs = np.append(own.costs, own.cost)
+            redone = decision_alone.costs(log, own, velocities, lasts)
+            left = (own.costs - redone) / np.maximum(own.costs, 1.0)
+            (rest if own.grid is None else equal).append(left)
+            n_track += len(own.tracks)
+    equal, rest = np.concatenate(equal), np.concatenate(rest)
+    assert len(equal) > 2 * 160 and n_track > 20
+    assert np.mean(np.abs(equal) < COST_SHARE) > 0.99
+    assert np.mean(rest > -COST_SHARE) > 0.99 and np.mean(np.abs(rest) < COST_SHARE) > 0.2

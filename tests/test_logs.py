@@ -142,6 +142,18 @@ def test_an_evasion_is_told_where_one_is_looked_for(log_path, snaps):
     assert found[0]["velocity"] == pytest.approx([0.1, 0.6, 0.2]) and found[0]["cost"] == 2.5
 
 
+def test_futures_are_told_beside_the_forecast(log_path):
+    """Slot 0 has its forecast alone; slot 2 has two futures, and its forecast what they leave."""
+    found = by_topic(log_path, "/futures")
+    assert len(found) == len(by_topic(log_path, "/evasion"))
+    first, second = found[0]["tracks"]
+    assert [path["weight"] for path in first["hypotheses"]] == [1.0]
+    assert first["hypotheses"][0]["x"] == [0, -2, -4] and first["hypotheses"][0]["y"] == [-1, -3, -5]
+    assert [path["weight"] for path in second["hypotheses"]] == pytest.approx([0.1, 0.25, 0.65])
+    assert second["hypotheses"][1]["x"] == [30, 32, 34] and second["radius"] == pytest.approx([0.2] * 3)
+    assert (second["above"], second["below"]) == (pytest.approx(-0.4), None)
+
+
 def test_every_topic_has_its_schema_and_every_message_fits_it(log_path):
     seen, validators = {}, {}
     for topic, schema, _, _, data in messages(log_path):

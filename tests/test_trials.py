@@ -3,8 +3,10 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from docs.writers.turn_backs import what_came
 from uuvtai.statistics import mcnemar_p
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -137,3 +139,34 @@ def test_local_planners_are_as_their_episodes_say():
             if "p = " in cell:
                 p = float(cell.split("p = ")[1].strip(" |"))
                 assert p == pytest.approx(mcnemar_p(*paired(outcomes, tree)), rel=0.15, abs=0.006)
+
+
+def test_turn_backs_are_as_their_counts_say():
+    cells = json.loads((DOCS / "data/turn_backs.json").read_text())["cells"]
+    rows = table("tuning.md", "### Are the futures", "| probability |")
+    for row, *bins in zip(rows, *cells.values(), strict=True):
+        for text, found in zip(row[1:3], bins, strict=True):
+            of_body = found["moments"] - found["no_body"] - found["other_way"]
+            mean, _, turned = text.partition("; ")
+            assert float(mean) == pytest.approx(100 * found["mean_probability"], abs=0.051)
+            assert turned == f"{100 * found['turned_back'] / of_body:.1f} of {of_body:,}"
+        assert float(row[3].strip(" |")) == pytest.approx(100 * bins[1]["turned"] / of_body, abs=0.051)
+
+
+@pytest.mark.parametrize(
+    ("phase_m", "way", "came"),
+    [
+        (2.0, (1.5, 0.0), ("line", True, True)),  # 1 m before the end of its way
+        (1.0, (1.5, 0.0), ("line", False, False)),  # 2 m before it
+        (3.5, (1.5, 0.0), ("other way", False, False)),  # it has turned back already
+    ],
+)
+def test_what_came_follows_from_the_path(phase_m, way, came):
+    """A body that swims to and fro on 3 m at 1.5 m/s, looked at for 0.8 s; and where no body is."""
+    path = {
+        "shape": "polyline", "corners": [[0.0, 0.0], [3.0, 0.0]], "length_m": 6.0, "phase_m": phase_m,
+        "speed_m_s": 1.5,
+    }  # fmt: skip
+    here = np.array([min(phase_m, 6.0 - phase_m), 0.0])
+    assert what_came([{"path": path}], here, np.array(way), 0.0) == came
+    assert what_came([{"path": path}], here + 0.6, np.array(way), 0.0) == ("none", False, False)

@@ -1,12 +1,12 @@
-"""Pages that say what the code says: commands, configuration, log topics, stages. Written anew by every
-build, never committed."""
+"""Pages that say what the code says: commands, configuration, log topics, stages, causes of failure. Written
+anew by every build, never committed."""
 
 from __future__ import annotations
 
 import shutil
 from pathlib import Path
 
-from docs.writers import commands, configuration, stages, topics
+from docs.writers import commands, configuration, failure_causes, stages, topics
 
 Pages = dict[str, str]
 """Markdown by path below ``docs/reference``"""
@@ -19,6 +19,7 @@ def pages() -> Pages:
         **configuration.pages(),
         "topics.md": topics.page(),
         "stages.md": stages.page(),
+        "failure_causes.md": failure_causes.page(),
     }
 
 

@@ -218,6 +218,9 @@ def _tracked(bodies: np.ndarray, which: np.ndarray) -> dict[str, Any]:
         "forecast.above_w": np.array([1e6, 0, -0.4, 0], np.float32),
         "forecast.below_w": np.array([-1.0, 0, -1e6, 0], np.float32),
         "futures.share": np.array([[0.0, 0.0], [0, 0], [0.1, 0.25], [0, 0]], np.float32),
+        "futures.pos_w": np.arange(4 * 2 * 3 * 2, dtype=np.float32).reshape(4, 2, 3, 2),
+        "forecast.pos_w": -np.arange(4 * 3 * 2, dtype=np.float32).reshape(4, 3, 2),
+        "forecast.radius_m": np.outer([0.3, -1, 0.2, -1], np.ones(3)).astype(np.float32),
         "tracks.beam_track": np.select([which == 3, which == 4], [0, 2], -1).astype(np.int32),
     }
 
@@ -256,6 +259,8 @@ def _driven(step: int) -> dict[str, Any]:
         "teacher.evade_vel_w": np.array([0.1, 0.6, 0.2], np.float32),
         "teacher.evade_cost": np.float32(2.5),
         "teacher.evade_candidate": np.int32(-1 if step % 2 else 17),
+        "teacher.candidate_cost": np.arange(160, dtype=np.float32),
+        "teacher.last_vel_w": np.array([0.2, 0.5, -0.1], np.float32),
         "reward.term": np.array([0.01, 0.02, -0.001, 0.0], np.float32),
         "driver.applied": np.array([0.8, 0.0, 0.1, -0.2], np.float32),
         **{f"driver.{name}": None for name in outputs},

@@ -95,6 +95,43 @@ FORMULAS = {
         "from the map of that step: its time is the timestamp of /map/clearance and /map/risk, which on a "
         "replan may lie before their log time."
     ),
+    "candidates": (
+        "Velocities in the order of `costs` of /evasion; names are keys of `teacher`, followed, asked and "
+        "top defined here. followed = `follow`; asked = `asked` of /action one control step before; "
+        "top(h) = min(evade_m_s, 1 / max(|cos(h - yaw)| / max_surge_m_s, |sin(h - yaw)| / max_sway_m_s)), "
+        "limits of `vehicle`; h0 = heading of followed. First n_heading * n_speed level ones with the "
+        "heave of followed: number i has heading h0 + 2 pi (i mod n_heading) / n_heading and speed top "
+        "(floor(i / n_heading) + 1) / n_speed. Then stop, asked, followed. If heave_m_s > 0: for "
+        "n_heave_heading headings, all round from h0 on, at top speed one that climbs and one that dives "
+        "with heave_m_s, and a pair straight up and down. Then stop again, up to a multiple of 16. If "
+        "burst_s > 0: 32 headings all round from h0 on, at top speed with the heave of followed, which "
+        "last burst_s and then stop. Heaves of asked, climbing and diving ones are held within [min(low - "
+        "z, 0), max(high - z, 0)]: low and high are floor and surface, inwards by edge_gap_m + "
+        "edge_sigmas sqrt(z_variance), half of the water at most."
+    ),
+    "evasion_cost": (
+        "weight_peak peak + weight_mean mean + weight_contact contact + weight_static static_mean + "
+        "weight_static_contact static_contact + (weight_deviation |c - followed| + weight_change |c - "
+        "asked|) / cruise_m_s. The vehicle approaches c, after burst_s 0, with a first-order lag lag_s "
+        "from own_velocity turned by yaw; z is held within [low, high]. For k = 1 .. horizon_s / "
+        "forecast_dt_s, t = k forecast_dt_s, body and radius of a hypothesis of /futures: g = "
+        "max(min(above - z, z - below), 0) vertical_weight; r = level distance of the axes; distance = r "
+        "- radius if g = 0, else sqrt(max(r - radius, 0)^2 + g^2); closing = max(rate at which r shrinks, "
+        "0), times max(r - radius, 0) / distance if g > 0, the body's velocity being that of its last "
+        "forecast_dt_s; free = distance - hull_reach_m - closing_s closing; wanted = contact_m + caution "
+        "(margin_m + margin_growth_m_s t), the second term times future_margin for hypotheses other than "
+        "the forecast; depth = max(wanted - free, 0). Of a hypothesis: largest depth; mean depth; largest "
+        "max(contact_m - free, 0). Of a track: their means by weight, where hypotheses of at most "
+        "least_share are left out and the forecast has what the others leave. peak and contact are the "
+        "largest of all tracks, mean is their sum. static: below = hull_reach_m + contact_m - "
+        "/map/clearance of the cell there, every static_dt_s up to static_horizon_s: mean of max(below + "
+        "static_margin_m, 0), and the largest below, at least 0."
+    ),
+    "evasion_choice": (
+        "Least = the first candidate of least cost. Mean = mean of the candidates with weights exp(-(cost "
+        "- least cost) / softness), those 12 softness above left out, held for the whole horizon. The "
+        "mean is taken if its own cost is at most least cost + softness, else the least."
+    ),
 }
 """How an outsider recomputes the log's figures; names such as mapping.occupied are keys of config.yaml."""
 

@@ -11,6 +11,7 @@ from uuvtai.logs.encode import (
     checked,
     color,
     line,
+    number,
     number_or_null,
     numbers,
     scene_entity,
@@ -30,7 +31,7 @@ from uuvtai.logs.schemas import (
     described,
     record,
 )
-from uuvtai.logs.topic import NEW_SCAN, OBSTACLES, Topic
+from uuvtai.logs.topic import EVADING, NEW_SCAN, OBSTACLES, Topic
 
 _GOAL_COLOR, _TANK_COLOR = (0.98, 0.75, 0.14, 1.0), (0.3, 0.38, 0.46, 1.0)
 _RESTING, _MOVING = (0.44, 0.5, 0.58, 0.9), (0.95, 0.45, 0.2, 0.9)
@@ -55,13 +56,14 @@ _OBSTACLE: Schema = {
     "oneOf": [{"required": ["radius"]}, {"required": ["half_extents"]}],
 }
 _OBSTACLES = record("uuv.Obstacles", "Truth. In the order of scenario.json.", obstacles=array_of(_OBSTACLE))
+_BOUNDS = {
+    "above": described(NUMBER, "[m] world z of the lowest edge of what may be above; null = free"),
+    "below": described(NUMBER, "[m] world z of the highest edge of what may be below; null = free"),
+}
 _TRACK = record(
     "uuv.Track",
     "State at the newest tracked scan.",
-    {
-        "above": described(NUMBER, "[m] world z of the lowest edge of what may be above; null = free"),
-        "below": described(NUMBER, "[m] world z of the highest edge of what may be below; null = free"),
-    },
+    _BOUNDS,
     x=NUMBER,
     y=NUMBER,
     z=NUMBER,
@@ -79,6 +81,26 @@ _TRACKS = record(
     "Moving bodies that the vehicle believes in.",
     tracks=array_of(_TRACK),
     beams=described(array_of(UINT), "beams of the newest scan that a moving body explains"),
+)
+_HYPOTHESIS = record(
+    "uuv.Hypothesis",
+    weight=described(
+        NUMBER, "probability; the last hypothesis is the forecast and has what the others leave"
+    ),
+    x=described(array_of(NUMBER), "[m] every tracking.forecast_dt_s from now on"),
+    y=described(array_of(NUMBER), "[m]"),
+)
+_EXPECTED = record(
+    "uuv.ExpectedTrack",
+    "Of a moving track.",
+    _BOUNDS,
+    radius=described(array_of(NUMBER), "[m] at the same times: the body's and what is unsure"),
+    hypotheses=array_of(_HYPOTHESIS),
+)
+_FUTURES = record(
+    "uuv.Futures",
+    "Where each moving track may be, as the decision of this time sees it; in the order of /tracks.",
+    tracks=array_of(_EXPECTED),
 )
 
 _MOTION = '"yaw":%.9g,"vx":%.9g,"vy":%.9g,"vz":%.9g}'
@@ -180,8 +202,34 @@ def _tracks(moment: Moment) -> bytes:
     return f'{{"tracks":[{checked(text)}],"beams":[{",".join(map(str, beams.tolist()))}]}}'.encode()
 
 
+def _futures(moment: Moment) -> bytes:
+    """Tracks that have a forecast, each with its futures that are possible and then the forecast itself."""
+    radius_m = moment["forecast.radius_m"]
+    rows = np.flatnonzero(radius_m[:, 0] >= 0)
+    bounds = moment["forecast.above_w"], moment["forecast.below_w"]
+    texts = []
+    for row in rows.tolist():
+        above, below = (_bound(found[row]) for found in bounds)
+        share = moment["futures.share"][row]
+        paths = [(weight, moment["futures.pos_w"][row, i]) for i, weight in enumerate(share) if weight > 0]
+        paths.append((1.0 - float(share.sum(dtype=float)), moment["forecast.pos_w"][row]))
+        texts.append(
+            f'{{"above":{above},"below":{below},"radius":{numbers(radius_m[row])},'
+            f'"hypotheses":[{",".join(_hypothesis(*path) for path in paths)}]}}'
+        )
+    return f'{{"tracks":[{",".join(texts)}]}}'.encode()
+
+
+def _hypothesis(weight: float, pos_w: np.ndarray) -> str:
+    return f'{{"weight":{number(weight)},"x":{numbers(pos_w[:, 0])},"y":{numbers(pos_w[:, 1])}}}'
+
+
+def _bound(z: float) -> str:
+    return number_or_null(None if abs(z) > _FREE_M else float(z))
+
+
 def _belief(rate: float, rate_cov: np.ndarray, present: float, above: float, below: float) -> str:
-    bounds = [number_or_null(None if abs(z) > _FREE_M else float(z)) for z in (above, below)]
+    bounds = [_bound(z) for z in (above, below)]
     return _BELIEF_TEXT % (rate, rate_cov[4], present, *bounds)
 
 
@@ -207,5 +255,15 @@ ROWS = (
             *("forecast.above_w", "forecast.below_w", "futures.share"),
         ),
         _read_tracks,
+    ),
+    Topic(
+        "/futures",
+        EVADING,
+        _FUTURES,
+        _futures,
+        (
+            *(f"forecast.{name}" for name in ("pos_w", "radius_m", "above_w", "below_w")),
+            *("futures.share", "futures.pos_w"),
+        ),
     ),
 )

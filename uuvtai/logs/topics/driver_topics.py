@@ -23,6 +23,7 @@ _ACTION = record(
     "Surge, sway, heave and yaw rate, each in [-1, 1].",
     {"policy": FOUR, "teacher": FOUR},
     applied=described(FOUR, "what drove the step that led here"),
+    asked=described(THREE, "[m/s] velocity that the tree asks for, world"),
     thrust=described(array_of(NUMBER), "[N] of each thruster"),
     leaf=described(STRING, "node of the tree that sets the teacher's action"),
 )
@@ -38,7 +39,9 @@ _SAFETY = record(
 
 _EVASION = record(
     "uuv.Evasion",
-    "What the behaviour tree weighs where following the route conflicts, or lately did. Velocities: world.",
+    "What the behaviour tree weighs where following the route conflicts, or lately did, and with /futures of "
+    "the same time what it weighs it by: scenario.json says how (candidates, evasion_cost, evasion_choice). "
+    "Velocities: world.",
     {
         "conflict_s": described(NUMBER, "first conflict of following the route; null = none"),
         "hold_conflict_s": described(NUMBER, "first conflict of stopping here; null = none"),
@@ -48,6 +51,11 @@ _EVASION = record(
     velocity=described(THREE, "[m/s] evasive velocity of least cost"),
     cost=described(NUMBER, "of that velocity"),
     candidate=described(INT, "its number among the candidates; -1 = the mean of the best ones"),
+    costs=described(array_of(NUMBER), "of every candidate"),
+    position=described(THREE, "[m] own, as estimated"),
+    own_velocity=described(THREE, "[m/s] body frame, as measured or estimated"),
+    yaw=described(NUMBER, "[rad] own, as estimated"),
+    z_variance=described(NUMBER, "[m^2] of the estimated z"),
 )
 
 
@@ -73,6 +81,7 @@ def _action(moment: Moment) -> bytes:
         f'{{"policy":{numbers_or_null(moment["driver.action"])},'
         f'"teacher":{numbers(moment["teacher.action"])},'
         f'"applied":{numbers(moment["driver.applied"])},'
+        f'"asked":{numbers(moment["teacher.last_vel_w"])},'
         f'"thrust":{numbers(moment["actuation.thrust_n"])},"leaf":{json.dumps(leaf)}}}'
     ).encode()
 
@@ -102,7 +111,10 @@ def _evasion(moment: Moment) -> bytes:
         f'"follow":{numbers(moment["teacher.follow_vel_w"])},'
         f'"cruise_z":{number(moment["teacher.cruise_z_m"])},'
         f'"velocity":{numbers(moment["teacher.evade_vel_w"])},'
-        f'"cost":{number(moment["teacher.evade_cost"])},"candidate":{int(moment["teacher.evade_candidate"])}}}'
+        f'"cost":{number(moment["teacher.evade_cost"])},"candidate":{int(moment["teacher.evade_candidate"])},'
+        f'"costs":{numbers(moment["teacher.candidate_cost"])},'
+        f'"position":{numbers(moment["ego.pos_w"])},"own_velocity":{numbers(moment["ego.vel_b"])},'
+        f'"yaw":{number(moment["ego.rpy"][2])},"z_variance":{number(moment["ego.z_var"])}}}'
     ).encode()
 
 
@@ -126,7 +138,11 @@ def _tree_text(nodes: tuple[str, ...], codes: tuple[int, ...]) -> bytes:
     return dumped(dict(zip(nodes, (_STATUSES[code] for code in codes), strict=True)))
 
 
-_DECISION = ("conflict_s", "hold_conflict_s", "follow_vel_w", "cruise_z_m", "evade_vel_w", "evade_cost")
+_DECISION = (
+    *("conflict_s", "hold_conflict_s", "follow_vel_w", "cruise_z_m", "evade_vel_w", "evade_cost"),
+    *("evade_candidate", "candidate_cost"),
+)
+_OWN = ("ego.pos_w", "ego.vel_b", "ego.rpy", "ego.z_var")
 
 ROWS = (
     Topic(
@@ -134,7 +150,10 @@ ROWS = (
         EVERY_STEP,
         _ACTION,
         _action,
-        ("driver.action", "driver.applied", "teacher.action", "teacher.leaf", "actuation.thrust_n"),
+        (
+            *("driver.action", "driver.applied", "teacher.action", "teacher.last_vel_w", "teacher.leaf"),
+            "actuation.thrust_n",
+        ),
         lambda data: data.get("leaf", ""),
     ),
     Topic(
@@ -153,7 +172,7 @@ ROWS = (
         EVADING,
         _EVASION,
         _evasion,
-        tuple(f"teacher.{name}" for name in (*_DECISION, "evade_candidate")),
+        (*(f"teacher.{name}" for name in _DECISION), *_OWN),
     ),
     Topic(
         "/safety",

@@ -9,12 +9,22 @@ add what may have contributed; any number of them may hold.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 from uuvtai.config import Config
-from uuvtai.measure.explain.facts import LAST_S, LEAD_S, Killer, Scene, killer_facts, timeout_facts
+from uuvtai.measure.explain.facts import (
+    BACK_RAD,
+    CLIMB_S,
+    LAST_S,
+    LEAD_S,
+    Killer,
+    Scene,
+    killer_facts,
+    timeout_facts,
+)
 from uuvtai.measure.explain.history import Bodies, History
 
 START_S = 2.0
@@ -41,6 +51,16 @@ CROWD_M = 0.6
 NEAR_M = 1.0
 """Contact with something static is no accident of its own when a moving body came this near to the hull in
 the last NEAR_S."""
+PLACE_M = 0.1
+"""Lost its place: the own position was farther off than the pilot's margin from what stands still
+(``teacher.static_margin_m``)."""
+DEPTH_M = 0.05
+"""Took floor or surface for farther than it was: the own depth was off by more, towards it; the pilot keeps
+the hull 0.03 m off and three standard deviations of the depth."""
+CLIMB_M = 0.15
+"""Changed its depth: moved by more, upwards or downwards, in the last second."""
+LIKELY = 0.5
+"""A turn back that was given less than this probability came unexpected."""
 PROGRESS_M = 1.0
 """A timeout that came this much nearer to the goal in that time was only slow."""
 STUCK_M = 0.5
@@ -48,15 +68,20 @@ STUCK_M = 0.5
 
 CAUSES: dict[str, str] = {
     "out_of_tank": "left the tank",
+    "depth_misjudged": f"touched floor or surface, the own depth off by > {DEPTH_M:g} m towards it",
     "hit_floor": "touched the floor",
     "hit_surface": "touched the surface",
+    "lost_place": f"touched a static or wall, the own position off by > {PLACE_M:g} m",
     "pushed_into_static": f"touched a static or wall while evading, or with a moving body within {NEAR_M:g} "
     "m",
     "hit_static": "touched a static obstacle, no moving body near",
     "hit_wall": "touched a side wall, no moving body near",
     "start_in_danger": f"killed in the first {START_S:g} s",
+    "depth_change": f"killer above or below the sonar's fan all through the last {UNSEEN_S:g} s, and the own "
+    f"depth changed towards it by > {CLIMB_M:g} m in the last {CLIMB_S:g} s",
     "unseen_above": f"killer above the sonar's fan all through the last {UNSEEN_S:g} s",
     "unseen_below": f"killer below the sonar's fan all through the last {UNSEEN_S:g} s",
+    "turned_back": f"killer turned back in the last {TURN_S:g} s and the forecast before it was wrong",
     "unannounced_turn": f"killer turned a corner in the last {TURN_S:g} s and the forecast before it was "
     "wrong",
     "seen_late": f"killer came into the sonar's fan less than {LEAD_S:g} s before the end",
@@ -67,6 +92,7 @@ CAUSES: dict[str, str] = {
     "late": "forecast right, but evasion began after the last chance to escape, or never",
     "wrong_evasion": "forecast right and evading before the last chance to escape: it chose the wrong way",
     "needs_heave": "forecast right, but only a change of depth would have escaped",
+    "depth_edge": "forecast right, only below the floor or above the surface was there a way out",
     "squeezed_by_static": f"forecast right, no way out: static or wall within {REACH_M:g} m",
     "crowded": f"forecast right, no way out: a second moving body within {CROWD_M:g} m",
     "fast_crossing": "forecast right, no way out: the killer is too fast to give way to",
@@ -90,6 +116,11 @@ REMARKS: dict[str, Callable[[Fact], bool]] = {
     "corner passed in reach before": lambda f: (
         _within(f["turned_ago_s"], TURN_S) and bool(f["turns_in_reach_before"])
     ),
+    "turn back foreseen by no hypothesis": lambda f: _turned_back(f) and f["turn_back_share"] == 0.0,
+    "turn back given little weight": lambda f: (
+        _turned_back(f) and f["turn_back_share"] is not None and 0.0 < f["turn_back_share"] < LIKELY
+    ),
+    "changed its depth": lambda f: abs(f["climbed_m"]) > CLIMB_M,
     "remembered to the end": lambda f: _is_unseen(f) and f["belief_error_m"] is not None,
     "remembered clear of the own depth": lambda f: _is_unseen(f) and (f["believed_gap_m"] or 0.0) > CLEAR_M,
     "taken as static": lambda f: _within(f["taken_as_static_ago_s"], LATELY_S),
@@ -103,6 +134,8 @@ been learnt."""
 
 _IMPLIED = {
     ("unannounced_turn", "turned lately"),
+    ("turned_back", "turned lately"),
+    ("depth_change", "changed its depth"),
     ("needs_heave", "only heave escaped"),
     ("squeezed_by_static", "static near"),
     ("crowded", "second body near"),
@@ -146,8 +179,11 @@ def label_of(outcome: str, killer: Killer, facts: Fact) -> str:
     if outcome == "out_of_tank":
         return "out_of_tank"
     if killer.name in ("floor", "surface"):
-        return f"hit_{killer.name}"
+        towards = facts["depth_error_m"] * (1 if killer.name == "floor" else -1)
+        return "depth_misjudged" if towards > DEPTH_M else f"hit_{killer.name}"
     if not killer.moving:
+        if facts["place_error_m"] > PLACE_M:
+            return "lost_place"
         pushed = facts["evading_s"] > 0 or _within(facts["moving_near_m"], NEAR_M)
         return "pushed_into_static" if pushed else "hit_wall" if killer.name == "wall" else "hit_static"
     return _knowledge_label(facts) or _pilot_label(facts)
@@ -158,9 +194,12 @@ def _knowledge_label(facts: Fact) -> str | None:
     if facts["age_s"] < START_S:
         return "start_in_danger"
     if _is_unseen(facts):
-        return "unseen_above" if facts["vertical_gap_m"] > 0 else "unseen_below"
+        above = facts["vertical_gap_m"] > 0
+        if facts["climbed_m"] * (1 if above else -1) > CLIMB_M:
+            return "depth_change"
+        return "unseen_above" if above else "unseen_below"
     if _within(facts["turned_ago_s"], TURN_S) and not _within(facts["turn_error_m"], MISS_M):
-        return "unannounced_turn"
+        return "turned_back" if _turned_back(facts) else "unannounced_turn"
     if facts["forecast_error_m"] is None:
         return (
             "seen_late"
@@ -180,6 +219,8 @@ def _pilot_label(facts: Fact) -> str:
         return "late" if facts["evading_s"] < facts["last_chance_s"] else "wrong_evasion"
     if facts["escapes_by_heave"]:
         return "needs_heave"
+    if facts["escapes_beyond_edge"]:
+        return "depth_edge"
     if facts["static_near_m"] < REACH_M:
         return "squeezed_by_static"
     return "crowded" if _within(facts["second_body_m"], CROWD_M) else "fast_crossing"
@@ -196,6 +237,10 @@ def timeout_label(facts: Fact) -> str:
     if facts["evading_share"] > 0.5:
         return "kept_away"
     return "stuck" if facts["driven_m"] < STUCK_M else "circling"
+
+
+def _turned_back(facts: Fact) -> bool:
+    return _within(facts["turned_ago_s"], TURN_S) and facts["turned_deg"] > math.degrees(BACK_RAD)
 
 
 def _is_unseen(facts: Fact) -> bool:

@@ -13,6 +13,7 @@ N_HEADING = 16
 SPEEDS = (0.5, 1.0)
 """Shares of the fastest evasion in that direction."""
 STEP_S = 0.05
+_DEEP_M = 1e3
 AFTER_S = 0.5
 """An escape keeps clear up to this after the end."""
 
@@ -35,6 +36,13 @@ def escapes(history: History, bodies: Bodies, config: Config, lead_s: float) -> 
     clear = is_clear(pos, vel, R_wb[:, 0], *motion(history, history.t_s[start] + t), bodies, config)
     level = command[:, 2] == 0
     return int(clear[level].sum()), int(clear[~level].sum())
+
+
+def escapes_beyond_the_edge(history: History, bodies: Bodies, config: Config, lead_s: float) -> int:
+    """How many of them would keep clear with heave if the water went on beyond floor and surface."""
+    tank = config.world.tank.model_copy(update={"z_m": (-_DEEP_M, _DEEP_M)})
+    world = config.world.model_copy(update={"tank": tank})
+    return escapes(history, bodies, config.model_copy(update={"world": world}), lead_s)[1]
 
 
 def candidates(config: Config, yaw: float) -> Array:

@@ -19,7 +19,7 @@ from uuvtai.closed_form import KIND_NAMES
 from uuvtai.config import Config
 from uuvtai.kernels.core.geometry import BOX, NONE
 from uuvtai.measure.explain import hindsight
-from uuvtai.measure.explain.escape import escapes
+from uuvtai.measure.explain.escape import escapes, escapes_beyond_the_edge
 from uuvtai.measure.explain.history import Array, Bodies, CoarseHistory, History
 
 WINDOW_S = 4.0
@@ -32,11 +32,15 @@ SIGHT_S = (1.5, 0.5)
 seen but not tracked."""
 TURN_RAD = math.radians(30.0)
 """A corner: the body's course changes by more between two samples."""
+BACK_RAD = math.radians(120.0)
+"""A turn back: a corner with more than this."""
 BEFORE_TURN_S = 0.1
 """The forecast that a turn is judged by was made this long before it."""
 BELIEF_M = 0.5
 """A forecast or track belongs to a body when its present position is this close to the truth, in the
 plane."""
+CLIMB_S = 1.0
+"""Changes of the own depth are counted over this time before the end."""
 BEAM_M = 0.1
 """A beam met the body when its range agrees with the truth within this plus four sigma."""
 CROWD_S = 0.5
@@ -130,7 +134,11 @@ class Scene:
         others = moving & (np.arange(len(moving)) != (-1 if killer.slot is None else killer.slot))
         still = (self.bodies.kind != NONE) & ~moving
         ago = h.t_s[-1] - h.t_s
+        off = h.believed_pos_w[-1] - h.pos_w[-1]
         return {
+            "place_error_m": _round(np.hypot(off[0], off[1])),
+            "depth_error_m": _round(off[2]),
+            "climbed_m": _round(h.pos_w[-1, 2] - h.pos_w[int(np.abs(ago - CLIMB_S).argmin()), 2]),
             "age_s": _round(h.t_s[-1]),
             "leaf": h.leaf[-1],
             "leaf_s": _round(_lasting_s(ago, np.array([leaf == h.leaf[-1] for leaf in h.leaf]))),
@@ -203,7 +211,10 @@ def _belief_facts(history: History, slot: int, turned_ago_s: float | None, confi
         )
         return _round(np.linalg.norm(foreseen - truth[-1]))
 
+    before = int(np.abs(ago - (turned_ago_s or 0.0) - BEFORE_TURN_S).argmin())
+    weighs = turned_ago_s is not None and bool(config.forecast.turn_back_s) and bool(believed[before])
     return {
+        "turn_back_share": _round(history.turn_back_share[before, belief[before]]) if weighs else None,
         "believed_ago_s": _last_ago(ago, believed),
         "belief_error_m": _round(distance[-1]) if believed[-1] else None,
         "believed_gap_m": _believed_gap(history, slot, int(belief[-1])) if believed[-1] else None,
@@ -241,6 +252,7 @@ def _course_facts(history: History, bodies: Bodies, slot: int, config: Config) -
     ago = _last_ago(history.t_s[-1] - history.t_s[1:], corner)
     return {
         "turned_ago_s": ago,
+        "turned_deg": None if ago is None else _round(np.degrees(turn[corner][-1])),
         "turns_in_reach_before": None if ago is None else _turns_in_reach(history, bodies, slot, ago, config),
     }
 
@@ -285,7 +297,13 @@ def _escape_facts(history: History, bodies: Bodies, config: Config) -> dict[str,
     """Velocities that would have escaped from LEAD_S before the end, and when the last one was gone."""
     level, heaving = escapes(history, bodies, config, LEAD_S)
     chances = (back for back in CHANCES_S if any(escapes(history, bodies, config, back)))
-    return {"escapes": level, "escapes_by_heave": heaving, "last_chance_s": next(chances, None)}
+    beyond = 0 if level or heaving else escapes_beyond_the_edge(history, bodies, config, LEAD_S)
+    return {
+        "escapes": level,
+        "escapes_by_heave": heaving,
+        "escapes_beyond_edge": beyond,
+        "last_chance_s": next(chances, None),
+    }
 
 
 def timeout_facts(coarse: CoarseHistory) -> dict[str, Any]:

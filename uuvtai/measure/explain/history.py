@@ -52,6 +52,8 @@ class History:
     t_s: Array
     """(n,) since the start"""
     pos_w: Array
+    believed_pos_w: Array
+    """(n, 3) own position as the vehicle estimates it"""
     quat_wb: Array
     vel_b: Array
     rate_b: Array
@@ -75,6 +77,8 @@ class History:
     may be level with it"""
     forecast_below_w: Array
     """(n, n_track) z of the highest edge of what it may hold below"""
+    turn_back_share: Array
+    """(n, n_track) probability that the futures beside the forecast have in all"""
     conflict: Array
     """(n,) bool: the pilot foresees a conflict"""
     leaf: list[str]

@@ -27,10 +27,12 @@ are read together."""
 
 _WINDOW_FIELDS = {
     "vehicle": ("pos_w", "quat_wb", "vel_b", "rate_b"),
+    "ego": ("pos_w",),
     "world": ("pos_w", "vel_w"),
     "scan": ("ping_step", "range_m"),
     "tracks": ("alive", "moving", "state"),
     "forecast": ("pos_w", "radius_m", "above_w", "below_w"),
+    "futures": ("share",),
     "teacher": ("leaf", "conflict_s", "action", "clearance_m"),
 }
 _COARSE_FIELDS = {"vehicle": ("pos_w",), "mission": ("goal_w",), "route": ("n_way",), "teacher": ("leaf",)}
@@ -111,6 +113,7 @@ class FailureRecorder:
         return History(
             t_s=w["step"] * self._dt,
             pos_w=w["vehicle.pos_w"].astype(float),
+            believed_pos_w=w["ego.pos_w"].astype(float),
             quat_wb=w["vehicle.quat_wb"].astype(float),
             vel_b=w["vehicle.vel_b"].astype(float),
             rate_b=w["vehicle.rate_b"].astype(float),
@@ -124,6 +127,7 @@ class FailureRecorder:
             forecast_m=w["forecast.radius_m"][:, :, 0].astype(float),
             forecast_above_w=w["forecast.above_w"].astype(float),
             forecast_below_w=w["forecast.below_w"].astype(float),
+            turn_back_share=w["futures.share"].astype(float).sum(-1),
             conflict=w["teacher.conflict_s"] < _FORESEEN_S,
             leaf=self._leaves(w["teacher.leaf"]),
             action=w["teacher.action"].astype(float),

@@ -1,0 +1,22 @@
+"""Causes of failure that ``uuv eval --explain`` knows, from the code that finds them."""
+
+from __future__ import annotations
+
+from uuvtai.measure.explain.causes import CAUSES, REMARKS
+from uuvtai.tables.table import text_table
+
+
+def page() -> str:
+    """All causes with their meaning, in the order in which they are asked for; then the remarks."""
+    causes = [[f"`{label}`", meaning] for label, meaning in CAUSES.items()]
+    parts = [
+        "# Causes of failure",
+        "`uuv eval --explain` plays every failed episode again and gives it one cause, the first of these "
+        "that holds. *Killer* is what the referee stopped the episode for. Forecasts, and whether there was "
+        "a way out, are judged 1 s before the end.",
+        text_table(["cause", "meaning"], causes),
+        "Remarks say what may have contributed, where the killer moves; any number of them may hold: "
+        + ", ".join(REMARKS)
+        + ".",
+    ]
+    return "\n\n".join(parts) + "\n"
