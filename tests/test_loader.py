@@ -173,7 +173,7 @@ def test_paper_is_the_table_to_the_letter():
     )
     assert not any(
         c.forecast.model_dump()[switch]
-        for switch in ("use_turn_rate", "use_habits", "use_reflection", "use_coasting")
+        for switch in ("use_turn_rate", "use_habits", "use_reflection", "use_coasting", "use_turning_back")
     )
 
 

@@ -29,7 +29,7 @@ TANK = TankConfig()
 RULES = EpisodeConfig()
 CONFIG = TrackingConfig()
 ELEVATION = ElevationConfig(memory_s=0.0)
-FORECAST = ForecastConfig(use_coasting=False)
+FORECAST = ForecastConfig(use_coasting=False, use_turning_back=False)
 PAPER = SonarConfig(range_sigma_m=0.02, doppler_sigma_m_s=0.05)
 HARSH = SonarConfig(
     period_steps=5, latency_steps=2, range_sigma_m=0.10, range_sigma_slope=0.01, range_quantum_m=0.024,

@@ -75,6 +75,9 @@ PIECES = (
     Piece("depth", "depth as a free dimension", _LEVEL),
     Piece("diagonal", "diagonal cruise: at most 0.6 m/s", "teacher.cruise_m_s=0.6"),
     Piece("first_sight", "motion at first sight", "tracking.sight_doppler_m_s=100"),
+    Piece("turning_back", "bodies above or below may turn back", "forecast.use_turning_back=false"),
+    Piece("margins", "margins as before", "teacher.margin_m=0.25 teacher.margin_growth_m_s=0.1"),
+    Piece("quiet", "nothing; quiet water on", "quiet.weight_seen=20"),
     Piece("futures", "nothing; futures on", "forecast.turn_back_s=[0.4,0.8]"),
     Piece(
         "pose", "corrections of the position", "sensors.localization=dead_reckoning", cells=("pool_6_harsh",)

@@ -36,9 +36,9 @@ class TeacherConfig(Section):
     """hull centre to surface: between 0.17 abeam and 0.27 ahead"""
     contact_m: NonNegative = 0.1
     """clearance that the referee calls a collision"""
-    margin_m: NonNegative = 0.25
+    margin_m: NonNegative = 0.2125
     """wanted clearance beyond contact from a forecast body"""
-    margin_growth_m_s: NonNegative = 0.1
+    margin_growth_m_s: NonNegative = 0.085
     """the margin grows with prediction time"""
     closing_s: NonNegative = 0.25
     """effective clearance is reduced by this times the closing speed (the referee stops at 0.18 s)"""
