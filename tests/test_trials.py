@@ -126,6 +126,26 @@ def test_unseen_bodies_are_as_measured():
             assert float(error) == pytest.approx(measured["nees_mean"], abs=0.051)
 
 
+def test_margins_are_as_their_episodes_say():
+    document = json.loads((DOCS / "data/margin_trials.json").read_text())
+    kept = {(str(row["seed"]), row["pilot"], row["cell"]): row["outcomes"] for row in document["rows"]}
+    found = table("tuning.md", "## Smaller margins", "| seed | pilot |")
+    shown = 0
+    for seed, pilot, *cells in found:
+        for cell, text in zip(document["cells"], cells, strict=True):
+            own = kept.get((seed.strip(" |"), pilot, cell))
+            if own is None:
+                assert text.strip(" |") == "-"
+                continue
+            shown += 1
+            before = kept.get((seed.strip(" |"), "as it was", cell))
+            assert told(text.strip(" |")) == pytest.approx(rates(own), abs=0.051), (pilot, cell)
+            if before is not None and pilot != "as it was":
+                won, lost = paired(own, before)
+                assert text.strip(" |").endswith(f"(+{won} -{lost})"), (pilot, cell)
+    assert shown == len(kept)
+
+
 def test_local_planners_are_as_their_episodes_say():
     rows = json.loads((DOCS / "data/baselines_90001.json").read_text())["rows"]
     kept = {(row["method"], row["cell"]): row["outcomes"] for row in rows}
