@@ -57,9 +57,7 @@ ROWS = (
     Row("pool_6", "`pool` (6, 0.6)", f"--world pool {_MOVING}", f"{Row.methods} {_LOCAL}"),
     Row("pool_9_fast", "`pool` (9, 1.5)", f"--world pool {_FAST}", f"{Row.methods} {_LOCAL}"),
     Row("gauntlet_6", "`gauntlet` (6, 0.4)", "--world gauntlet -S 8 -D 6 -v 0.4"),
-    Row(
-        "gauntlet_9_fast", "`gauntlet` (9, 1.5)", f"--world gauntlet {_FAST}", f"{Row.methods} {_LOCAL}"
-    ),
+    Row("gauntlet_9_fast", "`gauntlet` (9, 1.5)", f"--world gauntlet {_FAST}", f"{Row.methods} {_LOCAL}"),
     Row("maze_0", "`maze` (0)", "--world maze -S 8 -D 0"),
     Row("maze_6", "`maze` (6, 0.6)", f"--world maze {_MOVING}"),
     Row("column_9_fast", "`column` (9, 1.5)", f"--world column {_FAST}"),

@@ -43,12 +43,23 @@ def measured(sources: Sources) -> str:
         else "was never used for tuning and looked at once, for these figures"
     )
     kept = f" {shown['note']}" if "note" in shown else ""
+    counts = sorted({m["episodes"] for entry in shown["rows"] for m in entry["methods"].values()})
+    older = f" {OLDER} = played by the pilot before." if any(map(_is_older, shown["rows"])) else ""
     return (
-        f"Measured here: {shown['episodes']} episodes of seed {shown['seed']} in each row, paper sensing, S "
-        f"= 8.\nThis seed {seen}. Success, collision and endings are\nthose of `bt`, in the last row of "
-        f"`paper`. `-` = not played or not kept.{kept}\n"
+        f"Measured here: {' or '.join(f'{count:,}' for count in counts)} episodes of seed {shown['seed']} in "
+        f"each row, paper sensing, S = 8.\nThis seed {seen}. Success, collision and endings are\nthose of "
+        f"`bt`, in the last row of `paper`. `-` = not played or not kept.{older}{kept}\n"
         "`python -m docs.writers.evaluations` plays all rows; commands and counts: `docs/data/`."
     )
+
+
+OLDER = "†"
+"""mark of a row that the pilot before played"""
+
+
+def _is_older(entry: dict[str, Any]) -> bool:
+    """Whether a row was played before there was a pilot that is held to the paper's speed."""
+    return "bt" in entry["methods"] and "capped" not in entry["methods"] and entry.get("shows") == "bt"
 
 
 def evaluations(sources: Sources) -> str:
@@ -77,7 +88,7 @@ def _evaluated(entry: dict[str, Any]) -> list[str]:
     ]
     capped = _both(methods["capped"], 1) if "capped" in methods else DASH
     return [
-        entry["title"],
+        f"{entry['title']} {OLDER}" if _is_older(entry) else entry["title"],
         share(own, "success"),
         rated(own, "collision"),
         ends,
