@@ -81,7 +81,7 @@ def measure(job: Job) -> list[Row]:
     horizon = ["--set", f"episode.horizon_steps={100 if job.quick else 400}"]
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        commit, tree = stack.enter_context(_checked_out(job.against or "HEAD", folder / "tree"))
+        commit, tree = stack.enter_context(checked_out(job.against or "HEAD", folder / "tree"))
         ours, theirs = _Side(ROOT, folder / "ours"), _Side(tree, folder / "theirs")
         rows = []
         for world, sensors in _WORLDS[: 1 if job.quick else None]:
@@ -99,7 +99,7 @@ def measure(job: Job) -> list[Row]:
 
 
 @contextlib.contextmanager
-def _checked_out(commit: str, place: Path) -> Iterator[tuple[str, Path]]:
+def checked_out(commit: str, place: Path) -> Iterator[tuple[str, Path]]:
     """(short name, folder) of a commit, in a work tree that is taken away again."""
     git = ["git", "-C", str(ROOT)]
     name = subprocess.run(

@@ -40,7 +40,7 @@ def measured(sources: Sources) -> str:
     seen = (
         "was looked at while tuning (figures of a seed that was not will replace these)"
         if shown["seed"] in RETIRED_SEEDS
-        else "was never used for tuning and looked at once, for these figures"
+        else "was never used for tuning and looked at once for each pilot"
     )
     kept = f" {shown['note']}" if "note" in shown else ""
     counts = sorted({m["episodes"] for entry in shown["rows"] for m in entry["methods"].values()})

@@ -16,12 +16,12 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from benchmarks.before import checked_out
 from docs.writers.evaluations import ONE_THREAD, commit_of_package
 from docs.writers.figure_sources import ROOT
 from uuvtai.run_folder import hardware, write_atomic
@@ -188,18 +188,6 @@ def missing(document: dict[str, Any], turns: list[Turn], episodes: int) -> list[
         if len(row["outcomes"]) >= episodes
     }
     return [turn for turn in turns if (turn.piece.name, turn.cell.name, turn.commit) not in done]
-
-
-@contextlib.contextmanager
-def checked_out(commit: str, place: Path) -> Iterator[tuple[str, Path]]:
-    """(full name, folder) of a commit, in a work tree that is taken away again."""
-    git = ["git", "-C", str(ROOT)]
-    name = subprocess.run([*git, "rev-parse", commit], check=True, stdout=subprocess.PIPE, text=True)
-    subprocess.run([*git, "worktree", "add", "--quiet", "--detach", str(place), commit], check=True)
-    try:
-        yield name.stdout.strip(), place
-    finally:
-        subprocess.run([*git, "worktree", "remove", "--force", str(place)], check=False)
 
 
 def play_all(turns: list[Turn], path: Path, document: dict[str, Any], episodes: int, jobs: int) -> list[str]:
