@@ -529,11 +529,25 @@ def test_a_run_folder_that_cannot_be_written_is_refused(tmp_path):
     assert "Traceback" not in done.stderr
 
 
+CHUNK = 0x06
+"""opcode of the MCAP record that holds messages"""
+
+
+def _opcodes(part: Path) -> set[int]:
+    """Opcodes of the records that lie whole in an unfinished log: after the magic, each is a byte, eight
+    bytes of length, content."""
+    data, at, found = part.read_bytes(), 8, set()
+    while at + 9 <= len(data):
+        end = at + 9 + int.from_bytes(data[at + 1 : at + 9], "little")
+        if end <= len(data):
+            found.add(data[at])
+        at = end
+    return found
+
+
 def _parts_with_messages(folder: Path) -> list[Path]:
-    """Unfinished logs that have been flushed once at least: header and attachments alone are smaller."""
-    return [
-        part for part in (folder / "logs").glob("*.part") if part.exists() and part.stat().st_size > 50_000
-    ]
+    """Unfinished logs that have been flushed once at least, however large header and attachments are."""
+    return [part for part in (folder / "logs").glob("*.part") if part.exists() and CHUNK in _opcodes(part)]
 
 
 def test_interrupt_leaves_a_marked_run_and_repairable_logs(evaluation, tmp_path, capfd):
