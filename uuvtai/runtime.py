@@ -6,8 +6,10 @@ import contextlib
 import os
 import sys
 from dataclasses import dataclass
+from typing import Any
 
 import taichi as ti
+from taichi.lang import impl
 
 from uuvtai.errors import DeviceError, SettingError
 from uuvtai.taichi_patches.cache import CACHE_BYTES, stale_locks
@@ -31,6 +33,10 @@ class Runtime:
 _started: list[Runtime] = []
 
 _MAX_THREADS = 1024
+
+LOOP_PARTS = 16
+"""threads that loops are cut for, however many there are: one code, and one entry in the kernel cache, for
+all"""
 
 
 def start_taichi(device: str = "cpu", precision: str = "f32", fast_math: bool = False) -> Runtime:
@@ -65,6 +71,9 @@ def start_taichi(device: str = "cpu", precision: str = "f32", fast_math: bool = 
             log_level=ti.WARN,
             **options,
         )
+    if wanted.device == "cpu":  # its pool has its threads by now, and takes no more than it has
+        program: Any = impl.get_runtime().prog
+        program.config().cpu_max_num_threads = LOOP_PARTS
     _started.append(wanted)
     return wanted
 
