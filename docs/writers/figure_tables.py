@@ -161,20 +161,22 @@ def switched_off(sources: Sources) -> str:
     cells = [cell for cell in CELLS if any(found == cell.name for _piece, found in played)]
     table = []
     for piece in (*PIECES, BEFORE):
-        shown = [_beside_all(played, piece.name, cell.name) for cell in cells]
+        shown = [_beside(played, piece.name, "all", cell.name) for cell in cells]
         if any(text != DASH for text in shown):
             table.append([piece.title, *(f"`{key}`" if key else "" for key in [piece.settings]), *shown])
+    capped = [_beside(played, "diagonal", BEFORE.name, cell.name) for cell in cells]
+    table.append(["at most 0.6 m/s, against the pilot before", "", *capped])
     return text_table(["off", "by", *(cell.title for cell in cells)], table)
 
 
-def _beside_all(played: dict[tuple[str, str], str], piece: str, cell: str) -> str:
-    """One place of the table; the episodes that both rows played are compared."""
+def _beside(played: dict[tuple[str, str], str], piece: str, other: str, cell: str) -> str:
+    """One place of the table; the episodes that both pilots played are compared."""
     if (piece, cell) not in played:
         return DASH
-    own, whole = played[piece, cell], played.get(("all", cell), "")
+    own, whole = played[piece, cell], played.get((other, cell), "")
     collided = sum(own.count(LETTERS[ending]) for ending in COLLIDED)
     rates = f"{100 * own.count('s') / len(own):.1f} / {100 * collided / len(own):.1f}"
-    if piece == "all" or not whole:
+    if piece == other or not whole:
         return rates
     pairs = list(zip(own, whole, strict=False))
     won, lost = (sum(a == "s" != b for a, b in pairs), sum(b == "s" != a for a, b in pairs))

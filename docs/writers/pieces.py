@@ -73,7 +73,12 @@ _LEVEL = "teacher.free_depth=false teacher.vertical_weight=1.5 teacher.edge_gap_
 PIECES = (
     Piece("all", "nothing", cells=tuple(cell.name for cell in CELLS)),
     Piece("depth", "depth as a free dimension", _LEVEL),
-    Piece("diagonal", "diagonal cruise: at most 0.6 m/s", "teacher.cruise_m_s=0.6"),
+    Piece(
+        "diagonal",
+        "diagonal cruise: at most 0.6 m/s",
+        "teacher.cruise_m_s=0.6",
+        cells=("pool_6", "pool_9_fast", "gauntlet_9_fast", "column_9_fast"),
+    ),
     Piece("first_sight", "motion at first sight", "tracking.sight_doppler_m_s=100"),
     Piece("turning_back", "bodies above or below may turn back", "forecast.use_turning_back=false"),
     Piece("margins", "margins as before", "teacher.margin_m=0.25 teacher.margin_growth_m_s=0.1"),
