@@ -11,8 +11,11 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
+from uuvtai.files import FileError, open_file, parsed_json
+
 _MAGIC = b"UUVNATIVE1\n"
 MOST_BYTES = 512 << 20
+_MOST_FILE_BYTES = 64 << 20
 _SUFFIX = ".kernel"
 
 
@@ -56,14 +59,15 @@ class Store:
         file."""
         path = self.folder / (key + _SUFFIX)
         try:
-            handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+            with open_file(path, _MOST_FILE_BYTES, self.folder) as file:
+                _refuse_foreign(path, os.fstat(file.fileno()), stat.S_ISREG)
+                content = file.read(_MOST_FILE_BYTES)
         except FileNotFoundError:
             return None
+        except FileError as error:
+            raise StoreError(str(error)) from error
         except OSError as error:
             raise StoreError(f"{path}: {error.strerror}") from error
-        with os.fdopen(handle, "rb") as file:
-            _refuse_foreign(path, os.fstat(handle), stat.S_ISREG)
-            content = file.read()
         with contextlib.suppress(OSError):
             os.utime(path)  # what is used stays longest
         return _unpacked(content, key)
@@ -123,5 +127,5 @@ def _unpacked(content: bytes, key: str) -> MachineCode | None:
     if hashlib.sha256(rest).hexdigest().encode() != digest:
         return None
     head, _, machine = rest.partition(b"\n")
-    known = json.loads(head)
+    known = parsed_json(head, key)
     return MachineCode(known["tasks"], machine) if known["key"] == key else None

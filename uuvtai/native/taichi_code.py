@@ -14,6 +14,7 @@ from typing import Any
 
 from taichi.lang import impl
 
+from uuvtai.files import read_text
 from uuvtai.native.machine import UnfitError
 
 _CLONE_FS = 0x200
@@ -47,7 +48,7 @@ class Compiler:
             work = self._thread.submit(program.compile_kernel, program.config(), capabilities, kernel)
             found = self._wait(work)
         files = sorted(self._folder.glob("*.ll"))
-        text = files[0].read_text() if len(files) == 1 else ""
+        text = read_text(files[0]) if len(files) == 1 else ""
         for file in files:
             file.unlink()
         if not text:
