@@ -409,11 +409,14 @@ def _config_of(kind: str, name: str) -> Any:
 
 
 @app.command(epilog="Example: uuv doctor --json")
-def doctor(as_json: opt.AsJson = False) -> None:
+def doctor(clean: opt.Clean = False, as_json: opt.AsJson = False) -> None:
     """Check that everything uuv needs is here and works."""
     from uuvtai.doctor import checks
+    from uuvtai.doctor import clean as delete_machine_code
     from uuvtai.show.health import show_checks
 
+    if clean:
+        typer.echo(f"deleted {delete_machine_code()} files of machine code", err=True)
     found = checks()
     is_ok = all(check["ok"] for check in found)
     _print({"ok": is_ok, "checks": found}, as_json, lambda: show_checks(Screen(), found))

@@ -76,6 +76,9 @@ WithReport = Annotated[bool, Option("--report", help="Also write the run's repor
 Wide = Annotated[
     bool, Option("--wide", help="Show every column of a table, though the terminal be narrower.")
 ]
+Clean = Annotated[
+    bool, Option("--clean", help="First delete the kernels' own machine code (docs/native.md).")
+]
 AsJson = Annotated[bool, Option("--json", help="Print one JSON document and nothing else on stdout.")]
 Seeds = Annotated[str, Option("--seeds", "--seed", help="Seeds, separated by commas.")]
 Batch = Annotated[

@@ -29,6 +29,7 @@ from uuvtai.kernels.task import episode, reward
 from uuvtai.kernels.teacher import evasion, leaves, threats
 from uuvtai.kernels.vehicle import actuation, dynamics
 from uuvtai.kernels.world import scenarios
+from uuvtai.native.making import adopt
 from uuvtai.rrt import RouteFallback
 from uuvtai.runtime import start_taichi
 from uuvtai.scenario import Scene, check_scenarios, set_scenes
@@ -66,6 +67,8 @@ class Sim:
         self.privileged = False
         self._memory = self.memory()
         self._put = self._memory.put
+        if config.runtime.native and self.device.type == "cpu":
+            adopt(vars(self.io).values(), self._memory)
         self.use_tree(tree)
         self.set_scenes()
         fill_constants(self.s, config, self._put)

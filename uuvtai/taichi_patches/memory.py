@@ -51,7 +51,7 @@ class Memory:
         """``address`` is that of the first element of the field ``anchor``, from which all others are
         found."""
         root = _path(anchor)[-1]
-        self.structs, self.device = structs, device
+        self.structs, self.device, self.tree = structs, device, root.get_snode_tree_id()
         self.address, self.n_bytes = address - _offset(anchor), root.cell_size_bytes
         self._looked_at: dict[int, tuple[Any, np.ndarray]] = {}
 
@@ -69,6 +69,14 @@ class Memory:
             for declared in dataclasses.fields(getattr(self.structs, struct.name))
             if scratch or not declared.metadata["scratch"]
         }
+
+    def arrays(self, struct: Any, scratch: bool = True) -> list[np.ndarray]:
+        """The arrays of one struct as they lie in memory. CPU only."""
+        return [
+            _view(getattr(struct, declared.name), declared.metadata["lanes"], self.read())
+            for declared in dataclasses.fields(struct)
+            if scratch or not declared.metadata["scratch"]
+        ]
 
     def _field(self, struct: str, name: str) -> Any:
         return getattr(getattr(self.structs, struct), name)

@@ -8,7 +8,7 @@ from uuvtai.kernels.core.kalman import largest_position_variance
 from uuvtai.kernels.core.signature import Bundle, spread
 from uuvtai.kernels.perception.bundles import ForecastIO
 from uuvtai.kernels.perception.habits import expected_turn_rate, forget_habits, learn_habit, next_event
-from uuvtai.taichi_patches.launch import quick_launch
+from uuvtai.native.launch import quick_launch
 
 MOST_LEGS = 6
 """Turns within one forecast; beyond them a body goes straight on."""

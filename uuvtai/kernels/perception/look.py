@@ -14,7 +14,7 @@ from uuvtai.kernels.core.signature import Bundle, spread
 from uuvtai.kernels.perception.bundles import LookIO
 from uuvtai.kernels.perception.elevation import COLUMN, heights, weigh_camera
 from uuvtai.kernels.perception.evidence import pinhole
-from uuvtai.taichi_patches.launch import quick_launch
+from uuvtai.native.launch import quick_launch
 
 _DEPTH_SLACK_M = 0.25
 """A pixel this close to the body's expected distance shows the body (track errors and the size's)."""

@@ -17,7 +17,7 @@ from uuvtai.kernels.core.geometry import quaternion_wb, rotation_wb, wrapped_ang
 from uuvtai.kernels.core.signature import Bundle, spread
 from uuvtai.kernels.perception.bundles import PoseIO
 from uuvtai.kernels.perception.wall_fix import seen_walls
-from uuvtai.taichi_patches.launch import quick_launch
+from uuvtai.native.launch import quick_launch
 
 _N = 7
 """Numbers of the horizontal filter."""

@@ -27,7 +27,7 @@ from uuvtai.kernels.perception.track_slots import (
 )
 from uuvtai.kernels.perception.track_update import update_tracks
 from uuvtai.kernels.perception.unseen import turn_back_rate, turned_back
-from uuvtai.taichi_patches.launch import quick_launch
+from uuvtai.native.launch import quick_launch
 
 
 @quick_launch

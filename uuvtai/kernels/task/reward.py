@@ -20,8 +20,8 @@ from uuvtai.kernels.core.signature import (
     spread,
 )
 from uuvtai.kernels.task.bundles import RewardIO
+from uuvtai.native.launch import quick_launch
 from uuvtai.outcomes import COLLISION, OUT_OF_TANK, SUCCESS, TIMEOUT
-from uuvtai.taichi_patches.launch import quick_launch
 
 _PENALTIES = ("path_distance", "cross_track", "clearance", "ttc", "overspeed", "failure", "tilt", "effort")
 """Terms that the equation subtracts."""

@@ -8,7 +8,7 @@ from uuvtai.kernels.core.lanes import LANES, f16x, put_column
 from uuvtai.kernels.core.signature import Bundle, spread
 from uuvtai.kernels.teacher.bundles import EvasionIO
 from uuvtai.kernels.teacher.trajectories import body_depths, depth_band, static_depths
-from uuvtai.taichi_patches.launch import quick_launch
+from uuvtai.native.launch import quick_launch
 
 
 @quick_launch

@@ -16,7 +16,7 @@ from uuvtai.kernels.world.bodies import first_moving, put_body
 from uuvtai.kernels.world.bundles import WorldIO
 from uuvtai.kernels.world.layout import draw_layout
 from uuvtai.kernels.world.paths import draw_moving_bodies, path_point, polyline_length
-from uuvtai.taichi_patches.launch import quick_launch
+from uuvtai.native.launch import quick_launch
 
 
 @quick_launch

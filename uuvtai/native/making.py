@@ -1,0 +1,133 @@
+"""Where a kernel's machine code comes from: the store, or Taichi, whose result it is compared with once."""
+
+from __future__ import annotations
+
+import atexit
+import os
+import sys
+import warnings
+import weakref
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import taichi as ti
+import torch
+
+from uuvtai.native.keys import KeyNameError, key_of
+from uuvtai.native.launch import Launch, NativeLaunch, TaichiLaunch, native, written
+from uuvtai.native.machine import Machine, UnfitError, tasks_in
+from uuvtai.native.store import MachineCode, Store, StoreError, default_folder
+from uuvtai.native.taichi_code import Compiler
+from uuvtai.taichi_patches.memory import Memory
+
+
+class Native:
+    """One per process."""
+
+    def __init__(self) -> None:
+        """Raises UnfitError or StoreError where nothing can be launched or kept here."""
+        if sys.platform != "linux":
+            raise UnfitError("own machine code is for Linux so far")
+        if tuple(ti.__version__) != (1, 7, 4):
+            raise UnfitError(f"Taichi {'.'.join(map(str, ti.__version__))} is not 1.7.4")
+        self.store = Store(default_folder())
+        self.machine = Machine(int(os.environ.get("UUV_NUM_THREADS") or os.cpu_count() or 1))
+        self.surroundings = [*self.machine.surroundings(), *map(str, ti.__version__)]
+        self.adopted: weakref.WeakKeyDictionary[Any, Memory] = weakref.WeakKeyDictionary()
+        self.compiler: Compiler | None = None
+        self.found, self.made, self.refused = 0, 0, 0
+
+    def adopt(self, bundles: Iterable[Any], memory: Memory) -> None:
+        """Launch kernels on these bundles, whose arrays are those of ``memory``. Raises UnfitError."""
+        self.machine.set_root(memory.tree, memory.address)
+        for bundle in bundles:
+            self.adopted[bundle] = memory
+
+    def first(self, kernel: Any, arguments: tuple) -> Launch | None:
+        """Launch with arguments that were not seen before; None where this is nothing for us."""
+        memory = self.adopted.get(arguments[0]) if arguments else None
+        if memory is None or not all(_is_plain(value) for value in arguments[1:]):
+            return None
+        try:
+            key = key_of(kernel, arguments, self.surroundings)
+            code = self.store.get(key)
+            if code is None:
+                return self._make(key, kernel, arguments, memory)
+            tasks = self.machine.tasks_of(code.machine, code.tasks)
+            launch = NativeLaunch(self.machine, tasks, kernel, arguments)
+        except (UnfitError, KeyNameError, StoreError) as error:
+            self._tell(kernel, error)
+            return None
+        launch.again()
+        self.found += 1
+        return launch
+
+    def _make(self, key: str, kernel: Any, arguments: tuple, memory: Memory) -> Launch:
+        """Compile, launch both codes, keep ours if it did what Taichi's did."""
+        if self.compiler is None:
+            self.compiler = Compiler()
+            atexit.register(self.compiler.close)
+            self.store.bound()
+        made = kernel.compiled_kernels[kernel.ensure_compiled(*arguments)]
+        compiled, text = self.compiler.compiled(made)
+        taichi = TaichiLaunch(kernel, arguments, (made, compiled))
+        code = MachineCode(tasks_in(text), self.machine.object_of(text))
+        tasks = self.machine.tasks_of(code.machine, code.tasks)
+        ours = NativeLaunch(self.machine, tasks, kernel, arguments)
+        if not _agree(taichi, ours, arguments, memory):
+            self._tell(kernel, UnfitError("its own machine code gives another result"))
+            return taichi
+        self.made += 1
+        try:
+            self.store.put(key, code)
+        except StoreError as error:
+            self._tell(kernel, error, "its machine code is not kept")
+        return ours
+
+    def _tell(self, kernel: Any, error: Exception, effect: str = "Taichi launches it") -> None:
+        """One line for the first kernel; the others are counted."""
+        self.refused += 1
+        if self.refused == 1:
+            warnings.warn(f"{kernel.func.__name__}: {error}; {effect}", RuntimeWarning, stacklevel=2)
+
+
+def adopt(bundles: Iterable[Any], memory: Memory) -> None:
+    """Launch kernels on these bundles by machine code of their own from now on, where this machine allows it;
+    one line says why where it does not."""
+    try:
+        if not native:
+            native.append(Native())
+        native[0].adopt(bundles, memory)
+    except (UnfitError, StoreError) as error:
+        warnings.warn(f"{error}; Taichi launches all kernels", RuntimeWarning, stacklevel=2)
+
+
+def _is_plain(value: Any) -> bool:
+    return isinstance(value, int | float) or (
+        isinstance(value, torch.Tensor) and value.device.type == "cpu" and value.is_contiguous()
+    )
+
+
+def _agree(taichi: Launch, ours: Launch, arguments: tuple, memory: Memory) -> bool:
+    """Launch Taichi's code, then ours from the same state: whether every byte that another kernel may read is
+    the same. What Taichi's code has done stands."""
+    arrays = [view for struct in written(arguments[0]) for view in memory.arrays(struct)]
+    kept = [view for struct in written(arguments[0]) for view in memory.arrays(struct, scratch=False)]
+    tensors = [value.numpy() for value in arguments[1:] if isinstance(value, torch.Tensor)]
+    arrays, kept = arrays + tensors, kept + tensors
+    before = [array.copy() for array in arrays]
+    taichi.again()
+    after = [array.copy() for array in arrays]
+    wanted = [array.tobytes() for array in kept]
+    _put(arrays, before)
+    ours.again()
+    is_same = all(array.tobytes() == bits for array, bits in zip(kept, wanted, strict=True))
+    if not is_same:
+        _put(arrays, after)
+    return is_same
+
+
+def _put(arrays: list[np.ndarray], values: list[np.ndarray]) -> None:
+    for array, value in zip(arrays, values, strict=True):
+        array[...] = value
