@@ -36,36 +36,39 @@ def digest_of_sources() -> str:
     return digest.hexdigest()
 
 
-def key_of(kernel: Any, arguments: tuple, surroundings: list) -> str:
+def key_of(kernel: Any, arguments: tuple, tree: int, surroundings: list) -> str:
     """64 hexadecimal digits that name the machine code of ``kernel`` for these arguments; ``surroundings``
     say which processor, compilers and runtime it is for. Raises KeyNameError."""
     function = kernel.func
     given = [
-        "" if declared.annotation in (int, float) else described(value)
+        "" if declared.annotation in (int, float) else described(value, tree)
         for declared, value in zip(kernel.arguments, arguments, strict=True)
     ]
     parts = [digest_of_sources(), surroundings, function.__module__, function.__qualname__, given]
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
 
-def described(value: Any) -> str:
-    """All of an argument that its kernel's code can depend on. Raises KeyNameError."""
+def described(value: Any, tree: int) -> str:
+    """All of an argument that its kernel's code can depend on; fields must belong to ``tree``. Raises
+    KeyNameError."""
     if isinstance(value, Section | bool | int | str | None):
         return f"{type(value).__name__} {value!r}"
     if isinstance(value, ti.Field):
-        return _place(value)
+        return _place(value, tree)
     if hasattr(value, "data_ptr"):
         return f"tensor {value.dtype} {value.ndim} {value.device.type} {value.is_contiguous()}"
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        members = [f"{m.name}: {described(getattr(value, m.name))}" for m in dataclasses.fields(value)]
+        members = [f"{m.name}: {described(getattr(value, m.name), tree)}" for m in dataclasses.fields(value)]
         return f"{type(value).__name__}({'; '.join(members)})"
     raise KeyNameError(type(value).__name__)
 
 
-def _place(field: ti.Field) -> str:
+def _place(field: ti.Field, tree: int) -> str:
     """Type, shape and place of a field: the sizes of the nodes from it up to the root of its tree."""
-    node, path, tree = field.vars[0].ptr.snode(), [], 0
+    node, path, found = field.vars[0].ptr.snode(), [], -1
     while node is not None:
         path.append((str(node.type), node.cell_size_bytes, node.offset_bytes_in_parent_cell))
-        tree, node = node.get_snode_tree_id(), node.parent
-    return f"{field.dtype} {field.shape} {len(field.vars)} {tree} {path}"
+        found, node = node.get_snode_tree_id(), node.parent
+    if found != tree:
+        raise KeyNameError(f"a field of tree {found} among those of tree {tree}")
+    return f"{field.dtype} {field.shape} {len(field.vars)} {path}"

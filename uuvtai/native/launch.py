@@ -53,9 +53,9 @@ class TaichiLaunch:
 class NativeLaunch:
     """A kernel's own machine code with one list of arguments, which are kept alive."""
 
-    def __init__(self, machine: Any, tasks: list[int], kernel: Any, arguments: tuple) -> None:
+    def __init__(self, machine: Any, runtime: Any, tasks: list[int], kernel: Any, arguments: tuple) -> None:
         self.program: Any = impl.get_runtime().prog
-        self._arguments = arguments
+        self._arguments, self._runtime = arguments, runtime
         self._tasks = (ctypes.c_void_p * len(tasks))(*tasks)
         self._packed, self._tensors = _packed(given(kernel, arguments))
         self._launch = functools.partial(
@@ -63,7 +63,7 @@ class NativeLaunch:
             ctypes.addressof(self._tasks),
             len(tasks),
             ctypes.addressof(self._packed),
-            machine.runtime,
+            ctypes.addressof(runtime),
         )
 
     def again(self) -> None:

@@ -18,7 +18,7 @@ RUNTIME_TYPE = (
 """begin of the type ``LLVMRuntime`` of Taichi 1.7: the offsets below belong to it"""
 _ROOTS, _POOL, _PARALLEL_FOR, _TEMPORARIES = 88, 8280, 8288, 32872
 _RUNTIME_BYTES, _TEMPORARY_BYTES = 1 << 16, 1 << 20
-MOST_TREES = 512
+_TREES = 512
 
 _LAUNCHER = """
 %job = type { i8*, void (i8*, i32, i32)*, i32, i32 }
@@ -134,25 +134,23 @@ class Machine:
         for name in ("GOMP_parallel", "omp_get_thread_num"):
             self.llvm.add_symbol(name, ctypes.cast(getattr(_openmp(), name), ctypes.c_void_p).value)
         self._pool = ctypes.c_int32(threads)
-        self._runtime = ctypes.create_string_buffer(_RUNTIME_BYTES)
         self._temporaries = ctypes.create_string_buffer(_TEMPORARY_BYTES)
         engine = self._engine(self.object_of(_LAUNCHER))
         launcher = engine.get_function_address("uuv_launch")
-        self._set(_POOL, ctypes.addressof(self._pool))
-        self._set(_PARALLEL_FOR, engine.get_function_address("uuv_parallel_for"))
-        self._set(_TEMPORARIES, ctypes.addressof(self._temporaries))
-        self.runtime = ctypes.addressof(self._runtime)
+        self._parallel_for = engine.get_function_address("uuv_parallel_for")
         address = ctypes.c_void_p
         self.launch = ctypes.CFUNCTYPE(None, address, ctypes.c_int32, address, address)(launcher)
 
-    def set_root(self, tree: int, address: int) -> None:
-        """Say where the arrays of a tree of fields begin. Raises UnfitError for one tree too many."""
-        if tree >= MOST_TREES:
-            raise UnfitError(f"{tree} trees of fields")
-        self._set(_ROOTS + 8 * tree, address)
-
-    def _set(self, offset: int, address: int) -> None:
-        ctypes.c_uint64.from_buffer(self._runtime, offset).value = address
+    def runtime(self, root: int) -> Any:
+        """What kernels take for Taichi's runtime: a buffer, to be kept while they may be launched. Every tree
+        of fields in it begins at the address ``root``: the same code serves whichever tree the arrays are."""
+        block = ctypes.create_string_buffer(_RUNTIME_BYTES)
+        for offset in range(_ROOTS, _ROOTS + 8 * _TREES, 8):
+            _set(block, offset, root)
+        _set(block, _POOL, ctypes.addressof(self._pool))
+        _set(block, _PARALLEL_FOR, self._parallel_for)
+        _set(block, _TEMPORARIES, ctypes.addressof(self._temporaries))
+        return block
 
     def object_of(self, text: str) -> bytes:
         """Machine code of a module of LLVM's text. Raises UnfitError where it is not understood."""
@@ -205,6 +203,10 @@ def tasks_in(text: str) -> list[str]:
     if [number for number, _ in found] != list(range(len(found))) or not found:
         raise UnfitError("a kernel's tasks cannot be told apart")
     return [name for _, name in found]
+
+
+def _set(block: Any, offset: int, address: int) -> None:
+    ctypes.c_uint64.from_buffer(block, offset).value = address
 
 
 @functools.cache

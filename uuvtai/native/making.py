@@ -34,28 +34,28 @@ class Native:
         self.store = Store(default_folder())
         self.machine = Machine(int(os.environ.get("UUV_NUM_THREADS") or os.cpu_count() or 1))
         self.surroundings = [*self.machine.surroundings(), *map(str, ti.__version__)]
-        self.adopted: weakref.WeakKeyDictionary[Any, Memory] = weakref.WeakKeyDictionary()
+        self.adopted: weakref.WeakKeyDictionary[Any, tuple[Memory, Any]] = weakref.WeakKeyDictionary()
         self.compiler: Compiler | None = None
         self.found, self.made, self.refused = 0, 0, 0
 
     def adopt(self, bundles: Iterable[Any], memory: Memory) -> None:
-        """Launch kernels on these bundles, whose arrays are those of ``memory``. Raises UnfitError."""
-        self.machine.set_root(memory.tree, memory.address)
+        """Launch kernels on these bundles, whose arrays are those of ``memory``."""
+        runtime = self.machine.runtime(memory.address)
         for bundle in bundles:
-            self.adopted[bundle] = memory
+            self.adopted[bundle] = memory, runtime
 
     def first(self, kernel: Any, arguments: tuple) -> Launch | None:
         """Launch with arguments that were not seen before; None where this is nothing for us."""
-        memory = self.adopted.get(arguments[0]) if arguments else None
+        memory, runtime = self.adopted.get(arguments[0], (None, None)) if arguments else (None, None)
         if memory is None or not all(_is_plain(value) for value in arguments[1:]):
             return None
         try:
-            key = key_of(kernel, arguments, self.surroundings)
+            key = key_of(kernel, arguments, memory.tree, self.surroundings)
             code = self.store.get(key)
             if code is None:
-                return self._make(key, kernel, arguments, memory)
+                return self._make(key, kernel, arguments, memory, runtime)
             tasks = self.machine.tasks_of(code.machine, code.tasks)
-            launch = NativeLaunch(self.machine, tasks, kernel, arguments)
+            launch = NativeLaunch(self.machine, runtime, tasks, kernel, arguments)
         except (UnfitError, KeyNameError, StoreError) as error:
             self._tell(kernel, error)
             return None
@@ -63,7 +63,7 @@ class Native:
         self.found += 1
         return launch
 
-    def _make(self, key: str, kernel: Any, arguments: tuple, memory: Memory) -> Launch:
+    def _make(self, key: str, kernel: Any, arguments: tuple, memory: Memory, runtime: Any) -> Launch:
         """Compile, launch both codes, keep ours if it did what Taichi's did."""
         if self.compiler is None:
             self.compiler = Compiler()
@@ -74,7 +74,7 @@ class Native:
         taichi = TaichiLaunch(kernel, arguments, (made, compiled))
         code = MachineCode(tasks_in(text), self.machine.object_of(text))
         tasks = self.machine.tasks_of(code.machine, code.tasks)
-        ours = NativeLaunch(self.machine, tasks, kernel, arguments)
+        ours = NativeLaunch(self.machine, runtime, tasks, kernel, arguments)
         if not _agree(taichi, ours, arguments, memory):
             self._tell(kernel, UnfitError("its own machine code gives another result"))
             return taichi
