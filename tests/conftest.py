@@ -77,11 +77,8 @@ class SmallSim:
     """A simulator whose kernels are compiled once for the session, and what tests do with it."""
 
     N = 8
-    CHANGES = {"world.dynamic_capacity": 9, "runtime.native": True}
-    OPTIONS = (
-        "--num-envs", "8", "--device", "cpu",
-        "--set", "world.dynamic_capacity=9", "--set", "runtime.native=true",
-    )  # fmt: skip
+    CHANGES = {"world.dynamic_capacity": 9}
+    OPTIONS = ("--num-envs", "8", "--set", "world.dynamic_capacity=9", "--device", "cpu")
     """of commands in processes of their own that are to find these kernels compiled (``tests/warm.py``
     compiles them beforehand)"""
     TRAIN = (

@@ -8,5 +8,5 @@ from uuvtai.config.section import Section
 class RuntimeConfig(Section):
     """How kernels are launched."""
 
-    native: bool = False
+    native: bool = True
     """by machine code of their own, kept on disk, instead of by Taichi (CPU, Linux): ``docs/native.md``"""

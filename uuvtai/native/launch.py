@@ -3,10 +3,11 @@ simulator has offered its bundles (``making.adopt``), else by Taichi's."""
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import taichi as ti
@@ -106,8 +107,34 @@ def quick_launch(launch: _T) -> _T:
     return again  # type: ignore[return-value]
 
 
+def without_cse(launch: _T) -> _T:
+    """Decorator between ``quick_launch`` and Taichi's: compile without Taichi's common subexpression elimination.
+
+    The time of that pass grows with the square of a kernel's length, most of what a long kernel takes to
+    compile. LLVM does most of the work again: for kernels that are long to compile and short to run.
+    """
+    launch._primal.without_cse = True  # type: ignore[attr-defined]
+    return launch
+
+
+@contextlib.contextmanager
+def _compiling(kernel: Any) -> Iterator[None]:
+    config = impl.get_runtime().prog.config()
+    before = config.opt_level
+    config.opt_level = 0 if getattr(kernel, "without_cse", False) else before
+    try:
+        yield
+    finally:
+        config.opt_level = before
+
+
 def _first(launch: Callable, kernel: Any, arguments: tuple) -> Launch | None:
     """Launch with arguments that were not seen before; how to do it again, None where Taichi has to look."""
+    with _compiling(kernel):
+        return _compiled(launch, kernel, arguments)
+
+
+def _compiled(launch: Callable, kernel: Any, arguments: tuple) -> Launch | None:
     if native and len(arguments) == len(kernel.arguments):
         found = native[0].first(kernel, arguments)
         if found is not None:

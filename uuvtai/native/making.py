@@ -71,11 +71,19 @@ class Native:
             self.store.bound()
         made = kernel.compiled_kernels[kernel.ensure_compiled(*arguments)]
         compiled, text = self.compiler.compiled(made)
+        names = tasks_in(text)
+        work = self.compiler.beside(self.machine.object_of, text)
         taichi = TaichiLaunch(kernel, arguments, (made, compiled))
-        code = MachineCode(tasks_in(text), self.machine.object_of(text))
-        tasks = self.machine.tasks_of(code.machine, code.tasks)
-        ours = NativeLaunch(self.machine, runtime, tasks, kernel, arguments)
-        if not _agree(taichi, ours, arguments, memory):
+        state = Written(arguments, memory)
+        taichi.again()
+        try:
+            code = MachineCode(names, work())
+            tasks = self.machine.tasks_of(code.machine, code.tasks)
+            ours = NativeLaunch(self.machine, runtime, tasks, kernel, arguments)
+        except UnfitError as error:
+            self._tell(kernel, error)
+            return taichi
+        if not state.is_same_after(ours):
             self._tell(kernel, UnfitError("its own machine code gives another result"))
             return taichi
         self.made += 1
@@ -109,23 +117,27 @@ def _is_plain(value: Any) -> bool:
     )
 
 
-def _agree(taichi: Launch, ours: Launch, arguments: tuple, memory: Memory) -> bool:
-    """Launch Taichi's code, then ours from the same state: whether every byte that another kernel may read is
-    the same. What Taichi's code has done stands."""
-    arrays = [view for struct in written(arguments[0]) for view in memory.arrays(struct)]
-    kept = [view for struct in written(arguments[0]) for view in memory.arrays(struct, scratch=False)]
-    tensors = [value.numpy() for value in arguments[1:] if isinstance(value, torch.Tensor)]
-    arrays, kept = arrays + tensors, kept + tensors
-    before = [array.copy() for array in arrays]
-    taichi.again()
-    after = [array.copy() for array in arrays]
-    wanted = [array.tobytes() for array in kept]
-    _put(arrays, before)
-    ours.again()
-    is_same = all(array.tobytes() == bits for array, bits in zip(kept, wanted, strict=True))
-    if not is_same:
-        _put(arrays, after)
-    return is_same
+class Written:
+    """Everything that a kernel writes, as it is before its first launch."""
+
+    def __init__(self, arguments: tuple, memory: Memory) -> None:
+        tensors = [value.numpy() for value in arguments[1:] if isinstance(value, torch.Tensor)]
+        structs = written(arguments[0])
+        self._all = [a for s in structs for a in memory.arrays(s)] + tensors
+        self._kept = [a for s in structs for a in memory.arrays(s, scratch=False)] + tensors
+        self._before = [array.copy() for array in self._all]
+
+    def is_same_after(self, ours: Launch) -> bool:
+        """When Taichi's code has run: whether ours, from the same state, gives every byte that another kernel
+        may read. What Taichi's code has done stands."""
+        after = [array.copy() for array in self._all]
+        wanted = [array.tobytes() for array in self._kept]
+        _put(self._all, self._before)
+        ours.again()
+        is_same = all(array.tobytes() == bits for array, bits in zip(self._kept, wanted, strict=True))
+        if not is_same:
+            _put(self._all, after)
+        return is_same
 
 
 def _put(arrays: list[np.ndarray], values: list[np.ndarray]) -> None:

@@ -7,7 +7,7 @@ import ctypes
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -54,6 +54,11 @@ class Compiler:
         if not text:
             raise UnfitError(f"Taichi wrote {len(files)} texts for a kernel")
         return found, text
+
+    def beside(self, function: Callable[[str], bytes], text: str) -> Callable[[], bytes]:
+        """Start this in the thread; what waits for its result."""
+        work = self._thread.submit(function, text)
+        return lambda: self._wait(work)
 
     @staticmethod
     def _wait(work: Future) -> Any:
