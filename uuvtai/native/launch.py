@@ -108,7 +108,7 @@ def quick_launch(launch: _T) -> _T:
 
 
 def without_cse(launch: _T) -> _T:
-    """Decorator between ``quick_launch`` and Taichi's: compile without Taichi's common subexpression elimination.
+    """Decorator between ``quick_launch`` and Taichi's: compile without common subexpression elimination.
 
     The time of that pass grows with the square of a kernel's length, most of what a long kernel takes to
     compile. LLVM does most of the work again: for kernels that are long to compile and short to run.
@@ -119,8 +119,8 @@ def without_cse(launch: _T) -> _T:
 
 @contextlib.contextmanager
 def _compiling(kernel: Any) -> Iterator[None]:
-    config = impl.get_runtime().prog.config()
-    before = config.opt_level
+    program: Any = impl.get_runtime().prog
+    config, before = program.config(), program.config().opt_level
     config.opt_level = 0 if getattr(kernel, "without_cse", False) else before
     try:
         yield
