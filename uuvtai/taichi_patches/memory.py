@@ -92,8 +92,8 @@ class Memory:
         if self.device.type != "cpu":
             self._on_device().copy_(torch.from_numpy(content))
 
-    def rows(self, field: Any, rows: list[int] | None = None) -> np.ndarray:
-        """Copy of these rows of a field (None = all), shape (len(rows), ...), vectors with a last axis. CPU
+    def rows(self, field: Any, rows: list[int] | slice) -> np.ndarray:
+        """Copy of these rows of a field, shape (len(rows), ...), vectors with a last axis. CPU
         only, where a kernel is done when its launch returns.
 
         Nothing is compiled and nothing launched, so that a step can be looked at as often as one likes.
@@ -101,7 +101,7 @@ class Memory:
         known = self._looked_at.get(id(field))
         if known is None:  # the field is kept with its view, for an identity may be given again
             known = self._looked_at[id(field)] = field, _view(field, False, self.read())
-        return known[1].copy() if rows is None else known[1][np.asarray(rows, np.intp)]
+        return known[1][rows].copy() if isinstance(rows, slice) else known[1][np.asarray(rows, np.intp)]
 
     def put(self, field: Any, values: np.ndarray) -> None:
         """Fill a field that is not in lanes; ``values`` has its shape (vectors add a last axis) and dtype."""

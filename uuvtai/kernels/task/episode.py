@@ -22,7 +22,7 @@ def begin_episodes(
     number: IntVector,
 ):
     """Give the rows of ``mask`` a new episode and wake only them."""
-    for env in range(ti.static(io.clock.awake.shape[0])):
+    for env in range(mask.shape[0]):
         io.clock.awake[env] = mask[env]
         if mask[env] == 1:
             io.clock.active[env] = 1
