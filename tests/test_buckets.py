@@ -17,7 +17,7 @@ STEPS = 12
 
 def played(n_env, seed, **world):
     """Positions after some steps of ``n_env`` episodes of a world; rows beyond them must stay asleep."""
-    overrides = {f"world.{key}": value for key, value in world.items()}
+    overrides = {"world.dynamic_capacity": 9} | {f"world.{key}": value for key, value in world.items()}
     sim = Sim(load_config("pool", "paper", overrides=overrides), n_env, read_tree("bt"))
     observation, action = sim.observe(), sim.action
     assert observation.shape[0] == action.shape[0] == sim.reward.shape[0] == n_env
@@ -45,11 +45,11 @@ def test_kernels_do_not_see_how_many_obstacles_a_scene_has():
         load_config("pool", "paper", overrides={
             "world.n_static": s, "world.n_dynamic": d, "world.dynamic_speed_m_s": v,
         }).world.compiled()
-        for s, d, v in ((0, 0, 0.0), (1, 8, 0.6), (8, 6, 1.5), (3, 0, 3.0))
+        for s, d, v in ((0, 0, 0.0), (1, 8, 0.6), (12, 15, 1.5), (3, 0, 3.0))
     }  # fmt: skip
-    assert len(seen) == 1 and seen.pop().dynamic_slots == 8
-    more = load_config("pool", "paper", overrides={"world.n_dynamic": 9}).world
-    assert (more.static_slots, more.dynamic_slots) == (8, 16)
+    assert len(seen) == 1 and seen.pop().dynamic_slots == 16
+    more = load_config("pool", "paper", overrides={"world.n_dynamic": 17}).world
+    assert (more.static_slots, more.dynamic_slots) == (16, 32)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="own machine code is for Linux")

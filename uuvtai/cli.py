@@ -435,7 +435,7 @@ def warm(
     as_json: opt.AsJson = False,
 ) -> None:
     """Compile beforehand what later commands need, so that they start at once (docs/native.md)."""
-    from uuvtai.show.warming import show_shapes
+    from uuvtai.show.health import show_shapes
     from uuvtai.sizes import check_size
     from uuvtai.warming import Shape
     from uuvtai.warming import warm as run

@@ -212,9 +212,7 @@ SweepResume = Annotated[Path | None, _resume("Run folder of a sweep to go on wit
 
 BatchSizes = Annotated[str, Option("--num-envs", help="Batch sizes, separated by commas.")]
 WarmSensors = Annotated[str, Option("--sensors", help=f"Sensor presets, separated by commas: {_SENSORS}.")]
-WarmWorkers = Annotated[
-    int, Option("--workers", help="Sizes side by side \\[default: one per core].")
-]
+WarmWorkers = Annotated[int, Option("--workers", help="Sizes side by side \\[default: one per core].")]
 TickedTree = Annotated[str, _tree("Tree that is ticked")]
 ProfilePreset = Annotated[
     str,

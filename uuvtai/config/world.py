@@ -134,8 +134,8 @@ class FixedObstacle(Section):
 
 
 def _roomy(count: int) -> int:
-    """The next multiple of 8, at least 8."""
-    return 8 * max(1, -(-count // 8))
+    """The next multiple of 16, at least 16: an empty slot costs next to nothing, another size compiles."""
+    return 16 * max(1, -(-count // 16))
 
 
 class WorldConfig(Section, Truth):
@@ -155,7 +155,7 @@ class WorldConfig(Section, Truth):
     """v"""
     static_capacity: Count | None = None
     """slots kept for static obstacles, so that S can vary without recompilation; default n_static, rounded up
-    to a multiple of 8"""
+    to a multiple of 16"""
     dynamic_capacity: Count | None = None
     static: StaticObstacles = StaticObstacles()
     dynamic: DynamicObstacles = DynamicObstacles()
