@@ -77,6 +77,7 @@ class SmallSim:
     """A simulator whose kernels are compiled once for the session, and what tests do with it."""
 
     N = 8
+    CHANGES = {"world.dynamic_capacity": 9}
     OPTIONS = ("--num-envs", "8", "--set", "world.dynamic_capacity=9", "--device", "cpu")
     """of commands in processes of their own that are to find these kernels compiled (``tests/warm.py``
     compiles them beforehand)"""
@@ -97,7 +98,7 @@ class SmallSim:
         from uuvtai.sim import Sim
         from uuvtai.tree import read_tree
 
-        self.config = load_config("pool", "paper", overrides={"world.dynamic_capacity": 9})
+        self.config = load_config("pool", "paper", overrides=self.CHANGES)
         self.trees = {name: read_tree(name) for name in ("straight", "planner", "bt")}
         self.sim = Sim(self.config, self.N, self.trees["bt"])
 

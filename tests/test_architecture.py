@@ -21,7 +21,7 @@ PACKAGE = ROOT / "uuvtai"
 
 KNOWS = {"world", "vehicle", "sensors", "task", "privileged"}
 """Rooms that may see the truth; the others are the stack."""
-BELOW = ("state", "config", "kernels", "taichi_patches", "tree_codes", "plan_codes", "outcomes")
+BELOW = ("state", "config", "kernels", "native", "taichi_patches", "tree_codes", "plan_codes", "outcomes")
 """What kernels may import of the package."""
 STACK = {"core", "perception", "planning", "teacher", "baselines"}
 TRUTH = {
@@ -128,6 +128,7 @@ def test_kernels_import_taichi_and_the_floor_only(path):
             "state",
             "config",
             "kernels",
+            "native",
             "taichi_patches",
             "tree_codes",
             "plan_codes",

@@ -28,6 +28,8 @@ EXTREMES = (
     10**400,
     "",
     [],
+    True,
+    False,
 )
 TREE = load_training("curriculum").model_dump(mode="json")
 
@@ -51,7 +53,7 @@ def candidates(value):
     """Extremes for a value, and in every place of one that is a list of numbers."""
     yield from EXTREMES
     if isinstance(value, list) and value and all(isinstance(item, (int, float)) for item in value):
-        numbers = [x for x in EXTREMES if not isinstance(x, (str, list))]
+        numbers = [x for x in EXTREMES if not isinstance(x, (str, list, bool))]
         yield from ([x] * len(value) for x in numbers)
         yield from ([*value[:i], x, *value[i + 1 :]] for i in range(len(value)) for x in numbers)
 

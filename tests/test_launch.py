@@ -6,8 +6,8 @@ import taichi as ti
 import torch
 
 from uuvtai.kernels.core.signature import Const, In
+from uuvtai.native.launch import quick_launch
 from uuvtai.runtime import start_taichi
-from uuvtai.taichi_patches.launch import quick_launch
 
 N = 4
 

@@ -143,7 +143,7 @@ def test_what_describes_the_run_comes_before_data_and_loads(recordings, logs, tm
         text = yaml.safe_dump(log.config)
         (tmp_path / "config.yaml").write_text(text)
         sensors = "clean" if path in recordings["clean"] else "paper"
-        overrides = {"world.dynamic_capacity": 9, "episode.horizon_steps": HORIZON}
+        overrides = {**SmallSim.CHANGES, "episode.horizon_steps": HORIZON}
         assert load_resolved(tmp_path / "config.yaml") == load_config("pool", sensors, overrides=overrides)
         assert log.metadata["uuv.run"]["config_sha256"] == hashlib.sha256(log.config_text).hexdigest()
 

@@ -57,6 +57,7 @@ def test_a_stack_touches_nothing_that_makes_an_episode():
         "features",
         "reward",
         "episode",
+        "runtime",
     } == same
     assert all(getattr(other, name) == getattr(config, name) for name in same)
     assert any(getattr(other, name) != getattr(config, name) for name in STACK_SECTIONS)

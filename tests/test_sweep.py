@@ -142,7 +142,7 @@ def test_one_simulator_serves_every_scene():
         asked(grid_of(["paper"]), episodes=64), [("bt", "bt", None), ("straight", "straight", None)], set()
     )
     assert len({task.config.model_dump_json() for task in tasks}) == 1
-    assert (tasks[0].config.world.static_slots, tasks[0].config.world.dynamic_slots) == (12, 15)
+    assert (tasks[0].config.world.static_slots, tasks[0].config.world.dynamic_slots) == (16, 16)
     assert all(64 * len(task.scenes) <= 1024 for task in tasks)
     labels = [label for task in tasks for label in task.labels]
     assert len(labels) == 2 * 75
@@ -429,5 +429,5 @@ def test_bad_input_is_one_message_and_no_folder(arguments, said, tmp_path):
 
 
 def test_base_config_has_room_for_the_largest_cell():
-    config = base_config(asked(grid_of(["S=4,12", "D=3"]), overrides=("world.n_dynamic=9",)))
-    assert (config.world.static_slots, config.world.dynamic_slots) == (12, 9)
+    config = base_config(asked(grid_of(["S=4,18", "D=3"]), overrides=("world.n_dynamic=9",)))
+    assert (config.world.static_slots, config.world.dynamic_slots) == (18, 16)

@@ -418,7 +418,7 @@ import sys, numpy as np
 from uuvtai.runtime import start_taichi
 start_taichi("cpu")
 from tests.test_world import Drawn, PURE, world_config
-drawn = Drawn(world_config("pool"), n_env=7).draw(numbers=[6, 5, 4, 3, 2, 1, 0])
+drawn = Drawn(world_config("pool", static_capacity=8, dynamic_capacity=6), n_env=7).draw(numbers=[6, 5, 4, 3, 2, 1, 0])
 n_slot = 8
 np.savez(sys.argv[1], **{name: drawn[name][::-1] for name in PURE})
 """
@@ -450,6 +450,8 @@ def test_explicit_obstacles_stand_and_move_as_written():
         {
             "n_static": 0,
             "n_dynamic": 0,
+            "static_capacity": 0,
+            "dynamic_capacity": 0,
             "fixed": [
                 {"kind": "box", "x_m": 10, "y_m": 3, "half_extents_m": [0.1, 3.0]},
                 {
@@ -508,7 +510,7 @@ def test_a_world_that_cannot_be_placed_is_told():
 
 
 @pytest.mark.parametrize(
-    "scene", [(9, 0, 0.6), (0, 7, 0.6), (-1, 0, 0.6), (0, 0, float("nan")), (0, 0, -1.0)]
+    "scene", [(17, 0, 0.6), (0, 17, 0.6), (-1, 0, 0.6), (0, 0, float("nan")), (0, 0, -1.0)]
 )
 def test_scenes_that_do_not_fit_are_refused(scene):
     of = drawn_world("gauntlet")[0]

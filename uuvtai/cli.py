@@ -409,16 +409,47 @@ def _config_of(kind: str, name: str) -> Any:
 
 
 @app.command(epilog="Example: uuv doctor --json")
-def doctor(as_json: opt.AsJson = False) -> None:
+def doctor(clean: opt.Clean = False, as_json: opt.AsJson = False) -> None:
     """Check that everything uuv needs is here and works."""
     from uuvtai.doctor import checks
+    from uuvtai.doctor import clean as delete_machine_code
     from uuvtai.show.health import show_checks
 
+    if clean:
+        typer.echo(f"deleted {delete_machine_code()} files of machine code", err=True)
     found = checks()
     is_ok = all(check["ok"] for check in found)
     _print({"ok": is_ok, "checks": found}, as_json, lambda: show_checks(Screen(), found))
     if not is_ok:
         raise typer.Exit(FAILED)
+
+
+@app.command(epilog="Example: uuv warm --sensors nominal,paper --num-envs 16,256")
+def warm(
+    num_envs: opt.BatchSizes = "1,16,256",
+    world: opt.World = "pool",
+    sensors: opt.WarmSensors = "nominal,paper",
+    overrides: opt.Set = None,
+    workers: opt.WarmWorkers = 0,
+    wide: opt.Wide = False,
+    as_json: opt.AsJson = False,
+) -> None:
+    """Compile beforehand what later commands need, so that they start at once (docs/native.md)."""
+    from uuvtai.show.health import show_shapes
+    from uuvtai.sizes import check_size
+    from uuvtai.warming import Shape
+    from uuvtai.warming import warm as run
+
+    sizes = [arguments.integer("--num-envs", text) for text in num_envs.split(",")]
+    if workers < 0:
+        raise UsageError(f"--workers {workers}: must be 1 or more, for example --workers 2")
+    scenes = [SceneOptions(world, name, overrides=overrides) for name in sensors.split(",")]
+    shapes = [Shape(scene, size) for scene in scenes for size in sizes]
+    for shape in shapes:
+        check_size(shape.scene.config(), shape.num_envs, "cpu")
+    say(f"compiling {len(shapes)} sizes; the first time this takes about a minute each")
+    found = run(shapes, workers or None)
+    _print({"shapes": found}, as_json, lambda: show_shapes(Screen(wide), found))
 
 
 @app.command(epilog="Example: uuv tree --controller planner --dot")

@@ -24,6 +24,7 @@ def checks() -> list[dict[str, Any]]:
         "mcap": _mcap,
         "cuda": _cuda,
         "kernel cache": _cache,
+        "machine code": _native,
         "memory": _memory,
         "run folder": _runs,
     }
@@ -123,6 +124,23 @@ def _cache() -> str:
         )
     size = sum(f.stat().st_size for f in path.rglob("*") if f.is_file()) if path.exists() else 0
     return f"{path}, {size / 2**20:.1f} MB (empty = the next run compiles for about a minute)"
+
+
+def _native() -> str:
+    from uuvtai.native.machine import Machine
+    from uuvtai.native.store import Store, default_folder
+
+    store = Store(default_folder())
+    Machine(1)
+    size = sum(file.stat().st_size for file in store.folder.iterdir())
+    return f"{store.folder}, {size / 2**20:.1f} MB; used with --set runtime.native=true"
+
+
+def clean() -> int:
+    """Delete the kernels' own machine code; how many files."""
+    from uuvtai.native.store import Store, default_folder
+
+    return Store(default_folder()).clear()
 
 
 def _memory() -> str:

@@ -76,6 +76,9 @@ WithReport = Annotated[bool, Option("--report", help="Also write the run's repor
 Wide = Annotated[
     bool, Option("--wide", help="Show every column of a table, though the terminal be narrower.")
 ]
+Clean = Annotated[
+    bool, Option("--clean", help="First delete the kernels' own machine code (docs/native.md).")
+]
 AsJson = Annotated[bool, Option("--json", help="Print one JSON document and nothing else on stdout.")]
 Seeds = Annotated[str, Option("--seeds", "--seed", help="Seeds, separated by commas.")]
 Batch = Annotated[
@@ -208,6 +211,8 @@ SweepResume = Annotated[Path | None, _resume("Run folder of a sweep to go on wit
 # ----------------------------------------------------------------------------------------- profile, reproduce
 
 BatchSizes = Annotated[str, Option("--num-envs", help="Batch sizes, separated by commas.")]
+WarmSensors = Annotated[str, Option("--sensors", help=f"Sensor presets, separated by commas: {_SENSORS}.")]
+WarmWorkers = Annotated[int, Option("--workers", help="Sizes side by side \\[default: one per core].")]
 TickedTree = Annotated[str, _tree("Tree that is ticked")]
 ProfilePreset = Annotated[
     str,

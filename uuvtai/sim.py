@@ -29,6 +29,7 @@ from uuvtai.kernels.task import episode, reward
 from uuvtai.kernels.teacher import evasion, leaves, threats
 from uuvtai.kernels.vehicle import actuation, dynamics
 from uuvtai.kernels.world import scenarios
+from uuvtai.native.making import adopt
 from uuvtai.rrt import RouteFallback
 from uuvtai.runtime import start_taichi
 from uuvtai.scenario import Scene, check_scenarios, set_scenes
@@ -54,7 +55,7 @@ class Sim:
         self.device = torch.device(runtime.device)
         check_size(config, num_envs, runtime.device)
         self.s = allocate_state(array_sizes(config, num_envs, runtime.device))
-        self.io = bind_all(Stages, self.s, config)
+        self.io = bind_all(Stages, self.s, config.model_copy(update={"world": config.world.compiled()}))
         self.action = torch.zeros(num_envs, 4, device=self.device)
         self.reward = torch.zeros(num_envs, device=self.device)
         self.terminated = torch.zeros(num_envs, dtype=torch.int32, device=self.device)
@@ -66,6 +67,8 @@ class Sim:
         self.privileged = False
         self._memory = self.memory()
         self._put = self._memory.put
+        if config.runtime.native and self.device.type == "cpu":
+            adopt(vars(self.io).values(), self._memory)
         self.use_tree(tree)
         self.set_scenes()
         fill_constants(self.s, config, self._put)
@@ -243,7 +246,7 @@ class Sim:
     def rows(self, field: ti.Field, envs: list[int] | None = None) -> np.ndarray:
         """Host copy of these rows of a field alone, shape (len(envs), ...); None = all envs."""
         if self.device.type == "cpu":
-            return self._memory.rows(field, envs)
+            return self._memory.rows(field, slice(self.num_envs) if envs is None else envs)
         rows = self._every_row if envs is None else torch.tensor(envs, dtype=torch.int32, device=self.device)
         return copied_rows(field, rows)
 

@@ -22,6 +22,8 @@ from uuvtai.scenario import scenario_sizes
 from uuvtai.stages import SimState
 
 _MAX_ENVS = 1 << 20
+_ROWS = (1, 16, 64, 256, 1024)
+"""sizes of a batch that are allocated; beyond them powers of two"""
 _PLAN_SLOTS = 64
 """Plans under way at once: far more than a CPU has cores, and the planner's scratch stays small."""
 _MAP_SLOTS = 64
@@ -29,9 +31,15 @@ _MAP_SLOTS = 64
 every env has its own."""
 
 
+def rows_for(n_env: int) -> int:
+    """Rows that are allocated for so many envs: one of few sizes, for each is compiled for itself. Rows
+    beyond ``n_env`` sleep for ever."""
+    return next((rows for rows in _ROWS if n_env <= rows), 1 << (n_env - 1).bit_length())
+
+
 def array_sizes(config: Config, n_env: int, device: str = "cpu") -> dict[str, int]:
-    """Length of every named axis in ``state``."""
-    tank, sensors = config.world.tank, config.sensors
+    """Length of every named axis in ``state``; that of ``n_env`` is what is allocated."""
+    tank, sensors, n_env = config.world.tank, config.sensors, rows_for(n_env)
     n_row, n_col = grid_shape(tank, config.mapping.cell_m)
     n_block_row, n_block_col = block_shape((n_row, n_col), config.quiet)
     return {

@@ -21,7 +21,8 @@ SEE = {
     "report": ("quickstart",),
     "export": ("deployment",),
     "presets": ("reference/configuration",),
-    "doctor": ("quickstart",),
+    "doctor": ("quickstart", "native"),
+    "warm": ("native",),
     "tree": ("simulator",),
     "log": ("viewers", "reference/topics", "security"),
 }

@@ -13,6 +13,7 @@ from uuvtai.config.baselines import (
     PotentialFieldConfig,
     VelocityObstacleConfig,
 )
+from uuvtai.config.execution import RuntimeConfig
 from uuvtai.config.perception import (
     ElevationConfig,
     ForecastConfig,
@@ -69,6 +70,7 @@ class Config(Section):
     baselines: BaselinesConfig = BaselinesConfig()
     reward: RewardConfig = RewardConfig()
     episode: EpisodeConfig = EpisodeConfig()
+    runtime: RuntimeConfig = RuntimeConfig()
 
 
 __all__ = [
@@ -95,6 +97,7 @@ __all__ = [
     "QuietConfig",
     "RewardConfig",
     "RouteConfig",
+    "RuntimeConfig",
     "Section",
     "SensorsConfig",
     "SonarConfig",

@@ -133,6 +133,11 @@ class FixedObstacle(Section):
         return self
 
 
+def _roomy(count: int) -> int:
+    """The next multiple of 16, at least 16: an empty slot costs next to nothing, another size compiles."""
+    return 16 * max(1, -(-count // 16))
+
+
 class WorldConfig(Section, Truth):
     """Tank, spawn ranges and obstacles: with (seed, episode) it defines a scenario completely."""
 
@@ -149,7 +154,8 @@ class WorldConfig(Section, Truth):
     dynamic_speed_m_s: NonNegative = 0.6
     """v"""
     static_capacity: Count | None = None
-    """slots kept for static obstacles, so that S can vary without recompilation; default n_static"""
+    """slots kept for static obstacles, so that S can vary without recompilation; default n_static, rounded up
+    to a multiple of 16"""
     dynamic_capacity: Count | None = None
     static: StaticObstacles = StaticObstacles()
     dynamic: DynamicObstacles = DynamicObstacles()
@@ -172,12 +178,22 @@ class WorldConfig(Section, Truth):
     @property
     def static_slots(self) -> int:
         """Slots kept for random static obstacles."""
-        return self.n_static if self.static_capacity is None else self.static_capacity
+        return _roomy(self.n_static) if self.static_capacity is None else self.static_capacity
 
     @property
     def dynamic_slots(self) -> int:
         """Slots kept for random moving obstacles."""
-        return self.n_dynamic if self.dynamic_capacity is None else self.dynamic_capacity
+        return _roomy(self.n_dynamic) if self.dynamic_capacity is None else self.dynamic_capacity
+
+    def compiled(self) -> WorldConfig:
+        """What kernels are compiled for: slots instead of S, D and v, which each env's scene has."""
+        static, dynamic = self.static_slots, self.dynamic_slots
+        return self.model_copy(
+            update={
+                "n_static": static, "static_capacity": static,
+                "n_dynamic": dynamic, "dynamic_capacity": dynamic, "dynamic_speed_m_s": 0.0,
+            }
+        )  # fmt: skip
 
     @property
     def n_fixed_static(self) -> int:

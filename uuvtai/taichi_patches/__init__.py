@@ -1,8 +1,9 @@
 """What works around Taichi 1.7.4: all that replaces its parts or stands on names that it does not publish.
 
 A Taichi without one of the names in ``front_end`` is left as it is there; the other files fail loudly. Try a
-new version of Taichi with ``tests/test_front_end.py``, ``test_launch.py`` and ``test_capture.py`` first. No
-committed results file measures the gain of a part alone, so no figure stands here.
+new version of Taichi with ``tests/test_front_end.py``, ``test_launch.py``, ``test_native.py`` and
+``test_capture.py`` first. No committed results file measures the gain of a part alone, so no figure stands
+here.
 
 ``front_end`` (replaced in ``taichi.lang`` when ``uuvtai.kernels`` is imported)
     ``ASTTransformerContext.get_pos_info``: words a position, source and all, for every node of every inlined
@@ -16,12 +17,6 @@ committed results file measures the gain of a part alone, so no figure stands he
     ``Kernel.materialize``: counts the kernels made, so that a stopwatch leaves their time out, and keeps
     debuggers and coverage out of Taichi's own code. Can go when Taichi tells how many kernels it has made.
 
-``launch``
-    ``quick_launch`` goes round ``Kernel.__call__``, which looks at every argument and hashes every section at
-    every launch: the same objects again go straight to the compiled kernel. Stands on ``compiled_kernels``,
-    ``ensure_compiled``, ``compile_kernel`` and ``launch_kernel``. Can go when launching with arguments seen
-    before costs a lookup.
-
 ``memory``
     ``Memory`` finds every array in Taichi's one block of memory, by the offsets that SNodes hold, because
     ``to_numpy`` and ``from_numpy`` compile two kernels for each field; a log reads its rows there. Can go
@@ -30,6 +25,12 @@ committed results file measures the gain of a part alone, so no figure stands he
 ``cache``
     ``stale_locks``: a process that is killed leaves its lock, and from then on nobody uses the cache. Can go
     when Taichi's lock dies with its process. ``CACHE_BYTES`` lifts a limit by an option of ``ti.init``.
+
+``uuvtai.native.launch`` (a room of its own: ``docs/native.md``)
+    ``quick_launch`` goes round ``Kernel.__call__``, which looks at every argument and hashes every section at
+    every launch: the same objects again go straight to the compiled kernel. Stands on ``compiled_kernels``,
+    ``ensure_compiled``, ``compile_kernel`` and ``launch_kernel``. Can go when launching with arguments seen
+    before costs a lookup.
 
 Elsewhere, by what Taichi publishes: ``kernels.core.signature.spread`` (its scheduler keeps short loops on one
 core), ``config.section.Section.__getattr__`` (what it asks of every argument), ``state.arrays`` (layouts by

@@ -51,7 +51,7 @@ class Memory:
         """``address`` is that of the first element of the field ``anchor``, from which all others are
         found."""
         root = _path(anchor)[-1]
-        self.structs, self.device = structs, device
+        self.structs, self.device, self.tree = structs, device, root.get_snode_tree_id()
         self.address, self.n_bytes = address - _offset(anchor), root.cell_size_bytes
         self._looked_at: dict[int, tuple[Any, np.ndarray]] = {}
 
@@ -70,6 +70,14 @@ class Memory:
             if scratch or not declared.metadata["scratch"]
         }
 
+    def arrays(self, struct: Any, scratch: bool = True) -> list[np.ndarray]:
+        """The arrays of one struct as they lie in memory. CPU only."""
+        return [
+            _view(getattr(struct, declared.name), declared.metadata["lanes"], self.read())
+            for declared in dataclasses.fields(struct)
+            if scratch or not declared.metadata["scratch"]
+        ]
+
     def _field(self, struct: str, name: str) -> Any:
         return getattr(getattr(self.structs, struct), name)
 
@@ -84,8 +92,8 @@ class Memory:
         if self.device.type != "cpu":
             self._on_device().copy_(torch.from_numpy(content))
 
-    def rows(self, field: Any, rows: list[int] | None = None) -> np.ndarray:
-        """Copy of these rows of a field (None = all), shape (len(rows), ...), vectors with a last axis. CPU
+    def rows(self, field: Any, rows: list[int] | slice) -> np.ndarray:
+        """Copy of these rows of a field, shape (len(rows), ...), vectors with a last axis. CPU
         only, where a kernel is done when its launch returns.
 
         Nothing is compiled and nothing launched, so that a step can be looked at as often as one likes.
@@ -93,7 +101,7 @@ class Memory:
         known = self._looked_at.get(id(field))
         if known is None:  # the field is kept with its view, for an identity may be given again
             known = self._looked_at[id(field)] = field, _view(field, False, self.read())
-        return known[1].copy() if rows is None else known[1][np.asarray(rows, np.intp)]
+        return known[1][rows].copy() if isinstance(rows, slice) else known[1][np.asarray(rows, np.intp)]
 
     def put(self, field: Any, values: np.ndarray) -> None:
         """Fill a field that is not in lanes; ``values`` has its shape (vectors add a last axis) and dtype."""

@@ -15,7 +15,7 @@ from uuvtai.kernels.baselines.reachable import reachable_velocity
 from uuvtai.kernels.baselines.surroundings import decides, mapped_m, nearest_body_m, wanted_velocity
 from uuvtai.kernels.core.geometry import FAR_M, PI, turned_z3
 from uuvtai.kernels.core.signature import Bundle, spread
-from uuvtai.taichi_patches.launch import quick_launch
+from uuvtai.native.launch import quick_launch
 
 _FORBIDDEN = -100.0
 """Score below that of every admissible velocity."""

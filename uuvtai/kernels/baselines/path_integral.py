@@ -27,7 +27,7 @@ from uuvtai.kernels.baselines.surroundings import (
 from uuvtai.kernels.core.geometry import turned_z3
 from uuvtai.kernels.core.noise import STREAM_MPPI, episode_key, normal, stream_key
 from uuvtai.kernels.core.signature import Bundle, spread
-from uuvtai.taichi_patches.launch import quick_launch
+from uuvtai.native.launch import quick_launch
 
 _PLAIN = 3
 """Trials without noise: the plan, the wanted velocity, a stop."""

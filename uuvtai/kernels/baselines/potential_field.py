@@ -21,7 +21,7 @@ from uuvtai.kernels.baselines.surroundings import (
     wanted_velocity,
 )
 from uuvtai.kernels.core.signature import Bundle, spread
-from uuvtai.taichi_patches.launch import quick_launch
+from uuvtai.native.launch import quick_launch
 
 
 @quick_launch

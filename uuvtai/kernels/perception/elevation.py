@@ -18,8 +18,8 @@ from uuvtai.kernels.core.kalman import largest_position_variance
 from uuvtai.kernels.core.lanes import LANES, f16x, ramp_lanes
 from uuvtai.kernels.core.signature import Bundle, Const, In, Out, spread
 from uuvtai.kernels.perception.bundles import HeightsIO
+from uuvtai.native.launch import quick_launch
 from uuvtai.state import TrackState
-from uuvtai.taichi_patches.launch import quick_launch
 
 COLUMN = LANES - 1
 """Lane of the hypothesis "through the full water column"; the others are centre heights from floor to

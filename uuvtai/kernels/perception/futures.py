@@ -16,8 +16,8 @@ from uuvtai.kernels.core.geometry import FAR_M
 from uuvtai.kernels.core.signature import Bundle, Const, In, spread
 from uuvtai.kernels.perception.bundles import FuturesIO
 from uuvtai.kernels.perception.habits import expected_turn_rate, next_turn, wall_ahead
+from uuvtai.native.launch import quick_launch
 from uuvtai.state import TrackState
-from uuvtai.taichi_patches.launch import quick_launch
 
 _SLOWEST_M_S = 0.1
 """A slower body is where it is, whichever way it turns."""

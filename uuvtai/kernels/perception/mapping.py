@@ -31,7 +31,7 @@ from uuvtai.kernels.core.signature import Bundle, Const, spread
 from uuvtai.kernels.perception.bundles import MappingIO
 from uuvtai.kernels.perception.evidence import mark_depth, mark_hits
 from uuvtai.kernels.perception.fan import mark_fan
-from uuvtai.taichi_patches.launch import quick_launch
+from uuvtai.native.launch import quick_launch
 
 RATED_HZ = 10.0
 """Scan rate for which the gains of MappingConfig are given."""

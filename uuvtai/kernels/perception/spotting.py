@@ -18,7 +18,7 @@ from uuvtai.kernels.perception.elevation import begin_height
 from uuvtai.kernels.perception.evidence import NO_RETURN_SHARE, pinhole, wall_lanes
 from uuvtai.kernels.perception.sighting import bearing_vector
 from uuvtai.kernels.perception.track_slots import clear_track
-from uuvtai.taichi_patches.launch import quick_launch
+from uuvtai.native.launch import quick_launch
 
 _ROW_STRIDE = 2
 """Rows of the image that are looked at: every second one; a body fills several within the range that

@@ -27,7 +27,7 @@ from uuvtai.kernels.perception.track_slots import (
 )
 from uuvtai.kernels.perception.track_update import update_tracks
 from uuvtai.kernels.perception.unseen import turn_back_rate, turned_back
-from uuvtai.taichi_patches.launch import quick_launch
+from uuvtai.native.launch import quick_launch, without_cse
 
 
 @quick_launch
@@ -93,6 +93,7 @@ def cluster_beams(io: Bundle[TrackingIO]):
 
 
 @quick_launch
+@without_cse
 @ti.kernel
 def follow_bodies(io: Bundle[TrackingIO]):
     """Predict the tracks to the new ping, match them with clusters and correct them."""

@@ -30,7 +30,7 @@ from uuvtai.kernels.core.bits import WORD, highest_bit, lowest_bit, put_bit, wit
 from uuvtai.kernels.core.lanes import LANES, i16x
 from uuvtai.kernels.core.signature import Bundle, Const, In, spread
 from uuvtai.kernels.planning.bundles import ClearanceIO
-from uuvtai.taichi_patches.launch import quick_launch
+from uuvtai.native.launch import quick_launch
 
 _FAR_COLS = 1 << 12
 """[cells] stands for "no site in this row"; its square fits an int32."""

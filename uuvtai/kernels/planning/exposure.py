@@ -16,7 +16,7 @@ from uuvtai.kernels.core.grid import centre_of
 from uuvtai.kernels.core.signature import Bundle, Const, spread
 from uuvtai.kernels.perception.mapping import map_period_s
 from uuvtai.kernels.planning.bundles import ExposureIO, VoronoiIO
-from uuvtai.taichi_patches.launch import quick_launch
+from uuvtai.native.launch import quick_launch
 
 BLOCK = 5
 """[cells] edge of a block"""

@@ -13,7 +13,7 @@ from uuvtai.kernels.core.signature import Bundle, FloatMatrix, Out, spread
 from uuvtai.kernels.planning.advice import TEACHER_COLUMNS
 from uuvtai.kernels.planning.approach import BODY_COLUMNS, body_values, closest_approach, next_body
 from uuvtai.kernels.planning.bundles import FeaturesIO
-from uuvtai.taichi_patches.launch import quick_launch
+from uuvtai.native.launch import quick_launch
 
 
 @quick_launch

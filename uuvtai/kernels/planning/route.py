@@ -9,13 +9,13 @@ from uuvtai.kernels.core.signature import Bundle, FloatMatrix, spread
 from uuvtai.kernels.planning.along import foot_of, left_of_foot, level, look_along, point_left, segment_of
 from uuvtai.kernels.planning.bundles import RouteIO
 from uuvtai.kernels.planning.polyline import MAX_WIDENINGS, WIDENING, count_after_segment, install_route
+from uuvtai.native.launch import quick_launch
 from uuvtai.plan_codes import (
     N_PLANNER,
     N_REASON,
     N_TRIGGER,
     PLANNER_RRT,
 )
-from uuvtai.taichi_patches.launch import quick_launch
 
 _LONG_AGO = -(1 << 20)
 """Step at which no trigger has been served yet."""

@@ -17,6 +17,7 @@ from uuvtai.kernels.core.signature import Bundle, spread
 from uuvtai.kernels.planning.along import advanced_arc, level, look_along
 from uuvtai.kernels.planning.bundles import TriggersIO
 from uuvtai.kernels.planning.traversable import is_traversable
+from uuvtai.native.launch import quick_launch
 from uuvtai.plan_codes import (
     FAIL_NONE,
     N_TRIGGER,
@@ -26,7 +27,6 @@ from uuvtai.plan_codes import (
     TRIGGER_SAFETY,
     TRIGGER_STUCK,
 )
-from uuvtai.taichi_patches.launch import quick_launch
 
 
 @quick_launch

@@ -17,6 +17,7 @@ from uuvtai.kernels.planning.exposure import dearness, widest_m
 from uuvtai.kernels.planning.medial import FOUND, NOT_FOUND, join_skeleton, search_cells
 from uuvtai.kernels.planning.polyline import MAX_WIDENINGS, WIDENING, install_route
 from uuvtai.kernels.planning.traversable import is_traversable, occupancy
+from uuvtai.native.launch import quick_launch
 from uuvtai.plan_codes import (
     FAIL_BUDGET,
     FAIL_DISCONNECTED,
@@ -26,7 +27,6 @@ from uuvtai.plan_codes import (
     FAIL_START_OUTSIDE,
     PLANNER_VORONOI,
 )
-from uuvtai.taichi_patches.launch import quick_launch
 
 
 @quick_launch

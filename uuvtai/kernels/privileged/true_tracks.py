@@ -15,7 +15,7 @@ from uuvtai.kernels.perception.track_slots import clear_track
 from uuvtai.kernels.perception.track_update import CONFIRMED
 from uuvtai.kernels.privileged.bundles import TrueTracksIO
 from uuvtai.kernels.world.bodies import first_moving
-from uuvtai.taichi_patches.launch import quick_launch
+from uuvtai.native.launch import quick_launch
 
 _VARIANCE = 1.0e-6
 """[m^2, m^2/s^2, rad^2/s^2] of what is known exactly: small, but a filter's variance is never 0."""

@@ -17,7 +17,7 @@ from uuvtai.kernels.core.noise import STREAM_DEPTH, normal_pair_lanes, stream_ke
 from uuvtai.kernels.core.signature import Bundle, spread
 from uuvtai.kernels.sensors.bundles import DepthIO
 from uuvtai.kernels.sensors.raycast import ball_span, disc_span, rim_distance, slab_span
-from uuvtai.taichi_patches.launch import quick_launch
+from uuvtai.native.launch import quick_launch
 
 _BLOCK = 36
 """Image rows per loop item on a CPU: bodies are projected once per item."""

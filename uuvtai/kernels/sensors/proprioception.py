@@ -22,7 +22,7 @@ from uuvtai.kernels.core.noise import (
 )
 from uuvtai.kernels.core.signature import Bundle, spread
 from uuvtai.kernels.sensors.bundles import ExactProprioceptionIO, ProprioceptionIO
-from uuvtai.taichi_patches.launch import quick_launch
+from uuvtai.native.launch import quick_launch
 
 _EPISODE_DRAW = 1000
 """Index of draws made once per episode, apart from those of step 0."""

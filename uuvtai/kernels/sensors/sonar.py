@@ -27,7 +27,7 @@ from uuvtai.kernels.sensors.sonar_error import (
     range_noisy,
     start_cloud,
 )
-from uuvtai.taichi_patches.launch import quick_launch
+from uuvtai.native.launch import quick_launch
 
 _FALLOFF = 0.9
 """Intensity = cosine of incidence x (1 - 0.9 r / maximum range): Lambert's law and what gain control leaves

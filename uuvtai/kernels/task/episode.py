@@ -8,8 +8,8 @@ from uuvtai.kernels.core.hull import hull_to_body, hull_to_floor_or_surface, hul
 from uuvtai.kernels.core.noise import episode_key
 from uuvtai.kernels.core.signature import Bundle, IntVector, spread
 from uuvtai.kernels.task.bundles import EpisodeIO
+from uuvtai.native.launch import quick_launch
 from uuvtai.outcomes import COLLISION, OUT_OF_TANK, OUTCOMES, RUNNING, SUCCESS, TIMEOUT, TTC
-from uuvtai.taichi_patches.launch import quick_launch
 
 __all__ = ["COLLISION", "OUTCOMES", "OUT_OF_TANK", "RUNNING", "SUCCESS", "TIMEOUT", "TTC"]
 
@@ -22,7 +22,7 @@ def begin_episodes(
     number: IntVector,
 ):
     """Give the rows of ``mask`` a new episode and wake only them."""
-    for env in range(ti.static(io.clock.awake.shape[0])):
+    for env in range(mask.shape[0]):
         io.clock.awake[env] = mask[env]
         if mask[env] == 1:
             io.clock.active[env] = 1

@@ -20,8 +20,8 @@ from uuvtai.kernels.core.signature import (
     spread,
 )
 from uuvtai.kernels.task.bundles import RewardIO
+from uuvtai.native.launch import quick_launch
 from uuvtai.outcomes import COLLISION, OUT_OF_TANK, SUCCESS, TIMEOUT
-from uuvtai.taichi_patches.launch import quick_launch
 
 _PENALTIES = ("path_distance", "cross_track", "clearance", "ttc", "overspeed", "failure", "tilt", "effort")
 """Terms that the equation subtracts."""
@@ -140,7 +140,7 @@ def compute_reward(
     weights = ti.Vector(ti.static(list(signed_weights(io.reward_cfg))))
     n = ti.static(io.clock.awake.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
-        if pad == 0 and io.clock.awake[env] == 0:
+        if pad == 0 and io.clock.awake[env] == 0 and env < reward_out.shape[0]:
             reward_out[env] = 0.0
         if pad == 0 and io.clock.awake[env] == 1:
             progress = route_progress(env, io.episode_cfg.control_dt_s, io)
@@ -171,7 +171,7 @@ def write_results(
 ):
     """How the step and the episode so far went, for whoever learns from it: weighted terms, their sums,
     return, steps and outcome."""
-    for env in range(ti.static(io.clock.awake.shape[0])):
+    for env in range(terms.shape[0]):
         for i in ti.static(range(N_TERM)):
             terms[env, i] = ti.cast(io.reward.term[env, i], ti.f32)
             episode_terms[env, i] = ti.cast(io.reward.episode_sum[env, i], ti.f32)

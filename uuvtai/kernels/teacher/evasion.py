@@ -8,10 +8,11 @@ from uuvtai.kernels.core.lanes import LANES, f16x, put_column
 from uuvtai.kernels.core.signature import Bundle, spread
 from uuvtai.kernels.teacher.bundles import EvasionIO
 from uuvtai.kernels.teacher.trajectories import body_depths, depth_band, static_depths
-from uuvtai.taichi_patches.launch import quick_launch
+from uuvtai.native.launch import quick_launch, without_cse
 
 
 @quick_launch
+@without_cse
 @ti.kernel
 def plan_evasion(io: Bundle[EvasionIO]):
     """Best evasive velocity of the envs with ``want_evade``: the softmax mean of the candidates where that is

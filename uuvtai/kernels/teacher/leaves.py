@@ -11,7 +11,7 @@ from uuvtai.kernels.teacher.bundles import TeacherIO
 from uuvtai.kernels.teacher.threats import cruising_speed
 from uuvtai.kernels.teacher.trajectories import held_heave
 from uuvtai.kernels.teacher.tree_tick import tick_nodes
-from uuvtai.taichi_patches.launch import quick_launch
+from uuvtai.native.launch import quick_launch
 
 
 @quick_launch

@@ -11,7 +11,7 @@ from uuvtai.kernels.core.signature import Bundle, Const, spread
 from uuvtai.kernels.teacher.bundles import ThreatsIO
 from uuvtai.kernels.teacher.cruise_depth import choose_depth
 from uuvtai.kernels.teacher.trajectories import body_depths, held_heave
-from uuvtai.taichi_patches.launch import quick_launch
+from uuvtai.native.launch import quick_launch, without_cse
 
 _PATH_SAMPLES = 8
 
@@ -22,6 +22,7 @@ _NEARER_M = 0.2
 
 
 @quick_launch
+@without_cse
 @ti.kernel
 def assess_threats(io: Bundle[ThreatsIO]):
     """Fill the blackboard, and decide which envs must plan an evasion in this step."""

@@ -11,7 +11,7 @@ import taichi as ti
 
 from uuvtai.kernels.core.signature import AnyTensor, Bundle
 from uuvtai.kernels.teacher.bundles import TeacherIO
-from uuvtai.taichi_patches.launch import quick_launch
+from uuvtai.native.launch import quick_launch
 from uuvtai.tree_codes import (
     ACTION,
     CONDITION,

@@ -13,10 +13,11 @@ from uuvtai.kernels.core.lanes import column, is_awake, n_awake, n_column, put_c
 from uuvtai.kernels.core.signature import Bundle, Const, FloatMatrix, In, Out, spread
 from uuvtai.kernels.vehicle.bundles import ActuationIO
 from uuvtai.kernels.vehicle.rotor import rpm_of_thrust, thrust_limits
-from uuvtai.taichi_patches.launch import quick_launch
+from uuvtai.native.launch import quick_launch, without_cse
 
 
 @quick_launch
+@without_cse
 @ti.kernel
 def command_thrusters(io: Bundle[ActuationIO], action: FloatMatrix):
     """action (n_env, 4): surge, sway, heave, yaw rate in [-1, 1] of the vehicle's limits ->

@@ -30,7 +30,7 @@ from uuvtai.kernels.core.noise import (
 from uuvtai.kernels.core.signature import Bundle, Const, In, Out, spread
 from uuvtai.kernels.vehicle.bundles import DynamicsIO
 from uuvtai.kernels.vehicle.rotor import lag_kept, thrust_of_rpm
-from uuvtai.taichi_patches.launch import quick_launch
+from uuvtai.native.launch import quick_launch
 
 # draws of STREAM_VEHICLE (each spread has its own index, so switching one on does not change another)
 _DRAW_MASS = 0

@@ -1,0 +1,63 @@
+"""Few sizes are ever compiled: other batches, obstacles and speeds find the machine code that is there."""
+
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from uuvtai.loader import load_config
+from uuvtai.native.launch import native
+from uuvtai.sim import Sim
+from uuvtai.sizes import array_sizes, rows_for
+from uuvtai.tree import read_tree
+
+STEPS = 12
+
+
+def played(n_env, seed, **world):
+    """Positions after some steps of ``n_env`` episodes of a world; rows beyond them must stay asleep."""
+    overrides = {"world.dynamic_capacity": 9} | {f"world.{key}": value for key, value in world.items()}
+    sim = Sim(load_config("pool", "paper", overrides=overrides), n_env, read_tree("bt"))
+    observation, action = sim.observe(), sim.action
+    assert observation.shape[0] == action.shape[0] == sim.reward.shape[0] == n_env
+    ones = torch.ones(n_env, dtype=torch.int32)
+    sim.reset(ones, seed * ones, torch.arange(n_env, dtype=torch.int32))
+    for _ in range(STEPS):
+        sim.step()
+    pos_w = sim.rows(sim.s.vehicle.pos_w)
+    assert pos_w.shape == (n_env, 3)
+    awake = sim.s.clock.awake.to_numpy()
+    assert awake[:n_env].all() and not awake[n_env:].any()
+    return pos_w
+
+
+def test_sizes_are_few_and_never_too_small():
+    rows = [rows_for(n) for n in range(1, 5000)]
+    assert all(n <= row for n, row in enumerate(rows, 1)) and rows == sorted(rows)
+    assert sorted(set(rows)) == [1, 16, 64, 256, 1024, 2048, 4096, 8192]
+    config = load_config("pool", "paper")
+    assert array_sizes(config, 3) == array_sizes(config, 16) != array_sizes(config, 17)
+
+
+def test_kernels_do_not_see_how_many_obstacles_a_scene_has():
+    seen = {
+        load_config("pool", "paper", overrides={
+            "world.n_static": s, "world.n_dynamic": d, "world.dynamic_speed_m_s": v,
+        }).world.compiled()
+        for s, d, v in ((0, 0, 0.0), (1, 8, 0.6), (12, 15, 1.5), (3, 0, 3.0))
+    }  # fmt: skip
+    assert len(seen) == 1 and seen.pop().dynamic_slots == 16
+    more = load_config("pool", "paper", overrides={"world.n_dynamic": 17}).world
+    assert (more.static_slots, more.dynamic_slots) == (16, 32)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="own machine code is for Linux")
+def test_other_batches_bodies_and_speeds_compile_nothing_and_change_nothing():
+    """The first batch may compile; the others find its code, and an episode is the same in every batch."""
+    whole = played(9, 4, n_dynamic=6)
+    made = native[0].made
+    np.testing.assert_array_equal(played(2, 4, n_dynamic=6), whole[:2])
+    fewer = played(13, 4, n_dynamic=3, n_static=5, dynamic_speed_m_s=1.1)
+    assert not np.array_equal(fewer[:9], whole)
+    assert native[0].made == made

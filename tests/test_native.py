@@ -1,0 +1,302 @@
+"""Machine code of the kernels' own: compared with Taichi's, kept safely, refused where it does not fit."""
+
+import ast
+import dataclasses
+import errno
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import taichi as ti
+import torch
+
+import uuvtai
+from uuvtai.config import EpisodeConfig
+from uuvtai.kernels.core.signature import Bundle, Const, FloatMatrix, FloatVector, In, Out
+from uuvtai.native import keys, making
+from uuvtai.native.keys import KeyNameError, described, digest_of_sources
+from uuvtai.native.launch import native, quick_launch
+from uuvtai.native.machine import RUNTIME_TYPE, UnfitError, tasks_in
+from uuvtai.native.making import Native
+from uuvtai.native.store import MachineCode, Store, StoreError
+from uuvtai.state.arrays import allocate, array
+from uuvtai.taichi_patches.memory import Memory, address_of
+
+N = 3000
+"""more items than one block of a loop has, so that threads share them"""
+
+
+@dataclasses.dataclass
+class Sums:
+    """A struct as those of ``state``."""
+
+    total: ti.Field = array("n_env")
+    pair: ti.Field = array("n_env", vec=2)
+    rest: ti.Field = array("n_env", scratch=True)
+
+
+@dataclasses.dataclass
+class Source:
+    value: ti.Field = array("n_env")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SumsIO:
+    """Like a stage's bundle."""
+
+    sums: "Out[Sums]"
+    source: "In[Source]"
+    rules: "Const[EpisodeConfig]"
+
+
+@quick_launch
+@ti.kernel
+def add_up(io: Bundle[SumsIO], table: FloatMatrix, weight: float, count: int, out: FloatVector):
+    """Numbers, tensors of two ranks, fields and a config section."""
+    for i in range(N):
+        io.sums.total[i] += weight * io.source.value[i] + count + table[i % 2, 1] + io.rules.control_dt_s
+        io.sums.pair[i] = ti.Vector([io.sums.total[i], ti.sin(io.source.value[i])])
+        io.sums.rest[i] = 1.0
+    for i in range(N):
+        out[i] = io.sums.total[i] + io.sums.pair[i][1]
+
+
+@dataclasses.dataclass
+class Both:
+    sums: Sums
+    source: Source
+
+
+class Scene:
+    """Arrays, a bundle over them, and tensors."""
+
+    def __init__(self):
+        self.structs = Both(allocate(Sums, {"n_env": N}), allocate(Source, {"n_env": N}))
+        self.io = SumsIO(self.structs.sums, self.structs.source, EpisodeConfig())
+        anchor = self.structs.sums.total
+        anchor.fill(0.0)
+        self.structs.source.value.from_numpy(np.linspace(0, 3, N, dtype=np.float32))
+        self.memory = Memory(
+            self.structs, anchor, address_of(anchor, torch.device("cpu")), torch.device("cpu")
+        )
+        self.table = torch.tensor([[1.0, 2.0], [3.0, 4.0]])
+        self.out = torch.zeros(N)
+
+    def launch(self):
+        """Once; total and out."""
+        add_up(self.io, self.table, 0.5, 3, self.out)
+        return self.structs.sums.total.to_numpy(), self.out.numpy().copy()
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """An empty folder for machine code, and no ``Native`` yet."""
+    monkeypatch.setenv("UUV_NATIVE_CACHE", str(tmp_path / "native"))
+    kept = native[:]
+    native.clear()
+    yield tmp_path / "native"
+    native[:] = kept
+
+
+def started(scene, place):
+    """A new process's ``Native``, as far as the store can tell."""
+    native[:] = [Native()]
+    native[0].adopt([scene.io], scene.memory)
+    return native[0]
+
+
+@pytest.fixture(scope="module")
+def expected():
+    """What Taichi says after one, two, three and four launches."""
+    scene = Scene()
+    return [scene.launch() for _ in range(4)]
+
+
+@pytest.mark.parametrize("threads", ["1", "2"])
+def test_it_is_made_once_found_again_and_does_what_taichi_does(place, expected, monkeypatch, threads):
+    monkeypatch.setenv("UUV_NUM_THREADS", threads)
+    first = Scene()
+    ours = started(first, place)
+    for total, out in expected[:3]:
+        np.testing.assert_array_equal(first.launch(), (total, out))
+    assert (ours.found, ours.made, ours.refused) == (0, 1, 0)
+    assert [p.suffix for p in place.iterdir()] == [".kernel"]
+    assert place.stat().st_mode & 0o777 == 0o700
+    ours.compiler.compiled = None  # type: ignore[assignment]  # what is found is not compiled
+    ours.adopt([moved := dataclasses.replace(first.io)], first.memory)  # another bundle, the same arrays
+    add_up(moved, first.table, 0.5, 3, first.out)
+    np.testing.assert_array_equal((first.structs.sums.total.to_numpy(), first.out), expected[3])
+    elsewhere = Scene()  # arrays in the same order in another tree of fields
+    ours.adopt([elsewhere.io], elsewhere.memory)
+    np.testing.assert_array_equal(elsewhere.launch(), expected[0])
+    assert (ours.found, ours.made, ours.refused) == (2, 1, 0)
+
+
+def test_tensors_may_move_and_grow(place):
+    scene = Scene()
+    started(scene, place)
+    scene.launch()
+    scene.out.set_(torch.zeros(N + 512))  # type: ignore[call-overload]
+    total, out = scene.launch()
+    np.testing.assert_array_equal(out[:N] != 0, True)
+    np.testing.assert_array_equal(out[N:], 0)
+    assert total[0] == pytest.approx(2 * (3 + 2 + EpisodeConfig().control_dt_s))
+
+
+def test_code_that_does_something_else_is_never_used(place, expected, monkeypatch):
+    """One constant of the compiled kernel is another; the first launch sees it, Taichi's result stands."""
+    scene = Scene()
+    ours = started(scene, place)
+    real = ours.machine.object_of
+    monkeypatch.setattr(ours.machine, "object_of", lambda text: real(changed(text)))
+    with pytest.warns(
+        RuntimeWarning, match="add_up: its own machine code gives another result; Taichi launches it"
+    ):
+        np.testing.assert_array_equal(scene.launch(), expected[0])
+    np.testing.assert_array_equal(scene.launch(), expected[1])
+    assert (ours.made, ours.refused, list(place.glob("*.kernel"))) == (0, 1, [])
+
+
+def changed(text):
+    """LLVM's text with its first addition of floats turned into a subtraction."""
+    assert " fadd " in text
+    return text.replace(" fadd ", " fsub ", 1)
+
+
+def test_another_runtime_is_refused():
+    with pytest.raises(UnfitError, match="another layout"):
+        tasks_in("%struct.LLVMRuntime.6 = type { i8*, i32 }\n")
+    with pytest.raises(UnfitError, match="told apart"):
+        tasks_in(f"%struct.LLVMRuntime.6 = type {RUNTIME_TYPE}i8* }}\n")
+
+
+def test_adopt_says_in_one_line_why_not(place, monkeypatch):
+    place.mkdir(mode=0o700)
+    place.chmod(0o777)
+    scene = Scene()
+    with pytest.warns(RuntimeWarning, match=r"others could have written it.*; Taichi launches all kernels"):
+        making.adopt([scene.io], scene.memory)
+    assert not native
+    place.chmod(0o700)
+    monkeypatch.setattr(making.ti, "__version__", (1, 8, 0))
+    with pytest.warns(RuntimeWarning, match=r"Taichi 1\.8\.0 is not 1\.7\.4"):
+        making.adopt([scene.io], scene.memory)
+    assert not native
+
+
+# ------------------------------------------------------------------------------------------------- keys
+
+
+def test_every_source_that_kernels_import_is_part_of_the_key():
+    root = Path(uuvtai.__file__).parent
+    seen = {name.removesuffix(".py") for name in keys._SEEN_BY_KERNELS}
+    files = [
+        p
+        for name in keys._SEEN_BY_KERNELS
+        for p in ([root / name] if name.endswith(".py") else (root / name).rglob("*.py"))
+    ]
+    assert len(files) > 80
+    for path in files:
+        for node in ast.walk(ast.parse(path.read_text())):
+            for module in names_of(node):
+                if module.startswith("uuvtai."):
+                    assert module.split(".")[1] in seen | {"errors", "files"}, (path, module)
+
+
+def names_of(node):
+    """Modules that a statement imports."""
+    if isinstance(node, ast.ImportFrom) and node.module:
+        return [node.module]
+    return [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+
+
+def test_a_key_tells_configs_places_and_kinds_apart():
+    first, second = Scene(), Scene()
+    tree = first.memory.tree
+    other = dataclasses.replace(first.io, rules=EpisodeConfig(control_dt_s=0.05))
+    told = {described(value, tree) for value in (first.io, other, first.table, first.out, first.out.double())}
+    assert len(told) == 5 and len(digest_of_sources()) == 64
+    assert described(first.io, tree) == described(second.io, second.memory.tree), (
+        "the same places in another tree"
+    )
+    with pytest.raises(KeyNameError, match="a field of tree"):
+        described(second.io, tree)
+    with pytest.raises(KeyNameError):
+        described(object(), tree)
+
+
+# ------------------------------------------------------------------------------------------------ store
+
+
+@pytest.fixture
+def store(tmp_path):
+    return Store(tmp_path / "deep" / "native")
+
+
+CODE = MachineCode(["a_kernel_0_serial"], b"\x7fELF" + bytes(range(256)) * 40)
+
+
+def test_what_is_put_is_got_and_nothing_else(store):
+    assert store.get("k1") is None
+    store.put("k1", CODE)
+    assert store.get("k1") == CODE
+    store.put("k1", MachineCode([], b"new"))
+    assert store.get("k1") == MachineCode([], b"new")
+    assert [p.name for p in store.folder.iterdir()] == ["k1.kernel"]
+
+
+@pytest.mark.parametrize("at", [0, 5, 20, 90, 200, -1])
+@pytest.mark.parametrize("kind", ["flip", "cut"])
+def test_damage_is_as_good_as_missing(store, at, kind):
+    store.put("k", CODE)
+    path = store.folder / "k.kernel"
+    content = bytearray(path.read_bytes())
+    content[at] ^= 1
+    path.write_bytes(content if kind == "flip" else content[:at])
+    assert store.get("k") is None
+
+
+def test_a_file_under_another_name_is_not_run(store):
+    store.put("k", CODE)
+    os.rename(store.folder / "k.kernel", store.folder / "other.kernel")
+    assert store.get("other") is None
+
+
+def test_foreign_files_and_folders_are_refused(store, tmp_path):
+    store.put("k", CODE)
+    path = store.folder / "k.kernel"
+    path.chmod(0o666)
+    with pytest.raises(StoreError, match="others could have written it"):
+        store.get("k")
+    path.chmod(0o600)
+    (store.folder / "link.kernel").symlink_to(path)
+    with pytest.raises(StoreError):
+        store.get("link")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StoreError):
+        Store(tmp_path / "file")
+    (tmp_path / "way").symlink_to(store.folder)
+    with pytest.raises(StoreError, match="link"):
+        Store(tmp_path / "way")
+
+
+def test_a_full_disk_leaves_nothing_half(store, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(StoreError, match="No space left"):
+        store.put("k", CODE)
+    assert list(store.folder.iterdir()) == []
+
+
+def test_the_folder_is_bounded_and_what_is_used_stays(store):
+    for number in range(6):
+        store.put(f"k{number}", CODE)
+        os.utime(store.folder / f"k{number}.kernel", (number, number))
+    assert store.get("k0") == CODE  # used: newest now
+    size = (store.folder / "k0.kernel").stat().st_size
+    assert store.bound(3 * size) == 3
+    assert sorted(p.name for p in store.folder.iterdir()) == ["k0.kernel", "k4.kernel", "k5.kernel"]
+    assert store.clear() == 3 and not list(store.folder.iterdir())

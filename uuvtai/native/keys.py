@@ -1,0 +1,74 @@
+"""What a kernel's machine code depends on, as one key: the sources that kernels see, the arrays' places, the
+config sections, and the processor. Nothing of it asks Taichi to read a kernel."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import taichi as ti
+
+from uuvtai.config import Section
+
+_SEEN_BY_KERNELS = (
+    "kernels", "config", "state", "native", "taichi_patches",
+    "outcomes.py", "plan_codes.py", "tree_codes.py", "truth.py",
+)  # fmt: skip
+"""files and folders of the package that a kernel's code can depend on (``tests/test_native.py`` compares them
+with what the kernels import)"""
+
+
+class KeyNameError(Exception):
+    """An argument of a kind that no key can name: Taichi launches this kernel itself."""
+
+
+@functools.cache
+def digest_of_sources() -> str:
+    """Of every source that a kernel can see."""
+    root, digest = Path(__file__).parents[1], hashlib.sha256()
+    for name in _SEEN_BY_KERNELS:
+        for path in sorted((root / name).rglob("*.py")) if (root / name).is_dir() else [root / name]:
+            digest.update(f"{path.relative_to(root)}\0".encode() + path.read_bytes() + b"\0")
+    return digest.hexdigest()
+
+
+def key_of(kernel: Any, arguments: tuple, tree: int, surroundings: list) -> str:
+    """64 hexadecimal digits that name the machine code of ``kernel`` for these arguments; ``surroundings``
+    say which processor, compilers and runtime it is for. Raises KeyNameError."""
+    function = kernel.func
+    given = [
+        "" if declared.annotation in (int, float) else described(value, tree)
+        for declared, value in zip(kernel.arguments, arguments, strict=True)
+    ]
+    parts = [digest_of_sources(), surroundings, function.__module__, function.__qualname__, given]
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+
+
+def described(value: Any, tree: int) -> str:
+    """All of an argument that its kernel's code can depend on; fields must belong to ``tree``. Raises
+    KeyNameError."""
+    if isinstance(value, Section | bool | int | str | None):
+        return f"{type(value).__name__} {value!r}"
+    if isinstance(value, ti.Field):
+        return _place(value, tree)
+    if hasattr(value, "data_ptr"):
+        return f"tensor {value.dtype} {value.ndim} {value.device.type} {value.is_contiguous()}"
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        members = [f"{m.name}: {described(getattr(value, m.name), tree)}" for m in dataclasses.fields(value)]
+        return f"{type(value).__name__}({'; '.join(members)})"
+    raise KeyNameError(type(value).__name__)
+
+
+def _place(field: ti.Field, tree: int) -> str:
+    """Type, shape and place of a field: the sizes of the nodes from it up to the root of its tree."""
+    node, path, found = field.vars[0].ptr.snode(), [], -1
+    while node is not None:
+        path.append((str(node.type), node.cell_size_bytes, node.offset_bytes_in_parent_cell))
+        found, node = node.get_snode_tree_id(), node.parent
+    if found != tree:
+        raise KeyNameError(f"a field of tree {found} among those of tree {tree}")
+    return f"{field.dtype} {field.shape} {len(field.vars)} {path}"

@@ -1,0 +1,187 @@
+"""Launching kernels again without having Taichi look at them again: by machine code of their own where a
+simulator has offered its bundles (``making.adopt``), else by Taichi's."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import taichi as ti
+from taichi.lang import impl
+
+if TYPE_CHECKING:
+    import torch
+
+_T = TypeVar("_T")
+MOST_LAUNCHES = 64
+"""lists of arguments remembered per kernel"""
+
+
+class TaichiLaunch:
+    """A kernel compiled by Taichi for one list of arguments, which are kept alive: their identities are the
+    key."""
+
+    def __init__(self, kernel: Any, arguments: tuple, compiled: tuple[Any, Any] | None = None) -> None:
+        self.program: Any = impl.get_runtime().prog
+        self._arguments = arguments
+        self._given = given(kernel, arguments)
+        self._kernel, self._compiled = compiled or self._found(kernel)
+
+    def _found(self, kernel: Any) -> tuple[Any, Any]:
+        made = kernel.compiled_kernels[kernel.ensure_compiled(*self._arguments)]
+        return made, self.program.compile_kernel(self.program.config(), self.program.get_device_caps(), made)
+
+    def again(self) -> None:
+        """Launch it."""
+        context = self._kernel.make_launch_context()
+        for number, (declared, value) in enumerate(self._given):
+            if declared is int:
+                context.set_arg_int((number,), value)
+            elif declared is float:
+                context.set_arg_float((number,), value)
+            else:
+                size = value.element_size() * value.nelement()
+                context.set_arg_external_array_with_shape(
+                    (number,), value.data_ptr(), size, tuple(value.shape), 0
+                )
+        self.program.launch_kernel(self._compiled, context)
+
+
+class NativeLaunch:
+    """A kernel's own machine code with one list of arguments, which are kept alive."""
+
+    def __init__(self, machine: Any, runtime: Any, tasks: list[int], kernel: Any, arguments: tuple) -> None:
+        self.program: Any = impl.get_runtime().prog
+        self._arguments, self._runtime = arguments, runtime
+        self._tasks = (ctypes.c_void_p * len(tasks))(*tasks)
+        self._packed, self._tensors = _packed(given(kernel, arguments))
+        self._launch = functools.partial(
+            machine.launch,
+            ctypes.addressof(self._tasks),
+            len(tasks),
+            ctypes.addressof(self._packed),
+            ctypes.addressof(runtime),
+        )
+
+    def again(self) -> None:
+        """Launch it."""
+        for place, tensor in self._tensors:
+            place.data = tensor.data_ptr()
+            place.shape[:] = tensor.shape
+        self._launch()
+
+
+Launch = TaichiLaunch | NativeLaunch
+native: list[Any] = []
+"""the process's ``Native``, when a simulator has asked for it"""
+
+
+def quick_launch(launch: _T) -> _T:
+    """Decorator above Taichi's: launch again with the very same objects without looking at them again.
+
+    Taichi inspects every argument and hashes every section at every launch, which costs more than many
+    kernels do. Here the first launch looks; later ones with the same structs, sections, numbers and tensors
+    go straight to the machine code. For kernels whose arguments live as long as the simulator: they are kept
+    alive.
+    """
+    kernel = launch._primal  # type: ignore[attr-defined]
+    known: dict[tuple[int, ...], Launch] = {}
+
+    def again(*arguments):
+        key = tuple(map(id, arguments))
+        found = known.get(key)
+        if found is not None and found.program is impl.get_runtime().prog:
+            found.again()
+            return
+        found = _first(launch, kernel, arguments)  # type: ignore[arg-type]
+        if len(known) >= MOST_LAUNCHES:
+            known.clear()
+        if found is not None:
+            known[key] = found
+
+    again.__name__, again.__doc__ = launch.__name__, launch.__doc__  # type: ignore[attr-defined]
+    return again  # type: ignore[return-value]
+
+
+def without_cse(launch: _T) -> _T:
+    """Decorator between ``quick_launch`` and Taichi's: compile without common subexpression elimination.
+
+    The time of that pass grows with the square of a kernel's length, most of what a long kernel takes to
+    compile. LLVM does most of the work again: for kernels that are long to compile and short to run.
+    """
+    launch._primal.without_cse = True  # type: ignore[attr-defined]
+    return launch
+
+
+@contextlib.contextmanager
+def _compiling(kernel: Any) -> Iterator[None]:
+    program: Any = impl.get_runtime().prog
+    config, before = program.config(), program.config().opt_level
+    config.opt_level = 0 if getattr(kernel, "without_cse", False) else before
+    try:
+        yield
+    finally:
+        config.opt_level = before
+
+
+def _first(launch: Callable, kernel: Any, arguments: tuple) -> Launch | None:
+    """Launch with arguments that were not seen before; how to do it again, None where Taichi has to look."""
+    with _compiling(kernel):
+        return _compiled(launch, kernel, arguments)
+
+
+def _compiled(launch: Callable, kernel: Any, arguments: tuple) -> Launch | None:
+    if native and len(arguments) == len(kernel.arguments):
+        found = native[0].first(kernel, arguments)
+        if found is not None:
+            return found
+    launch(*arguments)
+    known = all(d in (int, float) or hasattr(value, "data_ptr") for d, value in given(kernel, arguments))
+    return TaichiLaunch(kernel, arguments) if known else None
+
+
+def given(kernel: Any, arguments: tuple) -> list[tuple[Any, Any]]:
+    """(what it is declared as, value) of the arguments that are no compile-time ones: int, float, tensors."""
+    return [
+        (declared.annotation, value)
+        for value, declared in zip(arguments, kernel.arguments, strict=True)
+        if not isinstance(declared.annotation, ti.template)
+    ]
+
+
+# ------------------------------------------------------------------------------------------------- arguments
+
+
+def _packed(values: list[tuple[Any, Any]]) -> tuple[ctypes.Structure, list[tuple[Any, torch.Tensor]]]:
+    """Arguments as Taichi's kernels read them from memory; the places of tensors in it."""
+    kinds = [
+        ctypes.c_int32 if declared is int else ctypes.c_float if declared is float else _array_of(value.ndim)
+        for declared, value in values
+    ]
+    struct = type("Arguments", (ctypes.Structure,), {"_fields_": [(f"a{i}", k) for i, k in enumerate(kinds)]})
+    packed, tensors = struct(), []
+    for i, (declared, value) in enumerate(values):
+        if declared in (int, float):
+            setattr(packed, f"a{i}", value)
+        else:
+            tensors.append((getattr(packed, f"a{i}"), value))
+    return packed, tensors
+
+
+@functools.cache
+def _array_of(rank: int) -> type[ctypes.Structure]:
+    fields = [("shape", ctypes.c_int32 * rank), ("data", ctypes.c_void_p)]
+    return type(f"Array{rank}", (ctypes.Structure,), {"_fields_": fields})
+
+
+def written(bundle: Any) -> list[Any]:
+    """The structs of a bundle that its kernels write."""
+    return [
+        getattr(bundle, member.name)
+        for member in dataclasses.fields(bundle)
+        if str(member.type).startswith("Out[")
+    ]
