@@ -429,15 +429,22 @@ def test_a_piece_switched_off_stands_beside_the_whole_pilot(tmp_path):
     path = tmp_path / "docs/data/pieces_77.json"
     path.parent.mkdir(parents=True)
     document = pieces.read(path, 77)
-    for piece, outcomes in (("all", "ssstc"), ("depth", "sstxo"), ("all", "ssssc")):
+    for piece, outcomes in (
+        ("all", "ssstc"), ("depth", "sstxo"), ("all", "ssssc"), ("diagonal", "sssxc"), ("before", "ssttc"),
+    ):  # fmt: skip
         pieces.add(path, document, pieces.entry_of(piece, "pool_6", ["eval"], played_alone(outcomes), "abc"))
     (path.parent / "shown.json").write_text(json.dumps({"pieces": path.name}))
     lines = figure_tables.switched_off(Sources(tmp_path)).splitlines()[2:]
     assert [line.split(" | ")[-1].strip(" |") for line in lines] == [
         "80.0 / 20.0",
         "40.0 / 40.0 (+0 -2, p = 0.5)",
+        "60.0 / 40.0 (+0 -1, p = 1)",
+        "40.0 / 20.0 (+0 -2, p = 0.5)",
+        "60.0 / 40.0 (+1 -0, p = 1)",
     ]
-    assert [row["piece"] for row in pieces.read(path, 77)["rows"]] == ["depth", "all"], "the newer counts"
+    assert sorted(row["piece"] for row in pieces.read(path, 77)["rows"]) == [
+        "all", "before", "depth", "diagonal",
+    ], "the newer counts"  # fmt: skip
 
 
 def test_only_pieces_that_this_code_did_not_play_are_played(tmp_path, monkeypatch):

@@ -418,7 +418,8 @@ import sys, numpy as np
 from uuvtai.runtime import start_taichi
 start_taichi("cpu")
 from tests.test_world import Drawn, PURE, world_config
-drawn = Drawn(world_config("pool", static_capacity=8, dynamic_capacity=6), n_env=7).draw(numbers=[6, 5, 4, 3, 2, 1, 0])
+drawn = Drawn(world_config("pool", static_capacity=8, dynamic_capacity=6), n_env=7)
+drawn = drawn.draw(numbers=[6, 5, 4, 3, 2, 1, 0])
 n_slot = 8
 np.savez(sys.argv[1], **{name: drawn[name][::-1] for name in PURE})
 """

@@ -165,7 +165,8 @@ def switched_off(sources: Sources) -> str:
         if any(text != DASH for text in shown):
             table.append([piece.title, *(f"`{key}`" if key else "" for key in [piece.settings]), *shown])
     capped = [_beside(played, "diagonal", BEFORE.name, cell.name) for cell in cells]
-    table.append(["at most 0.6 m/s, against the pilot before", "", *capped])
+    if any(text != DASH for text in capped):
+        table.append(["at most 0.6 m/s, against the pilot before", "", *capped])
     return text_table(["off", "by", *(cell.title for cell in cells)], table)
 
 
