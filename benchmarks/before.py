@@ -1,9 +1,9 @@
 """This tree against another commit of it (``--against``, default HEAD): are the bits equal, is it as fast?
 
 A refactoring shows here that it is one: 300 steps of 256 vehicles in three worlds, a recorded log, four
-iterations of training and the keys of the cached kernels, compared bit by bit; then steps per CPU second of
-one thread and the start with warm kernels, in turns (wall time on a shared machine wanders by a third). Both
-sides run in this environment, each with its own package and caches.
+iterations of training, compared bit by bit; then steps per CPU second of one thread and the start with warm
+kernels, in turns (wall time on a shared machine wanders by a third). Both sides run in this environment, each
+with its own package and caches.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _ROUNDS = 120
 _STARTS = 9
 
 
-class _Side:
+class Side:
     """A tree with folders of its own for kernels and runs."""
 
     def __init__(self, tree: Path, folder: Path) -> None:
@@ -70,10 +70,6 @@ class _Side:
         )
         return place
 
-    def kernels(self) -> set[str]:
-        """Names of the kernels in this side's cache: Taichi's keys."""
-        return {path.name for path in self.folder.rglob("*.tic")}
-
 
 def measure(job: Job) -> list[Row]:
     """Arrays, topics and files that differ, kernels that have other keys, and the ratios of speed."""
@@ -82,7 +78,7 @@ def measure(job: Job) -> list[Row]:
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         commit, tree = stack.enter_context(checked_out(job.against or "HEAD", folder / "tree"))
-        ours, theirs = _Side(ROOT, folder / "ours"), _Side(tree, folder / "theirs")
+        ours, theirs = Side(ROOT, folder / "ours"), Side(tree, folder / "theirs")
         rows = []
         for world, sensors in _WORLDS[: 1 if job.quick else None]:
             one, other = (side.bits(world, sensors, num_envs, steps) for side in (ours, theirs))
@@ -94,7 +90,6 @@ def measure(job: Job) -> list[Row]:
         rows.append(
             _equal("four iterations of training: files of checkpoints that differ", one, other, commit)
         )
-        rows.append(_keys(ours, theirs, commit))
         return rows + _speed(job, ours, theirs, commit, num_envs)
 
 
@@ -139,19 +134,12 @@ def _weights(run: Path) -> dict[str, str]:
     }
 
 
-def _keys(ours: _Side, theirs: _Side, commit: str) -> Row:
-    """Kernels of the commit that this tree compiles anew; a changed body is a reason: no floor."""
-    before, now = theirs.kernels(), ours.kernels()
-    note = f"of {len(before)} at {commit}; {len(now)} now"
-    return Row("kernels of the commit that have another key now", len(before - now), "", note=note)
-
-
-def _speed(job: Job, ours: _Side, theirs: _Side, commit: str, num_envs: int) -> list[Row]:
+def _speed(job: Job, ours: Side, theirs: Side, commit: str, num_envs: int) -> list[Row]:
     """Steps and starts, in turns; medians. Kernels are compiled by then."""
     world, sensors = _WORLDS[0]
     steps, starts = (5, 1) if job.quick else (20, _STARTS)
-    samples: dict[_Side, list[float]] = {ours: [], theirs: []}
-    begun: dict[_Side, list[float]] = {ours: [], theirs: []}
+    samples: dict[Side, list[float]] = {ours: [], theirs: []}
+    begun: dict[Side, list[float]] = {ours: [], theirs: []}
     for _ in range(starts):
         for side in samples:
             player = _Player(side, world, sensors, num_envs)
@@ -188,7 +176,7 @@ def _median_interval(values: list[float]) -> tuple[float, float, float]:
 class _Player:
     """A process of one thread that steps when it is asked to; ``start_s``: CPU time up to its first step."""
 
-    def __init__(self, side: _Side, world: str, sensors: str, num_envs: int) -> None:
+    def __init__(self, side: Side, world: str, sensors: str, num_envs: int) -> None:
         self.process = subprocess.Popen(
             side.played("speed", world, sensors, str(num_envs)),
             env={**side.environment, "UUV_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
