@@ -4,6 +4,9 @@ import ast
 import dataclasses
 import errno
 import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +25,8 @@ from uuvtai.native.making import Native
 from uuvtai.native.store import MachineCode, Store, StoreError
 from uuvtai.state.arrays import allocate, array
 from uuvtai.taichi_patches.memory import Memory, address_of
+
+ROOT = Path(__file__).resolve().parent.parent
 
 N = 3000
 """more items than one block of a loop has, so that threads share them"""
@@ -183,6 +188,70 @@ def test_adopt_says_in_one_line_why_not(place, monkeypatch):
     with pytest.warns(RuntimeWarning, match=r"Taichi 1\.8\.0 is not 1\.7\.4"):
         making.adopt([scene.io], scene.memory)
     assert not native
+
+
+# ------------------------------------------------------------------------------------------------ processes
+
+_PROCESS = """
+import hashlib, os, signal, sys
+from uuvtai.runtime import start_taichi
+start_taichi("cpu")
+from tests.test_native import Scene
+from uuvtai.native import making, store
+if sys.argv[1] == "killed":
+    store.os.replace = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
+scene = Scene()
+making.adopt([scene.io], scene.memory)
+for _ in range(2):
+    total, out = scene.launch()
+found = making.native[0]
+print(found.made, found.found, hashlib.sha256(total.tobytes() + out.tobytes()).hexdigest())
+"""
+
+
+def begun(place, what="whole"):
+    """A process that launches the kernel by what is in ``place``, or makes it."""
+    environment = {**os.environ, "UUV_NATIVE_CACHE": str(place), "UUV_NUM_THREADS": "1"}
+    command = [sys.executable, "-c", _PROCESS, what]
+    return subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True)
+
+
+def said(process):
+    """Kernels made, kernels found, what came out."""
+    made, found, digest = process.communicate(timeout=300)[0].split()[-3:]
+    assert process.returncode == 0
+    return int(made), int(found), digest
+
+
+def test_ten_processes_on_an_empty_folder_end_with_one_whole_file(place):
+    results = [said(process) for process in [begun(place) for _ in range(10)]]
+    assert all(made + found == 1 for made, found, _ in results) and any(made for made, *_ in results)
+    assert len({digest for *_, digest in results}) == 1
+    assert [path.suffix for path in place.iterdir()] == [".kernel"]
+    assert said(begun(place)) == (0, 1, results[0][2])
+
+
+def test_a_process_killed_while_it_writes_leaves_nothing_that_is_run(place):
+    process = begun(place, "killed")
+    process.communicate(timeout=300)
+    assert process.returncode == -signal.SIGKILL
+    (part,) = place.iterdir()
+    assert part.suffix == ".part"
+    made, found, _ = said(begun(place))
+    assert (made, found) == (1, 0)
+    os.utime(part, (0, 0))
+    Store(place).bound()
+    assert [path.suffix for path in place.iterdir()] == [".kernel"], "an old unfinished file goes"
+
+
+def test_where_nothing_can_be_kept_taichi_launches(tmp_path, place, expected, monkeypatch):
+    """A home that cannot be written to: here a file stands in the way, for root may write anywhere."""
+    (tmp_path / "home").write_text("")
+    monkeypatch.setenv("UUV_NATIVE_CACHE", str(tmp_path / "home" / "native"))
+    scene = Scene()
+    with pytest.warns(RuntimeWarning, match=r"Not a directory; Taichi launches all kernels"):
+        making.adopt([scene.io], scene.memory)
+    np.testing.assert_array_equal(scene.launch(), expected[0])
 
 
 # ------------------------------------------------------------------------------------------------- keys

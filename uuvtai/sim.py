@@ -68,7 +68,7 @@ class Sim:
         self._memory = self.memory()
         self._put = self._memory.put
         if config.runtime.native and self.device.type == "cpu":
-            adopt(vars(self.io).values(), self._memory)
+            adopt(vars(self.io).values(), self._memory, alone=num_envs == 1)
         self.use_tree(tree)
         self.set_scenes()
         fill_constants(self.s, config, self._put)

@@ -133,7 +133,7 @@ class Machine:
         self.engines: list[Any] = []
         for name in ("GOMP_parallel", "omp_get_thread_num"):
             self.llvm.add_symbol(name, ctypes.cast(getattr(_openmp(), name), ctypes.c_void_p).value)
-        self._pool = ctypes.c_int32(threads)
+        self._pool, self._alone = ctypes.c_int32(threads), ctypes.c_int32(1)
         self._temporaries = ctypes.create_string_buffer(_TEMPORARY_BYTES)
         engine = self._engine(self.object_of(_LAUNCHER))
         launcher = engine.get_function_address("uuv_launch")
@@ -141,13 +141,14 @@ class Machine:
         address = ctypes.c_void_p
         self.launch = ctypes.CFUNCTYPE(None, address, ctypes.c_int32, address, address)(launcher)
 
-    def runtime(self, root: int) -> Any:
+    def runtime(self, root: int, alone: bool = False) -> Any:
         """What kernels take for Taichi's runtime: a buffer, to be kept while they may be launched. Every tree
-        of fields in it begins at the address ``root``: the same code serves whichever tree the arrays are."""
+        of fields in it begins at the address ``root``: the same code serves whichever tree the arrays are.
+        ``alone``: loops run in the calling thread, for batches that are not worth waking another one."""
         block = ctypes.create_string_buffer(_RUNTIME_BYTES)
         for offset in range(_ROOTS, _ROOTS + 8 * _TREES, 8):
             _set(block, offset, root)
-        _set(block, _POOL, ctypes.addressof(self._pool))
+        _set(block, _POOL, ctypes.addressof(self._alone if alone else self._pool))
         _set(block, _PARALLEL_FOR, self._parallel_for)
         _set(block, _TEMPORARIES, ctypes.addressof(self._temporaries))
         return block

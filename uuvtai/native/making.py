@@ -38,9 +38,10 @@ class Native:
         self.compiler: Compiler | None = None
         self.found, self.made, self.refused = 0, 0, 0
 
-    def adopt(self, bundles: Iterable[Any], memory: Memory) -> None:
-        """Launch kernels on these bundles, whose arrays are those of ``memory``."""
-        runtime = self.machine.runtime(memory.address)
+    def adopt(self, bundles: Iterable[Any], memory: Memory, alone: bool = False) -> None:
+        """Launch kernels on these bundles, whose arrays are those of ``memory``; ``alone``: in the calling
+        thread."""
+        runtime = self.machine.runtime(memory.address, alone)
         for bundle in bundles:
             self.adopted[bundle] = memory, runtime
 
@@ -100,13 +101,13 @@ class Native:
             warnings.warn(f"{kernel.func.__name__}: {error}; {effect}", RuntimeWarning, stacklevel=2)
 
 
-def adopt(bundles: Iterable[Any], memory: Memory) -> None:
+def adopt(bundles: Iterable[Any], memory: Memory, alone: bool = False) -> None:
     """Launch kernels on these bundles by machine code of their own from now on, where this machine allows it;
-    one line says why where it does not."""
+    one line says why where it does not. ``alone``: in the calling thread, without waking others."""
     try:
         if not native:
             native.append(Native())
-        native[0].adopt(bundles, memory)
+        native[0].adopt(bundles, memory, alone)
     except (UnfitError, StoreError) as error:
         warnings.warn(f"{error}; Taichi launches all kernels", RuntimeWarning, stacklevel=2)
 

@@ -8,6 +8,7 @@ import json
 import os
 import stat
 import tempfile
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +17,9 @@ from uuvtai.files import FileError, open_file, parsed_json
 _MAGIC = b"UUVNATIVE1\n"
 MOST_BYTES = 512 << 20
 _MOST_FILE_BYTES = 64 << 20
-_SUFFIX = ".kernel"
+_SUFFIX, _UNFINISHED = ".kernel", ".part"
+_STALE_S = 3600.0
+"""age of an unfinished file whose writer is dead for sure [s]"""
 
 
 class StoreError(Exception):
@@ -79,7 +82,7 @@ class Store:
         content = _MAGIC + digest + b"\n" + head + code.machine
         temporary = None
         try:
-            handle, temporary = tempfile.mkstemp(dir=self.folder, suffix=".part")
+            handle, temporary = tempfile.mkstemp(dir=self.folder, suffix=_UNFINISHED)
             with os.fdopen(handle, "wb") as file:
                 file.write(content)
             os.replace(temporary, self.folder / (key + _SUFFIX))
@@ -94,11 +97,16 @@ class Store:
         return self.bound(0)
 
     def bound(self, most_bytes: int = MOST_BYTES) -> int:
-        """Delete what was used longest ago until the rest fits; how many files."""
-        files = []
+        """Delete what killed processes left, then what was used longest ago until the rest fits; how many
+        files of the latter."""
+        files, now = [], time.time()
         for path in self.folder.iterdir():
             with contextlib.suppress(OSError):
-                files.append((path.lstat().st_mtime, path.lstat().st_size, path))
+                found = path.lstat()
+                if path.suffix == _UNFINISHED and now - found.st_mtime > _STALE_S:
+                    path.unlink()
+                    continue
+                files.append((found.st_mtime, found.st_size, path))
         files.sort()  # longest ago first
         total, deleted = sum(size for _, size, _ in files), 0
         for _, size, path in files:
