@@ -251,19 +251,19 @@ READ = {
 
 def test_mppi_is_the_same_in_a_batch_of_another_size(scene):
     body(scene, 0, 0, near(1.5, 0.1), [-0.5, 0.0])
-    sizes = array_sizes(scene.config, 3)
+    sizes = array_sizes(scene.config, 64)
     parts = {"baselines": state.allocate(state.BaselineState, sizes)}
     for noun, (kind, names) in READ.items():
         parts[noun] = state.allocate(kind, sizes)
         for name in names:
-            getattr(parts[noun], name).from_numpy(np.repeat(scene.views[f"{noun}.{name}"][:1], 3, 0))
+            getattr(parts[noun], name).from_numpy(np.repeat(scene.views[f"{noun}.{name}"][:1], 64, 0))
     io = io_for(PathIntegralIO, *parts.values(), scene.config)
     for step in (0, 5):
         scene.views["clock.step"][:] = step
-        parts["clock"].step.from_numpy(np.full(3, step, np.int32))
+        parts["clock"].step.from_numpy(np.full(64, step, np.int32))
         wanted = decide(scene, "mppi")[0]
         plan_path_integral(io)
-        np.testing.assert_array_equal(parts["baselines"].vel_w.to_numpy(), np.tile(wanted, (3, 1)))
+        np.testing.assert_array_equal(parts["baselines"].vel_w.to_numpy(), np.tile(wanted, (64, 1)))
 
 
 # ------------------------------------------------------------------------------------------------------ whole

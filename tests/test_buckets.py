@@ -35,9 +35,9 @@ def played(n_env, seed, **world):
 def test_sizes_are_few_and_never_too_small():
     rows = [rows_for(n) for n in range(1, 5000)]
     assert all(n <= row for n, row in enumerate(rows, 1)) and rows == sorted(rows)
-    assert sorted(set(rows)) == [1, 16, 64, 256, 1024, 2048, 4096, 8192]
+    assert sorted(set(rows)) == [1, 8, 64, 256, 512, 1024, 2048, 4096, 8192]
     config = load_config("pool", "paper")
-    assert array_sizes(config, 3) == array_sizes(config, 16) != array_sizes(config, 17)
+    assert array_sizes(config, 3) == array_sizes(config, 8) != array_sizes(config, 9)
 
 
 def test_kernels_do_not_see_how_many_obstacles_a_scene_has():
@@ -55,9 +55,9 @@ def test_kernels_do_not_see_how_many_obstacles_a_scene_has():
 @pytest.mark.skipif(sys.platform != "linux", reason="own machine code is for Linux")
 def test_other_batches_bodies_and_speeds_compile_nothing_and_change_nothing():
     """The first batch may compile; the others find its code, and an episode is the same in every batch."""
-    whole = played(9, 4, n_dynamic=6)
+    whole = played(6, 4, n_dynamic=6)
     made = native[0].made
     np.testing.assert_array_equal(played(2, 4, n_dynamic=6), whole[:2])
-    fewer = played(13, 4, n_dynamic=3, n_static=5, dynamic_speed_m_s=1.1)
-    assert not np.array_equal(fewer[:9], whole)
+    fewer = played(7, 4, n_dynamic=3, n_static=5, dynamic_speed_m_s=1.1)
+    assert not np.array_equal(fewer[:6], whole)
     assert native[0].made == made

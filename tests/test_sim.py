@@ -148,4 +148,4 @@ def test_absurd_sizes_are_refused_before_anything_is_allocated():
         check_size(config, 900_000, "cpu")
     with pytest.raises(MemoryError, match="not supported"):
         check_size(config, 10**9, "cpu")
-    assert memory_bytes(config, 20) < 2.1 * memory_bytes(config, 10)
+    assert memory_bytes(config, 400) < 2.1 * memory_bytes(config, 200)

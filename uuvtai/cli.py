@@ -424,9 +424,9 @@ def doctor(clean: opt.Clean = False, as_json: opt.AsJson = False) -> None:
         raise typer.Exit(FAILED)
 
 
-@app.command(epilog="Example: uuv warm --sensors nominal,paper --num-envs 16,256")
+@app.command(epilog="Example: uuv warm --sensors nominal,paper --num-envs 64,256")
 def warm(
-    num_envs: opt.BatchSizes = "1,16,256",
+    num_envs: opt.BatchSizes = "1,8,64,256",
     world: opt.World = "pool",
     sensors: opt.WarmSensors = "nominal,paper",
     overrides: opt.Set = None,

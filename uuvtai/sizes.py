@@ -22,7 +22,7 @@ from uuvtai.scenario import scenario_sizes
 from uuvtai.stages import SimState
 
 _MAX_ENVS = 1 << 20
-_ROWS = (1, 16, 64, 256, 1024)
+_ROWS = (1, 8, 64, 256)
 """sizes of a batch that are allocated; beyond them powers of two"""
 _PLAN_SLOTS = 64
 """Plans under way at once: far more than a CPU has cores, and the planner's scratch stays small."""
