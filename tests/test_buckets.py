@@ -1,11 +1,13 @@
 """Few sizes are ever compiled: other batches, obstacles and speeds find the machine code that is there."""
 
+import json
 import sys
 
 import numpy as np
 import pytest
 import torch
 
+from tests.command import uuv
 from uuvtai.loader import load_config
 from uuvtai.native.launch import native
 from uuvtai.sim import Sim
@@ -61,3 +63,12 @@ def test_other_batches_bodies_and_speeds_compile_nothing_and_change_nothing():
     fewer = played(7, 4, n_dynamic=3, n_static=5, dynamic_speed_m_s=1.1)
     assert not np.array_equal(fewer[:6], whole)
     assert native[0].made == made
+
+
+def test_warm_makes_what_another_process_finds(capfd):
+    """The session's small simulator is compiled already: every kernel is found."""
+    options = ("--num-envs", "8", "--sensors", "paper", "--set", "world.dynamic_capacity=9", "--json")
+    code, out, _ = uuv(capfd, "warm", *options)
+    (shape,) = json.loads(out)["shapes"]
+    assert code == 0 and (shape["sensors"], shape["num_envs"]) == ("paper", 8)
+    assert shape["compiled"] + shape["found"] > 30

@@ -447,7 +447,7 @@ def warm(
     shapes = [Shape(scene, size) for scene in scenes for size in sizes]
     for shape in shapes:
         check_size(shape.scene.config(), shape.num_envs, "cpu")
-    say(f"compiling {len(shapes)} sizes; the first time this takes about a minute each")
+    say(f"sizes to compile: {len(shapes)}, about a minute each the first time")
     found = run(shapes, workers or None)
     _print({"shapes": found}, as_json, lambda: show_shapes(Screen(wide), found))
 
