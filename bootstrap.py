@@ -66,6 +66,7 @@ def test(arguments: list[str]) -> int:
     ):  # torch's threads of two test processes on two cores wait for each other more than they work
         os.environ.setdefault("OMP_NUM_THREADS", "1")
         os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+        os.environ.setdefault("UUV_COMPILERS", "1")
     warm = None if arguments else subprocess.Popen([python, "-m", "tests.warm"], cwd=ROOT)
     checks = [
         [str(BIN / "ruff"), "check", "."],

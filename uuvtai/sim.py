@@ -7,8 +7,10 @@ mapping -> clearance -> planning -> features -> teacher -> reward. A pass works 
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
+from functools import partial
 
 import numpy as np
 import taichi as ti
@@ -68,7 +70,8 @@ class Sim:
         self._memory = self.memory()
         self._put = self._memory.put
         if config.runtime.native and self.device.type == "cpu":
-            adopt(vars(self.io).values(), self._memory, alone=num_envs == 1)
+            recipe = partial(pickle.dumps, (config, num_envs, tree))
+            adopt(vars(self.io).values(), self._memory, recipe, alone=num_envs == 1)
         self.use_tree(tree)
         self.set_scenes()
         fill_constants(self.s, config, self._put)

@@ -118,7 +118,8 @@ def without_cse(launch: _T) -> _T:
 
 
 @contextlib.contextmanager
-def _compiling(kernel: Any) -> Iterator[None]:
+def compiling(kernel: Any) -> Iterator[None]:
+    """As this kernel wants to be compiled (``without_cse``)."""
     program: Any = impl.get_runtime().prog
     config, before = program.config(), program.config().opt_level
     config.opt_level = 0 if getattr(kernel, "without_cse", False) else before
@@ -130,7 +131,7 @@ def _compiling(kernel: Any) -> Iterator[None]:
 
 def _first(launch: Callable, kernel: Any, arguments: tuple) -> Launch | None:
     """Launch with arguments that were not seen before; how to do it again, None where Taichi has to look."""
-    with _compiling(kernel):
+    with compiling(kernel):
         return _compiled(launch, kernel, arguments)
 
 

@@ -7,19 +7,31 @@ import os
 import sys
 import warnings
 import weakref
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import taichi as ti
 import torch
 
+from uuvtai.native.companion import Companion
 from uuvtai.native.keys import KeyNameError, key_of
 from uuvtai.native.launch import Launch, NativeLaunch, TaichiLaunch, native, written
 from uuvtai.native.machine import Machine, UnfitError, tasks_in
 from uuvtai.native.store import MachineCode, Store, StoreError, default_folder
 from uuvtai.native.taichi_code import Compiler
 from uuvtai.taichi_patches.memory import Memory
+
+
+@dataclass(frozen=True)
+class Owner:
+    """What a bundle's kernels need to know of its simulator."""
+
+    memory: Memory
+    runtime: Any
+    recipe: Callable[[], bytes] | None
+    """what another process can build the same simulator by (``other_end``)"""
 
 
 class Native:
@@ -34,29 +46,36 @@ class Native:
         self.store = Store(default_folder())
         self.machine = Machine(int(os.environ.get("UUV_NUM_THREADS") or os.cpu_count() or 1))
         self.surroundings = [*self.machine.surroundings(), *map(str, ti.__version__)]
-        self.adopted: weakref.WeakKeyDictionary[Any, tuple[Memory, Any]] = weakref.WeakKeyDictionary()
+        self.adopted: weakref.WeakKeyDictionary[Any, Owner] = weakref.WeakKeyDictionary()
         self.compiler: Compiler | None = None
+        self.companion = Companion()
         self.found, self.made, self.refused = 0, 0, 0
 
-    def adopt(self, bundles: Iterable[Any], memory: Memory, alone: bool = False) -> None:
+    def adopt(
+        self,
+        bundles: Iterable[Any],
+        memory: Memory,
+        recipe: Callable[[], bytes] | None = None,
+        alone: bool = False,
+    ) -> None:
         """Launch kernels on these bundles, whose arrays are those of ``memory``; ``alone``: in the calling
         thread."""
-        runtime = self.machine.runtime(memory.address, alone)
+        owner = Owner(memory, self.machine.runtime(memory.address, alone), recipe)
         for bundle in bundles:
-            self.adopted[bundle] = memory, runtime
+            self.adopted[bundle] = owner
 
     def first(self, kernel: Any, arguments: tuple) -> Launch | None:
         """Launch with arguments that were not seen before; None where this is nothing for us."""
-        memory, runtime = self.adopted.get(arguments[0], (None, None)) if arguments else (None, None)
-        if memory is None or not all(_is_plain(value) for value in arguments[1:]):
+        owner = self.adopted.get(arguments[0]) if arguments else None
+        if owner is None or not all(_is_plain(value) for value in arguments[1:]):
             return None
         try:
-            key = key_of(kernel, arguments, memory.tree, self.surroundings)
+            key = key_of(kernel, arguments, owner.memory.tree, self.surroundings)
             code = self.store.get(key)
             if code is None:
-                return self._make(key, kernel, arguments, memory, runtime)
+                return self._make(key, kernel, arguments, owner)
             tasks = self.machine.tasks_of(code.machine, code.tasks)
-            launch = NativeLaunch(self.machine, runtime, tasks, kernel, arguments)
+            launch = NativeLaunch(self.machine, owner.runtime, tasks, kernel, arguments)
         except (UnfitError, KeyNameError, StoreError) as error:
             self._tell(kernel, error)
             return None
@@ -64,23 +83,26 @@ class Native:
         self.found += 1
         return launch
 
-    def _make(self, key: str, kernel: Any, arguments: tuple, memory: Memory, runtime: Any) -> Launch:
+    def _make(self, key: str, kernel: Any, arguments: tuple, owner: Owner) -> Launch:
         """Compile, launch both codes, keep ours if it did what Taichi's did."""
         if self.compiler is None:
             self.compiler = Compiler()
             atexit.register(self.compiler.close)
+            atexit.register(self.companion.close)
             self.store.bound()
+        if owner.recipe:
+            self.companion.ask(owner.recipe())
         made = kernel.compiled_kernels[kernel.ensure_compiled(*arguments)]
         compiled, text = self.compiler.compiled(made)
         names = tasks_in(text)
         work = self.compiler.beside(self.machine.object_of, text)
         taichi = TaichiLaunch(kernel, arguments, (made, compiled))
-        state = Written(arguments, memory)
+        state = Written(arguments, owner.memory)
         taichi.again()
         try:
             code = MachineCode(names, work())
             tasks = self.machine.tasks_of(code.machine, code.tasks)
-            ours = NativeLaunch(self.machine, runtime, tasks, kernel, arguments)
+            ours = NativeLaunch(self.machine, owner.runtime, tasks, kernel, arguments)
         except UnfitError as error:
             self._tell(kernel, error)
             return taichi
@@ -101,13 +123,19 @@ class Native:
             warnings.warn(f"{kernel.func.__name__}: {error}; {effect}", RuntimeWarning, stacklevel=2)
 
 
-def adopt(bundles: Iterable[Any], memory: Memory, alone: bool = False) -> None:
+def adopt(
+    bundles: Iterable[Any],
+    memory: Memory,
+    recipe: Callable[[], bytes] | None = None,
+    alone: bool = False,
+) -> None:
     """Launch kernels on these bundles by machine code of their own from now on, where this machine allows it;
-    one line says why where it does not. ``alone``: in the calling thread, without waking others."""
+    one line says why where it does not. ``recipe``: what a second process compiles the same by, where much is
+    to be compiled; ``alone``: in the calling thread, without waking others."""
     try:
         if not native:
             native.append(Native())
-        native[0].adopt(bundles, memory, alone)
+        native[0].adopt(bundles, memory, recipe, alone)
     except (UnfitError, StoreError) as error:
         warnings.warn(f"{error}; Taichi launches all kernels", RuntimeWarning, stacklevel=2)
 

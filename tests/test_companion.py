@@ -1,0 +1,114 @@
+"""The second process of a cold start: it compiles what the first one will look for, and never outlives it."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from uuvtai.native import companion
+from uuvtai.native.companion import Companion, compilers
+from uuvtai.native.keys import key_of
+from uuvtai.native.launch import native
+from uuvtai.other_end import calls_of
+from uuvtai.sim import Sim
+
+MANY = 40
+"""kernels that a reset and a step have at the least"""
+
+
+@pytest.fixture(scope="module")
+def another(small):
+    """The small simulator built once more: nothing of it has been launched."""
+    return Sim(small.config, small.N, small.trees["bt"])
+
+
+def test_it_knows_every_launch_and_makes_none(another):
+    kept = list(native)
+    calls = calls_of(another)
+    assert len(calls) >= MANY and native == kept
+    names = [kernel.func.__name__ for kernel, _ in calls]
+    assert names[0] == "generate_scenarios" and "tick_tree" in names
+    assert not another.s.clock.step.to_numpy().any() and not another.s.episode.key.to_numpy().any()
+
+
+def test_its_keys_are_those_that_the_first_process_looks_for(small, another):
+    small.begin([0, 1])
+    small.sim.step()
+    keys = {
+        kernel.func.__name__: key_of(kernel, arguments, another.memory().tree, native[0].surroundings)
+        for kernel, arguments in calls_of(another)
+    }
+    looked_for = ("generate_scenarios", "update_map", "follow_bodies", "plan_evasion", "compute_reward")
+    assert all(native[0].store.get(keys[name]) for name in looked_for)
+
+
+def test_it_ends_when_its_pipe_closes():
+    done = subprocess.run(
+        [sys.executable, "-m", companion.PROGRAM], input=b"", capture_output=True, timeout=120, check=False
+    )
+    assert (done.returncode, done.stdout) == (0, b"")
+
+
+SLEEPER = """
+import os, sys, pathlib
+sys.stdin.buffer.read(8)
+pathlib.Path(os.environ["TOLD"]).write_text(str(os.getpid()))
+sys.stdin.buffer.read()
+"""
+ASKER = """
+import os, pathlib, time
+from uuvtai.native import companion
+companion.PROGRAM = "sleeper"
+one = companion.Companion()
+one.ask(b"recipe")
+one.ask(b"another while it is busy")
+assert one.is_busy()
+while not pathlib.Path(os.environ["TOLD"]).exists():
+    time.sleep(0.01)
+print("up", flush=True)
+time.sleep(600)
+"""
+
+
+def test_killing_who_asked_ends_it(tmp_path):
+    (tmp_path / "sleeper.py").write_text(SLEEPER)
+    told = tmp_path / "told"
+    environment = os.environ | {
+        "TOLD": str(told),
+        "UUV_COMPILERS": "2",
+        "PYTHONPATH": os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")]),
+    }
+    with subprocess.Popen([sys.executable, "-c", ASKER], env=environment, stdout=subprocess.PIPE) as asker:
+        assert asker.stdout and asker.stdout.readline() == b"up\n"
+        asker.send_signal(signal.SIGKILL)
+    number = int(told.read_text())
+    for _ in range(1000):
+        if not _runs(number):
+            return
+        time.sleep(0.01)
+    raise AssertionError("the second process outlives the first")
+
+
+def _runs(number):
+    try:
+        state = Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state != "Z"
+
+
+def test_one_core_has_one_compiler(monkeypatch):
+    monkeypatch.delenv("UUV_COMPILERS", raising=False)
+    monkeypatch.setenv("UUV_NUM_THREADS", "1")
+    assert compilers() == 1
+    one = Companion()
+    one.ask(b"recipe")
+    assert not one.is_busy()
+    monkeypatch.setenv("UUV_NUM_THREADS", "8")
+    assert compilers() == 2
+    monkeypatch.setenv("UUV_COMPILERS", "1")
+    assert compilers() == 1
