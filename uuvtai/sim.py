@@ -1,7 +1,7 @@
 """The simulator: allocates every struct and runs the stages in order. ``Sim.step`` is the page to read first.
 
 Data goes one way: action -> actuation -> dynamics -> world -> referee -> sensing -> pose -> tracking ->
-mapping -> clearance -> planning -> features -> teacher -> reward. A pass works on the rows whose
+mapping -> clearance -> planning -> teacher -> features -> reward. A pass works on the rows whose
 ``clock.awake`` is 1: all running rows in a step, only the rows being reset in a reset.
 """
 
@@ -139,8 +139,6 @@ class Sim:
                 true_map.stamp_truth(io.true_map)
         with self._stage("clearance"):
             clearance.compute_clearance(io.clearance)
-        with self._stage("features"):
-            features.sense_sectors(io.features)
         with self._stage("planning"):
             if c.quiet.weight_seen > 0:
                 exposure.average_traffic(io.exposure)
@@ -193,6 +191,7 @@ class Sim:
 
     def _observe(self, obs: torch.Tensor) -> None:
         io, c = self.io, self.config.features
+        features.sense_sectors(io.features)
         features.write_observation(io.features, obs)
         if c.n_track > 0:
             features.write_bodies(io.features, obs)
