@@ -1,11 +1,12 @@
 """Velocity loop, allocation, rotors and two midpoint substeps of Fossen's equation, against the same on NumPy
-and torch arrays."""
+and torch arrays, and fused by torch.compile."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ DEVICES = ("cpu", "cuda")
 FLOOR = 4e6
 """[env-steps/s] at 16,384 envs on two CPU cores"""
 _CHECKED_STEPS = 25
+_FUSED = "torch.compile"
 AGREEMENT = 2e-5
 """[m, m/s, rad/s] half a second of single precision on both sides"""
 
@@ -32,18 +34,18 @@ def measure(job: Job) -> list[Row]:
     config = Config()
     plant = Plant(config, start_taichi(job.device), n_env)
     plant.reset()
-    peers = {"NumPy": Vehicles(config, n_env, np), "torch": Vehicles(config, n_env, torch, job.device)}
+    peers = {"NumPy": Vehicles(config, n_env, np)}
+    peers |= {name: Vehicles(config, n_env, torch, job.device) for name in ("torch", _FUSED)}
+    steps = {name: _step_of_peer(peer, name, job.device) for name, peer in peers.items()}
     actions = np.random.default_rng(0).uniform(-1, 1, (n_env, 4)).astype(np.float32)
-    turned = {
-        "NumPy": np.ascontiguousarray(actions.T),
-        "torch": torch.from_numpy(actions.T).contiguous().to(job.device),
-    }
-    worst = disagreement(plant, peers, actions, turned)
+    given = torch.from_numpy(actions.T).contiguous().to(job.device)
+    turned = dict.fromkeys(peers, given) | {"NumPy": np.ascontiguousarray(actions.T)}
+    worst = disagreement(plant, peers, steps, actions, turned)
     if worst > AGREEMENT:
         raise RuntimeError(f"kernels and peers disagree by {worst:.2g}")
 
     ours = _step_of(config, plant, torch.from_numpy(actions).to(job.device))
-    theirs = {name: _step_of_peer(peer, turned[name], job.device) for name, peer in peers.items()}
+    theirs = {name: partial(step, turned[name]) for name, step in steps.items()}
     cost = seconds_per_call({"ours": ours, **theirs}, job.seconds, clock=time.perf_counter)
     cpu_ns = 1e9 * seconds_per_call({"ours": ours}, job.seconds / 3)["ours"] / n_env
     row = Row(
@@ -71,27 +73,32 @@ def _step_of(config: Config, plant: Plant, shared: torch.Tensor) -> Callable[[],
     return step
 
 
-def _step_of_peer(peer: Vehicles, action: Any, device: str) -> Callable[[], None]:
-    """One call: the same of a peer."""
+def _step_of_peer(peer: Vehicles, name: str, device: str) -> Callable[[Any], None]:
+    """The same of a peer, for its actions."""
+    fused = peer.compiled() if name == _FUSED else None
 
-    def step() -> None:
-        peer.control(action)
-        peer.move()
+    def step(action: Any) -> None:
+        if fused:
+            fused(action)
+        else:
+            peer.control(action)
+            peer.move()
         if device == "cuda":
             torch.cuda.synchronize()
 
     return step
 
 
-def disagreement(plant: Plant, peers: dict[str, Vehicles], actions: np.ndarray, turned: dict) -> float:
+def disagreement(
+    plant: Plant, peers: dict[str, Vehicles], steps: dict[str, Callable], actions: np.ndarray, turned: dict
+) -> float:
     """Largest difference in position, velocity and turn rate after half a second from rest."""
     worst = 0.0
     for _ in range(_CHECKED_STEPS):
         plant.step(actions)
     for name, peer in peers.items():
         for _ in range(_CHECKED_STEPS):
-            peer.control(turned[name])
-            peer.move()
+            steps[name](turned[name])
         for field, values in (
             (plant.vehicle.pos_w, peer.pos),
             (plant.vehicle.vel_b, peer.vel),

@@ -1,4 +1,5 @@
-"""Plans of the Voronoi route against OMPL's RRT on the same maps, with the same traversable cells."""
+"""Plans of the Voronoi route against OMPL's RRT and a compiled A* on the same maps, with the same traversable
+cells."""
 
 from __future__ import annotations
 
@@ -49,23 +50,54 @@ def measure(job: Job) -> list[Row]:
             rrt.solve_rrt(_START, _GOAL, grid, check, 20_000, i, 1.0) for i, (grid, check) in enumerate(pairs)
         ]
 
+    weights = [_weights(grid) for grid in grids]
+
+    def shortest():
+        return [_a_star(cells) for cells in weights]
+
     ours()
-    mine, others = _way_costs(s["route"], theirs(), grids)
-    cost = seconds_per_call({"ours": ours, "peer": theirs}, job.seconds)
-    return [
-        Row(
+    mine = _our_cost(s["route"], grids)
+    cost = seconds_per_call({"ours": ours, "OMPL RRT": theirs, "pyastar2d": shortest}, job.seconds)
+    notes = {
+        "OMPL RRT": "OMPL calls a validity checker in Python",
+        "pyastar2d": "C++, eight neighbours, weights 1/clearance made beforehand",
+    }
+    rows = []
+    for name, ways in (("OMPL RRT", theirs()), ("pyastar2d", shortest())):
+        others = _peer_cost(name, ways, grids)
+        row = Row(
             what=f"plans over {_N_BODY} bodies, grid {maps.SHAPE[1]} x {maps.SHAPE[0]}",
             ours=n_env / cost["ours"],
-            peer=n_env / cost["peer"],
-            peer_name="OMPL RRT",
+            peer=n_env / cost[name],
+            peer_name=name,
             unit="plans/s per core",
-            floor=FLOOR,
-            floor_on="ratio",
-            note=f"{1e6 * cost['ours'] / n_env:.0f} against {1e6 * cost['peer'] / n_env:.0f} us a plan; "
-            f"cost of the way {mine:.0f} against {others:.0f}; OMPL calls a validity checker in Python",
+            note=f"{1e6 * cost['ours'] / n_env:.0f} against {1e6 * cost[name] / n_env:.0f} us a plan; "
+            f"cost of the way {mine:.1f} against {others:.1f}; {notes[name]}",
             details={"num_envs": n_env, "way_cost": mine, "peer_way_cost": others},
         )
-    ]
+        rows.append(row)
+    rows[0].floor, rows[0].floor_on = FLOOR, "ratio"
+    return rows
+
+
+def _weights(grid: rrt.ClearanceGrid) -> np.ndarray:
+    """Cost of a cell for A*: 1 where there is most room, in proportion to 1/clearance, infinite where the way
+    is closed."""
+    room = grid.clearance_m
+    costs = (float(room.max()) / np.maximum(room, 0.1)).astype(np.float32)
+    costs[~grid.open] = np.inf
+    return costs
+
+
+def _a_star(weights: np.ndarray) -> list[tuple[float, float]] | None:
+    """Way through the cells' centres [m], None where there is none."""
+    import pyastar2d
+
+    cells = pyastar2d.astar_path(weights, maps.cell_of(_START), maps.cell_of(_GOAL), allow_diagonal=True)
+    if cells is None:
+        return None
+    centres = (cells[:, ::-1] + 0.5) * maps.CELL_M + np.asarray(maps.ORIGIN[:2])
+    return [_START, *map(tuple, centres[1:-1]), _GOAL]
 
 
 def _maps(n: int, config: Config) -> list[tuple]:
@@ -115,17 +147,19 @@ def _structs(n_env: int, config: Config, found: list[tuple]) -> dict:
     return s
 
 
-def _way_costs(ours: state.RouteState, theirs: list, grids: list[rrt.ClearanceGrid]) -> tuple[float, float]:
-    """Mean cost of our ways and of the peer's. Raises RuntimeError where a map is without one: all of them
-    have ways."""
-    failed, lost = sum(ours.fallback_reason.to_numpy() != FAIL_NONE), sum(path is None for path in theirs)
-    if failed or lost:
-        raise RuntimeError(f"{failed} maps without our route, {lost} without OMPL's; all of them have one")
+def _our_cost(ours: state.RouteState, grids: list[rrt.ClearanceGrid]) -> float:
+    """Mean cost of our ways. Raises RuntimeError where a map is without one: all of them have ways."""
+    if failed := sum(ours.fallback_reason.to_numpy() != FAIL_NONE):
+        raise RuntimeError(f"{failed} maps without our route; all of them have one")
     ways, counts = ours.way_w.to_numpy(), ours.n_way.to_numpy()
-    mine = [_cost(ways[i, : counts[i]], grid) for i, grid in enumerate(grids)]
-    return float(np.mean(mine)), float(
-        np.mean([_cost(path, grid) for path, grid in zip(theirs, grids, strict=True)])
-    )
+    return float(np.mean([_cost(ways[i, : counts[i]], grid) for i, grid in enumerate(grids)]))
+
+
+def _peer_cost(name: str, theirs: list, grids: list[rrt.ClearanceGrid]) -> float:
+    """Mean cost of a peer's ways. Raises RuntimeError as ``_our_cost``."""
+    if lost := sum(path is None for path in theirs):
+        raise RuntimeError(f"{lost} maps without {name}'s route; all of them have one")
+    return float(np.mean([_cost(np.array(path), grid) for path, grid in zip(theirs, grids, strict=True)]))
 
 
 def _cost(way: np.ndarray, grid: rrt.ClearanceGrid) -> float:

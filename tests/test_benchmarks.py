@@ -105,9 +105,9 @@ def test_peers_of_dynamics_agree_and_a_wrong_one_is_seen():
         plant.reset()
         peer = Vehicles(config, n_env, xp)
         peer.quadratic *= factor
-        return dynamics.disagreement(
-            plant, {"peer": peer}, actions, {"peer": columns if xp is np else torch.from_numpy(columns)}
-        )
+        turned = {"peer": columns if xp is np else torch.from_numpy(columns)}
+        steps = {"peer": dynamics._step_of_peer(peer, "peer", "cpu")}
+        return dynamics.disagreement(plant, {"peer": peer}, steps, actions, turned)
 
     assert apart(np, 1.0) < dynamics.AGREEMENT and apart(torch, 1.0) < dynamics.AGREEMENT < apart(
         torch, 1.001

@@ -7,6 +7,7 @@ n_env) in single precision.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,8 @@ from uuvtai.allocation import allocation_matrices
 from uuvtai.config import Config
 from uuvtai.kernels.vehicle.actuation import axis_loops
 from uuvtai.kernels.vehicle.rotor import KGF, edge_rpm, thrust_at, thrust_limits
+
+_STATE = ("pos", "vel", "rate", "quat", "rpm", "rpm_command", "integral")
 
 
 class Vehicles:
@@ -47,7 +50,31 @@ class Vehicles:
         return made if self.xp is np else self.xp.from_numpy(made).to(self.device)
 
     def _column(self, values: Any) -> Any:
-        return self._array(np.reshape(values, (-1, 1)))
+        if self.xp is np:
+            return self._array(np.reshape(values, (-1, 1)))
+        rows = [[float(value)] for value in values]  # a constant that torch.compile understands
+        return self.xp.tensor(rows, dtype=self.xp.float32, device=self.device)
+
+    # ---------------------------------------------------------------------------------------------- compiled
+
+    def compiled(self) -> Callable[[Any], None]:
+        """A control step (``control`` and ``move``) as one function that ``torch.compile`` has fused."""
+
+        def step(state: tuple, action: Any) -> tuple:
+            for name, values in zip(_STATE, state, strict=True):
+                setattr(self, name, values)
+            self.control(action)
+            self.move()
+            return tuple(getattr(self, name) for name in _STATE)
+
+        fused = self.xp.compile(step, fullgraph=True)
+
+        def again(action: Any) -> None:
+            after = fused(tuple(getattr(self, name) for name in _STATE), action)
+            for name, values in zip(_STATE, after, strict=True):
+                setattr(self, name, values)
+
+        return again
 
     # --------------------------------------------------------------------------------------------- inner loop
 

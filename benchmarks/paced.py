@@ -1,0 +1,114 @@
+"""Time of a control step beside another commit (``--against``, default HEAD): one vehicle paced at 50 Hz, and
+1,024 on all cores.
+
+Back to back, one step warms the caches and keeps the threads awake for the next; a vehicle's loop sleeps in
+between. Both sides run in this environment with caches of their own, in turns.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import statistics
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.before import ROOT, Side, checked_out
+from benchmarks.common import Job, Row
+
+LONGEST_S = 3600
+_SENSORS = ("nominal", "paper")
+
+
+def measure(job: Job) -> list[Row]:
+    """Quantiles of the paced step [ms], and env-steps per second."""
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        commit, tree = stack.enter_context(checked_out(job.against or "HEAD", folder / "tree"))
+        sides = Side(ROOT, folder / "ours"), Side(tree, folder / "theirs")
+        rows = []
+        for sensors in _SENSORS[: 1 if job.quick else None]:
+            rows += _paced(job, sides, sensors, commit)
+            rows.append(_together(job, sides, sensors, commit))
+            job.say(rows[-1].what)
+        return rows
+
+
+def _paced(job: Job, sides: tuple[Side, Side], sensors: str, commit: str) -> list[Row]:
+    steps, turns = (50, 1) if job.quick else (1000, 5)
+    found: list[list[list[float]]] = [[], []]
+    for i, answers in _in_turns(sides, "paced", sensors, 1, steps, turns):
+        found[i].append(json.loads(answers))
+    what = f"one vehicle at 50 Hz, {sensors} sensing: "
+    details = {"steps_a_turn": steps, "turns": turns}
+    quantiles = {"median": 0.5, "99th percentile": 0.99, "longest": 1.0}
+    rows = []
+    for name, share in quantiles.items():
+        ours, theirs = (statistics.median(float(np.quantile(turn, share)) for turn in side) for side in found)
+        rows.append(
+            Row(what + name, ours, "ms", theirs, commit, less_is_better=True, note="median of the turns",
+                details=details)
+        )  # fmt: skip
+    return rows
+
+
+def _together(job: Job, sides: tuple[Side, Side], sensors: str, commit: str) -> Row:
+    num_envs, steps, turns = (16, 5, 1) if job.quick else (1024, 20, 15)
+    found: list[list[float]] = [[], []]
+    for i, seconds in _in_turns(sides, "all_cores", sensors, num_envs, steps, turns):
+        found[i].append(steps * num_envs / float(seconds))
+    ours, theirs = (statistics.median(rates) for rates in found)
+    return Row(
+        f"{num_envs:,} vehicles, {sensors} sensing, tree alone, all cores",
+        ours,
+        "env-steps/s",
+        theirs,
+        commit,
+        details={"ours": found[0], "theirs": found[1]},
+    )
+
+
+def _in_turns(
+    sides: tuple[Side, Side], what: str, sensors: str, num_envs: int, steps: int, turns: int
+) -> list[tuple[int, str]]:
+    """(side, answer) of every turn."""
+    with contextlib.ExitStack() as stack:
+        players = [stack.enter_context(_player(side, what, sensors, num_envs)) for side in sides]
+        for player in players:  # what is new to the caches
+            _asked(player, steps)
+        return [
+            (i, _asked(players[i], steps)) for turn in range(turns) for i in ((0, 1) if turn % 2 else (1, 0))
+        ]
+
+
+@contextlib.contextmanager
+def _player(side: Side, what: str, sensors: str, num_envs: int) -> Iterator[subprocess.Popen[str]]:
+    command = side.played(what, "pool", sensors, str(num_envs))
+    with subprocess.Popen(
+        command, env=side.environment, cwd=side.tree, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        _line(process, "ready")
+        yield process
+        assert process.stdin
+        process.stdin.close()
+
+
+def _asked(process: subprocess.Popen[str], steps: int) -> str:
+    assert process.stdin
+    process.stdin.write(f"{steps}\n")
+    process.stdin.flush()
+    return _line(process, "steps")
+
+
+def _line(process: subprocess.Popen[str], word: str) -> str:
+    """The rest of the next line that begins with this word. Raises RuntimeError where the process ends
+    before."""
+    assert process.stdout
+    for line in process.stdout:
+        if line.startswith(word):
+            return line.removeprefix(word)
+    raise RuntimeError("the player ended early")
