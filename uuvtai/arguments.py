@@ -48,6 +48,21 @@ def refuse_less(option: str, value: int, least: int) -> None:
         raise UsageError(f"{option} {value}: must be at least {least}")
 
 
+def drivers(
+    runs: list[str] | None, controller: list[str] | None, planner: list[str] | None, policy: list[str] | None
+) -> tuple[list[str], list[str]]:
+    """(trained policies, controllers with the user's own pieces among them) of RUN, --controller, --planner
+    and --policy; a --policy that is no file of hers is a RUN."""
+    from uuvtai.own.piece_spec import CONTROLLER, PLANNER, POLICY, is_piece, piece_spec
+
+    trained = [*(runs or []), *(name for name in policy or [] if not is_piece(name))]
+    own = [piece_spec(name, PLANNER).text for name in planner or []]
+    own += [piece_spec(name, POLICY).text for name in policy or [] if is_piece(name)]
+    named = controllers(controller, bool(trained or own))
+    found = [piece_spec(name, CONTROLLER).text if is_piece(name) else name for name in named]
+    return trained, [*found, *own]
+
+
 def controllers(given: list[str] | None, has_policies: bool) -> list[str]:
     """Names typed with --controller; without any all three, or the tree alone beside a policy."""
     default = ["bt"] if has_policies else ["straight", "planner", "bt"]

@@ -49,6 +49,8 @@ def evaluate(
     ctx: typer.Context,
     runs: opt.EvalRuns = None,
     controller: opt.EvalControllers = None,
+    planner: opt.Planners = None,
+    policy: opt.Policies = None,
     world: opt.World = "pool",
     sensors: opt.Sensors = None,
     vehicle: opt.Vehicle = None,
@@ -65,6 +67,7 @@ def evaluate(
     explain: opt.Explain = False,
     explain_record: opt.ExplainRecord = None,
     resume: opt.EvalResume = None,
+    allow_code: opt.AllowCode = False,
     device: opt.Device = "auto",
     overrides: opt.Set = None,
     with_report: opt.WithReport = False,
@@ -74,10 +77,10 @@ def evaluate(
 ) -> None:
     """Play the same episodes with every controller and trained policy and print the table of methods."""
     if resume is not None:
-        arguments.refuse_beside_resume(ctx)
+        arguments.refuse_beside_resume(ctx, ("allow_code",))
         from uuvtai.measure.evaluate.compare import resume as go_on
 
-        result, folder = go_on(resume, Progress())
+        result, folder = go_on(resume, Progress(), allow_code)
     else:
         seed_list = arguments.seeds(seeds)
         _refuse_counts(episodes, record, explain, explain_record)
@@ -85,8 +88,9 @@ def evaluate(
         from uuvtai.measure.evaluate.eval_request import Request
 
         scene = SceneOptions(world, sensors, vehicle, stack, n_static, n_dynamic, speed, overrides)
+        trained, controllers = arguments.drivers(runs, controller, planner, policy)
         request = Request.typed(
-            scene, world, runs or [], controllers=arguments.controllers(controller, bool(runs)),
+            scene, world, trained, controllers=controllers,
             seeds=seed_list, episodes=episodes, num_envs=num_envs, record=record, video=video,
             depth_images=depth_images, explain=explain,
             explain_record=3 if explain_record is None else explain_record, device=device, run_dir=run_dir,

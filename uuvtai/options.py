@@ -101,8 +101,32 @@ EvalControllers = Annotated[
         "local planners of the literature; paper = bt on the paper's own stack, a row of "
         "its own; none = policies alone \\[default: straight, planner, bt, beside a RUN bt]. Privileged "
         "yardsticks: NAME+truth (a tree that knows where every moving body is), oracle (knows the future: an "
-        "upper bound).",
+        "upper bound). A function of yours: mine.py:act (docs/own_pieces.md).",
     ),
+]
+Planners = Annotated[
+    list[str] | None,
+    Option(
+        "--planner",
+        metavar="FILE.py:NAME",
+        help="A route planner of yours, mine.py:plan, in the place of the built-in one: a row of its own, "
+        "driven by bt (repeatable).",
+        autocompletion=choices.files(".py"),
+    ),
+]
+Policies = Annotated[
+    list[str] | None,
+    Option(
+        "--policy",
+        metavar="FILE",
+        help="A policy of yours: model.onnx, or mine.py:load, which returns one of any library; mine.py:load=TEXT "
+        "hands it the text (repeatable).",
+        autocompletion=choices.files(".onnx", ".py"),
+    ),
+]
+AllowCode = Annotated[
+    bool,
+    Option("--allow-code", help="With --resume: the Python files that the run folder names may be run."),
 ]
 EvalEpisodes = Annotated[int, Option("--episodes", help="Episodes per seed.")]
 Record = Annotated[
@@ -186,7 +210,7 @@ Substep = Annotated[float, Option("--dt", help="Dynamics substep \\[s].")]
 SweepRuns = Annotated[list[str] | None, _players("[RUN]...", "Trained policies, as for eval.")]
 SweepControllers = Annotated[
     list[str] | None,
-    _controllers("straight, planner, bt or a tree's XML (repeatable) \\[default: bt]."),
+    _controllers("straight, planner, bt, a tree's XML or mine.py:act (repeatable) \\[default: bt]."),
 ]
 GridAxes = Annotated[
     list[str] | None,
