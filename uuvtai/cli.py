@@ -205,6 +205,8 @@ def sweep(
     ctx: typer.Context,
     runs: opt.SweepRuns = None,
     controller: opt.SweepControllers = None,
+    planner: opt.Planners = None,
+    policy: opt.Policies = None,
     grid: opt.GridAxes = None,
     world: opt.World = "pool",
     sensors: opt.Sensors = None,
@@ -220,6 +222,7 @@ def sweep(
     workers: opt.Workers = 1,
     address: opt.Address = "auto",
     resume: opt.SweepResume = None,
+    allow_code: opt.AllowCode = False,
     device: opt.Device = "auto",
     with_report: opt.WithReport = False,
     overrides: opt.Set = None,
@@ -239,12 +242,12 @@ def sweep(
     progress = Progress("cells")
     if resume is not None:
         arguments.refuse_beside_resume(ctx, _SWEEP_RESUME)
-        result, folder = play.resume(resume, engine_of(engine, workers, address), progress)
+        result, folder = play.resume(resume, engine_of(engine, workers, address), progress, allow_code)
     else:
         scene = SceneOptions(world, sensors, vehicle, stack, n_static, n_dynamic, speed, overrides)
+        trained, controllers = arguments.drivers(runs, controller or ["bt"], planner, policy)
         request = SweepRequest.typed(
-            scene, world, runs or [], grid=grid_of(grid or []),
-            controllers=tuple(arguments.controllers(controller or ["bt"], bool(runs))),
+            scene, world, trained, grid=grid_of(grid or []), controllers=tuple(controllers),
             seeds=tuple(arguments.seeds(seeds)), episodes=episodes, num_envs=num_envs, device=device,
         )  # fmt: skip
         result, folder = play.sweep(request, engine_of(engine, workers, address), run_dir, progress)
@@ -252,7 +255,7 @@ def sweep(
     _print(result, as_json, lambda: show_sweep(Screen(wide), result), folder)
 
 
-_SWEEP_RESUME = ("world", "episodes", "seeds", "engine", "workers", "address", "device")
+_SWEEP_RESUME = ("allow_code", "world", "episodes", "seeds", "engine", "workers", "address", "device")
 
 
 # ----------------------------------------------------------------------------------------- profile, reproduce

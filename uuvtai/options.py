@@ -119,8 +119,8 @@ Policies = Annotated[
     Option(
         "--policy",
         metavar="FILE",
-        help="A policy of yours: model.onnx, or mine.py:load, which returns one of any library; mine.py:load=TEXT "
-        "hands it the text (repeatable).",
+        help="A policy of yours: model.onnx, or mine.py:load, which returns one of any library; "
+        "mine.py:load=TEXT hands it the text (repeatable).",
         autocompletion=choices.files(".onnx", ".py"),
     ),
 ]

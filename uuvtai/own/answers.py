@@ -28,8 +28,8 @@ def commands(found: Any, n: int, place: str, meaning: str, device: torch.device)
     if len(bad):
         row, column = bad[0].tolist()
         raise PieceError(
-            f"{place}: gave {float(values[row, column])} in row {row}, column {column} of {n} x 4 ({meaning}), "
-            f"and {len(bad) - 1} more that are not finite"
+            f"{place}: gave {float(values[row, column])} in row {row}, column {column} of {n} x 4 ({meaning})"
+            f", and {len(bad) - 1} more that are not finite"
         )
     return values.to(device)
 
@@ -48,7 +48,7 @@ def waypoints(
     """Corners (n >= 2, 2) [m] of what a planner answered, from start to goal. Raises PieceError."""
     wanted = "waypoints (n, 2) [m] from the grid's corner, or None"
     values = _tensor(found, place, wanted).numpy()
-    if values.ndim != 2 or values.shape[1] != 2 or not 0 < len(values) <= MAX_WAYPOINTS:
+    if values.ndim != 2 or values.shape[1] != 2 or len(values) > MAX_WAYPOINTS:
         raise PieceError(
             f"{place}: gave shape {values.shape}; wanted are {wanted}, at most {MAX_WAYPOINTS:,}"
         )
@@ -65,6 +65,8 @@ def waypoints(
             f"{size_m[0]:g} x {size_m[1]:g} m; places are x = column * cell_m, y = row * cell_m"
         )
     start, goal = (end.astype(np.float32) for end in ends)
+    if not len(values):
+        return np.array([start, goal])
     before = [] if np.abs(values[0] - start).max() <= _ENDS_M else [start]
     after = [] if np.abs(values[-1] - goal).max() <= _ENDS_M and len(values) + len(before) > 1 else [goal]
     return np.array([*before, *values, *after], np.float32)

@@ -41,7 +41,7 @@ def onnx_policy(spec: PieceSpec, graph: bytes, n_obs: int) -> tuple[Callable[[np
         if width not in (None, n_obs):
             raise PieceError(
                 f"{spec.path}: takes observations of {width} columns, here they have {n_obs} "
-                "(docs/gym.md lists them); --set features.n_track=.. and --set features.teacher=true add columns"
+                "(docs/gym.md lists them); --set features.n_track=.. and features.teacher=true add columns"
             )
         graph_check.refuse_strange(graph, {name: (CHUNK, n_obs)}, 1)
         session = onnx_session.session(graph)

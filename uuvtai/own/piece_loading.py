@@ -11,7 +11,7 @@ from collections.abc import Callable
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 from uuvtai.files import read_bytes
 from uuvtai.own.piece_errors import PieceError, failed
@@ -86,9 +86,9 @@ def _is_own(value: Any, module: ModuleType) -> bool:
 def made(found: Any, spec: PieceSpec, about: About) -> Any:
     """What drives: the object itself, an instance of a class, or what a function named ``load`` returns.
     Raises PieceError."""
-    if not inspect.isclass(found) and not (spec.name == FACTORY and inspect.isroutine(found)):
+    is_class, make = inspect.isclass(found), cast("Callable[..., Any]", found)
+    if not is_class and not (spec.name == FACTORY and inspect.isroutine(found)):
         return found
-    make: Callable[..., Any] = found
     takes = _parameters(found)
     if takes > 1:
         raise PieceError(
@@ -99,7 +99,7 @@ def made(found: Any, spec: PieceSpec, about: About) -> Any:
     except (Exception, SystemExit) as error:
         raise failed(error, spec.path, f"while {spec.option} was made") from error
     for name in ("rows", "arrays", "hold_steps"):  # a decorated ``load`` says it for what it returns
-        if not inspect.isclass(found) and hasattr(found, name) and not hasattr(made_one, name):
+        if not is_class and hasattr(found, name) and not hasattr(made_one, name):
             return _Marked(made_one, {n: getattr(found, n) for n in ("rows", "arrays", "hold_steps")})
     return made_one
 

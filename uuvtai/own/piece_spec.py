@@ -105,7 +105,8 @@ def refuse_code(place: Path, names: Sequence[str], allowed: bool) -> None:
     said that it is hers: a folder may come from anybody."""
     code = [spec.path for name in names if is_piece(name) and (spec := piece_spec(name)).is_code]
     if code and not allowed:
+        files = ", ".join(map(str, dict.fromkeys(code)))
         raise SettingError(
-            f"{place}: goes on by running the Python code of {', '.join(map(str, dict.fromkeys(code)))}; look "
-            "at it, and add --allow-code if you trust it"
+            f"{place}: goes on by running the Python code of {files}; look at it, and add --allow-code if "
+            "you trust it"
         )

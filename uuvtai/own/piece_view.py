@@ -139,11 +139,8 @@ class PieceView:
         yaw = self.ego.rpy[..., 2]
         sine, cosine = (torch.sin(yaw), torch.cos(yaw)) if self._fixed.torch else (np.sin(yaw), np.cos(yaw))
         x, y = vectors_w[..., 0], vectors_w[..., 1]
-        parts = [
-            cosine * x + sine * y,
-            cosine * y - sine * x,
-            *([vectors_w[..., 2]] * (vectors_w.shape[-1] - 2)),
-        ]
+        parts = [cosine * x + sine * y, cosine * y - sine * x]
+        parts += [vectors_w[..., 2]] if vectors_w.shape[-1] == 3 else []
         return torch.stack(parts, -1) if self._fixed.torch else np.stack(parts, -1)
 
     def __repr__(self) -> str:
