@@ -63,6 +63,30 @@ def drivers(
     return trained, [*found, *own]
 
 
+def own_pieces(
+    controller: list[str] | None, planner: list[str] | None, policy: list[str] | None
+) -> list[str]:
+    """The user's own pieces where nothing else may be named."""
+    from uuvtai.own.piece_spec import is_piece
+
+    given = [*(controller or []), *(policy or [])]
+    strange = [name for name in given if not is_piece(name)]
+    if strange:
+        raise UsageError(f"{strange[0]}: is no piece of yours, for example --controller mine.py:act")
+    _trained, found = drivers(None, controller or ["none"], planner, policy) if given or planner else ([], [])
+    return found
+
+
+def one_driver(controller: str | None, planner: list[str] | None, policy: list[str] | None) -> str | None:
+    """Who drives one vehicle; None = nobody."""
+    if controller is None and not planner and not policy:
+        return None
+    trained, found = drivers(None, [controller or "none"], planner, policy)
+    if trained or len(found) != 1:
+        raise UsageError("--controller, --planner, --policy: give one of them, once: one vehicle is driven")
+    return found[0]
+
+
 def controllers(given: list[str] | None, has_policies: bool) -> list[str]:
     """Names typed with --controller; without any all three, or the tree alone beside a policy."""
     default = ["bt"] if has_policies else ["straight", "planner", "bt"]

@@ -165,6 +165,9 @@ def simulate(
     attitude_hold: opt.AttitudeHold = None,
     wrench: opt.Wrench = None,
     command: opt.Command = None,
+    controller: opt.DrivenBy = None,
+    planner: opt.Planners = None,
+    policy: opt.Policies = None,
     current: opt.Current = None,
     initial_rpy_deg: opt.InitialRpy = None,
     initial_velocity: opt.InitialVelocity = None,
@@ -174,7 +177,8 @@ def simulate(
     wide: opt.Wide = False,
     as_json: opt.AsJson = False,
 ) -> None:
-    """Open-loop physics in open water, to validate a vehicle against theory or data."""
+    """Open-loop physics in open water, to validate a vehicle against theory or data; or, with --controller,
+    one vehicle that is driven to a goal."""
     hold = [f"vehicle.attitude_hold={attitude_hold}"] if attitude_hold else []
     config = SceneOptions("open", "clean", vehicle, overrides=[*(overrides or []), *hold]).config()
 
@@ -193,7 +197,15 @@ def simulate(
         dt=dt,
     )
     title = f"{vehicle}: {seconds:g} s, substep {dt:g} s"
-    result = run(config, trial)
+    driven = arguments.one_driver(controller, planner, policy)
+    if driven is None:
+        result = run(config, trial)
+    else:
+        from uuvtai.measure.driven import drive
+
+        result = drive(config, trial, driven)
+        goal = ", ".join(f"{value:.2f}" for value in result["goal"])
+        title = f"{title}, {driven.removeprefix('controller:')} drives to ({goal})"
     _print(result, as_json, lambda: show_simulation(Screen(wide), result, title))
 
 
@@ -296,6 +308,10 @@ def profile(
 def reproduce(
     ctx: typer.Context,
     budget: opt.BudgetName = "quick",
+    controller: opt.OwnControllers = None,
+    planner: opt.Planners = None,
+    policy: opt.Policies = None,
+    allow_code: opt.AllowCode = False,
     resume: opt.ReproduceResume = None,
     run_dir: opt.RunDir = None,
     wide: opt.Wide = False,
@@ -306,10 +322,11 @@ def reproduce(
     from uuvtai.tables.claim_table import claim_table
 
     if resume is not None:
-        arguments.refuse_beside_resume(ctx, ("budget",))
-        result, folder = paper_run.resume(resume, Progress())
+        arguments.refuse_beside_resume(ctx, ("budget", "allow_code"))
+        result, folder = paper_run.resume(resume, Progress(), allow_code)
     else:
-        result, folder = paper_run.reproduce(budget, run_dir, Progress())
+        own = arguments.own_pieces(controller, planner, policy)
+        result, folder = paper_run.reproduce(budget, run_dir, Progress(), own)
     _print(result, as_json, lambda: Screen(wide).table(claim_table(result)), folder)
 
 

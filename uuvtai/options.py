@@ -200,6 +200,15 @@ Command = Annotated[
     str | None, Option("--command", help="Body velocity command u,v,w,r \\[m/s, rad/s] for the inner loop.")
 ]
 Current = Annotated[str | None, Option("--current", help="Water velocity x,y,z \\[m/s].")]
+DrivenBy = Annotated[
+    str | None,
+    Option(
+        "--controller",
+        metavar=_NAME,
+        help="Who drives from rest to the goal of world open: bt or another tree, or mine.py:act.",
+        autocompletion=choices.controllers,
+    ),
+]
 InitialRpy = Annotated[str | None, Option("--initial-rpy-deg", help="Roll, pitch, yaw \\[deg].")]
 InitialVelocity = Annotated[str | None, Option("--initial-velocity", help="u,v,w,p,q,r \\[m/s, rad/s].")]
 Neutral = Annotated[bool, Option("--neutral", help="Buoyancy equal to weight.")]
@@ -250,6 +259,15 @@ ProfileSeconds = Annotated[float, Option("--seconds", help="Measured time per ba
 Density = Annotated[bool, Option("--density", help="Also loop time against D.")]
 BudgetName = Annotated[
     str, choices.choice("--budget", ("quick", "full"), "How much: half an hour on two cores, or overnight.")
+]
+OwnControllers = Annotated[
+    list[str] | None,
+    Option(
+        "--controller",
+        metavar="FILE.py:NAME",
+        help="A controller of yours, mine.py:act, beside ours in every table (repeatable).",
+        autocompletion=choices.files(".py"),
+    ),
 ]
 ReproduceResume = Annotated[Path | None, _resume("Run folder of a reproduction to go on with.")]
 
