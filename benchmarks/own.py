@@ -1,5 +1,5 @@
-"""Pieces of the user's in the loop: env-steps per second of the whole step with a NumPy controller for 64 envs
-and a batched torch one for 1,024 (pool, S = 8, D = 6, paper sensing, resets on)."""
+"""Pieces of the user's in the loop: env-steps per second of the whole step with a NumPy controller for 64
+envs and a batched torch one for 1,024 (pool, S = 8, D = 6, paper sensing, resets on)."""
 
 from __future__ import annotations
 
@@ -24,26 +24,23 @@ PIECES = (
 
 
 def measure(job: Job) -> list[Row]:
-    """One row a piece, beside the tree on the same simulator."""
+    """One row a piece."""
     return [_row(job, what, 8 if job.quick else n, name, floor) for what, n, name, floor in PIECES]
 
 
 def _row(job: Job, what: str, n_env: int, name: str, floor: float) -> Row:
     job.say(f"{n_env} envs, {name}")
     config = load_config("pool", "paper")
-    own, tree = trees_of([f"controller:{EXAMPLES / name}", "bt"], config.teacher.max_node)
-    sim = Sim(config, n_env, tree.tree, job.device)
-    _speed(sim, tree, 0.5)  # the first step with an observation compiles
-    speeds = {method.name: _speed(sim, method, 2 * job.seconds) for method in (tree, own)}
+    (own,) = trees_of([f"controller:{EXAMPLES / name}"], config.teacher.max_node)
+    sim = Sim(config, n_env, own.tree, job.device)
+    speed = _speed(sim, own, 4 * job.seconds)
     assert own.own is not None
     told = own.own.document()
     own.own.close()
     return Row(
         what=f"{what} (examples/{name.partition(':')[0]}), {n_env:,} envs",
-        ours=speeds[own.name],
+        ours=speed,
         unit="env-steps/s",
-        peer=speeds[tree.name],
-        peer_name="bt in the kernels",
         floor=None if job.quick else floor,
         note=f"{1e3 * told['decision_ms']:.1f} us of it a decision in her code",
         details={

@@ -124,7 +124,7 @@ def _refuse_parts(model: Any) -> None:
         if o.domain or o.version not in OPSETS
     }
     if strange:
-        raise GraphError(f"holds what no policy needs: {', '.join(sorted(strange)[:5])}")
+        raise GraphError(f"is no policy's, it has {', '.join(sorted(strange)[:5])}")
     if len(graph.node) > MAX_NODES or len(graph.initializer) > MAX_NODES:
         raise GraphError(f"has more than {MAX_NODES:,} operators or weights")
     for tensor in _tensors(graph):

@@ -151,7 +151,8 @@ def method_of(
             f"{' or '.join(names)}; {usage}"
         )
     try:
-        inspect.signature(method).bind(*range(count))
+        taken = inspect.signature(method)
+        taken.bind(*range(count), **({"row": 0} if "row" in taken.parameters else {}))
     except TypeError as error:
         raise PieceError(f"{place_of(method, spec)}: {error}; {usage}") from None
     except ValueError:  # of compiled code

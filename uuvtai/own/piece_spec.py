@@ -80,14 +80,14 @@ class PieceSpec:
 
 def is_piece(text: str) -> bool:
     """Whether a controller's name is that of a piece of the user's."""
-    kind = text.partition(":")[0]
-    return kind in _DEFAULT or bool(_PYTHON.fullmatch(text)) or text.endswith(".onnx")
+    kind, colon, _rest = text.partition(":")
+    return (kind in _DEFAULT and bool(colon)) or bool(_PYTHON.fullmatch(text)) or text.endswith(".onnx")
 
 
 def piece_spec(text: str, kind: str = CONTROLLER) -> PieceSpec:
     """The piece of a text; ``kind`` where it does not begin with one. SettingError."""
-    first, _, rest = text.partition(":")
-    if first in _DEFAULT:
+    first, colon, rest = text.partition(":")
+    if first in _DEFAULT and colon:
         kind, text = first, rest
     if kind == POLICY and text.endswith(".onnx"):
         return PieceSpec(kind, Path(text))

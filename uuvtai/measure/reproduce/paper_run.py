@@ -47,9 +47,9 @@ def reproduce(
     if budget not in BUDGETS:
         raise SettingError(f"--budget {budget!r}: {' or '.join(BUDGETS)}")
     refuse_place(run_dir)
-    root = (run_dir or default_run_dir(f"reproduce-{budget}")).absolute()
     config, pieces = load_config("pool"), [piece_spec(name).absolute().text for name in own]
     trees_of(pieces, config.teacher.max_node)  # refuses what cannot be loaded before hours have passed
+    root = (run_dir or default_run_dir(f"reproduce-{budget}")).absolute()
     folder = RunFolder(root, config, [EVALUATION_SEED])
     request: dict[str, Any] = {
         "schema": 1,
