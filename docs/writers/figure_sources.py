@@ -122,6 +122,10 @@ class Sources:
         """The pilot with each piece off, as ``docs/tuning.md`` shows it."""
         return self.json(f"docs/data/{self.json('docs/data/shown.json')['pieces']}")
 
+    def own_pieces(self) -> dict[str, Any]:
+        """Pieces of a user's beside the tree, as ``docs/own_pieces.md`` shows them."""
+        return self.json("docs/data/own_pieces.json")
+
     def evaluation(self, row: str, method: str) -> Counts:
         """One method in one row of the evaluations."""
         rows = {entry["name"]: entry for entry in self.evaluations()["rows"]}

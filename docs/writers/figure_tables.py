@@ -104,6 +104,29 @@ def _causes(method: dict[str, Any]) -> str:
     return ", ".join(caption) or ("" if method["outcomes"]["success"] == method["episodes"] else DASH)
 
 
+def own_pieces(sources: Sources) -> str:
+    """The examples of own pieces beside the tree: counts, time, McNemar's exact test, time of her code."""
+    shown = sources.own_pieces()
+    pairs = {pair["b"]: pair for pair in shown["paired"]}
+    head = [
+        "row",
+        "success",
+        "collision",
+        "time to goal s",
+        "p beside `bt`",
+        "own code: ms a decision (slowest)",
+    ]
+    return text_table(head, [_own_piece(entry, pairs.get(entry["name"])) for entry in shown["methods"]])
+
+
+def _own_piece(entry: dict[str, Any], pair: dict[str, Any] | None) -> list[str]:
+    counts, own = Counts(entry["episodes"], entry["outcomes"]), entry.get("own")
+    took = DASH if own is None else f"{own['decision_ms']:.2g} ({own['slowest_ms']:.2g})"
+    p = DASH if pair is None else f"{pair['mcnemar_p']:.2g}"
+    time = f"{entry['time_to_success_mean_s']:.1f}"
+    return [f"`{entry['name']}`", share(counts, "success"), rated(counts, "collision"), time, p, took]
+
+
 LOCAL_PLANNERS = ("bt", "capped", "mppi", "dwa", "potential_field", "velocity_obstacle")
 
 
@@ -467,6 +490,7 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         measured,
         evaluations,
         local_planners,
+        own_pieces,
         switched_off,
         policy,
         grid,

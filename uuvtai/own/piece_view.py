@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from uuvtai.own.protocol import COMMAND, Ego, Grid, Scan, Tracks, Way
+from uuvtai.own.protocol import COMMAND, Ego, OccupancyGrid, Scan, Tracks, Way
 from uuvtai.sim import Sim
 
 FIELDS = {
@@ -68,7 +68,7 @@ class Readings:
             ahead = self._read("forecast")
             moving, state = (read[0] == 1) & (read[1] == 1), read[2]
             return Tracks(moving, state[..., :2], state[..., 2:], read[3], ahead[0], ahead[1])
-        kinds: dict[str, Callable[..., Any]] = {"ego": Ego, "map": Grid, "route": Way}
+        kinds: dict[str, Callable[..., Any]] = {"ego": Ego, "map": OccupancyGrid, "route": Way}
         return kinds[name](*read) if name in kinds else read[0]
 
 
@@ -115,11 +115,11 @@ class PieceView:
 
     @property
     def tracks(self) -> Tracks:
-        """Bodies that the tracker follows."""
+        """Forecast that the tracker follows."""
         return self._group("tracks")
 
     @property
-    def map(self) -> Grid:
+    def map(self) -> OccupancyGrid:
         """The map."""
         return self._group("map")
 

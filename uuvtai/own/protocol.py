@@ -38,7 +38,7 @@ class About:
     """what stands after = in ``mine.py:load=...``"""
 
 
-class Bodies(NamedTuple):
+class Forecast(NamedTuple):
     """Where tracked moving bodies are expected, B of them at K times."""
 
     position: np.ndarray
@@ -53,7 +53,7 @@ class OwnPlanner(Protocol):
     """Plans one route for one env."""
 
     def plan(
-        self, clearance: np.ndarray, cell_m: float, start: np.ndarray, goal: np.ndarray, forecast: Bodies
+        self, clearance: np.ndarray, cell_m: float, start: np.ndarray, goal: np.ndarray, forecast: Forecast
     ) -> Any:
         """Waypoints (n, 2) [m] from start to goal, or None where there is no way (the old route stays).
 
@@ -96,7 +96,7 @@ class Scan(NamedTuple):
 
 
 class Tracks(NamedTuple):
-    """Bodies that the tracker follows."""
+    """Forecast that the tracker follows."""
 
     moving: Any
     """(n, T) bool: the slot holds a body that is known to move"""
@@ -112,7 +112,7 @@ class Tracks(NamedTuple):
     """(n, T, K) [m]; negative = no forecast"""
 
 
-class Grid(NamedTuple):
+class OccupancyGrid(NamedTuple):
     """The map; rows along y, columns along x."""
 
     static: Any
@@ -167,7 +167,7 @@ class View(Protocol):
     @property
     def tracks(self) -> Tracks: ...
     @property
-    def map(self) -> Grid: ...
+    def map(self) -> OccupancyGrid: ...
     @property
     def route(self) -> Way: ...
     def __getitem__(self, column: str) -> Any:

@@ -9,7 +9,7 @@ import torch
 
 from uuvtai.own import answers
 from uuvtai.own.own_driver import OwnCode
-from uuvtai.own.protocol import Bodies
+from uuvtai.own.protocol import Forecast
 from uuvtai.rrt import PlanRequest
 
 
@@ -27,7 +27,7 @@ class RouteSource:
 
     def plan(self, asked: PlanRequest) -> np.ndarray | None:
         """Corners (n >= 2, 2) [m] from start to goal; None = no way. PieceError for any other answer."""
-        forecast = Bodies(asked.body, asked.radius_m, self._dt_s)
+        forecast = Forecast(asked.body, asked.radius_m, self._dt_s)
         more = {"row": asked.env} if self._wants_row else {}
 
         def called(_given: None) -> object:
