@@ -33,7 +33,9 @@ def _row(job: Job, what: str, n_env: int, name: str, floor: float) -> Row:
     config = load_config("pool", "paper")
     (own,) = trees_of([f"controller:{EXAMPLES / name}"], config.teacher.max_node)
     sim = Sim(config, n_env, own.tree, job.device)
-    speed = _speed(sim, own, 4 * job.seconds)
+    cpu = time.process_time()
+    speed, steps = _speed(sim, own, 4 * job.seconds)
+    cpu_us = 1e6 * (time.process_time() - cpu) / steps
     assert own.own is not None
     told = own.own.document()
     own.own.close()
@@ -42,16 +44,17 @@ def _row(job: Job, what: str, n_env: int, name: str, floor: float) -> Row:
         ours=speed,
         unit="env-steps/s",
         floor=None if job.quick else floor,
-        note=f"{1e3 * told['decision_ms']:.1f} us of it a decision in her code",
+        note=f"{cpu_us:.1f} us of CPU time a step, {1e3 * told['decision_ms']:.1f} us of it in her code",
         details={
             "num_envs": n_env,
+            "cpu_us_per_env_step": cpu_us,
             "own": {key: told[key] for key in ("calls", "decision_ms", "slowest_ms")},
         },
     )
 
 
-def _speed(sim: Sim, method: Method, seconds: float) -> float:
-    """Env-steps/s while a method drives; ended rows begin their next episode at once."""
+def _speed(sim: Sim, method: Method, seconds: float) -> tuple[float, int]:
+    """(env-steps/s while a method drives, env steps with those to warm up); ended rows begin anew at once."""
     note, obs = method.driver_for(sim), sim.observe()
     driver = note.pilot if note else None
     batch = SimBatch(sim)
@@ -67,7 +70,7 @@ def _speed(sim: Sim, method: Method, seconds: float) -> float:
 
     for _ in range(WARM_STEPS):
         step()
-    batch.env_steps, begun = 0, time.perf_counter()
+    warm, batch.env_steps, begun = batch.env_steps, 0, time.perf_counter()
     while (took := time.perf_counter() - begun) < seconds:
         step()
-    return batch.env_steps / took
+    return batch.env_steps / took, batch.env_steps + warm

@@ -14,6 +14,7 @@
                                            several texts); without brackets a list, for ``min(...)`` and
                                            ``max(...)``; FIELD may be ``note/PATTERN/``, a number within the
                                            note
+``own_pieces.ROW.FIELD``                   ``docs/data/own_pieces.json``
 ``paper.NAME``                             what the paper prints: a constant of
 ``uuvtai/measure/reproduce/paper.py``
 =========================================
@@ -159,6 +160,7 @@ class Sources:
         kind, _, rest = expression.partition(".")
         readers = {
             "evaluations": self._of_evaluations,
+            "own_pieces": self._of_own_pieces,
             "sweep": self._of_sweep,
             "bench": self._of_benchmark,
             "paper": _of_paper,
@@ -201,6 +203,12 @@ class Sources:
         if parts[3].startswith("weighted_"):
             return weighted(cells).field(parts[3].removeprefix("weighted_"))
         return pooled(cells).field(parts[3])
+
+    def _of_own_pieces(self, path: str) -> Any:
+        name, _, field = path.partition(".")
+        rows = {entry["name"]: entry for entry in self.own_pieces()["methods"]}
+        entry = _pick(rows, name, "row")
+        return Counts(entry["episodes"], entry["outcomes"], entry["time_to_success_mean_s"]).field(field)
 
     def _of_benchmark(self, path: str) -> Any:
         parts = re.fullmatch(r"(\w+)(?:\[([^\]]*)\])?\.(\w+)(?:/(.+)/)?", path)

@@ -14,6 +14,7 @@ from uuvtai.measure.reproduce import paper
 from uuvtai.measure.reproduce.steps import RETIRED_SEEDS
 from uuvtai.outcomes import COLLIDED
 from uuvtai.statistics import mcnemar_p
+from uuvtai.tables.method_tables import milliseconds
 from uuvtai.tables.table import text_table
 
 DASH = "-"
@@ -121,7 +122,7 @@ def own_pieces(sources: Sources) -> str:
 
 def _own_piece(entry: dict[str, Any], pair: dict[str, Any] | None) -> list[str]:
     counts, own = Counts(entry["episodes"], entry["outcomes"]), entry.get("own")
-    took = DASH if own is None else f"{own['decision_ms']:.2g} ({own['slowest_ms']:.2g})"
+    took = DASH if own is None else f"{milliseconds(own['decision_ms'])} ({milliseconds(own['slowest_ms'])})"
     p = DASH if pair is None else f"{pair['mcnemar_p']:.2g}"
     time = f"{entry['time_to_success_mean_s']:.1f}"
     return [f"`{entry['name']}`", share(counts, "success"), rated(counts, "collision"), time, p, took]

@@ -149,8 +149,8 @@ def _is_stack(name: str) -> bool:
     if name not in trees and not name.endswith(".xml") and "/" not in name:
         raise ConfigError(
             f"--controller: {name!r} is no preset of a tree or a stack{nearest(name, [*trees, *stacks])}; "
-            f"trees: {', '.join(trees)}; stacks: {', '.join(stacks)}; or give the path of a tree's .xml or a "
-            "stack's .yaml"
+            f"trees: {', '.join(trees)}; stacks: {', '.join(stacks)}; or give the path of a tree's .xml, a "
+            "stack's .yaml or a function of yours, mine.py:act"
         )
     return False
 
@@ -190,7 +190,8 @@ def find_policy(name: str, note: Callable[[str], None] = lambda _text: None) -> 
         return checkpoint.best(path, note)
     raise ConfigError(
         f"{name!r} is no trained policy: give the run folder of 'uuv train', one of its checkpoints/step_N, "
-        f"or a shipped policy's name ({', '.join(shipped) or 'none is shipped'})"
+        f"a shipped policy's name ({', '.join(shipped) or 'none is shipped'}), or one of yours: "
+        "--policy model.onnx, --policy mine.py:load"
     )
 
 
