@@ -3,16 +3,19 @@ never believed."""
 
 import ast
 import json
+import runpy
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
 from tests.command import run_cli
+from uuvtai.config import FeaturesConfig
 from uuvtai.deploy import export as deploy
 from uuvtai.deploy import run_policy
 from uuvtai.deploy.agreement import of_torch
@@ -20,6 +23,7 @@ from uuvtai.deploy.evaluations import evaluations_of
 from uuvtai.deploy.golden import TOLERANCE, golden_of
 from uuvtai.deploy.graph import OneDecision, missing_packages
 from uuvtai.deploy.weights import weights_of
+from uuvtai.kernels.planning.features import observation_width, placed_columns
 from uuvtai.learn import checkpoint
 from uuvtai.learn.checkpoint import CheckpointError
 from uuvtai.learn.pilot import TEACHER_COLUMN, Pilot, load_pilot
@@ -27,6 +31,8 @@ from uuvtai.learn.policy import ActorCritic
 from uuvtai.learn.risk import RiskHead
 from uuvtai.learn.world_model import N_TARGET, WorldModel
 from uuvtai.loader import ConfigError, load_training
+from uuvtai.own.onnx_policy import graph_of, onnx_policy
+from uuvtai.own.piece_spec import piece_spec
 
 N_OBS = 40
 TEACHER = slice(30, 34)
@@ -557,3 +563,22 @@ def test_links_out_of_the_folder_are_not_followed(folder, tmp_path):
     with pytest.raises(run_policy.PolicyError, match="no plain file"):
         run_policy.load(folder)
     assert Path(tmp_path / "elsewhere.npz").exists()
+
+
+# ---------------------------------------------------------------------------------- a policy of the user's
+
+
+def test_the_example_writes_a_graph_that_is_taken_as_a_policy(tmp_path, monkeypatch):
+    """``python examples/own_onnx.py``, then ``uuv eval --policy model.onnx``."""
+    pytest.importorskip("onnxscript", reason="needs the extra uuvtai[export]")
+    columns = {c.name: slice(first, first + width) for c, first, width in placed_columns(FeaturesConfig())}
+    n_obs = observation_width(FeaturesConfig())
+    env = SimpleNamespace(num_obs=n_obs, columns=columns)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("uuvtai.make", lambda *_given, **_others: env)
+    module = runpy.run_path(str(Path(__file__).parents[1] / "examples/own_onnx.py"), run_name="__main__")
+    spec = piece_spec("model.onnx", "policy")
+    act, hold_steps = onnx_policy(spec, graph_of(spec), n_obs)
+    obs = torch.randn(64, n_obs)
+    np.testing.assert_allclose(act(obs.numpy()), module["Policy"](columns)(obs), rtol=1e-5, atol=1e-6)
+    assert hold_steps == 10

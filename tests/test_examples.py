@@ -14,12 +14,14 @@ from tests.test_world import Drawn
 from uuvtai.env import VectorEnv
 from uuvtai.gym import UuvVectorEnv
 from uuvtai.loader import load_config
+from uuvtai.measure.episodes.methods import trees_of
+from uuvtai.measure.episodes.playing import jobs_of, run_episodes
 from uuvtai.run_folder import RunFolderError
 from uuvtai.runtime import start_taichi
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 N = 8
-MOST_LINES = {"train": 100, "custom": 60}
+MOST_LINES = {"train": 100, "custom": 60, "own": 30}
 """a newcomer reads an example in one go"""
 SHORT = 60
 """[control steps] of an episode here"""
@@ -214,4 +216,54 @@ def test_custom_tree_stands_beside_the_shipped_ones(short, example):
 def test_an_example_is_short_and_says_what_it_does(path):
     lines = path.read_text().splitlines()
     assert len(lines) <= MOST_LINES[path.stem.partition("_")[0]]
-    assert lines[0].startswith('"""') and f"python examples/{path.name}" in path.read_text()
+    assert lines[0].startswith('"""') and f"examples/{path.name}" in path.read_text()
+
+
+OWN = {"own_astar.py": "planner", "own_field.py:act": "controller", "own_torch.py:Pilot": "controller"}
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_an_own_piece_drives(short, name):
+    """It plays its episodes without an error, and gets nearer to the goal."""
+    method = trees_of([f"{OWN[name]}:{EXAMPLES / name}"], 64)[0]
+    observed, short.planner = short.observation, method.planner_for(short)
+    try:
+        note = method.driver_for(short)
+        results, _steps = run_episodes(short, jobs_of([77], N), driver=note.pilot if note else None)
+    finally:
+        short.planner, short.observation = None, observed
+        method.own.close()
+    assert [r.outcome for r in results] == ["timeout"] * N and max(r.path_length_m for r in results) > 0.1
+    assert (sum(r.planned_by["own"] for r in results) >= N) == (OWN[name] == "planner")
+
+
+def test_own_astar_goes_around_what_is_in_the_way(example):
+    """Through the one opening of a wall, by its middle; and out of cells that are too near to it."""
+    clearance = np.full((40, 60), 2.0, np.float32)
+    rows = np.abs(np.arange(40) - 9.5)[:, None] * 0.1
+    clearance[:, 25:35] = np.where(rows < 0.9, 1.0 - rows, 0.0)
+    clearance[[0, -1]] = clearance[:, [0, -1]] = 0.0
+    plan = example("own_astar").plan
+    start, goal = np.array([1.05, 2.05]), np.array([5.05, 2.05])
+    way = plan(clearance, 0.1, start, goal, None)
+    inside = way[(way[:, 0] > 2.5) & (way[:, 0] < 3.5)]
+    np.testing.assert_allclose([way[0], way[-1]], [start, goal], atol=1e-9)
+    assert len(way) < 15 and len(inside) and np.abs(inside[:, 1] - 1.0).max() < 0.3
+    clearance[:, 25:35] = 0.0
+    assert plan(clearance, 0.1, start, goal, None) is None
+
+
+@pytest.mark.parametrize("name", TRAINERS)
+def test_what_a_trainer_saved_drives_as_an_own_policy(short, example, tmp_path, name):
+    """``uuv eval --policy examples/own_NAME.py:load=FOLDER`` does what the trainer's own policy does."""
+    pytest.importorskip(TRAINERS[name], reason=f"{TRAINERS[name]} is not installed")
+    example(name).train(short, 0, tmp_path)
+    spec = f"policy:{EXAMPLES / name.replace('train', 'own')}.py:load={tmp_path}"
+    obs, _info = UuvVectorEnv(sim=short).reset(seed=1)
+    with torch.no_grad():
+        expected = example(name).play(short, tmp_path)(obs)
+    obs, _info = UuvVectorEnv(sim=short).reset(seed=1)
+    driver = trees_of([spec], 64)[0].driver_for(short).pilot
+    found = driver.decide(torch.from_numpy(obs)).action.numpy()
+    np.testing.assert_allclose(found, np.clip(expected, -1, 1), rtol=1e-4, atol=1e-5)
+    assert driver.code.marks.hold_steps == example("judge").HOLD_STEPS

@@ -67,6 +67,7 @@ def load(env, corners):
         io_for(RouteIO, s.route, s.clearance, s.clock, c.route, c.voronoi, c.mapping, maps.TANK),
         np.array(corners, np.float32),
         env,
+        codes.PLANNER_RRT,
     )
 
 
@@ -281,7 +282,7 @@ def test_loading_keeps_the_line_and_spaces_it():
         left = s.route.way_left_m.to_numpy()[env, : len(way)]
         assert np.allclose(left, [*steps[::-1].cumsum()[::-1].tolist(), 0.0], atol=1e-4)
         assert s.route.planner[env] == codes.PLANNER_RRT
-        assert s.route.planned_by.to_numpy()[env].tolist() == [0, 1]
+        assert s.route.planned_by.to_numpy()[env].tolist() == [0, 1, 0]
 
 
 def test_loading_counts_the_cost_of_the_line():

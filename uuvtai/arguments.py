@@ -48,6 +48,45 @@ def refuse_less(option: str, value: int, least: int) -> None:
         raise UsageError(f"{option} {value}: must be at least {least}")
 
 
+def drivers(
+    runs: list[str] | None, controller: list[str] | None, planner: list[str] | None, policy: list[str] | None
+) -> tuple[list[str], list[str]]:
+    """(trained policies, controllers with the user's own pieces among them) of RUN, --controller, --planner
+    and --policy; a --policy that is no file of hers is a RUN."""
+    from uuvtai.own.piece_spec import CONTROLLER, PLANNER, POLICY, is_piece, piece_spec
+
+    trained = [*(runs or []), *(name for name in policy or [] if not is_piece(name))]
+    own = [piece_spec(name, PLANNER).text for name in planner or []]
+    own += [piece_spec(name, POLICY).text for name in policy or [] if is_piece(name)]
+    named = controllers(controller, bool(trained or own))
+    found = [piece_spec(name, CONTROLLER).text if is_piece(name) else name for name in named]
+    return trained, [*found, *own]
+
+
+def own_pieces(
+    controller: list[str] | None, planner: list[str] | None, policy: list[str] | None
+) -> list[str]:
+    """The user's own pieces where nothing else may be named."""
+    from uuvtai.own.piece_spec import is_piece
+
+    given = [*(controller or []), *(policy or [])]
+    strange = [name for name in given if not is_piece(name)]
+    if strange:
+        raise UsageError(f"{strange[0]}: is no piece of yours, for example --controller mine.py:act")
+    _trained, found = drivers(None, controller or ["none"], planner, policy) if given or planner else ([], [])
+    return found
+
+
+def one_driver(controller: str | None, planner: list[str] | None, policy: list[str] | None) -> str | None:
+    """Who drives one vehicle; None = nobody."""
+    if controller is None and not planner and not policy:
+        return None
+    trained, found = drivers(None, [controller or "none"], planner, policy)
+    if trained or len(found) != 1:
+        raise UsageError("--controller, --planner, --policy: give one of them, once: one vehicle is driven")
+    return found[0]
+
+
 def controllers(given: list[str] | None, has_policies: bool) -> list[str]:
     """Names typed with --controller; without any all three, or the tree alone beside a policy."""
     default = ["bt"] if has_policies else ["straight", "planner", "bt"]

@@ -49,6 +49,8 @@ def evaluate(
     ctx: typer.Context,
     runs: opt.EvalRuns = None,
     controller: opt.EvalControllers = None,
+    planner: opt.Planners = None,
+    policy: opt.Policies = None,
     world: opt.World = "pool",
     sensors: opt.Sensors = None,
     vehicle: opt.Vehicle = None,
@@ -65,6 +67,7 @@ def evaluate(
     explain: opt.Explain = False,
     explain_record: opt.ExplainRecord = None,
     resume: opt.EvalResume = None,
+    allow_code: opt.AllowCode = False,
     device: opt.Device = "auto",
     overrides: opt.Set = None,
     with_report: opt.WithReport = False,
@@ -74,10 +77,10 @@ def evaluate(
 ) -> None:
     """Play the same episodes with every controller and trained policy and print the table of methods."""
     if resume is not None:
-        arguments.refuse_beside_resume(ctx)
+        arguments.refuse_beside_resume(ctx, ("allow_code",))
         from uuvtai.measure.evaluate.compare import resume as go_on
 
-        result, folder = go_on(resume, Progress())
+        result, folder = go_on(resume, Progress(), allow_code)
     else:
         seed_list = arguments.seeds(seeds)
         _refuse_counts(episodes, record, explain, explain_record)
@@ -85,8 +88,9 @@ def evaluate(
         from uuvtai.measure.evaluate.eval_request import Request
 
         scene = SceneOptions(world, sensors, vehicle, stack, n_static, n_dynamic, speed, overrides)
+        trained, controllers = arguments.drivers(runs, controller, planner, policy)
         request = Request.typed(
-            scene, world, runs or [], controllers=arguments.controllers(controller, bool(runs)),
+            scene, world, trained, controllers=controllers,
             seeds=seed_list, episodes=episodes, num_envs=num_envs, record=record, video=video,
             depth_images=depth_images, explain=explain,
             explain_record=3 if explain_record is None else explain_record, device=device, run_dir=run_dir,
@@ -161,6 +165,9 @@ def simulate(
     attitude_hold: opt.AttitudeHold = None,
     wrench: opt.Wrench = None,
     command: opt.Command = None,
+    controller: opt.DrivenBy = None,
+    planner: opt.Planners = None,
+    policy: opt.Policies = None,
     current: opt.Current = None,
     initial_rpy_deg: opt.InitialRpy = None,
     initial_velocity: opt.InitialVelocity = None,
@@ -170,7 +177,8 @@ def simulate(
     wide: opt.Wide = False,
     as_json: opt.AsJson = False,
 ) -> None:
-    """Open-loop physics in open water, to validate a vehicle against theory or data."""
+    """Open-loop physics in open water, to validate a vehicle against theory or data; or, with --controller,
+    one vehicle that is driven to a goal."""
     hold = [f"vehicle.attitude_hold={attitude_hold}"] if attitude_hold else []
     config = SceneOptions("open", "clean", vehicle, overrides=[*(overrides or []), *hold]).config()
 
@@ -189,7 +197,15 @@ def simulate(
         dt=dt,
     )
     title = f"{vehicle}: {seconds:g} s, substep {dt:g} s"
-    result = run(config, trial)
+    driven = arguments.one_driver(controller, planner, policy)
+    if driven is None:
+        result = run(config, trial)
+    else:
+        from uuvtai.measure.driven import drive
+
+        result = drive(config, trial, driven)
+        goal = ", ".join(f"{value:.2f}" for value in result["goal"])
+        title = f"{title}, {driven.removeprefix('controller:')} drives to ({goal})"
     _print(result, as_json, lambda: show_simulation(Screen(wide), result, title))
 
 
@@ -201,6 +217,8 @@ def sweep(
     ctx: typer.Context,
     runs: opt.SweepRuns = None,
     controller: opt.SweepControllers = None,
+    planner: opt.Planners = None,
+    policy: opt.Policies = None,
     grid: opt.GridAxes = None,
     world: opt.World = "pool",
     sensors: opt.Sensors = None,
@@ -216,6 +234,7 @@ def sweep(
     workers: opt.Workers = 1,
     address: opt.Address = "auto",
     resume: opt.SweepResume = None,
+    allow_code: opt.AllowCode = False,
     device: opt.Device = "auto",
     with_report: opt.WithReport = False,
     overrides: opt.Set = None,
@@ -235,12 +254,12 @@ def sweep(
     progress = Progress("cells")
     if resume is not None:
         arguments.refuse_beside_resume(ctx, _SWEEP_RESUME)
-        result, folder = play.resume(resume, engine_of(engine, workers, address), progress)
+        result, folder = play.resume(resume, engine_of(engine, workers, address), progress, allow_code)
     else:
         scene = SceneOptions(world, sensors, vehicle, stack, n_static, n_dynamic, speed, overrides)
+        trained, controllers = arguments.drivers(runs, controller or ["bt"], planner, policy)
         request = SweepRequest.typed(
-            scene, world, runs or [], grid=grid_of(grid or []),
-            controllers=tuple(arguments.controllers(controller or ["bt"], bool(runs))),
+            scene, world, trained, grid=grid_of(grid or []), controllers=tuple(controllers),
             seeds=tuple(arguments.seeds(seeds)), episodes=episodes, num_envs=num_envs, device=device,
         )  # fmt: skip
         result, folder = play.sweep(request, engine_of(engine, workers, address), run_dir, progress)
@@ -248,7 +267,7 @@ def sweep(
     _print(result, as_json, lambda: show_sweep(Screen(wide), result), folder)
 
 
-_SWEEP_RESUME = ("world", "episodes", "seeds", "engine", "workers", "address", "device")
+_SWEEP_RESUME = ("allow_code", "world", "episodes", "seeds", "engine", "workers", "address", "device")
 
 
 # ----------------------------------------------------------------------------------------- profile, reproduce
@@ -289,6 +308,10 @@ def profile(
 def reproduce(
     ctx: typer.Context,
     budget: opt.BudgetName = "quick",
+    controller: opt.OwnControllers = None,
+    planner: opt.Planners = None,
+    policy: opt.Policies = None,
+    allow_code: opt.AllowCode = False,
     resume: opt.ReproduceResume = None,
     run_dir: opt.RunDir = None,
     wide: opt.Wide = False,
@@ -299,10 +322,11 @@ def reproduce(
     from uuvtai.tables.claim_table import claim_table
 
     if resume is not None:
-        arguments.refuse_beside_resume(ctx, ("budget",))
-        result, folder = paper_run.resume(resume, Progress())
+        arguments.refuse_beside_resume(ctx, ("budget", "allow_code"))
+        result, folder = paper_run.resume(resume, Progress(), allow_code)
     else:
-        result, folder = paper_run.reproduce(budget, run_dir, Progress())
+        own = arguments.own_pieces(controller, planner, policy)
+        result, folder = paper_run.reproduce(budget, run_dir, Progress(), own)
     _print(result, as_json, lambda: Screen(wide).table(claim_table(result)), folder)
 
 

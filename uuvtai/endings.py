@@ -15,7 +15,7 @@ from typing import Any
 import typer
 
 from uuvtai import signals
-from uuvtai.errors import UserError
+from uuvtai.errors import OwnCodeError, UserError
 from uuvtai.version import __version__
 
 OK, FAILED, USAGE, GATE, INTERRUPTED = 0, 1, 2, 3, 130
@@ -79,6 +79,8 @@ def _ended_by(error: BaseException) -> int:
     if isinstance(error, UsageError.__base__):
         error.show()
         return USAGE
+    if isinstance(error, OwnCodeError) and error.__cause__ is not None:
+        return _own_code(error)
     if isinstance(error, UserError):
         return reported(f"uuv: {error}", USAGE)
     if isinstance(error, BrokenPipeError):  # the reader of our output has gone (| head): not an error of ours
@@ -123,21 +125,37 @@ def _interrupted() -> int:
 
 def _bug(error: BaseException) -> int:
     """One line, and all that a report needs in a file; with UUV_DEBUG=1 in the terminal."""
-    trace = "".join(traceback.format_exception(type(error), error, error.__traceback__))
     what = f"uuv: a bug of ours: {type(error).__name__}: {_one_line(error)}"
+    kept = _kept(error, "uuv-bug")
+    return reported(f"{what}; please report it with {kept}" if _is_file(kept) else f"{what}{kept}", FAILED)
+
+
+def _own_code(error: BaseException) -> int:
+    """The line of the user's own file that failed, and the way to it in a file."""
+    kept = _kept(error, "uuv-own")
+    return reported(
+        f"uuv: {error}; its traceback: {kept}" if _is_file(kept) else f"uuv: {error}{kept}", USAGE
+    )
+
+
+def _kept(error: BaseException, prefix: str) -> str:
+    """The file that holds the traceback; or, beginning with a semicolon or empty, why there is none."""
+    trace = "".join(traceback.format_exception(type(error), error, error.__traceback__))
     if os.environ.get("UUV_DEBUG") == "1":
         sys.stderr.write(plain(trace))
-        return reported(what, FAILED)
+        return ""
     about = f"uuvtai {__version__}, Python {platform.python_version()}, {platform.platform()}\n{sys.argv}\n"
     try:
-        handle, name = tempfile.mkstemp(prefix=f"uuv-bug-{time.strftime('%Y%m%d-%H%M%S')}-", suffix=".txt")
+        handle, name = tempfile.mkstemp(prefix=f"{prefix}-{time.strftime('%Y%m%d-%H%M%S')}-", suffix=".txt")
         with os.fdopen(handle, "w", encoding="utf-8", errors="backslashreplace") as file:
             file.write(about + trace)
     except OSError as reason:
-        return reported(
-            f"{what}; its traceback could not be kept ({reason.strerror}): UUV_DEBUG=1 shows it", FAILED
-        )
-    return reported(f"{what}; please report it with {name}", FAILED)
+        return f"; its traceback could not be kept ({reason.strerror}): UUV_DEBUG=1 shows it"
+    return name
+
+
+def _is_file(kept: str) -> bool:
+    return bool(kept) and not kept.startswith(";")
 
 
 def _one_line(error: BaseException) -> str:

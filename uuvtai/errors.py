@@ -18,3 +18,7 @@ class SizeError(UserError, MemoryError):
 
 class DeviceError(UserError, RuntimeError):
     """The device that was asked for is not here or cannot be had."""
+
+
+class OwnCodeError(UserError, RuntimeError):
+    """A piece that the user brought has failed; its ``__cause__`` is what was raised in her code."""

@@ -101,8 +101,32 @@ EvalControllers = Annotated[
         "local planners of the literature; paper = bt on the paper's own stack, a row of "
         "its own; none = policies alone \\[default: straight, planner, bt, beside a RUN bt]. Privileged "
         "yardsticks: NAME+truth (a tree that knows where every moving body is), oracle (knows the future: an "
-        "upper bound).",
+        "upper bound). A function of yours: mine.py:act (docs/own_pieces.md).",
     ),
+]
+Planners = Annotated[
+    list[str] | None,
+    Option(
+        "--planner",
+        metavar="FILE.py:NAME",
+        help="A route planner of yours, mine.py:plan, in the place of the built-in one: a row of its own, "
+        "driven by bt (repeatable).",
+        autocompletion=choices.files(".py"),
+    ),
+]
+Policies = Annotated[
+    list[str] | None,
+    Option(
+        "--policy",
+        metavar="FILE",
+        help="A policy of yours: model.onnx, or mine.py:load, which returns one of any library; "
+        "mine.py:load=TEXT hands it the text (repeatable).",
+        autocompletion=choices.files(".onnx", ".py"),
+    ),
+]
+AllowCode = Annotated[
+    bool,
+    Option("--allow-code", help="With --resume: the Python files that the run folder names may be run."),
 ]
 EvalEpisodes = Annotated[int, Option("--episodes", help="Episodes per seed.")]
 Record = Annotated[
@@ -176,6 +200,15 @@ Command = Annotated[
     str | None, Option("--command", help="Body velocity command u,v,w,r \\[m/s, rad/s] for the inner loop.")
 ]
 Current = Annotated[str | None, Option("--current", help="Water velocity x,y,z \\[m/s].")]
+DrivenBy = Annotated[
+    str | None,
+    Option(
+        "--controller",
+        metavar=_NAME,
+        help="Who drives from rest to the goal of world open: bt or another tree, or mine.py:act.",
+        autocompletion=choices.controllers,
+    ),
+]
 InitialRpy = Annotated[str | None, Option("--initial-rpy-deg", help="Roll, pitch, yaw \\[deg].")]
 InitialVelocity = Annotated[str | None, Option("--initial-velocity", help="u,v,w,p,q,r \\[m/s, rad/s].")]
 Neutral = Annotated[bool, Option("--neutral", help="Buoyancy equal to weight.")]
@@ -186,7 +219,7 @@ Substep = Annotated[float, Option("--dt", help="Dynamics substep \\[s].")]
 SweepRuns = Annotated[list[str] | None, _players("[RUN]...", "Trained policies, as for eval.")]
 SweepControllers = Annotated[
     list[str] | None,
-    _controllers("straight, planner, bt or a tree's XML (repeatable) \\[default: bt]."),
+    _controllers("straight, planner, bt, a tree's XML or mine.py:act (repeatable) \\[default: bt]."),
 ]
 GridAxes = Annotated[
     list[str] | None,
@@ -226,6 +259,15 @@ ProfileSeconds = Annotated[float, Option("--seconds", help="Measured time per ba
 Density = Annotated[bool, Option("--density", help="Also loop time against D.")]
 BudgetName = Annotated[
     str, choices.choice("--budget", ("quick", "full"), "How much: half an hour on two cores, or overnight.")
+]
+OwnControllers = Annotated[
+    list[str] | None,
+    Option(
+        "--controller",
+        metavar="FILE.py:NAME",
+        help="A controller of yours, mine.py:act, beside ours in every table (repeatable).",
+        autocompletion=choices.files(".py"),
+    ),
 ]
 ReproduceResume = Annotated[Path | None, _resume("Run folder of a reproduction to go on with.")]
 

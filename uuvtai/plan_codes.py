@@ -6,9 +6,10 @@ TRIGGERS = ("initial", "stuck", "safety", "intersection")
 N_TRIGGER = len(TRIGGERS)
 TRIGGER_NONE, TRIGGER_INITIAL, TRIGGER_STUCK, TRIGGER_SAFETY, TRIGGER_INTERSECTION = range(N_TRIGGER + 1)
 
-PLANNERS = ("voronoi", "rrt")
+PLANNERS = ("voronoi", "rrt", "own")
+"""own = a planner that the user brought (``own``)"""
 N_PLANNER = len(PLANNERS)
-PLANNER_NONE, PLANNER_VORONOI, PLANNER_RRT = range(N_PLANNER + 1)
+PLANNER_NONE, PLANNER_VORONOI, PLANNER_RRT, PLANNER_OWN = range(N_PLANNER + 1)
 
 REASONS = ("start_outside", "goal_outside", "disconnected", "forecast", "budget")
 """Why the Voronoi planner found nothing: the start or the goal is not traversable, the traversable set does

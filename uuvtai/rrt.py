@@ -1,4 +1,5 @@
-"""RRT (OMPL) on the host: takes over where the Voronoi planner fails, with the paper's lower clearance floor.
+"""Routes that the host plans: RRT (OMPL) where the Voronoi planner fails, with the paper's lower clearance
+floor, or a planner that the user brought in place of both.
 
 Deterministic per call: OMPL draws the seed of every generator it creates from one global sequence.
 ``RNG.setSeed`` restarts that sequence (OMPL logs an error when it is not the first call, because older
@@ -13,16 +14,17 @@ import importlib.util
 import warnings
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
 from uuvtai.config import Config
 from uuvtai.kernels.core.grid import grid_origin, grid_shape
+from uuvtai.plan_codes import PLANNER_OWN, PLANNER_RRT
 from uuvtai.stages import Stages
 
 if TYPE_CHECKING:
-    pass
+    import torch
 
 Point = tuple[float, float]
 
@@ -217,9 +219,38 @@ def _has_ompl() -> bool:
     return True
 
 
+class PlanRequest(NamedTuple):
+    """What a planner of the user is told for one env; lengths and places in metres from the grid's corner, x
+    along its columns, y along its rows."""
+
+    env: int
+    clearance_m: np.ndarray
+    """(n_row, n_col) float32 distance to the nearest occupied cell, 0 = occupied or outside"""
+    start: np.ndarray
+    """(2,) own position"""
+    goal: np.ndarray
+    """(2,)"""
+    body: np.ndarray
+    """(B, K, 2) where the moving bodies are expected"""
+    radius_m: np.ndarray
+    """(B, K) their radii with what the uncertainty adds"""
+
+
+class RoutePlanner(Protocol):
+    """Plans routes on the host in place of the simulator's own planners (``own.route_source``)."""
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """New episodes begin in the rows (n_env,) where this is not 0."""
+
+    def plan(self, asked: PlanRequest) -> np.ndarray | None:
+        """Corners (n >= 2, 2) [m] from start to goal, from the grid's corner; None = no way, so the old route
+        stays."""
+        ...
+
+
 class RouteFallback:
-    """Serves the envs whose Voronoi plan failed: fetch one clearance grid, run RRT, load the route or keep
-    the old one."""
+    """Serves the envs that the kernels did not plan for: fetch one clearance grid, run the host's planner,
+    load the route or keep the old one."""
 
     def __init__(self, config: Config) -> None:
         self.config = config
@@ -243,8 +274,40 @@ class RouteFallback:
             if corners is None:
                 keep_route(stages.route, env)
             else:
-                load_route(stages.route, corners.astype(np.float32), env)
+                load_route(stages.route, corners.astype(np.float32), env, PLANNER_RRT)
         return n_failed
+
+    def serve_by(self, planner: RoutePlanner, stages: Stages, read: Callable[..., np.ndarray]) -> None:
+        """Have ``planner`` plan for the whole queue, in place of the Voronoi planner and of RRT.
+        ``read(field, envs)`` gives rows of a field (``Sim.rows``)."""
+        from uuvtai.kernels.planning.route import keep_route, load_route
+        from uuvtai.kernels.planning.voronoi import overlay_clearance
+
+        io = stages.route
+        n_queue = int(io.route.n_queue[None])
+        envs = read(io.route.queue)[:n_queue].tolist() if n_queue else []
+        if not envs:
+            return
+        ends = [read(field, envs)[:, :2] - self.origin for field in (io.ego.pos_w, io.mission.goal_w)]
+        bodies, radius = (
+            read(f, envs) for f in (stages.voronoi.forecast.pos_w, stages.voronoi.forecast.radius_m)
+        )
+        for i, env in enumerate(envs):
+            overlay_clearance(stages.voronoi, self.overlay, env)
+            moves = radius[i, :, 0] >= 0
+            asked = PlanRequest(
+                env,
+                self.overlay.copy(),
+                ends[0][i],
+                ends[1][i],
+                bodies[i, moves] - self.origin,
+                radius[i, moves],
+            )
+            corners = planner.plan(asked)
+            if corners is None:
+                keep_route(io, env)
+            else:
+                load_route(io, (corners + self.origin).astype(np.float32), env, PLANNER_OWN)
 
     def plan(self, start_xy: Point, goal_xy: Point, seed: int) -> np.ndarray | None:
         """RRT on ``self.overlay`` with the config's floor and budget; None (with one warning) where OMPL is

@@ -32,7 +32,7 @@ from uuvtai.kernels.teacher import evasion, leaves, threats
 from uuvtai.kernels.vehicle import actuation, dynamics
 from uuvtai.kernels.world import scenarios
 from uuvtai.native.making import adopt
-from uuvtai.rrt import RouteFallback
+from uuvtai.rrt import RouteFallback, RoutePlanner
 from uuvtai.runtime import start_taichi
 from uuvtai.scenario import Scene, check_scenarios, set_scenes
 from uuvtai.sizes import array_sizes, check_size
@@ -47,7 +47,8 @@ class Sim:
     ``action`` is a torch tensor (n_env, 4) in [-1, 1] on the simulator's device: the behaviour tree writes
     its choice there, the next ``step`` reads it; overwrite it to drive otherwise. ``observation`` is None
     until somebody asks by ``observe``. While ``privileged`` is on (a yardstick, off in a new simulator), the
-    tracks of moving bodies are the truth.
+    tracks of moving bodies are the truth. ``planner`` plans the routes on the host in place of the
+    simulator's own planners; None in a new simulator.
     """
 
     def __init__(self, config: Config, num_envs: int, tree: FlatTree, device: str = "cpu") -> None:
@@ -65,6 +66,7 @@ class Sim:
         self.observation: torch.Tensor | None = None
         self._every_row = torch.arange(num_envs, dtype=torch.int32, device=self.device)
         self.fallback = RouteFallback(config)
+        self.planner: RoutePlanner | None = None
         self.stage_s: dict[str, float] | None = None
         self.privileged = False
         self._memory = self.memory()
@@ -143,8 +145,11 @@ class Sim:
             if c.quiet.weight_seen > 0:
                 exposure.average_traffic(io.exposure)
             triggers.fire_triggers(io.triggers)
-            voronoi.plan_routes(io.voronoi)
-            self.fallback.serve(io, self._plan_seed)
+            if self.planner is None:
+                voronoi.plan_routes(io.voronoi)
+                self.fallback.serve(io, self._plan_seed)
+            else:
+                self.fallback.serve_by(self.planner, io, self.rows)
             route.follow_route(io.route)
         with self._stage("teacher"):
             threats.assess_threats(io.threats)
@@ -202,6 +207,8 @@ class Sim:
         """Begin episode ``number`` of ``seed`` in the rows where ``mask`` is 1 (all int32, shape (n_env,)),
         up to the first observation."""
         io = self.io
+        if self.planner is not None:
+            self.planner.reset(mask)
         self.draw(mask, seed, number)
         dynamics.reset_vehicle(io.dynamics)
         actuation.reset_actuation(io.actuation)

@@ -12,12 +12,12 @@ from uuvtai import cli, endings
 from uuvtai.tables.table import text_table
 
 SEE = {
-    "eval": ("quickstart", "ceilings", "viewers", "determinism"),
+    "eval": ("quickstart", "own_pieces", "ceilings", "viewers", "determinism"),
     "train": ("quickstart", "learning"),
-    "simulate": ("simulator",),
-    "sweep": ("scale",),
+    "simulate": ("simulator", "own_pieces"),
+    "sweep": ("scale", "own_pieces"),
     "profile": ("history",),
-    "reproduce": ("learning",),
+    "reproduce": ("learning", "own_pieces"),
     "report": ("quickstart",),
     "export": ("deployment",),
     "presets": ("reference/configuration",),

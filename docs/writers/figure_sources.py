@@ -14,6 +14,7 @@
                                            several texts); without brackets a list, for ``min(...)`` and
                                            ``max(...)``; FIELD may be ``note/PATTERN/``, a number within the
                                            note
+``own_pieces.ROW.FIELD``                   ``docs/data/own_pieces.json``
 ``paper.NAME``                             what the paper prints: a constant of
 ``uuvtai/measure/reproduce/paper.py``
 =========================================
@@ -122,6 +123,10 @@ class Sources:
         """The pilot with each piece off, as ``docs/tuning.md`` shows it."""
         return self.json(f"docs/data/{self.json('docs/data/shown.json')['pieces']}")
 
+    def own_pieces(self) -> dict[str, Any]:
+        """Pieces of a user's beside the tree, as ``docs/own_pieces.md`` shows them."""
+        return self.json("docs/data/own_pieces.json")
+
     def evaluation(self, row: str, method: str) -> Counts:
         """One method in one row of the evaluations."""
         rows = {entry["name"]: entry for entry in self.evaluations()["rows"]}
@@ -155,6 +160,7 @@ class Sources:
         kind, _, rest = expression.partition(".")
         readers = {
             "evaluations": self._of_evaluations,
+            "own_pieces": self._of_own_pieces,
             "sweep": self._of_sweep,
             "bench": self._of_benchmark,
             "paper": _of_paper,
@@ -197,6 +203,12 @@ class Sources:
         if parts[3].startswith("weighted_"):
             return weighted(cells).field(parts[3].removeprefix("weighted_"))
         return pooled(cells).field(parts[3])
+
+    def _of_own_pieces(self, path: str) -> Any:
+        name, _, field = path.partition(".")
+        rows = {entry["name"]: entry for entry in self.own_pieces()["methods"]}
+        entry = _pick(rows, name, "row")
+        return Counts(entry["episodes"], entry["outcomes"], entry["time_to_success_mean_s"]).field(field)
 
     def _of_benchmark(self, path: str) -> Any:
         parts = re.fullmatch(r"(\w+)(?:\[([^\]]*)\])?\.(\w+)(?:/(.+)/)?", path)

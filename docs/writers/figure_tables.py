@@ -14,6 +14,7 @@ from uuvtai.measure.reproduce import paper
 from uuvtai.measure.reproduce.steps import RETIRED_SEEDS
 from uuvtai.outcomes import COLLIDED
 from uuvtai.statistics import mcnemar_p
+from uuvtai.tables.method_tables import milliseconds
 from uuvtai.tables.table import text_table
 
 DASH = "-"
@@ -102,6 +103,29 @@ def _causes(method: dict[str, Any]) -> str:
     """The two most frequent labels of ``uuv eval --explain`` with their counts."""
     caption = [f"{cause['label']} {cause['count']}" for cause in method["causes"][:2]]
     return ", ".join(caption) or ("" if method["outcomes"]["success"] == method["episodes"] else DASH)
+
+
+def own_pieces(sources: Sources) -> str:
+    """The examples of own pieces beside the tree: counts, time, McNemar's exact test, time of her code."""
+    shown = sources.own_pieces()
+    pairs = {pair["b"]: pair for pair in shown["paired"]}
+    head = [
+        "row",
+        "success",
+        "collision",
+        "time to goal s",
+        "p beside `bt`",
+        "own code: ms a decision (slowest)",
+    ]
+    return text_table(head, [_own_piece(entry, pairs.get(entry["name"])) for entry in shown["methods"]])
+
+
+def _own_piece(entry: dict[str, Any], pair: dict[str, Any] | None) -> list[str]:
+    counts, own = Counts(entry["episodes"], entry["outcomes"]), entry.get("own")
+    took = DASH if own is None else f"{milliseconds(own['decision_ms'])} ({milliseconds(own['slowest_ms'])})"
+    p = DASH if pair is None else f"{pair['mcnemar_p']:.2g}"
+    time = f"{entry['time_to_success_mean_s']:.1f}"
+    return [f"`{entry['name']}`", share(counts, "success"), rated(counts, "collision"), time, p, took]
 
 
 LOCAL_PLANNERS = ("bt", "capped", "mppi", "dwa", "potential_field", "velocity_obstacle")
@@ -467,6 +491,7 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         measured,
         evaluations,
         local_planners,
+        own_pieces,
         switched_off,
         policy,
         grid,

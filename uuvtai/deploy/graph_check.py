@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 from uuvtai.errors import UserError
 
@@ -38,6 +38,31 @@ class GraphError(UserError, RuntimeError):
 
     def __init__(self, reason: str) -> None:
         super().__init__(f"policy.onnx: {reason}; export the policy again")
+        self.reason = reason
+
+
+class GraphHead(NamedTuple):
+    """What a graph says of itself; nothing of it is believed but names."""
+
+    inputs: dict[str, int | None]
+    """width of the last axis by name; None = any"""
+    outputs: list[str]
+    metadata: dict[str, str]
+
+
+def head_of(graph: bytes) -> GraphHead:
+    """Inputs, outputs and metadata of a graph. GraphError for what is no graph."""
+    model = _parsed(graph)
+    weights = {tensor.name for tensor in model.graph.initializer}
+    inputs = {}
+    for value in model.graph.input:
+        if value.name not in weights:
+            sizes = list(value.type.tensor_type.shape.dim)
+            inputs[value.name] = sizes[-1].dim_value if sizes and sizes[-1].HasField("dim_value") else None
+    outputs = [value.name for value in model.graph.output]
+    if not outputs:
+        raise GraphError("gives nothing")
+    return GraphHead(inputs, outputs, {entry.key: entry.value for entry in model.metadata_props})
 
 
 def refuse_strange(graph: bytes, inputs: dict[str, tuple[int, ...]], single_calls: int) -> None:
@@ -99,7 +124,7 @@ def _refuse_parts(model: Any) -> None:
         if o.domain or o.version not in OPSETS
     }
     if strange:
-        raise GraphError(f"was not written by uuv export, it has {', '.join(sorted(strange)[:5])}")
+        raise GraphError(f"is no policy's, it has {', '.join(sorted(strange)[:5])}")
     if len(graph.node) > MAX_NODES or len(graph.initializer) > MAX_NODES:
         raise GraphError(f"has more than {MAX_NODES:,} operators or weights")
     for tensor in _tensors(graph):

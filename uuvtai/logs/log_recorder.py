@@ -48,7 +48,7 @@ class PolicyNote:
     """What a log says of the policy that drives."""
 
     pilot: Any
-    """its ``learn.pilot.Pilot``"""
+    """its ``learn.pilot.Pilot``, or an ``own.own_driver.OwnDriver``, which expects nothing"""
     checkpoint_sha256: str
     distill_lambda: float | None
     """weight of the distillation when the checkpoint was written"""
@@ -58,8 +58,8 @@ class PolicyNote:
         decision, foresees = self.pilot.decision, self.pilot.world_model is not None
         return {
             "driver.action": decision.action[row].cpu().numpy(),
-            "driver.value": float(decision.value[row]),
-            "driver.std": decision.std.cpu().numpy(),
+            "driver.value": float(decision.value[row]) if len(decision.value) else None,
+            "driver.std": decision.std.cpu().numpy() if len(decision.std) else None,
             "driver.distill_lambda": self.distill_lambda,
             "driver.residual": float(decision.residual[row]) if foresees else None,
             "driver.uncertainty": float(decision.uncertainty[row]) if foresees else None,

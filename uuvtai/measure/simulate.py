@@ -66,7 +66,7 @@ def simulate(config: Config, trial: Trial, runtime: Runtime | None = None) -> di
     vectors = {name: checked_vector(name, value) for name, value in given.items() if value is not None}
     substeps, control_dt = control_step(trial.dt)
     n_step = checked_steps(trial.seconds, control_dt, substeps)
-    config = _experiment(config, vectors, trial.neutral, control_dt, substeps)
+    config = experiment(config, trial)
     action = None if trial.command is None else _action(config, vectors["command"])
     plant = Plant(config, runtime or start_taichi(precision="f64"))
     plant.reset()
@@ -144,17 +144,15 @@ def _action(config: Config, command: np.ndarray) -> np.ndarray:
     return (command / limits).astype(np.float32)[None, :]
 
 
-def _experiment(
-    config: Config, vectors: dict[str, np.ndarray], neutral: bool, control_dt: float, substeps: int
-) -> Config:
-    """The config with the experiment's settings in it."""
+def experiment(config: Config, trial: Trial) -> Config:
+    """The config with the trial's current, buoyancy and steps in it. Raises SettingError."""
+    substeps, control_dt = control_step(trial.dt)
     vehicle, disturbance = config.vehicle, config.disturbance
-    if neutral:
+    if trial.neutral:
         vehicle = vehicle.model_copy(update={"volume_m3": vehicle.mass_kg / vehicle.water_density_kg_m3})
-    if "current" in vectors:
-        disturbance = disturbance.model_copy(
-            update={"current_m_s": tuple(float(x) for x in vectors["current"])}
-        )
+    if trial.current is not None:
+        current = checked_vector("current", trial.current)
+        disturbance = disturbance.model_copy(update={"current_m_s": tuple(float(x) for x in current)})
     episode = config.episode.model_copy(update={"control_dt_s": control_dt, "substeps": substeps})
     return config.model_copy(update={"vehicle": vehicle, "disturbance": disturbance, "episode": episode})
 

@@ -67,8 +67,17 @@ def controllers(incomplete: str) -> list[str]:
     trees = preset_names("tree")
     found = _starting(
         [*trees, *preset_names("stack"), *(f"{tree}+truth" for tree in trees), "oracle", "none"], last
-    ) + _paths(last, lambda path: path.suffix in (".xml", ".yaml"))
+    ) + _paths(last, lambda path: path.suffix in (".xml", ".yaml", ".py"))
     return [f"{before}{comma}{name}" for name in found]
+
+
+def files(*suffixes: str) -> Complete:
+    """Files with these endings."""
+
+    def complete(incomplete: str) -> list[str]:
+        return _paths(incomplete, lambda path: path.suffix in suffixes)
+
+    return complete
 
 
 def grids(incomplete: str) -> list[str]:

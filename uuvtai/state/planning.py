@@ -90,7 +90,7 @@ class RouteState:
     cost: ti.Field = array("n_env")
     """sum |dp| / max(clearance, eps) of the route when it was planned"""
     planner: ti.Field = array("n_env", dtype=ti.i32)
-    """who planned it: plan_codes.PLANNER_NONE, PLANNER_VORONOI, PLANNER_RRT"""
+    """who planned it: plan_codes.PLANNER_NONE, PLANNER_VORONOI, PLANNER_RRT, PLANNER_OWN"""
     trigger: ti.Field = array("n_env", dtype=ti.i32)
     """trigger of this step's replan, plan_codes.TRIGGER_NONE if none (a bit set of the triggers that fired in
     `fired`)"""
@@ -113,7 +113,7 @@ class RouteState:
     replans: ti.Field = array("n_env", "n_trigger", dtype=ti.i32)
     """replans of the episode by trigger: initial, stuck, safety, intersection"""
     planned_by: ti.Field = array("n_env", "n_planner", dtype=ti.i32)
-    """routes of the episode by planner: voronoi, rrt"""
+    """routes of the episode by planner: voronoi, rrt, own"""
     fallbacks: ti.Field = array("n_env", "n_reason", dtype=ti.i32)
     """fallbacks of the episode by reason: voronoi.* code - 1"""
     kept: ti.Field = array("n_env", dtype=ti.i32)

@@ -55,9 +55,29 @@ _METHODS = (
 )
 
 
+def milliseconds(value: float) -> str:
+    """'0.018', '4.6', '450'."""
+    return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
+
+
+def _own_ms(m: dict[str, Any]) -> Cell:
+    """Mean time of a decision, and the slowest; nothing where no code of the user's was called."""
+    own = m.get("own") or {}
+    mean_ms, slowest_ms = own.get("decision_ms"), own.get("slowest_ms")
+    if mean_ms is None or slowest_ms is None:
+        return Cell("-")
+    mean_text, slowest_text = milliseconds(mean_ms), milliseconds(slowest_ms)
+    return Cell(f"{mean_text} (slowest {slowest_text})", f"{mean_text} ({slowest_text})")
+
+
+_OWN = Column("own code: ms a decision", 1, short="own code ms\n(slowest)", of=_own_ms)
+
+
 def methods_table(methods: list[dict[str, Any]], title: str, **page: Any) -> Table:
-    """One row a method: rates with counts and 95 % Wilson intervals, how the rest ended, both times."""
-    return Table(_METHODS, methods, title, **page)
+    """One row a method: rates with counts and 95 % Wilson intervals, how the rest ended, both times; the time
+    of the user's own code where there is any."""
+    columns = (*_METHODS, _OWN) if any(m.get("own") for m in methods) else _METHODS
+    return Table(columns, methods, title, **page)
 
 
 def _difference(pair: dict[str, Any]) -> str:

@@ -10,12 +10,7 @@ from uuvtai.kernels.planning.along import foot_of, left_of_foot, level, look_alo
 from uuvtai.kernels.planning.bundles import RouteIO
 from uuvtai.kernels.planning.polyline import MAX_WIDENINGS, WIDENING, count_after_segment, install_route
 from uuvtai.native.launch import quick_launch
-from uuvtai.plan_codes import (
-    N_PLANNER,
-    N_REASON,
-    N_TRIGGER,
-    PLANNER_RRT,
-)
+from uuvtai.plan_codes import N_PLANNER, N_REASON, N_TRIGGER
 
 _LONG_AGO = -(1 << 20)
 """Step at which no trigger has been served yet."""
@@ -136,9 +131,9 @@ def _risk(env, pos_w, io: Bundle[RouteIO]):
 
 
 @ti.kernel
-def load_route(io: Bundle[RouteIO], way_w: FloatMatrix, env: int):
+def load_route(io: Bundle[RouteIO], way_w: FloatMatrix, env: int, planner: int):
     """Take the host's path (n >= 2 corners, (n, 2) [m]) as the env's route, spaced and counted like the
-    kernel's own, planner RRT."""
+    kernel's own; ``planner``: who made it (plan_codes.PLANNER_RRT, PLANNER_OWN)."""
     for _ in range(1):
         spacing, writing, tries, room = (
             ti.static(io.route_cfg.spacing_m) * 1.0,
@@ -156,7 +151,7 @@ def load_route(io: Bundle[RouteIO], way_w: FloatMatrix, env: int):
             tries += 1
             if writing == 1:
                 cost = _route_cost(env, count, io)
-                install_route(io.route, io.clock, env, count, cost, PLANNER_RRT)
+                install_route(io.route, io.clock, env, count, cost, planner)
                 tries = MAX_WIDENINGS
             elif count <= room:
                 writing = 1

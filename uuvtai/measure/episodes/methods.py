@@ -1,5 +1,5 @@
 """What drives an evaluation: behaviour trees and stacks by name, trained policies by run folder, checkpoint
-folder or shipped name."""
+folder or shipped name, and pieces that the user brings."""
 
 from __future__ import annotations
 
@@ -9,13 +9,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from uuvtai.config import Config
+from uuvtai.errors import SettingError
 from uuvtai.loader import ConfigError, nearest, preset_path, tree_of_stack, with_stack
+from uuvtai.own.piece_spec import is_piece, piece_spec
 from uuvtai.shipped import PRESET_DIR, TRAINING_TREE, preset_names
 from uuvtai.tree import FlatTree, read_tree
 
 if TYPE_CHECKING:
     from uuvtai.learn.checkpoint import Checkpoint
     from uuvtai.logs.log_recorder import PolicyNote
+    from uuvtai.own.own_piece import OwnPiece
+    from uuvtai.rrt import RoutePlanner
     from uuvtai.sim import Sim
 
 TRUTH = "truth"
@@ -49,6 +53,8 @@ class Method:
     """its tracks of moving bodies are the truth"""
     stack: str | None = None
     """stack preset (name or path) that this row alone drives with; None = the request's own"""
+    own: OwnPiece | None = None
+    """what the user brought: it drives, or plans the routes of the tree"""
 
     def config_of(self, config: Config) -> Config:
         """What this method's simulator runs on; scenarios, sensors and referee are those of ``config``.
@@ -56,8 +62,13 @@ class Method:
         return config if self.stack is None else with_stack(config, self.stack)
 
     def driver_for(self, sim: Sim) -> PolicyNote | None:
-        """The policy ready for this simulator's rows; None where the tree drives. Raises CheckpointError for
-        one that does not fit."""
+        """The policy ready for this simulator's rows; None where the tree drives. Raises CheckpointError or
+        PieceError for one that does not fit."""
+        if self.own is not None:
+            from uuvtai.logs.log_recorder import PolicyNote
+
+            driver = self.own.driver(sim)
+            return None if driver is None else PolicyNote(driver, self.own.sha256, None)
         if self.checkpoint is None:
             return None
         from uuvtai.env import VectorEnv
@@ -69,8 +80,14 @@ class Method:
         pilot = load_pilot(self.checkpoint, sim.num_envs, sim.device)
         return PolicyNote(pilot, self.checkpoint.sha256, weight if isinstance(weight, float) else None)
 
+    def planner_for(self, sim: Sim) -> RoutePlanner | None:
+        """Who plans this simulator's routes in place of its own planners; None = they do. PieceError."""
+        return None if self.own is None else self.own.planner(sim)
+
     def document(self) -> dict[str, Any]:
-        """What ``uuv eval --json`` says of a policy or a stack beside its results."""
+        """What ``uuv eval --json`` says of a policy, a stack or a piece of the user's beside its results."""
+        if self.own is not None:
+            return {"own": self.own.document()}
         if self.checkpoint is None:
             return (
                 {}
@@ -90,15 +107,34 @@ class Method:
 
 def trees_of(names: list[str], max_node: int) -> list[Method]:
     """Methods that a tree drives, by names of trees or stacks or paths of their XML or YAML, each perhaps
-    with ``+truth``. ConfigError."""
-    found = {}
+    with ``+truth``; and those of the user's own pieces. ConfigError, PieceError."""
+    found: dict[str, Method] = {}
     for name in names:
+        if is_piece(name):
+            method = _own_method(name, max_node)
+            if method.name in found:
+                raise ConfigError(
+                    f"{name}: two rows would be called {method.name}; rename a file or its function"
+                )
+            found[method.name] = method
+            continue
         driver, privileged = _parted(name)
         label = f"{_label(driver)}+{TRUTH}" if privileged else _label(driver)
         stack = driver if _is_stack(driver) else None
         tree = tree_of_stack(driver) if stack else driver
         found[label] = Method(label, read_tree(tree, max_node), privileged=privileged, stack=stack)
     return list(found.values())
+
+
+def _own_method(name: str, max_node: int) -> Method:
+    """A piece of the user's: what it leaves to the stack, the training tree's does."""
+    from uuvtai.own.own_piece import own_piece
+
+    try:
+        found = own_piece(piece_spec(name))
+    except SettingError as error:
+        raise ConfigError(str(error)) from None
+    return Method(found.label, read_tree(TRAINING_TREE, max_node), own=found)
 
 
 def _is_stack(name: str) -> bool:
@@ -113,8 +149,8 @@ def _is_stack(name: str) -> bool:
     if name not in trees and not name.endswith(".xml") and "/" not in name:
         raise ConfigError(
             f"--controller: {name!r} is no preset of a tree or a stack{nearest(name, [*trees, *stacks])}; "
-            f"trees: {', '.join(trees)}; stacks: {', '.join(stacks)}; or give the path of a tree's .xml or a "
-            "stack's .yaml"
+            f"trees: {', '.join(trees)}; stacks: {', '.join(stacks)}; or give the path of a tree's .xml, a "
+            "stack's .yaml or a function of yours, mine.py:act"
         )
     return False
 
@@ -154,7 +190,8 @@ def find_policy(name: str, note: Callable[[str], None] = lambda _text: None) -> 
         return checkpoint.best(path, note)
     raise ConfigError(
         f"{name!r} is no trained policy: give the run folder of 'uuv train', one of its checkpoints/step_N, "
-        f"or a shipped policy's name ({', '.join(shipped) or 'none is shipped'})"
+        f"a shipped policy's name ({', '.join(shipped) or 'none is shipped'}), or one of yours: "
+        "--policy model.onnx, --policy mine.py:load"
     )
 
 

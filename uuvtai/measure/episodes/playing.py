@@ -130,7 +130,7 @@ def run_episodes(
     ``clock`` is told the time of simulating, without what the recorder takes.
     """
     observed = sim.observation
-    stepper = _Stepper(sim, driver)
+    stepper = Stepper(sim, driver)
     waiting = list(enumerate(jobs))[::-1]
     playing: dict[int, int] = {}
     results: dict[int, EpisodeResult] = {}
@@ -178,7 +178,7 @@ def run_episodes(
     return [results[i] for i in range(len(jobs))], env_steps
 
 
-class _Stepper:
+class Stepper:
     """Steps the simulator by a driver, or by its tree where there is none."""
 
     def __init__(self, sim: Sim, driver: Driver | None) -> None:
@@ -206,7 +206,7 @@ class _Stepper:
 
 
 def _refill(
-    sim: Sim, stepper: _Stepper, jobs: list[Job], waiting: list, free: list[int], playing: dict[int, int]
+    sim: Sim, stepper: Stepper, jobs: list[Job], waiting: list, free: list[int], playing: dict[int, int]
 ) -> list[int]:
     """Begin as many jobs as there are free rows; the rows."""
     mask, seed, number = (torch.zeros(sim.num_envs, dtype=torch.int32) for _ in range(3))

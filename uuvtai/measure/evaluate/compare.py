@@ -19,6 +19,7 @@ from uuvtai.measure.evaluate.eval_request import (
     read_request,
     refuse_others,
 )
+from uuvtai.own.piece_spec import refuse_code
 from uuvtai.run_folder import RunFolder, default_run_dir, refuse_place
 
 if TYPE_CHECKING:
@@ -58,8 +59,9 @@ def compare(request: Request, watch: EvaluationWatch) -> tuple[dict[str, Any], P
         return _compared(comparison, folder), folder.path
 
 
-def resume(place: Path, watch: EvaluationWatch) -> tuple[dict[str, Any], Path]:
+def resume(place: Path, watch: EvaluationWatch, allow_code: bool = False) -> tuple[dict[str, Any], Path]:
     """Go on with an evaluation that was interrupted or killed: episodes that are over stay as they are.
+    ``allow_code``: Python files that the folder names may be run.
 
     The document is that of an undisturbed evaluation, times of the machine excepted. Raises RunFolderError,
     FileError, ConfigError, CheckpointError.
@@ -67,6 +69,7 @@ def resume(place: Path, watch: EvaluationWatch) -> tuple[dict[str, Any], Path]:
     folder = RunFolder.held(place, "uuv eval")
     try:
         request, drivers = read_request(place)
+        refuse_code(place, request.controllers, allow_code)
         methods = _methods(request, watch)
         refuse_others(place, drivers, drivers_of(methods))
         folder.go_on({"what": "eval"})
@@ -131,8 +134,12 @@ def _comparison(request: Request, num_envs: int, methods: list[Method], watch: E
     configs = {method.stack: method.config_of(request.config) for method in methods} or {None: request.config}
     tree = methods[0].tree if methods else _any_tree()
     sims = {stack: Sim(config, num_envs, tree, request.device) for stack, config in configs.items()}
+    for method in methods:
+        if method.own:
+            method.own.note = watch.note
     policies = {method.name: method.driver_for(sims[method.stack]) for method in methods}
-    return Comparison(request, methods, sims, policies, watch)
+    planners = {method.name: method.planner_for(sims[method.stack]) for method in methods}
+    return Comparison(request, methods, sims, policies, planners, watch)
 
 
 def _any_tree() -> FlatTree:

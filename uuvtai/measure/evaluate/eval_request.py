@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from uuvtai.config import Config
 from uuvtai.files import read_text
 from uuvtai.loader import ConfigError, preset_names, read_preset, sensors_of, validated
+from uuvtai.own.piece_spec import is_piece, piece_spec
 from uuvtai.run_folder import RunFolderError
 
 if TYPE_CHECKING:
@@ -38,7 +39,8 @@ class Request:
     world: str
     sensors: str
     controllers: list[str]
-    """names of trees or stacks, paths of XML or YAML files, each perhaps with ``+truth``; ``oracle``"""
+    """names of trees or stacks, paths of XML or YAML files, each perhaps with ``+truth``; ``oracle``; pieces
+    of the user's (``own.piece_spec``)"""
     seeds: list[int]
     episodes: int
     policies: tuple[str, ...] = ()
@@ -129,6 +131,8 @@ def _found_again(request: Request, cwd: Path) -> Request:
     """Paths that were typed in another folder, seen from this one; names of what is shipped stay names."""
 
     def seen(kind: str, name: str) -> str:
+        if kind == "tree" and is_piece(name):
+            return piece_spec(name).located(cwd).text
         file = name.removesuffix("+truth")
         is_path = file not in preset_names(kind) and (
             kind == "policy" or file.endswith((".xml", ".yaml", ".yml"))
@@ -142,10 +146,14 @@ def _found_again(request: Request, cwd: Path) -> Request:
 
 
 def drivers_of(methods: list[Method]) -> dict[str, str]:
-    """sha256 of what drives, by method: of a policy's checkpoint, of a tree as it is played, with its
-    stack."""
+    """sha256 of what drives, by method: of a policy's checkpoint, of a tree as it is played, with its stack,
+    of the file of a piece of the user's."""
     return {
-        method.name: method.checkpoint.sha256 if method.checkpoint else _tree_sha256(method)
+        method.name: method.own.sha256
+        if method.own
+        else method.checkpoint.sha256
+        if method.checkpoint
+        else _tree_sha256(method)
         for method in methods
     }
 

@@ -42,8 +42,14 @@ def _explained(comparison: Comparison, method_run: MethodRun) -> list[failures.R
         method_run.results,
         watch.update,
         policy.pilot if policy else None,
+        method_run.method.own is not None,
     )
     watch.stop()
+    if lost := len(failures.failures(method_run.results)) - len(rows):
+        watch.note(
+            f"{name}: {lost} failures ended otherwise when they were played again and are not explained: "
+            "your code depends on more than it is shown (random numbers, the clock, older episodes)"
+        )
     method_run.entry["causes"] = failures.table_of(rows)
     method_run.entry["explain"] = [row.document() for row in rows]
     return rows

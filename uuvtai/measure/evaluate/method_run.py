@@ -21,6 +21,7 @@ from uuvtai.measure.evaluate.foresight import (
 )
 from uuvtai.measure.evaluate.ledger import Finished, Ledger, LedgerWriter
 from uuvtai.measure.evaluate.summary import summary, tree_use
+from uuvtai.rrt import RoutePlanner
 from uuvtai.sim import Sim
 
 
@@ -43,6 +44,8 @@ class Comparison:
     """by the stack that drives; None = the request's own"""
     policies: dict[str, PolicyNote | None]
     """by method, ready for its simulator; None where a tree drives"""
+    planners: dict[str, RoutePlanner | None]
+    """by method: who plans routes in place of the simulator's planners; None = they do"""
     watch: EvaluationWatch
 
     def any_simulator(self) -> Sim:
@@ -50,10 +53,10 @@ class Comparison:
         return next(iter(self.sims.values()))
 
     def simulator_for(self, method: Method) -> Sim:
-        """The method's simulator, with its tree and, where it is a yardstick, with the truth."""
+        """The method's simulator, with its tree, its planner and, where it is a yardstick, with the truth."""
         sim = self.sims[method.stack]
         sim.use_tree(method.tree)
-        sim.privileged = method.privileged
+        sim.privileged, sim.planner = method.privileged, self.planners[method.name]
         return sim
 
 
@@ -97,8 +100,12 @@ def play(comparison: Comparison, method: Method, jobs: list[Job], ledger: Ledger
         )
     finally:
         watch.stop()
+        if method.own:
+            method.own.close()
         if recorder:
             recorder.abort()
+    if method.own and (slow := method.own.told()):
+        watch.note(slow)
     results = [over[job].result for job in jobs]
     env_steps, wall_s = sum(round(r.time_s / dt) for r in results), writer.wall_s if left else writer.before_s
     entry = summary(method.name, results, env_steps, wall_s, clock.env_steps_per_s)

@@ -50,18 +50,22 @@ def explain_failures(
     results: list[EpisodeResult],
     progress: Progress | None = None,
     driver: Driver | None = None,
+    own_code: bool = False,
 ) -> list[Row]:
     """Replay the failed episodes of one method and explain them; in the order of ``results``. Raises
-    RuntimeError (see ``FailureRecorder.end``).
+    RuntimeError (see ``FailureRecorder.end``). With ``own_code``, the user's, episodes that it plays
+    otherwise this time are left out.
 
     Where a ``driver`` drives, the facts about leaves and actions are those of the tree beside it.
     """
     failed = failures(results)
     if not failed:
         return []
-    recorder = FailureRecorder(sim.config, sim.tree, failed)
+    recorder = FailureRecorder(sim.config, sim.tree, failed, own_code)
     run_episodes(sim, [Job(r.seed, r.episode) for r in failed], recorder, progress, driver)
-    return [Row(r, recorder.found[Job(r.seed, r.episode)]) for r in failed]
+    jobs = [Job(r.seed, r.episode) for r in failed]
+    found = recorder.found
+    return [Row(r, found[job]) for r, job in zip(failed, jobs, strict=True) if job in found]
 
 
 def failures(results: list[EpisodeResult]) -> list[EpisodeResult]:

@@ -11,6 +11,7 @@ from typing import Any, Protocol
 from uuvtai.errors import SettingError
 from uuvtai.files import FileError, read_json
 from uuvtai.loader import load_config, preset_names
+from uuvtai.measure.episodes.methods import trees_of
 from uuvtai.measure.reproduce import claims, paper
 from uuvtai.measure.reproduce.markdown import results_page
 from uuvtai.measure.reproduce.sections import sections_of
@@ -25,6 +26,7 @@ from uuvtai.measure.reproduce.steps import (
     run_step,
     steps_of,
 )
+from uuvtai.own.piece_spec import is_piece, piece_spec, refuse_code
 from uuvtai.report.build import report
 from uuvtai.run_folder import RunFolder, RunFolderError, default_run_dir, refuse_place
 
@@ -37,26 +39,36 @@ class ReproductionWatch(Protocol):
     def note(self, text: str) -> None: ...
 
 
-def reproduce(budget: str, run_dir: Path | None, watch: ReproductionWatch) -> tuple[dict[str, Any], Path]:
-    """Begin a reproduction: its document and its folder. Raises ValueError for an unknown budget,
-    RunFolderError."""
+def reproduce(
+    budget: str, run_dir: Path | None, watch: ReproductionWatch, own: Sequence[str] = ()
+) -> tuple[dict[str, Any], Path]:
+    """Begin a reproduction: its document and its folder. ``own``: pieces of the user's, compared with ours.
+    Raises ValueError for an unknown budget, RunFolderError, PieceError."""
     if budget not in BUDGETS:
         raise SettingError(f"--budget {budget!r}: {' or '.join(BUDGETS)}")
     refuse_place(run_dir)
+    config, pieces = load_config("pool"), [piece_spec(name).absolute().text for name in own]
+    trees_of(pieces, config.teacher.max_node)  # refuses what cannot be loaded before hours have passed
     root = (run_dir or default_run_dir(f"reproduce-{budget}")).absolute()
-    folder = RunFolder(root, load_config("pool"), [EVALUATION_SEED])
-    request = {"schema": 1, "budget": budget, "policy": "best" if "best" in preset_names("policy") else None}
+    folder = RunFolder(root, config, [EVALUATION_SEED])
+    request: dict[str, Any] = {
+        "schema": 1,
+        "budget": budget,
+        "policy": "best" if "best" in preset_names("policy") else None,
+    }
+    request["own"] = pieces
     folder.write_json(REQUEST, request)
     return _run(folder, request, watch), root
 
 
-def resume(place: Path, watch: ReproductionWatch) -> tuple[dict[str, Any], Path]:
-    """Go on with a reproduction that was killed or interrupted; finished steps stay as they are. Raises
-    RunFolderError."""
+def resume(place: Path, watch: ReproductionWatch, allow_code: bool = False) -> tuple[dict[str, Any], Path]:
+    """Go on with a reproduction that was killed or interrupted; finished steps stay as they are.
+    ``allow_code``: Python files that the folder names may be run. Raises RunFolderError."""
     root = place.absolute()
     folder = RunFolder.held(root, "uuv reproduce")
     try:
         request = _request(root)
+        refuse_code(root, request["own"], allow_code)
         folder.go_on({})
         return _run(folder, request, watch), root
     finally:
@@ -69,17 +81,18 @@ def _request(root: Path) -> dict[str, Any]:
     try:
         request = read_json(file, folder=root)
         known = request["budget"] in BUDGETS and isinstance(request["policy"], str | None)
+        known = known and all(isinstance(name, str) and is_piece(name) for name in request.get("own", []))
     except (FileError, OSError, KeyError, TypeError) as error:
         raise RunFolderError(
             f"{file}: cannot be read ({error}); give the folder that 'uuv reproduce' printed"
         ) from None
     if not known:
         raise RunFolderError(f"{file}: no budget of this version; begin a new reproduction")
-    return request
+    return {"own": []} | request
 
 
 def _run(folder: RunFolder, request: dict[str, Any], watch: ReproductionWatch) -> dict[str, Any]:
-    steps = steps_of(BUDGETS[request["budget"]], request["policy"], folder.path)
+    steps = steps_of(BUDGETS[request["budget"]], request["policy"], folder.path, request["own"])
     try:
         with folder.recorded():
             for number, step in enumerate(steps, start=1):
@@ -112,7 +125,8 @@ def document_of(root: Path, request: dict[str, Any], steps: Sequence[Step]) -> d
     results = {step.folder: read_json(result_file(step, root), folder=root) for step in steps}
     record = read_json(root / "run.json", folder=root)
     budget = BUDGETS[request["budget"]]
-    by_preset = _by_preset(results["eval/main"], budget)
+    own = [piece_spec(name).label for name in request["own"]]
+    by_preset = _by_preset(results["eval/main"], budget, own)
     document = {
         "schema": 1,
         "title": f"The paper reproduced, budget {request['budget']}",
@@ -127,7 +141,7 @@ def document_of(root: Path, request: dict[str, Any], steps: Sequence[Step]) -> d
             step.folder: "uuv " + " ".join(_shown(part, root) for part in step.argv(root)) for step in steps
         },
         "table_main": by_preset,
-        "claims": [vars(claim) for claim in _claims(root, results, by_preset, request["policy"])],
+        "claims": [vars(claim) for claim in _claims(root, results, by_preset, request["policy"], own)],
         "inconsistencies": list(paper.INCONSISTENCIES),
         "ceilings": results["eval/ceilings"],
         "transfer": results["eval/transfer"],
@@ -146,7 +160,7 @@ def _shown(part: str, root: Path) -> str:
     return part.replace(str(root), "RUN")
 
 
-def _by_preset(main: dict[str, Any], budget: Budget) -> dict[str, list[dict[str, Any]]]:
+def _by_preset(main: dict[str, Any], budget: Budget, own: Sequence[str]) -> dict[str, list[dict[str, Any]]]:
     """Entries of the methods' table by preset, without their single episodes."""
     entries = {
         entry["name"]: {k: v for k, v in entry.items() if k != "episodes_detail"} for entry in main["methods"]
@@ -154,16 +168,20 @@ def _by_preset(main: dict[str, Any], budget: Budget) -> dict[str, list[dict[str,
     trained = {
         preset: [entries[f"{preset}-{seed}"] for seed in range(budget.training_seeds)] for preset in TRAINED
     }
-    return trained | {name: [entries[name]] for name in ("bt", "planner", "straight")}
+    return trained | {name: [entries[name]] for name in ("bt", "planner", "straight", *own)}
 
 
 def _claims(
-    root: Path, results: dict[str, Any], by_preset: dict[str, Any], policy: str | None
+    root: Path,
+    results: dict[str, Any],
+    by_preset: dict[str, Any],
+    policy: str | None,
+    own: Sequence[str],
 ) -> list[claims.Claim]:
     cells = results["sweep/pool"]["cells"]
     names = list(dict.fromkeys(cell["method"] for cell in cells))
-    pilot = next(name for name in names if name != "bt")
-    there = next(entry for entry in results["eval/transfer"]["methods"] if entry["name"] != "bt")
+    pilot = next(name for name in names if name not in ("bt", *own))
+    there = next(entry for entry in results["eval/transfer"]["methods"] if entry["name"] not in ("bt", *own))
     here = None if policy else by_preset["curriculum"][0]
     found = [
         *claims.of_table_main(by_preset),

@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -65,14 +66,15 @@ class Step:
     def argv(self, root: Path, resume: bool = False) -> list[str]:
         """Arguments of ``uuv`` with the folder, as they are run."""
         place = str(root / self.folder)
-        if resume:
-            return [self.command[0], "--resume", place, "--json"]
+        if resume:  # whoever began or goes on with the reproduction has agreed to the code that it names
+            allowed = ["--allow-code"] if self.command[0] == "sweep" else []
+            return [self.command[0], "--resume", place, *allowed, "--json"]
         return [*self.command, *([] if self.to_file else ["--run-dir", place]), "--json"]
 
 
-def steps_of(budget: Budget, policy: str | None, root: Path) -> list[Step]:
+def steps_of(budget: Budget, policy: str | None, root: Path, own: Sequence[str] = ()) -> list[Step]:
     """All steps in their order; ``policy``: name of the shipped policy, None = the trained curriculum stands
-    for it."""
+    for it; ``own``: pieces of the user's, beside ours wherever methods are compared."""
     seeds = range(budget.training_seeds)
     runs = {preset: [f"train/{preset}-{seed}" for seed in seeds] for preset in TRAINED}
     trainings = [
@@ -88,7 +90,7 @@ def steps_of(budget: Budget, policy: str | None, root: Path) -> list[Step]:
     at = ("--seeds", str(EVALUATION_SEED), "--episodes")
     places = [str(root / place) for of_preset in runs.values() for place in of_preset]
     pilot = policy or str(root / runs["curriculum"][0])
-    judged = ("eval", *places, *_controllers("straight", "planner", "bt"), *at, str(budget.episodes))
+    judged = ("eval", *places, *_controllers("straight", "planner", "bt", *own), *at, str(budget.episodes))
     recorded = ("--record", "1", *at, "1")
     methods = [str(root / runs[name][0]) for name in ("ppo", "distill_20", "curriculum")]
     steps = [
@@ -101,16 +103,20 @@ def steps_of(budget: Budget, policy: str | None, root: Path) -> list[Step]:
         ),
         Step(
             "transfer",
-            ("eval", pilot, *_controllers("bt"), "--world", "transfer", *at, str(budget.episodes)),
+            ("eval", pilot, *_controllers("bt", *own), "--world", "transfer", *at, str(budget.episodes)),
             "eval/transfer",
         ),
-        Step("scenario A", ("eval", *methods, *_controllers("bt"), *recorded, "--video"), "eval/scenario_a"),
+        Step(
+            "scenario A",
+            ("eval", *methods, *_controllers("bt", *own), *recorded, "--video"),
+            "eval/scenario_a",
+        ),
         Step(
             "scenario B",
-            ("eval", *methods, *_controllers("bt"), "-S", "12", "-D", "9", *recorded, "--video"),
+            ("eval", *methods, *_controllers("bt", *own), "-S", "12", "-D", "9", *recorded, "--video"),
             "eval/scenario_b",
         ),
-        Step("sweep", _sweep(pilot, "paper", budget.sweep_episodes), "sweep/pool", resumes=True),
+        Step("sweep", _sweep(pilot, "paper", budget.sweep_episodes, own=own), "sweep/pool", resumes=True),
         Step(
             "profile",
             ("profile", "--num-envs", "1,64,1024", "--seconds", str(budget.profile_seconds), "--density"),
@@ -118,22 +124,37 @@ def steps_of(budget: Budget, policy: str | None, root: Path) -> list[Step]:
             to_file=True,
         ),
     ]
-    return steps + (_beyond(pilot, budget) if budget.beyond else [])
+    return steps + (_beyond(pilot, budget, own) if budget.beyond else [])
 
 
 def _train(preset: str, seed: int, budget: Budget) -> tuple[str, ...]:
     return ("train", preset, "--seed", str(seed), "--set", f"train.iterations={budget.iterations}")
 
 
-def _sweep(pilot: str, grid: str, episodes: int, *more: str) -> tuple[str, ...]:
+def _sweep(pilot: str, grid: str, episodes: int, *more: str, own: Sequence[str] = ()) -> tuple[str, ...]:
     seed = ("--seeds", str(EVALUATION_SEED))
-    return ("sweep", pilot, *_controllers("bt"), "--grid", grid, "--episodes", str(episodes), *seed, *more)
+    return (
+        "sweep",
+        pilot,
+        *_controllers("bt", *own),
+        "--grid",
+        grid,
+        "--episodes",
+        str(episodes),
+        *seed,
+        *more,
+    )
 
 
-def _beyond(pilot: str, budget: Budget) -> list[Step]:
+def _beyond(pilot: str, budget: Budget, own: Sequence[str]) -> list[Step]:
     few = max(1, budget.sweep_episodes // 2)
     return [
-        Step("gauntlet", _sweep(pilot, "paper", few, "--world", "gauntlet"), "sweep/gauntlet", resumes=True),
+        Step(
+            "gauntlet",
+            _sweep(pilot, "paper", few, "--world", "gauntlet", own=own),
+            "sweep/gauntlet",
+            resumes=True,
+        ),
         Step(
             "trade-off",
             ("sweep", *_controllers("bt"), "--grid", "caution", "--episodes", str(few)),
@@ -142,13 +163,13 @@ def _beyond(pilot: str, budget: Budget) -> list[Step]:
         ),
         Step(
             "robustness",
-            _sweep(pilot, "robustness", 4 * budget.sweep_episodes),
+            _sweep(pilot, "robustness", 4 * budget.sweep_episodes, own=own),
             "sweep/robustness",
             resumes=True,
         ),
         Step(
             "dead reckoning",
-            _sweep(pilot, "dead_reckoning", 4 * budget.sweep_episodes),
+            _sweep(pilot, "dead_reckoning", 4 * budget.sweep_episodes, own=own),
             "sweep/dead_reckoning",
             resumes=True,
         ),

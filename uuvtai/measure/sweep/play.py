@@ -8,7 +8,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from uuvtai.files import FileError, open_to_append, parsed_json, read_json, read_lines, truncate
 from uuvtai.measure.sweep.cells import Grid
@@ -24,7 +24,12 @@ from uuvtai.measure.sweep.plan import (
     unchanged,
 )
 from uuvtai.measure.sweep.tasks import Row, play
+from uuvtai.own.piece_spec import is_piece, piece_spec, refuse_code
 from uuvtai.run_folder import RunFolder, RunFolderError, default_run_dir, refuse_place
+
+if TYPE_CHECKING:
+    from uuvtai.config import Config
+    from uuvtai.measure.episodes.methods import Method
 
 ROWS, REQUEST, RESULT = "cells.jsonl", "sweep_request.json", "sweep.json"
 
@@ -60,9 +65,11 @@ def sweep(
     return _play(request, methods, keys, engine, folder, watch), folder.path
 
 
-def resume(place: Path, engine: Engine, watch: SweepWatch) -> tuple[dict[str, Any], Path]:
-    """Go on with a sweep that was killed or interrupted: rows that are finished stay as they are. Raises
-    RunFolderError."""
+def resume(
+    place: Path, engine: Engine, watch: SweepWatch, allow_code: bool = False
+) -> tuple[dict[str, Any], Path]:
+    """Go on with a sweep that was killed or interrupted: rows that are finished stay as they are.
+    ``allow_code``: Python files that the folder names may be run. Raises RunFolderError."""
     folder = RunFolder.held(place, "uuv sweep")
     try:
         try:
@@ -73,7 +80,9 @@ def resume(place: Path, engine: Engine, watch: SweepWatch) -> tuple[dict[str, An
             raise RunFolderError(
                 f"{place / REQUEST}: cannot be read ({error}); give the folder that 'uuv sweep' printed"
             ) from None
-        _refuse_other_policies(place, request, checkpoints, watch)
+        controllers = [controller for _name, controller, _policy in methods]
+        refuse_code(place, [*request.controllers, *filter(None, controllers)], allow_code)
+        _refuse_other_policies(place, request, controllers, checkpoints, watch)
         keys = check_rows(request, [name for name, _controller, _policy in methods])
         folder.go_on({"rows": len(read_rows(place))})
         return _play(request, methods, keys, engine, folder, watch), place
@@ -90,7 +99,11 @@ def _method_key(given: Any) -> MethodKey:
 
 
 def _refuse_other_policies(
-    place: Path, request: SweepRequest, checkpoints: dict[str, str], watch: SweepWatch
+    place: Path,
+    request: SweepRequest,
+    controllers: Sequence[str | None],
+    checkpoints: dict[str, str],
+    watch: SweepWatch,
 ) -> None:
     """RunFolderError where a policy is another one by now: cells of two policies under one name would prove
     nothing."""
@@ -98,6 +111,8 @@ def _refuse_other_policies(
 
     trained = policies_of(list(request.policies), base_config(request).teacher.max_node, watch.note)
     now = {method.name: method.checkpoint.sha256 for method in trained if method.checkpoint}
+    own = _own_of(controllers, base_config(request))
+    now |= {method.name: method.own.sha256 for method in own if method.own}
     changed = [name for name, sha256 in checkpoints.items() if now.get(name) != sha256]
     if changed:
         raise RunFolderError(
@@ -120,21 +135,33 @@ def resolved(
     trees = trees_of(list(request.controllers), limit)
     policies = tuple(str(Path(name).resolve()) if Path(name).exists() else name for name in request.policies)
     trained = policies_of(list(policies), limit, watch.note)
-    controllers = [
-        str(Path(name).resolve()) if name.endswith((".xml", ".yaml", ".yml")) else name
-        for name in request.controllers
-    ]
+    controllers = [_located(name) for name in request.controllers]
     methods: list[MethodKey] = [
         (tree.name, name, None) for tree, name in zip(trees, controllers, strict=True)
     ]
     methods += [(method.name, None, name) for method, name in zip(trained, policies, strict=True)]
     features = features_of(list(policies)) if policies else []
     checkpoints = {method.name: method.checkpoint.sha256 for method in trained if method.checkpoint}
+    checkpoints |= {method.name: method.own.sha256 for method in trees if method.own}
     return (
         replace(request, overrides=(*features, *request.overrides), policies=policies),
         methods,
         checkpoints,
     )
+
+
+def _located(name: str) -> str:
+    """A controller's name as a worker in any folder finds it."""
+    if is_piece(name):
+        return piece_spec(name).absolute().text
+    return str(Path(name).resolve()) if name.endswith((".xml", ".yaml", ".yml")) else name
+
+
+def _own_of(controllers: Sequence[str | None], config: Config) -> list[Method]:
+    """The user's own pieces among them."""
+    from uuvtai.measure.episodes.methods import trees_of
+
+    return trees_of([name for name in controllers if name and is_piece(name)], config.teacher.max_node)
 
 
 def _play(

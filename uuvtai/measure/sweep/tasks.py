@@ -62,6 +62,7 @@ def play(task: Task) -> list[Row]:
     method = found[0]
     sim = _sim_of(task, method.config_of(task.config))
     sim.use_tree(method.tree)
+    sim.planner = method.planner_for(sim)
     jobs = [
         Job(seed, episode, scene)
         for scene in task.scenes

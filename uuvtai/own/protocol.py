@@ -1,0 +1,227 @@
+"""What a piece of the user's is called with and what it gives back: the types that her checker knows.
+
+A planner is a function ``plan`` or an object with that method, a controller one of ``act``, a policy one of
+``act``, ``predict`` (Stable-Baselines3's) or any callable. Whoever keeps something per env has ``reset`` too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, Protocol, TypeVar
+
+import numpy as np
+
+COMMAND = "surge, sway, heave [m/s], yaw rate [rad/s]"
+ACTION = "surge, sway, heave, yaw rate, each in [-1, 1]"
+
+
+@dataclass(frozen=True)
+class About:
+    """What is known before the first episode; a class, and a function named ``load``, may take it."""
+
+    num_envs: int
+    dt_s: float
+    """[s] of a control step"""
+    limits: np.ndarray
+    """(4,) of the command: surge, sway, heave [m/s], yaw rate [rad/s]"""
+    columns: Mapping[str, slice]
+    """columns of the observation by name"""
+    n_obs: int
+    cell_m: float
+    """[m] edge of a cell of the map"""
+    min_clearance_m: float
+    """[m] that the built-in planner keeps from what is occupied"""
+    device: str
+    """"cpu" or "cuda": where torch tensors are"""
+    argument: str = ""
+    """what stands after = in ``mine.py:load=...``"""
+
+
+class Forecast(NamedTuple):
+    """Where tracked moving bodies are expected, B of them at K times."""
+
+    position: np.ndarray
+    """(B, K, 2) [m] in the frame of start and goal; k = 0 is now"""
+    radius: np.ndarray
+    """(B, K) [m] with what the uncertainty adds"""
+    dt_s: float
+    """[s] between two times"""
+
+
+class OwnPlanner(Protocol):
+    """Plans one route for one env."""
+
+    def plan(
+        self, clearance: np.ndarray, cell_m: float, start: np.ndarray, goal: np.ndarray, forecast: Forecast
+    ) -> Any:
+        """Waypoints (n, 2) [m] from start to goal, or None where there is no way (the old route stays).
+
+        clearance: (n_row, n_col) [m] to the nearest occupied cell, 0 where occupied or outside the tank.
+        Places are in metres from the grid's corner: x = column * cell_m, y = row * cell_m.
+        """
+        ...
+
+
+class Ego(NamedTuple):
+    """What the vehicle knows of itself."""
+
+    position: Any
+    """(n, 3) [m] estimate, world, z up"""
+    rpy: Any
+    """(n, 3) [rad]"""
+    velocity: Any
+    """(n, 3) [m/s] body, as the DVL measured it last"""
+    rates: Any
+    """(n, 3) [rad/s] body"""
+    depth: Any
+    """(n,) [m] positive down"""
+
+
+class Scan(NamedTuple):
+    """The newest sonar scan; beam 0 was ahead when it was taken, counter-clockwise."""
+
+    range_m: Any
+    """(n, R) [m]; maximum range without a return"""
+    hit: Any
+    """(n, R) bool"""
+    doppler: Any
+    """(n, R) [m/s] rate of change of the range, own motion included"""
+    intensity: Any
+    """(n, R) [0, 1]"""
+    yaw: Any
+    """(n,) [rad] own yaw when it was taken"""
+    age_s: Any
+    """(n,) [s]"""
+
+
+class Tracks(NamedTuple):
+    """Forecast that the tracker follows."""
+
+    moving: Any
+    """(n, T) bool: the slot holds a body that is known to move"""
+    position: Any
+    """(n, T, 2) [m] world"""
+    velocity: Any
+    """(n, T, 2) [m/s] world"""
+    radius: Any
+    """(n, T) [m]"""
+    forecast: Any
+    """(n, T, K, 2) [m] world"""
+    forecast_radius: Any
+    """(n, T, K) [m]; negative = no forecast"""
+
+
+class OccupancyGrid(NamedTuple):
+    """The map; rows along y, columns along x."""
+
+    static: Any
+    """(n, n_row, n_col) occupancy in [0, 1] of what rests"""
+    moving: Any
+    """(n, n_row, n_col) occupancy of what moves"""
+    clearance: Any
+    """(n, n_row, n_col) [m] to the nearest resting cell or wall"""
+
+
+class Way(NamedTuple):
+    """The route."""
+
+    count: Any
+    """(n,) waypoints in use; 0 = no route"""
+    waypoints: Any
+    """(n, W, 2) [m] world; those beyond ``count`` mean nothing"""
+    lookahead: Any
+    """(n, 3) [m] world: where to steer"""
+    heading_error: Any
+    """(n,) [rad] bearing of that point less the own yaw"""
+    cross_track: Any
+    """(n,) [m] left positive"""
+    remaining: Any
+    """(n,) [m]"""
+
+
+class View(Protocol):
+    """What a controller is shown of n envs: what they sense, remember and decided, never the truth. Arrays
+    are NumPy's or torch's as ``piece(arrays=...)`` says; with ``rows="one"`` their first axis is gone."""
+
+    rows: Any
+    """(n,) numbers of the envs: their own memory is kept by these"""
+    time_s: Any
+    """(n,) [s] since the episode began"""
+    obs: Any
+    """(n, M) the observation that policies see"""
+    goal: Any
+    """(n, 3) [m] world"""
+    limits: Any
+    """(4,) of the command"""
+    dt_s: float
+    columns: Mapping[str, slice]
+    cell_m: float
+    origin: tuple[float, float]
+    """[m] world x, y of the grid's corner"""
+
+    @property
+    def ego(self) -> Ego: ...
+    @property
+    def scan(self) -> Scan: ...
+    @property
+    def tracks(self) -> Tracks: ...
+    @property
+    def map(self) -> OccupancyGrid: ...
+    @property
+    def route(self) -> Way: ...
+    def __getitem__(self, column: str) -> Any:
+        """Columns of the observation by name: (n, width)."""
+        ...
+
+    def in_body(self, vectors_w: Any) -> Any:
+        """Horizontal or 3-D vectors of the world (n, 2 or 3), turned by the own yaw: ahead, left(, up)."""
+        ...
+
+
+class OwnController(Protocol):
+    """Drives the envs that it is shown."""
+
+    def act(self, view: View) -> Any:
+        """Velocity command (n, 4) in the body frame: surge, sway, heave [m/s], yaw rate [rad/s]; cut off at
+        the limits."""
+        ...
+
+
+class OwnPolicy(Protocol):
+    """A trained policy: what it does follows from the observation alone."""
+
+    def act(self, obs: Any) -> Any:
+        """Actions (n, 4) in [-1, 1] for observations (n, M), without exploration."""
+        ...
+
+
+class Remembers(Protocol):
+    """Keeps something per env."""
+
+    def reset(self, rows: np.ndarray) -> None:
+        """New episodes begin in these envs (numbers)."""
+
+
+Piece = TypeVar("Piece", bound=Callable[..., Any])
+
+
+def piece(
+    rows: Literal["batch", "one"] = "batch", arrays: Literal["numpy", "torch"] = "numpy", hold_steps: int = 1
+) -> Callable[[Piece], Piece]:
+    """Decorator of a controller or policy, function or class: how it wants to be called.
+
+    rows: all envs at once, or one after the other; arrays: what it is given; hold_steps: control steps that a
+    decision is held for. Without it: the batch, NumPy, every step. ValueError for other values.
+    """
+    if rows not in ("batch", "one") or arrays not in ("numpy", "torch"):
+        raise ValueError(f"rows is 'batch' or 'one', arrays 'numpy' or 'torch', got {rows!r} and {arrays!r}")
+    if not isinstance(hold_steps, int) or isinstance(hold_steps, bool) or not 1 <= hold_steps <= 10_000:
+        raise ValueError(f"hold_steps is a number of control steps from 1, got {hold_steps!r}")
+
+    def marked(found: Piece) -> Piece:
+        for name, value in (("rows", rows), ("arrays", arrays), ("hold_steps", hold_steps)):
+            setattr(found, name, value)
+        return found
+
+    return marked
