@@ -37,7 +37,7 @@ def stage():
         "n_way": CONFIG.route.n_way,
         "n_ahead": N_AHEAD,
         "n_trigger": 4,
-        "n_planner": 2,
+        "n_planner": 3,
         "n_reason": 5,
         "n_track": 2,
         "n_forecast": 26,

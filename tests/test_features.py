@@ -142,7 +142,7 @@ OBSERVATION_ROUNDING = 1e-5
 def observed(stage):
     """(observation (n_env, n_obs), arrays it was made of, rows awake) for random states; -7 was there
     before."""
-    sizes = {"n_env": N_ENV, "n_way": 2, "n_ahead": 2, "n_trigger": 4, "n_planner": 2, "n_reason": 4}
+    sizes = {"n_env": N_ENV, "n_way": 2, "n_ahead": 2, "n_trigger": 4, "n_planner": 3, "n_reason": 4}
     route, mission = allocate(RouteState, sizes), allocate(MissionState, sizes)
     rng, arrays = np.random.default_rng(0), {}
     for struct, names in {

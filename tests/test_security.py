@@ -145,6 +145,8 @@ def test_nothing_in_the_package_can_execute_what_it_reads():
     assert {name for name, _ in imports} <= {"doctor.py", "convert.py", "__init__.py"}, (
         "modules are never imported by names from files"
     )
+    loaders = [path.name for path in PACKAGE.rglob("*.py") if "module_from_spec" in path.read_text()]
+    assert loaders == ["piece_loading.py"], "Python of the user's is run in one place, which she has named"
 
 
 READERS = {

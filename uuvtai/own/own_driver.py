@@ -14,7 +14,7 @@ from uuvtai.own.call_meter import CallMeter
 from uuvtai.own.piece_errors import failed
 from uuvtai.own.piece_spec import PieceSpec
 from uuvtai.own.piece_view import Fixed, PieceView, Readings
-from uuvtai.own.protocol import ACTION, COMMAND
+from uuvtai.own.protocol import ACTION, COMMAND, View
 from uuvtai.sim import Sim
 
 
@@ -106,8 +106,9 @@ def asking_controller(sim: Sim, code: OwnCode, columns: Mapping[str, slice], lim
 
     def ask(rows: list[int], obs: torch.Tensor) -> torch.Tensor:
         readings = Readings(sim, rows, obs)
+        view: View = PieceView(readings, fixed)
         if code.marks.rows == "batch":
-            found = code.called(code.act, PieceView(readings, fixed), len(rows))
+            found = code.called(code.act, view, len(rows))
         else:
             each = (code.called(code.act, PieceView(readings, fixed, i), 1) for i in range(len(rows)))
             found = torch.cat([answers.command(one, code.place, COMMAND) for one in each])

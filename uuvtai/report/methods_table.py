@@ -157,7 +157,7 @@ _PLANNING = (
         "initial / stuck / safety / intersection",
         of=lambda m: _counts(m, "replans_by_trigger", "initial", "stuck", "safety", "intersection"),
     ),
-    Column("Voronoi / RRT", of=lambda m: _counts(m, "planned_by", "voronoi", "rrt")),
+    Column("Voronoi / RRT / own", of=lambda m: _counts(m, "planned_by", "voronoi", "rrt", "own")),
     Column("path m", of=lambda m: number(m.get("path_length_mean_m"))),
     Column("env-steps/s", of=lambda m: number(m.get("env_steps_per_s"), 0)),
 )

@@ -108,4 +108,4 @@ def _as_list(interval: tuple[float, float] | None) -> list[float] | None:
 
 
 def _summed(names: tuple[str, ...], counts: list[dict[str, int]]) -> dict[str, int]:
-    return {name: sum(c[name] for c in counts) for name in names}
+    return {name: sum(c.get(name, 0) for c in counts) for name in names}

@@ -71,6 +71,8 @@ def play(task: Task) -> list[Row]:
     ]
     note = method.driver_for(sim)
     results, _env_steps = run_episodes(sim, jobs, driver=note.pilot if note else None)
+    if method.own:
+        method.own.close()
     each = len(task.seeds) * task.episodes
     return [
         row_of(method.name, label, results[i * each : (i + 1) * each]) for i, label in enumerate(task.labels)
