@@ -536,13 +536,18 @@ def log_repair(file: opt.LogFile, out: opt.RepairOut = None, force: opt.LogForce
 
 
 @log_app.command("convert", epilog="Example: uuv log convert runs/first/logs/bt_seed0_episode0.mcap")
-def log_convert(file: opt.LogFile, out: opt.ConvertOut = None, force: opt.LogForce = False) -> None:
-    """Write a log with protobuf messages and point clouds, for Rerun and other viewers that do not read
-    JSON."""
-    from uuvtai.logs import convert
+def log_convert(
+    file: opt.LogFile,
+    out: opt.ConvertOut = None,
+    to: opt.ConvertTo = "protobuf",
+    source: opt.ConvertFrom = "mcap",
+    force: opt.LogForce = False,
+) -> None:
+    """Write a log with protobuf messages and point clouds for Rerun, or as a ROS 2 bag; or a bag as a log."""
+    from uuvtai.logs.conversions import converted
 
-    target = out or file.with_suffix(".protobuf.mcap")
-    typer.echo(f"{target}: {convert.convert(file, target, force)} messages")
+    target, messages = converted(file, out, to, source, force)
+    typer.echo(f"{target}: {messages} messages")
 
 
 @log_app.command("video", epilog="Example: uuv log video runs/first/logs/bt_seed0_episode0.mcap")

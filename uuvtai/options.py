@@ -340,7 +340,29 @@ LogExportOut = Annotated[Path, Option("--out", help="New or empty folder for the
 Topics = Annotated[list[str] | None, Option("--topic", help="Only these topics (repeatable).")]
 LogFormat = Annotated[str, Option("--format", help="json (a line a message), csv or npz (NumPy arrays).")]
 RepairOut = Annotated[Path | None, Option("--out", help="Repaired file \\[default: NAME.repaired.mcap].")]
-ConvertOut = Annotated[Path | None, Option("--out", help="New file \\[default: NAME.protobuf.mcap].")]
+ConvertOut = Annotated[
+    Path | None,
+    Option(
+        "--out",
+        help="New file, or folder of a bag \\[default: NAME.protobuf.mcap, NAME_rosbag2, NAME.log.mcap].",
+    ),
+]
+ConvertTo = Annotated[
+    str,
+    Option(
+        "--to",
+        help="protobuf (Rerun), or rosbag2 (a ROS 2 bag).",
+        autocompletion=lambda: ["protobuf", "rosbag2"],
+    ),
+]
+ConvertFrom = Annotated[
+    str,
+    Option(
+        "--from",
+        help="mcap (a log), or rosbag2 (a ROS 2 bag becomes a log).",
+        autocompletion=lambda: ["mcap", "rosbag2"],
+    ),
+]
 VideoOut = Annotated[
     Path | None,
     Option(

@@ -59,8 +59,8 @@ class McapFile:
     """One MCAP file under way as ``<path>.part``; ``finish`` makes it whole, durable and gives it its
     name."""
 
-    def __init__(self, path: Path, suffix: str = ".part") -> None:
-        """Raises OSError."""
+    def __init__(self, path: Path, suffix: str = ".part", profile: str = "") -> None:
+        """``profile``: what the file says it keeps to, such as 'ros2'. Raises OSError."""
         self.path = path
         self.part = path.with_name(path.name + suffix)
         self._file: BinaryIO = open(self.part, "wb")  # noqa: SIM115 - lives as long as the object
@@ -74,7 +74,7 @@ class McapFile:
         self._messages, self._unsettled = 0, 0
         self._chunk: _OpenChunk | None = None
         self._file.write(MAGIC)
-        self._put(Header(profile="", library=f"uuvtai {__version__}"))
+        self._put(Header(profile=profile, library=f"uuvtai {__version__}"))
 
     def add_metadata(self, name: str, entries: dict[str, str]) -> None:
         """Named pairs of strings. Lies between chunks."""

@@ -44,11 +44,11 @@ class Layer:
 
 
 def _static(moment: Moment) -> bytes:
-    return _grid(moment, moment.stamp, moment["grid_map.static_occ"], _static_colors)
+    return _grid(moment, moment.stamp, moment["grid_map.static_occ"], static_colors)
 
 
 def _dynamic(moment: Moment) -> bytes:
-    return _grid(moment, moment.stamp, moment["grid_map.dynamic_occ"], _dynamic_colors)
+    return _grid(moment, moment.stamp, moment["grid_map.dynamic_occ"], dynamic_colors)
 
 
 def _clearance(moment: Moment) -> bytes:
@@ -71,19 +71,28 @@ def _computed(moment: Moment) -> str:
 
 
 def _grid(moment: Moment, stamp: str, values: np.ndarray, paint: Paint) -> bytes:
+    config = moment.header.config
+    x, y = map_origin(config, values.shape)
+    pose = {**IDENTITY, "position": {"x": x, "y": y, "z": 0}}
+    return grid_text(stamp, "world", pose, config.mapping.cell_m, values, paint)
+
+
+def grid_text(
+    stamp: str, frame: str, pose: dict[str, Any], cell_m: float, values: np.ndarray, paint: Paint
+) -> bytes:
+    """foxglove.Grid of ``values`` (row, col); ``pose``: of the outer corner of cell [0, 0]. Raises ValueError
+    for values that are not finite."""
     if not np.isfinite(values).all():
         raise ValueError("a map with values that are not finite")
     cells = np.empty(values.shape, _CELL)
     for name, channel in zip(("red", "green", "blue", "alpha"), paint(values), strict=True):
         cells[name] = channel
     cells["value"] = values
-    config = moment.header.config
-    x, y = map_origin(config, values.shape)
     head = {
-        "frame_id": "world",
-        "pose": {**IDENTITY, "position": {"x": x, "y": y, "z": 0}},
+        "frame_id": frame,
+        "pose": pose,
         "column_count": values.shape[1],
-        "cell_size": {"x": config.mapping.cell_m, "y": config.mapping.cell_m},
+        "cell_size": {"x": cell_m, "y": cell_m},
         "row_stride": values.shape[1] * _CELL.itemsize,
         "cell_stride": _CELL.itemsize,
         "fields": _FIELDS,
@@ -105,11 +114,13 @@ def map_origin(config: Config, shape: tuple[int, ...]) -> tuple[float, float]:
     return first_x, first_y
 
 
-def _static_colors(values: np.ndarray):
+def static_colors(values: np.ndarray) -> tuple[int, int, int, np.ndarray]:
+    """Paint of what rests."""
     return 38, 44, 56, _byte(values)
 
 
-def _dynamic_colors(values: np.ndarray):
+def dynamic_colors(values: np.ndarray) -> tuple[int, int, int, np.ndarray]:
+    """Paint of what moves."""
     return 229, 57, 70, _byte(values)
 
 

@@ -1,0 +1,196 @@
+"""Logs as ROS 2 bags: two independent readers see what the log says, and a bag gives the log back."""
+
+import importlib.util
+import math
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from tests.command import run_cli
+from tests.reference import logs as episode
+from uuvtai.logs import ros_types
+from uuvtai.logs.container import McapFile
+from uuvtai.logs.log_errors import LogError
+from uuvtai.logs.mcap_log import McapEpisodeLog
+from uuvtai.logs.reader import info, read_head, read_messages
+from uuvtai.logs.ros_write import WRITTEN
+from uuvtai.logs.rosbag import from_rosbag2, to_rosbag2
+from uuvtai.logs.topics.map_topics import grid_values
+
+if any(importlib.util.find_spec(name) is None for name in ("rosbags", "mcap_ros2")):
+    pytest.skip("needs the extra uuvtai[ros]", allow_module_level=True)
+
+N_STEP = 30
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    path = tmp_path_factory.mktemp("logs") / "a.mcap"
+    with McapEpisodeLog(path, episode.header()) as log:
+        for snap in episode.snapshots(N_STEP):
+            log.write(snap)
+        log.close(episode.result(N_STEP))
+    return path
+
+
+@pytest.fixture(scope="module")
+def bag(recorded):
+    out = recorded.with_name("bag")
+    to_rosbag2(recorded, out)
+    return out
+
+
+@pytest.fixture(scope="module")
+def back(bag):
+    out = bag.with_name("back.mcap")
+    from_rosbag2(bag, out)
+    return out
+
+
+def by_rosbags(bag):
+    """{topic: [(time, message)]} by the reader of rosbags, metadata.yaml included."""
+    from rosbags.rosbag2 import Reader
+    from rosbags.typesys import Stores, get_typestore
+
+    store, found = get_typestore(Stores.ROS2_HUMBLE), {}
+    with Reader(bag) as reader:
+        for connection, time_ns, data in reader.messages():
+            message = store.deserialize_cdr(data, connection.msgtype)
+            found.setdefault(connection.topic, []).append((time_ns, message))
+    return found
+
+
+def by_mcap_ros2(bag):
+    """The same by MCAP's reader and decoder, which parses the definitions in the file."""
+    from mcap_ros2.decoder import DecoderFactory
+
+    found = {}
+    with (bag / f"{bag.name}.mcap").open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()], validate_crcs=True)
+        assert reader.get_header().profile == "ros2"
+        for _schema, channel, message, decoded in reader.iter_decoded_messages():
+            found.setdefault(channel.topic, []).append((message.log_time, decoded))
+    return found
+
+
+@pytest.fixture(scope="module", params=[by_rosbags, by_mcap_ros2])
+def ros(request, bag):
+    return request.param(bag)
+
+
+def by_topic(path, topic):
+    return [m.data for m in read_messages(path, [topic])]
+
+
+def xyz(value):
+    return [value.x, value.y, value.z]
+
+
+def test_all_topics_are_there(ros, recorded):
+    assert ros.keys() == WRITTEN.keys()
+    for topic, source in (("/tf", "/tf"), ("/scan", "/sonar/scan"), ("/map", "/map/static")):
+        assert len(ros[topic]) == len(by_topic(recorded, source)) > 1
+
+
+def test_motion(ros, recorded):
+    states = by_topic(recorded, "/state")
+    for state, (_, truth), (_, own), (_, pressure), (_, imu) in zip(
+        states,
+        *(ros[topic] for topic in ("/ground_truth/odom", "/odometry/filtered", "/pressure", "/imu/data")),
+        strict=True,
+    ):
+        assert xyz(truth.pose.pose.position) == state["position"]
+        assert xyz(truth.twist.twist.linear) == state["velocity"]
+        assert (truth.header.frame_id, truth.child_frame_id) == ("map", "base_link")
+        assert xyz(own.twist.twist.linear) == state["measured"]["velocity"]
+        assert xyz(imu.angular_velocity) == state["measured"]["rates"]
+        assert imu.linear_acceleration_covariance[0] == -1
+        water = episode.config().vehicle
+        depth = (pressure.fluid_pressure - 101325) / (water.water_density_kg_m3 * water.gravity_m_s2)
+        assert depth == pytest.approx(state["measured"]["depth_m"], abs=1e-9)
+
+
+def test_scans_and_clouds(ros, recorded):
+    for scan, (_, found), (_, cloud) in zip(
+        by_topic(recorded, "/sonar/scan"), ros["/scan"], ros["/sonar/points"], strict=True
+    ):
+        hit = np.array(scan["intensities"]) > 0
+        ranges = np.array(found.ranges)
+        assert np.isinf(ranges[~hit]).all() and (ranges[hit] == np.float32(scan["ranges"])[hit]).all()
+        assert found.header.frame_id == "sonar_link"
+        assert found.angle_increment == pytest.approx(2 * math.pi / episode.N_RAY)
+        points = np.frombuffer(bytes(cloud.data), "<f4").reshape(-1, 5)
+        assert len(points) == hit.sum() == cloud.width
+        np.testing.assert_allclose(np.hypot(points[:, 0], points[:, 1]), np.abs(ranges[hit]), rtol=1e-6)
+
+
+def test_maps_and_commands(ros, recorded):
+    grid, (_, found) = by_topic(recorded, "/map/static")[-1], ros["/map"][-1]
+    values = np.array(found.data).reshape(found.info.height, found.info.width)
+    np.testing.assert_allclose(values / 100, np.clip(grid_values(grid), 0, 1), atol=0.0051)
+    applied = by_topic(recorded, "/action")[-1]["applied"]
+    speed = ros["/cmd_vel"][-1][1].linear.x
+    assert speed == pytest.approx(applied[0] * episode.config().vehicle.max_surge_m_s)
+
+
+def test_round_trip(recorded, back):
+    assert by_topic(back, "/tf") == by_topic(recorded, "/tf")
+    for one, other in zip(by_topic(back, "/sonar/scan"), by_topic(recorded, "/sonar/scan"), strict=True):
+        inside = np.array(other["ranges"]) >= 0  # noise next to a hull can go below, which is no range in ROS
+        for name in ("ranges", "intensities"):
+            np.testing.assert_allclose(np.array(one[name])[inside], np.array(other[name])[inside], rtol=1e-6)
+        assert one["end_angle"] == pytest.approx(other["end_angle"], rel=1e-6)
+        assert one["timestamp"] == other["timestamp"] and one["frame_id"] == "sonar"
+    for one, other in zip(by_topic(back, "/map/dynamic"), by_topic(recorded, "/map/dynamic"), strict=True):
+        assert one["pose"] == other["pose"]
+        np.testing.assert_allclose(grid_values(one), np.clip(grid_values(other), 0, 1), atol=0.0051)
+    for one, other in zip(by_topic(back, "/ground_truth/odom"), by_topic(recorded, "/state"), strict=True):
+        assert list(one["pose"]["position"].values()) == other["position"]
+        assert one["velocity"] == other["velocity"] and one["rates"] == other["rates"]
+    assert read_head(back) == read_head(recorded)
+    times = [m.time_s for m in read_messages(recorded, ["/tf"])]
+    assert [m.time_s for m in read_messages(back, ["/tf"])] == times
+
+
+# ----------------------------------------------------------------------------------------------------- errors
+
+
+def test_the_command(recorded, tmp_path, capfd):
+    bag, out = tmp_path / "bag", tmp_path / "b.mcap"
+    assert run_cli("log", "convert", recorded, "--to", "rosbag2", "--out", bag) == 0
+    assert run_cli("log", "convert", bag, "--from", "rosbag2", "--out", out) == 0
+    assert f"{out}: {info(out)['messages']} messages\n" in capfd.readouterr().out
+    for words, reason in (
+        (("--to", "ros"), "choose one of protobuf, rosbag2"),
+        (("--from", "bag"), "choose one of mcap, rosbag2"),
+        (("--to", "rosbag2", "--from", "rosbag2"), "leave out --to"),
+        (("--to", "rosbag2", "--out", bag), "is a new folder"),
+        (("--from", "rosbag2", "--out", tmp_path / "c.mcap"), "none of the messages that can be read"),
+    ):
+        assert run_cli("log", "convert", recorded, *words) == 2
+        assert reason in capfd.readouterr().err
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["b.mcap", "bag"]
+
+
+@pytest.mark.parametrize("kind", sorted(set(WRITTEN.values())))
+@pytest.mark.parametrize("data", [b"", b"\0\1\0\0" + b"\xff" * 400, b"\0\1\0\0" + b"\0" * 9])
+def test_hostile_messages_leave_nothing(tmp_path, kind, data):
+    file = McapFile(tmp_path / "a.mcap")
+    file.add_message(file.add_channel("/x", file.add_schema(kind, "ros2msg", b"?"), "cdr"), 0, data)
+    file.finish()
+    with pytest.raises(LogError, match="is not as its schema says"):
+        from_rosbag2(tmp_path / "a.mcap", tmp_path / "b.mcap")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a.mcap"]
+
+
+def test_bags_in_sqlite_are_named(tmp_path):
+    (tmp_path / "a.db3").write_bytes(b"SQLite format 3\0")
+    with pytest.raises(LogError, match="rosbags-convert"):
+        from_rosbag2(tmp_path, tmp_path / "b.mcap")
+
+
+def test_without_the_extra_it_says_what_to_install(recorded, tmp_path, monkeypatch):
+    monkeypatch.setattr(ros_types, "_PACKAGE", "nothing_of_this_name")
+    with pytest.raises(LogError, match=r"pip install 'uuvtai\[ros\]'"):
+        to_rosbag2(recorded, tmp_path / "b")

@@ -1,0 +1,234 @@
+"""ROS 2's standard messages as a log's JSON messages; the table of docs/ros.md. Nothing in a message is
+trusted: what does not fit together is a ValueError."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from uuvtai.logs.encode import dumped
+from uuvtai.logs.moment import time_text
+from uuvtai.logs.ros_types import FRAMES_BACK, SURFACE_PA
+from uuvtai.logs.ros_write import INVALID_VAR, Setup
+from uuvtai.logs.schemas import (
+    BASE64,
+    BOOLEAN,
+    FRAME_TRANSFORMS,
+    GRID,
+    LASER_SCAN,
+    NUMBER,
+    PACKED_FIELD,
+    POSE,
+    STRING,
+    THREE,
+    TIME,
+    UINT,
+    Schema,
+    array_of,
+    record,
+)
+from uuvtai.logs.topics.map_topics import dynamic_colors, grid_text, static_colors
+
+_CLOUD = record(
+    "foxglove.PointCloud",
+    timestamp=TIME,
+    frame_id=STRING,
+    pose=POSE,
+    point_stride=UINT,
+    fields=array_of(PACKED_FIELD),
+    data=BASE64,
+)
+_ODOMETRY = record(
+    "uuv.Odometry",
+    timestamp=TIME,
+    frame_id=STRING,
+    pose=POSE,
+    pose_covariance=array_of(NUMBER),
+    velocity=THREE,
+    rates=THREE,
+    velocity_valid=BOOLEAN,
+)
+_IMU = record(
+    "uuv.Imu",
+    {"acceleration": THREE},
+    timestamp=TIME,
+    frame_id=STRING,
+    orientation=POSE["properties"]["orientation"],
+    rates=THREE,
+)
+_PRESSURE = record("uuv.Pressure", timestamp=TIME, frame_id=STRING, pressure_pa=NUMBER, depth_m=NUMBER)
+_TWIST = record("uuv.Twist", linear=THREE, angular=THREE)
+_TWIST_STAMPED = record("uuv.TwistStamped", timestamp=TIME, frame_id=STRING, linear=THREE, angular=THREE)
+
+NAMES = {"/scan": "/sonar/scan", "/map": "/map/static"}
+"""ROS topic: the log's, where it is another"""
+_TYPES = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}
+"""PointField's codes: Foxglove's"""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How messages of one kind become ours."""
+
+    schema: Schema
+    read: Callable[[Reader, Any], bytes]
+
+
+class Reader:
+    """Of one topic's messages; times count from ``start_ns``."""
+
+    def __init__(self, topic: str, setup: Setup, start_ns: int) -> None:
+        self.topic, self.setup, self._start_ns = topic, setup, start_ns
+
+    def head(self, header: Any) -> dict[str, Any]:
+        """timestamp and frame_id; stamps before the start of the bag count as its start."""
+        return {
+            "timestamp": json.loads(self.stamp(header)),
+            "frame_id": FRAMES_BACK.get(header.frame_id, header.frame_id),
+        }
+
+    def stamp(self, header: Any) -> str:
+        """Time as a foxglove time."""
+        time_ns = header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
+        return time_text(max(time_ns - self._start_ns, 0))
+
+
+def _xyz(value: Any) -> dict[str, float]:
+    return {"x": value.x, "y": value.y, "z": value.z}
+
+
+def _list(value: Any) -> list[float]:
+    return [value.x, value.y, value.z]
+
+
+def _turn(value: Any) -> dict[str, float]:
+    return {"x": value.x, "y": value.y, "z": value.z, "w": value.w}
+
+
+def _pose(value: Any) -> dict[str, Any]:
+    return {"position": _xyz(value.position), "orientation": _turn(value.orientation)}
+
+
+_HERE = {"position": {"x": 0, "y": 0, "z": 0}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}
+
+
+def _transforms(reader: Reader, message: Any) -> bytes:
+    return dumped({"transforms": [_transform(reader, one) for one in message.transforms]})
+
+
+def _transform(reader: Reader, one: Any) -> dict[str, Any]:
+    head = reader.head(one.header)
+    return {
+        "timestamp": head["timestamp"],
+        "parent_frame_id": head["frame_id"],
+        "child_frame_id": FRAMES_BACK.get(one.child_frame_id, one.child_frame_id),
+        "translation": _xyz(one.transform.translation),
+        "rotation": _turn(one.transform.rotation),
+    }
+
+
+def _scan(reader: Reader, message: Any) -> bytes:
+    """No return (not finite, or beyond the range): maximum range with intensity 0, as in our logs."""
+    ranges = np.asarray(message.ranges, np.float64)
+    shine = np.asarray(message.intensities, np.float64)
+    if len(shine) not in (0, len(ranges)):
+        raise ValueError(f"{len(ranges)} ranges with {len(shine)} intensities")
+    hit = np.isfinite(ranges) & (ranges >= message.range_min) & (ranges <= message.range_max)
+    shine = np.where(hit, np.maximum(shine, 1e-3) if len(shine) else 1.0, 0.0)
+    last = message.angle_min + message.angle_increment * max(len(ranges) - 1, 0)
+    return dumped(
+        {
+            **reader.head(message.header),
+            "pose": _HERE,
+            "start_angle": message.angle_min,
+            "end_angle": last,
+            "ranges": np.where(hit, ranges, message.range_max).tolist(),
+            "intensities": shine.tolist(),
+        }
+    )
+
+
+def _cloud(reader: Reader, message: Any) -> bytes:
+    fields = [
+        {"name": one.name, "offset": one.offset, "type": _TYPES[one.datatype]} for one in message.fields
+    ]
+    if message.is_bigendian or len(message.data) != message.point_step * message.width * message.height:
+        raise ValueError("a point cloud that is big-endian, padded or cut off")
+    data = base64.b64encode(np.asarray(message.data, np.uint8).tobytes()).decode()
+    head = reader.head(message.header)
+    return dumped({**head, "pose": _HERE, "point_stride": message.point_step, "fields": fields, "data": data})
+
+
+def _grid(reader: Reader, message: Any) -> bytes:
+    """Per cent as a share; unknown (-1) as a half."""
+    info, data = message.info, np.asarray(message.data, np.int8)
+    if len(data) != info.width * info.height or not len(data) or data.max() > 100:
+        raise ValueError(f"a map of {info.width} x {info.height} with {len(data)} cells")
+    values = np.where(data < 0, np.float32(0.5), data / np.float32(100)).reshape(info.height, info.width)
+    head = reader.head(message.header)
+    paint = dynamic_colors if reader.topic == "/map/dynamic" else static_colors
+    place = _pose(info.origin)
+    dumped(place)  # finite
+    return grid_text(
+        reader.stamp(message.header), head["frame_id"], place, info.resolution, values.astype("<f4"), paint
+    )
+
+
+def _odometry(reader: Reader, message: Any) -> bytes:
+    twist = message.twist.twist
+    return dumped(
+        {
+            **reader.head(message.header),
+            "pose": _pose(message.pose.pose),
+            "pose_covariance": np.asarray(message.pose.covariance, float).tolist(),
+            "velocity": _list(twist.linear),
+            "rates": _list(twist.angular),
+            "velocity_valid": bool(message.twist.covariance[0] < INVALID_VAR),
+        }
+    )
+
+
+def _imu(reader: Reader, message: Any) -> bytes:
+    known = message.linear_acceleration_covariance[0] != -1
+    return dumped(
+        {
+            **reader.head(message.header),
+            "orientation": _turn(message.orientation),
+            "rates": _list(message.angular_velocity),
+            "acceleration": _list(message.linear_acceleration) if known else None,
+        }
+    )
+
+
+def _pressure(reader: Reader, message: Any) -> bytes:
+    depth = (message.fluid_pressure - SURFACE_PA) / reader.setup.pa_per_m
+    return dumped({**reader.head(message.header), "pressure_pa": message.fluid_pressure, "depth_m": depth})
+
+
+def _twist(reader: Reader, message: Any) -> bytes:
+    return dumped({"linear": _list(message.linear), "angular": _list(message.angular)})
+
+
+def _twist_stamped(reader: Reader, message: Any) -> bytes:
+    twist = message.twist
+    head = reader.head(message.header)
+    return dumped({**head, "linear": _list(twist.linear), "angular": _list(twist.angular)})
+
+
+READ = {
+    "tf2_msgs/msg/TFMessage": Reading(FRAME_TRANSFORMS, _transforms),
+    "nav_msgs/msg/Odometry": Reading(_ODOMETRY, _odometry),
+    "sensor_msgs/msg/Imu": Reading(_IMU, _imu),
+    "sensor_msgs/msg/FluidPressure": Reading(_PRESSURE, _pressure),
+    "sensor_msgs/msg/LaserScan": Reading(LASER_SCAN, _scan),
+    "sensor_msgs/msg/PointCloud2": Reading(_CLOUD, _cloud),
+    "nav_msgs/msg/OccupancyGrid": Reading(GRID, _grid),
+    "geometry_msgs/msg/TwistStamped": Reading(_TWIST_STAMPED, _twist_stamped),
+    "geometry_msgs/msg/Twist": Reading(_TWIST, _twist),
+}
+"""message: how it is read; all others are left out"""

@@ -1,0 +1,246 @@
+"""Logs as ROS 2 bags (``rosbag2`` with MCAP storage) and bags as logs, without ROS."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import yaml
+from mcap.records import Attachment, Channel, Message, Metadata, Schema
+
+from uuvtai.files import refuse_output
+from uuvtai.loader import ConfigError, parsed_yaml
+from uuvtai.logs.budget import MAX_MESSAGE
+from uuvtai.logs.container import McapFile
+from uuvtai.logs.log_errors import LogError
+from uuvtai.logs.reader import LogHead, read_head, read_messages, records
+from uuvtai.logs.ros_read import NAMES, READ, Reader
+from uuvtai.logs.ros_types import RosMessages
+from uuvtai.logs.ros_write import SOURCES, WRITTEN, Setup, ros_messages
+
+_ODD = (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError, RecursionError)
+
+
+def to_rosbag2(path: Path, out: Path, force: bool = False) -> int:
+    """Write the log ``path`` as a bag, the new folder ``out``; how many messages. Raises LogError, and then
+    nothing is left.
+
+    Raises LogError or FileError where ``out`` exists: ``force`` replaces no folder.
+    """
+    path, out, ros = Path(path), Path(out), RosMessages()
+    if out.is_dir():
+        raise LogError(f"{out}: a bag is a new folder, which --force does not replace; give a new --out DIR")
+    refuse_output(out, [path], False)
+    head = read_head(path)
+    setup = _setup(path, head)
+    staging = out.with_name(f".{out.name}.{os.getpid()}.partial")
+    with _as_log_error(path, out):
+        try:
+            staging.mkdir(parents=True)
+            count = _write_bag(path, head, setup, ros, staging, out.name)
+            staging.rename(out)
+        finally:
+            shutil.rmtree(staging, ignore_errors=True)
+    return count
+
+
+def from_rosbag2(path: Path, out: Path, force: bool = False) -> int:
+    """Write the bag ``path``, a folder or its .mcap file, as the log ``out``; how many messages. Those
+    that are not in ``READ`` are left out. Raises LogError, and then nothing is left; FileError as
+    ``refuse_output``."""
+    ros, file = RosMessages(), _bag_file(Path(path))
+    out = Path(out)
+    refuse_output(out, [file], force)
+    head = read_head(file)
+    setup = _setup(file, head)
+    with _as_log_error(file, out):
+        out.parent.mkdir(parents=True, exist_ok=True)
+        log = McapFile(out)
+        try:
+            count = _Reading(ros, setup, log).run(file, head)
+            if not count:
+                raise LogError(f"{file}: none of the messages that can be read; it needs {', '.join(READ)}")
+            log.finish()
+        except BaseException:
+            log.discard()
+            raise
+    return count
+
+
+@contextlib.contextmanager
+def _as_log_error(path: Path, out: Path) -> Iterator[None]:
+    try:
+        yield
+    except _ODD as error:
+        raise LogError(
+            f"{path}: a message is not as its schema says ({str(error)[:200]!r}); see what is in it: uuv "
+            f"log info {path}"
+        ) from None
+    except OSError as error:
+        raise LogError(f"{out}: cannot write ({error.strerror}); choose another place with --out") from None
+
+
+def _setup(path: Path, head: LogHead) -> Setup:
+    try:
+        given = parsed_yaml(head.attachments.get("config.yaml", b"{}").decode(), f"{path}: config.yaml")
+        return Setup.of(given)
+    except (ConfigError, ValueError, TypeError, AttributeError) as error:
+        raise LogError(
+            f"{path}: its config.yaml cannot be read ({error}); convert a log that uuv eval --record wrote"
+        ) from None
+
+
+def _bag_file(path: Path) -> Path:
+    """The one .mcap of a bag."""
+    if not path.is_dir():
+        return path
+    found = sorted(entry for entry in path.iterdir() if entry.suffix in (".mcap", ".db3"))
+    if len(found) == 1 and found[0].suffix == ".mcap":
+        return found[0]
+    if any(entry.suffix == ".db3" for entry in found):
+        raise LogError(
+            f"{path}: is a bag in SQLite, and only MCAP is read; first: rosbags-convert --src {path} --dst "
+            "NEW --dst-storage mcap"
+        )
+    raise LogError(f"{path}: holds {len(found)} .mcap files; name the one to convert")
+
+
+# -------------------------------------------------------------------------------------------------- writing
+
+
+def _write_bag(path: Path, head: LogHead, setup: Setup, ros: RosMessages, folder: Path, name: str) -> int:
+    file = McapFile(folder / f"{name}.mcap", profile="ros2")
+    try:
+        for key, entries in head.metadata.items():
+            file.add_metadata(key, entries)
+        for key, data in head.attachments.items():
+            file.add_attachment(key, "application/octet-stream", data)
+        kinds = dict.fromkeys(WRITTEN.values())
+        schemas = {kind: file.add_schema(kind, "ros2msg", ros.definition(kind)) for kind in kinds}
+        qos = {"offered_qos_profiles": ""}
+        channels = {
+            topic: file.add_channel(topic, schemas[kind], "cdr", qos) for topic, kind in WRITTEN.items()
+        }
+        counts: Counter[str] = Counter()
+        times = [0]
+        for time_ns, step in _steps(path):
+            for topic, message in ros_messages(ros, setup, time_ns, step):
+                file.add_message(channels[topic], time_ns, ros.packed(message))
+                counts[topic] += 1
+            times = [times[0] if sum(counts.values()) else time_ns, time_ns]
+        described = _description(f"{name}.mcap", counts, times[-1] - times[0], times[0])
+        file.add_metadata("rosbag2", {"serialized_metadata": yaml.safe_dump(described)})
+        file.finish()
+    except BaseException:
+        file.discard()
+        raise
+    text = yaml.safe_dump({"rosbag2_bagfile_information": described}, sort_keys=False)
+    (folder / "metadata.yaml").write_text(text, encoding="utf-8")
+    return sum(counts.values())
+
+
+def _steps(path: Path) -> Iterator[tuple[int, dict[str, dict[str, Any]]]]:
+    """(time [ns], messages by topic) of each control step."""
+    now, step = None, {}
+    for message in read_messages(path, SOURCES):
+        time_ns = round(message.time_s * 1e9)
+        if now is not None and time_ns != now:
+            yield now, step
+            step = {}
+        now = time_ns
+        step[message.topic] = message.data
+    if now is not None:
+        yield now, step
+
+
+def _description(file: str, counts: Counter[str], duration_ns: int, start_ns: int) -> dict[str, Any]:
+    """metadata.yaml of version 5, which Humble and all later ones read."""
+    span = {
+        "duration": {"nanoseconds": duration_ns},
+        "starting_time": {"nanoseconds_since_epoch": start_ns},
+        "message_count": sum(counts.values()),
+    }
+    topics = [
+        {
+            "topic_metadata": {
+                "name": topic,
+                "type": kind,
+                "serialization_format": "cdr",
+                "offered_qos_profiles": "",
+            },
+            "message_count": counts[topic],
+        }
+        for topic, kind in WRITTEN.items()
+    ]
+    return {
+        "version": 5,
+        "storage_identifier": "mcap",
+        "relative_file_paths": [file],
+        **span,
+        "topics_with_message_count": topics,
+        "compression_format": "",
+        "compression_mode": "",
+        "files": [{"path": file, **json.loads(json.dumps(span))}],
+    }
+
+
+# -------------------------------------------------------------------------------------------------- reading
+
+
+class _Reading:
+    """A bag's messages on their way into a log; times count from its first message."""
+
+    def __init__(self, ros: RosMessages, setup: Setup, file: McapFile) -> None:
+        self._ros, self._setup, self._log = ros, setup, file
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+        self._made: dict[int, int] = {}
+        self._known: dict[str, int] = {}
+        self._start_ns: int | None = None
+
+    def run(self, file: Path, head: LogHead) -> int:
+        """All of it; how many messages."""
+        count = 0
+        for name, entries in head.metadata.items():
+            if name != "rosbag2":
+                self._log.add_metadata(name, entries)
+        for name, data in head.attachments.items():
+            self._log.add_attachment(name, "application/octet-stream", data)
+        for record in records(file):
+            if isinstance(record, Schema):
+                self._schemas[record.id] = record
+            elif isinstance(record, Channel):
+                self._channels[record.id] = record
+            elif isinstance(record, Message):
+                count += self._put(record)
+            else:
+                assert isinstance(record, Attachment | Metadata)
+        return count
+
+    def _put(self, record: Message) -> bool:
+        channel = self._channels.get(record.channel_id)
+        schema = None if channel is None else self._schemas.get(channel.schema_id)
+        if channel is None or schema is None or channel.message_encoding != "cdr" or schema.name not in READ:
+            return False
+        if self._start_ns is None:
+            self._start_ns = record.log_time
+        topic, reading = NAMES.get(channel.topic, channel.topic), READ[schema.name]
+        if channel.id not in self._made:
+            title = reading.schema["title"]
+            if title not in self._known:
+                self._known[title] = self._log.add_schema(
+                    title, "jsonschema", json.dumps(reading.schema).encode()
+                )
+            self._made[channel.id] = self._log.add_channel(topic, self._known[title])
+        reader = Reader(topic, self._setup, self._start_ns)
+        data = reading.read(reader, self._ros.unpacked(record.data, schema.name))
+        if len(data) > MAX_MESSAGE:
+            raise ValueError(f"{channel.topic}: {len(data):,} bytes, more than a log's message may have")
+        self._log.add_message(self._made[channel.id], max(record.log_time - self._start_ns, 0), data)
+        return True
