@@ -13,11 +13,17 @@ class PoseConfig(Section):
     """Filter of the own pose, where ``sensors.localization`` is ``estimated`` (values EC, tuned). What the
     sensors do wrong it takes from their own sections."""
 
-    accel_density: Positive = 0.04
-    """[m^2/s^3] spectral density of the own horizontal acceleration, which carries the velocity from one
-    reading of the DVL to the next"""
-    heave_density: Positive = 0.03
-    """[m^2/s^3] the same of the vertical acceleration"""
+    newest_share: Fraction = 0.8
+    """share of a step's mean acceleration that its newest reading tells, the one before tells the rest:
+    rotors follow their command within a step"""
+    jump_share: NonNegative = 0.12
+    """standard deviation of that share: what a change of the acceleration leaves unknown"""
+    accel_density: Positive = 1e-6
+    """[m^2/s^3] spectral density of what else the acceleration leaves unknown; the accelerometer's own errors
+    come on top"""
+    sure_speed_m_s: Positive = 0.1
+    """the own velocity counts as known (``vel_valid``) while its standard deviation is smaller: the velocity
+    loop is closed by it"""
     use_walls: bool = True
     """correct the pose by the beams that end on a known wall, and the velocity by their Doppler; off: dead
     reckoning that knows how uncertain it is"""

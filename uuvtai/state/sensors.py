@@ -51,6 +51,8 @@ class ProprioceptionMemory(Truth):
     """[rad] integrated heading drift"""
     heading_rate: ti.Field = array("n_env")
     """[rad/s] drift rate of the episode"""
+    accel_bias_b: ti.Field = array("n_env", vec=3)
+    """[m/s^2] error of the accelerometer, constant over an episode"""
     dropout_until: ti.Field = array("n_env", dtype=ti.i32)
     """step until which the DVL has lost the bottom"""
 
