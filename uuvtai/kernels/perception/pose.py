@@ -73,6 +73,7 @@ def predict_pose(io: Bundle[PoseIO]):
                 jump = motion - io.pose.motion[env]
                 between = motion - ti.static(1.0 - io.pose_cfg.newest_share) * jump
                 between[3] = motion[3] - 0.5 * jump[3]
+                between -= leaning(env, io)
                 move_on(env, between, jump, io)
                 sink_on(env, between[2], jump[2], io)
             io.pose.motion[env] = motion
@@ -117,6 +118,15 @@ def level_motion(env, io: Bundle[PoseIO]):
 
 
 @ti.func
+def leaning(env, io: Bundle[PoseIO]):
+    """Error of ``level_motion`` beyond the accelerometer's as the filters have it: along the axes of the body,
+    which leans, less along those of the level frame."""
+    bias = ti.Vector([io.pose.mean[env][7], io.pose.mean[env][8], io.pose.depth[env][3]])
+    more = level_rotation(env, io) @ bias - bias
+    return ti.Vector([more[0], more[1], more[2], 0.0])
+
+
+@ti.func
 def move_on(env, motion, jump, io: Bundle[PoseIO]):
     """Predict the horizontal filter by one control step of the mean ``motion`` (of ``level_motion``), which
     changed by ``jump`` in it."""
@@ -133,7 +143,9 @@ def move_on(env, motion, jump, io: Bundle[PoseIO]):
     moved[0], moved[1] = mean[0] + way[0], mean[1] + way[1]
     half = ti.Matrix.zero(ti.f32, _N, _N)
     for j in ti.static(range(_N)):
-        column = carried(ti.Vector([cov[ti.static(place(i, j, _N))] for i in range(_N)]), way, ahead, spin, dt)
+        column = carried(
+            ti.Vector([cov[ti.static(place(i, j, _N))] for i in range(_N)]), way, ahead, spin, dt
+        )
         for i in ti.static(range(_N)):
             half[i, j] = column[i]
     for i in ti.static(range(_N)):
@@ -268,12 +280,8 @@ def take_walls(env, io: Bundle[PoseIO]):
         a, b = root[0, k], root[1, k]
         rows[k, 0], rows[k, 1], rows[k, 2], found[k] = a, b, root[2, k], seen[k]
         rows[k, 3], rows[k, 4] = -a * back_x - b * back_y, a * back_y - b * back_x
-    won = ti.static(
-        accel_variance(io.pose_cfg, io.episode_cfg.control_dt_s, io.sensors_cfg, io.vehicle_cfg)
-    )
-    info, part = blurred(
-        fix.velocity, fix.velocity_part, won * (io.clock.step[env] - io.scan.ping_step[env])
-    )
+    won = ti.static(accel_variance(io.pose_cfg, io.episode_cfg.control_dt_s, io.sensors_cfg, io.vehicle_cfg))
+    info, part = blurred(fix.velocity, fix.velocity_part, won * (io.clock.step[env] - io.scan.ping_step[env]))
     half, slip = halved(info, part)
     for k in ti.static(range(2)):
         rows[3 + k, 3], rows[3 + k, 4], found[3 + k] = half[0, k], half[1, k], slip[k]
