@@ -20,8 +20,8 @@ POOL, PEN = TankConfig(), TankConfig(shape="circle", x_m=(0.0, 8.0), y_m=(0.0, 8
 SEA = TankConfig(x_m=(-100.0, 100.0), y_m=(-100.0, 100.0))
 DEFAULT = PoseConfig()
 PLAIN = PoseConfig(bearing_sigma_rad=0.0, wall_sigma_m=1e-4)
-"""What the made-up worlds need: errors are those of the sensors, of the few false returns and ghosts that pass
-the gate, and of bodies."""
+"""What the made-up worlds need: errors are those of the sensors, of the few false returns and ghosts that
+pass the gate, and of bodies."""
 VEHICLE = VehicleConfig()
 BODIES = ((0.7, 4.0, 0.3), (6.9, 5.6, 0.35), (4.2, 0.5, 0.3), (5.5, 4.6, 0.2))
 """(x, y, radius) [m]: three at the pen's wall, closer than the gate is wide, and one before it"""

@@ -75,8 +75,8 @@ def taken(mean, cov, h, residual, noise):
 
 
 def gated(wrong, gate):
-    """Variance of a mean of what passes the gate, by numbers: unit normal values and a share ``wrong`` of them
-    anywhere in the gate; per value that passes, in units of its own variance."""
+    """Variance of a mean of what passes the gate, by numbers: unit normal values and a share ``wrong`` of
+    them anywhere in the gate; per value that passes, in units of its own variance."""
     at = np.linspace(-gate, gate, 20001)
     normal = (1 - wrong) * np.exp(-(at**2) / 2) / np.sqrt(2 * np.pi)
     density = normal + wrong / (2 * gate)

@@ -1,10 +1,12 @@
 """Where the vehicle is: two Kalman filters on sensor data and the known bounds of the water.
 
 Horizontal, extended: x, y, the heading's correction, velocity ahead and to the left in the level body frame,
-the correction's rate (the gyro drifts) and the DVL's scale error. The velocity carries the position from step
-to step and wanders between the readings of the DVL; while that has lost the bottom it wanders on. Every fresh
-scan corrects pose and velocity by the beams that end on a known wall (wall_fix.py). Depth: z, heave and the
-error that zeroing the pressure sensor at the known start has left. The start itself is known.
+the correction's rate (the gyro drifts), the DVL's scale error and the accelerometer's error. The velocity
+carries the position from step to step, and the accelerometer the velocity from one reading of the DVL to the
+next, or while that has lost the bottom. Rotors follow their command within a step, so a change of the
+acceleration makes the velocity less sure. Every fresh scan corrects pose and velocity by the beams that end
+on a known wall (wall_fix.py). Depth: z, heave, the error that zeroing the pressure sensor at the known start
+has left, and the accelerometer's upwards. The start itself is known.
 
 Errors of a scan refer to its ping: the pose there is off by the pose's error of now less the latency times
 the velocity's. S. Thrun, W. Burgard, D. Fox, Probabilistic Robotics (2005), chapters 3 and 7.
@@ -119,8 +121,8 @@ def level_motion(env, io: Bundle[PoseIO]):
 
 @ti.func
 def leaning(env, io: Bundle[PoseIO]):
-    """Error of ``level_motion`` beyond the accelerometer's as the filters have it: along the axes of the body,
-    which leans, less along those of the level frame."""
+    """Error of ``level_motion`` beyond the accelerometer's as the filters have it: along the axes of the
+    body, which leans, less along those of the level frame."""
     bias = ti.Vector([io.pose.mean[env][7], io.pose.mean[env][8], io.pose.depth[env][3]])
     more = level_rotation(env, io) @ bias - bias
     return ti.Vector([more[0], more[1], more[2], 0.0])
@@ -341,7 +343,8 @@ def place_cov(cov, back_x, back_y):
 
 @ti.func
 def tell_pose(env, before, io: Bundle[PoseIO]):
-    """Write what the stack takes for the own pose, its covariance, and the velocity where the DVL is lost.
+    """Write what the stack takes for the own pose, its covariance, and the velocity, which is valid where it
+    is sure enough, whether the DVL has a reading or not.
 
     ``before``: the heading's correction that ``ego.rpy`` already has in it.
     """

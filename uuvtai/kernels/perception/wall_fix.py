@@ -4,7 +4,9 @@ A beam along the unit vector u meets a wall of inward normal n at the range r: t
 e = c (range - r), c = -u'n, off the wall, and that is n'(error of the position) + r n'v (error of the
 heading), v = u turned to the left by a right angle. The wall does not move, so its Doppler is -u'(own
 velocity). Each beam adds its part to an information matrix and vector; bodies before a wall, ghosts and
-clutter lie outside the gate.
+clutter lie outside the gate, or outside that of a few neighbouring beams together. What passes all the same
+makes every beam count less, as much as the sonar's rates of wrong returns and the returns before the walls
+say.
 """
 
 import math

@@ -81,8 +81,8 @@ def _beam_ttc(env, beam, io: Bundle[ThreatsIO]):
 
 @ti.func
 def _read_clearance(env, io: Bundle[ThreatsIO]):
-    """Mapped clearance here, the way out of it, and the smallest one up to the look-ahead point; both less what
-    the own place is not sure of."""
+    """Mapped clearance here, the way out of it, and the smallest one up to the look-ahead point; both less
+    what the own place is not sure of."""
     pos = io.ego.pos_w[env]
     n_row, n_col = ti.static(io.clearance.clearance_m.shape[1], io.clearance.clearance_m.shape[2])
     cell = _held_cell(pos, n_row, n_col, io)
