@@ -1,7 +1,7 @@
 """How far off is the estimated pose, and does the filter know? ``python -m docs.writers.pose_errors`` plays
 episodes with ``nominal`` and ``harsh`` sensing and compares estimate, covariance and truth at fixed moments.
 
-Writes ``docs/data/pose_77002.json``, with the ending of every episode; ``--before COMMIT`` adds the endings of
+Writes ``docs/data/pose_77002.json``, with the ending of every episode; ``--before COMMIT`` adds those of
 the same episodes by that commit's own code. ``docs/simulator.md`` shows both.
 """
 
