@@ -124,8 +124,8 @@ def leaning(env, io: Bundle[PoseIO]):
     """Error of ``level_motion`` beyond the accelerometer's as the filters have it: along the axes of the
     body, which leans, less along those of the level frame."""
     bias = ti.Vector([io.pose.mean[env][7], io.pose.mean[env][8], io.pose.depth[env][3]])
-    more = level_rotation(env, io) @ bias - bias
-    return ti.Vector([more[0], more[1], more[2], 0.0])
+    level = level_rotation(env, io) @ bias
+    return ti.Vector([level[0] - bias[0], level[1] - bias[1], level[2] - bias[2], 0.0])
 
 
 @ti.func
