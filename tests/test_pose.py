@@ -7,7 +7,7 @@ from scipy.stats import chi2
 from tests.bundles import io_for
 from tests.conftest import set_step
 from tests.reference import pose as oracle
-from uuvtai.config import EpisodeConfig, PoseConfig, TankConfig
+from uuvtai.config import EpisodeConfig, PoseConfig, TankConfig, VehicleConfig
 from uuvtai.kernels.perception import pose
 from uuvtai.kernels.perception.bundles import PoseIO
 from uuvtai.loader import load_config
@@ -19,11 +19,15 @@ SENSORS = {name: load_config("pool", name).sensors for name in ("nominal", "hars
 POOL, PEN = TankConfig(), TankConfig(shape="circle", x_m=(0.0, 8.0), y_m=(0.0, 8.0))
 SEA = TankConfig(x_m=(-100.0, 100.0), y_m=(-100.0, 100.0))
 DEFAULT = PoseConfig()
-PLAIN = PoseConfig(inflation=1.05, bearing_sigma_rad=0.0, wall_sigma_m=1e-4)
-"""What a world without bodies needs: errors are those of the sensors, and of the few false returns and ghosts
-that pass the gate."""
+PLAIN = PoseConfig(bearing_sigma_rad=0.0, wall_sigma_m=1e-4)
+"""What the made-up worlds need: errors are those of the sensors, of the few false returns and ghosts that
+pass the gate, and of bodies."""
+VEHICLE = VehicleConfig()
 BODIES = ((0.7, 4.0, 0.3), (6.9, 5.6, 0.35), (4.2, 0.5, 0.3), (5.5, 4.6, 0.2))
 """(x, y, radius) [m]: three at the pen's wall, closer than the gate is wide, and one before it"""
+
+WRONG = 7.0
+"""[m/s] what the DVL says while it is lost: whoever believes it is far off"""
 
 ROUNDING_SIGMA, ROUNDING_SHARE = 5e-3, 5e-3
 """One step in float32: the mean in standard deviations of what the step leaves, these relatively."""
@@ -43,7 +47,16 @@ class Rig:
     def begin(self, voyage, cfg):
         self.voyage, self.cfg, self.pings = voyage, cfg, {}
         self.io = io_for(
-            PoseIO, self.ego, self.pose, self.clock, self.scan, cfg, voyage.sensors, voyage.tank, RULES
+            PoseIO,
+            self.ego,
+            self.pose,
+            self.clock,
+            self.scan,
+            cfg,
+            voyage.sensors,
+            voyage.tank,
+            RULES,
+            VEHICLE,
         )
         self.clock.awake.fill(1)
         set_step(self.clock, 0)
@@ -52,33 +65,39 @@ class Rig:
         pose.reset_pose(self.io)
 
     def sense(self, k):
-        """What the instruments say in step k; while the DVL is lost its last word stays."""
+        """What the instruments say in step k; while the DVL is lost it says nonsense."""
         v, ego = self.voyage, self.ego
         set_step(self.clock, k)
         ego.rpy.from_numpy(np.stack([v.roll[k], v.pitch[k], v.imu_yaw[k]], 1).astype(np.float32))
-        ego.rate_b.from_numpy(np.stack([0 * v.rate[k], 0 * v.rate[k], v.rate[k]], 1).astype(np.float32))
+        ego.rate_b.from_numpy(v.rates[k].astype(np.float32))
+        ego.specific_force_b.from_numpy(v.force[k].astype(np.float32))
         ego.depth_m.from_numpy(v.depth[k].astype(np.float32))
         if k % v.sensors.dvl.period_steps == 0:
             ego.vel_valid.from_numpy(v.valid[k])
             seen = v.valid[k][:, None] == 1
-            ego.vel_b.from_numpy(np.where(seen, v.reading[k], ego.vel_b.to_numpy()).astype(np.float32))
+            ego.vel_b.from_numpy(np.where(seen, v.reading[k], WRONG).astype(np.float32))
         pose.predict_pose(self.io)
 
     def ping(self, k):
         """Take a scan, deliver what is due; (ping step, range, Doppler, hit), or None."""
         sonar = self.voyage.sensors.sonar
         if k % sonar.period_steps == 0:
-            self.pings[k] = (*self.voyage.scan(k), self.ego.pos_w.to_numpy(), self.ego.rpy.to_numpy()[:, 2])
+            told = (self.ego.pos_w.to_numpy(), self.ego.rpy.to_numpy()[:, 2], self.ego.vel_b.to_numpy())
+            self.pings[k] = (*self.voyage.scan(k), *told)
         due = self.pings.pop(k - sonar.latency_steps, None)
         self.scan.fresh.fill(int(due is not None))
         if due is None:
             return None
-        for name, values in zip(
-            ("range_m", "doppler_m_s", "hit", "ping_pos_w", "ping_yaw"), due, strict=True
-        ):
-            getattr(self.scan, name).from_numpy(values if name == "hit" else values.astype(np.float32))
-        self.scan.ping_step.from_numpy(np.full(N_ENV, k - sonar.latency_steps, np.int32))
+        self.deliver(k - sonar.latency_steps, due)
         return due
+
+    def deliver(self, k, due):
+        """The scan of step ``k`` comes now."""
+        names = ("range_m", "doppler_m_s", "hit", "ping_pos_w", "ping_yaw", "ping_vel_b")
+        for name, values in zip(names, due, strict=True):
+            getattr(self.scan, name).from_numpy(values if name == "hit" else values.astype(np.float32))
+        self.scan.ping_step.from_numpy(np.full(N_ENV, k, np.int32))
+        self.scan.fresh.fill(1)
 
     def play(self, until=STEPS, since=0):
         for k in range(since, until):
@@ -100,7 +119,9 @@ class Rig:
         return nees, off[:, 2] ** 2 / self.ego.z_var.to_numpy(), np.hypot(off[:, 0], off[:, 1])
 
     def state(self):
-        return [getattr(self.pose, name).to_numpy() for name in ("mean", "cov", "depth", "depth_cov")]
+        return [
+            getattr(self.pose, name).to_numpy() for name in ("mean", "cov", "depth", "depth_cov", "motion")
+        ]
 
 
 @pytest.fixture(scope="module")
@@ -145,9 +166,12 @@ def test_every_step_is_that_of_the_float64_filter(rig, preset, cfg, tank):
         before, lost = rig.state(), v.valid[k - k % v.sensors.dvl.period_steps] == 0
         rig.sense(k)
         for row, ours in filters.items():
-            ours.seed(*(part[row] for part in before))
+            ours.seed(*(part[row] for part in before[:4]))
             if k > 0:
-                ours.move(v.imu_yaw[k][row], v.rate[k][row])
+                now = oracle.motion(v.roll[k], v.pitch[k], v.force[k], v.rates[k])[row]
+                ours.move(
+                    v.roll[k][row], v.pitch[k][row], v.imu_yaw[k][row], before[4][row].astype(float), now
+                )
             if k % v.sensors.dvl.period_steps == 0 and not lost[row]:
                 ours.dvl(v.roll[k][row], v.pitch[k][row], v.reading[k][row])
             if k > 0:
@@ -159,9 +183,10 @@ def test_every_step_is_that_of_the_float64_filter(rig, preset, cfg, tank):
         if due is not None:
             late, clear = (k - int(rig.scan.ping_step[0])) * RULES.control_dt_s, []
             for row, ours in filters.items():
-                ours.seed(*(part[row] for part in middle))
-                ranges, doppler, hit, pos, yaw = (part[row] for part in due)
-                if ours.scan(pos, yaw, late, ranges, doppler, hit) > EDGE:
+                ours.seed(*(part[row] for part in middle[:4]))
+                ranges, doppler, hit, pos, yaw, vel_b = (part[row] for part in due)
+                vel = oracle.level(v.roll[k][row], v.pitch[k][row], vel_b.astype(float))[:2]
+                if ours.scan(pos, yaw, vel, late, ranges, doppler, hit) > EDGE:
                     clear.append(row)
             scans += len(clear)
             assert_close(rig.state(), filters, clear)
@@ -199,22 +224,52 @@ def test_bodies_at_a_round_wall_do_not_make_it_too_sure(rig):
     assert np.quantile(off, 0.95) < 0.15
 
 
+def speed_errors(rig, k):
+    """Length [m/s] of the velocity's error of every row."""
+    v = rig.voyage
+    return np.linalg.norm(rig.ego.vel_b.to_numpy() - oracle.tilted(v.roll[k], v.pitch[k], v.vel[k]), axis=1)
+
+
 def test_the_velocity_goes_on_while_the_dvl_is_lost(rig):
-    """By the Doppler of the walls; the held reading would be as far off as the vehicle has changed."""
+    """By the accelerometer and the Doppler of the walls: as well as it is known, and no DVL is believed."""
     v = voyage("harsh", PLAIN, POOL, 14)
     rig.begin(v, PLAIN)
-    held = np.zeros((N_ENV, 3))
-    for k in range(121):
-        rig.sense(k)
-        held = np.where(rig.ego.vel_valid.to_numpy()[:, None] == 1, rig.ego.vel_b.to_numpy(), held)
-        rig.ping(k)
+    rig.play(121)
+    lost = v.valid[120] == 0
+    assert lost.sum() > 60 and np.all(rig.ego.vel_valid.to_numpy() == 1)
+    off = speed_errors(rig, 120)
+    assert np.sqrt(np.mean(off[lost] ** 2)) < 0.04 and np.sqrt(np.mean(off[~lost] ** 2)) < 0.03
+
+
+def test_a_velocity_that_nothing_tells_is_not_valid(rig):
+    """No bottom, no wall, and an accelerometer that was never corrected; with the DVL again it is known."""
+    v = voyage("harsh", PLAIN, SEA, 16)
+    v.valid[:] = 0
+    v.valid[61:] = 1
+    rig.begin(v, PLAIN)
+    rig.play(61)
+    assert np.all(rig.ego.vel_valid.to_numpy() == 0)
+    rig.play(81, since=61)
+    assert np.all(rig.ego.vel_valid.to_numpy() == 1)
+    assert np.quantile(speed_errors(rig, 80), 0.95) < 0.1
+
+
+def test_what_stands_before_the_walls_makes_them_count_less(rig):
+    """As many beams meet the walls both times, but once the others end at bodies, before the walls."""
+    v = voyage("harsh", PLAIN, POOL, 17)
+    rig.begin(v, PLAIN)
+    rig.play(6)
+    ranges, doppler, hit = v.scan(5)
+    ranges[:, ::4], before, sure = 1.0, rig.state(), []
+    told = v.pos[5], v.yaw[5], oracle.tilted(v.roll[5], v.pitch[5], v.vel[5])
+    for short in (0, 1):
+        hit[:, ::4] = short
+        for field, values in zip(("mean", "cov", "depth", "depth_cov", "motion"), before, strict=True):
+            getattr(rig.pose, field).from_numpy(values)
+        rig.deliver(5, (ranges, doppler, hit, *told))
         pose.correct_pose(rig.io)
-    lost = rig.ego.vel_valid.to_numpy() == 0
-    now = oracle.tilted(v.roll[120], v.pitch[120], v.vel[120])
-    off = [np.linalg.norm((vel - now)[lost], axis=1).mean() for vel in (rig.ego.vel_b.to_numpy(), held)]
-    assert lost.sum() > 60 and off[0] < 0.5 * off[1]
-    seen = rig.ego.vel_b.to_numpy()[~lost]
-    assert np.allclose(seen, v.reading[120][~lost], atol=1e-6), "a reading stays as it is"
+        sure.append(rig.ego.pose_cov.to_numpy()[:, [0, 3, 5]])
+    assert np.all(sure[1] > sure[0])
 
 
 def test_rows_do_not_touch_each_other_and_sleepers_keep_everything(rig):

@@ -215,6 +215,15 @@ def test_accelerometer_and_attitude_noise(rig):
     assert_normal(out["rpy"], 0.01)
 
 
+def test_the_accelerometers_error_stays_the_same_over_an_episode(rig):
+    sensors = SensorsConfig(imu=ImuConfig(accel_bias_m_s2=0.2))
+    rig.start(sensors)
+    errors = [rig.sense(sensors, step)["specific_force_b"] - (0, 0, 9.81) for step in (0, 7)]
+    assert_normal(errors[0], 0.2)
+    np.testing.assert_allclose(errors[0], errors[1], atol=1e-5)
+    np.testing.assert_allclose(errors[0], rig.memory.accel_bias_b.to_numpy(), atol=1e-5)
+
+
 def test_pressure_bias_and_sigma(rig):
     sensors = SensorsConfig(pressure=PressureConfig(bias_m=0.5, sigma_m=0.02))
     rig.start(sensors)

@@ -36,6 +36,7 @@ TEACHER = {
     "unstick_m_s": 0.3, "slow_clearance_m": 0.6, "slow_fraction": 0.5, "edge_gap_m": 0.26, "depth_gain": 1.0,
     "yaw_gain": 1.5,
     "gaze_m": 3.0, "gaze_level_m": 1.0, "gaze_clearance_m": 0.6, "askew_clearance_m": 0.5,
+    "place_sigmas": 2.5,
     "gaze_off_deg": 25.0, "free_depth": False, "least_share": 0.02, "heed_share": 0.2, "future_margin": 0.6,
 }  # fmt: skip
 """Every number of the stage, so that tuning the defaults breaks nothing here. The dashes end between two
@@ -112,6 +113,7 @@ def scene(stage):
     fill(stage.ego.pos_w, (5.0, 3.0, -0.8))
     fill(stage.ego.vel_b, (0, 0, 0))
     fill(stage.ego.rpy, (0, 0, 0))
+    fill(stage.ego.pose_cov, [0] * 6)
     fill(stage.mission.goal_w, (15.0, 3.0, -0.8))
     fill(stage.route.lookahead_w, (6.0, 3.0, -0.8))
     stage.route.n_way.fill(10)
@@ -291,6 +293,8 @@ def random_scene(scene, rng):
     put(scene.ego.pos_w, rng.uniform([3, 1.5, -1.3], [17, 4.5, -0.3], (N_ENV, 3)))
     put(scene.ego.vel_b, rng.uniform(-0.4, 0.4, (N_ENV, 3)))
     put(scene.ego.rpy, np.c_[np.zeros((N_ENV, 2)), rng.uniform(-3, 3, N_ENV)])
+    zero, sigma = np.zeros(N_ENV), np.linspace(0.0, 0.05, N_ENV)
+    put(scene.ego.pose_cov, np.c_[sigma**2, 0.3 * sigma**2, zero, 0.5 * sigma**2, zero, zero])
     pos = scene.ego.pos_w.to_numpy().astype(float)
     put(scene.mission.goal_w, pos + rng.uniform(-1, 1, (N_ENV, 3)))
     put(scene.route.lookahead_w, pos + rng.uniform(-1, 1, (N_ENV, 3)))
@@ -317,6 +321,12 @@ def random_scene(scene, rng):
     put(scene.forecast.below_w, np.choose(kind, [own_z, -OPEN_M, below, below]))
 
 
+def doubt(scene, env):
+    """[m] by which walls and mapped obstacles are taken to be nearer."""
+    xx, xy, _, yy, _, _ = scene.ego.pose_cov.to_numpy()[env].astype(float)
+    return CFG.teacher.place_sigmas * np.sqrt(np.linalg.eigvalsh([[xx, xy], [xy, yy]])[1])
+
+
 class View:
     """What one env's search sees, in float64, and the oracle's answers."""
 
@@ -333,7 +343,7 @@ class View:
             getattr(scene.forecast, name).to_numpy()[env].astype(float)
             for name in ("pos_w", "radius_m", "above_w", "below_w")
         ] + [getattr(scene.futures, name).to_numpy()[env].astype(float) for name in ("pos_w", "share")]
-        self.clearance = scene.clearance.clearance_m.to_numpy()[env].astype(float)
+        self.clearance = scene.clearance.clearance_m.to_numpy()[env].astype(float) - doubt(scene, env)
 
     def candidates(self):
         return oracle.candidates(
@@ -489,6 +499,26 @@ def test_sensed_emergency_backs_off_from_it(scene):
         (0.45 - CFG.teacher.hull_reach_m - CFG.teacher.contact_m) / 0.6, rel=1e-4
     )
     assert scene.t.nearest_m.to_numpy()[1] == pytest.approx(0.45 - CFG.teacher.hull_reach_m, rel=1e-4)
+
+
+def test_the_less_sure_of_its_place_the_nearer_are_walls(scene):
+    """2.5 standard deviations of the worst direction, here and on the way."""
+    scene.clearance.clearance_m.fill(1.0)
+    sigma, turn = np.array([0.0, 0.01, 0.05, 0.1, 0.2, 0.3]), np.linspace(0, 3, N_ENV)
+    c, s = np.cos(turn), np.sin(turn)
+    zero, worst, best = 0 * sigma, sigma**2, (0.3 * sigma) ** 2
+    cov = [
+        c * c * worst + s * s * best,
+        c * s * (worst - best),
+        zero,
+        s * s * worst + c * c * best,
+        zero,
+        zero,
+    ]
+    put(scene.ego.pose_cov, np.stack(cov, 1))
+    assess(scene)
+    for found in (scene.t.clearance_m, scene.t.path_clearance_m):
+        np.testing.assert_allclose(found.to_numpy(), 1.0 - 2.5 * sigma, atol=1e-5)
 
 
 def test_retreat_does_not_run_into_a_wall(scene):

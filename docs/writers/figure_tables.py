@@ -10,6 +10,7 @@ from typing import Any
 
 from docs.writers.figure_sources import Counts, SourceError, Sources, fitting, pooled, weighted
 from docs.writers.pieces import BEFORE, CELLS, LETTERS, PIECES
+from docs.writers.pose_tables import pose_endings, pose_errors
 from uuvtai.measure.reproduce import paper
 from uuvtai.measure.reproduce.steps import RETIRED_SEEDS
 from uuvtai.outcomes import COLLIDED
@@ -504,5 +505,7 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         world_model_switches,
         risk,
         risk_bins,
+        pose_endings,
+        pose_errors,
     )
 }

@@ -170,5 +170,6 @@ def static_depths(log, own, velocities, lasts):
         np.clip(np.floor((at[..., i] - grid["pose"]["position"]["xy"[i]]) / cell_m).astype(int), 0, most - 1)
         for i, most in ((0, cells.shape[1]), (1, cells.shape[0]))
     )
-    below = t["hull_reach_m"] + t["contact_m"] - cells[row, col]
+    doubt = t["place_sigmas"] * math.sqrt(own.place_variance)
+    below = t["hull_reach_m"] + t["contact_m"] + doubt - cells[row, col]
     return np.maximum(below + t["static_margin_m"], 0).mean(1), np.maximum(below, 0).max(1)

@@ -13,24 +13,31 @@ class PoseConfig(Section):
     """Filter of the own pose, where ``sensors.localization`` is ``estimated`` (values EC, tuned). What the
     sensors do wrong it takes from their own sections."""
 
-    accel_density: Positive = 0.04
-    """[m^2/s^3] spectral density of the own horizontal acceleration, which carries the velocity from one
-    reading of the DVL to the next"""
-    heave_density: Positive = 0.03
-    """[m^2/s^3] the same of the vertical acceleration"""
+    newest_share: Fraction = 0.8
+    """share of a step's mean acceleration that its newest reading tells, the one before tells the rest:
+    rotors follow their command within a step"""
+    jump_share: NonNegative = 0.12
+    """standard deviation of that share: what a change of the acceleration leaves unknown"""
+    accel_density: Positive = 1e-6
+    """[m^2/s^3] spectral density of what else the acceleration leaves unknown; the accelerometer's own errors
+    come on top"""
+    sure_speed_m_s: Positive = 0.1
+    """the own velocity counts as known (``vel_valid``) while its standard deviation is smaller: the velocity
+    loop is closed by it"""
     use_walls: bool = True
     """correct the pose by the beams that end on a known wall, and the velocity by their Doppler; off: dead
     reckoning that knows how uncertain it is"""
-    gate_sigmas: Positive = 3.0
-    """a beam counts if it ends within so many standard deviations of where the wall is expected; likewise its
-    Doppler"""
+    gate_sigmas: Annotated[float, Field(ge=1, le=10)] = 3.0
+    """a beam counts if it ends within so many standard deviations of where the wall is expected, and so does
+    the mean of it and its neighbours; likewise its Doppler"""
     wall_sigma_m: Positive = 0.003
     """error of the known place of a wall"""
     bearing_sigma_rad: NonNegative = 0.001
     """error of a beam's direction"""
-    inflation: Annotated[float, Field(ge=1, le=1000)] = 2.2
-    """a beam's variance is taken this many times larger: bodies close to a wall pass the gate in many
-    neighbouring beams and scans"""
+    body_returns_per_m: NonNegative = 240.0
+    """[1/m] returns of neighbouring beams and scans in a row that err together where a body stands so close
+    before a wall that it is not told from it, per metre of that. How often one does follows from how many
+    returns of the scan fall short of the walls"""
 
 
 class TrackingConfig(Section):

@@ -81,6 +81,8 @@ class ImuConfig(Section):
     heading_drift_rad_s: NonNegative = 0.0
     """standard deviation of the constant drift rate, drawn per episode"""
     accel_sigma_m_s2: NonNegative = 0.0
+    accel_bias_m_s2: NonNegative = 0.0
+    """standard deviation of each axis's constant error, drawn per episode"""
     attitude_sigma_rad: NonNegative = 0.0
 
 

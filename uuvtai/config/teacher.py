@@ -55,6 +55,8 @@ class TeacherConfig(Section):
     """factor of both margins from moving bodies: more trades time and success for fewer collisions"""
     static_margin_m: NonNegative = 0.1
     """wanted clearance beyond contact from mapped obstacles and walls"""
+    place_sigmas: NonNegative = 3.0
+    """walls and mapped obstacles are taken to be nearer by so many standard deviations of the own place"""
     static_horizon_s: Positive = 1.5
     static_dt_s: Positive = 0.25
 

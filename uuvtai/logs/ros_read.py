@@ -55,6 +55,7 @@ _ODOMETRY = record(
 )
 _IMU = record(
     "uuv.Imu",
+    "",
     {"acceleration": THREE},
     timestamp=TIME,
     frame_id=STRING,

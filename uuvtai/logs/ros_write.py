@@ -103,7 +103,7 @@ def _wxyz(value: dict[str, float]) -> tuple[float, ...]:
     return value["w"], value["x"], value["y"], value["z"]
 
 
-def _xyz(value: dict[str, float]) -> tuple[float, ...]:
+def _xyz(value: dict[str, float]) -> tuple[float, float, float]:
     return value["x"], value["y"], value["z"]
 
 

@@ -123,9 +123,9 @@ FORMULAS = {
         "the forecast; depth = max(wanted - free, 0). Of a hypothesis: largest depth; mean depth; largest "
         "max(contact_m - free, 0). Of a track: their means by weight, where hypotheses of at most "
         "least_share are left out and the forecast has what the others leave. peak and contact are the "
-        "largest of all tracks, mean is their sum. static: below = hull_reach_m + contact_m - "
-        "/map/clearance of the cell there, every static_dt_s up to static_horizon_s: mean of max(below + "
-        "static_margin_m, 0), and the largest below, at least 0."
+        "largest of all tracks, mean is their sum. static: below = hull_reach_m + contact_m + "
+        "place_sigmas sqrt(place_variance) - /map/clearance of the cell there, every static_dt_s up to "
+        "static_horizon_s: mean of max(below + static_margin_m, 0), and the largest below, at least 0."
     ),
     "evasion_choice": (
         "Least = the first candidate of least cost. Mean = mean of the candidates with weights exp(-(cost "

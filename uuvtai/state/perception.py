@@ -13,15 +13,20 @@ from uuvtai.state.arrays import array
 class PoseState:
     """Remembered: two Kalman filters, of the horizontal pose and of the depth."""
 
-    mean: ti.Field = array("n_env", vec=7)
-    """[m, m, rad, m/s, m/s, rad/s, 1] x, y, heading less the IMU's, velocity ahead and to the left in the
-    level body frame, rate of the heading's correction, scale error of the DVL"""
-    cov: ti.Field = array("n_env", vec=28)
-    """upper triangle of the 7 x 7 covariance, row by row"""
-    depth: ti.Field = array("n_env", vec=3)
-    """[m, m/s, m] z, heave, and how much too deep the zeroed pressure sensor reads"""
-    depth_cov: ti.Field = array("n_env", vec=6)
+    mean: ti.Field = array("n_env", vec=9)
+    """[m, m, rad, m/s, m/s, rad/s, 1, m/s^2, m/s^2] x, y, heading less the IMU's, velocity ahead and to the
+    left in the level body frame, rate of the heading's correction, scale error of the DVL, error of the
+    accelerometer ahead and to the left"""
+    cov: ti.Field = array("n_env", vec=45)
+    """upper triangle of the 9 x 9 covariance, row by row"""
+    depth: ti.Field = array("n_env", vec=4)
+    """[m, m/s, m, m/s^2] z, heave, how much too deep the zeroed pressure sensor reads, and the
+    accelerometer's error upwards"""
+    depth_cov: ti.Field = array("n_env", vec=10)
     """upper triangle of their covariance"""
+    motion: ti.Field = array("n_env", vec=4)
+    """[m/s^2, rad/s] what the IMU said in the last step: acceleration ahead, to the left and upwards in the
+    level body frame, and rate of the yaw"""
 
 
 @dataclass(frozen=True, eq=False)

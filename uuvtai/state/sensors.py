@@ -16,9 +16,11 @@ class Proprioception:
     invalid."""
 
     vel_b: ti.Field = array("n_env", vec=3)
-    """[m/s] DVL; where it is invalid the last reading, or what the pose filter makes of it"""
+    """[m/s] DVL, where it is invalid the last reading; where the pose is estimated the filter's, in every
+    step"""
     vel_valid: ti.Field = array("n_env", dtype=ti.i32)
-    """1 = the DVL has a reading no older than its own period"""
+    """1 = the DVL has a reading no older than its own period; where the pose is estimated: the filter is sure
+    of the velocity (``pose.sure_speed_m_s``)"""
     rpy: ti.Field = array("n_env", vec=3)
     """[rad] roll, pitch, yaw of the IMU; yaw corrected where the pose is estimated"""
     rate_b: ti.Field = array("n_env", vec=3)
@@ -51,6 +53,8 @@ class ProprioceptionMemory(Truth):
     """[rad] integrated heading drift"""
     heading_rate: ti.Field = array("n_env")
     """[rad/s] drift rate of the episode"""
+    accel_bias_b: ti.Field = array("n_env", vec=3)
+    """[m/s^2] error of the accelerometer, constant over an episode"""
     dropout_until: ti.Field = array("n_env", dtype=ti.i32)
     """step until which the DVL has lost the bottom"""
 

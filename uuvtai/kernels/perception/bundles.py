@@ -18,6 +18,7 @@ from uuvtai.config import (
     TeacherConfig,
     TrackingConfig,
     TrafficConfig,
+    VehicleConfig,
 )
 from uuvtai.kernels.core.signature import Const, In, Out
 from uuvtai.state import (
@@ -126,6 +127,7 @@ class PoseIO:
     pose_cfg: Const[PoseConfig]
     sensors_cfg: Const[SensorsConfig]
     tank_cfg: Const[TankConfig]
+    vehicle_cfg: Const[VehicleConfig]
 
 
 @dataclass(frozen=True, eq=False)

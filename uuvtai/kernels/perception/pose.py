@@ -1,10 +1,12 @@
 """Where the vehicle is: two Kalman filters on sensor data and the known bounds of the water.
 
 Horizontal, extended: x, y, the heading's correction, velocity ahead and to the left in the level body frame,
-the correction's rate (the gyro drifts) and the DVL's scale error. The velocity carries the position from step
-to step and wanders between the readings of the DVL; while that has lost the bottom it wanders on. Every fresh
-scan corrects pose and velocity by the beams that end on a known wall (wall_fix.py). Depth: z, heave and the
-error that zeroing the pressure sensor at the known start has left. The start itself is known.
+the correction's rate (the gyro drifts), the DVL's scale error and the accelerometer's error. The velocity
+carries the position from step to step, and the accelerometer the velocity from one reading of the DVL to the
+next, or while that has lost the bottom. Rotors follow their command within a step, so a change of the
+acceleration makes the velocity less sure. Every fresh scan corrects pose and velocity by the beams that end
+on a known wall (wall_fix.py). Depth: z, heave, the error that zeroing the pressure sensor at the known start
+has left, and the accelerometer's upwards. The start itself is known.
 
 Errors of a scan refer to its ping: the pose there is off by the pose's error of now less the latency times
 the velocity's. S. Thrun, W. Burgard, D. Fox, Probabilistic Robotics (2005), chapters 3 and 7.
@@ -19,8 +21,10 @@ from uuvtai.kernels.perception.bundles import PoseIO
 from uuvtai.kernels.perception.wall_fix import seen_walls
 from uuvtai.native.launch import quick_launch, without_cse
 
-_N = 7
-"""Numbers of the horizontal filter."""
+_N = 9
+"""Numbers of the horizontal filter,"""
+_D = 4
+"""and of the depth's."""
 
 _START_SPEED_M_S = 0.1
 """Standard deviation of the velocity before the first reading: vehicles start at rest, or nearly (EC)."""
@@ -38,18 +42,22 @@ def reset_pose(io: Bundle[PoseIO]):
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
         if pad == 0 and io.clock.awake[env] == 1:
             pos = io.ego.pos_w[env]
-            io.pose.mean[env] = ti.Vector([pos[0], pos[1], 0.0, 0.0, 0.0, 0.0, 0.0])
-            io.pose.depth[env] = ti.Vector([pos[2], 0.0, 0.0])
+            io.pose.mean[env] = ti.Vector([pos[0], pos[1], 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+            io.pose.depth[env] = ti.Vector([pos[2], 0.0, 0.0, 0.0])
             io.pose.cov[env] = 0.0
             io.pose.depth_cov[env] = 0.0
+            io.pose.motion[env] = 0.0
             drift, scale = io.sensors_cfg.imu.heading_drift_rad_s, io.sensors_cfg.dvl.scale_error
+            bias = io.sensors_cfg.imu.accel_bias_m_s2
             for axis in ti.static((3, 4)):
                 io.pose.cov[env][ti.static(place(axis, axis, _N))] = _START_SPEED_M_S * _START_SPEED_M_S
+                io.pose.cov[env][ti.static(place(axis + 4, axis + 4, _N))] = bias * bias
             io.pose.cov[env][ti.static(place(5, 5, _N))] = drift * drift
             io.pose.cov[env][ti.static(place(6, 6, _N))] = scale * scale
             zeroed = io.sensors_cfg.pressure.sigma_m * io.sensors_cfg.pressure.sigma_m
-            io.pose.depth_cov[env][ti.static(place(1, 1, 3))] = _START_SPEED_M_S * _START_SPEED_M_S
-            io.pose.depth_cov[env][ti.static(place(2, 2, 3))] = zeroed
+            io.pose.depth_cov[env][ti.static(place(1, 1, _D))] = _START_SPEED_M_S * _START_SPEED_M_S
+            io.pose.depth_cov[env][ti.static(place(2, 2, _D))] = zeroed
+            io.pose.depth_cov[env][ti.static(place(3, 3, _D))] = bias * bias
 
 
 @quick_launch
@@ -62,9 +70,15 @@ def predict_pose(io: Bundle[PoseIO]):
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
         if pad == 0 and io.clock.awake[env] == 1:
             step = io.clock.step[env]
+            motion = level_motion(env, io)
             if step > 0:
-                move_on(env, io)
-                sink_on(env, io)
+                jump = motion - io.pose.motion[env]
+                between = motion - ti.static(1.0 - io.pose_cfg.newest_share) * jump
+                between[3] = motion[3] - 0.5 * jump[3]
+                between -= leaning(env, io)
+                move_on(env, between, jump, io)
+                sink_on(env, between[2], jump[2], io)
+            io.pose.motion[env] = motion
             if step % io.sensors_cfg.dvl.period_steps == 0 and io.ego.vel_valid[env] == 1:
                 take_dvl(env, io)
             if step > 0:
@@ -89,64 +103,128 @@ def correct_pose(io: Bundle[PoseIO]):
 
 
 @ti.func
-def move_on(env, io: Bundle[PoseIO]):
-    """Predict the horizontal filter by one control step: the velocity stays as it is in the level body
-    frame."""
+def level_rotation(env, io: Bundle[PoseIO]):
+    """Matrix from the body's axes to the level frame of the same yaw."""
+    rpy = io.ego.rpy[env]
+    return rotation_wb(quaternion_wb(rpy[0], rpy[1], 0.0))
+
+
+@ti.func
+def level_motion(env, io: Bundle[PoseIO]):
+    """What the IMU says of the level body frame: acceleration ahead, to the left and upwards [m/s^2], without
+    gravity, and rate of the yaw [rad/s]."""
+    rpy, rate = io.ego.rpy[env], io.ego.rate_b[env]
+    force = level_rotation(env, io) @ io.ego.specific_force_b[env]
+    turning = (rate[1] * ti.sin(rpy[0]) + rate[2] * ti.cos(rpy[0])) / ti.cos(rpy[1])
+    return ti.Vector([force[0], force[1], force[2] - io.vehicle_cfg.gravity_m_s2, turning])
+
+
+@ti.func
+def leaning(env, io: Bundle[PoseIO]):
+    """Error of ``level_motion`` beyond the accelerometer's as the filters have it: along the axes of the
+    body, which leans, less along those of the level frame."""
+    bias = ti.Vector([io.pose.mean[env][7], io.pose.mean[env][8], io.pose.depth[env][3]])
+    level = level_rotation(env, io) @ bias
+    return ti.Vector([level[0] - bias[0], level[1] - bias[1], level[2] - bias[2], 0.0])
+
+
+@ti.func
+def move_on(env, motion, jump, io: Bundle[PoseIO]):
+    """Predict the horizontal filter by one control step of the mean ``motion`` (of ``level_motion``), which
+    changed by ``jump`` in it."""
     dt = ti.static(io.episode_cfg.control_dt_s)
-    mean, cov = io.pose.mean[env], io.pose.cov[env]
-    yaw = io.ego.rpy[env][2] + mean[2] - 0.5 * dt * io.ego.rate_b[env][2]  # half-way through the step
-    c, s = dt * ti.cos(yaw), dt * ti.sin(yaw)
-    way = ti.Vector([c * mean[3] - s * mean[4], s * mean[3] + c * mean[4]])
+    mean, cov, turn = io.pose.mean[env], io.pose.cov[env], dt * motion[3]
+    yaw = io.ego.rpy[env][2] + mean[2] - 0.5 * turn  # half-way through the step
+    spin, ahead = ti.Vector([ti.cos(turn), ti.sin(turn)]), ti.Vector([dt * ti.cos(yaw), dt * ti.sin(yaw)])
+    way = ti.Vector([0.0, 0.0])
+    moved = carried(mean, way, ahead, spin, dt)
+    moved[3] += dt * (motion[0] + 0.5 * turn * motion[1])  # the frame turns under the acceleration too
+    moved[4] += dt * (motion[1] - 0.5 * turn * motion[0])
+    u, v = 0.5 * (mean[3] + moved[3]), 0.5 * (mean[4] + moved[4])
+    way = ti.Vector([ahead[0] * u - ahead[1] * v, ahead[1] * u + ahead[0] * v])
+    moved[0], moved[1] = mean[0] + way[0], mean[1] + way[1]
     half = ti.Matrix.zero(ti.f32, _N, _N)
     for j in ti.static(range(_N)):
-        column = carried(ti.Vector([cov[ti.static(place(i, j, _N))] for i in range(_N)]), way, c, s, dt)
+        column = carried(
+            ti.Vector([cov[ti.static(place(i, j, _N))] for i in range(_N)]), way, ahead, spin, dt
+        )
         for i in ti.static(range(_N)):
             half[i, j] = column[i]
     for i in ti.static(range(_N)):
-        row = carried(ti.Vector([half[i, j] for j in range(_N)]), way, c, s, dt)
+        row = carried(ti.Vector([half[i, j] for j in range(_N)]), way, ahead, spin, dt)
         for j in ti.static(range(i, _N)):
             cov[ti.static(place(i, j, _N))] = row[j]
     cov[ti.static(place(2, 2, _N))] += ti.static(io.sensors_cfg.imu.gyro_noise_rad_s_rthz**2) * dt
     for axis in ti.static((3, 4)):
-        cov[ti.static(place(axis, axis, _N))] += ti.static(io.pose_cfg.accel_density) * dt
-    io.pose.mean[env] = mean + ti.Vector([way[0], way[1], dt * mean[5], 0.0, 0.0, 0.0, 0.0])
+        cov[ti.static(place(axis, axis, _N))] += won_variance(jump[axis - 3], io)
+    io.pose.mean[env] = moved
     io.pose.cov[env] = cov
 
 
 @ti.func
-def carried(u, way, c, s, dt):
+def carried(u, way, ahead, spin, dt):
     """A small change of the horizontal filter's numbers one step of dt later: ``way`` the step's displacement
-    (2), (c, s) its direction ahead times dt."""
+    (2), ``ahead`` its direction ahead times dt, ``spin`` cosine and sine of the turn."""
+    fore = spin[0] * u[3] + spin[1] * u[4] - dt * u[7]
+    side = spin[0] * u[4] - spin[1] * u[3] - dt * u[8]
+    mid_fore, mid_side = 0.5 * (u[3] + fore), 0.5 * (u[4] + side)
     return ti.Vector(
         [
-            u[0] - way[1] * u[2] + c * u[3] - s * u[4],
-            u[1] + way[0] * u[2] + s * u[3] + c * u[4],
+            u[0] - way[1] * u[2] + ahead[0] * mid_fore - ahead[1] * mid_side,
+            u[1] + way[0] * u[2] + ahead[1] * mid_fore + ahead[0] * mid_side,
             u[2] + dt * u[5],
-            u[3],
-            u[4],
+            fore,
+            side,
             u[5],
             u[6],
+            u[7],
+            u[8],
         ]
     )
 
 
 @ti.func
-def sink_on(env, io: Bundle[PoseIO]):
-    """Predict the depth's filter by one control step."""
-    dt = ti.static(io.episode_cfg.control_dt_s)
-    mean, cov = io.pose.depth[env], io.pose.depth_cov[env]
-    # upper triangle of (z, heave, error): 0 zz, 1 zw, 2 ze, 3 ww, 4 we, 5 ee
-    io.pose.depth[env] = ti.Vector([mean[0] + dt * mean[1], mean[1], mean[2]])
-    io.pose.depth_cov[env] = ti.Vector(
-        [
-            cov[0] + dt * (2.0 * cov[1] + dt * cov[3]),
-            cov[1] + dt * cov[3],
-            cov[2] + dt * cov[4],
-            cov[3] + ti.static(io.pose_cfg.heave_density) * dt,
-            cov[4],
-            cov[5],
-        ]
+def won_variance(jump, io: Bundle[PoseIO]):
+    """[m^2/s^2] by which a velocity becomes less sure in one step in which its acceleration changed by
+    ``jump`` [m/s^2]."""
+    missed = jump * ti.static(io.pose_cfg.jump_share * io.episode_cfg.control_dt_s)
+    return missed * missed + ti.static(
+        accel_variance(io.pose_cfg, io.episode_cfg.control_dt_s, io.sensors_cfg, io.vehicle_cfg)
     )
+
+
+def accel_variance(pose_cfg, dt, sensors_cfg, vehicle_cfg):
+    """[m^2/s^2] The same of a steady acceleration: noise of the accelerometer and of the attitude, by which
+    gravity leaks into the level axes; plain Python."""
+    leak = vehicle_cfg.gravity_m_s2 * sensors_cfg.imu.attitude_sigma_rad
+    return (sensors_cfg.imu.accel_sigma_m_s2**2 + leak**2) * dt**2 + pose_cfg.accel_density * dt
+
+
+@ti.func
+def sink_on(env, accel, jump, io: Bundle[PoseIO]):
+    """Predict the depth's filter by one control step of mean vertical acceleration ``accel`` [m/s^2], which
+    changed by ``jump`` in it."""
+    dt = ti.static(io.episode_cfg.control_dt_s)
+    mean, cov = sunk(io.pose.depth[env], dt), io.pose.depth_cov[env]
+    mean[0] += 0.5 * dt * dt * accel
+    mean[1] += dt * accel
+    half = ti.Matrix.zero(ti.f32, _D, _D)
+    for j in ti.static(range(_D)):
+        column = sunk(ti.Vector([cov[ti.static(place(i, j, _D))] for i in range(_D)]), dt)
+        for i in ti.static(range(_D)):
+            half[i, j] = column[i]
+    for i in ti.static(range(_D)):
+        row = sunk(ti.Vector([half[i, j] for j in range(_D)]), dt)
+        for j in ti.static(range(i, _D)):
+            cov[ti.static(place(i, j, _D))] = row[j]
+    cov[ti.static(place(1, 1, _D))] += won_variance(jump, io)
+    io.pose.depth[env], io.pose.depth_cov[env] = mean, cov
+
+
+@ti.func
+def sunk(u, dt):
+    """The depth's numbers one step of dt later, without acceleration."""
+    return ti.Vector([u[0] + dt * u[1] - 0.5 * dt * dt * u[3], u[1] - dt * u[3], u[2], u[3]])
 
 
 # --------------------------------------------------------------------------------------------------- correct
@@ -156,8 +234,7 @@ def sink_on(env, io: Bundle[PoseIO]):
 def take_dvl(env, io: Bundle[PoseIO]):
     """A fresh reading of the DVL: (1 + scale error) x velocity, turned level."""
     variance = ti.static(max(io.sensors_cfg.dvl.sigma_m_s, _LEAST_SPEED_SIGMA_M_S) ** 2)
-    rpy = io.ego.rpy[env]
-    reading = rotation_wb(quaternion_wb(rpy[0], rpy[1], 0.0)) @ io.ego.vel_b[env]
+    reading = level_rotation(env, io) @ io.ego.vel_b[env]
     mean, cov = io.pose.mean[env], io.pose.cov[env]
     for axis in range(2):
         h = ti.Vector([0.0] * _N)
@@ -169,7 +246,7 @@ def take_dvl(env, io: Bundle[PoseIO]):
     depth, depth_cov = measured(
         io.pose.depth[env],
         io.pose.depth_cov[env],
-        ti.Vector([0.0, 1.0, 0.0]),
+        ti.Vector([0.0, 1.0, 0.0, 0.0]),
         reading[2] - io.pose.depth[env][1],
         variance,
     )
@@ -182,7 +259,7 @@ def take_pressure(env, io: Bundle[PoseIO]):
     depth, depth_cov = measured(
         io.pose.depth[env],
         io.pose.depth_cov[env],
-        ti.Vector([-1.0, 0.0, 1.0]),
+        ti.Vector([-1.0, 0.0, 1.0, 0.0]),
         io.ego.depth_m[env] + io.pose.depth[env][0] - io.pose.depth[env][2],
         ti.static(max(io.sensors_cfg.pressure.sigma_m, _LEAST_DEPTH_SIGMA_M) ** 2),
     )
@@ -197,14 +274,16 @@ def take_walls(env, io: Bundle[PoseIO]):
     back_x = late * ti.cos(io.scan.ping_yaw[env])
     back_y = late * ti.sin(io.scan.ping_yaw[env])
     speed_cov = ti.Vector([cov[ti.static(place(i, j, _N))] for i, j in ti.static(((3, 3), (3, 4), (4, 4)))])
-    fix = seen_walls(env, place_cov(cov, back_x, back_y), ti.Vector([mean[3], mean[4]]), speed_cov, io)
+    speed = level_rotation(env, io) @ io.scan.ping_vel_b[env]  # roll and pitch hardly change meanwhile
+    fix = seen_walls(env, place_cov(cov, back_x, back_y), speed, speed_cov, io)
     rows, found = ti.Matrix.zero(ti.f32, 5, _N), ti.Vector([0.0] * 5)
     root, seen = halved(fix.pose, fix.pose_part)
     for k in ti.static(range(3)):
         a, b = root[0, k], root[1, k]
         rows[k, 0], rows[k, 1], rows[k, 2], found[k] = a, b, root[2, k], seen[k]
         rows[k, 3], rows[k, 4] = -a * back_x - b * back_y, a * back_y - b * back_x
-    info, part = blurred(fix.velocity, fix.velocity_part, io.pose_cfg.accel_density * late)
+    won = ti.static(accel_variance(io.pose_cfg, io.episode_cfg.control_dt_s, io.sensors_cfg, io.vehicle_cfg))
+    info, part = blurred(fix.velocity, fix.velocity_part, won * (io.clock.step[env] - io.scan.ping_step[env]))
     half, slip = halved(info, part)
     for k in ti.static(range(2)):
         rows[3 + k, 3], rows[3 + k, 4], found[3 + k] = half[0, k], half[1, k], slip[k]
@@ -264,7 +343,8 @@ def place_cov(cov, back_x, back_y):
 
 @ti.func
 def tell_pose(env, before, io: Bundle[PoseIO]):
-    """Write what the stack takes for the own pose, its covariance, and the velocity where the DVL is lost.
+    """Write what the stack takes for the own pose, its covariance, and the velocity, which is valid where it
+    is sure enough, whether the DVL has a reading or not.
 
     ``before``: the heading's correction that ``ego.rpy`` already has in it.
     """
@@ -276,6 +356,8 @@ def tell_pose(env, before, io: Bundle[PoseIO]):
             io.ego.pose_cov[env][ti.static(place(i, j, 3))] = cov[ti.static(place(i, j, _N))]
     io.ego.pose_cov[env][5] += ti.static(io.sensors_cfg.imu.attitude_sigma_rad**2)
     io.ego.z_var[env] = io.pose.depth_cov[env][0]
-    if io.ego.vel_valid[env] == 0:
-        level = ti.Vector([mean[3], mean[4], io.pose.depth[env][1]])
-        io.ego.vel_b[env] = rotation_wb(quaternion_wb(rpy[0], rpy[1], 0.0)).transpose() @ level
+    level = ti.Vector([mean[3], mean[4], io.pose.depth[env][1]])
+    io.ego.vel_b[env] = level_rotation(env, io).transpose() @ level
+    unsure = ti.max(cov[ti.static(place(3, 3, _N))], cov[ti.static(place(4, 4, _N))])
+    unsure = ti.max(unsure, io.pose.depth_cov[env][ti.static(place(1, 1, _D))])
+    io.ego.vel_valid[env] = ti.cast(unsure < ti.static(io.pose_cfg.sure_speed_m_s**2), ti.i32)

@@ -4,7 +4,9 @@ A beam along the unit vector u meets a wall of inward normal n at the range r: t
 e = c (range - r), c = -u'n, off the wall, and that is n'(error of the position) + r n'v (error of the
 heading), v = u turned to the left by a right angle. The wall does not move, so its Doppler is -u'(own
 velocity). Each beam adds its part to an information matrix and vector; bodies before a wall, ghosts and
-clutter lie outside the gate.
+clutter lie outside the gate, or outside that of a few neighbouring beams together. What passes all the same
+makes every beam count less, as much as the sonar's rates of wrong returns and the returns before the walls
+say.
 """
 
 import math
@@ -15,6 +17,12 @@ from uuvtai.kernels.core.geometry import TWO_PI
 from uuvtai.kernels.core.lanes import LANES, f16x
 from uuvtai.kernels.core.signature import Bundle
 from uuvtai.kernels.perception.bundles import PoseIO
+
+_BESIDE = 2
+"""Beams on either side that are looked at together with one: most bodies are wider."""
+
+_MOST_WRONG = 0.5
+"""No sonar is taken to be worse."""
 
 Beams = ti.types.struct(ahead=f16x, left=f16x, range_m=f16x, doppler_m_s=f16x, hit=f16x)
 """Sixteen neighbouring beams: direction in the level body frame, and what was measured."""
@@ -36,6 +44,7 @@ def seen_walls(env, place_cov, speed, speed_cov, io: Bundle[PoseIO]):
     pos, yaw = io.scan.ping_pos_w[env], io.scan.ping_yaw[env]
     c, s = ti.cos(yaw), ti.sin(yaw)
     fix = Fix(pose=0.0, pose_part=0.0, velocity=0.0, velocity_part=0.0)
+    seen, short = 0.0, 0.0
     for packet in range(ti.static(io.sensors_cfg.sonar.n_ray // LANES)):
         beams = read_beams(env, packet, io)
         ux, uy = c * beams.ahead - s * beams.left, s * beams.ahead + c * beams.left
@@ -49,11 +58,17 @@ def seen_walls(env, place_cov, speed, speed_cov, io: Bundle[PoseIO]):
             + lever * lever * ti.static(aim_variance(io.sensors_cfg, io.pose_cfg))
             + ti.static(io.pose_cfg.wall_sigma_m**2)
         )
-        gate = var + form3(place_cov, nx, ny, lever)
+        doubt = form3(place_cov, nx, ny, lever)
         near = r + io.pose_cfg.gate_sigmas * ti.sqrt(along) < ti.static(surest_range(io.sensors_cfg))
-        fits = e * e < ti.static(io.pose_cfg.gate_sigmas**2) * gate
+        fits = e * e < ti.static(io.pose_cfg.gate_sigmas**2) * (var + doubt)
         good = beams.hit * ti.select(near & fits, 1.0, 0.0)
-        weight = good / (var * io.pose_cfg.inflation)
+        n = ti.max(beside(good), 1.0)
+        mean = beside(good * e) / n
+        together = mean * mean < ti.static(io.pose_cfg.gate_sigmas**2) * (var / n + doubt)
+        good *= ti.select(together, 1.0, 0.0)
+        seen += good.sum()
+        short += (beams.hit * ti.select(near & (e < 0.0) & ~fits, 1.0, 0.0)).sum()
+        weight = good / (var * ti.static(gated(wrong_ranges(io.sensors_cfg, io.pose_cfg), io.pose_cfg)))
         wx, wy, wt = weight * nx, weight * ny, weight * lever
         fix.pose += ti.Vector(
             [
@@ -65,13 +80,32 @@ def seen_walls(env, place_cov, speed, speed_cov, io: Bundle[PoseIO]):
         slip = beams.doppler_m_s + speed[0] * beams.ahead + speed[1] * beams.left
         swing = ti.static(doppler_variance(io.sensors_cfg)) + form2(speed_cov, beams.ahead, beams.left)
         still = good * ti.select(slip * slip < ti.static(io.pose_cfg.gate_sigmas**2) * swing, 1.0, 0.0)
-        trust = still * ti.static(1.0 / (io.pose_cfg.inflation * doppler_variance(io.sensors_cfg)))
+        trust = still * ti.static(
+            1.0
+            / gated(wrong_dopplers(io.sensors_cfg, io.pose_cfg), io.pose_cfg)
+            / doppler_variance(io.sensors_cfg)
+        )
         va, vl = trust * beams.ahead, trust * beams.left
         fix.velocity += ti.Vector(
             [(va * beams.ahead).sum(), (va * beams.left).sum(), (vl * beams.left).sum()]
         )
         fix.velocity_part -= ti.Vector([(va * slip).sum(), (vl * slip).sum()])
+    # what stands before the walls, as much as was seen of it, stands unseen just before them too
+    share = short / ti.max(short + seen, 1.0)
+    together = 1.0 / (1.0 + share * ti.static(unseen_returns(io.sensors_cfg, io.pose_cfg)))
+    fix.pose *= together
+    fix.pose_part *= together
     return fix
+
+
+@ti.func
+def beside(values):
+    """Sum of each beam's value and those of its ``_BESIDE`` neighbours on either side, among sixteen."""
+    out = f16x(0.0)
+    for i in ti.static(range(LANES)):
+        for j in ti.static(range(max(i - _BESIDE, 0), min(i + _BESIDE + 1, LANES))):
+            out[i] += values[j]
+    return out
 
 
 @ti.func
@@ -127,6 +161,48 @@ def surest_range(sensors_cfg):
     """[m] beyond which errors push returns out of the sonar's reach: of such walls only the returns that came
     out too short are seen. Plain Python."""
     return sensors_cfg.sonar.max_range_m - sensors_cfg.sonar.range_jitter_m
+
+
+def middle_sigma(sensors_cfg):
+    """[m] standard deviation of a range half as long as the sonar's reach; plain Python."""
+    sonar = sensors_cfg.sonar
+    normal = sonar.range_sigma_m + sonar.range_sigma_slope * 0.5 * sonar.max_range_m
+    return math.sqrt(normal**2 + sonar.range_jitter_m**2 + sonar.range_quantum_m**2 / 12.0)
+
+
+def wrong_ranges(sensors_cfg, pose_cfg):
+    """Share of the beams that pass the gate and do not come from the wall: clutter and ghosts are anywhere in
+    reach; plain Python."""
+    sonar = sensors_cfg.sonar
+    width = 2.0 * pose_cfg.gate_sigmas * middle_sigma(sensors_cfg)
+    return min((sonar.false_return + sonar.ghost) * width / sonar.max_range_m, _MOST_WRONG)
+
+
+def wrong_dopplers(sensors_cfg, pose_cfg):
+    """The same of their Doppler; plain Python."""
+    sonar = sensors_cfg.sonar
+    if sonar.doppler_outlier_m_s == 0.0:
+        return 0.0
+    width = pose_cfg.gate_sigmas * math.sqrt(doppler_variance(sensors_cfg))
+    return min(sonar.doppler_outlier * min(width / sonar.doppler_outlier_m_s, 1.0), _MOST_WRONG)
+
+
+def gated(wrong, pose_cfg):
+    """How many times larger the variance of a gated measurement is, of which a share ``wrong`` is anywhere in
+    the gate: that of an M-estimator that leaves out what lies beyond the gate (P. Huber, Robust Statistics,
+    1981, section 3.2), for as many as pass; plain Python."""
+    g = pose_cfg.gate_sigmas
+    inside = math.erf(g / math.sqrt(2.0))
+    slope = (1.0 - wrong) * (inside - 2.0 * g * math.exp(-0.5 * g * g) / math.sqrt(2.0 * math.pi))
+    square = slope + wrong * g * g / 3.0
+    return ((1.0 - wrong) * inside + wrong) * square / slope**2
+
+
+def unseen_returns(sensors_cfg, pose_cfg):
+    """Returns that err together, times the share of the water before a wall in which a body passes for the
+    wall, half the sonar's reach away. The deeper that water, the longer a body stays in it; plain Python."""
+    deep = pose_cfg.gate_sigmas * middle_sigma(sensors_cfg) / math.sqrt(2 * _BESIDE + 1)
+    return pose_cfg.body_returns_per_m * deep * deep / (0.5 * sensors_cfg.sonar.max_range_m)
 
 
 def aim_variance(sensors_cfg, pose_cfg):

@@ -60,6 +60,11 @@ def draw_constants(env, io: Bundle[ProprioceptionIO]):
     dvl, imu = stream_key(key, 0, STREAM_DVL), stream_key(key, 0, STREAM_IMU)
     io.ego_memory.dvl_scale[env] = 1.0 + io.sensors_cfg.dvl.scale_error * normal(dvl, _EPISODE_DRAW)
     io.ego_memory.heading_rate[env] = io.sensors_cfg.imu.heading_drift_rad_s * normal(imu, _EPISODE_DRAW)
+    io.ego_memory.accel_bias_b[env] = 0.0
+    if ti.static(io.sensors_cfg.imu.accel_bias_m_s2 > 0):
+        io.ego_memory.accel_bias_b[env] = io.sensors_cfg.imu.accel_bias_m_s2 * normal_vector(
+            imu, _EPISODE_DRAW + 1
+        )
     io.ego_memory.heading_error[env] = 0.0
     io.ego_memory.dropout_until[env] = 0
     io.ego_memory.pressure_zero_m[env] = 0.0
@@ -130,6 +135,8 @@ def read_imu(env, key, step, io: Bundle[ProprioceptionIO]):
     )
     if ti.static(io.sensors_cfg.imu.accel_sigma_m_s2 > 0):
         force += io.sensors_cfg.imu.accel_sigma_m_s2 * normal_vector(stream, 6)
+    if ti.static(io.sensors_cfg.imu.accel_bias_m_s2 > 0):
+        force += io.ego_memory.accel_bias_b[env]
     io.ego.rpy[env] = ti.Vector([rpy[0], rpy[1], wrapped_angle(rpy[2] + io.ego_memory.heading_error[env])])
     io.ego.rate_b[env] = rate
     io.ego.specific_force_b[env] = force

@@ -7,7 +7,7 @@ from uuvtai.kernels.core.geometry import FAR_M, TWO_PI, turned_z3
 from uuvtai.kernels.core.lanes import LANES, f16x, put_column
 from uuvtai.kernels.core.signature import Bundle, spread
 from uuvtai.kernels.teacher.bundles import EvasionIO
-from uuvtai.kernels.teacher.trajectories import body_depths, depth_band, static_depths
+from uuvtai.kernels.teacher.trajectories import body_depths, depth_band, place_doubt, static_depths
 from uuvtai.native.launch import quick_launch, without_cse
 
 
@@ -120,8 +120,19 @@ def cost_lanes(env, cx, cy, cz, burst_s, io: Bundle[EvasionIO]):
     peak, mean, contact, _ = body_depths(
         env, drive, io.forecast, io.futures, io.teacher_cfg, io.tracking_cfg, io.tank_cfg
     )
+    doubt = place_doubt(io.ego.pose_cov[env], io.teacher_cfg)
     static_mean, static_contact = static_depths(
-        env, cx, cy, burst_s, level, level_vel, io.clearance, io.teacher_cfg, io.tank_cfg, io.mapping_cfg
+        env,
+        cx,
+        cy,
+        burst_s,
+        level,
+        level_vel,
+        doubt,
+        io.clearance,
+        io.teacher_cfg,
+        io.tank_cfg,
+        io.mapping_cfg,
     )
     off = _distance_lanes(cx, cy, cz, io.teacher.follow_vel_w[env]) * ti.static(
         io.teacher_cfg.weight_deviation / io.teacher_cfg.cruise_m_s

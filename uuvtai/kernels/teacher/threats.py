@@ -10,7 +10,7 @@ from uuvtai.kernels.core.lanes import f16x
 from uuvtai.kernels.core.signature import Bundle, Const, spread
 from uuvtai.kernels.teacher.bundles import ThreatsIO
 from uuvtai.kernels.teacher.cruise_depth import choose_depth
-from uuvtai.kernels.teacher.trajectories import body_depths, held_heave
+from uuvtai.kernels.teacher.trajectories import body_depths, held_heave, place_doubt
 from uuvtai.native.launch import quick_launch, without_cse
 
 _PATH_SAMPLES = 8
@@ -81,11 +81,13 @@ def _beam_ttc(env, beam, io: Bundle[ThreatsIO]):
 
 @ti.func
 def _read_clearance(env, io: Bundle[ThreatsIO]):
-    """Mapped clearance here, the way out of it, and the smallest one up to the look-ahead point."""
+    """Mapped clearance here, the way out of it, and the smallest one up to the look-ahead point; both less
+    what the own place is not sure of."""
     pos = io.ego.pos_w[env]
     n_row, n_col = ti.static(io.clearance.clearance_m.shape[1], io.clearance.clearance_m.shape[2])
     cell = _held_cell(pos, n_row, n_col, io)
-    io.teacher.clearance_m[env] = io.clearance.clearance_m[env, cell[0], cell[1]]
+    doubt = place_doubt(io.ego.pose_cov[env], io.teacher_cfg)
+    io.teacher.clearance_m[env] = io.clearance.clearance_m[env, cell[0], cell[1]] - doubt
     away = ti.Vector([0.0, 0.0])
     if io.clearance.site_row[env, cell[0], cell[1]] >= 0:
         site = centre_of(
@@ -102,7 +104,7 @@ def _read_clearance(env, io: Bundle[ThreatsIO]):
         io.teacher.clearance_m[env],
     )
     if io.route.n_way[env] > 0:
-        room = _room_to(env, here, steer, io.teacher.clearance_m[env], io)
+        room = _room_to(env, here, steer, doubt, io)
         for nearer in range(_NEARER):
             nth = (_NEARER - nearer) * ti.static(round(_NEARER_M / io.mapping_cfg.cell_m))
             if (
@@ -113,7 +115,7 @@ def _read_clearance(env, io: Bundle[ThreatsIO]):
                 and nth < io.route.n_ahead[env]
             ):
                 point = io.route.ahead_w[env, nth]
-                wider = _room_to(env, here, point, io.teacher.clearance_m[env], io)
+                wider = _room_to(env, here, point, doubt, io)
                 if wider > room:
                     steer, room = point, wider
     io.teacher.path_clearance_m[env] = room
@@ -121,13 +123,13 @@ def _read_clearance(env, io: Bundle[ThreatsIO]):
 
 
 @ti.func
-def _room_to(env, here, there, own, io: Bundle[ThreatsIO]):
-    """Smallest mapped clearance [m] on the straight way to a place, the own one included."""
+def _room_to(env, here, there, doubt, io: Bundle[ThreatsIO]):
+    """Smallest mapped clearance [m] on the straight way to a place, the own one included, less ``doubt``."""
     n_row, n_col = ti.static(io.clearance.clearance_m.shape[1], io.clearance.clearance_m.shape[2])
-    smallest = own
+    smallest = io.teacher.clearance_m[env]
     for k in range(1, _PATH_SAMPLES + 1):
         on_way = _held_cell(here + (there - here) * (k / _PATH_SAMPLES), n_row, n_col, io)
-        smallest = ti.min(smallest, io.clearance.clearance_m[env, on_way[0], on_way[1]])
+        smallest = ti.min(smallest, io.clearance.clearance_m[env, on_way[0], on_way[1]] - doubt)
     return smallest
 
 

@@ -191,13 +191,14 @@ def static_depths(
     burst_s,
     pos,
     vel,
+    doubt,
     clearance: In[ClearanceState],
     teacher_cfg: Const[TeacherConfig],
     tank_cfg: Const[TankConfig],
     mapping_cfg: Const[MappingConfig],
 ):
-    """How deep each commanded velocity violates the wanted static clearance: lanes mean depth and largest
-    depth below contact [m]."""
+    """How deep each commanded velocity violates the wanted static clearance, ``doubt`` [m] (of
+    ``place_doubt``) more than is mapped: lanes mean depth and largest depth below contact [m]."""
     mean, contact = f16x(0.0), f16x(0.0)
     n_sample = ti.static(max(1, round(teacher_cfg.static_horizon_s / teacher_cfg.static_dt_s)))
     touch = ti.static(teacher_cfg.hull_reach_m + teacher_cfg.contact_m)
@@ -215,7 +216,7 @@ def static_depths(
             mapping_cfg,
         )
         for i in ti.static(range(LANES)):
-            below = touch - free[i]
+            below = touch + doubt - free[i]
             mean[i] += ti.max(below + ti.static(teacher_cfg.static_margin_m), 0.0) / n_sample
             contact[i] = ti.max(contact[i], below)
     return mean, contact
@@ -260,6 +261,16 @@ def depth_band(z_var, tank_cfg: Const[TankConfig], teacher_cfg: Const[TeacherCon
     gap = teacher_cfg.edge_gap_m + teacher_cfg.edge_sigmas * ti.sqrt(z_var)
     gap = ti.min(gap, ti.static(0.5 * (tank_cfg.z_m[1] - tank_cfg.z_m[0])))
     return floor + gap, top - gap
+
+
+@ti.func
+def place_doubt(pose_cov, teacher_cfg: Const[TeacherConfig]):
+    """[m] by which the clearance from walls and mapped obstacles may be smaller than the map says: the less
+    sure the own place is in its worst direction (``pose_cov``: upper triangle of x, y, heading), the larger.
+    """
+    half, apart = 0.5 * (pose_cov[0] + pose_cov[3]), 0.5 * (pose_cov[0] - pose_cov[3])
+    worst = half + ti.sqrt(apart * apart + pose_cov[1] * pose_cov[1])
+    return teacher_cfg.place_sigmas * ti.sqrt(ti.max(worst, 0.0))
 
 
 def _decay(dt_s, lag_s):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 
 import numpy as np
 
@@ -56,6 +57,7 @@ _EVASION = record(
     own_velocity=described(THREE, "[m/s] body frame, as measured or estimated"),
     yaw=described(NUMBER, "[rad] own, as estimated"),
     z_variance=described(NUMBER, "[m^2] of the estimated z"),
+    place_variance=described(NUMBER, "[m^2] of the estimated x and y in their worst direction"),
 )
 
 
@@ -101,6 +103,12 @@ def _policy(moment: Moment) -> bytes:
     ).encode()
 
 
+def _worst_variance(cov: np.ndarray) -> float:
+    """[m^2] of x and y in their worst direction; ``cov``: upper triangle of x, y and heading."""
+    xx, xy, yy = (float(cov[i]) for i in (0, 1, 3))
+    return 0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy)
+
+
 def _evasion(moment: Moment) -> bytes:
     first, hold = (
         number_or_null(None if moment[f"teacher.{name}"] > _FAR else float(moment[f"teacher.{name}"]))
@@ -114,7 +122,8 @@ def _evasion(moment: Moment) -> bytes:
         f'"cost":{number(moment["teacher.evade_cost"])},"candidate":{int(moment["teacher.evade_candidate"])},'
         f'"costs":{numbers(moment["teacher.candidate_cost"])},'
         f'"position":{numbers(moment["ego.pos_w"])},"own_velocity":{numbers(moment["ego.vel_b"])},'
-        f'"yaw":{number(moment["ego.rpy"][2])},"z_variance":{number(moment["ego.z_var"])}}}'
+        f'"yaw":{number(moment["ego.rpy"][2])},"z_variance":{number(moment["ego.z_var"])},'
+        f'"place_variance":{number(_worst_variance(moment["ego.pose_cov"]))}}}'
     ).encode()
 
 
@@ -142,7 +151,7 @@ _DECISION = (
     *("conflict_s", "hold_conflict_s", "follow_vel_w", "cruise_z_m", "evade_vel_w", "evade_cost"),
     *("evade_candidate", "candidate_cost"),
 )
-_OWN = ("ego.pos_w", "ego.vel_b", "ego.rpy", "ego.z_var")
+_OWN = ("ego.pos_w", "ego.vel_b", "ego.rpy", "ego.z_var", "ego.pose_cov")
 
 ROWS = (
     Topic(
