@@ -1,2 +1,2 @@
-"""The kinematic twin: the same scenarios, motion and referee, a vehicle by fitted lags, tracks by a model of
-the tracker. Policies learn here at 10 Hz, many times faster than in the simulator, and drive there unchanged."""
+"""The kinematic twin: the simulator's scenarios, motion and referee, a vehicle by lags, tracks by a model of
+the tracker, ten decisions a second. A floor for learning: nothing trains in it yet."""

@@ -1,20 +1,23 @@
 """The twin's kernel of motion: a vehicle by fitted lags, bodies in closed form, the simulator's referee."""
 
 import math
+from typing import TYPE_CHECKING, Any
 
 import taichi as ti
 
 from uuvtai.config import TankConfig, VehicleConfig
 from uuvtai.kernels.core.geometry import NONE
 from uuvtai.kernels.core.hull import hull_to_body, hull_to_side_wall, is_in_tank
-from uuvtai.kernels.core.signature import Const
+from uuvtai.kernels.core.signature import AnyTensor as Tensor3
+from uuvtai.kernels.core.signature import Const, FloatVector, IntVector
+from uuvtai.kernels.core.signature import FloatMatrix as Tensor2
 from uuvtai.outcomes import COLLISION, OUT_OF_TANK, RUNNING, SUCCESS, TIMEOUT, TTC
 from uuvtai.twin.tensors import AXIS_M_S, CLIMB_M_S, CRUISE_M_S, DECISION_S, MARGIN_M, MOVERS, STATICS, WAY
 
-Tensor2 = ti.types.ndarray(dtype=ti.f32, ndim=2)
-Tensor3 = ti.types.ndarray(dtype=ti.f32, ndim=3)
-Vector1 = ti.types.ndarray(dtype=ti.f32, ndim=1)
-Codes1 = ti.types.ndarray(dtype=ti.i32, ndim=1)
+if TYPE_CHECKING:
+    Seconds = Rules = Any
+else:
+    Seconds, Rules = ti.f32, ti.template()
 
 SURGE_LAG_S, SWAY_LAG_S, HEAVE_LAG_S, RATE_LAG_S = 0.25, 0.33, 0.34, 0.15
 """time constants, fitted to the first 0.4 s of step responses of the simulator"""
@@ -32,7 +35,7 @@ _QUARTER = math.pi / 2
 @ti.func
 def body_on_path(mover: Tensor3, env, lane, time_s):
     """(x, y, vx, vy) of a moving body at a time since the episode's start."""
-    n_way = ti.cast(mover[env, lane, 4], ti.i32)
+    n_way = int(mover[env, lane, 4])
     length, speed = mover[env, lane, 6], mover[env, lane, 8]
     arc = mover[env, lane, 7] + speed * time_s
     rest = arc - length * ti.floor(arc / ti.max(length, 1e-6))
@@ -134,11 +137,11 @@ def drive(
     mover: Tensor3,
     ego: Tensor2,
     action: Tensor2,
-    nearest: Vector1,
-    outcome: Codes1,
+    nearest: FloatVector,
+    outcome: IntVector,
     vehicle_cfg: Const[VehicleConfig],
     tank_cfg: Const[TankConfig],
-    rules: ti.template(),
+    rules: Rules,
 ):
     """One decision of every env: motion, clearance at its least, outcome by the referee's rules."""
     for env in range(ego.shape[0]):
@@ -181,7 +184,7 @@ def drive(
                     out = COLLISION
                 elif near[1] < rules.ttc_s:
                     out = TTC
-                elif (goal - pos).norm() <= rules.goal_radius_m:
+                elif ti.math.length(goal - pos) <= rules.goal_radius_m:
                     out = SUCCESS
                 elif time_s >= rules.horizon_steps * rules.control_dt_s - 1e-3:
                     out = TIMEOUT

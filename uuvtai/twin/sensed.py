@@ -6,7 +6,7 @@ import math
 import taichi as ti
 
 from uuvtai.kernels.core.geometry import BOX, NONE
-from uuvtai.twin.motion import Tensor2, Tensor3, body_on_path
+from uuvtai.twin.motion import Seconds, Tensor2, Tensor3, body_on_path
 from uuvtai.twin.tensors import MOVERS, RAYS, STATICS
 
 FAN_SLOPE = 0.1763
@@ -39,7 +39,7 @@ def is_hidden(env, x, y, dx, dy, distance, static: Tensor3):
 
 
 @ti.kernel
-def sense(static: Tensor3, mover: Tensor3, ego: Tensor2, track: Tensor3, noise: Tensor3, dt: ti.f32):
+def sense(static: Tensor3, mover: Tensor3, ego: Tensor2, track: Tensor3, noise: Tensor3, dt: Seconds):
     """Tracks of every body ``dt`` [s] later; ``noise``: (n, MOVERS, 2) standard normal."""
     for env in range(ego.shape[0]):
         x, y, z, yaw = ego[env, 0], ego[env, 1], ego[env, 2], ego[env, 6]
@@ -132,11 +132,11 @@ def gather_tracks(
     seen: Tensor3,
     ray: Tensor2,
     true: Tensor3,
-    x1: ti.f32,
-    y1: ti.f32,
+    x1: Seconds,
+    y1: Seconds,
 ):
-    """Tracks as the simulator's stack would show them: ``seen`` (n, MOVERS, SEEN_COLUMNS): valid, x, y, vx, vy, radius,
-    above, below, age, turn rate, moves within 1 and 2 s; ``ray`` (n, RAYS)
+    """Tracks as the simulator's stack would show them: ``seen`` (n, MOVERS, SEEN_COLUMNS): valid, x, y,
+    vx, vy, radius, above, below, age, turn rate, way within 1 s and 2 s (x, y each); ``ray`` (n, RAYS)
     [m]; ``true`` (n, MOVERS, TRUE_COLUMNS) for the critic."""
     for env in range(ego.shape[0]):
         x, y, z, t = ego[env, 0], ego[env, 1], ego[env, 2], ego[env, 8]

@@ -28,8 +28,8 @@ class SetNet(nn.Module):
             self.out.weight.mul_(gain)
 
     def forward(self, body: torch.Tensor, row: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
-        """(n, n_out) for bodies (n, MOVERS, n_body), rows (n, EGO_COLUMNS); ``mask`` (n, MOVERS, 1) is 1 where
-        there is a body."""
+        """(n, n_out) for bodies (n, MOVERS, n_body), rows (n, EGO_COLUMNS); ``mask`` (n, MOVERS, 1) is 1
+        where there is a body."""
         each = self.body(body) * mask
         return self.out(self.head(torch.cat([each.amax(-2), _SUM_SCALE * each.sum(-2), self.own(row)], -1)))
 
