@@ -5,7 +5,6 @@ end; they meet in the folder of machine code."""
 from __future__ import annotations
 
 import os
-import pickle
 import sys
 import threading
 from typing import Any
@@ -16,10 +15,7 @@ from uuvtai.config import Config
 from uuvtai.errors import UserError
 from uuvtai.native.launch import compiling, native
 from uuvtai.sim import Sim
-from uuvtai.tree import FlatTree
-
-Recipe = tuple[Config, int, FlatTree]
-"""config, num_envs and tree of a simulator"""
+from uuvtai.tree import read_tree
 
 
 def main() -> None:
@@ -28,15 +24,15 @@ def main() -> None:
     size = int.from_bytes(pipe.read(8), "little")
     if not size:
         return
-    recipe: Recipe = pickle.loads(pipe.read(size))  # from the process that began this one
+    num_envs, config = pipe.read(size).decode().split("\n", 1)
     threading.Thread(target=_end_with, args=(pipe,), daemon=True).start()
-    compile_backwards(recipe)
+    compile_backwards(Config.model_validate_json(config), int(num_envs))
 
 
-def compile_backwards(recipe: Recipe) -> int:
+def compile_backwards(config: Config, num_envs: int) -> int:
     """Compile the kernels of a reset and a step from the last to the first, each run once on empty arrays;
     how many there are."""
-    sim = Sim(*recipe)
+    sim = Sim(config, num_envs, read_tree("bt", config.teacher.max_node))  # kernels know no tree
     calls = calls_of(sim)
     for clock in (sim.s.clock.awake, sim.s.clock.active):
         clock.fill(1)  # a kernel that does nothing compares nothing

@@ -7,7 +7,6 @@ mapping -> clearance -> planning -> teacher -> features -> reward. A pass works 
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from functools import partial
@@ -72,7 +71,7 @@ class Sim:
         self._memory = self.memory()
         self._put = self._memory.put
         if config.runtime.native and self.device.type == "cpu":
-            recipe = partial(pickle.dumps, (config, num_envs, tree))
+            recipe = partial(_recipe, config, num_envs)
             adopt(vars(self.io).values(), self._memory, recipe, alone=num_envs == 1)
         self.use_tree(tree)
         self.set_scenes()
@@ -269,3 +268,8 @@ class Sim:
 
     def _stage(self, name: str) -> AbstractContextManager[None]:
         return timed_stage(name, self.stage_s)
+
+
+def _recipe(config: Config, num_envs: int) -> bytes:
+    """What another process builds the same kernels by (``other_end``)."""
+    return f"{num_envs}\n{config.model_dump_json()}".encode()

@@ -4,13 +4,13 @@ trusted: what does not fit together is a ValueError."""
 from __future__ import annotations
 
 import base64
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from uuvtai.files import parsed_json
 from uuvtai.logs.encode import dumped
 from uuvtai.logs.moment import time_text
 from uuvtai.logs.ros_types import FRAMES_BACK, SURFACE_PA
@@ -89,7 +89,7 @@ class Reader:
     def head(self, header: Any) -> dict[str, Any]:
         """timestamp and frame_id; stamps before the start of the bag count as its start."""
         return {
-            "timestamp": json.loads(self.stamp(header)),
+            "timestamp": parsed_json(self.stamp(header), self.topic),
             "frame_id": FRAMES_BACK.get(header.frame_id, header.frame_id),
         }
 

@@ -186,7 +186,7 @@ def _description(file: str, counts: Counter[str], duration_ns: int, start_ns: in
         "topics_with_message_count": topics,
         "compression_format": "",
         "compression_mode": "",
-        "files": [{"path": file, **json.loads(json.dumps(span))}],
+        "files": [{"path": file, **span}],
     }
 
 

@@ -56,7 +56,8 @@ class Comparison:
         """The method's simulator, with its tree, its planner and, where it is a yardstick, with the truth."""
         sim = self.sims[method.stack]
         sim.use_tree(method.tree)
-        sim.privileged, sim.planner = method.privileged, self.planners[method.name]
+        sim.privileged = method.privileged
+        sim.planner = self.planners[method.name]
         return sim
 
 
