@@ -1,0 +1,97 @@
+"""Scenarios drawn by the simulator itself, as plain arrays that the twin's kernels read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from uuvtai.config import Config
+from uuvtai.loader import load_config
+from uuvtai.scenario import Scene
+from uuvtai.shipped import TRAINING_TREE
+from uuvtai.sim import Sim
+from uuvtai.tree import read_tree
+
+BATCH = 256
+"""envs of the simulator that draws"""
+
+
+@dataclass(frozen=True)
+class ScenarioBank:
+    """B scenarios: resting bodies first, then the moving ones."""
+
+    body: torch.Tensor
+    """(B, n_body, 8) kind, centre (3), size (3), yaw; kind 0 = none"""
+    path: torch.Tensor
+    """(B, n_lane, 16) corners (0 = circle), radius, length, phase, speed, corners' x and y; of a circle the
+    first is its centre"""
+    mission: torch.Tensor
+    """(B, 8) start (3), goal (3), heading at the start"""
+    origin: torch.Tensor
+    """(B,) int32: which of ``names`` it was drawn for"""
+    names: tuple[str, ...]
+    """world (D, v) by number"""
+
+
+def draw_bank(worlds: tuple[str, ...], scenes: tuple[Scene, ...], seed: int, count: int) -> ScenarioBank:
+    """Episodes 0 .. count - 1 of ``seed`` for every pair of a world preset and a scene (S, D, v), drawn by
+    ``Sim.draw``. Raises ConfigError for a world that is none."""
+    parts, names = [], []
+    for world in worlds:
+        most = [("world.n_static", max(s[0] for s in scenes)), ("world.n_dynamic", max(s[1] for s in scenes))]
+        config = load_config(world, overrides=[*most])
+        sim = Sim(config, min(BATCH, count), read_tree(TRAINING_TREE, config.teacher.max_node))
+        for scene in scenes:
+            rows = drawn(sim, scene, seed, count)
+            parts.append((*rows, torch.full((count,), len(names), dtype=torch.int32)))
+            names.append(f"{world} ({scene[1]}, {scene[2]:g})")
+    widest = [max(part[i].shape[1] for part in parts) for i in range(2)]
+    rest = max(part[0].shape[1] - part[1].shape[1] for part in parts)
+    body = torch.cat([_padded(part[0], rest + widest[1], part[1].shape[1], rest) for part in parts])
+    path = torch.cat([torch.nn.functional.pad(p[1], (0, 0, 0, widest[1] - p[1].shape[1])) for p in parts])
+    mission, origin = (torch.cat([part[i] for part in parts]) for i in (2, 3))
+    return ScenarioBank(body, path, mission, origin, tuple(names))
+
+
+def _padded(body: torch.Tensor, width: int, lanes: int, rest: int) -> torch.Tensor:
+    """With empty slots behind the resting and behind the moving bodies."""
+    out = torch.zeros(len(body), width, 8)
+    own = body.shape[1] - lanes
+    out[:, :own], out[:, rest : rest + lanes] = body[:, :own], body[:, own:]
+    return out
+
+
+def drawn(sim: Sim, scene: Scene, seed: int, count: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """(body, path, mission) as in a bank, of one scene's episodes; slots that are empty everywhere are left
+    out."""
+    sim.set_scenes([scene])
+    found = []
+    for first in range(0, count, sim.num_envs):
+        number = torch.arange(first, first + sim.num_envs, dtype=torch.int32)
+        mask = (number < count).int()
+        sim.draw(mask, torch.full_like(mask, seed), number)
+        found.append([rows[: int(mask.sum())] for rows in scenario_rows(sim)])
+    body, path, mission = (np.concatenate(part) for part in zip(*found, strict=True))
+    lanes, rest = path.shape[1], body.shape[1] - path.shape[1]
+    used = (body[:, :, 0] > 0).any(axis=0)
+    moving = used[rest:]
+    return tuple(torch.from_numpy(a) for a in (body[:, used].copy(), path[:, moving].copy(), mission))  # type: ignore[return-value]
+
+
+def scenario_rows(sim: Sim) -> list[np.ndarray]:
+    """(body, path, mission) of what every row of a simulator holds, float32."""
+    s = sim.s
+    kind, pos, size, yaw = (sim.rows(f) for f in (s.world.kind, s.world.pos_w, s.world.size, s.world.yaw))
+    way = sim.rows(s.path.way_w)
+    numbers = (s.path.n_way, s.path.radius_m, s.path.length_m, s.path.phase_m, s.path.speed_m_s)
+    path = np.stack([sim.rows(field) for field in numbers], axis=-1)
+    path = np.concatenate([path, way.reshape(*way.shape[:2], -1)], axis=-1)
+    path = np.concatenate([path, np.zeros((*path.shape[:2], 16 - path.shape[2]))], axis=-1)
+    path[..., 2] = np.where(path[..., 2] > 0, path[..., 2], 1.0)
+    m = s.mission
+    mission = np.concatenate([sim.rows(m.start_w), sim.rows(m.goal_w), sim.rows(m.start_yaw)[:, None]], axis=1)
+    mission = np.concatenate([mission, np.zeros((len(mission), 1))], axis=1)
+    body = np.concatenate([kind[..., None], pos, size, yaw[..., None]], axis=-1)
+    return [np.ascontiguousarray(a, np.float32) for a in (body, path, mission)]
