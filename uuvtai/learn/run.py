@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from uuvtai.env import VectorEnv
     from uuvtai.learn.checkpoint import Checkpoint
     from uuvtai.learn.train import Trainer
+    from uuvtai.learn.twin_trainer import TwinTrainer
     from uuvtai.scene_options import SceneOptions
 
 Metrics = dict[str, float]
@@ -66,7 +67,7 @@ class TrainWatch(Protocol):
     def stop(self) -> None: ...
 
 
-Evaluate = Callable[["Trainer", LearningConfig], Metrics]
+Evaluate = Callable[["Trainer | TwinTrainer", LearningConfig], Metrics]
 """``eval/*`` of the policy as it is; training goes on as if nothing had been
 (``measure.evaluate.while_training.evaluate_now``, which knows what learning does not)"""
 
@@ -116,7 +117,10 @@ def _train(
         f"starting {config.train.num_envs} envs (sizes not used before compile their kernels first, about "
         "half a minute)"
     )
-    trainer = _trainer(_env(config, request.device), config, found)
+    if config.twin.enabled:
+        trainer = _twin_trainer(config, found)
+    else:
+        trainer = _trainer(_env(config, request.device), config, found)
     place = _folder(request, config, found, folder) if trainer.processes.writes else None
     run = _Run(trainer, config, place, watch, evaluate, total)
     status, code = "failed", 1
@@ -185,6 +189,17 @@ def _trainer(env: VectorEnv, config: LearningConfig, checkpoint: Checkpoint | No
     return trainer
 
 
+def _twin_trainer(config: LearningConfig, checkpoint: Checkpoint | None) -> TwinTrainer:
+    """As ``_trainer``, in the kinematic twin."""
+    from uuvtai.learn.twin_trainer import TwinTrainer
+
+    trainer = TwinTrainer(config)
+    if checkpoint:
+        checkpoint.check_table(trainer.observation_table, config)
+        trainer.load_state(checkpoint.state(like=trainer.state()))
+    return trainer
+
+
 def _folder(
     request: TrainRequest, config: LearningConfig, checkpoint: Checkpoint | None, folder: RunFolder | None
 ) -> RunFolder:
@@ -202,7 +217,7 @@ class _Run:
 
     def __init__(
         self,
-        trainer: Trainer,
+        trainer: Trainer | TwinTrainer,
         config: LearningConfig,
         folder: RunFolder | None,
         watch: TrainWatch,
@@ -266,7 +281,7 @@ class _Run:
     def _save(self, folder: RunFolder) -> None:
         from uuvtai.learn import checkpoint
 
-        trainer, table = self._trainer, self._trainer.env.observation_table
+        trainer, table = self._trainer, self._trainer.observation_table
         score = self._metrics.get(SCORE)
         checkpoint.save(
             folder.path / "checkpoints",

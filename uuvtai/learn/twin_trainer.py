@@ -23,8 +23,10 @@ if TYPE_CHECKING:
 
 BANK_SEED = 4242
 """of the scenarios to learn from; those of evaluations come from ``train.evaluate_seed``"""
-CACHE_ROWS = 512
+CACHE_ROWS = 2048
 """rows in one pass through the networks: nine bodies each"""
+FASTEST_RATE = 2e-3
+"""most that the KL-adaptive rate may be"""
 CRITIC_RATE = 1e-3
 DECAY_FROM = 0.5
 """share of the run from which the learning rate falls to a tenth"""
@@ -169,7 +171,7 @@ class TwinTrainer:
                 sums += self._minibatch([part[index] for part in (*rows, *flat)])
         policy_loss, value_loss, kl, clipped = (sums / (config.epochs * config.minibatches)).tolist()
         if config.target_kl > 0:
-            self.rate = adapted_rate(self.rate, torch.tensor(kl), config.target_kl)
+            self.rate = adapted_rate(self.rate, torch.tensor(kl), config.target_kl).clamp(max=FASTEST_RATE)
         share = self.iteration / self.config.train.iterations
         fade = max(0.1, min(1.0, (1.0 - share) / (1.0 - DECAY_FROM)))
         self.optimiser.param_groups[0]["lr"] = float(self.rate) * fade
@@ -180,7 +182,7 @@ class TwinTrainer:
             "train/approx_kl": kl,
             "train/clip_fraction": clipped,
             "train/learning_rate": float(self.rate) * fade,
-            "train/std": float(self.actor.log_std.exp().mean()),
+            "train/std": float(self.actor.log_std.detach().exp().mean()),
             "train/explained_variance": float(1.0 - (target - self._value).var() / spread),
         }
 
