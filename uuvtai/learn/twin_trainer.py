@@ -193,9 +193,11 @@ class TwinTrainer:
         sums = torch.zeros(4)
         for part in zip(*(tensor.split(CACHE_ROWS) for tensor in batch), strict=True):
             bodies, own, truth, action, before, advantage, target = part
-            log_ratio = log_prob(action, self.actor(bodies, own), self.actor.log_std) - before
+            with self._coarse():
+                mean, value = self.actor(bodies, own), self.critic(bodies, own, truth)
+            log_ratio = log_prob(action, mean.float(), self.actor.log_std) - before
             policy_loss = surrogate_loss(log_ratio, advantage, config.clip).sum() / count
-            value_loss = (self.critic(bodies, own, truth) - target).square().sum() / count
+            value_loss = (value.float() - target).square().sum() / count
             (policy_loss + config.value_weight * value_loss).backward()
             with torch.no_grad():
                 kl = approximate_kl(log_ratio).sum() / count
@@ -207,6 +209,10 @@ class TwinTrainer:
         with torch.no_grad():
             self.actor.log_std.clamp_(math.log(self.config.policy.min_std), 0.0)
         return sums
+
+    def _coarse(self) -> torch.autocast:
+        """Products in bfloat16 where ``ppo.bfloat16`` says so."""
+        return torch.autocast("cpu", torch.bfloat16, enabled=self.config.ppo.bfloat16)
 
     # --------------------------------------------------------------------------------------------- evaluation
 
