@@ -4,7 +4,7 @@ import taichi as ti
 
 from uuvtai.config import TankConfig, VehicleConfig
 from uuvtai.kernels.core.geometry import PI, wrapped_angle
-from uuvtai.kernels.core.signature import Const, FloatMatrix, FloatVector
+from uuvtai.kernels.core.signature import Const
 
 TURN_GAIN = 2.5
 """[1/s] yaw rate by the angle that is still to turn"""
@@ -52,21 +52,3 @@ def wished_velocity(x, y, z, flip_x, flip_y, vehicle_cfg: Const[VehicleConfig]):
             ti.math.clamp(z, -1.0, 1.0) * vehicle_cfg.max_heave_m_s,
         ]
     )
-
-
-@ti.kernel
-def lay_on_hull(
-    vehicle_cfg: Const[VehicleConfig],
-    tank_cfg: Const[TankConfig],
-    gap_m: ti.f32,
-    wish: FloatMatrix,
-    yaw: FloatVector,
-    z_m: FloatVector,
-    command: FloatMatrix,
-):
-    """Commands (n, 4) of wished velocities (n, 3) [m/s] in the world, headings (n,) and heights (n,) [m]."""
-    for env in range(wish.shape[0]):
-        wanted = ti.Vector([wish[env, 0], wish[env, 1], wish[env, 2]])
-        out = hull_command(wanted, yaw[env], z_m[env], gap_m, vehicle_cfg, tank_cfg)
-        for i in ti.static(range(4)):
-            command[env, i] = out[i]

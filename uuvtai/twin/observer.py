@@ -1,14 +1,11 @@
 """The simulator seen as the twin sees its world: the same rows, from what the vehicle senses and remembers."""
 
-import dataclasses
-
 import taichi as ti
 
-from uuvtai.config import MappingConfig, TankConfig, TrackingConfig
 from uuvtai.kernels.core.geometry import FAR_M, TWO_PI
 from uuvtai.kernels.core.grid import cell_of
-from uuvtai.kernels.core.signature import AnyTensor, Bundle, Const, FloatMatrix, In
-from uuvtai.state import ClearanceState, ClockState, ForecastState, MissionState, Proprioception, TrackState
+from uuvtai.kernels.core.signature import AnyTensor, Bundle, FloatMatrix, IntVector
+from uuvtai.twin.hull_rule import hull_command, wished_velocity
 from uuvtai.twin.set_columns import BODY_WIDTH, EGO_COLUMNS, OWN_WIDTH
 from uuvtai.twin.twin_arrays import (
     AT_FLIP,
@@ -19,6 +16,7 @@ from uuvtai.twin.twin_arrays import (
     AT_YAW,
     N_BODY,
     RAW_WIDTH,
+    ObserverIO,
 )
 from uuvtai.env import ObservationColumn
 
@@ -28,21 +26,6 @@ SIGHT_M = 4.3
 MARCHES = 14
 LARGEST_TURN = 3.5
 """[rad/s] a forecast that bends more has a corner in it"""
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class ObserverIO:
-    """What the policy over a set of bodies is told of the simulator: nothing that only the simulator knows."""
-
-    clock: In[ClockState]
-    mission: In[MissionState]
-    ego: In[Proprioception]
-    tracks: In[TrackState]
-    forecast: In[ForecastState]
-    clearance: In[ClearanceState]
-    tank_cfg: Const[TankConfig]
-    mapping_cfg: Const[MappingConfig]
-    tracking_cfg: Const[TrackingConfig]
 
 
 @ti.func
@@ -88,7 +71,7 @@ def put_track(env, lane, track, raw: AnyTensor, io: Bundle[ObserverIO]):
 
 
 @ti.kernel
-def observe_bodies(io: Bundle[ObserverIO], due: ti.types.ndarray(dtype=ti.i32, ndim=1), ego: FloatMatrix, raw: AnyTensor, ray: FloatMatrix):
+def observe_bodies(io: Bundle[ObserverIO], due: IntVector, ego: FloatMatrix, raw: AnyTensor, ray: FloatMatrix):
     """Rows of the vehicle, of its nearest tracks and of the free distances, where ``due`` is 1; the last action in
     ``ego`` stays."""
     n_track = ti.static(io.tracks.alive.shape[1])
@@ -120,6 +103,20 @@ def observe_bodies(io: Bundle[ObserverIO], due: ti.types.ndarray(dtype=ti.i32, n
             for i in range(ray.shape[1]):
                 angle = i * (TWO_PI / ray.shape[1])
                 ray[env, i] = free_ray(env, pos_w[0], pos_w[1], ti.cos(angle), ti.sin(angle), io)
+
+
+@ti.kernel
+def command_hull(io: Bundle[ObserverIO], gap_m: ti.f32, action: FloatMatrix, command: FloatMatrix):
+    """Commands (n, 4) of the policy's actions (n, 3), where each vehicle is now."""
+    for env in range(action.shape[0]):
+        flip = ti.Vector([1.0, 1.0])
+        for i in ti.static(range(2)):
+            if io.mission.goal_w[env][i] < io.mission.start_w[env][i]:
+                flip[i] = -1.0
+        wish = wished_velocity(action[env, 0], action[env, 1], action[env, 2], flip[0], flip[1], io.vehicle_cfg)
+        out = hull_command(wish, io.ego.rpy[env][2], io.ego.pos_w[env][2], gap_m, io.vehicle_cfg, io.tank_cfg)
+        for i in ti.static(range(4)):
+            command[env, i] = out[i]
 
 
 def _table():

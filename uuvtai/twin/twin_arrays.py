@@ -4,9 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from uuvtai.config import ActuationConfig, EpisodeConfig, TankConfig, VehicleConfig
+from uuvtai.config import (
+    ActuationConfig,
+    EpisodeConfig,
+    MappingConfig,
+    TankConfig,
+    TrackingConfig,
+    VehicleConfig,
+)
 from uuvtai.config.learning import TwinConfig
-from uuvtai.kernels.core.signature import Const
+from uuvtai.kernels.core.signature import Const, In
+from uuvtai.state import ClearanceState, ClockState, ForecastState, MissionState, Proprioception, TrackState
 
 AT_POS, AT_VEL, AT_YAW, AT_RATE, AT_TIME, AT_GOAL, AT_FLIP, AT_LAST, AT_INTEGRAL = 0, 3, 6, 7, 8, 9, 12, 14, 17
 """columns of an env's row: position in the world, velocity in the body frame, heading, yaw rate, time, goal,
@@ -32,3 +40,19 @@ class TwinRules:
     tank_cfg: Const[TankConfig]
     episode_cfg: Const[EpisodeConfig]
     twin_cfg: Const[TwinConfig]
+
+
+@dataclass(frozen=True, eq=False)
+class ObserverIO:
+    """What the policy over a set of bodies is told of the simulator: nothing that only the simulator knows."""
+
+    clock: In[ClockState]
+    mission: In[MissionState]
+    ego: In[Proprioception]
+    tracks: In[TrackState]
+    forecast: In[ForecastState]
+    clearance: In[ClearanceState]
+    vehicle_cfg: Const[VehicleConfig]
+    tank_cfg: Const[TankConfig]
+    mapping_cfg: Const[MappingConfig]
+    tracking_cfg: Const[TrackingConfig]
