@@ -157,7 +157,10 @@ def by_chunk(function: Callable[..., torch.Tensor], *inputs: torch.Tensor) -> to
         missing = CHUNK - len(chunk[0])
         parts.append(
             function(
-                *(torch.cat([t, t[:1].expand(missing, *t.shape[1:])]) if missing else t.contiguous() for t in chunk)
+                *(
+                    torch.cat([t, t[:1].expand(missing, *t.shape[1:])]) if missing else t.contiguous()
+                    for t in chunk
+                )
             )
         )
     return torch.cat(parts)[: len(inputs[0])]
@@ -195,8 +198,8 @@ def load_pilot(checkpoint: Checkpoint, num_envs: int, device: torch.device | str
     config, rows = checkpoint.config, checkpoint.manifest.observation_table
     if config.twin.enabled:
         raise CheckpointError(
-            f"{checkpoint.path}: a policy over a set of bodies, which looks at the simulator itself; it drives "
-            "in 'uuv eval' and 'uuv sweep', and cannot be exported yet"
+            f"{checkpoint.path}: a policy over a set of bodies, which looks at the simulator itself; it "
+            "drives in 'uuv eval' and 'uuv sweep', and cannot be exported yet"
         )
     parts, generator = checkpoint.model(), torch.Generator()
     try:

@@ -1,5 +1,5 @@
-"""A policy over a set of bodies at the wheel of the simulator: a wish for a velocity ten times a second, laid on
-the hull by the fixed rule in every control step."""
+"""A policy over a set of bodies at the wheel of the simulator: a wish for a velocity ten times a second,
+laid on the hull by the fixed rule in every control step."""
 
 from __future__ import annotations
 
@@ -86,8 +86,8 @@ class SetPilot:
 
 
 def load_set_pilot(checkpoint: Checkpoint, sim: Sim) -> SetPilot:
-    """Pilot of a policy that learnt in the twin. Raises CheckpointError where its networks are not those of its
-    config."""
+    """Pilot of a policy that learnt in the twin. Raises CheckpointError where its networks are not those of
+    its config."""
     from uuvtai.twin.observer import SET_TABLE
     from uuvtai.twin.set_columns import BODY_WIDTH, EGO_COLUMNS
 
@@ -96,7 +96,10 @@ def load_set_pilot(checkpoint: Checkpoint, sim: Sim) -> SetPilot:
     try:
         part: dict[str, Any] = found["policy"]
         wide, head = config.twin.body_hidden, config.twin.head_hidden
-        for name, shape in (("net.body.0.weight", (wide, BODY_WIDTH)), ("net.head.0.weight", (head, 3 * wide))):
+        for name, shape in (
+            ("net.body.0.weight", (wide, BODY_WIDTH)),
+            ("net.head.0.weight", (head, 3 * wide)),
+        ):
             if tuple(part[name].shape) != shape:
                 raise ValueError(f"{name} is {tuple(part[name].shape)} instead of {shape}")
         actor = SetActor(BODY_WIDTH, EGO_COLUMNS, config, torch.Generator())
@@ -108,7 +111,8 @@ def load_set_pilot(checkpoint: Checkpoint, sim: Sim) -> SetPilot:
     for name, tensor in actor.state_dict().items():
         if not bool(torch.isfinite(tensor).all()):
             raise CheckpointError(
-                f"{checkpoint.path / MODEL}: {name} is not finite: the training failed; take an older checkpoint"
+                f"{checkpoint.path / MODEL}: {name} is not finite: the training failed; take an older "
+                "checkpoint"
             )
     actor.to(sim.device).eval()
     return SetPilot(actor, sim, config.policy.hold_steps, config.twin.vertical_gap_m)

@@ -1,6 +1,6 @@
-"""Policy over a set of bodies: every body goes through one encoder, and what comes out is pooled by maximum and
-sum, so that neither their order nor their number matters. The critic has an encoder of its own, which also sees the
-bodies' true future: it serves training alone, and no file that drives holds it."""
+"""Policy over a set of bodies: every body goes through one encoder, and what comes out is pooled by maximum
+and sum, so that neither their order nor their number matters. The critic has an encoder of its own, which
+also sees the bodies' true future: it serves training alone, and no file that drives holds it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,13 @@ class SetEncoder(nn.Module):
     n_own), to ``n_out`` numbers."""
 
     def __init__(
-        self, n_body: int, n_own: int, n_out: int, config: LearningConfig, gain: float, generator: torch.Generator
+        self,
+        n_body: int,
+        n_own: int,
+        n_out: int,
+        config: LearningConfig,
+        gain: float,
+        generator: torch.Generator,
     ) -> None:
         super().__init__()
         wide, head = config.twin.body_hidden, config.twin.head_hidden

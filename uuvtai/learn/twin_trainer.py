@@ -1,4 +1,4 @@
-"""PPO in the kinematic twin: what ``learn/run.py`` drives in place of ``learn/train.py`` where ``twin.enabled``."""
+"""PPO in the kinematic twin: what ``learn/run.py`` drives where ``twin.enabled``."""
 
 from __future__ import annotations
 
@@ -69,14 +69,19 @@ class TwinTrainer:
         self.iteration = self.env_steps = 0
         self._returns = torch.zeros(config.train.num_envs)
         self._held_out: ScenarioBank | None = None
-        self._allocate(config.ppo.rollout_steps, config.train.num_envs, bank.path.shape[1], BODY_WIDTH, EGO_COLUMNS)
+        self._allocate(
+            config.ppo.rollout_steps, config.train.num_envs, bank.path.shape[1], BODY_WIDTH, EGO_COLUMNS
+        )
         self.twin.begin(torch.ones(config.train.num_envs, dtype=torch.bool), self._next_scenarios())
         self.twin.look()
 
     def _allocate(self, steps: int, envs: int, lanes: int, n_body: int, n_own: int) -> None:
         truth = self.twin.view.truth.shape[2]
         self._bodies, self._own = torch.zeros(steps, envs, lanes, n_body), torch.zeros(steps, envs, n_own)
-        self._truth, self._action = torch.zeros(steps, envs, lanes, truth), torch.zeros(steps, envs, NUM_WISHES)
+        self._truth, self._action = (
+            torch.zeros(steps, envs, lanes, truth),
+            torch.zeros(steps, envs, NUM_WISHES),
+        )
         self._log_prob, self._value, self._reward = (torch.zeros(steps, envs) for _ in range(3))
         self._next_value = torch.zeros(steps, envs)
         self._terminated, self._ended = (torch.zeros(steps, envs, dtype=torch.bool) for _ in range(2))
@@ -160,10 +165,19 @@ class TwinTrainer:
     def _learn(self) -> dict[str, float]:
         config = self.config.ppo
         advantage, target = gae(
-            self._reward, self._value, self._next_value, self._terminated, self._ended, config.gamma, config.gae_lambda
+            self._reward,
+            self._value,
+            self._next_value,
+            self._terminated,
+            self._ended,
+            config.gamma,
+            config.gae_lambda,
         )
         rows = [part.flatten(0, 1) for part in (self._bodies, self._own, self._truth, self._action)]
-        flat = [part.flatten() for part in (self._log_prob, (advantage - advantage.mean()) / (advantage.std() + 1e-6), target)]
+        flat = [
+            part.flatten()
+            for part in (self._log_prob, (advantage - advantage.mean()) / (advantage.std() + 1e-6), target)
+        ]
         size = -(-len(flat[0]) // config.minibatches)
         sums = torch.zeros(4)
         for _ in range(config.epochs):

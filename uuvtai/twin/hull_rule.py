@@ -24,7 +24,10 @@ def hull_command(wish, yaw, z_m, gap_m, vehicle_cfg: Const[VehicleConfig], tank_
     surge = (c * wish[0] + s * wish[1]) / vehicle_cfg.max_surge_m_s
     sway = (c * wish[1] - s * wish[0]) / vehicle_cfg.max_sway_m_s
     over = ti.max(1.0, ti.max(ti.abs(surge), ti.abs(sway)))
-    rise = ti.min(ti.max(wish[2], ti.min(tank_cfg.z_m[0] + gap_m - z_m, 0.0)), ti.max(tank_cfg.z_m[1] - gap_m - z_m, 0.0))
+    rise = ti.min(
+        ti.max(wish[2], ti.min(tank_cfg.z_m[0] + gap_m - z_m, 0.0)),
+        ti.max(tank_cfg.z_m[1] - gap_m - z_m, 0.0),
+    )
     turn = 0.0
     if wish[0] * wish[0] + wish[1] * wish[1] > LEAST_SPEED_M_S**2:
         off = wrapped_angle(ti.atan2(wish[1], wish[0]) - yaw)

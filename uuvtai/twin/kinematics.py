@@ -1,5 +1,5 @@
-"""The twin's step: the velocity loops of the vehicle axis by axis, bodies in closed form, and the referee's own
-rules, by the simulator's own distances.
+"""The twin's step: the vehicle's velocity loops axis by axis, bodies in closed form, and the referee's rules,
+by the simulator's own distances.
 
 Arrays are the caller's tensors. A scenario is three rows of a bank (``scenario_bank.py``), which is never
 written: an env knows the number of its scenario.
@@ -15,6 +15,7 @@ from uuvtai.kernels.vehicle.actuation import axis_loops, integrated
 from uuvtai.outcomes import COLLISION, OUT_OF_TANK, RUNNING, SUCCESS, TIMEOUT, TTC
 from uuvtai.twin.hull_rule import hull_command, wished_velocity
 from uuvtai.twin.twin_arrays import (
+    AT_FLIP,
     AT_GOAL,
     AT_INTEGRAL,
     AT_LAST,
@@ -23,7 +24,6 @@ from uuvtai.twin.twin_arrays import (
     AT_TIME,
     AT_VEL,
     AT_YAW,
-    AT_FLIP,
     TwinRules,
 )
 
@@ -39,7 +39,7 @@ def path_place(number, lane, t_s, path: AnyTensor):
     length, speed = path[number, lane, 2], path[number, lane, 4]
     arc = path[number, lane, 3] + speed * t_s
     rest = arc - length * ti.floor(arc / length)
-    n_way = ti.cast(path[number, lane, 0], ti.i32)
+    n_way = int(path[number, lane, 0])
     out = ti.Vector([path[number, lane, 5], path[number, lane, 6], 0.0, 0.0])
     if n_way == 0:
         turn = path[number, lane, 1]
@@ -57,21 +57,23 @@ def path_place(number, lane, t_s, path: AnyTensor):
         on_it = 0
         for j in range(n_way):
             k = (j + 1) % n_way
-            corner = ti.Vector([path[number, lane, 5 + 2 * j], path[number, lane, 6 + 2 * j]])
-            leg = ti.Vector([path[number, lane, 5 + 2 * k], path[number, lane, 6 + 2 * k]]) - corner
-            leg_m = leg.norm()
+            x, y = path[number, lane, 5 + 2 * j], path[number, lane, 6 + 2 * j]
+            leg_x, leg_y = path[number, lane, 5 + 2 * k] - x, path[number, lane, 6 + 2 * k] - y
+            leg_m = ti.sqrt(leg_x * leg_x + leg_y * leg_y)
             if on_it == 0 and (rest < leg_m or j == n_way - 1):
-                along = leg / ti.max(leg_m, 1e-9)
-                at = corner + ti.min(rest, leg_m) * along
-                out = ti.Vector([at[0], at[1], speed * along[0], speed * along[1]])
+                scale = 1.0 / ti.max(leg_m, 1e-9)
+                gone = ti.min(rest, leg_m) * scale
+                out = ti.Vector(
+                    [x + gone * leg_x, y + gone * leg_y, speed * scale * leg_x, speed * scale * leg_y]
+                )
                 on_it = 1
             rest -= leg_m
     return out
 
 
 def axis_drag(cfg, axis):
-    """(inertia with added mass, linear, quadratic damping) of surge, sway, heave or yaw; plain Python, constants
-    of the kernel."""
+    """(inertia with added mass, linear, quadratic damping) of surge, sway, heave or yaw; plain Python,
+    constants of the kernel."""
     at = axis if axis < 3 else 5
     inertia = cfg.mass_kg if axis < 3 else cfg.inertia_kg_m2[2]
     return inertia + cfg.added_mass[at], cfg.linear_damping[at], cfg.quadratic_damping[at]
@@ -92,9 +94,11 @@ def axis_step(vel, integral, command, axis: Const[int], io: Bundle[TwinRules]):
 
 
 @ti.func
-def nearest_of(env, number, pos_w, axis_w, vel_w, rate, t_s, body: AnyTensor, path: AnyTensor, io: Bundle[TwinRules]):
-    """(clearance [m] to the nearest obstacle or side wall, smallest time to collision [s]) as the referee sees
-    it; bodies beyond ``NEAR_M`` are left out."""
+def nearest_of(
+    env, number, pos_w, axis_w, vel_w, rate, t_s, body: AnyTensor, path: AnyTensor, io: Bundle[TwinRules]
+):
+    """(clearance [m] to the nearest obstacle or side wall, smallest time to collision [s]) as the referee
+    sees it; bodies beyond ``NEAR_M`` are left out."""
     clearance = hull_to_side_wall(pos_w, axis_w, io.vehicle_cfg, io.tank_cfg)
     ttc = FAR_M + 0.0
     n_body, n_lane = body.shape[1], path.shape[1]
@@ -144,6 +148,22 @@ def verdict_of(pos_w, axis_w, goal_w, clearance, ttc, t_s, io: Bundle[TwinRules]
     return out
 
 
+@ti.func
+def earned(nearer_m, nearest_m, ended, io: Bundle[TwinRules]):
+    """Reward of a decision that brought the vehicle ``nearer_m`` to its goal and, at the worst, within
+    ``nearest_m`` of anything."""
+    held_s = ti.static(STEPS * io.episode_cfg.control_dt_s)
+    close = ti.math.clamp(1.0 - nearest_m / io.twin_cfg.soft_clearance_m, 0.0, 1.0)
+    out = io.twin_cfg.progress * nearer_m - held_s * (
+        io.twin_cfg.time_cost + io.twin_cfg.closeness_cost * close
+    )
+    if ended == SUCCESS:
+        out += 1.0
+    elif ended != RUNNING:
+        out -= 0.0 if ended == TIMEOUT else 1.0
+    return out
+
+
 @ti.kernel
 def drive_twin(
     io: Bundle[TwinRules],
@@ -165,13 +185,20 @@ def drive_twin(
         vel = ti.Vector([ego[env, AT_VEL], ego[env, AT_VEL + 1], ego[env, AT_VEL + 2], ego[env, AT_RATE]])
         yaw, t_s = ego[env, AT_YAW], ego[env, AT_TIME]
         wish = wished_velocity(
-            action[env, 0], action[env, 1], action[env, 2], ego[env, AT_FLIP], ego[env, AT_FLIP + 1], io.vehicle_cfg
+            action[env, 0],
+            action[env, 1],
+            action[env, 2],
+            ego[env, AT_FLIP],
+            ego[env, AT_FLIP + 1],
+            io.vehicle_cfg,
         )
-        before = (goal_w - pos_w).norm()
+        before = ti.math.length(goal_w - pos_w)
         nearest, ended = 9.0, RUNNING
         for _ in range(STEPS):
             if ended == RUNNING:
-                part = hull_command(wish, yaw, pos_w[2], io.twin_cfg.vertical_gap_m, io.vehicle_cfg, io.tank_cfg)
+                part = hull_command(
+                    wish, yaw, pos_w[2], io.twin_cfg.vertical_gap_m, io.vehicle_cfg, io.tank_cfg
+                )
                 asked = ti.Vector(
                     [
                         part[0] * io.vehicle_cfg.max_surge_m_s,
@@ -199,16 +226,8 @@ def drive_twin(
         long = ti.max(1.0, ti.sqrt(action[env, 0] ** 2 + action[env, 1] ** 2))
         ego[env, AT_LAST], ego[env, AT_LAST + 1] = action[env, 0] / long, action[env, 1] / long
         ego[env, AT_LAST + 2] = ti.math.clamp(action[env, 2], -1.0, 1.0)
-        held_s = ti.static(STEPS * io.episode_cfg.control_dt_s)
-        earned = io.twin_cfg.progress * (before - (goal_w - pos_w).norm()) - io.twin_cfg.time_cost * held_s
-        earned -= io.twin_cfg.closeness_cost * held_s * ti.math.clamp(
-            1.0 - nearest / io.twin_cfg.soft_clearance_m, 0.0, 1.0
-        )
-        if ended == SUCCESS:
-            earned += 1.0
-        elif ended != RUNNING and ended != TIMEOUT:
-            earned -= 1.0
-        reward[env] = earned
+        nearer = before - ti.math.length(goal_w - pos_w)
+        reward[env] = earned(nearer, nearest, ended, io)
         outcome[env] = ended
 
 

@@ -1,7 +1,8 @@
-"""The simulator seen as the twin sees its world: the same rows, from what the vehicle senses and remembers."""
+"""The simulator seen as the twin sees its world: the same rows, of what the vehicle senses and remembers."""
 
 import taichi as ti
 
+from uuvtai.env import ObservationColumn
 from uuvtai.kernels.core.geometry import FAR_M, TWO_PI
 from uuvtai.kernels.core.grid import cell_of
 from uuvtai.kernels.core.signature import AnyTensor, Bundle, FloatMatrix, IntVector
@@ -18,7 +19,6 @@ from uuvtai.twin.twin_arrays import (
     RAW_WIDTH,
     ObserverIO,
 )
-from uuvtai.env import ObservationColumn
 
 CONTROL_S = 0.02
 SIGHT_M = 4.3
@@ -71,9 +71,11 @@ def put_track(env, lane, track, raw: AnyTensor, io: Bundle[ObserverIO]):
 
 
 @ti.kernel
-def observe_bodies(io: Bundle[ObserverIO], due: IntVector, ego: FloatMatrix, raw: AnyTensor, ray: FloatMatrix):
-    """Rows of the vehicle, of its nearest tracks and of the free distances, where ``due`` is 1; the last action in
-    ``ego`` stays."""
+def observe_bodies(
+    io: Bundle[ObserverIO], due: IntVector, ego: FloatMatrix, raw: AnyTensor, ray: FloatMatrix
+):
+    """Rows of the vehicle, of its nearest tracks and of the free distances, where ``due`` is 1; the last
+    action in ``ego`` stays."""
     n_track = ti.static(io.tracks.alive.shape[1])
     for env in range(due.shape[0]):
         if due[env] == 1:
@@ -106,14 +108,16 @@ def observe_bodies(io: Bundle[ObserverIO], due: IntVector, ego: FloatMatrix, raw
 
 
 @ti.kernel
-def command_hull(io: Bundle[ObserverIO], gap_m: ti.f32, action: FloatMatrix, command: FloatMatrix):
+def command_hull(io: Bundle[ObserverIO], gap_m: float, action: FloatMatrix, command: FloatMatrix):
     """Commands (n, 4) of the policy's actions (n, 3), where each vehicle is now."""
     for env in range(action.shape[0]):
         flip = ti.Vector([1.0, 1.0])
         for i in ti.static(range(2)):
             if io.mission.goal_w[env][i] < io.mission.start_w[env][i]:
                 flip[i] = -1.0
-        wish = wished_velocity(action[env, 0], action[env, 1], action[env, 2], flip[0], flip[1], io.vehicle_cfg)
+        wish = wished_velocity(
+            action[env, 0], action[env, 1], action[env, 2], flip[0], flip[1], io.vehicle_cfg
+        )
         out = hull_command(wish, io.ego.rpy[env][2], io.ego.pos_w[env][2], gap_m, io.vehicle_cfg, io.tank_cfg)
         for i in ti.static(range(4)):
             command[env, i] = out[i]
@@ -121,10 +125,16 @@ def command_hull(io: Bundle[ObserverIO], gap_m: ti.f32, action: FloatMatrix, com
 
 def _table():
     """Columns of the policy's input: the vehicle's own, then one body's after the other."""
-    own = ObservationColumn("set_own", slice(0, OWN_WIDTH), "mixed", "mirrored world", "vehicle, goal, last action")
-    rays = ObservationColumn("set_rays", slice(OWN_WIDTH, EGO_COLUMNS), "1/m", "mirrored world", "nearness of walls")
+    own = ObservationColumn(
+        "set_own", slice(0, OWN_WIDTH), "mixed", "mirrored world", "vehicle, goal, last action"
+    )
+    rays = ObservationColumn(
+        "set_rays", slice(OWN_WIDTH, EGO_COLUMNS), "1/m", "mirrored world", "nearness of walls"
+    )
     stop = EGO_COLUMNS + N_BODY * BODY_WIDTH
-    bodies = ObservationColumn("set_bodies", slice(EGO_COLUMNS, stop), "mixed", "mirrored world", "nearest tracks")
+    bodies = ObservationColumn(
+        "set_bodies", slice(EGO_COLUMNS, stop), "mixed", "mirrored world", "nearest tracks"
+    )
     return own, rays, bodies
 
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from uuvtai.config import Config
 from uuvtai.loader import load_config
 from uuvtai.scenario import Scene
 from uuvtai.shipped import TRAINING_TREE
@@ -74,8 +73,8 @@ def drawn(sim: Sim, scene: Scene, seed: int, count: int) -> tuple[torch.Tensor, 
         sim.draw(mask, torch.full_like(mask, seed), number)
         found.append([rows[: int(mask.sum())] for rows in scenario_rows(sim)])
     body, path, mission = (np.concatenate(part) for part in zip(*found, strict=True))
-    lanes, rest = path.shape[1], body.shape[1] - path.shape[1]
-    used = (body[:, :, 0] > 0).any(axis=0)
+    rest = body.shape[1] - path.shape[1]
+    used = np.any(body[:, :, 0] > 0, axis=0)
     moving = used[rest:]
     return tuple(torch.from_numpy(a) for a in (body[:, used].copy(), path[:, moving].copy(), mission))  # type: ignore[return-value]
 
@@ -91,7 +90,9 @@ def scenario_rows(sim: Sim) -> list[np.ndarray]:
     path = np.concatenate([path, np.zeros((*path.shape[:2], 16 - path.shape[2]))], axis=-1)
     path[..., 2] = np.where(path[..., 2] > 0, path[..., 2], 1.0)
     m = s.mission
-    mission = np.concatenate([sim.rows(m.start_w), sim.rows(m.goal_w), sim.rows(m.start_yaw)[:, None]], axis=1)
+    mission = np.concatenate(
+        [sim.rows(m.start_w), sim.rows(m.goal_w), sim.rows(m.start_yaw)[:, None]], axis=1
+    )
     mission = np.concatenate([mission, np.zeros((len(mission), 1))], axis=1)
     body = np.concatenate([kind[..., None], pos, size, yaw[..., None]], axis=-1)
     return [np.ascontiguousarray(a, np.float32) for a in (body, path, mission)]

@@ -1,9 +1,9 @@
-"""What the tracker delivers of the twin's bodies: a model of its delays, noise, field of view and memory, in place
-of sonar and camera. Rays of free distance are those of the true walls and resting bodies."""
+"""What the tracker delivers of the twin's bodies: a model of its delays, noise, field of view and memory, in
+place of sonar and camera. Rays of free distance are those of the true walls and resting bodies."""
 
 import taichi as ti
 
-from uuvtai.kernels.core.geometry import BOX, NONE, SPHERE, TWO_PI, wrapped_angle
+from uuvtai.kernels.core.geometry import BOX, NONE, TWO_PI, wrapped_angle
 from uuvtai.kernels.core.noise import episode_key, normal
 from uuvtai.kernels.core.signature import AnyTensor, Bundle, FloatMatrix, IntVector
 from uuvtai.twin.kinematics import path_place
@@ -78,11 +78,92 @@ def free_along(number, slot_count, x, y, ux, uy, body: AnyTensor, io: Bundle[Twi
     return out
 
 
+@ti.func
+def update_track(
+    env, lane, number, at, is_visible, knows_height, key, ego: FloatMatrix, path: AnyTensor, track: AnyTensor
+):
+    """The track of a body that is at ``at`` (x, y, vx, vy): born late, its velocity across the line of sight
+    known later, noisy while it is seen, straight on while it is not."""
+    if knows_height:
+        track[env, lane, 6] = 1.0
+    if is_visible:
+        if track[env, lane, 5] > LOST_S:
+            track[env, lane, 4] = 0.0
+            track[env, lane, 2], track[env, lane, 3] = 0.0, 0.0
+        track[env, lane, 4] += DT_S
+        track[env, lane, 5] = 0.0
+        track[env, lane, 7] += ti.abs(path[number, lane, 4]) * DT_S
+        share = 1.0 if track[env, lane, 4] < 0.25 else 0.55
+        vx, vy = at[2], at[3]
+        if track[env, lane, 4] < SETTLED_S:
+            dx, dy = at[0] - ego[env, AT_POS], at[1] - ego[env, AT_POS + 1]
+            radial = (vx * dx + vy * dy) / ti.max(dx * dx + dy * dy, 1e-6)
+            vx, vy = 0.5 * (vx + radial * dx), 0.5 * (vy + radial * dy)
+        nx, ny = normal(key, 4 * lane), normal(key, 4 * lane + 1)
+        track[env, lane, 2] += share * (vx + VELOCITY_SIGMA_M_S * nx - track[env, lane, 2])
+        track[env, lane, 3] += share * (vy + VELOCITY_SIGMA_M_S * ny - track[env, lane, 3])
+        track[env, lane, 0] = at[0] + POSITION_SIGMA_M * normal(key, 4 * lane + 2)
+        track[env, lane, 1] = at[1] + POSITION_SIGMA_M * normal(key, 4 * lane + 3)
+    else:
+        track[env, lane, 5] += DT_S
+        track[env, lane, 0] += DT_S * track[env, lane, 2]
+        track[env, lane, 1] += DT_S * track[env, lane, 3]
+
+
+@ti.func
+def is_tracked(env, lane, track: AnyTensor):
+    """1 while the tracker has this body."""
+    limit = LOST_HEIGHT_S if track[env, lane, 6] > 0.5 else LOST_S
+    return track[env, lane, 5] < limit and track[env, lane, 4] >= BORN_S - 1e-4
+
+
+@ti.func
+def write_raw(
+    env, lane, number, at, over, under, t_s, radius, path: AnyTensor, track: AnyTensor, raw: AnyTensor
+):
+    """What the tracker delivers of a body that is tracked. A closed way that was watched once around is
+    foreseen as it is, a circle after a while, other ways straight on."""
+    circle = path[number, lane, 0] < 0.5
+    turn = 0.0
+    if circle and track[env, lane, 4] > TURN_KNOWN_S:
+        turn = path[number, lane, 4] / path[number, lane, 1]
+    for i in ti.static(range(4)):
+        raw[env, lane, i] = track[env, lane, i]
+    raw[env, lane, 4], raw[env, lane, 5], raw[env, lane, 8] = turn, radius, track[env, lane, 5]
+    if track[env, lane, 6] > 0.5:
+        raw[env, lane, 6] = over if over > 0.0 else (COLUMN_M if under > 0.0 else 0.0)
+        raw[env, lane, 7] = under if under > 0.0 else (COLUMN_M if over > 0.0 else 0.0)
+    is_known = not circle and track[env, lane, 7] > path[number, lane, 2]
+    for k in ti.static(range(2)):
+        half = 0.5 * turn * (k + 1.0)
+        arc = 1.0 if ti.abs(half) < 1e-4 else ti.sin(half) / half
+        c, s = arc * (k + 1.0) * ti.cos(half), arc * (k + 1.0) * ti.sin(half)
+        raw[env, lane, 9 + 2 * k] = c * track[env, lane, 2] - s * track[env, lane, 3]
+        raw[env, lane, 10 + 2 * k] = s * track[env, lane, 2] + c * track[env, lane, 3]
+        if is_known:
+            later = path_place(number, lane, t_s + (k + 1.0), path)
+            raw[env, lane, 9 + 2 * k], raw[env, lane, 10 + 2 * k] = later[0] - at[0], later[1] - at[1]
+    raw[env, lane, 13] = 1.0
+
+
+@ti.func
+def write_truth(env, lane, number, at, over, t_s, ego: FloatMatrix, path: AnyTensor, truth: AnyTensor):
+    """Where a body is and will be, for the critic."""
+    fx, fy = 0.25 * ego[env, AT_FLIP], 0.25 * ego[env, AT_FLIP + 1]
+    x, y = ego[env, AT_POS], ego[env, AT_POS + 1]
+    truth[env, lane, 0], truth[env, lane, 1] = fx * (at[0] - x), fy * (at[1] - y)
+    truth[env, lane, 2], truth[env, lane, 3] = 1.0, ti.math.clamp(over, -COLUMN_M, COLUMN_M)
+    for k in ti.static(range(3)):
+        later = path_place(number, lane, t_s + (k + 1.0), path)
+        truth[env, lane, 4 + 2 * k] = fx * (later[0] - x)
+        truth[env, lane, 5 + 2 * k] = fy * (later[1] - y)
+
+
 @ti.kernel
 def sense_twin(
     io: Bundle[TwinRules],
-    seed: ti.i32,
-    count: ti.i32,
+    seed: int,
+    count: int,
     body: AnyTensor,
     path: AnyTensor,
     scenario: IntVector,
@@ -99,87 +180,32 @@ def sense_twin(
     way [m].
     """
     for env in range(ego.shape[0]):
-        number = scenario[env]
-        n_rest, n_lane = body.shape[1] - path.shape[1], path.shape[1]
+        number, t_s = scenario[env], ego[env, AT_TIME]
+        n_rest = body.shape[1] - path.shape[1]
         x, y, z = ego[env, AT_POS], ego[env, AT_POS + 1], ego[env, AT_POS + 2]
-        t_s, yaw = ego[env, AT_TIME], ego[env, AT_YAW]
         key = episode_key(seed + count, env)
-        for lane in range(n_lane):
+        for lane in range(path.shape[1]):
             slot = n_rest + lane
-            kind = ti.cast(body[number, slot, 0], ti.i32)
             for i in range(raw.shape[2]):
                 raw[env, lane, i] = 0.0
             for i in range(truth.shape[2]):
                 truth[env, lane, i] = 0.0
-            if kind != NONE:
+            if body[number, slot, 0] > 0.5:
                 at = path_place(number, lane, t_s, path)
                 radius, high, level = body[number, slot, 4], body[number, slot, 6], body[number, slot, 3]
                 dx, dy = at[0] - x, at[1] - y
                 far = ti.max(ti.sqrt(dx * dx + dy * dy), 1e-3)
-                ux, uy = dx / far, dy / far
                 clear = is_hidden(number, n_rest, x, y, at[0], at[1], body) == 0
                 fan = ti.abs(z - level) - high < ti.max(far - radius, 0.0) * FAN_SLOPE
-                ahead = ti.abs(wrapped_angle(ti.atan2(dy, dx) - yaw)) < TWO_PI / 8
-                camera = ahead and far < CAMERA_RANGE_M
-                visible = clear and (fan or camera) and far < RANGE_M
-                if clear and camera and far < HEIGHT_RANGE_M:
-                    track[env, lane, 6] = 1.0
-                speed = path[number, lane, 4]
-                if visible:
-                    if track[env, lane, 5] > LOST_S:
-                        track[env, lane, 4] = 0.0
-                        track[env, lane, 2], track[env, lane, 3] = 0.0, 0.0
-                    track[env, lane, 4] += DT_S
-                    track[env, lane, 5] = 0.0
-                    track[env, lane, 7] += ti.abs(speed) * DT_S
-                    share = 1.0 if track[env, lane, 4] < 0.25 else 0.55
-                    vx, vy = at[2], at[3]
-                    if track[env, lane, 4] < SETTLED_S:
-                        radial = vx * ux + vy * uy
-                        vx, vy = 0.5 * (vx + radial * ux), 0.5 * (vy + radial * uy)
-                    nx, ny = normal(key, 4 * lane), normal(key, 4 * lane + 1)
-                    track[env, lane, 2] += share * (vx + VELOCITY_SIGMA_M_S * nx - track[env, lane, 2])
-                    track[env, lane, 3] += share * (vy + VELOCITY_SIGMA_M_S * ny - track[env, lane, 3])
-                    track[env, lane, 0] = at[0] + POSITION_SIGMA_M * normal(key, 4 * lane + 2)
-                    track[env, lane, 1] = at[1] + POSITION_SIGMA_M * normal(key, 4 * lane + 3)
-                else:
-                    track[env, lane, 5] += DT_S
-                    track[env, lane, 0] += DT_S * track[env, lane, 2]
-                    track[env, lane, 1] += DT_S * track[env, lane, 3]
-                limit = LOST_HEIGHT_S if track[env, lane, 6] > 0.5 else LOST_S
+                bearing = wrapped_angle(ti.atan2(dy, dx) - ego[env, AT_YAW])
+                camera = clear and ti.abs(bearing) < TWO_PI / 8 and far < CAMERA_RANGE_M
+                visible = clear and far < RANGE_M and (fan or camera)
+                knows = camera and far < HEIGHT_RANGE_M
+                update_track(env, lane, number, at, visible, knows, key, ego, path, track)
                 over, under = level - high - z, z - level - high
-                circle = path[number, lane, 0] < 0.5
-                if track[env, lane, 5] < limit and track[env, lane, 4] >= BORN_S - 1e-4:
-                    turn = 0.0
-                    if circle and track[env, lane, 4] > TURN_KNOWN_S:
-                        turn = speed / path[number, lane, 1]
-                    raw[env, lane, 0], raw[env, lane, 1] = track[env, lane, 0], track[env, lane, 1]
-                    raw[env, lane, 2], raw[env, lane, 3] = track[env, lane, 2], track[env, lane, 3]
-                    raw[env, lane, 4], raw[env, lane, 5] = turn, radius
-                    if track[env, lane, 6] > 0.5:
-                        raw[env, lane, 6] = over if over > 0.0 else (COLUMN_M if under > 0.0 else 0.0)
-                        raw[env, lane, 7] = under if under > 0.0 else (COLUMN_M if over > 0.0 else 0.0)
-                    raw[env, lane, 8] = track[env, lane, 5]
-                    known = not circle and track[env, lane, 7] > path[number, lane, 2]
-                    for k in ti.static(range(2)):
-                        later = path_place(number, lane, t_s + (k + 1.0), path)
-                        half = 0.5 * turn * (k + 1.0)
-                        arc = 1.0 if ti.abs(half) < 1e-4 else ti.sin(half) / half
-                        c, s = arc * (k + 1.0) * ti.cos(half), arc * (k + 1.0) * ti.sin(half)
-                        raw[env, lane, 9 + 2 * k] = c * raw[env, lane, 2] - s * raw[env, lane, 3]
-                        raw[env, lane, 10 + 2 * k] = s * raw[env, lane, 2] + c * raw[env, lane, 3]
-                        if known:
-                            raw[env, lane, 9 + 2 * k] = later[0] - at[0]
-                            raw[env, lane, 10 + 2 * k] = later[1] - at[1]
-                    raw[env, lane, 13] = 1.0
-                fx, fy = ego[env, AT_FLIP], ego[env, AT_FLIP + 1]
-                truth[env, lane, 0], truth[env, lane, 1] = 0.25 * fx * dx, 0.25 * fy * dy
-                truth[env, lane, 2] = 1.0
-                truth[env, lane, 3] = ti.math.clamp(over if kind != SPHERE else over, -COLUMN_M, COLUMN_M)
-                for k in ti.static(range(3)):
-                    later = path_place(number, lane, t_s + (k + 1.0), path)
-                    truth[env, lane, 4 + 2 * k] = 0.25 * fx * (later[0] - x)
-                    truth[env, lane, 5 + 2 * k] = 0.25 * fy * (later[1] - y)
+                if is_tracked(env, lane, track):
+                    write_raw(env, lane, number, at, over, under, t_s, radius, path, track, raw)
+                write_truth(env, lane, number, at, over, t_s, ego, path, truth)
         for i in range(N_RAY):
             angle = i * (TWO_PI / N_RAY)
             ray[env, i] = free_along(number, n_rest, x, y, ti.cos(angle), ti.sin(angle), body, io)

@@ -1,7 +1,7 @@
 """Columns of the policy over a set of bodies, the same for the twin and the simulator.
 
-Everything is seen in the frame of the world mirrored so that the goal lies ahead and to the left at the start:
-four situations that mirror each other are one to the policy.
+Everything is seen in the world mirrored so that the goal lies ahead and to the left at the start: four
+situations that mirror each other are one to the policy.
 """
 
 import taichi as ti
@@ -17,7 +17,9 @@ HULL_M = 0.22
 
 
 @ti.kernel
-def write_set_columns(ego: FloatMatrix, raw: AnyTensor, ray: FloatMatrix, bodies: AnyTensor, own: FloatMatrix):
+def write_set_columns(
+    ego: FloatMatrix, raw: AnyTensor, ray: FloatMatrix, bodies: AnyTensor, own: FloatMatrix
+):
     """``bodies`` (n, lanes, BODY_WIDTH) and ``own`` (n, EGO_COLUMNS) from rows of the vehicle
     (``twin_arrays``), tracks (n, lanes, RAW_WIDTH) and free distances (n, N_RAY) [m]."""
     for env in range(ego.shape[0]):

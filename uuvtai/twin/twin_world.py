@@ -22,11 +22,11 @@ class TwinView(NamedTuple):
     """What is known of N envs. The tensors are the twin's own: clone what must outlive the next step."""
 
     bodies: torch.Tensor
-    """(N, lanes, BODY_WIDTH) bodies as tracked; the first column is 1 where there is one, rows of 0 elsewhere"""
+    """(N, lanes, BODY_WIDTH) bodies as tracked; the first column is 1 where there is one, else all are 0"""
     own: torch.Tensor
     """(N, EGO_COLUMNS) the vehicle, its goal and the free distances around it"""
     truth: torch.Tensor
-    """(N, lanes, TRUTH_WIDTH) the bodies' true places, now and 1, 2, 3 s later: for a critic in training alone"""
+    """(N, lanes, TRUTH_WIDTH) true places of the bodies, now and 1, 2, 3 s later: for a critic in training"""
 
 
 class Twin:
@@ -76,7 +76,14 @@ class Twin:
         """Carry out a decision (N, 3): (reward, outcome code), both (N,)."""
         b = self.bank
         kinematics.drive_twin(
-            self.rules, action.contiguous(), b.body, b.path, self.scenario, self.ego, self.reward, self.outcome
+            self.rules,
+            action.contiguous(),
+            b.body,
+            b.path,
+            self.scenario,
+            self.ego,
+            self.reward,
+            self.outcome,
         )
         return self.reward, self.outcome
 
