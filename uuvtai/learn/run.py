@@ -3,6 +3,7 @@ how it all ends."""
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -118,7 +119,7 @@ def _train(
         "half a minute)"
     )
     if config.twin.enabled:
-        trainer = _twin_trainer(config, found)
+        trainer = _twin_trainer(config, found, request.device)
     else:
         trainer = _trainer(_env(config, request.device), config, found)
     place = _folder(request, config, found, folder) if trainer.processes.writes else None
@@ -189,10 +190,14 @@ def _trainer(env: VectorEnv, config: LearningConfig, checkpoint: Checkpoint | No
     return trainer
 
 
-def _twin_trainer(config: LearningConfig, checkpoint: Checkpoint | None) -> TwinTrainer:
+def _twin_trainer(config: LearningConfig, checkpoint: Checkpoint | None, device: str) -> TwinTrainer:
     """As ``_trainer``, in the kinematic twin."""
     from uuvtai.learn.twin_trainer import TwinTrainer
 
+    if device == "cuda" or os.environ.get("WORLD_SIZE", "1") != "1":
+        raise ConfigError(
+            "twin.enabled: the twin trains in one process on the CPU; leave out --device cuda and torchrun"
+        )
     trainer = TwinTrainer(config)
     if checkpoint:
         checkpoint.check_table(trainer.observation_table, config)

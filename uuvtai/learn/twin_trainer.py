@@ -37,8 +37,9 @@ MOST_WISH = 2.0
 class TwinTrainer:
     """Everything that training in the twin carries from one iteration to the next."""
 
-    def __init__(self, config: LearningConfig) -> None:
-        """Draws the scenarios. Raises ConfigError for a world that is none."""
+    def __init__(self, config: LearningConfig, bank: ScenarioBank | None = None) -> None:
+        """Draws the scenarios, unless they are given. Raises ConfigError for a world that is none, or has
+        another tank."""
         from uuvtai.twin.observer import SET_TABLE
         from uuvtai.twin.scenario_bank import draw_bank
         from uuvtai.twin.set_columns import BODY_WIDTH, EGO_COLUMNS
@@ -52,7 +53,7 @@ class TwinTrainer:
         world = config.world
         scenes = config.train.scenes or ((world.n_static, world.n_dynamic, world.dynamic_speed_m_s),)
         self._scenes = scenes
-        bank = draw_bank(config.twin.worlds, scenes, BANK_SEED, config.twin.scenarios)
+        bank = bank or draw_bank(config, scenes, BANK_SEED, config.twin.scenarios)
         self.twin = Twin(config, bank, config.train.num_envs, config.train.seed)
         self.actor = SetActor(BODY_WIDTH, EGO_COLUMNS, config, self.generator)
         self.critic = SetCritic(BODY_WIDTH, EGO_COLUMNS, TRUTH_WIDTH, config, self.generator)
@@ -241,14 +242,14 @@ class TwinTrainer:
         if self._held_out is None:
             groups = len(self.config.twin.worlds) * len(self._scenes)
             each = -(-train.evaluate_episodes // groups)
-            self._held_out = draw_bank(self.config.twin.worlds, self._scenes, train.evaluate_seed, each)
+            self._held_out = draw_bank(self.config, self._scenes, train.evaluate_seed, each)
         bank = self._held_out
         twin = Twin(self.config, bank, len(bank.body), train.evaluate_seed)
         outcome, time_s = play_once(twin, self.actor)
         metrics = _rates("eval", outcome, time_s)
         for number, name in enumerate(bank.names):
             rows = bank.origin == number
-            metrics[f"eval/success {name}"] = float((outcome[rows] == SUCCESS).float().mean())
+            metrics[f"eval/success_{name}"] = float((outcome[rows] == SUCCESS).float().mean())
         return metrics
 
     # ------------------------------------------------------------------------------------------------- resume

@@ -113,7 +113,8 @@ def nearest_of(
                 at[0], at[1] = place[0], place[1]
                 body_vel[0], body_vel[1] = place[2], place[3]
             size = ti.Vector([body[number, slot, 4], body[number, slot, 5], body[number, slot, 6]])
-            reach = size[0] + size[1] + NEAR_M
+            hull = io.vehicle_cfg.hull_radius_m + io.vehicle_cfg.hull_half_length_m
+            reach = size[0] + size[1] + hull + NEAR_M
             dx, dy = at[0] - pos_w[0], at[1] - pos_w[1]
             if dx * dx + dy * dy < reach * reach:
                 gap, normal, along = hull_to_body(

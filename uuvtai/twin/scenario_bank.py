@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
 
-from uuvtai.loader import load_config
+from uuvtai.config import TankConfig
+from uuvtai.config.learning import LearningConfig
+from uuvtai.loader import ConfigError, load_config
 from uuvtai.scenario import Scene
 from uuvtai.shipped import TRAINING_TREE
 from uuvtai.sim import Sim
@@ -31,27 +34,37 @@ class ScenarioBank:
     origin: torch.Tensor
     """(B,) int32: which of ``names`` it was drawn for"""
     names: tuple[str, ...]
-    """world (D, v) by number"""
+    """world_D_v by number"""
 
 
-def draw_bank(worlds: tuple[str, ...], scenes: tuple[Scene, ...], seed: int, count: int) -> ScenarioBank:
-    """Episodes 0 .. count - 1 of ``seed`` for every pair of a world preset and a scene (S, D, v), drawn by
-    ``Sim.draw``. Raises ConfigError for a world that is none."""
+def draw_bank(config: LearningConfig, scenes: tuple[Scene, ...], seed: int, count: int) -> ScenarioBank:
+    """Episodes 0 .. count - 1 of ``seed`` for every pair of a world of ``twin.worlds`` and a scene (S, D, v),
+    drawn by ``Sim.draw``. Raises ConfigError for a world that is none, or has another tank than the run's."""
     parts, names = [], []
-    for world in worlds:
+    for world in config.twin.worlds:
         most = [("world.n_static", max(s[0] for s in scenes)), ("world.n_dynamic", max(s[1] for s in scenes))]
-        config = load_config(world, overrides=[*most])
-        sim = Sim(config, min(BATCH, count), read_tree(TRAINING_TREE, config.teacher.max_node))
+        drawn_config = load_config(world, overrides=[*most])
+        _refuse_other_tank(world, drawn_config.world.tank, config.world.tank)
+        tree = read_tree(TRAINING_TREE, drawn_config.teacher.max_node)
+        sim = Sim(drawn_config, min(BATCH, count), tree)
         for scene in scenes:
             rows = drawn(sim, scene, seed, count)
             parts.append((*rows, torch.full((count,), len(names), dtype=torch.int32)))
-            names.append(f"{world} ({scene[1]}, {scene[2]:g})")
+            names.append(f"{Path(world).stem}_{scene[1]}_{scene[2]:g}")
     widest = [max(part[i].shape[1] for part in parts) for i in range(2)]
     rest = max(part[0].shape[1] - part[1].shape[1] for part in parts)
     body = torch.cat([_padded(part[0], rest + widest[1], part[1].shape[1], rest) for part in parts])
     path = torch.cat([torch.nn.functional.pad(p[1], (0, 0, 0, widest[1] - p[1].shape[1])) for p in parts])
     mission, origin = (torch.cat([part[i] for part in parts]) for i in (2, 3))
     return ScenarioBank(body, path, mission, origin, tuple(names))
+
+
+def _refuse_other_tank(world: str, own: TankConfig, wanted: TankConfig) -> None:
+    if own != wanted or own.shape != "rectangle":
+        raise ConfigError(
+            f"twin.worlds: {world} has another tank than the run's world, or a round one; the twin has one "
+            "rectangular tank: give worlds that share it, for example twin.worlds=[pool,gauntlet]"
+        )
 
 
 def _padded(body: torch.Tensor, width: int, lanes: int, rest: int) -> torch.Tensor:
