@@ -228,8 +228,8 @@ LEARNING = (
     Mutation(
         "eval_noise",
         "uuvtai/learn/pilot.py",
-        "mean = _by_chunk(lambda part: self.policy.distribution(part)[0], x)",
-        "mean = _by_chunk(lambda part: self.policy.distribution(part)[0], x)\n"
+        "mean = by_chunk(lambda part: self.policy.distribution(part)[0], x)",
+        "mean = by_chunk(lambda part: self.policy.distribution(part)[0], x)\n"
         "        mean = mean + 0.05 * torch.randn(mean.shape, generator=torch.Generator().manual_seed(0))",
         "tests/test_pilot.py",
         "means_within",
