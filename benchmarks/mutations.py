@@ -588,6 +588,33 @@ KERNELS = (
     ),
 )
 
-ALL = (*KERNELS, *STATISTICS, *LEARNING)
+TWIN = (
+    Mutation(
+        "twin_hull_other_diagonal",
+        "uuvtai/twin/hull_rule.py",
+        "(ti.floor(off / (0.5 * PI)) + 0.5)",
+        "(ti.floor(off / (0.5 * PI)) + 0.0)",
+        "tests/test_twin.py",
+        "hull_rule",
+    ),
+    Mutation(
+        "twin_near_bodies_only",
+        "uuvtai/twin/kinematics.py",
+        "NEAR_M = 1.5",
+        "NEAR_M = 0.2",
+        "tests/test_twin.py",
+        "referee",
+    ),
+    Mutation(
+        "set_mask_forgotten",
+        "uuvtai/learn/set_policy.py",
+        "each = self.body(bodies) * mask",
+        "each = self.body(bodies)",
+        "tests/test_twin.py",
+        "empty_rows",
+    ),
+)
+
+ALL = (*KERNELS, *STATISTICS, *LEARNING, *TWIN)
 QUICK = ("scale_dropped", "popart_norm", "wilson_half_width")
 """names of three that need no kernel"""
