@@ -16,7 +16,7 @@ from uuvtai.config.learning import LearningConfig
 from uuvtai.errors import UserError
 from uuvtai.kernels.core.geometry import FAR_M
 from uuvtai.kernels.core.signature import AnyTensor, Const, FloatMatrix
-from uuvtai.learn import checkpoint
+from uuvtai.learn import checkpoint, twin_trainer
 from uuvtai.learn.manifest import CheckpointError
 from uuvtai.learn.pilot import load_pilot
 from uuvtai.learn.run import TrainRequest, train
@@ -25,7 +25,7 @@ from uuvtai.learn.set_policy import SetActor
 from uuvtai.learn.twin_trainer import TwinTrainer
 from uuvtai.loader import ConfigError, load_training
 from uuvtai.measure.episodes.playing import jobs_of, run_episodes
-from uuvtai.twin import hull_rule, kinematics, observer
+from uuvtai.twin import hull_rule, kinematics, observer, sensing_model
 from uuvtai.twin.scenario_bank import ScenarioBank, draw_bank, scenario_rows
 from uuvtai.twin.set_columns import BODY_WIDTH, EGO_COLUMNS
 from uuvtai.twin.twin_arrays import ObserverIO, TwinRules
@@ -276,6 +276,27 @@ def test_rays_end_at_the_walls(small):
 def test_networks_that_cannot_drive_are_refused(small, saved, change, says):
     with pytest.raises(CheckpointError, match=says):
         load_set_pilot(saved(change), small.sim)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "says"),
+    [
+        ("policy.residual", True, "the twin has none"),
+        ("world_model.enabled", True, "the twin has none"),
+        ("risk.enabled", True, "the twin has none"),
+        ("policy.hold_steps", 4, "decides every 0.1 s"),
+        ("episode.control_dt_s", 0.01, "decides every 0.1 s"),
+        ("ppo.minibatches", 200, "only 128 samples"),
+    ],
+)
+def test_what_the_twin_lacks_is_refused(bank, key, value, says):
+    with pytest.raises(UserError, match=says):
+        TwinTrainer(load_training("twin", overrides=SMALL | {key: value}), bank)
+
+
+def test_the_trainer_knows_how_long_the_twin_holds_a_decision():
+    assert twin_trainer.HOLD_STEPS == kinematics.STEPS
+    assert twin_trainer.DECISION_S == sensing_model.DT_S
 
 
 def test_it_is_not_exported_yet(saved):

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from uuvtai.config.learning import LearningConfig
+from uuvtai.errors import SettingError
 from uuvtai.learn.distributed import Processes
 from uuvtai.learn.policy import log_prob
 from uuvtai.learn.ppo import ADAM_EPS, adapted_rate, approximate_kl, gae, surrogate_loss
@@ -30,6 +31,8 @@ FASTEST_RATE = 2e-3
 CRITIC_RATE = 1e-3
 DECAY_FROM = 0.5
 """share of the run from which the learning rate falls to a tenth"""
+HOLD_STEPS, DECISION_S = 5, 0.1
+"""of the twin (``uuvtai/twin/kinematics.py``), which this file does not import"""
 MOST_WISH = 2.0
 """wishes beyond it are cut off before they are carried out"""
 
@@ -46,6 +49,7 @@ class TwinTrainer:
         from uuvtai.twin.twin_arrays import TRUTH_WIDTH
         from uuvtai.twin.twin_world import Twin
 
+        _refuse_what_the_twin_lacks(config)
         self.config, self.processes = config, Processes()
         self.observation_table = SET_TABLE
         torch.set_flush_denormal(True)
@@ -158,7 +162,7 @@ class TwinTrainer:
     def _count_ended(self, sums: RolloutSums, outcome: torch.Tensor, ended: torch.Tensor) -> None:
         sums.outcomes += torch.bincount(outcome[ended], minlength=len(OUTCOMES)).double()
         sums.episode_return += self._returns[ended].double().sum()
-        sums.episode_steps += (self.twin.time_s[ended] / 0.1).round().double().sum()
+        sums.episode_steps += (self.twin.time_s[ended] / DECISION_S).round().double().sum()
         self._returns[ended] = 0.0
 
     # ------------------------------------------------------------------------------------------- an iteration
@@ -279,6 +283,29 @@ class TwinTrainer:
         self._returns.copy_(state["returns"])
         self.iteration, self.env_steps = (int(state["counters"][n]) for n in ("iteration", "env_steps"))
         self.twin.restore(state["env"])
+
+
+def _refuse_what_the_twin_lacks(config: LearningConfig) -> None:
+    """Raise SettingError for parts of a training that the twin does not have, and sizes that do not fit."""
+    for name, is_on in (
+        ("policy.residual", config.policy.residual),
+        ("world_model.enabled", config.world_model.enabled),
+        ("risk.enabled", config.risk.enabled),
+    ):
+        if is_on:
+            raise SettingError(f"{name}: the twin has none; set {name}=false, or twin.enabled=false")
+    held_s = config.policy.hold_steps * config.episode.control_dt_s
+    if config.policy.hold_steps != HOLD_STEPS or abs(held_s - DECISION_S) > 1e-9:
+        raise SettingError(
+            f"policy.hold_steps={config.policy.hold_steps} at episode.control_dt_s={config.episode.control_dt_s}: "
+            f"the twin decides every {DECISION_S} s, after {HOLD_STEPS} control steps"
+        )
+    samples = config.ppo.rollout_steps * config.train.num_envs
+    if config.ppo.minibatches > samples:
+        raise SettingError(
+            f"ppo.minibatches={config.ppo.minibatches}, but a rollout has only {samples} samples: raise "
+            "ppo.rollout_steps or train.num_envs"
+        )
 
 
 def _by_part(net: torch.nn.Module, *parts: torch.Tensor) -> torch.Tensor:
