@@ -294,11 +294,11 @@ def _refuse_what_the_twin_lacks(config: LearningConfig) -> None:
     ):
         if is_on:
             raise SettingError(f"{name}: the twin has none; set {name}=false, or twin.enabled=false")
-    held_s = config.policy.hold_steps * config.episode.control_dt_s
-    if config.policy.hold_steps != HOLD_STEPS or abs(held_s - DECISION_S) > 1e-9:
+    held, dt_s = config.policy.hold_steps, config.episode.control_dt_s
+    if held != HOLD_STEPS or abs(held * dt_s - DECISION_S) > 1e-9:
         raise SettingError(
-            f"policy.hold_steps={config.policy.hold_steps}, episode.control_dt_s="
-            f"{config.episode.control_dt_s}: the twin decides every {DECISION_S} s, after {HOLD_STEPS} control steps"
+            f"policy.hold_steps={held}, episode.control_dt_s={dt_s}: the twin decides every {DECISION_S} s, "
+            f"after {HOLD_STEPS} control steps"
         )
     samples = config.ppo.rollout_steps * config.train.num_envs
     if config.ppo.minibatches > samples:
