@@ -524,5 +524,7 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         world_model_switches,
         risk,
         risk_bins,
+        twin_curve,
+        twin_policy,
     )
 }
