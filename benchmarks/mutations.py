@@ -228,8 +228,8 @@ LEARNING = (
     Mutation(
         "eval_noise",
         "uuvtai/learn/pilot.py",
-        "mean = _by_chunk(lambda part: self.policy.distribution(part)[0], x)",
-        "mean = _by_chunk(lambda part: self.policy.distribution(part)[0], x)\n"
+        "mean = by_chunk(lambda part: self.policy.distribution(part)[0], x)",
+        "mean = by_chunk(lambda part: self.policy.distribution(part)[0], x)\n"
         "        mean = mean + 0.05 * torch.randn(mean.shape, generator=torch.Generator().manual_seed(0))",
         "tests/test_pilot.py",
         "means_within",
@@ -612,6 +612,33 @@ KERNELS = (
     ),
 )
 
-ALL = (*KERNELS, *STATISTICS, *LEARNING)
+TWIN = (
+    Mutation(
+        "twin_hull_other_diagonal",
+        "uuvtai/twin/hull_rule.py",
+        "(ti.floor(off / (0.5 * PI)) + 0.5)",
+        "(ti.floor(off / (0.5 * PI)) + 0.0)",
+        "tests/test_twin.py",
+        "hull_rule",
+    ),
+    Mutation(
+        "twin_near_bodies_only",
+        "uuvtai/twin/kinematics.py",
+        "NEAR_M = 1.5",
+        "NEAR_M = 0.2",
+        "tests/test_twin.py",
+        "referee",
+    ),
+    Mutation(
+        "set_mask_forgotten",
+        "uuvtai/learn/set_policy.py",
+        "each = self.body(bodies) * mask",
+        "each = self.body(bodies)",
+        "tests/test_twin.py",
+        "empty_rows",
+    ),
+)
+
+ALL = (*KERNELS, *STATISTICS, *LEARNING, *TWIN)
 QUICK = ("scale_dropped", "popart_norm", "wilson_half_width")
 """names of three that need no kernel"""

@@ -1,120 +1,323 @@
-"""The kinematic twin: bodies on their paths, the rule that lays a wish on the hull, the set encoder."""
+"""The kinematic twin against the simulator and against oracles, and the policy that learns in it."""
 
-import math
+import copy
 
 import numpy as np
 import pytest
 import taichi as ti
 import torch
 
-from uuvtai.config import TankConfig
-from uuvtai.kernels.core.hull import hull_to_side_wall
-from uuvtai.kernels.core.signature import AnyTensor as Tensor3
-from uuvtai.kernels.core.signature import FloatMatrix as Tensor2
-from uuvtai.outcomes import RUNNING
-from uuvtai.twin import motion
-from uuvtai.twin.scenario_bank import bank_of
-from uuvtai.twin.set_policy import SetActor
-from uuvtai.twin.tensors import AXIS_M_S, BODY_COLUMNS, CLIMB_M_S, EGO_COLUMNS, MARGIN_M, MOVERS, N_EGO
+from tests.reference import hull_rule as reference
+from tests.test_architecture import TRUTH
+from uuvtai.binding import bind, members_of
+from uuvtai.closed_form import describe_scenario, path_positions
+from uuvtai.config import TankConfig, VehicleConfig
+from uuvtai.config.learning import LearningConfig
+from uuvtai.errors import UserError
+from uuvtai.kernels.core.geometry import FAR_M
+from uuvtai.kernels.core.signature import AnyTensor, Const, FloatMatrix
+from uuvtai.learn import checkpoint, twin_trainer
+from uuvtai.learn.manifest import CheckpointError
+from uuvtai.learn.pilot import load_pilot
+from uuvtai.learn.run import TrainRequest, train
+from uuvtai.learn.set_pilot import load_set_pilot
+from uuvtai.learn.set_policy import SetActor
+from uuvtai.learn.twin_trainer import TwinTrainer
+from uuvtai.loader import ConfigError, load_training
+from uuvtai.measure.episodes.playing import jobs_of, run_episodes
+from uuvtai.twin import hull_rule, kinematics, observer, sensing_model
+from uuvtai.twin.scenario_bank import ScenarioBank, draw_bank, scenario_rows
+from uuvtai.twin.set_columns import BODY_WIDTH, EGO_COLUMNS
+from uuvtai.twin.twin_arrays import ObserverIO, TwinRules
 
-
-def laid(wish, yaw, z, tank):
-    """Oracle of the hull rule, in parts of the limits."""
-    surge = math.cos(yaw) * wish[0] + math.sin(yaw) * wish[1]
-    sway = math.cos(yaw) * wish[1] - math.sin(yaw) * wish[0]
-    over = max(1.0, abs(surge) / AXIS_M_S, abs(sway) / AXIS_M_S)
-    diagonals = [yaw + math.pi / 4 + i * math.pi / 2 for i in range(4)]
-    way = math.atan2(wish[1], wish[0])
-    off = min((math.remainder(way - d, 2 * math.pi) for d in diagonals), key=abs)
-    turn = off if math.hypot(wish[0], wish[1]) > 0.1 else 0.0
-    low, high = min(tank.z_m[0] + MARGIN_M - z, 0.0), max(tank.z_m[1] - MARGIN_M - z, 0.0)
-    heave = min(max(wish[2], low), high)
-    return (
-        surge / over / AXIS_M_S,
-        sway / over / AXIS_M_S,
-        np.clip(heave / CLIMB_M_S, -1, 1),
-        np.clip(2.5 * turn, -1, 1),
-    )
-
-
-def test_a_wish_is_laid_on_the_hull_as_the_oracle_lays_it():
-    tank, draw = TankConfig(), np.random.default_rng(0)
-    ego = np.stack([draw.uniform(-7, 7, 200), draw.uniform(*tank.z_m, 200)], 1).astype(np.float32)
-    wish = draw.uniform(-0.9, 0.9, (200, 3)).astype(np.float32)
-    wish[:20, :2] *= 0.01
-    out = torch.zeros(200, 4)
-    motion.command_of(torch.from_numpy(ego), torch.from_numpy(wish), out, tank)
-    wanted = [laid(w, e[0], e[1], tank) for w, e in zip(wish.tolist(), ego.tolist(), strict=True)]
-    assert out.numpy() == pytest.approx(np.array(wanted), abs=2e-5)
-    assert out.abs().max() <= 1.0 + 1e-6
-
-
-def test_the_order_of_the_bodies_means_nothing():
-    draw = torch.Generator().manual_seed(0)
-    body, row = (
-        torch.randn(5, MOVERS, BODY_COLUMNS, generator=draw),
-        torch.randn(5, EGO_COLUMNS, generator=draw),
-    )
-    body[..., 0] = (body[..., 0] > 0).float()
-    actor = SetActor()
-    actor.net.out.weight.data.mul_(100.0)
-    order = torch.randperm(MOVERS, generator=draw)
-    assert torch.allclose(actor(body, row), actor(body[:, order], row), atol=1e-5)
-
-
-def test_the_policy_has_no_input_for_the_truth():
-    names = dict(SetActor().named_parameters())
-    assert names["net.body.0.weight"].shape[1] == BODY_COLUMNS
-    assert names["net.own.0.weight"].shape[1] == EGO_COLUMNS
-    assert not any("critic" in name for name in names)
+CLEARANCE_TOL_M = 0.01
+"""the simulator's hull leans by a few degrees, the twin's does not"""
+TTC_TOL_S = 0.1
+"""the same, at closing speeds of 0.1 m/s and more"""
+SOON_S = 0.6
+"""bodies that hit within it are near enough for the twin to look at"""
+FLOAT_TOL = 2e-5
+SMALL = {
+    "train.num_envs": 16,
+    "ppo.rollout_steps": 8,
+    "ppo.minibatches": 2,
+    "twin.body_hidden": 8,
+    "twin.head_hidden": 8,
+    "train.evaluate_episodes": 8,
+    "train.scenes": [[8, 6, 0.6]],
+    "twin.worlds": ["pool"],
+    "train.iterations": 4,
+}
 
 
 @ti.kernel
-def referee_of(
-    static: Tensor3, mover: Tensor3, ego: Tensor2, bodies: Tensor3, found: Tensor2, cfg: ti.template()
-):
-    """The twin's bodies (x, y) and its referee's clearance and time to collision, at a time and a motion."""
-    for env in range(ego.shape[0]):
-        for lane in range(bodies.shape[1]):
-            at = motion.body_on_path(mover, env, lane, ego[env, 8])
-            bodies[env, lane, 0], bodies[env, lane, 1] = at[0], at[1]
-        pos, vel = (
-            ti.Vector([ego[env, 0], ego[env, 1], ego[env, 2]]),
-            ti.Vector([ego[env, 3], ego[env, 4], ego[env, 5]]),
+def lay(wishes: FloatMatrix, vehicle: Const[VehicleConfig], tank: Const[TankConfig], out: FloatMatrix):
+    for i in range(wishes.shape[0]):
+        wish = ti.Vector([wishes[i, 0], wishes[i, 1], wishes[i, 2]])
+        command = hull_rule.hull_command(wish, wishes[i, 3], wishes[i, 4], 0.25, vehicle, tank)
+        for j in ti.static(range(4)):
+            out[i, j] = command[j]
+
+
+@ti.kernel
+def places(path: AnyTensor, times: AnyTensor, out: AnyTensor):
+    for row, lane in ti.ndrange(path.shape[0], path.shape[1]):
+        place = kinematics.path_place(row, lane, times[row], path)
+        for i in ti.static(range(4)):
+            out[row, lane, i] = place[i]
+
+
+@pytest.fixture(scope="module")
+def config():
+    return load_training("twin", overrides=SMALL)
+
+
+@pytest.fixture(scope="module")
+def bank(small):
+    """Scenarios that the small simulator has drawn."""
+    small.begin(range(small.N), seed=5)
+    rows = [torch.from_numpy(rows.copy()) for rows in scenario_rows(small.sim)]
+    return ScenarioBank(*rows, torch.zeros(small.N, dtype=torch.int32), ("pool",))
+
+
+@pytest.fixture(scope="module")
+def trainer(config, bank):
+    """After two iterations."""
+    made = TwinTrainer(config, bank)
+    made.iterate()
+    made.iterate()
+    return made
+
+
+@pytest.fixture
+def saved(trainer, config, tmp_path):
+    """Function: checkpoint of the trainer after ``change`` (None = none) of its state."""
+
+    def save(change=None):
+        state = copy.deepcopy(trainer.state())
+        if change:
+            change(state["policy"])
+        path = checkpoint.save(tmp_path / "checkpoints", 2, state, config, trainer.observation_table)
+        return checkpoint.open_checkpoint(path)
+
+    return save
+
+
+# ------------------------------------------------------------------------------------------------- the twin
+
+
+def test_the_hull_rule_is_that_of_the_oracle():
+    rng = np.random.default_rng(0)
+    low, high = [-0.85, -0.85, -0.4, -np.pi, -1.6], [0.85, 0.85, 0.4, np.pi, 0.0]
+    wishes = rng.uniform(low, high, (300, 5)).astype(np.float32)
+    wishes[:20, :2] *= 0.05  # too slow to turn for
+    out = torch.zeros(300, 4)
+    lay(torch.from_numpy(wishes), VehicleConfig(), TankConfig(), out)
+    expected = [
+        reference.hull_command(
+            row[:3].astype(float), *map(float, row[3:]), 0.25, VehicleConfig(), TankConfig()
         )
-        axis = ti.Vector([ti.cos(ego[env, 6]), ti.sin(ego[env, 6]), 0.0])
-        near = motion.nearest_of(
-            pos, axis, vel, ego[env, 7], env, ego[env, 8], static, mover, cfg.episode.ttc_closing_m_s,
-            cfg.vehicle,
-        )  # fmt: skip
-        wall = hull_to_side_wall(pos, axis, cfg.vehicle, cfg.world.tank)
-        found[env, 0], found[env, 1] = ti.min(near[0], wall), near[1]
+        for row in wishes
+    ]
+    np.testing.assert_allclose(out.numpy(), expected, atol=1e-5)
 
 
-def test_bodies_and_referee_are_those_of_the_simulator(small):
-    """The same scenarios, forty steps later: the twin's referee, told the simulator's motion."""
-    sim, steps = small.sim, 40
-    small.begin(range(small.N), seed=3)
-    bank = bank_of(sim)
-    for _ in range(steps):
-        sim.step()
-    s, running = sim.s, sim.rows(sim.s.referee.outcome) == RUNNING
-    ego = torch.zeros(small.N, N_EGO)
-    rotation_yaw = sim.rows(s.vehicle.quat_wb)
-    w, x, y, z = rotation_yaw.T
-    ego[:, 0:3] = torch.from_numpy(sim.rows(s.vehicle.pos_w))
-    ego[:, 6] = torch.from_numpy(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
-    ego[:, 8] = steps * small.config.episode.control_dt_s
-    bodies, found = torch.zeros(small.N, MOVERS, 2), torch.zeros(small.N, 2)
-    referee_of(bank.static, bank.mover, ego, bodies, found, small.config)
-    kind, place = sim.rows(s.world.kind), sim.rows(s.world.pos_w)
-    lanes = s.path.n_way.shape[1]
-    first = kind.shape[1] - lanes
-    moving = kind[:, first:] != 0
-    assert running.sum() >= 4 and moving.any()
-    mine = bodies.numpy()[:, :lanes][running][moving[running]]
-    assert mine == pytest.approx(place[running, first:][moving[running]][:, :2], abs=2e-3)
-    near = sim.rows(s.referee.clearance_m)[running]
-    seen = found.numpy()[running, 0]
-    assert (near < 1.0).any(), "nothing is near"
-    assert seen[near < 1.0] == pytest.approx(near[near < 1.0], abs=5e-3)
+def test_bodies_move_as_in_closed_form(small, bank):
+    times = torch.linspace(0.0, 50.0, small.N)
+    out = torch.zeros(*bank.path.shape[:2], 4)
+    places(bank.path, times, out)
+    checked = 0
+    for row in range(small.N):
+        arrays = {k: v[row] for k, v in small.arrays("world", "path", "mission").items()}
+        first = bank.body.shape[1] - bank.path.shape[1]
+        for body in describe_scenario(lambda name, arrays=arrays: arrays[name])["bodies"]:
+            if body["path"]:
+                near = np.array([times[row] - 1e-3, times[row], times[row] + 1e-3])
+                way = path_positions(body["path"], near)
+                found = out[row, body["slot"] - first].numpy()
+                np.testing.assert_allclose(found[:2], way[1], atol=1e-3)  # float32 after 50 s
+                np.testing.assert_allclose(np.hypot(*found[2:]), body["path"]["speed_m_s"], rtol=1e-4)
+                checked += 1
+    assert checked == 6 * small.N
+
+
+def states_of(sim):
+    """(n, 12) rows for ``judge_states``."""
+    rows, s = sim.rows, sim.s
+    w, x, y, z = rows(s.vehicle.quat_wb).T
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    axis, vel_b = np.stack([x, y, z], axis=1), rows(s.vehicle.vel_b)
+    vel = vel_b + 2 * np.cross(axis, np.cross(axis, vel_b) + w[:, None] * vel_b)
+    time_s = rows(s.clock.step) * sim.config.episode.control_dt_s
+    rate, goal = rows(s.vehicle.rate_b)[:, 2], rows(s.mission.goal_w)
+    pose = np.column_stack([rows(s.vehicle.pos_w), yaw, vel, rate, time_s, goal])
+    return torch.from_numpy(np.ascontiguousarray(pose, np.float32))
+
+
+def test_the_referee_is_the_simulators(small, bank, config):
+    """Clearance, time to collision and verdict of the same states, along rides straight to the goal and
+    through whatever is in the way."""
+    small.sim.use_tree(small.trees["straight"])
+    small.begin(range(small.N), seed=5)
+    rules, compared, verdicts = bind(TwinRules, config), 0, set()
+    for step in range(500):
+        small.sim.step()
+        if step % 5:
+            continue
+        rows, referee = small.sim.rows, small.sim.s.referee
+        seen, outcome = torch.zeros(small.N, 2), torch.zeros(small.N, dtype=torch.int32)
+        kinematics.judge_states(rules, states_of(small.sim), bank.body, bank.path, seen, outcome)
+        clearance, ttc, ended = rows(referee.clearance_m), rows(referee.ttc_s), rows(referee.outcome)
+        near, soon = clearance < kinematics.NEAR_M, (ttc < SOON_S) & (ttc > 0.0)
+        np.testing.assert_allclose(seen[near, 0], clearance[near], atol=CLEARANCE_TOL_M)
+        np.testing.assert_allclose(seen[soon, 1], ttc[soon], atol=TTC_TOL_S)
+        edge = (abs(clearance - 0.1) < CLEARANCE_TOL_M) | (abs(ttc - 0.18) < TTC_TOL_S)
+        assert (outcome.numpy()[near & ~edge] == ended[near & ~edge]).all()
+        compared, verdicts = compared + int(soon.sum()), verdicts | set(ended[near & ~edge])
+    small.sim.use_tree(small.trees["bt"])
+    assert compared > 5 and len(verdicts) >= 3
+
+
+def test_far_bodies_are_left_out(config):
+    rules, far = bind(TwinRules, config), torch.zeros(1, 1, 8)
+    far[0, 0] = torch.tensor([1.0, 15.0, 3.0, -0.8, 0.2, 0.2, 0.2, 0.0])
+    pose = torch.tensor([[5.0, 3.0, -0.8, 0.0, 0.6, 0.0, 0.0, 0.0, 0.0, 18.0, 3.0, -0.8]])
+    seen, outcome = torch.zeros(1, 2), torch.zeros(1, dtype=torch.int32)
+    kinematics.judge_states(rules, pose, far, torch.zeros(1, 0, 16), seen, outcome)
+    assert seen[0, 1] == FAR_M and outcome[0] == 0
+    assert seen[0, 0] == pytest.approx(3.0 - 0.17, abs=FLOAT_TOL)  # the side walls
+
+
+# ----------------------------------------------------------------------------------------------- the policy
+
+
+def test_neither_order_nor_empty_rows_matter(config):
+    actor = SetActor(BODY_WIDTH, EGO_COLUMNS, config, torch.Generator().manual_seed(1))
+    for parameter in actor.parameters():  # biases too: an empty row must not count for what it gives
+        torch.nn.init.normal_(parameter, std=0.3, generator=torch.Generator().manual_seed(2))
+    bodies, own = torch.randn(5, 4, BODY_WIDTH), torch.randn(5, EGO_COLUMNS)
+    bodies[..., 0] = 1.0
+    said = actor(bodies, own)
+    assert torch.allclose(actor(bodies[:, [2, 0, 3, 1]], own), said, atol=1e-5)
+    padded = torch.cat([bodies, torch.zeros(5, 5, BODY_WIDTH)], dim=1)
+    assert torch.allclose(actor(padded, own), said, atol=1e-5)
+    assert not torch.allclose(actor(bodies[:, :3], own), said, atol=1e-3)
+
+
+def test_what_drives_knows_nothing_that_only_the_simulator_knows(saved):
+    assert not set(members_of(ObserverIO).values()) & TRUTH
+    found = saved()
+    assert list(found.model()) == ["policy"]
+    own = SetActor(BODY_WIDTH, EGO_COLUMNS, found.config, torch.Generator()).state_dict()
+    assert {n: t.shape for n, t in found.model()["policy"].items()} == {n: t.shape for n, t in own.items()}
+    assert max(row["stop"] for row in found.manifest.observation_table) == EGO_COLUMNS + 9 * BODY_WIDTH
+
+
+def test_the_critic_alone_feels_the_truth(trainer):
+    view = trainer.twin.look()
+    other = view.truth + torch.randn(view.truth.shape) * (view.truth[..., 2:3] > 0)
+    assert not torch.equal(trainer.critic(view.bodies, view.own, other), trainer.critic(*view))
+
+
+def test_learning_goes_on_from_a_state_bit_for_bit(trainer, config, bank):
+    other = TwinTrainer(config, bank)
+    other.load_state(copy.deepcopy(trainer.state()))
+    kept = copy.deepcopy(trainer.state())
+    ours, theirs = trainer.iterate(), other.iterate()
+    trainer.load_state(kept)
+    same = [name for name in ours if not name.startswith("time/")]
+    assert {n: ours[n] for n in same} == {n: theirs[n] for n in same}
+    assert theirs["train/std"] >= config.policy.min_std
+
+
+# ------------------------------------------------------------------------------------------ in the simulator
+
+
+def test_it_drives_whatever_the_order_of_the_episodes(small, saved):
+    pilot = load_set_pilot(saved(), small.sim)
+    jobs = jobs_of([3], 5)
+    forth, _ = run_episodes(small.sim, jobs, driver=pilot)
+    back, _ = run_episodes(small.sim, jobs[::-1], driver=pilot)
+    assert [(r.outcome, r.time_s, r.path_length_m) for r in forth] == [
+        (r.outcome, r.time_s, r.path_length_m) for r in back[::-1]
+    ]
+    assert max(r.path_length_m for r in forth) > 1.0
+
+
+def test_asking_again_changes_nothing(small, saved):
+    pilot = load_set_pilot(saved(), small.sim)
+    small.begin(range(small.N), seed=9)
+    pilot.reset(torch.ones(small.N))
+    first = pilot.decide(torch.zeros(0)).action
+    assert torch.equal(pilot.decide(torch.zeros(0)).action, first) and bool((first.abs() <= 1.0).all())
+
+
+def test_rays_end_at_the_walls(small):
+    small.begin(range(small.N), seed=5)
+    io = bind(ObserverIO, small.sim.s, small.sim.config)
+    ego, raw, ray = torch.zeros(small.N, 21), torch.zeros(small.N, 9, 14), torch.zeros(small.N, 24)
+    observer.observe_bodies(io, torch.ones(small.N, dtype=torch.int32), ego, raw, ray)
+    y = small.sim.rows(small.sim.s.ego.pos_w)[:, 1]
+    assert (ray[:, 6].numpy() <= 6.0 - y + 0.2).all() and (ray[:, 18].numpy() <= y + 0.2).all()
+    assert bool((ray > 0.3).all())
+
+
+# --------------------------------------------------------------------------------------------------- refusals
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda part: part.pop("log_std"), "not those of its config"),
+        (lambda part: part.update({"net.body.0.weight": torch.zeros(9, BODY_WIDTH)}), "instead of"),
+        (lambda part: part.update(log_std=torch.full((3,), float("nan"))), "log_std is not finite"),
+    ],
+)
+def test_networks_that_cannot_drive_are_refused(small, saved, change, says):
+    with pytest.raises(CheckpointError, match=says):
+        load_set_pilot(saved(change), small.sim)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "says"),
+    [
+        ("policy.residual", True, "the twin has none"),
+        ("world_model.enabled", True, "the twin has none"),
+        ("risk.enabled", True, "the twin has none"),
+        ("policy.hold_steps", 4, "decides every 0.1 s"),
+        ("episode.control_dt_s", 0.01, "decides every 0.1 s"),
+        ("ppo.minibatches", 200, "only 128 samples"),
+    ],
+)
+def test_what_the_twin_lacks_is_refused(bank, key, value, says):
+    with pytest.raises(UserError, match=says):
+        TwinTrainer(load_training("twin", overrides=SMALL | {key: value}), bank)
+
+
+def test_the_trainer_knows_how_long_the_twin_holds_a_decision():
+    assert twin_trainer.HOLD_STEPS == kinematics.STEPS
+    assert twin_trainer.DECISION_S == sensing_model.DT_S
+
+
+def test_it_is_not_exported_yet(saved):
+    with pytest.raises(CheckpointError, match="cannot be exported yet"):
+        load_pilot(saved(), 1)
+
+
+@pytest.mark.parametrize("world", ["netpen", "transfer"])
+def test_worlds_of_another_tank_are_refused(world):
+    other = load_training("twin", overrides=SMALL | {"twin.worlds": [world]})
+    with pytest.raises(ConfigError, match=f"{world} has another tank"):
+        draw_bank(other, ((8, 6, 0.6),), 0, 1)
+
+
+def test_a_gpu_is_refused_before_anything_is_written(config, tmp_path):
+    request = TrainRequest(config=config, device="cuda", run_dir=tmp_path / "run")
+    watch = type("Watch", (), {"note": lambda self, text: None})()
+    with pytest.raises(UserError, match="on the CPU"):
+        train(request, watch, lambda trainer, config: {})
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_defaults_are_off():
+    assert not LearningConfig().twin.enabled

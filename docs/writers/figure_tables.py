@@ -178,6 +178,51 @@ def policy(sources: Sources) -> str:
     return text_table(head, rows) if rows else "Not among the evaluations that are shown."
 
 
+TWIN_FILE = "docs/data/twin_77001.json"
+
+
+def twin_policy(sources: Sources) -> str:
+    """The policy that learnt in the twin beside the tree, in the simulator, on the same episodes."""
+    rows = []
+    for entry in sources.json(TWIN_FILE)["rows"]:
+        tree, own = entry["bt"], entry["policy"]
+        pairs = list(zip(tree["outcomes"], own["outcomes"], strict=True))
+        only = [sum(a == "s" != b for a, b in pairs), sum(b == "s" != a for a, b in pairs)]
+        both = [i for i, pair in enumerate(pairs) if pair == ("s", "s")]
+        times = [sum(who["times_s"][i] for i in both) / max(1, len(both)) for who in (tree, own)]
+        counts = [
+            Counts(len(pairs), {name: who["outcomes"].count(letter) for name, letter in LETTERS.items()})
+            for who in (tree, own)
+        ]
+        rows.append(
+            [
+                entry["cell"],
+                *(rated(found, ending) for ending in ("success", "collision") for found in counts),
+                f"{only[0]}, {only[1]}",
+                f"{mcnemar_p(*only):.2g}",
+                f"{times[0]:.1f}, {times[1]:.1f} s",
+            ]
+        )
+    head = ["`bt`", "policy", "`bt`: collision", "policy: collision"]
+    more = ["only `bt`, only the policy arrives", "exact McNemar p", "time where both arrive"]
+    return text_table(["world (S, D, v in m/s)", *head, *more], rows)
+
+
+def twin_curve(sources: Sources) -> str:
+    """Success in the twin along the training, on scenarios that it never learnt from."""
+    names = {"gauntlet_9_1.5": "gauntlet (8, 9, 1.5)", "pool_9_1.5": "pool (8, 9, 1.5)"}
+    names |= {"pool_6_0.6": "pool (8, 6, 0.6)"}
+    rows = [
+        [
+            f"{row['decisions'] / 1e6:.1f}",
+            f"{row['seconds'] / 60:.0f}",
+            *(f"{100 * row[name]:.0f} %" for name in names),
+        ]
+        for row in sources.json(TWIN_FILE)["curve"]
+    ]
+    return text_table(["million decisions", "minutes", *names.values()], rows)
+
+
 def switched_off(sources: Sources) -> str:
     """The pilot with each piece off, on the same episodes: success / collision, and against the first row's
     successes who alone arrives and p of McNemar's exact test."""
@@ -507,5 +552,7 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         risk_bins,
         pose_endings,
         pose_errors,
+        twin_curve,
+        twin_policy,
     )
 }

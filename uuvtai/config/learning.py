@@ -182,6 +182,33 @@ class TrainConfig(Section):
         return value
 
 
+class TwinConfig(Section):
+    """A kinematic twin of the simulator to train in, and the policy over a set of bodies that learns there
+    (``docs/learning.md``)."""
+
+    enabled: bool = False
+    """train in the twin; false = in the simulator"""
+    worlds: tuple[Annotated[str, Field(min_length=1, max_length=200)], ...] = ("pool", "gauntlet")
+    """world presets whose scenarios are dealt out, each with all of ``train.scenes``"""
+    scenarios: Annotated[int, Field(ge=1, le=2**20)] = 4096
+    """drawn by the simulator for every pair of world and scene"""
+    body_hidden: PositiveCount = 64
+    """width of the encoder that every body goes through"""
+    head_hidden: PositiveCount = 128
+    """width of the layers behind it"""
+    goal_gain: NonNegative = 0.7
+    """the policy begins as this part of full speed straight to the goal"""
+    vertical_gap_m: Positive = 0.26
+    """[m] heave is held back so that the centre stays so far from floor and surface"""
+    progress: NonNegative = 0.05
+    """reward per metre nearer to the goal; arriving is worth 1, an accident costs 1"""
+    time_cost: NonNegative = 0.01
+    """per second"""
+    closeness_cost: NonNegative = 0.1
+    """per second at contact, none from ``soft_clearance_m`` on"""
+    soft_clearance_m: Positive = 0.5
+
+
 class LearningConfig(Config):
     """A run's config with what training adds."""
 
@@ -191,4 +218,5 @@ class LearningConfig(Config):
     uncertainty: UncertaintyConfig = UncertaintyConfig()
     world_model: WorldModelConfig = WorldModelConfig()
     risk: RiskConfig = RiskConfig()
+    twin: TwinConfig = TwinConfig()
     train: TrainConfig = TrainConfig()

@@ -133,23 +133,23 @@ class Pilot:
         x[:, self._n_obs :] = self._features(rows, x)
         self._x[rows] = x
         teacher = self.policy.teacher_action(x)
-        mean = _by_chunk(lambda part: self.policy.distribution(part)[0], x)
+        mean = by_chunk(lambda part: self.policy.distribution(part)[0], x)
         self._offset[rows] = mean if teacher is None else mean - teacher
-        risk_logit = x.new_zeros(len(x)) if self.risk is None else _by_chunk(self.risk.logit, x)
+        risk_logit = x.new_zeros(len(x)) if self.risk is None else by_chunk(self.risk.logit, x)
         self._said[rows] = torch.stack(
-            [_by_chunk(self.policy.value, x), x[:, -2], x[:, -1], risk_logit], dim=1
+            [by_chunk(self.policy.value, x), x[:, -2], x[:, -1], risk_logit], dim=1
         )
 
     def _features(self, rows: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
         if self.world_model is None:
             return x.new_zeros(len(x), N_FEATURES)
-        found = _by_chunk(
+        found = by_chunk(
             self.world_model.features, self._last_obs[rows], self._last_action[rows], x[:, : self._n_obs]
         )
         return torch.where(self._has_last[rows, None], found, 0.0)
 
 
-def _by_chunk(function: Callable[..., torch.Tensor], *inputs: torch.Tensor) -> torch.Tensor:
+def by_chunk(function: Callable[..., torch.Tensor], *inputs: torch.Tensor) -> torch.Tensor:
     """Function of inputs (n, ...), ``CHUNK`` rows at a time, the last chunk filled up with its first row."""
     parts = []
     for i in range(0, len(inputs[0]), CHUNK):
@@ -157,7 +157,10 @@ def _by_chunk(function: Callable[..., torch.Tensor], *inputs: torch.Tensor) -> t
         missing = CHUNK - len(chunk[0])
         parts.append(
             function(
-                *(torch.cat([t, t[:1].expand(missing, -1)]) if missing else t.contiguous() for t in chunk)
+                *(
+                    torch.cat([t, t[:1].expand(missing, *t.shape[1:])]) if missing else t.contiguous()
+                    for t in chunk
+                )
             )
         )
     return torch.cat(parts)[: len(inputs[0])]
@@ -193,6 +196,11 @@ def load_pilot(checkpoint: Checkpoint, num_envs: int, device: torch.device | str
     """Pilot with the networks of a checkpoint. Raises CheckpointError where they do not fit what its config
     says."""
     config, rows = checkpoint.config, checkpoint.manifest.observation_table
+    if config.twin.enabled:
+        raise CheckpointError(
+            f"{checkpoint.path}: a policy over a set of bodies, which looks at the simulator itself; it "
+            "drives in 'uuv eval' and 'uuv sweep', and cannot be exported yet"
+        )
     parts, generator = checkpoint.model(), torch.Generator()
     try:
         n_obs = max(row["stop"] for row in rows)

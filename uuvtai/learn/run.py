@@ -3,6 +3,7 @@ how it all ends."""
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from uuvtai.env import VectorEnv
     from uuvtai.learn.checkpoint import Checkpoint
     from uuvtai.learn.train import Trainer
+    from uuvtai.learn.twin_trainer import TwinTrainer
     from uuvtai.scene_options import SceneOptions
 
 Metrics = dict[str, float]
@@ -66,7 +68,7 @@ class TrainWatch(Protocol):
     def stop(self) -> None: ...
 
 
-Evaluate = Callable[["Trainer", LearningConfig], Metrics]
+Evaluate = Callable[["Trainer | TwinTrainer", LearningConfig], Metrics]
 """``eval/*`` of the policy as it is; training goes on as if nothing had been
 (``measure.evaluate.while_training.evaluate_now``, which knows what learning does not)"""
 
@@ -116,7 +118,10 @@ def _train(
         f"starting {config.train.num_envs} envs (sizes not used before compile their kernels first, about "
         "half a minute)"
     )
-    trainer = _trainer(_env(config, request.device), config, found)
+    if config.twin.enabled:
+        trainer = _twin_trainer(config, found, request.device)
+    else:
+        trainer = _trainer(_env(config, request.device), config, found)
     place = _folder(request, config, found, folder) if trainer.processes.writes else None
     run = _Run(trainer, config, place, watch, evaluate, total)
     status, code = "failed", 1
@@ -185,6 +190,21 @@ def _trainer(env: VectorEnv, config: LearningConfig, checkpoint: Checkpoint | No
     return trainer
 
 
+def _twin_trainer(config: LearningConfig, checkpoint: Checkpoint | None, device: str) -> TwinTrainer:
+    """As ``_trainer``, in the kinematic twin."""
+    from uuvtai.learn.twin_trainer import TwinTrainer
+
+    if device == "cuda" or os.environ.get("WORLD_SIZE", "1") != "1":
+        raise ConfigError(
+            "twin.enabled: the twin trains in one process on the CPU; leave out --device cuda and torchrun"
+        )
+    trainer = TwinTrainer(config)
+    if checkpoint:
+        checkpoint.check_table(trainer.observation_table, config)
+        trainer.load_state(checkpoint.state(like=trainer.state()))
+    return trainer
+
+
 def _folder(
     request: TrainRequest, config: LearningConfig, checkpoint: Checkpoint | None, folder: RunFolder | None
 ) -> RunFolder:
@@ -202,7 +222,7 @@ class _Run:
 
     def __init__(
         self,
-        trainer: Trainer,
+        trainer: Trainer | TwinTrainer,
         config: LearningConfig,
         folder: RunFolder | None,
         watch: TrainWatch,
@@ -266,7 +286,7 @@ class _Run:
     def _save(self, folder: RunFolder) -> None:
         from uuvtai.learn import checkpoint
 
-        trainer, table = self._trainer, self._trainer.env.observation_table
+        trainer, table = self._trainer, self._trainer.observation_table
         score = self._metrics.get(SCORE)
         checkpoint.save(
             folder.path / "checkpoints",

@@ -42,7 +42,7 @@ class Trainer:
     def __init__(self, env: VectorEnv, config: LearningConfig, processes: Processes | None = None) -> None:
         """Resets ``env`` to this process's scenarios. ValueError for settings that do not fit each other."""
         check_weighting(config.distill.weighting, config.world_model.enabled, config.risk.enabled)
-        self.env, self.config = env, config
+        self.env, self.config, self.observation_table = env, config, env.observation_table
         self.processes = processes or Processes(device=env.device)
         self.generator = torch.Generator().manual_seed(config.train.seed)
         n_in, device = env.num_obs + N_FEATURES, env.device

@@ -1,2 +1,2 @@
-"""The kinematic twin: the simulator's scenarios, motion and referee, a vehicle by lags, tracks by a model of
-the tracker, ten decisions a second. A floor for learning: nothing trains in it yet."""
+"""A kinematic twin of the simulator: the same scenarios, bodies and referee, the vehicle's velocity loops
+axis by axis, and a model of what the tracker delivers in place of sensing. Decisions at 10 Hz."""

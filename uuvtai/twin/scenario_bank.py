@@ -1,88 +1,111 @@
-"""Scenarios of the simulator, drawn once and kept as the twin's tensors."""
+"""Scenarios drawn by the simulator itself, as plain arrays that the twin's kernels read."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
 
-from uuvtai.scene_options import SceneOptions
+from uuvtai.config import TankConfig
+from uuvtai.config.learning import LearningConfig
+from uuvtai.loader import ConfigError, load_config
+from uuvtai.scenario import Scene
+from uuvtai.shipped import TRAINING_TREE
 from uuvtai.sim import Sim
 from uuvtai.tree import read_tree
-from uuvtai.twin.tensors import MOVERS, N_MOVER, N_STATIC, STATICS, WAY
 
-_BATCH = 512
-
-
-class TwinScene(NamedTuple):
-    """A scene that the twin draws from, and how often."""
-
-    world: str
-    n_static: int
-    n_dynamic: int
-    speed_m_s: float
-    weight: float
+BATCH = 256
+"""envs of the simulator that draws"""
 
 
-class ScenarioBank(NamedTuple):
-    """n scenarios of a world: ``static`` (n, STATICS, N_STATIC), ``mover`` (n, MOVERS, N_MOVER), ``start``
-    and ``goal`` (n, 3) [m], ``yaw`` (n,) [rad]."""
+@dataclass(frozen=True)
+class ScenarioBank:
+    """B scenarios: resting bodies first, then the moving ones."""
 
-    static: torch.Tensor
-    mover: torch.Tensor
-    start: torch.Tensor
-    goal: torch.Tensor
-    yaw: torch.Tensor
-
-
-def draw_bank(world: str, count: int, seed: int) -> ScenarioBank:
-    """Episodes 0 .. count - 1 of ``seed`` in a world, with every body that the twin can hold. Raises
-    ConfigError."""
-    config = SceneOptions(world, n_static=STATICS, n_dynamic=MOVERS, speed_m_s=1.5).config()
-    rows = min(count, _BATCH)
-    sim = Sim(config, rows, read_tree("bt", config.teacher.max_node))
-    parts = []
-    for first in range(0, count, rows):
-        mask, seeds = torch.ones(rows, dtype=torch.int32), torch.full((rows,), seed, dtype=torch.int32)
-        sim.draw(mask, seeds, torch.arange(rows, dtype=torch.int32) + first)
-        parts.append(bank_of(sim))
-    return ScenarioBank(*(torch.cat(tensors)[:count] for tensors in zip(*parts, strict=True)))
+    body: torch.Tensor
+    """(B, n_body, 8) kind, centre (3), size (3), yaw; kind 0 = none"""
+    path: torch.Tensor
+    """(B, n_lane, 16) corners (0 = circle), radius, length, phase, speed, corners' x and y; of a circle the
+    first is its centre"""
+    mission: torch.Tensor
+    """(B, 8) start (3), goal (3), heading at the start"""
+    origin: torch.Tensor
+    """(B,) int32: which of ``names`` it was drawn for"""
+    names: tuple[str, ...]
+    """world_D_v by number"""
 
 
-def bank_of(sim: Sim) -> ScenarioBank:
-    """What a simulator has drawn. Raises ValueError where the twin cannot hold it."""
+def draw_bank(config: LearningConfig, scenes: tuple[Scene, ...], seed: int, count: int) -> ScenarioBank:
+    """Episodes 0 .. count - 1 of ``seed`` for every pair of a world of ``twin.worlds`` and a scene (S, D, v),
+    drawn by ``Sim.draw``. Raises ConfigError for a world that is none, or has another tank than the run's."""
+    parts, names = [], []
+    for world in config.twin.worlds:
+        most = [("world.n_static", max(s[0] for s in scenes)), ("world.n_dynamic", max(s[1] for s in scenes))]
+        drawn_config = load_config(world, overrides=[*most])
+        _refuse_other_tank(world, drawn_config.world.tank, config.world.tank)
+        tree = read_tree(TRAINING_TREE, drawn_config.teacher.max_node)
+        sim = Sim(drawn_config, min(BATCH, count), tree)
+        for scene in scenes:
+            rows = drawn(sim, scene, seed, count)
+            parts.append((*rows, torch.full((count,), len(names), dtype=torch.int32)))
+            names.append(f"{Path(world).stem}_{scene[1]}_{scene[2]:g}")
+    widest = [max(part[i].shape[1] for part in parts) for i in range(2)]
+    rest = max(part[0].shape[1] - part[1].shape[1] for part in parts)
+    body = torch.cat([_padded(part[0], rest + widest[1], part[1].shape[1], rest) for part in parts])
+    path = torch.cat([torch.nn.functional.pad(p[1], (0, 0, 0, widest[1] - p[1].shape[1])) for p in parts])
+    mission, origin = (torch.cat([part[i] for part in parts]) for i in (2, 3))
+    return ScenarioBank(body, path, mission, origin, tuple(names))
+
+
+def _refuse_other_tank(world: str, own: TankConfig, wanted: TankConfig) -> None:
+    if own != wanted or own.shape != "rectangle":
+        raise ConfigError(
+            f"twin.worlds: {world} has another tank than the run's world, or a round one; the twin has one "
+            "rectangular tank: give worlds that share it, for example twin.worlds=[pool,gauntlet]"
+        )
+
+
+def _padded(body: torch.Tensor, width: int, lanes: int, rest: int) -> torch.Tensor:
+    """With empty slots behind the resting and behind the moving bodies."""
+    out = torch.zeros(len(body), width, 8)
+    own = body.shape[1] - lanes
+    out[:, :own], out[:, rest : rest + lanes] = body[:, :own], body[:, own:]
+    return out
+
+
+def drawn(sim: Sim, scene: Scene, seed: int, count: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """(body, path, mission) as in a bank, of one scene's episodes; slots that are empty everywhere are left
+    out."""
+    sim.set_scenes([scene])
+    found = []
+    for first in range(0, count, sim.num_envs):
+        number = torch.arange(first, first + sim.num_envs, dtype=torch.int32)
+        mask = (number < count).int()
+        sim.draw(mask, torch.full_like(mask, seed), number)
+        found.append([rows[: int(mask.sum())] for rows in scenario_rows(sim)])
+    body, path, mission = (np.concatenate(part) for part in zip(*found, strict=True))
+    rest = body.shape[1] - path.shape[1]
+    used = np.any(body[:, :, 0] > 0, axis=0)
+    moving = used[rest:]
+    return tuple(torch.from_numpy(a) for a in (body[:, used].copy(), path[:, moving].copy(), mission))  # type: ignore[return-value]
+
+
+def scenario_rows(sim: Sim) -> list[np.ndarray]:
+    """(body, path, mission) of what every row of a simulator holds, float32."""
     s = sim.s
-    read = {
-        name: sim.rows(getattr(struct, name))
-        for struct, names in (
-            (s.world, ("kind", "pos_w", "size", "yaw")),
-            (s.path, ("n_way", "way_w", "radius_m", "length_m", "phase_m", "speed_m_s")),
-        )
-        for name in names
-    }
-    n, lanes = read["n_way"].shape
-    first = read["kind"].shape[1] - lanes
-    rest, moving = slice(0, STATICS), slice(first, first + min(lanes, MOVERS))
-    if (read["kind"][:, STATICS:first] != 0).any() or (read["kind"][:, moving.stop :] != 0).any():
-        raise ValueError(
-            f"the twin holds {STATICS} obstacles at rest and {MOVERS} moving ones; there are more"
-        )
-    static, mover = np.zeros((n, STATICS, N_STATIC), np.float32), np.zeros((n, MOVERS, N_MOVER), np.float32)
-    held = min(STATICS, first)
-    static[:, :held, 0], static[:, :held, 5] = read["kind"][:, rest][:, :held], read["yaw"][:, rest][:, :held]
-    static[:, :held, 1:3] = read["pos_w"][:, :held, :2]
-    static[:, :held, 3:5] = read["size"][:, :held, :2]
-    k = min(lanes, MOVERS)
-    mover[:, :k, 0], mover[:, :k, 1] = read["kind"][:, moving], read["pos_w"][:, moving, 2]
-    mover[:, :k, 2], mover[:, :k, 3] = read["size"][:, moving, 0], read["size"][:, moving, 2]
-    for column, name in enumerate(("n_way", "radius_m", "length_m", "phase_m", "speed_m_s"), 4):
-        mover[:, :k, column] = read[name][:, :k]
-    mover[:, :k, WAY:] = read["way_w"][:, :k].reshape(n, k, -1)
-    return ScenarioBank(
-        torch.from_numpy(static),
-        torch.from_numpy(mover),
-        torch.from_numpy(sim.rows(s.mission.start_w).copy()),
-        torch.from_numpy(sim.rows(s.mission.goal_w).copy()),
-        torch.from_numpy(sim.rows(s.mission.start_yaw).copy()),
+    kind, pos, size, yaw = (sim.rows(f) for f in (s.world.kind, s.world.pos_w, s.world.size, s.world.yaw))
+    way = sim.rows(s.path.way_w)
+    numbers = (s.path.n_way, s.path.radius_m, s.path.length_m, s.path.phase_m, s.path.speed_m_s)
+    path = np.stack([sim.rows(field) for field in numbers], axis=-1)
+    path = np.concatenate([path, way.reshape(*way.shape[:2], -1)], axis=-1)
+    path = np.concatenate([path, np.zeros((*path.shape[:2], 16 - path.shape[2]))], axis=-1)
+    path[..., 2] = np.where(path[..., 2] > 0, path[..., 2], 1.0)
+    m = s.mission
+    mission = np.concatenate(
+        [sim.rows(m.start_w), sim.rows(m.goal_w), sim.rows(m.start_yaw)[:, None]], axis=1
     )
+    mission = np.concatenate([mission, np.zeros((len(mission), 1))], axis=1)
+    body = np.concatenate([kind[..., None], pos, size, yaw[..., None]], axis=-1)
+    return [np.ascontiguousarray(a, np.float32) for a in (body, path, mission)]

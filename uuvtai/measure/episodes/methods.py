@@ -75,6 +75,10 @@ class Method:
         from uuvtai.learn.pilot import load_pilot
         from uuvtai.logs.log_recorder import PolicyNote
 
+        if self.checkpoint.config.twin.enabled:
+            from uuvtai.learn.set_pilot import load_set_pilot
+
+            return PolicyNote(load_set_pilot(self.checkpoint, sim), self.checkpoint.sha256, None)
         self.checkpoint.check_table(VectorEnv(sim).observation_table, sim.config)
         weight = self.checkpoint.manifest.metrics.get("distill/lambda")
         pilot = load_pilot(self.checkpoint, sim.num_envs, sim.device)

@@ -9,10 +9,11 @@ from uuvtai.config.learning import LearningConfig
 if TYPE_CHECKING:
     from uuvtai.learn.run import Metrics
     from uuvtai.learn.train import Trainer
+    from uuvtai.learn.twin_trainer import TwinTrainer
     from uuvtai.measure.evaluate.foresight import Foresight
 
 
-def evaluate_now(trainer: Trainer, config: LearningConfig) -> Metrics:
+def evaluate_now(trainer: Trainer | TwinTrainer, config: LearningConfig) -> Metrics:
     """``eval/*``: the policy as it is, without exploration, on scenarios of its own; training goes on as if
     nothing had been.
 
@@ -20,10 +21,13 @@ def evaluate_now(trainer: Trainer, config: LearningConfig) -> Metrics:
     others judge it.
     """
     from uuvtai.learn.pilot import Pilot
+    from uuvtai.learn.twin_trainer import TwinTrainer
     from uuvtai.measure.episodes.playing import Recorders, jobs_of, run_episodes
     from uuvtai.measure.evaluate.foresight import foresight_of
     from uuvtai.measure.evaluate.summary import summary
 
+    if isinstance(trainer, TwinTrainer):  # in the twin: the simulator is for uuv eval
+        return trainer.evaluate()
     env = trainer.env
     model = trainer.world_model if config.world_model.as_features else None
     pilot = Pilot(trainer.policy, model, env.num_envs, env.device, trainer.risk)

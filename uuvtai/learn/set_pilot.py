@@ -1,0 +1,118 @@
+"""A policy over a set of bodies at the wheel of the simulator: a wish for a velocity ten times a second,
+laid on the hull by the fixed rule in every control step."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from uuvtai.learn.checkpoint import Checkpoint
+from uuvtai.learn.manifest import MODEL, CheckpointError
+from uuvtai.learn.pilot import PilotDecision, by_chunk
+from uuvtai.learn.set_policy import NUM_WISHES, SetActor
+
+if TYPE_CHECKING:
+    from uuvtai.sim import Sim
+
+MOST_WISH = 2.0
+"""wishes beyond it are cut off before they are carried out"""
+
+
+class SetPilot:
+    """Drives the rows of a simulator; used as ``Pilot`` is, but it looks at tracks, map and pose itself."""
+
+    world_model = None
+    risk = None
+
+    def __init__(self, actor: SetActor, sim: Sim, hold_steps: int, gap_m: float) -> None:
+        """``hold_steps`` control steps a decision; the centre stays ``gap_m`` from floor and surface."""
+        from uuvtai.binding import bind
+        from uuvtai.twin.set_columns import BODY_WIDTH, EGO_COLUMNS
+        from uuvtai.twin.twin_arrays import EGO_WIDTH, N_BODY, N_RAY, RAW_WIDTH, ObserverIO
+
+        self.actor, self._sim, self._hold, self._gap_m = actor, sim, hold_steps, gap_m
+        self._io = bind(ObserverIO, sim.s, sim.config)
+        rows = sim.num_envs
+
+        def zeros(*shape: int) -> torch.Tensor:
+            return torch.zeros(rows, *shape, device=sim.device)
+
+        self._ego, self._raw, self._ray = zeros(EGO_WIDTH), zeros(N_BODY, RAW_WIDTH), zeros(N_RAY)
+        self._bodies, self._own = zeros(N_BODY, BODY_WIDTH), zeros(EGO_COLUMNS)
+        self._wish, self._last, self._command = zeros(NUM_WISHES), zeros(NUM_WISHES), zeros(4)
+        self._age = torch.zeros(rows, dtype=torch.int64, device=sim.device)
+        std = torch.cat([actor.log_std.detach().exp(), torch.zeros(1, device=sim.device)])
+        nothing = zeros()
+        self.decision = PilotDecision(self._command, nothing, std, nothing, nothing, nothing[:0])
+        """value, residual and uncertainty are 0: what drives has no critic and no world model"""
+
+    def reset(self, rows: torch.Tensor) -> None:
+        """New episodes have begun in the rows (num_envs,) where this is not 0."""
+        kept = rows.to(self._age.device) == 0
+        self._age *= kept
+        self._last *= kept[:, None]
+
+    @torch.no_grad()
+    def decide(self, _obs: torch.Tensor) -> PilotDecision:
+        """Command for all rows; changes nothing that the next one depends on."""
+        from uuvtai.twin.observer import command_hull, observe_bodies
+        from uuvtai.twin.set_columns import write_set_columns
+        from uuvtai.twin.twin_arrays import AT_LAST
+
+        due = self._due()
+        if bool(due.any()):
+            self._ego[:, AT_LAST : AT_LAST + NUM_WISHES] = self._last
+            observe_bodies(self._io, due.int(), self._ego, self._raw, self._ray)
+            write_set_columns(self._ego, self._raw, self._ray, self._bodies, self._own)
+            rows = due.nonzero().flatten()
+            wish = by_chunk(self.actor, self._bodies[rows], self._own[rows]).clamp(-MOST_WISH, MOST_WISH)
+            self._wish[rows] = wish
+        command_hull(self._io, self._gap_m, self._wish, self._command)
+        self.decision = self.decision._replace(action=self._command.clone())
+        return self.decision
+
+    def advance(self) -> None:
+        """The last decision has been carried out."""
+        due = self._due()
+        long = self._wish[:, :2].norm(dim=1, keepdim=True).clamp(min=1.0)
+        done = torch.cat([self._wish[:, :2] / long, self._wish[:, 2:].clamp(-1.0, 1.0)], dim=1)
+        self._last = torch.where(due[:, None], done, self._last)
+        self._age += 1
+
+    def _due(self) -> torch.Tensor:
+        """(num_envs,) rows whose decision is not held any more."""
+        return self._age % self._hold == 0
+
+
+def load_set_pilot(checkpoint: Checkpoint, sim: Sim) -> SetPilot:
+    """Pilot of a policy that learnt in the twin. Raises CheckpointError where its networks are not those of
+    its config."""
+    from uuvtai.twin.observer import SET_TABLE
+    from uuvtai.twin.set_columns import BODY_WIDTH, EGO_COLUMNS
+
+    checkpoint.check_table(SET_TABLE, sim.config)
+    config, found = checkpoint.config, checkpoint.model()
+    try:
+        part: dict[str, Any] = found["policy"]
+        wide, head = config.twin.body_hidden, config.twin.head_hidden
+        for name, shape in (
+            ("net.body.0.weight", (wide, BODY_WIDTH)),
+            ("net.head.0.weight", (head, 3 * wide)),
+        ):
+            if tuple(part[name].shape) != shape:
+                raise ValueError(f"{name} is {tuple(part[name].shape)} instead of {shape}")
+        actor = SetActor(BODY_WIDTH, EGO_COLUMNS, config, torch.Generator())
+        actor.load_state_dict(part)
+    except (KeyError, ValueError, RuntimeError, TypeError, AttributeError) as error:
+        raise CheckpointError(
+            f"{checkpoint.path / MODEL}: its networks are not those of its config ({error}); take another one"
+        ) from None
+    for name, tensor in actor.state_dict().items():
+        if not bool(torch.isfinite(tensor).all()):
+            raise CheckpointError(
+                f"{checkpoint.path / MODEL}: {name} is not finite: the training failed; take an older "
+                "checkpoint"
+            )
+    actor.to(sim.device).eval()
+    return SetPilot(actor, sim, config.policy.hold_steps, config.twin.vertical_gap_m)

@@ -1,0 +1,78 @@
+"""Policy over a set of bodies: every body goes through one encoder, and what comes out is pooled by maximum
+and sum, so that neither their order nor their number matters. The critic has an encoder of its own, which
+also sees the bodies' true future: it serves training alone, and no file that drives holds it."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import nn
+
+from uuvtai.config.learning import LearningConfig
+from uuvtai.learn.mlp import mlp
+
+NUM_WISHES = 3
+"""ahead, left, up: parts of the fastest velocity, in the mirrored world"""
+AT_DIRECTION = slice(3, 5)
+"""columns of ``own`` with the unit vector to the goal"""
+_SUM_SCALE = 0.3
+"""sums over the bodies are a few times as large as a maximum"""
+
+
+class SetEncoder(nn.Module):
+    """Bodies (..., n, n_body) of which ``mask`` (..., n, 1) are there, and the vehicle's own columns (...,
+    n_own), to ``n_out`` numbers."""
+
+    def __init__(
+        self,
+        n_body: int,
+        n_own: int,
+        n_out: int,
+        config: LearningConfig,
+        gain: float,
+        generator: torch.Generator,
+    ) -> None:
+        super().__init__()
+        wide, head = config.twin.body_hidden, config.twin.head_hidden
+        self.body = nn.Sequential(*mlp((n_body, wide, wide), "relu", generator, math.sqrt(2.0)), nn.ReLU())
+        self.own = nn.Sequential(*mlp((n_own, wide), "relu", generator, math.sqrt(2.0)), nn.ReLU())
+        self.head = mlp((3 * wide, head, head, n_out), "relu", generator, gain)
+
+    def forward(self, bodies: torch.Tensor, own: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+        """(..., n_out)."""
+        each = self.body(bodies) * mask
+        pooled = (each.amax(dim=-2), _SUM_SCALE * each.sum(dim=-2), self.own(own))
+        return self.head(torch.cat(pooled, dim=-1))
+
+
+class SetActor(nn.Module):
+    """What drives: a diagonal Gaussian over the wish for a velocity. Its input is what the vehicle knows."""
+
+    def __init__(self, n_body: int, n_own: int, config: LearningConfig, generator: torch.Generator) -> None:
+        super().__init__()
+        self.n_body, self.n_own = n_body, n_own
+        self.goal_gain = config.twin.goal_gain
+        self.net = SetEncoder(n_body, n_own, NUM_WISHES, config, 0.01, generator)
+        self.log_std = nn.Parameter(torch.full((NUM_WISHES,), math.log(config.policy.initial_std)))
+
+    def forward(self, bodies: torch.Tensor, own: torch.Tensor) -> torch.Tensor:
+        """(..., 3) mean wish; straight to the goal at birth."""
+        ahead = self.goal_gain * own[..., AT_DIRECTION]
+        prior = torch.cat([ahead, torch.zeros_like(ahead[..., :1])], dim=-1)
+        return prior + self.net(bodies, own, bodies[..., :1])
+
+
+class SetCritic(nn.Module):
+    """Expected return, from what the vehicle knows and from the bodies' true places, now and later."""
+
+    def __init__(
+        self, n_body: int, n_own: int, n_truth: int, config: LearningConfig, generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        self.net = SetEncoder(n_body + n_truth, n_own, 1, config, 1.0, generator)
+
+    def forward(self, bodies: torch.Tensor, own: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+        """(...,)."""
+        there = torch.maximum(bodies[..., :1], truth[..., 2:3])
+        return self.net(torch.cat([bodies, truth], dim=-1), own, there).squeeze(-1)

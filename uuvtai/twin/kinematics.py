@@ -1,0 +1,280 @@
+"""The twin's step: the vehicle's velocity loops axis by axis, bodies in closed form, and the referee's rules,
+by the simulator's own distances.
+
+Arrays are the caller's tensors. A scenario is three rows of a bank (``scenario_bank.py``), which is never
+written: an env knows the number of its scenario.
+"""
+
+import taichi as ti
+
+from uuvtai.kernels.core.footprint import steady_direction
+from uuvtai.kernels.core.geometry import FAR_M, NONE
+from uuvtai.kernels.core.hull import hull_to_body, hull_to_floor_or_surface, hull_to_side_wall, is_in_tank
+from uuvtai.kernels.core.signature import AnyTensor, Bundle, Const, FloatMatrix, FloatVector, IntVector
+from uuvtai.kernels.vehicle.actuation import axis_loops, integrated
+from uuvtai.outcomes import COLLISION, OUT_OF_TANK, RUNNING, SUCCESS, TIMEOUT, TTC
+from uuvtai.twin.hull_rule import hull_command, wished_velocity
+from uuvtai.twin.twin_arrays import (
+    AT_FLIP,
+    AT_GOAL,
+    AT_INTEGRAL,
+    AT_LAST,
+    AT_POS,
+    AT_RATE,
+    AT_TIME,
+    AT_VEL,
+    AT_YAW,
+    TwinRules,
+)
+
+STEPS = 5
+"""control steps that a decision is held"""
+NEAR_M = 1.5
+"""bodies whose surface is farther cannot matter to referee or reward within a step"""
+
+
+@ti.func
+def path_place(number, lane, t_s, path: AnyTensor):
+    """(x, y, vx, vy) of a moving body of scenario ``number`` at a time, as the simulator moves it."""
+    length, speed = path[number, lane, 2], path[number, lane, 4]
+    arc = path[number, lane, 3] + speed * t_s
+    rest = arc - length * ti.floor(arc / length)
+    n_way = int(path[number, lane, 0])
+    out = ti.Vector([path[number, lane, 5], path[number, lane, 6], 0.0, 0.0])
+    if n_way == 0:
+        turn = path[number, lane, 1]
+        ahead = steady_direction(rest / turn)
+        sign = 1.0 if turn > 0.0 else -1.0
+        out += ti.Vector(
+            [
+                ti.abs(turn) * ahead[0],
+                ti.abs(turn) * ahead[1],
+                -sign * ahead[1] * speed,
+                sign * ahead[0] * speed,
+            ]
+        )
+    else:
+        on_it = 0
+        for j in range(n_way):
+            k = (j + 1) % n_way
+            x, y = path[number, lane, 5 + 2 * j], path[number, lane, 6 + 2 * j]
+            leg_x, leg_y = path[number, lane, 5 + 2 * k] - x, path[number, lane, 6 + 2 * k] - y
+            leg_m = ti.sqrt(leg_x * leg_x + leg_y * leg_y)
+            if on_it == 0 and (rest < leg_m or j == n_way - 1):
+                scale = 1.0 / ti.max(leg_m, 1e-9)
+                gone = ti.min(rest, leg_m) * scale
+                out = ti.Vector(
+                    [x + gone * leg_x, y + gone * leg_y, speed * scale * leg_x, speed * scale * leg_y]
+                )
+                on_it = 1
+            rest -= leg_m
+    return out
+
+
+def axis_drag(cfg, axis):
+    """(inertia with added mass, linear, quadratic damping) of surge, sway, heave or yaw; plain Python,
+    constants of the kernel."""
+    at = axis if axis < 3 else 5
+    inertia = cfg.mass_kg if axis < 3 else cfg.inertia_kg_m2[2]
+    return inertia + cfg.added_mass[at], cfg.linear_damping[at], cfg.quadratic_damping[at]
+
+
+@ti.func
+def axis_step(vel, integral, command, axis: Const[int], io: Bundle[TwinRules]):
+    """(velocity, integral) of one of surge, sway, heave, yaw rate after a control step: the simulator's
+    velocity loop, whose feed-forward cancels Coriolis forces, against inertia and drag of this axis alone."""
+    loops = ti.static(axis_loops(io.actuation_cfg))
+    inertia, linear, quadratic = ti.static(axis_drag(io.vehicle_cfg, axis))
+    error = command - vel
+    force = loops[axis].gain * error + integral + linear * error
+    force += quadratic * (ti.abs(command) * command - ti.abs(vel) * vel)
+    per_step = loops[axis].integral_gain * io.episode_cfg.control_dt_s
+    after = integrated(integral, error, False, per_step, loops[axis].band, loops[axis].bound)
+    return ti.Vector([vel + io.episode_cfg.control_dt_s * force / inertia, after])
+
+
+@ti.func
+def nearest_of(
+    env, number, pos_w, axis_w, vel_w, rate, t_s, body: AnyTensor, path: AnyTensor, io: Bundle[TwinRules]
+):
+    """(clearance [m] to the nearest obstacle or side wall, smallest time to collision [s]) as the referee
+    sees it; bodies beyond ``NEAR_M`` are left out."""
+    clearance = hull_to_side_wall(pos_w, axis_w, io.vehicle_cfg, io.tank_cfg)
+    ttc = FAR_M + 0.0
+    n_body, n_lane = body.shape[1], path.shape[1]
+    for slot in range(n_body):
+        kind = ti.cast(body[number, slot, 0], ti.i32)
+        if kind != NONE:
+            at = ti.Vector([body[number, slot, 1], body[number, slot, 2], body[number, slot, 3]])
+            body_vel = ti.Vector([0.0, 0.0, 0.0])
+            lane = slot - (n_body - n_lane)
+            if lane >= 0:
+                place = path_place(number, lane, t_s, path)
+                at[0], at[1] = place[0], place[1]
+                body_vel[0], body_vel[1] = place[2], place[3]
+            size = ti.Vector([body[number, slot, 4], body[number, slot, 5], body[number, slot, 6]])
+            hull = io.vehicle_cfg.hull_radius_m + io.vehicle_cfg.hull_half_length_m
+            reach = size[0] + size[1] + hull + NEAR_M
+            dx, dy = at[0] - pos_w[0], at[1] - pos_w[1]
+            if dx * dx + dy * dy < reach * reach:
+                gap, normal, along = hull_to_body(
+                    pos_w, axis_w, kind, at, size, body[number, slot, 7], io.vehicle_cfg
+                )
+                hull_vel = vel_w + along * ti.Vector([0.0, 0.0, rate]).cross(axis_w)
+                closing = (hull_vel - body_vel).dot(normal)
+                clearance = ti.min(clearance, gap)
+                if closing > io.episode_cfg.ttc_closing_m_s:
+                    ttc = ti.min(ttc, ti.max(gap, 0.0) / closing)
+    return ti.Vector([clearance, ttc])
+
+
+@ti.func
+def verdict_of(pos_w, axis_w, goal_w, clearance, ttc, t_s, io: Bundle[TwinRules]):
+    """How the episode stands, in the order of the referee's rules."""
+    to_goal = goal_w - pos_w
+    out = RUNNING
+    if is_in_tank(pos_w, io.tank_cfg) == 0:
+        out = OUT_OF_TANK
+    elif (
+        clearance < io.episode_cfg.collision_clearance_m
+        or hull_to_floor_or_surface(pos_w, axis_w, io.vehicle_cfg, io.tank_cfg) < 0.0
+    ):
+        out = COLLISION
+    elif ttc < io.episode_cfg.ttc_s:
+        out = TTC
+    elif to_goal.dot(to_goal) <= io.episode_cfg.goal_radius_m**2:
+        out = SUCCESS
+    elif t_s >= io.episode_cfg.horizon_steps * io.episode_cfg.control_dt_s - 1e-3:
+        out = TIMEOUT
+    return out
+
+
+@ti.func
+def earned(nearer_m, nearest_m, ended, io: Bundle[TwinRules]):
+    """Reward of a decision that brought the vehicle ``nearer_m`` to its goal and, at the worst, within
+    ``nearest_m`` of anything."""
+    held_s = ti.static(STEPS * io.episode_cfg.control_dt_s)
+    close = ti.math.clamp(1.0 - nearest_m / io.twin_cfg.soft_clearance_m, 0.0, 1.0)
+    out = io.twin_cfg.progress * nearer_m - held_s * (
+        io.twin_cfg.time_cost + io.twin_cfg.closeness_cost * close
+    )
+    if ended == SUCCESS:
+        out += 1.0
+    elif ended != RUNNING:
+        out -= 0.0 if ended == TIMEOUT else 1.0
+    return out
+
+
+@ti.kernel
+def drive_twin(
+    io: Bundle[TwinRules],
+    action: FloatMatrix,
+    body: AnyTensor,
+    path: AnyTensor,
+    scenario: IntVector,
+    ego: FloatMatrix,
+    reward: FloatVector,
+    outcome: IntVector,
+):
+    """One decision of every env: ``action`` (n, 3) held for ``STEPS`` control steps, or until the episode
+    ends."""
+    dt_s = ti.static(io.episode_cfg.control_dt_s)
+    for env in range(ego.shape[0]):
+        number = scenario[env]
+        goal_w = ti.Vector([ego[env, AT_GOAL + i] for i in ti.static(range(3))])
+        pos_w = ti.Vector([ego[env, AT_POS + i] for i in ti.static(range(3))])
+        vel = ti.Vector([ego[env, AT_VEL], ego[env, AT_VEL + 1], ego[env, AT_VEL + 2], ego[env, AT_RATE]])
+        yaw, t_s = ego[env, AT_YAW], ego[env, AT_TIME]
+        wish = wished_velocity(
+            action[env, 0],
+            action[env, 1],
+            action[env, 2],
+            ego[env, AT_FLIP],
+            ego[env, AT_FLIP + 1],
+            io.vehicle_cfg,
+        )
+        before = ti.math.length(goal_w - pos_w)
+        nearest, ended = 9.0, RUNNING
+        for _ in range(STEPS):
+            if ended == RUNNING:
+                part = hull_command(
+                    wish, yaw, pos_w[2], io.twin_cfg.vertical_gap_m, io.vehicle_cfg, io.tank_cfg
+                )
+                asked = ti.Vector(
+                    [
+                        part[0] * io.vehicle_cfg.max_surge_m_s,
+                        part[1] * io.vehicle_cfg.max_sway_m_s,
+                        part[2] * io.vehicle_cfg.max_heave_m_s,
+                        part[3] * io.vehicle_cfg.max_yaw_rate_rad_s,
+                    ]
+                )
+                for axis in ti.static(range(4)):
+                    after = axis_step(vel[axis], ego[env, AT_INTEGRAL + axis], asked[axis], axis, io)
+                    vel[axis], ego[env, AT_INTEGRAL + axis] = after[0], after[1]
+                yaw += dt_s * vel[3]
+                c, s = ti.cos(yaw), ti.sin(yaw)
+                vel_w = ti.Vector([c * vel[0] - s * vel[1], s * vel[0] + c * vel[1], vel[2]])
+                pos_w += dt_s * vel_w
+                t_s += dt_s
+                axis_w = ti.Vector([c, s, 0.0])
+                threat = nearest_of(env, number, pos_w, axis_w, vel_w, vel[3], t_s, body, path, io)
+                nearest = ti.min(nearest, threat[0])
+                ended = verdict_of(pos_w, axis_w, goal_w, threat[0], threat[1], t_s, io)
+        for i in ti.static(range(3)):
+            ego[env, AT_POS + i] = pos_w[i]
+            ego[env, AT_VEL + i] = vel[i]
+        ego[env, AT_RATE], ego[env, AT_YAW], ego[env, AT_TIME] = vel[3], yaw, t_s
+        long = ti.max(1.0, ti.sqrt(action[env, 0] ** 2 + action[env, 1] ** 2))
+        ego[env, AT_LAST], ego[env, AT_LAST + 1] = action[env, 0] / long, action[env, 1] / long
+        ego[env, AT_LAST + 2] = ti.math.clamp(action[env, 2], -1.0, 1.0)
+        nearer = before - ti.math.length(goal_w - pos_w)
+        reward[env] = earned(nearer, nearest, ended, io)
+        outcome[env] = ended
+
+
+@ti.kernel
+def begin_twin(
+    begun: IntVector,
+    mission: FloatMatrix,
+    scenario: IntVector,
+    ego: FloatMatrix,
+    track: AnyTensor,
+):
+    """At rest at the start of their scenarios, nothing seen, in the envs where ``begun`` is 1."""
+    for env in range(ego.shape[0]):
+        if begun[env] == 1:
+            for i in range(ego.shape[1]):
+                ego[env, i] = 0.0
+            number = scenario[env]
+            for i in ti.static(range(3)):
+                ego[env, AT_POS + i] = mission[number, i]
+                ego[env, AT_GOAL + i] = mission[number, 3 + i]
+            ego[env, AT_YAW] = mission[number, 6]
+            ego[env, AT_FLIP] = 1.0 if mission[number, 3] >= mission[number, 0] else -1.0
+            ego[env, AT_FLIP + 1] = 1.0 if mission[number, 4] >= mission[number, 1] else -1.0
+            for lane in range(track.shape[1]):
+                for i in range(track.shape[2]):
+                    track[env, lane, i] = 0.0
+                track[env, lane, 5] = 9.0
+
+
+@ti.kernel
+def judge_states(
+    io: Bundle[TwinRules],
+    pose: FloatMatrix,
+    body: AnyTensor,
+    path: AnyTensor,
+    seen: FloatMatrix,
+    outcome: IntVector,
+):
+    """Clearance [m] and time to collision [s] into ``seen`` (n, 2), and the verdict, of states (n, 12): x, y,
+    z, yaw, velocity in the world, yaw rate, time, goal. State i is judged in scenario i; for comparisons."""
+    for env in range(pose.shape[0]):
+        pos_w = ti.Vector([pose[env, 0], pose[env, 1], pose[env, 2]])
+        axis_w = ti.Vector([ti.cos(pose[env, 3]), ti.sin(pose[env, 3]), 0.0])
+        vel_w = ti.Vector([pose[env, 4], pose[env, 5], pose[env, 6]])
+        goal_w = ti.Vector([pose[env, 9], pose[env, 10], pose[env, 11]])
+        t_s = pose[env, 8]
+        threat = nearest_of(env, env, pos_w, axis_w, vel_w, pose[env, 7], t_s, body, path, io)
+        seen[env, 0], seen[env, 1] = threat[0], threat[1]
+        outcome[env] = verdict_of(pos_w, axis_w, goal_w, threat[0], threat[1], t_s, io)

@@ -1,0 +1,211 @@
+"""What the tracker delivers of the twin's bodies: a model of its delays, noise, field of view and memory, in
+place of sonar and camera. Rays of free distance are those of the true walls and resting bodies."""
+
+import taichi as ti
+
+from uuvtai.kernels.core.geometry import BOX, NONE, TWO_PI, wrapped_angle
+from uuvtai.kernels.core.noise import episode_key, normal
+from uuvtai.kernels.core.signature import AnyTensor, Bundle, FloatMatrix, IntVector
+from uuvtai.twin.kinematics import path_place
+from uuvtai.twin.twin_arrays import AT_FLIP, AT_POS, AT_TIME, AT_YAW, N_RAY, TwinRules
+
+DT_S = 0.1
+RANGE_M = 12.0
+FAN_SLOPE = 0.1763
+"""the sonar's fan: 10 degrees up and down"""
+CAMERA_RANGE_M, HEIGHT_RANGE_M = 4.0, 3.0
+"""the camera sees a body up to the first, and knows how high it is up to the second"""
+BORN_S, SETTLED_S, TURN_KNOWN_S = 0.15, 0.35, 0.8
+"""seen so long: a track; its velocity across the line of sight is known; its turn rate is known"""
+LOST_S, LOST_HEIGHT_S = 2.0, 6.0
+"""out of sight so long a track ends, later where its height is known"""
+POSITION_SIGMA_M, VELOCITY_SIGMA_M_S = 0.03, 0.06
+"""of the tracks (EC, by comparison with the simulator's)"""
+COLUMN_M = 1.6
+"""free water above and below is cut off here"""
+
+
+@ti.func
+def is_hidden(number, slot_count, x, y, to_x, to_y, body: AnyTensor):
+    """1 where a resting body stands between a place and another."""
+    dx, dy = to_x - x, to_y - y
+    far = ti.max(ti.sqrt(dx * dx + dy * dy), 1e-3)
+    ux, uy = dx / far, dy / far
+    out = 0
+    for slot in range(slot_count):
+        if body[number, slot, 0] > 0.5:
+            rx, ry = body[number, slot, 1] - x, body[number, slot, 2] - y
+            along, across = rx * ux + ry * uy, ti.abs(rx * uy - ry * ux)
+            wide = 0.9 * ti.max(body[number, slot, 4], body[number, slot, 5])
+            if along > 0.0 and along < far and across < wide:
+                out = 1
+    return out
+
+
+@ti.func
+def free_along(number, slot_count, x, y, ux, uy, body: AnyTensor, io: Bundle[TwinRules]):
+    """[m] from a place in a direction to the nearest wall or resting body, without the hull."""
+    out = 99.0
+    if ux > 1e-6:
+        out = ti.min(out, (io.tank_cfg.x_m[1] - x) / ux)
+    elif ux < -1e-6:
+        out = ti.min(out, (io.tank_cfg.x_m[0] - x) / ux)
+    if uy > 1e-6:
+        out = ti.min(out, (io.tank_cfg.y_m[1] - y) / uy)
+    elif uy < -1e-6:
+        out = ti.min(out, (io.tank_cfg.y_m[0] - y) / uy)
+    for slot in range(slot_count):
+        kind = ti.cast(body[number, slot, 0], ti.i32)
+        if kind != NONE:
+            dx, dy = body[number, slot, 1] - x, body[number, slot, 2] - y
+            along = dx * ux + dy * uy
+            wide, deep = body[number, slot, 4], body[number, slot, 5]
+            if kind == BOX:
+                c, s = ti.cos(body[number, slot, 7]), ti.sin(body[number, slot, 7])
+                vx, vy = c * ux + s * uy, c * uy - s * ux
+                px, py = -(c * dx + s * dy), -(c * dy - s * dx)
+                vx = vx if ti.abs(vx) > 1e-6 else 1e-6
+                vy = vy if ti.abs(vy) > 1e-6 else 1e-6
+                a, b = (-wide - px) / vx, (wide - px) / vx
+                e, f = (-deep - py) / vy, (deep - py) / vy
+                enter, leave = ti.max(ti.min(a, b), ti.min(e, f)), ti.min(ti.max(a, b), ti.max(e, f))
+                if leave >= enter and leave > 0.0:
+                    out = ti.min(out, ti.max(enter, 0.0))
+            else:
+                inside = along * along - (dx * dx + dy * dy) + wide * wide
+                if inside > 0.0 and along > 0.0:
+                    out = ti.min(out, along - ti.sqrt(inside))
+    return out
+
+
+@ti.func
+def update_track(
+    env, lane, number, at, is_visible, knows_height, key, ego: FloatMatrix, path: AnyTensor, track: AnyTensor
+):
+    """The track of a body that is at ``at`` (x, y, vx, vy): born late, its velocity across the line of sight
+    known later, noisy while it is seen, straight on while it is not."""
+    if knows_height:
+        track[env, lane, 6] = 1.0
+    if is_visible:
+        if track[env, lane, 5] > LOST_S:
+            track[env, lane, 4] = 0.0
+            track[env, lane, 2], track[env, lane, 3] = 0.0, 0.0
+        track[env, lane, 4] += DT_S
+        track[env, lane, 5] = 0.0
+        track[env, lane, 7] += ti.abs(path[number, lane, 4]) * DT_S
+        share = 1.0 if track[env, lane, 4] < 0.25 else 0.55
+        vx, vy = at[2], at[3]
+        if track[env, lane, 4] < SETTLED_S:
+            dx, dy = at[0] - ego[env, AT_POS], at[1] - ego[env, AT_POS + 1]
+            radial = (vx * dx + vy * dy) / ti.max(dx * dx + dy * dy, 1e-6)
+            vx, vy = 0.5 * (vx + radial * dx), 0.5 * (vy + radial * dy)
+        nx, ny = normal(key, 4 * lane), normal(key, 4 * lane + 1)
+        track[env, lane, 2] += share * (vx + VELOCITY_SIGMA_M_S * nx - track[env, lane, 2])
+        track[env, lane, 3] += share * (vy + VELOCITY_SIGMA_M_S * ny - track[env, lane, 3])
+        track[env, lane, 0] = at[0] + POSITION_SIGMA_M * normal(key, 4 * lane + 2)
+        track[env, lane, 1] = at[1] + POSITION_SIGMA_M * normal(key, 4 * lane + 3)
+    else:
+        track[env, lane, 5] += DT_S
+        track[env, lane, 0] += DT_S * track[env, lane, 2]
+        track[env, lane, 1] += DT_S * track[env, lane, 3]
+
+
+@ti.func
+def is_tracked(env, lane, track: AnyTensor):
+    """1 while the tracker has this body."""
+    limit = LOST_HEIGHT_S if track[env, lane, 6] > 0.5 else LOST_S
+    return track[env, lane, 5] < limit and track[env, lane, 4] >= BORN_S - 1e-4
+
+
+@ti.func
+def write_raw(
+    env, lane, number, at, over, under, t_s, radius, path: AnyTensor, track: AnyTensor, raw: AnyTensor
+):
+    """What the tracker delivers of a body that is tracked. A closed way that was watched once around is
+    foreseen as it is, a circle after a while, other ways straight on."""
+    circle = path[number, lane, 0] < 0.5
+    turn = 0.0
+    if circle and track[env, lane, 4] > TURN_KNOWN_S:
+        turn = path[number, lane, 4] / path[number, lane, 1]
+    for i in ti.static(range(4)):
+        raw[env, lane, i] = track[env, lane, i]
+    raw[env, lane, 4], raw[env, lane, 5], raw[env, lane, 8] = turn, radius, track[env, lane, 5]
+    if track[env, lane, 6] > 0.5:
+        raw[env, lane, 6] = over if over > 0.0 else (COLUMN_M if under > 0.0 else 0.0)
+        raw[env, lane, 7] = under if under > 0.0 else (COLUMN_M if over > 0.0 else 0.0)
+    is_known = not circle and track[env, lane, 7] > path[number, lane, 2]
+    for k in ti.static(range(2)):
+        half = 0.5 * turn * (k + 1.0)
+        arc = 1.0 if ti.abs(half) < 1e-4 else ti.sin(half) / half
+        c, s = arc * (k + 1.0) * ti.cos(half), arc * (k + 1.0) * ti.sin(half)
+        raw[env, lane, 9 + 2 * k] = c * track[env, lane, 2] - s * track[env, lane, 3]
+        raw[env, lane, 10 + 2 * k] = s * track[env, lane, 2] + c * track[env, lane, 3]
+        if is_known:
+            later = path_place(number, lane, t_s + (k + 1.0), path)
+            raw[env, lane, 9 + 2 * k], raw[env, lane, 10 + 2 * k] = later[0] - at[0], later[1] - at[1]
+    raw[env, lane, 13] = 1.0
+
+
+@ti.func
+def write_truth(env, lane, number, at, over, t_s, ego: FloatMatrix, path: AnyTensor, truth: AnyTensor):
+    """Where a body is and will be, for the critic."""
+    fx, fy = 0.25 * ego[env, AT_FLIP], 0.25 * ego[env, AT_FLIP + 1]
+    x, y = ego[env, AT_POS], ego[env, AT_POS + 1]
+    truth[env, lane, 0], truth[env, lane, 1] = fx * (at[0] - x), fy * (at[1] - y)
+    truth[env, lane, 2], truth[env, lane, 3] = 1.0, ti.math.clamp(over, -COLUMN_M, COLUMN_M)
+    for k in ti.static(range(3)):
+        later = path_place(number, lane, t_s + (k + 1.0), path)
+        truth[env, lane, 4 + 2 * k] = fx * (later[0] - x)
+        truth[env, lane, 5 + 2 * k] = fy * (later[1] - y)
+
+
+@ti.kernel
+def sense_twin(
+    io: Bundle[TwinRules],
+    seed: int,
+    count: int,
+    body: AnyTensor,
+    path: AnyTensor,
+    scenario: IntVector,
+    ego: FloatMatrix,
+    track: AnyTensor,
+    raw: AnyTensor,
+    ray: FloatMatrix,
+    truth: AnyTensor,
+):
+    """Tracks, rays, and what only a critic may see, after a decision or a reset. The noise is a function of
+    (``seed``, ``count``) and the env.
+
+    ``track`` (n, lanes, 8): estimated x, y, vx, vy; seen for [s]; not seen for [s]; 1 = height known; watched
+    way [m].
+    """
+    for env in range(ego.shape[0]):
+        number, t_s = scenario[env], ego[env, AT_TIME]
+        n_rest = body.shape[1] - path.shape[1]
+        x, y, z = ego[env, AT_POS], ego[env, AT_POS + 1], ego[env, AT_POS + 2]
+        key = episode_key(seed + count, env)
+        for lane in range(path.shape[1]):
+            slot = n_rest + lane
+            for i in range(raw.shape[2]):
+                raw[env, lane, i] = 0.0
+            for i in range(truth.shape[2]):
+                truth[env, lane, i] = 0.0
+            if body[number, slot, 0] > 0.5:
+                at = path_place(number, lane, t_s, path)
+                radius, high, level = body[number, slot, 4], body[number, slot, 6], body[number, slot, 3]
+                dx, dy = at[0] - x, at[1] - y
+                far = ti.max(ti.sqrt(dx * dx + dy * dy), 1e-3)
+                clear = is_hidden(number, n_rest, x, y, at[0], at[1], body) == 0
+                fan = ti.abs(z - level) - high < ti.max(far - radius, 0.0) * FAN_SLOPE
+                bearing = wrapped_angle(ti.atan2(dy, dx) - ego[env, AT_YAW])
+                camera = clear and ti.abs(bearing) < TWO_PI / 8 and far < CAMERA_RANGE_M
+                visible = clear and far < RANGE_M and (fan or camera)
+                knows = camera and far < HEIGHT_RANGE_M
+                update_track(env, lane, number, at, visible, knows, key, ego, path, track)
+                over, under = level - high - z, z - level - high
+                if is_tracked(env, lane, track):
+                    write_raw(env, lane, number, at, over, under, t_s, radius, path, track, raw)
+                write_truth(env, lane, number, at, over, t_s, ego, path, truth)
+        for i in range(N_RAY):
+            angle = i * (TWO_PI / N_RAY)
+            ray[env, i] = free_along(number, n_rest, x, y, ti.cos(angle), ti.sin(angle), body, io)
