@@ -270,6 +270,53 @@ def sweep(
 _SWEEP_RESUME = ("allow_code", "world", "episodes", "seeds", "engine", "workers", "address", "device")
 
 
+# -------------------------------------------------------------------------------------------------- benchmark
+
+
+@app.command("benchmark", epilog="Example: uuv benchmark pool --controller examples/own_field.py --quick")
+def enter_benchmark(
+    name: opt.BenchmarkName = None,
+    file: opt.EntryFile = None,
+    controller: opt.EntryController = None,
+    planner: opt.Planners = None,
+    policy: opt.Policies = None,
+    quick: opt.Quick = False,
+    sample: opt.Sample = None,
+    num_envs: opt.Batch = None,
+    device: opt.Device = "auto",
+    run_dir: opt.RunDir = None,
+    wide: opt.Wide = False,
+    as_json: opt.AsJson = False,
+) -> None:
+    """Play fixed scenes that others play too, and write what came of it as a file; or check such a file.
+    Exit code 3: an entry disagrees with its replay."""
+    from uuvtai.show import benchmarking
+
+    arguments.refuse_odd_benchmark(name, file, quick, sample, num_envs, run_dir)
+    if name is None:
+        from uuvtai.measure.benchmark.benchmark_scenes import catalogue
+
+        found = catalogue()
+        _print(found, as_json, lambda: benchmarking.show_scenes(Screen(wide), found))
+        return
+    from uuvtai.measure.benchmark import entering, entrant, verifying
+
+    given = controller or planner or policy
+    who = [controller] if controller else ["none"] if given else ["bt"]
+    pilot = entrant.entrant_of(*arguments.drivers(None, who, planner, policy))
+    if file is None:
+        asked = entering.BenchmarkRequest(name, pilot, quick, num_envs, device, run_dir)
+        entry, folder = entering.enter(asked, Progress())
+        path = folder / entering.FILE
+        _print(entry, as_json, lambda: benchmarking.show_entry(Screen(wide), entry, path))
+        return
+    most = verifying.SAMPLE if sample is None else sample
+    checked = verifying.verify(file, pilot if given else None, Progress(), most, device)
+    _print(checked, as_json, lambda: benchmarking.show_check(Screen(wide), checked))
+    if not checked["ok"]:
+        raise typer.Exit(GATE)
+
+
 # ----------------------------------------------------------------------------------------- profile, reproduce
 
 
