@@ -384,11 +384,20 @@ def reproduce(
 def report_run(
     runs: opt.ReportRuns,
     out: opt.ReportOut = None,
+    paper: opt.ReportPaper = None,
     force: opt.ReportForce = False,
     as_json: opt.AsJson = False,
 ) -> None:
     """Write one self-contained HTML page of a run: tables, figures, pictures, videos, and where they come
-    from."""
+    from; or, with --paper, figures and tables for a paper."""
+    if paper is not None:
+        if out is not None or force:
+            raise UsageError("--paper: writes a folder of its own; leave out --out and --force")
+        from uuvtai.report.paper_kit import paper as write_paper
+
+        kit = write_paper(runs, paper)
+        _print(kit.document(), as_json, lambda: typer.echo(str(kit.folder)))
+        return
     from uuvtai.report.build import report
 
     written = report(runs, out, force)

@@ -317,6 +317,13 @@ ReportRuns = Annotated[
 ReportOut = Annotated[
     Path | None, Option("--out", help="The page \\[default: RUN/report.html]; figures/ is made beside it.")
 ]
+ReportPaper = Annotated[
+    Path | None,
+    Option(
+        "--paper",
+        help="New or empty folder for a paper's kit: figures as PDF and SVG, tables as LaTeX and CSV, captions.",
+    ),
+]
 ReportForce = Annotated[bool, Option("--force", help="Replace files that are there already.")]
 ExportRun = Annotated[str | None, _players("[RUN]", "Run folder, checkpoint folder or shipped name (best).")]
 ExportOut = Annotated[Path | None, Option("--out", help="New folder \\[default: runs/NAME_export].")]
