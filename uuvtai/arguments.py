@@ -135,7 +135,9 @@ def refuse_odd_benchmark(
     if is_check and (quick or num_envs is not None or run_dir is not None):
         raise UsageError("--quick, --num-envs, --run-dir: not with verify, which writes nothing")
     if sample is not None and not is_check:
-        raise UsageError("--sample: belongs to verify, for example: uuv benchmark verify entry.json --sample 16")
+        raise UsageError(
+            "--sample: belongs to verify, for example: uuv benchmark verify entry.json --sample 16"
+        )
     if sample is not None:
         refuse_less("--sample", sample, 0)
     if num_envs is not None:

@@ -247,13 +247,13 @@ SweepResume = Annotated[Path | None, _resume("Run folder of a sweep to go on wit
 BenchmarkName = Annotated[
     str | None,
     Argument(
-        metavar="[NAME|verify]",
+        metavar="NAME|verify",
         help=f"What to enter: {', '.join(benchmarks.NAMES)}; or verify, to check an entry's FILE \\[default: "
         "list them].",
         autocompletion=lambda: [*benchmarks.NAMES, "verify"],
     ),
 ]
-EntryFile = Annotated[Path | None, Argument(metavar="[FILE]", help="With verify: the entry, an entry.json.")]
+EntryFile = Annotated[Path | None, Argument(metavar="FILE", help="With verify: the entry, an entry.json.")]
 EntryController = Annotated[
     str | None,
     Option(
@@ -321,7 +321,8 @@ ReportPaper = Annotated[
     Path | None,
     Option(
         "--paper",
-        help="New or empty folder for a paper's kit: figures as PDF and SVG, tables as LaTeX and CSV, captions.",
+        help="New or empty folder for a paper's kit: figures as PDF and SVG, tables as LaTeX and CSV, "
+        "captions.",
     ),
 ]
 ReportForce = Annotated[bool, Option("--force", help="Replace files that are there already.")]

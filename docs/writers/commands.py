@@ -43,8 +43,8 @@ EXIT_CODES = (
     ),
     (
         endings.GATE,
-        "finished, but a gate was not met: `uuv export` found that an exported policy disagrees, `uuv benchmark "
-        "verify` that an entry does",
+        "finished, but a gate was not met: `uuv export` found that an exported policy disagrees, `uuv "
+        "benchmark verify` that an entry does",
     ),
     (
         endings.INTERRUPTED,

@@ -35,8 +35,8 @@ _SPECIAL = {
 _LETTERS = range(0xC0, 0x100)
 """letters with accents that every LaTeX knows in UTF-8"""
 _NO_LETTERS = (0xD7, 0xF7)
-_WIDE_COLUMNS, _WIDE_CHARACTERS = 6, 62
-"""a table of more does not fit one column of a page"""
+_COLUMN_CHARACTERS, _GAP = 52, 2
+"""what fits one column of a page, and what a column of the table takes beside its words"""
 _PROSE = "p{0.3\\linewidth}"
 
 
@@ -94,8 +94,10 @@ def tabular(table: Table, remark: str) -> str:
 def is_wide(table: Table) -> bool:
     """Whether a table wants both columns of a page."""
     columns, cells = table.on(PAGE)
-    widths = [max(len(str(row[i])) for row in [[c.head for c in columns], *cells]) for i in range(len(columns))]
-    return len(columns) > _WIDE_COLUMNS or sum(widths) > _WIDE_CHARACTERS
+    widths = [
+        max(len(str(row[i])) for row in [[c.head for c in columns], *cells]) for i in range(len(columns))
+    ]
+    return sum(widths) + _GAP * len(widths) > _COLUMN_CHARACTERS
 
 
 def float_of(kind: str, name: str, caption: str, body: Sequence[str], wide: bool = False) -> str:

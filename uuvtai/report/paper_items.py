@@ -27,6 +27,8 @@ from uuvtai.tables.wording import axis_name, number, probability, value_name, wi
 _MOST_EPISODES = 6
 """whose ways are drawn"""
 _LOG = re.compile(r"(?P<method>.+)_seed(?P<seed>-?\d+)_episode(?P<episode>\d+)")
+_WORDS = 3
+"""of a table's title that name it"""
 _WILSON = "95 % Wilson intervals"
 
 
@@ -63,7 +65,9 @@ def items_of(run: Path) -> list[PaperItem]:
     if (document := read_json(run, "sweep.json")) and document["cells"]:
         found += _of_sweep(document, origin)
     if document := read_json(run, "profile.json"):
-        found += list(_of_blocks(timing(document), origin, "one measurement on the machine that the run names"))
+        found += list(
+            _of_blocks(timing(document), origin, "One measurement on the machine that the run names")
+        )
     return found
 
 
@@ -80,11 +84,9 @@ def _of_blocks(blocks: Iterable[Block], origin: str, n: str) -> Iterable[PaperIt
             is_stages, is_cells = block.name == "stages", block.name.startswith("heat_map")
             panels = [of_panel(panel, is_cells, is_stages) for panel in block.panels]
             caption = _sentences(block.caption, n)
-            yield PaperItem(
-                block.name, caption, origin, block.data, panels=panels, both_widths=not is_stages
-            )
+            yield PaperItem(block.name, caption, origin, block.data, panels=panels, both_widths=not is_stages)
         elif isinstance(block, Table):
-            name = f"table_{i}" if not block.title else block.title.partition(":")[0][:40]
+            name = " ".join(re.findall(r"\w+", block.title)[:_WORDS]) or f"table_{i}"
             yield PaperItem(name, _sentences(block.title, n), origin, block.data, table=block)
 
 
@@ -137,7 +139,7 @@ def _of_evaluation(result: dict[str, Any], origin: str) -> list[PaperItem]:
         PaperItem(
             "methods",
             f"Methods on the same episodes. {scene} {n}; rates with {_WILSON}, collision counts contacts, "
-            f"stops for the time to collision and leaving the tank; times over successes, with 95 % bootstrap "
+            "stops for the time to collision and leaving the tank; times over successes, with 95 % bootstrap "
             f"intervals.{note}",
             origin,
             data,
@@ -210,10 +212,7 @@ def _of_sweep(document: dict[str, Any], origin: str) -> list[PaperItem]:
     n = f"n = {counts[0]}{most} episodes a cell"
     drawn = [block for block in sweep(document) if isinstance(block, Figure)]
     kept = f"{n}; counts and {_WILSON} of every cell: the data beside it"
-    found = [
-        replace(item, caption=_of_print(item.caption))
-        for item in _of_blocks(drawn, origin, kept)
-    ]
+    found = [replace(item, caption=_of_print(item.caption)) for item in _of_blocks(drawn, origin, kept)]
     if len(varying(document["axes"])) < 2 or varies_alone(document):
         caption = f"Every cell of the sweep. World {document.get('world', '-')}; {n}, {_WILSON}."
         return [*found, PaperItem("cells", caption, origin, cells_data(cells), table=_cells(cells, document))]
@@ -265,4 +264,6 @@ def _cells(cells: list[dict[str, Any]], document: dict[str, Any]) -> Table:
 
 
 def _axis(name: str) -> Column:
-    return Column(axis_name(name), left=True, of=lambda cell: "-" if cell.get(name) is None else value_name(cell[name]))
+    return Column(
+        axis_name(name), left=True, of=lambda cell: "-" if cell.get(name) is None else value_name(cell[name])
+    )

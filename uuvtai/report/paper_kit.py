@@ -1,4 +1,4 @@
-"""``uuv report --paper DIR``: figures, tables and captions of finished runs for a paper, whole or not at all."""
+"""``uuv report --paper DIR``: figures, tables and captions of finished runs, whole or not at all."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from uuvtai.loader import ConfigError
 from uuvtai.report import latex
 from uuvtai.report.build import NOTHING, damage_named, refuse_run, training_of
 from uuvtai.report.paper_items import PaperItem, items_of, items_of_trainings, origin_of
-from uuvtai.report.paper_style import ONE_COLUMN_IN, TWO_COLUMNS_IN, sheets
+from uuvtai.report.paper_style import ONE_COLUMN_IN, TWO_COLUMNS_IN, height_in, sheets
 from uuvtai.report.run_files import read_json
 from uuvtai.run_folder import RunFolderError, write_atomic
 from uuvtai.tables.table import Data, Table
@@ -23,6 +23,8 @@ _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 """what a spreadsheet takes a text that begins so for"""
 _MARKDOWN = re.compile(r"([\\`*_{}\[\]<>#|&!])")
 _MOST_ITEMS = 400
+_TALL_IN = 6.5
+"""a figure that is higher in one column stands in two"""
 
 
 @dataclass(frozen=True)
@@ -100,7 +102,7 @@ def _refuse_reproduction(run: Path) -> None:
 
 
 def _named(found: Iterator[tuple[Path, PaperItem]], several: bool) -> list[PaperItem]:
-    """The items under names that files may have, each kind's once: after their run where there are several."""
+    """The items under names that files may have, each kind's once; with their run where there are several."""
     items: list[PaperItem] = []
     taken: set[tuple[bool, str]] = set()
     for run, item in found:
@@ -147,7 +149,7 @@ def _texts(table: Table) -> Data:
 def _csv(data: Data) -> str:
     """CSV in which no text is a formula."""
     rows = [[_harmless(value) for value in row] for row in data.rows]
-    return Data([_harmless(column) for column in data.columns], rows).csv()
+    return Data([str(_harmless(column)) for column in data.columns], rows).csv()
 
 
 def _harmless(value: object) -> object:
@@ -170,7 +172,8 @@ def _tex(items: Sequence[PaperItem]) -> str:
             body, kind = [rf"\input{{tables/{item.name}}}"], "table"
             is_wide = latex.is_wide(item.table)
         else:
-            is_wide, kind = not item.both_widths, "figure"
+            is_tall = height_in(item.panels, ONE_COLUMN_IN) > _TALL_IN
+            is_wide, kind = is_tall or not item.both_widths, "figure"
             width = r"\textwidth" if is_wide else r"\columnwidth"
             file = f"figures/{item.name}_{'2col' if is_wide else '1col'}.pdf"
             body = [rf"\includegraphics[width={width}]{{{file}}}"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -72,17 +73,27 @@ def of_panel(panel: Panel, is_cells: bool = False, spans: bool = False) -> Paper
     return PaperPanel(panel.draw, lambda _width: height, is_cells, spans)
 
 
-def sheets(panels: Sequence[PaperPanel], width_in: float) -> dict[str, bytes]:
-    """The figure as 'pdf' and 'svg': one panel below the other in one column, two side by side in two."""
+def height_in(panels: Sequence[PaperPanel], width_in: float) -> float:
+    """Of the figure [in]."""
+    return math.fsum(_row_heights(panels, width_in)[1])
+
+
+def _row_heights(panels: Sequence[PaperPanel], width_in: float) -> tuple[int, list[float]]:
+    """How many panels stand side by side, and the height of each row [in]."""
     is_wide = width_in > ONE_COLUMN_IN
     across = 2 if is_wide and len(panels) > 1 and not any(panel.spans for panel in panels) else 1
     rows = [panels[i : i + across] for i in range(0, len(panels), across)]
-    heights = [max(panel.height_in(width_in / across) for panel in row) for row in rows]
+    return across, [max(panel.height_in(width_in / across) for panel in row) for row in rows]
+
+
+def sheets(panels: Sequence[PaperPanel], width_in: float) -> dict[str, bytes]:
+    """The figure as 'pdf' and 'svg': one panel below the other in one column, two side by side in two."""
+    across, heights = _row_heights(panels, width_in)
     with _style():
         from matplotlib.figure import Figure as Sheet
 
         sheet = Sheet(figsize=(width_in, math.fsum(heights)), layout="constrained", facecolor="white")
-        grid = sheet.subplots(len(rows), across, squeeze=False, gridspec_kw={"height_ratios": heights})
+        grid = sheet.subplots(len(heights), across, squeeze=False, gridspec_kw={"height_ratios": heights})
         for spare in grid.flatten()[len(panels) :]:
             spare.remove()
         places = list(zip(panels, grid.flatten(), strict=False))
@@ -111,14 +122,14 @@ def _settle(sheet: Sheet, cells: Sequence[Axes]) -> None:
         if _touch([label for label in axes.get_xticklabels() if label.get_text()]):
             axes.tick_params(axis="x", labelrotation=30)
             for label in axes.get_xticklabels():
-                label.set_ha("right")
+                label.set_horizontalalignment("right")
     for axes in cells:
         _shrink(axes)
 
 
 def _touch(labels: Sequence[Any]) -> bool:
     boxes = sorted((label.get_window_extent() for label in labels), key=lambda box: box.x0)
-    return any(left.x1 > right.x0 for left, right in zip(boxes, boxes[1:], strict=False))
+    return any(left.x1 > right.x0 for left, right in itertools.pairwise(boxes))
 
 
 def _shrink(axes: Axes) -> None:

@@ -13,7 +13,9 @@ from uuvtai.tables.benchmark_tables import checks_table, entry_table, scenes_tab
 def show_scenes(screen: Screen, document: dict[str, Any]) -> None:
     """What there is to enter, and how."""
     screen.table(scenes_table(document))
-    screen.line("enter one: uuv benchmark pool --controller mine.py:act; all of them: uuv benchmark all", "dim")
+    screen.line(
+        "enter one: uuv benchmark pool --controller mine.py:act; all of them: uuv benchmark all", "dim"
+    )
     screen.line("check an entry: uuv benchmark verify entry.json (docs/benchmark.md)", "dim")
 
 

@@ -1,5 +1,5 @@
-"""The scenes of ``uuv benchmark``. They are fixed: whoever changes one raises ``VERSION``, and old entries are
-of another benchmark."""
+"""The scenes of ``uuv benchmark``. They are fixed: whoever changes one raises ``VERSION``, and old entries
+are of another benchmark."""
 
 from __future__ import annotations
 

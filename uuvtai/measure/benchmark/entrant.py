@@ -75,4 +75,3 @@ def entrant_of(trained: list[str], controllers: list[str]) -> Entrant:
 def sha256_of_method(method: Method) -> str:
     """Of what drives: a tree as it is played, a checkpoint, the file of a piece."""
     return drivers_of([method])[method.name]
-

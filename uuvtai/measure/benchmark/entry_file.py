@@ -113,8 +113,8 @@ def read_entry(file: Path) -> Entry:
         entry = Entry.model_validate_json(text)
     except (ValidationError, RecursionError) as error:
         raise EntryError(
-            f"{file}: is no entry of a benchmark ({_reason(error)}); give the entry.json that 'uuv benchmark' "
-            "wrote"
+            f"{file}: is no entry of a benchmark ({_reason(error)}); give the entry.json that 'uuv "
+            "benchmark' wrote"
         ) from None
     if sealed(document)["seal"] != entry.seal:
         raise EntryError(

@@ -32,8 +32,8 @@ def digest_of(document: Any) -> str:
 
 
 def sealed(entry: dict[str, Any]) -> dict[str, Any]:
-    """An entry with the sha256 of all the rest. It shows that a file was damaged or changed by hand; it proves
-    nothing about who wrote it, for everybody can compute it."""
+    """An entry with the sha256 of all the rest. It shows that a file was damaged or changed by hand; it
+    proves nothing about who wrote it, for everybody can compute it."""
     whole = {key: value for key, value in entry.items() if key != "seal"}
     return whole | {"seal": digest_of(whole)}
 
@@ -63,7 +63,9 @@ def piece_files(spec: PieceSpec) -> dict[str, str]:
     found, left = {}, _MAX_BYTES
     for path in sorted(paths):
         if len(found) >= _MAX_FILES:
-            raise FileError(f"{spec.path}: brings more than {_MAX_FILES} files; put it into a folder of its own")
+            raise FileError(
+                f"{spec.path}: brings more than {_MAX_FILES} files; put it into a folder of its own"
+            )
         content = read_bytes(path, left)
         left -= len(content)
         name = path.relative_to(folder) if path.is_relative_to(folder) else Path(path.name)
@@ -72,8 +74,8 @@ def piece_files(spec: PieceSpec) -> dict[str, str]:
 
 
 def _modules_below(folder: Path) -> Iterator[Path]:
-    """Files of the modules that were imported from a folder as a Python beside the piece is: FOLDER/name.py or
-    FOLDER/name/..., not what happens to be installed somewhere below."""
+    """Files of the modules that were imported from a folder as a Python beside the piece is: FOLDER/name.py
+    or FOLDER/name/..., not what happens to be installed somewhere below."""
     for module in list(sys.modules.values()):
         name = getattr(module, "__file__", None)
         path = Path(name).resolve() if isinstance(name, str) and name.endswith(".py") else None

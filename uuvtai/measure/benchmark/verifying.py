@@ -84,7 +84,8 @@ def verify(
     method = entrant.method(next(iter(pairs.values()))[0].config(), watch)
     checks = [
         _check("form, seal, counts", True, "in order"),
-        _same("code", entry.code.sha256, sources_sha256(), f"uuvtai {entry.code.version}") | {"is_told": True},
+        _same("code", entry.code.sha256, sources_sha256(), f"uuvtai {entry.code.version}")
+        | {"is_told": True},
         _same("pilot", entry.pilot.sha256, sha256_of_method(method), entrant.name),
     ]
     replays = []
@@ -127,7 +128,9 @@ def _scene(
     """Checks of one scene, and what became of its sample."""
     ours = condition_sha256(bench.config())
     checks = [_same(f"config of {bench.name}", played.config_sha256, ours, "the scene's settings")]
-    numbers = sorted(random.SystemRandom().sample(range(len(played.episodes)), min(sample, len(played.episodes))))
+    numbers = sorted(
+        random.SystemRandom().sample(range(len(played.episodes)), min(sample, len(played.episodes)))
+    )
     differences = []
     if numbers:
         sim = replay.simulator(bench)
@@ -170,7 +173,9 @@ def _files(entry: Entry, entrant: Entrant) -> list[Check]:
         return []
     ours = entrant.files()
     other = [name for name, sha256 in entry.pilot.files.items() if ours.get(name) != sha256]
-    return [_check("pilot's files", not other, f"not the entry's: {', '.join(other)}" if other else "the same")]
+    return [
+        _check("pilot's files", not other, f"not the entry's: {', '.join(other)}" if other else "the same")
+    ]
 
 
 def _row(result: EpisodeResult) -> _EpisodeRow:
