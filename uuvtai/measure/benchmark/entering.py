@@ -71,10 +71,11 @@ def enter(asked: BenchmarkRequest, watch: EvaluationWatch) -> tuple[dict[str, An
     folder = asked.run_dir or default_run_dir(f"benchmark_{asked.name}")
     pilot = {"name": method.name, "typed": asked.entrant.typed, "is_shipped": asked.entrant.is_shipped}
     pilot["sha256"] = sha256_of_method(method)
+    code = {"version": __version__, "sha256": sources_sha256(), "commit": git_sha()}
     played, entry = [], {}
     for bench in scenes:
         played.append(_played(bench, asked, folder, watch))
-        entry = _entry(asked, pilot | {"files": asked.entrant.files()}, played)
+        entry = _entry(asked, pilot | {"files": asked.entrant.files()}, code, played)
         _write(folder / FILE, entry)
     return entry, folder
 
@@ -111,7 +112,9 @@ def _rounded(value: Any) -> Any:
     return round(value, _DIGITS) if isinstance(value, float) else value
 
 
-def _entry(asked: BenchmarkRequest, pilot: dict[str, Any], played: list[dict[str, Any]]) -> dict[str, Any]:
+def _entry(
+    asked: BenchmarkRequest, pilot: dict[str, Any], code: dict[str, Any], played: list[dict[str, Any]]
+) -> dict[str, Any]:
     machine = hardware()
     found = {
         "schema": 1,
@@ -119,7 +122,7 @@ def _entry(asked: BenchmarkRequest, pilot: dict[str, Any], played: list[dict[str
         "benchmark_version": VERSION,
         "is_entry": not asked.quick,
         "pilot": pilot,
-        "code": {"version": __version__, "sha256": sources_sha256(), "commit": git_sha()},
+        "code": code,
         "versions": versions(),
         "machine": f"{machine['cpu']}, {machine['cores']} cores, {machine['system']}",
         "command": shlex.join(["uuv", *sys.argv[1:]]),
