@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
+from uuvtai.report.plain_text import shown
 from uuvtai.tables.table import PAGE, Column, Table
 
 _SPECIAL = {
@@ -37,6 +39,8 @@ _LETTERS = range(0xC0, 0x100)
 _NO_LETTERS = (0xD7, 0xF7)
 _COLUMN_CHARACTERS, _GAP = 52, 2
 """what fits one column of a page, and what a column of the table takes beside its words"""
+_MINUS = re.compile(r"(?<![\w.-])-(?=\d)")
+"""before a number of a table"""
 _PROSE = "p{0.3\\linewidth}"
 
 
@@ -57,12 +61,11 @@ def _character(c: str) -> str:
 
 def comment(text: str) -> str:
     """A line that LaTeX does not read, whatever stands in it."""
-    plain = "".join(c if c.isprintable() else " " for c in text)
-    return f"% {' '.join(plain.split())}"
+    return f"% {shown(text)}"
 
 
 def _cell(text: str) -> str:
-    found = escaped(text)
+    found = escaped(_MINUS.sub("\N{MINUS SIGN}", text))
     # behind \\ LaTeX takes a bracket or a star for a part of it
     return f"{{{found[0]}}}{found[1:]}" if found[:1] in ("[", "*") else found
 

@@ -13,6 +13,7 @@ from uuvtai.report.learning_curves import Training, training
 from uuvtai.report.methods_table import conditions, evaluation_data, paired_data
 from uuvtai.report.paper_panels import bars, ways
 from uuvtai.report.paper_style import PaperPanel, of_panel
+from uuvtai.report.plain_text import all_shown, shown
 from uuvtai.report.provenance import command_of
 from uuvtai.report.run_files import read_json
 from uuvtai.report.sweep import ON_HOVER, by_method, cells_data, sweep
@@ -52,29 +53,36 @@ def origin_of(run: Path) -> str:
     record = read_json(run, "run.json") or {}
     version = (record.get("versions") or {}).get("uuvtai", "unknown")
     commit = record.get("git_sha") or "not known"
-    return f"command: {command_of(record) or 'not known'}\ncommit: {commit} (uuvtai {version})"
+    command = shown(command_of(record)) or "not known"
+    return f"command: {command}\ncommit: {shown(str(commit))} (uuvtai {shown(str(version))})"
 
 
 def items_of(run: Path) -> list[PaperItem]:
     """All that a run folder other than a training has to show."""
     origin = origin_of(run)
     found: list[PaperItem] = []
-    if result := read_json(run, "eval/result.json"):
+    if result := _read(run, "eval/result.json"):
         found += _of_evaluation(result, origin)
     found += _of_logs(run, origin)
-    if (document := read_json(run, "sweep.json")) and document["cells"]:
+    if (document := _read(run, "sweep.json")) and document["cells"]:
         found += _of_sweep(document, origin)
-    if document := read_json(run, "profile.json"):
+    if document := _read(run, "profile.json"):
         found += list(
             _of_blocks(timing(document), origin, "One measurement on the machine that the run names")
         )
     return found
 
 
+def _read(run: Path, name: str) -> dict[str, Any] | None:
+    """A document of a run without what cannot be shown."""
+    return all_shown(read_json(run, name))
+
+
 def items_of_trainings(trainings: Sequence[Training], origin: str) -> list[PaperItem]:
     """Curves of trainings, those that differ in their seed only as one line with its band."""
+    plain = [replace(one, name=shown(one.name), preset=shown(one.preset)) for one in trainings]
     runs = f"n = {len(trainings)} training{'s' if len(trainings) != 1 else ''}"
-    return list(_of_blocks(training(trainings), origin, f"{runs}; no intervals"))
+    return list(_of_blocks(training(plain), origin, f"{runs}; no intervals"))
 
 
 def _of_blocks(blocks: Iterable[Block], origin: str, n: str) -> Iterable[PaperItem]:
@@ -172,7 +180,7 @@ def _paired(pairs: list[dict[str, Any]], scene: str, origin: str) -> list[PaperI
     rows = [{**pair, "holm_p": p} for pair, p in zip(pairs, adjusted, strict=True)]
     caption = (
         f"Pairs of methods. {scene} n = {pairs[0]['episodes']} pairs of episodes; who alone arrives, p of "
-        f"McNemar's exact test, the same adjusted for {len(pairs)} tests by Holm; difference in time where "
+        f"McNemar's exact test, the same adjusted by Holm (tests: {len(pairs)}); difference in time where "
         "both arrive, with its 95 % bootstrap interval."
     )
     given = paired_data(pairs)
@@ -194,8 +202,8 @@ def _of_logs(run: Path, origin: str) -> list[PaperItem]:
         panel, said = ways(logs)
         caption = (
             f"Ways of {len(logs)} method{'s' if len(logs) > 1 else ''} through one episode, chosen by its "
-            f"number: {said}. Grey: what rests; dashed: ways of what moves, and where it is when the first "
-            "method ends; cross: an end that is no success. n = 1 episode; no intervals."
+            f"number: {said}; dashed: their ways. Grey: what rests; cross: an end that is no success. "
+            "n = 1 episode; no intervals."
         )
         name = f"ways_seed{seed}_episode{episode}"
         found.append(PaperItem(name, caption, origin, None, panels=[panel]))
@@ -218,7 +226,9 @@ def _of_sweep(document: dict[str, Any], origin: str) -> list[PaperItem]:
         return [*found, PaperItem("cells", caption, origin, cells_data(cells), table=_cells(cells, document))]
     for method, own in by_method(cells).items():
         table, note = _grid(own, document)
-        caption = f"{method}: success / collision [%]. World {document.get('world', '-')}; {n}.{note}"
+        caption = (
+            f"{method}: success / collision [%]. World {document.get('world', '-')}; {n}{_widest(own)}.{note}"
+        )
         found.append(PaperItem(f"grid_{method}", caption, origin, cells_data(own), table=table))
     return found
 
@@ -227,6 +237,17 @@ def _of_print(caption: str) -> str:
     """A caption of the page where nothing can be pointed at, and panels may stand one below the other."""
     said = caption.replace(f" {ON_HOVER}.", "")
     return said.replace("(left)", "(first)").replace("(right)", "(second)")
+
+
+def _widest(cells: list[dict[str, Any]]) -> str:
+    """How far the intervals of a grid reach at most; nothing where none is known."""
+    bounds = [
+        cell[f"{key}_ci95"] for cell in cells for key in ("success", "collision") if cell.get(f"{key}_ci95")
+    ]
+    if not bounds:
+        return ""
+    most = max(100 * (high - low) for low, high in bounds)
+    return f", {_WILSON} at most {most:.0f} points wide, each in the CSV beside it"
 
 
 def _both(cell: dict[str, Any]) -> str:

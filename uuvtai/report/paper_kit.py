@@ -12,6 +12,7 @@ from uuvtai.report import latex
 from uuvtai.report.build import NOTHING, damage_named, refuse_run, training_of
 from uuvtai.report.paper_items import PaperItem, items_of, items_of_trainings, origin_of
 from uuvtai.report.paper_style import ONE_COLUMN_IN, TWO_COLUMNS_IN, height_in, sheets
+from uuvtai.report.plain_text import shown
 from uuvtai.report.run_files import read_json
 from uuvtai.run_folder import RunFolderError, write_atomic
 from uuvtai.tables.table import Data, Table
@@ -185,14 +186,10 @@ def _markdown(items: Sequence[PaperItem]) -> str:
     parts = ["# Captions"]
     for item in items:
         kind = "Figure" if item.table is None else "Table"
-        origin = "\n".join(f"    {' '.join(_printable(line).split())}" for line in item.origin.splitlines())
-        said = _MARKDOWN.sub(r"\\\1", " ".join(_printable(item.caption).split()))
+        origin = "\n".join(f"    {shown(line)}" for line in item.origin.splitlines())
+        said = _MARKDOWN.sub(r"\\\1", shown(item.caption))
         parts += [f"## {kind} {item.name}", said, origin]
     return "\n\n".join(parts) + "\n"
-
-
-def _printable(text: str) -> str:
-    return "".join(c if c.isprintable() else " " for c in text)
 
 
 def _write(folder: Path, files: dict[str, bytes]) -> list[Path]:

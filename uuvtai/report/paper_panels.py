@@ -10,6 +10,7 @@ from uuvtai.report.blocks import Hover
 from uuvtai.report.colours import method_colours
 from uuvtai.report.ink import INK
 from uuvtai.report.paper_style import PaperPanel
+from uuvtai.report.plain_text import shown
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -57,7 +58,9 @@ def ways(logs: Sequence[Path]) -> tuple[PaperPanel, str]:
         (x0, x1), (y0, y1) = scenario["tank"]["x_m"], scenario["tank"]["y_m"]
         ratio = (y1 - y0) / (x1 - x0)
         said = f"world {scenario['world']}, seed {scenario['seed']}, episode {scenario['episode']}"
-        endings = "; ".join(f"{one.method}: {one.ending} after {one.duration_s:.1f} s" for one in found)
+        endings = "; ".join(
+            f"{shown(one.method)}: {one.ending} after {one.duration_s:.1f} s" for one in found
+        )
 
     def draw(axes: Axes) -> Hover:
         with drawing(logs[0]):
@@ -67,7 +70,10 @@ def ways(logs: Sequence[Path]) -> tuple[PaperPanel, str]:
     def height(width_in: float) -> float:
         return min(0.6 + 0.15 * -(-len(found) // 3) + ratio * (width_in - 0.5), _MOST_IN)
 
-    return PaperPanel(draw, height, spans=True), f"{said}. {endings}"
+    moment = f"when {shown(found[0].method)} ends"
+    return PaperPanel(
+        draw, height, spans=True
+    ), f"{said}. {endings}. Moving bodies are drawn where they are {moment}"
 
 
 def _draw_ways(axes: Axes, found: Sequence[Recording]) -> None:
@@ -80,11 +86,11 @@ def _draw_ways(axes: Axes, found: Sequence[Recording]) -> None:
     axes.set_aspect("equal")
     axes.add_patch(Polygon(tank_outline(scenario["tank"]), facecolor="none", edgecolor=INK, linewidth=1.0))
     _draw_bodies(axes, scenario, found[0].duration_s)
-    colours = method_colours([one.method for one in found])
+    colours = method_colours([shown(one.method) for one in found])
     for one in found:
         at = one.positions
-        ink = colours[one.method]
-        axes.plot(at[:, 0], at[:, 1], color=ink, linewidth=1.2, label=one.method)
+        ink = colours[shown(one.method)]
+        axes.plot(at[:, 0], at[:, 1], color=ink, linewidth=1.2, label=shown(one.method))
         end = "o" if one.outcome == "success" else "X"
         axes.plot([at[-1, 0]], [at[-1, 1]], color=ink, marker=end, markersize=4.5, linestyle="none")
     start, goal = scenario["start"], scenario["goal"]
@@ -116,5 +122,5 @@ def _draw_bodies(axes: Axes, scenario: dict[str, Any], time_s: float) -> None:
             continue
         period = body["path"]["length_m"] / max(body["path"]["speed_m_s"], 1e-6)
         way = body_positions(body, np.linspace(0, period, 181))
-        axes.plot(way[:, 0], way[:, 1], color=_MOVES, linewidth=0.5, linestyle=(0, (3, 2)), alpha=0.6)
+        axes.plot(way[:, 0], way[:, 1], color=_MOVES, linewidth=0.5, linestyle=(0, (3, 2)), alpha=0.45)
         axes.add_patch(Polygon(outline, facecolor="none", edgecolor=_MOVES, linewidth=0.8))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import itertools
 import math
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -89,8 +90,10 @@ def _row_heights(panels: Sequence[PaperPanel], width_in: float) -> tuple[int, li
 def sheets(panels: Sequence[PaperPanel], width_in: float) -> dict[str, bytes]:
     """The figure as 'pdf' and 'svg': one panel below the other in one column, two side by side in two."""
     across, heights = _row_heights(panels, width_in)
-    with _style():
+    with _style(), warnings.catch_warnings():
         from matplotlib.figure import Figure as Sheet
+
+        warnings.filterwarnings("ignore", "Glyph")  # a name may have letters that no font here has
 
         sheet = Sheet(figsize=(width_in, math.fsum(heights)), layout="constrained", facecolor="white")
         grid = sheet.subplots(len(heights), across, squeeze=False, gridspec_kw={"height_ratios": heights})
