@@ -320,3 +320,17 @@ def test_scenarios_are_equal_to_the_millimetre():
 
 def test_a_sample_is_drawn_by_chance():
     assert verifying.SAMPLE < benchmark_scenes.EPISODES
+
+
+ENTRIES = sorted((Path(__file__).parents[1] / "docs/data/benchmark").glob("*.json"))
+
+
+@pytest.mark.parametrize("path", ENTRIES, ids=lambda path: path.stem)
+def test_the_entries_of_the_page_are_whole(path):
+    entry = read_entry(path)
+    assert entry.is_entry and entry.pilot.name == path.stem
+    assert [scene.name for scene in entry.scenes] == [scene.name for scene in benchmark_scenes.SCENES]
+
+
+def test_the_page_has_an_entry_for_each_row():
+    assert {path.stem for path in ENTRIES} >= {"bt", "best", "planner", "straight"}

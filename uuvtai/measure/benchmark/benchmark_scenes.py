@@ -4,6 +4,7 @@ are of another benchmark."""
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from uuvtai.scene_options import SceneOptions
@@ -51,7 +52,7 @@ class BenchmarkScene:
 
     def config(self) -> Config:
         """The condition as a config, whoever drives."""
-        return self.options().config()
+        return _config_of(self)
 
     def document(self) -> dict[str, Any]:
         """A row of ``uuv benchmark --json``."""
@@ -64,6 +65,11 @@ class BenchmarkScene:
             "sensors": SENSORS,
             "about": self.about,
         }
+
+
+(maxsize=32)
+def _config_of(bench: BenchmarkScene) -> Config:
+    return bench.options().config()
 
 
 SCENES = (

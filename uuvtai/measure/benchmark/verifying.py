@@ -69,11 +69,11 @@ class _Replay:
 
 
 def verify(
-    file: Path, given: Entrant | None, watch: EvaluationWatch, sample: int = SAMPLE, device: str = "auto"
+    file: Path, entrant: Entrant | None, watch: EvaluationWatch, sample: int = SAMPLE, device: str = "auto"
 ) -> dict[str, Any]:
     """Check an entry; the document of ``uuv benchmark verify --json``.
 
-    ``given``: who shall play, from the user's own disk; without one a pilot that is shipped plays, and
+    ``entrant``: who shall play, from the user's own disk; without one a pilot that is shipped plays, and
     whatever else an entry names is never run. ``sample`` episodes of each scene are drawn by chance. Hashes
     of the code and of the scenarios are told, but do not decide: on another machine numbers round otherwise.
     Nor does that of the config where the code is another one, which may have more keys: the replay does.
@@ -81,21 +81,21 @@ def verify(
     """
     entry = read_entry(file)
     pairs = scenes_by_name(entry)
-    entrant = given or _shipped(file, entry)
-    method = entrant.method(next(iter(pairs.values()))[0].config(), watch)
+    player = entrant or _shipped(file, entry)
+    method = player.method(next(iter(pairs.values()))[0].config(), watch)
     checks = [
         _check("form, seal, counts", True, "in order"),
         _same("code", entry.code.sha256, sources_sha256(), f"uuvtai {entry.code.version}")
         | {"is_told": True},
-        _same("pilot", entry.pilot.sha256, sha256_of_method(method), entrant.name),
+        _same("pilot", entry.pilot.sha256, sha256_of_method(method), player.name),
     ]
     is_other = not checks[1]["ok"]
     replays = []
     for bench, played in pairs.values():
-        found, replay = _scene(bench, played, _Replay(entrant, method, device, watch), sample)
+        found, replay = _scene(bench, played, _Replay(player, method, device, watch), sample)
         checks += [check | {"is_told": check["is_told"] or is_other} for check in found]
         replays += [replay] if replay["episodes"] else []
-    checks += _files(entry, entrant)
+    checks += _files(entry, player)
     agree = all(replay["agree"] == replay["episodes"] for replay in replays)
     return {
         "schema": 1,
