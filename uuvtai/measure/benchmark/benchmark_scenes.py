@@ -67,7 +67,7 @@ class BenchmarkScene:
         }
 
 
-(maxsize=32)
+@lru_cache(maxsize=32)
 def _config_of(bench: BenchmarkScene) -> Config:
     return bench.options().config()
 
