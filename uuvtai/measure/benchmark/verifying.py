@@ -87,7 +87,7 @@ def verify(
         _check("form, seal, counts", True, "in order"),
         _same("code", entry.code.sha256, sources_sha256(), f"uuvtai {entry.code.version}")
         | {"is_told": True},
-        _same("pilot", entry.pilot.sha256, sha256_of_method(method), player.name),
+        _same("pilot", entry.pilot.sha256, sha256_of_method(method), player.typed),
     ]
     is_other = not checks[1]["ok"]
     replays = []
