@@ -132,6 +132,13 @@ def test_a_grid_says_where_a_row_does_not_depend_on_the_column(kit):
     assert "A row with one entry does not depend on v m/s." in answer
 
 
+def test_causes_of_failures_are_a_table(tmp_path):
+    run = evaluated(tmp_path / "run", samples.method("bt", causes=[samples.CAUSE], explain=[{}, {}]))
+    (item,) = [item for item in items_of(run) if item.name == "causes_bt"]
+    assert "n = 2 failures of 8 episodes" in item.caption
+    assert "unseen above & 2 & 100" in latex.tabular(item.table, "")
+
+
 def test_one_axis_makes_a_row_a_cell(tmp_path):
     for name, document in (("noise", samples.noise_sweep()), ("alone", samples.robustness_sweep())):
         run = samples.write_run(tmp_path / name, ("uuv", "sweep"), sweep=document)

@@ -21,6 +21,7 @@ from uuvtai.report.timing import timing
 from uuvtai.statistics import holm_adjusted
 from uuvtai.tables.cell_table import method_of
 from uuvtai.tables.heatmap import pivot, varying
+from uuvtai.tables.method_tables import causes_table
 from uuvtai.tables.one_at_a_time import change_name, varies_alone
 from uuvtai.tables.table import Column, Data, Table, heads
 from uuvtai.tables.wording import axis_name, number, probability, value_name, with_interval
@@ -154,7 +155,18 @@ def _of_evaluation(result: dict[str, Any], origin: str) -> list[PaperItem]:
             table=Table(_METHODS, methods),
         ),
     ]
-    return [*found, *_paired(result.get("paired", []), scene, origin)]
+    found += _paired(result.get("paired", []), scene, origin)
+    return [*found, *(_causes(m, scene, origin) for m in methods if m.get("causes"))]
+
+
+def _causes(method: dict[str, Any], scene: str, origin: str) -> PaperItem:
+    """Why episodes of a method failed."""
+    caption = (
+        f"Why episodes of {method['name']} failed, judged from the truth. {scene} n = "
+        f"{len(method['explain'])} failures of {method['episodes']} episodes; shares of the failures, without "
+        "intervals; times are medians before the end."
+    )
+    return PaperItem(f"causes_{method['name']}", caption, origin, None, table=causes_table(method, ""))
 
 
 _PAIRS = (

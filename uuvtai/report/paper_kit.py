@@ -57,11 +57,12 @@ def paper(runs: list[Path], folder: Path) -> PaperKit:
     for run in runs:
         refuse_run(run)
     _refuse_folder(folder)
-    items = _named(_all(runs), len(runs) > 1)
+    found = _named(_all(runs), len(runs) > 1)
     files: dict[str, bytes] = {}
-    for item in items:
-        with damage_named(runs[0]):
+    for run, item in found:
+        with damage_named(run):
             files |= _files_of(item)
+    items = [item for _run, item in found]
     files["captions.tex"] = _tex(items).encode()
     files["captions.md"] = _markdown(items).encode()
     files["paper.tex"] = latex.DOCUMENT.encode()
@@ -102,9 +103,9 @@ def _refuse_reproduction(run: Path) -> None:
         raise ConfigError(f"{run}: is a reproduction; give the run folders in it one by one ({run}/...)")
 
 
-def _named(found: Iterator[tuple[Path, PaperItem]], several: bool) -> list[PaperItem]:
+def _named(found: Iterator[tuple[Path, PaperItem]], several: bool) -> list[tuple[Path, PaperItem]]:
     """The items under names that files may have, each kind's once; with their run where there are several."""
-    items: list[PaperItem] = []
+    items: list[tuple[Path, PaperItem]] = []
     taken: set[tuple[bool, str]] = set()
     for run, item in found:
         if len(items) >= _MOST_ITEMS:
@@ -116,7 +117,7 @@ def _named(found: Iterator[tuple[Path, PaperItem]], several: bool) -> list[Paper
             number += 1
             name = f"{base}_{number}"
         taken.add((item.table is None, name.lower()))
-        items.append(replace(item, name=name))
+        items.append((run, replace(item, name=name)))
     return items
 
 

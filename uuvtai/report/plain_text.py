@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+_LONGEST = 300
+"""characters of a text in a document: names, not novels"""
+
 
 def shown(text: str) -> str:
     """The text on one line, without control characters."""
@@ -11,9 +14,9 @@ def shown(text: str) -> str:
 
 
 def all_shown(document: Any) -> Any:
-    """A JSON document with such texts alone."""
+    """A JSON document with such texts alone, none of them long."""
     if isinstance(document, str):
-        return shown(document)
+        return shown(document[:_LONGEST])
     if isinstance(document, dict):
-        return {shown(key): all_shown(value) for key, value in document.items()}
+        return {shown(key[:_LONGEST]): all_shown(value) for key, value in document.items()}
     return [all_shown(value) for value in document] if isinstance(document, list) else document
