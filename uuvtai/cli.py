@@ -608,21 +608,27 @@ def log_convert(
 
 @log_app.command("video", epilog="Example: uuv log video runs/first/logs/bt_seed0_episode0.mcap")
 def log_video(
-    file: opt.LogFile,
+    file: opt.FilmLogs,
     out: opt.VideoOut = None,
     speed: opt.VideoSpeed = 1.0,
     fps: opt.VideoFps = None,
     width: opt.VideoWidth = None,
     force: opt.LogForce = False,
 ) -> None:
-    """Render a top-down video of a recorded episode as WebM, MP4 or GIF."""
+    """Render a top-down video of a recorded episode as WebM, MP4 or GIF; of several, a grid of tanks."""
     from uuvtai.files import refuse_output
-    from uuvtai.logs import video
 
-    target = out or file.with_suffix(".webm")
-    refuse_output(target, [file], force)
+    target = out or file[0].with_suffix(".webm")
+    refuse_output(target, file, force)
     with counted(target.name, "frames") as drawn:
-        video.video(file, target, width, fps, speed, drawn)
+        if len(file) > 1:
+            from uuvtai.logs.overview import overview
+
+            overview(file, target, width, fps, speed, drawn)
+        else:
+            from uuvtai.logs.video import video
+
+            video(file[0], target, width, fps, speed, drawn)
     typer.echo(str(target))
 
 

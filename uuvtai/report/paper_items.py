@@ -163,8 +163,8 @@ def _causes(method: dict[str, Any], scene: str, origin: str) -> PaperItem:
     """Why episodes of a method failed."""
     caption = (
         f"Why episodes of {method['name']} failed, judged from the truth. {scene} n = "
-        f"{len(method['explain'])} failures of {method['episodes']} episodes; shares of the failures, without "
-        "intervals; times are medians before the end."
+        f"{len(method['explain'])} failures of {method['episodes']} episodes; shares of the failures, "
+        "without intervals; times are medians before the end."
     )
     return PaperItem(f"causes_{method['name']}", caption, origin, None, table=causes_table(method, ""))
 
