@@ -50,7 +50,7 @@ def test_what_nobody_could_see_is_refused(logs, tmp_path, monkeypatch):
         overview(logs, tmp_path / "x.mp4", width_px=100)
     monkeypatch.setattr(film, "_LEAST_PX", 400)
     with pytest.raises(LogError, match="give --width"):
-        overview(logs, tmp_path / "x.mp4", width_px=640)
+        overview(logs * 3, tmp_path / "x.mp4", width_px=640)
     with pytest.raises(LogError, match="give 144 at most"):
         overview(logs * 50, tmp_path / "x.mp4")
     assert list(tmp_path.iterdir()) == []
