@@ -37,8 +37,9 @@ class ChooserTrainer:
     """Everything that learning to choose carries from one iteration to the next. Episodes begin and end
     within an iteration: the simulators carry nothing."""
 
-    def __init__(self, config: LearningConfig) -> None:
-        """Raises SettingError or CheckpointError for a policy that is none of the twin's."""
+    def __init__(self, config: LearningConfig, sims: Mapping[str, Sim] | None = None) -> None:
+        """``sims``: simulators of worlds that are there already. Raises SettingError or CheckpointError for a
+        policy that is none of the twin's."""
         from uuvtai.twin.set_columns import BODY_WIDTH, EGO_COLUMNS
         from uuvtai.twin.tree_columns import CHOOSER_TABLE, TREE_WIDTH
         from uuvtai.twin.twin_arrays import N_BODY
@@ -61,7 +62,9 @@ class ChooserTrainer:
         world = config.world
         own = (world.n_static, world.n_dynamic, world.dynamic_speed_m_s)
         self._all_scenes: tuple[Scene, ...] = tuple(config.train.scenes) or (own,)
-        self._places: dict[str, tuple[Sim, SetPilot]] = {}
+        self._places: dict[str, tuple[Sim, SetPilot]] = {
+            world: (sim, set_pilot_of(self._source, sim)) for world, sim in (sims or {}).items()
+        }
 
     def iterate(self) -> dict[str, float]:
         """Play episodes, learn from the newest ones; metrics by their names in metrics.jsonl."""
@@ -222,17 +225,16 @@ class _Learner(_Judge):
         else:
             drives = torch.where(draw < self._share, coin < 0.5, drives)
         kept = self.running[rows]
-        self.net.widen(bodies[kept], own[kept])
-        self.ticks.append(
-            Tick(
-                self.number[rows][kept],
-                self._age[rows][kept],
-                bodies[kept].half(),
-                own[kept].half(),
-                drives[kept],
-            )
-        )
+        if bool(kept.any()):
+            self._keep(rows[kept], bodies[kept], own[kept], drives[kept])
         return drives, chance
+
+    def _keep(
+        self, rows: torch.Tensor, bodies: torch.Tensor, own: torch.Tensor, drives: torch.Tensor
+    ) -> None:
+        """A choice to learn from."""
+        self.net.widen(bodies, own)
+        self.ticks.append(Tick(self.number[rows], self._age[rows], bodies.half(), own.half(), drives))
 
 
 def play_episodes(pilot: _Judge, scene: Scene, seed: int, first: int, count: int) -> tuple[torch.Tensor, int]:
@@ -269,6 +271,11 @@ def _copied(net: torch.nn.Module) -> dict[str, torch.Tensor]:
 def _policy_of(config: LearningConfig) -> checkpoint.Checkpoint:
     """The checkpoint that ``chooser.policy`` names. Raises SettingError for one that is no policy of the
     twin's."""
+    if not config.chooser.policy:
+        raise SettingError(
+            "chooser.policy: names no policy; train one (uuv train twin --run-dir runs/twin), then: "
+            "uuv train chooser --set chooser.policy=runs/twin"
+        )
     path = Path(config.chooser.policy)
     found = checkpoint.best(path) if (path / "checkpoints").is_dir() else checkpoint.open_checkpoint(path)
     if not found.config.twin.enabled:
