@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 
 
-class Moments(NamedTuple):
+class Choices(NamedTuple):
     """Rows of one choice each."""
 
     bodies: torch.Tensor
@@ -37,8 +37,8 @@ class Tick:
     drives: torch.Tensor
 
 
-def moments_of_episodes(ticks: list[Tick], arrived: torch.Tensor, steps: int) -> Moments:
-    """Moments of whole episodes, one episode after the other; ``arrived`` (jobs,) by job. A moment looks at
+def moments_of_episodes(ticks: list[Tick], arrived: torch.Tensor, steps: int) -> Choices:
+    """Choices of whole episodes, one episode after the other; ``arrived`` (jobs,) by job. A moment looks at
     most ``steps`` choices ahead, as long as nobody takes over."""
     job, age = (torch.cat([getattr(tick, name) for tick in ticks]) for name in ("job", "age"))
     order = torch.argsort(job * (int(age.max()) + 1) + age)
@@ -58,7 +58,7 @@ def moments_of_episodes(ticks: list[Tick], arrived: torch.Tensor, steps: int) ->
         free &= goes_on[at]
         at = torch.where(free, at + 1, at)
         free &= drives[at] == drives
-    return Moments(
+    return Choices(
         bodies.half(), own.half(), drives.byte(), (at - rows).int(), ended.byte(), arrived[job].byte()
     )
 
@@ -71,7 +71,7 @@ class ChooserMemory:
         def empty(dtype: torch.dtype, *shape: int) -> torch.Tensor:
             return torch.zeros(size, *shape, dtype=dtype)
 
-        self.rows = Moments(
+        self.rows = Choices(
             bodies=empty(torch.float16, lanes, n_body),
             own=empty(torch.float16, n_own),
             drives=empty(torch.uint8),
@@ -81,7 +81,7 @@ class ChooserMemory:
         )
         self.count = self.at = 0
 
-    def add(self, new: Moments) -> None:
+    def add(self, new: Choices) -> None:
         """Write over the oldest ones."""
         size = len(self.rows.drives)
         n = min(len(new.drives), size)
