@@ -32,6 +32,8 @@ _TRAIN = ["train", "smoke", "--device", "cpu", "--iterations", "4"]
 _ROUNDS = 120
 """pairs of short turns"""
 _STARTS = 9
+_NO_BYTECODE = "PYTHONDONTWRITEBYTECODE"
+"""compiles every module again at every start, on both sides: nobody's start"""
 
 
 class Side:
@@ -42,7 +44,8 @@ class Side:
         places = {"HOME": folder / "home", "XDG_CACHE_HOME": folder / "cache", "PYTHONPATH": tree}
         for place in ("home", "cache"):
             (folder / place).mkdir(parents=True)
-        self.environment = {**os.environ, **{name: str(place) for name, place in places.items()}}
+        kept = {name: value for name, value in os.environ.items() if name != _NO_BYTECODE}
+        self.environment = kept | {name: str(place) for name, place in places.items()}
 
     def played(self, *arguments: str) -> list[str]:
         """The command of ``played.py`` for this side."""

@@ -109,9 +109,9 @@ def test_peers_of_dynamics_agree_and_a_wrong_one_is_seen():
         steps = {"peer": dynamics._step_of_peer(peer, "peer", "cpu")}
         return dynamics.disagreement(plant, {"peer": peer}, steps, actions, turned)
 
-    assert apart(np, 1.0) < dynamics.AGREEMENT and apart(torch, 1.0) < dynamics.AGREEMENT < apart(
-        torch, 1.001
-    )
+    for exact in (apart(np, 1.0), apart(torch, 1.0)):
+        assert exact.shape == (n_env,) and np.all(exact < dynamics.AGREEMENT)
+    assert np.mean(apart(torch, 1.001) > dynamics.AGREEMENT) > 0.5, "drag that is off shows in most vehicles"
     assert np.abs(plant.vehicle.vel_b.to_numpy()).max() > 0.2, "nothing moved"
 
 

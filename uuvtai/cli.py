@@ -270,6 +270,53 @@ def sweep(
 _SWEEP_RESUME = ("allow_code", "world", "episodes", "seeds", "engine", "workers", "address", "device")
 
 
+# -------------------------------------------------------------------------------------------------- benchmark
+
+
+@app.command("benchmark", epilog="Example: uuv benchmark pool --controller examples/own_field.py --quick")
+def enter_benchmark(
+    name: opt.BenchmarkName = None,
+    file: opt.EntryFile = None,
+    controller: opt.EntryController = None,
+    planner: opt.Planners = None,
+    policy: opt.Policies = None,
+    quick: opt.Quick = False,
+    sample: opt.Sample = None,
+    num_envs: opt.Batch = None,
+    device: opt.Device = "auto",
+    run_dir: opt.RunDir = None,
+    wide: opt.Wide = False,
+    as_json: opt.AsJson = False,
+) -> None:
+    """Play fixed scenes that others play too, and write what came of it as a file; or check such a file.
+    Exit code 3: an entry disagrees with its replay."""
+    from uuvtai.show import benchmarking
+
+    arguments.refuse_odd_benchmark(name, file, quick, sample, num_envs, run_dir)
+    if name is None:
+        from uuvtai.measure.benchmark.benchmark_scenes import catalogue
+
+        found = catalogue()
+        _print(found, as_json, lambda: benchmarking.show_scenes(Screen(wide), found))
+        return
+    from uuvtai.measure.benchmark import entering, entrant, verifying
+
+    given = controller or planner or policy
+    who = [controller] if controller else ["none"] if given else ["bt"]
+    pilot = entrant.entrant_of(*arguments.drivers(None, who, planner, policy))
+    if file is None:
+        asked = entering.BenchmarkRequest(name, pilot, quick, num_envs, device, run_dir)
+        entry, folder = entering.enter(asked, Progress())
+        path = folder / entering.FILE
+        _print(entry, as_json, lambda: benchmarking.show_entry(Screen(wide), entry, path))
+        return
+    most = verifying.SAMPLE if sample is None else sample
+    checked = verifying.verify(file, pilot if given else None, Progress(), most, device)
+    _print(checked, as_json, lambda: benchmarking.show_check(Screen(wide), checked))
+    if not checked["ok"]:
+        raise typer.Exit(GATE)
+
+
 # ----------------------------------------------------------------------------------------- profile, reproduce
 
 
@@ -337,11 +384,20 @@ def reproduce(
 def report_run(
     runs: opt.ReportRuns,
     out: opt.ReportOut = None,
+    paper: opt.ReportPaper = None,
     force: opt.ReportForce = False,
     as_json: opt.AsJson = False,
 ) -> None:
     """Write one self-contained HTML page of a run: tables, figures, pictures, videos, and where they come
-    from."""
+    from; or, with --paper, figures and tables for a paper."""
+    if paper is not None:
+        if out is not None or force:
+            raise UsageError("--paper: writes a folder of its own; leave out --out and --force")
+        from uuvtai.report.paper_kit import paper as write_paper
+
+        kit = write_paper(runs, paper)
+        _print(kit.document(), as_json, lambda: typer.echo(str(kit.folder)))
+        return
     from uuvtai.report.build import report
 
     written = report(runs, out, force)
@@ -552,21 +608,27 @@ def log_convert(
 
 @log_app.command("video", epilog="Example: uuv log video runs/first/logs/bt_seed0_episode0.mcap")
 def log_video(
-    file: opt.LogFile,
+    file: opt.FilmLogs,
     out: opt.VideoOut = None,
     speed: opt.VideoSpeed = 1.0,
     fps: opt.VideoFps = None,
     width: opt.VideoWidth = None,
     force: opt.LogForce = False,
 ) -> None:
-    """Render a top-down video of a recorded episode as WebM, MP4 or GIF."""
+    """Render a top-down video of a recorded episode as WebM, MP4 or GIF; of several, a grid of tanks."""
     from uuvtai.files import refuse_output
-    from uuvtai.logs import video
 
-    target = out or file.with_suffix(".webm")
-    refuse_output(target, [file], force)
+    target = out or file[0].with_suffix(".webm")
+    refuse_output(target, file, force)
     with counted(target.name, "frames") as drawn:
-        video.video(file, target, width, fps, speed, drawn)
+        if len(file) > 1:
+            from uuvtai.logs.overview import overview
+
+            overview(file, target, width, fps, speed, drawn)
+        else:
+            from uuvtai.logs.video import video
+
+            video(file[0], target, width, fps, speed, drawn)
     typer.echo(str(target))
 
 

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 from typer import Argument, Option
 
+from uuvtai.measure.benchmark import benchmark_scenes as benchmarks
 from uuvtai.show import choices
 
 _WORLDS, _SENSORS, _VEHICLES = (choices.names(kind) for kind in ("world", "sensors", "vehicle"))
@@ -241,6 +242,39 @@ Address = Annotated[
 ]
 SweepResume = Annotated[Path | None, _resume("Run folder of a sweep to go on with.")]
 
+# -------------------------------------------------------------------------------------------------- benchmark
+
+BenchmarkName = Annotated[
+    str | None,
+    Argument(
+        metavar="NAME|verify",
+        help=f"What to enter: {', '.join(benchmarks.NAMES)}; or verify, to check an entry's FILE \\[default: "
+        "list them].",
+        autocompletion=lambda: [*benchmarks.NAMES, "verify"],
+    ),
+]
+EntryFile = Annotated[Path | None, Argument(metavar="FILE", help="With verify: the entry, an entry.json.")]
+EntryController = Annotated[
+    str | None,
+    Option(
+        "--controller",
+        metavar=_NAME,
+        help="Who enters: bt, another tree or stack by name or file, or mine.py:act \\[default: bt].",
+        autocompletion=choices.controllers,
+    ),
+]
+Quick = Annotated[
+    bool,
+    Option(
+        "--quick",
+        help="Only a look: a few episodes that anybody may tune on. The file says that it is no entry.",
+    ),
+]
+Sample = Annotated[
+    int | None,
+    Option("--sample", help="With verify: episodes of each scene to play again \\[default: 8]."),
+]
+
 # ----------------------------------------------------------------------------------------- profile, reproduce
 
 BatchSizes = Annotated[str, Option("--num-envs", help="Batch sizes, separated by commas.")]
@@ -282,6 +316,14 @@ ReportRuns = Annotated[
 ]
 ReportOut = Annotated[
     Path | None, Option("--out", help="The page \\[default: RUN/report.html]; figures/ is made beside it.")
+]
+ReportPaper = Annotated[
+    Path | None,
+    Option(
+        "--paper",
+        help="New or empty folder for a paper's kit: figures as PDF and SVG, tables as LaTeX and CSV, "
+        "captions.",
+    ),
 ]
 ReportForce = Annotated[bool, Option("--force", help="Replace files that are there already.")]
 ExportRun = Annotated[str | None, _players("[RUN]", "Run folder, checkpoint folder or shipped name (best).")]
@@ -335,6 +377,7 @@ Dot = Annotated[bool, Option("--dot", help="Print Graphviz DOT instead.")]
 
 LogFile = Annotated[Path, Argument(help="An .mcap file.")]
 LogFiles = Annotated[list[Path], Argument(help="Logs of the same episode; trajectories are overlaid.")]
+FilmLogs = Annotated[list[Path], Argument(help="An .mcap file; several are shown at once, a tank each.")]
 LogForce = Annotated[bool, Option("--force", help="Replace the file that --out names.")]
 LogExportOut = Annotated[Path, Option("--out", help="New or empty folder for the exported files.")]
 Topics = Annotated[list[str] | None, Option("--topic", help="Only these topics (repeatable).")]

@@ -16,9 +16,10 @@ SEE = {
     "train": ("quickstart", "learning"),
     "simulate": ("simulator", "own_pieces"),
     "sweep": ("scale", "own_pieces"),
+    "benchmark": ("benchmark", "own_pieces"),
     "profile": ("history",),
     "reproduce": ("learning", "own_pieces"),
-    "report": ("quickstart",),
+    "report": ("quickstart", "paper_kit"),
     "export": ("deployment",),
     "presets": ("reference/configuration",),
     "doctor": ("quickstart", "native"),
@@ -40,7 +41,11 @@ EXIT_CODES = (
         "usage or configuration: nothing was begun, nothing was written; the message says what to type "
         "instead",
     ),
-    (endings.GATE, "finished, but a gate was not met: `uuv export` found that an exported policy disagrees"),
+    (
+        endings.GATE,
+        "finished, but a gate was not met: `uuv export` found that an exported policy disagrees, `uuv "
+        "benchmark verify` that an entry does",
+    ),
     (
         endings.INTERRUPTED,
         "interrupted (Ctrl-C); what was finished is kept, and the message names the command that goes on",

@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from docs.writers.benchmark_pages import benchmark, benchmark_scenes
 from docs.writers.figure_sources import Counts, SourceError, Sources, fitting, pooled, weighted
 from docs.writers.pieces import BEFORE, CELLS, LETTERS, PIECES
 from docs.writers.pose_tables import pose_endings, pose_errors
@@ -554,5 +555,7 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         pose_errors,
         twin_curve,
         twin_policy,
+        benchmark_scenes,
+        benchmark,
     )
 }

@@ -26,7 +26,7 @@ from uuvtai.report.timing import timing
 from uuvtai.run_folder import RunFolderError, write_atomic
 from uuvtai.tables.table import Table
 
-_NOTHING = (
+NOTHING = (
     "has nothing to report yet: no eval/result.json, metrics.jsonl, sweep.json, profile.json or "
     "reproduce.json"
 )
@@ -59,14 +59,14 @@ def report(runs: list[Path], out: Path | None = None, force: bool = False) -> Re
             f"{len(runs)} run folders: say where their common page is to be written: --out FILE"
         )
     for run in runs:
-        _refuse(run)
+        refuse_run(run)
     target = out or runs[0] / PAGE
     if target.is_dir():
         raise ConfigError(
             f"{target}: is a folder; give the page a name, for example --out {target / 'report.html'}"
         )
     _refuse_place(target, runs, force)
-    with _damage_named(runs[0] if len(runs) == 1 else target):
+    with damage_named(runs[0] if len(runs) == 1 else target):
         page = _of_several(runs) if len(runs) > 1 else _of_run(runs[0])
         html, pngs = render(replace(page, sections=shared(page.sections)))
     figures = [target.parent / FIGURES / f"{name}.png" for name in pngs]
@@ -75,7 +75,8 @@ def report(runs: list[Path], out: Path | None = None, force: bool = False) -> Re
     return _write(target, html, dict(zip(figures, pngs.values(), strict=True)))
 
 
-def _refuse(run: Path) -> None:
+def refuse_run(run: Path) -> None:
+    """Raise ConfigError for what is no folder, FileError for one with a link in it."""
     if not run.is_dir():
         raise ConfigError(
             f"{run}: is no run folder; give one that 'uuv eval', 'uuv train' or 'uuv sweep' printed"
@@ -122,7 +123,7 @@ def _of_run(run: Path) -> Page:
     sections += content(run)
     if not sections:
         raise ConfigError(
-            f"{run}: {_NOTHING}; give a run folder that 'uuv eval', 'uuv train' or 'uuv sweep' printed"
+            f"{run}: {NOTHING}; give a run folder that 'uuv eval', 'uuv train' or 'uuv sweep' printed"
         )
     title = str(document["title"]) if document else run.resolve().name
     closing = PageSection(
@@ -150,11 +151,11 @@ def _of_several(runs: list[Path]) -> Page:
 def _named_after(run: Path, trainings: list[Path]) -> list[PageSection]:
     """Sections of one of several folders. An evaluation says which of the trainings its policies come
     from."""
-    with _damage_named(run):
+    with damage_named(run):
         sections = content(run)
         methods = (read_json(run, "eval/result.json") or {}).get("methods", [])
     if not sections:
-        raise ConfigError(f"{run}: {_NOTHING}")
+        raise ConfigError(f"{run}: {NOTHING}")
     origin = origins(methods, trainings)
     named = [
         replace(section, title=f"{section.title}: {run.name}", blocks=_figures_of(run, section.blocks))
@@ -199,20 +200,21 @@ def _filled(blocks: Sequence[Block]) -> list[Block]:
 
 def _nested(run: Path) -> list[Block]:
     """Blocks of a run folder within a reproduction, the figures named after it."""
-    with _damage_named(run):
+    with damage_named(run):
         blocks = [block for section in content(run) for block in section.blocks]
     if not blocks:
-        raise ConfigError(f"{run}: {_NOTHING}")
+        raise ConfigError(f"{run}: {NOTHING}")
     return _figures_of(run, blocks)
 
 
 def _curves_of(runs: list[Path]) -> list[Block]:
     commands = [command_of(read_json(run, "run.json") or {}) for run in runs]
-    trainings = [_training_of(run) for run in runs]
+    trainings = [training_of(run) for run in runs]
     return training(trainings, "\n".join(command for command in commands if command))
 
 
-def _training_of(run: Path) -> Training:
+def training_of(run: Path) -> Training:
+    """What a training run recorded."""
     argv = [str(word) for word in (read_json(run, "run.json") or {}).get("argv", [])]
     after = argv[argv.index("train") + 1 :] if "train" in argv else []
     preset = Path(after[0]).stem if after and not after[0].startswith("-") else ""
@@ -220,7 +222,7 @@ def _training_of(run: Path) -> Training:
 
 
 @contextmanager
-def _damage_named(run: Path) -> Iterator[None]:
+def damage_named(run: Path) -> Iterator[None]:
     """A document that lacks what its schema promises is refused with the folder that it lies in."""
     try:
         yield

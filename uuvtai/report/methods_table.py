@@ -19,7 +19,7 @@ Method = dict[str, Any]
 def evaluation(result: dict[str, Any], command: str = "") -> list[Block]:
     """Everything that an evaluation has to show but its pictures."""
     methods = result["methods"]
-    table = methods_table(methods, _METHODS, data=_methods_data(methods), swatches=_swatches(methods))
+    table = methods_table(methods, _METHODS, data=evaluation_data(methods), swatches=_swatches(methods))
     blocks: list[Block] = [Paragraph(conditions(result)), table]
     if methods:
         blocks.append(_rates_figure(methods, command))
@@ -64,7 +64,8 @@ _PLAIN = (
 )
 
 
-def _methods_data(methods: list[Method]) -> Data:
+def evaluation_data(methods: list[Method]) -> Data:
+    """Counts, rates, bounds and times of every method as numbers."""
     bounds = ("success_ci95_low", "success_ci95_high", "collision_ci95_low", "collision_ci95_high")
     rows = [
         [
@@ -96,7 +97,7 @@ def _rates_figure(methods: list[Method], command: str) -> Figure:
         "methods",
         panels,
         "Success and collision of every method with 95 % Wilson intervals",
-        _methods_data(methods),
+        evaluation_data(methods),
         command,
     )
 
@@ -140,10 +141,14 @@ def _paired(pairs: list[dict[str, Any]]) -> list[Block]:
         "times where both arrive, their difference with its 95 % bootstrap interval. The values of p are not "
         "adjusted for the number of pairs"
     )
+    return [paired_table(pairs, caption, data=paired_data(pairs))]
+
+
+def paired_data(pairs: list[dict[str, Any]]) -> Data:
+    """Pairs of methods as numbers."""
     keys = ("a", "b", "episodes", *_PAIRED)
     rows = [[*map(pair.get, keys), *(pair.get(_BOUNDS) or (None, None))] for pair in pairs]
-    data = Data([*keys, f"{_BOUNDS}_low", f"{_BOUNDS}_high"], rows)
-    return [paired_table(pairs, caption, data=data)]
+    return Data([*keys, f"{_BOUNDS}_low", f"{_BOUNDS}_high"], rows)
 
 
 def _counts(method: Method, key: str, *names: str) -> str:

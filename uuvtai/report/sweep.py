@@ -15,6 +15,8 @@ from uuvtai.tables.one_at_a_time import axes_of, of_axis, place_names, places, v
 from uuvtai.tables.table import Data, Table
 from uuvtai.tables.wording import axis_name, value_name
 
+ON_HOVER = "Counts and intervals: on hover and below"
+"""said of a figure on a page, where it has both"""
 _NUMBERS = ("success_rate", "collision_rate", "time_mean_s", "tts_s", "time_to_success_mean_s")
 
 
@@ -58,7 +60,7 @@ def _maps(document: dict[str, Any], command: str) -> list[Block]:
         caption = (
             f"{method}: collision (left) and success (right) in per cent of the episodes, below each the "
             "mean time of the successes. Bright is good in both. A cell that spans the row does not depend "
-            "on the column. Counts and intervals: on hover and below"
+            f"on the column. {ON_HOVER}"
         )
         blocks += [
             Figure(f"heat_map_{method}", panels, caption, cells_data(own), command),

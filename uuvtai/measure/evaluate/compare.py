@@ -157,6 +157,7 @@ def _compared(comparison: Comparison, folder: RunFolder) -> dict[str, Any]:
     from uuvtai.measure.evaluate.explained import explain
     from uuvtai.measure.evaluate.ledger import Ledger
     from uuvtai.measure.evaluate.method_run import play
+    from uuvtai.measure.evaluate.scenario_digest import scenarios_sha256
     from uuvtai.measure.evaluate.summary import document
 
     request = comparison.request
@@ -174,6 +175,7 @@ def _compared(comparison: Comparison, folder: RunFolder) -> dict[str, Any]:
         request.config, request.world, request.sensors, request.seeds, request.episodes, entries
     )
     result |= {"condition": condition_of(request.config, scenarios), "remainder": remainder_of(entries)}
+    result["scenarios_sha256"] = scenarios_sha256(scenarios)
     _write_results(folder, result, runs)
     if request.explain:
         explain(comparison, runs, result, folder)

@@ -1,0 +1,155 @@
+"""Figures as journals want them: PDF and SVG, as wide as one or two columns of a page, text of one size."""
+
+from __future__ import annotations
+
+import io
+import itertools
+import math
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from uuvtai.report.blocks import Hover, Panel
+from uuvtai.report.ink import INK
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Sheet
+
+ONE_COLUMN_IN, TWO_COLUMNS_IN = 3.5, 7.16
+"""widths of IEEE's columns"""
+TEXT_PT = 8.0
+_LEAST_PT = 5.0
+"""of the words in a cell that is too narrow for more"""
+_CURVE_IN = 2.1
+"""height of a panel that has no wish of its own"""
+_ROOM = 0.94
+"""of a cell's width that its words may take"""
+
+_STYLE: dict[str, Any] = {
+    "text.parse_math": False,  # a name with dollars is a name
+    "text.usetex": False,
+    "font.family": ["STIXGeneral", "DejaVu Sans"],  # both come with matplotlib; the second has more letters
+    "font.size": TEXT_PT,
+    "axes.titlesize": TEXT_PT,
+    "axes.labelsize": TEXT_PT,
+    "xtick.labelsize": TEXT_PT,
+    "ytick.labelsize": TEXT_PT,
+    "legend.fontsize": TEXT_PT,
+    "pdf.fonttype": 42,  # fonts that publishers accept, text that can be searched
+    "svg.fonttype": "path",  # looks the same where the font is missing
+    "svg.hashsalt": "uuvtai",  # the same figure is the same file
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.linewidth": 0.6,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "grid.alpha": 0.18,
+    "grid.linewidth": 0.5,
+    "legend.frameon": False,
+    "legend.handlelength": 1.4,
+    "lines.linewidth": 1.1,
+}
+
+
+@dataclass(frozen=True)
+class PaperPanel:
+    """One pair of axes, and how high it is [in] where it has a width [in]."""
+
+    draw: Callable[[Axes], Hover]
+    height_in: Callable[[float], float]
+    is_cells: bool = False
+    """its words stand in cells of one unit"""
+    spans: bool = False
+    """takes the whole width, also of two columns"""
+
+
+def of_panel(panel: Panel, is_cells: bool = False, spans: bool = False) -> PaperPanel:
+    """A panel of the report's page."""
+    height = _CURVE_IN if panel.height_in == Panel.height_in and not is_cells else panel.height_in
+    return PaperPanel(panel.draw, lambda _width: height, is_cells, spans)
+
+
+def height_in(panels: Sequence[PaperPanel], width_in: float) -> float:
+    """Of the figure [in]."""
+    return math.fsum(_row_heights(panels, width_in)[1])
+
+
+def _row_heights(panels: Sequence[PaperPanel], width_in: float) -> tuple[int, list[float]]:
+    """How many panels stand side by side, and the height of each row [in]."""
+    is_wide = width_in > ONE_COLUMN_IN
+    across = 2 if is_wide and len(panels) > 1 and not any(panel.spans for panel in panels) else 1
+    rows = [panels[i : i + across] for i in range(0, len(panels), across)]
+    return across, [max(panel.height_in(width_in / across) for panel in row) for row in rows]
+
+
+def sheets(panels: Sequence[PaperPanel], width_in: float) -> dict[str, bytes]:
+    """The figure as 'pdf' and 'svg': one panel below the other in one column, two side by side in two."""
+    across, heights = _row_heights(panels, width_in)
+    with _style(), warnings.catch_warnings():
+        from matplotlib.figure import Figure as Sheet
+
+        warnings.filterwarnings("ignore", "Glyph")  # a name may have letters that no font here has
+
+        sheet = Sheet(figsize=(width_in, math.fsum(heights)), layout="constrained", facecolor="white")
+        grid = sheet.subplots(len(heights), across, squeeze=False, gridspec_kw={"height_ratios": heights})
+        for spare in grid.flatten()[len(panels) :]:
+            spare.remove()
+        places = list(zip(panels, grid.flatten(), strict=False))
+        for panel, axes in places:
+            axes.set_facecolor("none")
+            panel.draw(axes)
+        _settle(sheet, [axes for panel, axes in places if panel.is_cells])
+        return {"pdf": _saved(sheet, "pdf", "CreationDate"), "svg": _saved(sheet, "svg", "Date")}
+
+
+def _saved(sheet: Sheet, kind: str, date: str) -> bytes:
+    file = io.BytesIO()
+    sheet.savefig(file, format=kind, metadata={"Creator": "uuvtai", date: None})
+    return file.getvalue()
+
+
+def _settle(sheet: Sheet, cells: Sequence[Axes]) -> None:
+    """All text of one size, but smaller where cells are too narrow; names under an axis are turned where they
+    would touch."""
+    from matplotlib.text import Text
+
+    for text in sheet.findobj(Text):
+        text.set_fontsize(TEXT_PT)
+    sheet.draw_without_rendering()
+    for axes in sheet.axes:
+        if _touch([label for label in axes.get_xticklabels() if label.get_text()]):
+            axes.tick_params(axis="x", labelrotation=30)
+            for label in axes.get_xticklabels():
+                label.set_horizontalalignment("right")
+    for axes in cells:
+        _shrink(axes)
+
+
+def _touch(labels: Sequence[Any]) -> bool:
+    boxes = sorted((label.get_window_extent() for label in labels), key=lambda box: box.x0)
+    return any(left.x1 > right.x0 for left, right in itertools.pairwise(boxes))
+
+
+def _shrink(axes: Axes) -> None:
+    """The words in the cells of one pair of axes, so that the widest fits."""
+    (x0, _), (x1, _) = axes.transData.transform([(0, 0), (1, 0)])
+    widest = max((text.get_window_extent().width for text in axes.texts if text.get_text()), default=0.0)
+    share = _ROOM * (x1 - x0) / widest if widest else 1.0
+    for text in axes.texts if share < 1.0 else []:
+        text.set_fontsize(max(_LEAST_PT, share * TEXT_PT))
+
+
+@contextmanager
+def _style() -> Iterator[None]:
+    import matplotlib
+
+    # the defaults first: a reader's own matplotlibrc does not change a figure
+    inks = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color", "grid.color")
+    settings: Any = {**matplotlib.rcParamsDefault, "backend": "agg", **_STYLE, **dict.fromkeys(inks, INK)}
+    with matplotlib.rc_context(settings):
+        yield
