@@ -1,6 +1,7 @@
 """Who drives, tree or policy: columns, what is learnt from, the wheel, resuming, refusals."""
 
 import copy
+import dataclasses
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from uuvtai.learn.set_pilot import load_set_pilot, set_pilot_of
 from uuvtai.learn.set_policy import SetActor
 from uuvtai.loader import load_training
 from uuvtai.measure.episodes.playing import jobs_of, run_episodes
+from uuvtai.measure.evaluate.hand_overs import hand_overs_of, told
 from uuvtai.twin.observer import SET_TABLE
 from uuvtai.twin.set_columns import BODY_WIDTH, EGO_COLUMNS
 from uuvtai.twin.tree_columns import CHOOSER_TABLE, TREE_WIDTH, TreeColumnsIO
@@ -100,9 +102,9 @@ def test_approaches_are_those_of_a_search_in_time():
         real = bodies[..., 0] > 0
         assert np.allclose(gap[real], far.min(-1)[real].clip(-1, 3), atol=2e-3)
         assert np.allclose(when[real], times[far.argmin(-1)][real], atol=5e-3)
-        for seconds, told, place in ((1, in_1s, AT_LATER[0]), (2, in_2s, AT_LATER[1])):
+        for seconds, heard, place in ((1, in_1s, AT_LATER[0]), (2, in_2s, AT_LATER[1])):
             later = np.linalg.norm(4 * bodies[..., place] - seconds * own[:, None], axis=-1) - 0.52
-            assert np.allclose(told[real], later[real].clip(-1, 3), atol=1e-5)
+            assert np.allclose(heard[real], later[real].clip(-1, 3), atol=1e-5)
     assert not seen[0, 2].any(), "an empty row stays empty"
 
 
@@ -207,7 +209,7 @@ def test_the_likelier_one_drives_and_a_change_needs_a_margin(wheel, small):
     assert not hold(wheel, 0.83, 0.80)
     assert not hold(wheel, 0.80, 0.815)
     assert hold(wheel, 0.80, 0.83)
-    assert wheel.hand_overs.tolist() == [2] * small.N
+    assert wheel.hand_overs.tolist() == [2] * small.N and wheel.driven.tolist() == [75] * small.N
     wheel.reset(torch.ones(small.N))
     assert not wheel.hand_overs.any()
 
@@ -248,8 +250,12 @@ def test_it_drives_whatever_the_order_of_the_episodes(small, saved):
         part["most"].fill_(1e9)
 
     pilot = load_chooser(saved(widened), small.sim)
-    jobs = jobs_of([3], 5)
-    forth, _ = run_episodes(small.sim, jobs, driver=pilot)
+    jobs, counts = jobs_of([3], 5), hand_overs_of(pilot)
+    assert counts and hand_overs_of(load_set_pilot) is None
+    forth, _ = run_episodes(small.sim, jobs, counts, driver=pilot)
+    entry = {"name": "x", **counts.entry(forth, 0.02)}
+    assert counts.entry([*forth, dataclasses.replace(forth[0], episode=99)], 0.02) == {}
+    assert 0.0 <= entry["chooser"]["policy_share"] <= 1.0 and told(entry).startswith("x: ")
     back, _ = run_episodes(small.sim, jobs[::-1], driver=pilot)
     assert [(r.outcome, r.time_s, r.path_length_m) for r in forth] == [
         (r.outcome, r.time_s, r.path_length_m) for r in back[::-1]

@@ -105,8 +105,10 @@ class ChooserPilot:
         self._age = torch.zeros(rows, dtype=torch.int64, device=sim.device)
         self._drove, self.drives = (torch.zeros(rows, dtype=torch.bool, device=sim.device) for _ in range(2))
         """whether the policy drives: in the last step that was carried out, and in the one decided last"""
-        self.hand_overs = torch.zeros(rows, dtype=torch.int64, device=sim.device)
-        """of every row since its episode began"""
+        self.hand_overs, self.driven = (
+            torch.zeros(rows, dtype=torch.int64, device=sim.device) for _ in range(2)
+        )
+        """of every row since its episode began: how often the wheel changed hands, steps of the policy"""
         self._chance = torch.zeros(rows, device=sim.device)
         self.decision = pilot.decision
 
@@ -117,6 +119,7 @@ class ChooserPilot:
         self._age *= kept
         self._drove &= kept
         self.hand_overs *= kept
+        self.driven *= kept
 
     @torch.no_grad()
     def decide(self, obs: torch.Tensor) -> PilotDecision:
@@ -150,6 +153,7 @@ class ChooserPilot:
         """The last decision has been carried out."""
         self.pilot.advance()
         self.hand_overs += (self.drives != self._drove) & (self._age > 0)
+        self.driven += self.drives
         self._drove.copy_(self.drives)
         self._age += 1
 
