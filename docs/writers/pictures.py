@@ -1,9 +1,9 @@
 """The gallery anew: ``python -m docs.writers.pictures`` runs the commands of ``docs/gallery.md`` and writes
 the pictures into ``docs/gallery/``, and what is printed into the page.
 
-The other pictures are figures of pages: ``pool_grid_bt.png`` and ``robustness_collision.png`` come from
-``uuv report`` of the sweeps named in ``docs/robustness.md``, ``training.png`` and ``trainers.png`` from the
-commands beside them.
+The other pictures are figures of pages: ``pool_grid_bt.png`` and, by ``panels``, ``robustness_collision.png``
+come from ``uuv report`` of the sweeps named in ``docs/robustness.md``, ``training.png`` and ``trainers.png``
+from the commands beside them.
 """
 
 from __future__ import annotations
