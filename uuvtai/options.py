@@ -133,7 +133,13 @@ Record = Annotated[
     int, Option("--record", help="Record the first K episodes of every method as MCAP with a picture.")
 ]
 Video = Annotated[bool, Option("--video", help="Also a top-down video of every recorded episode.")]
-DepthImages = Annotated[bool, Option("--depth-images", help="Also record the depth camera (2 Hz).")]
+DepthImages = Annotated[
+    bool,
+    Option(
+        "--depth-images",
+        help="Also record the depth camera: 2 Hz to look at, and every image exactly (uuv replay).",
+    ),
+]
 Explain = Annotated[
     bool,
     Option(
