@@ -1,0 +1,131 @@
+"""Feed a log to the pilot, step by step, and compare what it decides with what was decided then."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from uuvtai.measure.replay.faults import Disturbed, Faults, disturbed
+from uuvtai.measure.replay.log_feed import LogFeed, LoggedStep, read_feed
+from uuvtai.pilot import OnboardPilot, PilotCommand
+
+COMPARED = ("command", "asked velocity", "node of the tree", "own position")
+"""per step: the tree's action, the velocity behind it, the leaf that chose, the pose estimate"""
+
+Build = Callable[[LogFeed], OnboardPilot]
+
+
+def replay(
+    path: Path, faults: Faults | None = None, controller: str | None = None, build: Build | None = None
+) -> dict[str, Any]:
+    """What ``uuv replay --json`` prints. ``build`` makes the pilot (default: one with a simulator of its own).
+
+    Numbers count as equal where they are equal as float32; logs do not keep the sign of a zero. Raises
+    LogError, TreeError, ConfigError.
+    """
+    feed, faults = read_feed(path, controller), faults or Faults()
+    told = disturbed(feed.arrivals, faults)
+    pilot = (build or built)(feed)
+    commands, tick_s = _played(pilot, feed, told)
+    return {
+        "schema": 1,
+        "log": str(path),
+        **{name: feed.run.get(name, "") for name in ("controller", "world", "seed", "episode")},
+        "steps": len(feed.steps),
+        "faults": {**asdict(faults), "any": faults.any},
+        "equal": all(_is_equal(one, two) == (True,) * 4 for one, two in zip(commands, feed.steps, strict=True)),
+        "agreement": _agreement(commands, feed),
+        "change": _change(commands, feed),
+        "messages": {
+            name: {**asdict(tally), "lost": told.lost[name]} for name, tally in pilot.tallies.items()
+        },
+        "tick_ms": {
+            "median": round(1e3 * float(np.median(tick_s)), 3),
+            "99th percentile": round(1e3 * float(np.quantile(tick_s, 0.99)), 3),
+        },
+    }
+
+
+def built(feed: LogFeed) -> OnboardPilot:
+    """A pilot of the log's config, tree and mission."""
+    return OnboardPilot.built(feed.config, feed.tree, feed.mission)
+
+
+def _played(
+    pilot: OnboardPilot, feed: LogFeed, told: Disturbed
+) -> tuple[list[PilotCommand], list[float]]:
+    """(commands of all steps, seconds that each took)."""
+    commands, tick_s, sent = [], [], 0
+    dt, arrivals = feed.config.episode.control_dt_s, told.arrivals
+    for step in range(len(feed.steps)):
+        until = (step + 0.5) * dt
+        began = time.perf_counter()
+        while sent < len(arrivals) and arrivals[sent].time_s <= until:
+            pilot.feed(arrivals[sent].message)
+            sent += 1
+        commands.append(pilot.tick())
+        tick_s.append(time.perf_counter() - began)
+    return commands, tick_s
+
+
+def _is_equal(command: PilotCommand, logged: LoggedStep) -> tuple[bool, ...]:
+    """One of COMPARED each."""
+    return (
+        bool(np.array_equal(command.action, logged.action)),
+        bool(np.array_equal(command.asked_w, logged.asked_w)),
+        command.leaf == logged.leaf,
+        logged.pos_w is None or bool(np.array_equal(command.pos_w, logged.pos_w)),
+    )
+
+
+def _agreement(commands: list[PilotCommand], feed: LogFeed) -> list[dict[str, Any]]:
+    """Of each of COMPARED: how many steps are equal, and where the first is not."""
+    equal = np.array([_is_equal(one, two) for one, two in zip(commands, feed.steps, strict=True)])
+    rows = []
+    for column, name in enumerate(COMPARED):
+        wrong = np.flatnonzero(~equal[:, column])
+        first = None
+        if len(wrong):
+            step = int(wrong[0])
+            dt = feed.config.episode.control_dt_s
+            first = {"step": step, "time_s": round(step * dt, 9)}
+            first |= dict(zip(("replayed", "logged"), _values(column, commands[step], feed.steps[step]), strict=True))
+        rows.append({"what": name, "equal_steps": int(equal[:, column].sum()), "first_difference": first})
+    return rows
+
+
+def _values(column: int, command: PilotCommand, logged: LoggedStep) -> list[Any]:
+    """(replayed, logged) of one of COMPARED."""
+    if column == 2:
+        return [command.leaf, logged.leaf]
+    names = {0: "action", 1: "asked_w", 3: "pos_w"}
+    return [getattr(one, names[column]).tolist() for one in (command, logged)]
+
+
+def _change(commands: list[PilotCommand], feed: LogFeed) -> dict[str, Any]:
+    """How far the commands are from the logged ones, and how often the pilot stopped."""
+    actions = np.array([command.action for command in commands], np.float64)
+    off = np.abs(actions - np.array([logged.action for logged in feed.steps], np.float64)).max(axis=1)
+    held = [command.held for command in commands]
+    reasons: dict[str, int] = {}
+    for name in (reason.partition(":")[0] for all_of in held for reason in all_of):
+        reasons[name] = reasons.get(name, 0) + 1
+    places = [
+        float(np.linalg.norm(command.pos_w - logged.pos_w))
+        for command, logged in zip(commands, feed.steps, strict=True)
+        if logged.pos_w is not None
+    ]
+    return {
+        "finite": bool(np.isfinite(actions).all()),
+        "largest": float(off.max(initial=0.0)),
+        "mean": float(off.mean()) if len(off) else 0.0,
+        "steps_beyond_tenth": int((off > 0.1).sum()),
+        "position_m": max(places, default=0.0),
+        "held_steps": sum(bool(all_of) for all_of in held),
+        "held_for": reasons,
+    }
