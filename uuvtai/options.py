@@ -301,6 +301,25 @@ ExportCheck = Annotated[
 ]
 ExportForce = Annotated[bool, Option("--force", help="Replace the exported policy that --out names.")]
 
+# ----------------------------------------------------------------------------------------------------- replay
+
+ReplayLog = Annotated[Path, Argument(help="A log of 'uuv eval --record N --depth-images'.")]
+ReplayTree = Annotated[str | None, _tree("Tree in place of the one that the log holds")]
+Drop = Annotated[float, Option("--drop", help="Share of the sensors' messages to lose, 0 to 1.")]
+Jitter = Annotated[
+    float, Option("--jitter", help="Messages arrive up to this much later \\[s], out of order too.")
+]
+Lose = Annotated[
+    list[str] | None,
+    Option(
+        "--lose",
+        metavar="SENSOR:FROM:TO",
+        help="A sensor that is dead for a while \\[s]: imu, dvl, pressure, position, sonar or depth "
+        "(repeatable).",
+    ),
+]
+FaultSeed = Annotated[int, Option("--fault-seed", help="Of the random numbers of --drop and --jitter.")]
+
 # ---------------------------------------------------------------------------------------------- presets, tree
 
 PresetsAction = Annotated[

@@ -20,6 +20,7 @@ SEE = {
     "reproduce": ("learning", "own_pieces"),
     "report": ("quickstart",),
     "export": ("deployment",),
+    "replay": ("replay", "viewers"),
     "presets": ("reference/configuration",),
     "doctor": ("quickstart", "native"),
     "warm": ("native",),
@@ -40,7 +41,11 @@ EXIT_CODES = (
         "usage or configuration: nothing was begun, nothing was written; the message says what to type "
         "instead",
     ),
-    (endings.GATE, "finished, but a gate was not met: `uuv export` found that an exported policy disagrees"),
+    (
+        endings.GATE,
+        "finished, but a gate was not met: `uuv export` found that an exported policy disagrees, or `uuv "
+        "replay` that commands do",
+    ),
     (
         endings.INTERRUPTED,
         "interrupted (Ctrl-C); what was finished is kept, and the message names the command that goes on",

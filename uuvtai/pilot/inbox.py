@@ -43,7 +43,9 @@ class Inbox:
         numbers that cannot be is counted as bad and forgotten."""
         name = NAMES.get(type(message))
         if name is None:
-            raise TypeError(f"a {type(message).__name__} is no message of a sensor: {', '.join(NAMES.values())}")
+            raise TypeError(
+                f"a {type(message).__name__} is no message of a sensor: {', '.join(NAMES.values())}"
+            )
         tally = self.tallies[name]
         tally.fed += 1
         values = {field.name: getattr(message, field.name) for field in dataclasses.fields(message)}

@@ -33,9 +33,7 @@ def _imu(moment: Moment) -> bytes:
 
 
 ROWS = (
-    Topic(
-        "/sensors/imu", EVERY_STEP, _IMU, _imu, ("ego.imu_rpy", "ego.rate_b", "ego.specific_force_b")
-    ),
+    Topic("/sensors/imu", EVERY_STEP, _IMU, _imu, ("ego.imu_rpy", "ego.rate_b", "ego.specific_force_b")),
     Topic(
         "/sensors/dvl",
         _NEW_VELOCITY,

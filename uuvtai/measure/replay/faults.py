@@ -1,4 +1,4 @@
-"""What goes wrong between a log's sensors and the pilot: messages lost, late, or a sensor dead for a while."""
+"""What goes wrong between a log's sensors and the pilot: messages lost or late, a sensor dead for a while."""
 
 from __future__ import annotations
 

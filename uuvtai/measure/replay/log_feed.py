@@ -164,12 +164,12 @@ class _Reading:
             wanted.add("/camera/exact")
         if missing := sorted(wanted - self._seen):
             raise LogError(
-                f"{path}: the log has no {', '.join(missing)}, without which nothing decides the same; record "
-                "it again: uuv eval --record 1 --depth-images"
+                f"{path}: the log has no {', '.join(missing)}, without which nothing decides the same; "
+                "record it again: uuv eval --record 1 --depth-images"
             )
 
-    def _arrives(self, late: LogMessage, message: SensorMessage) -> None:
-        self._feed.arrivals.append(Arrival(late.time_s, message))
+    def _arrives(self, m: LogMessage, message: SensorMessage) -> None:
+        self._feed.arrivals.append(Arrival(m.time_s, message))
 
     def _imu(self, m: LogMessage) -> None:
         parts = (_array(m.data[name]) for name in ("attitude", "rates", "specific_force"))
@@ -205,21 +205,20 @@ class _Reading:
     def _plan(self, m: LogMessage) -> None:
         if m.data["planner"] == "own":
             raise LogError(
-                f"{self._feed.path}: its routes come from a planner of the user's, which the log does not hold"
+                f"{self._feed.path}: its routes come from a planner of the user's, which no log holds; replay "
+                "one of --controller"
             )
 
     def _action(self, m: LogMessage) -> None:
         step = round(m.time_s / self._config.episode.control_dt_s)
         if step != len(self._feed.steps):
             raise LogError(
-                f"{self._feed.path}: step {len(self._feed.steps)} is missing, and a replay begins at step 0 and "
-                "leaves none out; replay a log that is whole"
+                f"{self._feed.path}: step {len(self._feed.steps)} is missing, and a replay begins at step 0 "
+                "and leaves none out; replay a log that is whole"
             )
         if step > _MAX_STEPS:
             raise LogError(f"{self._feed.path}: is longer than {_MAX_STEPS} steps; no episode of ours is")
-        logged = LoggedStep(
-            _array(m.data["teacher"]), _array(m.data["asked"]), m.data["leaf"], self._pos_w
-        )
+        logged = LoggedStep(_array(m.data["teacher"]), _array(m.data["asked"]), m.data["leaf"], self._pos_w)
         self._feed.steps.append(logged)
 
 

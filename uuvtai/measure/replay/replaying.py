@@ -14,8 +14,13 @@ from uuvtai.measure.replay.faults import Disturbed, Faults, disturbed
 from uuvtai.measure.replay.log_feed import LogFeed, LoggedStep, read_feed
 from uuvtai.pilot import OnboardPilot, PilotCommand
 
-COMPARED = ("command", "asked velocity", "node of the tree", "own position")
-"""per step: the tree's action, the velocity behind it, the leaf that chose, the pose estimate"""
+COMPARED = {
+    "command": "action",
+    "asked velocity": "asked_w",
+    "node of the tree": "leaf",
+    "own position": "pos_w",
+}
+"""what is compared per step: attribute of a PilotCommand and of a LoggedStep"""
 
 Build = Callable[[LogFeed], OnboardPilot]
 
@@ -23,7 +28,7 @@ Build = Callable[[LogFeed], OnboardPilot]
 def replay(
     path: Path, faults: Faults | None = None, controller: str | None = None, build: Build | None = None
 ) -> dict[str, Any]:
-    """What ``uuv replay --json`` prints. ``build`` makes the pilot (default: one with a simulator of its own).
+    """What ``uuv replay --json`` prints. ``build`` makes the pilot (default: one with its own simulator).
 
     Numbers count as equal where they are equal as float32; logs do not keep the sign of a zero. Raises
     LogError, TreeError, ConfigError.
@@ -32,14 +37,17 @@ def replay(
     told = disturbed(feed.arrivals, faults)
     pilot = (build or built)(feed)
     commands, tick_s = _played(pilot, feed, told)
+    agreement = [_agreement(name, commands, feed) for name in COMPARED]
     return {
         "schema": 1,
         "log": str(path),
         **{name: feed.run.get(name, "") for name in ("controller", "world", "seed", "episode")},
         "steps": len(feed.steps),
         "faults": {**asdict(faults), "any": faults.any},
-        "equal": all(_is_equal(one, two) == (True,) * 4 for one, two in zip(commands, feed.steps, strict=True)),
-        "agreement": _agreement(commands, feed),
+        "equal": all(
+            _is_equal(one, two) == (True,) * 4 for one, two in zip(commands, feed.steps, strict=True)
+        ),
+        "agreement": agreement,
         "change": _change(commands, feed),
         "messages": {
             name: {**asdict(tally), "lost": told.lost[name]} for name, tally in pilot.tallies.items()
@@ -56,9 +64,7 @@ def built(feed: LogFeed) -> OnboardPilot:
     return OnboardPilot.built(feed.config, feed.tree, feed.mission)
 
 
-def _played(
-    pilot: OnboardPilot, feed: LogFeed, told: Disturbed
-) -> tuple[list[PilotCommand], list[float]]:
+def _played(pilot: OnboardPilot, feed: LogFeed, told: Disturbed) -> tuple[list[PilotCommand], list[float]]:
     """(commands of all steps, seconds that each took)."""
     commands, tick_s, sent = [], [], 0
     dt, arrivals = feed.config.episode.control_dt_s, told.arrivals
@@ -73,38 +79,28 @@ def _played(
     return commands, tick_s
 
 
-def _is_equal(command: PilotCommand, logged: LoggedStep) -> tuple[bool, ...]:
-    """One of COMPARED each."""
-    return (
-        bool(np.array_equal(command.action, logged.action)),
-        bool(np.array_equal(command.asked_w, logged.asked_w)),
-        command.leaf == logged.leaf,
-        logged.pos_w is None or bool(np.array_equal(command.pos_w, logged.pos_w)),
-    )
+def _agreement(name: str, commands: list[PilotCommand], feed: LogFeed) -> dict[str, Any]:
+    """Of one of COMPARED: how many steps are equal, and where the first is not."""
+    pairs = [
+        (getattr(command, COMPARED[name]), getattr(logged, COMPARED[name]))
+        for command, logged in zip(commands, feed.steps, strict=True)
+    ]
+    wrong = [step for step, (ours, theirs) in enumerate(pairs) if not _is_equal(ours, theirs)]
+    first = None
+    if wrong:
+        step, (ours, theirs) = wrong[0], map(_plain, pairs[wrong[0]])
+        time_s = round(step * feed.config.episode.control_dt_s, 9)
+        first = {"step": step, "time_s": time_s, "replayed": ours, "logged": theirs}
+    return {"what": name, "equal_steps": len(pairs) - len(wrong), "first_difference": first}
 
 
-def _agreement(commands: list[PilotCommand], feed: LogFeed) -> list[dict[str, Any]]:
-    """Of each of COMPARED: how many steps are equal, and where the first is not."""
-    equal = np.array([_is_equal(one, two) for one, two in zip(commands, feed.steps, strict=True)])
-    rows = []
-    for column, name in enumerate(COMPARED):
-        wrong = np.flatnonzero(~equal[:, column])
-        first = None
-        if len(wrong):
-            step = int(wrong[0])
-            dt = feed.config.episode.control_dt_s
-            first = {"step": step, "time_s": round(step * dt, 9)}
-            first |= dict(zip(("replayed", "logged"), _values(column, commands[step], feed.steps[step]), strict=True))
-        rows.append({"what": name, "equal_steps": int(equal[:, column].sum()), "first_difference": first})
-    return rows
+def _is_equal(ours: Any, theirs: Any) -> bool:
+    """What the log does not say counts as equal."""
+    return theirs is None or bool(np.array_equal(ours, theirs))
 
 
-def _values(column: int, command: PilotCommand, logged: LoggedStep) -> list[Any]:
-    """(replayed, logged) of one of COMPARED."""
-    if column == 2:
-        return [command.leaf, logged.leaf]
-    names = {0: "action", 1: "asked_w", 3: "pos_w"}
-    return [getattr(one, names[column]).tolist() for one in (command, logged)]
+def _plain(value: Any) -> Any:
+    return value if isinstance(value, str) else value.tolist()
 
 
 def _change(commands: list[PilotCommand], feed: LogFeed) -> dict[str, Any]:
