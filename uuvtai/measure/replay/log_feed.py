@@ -205,8 +205,8 @@ class _Reading:
     def _plan(self, m: LogMessage) -> None:
         if m.data["planner"] == "own":
             raise LogError(
-                f"{self._feed.path}: its routes come from a planner of the user's, which no log holds; replay "
-                "one of --controller"
+                f"{self._feed.path}: its routes come from a planner of the user's, which no log holds; "
+                "replay a log of --controller"
             )
 
     def _action(self, m: LogMessage) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from uuvtai.measure.replay.faults import Disturbed, Faults, disturbed
-from uuvtai.measure.replay.log_feed import LogFeed, LoggedStep, read_feed
+from uuvtai.measure.replay.log_feed import LogFeed, read_feed
 from uuvtai.pilot import OnboardPilot, PilotCommand
 
 COMPARED = {
