@@ -1,5 +1,5 @@
 """Twenty logs of six worlds fed to the stack again without the simulator: steps whose command is equal to the
-last bit; what lost, late and dead sensors change; and episodes driven under such faults to their end."""
+last bit, and what lost, late and dead sensors change."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import subprocess
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -16,17 +15,12 @@ import zstandard
 from mcap.records import Channel, Message
 
 from benchmarks.common import Job, Row
-from uuvtai.config import Config
-from uuvtai.loader import load_config
 from uuvtai.logs.reader import records
 from uuvtai.measure.replay.faults import Faults, outage_of
-from uuvtai.measure.replay.live_feed import drive_by_pilot
 from uuvtai.measure.replay.log_feed import LogFeed
 from uuvtai.measure.replay.replaying import replay
 from uuvtai.pilot import OnboardPilot
 from uuvtai.sim import Sim
-from uuvtai.statistics import wilson_interval
-from uuvtai.tree import read_tree
 
 THREADS = 1
 LONGEST_S = 10800
@@ -49,8 +43,6 @@ FAULTS = {
     "DVL dead from 5 to 10 s": Faults(outages=(outage_of("dvl:5:10"),)),
     "all three": Faults(drop=0.2, jitter_s=0.1, outages=(outage_of("dvl:5:10"),)),
 }
-DRIVEN = 200
-"""episodes of each row of the closed loop"""
 _INSTRUMENTS, _IMAGES = ("/sensors/imu", "/sensors/dvl", "/sensors/pressure"), ("/camera/exact",)
 
 
@@ -67,7 +59,7 @@ def measure(job: Job) -> list[Row]:
             job.say(f"{rows[-1].what}: {rows[-1].note}")
             _SIMS.clear()
         rows += [_change(fault, [documents[fault] for documents in disturbed]) for fault in FAULTS]
-    return rows + list(_driven(job))
+    return rows
 
 
 def _recorded(case: tuple[str, str, tuple[str, ...], int], folder: Path) -> list[Path]:
@@ -173,32 +165,3 @@ def _change(fault: str, found: list[dict[str, Any]]) -> Row:
         f"{apart[-1]:.2f} m at most; all commands finite",
         less_is_better=True,
     )
-
-
-def _driven(job: Job) -> Iterator[Row]:
-    """The loop closed: pool (8, 6, 0.6), nominal sensing."""
-    config: Config = load_config(
-        "pool", "nominal", overrides={"world.n_dynamic": 6, "world.dynamic_speed_m_s": 0.6}
-    )
-    tree, count = read_tree("bt"), 2 if job.quick else DRIVEN
-    sim, flown = Sim(config, 1, tree), Sim(config, 1, tree)
-    for name, faults in FAULTS.items():
-        found = [
-            drive_by_pilot(
-                sim, flown, SEED, episode, Faults(faults.drop, faults.jitter_s, faults.outages, episode)
-            )
-            for episode in range(count)
-        ]
-        ends = Counter(str(one["outcome"]) for one in found)
-        low, high = wilson_interval(ends["success"], count) or (0.0, 1.0)
-        steps, held, other = (sum(int(one[key]) for one in found) for key in ("steps", "held", "other"))
-        others = ", ".join(f"{end} {n}" for end, n in sorted(ends.items()) if end != "success") or "none"
-        yield Row(
-            f"driven, {name}",
-            100.0 * ends["success"] / count,
-            "% of the episodes a success",
-            note=f"{ends['success']} of {count} [{100 * low:.1f}, {100 * high:.1f}]; other endings: {others}; "
-            f"in {steps:,} steps stopped in {held}, another command than undisturbed in {other}",
-            details={"endings": ends, "steps": steps, "held": held, "other": other, "seed": SEED},
-        )
-        job.say(f"driven, {name}: {ends}")

@@ -70,7 +70,7 @@ def commands(feed, build, arrivals=None):
     return replaying._played(pilot, feed, told)[0], pilot
 
 
-# ---------------------------------------------------------------------------------------------------- equality
+# --------------------------------------------------------------------------------------------------- equality
 
 
 def test_a_log_gives_the_same_commands(log, build):
@@ -123,7 +123,7 @@ def test_the_first_difference_is_told_with_its_place(log, build, monkeypatch):
     feed.arrivals = moved
     monkeypatch.setattr(replaying, "read_feed", lambda *_: feed)
     found = replay(log, build=build)
-    command, asked, leaf, place = found["agreement"]
+    command, asked, _, place = found["agreement"]
     assert not found["equal"] and place["first_difference"]["step"] == 40
     assert place["first_difference"]["time_s"] == 0.8
     gap = np.subtract(place["first_difference"]["replayed"], place["first_difference"]["logged"])
@@ -131,7 +131,7 @@ def test_the_first_difference_is_told_with_its_place(log, build, monkeypatch):
     assert command["first_difference"]["step"] >= 40 and asked["equal_steps"] >= 40
 
 
-# ------------------------------------------------------------------------------------------------------ faults
+# ----------------------------------------------------------------------------------------------------- faults
 
 
 def test_lost_late_and_dead_sensors_give_finite_commands(log, build):
@@ -197,7 +197,7 @@ def test_nonsense_is_counted_and_forgotten(log, build):
         if isinstance(message, PressureReading):
             spoilt.append(Arrival(arrival.time_s, PressureReading(message.time_s + 1e-6, 1e30)))
             spoilt.append(Arrival(arrival.time_s, PressureReading(float("nan"), 1.0)))
-    found, pilot = commands(feed, build, [one for one in spoilt])
+    found, pilot = commands(feed, build, spoilt)
     assert all(np.array_equal(one.action, two.action) for one, two in zip(usual, found, strict=True))
     assert pilot.tallies["sonar"].bad == STEPS + 1 and pilot.tallies["pressure"].bad == 2 * (STEPS + 1)
 
@@ -233,7 +233,7 @@ def test_faults_out_of_range_are_refused(wrong):
         Faults(**wrong)
 
 
-# -------------------------------------------------------------------------------------------------------- logs
+# ------------------------------------------------------------------------------------------------------- logs
 
 
 def rewritten(log, path, change):
@@ -273,7 +273,10 @@ def without(*names):
         (without("tree.xml"), "--controller bt"),
         (lambda kind, name, data: b"{a: [" if name == "config.yaml" else data, "config.yaml cannot be used"),
         (lambda kind, name, data: b"{}" if name == "/sensors/imu" else data, "not as its schema says"),
-        (lambda kind, name, data: b'{"velocity": [1]}' if name == "/sensors/dvl" else data, "vel_b must have"),
+        (
+            lambda kind, name, data: b'{"velocity": [1]}' if name == "/sensors/dvl" else data,
+            "vel_b must have",
+        ),
         (
             lambda kind, name, data: {**data, "controller": "bt+truth"} if name == "uuv.run" else data,
             "driven with the truth",
@@ -317,7 +320,7 @@ def test_exact_images_keep_every_bit(log):
         exact_image({"rows": 72, "columns": 128, "data": ""}, (2, 2))
 
 
-# ----------------------------------------------------------------------------------------------------- command
+# ---------------------------------------------------------------------------------------------------- command
 
 
 def test_the_command_tells_what_agrees(log, build, monkeypatch, capfd):
@@ -325,7 +328,9 @@ def test_the_command_tells_what_agrees(log, build, monkeypatch, capfd):
     code, out, _ = uuv(capfd, "replay", log)
     assert code == 0 and f"{STEPS + 1} of {STEPS + 1}" in out and "all commands equal the logged ones" in out
     code, out, _ = uuv(capfd, "replay", log, "--drop", "0.5", "--lose", "sonar:0:9")
-    assert code == 0 and "stopped in" in out and "sonar" in out and "commands differ, under these faults" in out
+    assert (
+        code == 0 and "stopped in" in out and "sonar" in out and "commands differ, under these faults" in out
+    )
     code, out, _ = uuv(capfd, "replay", log, "--json")
     assert code == 0 and json.loads(out)["equal"]
 

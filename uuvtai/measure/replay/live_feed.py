@@ -74,15 +74,18 @@ def drive_by_pilot(sim: Sim, flown: Sim, seed: int, episode: int, faults: Faults
     in which the pilot stopped, and those in which it did something else than ``sim``'s own stack would.
     ValueError where both are the same."""
     if sim is flown:
-        raise ValueError("drive_by_pilot needs two simulators: one is the vehicle, the pilot thinks in the other")
+        raise ValueError(
+            "drive_by_pilot needs two simulators: one is the vehicle, the pilot thinks in the other"
+        )
     one, seeds, numbers = (torch.zeros(sim.num_envs, dtype=torch.int32) for _ in range(3))
     one[0], seeds[0], numbers[0] = 1, seed, episode
     sim.sleep()
     sim.reset(one, seeds, numbers)
     start, goal = (
-        tuple(map(float, sim.rows(field, [0])[0])) for field in (sim.s.mission.start_w, sim.s.mission.goal_w)
+        sim.rows(field, [0])[0].tolist() for field in (sim.s.mission.start_w, sim.s.mission.goal_w)
     )
-    pilot = OnboardPilot(flown, Mission(start, goal, seed, episode))  # type: ignore[arg-type]
+    mission = Mission(tuple(start), tuple(goal), seed, episode)
+    pilot = OnboardPilot(flown, mission)
     feed = LiveFeed(sim, faults)
     held = other = 0
     while True:

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from uuvtai.logs.log_errors import LogError
 from uuvtai.measure.replay.faults import Disturbed, Faults, disturbed
 from uuvtai.measure.replay.log_feed import LogFeed, read_feed
-from uuvtai.pilot import OnboardPilot, PilotCommand
+from uuvtai.pilot import OnboardPilot, PilotCommand, SensorMessage
 
 COMPARED = {
     "command": "action",
@@ -44,9 +45,7 @@ def replay(
         **{name: feed.run.get(name, "") for name in ("controller", "world", "seed", "episode")},
         "steps": len(feed.steps),
         "faults": {**asdict(faults), "any": faults.any},
-        "equal": all(
-            _is_equal(one, two) == (True,) * 4 for one, two in zip(commands, feed.steps, strict=True)
-        ),
+        "equal": all(row["first_difference"] is None for row in agreement),
         "agreement": agreement,
         "change": _change(commands, feed),
         "messages": {
@@ -72,11 +71,21 @@ def _played(pilot: OnboardPilot, feed: LogFeed, told: Disturbed) -> tuple[list[P
         until = (step + 0.5) * dt
         began = time.perf_counter()
         while sent < len(arrivals) and arrivals[sent].time_s <= until:
-            pilot.feed(arrivals[sent].message)
+            _feed(pilot, arrivals[sent].message, feed.path)
             sent += 1
         commands.append(pilot.tick())
         tick_s.append(time.perf_counter() - began)
     return commands, tick_s
+
+
+def _feed(pilot: OnboardPilot, message: SensorMessage, path: Path) -> None:
+    try:
+        pilot.feed(message)
+    except ValueError as error:
+        raise LogError(
+            f"{path}: a message does not fit its config.yaml ({error}); see what is in it with: uuv log info "
+            f"{path}"
+        ) from None
 
 
 def _agreement(name: str, commands: list[PilotCommand], feed: LogFeed) -> dict[str, Any]:
