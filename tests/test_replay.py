@@ -22,7 +22,7 @@ from uuvtai.logs.topics.camera_topics import exact_image
 from uuvtai.measure.replay import replaying
 from uuvtai.measure.replay.faults import Faults, Outage, disturbed, outage_of
 from uuvtai.measure.replay.live_feed import drive_by_pilot
-from uuvtai.measure.replay.log_feed import Arrival, read_feed
+from uuvtai.measure.replay.log_feed import Delivery, read_feed
 from uuvtai.measure.replay.replaying import replay
 from uuvtai.pilot import DepthShot, ImuReading, OnboardPilot, PressureReading, SonarPing
 
@@ -119,7 +119,7 @@ def test_the_first_difference_is_told_with_its_place(log, build, monkeypatch):
         message = arrival.message
         if hasattr(message, "pos_w") and round(arrival.time_s / 0.02) == 40:
             message = dataclasses.replace(message, pos_w=message.pos_w + np.float32(0.25))
-        moved.append(Arrival(arrival.time_s, message))
+        moved.append(Delivery(arrival.time_s, message))
     feed.arrivals = moved
     monkeypatch.setattr(replaying, "read_feed", lambda *_: feed)
     found = replay(log, build=build)
@@ -193,10 +193,10 @@ def test_nonsense_is_counted_and_forgotten(log, build):
             wild = message.range_m.copy()
             wild[7] = np.nan
             later = message.time_s + 1e-6
-            spoilt.append(Arrival(arrival.time_s, dataclasses.replace(message, time_s=later, range_m=wild)))
+            spoilt.append(Delivery(arrival.time_s, dataclasses.replace(message, time_s=later, range_m=wild)))
         if isinstance(message, PressureReading):
-            spoilt.append(Arrival(arrival.time_s, PressureReading(message.time_s + 1e-6, 1e30)))
-            spoilt.append(Arrival(arrival.time_s, PressureReading(float("nan"), 1.0)))
+            spoilt.append(Delivery(arrival.time_s, PressureReading(message.time_s + 1e-6, 1e30)))
+            spoilt.append(Delivery(arrival.time_s, PressureReading(float("nan"), 1.0)))
     found, pilot = commands(feed, build, spoilt)
     assert all(np.array_equal(one.action, two.action) for one, two in zip(usual, found, strict=True))
     assert pilot.tallies["sonar"].bad == STEPS + 1 and pilot.tallies["pressure"].bad == 2 * (STEPS + 1)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from uuvtai.kernels.sensors import depth, proprioception, sonar
 from uuvtai.stages import Stages
 
 
@@ -25,31 +24,15 @@ class Mission:
 class SensorSource(Protocol):
     """Fills readings of the awake rows, in this order in every control step."""
 
-    def sense_motion(self, io: Stages) -> None:
+    def sense_motion(self, stages: Stages) -> None:
         """Readings of ``ego``: DVL, IMU, pressure, a position where it is given. The pose filter, if any,
         predicts between this and the sonar."""
         ...
 
-    def sense_sonar(self, io: Stages) -> None:
+    def sense_sonar(self, stages: Stages) -> None:
         """``scan``; the own pose at a ping is the one that ``ego`` holds now."""
         ...
 
-    def sense_depth(self, io: Stages) -> None:
+    def sense_depth(self, stages: Stages) -> None:
         """``image``; by now the pose filter has used the scan."""
         ...
-
-
-class SimulatedSensors:
-    """The simulator's own: from the truth, with errors as configured."""
-
-    def sense_motion(self, io: Stages) -> None:
-        """All instruments but sonar and camera."""
-        proprioception.sense_proprioception(io.proprioception)
-
-    def sense_sonar(self, io: Stages) -> None:
-        """The ring of beams."""
-        sonar.cast_sonar(io.sonar)
-
-    def sense_depth(self, io: Stages) -> None:
-        """The depth camera."""
-        depth.cast_depth(io.depth)

@@ -34,11 +34,27 @@ from uuvtai.native.making import adopt
 from uuvtai.rrt import RouteFallback, RoutePlanner
 from uuvtai.runtime import start_taichi
 from uuvtai.scenario import Scene, check_scenarios, set_scenes
-from uuvtai.sensing import Mission, SensorSource, SimulatedSensors
+from uuvtai.sensing import Mission, SensorSource
 from uuvtai.sizes import array_sizes, check_size
 from uuvtai.stages import Stages, timed_stage
 from uuvtai.taichi_patches.memory import Memory, address_of
 from uuvtai.tree import FlatTree, load_tree
+
+
+class SimulatedSensors:
+    """The simulator's own: from the truth, with errors as configured."""
+
+    def sense_motion(self, stages: Stages) -> None:
+        """All instruments but sonar and camera."""
+        proprioception.sense_proprioception(stages.proprioception)
+
+    def sense_sonar(self, stages: Stages) -> None:
+        """The ring of beams."""
+        sonar.cast_sonar(stages.sonar)
+
+    def sense_depth(self, stages: Stages) -> None:
+        """The depth camera."""
+        depth.cast_depth(stages.depth)
 
 
 class Sim:

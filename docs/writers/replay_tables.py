@@ -12,7 +12,8 @@ def replayed(sources: Sources) -> str:
     """Undisturbed: how many commands and logs are equal, and what a step takes."""
     pattern = re.compile(
         r"(\d+) of (\d+) logs equal in every step, ([\d,]+) steps; "
-        r"a step takes ([\d.]+) ms, 99 %: ([\d.]+) ms; log (\d+) kB/s, of which instruments ([\d.]+); exact images (\d+) beside"
+        r"a step takes ([\d.]+) ms, 99 %: ([\d.]+) ms; "
+        r"log (\d+) kB/s, of which instruments ([\d.]+); exact images (\d+) beside"
     )
     rows = []
     for row in sources.benchmark("replay")["rows"]:

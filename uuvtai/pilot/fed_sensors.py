@@ -61,7 +61,7 @@ class FedSensors:
         """Until when a message counts as of this step: half a step later."""
         return (self.step + 0.5) * self._dt
 
-    def sense_motion(self, io: Stages) -> None:
+    def sense_motion(self, stages: Stages) -> None:
         """IMU, DVL, pressure and position as they were last told."""
         if isinstance(imu := self._inbox.newest("imu", self.now_s), ImuReading):
             self._imu = imu
@@ -83,7 +83,7 @@ class FedSensors:
         if isinstance(reading, DvlReading):
             ego["vel_b"][0] = ego["dvl_b"][0] = reading.vel_b
 
-    def sense_sonar(self, io: Stages) -> None:
+    def sense_sonar(self, stages: Stages) -> None:
         """The newest ping, placed where the vehicle was when it was taken."""
         ego, scan = self._ego, self._scan
         if self._is_placed():
@@ -105,7 +105,7 @@ class FedSensors:
             for name, value in then.items():
                 scan[name][0] = value
 
-    def sense_depth(self, io: Stages) -> None:
+    def sense_depth(self, stages: Stages) -> None:
         """The newest image, with the own pose when it was taken."""
         ego, image = self._ego, self._image
         if self._is_placed():

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from uuvtai.errors import SettingError
-from uuvtai.measure.replay.log_feed import Arrival
+from uuvtai.measure.replay.log_feed import Delivery
 from uuvtai.pilot.sensor_messages import KINDS, NAMES
 
 
@@ -50,7 +50,7 @@ class Faults:
 class Disturbed:
     """What reaches the pilot, in the order in which it does, and how much was lost, by sensor."""
 
-    arrivals: list[Arrival]
+    arrivals: list[Delivery]
     lost: Counter[str] = field(default_factory=Counter)
 
 
@@ -69,7 +69,7 @@ def outage_of(text: str) -> Outage:
     return Outage(sensor, first, last)
 
 
-def disturbed(arrivals: Sequence[Arrival], faults: Faults) -> Disturbed:
+def disturbed(arrivals: Sequence[Delivery], faults: Faults) -> Disturbed:
     """What is left of the messages, and when it comes."""
     draws = np.random.default_rng(faults.seed).random((len(arrivals), 2))
     found = Disturbed([])
@@ -79,6 +79,6 @@ def disturbed(arrivals: Sequence[Arrival], faults: Faults) -> Disturbed:
         if dead or luck < faults.drop:
             found.lost[name] += 1
         else:
-            found.arrivals.append(Arrival(arrival.time_s + delay * faults.jitter_s, arrival.message))
+            found.arrivals.append(Delivery(arrival.time_s + delay * faults.jitter_s, arrival.message))
     found.arrivals.sort(key=lambda arrival: arrival.time_s)
     return found

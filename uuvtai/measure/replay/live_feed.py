@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from uuvtai.measure.replay.faults import Faults
-from uuvtai.measure.replay.log_feed import Arrival
+from uuvtai.measure.replay.log_feed import Delivery
 from uuvtai.outcomes import OUTCOMES, RUNNING
 from uuvtai.pilot import (
     DepthShot,
@@ -32,7 +32,7 @@ class LiveFeed:
     def __init__(self, sim: Sim, faults: Faults) -> None:
         self._sim, self._faults = sim, faults
         self._random = np.random.default_rng(faults.seed)
-        self._on_the_way: list[Arrival] = []
+        self._on_the_way: list[Delivery] = []
         self._dt = sim.config.episode.control_dt_s
         self._given = sim.config.sensors.localization != "estimated"
 
@@ -44,7 +44,7 @@ class LiveFeed:
             name = NAMES[type(message)]
             dead = any(o.sensor == name and o.from_s <= message.time_s < o.to_s for o in self._faults.outages)
             if not dead and luck >= self._faults.drop:
-                self._on_the_way.append(Arrival(step * self._dt + delay * self._faults.jitter_s, message))
+                self._on_the_way.append(Delivery(step * self._dt + delay * self._faults.jitter_s, message))
         until = (step + 0.5) * self._dt
         ready = [arrival for arrival in self._on_the_way if arrival.time_s <= until]
         self._on_the_way = [arrival for arrival in self._on_the_way if arrival.time_s > until]

@@ -32,7 +32,7 @@ _MAX_STEPS = 180_000
 
 
 @dataclass(frozen=True)
-class Arrival:
+class Delivery:
     """A message and when it reaches the pilot."""
 
     time_s: float
@@ -62,7 +62,7 @@ class LogFeed:
     mission: Mission
     run: dict[str, str]
     """metadata uuv.run"""
-    arrivals: list[Arrival] = field(default_factory=list)
+    arrivals: list[Delivery] = field(default_factory=list)
     """in the order of the log"""
     steps: list[LoggedStep] = field(default_factory=list)
     """from step 0 on, without a gap"""
@@ -74,7 +74,7 @@ def read_feed(path: Path, controller: str | None = None) -> LogFeed:
     head = read_head(path)
     try:
         feed = _begun(path, head, controller)
-        _Reading(feed).run()
+        _FeedReader(feed).run()
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         if isinstance(error, LogError):
             raise
@@ -132,7 +132,7 @@ def _array(values: Any) -> np.ndarray:
     return np.array(values, np.float32)
 
 
-class _Reading:
+class _FeedReader:
     """Messages into the feed."""
 
     def __init__(self, feed: LogFeed) -> None:
@@ -169,7 +169,7 @@ class _Reading:
             )
 
     def _arrives(self, m: LogMessage, message: SensorMessage) -> None:
-        self._feed.arrivals.append(Arrival(m.time_s, message))
+        self._feed.arrivals.append(Delivery(m.time_s, message))
 
     def _imu(self, m: LogMessage) -> None:
         parts = (_array(m.data[name]) for name in ("attitude", "rates", "specific_force"))
