@@ -12,6 +12,7 @@ from docs.writers.benchmark_pages import benchmark, benchmark_scenes
 from docs.writers.figure_sources import Counts, SourceError, Sources, fitting, pooled, weighted
 from docs.writers.pieces import BEFORE, CELLS, LETTERS, PIECES
 from docs.writers.pose_tables import pose_endings, pose_errors
+from docs.writers.replay_tables import changed, lossy, replayed
 from uuvtai.measure.reproduce import paper
 from uuvtai.measure.reproduce.steps import RETIRED_SEEDS
 from uuvtai.outcomes import COLLIDED
@@ -571,6 +572,9 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         risk_bins,
         pose_endings,
         pose_errors,
+        replayed,
+        changed,
+        lossy,
         twin_curve,
         twin_policy,
         chooser_trials,
