@@ -444,6 +444,34 @@ def export_policy(
         raise typer.Exit(GATE)
 
 
+# --------------------------------------------------------------------------------------------------- replay
+
+
+@app.command("replay", epilog="Example: uuv replay runs/first/logs/bt_seed0_episode0.mcap --lose dvl:10:15")
+def replay_log(
+    log: opt.ReplayLog,
+    controller: opt.ReplayTree = None,
+    drop: opt.Drop = 0.0,
+    jitter: opt.Jitter = 0.0,
+    lose: opt.Lose = None,
+    fault_seed: opt.FaultSeed = 0,
+    wide: opt.Wide = False,
+    as_json: opt.AsJson = False,
+) -> None:
+    """Feed a log's sensor messages to the stack again, without the simulator, and compare the commands. Exit
+    code 3: they differ, though nothing was disturbed."""
+    arguments.refuse_less("--fault-seed", fault_seed, 0)
+    from uuvtai.measure.replay.faults import Faults, outage_of
+    from uuvtai.measure.replay.replaying import replay
+    from uuvtai.show.replays import show_replay
+
+    faults = Faults(drop, jitter, tuple(map(outage_of, lose or [])), fault_seed)
+    found = replay(log, faults, controller)
+    _print(found, as_json, lambda: show_replay(Screen(wide), found))
+    if not (found["equal"] or found["faults"]["any"]):
+        raise typer.Exit(GATE)
+
+
 # -------------------------------------------------------------------------------------- presets, doctor, tree
 
 

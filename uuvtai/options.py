@@ -134,7 +134,13 @@ Record = Annotated[
     int, Option("--record", help="Record the first K episodes of every method as MCAP with a picture.")
 ]
 Video = Annotated[bool, Option("--video", help="Also a top-down video of every recorded episode.")]
-DepthImages = Annotated[bool, Option("--depth-images", help="Also record the depth camera (2 Hz).")]
+DepthImages = Annotated[
+    bool,
+    Option(
+        "--depth-images",
+        help="Also record the depth camera: 2 Hz to look at, and every image exactly (uuv replay).",
+    ),
+]
 Explain = Annotated[
     bool,
     Option(
@@ -336,6 +342,25 @@ ExportCheck = Annotated[
     Path | None, Option("--check", help="Verify an exported folder instead: sha256 and golden pairs.")
 ]
 ExportForce = Annotated[bool, Option("--force", help="Replace the exported policy that --out names.")]
+
+# ----------------------------------------------------------------------------------------------------- replay
+
+ReplayLog = Annotated[Path, Argument(help="A log of 'uuv eval --record N --depth-images'.")]
+ReplayTree = Annotated[str | None, _tree("Tree in place of the one that the log holds")]
+Drop = Annotated[float, Option("--drop", help="Share of the sensors' messages to lose, 0 to 1.")]
+Jitter = Annotated[
+    float, Option("--jitter", help="Messages arrive up to this much later \\[s], out of order too.")
+]
+Lose = Annotated[
+    list[str] | None,
+    Option(
+        "--lose",
+        metavar="SENSOR:FROM:TO",
+        help="A sensor that is dead for a while \\[s]: imu, dvl, pressure, position, sonar or depth "
+        "(repeatable).",
+    ),
+]
+FaultSeed = Annotated[int, Option("--fault-seed", help="Of the random numbers of --drop and --jitter.")]
 
 # ---------------------------------------------------------------------------------------------- presets, tree
 

@@ -34,10 +34,27 @@ from uuvtai.native.making import adopt
 from uuvtai.rrt import RouteFallback, RoutePlanner
 from uuvtai.runtime import start_taichi
 from uuvtai.scenario import Scene, check_scenarios, set_scenes
+from uuvtai.sensing import Mission, SensorSource
 from uuvtai.sizes import array_sizes, check_size
 from uuvtai.stages import Stages, timed_stage
 from uuvtai.taichi_patches.memory import Memory, address_of
 from uuvtai.tree import FlatTree, load_tree
+
+
+class SimulatedSensors:
+    """The simulator's own: from the truth, with errors as configured."""
+
+    def sense_motion(self, stages: Stages) -> None:
+        """All instruments but sonar and camera."""
+        proprioception.sense_proprioception(stages.proprioception)
+
+    def sense_sonar(self, stages: Stages) -> None:
+        """The ring of beams."""
+        sonar.cast_sonar(stages.sonar)
+
+    def sense_depth(self, stages: Stages) -> None:
+        """The depth camera."""
+        depth.cast_depth(stages.depth)
 
 
 class Sim:
@@ -47,7 +64,8 @@ class Sim:
     its choice there, the next ``step`` reads it; overwrite it to drive otherwise. ``observation`` is None
     until somebody asks by ``observe``. While ``privileged`` is on (a yardstick, off in a new simulator), the
     tracks of moving bodies are the truth. ``planner`` plans the routes on the host in place of the
-    simulator's own planners; None in a new simulator.
+    simulator's own planners; None in a new simulator. ``sensors`` fills what the stack senses; in a new
+    simulator its own kernels.
     """
 
     def __init__(self, config: Config, num_envs: int, tree: FlatTree, device: str = "cpu") -> None:
@@ -66,6 +84,7 @@ class Sim:
         self._every_row = torch.arange(num_envs, dtype=torch.int32, device=self.device)
         self.fallback = RouteFallback(config)
         self.planner: RoutePlanner | None = None
+        self.sensors: SensorSource = SimulatedSensors()
         self.stage_s: dict[str, float] | None = None
         self.privileged = False
         self._memory = self.memory()
@@ -117,21 +136,26 @@ class Sim:
             reward.compute_reward(io.reward, self.reward, self.terminated, self.truncated)
 
     def _perceive(self) -> None:
-        """Sensing to teacher for the rows that are awake."""
+        """Sensing to teacher for the rows that are awake.
+
+        Behind ``sensors`` no stage reads the truth but yardsticks, and none draws a random number by the
+        episode's key but the fallback planner (``_plan_seed``): the same readings in the same steps give
+        the same commands (``uuvtai.pilot``).
+        """
         io, c = self.io, self.config
         with self._stage("proprioception"):
-            proprioception.sense_proprioception(io.proprioception)
+            self.sensors.sense_motion(io)
         estimated = c.sensors.localization == "estimated"
         if estimated:
             with self._stage("pose"):
                 pose.predict_pose(io.pose)
         with self._stage("sonar"):
-            sonar.cast_sonar(io.sonar)
+            self.sensors.sense_sonar(io)
         if estimated and c.pose.use_walls:
             with self._stage("pose"):
                 pose.correct_pose(io.pose)
         with self._stage("depth"):
-            depth.cast_depth(io.depth)
+            self.sensors.sense_depth(io)
         with self._stage("tracking"):
             self._track()
         with self._stage("mapping"):
@@ -211,6 +235,15 @@ class Sim:
         self.draw(mask, seed, number)
         dynamics.reset_vehicle(io.dynamics)
         actuation.reset_actuation(io.actuation)
+        self._forget()
+        reward.reset_reward(io.reward)
+        episode.reset_referee(io.episode)
+        self._perceive()
+        episode.wake(io.episode)
+
+    def _forget(self) -> None:
+        """Empty readings and memory of the stack in the rows that are awake."""
+        io = self.io
         proprioception.reset_proprioception(io.proprioception)
         if self.config.sensors.localization == "estimated":
             pose.reset_pose(io.pose)
@@ -223,10 +256,30 @@ class Sim:
             exposure.reset_exposure(io.exposure)
         route.reset_route(io.route)
         leaves.reset_teacher(io.teacher)
-        reward.reset_reward(io.reward)
-        episode.reset_referee(io.episode)
+
+    def begin_mission(self, mission: Mission) -> None:
+        """Begin in row 0 alone, without a world: ``sensors`` delivers what is sensed there, ``step_mission``
+        goes on. The other rows sleep."""
+        mask, seed, number = torch.zeros(3, self.num_envs, dtype=torch.int32, device=self.device)
+        mask[0], seed[0], number[0] = 1, mission.seed, mission.episode
+        self.sleep()
+        episode.begin_episodes(self.io.episode, mask, seed, number)
+        for field, place in (
+            (self.s.mission.start_w, mission.start),
+            (self.s.mission.goal_w, mission.goal),
+            (self.s.vehicle.pos_w, mission.start),
+        ):
+            places = self.rows(field)
+            places[0] = place
+            self._put(field, places)
+        self._forget()
         self._perceive()
-        episode.wake(io.episode)
+        episode.wake(self.io.episode)
+
+    def step_mission(self) -> None:
+        """One control step more of ``begin_mission``: perception to the tree's choice, nothing is moved."""
+        episode.advance_clock(self.io.episode)
+        self._perceive()
 
     def draw(self, mask: torch.Tensor, seed: torch.Tensor, number: torch.Tensor) -> None:
         """Draw the scenarios of a ``reset`` to look at them, and nothing more: no row is ready for a step."""

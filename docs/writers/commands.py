@@ -21,6 +21,7 @@ SEE = {
     "reproduce": ("learning", "own_pieces"),
     "report": ("quickstart", "paper_kit"),
     "export": ("deployment",),
+    "replay": ("replay", "viewers"),
     "presets": ("reference/configuration",),
     "doctor": ("quickstart", "native"),
     "warm": ("native",),
@@ -44,7 +45,7 @@ EXIT_CODES = (
     (
         endings.GATE,
         "finished, but a gate was not met: `uuv export` found that an exported policy disagrees, `uuv "
-        "benchmark verify` that an entry does",
+        "benchmark verify` that an entry does, `uuv replay` that commands do",
     ),
     (
         endings.INTERRUPTED,

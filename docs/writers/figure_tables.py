@@ -12,6 +12,7 @@ from docs.writers.benchmark_pages import benchmark, benchmark_scenes
 from docs.writers.figure_sources import Counts, SourceError, Sources, fitting, pooled, weighted
 from docs.writers.pieces import BEFORE, CELLS, LETTERS, PIECES
 from docs.writers.pose_tables import pose_endings, pose_errors
+from docs.writers.replay_tables import changed, lossy, replayed
 from uuvtai.measure.reproduce import paper
 from uuvtai.measure.reproduce.steps import RETIRED_SEEDS
 from uuvtai.outcomes import COLLIDED
@@ -180,12 +181,23 @@ def policy(sources: Sources) -> str:
 
 
 TWIN_FILE = "docs/data/twin_77001.json"
+CHOOSER_FILE = "docs/data/chooser_77001.json"
 
 
 def twin_policy(sources: Sources) -> str:
     """The policy that learnt in the twin beside the tree, in the simulator, on the same episodes."""
+    return _trial_rows(sources, TWIN_FILE, "policy")
+
+
+def chooser_trials(sources: Sources) -> str:
+    """The chooser between tree and policy beside the tree, on the same episodes."""
+    return _trial_rows(sources, CHOOSER_FILE, "chooser")
+
+
+def _trial_rows(sources: Sources, file: str, name: str) -> str:
+    """What ``twin_trials`` has kept in a file."""
     rows = []
-    for entry in sources.json(TWIN_FILE)["rows"]:
+    for entry in sources.json(file)["rows"]:
         tree, own = entry["bt"], entry["policy"]
         pairs = list(zip(tree["outcomes"], own["outcomes"], strict=True))
         only = [sum(a == "s" != b for a, b in pairs), sum(b == "s" != a for a, b in pairs)]
@@ -202,11 +214,18 @@ def twin_policy(sources: Sources) -> str:
                 f"{only[0]}, {only[1]}",
                 f"{mcnemar_p(*only):.2g}",
                 f"{times[0]:.1f}, {times[1]:.1f} s",
+                *_wheel(entry),
             ]
         )
-    head = ["`bt`", "policy", "`bt`: collision", "policy: collision"]
-    more = ["only `bt`, only the policy arrives", "exact McNemar p", "time where both arrive"]
+    head = ["`bt`", name, "`bt`: collision", f"{name}: collision"]
+    more = [f"only `bt`, only the {name} arrives", "exact McNemar p", "time where both arrive"]
+    more += ["hand-overs an episode, share of the policy"] if name == "chooser" else []
     return text_table(["world (S, D, v in m/s)", *head, *more], rows)
+
+
+def _wheel(entry: dict[str, Any]) -> list[str]:
+    counts = entry.get("chooser")
+    return [f"{counts['hand_overs_mean']:.1f}, {100 * counts['policy_share']:.0f} %"] if counts else []
 
 
 def twin_curve(sources: Sources) -> str:
@@ -553,8 +572,12 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         risk_bins,
         pose_endings,
         pose_errors,
+        replayed,
+        changed,
+        lossy,
         twin_curve,
         twin_policy,
+        chooser_trials,
         benchmark_scenes,
         benchmark,
     )

@@ -31,6 +31,8 @@ CELLS = (
     ("pool (8, 9, 1.5)", "pool_9_1.5", "--world pool -S 8 -D 9 -v 1.5"),
     ("pool (8, 6, 0.6)", "pool_6_0.6", "--world pool -S 8 -D 6 -v 0.6"),
 )
+MORE = (("maze (8, 6, 0.6)", "", "--world maze -S 8 -D 6 -v 0.6"), ("netpen", "", "--world netpen"))
+"""worlds that no training met, for ``--more``"""
 """(title, name in the twin's evaluations, options of ``uuv eval``)"""
 
 
@@ -58,6 +60,7 @@ def entry_of(cell: str, command: list[str], result: dict[str, Any], commit: str)
             }
             for who, method in zip(("bt", "policy"), methods, strict=True)
         },
+        **({"chooser": methods[1]["chooser"]} if "chooser" in methods[1] else {}),
     }
 
 
@@ -76,7 +79,10 @@ def main() -> None:
     """Play all scenes and write the file."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path)
-    run = parser.parse_args().run
+    parser.add_argument("--out", default=FILE, help="file of the results, from the root of the tree")
+    parser.add_argument("--more", action="store_true", help="also worlds that no training met")
+    chosen = parser.parse_args()
+    run = chosen.run
     document: dict[str, Any] = {
         "schema": 1,
         "seeds": SEEDS,
@@ -84,7 +90,7 @@ def main() -> None:
         "curve": curve_of(run),
         "rows": [],
     }
-    for title, _name, options in CELLS:
+    for title, _name, options in (*CELLS, *(MORE if chosen.more else ())):
         command = command_of(str(run), options)
         with tempfile.TemporaryDirectory() as place:
             done = subprocess.run(
@@ -95,7 +101,7 @@ def main() -> None:
                 check=True,
             )
         document["rows"].append(entry_of(title, command, json.loads(done.stdout), commit_of_package()))
-        write_atomic(ROOT / FILE, (json.dumps(document, indent=1) + "\n").encode())
+        write_atomic(ROOT / chosen.out, (json.dumps(document, indent=1) + "\n").encode())
         print(title, flush=True)
 
 

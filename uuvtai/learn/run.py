@@ -20,6 +20,7 @@ from uuvtai.statistics import wilson_interval
 if TYPE_CHECKING:
     from uuvtai.env import VectorEnv
     from uuvtai.learn.checkpoint import Checkpoint
+    from uuvtai.learn.chooser_trainer import ChooserTrainer
     from uuvtai.learn.train import Trainer
     from uuvtai.learn.twin_trainer import TwinTrainer
     from uuvtai.scene_options import SceneOptions
@@ -68,7 +69,7 @@ class TrainWatch(Protocol):
     def stop(self) -> None: ...
 
 
-Evaluate = Callable[["Trainer | TwinTrainer", LearningConfig], Metrics]
+Evaluate = Callable[["Trainer | TwinTrainer | ChooserTrainer", LearningConfig], Metrics]
 """``eval/*`` of the policy as it is; training goes on as if nothing had been
 (``measure.evaluate.while_training.evaluate_now``, which knows what learning does not)"""
 
@@ -118,7 +119,10 @@ def _train(
         f"starting {config.train.num_envs} envs (sizes not used before compile their kernels first, about "
         "half a minute)"
     )
-    if config.twin.enabled:
+    trainer: Trainer | TwinTrainer | ChooserTrainer
+    if config.chooser.enabled:
+        trainer = _chooser_trainer(config, found, request.device)
+    elif config.twin.enabled:
         trainer = _twin_trainer(config, found, request.device)
     else:
         trainer = _trainer(_env(config, request.device), config, found)
@@ -205,6 +209,21 @@ def _twin_trainer(config: LearningConfig, checkpoint: Checkpoint | None, device:
     return trainer
 
 
+def _chooser_trainer(config: LearningConfig, checkpoint: Checkpoint | None, device: str) -> ChooserTrainer:
+    """As ``_trainer``, of who shall drive."""
+    from uuvtai.learn.chooser_trainer import ChooserTrainer
+
+    if device == "cuda" or os.environ.get("WORLD_SIZE", "1") != "1":
+        raise ConfigError(
+            "chooser.enabled: it learns in one process on the CPU; leave out --device cuda and torchrun"
+        )
+    trainer = ChooserTrainer(config)
+    if checkpoint:
+        checkpoint.check_table(trainer.observation_table, config)
+        trainer.load_state(checkpoint.state(like=trainer.state()))
+    return trainer
+
+
 def _folder(
     request: TrainRequest, config: LearningConfig, checkpoint: Checkpoint | None, folder: RunFolder | None
 ) -> RunFolder:
@@ -222,7 +241,7 @@ class _Run:
 
     def __init__(
         self,
-        trainer: Trainer | TwinTrainer,
+        trainer: Trainer | TwinTrainer | ChooserTrainer,
         config: LearningConfig,
         folder: RunFolder | None,
         watch: TrainWatch,

@@ -39,8 +39,9 @@ class SetPilot:
             return torch.zeros(rows, *shape, device=sim.device)
 
         self._ego, self._raw, self._ray = zeros(EGO_WIDTH), zeros(N_BODY, RAW_WIDTH), zeros(N_RAY)
-        self._bodies, self._own = zeros(N_BODY, BODY_WIDTH), zeros(EGO_COLUMNS)
-        self._wish, self._last, self._command = zeros(NUM_WISHES), zeros(NUM_WISHES), zeros(4)
+        self.bodies, self.own = zeros(N_BODY, BODY_WIDTH), zeros(EGO_COLUMNS)
+        """columns that the last decision was made from"""
+        self.wish, self._last, self._command = zeros(NUM_WISHES), zeros(NUM_WISHES), zeros(4)
         self._age = torch.zeros(rows, dtype=torch.int64, device=sim.device)
         std = torch.cat([actor.log_std.detach().exp(), torch.zeros(1, device=sim.device)])
         nothing = zeros()
@@ -64,19 +65,19 @@ class SetPilot:
         if bool(due.any()):
             self._ego[:, AT_LAST : AT_LAST + NUM_WISHES] = self._last
             observe_bodies(self._io, due.int(), self._ego, self._raw, self._ray)
-            write_set_columns(self._ego, self._raw, self._ray, self._bodies, self._own)
+            write_set_columns(self._ego, self._raw, self._ray, self.bodies, self.own)
             rows = due.nonzero().flatten()
-            wish = by_chunk(self.actor, self._bodies[rows], self._own[rows]).clamp(-MOST_WISH, MOST_WISH)
-            self._wish[rows] = wish
-        command_hull(self._io, self._gap_m, self._wish, self._command)
+            wish = by_chunk(self.actor, self.bodies[rows], self.own[rows]).clamp(-MOST_WISH, MOST_WISH)
+            self.wish[rows] = wish
+        command_hull(self._io, self._gap_m, self.wish, self._command)
         self.decision = self.decision._replace(action=self._command.clone())
         return self.decision
 
     def advance(self) -> None:
         """The last decision has been carried out."""
         due = self._due()
-        long = self._wish[:, :2].norm(dim=1, keepdim=True).clamp(min=1.0)
-        done = torch.cat([self._wish[:, :2] / long, self._wish[:, 2:].clamp(-1.0, 1.0)], dim=1)
+        long = self.wish[:, :2].norm(dim=1, keepdim=True).clamp(min=1.0)
+        done = torch.cat([self.wish[:, :2] / long, self.wish[:, 2:].clamp(-1.0, 1.0)], dim=1)
         self._last = torch.where(due[:, None], done, self._last)
         self._age += 1
 
@@ -89,9 +90,15 @@ def load_set_pilot(checkpoint: Checkpoint, sim: Sim) -> SetPilot:
     """Pilot of a policy that learnt in the twin. Raises CheckpointError where its networks are not those of
     its config."""
     from uuvtai.twin.observer import SET_TABLE
-    from uuvtai.twin.set_columns import BODY_WIDTH, EGO_COLUMNS
 
     checkpoint.check_table(SET_TABLE, sim.config)
+    return set_pilot_of(checkpoint, sim)
+
+
+def set_pilot_of(checkpoint: Checkpoint, sim: Sim) -> SetPilot:
+    """As ``load_set_pilot``, of a checkpoint whose columns are known to fit."""
+    from uuvtai.twin.set_columns import BODY_WIDTH, EGO_COLUMNS
+
     config, found = checkpoint.config, checkpoint.model()
     try:
         part: dict[str, Any] = found["policy"]

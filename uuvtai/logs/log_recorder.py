@@ -123,6 +123,7 @@ class EpisodeRecorder:
             scenario=scenario_document(sim.config, described, self._world, job.seed, job.episode),
             reward_terms=TERMS,
             tree_nodes=sim.tree.names,
+            tree_xml=sim.tree.xml,
             git_sha=git_sha() or "unknown",
             checkpoint_sha256=self._policy.checkpoint_sha256 if self._policy else "",
         )

@@ -87,6 +87,8 @@ class McapEpisodeLog:
         self._file.add_attachment("config.yaml", "application/yaml", self.header.config_yaml.encode())
         scenario = json.dumps(self.header.scenario, indent=1, allow_nan=False)
         self._file.add_attachment("scenario.json", "application/json", scenario.encode())
+        if self.header.tree_xml:
+            self._file.add_attachment("tree.xml", "application/xml", self.header.tree_xml)
 
     def _declared(self) -> dict[str, int]:
         """Channel of every topic."""

@@ -33,6 +33,8 @@ class EpisodeHeader:
     """names of ``reward.term``'s entries"""
     tree_nodes: tuple[str, ...] = ()
     """names of ``teacher.status``'s entries; numbered by the log where two are equal"""
+    tree_xml: bytes = b""
+    """the tree as it was read; empty = unknown"""
     git_sha: str = "unknown"
     checkpoint_sha256: str = ""
     """of the policy's checkpoint; empty = no policy"""
@@ -40,9 +42,13 @@ class EpisodeHeader:
 
     @cached_property
     def nodes(self) -> tuple[str, ...]:
-        """Names of the tree's nodes, where two are equal with their number: 'Hold', 'Hold#7'."""
-        names = self.tree_nodes
-        return tuple(name if names.index(name) == i else f"{name}#{i}" for i, name in enumerate(names))
+        """Names of the tree's nodes."""
+        return numbered(self.tree_nodes)
+
+
+def numbered(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Names of a tree's nodes, where two are equal with their number: 'Hold', 'Hold#7'."""
+    return tuple(name if names.index(name) == i else f"{name}#{i}" for i, name in enumerate(names))
 
 
 class EpisodeEnd(Protocol):

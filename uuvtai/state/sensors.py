@@ -36,6 +36,12 @@ class Proprioception:
     where the pose is not estimated"""
     z_var: ti.Field = array("n_env")
     """[m^2] variance of z; 0 where the position is given"""
+    imu_rpy: ti.Field = array("n_env", vec=3)
+    """[rad] roll, pitch, yaw as the IMU itself says, without the filter's correction: for logs"""
+    dvl_b: ti.Field = array("n_env", vec=3)
+    """[m/s] newest reading of the DVL itself, which the filter does not overwrite: for logs"""
+    dvl_fresh: ti.Field = array("n_env", dtype=ti.i32)
+    """1 = ``dvl_b`` was read in this very step"""
 
 
 @dataclass(frozen=True, eq=False)

@@ -83,7 +83,8 @@ def clear_readings(env, io: Bundle[ProprioceptionIO]):
         zero,
         zero,
     )
-    io.ego.vel_valid[env] = 0
+    io.ego.imu_rpy[env], io.ego.dvl_b[env] = zero, zero
+    io.ego.vel_valid[env], io.ego.dvl_fresh[env] = 0, 0
     io.ego.depth_m[env] = 0.0
     io.ego.pos_w[env] = io.vehicle.pos_w[env]
     io.ego.pose_cov[env] = 0.0
@@ -101,6 +102,7 @@ def sense_proprioception(io: Bundle[ProprioceptionIO]):
         if pad == 0 and io.clock.awake[env] == 1:
             key, step = io.episode.key[env], io.clock.step[env]
             read_imu(env, key, step, io)
+            io.ego.dvl_fresh[env] = 0
             if step % io.sensors_cfg.dvl.period_steps == 0:
                 read_dvl(env, key, step, io)
             read_pressure(env, key, step, io)
@@ -138,6 +140,7 @@ def read_imu(env, key, step, io: Bundle[ProprioceptionIO]):
     if ti.static(io.sensors_cfg.imu.accel_bias_m_s2 > 0):
         force += io.ego_memory.accel_bias_b[env]
     io.ego.rpy[env] = ti.Vector([rpy[0], rpy[1], wrapped_angle(rpy[2] + io.ego_memory.heading_error[env])])
+    io.ego.imu_rpy[env] = io.ego.rpy[env]
     io.ego.rate_b[env] = rate
     io.ego.specific_force_b[env] = force
 
@@ -161,6 +164,8 @@ def read_dvl(env, key, step, io: Bundle[ProprioceptionIO]):
         if ti.static(io.sensors_cfg.dvl.sigma_m_s > 0):
             reading += io.sensors_cfg.dvl.sigma_m_s * normal_vector(stream, 0)
         io.ego.vel_b[env] = reading
+        io.ego.dvl_b[env] = reading
+        io.ego.dvl_fresh[env] = 1
 
 
 @ti.func

@@ -9,6 +9,7 @@ from uuvtai.logs.topics import (
     camera_topics,
     driver_topics,
     event_topics,
+    instrument_topics,
     map_topics,
     plan_topics,
     pose_topics,
@@ -18,6 +19,7 @@ from uuvtai.logs.topics import (
 
 TOPICS: tuple[Topic, ...] = (
     *pose_topics.ROWS,
+    *instrument_topics.ROWS,
     *sonar_topics.ROWS,
     *camera_topics.ROWS,
     *map_topics.ROWS,

@@ -6,6 +6,7 @@ from __future__ import annotations
 import base64
 import math
 import struct
+import zlib
 from typing import Any
 
 import cv2
@@ -15,7 +16,7 @@ from uuvtai.config import Config
 from uuvtai.logs.encode import numbers
 from uuvtai.logs.log_errors import LogError
 from uuvtai.logs.moment import Moment
-from uuvtai.logs.schemas import COMPRESSED_IMAGE, NUMBER, TIME, UINT, array_of, described, record
+from uuvtai.logs.schemas import BASE64, COMPRESSED_IMAGE, NUMBER, TIME, UINT, array_of, described, record
 from uuvtai.logs.topic import IMAGES, NEW_IMAGE, Topic
 
 _NO_RETURN_SHARE = 0.999
@@ -33,6 +34,19 @@ _DEPTH_LINE = record(
     column=described(array_of(UINT), "0 = left"),
     row=described(array_of(UINT), "0 = top"),
     depth=described(array_of(NUMBER), "[m] along the camera's axis"),
+)
+
+_DEPTH_EXACT = record(
+    "uuv.DepthExact",
+    "Every image to the last bit, for `uuv replay`.",
+    timestamp=described(TIME, "when the image was taken"),
+    rows=UINT,
+    columns=UINT,
+    data=described(
+        BASE64,
+        "zlib of four planes, least significant byte first, of 32-bit differences: each pixel's float32 [m] "
+        "taken as a whole number, less its predecessor's row by row, modulo 2^32; maximum range = no return",
+    ),
 )
 
 
@@ -95,7 +109,45 @@ def depth_image(data: dict[str, Any]) -> np.ndarray:
     return image
 
 
+def _exact(moment: Moment) -> bytes:
+    """Every bit of the image; neighbouring pixels of clean images differ little, which the packing uses."""
+    depth_m = np.ascontiguousarray(moment["image.depth_m"], "<f4")
+    rows, cols = depth_m.shape
+    steps = np.diff(depth_m.view("<u4").ravel(), prepend=np.uint32(0)).astype("<u4")
+    planes = steps.view(np.uint8).reshape(-1, 4).T.tobytes()
+    data = base64.b64encode(zlib.compress(planes, 6)).decode()
+    return f'{{"timestamp":{moment.stamp},"rows":{rows},"columns":{cols},"data":"{data}"}}'.encode()
+
+
+def exact_image(data: dict[str, Any], shape: tuple[int, int]) -> np.ndarray:
+    """Depth image [m] of a uuv.DepthExact, float32 (rows, cols). Raises LogError for one that is damaged or
+    has another shape than the config's camera."""
+    if (data["rows"], data["columns"]) != shape:
+        raise LogError(
+            f"an exact depth image of the log has {data['rows']} x {data['columns']} pixels, but its "
+            f"config.yaml says {shape[0]} x {shape[1]}"
+        )
+    size = 4 * shape[0] * shape[1]
+    try:
+        planes = zlib.decompressobj().decompress(base64.b64decode(data["data"]), size)
+    except (ValueError, zlib.error) as error:
+        raise LogError(f"an exact depth image of the log is damaged ({error})") from None
+    if len(planes) != size:
+        raise LogError("an exact depth image of the log is damaged: it is too short")
+    steps = np.frombuffer(planes, np.uint8).reshape(4, -1).T.copy().view("<u4").ravel()
+    return np.cumsum(steps, dtype=np.uint32).view(np.float32).reshape(shape)
+
+
 ROWS = (
     Topic("/camera/line", NEW_IMAGE, _DEPTH_LINE, _line, ("image.depth_m", "image.shot_rpy")),
     Topic("/camera/depth", IMAGES, COMPRESSED_IMAGE, _png, ("image.depth_m",), on_request=True),
+    Topic(
+        "/camera/exact",
+        NEW_IMAGE,
+        _DEPTH_EXACT,
+        _exact,
+        ("image.depth_m",),
+        note=", with `--depth-images`",
+        on_request=True,
+    ),
 )

@@ -75,6 +75,10 @@ class Method:
         from uuvtai.learn.pilot import load_pilot
         from uuvtai.logs.log_recorder import PolicyNote
 
+        if self.checkpoint.config.chooser.enabled:
+            from uuvtai.learn.chooser import load_chooser
+
+            return PolicyNote(load_chooser(self.checkpoint, sim), self.checkpoint.sha256, None)
         if self.checkpoint.config.twin.enabled:
             from uuvtai.learn.set_pilot import load_set_pilot
 

@@ -19,6 +19,7 @@ from uuvtai.measure.evaluate.foresight import (
     moments_of,
     risk_entry,
 )
+from uuvtai.measure.evaluate.hand_overs import hand_overs_of, told
 from uuvtai.measure.evaluate.ledger import Finished, Ledger, LedgerWriter
 from uuvtai.measure.evaluate.summary import summary, tree_use
 from uuvtai.rrt import RoutePlanner
@@ -82,6 +83,7 @@ def play(comparison: Comparison, method: Method, jobs: list[Job], ledger: Ledger
     sim = comparison.simulator_for(method)
     recorder = _recorder(comparison.request, folder, method.name, jobs, policy)
     foresight = foresight_of(policy.pilot, dt) if policy else None
+    wheel = hand_overs_of(policy.pilot) if policy else None
     logs = recorder.paths if recorder else {}
     over = ledger.finished(method.name)
     left = [job for job in jobs if job not in over or (job in logs and not logs[job].exists())]
@@ -92,7 +94,7 @@ def play(comparison: Comparison, method: Method, jobs: list[Job], ledger: Ledger
         run_episodes(
             sim,
             left,
-            Recorders([recorder, foresight, writer]),
+            Recorders([recorder, foresight, wheel, writer]),
             lambda done, _total, env_steps, to_come: watch.update(
                 before + done, len(jobs), env_steps, to_come
             ),
@@ -112,6 +114,9 @@ def play(comparison: Comparison, method: Method, jobs: list[Job], ledger: Ledger
     entry = summary(method.name, results, env_steps, wall_s, clock.env_steps_per_s)
     entry |= {"privileged": method.privileged} | method.document()
     entry |= risk_entry(foresight, _moments(foresight, [over[job] for job in jobs], dt))
+    entry |= wheel.entry(results, dt) if wheel else {}
+    if line := told(entry):
+        watch.note(line)
     return MethodRun(method, policy, results, entry, tree_use(sim, results), logs)
 
 

@@ -7,26 +7,28 @@ from typing import TYPE_CHECKING
 from uuvtai.config.learning import LearningConfig
 
 if TYPE_CHECKING:
+    from uuvtai.learn.chooser_trainer import ChooserTrainer
     from uuvtai.learn.run import Metrics
     from uuvtai.learn.train import Trainer
     from uuvtai.learn.twin_trainer import TwinTrainer
     from uuvtai.measure.evaluate.foresight import Foresight
 
 
-def evaluate_now(trainer: Trainer | TwinTrainer, config: LearningConfig) -> Metrics:
+def evaluate_now(trainer: Trainer | TwinTrainer | ChooserTrainer, config: LearningConfig) -> Metrics:
     """``eval/*``: the policy as it is, without exploration, on scenarios of its own; training goes on as if
     nothing had been.
 
     Half of these episodes calibrate the risk head, where there is one and they hold enough accidents; the
     others judge it.
     """
+    from uuvtai.learn.chooser_trainer import ChooserTrainer
     from uuvtai.learn.pilot import Pilot
     from uuvtai.learn.twin_trainer import TwinTrainer
     from uuvtai.measure.episodes.playing import Recorders, jobs_of, run_episodes
     from uuvtai.measure.evaluate.foresight import foresight_of
     from uuvtai.measure.evaluate.summary import summary
 
-    if isinstance(trainer, TwinTrainer):  # in the twin: the simulator is for uuv eval
+    if isinstance(trainer, TwinTrainer | ChooserTrainer):  # they play by themselves
         return trainer.evaluate()
     env = trainer.env
     model = trainer.world_model if config.world_model.as_features else None

@@ -1,0 +1,1 @@
+"""Recorded episodes fed to the pilot again: does it decide the same?"""

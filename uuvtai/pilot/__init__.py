@@ -1,0 +1,33 @@
+"""The stack on a vehicle: sensor messages in, commands out (docs/replay.md)."""
+
+from __future__ import annotations
+
+from uuvtai.pilot.inbox import Tally
+from uuvtai.pilot.onboard import OnboardPilot, PilotCommand, StaleLimits
+from uuvtai.pilot.sensor_messages import (
+    KINDS,
+    DepthShot,
+    DvlReading,
+    ImuReading,
+    PositionFix,
+    PressureReading,
+    SensorMessage,
+    SonarPing,
+)
+from uuvtai.sensing import Mission
+
+__all__ = [
+    "KINDS",
+    "DepthShot",
+    "DvlReading",
+    "ImuReading",
+    "Mission",
+    "OnboardPilot",
+    "PilotCommand",
+    "PositionFix",
+    "PressureReading",
+    "SensorMessage",
+    "SonarPing",
+    "StaleLimits",
+    "Tally",
+]
