@@ -1,9 +1,9 @@
-"""Six random vehicles identified from five minutes of noisy simulated driving: how often the truth lies within
-the 95 % interval.
+"""Six random vehicles identified from five minutes of noisy simulated driving: how often the truth lies
+within the 95 % interval.
 
-Drag, added mass, net buoyancy and thruster gain differ from the vehicle that the identification is told. The
-vehicles are moved by ``Plant`` (six degrees of freedom, rotor lag, inner loop); readings have white and slowly
-varying errors, the DVL one reading in five steps.
+Drag, added mass, net buoyancy and thruster gain differ from the vehicle that the identification is told.
+The vehicles are moved by ``Plant`` (six degrees of freedom, rotor lag, inner loop); readings have white and
+slowly varying errors, the DVL one reading in five steps.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.common import Job, Row
 from uuvtai.config import Config
 from uuvtai.identify.drive_log import Drive, up_axis
-from uuvtai.identify.identified import KNOWN, identify_drives
+from uuvtai.identify.identified import KNOWN, identified
 from uuvtai.identify.motion_model import GAIN, NET, SIZE, parameters_of
 from uuvtai.loader import load_config
 from uuvtai.measure.simulate import roll_pitch_yaw
@@ -48,7 +48,7 @@ def measure(job: Job) -> list[Row]:
             if known == "gain":
                 told = told.model_copy(update={"thrust_scale": told.thrust_scale * true[GAIN]})
                 true[GAIN] = 1.0
-            found = identify_drives([drive], told, known)
+            found = identified([drive], told, known).document
             for entry in found["parameters"]:
                 if not entry["fitted"]:
                     continue
@@ -57,7 +57,7 @@ def measure(job: Job) -> list[Row]:
                 inside.setdefault(name, []).append(entry["low"] <= value <= entry["high"])
                 widths.setdefault(name, []).append(0.5 * (entry["high"] - entry["low"]))
                 total += 1
-        hits = sum(map(sum, inside.values()))
+        hits = int(sum(map(sum, inside.values())))
         table = {
             "within the interval": {name: float(sum(found)) for name, found in inside.items()},
             "half its width, median": {name: float(np.median(found)) for name, found in widths.items()},
@@ -107,8 +107,8 @@ def driven(config: Config, count: int, minutes: float, seed: int) -> tuple[np.nd
 
 
 def commands(rng: np.random.Generator, count: int, steps: int, dt_s: float) -> np.ndarray:
-    """(steps, count, 4) what to drive: each axis takes a random level, slow or fast, forth or back or none, for
-    half a second to four seconds."""
+    """(steps, count, 4) what to drive: each axis takes a random level, slow or fast, forth or back or none,
+    for half a second to four seconds."""
     out = np.zeros((steps, count, 4), np.float32)
     for env in range(count):
         for axis in range(4):

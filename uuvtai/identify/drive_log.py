@@ -1,4 +1,4 @@
-"""Drives as arrays: from logs of ours (MCAP) and from tables (CSV, SI units, body axes ahead, to port, up)."""
+"""Drives as arrays: from our logs (MCAP) and from tables (CSV, SI units; body axes ahead, to port, up)."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def up_axis(roll: np.ndarray, pitch: np.ndarray) -> np.ndarray:
     return np.stack([-np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)], axis=1)
 
 
-# ----------------------------------------------------------------------------------------------------------- logs
+# ------------------------------------------------------------------------------------------------------ logs
 
 
 def _log(path: Path, truth: bool) -> np.ndarray:
@@ -95,7 +95,7 @@ def _up_of(quaternion: Sequence[float]) -> list[float]:
     return [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
 
 
-# ---------------------------------------------------------------------------------------------------------- tables
+# ---------------------------------------------------------------------------------------------------- tables
 
 
 def _table(path: Path) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""``uuv identify``: parameters with intervals, horizon errors and warnings from drives; the vehicle as YAML."""
+"""``uuv identify``: parameters with intervals, errors ahead and warnings from drives; the vehicle as YAML."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from uuvtai.config import VehicleConfig
-from uuvtai.identify.drive_log import Drive, DriveError, read_drives
+from uuvtai.identify.drive_log import Drive, DriveError
 from uuvtai.identify.excitation import LEAST_STRETCHES, MORE, unexcited
 from uuvtai.identify.motion_model import (
     AXES,
@@ -24,6 +24,7 @@ from uuvtai.identify.motion_model import (
     stretches,
 )
 from uuvtai.identify.output_error import SCALE, Fit, fitted, horizon_errors
+from uuvtai.shipped import preset_names
 
 KNOWN = ("gain", "added-mass", "buoyancy")
 """what may be held: speeds and rotor speeds alone tell ratios, one force or mass has to be known"""
@@ -51,19 +52,8 @@ class Identified:
     dt_s: float
 
 
-def identify_files(
-    files: Sequence[Path], vehicle: VehicleConfig, known: str, truth: bool = False
-) -> Identified:
-    """Identify from logs. Raises DriveError, FileError, LogError."""
-    return _identified([drive for file in files for drive in read_drives(file, truth)], vehicle, known)
-
-
-def identify_drives(drives: Sequence[Drive], vehicle: VehicleConfig, known: str = "gain") -> dict[str, Any]:
-    """The same from arrays: the document alone."""
-    return _identified(list(drives), vehicle, known).document
-
-
-def _identified(drives: list[Drive], vehicle: VehicleConfig, known: str) -> Identified:
+def identified(drives: list[Drive], vehicle: VehicleConfig, known: str = "gain") -> Identified:
+    """Fit a vehicle to drives; ``vehicle`` gives mass, thrusters and what is ``known``. Raises DriveError."""
     if known not in KNOWN:
         raise DriveError(f"--known must be one of {', '.join(KNOWN)}, got {known!r}")
     if not drives:
@@ -72,8 +62,8 @@ def _identified(drives: list[Drive], vehicle: VehicleConfig, known: str) -> Iden
     count = len(given.velocity)
     if count < LEAST_STRETCHES:
         raise DriveError(
-            f"the logs hold {count} stretches of {_STRETCH_S:g} s without a gap, {LEAST_STRETCHES} are needed: "
-            "drive for five minutes, or give more logs"
+            f"the logs hold {count} stretches of {_STRETCH_S:g} s without a gap, {LEAST_STRETCHES} are "
+            "needed: drive for five minutes, or give more logs"
         )
     idle = unexcited(given)
     if len(idle) == len(AXES):
@@ -165,5 +155,6 @@ def vehicle_yaml(found: Identified, base: str, files: Sequence[Path]) -> str:
     for entry in found.document["parameters"]:
         bounds = f"[{entry['low']:.4g}, {entry['high']:.4g}]" if entry["fitted"] else "as given"
         lines.append(f"# {entry['name']}: {entry['value']:.4g} {entry['unit']} {bounds}".rstrip())
+    base = base if base in preset_names("vehicle") else str(Path(base).resolve())
     body = yaml.safe_dump({"extends": base, "vehicle": found.keys}, sort_keys=False, default_flow_style=None)
     return "\n".join(line.replace("\n", " ") for line in lines) + "\n" + body

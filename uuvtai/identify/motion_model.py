@@ -92,8 +92,8 @@ def _wrench(drive: Drive, vehicle: VehicleConfig) -> np.ndarray:
     count = drive.rpm.shape[1]
     if count != len(vehicle.thrusters):
         raise DriveError(
-            f"the log has {count} thrusters, the vehicle {len(vehicle.thrusters)}: name the one that was driven, "
-            "--vehicle NAME"
+            f"the log has {count} thrusters, the vehicle {len(vehicle.thrusters)}: name the one that was "
+            "driven, --vehicle NAME"
         )
     lag = drive.dt_s / vehicle.rotor_tau_s
     before, after = drive.rpm[:-1], drive.rpm[1:]
@@ -114,7 +114,8 @@ def thrust_of(rpm: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
 
 
 def motion(theta: np.ndarray, start: np.ndarray, given: Stretches, vehicle: VehicleConfig) -> np.ndarray:
-    """Velocities (runs, s, n + 1, 4) of each parameter set ``theta`` (runs, 14) from ``start`` (runs, s, 4)."""
+    """Velocities (runs, s, n + 1, 4) of each parameter set ``theta`` (runs, 14), from ``start`` (runs, s, 4)
+    on."""
     steps = given.wrench.shape[1]
     parts = max(1, int(np.ceil(given.dt_s / _LONGEST_STEP_S)))
     dt = given.dt_s / parts

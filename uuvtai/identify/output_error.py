@@ -1,5 +1,5 @@
-"""Least squares on the output: parameters whose motion, driven by the logged rotor speeds, comes closest to the
-measured velocities (Gauss-Newton); intervals by a bootstrap over stretches.
+"""Least squares on the output: parameters whose motion, driven by the logged rotor speeds, comes closest to
+the measured velocities (Gauss-Newton); intervals by a bootstrap over stretches.
 
 Each stretch has an initial velocity of its own that is fitted too. Noise of the readings does not enter the
 regressors, as it does where measured velocities are differentiated. A stretch is drawn as a whole, so errors
@@ -95,7 +95,8 @@ def _linearised(
     free: np.ndarray,
     noise: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(s, readings, free), (s, readings, 4), (s, readings): derivatives and what is left, in units of noise."""
+    """(s, readings, free), (s, readings, 4), (s, readings): derivatives and what is left, in units of
+    noise."""
     places = np.flatnonzero(free)
     runs = 1 + len(places) + len(AXES)
     theta, begin = np.tile(value, (runs, 1)), np.tile(start, (runs, 1, 1))
@@ -170,9 +171,9 @@ def horizon_errors(
                 given.velocity[:, begin : begin + ahead + 1],
                 *(a[:, begin : begin + ahead] for a in (given.tilt_rate, given.up, given.wrench)),
             )
-            whole = ~np.isnan(part.velocity[:, 0]).any(axis=1)
+            whole = np.flatnonzero(~np.isnan(part.velocity[:, 0]).any(axis=1))
             part = part.some(whole)
-            if whole.any():
+            if len(whole):
                 end = motion(theta[None], part.velocity[None, :, 0], part, vehicle)[0, :, -1]
                 errors.append(end - part.velocity[:, -1])
         if errors:
