@@ -185,6 +185,18 @@ def test_bad_tables_are_refused(text, tmp_path, capfd):
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.parametrize("name", ["none.csv", "none.mcap", "."])
+def test_what_is_no_log_is_refused(name, tmp_path, capfd):
+    code, out, err = uuv(capfd, "identify", tmp_path / name)
+    assert (code, out) == (2, "") and str(tmp_path) in err
+
+
+def test_a_folder_that_is_not_there_is_refused_before_the_work(table, capfd):
+    out = table.parent / "none" / "mine.yaml"
+    code, _, err = uuv(capfd, "identify", table, "--out", out)
+    assert code == 2 and "is no folder" in err
+
+
 def test_a_gap_parts_a_table(tmp_path):
     path = tmp_path / "gap.csv"
     rows = [f"{t:.1f},0,0,0,0,0" for t in [*np.arange(0, 3, 0.1), *np.arange(9, 11, 0.1)]]

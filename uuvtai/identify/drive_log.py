@@ -99,7 +99,11 @@ def _up_of(quaternion: Sequence[float]) -> list[float]:
 
 
 def _table(path: Path) -> np.ndarray:
-    lines = csv.reader(read_text(path, _MAX_CSV_BYTES).splitlines())
+    try:
+        text = read_text(path, _MAX_CSV_BYTES)
+    except (FileNotFoundError, NotADirectoryError, PermissionError) as error:
+        raise DriveError(f"{path}: cannot be read ({error.strerror}); give a log, .mcap or .csv") from None
+    lines = csv.reader(text.splitlines())
     head = [name.strip() for name in next(lines, [])]
     thrusters = [name for name in head if name.startswith("rpm_")]
     missing = [name for name in _NEEDED if name not in head] + ([] if thrusters else ["rpm_1"])

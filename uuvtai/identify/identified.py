@@ -52,13 +52,13 @@ class Identified:
     dt_s: float
 
 
-def identified(drives: list[Drive], vehicle: VehicleConfig, known: str = "gain") -> Identified:
-    """Fit a vehicle to drives; ``vehicle`` gives mass, thrusters and what is ``known``. Raises DriveError."""
+def identified(drives: list[Drive], vehicle_cfg: VehicleConfig, known: str = "gain") -> Identified:
+    """Fit a vehicle to drives; ``vehicle_cfg`` gives mass, thrusters, what is ``known``. Raises DriveError."""
     if known not in KNOWN:
         raise DriveError(f"--known must be one of {', '.join(KNOWN)}, got {known!r}")
     if not drives:
         raise DriveError("the logs hold no drive: drive for five minutes")
-    given = stretches(drives, vehicle, _STRETCH_S)
+    given = stretches(drives, vehicle_cfg, _STRETCH_S)
     count = len(given.velocity)
     if count < LEAST_STRETCHES:
         raise DriveError(
@@ -68,8 +68,8 @@ def identified(drives: list[Drive], vehicle: VehicleConfig, known: str = "gain")
     idle = unexcited(given)
     if len(idle) == len(AXES):
         raise DriveError(f"the logs excite no axis; {'; '.join(idle.values())}")
-    first, free = parameters_of(vehicle), _free(idle, known)
-    fit = fitted(given, vehicle, first, free)
+    first, free = parameters_of(vehicle_cfg), _free(idle, known)
+    fit = fitted(given, vehicle_cfg, first, free)
     entries = [_entry(place, first, fit, bool(free[place])) for place in range(SIZE)]
     warnings = [f"{text}; its numbers stay those of the vehicle given" for text in idle.values()]
     warnings += [text for entry in entries if (text := _warning(entry))]
@@ -79,11 +79,11 @@ def identified(drives: list[Drive], vehicle: VehicleConfig, known: str = "gain")
         "stretches": count,
         "parameters": entries,
         "residual_rms": dict(zip(AXES, fit.noise.tolist(), strict=True)),
-        "horizons": _horizons(given, vehicle, first, free),
+        "horizons": _horizons(given, vehicle_cfg, first, free),
         "warnings": warnings,
     }
-    predicted = motion(fit.value[None], fit.start[None], given, vehicle)[0]
-    return Identified(document, changed(vehicle, fit.value), given.velocity, predicted, given.dt_s)
+    predicted = motion(fit.value[None], fit.start[None], given, vehicle_cfg)[0]
+    return Identified(document, changed(vehicle_cfg, fit.value), given.velocity, predicted, given.dt_s)
 
 
 def _free(idle: dict[str, str], known: str) -> np.ndarray:
@@ -132,15 +132,15 @@ def _warning(entry: dict[str, Any]) -> str:
 
 
 def _horizons(
-    given: Stretches, vehicle: VehicleConfig, first: np.ndarray, free: np.ndarray
+    given: Stretches, vehicle_cfg: VehicleConfig, first: np.ndarray, free: np.ndarray
 ) -> dict[str, Any]:
     """Rms errors ahead on stretches that a fit of its own has not seen, beside the vehicle given."""
     held = np.arange(len(given.velocity)) % _HELD_OUT == _HELD_OUT - 1
-    fit = fitted(given.some(~held), vehicle, first, free)
+    fit = fitted(given.some(~held), vehicle_cfg, first, free)
     unseen = given.some(held)
     models = {"identified": fit.value, "given": first}
     return {
-        name: {str(k): v for k, v in horizon_errors(unseen, vehicle, theta, HORIZONS).items()}
+        name: {str(k): v for k, v in horizon_errors(unseen, vehicle_cfg, theta, HORIZONS).items()}
         for name, theta in models.items()
     }
 

@@ -46,28 +46,30 @@ class Stretches:
         )
 
 
-def parameters_of(vehicle: VehicleConfig) -> np.ndarray:
+def parameters_of(vehicle_cfg: VehicleConfig) -> np.ndarray:
     """(14,) of a vehicle."""
-    rows = (vehicle.added_mass, vehicle.linear_damping, vehicle.quadratic_damping)
-    net = vehicle.gravity_m_s2 * (vehicle.water_density_kg_m3 * vehicle.volume_m3 - vehicle.mass_kg)
+    rows = (vehicle_cfg.added_mass, vehicle_cfg.linear_damping, vehicle_cfg.quadratic_damping)
+    net = vehicle_cfg.gravity_m_s2 * (
+        vehicle_cfg.water_density_kg_m3 * vehicle_cfg.volume_m3 - vehicle_cfg.mass_kg
+    )
     return np.array([*(row[i] for row in rows for i in _OF_SIX), net, 1.0])
 
 
-def changed(vehicle: VehicleConfig, found: np.ndarray) -> dict[str, object]:
+def changed(vehicle_cfg: VehicleConfig, found: np.ndarray) -> dict[str, object]:
     """Keys of the vehicle section that ``found`` (14,) changes; negative damping and added mass become 0."""
     keys: dict[str, object] = {}
     for row, name in enumerate(("added_mass", "linear_damping", "quadratic_damping")):
-        values = list(getattr(vehicle, name))
+        values = list(getattr(vehicle_cfg, name))
         for i, place in enumerate(_OF_SIX):
             values[place] = max(0.0, round(float(found[4 * row + i]), 5))
         keys[name] = values
-    heavy = vehicle.mass_kg + float(found[NET]) / vehicle.gravity_m_s2
-    keys["volume_m3"] = round(heavy / vehicle.water_density_kg_m3, 8)
-    keys["thrust_scale"] = round(vehicle.thrust_scale * float(found[GAIN]), 5)
+    heavy = vehicle_cfg.mass_kg + float(found[NET]) / vehicle_cfg.gravity_m_s2
+    keys["volume_m3"] = round(heavy / vehicle_cfg.water_density_kg_m3, 8)
+    keys["thrust_scale"] = round(vehicle_cfg.thrust_scale * float(found[GAIN]), 5)
     return keys
 
 
-def stretches(drives: list[Drive], vehicle: VehicleConfig, seconds: float) -> Stretches:
+def stretches(drives: list[Drive], vehicle_cfg: VehicleConfig, seconds: float) -> Stretches:
     """All whole stretches of ``seconds`` in the drives. Raises DriveError."""
     dt_s = drives[0].dt_s
     n = max(2, round(seconds / dt_s))
@@ -77,7 +79,7 @@ def stretches(drives: list[Drive], vehicle: VehicleConfig, seconds: float) -> St
             raise DriveError(
                 f"one log has a sample every {dt_s:g} s, another every {drive.dt_s:g} s: identify them apart"
             )
-        wrench = _wrench(drive, vehicle)
+        wrench = _wrench(drive, vehicle_cfg)
         middle = [0.5 * (a[1:] + a[:-1]) for a in (drive.tilt_rate, drive.up)]
         for begin in range(0, len(wrench) - n + 1, n):
             cut = slice(begin, begin + n)
@@ -87,33 +89,37 @@ def stretches(drives: list[Drive], vehicle: VehicleConfig, seconds: float) -> St
     return Stretches(dt_s, *(np.stack(rows) for rows in zip(*parts, strict=True)))
 
 
-def _wrench(drive: Drive, vehicle: VehicleConfig) -> np.ndarray:
+def _wrench(drive: Drive, vehicle_cfg: VehicleConfig) -> np.ndarray:
     """(n - 1, 4) mean force and moment of each step: rotors approach their next speed as their lag has it."""
     count = drive.rpm.shape[1]
-    if count != len(vehicle.thrusters):
+    if count != len(vehicle_cfg.thrusters):
         raise DriveError(
-            f"the log has {count} thrusters, the vehicle {len(vehicle.thrusters)}: name the one that was "
+            f"the log has {count} thrusters, the vehicle {len(vehicle_cfg.thrusters)}: name the one that was "
             "driven, --vehicle NAME"
         )
-    lag = drive.dt_s / vehicle.rotor_tau_s
+    lag = drive.dt_s / vehicle_cfg.rotor_tau_s
     before, after = drive.rpm[:-1], drive.rpm[1:]
     thrust = np.zeros_like(before)
     for instant in _INSTANTS:
         share = -np.expm1(-instant * lag) / -np.expm1(-lag)
-        thrust += thrust_of(before + share * (after - before), vehicle) / len(_INSTANTS)
-    geometry, _ = allocation_matrices(vehicle)
+        thrust += thrust_of(before + share * (after - before), vehicle_cfg) / len(_INSTANTS)
+    geometry, _ = allocation_matrices(vehicle_cfg)
     return thrust @ geometry[list(_OF_SIX)].T
 
 
-def thrust_of(rpm: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
+def thrust_of(rpm: np.ndarray, vehicle_cfg: VehicleConfig) -> np.ndarray:
     """[N] of rotors, as the simulator has it."""
-    ahead = edge_rpm(vehicle.thrust_forward, vehicle.dead_band_rpm[0], 1.0)
-    astern = edge_rpm(vehicle.thrust_reverse, vehicle.dead_band_rpm[1], -1.0)
-    forward, reverse = (np.polyval(c, rpm) for c in (vehicle.thrust_forward, vehicle.thrust_reverse))
-    return KGF * vehicle.thrust_scale * np.where(rpm >= ahead, forward, np.where(rpm <= astern, reverse, 0.0))
+    ahead = edge_rpm(vehicle_cfg.thrust_forward, vehicle_cfg.dead_band_rpm[0], 1.0)
+    astern = edge_rpm(vehicle_cfg.thrust_reverse, vehicle_cfg.dead_band_rpm[1], -1.0)
+    forward, reverse = (np.polyval(c, rpm) for c in (vehicle_cfg.thrust_forward, vehicle_cfg.thrust_reverse))
+    return (
+        KGF
+        * vehicle_cfg.thrust_scale
+        * np.where(rpm >= ahead, forward, np.where(rpm <= astern, reverse, 0.0))
+    )
 
 
-def motion(theta: np.ndarray, start: np.ndarray, given: Stretches, vehicle: VehicleConfig) -> np.ndarray:
+def motion(theta: np.ndarray, start: np.ndarray, given: Stretches, vehicle_cfg: VehicleConfig) -> np.ndarray:
     """Velocities (runs, s, n + 1, 4) of each parameter set ``theta`` (runs, 14), from ``start`` (runs, s, 4)
     on."""
     steps = given.wrench.shape[1]
@@ -124,18 +130,18 @@ def motion(theta: np.ndarray, start: np.ndarray, given: Stretches, vehicle: Vehi
     for k in range(steps):
         inputs = (given.wrench[:, k], given.tilt_rate[:, k], given.up[:, k])
         for _ in range(parts):
-            half = x + 0.5 * dt * _acceleration(theta, x, inputs, vehicle)
-            x = np.clip(x + dt * _acceleration(theta, half, inputs, vehicle), -_FAST, _FAST)
+            half = x + 0.5 * dt * _acceleration(theta, x, inputs, vehicle_cfg)
+            x = np.clip(x + dt * _acceleration(theta, half, inputs, vehicle_cfg), -_FAST, _FAST)
         out[:, :, k + 1] = x
     return out
 
 
 def _acceleration(
-    theta: np.ndarray, x: np.ndarray, inputs: tuple[np.ndarray, ...], vehicle: VehicleConfig
+    theta: np.ndarray, x: np.ndarray, inputs: tuple[np.ndarray, ...], vehicle_cfg: VehicleConfig
 ) -> np.ndarray:
     wrench, tilt, up = inputs
     added, linear, quadratic = (theta[:, None, i : i + 4] for i in (0, 4, 8))
-    inertia = added + np.array([vehicle.mass_kg] * 3 + [vehicle.inertia_kg_m2[2]])
+    inertia = added + np.array([vehicle_cfg.mass_kg] * 3 + [vehicle_cfg.inertia_kg_m2[2]])
     load = theta[:, None, GAIN, None] * wrench - (linear + quadratic * np.abs(x)) * x
     load[..., :3] += theta[:, None, NET, None] * up
     p, q, r = tilt[:, 0], tilt[:, 1], x[..., 3]
@@ -143,7 +149,7 @@ def _acceleration(
     load[..., 0] -= q * mw - r * mv
     load[..., 1] -= r * mu - p * mw
     load[..., 2] -= p * mv - q * mu
-    six, spin = vehicle.added_mass, vehicle.inertia_kg_m2
+    six, spin = vehicle_cfg.added_mass, vehicle_cfg.inertia_kg_m2
     load[..., 3] -= (added[..., 1] - added[..., 0]) * x[..., 0] * x[..., 1]
     load[..., 3] -= p * q * (spin[1] + six[4] - spin[0] - six[3])
     return load / inertia

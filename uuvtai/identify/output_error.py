@@ -39,7 +39,7 @@ class Fit:
 
 
 def fitted(
-    given: Stretches, vehicle: VehicleConfig, first: np.ndarray, free: np.ndarray, seed: int = 0
+    given: Stretches, vehicle_cfg: VehicleConfig, first: np.ndarray, free: np.ndarray, seed: int = 0
 ) -> Fit:
     """Fit the parameters ``free`` (14, bool), from ``first`` (14,) on; the others stay."""
     value, start = first.copy(), _first_readings(given)
@@ -48,7 +48,7 @@ def fitted(
     back = (value, start)
     shrink = 1.0
     for i in range(_ROUNDS):
-        jacobian, own, rest = _linearised(given, vehicle, value, start, free, noise)
+        jacobian, own, rest = _linearised(given, vehicle_cfg, value, start, free, noise)
         now = float(np.sum(rest**2))
         if now > fault * (1 + 1e-9) and shrink > 0.1:
             shrink *= 0.5
@@ -61,11 +61,11 @@ def fitted(
         value[free] += step * SCALE[free]
         start = start + moved
         if settled or i == 1:
-            noise = _left(given, vehicle, value, start)
+            noise = _left(given, vehicle_cfg, value, start)
             fault = np.inf
         if settled and i > 2:
             break
-    jacobian, own, rest = _linearised(given, vehicle, value, start, free, noise)
+    jacobian, own, rest = _linearised(given, vehicle_cfg, value, start, free, noise)
     low, high = _bootstrap(jacobian, own, rest, seed)
     bounds = [value.copy(), value.copy()]
     for bound, apart in zip(bounds, (low, high), strict=True):
@@ -80,8 +80,8 @@ def _first_readings(given: Stretches) -> np.ndarray:
     return np.nan_to_num(start)
 
 
-def _left(given: Stretches, vehicle: VehicleConfig, value: np.ndarray, start: np.ndarray) -> np.ndarray:
-    away = given.velocity - motion(value[None], start[None], given, vehicle)[0]
+def _left(given: Stretches, vehicle_cfg: VehicleConfig, value: np.ndarray, start: np.ndarray) -> np.ndarray:
+    away = given.velocity - motion(value[None], start[None], given, vehicle_cfg)[0]
     seen = ~np.isnan(away)
     count = np.maximum(1, seen.sum(axis=(0, 1)))
     return np.maximum(1e-5, np.sqrt(np.square(np.where(seen, away, 0.0)).sum(axis=(0, 1)) / count))
@@ -89,7 +89,7 @@ def _left(given: Stretches, vehicle: VehicleConfig, value: np.ndarray, start: np
 
 def _linearised(
     given: Stretches,
-    vehicle: VehicleConfig,
+    vehicle_cfg: VehicleConfig,
     value: np.ndarray,
     start: np.ndarray,
     free: np.ndarray,
@@ -105,7 +105,7 @@ def _linearised(
         theta[1 + i, place] += small * SCALE[place]
     for axis in range(len(AXES)):
         begin[1 + len(places) + axis, :, axis] += small
-    moved = motion(theta, begin, given, vehicle) / noise
+    moved = motion(theta, begin, given, vehicle_cfg) / noise
     seen = ~np.isnan(given.velocity)
     rest = np.where(seen, np.nan_to_num(given.velocity) / noise - moved[0], 0.0)
     slopes = np.where(seen, (moved[1:] - moved[0]) / small, 0.0)
@@ -156,7 +156,7 @@ def _bootstrap(
 
 
 def horizon_errors(
-    given: Stretches, vehicle: VehicleConfig, theta: np.ndarray, horizons: tuple[int, ...]
+    given: Stretches, vehicle_cfg: VehicleConfig, theta: np.ndarray, horizons: tuple[int, ...]
 ) -> dict[int, list[float | None]]:
     """Rms error (surge, sway, heave, yaw) of what is predicted that many steps ahead of a reading, by
     ``theta`` (14,); None where no reading stands there. Horizons longer than a stretch are left out."""
@@ -174,7 +174,7 @@ def horizon_errors(
             whole = np.flatnonzero(~np.isnan(part.velocity[:, 0]).any(axis=1))
             part = part.some(whole)
             if len(whole):
-                end = motion(theta[None], part.velocity[None, :, 0], part, vehicle)[0, :, -1]
+                end = motion(theta[None], part.velocity[None, :, 0], part, vehicle_cfg)[0, :, -1]
                 errors.append(end - part.velocity[:, -1])
         if errors:
             away = np.concatenate(errors)
