@@ -53,7 +53,7 @@ class Identified:
 
 
 def identified(drives: list[Drive], vehicle_cfg: VehicleConfig, known: str = "gain") -> Identified:
-    """Fit a vehicle to drives; ``vehicle_cfg`` gives mass, thrusters, what is ``known``. Raises DriveError."""
+    """Fit a vehicle to drives; ``vehicle_cfg`` gives mass, thrusters, the ``known``. Raises DriveError."""
     if known not in KNOWN:
         raise DriveError(f"--known must be one of {', '.join(KNOWN)}, got {known!r}")
     if not drives:
