@@ -14,6 +14,7 @@ from tests.reference import dynamics as oracle
 from uuvtai.loader import load_config
 from uuvtai.measure.simulate import Trial, control_step, quaternion, roll_pitch_yaw, simulate
 from uuvtai.runtime import start_taichi
+from uuvtai.shipped import preset_names
 
 F32_POSITION_M = 2e-3
 """Single precision over some hundred substeps, far below the design's 1 cm."""
@@ -148,15 +149,20 @@ def test_divergence_is_named():
         run(raw(), seconds=20.0, dt=0.5, wrench=(0, 0, 0, 0, 0, 500))
 
 
-@pytest.mark.parametrize("name", ["bluerov2", "bluerov2_heavy", "bluerov2_li2020", "bluerov2_vonbenzon2022"])
+PUBLISHED_DRAG_N = {
+    "bluerov2": 8.96,
+    "bluerov2_16v": 8.96,
+    "bluerov2_heavy": 8.96,
+    "bluerov2_li2020": 14.5,
+    "bluerov2_nmpc2019": 12.64,
+    "bluerov2_vonbenzon2022": 59.0,
+}
+"""at 0.6 m/s surge"""
+
+
+@pytest.mark.parametrize("name", preset_names("vehicle"))
 def test_vehicle_presets_have_the_published_drag(name):
     v = load_config("open", vehicle=name).vehicle
     drag = v.linear_damping[0] * 0.6 + v.quadratic_damping[0] * 0.36
-    published = {
-        "bluerov2": 8.96,
-        "bluerov2_heavy": 8.96,
-        "bluerov2_li2020": 14.5,
-        "bluerov2_vonbenzon2022": 59.0,
-    }[name]
-    assert abs(drag - published) < 0.05
+    assert abs(drag - PUBLISHED_DRAG_N[name]) < 0.05
     assert len(v.thrusters) == (8 if v.attitude_hold == "thrusters" else 6)

@@ -209,6 +209,35 @@ def simulate(
     _print(result, as_json, lambda: show_simulation(Screen(wide), result, title))
 
 
+# --------------------------------------------------------------------------------------------------- identify
+
+
+@app.command("identify", epilog="Example: uuv identify drive.csv --vehicle bluerov2_16v --out mine.yaml")
+def identify_vehicle(
+    file: opt.DriveLogs,
+    vehicle: opt.SimulateVehicle = "bluerov2_16v",
+    known: opt.IdentifyKnown = "gain",
+    truth: opt.IdentifyTruth = False,
+    out: opt.IdentifyOut = None,
+    overrides: opt.Set = None,
+    force: opt.IdentifyForce = False,
+    wide: opt.Wide = False,
+    as_json: opt.AsJson = False,
+) -> None:
+    """Drag, added mass, buoyancy and thruster gain of a vehicle from logs of its drives, with intervals."""
+    from uuvtai.identify.identify_files import identify
+
+    target = out or file[0].with_suffix(".vehicle.yaml")
+    base = SceneOptions("open", "clean", vehicle, overrides=overrides).config().vehicle
+    document = identify(file, base, vehicle, known, truth, target, force)
+
+    from uuvtai.show.identification import show_identified
+
+    title = f"{file[0].name}: {document['seconds']:g} s of drives, known: {known} of {vehicle}"
+    _print(document, as_json, lambda: show_identified(Screen(wide), document, title))
+    say(f"wrote {target}")
+
+
 # ------------------------------------------------------------------------------------------------------ sweep
 
 

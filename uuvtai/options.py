@@ -401,6 +401,28 @@ Dot = Annotated[bool, Option("--dot", help="Print Graphviz DOT instead.")]
 # -------------------------------------------------------------------------------------------------------- log
 
 LogFile = Annotated[Path, Argument(help="An .mcap file.")]
+DriveLogs = Annotated[
+    list[Path],
+    Argument(help="Logs of drives: .mcap of ours, or .csv with t,u,v,w,r,rpm_1,.. (docs/vehicle.md)."),
+]
+IdentifyKnown = Annotated[
+    str,
+    choices.choice(
+        "--known",
+        ("gain", "added-mass", "buoyancy"),
+        "What is taken from --vehicle: speeds and rotor speeds alone tell ratios.",
+    ),
+]
+IdentifyTruth = Annotated[
+    bool, Option("--truth", help="Take the true motion of a simulated log, not what the instruments said.")
+]
+IdentifyOut = Annotated[
+    Path | None,
+    Option(
+        "--out", help="Vehicle file, with a .png of the prediction beside it \\[default: NAME.vehicle.yaml]."
+    ),
+]
+IdentifyForce = Annotated[bool, Option("--force", help="Replace files that are there.")]
 LogFiles = Annotated[list[Path], Argument(help="Logs of the same episode; trajectories are overlaid.")]
 FilmLogs = Annotated[list[Path], Argument(help="An .mcap file; several are shown at once, a tank each.")]
 LogForce = Annotated[bool, Option("--force", help="Replace the file that --out names.")]

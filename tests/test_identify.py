@@ -1,0 +1,222 @@
+"""``uuv identify``: a drive of the oracle's vehicle gives that vehicle back; what cannot be known is said."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from tests.command import uuv
+from tests.reference import dynamics as oracle
+from tests.reference import logs as episode
+from uuvtai.allocation import allocation_matrices
+from uuvtai.config import VehicleConfig
+from uuvtai.identify.drive_log import Drive, DriveError, read_drives
+from uuvtai.identify.excitation import unexcited
+from uuvtai.identify.identified import KNOWN, identified
+from uuvtai.identify.motion_model import GAIN, NET, changed, parameters_of, stretches
+from uuvtai.loader import load_config
+from uuvtai.logs.mcap_log import McapEpisodeLog
+
+DT_S, SECONDS = 0.02, 65.1
+NOISE = 0.004
+"""[m/s, rad/s] of the readings"""
+TOLD = VehicleConfig()
+TRUE = oracle.Body(
+    added=np.array([7.0, 10.0, 16.0, 0.12, 0.12, 0.15]),
+    linear=np.array([3.0, 8.0, 6.5, 0.07, 0.07, 0.1]),
+    quadratic=np.array([22.0, 18.0, 30.0, 1.55, 1.55, 1.2]),
+    buoyancy=TOLD.mass_kg * TOLD.gravity_m_s2 + 3.0,
+)
+"""level throughout: roll and pitch are held"""
+
+
+def thrust(rpm):
+    """[N] of one rotor speed, by the published coefficients."""
+    forward, reverse = TOLD.thrust_forward, TOLD.thrust_reverse
+    if rpm > TOLD.dead_band_rpm[0]:
+        return 9.81 * (forward[0] * rpm * rpm + forward[1] * rpm + forward[2])
+    if rpm < -TOLD.dead_band_rpm[1]:
+        return 9.81 * (reverse[0] * rpm * rpm + reverse[1] * rpm + reverse[2])
+    return 0.0
+
+
+def oracle_drive(seed=5):
+    """(times, velocities (n, 4), rotor speeds (n, 6)): random rotor speeds, Fossen's equation by RK4."""
+    rng, geometry = np.random.default_rng(seed), allocation_matrices(TOLD)[0]
+    level, still, steps = np.eye(3), np.zeros(3), round(SECONDS / DT_S)
+    nu, rpm, left, wanted = np.zeros(6), np.zeros(6), np.zeros(6, int), np.zeros(6)
+    speeds, rotors = [], []
+
+    def rate(nu, rpm):
+        wrench = geometry @ [thrust(n) for n in rpm]
+        found = oracle.nu_dot(TRUE, level, nu, wrench, still)
+        found[3:5] = 0.0
+        return found
+
+    for _ in range(steps):
+        speeds.append(nu[[0, 1, 2, 5]])
+        rotors.append(rpm)
+        for i in np.flatnonzero(left <= 0):
+            wanted[i] = rng.choice([-2300.0, -1200.0, 0.0, 1200.0, 2300.0])
+            left[i] = round(rng.uniform(0.5, 3.0) / DT_S)
+        left -= 1
+        middle, end = (
+            wanted + (rpm - wanted) * math.exp(-share * DT_S / TOLD.rotor_tau_s) for share in (0.5, 1)
+        )
+        a = rate(nu, rpm)
+        b = rate(nu + 0.5 * DT_S * a, middle)
+        c = rate(nu + 0.5 * DT_S * b, middle)
+        d = rate(nu + DT_S * c, end)
+        nu, rpm = nu + DT_S / 6 * (a + 2 * b + 2 * c + d), end
+    noisy = np.array(speeds) + NOISE * rng.normal(size=(steps, 4))
+    return np.arange(steps) * DT_S, noisy, np.array(rotors)
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory):
+    """A CSV of the drive; the DVL reads at every fifth row."""
+    times, speeds, rotors = oracle_drive()
+    lines = ["t,u,v,w,r,rpm_1,rpm_2,rpm_3,rpm_4,rpm_5,rpm_6"]
+    for k, (t, (u, v, w, r), rpm) in enumerate(zip(times, speeds, rotors, strict=True)):
+        seen = f"{u:.5f},{v:.5f},{w:.5f}" if k % 5 == 0 else ",,"
+        lines.append(f"{t:.2f},{seen},{r:.5f},{','.join(f'{n:.2f}' for n in rpm)}")
+    path = tmp_path_factory.mktemp("identify") / "drive.csv"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_the_oracles_vehicle_comes_back_within_its_intervals(table, capfd):
+    out = table.with_name("mine.yaml")
+    code, text, err = uuv(capfd, "identify", table, "--vehicle", "bluerov2", "--out", out, "--json")
+    assert code == 0, err
+    document = json.loads(text)
+    assert document["stretches"] == 13 and document["known"] == "gain"
+    picked = [0, 1, 2, 5]
+    true = [*TRUE.added[picked], *TRUE.linear[picked], *TRUE.quadratic[picked], 3.0]
+    inside = 0
+    for entry, value in zip(document["parameters"], true, strict=False):
+        inside += entry["low"] <= value <= entry["high"]
+        assert entry["fitted"] and entry["low"] < entry["value"] < entry["high"]
+        assert entry["low"] - (entry["high"] - entry["low"]) < value < 2 * entry["high"] - entry["low"], entry
+    assert inside >= 11
+    gain = document["parameters"][GAIN]
+    assert not gain["fitted"] and gain["value"] == 1.0
+    ours, given = (document["horizons"][name]["100"] for name in ("identified", "given"))
+    assert all(a < b for a, b in zip(ours, given, strict=True))
+    found = load_config("open", vehicle=str(out)).vehicle
+    assert abs(found.added_mass[0] - TRUE.added[0]) < 0.5 and found.added_mass[3] == TOLD.added_mass[3]
+    assert abs(parameters_of(found)[NET] - 3.0) < 0.2
+    assert out.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
+    code, _, err = uuv(capfd, "identify", table, "--out", out)
+    assert code == 2 and "already there" in err
+
+
+def test_one_force_or_mass_has_to_be_known(table):
+    """Twice the masses, drags, buoyancy and gain move alike: each choice holds one of them."""
+    drives = read_drives(table)
+    steady = VehicleConfig(volume_m3=TRUE.buoyancy / TOLD.gravity_m_s2 / TOLD.water_density_kg_m3)
+    found = identified(drives, steady, "buoyancy").document["parameters"]
+    assert not found[NET]["fitted"] and found[GAIN]["fitted"]
+    assert found[GAIN]["low"] < 1.0 < found[GAIN]["high"]
+    with pytest.raises(DriveError, match="gain, added-mass, buoyancy"):
+        identified(drives, TOLD, "mass")
+    assert KNOWN == ("gain", "added-mass", "buoyancy")
+
+
+def still_drive(**moving):
+    """Four minutes at rest but for what ``moving`` says: axis -> speed [n]."""
+    n = round(240 / DT_S)
+    velocity = np.zeros((n, 4))
+    for axis, speed in moving.items():
+        velocity[:, int(axis[1:])] = speed(np.arange(n) * DT_S)
+    return Drive(DT_S, velocity, np.zeros((n, 2)), np.tile([0.0, 0.0, 1.0], (n, 1)), np.zeros((n, 6)))
+
+
+def test_a_log_that_excites_nothing_is_refused_with_what_to_drive():
+    with pytest.raises(DriveError, match=r"excite no axis; surge stayed below 0.00 m/s .* forth and back"):
+        identified([still_drive()], TOLD)
+
+
+def test_axes_that_rest_are_named():
+    drive = still_drive(a0=lambda t: 0.4 * np.sin(t), a3=lambda t: 0.5 * np.sin(0.7 * t))
+    assert set(unexcited(stretches([drive], TOLD, 5.0))) == {"sway", "heave"}
+
+
+def test_short_logs_and_other_thrusters_are_refused():
+    drive = still_drive()
+    short = Drive(DT_S, *(a[:501] for a in (drive.velocity, drive.tilt_rate, drive.up, drive.rpm)))
+    with pytest.raises(DriveError, match="2 stretches of 5 s without a gap, 12 are needed"):
+        identified([short], TOLD)
+    heavy = load_config("open", vehicle="bluerov2_heavy").vehicle
+    with pytest.raises(DriveError, match="6 thrusters, the vehicle 8: name the one"):
+        identified([drive], heavy)
+    with pytest.raises(DriveError, match="identify them apart"):
+        stretches([drive, Drive(0.1, drive.velocity, drive.tilt_rate, drive.up, drive.rpm)], TOLD, 5.0)
+
+
+def test_a_vehicle_file_has_no_negative_numbers_and_its_own_trim():
+    found = parameters_of(TOLD)
+    found[[4, NET, GAIN]] = -0.2, 1.5, 0.9
+    keys = changed(TOLD, found)
+    assert keys["linear_damping"][0] == 0.0 and keys["thrust_scale"] == 0.9
+    again = VehicleConfig(**keys)
+    assert abs(parameters_of(again)[NET] - 1.5) < 1e-3
+
+
+BAD_TABLES = {
+    "t,u,v,w\n0,0,0,0\n": "missing: r, rpm_1",
+    "t,u,v,w,r,rpm_1\n": "has no rows",
+    "t,u,v,w,r,rpm_1\n0,0,0,0,0\n": "line 2 must hold 6 numbers",
+    "t,u,v,w,r,rpm_1\n0,0,0,0,x,0\n": "line 2 must hold 6 numbers",
+    "t,u,v,w,r,rpm_1\n0,0,0,0,inf,0\n": "line 2 must hold 6 numbers",
+    "t,u,v,w,r,rpm_1\n0,0,0,0,0,\n1,0,0,0,0,0\n": "only u, v, w and r may have empty cells",
+    "t,u,v,w,r,rpm_1\n1,0,0,0,0,0\n1,0,0,0,0,0\n": "times must rise",
+    "": "missing: t, u, v, w, r, rpm_1",
+}
+
+
+@pytest.mark.parametrize("text", BAD_TABLES, ids=list(BAD_TABLES.values()))
+def test_bad_tables_are_refused(text, tmp_path, capfd):
+    path = tmp_path / "bad.csv"
+    path.write_text(text)
+    code, out, err = uuv(capfd, "identify", path)
+    assert (code, out) == (2, "") and BAD_TABLES[text] in " ".join(err.split())
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("name", ["none.csv", "none.mcap", "."])
+def test_what_is_no_log_is_refused(name, tmp_path, capfd):
+    code, out, err = uuv(capfd, "identify", tmp_path / name)
+    assert (code, out) == (2, "") and str(tmp_path) in err
+
+
+def test_a_folder_that_is_not_there_is_refused_before_the_work(table, capfd):
+    out = table.parent / "none" / "mine.yaml"
+    code, _, err = uuv(capfd, "identify", table, "--out", out)
+    assert code == 2 and "is no folder" in err
+
+
+def test_a_gap_parts_a_table(tmp_path):
+    path = tmp_path / "gap.csv"
+    rows = [f"{t:.1f},0,0,0,0,0" for t in [*np.arange(0, 3, 0.1), *np.arange(9, 11, 0.1)]]
+    path.write_text("\n".join(["t,u,v,w,r,rpm_1", *rows]))
+    assert [len(drive.rpm) for drive in read_drives(path)] == [30, 20]
+
+
+def test_our_logs_are_read_by_their_instruments_or_by_the_truth(tmp_path):
+    path = tmp_path / "a.mcap"
+    taken = list(episode.snapshots(20, maps=False))
+    with McapEpisodeLog(path, episode.header()) as log:
+        for snap in taken:
+            log.write(snap)
+        log.close(episode.result(20))
+    (drive,), (exact,) = read_drives(path), read_drives(path, truth=True)
+    assert exact.velocity.shape == (21, 4) and abs(exact.dt_s - episode.DT) < 1e-9
+    true, rate, rpm = (np.array([s[f"vehicle.{name}"] for s in taken]) for name in ("vel_b", "rate_b", "rpm"))
+    assert np.allclose(exact.velocity, np.column_stack([true, rate[:, 2]]), atol=1e-6)
+    assert np.allclose(exact.rpm, rpm) and np.allclose(np.linalg.norm(exact.up, axis=1), 1, atol=1e-6)
+    said, valid = (np.array([s[f"ego.{name}"] for s in taken]) for name in ("vel_b", "vel_valid"))
+    held = ~valid.astype(bool) | np.r_[False, (said[1:] == said[:-1]).all(axis=1)]
+    assert np.isnan(drive.velocity[held, :3]).all()
+    assert np.allclose(drive.velocity[~held, :3], said[~held], atol=1e-6)

@@ -1,0 +1,1 @@
+"""From a log of a drive to the numbers of the vehicle: damping, added mass, buoyancy, thrust."""

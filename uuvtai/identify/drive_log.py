@@ -1,0 +1,139 @@
+"""Drives as arrays: from our logs (MCAP) and from tables (CSV, SI units; body axes ahead, to port, up)."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from uuvtai.errors import UserError
+from uuvtai.files import read_text
+from uuvtai.logs.reader import read_messages
+
+_MAX_CSV_BYTES = 256 << 20
+_MAX_SAMPLES = 2_000_000
+_GAP = 0.3
+"""A step that differs from the usual one by more than this share parts a log in two."""
+_NEEDED = ("t", "u", "v", "w", "r")
+
+
+class DriveError(UserError, ValueError):
+    """A log that cannot be identified from: what it lacks, and what to do."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """One drive without a gap, n samples ``dt_s`` apart."""
+
+    dt_s: float
+    velocity: np.ndarray
+    """(n, 4) surge, sway, heave [m/s] and yaw rate [rad/s]; NaN = no reading"""
+    tilt_rate: np.ndarray
+    """(n, 2) roll and pitch rate [rad/s]"""
+    up: np.ndarray
+    """(n, 3) world z axis in body axes"""
+    rpm: np.ndarray
+    """(n, thrusters) rotor speeds, as turned"""
+
+
+def read_drives(path: Path, truth: bool = False) -> list[Drive]:
+    """The drives of a file: ``.csv``, else MCAP. ``truth``: what a log of ours says of the truth, in place of
+    what the instruments said. Raises DriveError, FileError, LogError."""
+    rows = _table(path) if path.suffix.lower() == ".csv" else _log(path, truth)
+    time_s = rows[:, 0]
+    if len(rows) < 2 or not np.isfinite(time_s).all() or (np.diff(time_s) <= 0).any():
+        raise DriveError(f"{path}: times must rise from row to row; give a log of one drive")
+    dt_s = float(np.median(np.diff(time_s)))
+    cuts = np.flatnonzero(np.abs(np.diff(time_s) / dt_s - 1) > _GAP) + 1
+    return [_drive(part, dt_s) for part in np.split(rows, cuts) if len(part) > 1]
+
+
+def _drive(rows: np.ndarray, dt_s: float) -> Drive:
+    return Drive(dt_s, rows[:, 1:5], rows[:, 5:7], rows[:, 7:10], rows[:, 10:])
+
+
+def up_axis(roll: np.ndarray, pitch: np.ndarray) -> np.ndarray:
+    """(n, 3) world z axis in body axes, from angles [rad]."""
+    return np.stack([-np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)], axis=1)
+
+
+# ------------------------------------------------------------------------------------------------------ logs
+
+
+def _log(path: Path, truth: bool) -> np.ndarray:
+    rows, last = [], None
+    for message in read_messages(path, ("/state",)):
+        data = message.data
+        try:
+            source = data if truth else data["measured"]
+            velocity = [float(value) for value in source["velocity"]]
+            held = not truth and (velocity == last or not source["velocity_valid"])
+            last = velocity
+            p, q, r = (float(value) for value in source["rates"])
+            up = _up_of(data["orientation"])
+            rpm = [float(value) for value in data["rpm"]]
+        except (KeyError, TypeError, ValueError):
+            raise DriveError(
+                f"{path}: /state at {message.time_s:.2f} s lacks velocity, rates, orientation or rpm; give a "
+                "log of uuv eval --record, or a CSV"
+            ) from None
+        seen = [math.nan] * 3 if held else velocity
+        rows.append([message.time_s, *seen, r, p, q, *up, *rpm])
+        if len(rows) > _MAX_SAMPLES or len(rows[-1]) != len(rows[0]):
+            raise DriveError(f"{path}: is too long, or changes its number of thrusters on the way")
+    if not rows:
+        raise DriveError(f"{path}: has no messages on /state; give a log of uuv eval --record, or a CSV")
+    return np.array(rows)
+
+
+def _up_of(quaternion: Sequence[float]) -> list[float]:
+    w, x, y, z = (float(value) for value in quaternion)
+    return [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
+
+
+# ---------------------------------------------------------------------------------------------------- tables
+
+
+def _table(path: Path) -> np.ndarray:
+    try:
+        text = read_text(path, _MAX_CSV_BYTES)
+    except (FileNotFoundError, NotADirectoryError, PermissionError) as error:
+        raise DriveError(f"{path}: cannot be read ({error.strerror}); give a log, .mcap or .csv") from None
+    lines = csv.reader(text.splitlines())
+    head = [name.strip() for name in next(lines, [])]
+    thrusters = [name for name in head if name.startswith("rpm_")]
+    missing = [name for name in _NEEDED if name not in head] + ([] if thrusters else ["rpm_1"])
+    if missing or len(set(head)) < len(head):
+        raise DriveError(
+            f"{path}: its first line must name the columns t,u,v,w,r,rpm_1,rpm_2,.. once each (also p,q,roll,"
+            f"pitch); missing: {', '.join(missing) or 'none'}"
+        )
+    values = np.array([_numbers(path, number, row, len(head)) for number, row in enumerate(lines, 2) if row])
+    if not len(values):
+        raise DriveError(f"{path}: has no rows below its first line")
+    column = {name: values[:, i] for i, name in enumerate(head)}
+    nothing = np.zeros(len(values))
+    p, q, roll, pitch = (column.get(name, nothing) for name in ("p", "q", "roll", "pitch"))
+    seen = [column[name] for name in _NEEDED]
+    thrusters.sort(key=lambda name: (len(name), name))
+    rpm = [column[name] for name in thrusters]
+    inputs = np.column_stack([p, q, up_axis(roll, pitch), *rpm])
+    if not np.isfinite(inputs).all():
+        raise DriveError(f"{path}: only u, v, w and r may have empty cells (no reading); fill the others")
+    return np.column_stack([*seen, inputs])
+
+
+def _numbers(path: Path, number: int, row: list[str], width: int) -> list[float]:
+    try:
+        values = [float(cell) if cell.strip() else math.nan for cell in row]
+        if len(values) != width or any(math.isinf(value) for value in values):
+            raise ValueError
+    except ValueError:
+        raise DriveError(
+            f"{path}: line {number} must hold {width} numbers (an empty cell: no reading)"
+        ) from None
+    return values

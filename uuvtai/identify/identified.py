@@ -1,0 +1,160 @@
+"""``uuv identify``: parameters with intervals, errors ahead and warnings from drives; the vehicle as YAML."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from uuvtai.config import VehicleConfig
+from uuvtai.identify.drive_log import Drive, DriveError
+from uuvtai.identify.excitation import LEAST_STRETCHES, MORE, unexcited
+from uuvtai.identify.motion_model import (
+    AXES,
+    GAIN,
+    NET,
+    SIZE,
+    Stretches,
+    changed,
+    motion,
+    parameters_of,
+    stretches,
+)
+from uuvtai.identify.output_error import SCALE, Fit, fitted, horizon_errors
+from uuvtai.shipped import preset_names
+
+KNOWN = ("gain", "added-mass", "buoyancy")
+"""what may be held: speeds and rotor speeds alone tell ratios, one force or mass has to be known"""
+KINDS = ("added mass", "linear damping", "quadratic damping")
+HORIZONS = (1, 10, 100)
+_STRETCH_S = 5.0
+_HELD_OUT = 5
+"""one stretch in so many is predicted by a fit to the others"""
+_LOOSE = 0.5
+"""An interval wider than this share of the value, to either side, is warned of."""
+_UNITS = ("kg", "N s/m", "N s2/m2"), ("kg m2", "N m s", "N m s2")
+
+
+@dataclass(frozen=True)
+class Identified:
+    """The document of ``uuv identify --json`` and what its files are made of."""
+
+    document: dict[str, Any]
+    keys: dict[str, object]
+    """of the vehicle section, as found"""
+    measured: np.ndarray
+    """(s, n + 1, 4) readings, NaN = none"""
+    predicted: np.ndarray
+    """(s, n + 1, 4) by the fitted vehicle"""
+    dt_s: float
+
+
+def identified(drives: list[Drive], vehicle_cfg: VehicleConfig, known: str = "gain") -> Identified:
+    """Fit a vehicle to drives; ``vehicle_cfg`` gives mass, thrusters, the ``known``. Raises DriveError."""
+    if known not in KNOWN:
+        raise DriveError(f"--known must be one of {', '.join(KNOWN)}, got {known!r}")
+    if not drives:
+        raise DriveError("the logs hold no drive: drive for five minutes")
+    given = stretches(drives, vehicle_cfg, _STRETCH_S)
+    count = len(given.velocity)
+    if count < LEAST_STRETCHES:
+        raise DriveError(
+            f"the logs hold {count} stretches of {_STRETCH_S:g} s without a gap, {LEAST_STRETCHES} are "
+            "needed: drive for five minutes, or give more logs"
+        )
+    idle = unexcited(given)
+    if len(idle) == len(AXES):
+        raise DriveError(f"the logs excite no axis; {'; '.join(idle.values())}")
+    first, free = parameters_of(vehicle_cfg), _free(idle, known)
+    fit = fitted(given, vehicle_cfg, first, free)
+    entries = [_entry(place, first, fit, bool(free[place])) for place in range(SIZE)]
+    warnings = [f"{text}; its numbers stay those of the vehicle given" for text in idle.values()]
+    warnings += [text for entry in entries if (text := _warning(entry))]
+    document: dict[str, Any] = {
+        "known": known,
+        "seconds": round(count * _STRETCH_S, 3),
+        "stretches": count,
+        "parameters": entries,
+        "residual_rms": dict(zip(AXES, fit.noise.tolist(), strict=True)),
+        "horizons": _horizons(given, vehicle_cfg, first, free),
+        "warnings": warnings,
+    }
+    predicted = motion(fit.value[None], fit.start[None], given, vehicle_cfg)[0]
+    return Identified(document, changed(vehicle_cfg, fit.value), given.velocity, predicted, given.dt_s)
+
+
+def _free(idle: dict[str, str], known: str) -> np.ndarray:
+    """(14,) which parameters are fitted."""
+    free = np.array([axis not in idle for _ in KINDS for axis in AXES] + [True, True])
+    if known == "gain":
+        free[GAIN] = False
+    elif known == "buoyancy":
+        free[NET] = False
+    else:
+        free[: len(AXES)] = False
+    return free
+
+
+def _entry(place: int, first: np.ndarray, fit: Fit, is_fitted: bool) -> dict[str, Any]:
+    if place < NET:
+        kind, axis = KINDS[place // 4], AXES[place % 4]
+        name, unit = f"{kind}, {axis}", _UNITS[axis == "yaw"][place // 4]
+    else:
+        kind = "net buoyancy" if place == NET else "thruster gain"
+        name, unit = kind, "N" if place == NET else ""
+    return {
+        "name": name,
+        "kind": kind,
+        "place": place,
+        "unit": unit,
+        "given": float(first[place]),
+        "value": float(fit.value[place]),
+        "low": float(fit.low[place]),
+        "high": float(fit.high[place]),
+        "fitted": is_fitted,
+    }
+
+
+def _warning(entry: dict[str, Any]) -> str:
+    """What is loose about a parameter, or ''."""
+    if not entry["fitted"]:
+        return ""
+    half = 0.5 * (entry["high"] - entry["low"])
+    size = max(abs(entry["value"]), abs(entry["given"]), float(SCALE[entry["place"]]))
+    if half > _LOOSE * size:
+        return f"{entry['name']}: known to {half:.2g} {entry['unit']} only; {MORE[entry['kind']]}"
+    if entry["value"] < 0 and entry["place"] != NET:
+        return f"{entry['name']}: came out negative, 0 is written; {MORE[entry['kind']]}"
+    return ""
+
+
+def _horizons(
+    given: Stretches, vehicle_cfg: VehicleConfig, first: np.ndarray, free: np.ndarray
+) -> dict[str, Any]:
+    """Rms errors ahead on stretches that a fit of its own has not seen, beside the vehicle given."""
+    held = np.arange(len(given.velocity)) % _HELD_OUT == _HELD_OUT - 1
+    fit = fitted(given.some(~held), vehicle_cfg, first, free)
+    unseen = given.some(held)
+    models = {"identified": fit.value, "given": first}
+    return {
+        name: {str(k): v for k, v in horizon_errors(unseen, vehicle_cfg, theta, HORIZONS).items()}
+        for name, theta in models.items()
+    }
+
+
+def vehicle_yaml(found: Identified, base: str, files: Sequence[Path]) -> str:
+    """A vehicle file for ``--vehicle``: ``base`` with what was found."""
+    import yaml
+
+    told = ", ".join(file.name for file in files)
+    about = f"Identified by uuv identify from {told} ({found.document['seconds']:g} s), known: "
+    lines = [f"# {about}{found.document['known']}."]
+    for entry in found.document["parameters"]:
+        bounds = f"[{entry['low']:.4g}, {entry['high']:.4g}]" if entry["fitted"] else "as given"
+        lines.append(f"# {entry['name']}: {entry['value']:.4g} {entry['unit']} {bounds}".rstrip())
+    base = base if base in preset_names("vehicle") else str(Path(base).resolve())
+    body = yaml.safe_dump({"extends": base, "vehicle": found.keys}, sort_keys=False, default_flow_style=None)
+    return "\n".join(line.replace("\n", " ") for line in lines) + "\n" + body

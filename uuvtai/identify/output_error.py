@@ -1,0 +1,185 @@
+"""Least squares on the output: parameters whose motion, driven by the logged rotor speeds, comes closest to
+the measured velocities (Gauss-Newton); intervals by a bootstrap over stretches.
+
+Each stretch has an initial velocity of its own that is fitted too. Noise of the readings does not enter the
+regressors, as it does where measured velocities are differentiated. A stretch is drawn as a whole, so errors
+may be correlated within it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from uuvtai.config import VehicleConfig
+from uuvtai.identify.motion_model import AXES, SIZE, Stretches, motion
+
+SCALE = np.array([1.0] * 3 + [0.05] + [1.0] * 3 + [0.05] + [5.0] * 3 + [0.3] + [0.5, 0.1])
+"""size of a step of each parameter"""
+_ROUNDS, _SETTLED = 25, 1e-4
+_DRAWS = 2000
+_LEVEL = (2.5, 97.5)
+_NOISE = 0.02
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What least squares found."""
+
+    value: np.ndarray
+    """(14,)"""
+    low: np.ndarray
+    """(14,) of the 95 % interval; where nothing was fitted, the value itself"""
+    high: np.ndarray
+    start: np.ndarray
+    """(s, 4) initial velocity of each stretch"""
+    noise: np.ndarray
+    """(4,) rms of what is left [m/s, rad/s]"""
+
+
+def fitted(
+    given: Stretches, vehicle_cfg: VehicleConfig, first: np.ndarray, free: np.ndarray, seed: int = 0
+) -> Fit:
+    """Fit the parameters ``free`` (14, bool), from ``first`` (14,) on; the others stay."""
+    value, start = first.copy(), _first_readings(given)
+    noise = np.full(len(AXES), _NOISE)
+    fault = np.inf
+    back = (value, start)
+    shrink = 1.0
+    for i in range(_ROUNDS):
+        jacobian, own, rest = _linearised(given, vehicle_cfg, value, start, free, noise)
+        now = float(np.sum(rest**2))
+        if now > fault * (1 + 1e-9) and shrink > 0.1:
+            shrink *= 0.5
+            value, start = (old + 0.5 * (new - old) for old, new in zip(back, (value, start), strict=True))
+            continue
+        fault, back, shrink = now, (value, start), 1.0
+        step, moved = _step(jacobian, own, rest)
+        settled = np.abs(step).max(initial=0.0) < _SETTLED
+        value = value.copy()
+        value[free] += step * SCALE[free]
+        start = start + moved
+        if settled or i == 1:
+            noise = _left(given, vehicle_cfg, value, start)
+            fault = np.inf
+        if settled and i > 2:
+            break
+    jacobian, own, rest = _linearised(given, vehicle_cfg, value, start, free, noise)
+    low, high = _bootstrap(jacobian, own, rest, seed)
+    bounds = [value.copy(), value.copy()]
+    for bound, apart in zip(bounds, (low, high), strict=True):
+        bound[free] += apart * SCALE[free]
+    return Fit(value, bounds[0], bounds[1], start, noise)
+
+
+def _first_readings(given: Stretches) -> np.ndarray:
+    seen = ~np.isnan(given.velocity)
+    first = np.argmax(seen, axis=1)
+    start = np.take_along_axis(given.velocity, first[:, None], axis=1)[:, 0]
+    return np.nan_to_num(start)
+
+
+def _left(given: Stretches, vehicle_cfg: VehicleConfig, value: np.ndarray, start: np.ndarray) -> np.ndarray:
+    away = given.velocity - motion(value[None], start[None], given, vehicle_cfg)[0]
+    seen = ~np.isnan(away)
+    count = np.maximum(1, seen.sum(axis=(0, 1)))
+    return np.maximum(1e-5, np.sqrt(np.square(np.where(seen, away, 0.0)).sum(axis=(0, 1)) / count))
+
+
+def _linearised(
+    given: Stretches,
+    vehicle_cfg: VehicleConfig,
+    value: np.ndarray,
+    start: np.ndarray,
+    free: np.ndarray,
+    noise: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(s, readings, free), (s, readings, 4), (s, readings): derivatives and what is left, in units of
+    noise."""
+    places = np.flatnonzero(free)
+    runs = 1 + len(places) + len(AXES)
+    theta, begin = np.tile(value, (runs, 1)), np.tile(start, (runs, 1, 1))
+    small = 1e-4
+    for i, place in enumerate(places):
+        theta[1 + i, place] += small * SCALE[place]
+    for axis in range(len(AXES)):
+        begin[1 + len(places) + axis, :, axis] += small
+    moved = motion(theta, begin, given, vehicle_cfg) / noise
+    seen = ~np.isnan(given.velocity)
+    rest = np.where(seen, np.nan_to_num(given.velocity) / noise - moved[0], 0.0)
+    slopes = np.where(seen, (moved[1:] - moved[0]) / small, 0.0)
+    count = len(given.velocity)
+    flat = np.moveaxis(slopes.reshape(runs - 1, count, -1), 0, 2)
+    return flat[..., : len(places)], flat[..., len(places) :], rest.reshape(count, -1)
+
+
+def _apart(jacobian: np.ndarray, own: np.ndarray, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Normal equations of each stretch, (s, k, k) and (s, k), with its initial velocity eliminated."""
+    basis = np.linalg.qr(own)[0]
+    turned = np.swapaxes(basis, 1, 2)
+    free = jacobian - basis @ (turned @ jacobian)
+    left = rest - (basis @ (turned @ rest[..., None]))[..., 0]
+    across = np.swapaxes(free, 1, 2)
+    return across @ free, (across @ left[..., None])[..., 0]
+
+
+def _step(jacobian: np.ndarray, own: np.ndarray, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    square, right = _apart(jacobian, own, rest)
+    step = _solved(square.sum(axis=0), right.sum(axis=0))
+    left = rest - (jacobian @ step)
+    return step, (np.linalg.pinv(own) @ left[..., None])[..., 0]
+
+
+def _solved(square: np.ndarray, right: np.ndarray) -> np.ndarray:
+    ridge = 1e-10 * np.trace(square) / max(1, len(square)) + 1e-12
+    return np.linalg.solve(square + ridge * np.eye(len(square)), right)
+
+
+def _bootstrap(
+    jacobian: np.ndarray, own: np.ndarray, rest: np.ndarray, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """(low, high) (k,) about the fit: one Gauss-Newton step for each draw of stretches, widened for the
+    parameters that were spent."""
+    square, right = _apart(jacobian, own, rest)
+    count, size = right.shape
+    if not size:
+        return np.zeros(0), np.zeros(0)
+    rng = np.random.default_rng(seed)
+    draws = np.empty((_DRAWS, size))
+    for i in range(_DRAWS):
+        weight = np.bincount(rng.integers(0, count, count), minlength=count).astype(float)
+        draws[i] = _solved(np.tensordot(weight, square, 1), weight @ right)
+    wider = np.sqrt(count / max(1.0, count - size))
+    low, high = np.percentile(draws, _LEVEL, axis=0)
+    return wider * low, wider * high
+
+
+def horizon_errors(
+    given: Stretches, vehicle_cfg: VehicleConfig, theta: np.ndarray, horizons: tuple[int, ...]
+) -> dict[int, list[float | None]]:
+    """Rms error (surge, sway, heave, yaw) of what is predicted that many steps ahead of a reading, by
+    ``theta`` (14,); None where no reading stands there. Horizons longer than a stretch are left out."""
+    steps = given.wrench.shape[1]
+    assert theta.shape == (SIZE,)
+    found = {}
+    for ahead in (h for h in horizons if h <= steps):
+        errors = []
+        for begin in range(0, steps - ahead + 1, max(ahead, steps // 10)):
+            part = Stretches(
+                given.dt_s,
+                given.velocity[:, begin : begin + ahead + 1],
+                *(a[:, begin : begin + ahead] for a in (given.tilt_rate, given.up, given.wrench)),
+            )
+            whole = np.flatnonzero(~np.isnan(part.velocity[:, 0]).any(axis=1))
+            part = part.some(whole)
+            if len(whole):
+                end = motion(theta[None], part.velocity[None, :, 0], part, vehicle_cfg)[0, :, -1]
+                errors.append(end - part.velocity[:, -1])
+        if errors:
+            away = np.concatenate(errors)
+            seen = ~np.isnan(away)
+            count = seen.sum(axis=0)
+            rms = np.sqrt(np.square(np.where(seen, away, 0.0)).sum(axis=0) / np.maximum(1, count))
+            found[ahead] = [float(value) if n else None for value, n in zip(rms, count, strict=True)]
+    return found
