@@ -131,6 +131,7 @@ def test_the_viewers_own_reader_decodes_every_message_against_its_schema(recordi
         assert found["metadata"] == ["uuv.run", "uuv.result"] and found["attachments"] == [
             "config.yaml",
             "scenario.json",
+            "tree.xml",
         ]
 
 
@@ -139,7 +140,7 @@ def test_what_describes_the_run_comes_before_data_and_loads(recordings, logs, tm
         with path.open("rb") as file:
             kinds = [type(record) for record in StreamReader(file, emit_chunks=True).records]
         ahead = kinds[: kinds.index(Chunk)]
-        assert ahead.count(Metadata) == 1 and ahead.count(Attachment) == 2
+        assert ahead.count(Metadata) == 1 and ahead.count(Attachment) == 3
         text = yaml.safe_dump(log.config)
         (tmp_path / "config.yaml").write_text(text)
         sensors = "clean" if path in recordings["clean"] else "paper"

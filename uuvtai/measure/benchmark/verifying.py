@@ -49,9 +49,7 @@ class _Replay:
             bench.options(), bench.world, who["policies"], controllers=who["controllers"], seeds=[0],
             episodes=1, device=self.device,
         )  # fmt: skip
-        sim = Sim(self.method.config_of(request.config), BATCH, self.method.tree, self.device)
-        sim.privileged = False
-        return sim
+        return Sim(self.method.config_of(request.config), BATCH, self.method.tree, self.device)
 
     def play(self, sim: Sim, played: PlayedScene, numbers: list[int], name: str) -> list[EpisodeResult]:
         """These episodes once more."""

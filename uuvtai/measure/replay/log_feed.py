@@ -193,7 +193,7 @@ class _FeedReader:
     def _ping(self, m: LogMessage) -> None:
         stamp = m.data["timestamp"]
         if self._scan.get("timestamp") != stamp:
-            raise ValueError("/sonar/doppler without its /sonar/scan")
+            raise LookupError("/sonar/doppler without its /sonar/scan")
         hit = np.array(self._scan["intensities"], np.float32) > 0
         ping_s = stamp["sec"] + stamp["nsec"] / 1e9
         self._arrives(m, SonarPing(ping_s, _array(self._scan["ranges"]), hit, _array(m.data["velocity"])))
