@@ -15,4 +15,4 @@ LONGEST_S = 7200
 def measure(job: Job) -> list[Row]:
     """Violations of each kind; a violation is shown as it is found."""
     with tempfile.TemporaryDirectory() as folder:
-        return Bench(Path(folder), job).signalled(12 if job.quick else 120)
+        return Bench(Path(folder), job).signalled(12 if job.quick else 100)

@@ -223,6 +223,8 @@ class Bench:
 
     def signalled(self, count: int) -> list[Row]:
         """Every command in turn, one of the two signals at a random moment of it."""
+        # a shell's background ignores Ctrl-C, and so would every command
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         log = next((self.folder / self._played() / "logs").glob("*.mcap"))
         commands = [
             [*_EVAL, "--episodes", "8", "--record", "1", *_HORIZON, "--run-dir", "out"],
