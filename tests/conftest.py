@@ -64,6 +64,17 @@ def configure(monkeypatch, sim, config):
     monkeypatch.setattr(sim, "io", Stages(**(new | same)))
 
 
+def estimate_pose(monkeypatch, small):
+    """Have its simulator find out where it is from harsh readings: only kernels of proprioception and pose
+    are compiled for it."""
+    from uuvtai.loader import load_config
+
+    harsh = load_config("pool", "harsh").sensors
+    changed = {name: getattr(harsh, name) for name in ("localization", "dvl", "imu", "pressure")}
+    sensors = small.config.sensors.model_copy(update=changed)
+    configure(monkeypatch, small.sim, small.sim.config.model_copy(update={"sensors": sensors}))
+
+
 def near_horizon(env, rows, steps_left):
     """Put the clocks of these rows of a VectorEnv shortly before the horizon."""
     for row in rows:

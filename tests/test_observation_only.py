@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from tests.conftest import configure
+from tests.conftest import configure, estimate_pose
 from uuvtai.capture import capture
 from uuvtai.kernels.perception import pose
 from uuvtai.kernels.planning import features
 from uuvtai.kernels.sensors import proprioception
-from uuvtai.loader import load_config
 from uuvtai.stages import SimState
 
 KNOWN = {
@@ -155,12 +154,6 @@ def test_every_struct_is_known_or_truth():
     } <= TRUTH
 
 
-def with_sensors(small, monkeypatch, **changed):
-    """Another reading of pose and speed: only the kernels of proprioception and pose are compiled for it."""
-    sensors = small.config.sensors.model_copy(update=changed)
-    configure(monkeypatch, small.sim, small.sim.config.model_copy(update={"sensors": sensors}))
-
-
 def test_no_decision_observation_or_memory_depends_on_the_truth(watched):
     _, differing, written = compared(watched)
     assert differing == []
@@ -170,15 +163,7 @@ def test_no_decision_observation_or_memory_depends_on_the_truth(watched):
 def test_nor_with_an_estimated_pose_and_harsh_readings(watched, monkeypatch):
     """Position, heading and speed are off: whoever took the true ones would do something else."""
     exact, _, _ = driven(watched)
-    harsh = load_config("pool", "harsh").sensors
-    with_sensors(
-        watched,
-        monkeypatch,
-        localization="estimated",
-        dvl=harsh.dvl,
-        imu=harsh.imu,
-        pressure=harsh.pressure,
-    )
+    estimate_pose(monkeypatch, watched)
     actions, differing, written = compared(watched)
     assert (differing, written) == ([], set())
     assert not torch.equal(actions, exact), "the readings are others"

@@ -11,9 +11,8 @@ import pytest
 import torch
 
 from tests.command import uuv
-from tests.conftest import configure
+from tests.conftest import estimate_pose
 from uuvtai.errors import SettingError
-from uuvtai.loader import load_config
 from uuvtai.logs.container import McapFile
 from uuvtai.logs.log_errors import LogError
 from uuvtai.logs.log_recorder import EpisodeRecorder
@@ -89,12 +88,8 @@ def test_the_logged_commands_are_worth_comparing(log):
 
 
 def test_the_same_with_an_estimated_pose_and_late_scans(small, build, monkeypatch, tmp_path):
-    """The filter writes over yaw and velocity: the instruments' own values must come from the log. Only the
-    kernels of proprioception and pose are compiled for it, as in test_observation_only."""
-    harsh = load_config("pool", "harsh").sensors
-    changed = {name: getattr(harsh, name) for name in ("localization", "dvl", "imu", "pressure")}
-    sensors = small.config.sensors.model_copy(update=changed)
-    configure(monkeypatch, small.sim, small.config.model_copy(update={"sensors": sensors}))
+    """The filter writes over yaw and velocity: the instruments' own values must come from the log."""
+    estimate_pose(monkeypatch, small)
     log = recorded(small, tmp_path)
     apart = small.sim.s.ego.imu_rpy.to_numpy()[0] - small.sim.s.ego.rpy.to_numpy()[0]
     assert apart[2] != 0, "the filter corrects the yaw"

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.conftest import estimate_pose
 from uuvtai.loader import load_config
 from uuvtai.measure.episodes.playing import jobs_of, run_episodes
 
@@ -11,7 +12,6 @@ SENSED = (
     "ego",
     "scan",
     "image",
-    "pose",
     "tracks",
     "habits",
     "forecast",
@@ -39,26 +39,36 @@ def equal(a, b, rows_a, rows_b):
     ]
 
 
-def test_an_episode_is_the_same_in_any_row_and_company(small):
+@pytest.mark.parametrize("estimated", [False, True])
+def test_an_episode_is_the_same_in_any_row_and_company(small, monkeypatch, estimated):
+    """Where the vehicle is told its place nothing writes the pose filter's memory."""
+    if estimated:
+        estimate_pose(monkeypatch, small)
+    looked_at = (*SENSED, "vehicle", "world", "referee", *["pose"] * estimated)
     small.begin([0, 1, 2, 3])
     for _ in range(120):
         small.sim.step()
-    first = small.arrays(*SENSED, "vehicle", "world", "referee")
+    first = small.arrays(*looked_at)
     small.begin([5, 3, 6, 7, 1, 2, 0], rows=[0, 1, 2, 3, 4, 5, 6])
     for _ in range(120):
         small.sim.step()
-    again = small.arrays(*SENSED, "vehicle", "world", "referee")
+    again = small.arrays(*looked_at)
+    assert ("pose.mean" in first) == estimated
     assert equal(first, again, [0, 1, 2, 3], [6, 4, 5, 1]) == []
     assert equal(first, again, [0], [0]) != [], "another episode must differ"
 
 
-def test_a_reset_touches_only_its_rows(small):
+@pytest.mark.parametrize("estimated", [False, True])
+def test_a_reset_touches_only_its_rows(small, monkeypatch, estimated):
+    if estimated:
+        estimate_pose(monkeypatch, small)
+    looked_at = (*SENSED, "vehicle", "world", "referee", "episode", *["pose"] * estimated)
     small.begin(list(range(8)))
     for _ in range(40):
         small.sim.step()
-    before = small.arrays(*SENSED, "vehicle", "world", "referee", "episode")
+    before = small.arrays(*looked_at)
     small.begin([40, 41], rows=[2, 5])
-    after = small.arrays(*SENSED, "vehicle", "world", "referee", "episode")
+    after = small.arrays(*looked_at)
     rest = [0, 1, 3, 4, 6, 7]
     assert equal(before, after, rest, rest) == []
     assert equal(before, after, [2], [2]) != []
