@@ -34,11 +34,12 @@ from uuvtai.logs.container import CHUNK_MAX, CHUNK_MIN, McapFile
 from uuvtai.logs.log_errors import LogError
 from uuvtai.logs.log_export import export, file_name
 from uuvtai.logs.log_recorder import NO_POLICY
-from uuvtai.logs.mcap_log import SIGNS, McapEpisodeLog
+from uuvtai.logs.mcap_log import McapEpisodeLog
 from uuvtai.logs.moment import Moment
 from uuvtai.logs.reader import info, read_head, read_messages
 from uuvtai.logs.recording import load_recording
 from uuvtai.logs.repair import repair
+from uuvtai.logs.topic_stream import SIGNS
 from uuvtai.logs.topics import TOPICS
 from uuvtai.logs.topics.camera_topics import depth_image
 from uuvtai.logs.topics.map_topics import grid_values, map_origin

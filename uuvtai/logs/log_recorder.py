@@ -1,4 +1,5 @@
-"""Record chosen episodes of a running simulator: read what the table of topics names, hand it to the log."""
+"""Chosen episodes of a running simulator: read what the table of topics names, hand it to a log or whoever
+asks."""
 
 from __future__ import annotations
 
@@ -14,9 +15,10 @@ from uuvtai.closed_form import describe_scenario
 from uuvtai.config import Config
 from uuvtai.config.task import TERMS
 from uuvtai.loader import to_yaml
-from uuvtai.logs.mcap_log import SIGNS, McapEpisodeLog
+from uuvtai.logs.mcap_log import McapEpisodeLog
 from uuvtai.logs.moment import EpisodeEnd, EpisodeHeader
 from uuvtai.logs.scenario_document import scenario_document
+from uuvtai.logs.topic_stream import SIGNS, EpisodeSink
 from uuvtai.run_folder import git_sha
 
 
@@ -72,49 +74,45 @@ NO_POLICY: dict[str, Any] = dict.fromkeys(
 """the same where the tree drives"""
 
 
-class EpisodeRecorder:
-    """Writes one MCAP file per recorded job; ``paths`` maps each to its file."""
+class EpisodeReader:
+    """Reads chosen episodes out of a running simulator and hands them, step by step, to a sink each."""
 
-    def __init__(
-        self,
-        folder: Path,
-        world: str,
-        controller: str,
-        jobs: list[Any],
-        depth_images: bool = False,
-        policy: PolicyNote | None = None,
-    ) -> None:
-        """``jobs``: each a RecordedJob; ``policy``: who drives; None = the simulator's tree."""
+    def __init__(self, world: str, controller: str, policy: PolicyNote | None = None) -> None:
+        """``policy``: who drives; None = the simulator's tree."""
         self._world, self._controller, self._policy = world, controller, policy
-        self._depth_images = depth_images
-        self._logs: dict[int, McapEpisodeLog] = {}
+        self._sinks: dict[int, EpisodeSink] = {}
         self._applied: dict[int, np.ndarray] = {}
-        self.paths = {job: folder / f"{controller}_seed{job.seed}_episode{job.episode}.mcap" for job in jobs}
+
+    def sink_for(self, sim: Recordable, row: int, job: RecordedJob) -> EpisodeSink | None:
+        """Where the episode that was just reset in this row goes; None = nowhere."""
+        raise NotImplementedError
 
     def begin(self, sim: Recordable, row: int, job: RecordedJob) -> None:
-        """Open the log of an episode that was just reset, and write its first step."""
-        if job in self.paths:
-            self._logs[row] = McapEpisodeLog(self.paths[job], self._header(sim, row, job), self._depth_images)
+        """An episode was just reset: hand over its first step."""
+        sink = self.sink_for(sim, row, job)
+        if sink is not None:
+            self._sinks[row] = sink
             self._applied[row] = np.zeros(4, np.float32)
             self._write(sim, [row])
 
     def step(self, sim: Recordable) -> None:
-        """Write a step of every recorded row."""
-        if self._logs:
-            self._write(sim, sorted(self._logs))
+        """Hand over a step of every chosen row."""
+        if self._sinks:
+            self._write(sim, sorted(self._sinks))
 
     def end(self, sim: Recordable, row: int, result: EpisodeEnd) -> None:
-        """Close the log with the episode's result."""
-        if row in self._logs:
-            self._logs.pop(row).close(result)
+        """The episode of this row is over."""
+        if row in self._sinks:
+            self._sinks.pop(row).close(result)
 
     def abort(self) -> None:
-        """Leave the unfinished logs as they are (``.part``); ``uuv log repair`` reads them."""
-        for log in self._logs.values():
-            log.abandon()
-        self._logs.clear()
+        """Leave the unfinished episodes as they are."""
+        for sink in self._sinks.values():
+            sink.abandon()
+        self._sinks.clear()
 
-    def _header(self, sim: Recordable, row: int, job: RecordedJob) -> EpisodeHeader:
+    def header(self, sim: Recordable, row: int, job: RecordedJob) -> EpisodeHeader:
+        """What comes before the first step."""
         described = describe_scenario(lambda name: sim.rows(attrgetter(name)(sim.s), [row])[0])
         return EpisodeHeader(
             controller=self._controller,
@@ -137,11 +135,36 @@ class EpisodeRecorder:
             for row in rows
         }
         _fill(sim, values, dict.fromkeys(rows, SIGNS))
-        due = {row: self._logs[row].due(values[row]) for row in rows}
+        due = {row: self._sinks[row].due(values[row]) for row in rows}
         _fill(sim, values, {row: [name for topic in due[row] for name in topic.reads] for row in rows})
         for row in rows:
-            self._logs[row].write(values[row])
+            self._sinks[row].write(values[row])
             self._applied[row] = values[row]["driver.action" if self._policy else "teacher.action"]
+
+
+class EpisodeRecorder(EpisodeReader):
+    """Writes one MCAP file per recorded job; ``paths`` maps each to its file. Unfinished ones stay ``.part``;
+    ``uuv log repair`` reads them."""
+
+    def __init__(
+        self,
+        folder: Path,
+        world: str,
+        controller: str,
+        jobs: list[Any],
+        depth_images: bool = False,
+        policy: PolicyNote | None = None,
+    ) -> None:
+        """``jobs``: each a RecordedJob."""
+        super().__init__(world, controller, policy)
+        self._depth_images = depth_images
+        self.paths = {job: folder / f"{controller}_seed{job.seed}_episode{job.episode}.mcap" for job in jobs}
+
+    def sink_for(self, sim: Recordable, row: int, job: RecordedJob) -> McapEpisodeLog | None:
+        """The log of a recorded job."""
+        if job not in self.paths:
+            return None
+        return McapEpisodeLog(self.paths[job], self.header(sim, row, job), self._depth_images)
 
 
 def _fill(sim: Recordable, values: dict[int, dict[str, Any]], names: Mapping[int, Iterable[str]]) -> None:

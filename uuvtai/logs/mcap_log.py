@@ -21,13 +21,10 @@ from types import TracebackType
 from uuvtai.logs.container import McapFile
 from uuvtai.logs.encode import number
 from uuvtai.logs.log_errors import LogError
-from uuvtai.logs.moment import EpisodeEnd, EpisodeHeader, Moment, Values
+from uuvtai.logs.moment import EpisodeEnd, EpisodeHeader, Values
 from uuvtai.logs.scenario_document import FRAMES
 from uuvtai.logs.topic import Topic
-from uuvtai.logs.topics import TOPICS
-
-SIGNS = ("clock.step", *dict.fromkeys(name for topic in TOPICS for name in topic.when.reads))
-"""what ``McapEpisodeLog.due`` looks at"""
+from uuvtai.logs.topic_stream import TopicStream
 
 
 class McapEpisodeLog:
@@ -36,8 +33,7 @@ class McapEpisodeLog:
 
     def __init__(self, path: Path, header: EpisodeHeader, depth_images: bool = False) -> None:
         self.path, self.header = Path(path), header
-        self._topics = [topic for topic in TOPICS if depth_images or not topic.on_request]
-        self._written: dict[str, float] = {}
+        self._stream = TopicStream(header, depth_images)
         self._closed = False
         with self._guarded():
             self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -49,15 +45,13 @@ class McapEpisodeLog:
     def due(self, values: Values) -> list[Topic]:
         """Topics that this step has messages on; what they read must be in the values written. Needs SIGNS
         alone."""
-        return self._due(Moment(self.header, values))
+        return self._stream.due(values)
 
     def write(self, values: Values) -> None:
         """Add one control step. Raises ValueError for numbers that are not finite."""
-        moment = Moment(self.header, values)
         with self._guarded():
-            for topic in self._due(moment):
-                if all(name in values for name in topic.reads):
-                    self._put(topic, moment)
+            for message in self._stream.messages(values):
+                self._file.add_message(self._channels[message.topic], message.time_ns, message.data)
             self._file.settle()
 
     def close(self, result: EpisodeEnd) -> None:
@@ -94,30 +88,13 @@ class McapEpisodeLog:
         """Channel of every topic."""
         channels: dict[str, int] = {}
         known: dict[str, int] = {}
-        for topic in self._topics:
-            schema = topic.schema_for(self.header)
+        for topic, schema in self._stream.schemas().items():
             name = schema["title"]
             if name not in known:
                 text = json.dumps(schema, separators=(",", ":"))
                 known[name] = self._file.add_schema(name, "jsonschema", text.encode())
-            channels[topic.name] = self._file.add_channel(topic.name, known[name])
+            channels[topic] = self._file.add_channel(topic, known[name])
         return channels
-
-    def _due(self, moment: Moment) -> list[Topic]:
-        return [
-            topic for topic in self._topics if topic.when.holds(moment, self._waited(topic, moment.time_s))
-        ]
-
-    def _waited(self, topic: Topic, time_s: float) -> bool:
-        """Its last message is old enough for its rate."""
-        hertz, last = topic.when.hertz, self._written.get(topic.name)
-        return last is None or not hertz or time_s - last >= 1.0 / hertz - 1e-6
-
-    def _put(self, topic: Topic, moment: Moment) -> None:
-        data = topic.encode(moment)
-        self._written[topic.name] = moment.time_s
-        for message in data if isinstance(data, list) else [data]:
-            self._file.add_message(self._channels[topic.name], moment.time_ns, message)
 
     @contextlib.contextmanager
     def _guarded(self) -> Iterator[None]:
