@@ -112,6 +112,12 @@ class SmallSim:
         self.config = load_config("pool", "paper", overrides=self.CHANGES)
         self.trees = {name: read_tree(name) for name in ("straight", "planner", "bt")}
         self.sim = Sim(self.config, self.N, self.trees["bt"])
+        self.new = self.sim.memory().read().copy()
+
+    def forget(self):
+        """As it was built."""
+        self.sim.memory().read()[:] = self.new
+        self.sim.tree, self.sim.observation = self.trees["bt"], None
 
     def begin(self, episodes, seed=0, rows=None):
         """Reset ``rows`` (default: the first ones) to these episode numbers."""
@@ -133,3 +139,10 @@ class SmallSim:
 def small(taichi_runtime):
     """The session's simulator."""
     return _built[0]
+
+
+@pytest.fixture(autouse=True)
+def forgetful(request):
+    """No test sees what an earlier one left in the session's simulator."""
+    if "small" in request.fixturenames:
+        _built[0].forget()

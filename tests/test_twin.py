@@ -123,6 +123,7 @@ def test_the_hull_rule_is_that_of_the_oracle():
 
 
 def test_bodies_move_as_in_closed_form(small, bank):
+    small.begin(range(small.N), seed=5)
     times = torch.linspace(0.0, 50.0, small.N)
     out = torch.zeros(*bank.path.shape[:2], 4)
     places(bank.path, times, out)
