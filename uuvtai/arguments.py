@@ -99,6 +99,15 @@ def controllers(given: list[str] | None, has_policies: bool) -> list[str]:
     return names
 
 
+def refuse_odd_live(episodes: int, rate: float, port: int) -> None:
+    """UsageError for numbers of ``uuv watch`` that make no sense."""
+    refuse_less("--episodes", episodes, 0)
+    if not (math.isfinite(rate) and rate >= 0):
+        raise UsageError(f"--rate {rate:g}: give a number of at least 0, for example --rate 2")
+    if not 0 <= port < 65536:
+        raise UsageError(f"--port {port}: ports go from 0 (a free one) to 65535, for example --port 8765")
+
+
 _OF_EVERY_RESUME = ("resume", "with_report", "wide", "as_json")
 
 

@@ -209,6 +209,48 @@ def simulate(
     _print(result, as_json, lambda: show_simulation(Screen(wide), result, title))
 
 
+@app.command("watch", epilog="Example: uuv watch --world gauntlet --controller bt,dwa --episodes 4")
+def watch_live(
+    runs: opt.EvalRuns = None,
+    controller: opt.WatchControllers = None,
+    planner: opt.Planners = None,
+    policy: opt.Policies = None,
+    world: opt.World = "pool",
+    sensors: opt.Sensors = None,
+    vehicle: opt.Vehicle = None,
+    stack: opt.Stack = None,
+    episodes: opt.WatchEpisodes = 0,
+    seeds: opt.Seeds = "0",
+    n_static: opt.Static = None,
+    n_dynamic: opt.Dynamic = None,
+    speed: opt.Speed = None,
+    rate: opt.Rate = 1.0,
+    host: opt.Host = "127.0.0.1",
+    port: opt.Port = 8765,
+    depth_images: opt.DepthImages = False,
+    device: opt.Device = "auto",
+    overrides: opt.Set = None,
+    wide: opt.Wide = False,
+    as_json: opt.AsJson = False,
+) -> None:
+    """Run episodes in real time and serve them to Foxglove and Lichtblick."""
+    seed_list = arguments.seeds(seeds)
+    arguments.refuse_odd_live(episodes, rate, port)
+    from uuvtai.measure.evaluate.eval_request import Request
+    from uuvtai.measure.watching import LiveOptions, watch_episodes
+    from uuvtai.show.live_episodes import show_watched
+
+    scene = SceneOptions(world, sensors, vehicle, stack, n_static, n_dynamic, speed, overrides)
+    alone = ["none"] if runs or planner or policy else ["bt"]
+    trained, controllers = arguments.drivers(runs, controller or alone, planner, policy)
+    request = Request.typed(
+        scene, world, trained, controllers=controllers, seeds=seed_list, episodes=episodes,
+        depth_images=depth_images, device=device,
+    )  # fmt: skip
+    result = watch_episodes(request, LiveOptions(host, port, rate), Progress())
+    _print(result, as_json, lambda: show_watched(Screen(wide), result))
+
+
 # --------------------------------------------------------------------------------------------------- identify
 
 

@@ -221,6 +221,23 @@ InitialVelocity = Annotated[str | None, Option("--initial-velocity", help="u,v,w
 Neutral = Annotated[bool, Option("--neutral", help="Buoyancy equal to weight.")]
 Substep = Annotated[float, Option("--dt", help="Dynamics substep \\[s].")]
 
+# ------------------------------------------------------------------------------------------------------ watch
+
+WatchControllers = Annotated[
+    list[str] | None,
+    _controllers(
+        "Who drives, in turn (repeatable): as of uuv eval \\[default: bt, beside a RUN nobody else]."
+    ),
+]
+WatchEpisodes = Annotated[int, Option("--episodes", help="Episodes per seed; 0 = on and on, until Ctrl-C.")]
+Rate = Annotated[
+    float, Option("--rate", help="Seconds of the episode in one of the clock's; 0 = as fast as it goes.")
+]
+Host = Annotated[
+    str, Option("--host", help="Address to serve at; 0.0.0.0 shows it to every machine of the network.")
+]
+Port = Annotated[int, Option("--port", help="Port to serve at; 0 = a free one.")]
+
 # ------------------------------------------------------------------------------------------------------ sweep
 
 SweepRuns = Annotated[list[str] | None, _players("[RUN]...", "Trained policies, as for eval.")]

@@ -15,6 +15,7 @@ SEE = {
     "eval": ("quickstart", "own_pieces", "ceilings", "viewers", "determinism"),
     "train": ("quickstart", "learning"),
     "simulate": ("simulator", "own_pieces"),
+    "watch": ("viewers", "own_pieces"),
     "identify": ("vehicle",),
     "sweep": ("scale", "own_pieces"),
     "benchmark": ("benchmark", "own_pieces"),

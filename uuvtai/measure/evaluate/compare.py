@@ -49,9 +49,9 @@ def compare(request: Request, watch: EvaluationWatch) -> tuple[dict[str, Any], P
             "same"
         )
     refuse_place(request.run_dir)
-    methods = _methods(request, watch)
+    methods = methods_of(request, watch)
     num_envs = request.num_envs or min(len(request.seeds) * request.episodes, _BATCH)
-    comparison = _comparison(request, num_envs, methods, watch)
+    comparison = comparison_of(request, num_envs, methods, watch)
     folder = RunFolder(request.run_dir or default_run_dir(request.world), request.config, request.seeds)
     with _going_on(folder, watch):
         device = comparison.any_simulator().device.type
@@ -70,7 +70,7 @@ def resume(place: Path, watch: EvaluationWatch, allow_code: bool = False) -> tup
     try:
         request, drivers = read_request(place)
         refuse_code(place, request.controllers, allow_code)
-        methods = _methods(request, watch)
+        methods = methods_of(request, watch)
         refuse_others(place, drivers, drivers_of(methods))
         folder.go_on({"what": "eval"})
     except BaseException:
@@ -78,7 +78,7 @@ def resume(place: Path, watch: EvaluationWatch, allow_code: bool = False) -> tup
         raise
     with _going_on(folder, watch):
         assert request.num_envs is not None  # the file states it
-        return _compared(_comparison(request, request.num_envs, methods, watch), folder), place
+        return _compared(comparison_of(request, request.num_envs, methods, watch), folder), place
 
 
 @contextmanager
@@ -100,7 +100,8 @@ def _going_on(folder: RunFolder, watch: EvaluationWatch) -> Iterator[None]:
         watch.stop()
 
 
-def _methods(request: Request, watch: EvaluationWatch) -> list[Method]:
+def methods_of(request: Request, watch: EvaluationWatch) -> list[Method]:
+    """Who plays. Raises ConfigError, CheckpointError, PieceError."""
     from uuvtai.measure.episodes.methods import differences, policies_of, trees_of
 
     max_node = request.config.teacher.max_node
@@ -122,7 +123,9 @@ def _methods(request: Request, watch: EvaluationWatch) -> list[Method]:
     return methods
 
 
-def _comparison(request: Request, num_envs: int, methods: list[Method], watch: EvaluationWatch) -> Comparison:
+def comparison_of(
+    request: Request, num_envs: int, methods: list[Method], watch: EvaluationWatch
+) -> Comparison:
     """A simulator for the request's own config and one for every stack that drives a row: the episodes are
     the same in all. And the policies, ready for them."""
     from uuvtai.measure.evaluate.method_run import Comparison

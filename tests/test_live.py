@@ -1,0 +1,242 @@
+"""Episodes served while they run: an independent client gets what the log gets, also one that comes late; the
+clock is kept, and what cannot be served is refused."""
+
+import importlib.util
+import json
+import struct
+import time
+from types import SimpleNamespace
+from typing import NamedTuple
+
+import pytest
+from websockets.exceptions import InvalidHandshake
+from websockets.sync.client import connect
+
+from tests.command import uuv
+from uuvtai.live.broadcast import Broadcast
+from uuvtai.live.real_time import RealTime
+from uuvtai.live.viewer_server import LiveError, ViewerServer
+from uuvtai.logs.log_recorder import EpisodeRecorder
+
+STEPS = 30
+END = SimpleNamespace(
+    outcome="cut", episode_return=0.0, time_s=0.6, min_clearance_m=1.0, replans={}, planned_by={}
+)
+
+
+class Job(NamedTuple):
+    seed: int
+    episode: int
+
+
+class Viewer:
+    """A client of the protocol, by a library that knows nothing of Foxglove."""
+
+    def __init__(self, port):
+        self.socket = connect(f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"], max_size=None)
+        self.info, self.channels = json.loads(self.socket.recv(10)), {}
+        self.messages, self.sessions, self.time_ns = [], [self.info["sessionId"]], 0
+
+    def subscribe(self, server):
+        """To everything; returns when the server knows."""
+        while not self.channels:
+            self._take(self.socket.recv(10))
+        wanted = [{"id": number, "channelId": number} for number in self.channels]
+        self.socket.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+        end = time.monotonic() + 30
+        while len(server._asked) < len(wanted):
+            assert time.monotonic() < end, "subscriptions never came"
+            time.sleep(0.005)
+
+    def receive(self, count):
+        """Until so many messages have come."""
+        while len(self.messages) < count:
+            self._take(self.socket.recv(10))
+        return self.messages
+
+    def _take(self, frame):
+        if isinstance(frame, str):
+            told = json.loads(frame)
+            if told["op"] == "advertise":
+                self.channels |= {channel["id"]: channel for channel in told["channels"]}
+            if told["op"] == "serverInfo":
+                self.sessions.append(told["sessionId"])
+        elif frame[0] == 1:
+            number, time_ns = struct.unpack_from("<IQ", frame, 1)
+            self.messages.append((self.channels[number]["topic"], time_ns, frame[13:]))
+        elif frame[0] == 2:
+            (self.time_ns,) = struct.unpack_from("<Q", frame, 1)
+
+
+@pytest.fixture
+def server():
+    with ViewerServer(port=0) as found:
+        yield found
+
+
+def played(small, observers, job, steps=STEPS):
+    """An episode in row 0, cut."""
+    small.sim.sleep()
+    small.begin([job.episode], seed=job.seed)
+    for observer in observers:
+        observer.begin(small.sim, 0, job)
+    for _ in range(steps):
+        small.sim.step()
+        for observer in observers:
+            observer.step(small.sim)
+    for observer in observers:
+        observer.end(small.sim, 0, END)
+
+
+def test_a_viewer_gets_what_the_log_gets(small, server, tmp_path):
+    job = Job(77001, 3)
+    recorder = EpisodeRecorder(tmp_path, "pool", "bt", [job])
+    shown = Broadcast(server, "pool", "bt")
+    server.begin(shown.sink_for(small.sim, 0, job)._stream.schemas())
+    viewer = Viewer(server.port)
+    viewer.subscribe(server)
+    played(small, [shown, recorder], job)
+    logged = [(m.topic, m.time_ns, m.data) for m in logged_messages(recorder.paths[job])]
+    got = viewer.receive(len(logged))
+    assert sorted(got) == sorted(logged) and len(logged) > 10 * STEPS
+    poses = [time_ns for topic, time_ns, _ in got if topic == "/pose"]
+    assert poses == [round(step * 0.02e9) for step in range(STEPS + 1)], "50 Hz, more than the 20 of a viewer"
+    for channel in viewer.channels.values():
+        assert channel["encoding"] == "json" and channel["schemaEncoding"] == "jsonschema"
+        assert json.loads(channel["schema"])["title"] == channel["schemaName"]
+    assert viewer.time_ns == STEPS * 20_000_000 and "time" in viewer.info["capabilities"]
+
+
+def logged_messages(path):
+    """(topic, time_ns, data) of a log's messages, as they lie in the file."""
+    from mcap.reader import make_reader
+
+    with path.open("rb") as file:
+        for _, channel, message in make_reader(file).iter_messages():
+            yield SimpleNamespace(topic=channel.topic, time_ns=message.log_time, data=message.data)
+
+
+def test_who_comes_late_gets_the_newest_of_what_is_rare(small, server):
+    job, shown = Job(77001, 3), Broadcast(server, "pool", "bt")
+    small.sim.sleep()
+    small.begin([job.episode], seed=job.seed)
+    shown.begin(small.sim, 0, job)
+    small.sim.step()
+    shown.step(small.sim)
+    viewer = Viewer(server.port)
+    viewer.subscribe(server)
+    small.sim.step()
+    shown.step(small.sim)
+    got = viewer.receive(len(viewer.channels) - 2)
+    assert {"/map/static", "/goal", "/obstacles", "/pose"} <= {topic for topic, _, _ in got}
+    assert [time_ns for topic, time_ns, _ in got if topic == "/map/static"] == [0]
+
+
+def test_another_episode_is_another_session(small, server):
+    shown = Broadcast(server, "pool", "bt")
+    played(small, [shown], Job(77001, 3), 2)
+    viewer = Viewer(server.port)
+    viewer.subscribe(server)
+    played(small, [shown], Job(77001, 4), 2)
+    viewer.receive(20)
+    assert len(set(viewer.sessions)) == 2
+    assert viewer.messages[-1][1] < 3 * 20_000_000, "time begins again"
+
+
+def test_a_port_that_is_taken_is_refused(server):
+    with pytest.raises(LiveError, match=rf"{server.port}: cannot listen there .* --port {server.port + 1}"):
+        ViewerServer(port=server.port)
+
+
+def test_other_protocols_are_turned_away(server):
+    with pytest.raises(InvalidHandshake):
+        connect(f"ws://127.0.0.1:{server.port}", subprotocols=["mqtt"])
+
+
+def test_nonsense_from_a_client_ends_nothing(small, server):
+    shown = Broadcast(server, "pool", "bt")
+    strange = connect(f"ws://127.0.0.1:{server.port}", subprotocols=["foxglove.sdk.v1"])
+    for frame in ("{", '{"op": "subscribe"}', '{"op": "no such"}', b"", b"\xff" * 40, "x" * 100_000):
+        strange.send(frame)
+    played(small, [shown], Job(77001, 3), 2)
+    viewer = Viewer(server.port)
+    viewer.subscribe(server)
+    played(small, [shown], Job(77001, 3), 2)
+    assert viewer.receive(10)
+
+
+def test_without_the_sdk_it_is_said_how_to_get_it(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _name: None)
+    with pytest.raises(LiveError, match=r"pip install 'uuvtai\[live\]'"):
+        ViewerServer(port=0)
+
+
+# ----------------------------------------------------------------------------------------------------- clock
+
+
+class Clock:
+    """Time that passes by sleeping and by working."""
+
+    def __init__(self):
+        self.s, self.slept = 100.0, 0.0
+
+    def now(self):
+        return self.s
+
+    def sleep(self, seconds):
+        assert seconds > 0
+        self.s, self.slept = self.s + seconds, self.slept + seconds
+
+
+@pytest.mark.parametrize(("rate", "taken"), [(1.0, 2.0), (4.0, 0.5)])
+def test_a_step_takes_its_time(rate, taken):
+    clock = Clock()
+    pace = RealTime(0.02, rate, clock.now, clock.sleep)
+    pace.begin(None, 0, None)
+    for _ in range(100):
+        clock.s += 0.001
+        pace.step(None)
+    assert clock.s - 100.0 == pytest.approx(taken) and pace.real_time_factor == pytest.approx(rate)
+
+
+def test_short_delays_are_caught_up_and_long_ones_are_not():
+    clock = Clock()
+    pace = RealTime(0.02, 1.0, clock.now, clock.sleep)
+    pace.begin(None, 0, None)
+    for work in (0.1, *[0.0] * 9):
+        clock.s += work
+        pace.step(None)
+    assert clock.s == pytest.approx(100.2), "five steps late, then on time again"
+    clock.s += 3.0
+    pace.step(None)
+    begun = clock.s
+    pace.step(None)
+    assert clock.s - begun == pytest.approx(0.02), "no rush after a pause"
+
+
+def test_as_fast_as_it_goes():
+    clock = Clock()
+    pace = RealTime(0.02, 0.0, clock.now, clock.sleep)
+    for _ in range(10):
+        clock.s += 0.001
+        pace.step(None)
+    assert clock.slept == 0
+
+
+# --------------------------------------------------------------------------------------------------- command
+
+
+@pytest.mark.parametrize(
+    ("typed", "told"),
+    [
+        (("--rate", "-1"), "--rate -1"),
+        (("--rate", "nan"), "--rate nan"),
+        (("--port", "70000"), "--port 70000"),
+        (("--episodes", "-1"), "--episodes -1"),
+        (("--controller", "oracle"), "drives no vehicle"),
+        (("--controller", "nobody"), "'nobody' is no preset"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(typed, told, capfd):
+    code, out, err = uuv(capfd, "watch", *typed)
+    assert (code, out) == (2, "") and told in err
