@@ -99,11 +99,17 @@ def controllers(given: list[str] | None, has_policies: bool) -> list[str]:
     return names
 
 
+def refuse_odd_rate(rate: float, is_endless: bool = True) -> None:
+    """UsageError for a pace that is none; ``is_endless``: 0 means as fast as it goes."""
+    if not (math.isfinite(rate) and (rate > 0 or (is_endless and rate == 0))):
+        least = "at least 0" if is_endless else "above 0"
+        raise UsageError(f"--rate {rate:g}: give a number {least}, for example --rate 2")
+
+
 def refuse_odd_live(episodes: int, rate: float, port: int) -> None:
     """UsageError for numbers of ``uuv watch`` that make no sense."""
     refuse_less("--episodes", episodes, 0)
-    if not (math.isfinite(rate) and rate >= 0):
-        raise UsageError(f"--rate {rate:g}: give a number of at least 0, for example --rate 2")
+    refuse_odd_rate(rate)
     if not 0 <= port < 65536:
         raise UsageError(f"--port {port}: ports go from 0 (a free one) to 65535, for example --port 8765")
 

@@ -251,6 +251,46 @@ def watch_live(
     _print(result, as_json, lambda: show_watched(Screen(wide), result))
 
 
+@app.command("drive", epilog="Example: uuv drive --world maze --rate 0.5")
+def drive_vehicle(
+    controller: opt.DriveControllers = None,
+    world: opt.World = "pool",
+    sensors: opt.Sensors = None,
+    vehicle: opt.Vehicle = None,
+    episodes: opt.DriveEpisodes = 1,
+    seeds: opt.Seeds = "0",
+    n_static: opt.Static = None,
+    n_dynamic: opt.Dynamic = None,
+    speed: opt.Speed = None,
+    rate: opt.DriveRate = 1.0,
+    overrides: opt.Set = None,
+    run_dir: opt.RunDir = None,
+    wide: opt.Wide = False,
+    as_json: opt.AsJson = False,
+) -> None:
+    """Steer a vehicle by the keyboard, with the map that it makes; bt then plays the same episodes."""
+    seed_list = arguments.seeds(seeds)
+    arguments.refuse_less("--episodes", episodes, 1)
+    arguments.refuse_odd_rate(rate, is_endless=False)
+    from uuvtai.live.hand_driver import HandPiece
+    from uuvtai.live.hand_steering import HELP
+    from uuvtai.live.keyboard import keyboard
+    from uuvtai.measure.evaluate.eval_request import Request
+    from uuvtai.measure.hand_driving import drive_by_hand
+    from uuvtai.show.evaluation import show_evaluation
+    from uuvtai.show.live_episodes import Notes
+    from uuvtai.show.steering_view import steering_view
+
+    scene = SceneOptions(world, sensors, vehicle, None, n_static, n_dynamic, speed, overrides)
+    named = [name for name in arguments.drivers(None, controller or ["bt"], None, None)[1] if name != "none"]
+    request = Request.typed(
+        scene, world, [], controllers=named, seeds=seed_list, episodes=episodes, device="cpu", run_dir=run_dir
+    )
+    with keyboard() as keys, steering_view(HELP) as show:
+        result, folder = drive_by_hand(request, HandPiece(keys, show, rate), Notes())
+    _print(result, as_json, lambda: show_evaluation(Screen(wide), result, folder), folder)
+
+
 # --------------------------------------------------------------------------------------------------- identify
 
 

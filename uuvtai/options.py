@@ -238,6 +238,17 @@ Host = Annotated[
 ]
 Port = Annotated[int, Option("--port", help="Port to serve at; 0 = a free one.")]
 
+DriveControllers = Annotated[
+    list[str] | None,
+    _controllers(
+        "Who plays your episodes after you (repeatable): as of uuv eval \\[default: bt]; none = nobody."
+    ),
+]
+DriveEpisodes = Annotated[int, Option("--episodes", help="Episodes to drive.")]
+DriveRate = Annotated[
+    float, Option("--rate", help="Seconds of the episode in one of the clock's; 0.5 gives you time to think.")
+]
+
 # ------------------------------------------------------------------------------------------------------ sweep
 
 SweepRuns = Annotated[list[str] | None, _players("[RUN]...", "Trained policies, as for eval.")]

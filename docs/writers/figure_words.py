@@ -30,6 +30,7 @@ PARAMETER_PAGES = (
     "docs/deployment.md",
     "docs/determinism.md",
     "docs/gallery.md",
+    "docs/live.md",
     "docs/paper.md",
     "docs/python.md",
     "docs/security.md",
