@@ -10,7 +10,8 @@ What each stage reads (``kernels/*/bundles.py``), and where it comes from here:
 - all others: ``ego`` as it is now, ``clock``, ``mission``, and what those before them wrote.
 
 Nobody behind the sensors reads the truth (``tests/test_observation_only.py``). Between two messages the last
-one is held; a DVL without a message in its turn has lost the bottom. Sonar intensity is read by nobody.
+one is held, and one that comes late is carried forward to this step (``carrying.py``); a DVL without a
+message in its turn has lost the bottom. Sonar intensity is read by nobody.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from __future__ import annotations
 import numpy as np
 
 from uuvtai.config import Config
+from uuvtai.pilot.carrying import acceleration_b, to_world, turned_on
 from uuvtai.pilot.inbox import Inbox
 from uuvtai.pilot.pose_history import PoseHistory
 from uuvtai.pilot.sensor_messages import (
@@ -47,8 +49,12 @@ class FedSensors:
             {name.partition(".")[2]: array for name, array in views.items() if name.startswith(f"{struct}.")}
             for struct in ("clock", "ego", "scan", "image")
         )
-        self._pings, self._shots = PoseHistory(), PoseHistory()
-        self._imu = ImuReading(0.0, np.zeros(3), np.zeros(3), np.zeros(3))
+        self._pings, self._shots, self._motions = PoseHistory(), PoseHistory(), PoseHistory()
+        self._gravity = config.vehicle.gravity_m_s2
+        self._imu = ImuReading(0.0, np.zeros(3), np.zeros(3), np.array([0.0, 0.0, self._gravity]))
+        """until the first one comes: at rest"""
+        self._pressure: PressureReading | None = None
+        """until the first one comes: where the start is known to be"""
         self._fixes = ("imu",) if sensors.localization == "estimated" else ("imu", "position")
 
     @property
@@ -62,30 +68,58 @@ class FedSensors:
         return (self.step + 0.5) * self._dt
 
     def sense_motion(self, stages: Stages) -> None:
-        """IMU, DVL, pressure and position as they were last told."""
+        """IMU, DVL, pressure and position as they were last told; what came late is carried forward."""
         if isinstance(imu := self._inbox.newest("imu", self.now_s), ImuReading):
             self._imu = imu
-        ego = self._ego
-        ego["rpy"][0] = ego["imu_rpy"][0] = self._imu.rpy
-        ego["rate_b"][0], ego["specific_force_b"][0] = self._imu.rate_b, self._imu.specific_force_b
+        ego, imu = self._ego, self._imu
+        late_s = min(self._steps_since(imu.time_s) * self._dt, FIX_AGE_S)
+        ego["rpy"][0] = ego["imu_rpy"][0] = turned_on(imu, late_s) if late_s else imu.rpy
+        ego["rate_b"][0], ego["specific_force_b"][0] = imu.rate_b, imu.specific_force_b
         ego["dvl_fresh"][0] = 0
         if self.step % self._dvl_period == 0:
             self._take_velocity()
         if isinstance(pressure := self._inbox.newest("pressure", self.now_s), PressureReading):
-            ego["depth_m"][0] = pressure.depth_m
+            self._pressure = pressure
+        self._take_pressure(
+            self._pressure or PressureReading(self.step * self._dt, -float(ego["pos_w"][0, 2]))
+        )
         if isinstance(position := self._inbox.newest("position", self.now_s), PositionFix):
-            ego["pos_w"][0] = position.pos_w
+            late_s = self._steps_since(position.time_s) * self._dt
+            moved = to_world(ego["vel_b"][0], ego["rpy"][0]) * late_s if late_s else 0.0
+            ego["pos_w"][0] = position.pos_w + moved
 
     def _take_velocity(self) -> None:
-        """Valid where the DVL has said anything since its last turn; else it holds the last reading."""
+        """Valid where the DVL has said anything since its last turn; else it holds the last reading. A late
+        one changes by what the own estimate has changed since."""
         reading, ego = self._inbox.newest("dvl", self.now_s), self._ego
         ego["vel_valid"][0] = ego["dvl_fresh"][0] = isinstance(reading, DvlReading)
         if isinstance(reading, DvlReading):
-            ego["vel_b"][0] = ego["dvl_b"][0] = reading.vel_b
+            velocity = np.asarray(reading.vel_b)
+            if self._steps_since(reading.time_s):
+                then = self._motions.at(self._step_of(reading.time_s))
+                ego["vel_valid"][0] = ego["dvl_fresh"][0] = then is not None
+                velocity = velocity + self._won(then["vel_b"]) if then else ego["vel_b"][0]
+            ego["vel_b"][0] = ego["dvl_b"][0] = velocity
+
+    def _won(self, vel_b: np.ndarray) -> np.ndarray:
+        """Change of the own velocity since it was ``vel_b``: by the estimates up to the last step, and in
+        this one by the accelerometer."""
+        now = self._ego["vel_b"][0]
+        return now - vel_b + self._dt * acceleration_b(self._imu, now, self._gravity)
+
+    def _take_pressure(self, pressure: PressureReading) -> None:
+        """A late one, or one held, changes by what the own depth has changed since."""
+        ego, depth_m = self._ego, pressure.depth_m
+        then = self._motions.at(self._step_of(pressure.time_s))
+        if self._steps_since(pressure.time_s) and then is not None:
+            sinking = self._dt * to_world(ego["vel_b"][0], ego["rpy"][0])[2]
+            depth_m -= float(ego["pos_w"][0, 2] - then["pos_w"][2] + sinking)
+        ego["depth_m"][0] = depth_m
 
     def sense_sonar(self, stages: Stages) -> None:
         """The newest ping, placed where the vehicle was when it was taken."""
         ego, scan = self._ego, self._scan
+        self._motions.note(self.step, vel_b=ego["vel_b"][0], pos_w=ego["pos_w"][0])
         if self._is_placed():
             self._pings.note(
                 self.step,
@@ -117,6 +151,10 @@ class FedSensors:
             image["fresh"][0] = 1
             for name, value in then.items():
                 image[name][0] = value
+
+    def _steps_since(self, time_s: float) -> int:
+        """0 = measured in this step."""
+        return self.step - self._step_of(time_s)
 
     def _step_of(self, time_s: float) -> int:
         return round(time_s / self._dt)
