@@ -23,7 +23,7 @@ from uuvtai.measure.replay.faults import Faults, Outage, disturbed, outage_of
 from uuvtai.measure.replay.live_feed import drive_by_pilot
 from uuvtai.measure.replay.log_feed import Delivery, read_feed
 from uuvtai.measure.replay.replaying import replay
-from uuvtai.pilot import DepthShot, ImuReading, OnboardPilot, PressureReading, SonarPing
+from uuvtai.pilot import DepthShot, DvlReading, ImuReading, OnboardPilot, PressureReading, SonarPing
 
 STEPS, SEED = 90, 77001
 END = SimpleNamespace(
@@ -96,6 +96,26 @@ def test_the_same_with_an_estimated_pose_and_late_scans(small, build, monkeypatc
     found = replay(log, build=build)
     assert found["equal"] and found["messages"]["dvl"]["used"] < STEPS / 5
     assert "position" not in {name for name, row in found["messages"].items() if row["fed"]}
+
+
+def test_late_readings_are_carried_to_now(small, build, monkeypatch, tmp_path):
+    """Also the first ones: a start without a pressure is none at the surface. The logged vehicle drives its
+    own way, so the estimates may be compared."""
+    estimate_pose(monkeypatch, small)
+    feed = read_feed(recorded(small, tmp_path))
+    usual, _ = commands(feed, build)
+    late = [
+        Delivery(arrival.time_s + (0.1 if arrival.message.time_s < 0.1 else 0.06), arrival.message)
+        if isinstance(arrival.message, PressureReading | ImuReading | DvlReading)
+        else arrival
+        for arrival in feed.arrivals
+    ]
+    found, _ = commands(feed, build, sorted(late, key=lambda arrival: arrival.time_s))
+    apart = np.array([one.pos_w - two.pos_w for one, two in zip(usual, found, strict=True)])
+    moved = np.array([one.pos_w - usual[0].pos_w for one in usual])
+    assert np.abs(moved).max() > 0.3, "there was something to be late for"
+    assert np.abs(apart[:, 2]).max() < 0.1 and np.abs(apart[-30:, 2]).max() < 0.02
+    assert np.linalg.norm(apart[:, :2], axis=1).max() < 0.04
 
 
 def test_what_arrives_twice_or_in_another_order_changes_nothing(log, build):
