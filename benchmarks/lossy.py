@@ -18,7 +18,7 @@ from uuvtai.tree import read_tree
 
 THREADS = 1
 LONGEST_S = 7200
-DRIVEN = 100
+DRIVEN = 500
 """episodes of each row"""
 
 

@@ -170,7 +170,7 @@ def test_an_evaluation_holds_its_folder(tmp_path, monkeypatch):
     monkeypatch.setattr(
         compare, "RunFolder", lambda *arguments: made.append(RunFolder(*arguments)) or made[0]
     )
-    monkeypatch.setattr(compare, "_methods", lambda *_: [])
+    monkeypatch.setattr(compare, "methods_of", lambda *_: [])
     monkeypatch.setattr(compare, "_any_tree", lambda: None)
     monkeypatch.setattr("uuvtai.sim.Sim", lambda *_: SimpleNamespace(device=torch.device("cpu")))
 
