@@ -9,10 +9,12 @@ from types import SimpleNamespace
 from typing import NamedTuple
 
 import pytest
+from foxglove.websocket import ServerListener
 from websockets.exceptions import InvalidHandshake
 from websockets.sync.client import connect
 
 from tests.command import uuv
+from uuvtai.live import viewer_server
 from uuvtai.live.broadcast import Broadcast
 from uuvtai.live.real_time import RealTime
 from uuvtai.live.viewer_server import LiveError, ViewerServer
@@ -29,11 +31,15 @@ class Job(NamedTuple):
     episode: int
 
 
+def open_socket(port):
+    return connect(f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"], max_size=None).__enter__()
+
+
 class Viewer:
     """A client of the protocol, by a library that knows nothing of Foxglove."""
 
     def __init__(self, port):
-        self.socket = connect(f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"], max_size=None)
+        self.socket = open_socket(port)
         self.info, self.channels = json.loads(self.socket.recv(10)), {}
         self.messages, self.sessions, self.time_ns = [], [self.info["sessionId"]], 0
 
@@ -155,7 +161,7 @@ def test_other_protocols_are_turned_away(server):
 
 def test_nonsense_from_a_client_ends_nothing(small, server):
     shown = Broadcast(server, "pool", "bt")
-    strange = connect(f"ws://127.0.0.1:{server.port}", subprotocols=["foxglove.sdk.v1"])
+    strange = open_socket(server.port)
     for frame in ("{", '{"op": "subscribe"}', '{"op": "no such"}', b"", b"\xff" * 40, "x" * 100_000):
         strange.send(frame)
     played(small, [shown], Job(77001, 3), 2)
@@ -163,6 +169,23 @@ def test_nonsense_from_a_client_ends_nothing(small, server):
     viewer.subscribe(server)
     played(small, [shown], Job(77001, 3), 2)
     assert viewer.receive(10)
+
+
+def test_the_listener_takes_every_callback_of_the_sdk():
+    """One that lacked some printed an error for every viewer that left."""
+    found = viewer_server._listener(lambda _topic: None)
+    names = [name for name in vars(ServerListener) if name.startswith("on_")]
+    assert len(names) > 8 and all(callable(getattr(found, name)) for name in names)
+
+
+def test_who_leaves_leaves_no_trace(small, server, capfd):
+    shown = Broadcast(server, "pool", "bt")
+    played(small, [shown], Job(77001, 3), 2)
+    viewer = Viewer(server.port)
+    viewer.subscribe(server)
+    viewer.socket.close()
+    server.close()
+    assert capfd.readouterr() == ("", "")
 
 
 def test_without_the_sdk_it_is_said_how_to_get_it(monkeypatch):

@@ -7,7 +7,7 @@ import importlib.util
 import json
 import logging
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from uuvtai.errors import UserError
@@ -37,14 +37,13 @@ class ViewerServer:
         self._newest: dict[str, TopicMessage] = {}
         self._lock = threading.Lock()
         self._asked: set[str] = set()
-        listener: Any = self
         try:
             self._server = foxglove.start_server(
                 name=name,
                 host=host,
                 port=port,
                 capabilities=[Capability.Time],
-                server_listener=listener,
+                server_listener=_listener(self._ask),
                 context=self._context,
             )
         except (RuntimeError, OSError, ValueError) as error:
@@ -82,10 +81,10 @@ class ViewerServer:
                 self.send(self._newest[topic])
         self._server.broadcast_time(time_ns)
 
-    def on_subscribe(self, client: Any, channel: Any) -> None:
-        """Called by the SDK, on a thread of its own."""
+    def _ask(self, topic: str) -> None:
+        """Somebody has subscribed; on a thread of the SDK's."""
         with self._lock:
-            self._asked.add(channel.topic)
+            self._asked.add(topic)
 
     def close(self) -> None:
         """Let go of the port and of all who are connected."""
@@ -105,3 +104,14 @@ def _require_sdk() -> None:
         found = None
     if found is None:
         raise LiveError(f"a viewer is served by Foxglove's SDK, which is not here: pip install '{EXTRA}'")
+
+
+def _listener(ask: Callable[[str], None]) -> Any:
+    """Tells ``ask`` of subscriptions; all other callbacks do nothing, as the SDK's own class has them."""
+    from foxglove.websocket import ServerListener
+
+    class Arrivals(ServerListener):
+        def on_subscribe(self, client: Any, channel: Any) -> None:
+            ask(channel.topic)
+
+    return Arrivals()
