@@ -34,6 +34,18 @@ class ActuationIO:
 
 
 @dataclass(frozen=True, eq=False)
+class ThrusterWatchIO:
+    """What the vertical thrusters were told, and what the vehicle did."""
+
+    actuation: Out[ActuationState]
+    clock: In[ClockState]
+    ego: In[Proprioception]
+    actuation_cfg: Const[ActuationConfig]
+    episode_cfg: Const[EpisodeConfig]
+    vehicle_cfg: Const[VehicleConfig]
+
+
+@dataclass(frozen=True, eq=False)
 class DynamicsIO:
     """Rigid body, thrusters and current (Fossen)."""
 
