@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from uuvtai.config import ActuationConfig, DisturbanceConfig, EpisodeConfig, VehicleConfig
+from uuvtai.config import ActuationConfig, DisturbanceConfig, EpisodeConfig, SensorsConfig, VehicleConfig
 from uuvtai.kernels.core.signature import Const, In, Out
 from uuvtai.state import (
     ActuationState,
@@ -42,6 +42,7 @@ class ThrusterWatchIO:
     ego: In[Proprioception]
     actuation_cfg: Const[ActuationConfig]
     episode_cfg: Const[EpisodeConfig]
+    sensors_cfg: Const[SensorsConfig]
     vehicle_cfg: Const[VehicleConfig]
 
 

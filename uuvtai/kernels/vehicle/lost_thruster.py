@@ -24,6 +24,9 @@ from uuvtai.kernels.vehicle.bundles import ThrusterWatchIO
 from uuvtai.kernels.vehicle.rotor import thrust_of_rpm
 from uuvtai.native.launch import quick_launch
 
+_OFFSET_NOISE_N2_S = 2.5
+"""How much squared residual tells as much of the offset as the accelerometer's data sheet."""
+
 _UPRIGHT = 0.99
 """Vertical share of a thruster's direction, at least."""
 
@@ -43,6 +46,11 @@ def vertical_pair(vehicle_cfg):
 def is_watched(vehicle_cfg, actuation_cfg):
     """Whether there is anything to do; plain Python."""
     return actuation_cfg.watch_s > 0 and len(vertical_pair(vehicle_cfg)) == 2
+
+
+def _offset_n2(vehicle_cfg, sensors_cfg):
+    """[N^2] variance of the felt thrust's constant error, by the accelerometer's data sheet; plain Python."""
+    return ((vehicle_cfg.mass_kg + vehicle_cfg.added_mass[2]) * sensors_cfg.imu.accel_bias_m_s2) ** 2
 
 
 @quick_launch
@@ -70,12 +78,16 @@ def _weigh(env, io: Bundle[ThrusterWatchIO]):
     r -= a + b
     dt, memory_s = io.episode_cfg.control_dt_s, io.actuation_cfg.watch_s
     kept = ti.exp(-dt / memory_s)
-    new = ti.Vector([r * r, r * a, r * b, a * a, a * b, b * b])
+    new = ti.Vector([r * r, r * a, r * b, a * a, a * b, b * b, r, a, b, 1.0])
     sums = dt * new
     for i in ti.static(range(io.actuation.response.shape[1])):
         sums[i] += kept * io.actuation.response[env, i]
         io.actuation.response[env, i] = sums[i]
-    rr, ra, rb, aa, ab, bb = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
+    offset_n2 = ti.static(_offset_n2(io.vehicle_cfg, io.sensors_cfg))
+    weight = offset_n2 / (offset_n2 * sums[9] + _OFFSET_NOISE_N2_S)
+    mean_r, mean_a, mean_b = weight * sums[6], weight * sums[7], weight * sums[8]
+    rr, ra, rb = sums[0] - mean_r * sums[6], sums[1] - mean_r * sums[7], sums[2] - mean_r * sums[8]
+    aa, ab, bb = sums[3] - mean_a * sums[7], sums[4] - mean_a * sums[8], sums[5] - mean_b * sums[8]
     dead_a, dead_b = rr + 2.0 * ra + aa, rr + 2.0 * rb + bb
     weak = rr - (ra + rb) * (ra + rb) / ti.max(aa + 2.0 * ab + bb, 1e-6)
     others, ratio, doubt = ti.min(rr, weak), io.actuation_cfg.watch_ratio, io.actuation_cfg.watch_doubt_n2_s
