@@ -2,19 +2,20 @@
 it was told, and its mate carries on alone. From measured motion and own commands only.
 
 For frames with two vertical thrusters a and b. They hold the depth together, and against each other the roll
-moment of the horizontal ones, up to 20 N each at full sway: with one of them dead that is pure heave.
+moment of the horizontal ones, with 20 N each where these push with 60 N: with one of them dead that is heave.
 
 In every step the vertical thrust that the vehicle felt, from accelerometer, gyro and DVL by its nominal
 parameters, is compared with a + b that were asked for; r is the difference. Of four explanations each leaves
-the sum of squares unexplained, forgotten after ``watch_s``:
+a sum of squares, forgotten after ``watch_s``:
 
 - all is well: sum r^2
 - a is dead: sum (r + a)^2; b is dead: sum (r + b)^2
 - both are weaker by the same share c: the smallest sum (r + c (a + b))^2, as after lost gain or with other
   parameters than believed
 
-A thruster is given up, until the episode ends, when its death leaves less than ``watch_ratio`` of what the
-best of the other three leaves.
+each about its own mean, as far as the accelerometer's data sheet allows a constant error. A thruster is given
+up, until the episode ends, when its death leaves less than ``watch_ratio`` of what the best of the other
+three leaves.
 """
 
 import taichi as ti
@@ -78,10 +79,9 @@ def _weigh(env, io: Bundle[ThrusterWatchIO]):
     r -= a + b
     dt, memory_s = io.episode_cfg.control_dt_s, io.actuation_cfg.watch_s
     kept = ti.exp(-dt / memory_s)
-    new = ti.Vector([r * r, r * a, r * b, a * a, a * b, b * b, r, a, b, 1.0])
-    sums = dt * new
+    sums = ti.Vector([r * r, r * a, r * b, a * a, a * b, b * b, r, a, b, 1.0])
     for i in ti.static(range(io.actuation.response.shape[1])):
-        sums[i] += kept * io.actuation.response[env, i]
+        sums[i] = kept * io.actuation.response[env, i] + dt * sums[i]
         io.actuation.response[env, i] = sums[i]
     offset_n2 = ti.static(_offset_n2(io.vehicle_cfg, io.sensors_cfg))
     weight = offset_n2 / (offset_n2 * sums[9] + _OFFSET_NOISE_N2_S)
