@@ -33,6 +33,7 @@ class Plant:
             "n_env": n_env,
             "n_thruster": len(config.vehicle.thrusters),
             "n_wrench": 6,
+            "n_response": 10,
             "n_delay": 1 + round(config.disturbance.thruster_delay_s / config.episode.control_dt_s),
         }
         self.clock = self._allocated(state.ClockState)

@@ -28,7 +28,7 @@ from uuvtai.kernels.privileged import true_map, true_tracks
 from uuvtai.kernels.sensors import depth, proprioception, sonar
 from uuvtai.kernels.task import episode, reward
 from uuvtai.kernels.teacher import evasion, leaves, threats
-from uuvtai.kernels.vehicle import actuation, dynamics
+from uuvtai.kernels.vehicle import actuation, dynamics, lost_thruster
 from uuvtai.kernels.world import scenarios
 from uuvtai.native.making import adopt
 from uuvtai.rrt import RouteFallback, RoutePlanner
@@ -87,6 +87,7 @@ class Sim:
         self.sensors: SensorSource = SimulatedSensors()
         self.stage_s: dict[str, float] | None = None
         self.privileged = False
+        self._watches = lost_thruster.is_watched(config.vehicle, config.actuation)
         self._memory = self.memory()
         self._put = self._memory.put
         if config.runtime.native and self.device.type == "cpu":
@@ -125,6 +126,8 @@ class Sim:
             self.action.copy_(action)
         io, rules = self.io, self.config.episode
         with self._stage("dynamics"):
+            if self._watches:
+                lost_thruster.watch_thrusters(io.thrusters)
             actuation.command_thrusters(io.actuation, self.action)
             dynamics.move_vehicle(io.dynamics, rules.control_dt_s, rules.substeps)
         with self._stage("world"):

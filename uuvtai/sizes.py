@@ -46,6 +46,7 @@ def array_sizes(config: Config, n_env: int, device: str = "cpu") -> dict[str, in
         "n_env": n_env,
         "n_thruster": len(config.vehicle.thrusters),
         "n_wrench": 6,
+        "n_response": 10,
         "n_delay": 1 + round(config.disturbance.thruster_delay_s / config.episode.control_dt_s),
         **scenario_sizes(config.world),
         "n_ray": sensors.sonar.n_ray,

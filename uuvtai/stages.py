@@ -38,7 +38,7 @@ from uuvtai.kernels.privileged.bundles import TrueMapIO, TrueTracksIO
 from uuvtai.kernels.sensors.bundles import DepthIO, ProprioceptionIO, SonarIO
 from uuvtai.kernels.task.bundles import EpisodeIO, RewardIO
 from uuvtai.kernels.teacher.bundles import EvasionIO, TeacherIO, ThreatsIO
-from uuvtai.kernels.vehicle.bundles import ActuationIO, DynamicsIO
+from uuvtai.kernels.vehicle.bundles import ActuationIO, DynamicsIO, ThrusterWatchIO
 from uuvtai.kernels.world.bundles import WorldIO
 
 STAGES = (
@@ -112,6 +112,7 @@ class Stages:
 
     episode: EpisodeIO
     world: WorldIO
+    thrusters: ThrusterWatchIO
     actuation: ActuationIO
     dynamics: DynamicsIO
     proprioception: ProprioceptionIO

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from docs.writers.benchmark_pages import benchmark, benchmark_scenes
+from docs.writers.dead_tables import dead_commands, dead_thrusters
 from docs.writers.figure_sources import Counts, SourceError, Sources, fitting, pooled, weighted
 from docs.writers.pieces import BEFORE, CELLS, LETTERS, PIECES
 from docs.writers.pose_tables import pose_endings, pose_errors
@@ -565,6 +566,8 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         sweep_commands_alone,
         caution,
         alone,
+        dead_commands,
+        dead_thrusters,
         learning_cost,
         world_model_errors,
         world_model_switches,

@@ -10,7 +10,7 @@ import uuvtai
 KERNELS = Path(uuvtai.__file__).parent / "kernels"
 
 FILES = {
-    "dynamics": ("actuation", "dynamics"),
+    "dynamics": ("lost_thruster", "actuation", "dynamics"),
     "world": ("scenarios", "episode"),
     "proprioception": ("proprioception",),
     "sonar": ("sonar", "sonar_error", "raycast"),

@@ -116,6 +116,14 @@ class ActuationConfig(Section):
     max_force_n: tuple[Positive, Positive, Positive] = (90.0, 90.0, 80.0)
     """covers the drag at full speed of every published BlueROV2 parameter set (59, 78 and 44 N)"""
     max_moment_n_m: Positive = 8.0
+    watch_s: NonNegative = 2.0
+    """memory of the watch over the vertical thrusters, which gives up a dead one (frames with two of them);
+    0 = no watch"""
+    watch_ratio: Fraction = 0.3
+    """a thruster is given up when its death leaves less than this share of what any other explanation leaves
+    of the felt thrust; thrusters that lost less than 65 % of their gain never do (EC)"""
+    watch_doubt_n2_s: NonNegative = 1.0
+    """so much more must be left by the others: the accelerometer's noise is no evidence (EC)"""
     hold_gain_n_m: NonNegative = 60.0
     """[N m/rad] roll and pitch, ideal hold"""
     hold_damping: NonNegative = 8.0

@@ -45,25 +45,25 @@ class TeacherState:
     """cost of every candidate of the newest decision"""
     want_evade: ti.Field = array("n_env", dtype=ti.i32)
     """1 = plan an evasion in this step"""
-    ttc_s: ti.Field = array("n_env")
+    ttc_s: ti.Field = array("n_env", beside="danger")
     """[s] smallest sensed time to contact, geometry.FAR_M = none"""
-    threat_bearing: ti.Field = array("n_env")
+    threat_bearing: ti.Field = array("n_env", beside="danger")
     """[rad] its bearing in the body frame"""
-    nearest_m: ti.Field = array("n_env")
+    nearest_m: ti.Field = array("n_env", beside="danger")
     """[m] smallest sensed distance from the hull"""
-    nearest_bearing: ti.Field = array("n_env")
+    nearest_bearing: ti.Field = array("n_env", beside="danger")
     """[rad] its bearing in the body frame"""
-    clearance_m: ti.Field = array("n_env")
+    clearance_m: ti.Field = array("n_env", beside="danger")
     """[m] mapped static clearance of the own position"""
     away_w: ti.Field = array("n_env", vec=2)
     """unit vector away from the nearest mapped obstacle, zero = none near"""
-    path_clearance_m: ti.Field = array("n_env")
+    path_clearance_m: ti.Field = array("n_env", beside="danger")
     """[m] smallest mapped clearance on the straight way to the look-ahead point"""
-    conflict_s: ti.Field = array("n_env")
+    conflict_s: ti.Field = array("n_env", beside="danger")
     """[s] time of the first predicted conflict of following the route, geometry.FAR_M = none"""
-    hold_conflict_s: ti.Field = array("n_env")
+    hold_conflict_s: ti.Field = array("n_env", beside="danger")
     """[s] time of the first predicted conflict of stopping here, geometry.FAR_M = none"""
-    body_near_m: ti.Field = array("n_env")
+    body_near_m: ti.Field = array("n_env", beside="danger")
     """[m] distance to the nearest forecast body now, hull to surface"""
     steer_w: ti.Field = array("n_env", vec=2)
     """[m] horizontal way to the point that is steered for: the look-ahead point, or a nearer one where the

@@ -12,7 +12,8 @@ import taichi as ti
 from uuvtai.kernels.core.lanes import column, is_awake, n_awake, n_column, put_column
 from uuvtai.kernels.core.signature import Bundle, Const, FloatMatrix, In, Out, spread
 from uuvtai.kernels.vehicle.bundles import ActuationIO
-from uuvtai.kernels.vehicle.rotor import rpm_of_thrust, thrust_limits
+from uuvtai.kernels.vehicle.lost_thruster import is_watched, vertical_pair
+from uuvtai.kernels.vehicle.rotor import rpm_of_thrust, thrust_limits, thrust_of_rpm
 from uuvtai.native.launch import quick_launch, without_cse
 
 
@@ -42,6 +43,9 @@ def reset_actuation(io: Bundle[ActuationIO]):
         if pad == 0 and io.clock.awake[env] == 1:
             io.actuation.command[env] = 0.0
             io.actuation.integral[env] = 0.0
+            io.actuation.given_up[env] = 0
+            for i in ti.static(range(io.actuation.response.shape[1])):
+                io.actuation.response[env, i] = 0.0
             io.actuation.hold_moment_b[env] = 0.0
             io.actuation.external_wrench_b[env] = 0.0
             for i in range(ti.static(io.actuation.rpm_command.shape[1])):
@@ -154,8 +158,25 @@ def _store_vehicle(lane, env, fleet: In[Any], io: Bundle[ActuationIO]):
     due = (io.clock.step[env] - io.params.delay_steps[env]) % n_slot
     for i in ti.static(range(io.actuation.rpm_command.shape[1])):
         io.actuation.rpm_queue[env, slot, i] = fleet.rpm[i, lane]
+    if ti.static(is_watched(io.vehicle_cfg, io.actuation_cfg)):
+        _spare_given_up(env, slot, io)
     for i in ti.static(range(io.actuation.rpm_command.shape[1])):
         io.actuation.rpm_command[env, i] = io.actuation.rpm_queue[env, due, i]
+
+
+@ti.func
+def _spare_given_up(env, slot, io: Bundle[ActuationIO]):
+    """Tell a thruster that is given up nothing, and its mate the thrust of both: the heave stays, the roll
+    moment is left to the hold."""
+    pair = ti.static(vertical_pair(io.vehicle_cfg))
+    if io.actuation.given_up[env] > 0:
+        both = thrust_of_rpm(io.actuation.rpm_queue[env, slot, pair[0]], io.vehicle_cfg) + thrust_of_rpm(
+            io.actuation.rpm_queue[env, slot, pair[1]], io.vehicle_cfg
+        )
+        alone = rpm_of_thrust(both, io.vehicle_cfg)
+        dead_first = io.actuation.given_up[env] == ti.static(1 + pair[0])
+        io.actuation.rpm_queue[env, slot, pair[0]] = ti.select(dead_first, 0.0, alone)
+        io.actuation.rpm_queue[env, slot, pair[1]] = ti.select(dead_first, alone, 0.0)
 
 
 @ti.func

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from uuvtai.config import ActuationConfig, DisturbanceConfig, EpisodeConfig, VehicleConfig
+from uuvtai.config import ActuationConfig, DisturbanceConfig, EpisodeConfig, SensorsConfig, VehicleConfig
 from uuvtai.kernels.core.signature import Const, In, Out
 from uuvtai.state import (
     ActuationState,
@@ -30,6 +30,19 @@ class ActuationIO:
     params: In[VehicleParams]
     actuation_cfg: Const[ActuationConfig]
     episode_cfg: Const[EpisodeConfig]
+    vehicle_cfg: Const[VehicleConfig]
+
+
+@dataclass(frozen=True, eq=False)
+class ThrusterWatchIO:
+    """What the vertical thrusters were told, and what the vehicle did."""
+
+    actuation: Out[ActuationState]
+    clock: In[ClockState]
+    ego: In[Proprioception]
+    actuation_cfg: Const[ActuationConfig]
+    episode_cfg: Const[EpisodeConfig]
+    sensors_cfg: Const[SensorsConfig]
     vehicle_cfg: Const[VehicleConfig]
 
 
