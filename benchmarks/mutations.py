@@ -573,8 +573,8 @@ KERNELS = (
     Mutation(
         "trigger_ttc_range",
         "uuvtai/kernels/planning/triggers.py",
-        "soon = -io.scan.doppler_m_s[env, beam]",
-        "soon = io.scan.doppler_m_s[env, beam]",
+        "soon = -rate * ti.static",
+        "soon = rate * ti.static",
         "tests/test_route.py",
         "safety or near or ttc or trigger",
     ),

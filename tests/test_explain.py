@@ -67,6 +67,7 @@ class Story:
         self.place_error = np.zeros(3)
         self.turn_back_share = 0.0
         self.coarse = None
+        self.look, self.config = 0.0, CONFIG
 
     def turn(self, ago_s, before=(0.0, -1.0)):
         """The killer moved along ``before`` until ``ago_s`` before the end; forecasts went on straight."""
@@ -96,7 +97,7 @@ class Story:
 
     def history(self):
         toward = self.body[:, KILLER] - self.pos
-        yaw = np.arctan2(toward[:, 1], toward[:, 0])
+        yaw = np.arctan2(toward[:, 1], toward[:, 0]) + self.look
         lead = 0.1 * np.arange(26)
         forecast = self.body[:, KILLER, None, :2] + lead[:, None] * self.foreseen_vel[:, None]
         return History(
@@ -127,8 +128,8 @@ class Story:
             ),
         )
 
-    def explained(self, outcome="collision", config=CONFIG):
-        return explain(outcome, self.history(), self.bodies(), config)
+    def explained(self, outcome="collision", config=None):
+        return explain(outcome, self.history(), self.bodies(), config or self.config)
 
 
 def corridor(story, half_gap=0.32):
@@ -194,6 +195,14 @@ def diving_into_it():
     return story
 
 
+def from_behind():
+    """A sonar that looks ahead only, and the killer comes from behind."""
+    sonar = CONFIG.sensors.sonar.model_copy(update={"horizontal_aperture_deg": 130.0})
+    sensors = CONFIG.sensors.model_copy(update={"sonar": sonar})
+    config = CONFIG.model_copy(update={"sensors": sensors})
+    return change(Story(), look=np.pi, config=config)
+
+
 def above_the_floor():
     """In a corridor, too near to the floor to dive below what comes over the whole width at its height."""
     story = corridor(Story(speed=2.0, rise=0.25, gap=-0.05))
@@ -215,6 +224,7 @@ STORIES = {
     "hit_wall": (lambda: at_wall(Story()), "collision"),
     "pushed_into_static": (lambda: hit_static(evading=True), "collision"),
     "start_in_danger": (lambda: Story(end_s=1.5), "collision"),
+    "unseen_beside": (from_behind, "collision"),
     "unseen_above": (lambda: below(0.35), "collision"),
     "unseen_below": (lambda: below(-0.35), "collision"),
     "unannounced_turn": (lambda: Story().turn(1.1), "collision"),

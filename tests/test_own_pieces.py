@@ -453,7 +453,7 @@ def test_a_view_is_the_same_where_the_truth_is_spoilt(sim):
     poison.off()
     for one, other in zip(before, spoilt, strict=True):
         np.testing.assert_array_equal(one, other)
-    assert len(before) == 29 and all(len(value) == 3 for value in before)
+    assert len(before) == 30 and all(len(value) == 3 for value in before)
 
 
 def test_vectors_are_turned_into_the_body(sim, write):

@@ -9,7 +9,7 @@ from mcap.reader import make_reader
 
 from tests.command import run_cli
 from tests.reference import logs as episode
-from uuvtai.logs import ros_types
+from uuvtai.logs import ros_types, ros_write
 from uuvtai.logs.container import McapFile
 from uuvtai.logs.log_errors import LogError
 from uuvtai.logs.mcap_log import McapEpisodeLog
@@ -123,6 +123,15 @@ def test_scans_and_clouds(ros, recorded):
         points = np.frombuffer(bytes(cloud.data), "<f4").reshape(-1, 5)
         assert len(points) == hit.sum() == cloud.width
         np.testing.assert_allclose(np.hypot(points[:, 0], points[:, 1]), np.abs(ranges[hit]), rtol=1e-6)
+
+
+def test_a_cloud_of_a_sonar_without_doppler_says_no_speed():
+    scan = {"timestamp": {"sec": 1, "nsec": 5}, "frame_id": "sonar", "start_angle": -0.5, "end_angle": 0.5}
+    scan |= {"ranges": [1.0, 12.0, 3.0], "intensities": [0.5, 0.0, 0.2]}
+    cloud = ros_write._cloud(ros_types.RosMessages(), scan, [])
+    points = np.frombuffer(bytes(cloud.data), "<f4").reshape(-1, 5)
+    assert not cloud.is_dense and np.isnan(points[:, 4]).all()
+    np.testing.assert_allclose(points[:, 1], [np.sin(-0.5), 3.0 * np.sin(0.5)], rtol=1e-6)
 
 
 def test_maps_and_commands(ros, recorded):

@@ -33,6 +33,7 @@ def fire():
             s.mission,
             s.clock,
             c.route,
+            c.sensors.sonar,
             c.voronoi,
             c.tracking,
             c.mapping,

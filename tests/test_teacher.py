@@ -163,7 +163,7 @@ def body(stage, env, track, pos, vel, radius=0.2, above=-0.8, below=-0.8):
     put(stage.forecast.below_w, below, env, track)
 
 
-def assess(stage, cfg=CFG.teacher):
+def assess(stage, cfg=CFG.teacher, sonar=CFG.sensors.sonar):
     threats.assess_threats(
         io_for(
             ThreatsIO,
@@ -178,6 +178,7 @@ def assess(stage, cfg=CFG.teacher):
             stage.mission,
             stage.clock,
             cfg,
+            sonar,
             CFG.elevation,
             CFG.traffic,
             CFG.vehicle,
@@ -214,7 +215,7 @@ def decide(stage):
     tick(stage)
 
 
-def tick(stage):
+def tick(stage, sonar=CFG.sensors.sonar):
     leaves.tick_tree(
         io_for(
             TeacherIO,
@@ -226,6 +227,7 @@ def tick(stage):
             stage.mission,
             stage.clock,
             CFG.teacher,
+            sonar,
             CFG.vehicle,
             TANK,
             CFG.episode,
@@ -895,6 +897,23 @@ def test_following_the_nose_looks_at_the_body(scene):
     np.testing.assert_allclose(
         np.hypot(*scene.t.last_vel_w.to_numpy()[:, :2].T), 0.5, atol=1e-6
     )  # the way itself stays
+
+
+def test_with_a_fan_ahead_it_turns_before_it_drives(scene):
+    """The way lies ahead, to the side, or behind, of a fan of 65 degrees to either side and a margin of 20:
+    full speed up to 45, none beyond 65, and the nose turns until the way is 45 degrees off."""
+    fan = CFG.sensors.sonar.model_copy(update={"horizontal_aperture_deg": 130.0})
+    way = np.resize([0.0, 40.0, 55.0, 70.0, 180.0, -55.0], N_ENV)
+    ahead = np.stack([np.cos(np.radians(way)), np.sin(np.radians(way)), 0 * way], 1)
+    put(scene.route.lookahead_w, np.add(ahead, (5.0, 3.0, -0.8)))
+    assess(scene, sonar=fan)
+    tick(scene, sonar=fan)
+    speed = np.hypot(*scene.t.last_vel_w.to_numpy()[:, :2].T)[:6]
+    np.testing.assert_allclose(speed / speed[0], [1, 1, 0.5, 0, 0, 0.5], atol=1e-3)
+    rate = scene.action.numpy()[:6, 3]
+    assert (rate[2:4] > 0).all() and abs(rate[4]) > 0 and rate[5] < 0, "towards the way"
+    assess(scene)
+    assert scene.t.speed_share.to_numpy()[4] == scene.t.speed_share.to_numpy()[0], "a ring sees all around"
 
 
 def test_waiting_the_nose_looks_at_the_body(scene):

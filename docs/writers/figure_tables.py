@@ -14,6 +14,7 @@ from docs.writers.figure_sources import Counts, SourceError, Sources, fitting, p
 from docs.writers.pieces import BEFORE, CELLS, LETTERS, PIECES
 from docs.writers.pose_tables import pose_endings, pose_errors
 from docs.writers.replay_tables import changed, lossy, replayed
+from docs.writers.sonar_tables import sonars
 from uuvtai.measure.reproduce import paper
 from uuvtai.measure.reproduce.steps import RETIRED_SEEDS
 from uuvtai.outcomes import COLLIDED
@@ -578,6 +579,7 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         replayed,
         changed,
         lossy,
+        sonars,
         twin_curve,
         twin_policy,
         chooser_trials,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -20,9 +21,12 @@ from uuvtai.config.section import (
 
 
 class SonarConfig(Section):
-    """Horizontal ring of beams, fixed to the yaw, always level."""
+    """Horizontal beams, fixed to the yaw, always level: a ring, or a fan ahead."""
 
     n_ray: Packets = 256
+    horizontal_aperture_deg: Annotated[float, Field(ge=10, le=360)] = 360.0
+    """360: a ring, beam 0 ahead. Less: a fan of ``n_ray`` beams whose middle is ahead, beam 0 at its right
+    edge; what lies beside and behind it is not seen. Counter-clockwise both"""
     max_range_m: Positive = 12.0
     vertical_half_aperture_deg: Annotated[float, Field(ge=0, lt=80)] = 10.0
     period_steps: PositiveCount = 1
@@ -44,11 +48,40 @@ class SonarConfig(Section):
     """probability per beam that a specular bounce replaces the direct return"""
     grazing_cosine: Fraction = 0.0
     """a return is lost below this cosine of incidence"""
+    doppler: bool = True
+    """each return carries its Doppler; off: ranges and intensities alone, and nothing reads a speed from a
+    beam: what moves is told from one scan to the next"""
     doppler_sigma_m_s: NonNegative = 0.0
     doppler_outlier: Fraction = 0.0
     """probability per beam that the Doppler is worthless"""
     doppler_outlier_m_s: NonNegative = 2.0
     """worthless = uniform within +- this (EC)"""
+
+    @property
+    def is_ring(self) -> bool:
+        """Whether the beams go all around."""
+        return self.horizontal_aperture_deg == 360.0
+
+    def turn_rad(self, beams: int) -> float:
+        """[rad] from one beam to the one that comes so many after it."""
+        if self.is_ring:
+            return 2.0 * math.pi * beams / self.n_ray
+        return math.radians(self.horizontal_aperture_deg) * beams / self.n_ray
+
+    @property
+    def beam_step_rad(self) -> float:
+        """[rad] between neighbouring beams."""
+        return self.turn_rad(1)
+
+    @property
+    def first_beam_rad(self) -> float:
+        """[rad] bearing of beam 0 from ahead, counter-clockwise."""
+        return 0.0 if self.is_ring else -0.5 * self.turn_rad(self.n_ray - 1)
+
+    @property
+    def circle_beams(self) -> int:
+        """Beams that fill a whole circle at this spacing; ``n_ray`` of a ring."""
+        return self.n_ray if self.is_ring else math.ceil(2.0 * math.pi / self.beam_step_rad)
 
 
 class DepthConfig(Section):

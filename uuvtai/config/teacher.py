@@ -129,6 +129,9 @@ class TeacherConfig(Section):
     """where the way is narrower the vehicle slows down until its nose lies along it"""
     gaze_off_deg: NonNegative = 25.0
     """the nose may be so far off the body that is looked at, towards a diagonal of the body along the way"""
+    sight_margin_deg: NonNegative = 20.0
+    """where the sonar is a fan ahead, the way is kept so far within its edge: the nose turns, and beyond that
+    the vehicle slows down, to a stop at the edge"""
     yaw_gain: Positive = 2.5
     """[1/s]"""
     max_node: PositiveCount = 64

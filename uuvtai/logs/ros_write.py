@@ -202,10 +202,11 @@ def _scan(ros: RosMessages, setup: Setup, scan: dict[str, Any]) -> Any:
 
 
 def _cloud(ros: RosMessages, scan: dict[str, Any], velocity: Any) -> Any:
-    """Returns only."""
+    """Returns only; their velocity is NaN where the sonar measures none."""
     ranges, bearing, shine = np.array(scan["ranges"]), _bearings(scan), np.array(scan["intensities"])
     hit = shine > 0
-    columns = (ranges * np.cos(bearing), ranges * np.sin(bearing), 0 * ranges, shine, np.array(velocity))
+    speed = np.array(velocity) if len(velocity) else np.full(len(ranges), math.nan)
+    columns = (ranges * np.cos(bearing), ranges * np.sin(bearing), 0 * ranges, shine, speed)
     points = np.column_stack(columns)[hit].astype("<f4")
     fields = [
         ros("sensor_msgs/msg/PointField", name=name, offset=4 * i, datatype=_FLOAT32, count=1)
@@ -222,7 +223,7 @@ def _cloud(ros: RosMessages, scan: dict[str, Any], velocity: Any) -> Any:
         point_step=step,
         row_step=step * len(points),
         data=np.frombuffer(points.tobytes(), np.uint8),
-        is_dense=True,
+        is_dense=len(velocity) > 0,
     )
 
 

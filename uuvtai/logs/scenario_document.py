@@ -26,13 +26,15 @@ FORMULAS = {
         "it is turned by yaw about z"
     ),
     "sonar": (
-        "Beam i of n looks along the true yaw + 2 pi i / n in the horizontal plane of the true position at "
-        "the scan's own timestamp. A body is met where the beam enters its horizontal outline (of a sphere: "
-        "the circle of radius sqrt(r^2 - g^2), g = max(|dz| - d tan(a), 0), d = horizontal distance of its "
-        "centre) if the vertical gap is at most range * tan(a); a = "
-        "sensors.sonar.vertical_half_aperture_deg. Side walls are always met, floor and surface never; "
+        "Beam i looks along the true yaw + start_angle + i (end_angle - start_angle) / (n - 1), angles of "
+        "/sonar/scan, in the horizontal plane of the true position at the scan's own timestamp. A body is "
+        "met where the beam enters its horizontal outline (of a sphere: a circle of radius sqrt(r^2 - g^2), "
+        "g = max(|dz| - d tan(a), 0), d = horizontal distance of its centre) if the vertical gap is at most "
+        "range * tan(a); a = sensors.sonar.vertical_half_aperture_deg. Side walls are always met, floor and "
+        "surface never; "
         "nothing beyond sensors.sonar.max_range_m returns. Doppler = (velocity of the body or wall that is "
-        "met - own velocity) . beam: how fast that piece of surface recedes. Errors as in sensors.sonar."
+        "met - own velocity) . beam: how fast that piece of surface recedes; none is measured where "
+        "sensors.sonar.doppler is false. Errors as in sensors.sonar."
     ),
     "clearance": (
         "Hull = capsule about the vehicle's x axis (vehicle.hull_half_length_m either side of the origin, "
@@ -72,9 +74,9 @@ FORMULAS = {
         "(/sonar/doppler, beam in body axes) > max(doppler_evidence_m_s, 3 doppler_sigma_m_s), or if the "
         "beam is listed in /tracks, or if the cell speaks against a body at rest: (free_scans >= "
         "ceil(free_confident_s / P) or 0 < dynamic_scans < ceil(promote_s / P)) and no cell within m rows "
-        "and columns has static >= occupied, m = min(4, 1 + floor((2 pi / n * range + error) / cell_m)). All "
-        "of this as of before the scan. Counters of a cell, to 255: free: free_scans + 1, dynamic_scans = 0; "
-        "any return: free_scans = 0; a moving one: dynamic_scans + 1."
+        "and columns has static >= occupied, m = min(4, 1 + floor((spacing of the beams * range + error) / "
+        "cell_m)). All of this as of before the scan. Counters of a cell, to 255: free: free_scans + 1, "
+        "dynamic_scans = 0; any return: free_scans = 0; a moving one: dynamic_scans + 1."
     ),
     "map_depth": (
         "/camera/line has, per image column, the nearest pixel that sees something within "

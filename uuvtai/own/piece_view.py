@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from uuvtai.config import SonarConfig
 from uuvtai.own.protocol import COMMAND, Ego, OccupancyGrid, Scan, Tracks, Way
 from uuvtai.sim import Sim
 
@@ -63,13 +64,28 @@ class Readings:
         read, dt_s = self._read(name), self._sim.config.episode.control_dt_s
         if name == "scan":
             age_s = (self.group("step") - read[5]).astype(np.float32) * np.float32(dt_s)
-            return Scan(read[0], read[1] == 1, read[2], read[3], read[4], age_s)
+            return _scan(read, age_s, self._sim.config.sensors.sonar)
         if name == "tracks":
             ahead = self._read("forecast")
             moving, state = (read[0] == 1) & (read[1] == 1), read[2]
             return Tracks(moving, state[..., :2], state[..., 2:], read[3], ahead[0], ahead[1])
         kinds: dict[str, Callable[..., Any]] = {"ego": Ego, "map": OccupancyGrid, "route": Way}
         return kinds[name](*read) if name in kinds else read[0]
+
+
+def _scan(read: list[Array], age_s: Array, sonar_cfg: SonarConfig) -> Scan:
+    """Of what was read; a speed that is not measured is not a number."""
+    range_m, hit, doppler, intensity, yaw, _step = read
+    bearing = sonar_cfg.first_beam_rad + sonar_cfg.beam_step_rad * np.arange(sonar_cfg.n_ray)
+    return Scan(
+        range_m,
+        hit == 1,
+        doppler if sonar_cfg.doppler else np.full_like(doppler, np.nan),
+        intensity,
+        yaw,
+        age_s,
+        np.broadcast_to(bearing.astype(np.float32), range_m.shape).copy(),
+    )
 
 
 class PieceView:

@@ -79,20 +79,23 @@ class Ego(NamedTuple):
 
 
 class Scan(NamedTuple):
-    """The newest sonar scan; beam 0 was ahead when it was taken, counter-clockwise."""
+    """The newest sonar scan, counter-clockwise. Of a ring beam 0 was ahead when it was taken, of a fan it is
+    the rightmost one."""
 
     range_m: Any
     """(n, R) [m]; maximum range without a return"""
     hit: Any
     """(n, R) bool"""
     doppler: Any
-    """(n, R) [m/s] rate of change of the range, own motion included"""
+    """(n, R) [m/s] rate of change of the range, own motion included; NaN where the sonar measures none"""
     intensity: Any
     """(n, R) [0, 1]"""
     yaw: Any
     """(n,) [rad] own yaw when it was taken"""
     age_s: Any
     """(n,) [s]"""
+    bearing: Any
+    """(n, R) [rad] where each beam looked, from ahead, counter-clockwise"""
 
 
 class Tracks(NamedTuple):

@@ -133,7 +133,7 @@ class FedSensors:
         if isinstance(ping, SonarPing) and (then := self._pose_at("sonar", self._pings, ping.time_s)):
             hit = np.asarray(ping.hit) > 0
             scan["range_m"][0] = np.where(hit, np.clip(ping.range_m, 0.0, self._sonar_m), self._sonar_m)
-            scan["doppler_m_s"][0] = np.where(hit, ping.doppler_m_s, 0.0)
+            scan["doppler_m_s"][0] = np.where(hit, ping.doppler_m_s, 0.0) if len(ping.doppler_m_s) else 0.0
             scan["hit"][0], scan["fresh"][0] = hit, 1
             scan["ping_step"][0] = self._step_of(ping.time_s)
             for name, value in then.items():

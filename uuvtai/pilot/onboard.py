@@ -84,10 +84,11 @@ class OnboardPilot:
         self._nodes = numbered(sim.tree.names)
         memory = sim.memory()
         camera = config.sensors.depth
-        rays = (config.sensors.sonar.n_ray,)
+        sonar = config.sensors.sonar
         self._inbox = Inbox(
             {
-                **{f"sonar.{name}": rays for name in ("range_m", "hit", "doppler_m_s")},
+                **{f"sonar.{name}": (sonar.n_ray,) for name in ("range_m", "hit")},
+                "sonar.doppler_m_s": (sonar.n_ray if sonar.doppler else 0,),
                 "depth.depth_m": (camera.rows, camera.cols),
             }
         )

@@ -51,15 +51,17 @@ class PositionFix:
 
 @dataclass(frozen=True, eq=False)
 class SonarPing:
-    """A ring of beams; ``time_s`` is that of the ping."""
+    """A scan of all beams, in the order of ``SonarConfig``; ``time_s`` is that of the ping."""
 
     time_s: float
     range_m: np.ndarray
-    """(n_ray,) [m] beam 0 ahead, counter-clockwise; without a return anything finite"""
+    """(n_ray,) [m] counter-clockwise, beam 0 of a ring ahead, of a fan at its right edge; without a return
+    anything finite"""
     hit: np.ndarray
     """(n_ray,) 1 = return"""
     doppler_m_s: np.ndarray
-    """(n_ray,) [m/s] rate of change of the distance to what returned, own motion included"""
+    """(n_ray,) [m/s] rate of change of the distance to what returned, own motion included; empty where the
+    sonar measures none (``sensors.sonar.doppler``)"""
 
 
 @dataclass(frozen=True, eq=False)

@@ -72,7 +72,8 @@ class SonarScan:
     range_m: ti.Field = array("n_env", "n_ray", lanes=True)
     """[m] no return = maximum range"""
     doppler_m_s: ti.Field = array("n_env", "n_ray", lanes=True)
-    """[m/s] rate of change of the distance to what the beam hit, positive = receding, ego motion included"""
+    """[m/s] rate of change of the distance to what the beam hit, positive = receding, ego motion included;
+    without meaning (0) where the sonar measures none (``sonar.doppler``)"""
     intensity: ti.Field = array("n_env", "n_ray", lanes=True)
     """[0, 1]"""
     hit: ti.Field = array("n_env", "n_ray", lanes=True, dtype=ti.i32)

@@ -11,7 +11,8 @@ import math
 
 import taichi as ti
 
-from uuvtai.kernels.core.geometry import TWO_PI, turned_z
+from uuvtai.kernels.core.beams import beam_lanes, beam_there
+from uuvtai.kernels.core.geometry import turned_z
 from uuvtai.kernels.core.lanes import LANES, f16x
 from uuvtai.kernels.core.signature import Bundle
 from uuvtai.kernels.perception.bundles import TrackingIO
@@ -32,6 +33,9 @@ _MODEL_SIGMA_M = 0.01
 HELD_SIGMA_M_S = 1.0
 """Trust in the own velocity's last reading while the DVL has lost the bottom: it may be off by as much as the
 vehicle can change (EC)."""
+
+NO_DOPPLER_VAR = 1.0e6
+"""[m^2/s^2] variance of the Doppler of a sonar that measures none: it says nothing."""
 
 _SLIP_SIGMA_M_S = 0.01
 """What remains of a Doppler's error however many beams are averaged: the own velocity's error (EC)."""
@@ -73,7 +77,7 @@ def find_clusters(env, io: Bundle[TrackingIO]):
 @ti.func
 def label_beams(env, io: Bundle[TrackingIO]):
     """Label every beam _CANDIDATE or -1, compensate its Doppler, and learn the own velocity's error from the
-    walls: they do not move.
+    walls: they do not move. Without Doppler a measured velocity is taken as it is.
 
     ``normal`` = (sum ux ux, sum ux uy, sum uy uy, sum ux e, sum uy e) over the walls' beams, u = beam, e =
     compensated Doppler.
@@ -82,41 +86,33 @@ def label_beams(env, io: Bundle[TrackingIO]):
     vel = turned_z(io.scan.ping_vel_b[env], yaw)
     normal = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0])
     for packet in range(io.sonar_cfg.n_ray // LANES):
-        ux, uy = packet_directions(yaw + packet * ti.static(LANES * TWO_PI / io.sonar_cfg.n_ray), io)
-        range_m, doppler, hit = f16x(0.0), f16x(0.0), f16x(0.0)
+        ux, uy = beam_lanes(yaw, packet * LANES, io.sonar_cfg)
+        range_m, hit = f16x(0.0), f16x(0.0)
         for i in ti.static(range(LANES)):
             range_m[i] = io.scan.range_m[env, packet * LANES + i]
-            doppler[i] = io.scan.doppler_m_s[env, packet * LANES + i]
             hit[i] = ti.cast(io.scan.hit[env, packet * LANES + i], ti.f32)
-        own = vel[0] * ux + vel[1] * uy
-        still = doppler + own
         margin = io.tracking_cfg.wall_margin_m + 2.0 * ti.sqrt(range_variance(range_m, io))
         free = wall_distance(pos[0] + range_m * ux, pos[1] + range_m * uy, io) - margin
         wall = ti.select(free < 0.0, hit, f16x(0.0))
-        error = wall * still
         body = hit - wall
-        wx = wall * ux
-        wy = wall * uy
-        normal += ti.Vector(
-            [(wx * ux).sum(), (wx * uy).sum(), (wy * uy).sum(), (error * ux).sum(), (error * uy).sum()]
-        )
+        if ti.static(io.sonar_cfg.doppler):
+            still = vel[0] * ux + vel[1] * uy
+            for i in ti.static(range(LANES)):
+                still[i] += io.scan.doppler_m_s[env, packet * LANES + i]
+                io.clusters.beam_doppler[env, packet * LANES + i] = still[i]
+            error = wall * still
+            wx = wall * ux
+            wy = wall * uy
+            normal += ti.Vector(
+                [(wx * ux).sum(), (wx * uy).sum(), (wy * uy).sum(), (error * ux).sum(), (error * uy).sum()]
+            )
         for i in ti.static(range(LANES)):
-            io.clusters.beam_doppler[env, packet * LANES + i] = still[i]
             io.clusters.beam_cluster[env, packet * LANES + i] = ti.select(body[i] > 0.5, _CANDIDATE, -1)
-    slip_w, sigma = velocity_slip(normal, io.scan.ping_vel_valid[env], io)
+    slip_w, sigma = ti.Vector([0.0, 0.0]), ti.select(io.scan.ping_vel_valid[env] == 1, 0.0, HELD_SIGMA_M_S)
+    if ti.static(io.sonar_cfg.doppler):
+        slip_w, sigma = velocity_slip(normal, io.scan.ping_vel_valid[env], io)
     io.clusters.slip_w[env] = slip_w
     io.clusters.own_sigma_m_s[env] = sigma
-
-
-@ti.func
-def packet_directions(first_bearing, io: Bundle[TrackingIO]):
-    """Unit vectors (x, y) of sixteen neighbouring beams, the first at this world bearing."""
-    c, s = ti.cos(first_bearing), ti.sin(first_bearing)
-    ahead, left = f16x(0.0), f16x(0.0)
-    for i in ti.static(range(LANES)):
-        ahead[i] = ti.cast(ti.static(math.cos(i * TWO_PI / io.sonar_cfg.n_ray)), ti.f32)
-        left[i] = ti.cast(ti.static(math.sin(i * TWO_PI / io.sonar_cfg.n_ray)), ti.f32)
-    return c * ahead - s * left, s * ahead + c * left
 
 
 @ti.func
@@ -170,10 +166,12 @@ def joined(env, a, b, io: Bundle[TrackingIO]):
     ):
         if io.clusters.beam_cluster[env, b] == _CANDIDATE:
             jump = ti.abs(io.scan.range_m[env, b] - io.scan.range_m[env, a])
-            swing = ti.abs(io.clusters.beam_doppler[env, b] - io.clusters.beam_doppler[env, a])
-            out = jump <= split_distance(io.scan.range_m[env, a], io) and swing <= ti.static(
-                io.tracking_cfg.split_doppler_m_s + 6 * io.sonar_cfg.doppler_sigma_m_s
-            )
+            out = jump <= split_distance(io.scan.range_m[env, a], io)
+            if ti.static(io.sonar_cfg.doppler):
+                swing = ti.abs(io.clusters.beam_doppler[env, b] - io.clusters.beam_doppler[env, a])
+                out = out and swing <= ti.static(
+                    io.tracking_cfg.split_doppler_m_s + 6 * io.sonar_cfg.doppler_sigma_m_s
+                )
     return out
 
 
@@ -193,9 +191,12 @@ def next_beam(env, beam, io: Bundle[TrackingIO]):
 
 @ti.func
 def quiet_beam(env, io: Bundle[TrackingIO]):
-    """A beam that no run crosses, so that runs through beam 0 stay whole; 0 if there is none."""
+    """A beam that no run crosses, so that runs through beam 0 stay whole; 0 if there is none, and of a fan,
+    whose ends do not meet."""
     n = ti.static(io.sonar_cfg.n_ray)
     out = -1
+    if ti.static(not io.sonar_cfg.is_ring):
+        out = 0
     s = 0
     while out < 0 and s < n:
         crossed = False
@@ -237,7 +238,7 @@ def store_run(env, start, first, last, sums, io: Bundle[TrackingIO]):
     a, b = (start + first) % io.sonar_cfg.n_ray, (start + last) % io.sonar_cfg.n_ray
     range_m = sums[1] / sums[0] - io.sonar_cfg.range_jitter_m
     hidden = open_edges(env, a, b, io)
-    expected = io.tracking_cfg.min_radius_m / (ti.max(range_m, 0.1) * ti.static(TWO_PI / io.sonar_cfg.n_ray))
+    expected = io.tracking_cfg.min_radius_m / (ti.max(range_m, 0.1) * ti.static(io.sonar_cfg.beam_step_rad))
     if (
         c < io.clusters.match.shape[1]
         and is_narrow(env, a, b, last - first, io)
@@ -249,7 +250,9 @@ def store_run(env, start, first, last, sums, io: Bundle[TrackingIO]):
         io.clusters.hidden[env, c] = hidden
         io.clusters.match[env, c] = -1
         place_cluster(env, c, range_m, io)
-        weigh_doppler(env, c, sums, io)
+        io.clusters.doppler_m_s[env, c], io.clusters.doppler_var[env, c] = 0.0, NO_DOPPLER_VAR
+        if ti.static(io.sonar_cfg.doppler):
+            weigh_doppler(env, c, sums, io)
         io.clusters.count[env] = c + 1
     else:
         for k in range(first, last + 1):
@@ -260,10 +263,11 @@ def store_run(env, start, first, last, sums, io: Bundle[TrackingIO]):
 def is_narrow(env, a, b, steps, io: Bundle[TrackingIO]):
     """Whether the chord between the end beams can belong to a body."""
     ra, rb = io.scan.range_m[env, a], io.scan.range_m[env, b]
-    half = ti.sin(ti.min(steps, io.sonar_cfg.n_ray // 2) * ti.static(0.5 * TWO_PI / io.sonar_cfg.n_ray))
+    half_circle = ti.static(io.sonar_cfg.circle_beams // 2)
+    half = ti.sin(ti.min(steps, half_circle) * ti.static(0.5 * io.sonar_cfg.beam_step_rad))
     slack = ti.max(io.tracking_cfg.max_width_m, 4.0 * ti.sqrt(range_variance(ra, io)))
     return (
-        steps < io.sonar_cfg.n_ray // 2
+        steps < half_circle
         and 4.0 * ra * rb * half * half < io.tracking_cfg.max_width_m**2
         and ti.abs(ra - rb) < slack
     )
@@ -271,18 +275,24 @@ def is_narrow(env, a, b, steps, io: Bundle[TrackingIO]):
 
 @ti.func
 def open_edges(env, a, b, io: Bundle[TrackingIO]):
-    """Bit set of the edges (1 = first, 2 = last) that border a nearer return or go on as something else at
-    the same range."""
+    """Bit set of the edges (1 = first, 2 = last) that border a nearer return or the end of the fan, or go on
+    as something else at the same range."""
     return edge_open(env, a, -1, io) + 2 * edge_open(env, b, 1, io)
 
 
 @ti.func
 def edge_open(env, edge, way, io: Bundle[TrackingIO]):
-    """1 where the first return beyond this edge, within two beams, is nearer or continues it."""
+    """1 where the first return beyond this edge, within two beams, is nearer or continues it, or where no
+    beam looks there."""
     out = 0
     looking = True
     for step in ti.static((1, 2)):
-        beam = (edge + way * step + io.sonar_cfg.n_ray) % io.sonar_cfg.n_ray
+        beam = beam_there(edge + way * step, io.sonar_cfg)
+        if ti.static(not io.sonar_cfg.is_ring):
+            if looking and beam < 0:
+                looking = False
+                out = 1
+            beam = ti.max(beam, 0)
         if looking and io.scan.hit[env, beam] == 1:
             looking = False
             beyond = io.scan.range_m[env, beam] - io.scan.range_m[env, edge]
@@ -294,9 +304,9 @@ def edge_open(env, edge, way, io: Bundle[TrackingIO]):
 @ti.func
 def place_cluster(env, c, range_m, io: Bundle[TrackingIO]):
     """Circle through the visible arc: bearing, radius, centre, and the variance of the mean range."""
-    step = ti.static(TWO_PI / io.sonar_cfg.n_ray)
+    step = ti.static(io.sonar_cfg.beam_step_rad)
     half = 0.5 * step * io.clusters.span[env, c]
-    bearing = io.scan.ping_yaw[env] + step * (
+    bearing = (io.scan.ping_yaw[env] + ti.static(io.sonar_cfg.first_beam_rad)) + step * (
         io.clusters.first_beam[env, c] + 0.5 * (io.clusters.span[env, c] - 1)
     )
     # The outermost beams touch the circle: sin(half) = radius / distance. The mean range lies ARC radii

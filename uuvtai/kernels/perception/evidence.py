@@ -10,13 +10,13 @@ import math
 import taichi as ti
 
 from uuvtai.config import TankConfig
+from uuvtai.kernels.core.beams import beam_lanes
 from uuvtai.kernels.core.bits import WORD, bit_of, cell_bit, put_bit
-from uuvtai.kernels.core.geometry import FAR_M, TWO_PI, quaternion_wb, rotation_wb, turned_z
+from uuvtai.kernels.core.geometry import FAR_M, quaternion_wb, rotation_wb, turned_z
 from uuvtai.kernels.core.grid import cell_of, grid_origin, grid_shape
 from uuvtai.kernels.core.lanes import LANES, f16x, i16x, ramp_lanes
 from uuvtai.kernels.core.signature import Bundle, Const
 from uuvtai.kernels.perception.bundles import MappingIO
-from uuvtai.kernels.perception.fan import beam_lanes
 
 _MAX_REACH = 4
 """[cells] farthest neighbour that may explain a surprising return as the edge of a static body."""
@@ -154,7 +154,7 @@ def is_inconsistent(env, row, col, range_m, promote_scans: Const[int], io: Bundl
     if confident == 1 or (
         held == 1 and ti.cast(io.grid_map.dynamic_scans[env, row, col], ti.i32) < promote_scans
     ):
-        spacing = ti.static(TWO_PI / io.sonar_cfg.n_ray) * range_m
+        spacing = ti.static(io.sonar_cfg.beam_step_rad) * range_m
         reach = 1 + ti.cast((spacing + range_error(range_m, io)) / io.mapping_cfg.cell_m, ti.i32)
         inconsistent = 1 - edge_of_static(env, row, col, ti.min(reach, _MAX_REACH), io)
     return inconsistent
@@ -187,29 +187,32 @@ def own_motion(env, io: Bundle[MappingIO]):
 
 @ti.func
 def mapped_lanes(env, first_ray, pos, vel, threshold, io: Bundle[MappingIO]):
-    """Of sixteen beams: kind of return (0 = none or from a known wall, 1 = at rest, 2 = moving by its
-    Doppler), row, column, range [m].
+    """Of sixteen beams: kind of return (0 = none or from a known wall, 1 = at rest as far as it tells itself,
+    2 = moving by its Doppler), row, column, range [m].
 
     ``vel`` [m/s] is the own velocity along x and y of the body, ``threshold`` [m/s] the compensated Doppler
     that counts as motion.
     """
     n_row, n_col = ti.static(grid_shape(io.tank_cfg, io.mapping_cfg.cell_m))
     x0, y0 = ti.static(grid_origin(io.tank_cfg, io.mapping_cfg.cell_m))
-    range_m, doppler, hit = f16x(0.0), f16x(0.0), i16x(0)
+    range_m, hit = f16x(0.0), i16x(0)
     for i in ti.static(range(LANES)):
         range_m[i] = io.scan.range_m[env, first_ray + i]
-        doppler[i] = io.scan.doppler_m_s[env, first_ray + i]
         hit[i] = io.scan.hit[env, first_ray + i]
-    unit_x, unit_y = beam_lanes(io.scan.ping_yaw[env], first_ray, io.sonar_cfg.n_ray)
-    ahead_x, ahead_y = beam_lanes(0.0, first_ray, io.sonar_cfg.n_ray)
+    unit_x, unit_y = beam_lanes(io.scan.ping_yaw[env], first_ray, io.sonar_cfg)
     x, y = pos[0] + unit_x * range_m, pos[1] + unit_y * range_m
     # noise along a slanting beam reaches deeper into the tank than the margin
     gap, short = (
         wall_gaps(x, y, io),
         wall_lanes(pos, unit_x, unit_y, io.tank_cfg) - range_error(range_m, io) - range_m,
     )
-    # measured rate of range plus own velocity along the beam: motion through the water
-    moves = doppler + ahead_x * vel[0] + ahead_y * vel[1]
+    moves = f16x(0.0)
+    if ti.static(io.sonar_cfg.doppler):
+        # measured rate of range plus own velocity along the beam: motion through the water
+        ahead_x, ahead_y = beam_lanes(0.0, first_ray, io.sonar_cfg)
+        for i in ti.static(range(LANES)):
+            moves[i] = io.scan.doppler_m_s[env, first_ray + i]
+        moves = moves + ahead_x * vel[0] + ahead_y * vel[1]
     kind, row, col = i16x(0), i16x(0), i16x(0)
     for i in ti.static(range(LANES)):
         row[i] = ti.cast(ti.floor((y[i] - y0) / io.mapping_cfg.cell_m), ti.i32)

@@ -5,32 +5,18 @@ and both legs as long as the smaller of their reaches; a cell is free where its 
 triangles. Their union is one star-shaped polygon, so it is filled the way printers fill polygons: every edge
 leaves a bit where it crosses a column of cell centres (``fan_edge``), and whoever goes up a column is inside
 after an odd number of bits. That takes some 600 bits where walking 256 beams cell by cell takes 10,000
-stores, and far out, where beams are several cells apart, it leaves no gaps between them.
+stores, and far out, where beams are several cells apart, it leaves no gaps between them. Behind the last beam
+of a partial fan there is no triangle: the outline goes back to the ping.
 """
-
-import math
 
 import taichi as ti
 
+from uuvtai.kernels.core.beams import beam_lanes
 from uuvtai.kernels.core.bits import WORD, cell_bit
-from uuvtai.kernels.core.geometry import TWO_PI
 from uuvtai.kernels.core.grid import grid_origin, grid_shape
 from uuvtai.kernels.core.lanes import LANES, f16x, i16x
 from uuvtai.kernels.core.signature import Bundle, Const
 from uuvtai.kernels.perception.bundles import MappingIO
-
-
-@ti.func
-def beam_lanes(yaw, first_ray, n_ray: Const[int]):
-    """Horizontal unit vectors (x lanes, y lanes) of sixteen neighbouring beams (``yaw`` 0: in the body's
-    frame)."""
-    bearing = yaw + ti.static(TWO_PI / n_ray) * first_ray
-    c, s = ti.cos(bearing), ti.sin(bearing)
-    x, y = f16x(0.0), f16x(0.0)
-    for i in ti.static(range(LANES)):
-        x[i] = c * ti.static(math.cos(TWO_PI / n_ray * i)) - s * ti.static(math.sin(TWO_PI / n_ray * i))
-        y[i] = s * ti.static(math.cos(TWO_PI / n_ray * i)) + c * ti.static(math.sin(TWO_PI / n_ray * i))
-    return x, y
 
 
 @ti.func
@@ -65,6 +51,9 @@ def triangle_legs(env, first_ray, io: Bundle[MappingIO]):
     for i in ti.static(range(LANES - 1)):
         legs[i] = ti.min(reach[i], reach[i + 1]) / io.mapping_cfg.cell_m
     legs[LANES - 1] = ti.min(reach[LANES - 1], after) / io.mapping_cfg.cell_m
+    if ti.static(not io.sonar_cfg.is_ring):
+        if first_ray + LANES == io.sonar_cfg.n_ray:
+            legs[LANES - 1] = 0.0
     return legs
 
 
@@ -102,8 +91,8 @@ def mark_fan(env, slot, io: Bundle[MappingIO]):
     first, last = ti.Vector([0.0, 0.0]), ti.Vector([0.0, 0.0])
     first_col, last_col = 0, 0
     for packet in range(ti.static(n_ray // LANES)):
-        unit_x, unit_y = beam_lanes(io.scan.ping_yaw[env], packet * LANES, n_ray)
-        next_x, next_y = beam_lanes(io.scan.ping_yaw[env], packet * LANES + 1, n_ray)
+        unit_x, unit_y = beam_lanes(io.scan.ping_yaw[env], packet * LANES, io.sonar_cfg)
+        next_x, next_y = beam_lanes(io.scan.ping_yaw[env], packet * LANES + 1, io.sonar_cfg)
         legs = triangle_legs(env, packet * LANES, io)
         begin_x, begin_y = ping[0] + legs * unit_x, ping[1] + legs * unit_y
         end_x, end_y = ping[0] + legs * next_x, ping[1] + legs * next_y

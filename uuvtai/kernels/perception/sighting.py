@@ -3,7 +3,6 @@
 
 import taichi as ti
 
-from uuvtai.kernels.core.geometry import TWO_PI
 from uuvtai.kernels.core.kalman import position_variance, velocity_variance
 from uuvtai.kernels.core.signature import Bundle
 from uuvtai.kernels.perception.bundles import TrackingIO
@@ -29,7 +28,7 @@ def centre_sight(env, c, radius, io: Bundle[TrackingIO]):
     distance = io.clusters.range_m[env, c] + ARC * radius
     half = radius / distance
     distance /= 1.0 - half * half / 6.0
-    spare = half - 0.5 * ti.static(TWO_PI / io.sonar_cfg.n_ray) * io.clusters.span[env, c]
+    spare = half - 0.5 * ti.static(io.sonar_cfg.beam_step_rad) * io.clusters.span[env, c]
     bearing = io.clusters.bearing_w[env, c]
     if io.clusters.hidden[env, c] == 1:
         bearing -= ti.max(spare, 0.0)
@@ -41,7 +40,7 @@ def centre_sight(env, c, radius, io: Bundle[TrackingIO]):
 @ti.func
 def centre_variances(env, c, radius, radius_var, io: Bundle[TrackingIO]):
     """Variances [m^2] of a cluster's centre along and across the beam, larger where an edge is hidden."""
-    edge = _EDGE_SIGMA * ti.static(TWO_PI / io.sonar_cfg.n_ray) * io.clusters.range_m[env, c]
+    edge = _EDGE_SIGMA * ti.static(io.sonar_cfg.beam_step_rad) * io.clusters.range_m[env, c]
     radial = io.clusters.range_var[env, c] + ARC * ARC * radius_var
     cross = edge * edge + _CROSS_SIGMA_M * _CROSS_SIGMA_M
     if io.clusters.hidden[env, c] > 0:
@@ -53,14 +52,14 @@ def centre_variances(env, c, radius, radius_var, io: Bundle[TrackingIO]):
 @ti.func
 def radius_variance(env, c, io: Bundle[TrackingIO]):
     """Variance [m^2] of a cluster's radius: half of two edges, each uniform within one beam spacing."""
-    edge = _EDGE_SIGMA * ti.static(TWO_PI / io.sonar_cfg.n_ray) * io.clusters.range_m[env, c]
+    edge = _EDGE_SIGMA * ti.static(io.sonar_cfg.beam_step_rad) * io.clusters.range_m[env, c]
     return edge * edge + _CROSS_SIGMA_M * _CROSS_SIGMA_M
 
 
 @ti.func
 def pair_surprise(env, track, c, offset, io: Bundle[TrackingIO]):
-    """(squared normalised innovation of range, cross range and Doppler; product of their variances; the part
-    of the position alone)."""
+    """(squared normalised innovation of range, cross range and, where it is measured, Doppler; product of
+    their variances; the part of the position alone)."""
     mean, cov = io.tracks.state[env, track], io.tracks.cov[env, track]
     along = bearing_vector(io.clusters.bearing_w[env, c])
     across = ti.Vector([-along[1], along[0]])
@@ -69,8 +68,12 @@ def pair_surprise(env, track, c, offset, io: Bundle[TrackingIO]):
     )
     s_radial = position_variance(cov, along) + radial_var
     s_cross = position_variance(cov, across) + cross_var
-    s_doppler = velocity_variance(cov, along) + io.clusters.doppler_var[env, c]
     radial, cross = offset.dot(along), offset.dot(across)
-    swing = io.clusters.doppler_m_s[env, c] - (mean[2] * along[0] + mean[3] * along[1])
     near = radial * radial / s_radial + cross * cross / s_cross
-    return near + swing * swing / s_doppler, s_radial * s_cross * s_doppler, near
+    surprise, volume = near + 0.0, s_radial * s_cross
+    if ti.static(io.sonar_cfg.doppler):
+        s_doppler = velocity_variance(cov, along) + io.clusters.doppler_var[env, c]
+        swing = io.clusters.doppler_m_s[env, c] - (mean[2] * along[0] + mean[3] * along[1])
+        surprise = near + swing * swing / s_doppler
+        volume = s_radial * s_cross * s_doppler
+    return surprise, volume, near

@@ -9,7 +9,8 @@ that are nobody's begin tracks. Sees the image, the scan and tracks only.
 
 import taichi as ti
 
-from uuvtai.kernels.core.geometry import FAR_M, TWO_PI, quaternion_wb, rotation_wb, wrapped_angle
+from uuvtai.kernels.core.beams import beam_there, beam_towards
+from uuvtai.kernels.core.geometry import FAR_M, quaternion_wb, rotation_wb, wrapped_angle
 from uuvtai.kernels.core.kalman import born, corrected, position_variance
 from uuvtai.kernels.core.lanes import LANES, f16x, ramp_lanes
 from uuvtai.kernels.core.signature import Bundle, spread
@@ -198,13 +199,13 @@ def is_off_fan(seen, env, io: Bundle[SpottingIO]):
     own = io.scan.ping_pos_w[env]
     x, y = seen[0] - own[0], seen[1] - own[1]
     distance = ti.sqrt(x * x + y * y)
-    step = ti.static(TWO_PI / io.sonar_cfg.n_ray)
-    middle = ti.cast(ti.floor((ti.atan2(y, x) - io.scan.ping_yaw[env]) / step + 0.5), ti.i32)
+    middle = beam_towards(ti.atan2(y, x) - io.scan.ping_yaw[env], io.sonar_cfg)
     off = 1
     for k in range(-1, 2):
-        ray = (middle + k + 2 * io.sonar_cfg.n_ray) % io.sonar_cfg.n_ray
+        ray = ti.max(beam_there(middle + k, io.sonar_cfg), 0)
         if (
-            io.scan.hit[env, ray] == 1
+            beam_there(middle + k, io.sonar_cfg) >= 0
+            and io.scan.hit[env, ray] == 1
             and ti.abs(io.scan.range_m[env, ray] - distance) < io.spotting_cfg.split_m
         ):
             off = 0

@@ -3,7 +3,8 @@ the tracking stage)."""
 
 import taichi as ti
 
-from uuvtai.kernels.core.geometry import FAR_M, TWO_PI, wrapped_angle
+from uuvtai.kernels.core.beams import beam_there, beam_towards
+from uuvtai.kernels.core.geometry import FAR_M, wrapped_angle
 from uuvtai.kernels.core.kalman import born
 from uuvtai.kernels.core.lanes import f16x
 from uuvtai.kernels.core.signature import Bundle, Out
@@ -127,20 +128,25 @@ def is_lost(env, track, sight, io: Bundle[TrackingIO]):
 @ti.func
 def sight_of(env, track, io: Bundle[TrackingIO]):
     """What most beams through the middle of the predicted body say: SEEN_THROUGH, BLOCKED by something
-    nearer, or 0 = neither."""
-    step = ti.static(TWO_PI / io.sonar_cfg.n_ray)
+    nearer or because no beam looks there, or 0 = neither."""
+    step = ti.static(io.sonar_cfg.beam_step_rad)
     own, mean, radius = io.scan.ping_pos_w[env], io.tracks.state[env, track], io.tracks.radius_m[env, track]
     dx, dy = mean[0] - own[0], mean[1] - own[1]
     distance = ti.sqrt(dx * dx + dy * dy)
-    middle = ti.cast(ti.floor((ti.atan2(dy, dx) - io.scan.ping_yaw[env]) / step + 0.5), ti.i32)
+    middle = beam_towards(ti.atan2(dy, dx) - io.scan.ping_yaw[env], io.sonar_cfg)
     half = ti.cast(0.5 * radius / (ti.max(distance, radius) * step), ti.i32)
     slack = radius + split_distance(distance, io)
     through, before = 0, 0
     for k in range(-half, half + 1):
-        ray = (middle + k + 2 * io.sonar_cfg.n_ray) % io.sonar_cfg.n_ray
-        past = io.scan.hit[env, ray] == 0 or io.scan.range_m[env, ray] > distance + slack
-        through += ti.cast(past, ti.i32)
-        before += ti.cast(io.scan.hit[env, ray] == 1 and io.scan.range_m[env, ray] < distance - slack, ti.i32)
+        ray = beam_there(middle + k, io.sonar_cfg)
+        if ti.static(not io.sonar_cfg.is_ring) and ray < 0:
+            before += 1
+        else:
+            past = io.scan.hit[env, ray] == 0 or io.scan.range_m[env, ray] > distance + slack
+            through += ti.cast(past, ti.i32)
+            before += ti.cast(
+                io.scan.hit[env, ray] == 1 and io.scan.range_m[env, ray] < distance - slack, ti.i32
+            )
     return ti.select(
         2 * through > 2 * half + 1, SEEN_THROUGH, ti.select(2 * before > 2 * half + 1, BLOCKED, 0)
     )
@@ -222,8 +228,8 @@ def free_slot(env, c, io: Bundle[TrackingIO]):
 
 @ti.func
 def begin_track(env, track, c, io: Bundle[TrackingIO]):
-    """A new track from one cluster: velocity along the bearing from the Doppler, unknown across. Displaces
-    whoever had the slot."""
+    """A new track from one cluster: velocity along the bearing from the Doppler where it is measured, unknown
+    across. Displaces whoever had the slot."""
     if io.tracks.alive[env, track] == 1 and io.tracks.pick[env, track] >= 0:
         io.clusters.match[env, io.tracks.pick[env, track]] = -1
     clear_track(env, track, io.tracks)
@@ -241,7 +247,7 @@ def begin_track(env, track, c, io: Bundle[TrackingIO]):
         radial_var,
         cross_var,
         io.clusters.doppler_m_s[env, c],
-        io.clusters.doppler_var[env, c],
+        io.clusters.doppler_var[env, c] if ti.static(io.sonar_cfg.doppler) else cross_speed_var,
         cross_speed_var,
     )
     io.tracks.alive[env, track] = 1
@@ -283,12 +289,15 @@ def name_beams(env, io: Bundle[TrackingIO]):
 def carry_names(env, io: Bundle[TrackingIO]):
     """Name the beams of a scan that is not tracked after the last one that was: same bearing, and a range at
     which that body can be."""
-    step = ti.static(TWO_PI / io.sonar_cfg.n_ray)
+    step = ti.static(io.sonar_cfg.beam_step_rad)
     shift = ti.cast(
         ti.floor(wrapped_angle(io.scan.ping_yaw[env] - io.clusters.scan_yaw[env]) / step + 0.5), ti.i32
     )
     for ray in range(io.sonar_cfg.n_ray):
-        c = io.clusters.beam_cluster[env, (ray + shift + io.sonar_cfg.n_ray) % io.sonar_cfg.n_ray]
+        then = beam_there(ray + shift, io.sonar_cfg)
+        c = io.clusters.beam_cluster[env, ti.max(then, 0)]
+        if then < 0:
+            c = -1
         name = -1
         if c >= 0 and io.scan.hit[env, ray] == 1:
             range_m = io.scan.range_m[env, ray]

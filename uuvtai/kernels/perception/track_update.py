@@ -86,7 +86,7 @@ def update_filter(env, track, c, io: Bundle[TrackingIO]):
         cov[9] += ti.max(speed, 0.5) ** 2
     # Three numbers one after another, which is exact as their errors are independent: range (h = along on
     # the position), cross range, Doppler (h = along on the velocity). The mean Doppler over the visible half
-    # angle a is v'along times the mean cosine, sin(a) / a = 1 - a^2 / 6.
+    # angle a is v'along times the mean cosine, sin(a) / a = 1 - a^2 / 6. Without Doppler: the first two.
     h = ti.Vector([along[0], along[1], 0.0, 0.0])
     rate, link = io.tracks.turn_rate[env, track], io.tracks.turn_cov[env, track]
     mean_r, cov_r, rate_r, link_r = corrected(mean, cov, rate, link, h, offset.dot(along), radial_var)
@@ -95,27 +95,37 @@ def update_filter(env, track, c, io: Bundle[TrackingIO]):
     mean_c, cov_c, rate_c, link_c = corrected(
         mean_r, cov_r, rate_r, link_r, h_cross, left.dot(across), cross_var
     )
-    shrink = 1.0 - half * half / 6.0
-    h_doppler = ti.Vector([0.0, 0.0, shrink * along[0], shrink * along[1]])
-    swing = io.clusters.doppler_m_s[env, c] - shrink * (mean_c[2] * along[0] + mean_c[3] * along[1])
-    mean_d, cov_d, rate_d, link_d = corrected(
-        mean_c, cov_c, rate_c, link_c, h_doppler, swing, io.clusters.doppler_var[env, c]
-    )
-    io.tracks.state[env, track] = mean_d
-    io.tracks.cov[env, track] = cov_d
-    io.tracks.turn_rate[env, track] = rate_d
-    io.tracks.turn_cov[env, track] = link_d
+    if ti.static(io.sonar_cfg.doppler):
+        shrink = 1.0 - half * half / 6.0
+        h_doppler = ti.Vector([0.0, 0.0, shrink * along[0], shrink * along[1]])
+        swing = io.clusters.doppler_m_s[env, c] - shrink * (mean_c[2] * along[0] + mean_c[3] * along[1])
+        mean_d, cov_d, rate_d, link_d = corrected(
+            mean_c, cov_c, rate_c, link_c, h_doppler, swing, io.clusters.doppler_var[env, c]
+        )
+        put_filter(env, track, mean_d, cov_d, rate_d, link_d, io)
+    else:
+        put_filter(env, track, mean_c, cov_c, rate_c, link_c, io)
+
+
+@ti.func
+def put_filter(env, track, mean, cov, rate, link, io: Bundle[TrackingIO]):
+    """Write a track's filter."""
+    io.tracks.state[env, track] = mean
+    io.tracks.cov[env, track] = cov
+    io.tracks.turn_rate[env, track] = rate
+    io.tracks.turn_cov[env, track] = link
 
 
 @ti.func
 def update_evidence(env, track, c, dt, before, io: Bundle[TrackingIO]):
     """Fading mean of the Doppler and fading displacement. ``before`` = mean predicted for this scan."""
-    known = 1.0 / (io.tracks.doppler_var[env, track] * (1.0 + dt / io.tracking_cfg.doppler_memory_s))
-    new = 1.0 / io.clusters.doppler_var[env, c]
-    io.tracks.doppler_m_s[env, track] = (
-        known * io.tracks.doppler_m_s[env, track] + new * io.clusters.doppler_m_s[env, c]
-    ) / (known + new)
-    io.tracks.doppler_var[env, track] = 1.0 / (known + new)
+    if ti.static(io.sonar_cfg.doppler):
+        known = 1.0 / (io.tracks.doppler_var[env, track] * (1.0 + dt / io.tracking_cfg.doppler_memory_s))
+        new = 1.0 / io.clusters.doppler_var[env, c]
+        io.tracks.doppler_m_s[env, track] = (
+            known * io.tracks.doppler_m_s[env, track] + new * io.clusters.doppler_m_s[env, c]
+        ) / (known + new)
+        io.tracks.doppler_var[env, track] = 1.0 / (known + new)
     shift = io.tracks.shift_w[env, track] / (1.0 + dt / io.tracking_cfg.shift_memory_s)
     if io.clusters.hidden[env, c] == 0:
         after = io.tracks.state[env, track]
@@ -134,10 +144,12 @@ def is_moving(env, track, c, dt, io: Bundle[TrackingIO]):
     none."""
     mean = io.tracks.state[env, track]
     fast = mean[2] * mean[2] + mean[3] * mean[3] > io.tracking_cfg.moving_speed_m_s**2
-    doppler = ti.max(
-        io.tracking_cfg.moving_doppler_m_s, DOPPLER_SIGMAS * ti.sqrt(io.tracks.doppler_var[env, track])
-    )
-    shown = ti.abs(io.tracks.doppler_m_s[env, track]) > doppler or has_shifted(env, track, c, dt, io)
+    shown = has_shifted(env, track, c, dt, io)
+    if ti.static(io.sonar_cfg.doppler):
+        doppler = ti.max(
+            io.tracking_cfg.moving_doppler_m_s, DOPPLER_SIGMAS * ti.sqrt(io.tracks.doppler_var[env, track])
+        )
+        shown = shown or ti.abs(io.tracks.doppler_m_s[env, track]) > doppler
     begins = fast and shown and io.tracks.age[env, track] >= CONFIRMED - 1
     goes_on = io.tracks.moving[env, track] == 1 and (fast or shown)
     return ti.cast(begins or goes_on, ti.i32)

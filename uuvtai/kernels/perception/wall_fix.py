@@ -6,14 +6,14 @@ heading), v = u turned to the left by a right angle. The wall does not move, so 
 velocity). Each beam adds its part to an information matrix and vector; bodies before a wall, ghosts and
 clutter lie outside the gate, or outside that of a few neighbouring beams together. What passes all the same
 makes every beam count less, as much as the sonar's rates of wrong returns and the returns before the walls
-say.
+say. A sonar without Doppler says nothing of the velocity.
 """
 
 import math
 
 import taichi as ti
 
-from uuvtai.kernels.core.geometry import TWO_PI
+from uuvtai.kernels.core.beams import beam_lanes
 from uuvtai.kernels.core.lanes import LANES, f16x
 from uuvtai.kernels.core.signature import Bundle
 from uuvtai.kernels.perception.bundles import PoseIO
@@ -77,19 +77,20 @@ def seen_walls(env, place_cov, speed, speed_cov, io: Bundle[PoseIO]):
             ]
         )  # fmt: skip
         fix.pose_part += ti.Vector([(wx * e).sum(), (wy * e).sum(), (wt * e).sum()])
-        slip = beams.doppler_m_s + speed[0] * beams.ahead + speed[1] * beams.left
-        swing = ti.static(doppler_variance(io.sensors_cfg)) + form2(speed_cov, beams.ahead, beams.left)
-        still = good * ti.select(slip * slip < ti.static(io.pose_cfg.gate_sigmas**2) * swing, 1.0, 0.0)
-        trust = still * ti.static(
-            1.0
-            / gated(wrong_dopplers(io.sensors_cfg, io.pose_cfg), io.pose_cfg)
-            / doppler_variance(io.sensors_cfg)
-        )
-        va, vl = trust * beams.ahead, trust * beams.left
-        fix.velocity += ti.Vector(
-            [(va * beams.ahead).sum(), (va * beams.left).sum(), (vl * beams.left).sum()]
-        )
-        fix.velocity_part -= ti.Vector([(va * slip).sum(), (vl * slip).sum()])
+        if ti.static(io.sensors_cfg.sonar.doppler):
+            slip = beams.doppler_m_s + speed[0] * beams.ahead + speed[1] * beams.left
+            swing = ti.static(doppler_variance(io.sensors_cfg)) + form2(speed_cov, beams.ahead, beams.left)
+            still = good * ti.select(slip * slip < ti.static(io.pose_cfg.gate_sigmas**2) * swing, 1.0, 0.0)
+            trust = still * ti.static(
+                1.0
+                / gated(wrong_dopplers(io.sensors_cfg, io.pose_cfg), io.pose_cfg)
+                / doppler_variance(io.sensors_cfg)
+            )
+            va, vl = trust * beams.ahead, trust * beams.left
+            fix.velocity += ti.Vector(
+                [(va * beams.ahead).sum(), (va * beams.left).sum(), (vl * beams.left).sum()]
+            )
+            fix.velocity_part -= ti.Vector([(va * slip).sum(), (vl * slip).sum()])
     # what stands before the walls, as much as was seen of it, stands unseen just before them too
     share = short / ti.max(short + seen, 1.0)
     together = 1.0 / (1.0 + share * ti.static(unseen_returns(io.sensors_cfg, io.pose_cfg)))
@@ -111,15 +112,9 @@ def beside(values):
 @ti.func
 def read_beams(env, packet, io: Bundle[PoseIO]):
     """Sixteen beams; ranges without the mean of their one-sided error."""
-    turn = packet * ti.static(LANES * TWO_PI / io.sensors_cfg.sonar.n_ray)
-    c, s = ti.cos(turn), ti.sin(turn)
-    ahead, left = f16x(0.0), f16x(0.0)
+    ahead, left = beam_lanes(0.0, packet * LANES, io.sensors_cfg.sonar)
     range_m, doppler, hit = f16x(0.0), f16x(0.0), f16x(0.0)
     for i in ti.static(range(LANES)):
-        ci = ti.cast(ti.static(math.cos(i * TWO_PI / io.sensors_cfg.sonar.n_ray)), ti.f32)
-        si = ti.cast(ti.static(math.sin(i * TWO_PI / io.sensors_cfg.sonar.n_ray)), ti.f32)
-        ahead[i] = c * ci - s * si
-        left[i] = s * ci + c * si
         range_m[i] = io.scan.range_m[env, packet * LANES + i] - io.sensors_cfg.sonar.range_jitter_m
         doppler[i] = io.scan.doppler_m_s[env, packet * LANES + i]
         hit[i] = ti.cast(io.scan.hit[env, packet * LANES + i], ti.f32)

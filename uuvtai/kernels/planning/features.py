@@ -10,6 +10,7 @@ from uuvtai.config import FeaturesConfig
 from uuvtai.kernels.core.columns import ColumnGroup
 from uuvtai.kernels.core.geometry import FAR_M, TWO_PI, quaternion_wb, rotation_wb
 from uuvtai.kernels.core.signature import Bundle, FloatMatrix, Out, spread
+from uuvtai.kernels.perception.range_rate import range_rate
 from uuvtai.kernels.planning.advice import TEACHER_COLUMNS
 from uuvtai.kernels.planning.approach import BODY_COLUMNS, body_values, closest_approach, next_body
 from uuvtai.kernels.planning.bundles import FeaturesIO
@@ -26,27 +27,32 @@ def sense_sectors(io: Bundle[FeaturesIO]):
         if io.clock.awake[env] == 1:
             first, last = sector_beams(
                 sector,
-                io.ego.rpy[env][2] - io.scan.ping_yaw[env],
+                io.ego.rpy[env][2] - io.scan.ping_yaw[env] - ti.static(io.sonar_cfg.first_beam_rad),
                 n_sector,
-                ti.static(io.scan.range_m.shape[1]),
+                ti.static(io.sonar_cfg.circle_beams),
             )
             _summarise(env, sector, first, last, io)
 
 
 @ti.func
 def _summarise(env, sector, first, last, io: Bundle[FeaturesIO]):
-    """Doppler already holds the own motion, so a beam's time to collision is its range over its closing
-    speed."""
-    n_ray = ti.static(io.scan.range_m.shape[1])
+    """A range's rate already holds the own motion, so a beam's time to collision is its range over its
+    closing speed."""
+    circle, n_ray = ti.static(io.sonar_cfg.circle_beams, io.sonar_cfg.n_ray)
     nearest, ttc, closing, hits = 0.0 + io.sonar_cfg.max_range_m, 0.0 + io.features_cfg.ttc_cap_s, -FAR_M, 0
-    begin = first % n_ray
+    begin = first % circle
     for i in range(last - first):  # no branches: signs of noisy rates cannot be predicted
         beam = begin + i
-        beam -= ti.select(beam >= n_ray, n_ray, 0)
+        beam -= ti.select(beam >= circle, circle, 0)
+        wanted = 1
+        if ti.static(
+            not io.sonar_cfg.is_ring
+        ):  # where the fan has no beam there is no return: hit is never 2
+            wanted, beam = ti.select(beam < n_ray, 1, 2), ti.min(beam, n_ray - 1)
         hit, gap, rate = (
-            io.scan.hit[env, beam] == 1,
+            io.scan.hit[env, beam] == wanted,
             io.scan.range_m[env, beam],
-            -io.scan.doppler_m_s[env, beam],
+            -range_rate(env, beam, io.scan, io.tracks, io.sonar_cfg),
         )
         hits += ti.cast(hit, ti.i32)
         closing = ti.max(closing, ti.select(hit, rate, -FAR_M))
@@ -60,8 +66,8 @@ def _summarise(env, sector, first, last, io: Bundle[FeaturesIO]):
 
 @ti.func
 def sector_beams(sector, turned, n_sector, n_ray):
-    """Half-open range of beams in a sector now, after the vehicle has turned by ``turned`` [rad] since the
-    ping; take it modulo n_ray."""
+    """Half-open range of beams in a sector now, of ``n_ray`` in the circle, after the vehicle has turned by
+    ``turned`` [rad] since the ping, which is seen from beam 0; take it modulo the circle."""
     shift = turned * n_sector / TWO_PI
     per_sector = n_ray / n_sector
     first = ti.ceil((sector - 0.5 + shift) * per_sector)

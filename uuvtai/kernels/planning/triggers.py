@@ -14,6 +14,7 @@ import taichi as ti
 from uuvtai.kernels.core.grid import cell_of
 from uuvtai.kernels.core.lanes import LANES, i16x
 from uuvtai.kernels.core.signature import Bundle, spread
+from uuvtai.kernels.perception.range_rate import range_rate
 from uuvtai.kernels.planning.along import advanced_arc, level, look_along
 from uuvtai.kernels.planning.bundles import TriggersIO
 from uuvtai.kernels.planning.traversable import is_traversable
@@ -95,7 +96,8 @@ def _is_return_near(env, io: Bundle[TriggersIO]):
         for i in ti.static(range(LANES)):
             beam = packet * LANES + i
             gap = io.scan.range_m[env, beam]
-            soon = -io.scan.doppler_m_s[env, beam] * ti.static(io.route_cfg.safety_ttc_s) > gap
+            rate = range_rate(env, beam, io.scan, io.tracks, io.sonar_cfg)
+            soon = -rate * ti.static(io.route_cfg.safety_ttc_s) > gap
             urgent[i] = ti.cast(
                 (io.scan.hit[env, beam] == 1) & (soon | (gap < ti.static(io.route_cfg.safety_range_m))),
                 ti.i32,

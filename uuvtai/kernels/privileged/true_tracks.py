@@ -7,7 +7,7 @@ Launched only while ``Sim.privileged`` is on, which no config key and no preset 
 
 import taichi as ti
 
-from uuvtai.kernels.core.geometry import BOX, NONE, TWO_PI
+from uuvtai.kernels.core.geometry import BOX, NONE
 from uuvtai.kernels.core.lanes import LANES, f16x
 from uuvtai.kernels.core.signature import Bundle, Const, spread
 from uuvtai.kernels.perception.elevation import COLUMN, half_height
@@ -134,7 +134,9 @@ def name_beams_truly(io: Bundle[TrueTracksIO]):
     for env, ray, pad in ti.ndrange(n, n_ray, ti.static(spread(n * n_ray))):
         if pad == 0 and io.clock.awake[env] == 1 and io.scan.fresh[env] == 1:
             ago = (io.clock.step[env] - io.scan.ping_step[env]) * io.episode_cfg.control_dt_s
-            bearing = io.scan.ping_yaw[env] + ray * ti.static(TWO_PI / io.sonar_cfg.n_ray)
+            bearing = (io.scan.ping_yaw[env] + ti.static(io.sonar_cfg.first_beam_rad)) + ray * ti.static(
+                io.sonar_cfg.beam_step_rad
+            )
             hit_x = io.scan.ping_pos_w[env][0] + io.scan.range_m[env, ray] * ti.cos(bearing)
             hit_y = io.scan.ping_pos_w[env][1] + io.scan.range_m[env, ray] * ti.sin(bearing)
             named = -1

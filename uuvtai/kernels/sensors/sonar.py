@@ -1,10 +1,11 @@
-"""Sonar: a level ring of beams at the body origin, cast analytically in packets of sixteen neighbouring
-beams.
+"""Sonar: level beams at the body origin, a ring or a fan, cast analytically in packets of sixteen
+neighbouring beams.
 
-Beam i looks along the true yaw + 2 pi i / n_ray. A body is seen where the beam enters its horizontal outline
-and the vertical gap is within range x tan(half aperture); the side walls are always seen, floor and surface
-never. Every error source is a switch that is compiled away at zero. Order: geometry, ghost, grazing loss,
-bubble cloud, missed return, range noise, false return, quantisation.
+Beam i looks along the true yaw + the bearing of beam 0 + i times the spacing (``SonarConfig``). A body is
+seen where the beam enters its horizontal outline and the vertical gap is within range x tan(half aperture);
+the side walls are always seen, floor and surface never. Every error source is a switch that is compiled away
+at zero. Order: geometry, ghost, grazing loss, bubble cloud, missed return, range noise, false return,
+quantisation.
 """
 
 import math
@@ -198,7 +199,9 @@ def measured(env, packet, step, io: Bundle[SonarIO]):
     noisy = range_noisy(heard, key, step, ray, io)
     measured, speed, lit = falsely_returned(noisy, still, bright, key, step, ray, io)
     final = cut_off(measured, io)
-    doppler = doppler_noisy(speed - own, key, step, ray, io)
+    doppler = f16x(0.0)
+    if ti.static(io.sonar_cfg.doppler):
+        doppler = doppler_noisy(speed - own, key, step, ray, io)
     intensity = ti.max(lit, _DIMMEST) * (
         1.0 - _FALLOFF / io.sonar_cfg.max_range_m * ti.min(final, io.sonar_cfg.max_range_m)
     )
@@ -238,7 +241,7 @@ def direction_before(packet, heading, io: Bundle[SonarIO]):
     c, s = 0.0, 0.0
     for k in ti.static(range(io.sonar_cfg.n_ray // LANES)):
         if packet == k:
-            turn = ti.static(2.0 * math.pi * (LANES * k - 1) / io.sonar_cfg.n_ray)
+            turn = ti.static(io.sonar_cfg.first_beam_rad + io.sonar_cfg.turn_rad(LANES * k - 1))
             cosine, sine = ti.static(math.cos(turn), math.sin(turn))
             c, s = cosine, sine
     return ti.Vector([c * heading[0] - s * heading[1], s * heading[0] + c * heading[1]])
@@ -250,7 +253,7 @@ def beam_directions(packet, heading, io: Bundle[SonarIO]):
     before = direction_before(packet, heading, io)
     ux, uy = f16x(0.0), f16x(0.0)
     for i in ti.static(range(LANES)):
-        turn = ti.static(2.0 * math.pi * (i + 1) / io.sonar_cfg.n_ray)
+        turn = ti.static(io.sonar_cfg.turn_rad(i + 1))
         c, s = ti.static(math.cos(turn), math.sin(turn))
         ux[i] = before[0] * c - before[1] * s
         uy[i] = before[0] * s + before[1] * c
@@ -261,8 +264,8 @@ def beam_directions(packet, heading, io: Bundle[SonarIO]):
 def packet_wedge(packet, heading, io: Bundle[SonarIO]):
     """(x, y) of the middle direction of a packet's beams, then (cos, sin) of the half angle between its
     outermost beams."""
-    half = ti.static((LANES - 1) * math.pi / io.sonar_cfg.n_ray)
-    middle = ti.static(half + 2.0 * math.pi / io.sonar_cfg.n_ray)
+    half = ti.static(0.5 * io.sonar_cfg.turn_rad(LANES - 1))
+    middle = ti.static(half + io.sonar_cfg.beam_step_rad)
     c, s = ti.static(math.cos(middle), math.sin(middle))
     before = direction_before(packet, heading, io)
     x, y = c * before[0] - s * before[1], s * before[0] + c * before[1]

@@ -89,7 +89,7 @@ def start_cloud(env, io: Bundle[SonarIO]):
             lasts = uniform_in(key, first + 2, io.sonar_cfg.bubble_s[0], io.sonar_cfg.bubble_s[1])
             io.sonar_memory.cloud_width[env, free] = ti.cast(width, ti.i32)
             io.sonar_memory.cloud_beam[env, free] = ti.cast(
-                uniform_in(key, first + 3, 0.0, io.sonar_cfg.n_ray), ti.i32
+                uniform_in(key, first + 3, 0.0, io.sonar_cfg.circle_beams), ti.i32
             )
             io.sonar_memory.cloud_range_m[env, free] = uniform_in(
                 key, first + 4, _CLOUD_NEAREST_M, io.sonar_cfg.max_range_m
@@ -105,17 +105,22 @@ def cloud_covered(env, range_m, away, cosine, heading, ray, step, io: Bundle[Son
     them."""
     out_range, out_away, out_bright = range_m + 0.0, away + 0.0, cosine + 0.0
     if ti.static(io.sonar_cfg.bubble_clouds_per_s > 0):
-        turn = ti.cast(
-            ti.round(ti.atan2(heading[1], heading[0]) * ti.static(io.sonar_cfg.n_ray / TWO_PI)), ti.i32
-        )
+        turn = 0
+        if ti.static(io.sonar_cfg.is_ring):
+            turn = ti.cast(
+                ti.round(ti.atan2(heading[1], heading[0]) * ti.static(io.sonar_cfg.n_ray / TWO_PI)), ti.i32
+            )
+        else:
+            first = ti.atan2(heading[1], heading[0]) + ti.static(io.sonar_cfg.first_beam_rad)
+            turn = ti.cast(ti.round(first / ti.static(io.sonar_cfg.beam_step_rad)), ti.i32)
         index = i16x(0)
         for i in ti.static(range(LANES)):
             index[i] = ray + turn + i
         for cloud in range(io.sonar_memory.cloud_until.shape[1]):
             if step < io.sonar_memory.cloud_until[env, cloud]:
                 offset = (
-                    index - io.sonar_memory.cloud_beam[env, cloud] + 2 * io.sonar_cfg.n_ray
-                ) % io.sonar_cfg.n_ray
+                    index - io.sonar_memory.cloud_beam[env, cloud] + 2 * io.sonar_cfg.circle_beams
+                ) % io.sonar_cfg.circle_beams
                 distance = ti.cast(io.sonar_memory.cloud_range_m[env, cloud], ti.f32)
                 covered = (offset < io.sonar_memory.cloud_width[env, cloud]) & (out_range > distance)
                 out_range = ti.select(covered, distance, out_range)

@@ -8,6 +8,7 @@ from uuvtai.config import (
     ElevationConfig,
     EpisodeConfig,
     MappingConfig,
+    SonarConfig,
     TankConfig,
     TeacherConfig,
     TrackingConfig,
@@ -60,6 +61,7 @@ class TeacherIO:
     route: In[RouteState]
     table: In[TreeTable]
     episode_cfg: Const[EpisodeConfig]
+    sonar_cfg: Const[SonarConfig]
     teacher_cfg: Const[TeacherConfig]
     vehicle_cfg: Const[VehicleConfig]
 
@@ -81,6 +83,7 @@ class ThreatsIO:
     elevation_cfg: Const[ElevationConfig]
     episode_cfg: Const[EpisodeConfig]
     mapping_cfg: Const[MappingConfig]
+    sonar_cfg: Const[SonarConfig]
     tank_cfg: Const[TankConfig]
     teacher_cfg: Const[TeacherConfig]
     tracking_cfg: Const[TrackingConfig]

@@ -8,6 +8,7 @@ from uuvtai import tree_codes as codes
 from uuvtai.kernels.core.geometry import FAR_M, PI, quaternion_wb, rotation_wb, turned_z, wrapped_angle
 from uuvtai.kernels.core.signature import AnyTensor, Bundle, spread
 from uuvtai.kernels.teacher.bundles import TeacherIO
+from uuvtai.kernels.teacher.sight import kept_in_sight
 from uuvtai.kernels.teacher.threats import cruising_speed
 from uuvtai.kernels.teacher.trajectories import held_heave
 from uuvtai.kernels.teacher.tree_tick import tick_nodes
@@ -80,6 +81,7 @@ def tick_tree(io: Bundle[TeacherIO], action: AnyTensor):
             velocity = _wanted_velocity(env, leaf, acting, io)
             io.teacher.last_vel_w[env] = velocity
             turn = _turn(
+                env,
                 leaf,
                 velocity,
                 _gaze(env, leaf, acting, io),
@@ -237,7 +239,7 @@ def _gaze(env, leaf, node, io: Bundle[TeacherIO]):
 
 
 @ti.func
-def _turn(leaf, velocity, gaze, yaw, room, io: Bundle[TeacherIO]):
+def _turn(env, leaf, velocity, gaze, yaw, room, io: Bundle[TeacherIO]):
     """Angle to turn by: nose towards what is to be looked at, else along the way (where that is narrow, tail
     first is as slim).
 
@@ -261,4 +263,8 @@ def _turn(leaf, velocity, gaze, yaw, room, io: Bundle[TeacherIO]):
         elif not gazes:
             tail_first = room < ti.static(io.teacher_cfg.gaze_clearance_m) and leaf == codes.FOLLOW_ROUTE
             turn = way - ti.select(tail_first, PI * ti.floor(way / PI + 0.5), 0.0)
+    if ti.static(not io.sonar_cfg.is_ring) and leaf == codes.FOLLOW_ROUTE:
+        steer = io.teacher.steer_w[env]
+        way = wrapped_angle(ti.atan2(steer[1], steer[0]) - yaw)
+        turn = kept_in_sight(turn, way, io.sonar_cfg, io.teacher_cfg)
     return turn

@@ -4,12 +4,15 @@ following the route conflicts."""
 import taichi as ti
 
 from uuvtai.config import TeacherConfig, VehicleConfig
-from uuvtai.kernels.core.geometry import FAR_M, TWO_PI, turned_z3, wrapped_angle
+from uuvtai.kernels.core.beams import beam_bearing
+from uuvtai.kernels.core.geometry import FAR_M, turned_z3, wrapped_angle
 from uuvtai.kernels.core.grid import cell_of, centre_of
 from uuvtai.kernels.core.lanes import f16x
 from uuvtai.kernels.core.signature import Bundle, Const, spread
+from uuvtai.kernels.perception.range_rate import range_rate
 from uuvtai.kernels.teacher.bundles import ThreatsIO
 from uuvtai.kernels.teacher.cruise_depth import choose_depth
+from uuvtai.kernels.teacher.sight import sight_share
 from uuvtai.kernels.teacher.trajectories import body_depths, held_heave, place_doubt
 from uuvtai.native.launch import quick_launch, without_cse
 
@@ -42,7 +45,9 @@ def _sense_contact(env, io: Bundle[ThreatsIO]):
     outlier is no emergency."""
     n_ray = ti.static(io.scan.range_m.shape[1])
     ttc, threat, nearest, nearest_beam = FAR_M, 0, FAR_M, 0
-    before = _beam_ttc(env, n_ray - 1, io)
+    before = FAR_M
+    if ti.static(io.sonar_cfg.is_ring):
+        before = _beam_ttc(env, n_ray - 1, io)
     for beam in range(n_ray):
         own = _beam_ttc(env, beam, io)
         agreed = ti.max(own, before)
@@ -57,15 +62,15 @@ def _sense_contact(env, io: Bundle[ThreatsIO]):
                 nearest_beam = beam
     turned = io.scan.ping_yaw[env] - io.ego.rpy[env][2]
     io.teacher.ttc_s[env] = ttc
-    io.teacher.threat_bearing[env] = wrapped_angle(turned + TWO_PI * threat / n_ray)
+    io.teacher.threat_bearing[env] = wrapped_angle(turned + beam_bearing(threat, io.sonar_cfg))
     io.teacher.nearest_m[env] = nearest - ti.static(io.teacher_cfg.hull_reach_m)
-    io.teacher.nearest_bearing[env] = wrapped_angle(turned + TWO_PI * nearest_beam / n_ray)
+    io.teacher.nearest_bearing[env] = wrapped_angle(turned + beam_bearing(nearest_beam, io.sonar_cfg))
 
 
 @ti.func
 def _beam_ttc(env, beam, io: Bundle[ThreatsIO]):
     """Time until what the beam hit reaches the hull's contact distance; FAR_M where it does not approach."""
-    closing = -io.scan.doppler_m_s[env, beam]
+    closing = -range_rate(env, beam, io.scan, io.tracks, io.sonar_cfg)
     out = FAR_M
     if io.scan.hit[env, beam] == 1 and closing > ti.static(io.teacher_cfg.emergency_closing_m_s):
         out = (
@@ -159,6 +164,7 @@ def _follow_velocity(env, io: Bundle[ThreatsIO]):
         io.teacher_cfg.askew_clearance_m
     ):  # across the way the hull is wider: let it turn first
         share *= 1.0 - 0.6 * sideways
+    share *= sight_share(ti.atan2(level[1], level[0]) - io.ego.rpy[env][2], io.sonar_cfg, io.teacher_cfg)
     io.teacher.speed_share[env] = ti.select(io.route.n_way[env] > 0, share, 0.0)
     wanted = _unit(level) * cruising_speed(
         ti.static(io.teacher_cfg.cruise_m_s),

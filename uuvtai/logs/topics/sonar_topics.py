@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,8 @@ _DOPPLER = record(
     timestamp=described(TIME, "when the ping was taken"),
     velocity=described(
         array_of(NUMBER),
-        "[m/s] how fast what a beam met recedes, own motion included; 0 where nothing returned",
+        "[m/s] how fast what a beam met recedes, own motion included; 0 where nothing returned; empty where "
+        "the sonar measures none",
     ),
     own_velocity=described(THREE, "[m/s] own velocity in the body frame as measured when the ping was taken"),
 )
@@ -31,14 +31,14 @@ _DOPPLER = record(
 def _scan(moment: Moment) -> bytes:
     """Ranges as sensed; where nothing returned: maximum range with intensity 0, which no return has."""
     hit = moment["scan.hit"] != 0
-    max_range_m = np.float32(moment.header.config.sensors.sonar.max_range_m)
-    ranges = np.where(hit, moment["scan.range_m"], max_range_m)
+    sonar = moment.header.config.sensors.sonar
+    ranges = np.where(hit, moment["scan.range_m"], np.float32(sonar.max_range_m))
     thousandths = np.where(hit, np.clip(np.rint(moment["scan.intensity"] * 1000), 1, 1000), 0)
     intensities = ",".join(map(_THOUSANDTHS.__getitem__, thousandths.astype(np.int32).tolist()))
-    end_angle = 2 * math.pi * (len(hit) - 1) / len(hit)
+    first, last = sonar.first_beam_rad, sonar.first_beam_rad + sonar.turn_rad(sonar.n_ray - 1)
     return (
         f'{{"timestamp":{moment.stamp_of(int(moment["scan.ping_step"]))},"frame_id":"sonar",'
-        f'"pose":{_IDENTITY_TEXT},"start_angle":0,"end_angle":{end_angle!r},'
+        f'"pose":{_IDENTITY_TEXT},"start_angle":{first:.17g},"end_angle":{last!r},'
         f'"ranges":{numbers(ranges)},"intensities":[{intensities}]}}'
     ).encode()
 
@@ -47,6 +47,8 @@ def _doppler(moment: Moment) -> bytes:
     """Doppler of every beam and the own velocity it has to be compensated with."""
     stamp = moment.stamp_of(int(moment["scan.ping_step"]))
     velocity = np.where(moment["scan.hit"] != 0, moment["scan.doppler_m_s"], np.float32(0))
+    if not moment.header.config.sensors.sonar.doppler:
+        velocity = velocity[:0]
     own = numbers(moment["scan.ping_vel_b"])
     return f'{{"timestamp":{stamp},"velocity":{numbers(velocity)},"own_velocity":{own}}}'.encode()
 

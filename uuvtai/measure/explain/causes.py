@@ -31,7 +31,7 @@ START_S = 2.0
 """A younger episode starts in danger: track, forecast and evasion take about a second, and bodies start 1.5 m
 away."""
 UNSEEN_S = 0.3
-"""Unseen: out of the sonar's vertical fan all through this time before the end (the design's measure: no
+"""Unseen: out of the sonar's fan all through this time before the end (the design's measure: no
 track 0.3 s before)."""
 TURN_S = 1.2
 """An unannounced turn lies within this before the end (7-methods.md), and the forecast made just before it
@@ -77,6 +77,7 @@ CAUSES: dict[str, str] = {
     "hit_static": "touched a static obstacle, no moving body near",
     "hit_wall": "touched a side wall, no moving body near",
     "start_in_danger": f"killed in the first {START_S:g} s",
+    "unseen_beside": f"killer beside or behind the sonar's fan all through the last {UNSEEN_S:g} s",
     "depth_change": f"killer above or below the sonar's fan all through the last {UNSEEN_S:g} s, and the own "
     f"depth changed towards it by > {CLIMB_M:g} m in the last {CLIMB_S:g} s",
     "unseen_above": f"killer above the sonar's fan all through the last {UNSEEN_S:g} s",
@@ -194,6 +195,8 @@ def _knowledge_label(facts: Fact) -> str | None:
     if facts["age_s"] < START_S:
         return "start_in_danger"
     if _is_unseen(facts):
+        if facts["width_ago_s"] is None or facts["width_ago_s"] >= UNSEEN_S:
+            return "unseen_beside"
         above = facts["vertical_gap_m"] > 0
         if facts["climbed_m"] * (1 if above else -1) > CLIMB_M:
             return "depth_change"

@@ -170,10 +170,14 @@ def _sight_facts(history: History, bodies: Bodies, slot: int, config: Config) ->
         + sonar.range_jitter_m
     )
     met = reached & (np.abs(history.range_m - np.where(reached, entry, 0.0)) < tolerance)
+    off_w = body_then_w[:, :2] - then_w[:, :2]
+    off = np.angle(np.exp(1j * (np.arctan2(off_w[:, 1], off_w[:, 0]) - yaw)))
+    in_width = np.degrees(np.abs(off)) <= 0.5 * sonar.horizontal_aperture_deg
     in_fan, seen = np.asarray(reached.any(1)), np.asarray(met.any(1))
     before = (ago <= SIGHT_S[0]) & (ago >= SIGHT_S[1])
     return {
         "fan_ago_s": _last_ago(ago, in_fan),
+        "width_ago_s": _last_ago(ago, in_width),
         "seen_ago_s": _last_ago(ago, seen),
         "fan_share": _round(in_fan[before].mean()) if before.any() else 0.0,
         "seen_share": _round(seen[before].sum() / max(1, in_fan[before].sum())),

@@ -121,7 +121,8 @@ def beam_entries(
     """(n, n_ray) range at which each beam enters one body's outline within the sonar's vertical fan; inf = it
     does not (4-sensing.md)."""
     slope = math.tan(math.radians(sonar_cfg.vertical_half_aperture_deg))
-    bearing = yaw[:, None] + 2 * np.pi * np.arange(sonar_cfg.n_ray) / sonar_cfg.n_ray
+    beams = np.arange(sonar_cfg.n_ray)
+    bearing = yaw[:, None] + sonar_cfg.first_beam_rad + sonar_cfg.beam_step_rad * beams
     ux, uy = np.cos(bearing), np.sin(bearing)
     start = pos_w - body_w
     sx, sy, rise = start[:, 0:1], start[:, 1:2], np.abs(start[:, 2:3])

@@ -63,7 +63,9 @@ class LiveFeed:
         if self._given:
             yield PositionFix(now, value("ego.pos_w"))
         if value("scan.fresh"):
-            beams = (value(f"scan.{name}") for name in ("range_m", "hit", "doppler_m_s"))
+            beams = [value(f"scan.{name}") for name in ("range_m", "hit", "doppler_m_s")]
+            if not self._sim.config.sensors.sonar.doppler:
+                beams[2] = beams[2][:0]
             yield SonarPing(int(value("scan.ping_step")) * self._dt, *beams)
         if value("image.fresh"):
             yield DepthShot(now, value("image.depth_m"))

@@ -1,0 +1,60 @@
+"""Where the beams of the sonar look, for those who ask by beam or by bearing: a ring, whose beams go on
+behind the last one, or a fan, which ends."""
+
+import math
+
+import taichi as ti
+
+from uuvtai.config import SonarConfig
+from uuvtai.kernels.core.geometry import TWO_PI, wrapped_angle
+from uuvtai.kernels.core.lanes import LANES, f16x
+from uuvtai.kernels.core.signature import Const
+
+
+@ti.func
+def beam_bearing(beam, sonar_cfg: Const[SonarConfig]):
+    """[rad] of a beam from ahead, counter-clockwise."""
+    bearing = 0.0
+    if ti.static(sonar_cfg.is_ring):
+        bearing = TWO_PI * beam / sonar_cfg.n_ray
+    else:
+        bearing = ti.static(sonar_cfg.first_beam_rad) + ti.static(sonar_cfg.beam_step_rad) * beam
+    return bearing
+
+
+@ti.func
+def beam_towards(bearing, sonar_cfg: Const[SonarConfig]):
+    """Number of the beam nearest to a bearing [rad] from ahead, before ``beam_there``."""
+    number = 0
+    if ti.static(sonar_cfg.is_ring):
+        number = ti.cast(ti.floor(bearing / ti.static(sonar_cfg.beam_step_rad) + 0.5), ti.i32)
+    else:
+        off = wrapped_angle(bearing) - ti.static(sonar_cfg.first_beam_rad)
+        number = ti.cast(ti.floor(off / ti.static(sonar_cfg.beam_step_rad) + 0.5), ti.i32)
+    return number
+
+
+@ti.func
+def beam_there(number, sonar_cfg: Const[SonarConfig]):
+    """The beam of a number that may lie up to two circles below 0, or beyond the last one; -1 = none looks
+    there, which no ring says."""
+    beam = number
+    if ti.static(sonar_cfg.is_ring):
+        beam = (number + 2 * sonar_cfg.n_ray) % sonar_cfg.n_ray
+    else:
+        beam = ti.select((number >= 0) & (number < sonar_cfg.n_ray), number, -1)
+    return beam
+
+
+@ti.func
+def beam_lanes(yaw, first_ray, sonar_cfg: Const[SonarConfig]):
+    """Horizontal unit vectors (x lanes, y lanes) of sixteen neighbouring beams (``yaw`` 0: in the body's
+    frame)."""
+    bearing = (yaw + ti.static(sonar_cfg.first_beam_rad)) + ti.static(sonar_cfg.beam_step_rad) * first_ray
+    c, s = ti.cos(bearing), ti.sin(bearing)
+    x, y = f16x(0.0), f16x(0.0)
+    for i in ti.static(range(LANES)):
+        cosine, sine = ti.static(math.cos(sonar_cfg.turn_rad(i)), math.sin(sonar_cfg.turn_rad(i)))
+        x[i] = c * cosine - s * sine
+        y[i] = s * cosine + c * sine
+    return x, y
