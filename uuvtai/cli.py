@@ -7,6 +7,7 @@ machine: a full disk), 2 refused, with what to type instead, 3 a gate was not me
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import sys
 from pathlib import Path
@@ -194,13 +195,15 @@ def drive_vehicle(
     episodes: opt.DriveEpisodes = 1,
     seeds: opt.Seeds = "0",
     rate: opt.DriveRate = 1.0,
+    use_gamepad: opt.UseGamepad = False,
     run_dir: opt.RunDir = None,
     output: groups.OutputGroup,
 ) -> None:
-    """Steer a vehicle by the keyboard, with the map that it makes; bt then plays the same episodes."""
+    """Steer a vehicle by keyboard or gamepad, with the map that it makes; bt then plays the same episodes."""
     seed_list = arguments.seeds(seeds)
     arguments.refuse_less("--episodes", episodes, 1)
     arguments.refuse_odd_rate(rate, is_endless=False)
+    from uuvtai.live.gamepad import STICKS_HELP, gamepad
     from uuvtai.live.hand_driver import HandPiece
     from uuvtai.live.hand_steering import HELP
     from uuvtai.live.keyboard import keyboard
@@ -214,8 +217,11 @@ def drive_vehicle(
     request = Request.typed(
         scene, [], controllers=named, seeds=seed_list, episodes=episodes, device="cpu", run_dir=run_dir
     )
-    with keyboard() as keys, steering_view(HELP) as show:
-        result, folder = drive_by_hand(request, HandPiece(keys, show, rate), Notes())
+    with contextlib.ExitStack() as hands:
+        sticks = hands.enter_context(gamepad()) if use_gamepad else None
+        keys = hands.enter_context(keyboard())
+        show = hands.enter_context(steering_view(f"{STICKS_HELP}\n{HELP}" if sticks else HELP))
+        result, folder = drive_by_hand(request, HandPiece(keys, show, rate, sticks), Notes())
     output.show(result, lambda screen: show_evaluation(screen, result, folder), folder)
 
 
