@@ -22,10 +22,20 @@ from uuvtai.copying import copied_rows
 from uuvtai.initial import allocate_state, fill_constants
 from uuvtai.kernels.baselines import dynamic_window, path_integral, potential_field, velocity_obstacle
 from uuvtai.kernels.core.rows import copy_rows
-from uuvtai.kernels.perception import elevation, forecast, futures, look, mapping, pose, spotting, tracking
+from uuvtai.kernels.perception import (
+    echoes,
+    elevation,
+    forecast,
+    futures,
+    look,
+    mapping,
+    pose,
+    spotting,
+    tracking,
+)
 from uuvtai.kernels.planning import clearance, exposure, features, route, triggers, voronoi
 from uuvtai.kernels.privileged import true_map, true_tracks
-from uuvtai.kernels.sensors import depth, proprioception, sonar
+from uuvtai.kernels.sensors import depth, head, proprioception, sonar
 from uuvtai.kernels.task import episode, reward
 from uuvtai.kernels.teacher import evasion, leaves, threats
 from uuvtai.kernels.vehicle import actuation, dynamics, lost_thruster
@@ -44,13 +54,19 @@ from uuvtai.tree import FlatTree, load_tree
 class SimulatedSensors:
     """The simulator's own: from the truth, with errors as configured."""
 
+    def __init__(self, mechanical: bool) -> None:
+        self._mechanical = mechanical
+
     def sense_motion(self, stages: Stages) -> None:
         """All instruments but sonar and camera."""
         proprioception.sense_proprioception(stages.proprioception)
 
     def sense_sonar(self, stages: Stages) -> None:
-        """The ring of beams."""
-        sonar.cast_sonar(stages.sonar)
+        """All beams, or the mechanical one."""
+        if self._mechanical:
+            head.turn_head(stages.sonar)
+        else:
+            sonar.cast_sonar(stages.sonar)
 
     def sense_depth(self, stages: Stages) -> None:
         """The depth camera."""
@@ -84,7 +100,7 @@ class Sim:
         self._every_row = torch.arange(num_envs, dtype=torch.int32, device=self.device)
         self.fallback = RouteFallback(config)
         self.planner: RoutePlanner | None = None
-        self.sensors: SensorSource = SimulatedSensors()
+        self.sensors: SensorSource = SimulatedSensors(config.sensors.sonar.mechanical)
         self.stage_s: dict[str, float] | None = None
         self.privileged = False
         self._watches = lost_thruster.is_watched(config.vehicle, config.actuation)
@@ -154,6 +170,8 @@ class Sim:
                 pose.predict_pose(io.pose)
         with self._stage("sonar"):
             self.sensors.sense_sonar(io)
+            if c.sensors.sonar.mechanical:
+                echoes.recall_echoes(io.echoes)
         if estimated and c.pose.use_walls:
             with self._stage("pose"):
                 pose.correct_pose(io.pose)
@@ -251,6 +269,8 @@ class Sim:
         if self.config.sensors.localization == "estimated":
             pose.reset_pose(io.pose)
         sonar.reset_sonar(io.sonar)
+        if self.config.sensors.sonar.mechanical:
+            echoes.reset_echoes(io.echoes)
         depth.reset_depth(io.depth)
         tracking.reset_tracks(io.tracking)
         forecast.reset_forecast(io.forecast)

@@ -17,6 +17,7 @@ from uuvtai.kernels.baselines.bundles import (
     VelocityObstacleIO,
 )
 from uuvtai.kernels.perception.bundles import (
+    EchoesIO,
     ForecastIO,
     FuturesIO,
     HeightsIO,
@@ -83,6 +84,7 @@ class SimState:
     ego_memory: state.ProprioceptionMemory
     scan: state.SonarScan
     sonar_memory: state.SonarMemory
+    echoes: state.EchoState
     image: state.DepthImage
     pose: state.PoseState
     tracks: state.TrackState
@@ -117,6 +119,7 @@ class Stages:
     dynamics: DynamicsIO
     proprioception: ProprioceptionIO
     sonar: SonarIO
+    echoes: EchoesIO
     depth: DepthIO
     pose: PoseIO
     tracking: TrackingIO

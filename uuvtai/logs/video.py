@@ -45,6 +45,8 @@ _MARGINS = (52, 28, 84, 212)
 _PANEL = 160
 """[px] height of the panel below the map"""
 _ECHO, _GOOD = bgr("#0b7a75"), bgr("#2b8a3e")
+_ECHO_BEAMS = 64
+"""A scan of fewer beams is painted together with those before it."""
 _TRIGGER_COLORS = {
     "initial": GREY,
     "stuck": bgr("#ae3ec9"),
@@ -245,17 +247,19 @@ class FrameArtist:
             canvas.disc(ahead, 5, ROUTE)
 
     def _paint_echoes(self, time_s: float) -> None:
-        """Returns of the newest scan, seen from where it was taken."""
-        scan = self.recording["/sonar/scan"].at(time_s)
-        if scan is None:
-            return
-        ranges, hit, ping_s = scan
-        x, y, _, yaw = self.recording["/pose"].at(ping_s) or self._track[0]
-        bearing = yaw + 2 * np.pi * np.arange(len(ranges)) / len(ranges)
-        for echo in (
-            np.array([x, y]) + ranges[:, None] * np.column_stack([np.cos(bearing), np.sin(bearing)])
-        )[hit]:
-            self._canvas.disc(echo, 2.4, _ECHO)
+        """Returns of the newest scan, seen from where it was taken; of a mechanical beam those of the last
+        ``_ECHO_BEAMS``."""
+        beams = 0
+        for ranges, away, hit, ping_s in self.recording["/sonar/scan"].until(time_s):
+            x, y, _, yaw = self.recording["/pose"].at(ping_s) or self._track[0]
+            bearing = yaw + away
+            for echo in (
+                np.array([x, y]) + ranges[:, None] * np.column_stack([np.cos(bearing), np.sin(bearing)])
+            )[hit]:
+                self._canvas.disc(echo, 2.4, _ECHO)
+            beams += len(ranges)
+            if beams >= _ECHO_BEAMS:
+                return
 
     def _paint_goal(self) -> None:
         canvas, goal, radius = (

@@ -29,13 +29,19 @@ _DOPPLER = record(
 
 
 def _scan(moment: Moment) -> bytes:
-    """Ranges as sensed; where nothing returned: maximum range with intensity 0, which no return has."""
-    hit = moment["scan.hit"] != 0
+    """Ranges as sensed; where nothing returned: maximum range with intensity 0, which no return has. Of a
+    mechanical beam only what was taken in this step."""
     sonar = moment.header.config.sensors.sonar
-    ranges = np.where(hit, moment["scan.range_m"], np.float32(sonar.max_range_m))
-    thousandths = np.where(hit, np.clip(np.rint(moment["scan.intensity"] * 1000), 1, 1000), 0)
+    begin, count = 0, len(moment["scan.hit"])
+    if sonar.mechanical:
+        begin, count = int(moment["scan.new_from"]), int(moment["scan.new_count"])
+    beams = (begin + np.arange(count)) % sonar.n_ray
+    hit = moment["scan.hit"][beams] != 0
+    ranges = np.where(hit, moment["scan.range_m"][beams], np.float32(sonar.max_range_m))
+    thousandths = np.where(hit, np.clip(np.rint(moment["scan.intensity"][beams] * 1000), 1, 1000), 0)
     intensities = ",".join(map(_THOUSANDTHS.__getitem__, thousandths.astype(np.int32).tolist()))
-    first, last = sonar.first_beam_rad, sonar.first_beam_rad + sonar.turn_rad(sonar.n_ray - 1)
+    first = sonar.first_beam_rad + sonar.turn_rad(begin)
+    last = first + sonar.turn_rad(count - 1 if sonar.mechanical else sonar.n_ray - 1)
     return (
         f'{{"timestamp":{moment.stamp_of(int(moment["scan.ping_step"]))},"frame_id":"sonar",'
         f'"pose":{_IDENTITY_TEXT},"start_angle":{first:.17g},"end_angle":{last!r},'
@@ -53,10 +59,12 @@ def _doppler(moment: Moment) -> bytes:
     return f'{{"timestamp":{stamp},"velocity":{numbers(velocity)},"own_velocity":{own}}}'.encode()
 
 
-def _read_scan(data: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, float]:
-    """(ranges (n,), hit (n,), when it was taken)."""
+def _read_scan(data: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """(ranges (n,), bearings (n,) from ahead, hit (n,), when it was taken)."""
     ping_s = data["timestamp"]["sec"] + data["timestamp"]["nsec"] / 1e9
-    return np.array(data["ranges"]), np.array(data["intensities"]) > 0, ping_s
+    ranges = np.array(data["ranges"])
+    bearing = np.linspace(float(data["start_angle"]), float(data["end_angle"]), len(ranges))
+    return ranges, bearing, np.array(data["intensities"]) > 0, ping_s
 
 
 ROWS = (
@@ -65,7 +73,14 @@ ROWS = (
         NEW_SCAN,
         LASER_SCAN,
         _scan,
-        ("scan.ping_step", "scan.hit", "scan.range_m", "scan.intensity"),
+        (
+            "scan.ping_step",
+            "scan.hit",
+            "scan.range_m",
+            "scan.intensity",
+            "scan.new_from",
+            "scan.new_count",
+        ),
         _read_scan,
     ),
     Topic(
