@@ -17,8 +17,13 @@ MANY_ARGUMENTS, LONG_LINE, LONG_FUNCTION, DEEP = 9, 110, 60, 4
 _NESTS = (ast.For, ast.While, ast.If, ast.With, ast.Try)
 
 
-def measure(job: Job) -> list[Row]:
-    """The table; a floor is what we want of the figure."""
+def measure(_job: Job) -> list[Row]:
+    """The table."""
+    return rows()
+
+
+def rows() -> list[Row]:
+    """Every figure; a floor is what we want of it."""
     trees = {path: ast.parse(path.read_text(encoding="utf-8")) for path in sorted(PACKAGE.rglob("*.py"))}
     functions = [
         (path, node)
@@ -45,7 +50,7 @@ def measure(job: Job) -> list[Row]:
         _row(
             "signature lines in kernels and sim.py",
             sum(_signature(node) for path, node in functions if path in counted),
-            850,
+            900,
         ),
         _row(
             f"lines of more than {LONG_LINE} characters",

@@ -130,18 +130,26 @@ def leave_told(env, io: Bundle[TrackingIO]):
                 io.clusters.beam_cluster[env, beam] = -1
     newest = (io.scan.new_from[env] + io.scan.new_count[env] - 1 + n) % n
     for way in ti.static((-1, 1)):
-        at, going = newest, 1
-        while going == 1:
-            going = 0
-            for k in range(_BRIDGE + 1):
-                beam = beam_there(at + way * k, io.sonar_cfg)
-                if going == 0 and beam >= 0:
-                    if io.clusters.beam_cluster[env, beam] == _CANDIDATE and may_be_one(env, at, beam, io):
-                        io.clusters.beam_cluster[env, beam] = -1
-                        at, going = beam, 1
+        at = newest
+        while at >= 0:
+            at = next_open(env, at, way, io)
     for beam in range(n):
         if io.clusters.beam_cluster[env, beam] == _CANDIDATE:
             io.echoes.told[env, io.echoes.shown[env, beam]] = 1
+
+
+@ti.func
+def next_open(env, at, way, io: Bundle[TrackingIO]):
+    """The next candidate, ``way`` from this beam, of the body on which the head still is; it is none from
+    then on. -1 = there is none."""
+    found = -1
+    for k in range(_BRIDGE + 1):
+        beam = beam_there(at + way * k, io.sonar_cfg)
+        if found < 0 and beam >= 0:
+            if io.clusters.beam_cluster[env, beam] == _CANDIDATE and may_be_one(env, at, beam, io):
+                io.clusters.beam_cluster[env, beam] = -1
+                found = beam
+    return found
 
 
 @ti.func

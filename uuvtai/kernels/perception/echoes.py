@@ -92,15 +92,20 @@ def show_old(env, io: Bundle[EchoesIO]):
             bearing, far = io.echoes.bearing_w[env, slot], io.echoes.range_m[env, slot]
             x = io.echoes.pos_x_m[env, slot] + far * ti.cos(bearing) - here[0]
             y = io.echoes.pos_y_m[env, slot] + far * ti.sin(bearing) - here[1]
-            range_m = ti.sqrt(x * x + y * y)
             towards = beam_towards(ti.atan2(y, x) - io.scan.ping_yaw[env], io.sonar_cfg)
-            beam = beam_there(towards, io.sonar_cfg)
-            if beam >= 0:
-                if is_new(env, beam, io.scan, io.sonar_cfg):
-                    if range_m < io.scan.range_m[env, beam] + _SAME_M:  # not behind the new return
-                        io.echoes.hit[env, slot] = 0
-                elif range_m < io.scan.range_m[env, beam]:
-                    io.scan.range_m[env, beam] = range_m
-                    io.scan.intensity[env, beam] = io.echoes.intensity[env, slot]
-                    io.scan.hit[env, beam] = 1
-                    io.echoes.shown[env, beam] = slot
+            show_in(env, slot, beam_there(towards, io.sonar_cfg), ti.sqrt(x * x + y * y), io)
+
+
+@ti.func
+def show_in(env, slot, beam, range_m, io: Bundle[EchoesIO]):
+    """Show a remembered return at this range of a beam (-1 = none) if it is the nearest there; a new beam
+    ends the memory of what is not behind its own return."""
+    if beam >= 0:
+        if is_new(env, beam, io.scan, io.sonar_cfg):
+            if range_m < io.scan.range_m[env, beam] + _SAME_M:
+                io.echoes.hit[env, slot] = 0
+        elif range_m < io.scan.range_m[env, beam]:
+            io.scan.range_m[env, beam] = range_m
+            io.scan.intensity[env, beam] = io.echoes.intensity[env, slot]
+            io.scan.hit[env, beam] = 1
+            io.echoes.shown[env, beam] = slot

@@ -138,3 +138,12 @@ def mark_sectors(env, slot, io: Bundle[MappingIO]):
         mark_edge(slot, begin, end, begin_col, end_col, n_col, io)
         last, last_col = end, end_col
     mark_edge(slot, last, ping, last_col, ping_col, n_col, io)
+
+
+@ti.func
+def mark_free(env, slot, io: Bundle[MappingIO]):
+    """Bits of the outline of what the new beams prove free."""
+    if ti.static(io.sonar_cfg.mechanical):
+        mark_sectors(env, slot, io)
+    else:
+        mark_fan(env, slot, io)

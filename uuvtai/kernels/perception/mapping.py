@@ -30,7 +30,7 @@ from uuvtai.kernels.core.bits import WORD, bit_of, lowest_bit, taken, with_bit, 
 from uuvtai.kernels.core.signature import Bundle, Const, spread
 from uuvtai.kernels.perception.bundles import MappingIO
 from uuvtai.kernels.perception.evidence import mark_depth, mark_hits
-from uuvtai.kernels.perception.fan import mark_fan, mark_sectors
+from uuvtai.kernels.perception.fan import mark_free
 from uuvtai.native.launch import quick_launch
 
 RATED_HZ = 10.0
@@ -150,15 +150,7 @@ def count_dynamic(env, row, word, free, dynamics, io: Bundle[MappingIO]):
 
 
 @ti.func
-def folded(
-    static_old,
-    dynamic_old,
-    static_hit,
-    dynamic_hit,
-    free,
-    point,
-    io: Bundle[MappingIO],
-):
+def folded(static_old, dynamic_old, static_hit, dynamic_hit, free, point, io: Bundle[MappingIO]):
     """Both equations for one cell; indicators are 0 or 1."""
     scan_s = ti.static(map_period_s(io.mapping_cfg, io.sonar_cfg, io.episode_cfg))
     look_s = ti.static(look_period_s(io.mapping_cfg, io.sonar_cfg, io.episode_cfg))
@@ -182,16 +174,7 @@ def folded(
 
 
 @ti.func
-def fold_cells(
-    env,
-    row,
-    word,
-    statics,
-    dynamics,
-    free,
-    points,
-    io: Bundle[MappingIO],
-):
+def fold_cells(env, row, word, statics, dynamics, free, points, io: Bundle[MappingIO]):
     """Both equations for the cells of a word that have anything to fold, and what is then true of them."""
     alive = io.grid_map.alive[env, row, word]
     left = alive | statics | dynamics | points
@@ -290,10 +273,7 @@ def update_map(io: Bundle[MappingIO]):
                     io.grid_map.depth_waits[env] = 1
                 if is_due(env, io) == 1:
                     fetch_cells(env, slot, io)
-                    if ti.static(io.sonar_cfg.mechanical):
-                        mark_sectors(env, slot, io)
-                    else:
-                        mark_fan(env, slot, io)
+                    mark_free(env, slot, io)
                     mark_hits(env, slot, promote, io)
                     merge_scan(env, slot, confident, io)
                     io.grid_map.map_step[env] = io.clock.step[env]

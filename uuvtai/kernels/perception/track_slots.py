@@ -312,22 +312,30 @@ def name_beams(env, io: Bundle[TrackingIO]):
 def name_by_place(env, io: Bundle[TrackingIO]):
     """Name the returns of a mechanical beam after the moving track that is expected there: only few of a
     body's beams are ever of one scan."""
-    late = (io.scan.ping_step[env] - io.tracks.scan_step[env]) * io.episode_cfg.control_dt_s
     own = io.scan.ping_pos_w[env]
     for ray in range(io.sonar_cfg.n_ray):
-        name, nearest = -1, FAR_M
+        name = -1
         if io.scan.hit[env, ray] == 1:
             range_m = io.scan.range_m[env, ray]
             bearing = io.scan.ping_yaw[env] + beam_bearing(ray, io.sonar_cfg)
             x, y = own[0] + range_m * ti.cos(bearing), own[1] + range_m * ti.sin(bearing)
-            for track in range(io.tracks.alive.shape[1]):
-                if io.tracks.alive[env, track] == 1 and io.tracks.moving[env, track] == 1:
-                    mean = io.tracks.state[env, track]
-                    off = ti.Vector([x - mean[0] - late * mean[2], y - mean[1] - late * mean[3]])
-                    gap = off.norm() - io.tracks.radius_m[env, track]
-                    if gap < ti.min(nearest, split_distance(range_m, io)):
-                        name, nearest = track, gap
+            name = mover_at(env, x, y, split_distance(range_m, io), io)
         io.tracks.beam_track[env, ray] = name
+
+
+@ti.func
+def mover_at(env, x, y, slack, io: Bundle[TrackingIO]):
+    """The moving track whose outline is expected nearest to a point, within ``slack`` [m]; -1 = none."""
+    late = (io.scan.ping_step[env] - io.tracks.scan_step[env]) * io.episode_cfg.control_dt_s
+    name, nearest = -1, slack
+    for track in range(io.tracks.alive.shape[1]):
+        if io.tracks.alive[env, track] == 1 and io.tracks.moving[env, track] == 1:
+            mean = io.tracks.state[env, track]
+            off = ti.Vector([x - mean[0] - late * mean[2], y - mean[1] - late * mean[3]])
+            gap = off.norm() - io.tracks.radius_m[env, track]
+            if gap < nearest:
+                name, nearest = track, gap
+    return name
 
 
 @ti.func
