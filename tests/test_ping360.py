@@ -100,7 +100,7 @@ def test_a_log_tells_the_beams_of_this_step_alone():
     values |= {"scan.intensity": np.full(64, 0.5, np.float32), "scan.doppler_m_s": np.zeros(64, np.float32)}
     values |= {"scan.ping_vel_b": np.zeros(3, np.float32)}
     moment = Moment(EpisodeHeader("bt", Config(sensors=SensorsConfig(sonar=SONAR)), "", {}), values)
-    scan, doppler = (json.loads(row.encode(moment)) for row in ROWS)
+    scan, doppler = (json.loads(row.encode(moment)) for row in ROWS[:2])
     assert scan["ranges"] == [2.0] and scan["intensities"] == [0.5] and doppler["velocity"] == []
     assert scan["start_angle"] == scan["end_angle"] == pytest.approx(np.radians(56.7))
 

@@ -38,6 +38,9 @@ class SonarConfig(Section):
     """of a mechanical beam"""
     beam_width_deg: Annotated[float, Field(ge=0, le=30)] = 0.0
     """of a mechanical beam, horizontally: what is nearest within it returns"""
+    image_bins: Annotated[int, Field(ge=0, le=2048)] = 0
+    """range bins of the intensity image that logs with depth images hold twice a second (``/sonar/image``);
+    0: none. Nothing decides by it"""
     max_range_m: Positive = 12.0
     vertical_half_aperture_deg: Annotated[float, Field(ge=0, lt=80)] = 10.0
     period_steps: PositiveCount = 1

@@ -2,15 +2,29 @@
 
 from __future__ import annotations
 
+import base64
 import json
+import math
 from typing import Any
 
+import cv2
 import numpy as np
 
 from uuvtai.logs.encode import IDENTITY, numbers
+from uuvtai.logs.fan_image import echo_power, heard_image, shown_image
 from uuvtai.logs.moment import Moment
-from uuvtai.logs.schemas import LASER_SCAN, NUMBER, THREE, TIME, array_of, described, record
-from uuvtai.logs.topic import NEW_SCAN, Topic
+from uuvtai.logs.schemas import (
+    LASER_SCAN,
+    NUMBER,
+    THREE,
+    TIME,
+    array_of,
+    compressed_image,
+    described,
+    record,
+)
+from uuvtai.logs.topic import NEW_SCAN, SONAR_IMAGES, Topic
+from uuvtai.logs.topics.camera_topics import logged_image
 
 _THOUSANDTHS = [f"{i / 1000:g}" for i in range(1001)]
 """Intensities are printed to three digits; nothing is computed from them."""
@@ -25,6 +39,12 @@ _DOPPLER = record(
         "the sonar measures none",
     ),
     own_velocity=described(THREE, "[m/s] own velocity in the body frame as measured when the ping was taken"),
+)
+
+
+_IMAGE = compressed_image(
+    "8-bit PNG of the power that each beam hears, simulated from the true scene: column 0 is the leftmost "
+    "beam, the last row the nearest range bin; 50 dB from black to white, gain follows range and absorption"
 )
 
 
@@ -67,6 +87,19 @@ def _read_scan(data: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray
     return ranges, bearing, np.array(data["intensities"]) > 0, ping_s
 
 
+def _image(moment: Moment) -> bytes:
+    """8-bit PNG. The speckle is a function of the episode and the step."""
+    sonar, scenario = moment.header.config.sensors.sonar, moment.header.scenario
+    w, x, y, z = (float(part) for part in moment["vehicle.quat_wb"])
+    yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    place = np.asarray(moment["vehicle.pos_w"], float)
+    bearing, power = echo_power(scenario, moment.time_s, place, yaw, sonar, sonar.image_bins)
+    random = np.random.default_rng((scenario["seed"], scenario["episode"], moment.step))
+    shown = shown_image(heard_image(bearing, power, sonar, random), bearing, sonar)
+    png = base64.b64encode(cv2.imencode(".png", shown)[1].tobytes()).decode()
+    return f'{{"timestamp":{moment.stamp},"frame_id":"sonar","data":"{png}","format":"png"}}'.encode()
+
+
 ROWS = (
     Topic(
         "/sonar/scan",
@@ -89,5 +122,14 @@ ROWS = (
         _DOPPLER,
         _doppler,
         ("scan.ping_step", "scan.hit", "scan.doppler_m_s", "scan.ping_vel_b"),
+    ),
+    Topic(
+        "/sonar/image",
+        SONAR_IMAGES,
+        _IMAGE,
+        _image,
+        ("vehicle.pos_w", "vehicle.quat_wb"),
+        logged_image,
+        on_request=True,
     ),
 )
