@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from uuvtai.closed_form import body_positions
-from uuvtai.config import Config
+from uuvtai.config import Config, SensorsConfig, SonarConfig
 from uuvtai.logs.moment import EpisodeHeader
 from uuvtai.logs.scenario_document import scenario_document
 from uuvtai.outcomes import OUTCOMES
@@ -91,7 +91,7 @@ BODIES = [
 
 
 def config() -> Config:
-    return Config()
+    return Config(sensors=SensorsConfig(sonar=SonarConfig(image_bins=24)))
 
 
 def scenario(episode: int = 3) -> dict:

@@ -131,13 +131,13 @@ def _meet_prism(
 
 
 def echo_power(
-    scenario: dict[str, Any], time_s: float, start: np.ndarray, yaw: float, sonar: SonarConfig, n_bin: int
+    scenario: dict[str, Any], time_s: float, start: np.ndarray, yaw: float, sonar_cfg: SonarConfig, n_bin: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """(bearings (m,) [rad] from ahead, power (m, n_bin)): mean power that comes back from each bearing and
     range, elevations folded; no pattern across yet. Bins part ``max_range_m`` equally."""
-    aperture = sonar.horizontal_aperture_deg
-    span = 360.0 if sonar.is_ring else min(aperture + 2.0 * _PAD_DEG, 360.0)
-    n = math.ceil(math.radians(span) / sonar.beam_step_rad)
+    aperture = sonar_cfg.horizontal_aperture_deg
+    span = 360.0 if sonar_cfg.is_ring else min(aperture + 2.0 * _PAD_DEG, 360.0)
+    n = math.ceil(math.radians(span) / sonar_cfg.beam_step_rad)
     bearing = math.radians(span) * ((np.arange(n) + 0.5) / n - 0.5)
     edges = np.radians(np.arange(-_STEEPEST_DEG, _STEEPEST_DEG + 1e-9, _STEP_DEG))
     az, el = (grid.ravel() for grid in np.meshgrid(bearing + yaw, edges, indexing="ij"))
@@ -145,17 +145,16 @@ def echo_power(
     seen = cast_rays(scenario, time_s, np.asarray(start, float), unit)
     solid = math.radians(span) / n * math.radians(_STEP_DEG) * np.cos(el)
     lost = np.exp(-4.0 * ABSORPTION_NP_M * seen.range_m)  # amplitude, there and back, squared
-    power = (
-        elevation_pattern(el, sonar) ** 2 * seen.cosine * solid * lost / np.maximum(seen.range_m, 0.1) ** 2
-    )
-    bins = np.minimum(seen.range_m / sonar.max_range_m * n_bin, n_bin).astype(int)
+    lost /= np.maximum(seen.range_m, 0.1) ** 2
+    power = elevation_pattern(el, sonar_cfg) ** 2 * seen.cosine * solid * lost
+    bins = np.minimum(seen.range_m / sonar_cfg.max_range_m * n_bin, n_bin).astype(int)
     shape = (n, len(edges))
     return bearing, _folded(bins.reshape(shape), seen.surface.reshape(shape), power.reshape(shape), n_bin)
 
 
-def elevation_pattern(elevation_rad: np.ndarray, sonar: SonarConfig) -> np.ndarray:
+def elevation_pattern(elevation_rad: np.ndarray, sonar_cfg: SonarConfig) -> np.ndarray:
     """Amplitude of a beam above and below its plane."""
-    half = math.radians(max(sonar.vertical_half_aperture_deg, 0.1))
+    half = math.radians(max(sonar_cfg.vertical_half_aperture_deg, 0.1))
     return np.sinc(_HALF_POWER * np.sin(elevation_rad) / math.sin(half))
 
 
@@ -185,35 +184,36 @@ def _folded(bins: np.ndarray, surface: np.ndarray, power: np.ndarray, n_bin: int
 
 
 def heard_image(
-    bearing: np.ndarray, power: np.ndarray, sonar: SonarConfig, random: np.random.Generator
+    bearing: np.ndarray, power: np.ndarray, sonar_cfg: SonarConfig, random: np.random.Generator
 ) -> np.ndarray:
     """(n_ray, n_bin) power that the beams hear in one ping: patterns, speckle, noise."""
-    beams = sonar.first_beam_rad + sonar.beam_step_rad * np.arange(sonar.n_ray)
+    beams = sonar_cfg.first_beam_rad + sonar_cfg.beam_step_rad * np.arange(sonar_cfg.n_ray)
     pattern = beam_pattern(beams[:, None] - bearing[None])
     phases = random.normal(size=(2, *power.shape))
     field = pattern @ (np.sqrt(0.5 * power) * (phases[0] + 1j * phases[1]))
-    noise = random.normal(size=(2, *field.shape)) * math.sqrt(0.5 * noise_power(bearing, sonar))
+    noise = random.normal(size=(2, *field.shape)) * math.sqrt(0.5 * noise_power(bearing, sonar_cfg))
     return np.abs(field + noise[0] + 1j * noise[1]) ** 2
 
 
-def noise_power(bearing: np.ndarray, sonar: SonarConfig) -> float:
+def noise_power(bearing: np.ndarray, sonar_cfg: SonarConfig) -> float:
     """Mean power of the noise in a cell."""
-    far = math.exp(-4.0 * ABSORPTION_NP_M * sonar.max_range_m) / sonar.max_range_m**2
-    return filled_beam(bearing, sonar) * far * 10.0 ** (0.1 * NOISE_DB)
+    far = math.exp(-4.0 * ABSORPTION_NP_M * sonar_cfg.max_range_m) / sonar_cfg.max_range_m**2
+    return filled_beam(bearing, sonar_cfg) * far * 10.0 ** (0.1 * NOISE_DB)
 
 
-def filled_beam(bearing: np.ndarray, sonar: SonarConfig) -> float:
+def filled_beam(bearing: np.ndarray, sonar_cfg: SonarConfig) -> float:
     """[sr] of a beam: what a wall across it returns from 1 m, unabsorbed."""
     elevation = np.radians(np.arange(-_STEEPEST_DEG, _STEEPEST_DEG, _STEP_DEG))
-    upright = (elevation_pattern(elevation, sonar) ** 2 * np.cos(elevation)).sum() * math.radians(_STEP_DEG)
+    upright = (elevation_pattern(elevation, sonar_cfg) ** 2 * np.cos(elevation)).sum()
+    upright *= math.radians(_STEP_DEG)
     return float(upright * (beam_pattern(bearing) ** 2).sum() * (bearing[1] - bearing[0]))
 
 
-def shown_image(heard: np.ndarray, bearing: np.ndarray, sonar: SonarConfig) -> np.ndarray:
+def shown_image(heard: np.ndarray, bearing: np.ndarray, sonar_cfg: SonarConfig) -> np.ndarray:
     """(n_bin, n_ray) uint8, range upwards from the last row, left is left: gain follows range and absorption,
     ``SHOWN_DB`` from black to white."""
-    range_m = sonar.max_range_m * (np.arange(heard.shape[1]) + 0.5) / heard.shape[1]
-    gain = range_m**2 * np.exp(4.0 * ABSORPTION_NP_M * range_m) / filled_beam(bearing, sonar)
+    range_m = sonar_cfg.max_range_m * (np.arange(heard.shape[1]) + 0.5) / heard.shape[1]
+    gain = range_m**2 * np.exp(4.0 * ABSORPTION_NP_M * range_m) / filled_beam(bearing, sonar_cfg)
     level = 10.0 * np.log10(np.maximum(heard * gain, 1e-12))
     grey = np.clip(255.0 * (level / SHOWN_DB + 1.0), 0, 255).astype(np.uint8)
     return grey.T[::-1, ::-1].copy()

@@ -52,9 +52,9 @@ def _scan(moment: Moment) -> bytes:
     """Ranges as sensed; where nothing returned: maximum range with intensity 0, which no return has. Of a
     mechanical beam only what was taken in this step."""
     sonar = moment.header.config.sensors.sonar
-    begin, count = 0, len(moment["scan.hit"])
-    if sonar.mechanical:
-        begin, count = int(moment["scan.new_from"]), int(moment["scan.new_count"])
+    begin, count = int(moment["scan.new_from"]), int(moment["scan.new_count"])
+    if not sonar.mechanical:
+        begin, count = 0, len(moment["scan.hit"])
     beams = (begin + np.arange(count)) % sonar.n_ray
     hit = moment["scan.hit"][beams] != 0
     ranges = np.where(hit, moment["scan.range_m"][beams], np.float32(sonar.max_range_m))
