@@ -14,7 +14,7 @@ from uuvtai.config.task import TERMS
 from uuvtai.errors import SettingError, SizeError
 from uuvtai.kernels.core.grid import grid_shape
 from uuvtai.kernels.core.lanes import LANES
-from uuvtai.kernels.perception.mapping import map_period_s, scans_in
+from uuvtai.kernels.perception.mapping import look_period_s, scans_in
 from uuvtai.kernels.planning.clearance import offset_bits
 from uuvtai.kernels.planning.exposure import block_shape
 from uuvtai.plan_codes import N_PLANNER, N_REASON, N_TRIGGER
@@ -51,6 +51,7 @@ def array_sizes(config: Config, n_env: int, device: str = "cpu") -> dict[str, in
         **scenario_sizes(config.world),
         "n_ray": sensors.sonar.n_ray,
         "n_latency": sensors.sonar.latency_steps // sensors.sonar.period_steps + 2,
+        "n_echo": sensors.sonar.n_ray if sensors.sonar.mechanical else 1,
         "n_cloud": 8,
         "n_pixel_row": sensors.depth.rows,
         "n_pixel_col": sensors.depth.cols,
@@ -136,7 +137,7 @@ def _check_kernels(config: Config) -> None:
     try:
         offset_bits(config.clearance, mapping)
         for seconds in (mapping.free_confident_s, mapping.promote_s):
-            scans_in(seconds, map_period_s(mapping, sensors.sonar, config.episode))
+            scans_in(seconds, look_period_s(mapping, sensors.sonar, config.episode))
     except ValueError as error:
         raise SettingError(str(error)) from None
 
