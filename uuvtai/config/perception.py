@@ -110,6 +110,8 @@ class ForecastConfig(Section):
     """a course that passes a remembered turn within this leads to it,"""
     across_slope: NonNegative = 0.1
     """and within this more per metre ahead"""
+    alike_deg: Positive = 20.0
+    """... and is no farther off the course before that turn"""
     overdue_m: NonNegative = 0.15
     """a turn this far behind may still come: the filter lags"""
     passed_m: Positive = 0.5

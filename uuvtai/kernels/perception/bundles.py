@@ -61,6 +61,7 @@ class FuturesIO:
 
     futures: Out[FutureState]
     clock: In[ClockState]
+    ego: In[Proprioception]
     forecast: In[ForecastState]
     habits: In[HabitState]
     tracks: In[TrackState]

@@ -35,6 +35,9 @@ _TURNED_COS = 0.9
 _ALIKE_COS = 0.94
 """Cosine within which two courses are the same: 20 deg."""
 
+BEGIN_SEEN, CORNER_SEEN = 2, 3
+"""``run_kind`` of a way that began with a turn that was seen: back, or a corner."""
+
 _LONGEST_S = 4.0
 """Two legs farther apart in time than this do not make one turn."""
 
@@ -126,7 +129,9 @@ def place_turn(env, p0, d0, p1, d1, way, io: Bundle[ForecastIO]):
     misfit = (p1 - after * d1 - corner).norm()
     begin, kind = p1, 1
     if ti.min(before, after) > -_MISFIT_M and misfit < _MISFIT_M:
-        begin, kind = 0.5 * (corner + p1 - after * d1), 2
+        begin, kind = 0.5 * (corner + p1 - after * d1), BEGIN_SEEN
+        if d0.dot(d1) > -_ALIKE_COS:
+            kind = CORNER_SEEN
         store_turn(env, begin, d0, d1, io)
     return begin, kind
 
@@ -183,7 +188,7 @@ def drop_passed(env, pos, course, moved, io: Bundle[ForecastIO]):
     """A body that was expected to turn and has gone straight on past the place, in the last ``moved`` [m],
     takes one off its weight."""
     for packet in range(io.habits.weight.shape[1]):
-        along, across = offsets(env, packet, pos, course, io.habits)
+        along, across = offsets(env, packet, pos, course, io.habits, io.forecast_cfg)
         for lane in ti.static(range(LANES)):
             behind = (
                 along[lane] < -io.forecast_cfg.passed_m and along[lane] + moved >= -io.forecast_cfg.passed_m
@@ -200,7 +205,7 @@ def drop_passed(env, pos, course, moved, io: Bundle[ForecastIO]):
 
 
 @ti.func
-def offsets(env, packet, pos, course, habits: In[HabitState]):
+def offsets(env, packet, pos, course, habits: In[HabitState], forecast_cfg: Const[ForecastConfig]):
     """Lanes: how far ahead along the course a remembered turn lies, and how far aside; FAR_M aside for those
     on another course."""
     dx, dy = habits.turn_x[env, packet] - pos[0], habits.turn_y[env, packet] - pos[1]
@@ -209,8 +214,9 @@ def offsets(env, packet, pos, course, habits: In[HabitState]):
     alike = habits.in_x[env, packet] * course[0] + habits.in_y[env, packet] * course[1]
     weight = habits.weight[env, packet]
     across = f16x(FAR_M)
+    near = ti.static(math.cos(math.radians(forecast_cfg.alike_deg)))
     for lane in ti.static(range(LANES)):
-        across[lane] = ti.select(alike[lane] > _ALIKE_COS and weight[lane] > 0.0, ti.abs(aside[lane]), FAR_M)
+        across[lane] = ti.select(alike[lane] > near and weight[lane] > 0.0, ti.abs(aside[lane]), FAR_M)
     return along, across
 
 
@@ -219,7 +225,7 @@ def next_turn(env, pos, course, habits: In[HabitState], forecast_cfg: Const[Fore
     """(distance [m] to the nearest remembered turn ahead, course after it); FAR_M = none."""
     gap, slot = FAR_M, 0
     for packet in range(habits.weight.shape[1]):
-        along, across = offsets(env, packet, pos, course, habits)
+        along, across = offsets(env, packet, pos, course, habits, forecast_cfg)
         for lane in ti.static(range(LANES)):
             meets = (
                 across[lane] < forecast_cfg.across_m + forecast_cfg.across_slope * along[lane]
