@@ -229,8 +229,8 @@ def drawn_share(stage, span_s):
 
 def test_bayes_tells_corners_from_turning_back(stage):
     """Of bodies that do either as often: after a corner nearly none turns back, after a turn back fewer turn
-    corners (in the middle of the tank a third of the corners lead back), and who goes straight for longer than
-    any way to and fro turns corners."""
+    corners (in the middle of the tank a third of the corners lead back), and who goes straight for longer
+    than any way to and fro turns corners."""
     shares = {}
     for kind, begun in ((1, 0.0), (2, 1.0), (3, 1.0), (1, 8.0)):
         stage.run(kind, begun)
