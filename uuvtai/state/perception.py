@@ -199,6 +199,7 @@ class FutureState:
 
     Whoever fills it (a learned forecast, say) gives probabilities that sum to 1 at most; what is left is the
     forecast's own. A body begins all its futures where the forecast does, and is never faster than there.
+    Corners that do not lead to the vehicle have no future of their own: nothing is to be feared of them.
     """
 
     share: ti.Field = array("n_env", "n_track", "n_future")

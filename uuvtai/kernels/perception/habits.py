@@ -188,7 +188,7 @@ def drop_passed(env, pos, course, moved, io: Bundle[ForecastIO]):
     """A body that was expected to turn and has gone straight on past the place, in the last ``moved`` [m],
     takes one off its weight."""
     for packet in range(io.habits.weight.shape[1]):
-        along, across = offsets(env, packet, pos, course, io.habits, io.forecast_cfg)
+        along, across = offsets(env, packet, pos, course, io.habits)
         for lane in ti.static(range(LANES)):
             behind = (
                 along[lane] < -io.forecast_cfg.passed_m and along[lane] + moved >= -io.forecast_cfg.passed_m
@@ -205,7 +205,7 @@ def drop_passed(env, pos, course, moved, io: Bundle[ForecastIO]):
 
 
 @ti.func
-def offsets(env, packet, pos, course, habits: In[HabitState], forecast_cfg: Const[ForecastConfig]):
+def offsets(env, packet, pos, course, habits: In[HabitState]):
     """Lanes: how far ahead along the course a remembered turn lies, and how far aside; FAR_M aside for those
     on another course."""
     dx, dy = habits.turn_x[env, packet] - pos[0], habits.turn_y[env, packet] - pos[1]
@@ -214,9 +214,8 @@ def offsets(env, packet, pos, course, habits: In[HabitState], forecast_cfg: Cons
     alike = habits.in_x[env, packet] * course[0] + habits.in_y[env, packet] * course[1]
     weight = habits.weight[env, packet]
     across = f16x(FAR_M)
-    near = ti.static(math.cos(math.radians(forecast_cfg.alike_deg)))
     for lane in ti.static(range(LANES)):
-        across[lane] = ti.select(alike[lane] > near and weight[lane] > 0.0, ti.abs(aside[lane]), FAR_M)
+        across[lane] = ti.select(alike[lane] > _ALIKE_COS and weight[lane] > 0.0, ti.abs(aside[lane]), FAR_M)
     return along, across
 
 
@@ -225,7 +224,7 @@ def next_turn(env, pos, course, habits: In[HabitState], forecast_cfg: Const[Fore
     """(distance [m] to the nearest remembered turn ahead, course after it); FAR_M = none."""
     gap, slot = FAR_M, 0
     for packet in range(habits.weight.shape[1]):
-        along, across = offsets(env, packet, pos, course, habits, forecast_cfg)
+        along, across = offsets(env, packet, pos, course, habits)
         for lane in ti.static(range(LANES)):
             meets = (
                 across[lane] < forecast_cfg.across_m + forecast_cfg.across_slope * along[lane]
