@@ -60,7 +60,7 @@ def array_sizes(config: Config, n_env: int, device: str = "cpu") -> dict[str, in
         "n_height": LANES,
         "n_turn": config.forecast.n_turn,
         "n_forecast": round(config.tracking.horizon_s / config.tracking.forecast_dt_s) + 1,
-        "n_future": max(1, len(config.forecast.turn_back_s)),
+        "n_future": max(1, 2 * len(config.forecast.turn_back_s)),
         "n_row": n_row,
         "n_col": n_col,
         "n_packet": n_col // LANES,

@@ -72,6 +72,7 @@ class FuturesIO:
 
     futures: Out[FutureState]
     clock: In[ClockState]
+    ego: In[Proprioception]
     forecast: In[ForecastState]
     habits: In[HabitState]
     tracks: In[TrackState]
