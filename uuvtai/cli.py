@@ -583,6 +583,55 @@ def replay_log(
         raise typer.Exit(GATE)
 
 
+# --------------------------------------------------------------------------------------------------- vehicle
+
+
+@app.command(
+    "pilot", epilog="Example: uuv pilot --mavlink udp:127.0.0.1:14550 --start 2,3,-0.8 --goal 18,3,-0.8"
+)
+def pilot_vehicle(
+    mavlink: opt.Mavlink,
+    start: opt.PilotStart,
+    goal: opt.PilotGoal,
+    arm: opt.Arm = False,
+    heading: opt.Heading = None,
+    controller: opt.PilotTree = "bt",
+    world: opt.World = "pool",
+    sensors: opt.Sensors = "multibeam",
+    vehicle: opt.Vehicle = None,
+    box: opt.FenceBox = None,
+    depth: opt.FenceDepth = None,
+    max_speed: opt.MostSpeed = 0.5,
+    battery: opt.LeastBattery = 13.2,
+    system: opt.VehicleId = 1,
+    operator: opt.OperatorId = 255,
+    seconds: opt.PilotSeconds = None,
+    rate: opt.PilotRate = 1.0,
+    log: opt.PilotLog = None,
+    overrides: opt.Set = None,
+    wide: opt.Wide = False,
+    as_json: opt.AsJson = False,
+) -> None:
+    """Drive a real vehicle, or ArduSub's simulated one, by MAVLink; a dry run unless --arm is typed
+    (docs/safety.md). Exit code 3: it ended by a safe action."""
+    arguments.refuse_odd_rate(rate, is_endless=False)
+    from uuvtai.link.flight_plan import FlightPlan
+    from uuvtai.link.onboard_loop import fly
+    from uuvtai.show.flights import show_flight
+    from uuvtai.tree import read_tree
+
+    config = SceneOptions(world, sensors, vehicle, overrides=overrides).config()
+    plan = FlightPlan.typed(
+        config, mavlink, arguments.numbers("--start", start, 3), arguments.numbers("--goal", goal, 3),
+        arguments.numbers("--box", box, 4), arguments.numbers("--depth", depth, 2), max_speed, battery,
+        arms=arm, heading_deg=heading, seconds=seconds, rate=rate, log=log, system=system, operator=operator,
+    )  # fmt: skip
+    found = fly(config, read_tree(controller, config.teacher.max_node), plan, say)
+    _print(found, as_json, lambda: show_flight(Screen(wide), found))
+    if not found["safe"]:
+        raise typer.Exit(GATE)
+
+
 # -------------------------------------------------------------------------------------- presets, doctor, tree
 
 
