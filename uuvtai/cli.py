@@ -632,6 +632,39 @@ def pilot_vehicle(
         raise typer.Exit(GATE)
 
 
+@app.command("sitl", epilog="Example: uuv sitl --world pool -S 8 -D 6 -v 0.6 --instances 3")
+def serve_sitl(
+    world: opt.World = "pool",
+    sensors: opt.Sensors = "multibeam",
+    vehicle: opt.Vehicle = "bluerov2_16v",
+    n_static: opt.Static = None,
+    n_dynamic: opt.Dynamic = None,
+    speed: opt.Speed = None,
+    seed: opt.SitlSeed = 0,
+    episode: opt.SitlEpisode = 0,
+    instances: opt.Instances = 1,
+    port: opt.SitlPort = 9002,
+    host: opt.SitlHost = "127.0.0.1",
+    mavlink: opt.SensorPlaces = None,
+    rate: opt.SitlRate = 0.0,
+    seconds: opt.SitlSeconds = None,
+    once: opt.SitlOnce = False,
+    overrides: opt.Set = None,
+    wide: opt.Wide = False,
+    as_json: opt.AsJson = False,
+) -> None:
+    """Be the water for ArduSub: our physics, world and sensors behind its JSON interface (docs/sitl.md)."""
+    arguments.refuse_odd_rate(rate)
+    from uuvtai.show.flights import show_sitl
+    from uuvtai.sitl.serving import SitlPlan, serve_water
+    from uuvtai.tree import read_tree
+
+    config = SceneOptions(world, sensors, vehicle, None, n_static, n_dynamic, speed, overrides).config()
+    plan = SitlPlan.typed(host, port, instances, mavlink, rate, seconds, once, seed, episode)
+    found = serve_water(config, read_tree("straight", config.teacher.max_node), plan, say)
+    _print(found, as_json, lambda: show_sitl(Screen(wide), found))
+
+
 # -------------------------------------------------------------------------------------- presets, doctor, tree
 
 

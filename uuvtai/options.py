@@ -300,6 +300,28 @@ PilotRate = Annotated[
     Option("--rate", help="Seconds of the vehicle's clock in one of ours: 1 but for a simulated vehicle."),
 ]
 
+SitlPort = Annotated[int, Option("--port", min=1, max=65535, help="UDP port of the first ArduSub's physics.")]
+SitlHost = Annotated[str, Option("--host", help="Address to listen at.")]
+Instances = Annotated[
+    int, Option("--instances", help="ArduSubs (their -I 0, 1, ..); ports count on by ten, episodes by one.")
+]
+SensorPlaces = Annotated[
+    list[str] | None,
+    Option(
+        "--mavlink",
+        metavar="udp:HOST:PORT",
+        help="Where the DVL, the sonar and the altimeter speak to (repeatable) \\[default: "
+        "udp:127.0.0.1:14660 for ArduSub, udpout:127.0.0.1:14550 for uuv pilot].",
+    ),
+]
+SitlRate = Annotated[
+    float, Option("--rate", help="Seconds of the water in one of the clock's, at most; 0 = as ArduSub asks.")
+]
+SitlSeconds = Annotated[float | None, Option("--seconds", help="End after so long \\[default: at Ctrl-C].")]
+SitlOnce = Annotated[bool, Option("--once", help="End when the episode of every instance has ended.")]
+SitlSeed = Annotated[int, Option("--seed", help="Seed of the episodes.")]
+SitlEpisode = Annotated[int, Option("--episode", min=0, help="Episode of the first instance.")]
+
 # ------------------------------------------------------------------------------------------------------ sweep
 
 SweepRuns = Annotated[list[str] | None, _players("[RUN]...", "Trained policies, as for eval.")]

@@ -30,3 +30,25 @@ def show_flight(screen: Screen, found: dict[str, Any]) -> None:
     if found["log_trouble"]:
         screen.line(found["log_trouble"])
     screen.line(f"ended: {found['ended']}; log: {found['log']}")
+
+
+_INSTANCES = tuple(Column(name) for name in ("instance", "seconds", "driven s", "outcome"))
+_PACKETS = ("step", "reset", "again", "ignore", "bad")
+
+
+def show_sitl(screen: Screen, found: dict[str, Any]) -> None:
+    """A ``uuv sitl --json`` document."""
+    columns = (*_INSTANCES, *(Column(name, 1) for name in _PACKETS))
+    rows = [
+        [
+            str(row["row"]),
+            f"{row['seconds']:.1f}",
+            f"{row['driven_s']:.1f}",
+            row["outcome"],
+            *(str(row["packets"][name]) for name in _PACKETS),
+        ]
+        for row in found["instances"]
+    ]
+    screen.table(
+        Table(columns, rows, f"{found['seconds']:.0f} s by the clock; packets by what they asked for")
+    )
