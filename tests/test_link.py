@@ -23,7 +23,7 @@ from tests.mavlink_vehicle import (
 )
 from uuvtai.link import dialect, orders
 from uuvtai.link.dialect import MavCodec
-from uuvtai.link.endpoint import LONGEST, Endpoint, Place, place_of
+from uuvtai.link.endpoint import LONGEST, Endpoint, LinkPlace, place_of
 from uuvtai.link.intake import Intake
 from uuvtai.link.link_errors import LinkError
 from uuvtai.link.link_log import LinkLog
@@ -41,7 +41,7 @@ class Flight:
     """A vehicle, a pilot and the loop between them, step by step, without a clock."""
 
     def __init__(self, folder, arms=True, config=CONFIG, **vehicle):
-        self.endpoint = Endpoint(Place("127.0.0.1", 0, False))
+        self.endpoint = Endpoint(LinkPlace("127.0.0.1", 0, False))
         self.sub = FakeSub(self.endpoint.port, **vehicle)
         self.pilot, self.now_s = WishfulPilot(), 0.0
         self.log = LinkLog(folder / "flight.mcap", {})
@@ -586,8 +586,8 @@ def test_places_that_are_none(text):
 
 
 def test_a_port_that_is_taken_is_told():
-    with Endpoint(Place("127.0.0.1", 0, False)) as first, pytest.raises(LinkError, match="cannot listen"):
-        Endpoint(Place("127.0.0.1", first.port, False))
+    with Endpoint(LinkPlace("127.0.0.1", 0, False)) as first, pytest.raises(LinkError, match="cannot listen"):
+        Endpoint(LinkPlace("127.0.0.1", first.port, False))
 
 
 BASE = ["pilot", "--mavlink", "udp:127.0.0.1:14550", "--start", "2,3,-0.8", "--goal", "18,3,-0.8"]

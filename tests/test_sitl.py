@@ -17,7 +17,7 @@ from tests.command import uuv
 from tests.mavlink_vehicle import START, link_config
 from uuvtai.errors import SettingError
 from uuvtai.link.dialect import MavCodec
-from uuvtai.link.endpoint import Place
+from uuvtai.link.endpoint import LinkPlace
 from uuvtai.link.intake import Intake
 from uuvtai.link.link_errors import LinkError
 from uuvtai.loader import load_config
@@ -438,7 +438,10 @@ def test_who_speaks_to_the_sensors_port_is_told(served):
         free.bind(("127.0.0.1", 0))
         sensors = free.getsockname()[1]
     one = served(
-        places=(Place("127.0.0.1", sensors, False), Place("127.0.0.1", listener.getsockname()[1], True))
+        places=(
+            LinkPlace("127.0.0.1", sensors, False),
+            LinkPlace("127.0.0.1", listener.getsockname()[1], True),
+        )
     )
     autopilot, ardusub = client(), client()
     autopilot.sendto(b"\0", ("127.0.0.1", sensors))

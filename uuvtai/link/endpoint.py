@@ -18,7 +18,7 @@ _WRITTEN = re.compile(r"(udp|udpin|udpout):([A-Za-z0-9.\-]{1,253}):(\d{1,5})")
 
 
 @dataclass(frozen=True)
-class Place:
+class LinkPlace:
     """Where a link is."""
 
     host: str
@@ -27,7 +27,7 @@ class Place:
     """udpout: we speak first, to this place; else we listen there"""
 
 
-def place_of(text: str, option: str = "--mavlink") -> Place:
+def place_of(text: str, option: str = "--mavlink") -> LinkPlace:
     """``udp:HOST:PORT`` (or ``udpin:``): listen; ``udpout:HOST:PORT``: speak to it. Raises LinkError."""
     found = _WRITTEN.fullmatch(text)
     if found is None or not 0 < int(found[3]) < 65536:
@@ -35,13 +35,13 @@ def place_of(text: str, option: str = "--mavlink") -> Place:
             f"{option} {text!r}: write udp:HOST:PORT to listen, or udpout:HOST:PORT to speak first; for "
             f"example {option} udp:127.0.0.1:14550"
         )
-    return Place(found[2], int(found[3]), found[1] == "udpout")
+    return LinkPlace(found[2], int(found[3]), found[1] == "udpout")
 
 
 class Endpoint:
     """One side of a UDP link. Use as a context."""
 
-    def __init__(self, place: Place) -> None:
+    def __init__(self, place: LinkPlace) -> None:
         """Raises LinkError where the address cannot be had."""
         self.place = place
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from uuvtai.config import Config
-from uuvtai.link.endpoint import Place, place_of
+from uuvtai.link.endpoint import LinkPlace, place_of
 from uuvtai.link.link_errors import LinkError
 from uuvtai.link.safety import SafetyLimits, outside_m
 from uuvtai.pilot import Mission
@@ -23,7 +23,7 @@ MOST_SPEED_M_S = 2.0
 class FlightPlan:
     """What ``uuv pilot`` was told."""
 
-    place: Place
+    place: LinkPlace
     mission: Mission
     limits: SafetyLimits
     log: Path

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from uuvtai.kernels.sensors import proprioception, sonar
 from uuvtai.kernels.task import episode
 from uuvtai.kernels.vehicle import actuation, dynamics
 from uuvtai.kernels.world import scenarios
 from uuvtai.outcomes import OUTCOMES, RUNNING
+from uuvtai.sensing import forget_readings
 from uuvtai.sim import Sim
 from uuvtai.sitl.fdm_reply import Motion
 from uuvtai.sitl.motors import Motors
@@ -47,8 +47,7 @@ class WaterRows:
         self._sim.draw(one, seeds, numbers)
         dynamics.reset_vehicle(io.dynamics)
         actuation.reset_actuation(io.actuation)
-        proprioception.reset_proprioception(io.proprioception)
-        sonar.reset_sonar(io.sonar)
+        forget_readings(io)
         episode.reset_referee(io.episode)
         self.sense(row)
 

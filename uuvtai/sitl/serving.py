@@ -12,7 +12,7 @@ from typing import Any
 
 from uuvtai.config import Config
 from uuvtai.link.dialect import MavCodec
-from uuvtai.link.endpoint import Address, Endpoint, Place, place_of
+from uuvtai.link.endpoint import Address, Endpoint, LinkPlace, place_of
 from uuvtai.link.link_errors import LinkError
 from uuvtai.link.orders import Order
 from uuvtai.sim import Sim
@@ -41,7 +41,7 @@ class SitlPlan:
     host: str = "127.0.0.1"
     port: int = 9002
     instances: int = 1
-    places: tuple[Place, ...] = ()
+    places: tuple[LinkPlace, ...] = ()
     """of the sensors' MAVLink; ports count on with the instances"""
     rate: float = 0.0
     """seconds of the water in one of the clock's, at most; 0 = as ArduSub asks"""
@@ -116,7 +116,7 @@ class SitlPort:
             self.socket.bind((plan.host, port))
             self.socket.setblocking(False)
             for place in plan.places:
-                moved = Place(place.host, place.port + NEXT_PORT * number, place.calls)
+                moved = LinkPlace(place.host, place.port + NEXT_PORT * number, place.calls)
                 self._links.append(SensorLink(Endpoint(moved)))
         except OSError as error:
             self.close()

@@ -267,3 +267,19 @@ class MapScratch:
     """cells at which a column enters or leaves the fan of free water (fan.py)"""
     fetched: ti.Field = array("n_slot", dtype=ti.f32, scratch=True)
     """see mapping.fetch_cells"""
+
+
+@dataclass(frozen=True, eq=False)
+class PerceptionStructs:
+    """Structs of this room, by the noun of their stage."""
+
+    pose: PoseState
+    tracks: TrackState
+    clusters: ClusterState
+    spots: SpotState
+    habits: HabitState
+    forecast: ForecastState
+    futures: FutureState
+    mask: GridMask
+    grid_map: MapState
+    map_scratch: MapScratch

@@ -164,3 +164,17 @@ class TrackingIO:
     tank_cfg: Const[TankConfig]
     tracking_cfg: Const[TrackingConfig]
     traffic_cfg: Const[TrafficConfig]
+
+
+@dataclass(frozen=True, eq=False)
+class PerceptionStages:
+    """Bundles of this room, by the noun of their stage."""
+
+    pose: PoseIO
+    tracking: TrackingIO
+    spotting: SpottingIO
+    look: LookIO
+    forecast: ForecastIO
+    futures: FuturesIO
+    heights: HeightsIO
+    mapping: MappingIO
