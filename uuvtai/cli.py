@@ -140,12 +140,16 @@ def simulate(
     one vehicle that is driven to a goal."""
     hold = [f"vehicle.attitude_hold={attitude_hold}"] if attitude_hold else []
     config = SceneOptions("open", "clean", vehicle, overrides=[*(overrides or []), *hold]).config()
-    from uuvtai.measure.driven import drive
     from uuvtai.measure.simulate import simulate as run
     from uuvtai.show.simulation import show_simulation
 
     trial, driven = motion.trial(), driver.one
-    result = run(config, trial) if driven is None else drive(config, trial, driven)
+    if driven is None:
+        result = run(config, trial)
+    else:
+        from uuvtai.measure.driven import drive
+
+        result = drive(config, trial, driven)
     title = f"{vehicle}: {trial.seconds:g} s, substep {trial.dt:g} s"
     output.show(result, lambda screen: show_simulation(screen, result, title, driven))
 
