@@ -1,8 +1,8 @@
 """The closed loop over the real interfaces (pool, S = 8, D = 6, v = 0.6 m/s, sensing `multibeam`).
 
 Our water by ArduSub's JSON packets, sensors and orders by MAVLink over UDP, the stack by ``uuv pilot``'s own
-loop; in the place of ArduSub an autopilot of a hundred lines that knows its motion exactly. Beside it the same
-episodes in ``uuv eval``'s loop. Everything runs in one process, by the water's clock.
+loop; in the place of ArduSub an autopilot of a hundred lines that knows its motion exactly. Beside it the
+same episodes in ``uuv eval``'s loop. Everything runs in one process, by the water's clock.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def measure(job: Job) -> list[Row]:
     water, flown = Sim(config, 1, tree), Sim(config, 1, tree)
     ends = {
         "by JSON and MAVLink": [_flown(config, water, flown, number, job.say) for number in range(count)],
-        "in the simulator's own loop": [_simulated(water, number) for number in range(count)],
+        "in the simulator's own loop": [simulated(water, number) for number in range(count)],
     }
     return [_row(name, found) for name, found in ends.items()]
 
@@ -125,7 +125,7 @@ def _until_it_ends(instance: Instance, autopilot: StandIn, wire: Wire, loop: Onb
             step += 1
 
 
-def _simulated(sim: Sim, number: int) -> str:
+def simulated(sim: Sim, number: int) -> str:
     """How the same episode ends where the stack drives by the simulator's own velocity loop."""
     one, seeds, numbers = (torch.ones(sim.num_envs, dtype=torch.int32) for _ in range(3))
     sim.sleep()

@@ -105,7 +105,7 @@ class SitlPort:
         """Raises LinkError."""
         self.instance, self._system = instance, number + 1
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._links: list[SensorLink] = []
+        self.links: list[SensorLink] = []
         self._codec = MavCodec(self._system, SENSORS)
         self._peer: Address | None = None
         self._heard_s = float("-inf")
@@ -117,7 +117,7 @@ class SitlPort:
             self.socket.setblocking(False)
             for place in plan.places:
                 moved = LinkPlace(place.host, place.port + NEXT_PORT * number, place.calls)
-                self._links.append(SensorLink(Endpoint(moved)))
+                self.links.append(SensorLink(Endpoint(moved)))
         except OSError as error:
             self.close()
             raise LinkError(
@@ -147,18 +147,18 @@ class SitlPort:
         self._report(said)
 
     def _report(self, said: list[Order]) -> None:
-        for link in self._links if said else []:
+        for link in self.links if said else []:
             link.look()
         for order in said:
             data = self._codec.encode(order)
             self._codec.sent(order)
-            for link in self._links:
+            for link in self.links:
                 link.tell(data)
 
     def close(self) -> None:
         """Let go of all ports."""
         self.socket.close()
-        for link in self._links:
+        for link in self.links:
             link.endpoint.close()
 
 
