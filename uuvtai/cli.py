@@ -7,6 +7,7 @@ machine: a full disk), 2 refused, with what to type instead, 3 a gate was not me
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import sys
 from pathlib import Path
@@ -44,20 +45,19 @@ app.add_typer(log_app, name="log")
 @app.command("eval", epilog="Example: uuv eval best --world gauntlet -D 9 -v 1.5 --episodes 64 --seeds 7")
 @groups.grouped
 def evaluate(
-    *,
     ctx: typer.Context,
     drivers: groups.DriversGroup,
     scene: groups.SceneGroup,
+    kept: groups.RecordingGroup,
+    output: groups.OutputGroup,
     episodes: opt.EvalEpisodes = 64,
     seeds: opt.Seeds = "0",
     num_envs: opt.Batch = None,
-    kept: groups.RecordingGroup,
     resume: opt.EvalResume = None,
     allow_code: opt.AllowCode = False,
     device: opt.Device = "auto",
     with_report: opt.WithReport = False,
     run_dir: opt.RunDir = None,
-    output: groups.OutputGroup,
 ) -> None:
     """Play the same episodes with every controller and trained policy and print the table of methods."""
     if resume is not None:
@@ -91,18 +91,17 @@ def evaluate(
 )
 @groups.grouped
 def train_policy(
-    *,
     ctx: typer.Context,
+    scene: groups.TrainSceneGroup,
+    output: groups.PlainOutputGroup,
     preset: opt.TrainPreset = None,
     resume: opt.TrainResume = None,
     iterations: opt.Iterations = None,
     num_envs: opt.TrainEnvs = None,
     seed: opt.TrainSeed = None,
-    scene: groups.TrainSceneGroup,
     device: opt.Device = "auto",
     with_report: opt.WithReport = False,
     run_dir: opt.RunDir = None,
-    output: groups.PlainOutputGroup,
 ) -> None:
     """Train a policy into a run folder, or go on with one. Ctrl-C saves; --resume goes on."""
     from uuvtai.learn.run import TrainRequest, train
@@ -128,13 +127,12 @@ def train_policy(
 @app.command(epilog="Example: uuv simulate --seconds 5 --wrench 10,0,0,0,0,0 --vehicle bluerov2_heavy")
 @groups.grouped
 def simulate(
-    *,
-    vehicle: opt.SimulateVehicle = "bluerov2",
-    attitude_hold: opt.AttitudeHold = None,
     motion: groups.MotionGroup,
     driver: groups.DriverGroup,
-    overrides: opt.Set = None,
     output: groups.OutputGroup,
+    vehicle: opt.SimulateVehicle = "bluerov2",
+    attitude_hold: opt.AttitudeHold = None,
+    overrides: opt.Set = None,
 ) -> None:
     """Open-loop physics in open water, to validate a vehicle against theory or data; or, with --controller,
     one vehicle that is driven to a goal."""
@@ -157,9 +155,9 @@ def simulate(
 @app.command("watch", epilog="Example: uuv watch --world gauntlet --controller bt,dwa --episodes 4")
 @groups.grouped
 def watch_live(
-    *,
     drivers: groups.WatchDriversGroup,
     scene: groups.SceneGroup,
+    output: groups.OutputGroup,
     episodes: opt.WatchEpisodes = 0,
     seeds: opt.Seeds = "0",
     rate: opt.Rate = 1.0,
@@ -167,7 +165,6 @@ def watch_live(
     port: opt.Port = 8765,
     depth_images: opt.DepthImages = False,
     device: opt.Device = "auto",
-    output: groups.OutputGroup,
 ) -> None:
     """Run episodes in real time and serve them to Foxglove and Lichtblick."""
     seed_list = arguments.seeds(seeds)
@@ -188,19 +185,20 @@ def watch_live(
 @app.command("drive", epilog="Example: uuv drive --world maze --rate 0.5")
 @groups.grouped
 def drive_vehicle(
-    *,
     scene: groups.SceneGroup,
+    output: groups.OutputGroup,
     controller: opt.DriveControllers = None,
     episodes: opt.DriveEpisodes = 1,
     seeds: opt.Seeds = "0",
     rate: opt.DriveRate = 1.0,
+    use_gamepad: opt.UseGamepad = False,
     run_dir: opt.RunDir = None,
-    output: groups.OutputGroup,
 ) -> None:
-    """Steer a vehicle by the keyboard, with the map that it makes; bt then plays the same episodes."""
+    """Steer a vehicle by keyboard or gamepad, with the map that it makes; bt then plays the same episodes."""
     seed_list = arguments.seeds(seeds)
     arguments.refuse_less("--episodes", episodes, 1)
     arguments.refuse_odd_rate(rate, is_endless=False)
+    from uuvtai.live.gamepad import STICKS_HELP, gamepad
     from uuvtai.live.hand_driver import HandPiece
     from uuvtai.live.hand_steering import HELP
     from uuvtai.live.keyboard import keyboard
@@ -214,8 +212,11 @@ def drive_vehicle(
     request = Request.typed(
         scene, [], controllers=named, seeds=seed_list, episodes=episodes, device="cpu", run_dir=run_dir
     )
-    with keyboard() as keys, steering_view(HELP) as show:
-        result, folder = drive_by_hand(request, HandPiece(keys, show, rate), Notes())
+    with contextlib.ExitStack() as hands:
+        sticks = hands.enter_context(gamepad()) if use_gamepad else None
+        keys = hands.enter_context(keyboard())
+        show = hands.enter_context(steering_view(f"{STICKS_HELP}\n{HELP}" if sticks else HELP))
+        result, folder = drive_by_hand(request, HandPiece(keys, show, rate, sticks), Notes())
     output.show(result, lambda screen: show_evaluation(screen, result, folder), folder)
 
 
@@ -225,15 +226,14 @@ def drive_vehicle(
 @app.command("identify", epilog="Example: uuv identify drive.csv --vehicle bluerov2_16v --out mine.yaml")
 @groups.grouped
 def identify_vehicle(
-    *,
     file: opt.DriveLogs,
+    output: groups.OutputGroup,
     vehicle: opt.SimulateVehicle = "bluerov2_16v",
     known: opt.IdentifyKnown = "gain",
     truth: opt.IdentifyTruth = False,
     out: opt.IdentifyOut = None,
     overrides: opt.Set = None,
     force: opt.IdentifyForce = False,
-    output: groups.OutputGroup,
 ) -> None:
     """Drag, added mass, buoyancy and thruster gain of a vehicle from logs of its drives, with intervals."""
     from uuvtai.identify.identify_files import identify
@@ -255,21 +255,20 @@ def identify_vehicle(
 @app.command(epilog="Example: uuv sweep best --grid D=0,6 --grid v=0.4,1.5 --episodes 16 --workers 2")
 @groups.grouped
 def sweep(
-    *,
     ctx: typer.Context,
     drivers: groups.SweepDriversGroup,
-    grid: opt.GridAxes = None,
     scene: groups.SceneGroup,
+    place: groups.WorkplaceGroup,
+    output: groups.OutputGroup,
+    grid: opt.GridAxes = None,
     episodes: opt.SweepEpisodes = 64,
     seeds: opt.Seeds = "0",
     num_envs: opt.Batch = None,
-    place: groups.WorkplaceGroup,
     resume: opt.SweepResume = None,
     allow_code: opt.AllowCode = False,
     device: opt.Device = "auto",
     with_report: opt.WithReport = False,
     run_dir: opt.RunDir = None,
-    output: groups.OutputGroup,
 ) -> None:
     """Play every cell of a grid with every method; finished cells survive a kill: --resume goes on."""
     from uuvtai.measure.sweep import play
@@ -302,8 +301,8 @@ _SWEEP_RESUME = ("allow_code", "world", "episodes", "seeds", "engine", "workers"
 @app.command("benchmark", epilog="Example: uuv benchmark pool --controller examples/own_field.py --quick")
 @groups.grouped
 def enter_benchmark(
-    *,
     who: groups.EntrantGroup,
+    output: groups.OutputGroup,
     name: opt.BenchmarkName = None,
     file: opt.EntryFile = None,
     quick: opt.Quick = False,
@@ -311,7 +310,6 @@ def enter_benchmark(
     num_envs: opt.Batch = None,
     device: opt.Device = "auto",
     run_dir: opt.RunDir = None,
-    output: groups.OutputGroup,
 ) -> None:
     """Play fixed scenes that others play too, and write what came of it as a file; or check such a file.
     Exit code 3: an entry disagrees with its replay."""
@@ -345,15 +343,14 @@ def enter_benchmark(
 @app.command(epilog="Example: uuv profile --num-envs 1,64 --seconds 5")
 @groups.grouped
 def profile(
-    *,
+    scene: groups.SceneGroup,
+    output: groups.OutputGroup,
     num_envs: opt.BatchSizes = "1,64,1024",
     controller: opt.TickedTree = "bt",
     preset: opt.ProfilePreset = "curriculum",
-    scene: groups.SceneGroup,
     seconds: opt.ProfileSeconds = 10.0,
     density: opt.Density = False,
     device: opt.Device = "auto",
-    output: groups.OutputGroup,
 ) -> None:
     """Time per stage, env-steps per second (simulated, with inference, with training), memory, and the
     paper's timing tables."""
@@ -369,14 +366,13 @@ def profile(
 @app.command(epilog="Example: uuv reproduce --budget quick --run-dir runs/reproduction")
 @groups.grouped
 def reproduce(
-    *,
     ctx: typer.Context,
     own: groups.PiecesGroup,
+    output: groups.OutputGroup,
     budget: opt.BudgetName = "quick",
     allow_code: opt.AllowCode = False,
     resume: opt.ReproduceResume = None,
     run_dir: opt.RunDir = None,
-    output: groups.OutputGroup,
 ) -> None:
     """Train, evaluate, sweep and profile whatever the paper shows, and judge each of its claims."""
     from uuvtai.measure.reproduce import paper_run
@@ -396,12 +392,11 @@ def reproduce(
 @app.command("report", epilog="Example: uuv report runs/first")
 @groups.grouped
 def report_run(
-    *,
     runs: opt.ReportRuns,
+    output: groups.PlainOutputGroup,
     out: opt.ReportOut = None,
     paper: opt.ReportPaper = None,
     force: opt.ReportForce = False,
-    output: groups.PlainOutputGroup,
 ) -> None:
     """Write one self-contained HTML page of a run: tables, figures, pictures, videos, and where they come
     from; or, with --paper, figures and tables for a paper."""
@@ -430,13 +425,12 @@ def _report_if(with_report: bool, folder: Path) -> None:
 @app.command("export", epilog="Example: uuv export best --out runs/best_export")
 @groups.grouped
 def export_policy(
-    *,
+    output: groups.OutputGroup,
     run: opt.ExportRun = None,
     out: opt.ExportOut = None,
     evaluation: opt.ExportEvaluation = None,
     check: opt.ExportCheck = None,
     force: opt.ExportForce = False,
-    output: groups.OutputGroup,
 ) -> None:
     """Write a policy that drives without uuvtai (NumPy alone, or ONNX), or check such a folder. Exit code 3:
     it disagrees."""
@@ -462,10 +456,9 @@ def export_policy(
 @app.command("replay", epilog="Example: uuv replay runs/first/logs/bt_seed0_episode0.mcap --lose dvl:10:15")
 @groups.grouped
 def replay_log(
-    *,
     faults: groups.FaultsGroup,
-    output: groups.OutputGroup,
     log: opt.ReplayLog,
+    output: groups.OutputGroup,
     controller: opt.ReplayTree = None,
 ) -> None:
     """Feed a log's sensor messages to the stack again, without the simulator, and compare the commands. Exit
@@ -488,11 +481,10 @@ vehicle_commands.add_to(app)
 @app.command(epilog="Example: uuv presets show gauntlet")
 @groups.grouped
 def presets(
-    *,
+    output: groups.PlainOutputGroup,
     action: opt.PresetsAction = None,
     name: opt.PresetName = None,
     everything: opt.Everything = False,
-    output: groups.PlainOutputGroup,
 ) -> None:
     """List the shipped presets with a sentence each, or show what one of them states."""
     from uuvtai.show import presets as shown
@@ -532,13 +524,12 @@ def doctor(output: groups.PlainOutputGroup, clean: opt.Clean = False) -> None:
 @app.command(epilog="Example: uuv warm --sensors nominal,paper --num-envs 64,256")
 @groups.grouped
 def warm(
-    *,
+    output: groups.OutputGroup,
     num_envs: opt.BatchSizes = "1,8,64,256",
     world: opt.World = "pool",
     sensors: opt.WarmSensors = "nominal,paper",
     overrides: opt.Set = None,
     workers: opt.WarmWorkers = 0,
-    output: groups.OutputGroup,
 ) -> None:
     """Compile beforehand what later commands need, so that they start at once (docs/native.md)."""
     from uuvtai.show.health import show_shapes
@@ -558,11 +549,10 @@ def warm(
 @app.command(epilog="Example: uuv tree --controller planner --dot")
 @groups.grouped
 def tree(
-    *,
+    output: groups.OutputGroup,
     run: opt.EvaluatedRun = None,
     controller: opt.ShownTree = "bt",
     dot: opt.Dot = False,
-    output: groups.OutputGroup,
 ) -> None:
     """Print a behaviour tree, with the share of episodes and ticks per node after an evaluation."""
     from uuvtai.measure.evaluate.tree_report import tree_report

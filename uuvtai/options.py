@@ -248,6 +248,9 @@ DriveEpisodes = Annotated[int, Option("--episodes", help="Episodes to drive.")]
 DriveRate = Annotated[
     float, Option("--rate", help="Seconds of the episode in one of the clock's; 0.5 gives you time to think.")
 ]
+UseGamepad = Annotated[
+    bool, Option("--gamepad", help="Steer by the first gamepad too (pip install 'uuvtai\\[gamepad]').")
+]
 
 # ------------------------------------------------------------------------------------------------ pilot, sitl
 

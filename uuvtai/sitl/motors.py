@@ -61,8 +61,8 @@ class Motors:
                 "the thrusters do not sit as in ArduSub's frames VECTORED or VECTORED_6DOF: "
                 "--vehicle bluerov2_16v"
             )
-        self._scale = vehicle_cfg.rotor_max_rpm / -_SPEED_OF_PULSE[0, 1]
-        self._most = vehicle_cfg.rotor_max_rpm
+        self._scale = vehicle_cfg.top_rpm / -_SPEED_OF_PULSE[0, 1]
+        self._most = vehicle_cfg.top_rpm
 
     def rpm(self, pwm: Sequence[int]) -> np.ndarray:
         """(thrusters,) speed that is commanded. A channel that is off (0) stands still."""
