@@ -36,7 +36,7 @@ from uuvtai.tree import read_tree
 THREADS = 1
 LONGEST_S = 3600
 SEED = 77001
-EPISODES = 100
+EPISODES = 60
 _LONGEST_EPISODE_S = 70.0
 _CHANGES = {"world.n_dynamic": 6, "world.dynamic_speed_m_s": 0.6}
 

@@ -339,6 +339,21 @@ def test_a_step_is_a_step_of_the_simulators_own_dynamics(small, water):
         assert water.value(name, 5) == pytest.approx(water.value(name, 2), abs=1e-5)
 
 
+def test_a_step_is_launched_again_without_another_look(water, monkeypatch):
+    """A kernel looks at arguments that it has not seen, by identity: 10 ms instead of 0.1."""
+    from uuvtai.native import launch
+
+    looked = []
+    first = launch._first
+    monkeypatch.setattr(launch, "_first", lambda *given: looked.append(given) or first(*given))
+    water.begin(4)
+    water.push(4, NEUTRAL, 1.0 / 400)
+    before = len(looked)
+    for rate in (400.0, 400, 400.0):
+        water.push(4, NEUTRAL, 1.0 / rate)
+    assert len(looked) == before
+
+
 def test_an_episode_begins_as_uuv_eval_has_it_and_the_referee_judges(small, water):
     water.begin(2)
     start = water.motion(2, 0.0).pos_w
