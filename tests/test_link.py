@@ -2,8 +2,10 @@
 vehicle made with pymavlink, and strangers who send anything."""
 
 import dataclasses
+import json
 import math
 import re
+import socket
 import struct
 
 import numpy as np
@@ -21,7 +23,7 @@ from tests.mavlink_vehicle import (
     link_config,
     plan_of,
 )
-from uuvtai.link import dialect, orders
+from uuvtai.link import dialect, onboard_loop, orders
 from uuvtai.link.dialect import MavCodec
 from uuvtai.link.endpoint import LONGEST, Endpoint, LinkPlace, place_of
 from uuvtai.link.intake import Intake
@@ -614,6 +616,45 @@ BASE = ["pilot", "--mavlink", "udp:127.0.0.1:14550", "--start", "2,3,-0.8", "--g
 def test_what_makes_no_sense_is_refused(capfd, words, says):
     code, _out, err = uuv(capfd, *BASE, *words)
     assert code == 2 and says in err
+
+
+def free_port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        return free.getsockname()[1]
+
+
+@pytest.mark.parametrize("words", [["--json"], []])
+def test_the_command_flies_and_tells(capfd, monkeypatch, tmp_path, words):
+    monkeypatch.setattr(onboard_loop, "warmed", lambda config, tree, mission: WishfulPilot())
+    place = [
+        "--mavlink",
+        f"udp:127.0.0.1:{free_port()}",
+        "--seconds",
+        "0.2",
+        "--log",
+        str(tmp_path / "a.mcap"),
+    ]
+    code, out, err = uuv(capfd, *BASE[:1], *BASE[3:], *place, *words)
+    assert code == 0 and "dry run: no order that moves the vehicle is sent" in err
+    if words:
+        found = json.loads(out)
+        assert found["dry_run"] and found["ended"] == "time is up" and found["said"] == {}
+    else:
+        assert "ended: time is up" in out and "dry run: nothing was sent" in out
+    assert (tmp_path / "a.mcap").exists()
+
+
+def test_a_log_that_cannot_be_written_any_more_does_not_stop_the_flight(flight, monkeypatch):
+    one = flight()
+    one.run(3)
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(one.log._file, "add_message", full)
+    assert one.run(3).action.name == "DRIVE"
+    assert "No space left" in one.loop.document()["log_trouble"]
 
 
 def test_without_pymavlink_it_says_what_to_install(monkeypatch):

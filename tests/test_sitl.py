@@ -22,6 +22,7 @@ from uuvtai.link.intake import Intake
 from uuvtai.link.link_errors import LinkError
 from uuvtai.loader import load_config
 from uuvtai.pilot import DvlReading, SonarPing
+from uuvtai.sitl import serving
 from uuvtai.sitl.fdm_reply import Motion, euler_of, reply_of
 from uuvtai.sitl.instance import Instance
 from uuvtai.sitl.motors import Motors
@@ -484,6 +485,36 @@ def test_who_speaks_to_the_sensors_port_is_told(served):
 def test_what_makes_no_sense_is_refused(capfd, words, says):
     code, _out, err = uuv(capfd, "sitl", *words)
     assert code == 2 and says in err
+
+
+def test_the_water_waits_for_the_clock(served, monkeypatch):
+    port, slept = served().port, []
+    monkeypatch.setattr(serving.time, "sleep", slept.append)
+    monkeypatch.setattr(serving.time, "monotonic", lambda: 100.0)
+    port.paced_from_s = 100.0
+    port.instance.time_s = 0.05
+    serving._pace(port, 0.0)
+    assert slept == []
+    serving._pace(port, 0.5)
+    assert slept == pytest.approx([0.1]), "0.05 s of water take 0.1 s of the clock at half the pace"
+    port.instance.time_s = 50.0
+    serving._pace(port, 1.0)
+    assert len(slept) == 1 and port.paced_from_s == 50.0, "begun anew, or held up: nothing to catch up with"
+
+
+@pytest.mark.parametrize("words", [["--json"], []])
+def test_the_command_serves_and_tells(capfd, monkeypatch, small, words):
+    monkeypatch.setattr(serving, "Sim", lambda config, rows, tree: small.sim)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        number = free.getsockname()[1]
+    place = ["--port", str(number), "--mavlink", "udpout:127.0.0.1:9", "--seconds", "0.2"]
+    code, out, err = uuv(capfd, "sitl", *place, *words)
+    assert code == 0 and f"water for ArduSub at UDP 127.0.0.1:{number}" in err
+    if words:
+        assert json.loads(out)["instances"][0]["outcome"] == "waiting"
+    else:
+        assert "waiting" in out
 
 
 def test_a_port_that_is_taken_is_told():
