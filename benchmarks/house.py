@@ -55,7 +55,7 @@ def rows() -> list[Row]:
         _row(
             "lines of a signature there, mean",
             round(statistics.mean(_signature(node) for path, node in functions if path in counted), 2),
-            1.5,
+            1.3,
         ),
         _row(
             f"lines of more than {LONG_LINE} characters",
