@@ -27,8 +27,11 @@ _WIDTH = 120
 
 
 def command_block(commands: Iterable[str]) -> str:
-    """Commands to copy, each on as many lines as a page is wide."""
-    lines = (
-        textwrap.wrap(command, _WIDTH, break_long_words=False, break_on_hyphens=False) for command in commands
-    )
-    return "\n".join(["```sh", *(" \\\n  ".join(command) for command in lines), "```"])
+    """Commands to copy, each on as many lines as a page is wide; an option stays beside its value."""
+    return "\n".join(["```sh", *map(_broken, commands), "```"])
+
+
+def _broken(command: str) -> str:
+    glued = re.sub(r" (?!-)", "\0", command)
+    lines = textwrap.wrap(glued, _WIDTH, break_long_words=False, break_on_hyphens=False)
+    return " \\\n  ".join(lines).replace("\0", " ")
