@@ -7,7 +7,6 @@ machine: a full disk), 2 refused, with what to type instead, 3 a gate was not me
 
 from __future__ import annotations
 
-import contextlib
 import gc
 import sys
 from pathlib import Path
@@ -45,20 +44,19 @@ app.add_typer(log_app, name="log")
 @app.command("eval", epilog="Example: uuv eval best --world gauntlet -D 9 -v 1.5 --episodes 64 --seeds 7")
 @groups.grouped
 def evaluate(
-    *,
     ctx: typer.Context,
     drivers: groups.DriversGroup,
     scene: groups.SceneGroup,
+    kept: groups.RecordingGroup,
+    output: groups.OutputGroup,
     episodes: opt.EvalEpisodes = 64,
     seeds: opt.Seeds = "0",
     num_envs: opt.Batch = None,
-    kept: groups.RecordingGroup,
     resume: opt.EvalResume = None,
     allow_code: opt.AllowCode = False,
     device: opt.Device = "auto",
     with_report: opt.WithReport = False,
     run_dir: opt.RunDir = None,
-    output: groups.OutputGroup,
 ) -> None:
     """Play the same episodes with every controller and trained policy and print the table of methods."""
     if resume is not None:
@@ -67,7 +65,7 @@ def evaluate(
 
         result, folder = go_on(resume, Progress(), allow_code)
     else:
-        seed_list = arguments.seeds(seeds)
+        seed_list = arguments.integers("--seeds", seeds)
         arguments.refuse_less("--episodes", episodes, 1)
         recording = kept.asked()
         from uuvtai.measure.evaluate.compare import compare
@@ -85,25 +83,20 @@ def evaluate(
     _report_if(with_report, folder)
 
 
-@app.command(
-    "train",
-    epilog="Example: uuv train curriculum --iterations 20 --set ppo.learning_rate=0.0005 --run-dir "
-    "runs/first",
-)
+@app.command("train", epilog="Example: uuv train curriculum --iterations 20 --run-dir runs/first")
 @groups.grouped
 def train_policy(
-    *,
     ctx: typer.Context,
+    scene: groups.TrainSceneGroup,
+    output: groups.PlainOutputGroup,
     preset: opt.TrainPreset = None,
     resume: opt.TrainResume = None,
     iterations: opt.Iterations = None,
     num_envs: opt.TrainEnvs = None,
     seed: opt.TrainSeed = None,
-    scene: groups.TrainSceneGroup,
     device: opt.Device = "auto",
     with_report: opt.WithReport = False,
     run_dir: opt.RunDir = None,
-    output: groups.PlainOutputGroup,
 ) -> None:
     """Train a policy into a run folder, or go on with one. Ctrl-C saves; --resume goes on."""
     from uuvtai.learn.run import TrainRequest, train
@@ -129,13 +122,12 @@ def train_policy(
 @app.command(epilog="Example: uuv simulate --seconds 5 --wrench 10,0,0,0,0,0 --vehicle bluerov2_heavy")
 @groups.grouped
 def simulate(
-    *,
-    vehicle: opt.SimulateVehicle = "bluerov2",
-    attitude_hold: opt.AttitudeHold = None,
     motion: groups.MotionGroup,
     driver: groups.DriverGroup,
-    overrides: opt.Set = None,
     output: groups.OutputGroup,
+    vehicle: opt.SimulateVehicle = "bluerov2",
+    attitude_hold: opt.AttitudeHold = None,
+    overrides: opt.Set = None,
 ) -> None:
     """Open-loop physics in open water, to validate a vehicle against theory or data; or, with --controller,
     one vehicle that is driven to a goal."""
@@ -158,9 +150,9 @@ def simulate(
 @app.command("watch", epilog="Example: uuv watch --world gauntlet --controller bt,dwa --episodes 4")
 @groups.grouped
 def watch_live(
-    *,
     drivers: groups.WatchDriversGroup,
     scene: groups.SceneGroup,
+    output: groups.OutputGroup,
     episodes: opt.WatchEpisodes = 0,
     seeds: opt.Seeds = "0",
     rate: opt.Rate = 1.0,
@@ -168,10 +160,9 @@ def watch_live(
     port: opt.Port = 8765,
     depth_images: opt.DepthImages = False,
     device: opt.Device = "auto",
-    output: groups.OutputGroup,
 ) -> None:
     """Run episodes in real time and serve them to Foxglove and Lichtblick."""
-    seed_list = arguments.seeds(seeds)
+    seed_list = arguments.integers("--seeds", seeds)
     arguments.refuse_odd_live(episodes, rate, port)
     from uuvtai.measure.evaluate.eval_request import Request
     from uuvtai.measure.watching import LiveOptions, watch_episodes
@@ -189,24 +180,20 @@ def watch_live(
 @app.command("drive", epilog="Example: uuv drive --world maze --rate 0.5")
 @groups.grouped
 def drive_vehicle(
-    *,
     scene: groups.SceneGroup,
+    output: groups.OutputGroup,
     controller: opt.DriveControllers = None,
     episodes: opt.DriveEpisodes = 1,
     seeds: opt.Seeds = "0",
     rate: opt.DriveRate = 1.0,
     use_gamepad: opt.UseGamepad = False,
     run_dir: opt.RunDir = None,
-    output: groups.OutputGroup,
 ) -> None:
     """Steer a vehicle by keyboard or gamepad, with the map that it makes; bt then plays the same episodes."""
-    seed_list = arguments.seeds(seeds)
+    seed_list = arguments.integers("--seeds", seeds)
     arguments.refuse_less("--episodes", episodes, 1)
     arguments.refuse_odd_rate(rate, is_endless=False)
-    from uuvtai.live.gamepad import STICKS_HELP, gamepad
-    from uuvtai.live.hand_driver import HandPiece
-    from uuvtai.live.hand_steering import HELP
-    from uuvtai.live.keyboard import keyboard
+    from uuvtai.live.hands import at_the_wheel
     from uuvtai.measure.evaluate.eval_request import Request
     from uuvtai.measure.hand_driving import drive_by_hand
     from uuvtai.show.evaluation import show_evaluation
@@ -217,11 +204,8 @@ def drive_vehicle(
     request = Request.typed(
         scene, [], controllers=named, seeds=seed_list, episodes=episodes, device="cpu", run_dir=run_dir
     )
-    with contextlib.ExitStack() as hands:
-        sticks = hands.enter_context(gamepad()) if use_gamepad else None
-        keys = hands.enter_context(keyboard())
-        show = hands.enter_context(steering_view(f"{STICKS_HELP}\n{HELP}" if sticks else HELP))
-        result, folder = drive_by_hand(request, HandPiece(keys, show, rate, sticks), Notes())
+    with at_the_wheel(rate, use_gamepad, steering_view) as hand:
+        result, folder = drive_by_hand(request, hand, Notes())
     output.show(result, lambda screen: show_evaluation(screen, result, folder), folder)
 
 
@@ -231,15 +215,14 @@ def drive_vehicle(
 @app.command("identify", epilog="Example: uuv identify drive.csv --vehicle bluerov2_16v --out mine.yaml")
 @groups.grouped
 def identify_vehicle(
-    *,
     file: opt.DriveLogs,
+    output: groups.OutputGroup,
     vehicle: opt.SimulateVehicle = "bluerov2_16v",
     known: opt.IdentifyKnown = "gain",
     truth: opt.IdentifyTruth = False,
     out: opt.IdentifyOut = None,
     overrides: opt.Set = None,
     force: opt.IdentifyForce = False,
-    output: groups.OutputGroup,
 ) -> None:
     """Drag, added mass, buoyancy and thruster gain of a vehicle from logs of its drives, with intervals."""
     from uuvtai.identify.identify_files import identify
@@ -250,8 +233,7 @@ def identify_vehicle(
 
     from uuvtai.show.identification import show_identified
 
-    title = f"{file[0].name}: {document['seconds']:g} s of drives, known: {known} of {vehicle}"
-    output.show(document, lambda screen: show_identified(screen, document, title))
+    output.show(document, lambda screen: show_identified(screen, document, f"{known} of {vehicle}"))
     say(f"wrote {target}")
 
 
@@ -261,21 +243,20 @@ def identify_vehicle(
 @app.command(epilog="Example: uuv sweep best --grid D=0,6 --grid v=0.4,1.5 --episodes 16 --workers 2")
 @groups.grouped
 def sweep(
-    *,
     ctx: typer.Context,
     drivers: groups.SweepDriversGroup,
-    grid: opt.GridAxes = None,
     scene: groups.SceneGroup,
+    place: groups.WorkplaceGroup,
+    output: groups.OutputGroup,
+    grid: opt.GridAxes = None,
     episodes: opt.SweepEpisodes = 64,
     seeds: opt.Seeds = "0",
     num_envs: opt.Batch = None,
-    place: groups.WorkplaceGroup,
     resume: opt.SweepResume = None,
     allow_code: opt.AllowCode = False,
     device: opt.Device = "auto",
     with_report: opt.WithReport = False,
     run_dir: opt.RunDir = None,
-    output: groups.OutputGroup,
 ) -> None:
     """Play every cell of a grid with every method; finished cells survive a kill: --resume goes on."""
     from uuvtai.measure.sweep import play
@@ -286,20 +267,17 @@ def sweep(
     arguments.refuse_less("--episodes", episodes, 1)
     engine, progress = place.made(), Progress("cells")
     if resume is not None:
-        arguments.refuse_beside_resume(ctx, _SWEEP_RESUME)
+        arguments.refuse_beside_resume(ctx, arguments.OF_A_SWEEP_RESUMED)
         result, folder = play.resume(resume, engine, progress, allow_code)
     else:
         trained, controllers = drivers.named(["bt"])
         request = SweepRequest.typed(
-            scene, trained, grid=grid_of(grid or []), controllers=tuple(controllers),
-            seeds=tuple(arguments.seeds(seeds)), episodes=episodes, num_envs=num_envs, device=device,
+            scene, trained, grid=grid_of(grid or []), controllers=tuple(controllers), episodes=episodes,
+            seeds=tuple(arguments.integers("--seeds", seeds)), num_envs=num_envs, device=device,
         )  # fmt: skip
         result, folder = play.sweep(request, engine, run_dir, progress)
     _report_if(with_report, folder)
     output.show(result, lambda screen: show_sweep(screen, result), folder)
-
-
-_SWEEP_RESUME = ("allow_code", "world", "episodes", "seeds", "engine", "workers", "address", "device")
 
 
 # -------------------------------------------------------------------------------------------------- benchmark
@@ -308,8 +286,8 @@ _SWEEP_RESUME = ("allow_code", "world", "episodes", "seeds", "engine", "workers"
 @app.command("benchmark", epilog="Example: uuv benchmark pool --controller examples/own_field.py --quick")
 @groups.grouped
 def enter_benchmark(
-    *,
     who: groups.EntrantGroup,
+    output: groups.OutputGroup,
     name: opt.BenchmarkName = None,
     file: opt.EntryFile = None,
     quick: opt.Quick = False,
@@ -317,7 +295,6 @@ def enter_benchmark(
     num_envs: opt.Batch = None,
     device: opt.Device = "auto",
     run_dir: opt.RunDir = None,
-    output: groups.OutputGroup,
 ) -> None:
     """Play fixed scenes that others play too, and write what came of it as a file; or check such a file.
     Exit code 3: an entry disagrees with its replay."""
@@ -351,19 +328,18 @@ def enter_benchmark(
 @app.command(epilog="Example: uuv profile --num-envs 1,64 --seconds 5")
 @groups.grouped
 def profile(
-    *,
+    scene: groups.SceneGroup,
+    output: groups.OutputGroup,
     num_envs: opt.BatchSizes = "1,64,1024",
     controller: opt.TickedTree = "bt",
     preset: opt.ProfilePreset = "curriculum",
-    scene: groups.SceneGroup,
     seconds: opt.ProfileSeconds = 10.0,
     density: opt.Density = False,
     device: opt.Device = "auto",
-    output: groups.OutputGroup,
 ) -> None:
     """Time per stage, env-steps per second (simulated, with inference, with training), memory, and the
     paper's timing tables."""
-    sizes = [arguments.integer("--num-envs", text) for text in num_envs.split(",")]
+    sizes = arguments.integers("--num-envs", num_envs)
     arguments.refuse_no_duration("--seconds", seconds)
     from uuvtai.measure.profile.profiling import profile as run
     from uuvtai.show.profile import show_profile
@@ -375,14 +351,13 @@ def profile(
 @app.command(epilog="Example: uuv reproduce --budget quick --run-dir runs/reproduction")
 @groups.grouped
 def reproduce(
-    *,
     ctx: typer.Context,
     own: groups.PiecesGroup,
+    output: groups.OutputGroup,
     budget: opt.BudgetName = "quick",
     allow_code: opt.AllowCode = False,
     resume: opt.ReproduceResume = None,
     run_dir: opt.RunDir = None,
-    output: groups.OutputGroup,
 ) -> None:
     """Train, evaluate, sweep and profile whatever the paper shows, and judge each of its claims."""
     from uuvtai.measure.reproduce import paper_run
@@ -402,12 +377,11 @@ def reproduce(
 @app.command("report", epilog="Example: uuv report runs/first")
 @groups.grouped
 def report_run(
-    *,
     runs: opt.ReportRuns,
+    output: groups.PlainOutputGroup,
     out: opt.ReportOut = None,
     paper: opt.ReportPaper = None,
     force: opt.ReportForce = False,
-    output: groups.PlainOutputGroup,
 ) -> None:
     """Write one self-contained HTML page of a run: tables, figures, pictures, videos, and where they come
     from; or, with --paper, figures and tables for a paper."""
@@ -436,13 +410,12 @@ def _report_if(with_report: bool, folder: Path) -> None:
 @app.command("export", epilog="Example: uuv export best --out runs/best_export")
 @groups.grouped
 def export_policy(
-    *,
+    output: groups.OutputGroup,
     run: opt.ExportRun = None,
     out: opt.ExportOut = None,
     evaluation: opt.ExportEvaluation = None,
     check: opt.ExportCheck = None,
     force: opt.ExportForce = False,
-    output: groups.OutputGroup,
 ) -> None:
     """Write a policy that drives without uuvtai (NumPy alone, or ONNX), or check such a folder. Exit code 3:
     it disagrees."""
@@ -468,10 +441,9 @@ def export_policy(
 @app.command("replay", epilog="Example: uuv replay runs/first/logs/bt_seed0_episode0.mcap --lose dvl:10:15")
 @groups.grouped
 def replay_log(
-    *,
     faults: groups.FaultsGroup,
-    output: groups.OutputGroup,
     log: opt.ReplayLog,
+    output: groups.OutputGroup,
     controller: opt.ReplayTree = None,
 ) -> None:
     """Feed a log's sensor messages to the stack again, without the simulator, and compare the commands. Exit
@@ -491,11 +463,10 @@ def replay_log(
 @app.command(epilog="Example: uuv presets show gauntlet")
 @groups.grouped
 def presets(
-    *,
+    output: groups.PlainOutputGroup,
     action: opt.PresetsAction = None,
     name: opt.PresetName = None,
     everything: opt.Everything = False,
-    output: groups.PlainOutputGroup,
 ) -> None:
     """List the shipped presets with a sentence each, or show what one of them states."""
     from uuvtai.show import presets as shown
@@ -535,22 +506,20 @@ def doctor(output: groups.PlainOutputGroup, clean: opt.Clean = False) -> None:
 @app.command(epilog="Example: uuv warm --sensors nominal,paper --num-envs 64,256")
 @groups.grouped
 def warm(
-    *,
+    output: groups.OutputGroup,
     num_envs: opt.BatchSizes = "1,8,64,256",
     world: opt.World = "pool",
     sensors: opt.WarmSensors = "nominal,paper",
     overrides: opt.Set = None,
     workers: opt.WarmWorkers = 0,
-    output: groups.OutputGroup,
 ) -> None:
     """Compile beforehand what later commands need, so that they start at once (docs/native.md)."""
     from uuvtai.show.health import show_shapes
     from uuvtai.warming import shapes_of
     from uuvtai.warming import warm as run
 
-    sizes = [arguments.integer("--num-envs", text) for text in num_envs.split(",")]
-    if workers < 0:
-        raise UsageError(f"--workers {workers}: must be 1 or more, for example --workers 2")
+    sizes = arguments.integers("--num-envs", num_envs)
+    arguments.refuse_less("--workers", workers, 0)
     scenes = [SceneOptions(world, name, overrides=overrides) for name in sensors.split(",")]
     shapes = shapes_of(scenes, sizes)
     say(f"sizes to compile: {len(shapes)}, about a minute each the first time")
@@ -561,11 +530,10 @@ def warm(
 @app.command(epilog="Example: uuv tree --controller planner --dot")
 @groups.grouped
 def tree(
-    *,
+    output: groups.OutputGroup,
     run: opt.EvaluatedRun = None,
     controller: opt.ShownTree = "bt",
     dot: opt.Dot = False,
-    output: groups.OutputGroup,
 ) -> None:
     """Print a behaviour tree, with the share of episodes and ticks per node after an evaluation."""
     from uuvtai.measure.evaluate.tree_report import tree_report
@@ -593,9 +561,7 @@ def log_info(output: groups.OutputGroup, file: opt.LogFile) -> None:
     output.show(found, lambda screen: show_log(screen, found, file))
 
 
-@log_app.command(
-    "export", epilog="Example: uuv log export runs/first/logs/bt_seed0_episode0.mcap --out exported"
-)
+@log_app.command("export", epilog="Example: uuv log export runs/first/logs/bt_seed0_episode0.mcap --out all")
 def log_export(
     file: opt.LogFile, out: opt.LogExportOut, topic: opt.Topics = None, fmt: opt.LogFormat = "json"
 ) -> None:

@@ -32,10 +32,11 @@ _F = TypeVar("_F", bound=Callable[..., None])
 
 
 def grouped(command: _F) -> _F:
-    """The command as Typer is to see it: each option of its groups by itself."""
+    """The command as Typer is to see it: each option of its groups by itself, those of the output last."""
     hints = get_type_hints(command, include_extras=True)
     groups: dict[str, Any] = {name: kind for name, kind in hints.items() if is_dataclass(kind)}
-    given = inspect.signature(command).parameters.values()
+    given = list(inspect.signature(command).parameters.values())
+    given.sort(key=lambda each: issubclass(groups.get(each.name, object), OutputGroup))  # last in the help
     parameters = [own for each in given for own in _spread(each, hints[each.name], groups)]
 
     @functools.wraps(command)

@@ -30,6 +30,31 @@ class PoseState:
 
 
 @dataclass(frozen=True, eq=False)
+class EchoState:
+    """Remembered: what a mechanical beam heard last along each of its bearings, and from where. Of a sonar
+    whose beams come at once: nothing."""
+
+    step: ti.Field = array("n_env", "n_echo", dtype=ti.i32, beside="echo")
+    """when it was taken, -1 = never"""
+    pos_x_m: ti.Field = array("n_env", "n_echo", beside="echo")
+    """[m] own position estimate then, world"""
+    pos_y_m: ti.Field = array("n_env", "n_echo", beside="echo")
+    """[m]"""
+    bearing_w: ti.Field = array("n_env", "n_echo", beside="echo")
+    """[rad] where the beam looked, in the world"""
+    range_m: ti.Field = array("n_env", "n_echo", beside="echo")
+    """[m] no return = maximum range"""
+    intensity: ti.Field = array("n_env", "n_echo", beside="echo")
+    """[0, 1]"""
+    hit: ti.Field = array("n_env", "n_echo", dtype=ti.i32, beside="echo")
+    """1 = return, and no later beam went through it"""
+    told: ti.Field = array("n_env", "n_echo", dtype=ti.i32, beside="echo")
+    """1 = the tracking has had it"""
+    shown: ti.Field = array("n_env", "n_echo", dtype=ti.i32, beside="echo")
+    """the bearing whose return stands in each beam of the scan, -1 = none"""
+
+
+@dataclass(frozen=True, eq=False)
 class TrackState:
     """Remembered: moving (and candidate) bodies seen by the sonar, one Kalman filter each."""
 
@@ -277,6 +302,7 @@ class MapScratch:
 class PerceptionStructs:
     """Structs of this room, by the noun of their stage."""
 
+    echoes: EchoState
     pose: PoseState
     tracks: TrackState
     clusters: ClusterState
