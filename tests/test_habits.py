@@ -348,8 +348,8 @@ def test_coasting_equals_the_oracle(stage, shape):
 
 
 def test_a_way_remembers_what_kind_of_turn_began_it(stage):
-    """Bodies that have swum to and fro, and round corners, for some ways: 2 = began with a turn back, 3 =
-    with a corner."""
+    """Bodies that have swum to and fro, and round corners, for some ways: 2 = began with a turn back, 3 = a
+    corner."""
     for corners, kind in ((2, habits.BEGIN_SEEN), (3, habits.CORNER_SEEN)):
         stage.begin()
         paths = Loops(np.random.default_rng(4), corners, 1.5)

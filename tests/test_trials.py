@@ -195,10 +195,12 @@ def test_turn_backs_are_as_their_counts_say():
     for row, *bins in zip(rows, *cells.values(), strict=True):
         for text, found in zip(row[1:3], bins, strict=True):
             of_body = found["moments"] - found["no_body"] - found["other_way"]
-            mean, _, turned = text.partition("; ")
+            mean, _, turned = text.strip(" |").partition("; ")
+            if of_body == 0:
+                assert mean == "-"
+                continue
             assert float(mean) == pytest.approx(100 * found["mean_probability"], abs=0.051)
-            assert turned == f"{100 * found['turned_back'] / of_body:.1f} of {of_body:,}"
-        assert float(row[3].strip(" |")) == pytest.approx(100 * bins[1]["turned"] / of_body, abs=0.051)
+            assert turned == f"{100 * found['turned'] / of_body:.1f} of {of_body:,}"
 
 
 @pytest.mark.parametrize(
