@@ -14,7 +14,7 @@ from uuvtai.config.task import TERMS
 from uuvtai.errors import SettingError, SizeError
 from uuvtai.kernels.core.grid import grid_shape
 from uuvtai.kernels.core.lanes import LANES
-from uuvtai.kernels.perception.mapping import map_period_s, scans_in
+from uuvtai.kernels.perception.mapping import look_period_s, scans_in
 from uuvtai.kernels.planning.clearance import offset_bits
 from uuvtai.kernels.planning.exposure import block_shape
 from uuvtai.native.gpu_shape import is_gpu_shaped
@@ -55,6 +55,7 @@ def array_sizes(config: Config, n_env: int, device: str = "cpu") -> dict[str, in
         **scenario_sizes(config.world),
         "n_ray": sensors.sonar.n_ray,
         "n_latency": sensors.sonar.latency_steps // sensors.sonar.period_steps + 2,
+        "n_echo": sensors.sonar.n_ray if sensors.sonar.mechanical else 1,
         "n_cloud": 8,
         "n_pixel_row": sensors.depth.rows,
         "n_pixel_col": sensors.depth.cols,
@@ -63,7 +64,7 @@ def array_sizes(config: Config, n_env: int, device: str = "cpu") -> dict[str, in
         "n_height": LANES,
         "n_turn": config.forecast.n_turn,
         "n_forecast": round(config.tracking.horizon_s / config.tracking.forecast_dt_s) + 1,
-        "n_future": max(1, len(config.forecast.turn_back_s)),
+        "n_future": max(1, 2 * len(config.forecast.turn_back_s)),
         "n_row": n_row,
         "n_col": n_col,
         "n_packet": n_col // LANES,
@@ -140,7 +141,7 @@ def _check_kernels(config: Config) -> None:
     try:
         offset_bits(config.clearance, mapping)
         for seconds in (mapping.free_confident_s, mapping.promote_s):
-            scans_in(seconds, map_period_s(mapping, sensors.sonar, config.episode))
+            scans_in(seconds, look_period_s(mapping, sensors.sonar, config.episode))
     except ValueError as error:
         raise SettingError(str(error)) from None
 

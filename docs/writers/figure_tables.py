@@ -11,6 +11,7 @@ from typing import Any
 from docs.writers.benchmark_pages import benchmark, benchmark_scenes
 from docs.writers.dead_tables import dead_commands, dead_thrusters
 from docs.writers.figure_sources import Counts, SourceError, Sources, fitting, pooled, rated, share, weighted
+from docs.writers.link_tables import closed_loop
 from docs.writers.pieces import BEFORE, CELLS, LETTERS, PIECES
 from docs.writers.pose_tables import pose_endings, pose_errors
 from docs.writers.replay_tables import changed, lossy, replayed
@@ -569,6 +570,7 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         replayed,
         changed,
         lossy,
+        closed_loop,
         sonars,
         vehicle_commands,
         vehicles,

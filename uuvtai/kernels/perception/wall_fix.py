@@ -18,6 +18,7 @@ from uuvtai.kernels.core.beams import beam_lanes
 from uuvtai.kernels.core.lanes import LANES, f16x, lane_bits
 from uuvtai.kernels.core.signature import Bundle, Out
 from uuvtai.kernels.perception.bundles import PoseIO
+from uuvtai.kernels.perception.echoes import is_new
 
 _BESIDE = 2
 """Beams on either side that are looked at together with one: most bodies are wider."""
@@ -124,12 +125,16 @@ def beside(values):
 
 @ti.func
 def read_beams(env, packet, io: Bundle[PoseIO]):
-    """Sixteen beams; ranges without the mean of their one-sided error."""
+    """Sixteen beams; ranges without the mean of their one-sided error. What a mechanical beam heard before
+    was used then: it counts as no return."""
     ahead, left = beam_lanes(0.0, packet * LANES, io.sensors_cfg.sonar)
     range_m, hit = f16x(0.0), f16x(0.0)
     for i in ti.static(range(LANES)):
         range_m[i] = io.scan.range_m[env, packet * LANES + i] - io.sensors_cfg.sonar.range_jitter_m
         hit[i] = ti.cast(io.scan.hit[env, packet * LANES + i], ti.f32)
+        if ti.static(io.sensors_cfg.sonar.mechanical):
+            if not is_new(env, packet * LANES + i, io.scan, io.sensors_cfg.sonar):
+                hit[i] = 0.0
     return Beams(ahead=ahead, left=left, range_m=range_m, hit=hit)
 
 
@@ -213,8 +218,9 @@ def unseen_returns(sensors_cfg, pose_cfg):
 
 
 def aim_variance(sensors_cfg, pose_cfg):
-    """[rad^2] of a beam's direction; plain Python."""
-    return pose_cfg.bearing_sigma_rad**2 + sensors_cfg.imu.attitude_sigma_rad**2
+    """[rad^2] of a beam's direction, which a wide beam has anywhere in its width; plain Python."""
+    width = sensors_cfg.sonar.half_width_rad
+    return pose_cfg.bearing_sigma_rad**2 + sensors_cfg.imu.attitude_sigma_rad**2 + width**2
 
 
 def doppler_variance(sensors_cfg):

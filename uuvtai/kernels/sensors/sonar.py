@@ -70,6 +70,8 @@ def clear_scan(env, io: Bundle[SonarIO]):
     io.scan.ping_yaw[env] = 0.0
     io.scan.ping_vel_b[env] = ti.zero(io.scan.ping_vel_b[env])
     io.scan.ping_vel_valid[env] = 0
+    io.scan.new_from[env] = 0
+    io.scan.new_count[env] = 0
 
 
 @ti.func
@@ -132,11 +134,17 @@ def show(env, first, step, range_m, doppler, intensity, io: Bundle[SonarIO]):
         io.scan.intensity[env, ray] = ti.select(hit, intensity[i], 0.0)
         io.scan.hit[env, ray] = ti.select(hit, 1, 0)
     if first == 0:
-        io.scan.ping_step[env] = step
-        io.scan.ping_pos_w[env] = io.ego.pos_w[env]
-        io.scan.ping_yaw[env] = io.ego.rpy[env][2]
-        io.scan.ping_vel_b[env] = io.ego.vel_b[env]
-        io.scan.ping_vel_valid[env] = io.ego.vel_valid[env]
+        note_ping(env, step, io)
+
+
+@ti.func
+def note_ping(env, step, io: Bundle[SonarIO]):
+    """Write the own state of a ping to the output."""
+    io.scan.ping_step[env] = step
+    io.scan.ping_pos_w[env] = io.ego.pos_w[env]
+    io.scan.ping_yaw[env] = io.ego.rpy[env][2]
+    io.scan.ping_vel_b[env] = io.ego.vel_b[env]
+    io.scan.ping_vel_valid[env] = io.ego.vel_valid[env]
 
 
 @ti.func
@@ -201,6 +209,12 @@ def measured(env, ray, step, io: Bundle[SonarIO]):
     ux, uy = beam_directions(ray, mount.heading, io)
     wedge = packet_wedge(packet, mount.heading, io)
     echo = nearest_echo(env, mount.pos[0], mount.pos[1], ux, uy, 0.0, wedge, True, io)
+    return reported(env, echo, ux, uy, mount, wedge, ray, step, io)
+
+
+@ti.func
+def reported(env, echo, ux, uy, mount, wedge, ray, step, io: Bundle[SonarIO]):
+    """What a sensor reports, errors included, of sixteen beams from number ``ray`` on that meet ``echo``."""
     cosine = -(ux * echo.normal_x + uy * echo.normal_y)
     own = ux * mount.vel[0] + uy * mount.vel[1]
     key = io.episode.key[env]

@@ -12,7 +12,7 @@ from uuvtai.kernels.core.signature import Bundle, Const, spread
 from uuvtai.kernels.perception.range_rate import range_rate
 from uuvtai.kernels.teacher.bundles import ThreatsIO
 from uuvtai.kernels.teacher.cruise_depth import choose_depth
-from uuvtai.kernels.teacher.sight import sight_share
+from uuvtai.kernels.teacher.sight import sight_share, sweep_share
 from uuvtai.kernels.teacher.trajectories import body_depths, held_heave, place_doubt
 from uuvtai.native.launch import quick_launch, without_cse
 
@@ -165,6 +165,8 @@ def _follow_velocity(env, io: Bundle[ThreatsIO]):
     ):  # across the way the hull is wider: let it turn first
         share *= 1.0 - 0.6 * sideways
     share *= sight_share(ti.atan2(level[1], level[0]) - io.ego.rpy[env][2], io.sonar_cfg, io.teacher_cfg)
+    age_s = io.clock.step[env] * ti.static(io.episode_cfg.control_dt_s)
+    share *= sweep_share(age_s, io.sonar_cfg, io.teacher_cfg)
     io.teacher.speed_share[env] = ti.select(io.route.n_way[env] > 0, share, 0.0)
     wanted = _unit(level) * cruising_speed(
         ti.static(io.teacher_cfg.cruise_m_s),
