@@ -9,7 +9,7 @@ import torch
 from tests.field_memory import look_in_memory
 
 BEGUN_FIRST = """
-cli tracking training world signals log_alone security sonar docs report deploy mapping media_formats
+cli tracking training cuda world signals log_alone security sonar docs report deploy mapping media_formats
 resume_eval proprioception sweep dynamics completion telemetry explain examples stack hostile_logs
 """
 """files of tests that take long, longest first: a process takes whole files, and none shall work alone at the

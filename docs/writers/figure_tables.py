@@ -532,19 +532,6 @@ def risk_bins(sources: Sources) -> str:
     return text_table(rows[0], rows[1:])
 
 
-def rehearsal(sources: Sources) -> str:
-    """CUDA without a GPU: what was assembled, counted and compared, and the MODEL of its speed."""
-    rows = [
-        [
-            row["what"],
-            "not done" if row["ours"] is None else f"{row['ours']:,.0f} {row['unit']}".strip(),
-            row["note"],
-        ]
-        for row in sources.benchmark("rehearsal")["rows"]
-    ]
-    return text_table(["", "", ""], rows)
-
-
 def _row(sources: Sources, what: str, text: str) -> dict[str, Any]:
     return next(row for row in sources.benchmark(what)["rows"] if row["what"] == text)
 
@@ -592,6 +579,5 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         chooser_trials,
         benchmark_scenes,
         benchmark,
-        rehearsal,
     )
 }
