@@ -53,6 +53,11 @@ def rows() -> list[Row]:
             850,
         ),
         _row(
+            "lines of a signature there, mean",
+            round(statistics.mean(_signature(node) for path, node in functions if path in counted), 2),
+            1.3,
+        ),
+        _row(
             f"lines of more than {LONG_LINE} characters",
             sum(len(line) > LONG_LINE for text in lines.values() for line in text),
             0,

@@ -603,6 +603,14 @@ KERNELS = (
         "packets_equal or breaks_the_tie",
     ),
     Mutation(
+        "gpu_beams_of_another_part",
+        "uuvtai/kernels/sensors/sonar.py",
+        "turned_beams(before, part * beams, io)",
+        "turned_beams(before, 0, io)",
+        "tests/test_cuda.py",
+        "same_bits",
+    ),
+    Mutation(
         "inverter_agrees",
         "uuvtai/kernels/teacher/tree_tick.py",
         "status = SUCCESS + FAILURE - answer",

@@ -3,16 +3,13 @@ them, from the sweeps ``dead_*``."""
 
 from __future__ import annotations
 
-import textwrap
-
 from docs.writers.figure_sources import Sources, pooled
+from docs.writers.markdown import command_block
 from uuvtai.tables.table import text_table
 
 _SWEEPS = ("dead_sensing", "dead_frames", "dead_hold", "dead_actuators")
 _AWAY = ("dead_away", "dead_away_hold")
 """thruster 4 dead, the tree told to keep away from floor and surface"""
-_WIDTH = 120
-"""characters of a line in a block of the page"""
 _WATCH, _DEAD = "actuation.watch_s", "disturbance.dead_thruster"
 _COUNTED = ("method", "episodes", "success", "contact", "ttc_stop", "out_of_tank", "timeout")
 
@@ -54,11 +51,4 @@ def _off_and_on(cells: dict[tuple[str, str], str], dead: str) -> str:
 def dead_commands(sources: Sources) -> str:
     """What made the sweeps."""
     about = sources.json("docs/data/sweeps.json")
-    commands = (_broken(about[name]["command"]) for name in (*_SWEEPS, *_AWAY))
-    return "\n".join(["```sh", *commands, "```"])
-
-
-def _broken(command: str) -> str:
-    """A command on as many lines as a page is wide."""
-    lines = textwrap.wrap(command, _WIDTH, break_long_words=False, break_on_hyphens=False)
-    return " \\\n  ".join(lines)
+    return command_block(about[name]["command"] for name in (*_SWEEPS, *_AWAY))

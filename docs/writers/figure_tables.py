@@ -10,12 +10,13 @@ from typing import Any
 
 from docs.writers.benchmark_pages import benchmark, benchmark_scenes
 from docs.writers.dead_tables import dead_commands, dead_thrusters
-from docs.writers.figure_sources import Counts, SourceError, Sources, fitting, pooled, weighted
+from docs.writers.figure_sources import Counts, SourceError, Sources, fitting, pooled, rated, share, weighted
 from docs.writers.link_tables import closed_loop
 from docs.writers.pieces import BEFORE, CELLS, LETTERS, PIECES
 from docs.writers.pose_tables import pose_endings, pose_errors
 from docs.writers.replay_tables import changed, lossy, replayed
 from docs.writers.sonar_tables import sonars
+from docs.writers.vehicle_tables import vehicle_commands, vehicles
 from uuvtai.measure.reproduce import paper
 from uuvtai.measure.reproduce.steps import RETIRED_SEEDS
 from uuvtai.outcomes import COLLIDED
@@ -25,17 +26,6 @@ from uuvtai.tables.table import text_table
 
 DASH = "-"
 """what was not measured or not kept"""
-
-
-def share(counts: Counts, ending: str) -> str:
-    """'490/500 = 98.0 % [96.3, 98.9]'."""
-    return f"{counts.field(ending + '_of')} = {rated(counts, ending)}"
-
-
-def rated(counts: Counts, ending: str) -> str:
-    """'98.0 % [96.3, 98.9]': rate and 95 % Wilson interval."""
-    low, high = (100 * counts.field(f"{ending}_{end}") for end in ("low", "high"))
-    return f"{100 * counts.field(ending + '_rate'):.1f} % [{low:.1f}, {high:.1f}]"
 
 
 # ------------------------------------------------------------------------------------------------ evaluations
@@ -542,6 +532,19 @@ def risk_bins(sources: Sources) -> str:
     return text_table(rows[0], rows[1:])
 
 
+def rehearsal(sources: Sources) -> str:
+    """CUDA without a GPU: what was assembled, counted and compared, and the MODEL of its speed."""
+    rows = [
+        [
+            row["what"],
+            "not done" if row["ours"] is None else f"{row['ours']:,.0f} {row['unit']}".strip(),
+            row["note"],
+        ]
+        for row in sources.benchmark("rehearsal")["rows"]
+    ]
+    return text_table(["", "", ""], rows)
+
+
 def _row(sources: Sources, what: str, text: str) -> dict[str, Any]:
     return next(row for row in sources.benchmark(what)["rows"] if row["what"] == text)
 
@@ -582,10 +585,13 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         lossy,
         closed_loop,
         sonars,
+        vehicle_commands,
+        vehicles,
         twin_curve,
         twin_policy,
         chooser_trials,
         benchmark_scenes,
         benchmark,
+        rehearsal,
     )
 }

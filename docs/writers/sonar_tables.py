@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from docs.writers.figure_sources import Counts, Sources
+from docs.writers.figure_sources import Counts, Sources, rated, share
 from docs.writers.pieces import LETTERS
 from docs.writers.sonar_trials import CELLS, FILE, KINDS
 from uuvtai.statistics import mcnemar_p
@@ -15,12 +15,13 @@ _SHOWN_CAUSES = 3
 
 def sonars(sources: Sources) -> str:
     """A row for each sonar and scene: rates with intervals, time, against the first sonar on the same
-    episodes, and the most frequent causes."""
+    episodes, and the most frequent causes; of those that were played."""
     played = {(row["sonar"], row["cell"]): row for row in sources.json(FILE)["rows"]}
     rows = [
         _row(played[kind.title, cell], played[KINDS[0].title, cell])
         for cell, _options in CELLS
         for kind in KINDS
+        if (kind.title, cell) in played
     ]
     head = ["sonar", "world (S, D, v in m/s)", "success", "collision", "time to goal"]
     head += ["only the first, only this arrives; exact McNemar p", "most frequent causes of failure"]
@@ -35,17 +36,12 @@ def _row(own: dict[str, Any], first: dict[str, Any]) -> list[str]:
     return [
         own["sonar"],
         f"`{own['cell']}`",
-        f"{counts.field('success_of')} = {_rated(counts, 'success')}",
-        _rated(counts, "collision"),
+        share(counts, "success"),
+        rated(counts, "collision"),
         f"{sum(arrived) / max(1, len(arrived)):.1f} s",
         "" if own is first else _beside(first["outcomes"], outcomes),
         ", ".join(f"{label} {count}" for label, count in causes),
     ]
-
-
-def _rated(counts: Counts, ending: str) -> str:
-    low, high = (100 * counts.field(f"{ending}_{end}") for end in ("low", "high"))
-    return f"{100 * counts.field(f'{ending}_rate'):.1f} % [{low:.1f}, {high:.1f}]"
 
 
 def _beside(first: str, own: str) -> str:

@@ -132,6 +132,9 @@ class TeacherConfig(Section):
     sight_margin_deg: NonNegative = 20.0
     """where the sonar is a fan ahead, the way is kept so far within its edge: the nose turns, and beyond that
     the vehicle slows down, to a stop at the edge"""
+    sweep_way_m: Positive = 1.0
+    """with a mechanical sonar the vehicle drives no farther along its route while the beam comes round once,
+    and waits for the first sweep"""
     yaw_gain: Positive = 2.5
     """[1/s]"""
     max_node: PositiveCount = 64
