@@ -3,6 +3,7 @@
 ArduSub is GPL 3 and no part of this project. ``UUV_ARDUSUB`` names its binary (``waf configure --board
 sitl``, ``waf sub``), ``UUV_ARDUSUB_EPISODES`` how many episodes of the pool are driven (default 20). Without
 it there is nothing to measure. Everything runs by the water's clock, so that a slow machine changes nothing.
+**This was never run against ArduSub yet.**
 """
 
 from __future__ import annotations

@@ -672,7 +672,7 @@ LINK = (
         "if all(map(math.isfinite, view.rpy)) else math.nan",
         "if all(map(math.isfinite, view.rpy)) else 1.0",
         "tests/test_safety.py",
-        "tilted",
+        "goes_wrong",
     ),
     Mutation(
         "surfacing_is_not_for_good",
@@ -712,7 +712,7 @@ LINK = (
         'return "again" if waited_s >= DOUBLED_S else "ignore"',
         'return "again"',
         "tests/test_sitl.py",
-        "asks_for and not ardusub",
+        "packet_asks_for",
     ),
     Mutation(
         "motors_turn_the_other_way",
