@@ -22,7 +22,18 @@ from uuvtai.copying import copied_rows
 from uuvtai.initial import allocate_state, fill_constants
 from uuvtai.kernels.baselines import dynamic_window, path_integral, potential_field, velocity_obstacle
 from uuvtai.kernels.core.rows import copy_rows
-from uuvtai.kernels.perception import elevation, forecast, futures, look, mapping, pose, spotting, tracking
+from uuvtai.kernels.perception import (
+    elevation,
+    forecast,
+    futures,
+    look,
+    mapping,
+    mixture,
+    motion_columns,
+    pose,
+    spotting,
+    tracking,
+)
 from uuvtai.kernels.planning import clearance, exposure, features, route, triggers, voronoi
 from uuvtai.kernels.privileged import true_map, true_tracks
 from uuvtai.kernels.sensors import depth, proprioception, sonar
@@ -30,6 +41,7 @@ from uuvtai.kernels.task import episode, reward
 from uuvtai.kernels.teacher import evasion, leaves, threats
 from uuvtai.kernels.vehicle import actuation, dynamics, lost_thruster
 from uuvtai.kernels.world import scenarios
+from uuvtai.mixture_weights import put_weights, read_weights
 from uuvtai.native.making import adopt
 from uuvtai.rrt import RouteFallback, RoutePlanner
 from uuvtai.runtime import start_taichi
@@ -74,6 +86,7 @@ class Sim:
         runtime = start_taichi(device)
         self.device = torch.device(runtime.device)
         check_size(config, num_envs, runtime.device)
+        learned = read_weights(config.forecast.learned) if config.forecast.learned else {}
         self.s = allocate_state(array_sizes(config, num_envs, runtime.device))
         self.io = bind_all(Stages, self.s, config.model_copy(update={"world": config.world.compiled()}))
         self.action = torch.zeros(num_envs, 4, device=self.device)
@@ -96,6 +109,7 @@ class Sim:
         self.use_tree(tree)
         self.set_scenes()
         fill_constants(self.s, config, self._put)
+        put_weights(self.s.mixture, learned, self._put)
 
     def use_tree(self, tree: FlatTree) -> None:
         """Drive by another behaviour tree from the next tick on: nothing is compiled again."""
@@ -203,6 +217,11 @@ class Sim:
         forecast.forecast_tracks(io.forecast)
         if c.forecast.turn_back_s:
             futures.weigh_futures(io.futures)
+        if c.forecast.learned or c.forecast.keep_columns:
+            motion_columns.remember_past(io.past)
+            motion_columns.describe_motion(io.past)
+        if c.forecast.learned:
+            mixture.mix_futures(io.mixture)
         elevation.bound_heights(io.heights)
 
     def _has_baseline(self) -> bool:
@@ -254,6 +273,8 @@ class Sim:
         depth.reset_depth(io.depth)
         tracking.reset_tracks(io.tracking)
         forecast.reset_forecast(io.forecast)
+        if self.config.forecast.learned or self.config.forecast.keep_columns:
+            motion_columns.reset_past(io.past)
         mapping.reset_map(io.mapping)
         if self.config.quiet.weight_seen > 0:
             exposure.reset_exposure(io.exposure)

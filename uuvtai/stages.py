@@ -22,6 +22,8 @@ from uuvtai.kernels.perception.bundles import (
     HeightsIO,
     LookIO,
     MappingIO,
+    MixtureIO,
+    PastIO,
     PoseIO,
     SpottingIO,
     TrackingIO,
@@ -91,6 +93,8 @@ class SimState:
     habits: state.HabitState
     forecast: state.ForecastState
     futures: state.FutureState
+    past: state.PastState
+    mixture: state.MixtureState
     mask: state.GridMask
     grid_map: state.MapState
     map_scratch: state.MapScratch
@@ -125,6 +129,8 @@ class Stages:
     true_tracks: TrueTracksIO
     forecast: ForecastIO
     futures: FuturesIO
+    past: PastIO
+    mixture: MixtureIO
     heights: HeightsIO
     mapping: MappingIO
     true_map: TrueMapIO
