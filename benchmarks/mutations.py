@@ -639,6 +639,33 @@ TWIN = (
     ),
 )
 
-ALL = (*KERNELS, *STATISTICS, *LEARNING, *TWIN)
+FORECAST = (
+    Mutation(
+        "future_faster_than_the_body",
+        "uuvtai/kernels/perception/mixture.py",
+        "step * ti.min(1.0, speed * dt",
+        "step * ti.min(1.0, 9.0 * dt",
+        "tests/test_mixture.py",
+        "says_what_the_network_says",
+    ),
+    Mutation(
+        "new_track_keeps_the_past",
+        "uuvtai/kernels/perception/motion_columns.py",
+        "io.tracks.alive[env, track] == 0 or io.tracks.age[env, track] == 0",
+        "io.tracks.alive[env, track] == 0",
+        "tests/test_mixture.py",
+        "new_track",
+    ),
+    Mutation(
+        "mixture_of_certain_futures",
+        "uuvtai/learn/mixture_net.py",
+        "torch.logsumexp(mixture.log_weight + log_density, -1)",
+        "torch.logsumexp(log_density, -1)",
+        "tests/test_learned_forecast.py",
+        "likelihood_is_that",
+    ),
+)
+
+ALL = (*KERNELS, *STATISTICS, *LEARNING, *TWIN, *FORECAST)
 QUICK = ("scale_dropped", "popart_norm", "wilson_half_width")
 """names of three that need no kernel"""

@@ -258,7 +258,7 @@ class ForecasterConfig(Section):
     """control steps after which an episode is left"""
     memory: Annotated[int, Field(ge=1024, le=2**23)] = 2**21
     """moments of tracks that are kept to learn from"""
-    minibatches: PositiveCount = 2000
+    minibatches: PositiveCount = 3000
     """steps of the network per iteration"""
     minibatch: PositiveCount = 512
     """moments in one of them"""

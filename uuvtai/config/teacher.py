@@ -49,6 +49,11 @@ class TeacherConfig(Section):
     """futures that are less probable are left out,"""
     heed_share: Fraction = 0.2
     """and those that are less probable than this cost, but are no reason to evade"""
+    surprise_s: Positive = 9.0
+    """a future counts until so long after it has parted from the forecast: by then it is seen, and something
+    else is done"""
+    forecast_counts_fully: bool = False
+    """the forecast counts as if it were certain, the other futures on top; off: each by its probability"""
     future_margin: Fraction = 1.0
     """margin kept from a body that does something else than is forecast, as a share of the usual one"""
     caution: Positive = 1.0
