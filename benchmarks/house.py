@@ -17,8 +17,13 @@ MANY_ARGUMENTS, LONG_LINE, LONG_FUNCTION, DEEP = 9, 110, 60, 4
 _NESTS = (ast.For, ast.While, ast.If, ast.With, ast.Try)
 
 
-def measure(job: Job) -> list[Row]:
-    """The table; a floor is what we want of the figure."""
+def measure(_job: Job) -> list[Row]:
+    """The table."""
+    return rows()
+
+
+def rows() -> list[Row]:
+    """Every figure; a floor is what we want of it."""
     trees = {path: ast.parse(path.read_text(encoding="utf-8")) for path in sorted(PACKAGE.rglob("*.py"))}
     functions = [
         (path, node)

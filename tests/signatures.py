@@ -26,7 +26,9 @@ def bundles():
             found |= {
                 name: kind
                 for name, kind in vars(module).items()
-                if dataclasses.is_dataclass(kind) and kind.__module__ == module.__name__
+                if dataclasses.is_dataclass(kind)
+                and kind.__module__ == module.__name__
+                and not name.endswith("Stages")  # the list of the room's bundles
             }
     return found
 

@@ -244,10 +244,14 @@ def test_only_the_runtime_starts_taichi():
         assert ("ti.init" in calls) == (path.name == "runtime.py")
 
 
-def test_only_sim_plant_and_the_fallback_launch_kernels():
+LAUNCHERS = ("sim", "stack", "sensing", "mission", "plant", "rrt")
+"""files that run stages: of thousands of vehicles, of one on board, of one without a world"""
+
+
+def test_only_those_who_run_stages_launch_kernels():
     stages = {signatures.module_of(path) for path in FILES if "@ti.kernel" in path.read_text()}
     for path in PACKAGE.rglob("*.py"):
-        if KERNELS in path.parents or path.stem in ("sim", "plant", "rrt"):
+        if KERNELS in path.parents or path.stem in LAUNCHERS:
             continue
         modules = {i.split(".")[-1] for i in imports_of(path) if i in stages}
         launched = {

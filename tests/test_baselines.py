@@ -294,7 +294,7 @@ def test_nothing_of_them_runs_under_another_tree(small, monkeypatch):
     launched = []
     for name, (kernel, noun) in PLANNERS.items():
         monkeypatch.setattr(
-            f"uuvtai.sim.{noun}.{kernel.__name__}", lambda io, name=name: launched.append(name)
+            f"uuvtai.stack.{noun}.{kernel.__name__}", lambda io, name=name: launched.append(name)
         )
     for name in ("bt", "planner", "straight", *PLANNERS):
         small.sim.use_tree(read_tree(name))

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from tests.conftest import configure, estimate_pose
+from uuvtai import stack
 from uuvtai.capture import capture
 from uuvtai.kernels.perception import pose
 from uuvtai.kernels.planning import features
@@ -49,7 +50,7 @@ class Poison:
 
     def during(self, sim, patch):
         """From now on be on from the first kernel of tracking to the last that writes the observation."""
-        track, observe, planned_with = sim._track, sim._observe, sim._plan_seed
+        track, observe, planned_with = stack.track, stack.observe, sim._plan_seed
         predict, correct = pose.predict_pose, pose.correct_pose
 
         def poisoned(stage):
@@ -62,12 +63,12 @@ class Poison:
 
             return run
 
-        def poisoned_track():
+        def poisoned_track(io, config, privileged):
             self.on()
-            track()
+            track(io, config, privileged)
 
-        def poisoned_observe(obs):
-            observe(obs)
+        def poisoned_observe(io, columns, out):
+            observe(io, columns, out)
             self.off()
 
         def seed_of(env):
@@ -81,8 +82,8 @@ class Poison:
 
         patch.setattr(pose, "predict_pose", poisoned(predict))
         patch.setattr(pose, "correct_pose", poisoned(correct))
-        patch.setattr(sim, "_track", poisoned_track)
-        patch.setattr(sim, "_observe", poisoned_observe)
+        patch.setattr(stack, "track", poisoned_track)
+        patch.setattr(stack, "observe", poisoned_observe)
         patch.setattr(sim, "_plan_seed", seed_of)
 
 
@@ -199,6 +200,6 @@ def test_the_true_pose_in_place_of_the_estimate_is_found(watched, monkeypatch):
         elevation.bound_heights,
         dataclasses.replace(watched.sim.io.heights, ego=watched.sim.s.vehicle),
     )
-    monkeypatch.setattr("uuvtai.sim.elevation.bound_heights", lambda _io: honest(leaking))
+    monkeypatch.setattr("uuvtai.stack.elevation.bound_heights", lambda _io: honest(leaking))
     _, differing, _ = compared(watched)
     assert {"forecast.above_w", "observation"} & set(differing)

@@ -15,6 +15,7 @@ import pytest
 import uuvtai
 from tests.conftest import SmallSim
 from uuvtai import signals
+from uuvtai.logs.repair import repair
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 
@@ -75,6 +76,54 @@ def test_a_signal_whose_exception_was_swallowed_still_stops_a_training(tmp_path,
     process = started(tmp_path, program=_SWALLOWED.format(name=number.name))
     out, err = process.communicate(timeout=60)
     assert (out.strip(), process.returncode) == ("True", 0), err
+
+
+_WITHIN_A_WRITE = """
+import os, signal, sys
+from pathlib import Path
+from uuvtai import signals
+from uuvtai.logs import container
+
+signals.install()
+signals.engage()
+calls, make = [], container.zstandard.ZstdCompressor
+
+class Signalling:
+    def __init__(self, level):
+        self._inner = make(level=level).compressobj()
+    def compressobj(self):
+        return self
+    def compress(self, data):
+        return self._inner.compress(data)
+    def flush(self, mode):
+        packed = self._inner.flush(mode)
+        calls.append(mode)
+        if len(calls) == {call}:
+            os.kill(os.getpid(), signal.SIGINT)
+        return packed
+
+container.zstandard.ZstdCompressor = Signalling
+file = container.McapFile(Path("cut.mcap"))
+channel = file.add_channel("/numbers", 0)
+written = 0
+try:
+    while True:
+        file.add_message(channel, written, os.urandom(100))
+        written += 1
+        file.settle()
+except signals.Interrupted:
+    file.leave()
+    print(written)
+"""
+
+
+@pytest.mark.parametrize("call", [1, 2, 150])
+def test_a_signal_within_a_write_loses_no_message(tmp_path, call):
+    """The first and second block of a chunk, and one of a later chunk."""
+    process = started(tmp_path, program=_WITHIN_A_WRITE.format(call=call))
+    out, err = process.communicate(timeout=60)
+    found = repair(tmp_path / "cut.mcap.part")
+    assert found.messages == int(out) > 0, err
 
 
 @pytest.mark.parametrize("number", BOTH)

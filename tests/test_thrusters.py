@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from uuvtai.kernels.vehicle.rotor import KGF, edge_rpm, thrust_at, thrust_limits
-from uuvtai.loader import load_config
+from uuvtai.loader import ConfigError, load_config
 
 TABLE = Path(__file__).parents[1] / "docs" / "data" / "t200.csv"
 RMS_KGF = 0.05
@@ -56,6 +56,33 @@ def test_16_volts_push_as_hard_as_the_pack_can():
     assert abs(astern - measured[np.argmin(speed)]) < RMS_KGF * KGF
     assert 0.95 * measured.max() < ahead <= measured.max()
     assert vehicle.dead_band_rpm == (speed[speed > 0].min(), -speed[speed < 0].max())
+
+
+@pytest.mark.parametrize("voltage", [10, 12, 14, 16, 18, 20])
+def test_a_pack_pushes_as_hard_as_the_maker_measured(voltage):
+    """One limit serves both ways, so it is the slower one's; the curve is that of 16 V."""
+    settings = [("vehicle.battery_v", voltage)]
+    vehicle = load_config("open", vehicle="bluerov2_16v", overrides=settings).vehicle
+    speed, measured = table(voltage)
+    assert vehicle.top_rpm == min(speed.max(), -speed.min())
+    ahead, astern = thrust_limits(vehicle)
+    slower = measured.min() if -speed.min() <= speed.max() else measured.max()
+    ours = astern if -speed.min() <= speed.max() else ahead
+    assert abs(ours - slower) < 0.15 * KGF, "the fit at 16 V is off by up to 0.14 kgf at other voltages"
+    assert 0.9 * measured.max() < ahead <= measured.max() + RMS_KGF * KGF
+
+
+def test_a_voltage_between_two_of_the_table_lies_between_them():
+    speeds = [load_config("open", overrides=[("vehicle.battery_v", v)]).vehicle.top_rpm for v in (14, 15, 16)]
+    assert speeds[1] == 0.5 * (speeds[0] + speeds[2])
+    vehicle = load_config("open", vehicle="bluerov2_16v", overrides=["vehicle.battery_v=null"]).vehicle
+    assert vehicle.top_rpm == 3900.0, "without a pack the vehicle's own limit counts"
+
+
+@pytest.mark.parametrize("volts", ["9.9", "21", "nan", "full"])
+def test_a_voltage_beyond_the_table_is_refused(volts):
+    with pytest.raises(ConfigError, match="battery_v"):
+        load_config("open", overrides=[f"vehicle.battery_v={volts}"])
 
 
 def test_the_papers_vehicle_keeps_its_20_volts():

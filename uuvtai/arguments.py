@@ -49,6 +49,12 @@ def refuse_less(option: str, value: int, least: int) -> None:
         raise UsageError(f"{option} {value}: must be at least {least}")
 
 
+def refuse_no_duration(option: str, seconds: float) -> None:
+    """UsageError for a duration that is none."""
+    if not math.isfinite(seconds) or seconds <= 0:
+        raise UsageError(f"{option} {seconds}: must be a positive number, for example {option} 10")
+
+
 def drivers(
     runs: list[str] | None, controller: list[str] | None, planner: list[str] | None, policy: list[str] | None
 ) -> tuple[list[str], list[str]]:

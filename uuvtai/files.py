@@ -9,7 +9,7 @@ import math
 import os
 import re
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -193,6 +193,14 @@ def flush(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+def output_beside(sources: Sequence[Path], out: Path | None, suffix: str, force: bool) -> Path:
+    """Where to write what is made of files: ``out``, or the first one's name with another ending. Raises as
+    ``refuse_output``."""
+    target = out or sources[0].with_suffix(suffix)
+    refuse_output(target, sources, force)
+    return target
 
 
 def refuse_output(out: Path, inputs: Iterable[Path], force: bool) -> None:

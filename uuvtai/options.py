@@ -249,6 +249,10 @@ DriveRate = Annotated[
     float, Option("--rate", help="Seconds of the episode in one of the clock's; 0.5 gives you time to think.")
 ]
 
+UseGamepad = Annotated[
+    bool, Option("--gamepad", help="Steer by the first gamepad too (pip install 'uuvtai\\[gamepad]').")
+]
+
 # ------------------------------------------------------------------------------------------------------ sweep
 
 SweepRuns = Annotated[list[str] | None, _players("[RUN]...", "Trained policies, as for eval.")]

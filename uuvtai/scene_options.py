@@ -40,12 +40,18 @@ class SceneOptions:
         given: list[Setting] = [(key, value) for key, value in typed.items() if value is not None]
         return [*given, *(self.overrides or [])]
 
+    @property
+    def world_name(self) -> str:
+        """The world, the default one where none was typed."""
+        from uuvtai.loader import DEFAULT_WORLD
+
+        return DEFAULT_WORLD if self.world is None else self.world
+
     def config(self, first: Sequence[Setting] = ()) -> Config:
         """Config of the presets, ``first`` and the settings. Raises ConfigError."""
-        from uuvtai.loader import DEFAULT_WORLD, load_config
+        from uuvtai.loader import load_config
 
-        world = DEFAULT_WORLD if self.world is None else self.world
-        return load_config(world, self.sensors, self.vehicle, [*first, *self.settings])
+        return load_config(self.world_name, self.sensors, self.vehicle, [*first, *self.settings])
 
     def training(self, preset: str, first: Sequence[Setting] = ()) -> LearningConfig:
         """Config of a training preset in this scene, ``first`` and the settings. Raises ConfigError."""

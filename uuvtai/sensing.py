@@ -2,23 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Protocol
 
+from uuvtai.kernels.sensors import depth, proprioception, sonar
 from uuvtai.stages import Stages
-
-
-@dataclass(frozen=True)
-class Mission:
-    """What a vehicle is told before it begins."""
-
-    start: tuple[float, float, float]
-    """[m] world, where it begins"""
-    goal: tuple[float, float, float]
-    """[m] world"""
-    seed: int = 0
-    """with ``episode``: of the fallback planner's random numbers"""
-    episode: int = 0
 
 
 class SensorSource(Protocol):
@@ -36,3 +23,26 @@ class SensorSource(Protocol):
     def sense_depth(self, stages: Stages) -> None:
         """``image``; by now the pose filter has used the scan."""
         ...
+
+
+class SimulatedSensors:
+    """The simulator's own: from the truth, with errors as configured."""
+
+    def sense_motion(self, stages: Stages) -> None:
+        """All instruments but sonar and camera."""
+        proprioception.sense_proprioception(stages.proprioception)
+
+    def sense_sonar(self, stages: Stages) -> None:
+        """The ring or fan of beams."""
+        sonar.cast_sonar(stages.sonar)
+
+    def sense_depth(self, stages: Stages) -> None:
+        """The depth camera."""
+        depth.cast_depth(stages.depth)
+
+
+def forget_readings(stages: Stages) -> None:
+    """No reading yet in the rows that are awake, whoever fills them."""
+    proprioception.reset_proprioception(stages.proprioception)
+    sonar.reset_sonar(stages.sonar)
+    depth.reset_depth(stages.depth)

@@ -4,7 +4,8 @@ exception that tidies up.
 Standard library only, and little of it: the entry point imports this before anything else. Until ``engage``
 is called (a run folder, a file under way) a signal says "interrupted" and ends the process on the spot. From
 then on it raises ``Interrupted``, a KeyboardInterrupt, so that ``finally`` clauses do their work; not in the
-middle of an import or of a finaliser, where exceptions get lost, but right after. The second signal of a kind
+middle of an import or of a finaliser, where exceptions get lost, nor in the middle of a write that would be
+left half done (``never_within``), but right after. The second signal of a kind
 is the system's own affair: it ends the process at once, even while compiled code holds the interpreter.
 """
 
@@ -28,6 +29,7 @@ _LINUX_FLAGS_AT, _RESET_HAND = 8 + 128, 0x80000000
 """struct sigaction of glibc and musl on 64 bits: handler, 128 bytes of mask, flags"""
 
 _received: list[int] = []
+_unbroken: set[str] = set()
 _installed: list[bool] = []
 _engaged: list[bool] = []
 _finished: list[int] = []
@@ -69,6 +71,11 @@ def reinstall() -> None:
 def engage() -> None:
     """From now on there is something to tidy up."""
     _engaged[:] = [True]
+
+
+def never_within(file: str) -> None:
+    """From now on no signal raises while a function of this source file runs: call it with ``__file__``."""
+    _unbroken.add(file)
 
 
 class StopEvent:
@@ -160,11 +167,12 @@ def _deliver(_number: int, frame: FrameType | None) -> None:
 
 def _ignores_signals(frame: FrameType | None) -> bool:
     """Whether an exception would get lost here: in an import (extension modules make other errors of it), in
-    a finaliser."""
+    a finaliser; or would leave a file half written."""
     if not hasattr(signal, "setitimer"):
         return False
     while frame is not None:
-        if frame.f_code.co_filename in _LOADERS or frame.f_code.co_name == "__del__":
+        file = frame.f_code.co_filename
+        if file in _LOADERS or file in _unbroken or frame.f_code.co_name == "__del__":
             return True
         frame = frame.f_back
     return False

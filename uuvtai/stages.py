@@ -9,39 +9,23 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from uuvtai import state
-from uuvtai.kernels.baselines.bundles import (
-    DynamicWindowIO,
-    PathIntegralIO,
-    PotentialFieldIO,
-    VelocityObstacleIO,
-)
-from uuvtai.kernels.perception.bundles import (
-    ForecastIO,
-    FuturesIO,
-    HeightsIO,
-    LookIO,
-    MappingIO,
-    MixtureIO,
-    PastIO,
-    PoseIO,
-    SpottingIO,
-    TrackingIO,
-)
-from uuvtai.kernels.planning.bundles import (
-    ClearanceIO,
-    ExposureIO,
-    FeaturesIO,
-    RouteIO,
-    TriggersIO,
-    VoronoiIO,
-)
-from uuvtai.kernels.privileged.bundles import TrueMapIO, TrueTracksIO
-from uuvtai.kernels.sensors.bundles import DepthIO, ProprioceptionIO, SonarIO
-from uuvtai.kernels.task.bundles import EpisodeIO, RewardIO
-from uuvtai.kernels.teacher.bundles import EvasionIO, TeacherIO, ThreatsIO
-from uuvtai.kernels.vehicle.bundles import ActuationIO, DynamicsIO, ThrusterWatchIO
-from uuvtai.kernels.world.bundles import WorldIO
+from uuvtai.kernels.baselines.bundles import BaselineStages
+from uuvtai.kernels.perception.bundles import PerceptionStages
+from uuvtai.kernels.planning.bundles import PlanningStages
+from uuvtai.kernels.privileged.bundles import PrivilegedStages
+from uuvtai.kernels.sensors.bundles import SensorStages
+from uuvtai.kernels.task.bundles import TaskStages
+from uuvtai.kernels.teacher.bundles import TeacherStages
+from uuvtai.kernels.vehicle.bundles import VehicleStages
+from uuvtai.kernels.world.bundles import WorldStages
+from uuvtai.state.baselines import BaselineStructs
+from uuvtai.state.perception import PerceptionStructs
+from uuvtai.state.planning import PlanningStructs
+from uuvtai.state.sensors import SensorStructs
+from uuvtai.state.task import TaskStructs
+from uuvtai.state.teacher import TeacherStructs
+from uuvtai.state.vehicle import VehicleStructs
+from uuvtai.state.world import WorldStructs
 
 STAGES = (
     "dynamics", "world", "proprioception", "sonar", "pose", "depth", "tracking",
@@ -64,87 +48,29 @@ def timed_stage(name: str, stage_s: dict[str, float] | None) -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class SimState:
+class SimState(
+    TaskStructs,
+    WorldStructs,
+    VehicleStructs,
+    SensorStructs,
+    PerceptionStructs,
+    PlanningStructs,
+    TeacherStructs,
+    BaselineStructs,
+):
     """Every struct of the simulator, by the noun of its stage."""
-
-    clock: state.ClockState
-    episode: state.EpisodeState
-    vehicle: state.VehicleState
-    params: state.VehicleParams
-    actuation: state.ActuationState
-    allocation: state.Allocation
-    current: state.CurrentState
-    scene: state.SceneState
-    world: state.WorldState
-    path: state.PathState
-    fixed: state.FixedTable
-    scratch: state.ScenarioScratch
-    mission: state.MissionState
-    referee: state.RefereeState
-    ego: state.Proprioception
-    ego_memory: state.ProprioceptionMemory
-    scan: state.SonarScan
-    sonar_memory: state.SonarMemory
-    image: state.DepthImage
-    pose: state.PoseState
-    tracks: state.TrackState
-    clusters: state.ClusterState
-    spots: state.SpotState
-    habits: state.HabitState
-    forecast: state.ForecastState
-    futures: state.FutureState
-    past: state.PastState
-    mixture: state.MixtureState
-    mask: state.GridMask
-    grid_map: state.MapState
-    map_scratch: state.MapScratch
-    clearance: state.ClearanceState
-    clearance_memory: state.ClearanceMemory
-    exposure: state.ExposureState
-    voronoi: state.VoronoiState
-    route: state.RouteState
-    features: state.FeatureState
-    teacher: state.TeacherState
-    table: state.TreeTable
-    reward: state.RewardState
-    baselines: state.BaselineState
 
 
 @dataclass(frozen=True)
-class Stages:
+class Stages(
+    TaskStages,
+    WorldStages,
+    VehicleStages,
+    SensorStages,
+    PerceptionStages,
+    PlanningStages,
+    TeacherStages,
+    BaselineStages,
+    PrivilegedStages,
+):
     """What every stage reads and writes, by the noun of the stage."""
-
-    episode: EpisodeIO
-    world: WorldIO
-    thrusters: ThrusterWatchIO
-    actuation: ActuationIO
-    dynamics: DynamicsIO
-    proprioception: ProprioceptionIO
-    sonar: SonarIO
-    depth: DepthIO
-    pose: PoseIO
-    tracking: TrackingIO
-    spotting: SpottingIO
-    look: LookIO
-    true_tracks: TrueTracksIO
-    forecast: ForecastIO
-    futures: FuturesIO
-    past: PastIO
-    mixture: MixtureIO
-    heights: HeightsIO
-    mapping: MappingIO
-    true_map: TrueMapIO
-    clearance: ClearanceIO
-    exposure: ExposureIO
-    features: FeaturesIO
-    triggers: TriggersIO
-    voronoi: VoronoiIO
-    route: RouteIO
-    threats: ThreatsIO
-    evasion: EvasionIO
-    dynamic_window: DynamicWindowIO
-    potential_field: PotentialFieldIO
-    velocity_obstacle: VelocityObstacleIO
-    path_integral: PathIntegralIO
-    teacher: TeacherIO
-    reward: RewardIO

@@ -24,6 +24,16 @@ class Shape:
     num_envs: int
 
 
+def shapes_of(scenes: Sequence[SceneOptions], sizes: Sequence[int]) -> list[Shape]:
+    """Every scene in every size. ConfigError, and ValueError or MemoryError for sizes that cannot work."""
+    from uuvtai.sizes import check_size
+
+    shapes = [Shape(scene, size) for scene in scenes for size in sizes]
+    for shape in shapes:
+        check_size(shape.scene.config(), shape.num_envs, "cpu")
+    return shapes
+
+
 def warm(shapes: Sequence[Shape], workers: int | None = None) -> list[dict[str, Any]]:
     """Compile every shape, ``workers`` processes side by side (default: one per core); an entry per shape:
     world, sensors, num_envs, kernels compiled and found, seconds [s].

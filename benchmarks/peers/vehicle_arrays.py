@@ -131,7 +131,7 @@ class Vehicles:
                 xp.where(sign * thrust >= 0.5 * least, edge, 0.0),
             )
             rpm = xp.where((thrust > 0) if sign > 0 else (thrust <= 0), branch, rpm)
-        return xp.clip(rpm, -v.rotor_max_rpm, v.rotor_max_rpm)
+        return xp.clip(rpm, -v.top_rpm, v.top_rpm)
 
     # ----------------------------------------------------------------------------------------------- dynamics
 

@@ -4,6 +4,7 @@ them, from the sweeps ``dead_*``."""
 from __future__ import annotations
 
 from docs.writers.figure_sources import Sources, pooled
+from docs.writers.markdown import command_block
 from uuvtai.tables.table import text_table
 
 _SWEEPS = ("dead_sensing", "dead_frames", "dead_hold", "dead_actuators")
@@ -50,4 +51,4 @@ def _off_and_on(cells: dict[tuple[str, str], str], dead: str) -> str:
 def dead_commands(sources: Sources) -> str:
     """What made the sweeps."""
     about = sources.json("docs/data/sweeps.json")
-    return "\n".join(["```sh", *(about[name]["command"] for name in (*_SWEEPS, *_AWAY)), "```"])
+    return command_block(about[name]["command"] for name in (*_SWEEPS, *_AWAY))

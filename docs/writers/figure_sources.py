@@ -306,3 +306,14 @@ def weighted(cells: Sequence[dict[str, str]]) -> Counts:
     of our 32."""
     speeds = len({cell["v_m_s"] for cell in cells if cell["v_m_s"]})
     return pooled([cell for cell in cells for _ in range(1 if cell["v_m_s"] else speeds)])
+
+
+def share(counts: Counts, ending: str) -> str:
+    """'490/500 = 98.0 % [96.3, 98.9]'."""
+    return f"{counts.field(ending + '_of')} = {rated(counts, ending)}"
+
+
+def rated(counts: Counts, ending: str) -> str:
+    """'98.0 % [96.3, 98.9]': rate and 95 % Wilson interval."""
+    low, high = (100 * counts.field(f"{ending}_{end}") for end in ("low", "high"))
+    return f"{100 * counts.field(ending + '_rate'):.1f} % [{low:.1f}, {high:.1f}]"

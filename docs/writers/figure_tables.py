@@ -10,29 +10,18 @@ from typing import Any
 
 from docs.writers.benchmark_pages import benchmark, benchmark_scenes
 from docs.writers.dead_tables import dead_commands, dead_thrusters
-from docs.writers.figure_sources import Counts, SourceError, Sources, fitting, pooled, weighted
+from docs.writers.figure_sources import Counts, SourceError, Sources, fitting, pooled, rated, share, weighted
 from docs.writers.forecast_tables import forecast_pieces, forecast_scores
 from docs.writers.pieces import BEFORE, CELLS, DASH, LETTERS, PIECES, beside
 from docs.writers.pose_tables import pose_endings, pose_errors
 from docs.writers.replay_tables import changed, lossy, replayed
 from docs.writers.sonar_tables import sonars
+from docs.writers.vehicle_tables import vehicle_commands, vehicles
 from uuvtai.measure.reproduce import paper
 from uuvtai.measure.reproduce.steps import RETIRED_SEEDS
 from uuvtai.statistics import mcnemar_p
 from uuvtai.tables.method_tables import milliseconds
 from uuvtai.tables.table import text_table
-
-
-def share(counts: Counts, ending: str) -> str:
-    """'490/500 = 98.0 % [96.3, 98.9]'."""
-    return f"{counts.field(ending + '_of')} = {rated(counts, ending)}"
-
-
-def rated(counts: Counts, ending: str) -> str:
-    """'98.0 % [96.3, 98.9]': rate and 95 % Wilson interval."""
-    low, high = (100 * counts.field(f"{ending}_{end}") for end in ("low", "high"))
-    return f"{100 * counts.field(ending + '_rate'):.1f} % [{low:.1f}, {high:.1f}]"
-
 
 # ------------------------------------------------------------------------------------------------ evaluations
 
@@ -563,6 +552,8 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         changed,
         lossy,
         sonars,
+        vehicle_commands,
+        vehicles,
         twin_curve,
         twin_policy,
         chooser_trials,

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+import textwrap
+from collections.abc import Iterable, Iterator, Sequence
 
 FENCE = re.compile(r"^(<!-- (?P<mark>run) -->\n)?```(?P<language>\w*)\n(?P<body>.*?)^```", re.M | re.S)
 
@@ -19,3 +20,15 @@ def shell_blocks(text: str) -> Iterator[tuple[str | None, list[str]]]:
         if fence["language"] == "sh":
             body = re.sub(r" *\\\n *", " ", fence["body"])
             yield fence["mark"], [line for line in body.splitlines() if line.strip()]
+
+
+_WIDTH = 120
+"""characters of a line in a block of a page"""
+
+
+def command_block(commands: Iterable[str]) -> str:
+    """Commands to copy, each on as many lines as a page is wide."""
+    lines = (
+        textwrap.wrap(command, _WIDTH, break_long_words=False, break_on_hyphens=False) for command in commands
+    )
+    return "\n".join(["```sh", *(" \\\n  ".join(command) for command in lines), "```"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from docs.writers.figure_sources import Counts, Sources
+from docs.writers.figure_sources import Counts, Sources, rated, share
 from docs.writers.pieces import LETTERS
 from docs.writers.sonar_trials import CELLS, FILE, KINDS
 from uuvtai.statistics import mcnemar_p
@@ -35,17 +35,12 @@ def _row(own: dict[str, Any], first: dict[str, Any]) -> list[str]:
     return [
         own["sonar"],
         f"`{own['cell']}`",
-        f"{counts.field('success_of')} = {_rated(counts, 'success')}",
-        _rated(counts, "collision"),
+        share(counts, "success"),
+        rated(counts, "collision"),
         f"{sum(arrived) / max(1, len(arrived)):.1f} s",
         "" if own is first else _beside(first["outcomes"], outcomes),
         ", ".join(f"{label} {count}" for label, count in causes),
     ]
-
-
-def _rated(counts: Counts, ending: str) -> str:
-    low, high = (100 * counts.field(f"{ending}_{end}") for end in ("low", "high"))
-    return f"{100 * counts.field(f'{ending}_rate'):.1f} % [{low:.1f}, {high:.1f}]"
 
 
 def _beside(first: str, own: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -38,6 +39,25 @@ _BLUEROV2_THRUSTERS = (
 )
 
 
+_T200_FULL_RPM = (
+    (10.0, 2662.0),
+    (12.0, 2976.0),
+    (14.0, 3233.0),
+    (16.0, 3465.0),
+    (18.0, 3643.0),
+    (20.0, 3783.0),
+)
+"""[V, rpm] speed at full throttle, of the two ways the slower (docs/data/t200.csv)"""
+
+
+def _full_rpm(battery_v: float) -> float:
+    """[rpm] of the motor at a voltage within the table."""
+    for (low_v, low), (high_v, high) in pairwise(_T200_FULL_RPM):
+        if battery_v <= high_v:
+            return low + (high - low) * (battery_v - low_v) / (high_v - low_v)
+    raise ValueError(f"battery_v {battery_v}: the table ends at {_T200_FULL_RPM[-1][0]:g} V")
+
+
 class VehicleConfig(Section):
     """Rigid body, hydrodynamics and thrusters (MarineGym BlueROV asset; Wu 2018 coefficients). Origin =
     centre of mass."""
@@ -57,6 +77,9 @@ class VehicleConfig(Section):
     quadratic_damping: NonNegative6 = (18.18, 21.66, 36.99, 1.55, 1.55, 1.55)
     thrusters: Annotated[tuple[Thruster, ...], Field(min_length=1)] = _BLUEROV2_THRUSTERS
     rotor_tau_s: Positive = 0.01
+    battery_v: Annotated[float, Field(ge=_T200_FULL_RPM[0][0], le=_T200_FULL_RPM[-1][0])] | None = None
+    """[V] of the pack under load: the rotors turn as fast as a T200 does with it, by the maker's table,
+    straight lines between its voltages; none = as ``rotor_max_rpm`` says"""
     rotor_max_rpm: Positive = 3900.0
     thrust_forward: Vector3 = (4.7368e-7, -1.9275e-4, 8.4452e-2)
     """[kgf] quadratic in rpm for n > 0"""
@@ -76,6 +99,11 @@ class VehicleConfig(Section):
     max_heave_m_s: Positive = 0.4
     max_yaw_rate_rad_s: Positive = 1.0
 
+    @property
+    def top_rpm(self) -> float:
+        """Speed of a rotor at full throttle [rpm]."""
+        return self.rotor_max_rpm if self.battery_v is None else _full_rpm(self.battery_v)
+
     @model_validator(mode="after")
     def _thrust_grows(self) -> VehicleConfig:
         for name, curve, dead, sign in (
@@ -87,10 +115,10 @@ class VehicleConfig(Section):
                 raise ValueError(
                     f"{name} must push its own way and harder with speed outside the dead band, got {curve}"
                 )
-            if abs(edge) >= self.rotor_max_rpm:
+            if abs(edge) >= self.top_rpm:
                 raise ValueError(
                     f"rotor_max_rpm must exceed the dead band of {name} ({abs(edge):.0f} rpm), got "
-                    f"{self.rotor_max_rpm}"
+                    f"{self.top_rpm}"
                 )
         return self
 

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from uuvtai.learn.pilot import PilotDecision
+from uuvtai.live.gamepad import Sticks
 from uuvtai.live.hand_steering import HandSteering
 from uuvtai.live.keyboard import Keys
 from uuvtai.live.real_time import RealTime
@@ -62,12 +63,18 @@ class HandDriver:
     world_model = None
 
     def __init__(
-        self, sim: Sim, keys: Keys, show: Show, clock: RealTime, now: Callable[[], float] = time.perf_counter
+        self,
+        sim: Sim,
+        keys: Keys,
+        show: Show,
+        clock: RealTime,
+        now: Callable[[], float] = time.perf_counter,
+        sticks: Sticks | None = None,
     ) -> None:
         if sim.num_envs != 1:
             raise LiveError(f"a person drives one vehicle, not {sim.num_envs}")
         self._sim, self._keys, self._show, self._clock, self._now = sim, keys, show, clock, now
-        self._steering = HandSteering()
+        self._sticks, self._steering = sticks, HandSteering()
         self._shown_s = -np.inf
         self._take(np.zeros(4, np.float32))
 
@@ -88,7 +95,7 @@ class HandDriver:
         self._clock.step(self._sim)
         now = self._now()
         self._steering.press(self._keys.pressed(), now)
-        self._take(self._steering.action(now))
+        self._take(self._steering.action(now, self._sticks.tilted() if self._sticks else None))
         if now - self._shown_s >= 1.0 / _SHOWN_HZ:
             self._shown_s = now
             self._show(view_of(self._sim, self._steering.share, self.decision.action[0].numpy()))
@@ -139,7 +146,9 @@ class HandPiece:
     keys: Keys
     show: Show
     rate: float = 1.0
+    sticks: Sticks | None = None
 
     def driver(self, sim: Sim) -> HandDriver:
         """At the wheel of this simulator."""
-        return HandDriver(sim, self.keys, self.show, RealTime(sim.config.episode.control_dt_s, self.rate))
+        clock = RealTime(sim.config.episode.control_dt_s, self.rate)
+        return HandDriver(sim, self.keys, self.show, clock, sticks=self.sticks)

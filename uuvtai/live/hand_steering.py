@@ -45,7 +45,10 @@ class HandSteering:
         """Let go of everything."""
         self._until_s[:] = -np.inf
 
-    def action(self, now_s: float) -> np.ndarray:
-        """(4,) surge, sway, heave, yaw rate in parts of the vehicle's limits."""
-        held = now_s < self._until_s
-        return np.where(held, self.share * self._sign, 0.0).astype(np.float32)
+    def action(self, now_s: float, tilt: np.ndarray | None = None) -> np.ndarray:
+        """(4,) surge, sway, heave, yaw rate in parts of the vehicle's limits; ``tilt`` (4,): where sticks
+        are, which outweigh keys where they are not at rest."""
+        asked = np.where(now_s < self._until_s, self._sign, 0.0)
+        if tilt is not None:
+            asked = np.where(tilt != 0, tilt, asked)
+        return (self.share * asked).astype(np.float32)

@@ -3,7 +3,8 @@
 A chunk goes to disk while it grows: its header stands in the file with a length that has not been reached
 yet, behind it the zstd frame block by block; when the chunk is full the header is completed in place. So
 chunks have a useful size from the first byte on, and what was written of an unfinished one can be unpacked
-again (``repair.py``). Other readers see an unfinished chunk as a file that ends early.
+again (``repair.py``). Other readers see an unfinished chunk as a file that ends early. A signal interrupts
+between two calls of this file, never within one: half a block would make the rest of its frame unreadable.
 
 Format: https://mcap.dev/spec
 """
@@ -36,8 +37,10 @@ from mcap.records import (
     SummaryOffset,
 )
 
+from uuvtai import signals
 from uuvtai.version import __version__
 
+signals.never_within(__file__)
 MAGIC = b"\x89MCAP0\r\n"
 CHUNK_MIN, CHUNK_MAX = 64 * 1024, 256 * 1024
 """[bytes] uncompressed; a chunk is closed above the first and never grows beyond the second unless a single

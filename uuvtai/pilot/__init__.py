@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from uuvtai.pilot.inbox import Tally
+from uuvtai.pilot.mission import Mission
 from uuvtai.pilot.onboard import OnboardPilot, PilotCommand, StaleLimits
 from uuvtai.pilot.sensor_messages import (
     KINDS,
@@ -14,7 +15,6 @@ from uuvtai.pilot.sensor_messages import (
     SensorMessage,
     SonarPing,
 )
-from uuvtai.sensing import Mission
 
 __all__ = [
     "KINDS",

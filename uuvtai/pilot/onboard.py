@@ -22,9 +22,9 @@ from uuvtai.config import Config
 from uuvtai.logs.moment import numbered
 from uuvtai.pilot.fed_sensors import FedSensors
 from uuvtai.pilot.inbox import Inbox, Tally
+from uuvtai.pilot.mission import Mission, begin_mission, step_mission
 from uuvtai.pilot.sensor_messages import SensorMessage
 from uuvtai.plan_codes import TRIGGERS
-from uuvtai.sensing import Mission
 from uuvtai.sim import Sim
 from uuvtai.tree import FlatTree
 
@@ -124,9 +124,9 @@ class OnboardPilot:
         """One control step, the first one at time 0."""
         self._sim.sensors = self._sensors
         if self._begun:
-            self._sim.step_mission()
+            step_mission(self._sim)
         else:
-            self._sim.begin_mission(self.mission)
+            begin_mission(self._sim, self.mission)
             self._begun = True
         return self._command()
 

@@ -25,9 +25,12 @@ _STATE = (
 )
 
 
-def show_simulation(screen: Screen, result: dict[str, Any], title: str) -> None:
-    """Position, attitude and body velocities of a ``uuv simulate --json`` document at moments evenly
-    spread."""
+def show_simulation(screen: Screen, result: dict[str, Any], title: str, driven: str | None = None) -> None:
+    """Position, attitude and body velocities of a ``uuv simulate --json`` document at moments evenly spread;
+    ``driven``: who drove to its goal."""
+    if driven is not None:
+        goal = ", ".join(f"{value:.2f}" for value in result["goal"])
+        title = f"{title}, {driven.removeprefix('controller:')} drives to ({goal})"
     rows = []
     for i in _picked(len(result["t"]), _ROWS):
         values = [result["t"][i], *result["position"][i], *result["rpy_deg"][i], *result["nu"][i]]

@@ -21,3 +21,10 @@ class BaselineState:
     """[m/s] velocities that MPPI means to command from now on, one per decision, world"""
     change_w: ti.Field = array("n_env", "n_control", vec=3, scratch=True)
     """[m/s] weighted mean of the samples' noise"""
+
+
+@dataclass(frozen=True, eq=False)
+class BaselineStructs:
+    """Structs of this room, by the noun of their stage."""
+
+    baselines: BaselineState

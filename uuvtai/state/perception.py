@@ -201,7 +201,7 @@ class PastState:
     """Remembered for a learned forecast: where each track was, and where it turned. Newest first."""
 
     past_w: ti.Field = array("n_env", "n_track", "n_past", vec=2)
-    """[m] places in the last seconds, ``motion_columns.PAST_S`` apart"""
+    """[m] places in the last seconds, ``forecast_codes.PAST_S`` apart"""
     past_step: ti.Field = array("n_env", "n_track", dtype=ti.i32, beside="counts")
     """episode step of the newest one"""
     past_count: ti.Field = array("n_env", "n_track", dtype=ti.i32, beside="counts")
@@ -219,7 +219,7 @@ class MixtureState:
     frame: ti.Field = array("n_env", "n_track", "n_frame")
     """[m, m, -, -, m/s] place now, unit course and speed, in which columns and futures are counted"""
     column: ti.Field = array("n_env", "n_track", "n_column")
-    """what the network is told (``motion_columns.COLUMNS``)"""
+    """what the network is told (``forecast_codes.COLUMNS``)"""
     hidden: ti.Field = array("n_env", "n_track", "n_hidden", scratch=True)
     """scratch: first layer, then the second one"""
     said: ti.Field = array("n_env", "n_track", "n_said")
@@ -289,3 +289,21 @@ class MapScratch:
     """cells at which a column enters or leaves the fan of free water (fan.py)"""
     fetched: ti.Field = array("n_slot", dtype=ti.f32, scratch=True)
     """see mapping.fetch_cells"""
+
+
+@dataclass(frozen=True, eq=False)
+class PerceptionStructs:
+    """Structs of this room, by the noun of their stage."""
+
+    pose: PoseState
+    tracks: TrackState
+    clusters: ClusterState
+    spots: SpotState
+    habits: HabitState
+    forecast: ForecastState
+    futures: FutureState
+    past: PastState
+    mixture: MixtureState
+    mask: GridMask
+    grid_map: MapState
+    map_scratch: MapScratch

@@ -160,3 +160,15 @@ class FeatureState:
     observation shows bodies"""
     closest_s: ti.Field = array("n_env", "n_track", scratch=True)
     """[s] time until then"""
+
+
+@dataclass(frozen=True, eq=False)
+class PlanningStructs:
+    """Structs of this room, by the noun of their stage."""
+
+    clearance: ClearanceState
+    clearance_memory: ClearanceMemory
+    exposure: ExposureState
+    voronoi: VoronoiState
+    route: RouteState
+    features: FeatureState

@@ -148,3 +148,14 @@ class DepthImage:
     """[m] own position estimate when it was taken"""
     shot_rpy: ti.Field = array("n_env", vec=3)
     """[rad] own attitude estimate when it was taken"""
+
+
+@dataclass(frozen=True, eq=False)
+class SensorStructs:
+    """Structs of this room, by the noun of their stage."""
+
+    ego: Proprioception
+    ego_memory: ProprioceptionMemory
+    scan: SonarScan
+    sonar_memory: SonarMemory
+    image: DepthImage

@@ -81,3 +81,14 @@ class RefereeState(Truth):
     """[m] driven"""
     last_pos_w: ti.Field = array("n_env", vec=3)
     """[m] position at the last step"""
+
+
+@dataclass(frozen=True, eq=False)
+class TaskStructs:
+    """Structs of this room, by the noun of their stage."""
+
+    clock: ClockState
+    episode: EpisodeState
+    mission: MissionState
+    referee: RefereeState
+    reward: RewardState

@@ -95,3 +95,11 @@ class TreeTable:
     """which condition or action a leaf is"""
     param: ti.Field = array("n_node", vec=4)
     """numbers from the leaf's ports"""
+
+
+@dataclass(frozen=True, eq=False)
+class TeacherStructs:
+    """Structs of this room, by the noun of their stage."""
+
+    teacher: TeacherState
+    table: TreeTable

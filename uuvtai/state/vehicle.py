@@ -97,3 +97,14 @@ class CurrentState(Truth):
     """[m/s] constant part"""
     vel_w: ti.Field = array("n_env", vec=3)
     """[m/s] constant plus Gauss-Markov part"""
+
+
+@dataclass(frozen=True, eq=False)
+class VehicleStructs:
+    """Structs of this room, by the noun of their stage."""
+
+    vehicle: VehicleState
+    params: VehicleParams
+    actuation: ActuationState
+    allocation: Allocation
+    current: CurrentState

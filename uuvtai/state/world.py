@@ -94,3 +94,14 @@ class ScenarioScratch(Truth):
     """0 = free, 1 = blocked, 2 = reached from the start"""
     footprint: ti.Field = array("n_env", "n_body", vec=7, scratch=True)
     """plan view of the bodies at rest (footprint.py)"""
+
+
+@dataclass(frozen=True, eq=False)
+class WorldStructs:
+    """Structs of this room, by the noun of their stage."""
+
+    scene: SceneState
+    world: WorldState
+    path: PathState
+    fixed: FixedTable
+    scratch: ScenarioScratch

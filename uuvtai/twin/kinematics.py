@@ -165,6 +165,20 @@ def earned(nearer_m, nearest_m, ended, io: Bundle[TwinRules]):
     return out
 
 
+@ti.func
+def asked_speeds(wish, yaw, z, io: Bundle[TwinRules]):
+    """[m/s, rad/s] surge, sway, heave and yaw rate that the hull is asked for at a depth."""
+    part = hull_command(wish, yaw, z, io.twin_cfg.vertical_gap_m, io.vehicle_cfg, io.tank_cfg)
+    return ti.Vector(
+        [
+            part[0] * io.vehicle_cfg.max_surge_m_s,
+            part[1] * io.vehicle_cfg.max_sway_m_s,
+            part[2] * io.vehicle_cfg.max_heave_m_s,
+            part[3] * io.vehicle_cfg.max_yaw_rate_rad_s,
+        ]
+    )
+
+
 @ti.kernel
 def drive_twin(
     io: Bundle[TwinRules],
@@ -197,17 +211,7 @@ def drive_twin(
         nearest, ended = 9.0, RUNNING
         for _ in range(STEPS):
             if ended == RUNNING:
-                part = hull_command(
-                    wish, yaw, pos_w[2], io.twin_cfg.vertical_gap_m, io.vehicle_cfg, io.tank_cfg
-                )
-                asked = ti.Vector(
-                    [
-                        part[0] * io.vehicle_cfg.max_surge_m_s,
-                        part[1] * io.vehicle_cfg.max_sway_m_s,
-                        part[2] * io.vehicle_cfg.max_heave_m_s,
-                        part[3] * io.vehicle_cfg.max_yaw_rate_rad_s,
-                    ]
-                )
+                asked = asked_speeds(wish, yaw, pos_w[2], io)
                 for axis in ti.static(range(4)):
                     after = axis_step(vel[axis], ego[env, AT_INTEGRAL + axis], asked[axis], axis, io)
                     vel[axis], ego[env, AT_INTEGRAL + axis] = after[0], after[1]

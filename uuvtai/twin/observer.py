@@ -70,13 +70,28 @@ def put_track(env, lane, track, raw: AnyTensor, io: Bundle[ObserverIO]):
     raw[env, lane, 13] = 1.0
 
 
+@ti.func
+def next_track(env, after, slot, io: Bundle[ObserverIO]):
+    """Gap [m] and slot of the nearest track behind the one in ``slot``, whose gap is ``after``; slot -1 =
+    there is none."""
+    best, chosen = FAR_M + 0.0, -1
+    own = io.ego.pos_w[env]
+    for track in range(ti.static(io.tracks.alive.shape[1])):
+        if io.forecast.radius_m[env, track, 0] >= 0.0:
+            away = io.forecast.pos_w[env, track, 0] - ti.Vector([own[0], own[1]])
+            gap = away.norm() - io.tracks.radius_m[env, track]
+            is_next = gap > after or (gap == after and track > slot)
+            if is_next and gap < best:
+                best, chosen = gap, track
+    return best, chosen
+
+
 @ti.kernel
 def observe_bodies(
     io: Bundle[ObserverIO], due: IntVector, ego: FloatMatrix, raw: AnyTensor, ray: FloatMatrix
 ):
     """Rows of the vehicle, of its nearest tracks and of the free distances, where ``due`` is 1; the last
     action in ``ego`` stays."""
-    n_track = ti.static(io.tracks.alive.shape[1])
     for env in range(due.shape[0]):
         if due[env] == 1:
             pos_w, vel_b, rpy = io.ego.pos_w[env], io.ego.vel_b[env], io.ego.rpy[env]
@@ -89,14 +104,7 @@ def observe_bodies(
                 ego[env, AT_FLIP + i] = 1.0 if ahead else -1.0
             after, slot = -FAR_M, -1
             for lane in range(raw.shape[1]):
-                best, chosen = FAR_M + 0.0, -1
-                for track in range(n_track):
-                    if io.forecast.radius_m[env, track, 0] >= 0.0:
-                        away = io.forecast.pos_w[env, track, 0] - ti.Vector([pos_w[0], pos_w[1]])
-                        gap = away.norm() - io.tracks.radius_m[env, track]
-                        is_next = gap > after or (gap == after and track > slot)
-                        if is_next and gap < best:
-                            best, chosen = gap, track
+                best, chosen = next_track(env, after, slot, io)
                 for i in range(ti.static(RAW_WIDTH)):
                     raw[env, lane, i] = 0.0
                 if chosen >= 0:

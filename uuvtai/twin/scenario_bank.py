@@ -89,7 +89,8 @@ def drawn(sim: Sim, scene: Scene, seed: int, count: int) -> tuple[torch.Tensor, 
     rest = body.shape[1] - path.shape[1]
     used = np.any(body[:, :, 0] > 0, axis=0)
     moving = used[rest:]
-    return tuple(torch.from_numpy(a) for a in (body[:, used].copy(), path[:, moving].copy(), mission))  # type: ignore[return-value]
+    kept = body[:, used].copy(), path[:, moving].copy(), mission
+    return torch.from_numpy(kept[0]), torch.from_numpy(kept[1]), torch.from_numpy(kept[2])
 
 
 def scenario_rows(sim: Sim) -> list[np.ndarray]:

@@ -108,3 +108,13 @@ class PathIntegralIO:
     teacher_cfg: Const[TeacherConfig]
     tracking_cfg: Const[TrackingConfig]
     vehicle_cfg: Const[VehicleConfig]
+
+
+@dataclass(frozen=True, eq=False)
+class BaselineStages:
+    """Bundles of this room, by the noun of their stage."""
+
+    dynamic_window: DynamicWindowIO
+    potential_field: PotentialFieldIO
+    velocity_obstacle: VelocityObstacleIO
+    path_integral: PathIntegralIO

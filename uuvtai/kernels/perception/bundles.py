@@ -195,3 +195,19 @@ class TrackingIO:
     tank_cfg: Const[TankConfig]
     tracking_cfg: Const[TrackingConfig]
     traffic_cfg: Const[TrafficConfig]
+
+
+@dataclass(frozen=True, eq=False)
+class PerceptionStages:
+    """Bundles of this room, by the noun of their stage."""
+
+    pose: PoseIO
+    tracking: TrackingIO
+    spotting: SpottingIO
+    look: LookIO
+    forecast: ForecastIO
+    futures: FuturesIO
+    past: PastIO
+    mixture: MixtureIO
+    heights: HeightsIO
+    mapping: MappingIO

@@ -142,15 +142,7 @@ def count_dynamic(env, row, word, free, dynamics, io: Bundle[MappingIO]):
 
 
 @ti.func
-def folded(
-    static_old,
-    dynamic_old,
-    static_hit,
-    dynamic_hit,
-    free,
-    point,
-    io: Bundle[MappingIO],
-):
+def folded(static_old, dynamic_old, static_hit, dynamic_hit, free, point, io: Bundle[MappingIO]):
     """Both equations for one cell; indicators are 0 or 1."""
     scan_s = ti.static(map_period_s(io.mapping_cfg, io.sonar_cfg, io.episode_cfg))
     depth_s = ti.static(depth_period_s(io.mapping_cfg, io.sonar_cfg, io.depth_cfg, io.episode_cfg))
@@ -173,16 +165,7 @@ def folded(
 
 
 @ti.func
-def fold_cells(
-    env,
-    row,
-    word,
-    statics,
-    dynamics,
-    free,
-    points,
-    io: Bundle[MappingIO],
-):
+def fold_cells(env, row, word, statics, dynamics, free, points, io: Bundle[MappingIO]):
     """Both equations for the cells of a word that have anything to fold, and what is then true of them."""
     alive = io.grid_map.alive[env, row, word]
     left = alive | statics | dynamics | points

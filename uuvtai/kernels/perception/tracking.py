@@ -137,6 +137,39 @@ def is_due(env, io: Bundle[TrackingIO]):
 
 
 @ti.func
+def moved_on(env, track, dt, io: Bundle[TrackingIO]):
+    """State, covariance and link to the turn rate of a track ``dt`` [s] later; one that is not seen may coast
+    along its habits or turn back."""
+    mean, cov, link = predicted(
+        io.tracks.state[env, track],
+        io.tracks.cov[env, track],
+        io.tracks.turn_rate[env, track],
+        io.tracks.turn_cov[env, track],
+        dt,
+        io.tracking_cfg.accel_density,
+        io.tracking_cfg.turn_density,
+    )
+    unseen = io.tracks.moving[env, track] == 1 and io.tracks.misses[env, track] > 0
+    if unseen and expected_turn_rate(env, track, io.tracks, io.forecast_cfg, io.tracking_cfg) == 0.0:
+        if ti.static(io.forecast_cfg.use_coasting):
+            mean = coasted(
+                env,
+                track,
+                io.tracks.state[env, track],
+                dt,
+                io.habits,
+                io.tracks,
+                io.forecast_cfg,
+                io.tank_cfg,
+            )
+        if ti.static(io.forecast_cfg.use_turning_back):
+            if sight_of(env, track, io) == SEEN_THROUGH:  # what is hidden may be level
+                rate = turn_back_rate(env, track, dt, io)
+                mean, cov, link = turned_back(mean, cov, link, rate, dt)
+    return mean, cov, link
+
+
+@ti.func
 def predict_tracks(env, io: Bundle[TrackingIO]):
     """Move every track to the time of the new ping; returns the time since the last one [s]."""
     dt = 0.0
@@ -146,32 +179,7 @@ def predict_tracks(env, io: Bundle[TrackingIO]):
     for track in range(io.tracks.alive.shape[1]):
         io.tracks.pick[env, track] = -1
         if io.tracks.alive[env, track] == 1:
-            mean, cov, link = predicted(
-                io.tracks.state[env, track],
-                io.tracks.cov[env, track],
-                io.tracks.turn_rate[env, track],
-                io.tracks.turn_cov[env, track],
-                dt,
-                io.tracking_cfg.accel_density,
-                io.tracking_cfg.turn_density,
-            )
-            unseen = io.tracks.moving[env, track] == 1 and io.tracks.misses[env, track] > 0
-            if unseen and expected_turn_rate(env, track, io.tracks, io.forecast_cfg, io.tracking_cfg) == 0.0:
-                if ti.static(io.forecast_cfg.use_coasting):
-                    mean = coasted(
-                        env,
-                        track,
-                        io.tracks.state[env, track],
-                        dt,
-                        io.habits,
-                        io.tracks,
-                        io.forecast_cfg,
-                        io.tank_cfg,
-                    )
-                if ti.static(io.forecast_cfg.use_turning_back):
-                    if sight_of(env, track, io) == SEEN_THROUGH:  # what is hidden may be level
-                        rate = turn_back_rate(env, track, dt, io)
-                        mean, cov, link = turned_back(mean, cov, link, rate, dt)
+            mean, cov, link = moved_on(env, track, dt, io)
             io.tracks.state[env, track] = mean
             io.tracks.cov[env, track] = cov
             io.tracks.turn_cov[env, track] = link

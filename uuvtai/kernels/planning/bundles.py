@@ -149,3 +149,15 @@ class VoronoiIO:
     tank_cfg: Const[TankConfig]
     traffic_cfg: Const[TrafficConfig]
     voronoi_cfg: Const[VoronoiConfig]
+
+
+@dataclass(frozen=True, eq=False)
+class PlanningStages:
+    """Bundles of this room, by the noun of their stage."""
+
+    clearance: ClearanceIO
+    exposure: ExposureIO
+    features: FeaturesIO
+    triggers: TriggersIO
+    voronoi: VoronoiIO
+    route: RouteIO

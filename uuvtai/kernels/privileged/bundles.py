@@ -44,3 +44,11 @@ class TrueTracksIO:
     episode_cfg: Const[EpisodeConfig]
     sonar_cfg: Const[SonarConfig]
     tank_cfg: Const[TankConfig]
+
+
+@dataclass(frozen=True, eq=False)
+class PrivilegedStages:
+    """Bundles of this room, by the noun of their stage."""
+
+    true_tracks: TrueTracksIO
+    true_map: TrueMapIO

@@ -70,3 +70,12 @@ class ExactProprioceptionIO:
     ego: Out[Proprioception]
     clock: In[ClockState]
     vehicle: In[VehicleState]
+
+
+@dataclass(frozen=True, eq=False)
+class SensorStages:
+    """Bundles of this room, by the noun of their stage."""
+
+    proprioception: ProprioceptionIO
+    sonar: SonarIO
+    depth: DepthIO

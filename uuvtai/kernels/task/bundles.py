@@ -47,3 +47,11 @@ class RewardIO:
     episode_cfg: Const[EpisodeConfig]
     reward_cfg: Const[RewardConfig]
     vehicle_cfg: Const[VehicleConfig]
+
+
+@dataclass(frozen=True, eq=False)
+class TaskStages:
+    """Bundles of this room, by the noun of their stage."""
+
+    episode: EpisodeIO
+    reward: RewardIO

@@ -15,12 +15,7 @@ __all__ = ["COLLISION", "OUTCOMES", "OUT_OF_TANK", "RUNNING", "SUCCESS", "TIMEOU
 
 
 @ti.kernel
-def begin_episodes(
-    io: Bundle[EpisodeIO],
-    mask: IntVector,
-    seed: IntVector,
-    number: IntVector,
-):
+def begin_episodes(io: Bundle[EpisodeIO], mask: IntVector, seed: IntVector, number: IntVector):
     """Give the rows of ``mask`` a new episode and wake only them."""
     for env in range(mask.shape[0]):
         io.clock.awake[env] = mask[env]

@@ -130,10 +130,7 @@ def unweighted_terms(env, progress, io: Bundle[RewardIO]):
 @quick_launch
 @ti.kernel
 def compute_reward(
-    io: Bundle[RewardIO],
-    reward_out: FloatVector,
-    terminated: AnyVector,
-    truncated: AnyVector,
+    io: Bundle[RewardIO], reward_out: FloatVector, terminated: AnyVector, truncated: AnyVector
 ):
     """Reward of the step, weighted terms, their sums, and how the step ended. Rows that sleep earn 0 and keep
     their end."""

@@ -89,3 +89,12 @@ class ThreatsIO:
     tracking_cfg: Const[TrackingConfig]
     traffic_cfg: Const[TrafficConfig]
     vehicle_cfg: Const[VehicleConfig]
+
+
+@dataclass(frozen=True, eq=False)
+class TeacherStages:
+    """Bundles of this room, by the noun of their stage."""
+
+    threats: ThreatsIO
+    evasion: EvasionIO
+    teacher: TeacherIO

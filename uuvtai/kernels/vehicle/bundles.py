@@ -62,3 +62,12 @@ class DynamicsIO:
     disturbance_cfg: Const[DisturbanceConfig]
     episode_cfg: Const[EpisodeConfig]
     vehicle_cfg: Const[VehicleConfig]
+
+
+@dataclass(frozen=True, eq=False)
+class VehicleStages:
+    """Bundles of this room, by the noun of their stage."""
+
+    thrusters: ThrusterWatchIO
+    actuation: ActuationIO
+    dynamics: DynamicsIO

@@ -28,8 +28,8 @@ def thrust_at(curve, rpm, scale):
 def thrust_limits(cfg):
     """(forward, reverse) thrust [N] at full speed; reverse is negative."""
     return (
-        thrust_at(cfg.thrust_forward, cfg.rotor_max_rpm, cfg.thrust_scale),
-        thrust_at(cfg.thrust_reverse, -cfg.rotor_max_rpm, cfg.thrust_scale),
+        thrust_at(cfg.thrust_forward, cfg.top_rpm, cfg.thrust_scale),
+        thrust_at(cfg.thrust_reverse, -cfg.top_rpm, cfg.thrust_scale),
     )
 
 
@@ -68,7 +68,7 @@ def rpm_of_thrust(thrust, vehicle_cfg: Const[VehicleConfig]):
         rpm = _branch_rpm(
             thrust, vehicle_cfg.thrust_reverse, vehicle_cfg.dead_band_rpm[1], -1.0, vehicle_cfg.thrust_scale
         )
-    return ti.math.clamp(rpm, -vehicle_cfg.rotor_max_rpm, vehicle_cfg.rotor_max_rpm)
+    return ti.math.clamp(rpm, -vehicle_cfg.top_rpm, vehicle_cfg.top_rpm)
 
 
 @ti.func

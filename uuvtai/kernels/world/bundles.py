@@ -32,3 +32,10 @@ class WorldIO:
     scene: In[SceneState]
     episode_cfg: Const[EpisodeConfig]
     world_cfg: Const[WorldConfig]
+
+
+@dataclass(frozen=True, eq=False)
+class WorldStages:
+    """Bundles of this room, by the noun of their stage."""
+
+    world: WorldIO

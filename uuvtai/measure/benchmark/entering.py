@@ -90,7 +90,7 @@ def _played(
     seed, episodes = (TRIAL_SEED, TRIAL_EPISODES) if asked.quick else (SEED, EPISODES)
     who = asked.entrant.asked()
     request = Request.typed(
-        bench.options(), bench.world, who["policies"], controllers=who["controllers"], seeds=[seed],
+        bench.options(), who["policies"], controllers=who["controllers"], seeds=[seed],
         episodes=episodes, num_envs=asked.num_envs or BATCH, device=asked.device,
         run_dir=folder / bench.name,
     )  # fmt: skip

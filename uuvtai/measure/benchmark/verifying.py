@@ -46,7 +46,7 @@ class _Replay:
 
         who = self.entrant.asked()
         request = Request.typed(
-            bench.options(), bench.world, who["policies"], controllers=who["controllers"], seeds=[0],
+            bench.options(), who["policies"], controllers=who["controllers"], seeds=[0],
             episodes=1, device=self.device,
         )  # fmt: skip
         return Sim(self.method.config_of(request.config), BATCH, self.method.tree, self.device)

@@ -55,12 +55,13 @@ class Request:
     run_dir: Path | None = None
 
     @classmethod
-    def typed(cls, scene: SceneOptions, world: str, policies: list[str], **rest: Any) -> Request:
+    def typed(cls, scene: SceneOptions, policies: list[str], **rest: Any) -> Request:
         """What a command line asks for: the scene as it was typed, observed as the policies were trained.
         Raises ConfigError, CheckpointError."""
         from uuvtai.measure.episodes.methods import features_of
 
         config = scene.config(features_of(policies) if policies else [])
+        world = scene.world_name
         sensors = sensors_of(world, scene.sensors)
         return cls(config=config, world=world, sensors=sensors, policies=tuple(policies), **rest)
 

@@ -46,10 +46,10 @@ class SweepRequest:
     device: str = "auto"
 
     @classmethod
-    def typed(cls, scene: SceneOptions, world: str, policies: list[str], **rest: Any) -> SweepRequest:
+    def typed(cls, scene: SceneOptions, policies: list[str], **rest: Any) -> SweepRequest:
         """What a command line asks for, with the scene as it was typed."""
         return cls(
-            world=world,
+            world=scene.world_name,
             sensors=scene.sensors,
             vehicle=scene.vehicle,
             overrides=tuple(scene.settings),
