@@ -24,7 +24,7 @@ TEACHER = {
     "cruise_m_s": 0.6, "decide_period_steps": 5, "lag_s": 0.35, "horizon_s": 2.5,
     "n_heading": 12, "n_speed": 3, "evade_m_s": 0.8, "heave_m_s": 0.35, "n_heave_heading": 7, "burst_s": 0.75,
     "hull_reach_m": 0.22, "contact_m": 0.1, "margin_m": 0.25, "margin_growth_m_s": 0.1, "closing_s": 0.25,
-    "vertical_weight": 1.4, "surprise_s": 0.55,
+    "vertical_weight": 1.4,
     "caution": 1.2, "static_margin_m": 0.1, "static_horizon_s": 1.5, "static_dt_s": 0.25, "weight_peak": 6.0,
     "weight_mean": 6.0,
     "weight_contact": 12.0, "weight_static": 12.0, "weight_static_contact": 30.0, "weight_deviation": 1.0,

@@ -95,12 +95,6 @@ PIECES = (
     ),
     Piece("learned", "nothing; learned forecast, all futures", _LEARNED, _FAST),
     Piece(
-        "learned_soon",
-        "nothing; learned forecast, futures until they show",
-        _LEARNED + " teacher.surprise_s=0.5 teacher.forecast_counts_fully=true",
-        _FAST,
-    ),
-    Piece(
         "pose", "corrections of the position", "sensors.localization=dead_reckoning", cells=("pool_6_harsh",)
     ),
     Piece("pose_known", "nothing; position known", "sensors.localization=truth", cells=("pool_6_harsh",)),

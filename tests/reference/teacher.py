@@ -48,10 +48,6 @@ def distance_to(body, radius, above, below, at, cfg):
     return np.hypot(beside, upright), beside / np.hypot(beside, upright), doubt
 
 
-PARTED_M = 0.3
-"""a future so far from the forecast shows"""
-
-
 def body_depths(pos, vel, command, forecast, cfg, tank, dt_s, burst_s=np.inf):
     """(peak, mean, contact, first, doubt) of one command [m/s, 3].
 
@@ -72,13 +68,7 @@ def body_depths(pos, vel, command, forecast, cfg, tank, dt_s, burst_s=np.inf):
         expected = np.zeros(2)
         for places, share, margin in heeded:
             deepest, nearest = 0.0, 0.0
-            apart = np.linalg.norm(places - body, axis=-1)
-            parted = [k for k in range(1, n + 1) if apart[k] > PARTED_M]
-            until = parted[0] * dt_s + cfg.surprise_s if parted else np.inf
-            doubt = min(doubt, np.abs(apart - PARTED_M).min())
             for k in range(1, n + 1):
-                if k * dt_s > until - 1e-6:
-                    break
                 distance, slope, unsure = distance_to(places[k], radius[k], above, below, at[k], cfg)
                 outward = (at[k, :2] - places[k]) / np.hypot(*(at[k, :2] - places[k]))
                 closing = max(0.0, -(moving[k, :2] - (places[k] - places[k - 1]) / dt_s) @ outward)

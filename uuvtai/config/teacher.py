@@ -49,11 +49,6 @@ class TeacherConfig(Section):
     """futures that are less probable are left out,"""
     heed_share: Fraction = 0.2
     """and those that are less probable than this cost, but are no reason to evade"""
-    surprise_s: Positive = 9.0
-    """a future counts until so long after it has parted from the forecast: by then it is seen, and something
-    else is done"""
-    forecast_counts_fully: bool = False
-    """the forecast counts as if it were certain, the other futures on top; off: each by its probability"""
     future_margin: Fraction = 1.0
     """margin kept from a body that does something else than is forecast, as a share of the usual one"""
     caution: Positive = 1.0
@@ -137,6 +132,9 @@ class TeacherConfig(Section):
     sight_margin_deg: NonNegative = 20.0
     """where the sonar is a fan ahead, the way is kept so far within its edge: the nose turns, and beyond that
     the vehicle slows down, to a stop at the edge"""
+    sweep_way_m: Positive = 1.0
+    """with a mechanical sonar the vehicle drives no farther along its route while the beam comes round once,
+    and waits for the first sweep"""
     yaw_gain: Positive = 2.5
     """[1/s]"""
     max_node: PositiveCount = 64

@@ -16,9 +16,6 @@ from uuvtai.kernels.core.lanes import LANES, f16x
 from uuvtai.kernels.core.signature import Const, In, Out
 from uuvtai.state import ClearanceState, ForecastState, FutureState
 
-_PARTED_M = 0.3
-"""a future that is so far from the forecast shows"""
-
 
 @ti.func
 def body_depths(
@@ -49,7 +46,7 @@ def body_depths(
             left, peak, contact = 1.0, f16x(0.0), f16x(0.0)
             for nth in range(ti.static(futures.share.shape[2] + 1)):
                 future = ti.static(futures.share.shape[2]) - 1 - nth  # the forecast itself comes last: -1
-                likely = ti.select(ti.static(teacher_cfg.forecast_counts_fully), 1.0, left)
+                likely = left
                 if future >= 0:
                     likely = futures.share[env, track, future]
                 if likely > ti.static(teacher_cfg.least_share):
@@ -109,7 +106,7 @@ def _future_depths(
     level, level_vel = ti.Vector([drive.pos[0], drive.pos[1]]), ti.Vector([drive.vel[0], drive.vel[1]])
     reach_speed = level_vel.norm() + ti.static(_fastest(teacher_cfg))
     above, below = forecast.above_w[env, track], forecast.below_w[env, track]
-    decay, rest, before, until = 1.0, 1.0, forecast.pos_w[env, track, 0], FAR_M
+    decay, rest, before = 1.0, 1.0, forecast.pos_w[env, track, 0]
     for k in range(1, n_sample):
         # exp(-t / tau) by one factor a sample: settle = A(t), gain = B(t) - B(t - T), and the
         # velocity is v0 decay + c (rest - decay), the derivative of x(t)
@@ -123,8 +120,6 @@ def _future_depths(
         body, wanted = forecast.pos_w[env, track, k], _wanted_m(time, teacher_cfg)
         if future >= 0:
             body = futures.pos_w[env, track, future, k]
-            if until == FAR_M and (body - forecast.pos_w[env, track, k]).norm() > _PARTED_M:
-                until = time + teacher_cfg.surprise_s
             wanted -= ti.static(1.0 - teacher_cfg.future_margin) * (wanted - teacher_cfg.contact_m)
         body_vel = (body - before) / dt
         before = body
@@ -132,7 +127,7 @@ def _future_depths(
         drift = level_vel * decay - body_vel
         radius = forecast.radius_m[env, track, k]
         bound = _bound_m(radius, wanted, gain, reach_speed + body_vel.norm(), teacher_cfg)
-        if radius >= 0 and time < until and start.norm_sqr() < bound * bound:
+        if radius >= 0 and start.norm_sqr() < bound * bound:
             z = ti.math.clamp(drive.z * gain + (drive.pos[2] + drive.vel[2] * settle), low, high)
             gap = ti.max(ti.min(above - z, z - below), 0.0) * ti.static(teacher_cfg.vertical_weight)
             free = _free_lanes(drive.x, drive.y, gap, start, drift, gain, rest - decay, radius, teacher_cfg)
