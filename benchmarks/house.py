@@ -50,7 +50,7 @@ def rows() -> list[Row]:
         _row(
             "signature lines in kernels and sim.py",
             sum(_signature(node) for path, node in functions if path in counted),
-            850,
+            900,
         ),
         _row(
             f"lines of more than {LONG_LINE} characters",

@@ -603,6 +603,14 @@ KERNELS = (
         "packets_equal or breaks_the_tie",
     ),
     Mutation(
+        "gpu_beams_of_another_part",
+        "uuvtai/kernels/sensors/sonar.py",
+        "turned_beams(before, part * beams, io)",
+        "turned_beams(before, 0, io)",
+        "tests/test_cuda.py",
+        "same_bits",
+    ),
+    Mutation(
         "inverter_agrees",
         "uuvtai/kernels/teacher/tree_tick.py",
         "status = SUCCESS + FAILURE - answer",
@@ -666,6 +674,83 @@ FORECAST = (
     ),
 )
 
-ALL = (*KERNELS, *STATISTICS, *LEARNING, *TWIN, *FORECAST)
+_SAFETY = "uuvtai/link/safety.py"
+
+LINK = (
+    Mutation(
+        "dry_run_sends",
+        "uuvtai/link/onboard_loop.py",
+        "if (self._plan.arms or order.kind in HARMLESS) and self._vehicle is not None:",
+        "if self._vehicle is not None:",
+        "tests/test_link.py",
+        "dry_run",
+    ),
+    Mutation(
+        "fence_forgotten",
+        _SAFETY,
+        "most, least = FENCE_RATE_HZ * max(room_above, 0.0), -FENCE_RATE_HZ * max(room_below, 0.0)",
+        "most, least = 9.0, -9.0",
+        "tests/test_safety.py",
+        "driven_out",
+    ),
+    Mutation(
+        "tilt_that_is_not_a_number",
+        _SAFETY,
+        "if all(map(math.isfinite, view.rpy)) else math.nan",
+        "if all(map(math.isfinite, view.rpy)) else 1.0",
+        "tests/test_safety.py",
+        "tilted",
+    ),
+    Mutation(
+        "surfacing_is_not_for_good",
+        _SAFETY,
+        "for_good = action >= SafeAction.SURFACE",
+        "for_good = action > SafeAction.SURFACE",
+        "tests/test_safety.py",
+        "for_good",
+    ),
+    Mutation(
+        "limits_left_to_the_caller",
+        "uuvtai/link/orders.py",
+        "surge, sway, heave, turn = bounded(velocity, limits)",
+        "surge, sway, heave, turn = velocity",
+        "tests/test_link.py",
+        "client_reads",
+    ),
+    Mutation(
+        "unknown_sector_is_free",
+        "uuvtai/link/sectors.py",
+        "if (blind := int((distance == UNKNOWN_CM).sum())) > 0:",
+        "if (blind := int((distance == UNKNOWN_CM).sum())) > 999:",
+        "tests/test_link.py",
+        "nobody_looked",
+    ),
+    Mutation(
+        "port_and_starboard_swapped",
+        "uuvtai/link/intake.py",
+        "return self._velocity(time_s, (ahead, -right, -down))",
+        "return self._velocity(time_s, (ahead, right, -down))",
+        "tests/test_link.py",
+        "axes_of_velocity",
+    ),
+    Mutation(
+        "doubled_packet_is_answered",
+        "uuvtai/sitl/servo_frames.py",
+        'return "again" if waited_s >= DOUBLED_S else "ignore"',
+        'return "again"',
+        "tests/test_sitl.py",
+        "asks_for and not ardusub",
+    ),
+    Mutation(
+        "motors_turn_the_other_way",
+        "uuvtai/sitl/motors.py",
+        "self.channel[thruster], self.sign[thruster] = motor, sign",
+        "self.channel[thruster], self.sign[thruster] = motor, -sign",
+        "tests/test_sitl.py",
+        "vehicle_does",
+    ),
+)
+
+ALL = (*KERNELS, *STATISTICS, *LEARNING, *TWIN, *FORECAST, *LINK)
 QUICK = ("scale_dropped", "popart_norm", "wilson_half_width")
 """names of three that need no kernel"""

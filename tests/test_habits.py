@@ -336,3 +336,18 @@ def test_coasting_equals_the_oracle(stage, shape):
         )
         turned += last @ oracle.unit(x[i, 2:]) < 0.9
     assert turned > 20, turned
+
+
+def test_a_way_remembers_what_kind_of_turn_began_it(stage):
+    """Bodies that have swum to and fro, and round corners, for some ways: 2 = began with a turn back, 3 =
+    with a corner."""
+    for corners, kind in ((2, habits.BEGIN_SEEN), (3, habits.CORNER_SEEN)):
+        stage.begin()
+        paths = Loops(np.random.default_rng(4), corners, 1.5)
+        if corners == 3:  # no corner leads back or straight on
+            paths.way[:] = [(5.0, 1.5), (12.0, 2.0), (8.0, 5.0)]
+            paths.measure()
+        for k in range(160):
+            stage.watch(paths.at(k * PERIOD_S))
+        begun = stage.read()["run_kind"]
+        assert (begun[begun > 1] == kind).all() and (begun > 1).mean() > 0.8

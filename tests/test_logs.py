@@ -41,7 +41,7 @@ from uuvtai.logs.recording import load_recording
 from uuvtai.logs.repair import repair
 from uuvtai.logs.topic_stream import SIGNS
 from uuvtai.logs.topics import TOPICS
-from uuvtai.logs.topics.camera_topics import depth_image
+from uuvtai.logs.topics.camera_topics import logged_image
 from uuvtai.logs.topics.map_topics import grid_values, map_origin
 from uuvtai.stages import SimState
 
@@ -64,6 +64,7 @@ SCHEMAS = {
     "/sensors/pressure": "uuv.PressureReading",
     "/sonar/scan": "foxglove.LaserScan",
     "/sonar/doppler": "uuv.SonarDoppler",
+    "/sonar/image": "foxglove.CompressedImage",
     "/camera/line": "uuv.DepthLine",
     "/camera/depth": "foxglove.CompressedImage",
     "/camera/exact": "uuv.DepthExact",
@@ -203,7 +204,7 @@ def test_rates(log_path):
         N_STEP // 5 + 1
     }
     assert counts["/map/static"] == N_STEP // 25 + 2  # step 0, then 2 Hz, and the last step
-    assert counts["/camera/depth"] == N_STEP // 25 + 1
+    assert counts["/camera/depth"] == counts["/sonar/image"] == N_STEP // 25 + 1
     assert counts["/plan"] == counts["/plan/info"] == 2
     assert counts["/log"] == 3
 
@@ -329,7 +330,7 @@ def test_clearance_carries_the_time_of_its_map(tmp_path, snaps):
 
 
 def test_depth_images_are_millimetres(log_path, snaps):
-    image = depth_image(by_topic(log_path, "/camera/depth")[2])
+    image = logged_image(by_topic(log_path, "/camera/depth")[2])
     assert image.dtype == np.uint16
     np.testing.assert_allclose(image, snaps[50]["image.depth_m"] * 1000.0, atol=DEPTH_ROUNDING_MM)
 

@@ -41,9 +41,9 @@ def draw_lanes(
 ):
     key = noise.stream_key(noise.episode_key(a, b), c, d)
     for packet in range(ti.static(N // LANES)):
-        words = noise.bits_lanes(key, packet * LANES)
-        units = noise.uniform_lanes(key, packet * LANES)
-        normals, _ = noise.normal_pair_lanes(key, packet * LANES)
+        words = noise.bits_lanes(key, packet * LANES, LANES)
+        units = noise.uniform_lanes(key, packet * LANES, LANES)
+        normals, _ = noise.normal_pair_lanes(key, packet * LANES, LANES)
         for lane in ti.static(range(LANES)):
             word[packet * LANES + lane] = words[lane]
             unit[packet * LANES + lane] = units[lane]
@@ -66,7 +66,7 @@ def drawn():
 def draw_pairs(one: ti.template(), other: ti.template(), a: ti.i32, b: ti.i32, c: ti.i32, d: ti.i32):
     key = noise.stream_key(noise.episode_key(a, b), c, d)
     for packet in range(ti.static(N // LANES)):
-        x, y = noise.normal_pair_lanes(key, packet * LANES)
+        x, y = noise.normal_pair_lanes(key, packet * LANES, LANES)
         for lane in ti.static(range(LANES)):
             one[packet * LANES + lane] = x[lane]
             other[packet * LANES + lane] = y[lane]

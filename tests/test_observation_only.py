@@ -16,7 +16,8 @@ from uuvtai.kernels.sensors import proprioception
 from uuvtai.stages import SimState
 
 KNOWN = {
-    "clock", "mission", "ego", "scan", "image", "pose", "tracks", "clusters", "spots", "habits", "forecast",
+    "clock", "mission", "ego", "scan", "echoes", "image", "pose", "tracks", "clusters", "spots", "habits",
+    "forecast",
     "futures", "past", "mixture", "mask", "grid_map", "map_scratch", "exposure",
     "clearance", "clearance_memory", "voronoi", "route", "features", "teacher", "table", "baselines",
 }  # fmt: skip

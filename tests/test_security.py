@@ -43,7 +43,7 @@ from uuvtai.logs.log_errors import LogError
 from uuvtai.logs.picture import picture
 from uuvtai.logs.reader import info
 from uuvtai.logs.recording import load_recording
-from uuvtai.logs.topics.camera_topics import depth_image
+from uuvtai.logs.topics.camera_topics import logged_image
 from uuvtai.measure.evaluate.tree_report import tree_report
 from uuvtai.measure.evaluate.while_training import evaluate_now
 from uuvtai.measure.reproduce.paper_run import resume as resume_reproduction
@@ -940,7 +940,7 @@ def png(width, height):
 )
 def test_images_that_unfold(content, says):
     with pytest.raises(LogError, match=says):
-        depth_image({"data": base64.b64encode(content).decode()})
+        logged_image({"data": base64.b64encode(content).decode()})
 
 
 @pytest.mark.parametrize("text", TAGS[:3])

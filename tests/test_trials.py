@@ -149,6 +149,34 @@ def test_margins_are_as_their_episodes_say():
     assert shown == len(kept)
 
 
+@pytest.mark.parametrize(("column", "cell"), [(1, "pool15"), (2, "gaunt15")])
+def test_trials_of_turns_are_as_their_episodes_say(column, cell):
+    document = json.loads((DOCS / "data/turn_trials.json").read_text())
+    kept = {}
+    for row in document["rows"]:
+        if row["cell"] == cell and row["seed"] != 77003:
+            kept[row["pilot"]] = kept.get(row["pilot"], "") + row["outcomes"]
+    for name, *cells in table("tuning.md", "## Turns that nobody", "| pilot |"):
+        own, text = kept.get(name.strip(" |")), cells[column - 1].strip(" |")
+        if own is None:
+            assert text == "-"
+            continue
+        assert len(own) == 1200 and told(text) == pytest.approx(rates(own), abs=0.051), name
+        won, lost = paired(own, kept["as it is"])
+        assert won == 0 or text.endswith(f" (+{won} -{lost}, p = {mcnemar_p(won, lost):.2f})"), name
+
+
+def test_what_forecasts_miss_is_as_counted():
+    kept = json.loads((DOCS / "data/turn_trials.json").read_text())
+    found = table("tuning.md", "## Turns that nobody", "| moments of tracks |")
+    for (name, n, off), row in zip(found, kept["forecasts"], strict=True):
+        assert (name.strip(" |"), n) == (row["moments"], f"{row['n']:,}")
+        assert off.strip(" |") == f"{100 * row['off'] / row['n']:.0f} %"
+    text = (DOCS / "tuning.md").read_text()
+    for row in kept["danger"]:
+        assert f"{row['collisions'] / row['seconds']:.3f}" in text
+
+
 def test_local_planners_are_as_their_episodes_say():
     rows = json.loads((DOCS / "data/baselines_90001.json").read_text())["rows"]
     kept = {(row["method"], row["cell"]): row["outcomes"] for row in rows}

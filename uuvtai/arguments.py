@@ -10,12 +10,12 @@ import typer
 from uuvtai.endings import UsageError
 
 
-def seeds(text: str) -> list[int]:
-    """Seeds of ``--seeds``."""
-    return [integer("--seeds", item) for item in text.split(",")]
+def integers(option: str, text: str) -> list[int]:
+    """Whole numbers of 32 bits, as ``--seeds 0,1,2`` has them."""
+    return [_integer(option, item) for item in text.split(",")]
 
 
-def integer(option: str, text: str) -> int:
+def _integer(option: str, text: str) -> int:
     """A whole number of 32 bits."""
     try:
         value = int(text)
@@ -120,6 +120,10 @@ def refuse_odd_live(episodes: int, rate: float, port: int) -> None:
         raise UsageError(f"--port {port}: ports go from 0 (a free one) to 65535, for example --port 8765")
 
 
+OF_A_SWEEP_RESUMED = (
+    "allow_code", "world", "episodes", "seeds", "engine", "workers", "address", "device",
+)  # fmt: skip
+"""what is not refused beside ``--resume`` of a sweep"""
 _OF_EVERY_RESUME = ("resume", "with_report", "wide", "as_json")
 
 

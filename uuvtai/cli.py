@@ -7,7 +7,6 @@ machine: a full disk), 2 refused, with what to type instead, 3 a gate was not me
 
 from __future__ import annotations
 
-import contextlib
 import gc
 import sys
 from pathlib import Path
@@ -66,7 +65,7 @@ def evaluate(
 
         result, folder = go_on(resume, Progress(), allow_code)
     else:
-        seed_list = arguments.seeds(seeds)
+        seed_list = arguments.integers("--seeds", seeds)
         arguments.refuse_less("--episodes", episodes, 1)
         recording = kept.asked()
         from uuvtai.measure.evaluate.compare import compare
@@ -84,11 +83,7 @@ def evaluate(
     _report_if(with_report, folder)
 
 
-@app.command(
-    "train",
-    epilog="Example: uuv train curriculum --iterations 20 --set ppo.learning_rate=0.0005 --run-dir "
-    "runs/first",
-)
+@app.command("train", epilog="Example: uuv train curriculum --iterations 20 --run-dir runs/first")
 @groups.grouped
 def train_policy(
     ctx: typer.Context,
@@ -167,7 +162,7 @@ def watch_live(
     device: opt.Device = "auto",
 ) -> None:
     """Run episodes in real time and serve them to Foxglove and Lichtblick."""
-    seed_list = arguments.seeds(seeds)
+    seed_list = arguments.integers("--seeds", seeds)
     arguments.refuse_odd_live(episodes, rate, port)
     from uuvtai.measure.evaluate.eval_request import Request
     from uuvtai.measure.watching import LiveOptions, watch_episodes
@@ -195,13 +190,10 @@ def drive_vehicle(
     run_dir: opt.RunDir = None,
 ) -> None:
     """Steer a vehicle by keyboard or gamepad, with the map that it makes; bt then plays the same episodes."""
-    seed_list = arguments.seeds(seeds)
+    seed_list = arguments.integers("--seeds", seeds)
     arguments.refuse_less("--episodes", episodes, 1)
     arguments.refuse_odd_rate(rate, is_endless=False)
-    from uuvtai.live.gamepad import STICKS_HELP, gamepad
-    from uuvtai.live.hand_driver import HandPiece
-    from uuvtai.live.hand_steering import HELP
-    from uuvtai.live.keyboard import keyboard
+    from uuvtai.live.hands import at_the_wheel
     from uuvtai.measure.evaluate.eval_request import Request
     from uuvtai.measure.hand_driving import drive_by_hand
     from uuvtai.show.evaluation import show_evaluation
@@ -212,11 +204,8 @@ def drive_vehicle(
     request = Request.typed(
         scene, [], controllers=named, seeds=seed_list, episodes=episodes, device="cpu", run_dir=run_dir
     )
-    with contextlib.ExitStack() as hands:
-        sticks = hands.enter_context(gamepad()) if use_gamepad else None
-        keys = hands.enter_context(keyboard())
-        show = hands.enter_context(steering_view(f"{STICKS_HELP}\n{HELP}" if sticks else HELP))
-        result, folder = drive_by_hand(request, HandPiece(keys, show, rate, sticks), Notes())
+    with at_the_wheel(rate, use_gamepad, steering_view) as hand:
+        result, folder = drive_by_hand(request, hand, Notes())
     output.show(result, lambda screen: show_evaluation(screen, result, folder), folder)
 
 
@@ -244,8 +233,7 @@ def identify_vehicle(
 
     from uuvtai.show.identification import show_identified
 
-    title = f"{file[0].name}: {document['seconds']:g} s of drives, known: {known} of {vehicle}"
-    output.show(document, lambda screen: show_identified(screen, document, title))
+    output.show(document, lambda screen: show_identified(screen, document, f"{known} of {vehicle}"))
     say(f"wrote {target}")
 
 
@@ -279,20 +267,17 @@ def sweep(
     arguments.refuse_less("--episodes", episodes, 1)
     engine, progress = place.made(), Progress("cells")
     if resume is not None:
-        arguments.refuse_beside_resume(ctx, _SWEEP_RESUME)
+        arguments.refuse_beside_resume(ctx, arguments.OF_A_SWEEP_RESUMED)
         result, folder = play.resume(resume, engine, progress, allow_code)
     else:
         trained, controllers = drivers.named(["bt"])
         request = SweepRequest.typed(
-            scene, trained, grid=grid_of(grid or []), controllers=tuple(controllers),
-            seeds=tuple(arguments.seeds(seeds)), episodes=episodes, num_envs=num_envs, device=device,
+            scene, trained, grid=grid_of(grid or []), controllers=tuple(controllers), episodes=episodes,
+            seeds=tuple(arguments.integers("--seeds", seeds)), num_envs=num_envs, device=device,
         )  # fmt: skip
         result, folder = play.sweep(request, engine, run_dir, progress)
     _report_if(with_report, folder)
     output.show(result, lambda screen: show_sweep(screen, result), folder)
-
-
-_SWEEP_RESUME = ("allow_code", "world", "episodes", "seeds", "engine", "workers", "address", "device")
 
 
 # -------------------------------------------------------------------------------------------------- benchmark
@@ -354,7 +339,7 @@ def profile(
 ) -> None:
     """Time per stage, env-steps per second (simulated, with inference, with training), memory, and the
     paper's timing tables."""
-    sizes = [arguments.integer("--num-envs", text) for text in num_envs.split(",")]
+    sizes = arguments.integers("--num-envs", num_envs)
     arguments.refuse_no_duration("--seconds", seconds)
     from uuvtai.measure.profile.profiling import profile as run
     from uuvtai.show.profile import show_profile
@@ -472,6 +457,42 @@ def replay_log(
         raise typer.Exit(GATE)
 
 
+@app.command(
+    "pilot", epilog="Example: uuv pilot --mavlink udp:127.0.0.1:14550 --start 2,3,-0.8 --goal 18,3,-0.8"
+)
+@groups.grouped
+def pilot_vehicle(
+    flight: groups.FlightGroup,
+    scene: groups.SeenSceneGroup,
+    output: groups.OutputGroup,
+    controller: opt.PilotTree = "bt",
+) -> None:
+    """Drive a real vehicle, or ArduSub's simulated one, by MAVLink; a dry run unless --arm is typed
+    (docs/safety.md). Exit code 3: it ended by a safe action."""
+    from uuvtai.link.onboard_loop import fly
+    from uuvtai.show.flights import show_flight
+    from uuvtai.tree import read_tree
+
+    config = scene.config()
+    found = fly(config, read_tree(controller, config.teacher.max_node), flight.plan(config), say)
+    output.show(found, lambda screen: show_flight(screen, found))
+    if not found["safe"]:
+        raise typer.Exit(GATE)
+
+
+@app.command("sitl", epilog="Example: uuv sitl --world pool -S 8 -D 6 -v 0.6 --instances 3")
+@groups.grouped
+def serve_sitl(scene: groups.SitlSceneGroup, served: groups.ServedGroup, output: groups.OutputGroup) -> None:
+    """Be the water for ArduSub: our physics, world and sensors behind its JSON interface (docs/sitl.md)."""
+    from uuvtai.show.flights import show_sitl
+    from uuvtai.sitl.serving import serve_water
+    from uuvtai.tree import read_tree
+
+    plan, config = served.plan(), scene.config()
+    found = serve_water(config, read_tree("straight", config.teacher.max_node), plan, say)
+    output.show(found, lambda screen: show_sitl(screen, found))
+
+
 # -------------------------------------------------------------------------------------- presets, doctor, tree
 
 
@@ -533,9 +554,8 @@ def warm(
     from uuvtai.warming import shapes_of
     from uuvtai.warming import warm as run
 
-    sizes = [arguments.integer("--num-envs", text) for text in num_envs.split(",")]
-    if workers < 0:
-        raise UsageError(f"--workers {workers}: must be 1 or more, for example --workers 2")
+    sizes = arguments.integers("--num-envs", num_envs)
+    arguments.refuse_less("--workers", workers, 0)
     scenes = [SceneOptions(world, name, overrides=overrides) for name in sensors.split(",")]
     shapes = shapes_of(scenes, sizes)
     say(f"sizes to compile: {len(shapes)}, about a minute each the first time")
@@ -577,9 +597,7 @@ def log_info(output: groups.OutputGroup, file: opt.LogFile) -> None:
     output.show(found, lambda screen: show_log(screen, found, file))
 
 
-@log_app.command(
-    "export", epilog="Example: uuv log export runs/first/logs/bt_seed0_episode0.mcap --out exported"
-)
+@log_app.command("export", epilog="Example: uuv log export runs/first/logs/bt_seed0_episode0.mcap --out all")
 def log_export(
     file: opt.LogFile, out: opt.LogExportOut, topic: opt.Topics = None, fmt: opt.LogFormat = "json"
 ) -> None:

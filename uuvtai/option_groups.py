@@ -24,9 +24,12 @@ from uuvtai.scene_options import SceneOptions
 from uuvtai.show.screen import Screen
 
 if TYPE_CHECKING:
+    from uuvtai.config import Config
+    from uuvtai.link.flight_plan import FlightPlan
     from uuvtai.measure.replay.faults import Faults
     from uuvtai.measure.simulate import Trial
     from uuvtai.measure.sweep.engines import Engine
+    from uuvtai.sitl.serving import SitlPlan
 
 _F = TypeVar("_F", bound=Callable[..., None])
 
@@ -265,6 +268,104 @@ class FaultsGroup:
 
         arguments.refuse_less("--fault-seed", self.fault_seed, 0)
         return Faults(self.drop, self.jitter, tuple(map(outage_of, self.lose or [])), self.fault_seed)
+
+
+@dataclass(frozen=True)
+class SeenSceneGroup(SceneOptions):
+    """What a pilot on a vehicle is told of its world, vehicle and sensors."""
+
+    world: opt.World = "pool"
+    sensors: opt.Sensors = "multibeam"
+    vehicle: opt.Vehicle = None
+    overrides: opt.Set = None
+
+
+@dataclass(frozen=True)
+class SitlSceneGroup(SceneOptions):
+    """What ArduSub meets."""
+
+    world: opt.World = "pool"
+    sensors: opt.Sensors = "multibeam"
+    vehicle: opt.Vehicle = "bluerov2_16v"
+    n_static: opt.Static = None
+    n_dynamic: opt.Dynamic = None
+    speed_m_s: opt.Speed = None
+    overrides: opt.Set = None
+
+
+@dataclass(frozen=True)
+class FlightGroup:
+    """Where the vehicle is, where it is to go, and what it must keep to."""
+
+    mavlink: opt.Mavlink
+    start: opt.PilotStart
+    goal: opt.PilotGoal
+    arm: opt.Arm = False
+    heading: opt.Heading = None
+    box: opt.FenceBox = None
+    depth: opt.FenceDepth = None
+    max_speed: opt.MostSpeed = 0.5
+    battery: opt.LeastBattery = 13.2
+    system: opt.VehicleId = 1
+    operator: opt.OperatorId = 255
+    seconds: opt.PilotSeconds = None
+    rate: opt.PilotRate = 1.0
+    log: opt.PilotLog = None
+
+    def plan(self, config: Config) -> FlightPlan:
+        """UsageError, LinkError."""
+        from uuvtai.link.flight_plan import FlightPlan
+
+        arguments.refuse_odd_rate(self.rate, is_endless=False)
+        return FlightPlan.typed(
+            config,
+            self.mavlink,
+            arguments.numbers("--start", self.start, 3),
+            arguments.numbers("--goal", self.goal, 3),
+            arguments.numbers("--box", self.box, 4),
+            arguments.numbers("--depth", self.depth, 2),
+            self.max_speed,
+            self.battery,
+            arms=self.arm,
+            heading_deg=self.heading,
+            seconds=self.seconds,
+            rate=self.rate,
+            log=self.log,
+            system=self.system,
+            operator=self.operator,
+        )
+
+
+@dataclass(frozen=True)
+class ServedGroup:
+    """How water is served to ArduSub."""
+
+    seed: opt.SitlSeed = 0
+    episode: opt.SitlEpisode = 0
+    instances: opt.Instances = 1
+    port: opt.SitlPort = 9002
+    host: opt.SitlHost = "127.0.0.1"
+    mavlink: opt.SensorPlaces = None
+    rate: opt.SitlRate = 0.0
+    seconds: opt.SitlSeconds = None
+    once: opt.SitlOnce = False
+
+    def plan(self) -> SitlPlan:
+        """UsageError, LinkError."""
+        from uuvtai.sitl.serving import SitlPlan
+
+        arguments.refuse_odd_rate(self.rate)
+        return SitlPlan.typed(
+            self.host,
+            self.port,
+            self.instances,
+            self.mavlink,
+            self.rate,
+            self.seconds,
+            self.once,
+            self.seed,
+            self.episode,
+        )
 
 
 @dataclass(frozen=True)

@@ -248,10 +248,82 @@ DriveEpisodes = Annotated[int, Option("--episodes", help="Episodes to drive.")]
 DriveRate = Annotated[
     float, Option("--rate", help="Seconds of the episode in one of the clock's; 0.5 gives you time to think.")
 ]
-
 UseGamepad = Annotated[
     bool, Option("--gamepad", help="Steer by the first gamepad too (pip install 'uuvtai\\[gamepad]').")
 ]
+
+# ------------------------------------------------------------------------------------------------ pilot, sitl
+
+Mavlink = Annotated[
+    str,
+    Option(
+        "--mavlink",
+        metavar="udp:HOST:PORT",
+        help="Where the vehicle's MAVLink is: udp:HOST:PORT listens there, udpout:HOST:PORT speaks first.",
+    ),
+]
+PilotStart = Annotated[
+    str, Option("--start", metavar="X,Y,Z", help="Where the vehicle is now \\[m], in the world's axes, z up.")
+]
+PilotGoal = Annotated[str, Option("--goal", metavar="X,Y,Z", help="Where it is to go \\[m].")]
+Heading = Annotated[
+    float | None,
+    Option(
+        "--heading",
+        help="Compass heading of the world's x axis \\[deg] \\[default: where the vehicle looks at first].",
+    ),
+]
+Arm = Annotated[
+    bool, Option("--arm", help="Arm and drive. Without it nothing that moves the vehicle is ever sent.")
+]
+FenceBox = Annotated[
+    str | None,
+    Option("--box", metavar="X,Y,X,Y", help="Fence: least x, y, most x, y \\[m] \\[default: the tank]."),
+]
+FenceDepth = Annotated[
+    str | None,
+    Option("--depth", metavar="LEAST,MOST", help="Fence: depths \\[m] \\[default: the tank, 0.2 m within]."),
+]
+MostSpeed = Annotated[
+    float, Option("--max-speed", help="Horizontal speed that is never asked beyond \\[m/s].")
+]
+LeastBattery = Annotated[float, Option("--battery", help="Voltage below which it surfaces \\[V].")]
+VehicleId = Annotated[int, Option("--system", min=1, max=255, help="MAVLink id of the vehicle.")]
+OperatorId = Annotated[
+    int,
+    Option("--operator", min=1, max=255, help="MAVLink id of the ground station whose heartbeat must come."),
+]
+PilotSeconds = Annotated[
+    float | None, Option("--seconds", help="Give the vehicle back after so long \\[default: never].")
+]
+PilotLog = Annotated[Path | None, Option("--log", help="MCAP to write \\[default: runs/pilot_TIME.mcap].")]
+PilotTree = Annotated[str, _tree("Who drives")]
+PilotRate = Annotated[
+    float,
+    Option("--rate", help="Seconds of the vehicle's clock in one of ours: 1 but for a simulated vehicle."),
+]
+
+SitlPort = Annotated[int, Option("--port", min=1, max=65535, help="UDP port of the first ArduSub's physics.")]
+SitlHost = Annotated[str, Option("--host", help="Address to listen at.")]
+Instances = Annotated[
+    int, Option("--instances", help="ArduSubs (their -I 0, 1, ..); ports count on by ten, episodes by one.")
+]
+SensorPlaces = Annotated[
+    list[str] | None,
+    Option(
+        "--mavlink",
+        metavar="udp:HOST:PORT",
+        help="Where the DVL, the sonar and the altimeter speak to (repeatable) \\[default: "
+        "udp:127.0.0.1:14660 for ArduSub, udpout:127.0.0.1:14550 for uuv pilot].",
+    ),
+]
+SitlRate = Annotated[
+    float, Option("--rate", help="Seconds of the water in one of the clock's, at most; 0 = as ArduSub asks.")
+]
+SitlSeconds = Annotated[float | None, Option("--seconds", help="End after so long \\[default: at Ctrl-C].")]
+SitlOnce = Annotated[bool, Option("--once", help="End when the episode of every instance has ended.")]
+SitlSeed = Annotated[int, Option("--seed", help="Seed of the episodes.")]
+SitlEpisode = Annotated[int, Option("--episode", min=0, help="Episode of the first instance.")]
 
 # ------------------------------------------------------------------------------------------------------ sweep
 

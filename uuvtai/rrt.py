@@ -266,8 +266,7 @@ class RouteFallback:
 
         route, ego, mission = stages.route.route, stages.route.ego, stages.route.mission
         n_failed = int(route.n_failed[None])
-        for item in range(n_failed):
-            env = int(route.failed[item])
+        for env in sorted(int(route.failed[item]) for item in range(n_failed)):
             overlay_clearance(stages.voronoi, self.overlay, env)
             start, goal = ego.pos_w[env], mission.goal_w[env]
             corners = self.plan((start[0], start[1]), (goal[0], goal[1]), seed_of(env))
@@ -285,7 +284,7 @@ class RouteFallback:
 
         io = stages.route
         n_queue = int(io.route.n_queue[None])
-        envs = read(io.route.queue)[:n_queue].tolist() if n_queue else []
+        envs = sorted(read(io.route.queue)[:n_queue].tolist()) if n_queue else []
         if not envs:
             return
         ends = [read(field, envs)[:, :2] - self.origin for field in (io.ego.pos_w, io.mission.goal_w)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from uuvtai.kernels.sensors import depth, proprioception, sonar
+from uuvtai.kernels.sensors import depth, head, proprioception, sonar
 from uuvtai.stages import Stages
 
 
@@ -28,13 +28,19 @@ class SensorSource(Protocol):
 class SimulatedSensors:
     """The simulator's own: from the truth, with errors as configured."""
 
+    def __init__(self, mechanical: bool) -> None:
+        self._mechanical = mechanical
+
     def sense_motion(self, stages: Stages) -> None:
         """All instruments but sonar and camera."""
         proprioception.sense_proprioception(stages.proprioception)
 
     def sense_sonar(self, stages: Stages) -> None:
-        """The ring or fan of beams."""
-        sonar.cast_sonar(stages.sonar)
+        """The ring or fan of beams, or the mechanical one."""
+        if self._mechanical:
+            head.turn_head(stages.sonar)
+        else:
+            sonar.cast_sonar(stages.sonar)
 
     def sense_depth(self, stages: Stages) -> None:
         """The depth camera."""

@@ -64,7 +64,7 @@ class Sim:
         self._every_row = torch.arange(num_envs, dtype=torch.int32, device=self.device)
         self.fallback = RouteFallback(config)
         self.planner: RoutePlanner | None = None
-        self.sensors: SensorSource = SimulatedSensors()
+        self.sensors: SensorSource = SimulatedSensors(config.sensors.sonar.mechanical)
         self.stage_s: dict[str, float] | None = None
         self.privileged = False
         self._watches = lost_thruster.is_watched(config.vehicle, config.actuation)
@@ -132,6 +132,7 @@ class Sim:
                 pose.predict_pose(io.pose)
         with self._stage("sonar"):
             self.sensors.sense_sonar(io)
+            stack.recall(io, c)
         if estimated and c.pose.use_walls:
             with self._stage("pose"):
                 pose.correct_pose(io.pose)

@@ -15,9 +15,10 @@ from uuvtai.errors import SettingError, SizeError
 from uuvtai.forecast_codes import N_BEND, N_COLUMN, N_FRAME, N_HIDDEN, N_MODE, N_PAST, N_SAID, N_WEIGHT
 from uuvtai.kernels.core.grid import grid_shape
 from uuvtai.kernels.core.lanes import LANES
-from uuvtai.kernels.perception.mapping import map_period_s, scans_in
+from uuvtai.kernels.perception.mapping import look_period_s, scans_in
 from uuvtai.kernels.planning.clearance import offset_bits
 from uuvtai.kernels.planning.exposure import block_shape
+from uuvtai.native.gpu_shape import is_gpu_shaped
 from uuvtai.plan_codes import N_PLANNER, N_REASON, N_TRIGGER
 from uuvtai.scenario import scenario_sizes
 from uuvtai.stages import SimState
@@ -27,6 +28,8 @@ _ROWS = (1, 8, 64, 256)
 """sizes of a batch that are allocated; beyond them powers of two"""
 _PLAN_SLOTS = 64
 """Plans under way at once: far more than a CPU has cores, and the planner's scratch stays small."""
+_GPU_PLAN_SLOTS, _ENVS_PER_PLAN = 16, 16
+"""On a GPU a slot is a thread: as many as envs plan in a busy step, and no fewer than the first number."""
 _MAP_SLOTS = 64
 """Maps under way at once on a CPU: more than it has cores, and their scratch stays in its caches. On a GPU
 every env has its own."""
@@ -42,6 +45,7 @@ def array_sizes(config: Config, n_env: int, device: str = "cpu") -> dict[str, in
     """Length of every named axis in ``state``; that of ``n_env`` is what is allocated."""
     tank, sensors, n_env = config.world.tank, config.sensors, rows_for(n_env)
     n_row, n_col = grid_shape(tank, config.mapping.cell_m)
+    for_gpu = device == "cuda" or is_gpu_shaped()
     n_block_row, n_block_col = block_shape((n_row, n_col), config.quiet)
     return {
         "n_env": n_env,
@@ -52,6 +56,7 @@ def array_sizes(config: Config, n_env: int, device: str = "cpu") -> dict[str, in
         **scenario_sizes(config.world),
         "n_ray": sensors.sonar.n_ray,
         "n_latency": sensors.sonar.latency_steps // sensors.sonar.period_steps + 2,
+        "n_echo": sensors.sonar.n_ray if sensors.sonar.mechanical else 1,
         "n_cloud": 8,
         "n_pixel_row": sensors.depth.rows,
         "n_pixel_col": sensors.depth.cols,
@@ -61,15 +66,15 @@ def array_sizes(config: Config, n_env: int, device: str = "cpu") -> dict[str, in
         "n_turn_row": 7,
         "n_turn": config.forecast.n_turn,
         "n_forecast": round(config.tracking.horizon_s / config.tracking.forecast_dt_s) + 1,
-        "n_future": N_MODE if config.forecast.learned else max(1, len(config.forecast.turn_back_s)),
+        "n_future": N_MODE if config.forecast.learned else max(1, 2 * len(config.forecast.turn_back_s)),
         **_network_sizes(config.forecast),
         "n_row": n_row,
         "n_col": n_col,
         "n_packet": n_col // LANES,
         "n_block_row": n_block_row,
         "n_block_col": n_block_col,
-        "n_slot": n_env if device == "cuda" else min(n_env, _MAP_SLOTS),
-        "n_plan": min(n_env, _PLAN_SLOTS),
+        "n_slot": n_env if for_gpu else min(n_env, _MAP_SLOTS),
+        "n_plan": min(n_env, max(_GPU_PLAN_SLOTS, n_env // _ENVS_PER_PLAN) if for_gpu else _PLAN_SLOTS),
         "n_heap": n_row * n_col,
         "n_path": 2048,
         "n_ahead": math.ceil(config.route.risk_horizon_m / config.mapping.cell_m) + 2,
@@ -156,7 +161,7 @@ def _check_kernels(config: Config) -> None:
     try:
         offset_bits(config.clearance, mapping)
         for seconds in (mapping.free_confident_s, mapping.promote_s):
-            scans_in(seconds, map_period_s(mapping, sensors.sonar, config.episode))
+            scans_in(seconds, look_period_s(mapping, sensors.sonar, config.episode))
     except ValueError as error:
         raise SettingError(str(error)) from None
 

@@ -16,6 +16,7 @@ from uuvtai import tree_codes as codes
 from uuvtai.config import Config, FeaturesConfig
 from uuvtai.kernels.baselines import dynamic_window, path_integral, potential_field, velocity_obstacle
 from uuvtai.kernels.perception import (
+    echoes,
     elevation,
     forecast,
     futures,
@@ -33,6 +34,12 @@ from uuvtai.kernels.teacher import evasion, leaves, threats
 from uuvtai.sensing import forget_readings
 from uuvtai.stages import Stages
 from uuvtai.state import BaselineState
+
+
+def recall(stages: Stages, config: Config) -> None:
+    """A mechanical beam's scan has what it heard before, too."""
+    if config.sensors.sonar.mechanical:
+        echoes.recall_echoes(stages.echoes)
 
 
 def track(stages: Stages, config: Config, privileged: bool) -> None:
@@ -111,6 +118,8 @@ def observe(stages: Stages, features_cfg: FeaturesConfig, out: torch.Tensor) -> 
 def forget(stages: Stages, config: Config) -> None:
     """Empty readings and memory of the stack in the rows that are awake."""
     forget_readings(stages)
+    if config.sensors.sonar.mechanical:
+        echoes.reset_echoes(stages.echoes)
     if config.sensors.localization == "estimated":
         pose.reset_pose(stages.pose)
     tracking.reset_tracks(stages.tracking)

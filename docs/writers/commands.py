@@ -25,6 +25,8 @@ SEE = {
     "report": ("quickstart", "paper_kit"),
     "export": ("deployment",),
     "replay": ("replay", "viewers"),
+    "pilot": ("safety", "sitl"),
+    "sitl": ("sitl",),
     "presets": ("reference/configuration",),
     "doctor": ("quickstart", "native"),
     "warm": ("native",),
@@ -48,7 +50,8 @@ EXIT_CODES = (
     (
         endings.GATE,
         "finished, but a gate was not met: `uuv export` found that an exported policy disagrees, `uuv "
-        "benchmark verify` that an entry does, `uuv replay` that commands do",
+        "benchmark verify` that an entry does, `uuv replay` that commands do, "
+        "`uuv pilot` ended by a safe action",
     ),
     (
         endings.INTERRUPTED,

@@ -12,6 +12,7 @@ from docs.writers.benchmark_pages import benchmark, benchmark_scenes
 from docs.writers.dead_tables import dead_commands, dead_thrusters
 from docs.writers.figure_sources import Counts, SourceError, Sources, fitting, pooled, rated, share, weighted
 from docs.writers.forecast_tables import forecast_pieces, forecast_scores
+from docs.writers.link_tables import closed_loop
 from docs.writers.pieces import BEFORE, CELLS, DASH, LETTERS, PIECES, beside
 from docs.writers.pose_tables import pose_endings, pose_errors
 from docs.writers.replay_tables import changed, lossy, replayed
@@ -513,6 +514,19 @@ def risk_bins(sources: Sources) -> str:
     return text_table(rows[0], rows[1:])
 
 
+def rehearsal(sources: Sources) -> str:
+    """CUDA without a GPU: what was assembled, counted and compared, and the MODEL of its speed."""
+    rows = [
+        [
+            row["what"],
+            "not done" if row["ours"] is None else f"{row['ours']:,.0f} {row['unit']}".strip(),
+            row["note"],
+        ]
+        for row in sources.benchmark("rehearsal")["rows"]
+    ]
+    return text_table(["", "", ""], rows)
+
+
 def _row(sources: Sources, what: str, text: str) -> dict[str, Any]:
     return next(row for row in sources.benchmark(what)["rows"] if row["what"] == text)
 
@@ -551,6 +565,7 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         replayed,
         changed,
         lossy,
+        closed_loop,
         sonars,
         vehicle_commands,
         vehicles,
@@ -561,5 +576,6 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         forecast_pieces,
         benchmark_scenes,
         benchmark,
+        rehearsal,
     )
 }

@@ -15,12 +15,13 @@ _SHOWN_CAUSES = 3
 
 def sonars(sources: Sources) -> str:
     """A row for each sonar and scene: rates with intervals, time, against the first sonar on the same
-    episodes, and the most frequent causes."""
+    episodes, and the most frequent causes; of those that were played."""
     played = {(row["sonar"], row["cell"]): row for row in sources.json(FILE)["rows"]}
     rows = [
         _row(played[kind.title, cell], played[KINDS[0].title, cell])
         for cell, _options in CELLS
         for kind in KINDS
+        if (kind.title, cell) in played
     ]
     head = ["sonar", "world (S, D, v in m/s)", "success", "collision", "time to goal"]
     head += ["only the first, only this arrives; exact McNemar p", "most frequent causes of failure"]

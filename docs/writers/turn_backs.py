@@ -1,5 +1,6 @@
-"""Are the forecast's turn-backs as probable as it says? ``python -m docs.writers.turn_backs`` plays episodes
-with futures on and compares each track's probability with what the body then did, in closed form.
+"""Are turns as probable as the futures say? ``python -m docs.writers.turn_backs`` plays episodes with
+futures on and compares each track's probability to turn, back or a corner, with what the body then did, in
+closed form.
 
 Writes ``docs/data/turn_backs.json``, counts by bins of the probability, and ``docs/turn_backs.png`` from it;
 ``--draw`` draws anew what is kept. A track is looked at once per horizon, so that no two of its moments
@@ -35,7 +36,7 @@ Moment = tuple[float, str, bool, bool]
 
 
 class Watcher:
-    """Recorder of ``run_episodes``: each straight track's probability to turn back, and what came."""
+    """Recorder of ``run_episodes``: each straight track's probability to turn, and what came."""
 
     def __init__(self) -> None:
         self.moments: list[Moment] = []
@@ -56,11 +57,13 @@ class Watcher:
         due = [row for row in sorted(self._bodies) if steps[row] % round(TURN_BACK_S[-1] / _STEP_S) == 0]
         if not due:
             return
-        share, place = sim.rows(sim.s.futures.share, due), sim.rows(sim.s.forecast.pos_w, due)
+        back = sim.rows(sim.s.futures.share, due)[..., : len(TURN_BACK_S)].sum(-1)
+        share = back + sim.rows(sim.s.futures.corner, due)
+        place = sim.rows(sim.s.forecast.pos_w, due)
         there = sim.rows(sim.s.forecast.radius_m, due)[..., 0] >= 0
         for i, row in enumerate(due):
-            for track in np.flatnonzero(there[i] & (share[i].sum(-1) > 0)):
-                probability = min(float(share[i, track].sum()), 1.0)
+            for track in np.flatnonzero(there[i] & (share[i] > 0)):
+                probability = min(float(share[i, track]), 1.0)
                 way = place[i, track, 1] - place[i, track, 0]
                 seen = what_came(self._bodies[row], place[i, track, 0], way, steps[row] * _STEP_S)
                 self.moments.append((probability, *seen))
@@ -139,8 +142,8 @@ def drawn(kept: dict[str, Any]) -> bytes:
     figure, panels = pyplot.subplots(1, 2, figsize=(9.0, 4.3), sharey=True, layout="constrained")
     for panel, (cell, rows) in zip(panels, kept["cells"].items(), strict=True):
         panel.plot([0, 1], [0, 1], color="#7a7d80", linewidth=1, linestyle="--", label="as forecast")
-        for name, colour, mark in (("turned_back", "#0b6fb8", "o"), ("turned", "#c2571a", "s")):
-            if name == "turned" and all(row["turned"] == row["turned_back"] for row in rows):
+        for name, colour, mark in (("turned", "#0b6fb8", "o"), ("turned_back", "#c2571a", "s")):
+            if name == "turned_back" and all(row["turned"] == row["turned_back"] for row in rows):
                 continue
             x, low, share, high = np.array([point for row in rows if (point := _point(row, name))]).T
             label = "turned back" if name == "turned_back" else "turned by more than 30 degrees"
@@ -148,7 +151,7 @@ def drawn(kept: dict[str, Any]) -> bytes:
             panel.errorbar(x, share, spread, fmt=mark, ms=4.5, color=colour, label=label)
         n_moment = sum(row["moments"] - row["no_body"] - row["other_way"] for row in rows)
         panel.set(title=f"{cell}, {n_moment:,} moments", xlim=(0, 1), ylim=(0, 1), aspect="equal")
-        panel.set_xlabel(f"forecast probability of a turn-back within {TURN_BACK_S[-1]} s")
+        panel.set_xlabel(f"forecast probability of a turn within {TURN_BACK_S[-1]} s")
         panel.grid(alpha=0.2)
         panel.legend(frameon=False, loc="upper left")
     panels[0].set_ylabel("share that turned within it, 95 % Wilson")
@@ -172,7 +175,7 @@ def main(arguments: list[str] | None = None) -> int:
         cells = {CELLS[world]: counted(played(world, EPISODES)) for world in CELLS}
         about = (
             f"Moments of tracks that go straight, {EPISODES} episodes of seed {SEED} in each cell by `bt`, "
-            f"forecast.turn_back_s {TURN_BACK_S}: probability of a turn-back within {TURN_BACK_S[-1]} s, and "
+            f"forecast.turn_back_s {TURN_BACK_S}: probability of a turn within {TURN_BACK_S[-1]} s, and "
             "how many bodies did turn (course changed by more than 30 degrees) and turn back (120) within it"
         )
         rows = {cell: [json.dumps(row) for row in rows] for cell, rows in cells.items()}

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from uuvtai.closed_form import body_positions
-from uuvtai.config import Config
+from uuvtai.config import Config, SensorsConfig, SonarConfig
 from uuvtai.logs.moment import EpisodeHeader
 from uuvtai.logs.scenario_document import scenario_document
 from uuvtai.outcomes import OUTCOMES
@@ -91,7 +91,7 @@ BODIES = [
 
 
 def config() -> Config:
-    return Config()
+    return Config(sensors=SensorsConfig(sonar=SonarConfig(image_bins=24)))
 
 
 def scenario(episode: int = 3) -> dict:
@@ -198,6 +198,8 @@ def _sensed(
         "scan.doppler_m_s": rng.normal(-0.3, 0.05, N_RAY).astype(np.float32),
         "scan.intensity": rng.uniform(0.01, 1, N_RAY).astype(np.float32),
         "scan.hit": hit.astype(np.int32),
+        "scan.new_from": np.int32(0),
+        "scan.new_count": np.int32(0),
         "scan.ping_vel_b": np.array([0.5, 0.02, 0.0], np.float32),
         "image.fresh": np.int32(step % 5 == 0),
         "image.shot_rpy": np.array([0.02, -0.03, yaw], np.float32),

@@ -123,9 +123,10 @@ class ForecastConfig(Section):
     fades, and the uncertainty grows both ways along their course (``traffic.leg_m``); off: they go on for
     sure"""
     turn_back_s: tuple[Positive, ...] = ()
-    """[s] a body on a straight way may turn back within the first of these times, between the first and the
-    second, and so on: one future each, with its probability, (0.4, 0.8) for example; () = it goes on for
-    sure (in trials futures cost more in timeouts than they saved in collisions)"""
+    """[s] a body on a straight way may turn within the first of these times, between the first and the
+    second, and so on: two futures each, back and a corner after which it comes to the vehicle, with their
+    probabilities (``traffic``), (0.4, 0.8) for example; () = it goes on for sure (no trial showed a gain:
+    docs/tuning.md)"""
     learned: Annotated[str, Field(max_length=1000)] = ""
     """network that says what bodies may do, in place of ``turn_back_s``: ``shipped``, or the run folder of
     ``uuv train forecast``; empty = none (``docs/learning.md``)"""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from uuvtai.config.section import (
     Count,
@@ -19,14 +19,28 @@ from uuvtai.config.section import (
     Vector3,
 )
 
+SOUND_M_S = 1500.0
+"""[m/s] in water"""
+
 
 class SonarConfig(Section):
-    """Horizontal beams, fixed to the yaw, always level: a ring, or a fan ahead."""
+    """Horizontal beams, fixed to the yaw, always level: a ring, or a fan ahead; all at once, or one beam that
+    a motor turns from one to the next (``mechanical``)."""
 
     n_ray: Packets = 256
     horizontal_aperture_deg: Annotated[float, Field(ge=10, le=360)] = 360.0
     """360: a ring, beam 0 ahead. Less: a fan of ``n_ray`` beams whose middle is ahead, beam 0 at its right
     edge; what lies beside and behind it is not seen. Counter-clockwise both"""
+    mechanical: bool = False
+    """one beam, turned by a motor: it looks along beam 0, 1, .., of a ring round and round, of a fan there
+    and back. A step lasts as long as sound takes to ``max_range_m`` and back, and ``step_overhead_s``"""
+    step_overhead_s: NonNegative = 0.02
+    """of a mechanical beam"""
+    beam_width_deg: Annotated[float, Field(ge=0, le=30)] = 0.0
+    """of a mechanical beam, horizontally: what is nearest within it returns"""
+    image_bins: Annotated[int, Field(ge=0, le=2048)] = 0
+    """range bins of the intensity image that logs with depth images hold twice a second (``/sonar/image``);
+    0: none. Nothing decides by it"""
     max_range_m: Positive = 12.0
     vertical_half_aperture_deg: Annotated[float, Field(ge=0, lt=80)] = 10.0
     period_steps: PositiveCount = 1
@@ -56,6 +70,33 @@ class SonarConfig(Section):
     """probability per beam that the Doppler is worthless"""
     doppler_outlier_m_s: NonNegative = 2.0
     """worthless = uniform within +- this (EC)"""
+
+    @model_validator(mode="after")
+    def _possible(self) -> SonarConfig:
+        wanted = {"doppler": False, "period_steps": 1, "latency_steps": 0}
+        wrong = [name for name, value in wanted.items() if getattr(self, name) != value]
+        if self.mechanical and wrong:
+            typed = " ".join(f"--set sensors.sonar.{name}={str(wanted[name]).lower()}" for name in wrong)
+            raise ValueError(
+                f"mechanical: one beam comes at a time, at once and without Doppler; add {typed}, or take "
+                "--sensors ping360"
+            )
+        return self
+
+    @property
+    def step_us(self) -> int:
+        """[us] that one step of a mechanical beam lasts."""
+        return max(1, round(1e6 * (2.0 * self.max_range_m / SOUND_M_S + self.step_overhead_s)))
+
+    @property
+    def sweep_s(self) -> float:
+        """[s] in which a mechanical beam looks along all bearings once; 0 where all beams come at once."""
+        return self.n_ray * self.step_us / 1e6 if self.mechanical else 0.0
+
+    @property
+    def half_width_rad(self) -> float:
+        """[rad] from the middle of a mechanical beam to its edge; 0 where all beams come at once."""
+        return math.radians(0.5 * self.beam_width_deg) if self.mechanical else 0.0
 
     @property
     def is_ring(self) -> bool:

@@ -21,7 +21,7 @@ import numpy as np
 from uuvtai.files import refuse_output
 from uuvtai.logs.log_errors import LogError
 from uuvtai.logs.reader import info, original, read_head, read_messages
-from uuvtai.logs.topics.camera_topics import depth_image
+from uuvtai.logs.topics.camera_topics import logged_image
 from uuvtai.logs.topics.map_topics import grid_values
 
 FORMATS = ("json", "csv", "npz")
@@ -266,7 +266,7 @@ def _arrays(data: dict[str, Any]) -> dict[str, Any]:
             "cell_m": data["cell_size"]["x"],
         }
     if data.get("format") == "png":
-        return {"depth_mm": depth_image(data)}
+        return {"intensity" if data["frame_id"] == "sonar" else "depth_mm": logged_image(data)}
     found: dict[str, Any] = {}
     for key, value in data.items():
         if isinstance(value, dict):

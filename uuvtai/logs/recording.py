@@ -36,6 +36,11 @@ class Series:
         i = bisect.bisect_right(self.times, time_s + 1e-9)
         return self.values[i - 1] if i else None
 
+    def until(self, time_s: float) -> Iterator[Any]:
+        """Values up to this time, the newest first."""
+        for i in reversed(range(bisect.bisect_right(self.times, time_s + 1e-9))):
+            yield self.values[i]
+
 
 @dataclass
 class Recording:

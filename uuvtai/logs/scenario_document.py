@@ -27,14 +27,19 @@ FORMULAS = {
     ),
     "sonar": (
         "Beam i looks along the true yaw + start_angle + i (end_angle - start_angle) / (n - 1), angles of "
-        "/sonar/scan, in the horizontal plane of the true position at the scan's own timestamp. A body is "
+        "/sonar/scan (start_angle alone where n = 1), in the horizontal plane of the true position at the "
+        "scan's own timestamp. A body is "
         "met where the beam enters its horizontal outline (of a sphere: a circle of radius sqrt(r^2 - g^2), "
         "g = max(|dz| - d tan(a), 0), d = horizontal distance of its centre) if the vertical gap is at most "
         "range * tan(a); a = sensors.sonar.vertical_half_aperture_deg. Side walls are always met, floor and "
         "surface never; "
         "nothing beyond sensors.sonar.max_range_m returns. Doppler = (velocity of the body or wall that is "
         "met - own velocity) . beam: how fast that piece of surface recedes; none is measured where "
-        "sensors.sonar.doppler is false. Errors as in sensors.sonar."
+        "sensors.sonar.doppler is false. Errors as in sensors.sonar. If sensors.sonar.mechanical, a scan "
+        "holds the beams taken in that control step; a beam returns the nearest that 16 rays meet, evenly "
+        "over beam_width_deg about it. The k-th is taken at the end of the control step in which k (2 "
+        "max_range_m / (1500 m/s) + step_overhead_s), to whole microseconds, is; it is beam k mod n_ray of a "
+        "whole circle, and of a sector goes 0 .. n_ray - 1 and back."
     ),
     "clearance": (
         "Hull = capsule about the vehicle's x axis (vehicle.hull_half_length_m either side of the origin, "
@@ -59,22 +64,27 @@ FORMULAS = {
         "sonar.period_steps * ceil(mapping.period_steps / sonar.period_steps); for depth_hit the longer of P "
         "and control_dt_s * depth.period_steps. A scan is mapped at its log time if the last mapped one is "
         "at least mapping.period_steps steps older. Own position and yaw: /pose_estimate at the scan's "
-        "timestamp. The layers of a log time include that step's scan."
+        "timestamp. The layers of a log time include that step's scan. If sensors.sonar.mechanical: every "
+        "scan is mapped, P of the decays is the longer of a step of the beam and control_dt_s, and P of the "
+        "gains of returns and [free] is n_ray steps of the beam."
     ),
     "map_free": (
         "[free]: cells of the tank that have no return in this scan and whose centre lies in the triangle "
         "between two neighbouring beams, its two sides along them both as long as the smaller of their "
         "reaches. reach = range - cell_m - sigma for a return, sigma = range_sigma_m + range_sigma_slope * "
-        "range; min(free_range_m, max_range_m) without one; at least 0."
+        "range; min(free_range_m, max_range_m) without one; at least 0. Of a mechanical beam: the triangle "
+        "half a step of the beam to either side of it, both sides as long as its own reach."
     ),
     "map_returns": (
         "A return counts in the cell of its point, but not within wall_margin_m of a side wall or beyond, "
-        "nor where range > wall - error; error = 3 (sigma + range_jitter_m) + range_quantum_m, wall = range "
+        "(of a mechanical beam, plus half its width in rad times the range), nor where range > wall - error; "
+        "error = 3 (sigma + range_jitter_m) + range_quantum_m, wall = range "
         "of the known side wall along the beam. It is a moving one if |velocity + own_velocity . beam| "
         "(/sonar/doppler, beam in body axes) > max(doppler_evidence_m_s, 3 doppler_sigma_m_s), or if the "
         "beam is listed in /tracks, or if the cell speaks against a body at rest: (free_scans >= "
         "ceil(free_confident_s / P) or 0 < dynamic_scans < ceil(promote_s / P)) and no cell within m rows "
-        "and columns has static >= occupied, m = min(4, 1 + floor((spacing of the beams * range + error) / "
+        "and columns has static >= occupied, P being that of the gains, m = min(4, 1 + floor((spacing of the "
+        "beams (or half their width, if more) * range + error) / "
         "cell_m)). All of this as of before the scan. Counters of a cell, to 255: free: free_scans + 1, "
         "dynamic_scans = 0; any return: free_scans = 0; a moving one: dynamic_scans + 1."
     ),

@@ -96,13 +96,17 @@ LASER_SCAN = record(
     intensities=described(array_of(NUMBER), "[0, 1]; 0 = no return"),
 )
 
-COMPRESSED_IMAGE = record(
-    "foxglove.CompressedImage",
-    timestamp=TIME,
-    frame_id=STRING,
-    data=described(BASE64, "16-bit PNG of the z-depth [mm]; maximum range = no return"),
-    format=STRING,
-)
+
+def compressed_image(text: str) -> Schema:
+    """foxglove.CompressedImage; ``text`` says what its data are."""
+    return record(
+        "foxglove.CompressedImage",
+        timestamp=TIME,
+        frame_id=STRING,
+        data=described(BASE64, text),
+        format=STRING,
+    )
+
 
 UINT8, FLOAT32 = 1, 7
 """numeric types of packed fields"""

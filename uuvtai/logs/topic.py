@@ -73,6 +73,14 @@ IMAGES = When(
     ("image.fresh",),
     hertz=2.0,
 )
+SONAR_IMAGES = When(
+    "2 Hz, with `--depth-images`, where `sensors.sonar.image_bins` is not 0",
+    lambda moment, waited: (
+        waited and bool(moment["scan.fresh"]) and moment.header.config.sensors.sonar.image_bins > 0
+    ),
+    ("scan.fresh",),
+    hertz=2.0,
+)
 EVADING = When(
     "every decision that looks for an evasion",
     lambda moment, waited: bool(moment["teacher.want_evade"]),

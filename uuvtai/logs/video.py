@@ -27,6 +27,7 @@ from uuvtai.logs.canvas import (
     bgr,
     method_inks,
 )
+from uuvtai.logs.fan_image import polar_picture
 from uuvtai.logs.log_errors import LogError, checked_suffix
 from uuvtai.logs.painting import (
     map_canvas,
@@ -45,6 +46,10 @@ _MARGINS = (52, 28, 84, 212)
 _PANEL = 160
 """[px] height of the panel below the map"""
 _ECHO, _GOOD = bgr("#0b7a75"), bgr("#2b8a3e")
+_FAN_GAP = 8
+"""[px] from the map's corner to the sonar's image"""
+_ECHO_BEAMS = 64
+"""A scan of fewer beams is painted together with those before it."""
 _TRIGGER_COLORS = {
     "initial": GREY,
     "stuck": bgr("#ae3ec9"),
@@ -219,6 +224,7 @@ class FrameArtist:
         canvas.vehicle(pose, self._ink)
         self._paint_head(time_s)
         self._paint_panel(time_s, i)
+        self._paint_fan(time_s)
         return canvas.image
 
     def _background(self, time_s: float) -> np.ndarray:
@@ -245,17 +251,29 @@ class FrameArtist:
             canvas.disc(ahead, 5, ROUTE)
 
     def _paint_echoes(self, time_s: float) -> None:
-        """Returns of the newest scan, seen from where it was taken."""
-        scan = self.recording["/sonar/scan"].at(time_s)
-        if scan is None:
+        """Returns of the newest scan, seen from where it was taken; of a mechanical beam those of the last
+        ``_ECHO_BEAMS``."""
+        beams = 0
+        for ranges, away, hit, ping_s in self.recording["/sonar/scan"].until(time_s):
+            x, y, _, yaw = self.recording["/pose"].at(ping_s) or self._track[0]
+            bearing = yaw + away
+            for echo in (
+                np.array([x, y]) + ranges[:, None] * np.column_stack([np.cos(bearing), np.sin(bearing)])
+            )[hit]:
+                self._canvas.disc(echo, 2.4, _ECHO)
+            beams += len(ranges)
+            if beams >= _ECHO_BEAMS:
+                return
+
+    def _paint_fan(self, time_s: float) -> None:
+        """What the sonar's beams hear, if the log has it, in the upper right corner of the map."""
+        shown, scan = (self.recording[f"/sonar/{name}"].at(time_s) for name in ("image", "scan"))
+        if shown is None or scan is None or shown.shape[1] != len(scan[1]):
             return
-        ranges, hit, ping_s = scan
-        x, y, _, yaw = self.recording["/pose"].at(ping_s) or self._track[0]
-        bearing = yaw + 2 * np.pi * np.arange(len(ranges)) / len(ranges)
-        for echo in (
-            np.array([x, y]) + ranges[:, None] * np.column_stack([np.cos(bearing), np.sin(bearing)])
-        )[hit]:
-            self._canvas.disc(echo, 2.4, _ECHO)
+        image, top = self._canvas.image, _MARGINS[2] + _FAN_GAP
+        fan = polar_picture(shown, scan[1], image.shape[0] // 4, paper=0)
+        height, width = fan.shape
+        image[top : top + height, -_MARGINS[1] - _FAN_GAP - width : -_MARGINS[1] - _FAN_GAP] = fan[:, :, None]
 
     def _paint_goal(self) -> None:
         canvas, goal, radius = (

@@ -16,6 +16,7 @@ import taichi as ti
 import torch
 
 from uuvtai.native.companion import Companion
+from uuvtai.native.gpu_shape import asked_shape
 from uuvtai.native.keys import KeyNameError, key_of
 from uuvtai.native.launch import Launch, NativeLaunch, TaichiLaunch, native, written
 from uuvtai.native.machine import Machine, UnfitError, tasks_in
@@ -45,7 +46,7 @@ class Native:
             raise UnfitError(f"Taichi {'.'.join(map(str, ti.__version__))} is not 1.7.4")
         self.store = Store(default_folder())
         self.machine = Machine(int(os.environ.get("UUV_NUM_THREADS") or os.cpu_count() or 1))
-        self.surroundings = [*self.machine.surroundings(), *map(str, ti.__version__)]
+        self.surroundings = [*self.machine.surroundings(), *map(str, ti.__version__), asked_shape()]
         self.adopted: weakref.WeakKeyDictionary[Any, Owner] = weakref.WeakKeyDictionary()
         self.compiler: Compiler | None = None
         self.companion = Companion()

@@ -80,7 +80,7 @@ class Ego(NamedTuple):
 
 class Scan(NamedTuple):
     """The newest sonar scan, counter-clockwise. Of a ring beam 0 was ahead when it was taken, of a fan it is
-    the rightmost one."""
+    the rightmost one. Of a mechanical beam: each bearing's newest return, where it is seen from here."""
 
     range_m: Any
     """(n, R) [m]; maximum range without a return"""

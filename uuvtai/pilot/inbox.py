@@ -10,6 +10,9 @@ import numpy as np
 
 from uuvtai.pilot.sensor_messages import LIMITS, NAMES, SensorMessage
 
+ANY = -1
+"""Length of an axis that may have any"""
+
 
 @dataclass
 class Tally:
@@ -81,7 +84,7 @@ class Inbox:
 
     def _check_shape(self, name: str, key: str, shape: tuple[int, ...]) -> None:
         wanted = self._shapes.get(f"{name}.{key}", () if name == "pressure" else (3,))
-        if shape != wanted:
+        if len(shape) != len(wanted) or any(w not in (s, ANY) for s, w in zip(shape, wanted, strict=True)):
             raise ValueError(f"{name}: {key} must have the shape {wanted}, got {shape}")
 
 

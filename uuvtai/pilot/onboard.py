@@ -18,12 +18,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uuvtai.config import Config
+from uuvtai.config import Config, SonarConfig
 from uuvtai.logs.moment import numbered
 from uuvtai.pilot.fed_sensors import FedSensors
-from uuvtai.pilot.inbox import Inbox, Tally
+from uuvtai.pilot.inbox import ANY, Inbox, Tally
 from uuvtai.pilot.mission import Mission, begin_mission, step_mission
-from uuvtai.pilot.sensor_messages import SensorMessage
+from uuvtai.pilot.sensor_messages import SensorMessage, SonarPing
 from uuvtai.plan_codes import TRIGGERS
 from uuvtai.sim import Sim
 from uuvtai.tree import FlatTree
@@ -84,14 +84,7 @@ class OnboardPilot:
         self._nodes = numbered(sim.tree.names)
         memory = sim.memory()
         camera = config.sensors.depth
-        sonar = config.sensors.sonar
-        self._inbox = Inbox(
-            {
-                **{f"sonar.{name}": (sonar.n_ray,) for name in ("range_m", "hit")},
-                "sonar.doppler_m_s": (sonar.n_ray if sonar.doppler else 0,),
-                "depth.depth_m": (camera.rows, camera.cols),
-            }
-        )
+        self._inbox = Inbox(_shapes(config.sensors.sonar) | {"depth.depth_m": (camera.rows, camera.cols)})
         views = memory.views(memory.read(), scratch=True)
         self._sensors = FedSensors(config, views, self._inbox)
         self._teacher = {name: views[f"teacher.{name}"] for name in ("action", "last_vel_w", "leaf")}
@@ -118,6 +111,8 @@ class OnboardPilot:
 
     def feed(self, message: SensorMessage) -> None:
         """Take a message, at any time before the ``tick`` that is to use it. TypeError, ValueError."""
+        if isinstance(message, SonarPing):
+            _check_beams(message, self.config.sensors.sonar)
         self._inbox.feed(message)
 
     def tick(self) -> PilotCommand:
@@ -161,3 +156,26 @@ class OnboardPilot:
         if not np.isfinite(chosen).all():
             found.append("the stack's command is not finite")
         return tuple(found)
+
+
+def _shapes(sonar_cfg: SonarConfig) -> dict[str, tuple[int, ...]]:
+    """Of a ping's arrays."""
+    beams = () if sonar_cfg.mechanical else (sonar_cfg.n_ray,)
+    one_each = {f"sonar.{name}": beams or (ANY,) for name in ("range_m", "hit")}
+    return one_each | {
+        "sonar.doppler_m_s": (sonar_cfg.n_ray if sonar_cfg.doppler else 0,),
+        "sonar.first_beam": (),
+    }
+
+
+def _check_beams(ping: SonarPing, sonar_cfg: SonarConfig) -> None:
+    """ValueError for beams that the sonar does not have."""
+    n, last = len(ping.range_m), 2 * sonar_cfg.n_ray if sonar_cfg.is_ring else sonar_cfg.n_ray
+    there = 0 <= ping.first_beam < sonar_cfg.n_ray and n <= sonar_cfg.n_ray and ping.first_beam + n <= last
+    if sonar_cfg.mechanical and not (there and n == len(ping.hit) > 0):
+        raise ValueError(
+            f"sonar: {n} ranges and {len(ping.hit)} hits from beam {ping.first_beam} on are no neighbouring "
+            f"beams of {sonar_cfg.n_ray}"
+        )
+    if not sonar_cfg.mechanical and ping.first_beam != 0:
+        raise ValueError("sonar: first_beam is for a mechanical beam (sensors.sonar.mechanical)")

@@ -51,7 +51,9 @@ class PositionFix:
 
 @dataclass(frozen=True, eq=False)
 class SonarPing:
-    """A scan of all beams, in the order of ``SonarConfig``; ``time_s`` is that of the ping."""
+    """A scan of all beams, in the order of ``SonarConfig``; ``time_s`` is that of the ping. Of a mechanical
+    beam (``sensors.sonar.mechanical``): the one or the few neighbouring beams that were taken then, n of them
+    in place of n_ray."""
 
     time_s: float
     range_m: np.ndarray
@@ -62,6 +64,8 @@ class SonarPing:
     doppler_m_s: np.ndarray
     """(n_ray,) [m/s] rate of change of the distance to what returned, own motion included; empty where the
     sonar measures none (``sensors.sonar.doppler``)"""
+    first_beam: int = 0
+    """number of the first of these beams; 0 unless the beam is a mechanical one"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +99,7 @@ LIMITS = {
     "range_m": 1e5,
     "doppler_m_s": 1e3,
     "hit": 1.0,
+    "first_beam": 1e5,
 }
 """largest size that is believed, far above what any of these instruments says: a number that is larger, or
 not finite, makes the message a bad one"""

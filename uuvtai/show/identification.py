@@ -34,8 +34,10 @@ _AHEAD = (
 )
 
 
-def show_identified(screen: Screen, document: dict[str, Any], title: str) -> None:
-    """Tables of a ``uuv identify --json`` document, then its warnings."""
+def show_identified(screen: Screen, document: dict[str, Any], known: str) -> None:
+    """Tables of a ``uuv identify --json`` document, then its warnings; ``known``: what was taken from which
+    vehicle."""
+    title = f"{document['seconds']:g} s of drives, known: {known}"
     screen.table(Table(_PARAMETERS, document["parameters"], title))
     rows = [
         [steps, name, *_errors(found[steps])]

@@ -14,6 +14,7 @@ from uuvtai.state.arrays import PACKET, REAL, WORD, allocate, array, bytes_of
 from uuvtai.state.baselines import BaselineState
 from uuvtai.state.perception import (
     ClusterState,
+    EchoState,
     ForecastState,
     FutureState,
     GridMask,
@@ -53,6 +54,7 @@ __all__ = [
     "ClusterState",
     "CurrentState",
     "DepthImage",
+    "EchoState",
     "EpisodeState",
     "ExposureState",
     "FeatureState",

@@ -30,6 +30,31 @@ class PoseState:
 
 
 @dataclass(frozen=True, eq=False)
+class EchoState:
+    """Remembered: what a mechanical beam heard last along each of its bearings, and from where. Of a sonar
+    whose beams come at once: nothing."""
+
+    step: ti.Field = array("n_env", "n_echo", dtype=ti.i32, beside="echo")
+    """when it was taken, -1 = never"""
+    pos_x_m: ti.Field = array("n_env", "n_echo", beside="echo")
+    """[m] own position estimate then, world"""
+    pos_y_m: ti.Field = array("n_env", "n_echo", beside="echo")
+    """[m]"""
+    bearing_w: ti.Field = array("n_env", "n_echo", beside="echo")
+    """[rad] where the beam looked, in the world"""
+    range_m: ti.Field = array("n_env", "n_echo", beside="echo")
+    """[m] no return = maximum range"""
+    intensity: ti.Field = array("n_env", "n_echo", beside="echo")
+    """[0, 1]"""
+    hit: ti.Field = array("n_env", "n_echo", dtype=ti.i32, beside="echo")
+    """1 = return, and no later beam went through it"""
+    told: ti.Field = array("n_env", "n_echo", dtype=ti.i32, beside="echo")
+    """1 = the tracking has had it"""
+    shown: ti.Field = array("n_env", "n_echo", dtype=ti.i32, beside="echo")
+    """the bearing whose return stands in each beam of the scan, -1 = none"""
+
+
+@dataclass(frozen=True, eq=False)
 class TrackState:
     """Remembered: moving (and candidate) bodies seen by the sonar, one Kalman filter each."""
 
@@ -160,7 +185,8 @@ class HabitState:
     run_from_w: ti.Field = array("n_env", "n_track", vec=2)
     """[m] where the present straight way began, or was first seen"""
     run_kind: ti.Field = array("n_env", "n_track", dtype=ti.i32)
-    """0 = on none yet, 1 = its begin was not seen, 2 = it began with a turn that was seen"""
+    """0 = on none yet, 1 = its begin was not seen, 2 = it began with a turn back that was seen, 3 = with a
+    corner"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,10 +214,13 @@ class FutureState:
 
     Whoever fills it (a learned forecast, say) gives probabilities that sum to 1 at most; what is left is the
     forecast's own. A body begins all its futures where the forecast does, and is never faster than there.
+    Corners that do not lead to the vehicle have no future of their own: nothing is to be feared of them.
     """
 
     share: ti.Field = array("n_env", "n_track", "n_future")
-    """probability of this future, 0 = none"""
+    """probability of this future, 0 = none: the first half turn back, the second turn towards the vehicle"""
+    corner: ti.Field = array("n_env", "n_track")
+    """probability of a corner within the time that the futures cover, wherever it leads"""
     pos_w: ti.Field = array("n_env", "n_track", "n_future", "n_forecast", vec=2)
     """[m] where the body then is, at the forecast's times"""
 
@@ -295,6 +324,7 @@ class MapScratch:
 class PerceptionStructs:
     """Structs of this room, by the noun of their stage."""
 
+    echoes: EchoState
     pose: PoseState
     tracks: TrackState
     clusters: ClusterState

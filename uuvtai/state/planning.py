@@ -101,11 +101,11 @@ class RouteState:
     fallback_reason: ti.Field = array("n_env", dtype=ti.i32)
     """why Voronoi failed in this step (voronoi.* code), 0 = it did not"""
     queue: ti.Field = array("n_env", dtype=ti.i32, scratch=True)
-    """env ids that plan in this step"""
+    """env ids that plan in this step, in any order"""
     n_queue: ti.Field = array(dtype=ti.i32, scratch=True)
     """length of the queue"""
     failed: ti.Field = array("n_env", dtype=ti.i32, scratch=True)
-    """env ids whose Voronoi plan failed in this step: the host's RRT takes them"""
+    """env ids whose Voronoi plan failed in this step, in any order: the host's RRT takes them"""
     n_failed: ti.Field = array(dtype=ti.i32, scratch=True)
     """length of that list"""
     plan_step: ti.Field = array("n_env", dtype=ti.i32)

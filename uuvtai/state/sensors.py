@@ -48,26 +48,29 @@ class Proprioception:
 class ProprioceptionMemory(Truth):
     """Hidden state of the proprioceptive sensors (simulator side)."""
 
-    pressure_bias_m: ti.Field = array("n_env")
+    pressure_bias_m: ti.Field = array("n_env", beside="errors")
     """[m] constant over an episode"""
-    pressure_zero_m: ti.Field = array("n_env")
+    pressure_zero_m: ti.Field = array("n_env", beside="errors")
     """[m] what the sensor is zeroed by: its first reading less the known start's depth; 0 where the position
     is given"""
-    dvl_scale: ti.Field = array("n_env")
+    dvl_scale: ti.Field = array("n_env", beside="errors")
     """1 + scale error, constant over an episode"""
-    heading_error: ti.Field = array("n_env")
+    heading_error: ti.Field = array("n_env", beside="errors")
     """[rad] integrated heading drift"""
-    heading_rate: ti.Field = array("n_env")
+    heading_rate: ti.Field = array("n_env", beside="errors")
     """[rad/s] drift rate of the episode"""
     accel_bias_b: ti.Field = array("n_env", vec=3)
     """[m/s^2] error of the accelerometer, constant over an episode"""
-    dropout_until: ti.Field = array("n_env", dtype=ti.i32)
+    dropout_until: ti.Field = array("n_env", dtype=ti.i32, beside="errors")
     """step until which the DVL has lost the bottom"""
 
 
 @dataclass(frozen=True, eq=False)
 class SonarScan:
-    """Sensed: the newest delivered sonar scan. Beam 0 ahead, counter-clockwise, horizontal."""
+    """Sensed: the newest delivered sonar scan. Beam 0 ahead, counter-clockwise, horizontal.
+
+    Of a mechanical beam: the returns of this step, and in the other beams what was remembered of the last
+    sweep, as it would be seen from here (``EchoState``)."""
 
     range_m: ti.Field = array("n_env", "n_ray", lanes=True)
     """[m] no return = maximum range"""
@@ -78,9 +81,9 @@ class SonarScan:
     """[0, 1]"""
     hit: ti.Field = array("n_env", "n_ray", lanes=True, dtype=ti.i32)
     """1 = return"""
-    fresh: ti.Field = array("n_env", dtype=ti.i32)
+    fresh: ti.Field = array("n_env", dtype=ti.i32, beside="ping")
     """1 = delivered in this very step"""
-    ping_step: ti.Field = array("n_env", dtype=ti.i32)
+    ping_step: ti.Field = array("n_env", dtype=ti.i32, beside="ping")
     """episode step at which it was taken"""
     ping_pos_w: ti.Field = array("n_env", vec=3)
     """[m] own position estimate when it was taken"""
@@ -88,8 +91,12 @@ class SonarScan:
     """[rad] own yaw estimate when it was taken"""
     ping_vel_b: ti.Field = array("n_env", vec=3)
     """[m/s] own measured velocity when it was taken"""
-    ping_vel_valid: ti.Field = array("n_env", dtype=ti.i32)
+    ping_vel_valid: ti.Field = array("n_env", dtype=ti.i32, beside="ping")
     """1 = that was a reading; 0 = the last one, held since"""
+    new_from: ti.Field = array("n_env", dtype=ti.i32, beside="ping")
+    """of a mechanical beam: first of the beams that were taken in this step,"""
+    new_count: ti.Field = array("n_env", dtype=ti.i32, beside="ping")
+    """and how many, counter-clockwise"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,13 +133,13 @@ class SonarMemory(Truth):
     """[m] along y"""
     body_reach_m: ti.Field = array("n_env", "n_body", lanes=True, scratch=True)
     """[m] radius around it that holds the outline, far below 0 = empty slot"""
-    cloud_beam: ti.Field = array("n_env", "n_cloud", dtype=ti.i32)
+    cloud_beam: ti.Field = array("n_env", "n_cloud", dtype=ti.i32, beside="cloud")
     """first beam of a bubble cloud, counted from the world's x axis"""
-    cloud_width: ti.Field = array("n_env", "n_cloud", dtype=ti.i32)
+    cloud_width: ti.Field = array("n_env", "n_cloud", dtype=ti.i32, beside="cloud")
     """beams it covers"""
-    cloud_range_m: ti.Field = array("n_env", "n_cloud")
+    cloud_range_m: ti.Field = array("n_env", "n_cloud", beside="cloud")
     """[m]"""
-    cloud_until: ti.Field = array("n_env", "n_cloud", dtype=ti.i32)
+    cloud_until: ti.Field = array("n_env", "n_cloud", dtype=ti.i32, beside="cloud")
     """step at which it is gone"""
 
 

@@ -17,6 +17,7 @@ from typing import Any
 import taichi as ti
 
 from uuvtai.kernels.core.signature import Const, In, Out
+from uuvtai.native.gpu_shape import is_gpu_shaped
 from uuvtai.state import ClockState
 
 LANES = 16
@@ -24,7 +25,6 @@ LANES = 16
 
 f16x = ti.types.vector(LANES, ti.f32)
 i16x = ti.types.vector(LANES, ti.i32)
-u16x = ti.types.vector(LANES, ti.u32)
 
 
 _COLUMNS = 8
@@ -34,7 +34,13 @@ costs compile time."""
 
 def n_column() -> int:
     """Rows that one loop item takes together; one on a GPU, whose threads are lanes already. Plain Python."""
-    return 1 if ti.cfg.arch == ti.cuda else _COLUMNS  # pyright: ignore[reportOptionalMemberAccess]
+    return 1 if is_gpu_shaped() else _COLUMNS
+
+
+def n_lane() -> int:
+    """Lanes of a packet whose width its functions take from their arguments; one on a GPU, where sixteen
+    would need more registers than a thread has. Plain Python."""
+    return 1 if is_gpu_shaped() else LANES
 
 
 @ti.func
@@ -47,9 +53,21 @@ def ramp_lanes(first):
 
 
 @ti.func
+def filled(value, lanes: Const[int]):
+    """A packet of float32 with one value in all lanes."""
+    return ti.Vector([ti.cast(value, ti.f32) for _ in range(lanes)])
+
+
+@ti.func
 def column(matrix: In[Any], lane):
     """Vector of one lane of a local matrix."""
     return ti.Vector([matrix[row, lane] for row in range(matrix.n)])
+
+
+@ti.func
+def row_lanes(matrix: In[Any], row: Const[int]):
+    """A row of a local matrix as a packet."""
+    return ti.Vector([matrix[row, lane] for lane in range(matrix.m)])
 
 
 @ti.func
@@ -57,6 +75,13 @@ def put_column(matrix: Out[Any], lane, values):
     """Write one lane of a local matrix."""
     for row in ti.static(range(matrix.n)):
         matrix[row, lane] = values[row]
+
+
+@ti.func
+def lane_bits(condition):
+    """Bit i is 1 where the condition holds in lane i."""
+    weights = ti.Vector(ti.static([1 << i for i in range(LANES)]))
+    return ti.select(condition, weights, 0).sum()  # type: ignore[misc]
 
 
 @ti.func

@@ -7,7 +7,6 @@ Wellons, hash-prospector, bias 0.17).
 
 import taichi as ti
 
-from uuvtai.kernels.core.lanes import LANES, u16x
 from uuvtai.kernels.core.signature import Const
 
 # one stream per purpose; a stream's draws never meet another's
@@ -97,7 +96,7 @@ def normal(key, index):
 
 @ti.func
 def mixed_lanes(x):
-    """One round of lowbias32 in sixteen lanes."""
+    """One round of lowbias32 in lanes."""
     a = x ^ (x >> 16)
     b = a * ti.u32(0x7FEB352D)
     c = b ^ (b >> 15)
@@ -107,21 +106,18 @@ def mixed_lanes(x):
 
 
 @ti.func
-def bits_lanes(key, first_index):
-    """32 random bits per lane for indices first_index .. first_index + 15; lane i equals ``bits(key,
-    first_index + i)``."""
-    counter = u16x(0)
-    for i in ti.static(range(LANES)):
-        counter[i] = ti.cast(first_index + i, ti.u32) + ti.u32(_GOLDEN)
+def bits_lanes(key, first_index, lanes: Const[int]):
+    """32 random bits per lane; lane i equals ``bits(key, first_index + i)``."""
+    counter = ti.Vector([ti.cast(first_index + i, ti.u32) + ti.u32(_GOLDEN) for i in range(lanes)])
     inner = mixed_lanes(counter)
     keyed = inner ^ key
     return mixed_lanes(keyed)
 
 
 @ti.func
-def uniform_lanes(key, first_index):
+def uniform_lanes(key, first_index, lanes: Const[int]):
     """Uniform in [0, 1) per lane; lane i equals ``uniform(key, first_index + i)``."""
-    raw = bits_lanes(key, first_index)
+    raw = bits_lanes(key, first_index, lanes)
     shifted = raw >> 8
     return ti.cast(shifted, ti.f32) * _TO_UNIT
 
@@ -136,14 +132,14 @@ def polynomial(x, coefficients: Const[tuple]):
 
 
 @ti.func
-def normal_pair_lanes(key, first_index):
+def normal_pair_lanes(key, first_index, lanes: Const[int]):
     """Two independent standard normals per lane from one word of 32 bits: Box-Muller with polynomials, |x| <=
     4.9.
 
     Taichi does not vectorise log, sin and cos. The upper half of the word is the radius's uniform (k + 1/2) /
     2^16, the lower the angle's.
     """
-    word = bits_lanes(key, first_index)
+    word = bits_lanes(key, first_index, lanes)
     odd = ti.cast(((word >> 15) & ti.u32(0x1FFFE)) | ti.u32(1), ti.f32)  # 2 k + 1, exact
     raw = ti.bit_cast(odd, ti.i32)
     exponent = ti.cast((raw >> 23) - 144, ti.f32)  # of the uniform: 127 is float's bias, 17 divides by 2^17

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import taichi as ti
 
+from uuvtai.native.gpu_shape import is_gpu_shaped
+
 _T = TypeVar("_T")
 
 if TYPE_CHECKING:
@@ -51,5 +53,7 @@ _BLOCKS = 16
 
 def spread(n_env: int) -> int:
     """Loop items per env that make ``ti.ndrange(n_env, spread(n_env))`` fill every core; use only the items
-    with ``pad == 0``."""
+    with ``pad == 0``. One on a GPU, where an idle item is an idle thread."""
+    if is_gpu_shaped():
+        return 1
     return max(1, min(_CPU_BLOCK, -(-_CPU_BLOCK * _BLOCKS // n_env)))

@@ -2,6 +2,7 @@
 
 import taichi as ti
 
+from uuvtai.kernels.core.beams import beam_there, beam_towards
 from uuvtai.kernels.core.geometry import FAR_M
 from uuvtai.kernels.core.signature import Bundle
 from uuvtai.kernels.perception.bundles import TrackingIO
@@ -56,6 +57,25 @@ def pair_cost(env, track, c, dt, io: Bundle[TrackingIO]):
     if square < _REACH_M * _REACH_M:
         surprise, volume, near = pair_surprise(env, track, c, offset, io)
         free = io.tracking_cfg.gate_m + dt * ti.sqrt(mean[2] * mean[2] + mean[3] * mean[3])
-        if near < io.tracking_cfg.turn_gate or square < free * free:
+        within = near < io.tracking_cfg.turn_gate or square < free * free
+        if ti.static(io.sonar_cfg.mechanical):
+            within = within and square < swept_reach(env, track, io) ** 2
+        if within:
             cost = surprise + ti.log(volume)
     return cost
+
+
+@ti.func
+def swept_reach(env, track, io: Bundle[TrackingIO]):
+    """[m] from where it is expected to where a track may be found by a mechanical beam: as far as bodies get
+    since it was seen, if the beam has looked there since; else it may still be there, and what is found
+    elsewhere is another body."""
+    own, mean = io.scan.ping_pos_w[env], io.tracks.state[env, track]
+    bearing = ti.atan2(mean[1] - own[1], mean[0] - own[0]) - io.scan.ping_yaw[env]
+    beam = beam_there(beam_towards(bearing, io.sonar_cfg), io.sonar_cfg)
+    then = io.tracks.seen_step[env, track]
+    reach = io.tracking_cfg.gate_m + io.tracks.radius_m[env, track]
+    if beam >= 0 and io.echoes.step[env, ti.max(beam, 0)] > then:
+        since = (io.scan.ping_step[env] - then) * io.episode_cfg.control_dt_s
+        reach += io.tracking_cfg.birth_speed_sigma_m_s * since
+    return reach

@@ -25,6 +25,7 @@ from uuvtai.state import (
     ClockState,
     ClusterState,
     DepthImage,
+    EchoState,
     ForecastState,
     FutureState,
     GridMask,
@@ -39,6 +40,16 @@ from uuvtai.state import (
     SpotState,
     TrackState,
 )
+
+
+@dataclass(frozen=True, eq=False)
+class EchoesIO:
+    """What a mechanical beam heard, seen from where the vehicle is now."""
+
+    echoes: Out[EchoState]
+    scan: Out[SonarScan]
+    clock: In[ClockState]
+    sonar_cfg: Const[SonarConfig]
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +74,7 @@ class FuturesIO:
 
     futures: Out[FutureState]
     clock: In[ClockState]
+    ego: In[Proprioception]
     forecast: In[ForecastState]
     habits: In[HabitState]
     tracks: In[TrackState]
@@ -184,6 +196,7 @@ class TrackingIO:
     """Bodies followed from ping to ping."""
 
     clusters: Out[ClusterState]
+    echoes: Out[EchoState]
     tracks: Out[TrackState]
     clock: In[ClockState]
     habits: In[HabitState]
@@ -201,6 +214,7 @@ class TrackingIO:
 class PerceptionStages:
     """Bundles of this room, by the noun of their stage."""
 
+    echoes: EchoesIO
     pose: PoseIO
     tracking: TrackingIO
     spotting: SpottingIO

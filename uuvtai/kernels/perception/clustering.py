@@ -92,6 +92,8 @@ def label_beams(env, io: Bundle[TrackingIO]):
             range_m[i] = io.scan.range_m[env, packet * LANES + i]
             hit[i] = ti.cast(io.scan.hit[env, packet * LANES + i], ti.f32)
         margin = io.tracking_cfg.wall_margin_m + 2.0 * ti.sqrt(range_variance(range_m, io))
+        if ti.static(io.sonar_cfg.half_width_rad > 0):
+            margin += ti.static(io.sonar_cfg.half_width_rad) * range_m
         free = wall_distance(pos[0] + range_m * ux, pos[1] + range_m * uy, io) - margin
         wall = ti.select(free < 0.0, hit, f16x(0.0))
         body = hit - wall
@@ -113,6 +115,48 @@ def label_beams(env, io: Bundle[TrackingIO]):
         slip_w, sigma = velocity_slip(normal, io.scan.ping_vel_valid[env], io)
     io.clusters.slip_w[env] = slip_w
     io.clusters.own_sigma_m_s[env] = sigma
+    if ti.static(io.sonar_cfg.mechanical):
+        leave_told(env, io)
+
+
+@ti.func
+def leave_told(env, io: Bundle[TrackingIO]):
+    """Of a mechanical beam's returns only those are candidates that the tracking has not had yet, and not the
+    body on which the head is still."""
+    n = ti.static(io.sonar_cfg.n_ray)
+    for beam in range(n):
+        if io.clusters.beam_cluster[env, beam] == _CANDIDATE:
+            if io.echoes.told[env, io.echoes.shown[env, beam]] == 1:
+                io.clusters.beam_cluster[env, beam] = -1
+    newest = (io.scan.new_from[env] + io.scan.new_count[env] - 1 + n) % n
+    for way in ti.static((-1, 1)):
+        at = newest
+        while at >= 0:
+            at = next_open(env, at, way, io)
+    for beam in range(n):
+        if io.clusters.beam_cluster[env, beam] == _CANDIDATE:
+            io.echoes.told[env, io.echoes.shown[env, beam]] = 1
+
+
+@ti.func
+def next_open(env, at, way, io: Bundle[TrackingIO]):
+    """The next candidate, ``way`` from this beam, of the body on which the head still is; it is none from
+    then on. -1 = there is none."""
+    found = -1
+    for k in range(_BRIDGE + 1):
+        beam = beam_there(at + way * k, io.sonar_cfg)
+        if found < 0 and beam >= 0:
+            if io.clusters.beam_cluster[env, beam] == _CANDIDATE and may_be_one(env, at, beam, io):
+                io.clusters.beam_cluster[env, beam] = -1
+                found = beam
+    return found
+
+
+@ti.func
+def may_be_one(env, a, b, io: Bundle[TrackingIO]):
+    """Whether the ranges of two beams allow that they lie on one body; one without return allows all."""
+    jump = ti.abs(io.scan.range_m[env, b] - io.scan.range_m[env, a])
+    return io.scan.hit[env, a] == 0 or jump <= split_distance(io.scan.range_m[env, a], io)
 
 
 @ti.func

@@ -17,6 +17,7 @@ from uuvtai.kernels.core.grid import cell_of, grid_origin, grid_shape
 from uuvtai.kernels.core.lanes import LANES, f16x, i16x, ramp_lanes
 from uuvtai.kernels.core.signature import Bundle, Const
 from uuvtai.kernels.perception.bundles import MappingIO
+from uuvtai.kernels.perception.echoes import is_new
 
 _MAX_REACH = 4
 """[cells] farthest neighbour that may explain a surprising return as the edge of a static body."""
@@ -57,6 +58,16 @@ def range_error(range_m, io: Bundle[MappingIO]):
         )
         + io.sonar_cfg.range_quantum_m
     )
+
+
+@ti.func
+def wall_margins(range_m, io: Bundle[MappingIO]):
+    """[m] off a known wall within which sixteen returns are the wall's; a wide beam ends on its nearer
+    side."""
+    margin = f16x(io.mapping_cfg.wall_margin_m)
+    if ti.static(io.sonar_cfg.half_width_rad > 0):
+        margin += ti.static(io.sonar_cfg.half_width_rad) * range_m
+    return margin
 
 
 @ti.func
@@ -154,7 +165,7 @@ def is_inconsistent(env, row, col, range_m, promote_scans: Const[int], io: Bundl
     if confident == 1 or (
         held == 1 and ti.cast(io.grid_map.dynamic_scans[env, row, col], ti.i32) < promote_scans
     ):
-        spacing = ti.static(io.sonar_cfg.beam_step_rad) * range_m
+        spacing = ti.static(max(io.sonar_cfg.beam_step_rad, io.sonar_cfg.half_width_rad)) * range_m
         reach = 1 + ti.cast((spacing + range_error(range_m, io)) / io.mapping_cfg.cell_m, ti.i32)
         inconsistent = 1 - edge_of_static(env, row, col, ti.min(reach, _MAX_REACH), io)
     return inconsistent
@@ -213,12 +224,13 @@ def mapped_lanes(env, first_ray, pos, vel, threshold, io: Bundle[MappingIO]):
         for i in ti.static(range(LANES)):
             moves[i] = io.scan.doppler_m_s[env, first_ray + i]
         moves = moves + ahead_x * vel[0] + ahead_y * vel[1]
+    margin = wall_margins(range_m, io)
     kind, row, col = i16x(0), i16x(0), i16x(0)
     for i in ti.static(range(LANES)):
         row[i] = ti.cast(ti.floor((y[i] - y0) / io.mapping_cfg.cell_m), ti.i32)
         col[i] = ti.cast(ti.floor((x[i] - x0) / io.mapping_cfg.cell_m), ti.i32)
     for i in ti.static(range(LANES)):
-        known = (gap[i] < io.mapping_cfg.wall_margin_m) | (short[i] < 0.0)
+        known = (gap[i] < margin[i]) | (short[i] < 0.0)
         off = (row[i] < 0) | (row[i] >= n_row) | (col[i] < 0) | (col[i] >= n_col)
         moving = ti.abs(moves[i]) > threshold
         kind[i] = ti.select((hit[i] == 0) | known | off, 0, ti.select(moving, 2, 1))
@@ -234,7 +246,7 @@ def mark_hits(env, slot, promote_scans: Const[int], io: Bundle[MappingIO]):
     for packet in range(ti.static(io.sonar_cfg.n_ray // LANES)):
         kind, row, col, range_m = mapped_lanes(env, packet * LANES, pos, vel, threshold, io)
         for i in range(LANES):
-            if kind[i] != 0:
+            if kind[i] != 0 and is_new(env, packet * LANES + i, io.scan, io.sonar_cfg):
                 moves = ti.cast(kind[i] == 2, ti.i32) | moves_by_track(env, packet * LANES + i, io)
                 if moves == 0:
                     moves = is_inconsistent(env, row[i], col[i], range_m[i], promote_scans, io)

@@ -11,7 +11,7 @@ of a partial fan there is no triangle: the outline goes back to the ping.
 
 import taichi as ti
 
-from uuvtai.kernels.core.beams import beam_lanes
+from uuvtai.kernels.core.beams import beam_bearing, beam_lanes
 from uuvtai.kernels.core.bits import WORD, cell_bit
 from uuvtai.kernels.core.grid import grid_origin, grid_shape
 from uuvtai.kernels.core.lanes import LANES, f16x, i16x
@@ -77,17 +77,23 @@ def mark_edge(slot, begin, end, first_col, end_col, n_col: Const[int], io: Bundl
 
 
 @ti.func
-def mark_fan(env, slot, io: Bundle[MappingIO]):
-    """Bits of the fan's outline, triangle after triangle: along each chord, then along the beam to the next
-    triangle's leg."""
-    n_ray, n_col = ti.static(io.sonar_cfg.n_ray, grid_shape(io.tank_cfg, io.mapping_cfg.cell_m)[1])
+def ping_cell(env, io: Bundle[MappingIO]):
+    """(x, y) [cells] where the ping was taken, centres of cells whole numbers."""
     x0, y0 = ti.static(grid_origin(io.tank_cfg, io.mapping_cfg.cell_m))
-    ping = ti.Vector(
+    return ti.Vector(
         [
             (io.scan.ping_pos_w[env][0] - x0) / io.mapping_cfg.cell_m - 0.5,
             (io.scan.ping_pos_w[env][1] - y0) / io.mapping_cfg.cell_m - 0.5,
         ]
     )
+
+
+@ti.func
+def mark_fan(env, slot, io: Bundle[MappingIO]):
+    """Bits of the fan's outline, triangle after triangle: along each chord, then along the beam to the next
+    triangle's leg."""
+    n_ray, n_col = ti.static(io.sonar_cfg.n_ray, grid_shape(io.tank_cfg, io.mapping_cfg.cell_m)[1])
+    ping = ping_cell(env, io)
     first, last = ti.Vector([0.0, 0.0]), ti.Vector([0.0, 0.0])
     first_col, last_col = 0, 0
     for packet in range(ti.static(n_ray // LANES)):
@@ -110,3 +116,34 @@ def mark_fan(env, slot, io: Bundle[MappingIO]):
             mark_edge(slot, begin, end, begin_col[i], end_col[i], n_col, io)
             last, last_col = end, end_col[i]
     mark_edge(slot, last, first, last_col, first_col, n_col, io)
+
+
+@ti.func
+def mark_sectors(env, slot, io: Bundle[MappingIO]):
+    """Bits of the outline of what a mechanical head's new beams prove free: of each the triangle half a step
+    of the head to either side, both legs as long as its reach."""
+    n_col = ti.static(grid_shape(io.tank_cfg, io.mapping_cfg.cell_m)[1])
+    half = ti.static(0.5 * io.sonar_cfg.beam_step_rad)
+    ping = ping_cell(env, io)
+    ping_col = ti.cast(ti.ceil(ping[0]), ti.i32)
+    last, last_col = ping, ping_col
+    for k in range(io.scan.new_count[env]):
+        beam = (io.scan.new_from[env] + k) % io.sonar_cfg.n_ray
+        bearing = io.scan.ping_yaw[env] + beam_bearing(beam, io.sonar_cfg)
+        leg = free_reach(env, beam, io) / io.mapping_cfg.cell_m
+        begin = ti.Vector([ping[0] + leg * ti.cos(bearing - half), ping[1] + leg * ti.sin(bearing - half)])
+        end = ti.Vector([ping[0] + leg * ti.cos(bearing + half), ping[1] + leg * ti.sin(bearing + half)])
+        begin_col, end_col = ti.cast(ti.ceil(begin[0]), ti.i32), ti.cast(ti.ceil(end[0]), ti.i32)
+        mark_edge(slot, last, begin, last_col, begin_col, n_col, io)
+        mark_edge(slot, begin, end, begin_col, end_col, n_col, io)
+        last, last_col = end, end_col
+    mark_edge(slot, last, ping, last_col, ping_col, n_col, io)
+
+
+@ti.func
+def mark_free(env, slot, io: Bundle[MappingIO]):
+    """Bits of the outline of what the new beams prove free."""
+    if ti.static(io.sonar_cfg.mechanical):
+        mark_sectors(env, slot, io)
+    else:
+        mark_fan(env, slot, io)

@@ -38,6 +38,9 @@ _TURNED_COS = 0.9
 _ALIKE_COS = 0.94
 """Cosine within which two courses are the same: 20 deg."""
 
+BEGIN_SEEN, CORNER_SEEN = 2, 3
+"""``run_kind`` of a way that began with a turn that was seen: back, or a corner."""
+
 _LONGEST_S = 4.0
 """Two legs farther apart in time than this do not make one turn."""
 
@@ -129,7 +132,9 @@ def place_turn(env, p0, d0, p1, d1, way, io: Bundle[ForecastIO]):
     misfit = (p1 - after * d1 - corner).norm()
     begin, kind = p1, 1
     if ti.min(before, after) > -_MISFIT_M and misfit < _MISFIT_M:
-        begin, kind = 0.5 * (corner + p1 - after * d1), 2
+        begin, kind = 0.5 * (corner + p1 - after * d1), BEGIN_SEEN
+        if d0.dot(d1) > -_ALIKE_COS:
+            kind = CORNER_SEEN
         store_turn(env, begin, d0, d1, io)
     return begin, kind
 

@@ -30,7 +30,7 @@ from uuvtai.kernels.core.bits import WORD, bit_of, lowest_bit, taken, with_bit, 
 from uuvtai.kernels.core.signature import Bundle, Const, spread
 from uuvtai.kernels.perception.bundles import MappingIO
 from uuvtai.kernels.perception.evidence import mark_depth, mark_hits
-from uuvtai.kernels.perception.fan import mark_fan
+from uuvtai.kernels.perception.fan import mark_free
 from uuvtai.native.launch import quick_launch
 
 RATED_HZ = 10.0
@@ -48,8 +48,15 @@ _NO_SCAN = -(1 << 20)
 
 def map_period_s(mapping, sonar, episode):
     """[s] between two mapped scans: the first multiple of the sonar's period that is no shorter than the
-    map's own."""
+    map's own; with a mechanical beam every beam is mapped."""
+    if sonar.mechanical:
+        return max(sonar.step_us / 1e6, episode.control_dt_s)
     return sonar.period_steps * math.ceil(mapping.period_steps / sonar.period_steps) * episode.control_dt_s
+
+
+def look_period_s(mapping, sonar, episode):
+    """[s] between two mapped looks at the same water: a mechanical beam has to come round again."""
+    return max(map_period_s(mapping, sonar, episode), sonar.sweep_s)
 
 
 def depth_period_s(mapping, sonar, depth, episode):
@@ -94,7 +101,8 @@ def is_due(env, io: Bundle[MappingIO]):
     due = (
         io.clock.awake[env] == 1
         and io.scan.fresh[env] == 1
-        and io.clock.step[env] - io.grid_map.map_step[env] >= io.mapping_cfg.period_steps
+        and io.clock.step[env] - io.grid_map.map_step[env]
+        >= ti.static(1 if io.sonar_cfg.mechanical else io.mapping_cfg.period_steps)
     )
     return ti.cast(due, ti.i32)
 
@@ -145,6 +153,7 @@ def count_dynamic(env, row, word, free, dynamics, io: Bundle[MappingIO]):
 def folded(static_old, dynamic_old, static_hit, dynamic_hit, free, point, io: Bundle[MappingIO]):
     """Both equations for one cell; indicators are 0 or 1."""
     scan_s = ti.static(map_period_s(io.mapping_cfg, io.sonar_cfg, io.episode_cfg))
+    look_s = ti.static(look_period_s(io.mapping_cfg, io.sonar_cfg, io.episode_cfg))
     depth_s = ti.static(depth_period_s(io.mapping_cfg, io.sonar_cfg, io.depth_cfg, io.episode_cfg))
     supported = (static_hit == 1) | (static_old > 0.0)
     depth_hit = ti.select(
@@ -152,14 +161,14 @@ def folded(static_old, dynamic_old, static_hit, dynamic_hit, free, point, io: Bu
     )
     static_new = clipped(
         ti.static(1.0 - decay_per_scan(io.mapping_cfg.static_decay, scan_s)) * static_old
-        + ti.static(per_scan(io.mapping_cfg.static_hit, scan_s)) * static_hit
-        - ti.static(per_scan(io.mapping_cfg.static_free, scan_s)) * free
+        + ti.static(per_scan(io.mapping_cfg.static_hit, look_s)) * static_hit
+        - ti.static(per_scan(io.mapping_cfg.static_free, look_s)) * free
         + ti.static(per_scan(io.mapping_cfg.depth_hit, depth_s)) * depth_hit
     )
     dynamic_new = clipped(
         ti.static(1.0 - decay_per_scan(io.mapping_cfg.dynamic_decay, scan_s)) * dynamic_old
-        + ti.static(per_scan(io.mapping_cfg.dynamic_hit, scan_s)) * dynamic_hit
-        - ti.static(per_scan(io.mapping_cfg.dynamic_free, scan_s)) * free
+        + ti.static(per_scan(io.mapping_cfg.dynamic_hit, look_s)) * dynamic_hit
+        - ti.static(per_scan(io.mapping_cfg.dynamic_free, look_s)) * free
     )
     return static_new, dynamic_new
 
@@ -251,9 +260,9 @@ def update_map(io: Bundle[MappingIO]):
     """Take a fresh image's points and fold a fresh scan that is due into both layers; else the map stays as
     it is."""
     n_env, n_slot = ti.static(io.clock.awake.shape[0], io.map_scratch.fan_edge.shape[0])
-    scan_s = ti.static(map_period_s(io.mapping_cfg, io.sonar_cfg, io.episode_cfg))
+    look_s = ti.static(look_period_s(io.mapping_cfg, io.sonar_cfg, io.episode_cfg))
     confident, promote = ti.static(
-        scans_in(io.mapping_cfg.free_confident_s, scan_s), scans_in(io.mapping_cfg.promote_s, scan_s)
+        scans_in(io.mapping_cfg.free_confident_s, look_s), scans_in(io.mapping_cfg.promote_s, look_s)
     )
     # one thread has all of an env's bits, and does all of it while its scratch is in the cache
     for slot, pad in ti.ndrange(n_slot, ti.static(spread(n_slot))):
@@ -264,7 +273,7 @@ def update_map(io: Bundle[MappingIO]):
                     io.grid_map.depth_waits[env] = 1
                 if is_due(env, io) == 1:
                     fetch_cells(env, slot, io)
-                    mark_fan(env, slot, io)
+                    mark_free(env, slot, io)
                     mark_hits(env, slot, promote, io)
                     merge_scan(env, slot, confident, io)
                     io.grid_map.map_step[env] = io.clock.step[env]

@@ -3,7 +3,7 @@ the tracking stage)."""
 
 import taichi as ti
 
-from uuvtai.kernels.core.beams import beam_there, beam_towards
+from uuvtai.kernels.core.beams import beam_bearing, beam_there, beam_towards
 from uuvtai.kernels.core.geometry import FAR_M, wrapped_angle
 from uuvtai.kernels.core.kalman import born
 from uuvtai.kernels.core.lanes import f16x
@@ -110,7 +110,9 @@ def is_lost(env, track, sight, io: Bundle[TrackingIO]):
     """1 where an unmatched track is seen through, or was unseen for too long (longer where hidden)."""
     unseen = (io.scan.ping_step[env] - io.tracks.seen_step[env, track]) * io.episode_cfg.control_dt_s
     longest = ti.select(
-        sight == BLOCKED, io.tracking_cfg.hidden_s, ti.static(io.tracking_cfg.max_misses * _MISS_S)
+        sight == BLOCKED,
+        ti.static(io.tracking_cfg.hidden_s + 2.0 * io.sonar_cfg.sweep_s),
+        ti.static(io.tracking_cfg.max_misses * _MISS_S + 2.0 * io.sonar_cfg.sweep_s),
     )
     if io.tracks.spot_step[env, track] >= 0:  # the camera shows it
         unseen = ti.min(
@@ -122,6 +124,8 @@ def is_lost(env, track, sight, io: Bundle[TrackingIO]):
         and not spotted
         and (io.tracks.age[env, track] < CONFIRMED or unseen >= io.tracking_cfg.see_through_s)
     )
+    if ti.static(io.sonar_cfg.mechanical):  # where it has gone to may be looked at only later in the sweep
+        through = False
     return ti.cast(through or unseen > longest, ti.i32)
 
 
@@ -139,7 +143,12 @@ def sight_of(env, track, io: Bundle[TrackingIO]):
     through, before = 0, 0
     for k in range(-half, half + 1):
         ray = beam_there(middle + k, io.sonar_cfg)
+        looks = True
+        if ti.static(io.sonar_cfg.mechanical):
+            looks = looks_now(env, track, ti.max(ray, 0), 2 * half + 2, io)
         if ti.static(not io.sonar_cfg.is_ring) and ray < 0:
+            before += 1
+        elif not looks:
             before += 1
         else:
             past = io.scan.hit[env, ray] == 0 or io.scan.range_m[env, ray] > distance + slack
@@ -150,6 +159,18 @@ def sight_of(env, track, io: Bundle[TrackingIO]):
     return ti.select(
         2 * through > 2 * half + 1, SEEN_THROUGH, ti.select(2 * before > 2 * half + 1, BLOCKED, 0)
     )
+
+
+@ti.func
+def looks_now(env, track, ray, beams, io: Bundle[TrackingIO]):
+    """Whether a mechanical beam looked there after it saw the track, no longer ago than it takes for so many
+    beams and one tracked scan."""
+    then = io.echoes.step[env, ray]
+    ago = (io.scan.ping_step[env] - then) * io.episode_cfg.control_dt_s
+    lately = beams * ti.static(io.sonar_cfg.step_us / 1e6) + ti.static(
+        (io.tracking_cfg.period_steps + 1) * io.episode_cfg.control_dt_s
+    )
+    return then > io.tracks.seen_step[env, track] and ago <= lately
 
 
 @ti.func
@@ -283,12 +304,53 @@ def name_beams(env, io: Bundle[TrackingIO]):
         io.tracks.beam_track[env, ray] = -1
         if c >= 0:
             io.tracks.beam_track[env, ray] = io.clusters.match[env, c]
+    if ti.static(io.sonar_cfg.mechanical):
+        name_by_place(env, io)
+
+
+@ti.func
+def name_by_place(env, io: Bundle[TrackingIO]):
+    """Name the returns of a mechanical beam after the moving track that is expected there: only few of a
+    body's beams are ever of one scan."""
+    own = io.scan.ping_pos_w[env]
+    for ray in range(io.sonar_cfg.n_ray):
+        name = -1
+        if io.scan.hit[env, ray] == 1:
+            range_m = io.scan.range_m[env, ray]
+            bearing = io.scan.ping_yaw[env] + beam_bearing(ray, io.sonar_cfg)
+            x, y = own[0] + range_m * ti.cos(bearing), own[1] + range_m * ti.sin(bearing)
+            name = mover_at(env, x, y, split_distance(range_m, io), io)
+        io.tracks.beam_track[env, ray] = name
+
+
+@ti.func
+def mover_at(env, x, y, slack, io: Bundle[TrackingIO]):
+    """The moving track whose outline is expected nearest to a point, within ``slack`` [m]; -1 = none."""
+    late = (io.scan.ping_step[env] - io.tracks.scan_step[env]) * io.episode_cfg.control_dt_s
+    name, nearest = -1, slack
+    for track in range(io.tracks.alive.shape[1]):
+        if io.tracks.alive[env, track] == 1 and io.tracks.moving[env, track] == 1:
+            mean = io.tracks.state[env, track]
+            off = ti.Vector([x - mean[0] - late * mean[2], y - mean[1] - late * mean[3]])
+            gap = off.norm() - io.tracks.radius_m[env, track]
+            if gap < nearest:
+                name, nearest = track, gap
+    return name
 
 
 @ti.func
 def carry_names(env, io: Bundle[TrackingIO]):
     """Name the beams of a scan that is not tracked after the last one that was: same bearing, and a range at
     which that body can be."""
+    if ti.static(io.sonar_cfg.mechanical):
+        name_by_place(env, io)
+    else:
+        carry_over(env, io)
+
+
+@ti.func
+def carry_over(env, io: Bundle[TrackingIO]):
+    """The names of beams that all come at once."""
     step = ti.static(io.sonar_cfg.beam_step_rad)
     shift = ti.cast(
         ti.floor(wrapped_angle(io.scan.ping_yaw[env] - io.clusters.scan_yaw[env]) / step + 0.5), ti.i32

@@ -43,7 +43,12 @@ def update_tracks(env, dt, io: Bundle[TrackingIO]):
             before = io.tracks.state[env, track]
             update_radius(env, track, c, dt, io)
             update_filter(env, track, c, io)
-            update_evidence(env, track, c, dt, before, io)
+            since = dt
+            if ti.static(io.sonar_cfg.mechanical):  # the head has come round since
+                since = (
+                    io.scan.ping_step[env] - io.tracks.seen_step[env, track]
+                ) * io.episode_cfg.control_dt_s
+            update_evidence(env, track, c, since, before, io)
             io.tracks.z_m[env, track] = io.scan.ping_pos_w[env][2]
             io.tracks.seen_step[env, track] = io.scan.ping_step[env]
             io.tracks.misses[env, track] = 0

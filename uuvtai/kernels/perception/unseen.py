@@ -16,8 +16,8 @@ from uuvtai.kernels.core.geometry import FAR_M
 from uuvtai.kernels.core.kalman import AT
 from uuvtai.kernels.core.signature import Bundle
 from uuvtai.kernels.perception.bundles import TrackingIO
-from uuvtai.kernels.perception.futures import BEGIN_SEEN, longer_share, straight_share
-from uuvtai.kernels.perception.habits import next_turn
+from uuvtai.kernels.perception.futures import longer_share, straight_share
+from uuvtai.kernels.perception.habits import BEGIN_SEEN, next_turn
 
 _SLOWEST_M_S = 0.1
 """A slower body is where it is, whichever way it turns."""
@@ -51,7 +51,7 @@ def turn_back_rate(env, track, dt, io: Bundle[TrackingIO]):
         if ti.static(io.forecast_cfg.use_habits):
             turn, _ = next_turn(env, pos, course, io.habits, io.forecast_cfg)
         if turn >= FAR_M:
-            begun, known = 0.0, io.habits.run_kind[env, track] == BEGIN_SEEN
+            begun, known = 0.0, io.habits.run_kind[env, track] >= BEGIN_SEEN
             if io.habits.run_kind[env, track] > 0:
                 begun = ti.max((pos - io.habits.run_from_w[env, track]).dot(course), 0.0)
             first = ti.max(longer_share(begun, known, io.traffic_cfg), _LEAST_SHARE)

@@ -10,13 +10,15 @@ say. A sonar without Doppler says nothing of the velocity.
 """
 
 import math
+from typing import Any
 
 import taichi as ti
 
 from uuvtai.kernels.core.beams import beam_lanes
-from uuvtai.kernels.core.lanes import LANES, f16x
-from uuvtai.kernels.core.signature import Bundle
+from uuvtai.kernels.core.lanes import LANES, f16x, lane_bits
+from uuvtai.kernels.core.signature import Bundle, Out
 from uuvtai.kernels.perception.bundles import PoseIO
+from uuvtai.kernels.perception.echoes import is_new
 
 _BESIDE = 2
 """Beams on either side that are looked at together with one: most bodies are wider."""
@@ -24,7 +26,7 @@ _BESIDE = 2
 _MOST_WRONG = 0.5
 """No sonar is taken to be worse."""
 
-Beams = ti.types.struct(ahead=f16x, left=f16x, range_m=f16x, doppler_m_s=f16x, hit=f16x)
+Beams = ti.types.struct(ahead=f16x, left=f16x, range_m=f16x, hit=f16x)
 """Sixteen neighbouring beams: direction in the level body frame, and what was measured."""
 
 Fix = ti.types.struct(
@@ -44,7 +46,7 @@ def seen_walls(env, place_cov, speed, speed_cov, io: Bundle[PoseIO]):
     pos, yaw = io.scan.ping_pos_w[env], io.scan.ping_yaw[env]
     c, s = ti.cos(yaw), ti.sin(yaw)
     fix = Fix(pose=0.0, pose_part=0.0, velocity=0.0, velocity_part=0.0)
-    seen, short = 0.0, 0.0
+    seen, short, kept = 0.0, 0.0, ti.Vector.zero(ti.i32, ti.static(io.sensors_cfg.sonar.n_ray // LANES))
     for packet in range(ti.static(io.sensors_cfg.sonar.n_ray // LANES)):
         beams = read_beams(env, packet, io)
         ux, uy = c * beams.ahead - s * beams.left, s * beams.ahead + c * beams.left
@@ -77,26 +79,38 @@ def seen_walls(env, place_cov, speed, speed_cov, io: Bundle[PoseIO]):
             ]
         )  # fmt: skip
         fix.pose_part += ti.Vector([(wx * e).sum(), (wy * e).sum(), (wt * e).sum()])
-        if ti.static(io.sensors_cfg.sonar.doppler):
-            slip = beams.doppler_m_s + speed[0] * beams.ahead + speed[1] * beams.left
-            swing = ti.static(doppler_variance(io.sensors_cfg)) + form2(speed_cov, beams.ahead, beams.left)
-            still = good * ti.select(slip * slip < ti.static(io.pose_cfg.gate_sigmas**2) * swing, 1.0, 0.0)
-            trust = still * ti.static(
-                1.0
-                / gated(wrong_dopplers(io.sensors_cfg, io.pose_cfg), io.pose_cfg)
-                / doppler_variance(io.sensors_cfg)
-            )
-            va, vl = trust * beams.ahead, trust * beams.left
-            fix.velocity += ti.Vector(
-                [(va * beams.ahead).sum(), (va * beams.left).sum(), (vl * beams.left).sum()]
-            )
-            fix.velocity_part -= ti.Vector([(va * slip).sum(), (vl * slip).sum()])
+        kept[packet] = lane_bits(good > 0.0)
     # what stands before the walls, as much as was seen of it, stands unseen just before them too
     share = short / ti.max(short + seen, 1.0)
     together = 1.0 / (1.0 + share * ti.static(unseen_returns(io.sensors_cfg, io.pose_cfg)))
     fix.pose *= together
     fix.pose_part *= together
+    if ti.static(io.sensors_cfg.sonar.doppler):
+        add_dopplers(env, fix, kept, speed, speed_cov, io)
     return fix
+
+
+@ti.func
+def add_dopplers(env, fix: Out[Any], kept, speed, speed_cov, io: Bundle[PoseIO]):
+    """What the Doppler of the beams that end on a wall says of the velocity; ``kept``: a bit for each of
+    them, by packet. A loop of its own: both together need more registers than a GPU's thread has."""
+    for packet in range(ti.static(io.sensors_cfg.sonar.n_ray // LANES)):
+        ahead, left = beam_lanes(0.0, packet * LANES, io.sensors_cfg.sonar)
+        good, doppler = f16x(0.0), f16x(0.0)
+        for i in ti.static(range(LANES)):
+            good[i] = ti.cast((kept[packet] >> i) & 1, ti.f32)
+            doppler[i] = io.scan.doppler_m_s[env, packet * LANES + i]
+        slip = doppler + speed[0] * ahead + speed[1] * left
+        swing = ti.static(doppler_variance(io.sensors_cfg)) + form2(speed_cov, ahead, left)
+        still = good * ti.select(slip * slip < ti.static(io.pose_cfg.gate_sigmas**2) * swing, 1.0, 0.0)
+        trust = still * ti.static(
+            1.0
+            / gated(wrong_dopplers(io.sensors_cfg, io.pose_cfg), io.pose_cfg)
+            / doppler_variance(io.sensors_cfg)
+        )
+        va, vl = trust * ahead, trust * left
+        fix.velocity += ti.Vector([(va * ahead).sum(), (va * left).sum(), (vl * left).sum()])
+        fix.velocity_part -= ti.Vector([(va * slip).sum(), (vl * slip).sum()])
 
 
 @ti.func
@@ -111,14 +125,17 @@ def beside(values):
 
 @ti.func
 def read_beams(env, packet, io: Bundle[PoseIO]):
-    """Sixteen beams; ranges without the mean of their one-sided error."""
+    """Sixteen beams; ranges without the mean of their one-sided error. What a mechanical beam heard before
+    was used then: it counts as no return."""
     ahead, left = beam_lanes(0.0, packet * LANES, io.sensors_cfg.sonar)
-    range_m, doppler, hit = f16x(0.0), f16x(0.0), f16x(0.0)
+    range_m, hit = f16x(0.0), f16x(0.0)
     for i in ti.static(range(LANES)):
         range_m[i] = io.scan.range_m[env, packet * LANES + i] - io.sensors_cfg.sonar.range_jitter_m
-        doppler[i] = io.scan.doppler_m_s[env, packet * LANES + i]
         hit[i] = ti.cast(io.scan.hit[env, packet * LANES + i], ti.f32)
-    return Beams(ahead=ahead, left=left, range_m=range_m, doppler_m_s=doppler, hit=hit)
+        if ti.static(io.sensors_cfg.sonar.mechanical):
+            if not is_new(env, packet * LANES + i, io.scan, io.sensors_cfg.sonar):
+                hit[i] = 0.0
+    return Beams(ahead=ahead, left=left, range_m=range_m, hit=hit)
 
 
 @ti.func
@@ -201,8 +218,9 @@ def unseen_returns(sensors_cfg, pose_cfg):
 
 
 def aim_variance(sensors_cfg, pose_cfg):
-    """[rad^2] of a beam's direction; plain Python."""
-    return pose_cfg.bearing_sigma_rad**2 + sensors_cfg.imu.attitude_sigma_rad**2
+    """[rad^2] of a beam's direction, which a wide beam has anywhere in its width; plain Python."""
+    width = sensors_cfg.sonar.half_width_rad
+    return pose_cfg.bearing_sigma_rad**2 + sensors_cfg.imu.attitude_sigma_rad**2 + width**2
 
 
 def doppler_variance(sensors_cfg):

@@ -33,9 +33,10 @@ from uuvtai.plan_codes import (
 @quick_launch
 @ti.kernel
 def fire_triggers(io: Bundle[TriggersIO]):
-    """Move the foot along the route, find the triggers that hold, and queue the envs that plan in this step
-    in the order of their ids."""
+    """Move the foot along the route, find the triggers that hold, and queue the envs that plan in this step,
+    in any order."""
     n = ti.static(io.clock.awake.shape[0])
+    io.route.n_queue[None] = 0
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
         if pad == 0 and io.clock.awake[env] == 1:
             if io.route.n_way[env] > 0:
@@ -44,14 +45,8 @@ def fire_triggers(io: Bundle[TriggersIO]):
             _count_stuck(env, io)
             holding = _held_triggers(env, io)
             _serve(env, holding, io)
-    for _ in range(1):
-        count = 0
-        for env in range(n):
-            if io.clock.awake[env] == 1 and io.route.want_plan[env] == 1:
-                io.route.queue[count] = env
-                count += 1
-        io.route.n_queue[None] = count
-        io.route.n_failed[None] = 0
+            if io.route.want_plan[env] == 1:
+                io.route.queue[ti.atomic_add(io.route.n_queue[None], 1)] = env
 
 
 @ti.func

@@ -35,19 +35,13 @@ def plan_routes(io: Bundle[VoronoiIO]):
     """Plan for the queued envs; those for which it fails are listed in ``route.failed`` and keep their old
     route."""
     n = ti.static(io.voronoi.cost.shape[0])
+    io.route.n_failed[None] = 0
     for slot, pad in ti.ndrange(n, ti.static(spread(n))):
         if pad == 0:
             item = slot
             while item < io.route.n_queue[None]:
                 _plan(slot, io.route.queue[item], io)
                 item += n
-    for _ in range(1):
-        count = 0
-        for item in range(io.route.n_queue[None]):
-            if io.route.fallback_reason[io.route.queue[item]] != FAIL_NONE:
-                io.route.failed[count] = io.route.queue[item]
-                count += 1
-        io.route.n_failed[None] = count
 
 
 @ti.func
@@ -68,6 +62,7 @@ def _plan(slot, env, io: Bundle[VoronoiIO]):
     io.route.fallback_reason[env] = reason
     if reason != FAIL_NONE:
         io.route.fallbacks[env, reason - 1] += 1
+        io.route.failed[ti.atomic_add(io.route.n_failed[None], 1)] = env
 
 
 @ti.func

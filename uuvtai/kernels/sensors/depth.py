@@ -17,6 +17,7 @@ from uuvtai.kernels.core.noise import STREAM_DEPTH, normal_pair_lanes, stream_ke
 from uuvtai.kernels.core.signature import Bundle, spread
 from uuvtai.kernels.sensors.bundles import DepthIO
 from uuvtai.kernels.sensors.raycast import ball_span, disc_span, rim_distance, slab_span
+from uuvtai.native.gpu_shape import is_gpu_shaped
 from uuvtai.native.launch import quick_launch
 
 _BLOCK = 36
@@ -74,7 +75,7 @@ def cast_depth(io: Bundle[DepthIO]):
 
 def rows_per_item() -> int:
     """Image rows of one loop item."""
-    return _BLOCK_GPU if ti.cfg.arch == ti.cuda else _BLOCK  # type: ignore[union-attr]
+    return _BLOCK_GPU if is_gpu_shaped() else _BLOCK
 
 
 @ti.func
@@ -275,7 +276,7 @@ def disturb_block(env, first_row, step, io: Bundle[DepthIO]):
             for pair in range(
                 ti.static(-(-n_packet // 2))
             ):  # the two normals of a draw go to neighbouring packets
-                one, other = normal_pair_lanes(key, row * io.depth_cfg.cols + pair * LANES)
+                one, other = normal_pair_lanes(key, row * io.depth_cfg.cols + pair * LANES, LANES)
                 paint_noisy(env, row, 2 * pair * LANES, one, io)
                 if ti.static(n_packet % 2 == 0) or 2 * pair + 1 < n_packet:
                     paint_noisy(env, row, (2 * pair + 1) * LANES, other, io)

@@ -11,7 +11,7 @@ import math
 import taichi as ti
 
 from uuvtai.kernels.core.geometry import BOX, FAR_M, NONE, SPHERE
-from uuvtai.kernels.core.lanes import LANES, f16x
+from uuvtai.kernels.core.lanes import LANES, f16x, filled, lane_bits
 from uuvtai.kernels.core.signature import Bundle, Const
 from uuvtai.kernels.sensors.bundles import SonarIO
 
@@ -20,10 +20,6 @@ _TINY = 1.0e-9
 
 _SKIN_M = 1.0e-4
 """A ray that starts on a surface (after a bounce) does not meet that surface again within this."""
-
-Echo = ti.types.struct(range_m=f16x, normal_x=f16x, normal_y=f16x, vel_x=f16x, vel_y=f16x)
-"""What sixteen level rays meet: range [m] (FAR_M = nothing), outward unit normal and velocity [m/s] of the
-surface."""
 
 
 @ti.func
@@ -135,16 +131,10 @@ def bodies_there(env, first, io: Bundle[SonarIO]):
 
 
 @ti.func
-def lane_bits(condition):
-    """Bit i is 1 where the condition holds in lane i."""
-    weights = ti.Vector(ti.static([1 << i for i in range(LANES)]))
-    return ti.select(condition, weights, 0).sum()  # type: ignore[misc]
-
-
-@ti.func
 def nearest_echo(env, x, y, ux, uy, travelled, wedge, direct: Const[bool], io: Bundle[SonarIO]):
     """Nearest surface along level rays (ux, uy) from (x, y) in the sonar's plane, after a path already
-    ``travelled`` [m].
+    ``travelled`` [m]: a struct of lanes, range [m] (FAR_M = nothing), outward unit normal and velocity [m/s]
+    of the surface.
 
     A body counts where its vertical gap is at most ``fan_slope`` x path. (x, y) and ``travelled`` are
     scalars, or lanes after a bounce. ``direct`` rays start at the sensor, where only bodies in their
@@ -172,7 +162,7 @@ def nearer_echo(env, body, echo, x, y, ux, uy, travelled, io: Bundle[SonarIO]):
     kind = io.world.kind[env, body]
     pos, size = io.world.pos_w[env, body].cast(ti.f32), io.world.size[env, body].cast(ti.f32)
     sx, sy, rise = x - pos[0], y - pos[1], pos[2] - ti.cast(io.sonar_memory.mount_w[env][2], ti.f32)
-    enter, normal_x, normal_y = f16x(FAR_M), f16x(0.0), f16x(0.0)
+    enter, normal_x, normal_y = filled(FAR_M, ux.n), filled(0.0, ux.n), filled(0.0, ux.n)
     if kind == BOX:
         enter, normal_x, normal_y = box_entry(sx, sy, ux, uy, size, ti.cast(io.world.yaw[env, body], ti.f32))
     else:
@@ -224,7 +214,7 @@ def fan_slope(sonar_cfg):
 @ti.func
 def wall_echo(x, y, ux, uy, io: Bundle[SonarIO]):
     """Side walls of the tank: nothing moves, normals point inwards."""
-    range_m, normal_x, normal_y = f16x(0.0), f16x(0.0), f16x(0.0)
+    range_m, normal_x, normal_y = filled(0.0, ux.n), filled(0.0, ux.n), filled(0.0, ux.n)
     if ti.static(io.tank_cfg.shape == "circle"):
         sx = x - ti.static(0.5 * (io.tank_cfg.x_m[0] + io.tank_cfg.x_m[1]))
         sy = y - ti.static(0.5 * (io.tank_cfg.y_m[0] + io.tank_cfg.y_m[1]))
@@ -237,4 +227,5 @@ def wall_echo(x, y, ux, uy, io: Bundle[SonarIO]):
         range_m = ti.min(to_x, to_y)
         normal_x = ti.select(to_x < to_y, ti.select(ux > 0.0, -1.0, 1.0), 0.0)
         normal_y = ti.select(to_x < to_y, 0.0, ti.select(uy > 0.0, -1.0, 1.0))
-    return Echo(range_m=range_m, normal_x=normal_x, normal_y=normal_y, vel_x=f16x(0.0), vel_y=f16x(0.0))
+    still = filled(0.0, ux.n)
+    return ti.Struct(range_m=range_m, normal_x=normal_x, normal_y=normal_y, vel_x=still, vel_y=still)

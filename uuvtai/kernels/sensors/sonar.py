@@ -13,8 +13,8 @@ import math
 import taichi as ti
 
 from uuvtai.kernels.core.geometry import FAR_M, rotation_wb
-from uuvtai.kernels.core.lanes import LANES, f16x
-from uuvtai.kernels.core.signature import Bundle, spread
+from uuvtai.kernels.core.lanes import LANES, filled
+from uuvtai.kernels.core.signature import Bundle, Const, spread
 from uuvtai.kernels.sensors.bundles import SonarIO
 from uuvtai.kernels.sensors.raycast import nearest_echo, place_bodies
 from uuvtai.kernels.sensors.sonar_error import (
@@ -28,6 +28,7 @@ from uuvtai.kernels.sensors.sonar_error import (
     range_noisy,
     start_cloud,
 )
+from uuvtai.native.gpu_shape import is_gpu_shaped
 from uuvtai.native.launch import quick_launch
 
 _FALLOFF = 0.9
@@ -36,6 +37,9 @@ of the range loss (EC)."""
 
 _DIMMEST = 0.01
 """Floor of the cosine in the intensity, so that a return is never 0."""
+
+_BEAMS_GPU = 8
+"""Beams of one thread of a GPU"""
 
 Mount = ti.types.struct(pos=ti.math.vec3, vel=ti.math.vec2, heading=ti.math.vec2)
 """Truth of the sensor as float32: world position [m], horizontal velocity [m/s], unit vector ahead."""
@@ -66,6 +70,8 @@ def clear_scan(env, io: Bundle[SonarIO]):
     io.scan.ping_yaw[env] = 0.0
     io.scan.ping_vel_b[env] = ti.zero(io.scan.ping_vel_b[env])
     io.scan.ping_vel_valid[env] = 0
+    io.scan.new_from[env] = 0
+    io.scan.new_count[env] = 0
 
 
 @ti.func
@@ -86,60 +92,73 @@ def cast_sonar(io: Bundle[SonarIO]):
     period_steps.
     """
     n = ti.static(io.clock.awake.shape[0])
-    n_packet = ti.static(io.sonar_cfg.n_ray // LANES)
+    beams = ti.static(n_beam())
+    n_part = ti.static(io.sonar_cfg.n_ray // beams)
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
         if pad == 0 and io.clock.awake[env] == 1 and io.clock.step[env] % io.sonar_cfg.period_steps == 0:
             place_sonar(env, io)
             if ti.static(io.sonar_cfg.bubble_clouds_per_s > 0):
                 start_cloud(env, io)
-    for env, packet, pad in ti.ndrange(n, n_packet, ti.static(spread(n * n_packet))):
+    for env, part, pad in ti.ndrange(n, n_part, ti.static(spread(n * n_part))):
         if pad == 0 and io.clock.awake[env] == 1:
             step = io.clock.step[env]
             if step % io.sonar_cfg.period_steps == 0:
-                ping(env, packet, step, io)
-            deliver(env, packet, step, io)
+                ping(env, part * beams, step, io)
+            deliver(env, part * beams, step, io)
+
+
+def n_beam() -> int:
+    """Neighbouring beams that one loop item casts; fewer on a GPU, where a thread has not the registers for a
+    packet. Plain Python."""
+    return _BEAMS_GPU if is_gpu_shaped() else LANES
 
 
 @ti.func
-def ping(env, packet, step, io: Bundle[SonarIO]):
-    """Sixteen beams: without latency straight into the scan, else into the ring."""
-    range_m, doppler, intensity = measured(env, packet, step, io)
+def ping(env, first, step, io: Bundle[SonarIO]):
+    """The beams from ``first`` on: without latency straight into the scan, else into the ring."""
+    range_m, doppler, intensity = measured(env, first, step, io)
     if ti.static(io.sonar_cfg.latency_steps == 0):
-        show(env, packet, step, range_m, doppler, intensity, io)
+        show(env, first, step, range_m, doppler, intensity, io)
     else:
-        queue(env, packet, step, range_m, doppler, intensity, io)
+        queue(env, first, step, range_m, doppler, intensity, io)
 
 
 @ti.func
-def show(env, packet, step, range_m, doppler, intensity, io: Bundle[SonarIO]):
-    """Write a packet to the output; its first packet also writes the own state of the ping."""
-    for i in ti.static(range(LANES)):
-        ray = packet * LANES + i
+def show(env, first, step, range_m, doppler, intensity, io: Bundle[SonarIO]):
+    """Write beams to the output; the very first also writes the own state of the ping."""
+    for i in ti.static(range(range_m.n)):
+        ray = first + i
         hit = range_m[i] < FAR_M
         io.scan.range_m[env, ray] = ti.select(hit, range_m[i], io.sonar_cfg.max_range_m)
         io.scan.doppler_m_s[env, ray] = ti.select(hit, doppler[i], 0.0)
         io.scan.intensity[env, ray] = ti.select(hit, intensity[i], 0.0)
         io.scan.hit[env, ray] = ti.select(hit, 1, 0)
-    if packet == 0:
-        io.scan.ping_step[env] = step
-        io.scan.ping_pos_w[env] = io.ego.pos_w[env]
-        io.scan.ping_yaw[env] = io.ego.rpy[env][2]
-        io.scan.ping_vel_b[env] = io.ego.vel_b[env]
-        io.scan.ping_vel_valid[env] = io.ego.vel_valid[env]
+    if first == 0:
+        note_ping(env, step, io)
 
 
 @ti.func
-def queue(env, packet, step, range_m, doppler, intensity, io: Bundle[SonarIO]):
-    """Write a packet to the ring of scans under way."""
+def note_ping(env, step, io: Bundle[SonarIO]):
+    """Write the own state of a ping to the output."""
+    io.scan.ping_step[env] = step
+    io.scan.ping_pos_w[env] = io.ego.pos_w[env]
+    io.scan.ping_yaw[env] = io.ego.rpy[env][2]
+    io.scan.ping_vel_b[env] = io.ego.vel_b[env]
+    io.scan.ping_vel_valid[env] = io.ego.vel_valid[env]
+
+
+@ti.func
+def queue(env, first, step, range_m, doppler, intensity, io: Bundle[SonarIO]):
+    """Write beams to the ring of scans under way."""
     slot = ring_slot(step, io)
-    for i in ti.static(range(LANES)):
-        ray = packet * LANES + i
+    for i in ti.static(range(range_m.n)):
+        ray = first + i
         hit = range_m[i] < FAR_M
         io.sonar_memory.range_m[env, slot, ray] = ti.select(hit, range_m[i], io.sonar_cfg.max_range_m)
         io.sonar_memory.doppler_m_s[env, slot, ray] = ti.select(hit, doppler[i], 0.0)
         io.sonar_memory.intensity[env, slot, ray] = ti.select(hit, intensity[i], 0.0)
         io.sonar_memory.hit[env, slot, ray] = ti.select(hit, 1, 0)
-    if packet == 0:
+    if first == 0:
         io.sonar_memory.step[env, slot] = step
         io.sonar_memory.pos_w[env, slot] = io.ego.pos_w[env]
         io.sonar_memory.yaw[env, slot] = io.ego.rpy[env][2]
@@ -154,25 +173,25 @@ def ring_slot(step, io: Bundle[SonarIO]):
 
 
 @ti.func
-def deliver(env, packet, step, io: Bundle[SonarIO]):
+def deliver(env, first, step, io: Bundle[SonarIO]):
     """Move the scan that is due now from the ring to the output."""
     pinged = step - io.sonar_cfg.latency_steps
     if ti.static(io.sonar_cfg.latency_steps == 0):
-        if packet == 0:
+        if first == 0:
             io.scan.fresh[env] = ti.cast(step % io.sonar_cfg.period_steps == 0, ti.i32)
     else:
         due = step == 0 or (pinged > 0 and pinged % io.sonar_cfg.period_steps == 0)
         slot = ring_slot(ti.max(pinged, 0), io)
-        if packet == 0:
+        if first == 0:
             io.scan.fresh[env] = ti.cast(due, ti.i32)
         if due:
-            if packet == 0:
+            if first == 0:
                 io.scan.ping_step[env] = io.sonar_memory.step[env, slot]
                 io.scan.ping_pos_w[env] = io.sonar_memory.pos_w[env, slot]
                 io.scan.ping_yaw[env] = io.sonar_memory.yaw[env, slot]
                 io.scan.ping_vel_b[env] = io.sonar_memory.vel_b[env, slot]
                 io.scan.ping_vel_valid[env] = io.sonar_memory.vel_valid[env, slot]
-            for ray in range(packet * LANES, (packet + 1) * LANES):
+            for ray in range(first, first + ti.static(n_beam())):
                 io.scan.range_m[env, ray] = io.sonar_memory.range_m[env, slot, ray]
                 io.scan.doppler_m_s[env, ray] = io.sonar_memory.doppler_m_s[env, slot, ray]
                 io.scan.intensity[env, ray] = io.sonar_memory.intensity[env, slot, ray]
@@ -183,15 +202,22 @@ def deliver(env, packet, step, io: Bundle[SonarIO]):
 
 
 @ti.func
-def measured(env, packet, step, io: Bundle[SonarIO]):
-    """(range, Doppler, intensity) of sixteen beams as the sensor reports them; range FAR_M = no return."""
-    mount = sonar_mount(env, io)
-    ux, uy = beam_directions(packet, mount.heading, io)
+def measured(env, ray, step, io: Bundle[SonarIO]):
+    """(range, Doppler, intensity) of the beams from ``ray`` on as the sensor reports them; range FAR_M =
+    no return."""
+    mount, packet = sonar_mount(env, io), ray // LANES
+    ux, uy = beam_directions(ray, mount.heading, io)
     wedge = packet_wedge(packet, mount.heading, io)
     echo = nearest_echo(env, mount.pos[0], mount.pos[1], ux, uy, 0.0, wedge, True, io)
+    return reported(env, echo, ux, uy, mount, wedge, ray, step, io)
+
+
+@ti.func
+def reported(env, echo, ux, uy, mount, wedge, ray, step, io: Bundle[SonarIO]):
+    """What a sensor reports, errors included, of sixteen beams from number ``ray`` on that meet ``echo``."""
     cosine = -(ux * echo.normal_x + uy * echo.normal_y)
     own = ux * mount.vel[0] + uy * mount.vel[1]
-    key, ray = io.episode.key[env], packet * LANES
+    key = io.episode.key[env]
     bounced, away = ghosted(env, echo, ux, uy, mount.pos, wedge, step, ray, io)
     clear = grazing_lost(bounced, cosine, io)
     clouded, still, bright = cloud_covered(env, clear, away, cosine, mount.heading, ray, step, io)
@@ -199,7 +225,7 @@ def measured(env, packet, step, io: Bundle[SonarIO]):
     noisy = range_noisy(heard, key, step, ray, io)
     measured, speed, lit = falsely_returned(noisy, still, bright, key, step, ray, io)
     final = cut_off(measured, io)
-    doppler = f16x(0.0)
+    doppler = filled(0.0, final.n)
     if ti.static(io.sonar_cfg.doppler):
         doppler = doppler_noisy(speed - own, key, step, ray, io)
     intensity = ti.max(lit, _DIMMEST) * (
@@ -248,12 +274,23 @@ def direction_before(packet, heading, io: Bundle[SonarIO]):
 
 
 @ti.func
-def beam_directions(packet, heading, io: Bundle[SonarIO]):
-    """Horizontal unit vectors (x, y) of a packet's beams."""
-    before = direction_before(packet, heading, io)
-    ux, uy = f16x(0.0), f16x(0.0)
-    for i in ti.static(range(LANES)):
-        turn = ti.static(io.sonar_cfg.turn_rad(i + 1))
+def beam_directions(ray, heading, io: Bundle[SonarIO]):
+    """Horizontal unit vectors (x, y) of the beams from ``ray`` on."""
+    beams = ti.static(n_beam())
+    before = direction_before(ray // LANES, heading, io)
+    ux, uy = turned_beams(before, 0, io)
+    for part in ti.static(range(1, LANES // beams)):
+        if ray % LANES == part * beams:
+            ux, uy = turned_beams(before, part * beams, io)
+    return ux, uy
+
+
+@ti.func
+def turned_beams(before, first: Const[int], io: Bundle[SonarIO]):
+    """Horizontal unit vectors (x, y) of the beams from number ``first`` of a packet on."""
+    ux, uy = filled(0.0, ti.static(n_beam())), filled(0.0, ti.static(n_beam()))
+    for i in ti.static(range(n_beam())):
+        turn = ti.static(io.sonar_cfg.turn_rad(first + i + 1))
         c, s = ti.static(math.cos(turn), math.sin(turn))
         ux[i] = before[0] * c - before[1] * s
         uy[i] = before[0] * s + before[1] * c

@@ -1,10 +1,9 @@
-"""What goes wrong in a sonar beam, error by error; each is compiled away at zero. Packets of sixteen beams,
+"""What goes wrong in a sonar beam, error by error; each is compiled away at zero. Packets of beams,
 FAR_M = no return."""
 
 import taichi as ti
 
 from uuvtai.kernels.core.geometry import FAR_M, TWO_PI
-from uuvtai.kernels.core.lanes import LANES, i16x
 from uuvtai.kernels.core.noise import (
     STREAM_SONAR_CLUTTER,
     STREAM_SONAR_DOPPLER,
@@ -42,7 +41,7 @@ def ghosted(env, echo, ux, uy, pos, wedge, step, ray, io: Bundle[SonarIO]):
     out_range, out_away = range_m + 0.0, away + 0.0
     if ti.static(io.sonar_cfg.ghost > 0):
         stream = stream_key(io.episode.key[env], step, STREAM_SONAR_GHOST)
-        chosen = uniform_lanes(stream, ray) < io.sonar_cfg.ghost
+        chosen = uniform_lanes(stream, ray, ux.n) < io.sonar_cfg.ghost
         if any_lane(chosen):
             cosine = -(ux * echo.normal_x + uy * echo.normal_y)
             mx, my = ux + 2.0 * cosine * echo.normal_x, uy + 2.0 * cosine * echo.normal_y
@@ -113,9 +112,7 @@ def cloud_covered(env, range_m, away, cosine, heading, ray, step, io: Bundle[Son
         else:
             first = ti.atan2(heading[1], heading[0]) + ti.static(io.sonar_cfg.first_beam_rad)
             turn = ti.cast(ti.round(first / ti.static(io.sonar_cfg.beam_step_rad)), ti.i32)
-        index = i16x(0)
-        for i in ti.static(range(LANES)):
-            index[i] = ray + turn + i
+        index = ti.Vector([ray + turn + i for i in range(range_m.n)])
         for cloud in range(io.sonar_memory.cloud_until.shape[1]):
             if step < io.sonar_memory.cloud_until[env, cloud]:
                 offset = (
@@ -135,7 +132,8 @@ def missed(range_m, key, step, ray, io: Bundle[SonarIO]):
     out = range_m + 0.0
     if ti.static(io.sonar_cfg.missed_return > 0):
         out = ti.select(
-            uniform_lanes(stream_key(key, step, STREAM_SONAR_DROP), ray) < io.sonar_cfg.missed_return,
+            uniform_lanes(stream_key(key, step, STREAM_SONAR_DROP), ray, range_m.n)
+            < io.sonar_cfg.missed_return,
             FAR_M,
             range_m,
         )
@@ -148,10 +146,12 @@ def range_noisy(range_m, key, step, ray, io: Bundle[SonarIO]):
     out = range_m + 0.0
     stream = stream_key(key, step, STREAM_SONAR_RANGE)
     if ti.static(io.sonar_cfg.range_sigma_m > 0 or io.sonar_cfg.range_sigma_slope > 0):
-        error, _of_doppler = normal_pair_lanes(stream_key(key, step, STREAM_SONAR_NORMAL), ray)
+        error, _of_doppler = normal_pair_lanes(stream_key(key, step, STREAM_SONAR_NORMAL), ray, range_m.n)
         out += (io.sonar_cfg.range_sigma_m + io.sonar_cfg.range_sigma_slope * range_m) * error
     if ti.static(io.sonar_cfg.range_jitter_m > 0):
-        out -= io.sonar_cfg.range_jitter_m * ti.log(1.0 - uniform_lanes(stream, io.sonar_cfg.n_ray + ray))
+        out -= io.sonar_cfg.range_jitter_m * ti.log(
+            1.0 - uniform_lanes(stream, io.sonar_cfg.n_ray + ray, range_m.n)
+        )
     return out
 
 
@@ -162,12 +162,14 @@ def falsely_returned(range_m, away, bright, key, step, ray, io: Bundle[SonarIO])
     out_range, out_away, out_bright = range_m + 0.0, away + 0.0, bright + 0.0
     if ti.static(io.sonar_cfg.false_return > 0):
         stream = stream_key(key, step, STREAM_SONAR_CLUTTER)
-        chosen = uniform_lanes(stream, ray) < io.sonar_cfg.false_return
+        chosen = uniform_lanes(stream, ray, range_m.n) < io.sonar_cfg.false_return
         out_range = ti.select(
-            chosen, io.sonar_cfg.max_range_m * uniform_lanes(stream, io.sonar_cfg.n_ray + ray), range_m
+            chosen,
+            io.sonar_cfg.max_range_m * uniform_lanes(stream, io.sonar_cfg.n_ray + ray, range_m.n),
+            range_m,
         )
         out_away = ti.select(chosen, 0.0, away)
-        out_bright = ti.select(chosen, uniform_lanes(stream, 2 * io.sonar_cfg.n_ray + ray), bright)
+        out_bright = ti.select(chosen, uniform_lanes(stream, 2 * io.sonar_cfg.n_ray + ray, range_m.n), bright)
     return out_range, out_away, out_bright
 
 
@@ -190,13 +192,13 @@ def doppler_noisy(doppler, key, step, ray, io: Bundle[SonarIO]):
     out = doppler + 0.0
     stream = stream_key(key, step, STREAM_SONAR_DOPPLER)
     if ti.static(io.sonar_cfg.doppler_sigma_m_s > 0):
-        _of_range, error = normal_pair_lanes(stream_key(key, step, STREAM_SONAR_NORMAL), ray)
+        _of_range, error = normal_pair_lanes(stream_key(key, step, STREAM_SONAR_NORMAL), ray, doppler.n)
         out += io.sonar_cfg.doppler_sigma_m_s * error
     noisy = out + 0.0
     if ti.static(io.sonar_cfg.doppler_outlier > 0):
-        chosen = uniform_lanes(stream, io.sonar_cfg.n_ray + ray) < io.sonar_cfg.doppler_outlier
+        chosen = uniform_lanes(stream, io.sonar_cfg.n_ray + ray, doppler.n) < io.sonar_cfg.doppler_outlier
         wild = io.sonar_cfg.doppler_outlier_m_s * (
-            2.0 * uniform_lanes(stream, 2 * io.sonar_cfg.n_ray + ray) - 1.0
+            2.0 * uniform_lanes(stream, 2 * io.sonar_cfg.n_ray + ray, doppler.n) - 1.0
         )
         noisy = ti.select(chosen, wild, out)
     return noisy

@@ -4,8 +4,8 @@ rolled out in packets."""
 import taichi as ti
 
 from uuvtai.kernels.core.geometry import FAR_M, TWO_PI, turned_z3
-from uuvtai.kernels.core.lanes import LANES, f16x, put_column
-from uuvtai.kernels.core.signature import Bundle, spread
+from uuvtai.kernels.core.lanes import filled, n_lane, put_column, row_lanes
+from uuvtai.kernels.core.signature import Bundle, Const, spread
 from uuvtai.kernels.teacher.bundles import EvasionIO
 from uuvtai.kernels.teacher.trajectories import body_depths, depth_band, place_doubt, static_depths
 from uuvtai.native.launch import quick_launch, without_cse
@@ -17,20 +17,19 @@ from uuvtai.native.launch import quick_launch, without_cse
 def plan_evasion(io: Bundle[EvasionIO]):
     """Best evasive velocity of the envs with ``want_evade``: the softmax mean of the candidates where that is
     as good as the best one."""
-    n, n_packet = ti.static(io.clock.awake.shape[0], io.teacher.candidate_cost.shape[1] // LANES)
+    n, lanes = ti.static(io.clock.awake.shape[0], n_lane())
+    n_packet = ti.static(io.teacher.candidate_cost.shape[1] // lanes)
     for env, packet in ti.ndrange(n, n_packet):
         if io.clock.awake[env] == 1 and io.teacher.want_evade[env] == 1:
-            cx, cy, cz = candidate_lanes(env, packet * LANES, io)
-            burst_s = ti.select(packet * LANES >= io.teacher_cfg.first_burst, io.teacher_cfg.burst_s, FAR_M)
+            cx, cy, cz = candidate_lanes(env, packet * lanes, lanes, io)
+            burst_s = ti.select(packet * lanes >= io.teacher_cfg.first_burst, io.teacher_cfg.burst_s, FAR_M)
             cost = cost_lanes(env, cx, cy, cz, burst_s, io)
-            for i in ti.static(range(LANES)):
-                io.teacher.candidate_cost[env, packet * LANES + i] = cost[i]
+            for i in ti.static(range(lanes)):
+                io.teacher.candidate_cost[env, packet * lanes + i] = cost[i]
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
         if pad == 0 and io.clock.awake[env] == 1 and io.teacher.want_evade[env] == 1:
             index, best_cost, mean = _chosen(env, io)
-            cx, cy, cz = f16x(0.0), f16x(0.0), f16x(0.0)
-            for i in ti.static(range(LANES)):
-                cx[i], cy[i], cz[i] = mean[0], mean[1], mean[2]
+            cx, cy, cz = filled(mean[0], lanes), filled(mean[1], lanes), filled(mean[2], lanes)
             cost = cost_lanes(env, cx, cy, cz, FAR_M, io)
             good = cost[0] <= best_cost + ti.static(io.teacher_cfg.softness)
             io.teacher.evade_vel_w[env] = ti.select(good, mean, candidate(env, index, io))
@@ -39,15 +38,12 @@ def plan_evasion(io: Bundle[EvasionIO]):
 
 
 @ti.func
-def candidate_lanes(env, first, io: Bundle[EvasionIO]):
-    """World velocities (lanes x, y, z [m/s]) of candidates first .. first + 15."""
-    cx, cy, cz = f16x(0.0), f16x(0.0), f16x(0.0)
-    velocities = ti.Matrix.zero(ti.f32, 3, LANES)
-    for lane in range(LANES):
+def candidate_lanes(env, first, lanes: Const[int], io: Bundle[EvasionIO]):
+    """World velocities (lanes x, y, z [m/s]) of as many candidates from ``first`` on."""
+    velocities = ti.Matrix.zero(ti.f32, 3, lanes)
+    for lane in range(lanes):
         put_column(velocities, lane, candidate(env, first + lane, io))
-    for i in ti.static(range(LANES)):
-        cx[i], cy[i], cz[i] = velocities[0, i], velocities[1, i], velocities[2, i]
-    return cx, cy, cz
+    return row_lanes(velocities, 0), row_lanes(velocities, 1), row_lanes(velocities, 2)
 
 
 @ti.func
@@ -112,8 +108,8 @@ def speed_limit(angle, io: Bundle[EvasionIO]):
 
 @ti.func
 def cost_lanes(env, cx, cy, cz, burst_s, io: Bundle[EvasionIO]):
-    """Cost of sixteen commanded velocities. Violations count by depth: a flat penalty drives straight on when
-    every candidate is bad."""
+    """Cost of a packet of commanded velocities. Violations count by depth: a flat penalty drives straight on
+    when every candidate is bad."""
     pos, vel = io.ego.pos_w[env], turned_z3(io.ego.vel_b[env], io.ego.rpy[env][2])
     level, level_vel = ti.Vector([pos[0], pos[1]]), ti.Vector([vel[0], vel[1]])
     drive = ti.Struct(x=cx, y=cy, z=cz, burst_s=burst_s, pos=pos, vel=vel, z_var=io.ego.z_var[env])

@@ -32,6 +32,17 @@ def sight_share(off, sonar_cfg: Const[SonarConfig], teacher_cfg: Const[TeacherCo
 
 
 @ti.func
+def sweep_share(age_s, sonar_cfg: Const[SonarConfig], teacher_cfg: Const[TeacherConfig]):
+    """Share of the cruising speed that a mechanical beam allows, ``age_s`` after the start: what it has not
+    looked at for long may have changed. None in the first sweep."""
+    share = 1.0
+    if ti.static(sonar_cfg.mechanical):
+        allowed = ti.static(min(teacher_cfg.sweep_way_m / sonar_cfg.sweep_s / teacher_cfg.cruise_m_s, 1.0))
+        share = ti.select(age_s < ti.static(sonar_cfg.sweep_s), 0.0, allowed)
+    return share
+
+
+@ti.func
 def kept_in_sight(turn, way, sonar_cfg: Const[SonarConfig], teacher_cfg: Const[TeacherConfig]):
     """Angle to turn by, next to ``turn``, after which a way that lies ``way`` [rad] from ahead is well in
     sight."""

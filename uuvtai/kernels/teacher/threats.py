@@ -7,12 +7,12 @@ from uuvtai.config import TeacherConfig, VehicleConfig
 from uuvtai.kernels.core.beams import beam_bearing
 from uuvtai.kernels.core.geometry import FAR_M, turned_z3, wrapped_angle
 from uuvtai.kernels.core.grid import cell_of, centre_of
-from uuvtai.kernels.core.lanes import f16x
+from uuvtai.kernels.core.lanes import filled, n_lane
 from uuvtai.kernels.core.signature import Bundle, Const, spread
 from uuvtai.kernels.perception.range_rate import range_rate
 from uuvtai.kernels.teacher.bundles import ThreatsIO
 from uuvtai.kernels.teacher.cruise_depth import choose_depth
-from uuvtai.kernels.teacher.sight import sight_share
+from uuvtai.kernels.teacher.sight import sight_share, sweep_share
 from uuvtai.kernels.teacher.trajectories import body_depths, held_heave, place_doubt
 from uuvtai.native.launch import quick_launch, without_cse
 
@@ -165,6 +165,8 @@ def _follow_velocity(env, io: Bundle[ThreatsIO]):
     ):  # across the way the hull is wider: let it turn first
         share *= 1.0 - 0.6 * sideways
     share *= sight_share(ti.atan2(level[1], level[0]) - io.ego.rpy[env][2], io.sonar_cfg, io.teacher_cfg)
+    age_s = io.clock.step[env] * ti.static(io.episode_cfg.control_dt_s)
+    share *= sweep_share(age_s, io.sonar_cfg, io.teacher_cfg)
     io.teacher.speed_share[env] = ti.select(io.route.n_way[env] > 0, share, 0.0)
     wanted = _unit(level) * cruising_speed(
         ti.static(io.teacher_cfg.cruise_m_s),
@@ -202,9 +204,10 @@ def _foresee_conflict(env, io: Bundle[ThreatsIO]):
         follow = io.teacher.follow_vel_w[env]
         heave = held_heave(choose_depth(env, io) - pos[2], io.teacher_cfg, io.vehicle_cfg)
         # lanes 0 to 2: follow at this depth, follow and change depth, stop; the others repeat lane 0
-        cz = f16x(0.0)
+        lanes = ti.static(max(n_lane(), 3))
+        cz = filled(0.0, lanes)
         cz[1] = heave
-        cx, cy = f16x(follow[0]), f16x(follow[1])
+        cx, cy = filled(follow[0], lanes), filled(follow[1], lanes)
         cx[2], cy[2] = 0.0, 0.0
         drive = ti.Struct(x=cx, y=cy, z=cz, burst_s=FAR_M, pos=pos, vel=vel, z_var=io.ego.z_var[env])
         peak, _, _, first = body_depths(

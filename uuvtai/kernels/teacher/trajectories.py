@@ -1,4 +1,4 @@
-"""Roll-outs of sixteen commanded velocities at once against forecast bodies and the mapped clearance.
+"""Roll-outs of a packet of commanded velocities at once against forecast bodies and the mapped clearance.
 
 A commanded velocity c is reached with a first-order lag tau, so from velocity v0 the vehicle drives
 x(t) = x0 + v0 A(t) + c B(t), A(t) = tau (1 - exp(-t / tau)), B(t) = t - A(t): linear in c, which is all the
@@ -12,7 +12,7 @@ import taichi as ti
 from uuvtai.config import MappingConfig, TankConfig, TeacherConfig, TrackingConfig, VehicleConfig
 from uuvtai.kernels.core.geometry import FAR_M
 from uuvtai.kernels.core.grid import grid_origin
-from uuvtai.kernels.core.lanes import LANES, f16x
+from uuvtai.kernels.core.lanes import filled
 from uuvtai.kernels.core.signature import Const, In, Out
 from uuvtai.state import ClearanceState, ForecastState, FutureState
 
@@ -39,11 +39,11 @@ def body_depths(
     collision. Bodies are upright cylinders; water known to be free above or below them (``above_w``,
     ``below_w``) adds to the distance.
     """
-    found = ti.Struct(peak=f16x(0.0), mean=f16x(0.0), contact=f16x(0.0), first=f16x(FAR_M))
+    found = _no_depths(drive)
     for track in range(ti.static(forecast.radius_m.shape[1])):
         near = forecast.radius_m[env, track, 0] >= 0
         if near and _within_reach(env, track, drive, forecast, teacher_cfg, tracking_cfg):
-            left, peak, contact = 1.0, f16x(0.0), f16x(0.0)
+            left, peak, contact = 1.0, filled(0.0, drive.x.n), filled(0.0, drive.x.n)
             for nth in range(ti.static(futures.share.shape[2] + 1)):
                 future = ti.static(futures.share.shape[2]) - 1 - nth  # the forecast itself comes last: -1
                 likely = left
@@ -58,12 +58,19 @@ def body_depths(
                     peak += likely * one.peak
                     contact += likely * one.contact
                     if likely >= ti.static(teacher_cfg.heed_share):
-                        for i in ti.static(range(LANES)):
+                        for i in ti.static(range(drive.x.n)):
                             found.first[i] = ti.min(found.first[i], one.first[i])
-            for i in ti.static(range(LANES)):
+            for i in ti.static(range(drive.x.n)):
                 found.peak[i] = ti.max(found.peak[i], peak[i])
                 found.contact[i] = ti.max(found.contact[i], contact[i])
     return found.peak, found.mean, found.contact, found.first
+
+
+@ti.func
+def _no_depths(drive):
+    """Depths of no body at all, a lane per velocity."""
+    zero = filled(0.0, drive.x.n)
+    return ti.Struct(peak=zero, mean=zero, contact=zero, first=filled(FAR_M, drive.x.n))
 
 
 @ti.func
@@ -102,7 +109,7 @@ def _future_depths(
     n_sample = ti.static(_samples(forecast.radius_m.shape[2], teacher_cfg, tracking_cfg))
     dt = ti.static(tracking_cfg.forecast_dt_s)
     low, high = depth_band(drive.z_var, tank_cfg, teacher_cfg)
-    found = ti.Struct(peak=f16x(0.0), mean=f16x(0.0), contact=f16x(0.0), first=f16x(FAR_M))
+    found = _no_depths(drive)
     level, level_vel = ti.Vector([drive.pos[0], drive.pos[1]]), ti.Vector([drive.vel[0], drive.vel[1]])
     reach_speed = level_vel.norm() + ti.static(_fastest(teacher_cfg))
     above, below = forecast.above_w[env, track], forecast.below_w[env, track]
@@ -147,7 +154,7 @@ def _bound_m(radius, wanted, gain, closing, teacher_cfg: Const[TeacherConfig]):
 @ti.func
 def _deepen(found: Out[Any], wanted, free, time, n_ahead: Const[int], teacher_cfg: Const[TeacherConfig]):
     """Take one sample of one body into the lanes' largest and mean depths and first violations."""
-    for i in ti.static(range(LANES)):
+    for i in ti.static(range(free.n)):
         depth = ti.max(wanted - free[i], 0.0)
         found.peak[i] = ti.max(found.peak[i], depth)
         found.mean[i] += depth * ti.static(1.0 / n_ahead)
@@ -199,7 +206,7 @@ def static_depths(
 ):
     """How deep each commanded velocity violates the wanted static clearance, ``doubt`` [m] (of
     ``place_doubt``) more than is mapped: lanes mean depth and largest depth below contact [m]."""
-    mean, contact = f16x(0.0), f16x(0.0)
+    mean, contact = filled(0.0, cx.n), filled(0.0, cx.n)
     n_sample = ti.static(max(1, round(teacher_cfg.static_horizon_s / teacher_cfg.static_dt_s)))
     touch = ti.static(teacher_cfg.hull_reach_m + teacher_cfg.contact_m)
     for k in range(1, n_sample + 1):
@@ -215,7 +222,7 @@ def static_depths(
             tank_cfg,
             mapping_cfg,
         )
-        for i in ti.static(range(LANES)):
+        for i in ti.static(range(cx.n)):
             below = touch + doubt - free[i]
             mean[i] += ti.max(below + ti.static(teacher_cfg.static_margin_m), 0.0) / n_sample
             contact[i] = ti.max(contact[i], below)
@@ -238,8 +245,8 @@ def clearance_lanes(
     n_row, n_col = ti.static(clearance.clearance_m.shape[1], clearance.clearance_m.shape[2])
     at_col = (x - x0) * ti.static(1.0 / mapping_cfg.cell_m)
     at_row = (y - y0) * ti.static(1.0 / mapping_cfg.cell_m)
-    out = f16x(0.0)
-    for i in ti.static(range(LANES)):
+    out = filled(0.0, x.n)
+    for i in ti.static(range(x.n)):
         row = ti.math.clamp(ti.cast(ti.floor(at_row[i]), ti.i32), 0, n_row - 1)
         col = ti.math.clamp(ti.cast(ti.floor(at_col[i]), ti.i32), 0, n_col - 1)
         out[i] = clearance.clearance_m[env, row, col]

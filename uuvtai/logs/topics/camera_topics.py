@@ -16,7 +16,7 @@ from uuvtai.config import Config
 from uuvtai.logs.encode import numbers
 from uuvtai.logs.log_errors import LogError
 from uuvtai.logs.moment import Moment
-from uuvtai.logs.schemas import BASE64, COMPRESSED_IMAGE, NUMBER, TIME, UINT, array_of, described, record
+from uuvtai.logs.schemas import BASE64, NUMBER, TIME, UINT, array_of, compressed_image, described, record
 from uuvtai.logs.topic import IMAGES, NEW_IMAGE, Topic
 
 _NO_RETURN_SHARE = 0.999
@@ -35,6 +35,8 @@ _DEPTH_LINE = record(
     row=described(array_of(UINT), "0 = top"),
     depth=described(array_of(NUMBER), "[m] along the camera's axis"),
 )
+
+_DEPTH_IMAGE = compressed_image("16-bit PNG of the z-depth [mm]; maximum range = no return")
 
 _DEPTH_EXACT = record(
     "uuv.DepthExact",
@@ -93,19 +95,18 @@ def _png(moment: Moment) -> bytes:
     return f'{{"timestamp":{moment.stamp},"frame_id":"camera","data":"{png}","format":"png"}}'.encode()
 
 
-def depth_image(data: dict[str, Any]) -> np.ndarray:
-    """Depth image of a foxglove.CompressedImage [mm], uint16 (row, col). Raises LogError."""
+def logged_image(data: dict[str, Any]) -> np.ndarray:
+    """PNG of a foxglove.CompressedImage (row, col): depth [mm] as uint16, a sonar's intensity as uint8.
+    Raises LogError."""
     png = base64.b64decode(data["data"])
     signature, name, width, height = _PNG_HEAD.unpack_from(png.ljust(_PNG_HEAD.size, b"\0"))
     if signature != b"\x89PNG\r\n\x1a\n" or name != b"IHDR":
-        raise LogError("a depth image of the log cannot be decoded: it is not a PNG")
+        raise LogError("an image of the log cannot be decoded: it is not a PNG")
     if width * height > _MAX_PIXELS:
-        raise LogError(
-            f"a depth image of the log claims {width} x {height} pixels: no camera of ours has so many"
-        )
+        raise LogError(f"an image of the log claims {width} x {height} pixels: no sensor of ours has so many")
     image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None:
-        raise LogError("a depth image of the log cannot be decoded: it is damaged")
+        raise LogError("an image of the log cannot be decoded: it is damaged")
     return image
 
 
@@ -140,7 +141,7 @@ def exact_image(data: dict[str, Any], shape: tuple[int, int]) -> np.ndarray:
 
 ROWS = (
     Topic("/camera/line", NEW_IMAGE, _DEPTH_LINE, _line, ("image.depth_m", "image.shot_rpy")),
-    Topic("/camera/depth", IMAGES, COMPRESSED_IMAGE, _png, ("image.depth_m",), on_request=True),
+    Topic("/camera/depth", IMAGES, _DEPTH_IMAGE, _png, ("image.depth_m",), on_request=True),
     Topic(
         "/camera/exact",
         NEW_IMAGE,

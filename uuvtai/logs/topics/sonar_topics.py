@@ -2,15 +2,29 @@
 
 from __future__ import annotations
 
+import base64
 import json
+import math
 from typing import Any
 
+import cv2
 import numpy as np
 
 from uuvtai.logs.encode import IDENTITY, numbers
+from uuvtai.logs.fan_image import echo_power, heard_image, shown_image
 from uuvtai.logs.moment import Moment
-from uuvtai.logs.schemas import LASER_SCAN, NUMBER, THREE, TIME, array_of, described, record
-from uuvtai.logs.topic import NEW_SCAN, Topic
+from uuvtai.logs.schemas import (
+    LASER_SCAN,
+    NUMBER,
+    THREE,
+    TIME,
+    array_of,
+    compressed_image,
+    described,
+    record,
+)
+from uuvtai.logs.topic import NEW_SCAN, SONAR_IMAGES, Topic
+from uuvtai.logs.topics.camera_topics import logged_image
 
 _THOUSANDTHS = [f"{i / 1000:g}" for i in range(1001)]
 """Intensities are printed to three digits; nothing is computed from them."""
@@ -28,14 +42,26 @@ _DOPPLER = record(
 )
 
 
+_IMAGE = compressed_image(
+    "8-bit PNG of the power that each beam hears, simulated from the true scene: column 0 is the leftmost "
+    "beam, the last row the nearest range bin; 50 dB from black to white, gain follows range and absorption"
+)
+
+
 def _scan(moment: Moment) -> bytes:
-    """Ranges as sensed; where nothing returned: maximum range with intensity 0, which no return has."""
-    hit = moment["scan.hit"] != 0
+    """Ranges as sensed; where nothing returned: maximum range with intensity 0, which no return has. Of a
+    mechanical beam only what was taken in this step."""
     sonar = moment.header.config.sensors.sonar
-    ranges = np.where(hit, moment["scan.range_m"], np.float32(sonar.max_range_m))
-    thousandths = np.where(hit, np.clip(np.rint(moment["scan.intensity"] * 1000), 1, 1000), 0)
+    begin, count = int(moment["scan.new_from"]), int(moment["scan.new_count"])
+    if not sonar.mechanical:
+        begin, count = 0, len(moment["scan.hit"])
+    beams = (begin + np.arange(count)) % sonar.n_ray
+    hit = moment["scan.hit"][beams] != 0
+    ranges = np.where(hit, moment["scan.range_m"][beams], np.float32(sonar.max_range_m))
+    thousandths = np.where(hit, np.clip(np.rint(moment["scan.intensity"][beams] * 1000), 1, 1000), 0)
     intensities = ",".join(map(_THOUSANDTHS.__getitem__, thousandths.astype(np.int32).tolist()))
-    first, last = sonar.first_beam_rad, sonar.first_beam_rad + sonar.turn_rad(sonar.n_ray - 1)
+    first = sonar.first_beam_rad + sonar.turn_rad(begin)
+    last = first + sonar.turn_rad(count - 1 if sonar.mechanical else sonar.n_ray - 1)
     return (
         f'{{"timestamp":{moment.stamp_of(int(moment["scan.ping_step"]))},"frame_id":"sonar",'
         f'"pose":{_IDENTITY_TEXT},"start_angle":{first:.17g},"end_angle":{last!r},'
@@ -53,10 +79,25 @@ def _doppler(moment: Moment) -> bytes:
     return f'{{"timestamp":{stamp},"velocity":{numbers(velocity)},"own_velocity":{own}}}'.encode()
 
 
-def _read_scan(data: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, float]:
-    """(ranges (n,), hit (n,), when it was taken)."""
+def _read_scan(data: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """(ranges (n,), bearings (n,) from ahead, hit (n,), when it was taken)."""
     ping_s = data["timestamp"]["sec"] + data["timestamp"]["nsec"] / 1e9
-    return np.array(data["ranges"]), np.array(data["intensities"]) > 0, ping_s
+    ranges = np.array(data["ranges"])
+    bearing = np.linspace(float(data["start_angle"]), float(data["end_angle"]), len(ranges))
+    return ranges, bearing, np.array(data["intensities"]) > 0, ping_s
+
+
+def _image(moment: Moment) -> bytes:
+    """8-bit PNG. The speckle is a function of the episode and the step."""
+    sonar, scenario = moment.header.config.sensors.sonar, moment.header.scenario
+    w, x, y, z = (float(part) for part in moment["vehicle.quat_wb"])
+    yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    place = np.asarray(moment["vehicle.pos_w"], float)
+    bearing, power = echo_power(scenario, moment.time_s, place, yaw, sonar, sonar.image_bins)
+    random = np.random.default_rng((scenario["seed"], scenario["episode"], moment.step))
+    shown = shown_image(heard_image(bearing, power, sonar, random), bearing, sonar)
+    png = base64.b64encode(cv2.imencode(".png", shown)[1].tobytes()).decode()
+    return f'{{"timestamp":{moment.stamp},"frame_id":"sonar","data":"{png}","format":"png"}}'.encode()
 
 
 ROWS = (
@@ -65,7 +106,14 @@ ROWS = (
         NEW_SCAN,
         LASER_SCAN,
         _scan,
-        ("scan.ping_step", "scan.hit", "scan.range_m", "scan.intensity"),
+        (
+            "scan.ping_step",
+            "scan.hit",
+            "scan.range_m",
+            "scan.intensity",
+            "scan.new_from",
+            "scan.new_count",
+        ),
         _read_scan,
     ),
     Topic(
@@ -74,5 +122,14 @@ ROWS = (
         _DOPPLER,
         _doppler,
         ("scan.ping_step", "scan.hit", "scan.doppler_m_s", "scan.ping_vel_b"),
+    ),
+    Topic(
+        "/sonar/image",
+        SONAR_IMAGES,
+        _IMAGE,
+        _image,
+        ("vehicle.pos_w", "vehicle.quat_wb"),
+        logged_image,
+        on_request=True,
     ),
 )

@@ -136,7 +136,7 @@ class FailureRecorder:
             forecast_m=w["forecast.radius_m"][:, :, 0].astype(float),
             forecast_above_w=w["forecast.above_w"].astype(float),
             forecast_below_w=w["forecast.below_w"].astype(float),
-            turn_back_share=w["futures.share"].astype(float).sum(-1),
+            turn_back_share=_turns_back(w["futures.share"]),
             conflict=w["teacher.conflict_s"] < _FORESEEN_S,
             leaf=self._leaves(w["teacher.leaf"]),
             action=w["teacher.action"].astype(float),
@@ -166,6 +166,11 @@ def _read_rows(
         for name in names
     }
     return {row: {name: values[i].copy() for name, values in read.items()} for i, row in enumerate(rows)}
+
+
+def _turns_back(share: np.ndarray) -> np.ndarray:
+    """(n, n_track) probability of turning back in all: the first half of a track's futures."""
+    return share[..., : max(1, share.shape[-1] // 2)].astype(float).sum(-1)
 
 
 def _stacked(samples: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:

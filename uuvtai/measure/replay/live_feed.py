@@ -54,6 +54,18 @@ class LiveFeed:
         struct, _, field = name.partition(".")
         return self._sim.rows(getattr(getattr(self._sim.s, struct), field), [0])[0]
 
+    def _ping(self) -> SonarPing:
+        """The scan, or the beams of it that a mechanical head has just taken."""
+        sonar, first, count = self._sim.config.sensors.sonar, 0, self._sim.config.sensors.sonar.n_ray
+        if sonar.mechanical:
+            first, count = int(self._value("scan.new_from")), int(self._value("scan.new_count"))
+        beams = (first + np.arange(count)) % sonar.n_ray
+        range_m, hit, doppler = (
+            self._value(f"scan.{name}")[beams] for name in ("range_m", "hit", "doppler_m_s")
+        )
+        ping_s = int(self._value("scan.ping_step")) * self._dt
+        return SonarPing(ping_s, range_m, hit, doppler if sonar.doppler else doppler[:0], first)
+
     def _sensed(self, step: int) -> Iterator[SensorMessage]:
         now, value = step * self._dt, self._value
         yield ImuReading(now, value("ego.imu_rpy"), value("ego.rate_b"), value("ego.specific_force_b"))
@@ -63,10 +75,7 @@ class LiveFeed:
         if self._given:
             yield PositionFix(now, value("ego.pos_w"))
         if value("scan.fresh"):
-            beams = [value(f"scan.{name}") for name in ("range_m", "hit", "doppler_m_s")]
-            if not self._sim.config.sensors.sonar.doppler:
-                beams[2] = beams[2][:0]
-            yield SonarPing(int(value("scan.ping_step")) * self._dt, *beams)
+            yield self._ping()
         if value("image.fresh"):
             yield DepthShot(now, value("image.depth_m"))
 

@@ -196,7 +196,10 @@ class _FeedReader:
             raise LookupError("/sonar/doppler without its /sonar/scan")
         hit = np.array(self._scan["intensities"], np.float32) > 0
         ping_s = stamp["sec"] + stamp["nsec"] / 1e9
-        self._arrives(m, SonarPing(ping_s, _array(self._scan["ranges"]), hit, _array(m.data["velocity"])))
+        ranges, velocity = _array(self._scan["ranges"]), _array(m.data["velocity"])
+        sonar = self._config.sensors.sonar
+        first = round((self._scan["start_angle"] - sonar.first_beam_rad) / sonar.beam_step_rad)
+        self._arrives(m, SonarPing(ping_s, ranges, hit, velocity, first))
 
     def _shot(self, m: LogMessage) -> None:
         camera = self._config.sensors.depth

@@ -1,0 +1,148 @@
+"""A submarine made with pymavlink, for tests: it speaks by UDP, obeys modes and arming, and keeps what it was
+told. Beside it a ground station, and a pilot that wants what it is told to want."""
+
+import math
+import socket
+from types import SimpleNamespace
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mav
+
+from uuvtai.link.flight_plan import FlightPlan
+from uuvtai.link.safety import SafetyLimits
+from uuvtai.loader import load_config
+from uuvtai.pilot import KINDS, Mission, Tally
+
+START, GOAL = (2.0, 3.0, -0.8), (18.0, 3.0, -0.8)
+LIMITS = SafetyLimits(box_m=(0.0, 0.0, 20.0, 6.0), depth_m=(0.2, 1.4))
+
+
+def link_config(**changes):
+    """The pool seen by a fan without Doppler, its position estimated."""
+    given = {"sensors.localization": "estimated"} | changes
+    return load_config("pool", "multibeam", overrides=given)
+
+
+class WishfulPilot:
+    """Takes messages, and wants what ``velocity`` says."""
+
+    def __init__(self):
+        self.velocity, self.held, self.pos_w, self.fed = (0.3, 0.0, 0.0, 0.1), (), START, []
+        self.tallies = {name: Tally() for name in KINDS}
+
+    def feed(self, message):
+        self.fed.append(message)
+
+    def tick(self):
+        return SimpleNamespace(
+            velocity=np.array(self.velocity), held=self.held, leaf="FollowRoute", pos_w=np.array(self.pos_w)
+        )
+
+
+class FakeSub:
+    """Vehicle and ground station at one socket."""
+
+    def __init__(self, port, system=1, modes=(2, 4, 9), obeys=True):
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.bind(("127.0.0.1", 0))
+        self.socket.setblocking(False)
+        self.to = ("127.0.0.1", port)
+        self.system, self.modes, self.obeys = system, modes, obeys
+        self.mode, self.armed, self.time_s = 19, False, 0.0
+        self.told, self.raw = [], []
+        self.out = mav.MAVLink(None, srcSystem=system, srcComponent=1)
+        self.operator = mav.MAVLink(None, srcSystem=255, srcComponent=190)
+        self.parser = mav.MAVLink(None)
+        self.parser.robust_parsing = True
+        self.silent = set()
+        """what is not told: names of messages, or 'operator'"""
+        self.volts, self.tilt, self.north, self.depth = 15.5, 0.0, 0.0, 0.8
+
+    def send(self, message, link=None):
+        self.socket.sendto(message.pack(link or self.out), self.to)
+        (link or self.out).seq = ((link or self.out).seq + 1) % 256
+
+    def speak(self, dt=0.02):
+        """One step of everything that it tells."""
+        self.time_s += dt
+        boot, micro = round(1e3 * self.time_s), round(1e6 * self.time_s)
+        heartbeat = mav.MAVLink_heartbeat_message
+        armed = 128 if self.armed else 0
+        far = [3000] * 72
+        told = {
+            "HEARTBEAT": heartbeat(12, 3, 1 | armed, self.mode, 4, 3),
+            "ATTITUDE": mav.MAVLink_attitude_message(boot, self.tilt, 0.0, 0.0, 0.0, 0.0, 0.0),
+            "RAW_IMU": mav.MAVLink_raw_imu_message(micro, 0, 0, -1000, 0, 0, 0, 0, 0, 0),
+            "VISION_POSITION_DELTA": mav.MAVLink_vision_position_delta_message(
+                micro, 20000, [0.0] * 3, [0.006, 0.0, 0.0], 100.0
+            ),
+            "SCALED_PRESSURE2": mav.MAVLink_scaled_pressure2_message(
+                boot, 1013.25 + self.depth * 997 * 9.81 / 100, 0.0, 2000
+            ),
+            "OBSTACLE_DISTANCE": mav.MAVLink_obstacle_distance_message(
+                micro, 3, far, 5, 20, 2999, 130 / 72, -65 + 65 / 72, 12
+            ),
+            "SYS_STATUS": mav.MAVLink_sys_status_message(
+                0, 0, 0, 100, round(1e3 * self.volts), 500, 80, 0, 0, 0, 0, 0, 0
+            ),
+        }
+        for name, message in told.items():
+            if name not in self.silent:
+                self.send(message)
+        if "operator" not in self.silent:
+            self.send(heartbeat(6, 8, 0, 0, 4, 3), self.operator)
+
+    def listen(self):
+        """Take in what was said and obey."""
+        while True:
+            try:
+                data = self.socket.recv(4096)
+            except BlockingIOError:
+                return
+            self.raw.append(data)
+            for message in self.parser.parse_buffer(data) or []:
+                self.told.append(message)
+                if message.get_type() == "COMMAND_LONG" and message.command == 176:
+                    if int(message.param2) in self.modes:
+                        self.mode = int(message.param2)
+                elif message.get_type() == "COMMAND_LONG" and message.command == 400 and self.obeys:
+                    self.armed = message.param1 == 1
+
+    def kinds(self):
+        """Names of what it was told, those of commands with their number."""
+        return [
+            message.get_type() + (f" {message.command}" if message.get_type() == "COMMAND_LONG" else "")
+            for message in self.told
+        ]
+
+    def moved_by(self):
+        """What it was told that moves it, arms it or changes its mode."""
+        still = {"HEARTBEAT", "COMMAND_LONG 511"}
+        return [kind for kind in self.kinds() if kind not in still]
+
+    def close(self):
+        self.socket.close()
+
+
+def assert_within(told, limits=LIMITS):
+    """Whatever a vehicle was told keeps to the limits and to the kinds of orders that there are."""
+    for message in told:
+        kind = message.get_type()
+        if kind == "SET_POSITION_TARGET_LOCAL_NED":
+            assert (message.coordinate_frame, message.type_mask) == (8, 0x5C7)
+            assert math.hypot(message.vx, message.vy) <= limits.speed_m_s + 1e-6
+            assert abs(message.vz) <= limits.heave_m_s + 1e-6
+            assert abs(message.yaw_rate) <= limits.yaw_rate_rad_s + 1e-6
+        elif kind == "MANUAL_CONTROL":
+            assert max(abs(message.x), abs(message.y), abs(message.r), abs(2 * message.z - 1000)) <= 600
+            assert message.buttons == 0
+        elif kind == "COMMAND_LONG":
+            assert message.command in (176, 400, 511)
+            assert message.command != 400 or (message.param1, message.param2) == (1.0, 0.0), "never by force"
+            assert message.command != 176 or message.param2 in (2.0, 4.0, 9.0)
+        else:
+            assert kind == "HEARTBEAT"
+
+
+def plan_of(place, log, arms=True, limits=LIMITS):
+    return FlightPlan(place, Mission(START, GOAL), limits, log, arms)

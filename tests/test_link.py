@@ -1,0 +1,663 @@
+"""The stack on a vehicle that speaks MAVLink: the bytes, the meaning of what comes, every failsafe against a
+vehicle made with pymavlink, and strangers who send anything."""
+
+import dataclasses
+import json
+import math
+import re
+import socket
+import struct
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mav
+
+from tests.command import uuv
+from tests.mavlink_vehicle import (
+    GOAL,
+    LIMITS,
+    START,
+    FakeSub,
+    WishfulPilot,
+    assert_within,
+    link_config,
+    plan_of,
+)
+from uuvtai.link import dialect, onboard_loop, orders
+from uuvtai.link.dialect import MavCodec
+from uuvtai.link.endpoint import LONGEST, Endpoint, LinkPlace, place_of
+from uuvtai.link.intake import Intake
+from uuvtai.link.link_errors import LinkError
+from uuvtai.link.link_log import LinkLog
+from uuvtai.link.onboard_loop import OnboardLoop
+from uuvtai.link.sectors import ping_of, sectors_of
+from uuvtai.link.source_clock import SourceClock
+from uuvtai.logs.reader import read_messages
+from uuvtai.pilot import DvlReading, ImuReading, PositionFix, PressureReading, SonarPing
+
+DT = 0.02
+CONFIG = link_config()
+
+
+class Flight:
+    """A vehicle, a pilot and the loop between them, step by step, without a clock."""
+
+    def __init__(self, folder, arms=True, config=CONFIG, **vehicle):
+        self.endpoint = Endpoint(LinkPlace("127.0.0.1", 0, False))
+        self.sub = FakeSub(self.endpoint.port, **vehicle)
+        self.pilot, self.now_s = WishfulPilot(), 0.0
+        self.log = LinkLog(folder / "flight.mcap", {})
+        plan = plan_of(self.endpoint.place, self.log.path, arms)
+        self.loop = OnboardLoop(config, self.pilot, plan, self.endpoint, self.log)
+
+    def run(self, seconds, before=lambda step: None, farewell=""):
+        for step in range(round(seconds / DT)):
+            before(step)
+            self.sub.speak()
+            self.now_s += DT
+            self.loop.step(self.now_s, farewell=farewell)
+            self.sub.listen()
+        return self.loop.last
+
+    def close(self):
+        self.log.close()
+        self.endpoint.close()
+        self.sub.close()
+
+
+@pytest.fixture
+def flight(tmp_path):
+    made = []
+
+    def make(**given):
+        made.append(Flight(tmp_path, **given))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+
+
+# ------------------------------------------------------------------------------------------------------ bytes
+
+
+def test_golden_bytes():
+    """Packed by hand here, by MAVLink's own description: header, payload in order of size, checksum X.25."""
+    order = orders.set_velocity((0.3, -0.1, 0.05, 0.25), 1.5, 1, LIMITS)
+    payload = struct.pack(
+        "<I11fHBBB", 1500, 0, 0, 0, 0.3, 0.1, -0.05, 0, 0, 0, 0, -0.25, 0x5C7, 1, 1, 8
+    )  # fmt: skip
+    assert MavCodec(1, 191).encode(order) == framed(payload, 84, 143, 1, 191)
+    stick = orders.push_sticks((0.25, 0.1, 0.06, -0.4), None, 1, LIMITS)
+    payload = struct.pack("<4hHB", 150, -60, 530, 120, 0, 1)
+    assert MavCodec(1, 191).encode(stick) == framed(payload, 69, 243, 255, 191)
+    payload = struct.pack("<7fHBBB", 1, 4, 0, 0, 0, 0, 0, 176, 1, 1, 0)
+    assert MavCodec(1, 191).encode(orders.set_mode(4, 1)) == framed(payload, 76, 152, 1, 191)
+    payload = struct.pack("<7fHBBB", 1, 0, 0, 0, 0, 0, 0, 400, 1, 1, 0)
+    assert MavCodec(1, 191).encode(orders.arm(1)) == framed(payload, 76, 152, 1, 191)
+
+
+def framed(payload, number, extra, system, component):
+    """A packet of MAVLink 2: trailing zeros of the payload are left out."""
+    payload = payload.rstrip(b"\0") or payload[:1]
+    head = struct.pack("<BBBBBBB", len(payload), 0, 0, 0, system, component, number) + bytes(2)
+    crc = 0xFFFF
+    for byte in head + payload + bytes([extra]):
+        mixed = byte ^ (crc & 0xFF)
+        mixed = (mixed ^ (mixed << 4)) & 0xFF
+        crc = (crc >> 8) ^ (mixed << 8) ^ (mixed << 3) ^ (mixed >> 4)
+    return b"\xfd" + head + payload + struct.pack("<H", crc & 0xFFFF)
+
+
+def test_what_is_asked_for_is_what_a_client_reads():
+    message = mav.MAVLink(None).parse_buffer(
+        MavCodec(1, 191).encode(orders.set_velocity((9.0, 0.0, 9.0, -9.0), 0.0, 1, LIMITS))
+    )[0]
+    assert (message.vx, message.vy, message.get_srcComponent()) == (0.5, 0.0, 191)
+    assert (message.vz, message.yaw_rate) == (pytest.approx(-0.3), pytest.approx(0.8))
+    assert_within([message])
+
+
+def test_sticks_push_harder_where_the_vehicle_lags():
+    asked = (0.3, 0.0, 0.0, 0.0)
+    alone = orders.push_sticks(asked, None, 1, LIMITS).fields["x"]
+    slow = orders.push_sticks(asked, (0.1, 0.0, 0.0, 0.0), 1, LIMITS).fields["x"]
+    fast = orders.push_sticks(asked, (0.9, 0.0, 0.0, 0.0), 1, LIMITS).fields["x"]
+    assert alone == 180 and slow == 360 and fast < 0
+    assert orders.push_sticks(asked, (math.nan,) * 4, 1, LIMITS).fields["x"] == alone
+    assert orders.push_sticks(asked, (-1e9,) * 4, 1, LIMITS).fields["x"] == orders.STICK
+
+
+# ---------------------------------------------------------------------------------------------------- meaning
+
+
+def taken(intake, name, come_s=0.0, system=1, component=1, **fields):
+    return intake.take(name, system, component, fields, come_s)
+
+
+def attitude(intake, yaw=0.0, come_s=0.0, **fields):
+    given = {"roll": 0.1, "pitch": 0.2, "yaw": yaw, "rollspeed": 0.01, "pitchspeed": 0.02, "yawspeed": 0.03}
+    return taken(intake, "ATTITUDE", come_s, time_boot_ms=round(1e3 * come_s), **(given | fields))
+
+
+def test_axes_of_the_attitude():
+    """A bow up and a turn to starboard are positive there, a bow down and a turn to port here."""
+    intake = Intake(CONFIG, START, math.radians(30))
+    (imu,) = attitude(intake, yaw=math.radians(50))
+    assert isinstance(imu, ImuReading)
+    assert imu.rpy == pytest.approx([0.1, -0.2, math.radians(-20)])
+    assert imu.rate_b == pytest.approx([0.01, -0.02, -0.03])
+    gravity = CONFIG.vehicle.gravity_m_s2
+    assert np.linalg.norm(imu.specific_force_b) == pytest.approx(gravity) and imu.specific_force_b[0] > 0
+    taken(intake, "RAW_IMU", time_usec=0, xacc=100, yacc=200, zacc=-1000)
+    (imu,) = attitude(intake)
+    assert imu.specific_force_b == pytest.approx([0.980665, -1.96133, 9.80665])
+
+
+def test_the_first_look_is_along_the_worlds_x_axis():
+    intake = Intake(CONFIG, START, None)
+    assert attitude(intake, yaw=2.0)[0].rpy[2] == 0
+    assert attitude(intake, yaw=2.5)[0].rpy[2] == pytest.approx(-0.5)
+
+
+def test_axes_of_velocity_depth_and_position():
+    intake = Intake(link_config(**{"sensors.localization": "truth"}), START, math.radians(90))
+    attitude(intake, yaw=math.radians(90))
+    delta = {"time_delta_usec": 100000, "angle_delta": [0.0] * 3, "confidence": 90.0, "time_usec": 0}
+    (dvl,) = taken(intake, "VISION_POSITION_DELTA", position_delta=[0.03, 0.01, -0.02], **delta)
+    assert isinstance(dvl, DvlReading) and dvl.vel_b == pytest.approx([0.3, -0.1, 0.2])
+    place = {"vx": 0.0, "vy": 0.5, "vz": 0.1}
+    (first,) = taken(intake, "LOCAL_POSITION_NED", x=5.0, y=7.0, z=1.0, time_boot_ms=0, **place)
+    assert first.pos_w == pytest.approx(START)
+    found = taken(intake, "LOCAL_POSITION_NED", 2.0, x=5.0, y=8.0, z=1.5, time_boot_ms=2000, **place)
+    assert isinstance(found[0], PositionFix)
+    assert found[0].pos_w == pytest.approx([3.0, 3.0, -1.3]), "east is ahead, down is down"
+    assert found[1].vel_b == pytest.approx([0.5, 0.0, -0.1]), "no DVL for two seconds"
+
+
+def test_depth_is_zeroed_at_the_start_and_the_sensor_in_the_water_counts():
+    intake = Intake(CONFIG, START, 0.0)
+    hpa = CONFIG.vehicle.water_density_kg_m3 * CONFIG.vehicle.gravity_m_s2 / 100
+    rest = {"press_diff": 0.0, "temperature": 20, "time_boot_ms": 0}
+    assert taken(intake, "SCALED_PRESSURE", press_abs=1000.0, **rest)[0].depth_m == pytest.approx(0.8)
+    (first,) = taken(intake, "SCALED_PRESSURE2", press_abs=1100.0, **rest)
+    (deeper,) = taken(intake, "SCALED_PRESSURE2", press_abs=1100.0 + hpa, **rest)
+    assert isinstance(first, PressureReading)
+    assert (first.depth_m, deeper.depth_m) == (pytest.approx(0.8), pytest.approx(1.8))
+    assert taken(intake, "SCALED_PRESSURE", press_abs=1000.0, **rest) == []
+
+
+def obstacles(intake, distances, **fields):
+    given = {
+        "time_usec": 0, "sensor_type": 3, "distances": distances, "increment": 5, "min_distance": 20,
+        "max_distance": 1200, "increment_f": 130 / 72, "angle_offset": -65 + 65 / 72, "frame": 12,
+    }  # fmt: skip
+    return taken(intake, "OBSTACLE_DISTANCE", **(given | fields))
+
+
+def test_sectors_become_beams_clockwise_to_counter_clockwise():
+    intake = Intake(CONFIG, START, 0.0)
+    distances = [1201] * 72
+    distances[0], distances[71] = 300, 700
+    (ping,) = obstacles(intake, distances)
+    assert isinstance(ping, SonarPing) and ping.doppler_m_s.size == 0
+    assert ping.hit[0] == ping.hit[-1] == 1 and ping.hit.sum() == 8
+    assert ping.range_m[0] == 7.0, "beam 0 of a fan is at its right edge"
+    assert ping.range_m[-1] == 3.0
+
+
+def test_there_and_back_keeps_the_nearest_return():
+    rng = np.random.default_rng(77001)
+    for config in (CONFIG, link_config(**{"sensors.sonar.horizontal_aperture_deg": 360.0})):
+        sonar = config.sensors.sonar
+        range_m, hit = rng.uniform(0.5, 12.0, sonar.n_ray), rng.integers(0, 2, sonar.n_ray)
+        distances, increment, offset = sectors_of(sonar, range_m, hit)
+        ping = ping_of(sonar, 0.0, np.array(distances), increment, offset, 1200)
+        assert isinstance(ping, SonarPing) and len(distances) == 72
+        seen = np.where(hit > 0, range_m, np.inf)
+        told = np.where(ping.hit > 0, ping.range_m, np.inf)
+        assert (told <= seen + 0.006).all(), "nothing that was seen is further away or gone"
+        assert set(np.round(told[np.isfinite(told)], 2)) <= set(np.round(seen[np.isfinite(seen)], 2))
+
+
+@pytest.mark.parametrize(
+    ("fields", "says"),
+    [
+        ({"max_distance": 500}, r"sees 5 m far, the config says 12: --set sensors.sonar.max_range_m=5"),
+        ({"increment_f": 1.0}, "beams lie in sectors that nobody looked into"),
+        ({"frame": 0}, "not relative to the bow"),
+        ({"increment_f": math.nan}, "not finite"),
+        ({"increment_f": 1e-9}, "make no sense"),
+        ({"angle_offset": math.inf}, "not finite"),
+    ],
+)
+def test_a_scan_that_would_lie_is_refused(fields, says):
+    intake = Intake(CONFIG, START, 0.0)
+    assert obstacles(intake, [300] * 72, **fields) == []
+    (reason,) = intake.heard.refused
+    assert re.search(says, reason)
+
+
+def test_a_sector_that_nobody_looked_into_is_no_free_water():
+    intake = Intake(CONFIG, START, 0.0)
+    assert obstacles(intake, [300] * 71 + [65535]) == []
+    assert obstacles(intake, [300] * 72) != []
+
+
+def test_rangefinders_around_the_hull_are_a_ring():
+    intake = Intake(CONFIG, START, 0.0)
+    ranger = {
+        "time_boot_ms": 0,
+        "min_distance": 20,
+        "max_distance": 1200,
+        "type": 1,
+        "id": 0,
+        "covariance": 0,
+    }
+    assert taken(intake, "DISTANCE_SENSOR", orientation=0, current_distance=500, **ranger) == []
+    for turn, distance in ((1, 300), (7, 1200), (25, 80)):
+        taken(intake, "DISTANCE_SENSOR", orientation=turn, current_distance=distance, **ranger)
+    (ping,) = taken(intake, "DISTANCE_SENSOR", orientation=0, current_distance=500, **ranger)
+    middle = len(ping.range_m) // 2
+    assert ping.range_m[middle] == 5.0 and ping.range_m[0] == 3.0 and ping.hit[-1] == 0
+    later = ranger | {"time_boot_ms": 9000}
+    assert taken(intake, "DISTANCE_SENSOR", 9.0, orientation=0, current_distance=500, **later) == []
+
+
+def test_who_is_heard():
+    intake = Intake(CONFIG, START, 0.0)
+    beat = {"type": 12, "autopilot": 3, "base_mode": 129, "custom_mode": 4}
+    taken(intake, "HEARTBEAT", 1.0, component=191, **beat)
+    taken(intake, "HEARTBEAT", 1.0, system=7, **beat)
+    taken(intake, "HEARTBEAT", 1.0, **(beat | {"type": 2}))
+    taken(intake, "HEARTBEAT", 1.0, system=255, component=190, **(beat | {"type": 18}))
+    assert intake.heard.vehicle_s == intake.heard.operator_s == -math.inf
+    taken(intake, "HEARTBEAT", 2.0, **beat)
+    taken(intake, "HEARTBEAT", 3.0, system=255, component=190, **(beat | {"type": 6}))
+    heard = intake.heard
+    assert (heard.vehicle_s, heard.operator_s, heard.mode, heard.is_armed) == (2.0, 3.0, 4, True)
+    assert attitude(intake) != [] and intake.take("ATTITUDE", 7, 1, {"yaw": 0.0}, 0.0) == []
+
+
+def test_old_data_is_known_to_be_old():
+    clock = SourceClock()
+    assert clock.measured_s(500.0, 10.0) == 10.0
+    assert clock.measured_s(501.0, 11.3) == pytest.approx(11.0, abs=1e-3), "0.3 s under way"
+    assert clock.measured_s(501.1, 12.1) == pytest.approx(11.1, abs=1e-3)
+    assert clock.measured_s(0.2, 13.0) == 13.0, "begun anew"
+    assert clock.measured_s(1000.0, 14.0) == 14.0, "a stranger from the future"
+    assert clock.measured_s(1.3, 14.1) == 14.1, "does not make what comes after him old"
+
+
+# -------------------------------------------------------------------------------------------------- failsafes
+
+
+def test_it_arms_takes_guided_and_drives(flight):
+    one = flight()
+    assert one.run(5).action.name == "DRIVE"
+    kinds = one.sub.moved_by()
+    assert kinds[:2] == ["COMMAND_LONG 400", "COMMAND_LONG 176"]
+    assert set(kinds[2:]) == {"SET_POSITION_TARGET_LOCAL_NED"} and 40 <= len(kinds[2:]) <= 50
+    last = one.sub.told[-1]
+    assert (last.vx, last.yaw_rate) == (pytest.approx(0.3), pytest.approx(-0.1))
+    assert_within(one.sub.told)
+    assert {type(message) for message in one.pilot.fed} == {
+        ImuReading,
+        DvlReading,
+        PressureReading,
+        SonarPing,
+    }
+    assert one.loop.document()["driven_in"] == "GUIDED"
+
+
+def test_a_dry_run_moves_nothing_and_logs_what_it_would_say(flight):
+    one = flight(arms=False)
+    assert one.run(5).action.name == "DRIVE"
+    assert one.sub.moved_by() == [] and one.sub.kinds(), "a heartbeat, and requests for messages"
+    one.run(6, lambda step: one.sub.silent.add("operator"))
+    one.sub.silent.clear()
+    one.run(1, farewell="interrupted")
+    assert one.sub.moved_by() == [] and (one.sub.mode, one.sub.armed) == (19, False)
+    one.log.close()
+    said = [message.data for message in read_messages(one.log.path, ("/mavlink/said",))]
+    wanted = [row for row in said if row["name"] == "SET_POSITION_TARGET_LOCAL_NED"]
+    assert wanted and not any(row["sent"] for row in wanted)
+    assert wanted[0]["fields"]["vx"] == pytest.approx(0.3)
+    assert any(row["fields"]["vx"] == 0 for row in wanted), "it would have held"
+    assert {row["kind"] for row in said} >= {"MAV_CMD_COMPONENT_ARM_DISARM", "MAV_CMD_DO_SET_MODE"}
+    names = {message.data["name"] for message in read_messages(one.log.path, ("/mavlink/seen",))}
+    assert "OBSTACLE_DISTANCE" in names
+
+
+def test_where_guided_is_refused_it_drives_by_sticks(flight):
+    one = flight(modes=(2, 9))
+    one.run(12)
+    assert one.loop.document()["fallback"] and one.sub.mode == 2
+    sticks = [message for message in one.sub.told if message.get_type() == "MANUAL_CONTROL"]
+    assert sticks and sticks[-1].x > 0 and sticks[-1].get_srcSystem() == 255
+    one.sub.silent.add("operator")
+    one.run(4)
+    last = one.sub.told[-1] if one.sub.told[-1].get_type() == "MANUAL_CONTROL" else one.sub.told[-2]
+    assert last.x < 0 and last.z == 500, "it brakes"
+    assert_within(one.sub.told)
+
+
+@pytest.mark.parametrize(("given", "mode"), [({"modes": (9,)}, 19), ({"obeys": False}, 19)])
+def test_a_vehicle_that_refuses_is_left_alone(flight, given, mode):
+    one = flight(**given)
+    decision = one.run(16)
+    assert decision.action.name == "HAND_BACK" and one.sub.mode == mode
+    before = len(one.sub.moved_by())
+    assert 5 <= before <= 11
+    one.run(5)
+    assert len(one.sub.moved_by()) == before and not one.loop.document()["driven_in"]
+
+
+FAILS = [
+    # what fails, seconds, action, mode at the end
+    (lambda one: one.sub.silent.add("operator"), 3, "HOLD", 4),
+    (lambda one: one.sub.silent.add("operator"), 36, "SURFACE", 9),
+    (lambda one: one.sub.silent.add("OBSTACLE_DISTANCE"), 2, "HOLD", 4),
+    (lambda one: one.sub.silent.add("OBSTACLE_DISTANCE"), 34, "SURFACE", 9),
+    (lambda one: one.sub.silent.add("ATTITUDE"), 1, "HOLD", 4),
+    (lambda one: one.sub.silent.add("ATTITUDE"), 8, "HAND_BACK", 2),
+    (lambda one: one.sub.silent.add("VISION_POSITION_DELTA"), 3, "HOLD", 4),
+    (lambda one: one.sub.silent.add("VISION_POSITION_DELTA"), 9, "HAND_BACK", 2),
+    (lambda one: one.sub.silent.add("SCALED_PRESSURE2"), 9, "HAND_BACK", 2),
+    (lambda one: setattr(one.sub, "volts", 12.5), 7, "SURFACE", 9),
+    (lambda one: setattr(one.sub, "tilt", 1.0), 1, "HOLD", 4),
+    (lambda one: setattr(one.sub, "tilt", 1.0), 5, "HAND_BACK", 2),
+    (lambda one: setattr(one.pilot, "pos_w", (10.0, 6.5, -0.8)), 1, "HOLD", 4),
+    (lambda one: setattr(one.pilot, "pos_w", (10.0, 6.5, -0.8)), 7, "HAND_BACK", 2),
+    (lambda one: setattr(one.pilot, "pos_w", (10.0, 3.0, -1.5)), 7, "HAND_BACK", 2),
+    (lambda one: setattr(one.pilot, "held", ("sonar: 2 s old",)), 2, "HOLD", 4),
+    (lambda one: setattr(one.pilot, "velocity", (math.nan,) * 4), 2, "HOLD", 4),
+    (lambda one: setattr(one.sub, "mode", 19), 1, "HAND_BACK", 19),
+    (lambda one: setattr(one.sub, "armed", False), 1, "HAND_BACK", 2),
+]
+
+
+@pytest.mark.parametrize(("fail", "seconds", "action", "mode"), FAILS)
+def test_every_failsafe_on_a_vehicle(flight, fail, seconds, action, mode):
+    one = flight()
+    assert one.run(4).action.name == "DRIVE" and one.sub.mode == 4
+    fail(one)
+    assert one.run(seconds).action.name == action
+    assert one.sub.mode == mode
+    speeds = [m for m in one.sub.told if m.get_type() == "SET_POSITION_TARGET_LOCAL_NED"]
+    if action == "HOLD":
+        assert (speeds[-1].vx, speeds[-1].vy, speeds[-1].vz, speeds[-1].yaw_rate) == (0, 0, 0, 0)
+    else:
+        before = len(one.sub.moved_by())
+        one.sub.silent.clear()
+        one.run(3)
+        assert len(one.sub.moved_by()) == before, "for good"
+    assert_within(one.sub.told)
+
+
+def test_a_silent_autopilot_is_left_alone(flight):
+    one = flight()
+    one.run(4)
+    one.sub.silent.add("HEARTBEAT")
+    assert one.run(4).action.name == "HAND_BACK"
+    assert "COMMAND_LONG 176" in one.sub.kinds()[-30:] or one.sub.mode == 2
+
+
+def test_messages_that_stand_still_are_old(flight):
+    """They come on time, but their time stamps do not: a relay that says the same again and again."""
+    one = flight()
+    one.run(4)
+    one.sub.silent.add("ATTITUDE")
+    same = mav.MAVLink_attitude_message(round(1e3 * one.sub.time_s), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    assert one.run(2, lambda step: one.sub.send(same)).action.name == "HOLD"
+
+
+def test_a_stall_of_this_computer_holds_for_a_step(flight):
+    one = flight()
+    one.run(4)
+    one.loop.step(one.now_s + 0.5, stalled_s=0.48)
+    assert one.loop.last.action.name == "HOLD"
+    one.now_s += 0.5
+    assert one.run(0.1).action.name == "DRIVE"
+
+
+def test_the_goal_ends_the_flight(flight):
+    one = flight()
+    one.run(4)
+    one.pilot.pos_w = (GOAL[0] - 0.5, GOAL[1], GOAL[2])
+    command = one.loop.step(one.now_s)
+    assert one.loop._farewell(one.now_s, command) == "goal reached"
+    one.run(3, farewell="goal reached")
+    document = one.loop.document()
+    assert one.sub.mode == 2 and document["reached"] and document["safe"]
+
+
+class Clock:
+    """Time passes only while somebody sleeps; the vehicle lives meanwhile."""
+
+    def __init__(self, one, interrupted_s=math.inf, stalled_s=math.inf):
+        self.one, self.now_s, self.interrupted_s, self.stalled_s = one, 1000.0, interrupted_s, stalled_s
+
+    def now(self):
+        return self.now_s
+
+    def sleep(self, seconds):
+        assert 0 < seconds <= DT + 1e-9
+        self.one.sub.listen()
+        self.one.sub.speak()
+        self.now_s += seconds
+        if self.now_s > 1000 + self.stalled_s:
+            self.now_s, self.stalled_s = self.now_s + 2.0, math.inf
+            self.one.sub.time_s += 2.0
+        if self.now_s > 1000 + self.interrupted_s:
+            self.interrupted_s = math.inf
+            raise KeyboardInterrupt
+
+
+def flown(one, clock, seconds=math.inf):
+    plan = dataclasses.replace(plan_of(one.endpoint.place, one.log.path), seconds=seconds)
+    loop = OnboardLoop(CONFIG, one.pilot, plan, one.endpoint, one.log, clock.now, clock.sleep)
+    loop.run()
+    one.sub.listen()
+    return loop.document()
+
+
+def test_it_keeps_the_clock_and_gives_the_vehicle_back_when_the_time_is_up(flight):
+    one = flight()
+    clock = Clock(one)
+    document = flown(one, clock, seconds=5.0)
+    assert document["ended"] == "time is up" and document["safe"] and not document["reached"]
+    assert 5.0 <= clock.now_s - 1000 < 5.2 and document["steps"] == pytest.approx(50 * 5, abs=12)
+    assert one.sub.mode == 2
+
+
+def test_an_interrupt_gives_the_vehicle_back(flight):
+    one = flight()
+    document = flown(one, Clock(one, interrupted_s=4.0))
+    assert document["ended"] == "interrupted" and one.sub.mode == 2 and document["safe"]
+
+
+def test_an_interrupt_before_it_drives_ends_at_once(flight):
+    one = flight()
+    one.sub.silent.add("operator")
+    document = flown(one, Clock(one, interrupted_s=1.0))
+    assert document["ended"] == "interrupted" and one.sub.moved_by() == []
+
+
+def test_a_stall_shifts_the_pilots_clock_and_ages_grow(flight):
+    one = flight()
+    document = flown(one, Clock(one, stalled_s=3.0), seconds=8.0)
+    assert document["reasons"]["computer late"] == 1
+    assert document["steps"] == pytest.approx(50 * 6, abs=12), "what was lost is not made up for"
+    newest = max(message.time_s for message in one.pilot.fed)
+    assert newest == pytest.approx(DT * document["steps"], abs=0.3), "the pilot's clock is that of its steps"
+
+
+# -------------------------------------------------------------------------------------------------- strangers
+
+
+def hostile(rng, count):
+    """Datagrams of a stranger: noise, packets cut and changed, impossible numbers, senders of every kind."""
+    names = [mav.MAVLINK_MSG_ID_ATTITUDE, 63, 32, 330, 132, 11011, 29, 137, 1, 0, 27, 84, 76, 69, 147, 253]
+    values = [0.0, -1.0, 1e38, -1e38, math.nan, math.inf, -math.inf, 1e-45, 3.0]
+    for _ in range(count):
+        number = int(rng.choice(names))
+        kind = mav.mavlink_map[number]
+        link = mav.MAVLink(
+            None, srcSystem=int(rng.choice([1, 255, 7, 0])), srcComponent=int(rng.integers(0, 256))
+        )
+        size = struct.calcsize(kind.unpacker.format) if hasattr(kind, "unpacker") else 20
+        payload = rng.bytes(size)
+        if rng.random() < 0.5:
+            payload = struct.pack("<f", rng.choice(values)) * (size // 4) + rng.bytes(size % 4)
+        packet = real_packet(payload, number, kind.crc_extra, link)
+        luck = rng.random()
+        if luck < 0.2:
+            packet = packet[: rng.integers(1, len(packet))]
+        elif luck < 0.4:
+            at = int(rng.integers(0, len(packet)))
+            packet = packet[:at] + rng.bytes(1) + packet[at + 1 :]
+        elif luck < 0.5:
+            packet = rng.bytes(int(rng.integers(0, LONGEST + 200)))
+        elif luck < 0.6:
+            packet = packet * int(rng.integers(2, 30))
+        yield packet
+
+
+def real_packet(payload, number, extra, link):
+    """With a checksum that holds, and numbers of messages beyond a byte."""
+    payload = payload.rstrip(b"\0") or payload[:1]
+    head = struct.pack("<BBBBBB", len(payload), 0, 0, 0, link.srcSystem, link.srcComponent)
+    head += struct.pack("<I", number)[:3]
+    return b"\xfd" + head + payload + struct.pack("<H", mav.x25crc(head + payload + bytes([extra])).crc)
+
+
+@pytest.mark.parametrize("arms", [True, False])
+def test_a_thousand_hostile_packets_send_nothing_outside_the_limits(flight, arms):
+    one = flight(arms=arms)
+    one.pilot.velocity = (5.0, -5.0, 5.0, 50.0)
+    one.run(4)
+    packets = list(hostile(np.random.default_rng(77001), 1000))
+    one.run(5, lambda step: [one.sub.socket.sendto(p, one.sub.to) for p in packets[4 * step : 4 * step + 4]])
+    document = one.loop.document()
+    assert sum(document["heard"].values()) > 1000 and document["broken"] > 100
+    assert_within(one.sub.told)
+    if not arms:
+        assert one.sub.moved_by() == []
+    assert all(
+        math.isfinite(value)
+        for message in one.pilot.fed
+        for field in vars(message).values()
+        for value in np.ravel(field)
+    )
+
+
+def test_a_flood_is_bounded_in_every_step(flight):
+    one = flight()
+    one.run(4)
+    junk = b"\xfe" * 2000
+    for _ in range(300):
+        one.sub.socket.sendto(junk, one.sub.to)
+    assert len(one.endpoint.receive()) <= 64
+    one.sub.socket.sendto(b"x" * 5000, one.sub.to)
+    assert all(len(data) <= LONGEST for _, data in one.endpoint.receive())
+
+
+def test_a_stranger_does_not_get_the_orders(flight):
+    """Orders go where the first heartbeat came from, while that one speaks."""
+    one = flight()
+    one.run(1)
+    stranger = FakeSub(one.endpoint.port)
+    one.run(3, lambda step: stranger.speak())
+    stranger.listen()
+    one.sub.listen()
+    assert stranger.told == [] and one.sub.told
+    stranger.close()
+
+
+# --------------------------------------------------------------------------------------------------- refusals
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["tcp:127.0.0.1:5760", "udp:127.0.0.1", "udp::14550", "udp:127.0.0.1:0", "udp:127.0.0.1:70000", "x"],
+)
+def test_places_that_are_none(text):
+    with pytest.raises(LinkError, match="udp:HOST:PORT"):
+        place_of(text)
+
+
+def test_a_port_that_is_taken_is_told():
+    with Endpoint(LinkPlace("127.0.0.1", 0, False)) as first, pytest.raises(LinkError, match="cannot listen"):
+        Endpoint(LinkPlace("127.0.0.1", first.port, False))
+
+
+BASE = ["pilot", "--mavlink", "udp:127.0.0.1:14550", "--start", "2,3,-0.8", "--goal", "18,3,-0.8"]
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--goal", "18,3,0.8"], "outside the fence"),
+        (["--start", "2,3"], "give 3 finite numbers"),
+        (["--sensors", "paper"], "--sensors multibeam"),
+        (["--max-speed", "9"], "--max-speed 9"),
+        (["--max-speed", "nan"], "--max-speed nan"),
+        (["--box", "5,5,1,1"], "--box"),
+        (["--depth", "2,1"], "--depth"),
+        (["--system", "255"], "--operator"),
+        (["--battery", "-1"], "--battery"),
+        (["--rate", "0"], "--rate"),
+        (["--seconds", "0"], "--seconds"),
+        (["--heading", "400"], "--heading"),
+        (["--mavlink", "serial:/dev/ttyS0"], "udp:HOST:PORT"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(capfd, words, says):
+    code, _out, err = uuv(capfd, *BASE, *words)
+    assert code == 2 and says in err
+
+
+def free_port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        return free.getsockname()[1]
+
+
+@pytest.mark.parametrize("words", [["--json"], []])
+def test_the_command_flies_and_tells(capfd, monkeypatch, tmp_path, words):
+    monkeypatch.setattr(onboard_loop, "warmed", lambda config, tree, mission: WishfulPilot())
+    place = [
+        "--mavlink",
+        f"udp:127.0.0.1:{free_port()}",
+        "--seconds",
+        "0.2",
+        "--log",
+        str(tmp_path / "a.mcap"),
+    ]
+    code, out, err = uuv(capfd, *BASE[:1], *BASE[3:], *place, *words)
+    assert code == 0 and "dry run: no order that moves the vehicle is sent" in err
+    if words:
+        found = json.loads(out)
+        assert found["dry_run"] and found["ended"] == "time is up" and found["said"] == {}
+    else:
+        assert "ended: time is up" in out and "dry run: nothing was sent" in out
+    assert (tmp_path / "a.mcap").exists()
+
+
+def test_a_log_that_cannot_be_written_any_more_does_not_stop_the_flight(flight, monkeypatch):
+    one = flight()
+    one.run(3)
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(one.log._file, "add_message", full)
+    assert one.run(3).action.name == "DRIVE"
+    assert "No space left" in one.loop.document()["log_trouble"]
+
+
+def test_without_pymavlink_it_says_what_to_install(monkeypatch):
+    monkeypatch.setattr(dialect, "_NEEDED", "pymavlink_is_not_here.dialects")
+    with pytest.raises(LinkError, match=r"pip install 'uuvtai\[mavlink\]'"):
+        MavCodec(1, 191)

@@ -1,0 +1,236 @@
+"""The intensity image of a multibeam sonar, for logs: what its beams would hear of the true scene. Plain
+NumPy; nothing decides by it.
+
+Every beam hears all that lies in its pattern. Across, that is a sinc of ``BEAM_DEG`` (a line array without
+shading: first side lobe 13 dB below the main one); upwards and downwards a sinc 3 dB down at the vertical
+half aperture, so that whatever lies at one range and bearing folds into one place, floor and surface
+included. A surface sends back Lambert's share of what meets it: power per solid angle cos(incidence) /
+range^2 (two-way spreading, range^-4, over an area that grows with range^2), less the absorption of fresh
+water. Scatterers are many per cell and their phases random, so amplitudes are Rayleigh distributed (speckle);
+neighbouring beams share scatterers as far as their patterns overlap.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from uuvtai.closed_form import body_positions
+from uuvtai.config import SonarConfig
+
+BEAM_DEG = 1.0
+"""half-power width of a beam across (Oculus M750d at 750 kHz)"""
+FREQUENCY_HZ = 750e3
+ABSORPTION_NP_M = 25e-15 * FREQUENCY_HZ**2
+"""of the amplitude; classical absorption of pure water"""
+NOISE_DB = -40.0
+"""noise below the return of a wall that fills the beam at maximum range (EC)"""
+SHOWN_DB = 50.0
+"""of the picture, from black to white"""
+_PAD_DEG = 15.0
+"""A fan hears so far beyond its edge by its side lobes."""
+_STEEPEST_DEG, _STEP_DEG = 45.0, 0.75
+_HALF_POWER = 0.4429
+"""sinc(x)^2 = 1/2"""
+_WALL, _FLOOR, _SURFACE = -1, -2, -3
+
+
+class Seen:
+    """What rays meet: range [m], cosine of incidence, and which surface (a body's number, or below 0)."""
+
+    def __init__(self, n: int) -> None:
+        self.range_m, self.cosine, self.surface = np.full(n, np.inf), np.zeros(n), np.full(n, -9)
+
+    def nearer(self, range_m: np.ndarray, cosine: np.ndarray, surface: int | np.ndarray) -> None:
+        """Take in another surface; where it is not met its range is infinite."""
+        closer = range_m < self.range_m
+        self.range_m = np.where(closer, range_m, self.range_m)
+        self.cosine = np.where(closer, np.abs(cosine), self.cosine)
+        self.surface = np.where(closer, surface, self.surface)
+
+
+def cast_rays(scenario: dict[str, Any], time_s: float, start: np.ndarray, unit: np.ndarray) -> Seen:
+    """What rays (n, 3) from a place (3,) [m] within the tank meet at a time: bodies, side walls, floor and
+    surface of ``scenario.json``."""
+    seen = Seen(len(unit))
+    _meet_tank(seen, scenario["tank"], start, unit)
+    for number, body in enumerate(scenario["bodies"]):
+        centre = body_positions(body, np.array([time_s]))[0]
+        size, yaw = np.array(body["size"], float), float(body["yaw"])
+        if body["kind"] == "sphere":
+            _meet_sphere(seen, number, start - centre, unit, size[0])
+        else:
+            _meet_prism(seen, number, start - centre, unit, size, yaw, body["kind"] == "box")
+    return seen
+
+
+def _meet_tank(seen: Seen, tank: dict[str, Any], start: np.ndarray, unit: np.ndarray) -> None:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for axis, name, surfaces in (
+            (2, "z_m", (_FLOOR, _SURFACE)),
+            (0, "x_m", (_WALL,) * 2),
+            (1, "y_m", (_WALL,) * 2),
+        ):
+            if axis < 2 and tank["shape"] == "circle":
+                continue
+            low, high = tank[name]
+            u = unit[:, axis]
+            away = np.where(u > 0, high - start[axis], low - start[axis]) / u
+            seen.nearer(np.where(u == 0, np.inf, away), u, np.where(u > 0, surfaces[1], surfaces[0]))
+    if tank["shape"] == "circle":
+        off = start[:2] - [0.5 * sum(tank["x_m"]), 0.5 * sum(tank["y_m"])]
+        enter_leave = _quadratic(off, unit[:, :2], float(tank["radius_m"]))
+        point = off + enter_leave[1][:, None] * unit[:, :2]
+        seen.nearer(enter_leave[1], (point * unit[:, :2]).sum(1) / tank["radius_m"], _WALL)
+
+
+def _quadratic(off: np.ndarray, unit: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """Where rays enter and leave a circle or sphere about the origin; infinite where they do not meet it."""
+    a, b = (unit**2).sum(1), unit @ off
+    with np.errstate(divide="ignore", invalid="ignore"):
+        room = b * b - a * (off @ off - radius**2)
+        root = np.sqrt(np.where(room < 0, np.nan, room))
+        enter, leave = (-b - root) / a, (-b + root) / a
+    return np.where(np.isnan(enter), np.inf, enter), np.where(np.isnan(leave), np.inf, leave)
+
+
+def _meet_sphere(seen: Seen, number: int, off: np.ndarray, unit: np.ndarray, radius: float) -> None:
+    enter, _ = _quadratic(off, unit, radius)
+    met = np.where(enter > 0, enter, np.inf)
+    with np.errstate(invalid="ignore"):
+        cosine = ((off + met[:, None] * unit) * unit).sum(1) / radius
+    seen.nearer(met, np.nan_to_num(cosine), number)
+
+
+def _meet_prism(
+    seen: Seen, number: int, off: np.ndarray, unit: np.ndarray, size: np.ndarray, yaw: float, is_box: bool
+) -> None:
+    """An upright box or cylinder: the later of the entries into its outline and into its height."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    start, ray = turn @ off, unit @ turn.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        one, other = (-size - start) / ray, (size - start) / ray
+    enters, leaves = np.fmin(one, other), np.fmax(one, other)
+    cosines = np.abs(ray)
+    if not is_box:
+        enters[:, 0], leaves[:, 0] = _quadratic(start[:2], ray[:, :2], size[0])
+        level = start[:2] + np.where(np.isfinite(enters[:, :1]), enters[:, :1], 0.0) * ray[:, :2]
+        cosines[:, 0] = np.abs((level * ray[:, :2]).sum(1)) / size[0]
+        leaves[:, 0] = np.where(np.isinf(enters[:, 0]), -np.inf, leaves[:, 0])
+        enters[:, 1], leaves[:, 1] = -np.inf, np.inf
+    last = enters.argmax(1)
+    enter = enters.max(1)
+    met = (enter <= leaves.min(1)) & (enter > 0)
+    seen.nearer(np.where(met, enter, np.inf), cosines[np.arange(len(ray)), last], number)
+
+
+# ------------------------------------------------------------------------------------------------------ image
+
+
+def echo_power(
+    scenario: dict[str, Any], time_s: float, start: np.ndarray, yaw: float, sonar_cfg: SonarConfig, n_bin: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """(bearings (m,) [rad] from ahead, power (m, n_bin)): mean power that comes back from each bearing and
+    range, elevations folded; no pattern across yet. Bins part ``max_range_m`` equally."""
+    aperture = sonar_cfg.horizontal_aperture_deg
+    span = 360.0 if sonar_cfg.is_ring else min(aperture + 2.0 * _PAD_DEG, 360.0)
+    n = math.ceil(math.radians(span) / sonar_cfg.beam_step_rad)
+    bearing = math.radians(span) * ((np.arange(n) + 0.5) / n - 0.5)
+    edges = np.radians(np.arange(-_STEEPEST_DEG, _STEEPEST_DEG + 1e-9, _STEP_DEG))
+    az, el = (grid.ravel() for grid in np.meshgrid(bearing + yaw, edges, indexing="ij"))
+    unit = np.column_stack([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)])
+    seen = cast_rays(scenario, time_s, np.asarray(start, float), unit)
+    solid = math.radians(span) / n * math.radians(_STEP_DEG) * np.cos(el)
+    lost = np.exp(-4.0 * ABSORPTION_NP_M * seen.range_m)  # amplitude, there and back, squared
+    lost /= np.maximum(seen.range_m, 0.1) ** 2
+    power = elevation_pattern(el, sonar_cfg) ** 2 * seen.cosine * solid * lost
+    bins = np.minimum(seen.range_m / sonar_cfg.max_range_m * n_bin, n_bin).astype(int)
+    shape = (n, len(edges))
+    return bearing, _folded(bins.reshape(shape), seen.surface.reshape(shape), power.reshape(shape), n_bin)
+
+
+def elevation_pattern(elevation_rad: np.ndarray, sonar_cfg: SonarConfig) -> np.ndarray:
+    """Amplitude of a beam above and below its plane."""
+    half = math.radians(max(sonar_cfg.vertical_half_aperture_deg, 0.1))
+    return np.sinc(_HALF_POWER * np.sin(elevation_rad) / math.sin(half))
+
+
+def beam_pattern(off_rad: np.ndarray) -> np.ndarray:
+    """Amplitude of a beam across, ``off_rad`` from its middle."""
+    half = math.radians(0.5 * BEAM_DEG)
+    front = np.abs(np.angle(np.exp(1j * off_rad))) < 0.5 * math.pi
+    return np.where(front, np.sinc(_HALF_POWER * np.sin(off_rad) / math.sin(half)), 0.0)
+
+
+def _folded(bins: np.ndarray, surface: np.ndarray, power: np.ndarray, n_bin: int) -> np.ndarray:
+    """Power (n, n_bin) of rays (n, elevations): what two neighbouring rays meet of one surface lies evenly
+    between their ranges. ``bins``: of each ray, ``n_bin`` = beyond the last."""
+    half = 0.25 * (power[:, 1:] + power[:, :-1])
+    one, other = bins[:, :-1], bins[:, 1:]
+    same = surface[:, 1:] == surface[:, :-1]
+    spread_out = np.zeros((len(bins), n_bin + 2))
+    row = np.broadcast_to(np.arange(len(bins))[:, None], one.shape)
+    for low, high in (
+        (np.where(same, np.minimum(one, other), one), np.where(same, np.maximum(one, other), one)),
+        (np.where(same, np.minimum(one, other), other), np.where(same, np.maximum(one, other), other)),
+    ):
+        each = half / (high - low + 1)
+        np.add.at(spread_out, (row, low), each)
+        np.add.at(spread_out, (row, high + 1), -each)
+    return np.maximum(np.cumsum(spread_out, 1)[:, :n_bin], 0.0)
+
+
+def heard_image(
+    bearing: np.ndarray, power: np.ndarray, sonar_cfg: SonarConfig, random: np.random.Generator
+) -> np.ndarray:
+    """(n_ray, n_bin) power that the beams hear in one ping: patterns, speckle, noise."""
+    beams = sonar_cfg.first_beam_rad + sonar_cfg.beam_step_rad * np.arange(sonar_cfg.n_ray)
+    pattern = beam_pattern(beams[:, None] - bearing[None])
+    phases = random.normal(size=(2, *power.shape))
+    field = pattern @ (np.sqrt(0.5 * power) * (phases[0] + 1j * phases[1]))
+    noise = random.normal(size=(2, *field.shape)) * math.sqrt(0.5 * noise_power(bearing, sonar_cfg))
+    return np.abs(field + noise[0] + 1j * noise[1]) ** 2
+
+
+def noise_power(bearing: np.ndarray, sonar_cfg: SonarConfig) -> float:
+    """Mean power of the noise in a cell."""
+    far = math.exp(-4.0 * ABSORPTION_NP_M * sonar_cfg.max_range_m) / sonar_cfg.max_range_m**2
+    return filled_beam(bearing, sonar_cfg) * far * 10.0 ** (0.1 * NOISE_DB)
+
+
+def filled_beam(bearing: np.ndarray, sonar_cfg: SonarConfig) -> float:
+    """[sr] of a beam: what a wall across it returns from 1 m, unabsorbed."""
+    elevation = np.radians(np.arange(-_STEEPEST_DEG, _STEEPEST_DEG, _STEP_DEG))
+    upright = (elevation_pattern(elevation, sonar_cfg) ** 2 * np.cos(elevation)).sum()
+    upright *= math.radians(_STEP_DEG)
+    return float(upright * (beam_pattern(bearing) ** 2).sum() * (bearing[1] - bearing[0]))
+
+
+def shown_image(heard: np.ndarray, bearing: np.ndarray, sonar_cfg: SonarConfig) -> np.ndarray:
+    """(n_bin, n_ray) uint8, range upwards from the last row, left is left: gain follows range and absorption,
+    ``SHOWN_DB`` from black to white."""
+    range_m = sonar_cfg.max_range_m * (np.arange(heard.shape[1]) + 0.5) / heard.shape[1]
+    gain = range_m**2 * np.exp(4.0 * ABSORPTION_NP_M * range_m) / filled_beam(bearing, sonar_cfg)
+    level = 10.0 * np.log10(np.maximum(heard * gain, 1e-12))
+    grey = np.clip(255.0 * (level / SHOWN_DB + 1.0), 0, 255).astype(np.uint8)
+    return grey.T[::-1, ::-1].copy()
+
+
+def polar_picture(shown: np.ndarray, bearing: np.ndarray, height_px: int, paper: int) -> np.ndarray:
+    """(height, width) uint8: ``shown_image`` as a fan seen from above, the vehicle at its lower tip (a ring:
+    in the middle), ``paper`` where no beam looks; ``bearing`` (n_ray,) [rad] of the beams from ahead."""
+    n_bin, n_ray = shown.shape
+    step = float(bearing[1] - bearing[0])
+    half = min(0.5 * n_ray * step, math.pi)
+    wide = 1.0 if half > 0.5 * math.pi else math.sin(half)
+    scale = (height_px - 1) / (1.0 - min(math.cos(half), 0.0))
+    up = 1.0 - np.arange(height_px)[:, None] / scale
+    right = (np.arange(2 * int(wide * scale) + 1) - int(wide * scale))[None, :] / scale
+    far, away = np.hypot(up, right), np.arctan2(-right, up)
+    row = n_bin - 1 - np.minimum((far * n_bin).astype(int), n_bin - 1)
+    beam = np.rint((away - bearing[0]) / step).astype(int) % round(2 * math.pi / step)
+    inside = (far <= 1.0) & (np.abs(away) <= half) & (beam < n_ray)
+    return np.where(inside, shown[row, n_ray - 1 - np.minimum(beam, n_ray - 1)], paper).astype(np.uint8)

@@ -1,0 +1,1 @@
+"""Our water for ArduSub: the simulator behind its JSON interface, in lockstep (docs/sitl.md)."""

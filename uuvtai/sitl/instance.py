@@ -1,0 +1,117 @@
+"""One ArduSub's water: a packet in, an answer out, and what the sensors say meanwhile. No sockets here."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any, Protocol
+
+import numpy as np
+
+from uuvtai.config import Config
+from uuvtai.link.orders import Order
+from uuvtai.sitl.fdm_reply import Motion, reply_of
+from uuvtai.sitl.reported_sensors import ReportedSensors
+from uuvtai.sitl.servo_frames import frame_of, turn_of
+
+
+class Water(Protocol):
+    """What an instance needs of ``WaterRows``."""
+
+    def begin(self, row: int) -> None:
+        """The row's episode from its beginning."""
+        ...
+
+    def push(self, row: int, pwm: tuple[int, ...], dt_s: float) -> None:
+        """Move the vehicle by one step."""
+        ...
+
+    def control_step(self, row: int) -> str:
+        """The world by a control step; how the episode ended, '' = not yet."""
+        ...
+
+    def sense(self, row: int) -> None:
+        """Instruments and sonar."""
+        ...
+
+    def motion(self, row: int, time_s: float) -> Motion:
+        """What the vehicle really does."""
+        ...
+
+    def value(self, name: str, row: int) -> np.ndarray:
+        """Copy of 'struct.field'."""
+        ...
+
+    def turns(self, pwm: tuple[int, ...]) -> bool:
+        """Whether any thruster is asked to turn."""
+        ...
+
+
+class Instance:
+    """Until a thruster turns for the first time the vehicle is held at its start and the bodies stand still:
+    an autopilot needs half a minute to get ready, and an episode begins when it is driven."""
+
+    def __init__(self, config: Config, water: Water, row: int) -> None:
+        self._config, self._water, self._row = config, water, row
+        self._dt = config.episode.control_dt_s
+        self._count: int | None = None
+        self._answered_s, self._answer = 0.0, b""
+        self._forget()
+        self.counts: Counter[str] = Counter()
+        """by turn, and 'bad' packets"""
+        self.time_s = 0.0
+        """since the episode's or ArduSub's beginning"""
+        self.outcome = ""
+
+    def _forget(self) -> None:
+        self.time_s = self.driven_s = 0.0
+        self.is_held, self._ticks, self.outcome = True, 0, ""
+        self._sensors = ReportedSensors(self._config)
+
+    def answer(self, packet: bytes, now_s: float) -> tuple[bytes, list[Order]]:
+        """(what to send back, empty = nothing; what the sensors say) to a packet that came at ``now_s``."""
+        frame = frame_of(packet)
+        if frame is None:
+            self.counts["bad"] += 1
+            return b"", []
+        turn = turn_of(frame.count, self._count, now_s - self._answered_s)
+        self.counts[turn] += 1
+        if turn == "ignore":
+            return b"", []
+        said: list[Order] = []
+        if turn == "reset":
+            self._water.begin(self._row)
+            self._forget()
+        if turn != "again":
+            said = self._step(frame.pwm, 1.0 / frame.rate_hz)
+            self._answer = reply_of(self._water.motion(self._row, self.time_s))
+        self._count, self._answered_s = frame.count, now_s
+        return self._answer, said
+
+    def _step(self, pwm: tuple[int, ...], dt_s: float) -> list[Order]:
+        self.is_held = self.is_held and not self._water.turns(pwm)
+        if not self.is_held:
+            self._water.push(self._row, pwm, dt_s)
+            self.driven_s += dt_s
+        self.time_s += dt_s
+        said: list[Order] = []
+        while self._ticks * self._dt <= self.time_s + 1e-6:  # sums of steps miss a little
+            self._ticks += 1
+            if not self.is_held:
+                ended = self._water.control_step(self._row)
+                self.outcome = self.outcome or ended
+            self._water.sense(self._row)
+            altitude = self._water.motion(self._row, self.time_s).altitude_m
+            said += self._sensors.report(
+                self.time_s, altitude, lambda name: self._water.value(name, self._row)
+            )
+        return said
+
+    def document(self) -> dict[str, Any]:
+        """Its line in ``uuv sitl --json``."""
+        return {
+            "row": self._row,
+            "seconds": round(self.time_s, 3),
+            "driven_s": round(self.driven_s, 3),
+            "outcome": self.outcome or ("waiting" if self.is_held else "running"),
+            "packets": {name: self.counts[name] for name in ("step", "reset", "again", "ignore", "bad")},
+        }

@@ -1,0 +1,90 @@
+"""What the sensors beside the autopilot say by MAVLink: a DVL, a sonar, an altimeter."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from uuvtai.config import Config
+from uuvtai.link.orders import Order
+from uuvtai.link.sectors import sectors_of
+from uuvtai.sitl.fdm_reply import turned_over
+
+LEAST_STEPS = 5
+"""control steps between two reports, at least: 10 Hz, as of an A50 and a multibeam"""
+_SONAR, _DOWN, _BOW = 1, 25, 12
+"""MAV_DISTANCE_SENSOR_ULTRASOUND, MAV_SENSOR_ROTATION_PITCH_270, MAV_FRAME_BODY_FRD"""
+_MOST_ALTITUDE_CM = 5000
+
+Value = Callable[[str], np.ndarray]
+
+
+class ReportedSensors:
+    """One vehicle's. ``report`` is called in every control step."""
+
+    def __init__(self, config: Config) -> None:
+        sensors = config.sensors
+        dt = config.episode.control_dt_s
+        self._sonar = sensors.sonar
+        self._dvl_steps = max(LEAST_STEPS, sensors.dvl.period_steps)
+        self._scan_steps = max(LEAST_STEPS, sensors.sonar.period_steps)
+        self._dvl_s = self._dvl_steps * dt
+        self._steps = 0
+
+    def report(self, time_s: float, altitude_m: float, value: Value) -> list[Order]:
+        """Messages of this step; ``value`` gives arrays of the vehicle by 'struct.field'."""
+        found = []
+        if self._steps % self._dvl_steps == 0 and int(value("ego.dvl_fresh")):
+            found.append(self._velocity(time_s, value("ego.dvl_b"), value("ego.rate_b")))
+        if self._steps % self._scan_steps == 0:
+            found.append(self._scan(time_s, value("scan.range_m"), value("scan.hit")))
+        if self._steps % LEAST_STEPS == 0:
+            found.append(_altitude(time_s, altitude_m))
+        self._steps += 1
+        return found
+
+    def _velocity(self, time_s: float, vel_b: np.ndarray, rate_b: np.ndarray) -> Order:
+        fields = {
+            "time_usec": _microseconds(time_s),
+            "time_delta_usec": _microseconds(self._dvl_s),
+            "angle_delta": [self._dvl_s * value for value in turned_over(rate_b.tolist())],
+            "position_delta": [self._dvl_s * value for value in turned_over(vel_b.tolist())],
+            "confidence": 100.0,
+        }
+        return Order("VISION_POSITION_DELTA", "VISION_POSITION_DELTA", fields)
+
+    def _scan(self, time_s: float, range_m: np.ndarray, hit: np.ndarray) -> Order:
+        beams = self._sonar.n_ray
+        distances, increment, offset = sectors_of(self._sonar, range_m[:beams], hit[:beams])
+        fields = {
+            "time_usec": _microseconds(time_s),
+            "sensor_type": _SONAR,
+            "distances": distances,
+            "increment": max(1, round(increment)),
+            "min_distance": 1,
+            "max_distance": round(100.0 * self._sonar.max_range_m),
+            "increment_f": increment,
+            "angle_offset": offset,
+            "frame": _BOW,
+        }
+        return Order("OBSTACLE_DISTANCE", "OBSTACLE_DISTANCE", fields)
+
+
+def _altitude(time_s: float, altitude_m: float) -> Order:
+    distance = int(np.clip(round(100.0 * altitude_m), 1, _MOST_ALTITUDE_CM))
+    fields = {
+        "time_boot_ms": round(1e3 * time_s) & 0xFFFFFFFF,
+        "min_distance": 1,
+        "max_distance": _MOST_ALTITUDE_CM,
+        "current_distance": distance,
+        "type": _SONAR,
+        "id": 0,
+        "orientation": _DOWN,
+        "covariance": 255,
+    }
+    return Order("DISTANCE_SENSOR", "DISTANCE_SENSOR", fields)
+
+
+def _microseconds(seconds: float) -> int:
+    return round(1e6 * seconds)
