@@ -49,4 +49,4 @@ def forecast_pieces(sources: Sources) -> str:
         for piece in PIECES
         if any(found == piece.name for found, _cell in played)
     ]
-    return text_table(["off", "by", *(cell.title for cell in cells)], rows)
+    return text_table(["changed", "by", *(cell.title for cell in cells)], rows)

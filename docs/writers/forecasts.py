@@ -126,7 +126,7 @@ def drawn(kept: dict[str, Any]) -> bytes:
 
     figure, panel = pyplot.subplots(figsize=(5.2, 4.8), layout="constrained")
     panel.plot([0, 1], [0, 1], color="#7a7d80", linewidth=1, linestyle="--", label="as forecast")
-    for cell, mark in zip(kept["cells"], "osv^Dx", strict=True):
+    for cell, mark in zip(kept["cells"], "osv^Dx", strict=False):
         bins = [row for row in cell["reliability"] if row[2] >= 30]
         label = f"{cell['cell']}"
         panel.plot([row[0] for row in bins], [row[1] for row in bins], marker=mark, ms=4.5, lw=1, label=label)
