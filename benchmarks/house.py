@@ -50,7 +50,12 @@ def rows() -> list[Row]:
         _row(
             "signature lines in kernels and sim.py",
             sum(_signature(node) for path, node in functions if path in counted),
-            900,
+            850,
+        ),
+        _row(
+            "lines of a signature there, mean",
+            round(statistics.mean(_signature(node) for path, node in functions if path in counted), 2),
+            1.3,
         ),
         _row(
             f"lines of more than {LONG_LINE} characters",

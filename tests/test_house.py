@@ -2,8 +2,9 @@
 
 from benchmarks import house
 
-SHORT_OF_WHAT_IS_WANTED = {"lines of the package"}
-"""31,000 was wanted of what the package did at the time; every room since then came on top"""
+SHORT_OF_WHAT_IS_WANTED = {"lines of the package", "signature lines in kernels and sim.py"}
+"""sums, wanted of what the package did at the time: 31,000 and 850; every room and kernel since then came on
+top. The mean length of a signature keeps its limit."""
 
 
 def test_every_measure_keeps_its_limit():
