@@ -647,6 +647,33 @@ TWIN = (
     ),
 )
 
+FORECAST = (
+    Mutation(
+        "future_faster_than_the_body",
+        "uuvtai/kernels/perception/mixture.py",
+        "step * ti.min(1.0, speed * dt",
+        "step * ti.min(1.0, 9.0 * dt",
+        "tests/test_mixture.py",
+        "says_what_the_network_says",
+    ),
+    Mutation(
+        "new_track_keeps_the_past",
+        "uuvtai/kernels/perception/motion_columns.py",
+        "io.tracks.alive[env, track] == 0 or io.tracks.age[env, track] == 0",
+        "io.tracks.alive[env, track] == 0",
+        "tests/test_mixture.py",
+        "new_track",
+    ),
+    Mutation(
+        "mixture_of_certain_futures",
+        "uuvtai/learn/mixture_net.py",
+        "torch.logsumexp(mixture.log_weight + log_density, -1)",
+        "torch.logsumexp(log_density, -1)",
+        "tests/test_learned_forecast.py",
+        "likelihood_is_that",
+    ),
+)
+
 _SAFETY = "uuvtai/link/safety.py"
 
 LINK = (
@@ -724,6 +751,6 @@ LINK = (
     ),
 )
 
-ALL = (*KERNELS, *STATISTICS, *LEARNING, *TWIN, *LINK)
+ALL = (*KERNELS, *STATISTICS, *LEARNING, *TWIN, *FORECAST, *LINK)
 QUICK = ("scale_dropped", "popart_norm", "wilson_half_width")
 """names of three that need no kernel"""

@@ -34,7 +34,8 @@ POND, RULES = TankConfig(x_m=(0.0, 12.0), y_m=(0.0, 8.0)), EpisodeConfig()
 MAP, CAMERA = MappingConfig(), DepthConfig(rows=6, cols=16)
 SHAPE = grid_shape(POND, MAP.cell_m)
 SIZES = {
-    "n_env": 1, "n_ray": 64, "n_echo": 64, "n_row": SHAPE[0], "n_col": SHAPE[1], "n_slot": 1, "n_turn": 16,
+    "n_env": 1, "n_ray": 64, "n_echo": 64, "n_row": SHAPE[0], "n_col": SHAPE[1], "n_slot": 1,
+    "n_turn_row": 7, "n_turn": 16,
     "n_track": 16, "n_cluster": 16, "n_height": 16, "n_pixel_row": 6, "n_pixel_col": 16,
 }  # fmt: skip
 STRUCTS = (

@@ -22,6 +22,7 @@ SIZES = {
     "n_pixel_row": 1,
     "n_pixel_col": LANES,
     "n_height": LANES,
+    "n_turn_row": 7,
     "n_turn": 16,
     "n_forecast": round(TRACKING.horizon_s / TRACKING.forecast_dt_s) + 1,
 }
@@ -190,8 +191,8 @@ def test_forecast_equals_the_walk_from_turn_to_turn(stage, switches):
         place = (x[:2] + rng.uniform(0.2, 2) * came + rng.normal(0, 0.1, 2)).astype(np.float32)
         turns[env][i] = habit_oracle.Turn(place.astype(float), came, went, 1.0)
     columns = np.array([[[*t.pos, *t.came, *t.went, t.weight] for t in row] for row in turns])
-    for j, name in enumerate(("turn_x", "turn_y", "in_x", "in_y", "out_x", "out_y", "weight")):
-        getattr(stage.habits, name).from_numpy(columns[..., j].reshape(N_ENV, -1, LANES).astype(np.float32))
+    rows = dict(zip(habit_oracle.TURN_ROWS, np.moveaxis(columns, -1, 0), strict=True))
+    stage.habits.turn.from_numpy(habit_oracle.packed_turns(rows))
     stage.clock.step.fill(2)
     pos, _ = stage.predict()
     turned = 0
@@ -221,22 +222,14 @@ def test_the_first_turn_is_searched_again_when_a_scan_or_an_image_has_come(stage
             np.zeros(size),
             np.ones(size),
         )
-        for name, value in {
-            "turn_x": 5.6,
-            "turn_y": 3.0,
-            "in_x": 1.0,
-            "in_y": 0.0,
-            "out_x": 0.0,
-            "out_y": 1.0,
-            "weight": 1.0,
-        }.items():
-            filled = np.zeros((N_ENV, SIZES["n_turn"] // LANES, LANES), np.float32)
-            filled[:, 0, 0] = value
-            getattr(stage.habits, name).from_numpy(filled)
+        rows = {name: np.zeros((N_ENV, SIZES["n_turn"])) for name in habit_oracle.TURN_ROWS}
+        for name, value in (("turn_x", 5.6), ("turn_y", 3.0), ("in_x", 1.0), ("out_y", 1.0), ("weight", 1.0)):
+            rows[name][:, 0] = value
+        stage.habits.turn.from_numpy(habit_oracle.packed_turns(rows))
         north = 3.0 + 0.5 * AHEAD[-1] - 0.6
         np.testing.assert_allclose(stage.predict()[0][..., -1, 1], north, atol=WALK_TOLERANCE)
         stage.clusters.fresh.fill(0)
-        stage.habits.weight.fill(0.0)
+        stage.habits.turn.fill(0.0)
         np.testing.assert_allclose(stage.predict()[0][..., -1, 1], north, atol=WALK_TOLERANCE)
         getattr(stage, news).fresh.fill(1)
         np.testing.assert_allclose(stage.predict()[0][..., -1, 1], 3.0, atol=WALK_TOLERANCE)

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from tests.bundles import io_for
+from tests.reference import habits as habit_oracle
 from uuvtai.config import Config
 from uuvtai.kernels.core.lanes import LANES
 from uuvtai.kernels.perception import forecast, futures
@@ -26,8 +27,8 @@ N_ENV, N_TRACK = 3, 4
 N_SAMPLE = round(CFG.tracking.horizon_s / CFG.tracking.forecast_dt_s) + 1
 AHEAD = CFG.tracking.forecast_dt_s * np.arange(N_SAMPLE)
 SIZES = {
-    "n_env": N_ENV, "n_ray": 16, "n_track": N_TRACK, "n_height": LANES, "n_turn": 48, "n_forecast": N_SAMPLE,
-    "n_future": 6,
+    "n_env": N_ENV, "n_ray": 16, "n_track": N_TRACK, "n_height": LANES, "n_turn_row": 7, "n_turn": 48,
+    "n_forecast": N_SAMPLE, "n_future": 6,
 }  # fmt: skip
 ODD = 0.05
 """Share of ways with an exponential length of mean 6 m, as futures.py says."""
@@ -153,10 +154,10 @@ def test_circles_known_turns_and_resting_tracks_have_no_futures(stage):
 
 def test_a_turn_seen_before_leaves_no_doubt(stage):
     stage.run(2, 3.0)
+    rows = habit_oracle.turn_rows(stage.habits.turn.to_numpy())
     for name, value in (("turn_x", 13.0), ("turn_y", 3.0), ("in_x", 1.0), ("out_x", -1.0), ("weight", 1.0)):
-        values = getattr(stage.habits, name).to_numpy()
-        values[:, 0, 0] = value
-        getattr(stage.habits, name).from_numpy(values)
+        rows[name][:, 0] = value
+    stage.habits.turn.from_numpy(habit_oracle.packed_turns(rows))
     share, _ = stage.weigh()
     assert not share.any()
 

@@ -18,7 +18,7 @@ N_ENV, N_TRACK, PERIOD = 6, 5, 3
 CONFIG, RULES = ForecastConfig(n_turn=16), EpisodeConfig()
 SIZES = {
     "n_env": N_ENV, "n_ray": 16, "n_track": N_TRACK, "n_cluster": 4, "n_height": LANES,
-    "n_turn": CONFIG.n_turn, "n_forecast": 3,
+    "n_turn_row": 7, "n_turn": CONFIG.n_turn, "n_forecast": 3,
 }  # fmt: skip
 PERIOD_S = PERIOD * RULES.control_dt_s
 
@@ -75,16 +75,13 @@ class Stage:
     def read(self):
         """Every array of the habits; the packed ones as (N_ENV, n_turn)."""
         out = {name: field.to_numpy() for name, field in vars(self.habits).items()}
-        return {
-            name: v.reshape(N_ENV, -1) if v.ndim == 3 and v.shape[-1] == LANES else v
-            for name, v in out.items()
-        }
+        return out | oracle.turn_rows(out.pop("turn"))
 
     def turns(self, env):
         """Remembered turns of one env: rows of (x, y, in x, in y, out x, out y, weight)."""
         table = self.read()
         rows = np.stack(
-            [table[name][env] for name in ("turn_x", "turn_y", "in_x", "in_y", "out_x", "out_y", "weight")],
+            [table[name][env] for name in oracle.TURN_ROWS],
             -1,
         )
         return rows[rows[:, 6] > 0]
@@ -96,9 +93,7 @@ def stage():
 
 
 def oracle_turns(table, env):
-    columns = [
-        table[n][env].astype(float) for n in ("turn_x", "turn_y", "in_x", "in_y", "out_x", "out_y", "weight")
-    ]
+    columns = [table[n][env].astype(float) for n in oracle.TURN_ROWS]
     return [
         oracle.Turn(np.array(c[0:2]), np.array(c[2:4]), np.array(c[4:6]), c[6])
         for c in zip(*columns, strict=True)
@@ -310,10 +305,7 @@ def test_coasting_equals_the_oracle(stage, shape):
     high = [19, 5] if shape == "rectangle" else [15, 15]
     low = [1, 1] if shape == "rectangle" else [5, 5]
     pos = rng.uniform(low, high, (n, 2))
-    rows = {
-        name: np.zeros((N_ENV, CONFIG.n_turn))
-        for name in ("turn_x", "turn_y", "in_x", "in_y", "out_x", "out_y", "weight")
-    }
+    rows = {name: np.zeros((N_ENV, CONFIG.n_turn)) for name in oracle.TURN_ROWS}
     for i in range(0, 90):  # a turn just ahead of every other body, or at its side, or behind
         env, slot = i % N_ENV, i // N_ENV
         angle, after = course[i] + rng.normal(0, 0.2), rng.uniform(-np.pi, np.pi)
@@ -323,8 +315,7 @@ def test_coasting_equals_the_oracle(stage, shape):
         values = *place, np.cos(angle), np.sin(angle), np.cos(after), np.sin(after), rng.choice([-1, 1, 1, 4])
         for name, value in zip(rows, values, strict=True):
             rows[name][env, slot] = value
-    for name, value in rows.items():
-        getattr(stage.habits, name).from_numpy(value.reshape(N_ENV, -1, LANES).astype(np.float32))
+    stage.habits.turn.from_numpy(oracle.packed_turns(rows))
     x = np.concatenate([pos, speed[:, None] * np.stack([np.cos(course), np.sin(course)], -1)], -1).astype(
         np.float32
     )

@@ -42,6 +42,7 @@ SIZES = {
     "n_track": CONFIG.n_track,
     "n_cluster": CONFIG.n_cluster,
     "n_height": 16,
+    "n_turn_row": 7,
     "n_turn": FORECAST.n_turn,
 }
 

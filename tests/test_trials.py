@@ -5,8 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
+from docs.writers.forecasts import with_spread
 from docs.writers.turn_backs import what_came
+from uuvtai.forecast_codes import N_MODE
 from uuvtai.statistics import mcnemar_p
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -220,3 +223,24 @@ def test_what_came_follows_from_the_path(phase_m, way, came):
     here = np.array([min(phase_m, 6.0 - phase_m), 0.0])
     assert what_came([{"path": path}], here, np.array(way), 0.0) == came
     assert what_came([{"path": path}], here + 0.6, np.array(way), 0.0) == ("none", False, False)
+
+
+def test_scores_of_forecasts_are_whole():
+    """Every cell judges every forecast, and every future of every moment is in a bin of the reliability."""
+    kept = json.loads((DOCS / "data/forecasts.json").read_text())
+    assert (DOCS / "forecasts.png").is_file()
+    for cell in kept["cells"]:
+        assert list(cell["methods"]) == ["constant velocity", "arcs and habits", "with turns back", "learned"]
+        assert sum(row[2] for row in cell["reliability"]) == N_MODE * cell["moments"]
+        came = sum(share * count for _mean, share, count in cell["reliability"])
+        assert came == pytest.approx(cell["moments"], rel=1e-3), "one of the futures is the nearest"
+
+
+def test_a_spread_that_is_fitted_is_the_errors_own():
+    rng = np.random.default_rng(1)
+    sigma = np.array([[0.2, 0.1], [0.5, 0.3]])
+    place = torch.from_numpy(rng.normal(0, 1, (4000, 1, 2, 2))).float()
+    truth = place[:, 0] + torch.from_numpy(rng.normal(0, 1, (4000, 2, 2)) * sigma).float()
+    mixture = with_spread(torch.zeros(4000, 1), place, truth)
+    assert len(mixture.place) == 2000
+    np.testing.assert_allclose(mixture.sigma[0, 0].numpy(), sigma, rtol=0.08)

@@ -15,7 +15,15 @@ from uuvtai.kernels.perception.unseen import turn_back_rate, turned_back
 from uuvtai.state import ClusterState, HabitState, SonarScan, TrackState, allocate
 
 N = 64
-SIZES = {"n_env": N, "n_ray": 256, "n_track": 1, "n_cluster": 1, "n_height": LANES, "n_turn": 48}
+SIZES = {
+    "n_env": N,
+    "n_ray": 256,
+    "n_track": 1,
+    "n_cluster": 1,
+    "n_height": LANES,
+    "n_turn_row": 7,
+    "n_turn": 48,
+}
 CFG = Config.model_validate({"traffic": {"leg_m": [2.0, 6.0]}, "forecast": {"use_turning_back": True}})
 TRIANGLE = np.triu_indices(4)
 ROUNDING = 2e-5

@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import get_type_hints
 
 from uuvtai import state
-from uuvtai.config import Config
+from uuvtai.config import Config, ForecastConfig
 from uuvtai.config.task import TERMS
 from uuvtai.errors import SettingError, SizeError
+from uuvtai.forecast_codes import N_BEND, N_COLUMN, N_FRAME, N_HIDDEN, N_MODE, N_PAST, N_SAID, N_WEIGHT
 from uuvtai.kernels.core.grid import grid_shape
 from uuvtai.kernels.core.lanes import LANES
 from uuvtai.kernels.perception.mapping import look_period_s, scans_in
@@ -62,9 +63,11 @@ def array_sizes(config: Config, n_env: int, device: str = "cpu") -> dict[str, in
         "n_track": config.tracking.n_track,
         "n_cluster": config.tracking.n_cluster,
         "n_height": LANES,
+        "n_turn_row": 7,
         "n_turn": config.forecast.n_turn,
         "n_forecast": round(config.tracking.horizon_s / config.tracking.forecast_dt_s) + 1,
-        "n_future": max(1, 2 * len(config.forecast.turn_back_s)),
+        "n_future": N_MODE if config.forecast.learned else max(1, 2 * len(config.forecast.turn_back_s)),
+        **_network_sizes(config.forecast),
         "n_row": n_row,
         "n_col": n_col,
         "n_packet": n_col // LANES,
@@ -85,6 +88,23 @@ def array_sizes(config: Config, n_env: int, device: str = "cpu") -> dict[str, in
         "n_trial": config.baselines.n_trial,
         "n_control": _n_control(config),
         "n_term": len(TERMS),
+    }
+
+
+def _network_sizes(forecast_cfg: ForecastConfig) -> dict[str, int]:
+    """Axes of a learned forecast; as short as can be where there is none."""
+    if not forecast_cfg.learned and not forecast_cfg.keep_columns:
+        return dict.fromkeys(("n_past", "n_bend", "n_frame", "n_column", "n_hidden", "n_said"), 1) | {
+            "n_weight": LANES
+        }
+    return {
+        "n_past": N_PAST,
+        "n_bend": N_BEND,
+        "n_frame": N_FRAME,
+        "n_column": N_COLUMN,
+        "n_hidden": 2 * N_HIDDEN,
+        "n_said": N_SAID,
+        "n_weight": N_WEIGHT,
     }
 
 

@@ -22,6 +22,8 @@ from uuvtai.kernels.perception import (
     futures,
     look,
     mapping,
+    mixture,
+    motion_columns,
     pose,
     spotting,
     tracking,
@@ -55,6 +57,11 @@ def track(stages: Stages, config: Config, privileged: bool) -> None:
     forecast.forecast_tracks(stages.forecast)
     if config.forecast.turn_back_s:
         futures.weigh_futures(stages.futures)
+    if config.forecast.learned or config.forecast.keep_columns:
+        motion_columns.remember_past(stages.past)
+        motion_columns.describe_motion(stages.past)
+    if config.forecast.learned:
+        mixture.mix_futures(stages.mixture)
     elevation.bound_heights(stages.heights)
 
 
@@ -117,6 +124,8 @@ def forget(stages: Stages, config: Config) -> None:
         pose.reset_pose(stages.pose)
     tracking.reset_tracks(stages.tracking)
     forecast.reset_forecast(stages.forecast)
+    if config.forecast.learned or config.forecast.keep_columns:
+        motion_columns.reset_past(stages.past)
     mapping.reset_map(stages.mapping)
     if config.quiet.weight_seen > 0:
         exposure.reset_exposure(stages.exposure)

@@ -11,22 +11,18 @@ from typing import Any
 from docs.writers.benchmark_pages import benchmark, benchmark_scenes
 from docs.writers.dead_tables import dead_commands, dead_thrusters
 from docs.writers.figure_sources import Counts, SourceError, Sources, fitting, pooled, rated, share, weighted
+from docs.writers.forecast_tables import forecast_pieces, forecast_scores
 from docs.writers.link_tables import closed_loop
-from docs.writers.pieces import BEFORE, CELLS, LETTERS, PIECES
+from docs.writers.pieces import BEFORE, CELLS, DASH, LETTERS, PIECES, beside
 from docs.writers.pose_tables import pose_endings, pose_errors
 from docs.writers.replay_tables import changed, lossy, replayed
 from docs.writers.sonar_tables import sonars
 from docs.writers.vehicle_tables import vehicle_commands, vehicles
 from uuvtai.measure.reproduce import paper
 from uuvtai.measure.reproduce.steps import RETIRED_SEEDS
-from uuvtai.outcomes import COLLIDED
 from uuvtai.statistics import mcnemar_p
 from uuvtai.tables.method_tables import milliseconds
 from uuvtai.tables.table import text_table
-
-DASH = "-"
-"""what was not measured or not kept"""
-
 
 # ------------------------------------------------------------------------------------------------ evaluations
 
@@ -244,27 +240,13 @@ def switched_off(sources: Sources) -> str:
     cells = [cell for cell in CELLS if any(found == cell.name for _piece, found in played)]
     table = []
     for piece in (*PIECES, BEFORE):
-        shown = [_beside(played, piece.name, "all", cell.name) for cell in cells]
+        shown = [beside(played, piece.name, "all", cell.name) for cell in cells]
         if any(text != DASH for text in shown):
             table.append([piece.title, *(f"`{key}`" if key else "" for key in [piece.settings]), *shown])
-    capped = [_beside(played, "diagonal", BEFORE.name, cell.name) for cell in cells]
+    capped = [beside(played, "diagonal", BEFORE.name, cell.name) for cell in cells]
     if any(text != DASH for text in capped):
         table.append(["at most 0.6 m/s, against the pilot before", "", *capped])
     return text_table(["off", "by", *(cell.title for cell in cells)], table)
-
-
-def _beside(played: dict[tuple[str, str], str], piece: str, other: str, cell: str) -> str:
-    """One place of the table; the episodes that both pilots played are compared."""
-    if (piece, cell) not in played:
-        return DASH
-    own, whole = played[piece, cell], played.get((other, cell), "")
-    collided = sum(own.count(LETTERS[ending]) for ending in COLLIDED)
-    rates = f"{100 * own.count('s') / len(own):.1f} / {100 * collided / len(own):.1f}"
-    if piece == other or not whole:
-        return rates
-    pairs = list(zip(own, whole, strict=False))
-    won, lost = (sum(a == "s" != b for a, b in pairs), sum(b == "s" != a for a, b in pairs))
-    return f"{rates} (+{won} -{lost}, p = {mcnemar_p(won, lost):.2g})"
 
 
 # ----------------------------------------------------------------------------------------------------- sweeps
@@ -577,6 +559,8 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         twin_curve,
         twin_policy,
         chooser_trials,
+        forecast_scores,
+        forecast_pieces,
         benchmark_scenes,
         benchmark,
     )

@@ -24,7 +24,9 @@ from typing import Any
 from benchmarks.before import checked_out
 from docs.writers.evaluations import ONE_THREAD, commit_of_package
 from docs.writers.figure_sources import ROOT
+from uuvtai.outcomes import COLLIDED
 from uuvtai.run_folder import hardware, write_atomic
+from uuvtai.statistics import mcnemar_p
 
 EPISODES = 400
 LETTERS = {"success": "s", "collision": "c", "ttc": "x", "out_of_tank": "o", "timeout": "t"}
@@ -70,6 +72,7 @@ CELLS = (
     Cell("pool_6_harsh", "pool (8, 6, 0.6), harsh", "--world pool -S 8 -D 6 -v 0.6 --sensors harsh"),
 )
 _LEVEL = "teacher.free_depth=false teacher.vertical_weight=1.5 teacher.edge_gap_m=0.26"
+_LEARNED, _FAST = "forecast.learned=shipped", ("pool_9_fast", "gauntlet_9_fast")
 PIECES = (
     Piece("all", "nothing", cells=tuple(cell.name for cell in CELLS)),
     Piece("depth", "depth as a free dimension", _LEVEL),
@@ -85,10 +88,18 @@ PIECES = (
     Piece("quiet", "nothing; quiet water on", "quiet.weight_seen=20"),
     Piece("futures", "nothing; futures on", "forecast.turn_back_s=[0.4,0.8]"),
     Piece(
+        "learned_one",
+        "nothing; learned forecast, likeliest alone",
+        _LEARNED + " teacher.least_share=0.99",
+        _FAST,
+    ),
+    Piece("learned", "nothing; learned forecast, all futures", _LEARNED, _FAST),
+    Piece(
         "pose", "corrections of the position", "sensors.localization=dead_reckoning", cells=("pool_6_harsh",)
     ),
     Piece("pose_known", "nothing; position known", "sensors.localization=truth", cells=("pool_6_harsh",)),
 )
+DASH = "-"
 BEFORE = Piece("before", "all: the pilot before")
 
 
@@ -149,6 +160,20 @@ def add(path: Path, document: dict[str, Any], entry: dict[str, Any]) -> None:
     place = (entry["piece"], entry["cell"])
     document["rows"] = [row for row in document["rows"] if (row["piece"], row["cell"]) != place] + [entry]
     write_atomic(path, (json.dumps(document, indent=1) + "\n").encode())
+
+
+def beside(played: dict[tuple[str, str], str], piece: str, other: str, cell: str) -> str:
+    """One place of the table; the episodes that both pilots played are compared."""
+    if (piece, cell) not in played:
+        return DASH
+    own, whole = played[piece, cell], played.get((other, cell), "")
+    collided = sum(own.count(LETTERS[ending]) for ending in COLLIDED)
+    rates = f"{100 * own.count('s') / len(own):.1f} / {100 * collided / len(own):.1f}"
+    if piece == other or not whole:
+        return rates
+    pairs = list(zip(own, whole, strict=False))
+    won, lost = (sum(a == "s" != b for a, b in pairs), sum(b == "s" != a for a, b in pairs))
+    return f"{rates} (+{won} -{lost}, p = {mcnemar_p(won, lost):.2g})"
 
 
 # ---------------------------------------------------------------------------------------------------- playing

@@ -136,3 +136,18 @@ def walk(turns, x, radius, times, cfg, tank, most_legs):
         pos, gap = pos + way * course, gap - way
         where.append(pos)
     return np.array(where), course
+
+
+TURN_ROWS = ("turn_x", "turn_y", "in_x", "in_y", "out_x", "out_y", "weight")
+"""rows of ``HabitState.turn``"""
+
+
+def turn_rows(turn):
+    """Rows (n_env, n_turn) of ``HabitState.turn``, by their names."""
+    return {name: turn[:, row].reshape(len(turn), -1).copy() for row, name in enumerate(TURN_ROWS)}
+
+
+def packed_turns(rows):
+    """``HabitState.turn`` of rows (n_env, n_turn) by their names."""
+    table = np.stack([rows[name] for name in TURN_ROWS], 1)
+    return table.reshape(*table.shape[:2], -1, 16).astype(np.float32)

@@ -247,6 +247,25 @@ class ChooserConfig(Section):
     """part of the way that the slow copy, which says what is to come, goes with every step"""
 
 
+class ForecasterConfig(Section):
+    """A network that says what moving bodies may do in the next 2.5 s (``docs/learning.md``)."""
+
+    enabled: bool = False
+    """learn a forecast"""
+    worlds: tuple[Annotated[str, Field(min_length=1, max_length=200)], ...] = ("pool", "gauntlet", "maze")
+    """world presets whose episodes are played in turn, ``train.scenes`` dealt out to the envs"""
+    episode_steps: PositiveCount = 1500
+    """control steps after which an episode is left"""
+    memory: Annotated[int, Field(ge=1024, le=2**23)] = 2**21
+    """moments of tracks that are kept to learn from"""
+    minibatches: PositiveCount = 3000
+    """steps of the network per iteration"""
+    minibatch: PositiveCount = 512
+    """moments in one of them"""
+    learning_rate: Positive = 2e-3
+    """falls linearly over the run"""
+
+
 class LearningConfig(Config):
     """A run's config with what training adds."""
 
@@ -258,4 +277,5 @@ class LearningConfig(Config):
     risk: RiskConfig = RiskConfig()
     twin: TwinConfig = TwinConfig()
     chooser: ChooserConfig = ChooserConfig()
+    forecaster: ForecasterConfig = ForecasterConfig()
     train: TrainConfig = TrainConfig()

@@ -23,6 +23,7 @@ from uuvtai.learn.distributed import Processes
 from uuvtai.learn.ppo import ADAM_EPS
 from uuvtai.learn.rollout_sums import Recent, RolloutSums
 from uuvtai.learn.set_pilot import SetPilot, set_pilot_of
+from uuvtai.learn.world_sims import simulator_of
 from uuvtai.outcomes import OUTCOMES, RUNNING, SUCCESS
 
 if TYPE_CHECKING:
@@ -101,7 +102,7 @@ class ChooserTrainer:
     def place(self, world: str) -> tuple[Sim, SetPilot]:
         """The simulator of a world with the policy in it, made when it is first needed."""
         if world not in self._places:
-            sim = _simulator_of(self.config, world, self._all_scenes)
+            sim = simulator_of(self.config, world, self._all_scenes)
             self._places[world] = sim, set_pilot_of(self._source, sim)
         return self._places[world]
 
@@ -283,16 +284,3 @@ def _policy_of(config: LearningConfig) -> checkpoint.Checkpoint:
             f"chooser.policy={path}: was not trained in the twin; train one: uuv train twin --run-dir {path}"
         )
     return found
-
-
-def _simulator_of(config: LearningConfig, world: str, scenes: tuple[Scene, ...]) -> Sim:
-    """A simulator of a world with room for every scene, on the run's sensors and stack. Raises
-    ConfigError."""
-    from uuvtai.loader import load_config
-    from uuvtai.shipped import TRAINING_TREE
-    from uuvtai.sim import Sim
-    from uuvtai.tree import read_tree
-
-    most = [("world.n_static", max(s[0] for s in scenes)), ("world.n_dynamic", max(s[1] for s in scenes))]
-    config = config.model_copy(update={"world": load_config(world, overrides=[*most]).world})
-    return Sim(config, config.train.num_envs, read_tree(TRAINING_TREE, config.teacher.max_node))

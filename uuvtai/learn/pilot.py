@@ -196,6 +196,11 @@ def load_pilot(checkpoint: Checkpoint, num_envs: int, device: torch.device | str
     """Pilot with the networks of a checkpoint. Raises CheckpointError where they do not fit what its config
     says."""
     config, rows = checkpoint.config, checkpoint.manifest.observation_table
+    if config.forecaster.enabled:
+        raise CheckpointError(
+            f"{checkpoint.path}: forecasts and does not drive; give it to a pilot that does: --set "
+            "forecast.learned=RUN"
+        )
     if config.twin.enabled or config.chooser.enabled:
         raise CheckpointError(
             f"{checkpoint.path}: a policy over a set of bodies, which looks at the simulator itself; it "

@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, Union
 
 from uuvtai import signals
 from uuvtai.config.learning import LearningConfig
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from uuvtai.env import VectorEnv
     from uuvtai.learn.checkpoint import Checkpoint
     from uuvtai.learn.chooser_trainer import ChooserTrainer
+    from uuvtai.learn.forecast_trainer import ForecastTrainer
     from uuvtai.learn.train import Trainer
     from uuvtai.learn.twin_trainer import TwinTrainer
     from uuvtai.scene_options import SceneOptions
@@ -69,7 +70,8 @@ class TrainWatch(Protocol):
     def stop(self) -> None: ...
 
 
-Evaluate = Callable[["Trainer | TwinTrainer | ChooserTrainer", LearningConfig], Metrics]
+AnyTrainer = Union["Trainer", "TwinTrainer", "ChooserTrainer", "ForecastTrainer"]
+Evaluate = Callable[[AnyTrainer, LearningConfig], Metrics]
 """``eval/*`` of the policy as it is; training goes on as if nothing had been
 (``measure.evaluate.while_training.evaluate_now``, which knows what learning does not)"""
 
@@ -119,8 +121,10 @@ def _train(
         f"starting {config.train.num_envs} envs (sizes not used before compile their kernels first, about "
         "half a minute)"
     )
-    trainer: Trainer | TwinTrainer | ChooserTrainer
-    if config.chooser.enabled:
+    trainer: AnyTrainer
+    if config.forecaster.enabled:
+        trainer = _forecast_trainer(config, found, request.device)
+    elif config.chooser.enabled:
         trainer = _chooser_trainer(config, found, request.device)
     elif config.twin.enabled:
         trainer = _twin_trainer(config, found, request.device)
@@ -198,10 +202,7 @@ def _twin_trainer(config: LearningConfig, checkpoint: Checkpoint | None, device:
     """As ``_trainer``, in the kinematic twin."""
     from uuvtai.learn.twin_trainer import TwinTrainer
 
-    if device == "cuda" or os.environ.get("WORLD_SIZE", "1") != "1":
-        raise ConfigError(
-            "twin.enabled: the twin trains in one process on the CPU; leave out --device cuda and torchrun"
-        )
+    _refuse_many("twin.enabled: the twin trains", device)
     trainer = TwinTrainer(config)
     if checkpoint:
         checkpoint.check_table(trainer.observation_table, config)
@@ -213,15 +214,29 @@ def _chooser_trainer(config: LearningConfig, checkpoint: Checkpoint | None, devi
     """As ``_trainer``, of who shall drive."""
     from uuvtai.learn.chooser_trainer import ChooserTrainer
 
-    if device == "cuda" or os.environ.get("WORLD_SIZE", "1") != "1":
-        raise ConfigError(
-            "chooser.enabled: it learns in one process on the CPU; leave out --device cuda and torchrun"
-        )
+    _refuse_many("chooser.enabled: it learns", device)
     trainer = ChooserTrainer(config)
     if checkpoint:
         checkpoint.check_table(trainer.observation_table, config)
         trainer.load_state(checkpoint.state(like=trainer.state()))
     return trainer
+
+
+def _forecast_trainer(config: LearningConfig, checkpoint: Checkpoint | None, device: str) -> ForecastTrainer:
+    """As ``_trainer``, of what moving bodies will do."""
+    from uuvtai.learn.forecast_trainer import ForecastTrainer
+
+    _refuse_many("forecaster.enabled: it learns", device)
+    trainer = ForecastTrainer(config)
+    if checkpoint:
+        checkpoint.check_table(trainer.observation_table, config)
+        trainer.load_state(checkpoint.state(like=trainer.state()))
+    return trainer
+
+
+def _refuse_many(what: str, device: str) -> None:
+    if device == "cuda" or os.environ.get("WORLD_SIZE", "1") != "1":
+        raise ConfigError(f"{what} in one process on the CPU; leave out --device cuda and torchrun")
 
 
 def _folder(
@@ -241,7 +256,7 @@ class _Run:
 
     def __init__(
         self,
-        trainer: Trainer | TwinTrainer | ChooserTrainer,
+        trainer: AnyTrainer,
         config: LearningConfig,
         folder: RunFolder | None,
         watch: TrainWatch,
@@ -316,7 +331,17 @@ class _Run:
             self._metrics,
             score,
         )
+        if self._config.forecaster.enabled:
+            self._export(folder)
         self._saved = trainer.iteration
+
+    def _export(self, folder: RunFolder) -> None:
+        """The file that a stack forecasts with."""
+        from uuvtai.learn.forecast_trainer import ForecastTrainer
+        from uuvtai.mixture_weights import WEIGHTS
+
+        assert isinstance(self._trainer, ForecastTrainer)
+        folder.write_bytes(WEIGHTS, self._trainer.exported())
 
     def _success_interval(self) -> tuple[float, float] | None:
         """95 % interval of ``rollout/success_rate`` over the episodes that it is the mean of."""

@@ -172,20 +172,10 @@ class HabitState:
     """Remembered: places where moving bodies turned in this episode, of whichever track; and each track's
     last straight leg."""
 
-    turn_x: ti.Field = array("n_env", "n_turn", packed=True)
-    """[m] place of the turn, world"""
-    turn_y: ti.Field = array("n_env", "n_turn", packed=True)
-    """[m]"""
-    in_x: ti.Field = array("n_env", "n_turn", packed=True)
-    """unit course before the turn"""
-    in_y: ti.Field = array("n_env", "n_turn", packed=True)
-    """unit course before the turn"""
-    out_x: ti.Field = array("n_env", "n_turn", packed=True)
-    """unit course after it"""
-    out_y: ti.Field = array("n_env", "n_turn", packed=True)
-    """unit course after it"""
-    weight: ti.Field = array("n_env", "n_turn", packed=True)
-    """times seen, less times that it did not come; not above 0 = empty"""
+    turn: ti.Field = array("n_env", "n_turn_row", "n_turn", packed=True)
+    """rows (``habits.TURN_X`` and so on): place of the turn [m, m], world; unit course before it and after
+    it; times seen, less times that it did not come: not above 0 = empty. One array, for there may be 1,024
+    nodes in all"""
     next_slot: ti.Field = array("n_env", dtype=ti.i32)
     """slot that the next new turn takes"""
     leg: ti.Field = array("n_env", "n_track", vec=4)
@@ -233,6 +223,38 @@ class FutureState:
     """probability of a corner within the time that the futures cover, wherever it leads"""
     pos_w: ti.Field = array("n_env", "n_track", "n_future", "n_forecast", vec=2)
     """[m] where the body then is, at the forecast's times"""
+
+
+@dataclass(frozen=True, eq=False)
+class PastState:
+    """Remembered for a learned forecast: where each track was, and where it turned. Newest first."""
+
+    past_w: ti.Field = array("n_env", "n_track", "n_past", vec=2)
+    """[m] places in the last seconds, ``forecast_codes.PAST_S`` apart"""
+    past_step: ti.Field = array("n_env", "n_track", dtype=ti.i32, beside="counts")
+    """episode step of the newest one"""
+    past_count: ti.Field = array("n_env", "n_track", dtype=ti.i32, beside="counts")
+    """places remembered"""
+    bend_w: ti.Field = array("n_env", "n_track", "n_bend", vec=2)
+    """[m] the last turns between straight ways"""
+    bend_count: ti.Field = array("n_env", "n_track", dtype=ti.i32, beside="counts")
+    """turns remembered"""
+
+
+@dataclass(frozen=True, eq=False)
+class MixtureState:
+    """A learned forecast: a network of two hidden layers, what it is told of each track, and what it says."""
+
+    frame: ti.Field = array("n_env", "n_track", "n_frame")
+    """[m, m, -, -, m/s] place now, unit course and speed, in which columns and futures are counted"""
+    column: ti.Field = array("n_env", "n_track", "n_column")
+    """what the network is told (``forecast_codes.COLUMNS``)"""
+    hidden: ti.Field = array("n_env", "n_track", "n_hidden", scratch=True)
+    """scratch: first layer, then the second one"""
+    said: ti.Field = array("n_env", "n_track", "n_said")
+    """logits of the futures, then their places: see ``mixture``"""
+    weight: ti.Field = array("n_weight", packed=True)
+    """constant: the layers one after the other, each a row of biases, then a row for each input"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -310,6 +332,8 @@ class PerceptionStructs:
     habits: HabitState
     forecast: ForecastState
     futures: FutureState
+    past: PastState
+    mixture: MixtureState
     mask: GridMask
     grid_map: MapState
     map_scratch: MapScratch

@@ -32,6 +32,8 @@ from uuvtai.state import (
     HabitState,
     MapScratch,
     MapState,
+    MixtureState,
+    PastState,
     PoseState,
     Proprioception,
     SonarScan,
@@ -81,6 +83,35 @@ class FuturesIO:
     teacher_cfg: Const[TeacherConfig]
     tracking_cfg: Const[TrackingConfig]
     traffic_cfg: Const[TrafficConfig]
+
+
+@dataclass(frozen=True, eq=False)
+class PastIO:
+    """Where each track was and where it turned, as columns for a network."""
+
+    mixture: Out[MixtureState]
+    past: Out[PastState]
+    clock: In[ClockState]
+    clusters: In[ClusterState]
+    forecast: In[ForecastState]
+    habits: In[HabitState]
+    tracks: In[TrackState]
+    episode_cfg: Const[EpisodeConfig]
+    forecast_cfg: Const[ForecastConfig]
+    tank_cfg: Const[TankConfig]
+    teacher_cfg: Const[TeacherConfig]
+
+
+@dataclass(frozen=True, eq=False)
+class MixtureIO:
+    """What a network says that the bodies may do."""
+
+    forecast: Out[ForecastState]
+    futures: Out[FutureState]
+    mixture: Out[MixtureState]
+    clock: In[ClockState]
+    teacher_cfg: Const[TeacherConfig]
+    tracking_cfg: Const[TrackingConfig]
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,5 +221,7 @@ class PerceptionStages:
     look: LookIO
     forecast: ForecastIO
     futures: FuturesIO
+    past: PastIO
+    mixture: MixtureIO
     heights: HeightsIO
     mapping: MappingIO

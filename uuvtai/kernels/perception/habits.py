@@ -22,6 +22,9 @@ from uuvtai.kernels.core.signature import Bundle, Const, In
 from uuvtai.kernels.perception.bundles import ForecastIO
 from uuvtai.state import HabitState, TrackState
 
+TURN_X, TURN_Y, IN_X, IN_Y, OUT_X, OUT_Y, WEIGHT = range(7)
+"""what is remembered of a turn: rows of ``HabitState.turn``"""
+
 _STRAIGHT_SIGMA = 0.4
 """[rad/s] a body is on a straight leg where its turn rate is known to this and less than its standard
 deviation."""
@@ -54,14 +57,14 @@ _MOST_WEIGHT = 4.0
 @ti.func
 def forget_habits(env, io: Bundle[ForecastIO]):
     io.habits.next_slot[env] = 0
-    for packet in range(io.habits.weight.shape[1]):
-        io.habits.turn_x[env, packet] = ti.zero(io.habits.turn_x[env, packet])
-        io.habits.turn_y[env, packet] = ti.zero(io.habits.turn_y[env, packet])
-        io.habits.in_x[env, packet] = ti.zero(io.habits.in_x[env, packet])
-        io.habits.in_y[env, packet] = ti.zero(io.habits.in_y[env, packet])
-        io.habits.out_x[env, packet] = ti.zero(io.habits.out_x[env, packet])
-        io.habits.out_y[env, packet] = ti.zero(io.habits.out_y[env, packet])
-        io.habits.weight[env, packet] = ti.zero(io.habits.weight[env, packet])
+    for packet in range(io.habits.turn.shape[2]):
+        io.habits.turn[env, TURN_X, packet] = ti.zero(io.habits.turn[env, TURN_X, packet])
+        io.habits.turn[env, TURN_Y, packet] = ti.zero(io.habits.turn[env, TURN_Y, packet])
+        io.habits.turn[env, IN_X, packet] = ti.zero(io.habits.turn[env, IN_X, packet])
+        io.habits.turn[env, IN_Y, packet] = ti.zero(io.habits.turn[env, IN_Y, packet])
+        io.habits.turn[env, OUT_X, packet] = ti.zero(io.habits.turn[env, OUT_X, packet])
+        io.habits.turn[env, OUT_Y, packet] = ti.zero(io.habits.turn[env, OUT_Y, packet])
+        io.habits.turn[env, WEIGHT, packet] = ti.zero(io.habits.turn[env, WEIGHT, packet])
     for track in range(io.habits.leg_step.shape[1]):
         io.habits.leg[env, track] = ti.zero(io.habits.leg[env, track])
         io.habits.leg_step[env, track] = -1
@@ -139,55 +142,67 @@ def place_turn(env, p0, d0, p1, d1, way, io: Bundle[ForecastIO]):
 @ti.func
 def store_turn(env, pos, d0, d1, io: Bundle[ForecastIO]):
     """Average with the same turn seen before; else a new one in the place of the oldest."""
-    n_packet = ti.static(io.habits.weight.shape[1])
+    n_packet = ti.static(io.habits.turn.shape[2])
     slot, weight = io.habits.next_slot[env], 1.0
     known = 0
     for packet in range(n_packet):
         for lane in range(LANES):
-            if known == 0 and io.habits.weight[env, packet][lane] > 0.0:
+            if known == 0 and io.habits.turn[env, WEIGHT, packet][lane] > 0.0:
                 off = (
-                    ti.Vector([io.habits.turn_x[env, packet][lane], io.habits.turn_y[env, packet][lane]])
+                    ti.Vector(
+                        [io.habits.turn[env, TURN_X, packet][lane], io.habits.turn[env, TURN_Y, packet][lane]]
+                    )
                     - pos
                 )
                 alike_in = (
-                    io.habits.in_x[env, packet][lane] * d0[0] + io.habits.in_y[env, packet][lane] * d0[1]
+                    io.habits.turn[env, IN_X, packet][lane] * d0[0]
+                    + io.habits.turn[env, IN_Y, packet][lane] * d0[1]
                     > _ALIKE_COS
                 )
                 alike_out = (
-                    io.habits.out_x[env, packet][lane] * d1[0] + io.habits.out_y[env, packet][lane] * d1[1]
+                    io.habits.turn[env, OUT_X, packet][lane] * d1[0]
+                    + io.habits.turn[env, OUT_Y, packet][lane] * d1[1]
                     > _ALIKE_COS
                 )
                 if alike_in and alike_out and off.norm_sqr() < ti.static(_SAME_M**2):
                     known, slot = 1, packet * LANES + lane
     packet, lane = slot // LANES, slot % LANES
     if known == 1:
-        weight = ti.min(io.habits.weight[env, packet][lane] + 1.0, _MOST_WEIGHT)
+        weight = ti.min(io.habits.turn[env, WEIGHT, packet][lane] + 1.0, _MOST_WEIGHT)
     else:
         io.habits.next_slot[env] = (slot + 1) % ti.static(LANES * n_packet)
     keep, gain = 1.0 - 1.0 / weight, 1.0 / weight
     came = (
-        keep * known * ti.Vector([io.habits.in_x[env, packet][lane], io.habits.in_y[env, packet][lane]])
+        keep
+        * known
+        * ti.Vector([io.habits.turn[env, IN_X, packet][lane], io.habits.turn[env, IN_Y, packet][lane]])
         + gain * d0
     )
     went = (
-        keep * known * ti.Vector([io.habits.out_x[env, packet][lane], io.habits.out_y[env, packet][lane]])
+        keep
+        * known
+        * ti.Vector([io.habits.turn[env, OUT_X, packet][lane], io.habits.turn[env, OUT_Y, packet][lane]])
         + gain * d1
     )
     came, went = came.normalized(), went.normalized()
-    io.habits.turn_x[env, packet][lane] = keep * io.habits.turn_x[env, packet][lane] * known + gain * pos[0]
-    io.habits.turn_y[env, packet][lane] = keep * io.habits.turn_y[env, packet][lane] * known + gain * pos[1]
-    io.habits.in_x[env, packet][lane] = came[0]
-    io.habits.in_y[env, packet][lane] = came[1]
-    io.habits.out_x[env, packet][lane] = went[0]
-    io.habits.out_y[env, packet][lane] = went[1]
-    io.habits.weight[env, packet][lane] = weight
+    io.habits.turn[env, TURN_X, packet][lane] = (
+        keep * io.habits.turn[env, TURN_X, packet][lane] * known + gain * pos[0]
+    )
+    io.habits.turn[env, TURN_Y, packet][lane] = (
+        keep * io.habits.turn[env, TURN_Y, packet][lane] * known + gain * pos[1]
+    )
+    io.habits.turn[env, IN_X, packet][lane] = came[0]
+    io.habits.turn[env, IN_Y, packet][lane] = came[1]
+    io.habits.turn[env, OUT_X, packet][lane] = went[0]
+    io.habits.turn[env, OUT_Y, packet][lane] = went[1]
+    io.habits.turn[env, WEIGHT, packet][lane] = weight
 
 
 @ti.func
 def drop_passed(env, pos, course, moved, io: Bundle[ForecastIO]):
     """A body that was expected to turn and has gone straight on past the place, in the last ``moved`` [m],
     takes one off its weight."""
-    for packet in range(io.habits.weight.shape[1]):
+    for packet in range(io.habits.turn.shape[2]):
         along, across = offsets(env, packet, pos, course, io.habits)
         for lane in ti.static(range(LANES)):
             behind = (
@@ -196,9 +211,9 @@ def drop_passed(env, pos, course, moved, io: Bundle[ForecastIO]):
             if (
                 behind
                 and across[lane] < ti.static(0.5 * io.forecast_cfg.across_m)
-                and io.habits.weight[env, packet][lane] > 0.0
+                and io.habits.turn[env, WEIGHT, packet][lane] > 0.0
             ):
-                io.habits.weight[env, packet][lane] -= 1.0
+                io.habits.turn[env, WEIGHT, packet][lane] -= 1.0
 
 
 # ----------------------------------------------------------------------------------------------------- recall
@@ -208,11 +223,11 @@ def drop_passed(env, pos, course, moved, io: Bundle[ForecastIO]):
 def offsets(env, packet, pos, course, habits: In[HabitState]):
     """Lanes: how far ahead along the course a remembered turn lies, and how far aside; FAR_M aside for those
     on another course."""
-    dx, dy = habits.turn_x[env, packet] - pos[0], habits.turn_y[env, packet] - pos[1]
+    dx, dy = habits.turn[env, TURN_X, packet] - pos[0], habits.turn[env, TURN_Y, packet] - pos[1]
     along = dx * course[0] + dy * course[1]
     aside = dx * course[1] - dy * course[0]
-    alike = habits.in_x[env, packet] * course[0] + habits.in_y[env, packet] * course[1]
-    weight = habits.weight[env, packet]
+    alike = habits.turn[env, IN_X, packet] * course[0] + habits.turn[env, IN_Y, packet] * course[1]
+    weight = habits.turn[env, WEIGHT, packet]
     across = f16x(FAR_M)
     for lane in ti.static(range(LANES)):
         across[lane] = ti.select(alike[lane] > _ALIKE_COS and weight[lane] > 0.0, ti.abs(aside[lane]), FAR_M)
@@ -223,7 +238,7 @@ def offsets(env, packet, pos, course, habits: In[HabitState]):
 def next_turn(env, pos, course, habits: In[HabitState], forecast_cfg: Const[ForecastConfig]):
     """(distance [m] to the nearest remembered turn ahead, course after it); FAR_M = none."""
     gap, slot = FAR_M, 0
-    for packet in range(habits.weight.shape[1]):
+    for packet in range(habits.turn.shape[2]):
         along, across = offsets(env, packet, pos, course, habits)
         for lane in ti.static(range(LANES)):
             meets = (
@@ -236,7 +251,10 @@ def next_turn(env, pos, course, habits: In[HabitState], forecast_cfg: Const[Fore
     if gap < FAR_M:
         gap = ti.max(gap, 0.0)
         out = ti.Vector(
-            [habits.out_x[env, slot // LANES][slot % LANES], habits.out_y[env, slot // LANES][slot % LANES]]
+            [
+                habits.turn[env, OUT_X, slot // LANES][slot % LANES],
+                habits.turn[env, OUT_Y, slot // LANES][slot % LANES],
+            ]
         )
     return gap, out
 

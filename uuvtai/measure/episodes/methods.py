@@ -90,9 +90,9 @@ class Method:
             from uuvtai.learn.set_pilot import load_set_pilot
 
             return PolicyNote(load_set_pilot(self.checkpoint, sim), self.checkpoint.sha256, None)
+        pilot = load_pilot(self.checkpoint, sim.num_envs, sim.device)
         self.checkpoint.check_table(VectorEnv(sim).observation_table, sim.config)
         weight = self.checkpoint.manifest.metrics.get("distill/lambda")
-        pilot = load_pilot(self.checkpoint, sim.num_envs, sim.device)
         return PolicyNote(pilot, self.checkpoint.sha256, weight if isinstance(weight, float) else None)
 
     def planner_for(self, sim: Sim) -> RoutePlanner | None:

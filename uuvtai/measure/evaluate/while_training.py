@@ -7,14 +7,11 @@ from typing import TYPE_CHECKING
 from uuvtai.config.learning import LearningConfig
 
 if TYPE_CHECKING:
-    from uuvtai.learn.chooser_trainer import ChooserTrainer
-    from uuvtai.learn.run import Metrics
-    from uuvtai.learn.train import Trainer
-    from uuvtai.learn.twin_trainer import TwinTrainer
+    from uuvtai.learn.run import AnyTrainer, Metrics
     from uuvtai.measure.evaluate.foresight import Foresight
 
 
-def evaluate_now(trainer: Trainer | TwinTrainer | ChooserTrainer, config: LearningConfig) -> Metrics:
+def evaluate_now(trainer: AnyTrainer, config: LearningConfig) -> Metrics:
     """``eval/*``: the policy as it is, without exploration, on scenarios of its own; training goes on as if
     nothing had been.
 
@@ -22,13 +19,14 @@ def evaluate_now(trainer: Trainer | TwinTrainer | ChooserTrainer, config: Learni
     others judge it.
     """
     from uuvtai.learn.chooser_trainer import ChooserTrainer
+    from uuvtai.learn.forecast_trainer import ForecastTrainer
     from uuvtai.learn.pilot import Pilot
     from uuvtai.learn.twin_trainer import TwinTrainer
     from uuvtai.measure.episodes.playing import Recorders, jobs_of, run_episodes
     from uuvtai.measure.evaluate.foresight import foresight_of
     from uuvtai.measure.evaluate.summary import summary
 
-    if isinstance(trainer, TwinTrainer | ChooserTrainer):  # they play by themselves
+    if isinstance(trainer, TwinTrainer | ChooserTrainer | ForecastTrainer):  # they play by themselves
         return trainer.evaluate()
     env = trainer.env
     model = trainer.world_model if config.world_model.as_features else None

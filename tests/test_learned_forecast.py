@@ -1,0 +1,262 @@
+"""Learning what bodies will do: what is learnt from, likelihood and scores, resuming; and the forecast in the
+whole simulator."""
+
+import copy
+import math
+from operator import attrgetter
+
+import numpy as np
+import pytest
+import torch
+
+from tests.conftest import SmallSim
+from tests.test_observation_only import compared
+from uuvtai.closed_form import describe_scenario, path_positions
+from uuvtai.errors import UserError
+from uuvtai.forecast_codes import ANCHORS, COLUMNS, N_COLUMN, N_MODE
+from uuvtai.learn import checkpoint, forecast_trainer
+from uuvtai.learn.forecast_scores import LEVELS, coverage_of, reliability_of, scores_of
+from uuvtai.learn.forecast_trainer import ForecastTrainer, column_row
+from uuvtai.learn.manifest import CheckpointError
+from uuvtai.learn.mixture_net import TIMES_S, Mixture, MixtureNet, negative_log_likelihood
+from uuvtai.learn.pilot import load_pilot
+from uuvtai.learn.run import TrainRequest, train
+from uuvtai.learn.track_futures import TrackMoments, path_places, watch
+from uuvtai.loader import ConfigError, load_training
+from uuvtai.mixture_weights import packed_weights, read_weights
+from uuvtai.twin.scenario_bank import scenario_rows
+
+SMALL = {
+    "train.num_envs": 8,
+    "train.iterations": 4,
+    "forecaster.memory": 1024,
+    "forecaster.minibatches": 20,
+    "forecaster.minibatch": 64,
+}
+
+
+def made_up(seed, n=400):
+    """Moments of bodies that go on or turn back at once, each half of the time; column 5 tells nothing."""
+    generator = torch.Generator().manual_seed(seed)
+    columns = torch.zeros(n, N_COLUMN)
+    columns[:, 0] = 0.5 + torch.rand(n, generator=generator)
+    columns[:, 5] = torch.rand(n, generator=generator)
+    way = (
+        columns[:, 0, None]
+        * TIMES_S
+        * torch.where(torch.rand(n, generator=generator) < 0.5, 1.0, -1.0)[:, None]
+    )
+    truth = torch.stack([way, torch.zeros_like(way)], -1)
+    frame = torch.cat([torch.zeros(n, 4), columns[:, :1]], -1)
+    nothing = torch.zeros(n, 1)
+    return TrackMoments(columns, frame, truth, truth, nothing, truth[:, None])
+
+
+@pytest.fixture
+def config():
+    return load_training("forecast", overrides=SMALL)
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """In place of simulators: moments that follow from seed and number of the first episode."""
+    monkeypatch.setattr(forecast_trainer, "simulator_of", lambda *_arguments: None)
+    monkeypatch.setattr(
+        forecast_trainer, "watch", lambda _sim, _scenes, seed, first, _steps: (made_up(seed + first), 100)
+    )
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory, taichi_runtime):
+    """A small simulator that forecasts by a network which has learnt nothing."""
+
+    class LearnedSim(SmallSim):
+        CHANGES = SmallSim.CHANGES | {
+            "forecast.learned": str(tmp_path_factory.mktemp("net") / "f.safetensors")
+        }
+
+    net = MixtureNet(torch.Generator().manual_seed(3))
+    with open(LearnedSim.CHANGES["forecast.learned"], "wb") as file:
+        file.write(packed_weights(net.weights()))
+    found = LearnedSim()
+    found.net = net
+    return found
+
+
+# ------------------------------------------------------------------------------------------------- likelihood
+
+
+def test_the_likelihood_is_that_of_the_mixture():
+    rng = np.random.default_rng(1)
+    n = 20
+    weight = rng.dirichlet(np.ones(N_MODE), n)
+    place, sigma = rng.normal(0, 1, (n, N_MODE, ANCHORS, 2)), rng.uniform(0.1, 2, (n, N_MODE, ANCHORS, 2))
+    truth = rng.normal(0, 1, (n, ANCHORS, 2))
+    density = np.exp(-0.5 * ((truth[:, None] - place) / sigma) ** 2) / sigma / math.sqrt(2 * math.pi)
+    expected = -np.log((weight * density.prod((-1, -2))).sum(-1))
+    mixture = Mixture(*(torch.from_numpy(values) for values in (np.log(weight), place, sigma)))
+    found = negative_log_likelihood(mixture, torch.from_numpy(truth))
+    np.testing.assert_allclose(found.numpy(), expected, rtol=1e-9)
+
+
+def drawn_from(n, seed):
+    """(mixture, truth drawn from it)"""
+    generator = torch.Generator().manual_seed(seed)
+    weight = torch.tensor([0.5, 0.3, 0.2]).expand(n, -1)
+    place = torch.randn(n, 3, ANCHORS, 2, generator=generator) * 3
+    sigma = 0.1 + torch.rand(n, 3, ANCHORS, 2, generator=generator)
+    which = torch.multinomial(weight, 1, generator=generator)[:, :, None, None].expand(-1, -1, ANCHORS, 2)
+    truth = place.gather(1, which)[:, 0] + sigma.gather(1, which)[:, 0] * torch.randn(
+        n, ANCHORS, 2, generator=generator
+    )
+    return Mixture(weight.log(), place, sigma), truth
+
+
+def test_a_forecast_that_is_right_covers_as_much_as_it_says():
+    mixture, truth = drawn_from(4000, 2)
+    found = coverage_of(mixture, truth, 300, torch.Generator().manual_seed(1))
+    np.testing.assert_allclose(found, LEVELS, atol=0.03)
+    narrow = mixture._replace(sigma=0.3 * mixture.sigma)
+    assert coverage_of(narrow, truth, 300, torch.Generator().manual_seed(1))[0] < 0.35
+
+
+def test_scores_and_bins():
+    mixture, truth = drawn_from(4000, 3)
+    scores = scores_of(mixture, truth)
+    last = np.linalg.norm(mixture.place[:, :, -1].numpy() - truth[:, None, -1].numpy(), axis=-1)
+    assert scores["likeliest_median_m"] == pytest.approx(np.median(last[:, 0]), rel=1e-3)
+    assert scores["nearest_p90_m"] == pytest.approx(np.quantile(last.min(-1), 0.9), rel=1e-3)
+    assert scores["likeliest_said"] == pytest.approx(0.5)
+    rows = reliability_of(torch.tensor([0.05, 0.07, 0.95]), torch.tensor([0, 1, 1]))
+    assert [row[2] for row in rows] == [2, 1]
+    assert rows[0][:2] == pytest.approx((0.06, 0.5))
+
+
+# ------------------------------------------------------------------------------------------------------ learn
+
+
+def test_it_learns_two_futures_and_how_probable_they_are(config, made):
+    config = config.model_copy(
+        update={"forecaster": config.forecaster.model_copy(update={"minibatches": 150})}
+    )
+    trainer = ForecastTrainer(config)
+    first = trainer.evaluate()
+    for _ in range(4):
+        metrics = trainer.iterate()
+    last = trainer.evaluate()
+    assert metrics["train/moments"] == 1024, "what is kept is bounded"
+    assert last["eval/nll_pool"] < first["eval/nll_pool"] - 5
+    assert last["eval/nearest_p90_m_pool"] < 0.2
+    assert last["eval/likeliest_said_pool"] == pytest.approx(0.5, abs=0.1)
+
+
+def test_a_resumed_training_goes_on_bit_for_bit(config, made):
+    one = ForecastTrainer(config)
+    one.iterate()
+    held = copy.deepcopy(one.state())
+    one.iterate()
+    other = ForecastTrainer(config)
+    other.load_state(held)
+    other.iterate()
+    assert other.exported() == one.exported()
+    for name, value in one.state()["env"].items():
+        assert torch.equal(value, other.state()["env"][name])
+
+
+class Silent:
+    """Nobody watches."""
+
+    def __getattr__(self, _name):
+        return lambda *_arguments: None
+
+
+def test_a_run_leaves_the_file_that_a_stack_forecasts_with(config, made, tmp_path):
+    run = tmp_path / "run"
+    request = TrainRequest(config=config, run_dir=run, iterations=2)
+    document, _ = train(request, Silent(), lambda *_arguments: {})
+    assert document["iterations"] == 2
+    halfway = read_weights(str(run))
+    train(TrainRequest(resume=run), Silent(), lambda *_arguments: {})
+    found = checkpoint.newest(run)
+    assert found.step == 4
+    net = MixtureNet(torch.Generator())
+    net.load_state_dict(found.model()["forecast"])
+    whole = read_weights(str(run))
+    assert all(np.array_equal(whole[name], values) for name, values in net.weights().items())
+    assert any(not np.array_equal(whole[name], values) for name, values in halfway.items())
+    back = MixtureNet(torch.Generator())
+    back.take_weights(whole)
+    assert all(torch.equal(a, b) for a, b in zip(back.parameters(), net.parameters(), strict=True))
+    with pytest.raises(CheckpointError, match="forecasts and does not drive"):
+        load_pilot(found, 1)
+
+
+def test_what_cannot_be_learnt_is_refused(config, tmp_path):
+    forecast = config.forecast.model_copy(update={"learned": "shipped"})
+    with pytest.raises(UserError, match="leave it empty"):
+        ForecastTrainer(config.model_copy(update={"forecast": forecast}))
+    with pytest.raises(ConfigError, match="in one process on the CPU"):
+        train(TrainRequest(config=config, run_dir=tmp_path / "run", device="cuda"), Silent(), lambda *_a: {})
+
+
+# ---------------------------------------------------------------------------------------------- the simulator
+
+
+def test_bodies_are_where_the_closed_form_has_them(small):
+    small.begin(range(small.N), seed=5)
+    path = scenario_rows(small.sim)[1]
+    times = np.random.default_rng(1).uniform(0, 30, (small.N, 7))
+    found, compared_bodies = path_places(path, times), 0
+    for row in range(small.N):
+        s = small.sim.s
+        scenario = describe_scenario(lambda name: small.sim.rows(attrgetter(name)(s), [row])[0])  # noqa: B023
+        moving = [body for body in scenario["bodies"] if body["path"]]
+        first = min(body["slot"] for body in moving)
+        for body in moving:
+            own = path_positions(body["path"], times[row])
+            np.testing.assert_allclose(found[row, body["slot"] - first], own, atol=1e-4)
+            compared_bodies += 1
+    assert compared_bodies == 8 * 6
+    assert np.isnan(found).any(), "empty slots are nowhere"
+
+
+def test_what_is_watched_is_what_came(learned):
+    learned.forget()
+    moments, steps = watch(learned.sim, ((8, 6, 0.6),), 7, 0, 300)
+    assert steps <= 8 * 300
+    assert len(moments.truth) > 50
+    assert moments.columns[:, :COLUMNS].isfinite().all() and (moments.columns[:, COLUMNS:] == 0).all()
+    assert torch.equal(moments.columns[:, 0], moments.frame[:, 4])
+    far = moments.truth[:, -1].norm(dim=-1)
+    assert far.max() < 2.5 * 0.6 + 0.5 + 1e-3, "no body is faster than its scene says"
+    ahead = (moments.truth[:, 0] - torch.stack([0.5 * moments.frame[:, 4], 0 * far], -1)).norm(dim=-1)
+    assert ahead.median() < 0.1, "most bodies go on as they are tracked"
+    said = learned.net(moments.columns, moments.frame[:, 4]).log_weight.exp()
+    likeliest = torch.nn.functional.one_hot(said.argmax(-1), N_MODE) == 1
+    torch.testing.assert_close(moments.share, said.masked_fill(likeliest, 0.0), atol=2e-5, rtol=0)
+
+
+def test_futures_do_not_depend_on_the_truth(learned):
+    learned.forget()
+    learned.sim.observe()
+    try:
+        actions, differing, written = compared(learned)
+    finally:
+        learned.forget()
+    assert (differing, written) == ([], set())
+    assert actions.abs().mean() > 0.1
+
+
+def test_a_forecast_is_the_same_in_any_row_and_company(learned):
+    found = []
+    for rows, episodes in (([0, 1], [0, 1]), ([6, 3, 0], [0, 1, 5])):
+        learned.forget()
+        learned.begin(episodes, seed=4, rows=rows)
+        for _ in range(100):
+            learned.sim.step()
+        arrays = learned.arrays("futures", "past", "mixture", "forecast")
+        found.append([{k: v[row] for k, v in arrays.items() if len(v) == 8} for row in rows[:2]])
+    for one, other in zip(*found, strict=True):
+        assert [name for name in one if not np.array_equal(one[name], other[name])] == []
+    assert found[0][0]["futures.share"].any()
+    assert column_row().slice == slice(0, COLUMNS)

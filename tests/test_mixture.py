@@ -1,0 +1,286 @@
+"""The learned forecast: what the network is told, what its kernel says, its weights' file."""
+
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import save
+
+from tests.bundles import io_for
+from uuvtai import forecast_codes
+from uuvtai.config import Config
+from uuvtai.errors import UserError
+from uuvtai.kernels.core.lanes import LANES
+from uuvtai.kernels.perception import mixture, motion_columns
+from uuvtai.kernels.perception.bundles import MixtureIO, PastIO
+from uuvtai.learn.mixture_net import TIMES_S, MixtureNet, mirrored
+from uuvtai.mixture_weights import SHAPES, SPREADS, packed_weights, put_weights, read_weights
+from uuvtai.state import (
+    ClockState,
+    ClusterState,
+    ForecastState,
+    FutureState,
+    HabitState,
+    MixtureState,
+    PastState,
+    TrackState,
+    allocate,
+)
+
+CFG = Config()
+N_ENV, N_TRACK, N_SAMPLE = 3, 4, 26
+SIZES = {
+    "n_env": N_ENV, "n_ray": 16, "n_track": N_TRACK, "n_cluster": 1, "n_height": LANES, "n_turn_row": 7,
+    "n_turn": 48, "n_forecast": N_SAMPLE, "n_future": forecast_codes.N_MODE, "n_past": forecast_codes.N_PAST,
+    "n_bend": forecast_codes.N_BEND, "n_frame": forecast_codes.N_FRAME, "n_column": forecast_codes.N_COLUMN,
+    "n_hidden": 2 * forecast_codes.N_HIDDEN, "n_said": forecast_codes.N_SAID,
+    "n_weight": forecast_codes.N_WEIGHT,
+}  # fmt: skip
+TOLERANCE = 2e-5
+"""float32 sums of 64 in another order"""
+WIDTH_M, LENGTH_M = 6.0, 20.0
+
+
+class Stage:
+    """Tracks of bodies, what is remembered of them, and a network that says what they may do."""
+
+    def __init__(self):
+        kinds = (TrackState, HabitState, ForecastState, FutureState, ClockState, ClusterState)
+        self.tracks, self.habits, self.forecast, self.futures, self.clock, self.clusters = (
+            allocate(kind, SIZES) for kind in kinds
+        )
+        self.past, self.mixture = allocate(PastState, SIZES), allocate(MixtureState, SIZES)
+
+    def begin(self):
+        for struct in (self.tracks, self.habits, self.forecast, self.futures, self.clock, self.clusters):
+            for field in vars(struct).values():
+                field.fill(0)
+        self.clock.awake.fill(1)
+        self.clusters.fresh.fill(1)
+        self.tracks.alive.fill(1)
+        self.tracks.moving.fill(1)
+        self.tracks.age.fill(9)
+        self.tracks.radius_m.fill(0.2)
+        motion_columns.reset_past(self.past_io())
+        return self
+
+    def past_io(self):
+        structs = (
+            self.mixture,
+            self.past,
+            self.clock,
+            self.clusters,
+            self.forecast,
+            self.habits,
+            self.tracks,
+            CFG,
+        )
+        return io_for(PastIO, *structs)
+
+    def swim(self, places, velocity):
+        """Every body at a place (n_env, n_track, 2), on a velocity, for a scan."""
+        state = np.concatenate([places, velocity], -1).astype(np.float32)
+        self.tracks.state.from_numpy(np.broadcast_to(state, (N_ENV, N_TRACK, 4)).copy())
+        ahead = 0.1 * np.arange(N_SAMPLE)[:, None]
+        way = (places[..., None, :] + ahead * velocity[..., None, :]).astype(np.float32)
+        self.forecast.pos_w.from_numpy(np.broadcast_to(way, (N_ENV, N_TRACK, N_SAMPLE, 2)).copy())
+
+    def scan(self, step):
+        self.clock.step.fill(step)
+        self.tracks.scan_step.fill(step)
+        self.tracks.seen_step.fill(step)
+        motion_columns.remember_past(self.past_io())
+
+    def columns(self):
+        motion_columns.describe_motion(self.past_io())
+        return self.mixture.column.to_numpy()
+
+    def mix(self):
+        structs = (self.forecast, self.futures, self.mixture, self.clock, CFG)
+        mixture.mix_futures(io_for(MixtureIO, *structs))
+        return self.futures.share.to_numpy(), self.futures.pos_w.to_numpy(), self.forecast.pos_w.to_numpy()
+
+
+@pytest.fixture(scope="module")
+def stage():
+    return Stage()
+
+
+@pytest.fixture(scope="module")
+def net():
+    """A network that says something different of every track."""
+    found = MixtureNet(torch.Generator().manual_seed(3))
+    with torch.no_grad():
+        found.said.weight.mul_(8.0)
+    return found
+
+
+def drive(stage, begin, velocity, seconds):
+    """A straight way from ``begin`` (..., 2), a scan every 0.06 s, up to a decision step."""
+    last = 5 * round(seconds * 10)
+    for step in range(last % 3, last + 1, 3):
+        stage.swim(begin + 0.02 * step * velocity, velocity)
+        stage.scan(step)
+    return last
+
+
+def put(field, values):
+    field.from_numpy(np.ascontiguousarray(values, field.to_numpy().dtype))
+
+
+def test_the_kernel_says_what_the_network_says(stage, net):
+    stage.begin()
+    put_weights(stage.mixture, net.weights(), put)
+    rng = np.random.default_rng(1)
+    told = rng.normal(0, 0.5, (N_ENV, N_TRACK, forecast_codes.N_COLUMN)).astype(np.float32)
+    course, speed = rng.uniform(-np.pi, np.pi, (N_ENV, N_TRACK)), rng.uniform(0.3, 1.5, (N_ENV, N_TRACK))
+    place = rng.uniform(1, 5, (N_ENV, N_TRACK, 2))
+    frame = np.concatenate([place, np.stack([np.cos(course), np.sin(course), speed], -1)], -1)
+    put(stage.mixture.column, told)
+    put(stage.mixture.frame, frame)
+    share, pos, forecast = stage.mix()
+    said = net(torch.from_numpy(told).view(-1, told.shape[-1]), torch.from_numpy(speed).float().view(-1))
+    weight = said.log_weight.exp().detach().numpy().reshape(share.shape)
+    likeliest = weight.argmax(-1)
+    others = np.arange(forecast_codes.N_MODE) != likeliest[..., None]
+    np.testing.assert_allclose(share, weight * others, atol=TOLERANCE)
+    places = said.place.detach().numpy().reshape(*share.shape, len(TIMES_S), 2)
+    for env, track, mode in np.ndindex(share.shape):
+        turn = np.array([[np.cos(a := course[env, track]), -np.sin(a)], [np.sin(a), np.cos(a)]])
+        anchors = np.concatenate([np.zeros((1, 2)), places[env, track, mode]]) @ turn.T + place[env, track]
+        way = np.stack(
+            [np.interp(0.1 * np.arange(N_SAMPLE), 0.5 * np.arange(6), anchors[:, i]) for i in (0, 1)], -1
+        )
+        here = way[0]
+        for k in range(1, N_SAMPLE):  # never faster than now
+            step = way[k] - here
+            here = here + step * min(1.0, 0.1 * speed[env, track] / max(np.linalg.norm(step), 1e-9))
+            np.testing.assert_allclose(pos[env, track, mode, k], here, atol=2e-4)
+    best = np.take_along_axis(pos, likeliest[..., None, None, None], 2)[:, :, 0]
+    np.testing.assert_array_equal(forecast, best)
+
+
+def test_tracks_without_a_forecast_have_no_futures(stage, net):
+    stage.begin()
+    put_weights(stage.mixture, net.weights(), put)
+    radius = np.zeros((N_ENV, N_TRACK, N_SAMPLE), np.float32)
+    radius[:, 1] = -1.0
+    stage.forecast.radius_m.from_numpy(radius)
+    share, _, _ = stage.mix()
+    assert not share[:, 1].any()
+    assert (share[:, 0].sum(-1) > 0).all()
+    stage.clock.step.fill(3)  # no decision step: nothing is said anew
+    stage.forecast.radius_m.fill(-1.0)
+    assert (stage.mix()[0] == share).all()
+
+
+def test_a_straight_way_is_told_by_its_places_and_walls(stage):
+    stage.begin()
+    begin, velocity = np.array([3.0, 2.0]), np.array([1.0, 0.0])
+    last = drive(stage, begin, velocity, 4.0)
+    columns = stage.columns()[0, 0]
+    assert columns[0] == pytest.approx(1.0)
+    at = forecast_codes.N_MOTION
+    x, y = begin + 0.02 * last * velocity
+    far = forecast_codes.FAR
+    walls = [LENGTH_M - x - 0.2, x - 0.2, WIDTH_M - y - 0.2, y - 0.2]
+    np.testing.assert_allclose(columns[at : at + 4], np.minimum(np.array(walls) / 4, far), atol=1e-5)
+    past = columns[forecast_codes.COLUMNS - 1 - 2 * forecast_codes.N_PAST : forecast_codes.COLUMNS - 1]
+    apart = np.diff(past.reshape(-1, 2), axis=0)
+    np.testing.assert_allclose(apart, np.tile([-0.3 / 4, 0.0], (len(apart), 1)), atol=1e-5)
+    late = columns[forecast_codes.COLUMNS - 1]
+    assert past[0] == pytest.approx(-late / 4, abs=1e-5)
+    assert 0 <= late < 0.3
+
+
+def test_a_mirrored_track_has_mirrored_columns(stage):
+    rng = np.random.default_rng(2)
+    begin, velocity = (
+        rng.uniform([4, 1.5], [12, 4.5], (N_ENV, N_TRACK, 2)),
+        rng.normal(0, 0.7, (N_ENV, N_TRACK, 2)),
+    )
+    rate = rng.normal(0, 1, (N_ENV, N_TRACK))
+    told = []
+    for flip in (1, -1):
+        mirror = np.array([1.0, flip])
+        stage.begin()
+        put(stage.tracks.turn_rate, flip * rate)
+        stage.tracks.turn_cov.fill(0.1)
+        put(
+            stage.habits.run_from_w,
+            np.where(flip > 0, 0, WIDTH_M) * np.array([0, 1]) + (begin - 0.5) * mirror,
+        )
+        stage.habits.run_kind.fill(2)
+        turned = np.zeros((N_ENV, 7, 3, LANES), np.float32)
+        turned[..., 0] = np.array([14, 3, 1, 0, -0.6, 0.8 * flip, 1.0])[None, :, None]
+        stage.habits.turn.from_numpy(turned)
+        drive(
+            stage, np.where(flip > 0, 0, WIDTH_M) * np.array([0, 1]) + begin * mirror, velocity * mirror, 2.0
+        )
+        told.append(stage.columns().reshape(-1, forecast_codes.N_COLUMN))
+    straight, other = (torch.from_numpy(part) for part in told)
+    nothing = torch.zeros(len(straight), len(TIMES_S), 2)
+    torch.testing.assert_close(mirrored(straight, nothing)[0], other, atol=1e-5, rtol=0)
+    torch.testing.assert_close(mirrored(*mirrored(straight, nothing))[0], straight)
+
+
+def test_a_new_track_remembers_nothing(stage):
+    stage.begin()
+    drive(stage, np.array([3.0, 2.0]), np.array([1.0, 0.0]), 3.0)
+    assert (stage.past.past_count.to_numpy() == forecast_codes.N_PAST).all()
+    age = np.full((N_ENV, N_TRACK), 9, np.int32)
+    age[:, 2] = 0
+    stage.tracks.age.from_numpy(age)
+    stage.scan(153)
+    count = stage.past.past_count.to_numpy()
+    assert (count[:, 2] == 1).all()
+    assert (count[:, [0, 1, 3]] == forecast_codes.N_PAST).all()
+
+
+def test_turns_are_remembered_newest_first(stage):
+    stage.begin()
+    stage.habits.run_kind.fill(2)
+    bends = [(2.0, 2.0), (5.0, 2.0), (2.05, 2.0), (5.1, 2.0), (2.0, 2.1), (5.0, 2.1)]
+    for nth, bend in enumerate(bends):
+        for again in range(2):
+            put(stage.habits.run_from_w, np.broadcast_to(bend, (N_ENV, N_TRACK, 2)))
+            stage.scan(30 * nth + 3 * again)
+    n = forecast_codes.N_BEND
+    np.testing.assert_allclose(stage.past.bend_w.to_numpy()[0, 0], bends[::-1][:n], atol=1e-6)
+    assert (stage.past.bend_count.to_numpy() == n).all()
+
+
+# ---------------------------------------------------------------------------------------------- weights
+
+
+def test_weights_come_back_from_their_file(tmp_path, net):
+    path = tmp_path / "forecast.safetensors"
+    path.write_bytes(packed_weights(net.weights()))
+    for given in (path, tmp_path):
+        found = read_weights(str(given))
+        assert list(found) == [*SHAPES, *SPREADS]
+        for name, values in net.weights().items():
+            np.testing.assert_array_equal(found[name], values)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (None, "there is no"),
+        (lambda w: b"nonsense", "is no safetensors file"),
+        (lambda w: save({k: v for k, v in w.items() if k != "bias_mid"}), "bias_mid is missing"),
+        (lambda w: save(w | {"bias_mid": np.zeros(3, np.float32)}), "not float32"),
+        (lambda w: save(w | {"bias_mid": np.full(64, np.nan, np.float32)}), "is not finite"),
+        (lambda w: save(w | {"bias_mid": np.zeros(64)}), "not float32"),
+    ],
+)
+def test_files_that_hold_no_forecast_are_refused(tmp_path, net, spoil, says):
+    path = tmp_path / "forecast.safetensors"
+    if spoil:
+        path.write_bytes(spoil(net.weights()))
+    with pytest.raises(UserError, match=says):
+        read_weights(str(path))
+
+
+def test_two_sources_of_futures_are_refused():
+    with pytest.raises(ValueError, match="both say what bodies may do"):
+        Config.model_validate({"forecast": {"learned": "shipped", "turn_back_s": [0.5]}})
