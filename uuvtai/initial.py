@@ -22,7 +22,12 @@ def allocate_state(sizes: dict[str, int]) -> SimState:
 
 
 def fill_constants(s: SimState, config: Config, put: Put) -> None:
-    """What no step changes: explicit obstacles, the tank's bounds on the map, the thrusters' geometry."""
+    """What no step changes: explicit obstacles, the tank's bounds on the map, the thrusters' geometry, a
+    learned forecast. Raises ForecastError, FileError."""
+    if config.forecast.learned:
+        from uuvtai.mixture_weights import put_weights, read_weights
+
+        put_weights(s.mixture, read_weights(config.forecast.learned), put)
     load_fixed(s.fixed, config.world)
     load_bounds(s.mask, np.array(outside_cells(config.world.tank, config.mapping.cell_m)), put)
     wrench_of_thrust, thrust_of_wrench = allocation_matrices(config.vehicle)

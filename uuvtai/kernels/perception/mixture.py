@@ -85,7 +85,7 @@ def _tell(env, track, io: Bundle[MixtureIO]):
                 way = _place_at(env, track, future, k * dt, io) * speed
                 wanted = place + ti.Vector([along * way[0] - aside * way[1], aside * way[0] + along * way[1]])
                 step = wanted - there
-                there += step * ti.min(1.0, speed * dt / ti.max(step.norm(), 1.0e-6))
+                there += step * ti.min(1.0, speed * dt / ti.max(ti.math.length(step), 1.0e-6))
             io.futures.pos_w[env, track, future, k] = there
             if future == likeliest:
                 io.forecast.pos_w[env, track, k] = there

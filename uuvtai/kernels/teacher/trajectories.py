@@ -43,7 +43,7 @@ def body_depths(
     for track in range(ti.static(forecast.radius_m.shape[1])):
         near = forecast.radius_m[env, track, 0] >= 0
         if near and _within_reach(env, track, drive, forecast, teacher_cfg, tracking_cfg):
-            left, peak, contact = 1.0, filled(0.0, drive.x.n), filled(0.0, drive.x.n)
+            left, body = 1.0, _no_depths(drive)
             for nth in range(ti.static(futures.share.shape[2] + 1)):
                 future = ti.static(futures.share.shape[2]) - 1 - nth  # the forecast itself comes last: -1
                 likely = left
@@ -54,16 +54,22 @@ def body_depths(
                     one = _future_depths(
                         env, track, future, drive, forecast, futures, teacher_cfg, tracking_cfg, tank_cfg
                     )
-                    found.mean += likely * one.mean
-                    peak += likely * one.peak
-                    contact += likely * one.contact
-                    if likely >= ti.static(teacher_cfg.heed_share):
-                        for i in ti.static(range(drive.x.n)):
-                            found.first[i] = ti.min(found.first[i], one.first[i])
+                    _take_future(found, body, one, likely, teacher_cfg)
             for i in ti.static(range(drive.x.n)):
-                found.peak[i] = ti.max(found.peak[i], peak[i])
-                found.contact[i] = ti.max(found.contact[i], contact[i])
+                found.peak[i] = ti.max(found.peak[i], body.peak[i])
+                found.contact[i] = ti.max(found.contact[i], body.contact[i])
     return found.peak, found.mean, found.contact, found.first
+
+
+@ti.func
+def _take_future(found: Out[Any], body: Out[Any], one, likely, teacher_cfg: Const[TeacherConfig]):
+    """Add the depths of ``one`` future, as ``likely`` as it is, to those of its body and of all."""
+    found.mean += likely * one.mean
+    body.peak += likely * one.peak
+    body.contact += likely * one.contact
+    if likely >= ti.static(teacher_cfg.heed_share):
+        for i in ti.static(range(one.first.n)):
+            found.first[i] = ti.min(found.first[i], one.first[i])
 
 
 @ti.func
