@@ -11,6 +11,7 @@ from uuvtai.allocation import allocation_matrices
 from uuvtai.bounds import load_bounds
 from uuvtai.config import Config
 from uuvtai.kernels.core.grid import outside_cells
+from uuvtai.mixture_weights import put_weights, read_weights
 from uuvtai.scenario import load_fixed
 from uuvtai.stages import SimState
 from uuvtai.taichi_patches.memory import Put
@@ -22,9 +23,12 @@ def allocate_state(sizes: dict[str, int]) -> SimState:
 
 
 def fill_constants(s: SimState, config: Config, put: Put) -> None:
-    """What no step changes: explicit obstacles, the tank's bounds on the map, the thrusters' geometry."""
+    """What no step changes: explicit obstacles, the tank's bounds on the map, the thrusters' geometry, a
+    learned forecast's weights. Raises ForecastError."""
     load_fixed(s.fixed, config.world)
     load_bounds(s.mask, np.array(outside_cells(config.world.tank, config.mapping.cell_m)), put)
     wrench_of_thrust, thrust_of_wrench = allocation_matrices(config.vehicle)
     put(s.allocation.wrench_of_thrust, wrench_of_thrust.astype(np.float32))
     put(s.allocation.thrust_of_wrench, thrust_of_wrench.astype(np.float32))
+    if config.forecast.learned:
+        put_weights(s.mixture, read_weights(config.forecast.learned), put)

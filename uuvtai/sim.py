@@ -25,7 +25,6 @@ from uuvtai.kernels.planning import clearance, exposure, features, route, trigge
 from uuvtai.kernels.task import episode, reward
 from uuvtai.kernels.vehicle import actuation, dynamics, lost_thruster
 from uuvtai.kernels.world import scenarios
-from uuvtai.mixture_weights import put_weights, read_weights
 from uuvtai.native.making import adopt
 from uuvtai.rrt import RouteFallback, RoutePlanner
 from uuvtai.runtime import start_taichi
@@ -53,7 +52,6 @@ class Sim:
         runtime = start_taichi(device)
         self.device = torch.device(runtime.device)
         check_size(config, num_envs, runtime.device)
-        learned = read_weights(config.forecast.learned) if config.forecast.learned else {}
         self.s = allocate_state(array_sizes(config, num_envs, runtime.device))
         self.io = bind_all(Stages, self.s, config.model_copy(update={"world": config.world.compiled()}))
         self.action = torch.zeros(num_envs, 4, device=self.device)
@@ -75,7 +73,6 @@ class Sim:
         self.use_tree(tree)
         self.set_scenes()
         fill_constants(self.s, config, self.put)
-        put_weights(self.s.mixture, learned, self.put)
 
     def use_tree(self, tree: FlatTree) -> None:
         """Drive by another behaviour tree from the next tick on: nothing is compiled again."""
