@@ -78,5 +78,4 @@ def packed_weights(weights: Weights) -> bytes:
 
 def put_weights(mixture: MixtureState, weights: Weights, put: Put) -> None:
     """Into the simulator's array, in the order of ``SHAPES``."""
-    if weights:
-        put(mixture.weight, np.concatenate([weights[name].ravel() for name in SHAPES]).reshape(-1, PACKET))
+    put(mixture.weight, np.concatenate([weights[name].ravel() for name in SHAPES]).reshape(-1, PACKET))
