@@ -192,15 +192,20 @@ def _check_sizes(parts: dict[str, Any], config: LearningConfig, n_obs: int) -> N
                 )
 
 
-def load_pilot(checkpoint: Checkpoint, num_envs: int, device: torch.device | str = "cpu") -> Pilot:
-    """Pilot with the networks of a checkpoint. Raises CheckpointError where they do not fit what its config
-    says."""
-    config, rows = checkpoint.config, checkpoint.manifest.observation_table
-    if config.forecaster.enabled:
+def refuse_forecaster(checkpoint: Checkpoint) -> None:
+    """CheckpointError for a network that does not drive."""
+    if checkpoint.config.forecaster.enabled:
         raise CheckpointError(
             f"{checkpoint.path}: forecasts and does not drive; give it to a pilot that does: --set "
             "forecast.learned=RUN"
         )
+
+
+def load_pilot(checkpoint: Checkpoint, num_envs: int, device: torch.device | str = "cpu") -> Pilot:
+    """Pilot with the networks of a checkpoint. Raises CheckpointError where they do not fit what its config
+    says."""
+    config, rows = checkpoint.config, checkpoint.manifest.observation_table
+    refuse_forecaster(checkpoint)
     if config.twin.enabled or config.chooser.enabled:
         raise CheckpointError(
             f"{checkpoint.path}: a policy over a set of bodies, which looks at the simulator itself; it "

@@ -16,7 +16,7 @@ from uuvtai.config import Section
 
 _SEEN_BY_KERNELS = (
     "kernels", "config", "state", "native", "taichi_patches",
-    "outcomes.py", "plan_codes.py", "tree_codes.py", "truth.py",
+    "forecast_codes.py", "outcomes.py", "plan_codes.py", "tree_codes.py", "truth.py",
 )  # fmt: skip
 """files and folders of the package that a kernel's code can depend on (``tests/test_native.py`` compares them
 with what the kernels import)"""

@@ -79,7 +79,7 @@ class Method:
         if self.checkpoint is None:
             return None
         from uuvtai.env import VectorEnv
-        from uuvtai.learn.pilot import load_pilot
+        from uuvtai.learn.pilot import load_pilot, refuse_forecaster
         from uuvtai.logs.log_recorder import PolicyNote
 
         if self.checkpoint.config.chooser.enabled:
@@ -90,9 +90,10 @@ class Method:
             from uuvtai.learn.set_pilot import load_set_pilot
 
             return PolicyNote(load_set_pilot(self.checkpoint, sim), self.checkpoint.sha256, None)
-        pilot = load_pilot(self.checkpoint, sim.num_envs, sim.device)
+        refuse_forecaster(self.checkpoint)
         self.checkpoint.check_table(VectorEnv(sim).observation_table, sim.config)
         weight = self.checkpoint.manifest.metrics.get("distill/lambda")
+        pilot = load_pilot(self.checkpoint, sim.num_envs, sim.device)
         return PolicyNote(pilot, self.checkpoint.sha256, weight if isinstance(weight, float) else None)
 
     def planner_for(self, sim: Sim) -> RoutePlanner | None:
