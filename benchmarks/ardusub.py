@@ -3,7 +3,6 @@
 ArduSub is GPL 3 and no part of this project. ``UUV_ARDUSUB`` names its binary (``waf configure --board
 sitl``, ``waf sub``), ``UUV_ARDUSUB_EPISODES`` how many episodes of the pool are driven (default 20). Without
 it there is nothing to measure. Everything runs by the water's clock, so that a slow machine changes nothing.
-**This was never run against ArduSub yet.**
 """
 
 from __future__ import annotations
@@ -163,7 +162,7 @@ class Rig:
                 elif kind == "STATUSTEXT":
                     self.said = [*self.said, message.text][-60:]
             now_s = self.ports[row].instance.time_s
-            if not 0.0 <= now_s - self._beat_s[row] < 0.5 and link.last_address is not None:
+            if not 0.0 <= now_s - self._beat_s[row] < 0.5 and link.clients:
                 self._beat_s[row] = now_s
                 link.mav.heartbeat_send(6, 8, 0, 0, 4)
 
