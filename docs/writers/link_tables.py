@@ -1,10 +1,17 @@
-"""The table of ``docs/sitl.md``, from the newest results of the benchmark ``closed_loop``."""
+"""The tables of ``docs/sitl.md``, from the newest results of the benchmarks ``closed_loop``, ``ardusub``."""
 
 from __future__ import annotations
 
 from docs.writers.figure_sources import SourceError, Sources
 from uuvtai.statistics import mcnemar_p
 from uuvtai.tables.table import text_table
+
+
+def real_ardusub(sources: Sources) -> str:
+    """What ArduSub itself did in our water."""
+    rows = sources.benchmark("ardusub")["rows"]
+    cells = [[row["what"], f"{row['ours']:.3g} {row['unit']}", row["note"]] for row in rows]
+    return text_table(["tried", "result", "more"], cells)
 
 
 def closed_loop(sources: Sources) -> str:

@@ -69,6 +69,8 @@ class Intake:
         self._newest: dict[str, float] = {}
         self._force_b: tuple[float, np.ndarray] | None = None
         self._zero: dict[str, float] = {}
+        self._depth = -math.inf, 0.0
+        """(time, newest depth [m] of the pressure sensor)"""
         self._origin: np.ndarray | None = None
         self._rangers: dict[int, tuple[float, int, int]] = {}
         self._takers: dict[str, Callable[[Fields, float], list[SensorMessage]]] = {
@@ -175,7 +177,10 @@ class Intake:
             self._origin = place
         found: list[SensorMessage] = []
         if self._config.sensors.localization != "estimated":
-            found.append(PositionFix(time_s, np.array(self._start) + place - self._origin))
+            where = np.array(self._start) + place - self._origin
+            if abs(time_s - self._depth[0]) < _FRESH_S:  # the autopilot's own height lags behind a climb
+                where[2] = -self._depth[1]
+            found.append(PositionFix(time_s, where))
         if time_s - self._newest.get("VISION_POSITION_DELTA", -math.inf) > _FRESH_S:
             east, north, up = _turned(fields["vx"], fields["vy"], fields["vz"], turn)
             cos, sin = math.cos(yaw), math.sin(yaw)
@@ -190,6 +195,7 @@ class Intake:
         vehicle = self._config.vehicle
         depth = _PASCAL * float(fields["press_abs"]) / (vehicle.water_density_kg_m3 * vehicle.gravity_m_s2)
         zero = self._zero.setdefault(name, depth + self._start[2])
+        self._depth = time_s, depth - zero
         return [PressureReading(time_s, depth - zero)]
 
     def _obstacles(self, fields: Fields, time_s: float) -> list[SensorMessage]:
