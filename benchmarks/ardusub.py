@@ -48,8 +48,8 @@ PARAMETERS = {
     "AHRS_EKF_TYPE": 3, "SERIAL1_PROTOCOL": 2, "SERIAL2_PROTOCOL": 2, "LOG_DISARMED": 0,
     "LOG_BACKEND_TYPE": 0, "SIM_BARO_RND": 0.002, "SIM_BAR2_RND": 0.002,
 }  # fmt: skip
-"""beside ArduPilot's own defaults for its simulated submarine (Tools/autotest/default_params/sub.parm); pressure
-as exact as a Bar30's: 2 mm (its maker's data sheet), not the 0.2 m of a barometer in the air"""
+"""beside ArduPilot's own defaults for its simulated submarine (Tools/autotest/default_params/sub.parm);
+pressure as exact as a Bar30's: 2 mm (its maker's data sheet), not the 0.2 m of a barometer in the air"""
 
 
 def measure(job: Job) -> list[Row]:

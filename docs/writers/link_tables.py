@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from docs.writers.figure_sources import SourceError, Sources
 from uuvtai.statistics import mcnemar_p
 from uuvtai.tables.table import text_table
@@ -10,8 +12,14 @@ from uuvtai.tables.table import text_table
 def real_ardusub(sources: Sources) -> str:
     """What ArduSub itself did in our water."""
     rows = sources.benchmark("ardusub")["rows"]
-    cells = [[row["what"], f"{row['ours']:.3g} {row['unit']}", row["note"]] for row in rows]
+    cells = [[row["what"], _result(row), row["note"]] for row in rows]
     return text_table(["tried", "result", "more"], cells)
+
+
+def _result(row: dict[str, Any]) -> str:
+    if row["unit"] == "1 = yes":
+        return "yes" if row["ours"] else "no"
+    return f"{row['ours']:.3g} {row['unit']}"
 
 
 def closed_loop(sources: Sources) -> str:
