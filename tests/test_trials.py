@@ -179,7 +179,9 @@ def test_trials_of_the_gaze_are_as_their_episodes_say():
         assert {seeds.split(" ")[0].strip(","), seeds.split(" ")[-1]} == {str(min(own)), str(max(own))}
         assert told(text) == pytest.approx(rates("".join(own.values())), abs=0.051), (name, scene)
         won, lost = paired("".join(own.values()), "".join(before[seed] for seed in own))
-        assert name == "as it was" or text.endswith(f" (+{won} -{lost}, p = {mcnemar_p(won, lost):.3f})"), name
+        assert name == "as it was" or text.endswith(f" (+{won} -{lost}, p = {mcnemar_p(won, lost):.3f})"), (
+            name
+        )
 
 
 def test_what_forecasts_miss_is_as_counted():
