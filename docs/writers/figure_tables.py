@@ -67,7 +67,8 @@ def evaluations(sources: Sources) -> str:
         "`straight`",
         "most frequent causes of failure",
     ]
-    return text_table(head, [_evaluated(entry) for entry in sources.evaluations()["rows"]])
+    shown = [entry for entry in sources.evaluations()["rows"] if LITERATURE.isdisjoint(entry["methods"])]
+    return text_table(head, [_evaluated(entry) for entry in shown])
 
 
 def _evaluated(entry: dict[str, Any]) -> list[str]:
@@ -120,13 +121,14 @@ def _own_piece(entry: dict[str, Any], pair: dict[str, Any] | None) -> list[str]:
     return [f"`{entry['name']}`", share(counts, "success"), rated(counts, "collision"), time, p, took]
 
 
+LITERATURE = frozenset({"mppi", "dwa", "potential_field", "velocity_obstacle"})
 LOCAL_PLANNERS = ("bt", "capped", "mppi", "dwa", "potential_field", "velocity_obstacle")
 
 
 def local_planners(sources: Sources) -> str:
     """Local planners of the literature beside the tree, wherever they were played: success / collision, time
     to success, p of McNemar's exact test against ``bt``, success for success."""
-    entries = [entry for entry in sources.evaluations()["rows"] if "mppi" in entry["methods"]]
+    entries = [entry for entry in sources.evaluations()["rows"] if not LITERATURE.isdisjoint(entry["methods"])]
     if not entries:
         return "Not among the evaluations that are shown."
     rows = [[f"`{name}`", *(_beside_tree(entry, name) for entry in entries)] for name in LOCAL_PLANNERS]
