@@ -128,7 +128,9 @@ LOCAL_PLANNERS = ("bt", "capped", "mppi", "dwa", "potential_field", "velocity_ob
 def local_planners(sources: Sources) -> str:
     """Local planners of the literature beside the tree, wherever they were played: success / collision, time
     to success, p of McNemar's exact test against ``bt``, success for success."""
-    entries = [entry for entry in sources.evaluations()["rows"] if not LITERATURE.isdisjoint(entry["methods"])]
+    entries = [
+        entry for entry in sources.evaluations()["rows"] if not LITERATURE.isdisjoint(entry["methods"])
+    ]
     if not entries:
         return "Not among the evaluations that are shown."
     rows = [[f"`{name}`", *(_beside_tree(entry, name) for entry in entries)] for name in LOCAL_PLANNERS]
