@@ -228,8 +228,10 @@ def test_what_another_config_lacks_is_told_apart():
 
 # ------------------------------------------------------------------------------------- the whole simulator
 
-SHAPES = {"depth_cfg.fov_deg"}
-"""numbers among these that are no argument: the camera's picture is shaped by it"""
+SHAPES = {"depth_cfg.fov_deg", "sonar_cfg.horizontal_aperture_deg"}
+"""numbers among these that are no argument: what is seen is shaped by them"""
+LIMITED = {"teacher_cfg.cruise_m_s", "teacher_cfg.back_off_m_s"}
+"""numbers of which the smaller of two is taken that are equal by default: 1 % more decides otherwise"""
 OFTEN = ("teacher_cfg", "reward_cfg", "forecast_cfg", "sonar_cfg", "depth_cfg", "sensors_cfg.dvl",
          "sensors_cfg.imu", "sensors_cfg.pressure")  # fmt: skip
 """sections whose numbers people change"""
@@ -256,7 +258,7 @@ def test_another_number_of_the_tree_the_reward_the_forecast_or_the_noise_compile
                     if any(comes_to(each, io, leaf, 1.0) != comes_to(each, io, leaf, 1.01) for each in told):
                         wrong.add(leaf)
     assert len(tried) > 100 and {leaf.partition(".")[0] for leaf in tried} >= {"teacher_cfg", "reward_cfg"}
-    assert wrong == SHAPES
+    assert wrong == SHAPES | LIMITED
 
 
 def comes_to(told, io, leaf, factor):
