@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import SmallSim
+from tests.small_sim import SmallSim
 
 ROOT = Path(__file__).parent.parent
 KEPT = ("uuvtai", "tests", "benchmarks", "examples", "docs", "runs/README.md", ".ci", ".github")
