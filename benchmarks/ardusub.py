@@ -47,9 +47,11 @@ PARAMETERS = {
     "EK3_SRC1_POSXY": 6, "EK3_SRC1_VELXY": 6, "EK3_SRC1_POSZ": 1, "EK3_SRC1_VELZ": 0, "EK3_SRC1_YAW": 1,
     "AHRS_EKF_TYPE": 3, "SERIAL1_PROTOCOL": 2, "SERIAL2_PROTOCOL": 2, "LOG_DISARMED": 0,
     "LOG_BACKEND_TYPE": 0, "SIM_BARO_RND": 0.002, "SIM_BAR2_RND": 0.002,
+    "BARO1_GND_PRESS": 101325, "BARO2_GND_PRESS": 101325,
 }  # fmt: skip
 """beside ArduPilot's own defaults for its simulated submarine (Tools/autotest/default_params/sub.parm);
-pressure as exact as a Bar30's: 2 mm (its maker's data sheet), not the 0.2 m of a barometer in the air"""
+pressure as exact as a Bar30's: 2 mm (its maker's data sheet), not the 0.2 m of a barometer in the air, and
+zeroed at the surface (101,325 Pa in its simulation), as an owner does before a dive"""
 
 
 def measure(job: Job) -> list[Row]:
