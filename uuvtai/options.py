@@ -507,7 +507,10 @@ Dot = Annotated[bool, Option("--dot", help="Print Graphviz DOT instead.")]
 LogFile = Annotated[Path, Argument(help="An .mcap file.")]
 DriveLogs = Annotated[
     list[Path],
-    Argument(help="Logs of drives: .mcap of ours, or .csv with t,u,v,w,r,rpm_1,.. (docs/vehicle.md)."),
+    Argument(
+        help="Logs of drives: .mcap of ours, ArduSub's .bin or .tlog, or .csv with t,u,v,w,r,rpm_1,.. "
+        "(docs/vehicle.md)."
+    ),
 ]
 IdentifyKnown = Annotated[
     str,
