@@ -1,4 +1,5 @@
-"""The tables of ``docs/sitl.md`` and of identification from ArduSub's logs, from the newest results of the benchmarks ``closed_loop``, ``ardusub``."""
+"""Tables of the pages sitl, vehicle and companion, from the newest results of the benchmarks ``closed_loop``,
+``ardusub`` and ``aboard``."""
 
 from __future__ import annotations
 
@@ -57,6 +58,15 @@ def closed_loop(sources: Sources) -> str:
         for row, more in zip(rows, told, strict=True)
     ]
     return text_table(["driven", "success", "of episodes [95 %], and the others", "paired"], cells)
+
+
+def aboard(sources: Sources) -> str:
+    """Exported stacks beside what was decided at their export."""
+    rows = [row for row in sources.benchmark("aboard")["rows"] if row["ours"] is not None]
+    cells = [
+        [row["what"], f"{row['details']['equal']} of {row['details']['steps']}", row["note"]] for row in rows
+    ]
+    return text_table(["machine and stack", "commands equal to the last bit", "more"], cells)
 
 
 def _paired(rows: list[dict[str, Any]]) -> str:
