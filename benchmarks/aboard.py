@@ -1,6 +1,7 @@
 """Exported stacks (``uuv export --stack``) decide what was decided at their export: on this machine without
 Taichi and torch, and on aarch64. ``UUV_AARCH64`` names a Python of that machine with NumPy, as the words that
 start it (for example a user-mode emulator and its interpreter); without it that half is not tried.
+``UUV_STACK_FOLDER`` names a folder that was exported before, to be looked at in place of new ones.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from benchmarks.common import Job, Row
 THREADS = 1
 LONGEST_S = 3600
 SEED = 77001
-FOREIGN = "UUV_AARCH64"
+FOREIGN, BEFORE = "UUV_AARCH64", "UUV_STACK_FOLDER"
 CASES = (("pool", "multibeam", "6", "0.6"),)
 """world, sensors, moving bodies, their speed [m/s]"""
 _EMPTY = """
@@ -40,9 +41,10 @@ def measure(job: Job) -> list[Row]:
     """A row for each case and machine. RuntimeError where a command fails."""
     rows = []
     with tempfile.TemporaryDirectory() as name:
+        before = os.environ.get(BEFORE, "")
         for case in CASES:
-            out = _exported(case, Path(name))
-            told = f"{case[0]}, {case[1]} sensing"
+            out = Path(before) if before else _exported(case, Path(name))
+            told = "a folder exported before" if before else f"{case[0]}, {case[1]} sensing"
             rows.append(_row(f"{platform.machine()}: {told}", [sys.executable, "-I"], out, job))
             if words := shlex.split(os.environ.get(FOREIGN, "")):
                 rows.append(_row(f"aarch64: {told}", words, out, job))
