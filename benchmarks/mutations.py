@@ -743,7 +743,7 @@ LINK = (
     ),
     Mutation(
         "motors_turn_the_other_way",
-        "uuvtai/sitl/motors.py",
+        "uuvtai/link/motors.py",
         "self.channel[thruster], self.sign[thruster] = motor, sign",
         "self.channel[thruster], self.sign[thruster] = motor, -sign",
         "tests/test_sitl.py",

@@ -411,6 +411,7 @@ def _report_if(with_report: bool, folder: Path) -> None:
 @groups.grouped
 def export_policy(
     output: groups.OutputGroup,
+    stacked: groups.StackGroup,
     run: opt.ExportRun = None,
     out: opt.ExportOut = None,
     evaluation: opt.ExportEvaluation = None,
@@ -418,11 +419,14 @@ def export_policy(
     force: opt.ExportForce = False,
 ) -> None:
     """Write a policy that drives without uuvtai (NumPy alone, or ONNX), or check such a folder. Exit code 3:
-    it disagrees."""
+    it disagrees. Or, with --stack, the stack itself as native code."""
+    from uuvtai.show.exports import show_export, show_stack
+
+    if (written := stacked.written(run)) is not None:
+        return output.show(written, lambda _: show_stack(written))
     if (run is None) == (check is None):
         raise UsageError("give the RUN to export, or --check DIR for a folder that was exported")
     from uuvtai.deploy import export
-    from uuvtai.show.exports import show_export
 
     if check is not None:
         found = export.check(check, say)

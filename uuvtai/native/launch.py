@@ -114,6 +114,7 @@ def quick_launch(launch: _T) -> _T:
             known[key] = found
 
     again.__name__, again.__doc__ = launch.__name__, launch.__doc__  # type: ignore[attr-defined]
+    again._primal = kernel  # type: ignore[attr-defined]  # as Taichi has it; aboard/tape.py looks for it
     return again  # type: ignore[return-value]
 
 
