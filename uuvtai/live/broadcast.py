@@ -2,17 +2,55 @@
 
 from __future__ import annotations
 
-from uuvtai.live.viewer_server import ViewerServer
+from collections.abc import Mapping
+from typing import Protocol
+
 from uuvtai.logs.log_recorder import EpisodeReader, PolicyNote, Recordable, RecordedJob
 from uuvtai.logs.moment import EpisodeEnd, EpisodeHeader, Values
+from uuvtai.logs.schemas import Schema
 from uuvtai.logs.topic import Topic
-from uuvtai.logs.topic_stream import TopicStream
+from uuvtai.logs.topic_stream import TopicMessage, TopicStream
+
+
+class Viewers(Protocol):
+    """Whoever is shown episodes as messages."""
+
+    def begin(self, schemas: Mapping[str, Schema]) -> None:
+        """Another episode."""
+
+    def tell_time(self, time_ns: int) -> None:
+        """It is now this late in the episode."""
+
+    def send(self, message: TopicMessage) -> None:
+        """Show a message."""
+
+
+class EveryViewer:
+    """Several of them as one."""
+
+    def __init__(self, *viewers: Viewers) -> None:
+        self._viewers = viewers
+
+    def begin(self, schemas: Mapping[str, Schema]) -> None:
+        """Another episode, for all."""
+        for viewer in self._viewers:
+            viewer.begin(schemas)
+
+    def tell_time(self, time_ns: int) -> None:
+        """It is now this late in the episode, for all."""
+        for viewer in self._viewers:
+            viewer.tell_time(time_ns)
+
+    def send(self, message: TopicMessage) -> None:
+        """Show a message to all."""
+        for viewer in self._viewers:
+            viewer.send(message)
 
 
 class LiveEpisode:
-    """One episode for the viewers of a server; an ``EpisodeSink``."""
+    """One episode for viewers; an ``EpisodeSink``."""
 
-    def __init__(self, server: ViewerServer, header: EpisodeHeader, depth_images: bool) -> None:
+    def __init__(self, server: Viewers, header: EpisodeHeader, depth_images: bool) -> None:
         self._server, self._stream = server, TopicStream(header, depth_images)
         self._dt_s = header.config.episode.control_dt_s
         server.begin(self._stream.schemas())
@@ -39,7 +77,7 @@ class Broadcast(EpisodeReader):
 
     def __init__(
         self,
-        server: ViewerServer,
+        server: Viewers,
         world: str,
         controller: str,
         depth_images: bool = False,
