@@ -20,7 +20,6 @@ from typing import Any
 
 from benchmarks.common import Job, Row
 
-
 LONGEST_S = 7200
 _ROOT = Path(__file__).resolve().parent.parent
 _PAGES = ("own_pieces", "sonars", "benchmark", "paper_kit", "ros", "live")
@@ -143,7 +142,5 @@ def _row(page: str, line: str, found: dict[str, Any]) -> Row:
     ends = sorted({Path(name).suffix for name in found["made"] if Path(name).suffix})
     left = f"{len(found['made'])} files ({' '.join(ends)})" if found["made"] else ""
     note = left if found["code"] == 0 else f"exit code {found['code']}: {found['last']}"
-    return Row(
-        f"{page}: {line}", found["seconds"], "s", less_is_better=True, note=note,
-        details={"page": page, "line": line, "code": found["code"], "left": left, "threads": found["threads"]},
-    )  # fmt: skip
+    details = {"page": page, "line": line, "left": left, "code": found["code"], "threads": found["threads"]}
+    return Row(f"{page}: {line}", found["seconds"], "s", less_is_better=True, note=note, details=details)

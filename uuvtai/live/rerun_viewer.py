@@ -15,7 +15,6 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from uuvtai.live.viewer_server import LiveError
-from uuvtai.logs.reader import LogMessage
 from uuvtai.logs.recording import read_value
 from uuvtai.logs.schemas import Schema
 from uuvtai.logs.topic_stream import TopicMessage
@@ -89,7 +88,7 @@ class RerunViewer:
     # ------------------------------------------------------------------------------------------------- topics
 
     def _draw_pose(self, topic: str, data: dict[str, Any]) -> None:
-        self._pose = _value(topic, data)
+        self._pose = read_value(topic, data)
         place, turn = data["pose"]["position"], data["pose"]["orientation"]
         at = (place["x"], place["y"], place["z"])
         turned = self._rr.Quaternion(xyzw=[turn["x"], turn["y"], turn["z"], turn["w"]])
@@ -100,7 +99,7 @@ class RerunViewer:
             self._log("world/way", strip)
 
     def _draw_layer(self, topic: str, data: dict[str, Any]) -> None:
-        layer = _value(topic, data)
+        layer = read_value(topic, data)
         row, col = np.nonzero(layer.values >= _OCCUPIED)
         flat = np.column_stack([col, row]) + 0.5
         at = np.column_stack(
@@ -111,7 +110,7 @@ class RerunViewer:
         self._log(f"world{topic}", cells)
 
     def _draw_scan(self, topic: str, data: dict[str, Any]) -> None:
-        ranges, bearing, hit, _ = _value(topic, data)
+        ranges, bearing, hit, _ = read_value(topic, data)
         x, y, z, yaw = self._pose
         away = bearing[hit] + yaw
         at = np.column_stack([x + ranges[hit] * np.cos(away), y + ranges[hit] * np.sin(away)])
@@ -123,7 +122,7 @@ class RerunViewer:
         self._log("world/route", self._rr.LineStrips3D([way] if way else [], radii=0.03))
 
     def _draw_tracks(self, topic: str, data: dict[str, Any]) -> None:
-        found = _value(topic, data)
+        found = read_value(topic, data)
         at = np.column_stack([found[:, :2], np.full(len(found), self._pose[2])])
         self._log("world/tracks", self._rr.Ellipsoids3D(centers=at, radii=found[:, 2]))
 
@@ -171,10 +170,6 @@ _DRAWN = {
     "/safety": RerunViewer._draw_safety,
     "/log": RerunViewer._draw_text,
 }
-
-
-def _value(topic: str, data: dict[str, Any]) -> Any:
-    return read_value(LogMessage(topic, 0.0, data))
 
 
 def _new_file(target: str) -> Path:

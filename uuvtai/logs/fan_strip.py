@@ -63,5 +63,5 @@ def _moments(recording: Recording) -> list[int]:
 def _bearing(recording: Recording) -> np.ndarray | None:
     """(n,) [rad] of the beams from ahead, as the log's first scan has them."""
     for message in read_messages(recording.path, ("/sonar/scan",)):
-        return read_value(message)[1]
+        return read_value(message.topic, message.data)[1]
     return None

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from uuvtai.logs.log_errors import LogError
-from uuvtai.logs.reader import LogHead, LogMessage, read_head, read_messages
+from uuvtai.logs.reader import LogHead, read_head, read_messages
 from uuvtai.logs.topics import TOPICS
 from uuvtai.logs.topics.map_topics import Layer
 
@@ -103,7 +103,7 @@ def load_recording(path: Path, topics: tuple[str, ...] = VIDEO_TOPICS) -> Record
     size = 0
     try:
         for message in read_messages(path, topics):
-            value = read_value(message)
+            value = read_value(message.topic, message.data)
             found[message.topic].add(message.time_s, value)
             size += _taken(value) + _OVERHEAD
             if size > _MAX_ARRAYS:
@@ -126,9 +126,9 @@ def load_recording(path: Path, topics: tuple[str, ...] = VIDEO_TOPICS) -> Record
     return found
 
 
-def read_value(message: LogMessage) -> Any:
+def read_value(topic: str, data: dict[str, Any]) -> Any:
     """What the table of topics reads of a message. Raises LogError, and what a message unlike ours raises."""
-    return _READERS[message.topic](message.data)
+    return _READERS[topic](data)
 
 
 @contextlib.contextmanager

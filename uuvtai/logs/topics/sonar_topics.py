@@ -96,18 +96,18 @@ def _image(moment: Moment) -> bytes:
     return f'{{"timestamp":{moment.stamp},"frame_id":"sonar","data":"{png}","format":"png"}}'.encode()
 
 
-def _heard(moment: Moment, sonar: SonarConfig) -> np.ndarray:
+def _heard(moment: Moment, sonar_cfg: SonarConfig) -> np.ndarray:
     """(n_ray, n_bin) power that the beams hear: where ranges are detected in it, that of the ping; else made
     for the log, with speckle that is a function of the episode and the step."""
-    if sonar.detector != "none":
-        return np.asarray(moment["sonar_image.heard"], float)[: sonar.n_ray, : sonar.image_bins]
+    if sonar_cfg.detector != "none":
+        return np.asarray(moment["sonar_image.heard"], float)[: sonar_cfg.n_ray, : sonar_cfg.image_bins]
     scenario = moment.header.scenario
     w, x, y, z = (float(part) for part in moment["vehicle.quat_wb"])
     yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     place = np.asarray(moment["vehicle.pos_w"], float)
-    bearing, power = echo_power(scenario, moment.time_s, place, yaw, sonar, sonar.image_bins)
+    bearing, power = echo_power(scenario, moment.time_s, place, yaw, sonar_cfg, sonar_cfg.image_bins)
     random = np.random.default_rng((scenario["seed"], scenario["episode"], moment.step))
-    return heard_image(bearing, power, sonar, random)
+    return heard_image(bearing, power, sonar_cfg, random)
 
 
 ROWS = (
