@@ -50,9 +50,8 @@ KINDS = (
         "fan of 120 degrees, 512 beams, without Doppler",
         "--sensors multibeam --set sensors.sonar.horizontal_aperture_deg=120 --set sensors.sonar.n_ray=512",
     ),
-    SonarKind("`multibeam`, ten pings a second", "--sensors multibeam --set sensors.sonar.period_steps=5"),
     SonarKind(
-        "the same, ranges detected in the intensity image (SO-CFAR): `multibeam_image`",
+        "130 degrees, ten pings a second, ranges detected in the image (SO-CFAR): `multibeam_image`",
         "--sensors multibeam_image",
     ),
     SonarKind("one mechanical beam, a sector of 115 degrees in 1.8 s: `ping360`", "--sensors ping360"),
