@@ -25,6 +25,8 @@ def paint_fan_marks(canvas: Canvas, recording: Recording) -> None:
     """Numbers on the way, where the images were taken."""
     for number, moment in enumerate(_moments(recording), 1):
         pose = recording["/pose"].at(recording[TOPIC].times[moment])
+        if pose is None:
+            continue
         canvas.disc(pose[:2], 9, PAPER)
         canvas.disc(pose[:2], 9, INK, 1)
         (x, y), *_ = canvas.pixels([pose[:2]])

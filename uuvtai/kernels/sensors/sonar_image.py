@@ -227,9 +227,8 @@ def speckle(env, bearing, io: Bundle[SonarIO]):
         power = image_lanes(io.sonar_image.echo, env, bearing, packet)
         real, imag = normal_pair_lanes(key, (bearing * n_packet + packet) * LANES, LANES)
         amplitude = ti.sqrt(0.5 * power)
-        for i in ti.static(range(LANES)):
-            io.sonar_image.echo[env, bearing, packet * LANES + i] = amplitude[i] * real[i]
-            io.sonar_image.echo_imag[env, bearing, packet * LANES + i] = amplitude[i] * imag[i]
+        put_image(io.sonar_image.echo, env, bearing, packet, amplitude * real)
+        put_image(io.sonar_image.echo_imag, env, bearing, packet, amplitude * imag)
 
 
 @ti.func
@@ -242,6 +241,13 @@ def image_lanes(image, env, row, packet):
 
 
 @ti.func
+def put_image(image, env, row, packet, values):
+    """Write sixteen neighbouring range bins of a bearing or beam."""
+    for i in ti.static(range(LANES)):
+        image[env, row, packet * LANES + i] = values[i]
+
+
+@ti.func
 def listen(env, packet, io: Bundle[SonarIO]):
     """Power that all beams hear in sixteen range bins, two beams at a time."""
     key = stream_key(io.episode.key[env], io.clock.step[env], STREAM_SONAR_HISS)
@@ -251,8 +257,8 @@ def listen(env, packet, io: Bundle[SonarIO]):
         for bearing in range(ti.static(io.sonar_image.echo.shape[1])):
             if packet * LANES <= io.sonar_image.farthest[env, bearing]:
                 off = bearing - ti.static(pad_beams(io.sonar_cfg)) - beam
-                weight = io.sonar_image.across[ti.abs(off)][0]
-                next_weight = io.sonar_image.across[ti.abs(off - 1)][0]
+                weight = pattern_amplitude(off, io)
+                next_weight = pattern_amplitude(off - 1, io)
                 one = image_lanes(io.sonar_image.echo, env, bearing, packet)
                 other = image_lanes(io.sonar_image.echo_imag, env, bearing, packet)
                 real += weight * one
@@ -264,13 +270,16 @@ def listen(env, packet, io: Bundle[SonarIO]):
 
 
 @ti.func
+def pattern_amplitude(beams, io: Bundle[SonarIO]):
+    """What a beam hears of a bearing so many beams to its left."""
+    return io.sonar_image.across[ti.abs(beams)][0]
+
+
+@ti.func
 def keep(env, beam, packet, real, imag, key, io: Bundle[SonarIO]):
     """Write what a beam hears, with its noise."""
     sigma = ti.static(math.sqrt(0.5 * noise_power(io.sonar_cfg)))
     first = (beam * ti.static(packets(io.sonar_cfg)) + packet) * LANES
     hiss_real, hiss_imag = normal_pair_lanes(key, first, LANES)
     all_real, all_imag = real + sigma * hiss_real, imag + sigma * hiss_imag
-    for i in ti.static(range(LANES)):
-        io.sonar_image.heard[env, beam, packet * LANES + i] = (
-            all_real[i] * all_real[i] + all_imag[i] * all_imag[i]
-        )
+    put_image(io.sonar_image.heard, env, beam, packet, all_real * all_real + all_imag * all_imag)
