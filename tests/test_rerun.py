@@ -2,6 +2,7 @@
 shown is refused."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from uuvtai.live.rerun_viewer import RerunViewer
 from uuvtai.live.viewer_server import LiveError
 from uuvtai.logs.mcap_log import McapEpisodeLog
 from uuvtai.logs.recording import load_recording
+from uuvtai.measure import watching
 
 chunk = pytest.importorskip("rerun.chunk", reason="needs rerun-sdk (uuvtai[rerun]), which is for Python 3.11")
 N_STEP = 60
@@ -36,6 +38,17 @@ class Watched:
         self.messages.append(message)
 
 
+def read_back(path):
+    """Values of an .rrd by (entity, column), as Rerun's own loader has them."""
+    columns = {}
+    for part in chunk.RrdReader(str(path)).stream():
+        batch = part.to_record_batch()
+        for name in batch.schema.names:
+            column = batch.column(name).cast("int64") if name == "time" else batch.column(name)
+            columns.setdefault((str(part.entity_path), name), []).extend(column.to_pylist())
+    return columns
+
+
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory):
     """(rows of the .rrd by entity and column, messages of both episodes)."""
@@ -46,13 +59,7 @@ def shown(tmp_path_factory):
             live = LiveEpisode(EveryViewer(viewer, beside), episode.header("bt", number), True)
             for values in episode.snapshots(N_STEP):
                 live.write(values)
-    columns = {}
-    for part in chunk.RrdReader(str(path)).stream():
-        batch = part.to_record_batch()
-        for name in batch.schema.names:
-            column = batch.column(name).cast("int64") if name == "time" else batch.column(name)
-            columns.setdefault((str(part.entity_path), name), []).extend(column.to_pylist())
-    return columns, beside
+    return read_back(path), beside
 
 
 def by_topic(beside, topic):
@@ -98,6 +105,26 @@ def test_returns_maps_routes_images_and_lines_of_the_log_are_there(shown, tmp_pa
     boxes = columns["/world/truth/obstacles/cubes", "Boxes3D:half_sizes"][0]
     np.testing.assert_allclose(boxes[0], [0.5 * s for s in bodies["cubes"][0]["size"].values()], atol=FLOAT32)
     assert ("/safety/clearance_m", "Scalars:scalars") in columns
+
+
+def test_watch_shows_every_episode_to_foxglove_and_to_rerun(monkeypatch, tmp_path):
+    """The command's own loop, with made-up episodes in place of the simulator's."""
+
+    def played(comparison, method, job, viewers, rate):
+        live = LiveEpisode(viewers, episode.header("bt", job.episode), False)
+        for values in episode.snapshots(5):
+            live.write(values)
+        return {"episode": job.episode}
+
+    said, path = [], tmp_path / "live.rrd"
+    monkeypatch.setattr(watching, "methods_of", lambda *_: [SimpleNamespace(name="bt", own=None)])
+    monkeypatch.setattr(watching, "comparison_of", lambda *_: None)
+    monkeypatch.setattr(watching, "_watched", played)
+    request = SimpleNamespace(controllers=[], episodes=2, seeds=[0])
+    options = watching.LiveOptions(port=0, rate=0.0, rerun=str(path))
+    told = watching.watch_episodes(request, options, SimpleNamespace(note=said.append))
+    assert [entry["episode"] for entry in told] == [0, 1] and "serving ws://localhost:" in said[0]
+    assert set(read_back(path)["/world/vehicle", "episode"]) == {0, 1}, "the file is whole afterwards"
 
 
 # ----------------------------------------------------------------------------------------------------- errors
