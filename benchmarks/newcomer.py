@@ -22,12 +22,13 @@ from benchmarks.common import Job, Row
 
 LONGEST_S = 7200
 _ROOT = Path(__file__).resolve().parent.parent
-_PAGES = ("own_pieces", "sonars", "benchmark", "paper_kit", "ros", "live")
+_PAGES = ("own_pieces", "ros", "paper_kit", "benchmark", "live", "sonars")
 _EXTRAS = "export,live,viz,ros,rerun,sb3,skrl,torchrl,rsl-rl"
 _TRAINERS = ("sb3", "skrl", "torchrl", "rsl_rl")
 _CUSTOM = ("controller", "reward", "tree", "vehicle", "world")
 _CHECKOUT_ONLY = ("python -m docs.", "python benchmarks/", "python3 bootstrap.py")
-_LONG = "uuv reproduce"
+_LONG = ("examples/train_", "load=runs/", "uuv reproduce")
+"""of lines that are played last: minutes of training and what plays that"""
 _SHELL = re.compile(r"^```sh\n(.*?)^```", re.S | re.M)
 _LONGEST_STEP_S = 3000
 
@@ -47,7 +48,7 @@ def _walked(place: Path, job: Job) -> list[Row]:
     done: dict[str, dict[str, Any]] = json.loads(note.read_text()) if note.exists() else {}
     rows = []
     steps = list(dict.fromkeys(_steps(place, job.quick)))
-    steps.sort(key=lambda step: step[1].startswith(_LONG))  # what takes longest, last
+    steps.sort(key=lambda step: any(part in step[1] for part in _LONG))
     for page, line in steps:
         if f"{page}: {line}" not in done:
             job.say(f"{page}: {line}")
@@ -68,6 +69,8 @@ def _steps(place: Path, quick: bool) -> Iterator[tuple[str, str]]:
     if quick:
         return
     yield "begin", f"pip install 'uuvtai[{_EXTRAS}]'"
+    for name in _CUSTOM:
+        yield "examples", f"python examples/custom_{name}.py"
     for page in _PAGES:
         for line in shell_lines((_ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")):
             yield page, line
@@ -78,8 +81,6 @@ def _steps(place: Path, quick: bool) -> Iterator[tuple[str, str]]:
         if page == "live":
             yield page, "uuv watch --world gauntlet --controller bt,dwa --episodes 1"
             yield page, "uuv watch --world gauntlet --controller bt --episodes 2 --rate 0 --rerun live.rrd"
-    for name in _CUSTOM:
-        yield "examples", f"python examples/custom_{name}.py"
 
 
 def shell_lines(text: str) -> list[str]:
