@@ -69,12 +69,12 @@ def _steps(place: Path, quick: bool) -> Iterator[tuple[str, str]]:
     if quick:
         return
     yield "begin", f"pip install 'uuvtai[{_EXTRAS}]'"
-    for name in _CUSTOM:
-        yield "examples", f"python examples/custom_{name}.py"
     for page in _PAGES:
         for line in shell_lines((_ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")):
             yield page, line
         if page == "own_pieces":
+            for name in _CUSTOM:
+                yield "examples", f"python examples/custom_{name}.py"
             for name in _TRAINERS:
                 yield page, f"python examples/train_{name}.py --out runs/{name}"
                 yield page, f"uuv eval --policy examples/own_{name}.py:load=runs/{name}"
