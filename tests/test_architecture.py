@@ -31,6 +31,7 @@ BELOW = (
     "forecast_codes",
     "plan_codes",
     "outcomes",
+    "multibeam",
 )
 """What kernels may import of the package."""
 STACK = {"core", "perception", "planning", "teacher", "baselines"}

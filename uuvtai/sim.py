@@ -62,7 +62,7 @@ class Sim:
         self._every_row = torch.arange(num_envs, dtype=torch.int32, device=self.device)
         self.fallback = RouteFallback(config)
         self.planner: RoutePlanner | None = None
-        self.sensors: SensorSource = SimulatedSensors(config.sensors.sonar.mechanical)
+        self.sensors: SensorSource = SimulatedSensors(config.sensors.sonar)
         self.stage_s: dict[str, float] | None = None
         self.privileged = False
         self._watches = lost_thruster.is_watched(config.vehicle, config.actuation)
