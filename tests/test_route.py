@@ -70,6 +70,7 @@ def load(env, corners):
         env,
         codes.PLANNER_RRT,
     )
+    s.route.want_plan[env] = 1  # nobody loads a route that was not asked for
 
 
 def set_step(step):

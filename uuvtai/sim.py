@@ -147,9 +147,9 @@ class Sim:
             triggers.fire_triggers(io.triggers)
             if self.planner is None:
                 voronoi.plan_routes(io.voronoi)
-                self.fallback.serve(io, self._plan_seed)
+                self.fallback.serve(io, self._plan_seed, self.count)
             else:
-                self.fallback.serve_by(self.planner, io, self.rows)
+                self.fallback.serve_by(self.planner, io, self.rows, self.count)
             route.follow_route(io.route)
         with self._stage("teacher"):
             stack.choose(io, self.tree.leaf, self.action)
@@ -204,7 +204,14 @@ class Sim:
 
     def read_into(self, field: ti.Field, out: torch.Tensor) -> None:
         """Copy a whole field into ``out`` on the device, without a wait or a copy through the host."""
-        copy_rows(field, self._every_row, out)
+        if self.device.type == "cpu":  # nothing is launched: Taichi would wake its threads for it
+            out.copy_(torch.from_numpy(self._memory.live(field)[: self.num_envs]))
+        else:
+            copy_rows(field, self._every_row, out)
+
+    def count(self, field: ti.Field) -> int:
+        """A number without axes that kernels count."""
+        return int(self._memory.live(field) if self.device.type == "cpu" else field[None])
 
     def memory(self) -> Memory:
         """Where every array lies, when all kernels are done: for a capture."""

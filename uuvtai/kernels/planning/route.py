@@ -68,7 +68,8 @@ def follow_route(io: Bundle[RouteIO]):
     n = ti.static(io.clock.awake.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
         if pad == 0 and io.clock.awake[env] == 1:
-            look_along(io.route, env, level(io.ego.pos_w[env]), io.route_cfg, io.mapping_cfg)
+            if io.route.want_plan[env] == 1:  # else ``fire_triggers`` has just looked along the same route
+                look_along(io.route, env, level(io.ego.pos_w[env]), io.route_cfg, io.mapping_cfg)
             if io.route.n_way[env] > 0:
                 _aim(env, io)
             else:
