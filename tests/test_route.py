@@ -39,6 +39,7 @@ def fire():
             c.mapping,
             maps.TANK,
             c.episode,
+            c.clearance,
         )
     )
 
