@@ -150,13 +150,17 @@ def row_keys(sites, left_gap, right_gap, io: Bundle[ClearanceIO]):
         window_reach(io.clearance_cfg, io.mapping_cfg), offset_bits(io.clearance_cfg, io.mapping_cfg)
     )
     to_left, to_right = i16x(0), i16x(0)
-    left, right = left_gap - 1, right_gap - 1
-    for i in ti.static(range(LANES)):
-        left = ti.select((sites >> i) & 1 == 1, 0, left + 1)
-        to_left[i] = left
-    for back in ti.static(range(LANES)):
-        right = ti.select((sites >> (LANES - 1 - back)) & 1 == 1, 0, right + 1)
-        to_right[LANES - 1 - back] = right
+    if sites == 0:
+        for i in ti.static(range(LANES)):
+            to_left[i], to_right[i] = left_gap + i, right_gap + (LANES - 1 - i)
+    else:
+        left, right = left_gap - 1, right_gap - 1
+        for i in ti.static(range(LANES)):
+            left = ti.select((sites >> i) & 1 == 1, 0, left + 1)
+            to_left[i] = left
+        for back in ti.static(range(LANES)):
+            right = ti.select((sites >> (LANES - 1 - back)) & 1 == 1, 0, right + 1)
+            to_right[LANES - 1 - back] = right
     keys = i16x(0)
     for i in ti.static(range(LANES)):
         gap = ti.min(to_left[i], to_right[i])
