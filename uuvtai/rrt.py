@@ -260,7 +260,7 @@ class RouteFallback:
 
     def serve(self, stages: Stages, seed_of: Callable[[int], int], count: Callable[[Any], int]) -> int:
         """Plan for ``route.failed``; returns how many there were. ``seed_of(env)`` gives the env's number of
-        (seed, episode, step), ``count(field)`` a field's one number (``Sim.count``)."""
+        (seed, episode, step), ``count(field)`` a field's one number (``Memory.number``)."""
         from uuvtai.kernels.planning.route import keep_route, load_route
         from uuvtai.kernels.planning.voronoi import overlay_clearance
 

@@ -108,6 +108,10 @@ class Memory:
             known = self._looked_at[id(field)] = field, _view(field, False, self.read())
         return known[1]
 
+    def number(self, field: Any) -> int:
+        """The one number of a field without axes."""
+        return int(self.live(field) if self.device.type == "cpu" else field[None])
+
     def put(self, field: Any, values: np.ndarray) -> None:
         """Fill a field that is not in lanes; ``values`` has its shape (vectors add a last axis) and dtype."""
         if self.device.type == "cpu":

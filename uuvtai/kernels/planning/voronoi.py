@@ -103,7 +103,8 @@ def _weigh_cells(slot, env, io: Bundle[VoronoiIO]):
                 ti.static(widest_m(io.clearance_cfg, io.quiet_cfg, io.voronoi_cfg)),
             )
             for i in ti.static(range(lanes)):
-                io.voronoi.weight[slot, row, first + i] = ti.select(is_open[i] > 0.0, weight[i], 0.0)
+                value = weight[i]  # type: ignore[index]
+                io.voronoi.weight[slot, row, first + i] = ti.select(is_open[i] > 0.0, value, 0.0)
                 io.voronoi.cell[slot, row, first + i] = ti.cast(0, ti.u8)
 
 
