@@ -120,7 +120,7 @@ def expected():
     return [scene.launch() for _ in range(4)]
 
 
-@pytest.mark.parametrize("threads", ["1", "2"])
+@pytest.mark.parametrize("threads", ["1", "2", "3", "5"])
 def test_it_is_made_once_found_again_and_does_what_taichi_does(place, expected, monkeypatch, threads):
     monkeypatch.setenv("UUV_NUM_THREADS", threads)
     first = Scene()

@@ -137,10 +137,19 @@ class Memory:
 
         Nothing is compiled and nothing launched, so that a step can be looked at as often as one likes.
         """
+        view = self.live(field)
+        return view[rows].copy() if isinstance(rows, slice) else view[np.asarray(rows, np.intp)]
+
+    def live(self, field: Any) -> np.ndarray:
+        """A field as it lies in memory, shape of ``state``, vectors with a last axis. CPU only."""
         known = self._looked_at.get(id(field))
         if known is None:  # the field is kept with its view, for an identity may be given again
             known = self._looked_at[id(field)] = field, _view(field, False, self.read())
-        return known[1][rows].copy() if isinstance(rows, slice) else known[1][np.asarray(rows, np.intp)]
+        return known[1]
+
+    def number(self, field: Any) -> int:
+        """The one number of a field without axes."""
+        return int(self.live(field) if self.device.type == "cpu" else field[None])
 
     def put(self, field: Any, values: np.ndarray) -> None:
         """Fill a field that is not in lanes; ``values`` has its shape (vectors add a last axis) and dtype."""

@@ -100,7 +100,7 @@ def cast_sonar(io: Bundle[SonarIO]):
             place_sonar(env, io)
             if ti.static(io.sonar_cfg.bubble_clouds_per_s > 0):
                 start_cloud(env, io)
-    for env, part, pad in ti.ndrange(n, n_part, ti.static(spread(n * n_part))):
+    for env, part, pad in ti.ndrange(n, n_part, ti.static(spread(n, n_part))):
         if pad == 0 and io.clock.awake[env] == 1:
             step = io.clock.step[env]
             if step % io.sonar_cfg.period_steps == 0:
