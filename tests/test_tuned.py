@@ -202,16 +202,18 @@ def test_an_export_says_what_to_do_instead(saved, trainer):
 
 
 def test_a_stack_holds_the_numbers(config):
-    section = tuned_section(torch.full((len(TUNED),), math.log(0.5)), config.teacher)
-    assert section["horizon_s"] == config.teacher.horizon_s / 2
-    assert list(section) == [number.name for number in TUNED]
+    section = tuned_section(torch.full((len(TUNED),), math.log(0.5)), config)
+    assert config.teacher.horizon_s == 2.5 and section["horizon_s"] == 1.2, "the last sample within it"
+    assert section["weight_mean"] == pytest.approx(config.teacher.weight_mean * 12 / 25)
+    assert section["gaze_m"] == config.teacher.gaze_m / 2
+    assert section.keys() == {number.name for number in TUNED} | {"weight_mean"}
 
 
 def test_the_shipped_stack_holds_numbers_that_a_training_can_find():
     usual = load_config("pool")
     ours = with_stack(usual, "tuned")
     changed = {name for name, value in ours.teacher if value != getattr(usual.teacher, name)}
-    assert changed == {number.name for number in TUNED}
+    assert changed == {number.name for number in TUNED} | {"weight_mean"}
     for number in TUNED:
         factor = getattr(ours.teacher, number.name) / getattr(usual.teacher, number.name)
         assert number.least <= factor <= number.most, number.name

@@ -368,7 +368,7 @@ class _Run:
         from uuvtai.learn.tuner_trainer import TunerTrainer
 
         assert isinstance(self._trainer, TunerTrainer)
-        section = tuned_section(self._trainer.found(), self._config.teacher)
+        section = tuned_section(self._trainer.found(), self._config)
         lines = [
             f"tree: {TRAINING_TREE}",
             "teacher:",
