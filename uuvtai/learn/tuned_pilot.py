@@ -41,7 +41,7 @@ class TunedPilot:
         back."""
         self.simulator.put(self.simulator.s.teacher.tuned, self.log_factor)
 
-    def decide(self, _obs: torch.Tensor) -> PilotDecision:
+    def decide(self, obs: torch.Tensor) -> PilotDecision:
         """What the tree has chosen; changes nothing."""
         self.decision = self.decision._replace(action=self.simulator.action.clone())
         return self.decision
