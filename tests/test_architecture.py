@@ -29,6 +29,7 @@ BELOW = (
     "taichi_patches",
     "tree_codes",
     "forecast_codes",
+    "tuned_numbers",
     "plan_codes",
     "outcomes",
     "multibeam",

@@ -14,7 +14,15 @@ from uuvtai.kernels.teacher.cruise_depth import choose_depth, level_share
 from uuvtai.state import MissionState, Proprioception, TeacherState, TrackState, allocate
 
 N_ENV = 6
-SIZES = {"n_env": N_ENV, "n_track": 1, "n_ray": 16, "n_height": LANES, "n_node": 1, "n_candidate": LANES}
+SIZES = {
+    "n_env": N_ENV,
+    "n_track": 1,
+    "n_ray": 16,
+    "n_height": LANES,
+    "n_node": 1,
+    "n_candidate": LANES,
+    "n_tuned": 1,
+}
 POOL = {"z_m": [-1.2, -0.4], "height_m": [0.3, 0.5]}
 LOW, HIGH = -1.4, -0.2
 """Edges of the band: 0.2 m off the floor at -1.6 m and off the surface."""

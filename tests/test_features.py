@@ -370,7 +370,7 @@ CLASS_OF_LEAF = (0, 1, 2, 3, 4, 4)
 
 def test_advice_is_what_the_tree_says(stage):
     """A tree of the six action leaves; env i lets leaf i act, the seventh none."""
-    sizes = {"n_env": N_ENV, "n_node": 8, "n_candidate": 16}
+    sizes = {"n_env": N_ENV, "n_node": 8, "n_candidate": 16, "n_tuned": 1}
     teacher, table = allocate(TeacherState, sizes), allocate(TreeTable, sizes)
     table.leaf.from_numpy(np.array([*LEAVES, -1, -1], np.int32))
     acting = np.full(N_ENV, -1, np.int32)

@@ -18,6 +18,7 @@ from uuvtai.kernels.core.grid import grid_origin, grid_shape
 from uuvtai.kernels.teacher import evasion, leaves, threats
 from uuvtai.kernels.teacher.bundles import EvasionIO, TeacherIO, ThreatsIO
 from uuvtai.tree import load_tree, parse_tree, read_tree
+from uuvtai.tuned_numbers import TUNED
 
 N_ENV, N_TRACK, N_RAY = 6, 4, 64
 TEACHER = {
@@ -63,6 +64,7 @@ SIZES = {
     "n_height": 16,
     "n_ray": N_RAY,
     "n_ahead": 16,
+    "n_tuned": len(TUNED),
     "n_row": grid_shape(TANK, CELL)[0],
     "n_col": grid_shape(TANK, CELL)[1],
 }

@@ -211,7 +211,7 @@ def test_text_and_dot_name_every_node_and_its_use():
 
 @pytest.fixture(scope="module")
 def engine():
-    sizes = {"n_env": N_BOARD, "n_node": MAX_NODE, "n_candidate": 16}
+    sizes = {"n_env": N_BOARD, "n_node": MAX_NODE, "n_candidate": 16, "n_tuned": 10}
     return state.allocate(state.TeacherState, sizes), state.allocate(state.TreeTable, sizes)
 
 

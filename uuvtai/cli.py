@@ -392,8 +392,7 @@ def report_run(
         from uuvtai.report.paper_kit import paper as write_paper
 
         kit = write_paper(runs, paper)
-        output.show(kit.document(), lambda _screen: typer.echo(str(kit.folder)))
-        return
+        return output.show(kit.document(), lambda _screen: typer.echo(str(kit.folder)))
     from uuvtai.report.build import report
 
     written = report(runs, out, force)
@@ -428,13 +427,9 @@ def export_policy(
     if (run is None) == (check is None):
         raise UsageError("give the RUN to export, or --check DIR for a folder that was exported")
     from uuvtai.deploy import export
+    from uuvtai.measure.exporting import export_run
 
-    if check is not None:
-        found = export.check(check, say)
-    else:
-        from uuvtai.measure.exporting import export_run
-
-        found = export_run(run or "", out, evaluation or [], say, force)
+    found = export.check(check, say) if check else export_run(run or "", out, evaluation or [], say, force)
     output.show(found.document(), lambda screen: show_export(screen, found))
     if not found.agrees:
         raise typer.Exit(GATE)
@@ -560,15 +555,14 @@ def warm(
 ) -> None:
     """Compile beforehand what later commands need, so that they start at once (docs/native.md)."""
     from uuvtai.show.health import show_shapes
-    from uuvtai.warming import shapes_of
-    from uuvtai.warming import warm as run
+    from uuvtai import warming
 
     sizes = arguments.integers("--num-envs", num_envs)
     arguments.refuse_less("--workers", workers, 0)
     scenes = [SceneOptions(world, name, overrides=overrides) for name in sensors.split(",")]
-    shapes = shapes_of(scenes, sizes)
+    shapes = warming.shapes_of(scenes, sizes)
     say(f"sizes to compile: {len(shapes)}, about a minute each the first time")
-    found = run(shapes, workers or None)
+    found = warming.warm(shapes, workers or None)
     output.show({"shapes": found}, lambda screen: show_shapes(screen, found))
 
 
@@ -585,8 +579,8 @@ def tree(
 
     report = tree_report(controller, run)
     if dot or run is None:
-        output.show(report.document, lambda _screen: typer.echo(plain(report.dot if dot else report.text)))
-        return
+        text = plain(report.dot if dot else report.text)
+        return output.show(report.document, lambda _screen: typer.echo(text))
     from uuvtai.show.trees import show_tree
 
     output.show(report.document, lambda screen: show_tree(screen, report.text, report.document["nodes"]))

@@ -23,6 +23,7 @@ from uuvtai.native.gpu_shape import is_gpu_shaped
 from uuvtai.plan_codes import N_PLANNER, N_REASON, N_TRIGGER
 from uuvtai.scenario import scenario_sizes
 from uuvtai.stages import SimState
+from uuvtai.tuned_numbers import TUNED
 
 _MAX_ENVS = 1 << 20
 _ROWS = (1, 8, 64, 256)
@@ -87,6 +88,7 @@ def array_sizes(config: Config, n_env: int, device: str = "cpu") -> dict[str, in
         "n_sector": config.features.n_sector,
         "n_node": config.teacher.max_node,
         "n_candidate": config.teacher.n_candidate,
+        "n_tuned": len(TUNED),
         "n_trial": config.baselines.n_trial,
         "n_control": _n_control(config),
         "n_term": len(TERMS),

@@ -18,6 +18,7 @@ from docs.writers.pieces import BEFORE, CELLS, DASH, LETTERS, PIECES, beside
 from docs.writers.pose_tables import pose_endings, pose_errors
 from docs.writers.replay_tables import changed, lossy, replayed
 from docs.writers.sonar_tables import sonars
+from docs.writers.tuner_tables import tuner_slopes
 from docs.writers.vehicle_tables import vehicle_commands, vehicles
 from uuvtai.measure.reproduce import paper
 from uuvtai.measure.reproduce.steps import RETIRED_SEEDS
@@ -176,6 +177,8 @@ def policy(sources: Sources) -> str:
 
 TWIN_FILE = "docs/data/twin_77001.json"
 CHOOSER_FILE = "docs/data/chooser_77001.json"
+TUNED_FILE = "docs/data/tuned_77001.json"
+LEARNING_FILE = "docs/data/learning_trials.json"
 
 
 def twin_policy(sources: Sources) -> str:
@@ -186,6 +189,16 @@ def twin_policy(sources: Sources) -> str:
 def chooser_trials(sources: Sources) -> str:
     """The chooser between tree and policy beside the tree, on the same episodes."""
     return _trial_rows(sources, CHOOSER_FILE, "chooser")
+
+
+def tuned_trials(sources: Sources) -> str:
+    """The tree with learnt numbers beside the tree as configured, on the same episodes."""
+    return _trial_rows(sources, TUNED_FILE, "tuned")
+
+
+def learning_trials(sources: Sources) -> str:
+    """Other trials to go past the tree, on the same episodes."""
+    return _trial_rows(sources, LEARNING_FILE, "trial")
 
 
 def _trial_rows(sources: Sources, file: str, name: str) -> str:
@@ -569,6 +582,9 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         twin_curve,
         twin_policy,
         chooser_trials,
+        tuned_trials,
+        learning_trials,
+        tuner_slopes,
         forecast_scores,
         forecast_pieces,
         benchmark_scenes,

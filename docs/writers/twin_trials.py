@@ -81,17 +81,19 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("--out", default=FILE, help="file of the results, from the root of the tree")
     parser.add_argument("--more", action="store_true", help="also worlds that no training met")
+    parser.add_argument("--seeds", default=SEEDS, help="as uuv eval takes them")
+    parser.add_argument("--episodes", type=int, default=EPISODES, help="of each seed")
     chosen = parser.parse_args()
     run = chosen.run
     document: dict[str, Any] = {
         "schema": 1,
-        "seeds": SEEDS,
+        "seeds": chosen.seeds,
         "letters": {letter: name for name, letter in LETTERS.items()},
         "curve": curve_of(run),
         "rows": [],
     }
     for title, _name, options in (*CELLS, *(MORE if chosen.more else ())):
-        command = command_of(str(run), options)
+        command = command_of(str(run), options, chosen.seeds, chosen.episodes)
         with tempfile.TemporaryDirectory() as place:
             done = subprocess.run(
                 [sys.executable, "-m", "uuvtai", *command, "--json", "--run-dir", f"{place}/run"],

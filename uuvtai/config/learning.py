@@ -247,6 +247,22 @@ class ChooserConfig(Section):
     """part of the way that the slow copy, which says what is to come, goes with every step"""
 
 
+class TunerConfig(Section):
+    """A search for better numbers of the behaviour tree (``tuned_numbers``; ``docs/learning.md``)."""
+
+    enabled: bool = False
+    """learn the tree's numbers"""
+    worlds: tuple[Annotated[str, Field(min_length=1, max_length=200)], ...] = ("gauntlet", "pool", "gauntlet")
+    """world presets whose episodes are played in turn, each with every one of ``train.scenes``; one that is
+    named twice is played twice as often"""
+    spread: Fraction = 0.3
+    """numbers are tried so far from the best ones, in parts of the way between their bounds"""
+    warm_up: Fraction = 0.25
+    """part of the run before the numbers are moved for the first time"""
+    time_cost: NonNegative = 0.008
+    """[1/s] an arrival is worth so much less per second"""
+
+
 class ForecasterConfig(Section):
     """A network that says what moving bodies may do in the next 2.5 s (``docs/learning.md``)."""
 
@@ -277,5 +293,6 @@ class LearningConfig(Config):
     risk: RiskConfig = RiskConfig()
     twin: TwinConfig = TwinConfig()
     chooser: ChooserConfig = ChooserConfig()
+    tuner: TunerConfig = TunerConfig()
     forecaster: ForecasterConfig = ForecasterConfig()
     train: TrainConfig = TrainConfig()

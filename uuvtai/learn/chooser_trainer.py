@@ -20,12 +20,13 @@ from uuvtai.learn import checkpoint
 from uuvtai.learn.chooser import ArrivalNet, ChooserPilot
 from uuvtai.learn.chooser_memory import ChooserMemory, Tick, moments_of_episodes
 from uuvtai.learn.distributed import Processes
+from uuvtai.learn.episode_waves import play_episodes
 from uuvtai.learn.optimiser import PlainAdamW
 from uuvtai.learn.ppo import ADAM_EPS
 from uuvtai.learn.rollout_sums import Recent, RolloutSums
 from uuvtai.learn.set_pilot import SetPilot, set_pilot_of
 from uuvtai.learn.world_sims import simulator_of
-from uuvtai.outcomes import OUTCOMES, RUNNING, SUCCESS
+from uuvtai.outcomes import OUTCOMES, SUCCESS
 
 if TYPE_CHECKING:
     from uuvtai.scenario import Scene
@@ -75,9 +76,10 @@ class ChooserTrainer:
         world, scene = scenes[self.iteration % len(scenes)]
         learner = _Learner(self, world)
         episodes = self.config.train.num_envs
-        outcome, steps = play_episodes(
+        outcome, lasted = play_episodes(
             learner, scene, self.config.train.seed, self.iteration * episodes, episodes
         )
+        steps = int(lasted.sum())
         self.memory.add(
             moments_of_episodes(learner.ticks, outcome == SUCCESS, self.config.chooser.look_ahead)
         )
@@ -237,33 +239,6 @@ class _Learner(_Judge):
         """A choice to learn from."""
         self.net.widen(bodies, own)
         self.ticks.append(Tick(self.number[rows], self._age[rows], bodies.half(), own.half(), drives))
-
-
-def play_episodes(pilot: _Judge, scene: Scene, seed: int, first: int, count: int) -> tuple[torch.Tensor, int]:
-    """(outcome code of episodes first .. first + count - 1, env steps) of a seed."""
-    sim = pilot.simulator
-    outcome, steps = torch.zeros(count, dtype=torch.int64), 0
-    sim.set_scenes([scene])
-    for begin in range(0, count, sim.num_envs):
-        rows = torch.arange(sim.num_envs)
-        mask = (rows < count - begin).int()
-        pilot.running, pilot.number = mask == 1, begin + rows
-        sim.sleep()
-        sim.reset(mask, torch.full_like(mask, seed), (first + begin + rows).int())
-        pilot.reset(mask)
-        action = pilot.decide(sim.action).action
-        while bool(pilot.running.any()):
-            steps += int(pilot.running.sum())
-            sim.step(action)
-            pilot.advance()
-            now = torch.from_numpy(sim.rows(sim.s.referee.outcome).astype("int64"))
-            ended = pilot.running & (now != RUNNING)
-            if bool(ended.any()):
-                outcome[pilot.number[ended]] = now[ended]
-                pilot.running &= ~ended
-                sim.sleep_ended()
-            action = pilot.decide(sim.action).action
-    return outcome, steps
 
 
 def _copied(net: torch.nn.Module) -> dict[str, torch.Tensor]:

@@ -206,6 +206,11 @@ def load_pilot(checkpoint: Checkpoint, num_envs: int, device: torch.device | str
     says."""
     config, rows = checkpoint.config, checkpoint.manifest.observation_table
     refuse_forecaster(checkpoint)
+    if config.tuner.enabled:
+        raise CheckpointError(
+            f"{checkpoint.path}: numbers for the behaviour tree, no network that could be "
+            "exported; any stack takes them: --stack tuned, or stack.yaml of the run"
+        )
     if config.twin.enabled or config.chooser.enabled:
         raise CheckpointError(
             f"{checkpoint.path}: a policy over a set of bodies, which looks at the simulator itself; it "

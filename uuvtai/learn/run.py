@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from uuvtai.learn.chooser_trainer import ChooserTrainer
     from uuvtai.learn.forecast_trainer import ForecastTrainer
     from uuvtai.learn.train import Trainer
+    from uuvtai.learn.tuner_trainer import TunerTrainer
     from uuvtai.learn.twin_trainer import TwinTrainer
     from uuvtai.scene_options import SceneOptions
 
@@ -30,6 +31,8 @@ Metrics = dict[str, float]
 
 CONFIG = "config.yaml"
 """of a run folder"""
+STACK = "stack.yaml"
+"""of a run that learns the tree's numbers: the pilot with the newest ones"""
 SCORE = "eval/success_rate"
 """metric by which a checkpoint is the best"""
 
@@ -70,7 +73,7 @@ class TrainWatch(Protocol):
     def stop(self) -> None: ...
 
 
-AnyTrainer = Union["Trainer", "TwinTrainer", "ChooserTrainer", "ForecastTrainer"]
+AnyTrainer = Union["Trainer", "TwinTrainer", "ChooserTrainer", "TunerTrainer", "ForecastTrainer"]
 Evaluate = Callable[[AnyTrainer, LearningConfig], Metrics]
 """``eval/*`` of the policy as it is; training goes on as if nothing had been
 (``measure.evaluate.while_training.evaluate_now``, which knows what learning does not)"""
@@ -124,6 +127,8 @@ def _train(
     trainer: AnyTrainer
     if config.forecaster.enabled:
         trainer = _forecast_trainer(config, found, request.device)
+    elif config.tuner.enabled:
+        trainer = _tuner_trainer(config, found, request.device)
     elif config.chooser.enabled:
         trainer = _chooser_trainer(config, found, request.device)
     elif config.twin.enabled:
@@ -216,6 +221,18 @@ def _chooser_trainer(config: LearningConfig, checkpoint: Checkpoint | None, devi
 
     _refuse_many("chooser.enabled: it learns", device)
     trainer = ChooserTrainer(config)
+    if checkpoint:
+        checkpoint.check_table(trainer.observation_table, config)
+        trainer.load_state(checkpoint.state(like=trainer.state()))
+    return trainer
+
+
+def _tuner_trainer(config: LearningConfig, checkpoint: Checkpoint | None, device: str) -> TunerTrainer:
+    """As ``_trainer``, of the tree's numbers."""
+    from uuvtai.learn.tuner_trainer import TunerTrainer
+
+    _refuse_many("tuner.enabled: it searches", device)
+    trainer = TunerTrainer(config)
     if checkpoint:
         checkpoint.check_table(trainer.observation_table, config)
         trainer.load_state(checkpoint.state(like=trainer.state()))
@@ -333,6 +350,8 @@ class _Run:
         )
         if self._config.forecaster.enabled:
             self._export(folder)
+        if self._config.tuner.enabled:
+            self._write_stack(folder)
         self._saved = trainer.iteration
 
     def _export(self, folder: RunFolder) -> None:
@@ -342,6 +361,20 @@ class _Run:
 
         assert isinstance(self._trainer, ForecastTrainer)
         folder.write_bytes(WEIGHTS, self._trainer.exported())
+
+    def _write_stack(self, folder: RunFolder) -> None:
+        """The stack that drives with the tree's numbers as they are now, where ``--stack`` is taken."""
+        from uuvtai.learn.tuned_pilot import tuned_section
+        from uuvtai.learn.tuner_trainer import TunerTrainer
+
+        assert isinstance(self._trainer, TunerTrainer)
+        section = tuned_section(self._trainer.found(), self._config)
+        lines = [
+            f"tree: {TRAINING_TREE}",
+            "teacher:",
+            *(f"  {name}: {value}" for name, value in section.items()),
+        ]
+        folder.write(STACK, "\n".join(lines) + "\n")
 
     def _success_interval(self) -> tuple[float, float] | None:
         """95 % interval of ``rollout/success_rate`` over the episodes that it is the mean of."""

@@ -27,6 +27,9 @@ class TeacherState:
     """control steps of the episode in which this leaf set the action"""
     action: ti.Field = array("n_env", vec=4)
     """[-1, 1] surge, sway, heave, yaw rate of the tree"""
+    tuned: ti.Field = array("n_env", "n_tuned")
+    """natural logarithms of factors on the config's numbers (``tuned_numbers``), 0 = as configured: a
+    training changes them row by row, a reset sets them back"""
     leaf: ti.Field = array("n_env", dtype=ti.i32)
     """node that set the action, -1 = none (then the vehicle is told to stop)"""
     follow_vel_w: ti.Field = array("n_env", vec=3)

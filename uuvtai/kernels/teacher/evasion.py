@@ -3,12 +3,20 @@ rolled out in packets."""
 
 import taichi as ti
 
-from uuvtai.kernels.core.geometry import FAR_M, TWO_PI, turned_z3
+from uuvtai.kernels.core.geometry import FAR_M, TWO_PI
 from uuvtai.kernels.core.lanes import filled, n_lane, put_column, row_lanes
 from uuvtai.kernels.core.signature import Bundle, Const, spread
 from uuvtai.kernels.teacher.bundles import EvasionIO
-from uuvtai.kernels.teacher.trajectories import body_depths, depth_band, place_doubt, static_depths
+from uuvtai.kernels.teacher.trajectories import (
+    body_depths,
+    depth_band,
+    drive_of,
+    place_doubt,
+    static_depths,
+    tuned,
+)
 from uuvtai.native.launch import quick_launch, without_cse
+from uuvtai.tuned_numbers import DEVIATION
 
 
 @quick_launch
@@ -110,28 +118,23 @@ def speed_limit(angle, io: Bundle[EvasionIO]):
 def cost_lanes(env, cx, cy, cz, burst_s, io: Bundle[EvasionIO]):
     """Cost of a packet of commanded velocities. Violations count by depth: a flat penalty drives straight on
     when every candidate is bad."""
-    pos, vel = io.ego.pos_w[env], turned_z3(io.ego.vel_b[env], io.ego.rpy[env][2])
-    level, level_vel = ti.Vector([pos[0], pos[1]]), ti.Vector([vel[0], vel[1]])
-    drive = ti.Struct(x=cx, y=cy, z=cz, burst_s=burst_s, pos=pos, vel=vel, z_var=io.ego.z_var[env])
+    drive = drive_of(env, cx, cy, cz, burst_s, io.ego, io.teacher, io.teacher_cfg)
     peak, mean, contact, _ = body_depths(
         env, drive, io.forecast, io.futures, io.teacher_cfg, io.tracking_cfg, io.tank_cfg
     )
     doubt = place_doubt(io.ego.pose_cov[env], io.teacher_cfg)
     static_mean, static_contact = static_depths(
         env,
-        cx,
-        cy,
-        burst_s,
-        level,
-        level_vel,
+        drive,
         doubt,
         io.clearance,
         io.teacher_cfg,
         io.tank_cfg,
         io.mapping_cfg,
     )
-    off = _distance_lanes(cx, cy, cz, io.teacher.follow_vel_w[env]) * ti.static(
-        io.teacher_cfg.weight_deviation / io.teacher_cfg.cruise_m_s
+    off = _distance_lanes(cx, cy, cz, io.teacher.follow_vel_w[env]) * (
+        ti.static(io.teacher_cfg.weight_deviation / io.teacher_cfg.cruise_m_s)
+        * tuned(env, DEVIATION, io.teacher)
     )
     change = _distance_lanes(cx, cy, cz, io.teacher.last_vel_w[env]) * ti.static(
         io.teacher_cfg.weight_change / io.teacher_cfg.cruise_m_s

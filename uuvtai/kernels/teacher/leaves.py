@@ -10,9 +10,10 @@ from uuvtai.kernels.core.signature import AnyTensor, Bundle, spread
 from uuvtai.kernels.teacher.bundles import TeacherIO
 from uuvtai.kernels.teacher.sight import kept_in_sight
 from uuvtai.kernels.teacher.threats import cruising_speed
-from uuvtai.kernels.teacher.trajectories import held_heave
+from uuvtai.kernels.teacher.trajectories import held_heave, tuned
 from uuvtai.kernels.teacher.tree_tick import tick_nodes
 from uuvtai.native.launch import quick_launch
+from uuvtai.tuned_numbers import CALM, RANGE, TTC
 
 
 @quick_launch
@@ -31,6 +32,8 @@ def reset_teacher(io: Bundle[TeacherIO]):
                 io.teacher.acted[env, node] = 0
             for index in range(ti.static(io.teacher.candidate_cost.shape[1])):
                 io.teacher.candidate_cost[env, index] = 0.0
+            for number in range(ti.static(io.teacher.tuned.shape[1])):
+                io.teacher.tuned[env, number] = 0.0
             _reset_blackboard(env, io)
 
 
@@ -108,17 +111,18 @@ def _answer(env, node, io: Bundle[TeacherIO]):
     dt = ti.static(io.episode_cfg.control_dt_s)
     holds = 0
     if leaf == codes.EMERGENCY_TTC:
-        near = io.teacher.nearest_m[env] < _port(node, 1, ti.static(io.teacher_cfg.emergency_range_m), io)
+        usual_s = io.teacher_cfg.emergency_ttc_s * tuned(env, TTC, io.teacher)
+        usual_m = io.teacher_cfg.emergency_range_m * tuned(env, RANGE, io.teacher)
+        near = io.teacher.nearest_m[env] < _port(node, 1, usual_m, io)
         closing = io.teacher.ttc_s[env] < FAR_M
         holds = ti.cast(
-            io.teacher.ttc_s[env] < _port(node, 0, ti.static(io.teacher_cfg.emergency_ttc_s), io)
-            or (near and closing),
+            io.teacher.ttc_s[env] < _port(node, 0, usual_s, io) or (near and closing),
             ti.i32,
         )
     elif leaf == codes.PREDICTED_CONFLICT:
         seen = io.teacher.conflict_s[env] <= _port(node, 0, ti.static(io.teacher_cfg.conflict_within_s), io)
         lately = io.teacher.evading_steps[env] > 0 and io.teacher.calm_steps[env] * dt <= _port(
-            node, 1, ti.static(io.teacher_cfg.calm_s), io
+            node, 1, io.teacher_cfg.calm_s * tuned(env, CALM, io.teacher), io
         )
         holds = ti.cast(seen or lately, ti.i32)
     elif leaf == codes.ROUTE_BLOCKED:

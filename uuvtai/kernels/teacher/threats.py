@@ -5,7 +5,7 @@ import taichi as ti
 
 from uuvtai.config import TeacherConfig, VehicleConfig
 from uuvtai.kernels.core.beams import beam_bearing
-from uuvtai.kernels.core.geometry import FAR_M, turned_z3, wrapped_angle
+from uuvtai.kernels.core.geometry import FAR_M, wrapped_angle
 from uuvtai.kernels.core.grid import cell_of, centre_of
 from uuvtai.kernels.core.lanes import filled, n_lane
 from uuvtai.kernels.core.signature import Bundle, Const, spread
@@ -13,8 +13,9 @@ from uuvtai.kernels.perception.range_rate import range_rate
 from uuvtai.kernels.teacher.bundles import ThreatsIO
 from uuvtai.kernels.teacher.cruise_depth import choose_depth
 from uuvtai.kernels.teacher.sight import sight_share, sweep_share
-from uuvtai.kernels.teacher.trajectories import body_depths, held_heave, place_doubt
+from uuvtai.kernels.teacher.trajectories import body_depths, drive_of, held_heave, place_doubt, tuned
 from uuvtai.native.launch import quick_launch, without_cse
+from uuvtai.tuned_numbers import CALM, GAZE, TTC
 
 _PATH_SAMPLES = 8
 
@@ -200,7 +201,7 @@ def _foresee_conflict(env, io: Bundle[ThreatsIO]):
     io.teacher.want_evade[env] = 0
     io.teacher.calm_steps[env] += 1
     if io.clock.step[env] % ti.static(io.teacher_cfg.decide_period_steps) == 0:
-        pos, vel = io.ego.pos_w[env], turned_z3(io.ego.vel_b[env], io.ego.rpy[env][2])
+        pos = io.ego.pos_w[env]
         follow = io.teacher.follow_vel_w[env]
         heave = held_heave(choose_depth(env, io) - pos[2], io.teacher_cfg, io.vehicle_cfg)
         # lanes 0 to 2: follow at this depth, follow and change depth, stop; the others repeat lane 0
@@ -209,7 +210,7 @@ def _foresee_conflict(env, io: Bundle[ThreatsIO]):
         cz[1] = heave
         cx, cy = filled(follow[0], lanes), filled(follow[1], lanes)
         cx[2], cy[2] = 0.0, 0.0
-        drive = ti.Struct(x=cx, y=cy, z=cz, burst_s=FAR_M, pos=pos, vel=vel, z_var=io.ego.z_var[env])
+        drive = drive_of(env, cx, cy, cz, FAR_M, io.ego, io.teacher, io.teacher_cfg)
         peak, _, _, first = body_depths(
             env, drive, io.forecast, io.futures, io.teacher_cfg, io.tracking_cfg, io.tank_cfg
         )
@@ -225,11 +226,14 @@ def _foresee_conflict(env, io: Bundle[ThreatsIO]):
         if io.teacher.conflict_s[env] < FAR_M:
             io.teacher.calm_steps[env] = 0
         calm = io.teacher.calm_steps[env] * ti.static(io.episode_cfg.control_dt_s)
-        urgent = io.teacher.ttc_s[env] < ti.static(io.teacher_cfg.emergency_ttc_s)
+        urgent = io.teacher.ttc_s[env] < io.teacher_cfg.emergency_ttc_s * tuned(env, TTC, io.teacher)
         if (
             io.teacher.conflict_s[env] < FAR_M
             or urgent
-            or (io.teacher.evading_steps[env] > 0 and calm <= ti.static(io.teacher_cfg.calm_s + 0.2))
+            or (
+                io.teacher.evading_steps[env] > 0
+                and calm <= io.teacher_cfg.calm_s * tuned(env, CALM, io.teacher) + 0.2
+            )
         ):
             io.teacher.want_evade[env] = 1
 
@@ -241,7 +245,7 @@ def _nearest_body(env, pos, io: Bundle[ThreatsIO]):
 
     A body above or below the sonar's fan needs it most. FAR_M and zero where there is none.
     """
-    nearest, need, way = FAR_M, ti.static(io.teacher_cfg.gaze_m), ti.Vector([0.0, 0.0])
+    nearest, need, way = FAR_M, io.teacher_cfg.gaze_m * tuned(env, GAZE, io.teacher), ti.Vector([0.0, 0.0])
     for track in range(ti.static(io.forecast.radius_m.shape[1])):
         radius = io.forecast.radius_m[env, track, 0]
         if radius >= 0:

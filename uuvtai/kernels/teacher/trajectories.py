@@ -10,11 +10,50 @@ from typing import Any
 import taichi as ti
 
 from uuvtai.config import MappingConfig, TankConfig, TeacherConfig, TrackingConfig, VehicleConfig
-from uuvtai.kernels.core.geometry import FAR_M
+from uuvtai.kernels.core.geometry import FAR_M, turned_z3
 from uuvtai.kernels.core.grid import grid_origin
 from uuvtai.kernels.core.lanes import filled
 from uuvtai.kernels.core.signature import Const, In, Out
-from uuvtai.state import ClearanceState, ForecastState, FutureState
+from uuvtai.state import ClearanceState, ForecastState, FutureState, Proprioception, TeacherState
+from uuvtai.tuned_numbers import CAUTION, CLOSING, GROWTH, HORIZON, LAG
+
+_SLACK_S = 1.0e-3
+"""the last sample is within the horizon, however times are rounded"""
+
+
+@ti.func
+def tuned(env, number, teacher: In[TeacherState]):
+    """Factor on one of the config's numbers in this row (``tuned_numbers``)."""
+    return ti.exp(teacher.tuned[env, number])
+
+
+@ti.func
+def drive_of(
+    env,
+    cx,
+    cy,
+    cz,
+    burst_s,
+    ego: In[Proprioception],
+    teacher: In[TeacherState],
+    teacher_cfg: Const[TeacherConfig],
+):
+    """A packet of commanded velocities (lanes x, y, z [m/s]) from where the vehicle is, and what it is judged
+    by: the struct ``drive`` of ``body_depths``."""
+    return ti.Struct(
+        x=cx,
+        y=cy,
+        z=cz,
+        burst_s=burst_s,
+        pos=ego.pos_w[env],
+        vel=turned_z3(ego.vel_b[env], ego.rpy[env][2]),
+        z_var=ego.z_var[env],
+        caution=teacher_cfg.caution * tuned(env, CAUTION, teacher),
+        growth_m_s=teacher_cfg.margin_growth_m_s * tuned(env, GROWTH, teacher),
+        closing_s=teacher_cfg.closing_s * tuned(env, CLOSING, teacher),
+        horizon_s=teacher_cfg.horizon_s * tuned(env, HORIZON, teacher) + _SLACK_S,
+        slower=tuned(env, LAG, teacher),
+    )
 
 
 @ti.func
@@ -31,7 +70,7 @@ def body_depths(
 
     ``drive``: struct of the velocities (lanes x, y, z [m/s]), which are commanded for ``burst_s`` [s], then
     stop, and of the own position ``pos`` [m], velocity ``vel`` [m/s] and variance of z ``z_var`` [m^2] now,
-    world. Returns lanes: largest
+    world, and the row's own margins, horizon and lag (``drive_of``). Returns lanes: largest
     depth [m]; depth averaged over the horizon and summed over bodies [m]; largest depth below contact [m];
     time of the first violation [s], FAR_M = none. Each body counts with the mean of its futures, weighted by
     their probabilities; a future that is less probable than ``heed_share`` has no first violation. The
@@ -95,7 +134,7 @@ def _within_reach(
     closing = (second - first).norm() * ti.static(1.05 / tracking_cfg.forecast_dt_s)
     closing += ti.Vector([drive.vel[0], drive.vel[1]]).norm() + ti.static(_fastest(teacher_cfg))
     bound = forecast.radius_m[env, track, n - 1] + ti.static(teacher_cfg.hull_reach_m)
-    bound += _wanted_m(time, teacher_cfg) + closing * (time + ti.static(teacher_cfg.closing_s))
+    bound += _wanted_m(time, drive, teacher_cfg) + closing * (time + drive.closing_s)
     return (first - ti.Vector([drive.pos[0], drive.pos[1]])).norm_sqr() < bound * bound
 
 
@@ -119,18 +158,22 @@ def _future_depths(
     level, level_vel = ti.Vector([drive.pos[0], drive.pos[1]]), ti.Vector([drive.vel[0], drive.vel[1]])
     reach_speed = level_vel.norm() + ti.static(_fastest(teacher_cfg))
     above, below = forecast.above_w[env, track], forecast.below_w[env, track]
+    step_decay = ti.static(_decay(tracking_cfg.forecast_dt_s, teacher_cfg.lag_s)) * ti.exp(
+        ti.static(-tracking_cfg.forecast_dt_s / teacher_cfg.lag_s) * (1.0 / drive.slower - 1.0)
+    )
+    lag_s = teacher_cfg.lag_s * drive.slower
     decay, rest, before = 1.0, 1.0, forecast.pos_w[env, track, 0]
     for k in range(1, n_sample):
         # exp(-t / tau) by one factor a sample: settle = A(t), gain = B(t) - B(t - T), and the
         # velocity is v0 decay + c (rest - decay), the derivative of x(t)
-        decay *= ti.static(_decay(tracking_cfg.forecast_dt_s, teacher_cfg.lag_s))
+        decay *= step_decay
         time = k * dt
         over = ti.max(time - drive.burst_s, 0.0)
         if over > 0.0:
-            rest = ti.exp(over * ti.static(-1.0 / teacher_cfg.lag_s))
-        settle = ti.static(teacher_cfg.lag_s) * (1.0 - decay)
-        gain = time - settle - over + ti.static(teacher_cfg.lag_s) * (1.0 - rest)
-        body, wanted = forecast.pos_w[env, track, k], _wanted_m(time, teacher_cfg)
+            rest = ti.exp(over * ti.static(-1.0 / teacher_cfg.lag_s) / drive.slower)
+        settle = lag_s * (1.0 - decay)
+        gain = time - settle - over + lag_s * (1.0 - rest)
+        body, wanted = forecast.pos_w[env, track, k], _wanted_m(time, drive, teacher_cfg)
         if future >= 0:
             body = futures.pos_w[env, track, future, k]
             wanted -= ti.static(1.0 - teacher_cfg.future_margin) * (wanted - teacher_cfg.contact_m)
@@ -139,22 +182,24 @@ def _future_depths(
         start = level + level_vel * settle - body
         drift = level_vel * decay - body_vel
         radius = forecast.radius_m[env, track, k]
-        bound = _bound_m(radius, wanted, gain, reach_speed + body_vel.norm(), teacher_cfg)
-        if radius >= 0 and start.norm_sqr() < bound * bound:
+        bound = _bound_m(radius, wanted, gain, drive.closing_s * (reach_speed + body_vel.norm()), teacher_cfg)
+        if radius >= 0 and time <= drive.horizon_s and start.norm_sqr() < bound * bound:
             z = ti.math.clamp(drive.z * gain + (drive.pos[2] + drive.vel[2] * settle), low, high)
             gap = ti.max(ti.min(above - z, z - below), 0.0) * ti.static(teacher_cfg.vertical_weight)
-            free = _free_lanes(drive.x, drive.y, gap, start, drift, gain, rest - decay, radius, teacher_cfg)
+            free = _free_lanes(
+                drive.x, drive.y, gap, start, drift, gain, rest - decay, radius, drive.closing_s, teacher_cfg
+            )
             _deepen(found, wanted, free, time, n_sample - 1, teacher_cfg)
     return found
 
 
 @ti.func
-def _bound_m(radius, wanted, gain, closing, teacher_cfg: Const[TeacherConfig]):
+def _bound_m(radius, wanted, gain, reserve, teacher_cfg: Const[TeacherConfig]):
     """Distance [m] of ``start`` beyond which no lane's depth is above 0: however c is chosen, a lane comes no
-    nearer than |start| - fastest x gain and closes no faster than ``closing`` [m/s]."""
+    nearer than |start| - fastest x gain, and what closing takes off is at most ``reserve`` [m]."""
     bound = radius + ti.static(teacher_cfg.hull_reach_m) + wanted
     bound += ti.static(_fastest(teacher_cfg)) * gain
-    return bound + ti.static(teacher_cfg.closing_s) * closing
+    return bound + reserve
 
 
 @ti.func
@@ -169,14 +214,14 @@ def _deepen(found: Out[Any], wanted, free, time, n_ahead: Const[int], teacher_cf
 
 
 @ti.func
-def _wanted_m(time, teacher_cfg: Const[TeacherConfig]):
+def _wanted_m(time, drive, teacher_cfg: Const[TeacherConfig]):
     """Clearance [m] wanted ``time`` [s] ahead: it grows as the forecast's error does."""
-    margin = teacher_cfg.margin_m + teacher_cfg.margin_growth_m_s * time
-    return teacher_cfg.contact_m + teacher_cfg.caution * margin
+    margin = teacher_cfg.margin_m + drive.growth_m_s * time
+    return teacher_cfg.contact_m + drive.caution * margin
 
 
 @ti.func
-def _free_lanes(cx, cy, gap, start, drift, gain, share, radius, teacher_cfg: Const[TeacherConfig]):
+def _free_lanes(cx, cy, gap, start, drift, gain, share, radius, closing_s, teacher_cfg: Const[TeacherConfig]):
     """Surface-to-surface distance less closing_s times the closing speed, per lane; ``gap`` = weighted free
     water above or below.
 
@@ -191,44 +236,38 @@ def _free_lanes(cx, cy, gap, start, drift, gain, share, radius, teacher_cfg: Con
     distance = ti.sqrt(beyond * beyond + gap * gap + 1.0e-8)
     approach = -(dx * (cx * share + drift[0]) + dy * (cy * share + drift[1])) / middle
     closing = ti.max(approach, 0.0) * ti.select(gap > 0.0, beyond / distance, 1.0)
-    return (
-        distance + within - ti.static(teacher_cfg.hull_reach_m) - ti.static(teacher_cfg.closing_s) * closing
-    )
+    return distance + within - ti.static(teacher_cfg.hull_reach_m) - closing_s * closing
 
 
 @ti.func
 def static_depths(
     env,
-    cx,
-    cy,
-    burst_s,
-    pos,
-    vel,
+    drive,
     doubt,
     clearance: In[ClearanceState],
     teacher_cfg: Const[TeacherConfig],
     tank_cfg: Const[TankConfig],
     mapping_cfg: Const[MappingConfig],
 ):
-    """How deep each commanded velocity violates the wanted static clearance, ``doubt`` [m] (of
-    ``place_doubt``) more than is mapped: lanes mean depth and largest depth below contact [m]."""
-    mean, contact = filled(0.0, cx.n), filled(0.0, cx.n)
+    """How deep each commanded velocity of ``drive_of`` violates the wanted static clearance, ``doubt`` [m]
+    (of ``place_doubt``) more than is mapped: lanes mean depth and largest depth below contact [m]."""
+    mean, contact = filled(0.0, drive.x.n), filled(0.0, drive.x.n)
     n_sample = ti.static(max(1, round(teacher_cfg.static_horizon_s / teacher_cfg.static_dt_s)))
     touch = ti.static(teacher_cfg.hull_reach_m + teacher_cfg.contact_m)
     for k in range(1, n_sample + 1):
         time = k * ti.static(teacher_cfg.static_dt_s)
-        settle = settling(time, teacher_cfg)
-        over = ti.max(time - burst_s, 0.0)
-        gain = time - settle - over + settling(over, teacher_cfg)
+        settle = settling(time, drive.slower, teacher_cfg)
+        over = ti.max(time - drive.burst_s, 0.0)
+        gain = time - settle - over + settling(over, drive.slower, teacher_cfg)
         free = clearance_lanes(
             env,
-            cx * gain + (pos[0] + vel[0] * settle),
-            cy * gain + (pos[1] + vel[1] * settle),
+            drive.x * gain + (drive.pos[0] + drive.vel[0] * settle),
+            drive.y * gain + (drive.pos[1] + drive.vel[1] * settle),
             clearance,
             tank_cfg,
             mapping_cfg,
         )
-        for i in ti.static(range(cx.n)):
+        for i in ti.static(range(drive.x.n)):
             below = touch + doubt - free[i]
             mean[i] += ti.max(below + ti.static(teacher_cfg.static_margin_m), 0.0) / n_sample
             contact[i] = ti.max(contact[i], below)
@@ -236,9 +275,10 @@ def static_depths(
 
 
 @ti.func
-def settling(time, teacher_cfg: Const[TeacherConfig]):
-    """A(t) [s] of the module's text."""
-    return ti.static(teacher_cfg.lag_s) * (1.0 - ti.exp(-time * ti.static(1.0 / teacher_cfg.lag_s)))
+def settling(time, slower, teacher_cfg: Const[TeacherConfig]):
+    """A(t) [s] of the module's text, with ``slower`` times the lag."""
+    rate = ti.static(1.0 / teacher_cfg.lag_s) / slower
+    return teacher_cfg.lag_s * slower * (1.0 - ti.exp(-time * rate))
 
 
 @ti.func

@@ -82,6 +82,10 @@ class Method:
         from uuvtai.learn.pilot import load_pilot, refuse_forecaster
         from uuvtai.logs.log_recorder import PolicyNote
 
+        if self.checkpoint.config.tuner.enabled:
+            from uuvtai.learn.tuned_pilot import load_tuned
+
+            return PolicyNote(load_tuned(self.checkpoint, sim), self.checkpoint.sha256, None)
         if self.checkpoint.config.chooser.enabled:
             from uuvtai.learn.chooser import load_chooser
 

@@ -21,12 +21,15 @@ def evaluate_now(trainer: AnyTrainer, config: LearningConfig) -> Metrics:
     from uuvtai.learn.chooser_trainer import ChooserTrainer
     from uuvtai.learn.forecast_trainer import ForecastTrainer
     from uuvtai.learn.pilot import Pilot
+    from uuvtai.learn.tuner_trainer import TunerTrainer
     from uuvtai.learn.twin_trainer import TwinTrainer
     from uuvtai.measure.episodes.playing import Recorders, jobs_of, run_episodes
     from uuvtai.measure.evaluate.foresight import foresight_of
     from uuvtai.measure.evaluate.summary import summary
 
-    if isinstance(trainer, TwinTrainer | ChooserTrainer | ForecastTrainer):  # they play by themselves
+    if isinstance(
+        trainer, TwinTrainer | ChooserTrainer | TunerTrainer | ForecastTrainer
+    ):  # they play by themselves
         return trainer.evaluate()
     env = trainer.env
     model = trainer.world_model if config.world_model.as_features else None

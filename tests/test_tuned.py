@@ -1,0 +1,220 @@
+"""The tree's numbers as a training changes them: factors in the kernels, the search, resuming, refusals."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from uuvtai.errors import UserError
+from uuvtai.learn import checkpoint
+from uuvtai.learn.checkpoint import CheckpointError
+from uuvtai.learn.pilot import load_pilot
+from uuvtai.learn.response_surface import best_near, fitted
+from uuvtai.learn.tuned_pilot import TunedPilot, load_tuned, tuned_section
+from uuvtai.learn.tuner_trainer import TunerTrainer
+from uuvtai.loader import load_config, load_training, with_stack
+from uuvtai.measure.episodes.playing import jobs_of, run_episodes
+from uuvtai.tuned_numbers import DEVIATION, GAZE, HORIZON, RANGE, TTC, TUNED, log_bounds
+
+SMALL = {
+    "train.num_envs": 8,
+    "train.iterations": 4,
+    "train.scenes": [[8, 6, 0.6]],
+    "train.evaluate_episodes": 4,
+    "tuner.worlds": ["pool"],
+    "tuner.warm_up": 0.5,
+}
+
+
+@pytest.fixture(scope="module")
+def config():
+    return load_training("tuned", overrides=SMALL)
+
+
+@pytest.fixture(scope="module")
+def trainer(config, small):
+    """After three iterations, the last two of which moved the numbers."""
+    made = TunerTrainer(config, {"pool": small.sim})
+    for _ in range(3):
+        made.iterate()
+    return made
+
+
+# ------------------------------------------------------------------------------------------- response surface
+
+
+def test_the_surface_finds_what_made_the_scores():
+    rng = np.random.default_rng(0)
+    spread = np.array([0.5, 1.0, 2.0])
+    place = rng.uniform(-1, 1, (20000, 3)) * spread
+    x, group = place / spread, rng.integers(0, 2, 20000)
+    score = 0.6 + 0.1 * group + 0.04 * x[:, 0] - 0.05 * (x[:, 1] - 0.3) ** 2 + rng.normal(0, 0.1, 20000)
+    slope, bend = fitted(place, score, group, spread)
+    assert slope == pytest.approx([0.04, 0.03, 0.0], abs=0.006)
+    assert bend == pytest.approx([0.0, -0.05, 0.0], abs=0.01)
+    found = best_near(np.zeros(3), slope, bend, spread, -2 * spread, 2 * spread)
+    assert found[0] == pytest.approx(0.25), "a slope: as far as a step goes"
+    assert found[1] == pytest.approx(0.3, abs=0.08), "a top within the step"
+
+
+def test_a_step_stays_within_the_bounds():
+    one = np.ones(1)
+    assert best_near(0 * one, one, 0 * one, one, -one, 0.2 * one) == pytest.approx(0.2)
+    assert best_near(0 * one, -one, one, one, -0.1 * one, one) == pytest.approx(-0.1)
+
+
+def test_few_trials_are_not_believed():
+    rng = np.random.default_rng(1)
+    place = rng.uniform(-1, 1, (200, 2))
+    slope, bend = fitted(place, rng.integers(0, 2, 200).astype(float), np.zeros(200, int), np.ones(2))
+    assert np.abs(slope).max() < 0.03 and np.abs(bend).max() < 0.03
+
+
+# ------------------------------------------------------------------------------------------------ the numbers
+
+
+def test_every_number_is_one_of_the_config(config):
+    for number in TUNED:
+        assert getattr(config.teacher, number.name) > 0
+        assert 0 < number.least < 1 <= number.most
+    assert [TUNED[i].name for i in (DEVIATION, HORIZON, TTC, RANGE, GAZE)] == [
+        "weight_deviation",
+        "horizon_s",
+        "emergency_ttc_s",
+        "emergency_range_m",
+        "gaze_m",
+    ]
+    low, high = log_bounds()
+    assert low[TTC] == pytest.approx(math.log(0.15)) and high[HORIZON] == 0.0
+
+
+def ends(sim, log_factor=None):
+    """(outcome, time) of eight episodes, by the tree or with factors on its numbers."""
+    driver = None if log_factor is None else TunedPilot(log_factor, sim)
+    results, _ = run_episodes(sim, jobs_of([77], 8), driver=driver)
+    return [(result.outcome, result.time_s, result.path_length_m) for result in results]
+
+
+def test_factors_of_one_change_nothing_and_others_do(small):
+    sim = small.sim
+    sim.set_scenes([(8, 6, 0.6)])
+    usual = ends(sim)
+    assert ends(sim, torch.zeros(len(TUNED))) == usual
+    for number in range(len(TUNED)):
+        other = torch.zeros(len(TUNED))
+        other[number] = math.log(TUNED[number].least)
+        if number in (DEVIATION, HORIZON):
+            assert ends(sim, other) != usual, TUNED[number].name
+    assert ends(sim) == usual, "a reset sets the numbers back"
+    sim.set_scenes()
+
+
+def test_every_row_has_its_own_numbers(small):
+    sim = small.sim
+    rows = torch.arange(sim.num_envs, dtype=torch.int32)
+    sim.sleep()
+    sim.reset(torch.ones_like(rows), torch.full_like(rows, 77), rows)
+    pilot = TunedPilot(torch.zeros(len(TUNED)), sim)
+    pilot.log_factor[1, TTC] = -1.0
+    pilot.reset(torch.ones_like(rows))
+    held = sim.rows(sim.s.teacher.tuned)
+    assert held[1, TTC] == -1.0 and np.count_nonzero(held) == 1
+    assert torch.equal(pilot.decide(sim.action).action, sim.action)
+    sim.sleep()
+
+
+# ----------------------------------------------------------------------------------------------- the training
+
+
+def test_a_training_moves_the_numbers_within_their_bounds(trainer):
+    low, high = (torch.tensor(side) for side in log_bounds())
+    assert trainer.trials == 24 and trainer.env_steps > 24
+    assert bool((trainer.centre != 0).any())
+    assert bool(((trainer.centre >= low - 1e-6) & (trainer.centre <= high + 1e-6)).all())
+    assert set(trainer.factors()) == {f"tuner/{number.name}" for number in TUNED}
+    drawn = trainer._drawn(2000)
+    kept = (drawn == trainer.centre).float().mean(0)
+    assert bool(((kept > 0.4) & (kept < 0.9)).all())
+
+
+def test_arrivals_count_and_early_ones_more(trainer):
+    from uuvtai.outcomes import COLLISION, SUCCESS
+
+    score = trainer._scored(torch.tensor([SUCCESS, SUCCESS, COLLISION]), torch.tensor([500, 1000, 100]))
+    assert score.tolist() == pytest.approx([1 - 0.08, 1 - 0.16, 0.0])
+
+
+def test_an_evaluation_changes_nothing(trainer):
+    before = trainer.state()
+    metrics = trainer.evaluate()
+    assert set(metrics) == {"eval/success_rate", "eval/success_pool_6_0.6"}
+    after = trainer.state()
+    assert torch.equal(before["generator"], after["generator"])
+    assert before["counters"] == after["counters"]
+
+
+def test_a_resumed_training_has_the_same_bits(trainer, config, small, tmp_path):
+    path = checkpoint.save(tmp_path / "checkpoints", 3, trainer.state(), config, trainer.observation_table)
+    found = checkpoint.open_checkpoint(path)
+    other = TunerTrainer(config, {"pool": small.sim})
+    other.load_state(found.state(like=other.state()))
+    first = TunerTrainer(config, {"pool": small.sim})
+    first.load_state(trainer.state())
+    assert first.iterate()["rollout/success_rate"] == other.iterate()["rollout/success_rate"]
+    assert torch.equal(first.centre, other.centre)
+
+
+# --------------------------------------------------------------------------------------------- what it leaves
+
+
+@pytest.fixture
+def saved(trainer, config, tmp_path):
+    """Function: a checkpoint with these factors (logarithms)."""
+
+    def save(log_factor):
+        state = trainer.state() | {"tree": {"log_factor": log_factor}}
+        path = checkpoint.save(tmp_path / "checkpoints", 3, state, config, trainer.observation_table)
+        return checkpoint.open_checkpoint(path)
+
+    return save
+
+
+def test_a_checkpoint_drives(saved, trainer, small):
+    pilot = load_tuned(saved(trainer.centre), small.sim)
+    assert torch.equal(torch.from_numpy(pilot.log_factor[0]), trainer.centre)
+    assert pilot.log_factor.shape[0] >= small.sim.num_envs
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [torch.zeros(3), torch.full((len(TUNED),), 5.0), torch.full((len(TUNED),), float("nan"))],
+    ids=["too few", "beyond the bounds", "not finite"],
+)
+def test_numbers_that_no_training_leaves_are_refused(saved, small, wrong):
+    with pytest.raises(CheckpointError, match="holds no numbers of the tree"):
+        load_tuned(saved(wrong), small.sim)
+
+
+def test_an_export_says_what_to_do_instead(saved, trainer):
+    with pytest.raises(UserError, match=r"stack\.yaml"):
+        load_pilot(saved(trainer.centre), 1)
+
+
+def test_a_stack_holds_the_numbers(config):
+    section = tuned_section(torch.full((len(TUNED),), math.log(0.5)), config)
+    assert config.teacher.horizon_s == 2.5 and section["horizon_s"] == 1.2, "the last sample within it"
+    assert section["weight_mean"] == pytest.approx(config.teacher.weight_mean * 12 / 25)
+    assert section["gaze_m"] == config.teacher.gaze_m / 2
+    assert section.keys() == {number.name for number in TUNED} | {"weight_mean"}
+
+
+def test_the_shipped_stack_holds_numbers_that_a_training_can_find():
+    usual = load_config("pool")
+    ours = with_stack(usual, "tuned")
+    changed = {name for name, value in ours.teacher if value != getattr(usual.teacher, name)}
+    assert changed == {number.name for number in TUNED} | {"weight_mean"}
+    for number in TUNED:
+        factor = getattr(ours.teacher, number.name) / getattr(usual.teacher, number.name)
+        assert number.least <= factor <= number.most, number.name
+    assert ours.model_copy(update={"teacher": usual.teacher}) == usual

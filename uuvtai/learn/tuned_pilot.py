@@ -1,0 +1,96 @@
+"""The behaviour tree with numbers that were learnt: factors on its config's, row by row."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from uuvtai.learn.checkpoint import Checkpoint
+from uuvtai.learn.manifest import MODEL, CheckpointError
+from uuvtai.learn.pilot import PilotDecision
+from uuvtai.tuned_numbers import TUNED
+
+if TYPE_CHECKING:
+    from uuvtai.config import Config
+    from uuvtai.env import ObservationColumn
+    from uuvtai.sim import Sim
+
+
+class TunedPilot:
+    """Lets the simulator's tree drive, with other numbers from the first decision after a reset on; used as
+    ``Pilot`` is."""
+
+    world_model = None
+    risk = None
+
+    def __init__(self, log_factor: torch.Tensor, sim: Sim) -> None:
+        """``log_factor`` (n_tuned,) natural logarithms of the factors, in the order of ``TUNED``."""
+        self.simulator = sim
+        rows = sim.s.teacher.tuned.shape[0]
+        self.log_factor = log_factor.float().cpu().numpy()[None].repeat(rows, axis=0)
+        """(rows, n_tuned) of every row that is allocated"""
+        nothing = torch.zeros(sim.num_envs, device=sim.device)
+        std = torch.zeros(4, device=sim.device)
+        self.decision = PilotDecision(sim.action, nothing, std, nothing, nothing, nothing[:0])
+        """value, residual and uncertainty are 0: nobody says them"""
+
+    def reset(self, rows: torch.Tensor) -> None:
+        """New episodes have begun in the rows (num_envs,) where this is not 0: a reset has set their numbers
+        back."""
+        self.simulator.put(self.simulator.s.teacher.tuned, self.log_factor)
+
+    def decide(self, obs: torch.Tensor) -> PilotDecision:
+        """What the tree has chosen; changes nothing."""
+        self.decision = self.decision._replace(action=self.simulator.action.clone())
+        return self.decision
+
+    def advance(self) -> None:
+        """The last decision has been carried out."""
+
+
+def load_tuned(checkpoint: Checkpoint, sim: Sim) -> TunedPilot:
+    """Pilot of a checkpoint that holds numbers of the tree. Raises CheckpointError for others."""
+    return TunedPilot(log_factors(checkpoint), sim)
+
+
+def log_factors(checkpoint: Checkpoint) -> torch.Tensor:
+    """(n_tuned,) of a checkpoint. Raises CheckpointError where they are none that a training can leave."""
+    try:
+        found = checkpoint.model()["tree"]["log_factor"]
+        if tuple(found.shape) != (len(TUNED),):
+            raise ValueError(f"log_factor is {tuple(found.shape)} instead of {(len(TUNED),)}")
+        for number, factor in zip(TUNED, found.exp().tolist(), strict=True):
+            if not number.least * 0.999 <= factor <= number.most * 1.001:
+                raise ValueError(f"{number.name} is multiplied by {factor:g}")
+    except (KeyError, ValueError, TypeError, AttributeError) as error:
+        raise CheckpointError(
+            f"{checkpoint.path / MODEL}: holds no numbers of the tree ({error}); take another one"
+        ) from None
+    return found
+
+
+def tuned_section(log_factor: torch.Tensor, config: Config) -> dict[str, float]:
+    """Keys of the config's section ``teacher`` by which a stack drives as these factors do, to four digits.
+
+    The horizon ends with its last sample, and depths are averaged over as many samples as before:
+    ``weight_mean`` makes up for the fewer ones.
+    """
+    factors, teacher_cfg = np.exp(log_factor.double().numpy()), config.teacher
+    section = {
+        number.name: getattr(teacher_cfg, number.name) * factor
+        for number, factor in zip(TUNED, factors, strict=True)
+    }
+    dt_s = config.tracking.forecast_dt_s
+    samples = int((section["horizon_s"] + 1e-3) / dt_s)
+    section["horizon_s"] = samples * dt_s
+    section["weight_mean"] = teacher_cfg.weight_mean * samples / round(teacher_cfg.horizon_s / dt_s)
+    return {name: float(f"{value:.4g}") for name, value in section.items()}
+
+
+def tree_row() -> ObservationColumn:
+    """The observation of such a pilot, for a checkpoint's manifest."""
+    from uuvtai.env import ObservationColumn
+
+    return ObservationColumn("tree", slice(0, 4), "1", "body", "what the behaviour tree asks for")
