@@ -58,16 +58,10 @@ def demo(arguments: list[str]) -> int:
 def test(arguments: list[str]) -> int:
     """Lint, types, import contracts, then the tests with coverage; the first failure decides the exit
     code."""
+    python = str(BIN / "python")
+    warm = None if arguments else _warm(python)
     install(".[dev]")
     _install_js()
-    python = str(BIN / "python")
-    if (
-        not arguments
-    ):  # torch's threads of two test processes on two cores wait for each other more than they work
-        os.environ.setdefault("OMP_NUM_THREADS", "1")
-        os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-        os.environ.setdefault("UUV_COMPILERS", "1")
-    warm = None if arguments else subprocess.Popen([python, "-m", "tests.warm"], cwd=ROOT)
     checks = [
         [str(BIN / "ruff"), "check", "."],
         [str(BIN / "ruff"), "format", "--check", "."],
@@ -75,9 +69,20 @@ def test(arguments: list[str]) -> int:
         [str(BIN / "lint-imports")],
     ]
     code = next((code for command in checks if (code := run(command))), 0)
-    if warm:  # meanwhile the other core has compiled what both test processes need
-        warm.wait()
+    if warm:  # what it has compiled is kept, kernel by kernel
+        warm.terminate() if code else warm.wait()
     return code or run([python, "-m", "pytest", *(arguments or IN_FULL)])
+
+
+def _warm(python: str) -> subprocess.Popen[bytes]:
+    """Compile what both test processes need on the other core, while packages of the tests are installed and
+    the code is checked: kernels need none of them."""
+    # torch's threads of two test processes on two cores wait for each other more than they work
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    os.environ.setdefault("UUV_COMPILERS", "1")
+    install(".")
+    return subprocess.Popen([python, "-m", "tests.warm"], cwd=ROOT)
 
 
 def docs(arguments: list[str]) -> int:

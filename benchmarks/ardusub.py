@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import os
 import select
+import struct
 import subprocess
 import tempfile
 import time
@@ -23,6 +24,9 @@ from pymavlink import mavutil
 from benchmarks.closed_loop import SEED, simulated
 from benchmarks.common import Job, Row
 from uuvtai.config import Config
+from uuvtai.identify.ardusub_log import read_ardusub
+from uuvtai.identify.identified import identified
+from uuvtai.identify.motion_model import parameters_of
 from uuvtai.link.endpoint import Endpoint, LinkPlace
 from uuvtai.link.flight_plan import FlightPlan
 from uuvtai.link.link_log import LinkLog
@@ -40,16 +44,22 @@ THREADS = 1
 LONGEST_S = 7200
 BINARY = "UUV_ARDUSUB"
 RATE_HZ = 400
-ALT_HOLD, GUIDED = 2, 4
+TLOG_BEGINS_S = 1_700_000_000
+"""[s] since 1970; which day does not matter"""
+ALT_HOLD, GUIDED, MANUAL = 2, 4, 19
 PORT, SENSORS, OPERATOR = 29002, 24660, 24560
+TOLD_WRONG = ("added_mass", "linear_damping", "quadratic_damping")
+"""what ``uuv identify`` is told 30 % too high"""
 PARAMETERS = {
     "ARMING_CHECK": 0, "FS_PILOT_INPUT": 0, "FS_GCS_ENABLE": 0, "GPS1_TYPE": 0, "VISO_TYPE": 1,
     "EK3_SRC1_POSXY": 6, "EK3_SRC1_VELXY": 6, "EK3_SRC1_POSZ": 1, "EK3_SRC1_VELZ": 0, "EK3_SRC1_YAW": 1,
     "AHRS_EKF_TYPE": 3, "SERIAL1_PROTOCOL": 2, "SERIAL2_PROTOCOL": 2, "LOG_DISARMED": 0,
     "LOG_BACKEND_TYPE": 0, "SIM_BARO_RND": 0.002, "SIM_BAR2_RND": 0.002,
+    "BARO1_GND_PRESS": 101325, "BARO2_GND_PRESS": 101325,
 }  # fmt: skip
 """beside ArduPilot's own defaults for its simulated submarine (Tools/autotest/default_params/sub.parm);
-pressure as exact as a Bar30's: 2 mm (its maker's data sheet), not the 0.2 m of a barometer in the air"""
+pressure as exact as a Bar30's: 2 mm (its maker's data sheet), not the 0.2 m of a barometer in the air, and
+zeroed at the surface (101,325 Pa in its simulation), as an owner does before a dive"""
 
 
 def measure(job: Job) -> list[Row]:
@@ -59,7 +69,9 @@ def measure(job: Job) -> list[Row]:
         return [Row("real ArduSub", None, "", note=f"not tried: {BINARY} names no binary")]
     tree = read_tree("bt")
     still = load_config("open", "multibeam", "bluerov2_16v")
-    rows = [*_alone(Sim(still, 1, tree), binary, job), _three(Sim(still, 3, tree), binary, job)]
+    alone = Sim(still, 1, tree)
+    rows = [*_alone(alone, binary, job), *_identified(alone, binary, job)]
+    rows.append(_three(Sim(still, 3, tree), binary, job))
     pool = load_config(
         "pool", "multibeam", "bluerov2_16v", overrides={"world.n_dynamic": 6, "world.dynamic_speed_m_s": 0.6}
     )
@@ -71,9 +83,18 @@ class Rig:
     """ArduSubs and their water, moved on by its clock."""
 
     def __init__(
-        self, sim: Sim, binary: str, seed: int = SEED, episode: int = 0, pilot: int | None = None
+        self,
+        sim: Sim,
+        binary: str,
+        seed: int = SEED,
+        episode: int = 0,
+        pilot: int | None = None,
+        more: dict[str, float] | None = None,
     ) -> None:
         self.water, self._binary = WaterRows(sim, seed, episode), binary
+        self._parameters = PARAMETERS | (more or {})
+        self.tlog = b""
+        """what the first ArduSub told the operator, by the water's clock"""
         self._sim, count = sim, sim.num_envs
         places = [LinkPlace("127.0.0.1", SENSORS, False)]
         if pilot is not None:
@@ -101,14 +122,14 @@ class Rig:
         folder.mkdir()
         own = Path(self._binary).resolve().parents[3] / "Tools/autotest/default_params/sub.parm"
         text = own.read_text() if own.exists() else ""
-        text += "\n" + "".join(f"{name} {value}\n" for name, value in PARAMETERS.items())
+        text += "\n" + "".join(f"{name} {value}\n" for name, value in self._parameters.items())
         (folder / "sub.parm").write_text(text)
         words = [
             str(Path(self._binary).resolve()), "--model", "JSON:127.0.0.1", "--home",
             "-35.36,149.16,0,0", "--wipe", "--defaults", "sub.parm", f"-I{row}", "--sysid", str(row + 1),
             "--rate", str(RATE_HZ), "--speedup", "100",
             "--sim-port-out", str(PORT + 10 * row), "--sim-port-in", str(PORT + 500 + 10 * row),
-            "--base-port", "26760",
+            "--base-port", str(OPERATOR + 2200),
             "--serial0", f"udpclient:127.0.0.1:{OPERATOR + 10 * row}",
             "--serial1", f"udpclient:127.0.0.1:{self._pilot_port(row)}",
             "--serial2", f"udpclient:127.0.0.1:{SENSORS + 10 * row}",
@@ -158,6 +179,9 @@ class Rig:
         for row, link in enumerate(self.links):
             while (message := link.recv_match(blocking=False)) is not None:
                 kind = message.get_type()
+                if row == 0:
+                    stamp = round(1e6 * (TLOG_BEGINS_S + self.time_s))
+                    self.tlog += struct.pack(">Q", stamp) + message.get_msgbuf()
                 if kind == "HEARTBEAT" and message.get_srcComponent() == 1:
                     self.modes[row], self.armed[row] = message.custom_mode, bool(message.base_mode & 128)
                 elif kind == "STATUSTEXT":
@@ -195,6 +219,15 @@ class Rig:
         self.links[0].mav.set_position_target_local_ned_send(
             0, 1, 1, 8, 0x5C7, 0, 0, 0, ahead, 0, 0, 0, 0, 0, 0, turn
         )
+
+    def push(self, ahead: float, right: float, up: float, turn: float) -> None:
+        """The operator's sticks, shares of full thrust."""
+        x, y, r = (round(1000 * share) for share in (ahead, right, turn))
+        self.links[0].mav.manual_control_send(1, x, y, round(500 + 500 * up), r, 0)
+
+    def dataflash(self) -> list[Path]:
+        """Logs that ArduSub wrote."""
+        return sorted(Path(self._folder.name).rglob("*.BIN"))
 
     def stop(self, row: int) -> None:
         """Kill an ArduSub."""
@@ -257,6 +290,74 @@ def _alone(sim: Sim, binary: str, job: Job) -> list[Row]:
     finally:
         rig.close()
     return rows
+
+
+def _identified(sim: Sim, binary: str, job: Job) -> list[Row]:
+    """Five minutes of sticks, then ``uuv identify`` on ArduSub's own logs of it."""
+    rig = Rig(sim, binary, more={"LOG_BACKEND_TYPE": 1, "LOG_BITMASK": 4_194_303})
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            ready(rig)
+            for message in (30, 32, 36):  # ATTITUDE, LOCAL_POSITION_NED, SERVO_OUTPUT_RAW
+                rig.order(511, message, 20_000)
+            took = rig.take(MANUAL)
+            _legs(rig, 60.0 if job.quick else 300.0)
+            rig.advance(1.0)
+            files = [Path(folder) / "drive.bin", Path(folder) / "drive.tlog"]
+            files[0].write_bytes(rig.dataflash()[-1].read_bytes())
+            files[1].write_bytes(rig.tlog)
+        finally:
+            rig.close()
+        job.say(f"drive: {took}, {[file.stat().st_size for file in files]} bytes; {rig.said[-2:]}")
+        return [_identified_row(file, sim.config, job) for file in files]
+
+
+def _legs(rig: Rig, seconds: float) -> None:
+    """Each axis forth and back, alone and together, one to four seconds each."""
+    rng, sticks = np.random.default_rng(7), {"until": 0.0, "next": 0.0, "back": 0.0}
+    share = np.zeros(4)
+
+    def each(now_s: float) -> None:
+        if now_s >= sticks["until"]:
+            if sticks["back"] > 0:
+                share[:] *= -1.0
+                sticks["until"], sticks["back"] = now_s + sticks["back"], 0.0
+            else:
+                used = rng.random(4) < 0.5
+                share[:] = used * rng.choice([-1.0, 1.0], 4) * rng.uniform(0.2, 0.7, 4)
+                sticks["back"] = rng.uniform(1.0, 4.0)
+                sticks["until"] = now_s + sticks["back"]
+        if now_s >= sticks["next"]:
+            sticks["next"] = now_s + 0.05
+            rig.push(*share)
+
+    rig.advance(seconds, each)
+
+
+def _identified_row(file: Path, config: Config, job: Job) -> Row:
+    """How many of the true numbers lie within their intervals."""
+    vehicle_cfg = config.vehicle
+    true = parameters_of(vehicle_cfg)
+    told = vehicle_cfg.model_copy(
+        update={name: tuple(1.3 * v for v in getattr(vehicle_cfg, name)) for name in TOLD_WRONG}
+    )
+    found = identified(read_ardusub(file, told), told).document
+    fitted = [entry for entry in found["parameters"] if entry["fitted"]]
+    within = [entry["low"] <= true[entry["place"]] <= entry["high"] for entry in fitted]
+    for entry in fitted:
+        job.say(
+            f"{file.name} {entry['name']}: {entry['value']:.3g} [{entry['low']:.3g}, {entry['high']:.3g}], "
+            f"true {true[entry['place']]:.3g}"
+        )
+    return Row(
+        f"uuv identify, ArduSub's {file.suffix}",
+        float(sum(within)),
+        f"of {len(within)} true numbers within their interval",
+        note=f"{found['seconds']:g} s",
+        details={
+            "parameters": {e["name"]: [e["value"], e["low"], e["high"], true[e["place"]]] for e in fitted}
+        },
+    )
 
 
 def _velocity_row(rig: Rig, what: str, ahead: float, turn: float, seconds: float, took: bool) -> Row:

@@ -2,7 +2,8 @@
 
 Whole commands that do next to nothing, so that importing, compiling and resetting are all there is. Both
 sides run in this environment with caches of their own, in turns. A cold start compiles everything, a warm one
-has run before, a new one asks for a number of obstacles, a speed or a batch that has never been run.
+has run before, a new one asks for a number of obstacles, a speed, a batch or a threshold that has never been
+run.
 """
 
 from __future__ import annotations
@@ -32,6 +33,9 @@ _NEW = {
     "uuv eval with a D never run before": [[*_EIGHT, "-D", text] for text in ("3", "4", "5")],
     "uuv eval with a batch never run before": [[*_EVAL, "--episodes", text] for text in ("5", "7", "11")],
     "uuv eval with a speed never run before": [[*_EIGHT, "-v", text] for text in ("0.5", "0.7", "0.9")],
+    "uuv eval with a threshold never run before": [
+        [*_EIGHT, "--set", f"teacher.caution={text}"] for text in ("0.8", "1.2", "1.4")
+    ],
 }
 
 

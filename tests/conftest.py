@@ -4,9 +4,9 @@ the whole stack."""
 import signal
 
 import pytest
-import torch
 
 from tests.field_memory import look_in_memory
+from tests.small_sim import SmallSim
 
 BEGUN_FIRST = """
 cli tracking training cuda world signals log_alone security sonar docs report deploy mapping media_formats
@@ -50,8 +50,10 @@ def set_step(clock, step):
 
 
 def configure(monkeypatch, sim, config):
-    """Give a simulator another config for a test; stages whose sections stay keep their compiled kernels."""
+    """Give a simulator another config for a test; stages whose sections stay keep their compiled kernels, and
+    others are found where the config's numbers alone are others."""
     from uuvtai.binding import bind_all
+    from uuvtai.native.making import adopt
     from uuvtai.stages import Stages
 
     new = vars(bind_all(Stages, sim.s, config))
@@ -62,6 +64,7 @@ def configure(monkeypatch, sim, config):
     }
     monkeypatch.setattr(sim, "config", config)
     monkeypatch.setattr(sim, "io", Stages(**(new | same)))
+    adopt([new[name] for name in new.keys() - same.keys()], sim.memory())
 
 
 def estimate_pose(monkeypatch, small):
@@ -82,57 +85,6 @@ def near_horizon(env, rows, steps_left):
 
 
 _built = []
-
-
-class SmallSim:
-    """A simulator whose kernels are compiled once for the session, and what tests do with it."""
-
-    N = 8
-    CHANGES = {"world.dynamic_capacity": 9}
-    OPTIONS = ("--num-envs", "8", "--set", "world.dynamic_capacity=9", "--device", "cpu")
-    """of commands in processes of their own that are to find these kernels compiled (``tests/warm.py``
-    compiles them beforehand)"""
-    TRAIN = (
-        "train",
-        "smoke",
-        *OPTIONS,
-        "--set",
-        "episode.horizon_steps=400",
-        "--set",
-        "distill.batch=32",
-        "--set",
-        "world_model.batch=32",
-    )
-
-    def __init__(self):
-        from uuvtai.loader import load_config
-        from uuvtai.sim import Sim
-        from uuvtai.tree import read_tree
-
-        self.config = load_config("pool", "paper", overrides=self.CHANGES)
-        self.trees = {name: read_tree(name) for name in ("straight", "planner", "bt")}
-        self.sim = Sim(self.config, self.N, self.trees["bt"])
-        self.new = self.sim.memory().read().copy()
-
-    def forget(self):
-        """As it was built."""
-        self.sim.memory().read()[:] = self.new
-        self.sim.tree, self.sim.observation = self.trees["bt"], None
-
-    def begin(self, episodes, seed=0, rows=None):
-        """Reset ``rows`` (default: the first ones) to these episode numbers."""
-        rows = list(range(len(episodes))) if rows is None else rows
-        mask, seeds, numbers = (torch.zeros(self.N, dtype=torch.int32) for _ in range(3))
-        for row, number in zip(rows, episodes, strict=True):
-            mask[row], seeds[row], numbers[row] = 1, seed, number
-        self.sim.reset(mask, seeds, numbers)
-
-    def arrays(self, *nouns):
-        """NumPy copies of every array of these structs but scratch, which keeps what earlier tests left in
-        it, by 'struct.field'."""
-        memory = self.sim.memory()
-        views = memory.views(memory.read())
-        return {name: view.copy() for name, view in views.items() if name.partition(".")[0] in nouns}
 
 
 @pytest.fixture(scope="session")

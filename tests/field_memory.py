@@ -5,32 +5,17 @@ value that a field is filled with, and two for single elements. Here one kernel 
 where it lies. What NumPy sees is compared with Taichi's own copies in ``test_capture.py``.
 """
 
-import ctypes
-
 import numpy as np
-import taichi as ti
-import torch
-from taichi.lang import impl
 from taichi.lang.field import ScalarField
 from taichi.lang.matrix import MatrixField
 from taichi.lang.util import in_python_scope
 
-from uuvtai.taichi_patches.memory import _offset, _path, _view
-
-
-@ti.kernel
-def _tell_where(field: ti.template(), out: ti.types.ndarray(dtype=ti.i64, ndim=1)):  # type: ignore[valid-type]
-    """out[0] = address of the first element of a field of any rank."""
-    out[0] = ti.cast(ti.get_addr(field, ti.Vector([0 for _ in ti.static(range(len(field.shape)))])), ti.i64)
-
+from uuvtai.taichi_patches.memory import HostFields
 
 KINDS = (ScalarField, MatrixField)
 _own_copy = {kind: kind.to_numpy for kind in KINDS}
 
-_blocks: dict[int, np.ndarray] = {}
-"""bytes of every tree of fields, by its number"""
-_seen: dict[int, tuple] = {}
-"""(field, its view) by the field's identity"""
+FIELDS = HostFields()
 
 
 def copied_by_taichi(field):
@@ -38,36 +23,9 @@ def copied_by_taichi(field):
     return _own_copy[type(field)](field)
 
 
-def view_of(field):
-    """The field's memory as an array, vectors with a last axis; None where it does not lie in one piece."""
-    known = _seen.get(id(field))
-    if known is None:
-        impl.get_runtime().materialize()
-        known = _seen[id(field)] = field, _found(field)
-    return known[1]
-
-
-def _found(field):
-    first, last = (field.vars[i].ptr.snode() for i in (0, -1))
-    together = (last.offset_bytes_in_parent_cell - first.offset_bytes_in_parent_cell) == (
-        len(field.vars) - 1
-    ) * int(str(field.dtype)[1:]) // 8
-    if field.shape == () or not together or getattr(field, "m", 1) != 1:
-        return None
-    tree = first.get_snode_tree_id()
-    if tree not in _blocks:
-        out = torch.zeros(1, dtype=torch.int64)
-        _tell_where(field, out)
-        size = _path(field)[-1].cell_size_bytes
-        _blocks[tree] = np.ctypeslib.as_array(
-            (ctypes.c_uint8 * size).from_address(int(out[0]) - _offset(field))
-        )
-    return _view(field, False, _blocks[tree])
-
-
 def _reads(taichis):
     def to_numpy(self, *arguments, **named):
-        view = None if arguments or named else view_of(self)
+        view = None if arguments or named else FIELDS.view(self)
         return taichis(self, *arguments, **named) if view is None else view.copy()
 
     return to_numpy
@@ -75,7 +33,7 @@ def _reads(taichis):
 
 def _writes(taichis):
     def from_numpy(self, arr):
-        view = view_of(self)
+        view = FIELDS.view(self)
         if view is None or arr.shape != view.shape:
             taichis(self, arr)
         else:
@@ -87,7 +45,7 @@ def _writes(taichis):
 def _fills(taichis):
     def fill(self, val):
         plain = in_python_scope() and isinstance(val, int | float | np.generic | tuple | list)
-        view = view_of(self) if plain else None
+        view = FIELDS.view(self) if plain else None
         if view is None:
             taichis(self, val)
         else:
@@ -98,7 +56,7 @@ def _fills(taichis):
 
 def _gets(taichis):
     def getitem(self, key):
-        view = view_of(self)
+        view = FIELDS.view(self)
         return taichis(self, key) if view is None or not _is_cell(view, key) else view[key].item()
 
     return getitem
@@ -106,7 +64,7 @@ def _gets(taichis):
 
 def _sets(taichis):
     def setitem(self, key, value):
-        view = view_of(self)
+        view = FIELDS.view(self)
         if view is None or not _is_cell(view, key):
             taichis(self, key, value)
         else:

@@ -32,6 +32,7 @@ BELOW = (
     "tuned_numbers",
     "plan_codes",
     "outcomes",
+    "multibeam",
 )
 """What kernels may import of the package."""
 STACK = {"core", "perception", "planning", "teacher", "baselines"}
@@ -245,8 +246,11 @@ def test_only_the_runtime_starts_taichi():
         assert ("ti.init" in calls) == (path.name == "runtime.py")
 
 
-LAUNCHERS = ("sim", "stack", "sensing", "mission", "plant", "rrt", "rows_of_water")
-"""files that run stages: of thousands of vehicles, of one on board, of one without a world, of ArduSub's"""
+LAUNCHERS = (
+    "sim", "stack", "sensing", "sim_stack", "plant", "rrt", "rows_of_water", "tape", "stack_folder",
+)  # fmt: skip
+"""files that run stages: of thousands of vehicles, of one on board, of one without a world, of ArduSub's, of
+one that is written down"""
 
 
 def test_only_those_who_run_stages_launch_kernels():

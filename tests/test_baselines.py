@@ -9,7 +9,7 @@ import taichi as ti
 
 from tests.bundles import io_for
 from tests.command import uuv
-from tests.conftest import SmallSim
+from tests.small_sim import SmallSim
 from uuvtai import state
 from uuvtai.kernels.baselines.bundles import PathIntegralIO
 from uuvtai.kernels.baselines.dynamic_window import plan_dynamic_window

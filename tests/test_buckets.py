@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from tests.command import uuv
+from uuvtai.kernels.core.signature import spread
 from uuvtai.loader import load_config
 from uuvtai.native.launch import native
 from uuvtai.sim import Sim
@@ -72,3 +73,14 @@ def test_warm_makes_what_another_process_finds(capfd):
     (shape,) = json.loads(out)["shapes"]
     assert code == 0 and (shape["sensors"], shape["num_envs"]) == ("paper", 8)
     assert shape["compiled"] + shape["found"] > 30
+
+
+def test_one_vehicle_has_no_idle_items():
+    """Loops of many rows are padded until every core has a part; one row has one thread."""
+    assert [spread(n, inner) for n, inner in ((1, 1), (1, 16), (8, 1), (1024, 1), (1024, 16))] == [
+        1,
+        1,
+        512,
+        8,
+        1,
+    ]

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.field_memory import copied_by_taichi, view_of
+from tests.field_memory import FIELDS, copied_by_taichi
 from uuvtai.copying import copied_rows
 from uuvtai.env import VectorEnv
 from uuvtai.outcomes import OUTCOMES
@@ -120,7 +120,7 @@ def test_rows_are_what_a_kernel_copies(small):
         before = field.to_numpy()
         field.from_numpy(rng.integers(0, 99, before.shape).astype(before.dtype))
         found, copied = small.sim.rows(field, rows), copied_rows(field, torch.tensor(rows, dtype=torch.int32))
-        assert found.dtype == copied.dtype and not np.shares_memory(found, view_of(field))
+        assert found.dtype == copied.dtype and not np.shares_memory(found, FIELDS.view(field))
         np.testing.assert_array_equal(found, copied)
         np.testing.assert_array_equal(small.sim.rows(field)[rows], copied)
         field.from_numpy(before)

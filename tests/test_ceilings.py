@@ -6,7 +6,7 @@ import json
 import pytest
 
 from tests.command import uuv
-from tests.conftest import SmallSim
+from tests.small_sim import SmallSim
 from uuvtai.measure.episodes.methods import trees_of
 from uuvtai.measure.episodes.playing import Job, jobs_of
 from uuvtai.measure.evaluate.ceilings import condition_of, remainder_of, scenarios_of

@@ -20,7 +20,7 @@ from taichi.lang.impl import default_cfg
 
 import uuvtai
 from tests.command import uuv
-from tests.conftest import SmallSim
+from tests.small_sim import SmallSim
 from uuvtai import doctor, endings, loader
 from uuvtai.errors import SettingError, SizeError
 from uuvtai.runtime import _thread_count

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks import rehearsal
 from benchmarks.cuda_stub import assembling, counting, emitting, playing
-from tests.conftest import SmallSim
+from tests.small_sim import SmallSim
 from uuvtai.errors import SettingError
 from uuvtai.loader import load_config
 from uuvtai.native import gpu_shape

@@ -135,10 +135,8 @@ def test_every_key_has_a_row_with_type_default_unit_and_meaning():
         in (found["configuration/tracking.md"])
     )
     assert "| `max_range_m` | number > 0 | `12.0` | m |" in found["configuration/sensors.md"]
-    assert (
-        "| `sensors.sonar.period_steps` | `5` | sensors `harsh`, sensors `nominal` |"
-        in found["configuration/sensors.md"]
-    )
+    presets = "sensors `harsh`, sensors `multibeam_image`, sensors `nominal`"
+    assert f"| `sensors.sonar.period_steps` | `5` | {presets} |" in found["configuration/sensors.md"]
 
 
 @pytest.mark.parametrize(

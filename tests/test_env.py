@@ -387,6 +387,12 @@ def test_bad_actions_are_refused_and_change_nothing(env, action, error, words):
     assert not env.sim.rows(env.sim.s.clock.step).any()
 
 
+def test_huge_actions_are_finite(env):
+    """Their sum is not, which is what is looked at first."""
+    env.reset(seed=1)
+    assert torch.isfinite(env.step(torch.full((N, 4), 3e38))[0]).all()
+
+
 def test_unchecked_nan_asks_for_nothing(env):
     env.reset(seed=SEED)
     env.check_actions = False

@@ -12,10 +12,11 @@ from uuvtai.config import Config, SensorsConfig, TankConfig
 from uuvtai.errors import UserError
 from uuvtai.loader import load_config
 from uuvtai.logs import fan_image
-from uuvtai.logs.fan_image import beam_pattern, cast_rays, echo_power, elevation_pattern, heard_image
+from uuvtai.logs.fan_image import cast_rays, echo_power, heard_image
 from uuvtai.logs.moment import EpisodeHeader, Moment
 from uuvtai.logs.topics.camera_topics import logged_image
 from uuvtai.logs.topics.sonar_topics import ROWS
+from uuvtai.multibeam import ABSORPTION_NP_M, beam_pattern, elevation_pattern, noise_power
 
 SONAR = load_config("pool", "multibeam").sensors.sonar
 N_BIN = 240
@@ -24,6 +25,9 @@ TANK = TankConfig()
 POOL = {"shape": "rectangle", "x_m": [-40.0, 40.0], "y_m": [-40.0, 40.0], "z_m": [-40.0, 40.0]}
 """so large that nothing but bodies is within reach"""
 AT = np.zeros(3)
+HEARD = np.full((320, 240), 1e-12, np.float32)
+HEARD[7, 120] = 1e-3
+"""of a detector: rows beyond the beams too"""
 
 
 def body(kind, position, size):
@@ -74,7 +78,7 @@ def points_power(points, normals, area, beams):
     near = (cosine > 0) & (r < SONAR.max_range_m)
     u, r, cosine = u[near], r[near], cosine[near]
     el, az = np.arcsin(u[:, 2]), np.arctan2(u[:, 1], u[:, 0])
-    loss_db = 2 * r * fan_image.ABSORPTION_NP_M * 20 / np.log(10)
+    loss_db = 2 * r * ABSORPTION_NP_M * 20 / np.log(10)
     power = cosine**2 * area * r**-4.0 * 10 ** (-loss_db / 10) * elevation_pattern(el, SONAR) ** 2
     out = np.zeros((len(beams), N_BIN))
     for i, beam in enumerate(beams):
@@ -151,13 +155,13 @@ def test_amplitudes_are_rayleighs_and_their_mean_power_is_the_scenes():
     rng = np.random.default_rng(4)
     pings = np.array([heard_image(bearing, power, SONAR, rng) for _ in range(300)])
     beams = SONAR.first_beam_rad + SONAR.beam_step_rad * np.arange(SONAR.n_ray)
-    mean = beam_pattern(beams[:, None] - bearing[None]) ** 2 @ power + fan_image.noise_power(bearing, SONAR)
+    mean = beam_pattern(beams[:, None] - bearing[None]) ** 2 @ power + noise_power(SONAR)
     strong = mean > 0.1 * mean.max()
     assert strong.sum() > 50
     np.testing.assert_allclose((pings.mean(0) / mean)[strong].mean(), 1.0, atol=0.03)
     contrast = np.sqrt(pings).std(0)[strong] / np.sqrt(pings).mean(0)[strong]
     assert contrast.mean() == pytest.approx(np.sqrt(4 / np.pi - 1), abs=0.02)
-    empty = (mean < 1.01 * fan_image.noise_power(bearing, SONAR)).all(0)
+    empty = (mean < 1.01 * noise_power(SONAR)).all(0)
     assert empty.any(), "before the box there is noise alone"
 
 
@@ -171,6 +175,7 @@ def logged(sonar):
     header = EpisodeHeader("bt", config, "", scenario | {"seed": 1, "episode": 2})
     values = {"scan.fresh": np.int32(1), "clock.step": np.int32(50), "vehicle.pos_w": np.zeros(3, np.float32)}
     values["vehicle.quat_wb"] = np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)], np.float32)
+    values["sonar_image.heard"] = HEARD
     moment = Moment(header, values)
     data = json.loads(ROW.encode(moment))
     return data, logged_image(data), moment
@@ -183,6 +188,12 @@ def test_a_log_holds_the_image_of_the_true_scene_and_always_the_same():
     row = 239 - int(2.6 / 12 * 240)
     assert image[row - 1 : row + 3, 118:138].mean() > image[row - 12 : row - 8, 118:138].mean() + 15
     assert ROW.on_request and ROW.when.holds(moment, True) and not ROW.when.holds(moment, False)
+
+
+def test_where_ranges_are_detected_the_log_holds_what_the_detector_saw():
+    _, image, _ = logged(SONAR.model_copy(update={"detector": "so"}))
+    bright = np.argwhere(image > 200)
+    assert bright.tolist() == [[239 - 120, 255 - 7]], "beam 7, bin 120: range upwards, left on the left"
 
 
 @pytest.mark.parametrize("changes", [{"image_bins": 0}, {"image_bins": 0, "doppler": True}])

@@ -103,11 +103,11 @@ def test_kernels_in_classes_are_still_told_apart():
         def inside(self):
             return 1
 
-        assert front_end._inside_class(2) is True  # 0: itself, 1: the class's body, 2: the test
+        assert front_end.inside_class(2) is True  # 0: itself, 1: the class's body, 2: the test
 
     assert Body.inside.func.classfunc is True
     assert halved.func.classfunc is False
-    assert kernel_impl._inside_class is front_end._inside_class
+    assert kernel_impl._inside_class is front_end.inside_class
 
 
 def test_a_taichi_without_these_names_is_left_alone():

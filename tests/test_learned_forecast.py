@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.conftest import SmallSim
+from tests.small_sim import SmallSim
 from tests.test_observation_only import compared
 from uuvtai.closed_form import describe_scenario, path_positions
 from uuvtai.errors import UserError

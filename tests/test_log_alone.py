@@ -22,8 +22,8 @@ from mcap.reader import make_reader
 from mcap.records import Attachment, Chunk, Metadata
 from mcap.stream_reader import StreamReader
 
-from tests.conftest import SmallSim
 from tests.reference import decision_alone, log_alone
+from tests.small_sim import SmallSim
 from uuvtai.loader import load_config, load_resolved
 
 HORIZON = 200

@@ -18,7 +18,7 @@ import uuvtai
 from uuvtai.config import EpisodeConfig
 from uuvtai.kernels.core.signature import Bundle, Const, FloatMatrix, FloatVector, In, Out
 from uuvtai.native import keys, making
-from uuvtai.native.keys import KeyNameError, described, digest_of_sources
+from uuvtai.native.keys import KeyNameError, described, digest_of_sources, key_with
 from uuvtai.native.launch import native, quick_launch
 from uuvtai.native.machine import RUNTIME_TYPE, UnfitError, tasks_in
 from uuvtai.native.making import Native
@@ -28,6 +28,8 @@ from uuvtai.taichi_patches.memory import Memory, address_of
 
 ROOT = Path(__file__).resolve().parent.parent
 
+KEPT = [".kernel", ".kernel"]
+"""of one kernel: its code, and what of the config it depends on"""
 N = 3000
 """more items than one block of a loop has, so that threads share them"""
 
@@ -118,7 +120,7 @@ def expected():
     return [scene.launch() for _ in range(4)]
 
 
-@pytest.mark.parametrize("threads", ["1", "2"])
+@pytest.mark.parametrize("threads", ["1", "2", "3", "5"])
 def test_it_is_made_once_found_again_and_does_what_taichi_does(place, expected, monkeypatch, threads):
     monkeypatch.setenv("UUV_NUM_THREADS", threads)
     first = Scene()
@@ -126,7 +128,7 @@ def test_it_is_made_once_found_again_and_does_what_taichi_does(place, expected, 
     for total, out in expected[:3]:
         np.testing.assert_array_equal(first.launch(), (total, out))
     assert (ours.found, ours.made, ours.refused) == (0, 1, 0)
-    assert [p.suffix for p in place.iterdir()] == [".kernel"]
+    assert [p.suffix for p in place.iterdir()] == KEPT
     assert place.stat().st_mode & 0o777 == 0o700
     ours.compiler.compiled = None  # type: ignore[assignment]  # what is found is not compiled
     ours.adopt([moved := dataclasses.replace(first.io)], first.memory)  # another bundle, the same arrays
@@ -227,7 +229,7 @@ def test_ten_processes_on_an_empty_folder_end_with_one_whole_file(place):
     results = [said(process) for process in [begun(place) for _ in range(10)]]
     assert all(made + found == 1 for made, found, _ in results) and any(made for made, *_ in results)
     assert len({digest for *_, digest in results}) == 1
-    assert [path.suffix for path in place.iterdir()] == [".kernel"]
+    assert [path.suffix for path in place.iterdir()] == KEPT
     assert said(begun(place)) == (0, 1, results[0][2])
 
 
@@ -241,7 +243,7 @@ def test_a_process_killed_while_it_writes_leaves_nothing_that_is_run(place):
     assert (made, found) == (1, 0)
     os.utime(part, (0, 0))
     Store(place).bound()
-    assert [path.suffix for path in place.iterdir()] == [".kernel"], "an old unfinished file goes"
+    assert [path.suffix for path in place.iterdir()] == KEPT, "an old unfinished file goes"
 
 
 def test_where_nothing_can_be_kept_taichi_launches(tmp_path, place, expected, monkeypatch):
@@ -283,9 +285,8 @@ def names_of(node):
 def test_a_key_tells_configs_places_and_kinds_apart():
     first, second = Scene(), Scene()
     tree = first.memory.tree
-    other = dataclasses.replace(first.io, rules=EpisodeConfig(control_dt_s=0.05))
-    told = {described(value, tree) for value in (first.io, other, first.table, first.out, first.out.double())}
-    assert len(told) == 5 and len(digest_of_sources()) == 64
+    told = {described(value, tree) for value in (first.io, first.table, first.out, first.out.double())}
+    assert len(told) == 4 and len(digest_of_sources()) == 64
     assert described(first.io, tree) == described(second.io, second.memory.tree), (
         "the same places in another tree"
     )
@@ -293,6 +294,14 @@ def test_a_key_tells_configs_places_and_kinds_apart():
         described(second.io, tree)
     with pytest.raises(KeyNameError):
         described(object(), tree)
+    other = dataclasses.replace(first.io, rules=EpisodeConfig(control_dt_s=0.05))
+    of_time, of_horizon = (
+        [key_with("k", [name], io) for io in (first.io, other)]
+        for name in ("rules.control_dt_s", "rules.horizon_steps")
+    )
+    assert of_time[0] != of_time[1] and of_horizon[0] == of_horizon[1] != of_time[0], (
+        "what a kernel does not read is not in its key"
+    )
 
 
 # ------------------------------------------------------------------------------------------------ store

@@ -353,12 +353,12 @@ def test_the_command_tells_what_agrees(log, build, monkeypatch, capfd):
 def test_the_command_fails_where_commands_differ(log, build, monkeypatch, capfd):
     """Driven by another tree than the log's, with nothing disturbed."""
     monkeypatch.setattr(replaying, "built", build)
-    small_tree = build(read_feed(log))._sim.tree
+    small_tree = build(read_feed(log)).stack.sim.tree
     try:
-        build(read_feed(log))._sim.use_tree(read_feed(log, "straight").tree)
+        build(read_feed(log)).stack.sim.use_tree(read_feed(log, "straight").tree)
         code, out, _ = uuv(capfd, "replay", log)
     finally:
-        build(read_feed(log))._sim.use_tree(small_tree)
+        build(read_feed(log)).stack.sim.use_tree(small_tree)
     assert code == 3 and "though nothing was disturbed" in out and "instead of" in out
 
 

@@ -39,6 +39,7 @@ def fire():
             c.mapping,
             maps.TANK,
             c.episode,
+            c.clearance,
         )
     )
 
@@ -70,6 +71,7 @@ def load(env, corners):
         env,
         codes.PLANNER_RRT,
     )
+    s.route.want_plan[env] = 1  # nobody loads a route that was not asked for
 
 
 def set_step(step):
@@ -417,6 +419,23 @@ def test_path_risk_is_the_mean_over_the_look_ahead_segment():
         for k in cells
     ]
     assert s.route.path_risk[2] == pytest.approx(np.mean(risk), rel=1e-4)
+
+
+def test_triggers_and_route_see_the_same_ahead():
+    """Where no route is planned, what the triggers saw along it stays; looked at again it is the same."""
+    s = with_routes()
+    fire()
+    assert not s.route.want_plan.to_numpy().any()
+    follow()
+    names = ("ahead_w", "n_ahead", "path_risk")
+    seen = [getattr(s.route, name).to_numpy() for name in names]
+    s.route.want_plan.fill(1)
+    s.route.n_ahead.fill(0)
+    s.route.path_risk.fill(0)
+    follow()
+    for name, values in zip(names, seen, strict=True):
+        assert np.array_equal(getattr(s.route, name).to_numpy(), values), name
+    assert seen[2].all() and s.route.n_ahead[0] > 1
 
 
 def test_reset_clears_only_the_rows_that_are_awake():

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import uuvtai
-from tests.conftest import SmallSim
+from tests.small_sim import SmallSim
 from uuvtai import signals
 from uuvtai.logs.repair import repair
 

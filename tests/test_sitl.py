@@ -20,12 +20,12 @@ from uuvtai.link.dialect import MavCodec
 from uuvtai.link.endpoint import LinkPlace
 from uuvtai.link.intake import Intake
 from uuvtai.link.link_errors import LinkError
+from uuvtai.link.motors import Motors
 from uuvtai.loader import load_config
 from uuvtai.pilot import DvlReading, SonarPing
 from uuvtai.sitl import serving
 from uuvtai.sitl.fdm_reply import Motion, euler_of, reply_of
 from uuvtai.sitl.instance import Instance
-from uuvtai.sitl.motors import Motors
 from uuvtai.sitl.reported_sensors import ReportedSensors
 from uuvtai.sitl.rows_of_water import WaterRows
 from uuvtai.sitl.serving import SitlPlan, SitlPort

@@ -58,6 +58,9 @@ def test_mcnemar_by_hand():
     assert mcnemar_p(0, 0) == 1.0
     assert mcnemar_p(5, 5) == 1.0
     assert mcnemar_p(0, 6) == pytest.approx(2 / 64)
+    assert mcnemar_p(3000, 3000) == 1.0
+    # more pairs than a float has powers of two for; the normal approximation with its correction: z = 2.731
+    assert mcnemar_p(601, 509) == pytest.approx(0.00631, rel=0.02)
     with pytest.raises(ValueError, match="not be negative"):
         mcnemar_p(-1, 3)
 

@@ -12,8 +12,8 @@ import time
 import pytest
 
 from tests import sweep_work
-from tests.conftest import SmallSim
 from tests.report_samples import robustness_sweep
+from tests.small_sim import SmallSim
 from uuvtai.loader import ConfigError
 from uuvtai.measure.episodes.playing import Job, run_episodes
 from uuvtai.measure.sweep import play as sweep_run

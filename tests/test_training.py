@@ -11,8 +11,8 @@ import time
 import pytest
 import torch
 
-from tests.conftest import SmallSim
 from tests.point_env import PointEnv
+from tests.small_sim import SmallSim
 from uuvtai.env import VectorEnv
 from uuvtai.learn import checkpoint
 from uuvtai.learn import run as training

@@ -166,6 +166,24 @@ def test_trials_of_turns_are_as_their_episodes_say(column, cell):
         assert won == 0 or text.endswith(f" (+{won} -{lost}, p = {mcnemar_p(won, lost):.2f})"), name
 
 
+def test_trials_of_the_gaze_are_as_their_episodes_say():
+    document = json.loads((DOCS / "data/gaze_trials.json").read_text())
+    kept = {}
+    for row in document["rows"]:
+        kept.setdefault((row["pilot"], document["cells"][row["cell"]]), {})[row["seed"]] = row["outcomes"]
+    found = table("tuning.md", "## Where the nose looks", "| pilot |")
+    assert len(found) == len(kept)
+    for cells in found:
+        name, scene, seeds, text = (cell.strip(" |") for cell in cells)
+        own, before = kept[name, scene], kept["as it was", scene]
+        assert {seeds.split(" ")[0].strip(","), seeds.split(" ")[-1]} == {str(min(own)), str(max(own))}
+        assert told(text) == pytest.approx(rates("".join(own.values())), abs=0.051), (name, scene)
+        won, lost = paired("".join(own.values()), "".join(before[seed] for seed in own))
+        assert name == "as it was" or text.endswith(f" (+{won} -{lost}, p = {mcnemar_p(won, lost):.3f})"), (
+            name
+        )
+
+
 def test_what_forecasts_miss_is_as_counted():
     kept = json.loads((DOCS / "data/turn_trials.json").read_text())
     found = table("tuning.md", "## Turns that nobody", "| moments of tracks |")

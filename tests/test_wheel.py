@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import SmallSim
+from tests.small_sim import SmallSim
 
 ROOT = Path(__file__).parent.parent
 KEPT = ("uuvtai", "tests", "benchmarks", "examples", "docs", "runs/README.md", ".ci", ".github")
@@ -21,6 +21,7 @@ KEPT = ("uuvtai", "tests", "benchmarks", "examples", "docs", "runs/README.md", "
 PRESETS = {
     path.relative_to(ROOT).as_posix() for path in (ROOT / "uuvtai" / "presets").rglob("*") if path.is_file()
 }
+EXAMPLES = {path.name for path in (ROOT / "examples").iterdir() if path.is_file()}
 MODULES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "uuvtai").rglob("*.py")}
 
 NO_NETWORK = """
@@ -141,11 +142,14 @@ def uuv(installed, tmp_path):
     return call
 
 
-def test_the_wheel_holds_the_package_and_nothing_else(built):
+def test_the_wheel_holds_the_package_and_the_examples_and_nothing_else(built):
     names = set(zipfile.ZipFile(built[1]).namelist())
     info = {name for name in names if name.split("/")[0].endswith(".dist-info")}
-    assert {name.split("/")[0] for name in names - info} == {"uuvtai"}
-    assert names - info == MODULES | PRESETS | {"uuvtai/py.typed"}
+    beside = {name for name in names if ".data/" in name}
+    assert {name.partition("/data/")[2] for name in beside} == {
+        f"share/uuvtai/examples/{n}" for n in EXAMPLES
+    }
+    assert names - info - beside == MODULES | PRESETS | {"uuvtai/py.typed"}
     assert any(name.endswith("licenses/LICENSE") for name in info)
 
 
@@ -187,6 +191,17 @@ def test_the_installed_command_is_the_wheels_and_works_in_any_folder(installed, 
     listed = json.loads(uuv("presets", "--json"))
     assert "pool" in listed["world"] and "bt" in listed["tree"]
     assert "BTCPP_format" in uuv("presets", "show", "tree/bt")
+
+
+def test_the_examples_are_a_users_by_one_command_and_none_of_hers_is_overwritten(installed, uuv, tmp_path):
+    said = uuv("examples").split()
+    assert {Path(name).name for name in said} == EXAMPLES
+    mine = tmp_path / "examples" / "own_astar.py"
+    assert mine.read_bytes() == (ROOT / "examples" / "own_astar.py").read_bytes()
+    mine.write_text("# hers")
+    own = [installed[1].with_name("uuv"), "examples"]
+    again = subprocess.run(own, capture_output=True, text=True, check=False, cwd=tmp_path, env=clean())
+    assert again.returncode == 2 and "uuv examples NEW" in again.stderr and mine.read_text() == "# hers"
 
 
 def test_who_reaches_for_the_network_is_found_out(installed, tmp_path):

@@ -1,11 +1,15 @@
-"""Compile the kernels of the tests' small simulator once, for every process that will need them: ``python -m
-tests.warm``.
+"""Compile the kernels of the tests' small simulator once, for every process that will need them, and those
+that other tests need besides: ``python -m tests.warm``.
 
-Taichi writes what it has compiled when a process ends; test processes that run side by side would each
-compile everything.
+Test processes that run side by side would each compile them. ``bootstrap.py test`` runs this while packages
+of the tests are installed, so it needs none of them.
 """
 
-from tests.conftest import SmallSim
+import os
+import sys
+
+from tests.small_sim import SmallSim
+from uuvtai.native.gpu_shape import VARIABLE, asked_shape
 from uuvtai.runtime import start_taichi
 
 STEPS = 6
@@ -13,9 +17,17 @@ STEPS = 6
 
 
 def main() -> None:
-    """Begin two episodes, step, begin another, with observations asked for."""
+    """The small simulator with its own sensors, and with those that have no errors (``test_log_alone``); then
+    the first one in the shape for a GPU (``test_cuda``)."""
     start_taichi("cpu")
-    small = SmallSim()
+    play(SmallSim())
+    if asked_shape() == "cpu":
+        play(SmallSim("clean"))
+        os.execve(sys.executable, [sys.executable, "-m", "tests.warm"], os.environ | {VARIABLE: "gpu"})
+
+
+def play(small: SmallSim) -> None:
+    """Begin two episodes, step, begin another, with observations asked for."""
     small.sim.observe()
     small.begin([0, 1])
     for _ in range(STEPS):

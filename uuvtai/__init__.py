@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 
+from uuvtai.taichi_patches.first_import import watch_for_taichi
 from uuvtai.version import __version__ as __version__
 
 # without typing, which takes longer to import than this file: signals are not heard before it is done
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 # and it asks a server for its newest version, once a day; nothing here uses the network that was not told to
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
+watch_for_taichi()
 
 
 def make(

@@ -158,10 +158,11 @@ def watch_live(
     rate: opt.Rate = 1.0,
     host: opt.Host = "127.0.0.1",
     port: opt.Port = 8765,
+    rerun: opt.ToRerun = "",
     depth_images: opt.DepthImages = False,
     device: opt.Device = "auto",
 ) -> None:
-    """Run episodes in real time and serve them to Foxglove and Lichtblick."""
+    """Run episodes in real time and serve them to Foxglove and Lichtblick, and to Rerun."""
     seed_list = arguments.integers("--seeds", seeds)
     arguments.refuse_odd_live(episodes, rate, port)
     from uuvtai.measure.evaluate.eval_request import Request
@@ -173,7 +174,7 @@ def watch_live(
         scene, trained, controllers=controllers, seeds=seed_list, episodes=episodes,
         depth_images=depth_images, device=device,
     )  # fmt: skip
-    result = watch_episodes(request, LiveOptions(host, port, rate), Progress())
+    result = watch_episodes(request, LiveOptions(host, port, rate, rerun), Progress())
     output.show(result, lambda screen: show_watched(screen, result))
 
 
@@ -411,6 +412,7 @@ def _report_if(with_report: bool, folder: Path) -> None:
 @groups.grouped
 def export_policy(
     output: groups.OutputGroup,
+    stacked: groups.StackGroup,
     run: opt.ExportRun = None,
     out: opt.ExportOut = None,
     evaluation: opt.ExportEvaluation = None,
@@ -418,11 +420,14 @@ def export_policy(
     force: opt.ExportForce = False,
 ) -> None:
     """Write a policy that drives without uuvtai (NumPy alone, or ONNX), or check such a folder. Exit code 3:
-    it disagrees."""
+    it disagrees. Or, with --stack, the stack itself as native code."""
+    from uuvtai.show.exports import show_export, show_stack
+
+    if (written := stacked.written(run)) is not None:
+        return output.show(written, lambda _: show_stack(written))
     if (run is None) == (check is None):
         raise UsageError("give the RUN to export, or --check DIR for a folder that was exported")
     from uuvtai.deploy import export
-    from uuvtai.show.exports import show_export
 
     if check is not None:
         found = export.check(check, say)
@@ -508,18 +513,22 @@ def presets(
     from uuvtai.show import presets as shown
 
     if action is None:
-        output.show(shown.sentences(), shown.show_presets)
-        return
-    if action != "show" or not name:
-        raise UsageError("write 'uuv presets' or 'uuv presets show NAME'")
-    kind, name = shown.kind_and_name(name)
+        return output.show(shown.sentences(), shown.show_presets)
+    kind, name = shown.kind_and_name(action, name)
     if not everything or kind == "tree":  # a tree has no keys
-        shown.show_stated(kind, name, output.as_json)
-        return
+        return shown.show_stated(kind, name, output.as_json)
     from uuvtai.measure.preset_config import whole_preset
 
     found, text = whole_preset(kind, name)
     output.show(found, lambda _screen: typer.echo(text))
+
+
+@app.command(epilog="Example: uuv examples mine")
+def examples(folder: opt.ExamplesFolder = Path("examples")) -> None:
+    """Copy the examples of the documentation into a folder: own pieces, trainers, a world, a tree."""
+    from uuvtai.example_files import copy_examples
+
+    typer.echo("\n".join(map(str, copy_examples(folder))))
 
 
 @app.command(epilog="Example: uuv doctor --json")

@@ -1,4 +1,4 @@
-"""Chosen rows of Taichi's arrays as NumPy copies, by a kernel: for devices whose memory NumPy cannot see."""
+"""Rows of Taichi's arrays: by a kernel where NumPy cannot see the device's memory."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import taichi as ti
 import torch
 
 from uuvtai.kernels.core.rows import copy_rows
+from uuvtai.taichi_patches.memory import Memory
 
 _TORCH_DTYPE = {
     ti.f32: torch.float32,
@@ -26,3 +27,14 @@ def copied_rows(field: ti.Field, chosen: torch.Tensor) -> np.ndarray:
     )
     copy_rows(field, chosen, out)
     return out.cpu().numpy()
+
+
+def copy_into(out: torch.Tensor, field: ti.Field, chosen: torch.Tensor, memory: Memory) -> None:
+    """The first rows of a field into ``out``, as many as ``chosen`` (int32) counts from 0.
+
+    On the CPU nothing is launched: Taichi would wake its threads for it.
+    """
+    if memory.device.type == "cpu":
+        out.copy_(torch.from_numpy(memory.live(field)[: len(chosen)]))
+    else:
+        copy_rows(field, chosen, out)

@@ -294,6 +294,22 @@ class SitlSceneGroup(SceneOptions):
 
 
 @dataclass(frozen=True)
+class StackGroup:
+    """The whole stack of a log as a folder of native code."""
+
+    stack: opt.ExportStack = None
+    machines: opt.ExportFor = "x86_64,aarch64"
+
+    def written(self, log: str | None) -> dict[str, Any] | None:
+        """What was written, where it was asked for. Raises LogError, StackExportError, CrossError."""
+        if log is None or self.stack is None:
+            return None
+        from uuvtai.measure.exporting import export_log
+
+        return export_log(Path(log), self.stack, self.machines.split(","))
+
+
+@dataclass(frozen=True)
 class FlightGroup:
     """Where the vehicle is, where it is to go, and what it must keep to."""
 

@@ -238,6 +238,15 @@ Host = Annotated[
 ]
 Port = Annotated[int, Option("--port", help="Port to serve at; 0 = a free one.")]
 
+ToRerun = Annotated[
+    str,
+    Option(
+        "--rerun",
+        metavar="FILE.rrd|URL",
+        help="Show it to Rerun too: a new file, or a viewer's rerun+http://HOST:PORT/proxy.",
+    ),
+]
+
 DriveControllers = Annotated[
     list[str] | None,
     _controllers(
@@ -446,6 +455,17 @@ ExportCheck = Annotated[
     Path | None, Option("--check", help="Verify an exported folder instead: sha256 and golden pairs.")
 ]
 ExportForce = Annotated[bool, Option("--force", help="Replace the exported policy that --out names.")]
+ExportStack = Annotated[
+    Path | None,
+    Option(
+        "--stack",
+        help="Write the whole stack of a log (RUN is an .mcap file) into this new folder, for a computer "
+        "without Taichi and torch.",
+    ),
+]
+ExportFor = Annotated[
+    str, Option("--for", help="Computers that --stack writes code for: x86_64, aarch64, or both, by comma.")
+]
 
 # ----------------------------------------------------------------------------------------------------- replay
 
@@ -484,6 +504,7 @@ PresetName = Annotated[
         autocompletion=choices.shown,
     ),
 ]
+ExamplesFolder = Annotated[Path, Argument(metavar="FOLDER", help="Where to; what is there is kept.")]
 Everything = Annotated[
     bool,
     Option(
@@ -507,7 +528,10 @@ Dot = Annotated[bool, Option("--dot", help="Print Graphviz DOT instead.")]
 LogFile = Annotated[Path, Argument(help="An .mcap file.")]
 DriveLogs = Annotated[
     list[Path],
-    Argument(help="Logs of drives: .mcap of ours, or .csv with t,u,v,w,r,rpm_1,.. (docs/vehicle.md)."),
+    Argument(
+        help="Logs of drives: .mcap of ours, ArduSub's .bin or .tlog, or .csv with t,u,v,w,r,rpm_1,.. "
+        "(docs/vehicle.md)."
+    ),
 ]
 IdentifyKnown = Annotated[
     str,

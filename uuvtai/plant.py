@@ -7,7 +7,7 @@ from dataclasses import is_dataclass
 from typing import Any, TypeVar
 
 import numpy as np
-import taichi as ti
+from taichi.lang.util import to_numpy_type
 
 from uuvtai import state
 from uuvtai.allocation import allocation_matrices
@@ -19,6 +19,7 @@ from uuvtai.kernels.sensors.bundles import ExactProprioceptionIO
 from uuvtai.kernels.vehicle import actuation, dynamics
 from uuvtai.kernels.vehicle.bundles import ActuationIO, DynamicsIO
 from uuvtai.runtime import Runtime
+from uuvtai.taichi_patches.memory import HostFields
 
 _T = TypeVar("_T")
 
@@ -29,6 +30,7 @@ class Plant:
     def __init__(self, config: Config, runtime: Runtime, n_env: int = 1) -> None:
         check_thruster_index(config)
         self.config, self.n_env, self.real = config, n_env, runtime.real
+        self._host = HostFields() if runtime.device == "cpu" else None
         self._sizes = {
             "n_env": n_env,
             "n_thruster": len(config.vehicle.thrusters),
@@ -58,18 +60,27 @@ class Plant:
         return state.allocate(struct, self._sizes, self.real)
 
     def write(self, field: Any, value: Any) -> None:
-        """Fill a field of continuous values from anything that broadcasts to (field shape, vector length)."""
+        """Fill a field from anything that broadcasts to (field shape, vector length)."""
+        view = self._host.view(field) if self._host else None
+        if view is not None:  # in memory: Taichi would compile a kernel for every field
+            view[...] = value
+            return
         shape = (*field.shape, field.n) if hasattr(field, "n") else field.shape
-        dtype = np.float64 if self.real is ti.f64 else np.float32
+        dtype = to_numpy_type(field.dtype)
         field.from_numpy(np.ascontiguousarray(np.broadcast_to(np.asarray(value, dtype=dtype), shape)))
+
+    def read(self, field: Any) -> np.ndarray:
+        """A copy of a field, vectors with a last axis."""
+        view = self._host.view(field) if self._host else None
+        return field.to_numpy() if view is None else view.copy()
 
     def reset(self, keys: np.ndarray | None = None) -> None:
         """All vehicles at rest at the origin; ``keys`` (n_env) are the episodes' random keys (default: 0, 1,
         2, ..)."""
-        self.clock.active.fill(1)
-        self.clock.awake.fill(1)
+        self.write(self.clock.active, 1)
+        self.write(self.clock.awake, 1)
         self._set_time(0)
-        self.episode.key.from_numpy((np.arange(self.n_env) if keys is None else keys).astype(np.uint32))
+        self.write(self.episode.key, np.arange(self.n_env) if keys is None else keys)
         dynamics.reset_vehicle(self.dynamics_io)
         actuation.reset_actuation(self.actuation_io)
 
@@ -88,9 +99,7 @@ class Plant:
 
     def _set_time(self, steps: int) -> None:
         self.steps = steps
-        self.clock.step.from_numpy(
-            np.full(self.n_env, steps, dtype=np.int32)
-        )  # fill() would compile a kernel for every value
+        self.write(self.clock.step, steps)
 
     def command(self, action: np.ndarray) -> None:
         """The inner loop alone, on whatever ``ego`` holds."""

@@ -14,7 +14,7 @@ import importlib.util
 import warnings
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -258,14 +258,14 @@ class RouteFallback:
         self.overlay = np.zeros(grid_shape(tank, cell_m), dtype=np.float32)
         self.origin = grid_origin(tank, cell_m)
 
-    def serve(self, stages: Stages, seed_of: Callable[[int], int]) -> int:
+    def serve(self, stages: Stages, seed_of: Callable[[int], int], count: Callable[[Any], int]) -> int:
         """Plan for ``route.failed``; returns how many there were. ``seed_of(env)`` gives the env's number of
-        (seed, episode, step)."""
+        (seed, episode, step), ``count(field)`` a field's one number (``Memory.number``)."""
         from uuvtai.kernels.planning.route import keep_route, load_route
         from uuvtai.kernels.planning.voronoi import overlay_clearance
 
         route, ego, mission = stages.route.route, stages.route.ego, stages.route.mission
-        n_failed = int(route.n_failed[None])
+        n_failed = count(route.n_failed)
         for env in sorted(int(route.failed[item]) for item in range(n_failed)):
             overlay_clearance(stages.voronoi, self.overlay, env)
             start, goal = ego.pos_w[env], mission.goal_w[env]
@@ -276,14 +276,20 @@ class RouteFallback:
                 load_route(stages.route, corners.astype(np.float32), env, PLANNER_RRT)
         return n_failed
 
-    def serve_by(self, planner: RoutePlanner, stages: Stages, read: Callable[..., np.ndarray]) -> None:
+    def serve_by(
+        self,
+        planner: RoutePlanner,
+        stages: Stages,
+        read: Callable[..., np.ndarray],
+        count: Callable[[Any], int],
+    ) -> None:
         """Have ``planner`` plan for the whole queue, in place of the Voronoi planner and of RRT.
-        ``read(field, envs)`` gives rows of a field (``Sim.rows``)."""
+        ``read(field, envs)`` gives rows of a field (``Sim.rows``), ``count(field)`` its one number."""
         from uuvtai.kernels.planning.route import keep_route, load_route
         from uuvtai.kernels.planning.voronoi import overlay_clearance
 
         io = stages.route
-        n_queue = int(io.route.n_queue[None])
+        n_queue = count(io.route.n_queue)
         envs = sorted(read(io.route.queue)[:n_queue].tolist()) if n_queue else []
         if not envs:
             return

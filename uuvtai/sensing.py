@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from uuvtai.kernels.sensors import depth, head, proprioception, sonar
+from uuvtai.config import SonarConfig
+from uuvtai.kernels.sensors import depth, head, proprioception, sonar, sonar_image
 from uuvtai.stages import Stages
 
 
@@ -28,15 +29,17 @@ class SensorSource(Protocol):
 class SimulatedSensors:
     """The simulator's own: from the truth, with errors as configured."""
 
-    def __init__(self, mechanical: bool) -> None:
-        self._mechanical = mechanical
+    def __init__(self, sonar_cfg: SonarConfig) -> None:
+        self._mechanical, self._detects = sonar_cfg.mechanical, sonar_cfg.detector != "none"
 
     def sense_motion(self, stages: Stages) -> None:
         """All instruments but sonar and camera."""
         proprioception.sense_proprioception(stages.proprioception)
 
     def sense_sonar(self, stages: Stages) -> None:
-        """The ring or fan of beams, or the mechanical one."""
+        """The ring or fan of beams, or the mechanical one; its image first, where ranges come from that."""
+        if self._detects:
+            sonar_image.hear(stages.sonar)
         if self._mechanical:
             head.turn_head(stages.sonar)
         else:

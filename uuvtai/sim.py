@@ -17,9 +17,8 @@ import torch
 from uuvtai import stack
 from uuvtai.binding import bind_all
 from uuvtai.config import Config
-from uuvtai.copying import copied_rows
+from uuvtai.copying import copied_rows, copy_into
 from uuvtai.initial import allocate_state, fill_constants
-from uuvtai.kernels.core.rows import copy_rows
 from uuvtai.kernels.perception import pose
 from uuvtai.kernels.planning import clearance, exposure, features, route, triggers, voronoi
 from uuvtai.kernels.task import episode, reward
@@ -62,7 +61,7 @@ class Sim:
         self._every_row = torch.arange(num_envs, dtype=torch.int32, device=self.device)
         self.fallback = RouteFallback(config)
         self.planner: RoutePlanner | None = None
-        self.sensors: SensorSource = SimulatedSensors(config.sensors.sonar.mechanical)
+        self.sensors: SensorSource = SimulatedSensors(config.sensors.sonar)
         self.stage_s: dict[str, float] | None = None
         self.privileged = False
         self._watches = lost_thruster.is_watched(config.vehicle, config.actuation)
@@ -147,9 +146,9 @@ class Sim:
             triggers.fire_triggers(io.triggers)
             if self.planner is None:
                 voronoi.plan_routes(io.voronoi)
-                self.fallback.serve(io, self._plan_seed)
+                self.fallback.serve(io, self._plan_seed, self._memory.number)
             else:
-                self.fallback.serve_by(self.planner, io, self.rows)
+                self.fallback.serve_by(self.planner, io, self.rows, self._memory.number)
             route.follow_route(io.route)
         with self._stage("teacher"):
             stack.choose(io, self.tree.leaf, self.action)
@@ -204,7 +203,7 @@ class Sim:
 
     def read_into(self, field: ti.Field, out: torch.Tensor) -> None:
         """Copy a whole field into ``out`` on the device, without a wait or a copy through the host."""
-        copy_rows(field, self._every_row, out)
+        copy_into(out, field, self._every_row, self._memory)
 
     def memory(self) -> Memory:
         """Where every array lies, when all kernels are done: for a capture."""

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import get_type_hints
 
 from uuvtai import state
-from uuvtai.config import Config, ForecastConfig
+from uuvtai.config import Config, ForecastConfig, SonarConfig
 from uuvtai.config.task import TERMS
 from uuvtai.errors import SettingError, SizeError
 from uuvtai.forecast_codes import N_BEND, N_COLUMN, N_FRAME, N_HIDDEN, N_MODE, N_PAST, N_SAID, N_WEIGHT
@@ -18,6 +18,7 @@ from uuvtai.kernels.core.lanes import LANES
 from uuvtai.kernels.perception.mapping import look_period_s, scans_in
 from uuvtai.kernels.planning.clearance import offset_bits
 from uuvtai.kernels.planning.exposure import block_shape
+from uuvtai.multibeam import elevations, heard_bearings
 from uuvtai.native.gpu_shape import is_gpu_shaped
 from uuvtai.plan_codes import N_PLANNER, N_REASON, N_TRIGGER
 from uuvtai.scenario import scenario_sizes
@@ -57,6 +58,7 @@ def array_sizes(config: Config, n_env: int, device: str = "cpu") -> dict[str, in
         **scenario_sizes(config.world),
         "n_ray": sensors.sonar.n_ray,
         "n_latency": sensors.sonar.latency_steps // sensors.sonar.period_steps + 2,
+        **_image_sizes(sensors.sonar),
         "n_echo": sensors.sonar.n_ray if sensors.sonar.mechanical else 1,
         "n_cloud": 8,
         "n_pixel_row": sensors.depth.rows,
@@ -90,6 +92,17 @@ def array_sizes(config: Config, n_env: int, device: str = "cpu") -> dict[str, in
         "n_trial": config.baselines.n_trial,
         "n_control": _n_control(config),
         "n_term": len(TERMS),
+    }
+
+
+def _image_sizes(sonar_cfg: SonarConfig) -> dict[str, int]:
+    """Axes of the image in which a sonar detects; as short as can be where it does not."""
+    if sonar_cfg.detector == "none":
+        return dict.fromkeys(("n_heard", "n_bin", "n_elevation"), 1)
+    return {
+        "n_heard": len(heard_bearings(sonar_cfg)),
+        "n_bin": sonar_cfg.image_bins,
+        "n_elevation": len(elevations()),
     }
 
 

@@ -72,7 +72,7 @@ def mcnemar_p(only_a: int, only_b: int) -> float:
         raise ValueError(f"counts must not be negative, got {only_a} and {only_b}")
     n = only_a + only_b
     tail = sum(math.comb(n, k) for k in range(min(only_a, only_b) + 1))
-    return min(1.0, 2.0 * tail / 2**n)
+    return min(1.0, 2 * tail / 2**n)  # whole numbers: more than a float holds beyond 1,023 pairs
 
 
 def binomial_p(k: int, n: int, p: float) -> float:

@@ -28,6 +28,7 @@ SEE = {
     "pilot": ("safety", "sitl"),
     "sitl": ("sitl",),
     "presets": ("reference/configuration",),
+    "examples": ("own_pieces", "gym", "python"),
     "doctor": ("quickstart", "native"),
     "warm": ("native",),
     "tree": ("simulator",),

@@ -12,7 +12,8 @@ from docs.writers.benchmark_pages import benchmark, benchmark_scenes
 from docs.writers.dead_tables import dead_commands, dead_thrusters
 from docs.writers.figure_sources import Counts, SourceError, Sources, fitting, pooled, rated, share, weighted
 from docs.writers.forecast_tables import forecast_pieces, forecast_scores
-from docs.writers.link_tables import closed_loop, real_ardusub
+from docs.writers.link_tables import aboard, ardusub_identified, closed_loop, real_ardusub
+from docs.writers.newcomer_tables import newcomer, newcomer_zero
 from docs.writers.pieces import BEFORE, CELLS, DASH, LETTERS, PIECES, beside
 from docs.writers.pose_tables import pose_endings, pose_errors
 from docs.writers.replay_tables import changed, lossy, replayed
@@ -68,7 +69,8 @@ def evaluations(sources: Sources) -> str:
         "`straight`",
         "most frequent causes of failure",
     ]
-    return text_table(head, [_evaluated(entry) for entry in sources.evaluations()["rows"]])
+    shown = [entry for entry in sources.evaluations()["rows"] if LITERATURE.isdisjoint(entry["methods"])]
+    return text_table(head, [_evaluated(entry) for entry in shown])
 
 
 def _evaluated(entry: dict[str, Any]) -> list[str]:
@@ -121,13 +123,16 @@ def _own_piece(entry: dict[str, Any], pair: dict[str, Any] | None) -> list[str]:
     return [f"`{entry['name']}`", share(counts, "success"), rated(counts, "collision"), time, p, took]
 
 
+LITERATURE = frozenset({"mppi", "dwa", "potential_field", "velocity_obstacle"})
 LOCAL_PLANNERS = ("bt", "capped", "mppi", "dwa", "potential_field", "velocity_obstacle")
 
 
 def local_planners(sources: Sources) -> str:
     """Local planners of the literature beside the tree, wherever they were played: success / collision, time
     to success, p of McNemar's exact test against ``bt``, success for success."""
-    entries = [entry for entry in sources.evaluations()["rows"] if "mppi" in entry["methods"]]
+    entries = [
+        entry for entry in sources.evaluations()["rows"] if not LITERATURE.isdisjoint(entry["methods"])
+    ]
     if not entries:
         return "Not among the evaluations that are shown."
     rows = [[f"`{name}`", *(_beside_tree(entry, name) for entry in entries)] for name in LOCAL_PLANNERS]
@@ -546,6 +551,8 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         evaluations,
         local_planners,
         own_pieces,
+        newcomer,
+        newcomer_zero,
         switched_off,
         policy,
         grid,
@@ -567,6 +574,8 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         lossy,
         closed_loop,
         real_ardusub,
+        ardusub_identified,
+        aboard,
         sonars,
         vehicle_commands,
         vehicles,

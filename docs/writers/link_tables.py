@@ -1,4 +1,5 @@
-"""The tables of ``docs/sitl.md``, from the newest results of the benchmarks ``closed_loop``, ``ardusub``."""
+"""Tables of the pages sitl, vehicle and companion, from the newest results of the benchmarks ``closed_loop``,
+``ardusub`` and ``aboard``."""
 
 from __future__ import annotations
 
@@ -12,8 +13,32 @@ from uuvtai.tables.table import text_table
 def real_ardusub(sources: Sources) -> str:
     """What ArduSub itself did in our water."""
     rows = sources.benchmark("ardusub")["rows"]
-    cells = [[row["what"], _result(row), row["note"]] for row in rows]
+    driven = [row for row in rows if "endings" in row["details"]]
+    told = {driven[0]["what"]: f"; {_paired(driven)}"} if len(driven) == 2 else {}
+    cells = [[row["what"], _result(row), row["note"] + told.get(row["what"], "")] for row in rows]
     return text_table(["tried", "result", "more"], cells)
+
+
+def ardusub_identified(sources: Sources) -> str:
+    """What ``uuv identify`` made of ArduSub's own logs, beside the true numbers."""
+    found = {
+        row["what"].rpartition(" ")[2]: row["details"]["parameters"]
+        for row in sources.benchmark("ardusub")["rows"]
+        if "parameters" in row["details"]
+    }
+    if len(found) != 2:
+        raise SourceError("the benchmark ardusub was run without its drives for uuv identify")
+    names = next(iter(found.values()))
+    cells = [
+        [name, f"{names[name][3]:.3g}", *(_interval(entries[name]) for entries in found.values())]
+        for name in names
+    ]
+    return text_table(["number", "true", *(f"from `{ending}`" for ending in found)], cells)
+
+
+def _interval(entry: list[float]) -> str:
+    value, low, high, true = entry
+    return f"{value:.3g} [{low:.3g}, {high:.3g}]" + ("" if low <= true <= high else ": not within")
 
 
 def _result(row: dict[str, Any]) -> str:
@@ -27,13 +52,27 @@ def closed_loop(sources: Sources) -> str:
     rows = sources.benchmark("closed_loop")["rows"]
     if len(rows) != 2:
         raise SourceError(f"the benchmark closed_loop has {len(rows)} rows, not two")
-    arrived = [[end == "success" for end in row["details"]["endings"]] for row in rows]
-    pairs = list(zip(*arrived, strict=True))
-    first, second = (sum(pair == kind for pair in pairs) for kind in ((True, False), (False, True)))
-    p = mcnemar_p(first, second)
-    told = [f"only this arrives: {first}, only the other: {second}; exact McNemar p {p:.2g}", ""]
+    told = [_paired(rows), ""]
     cells = [
         [row["what"].removeprefix("closed loop, "), f"{row['ours']:.1f} %", row["note"], more]
         for row, more in zip(rows, told, strict=True)
     ]
     return text_table(["driven", "success", "of episodes [95 %], and the others", "paired"], cells)
+
+
+def aboard(sources: Sources) -> str:
+    """Exported stacks beside what was decided at their export."""
+    rows = [row for row in sources.benchmark("aboard")["rows"] if row["ours"] is not None]
+    cells = [
+        [row["what"], f"{row['details']['equal']} of {row['details']['steps']}", row["note"]] for row in rows
+    ]
+    return text_table(["machine and stack", "commands equal to the last bit", "more"], cells)
+
+
+def _paired(rows: list[dict[str, Any]]) -> str:
+    """The first row's episodes beside the second's."""
+    arrived = [[end == "success" for end in row["details"]["endings"]] for row in rows]
+    pairs = list(zip(*arrived, strict=True))
+    first, second = (sum(pair == kind for pair in pairs) for kind in ((True, False), (False, True)))
+    p = mcnemar_p(first, second)
+    return f"only this arrives: {first}, only the other: {second}; exact McNemar p {p:.2g}"

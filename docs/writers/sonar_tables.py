@@ -45,6 +45,6 @@ def _row(own: dict[str, Any], first: dict[str, Any]) -> list[str]:
 
 
 def _beside(first: str, own: str) -> str:
-    pairs = list(zip(first, own, strict=True))
+    pairs = list(zip(first, own, strict=False))  # a row of fewer episodes has the first of them
     only = [sum(a == "s" != b for a, b in pairs), sum(b == "s" != a for a, b in pairs)]
     return f"{only[0]}, {only[1]}; {mcnemar_p(*only):.2g}"

@@ -50,6 +50,10 @@ KINDS = (
         "fan of 120 degrees, 512 beams, without Doppler",
         "--sensors multibeam --set sensors.sonar.horizontal_aperture_deg=120 --set sensors.sonar.n_ray=512",
     ),
+    SonarKind(
+        "130 degrees, ten pings a second, ranges detected in the image (SO-CFAR): `multibeam_image`",
+        "--sensors multibeam_image",
+    ),
     SonarKind("one mechanical beam, a sector of 115 degrees in 1.8 s: `ping360`", "--sensors ping360"),
     SonarKind(
         "the same, whole turns of 400 steps in 14 s, 12 m",

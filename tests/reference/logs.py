@@ -160,6 +160,7 @@ def _truth(
     return {
         "vehicle.pos_w": pos.astype(np.float32),
         "vehicle.quat_wb": _quaternion(0.02, -0.03, yaw),
+        "sonar_image.heard": np.zeros((1, 16), np.float32),
         "vehicle.vel_b": np.array([0.5, 0.02, 0.0], np.float32),
         "vehicle.rate_b": rng.normal(0, 0.01, 3).astype(np.float32),
         "current.vel_w": np.zeros(3, np.float32),

@@ -40,7 +40,21 @@ class SonarConfig(Section):
     """of a mechanical beam, horizontally: what is nearest within it returns"""
     image_bins: Annotated[int, Field(ge=0, le=2048)] = 0
     """range bins of the intensity image that logs with depth images hold twice a second (``/sonar/image``);
-    0: none. Nothing decides by it"""
+    0: none. Nothing decides by it unless there is a ``detector``"""
+    detector: Literal["none", "ca", "so"] = "none"
+    """none: each beam reports the nearest range within its aperture, with the errors below. ca, so: what a
+    CFAR detector finds first in the beam's row of the intensity image, cell averaging or smallest of; the
+    errors of single beams below do not come on top"""
+    cfar_cells: PositiveCount = 12
+    """of a detector: range cells before and behind that tell the level around a cell"""
+    cfar_guard: Count = 4
+    """cells between, on either side"""
+    cfar_beams: PositiveCount = 3
+    """of a detector: neighbouring beams whose power is averaged beforehand, an odd number: less speckle"""
+    cfar_false_alarm: Annotated[float, Field(gt=0, lt=1)] = 1e-4
+    """probability that noise alone passes, in each cell of a single beam; of an average of beams less"""
+    least_level_db: float = -15.0
+    """A cell must return this much of what a wall across the beam would return from there (EC)"""
     max_range_m: Positive = 12.0
     vertical_half_aperture_deg: Annotated[float, Field(ge=0, lt=80)] = 10.0
     period_steps: PositiveCount = 1
@@ -80,6 +94,21 @@ class SonarConfig(Section):
             raise ValueError(
                 f"mechanical: one beam comes at a time, at once and without Doppler; add {typed}, or take "
                 "--sensors ping360"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _detectable(self) -> SonarConfig:
+        wanted = {"doppler": False, "mechanical": False}
+        wrong = [name for name, value in wanted.items() if getattr(self, name) != value]
+        if self.detector != "none" and self.cfar_beams % 2 == 0:
+            raise ValueError("cfar_beams: as many beams on either side of a beam, so 1, 3, 5, ..")
+        if self.detector != "none" and (wrong or self.image_bins < 2):
+            typed = [f"--set sensors.sonar.{name}=false" for name in wrong]
+            typed += ["--set sensors.sonar.image_bins=240"] * (self.image_bins < 2)
+            raise ValueError(
+                "detector: ranges come from the image of a multibeam without Doppler; add "
+                f"{' '.join(typed)}, or take --sensors multibeam_image"
             )
         return self
 

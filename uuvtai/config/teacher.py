@@ -121,8 +121,9 @@ class TeacherConfig(Section):
     gaze_m: NonNegative = 3.0
     """the nose, and with it the camera, turns to the nearest moving body this close: near ones leave the
     sonar's fan; 0 = along the way"""
-    gaze_level_m: NonNegative = 1.0
-    """bodies level with the vehicle count as so much farther: the sonar sees them"""
+    gaze_level_m: NonNegative = 3.0
+    """bodies level with the vehicle count as so much farther: the sonar sees them; as much as ``gaze_m`` or
+    more: the nose is not turned to them at all"""
     gaze_clearance_m: NonNegative = 0.6
     """mapped clearance below which the nose stays along the way: the hull is longer than wide"""
     askew_clearance_m: NonNegative = 0.5

@@ -43,7 +43,12 @@ class Drive:
 def read_drives(path: Path, truth: bool = False) -> list[Drive]:
     """The drives of a file: ``.csv``, else MCAP. ``truth``: what a log of ours says of the truth, in place of
     what the instruments said. Raises DriveError, FileError, LogError."""
-    rows = _table(path) if path.suffix.lower() == ".csv" else _log(path, truth)
+    return drives_of(_table(path) if path.suffix.lower() == ".csv" else _log(path, truth), path)
+
+
+def drives_of(rows: np.ndarray, path: Path) -> list[Drive]:
+    """Rows (n, 10 + thrusters) of a file, cut where samples are missing: time, velocity (3) and yaw rate,
+    rates of roll and pitch, world z axis in body axes, rotor speeds. Raises DriveError."""
     time_s = rows[:, 0]
     if len(rows) < 2 or not np.isfinite(time_s).all() or (np.diff(time_s) <= 0).any():
         raise DriveError(f"{path}: times must rise from row to row; give a log of one drive")

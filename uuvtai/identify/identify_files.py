@@ -8,7 +8,8 @@ from typing import Any
 
 from uuvtai.config import VehicleConfig
 from uuvtai.files import refuse_output
-from uuvtai.identify.drive_log import DriveError, read_drives
+from uuvtai.identify.ardusub_log import ENDINGS, read_ardusub
+from uuvtai.identify.drive_log import Drive, DriveError, read_drives
 from uuvtai.identify.identified import identified, vehicle_yaml
 
 
@@ -28,7 +29,7 @@ def identify(
         raise DriveError(f"{out.parent}: is no folder; give --out a name in a folder that is there")
     for path in (out, picture):
         refuse_output(path, files, force)
-    drives = [drive for file in files for drive in read_drives(file, truth)]
+    drives = [drive for file in files for drive in _drives(file, vehicle_cfg, truth)]
     found = identified(drives, vehicle_cfg, known)
     from uuvtai.identify.prediction_figure import prediction_png
 
@@ -36,3 +37,11 @@ def identify(
     out.write_text(vehicle_yaml(found, base, files), encoding="utf-8")
     picture.write_bytes(picture_bytes)
     return {**found.document, "files": [str(file) for file in files], "vehicle": str(out)}
+
+
+def _drives(file: Path, vehicle_cfg: VehicleConfig, truth: bool) -> list[Drive]:
+    if file.suffix.lower() in ENDINGS:
+        if truth:
+            raise DriveError(f"{file}: a log of ArduSub's holds no truth; leave --truth out")
+        return read_ardusub(file, vehicle_cfg)
+    return read_drives(file, truth)

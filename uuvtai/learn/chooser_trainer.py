@@ -21,6 +21,7 @@ from uuvtai.learn.chooser import ArrivalNet, ChooserPilot
 from uuvtai.learn.chooser_memory import ChooserMemory, Tick, moments_of_episodes
 from uuvtai.learn.distributed import Processes
 from uuvtai.learn.episode_waves import play_episodes
+from uuvtai.learn.optimiser import PlainAdamW
 from uuvtai.learn.ppo import ADAM_EPS
 from uuvtai.learn.rollout_sums import Recent, RolloutSums
 from uuvtai.learn.set_pilot import SetPilot, set_pilot_of
@@ -55,7 +56,7 @@ class ChooserTrainer:
             ArrivalNet(BODY_WIDTH, EGO_COLUMNS, TREE_WIDTH, config, self.generator) for _ in range(2)
         )
         self._slow.load_state_dict(self.net.state_dict())
-        self.optimiser = torch.optim.AdamW(
+        self.optimiser = PlainAdamW(
             self.net.parameters(), lr=config.chooser.learning_rate, eps=ADAM_EPS, weight_decay=1e-3
         )
         self.memory = ChooserMemory(config.chooser.memory, N_BODY, BODY_WIDTH, EGO_COLUMNS + TREE_WIDTH)

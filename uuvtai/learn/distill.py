@@ -17,6 +17,7 @@ from torch import nn
 
 from uuvtai.config.learning import DistillConfig
 from uuvtai.errors import SettingError
+from uuvtai.learn.optimiser import PlainAdam
 
 MAX_WEIGHT_RATIO = 4.0
 """a sample counts at most this many times the mean signal, and at least its inverse, before the weights' mean
@@ -83,7 +84,7 @@ class TeacherBatches:
         """``policy.distribution(x)`` gives the means; ``reduce`` averages the gradients over the
         processes."""
         self.policy, self.config, self.reduce = policy, config, reduce
-        self.optimiser = torch.optim.Adam(policy.parameters(), lr=config.learning_rate)
+        self.optimiser = PlainAdam(policy.parameters(), lr=config.learning_rate)
         self.skipped = 0
         """steps left out because the gradient was not finite"""
 

@@ -18,6 +18,7 @@ from uuvtai.forecast_codes import COLUMNS, N_COLUMN
 from uuvtai.learn.distributed import Processes
 from uuvtai.learn.forecast_scores import scores_of
 from uuvtai.learn.mixture_net import TIMES_S, MixtureNet, mirrored, negative_log_likelihood
+from uuvtai.learn.optimiser import PlainAdam
 from uuvtai.learn.ppo import ADAM_EPS
 from uuvtai.learn.rollout_sums import Recent
 from uuvtai.learn.track_futures import TrackMoments, watch
@@ -50,9 +51,7 @@ class ForecastTrainer:
         torch.set_flush_denormal(True)
         self.generator = torch.Generator().manual_seed(config.train.seed)
         self.net = MixtureNet(self.generator)
-        self.optimiser = torch.optim.Adam(
-            self.net.parameters(), lr=config.forecaster.learning_rate, eps=ADAM_EPS
-        )
+        self.optimiser = PlainAdam(self.net.parameters(), lr=config.forecaster.learning_rate, eps=ADAM_EPS)
         size = config.forecaster.memory
         self._columns = torch.zeros(size, N_COLUMN, dtype=torch.float16)
         self._truth = torch.zeros(size, len(TIMES_S), 2)

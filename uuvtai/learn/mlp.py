@@ -37,9 +37,8 @@ def mlp(
 
 def linear(n_in: int, n_out: int, gain: float, generator: torch.Generator) -> nn.Linear:
     """One layer, weights orthogonal with this gain, bias zero."""
-    layer = nn.Linear(n_in, n_out, device="meta").to_empty(
-        device="cpu"
-    )  # its own initial weights come from the global generator
+    with torch.random.fork_rng(devices=()):  # its own initial weights come from the global generator
+        layer = nn.Linear(n_in, n_out)
     nn.init.orthogonal_(layer.weight, gain, generator=generator)
     nn.init.zeros_(layer.bias)
     return layer

@@ -20,6 +20,7 @@ from uuvtai.config.learning import PpoConfig
 from uuvtai.errors import SettingError
 from uuvtai.learn.distill import Reduce, imitation_error
 from uuvtai.learn.normalise import Moments, moments_of
+from uuvtai.learn.optimiser import PlainAdam
 from uuvtai.learn.policy import ActorCritic, entropy, log_prob
 from uuvtai.learn.rollout import Rollout
 
@@ -135,7 +136,7 @@ class Ppo:
         self.policy, self.config, self.reduce, self.gather = policy, config, reduce, gather
         device = policy.log_std.device
         self.rate = torch.tensor(config.learning_rate, device=device)
-        self.optimiser = torch.optim.Adam(policy.parameters(), lr=self.rate, eps=ADAM_EPS, fused=True)
+        self.optimiser = PlainAdam(policy.parameters(), lr=self.rate, eps=ADAM_EPS, fused=True)
         self.updates = 0
         """minibatches that changed the policy"""
         self.skipped = 0

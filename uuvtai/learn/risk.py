@@ -23,6 +23,7 @@ from uuvtai.learn.calibration import brier, expected_calibration_error
 from uuvtai.learn.guard import guarded_step
 from uuvtai.learn.mlp import mlp
 from uuvtai.learn.normalise import Moments, RunningNorm, moments_of
+from uuvtai.learn.optimiser import PlainAdam
 
 STRIDE = 5
 """control steps between the moments that are learned from: neighbours in time are nearly the same sample"""
@@ -216,7 +217,7 @@ class RiskLearner:
         self.memory = RiskMemory(
             round(config.horizon_s / (control_dt_s * hold_steps)), max(1, STRIDE // hold_steps)
         )
-        self.optimiser = torch.optim.Adam(head.parameters(), lr=config.learning_rate, fused=True)
+        self.optimiser = PlainAdam(head.parameters(), lr=config.learning_rate, fused=True)
         self.skipped = 0
         """steps left out because the gradient was not finite, or zero for want of labels"""
 

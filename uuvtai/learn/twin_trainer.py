@@ -12,6 +12,7 @@ import torch
 from uuvtai.config.learning import LearningConfig
 from uuvtai.errors import SettingError
 from uuvtai.learn.distributed import Processes
+from uuvtai.learn.optimiser import PlainAdam
 from uuvtai.learn.policy import log_prob
 from uuvtai.learn.ppo import ADAM_EPS, adapted_rate, approximate_kl, gae, surrogate_loss
 from uuvtai.learn.rollout_sums import Recent, RolloutSums
@@ -62,7 +63,7 @@ class TwinTrainer:
         self.actor = SetActor(BODY_WIDTH, EGO_COLUMNS, config, self.generator)
         self.critic = SetCritic(BODY_WIDTH, EGO_COLUMNS, TRUTH_WIDTH, config, self.generator)
         self.rate = torch.tensor(config.ppo.learning_rate)
-        self.optimiser = torch.optim.Adam(
+        self.optimiser = PlainAdam(
             [
                 {"params": list(self.actor.parameters()), "lr": config.ppo.learning_rate},
                 {"params": list(self.critic.parameters()), "lr": CRITIC_RATE},

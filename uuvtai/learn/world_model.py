@@ -22,6 +22,7 @@ from uuvtai.learn.calibration import coverage, mean_squared_standardised_residua
 from uuvtai.learn.guard import guarded_step
 from uuvtai.learn.mlp import mlp
 from uuvtai.learn.normalise import Moments, RunningNorm, moments_of
+from uuvtai.learn.optimiser import PlainAdam
 
 N_TARGET = 24
 """first columns of the observation: goal, heading error, velocity, yaw rate, depth, tilt, 12 sector ranges"""
@@ -203,7 +204,7 @@ class WorldModelLearner:
     ) -> None:
         """``reduce`` averages gradients over the processes in place; ``gather`` unites their moments."""
         self.model, self.config, self.reduce, self.gather = world_model, config, reduce, gather
-        self.optimiser = torch.optim.Adam(world_model.parameters(), lr=config.learning_rate, fused=True)
+        self.optimiser = PlainAdam(world_model.parameters(), lr=config.learning_rate, fused=True)
         self.skipped = 0
         """steps left out because the gradient was not finite, or zero for want of valid samples"""
 

@@ -2,20 +2,58 @@
 
 from __future__ import annotations
 
-from uuvtai.live.viewer_server import ViewerServer
+from collections.abc import Mapping
+from typing import Protocol
+
 from uuvtai.logs.log_recorder import EpisodeReader, PolicyNote, Recordable, RecordedJob
 from uuvtai.logs.moment import EpisodeEnd, EpisodeHeader, Values
+from uuvtai.logs.schemas import Schema
 from uuvtai.logs.topic import Topic
-from uuvtai.logs.topic_stream import TopicStream
+from uuvtai.logs.topic_stream import TopicMessage, TopicStream
+
+
+class Viewers(Protocol):
+    """Whoever is shown episodes as messages."""
+
+    def begin(self, schemas: Mapping[str, Schema]) -> None:
+        """Another episode."""
+
+    def tell_time(self, time_ns: int) -> None:
+        """It is now this late in the episode."""
+
+    def send(self, message: TopicMessage) -> None:
+        """Show a message."""
+
+
+class EveryViewer:
+    """Several of them as one."""
+
+    def __init__(self, *viewers: Viewers) -> None:
+        self._viewers = viewers
+
+    def begin(self, schemas: Mapping[str, Schema]) -> None:
+        """Another episode, for all."""
+        for viewer in self._viewers:
+            viewer.begin(schemas)
+
+    def tell_time(self, time_ns: int) -> None:
+        """It is now this late in the episode, for all."""
+        for viewer in self._viewers:
+            viewer.tell_time(time_ns)
+
+    def send(self, message: TopicMessage) -> None:
+        """Show a message to all."""
+        for viewer in self._viewers:
+            viewer.send(message)
 
 
 class LiveEpisode:
-    """One episode for the viewers of a server; an ``EpisodeSink``."""
+    """One episode for viewers; an ``EpisodeSink``."""
 
-    def __init__(self, server: ViewerServer, header: EpisodeHeader, depth_images: bool) -> None:
-        self._server, self._stream = server, TopicStream(header, depth_images)
+    def __init__(self, viewers: Viewers, header: EpisodeHeader, depth_images: bool) -> None:
+        self._viewers, self._stream = viewers, TopicStream(header, depth_images)
         self._dt_s = header.config.episode.control_dt_s
-        server.begin(self._stream.schemas())
+        viewers.begin(self._stream.schemas())
 
     def due(self, values: Values) -> list[Topic]:
         """Topics that this step has messages on."""
@@ -23,9 +61,9 @@ class LiveEpisode:
 
     def write(self, values: Values) -> None:
         """Show one control step."""
-        self._server.tell_time(round(int(values["clock.step"]) * self._dt_s * 1e9))
+        self._viewers.tell_time(round(int(values["clock.step"]) * self._dt_s * 1e9))
         for message in self._stream.messages(values):
-            self._server.send(message)
+            self._viewers.send(message)
 
     def close(self, result: EpisodeEnd) -> None:
         """Its last messages have told how it ended."""
@@ -39,15 +77,17 @@ class Broadcast(EpisodeReader):
 
     def __init__(
         self,
-        server: ViewerServer,
+        viewers: Viewers,
         world: str,
         controller: str,
         depth_images: bool = False,
         policy: PolicyNote | None = None,
     ) -> None:
         super().__init__(world, controller, policy)
-        self._server, self._depth_images = server, depth_images
+        self._viewers, self._depth_images = viewers, depth_images
 
     def sink_for(self, sim: Recordable, row: int, job: RecordedJob) -> LiveEpisode | None:
         """Viewers look at one vehicle."""
-        return LiveEpisode(self._server, self.header(sim, row, job), self._depth_images) if row == 0 else None
+        return (
+            LiveEpisode(self._viewers, self.header(sim, row, job), self._depth_images) if row == 0 else None
+        )

@@ -7,7 +7,8 @@ half aperture, so that whatever lies at one range and bearing folds into one pla
 included. A surface sends back Lambert's share of what meets it: power per solid angle cos(incidence) /
 range^2 (two-way spreading, range^-4, over an area that grows with range^2), less the absorption of fresh
 water. Scatterers are many per cell and their phases random, so amplitudes are Rayleigh distributed (speckle);
-neighbouring beams share scatterers as far as their patterns overlap.
+neighbouring beams share scatterers as far as their patterns overlap. Patterns, losses and noise:
+``multibeam.py``.
 """
 
 from __future__ import annotations
@@ -19,21 +20,18 @@ import numpy as np
 
 from uuvtai.closed_form import body_positions
 from uuvtai.config import SonarConfig
+from uuvtai.multibeam import (
+    ABSORPTION_NP_M,
+    SHOWN_DB,
+    beam_pattern,
+    elevation_pattern,
+    elevations,
+    gain,
+    heard_bearings,
+    noise_power,
+    ray_sr,
+)
 
-BEAM_DEG = 1.0
-"""half-power width of a beam across (Oculus M750d at 750 kHz)"""
-FREQUENCY_HZ = 750e3
-ABSORPTION_NP_M = 25e-15 * FREQUENCY_HZ**2
-"""of the amplitude; classical absorption of pure water"""
-NOISE_DB = -40.0
-"""noise below the return of a wall that fills the beam at maximum range (EC)"""
-SHOWN_DB = 50.0
-"""of the picture, from black to white"""
-_PAD_DEG = 15.0
-"""A fan hears so far beyond its edge by its side lobes."""
-_STEEPEST_DEG, _STEP_DEG = 45.0, 0.75
-_HALF_POWER = 0.4429
-"""sinc(x)^2 = 1/2"""
 _WALL, _FLOOR, _SURFACE = -1, -2, -3
 
 
@@ -135,34 +133,16 @@ def echo_power(
 ) -> tuple[np.ndarray, np.ndarray]:
     """(bearings (m,) [rad] from ahead, power (m, n_bin)): mean power that comes back from each bearing and
     range, elevations folded; no pattern across yet. Bins part ``max_range_m`` equally."""
-    aperture = sonar_cfg.horizontal_aperture_deg
-    span = 360.0 if sonar_cfg.is_ring else min(aperture + 2.0 * _PAD_DEG, 360.0)
-    n = math.ceil(math.radians(span) / sonar_cfg.beam_step_rad)
-    bearing = math.radians(span) * ((np.arange(n) + 0.5) / n - 0.5)
-    edges = np.radians(np.arange(-_STEEPEST_DEG, _STEEPEST_DEG + 1e-9, _STEP_DEG))
+    bearing, edges = heard_bearings(sonar_cfg), elevations()
     az, el = (grid.ravel() for grid in np.meshgrid(bearing + yaw, edges, indexing="ij"))
     unit = np.column_stack([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)])
     seen = cast_rays(scenario, time_s, np.asarray(start, float), unit)
-    solid = math.radians(span) / n * math.radians(_STEP_DEG) * np.cos(el)
     lost = np.exp(-4.0 * ABSORPTION_NP_M * seen.range_m)  # amplitude, there and back, squared
     lost /= np.maximum(seen.range_m, 0.1) ** 2
-    power = elevation_pattern(el, sonar_cfg) ** 2 * seen.cosine * solid * lost
+    power = elevation_pattern(el, sonar_cfg) ** 2 * seen.cosine * ray_sr(el, sonar_cfg) * lost
     bins = np.minimum(seen.range_m / sonar_cfg.max_range_m * n_bin, n_bin).astype(int)
-    shape = (n, len(edges))
+    shape = (len(bearing), len(edges))
     return bearing, _folded(bins.reshape(shape), seen.surface.reshape(shape), power.reshape(shape), n_bin)
-
-
-def elevation_pattern(elevation_rad: np.ndarray, sonar_cfg: SonarConfig) -> np.ndarray:
-    """Amplitude of a beam above and below its plane."""
-    half = math.radians(max(sonar_cfg.vertical_half_aperture_deg, 0.1))
-    return np.sinc(_HALF_POWER * np.sin(elevation_rad) / math.sin(half))
-
-
-def beam_pattern(off_rad: np.ndarray) -> np.ndarray:
-    """Amplitude of a beam across, ``off_rad`` from its middle."""
-    half = math.radians(0.5 * BEAM_DEG)
-    front = np.abs(np.angle(np.exp(1j * off_rad))) < 0.5 * math.pi
-    return np.where(front, np.sinc(_HALF_POWER * np.sin(off_rad) / math.sin(half)), 0.0)
 
 
 def _folded(bins: np.ndarray, surface: np.ndarray, power: np.ndarray, n_bin: int) -> np.ndarray:
@@ -191,30 +171,15 @@ def heard_image(
     pattern = beam_pattern(beams[:, None] - bearing[None])
     phases = random.normal(size=(2, *power.shape))
     field = pattern @ (np.sqrt(0.5 * power) * (phases[0] + 1j * phases[1]))
-    noise = random.normal(size=(2, *field.shape)) * math.sqrt(0.5 * noise_power(bearing, sonar_cfg))
+    noise = random.normal(size=(2, *field.shape)) * math.sqrt(0.5 * noise_power(sonar_cfg))
     return np.abs(field + noise[0] + 1j * noise[1]) ** 2
 
 
-def noise_power(bearing: np.ndarray, sonar_cfg: SonarConfig) -> float:
-    """Mean power of the noise in a cell."""
-    far = math.exp(-4.0 * ABSORPTION_NP_M * sonar_cfg.max_range_m) / sonar_cfg.max_range_m**2
-    return filled_beam(bearing, sonar_cfg) * far * 10.0 ** (0.1 * NOISE_DB)
-
-
-def filled_beam(bearing: np.ndarray, sonar_cfg: SonarConfig) -> float:
-    """[sr] of a beam: what a wall across it returns from 1 m, unabsorbed."""
-    elevation = np.radians(np.arange(-_STEEPEST_DEG, _STEEPEST_DEG, _STEP_DEG))
-    upright = (elevation_pattern(elevation, sonar_cfg) ** 2 * np.cos(elevation)).sum()
-    upright *= math.radians(_STEP_DEG)
-    return float(upright * (beam_pattern(bearing) ** 2).sum() * (bearing[1] - bearing[0]))
-
-
-def shown_image(heard: np.ndarray, bearing: np.ndarray, sonar_cfg: SonarConfig) -> np.ndarray:
+def shown_image(heard: np.ndarray, sonar_cfg: SonarConfig) -> np.ndarray:
     """(n_bin, n_ray) uint8, range upwards from the last row, left is left: gain follows range and absorption,
     ``SHOWN_DB`` from black to white."""
     range_m = sonar_cfg.max_range_m * (np.arange(heard.shape[1]) + 0.5) / heard.shape[1]
-    gain = range_m**2 * np.exp(4.0 * ABSORPTION_NP_M * range_m) / filled_beam(bearing, sonar_cfg)
-    level = 10.0 * np.log10(np.maximum(heard * gain, 1e-12))
+    level = 10.0 * np.log10(np.maximum(heard * gain(range_m, sonar_cfg), 1e-12))
     grey = np.clip(255.0 * (level / SHOWN_DB + 1.0), 0, 255).astype(np.uint8)
     return grey.T[::-1, ::-1].copy()
 

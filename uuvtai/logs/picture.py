@@ -23,6 +23,7 @@ from uuvtai.logs.canvas import (
     Color,
     method_inks,
 )
+from uuvtai.logs.fan_strip import HEIGHT_PX, fans_of, paint_fan_marks, paint_fans
 from uuvtai.logs.log_errors import LogError, checked_suffix
 from uuvtai.logs.painting import (
     AnyCanvas,
@@ -131,9 +132,9 @@ def paint_picture(
 ) -> AnyCanvas:
     """The picture on a canvas; the other arguments as of ``picture``."""
     tank = recordings[0].scenario["tank"]
-    rows = len(recordings)
-    side = 92 if clearance else 0
-    canvas = map_canvas(tank, width_px, (_LEFT, _RIGHT + side, _TOP, _BOTTOM + _ROW * max(rows, 3)), kind)
+    heard, legend = fans_of(recordings), _BOTTOM + _ROW * max(len(recordings), 3)
+    side, strip = 92 if clearance else 0, HEIGHT_PX if heard else 0
+    canvas = map_canvas(tank, width_px, (_LEFT, _RIGHT + side, _TOP, legend + strip), kind)
     inks = _inks(recordings, methods)
     paint_water(canvas, tank)
     if clearance:
@@ -145,6 +146,9 @@ def paint_picture(
     _paint_trajectories(canvas, recordings, inks)
     _paint_ends(canvas, recordings, inks)
     _paint_frame(canvas, recordings, inks, not clearance, remark)
+    if heard:
+        paint_fan_marks(canvas, heard)
+        paint_fans(canvas, heard, _LEFT, canvas.size[1] - strip, canvas.size[0] - _RIGHT)
     return canvas
 
 

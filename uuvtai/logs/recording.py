@@ -103,7 +103,7 @@ def load_recording(path: Path, topics: tuple[str, ...] = VIDEO_TOPICS) -> Record
     size = 0
     try:
         for message in read_messages(path, topics):
-            value = _READERS[message.topic](message.data)
+            value = read_value(message.topic, message.data)
             found[message.topic].add(message.time_s, value)
             size += _taken(value) + _OVERHEAD
             if size > _MAX_ARRAYS:
@@ -124,6 +124,11 @@ def load_recording(path: Path, topics: tuple[str, ...] = VIDEO_TOPICS) -> Record
             f"{path}: claims to last {found.duration_s:g} s; no episode is longer than {_MAX_DURATION_S:g} s"
         )
     return found
+
+
+def read_value(topic: str, data: dict[str, Any]) -> Any:
+    """What the table of topics reads of a message. Raises LogError, and what a message unlike ours raises."""
+    return _READERS[topic](data)
 
 
 @contextlib.contextmanager

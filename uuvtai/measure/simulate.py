@@ -173,14 +173,14 @@ def _set_start(plant: Plant, vectors: dict[str, np.ndarray]) -> None:
 def _sample(plant: Plant, time_s: float) -> dict[str, Any]:
     v = plant.vehicle
     position, q, vel, rate = (
-        field.to_numpy()[0].astype(float) for field in (v.pos_w, v.quat_wb, v.vel_b, v.rate_b)
+        plant.read(field)[0].astype(float) for field in (v.pos_w, v.quat_wb, v.vel_b, v.rate_b)
     )
     return {
         "t": time_s,
         "position": position.tolist(),
         "rpy_deg": np.degrees(roll_pitch_yaw(q)).tolist(),
         "nu": [*vel.tolist(), *rate.tolist()],
-        "rpm": v.rpm.to_numpy()[0].astype(float).tolist(),
+        "rpm": plant.read(v.rpm)[0].astype(float).tolist(),
     }
 
 

@@ -1,5 +1,5 @@
 """What a kernel's machine code depends on, as one key: the sources that kernels see, the arrays' places, the
-config sections, and the processor. Nothing of it asks Taichi to read a kernel."""
+processor, and the values of the config that the kernel reads. Nothing of it asks Taichi to read a kernel."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ import dataclasses
 import functools
 import hashlib
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import taichi as ti
 
 from uuvtai.config import Section
+from uuvtai.native.reads import values_of
 
 _SEEN_BY_KERNELS = (
     "kernels", "config", "state", "native", "taichi_patches",
@@ -37,8 +39,8 @@ def digest_of_sources() -> str:
 
 
 def key_of(kernel: Any, arguments: tuple, tree: int, surroundings: list) -> str:
-    """64 hexadecimal digits that name the machine code of ``kernel`` for these arguments; ``surroundings``
-    say which processor, compilers and runtime it is for. Raises KeyNameError."""
+    """64 hexadecimal digits that name ``kernel`` for these arguments whatever their config says;
+    ``surroundings`` say which processor, compilers and runtime it is for. Raises KeyNameError."""
     function = kernel.func
     given = [
         "" if declared.annotation in (int, float) else described(value, tree)
@@ -48,10 +50,18 @@ def key_of(kernel: Any, arguments: tuple, tree: int, surroundings: list) -> str:
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
 
+def key_with(key: str, names: Iterable[str], bundle: Any) -> str:
+    """64 hexadecimal digits that name a kernel's machine code: its ``key_of``, and what of its bundle's
+    config it depends on (``reads.noted``)."""
+    return hashlib.sha256(json.dumps([key, values_of(names, bundle)]).encode()).hexdigest()
+
+
 def described(value: Any, tree: int) -> str:
-    """All of an argument that its kernel's code can depend on; fields must belong to ``tree``. Raises
-    KeyNameError."""
-    if isinstance(value, Section | bool | int | str | None):
+    """All of an argument that its kernel's code can depend on, but for values of the config; fields must
+    belong to ``tree``. Raises KeyNameError."""
+    if isinstance(value, Section):
+        return type(value).__name__
+    if isinstance(value, bool | int | str | None):
         return f"{type(value).__name__} {value!r}"
     if isinstance(value, ti.Field):
         return _place(value, tree)

@@ -25,10 +25,17 @@ class TaichiLaunch:
     """A kernel compiled by Taichi for one list of arguments, which are kept alive: their identities are the
     key."""
 
-    def __init__(self, kernel: Any, arguments: tuple, compiled: tuple[Any, Any] | None = None) -> None:
+    def __init__(
+        self,
+        kernel: Any,
+        arguments: tuple,
+        compiled: tuple[Any, Any] | None = None,
+        values: list[tuple[Any, Any]] | None = None,
+    ) -> None:
+        """``values``: as in ``NativeLaunch``; None where no number of the config is an argument."""
         self.program: Any = impl.get_runtime().prog
         self._arguments = arguments
-        self._given = given(kernel, arguments)
+        self._given = given(kernel, arguments) if values is None else values
         self._kernel, self._compiled = compiled or self._found(kernel)
 
     def _found(self, kernel: Any) -> tuple[Any, Any]:
@@ -54,11 +61,14 @@ class TaichiLaunch:
 class NativeLaunch:
     """A kernel's own machine code with one list of arguments, which are kept alive."""
 
-    def __init__(self, machine: Any, runtime: Any, tasks: list[int], kernel: Any, arguments: tuple) -> None:
+    def __init__(
+        self, machine: Any, runtime: Any, tasks: list[int], arguments: tuple, values: list[tuple[Any, Any]]
+    ) -> None:
+        """``values``: what it is told at each launch, as ``given`` has them, and numbers of the config."""
         self.program: Any = impl.get_runtime().prog
         self._arguments, self._runtime = arguments, runtime
         self._tasks = (ctypes.c_void_p * len(tasks))(*tasks)
-        self._packed, self._tensors = _packed(given(kernel, arguments))
+        self._packed, self._tensors = _packed(values)
         self._launch = functools.partial(
             machine.launch,
             ctypes.addressof(self._tasks),
@@ -104,6 +114,7 @@ def quick_launch(launch: _T) -> _T:
             known[key] = found
 
     again.__name__, again.__doc__ = launch.__name__, launch.__doc__  # type: ignore[attr-defined]
+    again._primal = kernel  # type: ignore[attr-defined]  # as Taichi has it; aboard/tape.py looks for it
     return again  # type: ignore[return-value]
 
 

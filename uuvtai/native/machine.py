@@ -194,6 +194,14 @@ class Machine:
         return [llvmlite.__version__, self.llvm.get_default_triple(), self.llvm.get_host_cpu_name(), features]
 
 
+def runtime_layout() -> dict[str, int]:
+    """Sizes and offsets [bytes] of what ``Machine.runtime`` fills, for who fills it elsewhere."""
+    return {
+        "bytes": _RUNTIME_BYTES, "roots": _ROOTS, "trees": _TREES, "pool": _POOL,
+        "parallel_for": _PARALLEL_FOR, "temporaries": _TEMPORARIES, "temporary_bytes": _TEMPORARY_BYTES,
+    }  # fmt: skip
+
+
 def tasks_in(text: str) -> list[str]:
     """Names of a kernel's tasks in their order. Raises UnfitError where the runtime is another one than the
     offsets here belong to."""

@@ -7,6 +7,7 @@ import os
 import sys
 import warnings
 import weakref
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -17,9 +18,11 @@ import torch
 
 from uuvtai.native.companion import Companion
 from uuvtai.native.gpu_shape import asked_shape
-from uuvtai.native.keys import KeyNameError, key_of
-from uuvtai.native.launch import Launch, NativeLaunch, TaichiLaunch, native, written
+from uuvtai.native.keys import KeyNameError, key_of, key_with
+from uuvtai.native.launch import Launch, NativeLaunch, TaichiLaunch, given, native, written
 from uuvtai.native.machine import Machine, UnfitError, tasks_in
+from uuvtai.native.numbers import Sum, worked_out
+from uuvtai.native.reads import noted, value_of
 from uuvtai.native.store import MachineCode, Store, StoreError, default_folder
 from uuvtai.native.taichi_code import Compiler
 from uuvtai.taichi_patches.memory import Memory
@@ -51,6 +54,7 @@ class Native:
         self.compiler: Compiler | None = None
         self.companion = Companion()
         self.found, self.made, self.refused = 0, 0, 0
+        self._times: Counter[Any] = Counter()
 
     def adopt(
         self,
@@ -72,11 +76,11 @@ class Native:
             return None
         try:
             key = key_of(kernel, arguments, owner.memory.tree, self.surroundings)
-            code = self.store.get(key)
+            kept = (self.store.get(key_with(key, names, arguments[0])) for names in self.store.names(key))
+            code = next(filter(None, kept), None)
             if code is None:
                 return self._make(key, kernel, arguments, owner)
-            tasks = self.machine.tasks_of(code.machine, code.tasks)
-            launch = NativeLaunch(self.machine, owner.runtime, tasks, kernel, arguments)
+            launch = self._launch(code, kernel, arguments, owner)
         except (UnfitError, KeyNameError, StoreError) as error:
             self._tell(kernel, error)
             return None
@@ -93,17 +97,16 @@ class Native:
             self.store.bound()
         if owner.recipe:
             self.companion.ask(owner.recipe())
-        made = kernel.compiled_kernels[kernel.ensure_compiled(*arguments)]
+        made, names, table = self._read(kernel, arguments)
         compiled, text = self.compiler.compiled(made)
-        names = tasks_in(text)
+        tasks = tasks_in(text)
         work = self.compiler.beside(self.machine.object_of, text)
-        taichi = TaichiLaunch(kernel, arguments, (made, compiled))
+        taichi = TaichiLaunch(kernel, arguments, (made, compiled), _values(kernel, arguments, table))
         state = Written(arguments, owner.memory)
         taichi.again()
         try:
-            code = MachineCode(names, work())
-            tasks = self.machine.tasks_of(code.machine, code.tasks)
-            ours = NativeLaunch(self.machine, owner.runtime, tasks, kernel, arguments)
+            code = MachineCode(tasks, work(), table)
+            ours = self._launch(code, kernel, arguments, owner)
         except UnfitError as error:
             self._tell(kernel, error)
             return taichi
@@ -112,10 +115,28 @@ class Native:
             return taichi
         self.made += 1
         try:
-            self.store.put(key, code)
+            self.store.put(key_with(key, names, arguments[0]), code)
+            self.store.put_names(key, names)
         except StoreError as error:
             self._tell(kernel, error, "its machine code is not kept")
         return ours
+
+    def _read(self, kernel: Any, arguments: tuple) -> tuple[Any, list[str], list[Sum]]:
+        """What Taichi makes of a kernel's source, what of the config this depends on, and the numbers that
+        are its arguments."""
+        instance = kernel.mapper.lookup(arguments)[0]
+        kernel.compiled_kernels.pop((kernel.func, instance, kernel.autodiff_mode), None)  # not read by us
+        self._times[kernel.func] += 1
+        with noted(arguments[0], self._times[kernel.func]) as (names, numbers):
+            made = kernel.compiled_kernels.pop(kernel.ensure_compiled(*arguments))
+        return made, sorted(names), numbers.table
+
+    def _launch(self, code: MachineCode, kernel: Any, arguments: tuple, owner: Owner) -> NativeLaunch:
+        tasks, values = (
+            self.machine.tasks_of(code.machine, code.tasks),
+            _values(kernel, arguments, code.numbers),
+        )
+        return NativeLaunch(self.machine, owner.runtime, tasks, arguments, values)
 
     def _tell(self, kernel: Any, error: Exception, effect: str = "Taichi launches it") -> None:
         """One line for the first kernel; the others are counted."""
@@ -139,6 +160,12 @@ def adopt(
         native[0].adopt(bundles, memory, recipe, alone)
     except (UnfitError, StoreError) as error:
         warnings.warn(f"{error}; Taichi launches all kernels", RuntimeWarning, stacklevel=2)
+
+
+def _values(kernel: Any, arguments: tuple, table: list[Sum]) -> list[tuple[Any, Any]]:
+    """What a kernel is told at a launch: its own numbers and tensors, then those of the config."""
+    numbers = (worked_out(told, lambda name: value_of(arguments[0], name)) for told in table)
+    return given(kernel, arguments) + [(float, number) for number in numbers]
 
 
 def _is_plain(value: Any) -> bool:

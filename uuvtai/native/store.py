@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import hashlib
 import json
 import os
@@ -11,6 +12,7 @@ import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from uuvtai.files import FileError, open_file, parsed_json
 
@@ -18,6 +20,8 @@ _MAGIC = b"UUVNATIVE1\n"
 MOST_BYTES = 512 << 20
 _MOST_FILE_BYTES = 64 << 20
 _SUFFIX, _UNFINISHED = ".kernel", ".part"
+_MOST_NAMES = 16
+"""ways through a kernel's source that are remembered: each depends on something else of the config"""
 _STALE_S = 3600.0
 """age of an unfinished file whose writer is dead for sure [s]"""
 
@@ -34,6 +38,8 @@ class MachineCode:
     """names of its functions, in order"""
     machine: bytes
     """an object file"""
+    numbers: list[Any] = dataclasses.field(default_factory=list)
+    """what its last arguments are to be (``numbers.Sum``)"""
 
 
 def default_folder() -> Path:
@@ -77,7 +83,7 @@ class Store:
 
     def put(self, key: str, code: MachineCode) -> None:
         """Keep it. Raises StoreError where the disk refuses; nothing half is left."""
-        head = json.dumps({"key": key, "tasks": code.tasks}).encode() + b"\n"
+        head = json.dumps({"key": key, "tasks": code.tasks, "numbers": code.numbers}).encode() + b"\n"
         digest = hashlib.sha256(head + code.machine).hexdigest().encode()
         content = _MAGIC + digest + b"\n" + head + code.machine
         temporary = None
@@ -91,6 +97,17 @@ class Store:
                 with contextlib.suppress(OSError):
                     os.unlink(temporary)
             raise StoreError(f"{self.folder}: {error.strerror}") from error
+
+    def names(self, key: str) -> list[list[str]]:
+        """What was kept by ``put_names``, newest first: where code is to be looked for. Raises StoreError."""
+        found = self.get(key)
+        return found.numbers if found else []
+
+    def put_names(self, key: str, names: list[str]) -> None:
+        """Note that there is code of a kernel that depends on this of the config; another process may have
+        noted something meanwhile, which is lost then: its code will be made anew. Raises StoreError."""
+        others = [known for known in self.names(key) if known != names]
+        self.put(key, MachineCode([], b"", [names, *others][:_MOST_NAMES]))
 
     def clear(self) -> int:
         """Delete all; how many files."""
@@ -136,4 +153,4 @@ def _unpacked(content: bytes, key: str) -> MachineCode | None:
         return None
     head, _, machine = rest.partition(b"\n")
     known = parsed_json(head, key)
-    return MachineCode(known["tasks"], machine) if known["key"] == key else None
+    return MachineCode(known["tasks"], machine, known["numbers"]) if known["key"] == key else None

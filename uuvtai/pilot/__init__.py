@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from uuvtai.pilot.fed_pilot import PilotCommand, StaleLimits
 from uuvtai.pilot.inbox import Tally
 from uuvtai.pilot.mission import Mission
-from uuvtai.pilot.onboard import OnboardPilot, PilotCommand, StaleLimits
+from uuvtai.pilot.onboard import OnboardPilot
 from uuvtai.pilot.sensor_messages import (
     KINDS,
     DepthShot,

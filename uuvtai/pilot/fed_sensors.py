@@ -18,9 +18,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from uuvtai.config import Config
 from uuvtai.pilot.carrying import acceleration_b, to_world, turned_on
 from uuvtai.pilot.inbox import Inbox
+from uuvtai.pilot.numbers import PilotNumbers
 from uuvtai.pilot.pose_history import PoseHistory
 from uuvtai.pilot.sensor_messages import (
     DepthShot,
@@ -30,7 +30,6 @@ from uuvtai.pilot.sensor_messages import (
     PressureReading,
     SonarPing,
 )
-from uuvtai.stages import Stages
 
 FIX_AGE_S = 0.3
 """[s] a scan or an image taken while attitude or position was older than this is not used: it would be drawn
@@ -40,22 +39,21 @@ at the wrong place of the map"""
 class FedSensors:
     """A ``SensorSource`` for row 0; ``views`` are the simulator's arrays in memory, by 'struct.field'."""
 
-    def __init__(self, config: Config, views: dict[str, np.ndarray], inbox: Inbox) -> None:
-        sensors = config.sensors
-        self._inbox, self._dt = inbox, config.episode.control_dt_s
-        self._dvl_period = sensors.dvl.period_steps
-        self._sonar_m, self._camera_m = sensors.sonar.max_range_m, sensors.depth.max_range_m
+    def __init__(self, numbers: PilotNumbers, views: dict[str, np.ndarray], inbox: Inbox) -> None:
+        self._inbox, self._dt = inbox, numbers.dt_s
+        self._dvl_period = numbers.dvl_steps
+        self._sonar_m, self._camera_m = numbers.sonar_m, numbers.camera_m
         self._clock, self._ego, self._scan, self._image = (
             {name.partition(".")[2]: array for name, array in views.items() if name.startswith(f"{struct}.")}
             for struct in ("clock", "ego", "scan", "image")
         )
         self._pings, self._shots, self._motions = PoseHistory(), PoseHistory(), PoseHistory()
-        self._gravity = config.vehicle.gravity_m_s2
+        self._gravity = numbers.gravity_m_s2
         self._imu = ImuReading(0.0, np.zeros(3), np.zeros(3), np.array([0.0, 0.0, self._gravity]))
         """until the first one comes: at rest"""
         self._pressure: PressureReading | None = None
         """until the first one comes: where the start is known to be"""
-        self._fixes = ("imu",) if sensors.localization == "estimated" else ("imu", "position")
+        self._fixes = ("imu",) if numbers.estimated else ("imu", "position")
 
     @property
     def step(self) -> int:
@@ -67,7 +65,7 @@ class FedSensors:
         """Until when a message counts as of this step: half a step later."""
         return (self.step + 0.5) * self._dt
 
-    def sense_motion(self, stages: Stages) -> None:
+    def sense_motion(self, stages: object) -> None:
         """IMU, DVL, pressure and position as they were last told; what came late is carried forward."""
         if isinstance(imu := self._inbox.newest("imu", self.now_s), ImuReading):
             self._imu = imu
@@ -116,7 +114,7 @@ class FedSensors:
             depth_m -= float(ego["pos_w"][0, 2] - then["pos_w"][2] + sinking)
         ego["depth_m"][0] = depth_m
 
-    def sense_sonar(self, stages: Stages) -> None:
+    def sense_sonar(self, stages: object) -> None:
         """The newest ping, placed where the vehicle was when it was taken."""
         ego, scan = self._ego, self._scan
         self._motions.note(self.step, vel_b=ego["vel_b"][0], pos_w=ego["pos_w"][0])
@@ -144,7 +142,7 @@ class FedSensors:
             for name, value in then.items():
                 scan[name][0] = value
 
-    def sense_depth(self, stages: Stages) -> None:
+    def sense_depth(self, stages: object) -> None:
         """The newest image, with the own pose when it was taken."""
         ego, image = self._ego, self._image
         if self._is_placed():

@@ -1,4 +1,4 @@
-"""An exported policy in the terminal: do its engines agree, and how long does each take."""
+"""What was exported, in the terminal: do a policy's engines agree, and how long does each take."""
 
 from __future__ import annotations
 
@@ -21,6 +21,14 @@ _ENGINES = (
     Column("p50 ms", 2, of=lambda one: f"{one.p50_ms:.3f}"),
     Column("p99 ms", 3, of=lambda one: f"{one.p99_ms:.3f}"),
 )
+
+
+def show_stack(document: dict[str, Any]) -> None:
+    """What ``uuv export --stack`` wrote."""
+    size = f"{document['bytes'] / 2**20:.1f} MiB"
+    machines = " and ".join(document["machines"])
+    say(f"wrote {document['folder']} ({size}): {document['kernels']} kernels for {machines}")
+    say(f"there: python3 -m uuv_stack decides {document['checked_steps']} steps of the log anew")
 
 
 def show_export(screen: Screen, found: Any) -> None:

@@ -76,9 +76,11 @@ def show_stated(kind: str, name: str, as_json: bool) -> None:
         say(f"it changes these keys of {base} (uuv presets show {kind}/{base}); every key: --all")
 
 
-def kind_and_name(name: str) -> tuple[str, str]:
-    """(kind, name) of 'NAME' or 'KIND/NAME'; a path is taken for a world's. UsageError for a name that no
-    kind has."""
+def kind_and_name(action: str, name: str | None) -> tuple[str, str]:
+    """(kind, name) of 'NAME' or 'KIND/NAME' after ``show``; a path is taken for a world's. UsageError for
+    another action, and for a name that no kind has."""
+    if action != "show" or not name:
+        raise UsageError("write 'uuv presets' or 'uuv presets show NAME'")
     kind, slash, rest = name.partition("/")
     if slash and kind in KINDS:
         return kind, rest

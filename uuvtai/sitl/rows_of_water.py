@@ -10,11 +10,11 @@ import torch
 from uuvtai.kernels.task import episode
 from uuvtai.kernels.vehicle import actuation, dynamics
 from uuvtai.kernels.world import scenarios
+from uuvtai.link.motors import Motors
 from uuvtai.outcomes import OUTCOMES, RUNNING
 from uuvtai.sensing import forget_readings
 from uuvtai.sim import Sim
 from uuvtai.sitl.fdm_reply import Motion
-from uuvtai.sitl.motors import Motors
 
 
 class WaterRows:

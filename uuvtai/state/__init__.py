@@ -35,7 +35,14 @@ from uuvtai.state.planning import (
     RouteState,
     VoronoiState,
 )
-from uuvtai.state.sensors import DepthImage, Proprioception, ProprioceptionMemory, SonarMemory, SonarScan
+from uuvtai.state.sensors import (
+    DepthImage,
+    Proprioception,
+    ProprioceptionMemory,
+    SonarImage,
+    SonarMemory,
+    SonarScan,
+)
 from uuvtai.state.task import ClockState, EpisodeState, MissionState, RefereeState, RewardState
 from uuvtai.state.teacher import TeacherState, TreeTable
 from uuvtai.state.vehicle import ActuationState, Allocation, CurrentState, VehicleParams, VehicleState
@@ -77,6 +84,7 @@ __all__ = [
     "RouteState",
     "ScenarioScratch",
     "SceneState",
+    "SonarImage",
     "SonarMemory",
     "SonarScan",
     "SpotState",

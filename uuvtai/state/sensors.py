@@ -144,6 +144,24 @@ class SonarMemory(Truth):
 
 
 @dataclass(frozen=True, eq=False)
+class SonarImage(Truth):
+    """What the beams of a multibeam with a detector hear in a ping (simulator side)."""
+
+    echo: ti.Field = array("n_env", "n_heard", "n_bin", lanes=True, scratch=True)
+    """power that comes back from each bearing and range, then its field's real part"""
+    echo_imag: ti.Field = array("n_env", "n_heard", "n_bin", lanes=True, scratch=True)
+    """imaginary part"""
+    heard: ti.Field = array("n_env", "n_heard", "n_bin", lanes=True, scratch=True)
+    """power that each beam hears in each range bin"""
+    farthest: ti.Field = array("n_env", "n_heard", dtype=ti.i32, scratch=True)
+    """range bin of the farthest that a bearing meets"""
+    across: ti.Field = array("n_heard", vec=2, scratch=True)
+    """a beam's pattern so many beams off, and its side lobes' share (``multibeam.main_lobe``)"""
+    upright: ti.Field = array("n_elevation", vec=3, scratch=True)
+    """sine and cosine of an elevation, and the power of its ray: pattern squared times solid angle [sr]"""
+
+
+@dataclass(frozen=True, eq=False)
 class DepthImage:
     """Sensed: forward depth camera, row 0 at the top, column 0 at the left."""
 
@@ -165,4 +183,5 @@ class SensorStructs:
     ego_memory: ProprioceptionMemory
     scan: SonarScan
     sonar_memory: SonarMemory
+    sonar_image: SonarImage
     image: DepthImage

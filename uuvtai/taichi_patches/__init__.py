@@ -11,7 +11,8 @@ here.
     ``kernel_impl.getsourcefile``, ``getsourcelines``, ``textwrap``, ``ast.parse``: ask for the same source at
     every call of a func; here once. Can go when Taichi keeps what it has read of a func.
     ``kernel_impl._inside_class``: searches all loaded modules for the source of a frame, for every decorator;
-    here the frame is asked. Can go when a decorator learns its class in another way.
+    here the frame is asked, from Taichi's import on (``first_import``). Can go when a decorator learns its
+    class in another way.
     ``impl.get_traceback``, ``snode.get_traceback``: a whole stack trace for every field; here one line. Can
     go when a field keeps no more than that.
     ``Kernel.materialize``: counts the kernels made, so that a stopwatch leaves their time out, and keeps
@@ -31,6 +32,11 @@ here.
     every launch: the same objects again go straight to the compiled kernel. Stands on ``compiled_kernels``,
     ``ensure_compiled``, ``compile_kernel`` and ``launch_kernel``. Can go when launching with arguments seen
     before costs a lookup.
+
+``uuvtai.native.numbers`` and ``uuvtai.native.reads``
+    ``as_arguments`` takes the place of ``transform_tree``, ``make_constant_expr`` and ``_infer_entry_dt``
+    while a kernel is read: numbers of the config become arguments. Can go when Taichi has arguments that
+    Python may reckon with beforehand.
 
 Elsewhere, by what Taichi publishes: ``kernels.core.signature.spread`` (its scheduler keeps short loops on one
 core), ``config.section.Section.__getattr__`` (what it asks of every argument), ``state.arrays`` (layouts by

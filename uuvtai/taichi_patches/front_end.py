@@ -21,6 +21,8 @@ from typing import Any
 from taichi.lang import impl, kernel_impl, snode
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
+from uuvtai.taichi_patches.first_import import inside_class
+
 
 def remember_sources() -> None:
     """Give this process's Taichi the memory; once is enough. A Taichi without these names is left as it
@@ -33,7 +35,7 @@ def remember_sources() -> None:
         if hasattr(kernel_impl, name) and not hasattr(getattr(kernel_impl, name), "__wrapped__"):
             setattr(kernel_impl, name, functools.cache(getattr(kernel_impl, name)))
     if hasattr(kernel_impl, "_inside_class"):
-        kernel_impl._inside_class = _inside_class  # type: ignore[attr-defined]
+        kernel_impl._inside_class = inside_class  # type: ignore[attr-defined]
     if getattr(kernel_impl, "textwrap", None) is textwrap:
         kernel_impl.textwrap = types.SimpleNamespace(
             fill=functools.cache(textwrap.fill), dedent=functools.cache(textwrap.dedent)
@@ -76,16 +78,6 @@ def _counted(materialize: Any) -> Any:
         return result
 
     return counted
-
-
-def _inside_class(level_of_class_stackframe: int) -> bool:
-    """Whether a decorator is at work in the body of a class; ``level_of_class_stackframe`` is the frame that
-    executes the class statement.
-
-    Taichi reads that frame's source and searches all loaded modules for it, for each of our funcs and kernels
-    when it is imported.
-    """
-    return "__qualname__" in sys._getframe(level_of_class_stackframe - 1).f_locals
 
 
 @functools.cache

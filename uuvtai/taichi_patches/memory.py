@@ -9,13 +9,16 @@ import ctypes
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import taichi as ti
-import torch
+from taichi.lang import impl
 
 from uuvtai.state import PACKET
+
+if TYPE_CHECKING:
+    import torch
 
 Put = Callable[[Any, np.ndarray], None]
 """Fills a field from an array of its shape (vectors add a last axis) and dtype."""
@@ -31,23 +34,57 @@ def put_by_kernel(field: Any, values: np.ndarray) -> None:
 
 @ti.kernel
 def _tell(field: ti.template(), out: ti.types.ndarray(dtype=ti.i64, ndim=1)):  # type: ignore[valid-type]
-    """out[0] = address in memory of the first element of a field of rank 1."""
-    out[0] = ti.cast(ti.get_addr(field, 0), ti.i64)
+    """out[0] = address in memory of the first element of a field of any rank."""
+    out[0] = ti.cast(ti.get_addr(field, ti.Vector([0 for _ in ti.static(range(len(field.shape)))])), ti.i64)
 
 
-def address_of(field: ti.Field, device: torch.device) -> int:
+def address_of(field: ti.Field, device: "torch.device") -> int:
     """Address of a field's first element, when all kernels are done."""
+    import torch
+
     address = torch.zeros(1, dtype=torch.int64, device=device)
     _tell(field, address)
     ti.sync()
     return int(address[0])
 
 
+class HostFields:
+    """Fields as NumPy sees them in the host's memory, without torch and with one kernel for each tree of
+    fields, wherever they were declared. CPU only."""
+
+    def __init__(self) -> None:
+        self._blocks: dict[int, np.ndarray] = {}
+        self._seen: dict[int, tuple[Any, np.ndarray | None]] = {}
+
+    def view(self, field: Any) -> np.ndarray | None:
+        """The field's memory as an array, vectors with a last axis; None where it is not in one piece."""
+        known = self._seen.get(id(field))
+        if known is None:  # the field is kept with its view, for an identity may be given again
+            impl.get_runtime().materialize()
+            known = self._seen[id(field)] = field, self._found(field)
+        return known[1]
+
+    def _found(self, field: Any) -> np.ndarray | None:
+        first, last = (field.vars[i].ptr.snode() for i in (0, -1))
+        apart = last.offset_bytes_in_parent_cell - first.offset_bytes_in_parent_cell
+        together = apart == (len(field.vars) - 1) * int(str(field.dtype)[1:]) // 8
+        if field.shape == () or not together or getattr(field, "m", 1) != 1:
+            return None
+        tree = first.get_snode_tree_id()
+        if tree not in self._blocks:
+            out = np.zeros(1, np.int64)
+            _tell(field, out)
+            size = _path(field)[-1].cell_size_bytes
+            begin = int(out[0]) - _offset(field)
+            self._blocks[tree] = np.ctypeslib.as_array((ctypes.c_uint8 * size).from_address(begin))
+        return _view(field, False, self._blocks[tree])
+
+
 class Memory:
     """The arrays of ``structs`` (a dataclass of them) as they lie in memory. Valid while the simulator lives;
     no kernel may be running."""
 
-    def __init__(self, structs: Any, anchor: Any, address: int, device: torch.device) -> None:
+    def __init__(self, structs: Any, anchor: Any, address: int, device: "torch.device") -> None:
         """``address`` is that of the first element of the field ``anchor``, from which all others are
         found."""
         root = _path(anchor)[-1]
@@ -90,6 +127,8 @@ class Memory:
     def write(self, content: np.ndarray) -> None:
         """Put back what ``read`` gave and what was changed in it."""
         if self.device.type != "cpu":
+            import torch
+
             self._on_device().copy_(torch.from_numpy(content))
 
     def rows(self, field: Any, rows: list[int] | slice) -> np.ndarray:
@@ -98,10 +137,19 @@ class Memory:
 
         Nothing is compiled and nothing launched, so that a step can be looked at as often as one likes.
         """
+        view = self.live(field)
+        return view[rows].copy() if isinstance(rows, slice) else view[np.asarray(rows, np.intp)]
+
+    def live(self, field: Any) -> np.ndarray:
+        """A field as it lies in memory, shape of ``state``, vectors with a last axis. CPU only."""
         known = self._looked_at.get(id(field))
         if known is None:  # the field is kept with its view, for an identity may be given again
             known = self._looked_at[id(field)] = field, _view(field, False, self.read())
-        return known[1][rows].copy() if isinstance(rows, slice) else known[1][np.asarray(rows, np.intp)]
+        return known[1]
+
+    def number(self, field: Any) -> int:
+        """The one number of a field without axes."""
+        return int(self.live(field) if self.device.type == "cpu" else field[None])
 
     def put(self, field: Any, values: np.ndarray) -> None:
         """Fill a field that is not in lanes; ``values`` has its shape (vectors add a last axis) and dtype."""
@@ -115,7 +163,9 @@ class Memory:
         else:
             put_by_kernel(field, values)
 
-    def _on_device(self) -> torch.Tensor:
+    def _on_device(self) -> "torch.Tensor":
+        import torch
+
         interface = {"shape": (self.n_bytes,), "typestr": "|u1", "data": (self.address, False), "version": 3}
         return torch.as_tensor(
             type("Bytes", (), {"__cuda_array_interface__": interface})(), device=self.device

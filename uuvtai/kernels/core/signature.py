@@ -51,9 +51,10 @@ _BLOCKS = 16
 """Blocks wanted per loop, so that two to sixteen cores share unequal work evenly."""
 
 
-def spread(n_env: int) -> int:
-    """Loop items per env that make ``ti.ndrange(n_env, spread(n_env))`` fill every core; use only the items
-    with ``pad == 0``. One on a GPU, where an idle item is an idle thread."""
-    if is_gpu_shaped():
+def spread(n_env: int, inner: int = 1) -> int:
+    """Loop items per env (and ``inner`` index) that make ``ti.ndrange(n_env, inner, spread(n_env, inner))``
+    fill every core; use only the items with ``pad == 0``. One on a GPU, where an idle item is an idle thread,
+    and for one env, which has one thread: idle items were a third of its step."""
+    if is_gpu_shaped() or n_env == 1:
         return 1
-    return max(1, min(_CPU_BLOCK, -(-_CPU_BLOCK * _BLOCKS // n_env)))
+    return max(1, min(_CPU_BLOCK, -(-_CPU_BLOCK * _BLOCKS // (n_env * inner))))

@@ -185,7 +185,7 @@ def bound_heights(io: Bundle[HeightsIO]):
     with the vehicle, and for tracks that do not move.
     """
     n, n_track = ti.static(io.tracks.alive.shape[0], io.tracks.alive.shape[1])
-    for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n * n_track))):
+    for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n, n_track))):
         if pad == 0 and io.clock.awake[env] == 1:
             own_z = io.ego.pos_w[env][2]
             above, below = own_z, own_z

@@ -57,7 +57,7 @@ def forecast_tracks(io: Bundle[ForecastIO]):
     """
     n = ti.static(io.clock.awake.shape[0])
     n_track = ti.static(io.tracks.alive.shape[1])
-    for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n * n_track))):
+    for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n, n_track))):
         if pad == 0 and io.clock.awake[env] == 1:
             changed = (
                 io.clusters.fresh[env] + io.image.fresh[env] > 0

@@ -64,7 +64,7 @@ _TOUCH_M = 0.3
 def weigh_futures(io: Bundle[FuturesIO]):
     """In decision steps: the futures of every track that goes straight. The others have none."""
     n, n_track = ti.static(io.tracks.alive.shape[0], io.tracks.alive.shape[1])
-    for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n * n_track))):
+    for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n, n_track))):
         due = io.clock.step[env] % ti.static(io.teacher_cfg.decide_period_steps) == 0
         if pad == 0 and due and io.clock.awake[env] == 1:
             io.futures.corner[env, track] = 0.0

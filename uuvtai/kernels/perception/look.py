@@ -42,7 +42,7 @@ _PAST = 2
 def look_at_bodies(io: Bundle[LookIO]):
     """Weigh the heights of every moving track in the view of a fresh image."""
     n, n_track = ti.static(io.tracks.alive.shape[0], io.tracks.alive.shape[1])
-    for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n * n_track))):
+    for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n, n_track))):
         if (
             pad == 0
             and io.clock.awake[env] == 1

@@ -22,7 +22,7 @@ def mix_futures(io: Bundle[MixtureIO]):
     """In decision steps: the likeliest future of every track that has a forecast becomes its forecast, the
     others are its futures, with their probabilities."""
     n, n_track = ti.static(io.clock.awake.shape[0], io.forecast.radius_m.shape[1])
-    for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n * n_track))):
+    for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n, n_track))):
         due = io.clock.step[env] % ti.static(io.teacher_cfg.decide_period_steps) == 0
         if pad == 0 and due and io.clock.awake[env] == 1:
             if io.forecast.radius_m[env, track, 0] >= 0:

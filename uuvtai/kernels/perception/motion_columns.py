@@ -38,7 +38,7 @@ _BACK_COS = -0.9
 def reset_past(io: Bundle[PastIO]):
     """Remember nothing in the awake rows."""
     n, n_track = ti.static(io.clock.awake.shape[0], io.tracks.alive.shape[1])
-    for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n * n_track))):
+    for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n, n_track))):
         if pad == 0 and io.clock.awake[env] == 1:
             _forget(env, track, io)
             for i in range(io.mixture.frame.shape[2]):
@@ -55,7 +55,7 @@ def reset_past(io: Bundle[PastIO]):
 def remember_past(io: Bundle[PastIO]):
     """After each tracked scan: where the tracks are, and where they turned. A new track remembers nothing."""
     n, n_track = ti.static(io.clock.awake.shape[0], io.tracks.alive.shape[1])
-    for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n * n_track))):
+    for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n, n_track))):
         if pad == 0 and io.clock.awake[env] == 1 and io.clusters.fresh[env] == 1:
             if io.tracks.alive[env, track] == 0 or io.tracks.age[env, track] == 0:
                 _forget(env, track, io)
@@ -69,7 +69,7 @@ def remember_past(io: Bundle[PastIO]):
 def describe_motion(io: Bundle[PastIO]):
     """In decision steps: the columns of every track that has a forecast."""
     n, n_track = ti.static(io.clock.awake.shape[0], io.tracks.alive.shape[1])
-    for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n * n_track))):
+    for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n, n_track))):
         due = io.clock.step[env] % ti.static(io.teacher_cfg.decide_period_steps) == 0
         if pad == 0 and due and io.clock.awake[env] == 1 and io.forecast.radius_m[env, track, 0] >= 0:
             mean, place = io.tracks.state[env, track], io.forecast.pos_w[env, track, 0]

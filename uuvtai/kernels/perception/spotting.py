@@ -41,7 +41,7 @@ def scan_columns(io: Bundle[SpottingIO]):
     """Horizontal distance of the nearest thing in every column of a fresh image, FAR_M = none within range,
     height band and walls."""
     n, n_packet = ti.static(io.clock.awake.shape[0], io.depth_cfg.cols // LANES)
-    for env, packet, pad in ti.ndrange(n, n_packet, ti.static(spread(n * n_packet))):
+    for env, packet, pad in ti.ndrange(n, n_packet, ti.static(spread(n, n_packet))):
         if pad == 0 and io.clock.awake[env] == 1 and io.image.fresh[env] == 1:
             near, edge = column_distances(env, packet * LANES, io)
             for i in ti.static(range(LANES)):

@@ -119,6 +119,7 @@ class TriggersIO:
     mission: In[MissionState]
     scan: In[SonarScan]
     tracks: In[TrackState]
+    clearance_cfg: Const[ClearanceConfig]
     episode_cfg: Const[EpisodeConfig]
     mapping_cfg: Const[MappingConfig]
     route_cfg: Const[RouteConfig]

@@ -26,7 +26,7 @@ import math
 
 import taichi as ti
 
-from uuvtai.kernels.core.bits import WORD, highest_bit, lowest_bit, put_bit, without_lowest
+from uuvtai.kernels.core.bits import WORD, cell_bit, highest_bit, lowest_bit, put_bit, without_lowest
 from uuvtai.kernels.core.lanes import LANES, i16x
 from uuvtai.kernels.core.signature import Bundle, Const, In, spread
 from uuvtai.kernels.planning.bundles import ClearanceIO
@@ -132,6 +132,17 @@ def next_site(env, row, first_col, io: Bundle[ClearanceIO]):
 
 
 @ti.func
+def site_before(env, row, col, io: Bundle[ClearanceIO]):
+    """Column of the last site before a column, far away if there is none."""
+    word = col // WORD
+    found = io.clearance_memory.sites[env, row, word] & (cell_bit(col) - ti.cast(1, ti.u64))
+    while found == 0 and word > 0:
+        word -= 1
+        found = io.clearance_memory.sites[env, row, word]
+    return ti.select(found != 0, word * WORD + highest_bit(found), -_FAR_COLS)
+
+
+@ti.func
 def row_keys(sites, left_gap, right_gap, io: Bundle[ClearanceIO]):
     """Keys of the nearest site in the same row for sixteen cells; gaps [cells] lie between their ends and the
     sites beyond."""
@@ -139,13 +150,17 @@ def row_keys(sites, left_gap, right_gap, io: Bundle[ClearanceIO]):
         window_reach(io.clearance_cfg, io.mapping_cfg), offset_bits(io.clearance_cfg, io.mapping_cfg)
     )
     to_left, to_right = i16x(0), i16x(0)
-    left, right = left_gap - 1, right_gap - 1
-    for i in ti.static(range(LANES)):
-        left = ti.select((sites >> i) & 1 == 1, 0, left + 1)
-        to_left[i] = left
-    for back in ti.static(range(LANES)):
-        right = ti.select((sites >> (LANES - 1 - back)) & 1 == 1, 0, right + 1)
-        to_right[LANES - 1 - back] = right
+    if sites == 0:
+        for i in ti.static(range(LANES)):
+            to_left[i], to_right[i] = left_gap + i, right_gap + (LANES - 1 - i)
+    else:
+        left, right = left_gap - 1, right_gap - 1
+        for i in ti.static(range(LANES)):
+            left = ti.select((sites >> i) & 1 == 1, 0, left + 1)
+            to_left[i] = left
+        for back in ti.static(range(LANES)):
+            right = ti.select((sites >> (LANES - 1 - back)) & 1 == 1, 0, right + 1)
+            to_right[LANES - 1 - back] = right
     keys = i16x(0)
     for i in ti.static(range(LANES)):
         gap = ti.min(to_left[i], to_right[i])
@@ -155,29 +170,39 @@ def row_keys(sites, left_gap, right_gap, io: Bundle[ClearanceIO]):
 
 
 @ti.func
-def scan_row(env, slot, row, io: Bundle[ClearanceIO]):
-    """Keys of the nearest site in the same row, and which packets have one in reach."""
-    n_row, n_packet = ti.static(io.clearance_memory.farthest.shape[1:])
-    reach = ti.static(window_reach(io.clearance_cfg, io.mapping_cfg))
-    last = -_FAR_COLS
-    for packet in range(n_packet):
-        first = packet * LANES
-        sites = ti.cast(
-            (io.clearance_memory.sites[env, row, first // WORD] >> ti.cast(first % WORD, ti.u64))
-            & ti.cast(0xFFFF, ti.u64),
-            ti.i32,
+def scan_packet(env, slot, row, packet, io: Bundle[ClearanceIO]):
+    """Keys of the nearest site in the same row for sixteen cells, and whether one is in reach."""
+    n_row, first = ti.static(io.clearance_memory.farthest.shape[1]), packet * LANES
+    sites = ti.cast(
+        (io.clearance_memory.sites[env, row, first // WORD] >> ti.cast(first % WORD, ti.u64))
+        & ti.cast(0xFFFF, ti.u64),
+        ti.i32,
+    )
+    left_gap = first - site_before(env, row, first, io)
+    right_gap = next_site(env, row, first + LANES, io) - (first + LANES - 1)
+    near = ti.min(left_gap, right_gap) <= ti.static(window_reach(io.clearance_cfg, io.mapping_cfg))
+    if sites != 0 or near:
+        io.clearance_memory.row_key[slot, row, packet] = row_keys(sites, left_gap, right_gap, io)
+        put_bit(io.clearance_memory.near_up, slot, packet, row)
+        put_bit(io.clearance_memory.near_down, slot, packet, n_row - 1 - row)
+    else:
+        io.clearance_memory.row_key[slot, row, packet] = i16x(
+            ti.static(no_site(io.clearance_cfg, io.mapping_cfg))
         )
-        left_gap, right_gap = first - last, next_site(env, row, first + LANES, io) - (first + LANES - 1)
-        if sites != 0 or ti.min(left_gap, right_gap) <= reach:
-            io.clearance_memory.row_key[slot, row, packet] = row_keys(sites, left_gap, right_gap, io)
-            put_bit(io.clearance_memory.near_up, slot, packet, row)
-            put_bit(io.clearance_memory.near_down, slot, packet, n_row - 1 - row)
-        else:
-            io.clearance_memory.row_key[slot, row, packet] = i16x(
-                ti.static(no_site(io.clearance_cfg, io.mapping_cfg))
-            )
-        if sites != 0:
-            last = first + highest_bit(ti.cast(sites, ti.u64))
+
+
+@ti.func
+def stale_rows(slot, packet, changed, io: Bundle[ClearanceIO]):
+    """(first, last) row of a packet that is to be redone; first > last where none is."""
+    n_row = ti.static(io.clearance_memory.farthest.shape[1])
+    first, last = n_row, -1
+    for word in range(ti.static(io.clearance_memory.stale.shape[2])):
+        rows = io.clearance_memory.stale[slot, packet, word]
+        if rows != 0:
+            first, last = ti.min(first, word * WORD + lowest_bit(rows)), word * WORD + highest_bit(rows)
+    if changed > _MAX_CHANGES:
+        first, last = 0, n_row - 1
+    return first, last
 
 
 @ti.func
@@ -284,25 +309,34 @@ def shorten(env, row, packet, io: Bundle[ClearanceIO]):
 
 @ti.func
 def transform(env, slot, changed, io: Bundle[ClearanceIO]):
-    """Both passes for an env, over everything or over what is stale; the marks are used up."""
+    """Both passes for an env, over everything or over what is stale and the rows in its reach; the marks are
+    used up."""
     n_row, n_packet = ti.static(io.clearance_memory.farthest.shape[1:])
+    reach = ti.static(window_reach(io.clearance_cfg, io.mapping_cfg))
     for packet in range(n_packet):
         for word in range(ti.static(io.clearance_memory.near_up.shape[2])):
             io.clearance_memory.near_up[slot, packet, word] = ti.cast(0, ti.u64)
             io.clearance_memory.near_down[slot, packet, word] = ti.cast(0, ti.u64)
-    for row in range(n_row):
-        scan_row(env, slot, row, io)
-    for packet in range(n_packet):
-        for word in range(ti.static(io.clearance_memory.stale.shape[2])):
-            rows = ti.select(
-                changed > _MAX_CHANGES, ~ti.cast(0, ti.u64), io.clearance_memory.stale[slot, packet, word]
-            )
-            io.clearance_memory.stale[slot, packet, word] = ti.cast(0, ti.u64)
-            while rows != 0:
-                row = word * WORD + lowest_bit(rows)
-                rows = without_lowest(rows)
-                if row < n_row:
-                    write_packet(env, slot, row, packet, io)
+        first, last = stale_rows(slot, packet, changed, io)
+        if first <= last:
+            for row in range(ti.max(first - reach, 0), ti.min(last + reach + 1, n_row)):
+                scan_packet(env, slot, row, packet, io)
+            redo_packets(env, slot, packet, changed, io)
+
+
+@ti.func
+def redo_packets(env, slot, packet, changed, io: Bundle[ClearanceIO]):
+    """The second pass for the stale rows of a packet's columns."""
+    for word in range(ti.static(io.clearance_memory.stale.shape[2])):
+        rows = ti.select(
+            changed > _MAX_CHANGES, ~ti.cast(0, ti.u64), io.clearance_memory.stale[slot, packet, word]
+        )
+        io.clearance_memory.stale[slot, packet, word] = ti.cast(0, ti.u64)
+        while rows != 0:
+            row = word * WORD + lowest_bit(rows)
+            rows = without_lowest(rows)
+            if row < ti.static(io.clearance_memory.farthest.shape[1]):
+                write_packet(env, slot, row, packet, io)
 
 
 @ti.func

@@ -91,6 +91,11 @@ def _average_row(env, row, io: Bundle[ExposureIO]):
 # ---------------------------------------------------------------------------------------------------- reading
 
 
+def is_dear(quiet_cfg):
+    """Whether any water is dearer than other; plain Python."""
+    return quiet_cfg.weight_prior > 0 or quiet_cfg.weight_seen > 0
+
+
 @ti.func
 def dearness(env, row, col, io: Bundle[VoronoiIO]):
     """Factor >= 1 by which a metre in a cell is dearer than in quiet water."""

@@ -4,10 +4,10 @@ what lies ahead."""
 import taichi as ti
 
 from uuvtai.kernels.core.geometry import wrapped_angle
-from uuvtai.kernels.core.grid import cell_of
 from uuvtai.kernels.core.signature import Bundle, FloatMatrix, spread
 from uuvtai.kernels.planning.along import foot_of, left_of_foot, level, look_along, point_left, segment_of
 from uuvtai.kernels.planning.bundles import RouteIO
+from uuvtai.kernels.planning.path_risk import cell_on_grid, risk_at
 from uuvtai.kernels.planning.polyline import MAX_WIDENINGS, WIDENING, count_after_segment, install_route
 from uuvtai.native.launch import quick_launch
 from uuvtai.plan_codes import N_PLANNER, N_REASON, N_TRIGGER
@@ -68,15 +68,23 @@ def follow_route(io: Bundle[RouteIO]):
     n = ti.static(io.clock.awake.shape[0])
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
         if pad == 0 and io.clock.awake[env] == 1:
-            look_along(io.route, env, level(io.ego.pos_w[env]), io.route_cfg, io.mapping_cfg)
+            if io.route.want_plan[env] == 1:  # else ``fire_triggers`` has just looked along the same route
+                _look_again(env, io)
             if io.route.n_way[env] > 0:
                 _aim(env, io)
             else:
                 _hover(env, io)
-            risk = 0.0
-            for k in range(io.route.n_ahead[env]):
-                risk += _risk(env, io.route.ahead_w[env, k], io)
-            io.route.path_risk[env] = risk / io.route.n_ahead[env]
+
+
+@ti.func
+def _look_again(env, io: Bundle[RouteIO]):
+    """What lies ahead on a route planned since, and its mean risk."""
+    look_along(io.route, env, level(io.ego.pos_w[env]), io.route_cfg, io.mapping_cfg)
+    risk = 0.0
+    for k in range(io.route.n_ahead[env]):
+        cell = cell_on_grid(io.route.ahead_w[env, k], io.clearance, io.tank_cfg, io.mapping_cfg)
+        risk += risk_at(env, cell, io.clearance, io.grid_map, io.clearance_cfg)
+    io.route.path_risk[env] = risk / io.route.n_ahead[env]
 
 
 @ti.func
@@ -110,24 +118,6 @@ def _hover(env, io: Bundle[RouteIO]):
     io.route.heading_error[env] = 0.0
     io.route.cross_track_m[env] = 0.0
     io.route.remaining_m[env] = level(io.mission.goal_w[env] - io.ego.pos_w[env]).norm()
-
-
-@ti.func
-def _cell_on_grid(pos_w, io: Bundle[RouteIO]):
-    """(row, col), off-grid positions held at the edge."""
-    cell = cell_of(pos_w, io.tank_cfg, io.mapping_cfg.cell_m)
-    n_row, n_col = ti.static(io.clearance.clearance_m.shape[1:])
-    return ti.Vector([ti.math.clamp(cell[0], 0, n_row - 1), ti.math.clamp(cell[1], 0, n_col - 1)])
-
-
-@ti.func
-def _risk(env, pos_w, io: Bundle[RouteIO]):
-    """The paper's risk R: alpha_m M^s + alpha_d M^d + alpha_delta / (clearance + eps)."""
-    cell = _cell_on_grid(pos_w, io)
-    occupied = ti.static(io.clearance_cfg.risk_static) * io.grid_map.static_occ[env, cell[0], cell[1]]
-    moving = ti.static(io.clearance_cfg.risk_dynamic) * io.grid_map.dynamic_occ[env, cell[0], cell[1]]
-    room = io.clearance.clearance_m[env, cell[0], cell[1]] + ti.static(io.clearance_cfg.risk_epsilon_m)
-    return occupied + moving + ti.static(io.clearance_cfg.risk_clearance) / room
 
 
 @ti.kernel
@@ -167,7 +157,7 @@ def _route_cost(env, n_way, io: Bundle[RouteIO]):
         a, along = io.route.way_w[env, i], io.route.way_w[env, i + 1] - io.route.way_w[env, i]
         pieces = ti.cast(ti.ceil(along.norm() / ti.static(0.5 * io.mapping_cfg.cell_m)), ti.i32)
         for k in range(pieces):  # type: ignore[arg-type]
-            cell = _cell_on_grid(a + along * ((k + 0.5) / pieces), io)
+            cell = cell_on_grid(a + along * ((k + 0.5) / pieces), io.clearance, io.tank_cfg, io.mapping_cfg)
             room = ti.max(
                 io.clearance.clearance_m[env, cell[0], cell[1]], ti.static(io.voronoi_cfg.cost_epsilon_m)
             )

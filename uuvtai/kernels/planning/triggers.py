@@ -11,12 +11,12 @@ them is counted per replan.
 
 import taichi as ti
 
-from uuvtai.kernels.core.grid import cell_of
 from uuvtai.kernels.core.lanes import LANES, i16x
 from uuvtai.kernels.core.signature import Bundle, spread
 from uuvtai.kernels.perception.range_rate import range_rate
 from uuvtai.kernels.planning.along import advanced_arc, level, look_along
 from uuvtai.kernels.planning.bundles import TriggersIO
+from uuvtai.kernels.planning.path_risk import cell_on_grid, risk_at
 from uuvtai.kernels.planning.traversable import is_traversable
 from uuvtai.native.launch import quick_launch
 from uuvtai.plan_codes import (
@@ -33,8 +33,8 @@ from uuvtai.plan_codes import (
 @quick_launch
 @ti.kernel
 def fire_triggers(io: Bundle[TriggersIO]):
-    """Move the foot along the route, find the triggers that hold, and queue the envs that plan in this step,
-    in any order."""
+    """Move the foot along the route, look along it, find the triggers that hold, and queue the envs that plan
+    in this step, in any order."""
     n = ti.static(io.clock.awake.shape[0])
     io.route.n_queue[None] = 0
     for env, pad in ti.ndrange(n, ti.static(spread(n))):
@@ -43,7 +43,8 @@ def fire_triggers(io: Bundle[TriggersIO]):
                 io.route.arc[env] = advanced_arc(io.route, env, level(io.ego.pos_w[env]), io.route_cfg)
             look_along(io.route, env, level(io.ego.pos_w[env]), io.route_cfg, io.mapping_cfg)
             _count_stuck(env, io)
-            holding = _held_triggers(env, io)
+            closed = _is_path_closed(env, io)
+            holding = _held_triggers(env, closed, io)
             _serve(env, holding, io)
             if io.route.want_plan[env] == 1:
                 io.route.queue[ti.atomic_add(io.route.n_queue[None], 1)] = env
@@ -57,8 +58,8 @@ def _count_stuck(env, io: Bundle[TriggersIO]):
 
 
 @ti.func
-def _held_triggers(env, io: Bundle[TriggersIO]):
-    """Bit set (bit = code - 1) of the triggers that hold and are not resting."""
+def _held_triggers(env, closed, io: Bundle[TriggersIO]):
+    """Bit set (bit = code - 1) of the triggers that hold and are not resting; ``closed``: the path is."""
     dt = ti.static(io.episode_cfg.control_dt_s)
     bits = 0
     for trigger in ti.static(range(TRIGGER_INITIAL, N_TRIGGER + 1)):
@@ -75,9 +76,7 @@ def _held_triggers(env, io: Bundle[TriggersIO]):
             elif ti.static(trigger == TRIGGER_SAFETY):
                 holds = _is_return_near(env, io)
             elif ti.static(trigger == TRIGGER_INTERSECTION):
-                holds = io.route.n_way[env] > 0 and (
-                    _path_is_closed(env, io) or _path_meets_forecast(env, io)
-                )
+                holds = io.route.n_way[env] > 0 and (closed or _path_meets_forecast(env, io))
         bits |= ti.select(holds, 1 << (trigger - 1), 0)
     return bits
 
@@ -102,17 +101,18 @@ def _is_return_near(env, io: Bundle[TriggersIO]):
 
 
 @ti.func
-def _path_is_closed(env, io: Bundle[TriggersIO]):
-    """True where a point of the look-ahead segment lies in a cell that is not traversable."""
-    closed = False
+def _is_path_closed(env, io: Bundle[TriggersIO]):
+    """True where a point of the look-ahead segment lies in a cell that is not traversable; the segment's mean
+    risk on the way, for the same cells hold both."""
+    closed, risk = False, 0.0
     for k in range(io.route.n_ahead[env]):
-        cell = cell_of(io.route.ahead_w[env, k], io.tank_cfg, io.mapping_cfg.cell_m)
-        row = ti.math.clamp(cell[0], 0, ti.static(io.mask.outside.shape[0] - 1))
-        col = ti.math.clamp(cell[1], 0, ti.static(io.mask.outside.shape[1] - 1))
+        cell = cell_on_grid(io.route.ahead_w[env, k], io.clearance, io.tank_cfg, io.mapping_cfg)
         if not is_traversable(
-            io.clearance, io.grid_map, io.mask, env, row, col, io.voronoi_cfg, io.mapping_cfg
+            io.clearance, io.grid_map, io.mask, env, cell[0], cell[1], io.voronoi_cfg, io.mapping_cfg
         ):
             closed = True
+        risk += risk_at(env, cell, io.clearance, io.grid_map, io.clearance_cfg)
+    io.route.path_risk[env] = risk / io.route.n_ahead[env]
     return closed
 
 

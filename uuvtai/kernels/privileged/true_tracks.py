@@ -40,7 +40,7 @@ def know_bodies(io: Bundle[TrueTracksIO]):
     """One track for every moving body, in the order of the bodies; the nearest bodies where the tracks are
     too few."""
     n, n_track = ti.static(io.tracks.alive.shape)
-    for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n * n_track))):
+    for env, track, pad in ti.ndrange(n, n_track, ti.static(spread(n, n_track))):
         if pad == 0 and io.clock.awake[env] == 1:
             io.clusters.fresh[env] = 1  # tracks have changed: habits and forecasts are to be worked out anew
             io.tracks.scan_step[env] = io.clock.step[env]
@@ -131,7 +131,7 @@ def name_beams_truly(io: Bundle[TrueTracksIO]):
     """Every return of a fresh scan within ``_NAMED_M`` of a body's outline, where it was at the ping, belongs
     to the nearest such body."""
     n, n_ray = ti.static(io.tracks.beam_track.shape)
-    for env, ray, pad in ti.ndrange(n, n_ray, ti.static(spread(n * n_ray))):
+    for env, ray, pad in ti.ndrange(n, n_ray, ti.static(spread(n, n_ray))):
         if pad == 0 and io.clock.awake[env] == 1 and io.scan.fresh[env] == 1:
             ago = (io.clock.step[env] - io.scan.ping_step[env]) * io.episode_cfg.control_dt_s
             bearing = (io.scan.ping_yaw[env] + ti.static(io.sonar_cfg.first_beam_rad)) + ray * ti.static(

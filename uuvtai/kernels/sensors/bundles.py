@@ -12,6 +12,7 @@ from uuvtai.state import (
     EpisodeState,
     Proprioception,
     ProprioceptionMemory,
+    SonarImage,
     SonarMemory,
     SonarScan,
     VehicleState,
@@ -53,6 +54,7 @@ class SonarIO:
 
     scan: Out[SonarScan]
     sonar_memory: Out[SonarMemory]
+    sonar_image: Out[SonarImage]
     clock: In[ClockState]
     ego: In[Proprioception]
     episode: In[EpisodeState]

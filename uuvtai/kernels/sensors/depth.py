@@ -45,7 +45,7 @@ CameraPose = ti.types.struct(pos=ti.math.vec3, R_wb=ti.math.mat3)
 def reset_depth(io: Bundle[DepthIO]):
     """Forget the image of the awake rows (the shot of step 0 fills it)."""
     n, n_row, n_col = ti.static(io.image.depth_m.shape)
-    for env, row, pad in ti.ndrange(n, n_row, ti.static(spread(n * n_row))):
+    for env, row, pad in ti.ndrange(n, n_row, ti.static(spread(n, n_row))):
         if pad == 0 and io.clock.awake[env] == 1:
             for col in range(n_col):
                 io.image.depth_m[env, row, col] = 0.0
@@ -63,7 +63,7 @@ def cast_depth(io: Bundle[DepthIO]):
     n = ti.static(io.clock.awake.shape[0])
     block_rows = ti.static(rows_per_item())
     n_block = ti.static(-(-io.depth_cfg.rows // block_rows))
-    for env, block, pad in ti.ndrange(n, n_block, ti.static(spread(n * n_block))):
+    for env, block, pad in ti.ndrange(n, n_block, ti.static(spread(n, n_block))):
         if pad == 0 and io.clock.awake[env] == 1:
             due = io.clock.step[env] % io.depth_cfg.period_steps == 0
             if block == 0:

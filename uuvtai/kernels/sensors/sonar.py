@@ -16,6 +16,7 @@ from uuvtai.kernels.core.geometry import FAR_M, rotation_wb
 from uuvtai.kernels.core.lanes import LANES, filled
 from uuvtai.kernels.core.signature import Bundle, Const, spread
 from uuvtai.kernels.sensors.bundles import SonarIO
+from uuvtai.kernels.sensors.cfar import detected
 from uuvtai.kernels.sensors.raycast import nearest_echo, place_bodies
 from uuvtai.kernels.sensors.sonar_error import (
     cloud_covered,
@@ -99,7 +100,7 @@ def cast_sonar(io: Bundle[SonarIO]):
             place_sonar(env, io)
             if ti.static(io.sonar_cfg.bubble_clouds_per_s > 0):
                 start_cloud(env, io)
-    for env, part, pad in ti.ndrange(n, n_part, ti.static(spread(n * n_part))):
+    for env, part, pad in ti.ndrange(n, n_part, ti.static(spread(n, n_part))):
         if pad == 0 and io.clock.awake[env] == 1:
             step = io.clock.step[env]
             if step % io.sonar_cfg.period_steps == 0:
@@ -205,11 +206,17 @@ def deliver(env, first, step, io: Bundle[SonarIO]):
 def measured(env, ray, step, io: Bundle[SonarIO]):
     """(range, Doppler, intensity) of the beams from ``ray`` on as the sensor reports them; range FAR_M =
     no return."""
-    mount, packet = sonar_mount(env, io), ray // LANES
-    ux, uy = beam_directions(ray, mount.heading, io)
-    wedge = packet_wedge(packet, mount.heading, io)
-    echo = nearest_echo(env, mount.pos[0], mount.pos[1], ux, uy, 0.0, wedge, True, io)
-    return reported(env, echo, ux, uy, mount, wedge, ray, step, io)
+    range_m = filled(FAR_M, ti.static(n_beam()))
+    doppler, intensity = filled(0.0, ti.static(n_beam())), filled(0.0, ti.static(n_beam()))
+    if ti.static(io.sonar_cfg.detector != "none"):
+        range_m, intensity = detected(env, ray, ti.static(n_beam()), io)
+    else:
+        mount, packet = sonar_mount(env, io), ray // LANES
+        ux, uy = beam_directions(ray, mount.heading, io)
+        wedge = packet_wedge(packet, mount.heading, io)
+        echo = nearest_echo(env, mount.pos[0], mount.pos[1], ux, uy, 0.0, wedge, True, io)
+        range_m, doppler, intensity = reported(env, echo, ux, uy, mount, wedge, ray, step, io)
+    return range_m, doppler, intensity
 
 
 @ti.func

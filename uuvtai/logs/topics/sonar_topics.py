@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from uuvtai.config import SonarConfig
 from uuvtai.logs.encode import IDENTITY, numbers
 from uuvtai.logs.fan_image import echo_power, heard_image, shown_image
 from uuvtai.logs.moment import Moment
@@ -88,16 +89,25 @@ def _read_scan(data: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def _image(moment: Moment) -> bytes:
-    """8-bit PNG. The speckle is a function of the episode and the step."""
-    sonar, scenario = moment.header.config.sensors.sonar, moment.header.scenario
+    """8-bit PNG."""
+    sonar = moment.header.config.sensors.sonar
+    shown = shown_image(_heard(moment, sonar), sonar)
+    png = base64.b64encode(cv2.imencode(".png", shown)[1].tobytes()).decode()
+    return f'{{"timestamp":{moment.stamp},"frame_id":"sonar","data":"{png}","format":"png"}}'.encode()
+
+
+def _heard(moment: Moment, sonar_cfg: SonarConfig) -> np.ndarray:
+    """(n_ray, n_bin) power that the beams hear: where ranges are detected in it, that of the ping; else made
+    for the log, with speckle that is a function of the episode and the step."""
+    if sonar_cfg.detector != "none":
+        return np.asarray(moment["sonar_image.heard"], float)[: sonar_cfg.n_ray, : sonar_cfg.image_bins]
+    scenario = moment.header.scenario
     w, x, y, z = (float(part) for part in moment["vehicle.quat_wb"])
     yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     place = np.asarray(moment["vehicle.pos_w"], float)
-    bearing, power = echo_power(scenario, moment.time_s, place, yaw, sonar, sonar.image_bins)
+    bearing, power = echo_power(scenario, moment.time_s, place, yaw, sonar_cfg, sonar_cfg.image_bins)
     random = np.random.default_rng((scenario["seed"], scenario["episode"], moment.step))
-    shown = shown_image(heard_image(bearing, power, sonar, random), bearing, sonar)
-    png = base64.b64encode(cv2.imencode(".png", shown)[1].tobytes()).decode()
-    return f'{{"timestamp":{moment.stamp},"frame_id":"sonar","data":"{png}","format":"png"}}'.encode()
+    return heard_image(bearing, power, sonar_cfg, random)
 
 
 ROWS = (
@@ -128,8 +138,9 @@ ROWS = (
         SONAR_IMAGES,
         _IMAGE,
         _image,
-        ("vehicle.pos_w", "vehicle.quat_wb"),
+        ("vehicle.pos_w", "vehicle.quat_wb", "sonar_image.heard"),
         logged_image,
+        in_picture=True,
         on_request=True,
     ),
 )

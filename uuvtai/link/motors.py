@@ -64,7 +64,7 @@ class Motors:
         self._scale = vehicle_cfg.top_rpm / -_SPEED_OF_PULSE[0, 1]
         self._most = vehicle_cfg.top_rpm
 
-    def rpm(self, pwm: Sequence[int]) -> np.ndarray:
+    def rpm(self, pwm: Sequence[float]) -> np.ndarray:
         """(thrusters,) speed that is commanded. A channel that is off (0) stands still."""
         pulse = np.array(pwm, float)[self.channel]
         off = np.clip(pulse - NEUTRAL_US, -SPAN_US, SPAN_US)

@@ -1,0 +1,55 @@
+"""The small simulator that serves every test of the whole stack: its kernels are compiled once
+(``tests/warm.py`` does so before the tests begin)."""
+
+import torch
+
+
+class SmallSim:
+    """A simulator whose kernels are compiled once for the session, and what tests do with it."""
+
+    N = 8
+    CHANGES = {"world.dynamic_capacity": 9}
+    OPTIONS = ("--num-envs", "8", "--set", "world.dynamic_capacity=9", "--device", "cpu")
+    """of commands in processes of their own that are to find these kernels compiled (``tests/warm.py``
+    compiles them beforehand)"""
+    TRAIN = (
+        "train",
+        "smoke",
+        *OPTIONS,
+        "--set",
+        "episode.horizon_steps=400",
+        "--set",
+        "distill.batch=32",
+        "--set",
+        "world_model.batch=32",
+    )
+
+    def __init__(self, sensors="paper"):
+        from uuvtai.loader import load_config
+        from uuvtai.sim import Sim
+        from uuvtai.tree import read_tree
+
+        self.config = load_config("pool", sensors, overrides=self.CHANGES)
+        self.trees = {name: read_tree(name) for name in ("straight", "planner", "bt")}
+        self.sim = Sim(self.config, self.N, self.trees["bt"])
+        self.new = self.sim.memory().read().copy()
+
+    def forget(self):
+        """As it was built."""
+        self.sim.memory().read()[:] = self.new
+        self.sim.tree, self.sim.observation = self.trees["bt"], None
+
+    def begin(self, episodes, seed=0, rows=None):
+        """Reset ``rows`` (default: the first ones) to these episode numbers."""
+        rows = list(range(len(episodes))) if rows is None else rows
+        mask, seeds, numbers = (torch.zeros(self.N, dtype=torch.int32) for _ in range(3))
+        for row, number in zip(rows, episodes, strict=True):
+            mask[row], seeds[row], numbers[row] = 1, seed, number
+        self.sim.reset(mask, seeds, numbers)
+
+    def arrays(self, *nouns):
+        """NumPy copies of every array of these structs but scratch, which keeps what earlier tests left in
+        it, by 'struct.field'."""
+        memory = self.sim.memory()
+        views = memory.views(memory.read())
+        return {name: view.copy() for name, view in views.items() if name.partition(".")[0] in nouns}

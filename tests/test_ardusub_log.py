@@ -1,0 +1,206 @@
+"""ArduSub's logs as drives: axes, pulses, reversed motors, holes, and what is damaged. The files are made
+here: DataFlash by a writer of its own, tlog by pymavlink."""
+
+import math
+import struct
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pymavlink")
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from tests.command import uuv
+from uuvtai.identify.ardusub_log import STEP_S, read_ardusub
+from uuvtai.identify.drive_log import DriveError
+from uuvtai.link.motors import Motors
+from uuvtai.loader import load_config
+
+SECONDS = 8.0
+ROLL, PITCH, YAW = 0.1, -0.2, 1.0
+VEHICLE = load_config("open", "clean", "bluerov2_16v").vehicle
+FORMATS = {
+    "PARM": (1, "QNf", "TimeUS,Name,Value"),
+    "RCOU": (2, "Q" + "H" * 14, "TimeUS," + ",".join(f"C{i}" for i in range(1, 15))),
+    "ATT": (3, "Qfff", "TimeUS,Roll,Pitch,Yaw"),
+    "IMU": (4, "QBfff", "TimeUS,I,GyrX,GyrY,GyrZ"),
+    "VISO": (5, "Qfffff", "TimeUS,dt,PosDX,PosDY,PosDZ,conf"),
+    "XKF1": (6, "QBfff", "TimeUS,C,VN,VE,VD"),
+    "EV": (7, "QB", "TimeUS,Id"),
+}
+CODES = {"Q": "Q", "N": "16s", "f": "f", "H": "H", "B": "B"}
+
+
+def dataflash(rows):
+    """Bytes of a DataFlash log; rows of (name, values)."""
+    out = b""
+    known = {"FMT": (128, "BBnNZ", "Type,Length,Name,Format,Columns"), **FORMATS}
+    for name, (number, form, columns) in known.items():
+        length = 89 if name == "FMT" else 3 + struct.calcsize("<" + "".join(CODES[c] for c in form))
+        texts = (name.encode(), form.encode(), columns.encode())
+        out += b"\xa3\x95\x80" + struct.pack("<BB4s16s64s", number, length, *texts)
+    for name, values in rows:
+        number, form, _ = FORMATS[name]
+        layout = "<" + "".join(CODES[c] for c in form)
+        out += b"\xa3\x95" + bytes([number]) + struct.pack(layout, *values)
+    return out
+
+
+def pulses(time_s):
+    """[us] of 14 channels: one motor after the other."""
+    found = [1500] * 6 + [0] * 8
+    found[int(time_s) % 6] = 1700
+    return found
+
+
+def drive(velocity="VISO", hole=False, armed=(0.0, SECONDS)):
+    """Rows of a log in which everything holds still but the pulses."""
+    yield "PARM", (0, b"MOT_2_DIRECTION", -1.0)
+    yield "PARM", (0, b"SERVO1_FUNCTION", 35.0)  # the first channel is the third motor
+    yield "PARM", (0, b"SERVO3_FUNCTION", 33.0)
+    for step in range(round(SECONDS / STEP_S)):
+        time_s = step * STEP_S
+        if hole and 3.0 < time_s < 5.0:
+            continue
+        now = round(1e6 * time_s)
+        for at_s, event in zip(armed, (10, 11), strict=True):
+            if step == round(at_s / STEP_S):
+                yield "EV", (now, event)
+        yield "IMU", (now, 0, 0.01, 0.02, 0.03)
+        yield "IMU", (now, 1, 9.0, 9.0, 9.0)
+        if step % 5 == 0:
+            yield "RCOU", (now, *pulses(time_s))
+            yield "ATT", (now, *map(math.degrees, (ROLL, PITCH, YAW)))
+            if velocity == "VISO":
+                yield "VISO", (now, 0.1, 0.03, 0.02, 0.01, 100.0)
+            else:
+                yield "XKF1", (now, 1, 9.0, 9.0, 9.0)
+                yield "XKF1", (now, 0, 0.3 * math.cos(YAW), 0.3 * math.sin(YAW), 0.0)
+
+
+def read(tmp_path, content, name="drive.bin"):
+    path = tmp_path / name
+    path.write_bytes(content)
+    return read_ardusub(path, VEHICLE)
+
+
+def test_dataflash_in_our_axes(tmp_path):
+    (found,) = read(tmp_path, dataflash(drive()))
+    assert found.dt_s == pytest.approx(STEP_S)
+    seen = ~np.isnan(found.velocity[:, 0])
+    assert seen[::5].all() and seen.sum() == len(seen[::5])
+    np.testing.assert_allclose(found.velocity[seen][:, :3], [[0.3, -0.2, -0.1]] * seen.sum(), atol=1e-6)
+    np.testing.assert_allclose(found.velocity[:, 3], -0.03, atol=1e-6)
+    np.testing.assert_allclose(found.tilt_rate, [[0.01, -0.02]] * len(found.rpm), atol=1e-6)
+    up = [math.sin(PITCH), math.sin(ROLL) * math.cos(PITCH), math.cos(ROLL) * math.cos(PITCH)]
+    np.testing.assert_allclose(found.up, [up] * len(found.rpm), atol=1e-6)  # of a bow that is down
+
+
+def test_pulses_turn_the_motors_that_they_are_for(tmp_path):
+    (found,) = read(tmp_path, dataflash(drive()))
+    motors = Motors(VEHICLE)
+    for second in range(6):
+        wanted = [1500] * 8
+        motor = {0: 2, 2: 0}.get(second, second)  # channels 1 and 3 changed places
+        wanted[motor] = 1300 if motor == 1 else 1700  # motor 2 is reversed
+        row = round((second + 0.5) / STEP_S)
+        np.testing.assert_allclose(found.rpm[row], motors.rpm(wanted), atol=1e-6)
+    assert (np.abs(found.rpm[25]) > 0).sum() == 1
+
+
+def test_the_filters_velocity_where_there_is_no_dvl(tmp_path):
+    (found,) = read(tmp_path, dataflash(drive("XKF1")))
+    ahead, right, down = 0.3 * math.cos(PITCH), 0.3 * math.sin(ROLL) * math.sin(PITCH), 0.0
+    down = 0.3 * math.cos(ROLL) * math.sin(PITCH)
+    np.testing.assert_allclose(found.velocity[50, :3], [ahead, -right, -down], atol=1e-5)
+
+
+def test_holes_and_what_was_not_armed_part_a_log(tmp_path):
+    first, second = read(tmp_path, dataflash(drive(hole=True)))
+    assert len(first.rpm) * STEP_S == pytest.approx(3.0, abs=0.1)
+    assert len(second.rpm) * STEP_S == pytest.approx(3.0, abs=0.2)
+    (found,) = read(tmp_path, dataflash(drive(armed=(2.0, 4.0))))
+    assert len(found.rpm) * STEP_S == pytest.approx(2.0, abs=0.1)
+    with pytest.raises(DriveError, match="never armed"):
+        read(tmp_path, dataflash(drive(armed=(2.0, 2.02))))
+
+
+def tlog():
+    """What a ground station writes: its own clock before every message; the DVL has another one."""
+    link = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    out = b""
+    for step in range(round(SECONDS / 0.1)):
+        boot_s = 5.0 + 0.1 * step
+        servos = [*pulses(0.1 * step), 0, 0]
+        for message in (
+            mavlink.MAVLink_attitude_message(round(1e3 * boot_s), ROLL, PITCH, YAW, 0.01, 0.02, 0.03),
+            mavlink.MAVLink_servo_output_raw_message(round(1e6 * boot_s), 0, *servos[:8], *servos[8:]),
+            mavlink.MAVLink_heartbeat_message(12, 3, 128 + 1, 4, 4, 3),
+            mavlink.MAVLink_vision_position_delta_message(
+                77_000_000, 100_000, [0.0] * 3, [0.03, 0.02, 0.01], 90.0
+            ),
+        ):
+            out += struct.pack(">Q", round(1e6 * (1_700_000_000 + boot_s))) + message.pack(link)
+    return out
+
+
+def test_tlog_in_our_axes(tmp_path):
+    (found,) = read(tmp_path, tlog(), "drive.tlog")
+    assert len(found.rpm) * STEP_S == pytest.approx(SECONDS, abs=0.3)
+    seen = ~np.isnan(found.velocity[:, 0])
+    assert seen.sum() == pytest.approx(SECONDS / 0.1, abs=3)
+    np.testing.assert_allclose(found.velocity[seen][:, :3], [[0.3, -0.2, -0.1]] * seen.sum(), atol=1e-6)
+    np.testing.assert_allclose(found.tilt_rate, [[0.01, -0.02]] * len(found.rpm), atol=1e-6)
+    assert (found.rpm[25] != 0).sum() == 1
+
+
+def without(name):
+    return dataflash(row for row in drive() if row[0] != name)
+
+
+BAD = {
+    "text.bin": (b"no log at all", "does not begin like"),
+    "empty.bin": (b"", "does not begin like"),
+    "head.bin": (b"\xa3\x95\x80", "holds no pulse widths"),
+    "pulses.bin": (without("RCOU"), "holds no pulse widths"),
+    "angles.bin": (without("ATT"), "holds no attitude"),
+    "rates.bin": (without("IMU"), "holds no rates"),
+    "speeds.bin": (without("VISO"), "holds no velocity"),
+    "text.tlog": (b"no log at all" * 50, "holds no pulse widths"),
+    "empty.tlog": (b"", "holds no pulse widths"),
+    "short.bin": (dataflash(drive()), "stretches of 5 s"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_logs_are_refused(name, tmp_path, capfd):
+    content, why = BAD[name]
+    path = tmp_path / name
+    path.write_bytes(content)
+    code, out, err = uuv(capfd, "identify", path)
+    assert (code, out) == (2, "") and why in " ".join(err.split())
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_log_of_ardusubs_has_no_truth(tmp_path, capfd):
+    path = tmp_path / "drive.bin"
+    path.write_bytes(dataflash(drive()))
+    code, _, err = uuv(capfd, "identify", path, "--truth")
+    assert code == 2 and "leave --truth out" in err
+    code, _, err = uuv(capfd, "identify", tmp_path / "none.tlog")
+    assert code == 2 and "cannot be read" in err
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_damaged_logs_are_read_as_far_as_they_go_or_refused(seed, tmp_path):
+    rng = np.random.default_rng(seed)
+    content, name = (dataflash(drive()), "drive.bin") if seed % 2 else (tlog(), "drive.tlog")
+    bytes_of = bytearray(content[: rng.integers(len(content) // 2, len(content))])
+    for place in rng.integers(700, len(bytes_of), 20):
+        bytes_of[place] = rng.integers(256)
+    try:
+        for found in read(tmp_path, bytes(bytes_of), name):
+            assert np.isfinite(found.rpm).all() and np.isfinite(found.up).all()
+    except DriveError as error:
+        assert name in str(error)

@@ -1,0 +1,47 @@
+"""Adam that does not import torch's compiler: the same numbers as torch's own."""
+
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from uuvtai.learn.optimiser import PlainAdam, PlainAdamW
+
+
+@pytest.mark.parametrize("fused", [False, True])
+@pytest.mark.parametrize(("ours", "theirs"), [(PlainAdam, torch.optim.Adam), (PlainAdamW, torch.optim.AdamW)])
+def test_steps_and_states_are_those_of_torch(ours, theirs, fused):
+    found = []
+    for kind in (ours, theirs):
+        weight = torch.nn.Parameter(torch.linspace(-1, 1, 50))
+        optimiser = kind([weight], lr=0.01, fused=fused)
+        for number in range(20):
+            optimiser.zero_grad()
+            (weight - number).square().sum().backward()
+            optimiser.step()
+        found.append((weight.detach(), optimiser.state_dict()))
+    (weight, state), (expected, known) = found
+    assert torch.equal(weight, expected) and not weight.equal(torch.linspace(-1, 1, 50))
+    assert state["param_groups"] == known["param_groups"]
+    assert all(torch.equal(state["state"][0][name], value) for name, value in known["state"][0].items())
+
+
+def test_a_state_of_torchs_is_taken():
+    weight = torch.nn.Parameter(torch.ones(3))
+    theirs, ours = torch.optim.Adam([weight]), PlainAdam([weight])
+    weight.grad = torch.ones(3)
+    theirs.step()
+    ours.load_state_dict(theirs.state_dict())
+    assert ours.state[weight]["step"] == 1
+
+
+def test_the_compiler_is_not_imported():
+    code = (
+        "import sys, torch\nfrom uuvtai.learn.mlp import mlp\nfrom uuvtai.learn.optimiser import PlainAdam\n"
+        "net = mlp([3, 4, 1], 'elu', torch.Generator())\nadam = PlainAdam(net.parameters(), fused=True)\n"
+        "net(torch.ones(2, 3)).sum().backward()\nadam.step()\nadam.zero_grad()\nadam.state_dict()\n"
+        "assert 'torch._dynamo' not in sys.modules"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,184 @@
+"""The stack's machine code in an exported folder, launched with NumPy and ctypes alone. Copied into the
+folder; it knows nothing of the rest of uuvtai but the pilot's frame."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import platform
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from uuvtai.pilot.fed_pilot import FedPilot, StaleLimits
+from uuvtai.pilot.fed_sensors import FedSensors
+from uuvtai.pilot.mission import Mission
+from uuvtai.pilot.numbers import PilotNumbers
+
+SCHEMA = 1
+SPEC, MEMORY, GOLDEN = "stack.json", "memory.npz", "golden.npz"
+_PAGE = 4096
+
+
+class StackFolderError(RuntimeError):
+    """What a folder lacks to be an exported stack for this computer."""
+
+
+class CarriedStack:
+    """A ``StackRunner`` out of a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        """Raises StackFolderError."""
+        self.spec = spec_of(folder)
+        self._library = _library_of(folder, self.spec)
+        first = np.load(folder / MEMORY)["memory"]
+        self._block = _aligned(len(first))
+        self._block[:] = first
+        self.views = {
+            name: np.ndarray(
+                place["shape"], place["dtype"], self._block.data, place["offset"], place["strides"]
+            )
+            for name, place in self.spec["arrays"].items()
+        }
+        self._kept: list[Any] = []
+        self._runtime = self._runtime_block(self.spec["runtime"])
+        self._tensors = [np.zeros(shape, dtype) for shape, dtype in self.spec["tensors"]]
+        self._begin, self._step, self._keep = (
+            [self._work(line) for line in self.spec[name]] for name in ("begin", "step", "keep")
+        )
+        self._mission: Mission | None = None
+
+    def begin(self, mission: Mission, sensors: FedSensors) -> None:
+        """Forget everything and take the first step."""
+        self._mission = mission
+        for name in ("clock.active", "clock.awake"):
+            self.views[name][...] = 0
+        for tensor, value in zip(self._tensors, (1, mission.seed, mission.episode), strict=False):
+            tensor[0] = value
+        self._run(self._begin, sensors)
+
+    def step(self, sensors: FedSensors) -> None:
+        """A control step."""
+        self._run(self._step, sensors)
+
+    def _run(self, lines: list[Any], sensors: FedSensors) -> None:
+        for line in lines:
+            if not isinstance(line, str):
+                line()
+            elif line == "place":
+                assert self._mission is not None
+                for name, place in self._mission.places().items():
+                    self.views[name][0] = place
+            elif line == "route":
+                if self.views["route.n_failed"][()]:  # there is no second planner here: the old route stays
+                    self._run(self._keep, sensors)
+            else:
+                getattr(sensors, line)(None)
+
+    def _work(self, line: dict[str, Any]) -> Any:
+        """What a line of the specification does."""
+        if "do" in line:
+            return str(line["do"])
+        function = getattr(self._library, f"uuv_kernel_{line['kernel']}")
+        function.argtypes, function.restype = (ctypes.c_void_p, ctypes.c_void_p), None
+        packed = self._packed(line["arguments"])
+        self._kept.append(packed)
+        runtime = ctypes.addressof(self._runtime)
+        return lambda: function(ctypes.addressof(packed), runtime)
+
+    def _packed(self, arguments: list[tuple[str, Any]]) -> ctypes.Structure:
+        """Arguments as Taichi's kernels read them from memory."""
+        fields: list[tuple[str, Any]] = []
+        for i, (kind, value) in enumerate(arguments):
+            if kind == "array":
+                rank = self._tensors[value].ndim
+                fields += [(f"shape{i}", _Shape.of(rank))]
+            else:
+                fields.append((f"a{i}", ctypes.c_int32 if kind == "int" else ctypes.c_float))
+        packed = type("Arguments", (ctypes.Structure,), {"_fields_": fields})()
+        for i, (kind, value) in enumerate(arguments):
+            if kind == "array":
+                place, tensor = getattr(packed, f"shape{i}"), self._tensors[value]
+                place.data, place.shape[:] = tensor.ctypes.data, tensor.shape
+            else:
+                setattr(packed, f"a{i}", value)
+        return packed
+
+    def _runtime_block(self, layout: dict[str, int]) -> Any:
+        """What kernels take for Taichi's runtime."""
+        block = ctypes.create_string_buffer(layout["bytes"])
+        alone = ctypes.c_int32(1)
+        temporaries = ctypes.create_string_buffer(layout["temporary_bytes"])
+        loop = ctypes.cast(self._library.uuv_parallel_for, ctypes.c_void_p).value
+        self._kept += [alone, temporaries]
+        addresses = {
+            layout["pool"]: ctypes.addressof(alone),
+            layout["parallel_for"]: loop,
+            layout["temporaries"]: ctypes.addressof(temporaries),
+        }
+        for tree in range(layout["trees"]):
+            addresses[layout["roots"] + 8 * tree] = self._block.ctypes.data
+        for offset, address in addresses.items():
+            ctypes.c_uint64.from_buffer(block, offset).value = address
+        return block
+
+
+class _Shape:
+    """Types of an array among a kernel's arguments."""
+
+    @staticmethod
+    def of(rank: int) -> type[ctypes.Structure]:
+        """Shape and address."""
+        fields = [("shape", ctypes.c_int32 * rank), ("data", ctypes.c_void_p)]
+        return type(f"Array{rank}", (ctypes.Structure,), {"_fields_": fields})
+
+
+def carried_pilot(
+    folder: Path, mission: Mission | None = None, limits: StaleLimits | None = None
+) -> FedPilot:
+    """The pilot of a folder; without a ``mission`` on that of the log that it was exported with. Raises
+    StackFolderError."""
+    stack = CarriedStack(folder)
+    numbers: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in stack.spec["numbers"].items()
+    }
+    told = stack.spec["mission"]
+    own = Mission(tuple(told["start"]), tuple(told["goal"]), told["seed"], told["episode"])
+    return FedPilot(PilotNumbers(**numbers), stack, mission or own, limits)
+
+
+def spec_of(folder: Path) -> dict[str, Any]:
+    """A folder's specification. Raises StackFolderError."""
+    try:
+        spec = json.loads((folder / SPEC).read_text(encoding="utf-8"))
+        schema = spec["schema"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise StackFolderError(f"{folder}: is no exported stack ({error})") from None
+    if schema != SCHEMA:
+        raise StackFolderError(
+            f"{folder}: has the form {schema}, this runtime reads {SCHEMA}: export it anew"
+        )
+    return spec
+
+
+def _library_of(folder: Path, spec: dict[str, Any]) -> ctypes.CDLL:
+    kind = platform.machine()
+    if kind not in spec["libraries"]:
+        there = ", ".join(spec["libraries"])
+        raise StackFolderError(
+            f"{folder}: has no code for {kind}, only for {there}: export it for {kind} too"
+        )
+    try:
+        ctypes.CDLL("libm.so.6", mode=ctypes.RTLD_GLOBAL)
+        return ctypes.CDLL(str((folder / spec["libraries"][kind]).resolve()))
+    except OSError as error:
+        raise StackFolderError(f"{folder}: its code cannot be loaded ({error})") from None
+
+
+def _aligned(n_bytes: int) -> np.ndarray:
+    """Bytes that begin at a page, as Taichi has them."""
+    whole = np.zeros(n_bytes + _PAGE, np.uint8)
+    begin = -whole.ctypes.data % _PAGE
+    return whole[begin : begin + n_bytes]
