@@ -554,8 +554,8 @@ def warm(
     workers: opt.WarmWorkers = 0,
 ) -> None:
     """Compile beforehand what later commands need, so that they start at once (docs/native.md)."""
-    from uuvtai.show.health import show_shapes
     from uuvtai import warming
+    from uuvtai.show.health import show_shapes
 
     sizes = arguments.integers("--num-envs", num_envs)
     arguments.refuse_less("--workers", workers, 0)
