@@ -131,7 +131,7 @@ class _TapeRecorder:
         names = tasks_in(text)
         tasks = self._machine.tasks_of(self._machine.object_of(text), names)
         self._tape.kernels.append(RecordedKernel(kernel.func.__name__, text, names))
-        launch = NativeLaunch(self._machine, self._runtime, tasks, kernel, arguments)
+        launch = NativeLaunch(self._machine, self._runtime, tasks, arguments, given(kernel, arguments))
         return len(self._tape.kernels) - 1, launch
 
     def _described(self, kernel: Any, arguments: tuple) -> list[Any]:
