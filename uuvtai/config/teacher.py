@@ -14,10 +14,10 @@ class TeacherConfig(Section):
     and 0.6 drives nose first everywhere, as in the paper"""
     decide_period_steps: PositiveCount = 5
     """control steps between decisions of the evasion (10 Hz: more made no difference in a trial)"""
-    lag_s: Positive = 0.35
+    lag_s: Positive = 0.3
     """time constant from commanded to driven velocity, for roll-outs"""
-    horizon_s: Positive = 2.5
-    """of roll-outs (1.5 s cost 7 points in a trial)"""
+    horizon_s: Positive = 2.0
+    """of roll-outs (``docs/tuning.md``)"""
 
     n_heading: PositiveCount = 24
     n_speed: PositiveCount = 4
@@ -36,11 +36,11 @@ class TeacherConfig(Section):
     """hull centre to surface: between 0.17 abeam and 0.27 ahead"""
     contact_m: NonNegative = 0.1
     """clearance that the referee calls a collision"""
-    margin_m: NonNegative = 0.2125
+    margin_m: NonNegative = 0.275
     """wanted clearance beyond contact from a forecast body"""
     margin_growth_m_s: NonNegative = 0.085
     """the margin grows with prediction time"""
-    closing_s: NonNegative = 0.25
+    closing_s: NonNegative = 0.2
     """effective clearance is reduced by this times the closing speed (the referee stops at 0.18 s)"""
     vertical_weight: Positive = 2.0
     """free water above or below a body counts this many times: the hull is slimmer upwards (0.17 m) and
@@ -62,7 +62,7 @@ class TeacherConfig(Section):
 
     weight_peak: NonNegative = 6.0
     """[1/m] largest depth of violation of the wanted clearance"""
-    weight_mean: NonNegative = 6.0
+    weight_mean: NonNegative = 5.0
     """[1/m] depth of violation averaged over the horizon, summed over bodies"""
     weight_contact: NonNegative = 12.0
     """[1/m] largest depth below contact"""
@@ -77,11 +77,11 @@ class TeacherConfig(Section):
     softness: Positive = 0.05
     """temperature of the cost-softmax mean over candidates"""
 
-    calm_s: NonNegative = 0.5
+    calm_s: NonNegative = 0.3
     """evasion goes on for this long after the last predicted conflict"""
     conflict_within_s: NonNegative = 2.5
-    emergency_ttc_s: NonNegative = 0.35
-    emergency_range_m: NonNegative = 0.12
+    emergency_ttc_s: NonNegative = 0.15
+    emergency_range_m: NonNegative = 0.07
     emergency_closing_m_s: NonNegative = 0.15
     """slower approach is no emergency"""
     back_off_m_s: Positive = 0.85
