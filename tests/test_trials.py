@@ -184,6 +184,25 @@ def test_trials_of_the_gaze_are_as_their_episodes_say():
         )
 
 
+def test_trials_of_learnt_numbers_are_as_their_episodes_say():
+    document = json.loads((DOCS / "data/number_trials.json").read_text())
+    kept = {}
+    for row in document["rows"]:
+        kept.setdefault((row["pilot"], document["cells"][row["cell"]]), {})[row["seed"]] = row["outcomes"]
+    found = table("tuning.md", "## Numbers that learning", "| pilot |")
+    assert {(name.strip(" |"), scene) for name, scene, *_ in found} == {
+        k for k in kept if k[0] != "as it was"
+    }
+    for name, scene, _seeds, was, text in ([cell.strip(" |") for cell in cells] for cells in found):
+        own = kept[name, scene]
+        before = "".join(kept["as it was", scene][seed] for seed in own)
+        outcomes = "".join(own.values())
+        assert told(was) == pytest.approx(rates(before), abs=0.051), (name, scene)
+        assert told(text) == pytest.approx(rates(outcomes), abs=0.051), (name, scene)
+        won, lost = paired(outcomes, before)
+        assert text.endswith(f" (+{won} -{lost}, p = {mcnemar_p(won, lost):.3f})"), (name, scene)
+
+
 def test_what_forecasts_miss_is_as_counted():
     kept = json.loads((DOCS / "data/turn_trials.json").read_text())
     found = table("tuning.md", "## Turns that nobody", "| moments of tracks |")
