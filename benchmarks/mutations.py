@@ -248,7 +248,7 @@ STATISTICS = (
     Mutation(
         "mcnemar_one_sided",
         "uuvtai/statistics.py",
-        "min(1.0, 2.0 * tail / 2**n)",
+        "min(1.0, 2 * tail / 2**n)",
         "min(1.0, tail / 2**n)",
         "tests/test_statistics.py",
         "mcnemar",

@@ -313,7 +313,9 @@ def test_presets_are_listed_and_shown(capfd):
     assert {"pool", "gauntlet", "column", "mixed", "maze", "netpen", "transfer", "open"} <= set(
         listed["world"]
     )
-    assert {"clean", "paper", "nominal", "harsh", "multibeam", "ping360"} == set(listed["sensors"])
+    assert {"clean", "paper", "nominal", "harsh", "multibeam", "multibeam_image", "ping360"} == set(
+        listed["sensors"]
+    )
     assert {
         "paper",
         "ppo",

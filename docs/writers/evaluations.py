@@ -2,8 +2,9 @@
 
 Each row is one ``uuv eval`` (or ``uuv sweep``) on one thread, two of them at a time. A row is in
 ``docs/data/evaluations_SEED.json`` as soon as it is played; a second start plays what is missing (same seed,
-same episodes, same last commit of ``uuvtai/``). Afterwards ``python -m docs.writers.figures --evaluations
-evaluations_SEED.json`` renews the text.
+same episodes, same last commit of ``uuvtai/``). Whoever changes the default pilot writes ``"older": true``
+into the rows that it has not played: the tables mark them. Afterwards ``python -m docs.writers.figures
+--evaluations evaluations_SEED.json`` renews the text.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ def measured(sources: Sources) -> str:
     )
     kept = f" {shown['note']}" if "note" in shown else ""
     counts = sorted({m["episodes"] for entry in shown["rows"] for m in entry["methods"].values()})
-    older = f" {OLDER} = played by the pilot before." if any(map(_is_older, shown["rows"])) else ""
+    older = f" {OLDER} = played by the default pilot before." if any(map(_is_older, shown["rows"])) else ""
     return (
         f"Measured here: {' or '.join(f'{count:,}' for count in counts)} episodes of seed {shown['seed']} in "
         f"each row, paper sensing, S = 8.\nThis seed {seen}. Success, collision and endings are\nthose of "
@@ -53,8 +53,12 @@ OLDER = "†"
 
 
 def _is_older(entry: dict[str, Any]) -> bool:
-    """Whether a row was played before there was a pilot that is held to the paper's speed."""
-    return "bt" in entry["methods"] and "capped" not in entry["methods"] and entry.get("shows") == "bt"
+    """Whether a row was played by another default pilot than today's: ``older`` in its entry says so."""
+    return entry.get("older", False)
+
+
+def _title(entry: dict[str, Any]) -> str:
+    return f"{entry['title']} {OLDER}" if _is_older(entry) else entry["title"]
 
 
 def evaluations(sources: Sources) -> str:
@@ -84,7 +88,7 @@ def _evaluated(entry: dict[str, Any]) -> list[str]:
     ]
     capped = _both(methods["capped"], 1) if "capped" in methods else DASH
     return [
-        f"{entry['title']} {OLDER}" if _is_older(entry) else entry["title"],
+        _title(entry),
         share(own, "success"),
         rated(own, "collision"),
         ends,
@@ -136,7 +140,7 @@ def local_planners(sources: Sources) -> str:
     if not entries:
         return "Not among the evaluations that are shown."
     rows = [[f"`{name}`", *(_beside_tree(entry, name) for entry in entries)] for name in LOCAL_PLANNERS]
-    return text_table(["", *(entry["title"] for entry in entries)], rows)
+    return text_table(["", *map(_title, entries)], rows)
 
 
 def _beside_tree(entry: dict[str, Any], name: str) -> str:

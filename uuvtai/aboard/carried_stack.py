@@ -14,7 +14,7 @@ import numpy as np
 from uuvtai.pilot.fed_pilot import FedPilot, StaleLimits
 from uuvtai.pilot.fed_sensors import FedSensors
 from uuvtai.pilot.mission import Mission
-from uuvtai.pilot.numbers import PilotNumbers
+from uuvtai.pilot.pilot_numbers import PilotNumbers
 
 SCHEMA = 1
 SPEC, MEMORY, GOLDEN = "stack.json", "memory.npz", "golden.npz"
@@ -32,7 +32,7 @@ class CarriedStack:
         """Raises StackFolderError."""
         self.spec = spec_of(folder)
         self._library = _library_of(folder, self.spec)
-        first = np.load(folder / MEMORY)["memory"]
+        first = np.load(folder / MEMORY, allow_pickle=False)["memory"]
         self._block = _aligned(len(first))
         self._block[:] = first
         self.views = {

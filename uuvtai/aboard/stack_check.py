@@ -88,7 +88,7 @@ def compare(folder: Path) -> dict[str, Any]:
     """What a folder's code decides on this computer beside what was decided at its export. Raises
     StackFolderError."""
     pilot = carried_pilot(folder)
-    with np.load(folder / GOLDEN) as golden:
+    with np.load(folder / GOLDEN, allow_pickle=False) as golden:
         arrivals, wanted = messages_in(golden, pilot.numbers.image), golden["commands"]
     off = np.abs(decided(pilot, arrivals, len(wanted)) - wanted).max(axis=1)
     wrong = np.flatnonzero(~(off <= AGREES))

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from uuvtai.config import VehicleConfig
+from uuvtai.files import open_file
 from uuvtai.identify.drive_log import Drive, DriveError, drives_of, up_axis
 from uuvtai.link.dialect import EXTRA
 from uuvtai.link.motors import NEUTRAL_US, Motors
@@ -201,14 +202,11 @@ def _by_motor(pulse: np.ndarray, parameters: dict[str, float]) -> list[float]:
 
 def _heard(path: Path) -> _Heard:
     try:
-        size = path.stat().st_size
-        with path.open("rb") as file:
+        with open_file(path, _MOST_BYTES) as file:
             head = file.read(len(_BIN_HEAD))
     except OSError as error:
         raise DriveError(f"{path}: cannot be read ({error.strerror}); give a .bin or .tlog") from None
     is_bin = path.suffix.lower() == ".bin"
-    if size > _MOST_BYTES:
-        raise DriveError(f"{path}: is larger than {_MOST_BYTES >> 30} GiB; cut it")
     if is_bin and head != _BIN_HEAD:
         raise DriveError(f"{path}: does not begin like a DataFlash log of ArduPilot's")
     if importlib.util.find_spec("pymavlink") is None:

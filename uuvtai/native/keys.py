@@ -18,7 +18,8 @@ from uuvtai.native.reads import values_of
 
 _SEEN_BY_KERNELS = (
     "kernels", "config", "state", "native", "taichi_patches",
-    "forecast_codes.py", "outcomes.py", "plan_codes.py", "tree_codes.py", "truth.py",
+    "forecast_codes.py", "multibeam.py", "outcomes.py", "plan_codes.py", "tree_codes.py", "truth.py",
+    "tuned_numbers.py",
 )  # fmt: skip
 """files and folders of the package that a kernel's code can depend on (``tests/test_native.py`` compares them
 with what the kernels import)"""

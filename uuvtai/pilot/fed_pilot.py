@@ -12,7 +12,7 @@ import numpy as np
 from uuvtai.pilot.fed_sensors import FedSensors
 from uuvtai.pilot.inbox import ANY, Inbox, Tally
 from uuvtai.pilot.mission import Mission
-from uuvtai.pilot.numbers import PilotNumbers
+from uuvtai.pilot.pilot_numbers import PilotNumbers
 from uuvtai.pilot.sensor_messages import SensorMessage, SonarPing
 from uuvtai.plan_codes import TRIGGERS
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from uuvtai.pilot.carrying import acceleration_b, to_world, turned_on
 from uuvtai.pilot.inbox import Inbox
-from uuvtai.pilot.numbers import PilotNumbers
+from uuvtai.pilot.pilot_numbers import PilotNumbers
 from uuvtai.pilot.pose_history import PoseHistory
 from uuvtai.pilot.sensor_messages import (
     DepthShot,

@@ -17,7 +17,7 @@ from uuvtai.config import Config
 from uuvtai.logs.moment import numbered
 from uuvtai.pilot.fed_pilot import FedPilot, StaleLimits
 from uuvtai.pilot.mission import Mission
-from uuvtai.pilot.numbers import PilotNumbers
+from uuvtai.pilot.pilot_numbers import PilotNumbers
 from uuvtai.pilot.sim_stack import SimStack
 from uuvtai.sim import Sim
 from uuvtai.tree import FlatTree

@@ -99,8 +99,9 @@ def _image(moment: Moment) -> bytes:
 def _heard(moment: Moment, sonar_cfg: SonarConfig) -> np.ndarray:
     """(n_ray, n_bin) power that the beams hear: where ranges are detected in it, that of the ping; else made
     for the log, with speckle that is a function of the episode and the step."""
+    detected_in = moment["sonar_image.heard"]
     if sonar_cfg.detector != "none":
-        return np.asarray(moment["sonar_image.heard"], float)[: sonar_cfg.n_ray, : sonar_cfg.image_bins]
+        return np.asarray(detected_in, float)[: sonar_cfg.n_ray, : sonar_cfg.image_bins]
     scenario = moment.header.scenario
     w, x, y, z = (float(part) for part in moment["vehicle.quat_wb"])
     yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
