@@ -100,9 +100,9 @@ class _KeptRoutes:
 
     count = 0
 
-    def serve(self, stages: Stages, seed_of: Callable[[int], int]) -> int:
+    def serve(self, stages: Stages, seed_of: Callable[[int], int], count: Callable[[Any], int]) -> int:
         """As ``RouteFallback.serve``."""
-        if failed := int(stages.route.route.n_failed[None]):
+        if failed := count(stages.route.route.n_failed):
             keep_route(stages.route, 0)
             self.count += 1
         return failed
