@@ -201,6 +201,13 @@ def test_trials_of_learnt_numbers_are_as_their_episodes_say():
         assert told(text) == pytest.approx(rates(outcomes), abs=0.051), (name, scene)
         won, lost = paired(outcomes, before)
         assert text.endswith(f" (+{won} -{lost}, p = {mcnemar_p(won, lost):.3f})"), (name, scene)
+    nominal = {}
+    for row in document["nominal"]:
+        nominal[row["pilot"]] = nominal.get(row["pilot"], "") + row["outcomes"]
+    before, own = nominal.values()
+    won, lost = paired(own, before)
+    said = f"{own.count('s'):,} against {before.count('s'):,} of {len(own):,} episodes (+{won} -{lost})"
+    assert said in " ".join((DOCS / "tuning.md").read_text().split())
 
 
 def test_what_forecasts_miss_is_as_counted():
