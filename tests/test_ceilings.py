@@ -62,7 +62,7 @@ def test_the_oracle_alone_is_printed_with_a_dagger_and_the_condition(borrowed, c
     code, out, err = uuv(capfd, *COMMAND, "--controller", "oracle", "--run-dir", str(tmp_path / "run"))
     assert code == 0, err
     assert "oracle †" in out and "† oracle is privileged" in out
-    assert "threat rate" in out and "required detection distance 2.3 m" in out
+    assert "threat rate" in out and "required detection distance 2.2 m" in out
 
 
 def test_a_bt_that_comes_after_the_truth_senses_again(borrowed, capfd, tmp_path):

@@ -226,8 +226,8 @@ def test_a_body_is_a_threat_where_it_is_when_the_vehicle_comes():
 
 def test_required_detection_distance_by_hand():
     assert time_aside_s(0.6, 0.6, 1e-6) == pytest.approx(1.0, abs=1e-5)
-    t = time_aside_s(0.52, 0.6, 0.35)
-    assert 0.6 * (t - 0.35 * (1 - math.exp(-t / 0.35))) == pytest.approx(0.52, abs=1e-9)
+    t = time_aside_s(0.52, 0.6, 0.3)
+    assert 0.6 * (t - 0.3 * (1 - math.exp(-t / 0.3))) == pytest.approx(0.52, abs=1e-9)
     found = required_detection(CONFIG)
     assert found.aside_m == pytest.approx(0.25 + 0.17 + 0.1)
     assert found.closing_m_s == pytest.approx(0.85 + 0.6)
