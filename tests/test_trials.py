@@ -166,11 +166,17 @@ def test_trials_of_turns_are_as_their_episodes_say(column, cell):
         assert won == 0 or text.endswith(f" (+{won} -{lost}, p = {mcnemar_p(won, lost):.2f})"), name
 
 
-def test_trials_of_the_gaze_are_as_their_episodes_say():
-    document = json.loads((DOCS / "data/gaze_trials.json").read_text())
+def outcomes_by_seed(document):
+    """{(pilot, scene): {seed: outcomes}}"""
     kept = {}
     for row in document["rows"]:
         kept.setdefault((row["pilot"], document["cells"][row["cell"]]), {})[row["seed"]] = row["outcomes"]
+    return kept
+
+
+def test_trials_of_the_gaze_are_as_their_episodes_say():
+    document = json.loads((DOCS / "data/gaze_trials.json").read_text())
+    kept = outcomes_by_seed(document)
     found = table("tuning.md", "## Where the nose looks", "| pilot |")
     assert len(found) == len(kept)
     for cells in found:
@@ -186,9 +192,7 @@ def test_trials_of_the_gaze_are_as_their_episodes_say():
 
 def test_trials_of_learnt_numbers_are_as_their_episodes_say():
     document = json.loads((DOCS / "data/number_trials.json").read_text())
-    kept = {}
-    for row in document["rows"]:
-        kept.setdefault((row["pilot"], document["cells"][row["cell"]]), {})[row["seed"]] = row["outcomes"]
+    kept = outcomes_by_seed(document)
     found = table("tuning.md", "## Numbers that learning", "| pilot |")
     assert {(name.strip(" |"), scene) for name, scene, *_ in found} == {
         k for k in kept if k[0] != "as it was"

@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, Union
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar, Union
 
 from uuvtai import signals
 from uuvtai.config.learning import LearningConfig
@@ -73,6 +73,8 @@ class TrainWatch(Protocol):
     def stop(self) -> None: ...
 
 
+_Alone = TypeVar("_Alone", "TwinTrainer", "ChooserTrainer", "TunerTrainer", "ForecastTrainer")
+"""trainers that one process has to itself"""
 AnyTrainer = Union["Trainer", "TwinTrainer", "ChooserTrainer", "TunerTrainer", "ForecastTrainer"]
 Evaluate = Callable[[AnyTrainer, LearningConfig], Metrics]
 """``eval/*`` of the policy as it is; training goes on as if nothing had been
@@ -203,16 +205,20 @@ def _trainer(env: VectorEnv, config: LearningConfig, checkpoint: Checkpoint | No
     return trainer
 
 
+def _continued(trainer: _Alone, config: LearningConfig, checkpoint: Checkpoint | None) -> _Alone:
+    """A trainer that goes on from a checkpoint; as it is where there is none."""
+    if checkpoint:
+        checkpoint.check_table(trainer.observation_table, config)
+        trainer.load_state(checkpoint.state(like=trainer.state()))
+    return trainer
+
+
 def _twin_trainer(config: LearningConfig, checkpoint: Checkpoint | None, device: str) -> TwinTrainer:
     """As ``_trainer``, in the kinematic twin."""
     from uuvtai.learn.twin_trainer import TwinTrainer
 
     _refuse_many("twin.enabled: the twin trains", device)
-    trainer = TwinTrainer(config)
-    if checkpoint:
-        checkpoint.check_table(trainer.observation_table, config)
-        trainer.load_state(checkpoint.state(like=trainer.state()))
-    return trainer
+    return _continued(TwinTrainer(config), config, checkpoint)
 
 
 def _chooser_trainer(config: LearningConfig, checkpoint: Checkpoint | None, device: str) -> ChooserTrainer:
@@ -220,11 +226,7 @@ def _chooser_trainer(config: LearningConfig, checkpoint: Checkpoint | None, devi
     from uuvtai.learn.chooser_trainer import ChooserTrainer
 
     _refuse_many("chooser.enabled: it learns", device)
-    trainer = ChooserTrainer(config)
-    if checkpoint:
-        checkpoint.check_table(trainer.observation_table, config)
-        trainer.load_state(checkpoint.state(like=trainer.state()))
-    return trainer
+    return _continued(ChooserTrainer(config), config, checkpoint)
 
 
 def _tuner_trainer(config: LearningConfig, checkpoint: Checkpoint | None, device: str) -> TunerTrainer:
@@ -232,11 +234,7 @@ def _tuner_trainer(config: LearningConfig, checkpoint: Checkpoint | None, device
     from uuvtai.learn.tuner_trainer import TunerTrainer
 
     _refuse_many("tuner.enabled: it searches", device)
-    trainer = TunerTrainer(config)
-    if checkpoint:
-        checkpoint.check_table(trainer.observation_table, config)
-        trainer.load_state(checkpoint.state(like=trainer.state()))
-    return trainer
+    return _continued(TunerTrainer(config), config, checkpoint)
 
 
 def _forecast_trainer(config: LearningConfig, checkpoint: Checkpoint | None, device: str) -> ForecastTrainer:
@@ -244,11 +242,7 @@ def _forecast_trainer(config: LearningConfig, checkpoint: Checkpoint | None, dev
     from uuvtai.learn.forecast_trainer import ForecastTrainer
 
     _refuse_many("forecaster.enabled: it learns", device)
-    trainer = ForecastTrainer(config)
-    if checkpoint:
-        checkpoint.check_table(trainer.observation_table, config)
-        trainer.load_state(checkpoint.state(like=trainer.state()))
-    return trainer
+    return _continued(ForecastTrainer(config), config, checkpoint)
 
 
 def _refuse_many(what: str, device: str) -> None:

@@ -54,7 +54,7 @@ _BLOCKS = 16
 def spread(n_env: int, inner: int = 1) -> int:
     """Loop items per env (and ``inner`` index) that make ``ti.ndrange(n_env, inner, spread(n_env, inner))``
     fill every core; use only the items with ``pad == 0``. One on a GPU, where an idle item is an idle thread,
-    and for one env, which has one thread: idle items were a third of its step."""
+    and for one env, which has one thread: idle items only cost time there."""
     if is_gpu_shaped() or n_env == 1:
         return 1
     return max(1, min(_CPU_BLOCK, -(-_CPU_BLOCK * _BLOCKS // (n_env * inner))))
