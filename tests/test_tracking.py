@@ -614,7 +614,7 @@ def test_partly_hidden_body_keeps_its_centre(paper):
 
 
 def course_after_leaving_the_fan(lab, cfg):
-    """(errors of course [deg], of place [m]) of a mover that comes near and leaves the fan by its nearest part:
+    """(errors of course [deg], of place [m]) of a mover that leaves the fan by its nearest part:
     its last scans show its sides alone."""
     lab, (pos, yaw, own) = lab.begin(23, cfg), at_rest(10.0, 3.0)
     vel, start, radius = np.array([-0.25, 0.35]), np.array([11.9, 2.0]), 0.25
