@@ -14,6 +14,7 @@ from tests.small_sim import SmallSim
 BEGUN_FIRST = """
 cli tracking training cuda world signals log_alone security sonar docs report deploy mapping media_formats
 resume_eval proprioception sweep dynamics completion telemetry explain examples stack hostile_logs
+learned_forecast wheel voronoi
 """
 """files of tests that take long, longest first: a process takes whole files, and none shall work alone at the
 end"""
