@@ -10,6 +10,7 @@ import pytest
 
 from tests.field_memory import look_in_memory
 from tests.small_sim import SmallSim
+from tests.tracing import keep_tracer_out
 
 BEGUN_FIRST = """
 cli tracking training cuda world signals log_alone security sonar docs report deploy mapping media_formats
@@ -51,6 +52,12 @@ def pytest_collection_modifyitems(items):
     """Long files first, the others as they were found."""
     order = {f"test_{name}": number for number, name in enumerate(BEGUN_FIRST.split())}
     items.sort(key=lambda item: order.get(item.path.stem, len(order)))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def tracer():
+    """Coverage, where it is measured, costs no more than it has to."""
+    keep_tracer_out()
 
 
 @pytest.fixture(scope="session", autouse=True)
