@@ -1,5 +1,6 @@
 """Coverage's tracer, which is called for every line that Python runs, is kept out of libraries that run many
-and call nothing of ours: drawing, YAML's grammar, making a command line, exporting a graph, unparsing.
+and call nothing of ours: drawing, grammar of YAML, schemas, chunks of logs, making a command line, exporting
+a graph, unparsing.
 
 Their lines are not counted anyway.
 """
@@ -30,6 +31,8 @@ def keep_tracer_out() -> None:
     """From now on, where there is a tracer."""
     if sys.gettrace() is None:
         return
+    import jsonschema
+    import mcap.reader
     import torch
     import typer.main
     from matplotlib.figure import Figure
@@ -37,6 +40,8 @@ def keep_tracer_out() -> None:
 
     for owner, names in (
         (Figure, ["savefig"]),
+        (jsonschema.Draft202012Validator, ["validate"]),
+        (mcap.reader, ["breakup_chunk"]),
         (Parser, ["check_event", "peek_event", "get_event"]),
         (typer.main, ["get_command"]),
         (torch.onnx, ["export"]),
