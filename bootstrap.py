@@ -59,9 +59,11 @@ def test(arguments: list[str]) -> int:
     """Lint, types, import contracts, then the tests with coverage; the first failure decides the exit
     code."""
     python = str(BIN / "python")
-    warm = None if arguments else _warm(python)
+    beside = [] if arguments else [_warm(python)]
     install(".[dev]")
     _install_js()
+    if beside:
+        beside.append(_read_tests(python))
     checks = [
         [str(BIN / "ruff"), "check", "."],
         [str(BIN / "ruff"), "format", "--check", "."],
@@ -69,8 +71,8 @@ def test(arguments: list[str]) -> int:
         [str(BIN / "lint-imports")],
     ]
     code = next((code for command in checks if (code := run(command))), 0)
-    if warm:  # what it has compiled is kept, kernel by kernel
-        warm.terminate() if code else warm.wait()
+    for process in beside:  # what they have compiled is kept, kernel by kernel and file by file
+        process.terminate() if code else process.wait()
     return code or run([python, "-m", "pytest", *(arguments or IN_FULL)])
 
 
@@ -83,6 +85,13 @@ def _warm(python: str) -> subprocess.Popen[bytes]:
     os.environ.setdefault("UUV_COMPILERS", "1")
     install(".")
     return subprocess.Popen([python, "-m", "tests.warm"], cwd=ROOT)
+
+
+def _read_tests(python: str) -> subprocess.Popen[bytes]:
+    """Compile the source of the tests, and of all that they import, while the code is checked: both test
+    processes would do it. Quiet, for they tell what is wrong."""
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    return subprocess.Popen([python, "-m", "pytest", "--collect-only"], cwd=ROOT, **quiet)
 
 
 def docs(arguments: list[str]) -> int:

@@ -1,25 +1,63 @@
 """Fixtures shared by the tests. Taichi is started once per session; one small simulator serves every test of
 the whole stack."""
 
+import ast
+import functools
 import signal
+import sys
 
 import pytest
 
 from tests.field_memory import look_in_memory
 from tests.small_sim import SmallSim
+from tests.tracing import keep_tracer_out
 
 BEGUN_FIRST = """
 cli tracking training cuda world signals log_alone security sonar docs report deploy mapping media_formats
 resume_eval proprioception sweep dynamics completion telemetry explain examples stack hostile_logs
+learned_forecast wheel voronoi
 """
 """files of tests that take long, longest first: a process takes whole files, and none shall work alone at the
 end"""
+
+OMITTED = {"kernels", "config", "state", "bounds", "loader", "errors", "multibeam", "outcomes"} | {
+    f"{noun}_codes" for noun in ("plan", "tree", "forecast")
+}
+"""what tests of kernels alone import of the package: kernels, which coverage omits, and tables of numbers,
+read by all other tests too"""
+
+
+@functools.cache
+def is_of_kernels_alone(path):
+    """Whether a file of tests has an oracle or a kernel, and imports nothing but these of the package."""
+    nodes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
+    names = [f"{node.module}.{alias.name}".split(".") for node in nodes for alias in node.names]
+    has_one = any(name[:2] in (["uuvtai", "kernels"], ["tests", "reference"]) for name in names)
+    return has_one and {name[1] for name in names if name[0] == "uuvtai"} <= OMITTED
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_protocol(item):
+    """No coverage of kernels and their oracles: there is nothing to be counted, and the tracer takes a tenth
+    to a half of the oracles' time."""
+    tracer = sys.gettrace() if is_of_kernels_alone(item.path) else None
+    if tracer is not None:
+        sys.settrace(None)
+    yield
+    if tracer is not None:
+        sys.settrace(tracer)
 
 
 def pytest_collection_modifyitems(items):
     """Long files first, the others as they were found."""
     order = {f"test_{name}": number for number, name in enumerate(BEGUN_FIRST.split())}
     items.sort(key=lambda item: order.get(item.path.stem, len(order)))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def tracer():
+    """Coverage, where it is measured, costs no more than it has to."""
+    keep_tracer_out()
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -4,6 +4,15 @@
 import torch
 
 
+def sim_with_one_beam():
+    """A simulator of one vehicle with a mechanical sonar; ``tests/warm.py`` compiles it beforehand too."""
+    from uuvtai.loader import load_config
+    from uuvtai.sim import Sim
+    from uuvtai.tree import read_tree
+
+    return Sim(load_config("pool", "ping360"), 1, read_tree("bt"))
+
+
 class SmallSim:
     """A simulator whose kernels are compiled once for the session, and what tests do with it."""
 

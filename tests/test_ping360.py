@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.small_sim import sim_with_one_beam
 from uuvtai.config import Config, SensorsConfig
 from uuvtai.loader import load_config
 from uuvtai.logs.log_recorder import EpisodeRecorder
@@ -17,8 +18,6 @@ from uuvtai.logs.topics.sonar_topics import ROWS
 from uuvtai.logs.video import _ECHO, FrameArtist
 from uuvtai.measure.replay.replaying import replay
 from uuvtai.pilot import Mission, OnboardPilot, SonarPing
-from uuvtai.sim import Sim
-from uuvtai.tree import read_tree
 
 STEPS, SEED, EPISODE = 200, 77001, 3
 END = SimpleNamespace(
@@ -36,7 +35,7 @@ class Job(NamedTuple):
 @pytest.fixture(scope="module")
 def alone(taichi_runtime):
     """A simulator of one vehicle."""
-    return Sim(CONFIG, 1, read_tree("bt"))
+    return sim_with_one_beam()
 
 
 @pytest.fixture(scope="module")

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 import uuvtai
+from tests.command import uncounted
 from tests.small_sim import SmallSim
 from uuvtai import signals
 from uuvtai.logs.repair import repair
@@ -23,11 +24,11 @@ ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(uuvtai.__file__).parents[1])}
 BOTH = [signal.SIGINT, signal.SIGTERM]
 
 
-def started(folder, *arguments, program=None):
+def started(folder, *arguments, program=None, environment=ENVIRONMENT):
     """A command whose handlers are in place: what Python does before its first line is not ours."""
     command = [sys.executable, "-c", program] if program else [sys.executable, "-m", "uuvtai", *arguments]
     process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder, env=ENVIRONMENT
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder, env=environment
     )
     deadline = time.monotonic() + 60
     while process.poll() is None and not catches(process.pid, signal.SIGTERM) and time.monotonic() < deadline:
@@ -139,7 +140,7 @@ def test_a_signal_within_a_write_loses_no_message(tmp_path, call):
     ],
 )  # fmt: skip
 def test_a_command_that_begins_ends_at_once_and_leaves_nothing(tmp_path, arguments, number):
-    process = started(tmp_path, *arguments)
+    process = started(tmp_path, *arguments, environment=uncounted(PYTHONPATH=ENVIRONMENT["PYTHONPATH"]))
     time.sleep(random.Random(f"{arguments}{number}").uniform(0.0, 0.6))
     process.send_signal(number)
     code, err = ended(process, number)

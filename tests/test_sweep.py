@@ -12,6 +12,7 @@ import time
 import pytest
 
 from tests import sweep_work
+from tests.command import uuv
 from tests.report_samples import robustness_sweep
 from tests.small_sim import SmallSim
 from uuvtai.loader import ConfigError
@@ -365,18 +366,10 @@ OPTIONS = [
     "episode.horizon_steps=400",
     "-S",
     "4",
-    "--set",
-    "world.static_capacity=8",
     "--episodes",
     "4",
     "--json",
 ]
-
-
-def uuv(*arguments):
-    return subprocess.run(
-        [sys.executable, "-m", "uuvtai", *arguments], capture_output=True, text=True, check=False
-    )
 
 
 def test_a_killed_sweep_gives_what_an_evaluation_gives(small, tmp_path):
@@ -395,7 +388,8 @@ def test_a_killed_sweep_gives_what_an_evaluation_gives(small, tmp_path):
         time.sleep(0.02)
     child.kill()
     child.wait()
-    done = uuv("sweep", "--resume", str(place), "--json")
+    words = [sys.executable, "-m", "uuvtai", "sweep", "--resume", str(place), "--json"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     cells = json.loads(done.stdout)["cells"]
     assert [(cell["D"], cell["v_m_s"]) for cell in cells] == [(2, 1.5), (6, 1.5)]
@@ -419,12 +413,13 @@ def test_a_killed_sweep_gives_what_an_evaluation_gives(small, tmp_path):
         (["--controller", "nosuch"], "nosuch"),
     ],
 )
-def test_bad_input_is_one_message_and_no_folder(arguments, said, tmp_path):
+def test_bad_input_is_one_message_and_no_folder(arguments, said, tmp_path, capfd):
     place = tmp_path / "run"
-    done = uuv("sweep", *arguments, *([] if "--resume" in arguments else ["--run-dir", str(place)]))
-    assert done.returncode in (1, 2)
-    assert said in " ".join(done.stderr.split())
-    assert "Traceback" not in done.stderr
+    where = [] if "--resume" in arguments else ["--run-dir", place]
+    code, _out, err = uuv(capfd, "sweep", *arguments, *where)
+    assert code in (1, 2)
+    assert said in " ".join(err.split())
+    assert "Traceback" not in err
     assert not place.exists()
 
 

@@ -2,7 +2,6 @@
 folder, without a network."""
 
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -13,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.command import uncounted
 from tests.small_sim import SmallSim
 
 ROOT = Path(__file__).parent.parent
@@ -120,11 +120,7 @@ def installed(built, tmp_path_factory):
 
 def clean(**more):
     """The environment of a user: nothing of the checkout in it."""
-    return {
-        name: value
-        for name, value in os.environ.items()
-        if name != "PYTHONPATH" and not name.startswith("COV")
-    } | more
+    return {name: value for name, value in uncounted().items() if name != "PYTHONPATH"} | more
 
 
 @pytest.fixture

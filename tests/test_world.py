@@ -168,7 +168,7 @@ def test_static_obstacles_keep_sizes_and_gaps(any_world):
             assert within(sizes, cfg.static.half_extent_m if kind == BOX else cfg.static.radius_m)
             assert reference.wall_distances(reference.outline(*body), cfg.tank).min() >= -FLOAT_TOL_M
             for other in bodies[:i]:
-                assert reference.gap(body, other) >= cfg.static.gap_m - FLOAT_TOL_M
+                assert reference.keeps_gap(body, other, cfg.static.gap_m - FLOAT_TOL_M)
 
 
 def test_half_of_the_static_obstacles_are_boxes(any_world):

@@ -8,7 +8,9 @@ of the tests are installed, so it needs none of them.
 import os
 import sys
 
-from tests.small_sim import SmallSim
+import torch
+
+from tests.small_sim import SmallSim, sim_with_one_beam
 from uuvtai.native.gpu_shape import VARIABLE, asked_shape
 from uuvtai.runtime import start_taichi
 
@@ -17,12 +19,13 @@ STEPS = 6
 
 
 def main() -> None:
-    """The small simulator with its own sensors, and with those that have no errors (``test_log_alone``); then
-    the first one in the shape for a GPU (``test_cuda``)."""
+    """The small simulator with its own sensors, and with those that have no errors (``test_log_alone``); one
+    with a mechanical sonar (``test_ping360``); then the first one in the shape for a GPU (``test_cuda``)."""
     start_taichi("cpu")
     play(SmallSim())
     if asked_shape() == "cpu":
         play(SmallSim("clean"))
+        play_alone(sim_with_one_beam())
         os.execve(sys.executable, [sys.executable, "-m", "tests.warm"], os.environ | {VARIABLE: "gpu"})
 
 
@@ -33,6 +36,14 @@ def play(small: SmallSim) -> None:
     for _ in range(STEPS):
         small.sim.step()
     small.begin([2])
+
+
+def play_alone(sim) -> None:
+    """Begin an episode of one vehicle, and step."""
+    one = torch.ones(1, dtype=torch.int32)
+    sim.reset(one, one, one)
+    for _ in range(STEPS):
+        sim.step()
 
 
 if __name__ == "__main__":

@@ -38,6 +38,13 @@ def gap(a, b):
     return float(min(plan_distances(outline(*a), *b).min(), plan_distances(outline(*b), *a).min()))
 
 
+def keeps_gap(a, b, least):
+    """Whether two bodies' plan views lie this far apart [m]; outlines are drawn only where circles around the
+    bodies do not."""
+    reach = sum(math.hypot(*size[:2]) if kind == BOX else size[0] for kind, _, size, _ in (a, b))
+    return math.dist(a[1][:2], b[1][:2]) - reach >= least or gap(a, b) >= least
+
+
 def wall_distances(points, tank):
     """Distances [m] of points (..., 2) to the side walls, negative outside."""
     x, y = points[..., 0], points[..., 1]
