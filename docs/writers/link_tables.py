@@ -1,5 +1,5 @@
 """Tables of the pages sitl, vehicle and companion, from the newest results of the benchmarks ``closed_loop``,
-``ardusub`` and ``aboard``."""
+``ardusub``, ``terminals`` and ``aboard``."""
 
 from __future__ import annotations
 
@@ -12,11 +12,20 @@ from uuvtai.tables.table import text_table
 
 def real_ardusub(sources: Sources) -> str:
     """What ArduSub itself did in our water."""
-    rows = sources.benchmark("ardusub")["rows"]
+    return _tried(sources, "ardusub")
+
+
+def _tried(sources: Sources, benchmark: str) -> str:
+    rows = sources.benchmark(benchmark)["rows"]
     driven = [row for row in rows if "endings" in row["details"]]
     told = {driven[0]["what"]: f"; {_paired(driven)}"} if len(driven) == 2 else {}
     cells = [[row["what"], _result(row), row["note"] + told.get(row["what"], "")] for row in rows]
     return text_table(["tried", "result", "more"], cells)
+
+
+def terminals(sources: Sources) -> str:
+    """Water, ArduSub and pilot as three processes."""
+    return _tried(sources, "terminals")
 
 
 def ardusub_identified(sources: Sources) -> str:
