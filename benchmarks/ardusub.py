@@ -24,9 +24,6 @@ from pymavlink import mavutil
 from benchmarks.closed_loop import SEED, simulated
 from benchmarks.common import Job, Row
 from uuvtai.config import Config
-from uuvtai.identify.ardusub_log import read_ardusub
-from uuvtai.identify.identified import identified
-from uuvtai.identify.motion_model import parameters_of
 from uuvtai.link.endpoint import Endpoint, LinkPlace
 from uuvtai.link.flight_plan import FlightPlan
 from uuvtai.link.link_log import LinkLog
@@ -48,18 +45,8 @@ TLOG_BEGINS_S = 1_700_000_000
 """[s] since 1970; which day does not matter"""
 ALT_HOLD, GUIDED, MANUAL = 2, 4, 19
 PORT, SENSORS, OPERATOR = 29002, 24660, 24560
-TOLD_WRONG = ("added_mass", "linear_damping", "quadratic_damping")
-"""what ``uuv identify`` is told 30 % too high"""
-PARAMETERS = {
-    "ARMING_CHECK": 0, "FS_PILOT_INPUT": 0, "FS_GCS_ENABLE": 0, "GPS1_TYPE": 0, "VISO_TYPE": 1,
-    "EK3_SRC1_POSXY": 6, "EK3_SRC1_VELXY": 6, "EK3_SRC1_POSZ": 1, "EK3_SRC1_VELZ": 0, "EK3_SRC1_YAW": 1,
-    "AHRS_EKF_TYPE": 3, "SERIAL1_PROTOCOL": 2, "SERIAL2_PROTOCOL": 2, "LOG_DISARMED": 0,
-    "LOG_BACKEND_TYPE": 0, "SIM_BARO_RND": 0.002, "SIM_BAR2_RND": 0.002,
-    "BARO1_GND_PRESS": 101325, "BARO2_GND_PRESS": 101325,
-}  # fmt: skip
-"""beside ArduPilot's own defaults for its simulated submarine (Tools/autotest/default_params/sub.parm);
-pressure as exact as a Bar30's: 2 mm (its maker's data sheet), not the 0.2 m of a barometer in the air, and
-zeroed at the surface (101,325 Pa in its simulation), as an owner does before a dive"""
+PARAMETERS = Path(__file__).resolve().parent.parent / "examples/ardusub.parm"
+"""beside ArduPilot's own defaults for its simulated submarine (Tools/autotest/default_params/sub.parm)"""
 
 
 def measure(job: Job) -> list[Row]:
@@ -70,13 +57,20 @@ def measure(job: Job) -> list[Row]:
     tree = read_tree("bt")
     still = load_config("open", "multibeam", "bluerov2_16v")
     alone = Sim(still, 1, tree)
-    rows = [*_alone(alone, binary, job), *_identified(alone, binary, job)]
+    rows = _alone(alone, binary, job)
     rows.append(_three(Sim(still, 3, tree), binary, job))
     pool = load_config(
         "pool", "multibeam", "bluerov2_16v", overrides={"world.n_dynamic": 6, "world.dynamic_speed_m_s": 0.6}
     )
     count = 1 if job.quick else int(os.environ.get(f"{BINARY}_EPISODES", "20"))
     return rows + _driven(pool, Sim(pool, 1, tree), Sim(pool, 1, tree), count, binary, job)
+
+
+def parameters(binary: str, more: dict[str, float]) -> str:
+    """A parameter file: the tree's own, ours, and ``more``."""
+    own = Path(binary).resolve().parents[3] / "Tools/autotest/default_params/sub.parm"
+    text = (own.read_text() if own.exists() else "") + "\n" + PARAMETERS.read_text()
+    return text + "".join(f"{name} {value}\n" for name, value in more.items())
 
 
 class Rig:
@@ -92,7 +86,7 @@ class Rig:
         more: dict[str, float] | None = None,
     ) -> None:
         self.water, self._binary = WaterRows(sim, seed, episode), binary
-        self._parameters = PARAMETERS | (more or {})
+        self._more = more or {}
         self.tlog = b""
         """what the first ArduSub told the operator, by the water's clock"""
         self._sim, count = sim, sim.num_envs
@@ -120,10 +114,7 @@ class Rig:
     def _started(self, row: int) -> subprocess.Popen[bytes]:
         folder = Path(self._folder.name) / f"{row}_{time.monotonic_ns()}"
         folder.mkdir()
-        own = Path(self._binary).resolve().parents[3] / "Tools/autotest/default_params/sub.parm"
-        text = own.read_text() if own.exists() else ""
-        text += "\n" + "".join(f"{name} {value}\n" for name, value in self._parameters.items())
-        (folder / "sub.parm").write_text(text)
+        (folder / "sub.parm").write_text(parameters(self._binary, self._more))
         words = [
             str(Path(self._binary).resolve()), "--model", "JSON:127.0.0.1", "--home",
             "-35.36,149.16,0,0", "--wipe", "--defaults", "sub.parm", f"-I{row}", "--sysid", str(row + 1),
@@ -179,7 +170,7 @@ class Rig:
         for row, link in enumerate(self.links):
             while (message := link.recv_match(blocking=False)) is not None:
                 kind = message.get_type()
-                if row == 0:
+                if row == 0 and kind != "BAD_DATA":  # the console's text at boot
                     stamp = round(1e6 * (TLOG_BEGINS_S + self.time_s))
                     self.tlog += struct.pack(">Q", stamp) + message.get_msgbuf()
                 if kind == "HEARTBEAT" and message.get_srcComponent() == 1:
@@ -292,74 +283,6 @@ def _alone(sim: Sim, binary: str, job: Job) -> list[Row]:
     return rows
 
 
-def _identified(sim: Sim, binary: str, job: Job) -> list[Row]:
-    """Five minutes of sticks, then ``uuv identify`` on ArduSub's own logs of it."""
-    rig = Rig(sim, binary, more={"LOG_BACKEND_TYPE": 1, "LOG_BITMASK": 4_194_303})
-    with tempfile.TemporaryDirectory() as folder:
-        try:
-            ready(rig)
-            for message in (30, 32, 36):  # ATTITUDE, LOCAL_POSITION_NED, SERVO_OUTPUT_RAW
-                rig.order(511, message, 20_000)
-            took = rig.take(MANUAL)
-            _legs(rig, 60.0 if job.quick else 300.0)
-            rig.advance(1.0)
-            files = [Path(folder) / "drive.bin", Path(folder) / "drive.tlog"]
-            files[0].write_bytes(rig.dataflash()[-1].read_bytes())
-            files[1].write_bytes(rig.tlog)
-        finally:
-            rig.close()
-        job.say(f"drive: {took}, {[file.stat().st_size for file in files]} bytes; {rig.said[-2:]}")
-        return [_identified_row(file, sim.config, job) for file in files]
-
-
-def _legs(rig: Rig, seconds: float) -> None:
-    """Each axis forth and back, alone and together, one to four seconds each."""
-    rng, sticks = np.random.default_rng(7), {"until": 0.0, "next": 0.0, "back": 0.0}
-    share = np.zeros(4)
-
-    def each(now_s: float) -> None:
-        if now_s >= sticks["until"]:
-            if sticks["back"] > 0:
-                share[:] *= -1.0
-                sticks["until"], sticks["back"] = now_s + sticks["back"], 0.0
-            else:
-                used = rng.random(4) < 0.5
-                share[:] = used * rng.choice([-1.0, 1.0], 4) * rng.uniform(0.2, 0.7, 4)
-                sticks["back"] = rng.uniform(1.0, 4.0)
-                sticks["until"] = now_s + sticks["back"]
-        if now_s >= sticks["next"]:
-            sticks["next"] = now_s + 0.05
-            rig.push(*share)
-
-    rig.advance(seconds, each)
-
-
-def _identified_row(file: Path, config: Config, job: Job) -> Row:
-    """How many of the true numbers lie within their intervals."""
-    vehicle_cfg = config.vehicle
-    true = parameters_of(vehicle_cfg)
-    told = vehicle_cfg.model_copy(
-        update={name: tuple(1.3 * v for v in getattr(vehicle_cfg, name)) for name in TOLD_WRONG}
-    )
-    found = identified(read_ardusub(file, told), told).document
-    fitted = [entry for entry in found["parameters"] if entry["fitted"]]
-    within = [entry["low"] <= true[entry["place"]] <= entry["high"] for entry in fitted]
-    for entry in fitted:
-        job.say(
-            f"{file.name} {entry['name']}: {entry['value']:.3g} [{entry['low']:.3g}, {entry['high']:.3g}], "
-            f"true {true[entry['place']]:.3g}"
-        )
-    return Row(
-        f"uuv identify, ArduSub's {file.suffix}",
-        float(sum(within)),
-        f"of {len(within)} true numbers within their interval",
-        note=f"{found['seconds']:g} s",
-        details={
-            "parameters": {e["name"]: [e["value"], e["low"], e["high"], true[e["place"]]] for e in fitted}
-        },
-    )
-
-
 def _velocity_row(rig: Rig, what: str, ahead: float, turn: float, seconds: float, took: bool) -> Row:
     spoke = {"next": 0.0}
     found: list[tuple[float, float]] = []
@@ -426,10 +349,10 @@ def _driven(config: Config, sim: Sim, flown: Sim, count: int, binary: str, job: 
             found.append(f"failed: {error}")
             job.say(f"episode {number}: {error}")
     ours = [simulated(sim, number) for number in range(count)]
-    return [_pool_row("driven by the stack through ArduSub", found), _pool_row("in uuv eval's loop", ours)]
+    return [pool_row("driven by the stack through ArduSub", found), pool_row("in uuv eval's loop", ours)]
 
 
-def _pool_row(name: str, found: list[str]) -> Row:
+def pool_row(name: str, found: list[str]) -> Row:
     count, ends = len(found), Counter(found)
     low, high = wilson_interval(ends["success"], count) or (0.0, 1.0)
     others = ", ".join(f"{end} {n}" for end, n in sorted(ends.items()) if end != "success") or "none"

@@ -1,20 +1,23 @@
 """Six random vehicles identified from five minutes of noisy simulated driving: how often the truth lies
 within the 95 % interval.
 
-Drag, added mass, net buoyancy and thruster gain differ from the vehicle that the identification is told.
-The vehicles are moved by ``Plant`` (six degrees of freedom, rotor lag, inner loop); readings have white and
-slowly varying errors, the DVL one reading in five steps.
+Drag, added mass, net buoyancy, thruster gain and rotor lag differ from the vehicle that the identification
+is told. The vehicles are moved by ``Plant`` (six degrees of freedom, rotor lag, inner loop); readings have
+delays, and white and slowly varying errors, the DVL one reading in five steps. Each drive is identified
+twice: from a log of the rotor speeds as turned, with errors, and from one of those that were commanded.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from benchmarks.common import Job, Row
-from uuvtai.config import Config
+from uuvtai.config import Config, VehicleConfig
 from uuvtai.identify.drive_log import Drive, up_axis
 from uuvtai.identify.identified import KNOWN, identified
-from uuvtai.identify.motion_model import GAIN, NET, SIZE, parameters_of
+from uuvtai.identify.motion_model import GAIN, LAG, LATE, NET, SIZE, parameters_of
 from uuvtai.loader import load_config
 from uuvtai.measure.simulate import roll_pitch_yaw
 from uuvtai.plant import Plant
@@ -24,86 +27,122 @@ VEHICLES, MINUTES, SEED = 6, 5.0, 77001
 SPREAD, GAIN_SPREAD, NET_N = 0.3, 0.1, (-4.0, 4.0)
 DVL_M_S, GYRO_RAD_S, TILT_RAD, SPEED_SHARE = (0.01, 0.004), (0.003, 0.001), (0.002, 0.003), 0.01
 """standard deviations: (white, slowly varying); of the rotor speed a share, white"""
+LAG_S, LATE_S = (0.01, 0.1), ((0.0, 0.1), (0.0, 0.02))
+"""ranges of the rotors' lag, and of the delays of DVL and gyro"""
 SLOW_S = 2.0
 EVERY = 5
 """control steps between readings of the DVL"""
 
 
 def measure(job: Job) -> list[Row]:
-    """A row for each thing that is held known: the share of true values within their intervals."""
+    """A row for each thing that is held known and each kind of log: the share of true values within their
+    intervals."""
     minutes = 1.0 if job.quick else MINUTES
     config = load_config("open", vehicle="bluerov2_16v")
-    truth, drives = driven(config, VEHICLES, minutes, SEED)
+    truth, turned, asked = driven(config, VEHICLES, minutes, SEED)
     rows = []
-    for known in KNOWN:
-        inside, widths, total = {}, {}, 0
-        for i, drive in enumerate(drives):
-            told = config.vehicle
-            if known == "buoyancy":
-                volume = (told.mass_kg + truth[i, NET] / told.gravity_m_s2) / told.water_density_kg_m3
-                told = told.model_copy(update={"volume_m3": volume})
-            if known == "added-mass":
-                told = told.model_copy(update={"added_mass": tuple(_six(truth[i, :4], told.added_mass))})
-            true = truth[i].copy()
-            if known == "gain":
-                told = told.model_copy(update={"thrust_scale": told.thrust_scale * true[GAIN]})
-                true[GAIN] = 1.0
-            found = identified([drive], told, known).document
-            for entry in found["parameters"]:
-                if not entry["fitted"]:
-                    continue
-                value = true[entry["place"]]
-                name = entry["name"]
-                inside.setdefault(name, []).append(entry["low"] <= value <= entry["high"])
-                widths.setdefault(name, []).append(0.5 * (entry["high"] - entry["low"]))
-                total += 1
-        hits = int(sum(map(sum, inside.values())))
-        table = {
-            "within the interval": {name: float(sum(found)) for name, found in inside.items()},
-            "half its width, median": {name: float(np.median(found)) for name, found in widths.items()},
-        }
-        rows.append(
-            Row(
-                f"truth within the 95 % interval, known: {known}",
-                100.0 * hits / total,
-                "%",
-                floor=95.0,
-                note=f"{hits} of {total} values, {len(drives)} vehicles, {minutes:g} minutes each",
-                details={"table": table, "hits": hits, "values": total},
-            )
-        )
-        job.say(rows[-1].note)
+    for kind, drives in (("turned", turned), ("commanded", asked)):
+        for known in KNOWN:
+            rows.append(_row(f"known: {known}, speeds as {kind}", known, config, truth, drives))
+            job.say(f"{rows[-1].what}: {rows[-1].note}; {rows[-1].details['table']}")
     return rows
+
+
+def _row(what: str, known: str, config: Config, truth: np.ndarray, drives: list[Drive]) -> Row:
+    inside, widths, total = {}, {}, 0
+    for row, drive in zip(truth, drives, strict=True):
+        told, true = _told(config, row, known)
+        for entry in identified([drive], told, known).document["parameters"]:
+            if not entry["fitted"]:
+                continue
+            value, name = true[entry["place"]], entry["name"]
+            inside.setdefault(name, []).append(entry["low"] <= value <= entry["high"])
+            widths.setdefault(name, []).append(0.5 * (entry["high"] - entry["low"]))
+            total += 1
+    hits = int(sum(map(sum, inside.values())))
+    table = {
+        "within the interval": {name: float(sum(found)) for name, found in inside.items()},
+        "half its width, median": {name: float(np.median(found)) for name, found in widths.items()},
+    }
+    return Row(
+        f"truth within the 95 % interval, {what}",
+        100.0 * hits / total,
+        "%",
+        floor=95.0,
+        note=f"{hits} of {total} values, {len(drives)} vehicles",
+        details={"table": table, "hits": hits, "values": total},
+    )
+
+
+def _told(config: Config, truth: np.ndarray, known: str) -> tuple[VehicleConfig, np.ndarray]:
+    """(the vehicle that the identification is told, the true values by its measure)"""
+    told, true = config.vehicle, truth.copy()
+    if known == "buoyancy":
+        volume = (told.mass_kg + truth[NET] / told.gravity_m_s2) / told.water_density_kg_m3
+        return told.model_copy(update={"volume_m3": volume}), true
+    if known == "added-mass":
+        return told.model_copy(update={"added_mass": tuple(_six(truth[:4], told.added_mass))}), true
+    true[GAIN] = 1.0
+    return told.model_copy(update={"thrust_scale": told.thrust_scale * truth[GAIN]}), true
 
 
 def _six(four: np.ndarray, six: tuple[float, ...]) -> list[float]:
     return [*(float(v) for v in four[:3]), *six[3:5], float(four[3])]
 
 
-def driven(config: Config, count: int, minutes: float, seed: int) -> tuple[np.ndarray, list[Drive]]:
-    """(truth (count, 14), drives): random vehicles about ``config``'s under random commands."""
+def driven(
+    config: Config, count: int, minutes: float, seed: int
+) -> tuple[np.ndarray, list[Drive], list[Drive]]:
+    """(truth (count, 17), drives, drives): random vehicles about ``config``'s under random commands, with the
+    rotor speeds as turned, and as commanded."""
     rng = np.random.default_rng(seed)
     truth = np.tile(parameters_of(config.vehicle), (count, 1))
     truth[:, :NET] *= rng.uniform(1 - SPREAD, 1 + SPREAD, (count, NET))
     truth[:, NET] = rng.uniform(*NET_N, count)
     truth[:, GAIN] = rng.uniform(1 - GAIN_SPREAD, 1 + GAIN_SPREAD, count)
+    truth[:, LAG] = rng.uniform(*LAG_S, count)
+    for place, bounds in zip(LATE, LATE_S, strict=True):
+        truth[:, place] = rng.uniform(*bounds, count)
     assert truth.shape[1] == SIZE
-    plant = Plant(config, start_taichi("cpu"), count)
-    plant.reset()
-    for i, field in enumerate(("added_mass", "linear_damping", "quadratic_damping")):
-        values = np.array([_six(row[4 * i : 4 * i + 4], getattr(config.vehicle, field)) for row in truth])
-        plant.write(getattr(plant.params, field), values)
-    weight = config.vehicle.mass_kg * config.vehicle.gravity_m_s2
-    plant.write(plant.params.buoyancy_n, weight + truth[:, NET])
-    plant.write(plant.params.thruster_gain, truth[:, GAIN, None])
-    steps = round(60 * minutes / config.episode.control_dt_s)
-    samples = []
-    for action in commands(rng, count, steps, config.episode.control_dt_s):
-        samples.append(_sample(plant))
-        plant.step(action)
-    recorded = [np.stack(column, axis=1) for column in zip(*samples, strict=True)]
     dt_s = config.episode.control_dt_s
-    return truth, [_noisy(rng, dt_s, *(column[i] for column in recorded)) for i in range(count)]
+    actions = commands(rng, count, round(60 * minutes / dt_s), dt_s)
+    arch, turned, asked = start_taichi("cpu"), [], []
+    for i, row in enumerate(truth):
+        vehicle = config.vehicle.model_copy(update={"rotor_tau_s": float(row[LAG])})
+        moved = _moved(
+            Plant(config.model_copy(update={"vehicle": vehicle}), arch, 1), row, actions[:, i : i + 1]
+        )
+        vel, rate, tilt, rpm, command = moved
+        late = [_delayed(values, row[place] / dt_s) for values, place in zip((vel, rate), LATE, strict=True)]
+        drive = _noisy(rng, dt_s, (late[0], late[1][:, 2:]), rate, tilt, rpm)
+        turned.append(drive)
+        asked.append(replace(drive, rpm=command, command="held"))
+    return truth, turned, asked
+
+
+def _moved(plant: Plant, truth: np.ndarray, actions: np.ndarray) -> list[np.ndarray]:
+    """(n, 3) velocity, (n, 3) rates, (n, 2) roll and pitch, (n, 6) rotor speeds, (n, 6) commands until the
+    next sample."""
+    plant.reset()
+    vehicle_cfg = plant.config.vehicle
+    for i, field in enumerate(("added_mass", "linear_damping", "quadratic_damping")):
+        values = _six(truth[4 * i : 4 * i + 4], getattr(vehicle_cfg, field))
+        plant.write(getattr(plant.params, field), np.array([values]))
+    weight = vehicle_cfg.mass_kg * vehicle_cfg.gravity_m_s2
+    plant.write(plant.params.buoyancy_n, np.array([weight + truth[NET]]))
+    plant.write(plant.params.thruster_gain, np.full((1, len(vehicle_cfg.thrusters)), truth[GAIN]))
+    samples = []
+    for action in actions:
+        sample = _sample(plant)
+        plant.step(action)
+        samples.append((*sample, plant.read(plant.actuation.rpm_command)))
+    return [np.concatenate(column) for column in zip(*samples, strict=True)]
+
+
+def _delayed(values: np.ndarray, steps: float) -> np.ndarray:
+    """As they were so many steps before."""
+    at = np.arange(len(values), dtype=float)
+    return np.stack([np.interp(at - steps, at, column) for column in values.T], axis=1)
 
 
 def commands(rng: np.random.Generator, count: int, steps: int, dt_s: float) -> np.ndarray:
@@ -123,25 +162,27 @@ def commands(rng: np.random.Generator, count: int, steps: int, dt_s: float) -> n
 
 def _sample(plant: Plant) -> tuple[np.ndarray, ...]:
     v = plant.vehicle
-    tilt = np.array([roll_pitch_yaw(q)[:2] for q in v.quat_wb.to_numpy().astype(float)])
-    return v.vel_b.to_numpy(), v.rate_b.to_numpy(), tilt, v.rpm.to_numpy()
+    tilt = np.array([roll_pitch_yaw(q)[:2] for q in plant.read(v.quat_wb).astype(float)])
+    return plant.read(v.vel_b), plant.read(v.rate_b), tilt, plant.read(v.rpm)
 
 
 def _noisy(
     rng: np.random.Generator,
     dt_s: float,
-    vel: np.ndarray,
+    read: tuple[np.ndarray, np.ndarray],
     rate: np.ndarray,
     tilt: np.ndarray,
     rpm: np.ndarray,
 ) -> Drive:
-    vel = vel + _errors(rng, vel.shape, DVL_M_S, dt_s)
+    """``read``: velocity (n, 3) and yaw rate (n, 1) as the instruments have them."""
+    vel = read[0] + _errors(rng, read[0].shape, DVL_M_S, dt_s)
+    turn = read[1] + _errors(rng, read[1].shape, GYRO_RAD_S, dt_s)
     rate = rate + _errors(rng, rate.shape, GYRO_RAD_S, dt_s)
     tilt = tilt + _errors(rng, tilt.shape, TILT_RAD, dt_s)
     rpm = rpm * (1 + SPEED_SHARE * rng.normal(size=rpm.shape))
     vel[np.arange(len(vel)) % EVERY != 0] = np.nan
-    velocity = np.column_stack([vel, rate[:, 2]])
-    return Drive(dt_s, velocity, rate[:, :2], up_axis(tilt[:, 0], tilt[:, 1]), rpm)
+    up = up_axis(tilt[:, 0], tilt[:, 1])
+    return Drive(dt_s, np.column_stack([vel, turn]), rate[:, :2], up, rpm)
 
 
 def _errors(

@@ -12,9 +12,20 @@ from tests.reference import logs as episode
 from uuvtai.allocation import allocation_matrices
 from uuvtai.config import VehicleConfig
 from uuvtai.identify.drive_log import Drive, DriveError, read_drives
-from uuvtai.identify.excitation import unexcited
+from uuvtai.identify.excitation import unexcited, unstepped
 from uuvtai.identify.identified import KNOWN, identified
-from uuvtai.identify.motion_model import GAIN, NET, changed, parameters_of, stretches
+from uuvtai.identify.motion_model import (
+    GAIN,
+    LAG,
+    LATE,
+    NET,
+    changed,
+    motion,
+    parameters_of,
+    readings,
+    stretches,
+)
+from uuvtai.identify.rotor_lag import mean_wrench
 from uuvtai.loader import load_config
 from uuvtai.logs.mcap_log import McapEpisodeLog
 
@@ -41,12 +52,13 @@ def thrust(rpm):
     return 0.0
 
 
-def oracle_drive(seed=5):
-    """(times, velocities (n, 4), rotor speeds (n, 6)): random rotor speeds, Fossen's equation by RK4."""
+def oracle_drive(seed=5, lag_s=TOLD.rotor_tau_s):
+    """(times, velocities (n, 4), rotor speeds (n, 6), those commanded until the next sample (n, 6)): random
+    rotor speeds, Fossen's equation by RK4."""
     rng, geometry = np.random.default_rng(seed), allocation_matrices(TOLD)[0]
     level, still, steps = np.eye(3), np.zeros(3), round(SECONDS / DT_S)
     nu, rpm, left, wanted = np.zeros(6), np.zeros(6), np.zeros(6, int), np.zeros(6)
-    speeds, rotors = [], []
+    speeds, rotors, asked = [], [], []
 
     def rate(nu, rpm):
         wrench = geometry @ [thrust(n) for n in rpm]
@@ -61,27 +73,30 @@ def oracle_drive(seed=5):
             wanted[i] = rng.choice([-2300.0, -1200.0, 0.0, 1200.0, 2300.0])
             left[i] = round(rng.uniform(0.5, 3.0) / DT_S)
         left -= 1
-        middle, end = (
-            wanted + (rpm - wanted) * math.exp(-share * DT_S / TOLD.rotor_tau_s) for share in (0.5, 1)
-        )
+        asked.append(wanted.copy())
+        middle, end = (wanted + (rpm - wanted) * math.exp(-share * DT_S / lag_s) for share in (0.5, 1))
         a = rate(nu, rpm)
         b = rate(nu + 0.5 * DT_S * a, middle)
         c = rate(nu + 0.5 * DT_S * b, middle)
         d = rate(nu + DT_S * c, end)
         nu, rpm = nu + DT_S / 6 * (a + 2 * b + 2 * c + d), end
     noisy = np.array(speeds) + NOISE * rng.normal(size=(steps, 4))
-    return np.arange(steps) * DT_S, noisy, np.array(rotors)
+    return np.arange(steps) * DT_S, noisy, np.array(rotors), np.array(asked)
 
 
 @pytest.fixture(scope="module")
 def table(tmp_path_factory):
-    """A CSV of the drive; the DVL reads at every fifth row."""
-    times, speeds, rotors = oracle_drive()
-    lines = ["t,u,v,w,r,rpm_1,rpm_2,rpm_3,rpm_4,rpm_5,rpm_6"]
+    """A CSV of the drive, rotor speeds as turned."""
+    times, speeds, rotors, _ = oracle_drive()
+    return written(tmp_path_factory.mktemp("identify") / "drive.csv", "rpm", times, speeds, rotors)
+
+
+def written(path, kind, times, speeds, rotors):
+    """A CSV; the DVL reads at every fifth row."""
+    lines = ["t,u,v,w,r," + ",".join(f"{kind}_{i}" for i in range(1, 7))]
     for k, (t, (u, v, w, r), rpm) in enumerate(zip(times, speeds, rotors, strict=True)):
         seen = f"{u:.5f},{v:.5f},{w:.5f}" if k % 5 == 0 else ",,"
         lines.append(f"{t:.2f},{seen},{r:.5f},{','.join(f'{n:.2f}' for n in rpm)}")
-    path = tmp_path_factory.mktemp("identify") / "drive.csv"
     path.write_text("\n".join(lines) + "\n")
     return path
 
@@ -92,10 +107,8 @@ def test_the_oracles_vehicle_comes_back_within_its_intervals(table, capfd):
     assert code == 0, err
     document = json.loads(text)
     assert document["stretches"] == 13 and document["known"] == "gain"
-    picked = [0, 1, 2, 5]
-    true = [*TRUE.added[picked], *TRUE.linear[picked], *TRUE.quadratic[picked], 3.0]
     inside = 0
-    for entry, value in zip(document["parameters"], true, strict=False):
+    for entry, value in zip(document["parameters"], true_row(), strict=False):
         inside += entry["low"] <= value <= entry["high"]
         assert entry["fitted"] and entry["low"] < entry["value"] < entry["high"]
         assert entry["low"] - (entry["high"] - entry["low"]) < value < 2 * entry["high"] - entry["low"], entry
@@ -122,6 +135,77 @@ def test_one_force_or_mass_has_to_be_known(table):
     with pytest.raises(DriveError, match="gain, added-mass, buoyancy"):
         identified(drives, TOLD, "mass")
     assert KNOWN == ("gain", "added-mass", "buoyancy")
+
+
+def test_the_rotors_lag_comes_back_from_commanded_speeds(tmp_path, capfd):
+    lag_s = 0.06
+    times, speeds, _, asked = oracle_drive(lag_s=lag_s)
+    speeds[2:, 3] = speeds[:-2, 3]  # a gyro that is filtered for 40 ms
+    path = written(tmp_path / "drive.csv", "asked", times, speeds, asked)
+    code, text, err = uuv(capfd, "identify", path, "--vehicle", "bluerov2", "--json")
+    assert code == 0, err
+    entries = json.loads(text)["parameters"]
+    for place, true in ((LAG, lag_s), (LATE[0], 0.0), (LATE[1], 0.04)):
+        entry, width = entries[place], entries[place]["high"] - entries[place]["low"]
+        assert entry["fitted"] and width < 0.02
+        assert entry["low"] - width < true < entry["high"] + width, entry
+    inside = sum(entries[i]["low"] <= value <= entries[i]["high"] for i, value in enumerate(true_row()))
+    assert inside >= 11
+    made = load_config("open", vehicle=str(path.with_suffix(".vehicle.yaml"))).vehicle
+    assert made.rotor_tau_s == pytest.approx(entries[LAG]["value"], abs=1e-4)
+
+
+def true_row():
+    picked = [0, 1, 2, 5]
+    return [*TRUE.added[picked], *TRUE.linear[picked], *TRUE.quadratic[picked], 3.0]
+
+
+def test_a_log_of_turned_speeds_says_nothing_of_the_lag(table):
+    document = identified(read_drives(table), TOLD).document
+    entry = document["parameters"][LAG]
+    assert not entry["fitted"] and entry["value"] == TOLD.rotor_tau_s
+    (warning,) = [text for text in document["warnings"] if text.startswith("rotor lag")]
+    assert "asked_1" in warning and "it stays that of the vehicle given" in warning
+
+
+def test_commands_that_change_slowly_do_not_show_the_lag():
+    n = 3000
+    slow = np.tile(2000 * np.sin(np.arange(n) * DT_S)[:, None], (1, 6))
+    still = np.zeros((n, 4)), np.zeros((n, 2)), np.tile([0.0, 0.0, 1.0], (n, 1))
+    assert "jump 0 times by 300 rpm" in unstepped([Drive(DT_S, *still, slow, command="held")])
+    steps = np.where(np.arange(n)[:, None] // 500 % 2 == 0, 1000.0, -1000.0) * np.ones(6)
+    assert "jump 5 times" in unstepped([Drive(DT_S, *still, steps, command="held")])
+    often = np.where(np.arange(n)[:, None] // 25 % 2 == 0, 1000.0, -1000.0) * np.ones(6)
+    assert unstepped([Drive(DT_S, *still, often, command="held")]) == ""
+
+
+@pytest.mark.parametrize("lag_s", [0.004, 0.03, 0.2])
+def test_thrust_of_a_lagging_rotor_against_small_steps(lag_s):
+    """First order between commands that jump from sample to sample."""
+    asked = np.array([0.0, 2000.0, 2000.0, -1500.0, 800.0, 800.0])[:, None] * np.ones(6)
+    blank = np.zeros((6, 4)), np.zeros((6, 2)), np.zeros((6, 3))
+    found = mean_wrench(Drive(DT_S, *blank, asked, command="held"), TOLD, np.array([lag_s]))[0]
+    turned, fine = 0.0, 2000
+    for k in range(5):
+        pushes = []
+        for _ in range(fine):
+            middle = asked[k, 0] + (turned - asked[k, 0]) * math.exp(-0.5 * DT_S / fine / lag_s)
+            turned = asked[k, 0] + (turned - asked[k, 0]) * math.exp(-DT_S / fine / lag_s)
+            pushes.append(thrust(middle))
+        assert found[k] == pytest.approx(np.mean(pushes), abs=0.25), k
+
+
+def test_a_delay_shifts_what_its_instrument_says(table):
+    given = stretches(read_drives(table), TOLD, 5.0)
+    theta, start = parameters_of(TOLD), np.full((1, len(given.velocity), 4), 0.1)
+    true = motion(theta[None], start, given, TOLD)[0]
+    theta[list(LATE)] = 3 * DT_S, 0.5 * DT_S
+    late = readings(theta[None], start, given, TOLD)[0]
+    assert np.allclose(late[:, 3:, :3], true[:, :-3, :3])
+    yaw = true[..., 3]
+    halfway = (9 * (yaw[:, 2:-2] + yaw[:, 1:-3]) - yaw[:, 3:-1] - yaw[:, :-4]) / 16
+    assert np.allclose(late[:, 2:-2, 3], halfway)
+    assert np.isnan(given.velocity[:, :8]).all(), "what a delay may have from before the stretch"
 
 
 def still_drive(**moving):
@@ -172,6 +256,7 @@ BAD_TABLES = {
     "t,u,v,w,r,rpm_1\n0,0,0,0,inf,0\n": "line 2 must hold 6 numbers",
     "t,u,v,w,r,rpm_1\n0,0,0,0,0,\n1,0,0,0,0,0\n": "only u, v, w and r may have empty cells",
     "t,u,v,w,r,rpm_1\n1,0,0,0,0,0\n1,0,0,0,0,0\n": "times must rise",
+    "t,u,v,w,r,rpm_1,asked_1\n0,0,0,0,0,0,0\n": "give one of the two",
     "": "missing: t, u, v, w, r, rpm_1",
 }
 

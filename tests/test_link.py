@@ -623,7 +623,7 @@ BASE = ["pilot", "--mavlink", "udp:127.0.0.1:14550", "--start", "2,3,-0.8", "--g
         (["--depth", "2,1"], "--depth"),
         (["--system", "255"], "--operator"),
         (["--battery", "-1"], "--battery"),
-        (["--rate", "0"], "--rate"),
+        (["--rate", "-1"], "--rate"),
         (["--seconds", "0"], "--seconds"),
         (["--heading", "400"], "--heading"),
         (["--mavlink", "serial:/dev/ttyS0"], "udp:HOST:PORT"),

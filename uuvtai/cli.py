@@ -225,7 +225,7 @@ def identify_vehicle(
     overrides: opt.Set = None,
     force: opt.IdentifyForce = False,
 ) -> None:
-    """Drag, added mass, buoyancy and thruster gain of a vehicle from logs of its drives, with intervals."""
+    """Drag, added mass, buoyancy, thruster gain and rotor lag of a vehicle from logs, with intervals."""
     from uuvtai.identify.identify_files import identify
 
     target = out or file[0].with_suffix(".vehicle.yaml")

@@ -8,7 +8,7 @@ from pathlib import Path
 from uuvtai.errors import UserError
 
 _CHECKOUT = Path(__file__).parents[1] / "examples"
-_SUFFIXES = (".py", ".yaml", ".xml", ".ipynb")
+_SUFFIXES = (".py", ".yaml", ".xml", ".ipynb", ".parm")
 
 
 class ExampleError(UserError, OSError):

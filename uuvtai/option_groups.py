@@ -11,7 +11,7 @@ import functools
 import inspect
 import json
 from collections.abc import Callable
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_origin, get_type_hints
 
@@ -332,7 +332,7 @@ class FlightGroup:
         """UsageError, LinkError."""
         from uuvtai.link.flight_plan import FlightPlan
 
-        arguments.refuse_odd_rate(self.rate, is_endless=False)
+        arguments.refuse_odd_rate(self.rate)
         return FlightPlan.typed(
             config,
             self.mavlink,
@@ -362,6 +362,7 @@ class ServedGroup:
     port: opt.SitlPort = 9002
     host: opt.SitlHost = "127.0.0.1"
     mavlink: opt.SensorPlaces = None
+    operator: opt.PlayOperator = False
     rate: opt.SitlRate = 0.0
     seconds: opt.SitlSeconds = None
     once: opt.SitlOnce = False
@@ -371,7 +372,7 @@ class ServedGroup:
         from uuvtai.sitl.serving import SitlPlan
 
         arguments.refuse_odd_rate(self.rate)
-        return SitlPlan.typed(
+        told = SitlPlan.typed(
             self.host,
             self.port,
             self.instances,
@@ -382,6 +383,7 @@ class ServedGroup:
             self.seed,
             self.episode,
         )
+        return replace(told, operator=self.operator)
 
 
 @dataclass(frozen=True)

@@ -309,7 +309,11 @@ PilotLog = Annotated[Path | None, Option("--log", help="MCAP to write \\[default
 PilotTree = Annotated[str, _tree("Who drives")]
 PilotRate = Annotated[
     float,
-    Option("--rate", help="Seconds of the vehicle's clock in one of ours: 1 but for a simulated vehicle."),
+    Option(
+        "--rate",
+        help="Seconds of the vehicle's clock in one of ours: 1 but for a simulated vehicle; 0 = follow its "
+        "clock.",
+    ),
 ]
 
 SitlPort = Annotated[int, Option("--port", min=1, max=65535, help="UDP port of the first ArduSub's physics.")]
@@ -324,6 +328,13 @@ SensorPlaces = Annotated[
         metavar="udp:HOST:PORT",
         help="Where the DVL, the sonar and the altimeter speak to (repeatable) \\[default: "
         "udp:127.0.0.1:14660 for ArduSub, udpout:127.0.0.1:14550 for uuv pilot].",
+    ),
+]
+PlayOperator = Annotated[
+    bool,
+    Option(
+        "--operator",
+        help="Be the ground station too: its heartbeat, without which the pilot stops, and ArduSub's origin.",
     ),
 ]
 SitlRate = Annotated[

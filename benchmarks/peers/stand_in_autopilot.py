@@ -22,11 +22,12 @@ _GUIDED = 4
 class StandIn:
     """One vehicle's. ``frame`` is its next packet to the physics, ``take`` the answer."""
 
-    def __init__(self, pilot: tuple[str, int]) -> None:
+    def __init__(self, pilot: tuple[str, int], operates: bool = True) -> None:
+        """``operates``: a ground station beats beside it."""
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", 0))
         self._socket.setblocking(False)
-        self._pilot, self._count = pilot, 0
+        self._pilot, self._count, self._operates = pilot, 0, operates
         self._own = mav.MAVLink(None, srcSystem=1, srcComponent=1)
         self._operator = mav.MAVLink(None, srcSystem=255, srcComponent=190)
         self._parser = mav.MAVLink(None)
@@ -88,8 +89,9 @@ class StandIn:
         if self._count % RATE_HZ == 0:
             armed = 128 if self.is_armed else 0
             self._send(mav.MAVLink_heartbeat_message(12, 3, 1 | armed, self.mode, 4, 3))
-            beat = mav.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3).pack(self._operator)
-            self._socket.sendto(beat, self._pilot)
+            if self._operates:
+                beat = mav.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3).pack(self._operator)
+                self._socket.sendto(beat, self._pilot)
 
     def _send(self, message: mav.MAVLink_message) -> None:
         self._socket.sendto(message.pack(self._own), self._pilot)

@@ -12,7 +12,14 @@ from docs.writers.benchmark_pages import benchmark, benchmark_scenes
 from docs.writers.dead_tables import dead_commands, dead_thrusters
 from docs.writers.figure_sources import Counts, SourceError, Sources, fitting, pooled, rated, share, weighted
 from docs.writers.forecast_tables import forecast_pieces, forecast_scores
-from docs.writers.link_tables import aboard, ardusub_identified, closed_loop, real_ardusub
+from docs.writers.link_tables import (
+    aboard,
+    ardusub_identified,
+    closed_loop,
+    identified_vehicles,
+    real_ardusub,
+    terminals,
+)
 from docs.writers.newcomer_tables import newcomer, newcomer_zero
 from docs.writers.pieces import BEFORE, CELLS, DASH, LETTERS, PIECES, beside
 from docs.writers.pose_tables import pose_endings, pose_errors
@@ -578,6 +585,8 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         lossy,
         closed_loop,
         real_ardusub,
+        terminals,
+        identified_vehicles,
         ardusub_identified,
         aboard,
         sonars,

@@ -1,5 +1,5 @@
 """Tables of the pages sitl, vehicle and companion, from the newest results of the benchmarks ``closed_loop``,
-``ardusub`` and ``aboard``."""
+``ardusub``, ``terminals`` and ``aboard``."""
 
 from __future__ import annotations
 
@@ -12,28 +12,60 @@ from uuvtai.tables.table import text_table
 
 def real_ardusub(sources: Sources) -> str:
     """What ArduSub itself did in our water."""
-    rows = sources.benchmark("ardusub")["rows"]
+    return _tried(sources, "ardusub")
+
+
+def _tried(sources: Sources, benchmark: str) -> str:
+    rows = [row for row in sources.benchmark(benchmark)["rows"] if "parameters" not in row["details"]]
     driven = [row for row in rows if "endings" in row["details"]]
     told = {driven[0]["what"]: f"; {_paired(driven)}"} if len(driven) == 2 else {}
     cells = [[row["what"], _result(row), row["note"] + told.get(row["what"], "")] for row in rows]
     return text_table(["tried", "result", "more"], cells)
 
 
+def terminals(sources: Sources) -> str:
+    """Water, ArduSub and pilot as three processes."""
+    return _tried(sources, "terminals")
+
+
 def ardusub_identified(sources: Sources) -> str:
     """What ``uuv identify`` made of ArduSub's own logs, beside the true numbers."""
     found = {
         row["what"].rpartition(" ")[2]: row["details"]["parameters"]
-        for row in sources.benchmark("ardusub")["rows"]
+        for row in sources.benchmark("ardusub_logs")["rows"]
         if "parameters" in row["details"]
     }
     if len(found) != 2:
-        raise SourceError("the benchmark ardusub was run without its drives for uuv identify")
+        raise SourceError("the benchmark ardusub_logs was run without ArduSub")
     names = next(iter(found.values()))
     cells = [
         [name, f"{names[name][3]:.3g}", *(_interval(entries[name]) for entries in found.values())]
         for name in names
     ]
     return text_table(["number", "true", *(f"from `{ending}`" for ending in found)], cells)
+
+
+def identified_vehicles(sources: Sources) -> str:
+    """Of how many true values of random vehicles the intervals hold the truth."""
+    cells = []
+    for row in sources.benchmark("identify")["rows"]:
+        found = row["details"]["table"]["within the interval"]
+        late = {name: hits for name, hits in found.items() if name.startswith("delay")}
+        own = {name: hits for name, hits in found.items() if name not in late}
+        count = _VEHICLES * len(own)
+        lag = found.get("rotor lag")
+        cells.append(
+            [
+                row["what"].rpartition("known: ")[2],
+                f"{sum(own.values()):.0f} of {count} = {100 * sum(own.values()) / count:.1f} %",
+                "-" if lag is None else f"{lag:.0f} of {_VEHICLES}",
+                f"{sum(late.values()):.0f} of {_VEHICLES * len(late)}",
+            ]
+        )
+    return text_table(["known, rotor speeds", "numbers of the vehicle", "of them the lag", "delays"], cells)
+
+
+_VEHICLES = 6
 
 
 def _interval(entry: list[float]) -> str:

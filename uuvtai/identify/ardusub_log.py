@@ -1,7 +1,7 @@
 """Drives out of ArduSub's own logs, by pymavlink: DataFlash (``.bin``) and what a ground station wrote down
 (``.tlog``).
 
-Pulse widths become rotor speeds by the maker's table and the vehicle's lag; velocities are the DVL's
+Pulse widths become commanded rotor speeds by the maker's table; velocities are the DVL's
 (``VISION_POSITION_DELTA``) where the log has them, else those of ArduSub's filter. ArduSub's axes are ahead,
 right, down and north, east, down.
 """
@@ -23,6 +23,7 @@ import numpy as np
 from uuvtai.config import VehicleConfig
 from uuvtai.files import open_file
 from uuvtai.identify.drive_log import Drive, DriveError, drives_of, up_axis
+from uuvtai.identify.rotor_lag import thrust_of
 from uuvtai.link.dialect import EXTRA
 from uuvtai.link.motors import NEUTRAL_US, Motors
 
@@ -34,6 +35,7 @@ _MOST_BYTES = 2 << 30
 _MOST_READINGS = 5_000_000
 _BIN_HEAD = b"\xa3\x95\x80"
 _CHANNELS = 16
+_STILL_N = 1e-6
 _FIRST_MOTOR = 33
 """SERVOn_FUNCTION of the first motor; 40 is the eighth"""
 _AUTOPILOT = 1
@@ -104,7 +106,10 @@ def read_ardusub(path: Path, vehicle_cfg: VehicleConfig) -> list[Drive]:
     times = _times(heard)
     if len(times) < 2:
         raise DriveError(f"{path}: was never armed while pulses and attitude were logged")
-    return drives_of(_rows(times, heard, vehicle_cfg), path)
+    grid = _LogTimes(times)
+    after = np.stack([grid.after(series) for series in (_velocity(heard), heard.rate)], axis=1)
+    rpm, jumped = _asked(times, heard, vehicle_cfg)
+    return drives_of(np.column_stack([_rows(times, grid, heard), rpm]), path, "line", after, jumped)
 
 
 def _velocity(heard: _Heard) -> _Readings:
@@ -128,19 +133,17 @@ def _times(heard: _Heard) -> np.ndarray:
     return times[kept]
 
 
-def _rows(times: np.ndarray, heard: _Heard, vehicle_cfg: VehicleConfig) -> np.ndarray:
-    """(n, 10 + thrusters) as ``drives_of`` wants them."""
+def _rows(times: np.ndarray, grid: _LogTimes, heard: _Heard) -> np.ndarray:
+    """(n, 10) as ``drives_of`` wants them, without rotor speeds."""
     angle, rate = _unwound(heard.angle).at(times), heard.rate.at(times)
-    grid = _LogTimes(times)
     if _velocity(heard) is heard.dvl:
         velocity = grid.near(heard.dvl)
     else:
         velocity = _to_body(grid.near(heard.filtered), angle)
     turn = grid.near(heard.rate)[:, 2]
     up = up_axis(angle[:, 0], -angle[:, 1])
-    rpm = _turned(grid, heard, vehicle_cfg)
     flipped = [velocity[:, 0], -velocity[:, 1], -velocity[:, 2], -turn, rate[:, 0], -rate[:, 1]]
-    return np.column_stack([times, *flipped, up, rpm])
+    return np.column_stack([times, *flipped, up])
 
 
 class _LogTimes:
@@ -154,6 +157,15 @@ class _LogTimes:
     def near(self, series: _Readings) -> np.ndarray:
         """Readings at the rows next to them."""
         return series.near(self.whole)[self.rows]
+
+    def after(self, series: _Readings) -> np.ndarray:
+        """(n,) [s] by how much later than its row each of them was read; 0 where there is none."""
+        known = np.array(series.time_s)
+        place = np.rint((known - self.whole[0]) / STEP_S).astype(int)
+        inside = (place >= 0) & (place < len(self.whole))
+        found = np.zeros(len(self.whole))
+        found[place[inside]] = known[inside] - self.whole[place[inside]]
+        return found[self.rows]
 
 
 def _unwound(series: _Readings) -> _Readings:
@@ -172,15 +184,17 @@ def _to_body(velocity: np.ndarray, angle: np.ndarray) -> np.ndarray:
     return np.stack([ahead, right, below], axis=1)
 
 
-def _turned(grid: _LogTimes, heard: _Heard, vehicle_cfg: VehicleConfig) -> np.ndarray:
-    """(n, thrusters) [rpm] as turned: what the pulses ask for, behind by the vehicle's own lag."""
-    motors, pulse = Motors(vehicle_cfg), heard.pulse.at(grid.whole)
-    asked = np.array([motors.rpm(_by_motor(row, heard.parameters)) for row in pulse])
-    kept = math.exp(-STEP_S / vehicle_cfg.rotor_tau_s)
-    turned = asked.copy()
-    for i in range(1, len(turned)):
-        turned[i] = asked[i] + kept * (turned[i - 1] - asked[i])
-    return turned[grid.rows]
+def _asked(times: np.ndarray, heard: _Heard, vehicle_cfg: VehicleConfig) -> tuple[np.ndarray, np.ndarray]:
+    """(n, thrusters) and (n, thrusters) [rpm] asked for. Between two messages thrust goes on a straight line:
+    so it does in the mean over all moments at which a stick may have been pushed. Or it jumps halfway."""
+    motors, known = Motors(vehicle_cfg), np.array(heard.pulse.time_s)
+    speeds = np.array([motors.rpm(_by_motor(np.array(row), heard.parameters)) for row in heard.pulse.values])
+    thrust = thrust_of(speeds, vehicle_cfg)
+    pushed = np.stack([np.interp(times, known, column) for column in thrust.T], axis=1)
+    table = np.arange(-motors.most_rpm, motors.most_rpm + 1.0)
+    found = np.interp(pushed, thrust_of(table, vehicle_cfg), table)
+    nearest = np.searchsorted(0.5 * (known[1:] + known[:-1]), times + 0.5 * STEP_S)
+    return np.where(np.abs(pushed) < _STILL_N, 0.0, found), speeds[nearest]
 
 
 def _by_motor(pulse: np.ndarray, parameters: dict[str, float]) -> list[float]:

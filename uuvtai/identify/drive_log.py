@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -19,6 +20,9 @@ _MAX_SAMPLES = 2_000_000
 _GAP = 0.3
 """A step that differs from the usual one by more than this share parts a log in two."""
 _NEEDED = ("t", "u", "v", "w", "r")
+
+
+Command = Literal["", "held", "line"]
 
 
 class DriveError(UserError, ValueError):
@@ -38,27 +42,52 @@ class Drive:
     """(n, 3) world z axis in body axes"""
     rpm: np.ndarray
     """(n, thrusters) rotor speeds, as turned"""
+    command: Command = ""
+    """whether they are as commanded instead: each ``held`` until the next sample, or on a ``line`` to it"""
+    after: np.ndarray | None = None
+    """(n, 2) [s] by how much later than their sample velocity and yaw rate were read; None = not at all"""
+
+    jumped: np.ndarray | None = None
+    """(n, thrusters) commands held until the next sample, as they were if each jumped halfway between two
+    messages of the log, of which ``rpm`` takes a line; None = the log leaves nothing open"""
+
+    @property
+    def is_asked(self) -> bool:
+        """Whether rotor speeds are as commanded."""
+        return self.command != ""
 
 
 def read_drives(path: Path, truth: bool = False) -> list[Drive]:
     """The drives of a file: ``.csv``, else MCAP. ``truth``: what a log of ours says of the truth, in place of
     what the instruments said. Raises DriveError, FileError, LogError."""
-    return drives_of(_table(path) if path.suffix.lower() == ".csv" else _log(path, truth), path)
+    if path.suffix.lower() != ".csv":
+        return drives_of(_log(path, truth), path)
+    rows, is_asked = _table(path)
+    return drives_of(rows, path, "held" if is_asked else "")
 
 
-def drives_of(rows: np.ndarray, path: Path) -> list[Drive]:
+def drives_of(
+    rows: np.ndarray,
+    path: Path,
+    command: Command = "",
+    after: np.ndarray | None = None,
+    jumped: np.ndarray | None = None,
+) -> list[Drive]:
     """Rows (n, 10 + thrusters) of a file, cut where samples are missing: time, velocity (3) and yaw rate,
-    rates of roll and pitch, world z axis in body axes, rotor speeds. Raises DriveError."""
+    rates of roll and pitch, world z axis in body axes, rotor speeds; ``command``, ``after`` (n, 2) and
+    ``jumped`` as in ``Drive``. Raises DriveError."""
     time_s = rows[:, 0]
     if len(rows) < 2 or not np.isfinite(time_s).all() or (np.diff(time_s) <= 0).any():
         raise DriveError(f"{path}: times must rise from row to row; give a log of one drive")
     dt_s = float(np.median(np.diff(time_s)))
     cuts = np.flatnonzero(np.abs(np.diff(time_s) / dt_s - 1) > _GAP) + 1
-    return [_drive(part, dt_s) for part in np.split(rows, cuts) if len(part) > 1]
-
-
-def _drive(rows: np.ndarray, dt_s: float) -> Drive:
-    return Drive(dt_s, rows[:, 1:5], rows[:, 5:7], rows[:, 7:10], rows[:, 10:])
+    late = np.zeros((len(rows), 2)) if after is None else after
+    other = [None] * (len(cuts) + 1) if jumped is None else np.split(jumped, cuts)
+    return [
+        Drive(dt_s, part[:, 1:5], part[:, 5:7], part[:, 7:10], part[:, 10:], command, own, jumps)
+        for part, own, jumps in zip(np.split(rows, cuts), np.split(late, cuts), other, strict=True)
+        if len(part) > 1
+    ]
 
 
 def up_axis(roll: np.ndarray, pitch: np.ndarray) -> np.ndarray:
@@ -103,19 +132,26 @@ def _up_of(quaternion: Sequence[float]) -> list[float]:
 # ---------------------------------------------------------------------------------------------------- tables
 
 
-def _table(path: Path) -> np.ndarray:
+def _table(path: Path) -> tuple[np.ndarray, bool]:
+    """(rows, whether their rotor speeds are as commanded)"""
     try:
         text = read_text(path, _MAX_CSV_BYTES)
     except (FileNotFoundError, NotADirectoryError, PermissionError) as error:
         raise DriveError(f"{path}: cannot be read ({error.strerror}); give a log, .mcap or .csv") from None
     lines = csv.reader(text.splitlines())
     head = [name.strip() for name in next(lines, [])]
-    thrusters = [name for name in head if name.startswith("rpm_")]
+    asked, turned = ([name for name in head if name.startswith(prefix)] for prefix in ("asked_", "rpm_"))
+    if asked and turned:
+        raise DriveError(
+            f"{path}: names rotor speeds as turned (rpm_1, ..) and as commanded (asked_1, ..); give one of "
+            "the two"
+        )
+    thrusters = turned or asked
     missing = [name for name in _NEEDED if name not in head] + ([] if thrusters else ["rpm_1"])
     if missing or len(set(head)) < len(head):
         raise DriveError(
-            f"{path}: its first line must name the columns t,u,v,w,r,rpm_1,rpm_2,.. once each (also p,q,roll,"
-            f"pitch); missing: {', '.join(missing) or 'none'}"
+            f"{path}: its first line must name the columns t,u,v,w,r,rpm_1,rpm_2,.. (or asked_1,..) once "
+            f"each (also p,q,roll,pitch); missing: {', '.join(missing) or 'none'}"
         )
     values = np.array([_numbers(path, number, row, len(head)) for number, row in enumerate(lines, 2) if row])
     if not len(values):
@@ -129,7 +165,7 @@ def _table(path: Path) -> np.ndarray:
     inputs = np.column_stack([p, q, up_axis(roll, pitch), *rpm])
     if not np.isfinite(inputs).all():
         raise DriveError(f"{path}: only u, v, w and r may have empty cells (no reading); fill the others")
-    return np.column_stack([*seen, inputs])
+    return np.column_stack([*seen, inputs]), bool(asked)
 
 
 def _numbers(path: Path, number: int, row: list[str], width: int) -> list[float]:

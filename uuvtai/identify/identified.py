@@ -11,16 +11,18 @@ import numpy as np
 
 from uuvtai.config import VehicleConfig
 from uuvtai.identify.drive_log import Drive, DriveError
-from uuvtai.identify.excitation import LEAST_STRETCHES, MORE, unexcited
+from uuvtai.identify.excitation import LEAST_STRETCHES, MORE, unexcited, unstepped
 from uuvtai.identify.motion_model import (
     AXES,
     GAIN,
+    LAG,
+    LATE,
     NET,
     SIZE,
     Stretches,
     changed,
-    motion,
     parameters_of,
+    readings,
     stretches,
 )
 from uuvtai.identify.output_error import SCALE, Fit, fitted, horizon_errors
@@ -35,6 +37,14 @@ _HELD_OUT = 5
 """one stretch in so many is predicted by a fit to the others"""
 _LOOSE = 0.5
 """An interval wider than this share of the value, to either side, is warned of."""
+_OTHERS = {
+    NET: ("net buoyancy", "N"),
+    GAIN: ("thruster gain", ""),
+    LAG: ("rotor lag", "s"),
+    LATE[0]: ("delay, velocity", "s"),
+    LATE[1]: ("delay, yaw rate", "s"),
+}
+"""name and unit of what no axis has"""
 _UNITS = ("kg", "N s/m", "N s2/m2"), ("kg m2", "N m s", "N m s2")
 
 
@@ -68,10 +78,13 @@ def identified(drives: list[Drive], vehicle_cfg: VehicleConfig, known: str = "ga
     idle = unexcited(given)
     if len(idle) == len(AXES):
         raise DriveError(f"the logs excite no axis; {'; '.join(idle.values())}")
-    first, free = parameters_of(vehicle_cfg), _free(idle, known)
+    lagless = unstepped(drives)
+    first, free = parameters_of(vehicle_cfg), _free(idle, known, not lagless)
     fit = fitted(given, vehicle_cfg, first, free)
     entries = [_entry(place, first, fit, bool(free[place])) for place in range(SIZE)]
     warnings = [f"{text}; its numbers stay those of the vehicle given" for text in idle.values()]
+    if lagless:
+        warnings.append(f"rotor lag: {lagless}; it stays that of the vehicle given")
     warnings += [text for entry in entries if (text := _warning(entry))]
     document: dict[str, Any] = {
         "known": known,
@@ -79,16 +92,18 @@ def identified(drives: list[Drive], vehicle_cfg: VehicleConfig, known: str = "ga
         "stretches": count,
         "parameters": entries,
         "residual_rms": dict(zip(AXES, fit.noise.tolist(), strict=True)),
-        "horizons": _horizons(given, vehicle_cfg, first, free),
+        "horizons": _horizons(given, vehicle_cfg, (first, fit.value), free),
         "warnings": warnings,
     }
-    predicted = motion(fit.value[None], fit.start[None], given, vehicle_cfg)[0]
+    given = given.at_lag(fit.value[LAG], vehicle_cfg)
+    predicted = readings(fit.value[None], fit.start[None], given, vehicle_cfg)[0]
     return Identified(document, changed(vehicle_cfg, fit.value), given.velocity, predicted, given.dt_s)
 
 
-def _free(idle: dict[str, str], known: str) -> np.ndarray:
-    """(14,) which parameters are fitted."""
-    free = np.array([axis not in idle for _ in KINDS for axis in AXES] + [True, True])
+def _free(idle: dict[str, str], known: str, shows_lag: bool) -> np.ndarray:
+    """(17,) which parameters are fitted."""
+    late = [any(axis not in idle for axis in axes) for axes in (AXES[:3], AXES[3:])]
+    free = np.array([axis not in idle for _ in KINDS for axis in AXES] + [True, True, shows_lag, *late])
     if known == "gain":
         free[GAIN] = False
     elif known == "buoyancy":
@@ -103,8 +118,8 @@ def _entry(place: int, first: np.ndarray, fit: Fit, is_fitted: bool) -> dict[str
         kind, axis = KINDS[place // 4], AXES[place % 4]
         name, unit = f"{kind}, {axis}", _UNITS[axis == "yaw"][place // 4]
     else:
-        kind = "net buoyancy" if place == NET else "thruster gain"
-        name, unit = kind, "N" if place == NET else ""
+        name, unit = _OTHERS[place]
+        kind = name.partition(",")[0]
     return {
         "name": name,
         "kind": kind,
@@ -126,17 +141,22 @@ def _warning(entry: dict[str, Any]) -> str:
     size = max(abs(entry["value"]), abs(entry["given"]), float(SCALE[entry["place"]]))
     if half > _LOOSE * size:
         return f"{entry['name']}: known to {half:.2g} {entry['unit']} only; {MORE[entry['kind']]}"
-    if entry["value"] < 0 and entry["place"] != NET:
+    if entry["value"] < 0 and entry["place"] not in (NET, *LATE):
         return f"{entry['name']}: came out negative, 0 is written; {MORE[entry['kind']]}"
     return ""
 
 
 def _horizons(
-    given: Stretches, vehicle_cfg: VehicleConfig, first: np.ndarray, free: np.ndarray
+    given: Stretches,
+    vehicle_cfg: VehicleConfig,
+    values: tuple[np.ndarray, np.ndarray],
+    free: np.ndarray,
 ) -> dict[str, Any]:
-    """Rms errors ahead on stretches that a fit of its own has not seen, beside the vehicle given."""
+    """Rms errors ahead on stretches that a fit of its own has not seen, beside the vehicle given. ``values``:
+    of that vehicle, and of the fit to all stretches, where this one sets out."""
     held = np.arange(len(given.velocity)) % _HELD_OUT == _HELD_OUT - 1
-    fit = fitted(given.some(~held), vehicle_cfg, first, free)
+    first, found = values
+    fit = fitted(given.some(~held), vehicle_cfg, found, free)
     unseen = given.some(held)
     models = {"identified": fit.value, "given": first}
     return {

@@ -1,28 +1,37 @@
 """The motion that is fitted: Fossen's equation in surge, sway, heave and yaw, with measured roll, pitch and
-thrust as inputs (T. Fossen, Handbook of Marine Craft, 2011). NumPy, many parameter sets at once."""
+thrust as inputs (T. Fossen, Handbook of Marine Craft, 2011). NumPy, many parameter sets at once.
+
+What an instrument says at a moment is what was so a little earlier (filters, averages, transport), so each of
+the two, of velocity and of yaw rate, has a delay of its own.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from uuvtai.allocation import allocation_matrices
 from uuvtai.config import VehicleConfig
 from uuvtai.identify.drive_log import Drive, DriveError
-from uuvtai.kernels.vehicle.rotor import KGF, edge_rpm
+from uuvtai.identify.rotor_lag import LEAST_LAG_S, mean_wrench
 
 AXES = ("surge", "sway", "heave", "yaw")
 _OF_SIX = (0, 1, 2, 5)
 """where those stand among six"""
 NET, GAIN = 12, 13
 """places of net buoyancy and gain, behind added mass, linear and quadratic damping of the four axes"""
-SIZE = 14
+LAG, LATE = 14, (15, 16)
+"""of the rotors' lag, and of the delays of velocity and yaw rate [s]"""
+SIZE = 17
 _LONGEST_STEP_S = 0.025
 _FAST = 20.0
 """[m/s, rad/s] a trial's motion ends here"""
-_INSTANTS = (0.125, 0.375, 0.625, 0.875)
-"""of a step, at which thrust is taken"""
+_LAG_STEP_S = 1e-3
+_LATEST_S = 0.15
+"""readings at the begin of a stretch that a delay may have from before it; they are left out"""
+_READ = (slice(0, 3), slice(3, 4))
+"""axes of the two instruments"""
 
 
 @dataclass(frozen=True)
@@ -37,26 +46,52 @@ class Stretches:
     up: np.ndarray
     """(s, n, 3) likewise"""
     wrench: np.ndarray
-    """(s, n, 4) mean of each step by the vehicle's own thrust curve [N, N m]"""
+    """(s, n, 4) mean of each step by the vehicle's own thrust curve [N, N m], with the lag ``lag_s``"""
+    slope: np.ndarray
+    """(s, n, 4) its change with the lag [N/s, N m/s]"""
+    lag_s: float
+    after: np.ndarray
+    """(s, n + 1, 2) [s] by how much later than their sample velocity and yaw rate were read"""
+    cuts: tuple[tuple[Drive, int], ...]
+    """where each was cut from, and at which step it begins"""
 
     def some(self, which: np.ndarray) -> Stretches:
         """These of them."""
-        return Stretches(
-            self.dt_s, self.velocity[which], self.tilt_rate[which], self.up[which], self.wrench[which]
-        )
+        names = ("velocity", "tilt_rate", "up", "wrench", "slope", "after")
+        kept = np.arange(len(self.velocity))[which]
+        cuts = tuple(self.cuts[i] for i in kept.tolist())
+        return replace(self, cuts=cuts, **{name: getattr(self, name)[kept] for name in names})
+
+    def jumped(self, vehicle_cfg: VehicleConfig) -> Stretches:
+        """The same driven by the other reading of the log's commands, ``Drive.jumped``."""
+        cuts = self.cuts
+        if any(drive.jumped is None for drive, _ in cuts):
+            return self
+        made = {id(drive): replace(drive, rpm=drive.jumped, command="held") for drive, _ in cuts}
+        other = tuple((made[id(drive)], begin) for drive, begin in cuts)
+        found = _wrenches(other, self.wrench.shape[1], self.lag_s, vehicle_cfg)
+        return replace(self, wrench=found[0], slope=found[1], cuts=other)
+
+    def at_lag(self, lag_s: float, vehicle_cfg: VehicleConfig) -> Stretches:
+        """The same with the wrench of another lag."""
+        lag_s = max(lag_s, LEAST_LAG_S)
+        if lag_s == self.lag_s or not any(drive.is_asked for drive, _ in self.cuts):
+            return self
+        found = _wrenches(self.cuts, self.wrench.shape[1], lag_s, vehicle_cfg)
+        return replace(self, wrench=found[0], slope=found[1], lag_s=lag_s)
 
 
 def parameters_of(vehicle_cfg: VehicleConfig) -> np.ndarray:
-    """(14,) of a vehicle."""
+    """(17,) of a vehicle; instruments without delay."""
     rows = (vehicle_cfg.added_mass, vehicle_cfg.linear_damping, vehicle_cfg.quadratic_damping)
     net = vehicle_cfg.gravity_m_s2 * (
         vehicle_cfg.water_density_kg_m3 * vehicle_cfg.volume_m3 - vehicle_cfg.mass_kg
     )
-    return np.array([*(row[i] for row in rows for i in _OF_SIX), net, 1.0])
+    return np.array([*(row[i] for row in rows for i in _OF_SIX), net, 1.0, vehicle_cfg.rotor_tau_s, 0.0, 0.0])
 
 
 def changed(vehicle_cfg: VehicleConfig, found: np.ndarray) -> dict[str, object]:
-    """Keys of the vehicle section that ``found`` (14,) changes; negative damping and added mass become 0."""
+    """Keys of the vehicle section that ``found`` (17,) changes; negative damping and added mass become 0."""
     keys: dict[str, object] = {}
     for row, name in enumerate(("added_mass", "linear_damping", "quadratic_damping")):
         values = list(getattr(vehicle_cfg, name))
@@ -66,6 +101,8 @@ def changed(vehicle_cfg: VehicleConfig, found: np.ndarray) -> dict[str, object]:
     heavy = vehicle_cfg.mass_kg + float(found[NET]) / vehicle_cfg.gravity_m_s2
     keys["volume_m3"] = round(heavy / vehicle_cfg.water_density_kg_m3, 8)
     keys["thrust_scale"] = round(vehicle_cfg.thrust_scale * float(found[GAIN]), 5)
+    if found[LAG] != vehicle_cfg.rotor_tau_s:
+        keys["rotor_tau_s"] = round(max(LEAST_LAG_S, float(found[LAG])), 5)
     return keys
 
 
@@ -74,66 +111,97 @@ def stretches(drives: list[Drive], vehicle_cfg: VehicleConfig, seconds: float) -
     dt_s = drives[0].dt_s
     n = max(2, round(seconds / dt_s))
     parts: list[tuple[np.ndarray, ...]] = []
+    cuts: list[tuple[Drive, int]] = []
     for drive in drives:
         if abs(drive.dt_s / dt_s - 1) > 0.02:
             raise DriveError(
                 f"one log has a sample every {dt_s:g} s, another every {drive.dt_s:g} s: identify them apart"
             )
-        wrench = _wrench(drive, vehicle_cfg)
+        if drive.rpm.shape[1] != len(vehicle_cfg.thrusters):
+            raise DriveError(
+                f"the log has {drive.rpm.shape[1]} thrusters, the vehicle {len(vehicle_cfg.thrusters)}: name "
+                "the one that was driven, --vehicle NAME"
+            )
+        after = np.zeros((len(drive.rpm), 2)) if drive.after is None else drive.after
         middle = [0.5 * (a[1:] + a[:-1]) for a in (drive.tilt_rate, drive.up)]
-        for begin in range(0, len(wrench) - n + 1, n):
+        for begin in range(0, len(drive.rpm) - n, n):
             cut = slice(begin, begin + n)
-            parts.append((drive.velocity[begin : begin + n + 1], *(a[cut] for a in (*middle, wrench))))
+            whole = slice(begin, begin + n + 1)
+            seen = drive.velocity[whole].copy()
+            seen[: 1 + round(_LATEST_S / dt_s)] = np.nan
+            parts.append((after[whole], seen, *(a[cut] for a in middle)))
+            cuts.append((drive, begin))
     if not parts:
         raise DriveError(f"no log lasts {seconds:g} s without a gap: drive for five minutes")
-    return Stretches(dt_s, *(np.stack(rows) for rows in zip(*parts, strict=True)))
+    lag_s = vehicle_cfg.rotor_tau_s
+    wrench, slope = _wrenches(tuple(cuts), n, lag_s, vehicle_cfg)
+    late, velocity, tilt_rate, up = (np.stack(row) for row in zip(*parts, strict=True))
+    return Stretches(dt_s, velocity, tilt_rate, up, wrench, slope, lag_s, late, tuple(cuts))
 
 
-def _wrench(drive: Drive, vehicle_cfg: VehicleConfig) -> np.ndarray:
-    """(n - 1, 4) mean force and moment of each step: rotors approach their next speed as their lag has it."""
-    count = drive.rpm.shape[1]
-    if count != len(vehicle_cfg.thrusters):
-        raise DriveError(
-            f"the log has {count} thrusters, the vehicle {len(vehicle_cfg.thrusters)}: name the one that was "
-            "driven, --vehicle NAME"
-        )
-    lag = drive.dt_s / vehicle_cfg.rotor_tau_s
-    before, after = drive.rpm[:-1], drive.rpm[1:]
-    thrust = np.zeros_like(before)
-    for instant in _INSTANTS:
-        share = -np.expm1(-instant * lag) / -np.expm1(-lag)
-        thrust += thrust_of(before + share * (after - before), vehicle_cfg) / len(_INSTANTS)
+def _wrenches(
+    cuts: tuple[tuple[Drive, int], ...], steps: int, lag_s: float, vehicle_cfg: VehicleConfig
+) -> tuple[np.ndarray, np.ndarray]:
+    """(s, n, 4) and (s, n, 4): the mean of each step, and its change with the lag."""
     geometry, _ = allocation_matrices(vehicle_cfg)
-    return thrust @ geometry[list(_OF_SIX)].T
-
-
-def thrust_of(rpm: np.ndarray, vehicle_cfg: VehicleConfig) -> np.ndarray:
-    """[N] of rotors, as the simulator has it."""
-    ahead = edge_rpm(vehicle_cfg.thrust_forward, vehicle_cfg.dead_band_rpm[0], 1.0)
-    astern = edge_rpm(vehicle_cfg.thrust_reverse, vehicle_cfg.dead_band_rpm[1], -1.0)
-    forward, reverse = (np.polyval(c, rpm) for c in (vehicle_cfg.thrust_forward, vehicle_cfg.thrust_reverse))
-    return (
-        KGF
-        * vehicle_cfg.thrust_scale
-        * np.where(rpm >= ahead, forward, np.where(rpm <= astern, reverse, 0.0))
-    )
+    across = geometry[list(_OF_SIX)].T
+    of_drive = {}
+    for drive, _ in cuts:
+        if id(drive) not in of_drive:
+            thrust = mean_wrench(drive, vehicle_cfg, np.array([lag_s, lag_s + _LAG_STEP_S]))
+            of_drive[id(drive)] = thrust @ across
+    rows = np.stack([of_drive[id(drive)][:, begin : begin + steps] for drive, begin in cuts], axis=1)
+    slope = (rows[1] - rows[0]) / _LAG_STEP_S
+    return rows[0], slope if any(drive.is_asked for drive, _ in cuts) else np.zeros_like(slope)
 
 
 def motion(theta: np.ndarray, start: np.ndarray, given: Stretches, vehicle_cfg: VehicleConfig) -> np.ndarray:
-    """Velocities (runs, s, n + 1, 4) of each parameter set ``theta`` (runs, 14), from ``start`` (runs, s, 4)
-    on."""
+    """Velocities (runs, s, n + 1, 4) of each parameter set ``theta`` (runs, 17), from ``start`` (runs, s, 4)
+    on. Lags near that of ``given``."""
     steps = given.wrench.shape[1]
     parts = max(1, int(np.ceil(given.dt_s / _LONGEST_STEP_S)))
     dt = given.dt_s / parts
     out = np.empty((*start.shape[:2], steps + 1, 4))
     x = out[:, :, 0] = start
+    later = (theta[:, LAG] - given.lag_s)[:, None, None]
     for k in range(steps):
-        inputs = (given.wrench[:, k], given.tilt_rate[:, k], given.up[:, k])
+        wrench = given.wrench[:, k] + later * given.slope[:, k]
+        inputs = (wrench, given.tilt_rate[:, k], given.up[:, k])
         for _ in range(parts):
             half = x + 0.5 * dt * _acceleration(theta, x, inputs, vehicle_cfg)
             x = np.clip(x + dt * _acceleration(theta, half, inputs, vehicle_cfg), -_FAST, _FAST)
         out[:, :, k + 1] = x
     return out
+
+
+def readings(
+    theta: np.ndarray, start: np.ndarray, given: Stretches, vehicle_cfg: VehicleConfig
+) -> np.ndarray:
+    """What the instruments say of ``motion``, (runs, s, n + 1, 4): each late by its delay."""
+    out = motion(theta, start, given, vehicle_cfg)
+    for place, after, axes in zip(LATE, np.moveaxis(given.after, 2, 0), _READ, strict=True):
+        for run, late_s in enumerate(theta[:, place].tolist()):
+            if late_s != 0.0 or after.any():
+                out[run, :, :, axes] = _earlier(out[run, :, :, axes], (late_s - after) / given.dt_s)
+    return out
+
+
+def _earlier(rows: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """(s, n, k) as they were so many steps (s, n) before: cubics through four samples, for straight lines
+    would smooth what a quick instrument sees."""
+    at = np.arange(rows.shape[1]) - steps
+    first = np.clip(np.floor(at).astype(int) - 1, 0, rows.shape[1] - 4)
+    x = (at - first)[..., None]
+    weights = (
+        -(x - 1) * (x - 2) * (x - 3) / 6,
+        x * (x - 2) * (x - 3) / 2,
+        -x * (x - 1) * (x - 3) / 2,
+        x * (x - 1) * (x - 2) / 6,
+    )
+    found = np.zeros_like(rows)
+    for i, weight in enumerate(weights):
+        found += weight * np.take_along_axis(rows, first[..., None] + i, axis=1)
+    return found
 
 
 def _acceleration(

@@ -8,16 +8,22 @@ may be correlated within it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from uuvtai.config import VehicleConfig
-from uuvtai.identify.motion_model import AXES, SIZE, Stretches, motion
+from uuvtai.identify.motion_model import AXES, LAG, SIZE, Stretches, motion, readings
 
-SCALE = np.array([1.0] * 3 + [0.05] + [1.0] * 3 + [0.05] + [5.0] * 3 + [0.3] + [0.5, 0.1])
+SCALE = np.array(
+    [1.0] * 3 + [0.05] + [1.0] * 3 + [0.05] + [5.0] * 3 + [0.3] + [0.5, 0.1] + [0.02, 0.01, 0.01]
+)
 """size of a step of each parameter"""
 _ROUNDS, _SETTLED = 25, 1e-4
+_WEIGHED = (1, 3)
+"""rounds after which readings are weighed anew, by what is left"""
+_NOTHING = 0.1
+"""change of the sum of squares, in units of noise, that moves no parameter by a part of its interval"""
 _DRAWS = 2000
 _LEVEL = (2.5, 97.5)
 _NOISE = 0.02
@@ -28,9 +34,9 @@ class Fit:
     """What least squares found."""
 
     value: np.ndarray
-    """(14,)"""
+    """(17,)"""
     low: np.ndarray
-    """(14,) of the 95 % interval; where nothing was fitted, the value itself"""
+    """(17,) of the 95 % interval; where nothing was fitted, the value itself"""
     high: np.ndarray
     start: np.ndarray
     """(s, 4) initial velocity of each stretch"""
@@ -41,15 +47,18 @@ class Fit:
 def fitted(
     given: Stretches, vehicle_cfg: VehicleConfig, first: np.ndarray, free: np.ndarray, seed: int = 0
 ) -> Fit:
-    """Fit the parameters ``free`` (14, bool), from ``first`` (14,) on; the others stay."""
+    """Fit the parameters ``free`` (17, bool), from ``first`` (17,) on; the others stay."""
     value, start = first.copy(), _first_readings(given)
     noise = np.full(len(AXES), _NOISE)
     fault = np.inf
     back = (value, start)
     shrink = 1.0
     for i in range(_ROUNDS):
+        given = given.at_lag(value[LAG], vehicle_cfg)
         jacobian, own, rest = _linearised(given, vehicle_cfg, value, start, free, noise)
         now = float(np.sum(rest**2))
+        if i > _WEIGHED[-1] + 1 and abs(now - fault) < _NOTHING:
+            break
         if now > fault * (1 + 1e-9) and shrink > 0.1:
             shrink *= 0.5
             value, start = (old + 0.5 * (new - old) for old, new in zip(back, (value, start), strict=True))
@@ -60,17 +69,21 @@ def fitted(
         value = value.copy()
         value[free] += step * SCALE[free]
         start = start + moved
-        if settled or i == 1:
+        if settled or i in _WEIGHED:
+            given = given.at_lag(value[LAG], vehicle_cfg)
             noise = _left(given, vehicle_cfg, value, start)
             fault = np.inf
-        if settled and i > 2:
+        if settled and i > _WEIGHED[-1]:
             break
+    given = given.at_lag(value[LAG], vehicle_cfg)
     jacobian, own, rest = _linearised(given, vehicle_cfg, value, start, free, noise)
     low, high = _bootstrap(jacobian, own, rest, seed)
+    apart = _left_open(given, vehicle_cfg, (value, start), noise, jacobian, own)
+    low, high = low - apart, high + apart
     bounds = [value.copy(), value.copy()]
     for bound, apart in zip(bounds, (low, high), strict=True):
         bound[free] += apart * SCALE[free]
-    return Fit(value, bounds[0], bounds[1], start, noise)
+    return Fit(value, bounds[0], bounds[1], start, _left(given, vehicle_cfg, value, start))
 
 
 def _first_readings(given: Stretches) -> np.ndarray:
@@ -81,7 +94,7 @@ def _first_readings(given: Stretches) -> np.ndarray:
 
 
 def _left(given: Stretches, vehicle_cfg: VehicleConfig, value: np.ndarray, start: np.ndarray) -> np.ndarray:
-    away = given.velocity - motion(value[None], start[None], given, vehicle_cfg)[0]
+    away = given.velocity - readings(value[None], start[None], given, vehicle_cfg)[0]
     seen = ~np.isnan(away)
     count = np.maximum(1, seen.sum(axis=(0, 1)))
     return np.maximum(1e-5, np.sqrt(np.square(np.where(seen, away, 0.0)).sum(axis=(0, 1)) / count))
@@ -105,7 +118,7 @@ def _linearised(
         theta[1 + i, place] += small * SCALE[place]
     for axis in range(len(AXES)):
         begin[1 + len(places) + axis, :, axis] += small
-    moved = motion(theta, begin, given, vehicle_cfg) / noise
+    moved = readings(theta, begin, given, vehicle_cfg) / noise
     seen = ~np.isnan(given.velocity)
     rest = np.where(seen, np.nan_to_num(given.velocity) / noise - moved[0], 0.0)
     slopes = np.where(seen, (moved[1:] - moved[0]) / small, 0.0)
@@ -136,6 +149,26 @@ def _solved(square: np.ndarray, right: np.ndarray) -> np.ndarray:
     return np.linalg.solve(square + ridge * np.eye(len(square)), right)
 
 
+def _left_open(
+    given: Stretches,
+    vehicle_cfg: VehicleConfig,
+    fit: tuple[np.ndarray, np.ndarray],
+    noise: np.ndarray,
+    jacobian: np.ndarray,
+    own: np.ndarray,
+) -> np.ndarray:
+    """(k,) by how much the fit moves where commands jump between two messages instead of going on a line: a
+    log does not say which, and no bootstrap of its stretches shows it, for it is the same in all of them."""
+    other = given.jumped(vehicle_cfg)
+    if other is given:
+        return np.zeros(jacobian.shape[2])
+    value, start = fit
+    said = [readings(value[None], start[None], one, vehicle_cfg)[0] for one in (given, other)]
+    moved = np.where(np.isnan(given.velocity), 0.0, (said[0] - said[1]) / noise)
+    square, right = _apart(jacobian, own, moved.reshape(len(moved), -1))
+    return np.abs(_solved(square.sum(axis=0), right.sum(axis=0)))
+
+
 def _bootstrap(
     jacobian: np.ndarray, own: np.ndarray, rest: np.ndarray, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -159,18 +192,17 @@ def horizon_errors(
     given: Stretches, vehicle_cfg: VehicleConfig, theta: np.ndarray, horizons: tuple[int, ...]
 ) -> dict[int, list[float | None]]:
     """Rms error (surge, sway, heave, yaw) of what is predicted that many steps ahead of a reading, by
-    ``theta`` (14,); None where no reading stands there. Horizons longer than a stretch are left out."""
+    ``theta`` (17,); None where no reading stands there. Horizons longer than a stretch are left out."""
     steps = given.wrench.shape[1]
     assert theta.shape == (SIZE,)
+    given = given.at_lag(theta[LAG], vehicle_cfg)
+    inputs = ("tilt_rate", "up", "wrench", "slope")
     found = {}
     for ahead in (h for h in horizons if h <= steps):
         errors = []
         for begin in range(0, steps - ahead + 1, max(ahead, steps // 10)):
-            part = Stretches(
-                given.dt_s,
-                given.velocity[:, begin : begin + ahead + 1],
-                *(a[:, begin : begin + ahead] for a in (given.tilt_rate, given.up, given.wrench)),
-            )
+            cut = {name: getattr(given, name)[:, begin : begin + ahead] for name in inputs}
+            part = replace(given, velocity=given.velocity[:, begin : begin + ahead + 1], **cut)
             whole = np.flatnonzero(~np.isnan(part.velocity[:, 0]).any(axis=1))
             part = part.some(whole)
             if len(whole):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import select
 import socket
 from dataclasses import dataclass
 
@@ -14,6 +15,7 @@ MOST_DATAGRAMS, MOST_BYTES = 64, 24 * 1024
 """taken in one step; what is more waits, and is lost where the system's own queue is full"""
 LONGEST = 2048
 """[bytes] a longer datagram is none of MAVLink's"""
+_MOST_ROUNDS = 100
 _WRITTEN = re.compile(r"(udp|udpin|udpout):([A-Za-z0-9.\-]{1,253}):(\d{1,5})")
 
 
@@ -77,6 +79,16 @@ class Endpoint:
             size += len(data)
             found.append((sender, data if len(data) <= LONGEST else b""))
         return found
+
+    def forget(self) -> None:
+        """Drop what has come so far; of a flood a part."""
+        for _ in range(_MOST_ROUNDS):
+            if not self.receive():
+                return
+
+    def wait(self, seconds: float) -> None:
+        """Until something has come, but no longer."""
+        select.select([self._socket], [], [], seconds)
 
     def send(self, data: bytes, to: Address) -> bool:
         """Whether the system took it."""

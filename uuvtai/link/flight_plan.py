@@ -33,7 +33,8 @@ class FlightPlan:
     """compass heading of the world's x axis; None = where the vehicle looks at first"""
     seconds: float = math.inf
     rate: float = 1.0
-    """seconds of the vehicle's clock in one of ours: a simulated one may be slower or faster"""
+    """seconds of the vehicle's clock in one of ours: a simulated one may be slower or faster; 0 = it is
+    followed"""
     system: int = 1
     operator: int = 255
 

@@ -128,8 +128,13 @@ class Intake:
                 return
             heard.vehicle_s, heard.mode = come_s, int(fields["custom_mode"])
             heard.is_armed = bool(int(fields["base_mode"]) & _ARMED)
-        elif system == self._operator and fields["type"] == GROUND_STATION:
-            heard.operator_s = come_s
+        elif fields["type"] == GROUND_STATION:
+            if system == self._operator:
+                heard.operator_s = come_s
+            else:
+                self._refuse(f"a ground station has the id {system}: --operator {system}")
+        elif fields["type"] == SUBMARINE and component == _AUTOPILOT:
+            self._refuse(f"a submarine has the id {system}: --system {system}")
 
     # ------------------------------------------------------------------------------------------- instruments
 

@@ -62,14 +62,14 @@ class Motors:
                 "--vehicle bluerov2_16v"
             )
         self._scale = vehicle_cfg.top_rpm / -_SPEED_OF_PULSE[0, 1]
-        self._most = vehicle_cfg.top_rpm
+        self.most_rpm = vehicle_cfg.top_rpm
 
     def rpm(self, pwm: Sequence[float]) -> np.ndarray:
         """(thrusters,) speed that is commanded. A channel that is off (0) stands still."""
         pulse = np.array(pwm, float)[self.channel]
         off = np.clip(pulse - NEUTRAL_US, -SPAN_US, SPAN_US)
         share = np.where(pulse == 0, 0.0, np.interp(off, _SPEED_OF_PULSE[:, 0], _SPEED_OF_PULSE[:, 1]))
-        return np.clip(self.sign * self._scale * share, -self._most, self._most)
+        return np.clip(self.sign * self._scale * share, -self.most_rpm, self.most_rpm)
 
 
 def _same(ours: np.ndarray, factors: np.ndarray) -> tuple[int, float]:

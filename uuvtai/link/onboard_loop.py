@@ -13,7 +13,9 @@ from typing import Any
 from uuvtai.config import Config
 from uuvtai.link.dialect import MavCodec
 from uuvtai.link.endpoint import Address, Endpoint
+from uuvtai.link.flight_notes import FlightNotes
 from uuvtai.link.flight_plan import FlightPlan
+from uuvtai.link.followed_endpoint import FollowedEndpoint
 from uuvtai.link.handover import Handover
 from uuvtai.link.intake import Intake
 from uuvtai.link.link_log import LinkLog
@@ -66,9 +68,12 @@ class OnboardLoop:
         log: LinkLog,
         now: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
+        note: Callable[[str], None] = lambda text: None,
     ) -> None:
         self._config, self._pilot, self._plan, self._endpoint, self._log = config, pilot, plan, endpoint, log
-        self._now, self._sleep = now, sleep
+        self._now, self._sleep, self._note_to = now, sleep, note
+        self._notes = FlightNotes(f"{plan.place.host}:{plan.place.port}")
+        self._rate = plan.rate or 1.0
         self._codec = MavCodec(plan.system, COMPONENT, plan.operator)
         self._intake = Intake(config, plan.mission.start, plan.heading_rad, plan.system, plan.operator)
         self._handover = Handover(plan.system, plan.limits, pretended=not plan.arms)
@@ -89,7 +94,7 @@ class OnboardLoop:
         begun, dt = self._now(), self._config.episode.control_dt_s
         due_s, farewell, until_s = 0.0, "", math.inf
         while True:
-            now_s = (self._now() - begun) * self._plan.rate
+            now_s = (self._now() - begun) * self._rate
             stalled_s = max(0.0, now_s - due_s)
             if stalled_s > STALL_S:
                 self._lag_s, due_s = self._lag_s + stalled_s, now_s
@@ -100,7 +105,7 @@ class OnboardLoop:
                 if self._handover.ended or now_s >= until_s:
                     return
                 due_s += dt
-                wait_s = due_s / self._plan.rate - (self._now() - begun)
+                wait_s = due_s / self._rate - (self._now() - begun)
                 if wait_s > 0:
                     self._sleep(wait_s)
             except KeyboardInterrupt:
@@ -199,6 +204,10 @@ class OnboardLoop:
         for reason in decision.reasons:
             self.tally.reasons[reason.partition(":")[0]] += 1
         self._log.decided(now_s, command, decision, heard.mode, heard.is_armed, speed)
+        wrong = ", ".join(heard.refused)
+        engaged, messages = self._handover.engaged, self.tally.heard.total()
+        if text := self._notes.look(now_s, decision, engaged, messages, wrong):
+            self._note_to(text)
 
     def _farewell(self, now_s: float, command: PilotCommand) -> str:
         goal, radius = self._plan.mission.goal, self._config.episode.goal_radius_m
@@ -235,11 +244,14 @@ class OnboardLoop:
 def fly(config: Config, tree: FlatTree, plan: FlightPlan, note: Callable[[str], None]) -> dict[str, Any]:
     """The document of a flight. Raises LinkError, LogError."""
     MavCodec(plan.system, COMPONENT)  # refused before a minute of compiling
-    with Endpoint(plan.place) as endpoint:
+    followed = FollowedEndpoint(plan.place, plan.system) if plan.rate == 0 else None
+    with followed or Endpoint(plan.place) as endpoint:
         pilot = warmed(config, tree, plan.mission)
         about = {"dry_run": str(not plan.arms), "limits": str(plan.limits), "mission": str(plan.mission)}
         log = LinkLog(plan.log, about)
-        loop = OnboardLoop(config, pilot, plan, endpoint, log)
+        clock = (followed.now, followed.sleep) if followed else (time.monotonic, time.sleep)
+        endpoint.forget()  # what came while kernels were compiled
+        loop = OnboardLoop(config, pilot, plan, endpoint, log, *clock, note)
         what = (
             "ARMS AND DRIVES the vehicle" if plan.arms else "dry run: no order that moves the vehicle is sent"
         )

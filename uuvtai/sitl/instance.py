@@ -60,7 +60,9 @@ class Instance:
         """by turn, and 'bad' packets"""
         self.time_s = 0.0
         """since the episode's or ArduSub's beginning"""
-        self.outcome = ""
+        self.outcome, self._ended_s = "", 0.0
+        self.joined_late = False
+        """whether a thruster turned in the first packet: ArduSub drove in another water"""
 
     def _forget(self) -> None:
         self.time_s = self.driven_s = 0.0
@@ -81,6 +83,7 @@ class Instance:
         if turn == "reset":
             self._water.begin(self._row)
             self._forget()
+            self.joined_late = self._water.turns(frame.pwm)
         if turn != "again":
             said = self._step(frame.pwm, 1.0 / frame.rate_hz)
             self._answer = reply_of(self._water.motion(self._row, self.time_s))
@@ -98,13 +101,19 @@ class Instance:
             self._ticks += 1
             if not self.is_held:
                 ended = self._water.control_step(self._row)
-                self.outcome = self.outcome or ended
+                if ended and not self.outcome:
+                    self.outcome, self._ended_s = ended, self.time_s
             self._water.sense(self._row)
             altitude = self._water.motion(self._row, self.time_s).altitude_m
             said += self._sensors.report(
                 self.time_s, altitude, lambda name: self._water.value(name, self._row)
             )
         return said
+
+    @property
+    def lingered_s(self) -> float:
+        """of the water's time, since the episode ended; 0 = it has not"""
+        return self.time_s - self._ended_s if self.outcome else 0.0
 
     def document(self) -> dict[str, Any]:
         """Its line in ``uuv sitl --json``."""

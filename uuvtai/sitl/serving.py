@@ -10,6 +10,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from uuvtai.config import Config
 from uuvtai.link.dialect import MavCodec
 from uuvtai.link.endpoint import Address, Endpoint, LinkPlace, place_of
@@ -18,6 +20,8 @@ from uuvtai.link.orders import Order
 from uuvtai.sim import Sim
 from uuvtai.sitl.instance import Instance
 from uuvtai.sitl.rows_of_water import WaterRows
+from uuvtai.sitl.serving_notes import ServingNotes
+from uuvtai.sitl.simulated_operator import SimulatedOperator
 from uuvtai.tree import FlatTree
 
 NEXT_PORT = 10
@@ -28,6 +32,8 @@ _LONGEST = 128
 """[bytes] a longer packet is none of ArduSub's"""
 _SILENT_S = 2.0
 """who has been silent for so long may be followed by somebody else"""
+LINGER_S = 10.0
+"""of the water's time, that it stays with ``once`` after the episode's end: for the pilot to notice"""
 _MOST_PEERS = 4
 _MOST_INSTANCES = 64
 PLACES = ("udp:127.0.0.1:14660", "udpout:127.0.0.1:14550")
@@ -50,6 +56,8 @@ class SitlPlan:
     """end when every instance's episode has ended"""
     seed: int = 0
     episode: int = 0
+    operator: bool = False
+    """be the ground station too"""
 
     @classmethod
     def typed(
@@ -107,11 +115,13 @@ class SitlPort:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.links: list[SensorLink] = []
         self._codec = MavCodec(self._system, SENSORS)
+        self._operator = SimulatedOperator(self._system) if plan.operator else None
         self._peer: Address | None = None
         self._heard_s = float("-inf")
         self.paced_from_s = 0.0
         """by the clock, when the water's time was 0"""
         port = plan.port + NEXT_PORT * number
+        self.notes = ServingNotes(number, port, time.monotonic())
         try:
             self.socket.bind((plan.host, port))
             self.socket.setblocking(False)
@@ -144,6 +154,8 @@ class SitlPort:
                 self.socket.sendto(reply, sender)
             except OSError:
                 self.instance.counts["unsent"] += 1
+        if reply and self._operator is not None and not self.instance.joined_late:
+            said = [*said, *self._operator.report(self.instance.time_s)]
         self._report(said)
 
     def _report(self, said: list[Order]) -> None:
@@ -179,7 +191,11 @@ def serve_water(
         note(
             f"water for ArduSub at UDP {shown}; start it with: ardusub --model JSON:{plan.host}; Ctrl-C ends"
         )
-        _serve(ports, plan, begun)
+        for number in range(plan.instances):
+            water.begin(number)
+            start, goal = (_written(water.value(f"mission.{name}_w", number)) for name in ("start", "goal"))
+            note(f"instance {number}: uuv pilot needs --start {start} --goal {goal} --heading 0")
+        _serve(ports, plan, begun, note)
     except KeyboardInterrupt:
         note("interrupted")
     finally:
@@ -190,7 +206,11 @@ def serve_water(
     return {"schema": 1, "seconds": round(spent, 3), "instances": instances}
 
 
-def _serve(ports: list[SitlPort], plan: SitlPlan, begun: float) -> None:
+def _written(place: np.ndarray) -> str:
+    return ",".join(f"{value:.4f}" for value in place.tolist())
+
+
+def _serve(ports: list[SitlPort], plan: SitlPlan, begun: float, note: Callable[[str], None]) -> None:
     with selectors.DefaultSelector() as waiting:
         for port in ports:
             waiting.register(port.socket, selectors.EVENT_READ, port)
@@ -199,7 +219,10 @@ def _serve(ports: list[SitlPort], plan: SitlPlan, begun: float) -> None:
                 port: SitlPort = key.data
                 _pace(port, plan.rate)
                 port.serve(time.monotonic())
-            if plan.once and all(port.instance.outcome for port in ports):
+            for port in ports:
+                for text in port.notes.look(port.instance, time.monotonic()):
+                    note(text)
+            if plan.once and all(port.instance.lingered_s > LINGER_S for port in ports):
                 return
 
 
