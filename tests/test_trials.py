@@ -214,6 +214,40 @@ def test_trials_of_learnt_numbers_are_as_their_episodes_say():
     assert said in " ".join((DOCS / "tuning.md").read_text().split())
 
 
+def test_trials_of_bodies_that_leave_the_fan_are_as_their_episodes_say():
+    document = json.loads((DOCS / "data/leaving_trials.json").read_text())
+    kept = outcomes_by_seed(document)
+    found = table("tuning.md", "## Bodies that leave", "| pilot |")
+    assert len(found) == len(kept) - sum(name == "as it is" for name, _ in kept)
+    for name, scene, seeds, was, text in ([cell.strip(" |") for cell in cells] for cells in found):
+        own = kept[name, scene]
+        assert seeds == ", ".join(map(str, sorted(own)))
+        before = "".join(kept["as it is", scene][seed] for seed in own)
+        outcomes = "".join(own.values())
+        assert told(was) == pytest.approx(rates(before), abs=0.051), (name, scene)
+        assert told(text) == pytest.approx(rates(outcomes), abs=0.051), (name, scene)
+        won, lost = paired(outcomes, before)
+        assert text.endswith(f" (+{won} -{lost}, p = {mcnemar_p(won, lost):.3f})"), (name, scene)
+    failures, gaps = document["maze_failures"], document["unseen_vertical_gap_m"]
+    unseen, late = (
+        sum(failures[label] for label in labels)
+        for labels in (("unseen_above", "unseen_below"), ("kept_away", "too_slow"))
+    )
+    said = " ".join((DOCS / "tuning.md").read_text().split())
+    assert f"{sum(failures.values())} episodes of `maze`" in said and f"fail: {unseen} by a body" in said
+    assert f"passes {gaps[0]:.2f} to {gaps[-1]:.2f} m" in said and f", {late} by time" in said
+    assert f"(median {np.median(gaps):.2f} m" in said
+    pool = kept["a side is a part", "pool (8, 9, 1.5)"]
+    new = [seed for seed in pool if seed not in (77003, 77004)]
+    won, lost = paired(
+        *(
+            "".join(kept[name, "pool (8, 9, 1.5)"][s] for s in new)
+            for name in ("a side is a part", "as it is")
+        )
+    )
+    assert f"had seen: +{won} -{lost})" in said
+
+
 def test_what_forecasts_miss_is_as_counted():
     kept = json.loads((DOCS / "data/turn_trials.json").read_text())
     found = table("tuning.md", "## Turns that nobody", "| moments of tracks |")

@@ -218,20 +218,31 @@ def turned(v, angle):
     return np.array([c * v[0] - s * v[1], s * v[0] + c * v[1]])
 
 
-def centre_variances(c, radius, radius_var, sonar):
+def missing_of(c, radius, radius_var, cfg, sonar):
+    """[m] that a cluster with two free edges is narrower than its body on one side; 0 where noise explains
+    it."""
+    edge = 0.25 * 2 * np.pi / sonar.n_ray * c.range_m
+    seen = (c.range_m + ARC * radius) * np.sin(np.pi / sonar.n_ray * c.span)
+    short = radius - seen - cfg.partial_sigmas * np.sqrt(radius_var + edge**2 + 0.02**2)
+    return max(short, 0.0) if cfg.partial_sigmas > 0 and not c.hidden else 0.0
+
+
+def centre_variances(c, radius, radius_var, cfg, sonar):
+    missing = missing_of(c, radius, radius_var, cfg, sonar)
     radial, cross = (
         c.range_var + ARC**2 * radius_var,
         (0.25 * 2 * np.pi / sonar.n_ray * c.range_m) ** 2 + 0.02**2,
     )
+    radial, cross = radial + missing**2, cross + missing**2
     if c.hidden:
         radial, cross = radial + (0.3 * radius) ** 2, cross + (0.5 * radius) ** 2 + radius_var
     return radial, cross
 
 
-def surprise_of(track, c, along, centre, sonar):
+def surprise_of(track, c, along, centre, cfg, sonar):
     """(squared normalised innovations of range, cross range, Doppler), their variances."""
     across = np.array([-along[1], along[0]])
-    radial_var, cross_var = centre_variances(c, track.radius, track.radius_var, sonar)
+    radial_var, cross_var = centre_variances(c, track.radius, track.radius_var, cfg, sonar)
     s = np.array(
         [along @ track.P[:2, :2] @ along + radial_var, across @ track.P[:2, :2] @ across + cross_var]
     )
@@ -260,7 +271,7 @@ def associate(tracks, clusters, dt, cfg, sonar):
             gap = np.hypot(*(c.pos - track.x[:2]))
             if gap >= 2.0:
                 continue
-            parts, s = surprise_of(track, c, unit(c.bearing), c.pos, sonar)
+            parts, s = surprise_of(track, c, unit(c.bearing), c.pos, cfg, sonar)
             if parts[0] + parts[1] < cfg.turn_gate or gap < cfg.gate_m + dt * np.hypot(*track.x[2:4]):
                 pairs.append((parts.sum() + np.log(s.prod()), t, k))
     out = {}
@@ -273,6 +284,7 @@ def associate(tracks, clusters, dt, cfg, sonar):
 def update(track, c, dt, scan, cfg, sonar):
     before = track.x.copy()
     noise, var = (0.25 * 2 * np.pi / sonar.n_ray * c.range_m) ** 2 + 0.02**2, track.radius_var + 4e-4 * dt
+    noise += missing_of(c, track.radius, var, cfg, sonar) ** 2
     if not c.hidden or c.radius > track.radius:
         track.radius += (c.radius - track.radius) * var / (var + noise)
         var = 1 / (1 / var + 1 / noise)
@@ -281,9 +293,9 @@ def update(track, c, dt, scan, cfg, sonar):
     along = unit(bearing)
     across = np.array([-along[1], along[0]])
     centre = scan.pos[:2] + distance * along
-    radial_var, cross_var = centre_variances(c, track.radius, track.radius_var, sonar)
+    radial_var, cross_var = centre_variances(c, track.radius, track.radius_var, cfg, sonar)
     # the gate of a turn looks along the middle of what is seen
-    parts, _ = surprise_of(track, c, unit(c.bearing), centre, sonar)
+    parts, _ = surprise_of(track, c, unit(c.bearing), centre, cfg, sonar)
     P, x = track.P.copy(), track.x
     if parts.sum() > cfg.turn_gate:
         P[2:4, 2:4] += max(np.hypot(*x[2:4]), 0.5) ** 2 * np.eye(2)
@@ -318,7 +330,7 @@ def is_moving(track, c, dt, cfg, sonar):
     shown = abs(track.doppler) > max(cfg.moving_doppler_m_s, 4 * np.sqrt(track.doppler_var))
     noise = np.sqrt(
         np.linalg.eigvalsh(track.P[:2, :2])[-1]
-        + centre_variances(c, track.radius, track.radius_var, sonar)[1]
+        + centre_variances(c, track.radius, track.radius_var, cfg, sonar)[1]
     )
     reach = cfg.moving_shift_m + 0.5 * cfg.max_width_m * abs(track.sweep) + 2 * noise
     length = np.hypot(*track.shift)
@@ -411,7 +423,7 @@ def begun(c, scan, cfg, sonar):
     along = unit(bearing)
     turn_in = np.array([[along[0], -along[1]], [along[1], along[0]]])
     P = np.zeros((5, 5))
-    P[:2, :2] = turn_in @ np.diag(centre_variances(c, radius, radius_var, sonar)) @ turn_in.T
+    P[:2, :2] = turn_in @ np.diag(centre_variances(c, radius, radius_var, cfg, sonar)) @ turn_in.T
     P[2:4, 2:4] = turn_in @ np.diag([c.doppler_var, cfg.birth_speed_sigma_m_s**2]) @ turn_in.T
     x = np.concatenate([scan.pos[:2] + distance * along, c.doppler * along, [0.0]])
     track = Track(x, P, radius, radius_var, scan.pos[2], c.doppler, c.doppler_var, c.bearing, scan.step)

@@ -38,11 +38,32 @@ def centre_sight(env, c, radius, io: Bundle[TrackingIO]):
 
 
 @ti.func
+def missing_width(env, c, radius, radius_var, io: Bundle[TrackingIO]):
+    """[m] by which a cluster with two free edges is narrower on one side than a body of known radius, beyond
+    what noise explains.
+
+    A body leaves the sonar's fan by its nearest part first: what is left of it are its two sides, and one
+    of them says no more than that the centre is this near.
+    """
+    missing = 0.0
+    if ti.static(io.tracking_cfg.partial_sigmas > 0):
+        distance = io.clusters.range_m[env, c] + ARC * radius
+        seen = distance * ti.sin(0.5 * ti.static(io.sonar_cfg.beam_step_rad) * io.clusters.span[env, c])
+        slack = io.tracking_cfg.partial_sigmas * ti.sqrt(radius_var + radius_variance(env, c, io))
+        missing = ti.select(io.clusters.hidden[env, c] == 0, ti.max(radius - seen - slack, 0.0), 0.0)
+    return missing
+
+
+@ti.func
 def centre_variances(env, c, radius, radius_var, io: Bundle[TrackingIO]):
-    """Variances [m^2] of a cluster's centre along and across the beam, larger where an edge is hidden."""
+    """Variances [m^2] of a cluster's centre along and across the beam, larger where an edge is hidden or a
+    part is missing."""
     edge = _EDGE_SIGMA * ti.static(io.sonar_cfg.beam_step_rad) * io.clusters.range_m[env, c]
     radial = io.clusters.range_var[env, c] + ARC * ARC * radius_var
     cross = edge * edge + _CROSS_SIGMA_M * _CROSS_SIGMA_M
+    missing = missing_width(env, c, radius, radius_var, io)
+    radial += missing * missing
+    cross += missing * missing
     if io.clusters.hidden[env, c] > 0:
         radial += 0.09 * radius * radius
         cross += 0.25 * radius * radius + radius_var

@@ -11,6 +11,7 @@ from uuvtai.kernels.perception.sighting import (
     bearing_vector,
     centre_sight,
     centre_variances,
+    missing_width,
     pair_surprise,
     radius_variance,
 )
@@ -62,7 +63,8 @@ def update_radius(env, track, c, dt, io: Bundle[TrackingIO]):
     seen."""
     seen, known = io.clusters.radius_m[env, c], io.tracks.radius_m[env, track]
     var = io.tracks.radius_var[env, track] + _RADIUS_DRIFT * dt
-    noise = radius_variance(env, c, io)
+    missing = missing_width(env, c, known, var, io)
+    noise = radius_variance(env, c, io) + missing * missing
     if io.clusters.hidden[env, c] == 0 or seen > known:
         known += (seen - known) * var / (var + noise)
         var = var * noise / (var + noise)
