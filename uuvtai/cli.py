@@ -41,9 +41,7 @@ app.add_typer(log_app, name="log")
 # ----------------------------------------------------------------------------------------------- eval, train
 
 
-@app.command(
-    "eval", epilog="Example: uuv eval --controller best --world gauntlet -D 9 -v 1.5 --episodes 64 --seeds 7"
-)
+@app.command("eval", epilog="Example: uuv eval --controller best --world gauntlet -D 9 -v 1.5 --seeds 7")
 @groups.grouped
 def evaluate(
     ctx: typer.Context,
@@ -243,9 +241,7 @@ def identify_vehicle(
 # ------------------------------------------------------------------------------------------------------ sweep
 
 
-@app.command(
-    epilog="Example: uuv sweep --controller best --grid D=0,6 --grid v=0.4,1.5 --episodes 16 --workers 2"
-)
+@app.command(epilog="Example: uuv sweep --controller best --grid D=0,6 --grid v=0.4,1.5 --workers 2")
 @groups.grouped
 def sweep(
     ctx: typer.Context,
