@@ -1,8 +1,8 @@
 """Seconds of a whole PPO update by autograd, beside the same update with back-propagation written by hand
 (`peers/passes.py`), in turns from one minibatch to the next.
 
-Sizes are those of `uuv train best`: 1,024 envs x 64 steps, its networks, epochs and minibatches; the rollout
-is random numbers. The hand-written passes were ours until autograd over blocks of rows was as fast.
+Sizes are those of `uuv train residual`: 1,024 envs x 64 steps, its networks, epochs and minibatches; the
+rollout is random numbers. The hand-written passes were ours until autograd over blocks of rows was as fast.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def filled_rollout(steps: int, num_envs: int, n_in: int) -> Rollout:
 def measure(job: Job) -> list[Row]:
     """A row for either width of the products."""
     num_envs, rounds = (8, 2) if job.quick else (1024, ROUNDS)
-    config = load_training("best", {"train.num_envs": num_envs})
+    config = load_training("residual", {"train.num_envs": num_envs})
     n_in = observation_width(config.features) + N_FEATURES
     rollout = filled_rollout(config.ppo.rollout_steps, num_envs, n_in)
     rows = []

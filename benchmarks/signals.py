@@ -181,13 +181,15 @@ class Bench:
 
     def killed_export(self, kills: int) -> list[Row]:
         """The folder is whole or not there, and the next try succeeds."""
-        whole_s, wrong = self._whole(["export", "best"], "exported", "--out"), []
+        whole_s, wrong = self._whole(["export", "residual"], "exported", "--out"), []
         for _ in range(kills):
-            self._kill(["export", "best", "--out", "again"], whole_s)
+            self._kill(["export", "residual", "--out", "again"], whole_s)
             if (self.folder / "again").exists() and self._run(["export", "--check", "again"])[0]:
                 wrong.append("export: a folder that does not agree")
             shutil.rmtree(self.folder / "again", ignore_errors=True)
-        wrong += [f"export: {err}" for code, err in [self._run(["export", "best", "--out", "again"])] if code]
+        wrong += [
+            f"export: {err}" for code, err in [self._run(["export", "residual", "--out", "again"])] if code
+        ]
         return [self._row(f"export killed {kills} times: halves under its name", wrong)]
 
     def killed_report(self, kills: int) -> list[Row]:
@@ -230,7 +232,7 @@ class Bench:
             [*_EVAL, "--episodes", "8", "--record", "1", *_HORIZON, "--run-dir", "out"],
             [*_TRAIN, "--iterations", "10", "--run-dir", "out"],
             ["simulate", "--seconds", "20"], ["report", "played", "--out", "out/page.html"],
-            ["export", "best", "--out", "out/policy"],
+            ["export", "residual", "--out", "out/policy"],
             ["sweep", "--grid", "D=0,3", "--controller", "straight", "--episodes", "4", "--num-envs", "8",
             "--run-dir", "out"],
             ["profile", "--num-envs", "8", "--seconds", "1"], ["presets"], ["doctor"], ["tree", "played"],

@@ -129,7 +129,7 @@ def test_missing_and_corrupt_logs_are_refused(capfd, tmp_path, command, content)
         (["eval", "--world", "a/" + 5000 * "b" + ".yaml"], "too long"),
         (["eval", "--resume", "nowhere"], "nowhere: is no run folder"),
         (["eval", "--resume", "nowhere", "--episodes", "64"], "--episodes 64: a resumed run keeps its own"),
-        (["eval", "best", "--resume", "nowhere"], "RUN ['best']: a resumed run keeps its own"),
+        (["eval", "residual", "--resume", "nowhere"], "RUN ['residual']: a resumed run keeps its own"),
         (["train", "smoke", "--set", "train.scenes=[[9, 9999, 1.0]]"], "do not fit"),
         (["train", "smoke", "--set", "policy.initial_std=0.01"], "lies below the floor"),
     ],

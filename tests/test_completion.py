@@ -157,7 +157,7 @@ def runs(tmp_path):
         (["tree", "--controller", "mi"], ["mine.xml"]),
         (["sweep", "--grid", "cau"], ["caution"]),
         (["eval", "--controller", "bt,str"], ["bt,straight", "bt,straight+truth"]),
-        (["eval", "be"], ["best"]),
+        (["eval", "res"], ["residual"]),
         (["eval", "runs/f"], ["runs/first", "runs/first_eval/"]),
         (["train", "--resume", "runs/"], ["runs/first", "runs/first_eval"]),
         (["tree", "runs/"], ["runs/first/", "runs/first_eval"]),

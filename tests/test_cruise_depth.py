@@ -12,6 +12,7 @@ from uuvtai.kernels.perception.elevation import COLUMN
 from uuvtai.kernels.teacher.bundles import ThreatsIO
 from uuvtai.kernels.teacher.cruise_depth import choose_depth, level_share
 from uuvtai.state import MissionState, Proprioception, TeacherState, TrackState, allocate
+from uuvtai.tuned_numbers import TUNED
 
 N_ENV = 6
 SIZES = {
@@ -21,7 +22,7 @@ SIZES = {
     "n_height": LANES,
     "n_node": 1,
     "n_candidate": LANES,
-    "n_tuned": 1,
+    "n_tuned": len(TUNED),
 }
 POOL = {"z_m": [-1.2, -0.4], "height_m": [0.3, 0.5]}
 LOW, HIGH = -1.4, -0.2

@@ -109,7 +109,7 @@ def test_names_that_are_none_are_refused():
     for name in ("oracle", "bt+truth"):
         with pytest.raises(SettingError, match="knows the truth"):
             Entrant(name).method(load_config("pool"), Watch())
-    assert Entrant("best", True).is_shipped and Entrant("capped").is_shipped
+    assert Entrant("residual", True).is_shipped and Entrant("capped").is_shipped
     assert not Entrant("controller:mine.py:act").is_shipped
     assert Entrant("controller:mine.py:act").typed == "--controller mine.py:act"
 

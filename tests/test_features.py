@@ -40,6 +40,7 @@ from uuvtai.state import (
     TreeTable,
     allocate,
 )
+from uuvtai.tuned_numbers import TUNED
 
 N_ENV, N_RAY, N_SECTOR, N_TRACK = 20, 256, 12, 5
 FEATURES, SONAR = FeaturesConfig(), SonarConfig()
@@ -370,7 +371,7 @@ CLASS_OF_LEAF = (0, 1, 2, 3, 4, 4)
 
 def test_advice_is_what_the_tree_says(stage):
     """A tree of the six action leaves; env i lets leaf i act, the seventh none."""
-    sizes = {"n_env": N_ENV, "n_node": 8, "n_candidate": 16, "n_tuned": 1}
+    sizes = {"n_env": N_ENV, "n_node": 8, "n_candidate": 16, "n_tuned": len(TUNED)}
     teacher, table = allocate(TeacherState, sizes), allocate(TreeTable, sizes)
     table.leaf.from_numpy(np.array([*LEAVES, -1, -1], np.int32))
     acting = np.full(N_ENV, -1, np.int32)

@@ -287,5 +287,5 @@ def test_shipped_policies_are_small_have_a_card_and_drive(name):
     assert torch.isfinite(pilot.act(torch.zeros(2, n_obs))).all()
 
 
-def test_best_is_shipped():
-    assert "best" in preset_names("policy")
+def test_best_and_the_residual_are_shipped():
+    assert "residual" in preset_names("policy") and "best" in preset_names("stack")

@@ -136,7 +136,7 @@ def scene(stage):
     stage.clearance.site_row.fill(-1)
     stage.clearance.site_col.fill(-1)
     use(stage, "bt")
-    leaves.reset_teacher(io_for(TeacherIO, stage.t, stage.mission, stage.clock))
+    leaves.reset_teacher(io_for(TeacherIO, stage.t, stage.table, stage.mission, stage.clock))
     return stage
 
 
@@ -188,6 +188,7 @@ def assess(stage, cfg=CFG.teacher, sonar=CFG.sensors.sonar):
             TANK,
             CFG.mapping,
             CFG.episode,
+            CFG.fast,
         )
     )
 
@@ -1015,7 +1016,7 @@ def test_sleeping_rows_are_untouched_and_rows_do_not_meet(scene):
         scene.clock.awake.fill(1)
         scene.clock.step.fill(0)
         scene.forecast.radius_m.fill(-1.0)
-        leaves.reset_teacher(io_for(TeacherIO, scene.t, scene.mission, scene.clock))
+        leaves.reset_teacher(io_for(TeacherIO, scene.t, scene.table, scene.mission, scene.clock))
         body(scene, 0, 0, (7.0, 3.1), (-0.6, 0.0))
         for env in range(1, N_ENV):
             if others:

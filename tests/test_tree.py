@@ -32,6 +32,7 @@ from uuvtai.tree import (
     tree_dot,
     tree_text,
 )
+from uuvtai.tuned_numbers import TUNED
 
 N_BOARD = 20
 """Random blackboards per tree: one env each."""
@@ -211,7 +212,7 @@ def test_text_and_dot_name_every_node_and_its_use():
 
 @pytest.fixture(scope="module")
 def engine():
-    sizes = {"n_env": N_BOARD, "n_node": MAX_NODE, "n_candidate": 16, "n_tuned": 10}
+    sizes = {"n_env": N_BOARD, "n_node": MAX_NODE, "n_candidate": 16, "n_tuned": len(TUNED)}
     return state.allocate(state.TeacherState, sizes), state.allocate(state.TreeTable, sizes)
 
 

@@ -41,7 +41,7 @@ app.add_typer(log_app, name="log")
 # ----------------------------------------------------------------------------------------------- eval, train
 
 
-@app.command("eval", epilog="Example: uuv eval best --world gauntlet -D 9 -v 1.5 --episodes 64 --seeds 7")
+@app.command("eval", epilog="Example: uuv eval --controller best --world gauntlet -D 9 -v 1.5 --seeds 7")
 @groups.grouped
 def evaluate(
     ctx: typer.Context,
@@ -241,7 +241,7 @@ def identify_vehicle(
 # ------------------------------------------------------------------------------------------------------ sweep
 
 
-@app.command(epilog="Example: uuv sweep best --grid D=0,6 --grid v=0.4,1.5 --episodes 16 --workers 2")
+@app.command(epilog="Example: uuv sweep --controller best --grid D=0,6 --grid v=0.4,1.5 --workers 2")
 @groups.grouped
 def sweep(
     ctx: typer.Context,
@@ -407,7 +407,7 @@ def _report_if(with_report: bool, folder: Path) -> None:
         say(f"report: {report([folder]).page}")
 
 
-@app.command("export", epilog="Example: uuv export best --out runs/best_export")
+@app.command("export", epilog="Example: uuv export residual --out runs/residual_export")
 @groups.grouped
 def export_policy(
     output: groups.OutputGroup,

@@ -14,6 +14,7 @@ from uuvtai.kernels.core.grid import outside_cells
 from uuvtai.scenario import load_fixed
 from uuvtai.stages import SimState
 from uuvtai.taichi_patches.memory import Put
+from uuvtai.tuned_numbers import TUNED
 
 
 def allocate_state(sizes: dict[str, int]) -> SimState:
@@ -23,11 +24,13 @@ def allocate_state(sizes: dict[str, int]) -> SimState:
 
 def fill_constants(s: SimState, config: Config, put: Put) -> None:
     """What no step changes: explicit obstacles, the tank's bounds on the map, the thrusters' geometry, a
-    learned forecast. Raises ForecastError, FileError."""
+    learned forecast, factors on the tree's numbers. Raises ForecastError, FileError."""
     if config.forecast.learned:
         from uuvtai.mixture_weights import put_weights, read_weights
 
         put_weights(s.mixture, read_weights(config.forecast.learned), put)
+    factors = [getattr(config.fast, number.name) for number in TUNED]
+    put(s.table.fast, np.log(np.array(factors)).astype(np.float32))
     load_fixed(s.fixed, config.world)
     load_bounds(s.mask, np.array(outside_cells(config.world.tank, config.mapping.cell_m)), put)
     wrench_of_thrust, thrust_of_wrench = allocation_matrices(config.vehicle)

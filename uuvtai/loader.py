@@ -41,6 +41,7 @@ STACK_SECTIONS = (
     "quiet",
     "route",
     "teacher",
+    "fast",
     "baselines",
 )
 """what a stack preset may set: nothing that a scenario, a sensor, the referee or the observation's columns

@@ -456,7 +456,9 @@ ReportPaper = Annotated[
     ),
 ]
 ReportForce = Annotated[bool, Option("--force", help="Replace files that are there already.")]
-ExportRun = Annotated[str | None, _players("[RUN]", "Run folder, checkpoint folder or shipped name (best).")]
+ExportRun = Annotated[
+    str | None, _players("[RUN]", "Run folder, checkpoint folder or shipped name (residual).")
+]
 ExportOut = Annotated[Path | None, Option("--out", help="New folder \\[default: runs/NAME_export].")]
 ExportEvaluation = Annotated[
     list[Path] | None,

@@ -1,4 +1,4 @@
-"""Numbers of the behaviour tree that ``uuv train tuned`` changes, row by row: the order of
+"""Numbers of the behaviour tree that ``uuv train best`` changes, row by row: the order of
 ``TeacherState.tuned``."""
 
 from __future__ import annotations
@@ -7,10 +7,12 @@ import math
 from typing import NamedTuple
 
 CAUTION, GROWTH, CLOSING, HORIZON, LAG, DEVIATION, TTC, RANGE, CALM, GAZE = range(10)
+VERTICAL, PEAK, MEAN, CONTACT, CHANGE, SOFTNESS, STATIC_MARGIN, STATIC, HEAVE, BURST = range(10, 20)
+WITHIN, SLOPE, GOAL_DEPTH, DEPTH_CHANGE, DOUBT = range(20, 25)
 
 
 class TunedNumber(NamedTuple):
-    """A number of the config's section ``teacher``."""
+    """A number of the config's section ``teacher``; ``FastConfig`` has a factor of the same name."""
 
     name: str
     least: float
@@ -21,15 +23,30 @@ class TunedNumber(NamedTuple):
 
 TUNED = (
     TunedNumber("caution", 0.6, 1.6),
-    TunedNumber("margin_growth_m_s", 0.5, 2.0),
-    TunedNumber("closing_s", 0.5, 2.0),
-    TunedNumber("horizon_s", 0.4, 1.0),
+    TunedNumber("margin_growth_m_s", 0.4, 2.0),
+    TunedNumber("closing_s", 0.4, 2.5),
+    TunedNumber("horizon_s", 0.5, 1.0),
     TunedNumber("lag_s", 0.5, 1.6),
     TunedNumber("weight_deviation", 0.4, 2.5),
     TunedNumber("emergency_ttc_s", 0.15, 2.0),
-    TunedNumber("emergency_range_m", 0.15, 2.0),
-    TunedNumber("calm_s", 0.3, 3.0),
+    TunedNumber("emergency_range_m", 0.15, 2.5),
+    TunedNumber("calm_s", 0.3, 4.0),
     TunedNumber("gaze_m", 0.2, 1.6),
+    TunedNumber("vertical_weight", 0.5, 1.6),
+    TunedNumber("weight_peak", 0.4, 2.5),
+    TunedNumber("weight_mean", 0.4, 2.5),
+    TunedNumber("weight_contact", 0.4, 2.5),
+    TunedNumber("weight_change", 0.3, 2.5),
+    TunedNumber("softness", 0.3, 3.0),
+    TunedNumber("static_margin_m", 0.5, 2.5),
+    TunedNumber("weight_static", 0.4, 2.5),
+    TunedNumber("heave_m_s", 0.5, 1.1),
+    TunedNumber("burst_s", 0.4, 2.0),
+    TunedNumber("conflict_within_s", 0.3, 1.0),
+    TunedNumber("return_slope", 0.4, 2.5),
+    TunedNumber("weight_goal_depth", 0.3, 3.0),
+    TunedNumber("weight_depth_change", 0.3, 3.0),
+    TunedNumber("body_doubt", 0.3, 2.0),
 )
 """by their numbers above; roll-outs are no longer than the config's horizon, for forecasts end there"""
 

@@ -105,11 +105,11 @@ ROWS = (
 """Local planners of the literature have rows of their own, which ``docs/baselines.md`` shows."""
 
 SWEEPS = {
-    "pool": "best --controller bt --controller capped --grid paper --episodes 64",
-    "gauntlet": "best --controller bt --grid paper --world gauntlet --episodes 32",
+    "pool": "--controller best --controller bt --controller capped --grid paper --episodes 64",
+    "gauntlet": "--controller best --controller bt --grid paper --world gauntlet --episodes 32",
     "caution": "--controller bt --grid caution --episodes 16",
-    "robustness": "best --controller bt --grid robustness --episodes 100",
-    "dead_reckoning": "best --controller bt --grid dead_reckoning --episodes 100",
+    "robustness": "--controller best --controller bt --grid robustness --episodes 100",
+    "dead_reckoning": "--controller best --controller bt --grid dead_reckoning --episodes 100",
 }
 """options of ``uuv sweep`` by the name of its file; ``pool`` is played by default, the others by
 ``--only``"""

@@ -25,7 +25,7 @@ from docs.writers.pieces import BEFORE, CELLS, DASH, LETTERS, PIECES, beside
 from docs.writers.pose_tables import pose_endings, pose_errors
 from docs.writers.replay_tables import changed, lossy, replayed
 from docs.writers.sonar_tables import sonars
-from docs.writers.tuner_tables import tuner_slopes
+from docs.writers.tuner_tables import fast_curve, fast_slopes, fast_trials, tuner_slopes
 from docs.writers.vehicle_tables import vehicle_commands, vehicles
 from uuvtai.measure.reproduce import paper
 from uuvtai.measure.reproduce.steps import RETIRED_SEEDS
@@ -598,6 +598,9 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         tuned_trials,
         learning_trials,
         tuner_slopes,
+        fast_curve,
+        fast_slopes,
+        fast_trials,
         forecast_scores,
         forecast_pieces,
         benchmark_scenes,

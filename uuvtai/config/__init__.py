@@ -14,6 +14,7 @@ from uuvtai.config.baselines import (
     VelocityObstacleConfig,
 )
 from uuvtai.config.execution import RuntimeConfig
+from uuvtai.config.fast import FastConfig
 from uuvtai.config.perception import (
     ElevationConfig,
     ForecastConfig,
@@ -67,6 +68,7 @@ class Config(Section):
     route: RouteConfig = RouteConfig()
     features: FeaturesConfig = FeaturesConfig()
     teacher: TeacherConfig = TeacherConfig()
+    fast: FastConfig = FastConfig()
     baselines: BaselinesConfig = BaselinesConfig()
     reward: RewardConfig = RewardConfig()
     episode: EpisodeConfig = EpisodeConfig()
@@ -85,6 +87,7 @@ __all__ = [
     "DynamicWindowConfig",
     "ElevationConfig",
     "EpisodeConfig",
+    "FastConfig",
     "FeaturesConfig",
     "FixedObstacle",
     "ForecastConfig",

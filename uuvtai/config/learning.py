@@ -255,11 +255,11 @@ class TunerConfig(Section):
     worlds: tuple[Annotated[str, Field(min_length=1, max_length=200)], ...] = ("gauntlet", "pool", "gauntlet")
     """world presets whose episodes are played in turn, each with every one of ``train.scenes``; one that is
     named twice is played twice as often"""
-    spread: Fraction = 0.3
+    spread: Fraction = 0.35
     """numbers are tried so far from the best ones, in parts of the way between their bounds"""
     warm_up: Fraction = 0.25
     """part of the run before the numbers are moved for the first time"""
-    time_cost: NonNegative = 0.008
+    time_cost: NonNegative = 0.005
     """[1/s] an arrival is worth so much less per second"""
 
 

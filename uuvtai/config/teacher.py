@@ -53,6 +53,8 @@ class TeacherConfig(Section):
     """margin kept from a body that does something else than is forecast, as a share of the usual one"""
     caution: Positive = 1.0
     """factor of both margins from moving bodies: more trades time and success for fewer collisions"""
+    body_doubt: Positive = 1.0
+    """factor of what a body's radius grows by in its forecast, as that is less and less sure"""
     static_margin_m: NonNegative = 0.1
     """wanted clearance beyond contact from mapped obstacles and walls"""
     place_sigmas: NonNegative = 3.0

@@ -31,9 +31,10 @@ class WavePilot(Protocol):
 
 
 def play_episodes(
-    pilot: WavePilot, scene: Scene, seed: int, first: int, count: int
+    pilot: WavePilot, scene: Scene, seed: int, first: int, count: int, times: int = 1
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """(outcome code, control steps), both (count,), of episodes first .. first + count - 1 of a seed."""
+    """(outcome code, control steps), both (count,), of episodes from ``first`` on of a seed, each played
+    ``times`` times in a row."""
     sim = pilot.simulator
     outcome, steps = (torch.zeros(count, dtype=torch.int64) for _ in range(2))
     sim.set_scenes([scene])
@@ -42,7 +43,7 @@ def play_episodes(
         mask = (rows < count - begin).int()
         pilot.running, pilot.number = mask == 1, begin + rows
         sim.sleep()
-        sim.reset(mask, torch.full_like(mask, seed), (first + begin + rows).int())
+        sim.reset(mask, torch.full_like(mask, seed), (first + (begin + rows) // times).int())
         pilot.reset(mask)
         action = pilot.decide(sim.action).action
         while bool(pilot.running.any()):

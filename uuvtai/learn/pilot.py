@@ -209,7 +209,7 @@ def load_pilot(checkpoint: Checkpoint, num_envs: int, device: torch.device | str
     if config.tuner.enabled:
         raise CheckpointError(
             f"{checkpoint.path}: numbers for the behaviour tree, no network that could be "
-            "exported; any stack takes them: --stack tuned, or stack.yaml of the run"
+            "exported; any stack takes them: --stack best, or stack.yaml of the run"
         )
     if config.twin.enabled or config.chooser.enabled:
         raise CheckpointError(

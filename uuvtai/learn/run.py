@@ -362,10 +362,10 @@ class _Run:
         from uuvtai.learn.tuner_trainer import TunerTrainer
 
         assert isinstance(self._trainer, TunerTrainer)
-        section = tuned_section(self._trainer.found(), self._config)
+        section = tuned_section(self._trainer.centre)
         lines = [
             f"tree: {TRAINING_TREE}",
-            "teacher:",
+            "fast:",
             *(f"  {name}: {value}" for name, value in section.items()),
         ]
         folder.write(STACK, "\n".join(lines) + "\n")

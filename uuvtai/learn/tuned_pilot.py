@@ -13,7 +13,6 @@ from uuvtai.learn.pilot import PilotDecision
 from uuvtai.tuned_numbers import TUNED
 
 if TYPE_CHECKING:
-    from uuvtai.config import Config
     from uuvtai.env import ObservationColumn
     from uuvtai.sim import Sim
 
@@ -71,22 +70,10 @@ def log_factors(checkpoint: Checkpoint) -> torch.Tensor:
     return found
 
 
-def tuned_section(log_factor: torch.Tensor, config: Config) -> dict[str, float]:
-    """Keys of the config's section ``teacher`` by which a stack drives as these factors do, to four digits.
-
-    The horizon ends with its last sample, and depths are averaged over as many samples as before:
-    ``weight_mean`` makes up for the fewer ones.
-    """
-    factors, teacher_cfg = np.exp(log_factor.double().numpy()), config.teacher
-    section = {
-        number.name: getattr(teacher_cfg, number.name) * factor
-        for number, factor in zip(TUNED, factors, strict=True)
-    }
-    dt_s = config.tracking.forecast_dt_s
-    samples = int((section["horizon_s"] + 1e-3) / dt_s)
-    section["horizon_s"] = samples * dt_s
-    section["weight_mean"] = teacher_cfg.weight_mean * samples / round(teacher_cfg.horizon_s / dt_s)
-    return {name: float(f"{value:.4g}") for name, value in section.items()}
+def tuned_section(log_factor: torch.Tensor) -> dict[str, float]:
+    """Keys of the config's section ``fast`` by which a stack drives as these factors do, to four digits."""
+    factors = np.exp(log_factor.double().numpy())
+    return {number.name: float(f"{factor:.4g}") for number, factor in zip(TUNED, factors, strict=True)}
 
 
 def tree_row() -> ObservationColumn:

@@ -40,9 +40,7 @@ class TunerTrainer:
         self.observation_table = (tree_row(),)
         self.generator = torch.Generator().manual_seed(config.train.seed)
         self.centre = torch.zeros(len(TUNED))
-        """natural logarithms of the factors that the next trials are drawn around"""
-        self._path = torch.zeros(config.train.iterations, len(TUNED))
-        """where that was after every iteration"""
+        """natural logarithms of the best factors so far, which the next trials are drawn around"""
         size = config.train.iterations * config.train.num_envs
         self._place, self._score = torch.zeros(size, len(TUNED)), torch.zeros(size)
         self._group = torch.zeros(size, dtype=torch.int64)
@@ -61,13 +59,12 @@ class TunerTrainer:
         scenes = self._scenes()
         group = self.iteration % len(scenes)
         place = self._drawn(self.config.train.num_envs)
-        outcome, steps = self._played(*scenes[group], place, self.config.train.seed, self.trials)
+        outcome, steps = self._played(*scenes[group], place, self.config.train.seed, self.trials // 2, 2)
         between = time.perf_counter()
         self._take(place, outcome, steps, group)
         if self.iteration + 1 >= self.config.tuner.warm_up * self.config.train.iterations:
             self._move()
         learn_s = time.perf_counter() - between
-        self._path[self.iteration] = self.centre
         self.iteration += 1
         env_steps = int(steps.sum())
         self.env_steps += env_steps
@@ -90,27 +87,24 @@ class TunerTrainer:
             for number, factor in zip(TUNED, self.centre.exp().tolist(), strict=True)
         }
 
-    def found(self) -> torch.Tensor:
-        """(n_tuned,) what the search has found: the mean over the second half of its way, which noise has
-        moved less than its end (Polyak & Juditsky 1992)."""
-        return self._path[self.iteration // 2 : max(1, self.iteration)].mean(0)
-
     def _scenes(self) -> list[tuple[str, Scene]]:
         """Every world of ``tuner.worlds`` with every scene, in the order in which they are played."""
         return [(name, scene) for scene in self._all_scenes for name in self.config.tuner.worlds]
 
     def _drawn(self, count: int) -> torch.Tensor:
-        """(count, n_tuned) numbers to try: half of them as they are, half anywhere within ``spread``."""
-        draw, coin = (torch.rand(count, len(TUNED), generator=self.generator) for _ in range(2))
-        other = self.centre + (2.0 * draw - 1.0) * self._spread
-        return torch.where(coin < 0.5, other, self.centre).clamp(self._low, self._high)
+        """(count, n_tuned) numbers to try, by pairs for one episode each: anywhere within ``spread``, the
+        second of a pair as far the other way (mirrored sampling)."""
+        draw = torch.rand(count // 2, len(TUNED), generator=self.generator)
+        way = (2.0 * draw - 1.0) * self._spread
+        tried = self.centre + torch.stack([way, -way], 1).reshape(count, len(TUNED))
+        return tried.clamp(self._low, self._high)
 
     def _played(
-        self, world: str, scene: Scene, place: torch.Tensor, seed: int, first: int
+        self, world: str, scene: Scene, place: torch.Tensor, seed: int, first: int, times: int = 1
     ) -> tuple[torch.Tensor, torch.Tensor]:
         if world not in self._sims:
             self._sims[world] = simulator_of(self.config, world, self._all_scenes)
-        return play_episodes(_TrialPilot(place, self._sims[world]), scene, seed, first, len(place))
+        return play_episodes(_TrialPilot(place, self._sims[world]), scene, seed, first, len(place), times)
 
     def _take(self, place: torch.Tensor, outcome: torch.Tensor, steps: torch.Tensor, group: int) -> None:
         """Remember trials."""
@@ -148,7 +142,7 @@ class TunerTrainer:
         train, scenes = self.config.train, list(dict.fromkeys(self._scenes()))
         each, won, metrics = -(-train.evaluate_episodes // len(scenes)), [], {}
         for world, scene in scenes:
-            outcome, _ = self._played(world, scene, self.found().repeat(each, 1), train.evaluate_seed, 0)
+            outcome, _ = self._played(world, scene, self.centre.repeat(each, 1), train.evaluate_seed, 0)
             won.append((outcome == SUCCESS).float())
             metrics[f"eval/success_{Path(world).stem}_{scene[1]}_{scene[2]:g}"] = float(won[-1].mean())
         return metrics | {"eval/success_rate": float(torch.cat(won).mean())}
@@ -158,8 +152,7 @@ class TunerTrainer:
     def state(self) -> dict[str, Any]:
         """All that the next iterations depend on. What drives is the part ``tree``."""
         return {
-            "tree": {"log_factor": self.found()},
-            "search": {"centre": self.centre.clone(), "path": self._path.clone()},
+            "tree": {"log_factor": self.centre.clone()},
             "generator": self.generator.get_state(),
             "recent": list(self.recent.rows),
             "counters": {name: getattr(self, name) for name in ("iteration", "env_steps", "trials")},
@@ -168,8 +161,7 @@ class TunerTrainer:
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Go on from what ``state`` gave."""
-        self.centre = state["search"]["centre"].clone()
-        self._path.copy_(state["search"]["path"])
+        self.centre = state["tree"]["log_factor"].clone()
         self.generator.set_state(state["generator"])
         self.recent.rows = [list(row) for row in state["recent"]]
         for name, value in state["counters"].items():

@@ -28,8 +28,11 @@ class TeacherState:
     action: ti.Field = array("n_env", vec=4)
     """[-1, 1] surge, sway, heave, yaw rate of the tree"""
     tuned: ti.Field = array("n_env", "n_tuned")
-    """natural logarithms of factors on the config's numbers (``tuned_numbers``), 0 = as configured: a
-    training changes them row by row, a reset sets them back"""
+    """natural logarithms of factors on the config's numbers (``tuned_numbers``) where bodies are fast: a
+    training changes them row by row, a reset sets them to those of the config's section ``fast``"""
+    alert: ti.Field = array("n_env")
+    """[0, 1] share of these factors that holds, by how fast the fastest tracked bodies have lately been; -1 =
+    none was tracked in this episode yet: no factor holds"""
     leaf: ti.Field = array("n_env", dtype=ti.i32)
     """node that set the action, -1 = none (then the vehicle is told to stop)"""
     follow_vel_w: ti.Field = array("n_env", vec=3)
@@ -98,6 +101,8 @@ class TreeTable:
     """which condition or action a leaf is"""
     param: ti.Field = array("n_node", vec=4)
     """numbers from the leaf's ports"""
+    fast: ti.Field = array("n_tuned")
+    """constant: natural logarithms of the factors in the config's section ``fast``"""
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from uuvtai.config import (
     ElevationConfig,
     EpisodeConfig,
+    FastConfig,
     MappingConfig,
     SonarConfig,
     TankConfig,
@@ -82,6 +83,7 @@ class ThreatsIO:
     tracks: In[TrackState]
     elevation_cfg: Const[ElevationConfig]
     episode_cfg: Const[EpisodeConfig]
+    fast_cfg: Const[FastConfig]
     mapping_cfg: Const[MappingConfig]
     sonar_cfg: Const[SonarConfig]
     tank_cfg: Const[TankConfig]

@@ -9,7 +9,8 @@ from uuvtai.kernels.core.lanes import f16x
 from uuvtai.kernels.core.signature import Bundle, Const
 from uuvtai.kernels.perception.elevation import COLUMN, half_height, heights
 from uuvtai.kernels.teacher.bundles import ThreatsIO
-from uuvtai.kernels.teacher.trajectories import depth_band
+from uuvtai.kernels.teacher.trajectories import depth_band, tuned
+from uuvtai.tuned_numbers import DEPTH_CHANGE, GOAL_DEPTH, SLOPE
 
 _AT_GOAL = 0.7
 """Share of the goal's radius that the depth may be off at the goal: the rest is for the level error."""
@@ -26,6 +27,8 @@ def choose_depth(env, io: Bundle[ThreatsIO]):
     wanted = ti.math.clamp(goal[2], low, high)
     if ti.static(io.teacher_cfg.free_depth):
         best_cost, best = FAR_M, wanted
+        of_goal = io.teacher_cfg.weight_goal_depth * tuned(env, GOAL_DEPTH, io.teacher)
+        of_change = io.teacher_cfg.weight_depth_change * tuned(env, DEPTH_CHANGE, io.teacher)
         n = ti.static(io.teacher_cfg.depth_choices)
         before = ti.math.clamp(io.teacher.cruise_z_m[env], low, high)
         for choice in range(n):
@@ -35,13 +38,14 @@ def choose_depth(env, io: Bundle[ThreatsIO]):
             )
             if ti.static(io.teacher_cfg.weight_seen > 0):
                 cost += ti.static(io.teacher_cfg.weight_seen) * _level_bodies(env, z, io)
-            cost += ti.static(io.teacher_cfg.weight_goal_depth) * ti.abs(z - goal[2])
-            cost += ti.static(io.teacher_cfg.weight_depth_change) * ti.abs(z - before)
+            cost += of_goal * ti.abs(z - goal[2])
+            cost += of_change * ti.abs(z - before)
             if cost < best_cost:
                 best_cost, best = cost, z
         away = ti.Vector([goal[0] - pos[0], goal[1] - pos[1]]).norm()
         radius = ti.static(io.episode_cfg.goal_radius_m)
-        off = _AT_GOAL * radius + ti.static(io.teacher_cfg.return_slope) * ti.max(away - radius, 0.0)
+        slope = io.teacher_cfg.return_slope * tuned(env, SLOPE, io.teacher)
+        off = _AT_GOAL * radius + slope * ti.max(away - radius, 0.0)
         io.teacher.cruise_z_m[env] = best
         wanted = ti.math.clamp(ti.math.clamp(best, goal[2] - off, goal[2] + off), low, high)
     return wanted

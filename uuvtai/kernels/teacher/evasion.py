@@ -16,7 +16,7 @@ from uuvtai.kernels.teacher.trajectories import (
     tuned,
 )
 from uuvtai.native.launch import quick_launch, without_cse
-from uuvtai.tuned_numbers import DEVIATION
+from uuvtai.tuned_numbers import BURST, CHANGE, CONTACT, DEVIATION, HEAVE, MEAN, PEAK, SOFTNESS, STATIC
 
 
 @quick_launch
@@ -30,7 +30,11 @@ def plan_evasion(io: Bundle[EvasionIO]):
     for env, packet in ti.ndrange(n, n_packet):
         if io.clock.awake[env] == 1 and io.teacher.want_evade[env] == 1:
             cx, cy, cz = candidate_lanes(env, packet * lanes, lanes, io)
-            burst_s = ti.select(packet * lanes >= io.teacher_cfg.first_burst, io.teacher_cfg.burst_s, FAR_M)
+            burst_s = ti.select(
+                packet * lanes >= io.teacher_cfg.first_burst,
+                io.teacher_cfg.burst_s * tuned(env, BURST, io.teacher),
+                FAR_M,
+            )
             cost = cost_lanes(env, cx, cy, cz, burst_s, io)
             for i in ti.static(range(lanes)):
                 io.teacher.candidate_cost[env, packet * lanes + i] = cost[i]
@@ -39,7 +43,7 @@ def plan_evasion(io: Bundle[EvasionIO]):
             index, best_cost, mean = _chosen(env, io)
             cx, cy, cz = filled(mean[0], lanes), filled(mean[1], lanes), filled(mean[2], lanes)
             cost = cost_lanes(env, cx, cy, cz, FAR_M, io)
-            good = cost[0] <= best_cost + ti.static(io.teacher_cfg.softness)
+            good = cost[0] <= best_cost + io.teacher_cfg.softness * tuned(env, SOFTNESS, io.teacher)
             io.teacher.evade_vel_w[env] = ti.select(good, mean, candidate(env, index, io))
             io.teacher.evade_candidate[env] = ti.select(good, -1, index)
             io.teacher.evade_cost[env] = ti.select(good, cost[0], best_cost)
@@ -82,7 +86,7 @@ def candidate(env, index, io: Bundle[EvasionIO]):
         out = follow
     elif index > n_level + 2 and index < ti.static(io.teacher_cfg.n_held):
         nth = index - n_level - 3
-        heave = ti.select(nth % 2 == 0, 1.0, -1.0) * io.teacher_cfg.heave_m_s
+        heave = ti.select(nth % 2 == 0, 1.0, -1.0) * io.teacher_cfg.heave_m_s * tuned(env, HEAVE, io.teacher)
         heave = edge_limited(heave, io.ego.pos_w[env][2], io.ego.z_var[env], io)
         turn = ti.static(TWO_PI / io.teacher_cfg.n_heave_heading) * (nth // 2)
         out = _towards(env, turn, ti.select(nth >= 2 * n_heave, 0.0, 1.0), heave, io)
@@ -136,14 +140,16 @@ def cost_lanes(env, cx, cy, cz, burst_s, io: Bundle[EvasionIO]):
         ti.static(io.teacher_cfg.weight_deviation / io.teacher_cfg.cruise_m_s)
         * tuned(env, DEVIATION, io.teacher)
     )
-    change = _distance_lanes(cx, cy, cz, io.teacher.last_vel_w[env]) * ti.static(
-        io.teacher_cfg.weight_change / io.teacher_cfg.cruise_m_s
+    change = _distance_lanes(cx, cy, cz, io.teacher.last_vel_w[env]) * (
+        ti.static(io.teacher_cfg.weight_change / io.teacher_cfg.cruise_m_s) * tuned(env, CHANGE, io.teacher)
     )
-    moving = peak * ti.static(io.teacher_cfg.weight_peak) + mean * ti.static(io.teacher_cfg.weight_mean)
-    touching = contact * ti.static(io.teacher_cfg.weight_contact) + static_contact * ti.static(
-        io.teacher_cfg.weight_static_contact
-    )
-    return moving + touching + static_mean * ti.static(io.teacher_cfg.weight_static) + off + change
+    of_peak = io.teacher_cfg.weight_peak * tuned(env, PEAK, io.teacher)
+    of_mean = io.teacher_cfg.weight_mean * tuned(env, MEAN, io.teacher)
+    of_contact = io.teacher_cfg.weight_contact * tuned(env, CONTACT, io.teacher)
+    of_static = io.teacher_cfg.weight_static * tuned(env, STATIC, io.teacher)
+    moving = peak * of_peak + mean * of_mean
+    touching = contact * of_contact + static_contact * ti.static(io.teacher_cfg.weight_static_contact)
+    return moving + touching + static_mean * of_static + off + change
 
 
 @ti.func
@@ -165,10 +171,9 @@ def _chosen(env, io: Bundle[EvasionIO]):
             best_cost = io.teacher.candidate_cost[env, index]
             best = index
     total, mean = 0.0, ti.Vector([0.0, 0.0, 0.0])
+    sharpness = ti.static(1.0 / io.teacher_cfg.softness) / tuned(env, SOFTNESS, io.teacher)
     for index in range(n_used):
-        excess = (io.teacher.candidate_cost[env, index] - best_cost) * ti.static(
-            1.0 / io.teacher_cfg.softness
-        )
+        excess = (io.teacher.candidate_cost[env, index] - best_cost) * sharpness
         if excess < 12.0:
             weight = ti.exp(-excess)
             total += weight

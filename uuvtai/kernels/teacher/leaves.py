@@ -13,7 +13,7 @@ from uuvtai.kernels.teacher.threats import cruising_speed
 from uuvtai.kernels.teacher.trajectories import held_heave, tuned
 from uuvtai.kernels.teacher.tree_tick import tick_nodes
 from uuvtai.native.launch import quick_launch
-from uuvtai.tuned_numbers import CALM, RANGE, TTC
+from uuvtai.tuned_numbers import CALM, RANGE, TTC, WITHIN
 
 
 @quick_launch
@@ -33,7 +33,7 @@ def reset_teacher(io: Bundle[TeacherIO]):
             for index in range(ti.static(io.teacher.candidate_cost.shape[1])):
                 io.teacher.candidate_cost[env, index] = 0.0
             for number in range(ti.static(io.teacher.tuned.shape[1])):
-                io.teacher.tuned[env, number] = 0.0
+                io.teacher.tuned[env, number] = io.table.fast[number]
             _reset_blackboard(env, io)
 
 
@@ -57,6 +57,7 @@ def _reset_blackboard(env, io: Bundle[TeacherIO]):
         FAR_M,
     )
     io.teacher.calm_steps[env], io.teacher.evading_steps[env] = 0, 0
+    io.teacher.alert[env] = -1.0
     io.teacher.speed_share[env], io.teacher.cruise_z_m[env] = 0.0, io.mission.goal_w[env][2]
 
 
@@ -120,7 +121,8 @@ def _answer(env, node, io: Bundle[TeacherIO]):
             ti.i32,
         )
     elif leaf == codes.PREDICTED_CONFLICT:
-        seen = io.teacher.conflict_s[env] <= _port(node, 0, ti.static(io.teacher_cfg.conflict_within_s), io)
+        usual_s = io.teacher_cfg.conflict_within_s * tuned(env, WITHIN, io.teacher)
+        seen = io.teacher.conflict_s[env] <= _port(node, 0, usual_s, io)
         lately = io.teacher.evading_steps[env] > 0 and io.teacher.calm_steps[env] * dt <= _port(
             node, 1, io.teacher_cfg.calm_s * tuned(env, CALM, io.teacher), io
         )

@@ -192,6 +192,25 @@ def cruising_speed(
 
 
 @ti.func
+def _note_speeds(env, io: Bundle[ThreatsIO]):
+    """Take the track that is surely the fastest into ``alert``; while none moves it stays as it is."""
+    fastest = -1.0
+    for track in range(ti.static(io.tracks.alive.shape[1])):
+        if io.tracks.alive[env, track] * io.tracks.moving[env, track] == 1:
+            state, cov = io.tracks.state[env, track], io.tracks.cov[env, track]
+            unsure = ti.sqrt(ti.max(cov[7], cov[9], 0.0))
+            fastest = ti.max(fastest, ti.Vector([state[2], state[3]]).norm() - unsure, 0.0)
+    if fastest >= 0.0:
+        slow, fast = ti.static(io.fast_cfg.from_m_s, io.fast_cfg.full_m_s)
+        now = ti.math.clamp((fastest - slow) / ti.static(max(fast - slow, 1e-6)), 0.0, 1.0)
+        before = io.teacher.alert[env]
+        rate = ti.static(
+            min(1.0, io.teacher_cfg.decide_period_steps * io.episode_cfg.control_dt_s / io.fast_cfg.settle_s)
+        )
+        io.teacher.alert[env] = ti.select(before < 0.0, now, before + rate * (now - before))
+
+
+@ti.func
 def _foresee_conflict(env, io: Bundle[ThreatsIO]):
     """Roll the follow velocity out against the forecasts, in decision steps only, with and without a change
     of depth; and a stop.
@@ -201,6 +220,7 @@ def _foresee_conflict(env, io: Bundle[ThreatsIO]):
     io.teacher.want_evade[env] = 0
     io.teacher.calm_steps[env] += 1
     if io.clock.step[env] % ti.static(io.teacher_cfg.decide_period_steps) == 0:
+        _note_speeds(env, io)
         pos = io.ego.pos_w[env]
         follow = io.teacher.follow_vel_w[env]
         heave = held_heave(choose_depth(env, io) - pos[2], io.teacher_cfg, io.vehicle_cfg)

@@ -15,7 +15,7 @@ from uuvtai.kernels.core.grid import grid_origin
 from uuvtai.kernels.core.lanes import filled
 from uuvtai.kernels.core.signature import Const, In, Out
 from uuvtai.state import ClearanceState, ForecastState, FutureState, Proprioception, TeacherState
-from uuvtai.tuned_numbers import CAUTION, CLOSING, GROWTH, HORIZON, LAG
+from uuvtai.tuned_numbers import CAUTION, CLOSING, DOUBT, GROWTH, HORIZON, LAG, STATIC_MARGIN, VERTICAL
 
 _SLACK_S = 1.0e-3
 """the last sample is within the horizon, however times are rounded"""
@@ -23,8 +23,8 @@ _SLACK_S = 1.0e-3
 
 @ti.func
 def tuned(env, number, teacher: In[TeacherState]):
-    """Factor on one of the config's numbers in this row (``tuned_numbers``)."""
-    return ti.exp(teacher.tuned[env, number])
+    """Factor on one of the config's numbers in this row and at this time (``tuned_numbers``)."""
+    return ti.exp(ti.max(teacher.alert[env], 0.0) * teacher.tuned[env, number])
 
 
 @ti.func
@@ -53,6 +53,9 @@ def drive_of(
         closing_s=teacher_cfg.closing_s * tuned(env, CLOSING, teacher),
         horizon_s=teacher_cfg.horizon_s * tuned(env, HORIZON, teacher) + _SLACK_S,
         slower=tuned(env, LAG, teacher),
+        vertical=teacher_cfg.vertical_weight * tuned(env, VERTICAL, teacher),
+        doubt=teacher_cfg.body_doubt * tuned(env, DOUBT, teacher) - 1.0,
+        static_margin_m=teacher_cfg.static_margin_m * tuned(env, STATIC_MARGIN, teacher),
     )
 
 
@@ -70,8 +73,8 @@ def body_depths(
 
     ``drive``: struct of the velocities (lanes x, y, z [m/s]), which are commanded for ``burst_s`` [s], then
     stop, and of the own position ``pos`` [m], velocity ``vel`` [m/s] and variance of z ``z_var`` [m^2] now,
-    world, and the row's own margins, horizon and lag (``drive_of``). Returns lanes: largest
-    depth [m]; depth averaged over the horizon and summed over bodies [m]; largest depth below contact [m];
+    world, and the row's own margins, weights, horizon and lag (``drive_of``). Returns lanes: largest depth
+    [m]; depth averaged over the horizon and summed over bodies [m]; largest depth below contact [m];
     time of the first violation [s], FAR_M = none. Each body counts with the mean of its futures, weighted by
     their probabilities; a future that is less probable than ``heed_share`` has no first violation. The
     clearance is reduced by closing_s times the closing speed, as the referee also stops at a small time to
@@ -133,7 +136,9 @@ def _within_reach(
     time = ti.static((n - 1) * tracking_cfg.forecast_dt_s)
     closing = (second - first).norm() * ti.static(1.05 / tracking_cfg.forecast_dt_s)
     closing += ti.Vector([drive.vel[0], drive.vel[1]]).norm() + ti.static(_fastest(teacher_cfg))
-    bound = forecast.radius_m[env, track, n - 1] + ti.static(teacher_cfg.hull_reach_m)
+    told = forecast.radius_m[env, track, n - 1]
+    bound = told + ti.max(drive.doubt, 0.0) * ti.max(told - forecast.radius_m[env, track, 0], 0.0)
+    bound += ti.static(teacher_cfg.hull_reach_m)
     bound += _wanted_m(time, drive, teacher_cfg) + closing * (time + drive.closing_s)
     return (first - ti.Vector([drive.pos[0], drive.pos[1]])).norm_sqr() < bound * bound
 
@@ -181,11 +186,12 @@ def _future_depths(
         before = body
         start = level + level_vel * settle - body
         drift = level_vel * decay - body_vel
-        radius = forecast.radius_m[env, track, k]
+        told = forecast.radius_m[env, track, k]
+        radius = told + drive.doubt * (told - forecast.radius_m[env, track, 0])
         bound = _bound_m(radius, wanted, gain, drive.closing_s * (reach_speed + body_vel.norm()), teacher_cfg)
-        if radius >= 0 and time <= drive.horizon_s and start.norm_sqr() < bound * bound:
+        if told >= 0 and time <= drive.horizon_s and start.norm_sqr() < bound * bound:
             z = ti.math.clamp(drive.z * gain + (drive.pos[2] + drive.vel[2] * settle), low, high)
-            gap = ti.max(ti.min(above - z, z - below), 0.0) * ti.static(teacher_cfg.vertical_weight)
+            gap = ti.max(ti.min(above - z, z - below), 0.0) * drive.vertical
             free = _free_lanes(
                 drive.x, drive.y, gap, start, drift, gain, rest - decay, radius, drive.closing_s, teacher_cfg
             )
@@ -269,7 +275,7 @@ def static_depths(
         )
         for i in ti.static(range(drive.x.n)):
             below = touch + doubt - free[i]
-            mean[i] += ti.max(below + ti.static(teacher_cfg.static_margin_m), 0.0) / n_sample
+            mean[i] += ti.max(below + drive.static_margin_m, 0.0) / n_sample
             contact[i] = ti.max(contact[i], below)
     return mean, contact
 

@@ -36,6 +36,7 @@ _STACK = (
     "quiet",
     "route",
     "teacher",
+    "fast",
     "actuation",
     "episode",
 )

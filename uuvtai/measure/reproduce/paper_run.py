@@ -54,7 +54,7 @@ def reproduce(
     request: dict[str, Any] = {
         "schema": 1,
         "budget": budget,
-        "policy": "best" if "best" in preset_names("policy") else None,
+        "policy": "residual" if "residual" in preset_names("policy") else None,
     }
     request["own"] = pieces
     folder.write_json(REQUEST, request)
