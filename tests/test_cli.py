@@ -60,6 +60,7 @@ from uuvtai.show.screen import Screen
         (["eval", "--device", "tpu"], "use auto, cpu or cuda"),
         (["eval", "no/such/run"], "is no trained policy"),
         (["eval", "bestt"], "is no trained policy"),
+        (["sweep", "best", "--grid", "D=0"], "it drives by itself: --controller best"),
         (["eval", "--controller", "none"], "'none' is no preset"),
         (["train", "curiculum"], "did you mean 'curriculum'"),
         (["train", "nowhere.yaml"], "no such file"),

@@ -174,6 +174,18 @@ def outcomes_by_seed(document):
     return kept
 
 
+def check_paired_rows(found, kept, usual):
+    """Rows (pilot, scene, seeds, rates of ``usual``, own rates with gains, losses and p) are as kept."""
+    for name, scene, _seeds, was, text in ([cell.strip(" |") for cell in cells] for cells in found):
+        own = kept[name, scene]
+        before = "".join(kept[usual, scene][seed] for seed in own)
+        outcomes = "".join(own.values())
+        assert told(was) == pytest.approx(rates(before), abs=0.051), (name, scene)
+        assert told(text) == pytest.approx(rates(outcomes), abs=0.051), (name, scene)
+        won, lost = paired(outcomes, before)
+        assert text.endswith(f" (+{won} -{lost}, p = {mcnemar_p(won, lost):.3f})"), (name, scene)
+
+
 def test_trials_of_the_gaze_are_as_their_episodes_say():
     document = json.loads((DOCS / "data/gaze_trials.json").read_text())
     kept = outcomes_by_seed(document)
@@ -197,14 +209,7 @@ def test_trials_of_learnt_numbers_are_as_their_episodes_say():
     assert {(name.strip(" |"), scene) for name, scene, *_ in found} == {
         k for k in kept if k[0] != "as it was"
     }
-    for name, scene, _seeds, was, text in ([cell.strip(" |") for cell in cells] for cells in found):
-        own = kept[name, scene]
-        before = "".join(kept["as it was", scene][seed] for seed in own)
-        outcomes = "".join(own.values())
-        assert told(was) == pytest.approx(rates(before), abs=0.051), (name, scene)
-        assert told(text) == pytest.approx(rates(outcomes), abs=0.051), (name, scene)
-        won, lost = paired(outcomes, before)
-        assert text.endswith(f" (+{won} -{lost}, p = {mcnemar_p(won, lost):.3f})"), (name, scene)
+    check_paired_rows(found, kept, "as it was")
     nominal = {}
     for row in document["nominal"]:
         nominal[row["pilot"]] = nominal.get(row["pilot"], "") + row["outcomes"]
@@ -219,15 +224,9 @@ def test_trials_of_bodies_that_leave_the_fan_are_as_their_episodes_say():
     kept = outcomes_by_seed(document)
     found = table("tuning.md", "## Bodies that leave", "| pilot |")
     assert len(found) == len(kept) - sum(name == "as it is" for name, _ in kept)
-    for name, scene, seeds, was, text in ([cell.strip(" |") for cell in cells] for cells in found):
-        own = kept[name, scene]
-        assert seeds == ", ".join(map(str, sorted(own)))
-        before = "".join(kept["as it is", scene][seed] for seed in own)
-        outcomes = "".join(own.values())
-        assert told(was) == pytest.approx(rates(before), abs=0.051), (name, scene)
-        assert told(text) == pytest.approx(rates(outcomes), abs=0.051), (name, scene)
-        won, lost = paired(outcomes, before)
-        assert text.endswith(f" (+{won} -{lost}, p = {mcnemar_p(won, lost):.3f})"), (name, scene)
+    check_paired_rows(found, kept, "as it is")
+    for name, scene, seeds, *_ in found:
+        assert seeds.strip(" |") == ", ".join(map(str, sorted(kept[name.strip(" |"), scene.strip(" |")])))
     failures, gaps = document["maze_failures"], document["unseen_vertical_gap_m"]
     unseen, late = (
         sum(failures[label] for label in labels)
@@ -237,14 +236,8 @@ def test_trials_of_bodies_that_leave_the_fan_are_as_their_episodes_say():
     assert f"{sum(failures.values())} episodes of `maze`" in said and f"fail: {unseen} by a body" in said
     assert f"passes {gaps[0]:.2f} to {gaps[-1]:.2f} m" in said and f", {late} by time" in said
     assert f"(median {np.median(gaps):.2f} m" in said
-    pool = kept["a side is a part", "pool (8, 9, 1.5)"]
-    new = [seed for seed in pool if seed not in (77003, 77004)]
-    won, lost = paired(
-        *(
-            "".join(kept[name, "pool (8, 9, 1.5)"][s] for s in new)
-            for name in ("a side is a part", "as it is")
-        )
-    )
+    names, scene, new = ("a side is a part", "as it is"), "pool (8, 9, 1.5)", (77008, 77009)
+    won, lost = paired(*("".join(kept[name, scene][seed] for seed in new) for name in names))
     assert f"had seen: +{won} -{lost})" in said
 
 

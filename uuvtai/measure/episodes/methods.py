@@ -209,10 +209,12 @@ def find_policy(name: str, note: Callable[[str], None] = lambda _text: None) -> 
         return checkpoint.open_checkpoint(path)
     if (path / "checkpoints").is_dir():
         return checkpoint.best(path, note)
+    is_driver = name in (*preset_names("tree"), *preset_names("stack"))
+    instead = f"; it drives by itself: --controller {name}. Else" if is_driver else ":"
     raise ConfigError(
-        f"{name!r} is no trained policy: give the run folder of 'uuv train', one of its checkpoints/step_N, "
-        f"a shipped policy's name ({', '.join(shipped) or 'none is shipped'}), or one of yours: "
-        "--policy model.onnx, --policy mine.py:load"
+        f"{name!r} is no trained policy{instead} give the run folder of 'uuv train', one of its "
+        f"checkpoints/step_N, a shipped policy's name ({', '.join(shipped) or 'none is shipped'}), or one of "
+        "yours: --policy model.onnx, --policy mine.py:load"
     )
 
 
