@@ -14,7 +14,7 @@ from uuvtai.kernels.core.grid import outside_cells
 from uuvtai.scenario import load_fixed
 from uuvtai.stages import SimState
 from uuvtai.taichi_patches.memory import Put
-from uuvtai.tuned_numbers import TUNED
+from uuvtai.tuned_numbers import configured_factors
 
 
 def allocate_state(sizes: dict[str, int]) -> SimState:
@@ -29,8 +29,7 @@ def fill_constants(s: SimState, config: Config, put: Put) -> None:
         from uuvtai.mixture_weights import put_weights, read_weights
 
         put_weights(s.mixture, read_weights(config.forecast.learned), put)
-    factors = [getattr(config.fast, number.name) for number in TUNED]
-    put(s.table.fast, np.log(np.array(factors)).astype(np.float32))
+    put(s.table.factor, configured_factors(config))
     load_fixed(s.fixed, config.world)
     load_bounds(s.mask, np.array(outside_cells(config.world.tank, config.mapping.cell_m)), put)
     wrench_of_thrust, thrust_of_wrench = allocation_matrices(config.vehicle)

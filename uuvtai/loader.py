@@ -41,6 +41,7 @@ STACK_SECTIONS = (
     "quiet",
     "route",
     "teacher",
+    "slow",
     "fast",
     "baselines",
 )

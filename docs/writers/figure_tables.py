@@ -12,6 +12,8 @@ from docs.writers.benchmark_pages import benchmark, benchmark_scenes
 from docs.writers.dead_tables import dead_commands, dead_thrusters
 from docs.writers.figure_sources import Counts, SourceError, Sources, fitting, pooled, rated, share, weighted
 from docs.writers.forecast_tables import forecast_pieces, forecast_scores
+from docs.writers.learned_search import learned_curve, learned_numbers
+from docs.writers.learned_trials import learned_trials, stack_trials
 from docs.writers.link_tables import (
     aboard,
     ardusub_identified,
@@ -25,7 +27,7 @@ from docs.writers.pieces import BEFORE, CELLS, DASH, LETTERS, PIECES, beside
 from docs.writers.pose_tables import pose_endings, pose_errors
 from docs.writers.replay_tables import changed, lossy, replayed
 from docs.writers.sonar_tables import sonars
-from docs.writers.tuner_tables import fast_curve, fast_slopes, fast_trials, tuner_slopes
+from docs.writers.tuner_tables import fast_slopes, tuner_slopes
 from docs.writers.vehicle_tables import vehicle_commands, vehicles
 from uuvtai.measure.reproduce import paper
 from uuvtai.measure.reproduce.steps import RETIRED_SEEDS
@@ -598,9 +600,11 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         tuned_trials,
         learning_trials,
         tuner_slopes,
-        fast_curve,
+        learned_curve,
+        learned_numbers,
         fast_slopes,
-        fast_trials,
+        learned_trials,
+        stack_trials,
         forecast_scores,
         forecast_pieces,
         benchmark_scenes,

@@ -14,7 +14,6 @@ from uuvtai.config.baselines import (
     VelocityObstacleConfig,
 )
 from uuvtai.config.execution import RuntimeConfig
-from uuvtai.config.fast import FastConfig
 from uuvtai.config.perception import (
     ElevationConfig,
     ForecastConfig,
@@ -36,6 +35,7 @@ from uuvtai.config.sensors import (
 from uuvtai.config.task import EpisodeConfig, RewardConfig
 from uuvtai.config.teacher import TeacherConfig
 from uuvtai.config.traffic import TrafficConfig
+from uuvtai.config.tuned import FastConfig, SlowConfig
 from uuvtai.config.vehicle import ActuationConfig, DisturbanceConfig, Thruster, VehicleConfig
 from uuvtai.config.world import (
     DynamicObstacles,
@@ -68,6 +68,7 @@ class Config(Section):
     route: RouteConfig = RouteConfig()
     features: FeaturesConfig = FeaturesConfig()
     teacher: TeacherConfig = TeacherConfig()
+    slow: SlowConfig = SlowConfig()
     fast: FastConfig = FastConfig()
     baselines: BaselinesConfig = BaselinesConfig()
     reward: RewardConfig = RewardConfig()
@@ -103,6 +104,7 @@ __all__ = [
     "RuntimeConfig",
     "Section",
     "SensorsConfig",
+    "SlowConfig",
     "SonarConfig",
     "SpottingConfig",
     "StaticObstacles",

@@ -17,6 +17,8 @@ from uuvtai.config.section import Count, Fraction, NonNegative, Positive, Positi
 
 Points = tuple[tuple[NonNegative, NonNegative], ...]
 """(share of the run, value): linear in between, constant outside; two points at the same share are a jump"""
+TunerScene = tuple[Annotated[str, Field(min_length=1, max_length=200)], Count, Count, NonNegative]
+"""world preset, S, D, v [m/s]"""
 
 
 class PolicyConfig(Section):
@@ -252,15 +254,25 @@ class TunerConfig(Section):
 
     enabled: bool = False
     """learn the tree's numbers"""
-    worlds: tuple[Annotated[str, Field(min_length=1, max_length=200)], ...] = ("gauntlet", "pool", "gauntlet")
-    """world presets whose episodes are played in turn, each with every one of ``train.scenes``; one that is
-    named twice is played twice as often"""
-    spread: Fraction = 0.35
+    scenes: tuple[TunerScene, ...] = (
+        ("gauntlet", 8, 9, 1.5),
+        ("pool", 8, 6, 0.6),
+        ("pool", 8, 9, 1.5),
+        ("maze", 8, 6, 0.6),
+        ("gauntlet", 8, 9, 1.5),
+        ("pool", 8, 6, 0.6),
+    )
+    """world preset, S, D and v [m/s] of what is played, an iteration each, in turn. By its speed a scene is
+    one of slow bodies (``fast.from_m_s`` or less) or of fast ones (``fast.full_m_s`` or more), and moves the
+    numbers for these alone"""
+    spread: Fraction = 0.3
     """numbers are tried so far from the best ones, in parts of the way between their bounds"""
     warm_up: Fraction = 0.25
     """part of the run before the numbers are moved for the first time"""
     time_cost: NonNegative = 0.005
-    """[1/s] an arrival is worth so much less per second"""
+    """[1/s] an arrival among fast bodies is worth so much less per second"""
+    slow_time_cost: NonNegative = 0.01
+    """[1/s] the same among slow ones, where nearly all arrive"""
 
 
 class ForecasterConfig(Section):

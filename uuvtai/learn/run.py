@@ -358,16 +358,13 @@ class _Run:
 
     def _write_stack(self, folder: RunFolder) -> None:
         """The stack that drives with the tree's numbers as they are now, where ``--stack`` is taken."""
-        from uuvtai.learn.tuned_pilot import tuned_section
+        from uuvtai.learn.tuned_pilot import tuned_sections
         from uuvtai.learn.tuner_trainer import TunerTrainer
 
         assert isinstance(self._trainer, TunerTrainer)
-        section = tuned_section(self._trainer.centre)
-        lines = [
-            f"tree: {TRAINING_TREE}",
-            "fast:",
-            *(f"  {name}: {value}" for name, value in section.items()),
-        ]
+        lines = [f"tree: {TRAINING_TREE}"]
+        for section, factors in tuned_sections(self._trainer.centre).items():
+            lines += [f"{section}:", *(f"  {name}: {value}" for name, value in factors.items())]
         folder.write(STACK, "\n".join(lines) + "\n")
 
     def _success_interval(self) -> tuple[float, float] | None:

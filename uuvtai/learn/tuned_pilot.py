@@ -10,7 +10,7 @@ import torch
 from uuvtai.learn.checkpoint import Checkpoint
 from uuvtai.learn.manifest import MODEL, CheckpointError
 from uuvtai.learn.pilot import PilotDecision
-from uuvtai.tuned_numbers import TUNED
+from uuvtai.tuned_numbers import FAST, SLOW, TUNED
 
 if TYPE_CHECKING:
     from uuvtai.env import ObservationColumn
@@ -25,11 +25,12 @@ class TunedPilot:
     risk = None
 
     def __init__(self, log_factor: torch.Tensor, sim: Sim) -> None:
-        """``log_factor`` (n_tuned,) natural logarithms of the factors, in the order of ``TUNED``."""
+        """``log_factor`` (n_tuned, 2) natural logarithms of the factors, in the order of ``TUNED``, for slow
+        bodies and for fast ones."""
         self.simulator = sim
         rows = sim.s.teacher.tuned.shape[0]
         self.log_factor = log_factor.float().cpu().numpy()[None].repeat(rows, axis=0)
-        """(rows, n_tuned) of every row that is allocated"""
+        """(rows, n_tuned, 2) of every row that is allocated"""
         nothing = torch.zeros(sim.num_envs, device=sim.device)
         std = torch.zeros(4, device=sim.device)
         self.decision = PilotDecision(sim.action, nothing, std, nothing, nothing, nothing[:0])
@@ -51,18 +52,19 @@ class TunedPilot:
 
 def load_tuned(checkpoint: Checkpoint, sim: Sim) -> TunedPilot:
     """Pilot of a checkpoint that holds numbers of the tree. Raises CheckpointError for others."""
-    return TunedPilot(log_factors(checkpoint), sim)
+    return TunedPilot(checkpoint_factors(checkpoint), sim)
 
 
-def log_factors(checkpoint: Checkpoint) -> torch.Tensor:
-    """(n_tuned,) of a checkpoint. Raises CheckpointError where they are none that a training can leave."""
+def checkpoint_factors(checkpoint: Checkpoint) -> torch.Tensor:
+    """(n_tuned, 2) of a checkpoint. Raises CheckpointError where they are none that a training can leave."""
     try:
         found = checkpoint.model()["tree"]["log_factor"]
-        if tuple(found.shape) != (len(TUNED),):
-            raise ValueError(f"log_factor is {tuple(found.shape)} instead of {(len(TUNED),)}")
-        for number, factor in zip(TUNED, found.exp().tolist(), strict=True):
-            if not number.least * 0.999 <= factor <= number.most * 1.001:
-                raise ValueError(f"{number.name} is multiplied by {factor:g}")
+        if tuple(found.shape) != (len(TUNED), 2):
+            raise ValueError(f"log_factor is {tuple(found.shape)} instead of {(len(TUNED), 2)}")
+        for number, factors in zip(TUNED, found.exp().tolist(), strict=True):
+            for factor in factors:
+                if not number.least * 0.999 <= factor <= number.most * 1.001:
+                    raise ValueError(f"{number.name} is multiplied by {factor:g}")
     except (KeyError, ValueError, TypeError, AttributeError) as error:
         raise CheckpointError(
             f"{checkpoint.path / MODEL}: holds no numbers of the tree ({error}); take another one"
@@ -70,10 +72,17 @@ def log_factors(checkpoint: Checkpoint) -> torch.Tensor:
     return found
 
 
-def tuned_section(log_factor: torch.Tensor) -> dict[str, float]:
-    """Keys of the config's section ``fast`` by which a stack drives as these factors do, to four digits."""
+def tuned_sections(log_factor: torch.Tensor) -> dict[str, dict[str, float]]:
+    """Sections ``slow`` and ``fast`` of the config by which a stack drives as these factors (n_tuned, 2) do,
+    to four digits."""
     factors = np.exp(log_factor.double().numpy())
-    return {number.name: float(f"{factor:.4g}") for number, factor in zip(TUNED, factors, strict=True)}
+    return {
+        section: {
+            number.name: float(f"{factor:.4g}")
+            for number, factor in zip(TUNED, factors[:, part], strict=True)
+        }
+        for section, part in (("slow", SLOW), ("fast", FAST))
+    }
 
 
 def tree_row() -> ObservationColumn:

@@ -27,12 +27,13 @@ class TeacherState:
     """control steps of the episode in which this leaf set the action"""
     action: ti.Field = array("n_env", vec=4)
     """[-1, 1] surge, sway, heave, yaw rate of the tree"""
-    tuned: ti.Field = array("n_env", "n_tuned")
-    """natural logarithms of factors on the config's numbers (``tuned_numbers``) where bodies are fast: a
-    training changes them row by row, a reset sets them to those of the config's section ``fast``"""
+    tuned: ti.Field = array("n_env", "n_tuned", vec=2)
+    """natural logarithms of factors on the config's numbers (``tuned_numbers``), where bodies are slow and
+    where they are fast: a training changes them row by row, a reset sets them to those of the config's
+    sections ``slow`` and ``fast``"""
     alert: ti.Field = array("n_env")
-    """[0, 1] share of these factors that holds, by how fast the fastest tracked bodies have lately been; -1 =
-    none was tracked in this episode yet: no factor holds"""
+    """[0, 1] share of the second ones in what holds, by how fast the fastest tracked bodies have lately been;
+    -1 = none was tracked in this episode yet: the first ones hold"""
     leaf: ti.Field = array("n_env", dtype=ti.i32)
     """node that set the action, -1 = none (then the vehicle is told to stop)"""
     follow_vel_w: ti.Field = array("n_env", vec=3)
@@ -101,8 +102,8 @@ class TreeTable:
     """which condition or action a leaf is"""
     param: ti.Field = array("n_node", vec=4)
     """numbers from the leaf's ports"""
-    fast: ti.Field = array("n_tuned")
-    """constant: natural logarithms of the factors in the config's section ``fast``"""
+    factor: ti.Field = array("n_tuned", vec=2)
+    """constant: natural logarithms of the factors in the config's sections ``slow`` and ``fast``"""
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,7 +33,7 @@ def reset_teacher(io: Bundle[TeacherIO]):
             for index in range(ti.static(io.teacher.candidate_cost.shape[1])):
                 io.teacher.candidate_cost[env, index] = 0.0
             for number in range(ti.static(io.teacher.tuned.shape[1])):
-                io.teacher.tuned[env, number] = io.table.fast[number]
+                io.teacher.tuned[env, number] = io.table.factor[number]
             _reset_blackboard(env, io)
 
 

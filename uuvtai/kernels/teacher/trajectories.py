@@ -24,7 +24,8 @@ _SLACK_S = 1.0e-3
 @ti.func
 def tuned(env, number, teacher: In[TeacherState]):
     """Factor on one of the config's numbers in this row and at this time (``tuned_numbers``)."""
-    return ti.exp(ti.max(teacher.alert[env], 0.0) * teacher.tuned[env, number])
+    share, log_factor = ti.max(teacher.alert[env], 0.0), teacher.tuned[env, number]
+    return ti.exp((1.0 - share) * log_factor[0] + share * log_factor[1])
 
 
 @ti.func

@@ -1,21 +1,13 @@
-"""The behaviour tree's numbers where bodies are fast."""
+"""Factors on the behaviour tree's numbers: among slow bodies and among fast ones."""
 
 from __future__ import annotations
 
 from uuvtai.config.section import NonNegative, Positive, Section
 
 
-class FastConfig(Section):
-    """Factors on numbers of ``teacher`` that hold where fast bodies were lately tracked, and by a share of
-    their logarithms where these are a little fast; among slow ones the numbers are as ``teacher`` says.
-    ``uuv train best`` learns them (``docs/learning.md``)."""
+class TunedConfig(Section):
+    """Factors on numbers of ``teacher``. ``uuv train best`` learns them (``docs/learning.md``)."""
 
-    from_m_s: NonNegative = 0.8
-    """speed of the fastest tracked body, less its standard deviation, up to which ``teacher`` holds alone"""
-    full_m_s: NonNegative = 1.2
-    """speed from which on the factors hold whole"""
-    settle_s: Positive = 1.0
-    """time constant of the mean of that speed"""
     caution: Positive = 1.0
     margin_growth_m_s: Positive = 1.0
     closing_s: Positive = 1.0
@@ -41,3 +33,19 @@ class FastConfig(Section):
     weight_goal_depth: Positive = 1.0
     weight_depth_change: Positive = 1.0
     body_doubt: Positive = 1.0
+
+
+class SlowConfig(TunedConfig):
+    """Factors on numbers of ``teacher`` that hold where no fast body was lately tracked."""
+
+
+class FastConfig(TunedConfig):
+    """Factors on numbers of ``teacher`` that hold, instead of those of ``slow``, where fast bodies were
+    lately tracked, and by a share of their logarithms where these are a little fast."""
+
+    from_m_s: NonNegative = 0.8
+    """speed of the fastest tracked body, less its standard deviation, up to which ``slow`` holds alone"""
+    full_m_s: NonNegative = 1.2
+    """speed from which on these factors hold alone"""
+    settle_s: Positive = 1.0
+    """time constant of the mean of that speed"""
