@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from uuvtai.identify.motion_model import (
     stretches,
 )
 from uuvtai.identify.rotor_lag import mean_wrench
+from uuvtai.identify.stretch_starts import first_readings, grown_starts
 from uuvtai.loader import load_config
 from uuvtai.logs.mcap_log import McapEpisodeLog
 
@@ -181,18 +183,47 @@ def test_commands_that_change_slowly_do_not_show_the_lag():
 
 @pytest.mark.parametrize("lag_s", [0.004, 0.03, 0.2])
 def test_thrust_of_a_lagging_rotor_against_small_steps(lag_s):
-    """First order between commands that jump from sample to sample."""
+    """First order between commands that jump from sample to sample: the mean of each step, and that weighted
+    by the time left of it."""
     asked = np.array([0.0, 2000.0, 2000.0, -1500.0, 800.0, 800.0])[:, None] * np.ones(6)
     blank = np.zeros((6, 4)), np.zeros((6, 2)), np.zeros((6, 3))
-    found = mean_wrench(Drive(DT_S, *blank, asked, command="held"), TOLD, np.array([lag_s]))[0]
+    found = mean_wrench(Drive(DT_S, *blank, asked, command="held"), TOLD, np.array([lag_s]))[:, 0]
     turned, fine = 0.0, 2000
+    left = 1 - (np.arange(fine) + 0.5) / fine
     for k in range(5):
         pushes = []
         for _ in range(fine):
             middle = asked[k, 0] + (turned - asked[k, 0]) * math.exp(-0.5 * DT_S / fine / lag_s)
             turned = asked[k, 0] + (turned - asked[k, 0]) * math.exp(-DT_S / fine / lag_s)
             pushes.append(thrust(middle))
-        assert found[k] == pytest.approx(np.mean(pushes), abs=0.25), k
+        assert found[0, k] == pytest.approx(np.mean(pushes), abs=0.25), k
+        assert found[1, k] == pytest.approx(np.average(pushes, weights=left), abs=0.35), k
+
+
+def test_a_rotor_never_quite_arrives_at_the_edge_of_its_dead_band():
+    """Told the edge from standstill it does not push, however long that lasts; told it from above it does."""
+    edge = TOLD.dead_band_rpm[0] * np.ones(200)
+    asked = np.stack([np.r_[0.0, edge], np.r_[2000.0, edge]], axis=1)
+    blank = np.zeros((201, 4)), np.zeros((201, 2)), np.zeros((201, 3))
+    found = mean_wrench(Drive(DT_S, *blank, asked, command="held"), TOLD, np.array([0.01]))[0, 0]
+    assert (found[:, 0] == 0.0).all()
+    assert found[150:, 1] == pytest.approx(thrust(TOLD.dead_band_rpm[0] + 1e-6), abs=1e-3)
+
+
+def test_speeds_as_turned_run_as_the_lag_has_it_or_straight():
+    """Thrust is taken on either way from one sample to the next, so that an interval can hold both."""
+    turned = np.array([600.0, 2200.0, 2300.0])[:, None] * np.ones(6)
+    drive = Drive(DT_S, np.zeros((3, 4)), np.zeros((3, 2)), np.zeros((3, 3)), turned)
+    other = drive.otherwise()
+    assert other is not None and other.straight
+    quick, straight = (mean_wrench(one, TOLD, np.array([0.05]))[0, 0, 0, 0] for one in (drive, other))
+    times = (np.arange(2000) + 0.5) / 2000
+    kept = np.exp(-times * DT_S / TOLD.rotor_tau_s)
+    lagged = 1 - (1 - kept) / (1 - math.exp(-DT_S / TOLD.rotor_tau_s))
+    for found, way in ((quick, 1 - lagged), (straight, times)):
+        assert found == pytest.approx(np.mean([thrust(600.0 + 1600.0 * share) for share in way]), rel=0.02)
+    held = Drive(DT_S, np.zeros((3, 4)), np.zeros((3, 2)), np.zeros((3, 3)), turned, command="held")
+    assert held.otherwise() is None
 
 
 def test_a_delay_shifts_what_its_instrument_says(table):
@@ -206,6 +237,26 @@ def test_a_delay_shifts_what_its_instrument_says(table):
     halfway = (9 * (yaw[:, 2:-2] + yaw[:, 1:-3]) - yaw[:, 3:-1] - yaw[:, :-4]) / 16
     assert np.allclose(late[:, 2:-2, 3], halfway)
     assert np.isnan(given.velocity[:, :8]).all(), "what a delay may have from before the stretch"
+
+
+def test_initial_velocities_of_an_unstable_vehicle_are_found(table):
+    """Ahead at 0.6 m/s its yaw runs away (Munk's moment), so undamped steps from first readings run away too:
+    one stretch that is not settled outweighs all others."""
+    whole = stretches(read_drives(table), TOLD, 5.0)
+    ahead = np.zeros_like(whole.wrench)
+    ahead[..., 0] = 9.0
+    value = parameters_of(TOLD)
+    value[NET], value[[0, 1]] = 0.0, (1.0, 25.0)
+    still = replace(whole, wrench=ahead, up=np.zeros_like(whole.up), tilt_rate=np.zeros_like(whole.tilt_rate))
+    rng = np.random.default_rng(3)
+    true = np.array([0.6, 0.0, 0.0, 0.0]) + 0.1 * rng.normal(size=(len(whole.velocity), 4))
+    seen = readings(value[None], true[None], still, TOLD)[0]
+    seen[:, np.arange(seen.shape[1]) % 5 != 0, :3] = np.nan
+    cuts = tuple((replace(whole.cuts[0][0], velocity=row), 0) for row in np.roll(seen, 5, axis=1))
+    given = replace(still, velocity=np.where(np.isnan(whole.velocity), np.nan, seen), cuts=cuts)
+    found = grown_starts(given, TOLD, value, np.array([0.01, 0.01, 0.01, 0.003]))
+    assert np.abs(first_readings(given) - true).max() > 0.1
+    assert np.abs(found - true).max() < 1e-3
 
 
 def still_drive(**moving):

@@ -3,10 +3,11 @@
 
 from __future__ import annotations
 
+import statistics
 from typing import Any
 
 from docs.writers.figure_sources import SourceError, Sources
-from uuvtai.statistics import mcnemar_p
+from uuvtai.statistics import mcnemar_p, wilson_interval
 from uuvtai.tables.table import text_table
 
 
@@ -47,25 +48,55 @@ def ardusub_identified(sources: Sources) -> str:
 
 def identified_vehicles(sources: Sources) -> str:
     """Of how many true values of random vehicles the intervals hold the truth."""
-    cells = []
-    for row in sources.benchmark("identify")["rows"]:
-        found = row["details"]["table"]["within the interval"]
+    rows = sources.benchmark("identify")["rows"]
+    cells, pooled = [], {}
+    for row in rows:
+        vehicles, found = row["details"]["vehicles"], row["details"]["table"]["within the interval"]
         late = {name: hits for name, hits in found.items() if name.startswith("delay")}
         own = {name: hits for name, hits in found.items() if name not in late}
-        count = _VEHICLES * len(own)
+        what = row["what"].rpartition("known: ")[2]
         lag = found.get("rotor lag")
-        cells.append(
-            [
-                row["what"].rpartition("known: ")[2],
-                f"{sum(own.values()):.0f} of {count} = {100 * sum(own.values()) / count:.1f} %",
-                "-" if lag is None else f"{lag:.0f} of {_VEHICLES}",
-                f"{sum(late.values()):.0f} of {_VEHICLES * len(late)}",
-            ]
-        )
-    return text_table(["known, rotor speeds", "numbers of the vehicle", "of them the lag", "delays"], cells)
+        counts = [sum(own.values()), vehicles * len(own), sum(late.values()), vehicles * len(late)]
+        cells.append([what, _held(*counts[:2]), "-" if lag is None else _of(lag, vehicles), _of(*counts[2:])])
+        kind = what.rpartition(", ")[2]
+        pooled[kind] = [a + b for a, b in zip(pooled.get(kind, [0] * 4), counts, strict=True)]
+    cells += [[f"all three, {kind}", _held(*c[:2]), "-", _of(*c[2:])] for kind, c in pooled.items()]
+    return text_table(
+        ["known, rotor speeds", "numbers of the vehicle [95 %]", "of them the lag", "delays"], cells
+    )
 
 
-_VEHICLES = 6
+def identified_before(sources: Sources) -> str:
+    """Commanded speeds with known buoyancy, by the fit before and after, on drives delayed either way."""
+    rows = list(sources.benchmark("identify_before")["rows"])
+    rows += [row for row in sources.benchmark("identify")["rows"] if row["what"].endswith(_COMPARED)]
+    names = [row["what"].partition(", code ") for row in rows[:3]] + [("delays of true motion", "", "after")]
+    cells = []
+    for (drives, _, code), row in zip(names, rows, strict=True):
+        details = row["details"]
+        vehicles, found = details["vehicles"], details["table"]["within the interval"]
+        timing = [hits for name, hits in found.items() if name.startswith(("rotor lag", "delay"))]
+        counts = round(sum(timing)), vehicles * len(timing)
+        widths, first = (a["details"]["table"][_WIDTHS] for a in (row, rows[len(cells) // 2 * 2]))
+        share = statistics.median(widths[name] / first[name] for name in first)
+        rest = _held(details["hits"] - counts[0], details["values"] - counts[1])
+        unsettled = _of(details["unsettled"], details["stretches"]) if "unsettled" in details else "-"
+        cells.append([drives, code, rest, _held(*counts), f"{share:.2f}", unsettled])
+    heads = ["drives", "fit", "other numbers [95 %]", "lag, delays [95 %]", "width", "not settled"]
+    return text_table(heads, cells)
+
+
+_COMPARED = "known: buoyancy, speeds as commanded"
+_WIDTHS = "half its width, median"
+
+
+def _of(hits: float, count: int) -> str:
+    return f"{hits:.0f} of {count}"
+
+
+def _held(hits: float, count: int) -> str:
+    low, high = wilson_interval(round(hits), count) or (0.0, 1.0)
+    return f"{_of(hits, count)} = {100 * hits / count:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
 
 
 def _interval(entry: list[float]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -49,12 +49,21 @@ class Drive:
 
     jumped: np.ndarray | None = None
     """(n, thrusters) commands held until the next sample, as they were if each jumped halfway between two
-    messages of the log, of which ``rpm`` takes a line; None = the log leaves nothing open"""
+    messages of the log, of which ``rpm`` takes a line; None = the log does not leave that open"""
+    straight: bool = False
+    """whether speeds as turned run on straight lines between samples, not as the vehicle's lag has it"""
 
     @property
     def is_asked(self) -> bool:
         """Whether rotor speeds are as commanded."""
         return self.command != ""
+
+    def otherwise(self) -> Drive | None:
+        """The drive by another reading of its log, which does not say how speeds ran between two samples or
+        messages; None = it leaves nothing open."""
+        if self.jumped is not None:
+            return replace(self, rpm=self.jumped, command="held", jumped=None)
+        return None if self.is_asked else replace(self, straight=True)
 
 
 def read_drives(path: Path, truth: bool = False) -> list[Drive]:

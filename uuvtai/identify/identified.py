@@ -62,8 +62,23 @@ class Identified:
     dt_s: float
 
 
-def identified(drives: list[Drive], vehicle_cfg: VehicleConfig, known: str = "gain") -> Identified:
-    """Fit a vehicle to drives; ``vehicle_cfg`` gives mass, thrusters, the ``known``. Raises DriveError."""
+@dataclass(frozen=True)
+class FittedDrives:
+    """What was fitted to drives."""
+
+    given: Stretches
+    first: np.ndarray
+    """(17,) of the vehicle given"""
+    free: np.ndarray
+    """(17,) which were fitted"""
+    fit: Fit
+    entries: list[dict[str, Any]]
+    """of the document, one for each parameter"""
+    warnings: list[str]
+
+
+def fitted_drives(drives: list[Drive], vehicle_cfg: VehicleConfig, known: str = "gain") -> FittedDrives:
+    """Parameters with intervals, without errors ahead; as ``identified``. Raises DriveError."""
     if known not in KNOWN:
         raise DriveError(f"--known must be one of {', '.join(KNOWN)}, got {known!r}")
     if not drives:
@@ -86,14 +101,22 @@ def identified(drives: list[Drive], vehicle_cfg: VehicleConfig, known: str = "ga
     if lagless:
         warnings.append(f"rotor lag: {lagless}; it stays that of the vehicle given")
     warnings += [text for entry in entries if (text := _warning(entry))]
+    return FittedDrives(given, first, free, fit, entries, warnings)
+
+
+def identified(drives: list[Drive], vehicle_cfg: VehicleConfig, known: str = "gain") -> Identified:
+    """Fit a vehicle to drives; ``vehicle_cfg`` gives mass, thrusters, the ``known``. Raises DriveError."""
+    made = fitted_drives(drives, vehicle_cfg, known)
+    given, fit = made.given, made.fit
+    count = len(given.velocity)
     document: dict[str, Any] = {
         "known": known,
         "seconds": round(count * _STRETCH_S, 3),
         "stretches": count,
-        "parameters": entries,
+        "parameters": made.entries,
         "residual_rms": dict(zip(AXES, fit.noise.tolist(), strict=True)),
-        "horizons": _horizons(given, vehicle_cfg, (first, fit.value), free),
-        "warnings": warnings,
+        "horizons": _horizons(given, vehicle_cfg, (made.first, fit.value), made.free),
+        "warnings": made.warnings,
     }
     given = given.at_lag(fit.value[LAG], vehicle_cfg)
     predicted = readings(fit.value[None], fit.start[None], given, vehicle_cfg)[0]

@@ -30,6 +30,8 @@ _FAST = 20.0
 _LAG_STEP_S = 1e-3
 _LATEST_S = 0.15
 """readings at the begin of a stretch that a delay may have from before it; they are left out"""
+_FORGOTTEN_S = 1.0
+"""begin of a drive with commanded speeds that is left out: how the rotors turned before it is not known"""
 _READ = (slice(0, 3), slice(3, 4))
 """axes of the two instruments"""
 
@@ -46,9 +48,10 @@ class Stretches:
     up: np.ndarray
     """(s, n, 3) likewise"""
     wrench: np.ndarray
-    """(s, n, 4) mean of each step by the vehicle's own thrust curve [N, N m], with the lag ``lag_s``"""
+    """(s, n, 2, 4) of each step by the vehicle's own thrust curve [N, N m], with the lag ``lag_s``: its mean,
+    and that weighted by the time left of the step"""
     slope: np.ndarray
-    """(s, n, 4) its change with the lag [N/s, N m/s]"""
+    """(s, n, 2, 4) its change with the lag [N/s, N m/s]"""
     lag_s: float
     after: np.ndarray
     """(s, n + 1, 2) [s] by how much later than their sample velocity and yaw rate were read"""
@@ -62,15 +65,20 @@ class Stretches:
         cuts = tuple(self.cuts[i] for i in kept.tolist())
         return replace(self, cuts=cuts, **{name: getattr(self, name)[kept] for name in names})
 
-    def jumped(self, vehicle_cfg: VehicleConfig) -> Stretches:
-        """The same driven by the other reading of the log's commands, ``Drive.jumped``."""
-        cuts = self.cuts
-        if any(drive.jumped is None for drive, _ in cuts):
-            return self
-        made = {id(drive): replace(drive, rpm=drive.jumped, command="held") for drive, _ in cuts}
-        other = tuple((made[id(drive)], begin) for drive, begin in cuts)
-        found = _wrenches(other, self.wrench.shape[1], self.lag_s, vehicle_cfg)
-        return replace(self, wrench=found[0], slope=found[1], cuts=other)
+    def begins(self, steps: int) -> Stretches:
+        """The first so many steps of each."""
+        of_steps = {name: getattr(self, name)[:, :steps] for name in ("tilt_rate", "up", "wrench", "slope")}
+        of_samples = {name: getattr(self, name)[:, : steps + 1] for name in ("velocity", "after")}
+        return replace(self, **of_steps, **of_samples)
+
+    def otherwise(self, vehicle_cfg: VehicleConfig) -> Stretches | None:
+        """The same by the other reading of the logs, ``Drive.otherwise``; None = they leave nothing open."""
+        made = {id(drive): drive.otherwise() for drive, _ in self.cuts}
+        if not any(made.values()):
+            return None
+        cuts = tuple((made[id(drive)] or drive, begin) for drive, begin in self.cuts)
+        found = _wrenches(cuts, self.wrench.shape[1], self.lag_s, vehicle_cfg)
+        return replace(self, wrench=found[0], slope=found[1], cuts=cuts)
 
     def at_lag(self, lag_s: float, vehicle_cfg: VehicleConfig) -> Stretches:
         """The same with the wrench of another lag."""
@@ -124,7 +132,8 @@ def stretches(drives: list[Drive], vehicle_cfg: VehicleConfig, seconds: float) -
             )
         after = np.zeros((len(drive.rpm), 2)) if drive.after is None else drive.after
         middle = [0.5 * (a[1:] + a[:-1]) for a in (drive.tilt_rate, drive.up)]
-        for begin in range(0, len(drive.rpm) - n, n):
+        first = round(_FORGOTTEN_S / dt_s) if drive.is_asked else 0
+        for begin in range(first, len(drive.rpm) - n, n):
             cut = slice(begin, begin + n)
             whole = slice(begin, begin + n + 1)
             seen = drive.velocity[whole].copy()
@@ -142,14 +151,14 @@ def stretches(drives: list[Drive], vehicle_cfg: VehicleConfig, seconds: float) -
 def _wrenches(
     cuts: tuple[tuple[Drive, int], ...], steps: int, lag_s: float, vehicle_cfg: VehicleConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(s, n, 4) and (s, n, 4): the mean of each step, and its change with the lag."""
+    """(s, n, 2, 4) and (s, n, 2, 4): the means of each step, and their change with the lag."""
     geometry, _ = allocation_matrices(vehicle_cfg)
     across = geometry[list(_OF_SIX)].T
     of_drive = {}
     for drive, _ in cuts:
         if id(drive) not in of_drive:
             thrust = mean_wrench(drive, vehicle_cfg, np.array([lag_s, lag_s + _LAG_STEP_S]))
-            of_drive[id(drive)] = thrust @ across
+            of_drive[id(drive)] = np.moveaxis(thrust @ across, 0, 2)
     rows = np.stack([of_drive[id(drive)][:, begin : begin + steps] for drive, begin in cuts], axis=1)
     slope = (rows[1] - rows[0]) / _LAG_STEP_S
     return rows[0], slope if any(drive.is_asked for drive, _ in cuts) else np.zeros_like(slope)
@@ -160,18 +169,22 @@ def motion(theta: np.ndarray, start: np.ndarray, given: Stretches, vehicle_cfg: 
     on. Lags near that of ``given``."""
     steps = given.wrench.shape[1]
     parts = max(1, int(np.ceil(given.dt_s / _LONGEST_STEP_S)))
-    dt = given.dt_s / parts
-    out = np.empty((*start.shape[:2], steps + 1, 4))
-    x = out[:, :, 0] = start
-    later = (theta[:, LAG] - given.lag_s)[:, None, None]
+    body = _Body.of(theta, vehicle_cfg)
+    later = (theta[:, LAG] - given.lag_s)[:, None]
+    wrench, slope = (np.ascontiguousarray(a.transpose(1, 2, 3, 0)) for a in (given.wrench, given.slope))
+    tilt, up = (np.ascontiguousarray(a.transpose(1, 2, 0)) for a in (given.tilt_rate, given.up))
+    out = np.empty((steps + 1, len(AXES), *start.shape[:2]))
+    x = out[0] = np.moveaxis(start, 2, 0)
     for k in range(steps):
-        wrench = given.wrench[:, k] + later * given.slope[:, k]
-        inputs = (wrench, given.tilt_rate[:, k], given.up[:, k])
-        for _ in range(parts):
-            half = x + 0.5 * dt * _acceleration(theta, x, inputs, vehicle_cfg)
-            x = np.clip(x + dt * _acceleration(theta, half, inputs, vehicle_cfg), -_FAST, _FAST)
-        out[:, :, k + 1] = x
-    return out
+        steady = body.steady(up[k], tilt[k])
+        loads = [w[:, None] + later * s[:, None] for w, s in zip(wrench[k], slope[k], strict=True)]
+        mean, early = (body.gain * load + steady for load in loads)
+        rise = 6.0 * (mean - early)
+        for part in range(parts):
+            middle = mean + ((part + 0.5) / parts - 0.5) * rise
+            x = _moved(body, x, (middle, middle - rise / (6 * parts)), tilt[k], given.dt_s / parts)
+        out[k + 1] = x
+    return out.transpose(2, 3, 0, 1)
 
 
 def readings(
@@ -204,20 +217,56 @@ def _earlier(rows: np.ndarray, steps: np.ndarray) -> np.ndarray:
     return found
 
 
-def _acceleration(
-    theta: np.ndarray, x: np.ndarray, inputs: tuple[np.ndarray, ...], vehicle_cfg: VehicleConfig
+@dataclass(frozen=True)
+class _Body:
+    """Parameter sets as the equation of motion wants them: (4, runs, 1), one number each (runs, 1)."""
+
+    inertia: np.ndarray
+    linear: np.ndarray
+    quadratic: np.ndarray
+    gain: np.ndarray
+    net: np.ndarray
+    munk: np.ndarray
+    rolling: float
+    """[kg m2] yaw moment of roll rate times pitch rate"""
+
+    @staticmethod
+    def of(theta: np.ndarray, vehicle_cfg: VehicleConfig) -> _Body:
+        added, linear, quadratic = (theta[:, i : i + 4].T[..., None] for i in (0, 4, 8))
+        six, spin = vehicle_cfg.added_mass, vehicle_cfg.inertia_kg_m2
+        own = np.array([vehicle_cfg.mass_kg] * 3 + [spin[2]])[:, None, None]
+        gain, net = theta[:, GAIN, None], theta[:, NET, None]
+        rolling = spin[1] + six[4] - spin[0] - six[3]
+        return _Body(added + own, linear, quadratic, gain, net, added[1] - added[0], rolling)
+
+    def steady(self, up: np.ndarray, tilt: np.ndarray) -> np.ndarray:
+        """(4, runs, s) [N, N m] what does not depend on the four velocities."""
+        load = np.empty((len(AXES), len(self.net), up.shape[1]))
+        load[:3] = self.net * up[:, None]
+        load[3] = -self.rolling * tilt[0] * tilt[1]
+        return load
+
+    def acceleration(self, x: np.ndarray, load: np.ndarray, tilt: np.ndarray) -> np.ndarray:
+        """(4, runs, s) at velocities ``x`` under ``load``, both of that shape."""
+        left = load - (self.linear + self.quadratic * np.abs(x)) * x
+        (p, q), r = tilt, x[3]
+        mu, mv, mw = self.inertia[:3] * x[:3]
+        left[0] -= q * mw - r * mv
+        left[1] -= r * mu - p * mw
+        left[2] -= p * mv - q * mu
+        left[3] -= self.munk * x[0] * x[1]
+        left /= self.inertia
+        return left
+
+
+def _moved(
+    body: _Body, x: np.ndarray, loads: tuple[np.ndarray, np.ndarray], tilt: np.ndarray, dt_s: float
 ) -> np.ndarray:
-    wrench, tilt, up = inputs
-    added, linear, quadratic = (theta[:, None, i : i + 4] for i in (0, 4, 8))
-    inertia = added + np.array([vehicle_cfg.mass_kg] * 3 + [vehicle_cfg.inertia_kg_m2[2]])
-    load = theta[:, None, GAIN, None] * wrench - (linear + quadratic * np.abs(x)) * x
-    load[..., :3] += theta[:, None, NET, None] * up
-    p, q, r = tilt[:, 0], tilt[:, 1], x[..., 3]
-    mu, mv, mw = (inertia[..., i] * x[..., i] for i in range(3))
-    load[..., 0] -= q * mw - r * mv
-    load[..., 1] -= r * mu - p * mw
-    load[..., 2] -= p * mv - q * mu
-    six, spin = vehicle_cfg.added_mass, vehicle_cfg.inertia_kg_m2
-    load[..., 3] -= (added[..., 1] - added[..., 0]) * x[..., 0] * x[..., 1]
-    load[..., 3] -= p * q * (spin[1] + six[4] - spin[0] - six[3])
-    return load / inertia
+    """(4, runs, s) a step further, by Kutta's method of third order. ``loads``: the mean, and that weighted
+    by the time left. Kutta's first two stages count for how early a load comes, so they get the latter, and
+    the third one what the mean then lacks."""
+    mean, early = loads
+    first = body.acceleration(x, early, tilt)
+    second = body.acceleration(x + 0.5 * dt_s * first, early, tilt)
+    third = body.acceleration(x + dt_s * (2 * second - first), 6 * mean - 5 * early, tilt)
+    return np.clip(x + dt_s / 6 * (first + 4 * second + third), -_FAST, _FAST)

@@ -1,9 +1,9 @@
 """Least squares on the output: parameters whose motion, driven by the logged rotor speeds, comes closest to
 the measured velocities (Gauss-Newton); intervals by a bootstrap over stretches.
 
-Each stretch has an initial velocity of its own that is fitted too. Noise of the readings does not enter the
-regressors, as it does where measured velocities are differentiated. A stretch is drawn as a whole, so errors
-may be correlated within it.
+Each stretch has an initial velocity of its own, fitted anew for each trial of the parameters. Noise of the
+readings does not enter the regressors, as it does where measured velocities are differentiated. A stretch is
+drawn as a whole, so errors may be correlated within it.
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from uuvtai.config import VehicleConfig
+from uuvtai.identify.linearised import SCALE, linearised
 from uuvtai.identify.motion_model import AXES, LAG, SIZE, Stretches, motion, readings
+from uuvtai.identify.stretch_starts import first_readings, grown_starts, settled_starts
 
-SCALE = np.array(
-    [1.0] * 3 + [0.05] + [1.0] * 3 + [0.05] + [5.0] * 3 + [0.3] + [0.5, 0.1] + [0.02, 0.01, 0.01]
-)
-"""size of a step of each parameter"""
-_ROUNDS, _SETTLED = 25, 1e-4
+_ROUNDS = 25
 _WEIGHED = (1, 3)
 """rounds after which readings are weighed anew, by what is left"""
-_NOTHING = 0.1
-"""change of the sum of squares, in units of noise, that moves no parameter by a part of its interval"""
+_NOTHING, _LITTLE, _KEPT = 0.01, 1.0, 0.1
+"""falls of the sum of squares that a step promises, in units of noise: below the first it is the last one,
+for no parameter moves by more than a tenth of its standard deviation; below the second it is if it keeps less
+than this share of its promise, for the dead band's edges make that sum rough"""
 _DRAWS = 2000
 _LEVEL = (2.5, 97.5)
 _NOISE = 0.02
@@ -48,24 +48,28 @@ def fitted(
     given: Stretches, vehicle_cfg: VehicleConfig, first: np.ndarray, free: np.ndarray, seed: int = 0
 ) -> Fit:
     """Fit the parameters ``free`` (17, bool), from ``first`` (17,) on; the others stay."""
-    value, start = first.copy(), _first_readings(given)
+    value, start = first.copy(), first_readings(given)
     noise = np.full(len(AXES), _NOISE)
     fault = np.inf
     back = (value, start)
-    shrink = 1.0
+    shrink, promised = 1.0, np.inf
     for i in range(_ROUNDS):
         given = given.at_lag(value[LAG], vehicle_cfg)
-        jacobian, own, rest = _linearised(given, vehicle_cfg, value, start, free, noise)
+        if i <= _WEIGHED[-1]:
+            start = grown_starts(given, vehicle_cfg, value, noise)
+        else:
+            start = settled_starts(given, vehicle_cfg, value, start, noise)
+        jacobian, own, rest = linearised(given, vehicle_cfg, value, start, free, noise)
         now = float(np.sum(rest**2))
-        if i > _WEIGHED[-1] + 1 and abs(now - fault) < _NOTHING:
+        if i > _WEIGHED[-1] + 1 and promised < _LITTLE and now > fault - _KEPT * promised:
             break
         if now > fault * (1 + 1e-9) and shrink > 0.1:
             shrink *= 0.5
             value, start = (old + 0.5 * (new - old) for old, new in zip(back, (value, start), strict=True))
             continue
         fault, back, shrink = now, (value, start), 1.0
-        step, moved = _step(jacobian, own, rest)
-        settled = np.abs(step).max(initial=0.0) < _SETTLED
+        step, moved, promised = _step(jacobian, own, rest)
+        settled = promised < _NOTHING
         value = value.copy()
         value[free] += step * SCALE[free]
         start = start + moved
@@ -76,7 +80,8 @@ def fitted(
         if settled and i > _WEIGHED[-1]:
             break
     given = given.at_lag(value[LAG], vehicle_cfg)
-    jacobian, own, rest = _linearised(given, vehicle_cfg, value, start, free, noise)
+    start = settled_starts(given, vehicle_cfg, value, start, noise)
+    jacobian, own, rest = linearised(given, vehicle_cfg, value, start, free, noise)
     low, high = _bootstrap(jacobian, own, rest, seed)
     apart = _left_open(given, vehicle_cfg, (value, start), noise, jacobian, own)
     low, high = low - apart, high + apart
@@ -86,45 +91,11 @@ def fitted(
     return Fit(value, bounds[0], bounds[1], start, _left(given, vehicle_cfg, value, start))
 
 
-def _first_readings(given: Stretches) -> np.ndarray:
-    seen = ~np.isnan(given.velocity)
-    first = np.argmax(seen, axis=1)
-    start = np.take_along_axis(given.velocity, first[:, None], axis=1)[:, 0]
-    return np.nan_to_num(start)
-
-
 def _left(given: Stretches, vehicle_cfg: VehicleConfig, value: np.ndarray, start: np.ndarray) -> np.ndarray:
     away = given.velocity - readings(value[None], start[None], given, vehicle_cfg)[0]
     seen = ~np.isnan(away)
     count = np.maximum(1, seen.sum(axis=(0, 1)))
     return np.maximum(1e-5, np.sqrt(np.square(np.where(seen, away, 0.0)).sum(axis=(0, 1)) / count))
-
-
-def _linearised(
-    given: Stretches,
-    vehicle_cfg: VehicleConfig,
-    value: np.ndarray,
-    start: np.ndarray,
-    free: np.ndarray,
-    noise: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(s, readings, free), (s, readings, 4), (s, readings): derivatives and what is left, in units of
-    noise."""
-    places = np.flatnonzero(free)
-    runs = 1 + len(places) + len(AXES)
-    theta, begin = np.tile(value, (runs, 1)), np.tile(start, (runs, 1, 1))
-    small = 1e-4
-    for i, place in enumerate(places):
-        theta[1 + i, place] += small * SCALE[place]
-    for axis in range(len(AXES)):
-        begin[1 + len(places) + axis, :, axis] += small
-    moved = readings(theta, begin, given, vehicle_cfg) / noise
-    seen = ~np.isnan(given.velocity)
-    rest = np.where(seen, np.nan_to_num(given.velocity) / noise - moved[0], 0.0)
-    slopes = np.where(seen, (moved[1:] - moved[0]) / small, 0.0)
-    count = len(given.velocity)
-    flat = np.moveaxis(slopes.reshape(runs - 1, count, -1), 0, 2)
-    return flat[..., : len(places)], flat[..., len(places) :], rest.reshape(count, -1)
 
 
 def _apart(jacobian: np.ndarray, own: np.ndarray, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -137,11 +108,12 @@ def _apart(jacobian: np.ndarray, own: np.ndarray, rest: np.ndarray) -> tuple[np.
     return across @ free, (across @ left[..., None])[..., 0]
 
 
-def _step(jacobian: np.ndarray, own: np.ndarray, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    square, right = _apart(jacobian, own, rest)
-    step = _solved(square.sum(axis=0), right.sum(axis=0))
+def _step(jacobian: np.ndarray, own: np.ndarray, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """(of the parameters, of the initial velocities, fall of the sum of squares that they promise)"""
+    square, right = (part.sum(axis=0) for part in _apart(jacobian, own, rest))
+    step = _solved(square, right)
     left = rest - (jacobian @ step)
-    return step, (np.linalg.pinv(own) @ left[..., None])[..., 0]
+    return step, (np.linalg.pinv(own) @ left[..., None])[..., 0], float(step @ right)
 
 
 def _solved(square: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -157,10 +129,10 @@ def _left_open(
     jacobian: np.ndarray,
     own: np.ndarray,
 ) -> np.ndarray:
-    """(k,) by how much the fit moves where commands jump between two messages instead of going on a line: a
-    log does not say which, and no bootstrap of its stretches shows it, for it is the same in all of them."""
-    other = given.jumped(vehicle_cfg)
-    if other is given:
+    """(k,) by how much the fit moves by the other reading of the logs, ``Drive.otherwise``: they do not say
+    which is right, and no bootstrap of their stretches shows it, for it is the same in all of them."""
+    other = given.otherwise(vehicle_cfg)
+    if other is None:
         return np.zeros(jacobian.shape[2])
     value, start = fit
     said = [readings(value[None], start[None], one, vehicle_cfg)[0] for one in (given, other)]

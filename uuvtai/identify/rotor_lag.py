@@ -12,11 +12,19 @@ LEAST_LAG_S = 1e-3
 _INSTANTS = (0.03, 0.1025, 0.20125, 0.3325, 0.50375, 0.7, 0.9)
 _SHARES = (0.06, 0.085, 0.1125, 0.15, 0.1925, 0.2, 0.2)
 """of a step, at which thrust is taken, and for how much of it: denser where a lagging rotor turns quickest"""
+_WEIGHTS = np.array([_SHARES, np.multiply(_SHARES, np.subtract(1, _INSTANTS))])
+_WEIGHTS /= _WEIGHTS.sum(axis=1, keepdims=True)
+_NEAREST_RPM = 1e-3
+"""A lagging rotor never quite arrives: one that comes to the dead band's edge from within does not push."""
+
+_STRAIGHT = 1e-6
+"""of a step to a lag, at which what decays runs straight"""
 
 
 def mean_wrench(drive: Drive, vehicle_cfg: VehicleConfig, lags_s: np.ndarray) -> np.ndarray:
-    """(lags, n - 1, thrusters) [N] mean thrust of each step with each lag. Speeds as turned approach the next
-    one as the vehicle's own lag has it, whatever ``lags_s`` says."""
+    """(2, lags, n - 1, thrusters) [N] mean thrust of each step with each lag: the plain mean, and that
+    weighted by the time left of the step, which says how early it came. Speeds as turned approach the next
+    one as the vehicle's own lag has it, or straight, whatever ``lags_s`` says."""
     if drive.is_asked:
         lag = drive.dt_s / lags_s[:, None, None]
         risen = _risen(drive)
@@ -28,10 +36,12 @@ def mean_wrench(drive: Drive, vehicle_cfg: VehicleConfig, lags_s: np.ndarray) ->
     else:
         lag = np.full((len(lags_s), 1, 1), drive.dt_s / vehicle_cfg.rotor_tau_s)
         before, goal = drive.rpm[None, :-1], drive.rpm[None, 1:]
-        ways = [-np.expm1(-instant * lag) / -np.expm1(-lag) for instant in _INSTANTS]
+        if drive.straight:
+            lag = np.full_like(lag, _STRAIGHT)
+        ways = [np.expm1(-instant * lag) / np.expm1(-lag) for instant in _INSTANTS]
         speeds = [before + way * (goal - before) for way in ways]
     pushed = np.stack([thrust_of(speed, vehicle_cfg) for speed in speeds])
-    return np.tensordot(_SHARES, pushed, 1)
+    return np.tensordot(_WEIGHTS, pushed, 1)
 
 
 def _risen(drive: Drive) -> np.ndarray:
@@ -43,13 +53,14 @@ def _behind(drive: Drive, risen: np.ndarray, lags_s: np.ndarray) -> np.ndarray:
     """(lags, n - 1, thrusters) [rpm] by how much the rotors are beyond the command at the begin of each step:
     a lag of first order behind a straight line (speed = line - slope * lag + what decays)."""
     kept = np.exp(-drive.dt_s / lags_s)[:, None]
-    share = (lags_s / drive.dt_s)[:, None]
+    behind = (lags_s / drive.dt_s)[:, None, None] * risen
     jumps = np.diff(drive.rpm, axis=0) - risen
-    off = np.zeros((len(lags_s), *risen.shape))
-    for k in range(len(risen) - 1):
-        behind = share * risen[k]
-        off[:, k + 1] = kept * (off[:, k] + behind) - behind - jumps[k]
-    return off
+    off = np.zeros((len(risen), len(lags_s), drive.rpm.shape[1]))
+    off[1:] = np.moveaxis((kept[:, None] - 1) * behind - jumps, 0, 1)[:-1]
+    for k in range(1, len(off)):
+        off[k] += kept * off[k - 1]
+    off = np.moveaxis(off, 0, 1)
+    return np.where(np.abs(off) < _NEAREST_RPM, np.copysign(_NEAREST_RPM, off), off)
 
 
 def thrust_of(rpm: np.ndarray, vehicle_cfg: VehicleConfig) -> np.ndarray:
