@@ -190,6 +190,7 @@ def policy(sources: Sources) -> str:
 
 
 TWIN_FILE = "docs/data/twin_77001.json"
+QUICK_FILE = "docs/data/quick_90008.json"
 CHOOSER_FILE = "docs/data/chooser_77001.json"
 TUNED_FILE = "docs/data/tuned_77001.json"
 LEARNING_FILE = "docs/data/learning_trials.json"
@@ -198,6 +199,20 @@ LEARNING_FILE = "docs/data/learning_trials.json"
 def twin_policy(sources: Sources) -> str:
     """The policy that learnt in the twin beside the tree, in the simulator, on the same episodes."""
     return _trial_rows(sources, TWIN_FILE, "policy")
+
+
+def quick_policy(sources: Sources) -> str:
+    """The policy of ``uuv train quick`` beside the tree, on the same episodes."""
+    return _trial_rows(sources, QUICK_FILE, "policy")
+
+
+def quick_curve(sources: Sources) -> str:
+    """Success of that policy in the twin along its training."""
+    rows = [
+        [f"{row['decisions'] / 1e6:.1f}", f"{row['seconds'] / 60:.0f}", f"{100 * row['pool_6_0.6']:.1f} %"]
+        for row in sources.json(QUICK_FILE)["curve"]
+    ]
+    return text_table(["million decisions", "minutes", "pool (8, 6, 0.6)"], rows)
 
 
 def chooser_trials(sources: Sources) -> str:
@@ -598,6 +613,8 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         vehicles,
         twin_curve,
         twin_policy,
+        quick_curve,
+        quick_policy,
         chooser_trials,
         tuned_trials,
         learning_trials,

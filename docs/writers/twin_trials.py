@@ -69,8 +69,9 @@ def curve_of(run: Path) -> list[dict[str, Any]]:
     rows, seconds = [], 0.0
     for row in read_metrics(run):
         seconds += row["time/simulate_s"] + row["time/learn_s"]
-        found = {name: row.get(f"eval/success_{name}") for _title, name, _options in CELLS}
-        if None not in found.values():
+        names = [name for _title, name, _options in CELLS if f"eval/success_{name}" in row]
+        found = {name: row[f"eval/success_{name}"] for name in names}
+        if found:
             rows.append({"decisions": row["time/env_steps"], "seconds": round(seconds), **found})
     return rows
 
@@ -81,6 +82,7 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("--out", default=FILE, help="file of the results, from the root of the tree")
     parser.add_argument("--more", action="store_true", help="also worlds that no training met")
+    parser.add_argument("--only", default="", help="scenes whose title begins so")
     parser.add_argument("--seeds", default=SEEDS, help="as uuv eval takes them")
     parser.add_argument("--episodes", type=int, default=EPISODES, help="of each seed")
     chosen = parser.parse_args()
@@ -92,7 +94,8 @@ def main() -> None:
         "curve": curve_of(run),
         "rows": [],
     }
-    for title, _name, options in (*CELLS, *(MORE if chosen.more else ())):
+    cells = [cell for cell in (*CELLS, *(MORE if chosen.more else ())) if cell[0].startswith(chosen.only)]
+    for title, _name, options in cells:
         command = command_of(str(run), options, chosen.seeds, chosen.episodes)
         with tempfile.TemporaryDirectory() as place:
             done = subprocess.run(
