@@ -190,7 +190,7 @@ def policy(sources: Sources) -> str:
 
 
 TWIN_FILE = "docs/data/twin_77001.json"
-QUICK_FILE = "docs/data/quick_90008.json"
+QUICK_FILE, SHALLOW_FILE = "docs/data/quick_77601.json", "docs/data/quick_90008.json"
 CHOOSER_FILE = "docs/data/chooser_77001.json"
 TUNED_FILE = "docs/data/tuned_77001.json"
 LEARNING_FILE = "docs/data/learning_trials.json"
@@ -204,6 +204,11 @@ def twin_policy(sources: Sources) -> str:
 def quick_policy(sources: Sources) -> str:
     """The policy of ``uuv train quick`` beside the tree, on the same episodes."""
     return _trial_rows(sources, QUICK_FILE, "policy")
+
+
+def quick_shallow(sources: Sources) -> str:
+    """The same, of the first one, which drove too near the surface."""
+    return _trial_rows(sources, SHALLOW_FILE, "policy")
 
 
 def quick_curve(sources: Sources) -> str:
@@ -615,6 +620,7 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         twin_policy,
         quick_curve,
         quick_policy,
+        quick_shallow,
         chooser_trials,
         tuned_trials,
         learning_trials,
