@@ -12,6 +12,7 @@ import taichi as ti
 
 from tests import signatures
 from tests.signatures import BUNDLES, FILES, KERNELS, ROOMS, functions, is_kernel
+from tests.sources import nodes_of
 from uuvtai import config, state
 from uuvtai.binding import members_of
 from uuvtai.truth import Truth
@@ -48,23 +49,19 @@ def room_of(path):
     return path.parent.name
 
 
-def tree_of(path):
-    return ast.parse(path.read_text())
-
-
 def names_in(path):
     """Every identifier and attribute that a file mentions in code."""
-    tree = tree_of(path)
+    nodes = nodes_of(path)
     return (
-        {n.id for n in ast.walk(tree) if isinstance(n, ast.Name)}
-        | {a.name for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) for a in n.names}
-        | {n.attr for n in ast.walk(tree) if isinstance(n, ast.Attribute)}
+        {n.id for n in nodes if isinstance(n, ast.Name)}
+        | {a.name for n in nodes if isinstance(n, ast.ImportFrom) for a in n.names}
+        | {n.attr for n in nodes if isinstance(n, ast.Attribute)}
     )
 
 
 def imports_of(path):
     found = set()
-    for node in ast.walk(tree_of(path)):
+    for node in nodes_of(path):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
@@ -155,7 +152,7 @@ def test_kernel_files_lend_functions_never_kernels():
 def test_kernel_files_stay_in_the_safe_subset(path):
     text = path.read_text()
     assert "from __future__ import annotations" not in text, "Taichi needs real annotations"
-    for call in (n for n in ast.walk(tree_of(path)) if isinstance(n, ast.Call)):
+    for call in (n for n in nodes_of(path) if isinstance(n, ast.Call)):
         name = ast.unparse(call.func)
         assert name not in ("ti.random", "ti.randn", "ti.init", "print"), (
             f"{path.name}:{call.lineno} calls {name}"
@@ -242,7 +239,7 @@ def test_every_bundle_holds_what_its_stage_touches_and_nothing_else():
 
 def test_only_the_runtime_starts_taichi():
     for path in PACKAGE.rglob("*.py"):
-        calls = [ast.unparse(n.func) for n in ast.walk(tree_of(path)) if isinstance(n, ast.Call)]
+        calls = [ast.unparse(n.func) for n in nodes_of(path) if isinstance(n, ast.Call)]
         assert ("ti.init" in calls) == (path.name == "runtime.py")
 
 
@@ -261,7 +258,7 @@ def test_only_those_who_run_stages_launch_kernels():
         modules = {i.split(".")[-1] for i in imports_of(path) if i in stages}
         launched = {
             ast.unparse(n.func)
-            for n in ast.walk(tree_of(path))
+            for n in nodes_of(path)
             if isinstance(n, ast.Call)
             and isinstance(n.func, ast.Attribute)
             and isinstance(n.func.value, ast.Name)
