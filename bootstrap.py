@@ -35,6 +35,8 @@ DEMO = ["eval", "--world", "pool", "--record", "2", "--video"]
 def main() -> int:
     """Run the job named on the command line; its exit code."""
     os.environ.setdefault("PATH", os.defpath)  # an empty environment has none
+    # packages are installed without bytecode: each process would compile all that it imports anew
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     jobs = {"demo": demo, "test": test, "docs": docs, "setup": setup}
     name = sys.argv[1] if len(sys.argv) > 1 else ""
     if name not in jobs:

@@ -2,15 +2,17 @@
 the whole stack."""
 
 import ast
+import atexit
 import functools
+import gc
 import signal
 import sys
 
 import pytest
 
-from tests.field_memory import look_in_memory
-from tests.small_sim import SmallSim
 from tests.tracing import keep_tracer_out
+
+gc.disable()  # until all is imported and collected, which makes millions of objects, few of them garbage
 
 BEGUN_FIRST = """
 cli tracking training cuda world signals log_alone security sonar docs report deploy mapping media_formats
@@ -54,6 +56,13 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: order.get(item.path.stem, len(order)))
 
 
+def pytest_collection_finish():
+    """What is there by now stays to the end: nobody need look through it for garbage before."""
+    gc.freeze()
+    gc.enable()
+    atexit.register(gc.unfreeze)  # libraries that then look for leaks would find all of it
+
+
 @pytest.fixture(scope="session", autouse=True)
 def tracer():
     """Coverage, where it is measured, costs no more than it has to."""
@@ -74,6 +83,8 @@ def taichi_runtime(request):
     Where a test of the session needs the small simulator it is built first of all: Taichi finds compiled
     kernels again by the layout of the memory before them too.
     """
+    from tests.field_memory import look_in_memory
+    from tests.small_sim import SmallSim
     from uuvtai.runtime import start_taichi
 
     start_taichi("cpu")

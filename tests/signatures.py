@@ -4,6 +4,7 @@ source."""
 import ast
 import dataclasses
 import importlib
+from functools import cache
 from pathlib import Path
 
 from uuvtai.binding import members_of
@@ -84,8 +85,10 @@ def is_kernel(node):
     return "ti.kernel" in decorated(node)
 
 
+@cache
 def functions():
-    """(module, name) -> Function, of all kernel files."""
+    """(module, name) -> Function, of all kernel files. Not made at import: every process of the gate imports
+    every file."""
     found = {}
     for path in FILES:
         tree = ast.parse(path.read_text())
@@ -97,9 +100,6 @@ def functions():
             if isinstance(node, ast.FunctionDef) and decorated(node) & {"ti.kernel", "ti.func"}:
                 found[module_of(path), node.name] = Function(path, node, own)
     return found
-
-
-FUNCTIONS = functions()
 
 
 def root_of(node):
@@ -140,10 +140,10 @@ def handed(function):
         if not (
             isinstance(node, ast.Call)
             and isinstance(node.func, ast.Name)
-            and function.calls.get(node.func.id) in FUNCTIONS
+            and function.calls.get(node.func.id) in functions()
         ):
             continue
-        called = FUNCTIONS[function.calls[node.func.id]]
+        called = functions()[function.calls[node.func.id]]
         for given, parameter in zip(node.args, called.node.args.args, strict=True):
             mark, kind = mark_of(parameter)
             if mark:

@@ -11,7 +11,8 @@ import pytest
 import taichi as ti
 
 from tests import signatures
-from tests.signatures import BUNDLES, FILES, FUNCTIONS, KERNELS, ROOMS, is_kernel
+from tests.signatures import BUNDLES, FILES, KERNELS, ROOMS, functions, is_kernel
+from tests.sources import nodes_of
 from uuvtai import config, state
 from uuvtai.binding import members_of
 from uuvtai.truth import Truth
@@ -48,23 +49,19 @@ def room_of(path):
     return path.parent.name
 
 
-def tree_of(path):
-    return ast.parse(path.read_text())
-
-
 def names_in(path):
     """Every identifier and attribute that a file mentions in code."""
-    tree = tree_of(path)
+    nodes = nodes_of(path)
     return (
-        {n.id for n in ast.walk(tree) if isinstance(n, ast.Name)}
-        | {a.name for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) for a in n.names}
-        | {n.attr for n in ast.walk(tree) if isinstance(n, ast.Attribute)}
+        {n.id for n in nodes if isinstance(n, ast.Name)}
+        | {a.name for n in nodes if isinstance(n, ast.ImportFrom) for a in n.names}
+        | {n.attr for n in nodes if isinstance(n, ast.Attribute)}
     )
 
 
 def imports_of(path):
     found = set()
-    for node in ast.walk(tree_of(path)):
+    for node in nodes_of(path):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
@@ -81,7 +78,7 @@ def test_no_import_contract_has_an_exemption():
 def test_there_is_something_to_check():
     assert {"WorldState", "VehicleState", "PathState", "EpisodeState", "WorldConfig"} <= TRUTH
     assert set(ROOMS) == KNOWS | STACK
-    assert len(BUNDLES) > 20 and len(FUNCTIONS) > 450
+    assert len(BUNDLES) > 20 and len(functions()) > 450
     assert {kind for bundle in BUNDLES.values() for kind in members_of(bundle).values()} >= TRUTH, (
         "some truth is nobody's"
     )
@@ -144,7 +141,7 @@ def test_kernels_import_taichi_and_the_floor_only(path):
 def test_kernel_files_lend_functions_never_kernels():
     """A kernel is launched by the simulator, in its order; what two files share is a function."""
     kernels = {
-        f"{module}.{name}" for (module, name), function in FUNCTIONS.items() if is_kernel(function.node)
+        f"{module}.{name}" for (module, name), function in functions().items() if is_kernel(function.node)
     }
     assert len(kernels) > 30
     for path in FILES:
@@ -155,7 +152,7 @@ def test_kernel_files_lend_functions_never_kernels():
 def test_kernel_files_stay_in_the_safe_subset(path):
     text = path.read_text()
     assert "from __future__ import annotations" not in text, "Taichi needs real annotations"
-    for call in (n for n in ast.walk(tree_of(path)) if isinstance(n, ast.Call)):
+    for call in (n for n in nodes_of(path) if isinstance(n, ast.Call)):
         name = ast.unparse(call.func)
         assert name not in ("ti.random", "ti.randn", "ti.init", "print"), (
             f"{path.name}:{call.lineno} calls {name}"
@@ -176,7 +173,7 @@ def wrongs_of(function):
 
 
 def test_no_function_writes_what_it_only_reads():
-    assert not [wrong for function in FUNCTIONS.values() for wrong in wrongs_of(function)]
+    assert not [wrong for function in functions().values() for wrong in wrongs_of(function)]
 
 
 @pytest.mark.parametrize(
@@ -191,13 +188,13 @@ def test_no_function_writes_what_it_only_reads():
 )
 def test_a_wrong_write_would_be_found(body, wrong):
     source = f"def made_up(env, io: Bundle[RouteIO]):\n    {body}\n"
-    calls = {name: (module, name) for module, name in FUNCTIONS if name == "clear_track"}
+    calls = {name: (module, name) for module, name in functions() if name == "clear_track"}
     found = list(wrongs_of(signatures.Function(Path("made_up.py"), ast.parse(source).body[0], calls)))
     assert (wrong is None and found == []) or (len(found) == 1 and wrong in found[0])
 
 
 def test_every_kernel_says_what_it_takes_and_nothing_is_handed_over_in_vain():
-    for function in FUNCTIONS.values():
+    for function in functions().values():
         names = [argument.arg for argument in function.node.args.args]
         if is_kernel(function.node):
             assert ast.get_docstring(function.node), f"{function.name} has no docstring"
@@ -211,7 +208,7 @@ def test_every_kernel_says_what_it_takes_and_nothing_is_handed_over_in_vain():
 def test_every_bundle_holds_what_its_stage_touches_and_nothing_else():
     """Members that some function of the stage names; what is marked Out is written by one."""
     touched, stored = {name: set() for name in BUNDLES}, {name: set() for name in BUNDLES}
-    for function in FUNCTIONS.values():
+    for function in functions().values():
         bundle = next(
             (
                 kind
@@ -242,7 +239,7 @@ def test_every_bundle_holds_what_its_stage_touches_and_nothing_else():
 
 def test_only_the_runtime_starts_taichi():
     for path in PACKAGE.rglob("*.py"):
-        calls = [ast.unparse(n.func) for n in ast.walk(tree_of(path)) if isinstance(n, ast.Call)]
+        calls = [ast.unparse(n.func) for n in nodes_of(path) if isinstance(n, ast.Call)]
         assert ("ti.init" in calls) == (path.name == "runtime.py")
 
 
@@ -261,7 +258,7 @@ def test_only_those_who_run_stages_launch_kernels():
         modules = {i.split(".")[-1] for i in imports_of(path) if i in stages}
         launched = {
             ast.unparse(n.func)
-            for n in ast.walk(tree_of(path))
+            for n in nodes_of(path)
             if isinstance(n, ast.Call)
             and isinstance(n.func, ast.Attribute)
             and isinstance(n.func.value, ast.Name)

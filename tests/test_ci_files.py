@@ -1,7 +1,9 @@
 """What runs elsewhere (GitHub's machines, a container, a contributor's hooks) agrees with this checkout,
 which cannot run it."""
 
+import os
 import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -9,6 +11,7 @@ import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+import bootstrap
 import uuvtai
 
 ROOT = Path(__file__).parent.parent
@@ -76,6 +79,14 @@ def test_ci_runs_the_gate_on_every_python_that_is_promised():
     runs = [step.get("run", "") for step in steps_of("test")]
     assert runs[-1] == ".ci/run" and "bootstrap.py test" in (ROOT / runs[-1]).read_text()
     assert any("--require-hashes --requirement .ci/requirements.lock" in run for run in runs)
+
+
+def test_the_processes_of_the_gate_keep_the_bytecode_they_compile(monkeypatch):
+    """Also where the environment forbids it: packages bring none, and hundreds of processes start."""
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+    monkeypatch.setattr(sys, "argv", ["bootstrap.py", "test"])
+    monkeypatch.setattr(bootstrap, "test", lambda _: int("PYTHONDONTWRITEBYTECODE" in os.environ))
+    assert bootstrap.main() == 0
 
 
 def test_ci_names_files_that_are_here():

@@ -527,16 +527,13 @@ def test_a_place_without_room_for_a_run_folder_is_refused_before_anything_is_com
     assert (tmp_path / "file").read_text() == "mine"
 
 
-def test_a_run_folder_that_cannot_be_written_is_refused(tmp_path):
+def test_a_run_folder_that_cannot_be_written_is_refused(tmp_path, monkeypatch, capfd):
     """Nobody, not even root, makes a folder there; that shows only when it is tried."""
-    done = subprocess.run(
-        [sys.executable, "-m", "uuvtai", "eval", "--episodes", "1", *SmallSim.OPTIONS, "--run-dir",
-        "/proc/nowhere/run"],
-        capture_output=True, text=True, check=False, cwd=tmp_path,
-    )  # fmt: skip
-    assert done.returncode == 2
-    assert "give a folder that can be written: --run-dir DIR" in done.stderr
-    assert "Traceback" not in done.stderr
+    monkeypatch.chdir(tmp_path)
+    code, _, err = uuv(capfd, "eval", "--episodes", "1", *SmallSim.OPTIONS, "--run-dir", "/proc/nowhere/run")
+    assert code == 2
+    assert "give a folder that can be written: --run-dir DIR" in err
+    assert "Traceback" not in err
 
 
 CHUNK = 0x06

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.sources import nodes_of
+
 PACKAGE = Path(__file__).parent.parent / "uuvtai"
 PATHS = sorted(PACKAGE.rglob("*.py"))
 DECKS = ("config", "state", "bundles")
@@ -19,34 +21,34 @@ def module_of(path):
     return ".".join(("uuvtai", *path.relative_to(PACKAGE).with_suffix("").parts)).removesuffix(".__init__")
 
 
-TREES = {module_of(path): ast.parse(path.read_text()) for path in PATHS}
+@cache
+def nodes():
+    """Module -> nodes of its syntax tree. Not made at import: every process of the gate imports every
+    file."""
+    return {module_of(path): nodes_of(path) for path in PATHS}
 
 
+@cache
 def classes():
     """Name -> modules that define such a class."""
     found = defaultdict(list)
-    for module, tree in TREES.items():
-        for node in ast.walk(tree):
+    for module, inside in nodes().items():
+        for node in inside:
             if isinstance(node, ast.ClassDef):
                 found[node.name].append(module)
     return found
 
 
-CLASSES = classes()
-
-
 def ours_in(module):
     """Names that stand for classes of the package in a module."""
-    tree = TREES[module]
+    inside = nodes()[module]
     imported = {
         alias.asname or alias.name
-        for node in ast.walk(tree)
+        for node in inside
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("uuvtai")
         for alias in node.names
     }
-    return (imported | {node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}) & set(
-        CLASSES
-    )
+    return (imported | {node.name for node in inside if isinstance(node, ast.ClassDef)}) & set(classes())
 
 
 def kind_of(annotation):
@@ -57,12 +59,12 @@ def kind_of(annotation):
     return match.group(1) if match else ""
 
 
-def names_of_types(trees):
+def names_of_types(modules):
     """Type -> names of the parameters that alone in their function have it -> where."""
     found = defaultdict(lambda: defaultdict(list))
-    for module in trees:
+    for module in modules:
         ours = ours_in(module)
-        for node in ast.walk(TREES[module]):
+        for node in nodes()[module]:
             if isinstance(node, ast.FunctionDef):
                 given = [
                     (kind_of(a.annotation), a.arg)
@@ -77,7 +79,7 @@ def names_of_types(trees):
 
 
 def test_a_type_has_one_name_as_a_parameter():
-    found = names_of_types(TREES)
+    found = names_of_types(nodes())
     assert len(found) > 100
     assert not {
         kind: {name: where[:3] for name, where in names.items()}
@@ -91,12 +93,12 @@ def test_a_second_name_would_be_found(monkeypatch):
         "from uuvtai.run_folder import RunFolder\ndef one(folder: RunFolder): ...\ndef two(held: "
         "'RunFolder | None'): ..."
     )
-    monkeypatch.setitem(TREES, "made.up", ast.parse(source))
+    monkeypatch.setitem(nodes(), "made.up", tuple(ast.walk(ast.parse(source))))
     assert set(names_of_types(["made.up"])["RunFolder"]) == {"folder", "held"}
 
 
 def test_no_two_classes_have_one_name():
-    assert not {name: modules for name, modules in CLASSES.items() if len(modules) > 1}
+    assert not {name: modules for name, modules in classes().items() if len(modules) > 1}
 
 
 def test_no_two_files_have_one_name():
@@ -113,12 +115,12 @@ def test_no_two_files_have_one_name():
 def imports():
     """Module -> modules of ours that it imports, inside functions too."""
     found = {}
-    for module, tree in TREES.items():
+    for module, inside in nodes().items():
         named = set()
-        for node in ast.walk(tree):
+        for node in inside:
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("uuvtai"):
                 named |= {
-                    f"{node.module}.{a.name}" if f"{node.module}.{a.name}" in TREES else node.module
+                    f"{node.module}.{a.name}" if f"{node.module}.{a.name}" in nodes() else node.module
                     for a in node.names
                 }
             elif isinstance(node, ast.Import):
@@ -153,7 +155,7 @@ def test_a_circle_would_be_found(graph):
 def defined_in(module):
     """Names that a module's own text defines, wherever in it."""
     found = set()
-    for node in ast.walk(TREES[module]):
+    for node in nodes()[module]:
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             found.add(node.name)
         elif isinstance(node, ast.ImportFrom | ast.Import):
@@ -167,11 +169,11 @@ def test_what_is_imported_is_there():
     """Also inside functions and under conditions, which no other test may come by."""
     missing = [
         f"{module} imports {node.module}.{alias.name}"
-        for module, tree in TREES.items()
-        for node in ast.walk(tree)
+        for module, inside in nodes().items()
+        for node in inside
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("uuvtai")
         for alias in node.names
-        if f"{node.module}.{alias.name}" not in TREES and alias.name not in defined_in(node.module)
+        if f"{node.module}.{alias.name}" not in nodes() and alias.name not in defined_in(node.module)
     ]
     assert not missing
 
@@ -182,6 +184,6 @@ def test_every_place_of_the_walk_through_the_house_is_there():
     places = re.findall(r"`([\w/]+)\.py(?::(\w+))?`", walk)
     assert len(places) > 30
     for path, function in places:
-        tree = TREES[f"uuvtai.{path.replace('/', '.')}"]
-        names = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
+        inside = nodes()[f"uuvtai.{path.replace('/', '.')}"]
+        names = {node.name for node in inside if isinstance(node, ast.FunctionDef)}
         assert not function or function in names, f"{path}.py has no {function}"
