@@ -413,6 +413,30 @@ def test_what_was_played_by_this_code_is_not_played_again(tmp_path, monkeypatch)
     assert evaluations.main(arguments) == 0 and len(played) == 7, "other code, other results"
 
 
+def test_one_more_pilot_is_played_beside_those_that_a_row_has(tmp_path, monkeypatch):
+    path, played = tmp_path / "evaluations_77.json", []
+
+    def play(row, seed, episodes, commit):
+        played.append((row.name, row.methods))
+        document = result()
+        document["methods"][1]["name"] = row.shows
+        return evaluations.entry_of(row, f"uuv eval {row.methods}", document, commit, "today")
+
+    monkeypatch.setattr(evaluations, "_play", play)
+    monkeypatch.setattr(evaluations, "commit_of_package", lambda: "abc")
+    given = ["--seeds", "77", "--episodes", "4", "--out", str(path), "--jobs", "1"]
+    assert evaluations.main([*given, "--only", "maze_0,pool_6_paper"]) == 0
+    before = json.loads(path.read_text())["rows"]
+    monkeypatch.setattr(evaluations, "commit_of_package", lambda: "def")
+    assert evaluations.main([*given, "--beside", "best"]) == 0
+    assert played[2:] == [("maze_0", "--controller best")], "not the paper's row, nor rows never played"
+    after = json.loads(path.read_text())["rows"]
+    best = after[0]["methods"].pop("best")
+    assert after == before, "the others stay as they were played"
+    assert (best["command"], best["commit"]) == ("uuv eval --controller best", "def")
+    assert evaluations.main([*given, "--beside", "best"]) == 0 and len(played) == 3, "it is there"
+
+
 def played_alone(outcomes):
     """What ``uuv eval --json`` says of one method, an episode a letter of the kept file."""
     names = {letter: name for name, letter in pieces.LETTERS.items()}

@@ -2,7 +2,8 @@
 
 Each row is one ``uuv eval`` (or ``uuv sweep``) on one thread, two of them at a time. A row is in
 ``docs/data/evaluations_SEED.json`` as soon as it is played; a second start plays what is missing (same seed,
-same episodes, same last commit of ``uuvtai/``). Whoever changes the default pilot writes ``"older": true``
+same episodes, same last commit of ``uuvtai/``). ``--beside best`` plays one more pilot in the rows of the
+table and leaves the others as they are. Whoever changes the default pilot writes ``"older": true``
 into the rows that it has not played: the tables mark them. Afterwards ``python -m docs.writers.figures
 --evaluations evaluations_SEED.json`` renews the text.
 """
@@ -17,8 +18,9 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +29,8 @@ from docs.writers.figure_sources import ROOT
 from uuvtai.run_folder import hardware, write_atomic
 
 EPISODES = 1000
+USUAL = "--controller straight --controller planner --controller bt --controller capped"
+"""methods of a row"""
 ONE_THREAD = {
     "UUV_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
@@ -44,7 +48,7 @@ class Row:
     """as the table has it, Markdown"""
     options: str
     """of ``uuv eval``"""
-    methods: str = "--controller straight --controller planner --controller bt --controller capped"
+    methods: str = USUAL
     shows: str = "bt"
     """the method whose counts stand in the table's row"""
 
@@ -211,6 +215,27 @@ def command_of(row: Row, seed: int, episodes: int) -> list[str]:
     ]
 
 
+def lacking(document: dict[str, Any], rows: list[Row], pilot: str, commit: str) -> list[Row]:
+    """Rows of README's table in which this pilot was not played with this code, with it as their one
+    method."""
+    played = {
+        entry["name"]: entry["methods"].get(pilot, {}).get("commit") == commit for entry in document["rows"]
+    }
+    return [
+        replace(row, methods=f"--controller {pilot}", shows=pilot)
+        for row in rows
+        if row.methods == USUAL and not played.get(row.name, True)
+    ]
+
+
+def add_beside(path: Path, document: dict[str, Any], entry: dict[str, Any]) -> None:
+    """Put the one method of an entry into the row that is there, with the command that played it."""
+    (row,) = (old for old in document["rows"] if old["name"] == entry["name"])
+    how = {name: entry[name] for name in ("command", "commit", "date", "machine")}
+    row["methods"] |= {entry["shows"]: entry["methods"][entry["shows"]] | how}
+    write_atomic(path, (json.dumps(document, indent=1) + "\n").encode())
+
+
 def _play(row: Row, seed: int, episodes: int, commit: str) -> dict[str, Any]:
     """The entry of one row. Raises RuntimeError where the command fails; its messages went to stderr."""
     command = command_of(row, seed, episodes)
@@ -263,9 +288,10 @@ def play_all(
     path: Path,
     commit: str,
     jobs: int,
+    keep: Callable[[Path, dict[str, Any], dict[str, Any]], None] = add,
 ) -> list[str]:
-    """Play rows and sweeps, ``jobs`` at a time; what went wrong, in words. The others are played and kept all
-    the same."""
+    """Play rows and sweeps, ``jobs`` at a time, and keep each by ``keep``; what went wrong, in words. The
+    others are played and kept all the same."""
     failed: list[str] = []
     with ThreadPoolExecutor(jobs) as pool:
         waiting: dict[Future[Any], str] = {
@@ -280,7 +306,7 @@ def play_all(
                     failed.append(f"{waiting[future]}: {error}")
                     continue
                 if entry is not None:
-                    add(path, document, entry)
+                    keep(path, document, entry)
                 print(f"{waiting[future]}: done", file=sys.stderr, flush=True)
         except KeyboardInterrupt:
             pool.shutdown(wait=False, cancel_futures=True)
@@ -307,6 +333,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--jobs", type=int, default=2, help="rows played at a time, one thread each (default 2)"
     )
+    parser.add_argument("--beside", default="", help="a pilot to play beside those that the rows have")
     parser.add_argument("--out", type=Path, help="results file (default docs/data/evaluations_SEED.json)")
     chosen = parser.parse_args(arguments)
     names = chosen.only.split(",") if chosen.only else list(BY_DEFAULT)
@@ -320,15 +347,19 @@ def main(arguments: list[str] | None = None) -> int:
     except ValueError as error:
         print(error, file=sys.stderr)
         return 2
-    rows = missing(document, tuple(row for row in ROWS if row.name in names), commit)
+    named = [row for row in ROWS if row.name in names]
+    rows = missing(document, tuple(named), commit)
     wanted = [name.removeprefix("sweep/") for name in names if name.startswith("sweep/")]
+    if chosen.beside:
+        rows, wanted = lacking(document, named, chosen.beside, commit), []
     print(
         f"{len(rows)} rows and {len(wanted)} sweeps to play, {chosen.jobs} at a time",
         file=sys.stderr,
         flush=True,
     )
     try:
-        failed = play_all(rows, wanted, chosen.seeds, document, path, commit, chosen.jobs)
+        keep = add_beside if chosen.beside else add
+        failed = play_all(rows, wanted, chosen.seeds, document, path, commit, chosen.jobs, keep)
     except KeyboardInterrupt:
         print("interrupted; what is played is kept: give the same command again", file=sys.stderr)
         return 130

@@ -78,7 +78,8 @@ def evaluations(sources: Sources) -> str:
         "success",
         "collision",
         "contact / TTC stop / out / timeout",
-        "`capped`: success / collision",
+        "`best`: success / collision",
+        "`capped`",
         "`planner`",
         "`straight`",
         "most frequent causes of failure",
@@ -96,12 +97,13 @@ def _evaluated(entry: dict[str, Any]) -> list[str]:
         f"{100 * methods[other].field('success_rate'):.1f} %" if other in methods else DASH
         for other in ("planner", "straight")
     ]
-    capped = _both(methods["capped"], 1) if "capped" in methods else DASH
+    capped, best = (_both(methods[other], 1) if other in methods else DASH for other in ("capped", "best"))
     return [
         _title(entry),
         share(own, "success"),
         rated(own, "collision"),
         ends,
+        best,
         capped,
         *others,
         _causes(entry["methods"][name]),
