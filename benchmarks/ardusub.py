@@ -34,6 +34,7 @@ from uuvtai.sim import Sim
 from uuvtai.sitl.instance import Instance
 from uuvtai.sitl.rows_of_water import WaterRows
 from uuvtai.sitl.serving import SitlPlan, SitlPort
+from uuvtai.sitl.simulated_operator import PLACE, PLACE_S, PLACED_S
 from uuvtai.statistics import wilson_interval
 from uuvtai.tree import read_tree
 
@@ -166,7 +167,8 @@ class Rig:
         return False
 
     def listen(self) -> None:
-        """What the ArduSubs tell the operator; a heartbeat of his twice a second."""
+        """What the ArduSubs tell the operator; his heartbeat, and where they are for a minute, for a DVL does
+        not tell that."""
         for row, link in enumerate(self.links):
             while (message := link.recv_match(blocking=False)) is not None:
                 kind = message.get_type()
@@ -178,18 +180,16 @@ class Rig:
                 elif kind == "STATUSTEXT":
                     self.said = [*self.said, message.text][-60:]
             now_s = self.ports[row].instance.time_s
-            if not 0.0 <= now_s - self._beat_s[row] < 0.5 and link.clients:
+            if not 0.0 <= now_s - self._beat_s[row] < PLACE_S and link.clients:
                 self._beat_s[row] = now_s
                 link.mav.heartbeat_send(6, 8, 0, 0, 4)
+                if now_s <= PLACED_S:
+                    link.mav.set_gps_global_origin_send(row + 1, *PLACE)
 
     def order(self, command: int, *params: float, row: int = 0) -> None:
         """A command by the operator."""
         given = [*params, *[0.0] * (7 - len(params))]
         self.links[row].mav.command_long_send(row + 1, 1, command, 0, *given)
-
-    def place(self, row: int = 0) -> None:
-        """Tell ArduSub where it is, for a DVL does not."""
-        self.links[row].mav.set_gps_global_origin_send(row + 1, -353600000, 1491600000, 0)
 
     def take(self, mode: int, seconds: float = 20.0, row: int = 0) -> bool:
         """Arm and take a mode; whether it did."""
@@ -245,10 +245,7 @@ def ready(rig: Rig) -> None:
     """Until every ArduSub speaks and knows where it is. RuntimeError after a minute."""
     if not rig.advance(60.0, until=lambda: all(mode >= 0 for mode in rig.modes)):
         raise RuntimeError("no heartbeat within a minute of the water's time")
-    rig.advance(12.0)
-    for row in range(len(rig.ports)):
-        rig.place(row)
-    rig.advance(8.0)
+    rig.advance(20.0)
 
 
 def _alone(sim: Sim, binary: str, job: Job) -> list[Row]:

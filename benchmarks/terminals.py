@@ -141,9 +141,11 @@ class Terminals:
         code, water = self.ended("sitl", 60.0)
         if code is None:  # no end yet, as the referee sees it
             self.processes["sitl"].send_signal(signal.SIGINT)
-            _, water = self.ended("sitl", 30.0)
-        outcome = water["instances"][0]["outcome"] if water else "failed"
-        return outcome, flight.get("ended", f"nothing: {self.said('pilot')[-300:]}")
+            code, water = self.ended("sitl", 30.0)
+        ended = flight.get("ended", f"nothing: {self.said('pilot')[-300:]}")
+        if not water:
+            return "failed", f"{ended}; the water, exit code {code}: {self.said('sitl')[-600:]}"
+        return water["instances"][0]["outcome"], ended
 
     def kill(self, name: str) -> None:
         """As a crash does."""

@@ -118,6 +118,18 @@ def test_late_readings_are_carried_to_now(small, build, monkeypatch, tmp_path):
     assert np.linalg.norm(apart[:, :2], axis=1).max() < 0.04
 
 
+@pytest.mark.parametrize("late_s", [0.3, 0.6, 1.24])
+def test_what_comes_too_late_to_be_carried_does_not_run_away(small, build, monkeypatch, tmp_path, late_s):
+    """Corrections that are fed back a second later used to grow to kilometres."""
+    estimate_pose(monkeypatch, small)
+    feed = read_feed(recorded(small, tmp_path, steps=400))
+    late = [Delivery(arrival.time_s + late_s, arrival.message) for arrival in feed.arrivals]
+    found, _ = commands(feed, build, late)
+    usual, _ = commands(feed, build)
+    apart = [np.linalg.norm(one.pos_w - two.pos_w) for one, two in zip(usual, found, strict=True)]
+    assert max(apart) < 3.0
+
+
 def test_what_arrives_twice_or_in_another_order_changes_nothing(log, build):
     feed = read_feed(log)
     usual, _ = commands(feed, build)

@@ -268,6 +268,22 @@ def test_water_that_begins_anew_under_a_vehicle_on_its_way_is_noticed(three):
     assert not one.port.instance.joined_late, "ArduSub has begun anew too"
 
 
+def test_a_vehicle_that_stood_still_is_heard_as_of_now_again(three):
+    """Our clock ran on without its clock: its readings are not older for that."""
+    one = three()
+    steps, go_on = iter(range(10**9)), one.step
+
+    def step():
+        if next(steps) == 200:
+            one.wall.now_s += SILENT_S + 1.2
+        go_on()
+
+    one.endpoint._pause = step
+    one.loop.run()
+    found = one.loop.document()
+    assert one.endpoint.clock_jumps and found["reached"] and found["safe"], (found, one.said)
+
+
 def test_the_water_stays_for_a_while_after_the_end(three):
     one = three()
     one.step()
@@ -284,7 +300,7 @@ def test_the_operator_beats_by_the_waters_clock_and_tells_the_place_for_a_minute
     operator = SimulatedOperator(1)
     said = [order for step in range(12_000) for order in operator.report(0.01 * step)]
     names = [order.message for order in said]
-    assert names.count("HEARTBEAT") == 120 and names.count("SET_GPS_GLOBAL_ORIGIN") == 13
+    assert names.count("HEARTBEAT") == 120 and names.count("SET_GPS_GLOBAL_ORIGIN") == 241
     assert all(order.as_operator for order in said)
     assert [order.message for order in operator.report(0.0)] == ["HEARTBEAT", "SET_GPS_GLOBAL_ORIGIN"]
 

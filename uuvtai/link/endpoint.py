@@ -43,6 +43,9 @@ def place_of(text: str, option: str = "--mavlink") -> LinkPlace:
 class Endpoint:
     """One side of a UDP link. Use as a context."""
 
+    clock_jumps = 0
+    """how often the clock that it keeps, if any, ran on without its senders' clocks"""
+
     def __init__(self, place: LinkPlace) -> None:
         """Raises LinkError where the address cannot be had."""
         self.place = place

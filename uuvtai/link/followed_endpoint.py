@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 
@@ -82,10 +83,9 @@ class FollowedEndpoint(Endpoint):
     def _hear(self, told_s: float) -> None:
         last_s, now_s = self._told_s, self.now()
         spent_s = 0.0 if last_s is None else told_s - last_s
-        if 0.0 <= spent_s <= _FARTHEST_S:
-            self._time_s = max(self._time_s + spent_s, now_s)
-        else:
-            self._time_s = now_s
+        told_now_s = self._time_s + spent_s if 0.0 <= spent_s <= _FARTHEST_S else -math.inf
+        self.clock_jumps += told_now_s < now_s
+        self._time_s = max(told_now_s, now_s)
         self._told_s, self._heard_s = told_s, self._wall()
 
 

@@ -109,6 +109,10 @@ class Intake:
             self._newest[name] = come_s
         return found
 
+    def forget_clocks(self) -> None:
+        """Date messages anew: our clock has run on without those of the senders."""
+        self._clocks.clear()
+
     def _is_known(self, system: int, component: int, name: str) -> bool:
         key = system, component, name
         if key not in self._clocks and len(self._clocks) < _MOST_CLOCKS:

@@ -84,6 +84,7 @@ class OnboardLoop:
         self._measured_s = dict.fromkeys(NAMES.values(), -math.inf)
         self._vehicle: Address | None = endpoint.calls
         self._asked_s = self._beat_s = -math.inf
+        self._clock_jumps = endpoint.clock_jumps
         self._lag_s = 0.0
         """pilot's clock behind ours: what was lost in stalls"""
         self.last = SafeDecision(SafeAction.HOLD, STOP, ("nothing was decided yet",))
@@ -131,7 +132,11 @@ class OnboardLoop:
         return command
 
     def _hear(self, now_s: float) -> None:
-        for sender, datagram in self._endpoint.receive():
+        datagrams = self._endpoint.receive()
+        if self._endpoint.clock_jumps != self._clock_jumps:
+            self._clock_jumps = self._endpoint.clock_jumps
+            self._intake.forget_clocks()
+        for sender, datagram in datagrams:
             for message in self._codec.decode(datagram):
                 self.tally.heard[message.name] += 1
                 self._log.saw(now_s, message)

@@ -33,7 +33,8 @@ from uuvtai.pilot.sensor_messages import (
 
 FIX_AGE_S = 0.3
 """[s] a scan or an image taken while attitude or position was older than this is not used: it would be drawn
-at the wrong place of the map"""
+at the wrong place of the map. A velocity or depth later than this is not carried forward: what an estimate
+has changed since, its own corrections too, would be fed back so late that the estimate runs away"""
 
 
 class FedSensors:
@@ -94,7 +95,7 @@ class FedSensors:
         if isinstance(reading, DvlReading):
             velocity = np.asarray(reading.vel_b)
             if self._steps_since(reading.time_s):
-                then = self._motions.at(self._step_of(reading.time_s))
+                then = self._motion_at(reading.time_s)
                 ego["vel_valid"][0] = ego["dvl_fresh"][0] = then is not None
                 velocity = velocity + self._won(then["vel_b"]) if then else ego["vel_b"][0]
             ego["vel_b"][0] = ego["dvl_b"][0] = velocity
@@ -108,7 +109,7 @@ class FedSensors:
     def _take_pressure(self, pressure: PressureReading) -> None:
         """A late one, or one held, changes by what the own depth has changed since."""
         ego, depth_m = self._ego, pressure.depth_m
-        then = self._motions.at(self._step_of(pressure.time_s))
+        then = self._motion_at(pressure.time_s)
         if self._steps_since(pressure.time_s) and then is not None:
             sinking = self._dt * to_world(ego["vel_b"][0], ego["rpy"][0])[2]
             depth_m -= float(ego["pos_w"][0, 2] - then["pos_w"][2] + sinking)
@@ -154,6 +155,11 @@ class FedSensors:
             image["fresh"][0] = 1
             for name, value in then.items():
                 image[name][0] = value
+
+    def _motion_at(self, time_s: float) -> dict[str, np.ndarray] | None:
+        """The own motion then; None where that is not known, or too long ago."""
+        is_late = self._steps_since(time_s) * self._dt > FIX_AGE_S
+        return None if is_late else self._motions.at(self._step_of(time_s))
 
     def _steps_since(self, time_s: float) -> int:
         """0 = measured in this step."""

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from uuvtai.link.orders import Order
 
-BEAT_S, PLACE_S, PLACED_S = 1.0, 5.0, 60.0
-"""a heartbeat so often; the place so often, until so long after the beginning: ArduSub takes it once"""
+BEAT_S, PLACE_S, PLACED_S = 1.0, 0.25, 60.0
+"""a heartbeat so often; the place so often, until so long after the beginning. ArduSub takes it once, as soon
+as its filter is there: the heading that it aligns without a place lacks the magnetic declination"""
 PLACE = (-353600000, 1491600000, 0)
 """latitude, longitude [1e-7 degrees], altitude [mm] of the surface"""
 
