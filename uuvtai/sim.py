@@ -25,6 +25,7 @@ from uuvtai.kernels.task import episode, reward
 from uuvtai.kernels.vehicle import actuation, dynamics, lost_thruster
 from uuvtai.kernels.world import scenarios
 from uuvtai.native.making import adopt
+from uuvtai.outcomes import RUNNING
 from uuvtai.rrt import RouteFallback, RoutePlanner
 from uuvtai.runtime import start_taichi
 from uuvtai.scenario import Scene, check_scenarios, set_scenes
@@ -62,6 +63,9 @@ class Sim:
         self.fallback = RouteFallback(config)
         self.planner: RoutePlanner | None = None
         self.sensors: SensorSource = SimulatedSensors(config.sensors.sonar)
+        self.any_ended: int | None = None
+        """not 0 where the last step ended an episode, or one rests; None: look at ``terminated`` and
+        ``truncated``"""
         self.stage_s: dict[str, float] | None = None
         self.privileged = False
         self._watches = lost_thruster.is_watched(config.vehicle, config.actuation)
@@ -146,9 +150,9 @@ class Sim:
             triggers.fire_triggers(io.triggers)
             if self.planner is None:
                 voronoi.plan_routes(io.voronoi)
-                self.fallback.serve(io, self._plan_seed, self._memory.number)
+                self.fallback.serve(io, self._plan_seed, self.rows, self._count)
             else:
-                self.fallback.serve_by(self.planner, io, self.rows, self._memory.number)
+                self.fallback.serve_by(self.planner, io, self.rows, self._count)
             route.follow_route(io.route)
         with self._stage("teacher"):
             stack.choose(io, self.tree.leaf, self.action)
@@ -177,7 +181,9 @@ class Sim:
         with self._stage("world"):
             scenarios.generate_scenarios(self.io.world)
             scenarios.move_obstacles(self.io.world)
-        check_scenarios(self.rows(self.s.world.faults)[mask.cpu().numpy() == 1])
+        faults = self.s.world.faults
+        if self._memory.device.type == "cpu" or bool((self._memory.tensor(faults)[: len(mask)] * mask).any()):
+            check_scenarios(self.rows(faults)[mask.cpu().numpy() == 1])
 
     def sleep_ended(self) -> None:
         """Put the rows whose episode has ended to sleep; they cost nothing until their next reset."""
@@ -187,6 +193,15 @@ class Sim:
         """Put every row to sleep, as in a new simulator."""
         self.s.clock.active.fill(0)
         self.s.clock.awake.fill(0)
+
+    def _count(self, field: ti.Field) -> int:
+        """A field's one number. On a GPU the wait for it tells also whether an episode has ended."""
+        if self._memory.device.type == "cpu":
+            return self._memory.number(field)
+        outcome = self._memory.tensor(self.s.referee.outcome)[: self.num_envs]
+        told = torch.stack((self._memory.tensor(field), outcome.ne(RUNNING).any().to(torch.int32)))
+        count, self.any_ended = told.tolist()
+        return count
 
     def _plan_seed(self, env: int) -> int:
         """Seed of the fallback planner's random numbers: a function of the episode's key and step alone."""
