@@ -17,7 +17,7 @@ import torch
 from uuvtai import stack
 from uuvtai.binding import bind_all
 from uuvtai.config import Config
-from uuvtai.copying import copied_rows, copy_into
+from uuvtai.copying import HostCounts, copied_rows, copy_into
 from uuvtai.initial import allocate_state, fill_constants
 from uuvtai.kernels.perception import pose
 from uuvtai.kernels.planning import clearance, exposure, features, route, triggers, voronoi
@@ -25,7 +25,6 @@ from uuvtai.kernels.task import episode, reward
 from uuvtai.kernels.vehicle import actuation, dynamics, lost_thruster
 from uuvtai.kernels.world import scenarios
 from uuvtai.native.making import adopt
-from uuvtai.outcomes import RUNNING
 from uuvtai.rrt import RouteFallback, RoutePlanner
 from uuvtai.runtime import start_taichi
 from uuvtai.scenario import Scene, check_scenarios, set_scenes
@@ -63,13 +62,11 @@ class Sim:
         self.fallback = RouteFallback(config)
         self.planner: RoutePlanner | None = None
         self.sensors: SensorSource = SimulatedSensors(config.sensors.sonar)
-        self.any_ended: int | None = None
-        """not 0 where the last step ended an episode, or one rests; None: look at ``terminated`` and
-        ``truncated``"""
         self.stage_s: dict[str, float] | None = None
         self.privileged = False
         self._watches = lost_thruster.is_watched(config.vehicle, config.actuation)
         self._memory = self.memory()
+        self.counts = HostCounts(self._memory, self.s.referee.outcome, num_envs)
         self.put = self._memory.put
         if config.runtime.native and self.device.type == "cpu":
             adopt(vars(self.io).values(), self._memory, self._recipe, alone=num_envs == 1)
@@ -150,9 +147,9 @@ class Sim:
             triggers.fire_triggers(io.triggers)
             if self.planner is None:
                 voronoi.plan_routes(io.voronoi)
-                self.fallback.serve(io, self._plan_seed, self.rows, self._count)
+                self.fallback.serve(io, self._plan_seed, self.rows, self.counts.number)
             else:
-                self.fallback.serve_by(self.planner, io, self.rows, self._count)
+                self.fallback.serve_by(self.planner, io, self.rows, self.counts.number)
             route.follow_route(io.route)
         with self._stage("teacher"):
             stack.choose(io, self.tree.leaf, self.action)
@@ -182,7 +179,7 @@ class Sim:
             scenarios.generate_scenarios(self.io.world)
             scenarios.move_obstacles(self.io.world)
         faults = self.s.world.faults
-        if self._memory.device.type == "cpu" or bool((self._memory.tensor(faults)[: len(mask)] * mask).any()):
+        if self.counts.has_any(faults, mask):
             check_scenarios(self.rows(faults)[mask.cpu().numpy() == 1])
 
     def sleep_ended(self) -> None:
@@ -193,15 +190,6 @@ class Sim:
         """Put every row to sleep, as in a new simulator."""
         self.s.clock.active.fill(0)
         self.s.clock.awake.fill(0)
-
-    def _count(self, field: ti.Field) -> int:
-        """A field's one number. On a GPU the wait for it tells also whether an episode has ended."""
-        if self._memory.device.type == "cpu":
-            return self._memory.number(field)
-        outcome = self._memory.tensor(self.s.referee.outcome)[: self.num_envs]
-        told = torch.stack((self._memory.tensor(field), outcome.ne(RUNNING).any().to(torch.int32)))
-        count, self.any_ended = told.tolist()
-        return count
 
     def _plan_seed(self, env: int) -> int:
         """Seed of the fallback planner's random numbers: a function of the episode's key and step alone."""

@@ -76,7 +76,7 @@ _LAUNCH_S, _WAIT_S = 4e-6, 2e-5
 def instrumented(text: str) -> str:
     """LLVM's text of a kernel with a count at the head of every block: instructions of single lanes, and
     accesses to memory."""
-    lines: list[str] = [f"@{SYMBOL} = external global [2 x i64]"]
+    lines: list[str] = []
     block: list[str] = []
     inside = False
     for line in text.splitlines():
@@ -91,7 +91,7 @@ def instrumented(text: str) -> str:
             block.append(line)
         else:
             lines.append(line)
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, f"@{SYMBOL} = external global [2 x i64]", ""])
 
 
 def _with_count(block: list[str], number: int) -> list[str]:

@@ -241,22 +241,29 @@ def mapped_lanes(env, first_ray, pos, vel, threshold, io: Bundle[MappingIO]):
 def mark_hits(env, slot, item, promote_scans: Const[int], io: Bundle[MappingIO]):
     """Bit of every return's cell: what moves is a dynamic hit only, the rest static hits; returns from known
     walls are left out. ``item``: which of those that share the env (``n_item``)."""
-    lanes, n_packet = ti.static(n_lane(), io.sonar_cfg.n_ray // n_lane())
+    lanes = ti.static(n_lane())
     pos = ti.Vector([io.scan.ping_pos_w[env][0], io.scan.ping_pos_w[env][1]])
     vel, threshold = own_motion(env, io)
-    for turn in range(ti.static(n_turn(n_packet))):
+    for turn in range(ti.static(n_turn(io.sonar_cfg.n_ray // n_lane()))):
         first = (turn * ti.static(n_item()) + item) * lanes
-        if first < ti.static(n_packet * n_lane()):
+        if first < io.sonar_cfg.n_ray:
             kind, row, col, range_m = mapped_lanes(env, first, pos, vel, threshold, io)
             for i in range(lanes):
                 if kind[i] != 0 and is_new(env, first + i, io.scan, io.sonar_cfg):
                     moves = ti.cast(kind[i] == 2, ti.i32) | moves_by_track(env, first + i, io)
-                    if moves == 0:
-                        moves = is_inconsistent(env, row[i], col[i], range_m[i], promote_scans, io)
-                    if moves == 1:
-                        put_bit(io.map_scratch.dynamic_hit, slot, row[i], col[i])
-                    else:
-                        put_bit(io.map_scratch.static_hit, slot, row[i], col[i])
+                    mark_hit(env, slot, row[i], col[i], range_m[i], moves, promote_scans, io)
+
+
+@ti.func
+def mark_hit(env, slot, row, col, range_m, moves, promote_scans: Const[int], io: Bundle[MappingIO]):
+    """Bit of a return's cell; ``moves``: 1 where the return or its track says so."""
+    dynamic = moves
+    if moves == 0:
+        dynamic = is_inconsistent(env, row, col, range_m, promote_scans, io)
+    if dynamic == 1:
+        put_bit(io.map_scratch.dynamic_hit, slot, row, col)
+    else:
+        put_bit(io.map_scratch.static_hit, slot, row, col)
 
 
 # ------------------------------------------------------------------------------------------------------ depth
@@ -299,22 +306,26 @@ def nearest_in_gate(env, first_col, R_wb, gate_m: Const[float], io: Bundle[Mappi
 def mark_depth(env, item, io: Bundle[MappingIO]):
     """Depth hit in the cell of the nearest point at the vehicle's own depth, per image column; it waits there
     for the next merge. ``item``: which of those that share the env (``n_item``)."""
-    lanes, n_packet = ti.static(n_lane(), io.image.depth_m.shape[2] // n_lane())
-    focal, middle_row, middle_col = ti.static(pinhole(io.depth_cfg))
-    n_row, n_col = ti.static(grid_shape(io.tank_cfg, io.mapping_cfg.cell_m))
+    lanes, n_col = ti.static(n_lane(), io.image.depth_m.shape[2])
     rpy = io.image.shot_rpy[env]
     R_wb = rotation_wb(quaternion_wb(rpy[0], rpy[1], rpy[2]))
-    offset = ti.Vector([io.depth_cfg.offset_b_m[0], io.depth_cfg.offset_b_m[1], io.depth_cfg.offset_b_m[2]])
-    for turn in range(ti.static(n_turn(n_packet))):
+    for turn in range(ti.static(n_turn(io.image.depth_m.shape[2] // n_lane()))):
         first = (turn * ti.static(n_item()) + item) * lanes
-        if first < ti.static(n_packet * n_lane()):
+        if first < n_col:
             nearest, nearest_row = nearest_in_gate(env, first, R_wb, io.mapping_cfg.depth_gate_m, io)
             for i in range(lanes):
                 if nearest[i] < FAR_M:
-                    ray_b = ti.Vector(
-                        [1.0, (middle_col - first - i) / focal, (middle_row - nearest_row[i]) / focal]
-                    )
-                    point = io.image.shot_pos_w[env] + R_wb @ (offset + nearest[i] * ray_b)
-                    cell = cell_of(point, io.tank_cfg, io.mapping_cfg.cell_m)
-                    if cell[0] >= 0 and cell[0] < n_row and cell[1] >= 0 and cell[1] < n_col:
-                        put_bit(io.grid_map.depth_hit, env, cell[0], cell[1])
+                    mark_point(env, first + i, nearest_row[i], nearest[i], R_wb, io)
+
+
+@ti.func
+def mark_point(env, pixel_col, pixel_row, depth_m, R_wb, io: Bundle[MappingIO]):
+    """Depth hit in the cell of a pixel's point, if it is one of the grid's."""
+    focal, middle_row, middle_col = ti.static(pinhole(io.depth_cfg))
+    n_row, n_col = ti.static(grid_shape(io.tank_cfg, io.mapping_cfg.cell_m))
+    offset = ti.Vector([io.depth_cfg.offset_b_m[0], io.depth_cfg.offset_b_m[1], io.depth_cfg.offset_b_m[2]])
+    ray_b = ti.Vector([1.0, (middle_col - pixel_col) / focal, (middle_row - pixel_row) / focal])
+    point = io.image.shot_pos_w[env] + R_wb @ (offset + depth_m * ray_b)
+    cell = cell_of(point, io.tank_cfg, io.mapping_cfg.cell_m)
+    if cell[0] >= 0 and cell[0] < n_row and cell[1] >= 0 and cell[1] < n_col:
+        put_bit(io.grid_map.depth_hit, env, cell[0], cell[1])

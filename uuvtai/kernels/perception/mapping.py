@@ -265,6 +265,20 @@ def merge_word(env, slot, row, word, in_fan, points, confident_scans: Const[int]
         io.grid_map.seen[env, row, word] = seen | free | statics | dynamics | points
 
 
+@ti.func
+def take_alone(env, slot, confident_scans: Const[int], promote_scans: Const[int], io: Bundle[MappingIO]):
+    """One env's turn, by one thread: a fresh image's points and a fresh scan that is due."""
+    if io.clock.awake[env] == 1 and io.image.fresh[env] == 1:
+        mark_depth(env, 0, io)
+        io.grid_map.depth_waits[env] = 1
+    if is_due(env, io) == 1:
+        fetch_cells(env, slot, io)
+        mark_free(env, slot, 0, io)
+        mark_hits(env, slot, 0, promote_scans, io)
+        merge_scan(env, slot, confident_scans, io)
+        io.grid_map.map_step[env] = io.clock.step[env]
+
+
 # ---------------------------------------------------------------------------- an env's items on a GPU
 
 
@@ -335,15 +349,7 @@ def update_map(io: Bundle[MappingIO]):
         for slot, pad in ti.ndrange(n_slot, ti.static(spread(n_slot))):
             if pad == 0:
                 for env in range(slot * n_env // n_slot, (slot + 1) * n_env // n_slot):
-                    if io.clock.awake[env] == 1 and io.image.fresh[env] == 1:
-                        mark_depth(env, 0, io)
-                        io.grid_map.depth_waits[env] = 1
-                    if is_due(env, io) == 1:
-                        fetch_cells(env, slot, io)
-                        mark_free(env, slot, 0, io)
-                        mark_hits(env, slot, 0, promote, io)
-                        merge_scan(env, slot, confident, io)
-                        io.grid_map.map_step[env] = io.clock.step[env]
+                    take_alone(env, slot, confident, promote, io)
 
 
 @quick_launch
