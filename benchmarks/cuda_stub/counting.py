@@ -211,6 +211,8 @@ def _count(num_envs: int, sensors: str, steps: int) -> dict[str, Any]:
     for _ in range(2):  # compiling launches each kernel twice
         found.clear()
         sim.reset(ones, 77001 * ones, numbers)
+    if not found:
+        raise RuntimeError("no kernel was launched by machine code of its own: nothing is counted")
     reset = {name: _summed(made, num_envs, parts[name]) for name, made in found.items()}
     sim.step()
     found.clear()
