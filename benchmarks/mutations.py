@@ -627,6 +627,22 @@ KERNELS = (
         "same_bits",
     ),
     Mutation(
+        "gpu_fan_of_one_row",
+        "uuvtai/kernels/perception/mapping.py",
+        "        in_fan ^= io.map_scratch.fan_edge[env, row, word]\n",
+        "        in_fan = io.map_scratch.fan_edge[env, row, word]\n",
+        "tests/test_cuda.py",
+        "same_bits",
+    ),
+    Mutation(
+        "gpu_upper_rows_unmarked",
+        "uuvtai/kernels/planning/clearance_cells.py",
+        "n_row - 1) // WORD + 1",
+        "n_row - 1) // WORD",
+        "tests/test_cuda.py",
+        "same_bits",
+    ),
+    Mutation(
         "inverter_agrees",
         "uuvtai/kernels/teacher/tree_tick.py",
         "status = SUCCESS + FAILURE - answer",

@@ -109,7 +109,7 @@ def assembled_rows(what: str, emitted: Emitted, entries: list[Assembled]) -> lis
 def step_rows(what: str, emitted: Emitted, num_envs: int) -> list[Row]:
     """How a step is launched: launches, waits, and kernels that are too narrow for a GPU."""
     rows, narrow = [], too_narrow(emitted, num_envs)
-    for name in ("step", "reset"):
+    for name in ("step", "reset", "step of a VectorEnv"):
         made = emitted.counts[name]
         rows.append(Row(f"{what}: launches of a {name}", len(made["launches"]), ""))
         rows.append(

@@ -35,13 +35,13 @@ ROUNDING_M = 5e-7
 class Stage:
     """The structs of clearance."""
 
-    def __init__(self, n_env=N_ENV):
+    def __init__(self, n_env=N_ENV, n_slot=4):
         sizes = {
             "n_env": n_env,
             "n_row": SHAPE[0],
             "n_col": SHAPE[1],
             "n_packet": SHAPE[1] // LANES,
-            "n_slot": 4,
+            "n_slot": n_slot,
         }
         self.clearance, self.grid_map = allocate(ClearanceState, sizes), allocate(MapState, sizes)
         self.memory = allocate(ClearanceMemory, sizes)

@@ -7,15 +7,19 @@ import shutil
 import sys
 
 import pytest
+import torch
 
 from benchmarks import rehearsal
 from benchmarks.cuda_stub import assembling, counting, emitting, playing
 from tests.small_sim import SmallSim
+from uuvtai.copying import HostCounts
 from uuvtai.errors import SettingError
 from uuvtai.loader import load_config
 from uuvtai.native import gpu_shape
 from uuvtai.native.machine import Machine
+from uuvtai.outcomes import RUNNING, TIMEOUT
 from uuvtai.sizes import array_sizes
+from uuvtai.taichi_patches.memory import Memory
 
 COMPILER = shutil.which("cc") or shutil.which("gcc")
 PTXAS = assembling.find_ptxas()
@@ -41,8 +45,14 @@ def test_taichi_writes_ptx_of_every_kernel_and_no_loop_is_too_narrow_for_a_gpu(e
     assert not any(assembling.doubles_in(module) for module in emitted.modules)
     plans = [t for t in emitted.tasks if "plan_routes" in t.entry and t.entry.endswith("range_for")]
     assert {task.blocks * task.threads for task in plans} == {ENVS // 16}
-    waits = emitted.counts["step"]["waits"]
-    assert len(waits) <= 2, f"a step waits for the GPU more often than to learn of failed plans: {waits}"
+    for kernel in ("update_map", "compute_clearance"):
+        wide = [t.blocks * t.threads for t in emitted.tasks if kernel in t.entry and "range_for" in t.entry]
+        assert wide.count(32 * ENVS) >= 2, f"{kernel}: no warp for an env"
+    waits = {name: len(made["waits"]) for name, made in emitted.counts.items()}
+    assert waits["step"] == waits["step of a VectorEnv"] == 1, (
+        "to learn of failed plans and of ended episodes"
+    )
+    assert waits["reset"] == 2, "the same, and to check the new scenarios"
 
 
 @needs_compiler
@@ -53,6 +63,40 @@ def test_ptxas_assembles_all_of_it_and_spills_little(emitted):
     worst = max(entries, key=lambda entry: entry.spilled)
     assert worst.spilled <= rehearsal.SPILL_LIMIT, worst
     assert all(0 < entry.registers <= 255 for entry in entries)
+
+
+class DevicesMemory(Memory):
+    """The simulator's memory as that of a GPU: tensors are all that is seen of it."""
+
+    def __init__(self, sim):
+        plain = sim.memory()
+        super().__init__(sim.s, sim.s.clock.active, 0, torch.device("cuda"))
+        self.address, self._bytes = plain.address, torch.from_numpy(plain.read())
+
+    def _on_device(self):
+        return self._bytes
+
+
+def test_a_gpus_numbers_are_told_at_once(small):
+    sim = small.sim
+    memory = DevicesMemory(sim)
+    for field in (sim.s.route.n_failed, sim.s.referee.outcome, sim.s.route.failed):
+        assert memory.tensor(field).numpy().tolist() == sim._memory.live(field).tolist()
+    outcome, kept = sim._memory.live(sim.s.referee.outcome), sim._memory.live(sim.s.referee.outcome).copy()
+    failed = sim._memory.live(sim.s.route.n_failed)
+    counts = HostCounts(memory, sim.s.referee.outcome, SmallSim.N)
+    try:
+        outcome[...], failed[...] = RUNNING, 3
+        assert (counts.number(sim.s.route.n_failed), counts.any_ended) == (3, 0)
+        outcome[SmallSim.N - 1] = TIMEOUT
+        assert (counts.number(sim.s.route.n_failed), counts.any_ended) == (3, 1)
+        mask = torch.zeros(SmallSim.N, dtype=torch.int32)
+        assert not counts.has_any(sim.s.referee.outcome, mask)
+        mask[-1] = 1
+        assert counts.has_any(sim.s.referee.outcome, mask)
+        assert HostCounts(sim._memory, sim.s.referee.outcome, SmallSim.N).has_any(sim.s.referee.outcome, mask)
+    finally:
+        outcome[...], failed[...] = kept, 0
 
 
 @needs_ptxas

@@ -119,6 +119,7 @@ def serve(s, config=CONFIG, seed=1):
     return fallback.serve(
         SimpleNamespace(route=io_for(RouteIO, *parts), voronoi=io_for(VoronoiIO, *parts)),
         lambda env: seed + env,
+        lambda field, envs=slice(None): field.to_numpy()[envs],
         lambda field: int(field[None]),
     )
 

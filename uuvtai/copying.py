@@ -7,6 +7,7 @@ import taichi as ti
 import torch
 
 from uuvtai.kernels.core.rows import copy_rows
+from uuvtai.outcomes import RUNNING
 from uuvtai.taichi_patches.memory import Memory
 
 _TORCH_DTYPE = {
@@ -17,6 +18,30 @@ _TORCH_DTYPE = {
     ti.i8: torch.int8,
     ti.u32: torch.uint32,
 }
+
+
+class HostCounts:
+    """A simulator's numbers for the host, with as few waits for a GPU as can be."""
+
+    def __init__(self, memory: Memory, outcome: ti.Field, num_envs: int) -> None:
+        """``outcome``: the referee's, a code of ``outcomes`` a row."""
+        self._memory, self._outcome, self._num_envs = memory, outcome, num_envs
+        self.any_ended: int | None = None
+        """not 0 where an episode had ended, or rested, at the last ``number``; None: nobody has looked"""
+
+    def number(self, field: ti.Field) -> int:
+        """The one number of a field without axes. The wait for it tells ``any_ended``, too."""
+        if self._memory.device.type == "cpu":
+            return self._memory.number(field)
+        ended = self._memory.tensor(self._outcome)[: self._num_envs].ne(RUNNING).any()
+        number, self.any_ended = torch.stack((self._memory.tensor(field), ended.to(torch.int32))).tolist()
+        return number
+
+    def has_any(self, field: ti.Field, mask: torch.Tensor) -> bool:
+        """Whether a number of these rows (int32 ``mask``) is not 0."""
+        if self._memory.device.type == "cpu":
+            return bool(self._memory.live(field)[: len(mask)][mask.numpy() != 0].any())
+        return bool((self._memory.tensor(field)[: len(mask)] * mask).any())
 
 
 def copied_rows(field: ti.Field, chosen: torch.Tensor) -> np.ndarray:

@@ -173,7 +173,8 @@ class VectorEnv:
         torch.ne(sim.terminated, 0, out=self._terminated)
         torch.ne(sim.truncated, 0, out=self._truncated)
         ended = self._terminated | self._truncated
-        if bool(ended.any()):
+        told = sim.counts.any_ended
+        if bool(ended.any() if told is None else told):
             self._go_on(ended)
         sim.read_into(sim.s.teacher.leaf, info["leaf"])
         return self._obs, sim.reward, self._terminated, self._truncated, dict(info)

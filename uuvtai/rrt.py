@@ -258,17 +258,27 @@ class RouteFallback:
         self.overlay = np.zeros(grid_shape(tank, cell_m), dtype=np.float32)
         self.origin = grid_origin(tank, cell_m)
 
-    def serve(self, stages: Stages, seed_of: Callable[[int], int], count: Callable[[Any], int]) -> int:
+    def serve(
+        self,
+        stages: Stages,
+        seed_of: Callable[[int], int],
+        read: Callable[..., np.ndarray],
+        count: Callable[[Any], int],
+    ) -> int:
         """Plan for ``route.failed``; returns how many there were. ``seed_of(env)`` gives the env's number of
-        (seed, episode, step), ``count(field)`` a field's one number (``Memory.number``)."""
+        (seed, episode, step), ``read(field, envs)`` rows of a field (``Sim.rows``), ``count(field)`` its one
+        number."""
         from uuvtai.kernels.planning.route import keep_route, load_route
         from uuvtai.kernels.planning.voronoi import overlay_clearance
 
         route, ego, mission = stages.route.route, stages.route.ego, stages.route.mission
         n_failed = count(route.n_failed)
-        for env in sorted(int(route.failed[item]) for item in range(n_failed)):
+        if n_failed == 0:
+            return 0
+        envs = sorted(read(route.failed)[:n_failed].tolist())
+        starts, goals = (read(field, envs)[:, :2].tolist() for field in (ego.pos_w, mission.goal_w))
+        for env, start, goal in zip(envs, starts, goals, strict=True):
             overlay_clearance(stages.voronoi, self.overlay, env)
-            start, goal = ego.pos_w[env], mission.goal_w[env]
             corners = self.plan((start[0], start[1]), (goal[0], goal[1]), seed_of(env))
             if corners is None:
                 keep_route(stages.route, env)

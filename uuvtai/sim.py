@@ -17,7 +17,7 @@ import torch
 from uuvtai import stack
 from uuvtai.binding import bind_all
 from uuvtai.config import Config
-from uuvtai.copying import copied_rows, copy_into
+from uuvtai.copying import HostCounts, copied_rows, copy_into
 from uuvtai.initial import allocate_state, fill_constants
 from uuvtai.kernels.perception import pose
 from uuvtai.kernels.planning import clearance, exposure, features, route, triggers, voronoi
@@ -66,6 +66,7 @@ class Sim:
         self.privileged = False
         self._watches = lost_thruster.is_watched(config.vehicle, config.actuation)
         self._memory = self.memory()
+        self.counts = HostCounts(self._memory, self.s.referee.outcome, num_envs)
         self.put = self._memory.put
         if config.runtime.native and self.device.type == "cpu":
             adopt(vars(self.io).values(), self._memory, self._recipe, alone=num_envs == 1)
@@ -146,9 +147,9 @@ class Sim:
             triggers.fire_triggers(io.triggers)
             if self.planner is None:
                 voronoi.plan_routes(io.voronoi)
-                self.fallback.serve(io, self._plan_seed, self._memory.number)
+                self.fallback.serve(io, self._plan_seed, self.rows, self.counts.number)
             else:
-                self.fallback.serve_by(self.planner, io, self.rows, self._memory.number)
+                self.fallback.serve_by(self.planner, io, self.rows, self.counts.number)
             route.follow_route(io.route)
         with self._stage("teacher"):
             stack.choose(io, self.tree.leaf, self.action)
@@ -177,7 +178,9 @@ class Sim:
         with self._stage("world"):
             scenarios.generate_scenarios(self.io.world)
             scenarios.move_obstacles(self.io.world)
-        check_scenarios(self.rows(self.s.world.faults)[mask.cpu().numpy() == 1])
+        faults = self.s.world.faults
+        if self.counts.has_any(faults, mask):
+            check_scenarios(self.rows(faults)[mask.cpu().numpy() == 1])
 
     def sleep_ended(self) -> None:
         """Put the rows whose episode has ended to sleep; they cost nothing until their next reset."""

@@ -16,7 +16,7 @@ from uuvtai.forecast_codes import N_BEND, N_COLUMN, N_FRAME, N_HIDDEN, N_MODE, N
 from uuvtai.kernels.core.grid import grid_shape
 from uuvtai.kernels.core.lanes import LANES
 from uuvtai.kernels.perception.mapping import look_period_s, scans_in
-from uuvtai.kernels.planning.clearance import offset_bits
+from uuvtai.kernels.planning.clearance_keys import offset_bits
 from uuvtai.kernels.planning.exposure import block_shape
 from uuvtai.multibeam import elevations, heard_bearings
 from uuvtai.native.gpu_shape import is_gpu_shaped

@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-PACKAGE = "nvidia-cuda-nvcc-cu12"
+PACKAGE = "nvidia-cuda-nvcc"
 _LONGEST_S = 300
 _ENTRY = re.compile(r"Compiling entry function '(\S+)'")
 _FRAME = re.compile(r"(\d+) bytes stack frame, (\d+) bytes spill stores, (\d+) bytes spill loads")
@@ -51,7 +51,7 @@ def find_ptxas() -> Path | None:
     """``ptxas`` of the package from PyPI, or else of an installed CUDA; None where there is none."""
     found = importlib.util.find_spec("nvidia")
     for folder in found.submodule_search_locations or () if found else ():
-        for path in Path(folder).glob("*/bin/ptxas"):
+        for path in sorted(Path(folder).glob("*/bin/ptxas")):  # cu13 before an older cuda_nvcc
             return path
     installed = shutil.which("ptxas")
     return Path(installed) if installed else None

@@ -26,6 +26,7 @@ _INSTRUCTION = re.compile(r"^  (?:%[\w.]+ = )?(\w+)")
 _LANES = re.compile(r"<(\d+) x ")
 _LABEL = re.compile(r'^(?:[\w.$-]+|"[^"]+"):')
 _FREE = ("phi", "br", "ret", "unreachable", "bitcast", "switch", "fence", "alloca")
+_ACCESSES = ("load", "store", "atomicrmw", "cmpxchg")
 _CALL_COSTS = 20
 """instructions of a function that is not in the module: sine, exponential and the like"""
 
@@ -56,10 +57,18 @@ _CYCLES_ALONE = 8.0
 """ASSUMED cycles between two instructions of a thread: the least time that its work takes"""
 _EPISODE_STEPS = 700
 """ASSUMED: one env in so many is reset in a step, and the pass of the resets is launched in every step"""
-_THREADS_PER_ENV = {"cast_sonar": 32, "cast_depth": 20, "plan_evasion": 160, "scan_columns": 10}
+_THREADS_PER_ENV = {
+    "cast_sonar": 32,
+    "cast_depth": 20,
+    "plan_evasion": 160,
+    "scan_columns": 10,
+} | dict.fromkeys(("update_map", "compute_clearance"), 32)
 """of kernels that have many; elsewhere a thread has an env or a track"""
-_WAITS = 4
-"""of the host, with torch's own and the check of new scenarios"""
+_BESIDE = dict.fromkeys(("update_map", "compute_clearance"), 4)
+"""ASSUMED accesses that share a sector, where the threads of an env go in step through neighbouring words of
+eight bytes"""
+_WAITS = 3
+"""of the host in a step of a ``VectorEnv`` with a reset (counted by the stub)"""
 _LAUNCH_S, _WAIT_S = 4e-6, 2e-5
 """ASSUMED of the host"""
 
@@ -67,7 +76,7 @@ _LAUNCH_S, _WAIT_S = 4e-6, 2e-5
 def instrumented(text: str) -> str:
     """LLVM's text of a kernel with a count at the head of every block: instructions of single lanes, and
     accesses to memory."""
-    lines: list[str] = [f"@{SYMBOL} = external global [2 x i64]"]
+    lines: list[str] = []
     block: list[str] = []
     inside = False
     for line in text.splitlines():
@@ -82,7 +91,7 @@ def instrumented(text: str) -> str:
             block.append(line)
         else:
             lines.append(line)
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, f"@{SYMBOL} = external global [2 x i64]", ""])
 
 
 def _with_count(block: list[str], number: int) -> list[str]:
@@ -95,7 +104,7 @@ def _with_count(block: list[str], number: int) -> list[str]:
         lanes = _LANES.search(line)
         width = int(lanes[1]) if lanes else 1
         counts[0] += _CALL_COSTS if found[1] in ("call", "tail") and "@llvm." not in line else width
-        counts[1] += width if found[1] in ("load", "store") else 0
+        counts[1] += width if found[1] in _ACCESSES else 0
     head = 0
     while head < len(block) and " = phi " in block[head]:
         head += 1
@@ -149,7 +158,7 @@ def step_seconds(gpu: Gpu, counts: dict[str, Any], num_envs: int) -> float:
         alone = count["of_item"] / _THREADS_PER_ENV.get(name, 1)
         total += max(
             instructions / issue,
-            accesses * _SECTOR_BYTES * _MISS_SHARE / gpu.bytes_per_s,
+            accesses * _SECTOR_BYTES * _MISS_SHARE / _BESIDE.get(name, 1) / gpu.bytes_per_s,
             count["busy_share"] * alone * _CYCLES_ALONE / gpu.clock_hz,
         )
         total += count["launches"] * _LAUNCH_S
@@ -164,25 +173,28 @@ def _count(num_envs: int, sensors: str, steps: int) -> dict[str, Any]:
     import torch
 
     from uuvtai.loader import load_config
-    from uuvtai.native import launch, machine
+    from uuvtai.native import launch, machine, making
     from uuvtai.sim import Sim
     from uuvtai.tree import read_tree
 
     counts = (ctypes.c_int64 * 2)()
     llvm.add_symbol(SYMBOL, ctypes.addressof(counts))
     found: dict[str, list[tuple[int, int]]] = {}
-    plain_object, plain_init, plain_again = (
+    parts: dict[str, int] = {}
+    plain_object, plain_launch, plain_again = (
         machine.Machine.object_of,
-        launch.NativeLaunch.__init__,
+        making.Native._launch,
         launch.NativeLaunch.again,
     )
 
     def object_of(self: Any, text: str) -> bytes:
         return plain_object(self, text if "@uuv_launch" in text else instrumented(text))
 
-    def init(self: Any, machine_: Any, runtime: Any, tasks: Any, kernel: Any, arguments: tuple) -> None:
-        plain_init(self, machine_, runtime, tasks, kernel, arguments)
-        self.name = kernel.func.__name__
+    def launched(self: Any, code: Any, kernel: Any, arguments: tuple, owner: Any) -> Any:
+        made = plain_launch(self, code, kernel, arguments, owner)
+        made.name = kernel.func.__name__
+        parts[made.name] = len(code.tasks)
+        return made
 
     def again(self: Any) -> None:
         before = tuple(counts)
@@ -191,7 +203,7 @@ def _count(num_envs: int, sensors: str, steps: int) -> dict[str, Any]:
         made.append((counts[0] - before[0], counts[1] - before[1]))
 
     machine.Machine.object_of = object_of  # type: ignore[method-assign]
-    launch.NativeLaunch.__init__, launch.NativeLaunch.again = init, again  # type: ignore[method-assign]
+    making.Native._launch, launch.NativeLaunch.again = launched, again  # type: ignore[method-assign]
     sim = Sim(load_config("pool", sensors), num_envs, read_tree("bt"))
     ones = torch.ones(num_envs, dtype=torch.int32)
     numbers = torch.arange(num_envs, dtype=torch.int32)
@@ -199,7 +211,9 @@ def _count(num_envs: int, sensors: str, steps: int) -> dict[str, Any]:
     for _ in range(2):  # compiling launches each kernel twice
         found.clear()
         sim.reset(ones, 77001 * ones, numbers)
-    reset = {name: _summed(made, num_envs) for name, made in found.items()}
+    if not found:
+        raise RuntimeError("no kernel was launched by machine code of its own: nothing is counted")
+    reset = {name: _summed(made, num_envs, parts[name]) for name, made in found.items()}
     sim.step()
     found.clear()
     plans = 0
@@ -207,14 +221,15 @@ def _count(num_envs: int, sensors: str, steps: int) -> dict[str, Any]:
         sim.step()
         plans += int(sim.s.route.n_queue[None])
     kernels = {
-        name: _summed(made, plans / max(steps, 1) if name == "plan_routes" else num_envs)
+        name: _summed(made, plans / max(steps, 1) if name == "plan_routes" else num_envs, parts[name])
         for name, made in found.items()
     }
     return {"num_envs": num_envs, "steps": steps, "plans": plans, "step": kernels, "reset": reset}
 
 
-def _summed(made: list[tuple[int, int]], items: float) -> dict[str, float]:
-    """Counts of all launches of a kernel; ``of_item``: instructions of an item in a launch that is busy."""
+def _summed(made: list[tuple[int, int]], items: float, parts: int) -> dict[str, float]:
+    """Counts of all launches of a kernel in so many ``parts``; ``of_item``: instructions of an item in a
+    launch that is busy."""
     most = max(instructions for instructions, _ in made)
     busy = [instructions for instructions, _ in made if instructions > 0.2 * most]
     return {
@@ -222,7 +237,7 @@ def _summed(made: list[tuple[int, int]], items: float) -> dict[str, float]:
         "accesses": sum(accesses for _, accesses in made),
         "of_item": sum(busy) / len(busy) / max(items, 1.0),
         "busy_share": len(busy) / len(made),
-        "launches": 1,
+        "launches": parts,
     }
 
 

@@ -8,6 +8,7 @@ the last step took.
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import subprocess
@@ -111,6 +112,23 @@ class _HostTorch:
         return torch.device("cpu")
 
 
+def _count_torchs_waits() -> None:
+    """Have the stub told of what torch would wait for, were its tensors on a GPU."""
+    driver = ctypes.CDLL("libcuda.so.1")
+
+    def telling(name: str) -> Any:
+        plain = getattr(torch.Tensor, name)
+
+        def told(self: torch.Tensor, *arguments: Any) -> Any:
+            driver.cuStreamSynchronize(None)
+            return plain(self, *arguments)
+
+        return told
+
+    for name in ("cpu", "item", "tolist", "__bool__", "__int__", "__float__"):
+        setattr(torch.Tensor, name, telling(name))
+
+
 def _simulator(num_envs: int, world: str, sensors: str) -> Any:
     """A simulator that takes itself to be on a GPU; its tensors are the host's."""
     torch.cuda.is_available = lambda: True
@@ -126,6 +144,9 @@ def _simulator(num_envs: int, world: str, sensors: str) -> Any:
     class DeviceMemory(Memory):
         def __init__(self, structs: Any, anchor: Any, address: int, _device: torch.device) -> None:
             super().__init__(structs, anchor, address, torch.device("cuda"))
+
+        def tensor(self, field: ti.Field) -> torch.Tensor:
+            return torch.zeros(field.shape, dtype=torch.int32)  # no kernel has written anything
 
     class Rehearsed(module.Sim):
         def rows(self, field: ti.Field, envs: list[int] | None = None) -> np.ndarray:
@@ -152,14 +173,20 @@ def _some(sim: Any, wanted: list[str]) -> dict[str, Any]:
 
 
 def _whole(sim: Any, folder: Path) -> dict[str, Any]:
-    """Reset and step twice; launches and waits of the second time."""
+    """Reset and step twice, and those of a VectorEnv; launches and waits of the second time."""
+    from uuvtai.env import VectorEnv
+
     ones = torch.ones(sim.num_envs, dtype=torch.int32)
     counts: dict[str, Any] = {}
     sim.observe()
+    env = VectorEnv(sim, check_actions=False)
+    _count_torchs_waits()
     for _ in range(2):
         for name, call in (
             ("reset", lambda: sim.reset(ones, 0 * ones, torch.arange(sim.num_envs, dtype=torch.int32))),
             ("step", sim.step),
+            ("first reset of a VectorEnv", env.reset),
+            ("step of a VectorEnv", lambda: env.step(sim.action)),
         ):
             ti.sync()
             before = _calls(folder)

@@ -26,6 +26,7 @@ from docs.writers.link_tables import (
 from docs.writers.newcomer_tables import newcomer, newcomer_zero
 from docs.writers.pieces import BEFORE, CELLS, DASH, LETTERS, PIECES, beside
 from docs.writers.pose_tables import pose_endings, pose_errors
+from docs.writers.rehearsal_tables import rehearsal
 from docs.writers.replay_tables import changed, lossy, replayed
 from docs.writers.sonar_tables import sonars
 from docs.writers.tuner_tables import fast_slopes, tuner_slopes
@@ -636,5 +637,6 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         forecast_pieces,
         benchmark_scenes,
         benchmark,
+        rehearsal,
     )
 }

@@ -100,7 +100,13 @@ class _KeptRoutes:
 
     count = 0
 
-    def serve(self, stages: Stages, seed_of: Callable[[int], int], count: Callable[[Any], int]) -> int:
+    def serve(
+        self,
+        stages: Stages,
+        seed_of: Callable[[int], int],
+        read: Callable[..., np.ndarray],
+        count: Callable[[Any], int],
+    ) -> int:
         """As ``RouteFallback.serve``."""
         if failed := count(stages.route.route.n_failed):
             keep_route(stages.route, 0)

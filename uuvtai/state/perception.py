@@ -318,6 +318,9 @@ class MapScratch:
     """cells at which a column enters or leaves the fan of free water (fan.py)"""
     fetched: ti.Field = array("n_slot", dtype=ti.f32, scratch=True)
     """see mapping.fetch_cells"""
+    due: ti.Field = array("n_slot", dtype=ti.i32, scratch=True)
+    """where several loop items share an env: 1 = the scan marked here is to be merged, 2 = with points of the
+    camera"""
 
 
 @dataclass(frozen=True, eq=False)

@@ -91,6 +91,7 @@ class Memory:
         self.structs, self.device, self.tree = structs, device, root.get_snode_tree_id()
         self.address, self.n_bytes = address - _offset(anchor), root.cell_size_bytes
         self._looked_at: dict[int, tuple[Any, np.ndarray]] = {}
+        self._words: torch.Tensor | None = None
 
     def views(self, content: np.ndarray, scratch: bool = False) -> dict[str, np.ndarray]:
         """Every array (``scratch`` too, if asked for) as a view of what ``read`` gave.
@@ -148,8 +149,19 @@ class Memory:
         return known[1]
 
     def number(self, field: Any) -> int:
-        """The one number of a field without axes."""
-        return int(self.live(field) if self.device.type == "cpu" else field[None])
+        """The one number of a field without axes. On a GPU one wait; Taichi would launch a kernel and wait
+        twice."""
+        return int(self.live(field) if self.device.type == "cpu" else self.tensor(field))
+
+    def tensor(self, field: Any) -> "torch.Tensor":
+        """A field of int32 as the device's own memory, shape of ``state``: nothing is copied, and torch sees
+        what kernels launched before have written."""
+        import torch
+
+        if self._words is None:
+            self._words = self._on_device()[: self.n_bytes // 4 * 4].view(torch.int32)
+        shape, strides = _layout(field, False)
+        return self._words.as_strided(shape, [step // 4 for step in strides], _offset(field) // 4)
 
     def put(self, field: Any, values: np.ndarray) -> None:
         """Fill a field that is not in lanes; ``values`` has its shape (vectors add a last axis) and dtype."""
@@ -185,13 +197,19 @@ def _offset(field: Any) -> int:
     return sum(node.offset_bytes_in_parent_cell for node in _path(field))
 
 
-def _view(field: Any, lanes: bool, content: np.ndarray) -> np.ndarray:
-    kind, bits = str(field.dtype)[0], int(str(field.dtype)[1:])
-    shape, dtype = tuple(field.shape), np.dtype(f"{kind}{bits // 8}")
+def _layout(field: Any, lanes: bool) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Shape and strides [bytes] of a field's first components."""
+    shape = tuple(field.shape)
     if lanes:
         shape = (*shape[:-1], PACKET * -(-shape[-1] // PACKET))
     cell = _path(field)[1].cell_size_bytes
-    strides = tuple(cell * math.prod(shape[axis + 1 :]) for axis in range(len(shape)))
+    return shape, tuple(cell * math.prod(shape[axis + 1 :]) for axis in range(len(shape)))
+
+
+def _view(field: Any, lanes: bool, content: np.ndarray) -> np.ndarray:
+    kind, bits = str(field.dtype)[0], int(str(field.dtype)[1:])
+    dtype = np.dtype(f"{kind}{bits // 8}")
+    shape, strides = _layout(field, lanes)
     if len(field.vars) > 1:
         shape, strides = (*shape, len(field.vars)), (*strides, dtype.itemsize)
     return np.ndarray(shape, dtype, buffer=content, offset=_offset(field), strides=strides)

@@ -7,7 +7,7 @@ import taichi as ti
 
 from uuvtai.config import SonarConfig
 from uuvtai.kernels.core.geometry import TWO_PI, wrapped_angle
-from uuvtai.kernels.core.lanes import LANES, f16x
+from uuvtai.kernels.core.lanes import LANES, f16x, n_lane
 from uuvtai.kernels.core.signature import Const
 
 
@@ -58,3 +58,27 @@ def beam_lanes(yaw, first_ray, sonar_cfg: Const[SonarConfig]):
         x[i] = c * cosine - s * sine
         y[i] = s * cosine + c * sine
     return x, y
+
+
+@ti.func
+def beam_packet(yaw, first_ray, sonar_cfg: Const[SonarConfig]):
+    """``beam_lanes`` of as many beams as a packet has (``n_lane``), to the same bits: of one it is the beam
+    itself."""
+    if ti.static(n_lane() == LANES):
+        x, y = beam_lanes(yaw, first_ray, sonar_cfg)
+        return x, y
+    else:
+        x, y = beam_unit(yaw, first_ray - first_ray % LANES, first_ray % LANES, sonar_cfg)
+        return ti.Vector([x]), ti.Vector([y])
+
+
+@ti.func
+def beam_unit(yaw, first_ray, lane, sonar_cfg: Const[SonarConfig]):
+    """What ``beam_lanes`` says of one of its sixteen beams."""
+    bearing = (yaw + ti.static(sonar_cfg.first_beam_rad)) + ti.static(sonar_cfg.beam_step_rad) * first_ray
+    c, s = ti.cos(bearing), ti.sin(bearing)
+    cosine, sine = 1.0, 0.0
+    for i in ti.static(range(LANES)):
+        cosine = ti.select(lane == i, ti.static(math.cos(sonar_cfg.turn_rad(i))), cosine)
+        sine = ti.select(lane == i, ti.static(math.sin(sonar_cfg.turn_rad(i))), sine)
+    return c * cosine - s * sine, s * cosine + c * sine

@@ -4,9 +4,16 @@ all of them."""
 import taichi as ti
 
 from uuvtai.kernels.core.signature import Out
+from uuvtai.native.gpu_shape import is_gpu_shaped
 
 WORD = 64
 """Cells of one word."""
+
+
+def has_clz() -> bool:
+    """Whether Taichi counts leading zeros: for Vulkan, 1.7.4 does not compile it for 64 bits, and counts them
+    wrongly where a number of 32 bits is negative (``tests/test_vulkan.py``). Plain Python."""
+    return ti.cfg.arch != ti.vulkan  # pyright: ignore[reportOptionalMemberAccess]
 
 
 @ti.func
@@ -25,7 +32,13 @@ def lowest_bit(word):
 @ti.func
 def highest_bit(word):
     """Number of the highest bit that is set; the word must not be 0."""
-    return WORD - 1 - ti.cast(ti.math.clz(ti.cast(word, ti.i64)), ti.i32)
+    if ti.static(has_clz()):
+        return WORD - 1 - ti.cast(ti.math.clz(ti.cast(word, ti.i64)), ti.i32)
+    else:
+        filled = word
+        for k in ti.static(range(6)):
+            filled |= filled >> ti.cast(1 << k, ti.u64)
+        return ti.cast(ti.math.popcnt(filled), ti.i32) - 1
 
 
 @ti.func
@@ -49,8 +62,21 @@ def with_bit(word, number, value):
 
 @ti.func
 def put_bit(words: Out[ti.Field], first, row, col):
-    """Set the bit of a cell; ``first`` is an env or a slot."""
-    words[first, row, col // WORD] = words[first, row, col // WORD] | cell_bit(col)
+    """Set the bit of a cell; ``first`` is an env or a slot. On a GPU others may set theirs in the same
+    word."""
+    if ti.static(is_gpu_shaped()):
+        ti.atomic_or(words[first, row, col // WORD], cell_bit(col))
+    else:
+        words[first, row, col // WORD] = words[first, row, col // WORD] | cell_bit(col)
+
+
+@ti.func
+def flip_bit(words: Out[ti.Field], first, row, col):
+    """Turn the bit of a cell over, as ``put_bit`` sets it."""
+    if ti.static(is_gpu_shaped()):
+        ti.atomic_xor(words[first, row, col // WORD], cell_bit(col))
+    else:
+        words[first, row, col // WORD] = words[first, row, col // WORD] ^ cell_bit(col)
 
 
 @ti.func

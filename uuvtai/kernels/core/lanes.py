@@ -31,6 +31,9 @@ _COLUMNS = 8
 """Columns on a CPU: LLVM prefers vectors of 256 bits even where there are longer ones, and every element
 costs compile time."""
 
+_WARP = 32
+"""Threads of a GPU that go in step."""
+
 
 def n_column() -> int:
     """Rows that one loop item takes together; one on a GPU, whose threads are lanes already. Plain Python."""
@@ -43,19 +46,33 @@ def n_lane() -> int:
     return 1 if is_gpu_shaped() else LANES
 
 
+def n_item() -> int:
+    """Loop items that share the map and the clearance of an env: a warp on a GPU, one on a CPU. Plain
+    Python."""
+    return _WARP if is_gpu_shaped() else 1
+
+
+def n_turn(count: int) -> int:
+    """Turns in which the items of an env get through so many things, one each in a turn. Plain Python."""
+    return -(-count // n_item())
+
+
 @ti.func
-def ramp_lanes(first):
-    """(first, first + 1, ..., first + 15)."""
-    out = f16x(0.0)
-    for i in ti.static(range(LANES)):
-        out[i] = first + float(i)
-    return out
+def ramp(first, lanes: Const[int]):
+    """(first, first + 1, ...)."""
+    return ti.Vector([first + float(i) for i in range(lanes)])
 
 
 @ti.func
 def filled(value, lanes: Const[int]):
     """A packet of float32 with one value in all lanes."""
     return ti.Vector([ti.cast(value, ti.f32) for _ in range(lanes)])
+
+
+@ti.func
+def filled_int(value, lanes: Const[int]):
+    """A packet of int32 with one value in all lanes."""
+    return ti.Vector([ti.cast(value, ti.i32) for _ in range(lanes)])
 
 
 @ti.func

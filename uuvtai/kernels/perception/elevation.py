@@ -15,7 +15,7 @@ import taichi as ti
 from uuvtai.config import ElevationConfig, SonarConfig, TankConfig
 from uuvtai.kernels.core.geometry import FAR_M
 from uuvtai.kernels.core.kalman import largest_position_variance
-from uuvtai.kernels.core.lanes import LANES, f16x, ramp_lanes
+from uuvtai.kernels.core.lanes import LANES, f16x, ramp
 from uuvtai.kernels.core.signature import Bundle, Const, In, Out, spread
 from uuvtai.kernels.perception.bundles import HeightsIO
 from uuvtai.native.launch import quick_launch
@@ -42,7 +42,7 @@ def heights(tank_cfg: Const[TankConfig]):
     water."""
     floor, top = ti.static(tank_cfg.z_m)
     step = ti.static((tank_cfg.z_m[1] - tank_cfg.z_m[0]) / COLUMN)
-    out = ramp_lanes(0.5) * step + floor
+    out = ramp(0.5, LANES) * step + floor
     out[COLUMN] = 0.5 * (floor + top)
     return out
 

@@ -1,7 +1,7 @@
 """What a scan and a depth image say about the cells of the map: a return that stays or moves, a point seen by
 the camera.
 
-Each is a bit per cell, set by the one thread that has all of an env's returns; ``fan.py`` adds free water,
+Each is a bit per cell, set by those that share an env's returns (``n_item``); ``fan.py`` adds free water,
 ``mapping.py`` merges all of it into the two layers.
 """
 
@@ -10,11 +10,11 @@ import math
 import taichi as ti
 
 from uuvtai.config import TankConfig
-from uuvtai.kernels.core.beams import beam_lanes
+from uuvtai.kernels.core.beams import beam_packet
 from uuvtai.kernels.core.bits import WORD, bit_of, cell_bit, put_bit
 from uuvtai.kernels.core.geometry import FAR_M, quaternion_wb, rotation_wb, turned_z
 from uuvtai.kernels.core.grid import cell_of, grid_origin, grid_shape
-from uuvtai.kernels.core.lanes import LANES, f16x, i16x, ramp_lanes
+from uuvtai.kernels.core.lanes import filled, filled_int, n_item, n_lane, n_turn, ramp
 from uuvtai.kernels.core.signature import Bundle, Const
 from uuvtai.kernels.perception.bundles import MappingIO
 from uuvtai.kernels.perception.echoes import is_new
@@ -62,9 +62,8 @@ def range_error(range_m, io: Bundle[MappingIO]):
 
 @ti.func
 def wall_margins(range_m, io: Bundle[MappingIO]):
-    """[m] off a known wall within which sixteen returns are the wall's; a wide beam ends on its nearer
-    side."""
-    margin = f16x(io.mapping_cfg.wall_margin_m)
+    """[m] off a known wall within which returns are the wall's; a wide beam ends on its nearer side."""
+    margin = filled(io.mapping_cfg.wall_margin_m, range_m.n)
     if ti.static(io.sonar_cfg.half_width_rad > 0):
         margin += ti.static(io.sonar_cfg.half_width_rad) * range_m
     return margin
@@ -72,9 +71,9 @@ def wall_margins(range_m, io: Bundle[MappingIO]):
 
 @ti.func
 def wall_lanes(pos, unit_x, unit_y, tank_cfg: Const[TankConfig]):
-    """[m] along sixteen horizontal beams to the known side wall through which each leaves the tank; negative
-    where it misses the tank."""
-    leave = f16x(0.0)
+    """[m] along horizontal beams to the known side wall through which each leaves the tank; negative where
+    it misses the tank."""
+    leave = filled(0.0, unit_x.n)
     if ti.static(tank_cfg.shape == "circle"):
         off = pos - ti.Vector(
             [0.5 * (tank_cfg.x_m[0] + tank_cfg.x_m[1]), 0.5 * (tank_cfg.y_m[0] + tank_cfg.y_m[1])]
@@ -83,10 +82,10 @@ def wall_lanes(pos, unit_x, unit_y, tank_cfg: Const[TankConfig]):
         # distance of the line from the centre by a cross product: along^2 - off^2 would cancel badly
         across = unit_y * off[0] - unit_x * off[1]
         inside = ti.static(tank_cfg.radius_m**2) - across * across
-        for i in ti.static(range(LANES)):
+        for i in ti.static(range(unit_x.n)):
             leave[i] = ti.select(inside[i] < 0.0, -1.0, ti.sqrt(ti.max(inside[i], 0.0)) - along[i])
     else:
-        for i in ti.static(range(LANES)):
+        for i in ti.static(range(unit_x.n)):
             to_x = ti.select(unit_x[i] > 0.0, tank_cfg.x_m[1] - pos[0], pos[0] - tank_cfg.x_m[0])
             to_y = ti.select(unit_y[i] > 0.0, tank_cfg.y_m[1] - pos[1], pos[1] - tank_cfg.y_m[0])
             leave[i] = ti.min(to_x / ti.max(ti.abs(unit_x[i]), 1e-9), to_y / ti.max(ti.abs(unit_y[i]), 1e-9))
@@ -95,18 +94,18 @@ def wall_lanes(pos, unit_x, unit_y, tank_cfg: Const[TankConfig]):
 
 @ti.func
 def wall_gaps(x, y, io: Bundle[MappingIO]):
-    """[m] from sixteen points to the nearest side wall, negative outside."""
-    gap = f16x(0.0)
+    """[m] from points to the nearest side wall, negative outside."""
+    gap = filled(0.0, x.n)
     if ti.static(io.tank_cfg.shape == "circle"):
         off_x, off_y = (
             x - 0.5 * (io.tank_cfg.x_m[0] + io.tank_cfg.x_m[1]),
             y - 0.5 * (io.tank_cfg.y_m[0] + io.tank_cfg.y_m[1]),
         )
         squared = off_x * off_x + off_y * off_y
-        for i in ti.static(range(LANES)):
+        for i in ti.static(range(x.n)):
             gap[i] = ti.static(io.tank_cfg.radius_m) - ti.sqrt(squared[i])
     else:
-        for i in ti.static(range(LANES)):
+        for i in ti.static(range(x.n)):
             gap[i] = ti.min(
                 x[i] - io.tank_cfg.x_m[0],
                 io.tank_cfg.x_m[1] - x[i],
@@ -198,38 +197,39 @@ def own_motion(env, io: Bundle[MappingIO]):
 
 @ti.func
 def mapped_lanes(env, first_ray, pos, vel, threshold, io: Bundle[MappingIO]):
-    """Of sixteen beams: kind of return (0 = none or from a known wall, 1 = at rest as far as it tells itself,
-    2 = moving by its Doppler), row, column, range [m].
+    """Of a packet of beams: kind of return (0 = none or from a known wall, 1 = at rest as far as it tells
+    itself, 2 = moving by its Doppler), row, column, range [m].
 
     ``vel`` [m/s] is the own velocity along x and y of the body, ``threshold`` [m/s] the compensated Doppler
     that counts as motion.
     """
     n_row, n_col = ti.static(grid_shape(io.tank_cfg, io.mapping_cfg.cell_m))
+    lanes = ti.static(n_lane())
     x0, y0 = ti.static(grid_origin(io.tank_cfg, io.mapping_cfg.cell_m))
-    range_m, hit = f16x(0.0), i16x(0)
-    for i in ti.static(range(LANES)):
+    range_m, hit = filled(0.0, lanes), filled_int(0, lanes)
+    for i in ti.static(range(lanes)):
         range_m[i] = io.scan.range_m[env, first_ray + i]
         hit[i] = io.scan.hit[env, first_ray + i]
-    unit_x, unit_y = beam_lanes(io.scan.ping_yaw[env], first_ray, io.sonar_cfg)
+    unit_x, unit_y = beam_packet(io.scan.ping_yaw[env], first_ray, io.sonar_cfg)
     x, y = pos[0] + unit_x * range_m, pos[1] + unit_y * range_m
     # noise along a slanting beam reaches deeper into the tank than the margin
     gap, short = (
         wall_gaps(x, y, io),
         wall_lanes(pos, unit_x, unit_y, io.tank_cfg) - range_error(range_m, io) - range_m,
     )
-    moves = f16x(0.0)
+    moves = filled(0.0, lanes)
     if ti.static(io.sonar_cfg.doppler):
         # measured rate of range plus own velocity along the beam: motion through the water
-        ahead_x, ahead_y = beam_lanes(0.0, first_ray, io.sonar_cfg)
-        for i in ti.static(range(LANES)):
+        ahead_x, ahead_y = beam_packet(0.0, first_ray, io.sonar_cfg)
+        for i in ti.static(range(lanes)):
             moves[i] = io.scan.doppler_m_s[env, first_ray + i]
         moves = moves + ahead_x * vel[0] + ahead_y * vel[1]
     margin = wall_margins(range_m, io)
-    kind, row, col = i16x(0), i16x(0), i16x(0)
-    for i in ti.static(range(LANES)):
+    kind, row, col = filled_int(0, lanes), filled_int(0, lanes), filled_int(0, lanes)
+    for i in ti.static(range(lanes)):
         row[i] = ti.cast(ti.floor((y[i] - y0) / io.mapping_cfg.cell_m), ti.i32)
         col[i] = ti.cast(ti.floor((x[i] - x0) / io.mapping_cfg.cell_m), ti.i32)
-    for i in ti.static(range(LANES)):
+    for i in ti.static(range(lanes)):
         known = (gap[i] < margin[i]) | (short[i] < 0.0)
         off = (row[i] < 0) | (row[i] >= n_row) | (col[i] < 0) | (col[i] >= n_col)
         moving = ti.abs(moves[i]) > threshold
@@ -238,22 +238,32 @@ def mapped_lanes(env, first_ray, pos, vel, threshold, io: Bundle[MappingIO]):
 
 
 @ti.func
-def mark_hits(env, slot, promote_scans: Const[int], io: Bundle[MappingIO]):
+def mark_hits(env, slot, item, promote_scans: Const[int], io: Bundle[MappingIO]):
     """Bit of every return's cell: what moves is a dynamic hit only, the rest static hits; returns from known
-    walls are left out."""
+    walls are left out. ``item``: which of those that share the env (``n_item``)."""
+    lanes = ti.static(n_lane())
     pos = ti.Vector([io.scan.ping_pos_w[env][0], io.scan.ping_pos_w[env][1]])
     vel, threshold = own_motion(env, io)
-    for packet in range(ti.static(io.sonar_cfg.n_ray // LANES)):
-        kind, row, col, range_m = mapped_lanes(env, packet * LANES, pos, vel, threshold, io)
-        for i in range(LANES):
-            if kind[i] != 0 and is_new(env, packet * LANES + i, io.scan, io.sonar_cfg):
-                moves = ti.cast(kind[i] == 2, ti.i32) | moves_by_track(env, packet * LANES + i, io)
-                if moves == 0:
-                    moves = is_inconsistent(env, row[i], col[i], range_m[i], promote_scans, io)
-                if moves == 1:
-                    put_bit(io.map_scratch.dynamic_hit, slot, row[i], col[i])
-                else:
-                    put_bit(io.map_scratch.static_hit, slot, row[i], col[i])
+    for turn in range(ti.static(n_turn(io.sonar_cfg.n_ray // n_lane()))):
+        first = (turn * ti.static(n_item()) + item) * lanes
+        if first < io.sonar_cfg.n_ray:
+            kind, row, col, range_m = mapped_lanes(env, first, pos, vel, threshold, io)
+            for i in range(lanes):
+                if kind[i] != 0 and is_new(env, first + i, io.scan, io.sonar_cfg):
+                    moves = ti.cast(kind[i] == 2, ti.i32) | moves_by_track(env, first + i, io)
+                    mark_hit(env, slot, row[i], col[i], range_m[i], moves, promote_scans, io)
+
+
+@ti.func
+def mark_hit(env, slot, row, col, range_m, moves, promote_scans: Const[int], io: Bundle[MappingIO]):
+    """Bit of a return's cell; ``moves``: 1 where the return or its track says so."""
+    dynamic = moves
+    if moves == 0:
+        dynamic = is_inconsistent(env, row, col, range_m, promote_scans, io)
+    if dynamic == 1:
+        put_bit(io.map_scratch.dynamic_hit, slot, row, col)
+    else:
+        put_bit(io.map_scratch.static_hit, slot, row, col)
 
 
 # ------------------------------------------------------------------------------------------------------ depth
@@ -261,25 +271,26 @@ def mark_hits(env, slot, promote_scans: Const[int], io: Bundle[MappingIO]):
 
 @ti.func
 def nearest_in_gate(env, first_col, R_wb, gate_m: Const[float], io: Bundle[MappingIO]):
-    """Per image column, sixteen of them: smallest depth [m] whose point lies within ``gate_m`` of the
+    """Per image column, a packet of them: smallest depth [m] whose point lies within ``gate_m`` of the
     vehicle's own depth, and its row."""
     focal, middle_row, middle_col = ti.static(pinhole(io.depth_cfg))
+    lanes = ti.static(n_lane())
     # Pinhole: the pixel (row, col) at depth z shows the point offset + z (1, left, up) in body axes. Its
     # height over the vehicle is the third row of R_wb times that: mount + z climb.
-    left = (middle_col - ramp_lanes(float(first_col))) / focal
+    left = (middle_col - ramp(float(first_col), lanes)) / focal
     mount = (
         R_wb[2, 0] * io.depth_cfg.offset_b_m[0]
         + R_wb[2, 1] * io.depth_cfg.offset_b_m[1]
         + R_wb[2, 2] * io.depth_cfg.offset_b_m[2]
     )
-    nearest, nearest_row = f16x(FAR_M), i16x(0)
+    nearest, nearest_row = filled(FAR_M, lanes), filled_int(0, lanes)
     for row in range(ti.static(io.image.depth_m.shape[1])):
-        z = f16x(0.0)
-        for i in ti.static(range(LANES)):
+        z = filled(0.0, lanes)
+        for i in ti.static(range(lanes)):
             z[i] = io.image.depth_m[env, row, first_col + i]
         climb = R_wb[2, 0] + R_wb[2, 2] * (middle_row - row) / focal + R_wb[2, 1] * left
         rise = mount + z * climb
-        for i in ti.static(range(LANES)):
+        for i in ti.static(range(lanes)):
             seen = (
                 (ti.abs(rise[i]) <= gate_m)
                 & (z[i] < ti.static(io.depth_cfg.max_range_m * NO_RETURN_SHARE))
@@ -292,22 +303,29 @@ def nearest_in_gate(env, first_col, R_wb, gate_m: Const[float], io: Bundle[Mappi
 
 
 @ti.func
-def mark_depth(env, io: Bundle[MappingIO]):
+def mark_depth(env, item, io: Bundle[MappingIO]):
     """Depth hit in the cell of the nearest point at the vehicle's own depth, per image column; it waits there
-    for the next merge."""
-    focal, middle_row, middle_col = ti.static(pinhole(io.depth_cfg))
-    n_row, n_col = ti.static(grid_shape(io.tank_cfg, io.mapping_cfg.cell_m))
+    for the next merge. ``item``: which of those that share the env (``n_item``)."""
+    lanes, n_col = ti.static(n_lane(), io.image.depth_m.shape[2])
     rpy = io.image.shot_rpy[env]
     R_wb = rotation_wb(quaternion_wb(rpy[0], rpy[1], rpy[2]))
+    for turn in range(ti.static(n_turn(io.image.depth_m.shape[2] // n_lane()))):
+        first = (turn * ti.static(n_item()) + item) * lanes
+        if first < n_col:
+            nearest, nearest_row = nearest_in_gate(env, first, R_wb, io.mapping_cfg.depth_gate_m, io)
+            for i in range(lanes):
+                if nearest[i] < FAR_M:
+                    mark_point(env, first + i, nearest_row[i], nearest[i], R_wb, io)
+
+
+@ti.func
+def mark_point(env, pixel_col, pixel_row, depth_m, R_wb, io: Bundle[MappingIO]):
+    """Depth hit in the cell of a pixel's point, if it is one of the grid's."""
+    focal, middle_row, middle_col = ti.static(pinhole(io.depth_cfg))
+    n_row, n_col = ti.static(grid_shape(io.tank_cfg, io.mapping_cfg.cell_m))
     offset = ti.Vector([io.depth_cfg.offset_b_m[0], io.depth_cfg.offset_b_m[1], io.depth_cfg.offset_b_m[2]])
-    for packet in range(ti.static(io.image.depth_m.shape[2] // LANES)):
-        nearest, nearest_row = nearest_in_gate(env, packet * LANES, R_wb, io.mapping_cfg.depth_gate_m, io)
-        for i in range(LANES):
-            if nearest[i] < FAR_M:
-                ray_b = ti.Vector(
-                    [1.0, (middle_col - packet * LANES - i) / focal, (middle_row - nearest_row[i]) / focal]
-                )
-                point = io.image.shot_pos_w[env] + R_wb @ (offset + nearest[i] * ray_b)
-                cell = cell_of(point, io.tank_cfg, io.mapping_cfg.cell_m)
-                if cell[0] >= 0 and cell[0] < n_row and cell[1] >= 0 and cell[1] < n_col:
-                    put_bit(io.grid_map.depth_hit, env, cell[0], cell[1])
+    ray_b = ti.Vector([1.0, (middle_col - pixel_col) / focal, (middle_row - pixel_row) / focal])
+    point = io.image.shot_pos_w[env] + R_wb @ (offset + depth_m * ray_b)
+    cell = cell_of(point, io.tank_cfg, io.mapping_cfg.cell_m)
+    if cell[0] >= 0 and cell[0] < n_row and cell[1] >= 0 and cell[1] < n_col:
+        put_bit(io.grid_map.depth_hit, env, cell[0], cell[1])

@@ -11,10 +11,10 @@ of a partial fan there is no triangle: the outline goes back to the ping.
 
 import taichi as ti
 
-from uuvtai.kernels.core.beams import beam_bearing, beam_lanes
-from uuvtai.kernels.core.bits import WORD, cell_bit
+from uuvtai.kernels.core.beams import beam_bearing, beam_lanes, beam_unit
+from uuvtai.kernels.core.bits import flip_bit
 from uuvtai.kernels.core.grid import grid_origin, grid_shape
-from uuvtai.kernels.core.lanes import LANES, f16x, i16x
+from uuvtai.kernels.core.lanes import LANES, f16x, i16x, n_item, n_turn
 from uuvtai.kernels.core.signature import Bundle, Const
 from uuvtai.kernels.perception.bundles import MappingIO
 
@@ -71,9 +71,7 @@ def mark_edge(slot, begin, end, first_col, end_col, n_col: Const[int], io: Bundl
         for col in range(ti.max(ti.min(first_col, end_col), 0), ti.min(ti.max(first_col, end_col), n_col)):
             row = ti.max(ti.cast(ti.ceil(begin[1] + (col - begin[0]) * slope), ti.i32), 0)
             if row < n_row:
-                io.map_scratch.fan_edge[slot, row, col // WORD] = io.map_scratch.fan_edge[
-                    slot, row, col // WORD
-                ] ^ cell_bit(col)
+                flip_bit(io.map_scratch.fan_edge, slot, row, col)
 
 
 @ti.func
@@ -119,6 +117,42 @@ def mark_fan(env, slot, io: Bundle[MappingIO]):
 
 
 @ti.func
+def mark_fan_together(env, slot, item, io: Bundle[MappingIO]):
+    """``mark_fan`` by all that share an env (``n_item``), each with triangles of its own: edges need no
+    order, and where the triangle before ends is computed once more."""
+    n_ray, n_col = ti.static(io.sonar_cfg.n_ray, grid_shape(io.tank_cfg, io.mapping_cfg.cell_m)[1])
+    ping = ping_cell(env, io)
+    for turn in range(ti.static(n_turn(n_ray))):
+        ray = turn * ti.static(n_item()) + item
+        if ray < n_ray:
+            last = leg_end(env, (ray + n_ray - 1) % n_ray, 1, ping, io)
+            begin, end = leg_end(env, ray, 0, ping, io), leg_end(env, ray, 1, ping, io)
+            last_col, begin_col, end_col = (
+                ti.cast(ti.ceil(last[0]), ti.i32),
+                ti.cast(ti.ceil(begin[0]), ti.i32),
+                ti.cast(ti.ceil(end[0]), ti.i32),
+            )
+            mark_edge(slot, last, begin, last_col, begin_col, n_col, io)
+            mark_edge(slot, begin, end, begin_col, end_col, n_col, io)
+
+
+@ti.func
+def leg_end(env, ray, side: Const[int], ping, io: Bundle[MappingIO]):
+    """(x, y) [cells] of the end of a triangle's leg, along its own beam (``side`` 0) or the next (1); to the
+    bits of ``mark_fan``."""
+    lane = ray % LANES
+    unit_x, unit_y = beam_unit(io.scan.ping_yaw[env], ray - lane + side, lane, io.sonar_cfg)
+    leg = (
+        ti.min(free_reach(env, ray, io), free_reach(env, (ray + 1) % io.sonar_cfg.n_ray, io))
+        / io.mapping_cfg.cell_m
+    )
+    if ti.static(not io.sonar_cfg.is_ring):
+        if ray + 1 == io.sonar_cfg.n_ray:
+            leg = 0.0
+    return ti.Vector([ping[0] + leg * unit_x, ping[1] + leg * unit_y])
+
+
+@ti.func
 def mark_sectors(env, slot, io: Bundle[MappingIO]):
     """Bits of the outline of what a mechanical head's new beams prove free: of each the triangle half a step
     of the head to either side, both legs as long as its reach."""
@@ -141,9 +175,13 @@ def mark_sectors(env, slot, io: Bundle[MappingIO]):
 
 
 @ti.func
-def mark_free(env, slot, io: Bundle[MappingIO]):
-    """Bits of the outline of what the new beams prove free."""
+def mark_free(env, slot, item, io: Bundle[MappingIO]):
+    """Bits of the outline of what the new beams prove free. ``item``: which of those that share the env
+    (``n_item``)."""
     if ti.static(io.sonar_cfg.mechanical):
-        mark_sectors(env, slot, io)
+        if item == 0:  # a head has few new beams, each of which begins where the one before ended
+            mark_sectors(env, slot, io)
+    elif ti.static(n_item() > 1):
+        mark_fan_together(env, slot, item, io)
     else:
         mark_fan(env, slot, io)

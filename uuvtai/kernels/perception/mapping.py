@@ -27,6 +27,7 @@ import math
 import taichi as ti
 
 from uuvtai.kernels.core.bits import WORD, bit_of, lowest_bit, taken, with_bit, without_lowest
+from uuvtai.kernels.core.lanes import n_item, n_turn
 from uuvtai.kernels.core.signature import Bundle, Const, spread
 from uuvtai.kernels.perception.bundles import MappingIO
 from uuvtai.kernels.perception.evidence import mark_depth, mark_hits
@@ -233,22 +234,93 @@ def merge_scan(env, slot, confident_scans: Const[int], io: Bundle[MappingIO]):
         in_fan = ti.cast(0, ti.u64)
         for row in range(ti.static(io.map_scratch.fan_edge.shape[1])):
             in_fan ^= taken(io.map_scratch.fan_edge, slot, row, word)
-            inside = ~io.mask.outside_bits[row, word]
-            statics, dynamics = (
-                taken(io.map_scratch.static_hit, slot, row, word) & inside,
-                taken(io.map_scratch.dynamic_hit, slot, row, word) & inside,
-            )
-            points = ti.cast(0, ti.u64)
-            if io.grid_map.depth_waits[env] == 1:
-                points = taken(io.grid_map.depth_hit, env, row, word) & inside
-            free = in_fan & inside & ~(statics | dynamics)
-            count_free(env, row, word, free, statics | dynamics, confident_scans, io)
-            count_dynamic(env, row, word, free, dynamics, io)
-            fold_cells(env, row, word, statics, dynamics, free, points, io)
-            seen = io.grid_map.seen[env, row, word]
-            if (free | statics | dynamics | points) & ~seen != 0:
-                io.grid_map.seen[env, row, word] = seen | free | statics | dynamics | points
+            points = waiting_points(env, row, word, io.grid_map.depth_waits[env], io)
+            merge_word(env, slot, row, word, in_fan, points, confident_scans, io)
     io.grid_map.depth_waits[env] = 0
+
+
+@ti.func
+def waiting_points(env, row, word, waits, io: Bundle[MappingIO]):
+    """The camera's points in a word's cells, if any wait."""
+    points = ti.cast(0, ti.u64)
+    if waits == 1:
+        points = taken(io.grid_map.depth_hit, env, row, word) & ~io.mask.outside_bits[row, word]
+    return points
+
+
+@ti.func
+def merge_word(env, slot, row, word, in_fan, points, confident_scans: Const[int], io: Bundle[MappingIO]):
+    """Fold what is marked of a word's cells; ``in_fan``: those within the fan of free water."""
+    inside = ~io.mask.outside_bits[row, word]
+    statics, dynamics = (
+        taken(io.map_scratch.static_hit, slot, row, word) & inside,
+        taken(io.map_scratch.dynamic_hit, slot, row, word) & inside,
+    )
+    free = in_fan & inside & ~(statics | dynamics)
+    count_free(env, row, word, free, statics | dynamics, confident_scans, io)
+    count_dynamic(env, row, word, free, dynamics, io)
+    fold_cells(env, row, word, statics, dynamics, free, points, io)
+    seen = io.grid_map.seen[env, row, word]
+    if (free | statics | dynamics | points) & ~seen != 0:
+        io.grid_map.seen[env, row, word] = seen | free | statics | dynamics | points
+
+
+@ti.func
+def take_alone(env, slot, confident_scans: Const[int], promote_scans: Const[int], io: Bundle[MappingIO]):
+    """One env's turn, by one thread: a fresh image's points and a fresh scan that is due."""
+    if io.clock.awake[env] == 1 and io.image.fresh[env] == 1:
+        mark_depth(env, 0, io)
+        io.grid_map.depth_waits[env] = 1
+    if is_due(env, io) == 1:
+        fetch_cells(env, slot, io)
+        mark_free(env, slot, 0, io)
+        mark_hits(env, slot, 0, promote_scans, io)
+        merge_scan(env, slot, confident_scans, io)
+        io.grid_map.map_step[env] = io.clock.step[env]
+
+
+# ---------------------------------------------------------------------------- an env's items on a GPU
+
+
+@ti.func
+def mark_together(env, item, promote_scans: Const[int], io: Bundle[MappingIO]):
+    """What an item marks of an env's image and scan; on a GPU an env has its own slot."""
+    if io.clock.awake[env] == 1 and io.image.fresh[env] == 1:
+        mark_depth(env, item, io)
+        if item == 0:
+            io.grid_map.depth_waits[env] = 1
+    due = is_due(env, io)
+    if item == 0:
+        io.map_scratch.due[env] = due * (1 + io.grid_map.depth_waits[env])
+    if due == 1:
+        mark_free(env, env, item, io)
+        mark_hits(env, env, item, promote_scans, io)
+
+
+@ti.func
+def fill_fan(env, word, io: Bundle[MappingIO]):
+    """Edges of the fan in a column of words become the cells within it, upwards. Who has the first column
+    notes that the scan is in the map: all others go by ``due`` from here on."""
+    in_fan = ti.cast(0, ti.u64)
+    for row in range(ti.static(io.map_scratch.fan_edge.shape[1])):
+        in_fan ^= io.map_scratch.fan_edge[env, row, word]
+        io.map_scratch.fan_edge[env, row, word] = in_fan
+    if word == 0:
+        io.grid_map.depth_waits[env] = 0
+        io.grid_map.map_step[env] = io.clock.step[env]
+
+
+@ti.func
+def merge_together(env, item, confident_scans: Const[int], io: Bundle[MappingIO]):
+    """``merge_scan`` of an item's share of an env's words."""
+    n_row, n_word = ti.static(io.map_scratch.fan_edge.shape[1:])
+    for turn in range(ti.static(n_turn(n_row * n_word))):
+        place = turn * ti.static(n_item()) + item
+        row, word = place // n_word, place % n_word
+        if row < n_row:
+            in_fan = taken(io.map_scratch.fan_edge, env, row, word)
+            points = waiting_points(env, row, word, io.map_scratch.due[env] - 1, io)
+            merge_word(env, env, row, word, in_fan, points, confident_scans, io)
 
 
 # ---------------------------------------------------------------------------------------------------- kernels
@@ -264,19 +336,20 @@ def update_map(io: Bundle[MappingIO]):
     confident, promote = ti.static(
         scans_in(io.mapping_cfg.free_confident_s, look_s), scans_in(io.mapping_cfg.promote_s, look_s)
     )
-    # one thread has all of an env's bits, and does all of it while its scratch is in the cache
-    for slot, pad in ti.ndrange(n_slot, ti.static(spread(n_slot))):
-        if pad == 0:
-            for env in range(slot * n_env // n_slot, (slot + 1) * n_env // n_slot):
-                if io.clock.awake[env] == 1 and io.image.fresh[env] == 1:
-                    mark_depth(env, io)
-                    io.grid_map.depth_waits[env] = 1
-                if is_due(env, io) == 1:
-                    fetch_cells(env, slot, io)
-                    mark_free(env, slot, io)
-                    mark_hits(env, slot, promote, io)
-                    merge_scan(env, slot, confident, io)
-                    io.grid_map.map_step[env] = io.clock.step[env]
+    if ti.static(n_item() > 1):  # each loop ends before the next begins
+        for env, item in ti.ndrange(n_env, ti.static(n_item())):
+            mark_together(env, item, promote, io)
+        for env, word in ti.ndrange(n_env, ti.static(io.map_scratch.fan_edge.shape[2])):
+            if io.map_scratch.due[env] != 0:
+                fill_fan(env, word, io)
+        for env, item in ti.ndrange(n_env, ti.static(n_item())):
+            if io.map_scratch.due[env] != 0:
+                merge_together(env, item, confident, io)
+    else:  # one thread has all of an env's bits, and does all of it while its scratch is in the cache
+        for slot, pad in ti.ndrange(n_slot, ti.static(spread(n_slot))):
+            if pad == 0:
+                for env in range(slot * n_env // n_slot, (slot + 1) * n_env // n_slot):
+                    take_alone(env, slot, confident, promote, io)
 
 
 @quick_launch

@@ -12,7 +12,7 @@ import taichi as ti
 from uuvtai.kernels.core.beams import beam_there, beam_towards
 from uuvtai.kernels.core.geometry import FAR_M, quaternion_wb, rotation_wb, wrapped_angle
 from uuvtai.kernels.core.kalman import born, corrected, position_variance
-from uuvtai.kernels.core.lanes import LANES, f16x, ramp_lanes
+from uuvtai.kernels.core.lanes import LANES, f16x, ramp
 from uuvtai.kernels.core.signature import Bundle, spread
 from uuvtai.kernels.perception.bundles import SpottingIO
 from uuvtai.kernels.perception.elevation import begin_height
@@ -65,7 +65,7 @@ def column_distances(env, first_col, io: Bundle[SpottingIO]):
     columns, FAR_M = none."""
     focal, middle_row, middle_col = ti.static(pinhole(io.depth_cfg))
     eye, R_wb = eye_of(env, io)
-    left = ramp_lanes(ti.cast(first_col, ti.f32) - middle_col) * ti.static(-1.0 / focal)
+    left = ramp(ti.cast(first_col, ti.f32) - middle_col, LANES) * ti.static(-1.0 / focal)
     level_x, level_y = left * R_wb[0, 1] + R_wb[0, 0], left * R_wb[1, 1] + R_wb[1, 0]
     length = f16x(0.0)
     for i in ti.static(range(LANES)):

@@ -27,9 +27,18 @@ import math
 import taichi as ti
 
 from uuvtai.kernels.core.bits import WORD, cell_bit, highest_bit, lowest_bit, put_bit, without_lowest
-from uuvtai.kernels.core.lanes import LANES, i16x
+from uuvtai.kernels.core.lanes import LANES, i16x, n_item
 from uuvtai.kernels.core.signature import Bundle, Const, In, spread
 from uuvtai.kernels.planning.bundles import ClearanceIO
+from uuvtai.kernels.planning.clearance_cells import find_changes, note_farthest, redo_cells
+from uuvtai.kernels.planning.clearance_keys import (
+    is_due,
+    no_site,
+    offset_bits,
+    site_word,
+    squared_limit,
+    window_reach,
+)
 from uuvtai.native.launch import quick_launch
 
 _FAR_COLS = 1 << 12
@@ -39,42 +48,7 @@ _MAX_CHANGES = 48
 """Sites that may change before redoing everything is cheaper than finding what they concern."""
 
 
-# ---------------------------------------------------------- plain Python, evaluated when a kernel is compiled
-
-
-def squared_limit(cfg, mapping):
-    """[cells^2] largest squared distance that is not beyond ``max_m``."""
-    return math.floor((cfg.max_m / mapping.cell_m) ** 2 + 1e-6)
-
-
-def window_reach(cfg, mapping):
-    """[cells] farthest row that can hold a site within ``max_m``."""
-    return math.isqrt(squared_limit(cfg, mapping))
-
-
-def offset_bits(cfg, mapping):
-    """Bits of a key that hold the row offset. Raises ValueError where keys would not fit an int32."""
-    bits = (2 * window_reach(cfg, mapping)).bit_length()
-    if window_reach(cfg, mapping) >= WORD or 4 * (squared_limit(cfg, mapping) + 1) << bits >= 1 << 31:
-        raise ValueError(f"clearance.max_m {cfg.max_m} is too many cells of {mapping.cell_m} m")
-    return bits
-
-
-def no_site(cfg, mapping):
-    """Key of a cell without a site within ``max_m``: larger than that of any cell with one."""
-    return 2 * (squared_limit(cfg, mapping) + 1) << offset_bits(cfg, mapping)
-
-
 # ------------------------------------------------------------------------------------------------------ sites
-
-
-@ti.func
-def site_word(env, row, word, io: Bundle[ClearanceIO]):
-    """Cells that are occupied or outside the tank."""
-    sites = io.grid_map.static_occupied[env, row, word] | io.mask.outside_bits[row, word]
-    if ti.static(io.voronoi_cfg.use == "fused"):
-        sites |= io.grid_map.dynamic_occupied[env, row, word]
-    return sites
 
 
 @ti.func
@@ -350,24 +324,26 @@ def bring_up_to_date(env, slot, io: Bundle[ClearanceIO]):
             transform(env, slot, changed, io)
 
 
-@ti.func
-def is_due(env, io: Bundle[ClearanceIO]):
-    """1 where the clearance is computed in this step."""
-    return ti.cast(
-        io.clock.awake[env] == 1 and io.clock.step[env] % io.clearance_cfg.period_steps == 0, ti.i32
-    )
-
-
 @quick_launch
 @ti.kernel
 def compute_clearance(io: Bundle[ClearanceIO]):
     """Clearance of every cell from the layer that the planner must avoid (``voronoi.use``), where it is
     due."""
     n_env, n_slot = ti.static(io.clock.awake.shape[0], io.clearance_memory.row_key.shape[0])
-    for slot, pad in ti.ndrange(n_slot, ti.static(spread(n_slot))):
-        if pad == 0:
-            for env in range(slot * n_env // n_slot, (slot + 1) * n_env // n_slot):
-                bring_up_to_date(env, slot, io)
+    if ti.static(n_item() > 1):  # each loop ends before the next begins
+        for env, item in ti.ndrange(n_env, ti.static(n_item())):
+            find_changes(env, item, io)
+        for env, item in ti.ndrange(n_env, ti.static(n_item())):
+            if is_due(env, io) == 1:
+                redo_cells(env, item, io)
+        for env, item in ti.ndrange(n_env, ti.static(n_item())):
+            if is_due(env, io) == 1:
+                note_farthest(env, item, io)
+    else:
+        for slot, pad in ti.ndrange(n_slot, ti.static(spread(n_slot))):
+            if pad == 0:
+                for env in range(slot * n_env // n_slot, (slot + 1) * n_env // n_slot):
+                    bring_up_to_date(env, slot, io)
 
 
 @ti.kernel

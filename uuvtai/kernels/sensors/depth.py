@@ -12,7 +12,7 @@ import math
 import taichi as ti
 
 from uuvtai.kernels.core.geometry import BOX, FAR_M, NONE, SPHERE, rotation_wb
-from uuvtai.kernels.core.lanes import LANES, f16x, ramp_lanes
+from uuvtai.kernels.core.lanes import LANES, f16x, ramp
 from uuvtai.kernels.core.noise import STREAM_DEPTH, normal_pair_lanes, stream_key
 from uuvtai.kernels.core.signature import Bundle, spread
 from uuvtai.kernels.sensors.bundles import DepthIO
@@ -129,7 +129,7 @@ def paint_nearer(env, row, first_col, enter, io: Bundle[DepthIO]):
 def ray_directions(row, first_col, R_wb, io: Bundle[DepthIO]):
     """World directions (x, y, z) of sixteen pixels' rays, scaled so that their body-x component is 1."""
     inverse_focal = ti.static(2.0 * math.tan(math.radians(0.5 * io.depth_cfg.fov_deg)) / io.depth_cfg.cols)
-    left = ramp_lanes(ti.cast(first_col, ti.f32) + ti.static(0.5 - 0.5 * io.depth_cfg.cols)) * -inverse_focal
+    left = ramp(ti.cast(first_col, ti.f32) + ti.static(0.5 - 0.5 * io.depth_cfg.cols), LANES) * -inverse_focal
     up = (0.5 * io.depth_cfg.rows - 0.5 - row) * inverse_focal
     dx = left * R_wb[0, 1] + (R_wb[0, 0] + up * R_wb[0, 2])
     dy = left * R_wb[1, 1] + (R_wb[1, 0] + up * R_wb[1, 2])
