@@ -15,6 +15,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from tests.command import uuv
 from tests.mavlink_vehicle import START, link_config
+from uuvtai import signals
 from uuvtai.errors import SettingError
 from uuvtai.link.dialect import MavCodec
 from uuvtai.link.endpoint import LinkPlace
@@ -502,12 +503,31 @@ def test_the_water_waits_for_the_clock(served, monkeypatch):
     assert len(slept) == 1 and port.paced_from_s == 50.0, "begun anew, or held up: nothing to catch up with"
 
 
+def free_port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        return free.getsockname()[1]
+
+
+def test_an_interrupted_water_tells_what_happened(capfd, monkeypatch, small):
+    """A signal ends a command at once unless that has said that there is something to do."""
+
+    def stopped(*_):
+        assert signals._engaged
+        raise signals.Interrupted
+
+    monkeypatch.setattr(signals, "_engaged", [])
+    monkeypatch.setattr(serving, "Sim", lambda config, rows, tree: small.sim)
+    monkeypatch.setattr(serving, "_serve", stopped)
+    place = ["--port", str(free_port()), "--mavlink", "udpout:127.0.0.1:9", "--json"]
+    code, out, err = uuv(capfd, "sitl", *place)
+    assert code == 0 and "interrupted" in err and len(json.loads(out)["instances"]) == 1
+
+
 @pytest.mark.parametrize("words", [["--json"], []])
 def test_the_command_serves_and_tells(capfd, monkeypatch, small, words):
     monkeypatch.setattr(serving, "Sim", lambda config, rows, tree: small.sim)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        number = free.getsockname()[1]
+    number = free_port()
     place = ["--port", str(number), "--mavlink", "udpout:127.0.0.1:9", "--seconds", "0.2"]
     code, out, err = uuv(capfd, "sitl", *place, *words)
     assert code == 0 and f"water for ArduSub at UDP 127.0.0.1:{number}" in err

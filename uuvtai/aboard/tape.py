@@ -109,7 +109,13 @@ class _TapeRecorder:
         """What the host does at this place."""
         self._lines.append({"do": what})
 
-    def serve(self, stages: Stages, seed_of: Callable[[int], int], count: Callable[[Any], int]) -> int:
+    def serve(
+        self,
+        stages: Stages,
+        seed_of: Callable[[int], int],
+        read: Callable[..., Any],
+        count: Callable[[Any], int],
+    ) -> int:
         """In place of the fallback planner."""
         self.note("route")
         return 0

@@ -11,15 +11,18 @@ What each stage reads (``kernels/*/bundles.py``), and where it comes from here:
 
 Nobody behind the sensors reads the truth (``tests/test_observation_only.py``). Between two messages the last
 one is held, and one that comes late is carried forward to this step (``carrying.py``); a DVL without a
-message in its turn has lost the bottom. Sonar intensity is read by nobody.
+message in its turn has lost the bottom. Nothing late is compared with, or carried by, corrections that came
+after it (``own_motion.py``). Sonar intensity is read by nobody.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from uuvtai.pilot.carrying import acceleration_b, to_world, turned_on
+from uuvtai.pilot.carrying import to_world, turned_on
 from uuvtai.pilot.inbox import Inbox
+from uuvtai.pilot.motion_watch import MotionWatch
+from uuvtai.pilot.own_motion import OwnPose
 from uuvtai.pilot.pilot_numbers import PilotNumbers
 from uuvtai.pilot.pose_history import PoseHistory
 from uuvtai.pilot.sensor_messages import (
@@ -33,8 +36,7 @@ from uuvtai.pilot.sensor_messages import (
 
 FIX_AGE_S = 0.3
 """[s] a scan or an image taken while attitude or position was older than this is not used: it would be drawn
-at the wrong place of the map. A velocity or depth later than this is not carried forward: what an estimate
-has changed since, its own corrections too, would be fed back so late that the estimate runs away"""
+at the wrong place of the map. A velocity or depth later than this is not carried forward"""
 
 
 class FedSensors:
@@ -49,8 +51,8 @@ class FedSensors:
             for struct in ("clock", "ego", "scan", "image")
         )
         self._pings, self._shots, self._motions = PoseHistory(), PoseHistory(), PoseHistory()
-        self._gravity = numbers.gravity_m_s2
-        self._imu = ImuReading(0.0, np.zeros(3), np.zeros(3), np.array([0.0, 0.0, self._gravity]))
+        self._watch, self._sonar_latency = MotionWatch(numbers, views), numbers.sonar_latency_steps
+        self._imu = ImuReading(0.0, np.zeros(3), np.zeros(3), np.array([0.0, 0.0, numbers.gravity_m_s2]))
         """until the first one comes: at rest"""
         self._pressure: PressureReading | None = None
         """until the first one comes: where the start is known to be"""
@@ -68,11 +70,14 @@ class FedSensors:
 
     def sense_motion(self, stages: object) -> None:
         """IMU, DVL, pressure and position as they were last told; what came late is carried forward."""
+        self._watch.note_walls(self.step)
         if isinstance(imu := self._inbox.newest("imu", self.now_s), ImuReading):
             self._imu = imu
         ego, imu = self._ego, self._imu
         late_s = min(self._steps_since(imu.time_s) * self._dt, FIX_AGE_S)
-        ego["rpy"][0] = ego["imu_rpy"][0] = turned_on(imu, late_s) if late_s else imu.rpy
+        rpy = turned_on(imu, late_s) if late_s else np.asarray(imu.rpy)
+        self._watch.feel(imu, rpy)
+        ego["rpy"][0] = ego["imu_rpy"][0] = rpy
         ego["rate_b"][0], ego["specific_force_b"][0] = imu.rate_b, imu.specific_force_b
         ego["dvl_fresh"][0] = 0
         if self.step % self._dvl_period == 0:
@@ -89,36 +94,30 @@ class FedSensors:
 
     def _take_velocity(self) -> None:
         """Valid where the DVL has said anything since its last turn; else it holds the last reading. A late
-        one changes by what the own estimate has changed since."""
+        one changes by what the accelerometer has felt since."""
         reading, ego = self._inbox.newest("dvl", self.now_s), self._ego
         ego["vel_valid"][0] = ego["dvl_fresh"][0] = isinstance(reading, DvlReading)
         if isinstance(reading, DvlReading):
             velocity = np.asarray(reading.vel_b)
             if self._steps_since(reading.time_s):
-                then = self._motion_at(reading.time_s)
+                then = self._motion_at(reading.time_s, self._dvl_period)
                 ego["vel_valid"][0] = ego["dvl_fresh"][0] = then is not None
-                velocity = velocity + self._won(then["vel_b"]) if then else ego["vel_b"][0]
+                velocity = velocity + self._watch.sums.won_b - then["won_b"] if then else ego["vel_b"][0]
             ego["vel_b"][0] = ego["dvl_b"][0] = velocity
 
-    def _won(self, vel_b: np.ndarray) -> np.ndarray:
-        """Change of the own velocity since it was ``vel_b``: by the estimates up to the last step, and in
-        this one by the accelerometer."""
-        now = self._ego["vel_b"][0]
-        return now - vel_b + self._dt * acceleration_b(self._imu, now, self._gravity)
-
     def _take_pressure(self, pressure: PressureReading) -> None:
-        """A late one, or one held, changes by what the own depth has changed since."""
-        ego, depth_m = self._ego, pressure.depth_m
-        then = self._motion_at(pressure.time_s)
+        """A late one, or one held, changes by what the vehicle has risen since."""
+        depth_m, then = pressure.depth_m, self._motion_at(pressure.time_s)
         if self._steps_since(pressure.time_s) and then is not None:
-            sinking = self._dt * to_world(ego["vel_b"][0], ego["rpy"][0])[2]
-            depth_m -= float(ego["pos_w"][0, 2] - then["pos_w"][2] + sinking)
-        ego["depth_m"][0] = depth_m
+            depth_m -= self._watch.sums.risen_m - float(then["risen_m"])
+        self._ego["depth_m"][0] = depth_m
 
     def sense_sonar(self, stages: object) -> None:
         """The newest ping, placed where the vehicle was when it was taken."""
         ego, scan = self._ego, self._scan
-        self._motions.note(self.step, vel_b=ego["vel_b"][0], pos_w=ego["pos_w"][0])
+        self._watch.note_dvl(self.step)
+        if self._inbox.age_s("imu", self.now_s) < np.inf:
+            self._motions.note(self.step, **self._watch.sums.noted())
         if self._is_placed():
             self._pings.note(
                 self.step,
@@ -140,7 +139,7 @@ class FedSensors:
             scan["hit"][0, beams], scan["fresh"][0] = hit, 1
             scan["new_from"][0], scan["new_count"][0] = ping.first_beam, n
             scan["ping_step"][0] = self._step_of(ping.time_s)
-            for name, value in then.items():
+            for name, value in self._corrected(then, ping.time_s).items():
                 scan[name][0] = value
 
     def sense_depth(self, stages: object) -> None:
@@ -156,10 +155,20 @@ class FedSensors:
             for name, value in then.items():
                 image[name][0] = value
 
-    def _motion_at(self, time_s: float) -> dict[str, np.ndarray] | None:
-        """The own motion then; None where that is not known, or too long ago."""
-        is_late = self._steps_since(time_s) * self._dt > FIX_AGE_S
-        return None if is_late else self._motions.at(self._step_of(time_s))
+    def _corrected(self, then: dict[str, np.ndarray], time_s: float) -> dict[str, np.ndarray]:
+        """The pose of a ping as it is known now, where it is later than its sonar always is."""
+        noted = self._motions.at(self._step_of(time_s))
+        if noted is None or self._steps_since(time_s) <= self._sonar_latency:
+            return then
+        rpy = np.append(self._imu.rpy[:2], then["ping_yaw"])
+        was = OwnPose(then["ping_pos_w"], rpy, then["ping_vel_b"])
+        known = self._watch.sums.known_now(was, noted, time_s)
+        return then | {"ping_pos_w": known.pos_w, "ping_yaw": known.rpy[2], "ping_vel_b": known.vel_b}
+
+    def _motion_at(self, time_s: float, waited: int = 0) -> dict[str, np.ndarray] | None:
+        """The own motion then; None where that is not known, or too long ago but for steps ``waited``."""
+        late_s = (self._steps_since(time_s) - waited) * self._dt
+        return None if late_s > FIX_AGE_S else self._motions.at(self._step_of(time_s))
 
     def _steps_since(self, time_s: float) -> int:
         """0 = measured in this step."""

@@ -63,6 +63,7 @@ def numbers_of(config: Config, tree: FlatTree) -> PilotNumbers:
         beam_limit=2 * sonar.n_ray if sonar.is_ring else sonar.n_ray,
         mechanical=sonar.mechanical,
         doppler=sonar.doppler,
+        sonar_latency_steps=sonar.latency_steps,
         sonar_m=sonar.max_range_m,
         image=(camera.rows, camera.cols),
         camera_m=camera.max_range_m,

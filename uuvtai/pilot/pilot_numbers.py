@@ -25,6 +25,8 @@ class PilotNumbers:
     """beams [0, limit) may follow each other in a ping of a mechanical sonar: a ring goes round"""
     mechanical: bool
     doppler: bool
+    sonar_latency_steps: int
+    """control steps from a ping to its scan, always"""
     sonar_m: float
     """maximum range"""
     image: tuple[int, int]

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from uuvtai import signals
 from uuvtai.config import Config
 from uuvtai.link.dialect import MavCodec
 from uuvtai.link.endpoint import Address, Endpoint, LinkPlace, place_of
@@ -187,6 +188,7 @@ def serve_water(
             ports.append(SitlPort(plan, Instance(config, water, number), number))
         water.warm()
         begun = time.monotonic()
+        signals.engage()  # there is a document to print
         shown = ", ".join(f"{plan.host}:{plan.port + NEXT_PORT * number}" for number in range(plan.instances))
         note(
             f"water for ArduSub at UDP {shown}; start it with: ardusub --model JSON:{plan.host}; Ctrl-C ends"

@@ -9,7 +9,8 @@ on a known wall (wall_fix.py). Depth: z, heave, the error that zeroing the press
 has left, and the accelerometer's upwards. The start itself is known.
 
 Errors of a scan refer to its ping: the pose there is off by the pose's error of now less the latency times
-the velocity's. S. Thrun, W. Burgard, D. Fox, Probabilistic Robotics (2005), chapters 3 and 7.
+the velocity's; for one later than the sonar's own latency the accelerometer's error counts too. S. Thrun,
+W. Burgard, D. Fox, Probabilistic Robotics (2005), chapters 3 and 7.
 """
 
 import taichi as ti
@@ -271,6 +272,8 @@ def take_walls(env, io: Bundle[PoseIO]):
     """The newest scan: pose at the ping by its ranges, velocity by their Doppler."""
     mean, cov = io.pose.mean[env], io.pose.cov[env]
     late = (io.clock.step[env] - io.scan.ping_step[env]) * ti.static(io.episode_cfg.control_dt_s)
+    overdue = io.clock.step[env] - io.scan.ping_step[env] - ti.static(io.sensors_cfg.sonar.latency_steps)
+    drifted = ti.max(overdue, 0) * ti.static(io.episode_cfg.control_dt_s)  # 0 in a simulator's own loop
     back_x = late * ti.cos(io.scan.ping_yaw[env])
     back_y = late * ti.sin(io.scan.ping_yaw[env])
     speed_cov = ti.Vector([cov[ti.static(place(i, j, _N))] for i, j in ti.static(((3, 3), (3, 4), (4, 4)))])
@@ -282,11 +285,13 @@ def take_walls(env, io: Bundle[PoseIO]):
         a, b = root[0, k], root[1, k]
         rows[k, 0], rows[k, 1], rows[k, 2], found[k] = a, b, root[2, k], seen[k]
         rows[k, 3], rows[k, 4] = -a * back_x - b * back_y, a * back_y - b * back_x
+        rows[k, 7], rows[k, 8] = 0.5 * drifted * rows[k, 3], 0.5 * drifted * rows[k, 4]
     won = ti.static(accel_variance(io.pose_cfg, io.episode_cfg.control_dt_s, io.sensors_cfg, io.vehicle_cfg))
     info, part = blurred(fix.velocity, fix.velocity_part, won * (io.clock.step[env] - io.scan.ping_step[env]))
     half, slip = halved(info, part)
     for k in ti.static(range(2)):
         rows[3 + k, 3], rows[3 + k, 4], found[3 + k] = half[0, k], half[1, k], slip[k]
+        rows[3 + k, 7], rows[3 + k, 8] = drifted * half[0, k], drifted * half[1, k]
     now = mean + 0.0
     for k in range(5):  # not unrolled, so that it is compiled once
         h = ti.Vector([rows[k, j] for j in range(_N)])
