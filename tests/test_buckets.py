@@ -1,6 +1,7 @@
 """Few sizes are ever compiled: other batches, obstacles and speeds find the machine code that is there."""
 
 import json
+import subprocess
 import sys
 
 import numpy as np
@@ -84,3 +85,10 @@ def test_one_vehicle_has_no_idle_items():
         8,
         1,
     ]
+
+
+def test_sizes_are_known_before_taichi_has_started():
+    """``uuv profile`` asks whether all sizes fit before it makes the first simulator."""
+    code = "from uuvtai import loader, sizes; sizes.check_size(loader.load_config(), 8, 'cpu')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

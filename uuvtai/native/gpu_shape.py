@@ -23,5 +23,5 @@ def asked_shape() -> str:
 
 def is_gpu_shaped() -> bool:
     """Whether the kernels of this process are made for a GPU. Plain Python, for the time when a kernel is
-    compiled or a size chosen."""
-    return ti.cfg.arch == ti.cuda or asked_shape() == "gpu"  # pyright: ignore[reportOptionalMemberAccess]
+    compiled or a size chosen; sizes are also asked for before Taichi has been started."""
+    return (ti.cfg is not None and ti.cfg.arch == ti.cuda) or asked_shape() == "gpu"
