@@ -8,7 +8,8 @@ import pytest
 import taichi as ti
 
 from tests.bundles import io_for
-from tests.test_architecture import PACKAGE, tree_of
+from tests.sources import nodes_of
+from tests.test_architecture import PACKAGE
 from uuvtai import state
 from uuvtai.config import Config, TrackingConfig, WorldConfig
 from uuvtai.kernels.core.geometry import NONE, SPHERE
@@ -136,7 +137,7 @@ def test_only_an_evaluation_that_is_asked_to_switches_it_on(small):
     setters = {
         path.name
         for path in PACKAGE.rglob("*.py")
-        for node in ast.walk(tree_of(path))
+        for node in nodes_of(path)
         if isinstance(node, ast.Assign)
         and any(getattr(target, "attr", "") == "privileged" for target in node.targets)
     }
