@@ -160,12 +160,14 @@ def main() -> None:
     parser.add_argument("runs", nargs="*", type=Path, help="run folders, in the order of the table")
     parser.add_argument("--add", action="store_true", help="behind those that the file has")
     chosen = parser.parse_args()
+    played = {"commit": commit_of_package(), "machine": hardware()}
     runs = [run_of(folder) for folder in chosen.runs]
+    document = {"schema": 1, **played, "runs": runs}
     if chosen.add:
-        runs = json.loads((ROOT / FILE).read_text(encoding="utf-8"))["runs"] + runs
-    document = {"schema": 1, "commit": commit_of_package(), "machine": hardware(), "runs": runs}
+        document = json.loads((ROOT / FILE).read_text(encoding="utf-8"))
+        document["runs"] += [run | played for run in runs]
     write_atomic(ROOT / FILE, (json.dumps(document, indent=1) + "\n").encode())
-    draw(runs, ROOT / PICTURE)
+    draw(document["runs"], ROOT / PICTURE)
 
 
 if __name__ == "__main__":
