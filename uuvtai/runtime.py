@@ -68,8 +68,6 @@ def start_taichi(device: str = "cpu", precision: str = "f32", fast_math: bool = 
             offline_cache_max_size_of_files=CACHE_BYTES,
             cfg_optimization=False,  # LLVM does that work again: half of the time to compile, equal results;
             # and on CUDA Taichi 1.7.4 falls over what that pass leaves of ``tick_tree``
-            # LLVM does that too: on the CPU a third less time to compile, equal results, equal speed
-            advanced_optimization=wanted.device == "cuda",
             log_level=ti.WARN,
             **options,
         )

@@ -52,7 +52,8 @@ class Native:
             raise UnfitError(f"Taichi {'.'.join(map(str, ti.__version__))} is not 1.7.4")
         self.store = Store(default_folder())
         self.machine = Machine(int(os.environ.get("UUV_NUM_THREADS") or os.cpu_count() or 1))
-        told: Any = impl.get_runtime().prog.config()
+        program: Any = impl.get_runtime().prog
+        told = program.config()
         passes = f"{told.advanced_optimization} {told.cfg_optimization} {told.fast_math}"
         self.surroundings = [*self.machine.surroundings(), *map(str, ti.__version__), asked_shape(), passes]
         self.adopted: weakref.WeakKeyDictionary[Any, Owner] = weakref.WeakKeyDictionary()
