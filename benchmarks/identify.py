@@ -58,7 +58,7 @@ def _row(what: str, known: str, config: Config, truth: np.ndarray, drives: list[
     widths: dict[str, list[float]] = {}
     missed = []
     for i, (row, drive) in enumerate(zip(truth, drives, strict=True)):
-        told, true = _told(config, row, known)
+        told, true = told_of(config, row, known)
         for entry in fitted_drives([drive], told, known).entries:
             if not entry["fitted"]:
                 continue
@@ -90,7 +90,7 @@ def _row(what: str, known: str, config: Config, truth: np.ndarray, drives: list[
     )
 
 
-def _told(config: Config, truth: np.ndarray, known: str) -> tuple[VehicleConfig, np.ndarray]:
+def told_of(config: Config, truth: np.ndarray, known: str) -> tuple[VehicleConfig, np.ndarray]:
     """(the vehicle that the identification is told, the true values by its measure)"""
     told, true = config.vehicle, truth.copy()
     if known == "buoyancy":
