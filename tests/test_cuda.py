@@ -166,7 +166,7 @@ done:
 def test_instructions_and_accesses_are_counted_as_often_as_they_are_done():
     counts, values = (ctypes.c_int64 * 2)(), (ctypes.c_float * 7)()
     machine = Machine(1)
-    machine.llvm.add_symbol(counting.SYMBOL, ctypes.addressof(counts))
+    machine.symbols[counting.SYMBOL] = ctypes.addressof(counts)
     (place,) = machine.tasks_of(machine.object_of(counting.instrumented(LOOP)), ["kernel"])
     ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int32)(place)(ctypes.addressof(values), 7)
     assert list(values) == [1.0] * 7

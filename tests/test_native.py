@@ -171,6 +171,56 @@ def changed(text):
     return text.replace(" fadd ", " fsub ", 1)
 
 
+FAR_APART = """
+import ctypes, mmap
+from uuvtai.native.machine import Machine
+
+libc = ctypes.CDLL(None)
+libc.mmap.restype = ctypes.c_void_p
+libc.mmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t, *[ctypes.c_int] * 3, ctypes.c_long]
+libc.munmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t]
+PRIVATE, FIXED, WALL = 0x4022, 0x100000, 5 << 30
+
+
+def reserved(size, at=None):
+    return libc.mmap(at, size, 0, PRIVATE | (FIXED if at else 0), -1, 0)
+
+
+machine = Machine(1)
+code = machine.object_of('''
+@table = private unnamed_addr constant [3 x float] [float 1.5, float 2.5, float 3.5]
+define void @kernel(float* %at, i32 %i) {
+  %place = getelementptr [3 x float], [3 x float]* @table, i32 0, i32 %i
+  %value = load float, float* %place
+  store float %value, float* %at
+  ret void
+}
+''')
+lowest = reserved(mmap.PAGESIZE)
+for power in range(30, 11, -1):  # no gap is left above
+    while (place := reserved(1 << power)) > lowest:
+        pass
+    lowest = place
+for pages in (1, 2, 3):  # but this one, and the next is 5 GiB away
+    gap = reserved((pages + 2) * mmap.PAGESIZE)
+    assert reserved(WALL, gap - WALL) == gap - WALL
+    libc.munmap(gap + mmap.PAGESIZE, pages * mmap.PAGESIZE)
+    (kernel,) = machine.tasks_of(code, ["kernel"])
+    out = ctypes.c_float()
+    ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int32)(kernel)(ctypes.addressof(out), 2)
+    print(out.value)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="own machine code is for Linux")
+def test_code_finds_its_constants_in_a_process_whose_memory_is_full_of_walls():
+    """With 5 GiB between two gaps: a distance of 32 bits does not reach across."""
+    done = subprocess.run(
+        [sys.executable, "-c", FAR_APART], cwd=ROOT, capture_output=True, text=True, check=False, timeout=120
+    )
+    assert (done.returncode, done.stdout.split()) == (0, ["3.5"] * 3), done.stderr
+
+
 def test_another_runtime_is_refused():
     with pytest.raises(UnfitError, match="another layout"):
         tasks_in("%struct.LLVMRuntime.6 = type { i8*, i32 }\n")

@@ -169,7 +169,6 @@ def step_seconds(gpu: Gpu, counts: dict[str, Any], num_envs: int) -> float:
 
 
 def _count(num_envs: int, sensors: str, steps: int) -> dict[str, Any]:
-    import llvmlite.binding as llvm
     import torch
 
     from uuvtai.loader import load_config
@@ -178,17 +177,21 @@ def _count(num_envs: int, sensors: str, steps: int) -> dict[str, Any]:
     from uuvtai.tree import read_tree
 
     counts = (ctypes.c_int64 * 2)()
-    llvm.add_symbol(SYMBOL, ctypes.addressof(counts))
     found: dict[str, list[tuple[int, int]]] = {}
     parts: dict[str, int] = {}
-    plain_object, plain_launch, plain_again = (
+    plain_object, plain_tasks, plain_launch, plain_again = (
         machine.Machine.object_of,
+        machine.Machine.tasks_of,
         making.Native._launch,
         launch.NativeLaunch.again,
     )
 
     def object_of(self: Any, text: str) -> bytes:
         return plain_object(self, text if "@uuv_launch" in text else instrumented(text))
+
+    def tasks_of(self: Any, code: bytes, names: list[str]) -> list[int]:
+        self.symbols[SYMBOL] = ctypes.addressof(counts)
+        return plain_tasks(self, code, names)
 
     def launched(self: Any, code: Any, kernel: Any, arguments: tuple, owner: Any) -> Any:
         made = plain_launch(self, code, kernel, arguments, owner)
@@ -203,6 +206,7 @@ def _count(num_envs: int, sensors: str, steps: int) -> dict[str, Any]:
         made.append((counts[0] - before[0], counts[1] - before[1]))
 
     machine.Machine.object_of = object_of  # type: ignore[method-assign]
+    machine.Machine.tasks_of = tasks_of  # type: ignore[method-assign]
     making.Native._launch, launch.NativeLaunch.again = launched, again  # type: ignore[method-assign]
     sim = Sim(load_config("pool", sensors), num_envs, read_tree("bt"))
     ones = torch.ones(num_envs, dtype=torch.int32)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import itertools
 import re
 from pathlib import Path
 from typing import Any
@@ -130,14 +131,22 @@ class Machine:
     def __init__(self, threads: int) -> None:
         """Raises UnfitError where llvmlite, its LLVM or torch's OpenMP does not fit."""
         self.llvm = _llvm()
-        self.engines: list[Any] = []
-        for name in ("GOMP_parallel", "omp_get_thread_num"):
-            self.llvm.add_symbol(name, ctypes.cast(getattr(_openmp(), name), ctypes.c_void_p).value)
+        self.symbols = {
+            name: ctypes.cast(getattr(_openmp(), name), ctypes.c_void_p).value or 0
+            for name in ("GOMP_parallel", "omp_get_thread_num")
+        }
+        """addresses of what code may call beside the process's own functions, by name"""
+        # JITLink: code and its constants in one piece of memory. Code finds them by distances of 32 bits, and
+        # LLVM's older linker puts them wherever a gap is, which in a large process may be farther away
+        self._linker = self.llvm.create_lljit_compiler(
+            self._target(), use_jit_link=True, suppress_errors=True
+        )
+        self._loaded: list[Any] = []
+        self._number = itertools.count()
         self._pool, self._alone = ctypes.c_int32(threads), ctypes.c_int32(1)
         self._temporaries = ctypes.create_string_buffer(_TEMPORARY_BYTES)
-        engine = self._engine(self.object_of(_LAUNCHER))
-        launcher = engine.get_function_address("uuv_launch")
-        self._parallel_for = engine.get_function_address("uuv_parallel_for")
+        names = ["uuv_launch", "uuv_parallel_for"]
+        launcher, self._parallel_for = self.tasks_of(self.object_of(_LAUNCHER), names)
         address = ctypes.c_void_p
         self.launch = ctypes.CFUNCTYPE(None, address, ctypes.c_int32, address, address)(launcher)
 
@@ -164,21 +173,17 @@ class Machine:
 
     def tasks_of(self, code: bytes, names: list[str]) -> list[int]:
         """Addresses of the functions of an object, which is loaded. Raises UnfitError."""
+        library = self.llvm.JITLibraryBuilder().add_object_img(code).add_current_process()
+        for name, address in self.symbols.items():
+            library.import_symbol(name, address)
+        for name in names:
+            library.export_symbol(name)
         try:
-            engine = self._engine(code)
+            loaded = library.link(self._linker, f"object {next(self._number)}")
         except RuntimeError as error:
             raise UnfitError(f"LLVM: {error}") from error
-        found = [engine.get_function_address(name) for name in names]
-        if not all(found):
-            raise UnfitError("a function is missing in the machine code")
-        return found
-
-    def _engine(self, code: bytes) -> Any:
-        engine = self.llvm.create_mcjit_compiler(self.llvm.parse_assembly(""), self._target())
-        engine.add_object_file(self.llvm.ObjectFileRef.from_data(code))
-        engine.finalize_object()
-        self.engines.append(engine)
-        return engine
+        self._loaded.append(loaded)
+        return [loaded[name] for name in names]
 
     def _target(self) -> Any:
         features = self.llvm.get_host_cpu_features().flatten()
