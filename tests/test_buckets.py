@@ -3,17 +3,21 @@
 import json
 import subprocess
 import sys
+from typing import get_type_hints
 
 import numpy as np
 import pytest
 import torch
 
 from tests.command import uuv
+from uuvtai.initial import LENGTHENED, rank
 from uuvtai.kernels.core.signature import spread
 from uuvtai.loader import load_config
 from uuvtai.native.launch import native
 from uuvtai.sim import Sim
 from uuvtai.sizes import array_sizes, rows_for
+from uuvtai.stages import SimState
+from uuvtai.state import bytes_of
 from uuvtai.tree import read_tree
 
 STEPS = 12
@@ -34,6 +38,30 @@ def played(n_env, seed, **world):
     awake = sim.s.clock.awake.to_numpy()
     assert awake[:n_env].all() and not awake[n_env:].any()
     return pos_w
+
+
+@pytest.mark.parametrize(
+    ("sensors", "overrides"),
+    [
+        ("clean", {}),
+        ("harsh", {}),
+        ("multibeam_image", {}),
+        ("ping360", {}),
+        ("nominal", {"forecast.learned": "shipped"}),
+        ("nominal", {"forecast.turn_back_s": [0.4, 0.8]}),
+        ("nominal", {"baselines.mppi.horizon_s": 1.0}),
+    ],
+)
+def test_other_sensors_and_forecasts_lengthen_only_what_lies_last(sensors, overrides):
+    """What lies before keeps its place, and the machine code for it holds."""
+    usual = array_sizes(load_config("pool", "nominal"), 8)
+    other = array_sizes(load_config("pool", sensors, overrides=overrides), 8)
+    changed = {axis for axis in usual if usual[axis] != other[axis]}
+    assert changed <= set(LENGTHENED)
+    kinds = get_type_hints(SimState).values()
+    first = [kind for kind in kinds if not rank(kind)]
+    assert len(first) > len(kinds) / 2
+    assert all(bytes_of(kind, usual) == bytes_of(kind, other) for kind in first)
 
 
 def test_sizes_are_few_and_never_too_small():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import get_type_hints
 
 import numpy as np
@@ -16,10 +17,26 @@ from uuvtai.stages import SimState
 from uuvtai.taichi_patches.memory import Put
 from uuvtai.tuned_numbers import configured_factors
 
+LENGTHENED = (
+    *("n_ray", "n_pixel_row", "n_pixel_col", "n_latency", "n_delay"),
+    *("n_echo", "n_heard", "n_bin", "n_elevation", "n_trial", "n_control"),
+    *("n_future", "n_past", "n_bend", "n_frame", "n_column", "n_hidden", "n_said", "n_weight"),
+)
+"""axes whose lengths follow from sensors and options"""
+
 
 def allocate_state(sizes: dict[str, int]) -> SimState:
-    """Every struct, with the lengths of ``sizes.array_sizes``."""
-    return SimState(**{name: state.allocate(kind, sizes) for name, kind in get_type_hints(SimState).items()})
+    """Every struct, with the lengths of ``sizes.array_sizes``; those that other options lengthen lie last, so
+    that the others keep their places, and what was compiled for them holds."""
+    kinds = get_type_hints(SimState)
+    built = {name: state.allocate(kinds[name], sizes) for name in sorted(kinds, key=lambda n: rank(kinds[n]))}
+    return SimState(**built)
+
+
+def rank(kind: type) -> int:
+    """0 for a struct that has the same length whatever sensors and options are; else how late it lies."""
+    axes = {axis for declared in dataclasses.fields(kind) for axis in declared.metadata["shape"]}
+    return max((LENGTHENED.index(axis) + 1 for axis in axes.intersection(LENGTHENED)), default=0)
 
 
 def fill_constants(s: SimState, config: Config, put: Put) -> None:

@@ -37,7 +37,7 @@ def compile_backwards(config: Config, num_envs: int) -> int:
     for clock in (sim.s.clock.awake, sim.s.clock.active):
         clock.fill(1)  # a kernel that does nothing compares nothing
     for kernel, arguments in reversed(calls):
-        with compiling(kernel):
+        with compiling(kernel, arguments):
             native[0].first(kernel, arguments)
     return len(calls)
 

@@ -167,7 +167,7 @@ def _some(sim: Any, wanted: list[str]) -> dict[str, Any]:
 
     found = [(k, a) for k, a in calls_of(sim) if k.func.__name__ in wanted]
     for kernel, arguments in found:
-        with compiling(kernel):
+        with compiling(kernel, arguments):
             kernel(*arguments)
     return {"kernels": sorted(k.func.__name__ for k, _ in found)}
 

@@ -131,7 +131,7 @@ class _TapeRecorder:
         launch.again()
 
     def _compiled(self, kernel: Any, arguments: tuple) -> tuple[int, NativeLaunch]:
-        with compiling(kernel):
+        with compiling(kernel, arguments):
             made = kernel.compiled_kernels[kernel.ensure_compiled(*arguments)]
             _, text = self.compiler.compiled(made)
         names = tasks_in(text)

@@ -75,10 +75,12 @@ def described(value: Any, tree: int) -> str:
 
 
 def _place(field: ti.Field, tree: int) -> str:
-    """Type, shape and place of a field: the sizes of the nodes from it up to the root of its tree."""
+    """Type, shape and place of a field: the sizes of the nodes from it up to the root of its tree. How large
+    the root is, whatever lies behind the field, does not matter."""
     node, path, found = field.vars[0].ptr.snode(), [], -1
     while node is not None:
-        path.append((str(node.type), node.cell_size_bytes, node.offset_bytes_in_parent_cell))
+        size = node.cell_size_bytes if node.parent is not None else 0
+        path.append((str(node.type), size, node.offset_bytes_in_parent_cell))
         found, node = node.get_snode_tree_id(), node.parent
     if found != tree:
         raise KeyNameError(f"a field of tree {found} among those of tree {tree}")

@@ -118,22 +118,28 @@ def quick_launch(launch: _T) -> _T:
     return again  # type: ignore[return-value]
 
 
-def without_cse(launch: _T) -> _T:
-    """Decorator between ``quick_launch`` and Taichi's: compile without common subexpression elimination.
+def with_cse(where: Callable[[Any], bool] = lambda _bundle: True) -> Callable[[_T], _T]:
+    """Decorator between ``quick_launch`` and Taichi's: compile with common subexpression elimination,
+    ``where`` the kernel's bundle says so.
 
-    The time of that pass grows with the square of a kernel's length, most of what a long kernel takes to
-    compile. LLVM does most of the work again: for kernels that are long to compile and short to run.
+    The time of that pass grows with the square of a kernel's length, a fifth of what all kernels took to
+    compile. LLVM does that work again, but for what Taichi hides from it: for kernels that run faster by it.
     """
-    launch._primal.without_cse = True  # type: ignore[attr-defined]
-    return launch
+
+    def mark(launch: _T) -> _T:
+        launch._primal.with_cse = where  # type: ignore[attr-defined]
+        return launch
+
+    return mark
 
 
 @contextlib.contextmanager
-def compiling(kernel: Any) -> Iterator[None]:
-    """As this kernel wants to be compiled (``without_cse``)."""
+def compiling(kernel: Any, arguments: tuple) -> Iterator[None]:
+    """As this kernel wants to be compiled for these arguments (``with_cse``)."""
     program: Any = impl.get_runtime().prog
     config, before = program.config(), program.config().opt_level
-    config.opt_level = 0 if getattr(kernel, "without_cse", False) else before
+    where = getattr(kernel, "with_cse", None)
+    config.opt_level = before if where is not None and where(arguments[0]) else 0
     try:
         yield
     finally:
@@ -142,7 +148,7 @@ def compiling(kernel: Any) -> Iterator[None]:
 
 def _first(launch: Callable, kernel: Any, arguments: tuple) -> Launch | None:
     """Launch with arguments that were not seen before; how to do it again, None where Taichi has to look."""
-    with compiling(kernel):
+    with compiling(kernel, arguments):
         return _compiled(launch, kernel, arguments)
 
 

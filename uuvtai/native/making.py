@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import atexit
+import contextlib
+import gc
 import os
 import sys
 import warnings
 import weakref
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import taichi as ti
 import torch
+from taichi.lang import impl
 
 from uuvtai.native.companion import Companion
 from uuvtai.native.gpu_shape import asked_shape
@@ -49,7 +52,10 @@ class Native:
             raise UnfitError(f"Taichi {'.'.join(map(str, ti.__version__))} is not 1.7.4")
         self.store = Store(default_folder())
         self.machine = Machine(int(os.environ.get("UUV_NUM_THREADS") or os.cpu_count() or 1))
-        self.surroundings = [*self.machine.surroundings(), *map(str, ti.__version__), asked_shape()]
+        program: Any = impl.get_runtime().prog
+        told = program.config()
+        passes = f"{told.advanced_optimization} {told.cfg_optimization} {told.fast_math}"
+        self.surroundings = [*self.machine.surroundings(), *map(str, ti.__version__), asked_shape(), passes]
         self.adopted: weakref.WeakKeyDictionary[Any, Owner] = weakref.WeakKeyDictionary()
         self.compiler: Compiler | None = None
         self.companion = Companion()
@@ -127,7 +133,7 @@ class Native:
         instance = kernel.mapper.lookup(arguments)[0]
         kernel.compiled_kernels.pop((kernel.func, instance, kernel.autodiff_mode), None)  # not read by us
         self._times[kernel.func] += 1
-        with noted(arguments[0], self._times[kernel.func]) as (names, numbers):
+        with noted(arguments[0], self._times[kernel.func]) as (names, numbers), _uncollected():
             made = kernel.compiled_kernels.pop(kernel.ensure_compiled(*arguments))
         return made, sorted(names), numbers.table
 
@@ -166,6 +172,18 @@ def _values(kernel: Any, arguments: tuple, table: list[Sum]) -> list[tuple[Any, 
     """What a kernel is told at a launch: its own numbers and tensors, then those of the config."""
     numbers = (worked_out(told, lambda name: value_of(arguments[0], name)) for told in table)
     return given(kernel, arguments) + [(float, number) for number in numbers]
+
+
+@contextlib.contextmanager
+def _uncollected() -> Iterator[None]:
+    """Look for no garbage meanwhile: Taichi makes trees of a kernel's source, which end with it."""
+    was = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was:
+            gc.enable()
 
 
 def _is_plain(value: Any) -> bool:

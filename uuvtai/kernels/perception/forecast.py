@@ -8,14 +8,13 @@ from uuvtai.kernels.core.kalman import largest_position_variance
 from uuvtai.kernels.core.signature import Bundle, spread
 from uuvtai.kernels.perception.bundles import ForecastIO
 from uuvtai.kernels.perception.habits import expected_turn_rate, forget_habits, learn_habit, next_event
-from uuvtai.native.launch import quick_launch, without_cse
+from uuvtai.native.launch import quick_launch
 
 MOST_LEGS = 6
 """Turns within one forecast; beyond them a body goes straight on."""
 
 
 @quick_launch
-@without_cse
 @ti.kernel
 def reset_forecast(io: Bundle[ForecastIO]):
     """Know no habits and expect nothing in the awake rows."""
@@ -34,7 +33,6 @@ def reset_forecast(io: Bundle[ForecastIO]):
 
 
 @quick_launch
-@without_cse
 @ti.kernel
 def learn_habits(io: Bundle[ForecastIO]):
     """Watch how the tracks move, after each tracked scan."""
@@ -46,7 +44,6 @@ def learn_habits(io: Bundle[ForecastIO]):
 
 
 @quick_launch
-@without_cse
 @ti.kernel
 def forecast_tracks(io: Bundle[ForecastIO]):
     """From now to the horizon, for the moving tracks of the awake rows; the others get a negative radius.

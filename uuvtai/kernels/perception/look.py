@@ -14,7 +14,7 @@ from uuvtai.kernels.core.signature import Bundle, spread
 from uuvtai.kernels.perception.bundles import LookIO
 from uuvtai.kernels.perception.elevation import COLUMN, heights, weigh_camera
 from uuvtai.kernels.perception.evidence import pinhole
-from uuvtai.native.launch import quick_launch, without_cse
+from uuvtai.native.launch import quick_launch
 
 _DEPTH_SLACK_M = 0.25
 """A pixel this close to the body's expected distance shows the body (track errors and the size's)."""
@@ -37,7 +37,6 @@ _PAST = 2
 
 
 @quick_launch
-@without_cse
 @ti.kernel
 def look_at_bodies(io: Bundle[LookIO]):
     """Weigh the heights of every moving track in the view of a fresh image."""

@@ -32,7 +32,7 @@ from uuvtai.kernels.core.signature import Bundle, Const, spread
 from uuvtai.kernels.perception.bundles import MappingIO
 from uuvtai.kernels.perception.evidence import mark_depth, mark_hits
 from uuvtai.kernels.perception.fan import mark_free
-from uuvtai.native.launch import quick_launch
+from uuvtai.native.launch import quick_launch, with_cse
 
 RATED_HZ = 10.0
 """Scan rate for which the gains of MappingConfig are given."""
@@ -353,6 +353,7 @@ def update_map(io: Bundle[MappingIO]):
 
 
 @quick_launch
+@with_cse()
 @ti.kernel
 def reset_map(io: Bundle[MappingIO]):
     """An empty map: nothing occupied, nothing seen."""

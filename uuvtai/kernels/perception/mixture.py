@@ -12,11 +12,10 @@ from uuvtai.forecast_codes import ANCHOR_S, ANCHORS, LAST, MIDDLE, N_COLUMN, N_H
 from uuvtai.kernels.core.lanes import LANES
 from uuvtai.kernels.core.signature import Bundle, spread
 from uuvtai.kernels.perception.bundles import MixtureIO
-from uuvtai.native.launch import quick_launch, without_cse
+from uuvtai.native.launch import quick_launch
 
 
 @quick_launch
-@without_cse
 @ti.kernel
 def mix_futures(io: Bundle[MixtureIO]):
     """In decision steps: the likeliest future of every track that has a forecast becomes its forecast, the

@@ -23,7 +23,7 @@ from uuvtai.kernels.core.lanes import LANES
 from uuvtai.kernels.core.signature import Bundle, spread
 from uuvtai.kernels.perception.bundles import PastIO
 from uuvtai.kernels.perception.habits import IN_X, IN_Y, OUT_X, OUT_Y, WEIGHT, next_turn, wall_ahead
-from uuvtai.native.launch import quick_launch, without_cse
+from uuvtai.native.launch import quick_launch
 
 _SLOWEST_M_S = 0.1
 _NEW_BEND_M = 0.3
@@ -33,7 +33,6 @@ _BACK_COS = -0.9
 
 
 @quick_launch
-@without_cse
 @ti.kernel
 def reset_past(io: Bundle[PastIO]):
     """Remember nothing in the awake rows."""
@@ -50,7 +49,6 @@ def reset_past(io: Bundle[PastIO]):
 
 
 @quick_launch
-@without_cse
 @ti.kernel
 def remember_past(io: Bundle[PastIO]):
     """After each tracked scan: where the tracks are, and where they turned. A new track remembers nothing."""
@@ -64,7 +62,6 @@ def remember_past(io: Bundle[PastIO]):
 
 
 @quick_launch
-@without_cse
 @ti.kernel
 def describe_motion(io: Bundle[PastIO]):
     """In decision steps: the columns of every track that has a forecast."""

@@ -20,7 +20,7 @@ from uuvtai.kernels.core.geometry import quaternion_wb, rotation_wb, wrapped_ang
 from uuvtai.kernels.core.signature import Bundle, spread
 from uuvtai.kernels.perception.bundles import PoseIO
 from uuvtai.kernels.perception.wall_fix import seen_walls
-from uuvtai.native.launch import quick_launch, without_cse
+from uuvtai.native.launch import quick_launch
 
 _N = 9
 """Numbers of the horizontal filter,"""
@@ -62,7 +62,6 @@ def reset_pose(io: Bundle[PoseIO]):
 
 
 @quick_launch
-@without_cse
 @ti.kernel
 def predict_pose(io: Bundle[PoseIO]):
     """Move both filters to this step, take in DVL and pressure, and say where the vehicle is: the sonar's
@@ -88,7 +87,6 @@ def predict_pose(io: Bundle[PoseIO]):
 
 
 @quick_launch
-@without_cse
 @ti.kernel
 def correct_pose(io: Bundle[PoseIO]):
     """Take in the walls of a scan that has just come. Awake rows only."""

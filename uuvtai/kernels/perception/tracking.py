@@ -27,7 +27,7 @@ from uuvtai.kernels.perception.track_slots import (
 )
 from uuvtai.kernels.perception.track_update import update_tracks
 from uuvtai.kernels.perception.unseen import turn_back_rate, turned_back
-from uuvtai.native.launch import quick_launch, without_cse
+from uuvtai.native.launch import quick_launch, with_cse
 
 
 @quick_launch
@@ -69,6 +69,7 @@ def track_bodies(io: TrackingIO) -> None:
 
 
 @quick_launch
+@with_cse()
 @ti.kernel
 def take_scan(io: Bundle[TrackingIO]):
     """See whether a scan is due, and which of its beams may have hit a body."""
@@ -93,7 +94,6 @@ def cluster_beams(io: Bundle[TrackingIO]):
 
 
 @quick_launch
-@without_cse
 @ti.kernel
 def follow_bodies(io: Bundle[TrackingIO]):
     """Predict the tracks to the new ping, match them with clusters and correct them."""

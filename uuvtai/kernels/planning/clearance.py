@@ -39,7 +39,7 @@ from uuvtai.kernels.planning.clearance_keys import (
     squared_limit,
     window_reach,
 )
-from uuvtai.native.launch import quick_launch
+from uuvtai.native.launch import quick_launch, with_cse
 
 _FAR_COLS = 1 << 12
 """[cells] stands for "no site in this row"; its square fits an int32."""
@@ -325,6 +325,7 @@ def bring_up_to_date(env, slot, io: Bundle[ClearanceIO]):
 
 
 @quick_launch
+@with_cse()
 @ti.kernel
 def compute_clearance(io: Bundle[ClearanceIO]):
     """Clearance of every cell from the layer that the planner must avoid (``voronoi.use``), where it is

@@ -18,7 +18,7 @@ from uuvtai.kernels.core.signature import Bundle, spread
 from uuvtai.kernels.sensors.bundles import DepthIO
 from uuvtai.kernels.sensors.raycast import ball_span, disc_span, rim_distance, slab_span
 from uuvtai.native.gpu_shape import is_gpu_shaped
-from uuvtai.native.launch import quick_launch
+from uuvtai.native.launch import quick_launch, with_cse
 
 _BLOCK = 36
 """Image rows per loop item on a CPU: bodies are projected once per item."""
@@ -56,6 +56,7 @@ def reset_depth(io: Bundle[DepthIO]):
 
 
 @quick_launch
+@with_cse()
 @ti.kernel
 def cast_depth(io: Bundle[DepthIO]):
     """New image in the rows whose step is a multiple of period_steps (step 0 included); the others keep

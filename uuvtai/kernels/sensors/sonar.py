@@ -30,7 +30,7 @@ from uuvtai.kernels.sensors.sonar_error import (
     start_cloud,
 )
 from uuvtai.native.gpu_shape import is_gpu_shaped
-from uuvtai.native.launch import quick_launch
+from uuvtai.native.launch import quick_launch, with_cse
 
 _FALLOFF = 0.9
 """Intensity = cosine of incidence x (1 - 0.9 r / maximum range): Lambert's law and what gain control leaves
@@ -84,6 +84,7 @@ def clear_memory(env, io: Bundle[SonarIO]):
 
 
 @quick_launch
+@with_cse(lambda io: io.sonar_cfg.detector != "none")
 @ti.kernel
 def cast_sonar(io: Bundle[SonarIO]):
     """Ping where a ping is due, deliver what is due; ``scan.fresh`` is 1 only in the step of delivery.

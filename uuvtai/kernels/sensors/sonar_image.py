@@ -33,13 +33,14 @@ from uuvtai.multibeam import (
     noise_power,
     pad_beams,
 )
-from uuvtai.native.launch import quick_launch
+from uuvtai.native.launch import quick_launch, with_cse
 
 _WALL, _FLOOR, _SURFACE = -1, -2, -3
 """surfaces that are no body"""
 
 
 @quick_launch
+@with_cse()
 @ti.kernel
 def hear(io: Bundle[SonarIO]):
     """Fill ``heard`` of the awake rows whose sonar pings in this step."""

@@ -15,12 +15,11 @@ from uuvtai.kernels.teacher.trajectories import (
     static_depths,
     tuned,
 )
-from uuvtai.native.launch import quick_launch, without_cse
+from uuvtai.native.launch import quick_launch
 from uuvtai.tuned_numbers import BURST, CHANGE, CONTACT, DEVIATION, HEAVE, MEAN, PEAK, SOFTNESS, STATIC
 
 
 @quick_launch
-@without_cse
 @ti.kernel
 def plan_evasion(io: Bundle[EvasionIO]):
     """Best evasive velocity of the envs with ``want_evade``: the softmax mean of the candidates where that is

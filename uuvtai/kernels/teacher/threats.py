@@ -14,7 +14,7 @@ from uuvtai.kernels.teacher.bundles import ThreatsIO
 from uuvtai.kernels.teacher.cruise_depth import choose_depth
 from uuvtai.kernels.teacher.sight import sight_share, sweep_share
 from uuvtai.kernels.teacher.trajectories import body_depths, drive_of, held_heave, place_doubt, tuned
-from uuvtai.native.launch import quick_launch, without_cse
+from uuvtai.native.launch import quick_launch
 from uuvtai.tuned_numbers import CALM, GAZE, TTC
 
 _PATH_SAMPLES = 8
@@ -26,7 +26,6 @@ _NEARER_M = 0.2
 
 
 @quick_launch
-@without_cse
 @ti.kernel
 def assess_threats(io: Bundle[ThreatsIO]):
     """Fill the blackboard, and decide which envs must plan an evasion in this step."""

@@ -14,11 +14,10 @@ from uuvtai.kernels.core.signature import Bundle, Const, FloatMatrix, In, Out, s
 from uuvtai.kernels.vehicle.bundles import ActuationIO
 from uuvtai.kernels.vehicle.lost_thruster import is_watched, vertical_pair
 from uuvtai.kernels.vehicle.rotor import rpm_of_thrust, thrust_limits, thrust_of_rpm
-from uuvtai.native.launch import quick_launch, without_cse
+from uuvtai.native.launch import quick_launch
 
 
 @quick_launch
-@without_cse
 @ti.kernel
 def command_thrusters(io: Bundle[ActuationIO], action: FloatMatrix):
     """action (n_env, 4): surge, sway, heave, yaw rate in [-1, 1] of the vehicle's limits ->

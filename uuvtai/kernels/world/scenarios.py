@@ -16,11 +16,10 @@ from uuvtai.kernels.world.bodies import first_moving, put_body
 from uuvtai.kernels.world.bundles import WorldIO
 from uuvtai.kernels.world.layout import draw_layout
 from uuvtai.kernels.world.paths import draw_moving_bodies, path_point, polyline_length
-from uuvtai.native.launch import quick_launch, without_cse
+from uuvtai.native.launch import quick_launch
 
 
 @quick_launch
-@without_cse
 @ti.kernel
 def generate_scenarios(io: Bundle[WorldIO]):
     """Draw start, goal, static and moving obstacles of every awake row; ``move_obstacles`` then puts the
