@@ -2,7 +2,8 @@
 (today's ``residual``), 1,024 envs with nominal sensing.
 
 Whole commands of a few iterations, in turns; the first iteration of each is left out, for it begins episodes
-and allocates. What counts is the time that the other iterations took to simulate, infer and learn.
+and allocates. What counts is the time that the other iterations took to simulate, infer and learn. The same
+recipe with hidden layers in bfloat16 (``ppo.bfloat16=true``) is in the same turns.
 """
 
 from __future__ import annotations
@@ -32,13 +33,15 @@ def measure(job: Job) -> list[Row]:
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         commit, tree = stack.enter_context(checked_out(job.against or "HEAD", folder / "tree"))
-        sides = Side(ROOT, folder / "ours"), Side(tree, folder / "theirs")
-        for i, side in enumerate(sides):  # what is new to the caches
-            _iterations(side, options, f"first{i}")
-        found: list[list[dict[str, float]]] = [[], []]
+        ours, theirs = Side(ROOT, folder / "ours"), Side(tree, folder / "theirs")
+        plays = (ours, options), (theirs, options), (ours, [*options, "--set", "ppo.bfloat16=true"])
+        for i, (side, told) in enumerate(plays):  # what is new to the caches
+            _iterations(side, told, f"first{i}")
+        found: list[list[dict[str, float]]] = [[] for _ in plays]
         for turn in range(1 if job.quick else _TURNS):
-            for i in (0, 1) if turn % 2 else (1, 0):
-                found[i] += _iterations(sides[i], options, f"turn{turn}")
+            for i in range(len(plays))[:: 1 if turn % 2 else -1]:
+                side, told = plays[i]
+                found[i] += _iterations(side, told, f"turn{turn}_{i}")
             job.say(f"turn {turn + 1}")
     return _rows(found, commit)
 
@@ -52,14 +55,17 @@ def _iterations(side: Side, options: list[str], run: str) -> list[dict[str, floa
 
 
 def _rows(found: list[list[dict[str, float]]], commit: str) -> list[Row]:
-    ours, theirs = (_median(side, "time/env_steps_per_s") for side in found)
-    told = {name: [row["time/env_steps_per_s"] for row in side]
-            for name, side in zip(("ours", "theirs"), found, strict=True)}  # fmt: skip
+    rate = "time/env_steps_per_s"
+    ours, theirs, coarse = (_median(side, rate) for side in found)
+    told = {name: [row[rate] for row in side]
+            for name, side in zip(("ours", "theirs", "bfloat16"), found, strict=True)}  # fmt: skip
     rows = [Row("training, nominal sensing", ours, "env-steps/s", theirs, commit, floor=1.3, floor_on="ratio",
-                details=told)]  # fmt: skip
+                details=told),
+            Row("training, hidden layers in bfloat16", coarse, "env-steps/s", theirs, commit)]  # fmt: skip
     for part in _PARTS:
-        ours, theirs = (_median(side, f"time/{part}_s") for side in found)
+        ours, theirs, coarse = (_median(side, f"time/{part}_s") for side in found)
         rows.append(Row(f"an iteration: {part}", ours, "s", theirs, commit, less_is_better=True))
+        rows.append(Row(f"in bfloat16: {part}", coarse, "s", theirs, commit, less_is_better=True))
     return rows
 
 
