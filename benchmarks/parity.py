@@ -30,7 +30,7 @@ from uuvtai.outcomes import RUNNING, SUCCESS
 from uuvtai.scenario import Scene
 from uuvtai.sim import Sim
 from uuvtai.statistics import wilson_interval
-from uuvtai.twin.scenario_bank import ScenarioBank, draw_bank, scenario_rows
+from uuvtai.twin.scenario_bank import draw_bank, scenario_rows
 from uuvtai.twin.twin_arrays import AT_POS
 from uuvtai.twin.twin_world import Twin
 
@@ -166,8 +166,9 @@ def in_twin(
     while (outcome == RUNNING).any():
         rows, view = np.flatnonzero(outcome == RUNNING), twin.look()
         now_s, own = twin.time_s.numpy()[rows].copy(), twin.ego[:, AT_POS : AT_POS + 2].numpy()[rows]
-        moved = errors.add(own, twin_tracks(twin)[rows], bodies_at(bank, rows, now_s))
-        births.add(rows, now_s, *moved)
+        if now_s.any():  # nothing is tracked at the start
+            moved = errors.add(own, twin_tracks(twin)[rows], true_bodies(bank.path.numpy()[rows], now_s))
+            births.add(rows, now_s, *moved)
         _, now = twin.step(actor(view.bodies, view.own).clamp(-MOST_WISH, MOST_WISH))
         ended = rows[now.numpy()[rows] != RUNNING]
         outcome[ended] = now.numpy()[ended]
@@ -179,11 +180,6 @@ def twin_tracks(twin: Twin) -> np.ndarray:
     """(N, lanes, 4) of the tracks that the policy is shown; NaN = none."""
     there = twin.view.bodies[..., :1].numpy() > 0.5
     return np.where(there, twin.track[..., :4].numpy(), np.nan)
-
-
-def bodies_at(bank: ScenarioBank, rows: np.ndarray, now_s: np.ndarray) -> np.ndarray:
-    """(n, lanes, 4) x, y, vx, vy of the true bodies of these scenarios at times (n,)."""
-    return true_bodies(bank.path.numpy()[rows], now_s)
 
 
 def true_bodies(path: np.ndarray, now_s: np.ndarray) -> np.ndarray:
@@ -202,18 +198,18 @@ class TrackWatcher:
         self._errors = errors
         self._playing = np.zeros(sim.num_envs, bool)
         self._age = np.zeros(sim.num_envs, int)
-        self._path = np.zeros(0)
-        self._births = Births(errors, sim.num_envs, scenario_rows(sim)[1].shape[1])
+        self._path, self._is_new = scenario_rows(sim)[1], False
+        self._births = Births(errors, sim.num_envs, self._path.shape[1])
 
-    def begin(self, sim: Sim, row: int, _job: Episode) -> None:
+    def begin(self, sim: Sim, row: int, job: Episode) -> None:
         """An episode has begun in this row."""
-        if self._playing.all() or not self._playing.any() or not len(self._path) or not self._playing[row]:
-            self._path = scenario_rows(sim)[1]
-        self._playing[row], self._age[row] = True, 0
+        self._playing[row], self._age[row], self._is_new = True, 0, True
 
     def step(self, sim: Sim) -> None:
         """A control step has been done."""
         self._age += self._playing
+        if self._is_new:
+            self._path, self._is_new = scenario_rows(sim)[1], False
         rows = np.flatnonzero(self._playing & (self._age % HOLD_STEPS == 0))
         if len(rows):
             now_s = self._age[rows] * STEP_S
@@ -221,22 +217,21 @@ class TrackWatcher:
             moved = self._errors.add(own, tracks, true_bodies(self._path[rows], now_s))
             self._births.add(rows, now_s, *moved)
 
-    def end(self, _sim: Sim, row: int, _result: EpisodeResult) -> None:
+    def end(self, sim: Sim, row: int, result: EpisodeResult) -> None:
         """The episode of this row is over."""
         self._playing[row] = False
         self._births.end(np.array([row]))
 
 
 def sim_tracks(sim: Sim, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(own places (n, 2), tracks (n, t, 4)) that a policy is shown; NaN = none. Both have the error of the
-    own position, which belongs to the stack."""
+    """(true own places (n, 2), tracks (n, t, 4) as the policy is shown them from there); NaN = none. The
+    error of the own position is in neither."""
     s, envs = sim.s, [int(row) for row in rows]
     there = sim.rows(s.forecast.radius_m, envs)[..., :1] >= 0
     place, speed = sim.rows(s.forecast.pos_w, envs)[:, :, 0], sim.rows(s.tracks.state, envs)[..., 2:]
-    return (
-        sim.rows(s.ego.pos_w, envs)[:, :2],
-        np.where(there, np.concatenate([place, speed], axis=-1), np.nan),
-    )
+    own, believed = (sim.rows(part, envs)[:, :2] for part in (s.vehicle.pos_w, s.ego.pos_w))
+    place = place + (own - believed)[:, None]
+    return own, np.where(there, np.concatenate([place, speed], axis=-1), np.nan)
 
 
 def in_simulator(
@@ -244,7 +239,8 @@ def in_simulator(
 ) -> tuple[np.ndarray, TrackErrors]:
     """(successes (count,), errors of the tracks) in the simulator."""
     errors, episodes = TrackErrors(), [Episode(SEED, i, scene) for i in range(count)]
-    results, _ = run_episodes(sim, episodes, TrackWatcher(sim, errors), driver=set_pilot_of(checkpoint, sim))
+    pilot: Any = set_pilot_of(checkpoint, sim)
+    results, _ = run_episodes(sim, episodes, TrackWatcher(sim, errors), driver=pilot)
     return np.array([result.outcome == "success" for result in results]), errors
 
 

@@ -266,17 +266,17 @@ def rates(counts: np.ndarray) -> dict[str, float]:
     """False alarms and misses with their 95 % intervals."""
     sums = counts.sum(0)
     many = _resampled(counts)
-    false, missed = many[:, 1] / many[:, 0], many[:, 3] / np.maximum(many[:, 2], 1)
+    false, missed = many[:, 1] / np.maximum(many[:, 0], 1), many[:, 3] / np.maximum(many[:, 2], 1)
     (low, high), (few, most) = (np.quantile(each, [0.025, 0.975]).tolist() for each in (false, missed))
     return {
-        "false alarms": sums[1] / sums[0],
+        "false alarms": float(sums[1] / sums[0]),
         "low": low,
         "high": high,
-        "missed": sums[3] / max(sums[2], 1),
+        "missed": float(sums[3] / max(sums[2], 1)),
         "missed low": few,
         "missed high": most,
-        "accidents": sums[2],
-        "safe moments": sums[0],
+        "accidents": float(sums[2]),
+        "safe moments": float(sums[0]),
     }
 
 
