@@ -191,6 +191,13 @@ def true_bodies(path: np.ndarray, now_s: np.ndarray) -> np.ndarray:
 # -------------------------------------------------------------------------------------------------- simulator
 
 
+def moving_paths(sim: Sim) -> np.ndarray:
+    """(N, lanes, 16) of the moving bodies that are there; a lane that an earlier scene left has speed 0."""
+    body, path, _ = scenario_rows(sim)
+    path[body[:, -path.shape[1] :, 0] == 0, 4] = 0.0
+    return path
+
+
 class TrackWatcher:
     """Looks at the tracks of every playing row at every decision (``playing.EpisodeObserver``)."""
 
@@ -198,7 +205,7 @@ class TrackWatcher:
         self._errors = errors
         self._playing = np.zeros(sim.num_envs, bool)
         self._age = np.zeros(sim.num_envs, int)
-        self._path, self._is_new = scenario_rows(sim)[1], False
+        self._path, self._is_new = moving_paths(sim), False
         self._births = Births(errors, sim.num_envs, self._path.shape[1])
 
     def begin(self, sim: Sim, row: int, job: Episode) -> None:
@@ -209,7 +216,7 @@ class TrackWatcher:
         """A control step has been done."""
         self._age += self._playing
         if self._is_new:
-            self._path, self._is_new = scenario_rows(sim)[1], False
+            self._path, self._is_new = moving_paths(sim), False
         rows = np.flatnonzero(self._playing & (self._age % HOLD_STEPS == 0))
         if len(rows):
             now_s = self._age[rows] * STEP_S

@@ -187,3 +187,10 @@ def test_true_bodies_move_as_their_paths_say():
 def test_parity_asks_for_a_policy():
     with pytest.raises(SystemExit, match="--policy RUN"):
         parity.measure(Job(quick=True))
+
+
+def test_bodies_of_an_earlier_scene_are_none(monkeypatch):
+    body, path = np.zeros((1, 3, 8)), np.ones((1, 2, 16))
+    body[0, :2, 0] = 1.0  # one rests, one moves, the last lane is empty
+    monkeypatch.setattr(parity, "scenario_rows", lambda _sim: [body, path, None])
+    assert parity.moving_paths(None)[0, :, 4].tolist() == [1.0, 0.0]
