@@ -24,6 +24,8 @@ class Job:
     """measured time per side of a comparison"""
     against: str = ""
     """commit that ``before`` compares with; empty: the last one"""
+    policy: str = ""
+    """run folder of the policy that ``parity`` plays"""
     say: Callable[[str], None] = print
     """shows progress"""
 

@@ -31,6 +31,8 @@ if sys.path[0] == str(HERE):
 from benchmarks.common import Job, Row  # noqa: E402
 
 NOT_BENCHMARKS = ("__init__", "common", "mutations", "played", "run")
+NEED_POLICY = ("parity",)
+"""left out of a run of all where no --policy is given"""
 PEERS = (
     "mujoco",
     "opencv-python-headless",
@@ -64,6 +66,7 @@ def main() -> int:
         "--seconds", type=float, help="measured time per side of a comparison [s] (default 4)"
     )
     parser.add_argument("--against", default="", help="commit for before (default: HEAD)")
+    parser.add_argument("--policy", default="", help="run folder for parity (uuv train twin)")
     parser.add_argument("--out", type=Path, help="folder of the results (default benchmarks/results)")
     parser.add_argument("--worker", help=argparse.SUPPRESS)
     chosen = parser.parse_args()
@@ -73,7 +76,7 @@ def main() -> int:
     if chosen.worker:
         return _work(chosen)
     failed, started = [], time.perf_counter()
-    for name in chosen.what or names:
+    for name in chosen.what or [each for each in names if chosen.policy or each not in NEED_POLICY]:
         devices, threads, longest_s = _traits(name)
         if chosen.device not in devices:
             if chosen.what:
@@ -143,6 +146,7 @@ def _work(chosen: argparse.Namespace) -> int:
         sizes,
         seconds,
         chosen.against,
+        chosen.policy,
         say=lambda text: print(f"  {text}", file=sys.stderr, flush=True),
     )
     module = importlib.import_module(f"benchmarks.{name}")

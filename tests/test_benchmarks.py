@@ -2,6 +2,7 @@
 that is cheap to check."""
 
 import ast
+import json
 import math
 import subprocess
 import sys
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import before, dynamics, mutants, mutations, run, tick
+from benchmarks import before, dynamics, mutants, mutations, parity, risk, run, tick
 from benchmarks.common import Job, Row, seconds_per_call
 from benchmarks.peers.vehicle_arrays import Vehicles
 from uuvtai.config import Config
@@ -127,3 +128,69 @@ def test_what_differs_from_a_commit_is_counted_on_both_sides():
     assert (same.ours, same.met) == (0, True)
     row = before._equal("arrays", {"a": "1", "b": "2", "new": "3"}, {"a": "1", "b": "x", "gone": "3"}, "abc")
     assert (row.ours, row.met, row.details["differ"]) == (3, False, ["b", "gone", "new"])
+
+
+# -------------------------------------------------------------------------------------- risk alarm and parity
+
+
+def watched(score):
+    """Two accidents of four dangerous moments each, and two quiet episodes of five safe moments; the first
+    peer says ``score``."""
+    event = torch.tensor([True] * 8 + [False] * 10)
+    episode = torch.tensor([0] * 4 + [1] * 4 + [2] * 5 + [3] * 5)
+    peers = torch.zeros(18, len(risk.PEERS))
+    peers[:, 0] = torch.tensor(score)
+    return risk.Watched(torch.zeros(18, 2), peers, event, episode, 4, 2, torch.zeros(18))
+
+
+def test_false_alarms_and_misses_are_counted_by_episode():
+    score = [0.1, 0.2, 0.9, 0.3] + [0.1, 0.1, 0.2, 0.1] + [0.6, 0.6, 0.0, 0.0, 0.0] + [0.0] * 5
+    seen = watched(score)
+    worst, episode = risk.accident_scores("all of the last", seen, seen.peers[:, 0])
+    assert dict(zip(episode.tolist(), worst.tolist(), strict=True)) == pytest.approx({0: 0.9, 1: 0.2})
+    counts = risk.counted("all of the last", seen, seen.peers[:, 0], 0.5)
+    assert counts.tolist() == [[0, 0, 1, 0], [0, 0, 1, 1], [5, 2, 0, 0], [5, 0, 0, 0]]
+    found = risk.rates(counts)
+    assert (found["false alarms"], found["missed"], found["safe moments"]) == (0.2, 0.5, 10)
+    assert found["low"] <= 0.2 <= found["high"]
+    assert json.dumps(found)
+    one, _ = risk.accident_scores("a moment", seen, seen.peers[:, 0])
+    assert len(one) == 2 and set(one.tolist()) <= set(seen.peers[:8, 0].tolist())
+
+
+def test_track_errors_are_those_of_the_nearest_track_within_reach():
+    errors, gone = parity.TrackErrors(), [np.nan] * 4
+    bodies = np.array([[[1.0, 0.0, 1.0, 0.0], [0.0, 3.0, 0.0, 0.0], [9.0, 0.0, 0.0, 0.0], gone]])
+    tracks = np.array([[[1.1, 0.0, 1.0, 0.3], [0.0, 4.5, 0.0, 0.0], gone, [9.0, 0.0, 0.0, 0.0]]])
+    near, found = errors.add(np.zeros((1, 2)), tracks, bodies)
+    assert near.tolist() == [[True, True, False, False]] and found.tolist() == [[True, False, False, False]]
+    births = parity.Births(errors, 1, 4)
+    births.add(np.array([0]), np.array([0.1]), near, np.zeros_like(found))
+    births.add(np.array([0]), np.array([0.4]), near, found)
+    births.end(np.array([0]))
+    said = errors.summary()
+    assert said["position error, median"] == pytest.approx(0.1)
+    assert said["velocity error, p90"] == pytest.approx(0.3)
+    assert (said["bodies tracked"], said["never tracked"]) == (0.5, 0.5)
+    assert errors.delay_s == pytest.approx([0.3])
+
+
+def test_true_bodies_move_as_their_paths_say():
+    path = np.zeros((1, 2, 16))
+    path[0, 0, :5] = 0, 2.0, 4 * np.pi, 0.0, 0.5  # a circle of radius 2 around (1, 1), half a metre a second
+    path[0, 0, 5:7] = 1.0, 1.0
+    (body, none) = parity.true_bodies(path, np.array([0.0]))[0]
+    np.testing.assert_allclose(body, [3.0, 1.0, 0.0, 0.5], atol=1e-3)
+    assert np.isnan(none).all()
+
+
+def test_parity_asks_for_a_policy():
+    with pytest.raises(SystemExit, match="--policy RUN"):
+        parity.measure(Job(quick=True))
+
+
+def test_bodies_of_an_earlier_scene_are_none(monkeypatch):
+    body, path = np.zeros((1, 3, 8)), np.ones((1, 2, 16))
+    body[0, :2, 0] = 1.0  # one rests, one moves, the last lane is empty
+    monkeypatch.setattr(parity, "scenario_rows", lambda _sim: [body, path, None])
+    assert parity.moving_paths(None)[0, :, 4].tolist() == [1.0, 0.0]

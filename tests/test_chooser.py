@@ -11,8 +11,9 @@ from tests.test_architecture import TRUTH
 from uuvtai.binding import members_of
 from uuvtai.errors import UserError
 from uuvtai.learn import checkpoint
+from uuvtai.learn.arrival_net import POLICY, TREE, ArrivalNet
 from uuvtai.learn.checkpoint import CheckpointError
-from uuvtai.learn.chooser import POLICY, TREE, ArrivalNet, ChooserPilot, load_chooser
+from uuvtai.learn.chooser import ChooserPilot, load_chooser
 from uuvtai.learn.chooser_columns import AT_LATER, wished, with_approach
 from uuvtai.learn.chooser_memory import ChooserMemory, Tick, moments_of_episodes
 from uuvtai.learn.chooser_trainer import ChooserTrainer
@@ -23,8 +24,8 @@ from uuvtai.loader import load_training
 from uuvtai.measure.episodes.playing import jobs_of, run_episodes
 from uuvtai.measure.evaluate.hand_overs import hand_overs_of, told
 from uuvtai.twin.observer import SET_TABLE
-from uuvtai.twin.set_columns import BODY_WIDTH, EGO_COLUMNS
-from uuvtai.twin.tree_columns import CHOOSER_TABLE, TREE_WIDTH, TreeColumnsIO
+from uuvtai.twin.set_codes import BODY_WIDTH, EGO_COLUMNS, TREE_WIDTH
+from uuvtai.twin.tree_columns import CHOOSER_TABLE, TreeColumnsIO
 from uuvtai.twin.twin_arrays import ObserverIO
 
 NET = {"twin.body_hidden": 8, "twin.head_hidden": 8}
@@ -338,8 +339,8 @@ def test_networks_that_cannot_choose_are_refused(small, saved, change, says):
         load_chooser(saved(change), small.sim)
 
 
-def test_it_is_not_exported_and_is_no_policy_of_the_twin(small, saved, policy):
-    with pytest.raises(CheckpointError, match="cannot be exported yet"):
+def test_it_is_no_policy_of_one_observation_and_no_policy_of_the_twin(small, saved, policy):
+    with pytest.raises(CheckpointError, match="looks at the simulator itself"):
         load_pilot(saved(), 1)
     with pytest.raises(CheckpointError, match="observation table"):
         load_set_pilot(saved(), small.sim)

@@ -26,7 +26,7 @@ from tests import report_samples as samples
 from tests import test_deploy as deployed
 from tests.command import run_cli
 from tests.reference import logs as episode
-from uuvtai.deploy import run_policy
+from uuvtai.deploy import run_policy, run_set_policy
 from uuvtai.deploy.agreement import of_onnx
 from uuvtai.errors import UserError
 from uuvtai.learn import checkpoint
@@ -167,7 +167,7 @@ OWN_FILES = {
     "logs/container.py": "os.open",
     "logs/film.py": "os.open, av.open",
     "native/keys.py": "path.read_bytes",
-    "deploy/export.py": "Path(run_policy.__file__).read_bytes",
+    "deploy/export.py": "Path(module.__file__ or '').read_bytes",
     "aboard/cross.py": "out.read_bytes",
     "aboard/stack_folder.py": "(_ROOT / name).read_text",
     "example_files.py": "source.read_bytes",
@@ -987,10 +987,11 @@ def test_names_in_a_log_cannot_steer_the_terminal(here, capfd):
 
 
 def test_the_reader_of_safetensors_is_the_only_one_that_run_policy_has():
-    """The driver that goes to the vehicle reads with NumPy; it must not have a way to load pickles."""
+    """The drivers that go to the vehicle read with NumPy; they must not have a way to load pickles."""
     names = {
         ast.unparse(node.func)
-        for node in ast.walk(ast.parse(Path(run_policy.__file__).read_text()))
+        for module in (run_policy, run_set_policy)
+        for node in ast.walk(ast.parse(Path(module.__file__).read_text()))
         if isinstance(node, ast.Call)
     }
     assert not names & {"np.load", "np.lib.format.read_array", "pickle.load", "pickle.loads"}

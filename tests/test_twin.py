@@ -27,7 +27,7 @@ from uuvtai.loader import ConfigError, load_training
 from uuvtai.measure.episodes.playing import jobs_of, run_episodes
 from uuvtai.twin import hull_rule, kinematics, observer, sensing_model
 from uuvtai.twin.scenario_bank import ScenarioBank, draw_bank, scenario_rows
-from uuvtai.twin.set_columns import BODY_WIDTH, EGO_COLUMNS
+from uuvtai.twin.set_codes import BODY_WIDTH, EGO_COLUMNS
 from uuvtai.twin.twin_arrays import ObserverIO, TwinRules
 
 CLEARANCE_TOL_M = 0.01
@@ -300,8 +300,8 @@ def test_the_trainer_knows_how_long_the_twin_holds_a_decision():
     assert twin_trainer.DECISION_S == sensing_model.DT_S
 
 
-def test_it_is_not_exported_yet(saved):
-    with pytest.raises(CheckpointError, match="cannot be exported yet"):
+def test_it_is_no_policy_of_one_observation(saved):
+    with pytest.raises(CheckpointError, match="looks at the simulator itself"):
         load_pilot(saved(), 1)
 
 

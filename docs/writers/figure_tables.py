@@ -569,6 +569,78 @@ def risk_bins(sources: Sources) -> str:
     return text_table(rows[0], rows[1:])
 
 
+def risk_alarms(sources: Sources) -> str:
+    """The risk alarm on the tree's episodes beside thresholds, for both ways to miss an accident."""
+    rows = []
+    for row in sources.benchmark("risk")["rows"]:
+        if not row["what"].startswith("false alarms"):
+            continue
+        table = row["details"]["table"]
+        for name in table["false alarms"]:
+            at = {column: values[name] for column, values in table.items()}
+            rows.append(
+                [
+                    row["what"].removeprefix("false alarms, missed by "),
+                    name,
+                    f"{_percent(at, 'false alarms')} [{_percent(at, 'low')}, {_percent(at, 'high')}]",
+                    *(_percent(at, f"false alarms {world}") for world in ("gauntlet", "pool")),
+                    f"{_percent(at, 'missed')} [{_percent(at, 'missed low')}, {_percent(at, 'missed high')}]",
+                ]
+            )
+    return text_table(["missed by", "alarm", "false alarms, %", "gauntlet", "pool", "missed, %"], rows)
+
+
+def _percent(values: dict[str, float], name: str) -> str:
+    return f"{100 * values[name]:.1f}"
+
+
+def parity_success(sources: Sources) -> str:
+    """Success of one policy in twin and simulator."""
+    rows = []
+    for row in sources.benchmark("parity")["rows"]:
+        if row["what"].startswith("success"):
+            at = row["details"]
+            shares = [
+                f"{100 * side['success'] / side['episodes']:.1f} % [{100 * side['interval'][0]:.1f}, "
+                f"{100 * side['interval'][1]:.1f}]"
+                for side in (at["twin"], at["simulator"])
+            ]
+            low, high = at["difference"] - at["half"], at["difference"] + at["half"]
+            rows.append(
+                [
+                    row["what"].removeprefix("success, "),
+                    *shares,
+                    f"{at['difference']:+.1f} [{low:+.1f}, {high:+.1f}]",
+                    f"{at['only twin']}, {at['only simulator']}",
+                    "yes" if abs(at["difference"]) <= 3 else "**no**",
+                ]
+            )
+    heads = ["scene", "twin", "simulator", "difference, points", "only twin, only simulator", "within 3"]
+    return text_table(heads, rows)
+
+
+_TRACKS = {
+    "position error": ("position error, m", ".3f"),
+    "velocity error": ("velocity error, m/s", ".2f"),
+    "birth delay": ("birth delay, s", ".1f"),
+}
+
+
+def parity_tracks(sources: Sources) -> str:
+    """Errors of the tracks in twin and simulator, median and 90th percentile."""
+    rows = []
+    for row in sources.benchmark("parity")["rows"]:
+        for side, values in row["details"].get("tracks", {}).items():
+            pairs = [
+                f"{values[f'{name}, median']:{form}}, {values[f'{name}, p90']:{form}}"
+                for name, (_, form) in _TRACKS.items()
+            ]
+            shares = [_percent(values, name) for name in ("bodies tracked", "never tracked")]
+            rows.append([row["what"].removeprefix("tracks, "), side, *pairs, *shares])
+    heads = [head for head, _ in _TRACKS.values()]
+    return text_table(["scene", "", *heads, "tracked within 6 m, %", "never tracked, %"], rows)
+
+
 def _row(sources: Sources, what: str, text: str) -> dict[str, Any]:
     return next(row for row in sources.benchmark(what)["rows"] if row["what"] == text)
 
@@ -604,6 +676,9 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         world_model_switches,
         risk,
         risk_bins,
+        risk_alarms,
+        parity_success,
+        parity_tracks,
         pose_endings,
         pose_errors,
         replayed,

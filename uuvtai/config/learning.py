@@ -137,7 +137,8 @@ class WorldModelConfig(Section):
 
 
 class RiskConfig(Section):
-    """Head that predicts the probability of a collision or TTC stop soon."""
+    """Head that predicts the probability of a collision or TTC stop soon. Its alarm is not useful so far: as
+    many false ones as of a threshold of the time to collision, roughly (``docs/learning.md``)."""
 
     enabled: bool = False
     horizon_s: Positive = 2.0

@@ -3,17 +3,18 @@ decision."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 import torch
 
-from uuvtai.deploy import onnx_session, run_policy
+from uuvtai.deploy import onnx_session, run_policy, run_set_policy
 from uuvtai.deploy.golden import TOLERANCE, Arrays, inputs_of
-from uuvtai.deploy.graph import OUTPUTS, OneDecision
+from uuvtai.deploy.graph import INPUTS, OUTPUTS, ExportedModule
 from uuvtai.deploy.graph_check import GraphError, refuse_strange
+from uuvtai.deploy.set_graph import SET_OUTPUTS
 
 
 @dataclass(frozen=True)
@@ -45,10 +46,18 @@ def of_numpy(policy: run_policy.Policy, golden: Arrays) -> Agreement:
     return Agreement("NumPy", worst, **run_policy.decision_latency_ms(policy, golden["obs"]))
 
 
-def of_torch(decision: OneDecision, golden: Arrays) -> Agreement:
+def of_set_numpy(
+    policy: run_set_policy.SetPolicy | run_set_policy.TrackForecast, golden: Arrays
+) -> Agreement:
+    """``run_set_policy.py`` answers the golden inputs."""
+    worst = run_set_policy.differences(policy, golden)
+    return Agreement("NumPy", worst, **run_set_policy.latency_ms(policy, golden))
+
+
+def of_torch(decision: ExportedModule, golden: Arrays) -> Agreement:
     """The networks themselves, one decision at a time without memory, against the pilot that flew the golden
     mission with its own."""
-    tensors = [torch.from_numpy(array) for array in inputs_of(golden).values()]
+    tensors = [torch.from_numpy(array) for array in inputs_of(golden, decision.inputs).values()]
     rows = [[tensor[i : i + 1] for tensor in tensors] for i in range(len(tensors[0]))]
     with torch.inference_mode():
         outputs = [torch.cat(parts).numpy() for parts in zip(*(decision(*row) for row in rows), strict=True)]
@@ -58,10 +67,12 @@ def of_torch(decision: OneDecision, golden: Arrays) -> Agreement:
     )
 
 
-def of_onnx(graph: bytes, golden: Arrays) -> Agreement:
-    """ONNX Runtime on one thread. Raises GraphError for a graph that is not ours or that it cannot use."""
-    inputs = inputs_of(golden)
-    if not all(array.ndim and 0 < len(array) == len(inputs["obs"]) for array in inputs.values()):
+def of_onnx(graph: bytes, golden: Arrays, names: Iterable[str] = INPUTS) -> Agreement:
+    """ONNX Runtime on one thread, told the golden inputs of these names. Raises GraphError for a graph that
+    is not ours or that it cannot use."""
+    inputs = inputs_of(golden, names)
+    count = {len(array) if array.ndim else 0 for array in inputs.values()}
+    if len(count) != 1 or 0 in count:
         raise GraphError("its golden pairs are no rows of inputs")
     refuse_strange(graph, {name: array.shape for name, array in inputs.items()}, run_policy.CALLS)
     try:
@@ -70,14 +81,14 @@ def of_onnx(graph: bytes, golden: Arrays) -> Agreement:
         outputs = [np.asarray(output) for output in session.run(names, inputs)]
     except Exception as error:  # its own errors share no base class beyond this
         raise GraphError(f"ONNX Runtime cannot use it ({error})") from None
-    rows = [{name: array[i : i + 1] for name, array in inputs.items()} for i in range(len(inputs["obs"]))]
+    rows = [{name: array[i : i + 1] for name, array in inputs.items()} for i in range(count.pop())]
     found = _differences(dict(zip(names, outputs, strict=True)), golden)
     return Agreement("ONNX Runtime", found, **_in_turn(lambda row: session.run(names, row), rows))
 
 
 def _differences(found: Arrays, golden: Arrays) -> dict[str, float]:
     """Of every output that the golden pairs have; one that is missing differs without end."""
-    wanted = [name for name in OUTPUTS if f"pair_{name}" in golden]
+    wanted = [name for name in (*OUTPUTS, *SET_OUTPUTS) if f"pair_{name}" in golden]
     return {
         name: run_policy.difference(found[name], golden[f"pair_{name}"]) if name in found else np.inf
         for name in wanted

@@ -20,9 +20,6 @@ simulator of uuvtai {version}.
 ## How it did
 {results}
 
-Rates are counts with 95 % Wilson intervals. Collision counts contacts, time-to-collision stops and leaving
-the tank.
-
 ## How to run it
 `python run_policy.py` (NumPy alone) replays the golden pairs and prints the latency. In a program:
 `load(folder)`, `reset()` when a mission begins, `act(observation)` at every control step ({control_hz:g} Hz).
@@ -44,6 +41,9 @@ means something else makes the policy worthless.
   thrusters.
 """
 
+_COUNTED = """
+Rates are counts with 95 % Wilson intervals. Collision counts contacts, time-to-collision stops and leaving
+the tank."""
 _RESIDUAL = (
     "it adds to the behaviour tree's action, which is part of the observation, so the tree has to "
     "run beside it."
@@ -66,8 +66,8 @@ def model_card(spec: dict[str, Any], checkpoint: Checkpoint, evaluations: list[E
     return _TEXT.format(
         name=spec["name"],
         version=checkpoint.manifest.version,
-        training=_training(checkpoint),
-        results=_results(checkpoint, evaluations),
+        training=training_text(checkpoint),
+        results=results_text(checkpoint, evaluations),
         control_hz=spec["rate"]["control_hz"],
         hold_steps=spec["rate"]["hold_steps"],
         residual=_RESIDUAL if is_residual else _PLAIN,
@@ -77,7 +77,8 @@ def model_card(spec: dict[str, Any], checkpoint: Checkpoint, evaluations: list[E
     )
 
 
-def _training(checkpoint: Checkpoint) -> str:
+def training_text(checkpoint: Checkpoint) -> str:
+    """How long, on what, and which checkpoint, as a list."""
     config, metrics = checkpoint.config, checkpoint.manifest.metrics
     steps = metrics.get("time/env_steps")
     trained = f"{checkpoint.step} iterations" + (
@@ -108,7 +109,8 @@ def _obstacles(config: LearningConfig) -> str:
     return f"Resting obstacles S, moving ones D, their speed v: {conditions}."
 
 
-def _results(checkpoint: Checkpoint, evaluations: list[Evaluation]) -> str:
+def results_text(checkpoint: Checkpoint, evaluations: list[Evaluation]) -> str:
+    """Counts of all evaluations as a table, and what they count."""
     own = during_training(checkpoint)
     rows = [(row, "") for row in evaluations] + (
         [(own, " (chose the checkpoint: too good by selection)")] if own else []
@@ -120,4 +122,4 @@ def _results(checkpoint: Checkpoint, evaluations: list[Evaluation]) -> str:
         )
     lines = ["| where | success | collision |", "|---|---|---|"]
     lines += ["| " + " | ".join((row.where + remark, *row.rates())) + " |" for row, remark in rows]
-    return "\n".join(lines)
+    return "\n".join([*lines, _COUNTED])

@@ -3,6 +3,7 @@ of such a folder."""
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import os
@@ -10,17 +11,23 @@ import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import safetensors.torch
+from torch import Tensor
 
-from uuvtai.deploy import onnx_session, run_policy
-from uuvtai.deploy.agreement import Agreement, of_numpy, of_onnx, of_torch
+from uuvtai.deploy import onnx_session, run_policy, run_set_policy
+from uuvtai.deploy.agreement import Agreement, of_numpy, of_onnx, of_set_numpy, of_torch
 from uuvtai.deploy.card import model_card
-from uuvtai.deploy.evaluations import evaluations_of
-from uuvtai.deploy.golden import golden_of, npz_bytes
-from uuvtai.deploy.graph import OneDecision, missing_packages, onnx_bytes
+from uuvtai.deploy.evaluations import Evaluation, evaluations_of
+from uuvtai.deploy.golden import Arrays, golden_of, npz_bytes
+from uuvtai.deploy.graph import INPUTS, ExportedModule, OneDecision, missing_packages, onnx_bytes
 from uuvtai.deploy.run_policy import FILES, GOLDEN, SPEC, WEIGHTS, PolicyError
+from uuvtai.deploy.set_card import set_card
+from uuvtai.deploy.set_golden import golden_rows
+from uuvtai.deploy.set_spec import set_specification
+from uuvtai.deploy.set_weights import kind_of, module_of, set_weights
 from uuvtai.deploy.spec import ONNX, specification
 from uuvtai.deploy.weights import weights_of
 from uuvtai.errors import UserError
@@ -77,8 +84,8 @@ def export(
     RunFolderError where the disk refuses.
     """
     _refuse_place(out, force)
-    pilot, rows = load_pilot(checkpoint, 1), evaluations_of(checkpoint, evaluations)
-    decision, golden, graph = OneDecision(pilot).eval(), golden_of(pilot), None
+    driver, rows = _driver_of(checkpoint, name), evaluations_of(checkpoint, evaluations)
+    decision, golden, graph = driver.decision, driver.golden, None
     if missing := missing_packages():
         note(
             f"left out {ONNX}: {', '.join(missing)} not installed. For an ONNX graph: pip install '{EXTRA}', "
@@ -86,15 +93,40 @@ def export(
         )
     else:
         graph = onnx_bytes(decision)
-    spec = specification(checkpoint, pilot, name, graph is not None)
+    spec = driver.spec(graph is not None)
     files = {
-        WEIGHTS: safetensors.torch.save(weights_of(pilot)),
+        WEIGHTS: safetensors.torch.save(driver.weights),
         GOLDEN: npz_bytes(golden),
-        "README.md": model_card(spec, checkpoint, rows).encode(),
-        "run_policy.py": Path(run_policy.__file__).read_bytes(),
+        "README.md": driver.card(spec, checkpoint, rows).encode(),
+        "run_policy.py": _source_of(run_policy),
     } | ({} if graph is None else {ONNX: graph})
+    if "kind" in spec:
+        files["run_set_policy.py"] = _source_of(run_set_policy)
     _publish(out, files, spec)
     return Export(out, (of_torch(decision, golden), *_replayed(out, run_policy.read_spec(out), note)))
+
+
+@dataclass(frozen=True)
+class _Driver:
+    """What of a checkpoint goes into a folder."""
+
+    decision: ExportedModule
+    golden: Arrays
+    weights: dict[str, Tensor]
+    spec: Callable[[bool], dict[str, Any]]
+    """of whether there is a graph"""
+    card: Callable[[dict[str, Any], Checkpoint, list[Evaluation]], str]
+
+
+def _driver_of(checkpoint: Checkpoint, name: str) -> _Driver:
+    """Raises CheckpointError for networks that cannot drive."""
+    if (kind := kind_of(checkpoint)) is None:
+        pilot = load_pilot(checkpoint, 1)
+        decision, spec = OneDecision(pilot), functools.partial(specification, checkpoint, pilot, name)
+        return _Driver(decision.eval(), golden_of(pilot), weights_of(pilot), spec, model_card)
+    decision = module_of(checkpoint, kind)
+    spec = functools.partial(set_specification, checkpoint, decision, kind, name)
+    return _Driver(decision.eval(), golden_rows(decision), set_weights(decision), spec, set_card)
 
 
 def check(folder: Path, note: Note) -> Export:
@@ -112,15 +144,25 @@ def check(folder: Path, note: Note) -> Export:
         raise ExportError(str(error)) from None
 
 
+def _source_of(module: ModuleType) -> bytes:
+    """A driver's own text."""
+    return Path(module.__file__ or "").read_bytes()
+
+
 def _replayed(folder: Path, spec: dict[str, Any], note: Note) -> list[Agreement]:
     """What NumPy and, where it is here, ONNX Runtime make of the folder's files."""
     golden = run_policy.read_golden(folder / GOLDEN)
     try:
-        found = [of_numpy(run_policy.Policy(spec, run_policy.read_safetensors(folder / WEIGHTS)), golden)]
+        arrays, names = run_policy.read_safetensors(folder / WEIGHTS), tuple(INPUTS)
+        if "kind" in spec:
+            policy = run_set_policy.made(spec, arrays)
+            found, names = [of_set_numpy(policy, golden)], policy.inputs
+        else:
+            found = [of_numpy(run_policy.Policy(spec, arrays), golden)]
         if ONNX not in spec["files"]:
             return found
         if onnx_session.is_installed():
-            return [*found, of_onnx(run_policy.content_of(folder / ONNX), golden)]
+            return [*found, of_onnx(run_policy.content_of(folder / ONNX), golden, names)]
     except (LookupError, ValueError, TypeError, AttributeError, ArithmeticError) as error:
         raise PolicyError(
             f"{folder}: its golden pairs do not fit its policy ({error!r}); export it again"

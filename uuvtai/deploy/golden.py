@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 import math
+from collections.abc import Iterable
 
 import numpy as np
 import torch
@@ -55,9 +56,9 @@ def npz_bytes(arrays: Arrays) -> bytes:
     return buffer.getvalue()
 
 
-def inputs_of(golden: Arrays) -> Arrays:
+def inputs_of(golden: Arrays, names: Iterable[str] = INPUTS) -> Arrays:
     """Inputs of the graph."""
-    return {name: golden[f"pair_{name}"] for name in INPUTS}
+    return {name: golden[f"pair_{name}"] for name in names}
 
 
 def _mission(pilot: Pilot) -> Tensor:

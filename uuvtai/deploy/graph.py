@@ -37,10 +37,27 @@ PACKAGES = ("onnx", "onnxscript")
 OPSET = 20
 
 
-class OneDecision(nn.Module):
+class ExportedModule(nn.Module):
+    """What is exported as a graph: inputs and outputs by name."""
+
+    inputs: dict[str, str]
+    """what each one is, in the order of ``forward``"""
+
+    @property
+    def outputs(self) -> list[str]:
+        """Names of what ``forward`` returns."""
+        raise NotImplementedError
+
+    def example(self) -> tuple[tuple[Tensor, ...], dict[str, dict[int, torch.export.Dim]]]:
+        """Inputs of two rows, and which of their axes may have any size."""
+        raise NotImplementedError
+
+
+class OneDecision(ExportedModule):
     """``Pilot`` for one decision: outputs by the names of OUTPUTS, without the last two where there is no
     risk head."""
 
+    inputs = INPUTS
     fill: Tensor
     """(n_obs,) what counts where a value is not finite"""
 
@@ -55,6 +72,12 @@ class OneDecision(nn.Module):
     def outputs(self) -> list[str]:
         """Names of what ``forward`` returns."""
         return list(OUTPUTS)[: 5 if self.risk is not None else 3]
+
+    def example(self) -> tuple[tuple[Tensor, ...], dict[str, dict[int, torch.export.Dim]]]:
+        """As in ``ExportedModule``."""
+        n_obs, rows = self.policy.n_in - N_FEATURES, torch.export.Dim("rows", min=1)
+        some = torch.zeros(2, n_obs), torch.zeros(2, n_obs), torch.zeros(2, NUM_ACTIONS)
+        return (*some, torch.tensor([True, False])), {name: {0: rows} for name in INPUTS}
 
     def forward(
         self, obs: Tensor, last_obs: Tensor, last_action: Tensor, has_last: Tensor
@@ -80,24 +103,17 @@ def missing_packages() -> list[str]:
     return [name for name in PACKAGES if importlib.util.find_spec(name) is None]
 
 
-def onnx_bytes(decision: OneDecision) -> bytes:
+def onnx_bytes(decision: ExportedModule) -> bytes:
     """The ONNX graph with its weights inside, any number of rows at once. Needs PACKAGES."""
     without_telemetry()
-    n_obs = decision.policy.n_in - N_FEATURES
-    example = (
-        torch.zeros(2, n_obs),
-        torch.zeros(2, n_obs),
-        torch.zeros(2, NUM_ACTIONS),
-        torch.tensor([True, False]),
-    )
-    rows = torch.export.Dim("rows", min=1)
+    example, sizes = decision.example()
     with _quiet():
         program = torch.onnx.export(
             decision.eval(),
             example,
-            input_names=list(INPUTS),
+            input_names=list(decision.inputs),
             output_names=decision.outputs,
-            dynamic_shapes={name: {0: rows} for name in INPUTS},
+            dynamic_shapes=sizes,
             opset_version=OPSET,
             dynamo=True,
             verbose=False,

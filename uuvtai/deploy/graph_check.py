@@ -11,7 +11,8 @@ from uuvtai.errors import UserError
 
 _OURS = """
 Add And Cast Clip Concat ConstantOfShape Div Elu Exp Floor GatherND Gemm Greater IsInf IsNaN Less Min Mul Not
-Pow ReduceMean Relu Shape Slice Softplus Split Sqrt Squeeze Sub Tanh Unsqueeze Where
+LogSoftmax Pow Reciprocal ReduceL2 ReduceMax ReduceMean ReduceMin Relu Shape Slice Softplus Split Sqrt Squeeze
+Sub Tanh Unsqueeze Where
 """
 _LIKE_OURS = """
 Abs Constant Equal Flatten Gather GreaterOrEqual Identity LessOrEqual Log MatMul Max Neg Or ReduceSum Reshape

@@ -32,8 +32,10 @@ import numpy as np
 SPEC, WEIGHTS, GOLDEN = "policy_spec.json", "policy.safetensors", "golden.npz"
 SCHEMA = 1
 """of the folder; another one is refused"""
-FILES = (WEIGHTS, GOLDEN, "policy.onnx", "README.md", "run_policy.py")
+FILES = (WEIGHTS, GOLDEN, "policy.onnx", "README.md", "run_policy.py", "run_set_policy.py")
 """names that the spec may list; nothing else is ever opened"""
+KINDS = ("set", "chooser", "forecast")
+"""of policies that ``run_set_policy.py`` drives by; a specification without ``kind`` is this file's"""
 N_TARGET, N_ACTION = 24, 4
 MAX_BYTES = 64 << 20
 """of any file of the folder: sixteen million parameters"""
@@ -93,7 +95,7 @@ class Policy:
             self._teacher = None if teacher is None else slice(int(teacher[0]), int(teacher[1]))
             self._a = arrays
             self._nets = {
-                name: _layers(arrays, name)
+                name: layers_of(arrays, name)
                 for name in ("actor", "critic", "encoder", "dynamics", "decoder", "risk")
             }
             self._check_widths()
@@ -229,10 +231,12 @@ def _softplus(x: np.ndarray) -> np.ndarray:
     return np.maximum(x, 0) + np.log1p(np.exp(-np.abs(x)))
 
 
-def _layers(arrays: Arrays, name: str) -> list[tuple[np.ndarray, np.ndarray]]:
+def layers_of(arrays: Arrays, name: str) -> list[tuple[np.ndarray, np.ndarray]]:
     """(weight, bias) of a network's layers in order; ValueError where one does not follow the other."""
     numbers = sorted(
-        int(key.split(".")[1]) for key in arrays if key.startswith(f"{name}.") and key.endswith(".weight")
+        int(key[len(name) + 1 :].partition(".")[0])
+        for key in arrays
+        if key.startswith(f"{name}.") and key.endswith(".weight")
     )
     layers = [(arrays[f"{name}.{i}.weight"], arrays[f"{name}.{i}.bias"]) for i in numbers]
     widths = [weight.shape[1] for weight, _ in layers[1:]]
@@ -250,6 +254,8 @@ def load(folder: str | Path = ".") -> Policy:
     """The policy of an exported folder, every file checked against its sha256. Raises PolicyError."""
     folder = Path(folder)
     spec = read_spec(folder)
+    if kind := spec.get("kind"):
+        raise PolicyError(f"{folder}: holds a policy of kind {kind!r}; drive by run_set_policy.py instead")
     if wrong := changed_files(folder, spec):
         raise PolicyError(f"{folder}: {'; '.join(wrong)}; export the policy again")
     return Policy(spec, read_safetensors(folder / WEIGHTS))

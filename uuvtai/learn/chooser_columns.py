@@ -32,7 +32,8 @@ def _approach(bodies: torch.Tensor, velocity: torch.Tensor) -> list[torch.Tensor
         gaps.append((4.0 * bodies[..., place] - seconds * own).norm(dim=-1) - reach)
     near = 1.0 / (SOFT_M + gaps[0].clamp(min=0.0))
     told = [gap.clamp(OVERLAP_M, FAR_SIGHT_M) for gap in gaps]
-    return [when, *told, near, *(part.expand_as(when) for part in own.unbind(-1))]
+    every = 0.0 * when  # of each body the same; an exported graph has nothing that repeats
+    return [when, *told, near, *(part + every for part in own.unbind(-1))]
 
 
 def wished(action: torch.Tensor, fastest: float) -> torch.Tensor:

@@ -17,7 +17,8 @@ import torch
 from uuvtai.config.learning import LearningConfig
 from uuvtai.errors import SettingError
 from uuvtai.learn import checkpoint
-from uuvtai.learn.chooser import ArrivalNet, ChooserPilot
+from uuvtai.learn.arrival_net import ArrivalNet
+from uuvtai.learn.chooser import ChooserPilot
 from uuvtai.learn.chooser_memory import ChooserMemory, Tick, moments_of_episodes
 from uuvtai.learn.distributed import Processes
 from uuvtai.learn.episode_waves import play_episodes
@@ -43,9 +44,8 @@ class ChooserTrainer:
     def __init__(self, config: LearningConfig, sims: Mapping[str, Sim] | None = None) -> None:
         """``sims``: simulators of worlds that are there already. Raises SettingError or CheckpointError for a
         policy that is none of the twin's."""
-        from uuvtai.twin.set_columns import BODY_WIDTH, EGO_COLUMNS
-        from uuvtai.twin.tree_columns import CHOOSER_TABLE, TREE_WIDTH
-        from uuvtai.twin.twin_arrays import N_BODY
+        from uuvtai.twin.set_codes import BODY_WIDTH, EGO_COLUMNS, N_BODY, TREE_WIDTH
+        from uuvtai.twin.tree_columns import CHOOSER_TABLE
 
         self.config, self.processes = config, Processes()
         self.observation_table = CHOOSER_TABLE

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import nn
 
@@ -25,7 +26,6 @@ from uuvtai.forecast_codes import (
     SIDE_COLUMNS,
 )
 from uuvtai.learn.mlp import linear
-from uuvtai.mixture_weights import Weights
 
 TIMES_S = torch.arange(1, ANCHORS + 1) * ANCHOR_S
 """[s] ahead, of the places that it tells"""
@@ -69,7 +69,7 @@ class MixtureNet(nn.Module):
         part = self.spread(hidden).view(-1, N_MODE, ANCHORS, 2).clamp(-6.0, math.log(_MOST)).exp()
         return Mixture(torch.log_softmax(said[:, :N_MODE], -1), place, _LEAST_M + part * reach)
 
-    def weights(self) -> Weights:
+    def weights(self) -> dict[str, np.ndarray]:
         """Arrays of a forecast's file (``mixture_weights``)."""
         out, bias = torch.zeros(N_HIDDEN, N_SAID), torch.zeros(N_SAID)
         out[:, :N_TOLD], bias[:N_TOLD] = self.said.weight.detach().T, self.said.bias.detach()
@@ -78,7 +78,7 @@ class MixtureNet(nn.Module):
             found |= {f"weight_{name}": layer.weight.T, f"bias_{name}": layer.bias}
         return {name: value.detach().contiguous().numpy().copy() for name, value in found.items()}
 
-    def take_weights(self, weights: Weights) -> None:
+    def take_weights(self, weights: dict[str, np.ndarray]) -> None:
         """Become the network of a forecast's file."""
         found = {name: torch.from_numpy(values) for name, values in weights.items()}
         with torch.no_grad():

@@ -214,7 +214,7 @@ def load_pilot(checkpoint: Checkpoint, num_envs: int, device: torch.device | str
     if config.twin.enabled or config.chooser.enabled:
         raise CheckpointError(
             f"{checkpoint.path}: a policy over a set of bodies, which looks at the simulator itself; it "
-            "drives in 'uuv eval' and 'uuv sweep', and cannot be exported yet"
+            "drives in 'uuv eval' and 'uuv sweep', and is exported by 'uuv export'"
         )
     parts, generator = checkpoint.model(), torch.Generator()
     try:

@@ -3,20 +3,17 @@ laid on the hull by the fixed rule in every control step."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 
 from uuvtai.learn.checkpoint import Checkpoint
-from uuvtai.learn.manifest import MODEL, CheckpointError
 from uuvtai.learn.pilot import PilotDecision, by_chunk
-from uuvtai.learn.set_policy import NUM_WISHES, SetActor
+from uuvtai.learn.set_networks import actor_of
+from uuvtai.learn.set_policy import MOST_WISH, NUM_WISHES, SetActor
 
 if TYPE_CHECKING:
     from uuvtai.sim import Sim
-
-MOST_WISH = 2.0
-"""wishes beyond it are cut off before they are carried out"""
 
 
 class SetPilot:
@@ -28,8 +25,8 @@ class SetPilot:
     def __init__(self, actor: SetActor, sim: Sim, hold_steps: int, gap_m: float) -> None:
         """``hold_steps`` control steps a decision; the centre stays ``gap_m`` from floor and surface."""
         from uuvtai.binding import bind
-        from uuvtai.twin.set_columns import BODY_WIDTH, EGO_COLUMNS
-        from uuvtai.twin.twin_arrays import EGO_WIDTH, N_BODY, N_RAY, RAW_WIDTH, ObserverIO
+        from uuvtai.twin.set_codes import BODY_WIDTH, EGO_COLUMNS, N_BODY, N_RAY
+        from uuvtai.twin.twin_arrays import EGO_WIDTH, RAW_WIDTH, ObserverIO
 
         self.actor, self._sim, self._hold, self._gap_m = actor, sim, hold_steps, gap_m
         self._io = bind(ObserverIO, sim.s, sim.config)
@@ -97,29 +94,5 @@ def load_set_pilot(checkpoint: Checkpoint, sim: Sim) -> SetPilot:
 
 def set_pilot_of(checkpoint: Checkpoint, sim: Sim) -> SetPilot:
     """As ``load_set_pilot``, of a checkpoint whose columns are known to fit."""
-    from uuvtai.twin.set_columns import BODY_WIDTH, EGO_COLUMNS
-
-    config, found = checkpoint.config, checkpoint.model()
-    try:
-        part: dict[str, Any] = found["policy"]
-        wide, head = config.twin.body_hidden, config.twin.head_hidden
-        for name, shape in (
-            ("net.body.0.weight", (wide, BODY_WIDTH)),
-            ("net.head.0.weight", (head, 3 * wide)),
-        ):
-            if tuple(part[name].shape) != shape:
-                raise ValueError(f"{name} is {tuple(part[name].shape)} instead of {shape}")
-        actor = SetActor(BODY_WIDTH, EGO_COLUMNS, config, torch.Generator())
-        actor.load_state_dict(part)
-    except (KeyError, ValueError, RuntimeError, TypeError, AttributeError) as error:
-        raise CheckpointError(
-            f"{checkpoint.path / MODEL}: its networks are not those of its config ({error}); take another one"
-        ) from None
-    for name, tensor in actor.state_dict().items():
-        if not bool(torch.isfinite(tensor).all()):
-            raise CheckpointError(
-                f"{checkpoint.path / MODEL}: {name} is not finite: the training failed; take an older "
-                "checkpoint"
-            )
-    actor.to(sim.device).eval()
-    return SetPilot(actor, sim, config.policy.hold_steps, config.twin.vertical_gap_m)
+    config, actor = checkpoint.config, actor_of(checkpoint)
+    return SetPilot(actor.to(sim.device), sim, config.policy.hold_steps, config.twin.vertical_gap_m)

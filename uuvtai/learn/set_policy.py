@@ -14,6 +14,8 @@ from uuvtai.learn.mlp import mlp
 
 NUM_WISHES = 3
 """ahead, left, up: parts of the fastest velocity, in the mirrored world"""
+MOST_WISH = 2.0
+"""wishes beyond it are cut off before they are carried out"""
 AT_DIRECTION = slice(3, 5)
 """columns of ``own`` with the unit vector to the goal"""
 _SUM_SCALE = 0.3
@@ -59,8 +61,8 @@ class SetActor(nn.Module):
     def forward(self, bodies: torch.Tensor, own: torch.Tensor) -> torch.Tensor:
         """(..., 3) mean wish; straight to the goal at birth."""
         ahead = self.goal_gain * own[..., AT_DIRECTION]
-        prior = torch.cat([ahead, torch.zeros_like(ahead[..., :1])], dim=-1)
-        return prior + self.net(bodies, own, bodies[..., :1])
+        said = self.net(bodies, own, bodies[..., :1])
+        return torch.cat([ahead + said[..., :2], said[..., 2:]], dim=-1)
 
 
 class SetCritic(nn.Module):

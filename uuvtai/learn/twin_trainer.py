@@ -16,7 +16,7 @@ from uuvtai.learn.optimiser import PlainAdam
 from uuvtai.learn.policy import log_prob
 from uuvtai.learn.ppo import ADAM_EPS, adapted_rate, approximate_kl, gae, surrogate_loss
 from uuvtai.learn.rollout_sums import Recent, RolloutSums
-from uuvtai.learn.set_policy import NUM_WISHES, SetActor, SetCritic
+from uuvtai.learn.set_policy import MOST_WISH, NUM_WISHES, SetActor, SetCritic
 from uuvtai.outcomes import OUTCOMES, RUNNING, SUCCESS, TIMEOUT
 
 if TYPE_CHECKING:
@@ -34,8 +34,6 @@ DECAY_FROM = 0.5
 """share of the run from which the learning rate falls to a tenth"""
 HOLD_STEPS, DECISION_S = 5, 0.1
 """of the twin (``uuvtai/twin/kinematics.py``), which this file does not import"""
-MOST_WISH = 2.0
-"""wishes beyond it are cut off before they are carried out"""
 
 
 class TwinTrainer:
@@ -46,7 +44,7 @@ class TwinTrainer:
         another tank."""
         from uuvtai.twin.observer import SET_TABLE
         from uuvtai.twin.scenario_bank import draw_bank
-        from uuvtai.twin.set_columns import BODY_WIDTH, EGO_COLUMNS
+        from uuvtai.twin.set_codes import BODY_WIDTH, EGO_COLUMNS
         from uuvtai.twin.twin_arrays import TRUTH_WIDTH
         from uuvtai.twin.twin_world import Twin
 

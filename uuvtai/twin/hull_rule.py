@@ -5,11 +5,7 @@ import taichi as ti
 from uuvtai.config import TankConfig, VehicleConfig
 from uuvtai.kernels.core.geometry import PI, wrapped_angle
 from uuvtai.kernels.core.signature import Const
-
-TURN_GAIN = 2.5
-"""[1/s] yaw rate by the angle that is still to turn"""
-LEAST_SPEED_M_S = 0.1
-"""below it the vehicle keeps its heading"""
+from uuvtai.twin.set_codes import LEAST_SPEED_M_S, TURN_GAIN
 
 
 @ti.func

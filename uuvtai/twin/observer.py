@@ -7,18 +7,8 @@ from uuvtai.kernels.core.geometry import FAR_M, TWO_PI
 from uuvtai.kernels.core.grid import cell_of
 from uuvtai.kernels.core.signature import AnyTensor, Bundle, FloatMatrix, IntVector
 from uuvtai.twin.hull_rule import hull_command, wished_velocity
-from uuvtai.twin.set_columns import BODY_WIDTH, EGO_COLUMNS, OWN_WIDTH
-from uuvtai.twin.twin_arrays import (
-    AT_FLIP,
-    AT_GOAL,
-    AT_POS,
-    AT_RATE,
-    AT_VEL,
-    AT_YAW,
-    N_BODY,
-    RAW_WIDTH,
-    ObserverIO,
-)
+from uuvtai.twin.set_codes import BODY_WIDTH, EGO_COLUMNS, N_BODY, OWN_WIDTH
+from uuvtai.twin.twin_arrays import AT_FLIP, AT_GOAL, AT_POS, AT_RATE, AT_VEL, AT_YAW, RAW_WIDTH, ObserverIO
 
 CONTROL_S = 0.02
 SIGHT_M = 4.3

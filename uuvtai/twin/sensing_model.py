@@ -7,7 +7,8 @@ from uuvtai.kernels.core.geometry import BOX, NONE, TWO_PI, wrapped_angle
 from uuvtai.kernels.core.noise import episode_key, normal
 from uuvtai.kernels.core.signature import AnyTensor, Bundle, FloatMatrix, IntVector
 from uuvtai.twin.kinematics import path_place
-from uuvtai.twin.twin_arrays import AT_FLIP, AT_POS, AT_TIME, AT_YAW, N_RAY, TwinRules
+from uuvtai.twin.set_codes import N_RAY
+from uuvtai.twin.twin_arrays import AT_FLIP, AT_POS, AT_TIME, AT_YAW, TwinRules
 
 DT_S = 0.1
 RANGE_M = 12.0

@@ -7,11 +7,9 @@ situations that mirror each other are one to the policy.
 import taichi as ti
 
 from uuvtai.kernels.core.signature import AnyTensor, FloatMatrix
-from uuvtai.twin.twin_arrays import AT_FLIP, AT_GOAL, AT_LAST, AT_POS, AT_VEL, AT_YAW, N_RAY
+from uuvtai.twin.set_codes import BODY_WIDTH, N_RAY, OWN_WIDTH
+from uuvtai.twin.twin_arrays import AT_FLIP, AT_GOAL, AT_LAST, AT_POS, AT_VEL, AT_YAW
 
-BODY_WIDTH = 22
-OWN_WIDTH = 17
-EGO_COLUMNS = OWN_WIDTH + N_RAY
 HULL_M = 0.22
 """hull radius and half of its half length"""
 

@@ -13,12 +13,7 @@ from uuvtai.env import ObservationColumn
 from uuvtai.kernels.core.signature import In
 from uuvtai.state import ClockState, MissionState, TeacherState, TreeTable
 from uuvtai.twin.observer import SET_TABLE
-
-N_LEAF = 6
-"""actions of the tree, one column each (``tree_codes``)"""
-AT_WISH = 28
-"""the first of the policy's three columns, behind the tree's own"""
-TREE_WIDTH = AT_WISH + 3
+from uuvtai.twin.set_codes import TREE_WIDTH
 
 
 @dataclass(frozen=True, eq=False)

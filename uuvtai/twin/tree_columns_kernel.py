@@ -4,7 +4,8 @@ import taichi as ti
 
 from uuvtai import tree_codes as codes
 from uuvtai.kernels.core.signature import Bundle, FloatMatrix, IntVector
-from uuvtai.twin.tree_columns import AT_WISH, N_LEAF, TreeColumnsIO
+from uuvtai.twin.set_codes import AT_WISH, N_LEAF
+from uuvtai.twin.tree_columns import TreeColumnsIO
 
 HORIZON_S, SIGHT_M, NARROW_M, CALM_STEPS, EPISODE_STEPS = 5.0, 4.0, 2.0, 150, 3000
 

@@ -13,7 +13,8 @@ from uuvtai.config.learning import LearningConfig
 from uuvtai.runtime import start_taichi
 from uuvtai.twin import kinematics, sensing_model, set_columns
 from uuvtai.twin.scenario_bank import ScenarioBank
-from uuvtai.twin.twin_arrays import EGO_WIDTH, N_RAY, RAW_WIDTH, TRUTH_WIDTH, TwinRules
+from uuvtai.twin.set_codes import BODY_WIDTH, EGO_COLUMNS, N_RAY
+from uuvtai.twin.twin_arrays import EGO_WIDTH, RAW_WIDTH, TRUTH_WIDTH, TwinRules
 
 TRACK_WIDTH = 8
 
@@ -45,8 +46,8 @@ class Twin:
         self._raw = torch.zeros(num_envs, lanes, RAW_WIDTH)
         self._ray = torch.zeros(num_envs, N_RAY)
         self.view = TwinView(
-            torch.zeros(num_envs, lanes, set_columns.BODY_WIDTH),
-            torch.zeros(num_envs, set_columns.EGO_COLUMNS),
+            torch.zeros(num_envs, lanes, BODY_WIDTH),
+            torch.zeros(num_envs, EGO_COLUMNS),
             torch.zeros(num_envs, lanes, TRUTH_WIDTH),
         )
 
