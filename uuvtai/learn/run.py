@@ -218,7 +218,10 @@ def _twin_trainer(config: LearningConfig, checkpoint: Checkpoint | None, device:
     from uuvtai.learn.twin_trainer import TwinTrainer
 
     _refuse_many("twin.enabled: the twin trains", device)
-    return _continued(TwinTrainer(config), config, checkpoint)
+    trainer = TwinTrainer(config)
+    if checkpoint is None:
+        trainer.warm_start()
+    return _continued(trainer, config, checkpoint)
 
 
 def _chooser_trainer(config: LearningConfig, checkpoint: Checkpoint | None, device: str) -> ChooserTrainer:

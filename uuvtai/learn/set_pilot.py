@@ -97,6 +97,14 @@ def load_set_pilot(checkpoint: Checkpoint, sim: Sim) -> SetPilot:
 
 def set_pilot_of(checkpoint: Checkpoint, sim: Sim) -> SetPilot:
     """As ``load_set_pilot``, of a checkpoint whose columns are known to fit."""
+    config, actor = checkpoint.config, actor_of(checkpoint)
+    actor.to(sim.device).eval()
+    return SetPilot(actor, sim, config.policy.hold_steps, config.twin.vertical_gap_m)
+
+
+def actor_of(checkpoint: Checkpoint) -> SetActor:
+    """The policy of a checkpoint. Raises CheckpointError where its networks are not those of its config, or
+    not finite."""
     from uuvtai.twin.set_columns import BODY_WIDTH, EGO_COLUMNS
 
     config, found = checkpoint.config, checkpoint.model()
@@ -121,5 +129,4 @@ def set_pilot_of(checkpoint: Checkpoint, sim: Sim) -> SetPilot:
                 f"{checkpoint.path / MODEL}: {name} is not finite: the training failed; take an older "
                 "checkpoint"
             )
-    actor.to(sim.device).eval()
-    return SetPilot(actor, sim, config.policy.hold_steps, config.twin.vertical_gap_m)
+    return actor
