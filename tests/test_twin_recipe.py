@@ -8,6 +8,7 @@ import pytest
 import taichi as ti
 import torch
 
+from docs.writers.twin_recipe import ARMS, entry_of, gain_of
 from tests.test_twin import SMALL
 from uuvtai.config import VehicleConfig
 from uuvtai.errors import UserError
@@ -299,3 +300,19 @@ def test_the_ring_keeps_the_newest(config, bank, monkeypatch):
     outcome = torch.full((16,), COLLISION, dtype=torch.int32)
     starts.begin(outcome != RUNNING, outcome, torch.zeros(16, dtype=torch.int64), generator)
     assert starts.count == 8 and bool((twin.time_s == 0).all())
+
+
+# ------------------------------------------------------------------------------------------------ the figures
+
+
+def test_a_gain_has_students_interval():
+    assert gain_of([1.0, 2.0, 3.0]) == "+2.0 [-0.5, +4.5]"  # 4.303 / sqrt 3
+
+
+def test_a_run_counts_once_its_end_is_evaluated():
+    row = {"time/env_steps": 10.0, "time/simulate_s": 1.0, "time/learn_s": 2.0, "train/std": 0.3}
+    last = row | {"eval/success_rate": 0.5, "eval/success_pool_9_1.5": 0.4}
+    assert entry_of(ARMS[1], 2, [row]) is None
+    entry = entry_of(ARMS[1], 2, [row, last])
+    assert entry is not None and entry["success"] == {"all": 0.5, "pool_9_1.5": 0.4}
+    assert entry["seconds"] == 6 and entry["command"].startswith("uuv train twin --seed 2 ")
