@@ -137,6 +137,13 @@ def test_values_without_a_meaning_are_refused(bank, changes, says):
         TwinTrainer(load_training("twin", overrides=SMALL | changes), bank)
 
 
+def test_what_clearly_pays_is_the_presets():
+    twin, quick = load_training("twin").twin, load_training("quick").twin
+    assert twin.warm_start_waves > 0 and twin.anchor > 0
+    assert (quick.warm_start_waves, quick.anchor) == (0, 0), "it learns from nothing"
+    assert (twin.failure_starts, twin.last_std) == (0, 0)
+
+
 # ---------------------------------------------------------------------------------------------- a trained one
 
 

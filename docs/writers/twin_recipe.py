@@ -26,8 +26,11 @@ from uuvtai.tables.table import text_table
 
 FILE = "docs/data/twin_recipe.json"
 SEEDS = (0, 1, 2)
-BUDGET = "--set train.iterations=40"
+IMITATED = "--set twin.warm_start_waves=0"
+"""by the arm ``tree``, once for all, or not at all"""
+BUDGET = f"--set train.iterations=40 {IMITATED}"
 """2.6 million decisions"""
+FREE = "--set twin.anchor=0"
 TREE = "tree"
 """arm that imitates the tree and learns nothing more; others begin as its seed 0"""
 CELLS = {
@@ -56,13 +59,13 @@ ARMS = (
     Arm(
         TREE,
         "imitation of the tree alone",
-        "--set twin.warm_start_waves=12 --set ppo.learning_rate=1e-9 --set train.iterations=1 "
+        f"--set twin.warm_start_waves=12 {FREE} --set ppo.learning_rate=1e-9 --set train.iterations=1 "
         "--set train.evaluate_every=1",
         (0,),
     ),
-    Arm("base", "as it is", BUDGET),
-    Arm("failure", "`failure_starts=0.25`", f"{BUDGET} --set twin.failure_starts=0.25"),
-    Arm("warm", "`warm_start`", f"{BUDGET} {_START}"),
+    Arm("base", "every switch off", f"{BUDGET} {FREE}"),
+    Arm("failure", "`failure_starts=0.25`", f"{BUDGET} {FREE} --set twin.failure_starts=0.25"),
+    Arm("warm", "`warm_start`", f"{BUDGET} {FREE} {_START}"),
     Arm(
         "anchored",
         "`warm_start`, `anchor=0.3`, `anchor_until=0.5`",

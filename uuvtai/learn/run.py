@@ -126,6 +126,11 @@ def _train(
         f"starting {config.train.num_envs} envs (sizes not used before compile their kernels first, about "
         "half a minute)"
     )
+    if config.twin.enabled and config.twin.warm_start_waves and not found:
+        watch.note(
+            f"first {config.twin.warm_start_waves} waves of episodes in the simulator, in which the policy "
+            "imitates the tree: about a minute each"
+        )
     trainer: AnyTrainer
     if config.forecaster.enabled:
         trainer = _forecast_trainer(config, found, request.device)
