@@ -228,7 +228,7 @@ class TwinConfig(Section):
     @model_validator(mode="after")
     def _start_to_hold_to(self):
         if self.warm_start and self.warm_start_waves:
-            raise ValueError("warm_start and warm_start_waves exclude each other: leave one of them out")
+            raise ValueError("warm_start and warm_start_waves exclude each other: set warm_start_waves=0")
         if self.anchor > 0 and not (self.warm_start or self.warm_start_waves):
             raise ValueError("anchor needs a warm start: warm_start=RUN or warm_start_waves=6; else anchor=0")
         return self
