@@ -151,9 +151,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("runs", type=Path)
     parser.add_argument("--read", action="store_true", help="train nothing: write what is there")
+    parser.add_argument("--commit", help="of the package that trained, where it is not this one")
     chosen = parser.parse_args()
     runs: Path = chosen.runs
-    document: dict[str, Any] = {"schema": 1, "commit": commit_of_package(), "machine": hardware(), "rows": []}
+    commit = chosen.commit or commit_of_package()
+    document: dict[str, Any] = {"schema": 1, "commit": commit, "machine": hardware(), "rows": []}
     for arm in ARMS:
         for seed in arm.seeds:
             place = runs / f"{arm.name}.{seed}"
