@@ -47,6 +47,8 @@ SMALL = {
     "train.scenes": [[8, 6, 0.6]],
     "twin.worlds": ["pool"],
     "train.iterations": 4,
+    "twin.warm_start_waves": 0,
+    "twin.anchor": 0.0,
 }
 
 

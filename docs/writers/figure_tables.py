@@ -30,6 +30,7 @@ from docs.writers.rehearsal_tables import rehearsal
 from docs.writers.replay_tables import changed, lossy, replayed
 from docs.writers.sonar_tables import sonars
 from docs.writers.tuner_tables import fast_slopes, tuner_slopes
+from docs.writers.twin_recipe import twin_recipe
 from docs.writers.vehicle_tables import vehicle_commands, vehicles
 from uuvtai.measure.reproduce import paper
 from uuvtai.measure.reproduce.steps import RETIRED_SEEDS
@@ -695,6 +696,7 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         vehicle_commands,
         vehicles,
         twin_curve,
+        twin_recipe,
         twin_policy,
         quick_curve,
         quick_policy,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 from typing import Annotated, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from uuvtai.config import Config
 from uuvtai.config.section import Count, Fraction, NonNegative, Positive, PositiveCount, Section
@@ -210,6 +210,29 @@ class TwinConfig(Section):
     closeness_cost: NonNegative = 0.1
     """per second at contact, none from ``soft_clearance_m`` on"""
     soft_clearance_m: Positive = 0.5
+    warm_start: Annotated[str, Field(max_length=1000)] = ""
+    """run folder or checkpoint of a policy of the twin to begin as; none = straight to the goal"""
+    warm_start_waves: Annotated[int, Field(ge=0, le=1000)] = 0
+    """waves of episodes in the simulator in which the policy first learns to imitate the behaviour tree
+    (DAgger), world by world and scene by scene; 0 = none"""
+    anchor: NonNegative = 0.0
+    """weight of KL(policy || warm-started policy) in the loss"""
+    anchor_until: Annotated[float, Field(gt=0, le=1)] = 0.3
+    """share of the run over which that weight falls to 0, linearly"""
+    last_std: NonNegative = 0.0
+    """``policy.min_std`` falls to this until the end of the run; 0 = it stays"""
+    explore_until: Annotated[float, Field(ge=0, lt=1)] = 0.8
+    """share of the run from which it falls, linearly"""
+    failure_starts: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    """share of the episodes that begin 1 to 4 s before an earlier failure"""
+
+    @model_validator(mode="after")
+    def _start_to_hold_to(self):
+        if self.warm_start and self.warm_start_waves:
+            raise ValueError("warm_start and warm_start_waves exclude each other: set warm_start_waves=0")
+        if self.anchor > 0 and not (self.warm_start or self.warm_start_waves):
+            raise ValueError("anchor needs a warm start: warm_start=RUN or warm_start_waves=6; else anchor=0")
+        return self
 
 
 class ChooserConfig(Section):

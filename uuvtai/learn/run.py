@@ -126,6 +126,11 @@ def _train(
         f"starting {config.train.num_envs} envs (sizes not used before compile their kernels first, about "
         "half a minute)"
     )
+    if config.twin.enabled and config.twin.warm_start_waves and not found:
+        watch.note(
+            f"first {config.twin.warm_start_waves} waves of episodes in the simulator, in which the policy "
+            "imitates the tree: about a minute each"
+        )
     trainer: AnyTrainer
     if config.forecaster.enabled:
         trainer = _forecast_trainer(config, found, request.device)
@@ -218,7 +223,10 @@ def _twin_trainer(config: LearningConfig, checkpoint: Checkpoint | None, device:
     from uuvtai.learn.twin_trainer import TwinTrainer
 
     _refuse_many("twin.enabled: the twin trains", device)
-    return _continued(TwinTrainer(config), config, checkpoint)
+    trainer = TwinTrainer(config)
+    if checkpoint is None:
+        trainer.warm_start()
+    return _continued(trainer, config, checkpoint)
 
 
 def _chooser_trainer(config: LearningConfig, checkpoint: Checkpoint | None, device: str) -> ChooserTrainer:

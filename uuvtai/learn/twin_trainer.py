@@ -11,12 +11,14 @@ import torch
 
 from uuvtai.config.learning import LearningConfig
 from uuvtai.errors import SettingError
+from uuvtai.learn.anchor import Anchor
 from uuvtai.learn.distributed import Processes
 from uuvtai.learn.optimiser import PlainAdam
 from uuvtai.learn.policy import log_prob
 from uuvtai.learn.ppo import ADAM_EPS, adapted_rate, approximate_kl, gae, surrogate_loss
 from uuvtai.learn.rollout_sums import Recent, RolloutSums
 from uuvtai.learn.set_policy import MOST_WISH, NUM_WISHES, SetActor, SetCritic
+from uuvtai.learn.warm_start import imitate, trained_actor
 from uuvtai.outcomes import OUTCOMES, RUNNING, SUCCESS, TIMEOUT
 
 if TYPE_CHECKING:
@@ -42,6 +44,7 @@ class TwinTrainer:
     def __init__(self, config: LearningConfig, bank: ScenarioBank | None = None) -> None:
         """Draws the scenarios, unless they are given. Raises ConfigError for a world that is none, or has
         another tank."""
+        from uuvtai.twin.failure_states import FailureStarts
         from uuvtai.twin.observer import SET_TABLE
         from uuvtai.twin.scenario_bank import draw_bank
         from uuvtai.twin.set_codes import BODY_WIDTH, EGO_COLUMNS
@@ -73,6 +76,9 @@ class TwinTrainer:
         self.iteration = self.env_steps = 0
         self._returns = torch.zeros(config.train.num_envs)
         self._held_out: ScenarioBank | None = None
+        self._anchor: Anchor | None = None
+        share = config.twin.failure_starts
+        self._failures = FailureStarts(self.twin, share) if share > 0 else None
         self._allocate(
             config.ppo.rollout_steps, config.train.num_envs, bank.path.shape[1], BODY_WIDTH, EGO_COLUMNS
         )
@@ -90,8 +96,29 @@ class TwinTrainer:
         self._next_value = torch.zeros(steps, envs)
         self._terminated, self._ended = (torch.zeros(steps, envs, dtype=torch.bool) for _ in range(2))
 
+    def warm_start(self) -> None:
+        """Begin as the policy that ``twin.warm_start`` names, if any. Raises SettingError or CheckpointError
+        for one that does not fit."""
+        if self.config.twin.warm_start:
+            self.actor.load_state_dict(trained_actor(self.config))
+        self._set_anchor()
+
+    def _imitate(self) -> dict[str, float]:
+        """Learn from the tree first, where ``twin.warm_start_waves`` says so; metrics."""
+        if self.iteration > 0 or not self.config.twin.warm_start_waves:
+            return {}
+        metrics = imitate(self.actor, self.config, self._scenes)
+        self._set_anchor()
+        return metrics
+
+    def _set_anchor(self) -> None:
+        """Remember the policy as it is."""
+        config = self.config.twin
+        self._anchor = Anchor(self.actor, config.anchor, config.anchor_until) if config.anchor > 0 else None
+
     def iterate(self) -> dict[str, float]:
         """A rollout and what is learned from it; metrics by their names in metrics.jsonl."""
+        warmed = self._imitate()
         began = time.perf_counter()
         sums = self._collect()
         between = time.perf_counter()
@@ -100,13 +127,17 @@ class TwinTrainer:
         self.iteration += 1
         samples = self._reward.numel()
         self.env_steps += samples
-        return metrics | {
-            "time/simulate_s": between - began,
-            "time/infer_s": 0.0,
-            "time/learn_s": learn_s,
-            "time/env_steps_per_s": samples / (between - began + learn_s),
-            "time/env_steps": float(self.env_steps),
-        }
+        return (
+            warmed
+            | metrics
+            | {
+                "time/simulate_s": between - began,
+                "time/infer_s": 0.0,
+                "time/learn_s": learn_s,
+                "time/env_steps_per_s": samples / (between - began + learn_s),
+                "time/env_steps": float(self.env_steps),
+            }
+        )
 
     # ---------------------------------------------------------------------------------------------- a rollout
 
@@ -139,16 +170,25 @@ class TwinTrainer:
                 if bool(late.any()):
                     twin.look()
                     after = self.critic(view.bodies[late], view.own[late], view.truth[late])
-                twin.begin(ended, self._next_scenarios())
+                self._begin(ended, outcome)
             else:
                 late, after = ended, None
             self._late = (late.clone(), after)
+            if self._failures:
+                self._failures.advance()
             twin.look()
             self._bootstrap(t)
         last = _by_part(self.critic, *view)
         self._next_value[-1] = torch.where(self._ended[-1], self._next_value[-1], last)
         sums.samples += self._reward.numel()
         return sums
+
+    def _begin(self, ended: torch.Tensor, outcome: torch.Tensor) -> None:
+        """New episodes in the rows (N,) that ended with these outcomes (N,)."""
+        if self._failures:
+            self._failures.begin(ended, outcome, self._next_scenarios(), self.generator)
+        else:
+            self.twin.begin(ended, self._next_scenarios())
 
     def _bootstrap(self, t: int) -> None:
         """After a timeout the return goes on by the value of where it led to: as part of the reward, for the
@@ -207,6 +247,8 @@ class TwinTrainer:
     def _minibatch(self, batch: list[torch.Tensor]) -> torch.Tensor:
         """One step of both networks; (policy loss, value loss, KL, share clipped)."""
         config, count = self.config.ppo, len(batch[0])
+        share = self.iteration / self.config.train.iterations
+        held = self._anchor.weight(share) if self._anchor else 0.0
         self.optimiser.zero_grad(set_to_none=True)
         sums = torch.zeros(4)
         for part in zip(*(tensor.split(CACHE_ROWS) for tensor in batch), strict=True):
@@ -216,7 +258,11 @@ class TwinTrainer:
             log_ratio = log_prob(action, mean.float(), self.actor.log_std) - before
             policy_loss = surrogate_loss(log_ratio, advantage, config.clip).sum() / count
             value_loss = (value.float() - target).square().sum() / count
-            (policy_loss + config.value_weight * value_loss).backward()
+            loss = policy_loss + config.value_weight * value_loss
+            if self._anchor and held > 0:
+                far = self._anchor.divergence(mean.float(), self.actor.log_std, bodies, own)
+                loss = loss + held * far.sum() / count
+            loss.backward()
             with torch.no_grad():
                 kl = approximate_kl(log_ratio).sum() / count
                 clipped = ((log_ratio.exp() - 1.0).abs() > config.clip).sum() / count
@@ -225,7 +271,7 @@ class TwinTrainer:
         torch.nn.utils.clip_grad_norm_(self.critic.parameters(), config.max_grad_norm)
         self.optimiser.step()
         with torch.no_grad():
-            self.actor.log_std.clamp_(math.log(self.config.policy.min_std), 0.0)
+            self.actor.log_std.clamp_(math.log(least_std(self.config, share)), 0.0)
         return sums
 
     def _coarse(self) -> torch.autocast:
@@ -260,16 +306,16 @@ class TwinTrainer:
     def state(self) -> dict[str, Any]:
         """All that the next iterations depend on. What drives, the actor, is the part ``policy``."""
         return {
-            "policy": {name: tensor.clone() for name, tensor in self.actor.state_dict().items()},
-            "critic": {name: tensor.clone() for name, tensor in self.critic.state_dict().items()},
+            "policy": _copied(self.actor),
+            "critic": _copied(self.critic),
             "optimiser": self.optimiser.state_dict(),
             "rate": self.rate.clone(),
             "generator": self.generator.get_state(),
             "recent": list(self.recent.rows),
             "returns": self._returns.clone(),
             "counters": {"iteration": self.iteration, "env_steps": self.env_steps},
-            "env": self.twin.capture(),
-        }
+            "env": self.twin.capture() | (self._failures.capture() if self._failures else {}),
+        } | ({"anchor": _copied(self._anchor.actor)} if self._anchor else {})
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Go on from what ``state`` gave."""
@@ -282,6 +328,23 @@ class TwinTrainer:
         self._returns.copy_(state["returns"])
         self.iteration, self.env_steps = (int(state["counters"][n]) for n in ("iteration", "env_steps"))
         self.twin.restore(state["env"])
+        if self._failures:
+            self._failures.restore(state["env"])
+        self._set_anchor()
+        if self._anchor and "anchor" in state:
+            self._anchor.actor.load_state_dict(state["anchor"])
+
+
+def _copied(net: torch.nn.Module) -> dict[str, torch.Tensor]:
+    return {name: tensor.clone() for name, tensor in net.state_dict().items()}
+
+
+def least_std(config: LearningConfig, share: float) -> float:
+    """Floor under the deviation: ``policy.min_std``, falling to ``twin.last_std`` where that is set."""
+    last, until = config.twin.last_std, config.twin.explore_until
+    if last == 0 or share <= until:
+        return config.policy.min_std
+    return config.policy.min_std + (last - config.policy.min_std) * (share - until) / (1.0 - until)
 
 
 def _refuse_what_the_twin_lacks(config: LearningConfig) -> None:
@@ -298,6 +361,11 @@ def _refuse_what_the_twin_lacks(config: LearningConfig) -> None:
         raise SettingError(
             f"policy.hold_steps={held}, episode.control_dt_s={dt_s}: the twin decides every {DECISION_S} s, "
             f"after {HOLD_STEPS} control steps"
+        )
+    if config.twin.last_std > config.policy.min_std:
+        raise SettingError(
+            f"twin.last_std={config.twin.last_std}: the floor falls, so at most "
+            f"policy.min_std={config.policy.min_std}"
         )
     samples = config.ppo.rollout_steps * config.train.num_envs
     if config.ppo.minibatches > samples:
