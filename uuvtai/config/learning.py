@@ -190,6 +190,12 @@ class TwinConfig(Section):
 
     enabled: bool = False
     """train in the twin; false = in the simulator"""
+    simulator: bool = False
+    """fine-tune in the full simulator in the twin's place, with the twin's reward; needs ``start``"""
+    start: Annotated[str, Field(max_length=1000)] = ""
+    """run folder or checkpoint of the policy to begin with (``uuv train twin``); none = random weights"""
+    critic_warmup_iterations: Count = 0
+    """iterations in which only the critic learns, before it may move the policy"""
     worlds: tuple[Annotated[str, Field(min_length=1, max_length=200)], ...] = ("pool", "gauntlet")
     """world presets whose scenarios are dealt out, each with all of ``train.scenes``"""
     scenarios: Annotated[int, Field(ge=1, le=2**20)] = 4096

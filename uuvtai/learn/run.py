@@ -215,10 +215,15 @@ def _continued(trainer: _Alone, config: LearningConfig, checkpoint: Checkpoint |
 
 def _twin_trainer(config: LearningConfig, checkpoint: Checkpoint | None, device: str) -> TwinTrainer:
     """As ``_trainer``, in the kinematic twin."""
+    from uuvtai.learn.starting_policy import starting_policy
     from uuvtai.learn.twin_trainer import TwinTrainer
 
     _refuse_many("twin.enabled: the twin trains", device)
-    return _continued(TwinTrainer(config), config, checkpoint)
+    start = None if checkpoint else starting_policy(config)
+    trainer = TwinTrainer(config)
+    if start:
+        start.give(trainer.actor, trainer.critic)
+    return _continued(trainer, config, checkpoint)
 
 
 def _chooser_trainer(config: LearningConfig, checkpoint: Checkpoint | None, device: str) -> ChooserTrainer:
