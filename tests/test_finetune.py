@@ -217,7 +217,7 @@ def test_rewards_are_of_the_simulators_truth(world, small, actor):
     """Progress and the smallest clearance of the steps of a decision, as the referee keeps them."""
     world.begin(EVERY, torch.arange(8))
     sim, twin = small.sim, world._rules.twin_cfg
-    kept, step = [], sim.step
+    kept, step, differ = [], sim.step, 0
 
     def noting(action):
         step(action)
@@ -225,7 +225,7 @@ def test_rewards_are_of_the_simulators_truth(world, small, actor):
 
     sim.step = noting
     try:
-        for _ in range(6):
+        for _ in range(60):
             view, kept[:] = world.look(), []
             way = sim.rows(sim.s.mission.goal_w) - sim.rows(sim.s.vehicle.pos_w)
             reward, outcome = world.step(said(actor, view))
@@ -234,10 +234,13 @@ def test_rewards_are_of_the_simulators_truth(world, small, actor):
             close = np.clip(1.0 - np.min(kept, axis=0) / twin.soft_clearance_m, 0.0, 1.0)
             expected = twin.progress * nearer - 0.1 * (twin.time_cost + twin.closeness_cost * close)
             running = outcome.numpy() == RUNNING
+            nearest_before_the_end = (kept[-1] > np.min(kept, axis=0)) & (close > 0.0) & running
+            differ += int(nearest_before_the_end.sum())
             assert len(kept) == 5 and running.any()
             np.testing.assert_allclose(reward.numpy()[running], expected[running], atol=1e-5)
     finally:
         del sim.step
+    assert differ > 0
 
 
 # ------------------------------------------------------------------------------------------ where it begins
