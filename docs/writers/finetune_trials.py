@@ -22,6 +22,7 @@ from docs.writers.evaluations import ONE_THREAD, commit_of_package
 from docs.writers.figure_sources import ROOT
 from docs.writers.pieces import LETTERS
 from docs.writers.twin_trials import CELLS, curve_of
+from uuvtai.learn import checkpoint
 from uuvtai.run_folder import hardware, write_atomic
 
 SEED, EPISODES = 77701, 600
@@ -54,20 +55,25 @@ def entry_of(method: dict[str, Any]) -> dict[str, Any]:
 def row_of(title: str, options: str, before: Path, after: Path) -> dict[str, Any]:
     """One scene, played by the tree, the policy as it came, and as it is."""
     scene = [*options.split(), "--seeds", str(SEED), "--episodes", str(EPISODES)]
-    first, second = [str(before), "--controller", "bt", *scene], [str(after), *scene]
-    methods = sorted(played(first), key=lambda method: method["name"] != "bt")
+    methods = played([str(before), str(after), "--controller", "bt", *scene])
+    found = {
+        "bt": next(method for method in methods if method["name"] == "bt"),
+        **{who: method_of(methods, path) for who, path in (("before", before), ("after", after))},
+    }
     return {
         "cell": title,
-        "commands": [
-            "uuv eval " + " ".join([name, *words[1:]])
-            for name, words in (("BEFORE", first), ("AFTER", second))
-        ],
+        "command": " ".join(["uuv eval BEFORE AFTER --controller bt", *scene]),
         "commit": commit_of_package(),
         "machine": hardware(),
-        "bt": entry_of(methods[0]),
-        "before": entry_of(methods[1]),
-        "after": entry_of(played(second)[0]),
+        **{who: entry_of(method) for who, method in found.items()},
     }
+
+
+def method_of(methods: list[dict[str, Any]], path: Path) -> dict[str, Any]:
+    """What a run folder's best checkpoint, or a checkpoint, did."""
+    is_run = (path / "checkpoints").is_dir()
+    wanted = (checkpoint.best(path) if is_run else checkpoint.open_checkpoint(path)).sha256
+    return next(method for method in methods if (method.get("checkpoint") or {}).get("sha256") == wanted)
 
 
 def main() -> None:
