@@ -677,6 +677,30 @@ TWIN = (
         "tests/test_twin.py",
         "empty_rows",
     ),
+    Mutation(
+        "truth_beside_another_track",
+        "uuvtai/twin/simulator_truth.py",
+        "if far <= best:",
+        "if far >= 0.0:",
+        "tests/test_finetune.py",
+        "lanes_by_hand",
+    ),
+    Mutation(
+        "near_is_the_last_step_alone",
+        "uuvtai/learn/simulated_world.py",
+        "np.minimum(nearest, sim.rows(referee.clearance_m))",
+        "sim.rows(referee.clearance_m)",
+        "tests/test_finetune.py",
+        "simulators_truth",
+    ),
+    Mutation(
+        "new_episode_remembers_the_last_decision",
+        "uuvtai/learn/simulated_world.py",
+        "self.wheel.last * (mask == 0)[:, None]",
+        "self.wheel.last",
+        "tests/test_finetune.py",
+        "what_the_pilot_is_shown",
+    ),
 )
 
 FORECAST = (

@@ -17,6 +17,7 @@ from uuvtai.learn import checkpoint, warm_start
 from uuvtai.learn.anchor import Anchor, gaussian_kl
 from uuvtai.learn.set_pilot import load_set_pilot
 from uuvtai.learn.set_policy import SetActor
+from uuvtai.learn.starting_policy import starting_policy
 from uuvtai.learn.twin_trainer import TwinTrainer, least_std
 from uuvtai.learn.warm_start import Student, imitate, wish_of_command
 from uuvtai.loader import load_training
@@ -25,7 +26,7 @@ from uuvtai.twin import failure_states, hull_rule
 from uuvtai.twin.failure_states import ARRAYS, FailureStarts
 from uuvtai.twin.observer import SET_TABLE
 from uuvtai.twin.scenario_bank import ScenarioBank, scenario_rows
-from uuvtai.twin.set_columns import BODY_WIDTH, EGO_COLUMNS
+from uuvtai.twin.set_codes import BODY_WIDTH, EGO_COLUMNS
 from uuvtai.twin.twin_world import Twin
 
 SWITCHES = {
@@ -64,14 +65,14 @@ def policy(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def config(policy):
-    return load_training("twin", overrides=SMALL | SWITCHES | {"twin.warm_start": str(policy)})
+    return load_training("twin", overrides=SMALL | SWITCHES | {"twin.start": str(policy)})
 
 
 @pytest.fixture(scope="module")
 def trainer(config, bank):
     """With every switch on, after two iterations."""
     made = TwinTrainer(config, bank)
-    made.warm_start()
+    made.begin_with(starting_policy(config))
     made.iterate()
     made.iterate()
     return made
@@ -81,7 +82,7 @@ def trainer(config, bank):
 
 
 def test_it_goes_on_bit_for_bit_without_the_file_it_began_with(trainer, config, bank):
-    gone = config.model_copy(update={"twin": config.twin.model_copy(update={"warm_start": "gone"})})
+    gone = config.model_copy(update={"twin": config.twin.model_copy(update={"start": "gone"})})
     other = TwinTrainer(gone, bank)
     other.load_state(copy.deepcopy(trainer.state()))
     kept = copy.deepcopy(trainer.state())
@@ -124,10 +125,11 @@ def test_switched_off_nothing_is_kept(bank):
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"twin.anchor": 0.5}, "anchor needs a warm start"),
-        ({"twin.warm_start": "a", "twin.warm_start_waves": 2}, "exclude each other"),
+        ({"twin.anchor": 0.5}, "anchor needs a policy"),
+        ({"twin.start": "a", "twin.warm_start_waves": 2}, "exclude each other"),
         ({"twin.last_std": 0.3}, "twin.last_std=0.3"),
         ({"twin.failure_starts": 1.0}, "failure_starts"),
+        ({"twin.failure_starts": 0.2, "twin.simulator": True}, "twin.failure_starts"),
         ({"twin.explore_until": 1.0}, "explore_until"),
         ({"twin.anchor_until": 0.0}, "anchor_until"),
     ],
@@ -150,7 +152,7 @@ def test_what_clearly_pays_is_the_presets():
 def test_it_begins_as_the_policy_that_is_named(config, bank, policy):
     trainer = TwinTrainer(config, bank)
     critic = copy.deepcopy(trainer.critic.state_dict())
-    trainer.warm_start()
+    trainer.begin_with(starting_policy(config))
     named = checkpoint.open_checkpoint(policy).model()["policy"]
     assert all(torch.equal(tensor, named[name]) for name, tensor in trainer.actor.state_dict().items())
     assert all(torch.equal(tensor, critic[name]) for name, tensor in trainer.critic.state_dict().items())
@@ -159,16 +161,16 @@ def test_it_begins_as_the_policy_that_is_named(config, bank, policy):
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"twin.warm_start": "nowhere"}, "nowhere"),
+        ({"twin.start": "nowhere"}, "nowhere"),
         ({"twin.body_hidden": 16}, "twin.body_hidden=8, this run 16"),
         ({"twin.goal_gain": 0.5}, "twin.goal_gain=0.7"),
         ({"vehicle.max_surge_m_s": 0.5}, "action table"),
     ],
 )
-def test_a_start_that_does_not_fit_is_refused(bank, policy, changes, says):
-    options = SMALL | {"twin.warm_start": str(policy)} | changes
+def test_a_start_that_does_not_fit_is_refused(policy, changes, says):
+    options = SMALL | {"twin.start": str(policy)} | changes
     with pytest.raises(UserError, match=says):
-        TwinTrainer(load_training("twin", overrides=options), bank).warm_start()
+        starting_policy(load_training("twin", overrides=options))
 
 
 # --------------------------------------------------------------------------------------------------- the tree
@@ -241,7 +243,7 @@ def test_the_anchor_holds_and_fades(config, bank):
     def moved(weight):
         twin = config.twin.model_copy(update={"anchor": weight, "failure_starts": 0.0})
         trainer = TwinTrainer(config.model_copy(update={"twin": twin}), bank)
-        trainer.warm_start()
+        trainer.begin_with(starting_policy(config))
         first = copy.deepcopy(trainer.actor)
         trainer.iterate()
         return gap(trainer.actor, first, trainer.twin.view)

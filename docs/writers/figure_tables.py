@@ -195,6 +195,7 @@ def policy(sources: Sources) -> str:
 
 TWIN_FILE = "docs/data/twin_77001.json"
 QUICK_FILE, SHALLOW_FILE = "docs/data/quick_77601.json", "docs/data/quick_90008.json"
+FINETUNE_FILE = "docs/data/finetune_77701.json"
 CHOOSER_FILE = "docs/data/chooser_77001.json"
 TUNED_FILE = "docs/data/tuned_77001.json"
 LEARNING_FILE = "docs/data/learning_trials.json"
@@ -271,6 +272,56 @@ def _trial_rows(sources: Sources, file: str, name: str) -> str:
 def _wheel(entry: dict[str, Any]) -> list[str]:
     counts = entry.get("chooser")
     return [f"{counts['hand_overs_mean']:.1f}, {100 * counts['policy_share']:.0f} %"] if counts else []
+
+
+def finetune_policy(sources: Sources) -> str:
+    """A policy of the twin before and after its fine-tuning in the simulator, beside the tree."""
+    rows = []
+    for entry in sources.json(FINETUNE_FILE)["rows"]:
+        before, after = (entry[who]["outcomes"] for who in ("before", "after"))
+        pairs = list(zip(before, after, strict=True))
+        only = [sum(a == "s" != b for a, b in pairs), sum(b == "s" != a for a, b in pairs)]
+        both = [i for i, pair in enumerate(pairs) if pair == ("s", "s")]
+        times = [
+            sum(entry[who]["times_s"][i] for i in both) / max(1, len(both)) for who in ("before", "after")
+        ]
+        counts = {
+            who: Counts(
+                len(pairs), {name: entry[who]["outcomes"].count(letter) for name, letter in LETTERS.items()}
+            )
+            for who in ("bt", "before", "after")
+        }
+        rows.append(
+            [
+                entry["cell"],
+                rated(counts["bt"], "success"),
+                *(
+                    rated(counts[who], ending)
+                    for ending in ("success", "collision")
+                    for who in ("before", "after")
+                ),
+                f"{only[0]}, {only[1]}",
+                f"{mcnemar_p(*only):.2g}",
+                f"{times[0]:.1f}, {times[1]:.1f} s",
+            ]
+        )
+    head = ["world (S, D, v in m/s)", "`bt`", "before", "after", "before: collision", "after: collision"]
+    more = ["arrives only before, only after", "exact McNemar p", "time where both arrive"]
+    return text_table([*head, *more], rows)
+
+
+def finetune_curve(sources: Sources) -> str:
+    """Success on held-out episodes of the simulator along the fine-tuning."""
+    names = {"gauntlet_9_1.5": "gauntlet (8, 9, 1.5)", "pool_9_1.5": "pool (8, 9, 1.5)"}
+    rows = [
+        [
+            f"{row['decisions'] / 1e6:.2f}",
+            f"{row['seconds'] / 60:.0f}",
+            *(f"{100 * row[name]:.1f} %" for name in names),
+        ]
+        for row in sources.json(FINETUNE_FILE)["curve"]
+    ]
+    return text_table(["million decisions", "minutes", *names.values()], rows)
 
 
 def twin_curve(sources: Sources) -> str:
@@ -698,6 +749,8 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         twin_curve,
         twin_recipe,
         twin_policy,
+        finetune_curve,
+        finetune_policy,
         quick_curve,
         quick_policy,
         quick_shallow,

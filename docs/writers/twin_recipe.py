@@ -54,7 +54,7 @@ class Arm:
     seeds: tuple[int, ...] = SEEDS
 
 
-_START = f"--set twin.warm_start={{runs}}/{TREE}.0"
+_START = f"--set twin.start={{runs}}/{TREE}.0"
 ARMS = (
     Arm(
         TREE,
@@ -65,10 +65,10 @@ ARMS = (
     ),
     Arm("base", "every switch off", f"{BUDGET} {FREE}"),
     Arm("failure", "`failure_starts=0.25`", f"{BUDGET} {FREE} --set twin.failure_starts=0.25"),
-    Arm("warm", "`warm_start`", f"{BUDGET} {FREE} {_START}"),
+    Arm("warm", "`start`", f"{BUDGET} {FREE} {_START}"),
     Arm(
         "anchored",
-        "`warm_start`, `anchor=0.3`, `anchor_until=0.5`",
+        "`start`, `anchor=0.3`, `anchor_until=0.5`",
         f"{BUDGET} {_START} --set twin.anchor=0.3 --set twin.anchor_until=0.5",
     ),
 )

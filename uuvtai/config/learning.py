@@ -191,6 +191,12 @@ class TwinConfig(Section):
 
     enabled: bool = False
     """train in the twin; false = in the simulator"""
+    simulator: bool = False
+    """fine-tune in the full simulator in the twin's place, with the twin's reward; needs ``start``"""
+    start: Annotated[str, Field(max_length=1000)] = ""
+    """run folder or checkpoint of the policy to begin as (``uuv train twin``); none = straight to goals"""
+    critic_warmup_iterations: Count = 0
+    """iterations in which only the critic learns, before it may move the policy"""
     worlds: tuple[Annotated[str, Field(min_length=1, max_length=200)], ...] = ("pool", "gauntlet")
     """world presets whose scenarios are dealt out, each with all of ``train.scenes``"""
     scenarios: Annotated[int, Field(ge=1, le=2**20)] = 4096
@@ -210,13 +216,11 @@ class TwinConfig(Section):
     closeness_cost: NonNegative = 0.1
     """per second at contact, none from ``soft_clearance_m`` on"""
     soft_clearance_m: Positive = 0.5
-    warm_start: Annotated[str, Field(max_length=1000)] = ""
-    """run folder or checkpoint of a policy of the twin to begin as; none = straight to the goal"""
     warm_start_waves: Annotated[int, Field(ge=0, le=1000)] = 0
     """waves of episodes in the simulator in which the policy first learns to imitate the behaviour tree
     (DAgger), world by world and scene by scene; 0 = none"""
     anchor: NonNegative = 0.0
-    """weight of KL(policy || warm-started policy) in the loss"""
+    """weight of KL(policy || policy that it began as) in the loss"""
     anchor_until: Annotated[float, Field(gt=0, le=1)] = 0.3
     """share of the run over which that weight falls to 0, linearly"""
     last_std: NonNegative = 0.0
@@ -228,10 +232,12 @@ class TwinConfig(Section):
 
     @model_validator(mode="after")
     def _start_to_hold_to(self):
-        if self.warm_start and self.warm_start_waves:
-            raise ValueError("warm_start and warm_start_waves exclude each other: set warm_start_waves=0")
-        if self.anchor > 0 and not (self.warm_start or self.warm_start_waves):
-            raise ValueError("anchor needs a warm start: warm_start=RUN or warm_start_waves=6; else anchor=0")
+        if self.start and self.warm_start_waves:
+            raise ValueError("start and warm_start_waves exclude each other: set warm_start_waves=0")
+        if self.anchor > 0 and not (self.start or self.warm_start_waves):
+            raise ValueError(
+                "anchor needs a policy to hold to: start=RUN or warm_start_waves=6; else anchor=0"
+            )
         return self
 
 

@@ -88,6 +88,10 @@ class Checkpoint:
         """State of the networks, by the names of MODEL_PARTS that were saved. Raises CheckpointError."""
         return self._part(MODEL, self.manifest.model)
 
+    def training(self) -> dict[str, Any]:
+        """What training needs beside the networks that drive and the simulator. Raises CheckpointError."""
+        return self._part(TRAINING, self.manifest.training)
+
     def state(self, like: Mapping[str, Any]) -> dict[str, Any]:
         """The trainer's whole state. ``like`` is the state of the trainer it is meant for: a simulator of
         another size is refused."""
@@ -95,7 +99,7 @@ class Checkpoint:
             raise CheckpointError(
                 f"{self.path}: has networks only and cannot be trained on; resume the run's newest checkpoint"
             )
-        state = self.model() | self._part(TRAINING, self.manifest.training)
+        state = self.model() | self.training()
         plain, expected = pack(like[SIMULATOR_PART], SIMULATOR_PART, copy=False)
         layout = self.manifest.simulator_layout
         if _structure(plain) != _structure(self.manifest.simulator) or layout != layout_of(expected):

@@ -10,13 +10,14 @@ import torch
 from uuvtai.learn.checkpoint import Checkpoint
 from uuvtai.learn.pilot import PilotDecision, by_chunk
 from uuvtai.learn.set_networks import actor_of
-from uuvtai.learn.set_policy import MOST_WISH, NUM_WISHES, SetActor
+from uuvtai.learn.set_policy import MOST_WISH, SetActor
+from uuvtai.learn.set_wheel import SetWheel
 
 if TYPE_CHECKING:
     from uuvtai.sim import Sim
 
 
-class SetPilot:
+class SetPilot(SetWheel):
     """Drives the rows of a simulator; used as ``Pilot`` is, but it looks at tracks, map and pose itself."""
 
     world_model = None
@@ -24,24 +25,11 @@ class SetPilot:
 
     def __init__(self, actor: SetActor, sim: Sim, hold_steps: int, gap_m: float) -> None:
         """``hold_steps`` control steps a decision; the centre stays ``gap_m`` from floor and surface."""
-        from uuvtai.binding import bind
-        from uuvtai.twin.set_codes import BODY_WIDTH, EGO_COLUMNS, N_BODY, N_RAY
-        from uuvtai.twin.twin_arrays import EGO_WIDTH, RAW_WIDTH, ObserverIO
-
-        self.actor, self._sim, self._hold, self._gap_m = actor, sim, hold_steps, gap_m
-        self._io = bind(ObserverIO, sim.s, sim.config)
-        rows = sim.num_envs
-
-        def zeros(*shape: int) -> torch.Tensor:
-            return torch.zeros(rows, *shape, device=sim.device)
-
-        self._ego, self._raw, self._ray = zeros(EGO_WIDTH), zeros(N_BODY, RAW_WIDTH), zeros(N_RAY)
-        self.bodies, self.own = zeros(N_BODY, BODY_WIDTH), zeros(EGO_COLUMNS)
-        """columns that the last decision was made from"""
-        self.wish, self._last, self._command = zeros(NUM_WISHES), zeros(NUM_WISHES), zeros(4)
-        self._age = torch.zeros(rows, dtype=torch.int64, device=sim.device)
+        super().__init__(sim, gap_m)
+        self.actor, self._hold = actor, hold_steps
+        self._age = torch.zeros(sim.num_envs, dtype=torch.int64, device=sim.device)
         std = torch.cat([actor.log_std.detach().exp(), torch.zeros(1, device=sim.device)])
-        nothing = zeros()
+        nothing = torch.zeros(sim.num_envs, device=sim.device)
         self.decision = PilotDecision(self._command, nothing, std, nothing, nothing, nothing[:0])
         """value, residual and uncertainty are 0: what drives has no critic and no world model"""
 
@@ -49,33 +37,23 @@ class SetPilot:
         """New episodes have begun in the rows (num_envs,) where this is not 0."""
         kept = rows.to(self._age.device) == 0
         self._age *= kept
-        self._last *= kept[:, None]
+        self.last *= kept[:, None]
 
     @torch.no_grad()
     def decide(self, _obs: torch.Tensor) -> PilotDecision:
         """Command for all rows; changes nothing that the next one depends on."""
-        from uuvtai.twin.observer import command_hull, observe_bodies
-        from uuvtai.twin.set_columns import write_set_columns
-        from uuvtai.twin.twin_arrays import AT_LAST
-
         due = self._due()
         if bool(due.any()):
-            self._ego[:, AT_LAST : AT_LAST + NUM_WISHES] = self._last
-            observe_bodies(self._io, due.int(), self._ego, self._raw, self._ray)
-            write_set_columns(self._ego, self._raw, self._ray, self.bodies, self.own)
+            self.look(due)
             rows = due.nonzero().flatten()
             wish = by_chunk(self.actor, self.bodies[rows], self.own[rows]).clamp(-MOST_WISH, MOST_WISH)
             self.wish[rows] = wish
-        command_hull(self._io, self._gap_m, self.wish, self._command)
-        self.decision = self.decision._replace(action=self._command.clone())
+        self.decision = self.decision._replace(action=self.command().clone())
         return self.decision
 
     def advance(self) -> None:
         """The last decision has been carried out."""
-        due = self._due()
-        long = self.wish[:, :2].norm(dim=1, keepdim=True).clamp(min=1.0)
-        done = torch.cat([self.wish[:, :2] / long, self.wish[:, 2:].clamp(-1.0, 1.0)], dim=1)
-        self._last = torch.where(due[:, None], done, self._last)
+        self.note_last(self._due())
         self._age += 1
 
     def _due(self) -> torch.Tensor:

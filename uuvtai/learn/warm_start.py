@@ -7,19 +7,14 @@ mean is fitted to all that was said so far. The tree drives in the first wave, t
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
 from uuvtai.config.learning import LearningConfig
-from uuvtai.errors import SettingError
-from uuvtai.learn import checkpoint
 from uuvtai.learn.episode_waves import play_episodes
-from uuvtai.learn.manifest import CheckpointError
 from uuvtai.learn.optimiser import PlainAdam
 from uuvtai.learn.pilot import PilotDecision
-from uuvtai.learn.set_networks import actor_of
 from uuvtai.learn.set_pilot import SetPilot
 from uuvtai.learn.set_policy import NUM_WISHES, SetActor
 from uuvtai.learn.world_sims import simulator_of
@@ -149,29 +144,3 @@ def regress(
             optimiser.step()
             errors.append(float(loss.detach()) / NUM_WISHES)
     return sum(errors) / len(errors)
-
-
-def trained_actor(config: LearningConfig) -> dict[str, torch.Tensor]:
-    """Weights that ``twin.warm_start`` names. Raises SettingError or CheckpointError where there are none
-    that fit."""
-    from uuvtai.twin.observer import SET_TABLE
-
-    path = Path(config.twin.warm_start)
-    found = checkpoint.best(path) if (path / "checkpoints").is_dir() else checkpoint.open_checkpoint(path)
-    if not found.config.twin.enabled:
-        raise SettingError(f"twin.warm_start={path}: was not trained in the twin")
-    try:
-        found.check_table(SET_TABLE, config)
-    except CheckpointError as error:
-        raise SettingError(f"twin.warm_start: {error}") from None
-    for name in ("body_hidden", "head_hidden"):
-        theirs, own = getattr(found.config.twin, name), getattr(config.twin, name)
-        if theirs != own:
-            raise SettingError(
-                f"twin.warm_start={path}: has twin.{name}={theirs}, this run {own}; set twin.{name}={theirs}"
-            )
-    if found.config.twin.goal_gain != config.twin.goal_gain:
-        raise SettingError(
-            f"twin.warm_start={path}: has twin.goal_gain={found.config.twin.goal_gain}; set it here as well"
-        )
-    return {name: tensor.clone() for name, tensor in actor_of(found).state_dict().items()}

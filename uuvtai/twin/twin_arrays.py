@@ -14,7 +14,16 @@ from uuvtai.config import (
 )
 from uuvtai.config.learning import TwinConfig
 from uuvtai.kernels.core.signature import Const, In
-from uuvtai.state import ClearanceState, ClockState, ForecastState, MissionState, Proprioception, TrackState
+from uuvtai.state import (
+    ClearanceState,
+    ClockState,
+    ForecastState,
+    MissionState,
+    Proprioception,
+    TrackState,
+    VehicleState,
+    WorldState,
+)
 
 AT_POS, AT_VEL, AT_YAW, AT_RATE, AT_TIME, AT_GOAL, AT_FLIP, AT_LAST, AT_INTEGRAL = (
     0,
@@ -62,3 +71,14 @@ class ObserverIO:
     tank_cfg: Const[TankConfig]
     mapping_cfg: Const[MappingConfig]
     tracking_cfg: Const[TrackingConfig]
+
+
+@dataclass(frozen=True, eq=False)
+class TrueBodiesIO:
+    """What the critic's truth is made of, in training in the simulator: no policy is shown it."""
+
+    clock: In[ClockState]
+    mission: In[MissionState]
+    vehicle: In[VehicleState]
+    world: In[WorldState]
+    episode_cfg: Const[EpisodeConfig]

@@ -52,6 +52,11 @@ class Twin:
         )
 
     @property
+    def num_scenarios(self) -> int:
+        """How many there are to begin."""
+        return len(self.bank.body)
+
+    @property
     def time_s(self) -> torch.Tensor:
         """(N,) since the begin of each episode."""
         return self.ego[:, 8]
