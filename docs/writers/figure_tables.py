@@ -194,6 +194,7 @@ def policy(sources: Sources) -> str:
 
 
 TWIN_FILE = "docs/data/twin_77001.json"
+WARM_FILE, COLD_FILE = "docs/data/twin_warm_77001.json", "docs/data/twin_cold_77001.json"
 QUICK_FILE, SHALLOW_FILE = "docs/data/quick_77601.json", "docs/data/quick_90008.json"
 FINETUNE_FILE = "docs/data/finetune_77701.json"
 CHOOSER_FILE = "docs/data/chooser_77001.json"
@@ -204,6 +205,16 @@ LEARNING_FILE = "docs/data/learning_trials.json"
 def twin_policy(sources: Sources) -> str:
     """The policy that learnt in the twin beside the tree, in the simulator, on the same episodes."""
     return _trial_rows(sources, TWIN_FILE, "policy")
+
+
+def twin_warm(sources: Sources) -> str:
+    """A policy that was warm-started from the tree beside the tree, on the same episodes."""
+    return _trial_rows(sources, WARM_FILE, "policy")
+
+
+def twin_cold(sources: Sources) -> str:
+    """The same budget with every switch off."""
+    return _trial_rows(sources, COLD_FILE, "policy")
 
 
 def quick_policy(sources: Sources) -> str:
@@ -748,6 +759,8 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         vehicles,
         twin_curve,
         twin_recipe,
+        twin_warm,
+        twin_cold,
         twin_policy,
         finetune_curve,
         finetune_policy,
