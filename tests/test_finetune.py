@@ -29,17 +29,9 @@ from uuvtai.measure.episodes.playing import jobs_of, run_episodes
 from uuvtai.measure.evaluate.while_training import evaluate_now
 from uuvtai.outcomes import COLLISION, OUTCOMES, RUNNING, SUCCESS, TIMEOUT
 from uuvtai.twin.observer import SET_TABLE
-from uuvtai.twin.set_codes import BODY_WIDTH, EGO_COLUMNS
+from uuvtai.twin.set_codes import BODY_WIDTH, EGO_COLUMNS, N_BODY
 from uuvtai.twin.simulator_truth import SAME_M, reward_decisions, see_truth
-from uuvtai.twin.twin_arrays import (
-    EGO_WIDTH,
-    N_BODY,
-    RAW_WIDTH,
-    TRUTH_WIDTH,
-    ObserverIO,
-    TrueBodiesIO,
-    TwinRules,
-)
+from uuvtai.twin.twin_arrays import EGO_WIDTH, RAW_WIDTH, TRUTH_WIDTH, ObserverIO, TrueBodiesIO, TwinRules
 
 SCENES = ((8, 6, 0.6),)
 NET = {"twin.body_hidden": 8, "twin.head_hidden": 8}
@@ -275,7 +267,8 @@ def test_without_a_critic_one_begins_anew(start, config):
 
 def test_the_twin_may_begin_with_a_policy_too(start):
     path, _ = start()
-    assert starting_policy.starting_policy(load_training("twin", overrides=NET | {"twin.start": str(path)}))
+    given = NET | {"twin.start": str(path), "twin.warm_start_waves": 0}
+    assert starting_policy.starting_policy(load_training("twin", overrides=given))
     assert starting_policy.starting_policy(load_training("twin", overrides=NET)) is None
 
 

@@ -233,7 +233,7 @@ class TwinConfig(Section):
     @model_validator(mode="after")
     def _start_to_hold_to(self):
         if self.start and self.warm_start_waves:
-            raise ValueError("start and warm_start_waves exclude each other: set warm_start_waves=0")
+            raise ValueError("start and warm_start_waves exclude each other: --set twin.warm_start_waves=0")
         if self.anchor > 0 and not (self.start or self.warm_start_waves):
             raise ValueError(
                 "anchor needs a policy to hold to: start=RUN or warm_start_waves=6; else anchor=0"
