@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import time
 from collections.abc import Mapping
@@ -16,9 +17,11 @@ from uuvtai.learn.distributed import Processes
 from uuvtai.learn.held_out import play_held_out
 from uuvtai.learn.optimiser import PlainAdam
 from uuvtai.learn.policy import log_prob
-from uuvtai.learn.ppo import ADAM_EPS, adapted_rate, approximate_kl, gae, surrogate_loss
+from uuvtai.learn.ppo import ADAM_EPS, adapted_rate, gae
 from uuvtai.learn.rollout_sums import Recent, RolloutSums
+from uuvtai.learn.set_losses import SetLosses, by_part
 from uuvtai.learn.set_policy import MOST_WISH, NUM_WISHES, SetActor, SetCritic
+from uuvtai.learn.side_by_side import side_by_side
 from uuvtai.learn.simulated_world import SimulatedWorld
 from uuvtai.learn.starting_policy import StartingPolicy
 from uuvtai.learn.warm_start import imitate
@@ -32,8 +35,6 @@ if TYPE_CHECKING:
 
 BANK_SEED = 4242
 """of the scenarios to learn from; those of evaluations come from ``train.evaluate_seed``"""
-CACHE_ROWS = 2048
-"""rows in one pass through the networks: nine bodies each"""
 FASTEST_RATE = 2e-3
 """most that the KL-adaptive rate may be"""
 CRITIC_RATE = 1e-3
@@ -164,11 +165,13 @@ class TwinTrainer:
         sums = RolloutSums.zeros(len(OUTCOMES), 0, torch.device("cpu"))
         for t in range(len(self._reward)):
             self._bodies[t], self._own[t], self._truth[t] = view
-            mean = _by_part(self.actor, view.bodies, view.own)
+            mean, self._value[t] = side_by_side(
+                functools.partial(by_part, self.actor, view.bodies, view.own),
+                functools.partial(by_part, self.critic, *view),
+            )
             noise = torch.randn(mean.shape, generator=self.generator)
             action = torch.addcmul(mean, noise, self.actor.log_std.exp())
             self._action[t], self._log_prob[t] = action, log_prob(action, mean, self.actor.log_std)
-            self._value[t] = _by_part(self.critic, *view)
             reward, outcome = twin.step(action)
             ended = outcome != RUNNING
             self._reward[t], self._ended[t] = reward, ended
@@ -191,7 +194,7 @@ class TwinTrainer:
                 self._failures.advance()
             twin.look()
             self._bootstrap(t)
-        last = _by_part(self.critic, *view)
+        last = by_part(self.critic, *view)
         self._next_value[-1] = torch.where(self._ended[-1], self._next_value[-1], last)
         sums.samples += self._reward.numel()
         return sums
@@ -259,29 +262,12 @@ class TwinTrainer:
 
     def _minibatch(self, batch: list[torch.Tensor]) -> torch.Tensor:
         """One step of both networks; (policy loss, value loss, KL, share clipped)."""
-        config, count = self.config.ppo, len(batch[0])
+        config = self.config.ppo
         share = self.iteration / self.config.train.iterations
         held = self._anchor.weight(share) if self._anchor else 0.0
         self.optimiser.zero_grad(set_to_none=True)
-        sums = torch.zeros(4)
-        for part in zip(*(tensor.split(CACHE_ROWS) for tensor in batch), strict=True):
-            bodies, own, truth, action, before, advantage, target = part
-            with self._coarse():
-                mean, value = self.actor(bodies, own), self.critic(bodies, own, truth)
-            log_ratio = log_prob(action, mean.float(), self.actor.log_std) - before
-            policy_loss = surrogate_loss(log_ratio, advantage, config.clip).sum() / count
-            value_loss = (value.float() - target).square().sum() / count
-            loss = policy_loss + config.value_weight * value_loss
-            if self._anchor and held > 0:
-                far = self._anchor.divergence(mean.float(), self.actor.log_std, bodies, own)
-                loss = loss + held * far.sum() / count
-            loss.backward()
-            with torch.no_grad():
-                kl = approximate_kl(log_ratio).sum() / count
-                clipped = ((log_ratio.exp() - 1.0).abs() > config.clip).sum() / count
-                sums += torch.stack([policy_loss, value_loss, kl, clipped])
-        if self._critic_alone():
-            self.actor.zero_grad(set_to_none=True)
+        losses = SetLosses(self.config, self.actor, self.critic, self._anchor, held)
+        sums = losses.backward(batch, not self._critic_alone())
         torch.nn.utils.clip_grad_norm_(self.actor.parameters(), config.max_grad_norm)
         torch.nn.utils.clip_grad_norm_(self.critic.parameters(), config.max_grad_norm)
         self.optimiser.step()
@@ -291,10 +277,6 @@ class TwinTrainer:
 
     def _critic_alone(self) -> bool:
         return self.iteration < self.config.twin.critic_warmup_iterations
-
-    def _coarse(self) -> torch.autocast:
-        """Products in bfloat16 where ``ppo.bfloat16`` says so."""
-        return torch.autocast("cpu", torch.bfloat16, enabled=self.config.ppo.bfloat16)
 
     # --------------------------------------------------------------------------------------------- evaluation
 
@@ -419,11 +401,6 @@ def _refuse_what_the_twin_lacks(config: LearningConfig) -> None:
         )
 
 
-def _by_part(net: torch.nn.Module, *parts: torch.Tensor) -> torch.Tensor:
-    """What a network says of many rows, ``CACHE_ROWS`` at a time."""
-    return torch.cat([net(*rows) for rows in zip(*(part.split(CACHE_ROWS) for part in parts), strict=True)])
-
-
 @torch.no_grad()
 def play_once(twin: Twin, actor: SetActor) -> tuple[torch.Tensor, torch.Tensor]:
     """(outcome code, time [s]), both (N,), of scenario i in env i, driven by the mean."""
@@ -432,7 +409,7 @@ def play_once(twin: Twin, actor: SetActor) -> tuple[torch.Tensor, torch.Tensor]:
     outcome, time_s = torch.zeros(twin.num_envs, dtype=torch.int32), torch.zeros(twin.num_envs)
     while bool((outcome == RUNNING).any()):
         view = twin.look()
-        _, now = twin.step(_by_part(actor, view.bodies, view.own).clamp(-MOST_WISH, MOST_WISH))
+        _, now = twin.step(by_part(actor, view.bodies, view.own).clamp(-MOST_WISH, MOST_WISH))
         new = (outcome == RUNNING) & (now != RUNNING)
         outcome, time_s = torch.where(new, now, outcome), torch.where(new, twin.time_s, time_s)
     return outcome, time_s

@@ -1,0 +1,87 @@
+"""Losses of a policy over a set of bodies, by pieces on several threads: gradients of the whole minibatch,
+whatever the number of threads."""
+
+import pytest
+import torch
+
+from uuvtai.config.learning import LearningConfig
+from uuvtai.learn import side_by_side as pieces
+from uuvtai.learn.anchor import Anchor
+from uuvtai.learn.policy import log_prob
+from uuvtai.learn.ppo import surrogate_loss
+from uuvtai.learn.set_losses import CACHE_ROWS, SetLosses, by_part
+from uuvtai.learn.set_policy import SetActor, SetCritic
+from uuvtai.learn.side_by_side import side_by_side
+
+ROWS, LANES, N_BODY, N_OWN, N_TRUTH = CACHE_ROWS + 77, 3, 5, 7, 4
+
+
+@pytest.fixture
+def nets():
+    config = LearningConfig.model_validate({"twin": {"body_hidden": 8, "head_hidden": 8}, "policy": {}})
+    generator = torch.Generator().manual_seed(0)
+    actor = SetActor(N_BODY, N_OWN, config, generator)
+    return config, actor, SetCritic(N_BODY, N_OWN, N_TRUTH, config, generator)
+
+
+@pytest.fixture(scope="module")
+def batch():
+    generator = torch.Generator().manual_seed(1)
+
+    def drawn(*shape):
+        return torch.randn(ROWS, *shape, generator=generator)
+
+    bodies = drawn(LANES, N_BODY)
+    bodies[..., 0] = (bodies[..., 0] > 0).float()
+    return [bodies, drawn(N_OWN), drawn(LANES, N_TRUTH), drawn(3), drawn() - 3.0, drawn(), drawn()]
+
+
+def gradients(config, actor, critic, batch, anchor=None, held=0.0, actor_learns=True):
+    for parameter in (*actor.parameters(), *critic.parameters()):
+        parameter.grad = None
+    sums = SetLosses(config, actor, critic, anchor, held).backward(batch, actor_learns)
+    return [p.grad for p in actor.parameters()], [p.grad for p in critic.parameters()], sums
+
+
+def test_pieces_add_up_to_the_gradient_of_the_whole(nets, batch):
+    config, actor, critic = nets
+    anchor = Anchor(SetActor(N_BODY, N_OWN, config, torch.Generator().manual_seed(2)), 0.3, 0.5)
+    of_actor, of_critic, sums = gradients(config, actor, critic, batch, anchor, 0.3)
+    bodies, own, truth, action, before, advantage, target = batch
+    mean, value = actor(bodies, own), critic(bodies, own, truth)
+    surrogate = surrogate_loss(
+        log_prob(action, mean, actor.log_std) - before, advantage, config.ppo.clip
+    ).mean()
+    error = (value - target).square().mean()
+    far = anchor.divergence(mean, actor.log_std, bodies, own).mean()
+    wanted = torch.autograd.grad(surrogate + 0.3 * far, list(actor.parameters()))
+    for found, asked in zip(of_actor, wanted, strict=True):
+        torch.testing.assert_close(found, asked, rtol=1e-3, atol=1e-5)
+    wanted = torch.autograd.grad(config.ppo.value_weight * error, list(critic.parameters()))
+    for found, asked in zip(of_critic, wanted, strict=True):
+        torch.testing.assert_close(found, asked, rtol=1e-3, atol=1e-5)
+    torch.testing.assert_close(sums[:2], torch.stack([surrogate, error]).detach(), rtol=1e-4, atol=1e-5)
+
+
+def test_the_number_of_threads_changes_no_bit(nets, batch, monkeypatch):
+    def found(threads):
+        monkeypatch.setattr(pieces.torch, "get_num_threads", lambda: threads)
+        of_actor, of_critic, sums = gradients(*nets, batch)
+        return [*of_actor, *of_critic, sums, by_part(nets[1], *batch[:2])]
+
+    one = found(1)
+    assert all(tensor.abs().sum() > 0 for tensor in one)
+    for threads in (2, 3):
+        assert all(torch.equal(a, b) for a, b in zip(one, found(threads), strict=True))
+
+
+def test_while_the_critic_learns_alone_the_actor_has_no_gradient(nets, batch):
+    of_actor, of_critic, _ = gradients(*nets, batch, actor_learns=False)
+    assert of_actor == [None] * len(of_actor) and None not in of_critic
+
+
+def test_what_goes_wrong_in_a_piece_is_told(monkeypatch):
+    monkeypatch.setattr(pieces.torch, "get_num_threads", lambda: 2)
+    with pytest.raises(ZeroDivisionError):
+        side_by_side(lambda: 1, lambda: 1 // 0)
+    assert side_by_side(lambda: 1, lambda: 2) == [1, 2]
