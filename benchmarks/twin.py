@@ -40,7 +40,10 @@ def measure(job: Job) -> list[Row]:
 def _rows(found: list[list[dict[str, float]]], commit: str) -> list[Row]:
     rate = "time/env_steps_per_s"
     ours, theirs = (_median(side, rate) for side in found)
-    told = {name: [row[rate] for row in side] for name, side in zip(("ours", "theirs"), found, strict=True)}
+    told = {
+        name: [row[rate] for row in side]
+        for name, side in zip(("rates", "rates_of_the_peer"), found, strict=True)
+    }
     rows = [Row("training in the twin", ours, "decisions/s", theirs, commit, floor=40_000, details=told)]
     for part in _PARTS:
         ours, theirs = (_median(side, f"time/{part}_s") for side in found)
