@@ -56,6 +56,14 @@ class SmallSim:
             mask[row], seeds[row], numbers[row] = 1, seed, number
         self.sim.reset(mask, seeds, numbers)
 
+    def scenario_bank(self):
+        """The scenarios of episodes 0 .. N - 1 of seed 5, for the twin."""
+        from uuvtai.twin.scenario_bank import ScenarioBank, scenario_rows
+
+        self.begin(range(self.N), seed=5)
+        rows = [torch.from_numpy(rows.copy()) for rows in scenario_rows(self.sim)]
+        return ScenarioBank(*rows, torch.zeros(self.N, dtype=torch.int32), ("pool",))
+
     def arrays(self, *nouns):
         """NumPy copies of every array of these structs but scratch, which keeps what earlier tests left in
         it, by 'struct.field'."""

@@ -116,6 +116,18 @@ def test_a_folder_has_its_driver_and_checks_itself(kind, whole, capfd):
     assert "agrees" in capfd.readouterr().out
 
 
+def test_the_card_says_where_it_was_judged(whole, kind):
+    """Not in the config's own world: in all worlds and scenes that it learnt in."""
+    card = (whole[1] / "README.md").read_text()
+    if kind == "set":
+        assert (
+            "the kinematic twin, pool and gauntlet, S = 8, D = 9, v = 1.5 m/s; S = 8, D = 9, v = 1 m/s; "
+            in card
+        )
+        assert "| 768/1536 = 50.0 %" in card and "| 384/1536 = 25.0 %" in card
+    assert "the simulator of uuvtai" not in card
+
+
 def test_it_drives_where_there_is_numpy_alone(whole):
     _, folder = whole
     code = (

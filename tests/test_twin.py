@@ -26,7 +26,7 @@ from uuvtai.learn.twin_trainer import TwinTrainer
 from uuvtai.loader import ConfigError, load_training
 from uuvtai.measure.episodes.playing import jobs_of, run_episodes
 from uuvtai.twin import hull_rule, kinematics, observer, sensing_model
-from uuvtai.twin.scenario_bank import ScenarioBank, draw_bank, scenario_rows
+from uuvtai.twin.scenario_bank import draw_bank
 from uuvtai.twin.set_codes import BODY_WIDTH, EGO_COLUMNS
 from uuvtai.twin.twin_arrays import ObserverIO, TwinRules
 
@@ -77,9 +77,7 @@ def config():
 @pytest.fixture(scope="module")
 def bank(small):
     """Scenarios that the small simulator has drawn."""
-    small.begin(range(small.N), seed=5)
-    rows = [torch.from_numpy(rows.copy()) for rows in scenario_rows(small.sim)]
-    return ScenarioBank(*rows, torch.zeros(small.N, dtype=torch.int32), ("pool",))
+    return small.scenario_bank()
 
 
 @pytest.fixture(scope="module")

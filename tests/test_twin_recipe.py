@@ -25,7 +25,6 @@ from uuvtai.outcomes import COLLISION, RUNNING, SUCCESS
 from uuvtai.twin import failure_states, hull_rule
 from uuvtai.twin.failure_states import ARRAYS, FailureStarts
 from uuvtai.twin.observer import SET_TABLE
-from uuvtai.twin.scenario_bank import ScenarioBank, scenario_rows
 from uuvtai.twin.set_codes import BODY_WIDTH, EGO_COLUMNS
 from uuvtai.twin.twin_world import Twin
 
@@ -49,9 +48,7 @@ def velocities(wish: FloatMatrix, flip: FloatMatrix, vehicle: Const[VehicleConfi
 
 @pytest.fixture(scope="module")
 def bank(small):
-    small.begin(range(small.N), seed=5)
-    rows = [torch.from_numpy(rows.copy()) for rows in scenario_rows(small.sim)]
-    return ScenarioBank(*rows, torch.zeros(small.N, dtype=torch.int32), ("pool",))
+    return small.scenario_bank()
 
 
 @pytest.fixture(scope="module")

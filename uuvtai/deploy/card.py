@@ -6,7 +6,7 @@ from __future__ import annotations
 from typing import Any
 
 from uuvtai.config.learning import LearningConfig
-from uuvtai.deploy.evaluations import Evaluation, during_training
+from uuvtai.deploy.evaluations import Evaluation, during_training, scenes_of
 from uuvtai.learn.checkpoint import Checkpoint
 
 _TEXT = """# {name}
@@ -103,10 +103,7 @@ def _tank(config: LearningConfig) -> str:
 
 
 def _obstacles(config: LearningConfig) -> str:
-    world = config.world
-    scenes = config.train.scenes or ((world.n_static, world.n_dynamic, world.dynamic_speed_m_s),)
-    conditions = "; ".join(f"S = {s}, D = {d}, v = {v:g} m/s" for s, d, v in scenes)
-    return f"Resting obstacles S, moving ones D, their speed v: {conditions}."
+    return f"Resting obstacles S, moving ones D, their speed v: {scenes_of(config)}."
 
 
 def results_text(checkpoint: Checkpoint, evaluations: list[Evaluation]) -> str:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from uuvtai.config.learning import LearningConfig
 from uuvtai.errors import UserError
 from uuvtai.files import read_json
 from uuvtai.learn.checkpoint import Checkpoint
@@ -43,12 +44,33 @@ def during_training(checkpoint: Checkpoint) -> Evaluation | None:
     success, collision = (metrics.get(f"eval/{name}_rate") for name in ("success", "collision"))
     if not isinstance(success, float | int) or not isinstance(collision, float | int):
         return None
-    n, world = config.train.evaluate_episodes, config.world
-    where = (
-        f"the training's own world and sensing, S = {world.n_static}, D = {world.n_dynamic}, v = "
-        f"{world.dynamic_speed_m_s:g} m/s, seed {config.train.evaluate_seed}"
-    )
+    where, n = _held_out_in_worlds(config) if config.twin.enabled else _held_out(config)
+    where += f", seed {config.train.evaluate_seed}"
     return Evaluation(where, n, round(success * n), round(collision * n))
+
+
+def _held_out(config: LearningConfig) -> tuple[str, int]:
+    """(conditions, number of episodes) of a training in its own world."""
+    world = config.world
+    return (
+        f"the training's own world and sensing, S = {world.n_static}, D = {world.n_dynamic}, v = "
+        f"{world.dynamic_speed_m_s:g} m/s"
+    ), config.train.evaluate_episodes
+
+
+def _held_out_in_worlds(config: LearningConfig) -> tuple[str, int]:
+    """As ``_held_out``, of a policy over a set of bodies: as many of every world and scene."""
+    worlds, place = config.twin.worlds, "simulator" if config.twin.simulator else "kinematic twin"
+    groups = len(worlds) * max(1, len(config.train.scenes))
+    each = -(-config.train.evaluate_episodes // groups)
+    return f"the {place}, {' and '.join(map(_word, worlds))}, {scenes_of(config)}", groups * each
+
+
+def scenes_of(config: LearningConfig) -> str:
+    """Numbers and speeds of the obstacles that were learnt among."""
+    world = config.world
+    scenes = config.train.scenes or ((world.n_static, world.n_dynamic, world.dynamic_speed_m_s),)
+    return "; ".join(f"S = {s}, D = {d}, v = {v:g} m/s" for s, d, v in scenes)
 
 
 def evaluations_of(checkpoint: Checkpoint, folders: Iterable[Path]) -> list[Evaluation]:

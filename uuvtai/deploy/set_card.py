@@ -12,7 +12,7 @@ from uuvtai.learn.checkpoint import Checkpoint
 _CARD = """# {name}
 
 {what}
-Trained in the simulator of uuvtai {version}.
+Trained with uuvtai {version}.
 
 ## What it was trained on
 {training}

@@ -12,12 +12,11 @@ from uuvtai.deploy.graph import OPSET, ExportedModule
 from uuvtai.deploy.run_policy import GOLDEN, SCHEMA, WEIGHTS
 from uuvtai.deploy.set_columns_text import BODY_COLUMNS, MEANING, MOTION_MEANING, OWN_COLUMNS, TREE_COLUMNS
 from uuvtai.deploy.set_graph import SET_OUTPUTS, OneWish
-from uuvtai.deploy.spec import ONNX
+from uuvtai.deploy.spec import ONNX, origin_of
 from uuvtai.forecast_codes import COLUMNS, N_MODE
 from uuvtai.learn.checkpoint import Checkpoint
 from uuvtai.learn.mixture_net import TIMES_S
 from uuvtai.twin.set_codes import LEAST_SPEED_M_S, N_BODY, TURN_GAIN
-from uuvtai.version import __version__
 
 _WISH = (
     "ahead, left, up in the mirrored world: the first two in parts of fastest_m_s, shortened to length 1 "
@@ -40,12 +39,7 @@ def set_specification(
         "schema": SCHEMA,
         "kind": kind,
         "name": name,
-        "uuvtai": __version__,
-        "checkpoint": {
-            "sha256": checkpoint.sha256,
-            "step": checkpoint.step,
-            "created": checkpoint.manifest.created,
-        },
+        **origin_of(checkpoint),
         **about,
         "graph": graph if has_onnx else None,
         "golden": {"file": GOLDEN, "tolerance": TOLERANCE},

@@ -28,18 +28,25 @@ _HOLD = (
 )
 
 
-def specification(checkpoint: Checkpoint, pilot: Pilot, name: str, has_onnx: bool) -> dict[str, Any]:
-    """The document without ``files``, which ``export`` adds."""
-    config, policy = checkpoint.config, pilot.policy
+def origin_of(checkpoint: Checkpoint) -> dict[str, Any]:
+    """What the folder came from: part of the document."""
     return {
-        "schema": SCHEMA,
-        "name": name,
         "uuvtai": __version__,
         "checkpoint": {
             "sha256": checkpoint.sha256,
             "step": checkpoint.step,
             "created": checkpoint.manifest.created,
         },
+    }
+
+
+def specification(checkpoint: Checkpoint, pilot: Pilot, name: str, has_onnx: bool) -> dict[str, Any]:
+    """The document without ``files``, which ``export`` adds."""
+    config, policy = checkpoint.config, pilot.policy
+    return {
+        "schema": SCHEMA,
+        "name": name,
+        **origin_of(checkpoint),
         "observation": {
             "width": policy.n_in - N_FEATURES,
             "meaning": _OBSERVATION,

@@ -1,4 +1,4 @@
-"""Warm start of the set policy: from a trained one, or by imitation of the behaviour tree in the simulator.
+"""Warm start of a policy over a set of bodies: imitation of the behaviour tree in the simulator.
 
 DAgger (Ross, Gordon & Bagnell 2011, AISTATS): whoever drives, the tree says what it would do, and the actor's
 mean is fitted to all that was said so far. The tree drives in the first wave, the student more and more.
