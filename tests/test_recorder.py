@@ -4,6 +4,7 @@ import json
 
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.summary.writer import event_file_writer
 
 from uuvtai.learn.recorder import MetricsRecorder, read_metrics
 
@@ -36,6 +37,17 @@ def test_lines_are_readable_while_the_run_goes_on(tmp_path):
     recorder.write(1, {"a": 1.0})
     assert read_metrics(tmp_path) == [{"iteration": 1, "a": 1.0}]
     recorder.close()
+
+
+def test_events_are_read_in_the_order_of_the_resumes(tmp_path, monkeypatch):
+    """A name ends in how many files its process had opened before, and names are sorted as text: 10 before
+    9."""
+    monkeypatch.setattr(event_file_writer, "_global_uid", event_file_writer.AtomicCounter(9))
+    record(tmp_path, 0, (1, 2))
+    record(tmp_path, 1, (2, 3))
+    assert {path.name.rpartition(".")[2] for path in (tmp_path / "tensorboard").iterdir()} == {"9", "10"}
+    events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    assert [e.step for e in events.Scalars("rollout/ep_rew_mean")] == [1, 2, 3]
 
 
 @pytest.mark.parametrize("cut_off", ["", '{"iteration": 5, "rollo', "{}\n", "\x00\x00"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ class MetricsRecorder:
 
         _cut(run, iteration)
         self._file = open_to_append(run / METRICS, run)
+        _await_next_name(run / EVENTS)
         self._events = SummaryWriter(str(run / EVENTS), purge_step=iteration + 1 if iteration else None)
 
     def write(self, iteration: int, metrics: Mapping[str, float]) -> None:
@@ -70,6 +72,14 @@ def _cut(run: Path, iteration: int) -> None:
             break
         kept += len(line)
     truncate(file, kept, run)
+
+
+def _await_next_name(folder: Path) -> None:
+    """TensorBoard reads files in the order of their names, which begin with the second in which they were
+    opened, and within one second as text: what goes on must not come before what it goes on from."""
+    now = time.time()
+    if any(folder.glob(f"events.out.tfevents.{int(now):010d}.*")):
+        time.sleep(int(now) + 1 - now)
 
 
 def _row(line: bytes) -> dict[str, Any] | None:
