@@ -17,15 +17,7 @@ VENV = ROOT / ".venv"
 BIN = VENV / ("Scripts" if os.name == "nt" else "bin")
 JS = ROOT / "tests" / "js"
 
-IN_FULL = [
-    "-n",
-    "2",
-    "--dist",
-    "loadfile",
-    "--no-loadscope-reorder",
-    "--cov",
-    "--cov-report=term:skip-covered",
-]
+IN_FULL = ["slipcover", "-m", "pytest", "-n", "2", "--dist", "loadfile", "--no-loadscope-reorder"]
 """Two processes: what takes long is compiling kernels, which one process does on one thread. Each takes whole
 files in the order of ``tests/conftest.py``: what the tests of a file share is made once."""
 
@@ -75,7 +67,7 @@ def test(arguments: list[str]) -> int:
     code = next((code for command in checks if (code := run(command))), 0)
     for process in beside:  # what they have compiled is kept, kernel by kernel and file by file
         process.terminate() if code else process.wait()
-    return code or run([python, "-m", "pytest", *(arguments or IN_FULL)])
+    return code or run([python, "-m", *(["pytest", *arguments] if arguments else IN_FULL)])
 
 
 def _warm(python: str) -> subprocess.Popen[bytes]:

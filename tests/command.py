@@ -1,6 +1,4 @@
-"""A command of ``uuv`` in the process of the test, and the environment of processes that are not counted."""
-
-import os
+"""A command of ``uuv`` in the process of the test."""
 
 import pytest
 
@@ -18,9 +16,3 @@ def uuv(capfd, *arguments):
     """(exit code, stdout, stderr)"""
     code = run_cli(*arguments)
     return code, *capfd.readouterr()
-
-
-def uncounted(**more):
-    """The environment of a process that coverage does not count, for other tests run the same code: to be
-    counted costs each process 0.3 s, as much as many take."""
-    return {name: value for name, value in os.environ.items() if not name.startswith("COV")} | more

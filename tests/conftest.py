@@ -1,16 +1,11 @@
 """Fixtures shared by the tests. Taichi is started once per session; one small simulator serves every test of
 the whole stack."""
 
-import ast
 import atexit
-import functools
 import gc
 import signal
-import sys
 
 import pytest
-
-from tests.tracing import keep_tracer_out
 
 gc.disable()  # until all is imported and collected, which makes millions of objects, few of them garbage
 
@@ -21,33 +16,6 @@ learned_forecast wheel voronoi
 """
 """files of tests that take long, longest first: a process takes whole files, and none shall work alone at the
 end"""
-
-OMITTED = {"kernels", "config", "state", "bounds", "loader", "errors", "multibeam", "outcomes"} | {
-    f"{noun}_codes" for noun in ("plan", "tree", "forecast")
-}
-"""what tests of kernels alone import of the package: kernels, which coverage omits, and tables of numbers,
-read by all other tests too"""
-
-
-@functools.cache
-def is_of_kernels_alone(path):
-    """Whether a file of tests has an oracle or a kernel, and imports nothing but these of the package."""
-    nodes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
-    names = [f"{node.module}.{alias.name}".split(".") for node in nodes for alias in node.names]
-    has_one = any(name[:2] in (["uuvtai", "kernels"], ["tests", "reference"]) for name in names)
-    return has_one and {name[1] for name in names if name[0] == "uuvtai"} <= OMITTED
-
-
-@pytest.hookimpl(hookwrapper=True)
-def pytest_runtest_protocol(item):
-    """No coverage of kernels and their oracles: there is nothing to be counted, and the tracer takes a tenth
-    to a half of the oracles' time."""
-    tracer = sys.gettrace() if is_of_kernels_alone(item.path) else None
-    if tracer is not None:
-        sys.settrace(None)
-    yield
-    if tracer is not None:
-        sys.settrace(tracer)
 
 
 def pytest_collection_modifyitems(items):
@@ -61,12 +29,6 @@ def pytest_collection_finish():
     gc.freeze()
     gc.enable()
     atexit.register(gc.unfreeze)  # libraries that then look for leaks would find all of it
-
-
-@pytest.fixture(scope="session", autouse=True)
-def tracer():
-    """Coverage, where it is measured, costs no more than it has to."""
-    keep_tracer_out()
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -1,6 +1,7 @@
 """The command line answers quickly: what help, completion and light commands import, and what completion
 offers."""
 
+import os
 import re
 import shlex
 import subprocess
@@ -9,7 +10,7 @@ import sys
 import pytest
 
 from docs.writers import commands
-from tests.command import uncounted, uuv
+from tests.command import uuv
 from tests.test_docs import fault
 from uuvtai.shipped import KINDS, preset_names
 from uuvtai.show import choices
@@ -38,9 +39,7 @@ def modules_after(*arguments, **environment):
         f"try: main({list(arguments)})\nexcept SystemExit as left: print('left', left.code, *sys.modules, "
         "file=sys.stderr)"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True, env=uncounted()
-    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     _left, code, *modules = done.stderr.splitlines()[-1].split()
     return int(code), set(modules)
 
@@ -120,7 +119,7 @@ def completed(words, cwd, shell="bash"):
     program = (
         "import sys\nfrom uuvtai.cli import main\ntry: main()\nfinally: print(*sys.modules, file=sys.stderr)"
     )
-    environment = uncounted() | {
+    environment = os.environ | {
         "_UUV_COMPLETE": f"complete_{shell}", "COMP_WORDS": "uuv " + " ".join(words),
         "COMP_CWORD": str(len(words)),
         "_TYPER_COMPLETE_ARGS": "uuv " + " ".join(words),
@@ -178,9 +177,7 @@ def test_completion_is_shown_for_a_shell():
         "from typer.completion import get_completion_script as s; print(s(prog_name='uuv', "
         "complete_var='_UUV_COMPLETE', shell='bash'))"
     )
-    wanted = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=uncounted()
-    ).stdout
+    wanted = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert "_UUV_COMPLETE=complete_bash" in wanted
     for option in ("--show-completion", "--install-completion"):
         assert option in {name for parameter in COMMANDS[()].params for name in parameter.opts}

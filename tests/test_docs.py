@@ -4,7 +4,6 @@ works, the tutorial runs."""
 import ast
 import importlib
 import itertools
-import os
 import re
 import shlex
 import shutil
@@ -21,7 +20,7 @@ from docs.writers.figure_words import GENERATED
 from docs.writers.markdown import FENCE, shell_blocks
 from docs.writers.pictures import PAGE, PICTURES, renewed
 from tests.browser import brightness, look
-from tests.command import uncounted, uuv
+from tests.command import uuv
 from uuvtai.config.learning import LearningConfig
 from uuvtai.env import VectorEnv
 from uuvtai.logs.topics import TOPICS
@@ -57,7 +56,7 @@ def site(tmp_path_factory):
     shutil.copytree(ROOT / "docs", folder / "docs", ignore=shutil.ignore_patterns("reference", "__pycache__"))
     done = subprocess.run(
         [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "docs", "site"],
-        cwd=folder, capture_output=True, text=True, check=False, env=uncounted(),
+        cwd=folder, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return folder / "site"
@@ -374,7 +373,7 @@ def test_the_tables_of_the_python_page_are_those_of_the_environment(small):
 # --------------------------------------------------------------------------------------------------- notebook
 
 
-def test_the_tutorial_runs(monkeypatch):
+def test_the_tutorial_runs():
     """In a process of its own, whose simulator has the sizes of the small one: ``tests/warm.py`` has compiled
     its kernels."""
     nbformat = pytest.importorskip("nbformat", reason="nbclient is not installed")
@@ -383,8 +382,6 @@ def test_the_tutorial_runs(monkeypatch):
     assert not any(cell.outputs for cell in notebook.cells if cell.cell_type == "code"), (
         "commit it without outputs"
     )
-    for name in os.environ.keys() - uncounted().keys():
-        monkeypatch.delenv(name)
     client.NotebookClient(notebook, timeout=600, startup_timeout=300, kernel_name="python3").execute()
     outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
     assert sum("image/png" in output.get("data", {}) for output in outputs) == 2

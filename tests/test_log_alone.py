@@ -22,7 +22,6 @@ from mcap.reader import make_reader
 from mcap.records import Attachment, Chunk, Metadata
 from mcap.stream_reader import StreamReader
 
-from tests.command import uncounted
 from tests.reference import decision_alone, log_alone
 from tests.small_sim import SmallSim
 from uuvtai.loader import load_config, load_resolved
@@ -56,7 +55,6 @@ def recorded(folder, *options):
     ]  # fmt: skip
     done = subprocess.run(
         command, capture_output=True, text=True, check=False, cwd=Path(__file__).parent.parent, timeout=600,
-        env=uncounted(),
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return sorted((folder / "logs").glob("*.mcap")), json.loads(done.stdout)

@@ -13,7 +13,6 @@ from pathlib import Path
 import pytest
 
 import uuvtai
-from tests.command import uncounted
 from tests.small_sim import SmallSim
 from uuvtai import signals
 from uuvtai.logs.repair import repair
@@ -140,7 +139,9 @@ def test_a_signal_within_a_write_loses_no_message(tmp_path, call):
     ],
 )  # fmt: skip
 def test_a_command_that_begins_ends_at_once_and_leaves_nothing(tmp_path, arguments, number):
-    process = started(tmp_path, *arguments, environment=uncounted(PYTHONPATH=ENVIRONMENT["PYTHONPATH"]))
+    process = started(
+        tmp_path, *arguments, environment=os.environ | {"PYTHONPATH": ENVIRONMENT["PYTHONPATH"]}
+    )
     time.sleep(random.Random(f"{arguments}{number}").uniform(0.0, 0.6))
     process.send_signal(number)
     code, err = ended(process, number)

@@ -11,7 +11,6 @@ import time
 import pytest
 import torch
 
-from tests.command import uncounted
 from tests.point_env import PointEnv
 from tests.small_sim import SmallSim
 from uuvtai.env import VectorEnv
@@ -292,12 +291,11 @@ def uuv(*arguments):
 
 
 def killed_between_checkpoints(folder, *arguments):
-    """Run a training and kill it as soon as it has written two checkpoints: what coverage counted would be
-    lost with it."""
+    """Run a training and kill it as soon as it has written two checkpoints."""
     with subprocess.Popen(
         [*UUV, *arguments, "--run-dir", str(folder)],
         stderr=subprocess.DEVNULL,
-        env=uncounted(OMP_NUM_THREADS="1", NO_COLOR="1"),
+        env=os.environ | {"OMP_NUM_THREADS": "1", "NO_COLOR": "1"},
     ) as process:
         deadline = time.monotonic() + LONGEST_S
         while (

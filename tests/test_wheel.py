@@ -2,6 +2,7 @@
 folder, without a network."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -12,7 +13,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.command import uncounted
 from tests.small_sim import SmallSim
 
 ROOT = Path(__file__).parent.parent
@@ -56,7 +56,7 @@ def built(tmp_path_factory):
     copy, dist = place / "checkout", place / "dist"
     for name in [
         *KEPT,
-        *(path.name for path in ROOT.iterdir() if path.is_file() and not path.name.startswith(".coverage")),
+        *(path.name for path in ROOT.iterdir() if path.is_file()),
     ]:
         source = ROOT / name
         (copy / name).parent.mkdir(parents=True, exist_ok=True)
@@ -120,7 +120,7 @@ def installed(built, tmp_path_factory):
 
 def clean(**more):
     """The environment of a user: nothing of the checkout in it."""
-    return {name: value for name, value in uncounted().items() if name != "PYTHONPATH"} | more
+    return {name: value for name, value in os.environ.items() if name != "PYTHONPATH"} | more
 
 
 @pytest.fixture
