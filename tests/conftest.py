@@ -10,9 +10,9 @@ import pytest
 gc.disable()  # until all is imported and collected, which makes millions of objects, few of them garbage
 
 BEGUN_FIRST = """
-cli tracking training cuda world signals log_alone security sonar docs report deploy mapping media_formats
-resume_eval proprioception sweep dynamics completion telemetry explain examples stack hostile_logs
-learned_forecast wheel voronoi
+docs cuda native tuned world replay cli aboard deploy training tracking report set_export security sonar
+examples log_alone pose chooser signals identify finetune telemetry resume_eval dynamics logs sweep
+media_formats link wheel fan_image explain hostile_logs echoes voronoi
 """
 """files of tests that take long, longest first: a process takes whole files, and none shall work alone at the
 end"""

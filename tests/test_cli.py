@@ -189,7 +189,7 @@ def test_text_from_outside_is_never_markup(tmp_path, monkeypatch, capfd, evaluat
     monkeypatch.chdir(tmp_path)
     Path("a[/x]").mkdir(parents=True)
     shutil.copy(folder / "logs/bt_seed3_episode0.mcap", "a[/x]/log.mcap")
-    shutil.copy(loader.preset_path("vehicle", "bluerov2_li2020"), "a[/x]/odd.yaml")
+    shutil.copy(loader.preset_path("vehicle", "bluerov2"), "a[/x]/odd.yaml")
     assert uuv(capfd, "log", "info", "a[/x]/log.mcap")[0] == 0
     code, out, err = in_a_process(tmp_path, "simulate", "--seconds", "0.1", "--vehicle", "a[/x]/odd.yaml")
     assert code == 0 and "a[/x]/odd.yaml: 0.1 s" in out, err
