@@ -9,11 +9,13 @@ from pathlib import Path
 
 import pytest
 
+from uuvtai.config import Config
+from uuvtai.loader import load_training
 from uuvtai.native import companion
 from uuvtai.native.companion import Companion, compilers
 from uuvtai.native.keys import key_of, key_with
 from uuvtai.native.launch import native
-from uuvtai.other_end import calls_of
+from uuvtai.other_end import calls_of, understood, wake
 from uuvtai.sim import Sim
 
 MANY = 40
@@ -24,6 +26,23 @@ MANY = 40
 def another(small):
     """The small simulator built once more: nothing of it has been launched."""
     return Sim(small.config, small.N, small.trees["bt"])
+
+
+def test_a_training_s_simulator_is_asked_for_too(another, monkeypatch):
+    """Its config has sections that no simulator knows."""
+    config = load_training("smoke")
+    monkeypatch.setattr(another, "config", config)
+    read, num_envs = understood(another._recipe())
+    assert num_envs == another.num_envs
+    assert vars(read) == {name: getattr(config, name) for name in Config.model_fields}
+
+
+def test_rows_that_fill_up_a_size_sleep(another, monkeypatch):
+    """Kernels would write beyond the ends of the batch's tensors."""
+    monkeypatch.setattr(another, "num_envs", another.num_envs - 2)
+    wake(another)
+    for clock in (another.s.clock.awake, another.s.clock.active):
+        assert clock.to_numpy().tolist() == [1] * another.num_envs + [0] * 2
 
 
 def test_it_knows_every_launch_and_makes_none(another):

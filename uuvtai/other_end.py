@@ -9,6 +9,7 @@ import sys
 import threading
 from typing import Any
 
+import numpy as np
 import torch
 
 from uuvtai.config import Config
@@ -24,9 +25,15 @@ def main() -> None:
     size = int.from_bytes(pipe.read(8), "little")
     if not size:
         return
-    num_envs, config = pipe.read(size).decode().split("\n", 1)
+    config, num_envs = understood(pipe.read(size))
     threading.Thread(target=_end_with, args=(pipe,), daemon=True).start()
-    compile_backwards(Config.model_validate_json(config), int(num_envs))
+    compile_backwards(config, num_envs)
+
+
+def understood(recipe: bytes) -> tuple[Config, int]:
+    """Config and number of envs of what ``Sim`` asks for."""
+    num_envs, config = recipe.decode().split("\n", 1)
+    return Config.model_validate_json(config), int(num_envs)
 
 
 def compile_backwards(config: Config, num_envs: int) -> int:
@@ -34,12 +41,20 @@ def compile_backwards(config: Config, num_envs: int) -> int:
     how many there are."""
     sim = Sim(config, num_envs, read_tree("bt", config.teacher.max_node))  # kernels know no tree
     calls = calls_of(sim)
-    for clock in (sim.s.clock.awake, sim.s.clock.active):
-        clock.fill(1)  # a kernel that does nothing compares nothing
+    wake(sim)
     for kernel, arguments in reversed(calls):
         with compiling(kernel, arguments):
             native[0].first(kernel, arguments)
     return len(calls)
+
+
+def wake(sim: Sim) -> None:
+    """Have every row work, for a kernel that does nothing compares nothing; but not the rows that fill up a
+    size: the tensors that kernels write to have none for them."""
+    for clock in (sim.s.clock.awake, sim.s.clock.active):
+        rows = clock.to_numpy()
+        rows[:] = np.arange(len(rows)) < sim.num_envs
+        clock.from_numpy(rows)
 
 
 def calls_of(sim: Sim) -> list[tuple[Any, tuple]]:

@@ -217,4 +217,4 @@ class Sim:
 
     def _recipe(self) -> bytes:
         """What another process builds the same kernels by (``other_end``)."""
-        return f"{self.num_envs}\n{self.config.model_dump_json()}".encode()
+        return f"{self.num_envs}\n{self.config.model_dump_json(include=set(Config.model_fields))}".encode()
