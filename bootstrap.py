@@ -18,6 +18,7 @@ BIN = VENV / ("Scripts" if os.name == "nt" else "bin")
 JS = ROOT / "tests" / "js"
 
 COUNTS = ".coverage.json"
+"""which lines the tests ran"""
 IN_FULL = ["slipcover", "--json", "--out", COUNTS]
 IN_FULL += ["-m", "pytest", "-n", "2", "--dist", "loadfile", "--no-loadscope-reorder"]
 """Two processes: what takes long is compiling kernels, which one process does on one thread. Each takes whole
@@ -123,7 +124,7 @@ def install(what: str) -> None:
     if not BIN.exists():
         print("making .venv", file=sys.stderr)
         subprocess.run([_python(), "-m", "venv", str(VENV)], check=True)
-        # that of Python 3.11 chooses and unpacks a third more slowly; where it cannot be had, it will do
+        # Python 3.11's own pip takes half as much time again; where no newer one can be had, it will do
         subprocess.run(
             [str(BIN / "python"), "-m", "pip", "install", "--quiet", "--upgrade", "pip"], check=False
         )

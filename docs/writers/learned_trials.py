@@ -18,7 +18,7 @@ from typing import Any
 from docs.writers.evaluations import commit_of_package
 from docs.writers.figure_sources import ROOT, Sources
 from docs.writers.pieces import LETTERS
-from docs.writers.sonar_trials import play
+from docs.writers.sonar_trials import document_at, play
 from uuvtai.run_folder import hardware, write_atomic
 from uuvtai.statistics import bootstrap_interval, mcnemar_p
 from uuvtai.tables.table import text_table
@@ -160,10 +160,7 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=2, help="cells played at a time, one thread each")
     chosen = parser.parse_args()
     path: Path = ROOT / FILE
-    letters = {letter: name for name, letter in LETTERS.items()}
-    document: dict[str, Any] = {"schema": 1, "seed": SEED, "letters": letters, "rows": []}
-    if path.exists():
-        document = json.loads(path.read_text(encoding="utf-8"))
+    document = document_at(path, SEED)
     done = {row["command"] for row in document["rows"]}
     cells = [cell for cell in CELLS if "uuv " + " ".join(command_of(cell)) not in done]
     commit = commit_of_package()

@@ -87,6 +87,14 @@ def entry_of(
     }
 
 
+def document_at(path: Path, seed: int) -> dict[str, Any]:
+    """What a file of results holds so far; an empty document where there is none."""
+    if path.exists():
+        return json.loads(path.read_text(encoding="utf-8"))
+    letters = {letter: name for name, letter in LETTERS.items()}
+    return {"schema": 1, "seed": seed, "letters": letters, "rows": []}
+
+
 def play(command: list[str]) -> dict[str, Any]:
     """The document that ``uuv`` prints."""
     with tempfile.TemporaryDirectory() as place:
@@ -107,10 +115,7 @@ def main() -> None:
     parser.add_argument("--out", default=FILE, help="file of the results, from the root of the tree")
     chosen = parser.parse_args()
     path: Path = ROOT / chosen.out
-    letters = {letter: name for name, letter in LETTERS.items()}
-    document: dict[str, Any] = {"schema": 1, "seed": SEED, "letters": letters, "rows": []}
-    if path.exists():
-        document = json.loads(path.read_text(encoding="utf-8"))
+    document = document_at(path, SEED)
     for kind in KINDS:
         for cell, options in CELLS:
             command = command_of(kind, options, chosen.episodes)

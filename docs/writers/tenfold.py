@@ -20,7 +20,7 @@ from typing import Any
 from docs.writers.evaluations import ONE_THREAD, commit_of_package
 from docs.writers.figure_sources import ROOT, Sources
 from docs.writers.pieces import LETTERS
-from docs.writers.sonar_trials import play
+from docs.writers.sonar_trials import document_at, play
 from docs.writers.twin_recipe import gain_of
 from uuvtai.learn.recorder import read_metrics
 from uuvtai.learn.run import CONFIG
@@ -126,10 +126,7 @@ def main() -> None:
     parser.add_argument("--commit", help="of the package that trained, where it is not this one")
     chosen = parser.parse_args()
     path: Path = ROOT / FILE
-    letters = {letter: name for name, letter in LETTERS.items()}
-    document: dict[str, Any] = {"schema": 1, "seed": SEED, "letters": letters, "rows": []}
-    if path.exists():
-        document = json.loads(path.read_text(encoding="utf-8"))
+    document = document_at(path, SEED)
     done = {(row["method"], row["seed"]) for row in document["rows"]}
     commit = chosen.commit or commit_of_package()
     for seed, method in ((seed, method) for seed in SEEDS for method in METHODS):
