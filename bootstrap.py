@@ -137,7 +137,8 @@ def install(what: str) -> None:
         "--quiet",
         "--no-compile",
     ]  # what is imported is compiled then; the rest never
-    subprocess.run([*pip, "--editable", what], cwd=ROOT, check=True)
+    quiet = os.environ | {"PYTHONWARNINGS": "ignore"}  # setuptools warns of every editable installation
+    subprocess.run([*pip, "--editable", what], cwd=ROOT, env=quiet, check=True)
     stamp.write_text(project)
 
 
