@@ -11,6 +11,7 @@ from uuvtai.learn.policy import log_prob
 from uuvtai.learn.ppo import surrogate_loss
 from uuvtai.learn.set_losses import CACHE_ROWS, SetLosses, by_part
 from uuvtai.learn.set_policy import SetActor, SetCritic
+from uuvtai.learn.set_pooling import MaxAndSum
 from uuvtai.learn.side_by_side import side_by_side
 
 ROWS, LANES, N_BODY, N_OWN, N_TRUTH = CACHE_ROWS + 77, 3, 5, 7, 4
@@ -39,7 +40,9 @@ def batch():
 def gradients(config, actor, critic, batch, anchor=None, held=0.0, actor_learns=True):
     for parameter in (*actor.parameters(), *critic.parameters()):
         parameter.grad = None
-    sums = SetLosses(config, actor, critic, anchor, held).backward(batch, actor_learns)
+    sums = SetLosses(config, actor, critic, anchor, held).backward(
+        batch, torch.arange(len(batch[0])), actor_learns
+    )
     return [p.grad for p in actor.parameters()], [p.grad for p in critic.parameters()], sums
 
 
@@ -61,6 +64,33 @@ def test_pieces_add_up_to_the_gradient_of_the_whole(nets, batch):
     for found, asked in zip(of_critic, wanted, strict=True):
         torch.testing.assert_close(found, asked, rtol=1e-3, atol=1e-5)
     torch.testing.assert_close(sums[:2], torch.stack([surrogate, error]).detach(), rtol=1e-4, atol=1e-5)
+
+
+def test_a_minibatch_is_the_rows_that_were_chosen(nets, batch):
+    chosen = torch.randperm(ROWS, generator=torch.Generator().manual_seed(3))[:500]
+    of_actor, of_critic, _ = gradients(*nets, [part[chosen] for part in batch])
+    SetLosses(*nets, None, 0.0).backward(batch, chosen, True)
+    for net, wanted in zip(nets[1:], (of_actor, of_critic), strict=True):
+        assert all(torch.equal(p.grad, grad) for p, grad in zip(net.parameters(), wanted, strict=True))
+
+
+@pytest.mark.parametrize("kind", [torch.float32, torch.bfloat16])
+def test_maximum_and_sum_have_the_gradient_of_torch(kind):
+    generator = torch.Generator().manual_seed(4)
+    said = torch.randn(64, 5, 8, generator=generator).to(kind)
+    said[:9, 1] = said[:9, 3]  # equally high bodies share
+    said.requires_grad_()
+    mask = (torch.rand(64, 5, 1, generator=generator) < 0.6).float()
+    mask[20:25] = 0.0  # rows without a body
+    back = [torch.randn(64, 8, generator=generator).to(kind) for _ in range(2)]
+    each = torch.relu(said) * mask.to(kind)
+    wanted = each.amax(dim=-2), each.sum(dim=-2)
+    found = MaxAndSum.apply(said, mask)
+    assert all(torch.equal(a, b) for a, b in zip(found, wanted, strict=True))
+    (asked,) = torch.autograd.grad(wanted, said, back)
+    (grad,) = torch.autograd.grad(found, said, back)
+    torch.testing.assert_close(grad, asked)
+    assert bool((grad[(each == 0).detach()] == 0).all())
 
 
 def test_the_number_of_threads_changes_no_bit(nets, batch, monkeypatch):

@@ -14,8 +14,8 @@ from uuvtai.closed_form import describe_scenario, path_positions
 from uuvtai.config import TankConfig, VehicleConfig
 from uuvtai.config.learning import LearningConfig
 from uuvtai.errors import UserError
-from uuvtai.kernels.core.geometry import FAR_M
-from uuvtai.kernels.core.signature import AnyTensor, Const, FloatMatrix
+from uuvtai.kernels.core.geometry import BOX, CYLINDER, FAR_M, NONE
+from uuvtai.kernels.core.signature import AnyTensor, Bundle, Const, FloatMatrix
 from uuvtai.learn import checkpoint, twin_trainer
 from uuvtai.learn.manifest import CheckpointError
 from uuvtai.learn.pilot import load_pilot
@@ -27,7 +27,7 @@ from uuvtai.loader import ConfigError, load_training
 from uuvtai.measure.episodes.playing import jobs_of, run_episodes
 from uuvtai.twin import hull_rule, kinematics, observer, sensing_model
 from uuvtai.twin.scenario_bank import draw_bank
-from uuvtai.twin.set_codes import BODY_WIDTH, EGO_COLUMNS
+from uuvtai.twin.set_codes import BODY_WIDTH, EGO_COLUMNS, N_RAY
 from uuvtai.twin.twin_arrays import ObserverIO, TwinRules
 
 CLEARANCE_TOL_M = 0.01
@@ -67,6 +67,12 @@ def places(path: AnyTensor, times: AnyTensor, out: AnyTensor):
         place = kinematics.path_place(row, lane, times[row], path)
         for i in ti.static(range(4)):
             out[row, lane, i] = place[i]
+
+
+@ti.kernel
+def look_along(place: FloatMatrix, body: AnyTensor, io: Bundle[TwinRules], ray: FloatMatrix):
+    for i in range(place.shape[0]):
+        sensing_model.write_rays(i, i, body.shape[1], place[i, 0], place[i, 1], body, ray, io)
 
 
 @pytest.fixture(scope="module")
@@ -187,6 +193,53 @@ def test_far_bodies_are_left_out(config):
     kinematics.judge_states(rules, pose, far, torch.zeros(1, 0, 16), seen, outcome)
     assert seen[0, 1] == FAR_M and outcome[0] == 0
     assert seen[0, 0] == pytest.approx(3.0 - 0.17, abs=FLOAT_TOL)  # the side walls
+
+
+def free_m(x, y, bodies, tank):
+    """Along 24 rays, in float64, each ray against each body: what the twin looks up by directions."""
+    angle = np.arange(N_RAY) * 2 * np.pi / N_RAY
+    u = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    with np.errstate(divide="ignore"):
+        ends = [np.where(u[:, a] > 0, (bound[1] - at) / u[:, a], (bound[0] - at) / u[:, a])
+                for a, (at, bound) in enumerate(((x, tank.x_m), (y, tank.y_m)))]  # fmt: skip
+        out = np.minimum(*[np.where(abs(u[:, a]) < 1e-6, 99.0, end) for a, end in enumerate(ends)])
+    for kind, bx, by, _, wide, deep, _, yaw in bodies:
+        d = np.array([bx - x, by - y])
+        if kind == BOX:
+            c, s = np.cos(yaw), np.sin(yaw)
+            turn = np.array([[c, s], [-s, c]])
+            with np.errstate(divide="ignore"):
+                a, b = ((turn @ d + side)[:, None] / (turn @ u.T) for side in ([-wide, -deep], [wide, deep]))
+            enter, leave = np.minimum(a, b).max(0), np.maximum(a, b).min(0)
+            hit = np.where((leave >= enter) & (leave > 0), np.maximum(enter, 0.0), 99.0)
+        elif kind != NONE:
+            along = u @ d
+            inside = along**2 - d @ d + wide**2
+            hit = np.where((inside > 0) & (along > 0), along - np.sqrt(np.maximum(inside, 0)), 99.0)
+        else:
+            continue
+        out = np.minimum(out, hit)
+    return out
+
+
+def test_rays_meet_what_stands_in_their_way(config):
+    rng, count = np.random.default_rng(0), 400
+    tank = config.world.tank
+    place = np.column_stack([rng.uniform(*tank.x_m, count), rng.uniform(*tank.y_m, count)])
+    body = np.zeros((count, 5, 8))
+    body[..., 0] = rng.choice([NONE, CYLINDER, BOX], (count, 5))
+    body[..., 1:3] = place[:, None] + rng.uniform(-4, 4, (count, 5, 2))
+    body[..., 4:6], body[..., 7] = rng.uniform(0.1, 0.8, (count, 5, 2)), rng.uniform(-7, 7, (count, 5))
+    ray = torch.zeros(count, N_RAY)
+    place, body = (torch.from_numpy(a.astype(np.float32)) for a in (place, body))
+    look_along(place, body, bind(TwinRules, config), ray)
+    wanted = [
+        free_m(*at, row, tank) for at, row in zip(place.double().numpy(), body.double().numpy(), strict=True)
+    ]
+    off = abs(ray.numpy() - wanted) > 1e-3
+    assert off.mean() < 1e-3, "but for rays that touch an edge"
+    bare = [free_m(*at, [], tank) for at in place.double().numpy()]
+    assert (np.array(bare) > np.array(wanted) + 0.1).mean() > 0.1, "bodies are in the way"
 
 
 # ----------------------------------------------------------------------------------------------- the policy

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from collections.abc import Callable
 from typing import NamedTuple
@@ -37,16 +38,17 @@ class SetLosses:
         self._config, self._actor, self._critic = config, actor, critic
         self._anchor, self._held = anchor, held
 
-    def backward(self, batch: list[torch.Tensor], actor_learns: bool) -> torch.Tensor:
+    def backward(self, rows: list[torch.Tensor], index: torch.Tensor, actor_learns: bool) -> torch.Tensor:
         """Fill the parameters' gradients; (4,) sums as in ``Piece``.
 
-        ``batch``: bodies, own, truth, action, log probability, advantage, target; rows of each. Pieces are
-        added up in their order, so that the number of threads changes no bit.
+        ``rows``: bodies, own, truth, action, log probability, advantage, target; ``index`` (M,) chooses the
+        minibatch. Pieces are added up in their order, so that the number of threads changes no bit.
         """
-        count = len(batch[0])
-        parts = list(zip(*(tensor.split(CACHE_ROWS) for tensor in batch), strict=True))
+        count, some = len(index), index.split(CACHE_ROWS)
         pieces: list[Callable[[], Piece]] = [
-            functools.partial(of, part, count) for part in parts for of in (self._of_actor, self._of_critic)
+            functools.partial(of, rows, chosen, count)
+            for chosen in some
+            for of in (self._of_actor, self._of_critic)
         ]
         found = side_by_side(*pieces)
         _add_up(self._critic, [piece.gradients for piece in found[1::2]])
@@ -57,15 +59,16 @@ class SetLosses:
             sums += of_actor.sums + of_critic.sums
         return sums
 
-    def _of_actor(self, part: tuple[torch.Tensor, ...], count: int) -> Piece:
-        bodies, own, _truth, action, before, advantage, _target = part
+    def _of_actor(self, rows: list[torch.Tensor], chosen: torch.Tensor, count: int) -> Piece:
+        bodies, own, _, action, before, advantage, _ = rows
+        bodies, own, before = bodies[chosen], own[chosen], before[chosen]
         clip = self._config.ppo.clip
-        with self._coarse():
+        with coarse(self._config):
             mean = self._actor(bodies, own)
-        log_ratio = log_prob(action, mean.float(), self._actor.log_std) - before
-        policy_loss = loss = surrogate_loss(log_ratio, advantage, clip).sum() / count
+        log_ratio = log_prob(action[chosen], mean.float(), self._actor.log_std) - before
+        policy_loss = loss = surrogate_loss(log_ratio, advantage[chosen], clip).sum() / count
         if self._anchor and self._held > 0:
-            far = self._anchor.divergence(mean.float(), self._actor.log_std, bodies, own)
+            far = self._anchor.divergence(mean.float(), self._actor.log_std, bodies.float(), own)
             loss = loss + self._held * far.sum() / count
         gradients = torch.autograd.grad(loss, list(self._actor.parameters()))
         with torch.no_grad():
@@ -73,20 +76,21 @@ class SetLosses:
             clipped = ((log_ratio.exp() - 1.0).abs() > clip).sum() / count
             return Piece(gradients, torch.stack([policy_loss, torch.zeros(()), kl, clipped]))
 
-    def _of_critic(self, part: tuple[torch.Tensor, ...], count: int) -> Piece:
-        bodies, own, truth, *_, target = part
-        with self._coarse():
-            value = self._critic(bodies, own, truth)
-        value_loss = (value.float() - target).square().sum() / count
+    def _of_critic(self, rows: list[torch.Tensor], chosen: torch.Tensor, count: int) -> Piece:
+        bodies, own, truth, *_, target = rows
+        with coarse(self._config):
+            value = self._critic(bodies[chosen], own[chosen], truth[chosen])
+        value_loss = (value.float() - target[chosen]).square().sum() / count
         loss = self._config.ppo.value_weight * value_loss
         gradients = torch.autograd.grad(loss, list(self._critic.parameters()))
         sums = torch.zeros(4)
         sums[1] = value_loss.detach()
         return Piece(gradients, sums)
 
-    def _coarse(self) -> torch.autocast:
-        """Products in bfloat16 where ``ppo.bfloat16`` says so."""
-        return torch.autocast("cpu", torch.bfloat16, enabled=self._config.ppo.bfloat16)
+
+def coarse(config: LearningConfig) -> torch.autocast:
+    """Products in bfloat16 where ``ppo.bfloat16`` says so."""
+    return torch.autocast("cpu", torch.bfloat16, enabled=config.ppo.bfloat16)
 
 
 def _add_up(net: torch.nn.Module, pieces: list[tuple[torch.Tensor, ...]]) -> None:
@@ -94,8 +98,9 @@ def _add_up(net: torch.nn.Module, pieces: list[tuple[torch.Tensor, ...]]) -> Non
         parameter.grad = functools.reduce(torch.add, gradients)
 
 
-def by_part(net: torch.nn.Module, *parts: torch.Tensor) -> torch.Tensor:
-    """What a network says of many rows, ``CACHE_ROWS`` at a time; nothing of it can be learnt from."""
-    with torch.no_grad():
+def by_part(net: torch.nn.Module, *parts: torch.Tensor, config: LearningConfig | None = None) -> torch.Tensor:
+    """What a network says of many rows, ``CACHE_ROWS`` at a time; nothing of it can be learnt from. As
+    coarsely as it learns where a config is given."""
+    with torch.no_grad(), coarse(config) if config else contextlib.nullcontext():
         rows = zip(*(part.split(CACHE_ROWS) for part in parts), strict=True)
-        return torch.cat([net(*some) for some in rows])
+        return torch.cat([net(*some).float() for some in rows])

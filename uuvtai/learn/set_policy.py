@@ -11,6 +11,7 @@ from torch import nn
 
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learn.mlp import mlp
+from uuvtai.learn.set_pooling import MaxAndSum
 
 NUM_WISHES = 3
 """ahead, left, up: parts of the fastest velocity, in the mirrored world"""
@@ -37,15 +38,17 @@ class SetEncoder(nn.Module):
     ) -> None:
         super().__init__()
         wide, head = config.twin.body_hidden, config.twin.head_hidden
-        self.body = nn.Sequential(*mlp((n_body, wide, wide), "relu", generator, math.sqrt(2.0)), nn.ReLU())
+        self.body = mlp((n_body, wide, wide), "relu", generator, math.sqrt(2.0))
         self.own = nn.Sequential(*mlp((n_own, wide), "relu", generator, math.sqrt(2.0)), nn.ReLU())
         self.head = mlp((3 * wide, head, head, n_out), "relu", generator, gain)
 
     def forward(self, bodies: torch.Tensor, own: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
         """(..., n_out)."""
-        each = self.body(bodies) * mask
-        pooled = (each.amax(dim=-2), _SUM_SCALE * each.sum(dim=-2), self.own(own))
-        return self.head(torch.cat(pooled, dim=-1))
+        said = self.body(bodies.flatten(0, -2)).unflatten(
+            0, bodies.shape[:-1]
+        )  # rows: ReLU in place costs none
+        highest, total = MaxAndSum.apply(said, mask)
+        return self.head(torch.cat((highest, _SUM_SCALE * total, self.own(own)), dim=-1))
 
 
 class SetActor(nn.Module):

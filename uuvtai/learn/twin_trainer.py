@@ -21,7 +21,7 @@ from uuvtai.learn.ppo import ADAM_EPS, adapted_rate, gae
 from uuvtai.learn.rollout_sums import Recent, RolloutSums
 from uuvtai.learn.set_losses import SetLosses, by_part
 from uuvtai.learn.set_policy import MOST_WISH, NUM_WISHES, SetActor, SetCritic
-from uuvtai.learn.side_by_side import side_by_side
+from uuvtai.learn.side_by_side import side_by_side, torch_threads_rest
 from uuvtai.learn.simulated_world import SimulatedWorld
 from uuvtai.learn.starting_policy import StartingPolicy
 from uuvtai.learn.warm_start import imitate
@@ -101,12 +101,12 @@ class TwinTrainer:
         self.twin.look()
 
     def _allocate(self, steps: int, envs: int, lanes: int, n_body: int, n_own: int) -> None:
-        truth = self.twin.view.truth.shape[2]
-        self._bodies, self._own = torch.zeros(steps, envs, lanes, n_body), torch.zeros(steps, envs, n_own)
-        self._truth, self._action = (
-            torch.zeros(steps, envs, lanes, truth),
-            torch.zeros(steps, envs, NUM_WISHES),
+        kind = torch.bfloat16 if self.config.ppo.bfloat16 else torch.float32
+        n_truth = self.twin.view.truth.shape[2]
+        self._bodies, self._truth = (
+            torch.zeros(steps, envs, lanes, width, dtype=kind) for width in (n_body, n_truth)
         )
+        self._own, self._action = (torch.zeros(steps, envs, width) for width in (n_own, NUM_WISHES))
         self._log_prob, self._value, self._reward = (torch.zeros(steps, envs) for _ in range(3))
         self._next_value = torch.zeros(steps, envs)
         self._terminated, self._ended = (torch.zeros(steps, envs, dtype=torch.bool) for _ in range(2))
@@ -133,11 +133,12 @@ class TwinTrainer:
     def iterate(self) -> dict[str, float]:
         """A rollout and what is learned from it; metrics by their names in metrics.jsonl."""
         warmed = self._imitate()
-        began = time.perf_counter()
-        sums = self._collect()
-        between = time.perf_counter()
-        metrics = self._learn() | self.recent.add(sums)
-        learn_s = time.perf_counter() - between
+        with torch_threads_rest():
+            began = time.perf_counter()
+            sums = self._collect()
+            between = time.perf_counter()
+            metrics = self._learn() | self.recent.add(sums)
+            learn_s = time.perf_counter() - between
         self.iteration += 1
         samples = self._reward.numel()
         self.env_steps += samples
@@ -166,8 +167,8 @@ class TwinTrainer:
         for t in range(len(self._reward)):
             self._bodies[t], self._own[t], self._truth[t] = view
             mean, self._value[t] = side_by_side(
-                functools.partial(by_part, self.actor, view.bodies, view.own),
-                functools.partial(by_part, self.critic, *view),
+                functools.partial(by_part, self.actor, view.bodies, view.own, config=self.config),
+                functools.partial(by_part, self.critic, *view, config=self.config),
             )
             noise = torch.randn(mean.shape, generator=self.generator)
             action = torch.addcmul(mean, noise, self.actor.log_std.exp())
@@ -194,7 +195,7 @@ class TwinTrainer:
                 self._failures.advance()
             twin.look()
             self._bootstrap(t)
-        last = by_part(self.critic, *view)
+        last = by_part(self.critic, *view, config=self.config)
         self._next_value[-1] = torch.where(self._ended[-1], self._next_value[-1], last)
         sums.samples += self._reward.numel()
         return sums
@@ -242,7 +243,7 @@ class TwinTrainer:
         sums = torch.zeros(4)
         for _ in range(config.epochs):
             for index in torch.randperm(len(flat[0]), generator=self.generator).split(size):
-                sums += self._minibatch([part[index] for part in (*rows, *flat)])
+                sums += self._minibatch([*rows, *flat], index)
         policy_loss, value_loss, kl, clipped = (sums / (config.epochs * config.minibatches)).tolist()
         if config.target_kl > 0 and not self._critic_alone():
             self.rate = adapted_rate(self.rate, torch.tensor(kl), config.target_kl).clamp(max=FASTEST_RATE)
@@ -260,14 +261,15 @@ class TwinTrainer:
             "train/explained_variance": float(1.0 - (target - self._value).var() / spread),
         }
 
-    def _minibatch(self, batch: list[torch.Tensor]) -> torch.Tensor:
-        """One step of both networks; (policy loss, value loss, KL, share clipped)."""
+    def _minibatch(self, rows: list[torch.Tensor], index: torch.Tensor) -> torch.Tensor:
+        """One step of both networks by the samples of ``index``; (policy loss, value loss, KL, share
+        clipped)."""
         config = self.config.ppo
         share = self.iteration / self.config.train.iterations
         held = self._anchor.weight(share) if self._anchor else 0.0
         self.optimiser.zero_grad(set_to_none=True)
         losses = SetLosses(self.config, self.actor, self.critic, self._anchor, held)
-        sums = losses.backward(batch, not self._critic_alone())
+        sums = losses.backward(rows, index, not self._critic_alone())
         torch.nn.utils.clip_grad_norm_(self.actor.parameters(), config.max_grad_norm)
         torch.nn.utils.clip_grad_norm_(self.critic.parameters(), config.max_grad_norm)
         self.optimiser.step()

@@ -44,39 +44,85 @@ def is_hidden(number, slot_count, x, y, to_x, to_y, body: AnyTensor):
 
 
 @ti.func
-def free_along(number, slot_count, x, y, ux, uy, body: AnyTensor, io: Bundle[TwinRules]):
-    """[m] from a place in a direction to the nearest wall or resting body, without the hull."""
+def ray_of(i):
+    """Unit vector (x, y) of a ray, by its number."""
+    angle = i * (TWO_PI / N_RAY)
+    return ti.Vector([ti.cos(angle), ti.sin(angle)])
+
+
+@ti.func
+def free_to_wall(x, y, to, io: Bundle[TwinRules]):
+    """[m] from a place in a direction to the nearest side wall."""
     out = 99.0
-    if ux > 1e-6:
-        out = ti.min(out, (io.tank_cfg.x_m[1] - x) / ux)
-    elif ux < -1e-6:
-        out = ti.min(out, (io.tank_cfg.x_m[0] - x) / ux)
-    if uy > 1e-6:
-        out = ti.min(out, (io.tank_cfg.y_m[1] - y) / uy)
-    elif uy < -1e-6:
-        out = ti.min(out, (io.tank_cfg.y_m[0] - y) / uy)
+    if to[0] > 1e-6:
+        out = ti.min(out, (io.tank_cfg.x_m[1] - x) / to[0])
+    elif to[0] < -1e-6:
+        out = ti.min(out, (io.tank_cfg.x_m[0] - x) / to[0])
+    if to[1] > 1e-6:
+        out = ti.min(out, (io.tank_cfg.y_m[1] - y) / to[1])
+    elif to[1] < -1e-6:
+        out = ti.min(out, (io.tank_cfg.y_m[0] - y) / to[1])
+    return out
+
+
+@ti.func
+def free_to_box(dx, dy, to, c, s, wide, deep):
+    """[m] in a direction to a box whose middle is (dx, dy) away, turned by an angle of this cosine and
+    sine."""
+    vx, vy = c * to[0] + s * to[1], c * to[1] - s * to[0]
+    px, py = -(c * dx + s * dy), -(c * dy - s * dx)
+    vx = vx if ti.abs(vx) > 1e-6 else 1e-6
+    vy = vy if ti.abs(vy) > 1e-6 else 1e-6
+    a, b = (-wide - px) / vx, (wide - px) / vx
+    e, f = (-deep - py) / vy, (deep - py) / vy
+    enter, leave = ti.max(ti.min(a, b), ti.min(e, f)), ti.min(ti.max(a, b), ti.max(e, f))
+    return ti.max(enter, 0.0) if leave >= enter and leave > 0.0 else 99.0
+
+
+@ti.func
+def free_to_circle(dx, dy, to, wide):
+    """[m] in a direction to a circle whose middle is (dx, dy) away."""
+    along = dx * to[0] + dy * to[1]
+    inside = along * along - (dx * dx + dy * dy) + wide * wide
+    return along - ti.sqrt(inside) if inside > 0.0 and along > 0.0 else 99.0
+
+
+@ti.func
+def rays_towards(dx, dy, reach):
+    """(first, count) of the rays that can meet a body of this radius whose middle is (dx, dy) away: its half
+    angle is at most pi/2 times the ratio of radius to distance."""
+    first, count = 0, N_RAY
+    far = ti.sqrt(dx * dx + dy * dy)
+    if far > 1.01 * reach:
+        half = (0.25 * TWO_PI * reach / far) * (N_RAY / TWO_PI) + 0.01
+        at = ti.atan2(dy, dx) * (N_RAY / TWO_PI)
+        first = ti.cast(ti.ceil(at - half), ti.i32)
+        count = ti.min(ti.cast(ti.floor(at + half), ti.i32) - first + 1, N_RAY)
+    return first, count
+
+
+@ti.func
+def write_rays(env, number, slot_count, x, y, body: AnyTensor, ray: FloatMatrix, io: Bundle[TwinRules]):
+    """[m] from a place along each ray to the nearest wall or resting body, without the hull."""
+    for i in range(N_RAY):
+        ray[env, i] = free_to_wall(x, y, ray_of(i), io)
     for slot in range(slot_count):
         kind = ti.cast(body[number, slot, 0], ti.i32)
         if kind != NONE:
             dx, dy = body[number, slot, 1] - x, body[number, slot, 2] - y
-            along = dx * ux + dy * uy
-            wide, deep = body[number, slot, 4], body[number, slot, 5]
+            wide, deep, c, s = body[number, slot, 4], 0.0, 1.0, 0.0
             if kind == BOX:
+                deep = body[number, slot, 5]
                 c, s = ti.cos(body[number, slot, 7]), ti.sin(body[number, slot, 7])
-                vx, vy = c * ux + s * uy, c * uy - s * ux
-                px, py = -(c * dx + s * dy), -(c * dy - s * dx)
-                vx = vx if ti.abs(vx) > 1e-6 else 1e-6
-                vy = vy if ti.abs(vy) > 1e-6 else 1e-6
-                a, b = (-wide - px) / vx, (wide - px) / vx
-                e, f = (-deep - py) / vy, (deep - py) / vy
-                enter, leave = ti.max(ti.min(a, b), ti.min(e, f)), ti.min(ti.max(a, b), ti.max(e, f))
-                if leave >= enter and leave > 0.0:
-                    out = ti.min(out, ti.max(enter, 0.0))
-            else:
-                inside = along * along - (dx * dx + dy * dy) + wide * wide
-                if inside > 0.0 and along > 0.0:
-                    out = ti.min(out, along - ti.sqrt(inside))
-    return out
+            first, count = rays_towards(dx, dy, ti.sqrt(wide * wide + deep * deep))
+            for k in range(count):
+                i = (first + k + N_RAY) % N_RAY
+                free_m = 0.0
+                if kind == BOX:
+                    free_m = free_to_box(dx, dy, ray_of(i), c, s, wide, deep)
+                else:
+                    free_m = free_to_circle(dx, dy, ray_of(i), wide)
+                ray[env, i] = ti.min(ray[env, i], free_m)
 
 
 @ti.func
@@ -207,6 +253,4 @@ def sense_twin(
                 if is_tracked(env, lane, track):
                     write_raw(env, lane, number, at, over, under, t_s, radius, path, track, raw)
                 write_truth(env, lane, number, at, over, t_s, ego, path, truth)
-        for i in range(N_RAY):
-            angle = i * (TWO_PI / N_RAY)
-            ray[env, i] = free_along(number, n_rest, x, y, ti.cos(angle), ti.sin(angle), body, io)
+        write_rays(env, number, n_rest, x, y, body, ray, io)
