@@ -288,7 +288,12 @@ def test_the_shipped_stack_holds_factors_that_a_training_can_find():
     for number in TUNED:
         for section in (ours.slow, ours.fast):
             assert number.least <= getattr(section, number.name) <= number.most, number.name
-    own = {name: getattr(usual, name) for name in ("slow", "fast", "tracking", "forecast")}
+    changed = ("slow", "fast", "tracking", "forecast", "quiet", "route", "teacher")
+    own = {name: getattr(usual, name) for name in changed}
     assert ours.model_copy(update=own) == usual
+    brisk = {"gaze_clearance_m": 0.48, "slow_fraction": 1.0}
+    assert ours.teacher == usual.teacher.model_copy(update=brisk)
+    assert ours.route == usual.route.model_copy(update={"lookahead_m": 0.8})
+    assert ours.quiet == usual.quiet.model_copy(update={"room_m": 0.8})
     assert ours.tracking == usual.tracking.model_copy(update={"partial_sigmas": 2.0})
     assert ours.forecast == usual.forecast.model_copy(update={"learned": "shipped"})
