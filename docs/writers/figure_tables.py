@@ -13,7 +13,7 @@ from docs.writers.dead_tables import dead_commands, dead_thrusters
 from docs.writers.figure_sources import Counts, SourceError, Sources, fitting, pooled, rated, share, weighted
 from docs.writers.forecast_tables import forecast_pieces, forecast_scores
 from docs.writers.learned_search import learned_curve, learned_numbers
-from docs.writers.learned_trials import learned_trials, stack_trials
+from docs.writers.learned_trials import learned_before, learned_trials, stack_trials
 from docs.writers.link_tables import (
     aboard,
     ardusub_identified,
@@ -775,6 +775,7 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         learned_numbers,
         fast_slopes,
         learned_trials,
+        learned_before,
         stack_trials,
         forecast_scores,
         forecast_pieces,

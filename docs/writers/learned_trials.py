@@ -24,6 +24,8 @@ from uuvtai.statistics import bootstrap_interval, mcnemar_p
 from uuvtai.tables.table import text_table
 
 FILE = "docs/data/learned_90008.json"
+BEFORE_FILE = "docs/data/learned_90008_before.json"
+"""the stack that was ``best`` before, on these episodes"""
 TRIALS_FILE = "docs/data/stack_trials.json"
 SEED, EPISODES = 90008, 1000
 CONDITION_EPISODES = 64
@@ -97,6 +99,18 @@ def learned_trials(sources: Sources) -> str:
         pair = Paired.of([(entry["bt"], entry["best"]) for entry in here])
         rows.append([title, str(len(pair.ends)), *pair.cells(), pair.points(), pair.times()])
     head = ["world (S, D, v in m/s)", "episodes", "`bt`", "`best`", "gains, losses, McNemar's p", "points"]
+    return text_table([*head, "time where both arrive"], rows)
+
+
+def learned_before(sources: Sources) -> str:
+    """``best`` beside the stack that was ``best`` before, on the same episodes."""
+    before = {row["command"]: row["best"] for row in sources.json(BEFORE_FILE)["rows"]}
+    entries, rows = sources.json(FILE)["rows"], []
+    for title in dict.fromkeys(cell.title for cell in CELLS):
+        here = [entry for entry in entries if entry["cell"] == title]
+        pair = Paired.of([(before[entry["command"]], entry["best"]) for entry in here])
+        rows.append([title, *pair.cells(), pair.points(), pair.times()])
+    head = ["world (S, D, v in m/s)", "before", "`best`", "gains, losses, McNemar's p", "points"]
     return text_table([*head, "time where both arrive"], rows)
 
 
