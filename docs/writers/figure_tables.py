@@ -29,6 +29,7 @@ from docs.writers.pose_tables import pose_endings, pose_errors
 from docs.writers.rehearsal_tables import rehearsal
 from docs.writers.replay_tables import changed, lossy, replayed
 from docs.writers.sonar_tables import sonars
+from docs.writers.tenfold import tenfold, tenfold_claims
 from docs.writers.tuner_tables import fast_slopes, tuner_slopes
 from docs.writers.twin_recipe import twin_recipe
 from docs.writers.vehicle_tables import vehicle_commands, vehicles
@@ -735,6 +736,8 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         dead_commands,
         dead_thrusters,
         learning_cost,
+        tenfold,
+        tenfold_claims,
         world_model_errors,
         world_model_switches,
         risk,
