@@ -671,9 +671,9 @@ TWIN = (
     ),
     Mutation(
         "set_mask_forgotten",
-        "uuvtai/learn/set_policy.py",
-        "each = self.body(bodies) * mask",
-        "each = self.body(bodies)",
+        "uuvtai/learn/set_pooling.py",
+        "each = torch.relu(said).mul_(mask.to(said.dtype))",
+        "each = torch.relu(said)",
         "tests/test_twin.py",
         "empty_rows",
     ),
