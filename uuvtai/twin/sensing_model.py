@@ -22,6 +22,10 @@ LOST_S, LOST_HEIGHT_S = 2.0, 6.0
 """out of sight so long a track ends, later where its height is known"""
 POSITION_SIGMA_M, VELOCITY_SIGMA_M_S = 0.03, 0.06
 """of the tracks (EC, by comparison with the simulator's)"""
+UNBOUNDED_M = 99.0
+"""nothing in the way of a ray"""
+RAY_SLACK = 0.01
+"""share of the angle between two rays by which a body is looked for wider than it is: rounding"""
 COLUMN_M = 1.6
 """free water above and below is cut off here"""
 
@@ -53,7 +57,7 @@ def ray_of(i):
 @ti.func
 def free_to_wall(x, y, to, io: Bundle[TwinRules]):
     """[m] from a place in a direction to the nearest side wall."""
-    out = 99.0
+    out = UNBOUNDED_M + 0.0
     if to[0] > 1e-6:
         out = ti.min(out, (io.tank_cfg.x_m[1] - x) / to[0])
     elif to[0] < -1e-6:
@@ -76,7 +80,7 @@ def free_to_box(dx, dy, to, c, s, wide, deep):
     a, b = (-wide - px) / vx, (wide - px) / vx
     e, f = (-deep - py) / vy, (deep - py) / vy
     enter, leave = ti.max(ti.min(a, b), ti.min(e, f)), ti.min(ti.max(a, b), ti.max(e, f))
-    return ti.max(enter, 0.0) if leave >= enter and leave > 0.0 else 99.0
+    return ti.max(enter, 0.0) if leave >= enter and leave > 0.0 else UNBOUNDED_M
 
 
 @ti.func
@@ -84,7 +88,7 @@ def free_to_circle(dx, dy, to, wide):
     """[m] in a direction to a circle whose middle is (dx, dy) away."""
     along = dx * to[0] + dy * to[1]
     inside = along * along - (dx * dx + dy * dy) + wide * wide
-    return along - ti.sqrt(inside) if inside > 0.0 and along > 0.0 else 99.0
+    return along - ti.sqrt(inside) if inside > 0.0 and along > 0.0 else UNBOUNDED_M
 
 
 @ti.func
@@ -94,7 +98,7 @@ def rays_towards(dx, dy, reach):
     first, count = 0, N_RAY
     far = ti.sqrt(dx * dx + dy * dy)
     if far > 1.01 * reach:
-        half = (0.25 * TWO_PI * reach / far) * (N_RAY / TWO_PI) + 0.01
+        half = (0.25 * TWO_PI * reach / far) * (N_RAY / TWO_PI) + RAY_SLACK
         at = ti.atan2(dy, dx) * (N_RAY / TWO_PI)
         first = ti.cast(ti.ceil(at - half), ti.i32)
         count = ti.min(ti.cast(ti.floor(at + half), ti.i32) - first + 1, N_RAY)
