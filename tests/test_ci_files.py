@@ -3,6 +3,7 @@ which cannot run it."""
 
 import os
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -87,6 +88,47 @@ def test_the_processes_of_the_gate_keep_the_bytecode_they_compile(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["bootstrap.py", "test"])
     monkeypatch.setattr(bootstrap, "test", lambda _: int("PYTHONDONTWRITEBYTECODE" in os.environ))
     assert bootstrap.main() == 0
+
+
+def test_settings_of_pip_are_told_to_uv_and_the_nearer_ones_count():
+    listed = """:env:.find-links='/opt/wheels /more'
+:env:.disable-pip-version-check='1'
+global.cert='/etc/ssl/ours.crt'
+global.extra-index-url='https://a.example/simple\\nhttps://b.example/simple'
+global.find-links='/elsewhere'
+install.index-url='https://c.example/simple'
+list.format='columns'
+"""
+    assert bootstrap.settings_of_uv(listed) == {
+        "SSL_CERT_FILE": "/etc/ssl/ours.crt",
+        "UV_INDEX": "https://a.example/simple https://b.example/simple",
+        "UV_FIND_LINKS": "/opt/wheels,/more",
+        "UV_DEFAULT_INDEX": "https://c.example/simple",
+    }
+    assert bootstrap.settings_of_uv("") == {}
+    assert bootstrap.settings_of_uv("global.only-binary=':all:'\n") is None
+
+
+@pytest.mark.parametrize("fails", ["config", "uv>=0.5,<1", "--python", None])
+def test_pip_installs_what_uv_cannot(fails, monkeypatch, tmp_path, capsys):
+    ran = []
+
+    def run(command, **_how):
+        ran.append([str(word) for word in command])
+        return subprocess.CompletedProcess(command, int(fails in ran[-1]), "", "no such wheel")
+
+    monkeypatch.setattr(bootstrap, "VENV", tmp_path)
+    monkeypatch.setattr(bootstrap, "BIN", tmp_path)
+    monkeypatch.setattr(bootstrap.subprocess, "run", run)
+    bootstrap.install(".[dev]")
+    by_pip = [bootstrap.PIP[0], "-m", "pip", "install", "--quiet", "--no-compile", "--editable", ".[dev]"]
+    assert (by_pip in ran) == bool(fails)
+    told = capsys.readouterr().err
+    assert ("no such wheel" in told) == ("pip does it" in told) == (fails == "--python")
+    assert (tmp_path / ".installed-dev").exists()
+    ran.clear()
+    bootstrap.install(".[dev]")
+    assert ran == [], "nothing has changed since"
 
 
 def test_ci_names_files_that_are_here():
