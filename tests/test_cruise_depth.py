@@ -102,11 +102,13 @@ def test_the_less_sure_of_its_depth_the_farther_from_the_edges(stage):
     np.testing.assert_allclose(stage.choose(goal_z, sigma_m=1.0), -0.8, atol=1e-5)
 
 
-def test_comes_back_to_the_goals_depth_in_time(stage):
-    """0.7 of the goal's radius may be left at the goal, and 0.3 m more per metre before it."""
+@pytest.mark.parametrize("share", [0.7, 0.2, 0.0])
+def test_comes_back_to_the_goals_depth_in_time(stage, share):
+    """That much of the goal's radius may be left at the goal, and 0.3 m more per metre before it."""
     away = np.array([0.5, 1.0, 1.5, 2.0, 2.2, 10.0])
-    off = np.minimum(0.7 + 0.3 * np.maximum(away - 1.0, 0), 1.0)
-    np.testing.assert_allclose(stage.choose(-1.2, away, HIGH), np.full(6, -1.2) + off, atol=1e-5)
+    off = np.minimum(share + 0.3 * np.maximum(away - 1.0, 0), 1.0)
+    found = stage.choose(-1.2, away, HIGH, cfg=config(arrival_depth_share=share))
+    np.testing.assert_allclose(found, np.full(6, -1.2) + off, atol=1e-5)
 
 
 def test_keeps_what_it_has_chosen_where_both_edges_are_as_good(stage):

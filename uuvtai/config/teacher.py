@@ -118,6 +118,9 @@ class TeacherConfig(Section):
     """[1/m] of leaving the depth chosen before"""
     return_slope: NonNegative = 0.3
     """[m/m] how much farther from the goal's depth the vehicle may be per metre from the goal"""
+    arrival_depth_share: Fraction = 0.7
+    """share of the goal's radius that the depth may be off on arrival: what is left of the radius ends the
+    level way"""
     depth_gain: Positive = 1.0
     """[1/s] heave per metre of depth error"""
     gaze_m: NonNegative = 3.0
