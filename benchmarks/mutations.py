@@ -672,8 +672,8 @@ TWIN = (
     Mutation(
         "set_mask_forgotten",
         "uuvtai/learn/set_pooling.py",
-        "each = torch.relu(said).mul_(mask.to(said.dtype))",
-        "each = torch.relu(said)",
+        ".mul_(mask.to(said.dtype).unsqueeze(-1))",
+        "",
         "tests/test_twin.py",
         "empty_rows",
     ),

@@ -77,14 +77,14 @@ def test_a_minibatch_is_the_rows_that_were_chosen(nets, batch):
 @pytest.mark.parametrize("kind", [torch.float32, torch.bfloat16])
 def test_maximum_and_sum_have_the_gradient_of_torch(kind):
     generator = torch.Generator().manual_seed(4)
-    said = torch.randn(64, 5, 8, generator=generator).to(kind)
-    said[:9, 1] = said[:9, 3]  # equally high bodies share
+    said = torch.randn(5, 64, 8, generator=generator).to(kind)
+    said[1, :9] = said[3, :9]  # equally high bodies share
     said.requires_grad_()
-    mask = (torch.rand(64, 5, 1, generator=generator) < 0.6).float()
-    mask[20:25] = 0.0  # rows without a body
+    mask = (torch.rand(5, 64, generator=generator) < 0.6).float()
+    mask[:, 20:25] = 0.0  # rows without a body
     back = [torch.randn(64, 8, generator=generator).to(kind) for _ in range(2)]
-    each = torch.relu(said) * mask.to(kind)
-    wanted = each.amax(dim=-2), each.sum(dim=-2)
+    each = torch.relu(said) * mask.to(kind).unsqueeze(-1)
+    wanted = each.amax(dim=0), each.sum(dim=0)
     found = MaxAndSum.apply(said, mask)
     assert all(torch.equal(a, b) for a, b in zip(found, wanted, strict=True))
     (asked,) = torch.autograd.grad(wanted, said, back)

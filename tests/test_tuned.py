@@ -248,10 +248,22 @@ def test_a_checkpoint_drives(saved, trainer, small):
     assert pilot.log_factor.shape[0] >= small.sim.num_envs
 
 
+def test_a_checkpoint_from_before_a_number_leaves_it_as_it_is(saved, trainer, small):
+    older = trainer.centre[:-1].clone()
+    pilot = load_tuned(saved(older), small.sim)
+    assert torch.equal(torch.from_numpy(pilot.log_factor[0, :-1]), older)
+    assert not pilot.log_factor[:, -1].any()
+
+
 @pytest.mark.parametrize(
     "wrong",
-    [torch.zeros(3, 2), torch.full((len(TUNED), 2), 5.0), torch.full((len(TUNED), 2), float("nan"))],
-    ids=["too few", "beyond the bounds", "not finite"],
+    [
+        torch.zeros(3, 2),
+        torch.zeros(len(TUNED) + 1, 2),
+        torch.full((len(TUNED), 2), 5.0),
+        torch.full((len(TUNED), 2), float("nan")),
+    ],
+    ids=["too few", "too many", "beyond the bounds", "not finite"],
 )
 def test_numbers_that_no_training_leaves_are_refused(saved, small, wrong):
     with pytest.raises(CheckpointError, match="holds no numbers of the tree"):

@@ -16,7 +16,7 @@ SLOW, FAST = 0, 1
 
 CAUTION, GROWTH, CLOSING, HORIZON, LAG, DEVIATION, TTC, RANGE, CALM, GAZE = range(10)
 VERTICAL, PEAK, MEAN, CONTACT, CHANGE, SOFTNESS, STATIC_MARGIN, STATIC, HEAVE, BURST = range(10, 20)
-WITHIN, SLOPE, GOAL_DEPTH, DEPTH_CHANGE, DOUBT = range(20, 25)
+WITHIN, SLOPE, GOAL_DEPTH, DEPTH_CHANGE, DOUBT, ARRIVAL = range(20, 26)
 
 
 class TunedNumber(NamedTuple):
@@ -56,8 +56,10 @@ TUNED = (
     TunedNumber("weight_goal_depth", 0.3, 3.0),
     TunedNumber("weight_depth_change", 0.3, 3.0),
     TunedNumber("body_doubt", 0.1, 2.0),
+    TunedNumber("arrival_depth_share", 0.1, 1.4),
 )
-"""by their numbers above; roll-outs are no longer than the config's horizon, for forecasts end there"""
+"""by their numbers above, new ones last: a checkpoint without them drives by factors of one; roll-outs are no
+longer than the config's horizon, for forecasts end there"""
 
 
 def log_bounds() -> tuple[list[float], list[float]]:

@@ -52,7 +52,8 @@ def run_of(folder: Path) -> dict[str, Any]:
             for number, row in enumerate(metrics)
         ],
         "found": {
-            name: {n.name: round(metrics[-1][f"{name}/{n.name}"], 4) for n in TUNED} for name in SECTIONS
+            name: {n.name: round(metrics[-1].get(f"{name}/{n.name}", 1.0), 4) for n in TUNED}
+            for name in SECTIONS  # the search did not know all of them if it is older than some
         },
     }
 

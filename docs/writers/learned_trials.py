@@ -24,8 +24,11 @@ from uuvtai.statistics import bootstrap_interval, mcnemar_p
 from uuvtai.tables.table import text_table
 
 FILE = "docs/data/learned_90008.json"
-BEFORE_FILE = "docs/data/learned_90008_before.json"
-"""the stack that was ``best`` before, on these episodes"""
+BEFORE_FILES = {
+    "until 25 November": "docs/data/learned_90008_first.json",
+    "without `arrival_depth_share`": "docs/data/learned_90008_second.json",
+}
+"""the stacks that were ``best`` before, on these episodes"""
 TRIALS_FILE = "docs/data/stack_trials.json"
 SEED, EPISODES = 90008, 1000
 CONDITION_EPISODES = 64
@@ -103,14 +106,15 @@ def learned_trials(sources: Sources) -> str:
 
 
 def learned_before(sources: Sources) -> str:
-    """``best`` beside the stack that was ``best`` before, on the same episodes."""
-    before = {row["command"]: row["best"] for row in sources.json(BEFORE_FILE)["rows"]}
+    """``best`` beside the stacks that were ``best`` before, on the same episodes."""
     entries, rows = sources.json(FILE)["rows"], []
-    for title in dict.fromkeys(cell.title for cell in CELLS):
-        here = [entry for entry in entries if entry["cell"] == title]
-        pair = Paired.of([(before[entry["command"]], entry["best"]) for entry in here])
-        rows.append([title, *pair.cells(), pair.points(), pair.times()])
-    head = ["world (S, D, v in m/s)", "before", "`best`", "gains, losses, McNemar's p", "points"]
+    for stack, file in BEFORE_FILES.items():
+        before = {row["command"]: row["best"] for row in sources.json(file)["rows"]}
+        for title in dict.fromkeys(cell.title for cell in CELLS):
+            here = [entry for entry in entries if entry["cell"] == title]
+            pair = Paired.of([(before[entry["command"]], entry["best"]) for entry in here])
+            rows.append([stack, title, *pair.cells(), pair.points(), pair.times()])
+    head = ["`best` before", "world (S, D, v in m/s)", "it", "`best`", "gains, losses, McNemar's p", "points"]
     return text_table([*head, "time where both arrive"], rows)
 
 

@@ -33,6 +33,7 @@ class TunedConfig(Section):
     weight_goal_depth: Positive = 1.0
     weight_depth_change: Positive = 1.0
     body_doubt: Positive = 1.0
+    arrival_depth_share: Positive = 1.0
 
 
 class SlowConfig(TunedConfig):

@@ -44,10 +44,11 @@ class SetLosses:
         ``rows``: bodies, own, truth, action, log probability, advantage, target; ``index`` (M,) chooses the
         minibatch. Pieces are added up in their order, so that the number of threads changes no bit.
         """
-        count, some = len(index), index.split(CACHE_ROWS)
+        count = len(index)
+        some = side_by_side(*(functools.partial(_chosen, rows, part) for part in index.split(CACHE_ROWS)))
         pieces: list[Callable[[], Piece]] = [
-            functools.partial(of, rows, chosen, count)
-            for chosen in some
+            functools.partial(of, samples, count)
+            for samples in some
             for of in (self._of_actor, self._of_critic)
         ]
         found = side_by_side(*pieces)
@@ -59,14 +60,13 @@ class SetLosses:
             sums += of_actor.sums + of_critic.sums
         return sums
 
-    def _of_actor(self, rows: list[torch.Tensor], chosen: torch.Tensor, count: int) -> Piece:
-        bodies, own, _, action, before, advantage, _ = rows
-        bodies, own, before = bodies[chosen], own[chosen], before[chosen]
+    def _of_actor(self, samples: list[torch.Tensor], count: int) -> Piece:
+        bodies, own, _, action, before, advantage, _ = samples
         clip = self._config.ppo.clip
         with coarse(self._config):
             mean = self._actor(bodies, own)
-        log_ratio = log_prob(action[chosen], mean.float(), self._actor.log_std) - before
-        policy_loss = loss = surrogate_loss(log_ratio, advantage[chosen], clip).sum() / count
+        log_ratio = log_prob(action, mean.float(), self._actor.log_std) - before
+        policy_loss = loss = surrogate_loss(log_ratio, advantage, clip).sum() / count
         if self._anchor and self._held > 0:
             far = self._anchor.divergence(mean.float(), self._actor.log_std, bodies.float(), own)
             loss = loss + self._held * far.sum() / count
@@ -76,16 +76,21 @@ class SetLosses:
             clipped = ((log_ratio.exp() - 1.0).abs() > clip).sum() / count
             return Piece(gradients, torch.stack([policy_loss, torch.zeros(()), kl, clipped]))
 
-    def _of_critic(self, rows: list[torch.Tensor], chosen: torch.Tensor, count: int) -> Piece:
-        bodies, own, truth, *_, target = rows
+    def _of_critic(self, samples: list[torch.Tensor], count: int) -> Piece:
+        bodies, own, truth, *_, target = samples
         with coarse(self._config):
-            value = self._critic(bodies[chosen], own[chosen], truth[chosen])
-        value_loss = (value.float() - target[chosen]).square().sum() / count
+            value = self._critic(bodies, own, truth)
+        value_loss = (value.float() - target).square().sum() / count
         loss = self._config.ppo.value_weight * value_loss
         gradients = torch.autograd.grad(loss, list(self._critic.parameters()))
         sums = torch.zeros(4)
         sums[1] = value_loss.detach()
         return Piece(gradients, sums)
+
+
+def _chosen(rows: list[torch.Tensor], index: torch.Tensor) -> list[torch.Tensor]:
+    """These samples, next to each other: both networks read them."""
+    return [part[index] for part in rows]
 
 
 def coarse(config: LearningConfig) -> torch.autocast:

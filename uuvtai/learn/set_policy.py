@@ -44,11 +44,12 @@ class SetEncoder(nn.Module):
 
     def forward(self, bodies: torch.Tensor, own: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
         """(..., n_out)."""
-        said = self.body(bodies.flatten(0, -2)).unflatten(
-            0, bodies.shape[:-1]
-        )  # rows: ReLU in place costs none
-        highest, total = MaxAndSum.apply(said, mask)
-        return self.head(torch.cat((highest, _SUM_SCALE * total, self.own(own)), dim=-1))
+        n, rows = bodies.shape[-2], bodies.shape[:-2]
+        each = bodies.reshape(-1, n, bodies.shape[-1]).transpose(0, 1)  # bodies first, as pooling wants them
+        said = self.body(each.flatten(0, 1)).unflatten(0, each.shape[:2])  # rows: ReLU in place costs none
+        highest, total = MaxAndSum.apply(said, mask.reshape(-1, n).t())
+        pooled = torch.cat((highest, _SUM_SCALE * total), dim=-1)
+        return self.head(torch.cat((pooled.reshape(*rows, -1), self.own(own)), dim=-1))
 
 
 class SetActor(nn.Module):

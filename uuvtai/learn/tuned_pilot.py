@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from uuvtai.env import ObservationColumn
     from uuvtai.sim import Sim
 
+_FEWEST = 25
+"""numbers that a checkpoint holds; those that came later are not changed where it lacks them"""
+
 
 class TunedPilot:
     """Lets the simulator's tree drive, with other numbers from the first decision after a reset on; used as
@@ -59,8 +62,10 @@ def checkpoint_factors(checkpoint: Checkpoint) -> torch.Tensor:
     """(n_tuned, 2) of a checkpoint. Raises CheckpointError where they are none that a training can leave."""
     try:
         found = checkpoint.model()["tree"]["log_factor"]
-        if tuple(found.shape) != (len(TUNED), 2):
+        known = len(found)
+        if tuple(found.shape) != (known, 2) or not _FEWEST <= known <= len(TUNED):
             raise ValueError(f"log_factor is {tuple(found.shape)} instead of {(len(TUNED), 2)}")
+        found = torch.cat([found, found.new_zeros(len(TUNED) - known, 2)])
         for number, factors in zip(TUNED, found.exp().tolist(), strict=True):
             for factor in factors:
                 if not number.least * 0.999 <= factor <= number.most * 1.001:

@@ -10,7 +10,7 @@ from uuvtai.kernels.core.signature import Bundle, Const
 from uuvtai.kernels.perception.elevation import COLUMN, half_height, heights
 from uuvtai.kernels.teacher.bundles import ThreatsIO
 from uuvtai.kernels.teacher.trajectories import depth_band, tuned
-from uuvtai.tuned_numbers import DEPTH_CHANGE, GOAL_DEPTH, SLOPE
+from uuvtai.tuned_numbers import ARRIVAL, DEPTH_CHANGE, GOAL_DEPTH, SLOPE
 
 _BLUR_M = 0.1
 """A body's edge is known to this, vertically."""
@@ -42,8 +42,8 @@ def choose_depth(env, io: Bundle[ThreatsIO]):
         away = ti.Vector([goal[0] - pos[0], goal[1] - pos[1]]).norm()
         radius = ti.static(io.episode_cfg.goal_radius_m)
         slope = io.teacher_cfg.return_slope * tuned(env, SLOPE, io.teacher)
-        arrival = ti.static(io.teacher_cfg.arrival_depth_share * io.episode_cfg.goal_radius_m)
-        off = arrival + slope * ti.max(away - radius, 0.0)
+        share = io.teacher_cfg.arrival_depth_share * tuned(env, ARRIVAL, io.teacher)
+        off = share * radius + slope * ti.max(away - radius, 0.0)
         io.teacher.cruise_z_m[env] = best
         wanted = ti.math.clamp(ti.math.clamp(best, goal[2] - off, goal[2] + off), low, high)
     return wanted
