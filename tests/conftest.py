@@ -28,6 +28,7 @@ def pytest_collection_finish():
     """What is there by now stays to the end: nobody need look through it for garbage before."""
     gc.freeze()
     gc.enable()
+    gc.set_threshold(50_000, 50, 1000)  # as in a command (``uuvtai/cli.py``)
     atexit.register(gc.unfreeze)  # libraries that then look for leaks would find all of it
 
 

@@ -63,8 +63,8 @@ class PpoConfig(Section):
     shuffle: bool = False
     """draw minibatches at random instead of as contiguous blocks, each of all envs in a span of steps"""
     bfloat16: bool = False
-    """products of the hidden layers in bfloat16 during the update: faster where the CPU has the instructions,
-    the gradient is coarser"""
+    """products of the hidden layers in bfloat16 during the update, where the CPU has instructions for it:
+    faster, and the gradient is coarser; in float32 where it has none"""
     normalise_observations: bool = True
     normalise_values: bool = True
 

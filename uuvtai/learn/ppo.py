@@ -19,6 +19,7 @@ from torch import nn
 from uuvtai.config.learning import PpoConfig
 from uuvtai.errors import SettingError
 from uuvtai.learn.distill import Reduce, imitation_error
+from uuvtai.learn.half_width import in_bfloat16
 from uuvtai.learn.normalise import Moments, moments_of
 from uuvtai.learn.optimiser import PlainAdam
 from uuvtai.learn.policy import ActorCritic, entropy, log_prob
@@ -279,9 +280,11 @@ class Ppo:
         surrogate: bool,
         sums: torch.Tensor,
     ) -> None:
-        value = _output(self.policy.critic, batch.normalised, self.config.bfloat16)
+        x = batch.normalised
+        bfloat16 = in_bfloat16(self.config, x.device.type)
+        value = _output(self.policy.critic, x, bfloat16)
         acting = surrogate or distill_weight != 0.0
-        out = _output(self.policy.actor, batch.normalised, self.config.bfloat16) if acting else batch.action
+        out = _output(self.policy.actor, x, bfloat16) if acting else batch.action
         self._loss(batch, value, out, count, distill_weight, surrogate, sums).backward()
 
     def _loss(

@@ -113,6 +113,7 @@ def _train(
 ) -> tuple[dict[str, Any], Path]:
     """As ``train``; ``folder`` is the folder of the run to go on with, where this process writes."""
     from uuvtai.learn.distributed import claim_gpu
+    from uuvtai.learn.half_width import in_bfloat16
 
     found, config = _begin(request, watch)
     total = request.iterations or config.train.iterations
@@ -142,6 +143,10 @@ def _train(
         trainer = _twin_trainer(config, found, request.device)
     else:
         trainer = _trainer(_env(config, request.device), config, found)
+    env = getattr(trainer, "env", None)  # of those that learn in the simulator
+    device = env.device.type if env else "cpu"
+    if config.ppo.bfloat16 and not in_bfloat16(config.ppo, device):
+        watch.note("ppo.bfloat16: this CPU has no instructions for it (or torch is too old to tell): float32")
     place = _folder(request, config, found, folder) if trainer.processes.writes else None
     run = _Run(trainer, config, place, watch, evaluate, total)
     status, code = "failed", 1

@@ -11,6 +11,7 @@ import torch
 
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learn.anchor import Anchor
+from uuvtai.learn.half_width import in_bfloat16
 from uuvtai.learn.policy import log_prob
 from uuvtai.learn.ppo import approximate_kl, surrogate_loss
 from uuvtai.learn.set_policy import SetActor, SetCritic
@@ -94,8 +95,8 @@ def _chosen(rows: list[torch.Tensor], index: torch.Tensor) -> list[torch.Tensor]
 
 
 def coarse(config: LearningConfig) -> torch.autocast:
-    """Products in bfloat16 where ``ppo.bfloat16`` says so."""
-    return torch.autocast("cpu", torch.bfloat16, enabled=config.ppo.bfloat16)
+    """Products in bfloat16 where ``ppo.bfloat16`` says so and the CPU can."""
+    return torch.autocast("cpu", torch.bfloat16, enabled=in_bfloat16(config.ppo, "cpu"))
 
 
 def _add_up(net: torch.nn.Module, pieces: list[tuple[torch.Tensor, ...]]) -> None:

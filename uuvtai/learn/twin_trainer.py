@@ -14,6 +14,7 @@ from uuvtai.config.learning import LearningConfig
 from uuvtai.errors import SettingError
 from uuvtai.learn.anchor import Anchor
 from uuvtai.learn.distributed import Processes
+from uuvtai.learn.half_width import in_bfloat16
 from uuvtai.learn.held_out import play_held_out
 from uuvtai.learn.optimiser import PlainAdam
 from uuvtai.learn.policy import log_prob
@@ -101,7 +102,7 @@ class TwinTrainer:
         self.twin.look()
 
     def _allocate(self, steps: int, envs: int, lanes: int, n_body: int, n_own: int) -> None:
-        kind = torch.bfloat16 if self.config.ppo.bfloat16 else torch.float32
+        kind = torch.bfloat16 if in_bfloat16(self.config.ppo, "cpu") else torch.float32
         n_truth = self.twin.view.truth.shape[2]
         self._bodies, self._truth = (
             torch.zeros(steps, envs, lanes, width, dtype=kind) for width in (n_body, n_truth)

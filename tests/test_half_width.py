@@ -1,0 +1,60 @@
+"""``ppo.bfloat16``: only where the device multiplies in it, and said where it does not."""
+
+import pytest
+import torch
+
+from tests.command import uuv
+from uuvtai.config.learning import PpoConfig
+from uuvtai.learn import half_width
+from uuvtai.learn.half_width import in_bfloat16, multiplies_bfloat16
+from uuvtai.learn.set_losses import coarse
+from uuvtai.loader import load_training
+
+QUICK = load_training("quick")
+
+
+@pytest.fixture
+def cpu(monkeypatch):
+    """Function: another CPU, as torch tells of it."""
+
+    def other(**capabilities):
+        monkeypatch.setattr(half_width.torch.cpu, "get_capabilities", lambda: capabilities, raising=False)
+        multiplies_bfloat16.cache_clear()
+
+    yield other
+    multiplies_bfloat16.cache_clear()
+
+
+@pytest.mark.parametrize("name", half_width.INSTRUCTIONS)
+def test_a_cpu_that_has_the_instructions_uses_them(cpu, name):
+    cpu(avx2=True, **{name: True})
+    assert in_bfloat16(PpoConfig(bfloat16=True), "cpu")
+    assert not in_bfloat16(PpoConfig(bfloat16=False), "cpu")
+
+
+def test_a_cpu_without_them_multiplies_in_float32(cpu):
+    cpu(avx2=True, avx512_f=True, avx512_bf16=False)
+    assert QUICK.ppo.bfloat16 and not in_bfloat16(QUICK.ppo, "cpu")
+    assert in_bfloat16(QUICK.ppo, "cuda")
+    a = torch.full((2, 2), 1.001)
+    with coarse(QUICK):
+        assert (a @ a).dtype == torch.float32
+    cpu(avx512_bf16=True)
+    with coarse(QUICK):
+        assert (a @ a).dtype == torch.bfloat16
+
+
+def test_a_torch_that_cannot_tell_counts_as_without(monkeypatch):
+    monkeypatch.delattr(half_width.torch.cpu, "get_capabilities", raising=False)
+    multiplies_bfloat16.cache_clear()
+    assert not multiplies_bfloat16("cpu")
+    multiplies_bfloat16.cache_clear()
+
+
+@pytest.mark.parametrize("has", [False, True])
+def test_a_training_says_so(cpu, has, tmp_path, capfd):
+    cpu(avx512_bf16=has)
+    small = ["train.num_envs=8", "ppo.minibatches=1", "twin.scenarios=8", "train.evaluate_episodes=8"]
+    words = [word for change in small for word in ("--set", change)]
+    code, _, told = uuv(capfd, "train", "quick", "--iterations", "1", "--run-dir", tmp_path / "run", *words)
+    assert code == 0 and ("float32" in told) == (not has)
