@@ -13,7 +13,7 @@ from docs.writers.dead_tables import dead_commands, dead_thrusters
 from docs.writers.figure_sources import Counts, SourceError, Sources, fitting, pooled, rated, share, weighted
 from docs.writers.forecast_tables import forecast_pieces, forecast_scores
 from docs.writers.learned_search import learned_curve, learned_numbers
-from docs.writers.learned_trials import learned_before, learned_trials, stack_trials
+from docs.writers.learned_trials import learned_before, learned_fresh, learned_trials, stack_trials
 from docs.writers.link_tables import (
     aboard,
     ardusub_identified,
@@ -779,6 +779,7 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         fast_slopes,
         learned_trials,
         learned_before,
+        learned_fresh,
         stack_trials,
         forecast_scores,
         forecast_pieces,

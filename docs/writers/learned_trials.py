@@ -26,11 +26,14 @@ from uuvtai.tables.table import text_table
 FILE = "docs/data/learned_90008.json"
 BEFORE_FILES = {
     "until 25 November": "docs/data/learned_90008_first.json",
-    "without `arrival_depth_share`": "docs/data/learned_90008_second.json",
+    "depth on arrival as in `bt`": "docs/data/learned_90008_second.json",
+    "on arrival deep among fast bodies, too": "docs/data/learned_90008_third.json",
 }
-"""the stacks that were ``best`` before, on these episodes"""
+"""the stacks that were ``best`` before, on these episodes; the third was not played in all of them"""
 TRIALS_FILE = "docs/data/stack_trials.json"
 SEED, EPISODES = 90008, 1000
+FRESH_FILE, FRESH_SEED, FRESH = "docs/data/learned_77909.json", 77909, 6
+"""episodes that no stack had met, in so many of the cells, the first ones"""
 CONDITION_EPISODES = 64
 """of each of the paper's conditions"""
 PAPER = "the paper's conditions"
@@ -69,18 +72,18 @@ CELLS = (
 """without bodies their speed makes no difference: these conditions are played once"""
 
 
-def command_of(cell: LearnedCell) -> list[str]:
+def command_of(cell: LearnedCell, seed: int = SEED) -> list[str]:
     """Arguments of ``uuv`` for a cell."""
     who = ["eval", "--controller", "bt", "--controller", "best", *cell.options.split()]
-    return [*who, "--seeds", str(SEED), "--episodes", str(cell.episodes)]
+    return [*who, "--seeds", str(seed), "--episodes", str(cell.episodes)]
 
 
-def entry_of(cell: LearnedCell, result: dict[str, Any], commit: str) -> dict[str, Any]:
+def entry_of(cell: LearnedCell, seed: int, result: dict[str, Any], commit: str) -> dict[str, Any]:
     """What is kept of a ``uuv eval --json`` document."""
     found = {method["name"]: method["episodes_detail"] for method in result["methods"]}
     return {
         "cell": cell.title,
-        "command": "uuv " + " ".join(command_of(cell)),
+        "command": "uuv " + " ".join(command_of(cell, seed)),
         "commit": commit,
         "machine": hardware(),
         **{
@@ -95,10 +98,20 @@ def entry_of(cell: LearnedCell, result: dict[str, Any], commit: str) -> dict[str
 
 def learned_trials(sources: Sources) -> str:
     """``best`` beside ``bt`` on the same episodes."""
-    entries = sources.json(FILE)["rows"]
+    return _beside_the_tree(sources.json(FILE)["rows"])
+
+
+def learned_fresh(sources: Sources) -> str:
+    """The same on episodes that no stack had met."""
+    return _beside_the_tree(sources.json(FRESH_FILE)["rows"])
+
+
+def _beside_the_tree(entries: list[dict[str, Any]]) -> str:
     rows = []
     for title in dict.fromkeys(cell.title for cell in CELLS):
         here = [entry for entry in entries if entry["cell"] == title]
+        if not here:
+            continue
         pair = Paired.of([(entry["bt"], entry["best"]) for entry in here])
         rows.append([title, str(len(pair.ends)), *pair.cells(), pair.points(), pair.times()])
     head = ["world (S, D, v in m/s)", "episodes", "`bt`", "`best`", "gains, losses, McNemar's p", "points"]
@@ -112,6 +125,8 @@ def learned_before(sources: Sources) -> str:
         before = {row["command"]: row["best"] for row in sources.json(file)["rows"]}
         for title in dict.fromkeys(cell.title for cell in CELLS):
             here = [entry for entry in entries if entry["cell"] == title]
+            if not before.keys() >= {entry["command"] for entry in here}:
+                continue
             pair = Paired.of([(before[entry["command"]], entry["best"]) for entry in here])
             rows.append([stack, title, *pair.cells(), pair.points(), pair.times()])
     head = ["`best` before", "world (S, D, v in m/s)", "it", "`best`", "gains, losses, McNemar's p", "points"]
@@ -176,15 +191,19 @@ def main() -> None:
     """Play all cells that are not in the file yet."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("--jobs", type=int, default=2, help="cells played at a time, one thread each")
+    parser.add_argument("--fresh", action="store_true", help=f"the episodes of seed {FRESH_SEED}")
     chosen = parser.parse_args()
-    path: Path = ROOT / FILE
-    document = document_at(path, SEED)
+    seed, file, wanted = (FRESH_SEED, FRESH_FILE, CELLS[:FRESH]) if chosen.fresh else (SEED, FILE, CELLS)
+    path: Path = ROOT / file
+    document = document_at(path, seed)
     done = {row["command"] for row in document["rows"]}
-    cells = [cell for cell in CELLS if "uuv " + " ".join(command_of(cell)) not in done]
+    cells = [cell for cell in wanted if "uuv " + " ".join(command_of(cell, seed)) not in done]
     commit = commit_of_package()
     with ThreadPoolExecutor(chosen.jobs) as pool:
-        for cell, result in zip(cells, pool.map(lambda cell: play(command_of(cell)), cells), strict=True):
-            document["rows"].append(entry_of(cell, result, commit))
+        for cell, result in zip(
+            cells, pool.map(lambda cell: play(command_of(cell, seed)), cells), strict=True
+        ):
+            document["rows"].append(entry_of(cell, seed, result, commit))
             write_atomic(path, (json.dumps(document, indent=1) + "\n").encode())
             print(cell.title, cell.options, flush=True)
 
