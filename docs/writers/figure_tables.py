@@ -13,7 +13,7 @@ from docs.writers.dead_tables import dead_commands, dead_thrusters
 from docs.writers.figure_sources import Counts, SourceError, Sources, fitting, pooled, rated, share, weighted
 from docs.writers.forecast_tables import forecast_pieces, forecast_scores
 from docs.writers.learned_search import learned_curve, learned_numbers
-from docs.writers.learned_trials import learned_before, learned_fresh, learned_trials, stack_trials
+from docs.writers.learned_trials import Paired, learned_before, learned_fresh, learned_trials, stack_trials
 from docs.writers.link_tables import (
     aboard,
     ardusub_identified,
@@ -198,6 +198,7 @@ TWIN_FILE = "docs/data/twin_77001.json"
 WARM_FILE, COLD_FILE = "docs/data/twin_warm_77001.json", "docs/data/twin_cold_77001.json"
 QUICK_FILE, SHALLOW_FILE = "docs/data/quick_77601.json", "docs/data/quick_90008.json"
 FINETUNE_FILE = "docs/data/finetune_77701.json"
+HALF_WIDTH_FILE = "docs/data/half_width_77801.json"
 CHOOSER_FILE = "docs/data/chooser_77001.json"
 TUNED_FILE = "docs/data/tuned_77001.json"
 LEARNING_FILE = "docs/data/learning_trials.json"
@@ -284,6 +285,23 @@ def _trial_rows(sources: Sources, file: str, name: str) -> str:
 def _wheel(entry: dict[str, Any]) -> list[str]:
     counts = entry.get("chooser")
     return [f"{counts['hand_overs_mean']:.1f}, {100 * counts['policy_share']:.0f} %"] if counts else []
+
+
+def half_width(sources: Sources) -> str:
+    """Trainings with hidden layers in float32 and in bfloat16, on the same episodes."""
+    rows = []
+    for entry in sources.json(HALF_WIDTH_FILE)["rows"]:
+        pair = Paired.of([(entry["float32"], entry["bfloat16"])])
+        rows.append([entry["cell"], str(len(pair.ends)), *pair.cells(), pair.points(), pair.times()])
+    head = [
+        "world (S, D, v in m/s)",
+        "episodes",
+        "float32",
+        "bfloat16",
+        "gains, losses, McNemar's p",
+        "points",
+    ]
+    return text_table([*head, "time where both arrive"], rows)
 
 
 def finetune_policy(sources: Sources) -> str:
@@ -780,6 +798,7 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         learned_trials,
         learned_before,
         learned_fresh,
+        half_width,
         stack_trials,
         forecast_scores,
         forecast_pieces,
