@@ -30,6 +30,7 @@ COVERED = ["slipcover", "--merge", COUNTS, "--out", COUNTS, "--fail-under", "90"
 
 PIP = [str(BIN / "python"), "-m", "pip"]
 UV = "uv>=0.5,<1"
+"""installs the same packages in half of pip's time or less, and is a wheel like any other"""
 OF_PIP = {
     "index-url": ("UV_DEFAULT_INDEX", " "),
     "extra-index-url": ("UV_INDEX", " "),
@@ -162,7 +163,7 @@ def install(what: str) -> None:
 
 
 def _install_by_uv(what: str) -> bool:
-    """Install as pip is set up here to do, in a seventh of its time; False where that is pip's own work."""
+    """Install as pip is set up here to do, in half of its time or less; False where pip has to do it."""
     listed = subprocess.run([*PIP, "config", "list"], capture_output=True, text=True, check=False)
     settings = settings_of_uv(listed.stdout)
     if listed.returncode or settings is None:

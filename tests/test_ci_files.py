@@ -91,18 +91,18 @@ def test_the_processes_of_the_gate_keep_the_bytecode_they_compile(monkeypatch):
 
 
 def test_settings_of_pip_are_told_to_uv_and_the_nearer_ones_count():
-    listed = """:env:.find-links='/opt/wheels /more'
+    listed = """:env:.find-links='/a/wheels /b/wheels'
 :env:.disable-pip-version-check='1'
 global.cert='/etc/ssl/ours.crt'
 global.extra-index-url='https://a.example/simple\\nhttps://b.example/simple'
-global.find-links='/elsewhere'
+global.find-links='/c/wheels'
 install.index-url='https://c.example/simple'
 list.format='columns'
 """
     assert bootstrap.settings_of_uv(listed) == {
         "SSL_CERT_FILE": "/etc/ssl/ours.crt",
         "UV_INDEX": "https://a.example/simple https://b.example/simple",
-        "UV_FIND_LINKS": "/opt/wheels,/more",
+        "UV_FIND_LINKS": "/a/wheels,/b/wheels",
         "UV_DEFAULT_INDEX": "https://c.example/simple",
     }
     assert bootstrap.settings_of_uv("") == {}

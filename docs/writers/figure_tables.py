@@ -198,7 +198,7 @@ TWIN_FILE = "docs/data/twin_77001.json"
 WARM_FILE, COLD_FILE = "docs/data/twin_warm_77001.json", "docs/data/twin_cold_77001.json"
 QUICK_FILE, SHALLOW_FILE = "docs/data/quick_77601.json", "docs/data/quick_90008.json"
 FINETUNE_FILE = "docs/data/finetune_77701.json"
-HALF_WIDTH_FILE = "docs/data/half_width_77801.json"
+BFLOAT16_FILE = "docs/data/bfloat16_77801.json"
 CHOOSER_FILE = "docs/data/chooser_77001.json"
 TUNED_FILE = "docs/data/tuned_77001.json"
 LEARNING_FILE = "docs/data/learning_trials.json"
@@ -287,10 +287,10 @@ def _wheel(entry: dict[str, Any]) -> list[str]:
     return [f"{counts['hand_overs_mean']:.1f}, {100 * counts['policy_share']:.0f} %"] if counts else []
 
 
-def half_width(sources: Sources) -> str:
+def bfloat16(sources: Sources) -> str:
     """Trainings with hidden layers in float32 and in bfloat16, on the same episodes."""
     rows = []
-    for entry in sources.json(HALF_WIDTH_FILE)["rows"]:
+    for entry in sources.json(BFLOAT16_FILE)["rows"]:
         pair = Paired.of([(entry["float32"], entry["bfloat16"])])
         rows.append([entry["cell"], str(len(pair.ends)), *pair.cells(), pair.points(), pair.times()])
     head = [
@@ -798,7 +798,7 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         learned_trials,
         learned_before,
         learned_fresh,
-        half_width,
+        bfloat16,
         stack_trials,
         forecast_scores,
         forecast_pieces,

@@ -32,8 +32,10 @@ BEFORE_FILES = {
 """the stacks that were ``best`` before, on these episodes; the third was not played in all of them"""
 TRIALS_FILE = "docs/data/stack_trials.json"
 SEED, EPISODES = 90008, 1000
-FRESH_FILE, FRESH_SEED, FRESH = "docs/data/learned_77909.json", 77909, 6
-"""episodes that no stack had met, in so many of the cells, the first ones"""
+FRESH_FILE, FRESH_SEED = "docs/data/learned_77909.json", 77909
+"""episodes that no stack had met,"""
+FRESH_CELLS = 6
+"""in the first of the cells"""
 CONDITION_EPISODES = 64
 """of each of the paper's conditions"""
 PAPER = "the paper's conditions"
@@ -193,7 +195,9 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=2, help="cells played at a time, one thread each")
     parser.add_argument("--fresh", action="store_true", help=f"the episodes of seed {FRESH_SEED}")
     chosen = parser.parse_args()
-    seed, file, wanted = (FRESH_SEED, FRESH_FILE, CELLS[:FRESH]) if chosen.fresh else (SEED, FILE, CELLS)
+    seed, file, wanted = (
+        (FRESH_SEED, FRESH_FILE, CELLS[:FRESH_CELLS]) if chosen.fresh else (SEED, FILE, CELLS)
+    )
     path: Path = ROOT / file
     document = document_at(path, seed)
     done = {row["command"] for row in document["rows"]}

@@ -18,8 +18,8 @@ from torch import nn
 
 from uuvtai.config.learning import PpoConfig
 from uuvtai.errors import SettingError
+from uuvtai.learn.bfloat16 import in_bfloat16
 from uuvtai.learn.distill import Reduce, imitation_error
-from uuvtai.learn.half_width import in_bfloat16
 from uuvtai.learn.normalise import Moments, moments_of
 from uuvtai.learn.optimiser import PlainAdam
 from uuvtai.learn.policy import ActorCritic, entropy, log_prob

@@ -112,8 +112,8 @@ def _train(
     request: TrainRequest, folder: RunFolder | None, watch: TrainWatch, evaluate: Evaluate
 ) -> tuple[dict[str, Any], Path]:
     """As ``train``; ``folder`` is the folder of the run to go on with, where this process writes."""
+    from uuvtai.learn.bfloat16 import in_bfloat16
     from uuvtai.learn.distributed import claim_gpu
-    from uuvtai.learn.half_width import in_bfloat16
 
     found, config = _begin(request, watch)
     total = request.iterations or config.train.iterations

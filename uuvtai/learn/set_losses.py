@@ -11,7 +11,7 @@ import torch
 
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learn.anchor import Anchor
-from uuvtai.learn.half_width import in_bfloat16
+from uuvtai.learn.bfloat16 import in_bfloat16
 from uuvtai.learn.policy import log_prob
 from uuvtai.learn.ppo import approximate_kl, surrogate_loss
 from uuvtai.learn.set_policy import SetActor, SetCritic

@@ -13,8 +13,8 @@ import torch
 from uuvtai.config.learning import LearningConfig
 from uuvtai.errors import SettingError
 from uuvtai.learn.anchor import Anchor
+from uuvtai.learn.bfloat16 import in_bfloat16
 from uuvtai.learn.distributed import Processes
-from uuvtai.learn.half_width import in_bfloat16
 from uuvtai.learn.held_out import play_held_out
 from uuvtai.learn.optimiser import PlainAdam
 from uuvtai.learn.policy import log_prob
