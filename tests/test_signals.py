@@ -322,12 +322,33 @@ def test_the_workers_of_a_sweep_end_with_it(tmp_path):
     os.kill(process.pid, signal.SIGTERM)
     code, err = ended(process, signal.SIGTERM)
     assert code == 143 and "go on with: uuv sweep --resume run" in err
-    deadline = time.monotonic() + 20
-    while any(Path(f"/proc/{child}").exists() for child in children) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert not [child for child in children if Path(f"/proc/{child}").exists()]
+    assert not left_of(children)
     held = subprocess.run(["sh", "-c", "flock --nonblock run/.lock true"], cwd=tmp_path, check=False)
     assert held.returncode in (0, 127), "the lock is free"
+
+
+def test_ctrl_c_ends_what_compiles_side_by_side(tmp_path):
+    """A terminal sends it to every process of the command."""
+    command = [sys.executable, "-m", "uuvtai", "warm", "--workers", "2", *SmallSim.OPTIONS[:4]]
+    process = subprocess.Popen(
+        command, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=ENVIRONMENT, start_new_session=True
+    )
+    deadline = time.monotonic() + 60
+    while len(children := children_of(process.pid)) < 2 and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert len(children) >= 2
+    os.killpg(process.pid, signal.SIGINT)
+    code, err = ended(process, signal.SIGINT)
+    assert code == 130 and err.splitlines()[-1] == "interrupted"
+    assert not left_of(children)
+
+
+def left_of(children, patience_s=20.0):
+    """Those that have not ended by then."""
+    deadline = time.monotonic() + patience_s
+    while any(Path(f"/proc/{child}").exists() for child in children) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return [child for child in children if Path(f"/proc/{child}").exists()]
 
 
 def children_of(pid):

@@ -2,16 +2,13 @@
 moment."""
 
 import json
-import multiprocessing
-import os
-import signal
 import subprocess
 import sys
 import time
 
 import pytest
 
-from tests import sweep_work
+from tests import worker_work
 from tests.command import uuv
 from tests.report_samples import robustness_sweep
 from tests.small_sim import SmallSim
@@ -19,12 +16,13 @@ from uuvtai.loader import ConfigError
 from uuvtai.measure.episodes.playing import Job, run_episodes
 from uuvtai.measure.sweep import play as sweep_run
 from uuvtai.measure.sweep.cells import Grid, grid_of
-from uuvtai.measure.sweep.engines import EngineError, LocalEngine, RayEngine
+from uuvtai.measure.sweep.engines import RayEngine
 from uuvtai.measure.sweep.plan import SweepRequest, base_config, request_of, tasks_of
 from uuvtai.measure.sweep.play import ROWS, read_rows, resume, sweep
 from uuvtai.run_folder import RunFolderError
 from uuvtai.show.screen import Screen
 from uuvtai.show.sweeping import show_sweep
+from uuvtai.workers import EngineError
 
 
 class Quiet:
@@ -281,73 +279,13 @@ def test_two_processes_do_not_share_a_sweep(tmp_path, monkeypatch):
 # ---------------------------------------------------------------------------------------------------- engines
 
 
-def test_local_workers_give_every_result_once():
-    assert sorted(LocalEngine(2).run(sweep_work.square, [3, 1, 2])) == [(0, 9), (1, 1), (2, 4)]
-
-
-def test_a_lost_worker_costs_its_task_once_more(tmp_path):
-    assert list(LocalEngine(1).run(sweep_work.fall_once, [str(tmp_path / "a"), str(tmp_path / "b")])) == [
-        (0, "a"),
-        (1, "b"),
-    ]
-
-
-def test_what_only_waited_is_not_counted_as_lost(tmp_path):
-    """Each of the first tasks kills its worker once; the last one, which waits meanwhile, must not use up its
-    attempts."""
-    places = [str(tmp_path / name) for name in "abcde"]
-    assert sorted(LocalEngine(1).run(sweep_work.fall_once, places)) == list(enumerate("abcde"))
-
-
-def test_workers_that_keep_dying_end_the_sweep_with_a_reason():
-    with pytest.raises(EngineError, match="lost its worker 3 times"):
-        list(LocalEngine(1).run(sweep_work.always_fall, [1]))
-
-
-def test_errors_of_the_work_are_not_tried_again():
-    with pytest.raises(ValueError, match="-2 is negative"):
-        list(LocalEngine(1).run(sweep_work.square, [-2]))
-
-
-def _start_waiting(place):
-    list(LocalEngine(1).run(sweep_work.tell_and_wait, [place]))
-
-
-def test_workers_end_with_a_parent_that_was_killed(tmp_path):
-    place = tmp_path / "pid"
-    parent = multiprocessing.get_context("spawn").Process(target=_start_waiting, args=(str(place),))
-    parent.start()
-    worker = _pid_in(place)
-    os.kill(parent.pid, signal.SIGKILL)
-    parent.join()
-    assert _gone(worker), "a worker without a parent would fill the machine for ever"
-
-
-def _pid_in(place, patience_s=60.0):
-    for _ in range(int(patience_s / 0.05)):
-        if place.exists() and place.read_text():
-            return int(place.read_text())
-        time.sleep(0.05)
-    raise AssertionError("the worker never began")
-
-
-def _gone(pid, patience_s=30.0):
-    for _ in range(int(patience_s / 0.05)):
-        try:
-            os.kill(pid, 0)
-        except ProcessLookupError:
-            return True
-        time.sleep(0.05)
-    return False
-
-
 def test_a_ray_cluster_gives_the_same_results_and_runs_lost_tasks_again(tmp_path):
     ray = pytest.importorskip("ray", reason="the extra [cluster] is not installed")
     engine = RayEngine("local", cpus_per_task=1)
-    assert list(engine.run(sweep_work.fall_once, [str(tmp_path / "a")])) == [(0, "a")]
-    assert sorted(engine.run(sweep_work.square, [3, 1, 2])) == [(0, 9), (1, 1), (2, 4)]
+    assert list(engine.run(worker_work.fall_once, [str(tmp_path / "a")])) == [(0, "a")]
+    assert sorted(engine.run(worker_work.square, [3, 1, 2])) == [(0, 9), (1, 1), (2, 4)]
     with pytest.raises(ValueError, match="-2 is negative"):
-        list(engine.run(sweep_work.square, [-2]))
+        list(engine.run(worker_work.square, [-2]))
     ray.shutdown()
 
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from multiprocessing import get_context
 from typing import Any
 
 from uuvtai.scene_options import SceneOptions
+from uuvtai.workers import LocalEngine
 
 _STEPS = 6
 """one depth image and one decision of the tree are among them"""
@@ -38,15 +37,11 @@ def warm(shapes: Sequence[Shape], workers: int | None = None) -> list[dict[str, 
     """Compile every shape, ``workers`` processes side by side (default: one per core); an entry per shape:
     world, sensors, num_envs, kernels compiled and found, seconds [s].
 
-    Raises what the shape's config or size raises. What was compiled by then stays.
+    Raises what the shape's config or size raises, and EngineError. What was compiled by then stays.
     """
-    workers = min(len(shapes), workers or os.cpu_count() or 1)
-    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
-        try:
-            return list(pool.map(compiled, shapes))
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+    engine = LocalEngine(min(len(shapes), workers or os.cpu_count() or 1), "run it again")
+    found = dict(engine.run(compiled, shapes))
+    return [found[number] for number in range(len(shapes))]
 
 
 def compiled(shape: Shape) -> dict[str, Any]:

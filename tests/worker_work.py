@@ -1,4 +1,4 @@
-"""Work for the engines of a sweep that needs no simulator; in a module of its own, so that other processes
+"""Work for processes side by side that needs no simulator; in a module of its own, so that other processes
 can import it."""
 
 import os
