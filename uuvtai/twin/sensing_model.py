@@ -4,7 +4,7 @@ place of sonar and camera. Rays of free distance are those of the true walls and
 import taichi as ti
 
 from uuvtai.kernels.core.geometry import BOX, NONE, TWO_PI, wrapped_angle
-from uuvtai.kernels.core.noise import episode_key, normal
+from uuvtai.kernels.core.noise import episode_key, normal, uniform
 from uuvtai.kernels.core.signature import AnyTensor, Bundle, FloatMatrix, IntVector
 from uuvtai.twin.kinematics import path_place
 from uuvtai.twin.set_codes import N_RAY
@@ -16,12 +16,25 @@ FAN_SLOPE = 0.1763
 """the sonar's fan: 10 degrees up and down"""
 CAMERA_RANGE_M, HEIGHT_RANGE_M = 4.0, 3.0
 """the camera sees a body up to the first, and knows how high it is up to the second"""
-BORN_S, SETTLED_S, TURN_KNOWN_S = 0.15, 0.35, 0.8
-"""seen so long: a track; its velocity across the line of sight is known; its turn rate is known"""
-LOST_S, LOST_HEIGHT_S = 2.0, 6.0
+SPELL = 10
+"""decisions for which a body is seen equally well: part of it, at an edge of the fan, beside another"""
+USUAL, MISSED, MISSED_HIDDEN = 0.5, 0.985, 0.94
+"""how badly: the first over one minus a uniform number; beyond the second, or the third out of sight, it is
+not tracked"""
+BORN_S, SETTLED_S = 0.05, 0.07
+"""seen so long, times how badly: a track; its velocity across the line of sight is known"""
+TURN_KNOWN_S = 0.8
+"""seen so long, its turn rate is known"""
+LOST_S, LOST_HEIGHT_S = 2.5, 6.0
 """out of sight so long a track ends, later where its height is known"""
-POSITION_SIGMA_M, VELOCITY_SIGMA_M_S = 0.03, 0.06
-"""of the tracks (EC, by comparison with the simulator's)"""
+POSITION_SIGMA, VELOCITY_SIGMA_M_S, VELOCITY_SIGMA_S = 0.0042, 0.009, 0.0062
+"""of the tracks, times how badly: per metre of distance; at none; per metre"""
+CAMERA_ALONE = 12.0
+"""as badly is what the camera alone sees"""
+QUICKEST, SLOWER = 0.65, 1.0
+"""share of a change of velocity that is seen at once; less of it beyond the middle uniform number"""
+HIDDEN_SIGMA_M, HIDDEN_SIGMA = 0.02, 0.05
+"""of position, and of velocity as a share of it, times how badly: a body goes out of sight part by part"""
 UNBOUNDED_M = 99.0
 """nothing in the way of a ray"""
 RAY_SLACK = 0.01
@@ -130,11 +143,30 @@ def write_rays(env, number, slot_count, x, y, body: AnyTensor, ray: FloatMatrix,
 
 
 @ti.func
+def how_badly(drawn):
+    """How badly a body is seen, by a uniform number: 1 in the middle, with a long tail."""
+    return USUAL / (1.0 - ti.min(drawn, MISSED))
+
+
+@ti.func
 def update_track(
-    env, lane, number, at, is_visible, knows_height, key, ego: FloatMatrix, path: AnyTensor, track: AnyTensor
+    env,
+    lane,
+    number,
+    at,
+    is_visible,
+    knows_height,
+    in_fan,
+    key,
+    ego: FloatMatrix,
+    path: AnyTensor,
+    track: AnyTensor,
 ):
     """The track of a body that is at ``at`` (x, y, vx, vy): born late, its velocity across the line of sight
-    known later, noisy while it is seen, straight on while it is not."""
+    known later, in error by what this spell (``key``) has for it, straight on while it is not seen."""
+    drawn = uniform(key, lane)
+    badly = how_badly(drawn)
+    track[env, lane, 8] = drawn
     if knows_height:
         track[env, lane, 6] = 1.0
     if is_visible:
@@ -144,18 +176,27 @@ def update_track(
         track[env, lane, 4] += DT_S
         track[env, lane, 5] = 0.0
         track[env, lane, 7] += ti.abs(path[number, lane, 4]) * DT_S
-        share = 1.0 if track[env, lane, 4] < 0.25 else 0.55
-        vx, vy = at[2], at[3]
-        if track[env, lane, 4] < SETTLED_S:
-            dx, dy = at[0] - ego[env, AT_POS], at[1] - ego[env, AT_POS + 1]
-            radial = (vx * dx + vy * dy) / ti.max(dx * dx + dy * dy, 1e-6)
+        share = 1.0 if track[env, lane, 4] < 0.25 else QUICKEST - SLOWER * ti.max(drawn - 0.5, 0.0)
+        dx, dy = at[0] - ego[env, AT_POS], at[1] - ego[env, AT_POS + 1]
+        square = ti.max(dx * dx + dy * dy, 1e-6)
+        far, vx, vy = ti.sqrt(square), at[2], at[3]
+        if track[env, lane, 4] < SETTLED_S * badly:
+            radial = (vx * dx + vy * dy) / square
             vx, vy = 0.5 * (vx + radial * dx), 0.5 * (vy + radial * dy)
-        nx, ny = normal(key, 4 * lane), normal(key, 4 * lane + 1)
-        track[env, lane, 2] += share * (vx + VELOCITY_SIGMA_M_S * nx - track[env, lane, 2])
-        track[env, lane, 3] += share * (vy + VELOCITY_SIGMA_M_S * ny - track[env, lane, 3])
-        track[env, lane, 0] = at[0] + POSITION_SIGMA_M * normal(key, 4 * lane + 2)
-        track[env, lane, 1] = at[1] + POSITION_SIGMA_M * normal(key, 4 * lane + 3)
+        if not in_fan:
+            badly *= CAMERA_ALONE
+        away, faster = badly * far * POSITION_SIGMA, badly * (VELOCITY_SIGMA_M_S + far * VELOCITY_SIGMA_S)
+        track[env, lane, 2] += share * (vx + faster * normal(key, 4 * lane) - track[env, lane, 2])
+        track[env, lane, 3] += share * (vy + faster * normal(key, 4 * lane + 1) - track[env, lane, 3])
+        track[env, lane, 0] = at[0] + away * normal(key, 4 * lane + 2)
+        track[env, lane, 1] = at[1] + away * normal(key, 4 * lane + 3)
     else:
+        if track[env, lane, 5] < 0.5 * DT_S:
+            away, faster = badly * HIDDEN_SIGMA_M, badly * HIDDEN_SIGMA * ti.abs(path[number, lane, 4])
+            track[env, lane, 2] += faster * normal(key, 4 * lane)
+            track[env, lane, 3] += faster * normal(key, 4 * lane + 1)
+            track[env, lane, 0] += away * normal(key, 4 * lane + 2)
+            track[env, lane, 1] += away * normal(key, 4 * lane + 3)
         track[env, lane, 5] += DT_S
         track[env, lane, 0] += DT_S * track[env, lane, 2]
         track[env, lane, 1] += DT_S * track[env, lane, 3]
@@ -164,8 +205,10 @@ def update_track(
 @ti.func
 def is_tracked(env, lane, track: AnyTensor):
     """1 while the tracker has this body."""
-    limit = LOST_HEIGHT_S if track[env, lane, 6] > 0.5 else LOST_S
-    return track[env, lane, 5] < limit and track[env, lane, 4] >= BORN_S - 1e-4
+    unseen_s, drawn = track[env, lane, 5], track[env, lane, 8]
+    limit_s = LOST_HEIGHT_S if track[env, lane, 6] > 0.5 else LOST_S
+    is_born = track[env, lane, 4] >= BORN_S * how_badly(drawn) - 1e-4
+    return unseen_s < limit_s and is_born and drawn < (MISSED_HIDDEN if unseen_s > 0.0 else MISSED)
 
 
 @ti.func
@@ -227,14 +270,13 @@ def sense_twin(
     """Tracks, rays, and what only a critic may see, after a decision or a reset. The noise is a function of
     (``seed``, ``count``) and the env.
 
-    ``track`` (n, lanes, 8): estimated x, y, vx, vy; seen for [s]; not seen for [s]; 1 = height known; watched
-    way [m].
+    ``track`` (n, lanes, 9): estimated x, y, vx, vy; seen for [s]; not seen for [s]; 1 = height known; watched
+    way [m]; uniform number of this spell.
     """
     for env in range(ego.shape[0]):
         number, t_s = scenario[env], ego[env, AT_TIME]
         n_rest = body.shape[1] - path.shape[1]
         x, y, z = ego[env, AT_POS], ego[env, AT_POS + 1], ego[env, AT_POS + 2]
-        key = episode_key(seed + count, env)
         for lane in range(path.shape[1]):
             slot = n_rest + lane
             for i in range(raw.shape[2]):
@@ -242,6 +284,7 @@ def sense_twin(
             for i in range(truth.shape[2]):
                 truth[env, lane, i] = 0.0
             if body[number, slot, 0] > 0.5:
+                key = episode_key(seed + (count + 3 * lane) // SPELL, env)
                 at = path_place(number, lane, t_s, path)
                 radius, high, level = body[number, slot, 4], body[number, slot, 6], body[number, slot, 3]
                 dx, dy = at[0] - x, at[1] - y
@@ -252,7 +295,7 @@ def sense_twin(
                 camera = clear and ti.abs(bearing) < TWO_PI / 8 and far < CAMERA_RANGE_M
                 visible = clear and far < RANGE_M and (fan or camera)
                 knows = camera and far < HEIGHT_RANGE_M
-                update_track(env, lane, number, at, visible, knows, key, ego, path, track)
+                update_track(env, lane, number, at, visible, knows, fan, key, ego, path, track)
                 over, under = level - high - z, z - level - high
                 if is_tracked(env, lane, track):
                     write_raw(env, lane, number, at, over, under, t_s, radius, path, track, raw)

@@ -16,7 +16,7 @@ from uuvtai.twin.scenario_bank import ScenarioBank
 from uuvtai.twin.set_codes import BODY_WIDTH, EGO_COLUMNS, N_RAY
 from uuvtai.twin.twin_arrays import EGO_WIDTH, RAW_WIDTH, TRUTH_WIDTH, TwinRules
 
-TRACK_WIDTH = 8
+TRACK_WIDTH = 9
 
 
 class TwinView(NamedTuple):
