@@ -39,7 +39,7 @@ THREADS = 1
 SCENES: tuple[tuple[str, Scene], ...] = tuple(
     (world, scene) for world in ("gauntlet", "pool") for scene in ((8, 9, 1.5), (8, 9, 1.0), (8, 6, 0.6))
 )
-SEED, EPISODES, NUM_ENVS = 77501, 512, 256
+SEED, EPISODES, NUM_ENVS = 77503, 1024, 256
 POINTS = 3.0
 """success may differ by so many"""
 GATE_M, NEAR_M, HOLD_STEPS, STEP_S = 1.0, 6.0, 5, 0.02

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 
 import typer
@@ -61,6 +62,7 @@ EXIT_CODES = (
 )
 
 
+@functools.cache
 def app() -> typer.core.TyperGroup:
     """The command line as Typer runs it."""
     found = typer.main.get_command(cli.app)

@@ -18,9 +18,9 @@ CAMERA_RANGE_M, HEIGHT_RANGE_M = 4.0, 3.0
 """the camera sees a body up to the first, and knows how high it is up to the second"""
 SPELL = 10
 """decisions for which a body is seen equally well: part of it, at an edge of the fan, beside another"""
-USUAL, MISSED, MISSED_HIDDEN = 0.5, 0.985, 0.94
-"""how badly: the first over one minus a uniform number; beyond the second, or the third out of sight, it is
-not tracked"""
+BEST, SPREAD, MISSED, MISSED_HIDDEN = 0.35, 0.325, 0.985, 0.94
+"""how badly: the first, and the second over one minus a uniform number; beyond the third, or the fourth out
+of sight, it is not tracked"""
 BORN_S, SETTLED_S = 0.05, 0.07
 """seen so long, times how badly: a track; its velocity across the line of sight is known"""
 TURN_KNOWN_S = 0.8
@@ -31,9 +31,10 @@ POSITION_SIGMA, VELOCITY_SIGMA_M_S, VELOCITY_SIGMA_S = 0.0042, 0.009, 0.0062
 """of the tracks, times how badly: per metre of distance; at none; per metre"""
 CAMERA_ALONE = 12.0
 """as badly is what the camera alone sees"""
-QUICKEST, SLOWER = 0.65, 1.0
-"""share of a change of velocity that is seen at once; less of it beyond the middle uniform number"""
-HIDDEN_SIGMA_M, HIDDEN_SIGMA = 0.02, 0.05
+QUICKEST, SLOWER, LAG_S = 0.6, 1.1, 0.04
+"""share of a change of velocity that is seen at once; less of it beyond the middle uniform number; the place
+is behind by so much of what is not seen yet"""
+HIDDEN_SIGMA_M, HIDDEN_SIGMA = 0.02, 0.04
 """of position, and of velocity as a share of it, times how badly: a body goes out of sight part by part"""
 UNBOUNDED_M = 99.0
 """nothing in the way of a ray"""
@@ -145,7 +146,7 @@ def write_rays(env, number, slot_count, x, y, body: AnyTensor, ray: FloatMatrix,
 @ti.func
 def how_badly(drawn):
     """How badly a body is seen, by a uniform number: 1 in the middle, with a long tail."""
-    return USUAL / (1.0 - ti.min(drawn, MISSED))
+    return BEST + SPREAD / (1.0 - ti.min(drawn, MISSED))
 
 
 @ti.func
@@ -163,10 +164,16 @@ def update_track(
     track: AnyTensor,
 ):
     """The track of a body that is at ``at`` (x, y, vx, vy): born late, its velocity across the line of sight
-    known later, in error by what this spell (``key``) has for it, straight on while it is not seen."""
+    known later, in error by what this spell (``key``) has for it; while it is not seen straight on, or on its
+    circle."""
     drawn = uniform(key, lane)
     badly = how_badly(drawn)
     track[env, lane, 8] = drawn
+    if path[number, lane, 0] < 0.5 and track[env, lane, 4] > SETTLED_S:
+        turn = DT_S * path[number, lane, 4] / path[number, lane, 1]
+        c, s = ti.cos(turn), ti.sin(turn)
+        vx, vy = track[env, lane, 2], track[env, lane, 3]
+        track[env, lane, 2], track[env, lane, 3] = c * vx - s * vy, s * vx + c * vy
     if knows_height:
         track[env, lane, 6] = 1.0
     if is_visible:
@@ -188,8 +195,9 @@ def update_track(
         away, faster = badly * far * POSITION_SIGMA, badly * (VELOCITY_SIGMA_M_S + far * VELOCITY_SIGMA_S)
         track[env, lane, 2] += share * (vx + faster * normal(key, 4 * lane) - track[env, lane, 2])
         track[env, lane, 3] += share * (vy + faster * normal(key, 4 * lane + 1) - track[env, lane, 3])
-        track[env, lane, 0] = at[0] + away * normal(key, 4 * lane + 2)
-        track[env, lane, 1] = at[1] + away * normal(key, 4 * lane + 3)
+        behind_x, behind_y = LAG_S * (track[env, lane, 2] - at[2]), LAG_S * (track[env, lane, 3] - at[3])
+        track[env, lane, 0] = at[0] + behind_x + away * normal(key, 4 * lane + 2)
+        track[env, lane, 1] = at[1] + behind_y + away * normal(key, 4 * lane + 3)
     else:
         if track[env, lane, 5] < 0.5 * DT_S:
             away, faster = badly * HIDDEN_SIGMA_M, badly * HIDDEN_SIGMA * ti.abs(path[number, lane, 4])
