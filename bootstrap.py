@@ -83,7 +83,7 @@ def test(arguments: list[str]) -> int:
     """Lint, types, import contracts, then the tests with coverage; the first failure decides the exit
     code."""
     python = str(BIN / "python")
-    beside = [] if arguments else [_warm(python)]
+    beside = [] if arguments else _warm(python)
     install(".[dev]")
     _install_js()
     if beside:
@@ -102,15 +102,15 @@ def test(arguments: list[str]) -> int:
     return run([python, "-m", *IN_FULL]) or run([python, "-m", *COVERED])
 
 
-def _warm(python: str) -> subprocess.Popen[bytes]:
-    """Compile what both test processes need on the other core, while packages of the tests are installed and
-    the code is checked: kernels need none of them."""
+def _warm(python: str) -> list[subprocess.Popen[bytes]]:
+    """Compile what both test processes need while packages of the tests are installed and the code is checked:
+    kernels need none of them. Two processes, which keep both cores busy."""
     # torch's threads of two test processes on two cores wait for each other more than they work
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     os.environ.setdefault("UUV_COMPILERS", "1")
     install(".")
-    return subprocess.Popen([python, "-m", "tests.warm"], cwd=ROOT)
+    return [subprocess.Popen([python, "-m", "tests.warm", *what], cwd=ROOT) for what in ([], ["one"])]
 
 
 def _read_tests(python: str) -> subprocess.Popen[bytes]:

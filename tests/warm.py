@@ -1,5 +1,5 @@
-"""Compile the kernels of the tests' small simulator once, for every process that will need them, and those
-that other tests need besides: ``python -m tests.warm``.
+"""Compile the kernels of the tests' small simulator once, for every process that will need them:
+``python -m tests.warm``; and those of one vehicle with a mechanical sonar: ``python -m tests.warm one``.
 
 Test processes that run side by side would each compile them. ``bootstrap.py test`` runs this while packages
 of the tests are installed, so it needs none of them.
@@ -18,14 +18,15 @@ STEPS = 6
 """one depth image and one decision of the tree are among them"""
 
 
-def main() -> None:
-    """The small simulator with its own sensors, and with those that have no errors (``test_log_alone``); one
-    with a mechanical sonar (``test_ping360``); then the first one in the shape for a GPU (``test_cuda``)."""
+def main(what: str) -> None:
+    """The small simulator with its own sensors, and with those that have no errors (``test_log_alone``), then
+    the first one in the shape for a GPU (``test_cuda``); or the one vehicle alone (``test_ping360``)."""
     start_taichi("cpu")
+    if what == "one":
+        return play_alone(sim_with_one_beam())
     play(SmallSim())
     if asked_shape() == "cpu":
         play(SmallSim("clean"))
-        play_alone(sim_with_one_beam())
         os.execve(sys.executable, [sys.executable, "-m", "tests.warm"], os.environ | {VARIABLE: "gpu"})
 
 
@@ -47,4 +48,4 @@ def play_alone(sim) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(" ".join(sys.argv[1:]))

@@ -343,10 +343,17 @@ _SafeLoader.add_implicit_resolver(
 
 def parsed_yaml(text: str, where: str) -> Any:
     """Python value of a YAML text; ConfigError names ``where`` and the line."""
+    return _composed(text, where)[0]
+
+
+def _composed(text: str, where: str) -> tuple[Any, yaml.Node | None]:
+    """(value, node) of a YAML text; None for an empty one. ConfigError as ``parsed_yaml``."""
     if len(text) > MAX_BYTES:
         raise ConfigError(f"{where}: larger than 1 MiB; a config is a small text file")
     try:
-        return yaml.load(text, Loader=_SafeLoader)
+        loader = _SafeLoader(text)
+        node = loader.get_single_node()
+        return (None, None) if node is None else (loader.construct_document(node), node)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         line = f":{mark.line + 1}" if mark else ""
@@ -364,12 +371,12 @@ def _read_yaml(path: Path, folder: Path | None = None) -> _Layer:
         raise ConfigError(
             f"{path}: cannot be read ({error.strerror}); check the path and its permissions"
         ) from None
-    tree = parsed_yaml(text, str(path)) or {}
+    found, node = _composed(text, str(path))
+    tree = found or {}
     if not isinstance(tree, dict):
         raise ConfigError(
             f"{path}: must be a mapping of sections such as 'world:', got {type(tree).__name__}"
         )
-    node = yaml.compose(text, Loader=_SafeLoader)
     return _Layer(tree, dict(_lines(node, str(path), ())) if node is not None else {})
 
 

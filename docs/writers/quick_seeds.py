@@ -1,0 +1,129 @@
+"""Train ``quick`` with three seeds, as it is and with a floor under the deviation that falls at the end, and
+play what was learnt in the simulator: ``python -m docs.writers.quick_seeds RUNS``.
+
+Each run is one ``uuv train quick`` in a process of its own, in a folder ``RUNS/ARM.SEED``; a second start
+trains what is missing. Each best checkpoint by the twin then plays the same episodes in the simulator, and
+the tree beside it. ``docs/data/quick_seeds_77801.json`` holds the evaluations in the twin along the
+trainings, and the outcome and the time of every episode. ``docs/learning.md`` shows the tables.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from docs.writers.evaluations import ONE_THREAD, commit_of_package
+from docs.writers.figure_sources import ROOT, Sources
+from docs.writers.pieces import LETTERS
+from docs.writers.twin_recipe import SEEDS, gain_of
+from docs.writers.twin_trials import CELLS, command_of, curve_of, entry_of
+from uuvtai.run_folder import hardware, write_atomic
+from uuvtai.tables.table import text_table
+
+FILE = "docs/data/quick_seeds_77801.json"
+SEED, EPISODES = "77801", 512
+"""a tuning seed"""
+TITLE, SCENE, OPTIONS = CELLS[2]
+ARMS = {"base": ("as it is", ""), "std": ("`last_std=0.1`", "--set twin.last_std=0.1")}
+"""name: (title in the table, options of ``uuv train quick``)"""
+
+
+def train(arm: str, seed: int, place: Path) -> None:
+    """One training."""
+    command = ["train", "quick", "--seed", str(seed), *ARMS[arm][1].split(), "--run-dir", str(place)]
+    subprocess.run([sys.executable, "-m", "uuvtai", *command], env=os.environ | ONE_THREAD, check=True)
+
+
+def played(place: Path) -> dict[str, Any]:
+    """The best checkpoint and the tree on the same episodes of the simulator."""
+    command = command_of(str(place), OPTIONS, SEED, EPISODES)
+    with tempfile.TemporaryDirectory() as folder:
+        done = subprocess.run(
+            [sys.executable, "-m", "uuvtai", *command, "--json", "--run-dir", f"{folder}/run"],
+            env=os.environ | ONE_THREAD,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+    return entry_of(TITLE, command, json.loads(done.stdout), commit_of_package())
+
+
+def quick_seeds(sources: Sources) -> str:
+    """Success of every run in the twin and in the simulator, and the gain of the second arm, seed by seed."""
+    runs = sources.json(FILE)["runs"]
+    rows, found = [], {}
+    for arm, (title, _options) in ARMS.items():
+        own = [run for run in runs if run["arm"] == arm]
+        shares = found[arm] = {run["seed"]: _shares(run) for run in own}
+        for part in shares.values():
+            rows.append([title, *(f"{value:.1f} %" for value in part)])
+    both = [
+        gain_of([found["std"][seed][i] - found["base"][seed][i] for seed in sorted(found["base"])])
+        for i in range(2)
+    ]
+    rows.append(["gain, points", *both])
+    return text_table(["training, seed by seed", "twin, best", f"simulator, {EPISODES}"], rows)
+
+
+def _shares(run: dict[str, Any]) -> tuple[float, float]:
+    """[%] the best of the evaluations in the twin, and what came of that checkpoint in the simulator."""
+    outcomes = run["played"]["policy"]["outcomes"]
+    return (
+        100 * max(row[SCENE] for row in run["curve"]),
+        100 * outcomes.count("s") / len(outcomes),
+    )
+
+
+def quick_failures(sources: Sources) -> str:
+    """How episodes ended in the simulator, of all seeds together, beside the tree."""
+    runs = sources.json(FILE)["runs"]
+    names = {"bt": [run["played"]["bt"] for run in runs[:1]]}
+    names |= {ARMS[arm][0]: [r["played"]["policy"] for r in runs if r["arm"] == arm] for arm in ARMS}
+    rows = []
+    for name, parts in names.items():
+        text = "".join(part["outcomes"] for part in parts)
+        times = [
+            t for part in parts for t, o in zip(part["times_s"], part["outcomes"], strict=True) if o == "s"
+        ]
+        ended = [
+            f"{100 * text.count(LETTERS[end]) / len(text):.1f} %" for end in ("success", "collision", "ttc")
+        ]
+        rows.append([name, *ended, f"{statistics.mean(times):.1f} s"])
+    return text_table(["driver", "success", "collision", "ttc", "time of a success"], rows)
+
+
+def main() -> None:
+    """Train what is missing, play all of it and write the file."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("runs", type=Path)
+    parser.add_argument("--commit", help="of the package that trained, where it is not this one")
+    chosen = parser.parse_args()
+    commit = chosen.commit or commit_of_package()
+    document: dict[str, Any] = {
+        "schema": 1,
+        "seed": SEED,
+        "letters": {letter: name for name, letter in LETTERS.items()},
+        "commit": commit,
+        "machine": hardware(),
+        "runs": [],
+    }
+    for arm in ARMS:
+        for seed in SEEDS:
+            place = chosen.runs / f"{arm}.{seed}"
+            if not place.exists():
+                train(arm, seed, place)
+            run = {"arm": arm, "seed": seed, "curve": curve_of(place), "played": played(place)}
+            document["runs"].append(run)
+            write_atomic(ROOT / FILE, (json.dumps(document, indent=1) + "\n").encode())
+            print(place.name, flush=True)
+
+
+if __name__ == "__main__":
+    main()
