@@ -15,6 +15,7 @@ from uuvtai.config import TankConfig, VehicleConfig
 from uuvtai.config.learning import LearningConfig
 from uuvtai.errors import UserError
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, FAR_M, NONE
+from uuvtai.kernels.core.noise import episode_key
 from uuvtai.kernels.core.signature import AnyTensor, Bundle, Const, FloatMatrix
 from uuvtai.learn import checkpoint, twin_trainer
 from uuvtai.learn.manifest import CheckpointError
@@ -28,7 +29,8 @@ from uuvtai.measure.episodes.playing import jobs_of, run_episodes
 from uuvtai.twin import hull_rule, kinematics, observer, sensing_model
 from uuvtai.twin.scenario_bank import draw_bank
 from uuvtai.twin.set_codes import BODY_WIDTH, EGO_COLUMNS, N_RAY
-from uuvtai.twin.twin_arrays import ObserverIO, TwinRules
+from uuvtai.twin.twin_arrays import EGO_WIDTH, ObserverIO, TwinRules
+from uuvtai.twin.twin_world import TRACK_WIDTH
 
 CLEARANCE_TOL_M = 0.01
 """the simulator's hull leans by a few degrees, the twin's does not"""
@@ -73,6 +75,22 @@ def places(path: AnyTensor, times: AnyTensor, out: AnyTensor):
 def look_along(place: FloatMatrix, body: AnyTensor, io: Bundle[TwinRules], ray: FloatMatrix):
     for i in range(place.shape[0]):
         sensing_model.write_rays(i, i, body.shape[1], place[i, 0], place[i, 1], body, ray, io)
+
+
+@ti.kernel
+def watch(at: FloatMatrix, is_seen: int, steps: int, ego: FloatMatrix, path: AnyTensor, track: AnyTensor):
+    """Bodies that stay at (x, y) with a velocity, each a row, for so many decisions."""
+    for i in range(at.shape[0]):
+        place = ti.Vector([at[i, 0], at[i, 1], at[i, 2], at[i, 3]])
+        for step in range(steps):
+            key = episode_key(step // sensing_model.SPELL, i)
+            sensing_model.update_track(i, 0, i, place, is_seen == 1, 0, 1, key, ego, path, track)
+
+
+@ti.kernel
+def tracked(track: AnyTensor, out: AnyTensor):
+    for i in range(track.shape[0]):
+        out[i] = sensing_model.is_tracked(i, 0, track)
 
 
 @pytest.fixture(scope="module")
@@ -240,6 +258,55 @@ def test_rays_meet_what_stands_in_their_way(config):
     assert off.mean() < 1e-3, "but for rays that touch an edge"
     bare = [free_m(*at, [], tank) for at in place.double().numpy()]
     assert (np.array(bare) > np.array(wanted) + 0.1).mean() > 0.1, "bodies are in the way"
+
+
+def watched(far_m, steps, is_seen=1, count=4000, radius_m=None, track=None):
+    """Tracks (count, 9) of bodies so far ahead that go across at 1 m/s, on a circle where it has a radius."""
+    at = torch.tensor([[far_m, 0.0, 0.0, 1.0]]).repeat(count, 1)
+    path = torch.zeros(count, 1, 16)
+    path[..., 0], path[..., 1], path[..., 2] = (3.0, 1.0, 9.0) if radius_m is None else (0.0, radius_m, 9.0)
+    path[..., 4] = 1.0
+    track = torch.zeros(count, 1, TRACK_WIDTH) if track is None else track
+    watch(at, is_seen, steps, torch.zeros(count, EGO_WIDTH), path, track)
+    return track[:, 0]
+
+
+def test_errors_of_tracks_grow_with_distance_and_have_a_long_tail():
+    near, far = watched(1.0, 30), watched(4.0, 30)
+    errors = [(track[:, :2] - torch.tensor([at, 0.0])).norm(dim=1) for track, at in ((near, 1.0), (far, 4.0))]
+    middle, tail = (np.array([np.quantile(error, q) for error in errors]) for q in (0.5, 0.95))
+    assert middle[1] / middle[0] == pytest.approx(4.0, rel=0.15)
+    assert (tail / middle).min() > 5 and (tail / middle).max() < 20, (
+        "of a normal distribution it would be two"
+    )
+    assert 0.015 < middle[1] < 0.025, "centimetres"
+    assert abs(far[:, 3].median() - 1.0) < 0.01, "what goes across is known by then"
+
+
+def test_a_track_out_of_sight_follows_a_circle_and_else_goes_straight():
+    for radius_m, turned in ((1.0, 1.0), (-1.0, -1.0), (None, 0.0)):
+        track = watched(2.0, 30, radius_m=radius_m)[:, None].contiguous()
+        before = torch.atan2(track[:, 0, 3], track[:, 0, 2])
+        hidden = watched(2.0, 1, is_seen=0, radius_m=radius_m, track=track.clone())
+        track = watched(2.0, 11, is_seen=0, radius_m=radius_m, track=track)
+        moved = torch.atan2(track[:, 3], track[:, 2]) - before
+        assert float(torch.remainder(moved + np.pi, 2 * np.pi).median() - np.pi) == pytest.approx(
+            1.1 * turned, abs=0.05
+        )
+        assert float((hidden[:, 2:4] - track[:, 2:4]).norm(dim=1).median()) > 0.5 or turned == 0.0
+        assert float(track[:, 5].min()) == pytest.approx(1.1)
+
+
+def test_what_is_seen_badly_is_born_late_or_missed():
+    told = [born_of(watched(2.0, steps)).mean() for steps in (1, 3, 5, 9)]
+    assert 0.7 < told[0] < told[1] < told[2] < told[3] < 0.99
+
+
+def born_of(track):
+    """1 where the tracker has the body."""
+    out = np.zeros(len(track), np.int32)
+    tracked(track[:, None].contiguous(), out)
+    return out
 
 
 # ----------------------------------------------------------------------------------------------- the policy

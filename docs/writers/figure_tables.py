@@ -24,8 +24,10 @@ from docs.writers.link_tables import (
     terminals,
 )
 from docs.writers.newcomer_tables import newcomer, newcomer_zero
+from docs.writers.parity_tables import parity_success, parity_tracks
 from docs.writers.pieces import BEFORE, CELLS, DASH, LETTERS, PIECES, beside
 from docs.writers.pose_tables import pose_endings, pose_errors
+from docs.writers.quick_seeds import quick_failures, quick_seeds
 from docs.writers.rehearsal_tables import rehearsal
 from docs.writers.replay_tables import changed, lossy, replayed
 from docs.writers.sonar_tables import sonars
@@ -676,53 +678,6 @@ def _percent(values: dict[str, float], name: str) -> str:
     return f"{100 * values[name]:.1f}"
 
 
-def parity_success(sources: Sources) -> str:
-    """Success of one policy in twin and simulator."""
-    rows = []
-    for row in sources.benchmark("parity")["rows"]:
-        if row["what"].startswith("success"):
-            at = row["details"]
-            shares = [
-                f"{100 * side['success'] / side['episodes']:.1f} % [{100 * side['interval'][0]:.1f}, "
-                f"{100 * side['interval'][1]:.1f}]"
-                for side in (at["twin"], at["simulator"])
-            ]
-            low, high = at["difference"] - at["half"], at["difference"] + at["half"]
-            rows.append(
-                [
-                    row["what"].removeprefix("success, "),
-                    *shares,
-                    f"{at['difference']:+.1f} [{low:+.1f}, {high:+.1f}]",
-                    f"{at['only twin']}, {at['only simulator']}",
-                    "yes" if abs(at["difference"]) <= 3 else "**no**",
-                ]
-            )
-    heads = ["scene", "twin", "simulator", "difference, points", "only twin, only simulator", "within 3"]
-    return text_table(heads, rows)
-
-
-_TRACKS = {
-    "position error": ("position error, m", ".3f"),
-    "velocity error": ("velocity error, m/s", ".2f"),
-    "birth delay": ("birth delay, s", ".1f"),
-}
-
-
-def parity_tracks(sources: Sources) -> str:
-    """Errors of the tracks in twin and simulator, median and 90th percentile."""
-    rows = []
-    for row in sources.benchmark("parity")["rows"]:
-        for side, values in row["details"].get("tracks", {}).items():
-            pairs = [
-                f"{values[f'{name}, median']:{form}}, {values[f'{name}, p90']:{form}}"
-                for name, (_, form) in _TRACKS.items()
-            ]
-            shares = [_percent(values, name) for name in ("bodies tracked", "never tracked")]
-            rows.append([row["what"].removeprefix("tracks, "), side, *pairs, *shares])
-    heads = [head for head, _ in _TRACKS.values()]
-    return text_table(["scene", "", *heads, "tracked within 6 m, %", "never tracked, %"], rows)
-
-
 def _row(sources: Sources, what: str, text: str) -> dict[str, Any]:
     return next(row for row in sources.benchmark(what)["rows"] if row["what"] == text)
 
@@ -788,6 +743,8 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         quick_curve,
         quick_policy,
         quick_shallow,
+        quick_seeds,
+        quick_failures,
         chooser_trials,
         tuned_trials,
         learning_trials,
