@@ -103,8 +103,8 @@ def test(arguments: list[str]) -> int:
 
 
 def _warm(python: str) -> list[subprocess.Popen[bytes]]:
-    """Compile what both test processes need while packages of the tests are installed and the code is checked:
-    kernels need none of them. Two processes, which keep both cores busy."""
+    """Compile what both test processes need while packages are installed and the code is checked, for kernels
+    need none of them. Two processes keep both cores busy."""
     # torch's threads of two test processes on two cores wait for each other more than they work
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
