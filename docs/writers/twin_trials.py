@@ -64,6 +64,19 @@ def entry_of(cell: str, command: list[str], result: dict[str, Any], commit: str)
     }
 
 
+def played(command: list[str]) -> dict[str, Any]:
+    """The ``--json`` document of these arguments of ``uuv``, in a process of its own."""
+    with tempfile.TemporaryDirectory() as place:
+        done = subprocess.run(
+            [sys.executable, "-m", "uuvtai", *command, "--json", "--run-dir", f"{place}/run"],
+            env=os.environ | ONE_THREAD,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+    return json.loads(done.stdout)
+
+
 def curve_of(run: Path) -> list[dict[str, Any]]:
     """Success in the twin, by scene, along a training; decisions and seconds of the training so far."""
     rows, seconds = [], 0.0
@@ -97,15 +110,8 @@ def main() -> None:
     cells = [cell for cell in (*CELLS, *(MORE if chosen.more else ())) if cell[0].startswith(chosen.only)]
     for title, _name, options in cells:
         command = command_of(str(run), options, chosen.seeds, chosen.episodes)
-        with tempfile.TemporaryDirectory() as place:
-            done = subprocess.run(
-                [sys.executable, "-m", "uuvtai", *command, "--json", "--run-dir", f"{place}/run"],
-                env=os.environ | ONE_THREAD,
-                capture_output=True,
-                text=True,
-                check=True,
-            )
-        document["rows"].append(entry_of(title, command, json.loads(done.stdout), commit_of_package()))
+        result = played(command)
+        document["rows"].append(entry_of(title, command, result, commit_of_package()))
         write_atomic(ROOT / chosen.out, (json.dumps(document, indent=1) + "\n").encode())
         print(title, flush=True)
 
