@@ -1,5 +1,5 @@
-"""Train ``quick`` with several seeds, as it is and with a floor under the deviation that falls at the end, and
-play what was learnt in the simulator: ``python -m docs.writers.quick_seeds RUNS``.
+"""Train ``quick`` with several seeds, as it is and with a floor under the deviation that falls at the end;
+then play what was learnt in the simulator: ``python -m docs.writers.quick_seeds RUNS``.
 
 Each run is one ``uuv train quick`` in a process of its own, in a folder ``RUNS/ARM.SEED``; a second start
 trains what is missing. Each best checkpoint by the twin then plays the same episodes in the simulator, and

@@ -28,14 +28,16 @@ TURN_KNOWN_S = 0.8
 LOST_S, LOST_HEIGHT_S = 2.5, 6.0
 """out of sight so long a track ends, later where its height is known"""
 POSITION_SIGMA, VELOCITY_SIGMA_M_S, VELOCITY_SIGMA_S = 0.0042, 0.009, 0.0062
-"""of the tracks, times how badly: per metre of distance; at none; per metre"""
+"""errors of the tracks, times how badly: of position per metre of distance; of velocity at no distance, and
+per metre. EC, as are the constants around: by quantiles of the simulator's tracks (docs/learning.md)"""
 CAMERA_ALONE = 12.0
-"""as badly is what the camera alone sees"""
+"""times as badly is a body seen that the camera sees and the sonar does not"""
 QUICKEST, SLOWER, LAG_S = 0.6, 1.1, 0.04
 """share of a change of velocity that is seen at once; less of it beyond the middle uniform number; the place
 is behind by so much of what is not seen yet"""
 HIDDEN_SIGMA_M, HIDDEN_SIGMA = 0.02, 0.04
-"""of position, and of velocity as a share of it, times how badly: a body goes out of sight part by part"""
+"""errors of position, and of velocity as a share of it, times how badly, when a body goes out of sight, which
+it does part by part"""
 UNBOUNDED_M = 99.0
 """nothing in the way of a ray"""
 RAY_SLACK = 0.01
@@ -292,7 +294,7 @@ def sense_twin(
             for i in range(truth.shape[2]):
                 truth[env, lane, i] = 0.0
             if body[number, slot, 0] > 0.5:
-                key = episode_key(seed + (count + 3 * lane) // SPELL, env)
+                key = episode_key(seed + (count + 3 * lane) // SPELL, env)  # spells do not begin all at once
                 at = path_place(number, lane, t_s, path)
                 radius, high, level = body[number, slot, 4], body[number, slot, 6], body[number, slot, 3]
                 dx, dy = at[0] - x, at[1] - y
