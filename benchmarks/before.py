@@ -145,10 +145,10 @@ def _speed(job: Job, ours: Side, theirs: Side, commit: str, num_envs: int) -> li
     begun: dict[Side, list[float]] = {ours: [], theirs: []}
     for _ in range(starts):
         for side in samples:
-            player = _Player(side, world, sensors, num_envs)
+            player = Player(side, "speed", world, sensors, str(num_envs), threads=1)
             begun[side].append(player.start_s)
             player.close()
-    players = {side: _Player(side, world, sensors, num_envs) for side in samples}
+    players = {side: Player(side, "speed", world, sensors, str(num_envs), threads=1) for side in samples}
     for turn in range(2 if job.quick else _ROUNDS):
         for side in (ours, theirs)[:: 1 if turn % 2 else -1]:
             samples[side].append(players[side].seconds(steps))
@@ -176,13 +176,15 @@ def _median_interval(values: list[float]) -> tuple[float, float, float]:
     return ordered[max(low, 0)], statistics.median(ordered), ordered[min(high, len(values) - 1)]
 
 
-class _Player:
-    """A process of one thread that steps when it is asked to; ``start_s``: CPU time up to its first step."""
+class Player:
+    """A process that steps when it is asked to; ``start_s``: CPU time up to its first step."""
 
-    def __init__(self, side: Side, world: str, sensors: str, num_envs: int) -> None:
+    def __init__(self, side: Side, *arguments: str, threads: int = 0) -> None:
+        """``arguments`` of ``played.py``; ``threads`` 0: all cores."""
+        limits = ("UUV_NUM_THREADS", "OMP_NUM_THREADS") if threads else ()
         self.process = subprocess.Popen(
-            side.played("speed", world, sensors, str(num_envs)),
-            env={**side.environment, "UUV_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
+            side.played(*arguments),
+            env={**side.environment, **dict.fromkeys(limits, str(threads))},
             cwd=side.tree,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -191,7 +193,7 @@ class _Player:
         self.start_s = self._answer("ready")
 
     def seconds(self, steps: int) -> float:
-        """CPU time of so many steps [s]."""
+        """What so many steps took [s]."""
         assert self.process.stdin
         self.process.stdin.write(f"{steps}\n")
         self.process.stdin.flush()

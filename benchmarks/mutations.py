@@ -670,6 +670,14 @@ TWIN = (
         "referee",
     ),
     Mutation(
+        "twin_bodies_that_come_near",
+        "uuvtai/twin/kinematics.py",
+        "x, y, farthest = body[number, slot, 1], body[number, slot, 2], DRIVEN_M + 0.0",
+        "x, y, farthest = body[number, slot, 1], body[number, slot, 2], DRIVEN_M - 0.3",
+        "tests/test_twin.py",
+        "left_out",
+    ),
+    Mutation(
         "set_mask_forgotten",
         "uuvtai/learn/set_pooling.py",
         ".mul_(mask.to(said.dtype).unsqueeze(-1))",

@@ -1,6 +1,6 @@
 """Decisions per second of a training in the kinematic twin (``uuv train quick``) on all cores, beside another
 commit (``--against``, default HEAD): whole commands of a few iterations in turns, the first two of each left
-out."""
+out. And the twin alone, without networks, in short turns of two processes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import statistics
 import tempfile
 from pathlib import Path
 
-from benchmarks.before import ROOT, Side, checked_out
+from benchmarks.before import ROOT, Player, Side, checked_out
 from benchmarks.common import Job, Row
 
 LONGEST_S = 1800
@@ -18,6 +18,9 @@ _TURNS, _ITERATIONS, _LEFT_OUT = 5, 10, 2
 _SHORT = ["--set", "train.evaluate_every=1000", "--set", "train.evaluate_episodes=16"]
 _SMALL = ["--set", "train.num_envs=16", "--set", "ppo.minibatches=1", "--set", "twin.scenarios=16"]
 _PARTS = ("simulate", "learn")
+_NUM_ENVS, _DECISIONS, _ROUNDS = 2048, 50, 21
+_KERNELS_US = 3.0
+"""what a decision of the twin may take"""
 
 
 def measure(job: Job) -> list[Row]:
@@ -34,7 +37,25 @@ def measure(job: Job) -> list[Row]:
                 lines = (place / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
                 found[i] += [json.loads(line) for line in lines][_LEFT_OUT:]
             job.say(f"turn {turn + 1}")
-    return _rows(found, commit)
+        return [*_rows(found, commit), _alone(job, sides, commit)]
+
+
+def _alone(job: Job, sides: tuple[Side, Side], commit: str) -> Row:
+    """A decision of the twin on all cores, medians of both sides in turns."""
+    num_envs = 64 if job.quick else _NUM_ENVS
+    players = [Player(side, "twin", "twin", str(num_envs)) for side in sides]
+    taken: list[list[float]] = [[], []]
+    for turn in range(1 if job.quick else _ROUNDS):
+        for i in (0, 1) if turn % 2 else (1, 0):
+            taken[i].append(1e6 * players[i].seconds(_DECISIONS) / (_DECISIONS * num_envs))
+    for player in players:
+        player.close()
+    ours, theirs = map(statistics.median, taken)
+    told = dict(zip(("ours_us", "theirs_us"), taken, strict=True))
+    return Row(
+        "a decision of the twin alone", ours, "us", theirs, commit,
+        less_is_better=True, floor=_KERNELS_US, details=told,
+    )  # fmt: skip
 
 
 def _rows(found: list[list[dict[str, float]]], commit: str) -> list[Row]:

@@ -29,8 +29,7 @@ from uuvtai.measure.episodes.playing import jobs_of, run_episodes
 from uuvtai.twin import hull_rule, kinematics, observer, sensing_model
 from uuvtai.twin.scenario_bank import draw_bank
 from uuvtai.twin.set_codes import BODY_WIDTH, EGO_COLUMNS, N_RAY
-from uuvtai.twin.twin_arrays import EGO_WIDTH, ObserverIO, TwinRules
-from uuvtai.twin.twin_world import TRACK_WIDTH
+from uuvtai.twin.twin_arrays import TRACK_WIDTH, ObserverIO, TwinRules
 
 CLEARANCE_TOL_M = 0.01
 """the simulator's hull leans by a few degrees, the twin's does not"""
@@ -78,19 +77,49 @@ def look_along(place: FloatMatrix, body: AnyTensor, io: Bundle[TwinRules], ray: 
 
 
 @ti.kernel
-def watch(at: FloatMatrix, is_seen: int, steps: int, ego: FloatMatrix, path: AnyTensor, track: AnyTensor):
-    """Bodies that stay at (x, y) with a velocity, each a row, for so many decisions."""
+def threats(
+    near_only: int,
+    pose: FloatMatrix,
+    moved: FloatMatrix,
+    io: Bundle[TwinRules],
+    body: AnyTensor,
+    path: AnyTensor,
+    out: FloatMatrix,
+):
+    """Clearance and time to collision after hulls (x, y, z, t) have moved by (x, y, z, t), of the bodies that
+    were found near before, or of all."""
+    for i in range(pose.shape[0]):
+        before = ti.Vector([pose[i, k] for k in ti.static(range(3))])
+        after = before + ti.Vector([moved[i, k] for k in ti.static(range(3))])
+        near = kinematics.EVERY_SLOT + 0
+        if near_only == 1:
+            near = kinematics.near_slots(i, before, pose[i, 3], body, path, io)
+        ahead = ti.Vector([1.0, 0.0, 0.0])
+        t_s = pose[i, 3] + moved[i, 3]
+        threat = kinematics.nearest_of(near, i, after, ahead, ahead, 0.0, t_s, body, path, io)
+        out[i, 0], out[i, 1] = threat[0], threat[1]
+
+
+@ti.kernel
+def watch(at: FloatMatrix, is_seen: int, steps: int, bend_m: float, track: AnyTensor):
+    """Bodies that stay at (x, y) with a velocity, each a row, for so many decisions, seen from (0, 0)."""
     for i in range(at.shape[0]):
         place = ti.Vector([at[i, 0], at[i, 1], at[i, 2], at[i, 3]])
         for step in range(steps):
             key = episode_key(step // sensing_model.SPELL, i)
-            sensing_model.update_track(i, 0, i, place, is_seen == 1, 0, 1, key, ego, path, track)
+            old = ti.Vector([track[i, 0, k] for k in ti.static(range(TRACK_WIDTH))])
+            new = sensing_model.updated_track(
+                old, 0, place, bend_m, 1.0, ti.Vector([0.0, 0.0]), is_seen == 1, 0, 1, key
+            )
+            for k in ti.static(range(TRACK_WIDTH)):
+                track[i, 0, k] = new[k]
 
 
 @ti.kernel
 def tracked(track: AnyTensor, out: AnyTensor):
     for i in range(track.shape[0]):
-        out[i] = sensing_model.is_tracked(i, 0, track)
+        row = ti.Vector([track[i, 0, k] for k in ti.static(range(TRACK_WIDTH))])
+        out[i] = sensing_model.is_tracked(row)
 
 
 @pytest.fixture(scope="module")
@@ -213,6 +242,27 @@ def test_far_bodies_are_left_out(config):
     assert seen[0, 0] == pytest.approx(3.0 - 0.17, abs=FLOAT_TOL)  # the side walls
 
 
+@pytest.mark.parametrize("slots", [0, 30])
+def test_no_body_that_can_come_near_is_left_out(bank, config, slots):
+    """Nothing changes where those alone are looked at that were near when the decision began, however the
+    hull has moved since; nor where there are more slots than an integer has bits."""
+    rng, count = np.random.default_rng(3), len(bank.body)
+    rules, changed = bind(TwinRules, config), 0
+    body = torch.cat([torch.zeros(count, slots, 8), bank.body], dim=1).contiguous()
+    for _ in range(200):
+        pose, moved = rng.uniform(0, 1, (count, 4)), rng.uniform(-1, 1, (count, 4))
+        pose = pose * [20.0, 6.0, -1.6, 30.0]
+        moved = moved / np.linalg.norm(moved[:, :3], axis=1, keepdims=True) * 0.25
+        moved[:, 3] = rng.uniform(0, 0.1, count)
+        pose, moved = (torch.from_numpy(a.astype(np.float32)) for a in (pose, moved))
+        all_of_them, near = torch.zeros(count, 2), torch.zeros(count, 2)
+        threats(0, pose, moved, rules, body, bank.path, all_of_them)
+        threats(1, pose, moved, rules, body, bank.path, near)
+        assert torch.equal(near, all_of_them)
+        changed += int((near[:, 1] < FAR_M).sum())
+    assert changed > 100, "bodies come closer"
+
+
 def free_m(x, y, bodies, tank):
     """Along 24 rays, in float64, each ray against each body: what the twin looks up by directions."""
     angle = np.arange(N_RAY) * 2 * np.pi / N_RAY
@@ -263,11 +313,8 @@ def test_rays_meet_what_stands_in_their_way(config):
 def watched(far_m, steps, is_seen=1, count=4000, radius_m=None, track=None):
     """Tracks (count, 9) of bodies so far ahead that go across at 1 m/s, on a circle where it has a radius."""
     at = torch.tensor([[far_m, 0.0, 0.0, 1.0]]).repeat(count, 1)
-    path = torch.zeros(count, 1, 16)
-    path[..., 0], path[..., 1], path[..., 2] = (3.0, 1.0, 9.0) if radius_m is None else (0.0, radius_m, 9.0)
-    path[..., 4] = 1.0
     track = torch.zeros(count, 1, TRACK_WIDTH) if track is None else track
-    watch(at, is_seen, steps, torch.zeros(count, EGO_WIDTH), path, track)
+    watch(at, is_seen, steps, radius_m or 0.0, track)
     return track[:, 0]
 
 

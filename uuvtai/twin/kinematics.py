@@ -31,44 +31,52 @@ STEPS = 5
 """control steps that a decision is held"""
 NEAR_M = 1.5
 """bodies whose surface is farther cannot matter to referee or reward within a step"""
+DRIVEN_M = 0.3
+"""more than a hull moves while a decision is held"""
+EVERY_SLOT = -1
+"""as ``near_slots``, of all bodies"""
+
+
+@ti.func
+def path_places(number, lane, times, path: AnyTensor):
+    """Rows of (x, y, vx, vy) of a moving body of scenario ``number`` at some times [s], as the simulator
+    moves it."""
+    length, speed = path[number, lane, 2], path[number, lane, 4]
+    n_way = int(path[number, lane, 0])
+    out = ti.Matrix.zero(ti.f32, times.n, 4)
+    rest, on_it = ti.Vector.zero(ti.f32, times.n), ti.Vector.zero(ti.i32, times.n)
+    for k in ti.static(range(times.n)):
+        arc = path[number, lane, 3] + speed * times[k]
+        rest[k] = arc - length * ti.floor(arc / length)
+    if n_way == 0:
+        turn = path[number, lane, 1]
+        sign = 1.0 if turn > 0.0 else -1.0
+        for k in ti.static(range(times.n)):
+            ahead = steady_direction(rest[k] / turn)
+            out[k, 0] = path[number, lane, 5] + ti.abs(turn) * ahead[0]
+            out[k, 1] = path[number, lane, 6] + ti.abs(turn) * ahead[1]
+            out[k, 2], out[k, 3] = -sign * ahead[1] * speed, sign * ahead[0] * speed
+    for j in range(n_way):
+        after = (j + 1) % n_way
+        x, y = path[number, lane, 5 + 2 * j], path[number, lane, 6 + 2 * j]
+        leg_x, leg_y = path[number, lane, 5 + 2 * after] - x, path[number, lane, 6 + 2 * after] - y
+        leg_m = ti.sqrt(leg_x * leg_x + leg_y * leg_y)
+        scale = 1.0 / ti.max(leg_m, 1e-9)
+        for k in ti.static(range(times.n)):
+            if on_it[k] == 0 and (rest[k] < leg_m or j == n_way - 1):
+                gone = ti.min(rest[k], leg_m) * scale
+                out[k, 0], out[k, 1] = x + gone * leg_x, y + gone * leg_y
+                out[k, 2], out[k, 3] = speed * scale * leg_x, speed * scale * leg_y
+                on_it[k] = 1
+            rest[k] -= leg_m
+    return out
 
 
 @ti.func
 def path_place(number, lane, t_s, path: AnyTensor):
-    """(x, y, vx, vy) of a moving body of scenario ``number`` at a time, as the simulator moves it."""
-    length, speed = path[number, lane, 2], path[number, lane, 4]
-    arc = path[number, lane, 3] + speed * t_s
-    rest = arc - length * ti.floor(arc / length)
-    n_way = int(path[number, lane, 0])
-    out = ti.Vector([path[number, lane, 5], path[number, lane, 6], 0.0, 0.0])
-    if n_way == 0:
-        turn = path[number, lane, 1]
-        ahead = steady_direction(rest / turn)
-        sign = 1.0 if turn > 0.0 else -1.0
-        out += ti.Vector(
-            [
-                ti.abs(turn) * ahead[0],
-                ti.abs(turn) * ahead[1],
-                -sign * ahead[1] * speed,
-                sign * ahead[0] * speed,
-            ]
-        )
-    else:
-        on_it = 0
-        for j in range(n_way):
-            k = (j + 1) % n_way
-            x, y = path[number, lane, 5 + 2 * j], path[number, lane, 6 + 2 * j]
-            leg_x, leg_y = path[number, lane, 5 + 2 * k] - x, path[number, lane, 6 + 2 * k] - y
-            leg_m = ti.sqrt(leg_x * leg_x + leg_y * leg_y)
-            if on_it == 0 and (rest < leg_m or j == n_way - 1):
-                scale = 1.0 / ti.max(leg_m, 1e-9)
-                gone = ti.min(rest, leg_m) * scale
-                out = ti.Vector(
-                    [x + gone * leg_x, y + gone * leg_y, speed * scale * leg_x, speed * scale * leg_y]
-                )
-                on_it = 1
-            rest -= leg_m
-    return out
+    """(x, y, vx, vy) of a moving body at a time."""
+    place = path_places(number, lane, ti.Vector([t_s]), path)
+    return ti.Vector([place[0, 0], place[0, 1], place[0, 2], place[0, 3]])
 
 
 def axis_drag(cfg, axis):
@@ -94,17 +102,54 @@ def axis_step(vel, integral, command, axis: Const[int], io: Bundle[TwinRules]):
 
 
 @ti.func
+def reach_of(number, slot, body: AnyTensor, io: Bundle[TwinRules]):
+    """[m] between the centres of hull and body from which on the body is left out."""
+    hull = io.vehicle_cfg.hull_radius_m + io.vehicle_cfg.hull_half_length_m
+    return body[number, slot, 4] + body[number, slot, 5] + hull + NEAR_M
+
+
+@ti.func
+def near_slots(number, pos_w, t_s, body: AnyTensor, path: AnyTensor, io: Bundle[TwinRules]):
+    """A bit for each slot whose body can come near while a decision is held; slots beyond the bits count as
+    near."""
+    out = 0
+    n_body, n_lane = body.shape[1], path.shape[1]
+    for slot in range(ti.min(n_body, 31)):
+        if body[number, slot, 0] > 0.5:
+            x, y, farthest = body[number, slot, 1], body[number, slot, 2], DRIVEN_M + 0.0
+            lane = slot - (n_body - n_lane)
+            if lane >= 0:
+                place = path_place(number, lane, t_s, path)
+                x, y = place[0], place[1]
+                farthest += path[number, lane, 4] * STEPS * io.episode_cfg.control_dt_s
+            reach = reach_of(number, slot, body, io) + farthest
+            dx, dy = x - pos_w[0], y - pos_w[1]
+            if dx * dx + dy * dy < reach * reach:
+                out |= 1 << slot
+    return out
+
+
+@ti.func
 def nearest_of(
-    env, number, pos_w, axis_w, vel_w, rate, t_s, body: AnyTensor, path: AnyTensor, io: Bundle[TwinRules]
+    near,
+    number,
+    pos_w,
+    axis_w,
+    vel_w,
+    rate,
+    t_s,
+    body: AnyTensor,
+    path: AnyTensor,
+    io: Bundle[TwinRules],
 ):
     """(clearance [m] to the nearest obstacle or side wall, smallest time to collision [s]) as the referee
-    sees it; bodies beyond ``NEAR_M`` are left out."""
+    sees it; bodies beyond ``NEAR_M``, and those whose bit is not in ``near``, are left out."""
     clearance = hull_to_side_wall(pos_w, axis_w, io.vehicle_cfg, io.tank_cfg)
     ttc = FAR_M + 0.0
     n_body, n_lane = body.shape[1], path.shape[1]
     for slot in range(n_body):
         kind = ti.cast(body[number, slot, 0], ti.i32)
-        if kind != NONE:
+        if kind != NONE and ((near >> ti.min(slot, 31)) & 1 == 1 or slot > 30):
             at = ti.Vector([body[number, slot, 1], body[number, slot, 2], body[number, slot, 3]])
             body_vel = ti.Vector([0.0, 0.0, 0.0])
             lane = slot - (n_body - n_lane)
@@ -113,8 +158,7 @@ def nearest_of(
                 at[0], at[1] = place[0], place[1]
                 body_vel[0], body_vel[1] = place[2], place[3]
             size = ti.Vector([body[number, slot, 4], body[number, slot, 5], body[number, slot, 6]])
-            hull = io.vehicle_cfg.hull_radius_m + io.vehicle_cfg.hull_half_length_m
-            reach = size[0] + size[1] + hull + NEAR_M
+            reach = reach_of(number, slot, body, io)
             dx, dy = at[0] - pos_w[0], at[1] - pos_w[1]
             if dx * dx + dy * dy < reach * reach:
                 gap, normal, along = hull_to_body(
@@ -209,6 +253,7 @@ def drive_twin(
         )
         before = ti.math.length(goal_w - pos_w)
         nearest, ended = 9.0, RUNNING
+        near = near_slots(number, pos_w, t_s, body, path, io)
         for _ in range(STEPS):
             if ended == RUNNING:
                 asked = asked_speeds(wish, yaw, pos_w[2], io)
@@ -221,7 +266,7 @@ def drive_twin(
                 pos_w += dt_s * vel_w
                 t_s += dt_s
                 axis_w = ti.Vector([c, s, 0.0])
-                threat = nearest_of(env, number, pos_w, axis_w, vel_w, vel[3], t_s, body, path, io)
+                threat = nearest_of(near, number, pos_w, axis_w, vel_w, vel[3], t_s, body, path, io)
                 nearest = ti.min(nearest, threat[0])
                 ended = verdict_of(pos_w, axis_w, goal_w, threat[0], threat[1], t_s, io)
         for i in ti.static(range(3)):
@@ -279,6 +324,6 @@ def judge_states(
         vel_w = ti.Vector([pose[env, 4], pose[env, 5], pose[env, 6]])
         goal_w = ti.Vector([pose[env, 9], pose[env, 10], pose[env, 11]])
         t_s = pose[env, 8]
-        threat = nearest_of(env, env, pos_w, axis_w, vel_w, pose[env, 7], t_s, body, path, io)
+        threat = nearest_of(EVERY_SLOT, env, pos_w, axis_w, vel_w, pose[env, 7], t_s, body, path, io)
         seen[env, 0], seen[env, 1] = threat[0], threat[1]
         outcome[env] = verdict_of(pos_w, axis_w, goal_w, threat[0], threat[1], t_s, io)

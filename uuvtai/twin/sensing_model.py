@@ -1,14 +1,25 @@
 """What the tracker delivers of the twin's bodies: a model of its delays, noise, field of view and memory, in
 place of sonar and camera. Rays of free distance are those of the true walls and resting bodies."""
 
+import math
+
 import taichi as ti
 
 from uuvtai.kernels.core.geometry import BOX, NONE, TWO_PI, wrapped_angle
-from uuvtai.kernels.core.noise import episode_key, normal, uniform
+from uuvtai.kernels.core.noise import episode_key, normal_pair_lanes, uniform
 from uuvtai.kernels.core.signature import AnyTensor, Bundle, FloatMatrix, IntVector
-from uuvtai.twin.kinematics import path_place
+from uuvtai.twin.kinematics import path_places
 from uuvtai.twin.set_codes import N_RAY
-from uuvtai.twin.twin_arrays import AT_FLIP, AT_POS, AT_TIME, AT_YAW, TwinRules
+from uuvtai.twin.twin_arrays import (
+    AT_FLIP,
+    AT_POS,
+    AT_TIME,
+    AT_YAW,
+    RAW_WIDTH,
+    TRACK_WIDTH,
+    TRUTH_WIDTH,
+    TwinRules,
+)
 
 DT_S = 0.1
 RANGE_M = 12.0
@@ -38,6 +49,8 @@ is behind by so much of what is not seen yet"""
 HIDDEN_SIGMA_M, HIDDEN_SIGMA = 0.02, 0.04
 """errors of position, and of velocity as a share of it, times how badly, when a body goes out of sight, which
 it does part by part"""
+FIRST_NORMAL = 1024
+"""number of the first draw of an error; those before it say how badly each body is seen"""
 UNBOUNDED_M = 99.0
 """nothing in the way of a ray"""
 RAY_SLACK = 0.01
@@ -54,7 +67,7 @@ def is_hidden(number, slot_count, x, y, to_x, to_y, body: AnyTensor):
     ux, uy = dx / far, dy / far
     out = 0
     for slot in range(slot_count):
-        if body[number, slot, 0] > 0.5:
+        if out == 0 and body[number, slot, 0] > 0.5:
             rx, ry = body[number, slot, 1] - x, body[number, slot, 2] - y
             along, across = rx * ux + ry * uy, ti.abs(rx * uy - ry * ux)
             wide = 0.9 * ti.max(body[number, slot, 4], body[number, slot, 5])
@@ -63,11 +76,10 @@ def is_hidden(number, slot_count, x, y, to_x, to_y, body: AnyTensor):
     return out
 
 
-@ti.func
-def ray_of(i):
-    """Unit vector (x, y) of a ray, by its number."""
-    angle = i * (TWO_PI / N_RAY)
-    return ti.Vector([ti.cos(angle), ti.sin(angle)])
+def rays():
+    """Unit vectors (x, y) of the rays; plain Python, constants of the kernel."""
+    angles = [i * TWO_PI / N_RAY for i in range(N_RAY)]
+    return [[math.cos(angle), math.sin(angle)] for angle in angles]
 
 
 @ti.func
@@ -124,8 +136,9 @@ def rays_towards(dx, dy, reach):
 @ti.func
 def write_rays(env, number, slot_count, x, y, body: AnyTensor, ray: FloatMatrix, io: Bundle[TwinRules]):
     """[m] from a place along each ray to the nearest wall or resting body, without the hull."""
-    for i in range(N_RAY):
-        ray[env, i] = free_to_wall(x, y, ray_of(i), io)
+    towards = ti.Matrix(ti.static(rays()))
+    for i in ti.static(range(N_RAY)):
+        ray[env, i] = free_to_wall(x, y, ti.Vector([towards[i, 0], towards[i, 1]]), io)
     for slot in range(slot_count):
         kind = ti.cast(body[number, slot, 0], ti.i32)
         if kind != NONE:
@@ -137,11 +150,12 @@ def write_rays(env, number, slot_count, x, y, body: AnyTensor, ray: FloatMatrix,
             first, count = rays_towards(dx, dy, ti.sqrt(wide * wide + deep * deep))
             for k in range(count):
                 i = (first + k + N_RAY) % N_RAY
+                to = ti.Vector([towards[i, 0], towards[i, 1]])
                 free_m = 0.0
                 if kind == BOX:
-                    free_m = free_to_box(dx, dy, ray_of(i), c, s, wide, deep)
+                    free_m = free_to_box(dx, dy, to, c, s, wide, deep)
                 else:
-                    free_m = free_to_circle(dx, dy, ray_of(i), wide)
+                    free_m = free_to_circle(dx, dy, to, wide)
                 ray[env, i] = ti.min(ray[env, i], free_m)
 
 
@@ -152,115 +166,101 @@ def how_badly(drawn):
 
 
 @ti.func
-def update_track(
-    env,
-    lane,
-    number,
-    at,
-    is_visible,
-    knows_height,
-    in_fan,
-    key,
-    ego: FloatMatrix,
-    path: AnyTensor,
-    track: AnyTensor,
-):
-    """The track of a body that is at ``at`` (x, y, vx, vy): born late, its velocity across the line of sight
-    known later, in error by what this spell (``key``) has for it; while it is not seen straight on, or on its
-    circle."""
+def updated_track(old, lane, at, bend_m, speed, ego_at, is_visible, knows_height, in_fan, key):
+    """The row of ``track`` after a decision, of a body that is at ``at`` (x, y, vx, vy): born late, its
+    velocity across the line of sight known later, in error by what this spell (``key``) has for it; while it
+    is not seen straight on, or on its circle (``bend_m``: signed radius, else 0)."""
+    new = old
     drawn = uniform(key, lane)
+    first, second = normal_pair_lanes(key, FIRST_NORMAL + 2 * lane, 2)
     badly = how_badly(drawn)
-    track[env, lane, 8] = drawn
-    if path[number, lane, 0] < 0.5 and track[env, lane, 4] > SETTLED_S:
-        turn = DT_S * path[number, lane, 4] / path[number, lane, 1]
+    new[8] = drawn
+    if bend_m != 0.0 and old[4] > SETTLED_S:
+        turn = DT_S * speed / bend_m
         c, s = ti.cos(turn), ti.sin(turn)
-        vx, vy = track[env, lane, 2], track[env, lane, 3]
-        track[env, lane, 2], track[env, lane, 3] = c * vx - s * vy, s * vx + c * vy
+        new[2], new[3] = c * old[2] - s * old[3], s * old[2] + c * old[3]
     if knows_height:
-        track[env, lane, 6] = 1.0
+        new[6] = 1.0
     if is_visible:
-        if track[env, lane, 5] > LOST_S:
-            track[env, lane, 4] = 0.0
-            track[env, lane, 2], track[env, lane, 3] = 0.0, 0.0
-        track[env, lane, 4] += DT_S
-        track[env, lane, 5] = 0.0
-        track[env, lane, 7] += ti.abs(path[number, lane, 4]) * DT_S
-        share = 1.0 if track[env, lane, 4] < 0.25 else QUICKEST - SLOWER * ti.max(drawn - 0.5, 0.0)
-        dx, dy = at[0] - ego[env, AT_POS], at[1] - ego[env, AT_POS + 1]
+        if new[5] > LOST_S:
+            new[4], new[2], new[3] = 0.0, 0.0, 0.0
+        new[4] += DT_S
+        new[5] = 0.0
+        new[7] += ti.abs(speed) * DT_S
+        share = 1.0 if new[4] < 0.25 else QUICKEST - SLOWER * ti.max(drawn - 0.5, 0.0)
+        dx, dy = at[0] - ego_at[0], at[1] - ego_at[1]
         square = ti.max(dx * dx + dy * dy, 1e-6)
         far, vx, vy = ti.sqrt(square), at[2], at[3]
-        if track[env, lane, 4] < SETTLED_S * badly:
+        if new[4] < SETTLED_S * badly:
             radial = (vx * dx + vy * dy) / square
             vx, vy = 0.5 * (vx + radial * dx), 0.5 * (vy + radial * dy)
         if not in_fan:
             badly *= CAMERA_ALONE
         away, faster = badly * far * POSITION_SIGMA, badly * (VELOCITY_SIGMA_M_S + far * VELOCITY_SIGMA_S)
-        track[env, lane, 2] += share * (vx + faster * normal(key, 4 * lane) - track[env, lane, 2])
-        track[env, lane, 3] += share * (vy + faster * normal(key, 4 * lane + 1) - track[env, lane, 3])
-        behind_x, behind_y = LAG_S * (track[env, lane, 2] - at[2]), LAG_S * (track[env, lane, 3] - at[3])
-        track[env, lane, 0] = at[0] + behind_x + away * normal(key, 4 * lane + 2)
-        track[env, lane, 1] = at[1] + behind_y + away * normal(key, 4 * lane + 3)
+        new[2] += share * (vx + faster * first[0] - new[2])
+        new[3] += share * (vy + faster * first[1] - new[3])
+        new[0] = at[0] + LAG_S * (new[2] - at[2]) + away * second[0]
+        new[1] = at[1] + LAG_S * (new[3] - at[3]) + away * second[1]
     else:
-        if track[env, lane, 5] < 0.5 * DT_S:
-            away, faster = badly * HIDDEN_SIGMA_M, badly * HIDDEN_SIGMA * ti.abs(path[number, lane, 4])
-            track[env, lane, 2] += faster * normal(key, 4 * lane)
-            track[env, lane, 3] += faster * normal(key, 4 * lane + 1)
-            track[env, lane, 0] += away * normal(key, 4 * lane + 2)
-            track[env, lane, 1] += away * normal(key, 4 * lane + 3)
-        track[env, lane, 5] += DT_S
-        track[env, lane, 0] += DT_S * track[env, lane, 2]
-        track[env, lane, 1] += DT_S * track[env, lane, 3]
+        if new[5] < 0.5 * DT_S:
+            away, faster = badly * HIDDEN_SIGMA_M, badly * HIDDEN_SIGMA * ti.abs(speed)
+            new[2] += faster * first[0]
+            new[3] += faster * first[1]
+            new[0] += away * second[0]
+            new[1] += away * second[1]
+        new[5] += DT_S
+        new[0] += DT_S * new[2]
+        new[1] += DT_S * new[3]
+    return new
 
 
 @ti.func
-def is_tracked(env, lane, track: AnyTensor):
-    """1 while the tracker has this body."""
-    unseen_s, drawn = track[env, lane, 5], track[env, lane, 8]
-    limit_s = LOST_HEIGHT_S if track[env, lane, 6] > 0.5 else LOST_S
-    is_born = track[env, lane, 4] >= BORN_S * how_badly(drawn) - 1e-4
+def is_tracked(track):
+    """1 while the tracker has the body of this row of ``track``."""
+    unseen_s, drawn = track[5], track[8]
+    limit_s = LOST_HEIGHT_S if track[6] > 0.5 else LOST_S
+    is_born = track[4] >= BORN_S * how_badly(drawn) - 1e-4
     return unseen_s < limit_s and is_born and drawn < (MISSED_HIDDEN if unseen_s > 0.0 else MISSED)
 
 
 @ti.func
-def write_raw(
-    env, lane, number, at, over, under, t_s, radius, path: AnyTensor, track: AnyTensor, raw: AnyTensor
-):
-    """What the tracker delivers of a body that is tracked. A closed way that was watched once around is
-    foreseen as it is, a circle after a while, other ways straight on."""
-    circle = path[number, lane, 0] < 0.5
-    turn = 0.0
-    if circle and track[env, lane, 4] > TURN_KNOWN_S:
-        turn = path[number, lane, 4] / path[number, lane, 1]
+def write_raw(env, lane, track, places, is_known, turn_rate, over, under, radius, raw: AnyTensor):
+    """What the tracker delivers of a body that is tracked. A closed way that was watched once around
+    (``is_known``) is foreseen as it is (``places``: ``now_and_later``), a circle after a while, other ways
+    straight on."""
+    turn = turn_rate if track[4] > TURN_KNOWN_S else 0.0
     for i in ti.static(range(4)):
-        raw[env, lane, i] = track[env, lane, i]
-    raw[env, lane, 4], raw[env, lane, 5], raw[env, lane, 8] = turn, radius, track[env, lane, 5]
-    if track[env, lane, 6] > 0.5:
+        raw[env, lane, i] = track[i]
+    raw[env, lane, 4], raw[env, lane, 5], raw[env, lane, 8] = turn, radius, track[5]
+    if track[6] > 0.5:
         raw[env, lane, 6] = over if over > 0.0 else (COLUMN_M if under > 0.0 else 0.0)
         raw[env, lane, 7] = under if under > 0.0 else (COLUMN_M if over > 0.0 else 0.0)
-    is_known = not circle and track[env, lane, 7] > path[number, lane, 2]
     for k in ti.static(range(2)):
-        half = 0.5 * turn * (k + 1.0)
-        arc = 1.0 if ti.abs(half) < 1e-4 else ti.sin(half) / half
-        c, s = arc * (k + 1.0) * ti.cos(half), arc * (k + 1.0) * ti.sin(half)
-        raw[env, lane, 9 + 2 * k] = c * track[env, lane, 2] - s * track[env, lane, 3]
-        raw[env, lane, 10 + 2 * k] = s * track[env, lane, 2] + c * track[env, lane, 3]
-        if is_known:
-            later = path_place(number, lane, t_s + (k + 1.0), path)
-            raw[env, lane, 9 + 2 * k], raw[env, lane, 10 + 2 * k] = later[0] - at[0], later[1] - at[1]
+        x, y = places[k + 1, 0] - places[0, 0], places[k + 1, 1] - places[0, 1]
+        if not is_known:
+            half = 0.5 * turn * (k + 1.0)
+            arc = 1.0 if ti.abs(half) < 1e-4 else ti.sin(half) / half
+            c, s = arc * (k + 1.0) * ti.cos(half), arc * (k + 1.0) * ti.sin(half)
+            x, y = c * track[2] - s * track[3], s * track[2] + c * track[3]
+        raw[env, lane, 9 + 2 * k], raw[env, lane, 10 + 2 * k] = x, y
     raw[env, lane, 13] = 1.0
 
 
 @ti.func
-def write_truth(env, lane, number, at, over, t_s, ego: FloatMatrix, path: AnyTensor, truth: AnyTensor):
-    """Where a body is and will be, for the critic."""
-    fx, fy = 0.25 * ego[env, AT_FLIP], 0.25 * ego[env, AT_FLIP + 1]
-    x, y = ego[env, AT_POS], ego[env, AT_POS + 1]
-    truth[env, lane, 0], truth[env, lane, 1] = fx * (at[0] - x), fy * (at[1] - y)
+def now_and_later(number, lane, t_s, path: AnyTensor):
+    """Rows of (x, y, vx, vy) of a moving body, now and in 1, 2 and 3 s."""
+    return path_places(number, lane, ti.Vector([t_s, t_s + 1.0, t_s + 2.0, t_s + 3.0]), path)
+
+
+@ti.func
+def write_truth(env, lane, places, over, flip, x, y, truth: AnyTensor):
+    """Where a body is and will be (``places``: ``now_and_later``), for the critic."""
+    fx, fy = 0.25 * flip[0], 0.25 * flip[1]
+    truth[env, lane, 0], truth[env, lane, 1] = fx * (places[0, 0] - x), fy * (places[0, 1] - y)
     truth[env, lane, 2], truth[env, lane, 3] = 1.0, ti.math.clamp(over, -COLUMN_M, COLUMN_M)
-    for k in ti.static(range(3)):
-        later = path_place(number, lane, t_s + (k + 1.0), path)
-        truth[env, lane, 4 + 2 * k] = fx * (later[0] - x)
-        truth[env, lane, 5 + 2 * k] = fy * (later[1] - y)
+    for k in ti.static(range(1, 4)):
+        truth[env, lane, 2 + 2 * k] = fx * (places[k, 0] - x)
+        truth[env, lane, 3 + 2 * k] = fy * (places[k, 1] - y)
 
 
 @ti.kernel
@@ -287,27 +287,39 @@ def sense_twin(
         number, t_s = scenario[env], ego[env, AT_TIME]
         n_rest = body.shape[1] - path.shape[1]
         x, y, z = ego[env, AT_POS], ego[env, AT_POS + 1], ego[env, AT_POS + 2]
+        flip = ti.Vector([ego[env, AT_FLIP], ego[env, AT_FLIP + 1]])
+        yaw = ego[env, AT_YAW]
         for lane in range(path.shape[1]):
             slot = n_rest + lane
-            for i in range(raw.shape[2]):
+            for i in ti.static(range(RAW_WIDTH)):
                 raw[env, lane, i] = 0.0
-            for i in range(truth.shape[2]):
+            for i in ti.static(range(TRUTH_WIDTH)):
                 truth[env, lane, i] = 0.0
             if body[number, slot, 0] > 0.5:
                 key = episode_key(seed + (count + 3 * lane) // SPELL, env)  # spells do not begin all at once
-                at = path_place(number, lane, t_s, path)
+                places = now_and_later(number, lane, t_s, path)
+                at = ti.Vector([places[0, i] for i in ti.static(range(4))])
+                is_circle, speed = path[number, lane, 0] < 0.5, path[number, lane, 4]
+                bend_m = path[number, lane, 1] if is_circle else 0.0
+                turn_rate = speed / bend_m if is_circle else 0.0
                 radius, high, level = body[number, slot, 4], body[number, slot, 6], body[number, slot, 3]
                 dx, dy = at[0] - x, at[1] - y
                 far = ti.max(ti.sqrt(dx * dx + dy * dy), 1e-3)
-                clear = is_hidden(number, n_rest, x, y, at[0], at[1], body) == 0
                 fan = ti.abs(z - level) - high < ti.max(far - radius, 0.0) * FAN_SLOPE
-                bearing = wrapped_angle(ti.atan2(dy, dx) - ego[env, AT_YAW])
-                camera = clear and ti.abs(bearing) < TWO_PI / 8 and far < CAMERA_RANGE_M
-                visible = clear and far < RANGE_M and (fan or camera)
-                knows = camera and far < HEIGHT_RANGE_M
-                update_track(env, lane, number, at, visible, knows, fan, key, ego, path, track)
+                bearing = wrapped_angle(ti.atan2(dy, dx) - yaw)
+                visible, knows = False, False
+                camera = ti.abs(bearing) < TWO_PI / 8 and far < CAMERA_RANGE_M
+                if far < RANGE_M and (fan or camera):
+                    visible = is_hidden(number, n_rest, x, y, at[0], at[1], body) == 0
+                    knows = visible and camera and far < HEIGHT_RANGE_M
+                old = ti.Vector([track[env, lane, i] for i in ti.static(range(TRACK_WIDTH))])
+                here = ti.Vector([x, y])
+                new = updated_track(old, lane, at, bend_m, speed, here, visible, knows, fan, key)
+                for i in ti.static(range(TRACK_WIDTH)):
+                    track[env, lane, i] = new[i]
                 over, under = level - high - z, z - level - high
-                if is_tracked(env, lane, track):
-                    write_raw(env, lane, number, at, over, under, t_s, radius, path, track, raw)
-                write_truth(env, lane, number, at, over, t_s, ego, path, truth)
+                if is_tracked(new):
+                    is_known = not is_circle and new[7] > path[number, lane, 2]
+                    write_raw(env, lane, new, places, is_known, turn_rate, over, under, radius, raw)
+                write_truth(env, lane, places, over, flip, x, y, truth)
         write_rays(env, number, n_rest, x, y, body, ray, io)

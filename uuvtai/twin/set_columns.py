@@ -41,9 +41,8 @@ def length_of(way):
 
 
 @ti.func
-def body_columns(env, lane, ego: FloatMatrix, raw: AnyTensor):
-    """What the policy is told of a track."""
-    flip, speed, way = mirrored(env, ego)
+def body_columns(env, lane, flip, speed, way, ego: FloatMatrix, raw: AnyTensor):
+    """What the policy is told of a track; ``flip``, ``speed`` and ``way`` as ``mirrored`` gives them."""
     fx, fy, to_goal = flip[0], flip[1], length_of(way)
     dx = fx * (raw[env, lane, 0] - ego[env, AT_POS])
     dy = fy * (raw[env, lane, 1] - ego[env, AT_POS + 1])
@@ -81,9 +80,8 @@ def body_columns(env, lane, ego: FloatMatrix, raw: AnyTensor):
 
 
 @ti.func
-def own_columns(env, ego: FloatMatrix):
-    """What the policy is told of the vehicle and its goal."""
-    flip, speed, way = mirrored(env, ego)
+def own_columns(env, flip, speed, way, ego: FloatMatrix):
+    """What the policy is told of the vehicle and its goal; as ``body_columns``."""
     to_goal, yaw, z = length_of(way), ego[env, AT_YAW], ego[env, AT_POS + 2]
     return ti.Vector(
         [
@@ -126,14 +124,15 @@ def write_set_columns(
     """``bodies`` (n, lanes, BODY_WIDTH) and ``own`` (n, EGO_COLUMNS) from rows of the vehicle
     (``twin_arrays``), tracks (n, lanes, RAW_WIDTH) and free distances (n, N_RAY) [m]."""
     for env in range(ego.shape[0]):
+        flip, speed, way = mirrored(env, ego)
         for lane in range(raw.shape[1]):
             for i in range(BODY_WIDTH):
                 bodies[env, lane, i] = 0.0
             if raw[env, lane, 13] > 0.5:
-                columns = body_columns(env, lane, ego, raw)
+                columns = body_columns(env, lane, flip, speed, way, ego, raw)
                 for i in ti.static(range(BODY_WIDTH)):
                     bodies[env, lane, i] = columns[i]
-        values = own_columns(env, ego)
+        values = own_columns(env, flip, speed, way, ego)
         for i in ti.static(range(OWN_WIDTH)):
             own[env, i] = values[i]
         for i in range(N_RAY):

@@ -5,8 +5,8 @@ import taichi as ti
 
 from uuvtai.kernels.core.geometry import NONE
 from uuvtai.kernels.core.signature import AnyTensor, Bundle, FloatMatrix, FloatVector, IntVector
-from uuvtai.twin.kinematics import earned, path_place
-from uuvtai.twin.sensing_model import write_truth
+from uuvtai.twin.kinematics import earned
+from uuvtai.twin.sensing_model import now_and_later, write_truth
 from uuvtai.twin.twin_arrays import AT_FLIP, AT_POS, TRUTH_WIDTH, TrueBodiesIO, TwinRules
 
 SAME_M = 1.5
@@ -28,13 +28,15 @@ def know_places(env, io: Bundle[TrueBodiesIO], path: AnyTensor, ego: FloatMatrix
         for i in ti.static(range(TRUTH_WIDTH)):
             known[env, lane, i] = 0.0
         if io.world.kind[env, first + lane] != NONE:
-            at = path_place(env, lane, t_s, path)
+            places = now_and_later(env, lane, t_s, path)
             over = (
                 io.world.pos_w[env, first + lane][2]
                 - io.world.size[env, first + lane][2]
                 - io.vehicle.pos_w[env][2]
             )
-            write_truth(env, lane, env, at, over, t_s, ego, path, known)
+            flip = ti.Vector([ego[env, AT_FLIP], ego[env, AT_FLIP + 1]])
+            x, y = ego[env, AT_POS], ego[env, AT_POS + 1]
+            write_truth(env, lane, places, over, flip, x, y, known)
 
 
 @ti.func

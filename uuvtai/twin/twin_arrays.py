@@ -39,6 +39,8 @@ AT_POS, AT_VEL, AT_YAW, AT_RATE, AT_TIME, AT_GOAL, AT_FLIP, AT_LAST, AT_INTEGRAL
 """columns of an env's row: position in the world, velocity in the body frame, heading, yaw rate, time, goal,
 signs of the way to the goal, last action, integrals of the velocity loops"""
 EGO_WIDTH = 21
+TRACK_WIDTH = 9
+"""of what the twin's tracker remembers of a body (``sensing_model.sense_twin``)"""
 RAW_WIDTH = 14
 """of a body as a tracker delivers it: x, y, vx, vy, turn rate, radius, free water above, below, time unseen,
 displacement in 1 s (2), in 2 s (2), 1 = there"""

@@ -14,9 +14,7 @@ from uuvtai.runtime import start_taichi
 from uuvtai.twin import kinematics, sensing_model, set_columns
 from uuvtai.twin.scenario_bank import ScenarioBank
 from uuvtai.twin.set_codes import BODY_WIDTH, EGO_COLUMNS, N_RAY
-from uuvtai.twin.twin_arrays import EGO_WIDTH, RAW_WIDTH, TRUTH_WIDTH, TwinRules
-
-TRACK_WIDTH = 9
+from uuvtai.twin.twin_arrays import EGO_WIDTH, RAW_WIDTH, TRACK_WIDTH, TRUTH_WIDTH, TwinRules
 
 
 class TwinView(NamedTuple):
