@@ -16,16 +16,18 @@ from uuvtai.kernels.core.signature import Const, FloatMatrix
 from uuvtai.learn import checkpoint, warm_start
 from uuvtai.learn.anchor import Anchor, gaussian_kl
 from uuvtai.learn.set_pilot import load_set_pilot
-from uuvtai.learn.set_policy import SetActor
+from uuvtai.learn.set_policy import SetActor, SetCritic
 from uuvtai.learn.starting_policy import starting_policy
-from uuvtai.learn.twin_trainer import TwinTrainer, least_std
+from uuvtai.learn.twin_trainer import TwinTrainer, joined, least_std
 from uuvtai.learn.warm_start import Student, imitate, wish_of_command
 from uuvtai.loader import load_training
 from uuvtai.outcomes import COLLISION, RUNNING, SUCCESS
 from uuvtai.twin import failure_states, hull_rule
 from uuvtai.twin.failure_states import ARRAYS, FailureStarts
 from uuvtai.twin.observer import SET_TABLE
+from uuvtai.twin.scenario_bank import ScenarioBank
 from uuvtai.twin.set_codes import BODY_WIDTH, EGO_COLUMNS
+from uuvtai.twin.twin_arrays import TRUTH_WIDTH
 from uuvtai.twin.twin_world import Twin
 
 SWITCHES = {
@@ -34,6 +36,8 @@ SWITCHES = {
     "twin.last_std": 0.1,
     "twin.explore_until": 0.25,
     "twin.failure_starts": 0.5,
+    "twin.curriculum_until": 0.5,
+    "twin.critic_sees_truth": False,
     "ppo.rollout_steps": 32,
 }
 
@@ -127,6 +131,8 @@ def test_switched_off_nothing_is_kept(bank):
         ({"twin.last_std": 0.3}, "twin.last_std=0.3"),
         ({"twin.failure_starts": 1.0}, "failure_starts"),
         ({"twin.failure_starts": 0.2, "twin.simulator": True}, "twin.failure_starts"),
+        ({"twin.curriculum_until": 0.2, "twin.simulator": True}, "twin.curriculum_until"),
+        ({"twin.curriculum_until": 1.1}, "curriculum_until"),
         ({"twin.explore_until": 1.0}, "explore_until"),
         ({"twin.anchor_until": 0.0}, "anchor_until"),
     ],
@@ -140,7 +146,8 @@ def test_what_clearly_pays_is_the_presets():
     twin, quick = load_training("twin").twin, load_training("quick").twin
     assert twin.warm_start_waves > 0 and twin.anchor > 0
     assert (quick.warm_start_waves, quick.anchor) == (0, 0), "it learns from nothing"
-    assert (twin.failure_starts, twin.last_std) == (0, 0)
+    assert (twin.failure_starts, twin.last_std, twin.curriculum_until) == (0, 0, 0)
+    assert twin.critic_sees_truth
 
 
 # ---------------------------------------------------------------------------------------------- a trained one
@@ -255,6 +262,45 @@ def test_the_floor_falls_at_the_end():
     shares = (0.0, 0.8, 0.9, 1.0)
     assert [least_std(config, share) for share in shares] == pytest.approx([0.25, 0.25, 0.15, 0.05])
     assert least_std(load_training("twin", overrides=SMALL), 1.0) == 0.25
+
+
+# ------------------------------------------------------------------------------------- curriculum and critic
+
+
+def test_slow_scenarios_come_first_and_worlds_take_turns():
+    path, origin = torch.zeros(8, 2, 16), torch.arange(4).repeat_interleave(2).int()
+    path[:, 0, 4] = torch.tensor([1.5, 1.5, 0.6, 0.6, 1.5, 1.5, 0.6, 0.6])
+    bank = ScenarioBank(torch.zeros(8, 2, 8), path, torch.zeros(8, 8), origin, ("a", "b", "c", "d"))
+    assert bank.slow_first().tolist() == [2, 6, 3, 7, 0, 4, 1, 5]
+    config = load_training("twin", overrides=SMALL | {"twin.curriculum_until": 0.4})
+    parts = [joined(config, share, 2) for share in (0.0, 0.2, 0.4, 1.0)]
+    assert parts == pytest.approx([0.5, 0.75, 1.0, 1.0])
+
+
+def test_a_curriculum_deals_out_what_has_joined(bank):
+    scenes = {"train.scenes": [[8, 6, 0.6], [8, 6, 0.9]], "train.iterations": 4}
+    trainer = TwinTrainer(
+        load_training("twin", overrides=SMALL | scenes | {"twin.curriculum_until": 1.0}), bank
+    )
+    slow = set(bank.slow_first()[: len(bank.body) // 2].tolist())
+    dealt = [set(), set()]
+    for number, iteration in enumerate((0, 4)):
+        trainer.iteration = iteration
+        for _ in range(40):
+            dealt[number] |= set(trainer._next_scenarios().tolist())
+    assert dealt[0] == slow and len(dealt[1]) == len(bank.body)
+
+
+@pytest.mark.parametrize("sees", [True, False])
+def test_the_critic_may_be_blind(sees):
+    config = load_training("twin", overrides=SMALL | {"twin.critic_sees_truth": sees})
+    critic = SetCritic(BODY_WIDTH, EGO_COLUMNS, TRUTH_WIDTH, config, torch.Generator().manual_seed(1))
+    bodies, own, truth = (
+        torch.rand(5, 3, BODY_WIDTH),
+        torch.rand(5, EGO_COLUMNS),
+        torch.rand(5, 3, TRUTH_WIDTH),
+    )
+    assert torch.equal(critic(bodies, own, truth), critic(bodies, own, 2 * truth)) != sees
 
 
 # ------------------------------------------------------------------------------------- starts before failures

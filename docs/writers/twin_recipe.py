@@ -65,6 +65,8 @@ ARMS = (
     ),
     Arm("base", "every switch off", f"{BUDGET} {FREE}"),
     Arm("failure", "`failure_starts=0.25`", f"{BUDGET} {FREE} --set twin.failure_starts=0.25"),
+    Arm("curriculum", "`curriculum_until=0.5`", f"{BUDGET} {FREE} --set twin.curriculum_until=0.5"),
+    Arm("blind", "`critic_sees_truth=false`", f"{BUDGET} {FREE} --set twin.critic_sees_truth=false"),
     Arm("warm", "`start`", f"{BUDGET} {FREE} {_START}"),
     Arm(
         "anchored",

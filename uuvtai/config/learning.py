@@ -229,6 +229,11 @@ class TwinConfig(Section):
     """share of the run from which it falls, linearly"""
     failure_starts: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """share of the episodes that begin 1 to 4 s before an earlier failure"""
+    curriculum_until: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """share of the run over which scenarios join the slowest scenes', slower ones first; 0 = all from the
+    begin"""
+    critic_sees_truth: bool = True
+    """the critic, which serves training alone, knows where the bodies are and will be"""
 
     @model_validator(mode="after")
     def _start_to_hold_to(self):

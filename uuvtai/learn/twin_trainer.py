@@ -87,6 +87,9 @@ class TwinTrainer:
         self._returns = torch.zeros(config.train.num_envs)
         self._held_out: ScenarioBank | None = None
         self._anchor: Anchor | None = None
+        self._slow_first = None
+        if config.twin.curriculum_until > 0 and isinstance(self.twin, Twin):
+            self._slow_first = self.twin.bank.slow_first()
         share = config.twin.failure_starts
         self._failures = (
             FailureStarts(self.twin, share) if share > 0 and isinstance(self.twin, Twin) else None
@@ -158,8 +161,13 @@ class TwinTrainer:
     # ---------------------------------------------------------------------------------------------- a rollout
 
     def _next_scenarios(self) -> torch.Tensor:
-        """(N,) numbers of scenarios, any of them."""
-        return torch.randint(self.twin.num_scenarios, (self.twin.num_envs,), generator=self.generator)
+        """(N,) numbers of scenarios: any, or of those that have joined (``twin.curriculum_until``)."""
+        size = (self.twin.num_envs,)
+        if self._slow_first is None:
+            return torch.randint(self.twin.num_scenarios, size, generator=self.generator)
+        part = joined(self.config, self.iteration / self.config.train.iterations, len(self._scenes))
+        count = max(1, round(part * len(self._slow_first)))
+        return self._slow_first[torch.randint(count, size, generator=self.generator)]
 
     @torch.no_grad()
     def _collect(self) -> RolloutSums:
@@ -358,6 +366,12 @@ def least_std(config: LearningConfig, share: float) -> float:
     return config.policy.min_std + (last - config.policy.min_std) * (share - until) / (1.0 - until)
 
 
+def joined(config: LearningConfig, share: float, scenes: int) -> float:
+    """Part of the scenarios, slow ones first, that a run deals out at this share of its iterations."""
+    slowest = 1.0 / scenes
+    return slowest + (1.0 - slowest) * min(1.0, share / config.twin.curriculum_until)
+
+
 def _world_to_learn_in(
     config: LearningConfig,
     scenes: tuple[Scene, ...],
@@ -385,6 +399,8 @@ def _refuse_what_the_twin_lacks(config: LearningConfig) -> None:
             raise SettingError(f"{name}: the twin has none; set {name}=false, or twin.enabled=false")
     if config.twin.simulator and config.twin.failure_starts > 0:
         raise SettingError("twin.failure_starts: the simulator begins no episode in its middle; set it to 0")
+    if config.twin.simulator and config.twin.curriculum_until > 0:
+        raise SettingError("twin.curriculum_until: only the twin deals scenarios out by speed; set it to 0")
     held, dt_s = config.policy.hold_steps, config.episode.control_dt_s
     if held != HOLD_STEPS or abs(held * dt_s - DECISION_S) > 1e-9:
         raise SettingError(
