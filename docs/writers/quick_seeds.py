@@ -4,7 +4,8 @@ then play what was learnt in the simulator: ``python -m docs.writers.quick_seeds
 Each run is one ``uuv train quick`` in a process of its own, in a folder ``RUNS/ARM.SEED``; a second start
 trains what is missing. Each best checkpoint by the twin then plays the same episodes in the simulator, and
 the tree beside it. ``docs/data/quick_seeds_77801.json`` holds the evaluations in the twin along the
-trainings, and the outcome and the time of every episode. ``docs/learning.md`` shows the tables.
+trainings, and the outcome and the time of every episode. ``docs/learning.md`` shows the tables, and the
+evaluations along the trainings as ``docs/quick_seeds.png``.
 """
 
 from __future__ import annotations
@@ -27,13 +28,14 @@ from uuvtai.run_folder import hardware, write_atomic
 from uuvtai.tables.table import text_table
 
 FILE = "docs/data/quick_seeds_77801.json"
+PICTURE = "docs/quick_seeds.png"
 SEED, EPISODES = "77801", 512
 """a tuning seed"""
 TITLE, SCENE, OPTIONS = CELLS[2]
 ARMS = {"base": ("as it is", ""), "std": ("`last_std=0.1`", "--set twin.last_std=0.1")}
 """name: (title in the table, options of ``uuv train quick``)"""
-SEEDS = {"base": (0, 1, 2), "std": (0, 1)}
-"""of each arm; the second one's third was not trained"""
+SEEDS = {"base": (0, 1, 2), "std": (0, 1, 2)}
+"""of each arm"""
 
 
 def train(arm: str, seed: int, place: Path) -> None:
@@ -85,8 +87,32 @@ def quick_failures(sources: Sources) -> str:
     return text_table(["driver", "success", "collision", "ttc", "time of a success"], rows)
 
 
+def draw(runs: list[dict[str, Any]], out: Path) -> None:
+    """Success in the twin along every training: a line for each seed, the second arm's dashed."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, panel = pyplot.subplots(figsize=(6.2, 3.2))
+    for run in runs:
+        decisions = [row["decisions"] / 1e6 for row in run["curve"]]
+        success = [100 * row[SCENE] for row in run["curve"]]
+        title, seed = ARMS[run["arm"]][0].replace("`", ""), run["seed"]
+        style = "-" if run["arm"] == "base" else "--"
+        panel.plot(decisions, success, style, color=f"C{seed}", lw=1.2, label=f"{title}, seed {seed}")
+    panel.set_xlabel("decisions [million]", fontsize=9)
+    panel.set_ylabel("success in the twin [%]", fontsize=9)
+    panel.grid(alpha=0.25)
+    panel.tick_params(labelsize=8)
+    panel.legend(fontsize=8)
+    figure.tight_layout()
+    figure.savefig(out, format="png", dpi=100, facecolor="white", metadata={"Software": None})
+    pyplot.close(figure)
+
+
 def main() -> None:
-    """Train what is missing, play all of it and write the file."""
+    """Train what is missing, play all of it, write the file and draw it."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("runs", type=Path)
     parser.add_argument("--commit", help="of the package that trained, where it is not this one")
@@ -111,6 +137,7 @@ def main() -> None:
             document["runs"].append(run)
             write_atomic(ROOT / FILE, (json.dumps(document, indent=1) + "\n").encode())
             print(place.name, flush=True)
+    draw(document["runs"], ROOT / PICTURE)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,8 @@
 
 Each run is one ``uuv train twin`` in a process of its own, in a folder ``RUNS/ARM.SEED``; a second start
 trains what is missing. ``docs/data/twin_recipe.json`` holds what each run reached in the twin, on the same
-scenarios, which none learnt from. ``docs/learning.md`` shows the table.
+scenarios, which none learnt from; ``--later`` trains the switches that came with the twin's new tracks, and a
+base of their own, for ``docs/data/twin_recipe_later.json``. ``docs/learning.md`` shows the tables.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from uuvtai.learn.recorder import read_metrics
 from uuvtai.run_folder import hardware, write_atomic
 from uuvtai.tables.table import text_table
 
-FILE = "docs/data/twin_recipe.json"
+FILE, LATER_FILE = "docs/data/twin_recipe.json", "docs/data/twin_recipe_later.json"
 SEEDS = (0, 1, 2)
 IMITATED = "--set twin.warm_start_waves=0"
 """by the arm ``tree``, once for all, or not at all"""
@@ -65,14 +66,17 @@ ARMS = (
     ),
     Arm("base", "every switch off", f"{BUDGET} {FREE}"),
     Arm("failure", "`failure_starts=0.25`", f"{BUDGET} {FREE} --set twin.failure_starts=0.25"),
-    Arm("curriculum", "`curriculum_until=0.5`", f"{BUDGET} {FREE} --set twin.curriculum_until=0.5"),
-    Arm("blind", "`critic_sees_truth=false`", f"{BUDGET} {FREE} --set twin.critic_sees_truth=false"),
     Arm("warm", "`start`", f"{BUDGET} {FREE} {_START}"),
     Arm(
         "anchored",
         "`start`, `anchor=0.3`, `anchor_until=0.5`",
         f"{BUDGET} {_START} --set twin.anchor=0.3 --set twin.anchor_until=0.5",
     ),
+)
+LATER = (
+    Arm("base", "every switch off", f"{BUDGET} {FREE}"),
+    Arm("curriculum", "`curriculum_until=0.5`", f"{BUDGET} {FREE} --set twin.curriculum_until=0.5"),
+    Arm("blind", "`critic_sees_truth=false`", f"{BUDGET} {FREE} --set twin.critic_sees_truth=false"),
 )
 
 
@@ -103,12 +107,21 @@ def train(arm: Arm, seed: int, runs: Path) -> None:
 
 
 def twin_recipe(sources: Sources) -> str:
-    """Success in the twin with each switch: mean and range over the seeds, and the difference from the first
-    row, seed by seed, with Student's 95 % interval."""
-    found = sources.json(FILE)["rows"]
+    """Success in the twin with each switch: mean and range over the seeds, and the difference from ``base``,
+    seed by seed, with Student's 95 % interval."""
+    return _table(sources, FILE, ARMS)
+
+
+def twin_recipe_later(sources: Sources) -> str:
+    """As ``twin_recipe``, of the switches that came with the twin's new tracks."""
+    return _table(sources, LATER_FILE, LATER)
+
+
+def _table(sources: Sources, file: str, arms: tuple[Arm, ...]) -> str:
+    found = sources.json(file)["rows"]
     base = _by_seed(found, "base")
     rows = []
-    for arm in ARMS:
+    for arm in arms:
         own = _by_seed(found, arm.name)
         if own:
             rows.append(
@@ -153,12 +166,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("runs", type=Path)
     parser.add_argument("--read", action="store_true", help="train nothing: write what is there")
+    parser.add_argument("--later", action="store_true", help="the later switches and their base")
     parser.add_argument("--commit", help="of the package that trained, where it is not this one")
     chosen = parser.parse_args()
     runs: Path = chosen.runs
     commit = chosen.commit or commit_of_package()
     document: dict[str, Any] = {"schema": 1, "commit": commit, "machine": hardware(), "rows": []}
-    for arm in ARMS:
+    for arm in LATER if chosen.later else ARMS:
         for seed in arm.seeds:
             place = runs / f"{arm.name}.{seed}"
             if not place.exists() and not chosen.read:
@@ -166,7 +180,8 @@ def main() -> None:
             entry = entry_of(arm, seed, read_metrics(place)) if place.exists() else None
             if entry:
                 document["rows"].append(entry)
-                write_atomic(ROOT / FILE, (json.dumps(document, indent=1) + "\n").encode())
+                file = ROOT / (LATER_FILE if chosen.later else FILE)
+                write_atomic(file, (json.dumps(document, indent=1) + "\n").encode())
 
 
 if __name__ == "__main__":
