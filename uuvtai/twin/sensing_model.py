@@ -10,6 +10,7 @@ from uuvtai.kernels.core.noise import episode_key, normal_pair_lanes, uniform
 from uuvtai.kernels.core.signature import AnyTensor, Bundle, FloatMatrix, IntVector
 from uuvtai.twin.kinematics import path_places
 from uuvtai.twin.set_codes import N_RAY
+from uuvtai.twin.set_columns import write_columns_of
 from uuvtai.twin.twin_arrays import (
     AT_FLIP,
     AT_POS,
@@ -160,6 +161,22 @@ def write_rays(env, number, slot_count, x, y, body: AnyTensor, ray: FloatMatrix,
 
 
 @ti.func
+def sight_of(number, slot_count, here, at, radius, high, level, body: AnyTensor):
+    """(1 = seen, 1 = its height is seen, 1 = in the sonar's fan) of a moving body at ``at`` (x, y), from
+    ``here`` (x, y, z, yaw)."""
+    dx, dy = at[0] - here[0], at[1] - here[1]
+    far = ti.max(ti.sqrt(dx * dx + dy * dy), 1e-3)
+    fan = ti.abs(here[2] - level) - high < ti.max(far - radius, 0.0) * FAN_SLOPE
+    bearing = wrapped_angle(ti.atan2(dy, dx) - here[3])
+    camera = ti.abs(bearing) < TWO_PI / 8 and far < CAMERA_RANGE_M
+    visible, knows = False, False
+    if far < RANGE_M and (fan or camera):
+        visible = is_hidden(number, slot_count, here[0], here[1], at[0], at[1], body) == 0
+        knows = visible and camera and far < HEIGHT_RANGE_M
+    return ti.Vector([ti.cast(visible, ti.i32), ti.cast(knows, ti.i32), ti.cast(fan, ti.i32)])
+
+
+@ti.func
 def how_badly(drawn):
     """How badly a body is seen, by a uniform number: 1 in the middle, with a long tail."""
     return BEST + SPREAD / (1.0 - ti.min(drawn, MISSED))
@@ -276,9 +293,11 @@ def sense_twin(
     raw: AnyTensor,
     ray: FloatMatrix,
     truth: AnyTensor,
+    bodies: AnyTensor,
+    own: FloatMatrix,
 ):
-    """Tracks, rays, and what only a critic may see, after a decision or a reset. The noise is a function of
-    (``seed``, ``count``) and the env.
+    """Tracks, rays, what only a critic may see, and the columns of a policy, after a decision or a reset. The
+    noise is a function of (``seed``, ``count``) and the env.
 
     ``track`` (n, lanes, 9): estimated x, y, vx, vy; seen for [s]; not seen for [s]; 1 = height known; watched
     way [m]; uniform number of this spell.
@@ -303,18 +322,10 @@ def sense_twin(
                 bend_m = path[number, lane, 1] if is_circle else 0.0
                 turn_rate = speed / bend_m if is_circle else 0.0
                 radius, high, level = body[number, slot, 4], body[number, slot, 6], body[number, slot, 3]
-                dx, dy = at[0] - x, at[1] - y
-                far = ti.max(ti.sqrt(dx * dx + dy * dy), 1e-3)
-                fan = ti.abs(z - level) - high < ti.max(far - radius, 0.0) * FAN_SLOPE
-                bearing = wrapped_angle(ti.atan2(dy, dx) - yaw)
-                visible, knows = False, False
-                camera = ti.abs(bearing) < TWO_PI / 8 and far < CAMERA_RANGE_M
-                if far < RANGE_M and (fan or camera):
-                    visible = is_hidden(number, n_rest, x, y, at[0], at[1], body) == 0
-                    knows = visible and camera and far < HEIGHT_RANGE_M
+                here = ti.Vector([x, y, z, yaw])
+                seen = sight_of(number, n_rest, here, at, radius, high, level, body)
                 old = ti.Vector([track[env, lane, i] for i in ti.static(range(TRACK_WIDTH))])
-                here = ti.Vector([x, y])
-                new = updated_track(old, lane, at, bend_m, speed, here, visible, knows, fan, key)
+                new = updated_track(old, lane, at, bend_m, speed, here, seen[0], seen[1], seen[2], key)
                 for i in ti.static(range(TRACK_WIDTH)):
                     track[env, lane, i] = new[i]
                 over, under = level - high - z, z - level - high
@@ -323,3 +334,4 @@ def sense_twin(
                     write_raw(env, lane, new, places, is_known, turn_rate, over, under, radius, raw)
                 write_truth(env, lane, places, over, flip, x, y, truth)
         write_rays(env, number, n_rest, x, y, body, ray, io)
+        write_columns_of(env, ego, raw, ray, bodies, own)

@@ -117,6 +117,26 @@ def mirrored_ray(i, env, ego: FloatMatrix):
     return at
 
 
+@ti.func
+def write_columns_of(
+    env, ego: FloatMatrix, raw: AnyTensor, ray: FloatMatrix, bodies: AnyTensor, own: FloatMatrix
+):
+    """Columns of one row, as ``write_set_columns``."""
+    flip, speed, way = mirrored(env, ego)
+    for lane in range(raw.shape[1]):
+        columns = ti.Vector.zero(ti.f32, BODY_WIDTH)
+        if raw[env, lane, 13] > 0.5:
+            columns = body_columns(env, lane, flip, speed, way, ego, raw)
+        for i in ti.static(range(BODY_WIDTH)):
+            bodies[env, lane, i] = columns[i]
+    values = own_columns(env, flip, speed, way, ego)
+    for i in ti.static(range(OWN_WIDTH)):
+        own[env, i] = values[i]
+    for i in range(N_RAY):
+        free = ray[env, mirrored_ray(i, env, ego)]
+        own[env, OWN_WIDTH + i] = 1.0 / (0.3 + ti.math.clamp(free - HULL_M, 0.0, 4.0)) - 0.5
+
+
 @ti.kernel
 def write_set_columns(
     ego: FloatMatrix, raw: AnyTensor, ray: FloatMatrix, bodies: AnyTensor, own: FloatMatrix
@@ -124,17 +144,4 @@ def write_set_columns(
     """``bodies`` (n, lanes, BODY_WIDTH) and ``own`` (n, EGO_COLUMNS) from rows of the vehicle
     (``twin_arrays``), tracks (n, lanes, RAW_WIDTH) and free distances (n, N_RAY) [m]."""
     for env in range(ego.shape[0]):
-        flip, speed, way = mirrored(env, ego)
-        for lane in range(raw.shape[1]):
-            for i in range(BODY_WIDTH):
-                bodies[env, lane, i] = 0.0
-            if raw[env, lane, 13] > 0.5:
-                columns = body_columns(env, lane, flip, speed, way, ego, raw)
-                for i in ti.static(range(BODY_WIDTH)):
-                    bodies[env, lane, i] = columns[i]
-        values = own_columns(env, flip, speed, way, ego)
-        for i in ti.static(range(OWN_WIDTH)):
-            own[env, i] = values[i]
-        for i in range(N_RAY):
-            free = ray[env, mirrored_ray(i, env, ego)]
-            own[env, OWN_WIDTH + i] = 1.0 / (0.3 + ti.math.clamp(free - HULL_M, 0.0, 4.0)) - 0.5
+        write_columns_of(env, ego, raw, ray, bodies, own)

@@ -11,7 +11,7 @@ import torch
 from uuvtai.binding import bind
 from uuvtai.config.learning import LearningConfig
 from uuvtai.runtime import start_taichi
-from uuvtai.twin import kinematics, sensing_model, set_columns
+from uuvtai.twin import kinematics, sensing_model
 from uuvtai.twin.scenario_bank import ScenarioBank
 from uuvtai.twin.set_codes import BODY_WIDTH, EGO_COLUMNS, N_RAY
 from uuvtai.twin.twin_arrays import EGO_WIDTH, RAW_WIDTH, TRACK_WIDTH, TRUTH_WIDTH, TwinRules
@@ -70,9 +70,8 @@ class Twin:
         b = self.bank
         sensing_model.sense_twin(
             self.rules, self.seed, self.count, b.body, b.path, self.scenario, self.ego, self.track,
-            self._raw, self._ray, self.view.truth,
+            self._raw, self._ray, self.view.truth, self.view.bodies, self.view.own,
         )  # fmt: skip
-        set_columns.write_set_columns(self.ego, self._raw, self._ray, self.view.bodies, self.view.own)
         self.count = (self.count + 1) % 2**30
         return self.view
 
