@@ -13,7 +13,7 @@ from docs.writers.dead_tables import dead_commands, dead_thrusters
 from docs.writers.figure_sources import Counts, SourceError, Sources, fitting, pooled, rated, share, weighted
 from docs.writers.forecast_tables import forecast_pieces, forecast_scores
 from docs.writers.learned_search import learned_curve, learned_numbers
-from docs.writers.learned_trials import Paired, learned_before, learned_fresh, learned_trials, stack_trials
+from docs.writers.learned_trials import learned_before, learned_fresh, learned_trials, stack_trials
 from docs.writers.link_tables import (
     aboard,
     ardusub_identified,
@@ -25,19 +25,35 @@ from docs.writers.link_tables import (
 )
 from docs.writers.newcomer_tables import newcomer, newcomer_zero
 from docs.writers.parity_tables import parity_success, parity_tracks
-from docs.writers.pieces import BEFORE, CELLS, DASH, LETTERS, PIECES, beside
+from docs.writers.pieces import BEFORE, CELLS, DASH, PIECES, beside
 from docs.writers.pose_tables import pose_endings, pose_errors
 from docs.writers.quick_seeds import quick_failures, quick_seeds
 from docs.writers.rehearsal_tables import rehearsal
 from docs.writers.replay_tables import changed, lossy, replayed
 from docs.writers.sonar_tables import sonars
 from docs.writers.tenfold import tenfold, tenfold_claims
+from docs.writers.trial_tables import (
+    bfloat16,
+    chooser_trials,
+    finetune_curve,
+    finetune_late,
+    finetune_policy,
+    learning_trials,
+    quick_curve,
+    quick_policy,
+    quick_shallow,
+    tuned_trials,
+    twin_cold,
+    twin_curve,
+    twin_forecast,
+    twin_policy,
+    twin_warm,
+)
 from docs.writers.tuner_tables import fast_slopes, tuner_slopes
-from docs.writers.twin_recipe import twin_recipe
+from docs.writers.twin_recipe import twin_memory, twin_recipe, twin_recipe_later
 from docs.writers.vehicle_tables import vehicle_commands, vehicles
 from uuvtai.measure.reproduce import paper
 from uuvtai.measure.reproduce.steps import RETIRED_SEEDS
-from uuvtai.statistics import mcnemar_p
 from uuvtai.tables.method_tables import milliseconds
 from uuvtai.tables.table import text_table
 
@@ -194,181 +210,6 @@ def policy(sources: Sources) -> str:
         ]
         rows.append([entry["title"], *cells, f"{only[0]}, {only[1]}", f"{pair['mcnemar_p']:.2g}"])
     return text_table(head, rows) if rows else "Not among the evaluations that are shown."
-
-
-TWIN_FILE = "docs/data/twin_77001.json"
-WARM_FILE, COLD_FILE = "docs/data/twin_warm_77001.json", "docs/data/twin_cold_77001.json"
-QUICK_FILE, SHALLOW_FILE = "docs/data/quick_77601.json", "docs/data/quick_90008.json"
-FINETUNE_FILE = "docs/data/finetune_77701.json"
-BFLOAT16_FILE = "docs/data/bfloat16_77801.json"
-CHOOSER_FILE = "docs/data/chooser_77001.json"
-TUNED_FILE = "docs/data/tuned_77001.json"
-LEARNING_FILE = "docs/data/learning_trials.json"
-
-
-def twin_policy(sources: Sources) -> str:
-    """The policy that learnt in the twin beside the tree, in the simulator, on the same episodes."""
-    return _trial_rows(sources, TWIN_FILE, "policy")
-
-
-def twin_warm(sources: Sources) -> str:
-    """A policy that was warm-started from the tree beside the tree, on the same episodes."""
-    return _trial_rows(sources, WARM_FILE, "policy")
-
-
-def twin_cold(sources: Sources) -> str:
-    """The same budget with every switch off."""
-    return _trial_rows(sources, COLD_FILE, "policy")
-
-
-def quick_policy(sources: Sources) -> str:
-    """The policy of ``uuv train quick`` beside the tree, on the same episodes."""
-    return _trial_rows(sources, QUICK_FILE, "policy")
-
-
-def quick_shallow(sources: Sources) -> str:
-    """The same, of the first one, which drove too near the surface."""
-    return _trial_rows(sources, SHALLOW_FILE, "policy")
-
-
-def quick_curve(sources: Sources) -> str:
-    """Success of that policy in the twin along its training."""
-    rows = [
-        [f"{row['decisions'] / 1e6:.1f}", f"{row['seconds'] / 60:.0f}", f"{100 * row['pool_6_0.6']:.1f} %"]
-        for row in sources.json(QUICK_FILE)["curve"]
-    ]
-    return text_table(["million decisions", "minutes", "pool (8, 6, 0.6)"], rows)
-
-
-def chooser_trials(sources: Sources) -> str:
-    """The chooser between tree and policy beside the tree, on the same episodes."""
-    return _trial_rows(sources, CHOOSER_FILE, "chooser")
-
-
-def tuned_trials(sources: Sources) -> str:
-    """The tree with learnt numbers beside the tree as configured, on the same episodes."""
-    return _trial_rows(sources, TUNED_FILE, "tuned")
-
-
-def learning_trials(sources: Sources) -> str:
-    """Other trials to go past the tree, on the same episodes."""
-    return _trial_rows(sources, LEARNING_FILE, "trial")
-
-
-def _trial_rows(sources: Sources, file: str, name: str) -> str:
-    """What ``twin_trials`` has kept in a file."""
-    rows = []
-    for entry in sources.json(file)["rows"]:
-        tree, own = entry["bt"], entry["policy"]
-        pairs = list(zip(tree["outcomes"], own["outcomes"], strict=True))
-        only = [sum(a == "s" != b for a, b in pairs), sum(b == "s" != a for a, b in pairs)]
-        both = [i for i, pair in enumerate(pairs) if pair == ("s", "s")]
-        times = [sum(who["times_s"][i] for i in both) / max(1, len(both)) for who in (tree, own)]
-        counts = [
-            Counts(len(pairs), {name: who["outcomes"].count(letter) for name, letter in LETTERS.items()})
-            for who in (tree, own)
-        ]
-        rows.append(
-            [
-                entry["cell"],
-                *(rated(found, ending) for ending in ("success", "collision") for found in counts),
-                f"{only[0]}, {only[1]}",
-                f"{mcnemar_p(*only):.2g}",
-                f"{times[0]:.1f}, {times[1]:.1f} s",
-                *_wheel(entry),
-            ]
-        )
-    head = ["`bt`", name, "`bt`: collision", f"{name}: collision"]
-    more = [f"only `bt`, only the {name} arrives", "exact McNemar p", "time where both arrive"]
-    more += ["hand-overs an episode, share of the policy"] if name == "chooser" else []
-    return text_table(["world (S, D, v in m/s)", *head, *more], rows)
-
-
-def _wheel(entry: dict[str, Any]) -> list[str]:
-    counts = entry.get("chooser")
-    return [f"{counts['hand_overs_mean']:.1f}, {100 * counts['policy_share']:.0f} %"] if counts else []
-
-
-def bfloat16(sources: Sources) -> str:
-    """Trainings with hidden layers in float32 and in bfloat16, on the same episodes."""
-    rows = []
-    for entry in sources.json(BFLOAT16_FILE)["rows"]:
-        pair = Paired.of([(entry["float32"], entry["bfloat16"])])
-        rows.append([entry["cell"], str(len(pair.ends)), *pair.cells(), pair.points(), pair.times()])
-    head = [
-        "world (S, D, v in m/s)",
-        "episodes",
-        "float32",
-        "bfloat16",
-        "gains, losses, McNemar's p",
-        "points",
-    ]
-    return text_table([*head, "time where both arrive"], rows)
-
-
-def finetune_policy(sources: Sources) -> str:
-    """A policy of the twin before and after its fine-tuning in the simulator, beside the tree."""
-    rows = []
-    for entry in sources.json(FINETUNE_FILE)["rows"]:
-        before, after = (entry[who]["outcomes"] for who in ("before", "after"))
-        pairs = list(zip(before, after, strict=True))
-        only = [sum(a == "s" != b for a, b in pairs), sum(b == "s" != a for a, b in pairs)]
-        both = [i for i, pair in enumerate(pairs) if pair == ("s", "s")]
-        times = [
-            sum(entry[who]["times_s"][i] for i in both) / max(1, len(both)) for who in ("before", "after")
-        ]
-        counts = {
-            who: Counts(
-                len(pairs), {name: entry[who]["outcomes"].count(letter) for name, letter in LETTERS.items()}
-            )
-            for who in ("bt", "before", "after")
-        }
-        rows.append(
-            [
-                entry["cell"],
-                rated(counts["bt"], "success"),
-                *(
-                    rated(counts[who], ending)
-                    for ending in ("success", "collision")
-                    for who in ("before", "after")
-                ),
-                f"{only[0]}, {only[1]}",
-                f"{mcnemar_p(*only):.2g}",
-                f"{times[0]:.1f}, {times[1]:.1f} s",
-            ]
-        )
-    head = ["world (S, D, v in m/s)", "`bt`", "before", "after", "before: collision", "after: collision"]
-    more = ["arrives only before, only after", "exact McNemar p", "time where both arrive"]
-    return text_table([*head, *more], rows)
-
-
-def finetune_curve(sources: Sources) -> str:
-    """Success on held-out episodes of the simulator along the fine-tuning."""
-    names = {"gauntlet_9_1.5": "gauntlet (8, 9, 1.5)", "pool_9_1.5": "pool (8, 9, 1.5)"}
-    rows = [
-        [
-            f"{row['decisions'] / 1e6:.2f}",
-            f"{row['seconds'] / 60:.0f}",
-            *(f"{100 * row[name]:.1f} %" for name in names),
-        ]
-        for row in sources.json(FINETUNE_FILE)["curve"]
-    ]
-    return text_table(["million decisions", "minutes", *names.values()], rows)
-
-
-def twin_curve(sources: Sources) -> str:
-    """Success in the twin along the training, on scenarios that it never learnt from."""
-    names = {"gauntlet_9_1.5": "gauntlet (8, 9, 1.5)", "pool_9_1.5": "pool (8, 9, 1.5)"}
-    names |= {"pool_6_0.6": "pool (8, 6, 0.6)"}
-    rows = [
-        [
-            f"{row['decisions'] / 1e6:.1f}",
-            f"{row['seconds'] / 60:.0f}",
-            *(f"{100 * row[name]:.0f} %" for name in names),
-        ]
-        for row in sources.json(TWIN_FILE)["curve"]
-    ]
-    return text_table(["million decisions", "minutes", *names.values()], rows)
 
 
 def switched_off(sources: Sources) -> str:
@@ -735,11 +576,15 @@ TABLES: dict[str, Callable[[Sources], str]] = {
         vehicles,
         twin_curve,
         twin_recipe,
+        twin_recipe_later,
+        twin_memory,
         twin_warm,
         twin_cold,
         twin_policy,
+        twin_forecast,
         finetune_curve,
         finetune_policy,
+        finetune_late,
         quick_curve,
         quick_policy,
         quick_shallow,

@@ -3,7 +3,8 @@ fine-tuning said of itself: ``python -m docs.writers.finetune_trials BEFORE AFTE
 checkpoints).
 
 ``docs/data/finetune_77701.json`` holds the outcome and the time of every episode, by all three, and the
-evaluations on held-out episodes of the simulator along the fine-tuning. ``docs/learning.md`` shows the
+evaluations on held-out episodes of the simulator along the fine-tuning; ``--late`` keeps the evaluations
+alone, of a fine-tuning that began with a policy that had learnt longer. ``docs/learning.md`` shows the
 tables.
 """
 
@@ -26,7 +27,7 @@ from uuvtai.learn import checkpoint
 from uuvtai.run_folder import hardware, write_atomic
 
 SEED, EPISODES = 77701, 600
-FILE = "docs/data/finetune_77701.json"
+FILE, LATE_FILE = "docs/data/finetune_77701.json", "docs/data/finetune_late.json"
 
 
 def played(options: list[str]) -> list[dict[str, Any]]:
@@ -81,7 +82,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("before", type=Path)
     parser.add_argument("after", type=Path)
+    parser.add_argument("--late", action="store_true", help="only what a later fine-tuning said of itself")
     chosen = parser.parse_args()
+    if chosen.late:
+        late: dict[str, Any] = {"schema": 1, "commit": commit_of_package(), "machine": hardware()}
+        late["curve"] = curve_of(chosen.after)
+        write_atomic(ROOT / LATE_FILE, (json.dumps(late, indent=1) + "\n").encode())
+        return
     document: dict[str, Any] = {
         "schema": 1,
         "seeds": str(SEED),

@@ -26,6 +26,8 @@ from uuvtai.run_folder import hardware, write_atomic
 from uuvtai.tables.table import text_table
 
 FILE, LATER_FILE = "docs/data/twin_recipe.json", "docs/data/twin_recipe_later.json"
+MEMORY_FILE = "docs/data/twin_memory.json"
+"""of a trial whose code was not kept"""
 SEEDS = (0, 1, 2)
 IMITATED = "--set twin.warm_start_waves=0"
 """by the arm ``tree``, once for all, or not at all"""
@@ -78,6 +80,10 @@ LATER = (
     Arm("curriculum", "`curriculum_until=0.5`", f"{BUDGET} {FREE} --set twin.curriculum_until=0.5"),
     Arm("blind", "`critic_sees_truth=false`", f"{BUDGET} {FREE} --set twin.critic_sees_truth=false"),
 )
+MEMORY = (
+    Arm("base", "without a memory", ""),
+    Arm("memory", "with a memory (64 gated recurrent units)", ""),
+)
 
 
 def entry_of(arm: Arm, seed: int, rows: list[dict[str, Any]]) -> dict[str, Any] | None:
@@ -115,6 +121,11 @@ def twin_recipe(sources: Sources) -> str:
 def twin_recipe_later(sources: Sources) -> str:
     """As ``twin_recipe``, of the switches that came with the twin's new tracks."""
     return _table(sources, LATER_FILE, LATER)
+
+
+def twin_memory(sources: Sources) -> str:
+    """As ``twin_recipe``, of policies with and without a memory."""
+    return _table(sources, MEMORY_FILE, MEMORY)
 
 
 def _table(sources: Sources, file: str, arms: tuple[Arm, ...]) -> str:

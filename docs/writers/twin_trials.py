@@ -96,6 +96,7 @@ def main() -> None:
     parser.add_argument("--out", default=FILE, help="file of the results, from the root of the tree")
     parser.add_argument("--more", action="store_true", help="also worlds that no training met")
     parser.add_argument("--only", default="", help="scenes whose title begins so")
+    parser.add_argument("--options", default="", help="more options of uuv eval, for both")
     parser.add_argument("--seeds", default=SEEDS, help="as uuv eval takes them")
     parser.add_argument("--episodes", type=int, default=EPISODES, help="of each seed")
     chosen = parser.parse_args()
@@ -109,7 +110,8 @@ def main() -> None:
     }
     cells = [cell for cell in (*CELLS, *(MORE if chosen.more else ())) if cell[0].startswith(chosen.only)]
     for title, _name, options in cells:
-        command = command_of(str(run), options, chosen.seeds, chosen.episodes)
+        more = chosen.options.split()
+        command = [*command_of(str(run), options, chosen.seeds, chosen.episodes), *more]
         result = played(command)
         document["rows"].append(entry_of(title, command, result, commit_of_package()))
         write_atomic(ROOT / chosen.out, (json.dumps(document, indent=1) + "\n").encode())
