@@ -18,7 +18,7 @@ _TURNS, _ITERATIONS, _LEFT_OUT = 5, 10, 2
 _SHORT = ["--set", "train.evaluate_every=1000", "--set", "train.evaluate_episodes=16"]
 _SMALL = ["--set", "train.num_envs=16", "--set", "ppo.minibatches=1", "--set", "twin.scenarios=16"]
 _PARTS = ("simulate", "learn")
-_NUM_ENVS, _DECISIONS, _ROUNDS = 2048, 50, 21
+_SIZES, _DECISIONS, _ROUNDS = (2048, 8192), 50, 15
 _KERNELS_US = 3.0
 """what a decision of the twin may take"""
 
@@ -37,12 +37,12 @@ def measure(job: Job) -> list[Row]:
                 lines = (place / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
                 found[i] += [json.loads(line) for line in lines][_LEFT_OUT:]
             job.say(f"turn {turn + 1}")
-        return [*_rows(found, commit), _alone(job, sides, commit)]
+        sizes = (64,) if job.quick else _SIZES
+        return [*_rows(found, commit), *(_alone(job, sides, commit, size) for size in sizes)]
 
 
-def _alone(job: Job, sides: tuple[Side, Side], commit: str) -> Row:
+def _alone(job: Job, sides: tuple[Side, Side], commit: str, num_envs: int) -> Row:
     """A decision of the twin on all cores, medians of both sides in turns."""
-    num_envs = 64 if job.quick else _NUM_ENVS
     players = [Player(side, "twin", "twin", str(num_envs)) for side in sides]
     taken: list[list[float]] = [[], []]
     for turn in range(1 if job.quick else _ROUNDS):
@@ -53,7 +53,7 @@ def _alone(job: Job, sides: tuple[Side, Side], commit: str) -> Row:
     ours, theirs = map(statistics.median, taken)
     told = dict(zip(("ours_us", "theirs_us"), taken, strict=True))
     return Row(
-        "a decision of the twin alone", ours, "us", theirs, commit,
+        f"a decision of the twin alone, {num_envs:,} vehicles", ours, "us", theirs, commit,
         less_is_better=True, floor=_KERNELS_US, details=told,
     )  # fmt: skip
 
