@@ -12,35 +12,18 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import subprocess
-import sys
-import tempfile
 from pathlib import Path
 from typing import Any
 
-from docs.writers.evaluations import ONE_THREAD, commit_of_package
+from docs.writers.evaluations import commit_of_package
 from docs.writers.figure_sources import ROOT
 from docs.writers.pieces import LETTERS
-from docs.writers.twin_trials import CELLS, curve_of
+from docs.writers.twin_trials import CELLS, curve_of, played
 from uuvtai.learn import checkpoint
 from uuvtai.run_folder import hardware, write_atomic
 
 SEED, EPISODES = 77701, 600
 FILE, LATE_FILE = "docs/data/finetune_77701.json", "docs/data/finetune_late.json"
-
-
-def played(options: list[str]) -> list[dict[str, Any]]:
-    """Methods of a ``uuv eval --json`` document."""
-    with tempfile.TemporaryDirectory() as place:
-        done = subprocess.run(
-            [sys.executable, "-m", "uuvtai", "eval", *options, "--json", "--run-dir", f"{place}/run"],
-            env=os.environ | ONE_THREAD,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-    return json.loads(done.stdout)["methods"]
 
 
 def entry_of(method: dict[str, Any]) -> dict[str, Any]:
@@ -56,7 +39,7 @@ def entry_of(method: dict[str, Any]) -> dict[str, Any]:
 def row_of(title: str, options: str, before: Path, after: Path) -> dict[str, Any]:
     """One scene, played by the tree, the policy as it came, and as it is."""
     scene = [*options.split(), "--seeds", str(SEED), "--episodes", str(EPISODES)]
-    methods = played([str(before), str(after), "--controller", "bt", *scene])
+    methods = played(["eval", str(before), str(after), "--controller", "bt", *scene])["methods"]
     found = {
         "bt": next(method for method in methods if method["name"] == "bt"),
         **{who: method_of(methods, path) for who, path in (("before", before), ("after", after))},

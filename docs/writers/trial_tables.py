@@ -75,21 +75,12 @@ def _trial_rows(sources: Sources, file: str, name: str) -> str:
     rows = []
     for entry in sources.json(file)["rows"]:
         tree, own = entry["bt"], entry["policy"]
-        pairs = list(zip(tree["outcomes"], own["outcomes"], strict=True))
-        only = [sum(a == "s" != b for a, b in pairs), sum(b == "s" != a for a, b in pairs)]
-        both = [i for i, pair in enumerate(pairs) if pair == ("s", "s")]
-        times = [sum(who["times_s"][i] for i in both) / max(1, len(both)) for who in (tree, own)]
-        counts = [
-            Counts(len(pairs), {name: who["outcomes"].count(letter) for name, letter in LETTERS.items()})
-            for who in (tree, own)
-        ]
+        counts = [_counts(who) for who in (tree, own)]
         rows.append(
             [
                 entry["cell"],
                 *(rated(found, ending) for ending in ("success", "collision") for found in counts),
-                f"{only[0]}, {only[1]}",
-                f"{mcnemar_p(*only):.2g}",
-                f"{times[0]:.1f}, {times[1]:.1f} s",
+                *_compared(tree, own),
                 *_wheel(entry),
             ]
         )
@@ -97,6 +88,21 @@ def _trial_rows(sources: Sources, file: str, name: str) -> str:
     more = [f"only `bt`, only the {name} arrives", "exact McNemar p", "time where both arrive"]
     more += ["hand-overs an episode, share of the policy"] if name == "chooser" else []
     return text_table(["world (S, D, v in m/s)", *head, *more], rows)
+
+
+def _counts(who: dict[str, Any]) -> Counts:
+    """How the episodes of one driver ended."""
+    ends = who["outcomes"]
+    return Counts(len(ends), {name: ends.count(letter) for name, letter in LETTERS.items()})
+
+
+def _compared(one: dict[str, Any], other: dict[str, Any]) -> list[str]:
+    """Who alone arrives, McNemar's p, and the mean times where both arrive."""
+    pairs = list(zip(one["outcomes"], other["outcomes"], strict=True))
+    only = [sum(a == "s" != b for a, b in pairs), sum(b == "s" != a for a, b in pairs)]
+    both = [i for i, pair in enumerate(pairs) if pair == ("s", "s")]
+    times = [sum(who["times_s"][i] for i in both) / max(1, len(both)) for who in (one, other)]
+    return [f"{only[0]}, {only[1]}", f"{mcnemar_p(*only):.2g}", f"{times[0]:.1f}, {times[1]:.1f} s"]
 
 
 def _wheel(entry: dict[str, Any]) -> list[str]:
@@ -135,31 +141,13 @@ def finetune_policy(sources: Sources) -> str:
     """A policy of the twin before and after its fine-tuning in the simulator, beside the tree."""
     rows = []
     for entry in sources.json(FINETUNE_FILE)["rows"]:
-        before, after = (entry[who]["outcomes"] for who in ("before", "after"))
-        pairs = list(zip(before, after, strict=True))
-        only = [sum(a == "s" != b for a, b in pairs), sum(b == "s" != a for a, b in pairs)]
-        both = [i for i, pair in enumerate(pairs) if pair == ("s", "s")]
-        times = [
-            sum(entry[who]["times_s"][i] for i in both) / max(1, len(both)) for who in ("before", "after")
-        ]
-        counts = {
-            who: Counts(
-                len(pairs), {name: entry[who]["outcomes"].count(letter) for name, letter in LETTERS.items()}
-            )
-            for who in ("bt", "before", "after")
-        }
+        pair = [_counts(entry[who]) for who in ("before", "after")]
         rows.append(
             [
                 entry["cell"],
-                rated(counts["bt"], "success"),
-                *(
-                    rated(counts[who], ending)
-                    for ending in ("success", "collision")
-                    for who in ("before", "after")
-                ),
-                f"{only[0]}, {only[1]}",
-                f"{mcnemar_p(*only):.2g}",
-                f"{times[0]:.1f}, {times[1]:.1f} s",
+                rated(_counts(entry["bt"]), "success"),
+                *(rated(found, ending) for ending in ("success", "collision") for found in pair),
+                *_compared(entry["before"], entry["after"]),
             ]
         )
     head = ["world (S, D, v in m/s)", "`bt`", "before", "after", "before: collision", "after: collision"]

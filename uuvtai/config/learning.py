@@ -230,8 +230,8 @@ class TwinConfig(Section):
     failure_starts: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """share of the episodes that begin 1 to 4 s before an earlier failure"""
     curriculum_until: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """share of the run over which scenarios join the slowest scenes', slower ones first; 0 = all from the
-    begin"""
+    """share of the run over which scenarios with faster and faster bodies join the slowest ones; 0 = all take
+    part from the start"""
     critic_sees_truth: bool = True
     """the critic, which serves training alone, knows where the bodies are and will be"""
 
