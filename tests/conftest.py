@@ -79,6 +79,11 @@ def configure(monkeypatch, sim, config):
     adopt([new[name] for name in new.keys() - same.keys()], sim.memory())
 
 
+def launch_one_by_one(monkeypatch, sim):
+    """For who puts something of her own in a kernel's place: what is launched in a row looks at none."""
+    monkeypatch.setattr(sim, "_rows", None)
+
+
 def estimate_pose(monkeypatch, small):
     """Have its simulator find out where it is from harsh readings: only kernels of proprioception and pose
     are compiled for it."""

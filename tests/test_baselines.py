@@ -9,6 +9,7 @@ import taichi as ti
 
 from tests.bundles import io_for
 from tests.command import uuv
+from tests.conftest import launch_one_by_one
 from tests.small_sim import SmallSim
 from uuvtai import state
 from uuvtai.kernels.baselines.bundles import PathIntegralIO
@@ -292,6 +293,7 @@ def test_all_of_them_are_rows_of_an_evaluation(borrowed, capfd, tmp_path):
 def test_nothing_of_them_runs_under_another_tree(small, monkeypatch):
     """Kernels are launched, and their arrays written, only where the tree has their leaf."""
     launched = []
+    launch_one_by_one(monkeypatch, small.sim)
     for name, (kernel, noun) in PLANNERS.items():
         monkeypatch.setattr(
             f"uuvtai.stack.{noun}.{kernel.__name__}", lambda io, name=name: launched.append(name)

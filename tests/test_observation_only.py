@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.conftest import configure, estimate_pose
+from tests.conftest import configure, estimate_pose, launch_one_by_one
 from uuvtai import stack
 from uuvtai.capture import capture
 from uuvtai.kernels.perception import pose
@@ -92,6 +92,7 @@ class Poison:
 def watched(small, monkeypatch):
     """The session's simulator, writing observations with all the columns there are: only their kernels are
     compiled for it."""
+    launch_one_by_one(monkeypatch, small.sim)
     columns = small.config.features.model_copy(update={"n_track": 4, "teacher": True})
     configure(monkeypatch, small.sim, small.config.model_copy(update={"features": columns}))
     monkeypatch.setattr(small.sim, "observation", torch.zeros(small.N, features.observation_width(columns)))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.conftest import estimate_pose
+from tests.conftest import estimate_pose, launch_one_by_one
 from uuvtai.loader import load_config
 from uuvtai.measure.episodes.playing import jobs_of, run_episodes
 
@@ -78,6 +78,7 @@ def test_the_camera_is_asked_about_heights_only_if_the_config_says_so(small, mon
     """The kernels that read this section of the config are left out: nothing is compiled again for the
     switch."""
     asked, sim = [], small.sim
+    launch_one_by_one(monkeypatch, sim)
     small.begin([0])
     monkeypatch.setattr("uuvtai.stack.tracking.track_bodies", lambda *_: None)
     monkeypatch.setattr("uuvtai.stack.elevation.bound_heights", lambda *_: None)

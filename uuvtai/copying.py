@@ -37,6 +37,13 @@ class HostCounts:
         number, self.any_ended = torch.stack((self._memory.tensor(field), ended.to(torch.int32))).tolist()
         return number
 
+    def rows(self, field: ti.Field, envs: list[int] | None = None) -> np.ndarray:
+        """Copy of these rows of a field, shape (len(envs), ...); None = all of them."""
+        if self._memory.device.type == "cpu":
+            return self._memory.rows(field, slice(self._num_envs) if envs is None else envs)
+        chosen = range(self._num_envs) if envs is None else envs
+        return copied_rows(field, torch.tensor(chosen, dtype=torch.int32, device=self._memory.device))
+
     def has_any(self, field: ti.Field, mask: torch.Tensor) -> bool:
         """Whether a number of these rows (int32 ``mask``) is not 0."""
         if self._memory.device.type == "cpu":
@@ -52,14 +59,3 @@ def copied_rows(field: ti.Field, chosen: torch.Tensor) -> np.ndarray:
     )
     copy_rows(field, chosen, out)
     return out.cpu().numpy()
-
-
-def copy_into(out: torch.Tensor, field: ti.Field, chosen: torch.Tensor, memory: Memory) -> None:
-    """The first rows of a field into ``out``, as many as ``chosen`` (int32) counts from 0.
-
-    On the CPU nothing is launched: Taichi would wake its threads for it.
-    """
-    if memory.device.type == "cpu":
-        out.copy_(torch.from_numpy(memory.live(field)[: len(chosen)]))
-    else:
-        copy_rows(field, chosen, out)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -22,7 +21,9 @@ from uuvtai.capture import capture, check_arrays, check_setting, restore
 from uuvtai.config import Config
 from uuvtai.config.task import TERMS
 from uuvtai.kernels.planning.features import placed_columns
-from uuvtai.kernels.task.reward import write_results
+from uuvtai.kernels.task.reward import write_ends, write_results
+from uuvtai.kernels.teacher.leaves import write_leaf
+from uuvtai.kernels.vehicle.actuation import take_action
 from uuvtai.outcomes import OUTCOMES
 from uuvtai.sim import Sim
 
@@ -103,6 +104,8 @@ class VectorEnv:
         self._terminated, self._truncated = (
             torch.zeros(self.num_envs, dtype=torch.bool, device=self.device) for _ in range(2)
         )
+        self._ends = self._terminated.view(torch.uint8), self._truncated.view(torch.uint8)
+        self._asked = torch.zeros(self.num_envs, NUM_ACTIONS, device=self.device)
         self._info = {
             "teacher_action": sim.action,
             "leaf": torch.full_like(self._number, -1),
@@ -137,7 +140,7 @@ class VectorEnv:
             self._number += self.num_envs * rows
         self.sim.observation = self._obs
         self._begin(rows)
-        self.sim.read_into(self.sim.s.teacher.leaf, self._info["leaf"])
+        write_leaf(self.sim.io.teacher, self._info["leaf"])
         self._begun = True
         for name in ("outcome", "episode_return", "episode_steps"):
             self._info[name].masked_fill_(rows, 0)
@@ -167,16 +170,15 @@ class VectorEnv:
         self._check_action(action)
         sim, info = self.sim, self._info
         sim.observation = self._obs
-        sim.step(action.detach())
+        self._take(action.detach())
+        sim.step()
         info["final_obs"].copy_(self._obs)
         write_results(sim.io.reward, *(info[name] for name in _STEP_RESULTS))
-        torch.ne(sim.terminated, 0, out=self._terminated)
-        torch.ne(sim.truncated, 0, out=self._truncated)
-        ended = self._terminated | self._truncated
+        write_ends(sim.io.reward, *self._ends)
         told = sim.counts.any_ended
-        if bool(ended.any() if told is None else told):
-            self._go_on(ended)
-        sim.read_into(sim.s.teacher.leaf, info["leaf"])
+        if sim.counts.number(sim.s.reward.n_ended) if told is None else told:
+            self._go_on(self._terminated | self._truncated)
+        write_leaf(sim.io.teacher, info["leaf"])
         return self._obs, sim.reward, self._terminated, self._truncated, dict(info)
 
     def not_finite(
@@ -318,9 +320,17 @@ class VectorEnv:
             raise ValueError(
                 f"action must be on {self.device}, got {_described(action)}; use action.to(env.device)"
             )
-        # whatever is not finite makes the sum so; large numbers may too
-        in_doubt = self.check_actions and not math.isfinite(action.sum())
-        if in_doubt and not bool(torch.isfinite(action).all()):
+
+    def _take(self, action: torch.Tensor) -> None:
+        """Have the simulator drive by it; raises ValueError, with nothing changed, where it is to be looked
+        at and not finite."""
+        sim = self.sim
+        if not self.check_actions:
+            sim.action.copy_(action)
+            return
+        self._asked.copy_(action)
+        take_action(sim.io.actuation, self._asked, sim.action)
+        if sim.counts.number(sim.s.actuation.n_odd):
             bad = (~torch.isfinite(action).all(dim=1)).nonzero().flatten().tolist()
             raise ValueError(
                 f"action is not finite in env {', '.join(map(str, bad[:8]))}{' ...' if len(bad) > 8 else ''}"

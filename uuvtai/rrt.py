@@ -264,17 +264,23 @@ class RouteFallback:
         seed_of: Callable[[int], int],
         read: Callable[..., np.ndarray],
         count: Callable[[Any], int],
+        planner: RoutePlanner | None = None,
     ) -> int:
-        """Plan for ``route.failed``; returns how many there were. ``seed_of(env)`` gives the env's number of
-        (seed, episode, step), ``read(field, envs)`` rows of a field (``Sim.rows``), ``count(field)`` its one
-        number."""
-        from uuvtai.kernels.planning.route import keep_route, load_route
-        from uuvtai.kernels.planning.voronoi import overlay_clearance
+        """Plan for ``route.failed``; returns how many there were. Or have ``planner`` plan for the whole
+        queue, in place of the Voronoi planner and of RRT.
 
+        ``seed_of(env)`` gives the env's number of (seed, episode, step), ``read(field, envs)`` rows of a
+        field (``Sim.rows``), ``count(field)`` its one number.
+        """
+        if planner is not None:
+            return self._serve_by(planner, stages, read, count)
         route, ego, mission = stages.route.route, stages.route.ego, stages.route.mission
         n_failed = count(route.n_failed)
         if n_failed == 0:
             return 0
+        from uuvtai.kernels.planning.route import keep_route, load_route
+        from uuvtai.kernels.planning.voronoi import overlay_clearance
+
         envs = sorted(read(route.failed)[:n_failed].tolist())
         starts, goals = (read(field, envs)[:, :2].tolist() for field in (ego.pos_w, mission.goal_w))
         for env, start, goal in zip(envs, starts, goals, strict=True):
@@ -286,23 +292,21 @@ class RouteFallback:
                 load_route(stages.route, corners.astype(np.float32), env, PLANNER_RRT)
         return n_failed
 
-    def serve_by(
+    def _serve_by(
         self,
         planner: RoutePlanner,
         stages: Stages,
         read: Callable[..., np.ndarray],
         count: Callable[[Any], int],
-    ) -> None:
-        """Have ``planner`` plan for the whole queue, in place of the Voronoi planner and of RRT.
-        ``read(field, envs)`` gives rows of a field (``Sim.rows``), ``count(field)`` its one number."""
-        from uuvtai.kernels.planning.route import keep_route, load_route
-        from uuvtai.kernels.planning.voronoi import overlay_clearance
-
+    ) -> int:
         io = stages.route
         n_queue = count(io.route.n_queue)
         envs = sorted(read(io.route.queue)[:n_queue].tolist()) if n_queue else []
         if not envs:
-            return
+            return 0
+        from uuvtai.kernels.planning.route import keep_route, load_route
+        from uuvtai.kernels.planning.voronoi import overlay_clearance
+
         ends = [read(field, envs)[:, :2] - self.origin for field in (io.ego.pos_w, io.mission.goal_w)]
         bodies, radius = (
             read(f, envs) for f in (stages.voronoi.forecast.pos_w, stages.voronoi.forecast.radius_m)
@@ -323,6 +327,7 @@ class RouteFallback:
                 keep_route(io, env)
             else:
                 load_route(io, (corners + self.origin).astype(np.float32), env, PLANNER_OWN)
+        return len(envs)
 
     def plan(self, start_xy: Point, goal_xy: Point, seed: int) -> np.ndarray | None:
         """RRT on ``self.overlay`` with the config's floor and budget; None (with one warning) where OMPL is

@@ -119,8 +119,9 @@ Scene = tuple[int, int, float]
 def set_scenes(
     scene: SceneState, world_cfg: WorldConfig, scenes: Sequence[Scene], put: Put = put_by_kernel
 ) -> None:
-    """Deal the scenes out to the envs in turn, for their next scenarios. SettingError where one does not fit
-    the slots of ``world``."""
+    """Deal the scenes (none: the world's own) out to the envs in turn, for their next scenarios. SettingError
+    where one does not fit the slots of ``world``."""
+    scenes = scenes or [world_cfg.own_scene]
     for n_static, n_dynamic, speed_m_s in scenes:
         for name, wanted, slots in (
             ("static", n_static, world_cfg.static_slots),

@@ -7,7 +7,7 @@ mapping -> clearance -> planning -> teacher -> features -> reward. A pass works 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 
 import numpy as np
@@ -17,13 +17,14 @@ import torch
 from uuvtai import stack
 from uuvtai.binding import bind_all
 from uuvtai.config import Config
-from uuvtai.copying import HostCounts, copied_rows, copy_into
+from uuvtai.copying import HostCounts
 from uuvtai.initial import allocate_state, fill_constants
 from uuvtai.kernels.perception import pose
-from uuvtai.kernels.planning import clearance, exposure, features, route, triggers, voronoi
+from uuvtai.kernels.planning import clearance, features, route
 from uuvtai.kernels.task import episode, reward
 from uuvtai.kernels.vehicle import actuation, dynamics, lost_thruster
 from uuvtai.kernels.world import scenarios
+from uuvtai.native.in_a_row import Rows
 from uuvtai.native.making import adopt
 from uuvtai.rrt import RouteFallback, RoutePlanner
 from uuvtai.runtime import start_taichi
@@ -48,27 +49,25 @@ class Sim:
     def __init__(self, config: Config, num_envs: int, tree: FlatTree, device: str = "cpu") -> None:
         """Raises ValueError or MemoryError for sizes that cannot work, RuntimeError for a missing device."""
         self.config, self.num_envs = config, num_envs
-        runtime = start_taichi(device)
-        self.device = torch.device(runtime.device)
-        check_size(config, num_envs, runtime.device)
-        self.s = allocate_state(array_sizes(config, num_envs, runtime.device))
+        self.device = torch.device(start_taichi(device).device)
+        check_size(config, num_envs, self.device.type)
+        self.s = allocate_state(array_sizes(config, num_envs, self.device.type))
         self.io = bind_all(Stages, self.s, config.model_copy(update={"world": config.world.compiled()}))
         self.action = torch.zeros(num_envs, 4, device=self.device)
         self.reward = torch.zeros(num_envs, device=self.device)
         self.terminated = torch.zeros(num_envs, dtype=torch.int32, device=self.device)
-        self.truncated = torch.zeros(num_envs, dtype=torch.int32, device=self.device)
+        self.truncated = torch.zeros_like(self.terminated)
         self.observation: torch.Tensor | None = None
-        self._every_row = torch.arange(num_envs, dtype=torch.int32, device=self.device)
         self.fallback = RouteFallback(config)
         self.planner: RoutePlanner | None = None
         self.sensors: SensorSource = SimulatedSensors(config.sensors.sonar)
         self.stage_s: dict[str, float] | None = None
         self.privileged = False
-        self._watches = lost_thruster.is_watched(config.vehicle, config.actuation)
         self._memory = self.memory()
-        self.counts = HostCounts(self._memory, self.s.referee.outcome, num_envs)
         self.put = self._memory.put
-        if config.runtime.native and self.device.type == "cpu":
+        self.counts = HostCounts(self._memory, self.s.referee.outcome, num_envs)
+        self._rows = Rows() if config.runtime.native and self.device.type == "cpu" else None
+        if self._rows:
             adopt(vars(self.io).values(), self._memory, self._recipe, alone=num_envs == 1)
         self.use_tree(tree)
         self.set_scenes()
@@ -81,11 +80,9 @@ class Sim:
         stack.clear_baselines(self.s.baselines, tree.leaf, self.put)
 
     def set_scenes(self, scenes: Sequence[Scene] = ()) -> None:
-        """Deal (S, D, v) out to the envs in turn, for their next scenarios; none = the world's own.
-        ValueError where slots are too few."""
-        world = self.config.world
-        own = (world.n_static, world.n_dynamic, world.dynamic_speed_m_s)
-        set_scenes(self.s.scene, world, scenes or [own], self.put)
+        """Deal (S, D, v) out to the envs' next scenarios; none = the world's own. ValueError where slots are
+        too few."""
+        set_scenes(self.s.scene, self.config.world, scenes, self.put)
 
     def observe(self) -> torch.Tensor:
         """(n_env, n_obs), from the next pass on written for every awake row (``features.columns``)."""
@@ -94,15 +91,19 @@ class Sim:
             self.observation = torch.zeros(self.num_envs, width, device=self.device)
         return self.observation
 
-    # --------------------------------------------------------------------------------------------------- step
-
     def step(self, action: torch.Tensor | None = None) -> None:
         """One control step of every running env, driven by ``action`` (default: what the tree chose)."""
         if action is not None:
             self.action.copy_(action)
-        io, rules = self.io, self.config.episode
+        self._launched(self._move)
+        self.perceive()
+        with self._stage("reward"):
+            reward.compute_reward(self.io.reward, self.reward, self.terminated, self.truncated)
+
+    def _move(self) -> None:
+        io, c, rules = self.io, self.config, self.config.episode
         with self._stage("dynamics"):
-            if self._watches:
+            if lost_thruster.is_watched(c.vehicle, c.actuation):
                 lost_thruster.watch_thrusters(io.thrusters)
             actuation.command_thrusters(io.actuation, self.action)
             dynamics.move_vehicle(io.dynamics, rules.control_dt_s, rules.substeps)
@@ -110,9 +111,6 @@ class Sim:
             episode.advance_clock(io.episode)
             scenarios.move_obstacles(io.world)
             episode.judge(io.episode)
-        self.perceive()
-        with self._stage("reward"):
-            reward.compute_reward(io.reward, self.reward, self.terminated, self.truncated)
 
     def perceive(self) -> None:
         """Sensing to teacher for the rows that are awake.
@@ -135,6 +133,13 @@ class Sim:
                 pose.correct_pose(io.pose)
         with self._stage("depth"):
             self.sensors.sense_depth(io)
+        self._launched(self._see)
+        with self._stage("planning"):
+            self.fallback.serve(io, self._plan_seed, self.rows, self.counts.number, self.planner)
+        self._launched(self._act)
+
+    def _see(self) -> None:
+        io, c = self.io, self.config
         with self._stage("tracking"):
             stack.track(io, c, self.privileged)
         with self._stage("mapping"):
@@ -142,14 +147,11 @@ class Sim:
         with self._stage("clearance"):
             clearance.compute_clearance(io.clearance)
         with self._stage("planning"):
-            if c.quiet.weight_seen > 0:
-                exposure.average_traffic(io.exposure)
-            triggers.fire_triggers(io.triggers)
-            if self.planner is None:
-                voronoi.plan_routes(io.voronoi)
-                self.fallback.serve(io, self._plan_seed, self.rows, self.counts.number)
-            else:
-                self.fallback.serve_by(self.planner, io, self.rows, self.counts.number)
+            stack.plan(io, c, self.planner is None)
+
+    def _act(self) -> None:
+        io, c = self.io, self.config
+        with self._stage("planning"):
             route.follow_route(io.route)
         with self._stage("teacher"):
             stack.choose(io, self.tree.leaf, self.action)
@@ -157,9 +159,16 @@ class Sim:
             with self._stage("features"):
                 stack.observe(io, c.features, self.observation)
 
+    def _launched(self, work: Callable[[], None]) -> None:
+        """Do what is nothing but launches, with all that decides which."""
+        shown = self.observation, self.privileged, self.planner is None
+        if self._rows is None or self.stage_s is not None:
+            work()
+        else:
+            self._rows.play(work, (self.io, self.config, self.tree, self.action, *shown))
+
     def reset(self, mask: torch.Tensor, seed: torch.Tensor, number: torch.Tensor) -> None:
-        """Begin episode ``number`` of ``seed`` in the rows where ``mask`` is 1 (all int32, shape (n_env,)),
-        up to the first observation."""
+        """Begin episode ``number`` of ``seed`` where ``mask`` is 1, all int32 (n_env,), to a first look."""
         io = self.io
         if self.planner is not None:
             self.planner.reset(mask)
@@ -195,18 +204,9 @@ class Sim:
         """Seed of the fallback planner's random numbers: a function of the episode's key and step alone."""
         return (int(self.s.episode.key[env]) + 0x9E3779B1 * int(self.s.clock.step[env])) & 0x7FFFFFFF
 
-    # ----------------------------------------------------------------------------------------------- reading
-
     def rows(self, field: ti.Field, envs: list[int] | None = None) -> np.ndarray:
         """Host copy of these rows of a field alone, shape (len(envs), ...); None = all envs."""
-        if self.device.type == "cpu":
-            return self._memory.rows(field, slice(self.num_envs) if envs is None else envs)
-        rows = self._every_row if envs is None else torch.tensor(envs, dtype=torch.int32, device=self.device)
-        return copied_rows(field, rows)
-
-    def read_into(self, field: ti.Field, out: torch.Tensor) -> None:
-        """Copy a whole field into ``out`` on the device, without a wait or a copy through the host."""
-        copy_into(out, field, self._every_row, self._memory)
+        return self.counts.rows(field, envs)
 
     def memory(self) -> Memory:
         """Where every array lies, when all kernels are done: for a capture."""

@@ -28,7 +28,7 @@ from uuvtai.kernels.perception import (
     spotting,
     tracking,
 )
-from uuvtai.kernels.planning import exposure, features, route
+from uuvtai.kernels.planning import exposure, features, route, triggers, voronoi
 from uuvtai.kernels.privileged import true_map, true_tracks
 from uuvtai.kernels.teacher import evasion, leaves, threats
 from uuvtai.sensing import forget_readings
@@ -70,6 +70,15 @@ def draw_map(stages: Stages, config: Config) -> None:
     mapping.update_map(stages.mapping)
     if config.mapping.stamp > 0:
         true_map.stamp_truth(stages.true_map)
+
+
+def plan(stages: Stages, config: Config, own: bool) -> None:
+    """Which routes are wanted; routes by the ``own`` planner."""
+    if config.quiet.weight_seen > 0:
+        exposure.average_traffic(stages.exposure)
+    triggers.fire_triggers(stages.triggers)
+    if own:
+        voronoi.plan_routes(stages.voronoi)
 
 
 def choose(stages: Stages, used: Collection[int], action: torch.Tensor) -> None:

@@ -150,8 +150,8 @@ def _simulator(num_envs: int, world: str, sensors: str) -> Any:
 
     class Rehearsed(module.Sim):
         def rows(self, field: ti.Field, envs: list[int] | None = None) -> np.ndarray:
-            chosen = self._every_row if envs is None else torch.tensor(envs, dtype=torch.int32)
-            return copied_rows(field, chosen)
+            chosen = range(self.num_envs) if envs is None else envs
+            return copied_rows(field, torch.tensor(chosen, dtype=torch.int32))
 
     module.torch = _HostTorch()  # type: ignore[assignment]
     module.Memory = DeviceMemory  # type: ignore[misc]

@@ -106,6 +106,7 @@ class _KeptRoutes:
         seed_of: Callable[[int], int],
         read: Callable[..., np.ndarray],
         count: Callable[[Any], int],
+        planner: Any = None,
     ) -> int:
         """As ``RouteFallback.serve``."""
         if failed := count(stages.route.route.n_failed):

@@ -115,6 +115,7 @@ class _TapeRecorder:
         seed_of: Callable[[int], int],
         read: Callable[..., Any],
         count: Callable[[Any], int],
+        planner: Any = None,
     ) -> int:
         """In place of the fallback planner."""
         self.note("route")

@@ -176,6 +176,11 @@ class WorldConfig(Section, Truth):
         return self
 
     @property
+    def own_scene(self) -> tuple[int, int, float]:
+        """(S, D, v [m/s]): numbers of its obstacles, and the speed of those that move."""
+        return self.n_static, self.n_dynamic, self.dynamic_speed_m_s
+
+    @property
     def static_slots(self) -> int:
         """Slots kept for random static obstacles."""
         return _roomy(self.n_static) if self.static_capacity is None else self.static_capacity

@@ -68,8 +68,7 @@ def _held_out_in_worlds(config: LearningConfig) -> tuple[str, int]:
 
 def scenes_of(config: LearningConfig) -> str:
     """Numbers and speeds of the obstacles that were learnt among."""
-    world = config.world
-    scenes = config.train.scenes or ((world.n_static, world.n_dynamic, world.dynamic_speed_m_s),)
+    scenes = config.train.scenes or (config.world.own_scene,)
     return "; ".join(f"S = {s}, D = {d}, v = {v:g} m/s" for s, d, v in scenes)
 
 

@@ -62,9 +62,7 @@ class ChooserTrainer:
         self.memory = ChooserMemory(config.chooser.memory, N_BODY, BODY_WIDTH, EGO_COLUMNS + TREE_WIDTH)
         self.recent = Recent(OUTCOMES, ())
         self.iteration = self.env_steps = 0
-        world = config.world
-        own = (world.n_static, world.n_dynamic, world.dynamic_speed_m_s)
-        self._all_scenes: tuple[Scene, ...] = tuple(config.train.scenes) or (own,)
+        self._all_scenes: tuple[Scene, ...] = tuple(config.train.scenes) or (config.world.own_scene,)
         self._places: dict[str, tuple[Sim, SetPilot]] = {
             world: (sim, set_pilot_of(self._source, sim)) for world, sim in (sims or {}).items()
         }

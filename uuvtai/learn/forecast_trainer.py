@@ -57,8 +57,7 @@ class ForecastTrainer:
         self._truth = torch.zeros(size, len(TIMES_S), 2)
         self.recent = Recent(OUTCOMES, ())
         self.iteration = self.env_steps = self.kept = self.seen = 0
-        own = (config.world.n_static, config.world.n_dynamic, config.world.dynamic_speed_m_s)
-        self._scenes: tuple[Scene, ...] = tuple(config.train.scenes) or (own,)
+        self._scenes: tuple[Scene, ...] = tuple(config.train.scenes) or (config.world.own_scene,)
         self._sims: dict[str, Sim] = dict(sims or {})
 
     def iterate(self) -> dict[str, float]:

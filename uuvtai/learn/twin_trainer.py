@@ -67,9 +67,7 @@ class TwinTrainer:
         self.observation_table = SET_TABLE
         torch.set_flush_denormal(True)
         self.generator = torch.Generator().manual_seed(config.train.seed)
-        world = config.world
-        scenes = config.train.scenes or ((world.n_static, world.n_dynamic, world.dynamic_speed_m_s),)
-        self._scenes = scenes
+        self._scenes = scenes = config.train.scenes or (config.world.own_scene,)
         self.twin = _world_to_learn_in(config, scenes, bank, sims)
         self.actor = SetActor(BODY_WIDTH, EGO_COLUMNS, config, self.generator)
         self.critic = SetCritic(BODY_WIDTH, EGO_COLUMNS, TRUTH_WIDTH, config, self.generator)

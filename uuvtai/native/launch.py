@@ -7,6 +7,7 @@ import contextlib
 import ctypes
 import dataclasses
 import functools
+import threading
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -66,28 +67,36 @@ class NativeLaunch:
     ) -> None:
         """``values``: what it is told at each launch, as ``given`` has them, and numbers of the config."""
         self.program: Any = impl.get_runtime().prog
+        self.machine = machine
         self._arguments, self._runtime = arguments, runtime
         self._tasks = (ctypes.c_void_p * len(tasks))(*tasks)
-        self._packed, self._tensors = _packed(values)
-        self._launch = functools.partial(
-            machine.launch,
+        self._packed, self.tensors = _packed(values)
+        self.entry = (
             ctypes.addressof(self._tasks),
             len(tasks),
             ctypes.addressof(self._packed),
             ctypes.addressof(runtime),
         )
+        """what the machine is told: tasks, how many, arguments, runtime"""
+        self._launch = functools.partial(machine.launch, *self.entry)
+
+    def look_at_tensors(self) -> None:
+        """Where they lie now, for a launch."""
+        for place, tensor in self.tensors:
+            place.data = tensor.data_ptr()
+            place.shape[:] = tensor.shape
 
     def again(self) -> None:
         """Launch it."""
-        for place, tensor in self._tensors:
-            place.data = tensor.data_ptr()
-            place.shape[:] = tensor.shape
+        self.look_at_tensors()
         self._launch()
 
 
 Launch = TaichiLaunch | NativeLaunch
 native: list[Any] = []
 """the process's ``Native``, when a simulator has asked for it"""
+_noting: list[tuple[int, list[Launch | None]]] = []
+"""thread whose launches are being noted, and these; at most one"""
 
 
 def quick_launch(launch: _T) -> _T:
@@ -106,16 +115,29 @@ def quick_launch(launch: _T) -> _T:
         found = known.get(key)
         if found is not None and found.program is impl.get_runtime().prog:
             found.again()
-            return
-        found = _first(launch, kernel, arguments)  # type: ignore[arg-type]
-        if len(known) >= MOST_LAUNCHES:
-            known.clear()
-        if found is not None:
-            known[key] = found
+        else:
+            found = _first(launch, kernel, arguments)  # type: ignore[arg-type]
+            if len(known) >= MOST_LAUNCHES:
+                known.clear()
+            if found is not None:
+                known[key] = found
+        if _noting and _noting[0][0] == threading.get_ident():
+            _noting[0][1].append(found)
 
     again.__name__, again.__doc__ = launch.__name__, launch.__doc__  # type: ignore[attr-defined]
     again._primal = kernel  # type: ignore[attr-defined]  # as Taichi has it; aboard/tape.py looks for it
     return again  # type: ignore[return-value]
+
+
+def noted(work: Callable[[], None]) -> list[Launch | None]:
+    """Do it; what this thread has launched meanwhile, None where Taichi had to look."""
+    launches: list[Launch | None] = []
+    _noting.insert(0, (threading.get_ident(), launches))
+    try:
+        work()
+    finally:
+        _noting.pop(0)
+    return launches
 
 
 def with_cse(where: Callable[[Any], bool] = lambda _bundle: True) -> Callable[[_T], _T]:

@@ -85,6 +85,31 @@ done:
   ret void
 }
 
+; kernels one after another
+%entry = type { void (%context*)**, i32, i8*, i8* }
+define void @uuv_launch_row(%entry* %entries, i32 %count) {
+entry:
+  br label %next
+next:
+  %i = phi i32 [ 0, %entry ], [ %i.next, %do ]
+  %more = icmp slt i32 %i, %count
+  br i1 %more, label %do, label %done
+do:
+  %at.tasks = getelementptr %entry, %entry* %entries, i32 %i, i32 0
+  %at.count = getelementptr %entry, %entry* %entries, i32 %i, i32 1
+  %at.arguments = getelementptr %entry, %entry* %entries, i32 %i, i32 2
+  %at.runtime = getelementptr %entry, %entry* %entries, i32 %i, i32 3
+  %tasks = load void (%context*)**, void (%context*)*** %at.tasks
+  %tasks.count = load i32, i32* %at.count
+  %arguments = load i8*, i8** %at.arguments
+  %runtime = load i8*, i8** %at.runtime
+  call void @uuv_launch(void (%context*)** %tasks, i32 %tasks.count, i8* %arguments, i8* %runtime)
+  %i.next = add i32 %i, 1
+  br label %next
+done:
+  ret void
+}
+
 ; the tasks of a kernel, one after another
 define void @uuv_launch(void (%context*)** %tasks, i32 %count, i8* %arguments, i8* %runtime) {
 entry:
@@ -145,10 +170,11 @@ class Machine:
         self._number = itertools.count()
         self._pool, self._alone = ctypes.c_int32(threads), ctypes.c_int32(1)
         self._temporaries = ctypes.create_string_buffer(_TEMPORARY_BYTES)
-        names = ["uuv_launch", "uuv_parallel_for"]
-        launcher, self._parallel_for = self.tasks_of(self.object_of(_LAUNCHER), names)
+        names = ["uuv_launch", "uuv_launch_row", "uuv_parallel_for"]
+        launcher, in_a_row, self._parallel_for = self.tasks_of(self.object_of(_LAUNCHER), names)
         address = ctypes.c_void_p
         self.launch = ctypes.CFUNCTYPE(None, address, ctypes.c_int32, address, address)(launcher)
+        self.launch_row = ctypes.CFUNCTYPE(None, address, ctypes.c_int32)(in_a_row)
 
     def runtime(self, root: int, alone: bool = False) -> Any:
         """What kernels take for Taichi's runtime: a buffer, to be kept while they may be launched. Every tree

@@ -62,6 +62,8 @@ class RewardState:
     """sum of rewards over the episode"""
     last_remaining_m: ti.Field = array("n_env")
     """[m] route length that was still ahead in the last step, negative = unknown"""
+    n_ended: ti.Field = array(dtype=ti.i32, scratch=True)
+    """envs whose episode has ended"""
 
 
 @dataclass(frozen=True, eq=False)

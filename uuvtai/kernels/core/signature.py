@@ -21,10 +21,11 @@ if TYPE_CHECKING:
     Out = Annotated[_T, "read and written"]
     Const = Annotated[_T, "compile-time constant"]
     Bundle = Annotated[_T, "what a stage reads and writes"]
-    FloatVector = FloatMatrix = IntVector = AnyVector = AnyTensor = Any
+    FloatVector = FloatMatrix = IntVector = ByteVector = AnyVector = AnyTensor = Any
 else:
     FloatVector, FloatMatrix = ti.types.ndarray(dtype=ti.f32, ndim=1), ti.types.ndarray(dtype=ti.f32, ndim=2)
     IntVector, AnyVector = ti.types.ndarray(dtype=ti.i32, ndim=1), ti.types.ndarray(ndim=1)
+    ByteVector = ti.types.ndarray(dtype=ti.u8, ndim=1)
     AnyTensor = ti.types.ndarray()
 
     class _Marker:

@@ -13,6 +13,7 @@ from uuvtai.kernels.core.geometry import rotation_wb
 from uuvtai.kernels.core.signature import (
     AnyVector,
     Bundle,
+    ByteVector,
     Const,
     FloatMatrix,
     FloatVector,
@@ -175,3 +176,17 @@ def write_results(
         episode_return[env] = ti.cast(io.reward.episode_return[env], ti.f32)
         episode_steps[env] = io.clock.step[env]
         outcome[env] = io.referee.outcome[env]
+
+
+@quick_launch
+@ti.kernel
+def write_ends(io: Bundle[RewardIO], terminated: ByteVector, truncated: ByteVector):
+    """Which episodes have ended, and how: 1 or 0."""
+    io.reward.n_ended[None] = 0
+    for env in range(terminated.shape[0]):
+        outcome = io.referee.outcome[env]
+        is_late = outcome == TIMEOUT
+        is_over = outcome == SUCCESS or is_failure(outcome) == 1
+        terminated[env], truncated[env] = ti.cast(is_over, ti.u8), ti.cast(is_late, ti.u8)
+        if is_over or is_late:
+            ti.atomic_add(io.reward.n_ended[None], 1)

@@ -6,7 +6,7 @@ import taichi as ti
 
 from uuvtai import tree_codes as codes
 from uuvtai.kernels.core.geometry import FAR_M, PI, quaternion_wb, rotation_wb, turned_z, wrapped_angle
-from uuvtai.kernels.core.signature import AnyTensor, Bundle, spread
+from uuvtai.kernels.core.signature import AnyTensor, Bundle, IntVector, spread
 from uuvtai.kernels.teacher.bundles import TeacherIO
 from uuvtai.kernels.teacher.sight import kept_in_sight
 from uuvtai.kernels.teacher.threats import cruising_speed
@@ -35,6 +35,14 @@ def reset_teacher(io: Bundle[TeacherIO]):
             for number in range(ti.static(io.teacher.tuned.shape[1])):
                 io.teacher.tuned[env, number] = io.table.factor[number]
             _reset_blackboard(env, io)
+
+
+@quick_launch
+@ti.kernel
+def write_leaf(io: Bundle[TeacherIO], leaf: IntVector):
+    """The node that drives each env, -1 = none."""
+    for env in range(leaf.shape[0]):
+        leaf[env] = io.teacher.leaf[env]
 
 
 @ti.func

@@ -16,6 +16,9 @@ from uuvtai.kernels.vehicle.lost_thruster import is_watched, vertical_pair
 from uuvtai.kernels.vehicle.rotor import rpm_of_thrust, thrust_limits, thrust_of_rpm
 from uuvtai.native.launch import quick_launch
 
+_LARGEST = 3.4028234663852886e38
+"""of float32"""
+
 
 @quick_launch
 @ti.kernel
@@ -31,6 +34,22 @@ def command_thrusters(io: Bundle[ActuationIO], action: FloatMatrix):
                     raw = ti.Vector([action[env, 0], action[env, 1], action[env, 2], action[env, 3]])
                     io.actuation.command[env] = scaled_command(raw, io)
             _drive(packet * lanes, lanes, io)
+
+
+@quick_launch
+@ti.kernel
+def take_action(io: Bundle[ActuationIO], asked: FloatMatrix, action: FloatMatrix):
+    """``action`` becomes ``asked`` (both (n_env, 4)) where every number of it is finite; actuation.n_odd says
+    how many are not."""
+    io.actuation.n_odd[None] = 0
+    for env in range(asked.shape[0]):
+        for axis in ti.static(range(4)):
+            if not ti.abs(asked[env, axis]) <= _LARGEST:
+                ti.atomic_add(io.actuation.n_odd[None], 1)
+    for env in range(asked.shape[0]):
+        if io.actuation.n_odd[None] == 0:
+            for axis in ti.static(range(4)):
+                action[env, axis] = asked[env, axis]
 
 
 @quick_launch
