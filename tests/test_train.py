@@ -11,7 +11,7 @@ from tests.point_env import PointEnv
 from tests.test_distributed import two
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learn.distributed import Processes
-from uuvtai.learn.guard import TrainingError
+from uuvtai.learn.guard import Guard, TrainingError
 from uuvtai.learn.packing import pack
 from uuvtai.learn.train import Trainer
 
@@ -197,6 +197,27 @@ def test_first_inputs_of_an_episode_have_no_prediction_behind_them():
     ended, x = trainer.rollout.ended[:-1], trainer.rollout.x[1:]
     assert ended.any()
     assert not x[ended][:, -2:].any() and (x[~ended][:, -1] > 0).all()
+
+
+@pytest.mark.parametrize("of_all", [False, True])
+def test_large_numbers_whose_sum_is_infinite_are_sound(of_all):
+    guard = Guard([("range", slice(0, 3))], 2, 3, torch.device("cpu"))
+    large, out = torch.tensor([[3e38, 3e38, 1.0], [0.0, 2.0, -4.0]]), torch.zeros(2, 3)
+    if of_all:
+        bad = guard.observation(large, torch.zeros(3), out)
+    else:
+        bad = guard.values("reward", large, out)
+    assert bad.tolist() == [False, False] and torch.equal(out, large) and guard.take() == {}
+
+
+def test_what_is_sound_clears_what_was_there():
+    """The rows that the guard says are bad are no longer so a step later."""
+    guard = Guard([("range", slice(0, 2))], 2, 3, torch.device("cpu"))
+    out, fill = torch.zeros(2, 2), torch.full((2,), 7.0)
+    bad = guard.observation(torch.tensor([[1.0, math.inf], [2.0, 3.0]]), fill, out).clone()
+    assert bad.tolist() == [True, False] and out.tolist() == [[1.0, 7.0], [2.0, 3.0]]
+    assert guard.observation(torch.ones(2, 2), fill, out).tolist() == [False, False]
+    assert out.tolist() == [[1.0, 1.0], [1.0, 1.0]] and guard.take() == {"non_finite/range": 1.0}
 
 
 # -------------------------------------------------------------------------------------------------- processes

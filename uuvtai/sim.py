@@ -55,8 +55,8 @@ class Sim:
         self.io = bind_all(Stages, self.s, config.model_copy(update={"world": config.world.compiled()}))
         self.action = torch.zeros(num_envs, 4, device=self.device)
         self.reward = torch.zeros(num_envs, device=self.device)
-        self.terminated = torch.zeros(num_envs, dtype=torch.int32, device=self.device)
-        self.truncated = torch.zeros_like(self.terminated)
+        whole = torch.zeros(5, num_envs, dtype=torch.int32, device=self.device)
+        self.terminated, self.truncated, *self._asked = whole
         self.observation: torch.Tensor | None = None
         self.fallback = RouteFallback(config)
         self.planner: RoutePlanner | None = None
@@ -80,8 +80,7 @@ class Sim:
         stack.clear_baselines(self.s.baselines, tree.leaf, self.put)
 
     def set_scenes(self, scenes: Sequence[Scene] = ()) -> None:
-        """Deal (S, D, v) out to the envs' next scenarios; none = the world's own. ValueError where slots are
-        too few."""
+        """Deal (S, D, v) to the envs' next scenarios; none: the world's own. ValueError: too few slots."""
         set_scenes(self.s.scene, self.config.world, scenes, self.put)
 
     def observe(self) -> torch.Tensor:
@@ -183,13 +182,14 @@ class Sim:
 
     def draw(self, mask: torch.Tensor, seed: torch.Tensor, number: torch.Tensor) -> None:
         """Draw the scenarios of a ``reset`` to look at them, and nothing more: no row is ready for a step."""
-        episode.begin_episodes(self.io.episode, mask, seed, number)
+        for kept, given in zip(self._asked, (mask, seed, number), strict=True):
+            kept.copy_(given)
+        episode.begin_episodes(self.io.episode, *self._asked)
         with self._stage("world"):
             scenarios.generate_scenarios(self.io.world)
             scenarios.move_obstacles(self.io.world)
-        faults = self.s.world.faults
-        if self.counts.has_any(faults, mask):
-            check_scenarios(self.rows(faults)[mask.cpu().numpy() == 1])
+        if self.counts.has_any(self.s.world.faults, mask):
+            check_scenarios(self.rows(self.s.world.faults)[mask.cpu().numpy() == 1])
 
     def sleep_ended(self) -> None:
         """Put the rows whose episode has ended to sleep; they cost nothing until their next reset."""

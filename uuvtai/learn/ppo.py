@@ -33,8 +33,8 @@ ADAM_EPS = 1e-5
 RATE_FACTOR, RATE_BOUNDS = 1.5, (1e-5, 1e-2)
 """steps and bounds of the KL-adaptive learning rate (rsl_rl)"""
 CACHE_ROWS = 2048
-"""rows of a minibatch in one pass on a CPU: their activations stay in the cache and in memory that is used
-again, and the gradients add up to the same sum"""
+"""rows of a minibatch in one pass on a CPU, twice as many in bfloat16: their activations stay in the cache
+and in memory that is used again, and the gradients add up to the same sum"""
 
 
 def gae(
@@ -266,7 +266,8 @@ class Ppo:
         self.optimiser.zero_grad(set_to_none=True)
         count = batch.valid.sum().clamp(min=1.0)
         kl_before = sums[_SUMS.index("approx_kl")].clone()
-        rows = CACHE_ROWS if self.rate.device.type == "cpu" else len(batch.valid)
+        device = self.rate.device.type
+        rows = CACHE_ROWS * (1 + in_bfloat16(self.config, device)) if device == "cpu" else len(batch.valid)
         for first in range(0, len(batch.valid), rows):
             block = batch.rows(slice(first, first + rows))
             self._add_gradients(block, count, distill_weight, surrogate, sums)

@@ -18,14 +18,15 @@ class SimStack:
         self.sim = sim
         memory = sim.memory()
         self.views = memory.views(memory.read(), scratch=True)
+        self._asked = list(torch.zeros(3, sim.num_envs, dtype=torch.int32, device=sim.device))
 
     def begin(self, mission: Mission, sensors: SensorSource) -> None:
         """Begin in row 0 alone: ``sensors`` delivers what is sensed there. The other rows sleep."""
         sim = self.sim
-        mask, seed, number = torch.zeros(3, sim.num_envs, dtype=torch.int32, device=sim.device)
-        mask[0], seed[0], number[0] = 1, mission.seed, mission.episode
+        for asked, of_row in zip(self._asked, (1, mission.seed, mission.episode), strict=True):
+            asked[0] = of_row
         sim.sleep()
-        episode.begin_episodes(sim.io.episode, mask, seed, number)
+        episode.begin_episodes(sim.io.episode, *self._asked)
         self.place(mission)
         stack.forget(sim.io, sim.config)
         sim.sensors = sensors

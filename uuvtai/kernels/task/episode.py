@@ -14,6 +14,7 @@ from uuvtai.outcomes import COLLISION, OUT_OF_TANK, OUTCOMES, RUNNING, SUCCESS, 
 __all__ = ["COLLISION", "OUTCOMES", "OUT_OF_TANK", "RUNNING", "SUCCESS", "TIMEOUT", "TTC"]
 
 
+@quick_launch
 @ti.kernel
 def begin_episodes(io: Bundle[EpisodeIO], mask: IntVector, seed: IntVector, number: IntVector):
     """Give the rows of ``mask`` a new episode and wake only them."""
