@@ -118,6 +118,31 @@ def test_only_what_was_made_by_machine_code_becomes_a_row(small):
     assert rows_of(small.sim).keys() >= {"_act"} and rows._known["_act"]._on == ("what decides",)
 
 
+def test_no_kernel_of_theirs_is_left_out(small, monkeypatch):
+    """One without ``quick_launch`` would not be noted."""
+    launched, sim = [], small.sim
+    small.begin(range(small.N))
+    sim.observe()
+    sim.step()
+
+    def told(kernel):
+        def tell(*arguments):
+            launched.append(kernel.__name__)
+            kernel(*arguments)
+
+        return tell
+
+    for module in [module for name, module in sys.modules.items() if name.startswith("uuvtai.kernels.")]:
+        for name, kernel in list(vars(module).items()):
+            if hasattr(kernel, "_primal"):
+                monkeypatch.setattr(module, name, told(kernel))
+    for privileged in (False, True):
+        monkeypatch.setattr(sim, "privileged", privileged)
+        for work in (sim._move, sim._see, sim._act):
+            launched.clear()
+            assert len(noted(work)) == len(launched) > 3, work.__name__
+
+
 def test_tensors_may_lie_elsewhere_the_next_time(small):
     """Torch may give a tensor new memory under its old name."""
     sim = small.sim
