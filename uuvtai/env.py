@@ -330,7 +330,7 @@ class VectorEnv:
             return
         self._asked.copy_(action)
         take_action(sim.io.actuation, self._asked, sim.action)
-        if sim.counts.number(sim.s.actuation.n_odd):
+        if sim.counts.number(sim.s.actuation.n_not_finite):
             bad = (~torch.isfinite(action).all(dim=1)).nonzero().flatten().tolist()
             raise ValueError(
                 f"action is not finite in env {', '.join(map(str, bad[:8]))}{' ...' if len(bad) > 8 else ''}"

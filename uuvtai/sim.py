@@ -159,15 +159,15 @@ class Sim:
                 stack.observe(io, c.features, self.observation)
 
     def _launched(self, work: Callable[[], None]) -> None:
-        """Do what is nothing but launches, with all that decides which."""
-        shown = self.observation, self.privileged, self.planner is None
+        """Do ``work``, which is nothing but launches; by what ``decides`` about them they are known again."""
+        decides = self.io, self.config, self.tree, self.action, self.observation, self.privileged
         if self._rows is None or self.stage_s is not None:
             work()
         else:
-            self._rows.play(work, (self.io, self.config, self.tree, self.action, *shown))
+            self._rows.play(work, (*decides, self.planner is None))
 
     def reset(self, mask: torch.Tensor, seed: torch.Tensor, number: torch.Tensor) -> None:
-        """Begin episode ``number`` of ``seed`` where ``mask`` is 1, all int32 (n_env,), to a first look."""
+        """Begin episode ``number`` of ``seed`` where ``mask`` is 1 (int32, (n_env,)), and look around."""
         io = self.io
         if self.planner is not None:
             self.planner.reset(mask)

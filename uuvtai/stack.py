@@ -72,12 +72,12 @@ def draw_map(stages: Stages, config: Config) -> None:
         true_map.stamp_truth(stages.true_map)
 
 
-def plan(stages: Stages, config: Config, own: bool) -> None:
-    """Which routes are wanted; routes by the ``own`` planner."""
+def plan(stages: Stages, config: Config, by_voronoi: bool) -> None:
+    """Which envs want a route; ``by_voronoi``: plan them, else they wait for the host's planner."""
     if config.quiet.weight_seen > 0:
         exposure.average_traffic(stages.exposure)
     triggers.fire_triggers(stages.triggers)
-    if own:
+    if by_voronoi:
         voronoi.plan_routes(stages.voronoi)
 
 

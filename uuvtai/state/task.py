@@ -63,7 +63,7 @@ class RewardState:
     last_remaining_m: ti.Field = array("n_env")
     """[m] route length that was still ahead in the last step, negative = unknown"""
     n_ended: ti.Field = array(dtype=ti.i32, scratch=True)
-    """envs whose episode has ended"""
+    """envs whose episode had ended at the last ``write_ends``"""
 
 
 @dataclass(frozen=True, eq=False)

@@ -77,8 +77,8 @@ class ActuationState(Truth):
     """[N m] moment of the ideal attitude hold"""
     external_wrench_b: ti.Field = array("n_env", vec=6)
     """[N, N m] applied from outside (experiments); zero in navigation"""
-    n_odd: ti.Field = array(dtype=ti.i32, scratch=True)
-    """how many numbers of the actions that were asked for last are not finite"""
+    n_not_finite: ti.Field = array(dtype=ti.i32, scratch=True)
+    """numbers that are not finite in the actions that were asked for last"""
 
 
 @dataclass(frozen=True, eq=False)

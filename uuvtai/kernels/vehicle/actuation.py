@@ -39,15 +39,15 @@ def command_thrusters(io: Bundle[ActuationIO], action: FloatMatrix):
 @quick_launch
 @ti.kernel
 def take_action(io: Bundle[ActuationIO], asked: FloatMatrix, action: FloatMatrix):
-    """``action`` becomes ``asked`` (both (n_env, 4)) where every number of it is finite; actuation.n_odd says
-    how many are not."""
-    io.actuation.n_odd[None] = 0
+    """``action`` becomes ``asked``, both (n_env, 4), if every number of it is finite; actuation.n_not_finite
+    says how many are not."""
+    io.actuation.n_not_finite[None] = 0
     for env in range(asked.shape[0]):
         for axis in ti.static(range(4)):
             if not ti.abs(asked[env, axis]) <= _LARGEST:
-                ti.atomic_add(io.actuation.n_odd[None], 1)
+                ti.atomic_add(io.actuation.n_not_finite[None], 1)
     for env in range(asked.shape[0]):
-        if io.actuation.n_odd[None] == 0:
+        if io.actuation.n_not_finite[None] == 0:
             for axis in ti.static(range(4)):
                 action[env, axis] = asked[env, axis]
 
