@@ -661,6 +661,14 @@ def test_the_command_flies_and_tells(capfd, monkeypatch, tmp_path, words):
     assert (tmp_path / "a.mcap").exists()
 
 
+def test_arming_is_refused_and_nothing_is_opened(capfd, monkeypatch, tmp_path):
+    monkeypatch.setattr(onboard_loop, "fly", lambda *_: pytest.fail("it flies"))
+    place = ["--mavlink", f"udp:127.0.0.1:{free_port()}", "--log", str(tmp_path / "a.mcap")]
+    code, _, err = uuv(capfd, *BASE[:1], *BASE[3:], *place, "--arm")
+    assert code == 2 and "--arm is refused" in err and "dry run" in err
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_log_that_cannot_be_written_any_more_does_not_stop_the_flight(flight, monkeypatch):
     one = flight()
     one.run(3)

@@ -332,6 +332,11 @@ class FlightGroup:
         """UsageError, LinkError."""
         from uuvtai.link.flight_plan import FlightPlan
 
+        if self.arm:
+            raise UsageError(
+                "--arm is refused for now: an audit found that Ctrl-C leaves an armed vehicle driving and that "
+                "old readings reach the thrusters (docs/safety.md); leave --arm out for a dry run"
+            )
         arguments.refuse_odd_rate(self.rate)
         return FlightPlan.typed(
             config,

@@ -283,7 +283,7 @@ Heading = Annotated[
     ),
 ]
 Arm = Annotated[
-    bool, Option("--arm", help="Arm and drive. Without it nothing that moves the vehicle is ever sent.")
+    bool, Option("--arm", help="Arm and drive: refused for now (docs/safety.md). Dry runs send nothing that moves the vehicle.")
 ]
 FenceBox = Annotated[
     str | None,
