@@ -5,6 +5,7 @@ import dataclasses
 import re
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -335,3 +336,91 @@ def test_what_learns_records_and_reports_starts_no_taichi():
     )
     assert done.returncode == 0, done.stderr
     assert int(done.stdout) > 100
+
+
+def module_of(path):
+    return ".".join(("uuvtai", *path.relative_to(PACKAGE).with_suffix("").parts)).removesuffix(".__init__")
+
+
+@cache
+def nodes():
+    """Module -> nodes of its syntax tree. Not made at import: every process of the gate imports every
+    file."""
+    return {module_of(path): nodes_of(path) for path in sorted(PACKAGE.rglob("*.py"))}
+
+
+def imports():
+    """Module -> modules of ours that it imports, inside functions too."""
+    found = {}
+    for module, inside in nodes().items():
+        named = set()
+        for node in inside:
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("uuvtai"):
+                named |= {
+                    f"{node.module}.{a.name}" if f"{node.module}.{a.name}" in nodes() else node.module
+                    for a in node.names
+                }
+            elif isinstance(node, ast.Import):
+                named |= {a.name for a in node.names if a.name.startswith("uuvtai")}
+        found[module] = named - {module}
+    return found
+
+
+def circle_in(graph):
+    """Modules along one circle of a graph, or nothing."""
+    left = {node: {other for other in others if other in graph} for node, others in graph.items()}
+    while free := [node for node, others in left.items() if not others & left.keys()]:
+        for node in free:
+            del left[node]
+    return sorted(left)
+
+
+def test_no_module_imports_itself_by_a_detour():
+    graph = imports()
+    assert sum(map(len, graph.values())) > 900
+    assert not circle_in(graph)
+
+
+@pytest.mark.parametrize(
+    "graph", [{"a": {"b"}, "b": {"a"}}, {"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}]
+)
+def test_a_circle_would_be_found(graph):
+    assert {"a", "b"} <= set(circle_in(graph))
+
+
+@cache
+def defined_in(module):
+    """Names that a module's own text defines, wherever in it."""
+    found = set()
+    for node in nodes()[module]:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            found.add(node.name)
+        elif isinstance(node, ast.ImportFrom | ast.Import):
+            found |= {alias.asname or alias.name for alias in node.names}
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            found.add(node.id)
+    return found
+
+
+def test_what_is_imported_is_there():
+    """Also inside functions and under conditions, which no other test may come by."""
+    missing = [
+        f"{module} imports {node.module}.{alias.name}"
+        for module, inside in nodes().items()
+        for node in inside
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("uuvtai")
+        for alias in node.names
+        if f"{node.module}.{alias.name}" not in nodes() and alias.name not in defined_in(node.module)
+    ]
+    assert not missing
+
+
+def test_every_place_of_the_walk_through_the_house_is_there():
+    text = (ROOT / "CONTRIBUTING.md").read_text()
+    walk = text[text.index("## A walk through the house") : text.index("## What a new thing touches")]
+    places = re.findall(r"`([\w/]+)\.py(?::(\w+))?`", walk)
+    assert len(places) > 30
+    for path, function in places:
+        inside = nodes()[f"uuvtai.{path.replace('/', '.')}"]
+        names = {node.name for node in inside if isinstance(node, ast.FunctionDef)}
+        assert not function or function in names, f"{path}.py has no {function}"
