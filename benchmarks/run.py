@@ -30,7 +30,7 @@ if sys.path[0] == str(HERE):
 
 from benchmarks.common import Job, Row  # noqa: E402
 
-NOT_BENCHMARKS = ("__init__", "common", "mutations", "played", "run")
+NOT_BENCHMARKS = ("__init__", "common", "played", "run")
 NEED_POLICY = ("parity",)
 """left out of a run of all where no --policy is given"""
 PEERS = (
