@@ -1,4 +1,4 @@
-"""ROS 2's standard messages as a log's JSON messages; the table of docs/ros.md. Nothing in a message is
+"""ROS 2's standard messages as a log's JSON messages; the table of docs/viewers.md. Nothing in a message is
 trusted: what does not fit together is a ValueError."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A log's control steps as ROS 2's standard messages; the table of docs/ros.md."""
+"""A log's control steps as ROS 2's standard messages; the table of docs/viewers.md."""
 
 from __future__ import annotations
 
