@@ -22,8 +22,8 @@ from benchmarks.common import Job, Row
 
 LONGEST_S = 7200
 _ROOT = Path(__file__).resolve().parent.parent
-_PAGES = ("own_pieces", "ros", "paper_kit", "benchmark", "live", "sonars")
-_EXTRAS = "export,live,viz,ros,rerun,sb3,skrl,torchrl,rsl-rl"
+_PAGES = ("own_pieces", "viewers", "sonars")
+_EXTRAS = "export,live,ros,sb3,skrl,torchrl,rsl-rl"
 _TRAINERS = ("sb3", "skrl", "torchrl", "rsl_rl")
 _CUSTOM = ("controller", "reward", "tree", "vehicle", "world")
 _CHECKOUT_ONLY = ("python -m docs.", "python benchmarks/", "python3 bootstrap.py")
@@ -78,9 +78,6 @@ def _steps(place: Path, quick: bool) -> Iterator[tuple[str, str]]:
             for name in _TRAINERS:
                 yield page, f"python examples/train_{name}.py --out runs/{name}"
                 yield page, f"uuv eval --policy examples/own_{name}.py:load=runs/{name}"
-        if page == "live":
-            yield page, "uuv watch --world gauntlet --controller bt,dwa --episodes 1"
-            yield page, "uuv watch --world gauntlet --controller bt --episodes 2 --rate 0 --rerun live.rrd"
 
 
 def shell_lines(text: str) -> list[str]:
