@@ -193,7 +193,6 @@ OWN_JSON = {
     "capture.py",
     "learn/distributed.py",
     "measure/sweep/plan.py",
-    "live/rerun_viewer.py",
     "native/reads.py",
 }
 """files whose JSON comes from this process or its siblings, not from a file"""

@@ -160,11 +160,10 @@ def watch_live(
     rate: opt.Rate = 1.0,
     host: opt.Host = "127.0.0.1",
     port: opt.Port = 8765,
-    rerun: opt.ToRerun = "",
     depth_images: opt.DepthImages = False,
     device: opt.Device = "auto",
 ) -> None:
-    """Run episodes in real time and serve them to Foxglove and Lichtblick, and to Rerun."""
+    """Run episodes in real time and serve them to Foxglove and Lichtblick."""
     seed_list = arguments.integers("--seeds", seeds)
     arguments.refuse_odd_live(episodes, rate, port)
     from uuvtai.measure.evaluate.eval_request import Request
@@ -176,7 +175,7 @@ def watch_live(
         scene, trained, controllers=controllers, seeds=seed_list, episodes=episodes,
         depth_images=depth_images, device=device,
     )  # fmt: skip
-    result = watch_episodes(request, LiveOptions(host, port, rate, rerun), Progress())
+    result = watch_episodes(request, LiveOptions(host, port, rate), Progress())
     output.show(result, lambda screen: show_watched(screen, result))
 
 

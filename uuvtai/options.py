@@ -238,15 +238,6 @@ Host = Annotated[
 ]
 Port = Annotated[int, Option("--port", help="Port to serve at; 0 = a free one.")]
 
-ToRerun = Annotated[
-    str,
-    Option(
-        "--rerun",
-        metavar="FILE.rrd|URL",
-        help="Show it to Rerun too: a new file, or a viewer's rerun+http://HOST:PORT/proxy.",
-    ),
-]
-
 DriveControllers = Annotated[
     list[str] | None,
     _controllers(

@@ -25,28 +25,6 @@ class Viewers(Protocol):
         """Show a message."""
 
 
-class EveryViewer:
-    """Several of them as one."""
-
-    def __init__(self, *viewers: Viewers) -> None:
-        self._viewers = viewers
-
-    def begin(self, schemas: Mapping[str, Schema]) -> None:
-        """Another episode, for all."""
-        for viewer in self._viewers:
-            viewer.begin(schemas)
-
-    def tell_time(self, time_ns: int) -> None:
-        """It is now this late in the episode, for all."""
-        for viewer in self._viewers:
-            viewer.tell_time(time_ns)
-
-    def send(self, message: TopicMessage) -> None:
-        """Show a message to all."""
-        for viewer in self._viewers:
-            viewer.send(message)
-
-
 class LiveEpisode:
     """One episode for viewers; an ``EpisodeSink``."""
 

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from uuvtai.live.broadcast import Broadcast, EveryViewer, Viewers
+from uuvtai.live.broadcast import Broadcast
 from uuvtai.live.real_time import RealTime
-from uuvtai.live.rerun_viewer import RerunViewer
 from uuvtai.live.viewer_server import ViewerServer
 from uuvtai.loader import ConfigError
 from uuvtai.measure.episodes.methods import Method
@@ -33,8 +31,6 @@ class LiveOptions:
     port: int = 8765
     rate: float = 1.0
     """seconds of the episode in one of the clock's; 0 = as fast as it goes"""
-    rerun: str = ""
-    """to Rerun too: a new file .rrd, or a viewer's address; empty: not"""
 
 
 def watch_episodes(request: Request, live: LiveOptions, watch: EvaluationWatch) -> list[dict[str, Any]]:
@@ -43,17 +39,14 @@ def watch_episodes(request: Request, live: LiveOptions, watch: EvaluationWatch) 
     if ORACLE in request.controllers:
         raise ConfigError("--controller oracle: it drives no vehicle; name who does, for example bt")
     methods = methods_of(request, watch)
-    with contextlib.ExitStack() as closing:
-        server = closing.enter_context(ViewerServer(live.host, live.port))
-        rerun = [closing.enter_context(RerunViewer(live.rerun))] if live.rerun else []
-        viewers = EveryViewer(server, *rerun)
+    with ViewerServer(live.host, live.port) as server:
         shown = "localhost" if live.host in ("127.0.0.1", "0.0.0.0", "::") else live.host
         watch.note(f"serving ws://{shown}:{server.port}; in Foxglove or Lichtblick: open a connection,")
         watch.note(f"Foxglove WebSocket, to that address, and import the layout {LAYOUT}")
         comparison = comparison_of(request, 1, methods, watch)
         try:
             return [
-                _watched(comparison, method, job, viewers, live.rate)
+                _watched(comparison, method, job, server, live.rate)
                 for job in _jobs(request)
                 for method in methods
             ]
@@ -69,13 +62,13 @@ def _jobs(request: Request) -> Iterable[Job]:
 
 
 def _watched(
-    comparison: Comparison, method: Method, job: Job, viewers: Viewers, rate: float
+    comparison: Comparison, method: Method, job: Job, server: ViewerServer, rate: float
 ) -> dict[str, Any]:
     """Play one episode for all to see; how it ended."""
     request, policy = comparison.request, comparison.policies[method.name]
     sim = comparison.simulator_for(method)
     clock = RealTime(request.config.episode.control_dt_s, rate)
-    shown = Broadcast(viewers, Path(request.world).stem, method.name, request.depth_images, policy)
+    shown = Broadcast(server, Path(request.world).stem, method.name, request.depth_images, policy)
     driver = policy.pilot if policy else None
     (result,), _ = run_episodes(sim, [job], Recorders([shown, clock]), driver=driver)
     entry = {
