@@ -264,7 +264,9 @@ TUNING = ("77", "77001")
 def test_every_picture_of_the_gallery_has_its_command_and_is_small():
     lines = [shlex.split(line) for _mark, lines in shell_blocks(GALLERY) for line in lines]
     made = [words[words.index("--out") + 1] for words in lines if "--out" in words]
-    there = {path.relative_to(ROOT).as_posix(): path.stat().st_size for path in (ROOT / "docs/gallery").iterdir()}
+    there = {
+        path.relative_to(ROOT).as_posix(): path.stat().st_size for path in (ROOT / "docs/gallery").iterdir()
+    }
     assert sorted(made) == sorted(there)
     assert {f"docs/{target}" for target in LINK.findall(GALLERY)} >= set(there), "all are shown"
     assert max(there.values()) <= 1e6 and sum(there.values()) <= 3e6
@@ -292,7 +294,9 @@ def test_no_line_is_longer_than_140_characters(path):
     """Rows of tables cannot be wrapped."""
     if path.name == "results.md":
         return  # written by a script
-    long = [line for line in path.read_text().splitlines() if len(line) > 140 and not line.startswith(("|", "!["))]
+    long = [
+        line for line in path.read_text().splitlines() if len(line) > 140 and not line.startswith(("|", "!["))
+    ]
     assert [line for line in long if not ONE_PIECE.fullmatch(line)] == []
 
 

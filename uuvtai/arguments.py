@@ -105,11 +105,10 @@ def controllers(given: list[str] | None, has_policies: bool) -> list[str]:
     return names
 
 
-def refuse_odd_rate(rate: float, is_endless: bool = True) -> None:
-    """UsageError for a pace that is none; ``is_endless``: 0 means as fast as it goes."""
-    if not (math.isfinite(rate) and (rate > 0 or (is_endless and rate == 0))):
-        least = "at least 0" if is_endless else "above 0"
-        raise UsageError(f"--rate {rate:g}: give a number {least}, for example --rate 2")
+def refuse_odd_rate(rate: float) -> None:
+    """UsageError for a pace that is none; 0 means as fast as it goes."""
+    if not (math.isfinite(rate) and rate >= 0):
+        raise UsageError(f"--rate {rate:g}: give a number at least 0, for example --rate 2")
 
 
 def refuse_odd_live(episodes: int, rate: float, port: int) -> None:

@@ -179,38 +179,6 @@ def watch_live(
     output.show(result, lambda screen: show_watched(screen, result))
 
 
-@app.command("drive", epilog="Example: uuv drive --world maze --rate 0.5")
-@groups.grouped
-def drive_vehicle(
-    scene: groups.SceneGroup,
-    output: groups.OutputGroup,
-    controller: opt.DriveControllers = None,
-    episodes: opt.DriveEpisodes = 1,
-    seeds: opt.Seeds = "0",
-    rate: opt.DriveRate = 1.0,
-    use_gamepad: opt.UseGamepad = False,
-    run_dir: opt.RunDir = None,
-) -> None:
-    """Steer a vehicle by keyboard or gamepad, with the map that it makes; bt then plays the same episodes."""
-    seed_list = arguments.integers("--seeds", seeds)
-    arguments.refuse_less("--episodes", episodes, 1)
-    arguments.refuse_odd_rate(rate, is_endless=False)
-    from uuvtai.live.hands import at_the_wheel
-    from uuvtai.measure.evaluate.eval_request import Request
-    from uuvtai.measure.hand_driving import drive_by_hand
-    from uuvtai.show.evaluation import show_evaluation
-    from uuvtai.show.live_episodes import Notes
-    from uuvtai.show.steering_view import steering_view
-
-    named = [name for name in arguments.drivers(None, controller or ["bt"], None, None)[1] if name != "none"]
-    request = Request.typed(
-        scene, [], controllers=named, seeds=seed_list, episodes=episodes, device="cpu", run_dir=run_dir
-    )
-    with at_the_wheel(rate, use_gamepad, steering_view) as hand:
-        result, folder = drive_by_hand(request, hand, Notes())
-    output.show(result, lambda screen: show_evaluation(screen, result, folder), folder)
-
-
 # --------------------------------------------------------------------------------------------------- identify
 
 

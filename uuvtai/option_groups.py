@@ -334,8 +334,8 @@ class FlightGroup:
 
         if self.arm:
             raise UsageError(
-                "--arm is refused for now: an audit found that Ctrl-C leaves an armed vehicle driving and that "
-                "old readings reach the thrusters (docs/safety.md); leave --arm out for a dry run"
+                "--arm is refused for now: an audit found that Ctrl-C leaves an armed vehicle driving and "
+                "that old readings reach the thrusters (docs/safety.md); leave --arm out for a dry run"
             )
         arguments.refuse_odd_rate(self.rate)
         return FlightPlan.typed(

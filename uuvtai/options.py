@@ -238,20 +238,6 @@ Host = Annotated[
 ]
 Port = Annotated[int, Option("--port", help="Port to serve at; 0 = a free one.")]
 
-DriveControllers = Annotated[
-    list[str] | None,
-    _controllers(
-        "Who plays your episodes after you (repeatable): as of uuv eval \\[default: bt]; none = nobody."
-    ),
-]
-DriveEpisodes = Annotated[int, Option("--episodes", help="Episodes to drive.")]
-DriveRate = Annotated[
-    float, Option("--rate", help="Seconds of the episode in one of the clock's; 0.5 gives you time to think.")
-]
-UseGamepad = Annotated[
-    bool, Option("--gamepad", help="Steer by the first gamepad too (pip install 'uuvtai\\[gamepad]').")
-]
-
 # ------------------------------------------------------------------------------------------------ pilot, sitl
 
 Mavlink = Annotated[
@@ -274,7 +260,11 @@ Heading = Annotated[
     ),
 ]
 Arm = Annotated[
-    bool, Option("--arm", help="Arm and drive: refused for now (docs/safety.md). Dry runs send nothing that moves the vehicle.")
+    bool,
+    Option(
+        "--arm",
+        help="Arm and drive: refused for now (docs/safety.md).",
+    ),
 ]
 FenceBox = Annotated[
     str | None,

@@ -17,7 +17,6 @@ SEE = {
     "train": ("quickstart", "learning"),
     "simulate": ("simulator", "own_pieces"),
     "watch": ("live", "viewers", "own_pieces"),
-    "drive": ("live", "quickstart"),
     "identify": ("vehicle",),
     "sweep": ("scale", "own_pieces"),
     "benchmark": ("benchmark", "own_pieces"),

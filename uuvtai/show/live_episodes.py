@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from uuvtai.endings import say
 from uuvtai.show.screen import Screen
 from uuvtai.tables.table import Column, Table
 
@@ -17,23 +16,6 @@ _COLUMNS = (
     Column("min clearance m", 1),
     Column("real-time factor", 2),
 )
-
-
-class Notes:
-    """Messages alone: the screen belongs to somebody else. An ``EvaluationWatch``."""
-
-    def start(self, name: str, total: int) -> None:
-        """A job begins."""
-
-    def note(self, text: str) -> None:
-        """A message for the person who waits."""
-        say(text)
-
-    def update(self, done: int, total: int, env_steps: int, left: int | None = None) -> None:
-        """How far it is."""
-
-    def stop(self) -> None:
-        """It is over."""
 
 
 def show_watched(screen: Screen, watched: list[dict[str, Any]]) -> None:

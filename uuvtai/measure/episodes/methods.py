@@ -17,7 +17,6 @@ from uuvtai.tree import FlatTree, read_tree
 
 if TYPE_CHECKING:
     from uuvtai.learn.checkpoint import Checkpoint
-    from uuvtai.live.hand_driver import HandPiece
     from uuvtai.logs.log_recorder import PolicyNote
     from uuvtai.own.own_piece import OwnPiece
     from uuvtai.rrt import RoutePlanner
@@ -57,8 +56,6 @@ class Method:
     """stack preset (name or path) that this row alone drives with; None = the request's own"""
     own: OwnPiece | None = None
     """what the user brought: it drives, or plans the routes of the tree"""
-    hand: HandPiece | None = None
-    """a person who drives"""
 
     def config_of(self, config: Config) -> Config:
         """What this method's simulator runs on; scenarios, sensors and referee are those of ``config``.
@@ -68,10 +65,6 @@ class Method:
     def driver_for(self, sim: Sim) -> PolicyNote | None:
         """The policy ready for this simulator's rows; None where the tree drives. Raises CheckpointError or
         PieceError for one that does not fit."""
-        if self.hand is not None:
-            from uuvtai.logs.log_recorder import PolicyNote
-
-            return PolicyNote(self.hand.driver(sim), "", None)
         if self.own is not None:
             from uuvtai.logs.log_recorder import PolicyNote
 

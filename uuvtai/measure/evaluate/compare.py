@@ -3,7 +3,7 @@ videos."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,11 +33,8 @@ _BATCH = 256
 little."""
 
 
-def compare(
-    request: Request, watch: EvaluationWatch, first: Sequence[Method] = ()
-) -> tuple[dict[str, Any], Path]:
-    """Play every method's episodes, ``first`` before those that the request names; the ``uuv eval --json``
-    document and the run folder.
+def compare(request: Request, watch: EvaluationWatch) -> tuple[dict[str, Any], Path]:
+    """Play every method's episodes; the ``uuv eval --json`` document and the run folder.
 
     Everything that can be refused is refused before anything is written. Raises ConfigError, ValueError,
     MemoryError, RunFolderError, CheckpointError.
@@ -52,11 +49,11 @@ def compare(
             "same"
         )
     refuse_place(request.run_dir)
-    methods = [*first, *methods_of(request, watch)]
+    methods = methods_of(request, watch)
     num_envs = request.num_envs or min(len(request.seeds) * request.episodes, _BATCH)
     comparison = comparison_of(request, num_envs, methods, watch)
     folder = RunFolder(request.run_dir or default_run_dir(request.world), request.config, request.seeds)
-    with _going_on(folder, watch, can_resume=not any(method.hand for method in methods)):
+    with _going_on(folder, watch):
         device = comparison.any_simulator().device.type
         folder.write_json(REQUEST, document_of(request, num_envs, device, drivers_of(methods)))
         return _compared(comparison, folder), folder.path
@@ -85,16 +82,13 @@ def resume(place: Path, watch: EvaluationWatch, allow_code: bool = False) -> tup
 
 
 @contextmanager
-def _going_on(folder: RunFolder, watch: EvaluationWatch, can_resume: bool = True) -> Iterator[None]:
+def _going_on(folder: RunFolder, watch: EvaluationWatch) -> Iterator[None]:
     """Record how the work inside ends, and say how to go on where it was interrupted."""
     try:
         with folder.recorded():
             yield
     except KeyboardInterrupt:
         watch.stop()
-        if not can_resume:
-            watch.note(f"finished episodes are kept in {folder.path}")
-            raise
         watch.note(f"finished episodes are kept; go on with: uuv eval --resume {folder.path}")
         if any((folder.path / "logs").glob("*.part")):
             watch.note(

@@ -150,9 +150,7 @@ def drivers_of(methods: list[Method]) -> dict[str, str]:
     """sha256 of what drives, by method: of a policy's checkpoint, of a tree as it is played, with its stack,
     of the file of a piece of the user's."""
     return {
-        method.name: "by hand"
-        if method.hand
-        else method.own.sha256
+        method.name: method.own.sha256
         if method.own
         else method.checkpoint.sha256
         if method.checkpoint
