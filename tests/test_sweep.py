@@ -117,7 +117,7 @@ def test_a_grid_file_says_what_is_wrong(tmp_path):
             grid_of([str(file)])
 
 
-@pytest.mark.parametrize("name", ["paper", "caution", "robustness", "dead_reckoning"])
+@pytest.mark.parametrize("name", ["paper", "benchmark", "caution", "robustness", "dead_reckoning"])
 def test_shipped_grids_load_and_every_cell_has_a_config(name):
     request = asked(grid_of([name]))
     tasks = tasks_of(request, [("bt", "bt", None)], set())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import typer
 
@@ -140,29 +139,3 @@ def refuse_beside_resume(ctx: typer.Context, kept: tuple[str, ...] = ()) -> None
             f"{what} {ctx.params[name]}: a resumed run keeps its own; leave it out, or begin a new run "
             "without --resume"
         )
-
-
-def refuse_odd_benchmark(
-    name: str | None,
-    file: Path | None,
-    quick: bool,
-    sample: int | None,
-    num_envs: int | None,
-    run_dir: Path | None,
-) -> None:
-    """UsageError for words and options of ``uuv benchmark`` that do not go together."""
-    is_check = name == "verify"
-    if is_check and file is None:
-        raise UsageError("verify: which entry? For example: uuv benchmark verify entry.json")
-    if file is not None and not is_check:
-        raise UsageError(f"{name} {file}: to check an entry write: uuv benchmark verify {file}")
-    if is_check and (quick or num_envs is not None or run_dir is not None):
-        raise UsageError("--quick, --num-envs, --run-dir: not with verify, which writes nothing")
-    if sample is not None and not is_check:
-        raise UsageError(
-            "--sample: belongs to verify, for example: uuv benchmark verify entry.json --sample 16"
-        )
-    if sample is not None:
-        refuse_less("--sample", sample, 0)
-    if num_envs is not None:
-        refuse_less("--num-envs", num_envs, 1)

@@ -253,45 +253,6 @@ def sweep(
 # -------------------------------------------------------------------------------------------------- benchmark
 
 
-@app.command("benchmark", epilog="Example: uuv benchmark pool --controller examples/own_field.py --quick")
-@groups.grouped
-def enter_benchmark(
-    who: groups.EntrantGroup,
-    output: groups.OutputGroup,
-    name: opt.BenchmarkName = None,
-    file: opt.EntryFile = None,
-    quick: opt.Quick = False,
-    sample: opt.Sample = None,
-    num_envs: opt.Batch = None,
-    device: opt.Device = "auto",
-    run_dir: opt.RunDir = None,
-) -> None:
-    """Play fixed scenes that others play too, and write what came of it as a file; or check such a file.
-    Exit code 3: an entry disagrees with its replay."""
-    from uuvtai.show import benchmarking
-
-    arguments.refuse_odd_benchmark(name, file, quick, sample, num_envs, run_dir)
-    if name is None:
-        from uuvtai.measure.benchmark.benchmark_scenes import catalogue
-
-        found = catalogue()
-        output.show(found, lambda screen: benchmarking.show_scenes(screen, found))
-        return
-    from uuvtai.measure.benchmark import entering, entrant, verifying
-
-    pilot = entrant.entrant_of(*who.named())
-    if file is None:
-        asked = entering.BenchmarkRequest(name, pilot, quick, num_envs, device, run_dir)
-        entry, folder = entering.enter(asked, Progress())
-        output.show(entry, lambda screen: benchmarking.show_entry(screen, entry, folder / entering.FILE))
-        return
-    most = verifying.SAMPLE if sample is None else sample
-    checked = verifying.verify(file, pilot if who.is_given else None, Progress(), most, device)
-    output.show(checked, lambda screen: benchmarking.show_check(screen, checked))
-    if not checked["ok"]:
-        raise typer.Exit(GATE)
-
-
 # ----------------------------------------------------------------------------------------- profile, reproduce
 
 

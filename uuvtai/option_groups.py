@@ -156,25 +156,6 @@ class DriverGroup:
 
 
 @dataclass(frozen=True)
-class EntrantGroup:
-    """Who enters a benchmark."""
-
-    controller: opt.EntryController = None
-    planner: opt.Planners = None
-    policy: opt.Policies = None
-
-    @property
-    def is_given(self) -> bool:
-        """Whether anybody was named."""
-        return bool(self.controller or self.planner or self.policy)
-
-    def named(self) -> tuple[list[str], list[str]]:
-        """As ``DriversGroup.named``; the tree where nobody was named."""
-        who = [self.controller] if self.controller else ["none"] if self.is_given else ["bt"]
-        return arguments.drivers(None, who, self.planner, self.policy)
-
-
-@dataclass(frozen=True)
 class PiecesGroup:
     """The user's own pieces, and nothing else."""
 

@@ -7,7 +7,6 @@ from typing import Annotated, Any
 
 from typer import Argument, Option
 
-from uuvtai.measure.benchmark import benchmark_scenes as benchmarks
 from uuvtai.show import choices
 
 _WORLDS, _SENSORS, _VEHICLES = (choices.names(kind) for kind in ("world", "sensors", "vehicle"))
@@ -352,39 +351,6 @@ Address = Annotated[
     str, Option("--address", help="Ray cluster: host:port, auto, or local (inside this process).")
 ]
 SweepResume = Annotated[Path | None, _resume("Run folder of a sweep to go on with.")]
-
-# -------------------------------------------------------------------------------------------------- benchmark
-
-BenchmarkName = Annotated[
-    str | None,
-    Argument(
-        metavar="NAME|verify",
-        help=f"What to enter: {', '.join(benchmarks.NAMES)}; or verify, to check an entry's FILE \\[default: "
-        "list them].",
-        autocompletion=lambda: [*benchmarks.NAMES, "verify"],
-    ),
-]
-EntryFile = Annotated[Path | None, Argument(metavar="FILE", help="With verify: the entry, an entry.json.")]
-EntryController = Annotated[
-    str | None,
-    Option(
-        "--controller",
-        metavar=_NAME,
-        help="Who enters: bt, another tree or stack by name or file, or mine.py:act \\[default: bt].",
-        autocompletion=choices.controllers,
-    ),
-]
-Quick = Annotated[
-    bool,
-    Option(
-        "--quick",
-        help="Only a look: a few episodes that anybody may tune on. The file says that it is no entry.",
-    ),
-]
-Sample = Annotated[
-    int | None,
-    Option("--sample", help="With verify: episodes of each scene to play again \\[default: 8]."),
-]
 
 # ----------------------------------------------------------------------------------------- profile, reproduce
 

@@ -19,7 +19,6 @@ SEE = {
     "watch": ("live", "viewers", "own_pieces"),
     "identify": ("vehicle",),
     "sweep": ("scale", "own_pieces"),
-    "benchmark": ("benchmark", "own_pieces"),
     "profile": ("history",),
     "reproduce": ("learning", "own_pieces"),
     "report": ("quickstart", "paper_kit"),

@@ -1,1 +1,0 @@
-"""A benchmark that others can enter: fixed scenes, an entry as a file, its check by replay."""
