@@ -48,7 +48,6 @@ def played(n_env, seed, **world):
         ("multibeam_image", {}),
         ("ping360", {}),
         ("nominal", {"forecast.learned": "shipped"}),
-        ("nominal", {"forecast.turn_back_s": [0.4, 0.8]}),
         ("nominal", {"baselines.mppi.horizon_s": 1.0}),
     ],
 )

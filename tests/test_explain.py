@@ -65,7 +65,6 @@ class Story:
         self.conflict = np.ones(self.n, bool)
         self.believed_gap = 0.0
         self.place_error = np.zeros(3)
-        self.turn_back_share = 0.0
         self.coarse = None
         self.look, self.config = 0.0, CONFIG
 
@@ -117,7 +116,6 @@ class Story:
             forecast_m=np.where(self.believes, 0.2, -1.0)[:, None],
             forecast_above_w=self.pos[:, 2:] + self.believed_gap,
             forecast_below_w=self.pos[:, 2:] - self.believed_gap,
-            turn_back_share=np.full((self.n, 1), self.turn_back_share),
             conflict=self.conflict,
             leaf=self.leaf,
             action=np.zeros((self.n, 4)),
@@ -128,8 +126,8 @@ class Story:
             ),
         )
 
-    def explained(self, outcome="collision", config=None):
-        return explain(outcome, self.history(), self.bodies(), config or self.config)
+    def explained(self, outcome="collision"):
+        return explain(outcome, self.history(), self.bodies(), self.config)
 
 
 def corridor(story, half_gap=0.32):
@@ -345,27 +343,8 @@ REMARKABLE = {
 }
 
 
-TURNED_BACK = {"turn back foreseen by no hypothesis", "turn back given little weight"}
-
-
-@pytest.mark.parametrize(
-    ("share", "turn_back_s", "remarks"),
-    [
-        (0.0, (0.4, 0.8), {"turn back foreseen by no hypothesis"}),
-        (0.3, (0.4, 0.8), {"turn back given little weight"}),
-        (0.6, (0.4, 0.8), set()),
-        (0.0, (), set()),  # nobody was asked
-    ],
-)
-def test_a_turn_back_says_how_probable_it_was_thought(share, turn_back_s, remarks):
-    config = Config.model_validate({"forecast": {"turn_back_s": turn_back_s}})
-    found = change(Story().turn(1.1, before=(1.0, 0.1)), turn_back_share=share).explained(config=config)
-    assert found.label == "turned_back"
-    assert TURNED_BACK & set(found.remarks) == remarks
-
-
 def test_every_remark_has_its_story_and_a_plain_one_has_none():
-    assert set(REMARKABLE) | TURNED_BACK == set(REMARKS)
+    assert set(REMARKABLE) == set(REMARKS)
     assert Story().explained().remarks == []
     for remark, make in REMARKABLE.items():
         assert remark in make().explained().remarks, remark

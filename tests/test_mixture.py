@@ -279,8 +279,3 @@ def test_files_that_hold_no_forecast_are_refused(tmp_path, net, spoil, says):
         path.write_bytes(spoil(net.weights()))
     with pytest.raises(UserError, match=says):
         read_weights(str(path))
-
-
-def test_two_sources_of_futures_are_refused():
-    with pytest.raises(ValueError, match="both say what bodies may do"):
-        Config.model_validate({"forecast": {"learned": "shipped", "turn_back_s": [0.5]}})

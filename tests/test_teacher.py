@@ -46,7 +46,6 @@ CFG = Config.model_validate(
     {
         "sensors": {"sonar": {"n_ray": N_RAY}},
         "tracking": {"n_track": N_TRACK, "horizon_s": 2.5, "forecast_dt_s": 0.1},
-        "forecast": {"turn_back_s": [0.5, 1.5]},
         "teacher": TEACHER,
     }
 )

@@ -1,11 +1,14 @@
 """Unseen bodies that may turn back: first and second moments against a drawn population and a float64
 oracle, rates against the ways that are expected."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 import taichi as ti
 
 from tests.bundles import io_for
+from tests.reference import habits as habit_oracle
 from uuvtai.config import Config
 from uuvtai.kernels.core.lanes import LANES
 from uuvtai.kernels.core.signature import AnyTensor, Bundle
@@ -26,6 +29,7 @@ SIZES = {
 }
 CFG = Config.model_validate({"traffic": {"leg_m": [2.0, 6.0]}, "forecast": {"use_turning_back": True}})
 TRIANGLE = np.triu_indices(4)
+SPEED = 1.5
 ROUNDING = 2e-5
 """Of values up to 10, carried from step to step in float32; the noise's closed form is a difference of terms
 seven digits long."""
@@ -134,27 +138,75 @@ def test_moments_are_those_of_a_drawn_population():
     np.testing.assert_allclose(full(p.astype(float))[0], expected, atol=0.02)
 
 
+@cache
+def straight_bodies():
+    return allocate(TrackState, SIZES), allocate(HabitState, SIZES)
+
+
+def rates_of(kind, way, dt, turn_rate=0.0, turn_var=0.0, turned=None):
+    """[1/s] of bodies that swim along +x at 1.5 m/s and have gone straight for ``way`` [m] since a turn that
+    was seen (``kind`` 2), or since they were met (1)."""
+    tracks, habits = straight_bodies()
+    for struct in (tracks, habits):
+        for field in vars(struct).values():
+            field.fill(0)
+    state = np.stack([way, 0 * way, 0 * way + SPEED, 0 * way], 1)[:, None]
+    tracks.state.from_numpy(state.astype(np.float32))
+    tracks.turn_rate.fill(turn_rate)
+    cov = np.zeros((N, 1, 5), np.float32)
+    cov[..., 4] = turn_var
+    tracks.turn_cov.from_numpy(cov)
+    habits.run_kind.fill(kind)
+    if turned is not None:
+        habits.turn.from_numpy(turned)
+    out = np.zeros(N, np.float32)
+    _rates(dt, out, io_for(TrackingIO, tracks, habits, CFG.forecast, CFG.tracking, CFG.traffic))
+    return out
+
+
 def test_rate_is_the_share_of_ways_that_end():
     """Of ways between 2 and 6 m and one in twenty of any length, that have lasted so long since a turn that
     was seen."""
     way = np.linspace(0.0, 5.9, N)
-    tracks, habits = allocate(TrackState, SIZES), allocate(HabitState, SIZES)
-    for struct in (tracks, habits):
-        for field in vars(struct).values():
-            field.fill(0)
-    state = np.stack([way, 0 * way, 0 * way + 1.5, 0 * way], 1)[:, None]
-    tracks.state.from_numpy(state.astype(np.float32))
-    habits.run_kind.fill(2)
-    out = np.zeros(N, np.float32)
-    io = io_for(TrackingIO, tracks, habits, CFG.forecast, CFG.tracking, CFG.traffic)
-    _rates(0.06, out, io)
 
     def lasting(y):
         return 0.95 * np.clip((6 - y) / 4, 0, 1) + 0.05 * np.exp(-y / 6)
 
+    out = rates_of(2, way, 0.06)
     expected = np.log(lasting(way) / lasting(way + 0.09)) / 0.06
     np.testing.assert_allclose(out, expected, rtol=2e-3, atol=1e-4)
     assert expected.max() > 2 > 0.1 > expected.min()
+
+
+@pytest.mark.parametrize("kind", [1, 2])
+def test_rate_is_that_of_a_drawn_population(kind):
+    """A way's begin was seen (2), or the body was met anywhere on it (1)."""
+    rng, n, dt, way = np.random.default_rng(3), 4_000_000, 0.5, np.linspace(0.0, 4.5, N)
+    length = rng.uniform(2, 6, n)
+    met = np.ones(n, bool)
+    if kind == 1:  # long ways are met more often, and each at any place
+        met = rng.random(n) < length / 6
+        length *= rng.random(n)
+    length = np.sort(np.where(rng.random(n) < 0.05, rng.exponential(6.0, n), length)[met])
+    ended = np.searchsorted(length, [way, way + SPEED * dt]) / len(length)
+    expected = (ended[1] - ended[0]) / (1 - ended[0])
+    np.testing.assert_allclose(1 - np.exp(-dt * rates_of(kind, way, dt)), expected, atol=4e-3)
+    assert expected.max() > 3 * expected.min()
+
+
+def test_bodies_that_may_circle_turn_back_less_and_known_turns_leave_no_doubt():
+    """The share that goes straight is that of Bayes' rule: the prior odds against the turn rate's density of
+    0 in its prior over that in its posterior."""
+    way = np.full(N, 3.0)
+    usual = rates_of(2, way, 0.06)
+    for turn_rate, var in ((0.0, 0.01), (0.2, 0.01), (0.5, 0.02)):
+        bayes = np.sqrt(var) / CFG.tracking.turn_rate_sigma_rad_s * np.exp(0.5 * turn_rate**2 / var)
+        straight = CFG.forecast.straight_odds / (CFG.forecast.straight_odds + bayes)
+        np.testing.assert_allclose(rates_of(2, way, 0.06, turn_rate, var), straight * usual, rtol=1e-4)
+    rows = habit_oracle.turn_rows(np.zeros((N, 7, 3, LANES), np.float32))
+    for name, value in (("turn_x", 6.0), ("in_x", 1.0), ("out_x", -1.0), ("weight", 1.0)):
+        rows[name][:, 0] = value
+    assert usual.all() and not rates_of(2, way, 0.06, turned=habit_oracle.packed_turns(rows)).any()
 
 
 def test_only_bodies_that_beams_pass_by_may_have_turned():

@@ -69,7 +69,7 @@ def array_sizes(config: Config, n_env: int, device: str = "cpu") -> dict[str, in
         "n_turn_row": 7,
         "n_turn": config.forecast.n_turn,
         "n_forecast": round(config.tracking.horizon_s / config.tracking.forecast_dt_s) + 1,
-        "n_future": N_MODE if config.forecast.learned else max(1, 2 * len(config.forecast.turn_back_s)),
+        "n_future": N_MODE if config.forecast.learned else 1,
         **_network_sizes(config.forecast),
         "n_row": n_row,
         "n_col": n_col,

@@ -19,7 +19,6 @@ from uuvtai.kernels.perception import (
     echoes,
     elevation,
     forecast,
-    futures,
     look,
     mapping,
     mixture,
@@ -55,8 +54,6 @@ def track(stages: Stages, config: Config, privileged: bool) -> None:
             look.look_at_bodies(stages.look)
     forecast.learn_habits(stages.forecast)
     forecast.forecast_tracks(stages.forecast)
-    if config.forecast.turn_back_s:
-        futures.weigh_futures(stages.futures)
     if config.forecast.learned or config.forecast.keep_columns:
         motion_columns.remember_past(stages.past)
         motion_columns.describe_motion(stages.past)

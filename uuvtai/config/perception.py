@@ -126,24 +126,11 @@ class ForecastConfig(Section):
     """bodies above or below the fan whose next turn is not known may have turned back: the expected velocity
     fades, and the uncertainty grows both ways along their course (``traffic.leg_m``); off: they go on for
     sure"""
-    turn_back_s: tuple[Positive, ...] = ()
-    """[s] a body on a straight way may turn within the first of these times, between the first and the
-    second, and so on: two futures each, back and a corner after which it comes to the vehicle, with their
-    probabilities (``traffic``), (0.4, 0.8) for example; () = it goes on for sure (no trial showed a gain:
-    docs/tuning.md)"""
     learned: Annotated[str, Field(max_length=1000)] = ""
-    """network that says what bodies may do, in place of ``turn_back_s``: ``shipped``, or the run folder of
-    ``uuv train forecast``; empty = none (``docs/learning.md``)"""
+    """network that says what bodies may do: ``shipped``, or the run folder of ``uuv train forecast``; empty =
+    none (``docs/learning.md``)"""
     keep_columns: bool = False
     """keep what such a network is told of each track, to train one"""
-
-    @model_validator(mode="after")
-    def _rising(self) -> ForecastConfig:
-        if self.learned and self.turn_back_s:
-            raise ValueError("learned and turn_back_s both say what bodies may do: leave one of them empty")
-        if list(self.turn_back_s) != sorted(set(self.turn_back_s)):
-            raise ValueError(f"turn_back_s must rise, got {self.turn_back_s}: for example (0.5, 1.2, 2.2)")
-        return self
 
 
 class ElevationConfig(Section):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from uuvtai.config.section import Fraction, OrderedInterval, PositiveInterval, Section
+from uuvtai.config.section import OrderedInterval, PositiveInterval, Section
 
 
 class TrafficConfig(Section):
@@ -18,6 +18,3 @@ class TrafficConfig(Section):
     """from top to bottom"""
     leg_m: PositiveInterval = (2.0, 6.0)
     """straight ways between two turns back, equally likely"""
-    corner_share: Fraction = 0.05
-    """share of the bodies on straight ways that turn corners, on to anywhere in the known water, rather than
-    back; what a body is seen to do counts beside it"""

@@ -214,13 +214,10 @@ class FutureState:
 
     Whoever fills it (a learned forecast, say) gives probabilities that sum to 1 at most; what is left is the
     forecast's own. A body begins all its futures where the forecast does, and is never faster than there.
-    Corners that do not lead to the vehicle have no future of their own: nothing is to be feared of them.
     """
 
     share: ti.Field = array("n_env", "n_track", "n_future")
-    """probability of this future, 0 = none: the first half turn back, the second turn towards the vehicle"""
-    corner: ti.Field = array("n_env", "n_track")
-    """probability of a corner within the time that the futures cover, wherever it leads"""
+    """probability of this future, 0 = none"""
     pos_w: ti.Field = array("n_env", "n_track", "n_future", "n_forecast", vec=2)
     """[m] where the body then is, at the forecast's times"""
 

@@ -69,23 +69,6 @@ class ForecastIO:
 
 
 @dataclass(frozen=True, eq=False)
-class FuturesIO:
-    """What else the bodies may do."""
-
-    futures: Out[FutureState]
-    clock: In[ClockState]
-    ego: In[Proprioception]
-    forecast: In[ForecastState]
-    habits: In[HabitState]
-    tracks: In[TrackState]
-    forecast_cfg: Const[ForecastConfig]
-    tank_cfg: Const[TankConfig]
-    teacher_cfg: Const[TeacherConfig]
-    tracking_cfg: Const[TrackingConfig]
-    traffic_cfg: Const[TrafficConfig]
-
-
-@dataclass(frozen=True, eq=False)
 class PastIO:
     """Where each track was and where it turned, as columns for a network."""
 
@@ -220,7 +203,6 @@ class PerceptionStages:
     spotting: SpottingIO
     look: LookIO
     forecast: ForecastIO
-    futures: FuturesIO
     past: PastIO
     mixture: MixtureIO
     heights: HeightsIO

@@ -12,18 +12,22 @@ the speed.
 
 import taichi as ti
 
+from uuvtai.config import ForecastConfig, TrackingConfig, TrafficConfig
 from uuvtai.kernels.core.geometry import FAR_M
 from uuvtai.kernels.core.kalman import AT
-from uuvtai.kernels.core.signature import Bundle
+from uuvtai.kernels.core.signature import Bundle, Const, In
 from uuvtai.kernels.perception.bundles import TrackingIO
-from uuvtai.kernels.perception.futures import longer_share, straight_share
 from uuvtai.kernels.perception.habits import BEGIN_SEEN, next_turn
+from uuvtai.state import TrackState
 
 _SLOWEST_M_S = 0.1
 """A slower body is where it is, whichever way it turns."""
 
 _LEAST_SHARE = 1.0e-3
 """Share of ways at least that a body may still be on."""
+
+_ODD_SHARE = 0.05
+"""Share of ways that are longer than any expected: their length is exponential."""
 
 
 @ti.func
@@ -59,6 +63,39 @@ def turn_back_rate(env, track, dt, io: Bundle[TrackingIO]):
             straight = straight_share(env, track, io.tracks, io.forecast_cfg, io.tracking_cfg)
             rate = straight * ti.log(first / last) / ti.max(dt, 1.0e-3)
     return rate
+
+
+@ti.func
+def longer_share(way_m, known, traffic_cfg: Const[TrafficConfig]):
+    """S: share of straight ways that go on for more than ``way_m`` [m]; ``known``: counted from their begin,
+    else from a place anywhere on them."""
+    low, high = ti.static(traffic_cfg.leg_m)
+    left = ti.math.clamp((high - way_m) * ti.static(1.0 / max(high - low, 1e-3)), 0.0, 1.0)
+    if not known:
+        middle = ti.static(0.5 * (low + high))
+        beyond = ti.max(high - way_m, 0.0)
+        curve = beyond * beyond * ti.static(0.5 / max(high - low, 1e-3) / (0.5 * (low + high)))
+        left = ti.select(way_m < low, (middle - way_m) / middle, curve)
+    return (1.0 - _ODD_SHARE) * left + _ODD_SHARE * ti.exp(-way_m * ti.static(1.0 / high))
+
+
+@ti.func
+def straight_share(
+    env,
+    track,
+    tracks: In[TrackState],
+    forecast_cfg: Const[ForecastConfig],
+    tracking_cfg: Const[TrackingConfig],
+):
+    """Probability that the body goes straight rather than in a circle (``habits.expected_turn_rate``)."""
+    share = 1.0
+    if ti.static(forecast_cfg.use_turn_rate and tracking_cfg.turn_rate_sigma_rad_s > 0):
+        rate, var = tracks.turn_rate[env, track], tracks.turn_cov[env, track][4]
+        if var > 0.0:
+            turns = ti.sqrt(var) * ti.static(1.0 / tracking_cfg.turn_rate_sigma_rad_s)
+            turns *= ti.exp(ti.min(0.5 * rate * rate / var, 20.0))
+            share = forecast_cfg.straight_odds / (forecast_cfg.straight_odds + turns)
+    return share
 
 
 @ti.func

@@ -59,8 +59,6 @@ DEPTH_M = 0.05
 the hull 0.03 m off and three standard deviations of the depth."""
 CLIMB_M = 0.15
 """Changed its depth: moved by more, upwards or downwards, in the last second."""
-LIKELY = 0.5
-"""A turn back that was given less than this probability came unexpected."""
 PROGRESS_M = 1.0
 """A timeout that came this much nearer to the goal in that time was only slow."""
 STUCK_M = 0.5
@@ -116,10 +114,6 @@ REMARKS: dict[str, Callable[[Fact], bool]] = {
     "turned lately": lambda f: _within(f["turned_ago_s"], LATELY_S),
     "corner passed in reach before": lambda f: (
         _within(f["turned_ago_s"], TURN_S) and bool(f["turns_in_reach_before"])
-    ),
-    "turn back foreseen by no hypothesis": lambda f: _turned_back(f) and f["turn_back_share"] == 0.0,
-    "turn back given little weight": lambda f: (
-        _turned_back(f) and f["turn_back_share"] is not None and 0.0 < f["turn_back_share"] < LIKELY
     ),
     "changed its depth": lambda f: abs(f["climbed_m"]) > CLIMB_M,
     "remembered to the end": lambda f: _is_unseen(f) and f["belief_error_m"] is not None,

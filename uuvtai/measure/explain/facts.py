@@ -215,10 +215,7 @@ def _belief_facts(history: History, slot: int, turned_ago_s: float | None, confi
         )
         return _round(np.linalg.norm(foreseen - truth[-1]))
 
-    before = int(np.abs(ago - (turned_ago_s or 0.0) - BEFORE_TURN_S).argmin())
-    weighs = turned_ago_s is not None and bool(config.forecast.turn_back_s) and bool(believed[before])
     return {
-        "turn_back_share": _round(history.turn_back_share[before, belief[before]]) if weighs else None,
         "believed_ago_s": _last_ago(ago, believed),
         "belief_error_m": _round(distance[-1]) if believed[-1] else None,
         "believed_gap_m": _believed_gap(history, slot, int(belief[-1])) if believed[-1] else None,

@@ -77,8 +77,6 @@ class History:
     may be level with it"""
     forecast_below_w: Array
     """(n, n_track) z of the highest edge of what it may hold below"""
-    turn_back_share: Array
-    """(n, n_track) probability that the futures in which the body turns back have in all"""
     conflict: Array
     """(n,) bool: the pilot foresees a conflict"""
     leaf: list[str]

@@ -32,7 +32,6 @@ _WINDOW_FIELDS = {
     "scan": ("ping_step", "range_m"),
     "tracks": ("alive", "moving", "state"),
     "forecast": ("pos_w", "radius_m", "above_w", "below_w"),
-    "futures": ("share",),
     "teacher": ("leaf", "conflict_s", "action", "clearance_m"),
 }
 _COARSE_FIELDS = {"vehicle": ("pos_w",), "mission": ("goal_w",), "route": ("n_way",), "teacher": ("leaf",)}
@@ -136,7 +135,6 @@ class FailureRecorder:
             forecast_m=w["forecast.radius_m"][:, :, 0].astype(float),
             forecast_above_w=w["forecast.above_w"].astype(float),
             forecast_below_w=w["forecast.below_w"].astype(float),
-            turn_back_share=_turns_back(w["futures.share"]),
             conflict=w["teacher.conflict_s"] < _FORESEEN_S,
             leaf=self._leaves(w["teacher.leaf"]),
             action=w["teacher.action"].astype(float),
@@ -166,11 +164,6 @@ def _read_rows(
         for name in names
     }
     return {row: {name: values[i].copy() for name, values in read.items()} for i, row in enumerate(rows)}
-
-
-def _turns_back(share: np.ndarray) -> np.ndarray:
-    """(n, n_track) probability of turning back in all: the first half of a track's futures."""
-    return share[..., : max(1, share.shape[-1] // 2)].astype(float).sum(-1)
 
 
 def _stacked(samples: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
