@@ -121,14 +121,13 @@ def _structs(n_env: int, config: Config, found: list[tuple]) -> dict:
     names = {
         "voronoi": "VoronoiState", "route": "RouteState", "clearance": "ClearanceState",
         "grid_map": "MapState", "mask": "GridMask", "mission": "MissionState", "ego": "Proprioception",
-        "forecast": "ForecastState", "clock": "ClockState", "exposure": "ExposureState",
+        "forecast": "ForecastState", "clock": "ClockState",
     }  # fmt: skip
     n_row, n_col = maps.SHAPE
     sizes = {
         "n_env": n_env, "n_plan": min(n_env, 64), "n_row": n_row, "n_col": n_col, "n_heap": n_row * n_col,
         "n_path": 2048, "n_way": config.route.n_way, "n_ahead": 32, "n_trigger": N_TRIGGER,
         "n_planner": N_PLANNER, "n_reason": N_REASON, "n_track": 2, "n_forecast": 2,
-        "n_block_row": 1, "n_block_col": 1,
     }  # fmt: skip
     s = {name: state.allocate(getattr(state, struct), sizes) for name, struct in names.items()}
     s["mask"].outside.from_numpy(maps.OUTSIDE.astype(np.int32))

@@ -12,14 +12,12 @@ from uuvtai import state
 from uuvtai.bounds import load_bounds
 from uuvtai.config import Config
 from uuvtai.kernels.planning.bundles import RouteIO, VoronoiIO
-from uuvtai.kernels.planning.exposure import block_shape
 
 N_ENV = 8
 N_PLAN = 3
 """Fewer slots than envs, so that slots are used again within a launch."""
 N_AHEAD = 31
 CONFIG = Config()
-N_BLOCK = block_shape(maps.SHAPE, CONFIG.quiet.model_copy(update={"weight_seen": 1.0}))
 
 
 @lru_cache(maxsize=1)
@@ -30,8 +28,6 @@ def stage():
         "n_plan": N_PLAN,
         "n_row": maps.SHAPE[0],
         "n_col": maps.SHAPE[1],
-        "n_block_row": N_BLOCK[0],
-        "n_block_col": N_BLOCK[1],
         "n_heap": maps.SHAPE[0] * maps.SHAPE[1],
         "n_path": 2048,
         "n_way": CONFIG.route.n_way,
@@ -44,7 +40,6 @@ def stage():
         "n_ray": 16,
     }
     structs = {
-        "exposure": state.ExposureState,
         "voronoi": state.VoronoiState,
         "route": state.RouteState,
         "clearance": state.ClearanceState,
@@ -72,7 +67,6 @@ def clean():
     for field in (
         s.grid_map.static_occ,
         s.grid_map.dynamic_occ,
-        s.exposure.share,
         s.ego.vel_b,
         s.ego.rpy,
         s.scan.hit,
@@ -116,7 +110,6 @@ def plan(envs=range(N_ENV), config=CONFIG):
     plan_routes(
         io_for(
             VoronoiIO,
-            s.exposure,
             s.voronoi,
             s.route,
             s.clearance,
@@ -128,7 +121,6 @@ def plan(envs=range(N_ENV), config=CONFIG):
             s.clock,
             config.voronoi,
             config.quiet,
-            config.traffic,
             config.route,
             config.clearance,
             config.mapping,

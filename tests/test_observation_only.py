@@ -18,7 +18,7 @@ from uuvtai.stages import SimState
 KNOWN = {
     "clock", "mission", "ego", "scan", "echoes", "image", "pose", "tracks", "clusters", "spots", "habits",
     "forecast",
-    "futures", "past", "mixture", "mask", "grid_map", "map_scratch", "exposure",
+    "futures", "past", "mixture", "mask", "grid_map", "map_scratch",
     "clearance", "clearance_memory", "voronoi", "route", "features", "teacher", "table", "baselines",
 }  # fmt: skip
 """Structs of what the vehicle is told, senses, remembers and decides. Every other struct, a new one too,

@@ -36,11 +36,11 @@ STRICT = CONFIG.model_copy(
         "voronoi": V.model_copy(
             update={"avoid_forecast": True, "use": "fused", "min_clearance_m": 0.3, "max_pops": 5000}
         ),
-        "quiet": CONFIG.quiet.model_copy(update={"room_m": 0.7, "weight_seen": 5.0}),
+        "quiet": CONFIG.quiet.model_copy(update={"room_m": 0.7}),
     }
 )
 """One other compiled variant for all switches: forecast avoided, both layers, another d_min, small budget,
-quiet water."""
+less room."""
 
 
 @lru_cache(maxsize=1)
@@ -266,6 +266,17 @@ def test_the_dynamic_layer_counts_only_when_asked_for():
     assert s.route.fallback_reason[0] == plan_codes.FAIL_NONE
     plan([0], STRICT)
     assert s.route.fallback_reason[0] == plan_codes.FAIL_DISCONNECTED
+
+
+def test_clearance_beyond_room_m_is_worth_no_detour():
+    """Along a wall, 1.2 m off: the usual planner keeps to the middle, the strict one has room enough."""
+    s = clean()
+    put_ends([(2.0, 1.2)] * N_ENV, [(18.0, 1.2)] * N_ENV)
+    plan([0], STRICT)
+    plan([1])
+    straight, wide = (way_of(env)[:, 1].max() for env in (0, 1))
+    assert straight < 1.4 and wide > 1.8
+    assert s.route.cost[0] == pytest.approx(16 / STRICT.quiet.room_m, rel=0.02)
 
 
 def test_the_budget_ends_the_search():

@@ -17,7 +17,6 @@ from uuvtai.kernels.core.grid import grid_shape
 from uuvtai.kernels.core.lanes import LANES
 from uuvtai.kernels.perception.mapping import look_period_s, scans_in
 from uuvtai.kernels.planning.clearance_keys import offset_bits
-from uuvtai.kernels.planning.exposure import block_shape
 from uuvtai.multibeam import elevations, heard_bearings
 from uuvtai.native.gpu_shape import is_gpu_shaped
 from uuvtai.plan_codes import N_PLANNER, N_REASON, N_TRIGGER
@@ -48,7 +47,6 @@ def array_sizes(config: Config, n_env: int, device: str = "cpu") -> dict[str, in
     tank, sensors, n_env = config.world.tank, config.sensors, rows_for(n_env)
     n_row, n_col = grid_shape(tank, config.mapping.cell_m)
     for_gpu = device == "cuda" or is_gpu_shaped()
-    n_block_row, n_block_col = block_shape((n_row, n_col), config.quiet)
     return {
         "n_env": n_env,
         "n_thruster": len(config.vehicle.thrusters),
@@ -74,8 +72,6 @@ def array_sizes(config: Config, n_env: int, device: str = "cpu") -> dict[str, in
         "n_row": n_row,
         "n_col": n_col,
         "n_packet": n_col // LANES,
-        "n_block_row": n_block_row,
-        "n_block_col": n_block_col,
         "n_slot": n_env if for_gpu else min(n_env, _MAP_SLOTS),
         "n_plan": min(n_env, max(_GPU_PLAN_SLOTS, n_env // _ENVS_PER_PLAN) if for_gpu else _PLAN_SLOTS),
         "n_heap": n_row * n_col,

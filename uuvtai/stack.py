@@ -27,7 +27,7 @@ from uuvtai.kernels.perception import (
     spotting,
     tracking,
 )
-from uuvtai.kernels.planning import exposure, features, route, triggers, voronoi
+from uuvtai.kernels.planning import features, route, triggers, voronoi
 from uuvtai.kernels.privileged import true_map, true_tracks
 from uuvtai.kernels.teacher import evasion, leaves, threats
 from uuvtai.sensing import forget_readings
@@ -71,8 +71,6 @@ def draw_map(stages: Stages, config: Config) -> None:
 
 def plan(stages: Stages, config: Config, by_voronoi: bool) -> None:
     """Which envs want a route; ``by_voronoi``: plan them, else they wait for the host's planner."""
-    if config.quiet.weight_seen > 0:
-        exposure.average_traffic(stages.exposure)
     triggers.fire_triggers(stages.triggers)
     if by_voronoi:
         voronoi.plan_routes(stages.voronoi)
@@ -133,7 +131,5 @@ def forget(stages: Stages, config: Config) -> None:
     if config.forecast.learned or config.forecast.keep_columns:
         motion_columns.reset_past(stages.past)
     mapping.reset_map(stages.mapping)
-    if config.quiet.weight_seen > 0:
-        exposure.reset_exposure(stages.exposure)
     route.reset_route(stages.route)
     leaves.reset_teacher(stages.teacher)

@@ -19,7 +19,7 @@ FILES = {
     "tracking": ("tracking", "habits", "elevation", "look", "forecast", "spotting"),
     "mapping": ("mapping",),
     "clearance": ("clearance",),
-    "planning": ("exposure", "triggers", "voronoi", "medial", "route"),
+    "planning": ("triggers", "voronoi", "medial", "route"),
     "features": ("features",),
     "teacher": (
         "threats",

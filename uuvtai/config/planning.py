@@ -42,19 +42,11 @@ class VoronoiConfig(Section):
 
 
 class QuietConfig(Section):
-    """Quiet water: routes keep out of the traffic where that is cheap. Clearance floors stay. All of it is
-    off: trials found no gain (docs/tuning.md)."""
+    """Quiet water: how much room a route takes."""
 
     room_m: Positive = 2.0
     """clearance beyond this is worth nothing more, and water so wide belongs to the planner's graph; at most
     ``clearance.max_m``"""
-    weight_prior: NonNegative = 0.0
-    """how much dearer a metre is where the most bodies are expected before any is seen (``traffic``: the
-    middle of the tank); needs a smaller ``room_m``, or clearance outweighs it; 0 = off"""
-    weight_seen: NonNegative = 0.0
-    """how much dearer a metre is where something moved all the time lately; 0 = off"""
-    memory_s: Positive = 10.0
-    """time constant of "lately" """
 
 
 class RouteConfig(Section):

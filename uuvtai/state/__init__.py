@@ -30,7 +30,6 @@ from uuvtai.state.perception import (
 from uuvtai.state.planning import (
     ClearanceMemory,
     ClearanceState,
-    ExposureState,
     FeatureState,
     RouteState,
     VoronoiState,
@@ -63,7 +62,6 @@ __all__ = [
     "DepthImage",
     "EchoState",
     "EpisodeState",
-    "ExposureState",
     "FeatureState",
     "FixedTable",
     "ForecastState",

@@ -45,15 +45,6 @@ class ClearanceMemory:
 
 
 @dataclass(frozen=True, eq=False)
-class ExposureState:
-    """Remembered: where something moved lately, in blocks of cells (``exposure.BLOCK``)."""
-
-    share: ti.Field = array("n_env", "n_block_row", "n_block_col")
-    """[0, 1] share of the time, the last moments counting most, in which the block held a cell of the dynamic
-    layer that was occupied"""
-
-
-@dataclass(frozen=True, eq=False)
 class VoronoiState:
     """Scratch of the global planner. Slots are shared by the queue (slot s plans its items s, s + n_plan,
     ...): few serve many envs."""
@@ -168,7 +159,6 @@ class PlanningStructs:
 
     clearance: ClearanceState
     clearance_memory: ClearanceMemory
-    exposure: ExposureState
     voronoi: VoronoiState
     route: RouteState
     features: FeatureState

@@ -15,7 +15,6 @@ from uuvtai.config import (
     SonarConfig,
     TankConfig,
     TrackingConfig,
-    TrafficConfig,
     VoronoiConfig,
 )
 from uuvtai.kernels.core.signature import Const, In, Out
@@ -23,7 +22,6 @@ from uuvtai.state import (
     ClearanceMemory,
     ClearanceState,
     ClockState,
-    ExposureState,
     FeatureState,
     ForecastState,
     GridMask,
@@ -51,19 +49,6 @@ class ClearanceIO:
     clearance_cfg: Const[ClearanceConfig]
     mapping_cfg: Const[MappingConfig]
     voronoi_cfg: Const[VoronoiConfig]
-
-
-@dataclass(frozen=True, eq=False)
-class ExposureIO:
-    """Where something moved lately."""
-
-    exposure: Out[ExposureState]
-    clock: In[ClockState]
-    grid_map: In[MapState]
-    episode_cfg: Const[EpisodeConfig]
-    mapping_cfg: Const[MappingConfig]
-    quiet_cfg: Const[QuietConfig]
-    sonar_cfg: Const[SonarConfig]
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +123,6 @@ class VoronoiIO:
     clearance: In[ClearanceState]
     clock: In[ClockState]
     ego: In[Proprioception]
-    exposure: In[ExposureState]
     forecast: In[ForecastState]
     grid_map: In[MapState]
     mask: In[GridMask]
@@ -148,7 +132,6 @@ class VoronoiIO:
     quiet_cfg: Const[QuietConfig]
     route_cfg: Const[RouteConfig]
     tank_cfg: Const[TankConfig]
-    traffic_cfg: Const[TrafficConfig]
     voronoi_cfg: Const[VoronoiConfig]
 
 
@@ -157,7 +140,6 @@ class PlanningStages:
     """Bundles of this room, by the noun of their stage."""
 
     clearance: ClearanceIO
-    exposure: ExposureIO
     features: FeaturesIO
     triggers: TriggersIO
     voronoi: VoronoiIO

@@ -11,7 +11,6 @@ import taichi as ti
 from uuvtai.kernels.core.heap import heap_after_pop, heap_after_push, top_cell
 from uuvtai.kernels.core.signature import Bundle
 from uuvtai.kernels.planning.bundles import VoronoiIO
-from uuvtai.kernels.planning.exposure import widest_m
 
 # bits of VoronoiState.cell; bits 4 to 6 hold the direction of the next cell towards the goal
 KNOWN = 1
@@ -36,6 +35,11 @@ _BETTER = 1.0 - 1.0e-6
 
 _FLAT_M = 1.0e-4
 """Clearances within this of clearance.max_m are saturated."""
+
+
+def widest_m(clearance, quiet, voronoi):
+    """[m] clearance beyond which more is worth nothing to the planner; plain Python."""
+    return max(min(clearance.max_m, quiet.room_m), voronoi.cost_epsilon_m)
 
 
 @ti.func

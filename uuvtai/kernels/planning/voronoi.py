@@ -14,8 +14,7 @@ from uuvtai.kernels.core.lanes import filled, n_lane
 from uuvtai.kernels.core.signature import Bundle, FloatMatrix, spread
 from uuvtai.kernels.planning.bundles import VoronoiIO
 from uuvtai.kernels.planning.chord import count_of_waypoints, path_cells, straightened_cost
-from uuvtai.kernels.planning.exposure import dearness, is_dear, widest_m
-from uuvtai.kernels.planning.medial import FOUND, NOT_FOUND, join_skeleton, search_cells
+from uuvtai.kernels.planning.medial import FOUND, NOT_FOUND, join_skeleton, search_cells, widest_m
 from uuvtai.kernels.planning.polyline import MAX_WIDENINGS, WIDENING, install_route
 from uuvtai.kernels.planning.traversable import is_traversable, occupancy
 from uuvtai.native.launch import quick_launch
@@ -87,17 +86,14 @@ def _weigh_cells(slot, env, io: Bundle[VoronoiIO]):
     for row in range(io.voronoi.weight.shape[1]):
         for packet in range(io.voronoi.weight.shape[2] // lanes):
             first = packet * lanes
-            room, dear, is_open = filled(1.0, lanes), filled(1.0, lanes), filled(0.0, lanes)
+            room, is_open = filled(1.0, lanes), filled(0.0, lanes)
             for i in ti.static(range(lanes)):
                 room[i] = io.clearance.clearance_m[env, row, first + i]
                 if is_traversable(
                     io.clearance, io.grid_map, io.mask, env, row, first + i, io.voronoi_cfg, io.mapping_cfg
                 ):
                     is_open[i] = 1.0
-            if ti.static(is_dear(io.quiet_cfg)):
-                for i in range(lanes):
-                    dear[i] = dearness(env, row, first + i, io)
-            weight = dear / ti.math.clamp(
+            weight = 1.0 / ti.math.clamp(
                 room,
                 ti.static(io.voronoi_cfg.cost_epsilon_m),
                 ti.static(widest_m(io.clearance_cfg, io.quiet_cfg, io.voronoi_cfg)),
