@@ -1,5 +1,4 @@
-"""Privileged yardsticks on hand-made scenarios: distances, what the referee forbids, earliest arrivals, blind
-rides, detection distance."""
+"""The oracle on hand-made scenarios: distances, what the referee forbids, earliest arrivals."""
 
 import math
 
@@ -8,11 +7,9 @@ import pytest
 
 from tests.reference.world import path_position
 from uuvtai.closed_form import path_positions
-from uuvtai.config import Config, DisturbanceConfig, FixedObstacle, Waypoint, WorldConfig
+from uuvtai.config import Config, DisturbanceConfig
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, SPHERE
 from uuvtai.measure.explain import hindsight
-from uuvtai.privileged.blind_ride import ride_blindly
-from uuvtai.privileged.detection import required_detection, time_aside_s
 from uuvtai.privileged.lattice import CELL_M, MOVES, Referee, lattice_of
 from uuvtai.privileged.obstacles import (
     Obstacle,
@@ -197,50 +194,3 @@ def test_who_is_run_over_in_a_corner_does_not_arrive():
     """Columns side by side sweep the whole width of the tank at 3 m/s before anybody could be through."""
     sweep = [column(18.0, y, path=line((18.0, y), (0.5, y), 3.0)) for y in np.arange(0.25, 6.0, 0.5)]
     assert arrival((2.0, 3.0, -0.8), (16.0, 3.0, -0.8), *sweep) is None
-
-
-# --------------------------------------------------------------------------------------------- how hard it is
-
-
-def test_a_blind_ride_counts_the_bodies_that_come_too_near():
-    start, goal = (2.0, 3.0, -0.8), (9.0, 3.0, -0.8)
-    crossing = column(5.0, 3.0, path=line((5.0, 3.0), (5.0, 3.2), 0.1))
-    beside = column(5.0, 4.0, path=line((5.0, 4.0), (5.0, 4.2), 0.1))
-    above = body("sphere", (4.0, 3.0, -0.2), (0.2, 0.2, 0.2), line((4.0, 3.0), (4.0, 3.1), 0.1))
-    behind = column(10.5, 3.0, path=line((10.5, 3.0), (10.6, 3.0), 0.1))
-    ride = ride_blindly(scenario(start, goal, crossing, beside, above, behind, column(6.0, 3.0)), CONFIG)
-    assert ride.threats == 1, (
-        "one crosses; beside, above and beyond the goal none comes near, and what stands still does not count"
-    )
-    assert ride.time_s == pytest.approx(6.0 / 0.6, abs=0.03)
-
-
-def test_a_body_is_a_threat_where_it_is_when_the_vehicle_comes():
-    """It crosses the line at x = 5, that is 5 s after the start, but only then."""
-    start, goal = (2.0, 3.0, -0.8), (9.0, 3.0, -0.8)
-    met = column(5.0, 0.5, path=line((5.0, 0.5), (5.0, 5.5), 0.5))
-    missed = column(5.0, 0.5, path=line((5.0, 0.5), (5.0, 5.5), 1.0))
-    assert ride_blindly(scenario(start, goal, met), CONFIG).threats == 1
-    assert ride_blindly(scenario(start, goal, missed), CONFIG).threats == 0
-
-
-def test_required_detection_distance_by_hand():
-    assert time_aside_s(0.6, 0.6, 1e-6) == pytest.approx(1.0, abs=1e-5)
-    t = time_aside_s(0.52, 0.6, 0.3)
-    assert 0.6 * (t - 0.3 * (1 - math.exp(-t / 0.3))) == pytest.approx(0.52, abs=1e-9)
-    found = required_detection(CONFIG)
-    assert found.aside_m == pytest.approx(0.25 + 0.17 + 0.1)
-    assert found.closing_m_s == pytest.approx(0.85 + 0.6)
-    assert found.margin_m == pytest.approx(0.18 * 1.45)
-    assert found.required_m == pytest.approx(1.45 * t + 0.261 + 0.27)
-
-
-def test_detection_distance_knows_what_moves():
-    assert required_detection(CONFIG.model_copy(update={"world": WorldConfig(n_dynamic=0)})) is None
-    assert required_detection(CONFIG.model_copy(update={"world": WorldConfig(dynamic_speed_m_s=0.0)})) is None
-    path = (Waypoint(x_m=5, y_m=1), Waypoint(x_m=5, y_m=5))
-    swinging = FixedObstacle(kind="box", x_m=5, y_m=1, half_extents_m=(0.3, 0.4), path=path, speed_m_s=1.4)
-    found = required_detection(
-        CONFIG.model_copy(update={"world": WorldConfig(n_dynamic=0, fixed=(swinging,))})
-    )
-    assert (found.closing_m_s, found.aside_m) == (pytest.approx(2.25), pytest.approx(0.5 + 0.27))

@@ -25,11 +25,6 @@ from uuvtai.tables.table import PAGE, TERMINAL, Cell, Column, Table, markdown
 from uuvtai.tables.wording import sensing
 
 WIDTHS = (80, 100, 120)
-CONDITION = {
-    "detection": {"required_m": 1.9, "closing_m_s": 1.2, "aside_s": 1.1},
-    "rides": 64, "rides_threatened": 40, "rides_threatened_ci95": [0.5, 0.7], "threats_per_min": 3.1,
-    "threats": 99, "ride_minutes": 32.0,
-}  # fmt: skip
 
 
 def shown(show, width, wide=False):
@@ -47,7 +42,6 @@ def evaluation():
         for name, k in names.items()
     ]
     return samples.evaluation_document(*methods) | {
-        "condition": CONDITION,
         "remainder": [],
         "paired": paired(methods),
     }

@@ -1,5 +1,4 @@
-"""An evaluation in the terminal: the table of methods, how hard the condition is, pairs of methods, and the
-risk head."""
+"""An evaluation in the terminal: the table of methods, pairs of methods, and the risk head."""
 
 from __future__ import annotations
 
@@ -10,7 +9,7 @@ from uuvtai.endings import say
 from uuvtai.show.cause_table import show_causes
 from uuvtai.show.screen import Screen
 from uuvtai.tables.method_tables import DAGGER, methods_table, paired_table
-from uuvtai.tables.wording import number, rate, sensing
+from uuvtai.tables.wording import number, sensing
 
 
 def show_evaluation(screen: Screen, result: dict[str, Any], folder: Path) -> None:
@@ -34,7 +33,6 @@ def show_methods(screen: Screen, result: dict[str, Any]) -> None:
         f"{result['episodes_per_seed']} episodes"
     )
     screen.table(methods_table(result["methods"], title))
-    _show_condition(screen, result["condition"])
     for part in result["remainder"]:
         _show_remainder(screen, part)
     for m in result["methods"]:
@@ -65,20 +63,6 @@ def _privilege(name: str) -> str:
             "it knows the future and has no inertia; timeout = not reachable. An upper bound, no controller"
         )
     return "it is told where every moving body is and how it moves; what stands still it senses"
-
-
-def _show_condition(screen: Screen, condition: dict[str, Any]) -> None:
-    """How hard the condition is, in one line."""
-    detection, threatened = condition["detection"], condition["rides_threatened"]
-    if detection is None:
-        return
-    rides = rate(threatened, condition["rides"], condition["rides_threatened_ci95"]).brief
-    screen.line(
-        f"threat rate {condition['threats_per_min']:.2f} per minute ({condition['threats']} moving bodies in "
-        f"{condition['ride_minutes']:.1f} min of blind rides; {rides} of the rides meet one), required "
-        f"detection distance {detection['required_m']:.1f} m (closing {detection['closing_m_s']:.1f} m/s, "
-        f"{detection['aside_s']:.1f} s to move aside)"
-    )
 
 
 def show_risk(screen: Screen, name: str, risk: dict[str, Any]) -> None:

@@ -1,5 +1,4 @@
-"""Privileged yardsticks beside the methods: the oracle's row of the table; threat rate and detection distance
-of the condition."""
+"""Privileged yardsticks beside the methods: the oracle's row of the table, and what a method lacks of it."""
 
 from __future__ import annotations
 
@@ -18,11 +17,8 @@ from uuvtai.measure.episodes.playing import EpisodeResult, Job, Progress
 from uuvtai.measure.evaluate.eval_request import ORACLE
 from uuvtai.measure.evaluate.summary import summary
 from uuvtai.plan_codes import PLANNERS, REASONS, TRIGGERS
-from uuvtai.privileged.blind_ride import ride_blindly
-from uuvtai.privileged.detection import required_detection
 from uuvtai.privileged.oracle import earliest_arrival
 from uuvtai.sim import Sim
-from uuvtai.statistics import rate, wilson_interval
 
 _UNKNOWN = (
     "return_mean",
@@ -94,30 +90,6 @@ def _result(job: Job, time_s: float | None, config: Config) -> EpisodeResult:
         ticks=np.zeros(0),
         acted=np.zeros(0),
     )
-
-
-def condition_of(config: Config, scenarios: list[dict[str, Any]]) -> dict[str, Any]:
-    """How hard the condition is, from the truth: ``condition`` of ``uuv eval --json``.
-
-    The threat rate is the number of moving bodies per minute that come within the collision clearance of a
-    vehicle that rides the straight line from start to goal at cruise speed and does not look
-    (``privileged.blind_ride``), over all these scenarios.
-    """
-    rides = [ride_blindly(scenario, config) for scenario in scenarios]
-    threats, minutes = sum(ride.threats for ride in rides), sum(ride.time_s for ride in rides) / 60.0
-    threatened = sum(ride.threats > 0 for ride in rides)
-    interval = wilson_interval(threatened, len(rides))
-    detection = required_detection(config)
-    return {
-        "threats": threats,
-        "ride_minutes": round(minutes, 3),
-        "threats_per_min": threats / minutes if minutes else None,
-        "rides": len(rides),
-        "rides_threatened": threatened,
-        "rides_threatened_rate": rate(threatened, len(rides)),
-        "rides_threatened_ci95": None if interval is None else list(interval),
-        "detection": None if detection is None else vars(detection),
-    }
 
 
 def remainder_of(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -156,7 +156,7 @@ def _any_tree() -> FlatTree:
 def _compared(comparison: Comparison, folder: RunFolder) -> dict[str, Any]:
     """Play what is not over yet; the whole document, and all that is written and drawn of it."""
     from uuvtai.measure.episodes.playing import jobs_of
-    from uuvtai.measure.evaluate.ceilings import condition_of, remainder_of, scenarios_of
+    from uuvtai.measure.evaluate.ceilings import remainder_of, scenarios_of
     from uuvtai.measure.evaluate.explained import explain
     from uuvtai.measure.evaluate.ledger import Ledger
     from uuvtai.measure.evaluate.method_run import play
@@ -177,8 +177,7 @@ def _compared(comparison: Comparison, folder: RunFolder) -> dict[str, Any]:
     result = document(
         request.config, request.world, request.sensors, request.seeds, request.episodes, entries
     )
-    result |= {"condition": condition_of(request.config, scenarios), "remainder": remainder_of(entries)}
-    result["scenarios_sha256"] = scenarios_sha256(scenarios)
+    result |= {"remainder": remainder_of(entries), "scenarios_sha256": scenarios_sha256(scenarios)}
     _write_results(folder, result, runs)
     if request.explain:
         explain(comparison, runs, result, folder)
