@@ -20,7 +20,6 @@ from uuvtai.logs.reader import records
 from uuvtai.logs.topics.camera_topics import exact_image
 from uuvtai.measure.replay import replaying
 from uuvtai.measure.replay.faults import Faults, Outage, disturbed, outage_of
-from uuvtai.measure.replay.live_feed import drive_by_pilot
 from uuvtai.measure.replay.log_feed import Delivery, read_feed
 from uuvtai.measure.replay.replaying import replay
 from uuvtai.pilot import DepthShot, DvlReading, ImuReading, OnboardPilot, PressureReading, SonarPing
@@ -252,13 +251,6 @@ def test_what_is_no_message_or_has_another_shape_is_refused(log, build):
         pilot.feed(DepthShot(0.0, np.zeros((3, 3))))
     with pytest.raises(ValueError, match="imu: rpy"):
         pilot.feed(ImuReading(0.0, np.zeros(2), np.zeros(3), np.zeros(3)))
-
-
-def test_a_pilot_on_its_own_vehicle_does_what_the_simulator_does(small, monkeypatch):
-    """Row 0 senses, is driven and judged; with everything lost it stays where it is until the end."""
-    monkeypatch.setattr(small.sim, "sensors", small.sim.sensors)
-    with pytest.raises(ValueError, match="two simulators"):
-        drive_by_pilot(small.sim, small.sim, SEED, 3, Faults())
 
 
 @pytest.mark.parametrize(
