@@ -8,18 +8,15 @@ from tests.bundles import io_for
 from uuvtai.config import Config
 from uuvtai.kernels.core.lanes import LANES
 from uuvtai.kernels.core.signature import AnyTensor, Bundle
-from uuvtai.kernels.perception.elevation import COLUMN
 from uuvtai.kernels.teacher.bundles import ThreatsIO
 from uuvtai.kernels.teacher.cruise_depth import choose_depth, level_share
-from uuvtai.state import MissionState, Proprioception, TeacherState, TrackState, allocate
+from uuvtai.state import MissionState, Proprioception, TeacherState, allocate
 from uuvtai.tuned_numbers import TUNED
 
 N_ENV = 6
 SIZES = {
     "n_env": N_ENV,
     "n_track": 1,
-    "n_ray": 16,
-    "n_height": LANES,
     "n_node": 1,
     "n_candidate": LANES,
     "n_tuned": len(TUNED),
@@ -30,7 +27,7 @@ LOW, HIGH = -1.4, -0.2
 
 
 def config(column_share=0.0, **teacher):
-    numbers = {"edge_gap_m": 0.2, "depth_choices": 7, "weight_seen": 0.0} | teacher
+    numbers = {"edge_gap_m": 0.2, "depth_choices": 7} | teacher
     prior = {"column_share": column_share}
     return Config.model_validate({"traffic": POOL, "elevation": prior, "teacher": numbers})
 
@@ -49,7 +46,7 @@ def _choose(out: AnyTensor, io: Bundle[ThreatsIO]):
 
 class Stage:
     def __init__(self):
-        self.teacher, self.tracks = allocate(TeacherState, SIZES), allocate(TrackState, SIZES)
+        self.teacher = allocate(TeacherState, SIZES)
         self.ego, self.mission = allocate(Proprioception, SIZES), allocate(MissionState, SIZES)
 
     def choose(self, goal_z, away_m=10.0, before_z=-0.8, sigma_m=0.0, cfg=None):
@@ -121,20 +118,3 @@ def test_stays_at_the_goals_depth_where_bodies_fill_the_water(stage):
     full = config(1.0, weight_depth_change=0.0)
     np.testing.assert_allclose(stage.choose(-0.6, cfg=full), -0.6, atol=1e-6)
     np.testing.assert_allclose(stage.choose(-0.4, cfg=config(free_depth=False)), -0.4, atol=1e-6)
-
-
-def test_a_tracked_body_drives_it_to_the_other_edge(stage):
-    """Heights of tracked bodies count where they are weighed; one through the full column for no depth."""
-    for field in vars(stage.tracks).values():
-        field.fill(0)
-    height = np.zeros((N_ENV, 1, 1, LANES), np.float32)
-    at = -1.6 + (np.arange(COLUMN) + 0.5) * 1.6 / COLUMN
-    height[:3, 0, 0, np.abs(at + 0.3).argmin()] = 1.0
-    height[3:, 0, 0, COLUMN] = 1.0
-    stage.tracks.height.from_numpy(height.reshape(stage.tracks.height.to_numpy().shape))
-    stage.tracks.state.from_numpy(np.full((N_ENV, 1, 4), (5.0, 3.0, 0.0, 0.0), np.float32))
-    for field, value in ((stage.tracks.alive, 1), (stage.tracks.moving, 1), (stage.tracks.present, 1.0)):
-        field.fill(value)
-    found = stage.choose(-0.6, before_z=HIGH, cfg=config(weight_seen=1.0))
-    np.testing.assert_allclose(found, [LOW] * 3 + [HIGH] * 3, atol=1e-6)
-    stage.tracks.alive.fill(0)

@@ -106,12 +106,8 @@ class TeacherConfig(Section):
     reached in time; false = at the goal's depth"""
     depth_choices: PositiveCount = 8
     """depths to choose among, from edge to edge"""
-    depth_reach_m: Positive = 3.0
-    """tracked bodies count by reach / (reach + distance)"""
     weight_traffic: NonNegative = 1.0
     """of the bodies that are expected but not seen (``traffic``), by the share of them that is level"""
-    weight_seen: NonNegative = 0.0
-    """per tracked body level with the vehicle; 0 = none counts, for the choice gets restless by them"""
     weight_goal_depth: NonNegative = 0.05
     """[1/m] of the way to the goal's depth"""
     weight_depth_change: NonNegative = 0.1

@@ -5,9 +5,7 @@ import taichi as ti
 
 from uuvtai.config import ElevationConfig, TeacherConfig, TrafficConfig, VehicleConfig
 from uuvtai.kernels.core.geometry import FAR_M
-from uuvtai.kernels.core.lanes import f16x
 from uuvtai.kernels.core.signature import Bundle, Const
-from uuvtai.kernels.perception.elevation import COLUMN, half_height, heights
 from uuvtai.kernels.teacher.bundles import ThreatsIO
 from uuvtai.kernels.teacher.trajectories import depth_band, tuned
 from uuvtai.tuned_numbers import ARRIVAL, DEPTH_CHANGE, GOAL_DEPTH, SLOPE
@@ -33,8 +31,6 @@ def choose_depth(env, io: Bundle[ThreatsIO]):
             cost = ti.static(io.teacher_cfg.weight_traffic) * level_share(
                 z, io.traffic_cfg, io.elevation_cfg, io.teacher_cfg, io.vehicle_cfg
             )
-            if ti.static(io.teacher_cfg.weight_seen > 0):
-                cost += ti.static(io.teacher_cfg.weight_seen) * _level_bodies(env, z, io)
             cost += of_goal * ti.abs(z - goal[2])
             cost += of_change * ti.abs(z - before)
             if cost < best_cost:
@@ -70,24 +66,3 @@ def level_share(
 def _reach_m(traffic_cfg, teacher_cfg, vehicle_cfg):
     """[m] a body's centre nearer than this in height touches the hull."""
     return 0.25 * sum(traffic_cfg.height_m) + vehicle_cfg.hull_radius_m + teacher_cfg.contact_m
-
-
-@ti.func
-def _level_bodies(env, z, io: Bundle[ThreatsIO]):
-    """Expected number of tracked moving bodies level with a vehicle at ``z``, near ones counting more."""
-    at, found = heights(io.tank_cfg), 0.0
-    pos, touch = io.ego.pos_w[env], ti.static(io.vehicle_cfg.hull_radius_m + io.teacher_cfg.contact_m)
-    for track in range(ti.static(io.tracks.alive.shape[1])):
-        if io.tracks.alive[env, track] * io.tracks.moving[env, track] == 1:
-            share, level = io.tracks.height[env, track, 0], f16x(0.0)
-            reach = half_height(env, track, io.tracks, io.elevation_cfg) + touch
-            for i in ti.static(range(COLUMN)):
-                level[i] = ti.math.clamp(
-                    (reach - ti.abs(at[i] - z)) * ti.static(1.0 / _BLUR_M) + 0.5, 0.0, 1.0
-                )
-            level[COLUMN] = 1.0
-            mean = io.tracks.state[env, track]
-            away = ti.Vector([mean[0] - pos[0], mean[1] - pos[1]]).norm()
-            near = ti.static(io.teacher_cfg.depth_reach_m) / (ti.static(io.teacher_cfg.depth_reach_m) + away)
-            found += io.tracks.present[env, track] * (share * level).sum() * near
-    return found
