@@ -121,13 +121,13 @@ def _structs(n_env: int, config: Config, found: list[tuple]) -> dict:
     names = {
         "voronoi": "VoronoiState", "route": "RouteState", "clearance": "ClearanceState",
         "grid_map": "MapState", "mask": "GridMask", "mission": "MissionState", "ego": "Proprioception",
-        "forecast": "ForecastState", "clock": "ClockState",
+        "clock": "ClockState",
     }  # fmt: skip
     n_row, n_col = maps.SHAPE
     sizes = {
         "n_env": n_env, "n_plan": min(n_env, 64), "n_row": n_row, "n_col": n_col, "n_heap": n_row * n_col,
         "n_path": 2048, "n_way": config.route.n_way, "n_ahead": 32, "n_trigger": N_TRIGGER,
-        "n_planner": N_PLANNER, "n_reason": N_REASON, "n_track": 2, "n_forecast": 2,
+        "n_planner": N_PLANNER, "n_reason": N_REASON,
     }  # fmt: skip
     s = {name: state.allocate(getattr(state, struct), sizes) for name, struct in names.items()}
     s["mask"].outside.from_numpy(maps.OUTSIDE.astype(np.int32))
@@ -138,7 +138,6 @@ def _structs(n_env: int, config: Config, found: list[tuple]) -> dict:
         (s["clearance"].site_row, 2, np.int16), (s["clearance"].site_col, 3, np.int16),
     ):  # fmt: skip
         field.from_numpy(np.array([f[i] for f in found], dtype))
-    s["forecast"].radius_m.fill(-1.0)
     s["ego"].pos_w.from_numpy(np.tile(np.array([*_START, _Z_M], np.float32), (n_env, 1)))
     s["mission"].goal_w.from_numpy(np.tile(np.array([*_GOAL, _Z_M], np.float32), (n_env, 1)))
     s["route"].queue.from_numpy(np.arange(n_env, dtype=np.int32))

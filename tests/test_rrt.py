@@ -115,7 +115,7 @@ def test_straightening_never_costs_more():
 
 def serve(s, config=CONFIG, seed=1):
     fallback = rrt.RouteFallback(config)
-    parts = (s.route, s.clearance, s.grid_map, s.mask, s.forecast, s.mission, s.ego, s.clock, config)
+    parts = (s.route, s.clearance, s.grid_map, s.mask, s.mission, s.ego, s.clock, config)
     return fallback.serve(
         SimpleNamespace(route=io_for(RouteIO, *parts), voronoi=io_for(VoronoiIO, *parts)),
         lambda env: seed + env,
@@ -136,7 +136,6 @@ CASES = {
     "start_outside": (start_by_an_obstacle(), (2.0, 3.0), (18.0, 3.0), CONFIG),
     "goal_outside": (np.hypot(maps.X - 18.0, maps.Y - 3.6) < 0.4, (2.0, 3.0), (18.0, 3.0), CONFIG),
     "disconnected": (narrow_gap(), (2.0, 3.0), (18.0, 3.0), CONFIG),
-    "forecast": (wall(18.75, 2.5, 3.5), (17.8, 3.0), (19.4, 3.0), STRICT),
     "budget": (np.abs(maps.X - 12.0) < 0, (19.4, 3.0), (2.0, 1.0), None),
 }
 
@@ -147,9 +146,6 @@ def test_rrt_takes_over(reason):
     s = clean()
     put_maps([occ] * N_ENV)
     put_ends([start] * N_ENV, [goal] * N_ENV)
-    if reason == "forecast":
-        s.forecast.radius_m.fill(0.1)
-        s.forecast.pos_w.from_numpy(np.full(s.forecast.pos_w.to_numpy().shape, (18.7, 3.1), np.float32))
     if config is None:  # the small budget of STRICT, used up by a wide search around a wall
         config = STRICT
         baffled = np.zeros(maps.SHAPE, bool)

@@ -33,14 +33,11 @@ SPACING_TOLERANCE = 2e-4
 V = CONFIG.voronoi
 STRICT = CONFIG.model_copy(
     update={
-        "voronoi": V.model_copy(
-            update={"avoid_forecast": True, "use": "fused", "min_clearance_m": 0.3, "max_pops": 5000}
-        ),
+        "voronoi": V.model_copy(update={"use": "fused", "min_clearance_m": 0.3, "max_pops": 5000}),
         "quiet": CONFIG.quiet.model_copy(update={"room_m": 0.7}),
     }
 )
-"""One other compiled variant for all switches: forecast avoided, both layers, another d_min, small budget,
-less room."""
+"""One other compiled variant for all switches: both layers, another d_min, small budget, less room."""
 
 
 @lru_cache(maxsize=1)
@@ -227,35 +224,6 @@ def test_a_failed_plan_keeps_the_old_route():
     plan([0])
     assert s.route.fallback_reason[0] == plan_codes.FAIL_DISCONNECTED
     assert np.array_equal(way_of(0), before) and s.route.planned_by[0, 0] == 1
-
-
-def test_the_forecast_blocks_only_where_it_is_avoided():
-    s = clean()
-    put_maps([wall(18.75, 2.5, 3.5)] * N_ENV)
-    radius, pos = s.forecast.radius_m.to_numpy(), s.forecast.pos_w.to_numpy()
-    radius[0, 1], pos[0, 1, :, 0], pos[0, 1, :, 1] = 0.3, 18.7, np.linspace(2.8, 3.2, 26)
-    s.forecast.radius_m.from_numpy(radius)
-    s.forecast.pos_w.from_numpy(pos)
-    put_ends([(17.8, 3.0)] * N_ENV, [(19.4, 3.0)] * N_ENV)
-    plan([0, 1])
-    assert [s.route.fallback_reason[env] for env in (0, 1)] == [plan_codes.FAIL_NONE] * 2
-    plan([0, 1], STRICT)
-    assert [s.route.fallback_reason[env] for env in (0, 1)] == [
-        plan_codes.FAIL_FORECAST,
-        plan_codes.FAIL_NONE,
-    ]
-
-
-def test_the_forecast_is_gone_around_where_there_is_room():
-    s = clean()
-    s.forecast.radius_m.fill(0.3)
-    s.forecast.pos_w.fill(3.0)
-    put_ends([(1.0, 3.0)] * N_ENV, [(6.0, 3.0)] * N_ENV)
-    plan([0], STRICT)
-    assert s.route.fallback_reason[0] == plan_codes.FAIL_NONE
-    assert (
-        np.linalg.norm(oracle.line_points(way_of(0), 0.01)[0] - 3.0, axis=1).min() > 0.3 + 0.3 - maps.CELL_M
-    )
 
 
 def test_the_dynamic_layer_counts_only_when_asked_for():

@@ -11,11 +11,8 @@ PLANNERS = ("voronoi", "rrt", "own")
 N_PLANNER = len(PLANNERS)
 PLANNER_NONE, PLANNER_VORONOI, PLANNER_RRT, PLANNER_OWN = range(N_PLANNER + 1)
 
-REASONS = ("start_outside", "goal_outside", "disconnected", "forecast", "budget")
+REASONS = ("start_outside", "goal_outside", "disconnected", "budget")
 """Why the Voronoi planner found nothing: the start or the goal is not traversable, the traversable set does
-not join them (gaps below d_min), only the forecast of moving bodies parts them, or the search ran out of pops
-or memory."""
+not join them (gaps below d_min), or the search ran out of pops or memory."""
 N_REASON = len(REASONS)
-FAIL_NONE, FAIL_START_OUTSIDE, FAIL_GOAL_OUTSIDE, FAIL_DISCONNECTED, FAIL_FORECAST, FAIL_BUDGET = range(
-    N_REASON + 1
-)
+FAIL_NONE, FAIL_START_OUTSIDE, FAIL_GOAL_OUTSIDE, FAIL_DISCONNECTED, FAIL_BUDGET = range(N_REASON + 1)

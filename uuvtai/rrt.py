@@ -309,7 +309,7 @@ class RouteFallback:
 
         ends = [read(field, envs)[:, :2] - self.origin for field in (io.ego.pos_w, io.mission.goal_w)]
         bodies, radius = (
-            read(f, envs) for f in (stages.voronoi.forecast.pos_w, stages.voronoi.forecast.radius_m)
+            read(f, envs) for f in (stages.triggers.forecast.pos_w, stages.triggers.forecast.radius_m)
         )
         for i, env in enumerate(envs):
             overlay_clearance(stages.voronoi, self.overlay, env)

@@ -37,8 +37,6 @@ class VoronoiConfig(Section):
     """budget of each pass of the search"""
     use: Literal["static", "fused"] = "static"
     """which occupancy the route must avoid"""
-    avoid_forecast: bool = False
-    """plan around the forecast of moving bodies too (no gain found in trials)"""
 
 
 class QuietConfig(Section):

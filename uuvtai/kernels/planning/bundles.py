@@ -123,7 +123,6 @@ class VoronoiIO:
     clearance: In[ClearanceState]
     clock: In[ClockState]
     ego: In[Proprioception]
-    forecast: In[ForecastState]
     grid_map: In[MapState]
     mask: In[GridMask]
     mission: In[MissionState]

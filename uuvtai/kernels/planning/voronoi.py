@@ -9,7 +9,7 @@ fails with a reason, and the host's RRT takes over.
 
 import taichi as ti
 
-from uuvtai.kernels.core.grid import centre_of, grid_origin
+from uuvtai.kernels.core.grid import grid_origin
 from uuvtai.kernels.core.lanes import filled, n_lane
 from uuvtai.kernels.core.signature import Bundle, FloatMatrix, spread
 from uuvtai.kernels.planning.bundles import VoronoiIO
@@ -21,7 +21,6 @@ from uuvtai.native.launch import quick_launch
 from uuvtai.plan_codes import (
     FAIL_BUDGET,
     FAIL_DISCONNECTED,
-    FAIL_FORECAST,
     FAIL_GOAL_OUTSIDE,
     FAIL_NONE,
     FAIL_START_OUTSIDE,
@@ -53,8 +52,6 @@ def _plan(slot, env, io: Bundle[VoronoiIO]):
     reason = _endpoint_reason(slot, start_w, goal_w, io)
     io.voronoi.pops[env] = 0
     if reason == FAIL_NONE:
-        if ti.static(io.voronoi_cfg.avoid_forecast):
-            _block_forecast(slot, env, start_w, io)
         start, goal = _cell(start_w, io), _cell(goal_w, io)
         reason = _search_reason(slot, env, start, goal, io)
     if reason == FAIL_NONE:
@@ -126,58 +123,21 @@ def _weight_at(slot, cell, io: Bundle[VoronoiIO]):
 
 
 @ti.func
-def _block_forecast(slot, env, start_w, io: Bundle[VoronoiIO]):
-    """Close every cell that a moving body is expected to come closer to than d_min within the horizon; the
-    own cell stays open."""
-    own = _cell(start_w, io)
-    own_weight = io.voronoi.weight[slot, own[0], own[1]]
-    for track in range(io.forecast.radius_m.shape[1]):
-        if io.forecast.radius_m[env, track, 0] >= 0:  # a track is forecast at all steps or at none
-            for k in range(io.forecast.radius_m.shape[2]):
-                pos_w = ti.cast(io.forecast.pos_w[env, track, k], ti.f32)
-                reach = io.forecast.radius_m[env, track, k] + ti.static(io.voronoi_cfg.min_clearance_m)
-                _close_disc(slot, pos_w, reach, io)
-    io.voronoi.weight[slot, own[0], own[1]] = own_weight
-
-
-@ti.func
-def _close_disc(slot, pos_w, reach, io: Bundle[VoronoiIO]):
-    """Close every cell whose centre lies nearer than ``reach`` [m] to a point."""
-    n_row, n_col = ti.static(io.voronoi.weight.shape[1:])
-    low, high = _cell(pos_w - reach, io), _cell(pos_w + reach, io)
-    for row in range(ti.max(low[0], 0), ti.min(high[0] + 1, n_row)):
-        for col in range(ti.max(low[1], 0), ti.min(high[1] + 1, n_col)):
-            away = centre_of(row, col, io.tank_cfg, io.mapping_cfg.cell_m) - pos_w
-            if away.dot(away) < reach**2:  # type: ignore[misc]
-                io.voronoi.weight[slot, row, col] = 0.0
-
-
-@ti.func
 def _search_reason(slot, env, start, goal, io: Bundle[VoronoiIO]):
-    """Search the skeleton, then everything, then (where the forecast was avoided) everything as if nothing
-    moved, to name the reason."""
-    status, attempt, attempts, reason = (
-        NOT_FOUND,
-        0,
-        ti.static(3 if io.voronoi_cfg.avoid_forecast else 2),
-        FAIL_NONE,
-    )
-    while status == NOT_FOUND and attempt < attempts:
+    """Search the skeleton, then everything; why nothing was found."""
+    status, attempt, reason = NOT_FOUND, 0, FAIL_NONE
+    while status == NOT_FOUND and attempt < 2:
         if attempt == 0:
             join_skeleton(slot, env, start, goal, io)
-        elif attempt == 1:
+        else:
             io.route.second_passes[env] += 1
             _forget_search(slot, io)
-        else:
-            _weigh_cells(slot, env, io)
         status = search_cells(slot, env, start, goal, attempt, io)
         attempt += 1
     if status == NOT_FOUND:
         reason = FAIL_DISCONNECTED
     elif status != FOUND:
         reason = FAIL_BUDGET
-    elif attempt == 3:
-        reason = FAIL_FORECAST
     return reason
 
 
@@ -214,8 +174,7 @@ def _write_reason(slot, env, start_w, goal_w, io: Bundle[VoronoiIO]):
 
 @ti.kernel
 def overlay_clearance(io: Bundle[VoronoiIO], out: FloatMatrix, env: int):
-    """Clearance (n_row, n_col) [m] of one env for the host's fallback: 0 where occupied or outside, lowered
-    by the forecast if avoided."""
+    """Clearance (n_row, n_col) [m] of one env for the host's fallback: 0 where occupied or outside."""
     for row, col in ti.ndrange(out.shape[0], out.shape[1]):
         room = io.clearance.clearance_m[env, row, col]
         if (
@@ -223,20 +182,4 @@ def overlay_clearance(io: Bundle[VoronoiIO], out: FloatMatrix, env: int):
             or io.mask.outside[row, col] == 1
         ):
             room = 0.0
-        if ti.static(io.voronoi_cfg.avoid_forecast):
-            room = _room_beside_forecast(env, row, col, room, io)
         out[row, col] = room
-
-
-@ti.func
-def _room_beside_forecast(env, row, col, room, io: Bundle[VoronoiIO]):
-    """``room`` [m] of a cell, at most the gap to any forecast body at any step; never below 0."""
-    least = room
-    centre = centre_of(row, col, io.tank_cfg, io.mapping_cfg.cell_m)
-    for track in range(io.forecast.radius_m.shape[1]):
-        for k in range(io.forecast.radius_m.shape[2]):
-            radius = io.forecast.radius_m[env, track, k]
-            if radius >= 0:
-                gap = (centre - io.forecast.pos_w[env, track, k]).norm() - radius
-                least = ti.max(ti.min(least, gap), 0.0)
-    return least
