@@ -10,18 +10,16 @@ from __future__ import annotations
 import math
 import os
 import select
-import struct
 import subprocess
 import tempfile
 import time
-from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from pymavlink import mavutil
 
-from benchmarks.closed_loop import SEED, simulated
+from benchmarks.closed_loop import SEED, ends_row, simulated
 from benchmarks.common import Job, Row
 from uuvtai.config import Config
 from uuvtai.link.endpoint import Endpoint, LinkPlace
@@ -35,16 +33,13 @@ from uuvtai.sitl.instance import Instance
 from uuvtai.sitl.rows_of_water import WaterRows
 from uuvtai.sitl.serving import SitlPlan, SitlPort
 from uuvtai.sitl.simulated_operator import PLACE, PLACE_S, PLACED_S
-from uuvtai.statistics import wilson_interval
 from uuvtai.tree import read_tree
 
 THREADS = 1
 LONGEST_S = 7200
 BINARY = "UUV_ARDUSUB"
 RATE_HZ = 400
-TLOG_BEGINS_S = 1_700_000_000
-"""[s] since 1970; which day does not matter"""
-ALT_HOLD, GUIDED, MANUAL = 2, 4, 19
+ALT_HOLD, GUIDED = 2, 4
 PORT, SENSORS, OPERATOR = 29002, 24660, 24560
 PARAMETERS = Path(__file__).resolve().parent.parent / "examples/ardusub.parm"
 """beside ArduPilot's own defaults for its simulated submarine (Tools/autotest/default_params/sub.parm)"""
@@ -67,11 +62,10 @@ def measure(job: Job) -> list[Row]:
     return rows + _driven(pool, Sim(pool, 1, tree), Sim(pool, 1, tree), count, binary, job)
 
 
-def parameters(binary: str, more: dict[str, float]) -> str:
-    """A parameter file: the tree's own, ours, and ``more``."""
+def parameters(binary: str) -> str:
+    """A parameter file: the tree's own, and ours."""
     own = Path(binary).resolve().parents[3] / "Tools/autotest/default_params/sub.parm"
-    text = (own.read_text() if own.exists() else "") + "\n" + PARAMETERS.read_text()
-    return text + "".join(f"{name} {value}\n" for name, value in more.items())
+    return (own.read_text() if own.exists() else "") + "\n" + PARAMETERS.read_text()
 
 
 class Rig:
@@ -84,12 +78,8 @@ class Rig:
         seed: int = SEED,
         episode: int = 0,
         pilot: int | None = None,
-        more: dict[str, float] | None = None,
     ) -> None:
         self.water, self._binary = WaterRows(sim, seed, episode), binary
-        self._more = more or {}
-        self.tlog = b""
-        """what the first ArduSub told the operator, by the water's clock"""
         self._sim, count = sim, sim.num_envs
         places = [LinkPlace("127.0.0.1", SENSORS, False)]
         if pilot is not None:
@@ -115,7 +105,7 @@ class Rig:
     def _started(self, row: int) -> subprocess.Popen[bytes]:
         folder = Path(self._folder.name) / f"{row}_{time.monotonic_ns()}"
         folder.mkdir()
-        (folder / "sub.parm").write_text(parameters(self._binary, self._more))
+        (folder / "sub.parm").write_text(parameters(self._binary))
         words = [
             str(Path(self._binary).resolve()), "--model", "JSON:127.0.0.1", "--home",
             "-35.36,149.16,0,0", "--wipe", "--defaults", "sub.parm", f"-I{row}", "--sysid", str(row + 1),
@@ -172,9 +162,6 @@ class Rig:
         for row, link in enumerate(self.links):
             while (message := link.recv_match(blocking=False)) is not None:
                 kind = message.get_type()
-                if row == 0 and kind != "BAD_DATA":  # the console's text at boot
-                    stamp = round(1e6 * (TLOG_BEGINS_S + self.time_s))
-                    self.tlog += struct.pack(">Q", stamp) + message.get_msgbuf()
                 if kind == "HEARTBEAT" and message.get_srcComponent() == 1:
                     self.modes[row], self.armed[row] = message.custom_mode, bool(message.base_mode & 128)
                 elif kind == "STATUSTEXT":
@@ -210,15 +197,6 @@ class Rig:
         self.links[0].mav.set_position_target_local_ned_send(
             0, 1, 1, 8, 0x5C7, 0, 0, 0, ahead, 0, 0, 0, 0, 0, 0, turn
         )
-
-    def push(self, ahead: float, right: float, up: float, turn: float) -> None:
-        """The operator's sticks, shares of full thrust."""
-        x, y, r = (round(1000 * share) for share in (ahead, right, turn))
-        self.links[0].mav.manual_control_send(1, x, y, round(500 + 500 * up), r, 0)
-
-    def dataflash(self) -> list[Path]:
-        """Logs that ArduSub wrote."""
-        return sorted(Path(self._folder.name).rglob("*.BIN"))
 
     def stop(self, row: int) -> None:
         """Kill an ArduSub."""
@@ -346,20 +324,11 @@ def _driven(config: Config, sim: Sim, flown: Sim, count: int, binary: str, job: 
             found.append(f"failed: {error}")
             job.say(f"episode {number}: {error}")
     ours = [simulated(sim, number) for number in range(count)]
-    return [pool_row("driven by the stack through ArduSub", found), pool_row("in uuv eval's loop", ours)]
-
-
-def pool_row(name: str, found: list[str]) -> Row:
-    count, ends = len(found), Counter(found)
-    low, high = wilson_interval(ends["success"], count) or (0.0, 1.0)
-    others = ", ".join(f"{end} {n}" for end, n in sorted(ends.items()) if end != "success") or "none"
-    return Row(
-        f"pool (8, 6, 0.6), {name}",
-        100.0 * ends["success"] / count,
-        "% of the episodes a success",
-        note=f"{ends['success']} of {count} [{100 * low:.1f}, {100 * high:.1f}]; others: {others}",
-        details={"endings": found, "seed": SEED},
-    )
+    what = "pool (8, 6, 0.6), "
+    return [
+        ends_row(f"{what}driven by the stack through ArduSub", found),
+        ends_row(f"{what}in uuv eval's loop", ours),
+    ]
 
 
 def _episode(config: Config, sim: Sim, flown: Sim, number: int, binary: str, job: Job) -> str:

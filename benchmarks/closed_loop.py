@@ -50,15 +50,16 @@ def measure(job: Job) -> list[Row]:
         "by JSON and MAVLink": [_flown(config, water, flown, number, job.say) for number in range(count)],
         "in the simulator's own loop": [simulated(water, number) for number in range(count)],
     }
-    return [_row(name, found) for name, found in ends.items()]
+    return [ends_row(f"closed loop, {name}", found) for name, found in ends.items()]
 
 
-def _row(name: str, found: list[str]) -> Row:
+def ends_row(what: str, found: list[str]) -> Row:
+    """How many episodes were a success, and how the others ended."""
     count, ends = len(found), Counter(found)
     low, high = wilson_interval(ends["success"], count) or (0.0, 1.0)
     others = ", ".join(f"{end} {n}" for end, n in sorted(ends.items()) if end != "success") or "none"
     return Row(
-        f"closed loop, {name}",
+        what,
         100.0 * ends["success"] / count,
         "% of the episodes a success",
         note=f"{ends['success']} of {count} [{100 * low:.1f}, {100 * high:.1f}]; others: {others}",

@@ -1,4 +1,4 @@
-"""One side of ``before.py``, ``paced.py`` or ``twin.py``, in a process of its own with one tree: plays and
+"""One side of ``before.py`` or ``paced.py``, in a process of its own with one tree: plays and
 answers on stdout.
 
 python played.py bits WORLD SENSORS NUM_ENVS STEPS   sha256 of the steps and of every array, as JSON
@@ -6,8 +6,6 @@ python played.py speed WORLD SENSORS NUM_ENVS        for every number read: CPU 
 python played.py paced WORLD SENSORS NUM_ENVS        for every number read: milliseconds of each of so many
                                                      steps, one begun every 20 ms, as JSON
 python played.py all_cores WORLD SENSORS NUM_ENVS    for every number read: seconds of so many steps
-python played.py twin PRESET NUM_ENVS                for every number read: seconds of so many decisions of
-                                                     every env in the kinematic twin, without a policy
 """
 
 from __future__ import annotations
@@ -25,9 +23,6 @@ _PERIOD_S = 0.02
 def main() -> None:
     """Play as the command line says."""
     del sys.path[0]  # this folder: its names must not hide others
-    if sys.argv[1] == "twin":
-        answer_of_twin(sys.argv[2], int(sys.argv[3]))
-        return
     what, world, sensors, *numbers = sys.argv[1:]
     if what == "bits":
         print("\n" + json.dumps(bits(world, sensors, *map(int, numbers))))
@@ -68,31 +63,6 @@ def answer(what: str, world: str, sensors: str, num_envs: int) -> None:
         begun = clock()
         info = _steps(env, info, int(line))
         print(f"steps {clock() - begun}", flush=True)
-
-
-def answer_of_twin(preset: str, num_envs: int) -> None:
-    """As ``answer``, of vehicles that go ahead and to the sides at random."""
-    import torch
-
-    from uuvtai.loader import load_training
-    from uuvtai.twin.scenario_bank import draw_bank
-    from uuvtai.twin.twin_world import Twin
-
-    config = load_training(preset)
-    twin = Twin(config, draw_bank(config, config.train.scenes, _SEED, 256), num_envs, _SEED)
-    generator = torch.Generator().manual_seed(_SEED)
-    scenario = torch.randint(twin.num_scenarios, (num_envs,), generator=generator)
-    wishes = torch.randn(16, num_envs, 3, generator=generator) * 0.4 + torch.tensor([0.8, 0.0, 0.0])
-    twin.begin(torch.ones(num_envs, dtype=torch.bool), scenario)
-    twin.look()
-    print(f"ready {time.process_time()}", flush=True)
-    for line in sys.stdin:
-        begun = time.perf_counter()
-        for step in range(int(line)):
-            _reward, outcome = twin.step(wishes[step % len(wishes)])
-            twin.begin(outcome != 0, scenario)
-            twin.look()
-        print(f"steps {time.perf_counter() - begun}", flush=True)
 
 
 def _paced(env: Any, info: dict[str, Any], count: int) -> tuple[dict[str, Any], list[float]]:

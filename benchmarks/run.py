@@ -41,7 +41,6 @@ PEERS = (
     "py_trees",
     "numpy",
     "torch",
-    "stable-baselines3",
 )
 _LONGEST_S = 1200
 """of a benchmark that names no LONGEST_S of its own"""
@@ -59,9 +58,7 @@ def main() -> int:
         "--quick", action="store_true", help="small sizes, short times; nothing is kept unless --out is given"
     )
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
-    parser.add_argument(
-        "--num-envs", default="", help="batch sizes for scale and growth, separated by commas"
-    )
+    parser.add_argument("--num-envs", default="", help="batch sizes for scale, separated by commas")
     parser.add_argument(
         "--seconds", type=float, help="measured time per side of a comparison [s] (default 4)"
     )
