@@ -138,39 +138,6 @@ def test_false_alarms_and_misses_are_counted_by_episode():
     assert len(one) == 2 and set(one.tolist()) <= set(seen.peers[:8, 0].tolist())
 
 
-def test_track_errors_are_those_of_the_nearest_track_within_reach():
-    errors, gone = parity.TrackErrors(), [np.nan] * 4
-    bodies = np.array([[[1.0, 0.0, 1.0, 0.0], [0.0, 3.0, 0.0, 0.0], [9.0, 0.0, 0.0, 0.0], gone]])
-    tracks = np.array([[[1.1, 0.0, 1.0, 0.3], [0.0, 4.5, 0.0, 0.0], gone, [9.0, 0.0, 0.0, 0.0]]])
-    near, found = errors.add(np.zeros((1, 2)), tracks, bodies)
-    assert near.tolist() == [[True, True, False, False]] and found.tolist() == [[True, False, False, False]]
-    births = parity.Births(errors, 1, 4)
-    births.add(np.array([0]), np.array([0.1]), near, np.zeros_like(found))
-    births.add(np.array([0]), np.array([0.4]), near, found)
-    births.end(np.array([0]))
-    said = errors.summary()
-    assert said["position error, median"] == pytest.approx(0.1)
-    assert said["velocity error, p90"] == pytest.approx(0.3)
-    assert (said["bodies tracked"], said["never tracked"]) == (0.5, 0.5)
-    assert errors.delay_s == pytest.approx([0.3])
-
-
-def test_true_bodies_move_as_their_paths_say():
-    path = np.zeros((1, 2, 16))
-    path[0, 0, :5] = 0, 2.0, 4 * np.pi, 0.0, 0.5  # a circle of radius 2 around (1, 1), half a metre a second
-    path[0, 0, 5:7] = 1.0, 1.0
-    (body, none) = parity.true_bodies(path, np.array([0.0]))[0]
-    np.testing.assert_allclose(body, [3.0, 1.0, 0.0, 0.5], atol=1e-3)
-    assert np.isnan(none).all()
-
-
 def test_parity_asks_for_a_policy():
     with pytest.raises(SystemExit, match="--policy RUN"):
         parity.measure(Job(quick=True))
-
-
-def test_bodies_of_an_earlier_scene_are_none(monkeypatch):
-    body, path = np.zeros((1, 3, 8)), np.ones((1, 2, 16))
-    body[0, :2, 0] = 1.0  # one rests, one moves, the last lane is empty
-    monkeypatch.setattr(parity, "scenario_rows", lambda _sim: [body, path, None])
-    assert parity.moving_paths(None)[0, :, 4].tolist() == [1.0, 0.0]
