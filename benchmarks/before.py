@@ -1,9 +1,10 @@
 """This tree against another commit of it (``--against``, default HEAD): are the bits equal, is it as fast?
 
-A refactoring shows here that it is one: 300 steps of 256 vehicles in three worlds, a recorded log, four
-iterations of training, compared bit by bit; then steps per CPU second of one thread and the start with warm
-kernels, in turns (wall time on a shared machine wanders by a third). Both sides run in this environment, each
-with its own package and caches.
+A refactoring shows here that it is one: 300 steps of 256 vehicles in three worlds, the messages of two
+recorded episodes, four iterations of training in the simulator and in the surrogate, compared bit by bit;
+what only one side has is named. Then steps per CPU second of one thread, the start with warm kernels and the
+writing of logs, in turns (wall time on a shared machine wanders by a third). Both sides run in this
+environment, each with its own package and caches.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import hashlib
 import json
 import math
 import os
+import resource
 import statistics
 import subprocess
 import sys
@@ -28,10 +30,20 @@ LONGEST_S = 5400
 ROOT = Path(__file__).resolve().parent.parent
 _WORLDS = (("pool", "paper"), ("gauntlet", "harsh"), ("maze", "nominal"))
 _EVAL = ["eval", "--controller", "bt", "--episodes", "2", "--seeds", "77", "--num-envs", "4", "--record", "2"]
-_TRAIN = ["train", "smoke", "--device", "cpu", "--iterations", "4"]
+_TRAIN = ["--device", "cpu", "--iterations", "4"]
+_SMALL = {
+    "curriculum": {
+        "train.num_envs": 16,
+        "ppo.rollout_steps": 16,
+        "distill.batch": 64,
+        "world_model.batch": 64,
+    },
+    "quick": {"train.num_envs": 64, "twin.scenarios": 64},
+}
+"""trainings in the simulator and in the surrogate, as small as they go"""
 _ROUNDS = 120
 """pairs of short turns"""
-_STARTS = 9
+_STARTS, _LOGS = 9, 5
 _NO_BYTECODE = "PYTHONDONTWRITEBYTECODE"
 """compiles every module again at every start, on both sides: nobody's start"""
 
@@ -89,11 +101,14 @@ def measure(job: Job) -> list[Row]:
             rows.append(_equal(what, one, other, commit))
         one, other = (_topics(side.uuv([*_EVAL, *horizon], "eval")) for side in (ours, theirs))
         rows.append(_equal("two recorded episodes: topics that differ", one, other, commit))
-        one, other = (_weights(side.uuv(_TRAIN, "train")) for side in (ours, theirs))
-        rows.append(
-            _equal("four iterations of training: files of checkpoints that differ", one, other, commit)
-        )
-        return rows + _speed(job, ours, theirs, commit, num_envs)
+        for name, small in _SMALL.items():
+            sets = (word for key, value in small.items() for word in ("--set", f"{key}={value}"))
+            command = ["train", name, *_TRAIN, *sets]
+            one, other = (_weights(side.uuv(command, name)) for side in (ours, theirs))
+            what = f"four iterations of uuv train {name}: tensors of checkpoints that differ"
+            rows.append(_equal(what, one, other, commit))
+        rows += _speed(job, ours, theirs, commit, num_envs)
+        return rows + _logging(job, (ours, theirs), commit, [*_EVAL, *horizon])
 
 
 @contextlib.contextmanager
@@ -111,10 +126,15 @@ def checked_out(commit: str, place: Path) -> Iterator[tuple[str, Path]]:
 
 
 def _equal(what: str, ours: dict[str, str], theirs: dict[str, str], commit: str) -> Row:
-    """How many of the names have other bits, or are on one side alone."""
-    wrong = sorted(name for name in ours.keys() | theirs.keys() if ours.get(name) != theirs.get(name))
-    note = f"of {len(theirs)} at {commit}" + (f": {', '.join(wrong[:5])}" if wrong else "")
-    return Row(what, len(wrong), "", less_is_better=True, floor=0, note=note, details={"differ": wrong})
+    """How many of the names that both sides have are of other bits; those of one side alone are named."""
+    wrong = sorted(name for name in ours.keys() & theirs.keys() if ours[name] != theirs[name])
+    alone = {"here": sorted(ours.keys() - theirs.keys()), commit: sorted(theirs.keys() - ours.keys())}
+    count = len(ours.keys() & theirs.keys())
+    notes = [f"of {count}" + (f": {', '.join(wrong[:5])}" if wrong else "")]
+    notes += [f"only {side}, {len(names)}: {', '.join(names)}" for side, names in alone.items() if names]
+    details = {"differ": wrong, "only": alone}
+    found = len(wrong) if count else None
+    return Row(what, found, "", less_is_better=True, floor=0, note="; ".join(notes), details=details)
 
 
 def _topics(run: Path) -> dict[str, str]:
@@ -131,10 +151,17 @@ def _topics(run: Path) -> dict[str, str]:
 
 
 def _weights(run: Path) -> dict[str, str]:
-    files = sorted((run / "checkpoints").glob("step_*/*.safetensors"))
-    return {
-        f"{file.parent.name}/{file.name}": hashlib.sha256(file.read_bytes()).hexdigest() for file in files
-    }
+    """sha256 of every tensor of every checkpoint."""
+    found = {}
+    for file in sorted((run / "checkpoints").glob("step_*/*.safetensors")):
+        content = file.read_bytes()
+        begin = 8 + int.from_bytes(content[:8], "little")
+        for name, tensor in json.loads(content[8:begin]).items():
+            if name != "__metadata__":
+                first, last = (begin + offset for offset in tensor["data_offsets"])
+                value = hashlib.sha256(f"{tensor['dtype']}{tensor['shape']}".encode() + content[first:last])
+                found[f"{file.parent.name}/{file.stem}/{name}"] = value.hexdigest()
+    return found
 
 
 def _speed(job: Job, ours: Side, theirs: Side, commit: str, num_envs: int) -> list[Row]:
@@ -167,6 +194,37 @@ def _speed(job: Job, ours: Side, theirs: Side, commit: str, num_envs: int) -> li
             less_is_better=True, floor=0.98, floor_on="ratio",
             details={"ours": begun[ours], "theirs": begun[theirs]}),
     ]  # fmt: skip
+
+
+def _logging(job: Job, sides: tuple[Side, Side], commit: str, command: list[str]) -> list[Row]:
+    """CPU time of an evaluation that records all that it plays, in turns, and the bytes of its logs."""
+    spent: list[list[float]] = [[], []]
+    for turn in range(1 if job.quick else _LOGS):
+        for i in (0, 1) if turn % 2 else (1, 0):
+            begun = _children_s()
+            sides[i].uuv(command, f"eval{turn}")
+            spent[i].append(_children_s() - begun)
+    sizes = [sum(log.stat().st_size for log in (side.folder / "eval0/logs").glob("*.mcap")) for side in sides]
+    ours, theirs = map(statistics.median, spent)
+    details = {"ours_s": spent[0], "theirs_s": spent[1]}
+    return [
+        Row(
+            "uuv eval that writes two logs",
+            ours,
+            "CPU s",
+            theirs,
+            commit,
+            less_is_better=True,
+            details=details,
+        ),
+        Row("their size", sizes[0] / 1e6, "MB", sizes[1] / 1e6, commit, less_is_better=True),
+    ]
+
+
+def _children_s() -> float:
+    """CPU seconds of all processes that were waited for."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def _median_interval(values: list[float]) -> tuple[float, float, float]:

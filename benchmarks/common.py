@@ -23,7 +23,7 @@ class Job:
     seconds: float = 4.0
     """measured time per side of a comparison"""
     against: str = ""
-    """commit that ``before`` compares with; empty: the last one"""
+    """commit to compare with; empty: the last one"""
     policy: str = ""
     """run folder of the policy that ``parity`` plays"""
     say: Callable[[str], None] = print

@@ -103,11 +103,13 @@ def test_unknown_names_are_refused():
     assert done.returncode == 2 and "sonra" in done.stderr and "tick" in done.stderr
 
 
-def test_what_differs_from_a_commit_is_counted_on_both_sides():
+def test_what_differs_from_a_commit_is_counted_and_what_one_side_lacks_is_named():
     same = before._equal("arrays", {"a": "1"}, {"a": "1"}, "abc")
     assert (same.ours, same.met) == (0, True)
     row = before._equal("arrays", {"a": "1", "b": "2", "new": "3"}, {"a": "1", "b": "x", "gone": "3"}, "abc")
-    assert (row.ours, row.met, row.details["differ"]) == (3, False, ["b", "gone", "new"])
+    assert (row.ours, row.met, row.details["differ"]) == (1, False, ["b"])
+    assert row.note == "of 2: b; only here, 1: new; only abc, 1: gone"
+    assert before._equal("arrays", {"new": "3"}, {"gone": "3"}, "abc").met is False, "nothing was compared"
 
 
 # -------------------------------------------------------------------------------------- risk alarm and parity
