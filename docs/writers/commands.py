@@ -13,13 +13,12 @@ from uuvtai import cli, endings
 from uuvtai.tables.table import text_table
 
 SEE = {
-    "eval": ("quickstart", "own_pieces", "ceilings", "viewers", "determinism"),
+    "eval": ("quickstart", "own_pieces", "viewers", "determinism"),
     "train": ("quickstart", "learning"),
     "simulate": ("simulator", "own_pieces"),
     "watch": ("viewers", "own_pieces"),
     "identify": ("vehicle",),
     "sweep": ("scale", "own_pieces"),
-    "profile": ("history",),
     "reproduce": ("learning", "own_pieces"),
     "report": ("quickstart", "viewers"),
     "export": ("deployment",),
@@ -50,8 +49,7 @@ EXIT_CODES = (
     (
         endings.GATE,
         "finished, but a gate was not met: `uuv export` found that an exported policy disagrees, `uuv "
-        "benchmark verify` that an entry does, `uuv replay` that commands do, "
-        "`uuv pilot` ended by a safe action",
+        "replay` that commands do, `uuv pilot` ended by a safe action",
     ),
     (
         endings.INTERRUPTED,
@@ -81,8 +79,9 @@ def _page(name: str) -> str:
             obj=root.commands[name], ctx=typer.Context(root, info_name="uuv"), name=f"uuv {name}"
         )
     )
-    links = ", ".join(f"[{page.rpartition('/')[2]}](../../{page}.md)" for page in SEE[name])
-    return f"{text.rstrip()}\n\nMore: {links}. Exit codes: [commands](../commands.md#exit-codes).\n"
+    links = ", ".join(f"[{page.rpartition('/')[2]}](../../{page}.md)" for page in SEE.get(name, ()))
+    more = f"More: {links}. " if links else ""
+    return f"{text.rstrip()}\n\n{more}Exit codes: [commands](../commands.md#exit-codes).\n"
 
 
 def words(text: str) -> str:

@@ -11,7 +11,7 @@ def page() -> str:
     causes = [[f"`{label}`", meaning] for label, meaning in CAUSES.items()]
     parts = [
         "# Causes of failure",
-        "`uuv eval --explain` plays every failed episode again and gives it one cause, the first of these "
+        "`uuv eval --explain` runs every failed episode again and gives it one cause, the first of these "
         "that holds. *Killer* is what the referee stopped the episode for. Forecasts, and whether there was "
         "a way out, are judged 1 s before the end.",
         text_table(["cause", "meaning"], causes),

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import re
-import textwrap
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 FENCE = re.compile(r"^(<!-- (?P<mark>run) -->\n)?```(?P<language>\w*)\n(?P<body>.*?)^```", re.M | re.S)
 
@@ -20,18 +19,3 @@ def shell_blocks(text: str) -> Iterator[tuple[str | None, list[str]]]:
         if fence["language"] == "sh":
             body = re.sub(r" *\\\n *", " ", fence["body"])
             yield fence["mark"], [line for line in body.splitlines() if line.strip()]
-
-
-_WIDTH = 120
-"""characters of a line in a block of a page"""
-
-
-def command_block(commands: Iterable[str]) -> str:
-    """Commands to copy, each on as many lines as a page is wide; an option stays beside its value."""
-    return "\n".join(["```sh", *map(_broken, commands), "```"])
-
-
-def _broken(command: str) -> str:
-    glued = re.sub(r" (?!-)", "\0", command)
-    lines = textwrap.wrap(glued, _WIDTH, break_long_words=False, break_on_hyphens=False)
-    return " \\\n  ".join(lines).replace("\0", " ")

@@ -1,0 +1,112 @@
+"""Tables of README and the page of results say what the committed results say; whatever differs is caught."""
+
+import json
+import shlex
+import shutil
+
+import pytest
+
+from docs import render_results
+from docs.render_results import EVALUATIONS, README, REPRODUCTION, RESULTS, ROOT
+from tests.test_docs import fault
+
+
+def test_the_pages_are_those_of_the_results(capsys):
+    """Where this fails: ``python -m docs.render_results``."""
+    assert render_results.differences() == []
+    assert render_results.main(["--check"]) == 0
+    tables = render_results.TABLE.findall((ROOT / README).read_text())
+    assert {name for _head, name, _body, _foot in tables} == set(render_results.TABLES)
+
+
+@pytest.fixture
+def copy(tmp_path, monkeypatch):
+    """Pages and results in a folder of their own."""
+    for name in (README, RESULTS, EVALUATIONS, REPRODUCTION):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, tmp_path / name)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("page", "cell", "changed"),
+    [
+        (README, "| `pool` (6, 0.6) | 990/1000 = 99.0 %", "| `pool` (6, 0.6) | 991/1000 = 99.1 %"),
+        (README, "of seed 90007", "of seed 90001"),
+        (RESULTS, "| holds |", "| does not hold |"),
+    ],
+)
+def test_a_cell_that_was_changed_by_hand_is_caught(copy, page, cell, changed):
+    text = (copy / page).read_text()
+    assert cell in text
+    (copy / page).write_text(text.replace(cell, changed, 1))
+    found = "\n".join(render_results.differences(copy))
+    assert changed in found and cell in found
+
+
+def test_results_that_move_on_leave_the_pages_behind(copy):
+    document = json.loads((copy / EVALUATIONS).read_text())
+    document["rows"][0]["methods"]["bt"]["outcomes"] |= {"success": 999, "collision": 1}
+    (copy / EVALUATIONS).write_text(json.dumps(document))
+    assert "+| `pool` (0) | 999/1000 = 99.9 %" in "\n".join(render_results.differences(copy))
+    document = json.loads((copy / REPRODUCTION).read_text())
+    document["profile"]["rows"][0]["env_steps_per_s"]["step"] *= 2
+    (copy / REPRODUCTION).write_text(json.dumps(document))
+    assert any("| 1,018 |" in line for line in render_results.differences(copy))
+
+
+def test_a_seed_that_was_tuned_on_is_called_so(copy):
+    document = json.loads((copy / EVALUATIONS).read_text())
+    assert "No tuning used this seed" in render_results.measured(document)
+    assert "was looked at while tuning" in render_results.measured(document | {"seed": 90001})
+
+
+def test_every_row_says_how_it_can_be_evaluated_again():
+    for row in json.loads((ROOT / EVALUATIONS).read_text())["rows"]:
+        first, *words = shlex.split(row["command"])
+        assert first == "uuv" and fault(words) is None
+
+
+def evaluation(folder, n=1000):
+    """A run folder as ``uuv eval`` leaves it."""
+    ends = {"success": n - 3, "collision": 1, "ttc": 1, "out_of_tank": 0, "timeout": 1}
+    agent = {"name": "bt", "episodes": n, "outcomes": ends, "time_mean_s": 9.0, "time_to_success_mean_s": 9.0}
+    agent |= {"causes": [{"label": "late", "count": 3, "share": 1.0}], "episodes_detail": [{}] * n}
+    (folder / "eval").mkdir(parents=True)
+    (folder / "eval/result.json").write_text(json.dumps({"methods": [agent], "paired": []}))
+    (folder / "run.json").write_text(json.dumps({"git_sha": "abc", "started": "today", "hardware": {}}))
+    return folder
+
+
+def test_an_evaluation_is_kept_in_its_row_alone(copy, tmp_path):
+    before = json.loads((copy / EVALUATIONS).read_text())
+    render_results.keep_row("pool_0", evaluation(tmp_path / "run"), copy)
+    after = json.loads((copy / EVALUATIONS).read_text())
+    assert after["rows"][1:] == before["rows"][1:]
+    agents = after["rows"][0]["methods"]
+    assert agents["bt"]["commit"] == "abc" and "episodes_detail" not in agents["bt"]
+    assert agents["best"] == before["rows"][0]["methods"]["best"]
+    assert all("bt" not in (pair["a"], pair["b"]) for pair in after["rows"][0]["paired"])
+    assert (
+        "| `pool` (0) | 997/1000 = 99.7 % [99.1, 99.9] | 0.2 % [0.1, 0.7] | 1 / 1 / 0 / 1 |"
+        in (render_results.pages(copy)[README])
+    )
+    with pytest.raises(ValueError, match="there are pool_0"):
+        render_results.keep_row("pol_0", tmp_path / "run", copy)
+    with pytest.raises(ValueError, match="bt: not 1000 episodes"):
+        render_results.keep_row("pool_0", evaluation(tmp_path / "short", 10), copy)
+
+
+def test_a_reproduction_is_kept_as_small_as_it_is(copy, tmp_path):
+    document = json.loads((copy / REPRODUCTION).read_text())
+    for cell in document["sweeps"]["pool"]["cells"]:
+        cell["episodes_detail"] = [{}]
+    (tmp_path / "reproduce.json").write_text(json.dumps(document | {"figures": []}))
+    render_results.keep_reproduction(tmp_path, copy)
+    assert render_results.differences(copy) == []
+    assert (copy / REPRODUCTION).stat().st_size == (ROOT / REPRODUCTION).stat().st_size
+
+
+def test_a_folder_that_is_no_run_is_refused(tmp_path, capsys):
+    assert render_results.main(["--keep", str(tmp_path)]) == 1
+    assert "not kept" in capsys.readouterr().err
