@@ -199,7 +199,7 @@ def main(arguments: list[str] | None = None) -> int:
             return 1
     if chosen.check:
         found = differences()
-        print("\n".join(found), file=sys.stderr)
+        print(*found, sep="\n", end="\n" if found else "", file=sys.stderr)
         return 1 if found else 0
     for name, text in pages().items():
         (ROOT / name).write_text(text, encoding="utf-8")
