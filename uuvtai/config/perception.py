@@ -74,7 +74,7 @@ class TrackingConfig(Section):
     partial_sigmas: NonNegative = 0.0
     """a cluster with free edges that is narrower than its track by more standard deviations than this is a
     part of the body, which leaves the sonar's fan by its nearest side first; 0 = it is all of it
-    (``docs/tuning.md``)"""
+    (``research/LOG.md``)"""
     moving_speed_m_s: NonNegative = 0.08
     moving_doppler_m_s: NonNegative = 0.03
     sight_doppler_m_s: Positive = 0.2

@@ -17,7 +17,7 @@ class TeacherConfig(Section):
     lag_s: Positive = 0.3
     """time constant from commanded to driven velocity, for roll-outs"""
     horizon_s: Positive = 2.0
-    """of roll-outs (``docs/tuning.md``)"""
+    """of roll-outs (``research/LOG.md``)"""
 
     n_heading: PositiveCount = 24
     n_speed: PositiveCount = 4

@@ -12,7 +12,7 @@ found is the earliest arrival of a kinematic point:
   full speed for the time to collision, also in a slow approach; climbing and diving count as standing still
   for it.
 
-So it bounds success from above but for the rounding to nodes; docs/ceilings.md says how often a pilot arrived
+So it bounds success from above but for the rounding to nodes; research/LOG.md says how often a pilot arrived
 where the oracle saw no way.
 """
 
