@@ -107,14 +107,6 @@ def evaluation_document(*methods):
     return {"schema": 1, **scene, "methods": list(methods or (method("straight", 3, 5), method("bt")))}
 
 
-RISK = {
-    "moments": 1300, "brier": 0.0038, "brier_base_rate": 0.0036, "ece": 0.0018, "auroc": 0.69,
-    "reliability": {"samples": [1200.0, 80.0, 20.0], "predicted": [0.005, 0.13, 0.6],
-    "observed": [0.004, 0.1, 0.5]},
-    "accidents": 9, "missed": 1, "missed_ci95": [0.02, 0.44], "promised_miss_rate": 0.1,
-    "alarm_rate_safe": 0.05,
-}  # fmt: skip
-
 CAUSE = {
     "label": "unseen_above", "count": 2, "share": 1.0, "knew_share": 0.5, "unseen_median_s": 1.7,
     "evading_median_s": None,

@@ -2,7 +2,6 @@
 that is cheap to check."""
 
 import ast
-import json
 import math
 import subprocess
 import sys
@@ -12,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import before, dynamics, parity, risk, run, tick
+from benchmarks import before, dynamics, parity, run, tick
 from benchmarks.common import Job, Row, seconds_per_call
 from benchmarks.peers.vehicle_arrays import Vehicles
 from uuvtai.config import Config
@@ -112,32 +111,7 @@ def test_what_differs_from_a_commit_is_counted_and_what_one_side_lacks_is_named(
     assert before._equal("arrays", {"new": "3"}, {"gone": "3"}, "abc").met is False, "nothing was compared"
 
 
-# -------------------------------------------------------------------------------------- risk alarm and parity
-
-
-def watched(score):
-    """Two accidents of four dangerous moments each, and two quiet episodes of five safe moments; the first
-    peer says ``score``."""
-    event = torch.tensor([True] * 8 + [False] * 10)
-    episode = torch.tensor([0] * 4 + [1] * 4 + [2] * 5 + [3] * 5)
-    peers = torch.zeros(18, len(risk.PEERS))
-    peers[:, 0] = torch.tensor(score)
-    return risk.Watched(torch.zeros(18, 2), peers, event, episode, 4, 2, torch.zeros(18))
-
-
-def test_false_alarms_and_misses_are_counted_by_episode():
-    score = [0.1, 0.2, 0.9, 0.3] + [0.1, 0.1, 0.2, 0.1] + [0.6, 0.6, 0.0, 0.0, 0.0] + [0.0] * 5
-    seen = watched(score)
-    worst, episode = risk.accident_scores("all of the last", seen, seen.peers[:, 0])
-    assert dict(zip(episode.tolist(), worst.tolist(), strict=True)) == pytest.approx({0: 0.9, 1: 0.2})
-    counts = risk.counted("all of the last", seen, seen.peers[:, 0], 0.5)
-    assert counts.tolist() == [[0, 0, 1, 0], [0, 0, 1, 1], [5, 2, 0, 0], [5, 0, 0, 0]]
-    found = risk.rates(counts)
-    assert (found["false alarms"], found["missed"], found["safe moments"]) == (0.2, 0.5, 10)
-    assert found["low"] <= 0.2 <= found["high"]
-    assert json.dumps(found)
-    one, _ = risk.accident_scores("a moment", seen, seen.peers[:, 0])
-    assert len(one) == 2 and set(one.tolist()) <= set(seen.peers[:8, 0].tolist())
+# -------------------------------------------------------------------------------------- parity
 
 
 def test_parity_asks_for_a_policy():

@@ -28,7 +28,6 @@ from uuvtai.learn import checkpoint
 from uuvtai.learn.checkpoint import CheckpointError
 from uuvtai.learn.pilot import TEACHER_COLUMN, Pilot, load_pilot
 from uuvtai.learn.policy import ActorCritic
-from uuvtai.learn.risk import RiskHead
 from uuvtai.learn.world_model import N_TARGET, WorldModel
 from uuvtai.loader import ConfigError, load_training
 from uuvtai.own.onnx_policy import graph_of, onnx_policy
@@ -42,7 +41,7 @@ TABLE = [
     (TEACHER_COLUMN, 30, 34, "1", "body"),
     ("more", 34, 40, "s", "body"),
 ]
-SMALL = {"policy.hidden": [16, 16], "world_model.hidden": [16], "world_model.latent": 8, "risk.hidden": [8]}
+SMALL = {"policy.hidden": [16, 16], "world_model.hidden": [16], "world_model.latent": 8}
 
 
 class Column:
@@ -72,15 +71,6 @@ def networks(config, seed=0):
         model.observation_norm.update(3.0 * torch.randn(500, N_OBS, generator=rng))
         model.change_norm.update(0.2 * torch.randn(500, N_TARGET, generator=rng))
         state["world_model"] = model.state_dict()
-    if config.risk.enabled:
-        head = RiskHead(N_OBS + 2, config.risk, rng)
-        head.observation_norm.update(3.0 * torch.randn(500, N_OBS + 2, generator=rng))
-        with torch.no_grad():
-            head.net[-1].weight.mul_(300.0)
-        logit = torch.randn(400, generator=rng)
-        head.calibrate(logit, torch.rand(400, generator=rng) < torch.sigmoid(2 * logit))
-        head.set_threshold(0.5)
-        state["risk"] = head.state_dict()
     return state
 
 
@@ -114,7 +104,7 @@ CASES = {
         "policy.activation": "tanh",
         "policy.hold_steps": 3,
     },
-    "no risk head, relu": {"risk.enabled": False, "policy.activation": "relu"},
+    "relu": {"policy.activation": "relu"},
     "world model as in the paper": {
         "world_model.predict_change": False,
         "world_model.normalise_targets": True,
@@ -139,10 +129,9 @@ def test_numpy_and_a_decision_without_memory_agree_with_the_pilot(tmp_path, chan
     for name, values in answer.items():
         assert run_policy.difference(values, golden[name]) <= TOLERANCE, name
     assert of_torch(OneDecision(pilot), golden).agrees
-    has_model, has_risk = pilot.world_model is not None, pilot.risk is not None
+    has_model = pilot.world_model is not None
     assert golden["action"].std() > 0.1 and np.abs(golden["action"]).max() <= 1.0
-    assert (golden["residual"] > 0).any() == has_model and ("risk" in answer) == has_risk
-    assert not has_risk or np.ptp(golden["risk"]) > 0.1
+    assert (golden["residual"] > 0).any() == has_model
     first, hold = len(golden["obs"]) // 2 + 1, found.config.policy.hold_steps
     assert len(golden["pair_obs"]) == -(-first // hold) + -(-(len(golden["obs"]) - first) // hold)
     assert not np.isfinite(golden["obs"]).all(), "sensors that fail are among the golden pairs"
@@ -189,21 +178,6 @@ def test_an_observation_of_another_width_is_refused(folder):
         run_policy.load(folder).act(np.zeros(39))
 
 
-def test_the_alarm_sounds_from_the_threshold_on(tmp_path, no_onnx):
-    found = saved(tmp_path / "run")
-    exported(found, tmp_path / "out")
-    policy, pilot = run_policy.load(tmp_path / "out"), load_pilot(found, 1)
-    rng = np.random.default_rng(1)
-    alarms = []
-    for _ in range(40):
-        obs = rng.normal(1, 3, N_OBS).astype(np.float32)
-        logit = float(pilot.decide(torch.from_numpy(obs)[None]).risk_logit)
-        pilot.advance()
-        alarms.append(policy.act(obs).alarm)
-        assert alarms[-1] == (logit >= 0.5)
-    assert len(set(alarms)) == 2
-
-
 # ----------------------------------------------------------------------------------------------------- folder
 
 
@@ -212,7 +186,7 @@ def test_the_alarm_sounds_from_the_threshold_on(tmp_path, no_onnx):
     "changes",
     [
         {"policy__residual": True, "policy__hold_steps": 10},
-        {"risk__enabled": False, "world_model__as_features": False},
+        {"world_model__as_features": False},
     ],
 )
 def test_onnx_runtime_agrees_and_the_folder_passes_its_check(tmp_path, changes, capfd):
@@ -225,7 +199,7 @@ def test_onnx_runtime_agrees_and_the_folder_passes_its_check(tmp_path, changes, 
     assert capfd.readouterr().out == "", "results only on stdout"
     spec = run_policy.read_spec(tmp_path / "out")
     assert set(spec["graph"]["inputs"]) == {"obs", "last_obs", "last_action", "has_last"}
-    assert ("risk" in spec["graph"]["outputs"]) == ("risk__enabled" not in changes)
+    assert set(spec["graph"]["outputs"]) == {"mean_action", "value", "features"}
 
 
 def test_the_specification_says_what_every_column_is(tmp_path, no_onnx):
@@ -274,7 +248,7 @@ def test_the_folder_drives_where_there_is_numpy_alone(folder):
         [sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, timeout=120, check=False
     )
     assert done.returncode == 0, done.stderr
-    assert "risk: largest difference" in done.stdout and "p50" in done.stdout
+    assert "uncertainty: largest difference" in done.stdout and "p50" in done.stdout
     roots = {
         (node.module or "").split(".")[0]
         if isinstance(node, ast.ImportFrom)
@@ -286,14 +260,13 @@ def test_the_folder_drives_where_there_is_numpy_alone(folder):
 
 
 def test_constants_that_the_driver_repeats_are_those_of_the_package():
-    from uuvtai.learn import risk, world_model
+    from uuvtai.learn import world_model
 
     assert (run_policy.N_TARGET, run_policy.N_ACTION) == (world_model.N_TARGET, world_model.N_ACTION)
     assert (run_policy._LOG_VAR, run_policy._MAX_DEVIATIONS) == (
         world_model.LOG_VAR_BOUNDS,
         world_model.MAX_DEVIATIONS,
     )
-    assert run_policy._MAX_LOGIT == risk.MAX_LOGIT
 
 
 def test_without_the_extra_the_graph_is_left_out_and_told(tmp_path, no_onnx):

@@ -71,19 +71,16 @@ def test_weights_survive_zeros_and_what_is_not_finite():
 
 
 def test_weighting_by_name():
-    uncertainty, risk = torch.tensor([1.0, 3.0]), torch.tensor([3.0, 1.0])
-    assert weights_of("none", uncertainty, risk).tolist() == [1.0, 1.0]
-    assert weights_of("uncertainty", uncertainty, risk).tolist() == [0.5, 1.5]
-    assert weights_of("risk", uncertainty, risk).tolist() == [1.5, 0.5]
+    uncertainty = torch.tensor([1.0, 3.0])
+    assert weights_of("none", uncertainty).tolist() == [1.0, 1.0]
+    assert weights_of("uncertainty", uncertainty).tolist() == [0.5, 1.5]
 
 
 def test_a_weighting_needs_its_signal():
-    check_weighting("none", False, False)
-    check_weighting("uncertainty", True, False)
-    with pytest.raises(ValueError, match=r"risk\.enabled=true"):
-        check_weighting("risk", True, False)
+    check_weighting("none", False)
+    check_weighting("uncertainty", True)
     with pytest.raises(ValueError, match=r"world_model\.enabled=true"):
-        check_weighting("uncertainty", False, True)
+        check_weighting("uncertainty", False)
 
 
 def test_teacher_batches_teach_the_mean_and_leave_the_critic(lesson):

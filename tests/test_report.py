@@ -25,7 +25,7 @@ from uuvtai.errors import UserError
 from uuvtai.loader import ConfigError
 from uuvtai.measure.evaluate.paired import paired
 from uuvtai.report import ink
-from uuvtai.report.blocks import Figure, Gallery, Paragraph
+from uuvtai.report.blocks import Figure, Gallery
 from uuvtai.report.build import report
 from uuvtai.report.colours import contrast, ink_on, shade
 from uuvtai.report.figures import Line, curves, heat_map, intervals
@@ -283,20 +283,13 @@ def test_a_method_without_episodes_is_dashes():
     assert row[1:3] == ["-", "-"]
 
 
-def test_causes_and_risk_are_shown_where_there_are_any():
+def test_causes_are_shown_where_there_are_any():
     blocks = evaluation(
-        samples.evaluation_document(
-            samples.method("best", risk=samples.RISK, causes=[samples.CAUSE], explain=[1, 2])
-        )
+        samples.evaluation_document(samples.method("best", causes=[samples.CAUSE], explain=[1, 2]))
     )
     assert rows(tables(blocks)[-1]) == [
         ["unseen above", "2", "100 %", "50 %", "1.7", "-", "0.2", samples.CAUSE["meaning"]]
     ]
-    said = [block.text for block in blocks if isinstance(block, Paragraph)][-1]
-    assert "missed 1 of 9 accidents, 2.0 % to 44.0 % (promised 10.0 %)" in said
-    figure = figures(blocks)["reliability_best"]
-    assert figure.data.rows == [(0.005, 0.004, 1200.0), (0.13, 0.1, 80.0), (0.6, 0.5, 20.0)]
-    assert drawn(figure.panels[0])[1]["bin-2"] == "said 0.600, came 0.500, 20 moments"
 
 
 def test_a_sweep_over_two_axes_is_two_heat_maps_a_method():
@@ -467,9 +460,7 @@ EVIL = "</title><script>alert(1)</script>$x$\"'&"
 def evil(tmp_path_factory):
     """Page of an evaluation whose every name wants to be more than a name."""
     name = EVIL.replace("/", ":")
-    method = samples.method(
-        EVIL, risk=samples.RISK, causes=[samples.CAUSE | {"label": EVIL, "meaning": EVIL}], explain=[1]
-    )
+    method = samples.method(EVIL, causes=[samples.CAUSE | {"label": EVIL, "meaning": EVIL}], explain=[1])
     folder = tmp_path_factory.mktemp("evil") / name
     document = samples.evaluation_document(method) | {"world": EVIL}
     samples.write_run(folder, ("uuv", "eval", EVIL), EVIL, eval__result=document)
@@ -483,10 +474,7 @@ def test_everything_from_files_is_escaped(evil):
     assert not [key for _, attributes in page.tags for key in attributes if key.startswith("on")]
     text = "".join(page.words)
     assert text.count("alert(1)") > 5, "as words they are there"
-    assert [path.name for path in written.figures] == [
-        "methods.png",
-        "reliability_title_script_alert_1_script_x.png",
-    ]
+    assert [path.name for path in written.figures] == ["methods.png"]
 
 
 def test_a_page_needs_nothing_but_itself(evil):

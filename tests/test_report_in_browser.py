@@ -33,7 +33,7 @@ def page(tmp_path_factory):
     folder = tmp_path_factory.mktemp("browser") / "run"
     long = "a_method_with_a_name_that_is_far_longer_than_any_column_would_like_it_to_be"
     methods = [
-        samples.method(long, risk=samples.RISK, causes=[samples.CAUSE], explain=[1, 2]),
+        samples.method(long, causes=[samples.CAUSE], explain=[1, 2]),
         samples.method("bt"),
     ]
     verdict = {"claim": "it swims " * 30, "verdict": "holds", "numbers": "3 of 3"}

@@ -73,7 +73,6 @@ def test_it_learns_the_task_from_its_teacher_and_says_so():
     [
         {},
         {
-            "risk": {"enabled": True, "batch": 64},
             "ppo": {"shuffle": True, "target_kl": 0.01, "rollout_steps": 16},
         },
     ],
@@ -164,21 +163,12 @@ def test_critic_warm_up_leaves_the_policy_alone_without_distillation():
     assert not torch.equal(trainer.policy.actor[0].weight, actor)
 
 
-def test_the_risk_head_learns_beside_and_weighs_the_distillation():
-    config = config_of(
-        risk={"enabled": True, "horizon_s": 0.2, "batch": 64, "hidden": [8]}, distill={"weighting": "risk"}
-    )
-    trainer = Trainer(PointEnv(), config)
-    metrics = [trainer.iterate() for _ in range(4)][-1]
-    assert 0 <= metrics["risk/brier"] <= 1
+def test_the_uncertainty_weighs_the_distillation():
+    trainer = Trainer(PointEnv(), config_of(distill={"weighting": "uncertainty"}))
+    for _ in range(4):
+        trainer.iterate()
     weight = trainer.rollout.weight
     assert float(weight.mean()) == pytest.approx(1.0, abs=1e-4) and float(weight.std()) > 0
-    assert {"risk", "risk_learner"} <= trainer.state().keys()
-
-
-def test_weighting_by_risk_without_a_risk_head_is_an_error_before_the_first_step():
-    with pytest.raises(ValueError, match=r"risk\.enabled=true"):
-        Trainer(PointEnv(), config_of(distill={"weighting": "risk"}))
 
 
 def test_the_world_models_columns_can_be_left_out():

@@ -26,7 +26,7 @@ from uuvtai.measure.evaluate.while_training import evaluate_now
 from uuvtai.run_folder import RunFolder, RunFolderError
 
 TINY = {
-    "policy.hidden": [8, 8], "world_model.hidden": [8], "world_model.latent": 4, "risk.hidden": [8],
+    "policy.hidden": [8, 8], "world_model.hidden": [8], "world_model.latent": 4,
     "ppo.rollout_steps": 8,
     "ppo.epochs": 1, "train.evaluate_every": 0, "train.checkpoint_every": 2,
 }  # fmt: skip

@@ -451,7 +451,6 @@ def test_networks_that_cannot_drive_are_refused(small, saved, change, says):
     [
         ("policy.residual", True, "the twin has none"),
         ("world_model.enabled", True, "the twin has none"),
-        ("risk.enabled", True, "the twin has none"),
         ("policy.hold_steps", 4, "decides every 0.1 s"),
         ("episode.control_dt_s", 0.01, "decides every 0.1 s"),
         ("ppo.minibatches", 200, "only 128 samples"),

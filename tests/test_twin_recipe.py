@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import taichi as ti
 import torch
-
 from docs.writers.twin_recipe import ARMS, entry_of, gain_of
+
 from tests.test_twin import SMALL
 from uuvtai.config import VehicleConfig
 from uuvtai.errors import UserError

@@ -285,44 +285,10 @@ def test_the_world_model_learns_from_transitions_that_took_place_and_from_none_a
     assert unit.max() < 0.2 < JUMP, "changes between two episodes are none"
 
 
-# ------------------------------------------------------------------------------------------ the risk's labels
+# ----------------------------------------------------------------------------------------------------- rates
 
 ENDS_AT = 7
 """control step of the policy's rollout in which all but one of the envs end"""
-LABELS = {
-    "collision": True,
-    "ttc": True,
-    "success": False,
-    "out_of_tank": False,
-    "timeout": None,
-    None: False,
-}
-"""of a moment two steps before that ending, at a horizon of three: None = not known, since the time was
-over"""
-
-
-def test_accidents_are_events_timeouts_are_not_known_and_other_endings_are_safe():
-    """Moments are steps 0, 5, 10 of the rollout (15 still waits for its future); step 5 sees the ending."""
-    script = [[(STEPS + ENDS_AT, how)] if how else [] for how in LABELS]
-    risk = {"enabled": True, "horizon_s": 0.06, "batch": 64, "hidden": [8]}
-    trainer, env = trainer_of(script, risk=risk)
-    with (
-        torch.no_grad()
-    ):  # an opinion of its own on every moment, but not by its running number, which would drown the rest
-        trainer.risk.net[-1].weight.mul_(100.0)
-        trainer.risk.net[0].weight[:, N_TARGET] = 0.0
-    head = copy.deepcopy(trainer.risk)
-    metrics = trainer.iterate()
-    assert env.log[STEPS + ENDS_AT - 1].ended.sum() == len(LABELS) - 1
-    samples = [
-        (t, row, label if t == 5 else False) for t in (0, 5, 10) for row, label in enumerate(LABELS.values())
-    ]
-    samples = [(t, row, label) for t, row, label in samples if label is not None]
-    errors = [(float(head(trainer.rollout.x[t, row])) - label) ** 2 for t, row, label in samples]
-    assert len(samples) == 17 and metrics["risk/event_rate"] == pytest.approx(2 / 17)
-    assert metrics["risk/brier"] == pytest.approx(sum(errors) / 17, rel=1e-5)
-    opinions = head(trainer.rollout.x[5]).sort().values.diff()
-    assert opinions.min() > 5e-4, "with the labels of two envs exchanged the error would be another"
 
 
 def test_rates_count_every_ending_by_what_it_was():

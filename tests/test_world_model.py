@@ -7,13 +7,21 @@ import math
 import numpy as np
 import pytest
 import torch
+from scipy import stats
 
 from tests.reference import world_model as reference
 from uuvtai.config.learning import UncertaintyConfig, WorldModelConfig
-from uuvtai.learn.calibration import mean_squared_standardised_residual, spearman
 from uuvtai.learn.normalise import Moments, moments_of
 from uuvtai.learn.uncertainty import Uncertainty
-from uuvtai.learn.world_model import LOG_VAR_BOUNDS, N_TARGET, WorldModel, WorldModelLearner
+from uuvtai.learn.world_model import (
+    LOG_VAR_BOUNDS,
+    N_TARGET,
+    WorldModel,
+    WorldModelLearner,
+    coverage,
+    mean_squared_standardised_residual,
+    standardised_residual,
+)
 
 N_OBS, STEPS, N_ENV = 30, 16, 32
 SMALL = WorldModelConfig(hidden=(32, 32), latent=16, batch=256, steps=2, learning_rate=3e-3)
@@ -145,7 +153,7 @@ def test_it_learns_the_change_and_where_it_is_uncertain():
     assert metrics["world_model/latent_std"] > 0.1
     sigma = model.features(obs, action, next_obs)[:, 1]
     assert 0 < sigma.max() < 3
-    assert spearman(sigma, obs[:, 24] > 0) > 0.8, "the noise is ten times stronger there"
+    assert stats.spearmanr(sigma, obs[:, 24] > 0).statistic > 0.8, "the noise is ten times stronger there"
 
 
 def test_features_do_not_depend_on_units():
@@ -314,3 +322,41 @@ def test_processes_share_gradients_and_statistics():
 def test_too_narrow_an_observation_is_refused():
     with pytest.raises(ValueError, match="first 24 columns of the observation, but it has only 20"):
         WorldModel(20, SMALL, generator())
+
+
+# ------------------------------------------------------------------------------------------------ calibration
+
+SHARE_SAMPLING = 0.01
+"""Four standard errors of a share of 100,000 samples are 0.0063 at most; of their mean square, 0.018 / 2."""
+
+
+def test_residual_of_a_variance_of_four():
+    mean, log_var = torch.tensor([[1.0, 2.0]]), torch.tensor([[math.log(4.0), 0.0]])
+    target = torch.tensor([[3.0, 5.0]])
+    z = standardised_residual(mean, log_var, target)
+    np.testing.assert_allclose(z, [[1.0, 3.0]], rtol=1e-7)  # log(4) is a float32 here
+    assert mean_squared_standardised_residual(mean, log_var, target) == pytest.approx(5.0, rel=1e-7)
+
+
+def test_true_variance_gives_one_and_nominal_coverage():
+    gen = torch.Generator().manual_seed(0)
+    log_var = torch.randn(100_000, generator=gen)
+    target = torch.exp(0.5 * log_var) * torch.randn(100_000, generator=gen) + 3.0
+    mean, levels = torch.full_like(target, 3.0), torch.tensor([0.5, 0.8, 0.9, 0.99])
+    assert mean_squared_standardised_residual(mean, log_var, target) == pytest.approx(
+        1.0, abs=2 * SHARE_SAMPLING
+    )
+    np.testing.assert_allclose(coverage(mean, log_var, target, levels), levels, atol=SHARE_SAMPLING)
+    too_sure = coverage(mean, log_var - math.log(4.0), target, levels)
+    inside = [2 * stats.norm.cdf(0.5 * stats.norm.ppf(0.5 + level / 2)) - 1 for level in levels.tolist()]
+    np.testing.assert_allclose(too_sure, inside, atol=SHARE_SAMPLING)
+
+
+def test_coverage_of_four_residuals():
+    zero = torch.zeros(4)
+    inside = coverage(
+        zero, zero, torch.tensor([0.5, -0.7, 1.5, 3.0]), torch.tensor([0.5, 0.9])
+    )  # |z| < 0.674, 1.645
+    assert inside.tolist() == [0.25, 0.75]
+    with pytest.raises(ValueError, match="between 0 and 1"):
+        coverage(zero, zero, zero, torch.tensor([0.5, 1.0]))

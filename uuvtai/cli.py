@@ -58,8 +58,7 @@ def evaluate(
     with_report: opt.WithReport = False,
     run_dir: opt.RunDir = None,
 ) -> None:
-    """Play the same episodes with every controller and trained policy and print the table of methods; of a
-    risk head what its alarm misses (it is not useful so far: docs/learning.md)."""
+    """Play the same episodes with every controller and trained policy and print the table of methods."""
     if resume is not None:
         arguments.refuse_beside_resume(ctx, ("allow_code",))
         from uuvtai.measure.evaluate.compare import resume as go_on
@@ -99,8 +98,7 @@ def train_policy(
     with_report: opt.WithReport = False,
     run_dir: opt.RunDir = None,
 ) -> None:
-    """Train a policy into a run folder, or go on with one. Ctrl-C saves; --resume goes on. A risk head
-    (risk.enabled) is research: its alarm is not useful so far (docs/learning.md)."""
+    """Train a policy into a run folder, or go on with one. Ctrl-C saves; --resume goes on."""
     from uuvtai.learn.run import TrainRequest, train
     from uuvtai.measure.evaluate.while_training import evaluate_now
     from uuvtai.show.dashboard import TrainingProgress

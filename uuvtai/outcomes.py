@@ -9,5 +9,3 @@ ENDINGS = OUTCOMES[1:]
 COLLIDED = ("collision", "ttc", "out_of_tank")
 """what counts as a collision in every rate: contact, a stop for the time to collision, and leaving the
 tank"""
-FORESEEABLE = ("collision", "ttc")
-"""what the risk head foresees"""

@@ -1,4 +1,4 @@
-"""What training adds to a run: policy, PPO, distillation, world model, risk and the schedule of the run
+"""What training adds to a run: policy, PPO, distillation, world model and the schedule of the run
 itself.
 
 Defaults are Table app_repro of the paper where it gives a number; the rest says why. Presets
@@ -81,8 +81,8 @@ class DistillConfig(Section):
     critic_warmup_iterations: Count = 0
     """iterations in which only critic and distillation learn: an untrained critic destroys a distilled
     policy"""
-    weighting: Literal["none", "uncertainty", "risk"] = "none"
-    """weight of a sample: equal, or by the world model's uncertainty, or by the predicted risk (mean one)"""
+    weighting: Literal["none", "uncertainty"] = "none"
+    """weight of a sample: equal, or by the world model's uncertainty (mean one)"""
 
     @field_validator("schedule")
     @classmethod
@@ -134,24 +134,6 @@ class WorldModelConfig(Section):
     paper: mean(exp(log variance)) as the decoder says it"""
     stop_target_gradient: bool = True
     """no gradient through the encoding of the next observation, or the latent collapses"""
-
-
-class RiskConfig(Section):
-    """Head that predicts the probability of a collision or TTC stop soon. Its alarm is not useful so far: as
-    many false ones as of a threshold of the time to collision, roughly (``docs/learning.md``)."""
-
-    enabled: bool = False
-    horizon_s: Positive = 2.0
-    hidden: tuple[PositiveCount, ...] = (64, 64)
-    batch: PositiveCount = 2048
-    steps: PositiveCount = 4
-    """gradient steps per iteration"""
-    learning_rate: Positive = 1e-3
-    """takes a third of the steps of 3e-4 to the same AUROC (EC)"""
-    bins: PositiveCount = 10
-    """of the reliability diagram"""
-    miss_rate: Annotated[float, Field(gt=0, lt=1)] = 0.05
-    """share of dangerous moments that the conformal threshold may miss"""
 
 
 class TrainConfig(Section):
@@ -337,7 +319,6 @@ class LearningConfig(Config):
     distill: DistillConfig = DistillConfig()
     uncertainty: UncertaintyConfig = UncertaintyConfig()
     world_model: WorldModelConfig = WorldModelConfig()
-    risk: RiskConfig = RiskConfig()
     twin: TwinConfig = TwinConfig()
     chooser: ChooserConfig = ChooserConfig()
     tuner: TunerConfig = TunerConfig()

@@ -35,8 +35,7 @@ means something else makes the policy worthless.
 ## What it is not for
 - It has been judged in this simulator alone. Nothing here says how it does on a real vehicle, in other water,
   or with other sensors.
-- It does not guarantee clearance. Keep a separate safety stop.
-- {risk}
+- It does not guarantee clearance and does not say when it is in danger. Keep a separate safety stop.
 - It expects the vehicle's inner velocity loop with the limits of `policy_spec.json`; it never commands
   thrusters.
 """
@@ -53,16 +52,11 @@ _GRAPH = """
 
 `policy.onnx` is one decision without memory: remember the last decision yourself, as `graph`
 in the specification says."""
-_RISK = (
-    "Its risk is the probability of an accident within {horizon_s:g} s as calibrated in simulation; "
-    "elsewhere it is a mere score."
-)
-_NO_RISK = "It has no risk head: it does not say when it is in danger."
 
 
 def model_card(spec: dict[str, Any], checkpoint: Checkpoint, evaluations: list[Evaluation]) -> str:
     """The card as Markdown."""
-    is_residual, risk = spec["network"]["teacher_columns"] is not None, spec["risk"]
+    is_residual = spec["network"]["teacher_columns"] is not None
     return _TEXT.format(
         name=spec["name"],
         version=checkpoint.manifest.version,
@@ -73,7 +67,6 @@ def model_card(spec: dict[str, Any], checkpoint: Checkpoint, evaluations: list[E
         residual=_RESIDUAL if is_residual else _PLAIN,
         tree=", behaviour tree" if checkpoint.config.features.teacher else "",
         graph=_GRAPH if spec["graph"] else "",
-        risk=_NO_RISK if risk is None else _RISK.format(**risk),
     )
 
 

@@ -30,7 +30,7 @@ def golden_of(pilot: Pilot) -> Arrays:
     graph.
 
     ``obs`` (T, n_obs), ``begins`` (T,): another mission begins here; outputs ``action`` (T, 4), ``value``,
-    ``residual``, ``uncertainty`` and, with a head, ``risk`` (T,). ``pair_<input>`` and ``pair_<output>`` have
+    ``residual`` and ``uncertainty`` (T,). ``pair_<input>`` and ``pair_<output>`` have
     a row per decision. Some values are not finite, as a sensor that fails may give them.
     """
     obs = _mission(pilot)
@@ -102,18 +102,10 @@ def _outputs_of(pilot: Pilot, obs: Tensor) -> Row:
     """One control step: outputs under their golden names."""
     said = pilot.decide(obs[None])
     pilot.advance()
-    found = {name: getattr(said, name)[0].clone() for name in ("action", "value", "residual", "uncertainty")}
-    return (
-        found if pilot.risk is None else found | {"risk": pilot.risk.calibrated(said.risk_logit)[0].float()}
-    )
+    return {name: getattr(said, name)[0].clone() for name in ("action", "value", "residual", "uncertainty")}
 
 
 def _pair_outputs(pilot: Pilot, row: Row) -> Row:
     """The same decision under the names of the graph's outputs."""
     found = {"mean_action": pilot.mean_action[0].clone(), "value": row["value"]}
-    found["features"] = torch.stack([row["residual"], row["uncertainty"]])
-    return (
-        found
-        if pilot.risk is None
-        else found | {"risk_logit": pilot.decision.risk_logit[0].clone(), "risk": row["risk"]}
-    )
+    return found | {"features": torch.stack([row["residual"], row["uncertainty"]])}

@@ -29,8 +29,6 @@ OUTPUTS = {
     "mean_action": "(N, 4) float32: mean action, not yet cut off to [-1, 1]",
     "value": "(N,) float32: expected return",
     "features": "(N, 2) float32: residual and uncertainty of the world model's last prediction",
-    "risk_logit": "(N,) float32: uncalibrated logit of an accident soon",
-    "risk": "(N,) float32: its calibrated probability",
 }
 PACKAGES = ("onnx", "onnxscript")
 """what torch's exporter needs"""
@@ -54,8 +52,7 @@ class ExportedModule(nn.Module):
 
 
 class OneDecision(ExportedModule):
-    """``Pilot`` for one decision: outputs by the names of OUTPUTS, without the last two where there is no
-    risk head."""
+    """``Pilot`` for one decision: outputs by the names of OUTPUTS."""
 
     inputs = INPUTS
     fill: Tensor
@@ -63,7 +60,7 @@ class OneDecision(ExportedModule):
 
     def __init__(self, pilot: Pilot) -> None:
         super().__init__()
-        self.policy, self.world_model, self.risk = pilot.policy, pilot.world_model, pilot.risk
+        self.policy, self.world_model = pilot.policy, pilot.world_model
         self.register_buffer(
             "fill", pilot.policy.observation_norm.mean[: pilot.policy.n_in - N_FEATURES].float()
         )
@@ -71,7 +68,7 @@ class OneDecision(ExportedModule):
     @property
     def outputs(self) -> list[str]:
         """Names of what ``forward`` returns."""
-        return list(OUTPUTS)[: 5 if self.risk is not None else 3]
+        return list(OUTPUTS)
 
     def example(self) -> tuple[tuple[Tensor, ...], dict[str, dict[int, torch.export.Dim]]]:
         """As in ``ExportedModule``."""
@@ -91,11 +88,7 @@ class OneDecision(ExportedModule):
             )
         x = torch.cat([obs, features], dim=1)
         mean, _ = self.policy.distribution(x)
-        said = mean, self.policy.value(x), features
-        if self.risk is None:
-            return said
-        logit = self.risk.logit(x)
-        return *said, logit, self.risk.calibrated(logit).float()
+        return mean, self.policy.value(x), features
 
 
 def missing_packages() -> list[str]:

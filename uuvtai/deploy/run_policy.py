@@ -47,7 +47,6 @@ MAX_STEPS, MAX_WORK = 1 << 16, 1 << 34
 _OPEN = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
 _LOG_VAR = (-12.0, 6.0)  # bounds of the world model's log-variance
 _MAX_DEVIATIONS = 100.0  # a residual counts as at most this many deviations
-_MAX_LOGIT = 12.0  # range of the risk head's calibration table
 _MAX_HEADER = 1 << 20
 _DTYPES = {"F32": np.dtype("<f4"), "F64": np.dtype("<f8")}
 
@@ -71,10 +70,6 @@ class Decision(NamedTuple):
     """of the world model's last prediction, in deviations of the one-step change; 0 = none yet"""
     uncertainty: float
     """of that prediction"""
-    risk: float | None
-    """probability of a collision or TTC stop within ``risk.horizon_s``; None without a risk head"""
-    alarm: bool
-    """the risk has reached its threshold; always false where none is known"""
 
 
 class Policy:
@@ -96,7 +91,7 @@ class Policy:
             self._a = arrays
             self._nets = {
                 name: layers_of(arrays, name)
-                for name in ("actor", "critic", "encoder", "dynamics", "decoder", "risk")
+                for name in ("actor", "critic", "encoder", "dynamics", "decoder")
             }
             self._check_widths()
         except (KeyError, TypeError, ValueError, IndexError) as error:
@@ -111,7 +106,7 @@ class Policy:
         """Forget the last step: another mission begins."""
         self._age = 0
         self._last: tuple[np.ndarray, np.ndarray] | None = None
-        self._offset, self._said = np.zeros(N_ACTION, np.float32), np.zeros(4, np.float32)
+        self._offset, self._said = np.zeros(N_ACTION, np.float32), np.zeros(3, np.float32)
 
     def act(self, observation: Any) -> Decision:
         """Decision for the newest observation (n_obs,), carried out: call it every control step, also while a
@@ -129,16 +124,9 @@ class Policy:
         if self._age % self.hold_steps == 0:
             self._last = obs, action
         self._age += 1
-        value, residual, uncertainty, logit = (float(said) for said in self._said)
+        value, residual, uncertainty = (float(said) for said in self._said)
         action = np.clip(action, -1.0, 1.0)
-        risk = self.probability(logit) if self._nets["risk"] else None
-        alarm = risk is not None and logit >= float(self._a["risk.threshold"])
-        return Decision(action, action * self._limits, value, residual, uncertainty, risk, alarm)
-
-    def probability(self, logit: float) -> float:
-        """Calibrated probability of the risk head's logit."""
-        table = self._a["risk.table"]
-        return float(np.float32(np.interp(logit, np.linspace(-_MAX_LOGIT, _MAX_LOGIT, len(table)), table)))
+        return Decision(action, action * self._limits, value, residual, uncertainty)
 
     def _filled(self, obs: np.ndarray) -> np.ndarray:
         """What is not finite counts as the training's mean."""
@@ -159,10 +147,7 @@ class Policy:
             tree = self._base(obs)
             self._offset = (tree + np.float32(self._network["residual_limit"]) * np.tanh(out)) - tree
         value = self._a["value.mean"][0] + self._through("critic", scaled)[0] * self._a["value.std"][0]
-        logit = (
-            self._through("risk", self._scaled(x, "risk.norm"))[0] if self._nets["risk"] else np.float32(0)
-        )
-        self._said = np.array([value, x[-2], x[-1], logit], np.float32)
+        self._said = np.array([value, x[-2], x[-1]], np.float32)
 
     def _features(self, obs: np.ndarray) -> np.ndarray:
         """(2,) residual and uncertainty of the world model's prediction from the last decision; 0 where there
@@ -209,8 +194,6 @@ class Policy:
                 "dynamics": (latent + N_ACTION, latent),
                 "decoder": (latent, 2 * N_TARGET),
             }
-        if nets["risk"]:
-            wanted["risk"] = (n_in, 1)
         for name, (first, last) in wanted.items():
             if not nets[name] or nets[name][0][0].shape[1] != first or len(nets[name][-1][1]) != last:
                 raise ValueError(f"{name} is not a network from {first} to {last}")
@@ -399,7 +382,7 @@ def replayed(policy: Policy, golden: Arrays) -> Arrays:
         if begins:
             policy.reset()
         decisions.append(policy.act(obs))
-    columns = ("action", "value", "residual", "uncertainty", *(["risk"] if "risk" in golden else []))
+    columns = ("action", "value", "residual", "uncertainty")
     return {name: np.array([getattr(d, name) for d in decisions], np.float32) for name in columns}
 
 

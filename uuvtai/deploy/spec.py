@@ -58,7 +58,6 @@ def specification(checkpoint: Checkpoint, pilot: Pilot, name: str, has_onnx: boo
         "inner velocity loop",
         "rate": _rate(config.episode.control_dt_s, policy.config.hold_steps),
         "network": _network(pilot),
-        "risk": _risk(pilot),
         "graph": _graph(pilot) if has_onnx else None,
         "golden": {"file": GOLDEN, "tolerance": TOLERANCE},
         "weights": WEIGHTS,
@@ -120,18 +119,6 @@ def _network(pilot: Pilot) -> dict[str, Any]:
         "teacher_columns": [teacher.start, teacher.stop] if config.residual and teacher else None,
         "predict_change": pilot.world_model is None or pilot.world_model.config.predict_change,
         "clip_observation": config.clip_observation,
-    }
-
-
-def _risk(pilot: Pilot) -> dict[str, Any] | None:
-    head = pilot.risk
-    if head is None:
-        return None
-    threshold = float(head.threshold) if head.has_threshold else None
-    return {
-        "horizon_s": head.config.horizon_s,
-        "alarm_threshold_logit": threshold,
-        "miss_rate": head.config.miss_rate,
     }
 
 

@@ -11,7 +11,6 @@ from torch import Tensor, nn
 from uuvtai.learn.normalise import RunningNorm
 from uuvtai.learn.pilot import Pilot
 from uuvtai.learn.policy import ActorCritic
-from uuvtai.learn.risk import RiskHead
 from uuvtai.learn.world_model import WorldModel
 
 NO_LIMIT = float(torch.finfo(torch.float32).max)
@@ -19,12 +18,10 @@ NO_LIMIT = float(torch.finfo(torch.float32).max)
 
 
 def weights_of(pilot: Pilot) -> dict[str, Tensor]:
-    """Arrays of policy, world model and risk head, on the host, contiguous."""
+    """Arrays of policy and world model, on the host, contiguous."""
     found = dict(_policy(pilot.policy))
     if pilot.world_model is not None:
         found |= dict(_world_model(pilot.world_model))
-    if pilot.risk is not None:
-        found |= dict(_risk(pilot.risk))
     return {name: tensor.detach().cpu().contiguous().clone() for name, tensor in found.items()}
 
 
@@ -46,13 +43,6 @@ def _world_model(world_model: WorldModel) -> Iterator[tuple[str, Tensor]]:
         world_model.base(torch.zeros(world_model.n_obs, device=world_model.change_norm.mean.device)),
     )
     yield "change.unit", world_model.error_unit()
-
-
-def _risk(head: RiskHead) -> Iterator[tuple[str, Tensor]]:
-    yield from _net("risk", head.net)
-    yield from _norm("risk.norm", head.observation_norm)
-    yield "risk.table", head.table
-    yield "risk.threshold", head.threshold
 
 
 def _net(name: str, net: nn.Module) -> Iterator[tuple[str, Tensor]]:

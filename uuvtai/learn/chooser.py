@@ -27,7 +27,6 @@ class ChooserPilot:
     """Drives the rows of a simulator whose tree thinks along; used as ``Pilot`` is."""
 
     world_model = None
-    risk = None
 
     def __init__(self, net: ArrivalNet, pilot: SetPilot, sim: Sim, config: ChooserConfig) -> None:
         from uuvtai.binding import bind

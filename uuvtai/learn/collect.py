@@ -15,7 +15,6 @@ from uuvtai.learn.hold import HeldResult, Hold, Info
 from uuvtai.learn.policy import NUM_ACTIONS, ActorCritic
 from uuvtai.learn.rollout import Rollout, final_value
 from uuvtai.learn.rollout_sums import RolloutSums
-from uuvtai.outcomes import FORESEEABLE
 
 if TYPE_CHECKING:
     from uuvtai.env import VectorEnv
@@ -54,9 +53,6 @@ class Collector:
         self.x, self.final_x = (torch.zeros(n, rollout.n_in, device=device) for _ in range(2))
         self.uncertainty = torch.zeros(rollout.steps, n, device=device)
         """(T, N) the world model's uncertainty proxy of every transition in the rollout"""
-        self.failed = torch.zeros(rollout.steps, n, dtype=torch.bool, device=device)
-        """(T, N) the step ended in a collision or a TTC stop"""
-        self._failures = torch.tensor([name in FORESEEABLE for name in env.outcomes], device=device)
         self.leaf_errors = LeafErrors(env.node_names, device)
         self.hold = Hold(env, policy)
         self._teacher, self._reward = (
@@ -118,7 +114,6 @@ class Collector:
             rollout.add(
                 self.x, step, self._reward, end.terminated, end.ended, last_value, self._teacher, self._leaf
             )
-            self.failed[t] = end.ended & self._failures[end.outcome]
             self._move_on(end.ended)
         rollout.close(self.policy.value(self.x))
         self.infer_s = time.perf_counter() - began - self.simulate_s

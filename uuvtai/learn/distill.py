@@ -40,7 +40,7 @@ def distillation_loss(mean: torch.Tensor, teacher_action: torch.Tensor, weight: 
 
 
 def sample_weight(signal: torch.Tensor) -> torch.Tensor:
-    """Weight of every sample in proportion to a signal >= 0 (uncertainty, risk) of any shape: mean one,
+    """Weight of every sample in proportion to a signal >= 0 of any shape: mean one,
     bounded.
 
     Weights differ by at most ``MAX_WEIGHT_RATIO`` squared; a sample whose signal is not finite counts as an
@@ -53,15 +53,11 @@ def sample_weight(signal: torch.Tensor) -> torch.Tensor:
     return ratio / ratio.mean()
 
 
-Weighting = Literal["none", "uncertainty", "risk"]
+Weighting = Literal["none", "uncertainty"]
 
 
-def check_weighting(kind: Weighting, has_world_model: bool, has_risk: bool) -> None:
+def check_weighting(kind: Weighting, has_world_model: bool) -> None:
     """Raise ValueError for a ``distill.weighting`` whose signal this run does not have."""
-    if kind == "risk" and not has_risk:
-        raise SettingError(
-            "distill.weighting=risk needs the risk head: set risk.enabled=true, or distill.weighting=none"
-        )
     if kind == "uncertainty" and not has_world_model:
         raise SettingError(
             "distill.weighting=uncertainty needs the world model: set world_model.enabled=true, or "
@@ -69,12 +65,9 @@ def check_weighting(kind: Weighting, has_world_model: bool, has_risk: bool) -> N
         )
 
 
-def weights_of(kind: Weighting, uncertainty: torch.Tensor, risk: torch.Tensor | None) -> torch.Tensor:
-    """Weights by ``distill.weighting``, of the shape of the uncertainties; ``risk`` may be None where the
-    kind does not ask for it."""
-    if kind == "uncertainty":
-        return sample_weight(uncertainty)
-    return torch.ones_like(uncertainty) if kind == "none" or risk is None else sample_weight(risk)
+def weights_of(kind: Weighting, uncertainty: torch.Tensor) -> torch.Tensor:
+    """Weights by ``distill.weighting``, of the shape of the uncertainties."""
+    return sample_weight(uncertainty) if kind == "uncertainty" else torch.ones_like(uncertainty)
 
 
 class TeacherBatches:

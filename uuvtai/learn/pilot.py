@@ -18,7 +18,6 @@ from uuvtai.config.learning import LearningConfig
 from uuvtai.learn.checkpoint import Checkpoint
 from uuvtai.learn.manifest import MODEL, CheckpointError
 from uuvtai.learn.policy import NUM_ACTIONS, ActorCritic
-from uuvtai.learn.risk import RiskHead
 from uuvtai.learn.world_model import N_FEATURES, WorldModel
 
 CHUNK = 64
@@ -40,8 +39,6 @@ class PilotDecision(NamedTuple):
     """(N,) of the world model's last prediction; 0 = none yet, or no world model"""
     uncertainty: torch.Tensor
     """(N,) of that prediction"""
-    risk_logit: torch.Tensor
-    """(N,) uncalibrated logit of a collision or TTC stop soon; empty without a risk head"""
 
 
 class Pilot:
@@ -54,16 +51,10 @@ class Pilot:
         world_model: WorldModel | None,
         num_envs: int,
         device: torch.device | str = "cpu",
-        head: RiskHead | None = None,
     ) -> None:
         """``world_model``: None where the policy was trained without its features. The networks are used, not
         copied."""
-        self.policy, self.world_model, self.risk, self.device = (
-            policy,
-            world_model,
-            head,
-            torch.device(device),
-        )
+        self.policy, self.world_model, self.device = policy, world_model, torch.device(device)
         self._n_obs = policy.n_in - N_FEATURES
         rows = num_envs
         self._x, self._last_obs = (
@@ -72,7 +63,7 @@ class Pilot:
         self._action, self._last_action = (torch.zeros(rows, NUM_ACTIONS, device=device) for _ in range(2))
         self._has_last = torch.zeros(rows, dtype=torch.bool, device=device)
         self._hold, self._age = policy.config.hold_steps, torch.zeros(rows, dtype=torch.int64, device=device)
-        self._offset, self._said = (torch.zeros(rows, width, device=device) for width in (NUM_ACTIONS, 4))
+        self._offset, self._said = (torch.zeros(rows, width, device=device) for width in (NUM_ACTIONS, 3))
         self.decision = PilotDecision(*(torch.zeros(0) for _ in PilotDecision._fields))
         """the last one; where an older one is held, what the networks said then"""
 
@@ -99,14 +90,13 @@ class Pilot:
             self._think(due)
         teacher = self.policy.teacher_action(x)
         self._action = self._offset if teacher is None else teacher + self._offset
-        value, residual, uncertainty, risk_logit = self._said.clone().T
+        value, residual, uncertainty = self._said.clone().T
         self.decision = PilotDecision(
             self._action.clamp(-1.0, 1.0),
             value,
             self.policy.log_std.exp(),
             residual,
             uncertainty,
-            value[:0] if self.risk is None else risk_logit,
         )
         return self.decision
 
@@ -135,10 +125,7 @@ class Pilot:
         teacher = self.policy.teacher_action(x)
         mean = by_chunk(lambda part: self.policy.distribution(part)[0], x)
         self._offset[rows] = mean if teacher is None else mean - teacher
-        risk_logit = x.new_zeros(len(x)) if self.risk is None else by_chunk(self.risk.logit, x)
-        self._said[rows] = torch.stack(
-            [by_chunk(self.policy.value, x), x[:, -2], x[:, -1], risk_logit], dim=1
-        )
+        self._said[rows] = torch.stack([by_chunk(self.policy.value, x), x[:, -2], x[:, -1]], dim=1)
 
     def _features(self, rows: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
         if self.world_model is None:
@@ -181,8 +168,6 @@ def _check_sizes(parts: dict[str, Any], config: LearningConfig, n_obs: int) -> N
             ("world_model", "dynamics", (latent + NUM_ACTIONS, *hidden, latent)),
         ]
         nets += [("world_model", "decoder", (latent, *hidden))]
-    if config.risk.enabled:
-        nets += [("risk", "net", (n_in, *config.risk.hidden))]
     for part, net, widths in nets:
         for number, (first, last) in enumerate(itertools.pairwise(widths)):
             name = f"{net}.{2 * number}.weight"
@@ -229,15 +214,11 @@ def load_pilot(checkpoint: Checkpoint, num_envs: int, device: torch.device | str
         if config.world_model.enabled and config.world_model.as_features:
             world_model = WorldModel(n_obs, config.world_model, generator)
             world_model.load_state_dict(parts["world_model"])
-        risk = None
-        if config.risk.enabled:
-            risk = RiskHead(n_obs + N_FEATURES, config.risk, generator)
-            risk.load_state_dict(parts["risk"])
     except (KeyError, ValueError, RuntimeError, TypeError, AttributeError) as error:
         raise CheckpointError(
             f"{checkpoint.path / MODEL}: its networks are not those of its config ({error}); take another one"
         ) from None
-    modules = [module for module in (policy, world_model, risk) if module is not None]
+    modules = [module for module in (policy, world_model) if module is not None]
     for module in modules:
         for name, tensor in module.state_dict().items():
             if not bool(torch.isfinite(tensor).all()):
@@ -246,4 +227,4 @@ def load_pilot(checkpoint: Checkpoint, num_envs: int, device: torch.device | str
                     "checkpoint"
                 )
         module.to(device).eval()
-    return Pilot(policy, world_model, num_envs, device, risk)
+    return Pilot(policy, world_model, num_envs, device)

@@ -21,7 +21,6 @@ class SetPilot(SetWheel):
     """Drives the rows of a simulator; used as ``Pilot`` is, but it looks at tracks, map and pose itself."""
 
     world_model = None
-    risk = None
 
     def __init__(self, actor: SetActor, sim: Sim, hold_steps: int, gap_m: float) -> None:
         """``hold_steps`` control steps a decision; the centre stays ``gap_m`` from floor and surface."""
@@ -30,7 +29,7 @@ class SetPilot(SetWheel):
         self._age = torch.zeros(sim.num_envs, dtype=torch.int64, device=sim.device)
         std = torch.cat([actor.log_std.detach().exp(), torch.zeros(1, device=sim.device)])
         nothing = torch.zeros(sim.num_envs, device=sim.device)
-        self.decision = PilotDecision(self._command, nothing, std, nothing, nothing, nothing[:0])
+        self.decision = PilotDecision(self._command, nothing, std, nothing, nothing)
         """value, residual and uncertainty are 0: what drives has no critic and no world model"""
 
     def reset(self, rows: torch.Tensor) -> None:

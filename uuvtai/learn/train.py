@@ -18,7 +18,6 @@ from uuvtai.learn.guard import PREFIX, Guard
 from uuvtai.learn.normalise import Moments, combined
 from uuvtai.learn.policy import ActorCritic
 from uuvtai.learn.ppo import Ppo
-from uuvtai.learn.risk import RiskHead, RiskLearner
 from uuvtai.learn.rollout import Rollout
 from uuvtai.learn.rollout_sums import Recent
 from uuvtai.learn.schedule import piecewise_linear
@@ -41,7 +40,7 @@ class Trainer:
 
     def __init__(self, env: VectorEnv, config: LearningConfig, processes: Processes | None = None) -> None:
         """Resets ``env`` to this process's scenarios. ValueError for settings that do not fit each other."""
-        check_weighting(config.distill.weighting, config.world_model.enabled, config.risk.enabled)
+        check_weighting(config.distill.weighting, config.world_model.enabled)
         self.env, self.config, self.observation_table = env, config, env.observation_table
         self.processes = processes or Processes(device=env.device)
         self.generator = torch.Generator().manual_seed(config.train.seed)
@@ -63,9 +62,6 @@ class Trainer:
         self.world_learner = self.world_model and WorldModelLearner(
             self.world_model, world, self._reduce, self._united
         )
-        risk, dt_s, hold = config.risk, config.episode.control_dt_s, config.policy.hold_steps
-        self.risk = RiskHead(n_in, risk, self.generator).to(device) if risk.enabled else None
-        self.risk_learner = self.risk and RiskLearner(self.risk, risk, dt_s, self._reduce, self._united, hold)
         self.collector = Collector(
             env, self.policy, self.world_model, self.rollout, self.guard, self.generator, world.as_features
         )
@@ -80,7 +76,7 @@ class Trainer:
 
         Order: rollout, all statistics standing still; running uncertainty; PPO with the distillation term
         (value statistics before its minibatches, observation statistics after them); teacher batches; world
-        model; risk head. Before the first iteration the behaviour tree drives for one rollout, which only the
+        model. Before the first iteration the behaviour tree drives for one rollout, which only the
         statistics see. TrainingError after too many bad iterations in a row.
         """
         if self.iteration == 0:
@@ -132,11 +128,9 @@ class Trainer:
         parts = {
             "policy": self.policy,
             "world_model": self.world_model,
-            "risk": self.risk,
             "ppo": self.ppo,
             "teacher_batches": self.teacher_batches,
             "world_learner": self.world_learner,
-            "risk_learner": self.risk_learner,
             "uncertainty": self.uncertainty,
             "collector": self.collector,
         }
@@ -148,7 +142,7 @@ class Trainer:
         """Everything that learns from the rollout; ``share`` of the run is over."""
         strength, metrics = self._strength(share)
         rollout, config = self.rollout, self.config.distill
-        rollout.weight.copy_(weights_of(config.weighting, self.collector.uncertainty, self._foreseen()))
+        rollout.weight.copy_(weights_of(config.weighting, self.collector.uncertainty))
         surrogate = self.iteration >= config.critic_warmup_iterations
         metrics |= self.ppo.update(rollout, strength, surrogate, self.generator)
         metrics |= self.collector.leaf_errors.take()
@@ -156,7 +150,7 @@ class Trainer:
         self.teacher_batches.update(
             rollout.flat("x"), rollout.flat("teacher_action"), kept.flatten(), strength, self.generator
         )
-        return metrics | self._learn_world() | self._learn_risk()
+        return metrics | self._learn_world()
 
     def _look_around(self) -> None:
         """Statistics begin with what the behaviour tree meets: networks that begin unscaled learn from their
@@ -173,25 +167,6 @@ class Trainer:
             return {}
         obs, valid = self.rollout.x[..., : self.env.num_obs], ~self.rollout.ended[:-1]
         return self.world_learner.update(obs[:-1], self.rollout.action[:-1], obs[1:], self.generator, valid)
-
-    def _learn_risk(self) -> dict[str, float]:
-        """Risk head, from the moments whose future is known by now."""
-        if self.risk_learner is None:
-            return {}
-        rollout = self.rollout
-        censored = rollout.ended & ~rollout.terminated
-        return self.risk_learner.update(
-            rollout.x, self.collector.failed, rollout.ended, censored, self.generator
-        )
-
-    def _foreseen(self) -> torch.Tensor | None:
-        """(T, N) probability of a failure soon at every moment of the rollout, where the weights ask for
-        it."""
-        return (
-            self.risk(self.rollout.x)
-            if self.risk is not None and self.config.distill.weighting == "risk"
-            else None
-        )
 
     def _strength(self, share: float) -> tuple[float, dict[str, float]]:
         """lambda_t s_t, and both for the log. All processes scale by the mean of their uncertainties, or

@@ -25,7 +25,6 @@ class TunedPilot:
     ``Pilot`` is."""
 
     world_model = None
-    risk = None
 
     def __init__(self, log_factor: torch.Tensor, sim: Sim) -> None:
         """``log_factor`` (n_tuned, 2) natural logarithms of the factors, in the order of ``TUNED``, for slow
@@ -36,7 +35,7 @@ class TunedPilot:
         """(rows, n_tuned, 2) of every row that is allocated"""
         nothing = torch.zeros(sim.num_envs, device=sim.device)
         std = torch.zeros(4, device=sim.device)
-        self.decision = PilotDecision(sim.action, nothing, std, nothing, nothing, nothing[:0])
+        self.decision = PilotDecision(sim.action, nothing, std, nothing, nothing)
         """value, residual and uncertainty are 0: nobody says them"""
 
     def reset(self, rows: torch.Tensor) -> None:

@@ -391,7 +391,6 @@ def _refuse_what_the_twin_lacks(config: LearningConfig) -> None:
     for name, is_on in (
         ("policy.residual", config.policy.residual),
         ("world_model.enabled", config.world_model.enabled),
-        ("risk.enabled", config.risk.enabled),
     ):
         if is_on:
             raise SettingError(f"{name}: the twin has none; set {name}=false, or twin.enabled=false")

@@ -9,6 +9,7 @@ next observation plus beta
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
@@ -18,7 +19,6 @@ from torch import Tensor, nn
 
 from uuvtai.config.learning import WorldModelConfig
 from uuvtai.errors import SettingError
-from uuvtai.learn.calibration import coverage, mean_squared_standardised_residual
 from uuvtai.learn.guard import guarded_step
 from uuvtai.learn.mlp import mlp
 from uuvtai.learn.normalise import Moments, RunningNorm, moments_of
@@ -305,3 +305,26 @@ class ModelBatch(NamedTuple):
     """(B, n_obs)"""
     valid: Tensor
     """(B,) bool"""
+
+
+# ------------------------------------------------------------------------------------------------ calibration
+
+
+def standardised_residual(mean: Tensor, log_var: Tensor, target: Tensor) -> Tensor:
+    """(target - mean) in predicted standard deviations, float64, same shape."""
+    return (target.double() - mean.double()) * torch.exp(-0.5 * log_var.double())
+
+
+def mean_squared_standardised_residual(mean: Tensor, log_var: Tensor, target: Tensor) -> float:
+    """1 where predicted variances are right on average; above 1: too sure of itself."""
+    return float(standardised_residual(mean, log_var, target).square().mean())
+
+
+def coverage(mean: Tensor, log_var: Tensor, target: Tensor, levels: Tensor) -> Tensor:
+    """Share of targets inside the central Gaussian interval of each nominal level, (n_level,): equals
+    ``levels`` if calibrated."""
+    if bool(((levels <= 0) | (levels >= 1)).any()):
+        raise ValueError(f"coverage levels must lie between 0 and 1, got {levels.tolist()}")
+    size = standardised_residual(mean, log_var, target).abs().flatten()
+    half_width = math.sqrt(2.0) * torch.erfinv(levels.double())
+    return torch.stack([(size <= width).double().mean() for width in half_width])

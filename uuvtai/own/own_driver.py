@@ -62,7 +62,6 @@ Ask = Callable[[list[int], torch.Tensor], torch.Tensor]
 class OwnDriver:
     """Asks for every row once per decision, the running rows alone. A ``playing.Driver``."""
 
-    risk = None
     world_model = None
 
     def __init__(self, sim: Sim, code: OwnCode, ask: Ask) -> None:

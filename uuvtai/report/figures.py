@@ -1,4 +1,4 @@
-"""What the figures show, panel by panel: heat maps, curves with seed bands, intervals, reliability, time per
+"""What the figures show, panel by panel: heat maps, curves with seed bands, intervals, time per
 stage.
 
 Every function gives a ``Panel`` whose drawing is done later; the hover texts carry counts and intervals.
@@ -226,39 +226,6 @@ def _frame(axes: Axes, lines: Sequence[Line], share: bool, zero: bool) -> None:
 
 def _spans_decades(values: Sequence[float]) -> bool:
     return bool(values) and min(values) > 0 and max(values) > _LOG_SPAN * min(values)
-
-
-def reliability(bins: dict[str, Sequence[float]], title: str) -> Panel:
-    """What came against what was said; the diagonal is a forecast that can be taken at its word. Area grows
-    with the number of moments."""
-
-    def draw(axes: Axes) -> Hover:
-        axes.set_title(title, loc="left")
-        axes.set_xlabel("said: probability of an accident soon")
-        axes.set_ylabel("came: share of the moments")
-        axes.plot([0, 1], [0, 1], color=INK, linewidth=0.8, linestyle=(0, (4, 3)))
-        most = max(bins["samples"], default=1.0)
-        hover: Hover = {}
-        for i, (said, came, n) in enumerate(
-            zip(bins["predicted"], bins["observed"], bins["samples"], strict=True)
-        ):
-            size = 3.0 + 9.0 * (n / most) ** 0.5
-            axes.plot(
-                [said],
-                [came],
-                marker="o",
-                markersize=size,
-                color=SERIES[0],
-                alpha=0.75,
-                linestyle="none",
-                gid=f"bin-{i}",
-            )
-            hover[f"bin-{i}"] = f"said {said:.3f}, came {came:.3f}, {n:,.0f} moments"
-        axes.set_xlim(-0.03, 1.03)
-        axes.set_ylim(-0.03, 1.03)
-        return hover
-
-    return Panel(draw, 3.8, 3.6)
 
 
 def trade_off(series: Sequence[Line], marks: Sequence[tuple[str, float, float]]) -> Panel:

@@ -1,17 +1,16 @@
-"""Blocks of an evaluation (the document of ``uuv eval --json``): methods, why they failed, how far the risk
-head can be believed."""
+"""Blocks of an evaluation (the document of ``uuv eval --json``): methods, and why they failed."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from uuvtai.outcomes import ENDINGS
-from uuvtai.report.blocks import Block, Figure, Heading, Paragraph
+from uuvtai.report.blocks import Block, Figure, Paragraph
 from uuvtai.report.colours import method_colours
-from uuvtai.report.figures import Line, intervals, rates_text, reliability
+from uuvtai.report.figures import Line, intervals, rates_text
 from uuvtai.tables.method_tables import causes_table, methods_table, paired_table
 from uuvtai.tables.table import Column, Data, Table
-from uuvtai.tables.wording import number, percent, sensing
+from uuvtai.tables.wording import number, sensing
 
 Method = dict[str, Any]
 
@@ -26,7 +25,7 @@ def evaluation(result: dict[str, Any], command: str = "") -> list[Block]:
     blocks += _paired(result.get("paired", []))
     blocks.append(Table(_PLANNING, methods, "Planning", swatches=_swatches(methods)))
     for method in methods:
-        blocks += [*_causes(method), *_risk(method, command)]
+        blocks += _causes(method)
     return blocks
 
 
@@ -168,7 +167,7 @@ _PLANNING = (
 )
 
 
-# -------------------------------------------------------------------------------------------- causes and risk
+# -------------------------------------------------------------------------------------------- causes
 
 
 def _causes(method: Method) -> list[Block]:
@@ -180,35 +179,3 @@ def _causes(method: Method) -> list[Block]:
         "the end"
     )
     return [causes_table(method, caption)]
-
-
-def _risk(method: Method, command: str) -> list[Block]:
-    risk = method.get("risk")
-    if not risk:
-        return []
-    bins = risk["reliability"]
-    said = (
-        f"At {risk['moments']:,} moments the risk head of {method['name']} gave the probability of an "
-        f"accident soon: Brier score {number(risk['brier'], 4)} (base rate alone "
-        f"{number(risk['brier_base_rate'], 4)}), expected calibration error {number(risk['ece'], 4)}, area "
-        f"under the ROC curve {number(risk.get('auroc'), 3)}."
-    )
-    if "accidents" in risk:
-        low, high = risk["missed_ci95"]
-        said += (
-            f" The alarm missed {risk['missed']} of {risk['accidents']} accidents, {percent(low)} to "
-            f"{percent(high)} (promised {percent(risk['promised_miss_rate'])}), and was raised in "
-            f"{percent(risk['alarm_rate_safe'])} of the safe moments."
-        )
-    columns = ["said", "came", "moments"]
-    data = Data(columns, list(zip(bins["predicted"], bins["observed"], bins["samples"], strict=True)))
-    caption = (
-        "Reliability: a point's area grows with the number of its moments; on the dashed line a "
-        "forecast can be taken at its word"
-    )
-    panel = reliability(bins, method["name"])
-    return [
-        Heading(f"Risk: {method['name']}"),
-        Paragraph(said),
-        Figure(f"reliability_{method['name']}", [panel], caption, data, command),
-    ]

@@ -1,4 +1,4 @@
-"""An evaluation in the terminal: the table of methods, pairs of methods, and the risk head."""
+"""An evaluation in the terminal: the table of methods, and pairs of methods."""
 
 from __future__ import annotations
 
@@ -9,16 +9,13 @@ from uuvtai.endings import say
 from uuvtai.show.cause_table import show_causes
 from uuvtai.show.screen import Screen
 from uuvtai.tables.method_tables import DAGGER, methods_table, paired_table
-from uuvtai.tables.wording import number, sensing
+from uuvtai.tables.wording import sensing
 
 
 def show_evaluation(screen: Screen, result: dict[str, Any], folder: Path) -> None:
-    """All of a ``uuv eval --json`` document: methods, pairs, risk, and why episodes failed."""
+    """All of a ``uuv eval --json`` document: methods, pairs, and why episodes failed."""
     show_methods(screen, result)
     show_pairs(screen, result["paired"])
-    for method in result["methods"]:
-        if "risk" in method:
-            show_risk(screen, method["name"], method["risk"])
     if any("causes" in method for method in result["methods"]):
         show_causes(screen, result)
         say(f"facts of every failure, and which of them are recorded: {folder / 'eval/explain.json'}")
@@ -63,21 +60,3 @@ def _privilege(name: str) -> str:
             "it knows the future and has no inertia; timeout = not reachable. An upper bound, no controller"
         )
     return "it is told where every moving body is and how it moves; what stands still it senses"
-
-
-def show_risk(screen: Screen, name: str, risk: dict[str, Any]) -> None:
-    """How far the policy's probability of an accident soon can be believed."""
-    screen.line(
-        f"{name}: risk of an accident soon at {risk['moments']:,} moments: Brier {risk['brier']:.4f} "
-        f"(base rate {risk['brier_base_rate']:.4f}), ECE {risk['ece']:.4f}, AUROC {number(risk['auroc'], 3)}"
-    )
-    bins = risk["reliability"]
-    pairs = zip(bins["predicted"], bins["observed"], bins["samples"], strict=True)
-    screen.line("  said -> came (n): " + ", ".join(f"{p:.2f} -> {o:.2f} ({n:,.0f})" for p, o, n in pairs))
-    if "accidents" in risk:
-        low, high = risk["missed_ci95"]
-        screen.line(
-            f"  alarm: missed {risk['missed']} of {risk['accidents']} accidents, {100 * low:.1f} to "
-            f"{100 * high:.1f} % (promised {100 * risk['promised_miss_rate']:g} %), raised in "
-            f"{100 * risk['alarm_rate_safe']:.1f} % of the safe moments"
-        )

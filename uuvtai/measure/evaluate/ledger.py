@@ -17,7 +17,6 @@ from uuvtai.measure.episodes.playing import EpisodeObserver, EpisodeResult, Job
 from uuvtai.run_folder import RunFolderError
 
 if TYPE_CHECKING:
-    from uuvtai.measure.evaluate.foresight import Foresight
     from uuvtai.sim import Sim
 
 FILE = "eval/episodes.jsonl"
@@ -43,8 +42,6 @@ class Finished(NamedTuple):
     """An episode that is over."""
 
     result: EpisodeResult
-    said: list[float] | None
-    """what the policy's risk head said along it (``foresight.Foresight``); None without one"""
     wall_s: float
     """time that its method had taken by then"""
 
@@ -67,7 +64,6 @@ class _Line(BaseModel):
     fallbacks: dict[str, int]
     ticks: list[int]
     acted: list[int]
-    said: list[float] | None
     wall_s: float = Field(ge=0)
 
     def finished(self) -> Finished:
@@ -75,7 +71,7 @@ class _Line(BaseModel):
         counts: dict[str, Any] = {
             name: np.array(getattr(self, name), dtype=np.int32) for name in ("ticks", "acted")
         }
-        return Finished(EpisodeResult(**plain, **counts), self.said, self.wall_s)
+        return Finished(EpisodeResult(**plain, **counts), self.wall_s)
 
 
 class Ledger:
@@ -101,7 +97,7 @@ class Ledger:
         result = finished.result
         row: dict[str, Any] = {"method": method} | {name: getattr(result, name) for name in _PLAIN}
         row |= {name: getattr(result, name).tolist() for name in ("ticks", "acted")}
-        row |= {"said": finished.said, "wall_s": round(finished.wall_s, 3)}
+        row |= {"wall_s": round(finished.wall_s, 3)}
         self._file.write(json.dumps(row, allow_nan=False, separators=(",", ":")).encode() + b"\n")
         self._file.flush()
         if time.monotonic() - self._synced >= _SYNC_S:
@@ -138,8 +134,8 @@ class LedgerWriter(EpisodeObserver):
     """Recorder that writes a method's episodes into the ledger as they end; behind those whose work an
     episode needs to be whole."""
 
-    def __init__(self, ledger: Ledger, method: str, foresight: Foresight | None) -> None:
-        self._ledger, self._method, self._foresight = ledger, method, foresight
+    def __init__(self, ledger: Ledger, method: str) -> None:
+        self._ledger, self._method = ledger, method
         self.before_s = max((found.wall_s for found in ledger.finished(method).values()), default=0.0)
         self._begun = time.perf_counter()
 
@@ -150,7 +146,4 @@ class LedgerWriter(EpisodeObserver):
 
     def end(self, sim: Sim, row: int, result: EpisodeResult) -> None:
         """Keep the episode."""
-        self._ledger.add(
-            self._method,
-            Finished(result, self._foresight.newest_logits if self._foresight else None, self.wall_s),
-        )
+        self._ledger.add(self._method, Finished(result, self.wall_s))

@@ -11,16 +11,8 @@ from uuvtai.measure.episodes.methods import Method
 from uuvtai.measure.episodes.playing import EpisodeResult, Job, Recorders, run_episodes
 from uuvtai.measure.episodes.stopwatch import StepClock
 from uuvtai.measure.evaluate.eval_request import Request
-from uuvtai.measure.evaluate.foresight import (
-    Foresight,
-    RiskMoments,
-    foresight_of,
-    joined,
-    moments_of,
-    risk_entry,
-)
 from uuvtai.measure.evaluate.hand_overs import hand_overs_of, told
-from uuvtai.measure.evaluate.ledger import Finished, Ledger, LedgerWriter
+from uuvtai.measure.evaluate.ledger import Ledger, LedgerWriter
 from uuvtai.measure.evaluate.summary import summary, tree_use
 from uuvtai.rrt import RoutePlanner
 from uuvtai.sim import Sim
@@ -82,19 +74,18 @@ def play(comparison: Comparison, method: Method, jobs: list[Job], ledger: Ledger
     dt = comparison.request.config.episode.control_dt_s
     sim = comparison.simulator_for(method)
     recorder = _recorder(comparison.request, folder, method.name, jobs, policy)
-    foresight = foresight_of(policy.pilot, dt) if policy else None
     wheel = hand_overs_of(policy.pilot) if policy else None
     logs = recorder.paths if recorder else {}
     over = ledger.finished(method.name)
     left = [job for job in jobs if job not in over or (job in logs and not logs[job].exists())]
     before = len(jobs) - len(left)
     watch.start(method.name, len(jobs))
-    writer, clock = LedgerWriter(ledger, method.name, foresight), StepClock()
+    writer, clock = LedgerWriter(ledger, method.name), StepClock()
     try:
         run_episodes(
             sim,
             left,
-            Recorders([recorder, foresight, wheel, writer]),
+            Recorders([recorder, wheel, writer]),
             lambda done, _total, env_steps, to_come: watch.update(
                 before + done, len(jobs), env_steps, to_come
             ),
@@ -113,19 +104,10 @@ def play(comparison: Comparison, method: Method, jobs: list[Job], ledger: Ledger
     env_steps, wall_s = sum(round(r.time_s / dt) for r in results), writer.wall_s if left else writer.before_s
     entry = summary(method.name, results, env_steps, wall_s, clock.env_steps_per_s)
     entry |= {"privileged": method.privileged} | method.document()
-    entry |= risk_entry(foresight, _moments(foresight, [over[job] for job in jobs], dt))
     entry |= wheel.entry(results, dt) if wheel else {}
     if line := told(entry):
         watch.note(line)
     return MethodRun(method, policy, results, entry, tree_use(sim, results), logs)
-
-
-def _moments(foresight: Foresight | None, finished: list[Finished], dt: float) -> RiskMoments | None:
-    """What the risk head said along the episodes, in their order, whoever has played them."""
-    if foresight is None:
-        return None
-    rows = [(f.said or [], round(f.result.time_s / dt), f.result.outcome) for f in finished]
-    return joined([moments_of(*row, foresight.horizon_steps, number) for number, row in enumerate(rows)])
 
 
 def _recorder(
