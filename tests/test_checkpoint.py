@@ -141,16 +141,6 @@ def test_a_run_without_checkpoints(tmp_path):
         checkpoint.newest(tmp_path)
 
 
-def test_a_shipped_policy_drives_but_cannot_be_trained_on(tmp_path):
-    source = checkpoint.open_checkpoint(saved(tmp_path))
-    checkpoint.ship(source, tmp_path / "policies" / "mine")
-    shipped = checkpoint.open_checkpoint(tmp_path / "policies" / "mine")
-    assert sorted(p.name for p in shipped.path.iterdir()) == ["manifest.json", "model.safetensors"]
-    assert_same(shipped.model(), source.model())
-    with pytest.raises(CheckpointError, match="networks only"):
-        shipped.state(like=state_of(0))
-
-
 # --------------------------------------------------------------------------------------------------- refusals
 
 

@@ -156,7 +156,6 @@ def runs(tmp_path):
         (["tree", "--controller", "mi"], ["mine.xml"]),
         (["sweep", "--grid", "cau"], ["caution"]),
         (["eval", "--controller", "bt,str"], ["bt,straight", "bt,straight+truth"]),
-        (["eval", "res"], ["residual"]),
         (["eval", "runs/f"], ["runs/first", "runs/first_eval/"]),
         (["train", "--resume", "runs/"], ["runs/first", "runs/first_eval"]),
         (["tree", "runs/"], ["runs/first/", "runs/first_eval"]),

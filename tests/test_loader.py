@@ -271,10 +271,8 @@ def differing(config, base):
     [
         ("ppo", {"distill.schedule", "distill.steps"}),
         ("distill_20", {"distill.schedule"}),
-        ("full", set()),
         ("no_risk_scaling", {"uncertainty.gain"}),
         ("no_world_model", {"world_model.as_features"}),
-        ("no_distill", {"distill.schedule", "distill.steps"}),
     ],
 )
 def test_rows_of_the_tables_differ_in_one_thing(row, keys):

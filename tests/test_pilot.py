@@ -13,7 +13,7 @@ from uuvtai.learn.checkpoint import CheckpointError
 from uuvtai.learn.pilot import CHUNK, Pilot, load_pilot
 from uuvtai.learn.policy import ActorCritic
 from uuvtai.learn.world_model import WorldModel
-from uuvtai.loader import load_training, preset_names
+from uuvtai.loader import load_training
 from uuvtai.logs.log_recorder import EpisodeRecorder
 from uuvtai.measure.episodes.methods import Method, features_of, find_policy, policies_of
 from uuvtai.measure.episodes.playing import jobs_of, run_episodes
@@ -256,18 +256,3 @@ def test_policies_with_other_columns_are_not_evaluated_together(trained, tmp_pat
     checkpoint.save(tmp_path / "other" / "checkpoints", 1, {"policy": {}, "env": {}}, wider, columns)
     with pytest.raises(ValueError, match="evaluate them one by one"):
         features_of([str(folder), str(tmp_path / "other")])
-
-
-@pytest.mark.parametrize("name", preset_names("policy"))
-def test_shipped_policies_are_small_have_a_card_and_drive(name):
-    found = find_policy(name)
-    files = {path.name: path.stat().st_size for path in found.path.iterdir()}
-    assert {"MODEL_CARD.md", "manifest.json", "model.safetensors"} == set(files)
-    assert sum(files.values()) < 5_000_000
-    pilot = load_pilot(found, 2)
-    n_obs = max(row["stop"] for row in found.manifest.observation_table)
-    assert torch.isfinite(pilot.act(torch.zeros(2, n_obs))).all()
-
-
-def test_best_and_the_residual_are_shipped():
-    assert "residual" in preset_names("policy") and "best" in preset_names("stack")

@@ -28,7 +28,7 @@ def test_show_prints_what_a_preset_states_with_units_and_sources(kind, capfd):
         code, out, err = uuv(capfd, "presets", "show", f"{kind}/{name}")
         assert code == 0, err
         assert out == shipped_file(kind, name).read_text().rstrip("\n") + "\n"
-        extends = "extends:" in out and kind != "tree" and kind != "policy"
+        extends = "extends:" in out and kind != "tree"
         assert ("it changes these keys of" in err) == extends
 
 
@@ -45,7 +45,7 @@ def test_all_prints_every_key_with_defaults_and_what_it_builds_on(capfd):
     assert whole["world"]["n_dynamic"] == 6 and "tank" in whole["world"] and "sonar" in whole["sensors"]
     _, own, _ = uuv(capfd, "presets", "show", "gauntlet", "--json")
     assert "tank" not in json.loads(own)["world"]
-    _, out, _ = uuv(capfd, "presets", "show", "train/full", "--all", "--json")
+    _, out, _ = uuv(capfd, "presets", "show", "train/ppo", "--all", "--json")
     assert json.loads(out)["ppo"]["rollout_steps"] == 64, "from the preset below the preset below it"
     _, out, _ = uuv(capfd, "presets", "show", "grid/paper", "--all")
     assert yaml.safe_load(out)["axes"]["S"] == [4, 8, 12]

@@ -242,7 +242,7 @@ def test_the_papers_own_time_to_success_is_as_inconsistent_as_we_say():
 
 @pytest.mark.parametrize("budget", list(steps.BUDGETS))
 def test_steps_have_folders_of_their_own_and_known_presets(budget, tmp_path):
-    found = steps.steps_of(steps.BUDGETS[budget], None, tmp_path)
+    found = steps.steps_of(steps.BUDGETS[budget], tmp_path)
     assert len({step.folder for step in found}) == len(found)
     trained = [step.command[1] for step in found if step.command[0] == "train"]
     assert set(trained) <= set(preset_names("train"))
@@ -317,7 +317,7 @@ def test_an_interrupted_reproduction_goes_on_and_runs_no_step_twice(tmp_path, mo
     assert any(f"--resume {place}" in text for text in watch.answer)
     second = Uuv(monkeypatch)
     document, _ = resume(place, Quiet())
-    wanted = steps.steps_of(steps.BUDGETS["quick"], document.get("policy"), place)
+    wanted = steps.steps_of(steps.BUDGETS["quick"], place)
     assert len(first.ran) + len(second.ran) == len(wanted) + 1, "the interrupted step alone runs again"
     assert (place / "results.md").read_text() == results_page(document)
     assert str(place) not in json.dumps(document["commands"]), "commands are told without the machine's paths"

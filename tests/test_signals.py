@@ -133,7 +133,7 @@ def test_a_signal_within_a_write_loses_no_message(tmp_path, call):
         ("eval", "--episodes", "4", "--run-dir", "run"), ("train", "smoke", "--run-dir", "run"),
         ("simulate", "--seconds", "1"),
         ("sweep", "--grid", "D=0,3", "--run-dir", "run"), ("profile",), ("report", "nowhere"),
-        ("export", "residual", "--out", "out"),
+        ("export", "nowhere", "--out", "out"),
         ("presets",), ("doctor",), ("tree",), ("log", "info", "nowhere.mcap"),
         ("reproduce", "--run-dir", "run"),
     ],

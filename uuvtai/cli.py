@@ -335,7 +335,7 @@ def _report_if(with_report: bool, folder: Path) -> None:
         say(f"report: {report([folder]).page}")
 
 
-@app.command("export", epilog="Example: uuv export residual --out runs/residual_export")
+@app.command("export", epilog="Example: uuv export runs/mine --out runs/mine_export")
 @groups.grouped
 def export_policy(
     output: groups.OutputGroup,

@@ -91,7 +91,7 @@ EvalRuns = Annotated[
     list[str] | None,
     _players(
         "RUN",
-        f"Trained policies: run folders, checkpoint folders or shipped names ({choices.names('policy')}).",
+        "Trained policies: run folders or checkpoint folders.",
     ),
 ]
 EvalControllers = Annotated[
@@ -403,9 +403,7 @@ ReportPaper = Annotated[
     ),
 ]
 ReportForce = Annotated[bool, Option("--force", help="Replace files that are there already.")]
-ExportRun = Annotated[
-    str | None, _players("[RUN]", "Run folder, checkpoint folder or shipped name (residual).")
-]
+ExportRun = Annotated[str | None, _players("[RUN]", "Run folder or checkpoint folder.")]
 ExportOut = Annotated[Path | None, Option("--out", help="New folder \\[default: runs/NAME_export].")]
 ExportEvaluation = Annotated[
     list[Path] | None,

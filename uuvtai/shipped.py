@@ -13,7 +13,6 @@ KINDS = {
     "tree": "trees",
     "train": "train",
     "grid": "grids",
-    "policy": "policies",
 }
 """kind -> folder in ``PRESET_DIR``"""
 TRAINING_TREE = "bt"
@@ -23,14 +22,9 @@ TRAINING_TREE = "bt"
 def preset_names(kind: str) -> list[str]:
     """Names of what is shipped of a kind (``KINDS``)."""
     folder = PRESET_DIR / KINDS[kind]
-    if kind == "policy":
-        return sorted(path.parent.name for path in folder.glob("*/manifest.json"))
     return sorted(path.stem for path in folder.iterdir() if path.suffix in (".yaml", ".xml"))
 
 
 def shipped_file(kind: str, name: str) -> Path:
-    """File of a shipped preset; of a policy, its model card."""
-    folder = PRESET_DIR / KINDS[kind]
-    if kind == "policy":
-        return folder / name / "MODEL_CARD.md"
-    return folder / f"{name}{'.xml' if kind == 'tree' else '.yaml'}"
+    """File of a shipped preset."""
+    return PRESET_DIR / KINDS[kind] / f"{name}{'.xml' if kind == 'tree' else '.yaml'}"

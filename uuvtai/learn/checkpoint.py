@@ -4,9 +4,8 @@ opening one executes nothing.
 ``checkpoints/step_000050/`` holds ``manifest.json`` (what it is, for which observation and action, sha256 of
 every file), ``model.safetensors`` (the networks with their normalisers: all that driving needs),
 ``training.safetensors`` (optimisers, generators, counters) and ``simulator.zst`` (the envs themselves, large,
-so only beside the newest ones). A shipped policy is the same folder without the last two. The folder is
-written under another name, flushed to disk and renamed: a process killed at any moment leaves the newest
-verified one usable.
+so only beside the newest ones). The folder is written under another name, flushed to disk and renamed: a
+process killed at any moment leaves the newest verified one usable.
 """
 
 from __future__ import annotations
@@ -184,21 +183,6 @@ def save(
             f"{target}: cannot be written ({error.strerror}); make room or mend the folder, then: --resume"
         ) from None
     return target
-
-
-def ship(checkpoint: Checkpoint, target: Path) -> None:
-    """Copy the networks of a checkpoint into a new folder ``target``: a policy that drives but cannot be
-    trained on."""
-    partial = target.with_name(f"{_PARTIAL}{target.name}")
-    partial.mkdir(parents=True)
-    _write(partial / MODEL, read_bytes(checkpoint.path / MODEL, LARGEST[MODEL], checkpoint.path))
-    kept = {
-        "training": None,
-        "simulator": None,
-        "simulator_layout": None,
-        "files": {MODEL: checkpoint.manifest.files[MODEL]},
-    }
-    _publish(partial, target, checkpoint.manifest.model_copy(update=kept))
 
 
 def sweep(checkpoints: Path) -> None:

@@ -95,10 +95,7 @@ def manifest_content(path: Path) -> bytes:
     """Bytes of a checkpoint folder's manifest. Raises CheckpointError."""
     file = path / MANIFEST
     if not path.is_dir():
-        raise CheckpointError(
-            f"{path}: no such folder; give a run folder, one of its checkpoints/step_N, or a shipped "
-            "policy's name"
-        )
+        raise CheckpointError(f"{path}: no such folder; give a run folder or one of its checkpoints/step_N")
     if file.is_symlink() or not file.is_file():
         raise CheckpointError(f"{file}: is missing; the folder is no checkpoint, or its writing was cut off")
     with refused(file):

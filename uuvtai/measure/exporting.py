@@ -1,4 +1,4 @@
-"""A run, a checkpoint or a shipped policy, found by name and exported; the stack of a log."""
+"""A run or a checkpoint, found and exported; the stack of a log."""
 
 from __future__ import annotations
 

@@ -20,9 +20,5 @@ def whole_preset(kind: str, name: str) -> tuple[Any, str]:
 def _config_of(kind: str, name: str) -> Any:
     if kind == "train":
         return SceneOptions().training(name)
-    if kind == "policy":
-        from uuvtai.measure.episodes.methods import find_policy
-
-        return find_policy(name).config
     chosen: dict[str, Any] = {kind: name}
     return SceneOptions(**chosen).config()

@@ -86,8 +86,8 @@ def grids(incomplete: str) -> list[str]:
 
 
 def policies(incomplete: str) -> list[str]:
-    """Shipped policies, and run folders with checkpoints."""
-    return _starting(preset_names("policy"), incomplete) + _runs(incomplete, "checkpoints")
+    """Run folders with checkpoints."""
+    return _runs(incomplete, "checkpoints")
 
 
 def runs(incomplete: str) -> list[str]:

@@ -23,12 +23,9 @@ _SENTENCE = re.compile(r"(.+?[.])(?:\s+(?=[A-Z0-9])|$)", re.S)
 
 
 def sentence(kind: str, name: str) -> str:
-    """What a shipped preset says of itself first: its first comment's first sentence; a policy's model
-    card."""
+    """What a shipped preset says of itself first: its first comment's first sentence."""
     text = read_text(shipped_file(kind, name), _MAX_BYTES)
-    if kind == "policy":
-        said = text.split("\n", 1)[1].strip().partition("\n\n")[0]
-    elif kind == "tree":
+    if kind == "tree":
         said = text.partition("<!--")[2].partition("-->")[0]
     else:
         lines = text.splitlines()

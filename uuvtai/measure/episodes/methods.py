@@ -1,5 +1,5 @@
 """What drives an evaluation: behaviour trees and stacks by name, trained policies by run folder, checkpoint
-folder or shipped name, and pieces that the user brings."""
+folder, and pieces that the user brings."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from uuvtai.config import Config
 from uuvtai.errors import SettingError
 from uuvtai.loader import ConfigError, nearest, preset_path, tree_of_stack, with_stack
 from uuvtai.own.piece_spec import is_piece, piece_spec
-from uuvtai.shipped import PRESET_DIR, TRAINING_TREE, preset_names
+from uuvtai.shipped import TRAINING_TREE, preset_names
 from uuvtai.tree import FlatTree, read_tree
 
 if TYPE_CHECKING:
@@ -188,15 +188,12 @@ def policies_of(names: list[str], max_node: int, note: Callable[[str], None]) ->
 
 
 def find_policy(name: str, note: Callable[[str], None] = lambda _text: None) -> Checkpoint:
-    """Checkpoint of a shipped policy, a checkpoint folder, or a run folder (its best one, else its newest).
+    """Checkpoint of a checkpoint folder, or of a run folder (its best one, else its newest).
 
     Raises ConfigError for what is none of them, CheckpointError for what cannot be used.
     """
     from uuvtai.learn import checkpoint, manifest
 
-    shipped = preset_names("policy")
-    if name in shipped:
-        return checkpoint.open_checkpoint(PRESET_DIR / "policies" / name)
     path = Path(name)
     if (path / manifest.MANIFEST).exists():
         return checkpoint.open_checkpoint(path)
@@ -206,8 +203,7 @@ def find_policy(name: str, note: Callable[[str], None] = lambda _text: None) -> 
     instead = f"; it drives by itself: --controller {name}. Else" if is_driver else ":"
     raise ConfigError(
         f"{name!r} is no trained policy{instead} give the run folder of 'uuv train', one of its "
-        f"checkpoints/step_N, a shipped policy's name ({', '.join(shipped) or 'none is shipped'}), or one of "
-        "yours: --policy model.onnx, --policy mine.py:load"
+        f"checkpoints/step_N, or one of yours: --policy model.onnx, --policy mine.py:load"
     )
 
 
@@ -239,9 +235,7 @@ def differences(method: Method, config: Config) -> str:
 
 
 def policy_name(name: str, checkpoint: Checkpoint) -> str:
-    """What a policy is called in tables: its shipped name, its run, or its run and step."""
-    if name in preset_names("policy"):
-        return name
+    """What a policy is called in tables: its run, or its run and step."""
     path = Path(name).resolve()
     return path.name if path != checkpoint.path.resolve() else f"{path.parent.parent.name}-{path.name}"
 

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from uuvtai.config import Config
 from uuvtai.files import read_text
-from uuvtai.loader import ConfigError, preset_names, read_preset, sensors_of, validated
+from uuvtai.loader import ConfigError, read_preset, sensors_of, validated
 from uuvtai.own.piece_spec import is_piece, piece_spec
 from uuvtai.run_folder import RunFolderError
 
@@ -44,7 +44,7 @@ class Request:
     seeds: list[int]
     episodes: int
     policies: tuple[str, ...] = ()
-    """run folders, checkpoint folders or shipped names"""
+    """run folders or checkpoint folders"""
     num_envs: int | None = None
     record: int = 0
     video: bool = False
@@ -131,19 +131,17 @@ def read_request(place: Path) -> tuple[Request, dict[str, str]]:
 def _found_again(request: Request, cwd: Path) -> Request:
     """Paths that were typed in another folder, seen from this one; names of what is shipped stay names."""
 
-    def seen(kind: str, name: str) -> str:
-        if kind == "tree" and is_piece(name):
-            return piece_spec(name).located(cwd).text
+    def seen(name: str) -> str:
         file = name.removesuffix("+truth")
-        is_path = file not in preset_names(kind) and (
-            kind == "policy" or file.endswith((".xml", ".yaml", ".yml"))
-        )
-        return str(cwd / name) if is_path and not Path(file).exists() else name
+        return name if Path(file).exists() else str(cwd / name)
 
-    controllers = [seen("tree", name) for name in request.controllers]
-    return replace(
-        request, controllers=controllers, policies=tuple(seen("policy", name) for name in request.policies)
-    )
+    def seen_driver(name: str) -> str:
+        if is_piece(name):
+            return piece_spec(name).located(cwd).text
+        return seen(name) if name.removesuffix("+truth").endswith((".xml", ".yaml", ".yml")) else name
+
+    controllers = [seen_driver(name) for name in request.controllers]
+    return replace(request, controllers=controllers, policies=tuple(map(seen, request.policies)))
 
 
 def drivers_of(methods: list[Method]) -> dict[str, str]:

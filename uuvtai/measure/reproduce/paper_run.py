@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 from uuvtai.errors import SettingError
 from uuvtai.files import FileError, read_json
-from uuvtai.loader import load_config, preset_names
+from uuvtai.loader import load_config
 from uuvtai.measure.episodes.methods import trees_of
 from uuvtai.measure.reproduce import claims, paper
 from uuvtai.measure.reproduce.markdown import results_page
@@ -51,12 +51,7 @@ def reproduce(
     trees_of(pieces, config.teacher.max_node)  # refuses what cannot be loaded before hours have passed
     root = (run_dir or default_run_dir(f"reproduce-{budget}")).absolute()
     folder = RunFolder(root, config, [EVALUATION_SEED])
-    request: dict[str, Any] = {
-        "schema": 1,
-        "budget": budget,
-        "policy": "residual" if "residual" in preset_names("policy") else None,
-    }
-    request["own"] = pieces
+    request: dict[str, Any] = {"schema": 1, "budget": budget, "own": pieces}
     folder.write_json(REQUEST, request)
     return _run(folder, request, watch), root
 
@@ -80,7 +75,7 @@ def _request(root: Path) -> dict[str, Any]:
     file = root / REQUEST
     try:
         request = read_json(file, folder=root)
-        known = request["budget"] in BUDGETS and isinstance(request["policy"], str | None)
+        known = request["budget"] in BUDGETS
         known = known and all(isinstance(name, str) and is_piece(name) for name in request.get("own", []))
     except (FileError, OSError, KeyError, TypeError) as error:
         raise RunFolderError(
@@ -92,7 +87,7 @@ def _request(root: Path) -> dict[str, Any]:
 
 
 def _run(folder: RunFolder, request: dict[str, Any], watch: ReproductionWatch) -> dict[str, Any]:
-    steps = steps_of(BUDGETS[request["budget"]], request["policy"], folder.path, request["own"])
+    steps = steps_of(BUDGETS[request["budget"]], folder.path, request["own"])
     try:
         with folder.recorded():
             for number, step in enumerate(steps, start=1):
@@ -141,7 +136,7 @@ def document_of(root: Path, request: dict[str, Any], steps: Sequence[Step]) -> d
             step.folder: "uuv " + " ".join(_shown(part, root) for part in step.argv(root)) for step in steps
         },
         "table_main": by_preset,
-        "claims": [vars(claim) for claim in _claims(root, results, by_preset, request["policy"], own)],
+        "claims": [vars(claim) for claim in _claims(root, results, by_preset, own)],
         "inconsistencies": list(paper.INCONSISTENCIES),
         "ceilings": results["eval/ceilings"],
         "transfer": results["eval/transfer"],
@@ -175,31 +170,20 @@ def _claims(
     root: Path,
     results: dict[str, Any],
     by_preset: dict[str, Any],
-    policy: str | None,
     own: Sequence[str],
 ) -> list[claims.Claim]:
     cells = results["sweep/pool"]["cells"]
     names = list(dict.fromkeys(cell["method"] for cell in cells))
     pilot = next(name for name in names if name not in ("bt", *own))
     there = next(entry for entry in results["eval/transfer"]["methods"] if entry["name"] not in ("bt", *own))
-    here = None if policy else by_preset["curriculum"][0]
     found = [
         *claims.of_table_main(by_preset),
         *claims.of_training(_metrics(root / "train" / "curriculum-0")),
         *(claim for name in (pilot, "bt") for claim in claims.of_sweep(cells, name)),
         *claims.of_timing(results["profile"]),
-        *(claims.of_transfer(here or _cell_of(cells, pilot), there)),
+        *(claims.of_transfer(by_preset["curriculum"][0], there)),
     ]
     return claims.judged(found)
-
-
-def _cell_of(cells: Sequence[dict[str, Any]], method: str) -> dict[str, Any]:
-    """The pool's own condition in the sweep."""
-    return next(
-        cell
-        for cell in cells
-        if cell["method"] == method and (cell["S"], cell["D"], cell["v_m_s"]) == (8, 6, 0.6)
-    )
 
 
 def _metrics(run: Path) -> list[dict[str, Any]]:

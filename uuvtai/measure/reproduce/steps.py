@@ -17,8 +17,7 @@ from uuvtai.files import FileError, read_json
 from uuvtai.run_folder import RunFolderError, write_atomic
 
 TRAINED = ("ppo", "distill_20", "curriculum", "no_risk_scaling", "no_world_model")
-"""presets that are trained; ``full`` is the curriculum and ``no_distill`` is ppo under the names of the
-ablation"""
+"""presets that are trained; in the ablation's table ``curriculum`` is "Full" and ``ppo`` is "BT distill\""""
 EVALUATION_SEED = 90007
 """never trained or tuned on; it is for published figures alone, so do not look at it while you change
 anything"""
@@ -72,9 +71,8 @@ class Step:
         return [*self.command, *([] if self.to_file else ["--run-dir", place]), "--json"]
 
 
-def steps_of(budget: Budget, policy: str | None, root: Path, own: Sequence[str] = ()) -> list[Step]:
-    """All steps in their order; ``policy``: name of the shipped policy, None = the trained curriculum stands
-    for it; ``own``: pieces of the user's, beside ours wherever methods are compared."""
+def steps_of(budget: Budget, root: Path, own: Sequence[str] = ()) -> list[Step]:
+    """All steps in their order; ``own``: pieces of the user's, beside ours wherever methods are compared."""
     seeds = range(budget.training_seeds)
     runs = {preset: [f"train/{preset}-{seed}" for seed in seeds] for preset in TRAINED}
     trainings = [
@@ -89,7 +87,7 @@ def steps_of(budget: Budget, policy: str | None, root: Path, own: Sequence[str] 
     ]
     at = ("--seeds", str(EVALUATION_SEED), "--episodes")
     places = [str(root / place) for of_preset in runs.values() for place in of_preset]
-    pilot = policy or str(root / runs["curriculum"][0])
+    pilot = str(root / runs["curriculum"][0])
     judged = ("eval", *places, *_controllers("straight", "planner", "bt", *own), *at, str(budget.episodes))
     recorded = ("--record", "1", *at, "1")
     methods = [str(root / runs[name][0]) for name in ("ppo", "distill_20", "curriculum")]
