@@ -10,12 +10,6 @@ WORD = 64
 """Cells of one word."""
 
 
-def has_clz() -> bool:
-    """Whether Taichi counts leading zeros: for Vulkan, 1.7.4 does not compile it for 64 bits, and counts them
-    wrongly where a number of 32 bits is negative (``tests/test_vulkan.py``). Plain Python."""
-    return ti.cfg.arch != ti.vulkan  # pyright: ignore[reportOptionalMemberAccess]
-
-
 @ti.func
 def cell_bit(col):
     """The bit of a column in its word."""
@@ -32,13 +26,7 @@ def lowest_bit(word):
 @ti.func
 def highest_bit(word):
     """Number of the highest bit that is set; the word must not be 0."""
-    if ti.static(has_clz()):
-        return WORD - 1 - ti.cast(ti.math.clz(ti.cast(word, ti.i64)), ti.i32)
-    else:
-        filled = word
-        for k in ti.static(range(6)):
-            filled |= filled >> ti.cast(1 << k, ti.u64)
-        return ti.cast(ti.math.popcnt(filled), ti.i32) - 1
+    return WORD - 1 - ti.cast(ti.math.clz(ti.cast(word, ti.i64)), ti.i32)
 
 
 @ti.func

@@ -1,6 +1,6 @@
 """The same episodes by kernels of either shape: what must come out alike to the last bit.
 
-``UUV_KERNELS=gpu python -m benchmarks.cuda_stub.playing NUM_ENVS SENSORS STEPS``: prints digests as JSON.
+``UUV_KERNELS=gpu python -m tests.shape_bits NUM_ENVS SENSORS STEPS``: prints digests as JSON.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from uuvtai.native.gpu_shape import VARIABLE
 from uuvtai.sim import Sim
 from uuvtai.tree import read_tree
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 _LONGEST_S = 1200
 RESET_STEPS = 25
 """every so many steps one row in four begins another episode"""
