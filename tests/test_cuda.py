@@ -1,5 +1,5 @@
-"""The shape of kernels for a GPU, as far as a CPU can tell: the same bits, the sizes, the numbers that the host
-asks for."""
+"""The shape of kernels for a GPU, as far as a CPU can tell: the same bits, the sizes, the numbers that the
+host asks for."""
 
 import os
 
