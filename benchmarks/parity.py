@@ -15,7 +15,7 @@ from benchmarks.common import Job, Row
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learn.checkpoint import Checkpoint
 from uuvtai.learn.set_networks import actor_of
-from uuvtai.learn.set_pilot import set_pilot_of
+from uuvtai.learn.set_pilot import load_set_pilot
 from uuvtai.learn.set_policy import MOST_WISH, SetActor
 from uuvtai.learn.world_sims import simulator_of
 from uuvtai.measure.episodes.methods import find_policy
@@ -91,7 +91,7 @@ def in_twin(config: LearningConfig, scene: Scene, actor: SetActor, count: int) -
 def in_simulator(sim: Sim, scene: Scene, checkpoint: Checkpoint, count: int) -> np.ndarray:
     """Successes (count,) in the simulator."""
     episodes = [Episode(SEED, i, scene) for i in range(count)]
-    results, _ = run_episodes(sim, episodes, driver=set_pilot_of(checkpoint, sim))
+    results, _ = run_episodes(sim, episodes, driver=load_set_pilot(checkpoint, sim))
     return np.array([result.outcome == "success" for result in results])
 
 

@@ -1,4 +1,4 @@
-"""Exported policies over a set of bodies, choosers and forecasts: NumPy, ONNX Runtime and torch agree with
+"""Exported policies over a set of bodies and forecasts: NumPy, ONNX Runtime and torch agree with
 what drives in the simulator, the hull rule is the kernel's, and folders are checked and never believed."""
 
 import copy
@@ -21,23 +21,18 @@ from uuvtai.deploy.set_golden import golden_rows
 from uuvtai.deploy.set_spec import hull_rule_of
 from uuvtai.deploy.set_weights import kind_of, module_of, set_weights
 from uuvtai.forecast_codes import COLUMNS, N_COLUMN
-from uuvtai.learn import arrival_net, checkpoint, chooser_columns, mixture_net, set_policy
-from uuvtai.learn.arrival_net import ArrivalNet
+from uuvtai.learn import checkpoint, mixture_net, set_policy
 from uuvtai.learn.checkpoint import CheckpointError
-from uuvtai.learn.chooser import load_chooser
 from uuvtai.learn.forecast_trainer import column_row
 from uuvtai.learn.mixture_net import MixtureNet
 from uuvtai.learn.set_pilot import load_set_pilot
 from uuvtai.learn.set_policy import SetActor, SetCritic
 from uuvtai.loader import load_training
-from uuvtai.measure.episodes.playing import jobs_of, run_episodes
 from uuvtai.twin.observer import SET_TABLE
-from uuvtai.twin.set_codes import AT_WISH, BODY_WIDTH, EGO_COLUMNS, N_BODY, TREE_WIDTH
-from uuvtai.twin.tree_columns import CHOOSER_TABLE
+from uuvtai.twin.set_codes import BODY_WIDTH, EGO_COLUMNS, N_BODY
 from uuvtai.twin.twin_arrays import TRUTH_WIDTH
 
 NET = {"twin.body_hidden": 8, "twin.head_hidden": 8}
-EDGES = {"chooser.least", "chooser.most"}
 
 
 def filled(module, seed, spread=0.3):
@@ -56,27 +51,11 @@ def actor_and_critic(config):
     return {"policy": actor.state_dict(), "critic": critic.state_dict(), "counters": {}, "env": {}}
 
 
-def arrival(config):
-    """A net that has seen columns of about 1."""
-    net = filled(ArrivalNet(BODY_WIDTH, EGO_COLUMNS, TREE_WIDTH, config, torch.Generator().manual_seed(3)), 4)
-    rng = torch.Generator().manual_seed(5)
-    bodies = torch.randn(500, N_BODY, BODY_WIDTH, generator=rng)
-    net.widen(
-        bodies * (torch.rand(500, N_BODY, 1, generator=rng) < 0.5),
-        torch.randn(500, EGO_COLUMNS + TREE_WIDTH, generator=rng).mul(2.0),
-    )
-    return net.state_dict()
-
-
 def saved(kind, folder, change=None):
     """A run folder with one checkpoint of a kind, after ``change`` of its state."""
-    preset, table = {"set": ("twin", SET_TABLE), "chooser": ("chooser", CHOOSER_TABLE)}.get(
-        kind, ("forecast", (column_row(),))
-    )
+    preset, table = ("twin", SET_TABLE) if kind == "set" else ("forecast", (column_row(),))
     config = load_training(preset, overrides=NET)
     state = actor_and_critic(config)
-    if kind == "chooser":
-        state["chooser"] = arrival(config)
     if kind == "forecast":
         net = filled(MixtureNet(torch.Generator().manual_seed(6)), 7, 0.05)
         state = {"forecast": net.state_dict(), "counters": {}, "env": {}}
@@ -160,8 +139,6 @@ def test_the_golden_pairs_say_something(kind, whole):
     there = golden["pair_bodies"][..., 0]
     assert set(there.sum(1).astype(int)) >= {0, 1, N_BODY} and np.ptp(golden["pair_mean_wish"]) > 0.5
     assert (golden["pair_bodies"][there == 0] == 0).all()
-    if kind == "chooser":
-        assert set(golden["pair_known"]) == {0.0, 1.0} and np.ptp(golden["pair_chance"]) > 0.1
 
 
 def test_no_critic_and_no_truth_is_exported(kind, whole):
@@ -169,15 +146,9 @@ def test_no_critic_and_no_truth_is_exported(kind, whole):
     found, folder = whole
     arrays = run_policy.read_safetensors(folder / "policy.safetensors")
     module = module_of(found, kind)
-    nets = {"set": ("actor",), "chooser": ("actor", "net"), "forecast": ("net",)}[kind]
-    driving = [getattr(module, name) for name in nets]
-    tensors = [name for net in driving for name in getattr(net, "net", net).state_dict()]
-    assert len(arrays) == len(tensors)
-    parts = {
-        "set": {"actor"},
-        "chooser": {"actor", "chooser"},
-        "forecast": {"into", "middle", "said", "spread"},
-    }
+    driving = module.actor.net if kind == "set" else module.net
+    assert len(arrays) == len(driving.state_dict())
+    parts = {"set": {"actor"}, "forecast": {"into", "middle", "said", "spread"}}
     assert {name.split(".")[0] for name in arrays} == parts[kind]
     assert not any("critic" in name or "log_std" in name for name in arrays)
     text = (folder / "policy_spec.json").read_text() + (folder / "README.md").read_text()
@@ -246,32 +217,6 @@ def test_the_folder_commands_what_the_pilot_commands_in_the_simulator(small, tmp
         pilot.advance()
 
 
-def test_a_chooser_says_what_the_one_in_the_simulator_says(small, tmp_path, no_onnx):
-    found = saved("chooser", tmp_path / "run")
-    deploy.export(found, "mine", tmp_path / "out", (), lambda _text: None)
-    policy, pilot = run_set_policy.load(tmp_path / "out"), load_chooser(found, small.sim)
-    seen = []
-    inner = pilot.choose
-
-    def choose(rows, bodies, own):
-        seen.append((bodies.clone(), own.clone()))
-        return inner(rows, bodies, own)
-
-    pilot.choose = choose
-    run_episodes(small.sim, jobs_of([3], small.N), driver=pilot)
-    assert len(seen) > 5
-    for bodies, own in seen[:6]:
-        said = [
-            policy.act(b, o[:EGO_COLUMNS], o[EGO_COLUMNS : EGO_COLUMNS + AT_WISH])
-            for b, o in zip(bodies.numpy(), own.numpy(), strict=True)
-        ]
-        with torch.no_grad():
-            chance, known = pilot.net(bodies, own), pilot.net.knows(bodies, own)
-        np.testing.assert_allclose([each.chance for each in said], chance.numpy(), atol=1e-5)
-        np.testing.assert_allclose([each.wish for each in said], own[:, -3:].numpy(), atol=1e-5)
-        assert [each.known for each in said] == known.tolist()
-
-
 @pytest.fixture
 def no_onnx(monkeypatch):
     """As if the extra were not installed; ONNX takes seconds."""
@@ -305,7 +250,7 @@ def module_policy():
             "bodies": {"columns": [0] * BODY_WIDTH},
             "own": {"columns": [0] * EGO_COLUMNS},
         },
-        "network": {"goal_gain": 0.7, "choosers": 0},
+        "network": {"goal_gain": 0.7},
         "hull_rule": hull_rule_of(config),
     }
     arrays = {f"actor.{name}": tensor.numpy() for name, tensor in actor.net.state_dict().items()}
@@ -324,37 +269,17 @@ def test_order_and_number_of_bodies_do_not_matter():
 
 def test_words_and_constants_are_those_of_the_package():
     text = set_columns_text
-    assert [len(columns) for columns in (text.BODY_COLUMNS, text.OWN_COLUMNS, text.TREE_COLUMNS)] == [
-        BODY_WIDTH,
-        EGO_COLUMNS,
-        AT_WISH,
-    ]
+    assert [len(columns) for columns in (text.BODY_COLUMNS, text.OWN_COLUMNS)] == [BODY_WIDTH, EGO_COLUMNS]
     names = [row["name"] for columns in (text.BODY_COLUMNS, text.OWN_COLUMNS) for row in columns]
     assert names[12] == "way_in_1s.x" and names[BODY_WIDTH + 3] == "goal_direction.x"
-    assert text.TREE_COLUMNS[22]["name"] == "acts.BackOff" and text.TREE_COLUMNS[6]["name"] == "asked.x"
     for own, theirs in (
         (run_set_policy.AT_DIRECTION, set_policy.AT_DIRECTION),
         (run_set_policy.SUM_SCALE, set_policy._SUM_SCALE),
         (run_set_policy.MOST_WISH, set_policy.MOST_WISH),
-        (run_set_policy.AT_TREE_VELOCITY, arrival_net.AT_TREE_VELOCITY),
-        (run_set_policy.SLACK, arrival_net.SLACK),
         (run_set_policy.LEAST_M, mixture_net._LEAST_M),
         (run_set_policy.LOG_BOUNDS[1], np.log(mixture_net._MOST)),
-        (run_set_policy.ADDED, chooser_columns.APPROACH_WIDTH),
     ):
         assert own == theirs
-    for name in (
-        "HULL_M",
-        "FAR_SIGHT_M",
-        "OVERLAP_M",
-        "HORIZON_S",
-        "SOFT_M",
-        "AT_WAY",
-        "AT_VELOCITY",
-        "AT_WIDTH",
-        "AT_LATER",
-    ):
-        assert getattr(run_set_policy, name) == getattr(chooser_columns, name), name
 
 
 def test_a_forecast_is_that_of_its_network(tmp_path, no_onnx):
@@ -385,7 +310,6 @@ def test_a_forecast_is_that_of_its_network(tmp_path, no_onnx):
         (lambda b, o: (b * np.nan, o), "not finite"),
         (lambda b, o: (b, o * np.inf), "not finite"),
         (lambda b, o: (b * 0.5, o), "first column"),
-        (lambda b, o: (b, o, o), "takes bodies, own; got bodies, own, tree"),
     ],
 )
 def test_bad_columns_are_refused(change, says):
@@ -393,12 +317,9 @@ def test_bad_columns_are_refused(change, says):
         module_policy().act(*change(np.ones((3, BODY_WIDTH)), np.ones(EGO_COLUMNS)))
 
 
-def test_a_chooser_wants_the_trees_columns(tmp_path, no_onnx):
-    found = saved("chooser", tmp_path / "run")
-    deploy.export(found, "mine", tmp_path / "out", (), lambda _text: None)
-    with pytest.raises(ValueError, match="takes bodies, own, tree; got bodies, own"):
-        run_set_policy.load(tmp_path / "out").act(np.ones((3, BODY_WIDTH)), np.ones(EGO_COLUMNS))
-    with pytest.raises(run_policy.PolicyError, match="'chooser'; drive by run_set_policy"):
+def test_the_other_driver_is_named(tmp_path, no_onnx):
+    deploy.export(saved("set", tmp_path / "run"), "mine", tmp_path / "out", (), lambda _text: None)
+    with pytest.raises(run_policy.PolicyError, match="'set'; drive by run_set_policy"):
         run_policy.load(tmp_path / "out")
 
 
@@ -422,10 +343,8 @@ def test_bad_tracks_are_refused(columns, speed):
     ("kind", "change"),
     [
         ("set", lambda s: s["policy"]["net.own.0.bias"].fill_(float("nan"))),
-        ("chooser", lambda s: s["chooser"]["most"].fill_(float("inf"))),
         ("forecast", lambda s: s["forecast"]["into.bias"].fill_(float("nan"))),
         ("set", lambda s: s["policy"].pop("net.own.0.bias")),
-        ("chooser", lambda s: s.pop("chooser")),
         ("forecast", lambda s: s["forecast"].update({"into.bias": torch.zeros(3)})),
     ],
 )
@@ -447,7 +366,7 @@ def test_other_weights_with_the_right_sha256_are_exit_3(kind, tmp_path, no_onnx,
     found = saved(kind, tmp_path / "run")
     deploy.export(found, "mine", tmp_path / "out", (), lambda _text: None)
     weights = set_weights(module_of(found, kind_of(found)))
-    changed = next(name for name in weights if name.endswith("bias") and name not in EDGES)
+    changed = next(name for name in weights if name.endswith("bias"))
     weights[changed] += 1.0
     from safetensors.torch import save
 
@@ -462,8 +381,6 @@ def test_other_weights_with_the_right_sha256_are_exit_3(kind, tmp_path, no_onnx,
         ("set", lambda a: a.pop("actor.own.0.bias")),
         ("set", lambda a: a.update({"actor.body.0.weight": a["actor.body.0.weight"][:, 1:]})),
         ("set", lambda a: a.clear()),
-        ("chooser", lambda a: a.update({"chooser.least": a["chooser.least"][1:]})),
-        ("chooser", lambda a: a.pop("chooser.1.head.4.weight")),
         ("forecast", lambda a: a.update({"said.weight": a["said.weight"][1:]})),
         ("forecast", lambda a: a.pop("spread.bias")),
     ],
@@ -484,7 +401,7 @@ def test_a_kind_that_is_none_is_refused(other, tmp_path, no_onnx, capfd):
     spec = json.loads((tmp_path / "out" / "policy_spec.json").read_text()) | {"kind": other}
     (tmp_path / "out" / "policy_spec.json").write_text(json.dumps(spec))
     assert run_cli("export", "--check", tmp_path / "out") == 2
-    assert "not one of set, chooser, forecast" in capfd.readouterr().err
+    assert "not one of set, forecast" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -228,44 +228,6 @@ class TwinConfig(Section):
         return self
 
 
-class ChooserConfig(Section):
-    """A network that chooses who drives, the behaviour tree or a policy of the twin, by who is likelier to
-    arrive (``docs/learning.md``)."""
-
-    enabled: bool = False
-    """learn to choose"""
-    policy: Annotated[str, Field(max_length=1000)] = ""
-    """run folder or checkpoint of the policy (``uuv train twin``)"""
-    worlds: tuple[Annotated[str, Field(min_length=1, max_length=200)], ...] = ("gauntlet", "pool")
-    """world presets whose episodes are played in turn, each with every one of ``train.scenes``"""
-    hold_steps: PositiveCount = 25
-    """control steps between two choices"""
-    margin: Fraction = 0.02
-    """the other one takes over where it is likelier to arrive by so much"""
-    networks: Annotated[int, Field(ge=1, le=8)] = 2
-    """whose probabilities are averaged"""
-    change: Fraction = 0.15
-    """while everything is drawn: chance that a choice is drawn anew, else the same one drives on"""
-    explore: Fraction = 0.15
-    """share of the choices that are drawn later on"""
-    warm_up: Fraction = 0.5
-    """part of the run in which all choices are drawn"""
-    ends_alone: Fraction = 0.1
-    """part of the run in which the networks learn from how episodes ended alone"""
-    look_ahead: PositiveCount = 4
-    """choices after which the networks' own estimate stands for the rest of the episode"""
-    memory: Annotated[int, Field(ge=1024, le=2**22)] = 2**18
-    """choices that are kept to learn from"""
-    minibatches: PositiveCount = 150
-    """steps of the networks per iteration"""
-    minibatch: PositiveCount = 1024
-    """choices in one of them"""
-    learning_rate: Positive = 1e-3
-    """falls linearly over the run"""
-    follow: Fraction = 0.01
-    """part of the way that the slow copy, which says what is to come, goes with every step"""
-
-
 class TunerConfig(Section):
     """A search for better numbers of the behaviour tree (``tuned_numbers``; ``docs/learning.md``)."""
 
@@ -320,7 +282,6 @@ class LearningConfig(Config):
     uncertainty: UncertaintyConfig = UncertaintyConfig()
     world_model: WorldModelConfig = WorldModelConfig()
     twin: TwinConfig = TwinConfig()
-    chooser: ChooserConfig = ChooserConfig()
     tuner: TunerConfig = TunerConfig()
     forecaster: ForecasterConfig = ForecasterConfig()
     train: TrainConfig = TrainConfig()

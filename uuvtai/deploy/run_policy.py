@@ -34,7 +34,7 @@ SCHEMA = 1
 """of the folder; another one is refused"""
 FILES = (WEIGHTS, GOLDEN, "policy.onnx", "README.md", "run_policy.py", "run_set_policy.py")
 """names that the spec may list; nothing else is ever opened"""
-KINDS = ("set", "chooser", "forecast")
+KINDS = ("set", "forecast")
 """of policies that ``run_set_policy.py`` drives by; a specification without ``kind`` is this file's"""
 N_TARGET, N_ACTION = 24, 4
 MAX_BYTES = 64 << 20

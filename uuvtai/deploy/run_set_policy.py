@@ -1,15 +1,13 @@
-"""Drive by an exported policy over a set of bodies, by a chooser between such a policy and a behaviour tree,
-or forecast by an exported network, with NumPy alone. ``uuv export`` puts a copy of this file in its folder,
-beside ``run_policy.py``, which reads the files.
+"""Drive by an exported policy over a set of bodies, or forecast by an exported network, with NumPy alone.
+``uuv export`` puts a copy of this file in its folder, beside ``run_policy.py``, which reads the files.
 
     from run_set_policy import load
     policy = load("FOLDER")               # checks the sha256 of every file
     said = policy.act(bodies, own)        # ten times a second: columns as policy_spec.json says
     command = policy.command(said.wish, flip, yaw_rad, z_m)     # every control step: the hull rule
 
-A chooser takes the tree's columns too, ``act(bodies, own, tree)``; a forecast is asked by
-``futures(columns, speed)``. ``python run_set_policy.py [FOLDER]`` replays the golden pairs, prints the
-differences and the latency, and exits 3 where they differ.
+A forecast is asked by ``futures(columns, speed)``. ``python run_set_policy.py [FOLDER]`` replays the golden
+pairs, prints the differences and the latency, and exits 3 where they differ.
 """
 
 from __future__ import annotations
@@ -33,29 +31,18 @@ AT_THERE, AT_DIRECTION = 0, slice(3, 5)
 """columns: of a body, 1 = there; of the vehicle's own, the unit vector to the goal"""
 SUM_SCALE = 0.3
 MOST_WISH = 2.0
-HULL_M = 0.22
-FAR_SIGHT_M, OVERLAP_M, HORIZON_S, SOFT_M = 3.0, -1.0, 3.0, 0.3
-AT_WAY, AT_VELOCITY, AT_WIDTH, AT_LATER = slice(1, 3), slice(5, 7), 7, (slice(12, 14), slice(14, 16))
-AT_TREE_VELOCITY = slice(6, 8)
-SLACK = 0.1
-ADDED = 14
-"""columns that a chooser adds to every body"""
 LEAST_M, LOG_BOUNDS = 0.03, (-6.0, math.log(4.0))
 """of a forecast's deviations"""
 _UNFIT = f"{folders.SPEC} and {folders.WEIGHTS} do not fit together ({{error!r}}); export the policy again"
 
 
 class SetDecision(NamedTuple):
-    """What the policy wishes, and what a chooser thinks of it."""
+    """What the policy wishes."""
 
     wish: np.ndarray
     """(3,) ahead, left, up in the mirrored world, in parts of the fastest velocity, within +-2"""
     mean_wish: np.ndarray
     """(3,) the same, not cut off"""
-    chance: np.ndarray | None
-    """(2,) probabilities to arrive: if the tree drives on, if the policy does; None without a chooser"""
-    known: bool | None
-    """every column lies within what the chooser learnt from; where not, let the tree drive"""
 
 
 class Futures(NamedTuple):
@@ -70,66 +57,41 @@ class Futures(NamedTuple):
 
 
 class SetPolicy:
-    """A policy over a set of bodies, alone or with a chooser; it remembers nothing."""
+    """A policy over a set of bodies; it remembers nothing."""
+
+    inputs = ("bodies", "own")
 
     def __init__(self, spec: dict[str, Any], arrays: Arrays) -> None:
         """``spec`` is policy_spec.json, ``arrays`` policy.safetensors. Raises PolicyError where they do not
         fit together."""
-        self._a, self.rule = arrays, spec.get("hull_rule", {})
         try:
+            self.rule = spec["hull_rule"]
             columns = spec["observation"]
             self.widths = {name: len(columns[name]["columns"]) for name in columns if name != "meaning"}
             self._gain = np.float32(spec["network"]["goal_gain"])
-            self._fastest = np.float32(spec["hull_rule"]["fastest_m_s"])
             self._actor = _encoder(arrays, "actor", self.widths["bodies"], self.widths["own"], 3)
-            count = int(spec["network"]["choosers"])
-            body, own = self.widths["bodies"] + ADDED, self.widths["own"] + self.widths.get("tree", 0) + 3
-            self._nets = [_encoder(arrays, f"chooser.{i}", body, own, 2) for i in range(count)]
-            if count and not arrays["chooser.least"].shape == arrays["chooser.most"].shape == (
-                own + body - ADDED,
-            ):
-                raise ValueError("chooser.least or chooser.most")
-            if ("tree" in self.widths) != (count > 0):
-                raise ValueError("columns of the tree without a chooser")
         except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
             raise folders.PolicyError(_UNFIT.format(error=error)) from None
-        self.work = sum(w.size for net in (self._actor, *self._nets) for layers in net for w, _ in layers)
+        self.work = sum(w.size for layers in self._actor for w, _ in layers)
         """multiplications of a decision about one body"""
 
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """Names of what ``said`` takes."""
-        return ("bodies", "own", "tree") if self._nets else ("bodies", "own")
-
-    def act(self, bodies: Any, own: Any, tree: Any = None) -> SetDecision:
-        """Decision for the newest columns: bodies (n, width), any n; own (width,); a chooser's tree (width,).
+    def act(self, bodies: Any, own: Any) -> SetDecision:
+        """Decision for the newest columns: bodies (n, width), any n; own (width,).
 
         Raises ValueError for other shapes, numbers that are not finite, or a first column of a body that is
         neither 0 nor 1.
         """
-        given = {"bodies": bodies, "own": own} | ({} if tree is None else {"tree": tree})
-        if set(given) != set(self.inputs):
-            raise ValueError(f"this policy takes {', '.join(self.inputs)}; got {', '.join(given)}")
+        given = {"bodies": bodies, "own": own}
         found = self.said({name: np.asarray(value, np.float32)[None] for name, value in given.items()})
         mean = found["mean_wish"][0]
-        chance = found["chance"][0] if self._nets else None
-        known = bool(found["known"][0]) if self._nets else None
-        return SetDecision(np.clip(mean, -MOST_WISH, MOST_WISH), mean, chance, known)
+        return SetDecision(np.clip(mean, -MOST_WISH, MOST_WISH), mean)
 
     def said(self, given: Arrays) -> Arrays:
-        """Outputs by name for rows of inputs: ``mean_wish`` (N, 3), and of a chooser ``chance`` (N, 2) and
-        ``known`` (N,), 1 or 0. Raises ValueError as ``act``."""
-        bodies, own, *rest = (self._checked(name, given[name]) for name in self.inputs)
+        """Outputs by name for rows of inputs: ``mean_wish`` (N, 3). Raises ValueError as ``act``."""
+        bodies, own = (self._checked(name, given[name]) for name in self.inputs)
         mean = _pooled(self._actor, bodies, own)
         mean[:, :2] += self._gain * own[:, AT_DIRECTION]
-        if not self._nets:
-            return {"mean_wish": mean}
-        tree = rest[0]
-        wish = np.clip(mean, -MOST_WISH, MOST_WISH)
-        every = np.concatenate([own, tree, wish], axis=1)
-        seen = self._with_approach(bodies, tree[:, AT_TREE_VELOCITY], wish[:, :2])
-        chance = np.mean([_sigmoid(_pooled(net, seen, every)) for net in self._nets], axis=0)
-        return {"mean_wish": mean, "chance": chance, "known": self._known(bodies, every)}
+        return {"mean_wish": mean}
 
     def command(self, wish: Any, flip: Any, yaw_rad: float, z_m: float) -> np.ndarray:
         """(4,) surge, sway, heave, yaw rate in parts of the vehicle's limits, body frame: the hull rule.
@@ -167,19 +129,6 @@ class SetPolicy:
         if rank == 3 and not np.isin(rows[..., AT_THERE], (0.0, 1.0)).all():
             raise ValueError("bodies: the first column is 1 where there is a body, else all columns are 0")
         return rows
-
-    def _with_approach(self, bodies: np.ndarray, tree: np.ndarray, policy: np.ndarray) -> np.ndarray:
-        """Bodies with how close each comes if the tree's velocity (N, 2) is driven on, and the policy's."""
-        long = np.maximum(np.linalg.norm(policy, axis=-1, keepdims=True), np.float32(1.0))
-        added = [*_approach(bodies, tree), *_approach(bodies, self._fastest * policy / long)]
-        return np.concatenate([bodies, np.stack(added, -1) * bodies[..., :1]], -1)
-
-    def _known(self, bodies: np.ndarray, own: np.ndarray) -> np.ndarray:
-        """(N,) 1 where every column lies within what was learnt from, and a little beyond."""
-        least, most = self._a["chooser.least"], self._a["chooser.most"]
-        slack = np.float32(SLACK) * (most - least)
-        low, high = (np.concatenate([own, ends], -1) for ends in (bodies.min(-2), bodies.max(-2)))
-        return np.all((low >= least - slack) & (high <= most + slack), axis=-1).astype(np.float32)
 
 
 class TrackForecast:
@@ -281,26 +230,6 @@ def _pooled(net: tuple[Layers, Layers, Layers], bodies: np.ndarray, own: np.ndar
     for layer in head[:-1]:
         x = np.maximum(_affine(layer, x), 0)
     return _affine(head[-1], x)
-
-
-def _approach(bodies: np.ndarray, velocity: np.ndarray) -> list[np.ndarray]:
-    """Time [s] and distance [m] of the closest approach along straight lines, distances in 1 s and 2 s where
-    the body is forecast, nearness, and the velocity (N, 2) itself."""
-    own = velocity[..., None, :]
-    way, reach = 4.0 * bodies[..., AT_WAY], 0.5 * bodies[..., AT_WIDTH] + np.float32(HULL_M)
-    moves = bodies[..., AT_VELOCITY] - own
-    slow = np.maximum((moves * moves).sum(-1), np.float32(1e-3))
-    when = np.clip(-(way * moves).sum(-1) / slow, 0.0, HORIZON_S).astype(np.float32)
-    gaps = [np.linalg.norm(way + when[..., None] * moves, axis=-1) - reach]
-    for seconds, place in enumerate(AT_LATER, start=1):
-        gaps.append(np.linalg.norm(4.0 * bodies[..., place] - seconds * own, axis=-1) - reach)
-    near = 1.0 / (SOFT_M + np.maximum(gaps[0], 0.0))
-    told = [np.clip(gap, OVERLAP_M, FAR_SIGHT_M) for gap in gaps]
-    return [when, *told, near, *(np.broadcast_to(own[..., i], when.shape) for i in range(2))]
-
-
-def _sigmoid(x: np.ndarray) -> np.ndarray:
-    return (0.5 * (1.0 + np.tanh(0.5 * x))).astype(np.float32)
 
 
 # ----------------------------------------------------------------------------------------------- golden pairs

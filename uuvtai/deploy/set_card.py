@@ -1,5 +1,5 @@
-"""README.md of an exported policy over a set of bodies, of a chooser or of a learned forecast: how a stranger
-drives by it, what it learnt from, how it did, and what it is not for."""
+"""README.md of an exported policy over a set of bodies or of a learned forecast: how a stranger drives by it,
+what it learnt from, how it did, and what it is not for."""
 
 from __future__ import annotations
 
@@ -34,20 +34,11 @@ _SET = (
     "A policy that drives an underwater vehicle by a wish for a velocity, from tracked bodies and free "
     "distances."
 )
-_CHOOSER = (
-    "A policy that drives an underwater vehicle by a wish for a velocity, and a chooser that says how likely "
-    "the vehicle is to arrive if a behaviour tree drives on and if the policy does."
-)
 _FORECAST = "A forecast of tracked moving bodies: a mixture of Gaussians over the places in the next seconds."
 _HOW_SET = """In a program: `from run_set_policy import load`, `policy = load(folder)`, then {rate:g} times a
-second `said = policy.act({inputs})`, and at every control step ({control_hz:g} Hz)
+second `said = policy.act(bodies, own)`, and at every control step ({control_hz:g} Hz)
 `policy.command(said.wish, flip, yaw_rad, z_m)`. It remembers nothing; the last wish that was carried out is
 among the columns."""
-_HOW_CHOICE = """
-Ask `said.chance` (tree, policy) at every {hold}th control step. Whoever drives goes on unless the other
-is likelier to arrive by more than {margin:g}; at the start of a mission the likelier one drives. Where
-`said.known` is false the tree drives. The tree has to run beside it, and its action goes to the vehicle
-as it is."""
 _HOW_FORECAST = """In a program: `from run_set_policy import load`, `forecast = load(folder)`, then
 `forecast.futures(columns, speed)` for each track: `log_weight` of each future, `place` [m] along and
 across the track's course after {times} s, and `sigma` [m]."""
@@ -70,7 +61,7 @@ numbers are `hull_rule` of `policy_spec.json`, and `command` in `run_set_policy.
 
 """
 _LIMITS = """- It does not guarantee clearance. Keep a separate safety stop.
-- Columns have to come from the same stack (tracks, map, pose{tree}) with the same meaning.
+- Columns have to come from the same stack (tracks, map, pose) with the same meaning.
 - It expects the vehicle's inner velocity loop with these limits; it never commands thrusters."""
 _LIMITS_FORECAST = """- Its probabilities are those of bodies as they move in this simulator.
 - Columns have to come from the same tracker with the same meaning."""
@@ -91,16 +82,12 @@ def set_card(spec: dict[str, Any], checkpoint: Checkpoint, evaluations: list[Eva
 
 
 def _set_parts(spec: dict[str, Any]) -> dict[str, str]:
-    rate, is_chooser = spec["rate"], spec["kind"] == "chooser"
-    inputs = "bodies, own, tree" if is_chooser else "bodies, own"
-    how = _HOW_SET.format(rate=rate["decision_hz"], control_hz=rate["control_hz"], inputs=inputs)
-    if is_chooser:
-        how += _HOW_CHOICE.format(hold=rate["choice_hold_steps"], margin=spec["network"]["margin"])
+    rate = spec["rate"]
     return {
-        "what": _CHOOSER if is_chooser else _SET,
-        "how": how,
+        "what": _SET,
+        "how": _HOW_SET.format(rate=rate["decision_hz"], control_hz=rate["control_hz"]),
         "rule": _rule(spec["hull_rule"]),
-        "limits": _LIMITS.format(tree=", behaviour tree" if is_chooser else ""),
+        "limits": _LIMITS,
     }
 
 

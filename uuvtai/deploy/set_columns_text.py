@@ -1,11 +1,10 @@
 """What every column of a policy over a set of bodies is, in words, for policy_spec.json
-(``twin/set_columns.py`` and ``twin/tree_columns_kernel.py`` write them)."""
+(``twin/set_columns.py`` writes them)."""
 
 from __future__ import annotations
 
-from uuvtai import tree_codes
 from uuvtai.forecast_codes import AHEAD_STEPS, FAR, LENGTH_M, N_BEND, N_PAST, PAST_S
-from uuvtai.twin.set_codes import N_LEAF, N_RAY
+from uuvtai.twin.set_codes import N_RAY
 
 MEANING = (
     "float32. Mirrored world: x is turned round where the goal lies at smaller x than the start, y "
@@ -87,33 +86,3 @@ OWN_COLUMNS = [
     ],
 ]  # fmt: skip
 """Columns of the vehicle's own."""
-_LEAVES = {row.code: name for name, row in tree_codes.LEAVES.items()}
-TREE_COLUMNS = [
-    *[
-        _column(f"{name}.{axis}", "m/s", meaning)
-        for name, meaning in (
-            ("evade", "velocity of least cost among the evasive ones, world, x and y mirrored"),
-            ("follow", "velocity along the route"),
-            ("asked", "velocity that the tree asks for"),
-        )
-        for axis in "xyz"
-    ],
-    _column("evade_cost", "1", "cost / (1 + |cost|)"),
-    _column("wants_to_evade", "1", "1 = yes"),
-    _column("conflict", "5 s", "time to a conflict on the way asked for, / 5, within +-1"),
-    _column("hold_conflict", "5 s", "the same if the vehicle stays, / 5"),
-    _column("ttc", "5 s", "smallest time to collision sensed, / 5"),
-    _column("nearest", "4 m", "nearest return, / 4"),
-    _column("nearest_body", "4 m", "nearest forecast body, / 4"),
-    _column("clearance", "2 m", "of the map here, / 2"),
-    _column("path_clearance", "2 m", "of the map along the route, / 2"),
-    _column("speed_share", "1", "part of the cruise speed that the tree allows"),
-    _column("calm", "150 steps", "control steps without danger, / 150"),
-    _column("evading", "150 steps", "control steps of evasion, / 150"),
-    _column("age", "3000 steps", "control steps of the mission, / 3000"),
-    *[
-        _column(f"acts.{_LEAVES[tree_codes.BACK_OFF + i]}", "1", "1 = this leaf of the tree acted")
-        for i in range(N_LEAF)
-    ],
-]
-"""Columns of what the tree makes of the moment; the policy's own wish is added inside."""

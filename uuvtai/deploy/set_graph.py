@@ -1,5 +1,5 @@
-"""A policy over a set of bodies, a chooser and a learned forecast as torch modules that become ONNX graphs.
-None of them remembers anything."""
+"""A policy over a set of bodies and a learned forecast as torch modules that become ONNX graphs. Neither
+remembers anything."""
 
 from __future__ import annotations
 
@@ -8,16 +8,14 @@ from torch import Tensor
 
 from uuvtai.deploy.graph import ExportedModule
 from uuvtai.forecast_codes import COLUMNS
-from uuvtai.learn.arrival_net import ArrivalNet
 from uuvtai.learn.mixture_net import MixtureNet
-from uuvtai.learn.set_policy import MOST_WISH, SetActor
-from uuvtai.twin.set_codes import AT_WISH, BODY_WIDTH, EGO_COLUMNS, N_BODY
+from uuvtai.learn.set_policy import SetActor
+from uuvtai.twin.set_codes import BODY_WIDTH, EGO_COLUMNS, N_BODY
 
 SET_INPUTS = {
     "bodies": f"(N, n, {BODY_WIDTH}) float32: the nearest moving bodies in any order, any n from 1 on; a row "
     "of zeros is no body",
     "own": f"(N, {EGO_COLUMNS}) float32: the vehicle, its goal and the free distances around it",
-    "tree": f"(N, {AT_WISH}) float32: what the behaviour tree makes of the moment",
 }
 FORECAST_INPUTS = {
     "columns": f"(N, {COLUMNS}) float32: how a track moves, moved and turned",
@@ -26,8 +24,6 @@ FORECAST_INPUTS = {
 SET_OUTPUTS = {
     "mean_wish": "(N, 3) float32: ahead, left, up, in parts of the fastest velocity, mirrored world; cut it "
     "off to [-2, 2]",
-    "chance": "(N, 2) float32: probabilities to arrive, if the tree drives on and if the policy does",
-    "known": "(N,) float32: 1 = every column lies within what the chooser learnt from",
     "log_weight": "(N, modes) float32: logarithm of the probability of each future",
     "place": "(N, modes, times, 2) float32: [m] along and across the track's course",
     "sigma": "(N, modes, times, 2) float32: [m] standard deviations",
@@ -36,34 +32,28 @@ Example = tuple[tuple[Tensor, ...], dict[str, dict[int, torch.export.Dim]]]
 
 
 class OneWish(ExportedModule):
-    """One decision of a policy over a set of bodies, and of the chooser beside it."""
+    """One decision of a policy over a set of bodies."""
 
-    def __init__(self, actor: SetActor, net: ArrivalNet | None) -> None:
+    inputs = SET_INPUTS
+
+    def __init__(self, actor: SetActor) -> None:
         super().__init__()
-        self.actor, self.net = actor, net
-        told = list(SET_INPUTS)[: 2 if net is None else 3]
-        self.inputs = {name: SET_INPUTS[name] for name in told}
+        self.actor = actor
 
     @property
     def outputs(self) -> list[str]:
         """Names of what ``forward`` returns."""
-        return list(SET_OUTPUTS)[: 1 if self.net is None else 3]
+        return list(SET_OUTPUTS)[:1]
 
     def example(self) -> Example:
         """As in ``ExportedModule``."""
         rows, bodies = torch.export.Dim("rows", min=1), torch.export.Dim("bodies", min=1)
-        some = torch.zeros(2, N_BODY, BODY_WIDTH), torch.zeros(2, EGO_COLUMNS), torch.zeros(2, AT_WISH)
-        sizes = {name: {0: rows} for name in self.inputs}
-        sizes["bodies"][1] = bodies
-        return some[: len(self.inputs)], sizes
+        some = torch.zeros(2, N_BODY, BODY_WIDTH), torch.zeros(2, EGO_COLUMNS)
+        return some, {"bodies": {0: rows, 1: bodies}, "own": {0: rows}}
 
-    def forward(self, bodies: Tensor, own: Tensor, tree: Tensor | None = None) -> tuple[Tensor, ...]:
+    def forward(self, bodies: Tensor, own: Tensor) -> tuple[Tensor, ...]:
         """Shapes as SET_INPUTS says."""
-        mean = self.actor(bodies, own)
-        if self.net is None or tree is None:
-            return (mean,)
-        every = torch.cat([own, tree, mean.clamp(-MOST_WISH, MOST_WISH)], dim=1)
-        return mean, self.net(bodies, every), self.net.knows(bodies, every).float()
+        return (self.actor(bodies, own),)
 
 
 class OneForecast(ExportedModule):
@@ -78,7 +68,7 @@ class OneForecast(ExportedModule):
     @property
     def outputs(self) -> list[str]:
         """Names of what ``forward`` returns."""
-        return list(SET_OUTPUTS)[3:]
+        return list(SET_OUTPUTS)[1:]
 
     def example(self) -> Example:
         """As in ``ExportedModule``."""

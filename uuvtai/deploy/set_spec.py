@@ -1,5 +1,5 @@
-"""policy_spec.json of policies over a set of bodies, of choosers and of learned forecasts: every column, the
-hull rule, and what the networks are."""
+"""policy_spec.json of policies over a set of bodies and of learned forecasts: every column, the hull rule,
+and what the networks are."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from uuvtai.config.learning import LearningConfig
 from uuvtai.deploy.golden import TOLERANCE
 from uuvtai.deploy.graph import OPSET, ExportedModule
 from uuvtai.deploy.run_policy import GOLDEN, SCHEMA, WEIGHTS
-from uuvtai.deploy.set_columns_text import BODY_COLUMNS, MEANING, MOTION_MEANING, OWN_COLUMNS, TREE_COLUMNS
+from uuvtai.deploy.set_columns_text import BODY_COLUMNS, MEANING, MOTION_MEANING, OWN_COLUMNS
 from uuvtai.deploy.set_graph import SET_OUTPUTS, OneWish
 from uuvtai.deploy.spec import ONNX, origin_of
 from uuvtai.forecast_codes import COLUMNS, N_MODE
@@ -28,7 +28,7 @@ def set_specification(
     checkpoint: Checkpoint, decision: ExportedModule, kind: str, name: str, has_onnx: bool
 ) -> dict[str, Any]:
     """The document without ``files``, which ``export`` adds."""
-    about = _set_parts(checkpoint.config, decision) if isinstance(decision, OneWish) else _forecast_parts()
+    about = _set_parts(checkpoint.config) if isinstance(decision, OneWish) else _forecast_parts()
     graph = {
         "file": ONNX,
         "opset": OPSET,
@@ -47,32 +47,21 @@ def set_specification(
     }
 
 
-def _set_parts(config: LearningConfig, decision: OneWish) -> dict[str, Any]:
+def _set_parts(config: LearningConfig) -> dict[str, Any]:
     columns = {"bodies": {"most": N_BODY, "columns": BODY_COLUMNS}, "own": {"columns": OWN_COLUMNS}}
-    if decision.net is not None:
-        columns["tree"] = {"columns": TREE_COLUMNS}
+    dt_s, hold = config.episode.control_dt_s, config.policy.hold_steps
     return {
         "observation": {"meaning": MEANING, **columns},
         "action": {"columns": ["ahead", "left", "up"], "meaning": _WISH},
-        "rate": _rates(config, decision),
-        "hull_rule": hull_rule_of(config),
-        "network": {
-            "goal_gain": config.twin.goal_gain,
-            "choosers": 0 if decision.net is None else len(decision.net.nets),
-            "margin": None if decision.net is None else config.chooser.margin,
+        "rate": {
+            "control_dt_s": dt_s,
+            "control_hz": 1.0 / dt_s,
+            "hold_steps": hold,
+            "decision_hz": 1.0 / dt_s / hold,
         },
+        "hull_rule": hull_rule_of(config),
+        "network": {"goal_gain": config.twin.goal_gain},
     }
-
-
-def _rates(config: LearningConfig, decision: OneWish) -> dict[str, Any]:
-    dt_s, hold = config.episode.control_dt_s, config.policy.hold_steps
-    found = {
-        "control_dt_s": dt_s,
-        "control_hz": 1.0 / dt_s,
-        "hold_steps": hold,
-        "decision_hz": 1.0 / dt_s / hold,
-    }
-    return found if decision.net is None else found | {"choice_hold_steps": config.chooser.hold_steps}
 
 
 def hull_rule_of(config: LearningConfig) -> dict[str, Any]:

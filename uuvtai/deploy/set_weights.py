@@ -1,16 +1,16 @@
-"""What of a checkpoint is exported where it learnt in the twin, to choose or to forecast: the networks that
-drive as float32 arrays under plain names. No critic is among them, and nothing that the truth goes into."""
+"""What of a checkpoint is exported where it learnt in the twin or to forecast: the networks that drive as
+float32 arrays under plain names. No critic is among them, and nothing that the truth goes into."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from torch import Tensor, nn
+from torch import Tensor
 
 from uuvtai.deploy.graph import ExportedModule
 from uuvtai.deploy.set_graph import OneForecast, OneWish
 from uuvtai.learn.checkpoint import Checkpoint
-from uuvtai.learn.set_networks import actor_of, arrival_net_of, mixture_net_of
+from uuvtai.learn.set_networks import actor_of, mixture_net_of
 
 
 def kind_of(checkpoint: Checkpoint) -> str | None:
@@ -18,8 +18,6 @@ def kind_of(checkpoint: Checkpoint) -> str | None:
     config = checkpoint.config
     if config.forecaster.enabled:
         return "forecast"
-    if config.chooser.enabled:
-        return "chooser"
     return "set" if config.twin.enabled else None
 
 
@@ -27,7 +25,7 @@ def module_of(checkpoint: Checkpoint, kind: str) -> ExportedModule:
     """The networks of a checkpoint of this kind. Raises CheckpointError where they cannot drive."""
     if kind == "forecast":
         return OneForecast(mixture_net_of(checkpoint))
-    return OneWish(actor_of(checkpoint), arrival_net_of(checkpoint) if kind == "chooser" else None)
+    return OneWish(actor_of(checkpoint))
 
 
 def set_weights(decision: ExportedModule) -> dict[str, Tensor]:
@@ -42,14 +40,5 @@ def _named(decision: ExportedModule) -> Iterator[tuple[str, Tensor]]:
             yield name, tensor[:, : decision.example()[0][0].shape[1]] if name == "into.weight" else tensor
         return
     assert isinstance(decision, OneWish)
-    yield from _parts("actor", decision.actor.net)
-    if decision.net is not None:
-        for i, net in enumerate(decision.net.nets):
-            yield from _parts(f"chooser.{i}", net)
-        yield "chooser.least", decision.net.least
-        yield "chooser.most", decision.net.most
-
-
-def _parts(name: str, net: nn.Module) -> Iterator[tuple[str, Tensor]]:
-    for key, tensor in net.state_dict().items():
-        yield f"{name}.{key}", tensor
+    for name, tensor in decision.actor.net.state_dict().items():
+        yield f"actor.{name}", tensor

@@ -53,7 +53,7 @@ from uuvtai.learn.manifest import (
 from uuvtai.learn.packing import PackingError, layout_of, pack, read_stream, unpack, write_stream
 from uuvtai.version import __version__
 
-MODEL_PARTS = ("policy", "world_model", "chooser", "forecast", "tree")
+MODEL_PARTS = ("policy", "world_model", "forecast", "tree")
 """parts of a trainer's state that go into model.safetensors"""
 SIMULATOR_PART = "env"
 """part of a trainer's state that goes into simulator.zst"""

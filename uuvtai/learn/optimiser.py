@@ -1,4 +1,4 @@
-"""Adam without torch's compiler, which its classes import when one is built and when it steps: that takes
+"""Adam without torch's compiler, which its class imports when one is built and when it steps: that takes
 most of a second, and nothing here compiles by it. Same numbers, same states."""
 
 from __future__ import annotations
@@ -8,25 +8,11 @@ import sys
 import torch
 
 
-def _plain(step):
-    """A step of torch's without what switches its compiler off around it."""
-    return torch.no_grad()(getattr(step, "__wrapped__", step))
-
-
 class PlainAdam(torch.optim.Adam):
     """``torch.optim.Adam``."""
 
-    step = _plain(torch.optim.Adam.step)
-
-    def __init__(self, *arguments, **named) -> None:
-        _spare_compiler()
-        super().__init__(*arguments, **named)
-
-
-class PlainAdamW(torch.optim.AdamW):
-    """``torch.optim.AdamW``."""
-
-    step = _plain(torch.optim.AdamW.step)
+    step = torch.no_grad()(getattr(torch.optim.Adam.step, "__wrapped__", torch.optim.Adam.step))
+    """torch's without what switches its compiler off around it"""
 
     def __init__(self, *arguments, **named) -> None:
         _spare_compiler()

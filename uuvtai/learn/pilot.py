@@ -196,7 +196,7 @@ def load_pilot(checkpoint: Checkpoint, num_envs: int, device: torch.device | str
             f"{checkpoint.path}: numbers for the behaviour tree, no network that could be "
             "exported; any stack takes them: --stack best, or stack.yaml of the run"
         )
-    if config.twin.enabled or config.chooser.enabled:
+    if config.twin.enabled:
         raise CheckpointError(
             f"{checkpoint.path}: a policy over a set of bodies, which looks at the simulator itself; it "
             "drives in 'uuv eval' and 'uuv sweep', and is exported by 'uuv export'"

@@ -20,7 +20,6 @@ from uuvtai.statistics import wilson_interval
 if TYPE_CHECKING:
     from uuvtai.env import VectorEnv
     from uuvtai.learn.checkpoint import Checkpoint
-    from uuvtai.learn.chooser_trainer import ChooserTrainer
     from uuvtai.learn.forecast_trainer import ForecastTrainer
     from uuvtai.learn.train import Trainer
     from uuvtai.learn.tuner_trainer import TunerTrainer
@@ -73,9 +72,9 @@ class TrainWatch(Protocol):
     def stop(self) -> None: ...
 
 
-_Alone = TypeVar("_Alone", "TwinTrainer", "ChooserTrainer", "TunerTrainer", "ForecastTrainer")
+_Alone = TypeVar("_Alone", "TwinTrainer", "TunerTrainer", "ForecastTrainer")
 """trainers that one process has to itself"""
-AnyTrainer = Union["Trainer", "TwinTrainer", "ChooserTrainer", "TunerTrainer", "ForecastTrainer"]
+AnyTrainer = Union["Trainer", "TwinTrainer", "TunerTrainer", "ForecastTrainer"]
 Evaluate = Callable[[AnyTrainer, LearningConfig], Metrics]
 """``eval/*`` of the policy as it is; training goes on as if nothing had been
 (``measure.evaluate.while_training.evaluate_now``, which knows what learning does not)"""
@@ -137,8 +136,6 @@ def _train(
         trainer = _forecast_trainer(config, found, request.device)
     elif config.tuner.enabled:
         trainer = _tuner_trainer(config, found, request.device)
-    elif config.chooser.enabled:
-        trainer = _chooser_trainer(config, found, request.device)
     elif config.twin.enabled:
         trainer = _twin_trainer(config, found, request.device)
     else:
@@ -234,14 +231,6 @@ def _twin_trainer(config: LearningConfig, checkpoint: Checkpoint | None, device:
     if checkpoint is None:
         trainer.begin_with(start)
     return _continued(trainer, config, checkpoint)
-
-
-def _chooser_trainer(config: LearningConfig, checkpoint: Checkpoint | None, device: str) -> ChooserTrainer:
-    """As ``_trainer``, of who shall drive."""
-    from uuvtai.learn.chooser_trainer import ChooserTrainer
-
-    _refuse_many("chooser.enabled: it learns", device)
-    return _continued(ChooserTrainer(config), config, checkpoint)
 
 
 def _tuner_trainer(config: LearningConfig, checkpoint: Checkpoint | None, device: str) -> TunerTrainer:

@@ -1,4 +1,4 @@
-"""The networks of a checkpoint that learnt in the twin, to choose or to forecast: made, filled, checked."""
+"""The networks of a checkpoint that learnt in the twin or to forecast: made, filled, checked."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ from typing import TypeVar
 import torch
 from torch import nn
 
-from uuvtai.learn.arrival_net import ArrivalNet
 from uuvtai.learn.checkpoint import Checkpoint
 from uuvtai.learn.manifest import MODEL, CheckpointError
 from uuvtai.learn.mixture_net import MixtureNet
 from uuvtai.learn.set_policy import SetActor
-from uuvtai.twin.set_codes import BODY_WIDTH, EGO_COLUMNS, TREE_WIDTH
+from uuvtai.twin.set_codes import BODY_WIDTH, EGO_COLUMNS
 
 Net = TypeVar("Net", bound=nn.Module)
 
@@ -35,14 +34,6 @@ def actor_of(checkpoint: Checkpoint) -> SetActor:
         actor = SetActor(BODY_WIDTH, EGO_COLUMNS, config, torch.Generator())
         actor.load_state_dict(part)
     return _finite(actor, checkpoint)
-
-
-def arrival_net_of(checkpoint: Checkpoint) -> ArrivalNet:
-    """What a chooser chooses by. Raises as ``actor_of``."""
-    with _refused(checkpoint):
-        net = ArrivalNet(BODY_WIDTH, EGO_COLUMNS, TREE_WIDTH, checkpoint.config, torch.Generator())
-        net.load_state_dict(checkpoint.model()["chooser"])
-    return _finite(net, checkpoint)
 
 
 def mixture_net_of(checkpoint: Checkpoint) -> MixtureNet:

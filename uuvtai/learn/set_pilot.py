@@ -66,10 +66,5 @@ def load_set_pilot(checkpoint: Checkpoint, sim: Sim) -> SetPilot:
     from uuvtai.twin.observer import SET_TABLE
 
     checkpoint.check_table(SET_TABLE, sim.config)
-    return set_pilot_of(checkpoint, sim)
-
-
-def set_pilot_of(checkpoint: Checkpoint, sim: Sim) -> SetPilot:
-    """As ``load_set_pilot``, of a checkpoint whose columns are known to fit."""
     config, actor = checkpoint.config, actor_of(checkpoint)
     return SetPilot(actor.to(sim.device), sim, config.policy.hold_steps, config.twin.vertical_gap_m)

@@ -11,12 +11,6 @@ N_RAY = 24
 """rays of free distance around the vehicle"""
 EGO_COLUMNS = OWN_WIDTH + N_RAY
 """columns of the vehicle's own, rays included"""
-N_LEAF = 6
-"""actions of the tree, one column each (``tree_codes``)"""
-AT_WISH = 28
-"""the first of the policy's three columns, behind the tree's own"""
-TREE_WIDTH = AT_WISH + 3
-"""columns of what the tree makes of the moment, with the policy's wish"""
 
 TURN_GAIN = 2.5
 """[1/s] yaw rate by the angle that is still to turn"""

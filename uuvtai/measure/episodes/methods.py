@@ -80,10 +80,6 @@ class Method:
             from uuvtai.learn.tuned_pilot import load_tuned
 
             return PolicyNote(load_tuned(self.checkpoint, sim), self.checkpoint.sha256, None)
-        if self.checkpoint.config.chooser.enabled:
-            from uuvtai.learn.chooser import load_chooser
-
-            return PolicyNote(load_chooser(self.checkpoint, sim), self.checkpoint.sha256, None)
         if self.checkpoint.config.twin.enabled:
             from uuvtai.learn.set_pilot import load_set_pilot
 

@@ -11,7 +11,6 @@ from uuvtai.measure.episodes.methods import Method
 from uuvtai.measure.episodes.playing import EpisodeResult, Job, Recorders, run_episodes
 from uuvtai.measure.episodes.stopwatch import StepClock
 from uuvtai.measure.evaluate.eval_request import Request
-from uuvtai.measure.evaluate.hand_overs import hand_overs_of, told
 from uuvtai.measure.evaluate.ledger import Ledger, LedgerWriter
 from uuvtai.measure.evaluate.summary import summary, tree_use
 from uuvtai.rrt import RoutePlanner
@@ -74,7 +73,6 @@ def play(comparison: Comparison, method: Method, jobs: list[Job], ledger: Ledger
     dt = comparison.request.config.episode.control_dt_s
     sim = comparison.simulator_for(method)
     recorder = _recorder(comparison.request, folder, method.name, jobs, policy)
-    wheel = hand_overs_of(policy.pilot) if policy else None
     logs = recorder.paths if recorder else {}
     over = ledger.finished(method.name)
     left = [job for job in jobs if job not in over or (job in logs and not logs[job].exists())]
@@ -85,7 +83,7 @@ def play(comparison: Comparison, method: Method, jobs: list[Job], ledger: Ledger
         run_episodes(
             sim,
             left,
-            Recorders([recorder, wheel, writer]),
+            Recorders([recorder, writer]),
             lambda done, _total, env_steps, to_come: watch.update(
                 before + done, len(jobs), env_steps, to_come
             ),
@@ -104,9 +102,6 @@ def play(comparison: Comparison, method: Method, jobs: list[Job], ledger: Ledger
     env_steps, wall_s = sum(round(r.time_s / dt) for r in results), writer.wall_s if left else writer.before_s
     entry = summary(method.name, results, env_steps, wall_s, clock.env_steps_per_s)
     entry |= {"privileged": method.privileged} | method.document()
-    entry |= wheel.entry(results, dt) if wheel else {}
-    if line := told(entry):
-        watch.note(line)
     return MethodRun(method, policy, results, entry, tree_use(sim, results), logs)
 
 

@@ -13,7 +13,6 @@ if TYPE_CHECKING:
 def evaluate_now(trainer: AnyTrainer, config: LearningConfig) -> Metrics:
     """``eval/*``: the policy as it is, without exploration, on scenarios of its own; training goes on as if
     nothing had been."""
-    from uuvtai.learn.chooser_trainer import ChooserTrainer
     from uuvtai.learn.forecast_trainer import ForecastTrainer
     from uuvtai.learn.pilot import Pilot
     from uuvtai.learn.tuner_trainer import TunerTrainer
@@ -21,9 +20,7 @@ def evaluate_now(trainer: AnyTrainer, config: LearningConfig) -> Metrics:
     from uuvtai.measure.episodes.playing import jobs_of, run_episodes
     from uuvtai.measure.evaluate.summary import summary
 
-    if isinstance(
-        trainer, TwinTrainer | ChooserTrainer | TunerTrainer | ForecastTrainer
-    ):  # they play by themselves
+    if isinstance(trainer, TwinTrainer | TunerTrainer | ForecastTrainer):  # they play by themselves
         return trainer.evaluate()
     env = trainer.env
     model = trainer.world_model if config.world_model.as_features else None
