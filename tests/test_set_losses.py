@@ -37,12 +37,10 @@ def batch():
     return [bodies, drawn(N_OWN), drawn(LANES, N_TRUTH), drawn(3), drawn() - 3.0, drawn(), drawn()]
 
 
-def gradients(config, actor, critic, batch, anchor=None, held=0.0, actor_learns=True):
+def gradients(config, actor, critic, batch, anchor=None, held=0.0):
     for parameter in (*actor.parameters(), *critic.parameters()):
         parameter.grad = None
-    sums = SetLosses(config, actor, critic, anchor, held).backward(
-        batch, torch.arange(len(batch[0])), actor_learns
-    )
+    sums = SetLosses(config, actor, critic, anchor, held).backward(batch, torch.arange(len(batch[0])))
     return [p.grad for p in actor.parameters()], [p.grad for p in critic.parameters()], sums
 
 
@@ -69,7 +67,7 @@ def test_pieces_add_up_to_the_gradient_of_the_whole(nets, batch):
 def test_a_minibatch_is_the_rows_that_were_chosen(nets, batch):
     chosen = torch.randperm(ROWS, generator=torch.Generator().manual_seed(3))[:500]
     of_actor, of_critic, _ = gradients(*nets, [part[chosen] for part in batch])
-    SetLosses(*nets, None, 0.0).backward(batch, chosen, True)
+    SetLosses(*nets, None, 0.0).backward(batch, chosen)
     for net, wanted in zip(nets[1:], (of_actor, of_critic), strict=True):
         assert all(torch.equal(p.grad, grad) for p, grad in zip(net.parameters(), wanted, strict=True))
 
@@ -103,11 +101,6 @@ def test_the_number_of_threads_changes_no_bit(nets, batch, monkeypatch):
     assert all(tensor.abs().sum() > 0 for tensor in one)
     for threads in (2, 3):
         assert all(torch.equal(a, b) for a, b in zip(one, found(threads), strict=True))
-
-
-def test_while_the_critic_learns_alone_the_actor_has_no_gradient(nets, batch):
-    of_actor, of_critic, _ = gradients(*nets, batch, actor_learns=False)
-    assert of_actor == [None] * len(of_actor) and None not in of_critic
 
 
 def test_what_goes_wrong_in_a_piece_is_told(monkeypatch):

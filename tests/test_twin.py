@@ -16,16 +16,19 @@ from uuvtai.config.learning import LearningConfig
 from uuvtai.errors import UserError
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, FAR_M, NONE
 from uuvtai.kernels.core.noise import episode_key
-from uuvtai.kernels.core.signature import AnyTensor, Bundle, Const, FloatMatrix
-from uuvtai.learn import checkpoint, twin_trainer
+from uuvtai.kernels.core.signature import AnyTensor, Bundle, Const, FloatMatrix, FloatVector, IntVector
+from uuvtai.learn import checkpoint, twin_trainer, warm_start
+from uuvtai.learn.anchor import Anchor, gaussian_kl
 from uuvtai.learn.manifest import CheckpointError
 from uuvtai.learn.pilot import load_pilot
 from uuvtai.learn.run import TrainRequest, train
 from uuvtai.learn.set_pilot import load_set_pilot
 from uuvtai.learn.set_policy import SetActor
 from uuvtai.learn.twin_trainer import TwinTrainer
+from uuvtai.learn.warm_start import Student, imitate, wish_of_command
 from uuvtai.loader import ConfigError, load_training
 from uuvtai.measure.episodes.playing import jobs_of, run_episodes
+from uuvtai.outcomes import COLLISION, RUNNING, SUCCESS, TIMEOUT
 from uuvtai.twin import hull_rule, kinematics, observer, sensing_model
 from uuvtai.twin.scenario_bank import draw_bank
 from uuvtai.twin.set_codes import BODY_WIDTH, EGO_COLUMNS, N_RAY
@@ -120,6 +123,22 @@ def tracked(track: AnyTensor, out: AnyTensor):
     for i in range(track.shape[0]):
         row = ti.Vector([track[i, 0, k] for k in ti.static(range(TRACK_WIDTH))])
         out[i] = sensing_model.is_tracked(row)
+
+
+@ti.kernel
+def velocities(wish: FloatMatrix, flip: FloatMatrix, vehicle: Const[VehicleConfig], out: FloatMatrix):
+    for i in range(wish.shape[0]):
+        found = hull_rule.wished_velocity(wish[i, 0], wish[i, 1], wish[i, 2], flip[i, 0], flip[i, 1], vehicle)
+        for j in ti.static(range(3)):
+            out[i, j] = found[j]
+
+
+@ti.kernel
+def earn(
+    nearer: FloatVector, nearest: FloatVector, ended: IntVector, io: Bundle[TwinRules], out: FloatVector
+):
+    for i in range(out.shape[0]):
+        out[i] = kinematics.earned(nearer[i], nearest[i], ended[i], io)
 
 
 @pytest.fixture(scope="module")
@@ -310,6 +329,16 @@ def test_rays_meet_what_stands_in_their_way(config):
     assert (np.array(bare) > np.array(wanted) + 0.1).mean() > 0.1, "bodies are in the way"
 
 
+def test_rewards_by_hand(config):
+    nearer, nearest = torch.tensor([0.08, 0.0, -0.02, 0.1]), torch.tensor([9.0, 0.25, 0.05, 2.0])
+    ended = torch.tensor([RUNNING, TIMEOUT, COLLISION, SUCCESS], dtype=torch.int32)
+    reward, twin = torch.zeros(4), config.twin
+    earn(nearer, nearest, ended, bind(TwinRules, config), reward)
+    close = (1.0 - nearest / twin.soft_clearance_m).clamp(0.0, 1.0)
+    expected = twin.progress * nearer - 0.1 * (twin.time_cost + twin.closeness_cost * close)
+    assert torch.allclose(reward, expected + torch.tensor([0.0, 0.0, -1.0, 1.0]), atol=1e-6)
+
+
 def watched(far_m, steps, is_seen=1, count=4000, radius_m=None, track=None):
     """Tracks (count, 9) of bodies so far ahead that go across at 1 m/s, on a circle where it has a radius."""
     at = torch.tensor([[far_m, 0.0, 0.0, 1.0]]).repeat(count, 1)
@@ -396,6 +425,133 @@ def test_learning_goes_on_from_a_state_bit_for_bit(trainer, config, bank):
     same = [name for name in ours if not name.startswith("time/")]
     assert {n: ours[n] for n in same} == {n: theirs[n] for n in same}
     assert theirs["train/std"] >= config.policy.min_std
+
+
+# ------------------------------------------------------------------------------------- warm start and anchor
+
+
+HELD = SMALL | {"twin.warm_start_waves": 1, "twin.anchor": 0.5, "twin.anchor_until": 1.0}
+
+
+@pytest.fixture
+def held(bank, monkeypatch):
+    """Function: a trainer that is held to an actor that imitates nobody, before its first iteration."""
+
+    def moved(actor, *_):
+        with torch.no_grad():
+            for number, parameter in enumerate(actor.net.parameters()):
+                generator = torch.Generator().manual_seed(number)
+                parameter.add_(0.1 * torch.randn(parameter.shape, generator=generator))
+        return {}
+
+    monkeypatch.setattr(twin_trainer, "imitate", moved)
+    return lambda **changes: TwinTrainer(load_training("twin", overrides=HELD | changes), bank)
+
+
+def test_a_command_becomes_the_wish_with_its_velocity():
+    rng, vehicle = np.random.default_rng(0), VehicleConfig()
+    command = torch.from_numpy(rng.uniform(-1, 1, (200, 4)).astype(np.float32))
+    yaw = torch.from_numpy(rng.uniform(-np.pi, np.pi, 200).astype(np.float32))
+    flip = torch.from_numpy(rng.choice([-1.0, 1.0], (200, 2)).astype(np.float32))
+    out = torch.zeros(200, 3)
+    velocities(wish_of_command(command, yaw, flip, vehicle), flip, vehicle, out)
+    surge, sway = vehicle.max_surge_m_s * command[:, 0], vehicle.max_sway_m_s * command[:, 1]
+    expected = [
+        yaw.cos() * surge - yaw.sin() * sway,
+        yaw.sin() * surge + yaw.cos() * sway,
+        vehicle.max_heave_m_s * command[:, 2],
+    ]
+    np.testing.assert_allclose(out, torch.stack(expected, dim=1), atol=1e-5)
+
+
+def test_it_learns_what_the_tree_says(small, monkeypatch):
+    monkeypatch.setattr(warm_start, "PASSES", 1)
+    losses, decisions = [], []
+    config = load_training("twin", overrides=SMALL | {"train.num_envs": small.N, "twin.warm_start_waves": 2})
+    for passes in (1, 20):
+        monkeypatch.setattr(warm_start, "LAST_PASSES", passes)
+        actor = SetActor(BODY_WIDTH, EGO_COLUMNS, config, torch.Generator().manual_seed(1))
+        std = actor.log_std.detach().clone()
+        found = imitate(actor, config, ((8, 6, 0.6),), {"pool": small.sim})
+        losses.append(found["warm_start/loss"])
+        decisions.append(found["warm_start/decisions"])
+        assert torch.equal(actor.log_std, std), "its mean alone is fitted"
+    assert losses[1] < 0.9 * losses[0] and decisions[0] > 100 * small.N / 2
+
+
+def test_the_tree_alone_drives_as_without_a_student(small):
+    config = load_training("twin", overrides=SMALL)
+    actor = SetActor(BODY_WIDTH, EGO_COLUMNS, config, torch.Generator().manual_seed(1))
+    student = Student(actor, small.sim, config, torch.Generator().manual_seed(0))
+    small.begin(range(small.N), seed=9)
+    student.reset(torch.ones(small.N))
+    for share, driver in ((1.0, small.sim.action), (0.0, None)):
+        student.tree_share = share
+        said = student.decide(small.sim.action).action
+        expected = student.decision.action if driver is None else driver
+        assert torch.equal(said, expected)
+    assert len(student.samples) == 2 and len(student.samples[0].wish) == small.N
+
+
+def test_the_divergence_is_that_of_the_distributions():
+    mean, other = torch.randn(50, 3), torch.randn(50, 3)
+    log_std, other_log_std = 0.3 * torch.randn(3), 0.3 * torch.randn(3)
+    ours, theirs = (
+        torch.distributions.Normal(m, s.exp()) for m, s in ((mean, log_std), (other, other_log_std))
+    )
+    expected = torch.distributions.kl_divergence(ours, theirs).sum(-1)
+    assert torch.allclose(gaussian_kl(mean, log_std, other, other_log_std), expected, atol=1e-5)
+    assert torch.allclose(gaussian_kl(mean, log_std, mean, log_std), torch.zeros(50))
+
+
+def test_the_anchor_holds_and_fades(held, config):
+    @torch.no_grad()
+    def gap(actor, other, view):
+        return float((actor(view.bodies, view.own) - other(view.bodies, view.own)).square().mean())
+
+    def moved(weight):
+        trainer = held(**{"twin.anchor": weight, "ppo.rollout_steps": 32})
+        trainer.iterate()
+        return gap(trainer.actor, trainer._anchor.actor, trainer.twin.view)
+
+    assert moved(1e4) < 0.5 * moved(1e-6)
+    anchor = Anchor(SetActor(BODY_WIDTH, EGO_COLUMNS, config, torch.Generator()), 0.4, 0.5)
+    assert [anchor.weight(share) for share in (0.0, 0.25, 0.5, 0.9)] == [0.4, 0.2, 0.0, 0.0]
+
+
+def test_a_saved_training_goes_on_with_its_anchor_bit_for_bit(held, tmp_path):
+    trainer, other = held(), held()
+    trainer.iterate()
+    saved = trainer.state(), trainer.config, trainer.observation_table
+    found = checkpoint.open_checkpoint(checkpoint.save(tmp_path / "checkpoints", 1, *saved))
+    assert list(found.model()) == ["policy"]
+    other.load_state(found.state(like=other.state()))
+    ours, theirs = trainer.iterate(), other.iterate()
+    same = [name for name in ours if not name.startswith("time/")]
+    assert {n: ours[n] for n in same} == {n: theirs[n] for n in same}
+    after, there = trainer.state(), other.state()
+    for part in ("policy", "critic", "anchor"):
+        assert all(torch.equal(tensor, there[part][name]) for name, tensor in after[part].items())
+    assert not torch.equal(after["anchor"]["log_std"], after["policy"]["log_std"])
+
+
+def test_without_an_anchor_none_is_kept(trainer):
+    assert "anchor" not in trainer.state()
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [({"twin.anchor": 0.5}, "anchor needs a policy"), ({"twin.anchor_until": 0.0}, "anchor_until")],
+)
+def test_an_anchor_without_a_meaning_is_refused(changes, says):
+    with pytest.raises(UserError, match=says):
+        load_training("twin", overrides=SMALL | changes)
+
+
+def test_what_clearly_pays_is_the_presets():
+    twin, quick = load_training("twin").twin, load_training("quick").twin
+    assert twin.warm_start_waves > 0 and twin.anchor > 0
+    assert (quick.warm_start_waves, quick.anchor) == (0, 0), "it learns from nothing"
 
 
 # ------------------------------------------------------------------------------------------ in the simulator

@@ -173,12 +173,6 @@ class TwinConfig(Section):
 
     enabled: bool = False
     """train in the twin; false = in the simulator"""
-    simulator: bool = False
-    """fine-tune in the full simulator in the twin's place, with the twin's reward; needs ``start``"""
-    start: Annotated[str, Field(max_length=1000)] = ""
-    """run folder or checkpoint of the policy to begin as (``uuv train twin``); none = straight to goals"""
-    critic_warmup_iterations: Count = 0
-    """iterations in which only the critic learns, before it may move the policy"""
     worlds: tuple[Annotated[str, Field(min_length=1, max_length=200)], ...] = ("pool", "gauntlet")
     """world presets whose scenarios are dealt out, each with all of ``train.scenes``"""
     scenarios: Annotated[int, Field(ge=1, le=2**20)] = 4096
@@ -218,13 +212,9 @@ class TwinConfig(Section):
     """the critic, which serves training alone, knows where the bodies are and will be"""
 
     @model_validator(mode="after")
-    def _start_to_hold_to(self):
-        if self.start and self.warm_start_waves:
-            raise ValueError("start and warm_start_waves exclude each other: --set twin.warm_start_waves=0")
-        if self.anchor > 0 and not (self.start or self.warm_start_waves):
-            raise ValueError(
-                "anchor needs a policy to hold to: start=RUN or warm_start_waves=6; else anchor=0"
-            )
+    def _policy_to_hold_to(self):
+        if self.anchor > 0 and not self.warm_start_waves:
+            raise ValueError("anchor needs a policy to hold to: warm_start_waves=6; else anchor=0")
         return self
 
 

@@ -60,10 +60,10 @@ def _held_out(config: LearningConfig) -> tuple[str, int]:
 
 def _held_out_in_worlds(config: LearningConfig) -> tuple[str, int]:
     """As ``_held_out``, of a policy over a set of bodies: as many of every world and scene."""
-    worlds, place = config.twin.worlds, "simulator" if config.twin.simulator else "kinematic twin"
+    worlds = config.twin.worlds
     groups = len(worlds) * max(1, len(config.train.scenes))
     each = -(-config.train.evaluate_episodes // groups)
-    return f"the {place}, {' and '.join(map(_word, worlds))}, {scenes_of(config)}", groups * each
+    return f"the kinematic twin, {' and '.join(map(_word, worlds))}, {scenes_of(config)}", groups * each
 
 
 def scenes_of(config: LearningConfig) -> str:

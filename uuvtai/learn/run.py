@@ -222,15 +222,10 @@ def _continued(trainer: _Alone, config: LearningConfig, checkpoint: Checkpoint |
 
 def _twin_trainer(config: LearningConfig, checkpoint: Checkpoint | None, device: str) -> TwinTrainer:
     """As ``_trainer``, in the kinematic twin."""
-    from uuvtai.learn.starting_policy import starting_policy
     from uuvtai.learn.twin_trainer import TwinTrainer
 
     _refuse_many("twin.enabled: the twin trains", device)
-    start = None if checkpoint else starting_policy(config)
-    trainer = TwinTrainer(config)
-    if checkpoint is None:
-        trainer.begin_with(start)
-    return _continued(trainer, config, checkpoint)
+    return _continued(TwinTrainer(config), config, checkpoint)
 
 
 def _tuner_trainer(config: LearningConfig, checkpoint: Checkpoint | None, device: str) -> TunerTrainer:

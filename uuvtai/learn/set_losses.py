@@ -39,7 +39,7 @@ class SetLosses:
         self._config, self._actor, self._critic = config, actor, critic
         self._anchor, self._held = anchor, held
 
-    def backward(self, rows: list[torch.Tensor], index: torch.Tensor, actor_learns: bool) -> torch.Tensor:
+    def backward(self, rows: list[torch.Tensor], index: torch.Tensor) -> torch.Tensor:
         """Fill the parameters' gradients; (4,) sums as in ``Piece``.
 
         ``rows``: bodies, own, truth, action, log probability, advantage, target; ``index`` (M,) chooses the
@@ -54,8 +54,7 @@ class SetLosses:
         ]
         found = side_by_side(*pieces)
         _add_up(self._critic, [piece.gradients for piece in found[1::2]])
-        if actor_learns:
-            _add_up(self._actor, [piece.gradients for piece in found[::2]])
+        _add_up(self._actor, [piece.gradients for piece in found[::2]])
         sums = torch.zeros(4)
         for of_actor, of_critic in zip(found[::2], found[1::2], strict=True):
             sums += of_actor.sums + of_critic.sums

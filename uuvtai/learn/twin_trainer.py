@@ -15,7 +15,6 @@ from uuvtai.errors import SettingError
 from uuvtai.learn.anchor import Anchor
 from uuvtai.learn.bfloat16 import in_bfloat16
 from uuvtai.learn.distributed import Processes
-from uuvtai.learn.held_out import play_held_out
 from uuvtai.learn.optimiser import PlainAdam
 from uuvtai.learn.policy import log_prob
 from uuvtai.learn.ppo import ADAM_EPS, adapted_rate, gae
@@ -23,14 +22,10 @@ from uuvtai.learn.rollout_sums import Recent, RolloutSums
 from uuvtai.learn.set_losses import SetLosses, by_part
 from uuvtai.learn.set_policy import MOST_WISH, NUM_WISHES, SetActor, SetCritic
 from uuvtai.learn.side_by_side import side_by_side, torch_threads_rest
-from uuvtai.learn.simulated_world import SimulatedWorld
-from uuvtai.learn.starting_policy import StartingPolicy
 from uuvtai.learn.warm_start import imitate
 from uuvtai.outcomes import OUTCOMES, RUNNING, SUCCESS, TIMEOUT
 
 if TYPE_CHECKING:
-    from uuvtai.scenario import Scene
-    from uuvtai.sim import Sim
     from uuvtai.twin.scenario_bank import ScenarioBank
     from uuvtai.twin.twin_world import Twin
 
@@ -48,16 +43,12 @@ HOLD_STEPS, DECISION_S = 5, 0.1
 class TwinTrainer:
     """Everything that training in the twin carries from one iteration to the next."""
 
-    def __init__(
-        self,
-        config: LearningConfig,
-        bank: ScenarioBank | None = None,
-        sims: Mapping[str, Sim] | None = None,
-    ) -> None:
-        """Draws the scenarios, unless they are given; ``sims``: simulators for ``SimulatedWorld``. Raises
-        ConfigError for a world that is none, or has another tank."""
+    def __init__(self, config: LearningConfig, bank: ScenarioBank | None = None) -> None:
+        """Draws the scenarios, unless they are given. Raises ConfigError for a world that is none, or has
+        another tank."""
         from uuvtai.twin.failure_states import FailureStarts
         from uuvtai.twin.observer import SET_TABLE
+        from uuvtai.twin.scenario_bank import draw_bank
         from uuvtai.twin.set_codes import BODY_WIDTH, EGO_COLUMNS
         from uuvtai.twin.twin_arrays import TRUTH_WIDTH
         from uuvtai.twin.twin_world import Twin
@@ -68,7 +59,8 @@ class TwinTrainer:
         torch.set_flush_denormal(True)
         self.generator = torch.Generator().manual_seed(config.train.seed)
         self._scenes = scenes = config.train.scenes or (config.world.own_scene,)
-        self.twin = _world_to_learn_in(config, scenes, bank, sims)
+        bank = bank or draw_bank(config, scenes, BANK_SEED, config.twin.scenarios)
+        self.twin = Twin(config, bank, config.train.num_envs, config.train.seed)
         self.actor = SetActor(BODY_WIDTH, EGO_COLUMNS, config, self.generator)
         self.critic = SetCritic(BODY_WIDTH, EGO_COLUMNS, TRUTH_WIDTH, config, self.generator)
         self.rate = torch.tensor(config.ppo.learning_rate)
@@ -86,12 +78,10 @@ class TwinTrainer:
         self._held_out: ScenarioBank | None = None
         self._anchor: Anchor | None = None
         self._slow_first = None
-        if config.twin.curriculum_until > 0 and isinstance(self.twin, Twin):
+        if config.twin.curriculum_until > 0:
             self._slow_first = self.twin.bank.slow_first()
         share = config.twin.failure_starts
-        self._failures = (
-            FailureStarts(self.twin, share) if share > 0 and isinstance(self.twin, Twin) else None
-        )
+        self._failures = FailureStarts(self.twin, share) if share > 0 else None
         self._allocate(
             config.ppo.rollout_steps,
             config.train.num_envs,
@@ -112,12 +102,6 @@ class TwinTrainer:
         self._log_prob, self._value, self._reward = (torch.zeros(steps, envs) for _ in range(3))
         self._next_value = torch.zeros(steps, envs)
         self._terminated, self._ended = (torch.zeros(steps, envs, dtype=torch.bool) for _ in range(2))
-
-    def begin_with(self, start: StartingPolicy | None) -> None:
-        """A new run begins as this policy, if any."""
-        if start:
-            start.give(self.actor, self.critic)
-        self._set_anchor()
 
     def _imitate(self) -> dict[str, float]:
         """Learn from the tree first, where ``twin.warm_start_waves`` says so; metrics."""
@@ -252,7 +236,7 @@ class TwinTrainer:
             for index in torch.randperm(len(flat[0]), generator=self.generator).split(size):
                 sums += self._minibatch([*rows, *flat], index)
         policy_loss, value_loss, kl, clipped = (sums / (config.epochs * config.minibatches)).tolist()
-        if config.target_kl > 0 and not self._critic_alone():
+        if config.target_kl > 0:
             self.rate = adapted_rate(self.rate, torch.tensor(kl), config.target_kl).clamp(max=FASTEST_RATE)
         share = self.iteration / self.config.train.iterations
         fade = max(0.1, min(1.0, (1.0 - share) / (1.0 - DECAY_FROM)))
@@ -276,7 +260,7 @@ class TwinTrainer:
         held = self._anchor.weight(share) if self._anchor else 0.0
         self.optimiser.zero_grad(set_to_none=True)
         losses = SetLosses(self.config, self.actor, self.critic, self._anchor, held)
-        sums = losses.backward(rows, index, not self._critic_alone())
+        sums = losses.backward(rows, index)
         torch.nn.utils.clip_grad_norm_(self.actor.parameters(), config.max_grad_norm)
         torch.nn.utils.clip_grad_norm_(self.critic.parameters(), config.max_grad_norm)
         self.optimiser.step()
@@ -284,39 +268,26 @@ class TwinTrainer:
             self.actor.log_std.clamp_(math.log(least_std(self.config, share)), 0.0)
         return sums
 
-    def _critic_alone(self) -> bool:
-        return self.iteration < self.config.twin.critic_warmup_iterations
-
     # --------------------------------------------------------------------------------------------- evaluation
 
     @torch.no_grad()
     def evaluate(self) -> dict[str, float]:
         """``eval/*`` of the policy as it is, without exploration, on scenarios that it never learnt from, the
-        same number of each world and scene: in the twin, or where it learns in the simulator, there."""
-        train = self.config.train
-        each = -(-train.evaluate_episodes // (len(self.config.twin.worlds) * len(self._scenes)))
-        if isinstance(self.twin, SimulatedWorld):
-            outcome, time_s, origin = play_held_out(self.twin, self.actor, train.evaluate_seed, each)
-            names = self.twin.names
-        else:
-            outcome, time_s, origin, names = self._play_in_twin(each)
-        metrics = _rates("eval", outcome, time_s)
-        for number, name in enumerate(names):
-            rows = origin == number
-            metrics[f"eval/success_{name}"] = float((outcome[rows] == SUCCESS).float().mean())
-        return metrics
-
-    def _play_in_twin(self, each: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, tuple[str, ...]]:
-        """(outcome code, time [s], which of the names, names of world and scene)."""
+        same number of each world and scene, in the twin."""
         from uuvtai.twin.scenario_bank import draw_bank
         from uuvtai.twin.twin_world import Twin
 
-        seed = self.config.train.evaluate_seed
+        train = self.config.train
+        each = -(-train.evaluate_episodes // (len(self.config.twin.worlds) * len(self._scenes)))
         if self._held_out is None:
-            self._held_out = draw_bank(self.config, self._scenes, seed, each)
+            self._held_out = draw_bank(self.config, self._scenes, train.evaluate_seed, each)
         bank = self._held_out
-        twin = Twin(self.config, bank, len(bank.body), seed)
-        return *play_once(twin, self.actor), bank.origin, bank.names
+        outcome, time_s = play_once(Twin(self.config, bank, len(bank.body), train.evaluate_seed), self.actor)
+        metrics = _rates("eval", outcome, time_s)
+        for number, name in enumerate(bank.names):
+            rows = bank.origin == number
+            metrics[f"eval/success_{name}"] = float((outcome[rows] == SUCCESS).float().mean())
+        return metrics
 
     # ------------------------------------------------------------------------------------------------- resume
 
@@ -370,22 +341,6 @@ def joined(config: LearningConfig, share: float, scenes: int) -> float:
     return slowest + (1.0 - slowest) * min(1.0, share / config.twin.curriculum_until)
 
 
-def _world_to_learn_in(
-    config: LearningConfig,
-    scenes: tuple[Scene, ...],
-    bank: ScenarioBank | None,
-    sims: Mapping[str, Sim] | None,
-) -> Twin | SimulatedWorld:
-    """The twin with a bank of scenarios, or the simulator."""
-    from uuvtai.twin.scenario_bank import draw_bank
-    from uuvtai.twin.twin_world import Twin
-
-    if config.twin.simulator:
-        return SimulatedWorld(config, scenes, sims)
-    bank = bank or draw_bank(config, scenes, BANK_SEED, config.twin.scenarios)
-    return Twin(config, bank, config.train.num_envs, config.train.seed)
-
-
 def _refuse_what_the_twin_lacks(config: LearningConfig) -> None:
     """Raise SettingError for parts of a training that the twin does not have, and sizes that do not fit."""
     for name, is_on in (
@@ -394,10 +349,6 @@ def _refuse_what_the_twin_lacks(config: LearningConfig) -> None:
     ):
         if is_on:
             raise SettingError(f"{name}: the twin has none; set {name}=false, or twin.enabled=false")
-    if config.twin.simulator and config.twin.failure_starts > 0:
-        raise SettingError("twin.failure_starts: the simulator begins no episode in its middle; set it to 0")
-    if config.twin.simulator and config.twin.curriculum_until > 0:
-        raise SettingError("twin.curriculum_until: only the twin deals scenarios out by speed; set it to 0")
     held, dt_s = config.policy.hold_steps, config.episode.control_dt_s
     if held != HOLD_STEPS or abs(held * dt_s - DECISION_S) > 1e-9:
         raise SettingError(

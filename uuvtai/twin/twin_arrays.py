@@ -21,8 +21,6 @@ from uuvtai.state import (
     MissionState,
     Proprioception,
     TrackState,
-    VehicleState,
-    WorldState,
 )
 
 AT_POS, AT_VEL, AT_YAW, AT_RATE, AT_TIME, AT_GOAL, AT_FLIP, AT_LAST, AT_INTEGRAL = (
@@ -73,14 +71,3 @@ class ObserverIO:
     tank_cfg: Const[TankConfig]
     mapping_cfg: Const[MappingConfig]
     tracking_cfg: Const[TrackingConfig]
-
-
-@dataclass(frozen=True, eq=False)
-class TrueBodiesIO:
-    """What the critic's truth is made of, in training in the simulator: no policy is shown it."""
-
-    clock: In[ClockState]
-    mission: In[MissionState]
-    vehicle: In[VehicleState]
-    world: In[WorldState]
-    episode_cfg: Const[EpisodeConfig]
