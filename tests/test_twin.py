@@ -54,6 +54,7 @@ SMALL = {
     "twin.warm_start_waves": 0,
     "twin.anchor": 0.0,
 }
+HELD = SMALL | {"twin.warm_start_waves": 1, "twin.anchor": 0.5, "twin.anchor_until": 1.0}
 
 
 @ti.kernel
@@ -428,9 +429,6 @@ def test_learning_goes_on_from_a_state_bit_for_bit(trainer, config, bank):
 
 
 # ------------------------------------------------------------------------------------- warm start and anchor
-
-
-HELD = SMALL | {"twin.warm_start_waves": 1, "twin.anchor": 0.5, "twin.anchor_until": 1.0}
 
 
 @pytest.fixture

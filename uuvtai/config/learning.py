@@ -199,17 +199,6 @@ class TwinConfig(Section):
     """weight of KL(policy || policy that it began as) in the loss"""
     anchor_until: Annotated[float, Field(gt=0, le=1)] = 0.3
     """share of the run over which that weight falls to 0, linearly"""
-    last_std: NonNegative = 0.0
-    """``policy.min_std`` falls to this until the end of the run; 0 = it stays"""
-    explore_until: Annotated[float, Field(ge=0, lt=1)] = 0.8
-    """share of the run from which it falls, linearly"""
-    failure_starts: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """share of the episodes that begin 1 to 4 s before an earlier failure"""
-    curriculum_until: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """share of the run over which scenarios with faster and faster bodies join the slowest ones; 0 = all take
-    part from the start"""
-    critic_sees_truth: bool = True
-    """the critic, which serves training alone, knows where the bodies are and will be"""
 
     @model_validator(mode="after")
     def _policy_to_hold_to(self):

@@ -70,18 +70,15 @@ class SetActor(nn.Module):
 
 
 class SetCritic(nn.Module):
-    """Expected return, from what the vehicle knows and, unless ``twin.critic_sees_truth`` is off, from the
-    bodies' true places, now and later."""
+    """Expected return, from what the vehicle knows and from the bodies' true places, now and later."""
 
     def __init__(
         self, n_body: int, n_own: int, n_truth: int, config: LearningConfig, generator: torch.Generator
     ) -> None:
         super().__init__()
         self.net = SetEncoder(n_body + n_truth, n_own, 1, config, 1.0, generator)
-        self._sees_truth = config.twin.critic_sees_truth
 
     def forward(self, bodies: torch.Tensor, own: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
         """(...,)."""
-        truth = truth if self._sees_truth else torch.zeros_like(truth)
         there = torch.maximum(bodies[..., :1], truth[..., 2:3])
         return self.net(torch.cat([bodies, truth], dim=-1), own, there).squeeze(-1)

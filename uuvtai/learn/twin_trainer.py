@@ -46,7 +46,6 @@ class TwinTrainer:
     def __init__(self, config: LearningConfig, bank: ScenarioBank | None = None) -> None:
         """Draws the scenarios, unless they are given. Raises ConfigError for a world that is none, or has
         another tank."""
-        from uuvtai.twin.failure_states import FailureStarts
         from uuvtai.twin.observer import SET_TABLE
         from uuvtai.twin.scenario_bank import draw_bank
         from uuvtai.twin.set_codes import BODY_WIDTH, EGO_COLUMNS
@@ -77,11 +76,6 @@ class TwinTrainer:
         self._returns = torch.zeros(config.train.num_envs)
         self._held_out: ScenarioBank | None = None
         self._anchor: Anchor | None = None
-        self._slow_first = None
-        if config.twin.curriculum_until > 0:
-            self._slow_first = self.twin.bank.slow_first()
-        share = config.twin.failure_starts
-        self._failures = FailureStarts(self.twin, share) if share > 0 else None
         self._allocate(
             config.ppo.rollout_steps,
             config.train.num_envs,
@@ -143,13 +137,8 @@ class TwinTrainer:
     # ---------------------------------------------------------------------------------------------- a rollout
 
     def _next_scenarios(self) -> torch.Tensor:
-        """(N,) numbers of scenarios: any, or of those that have joined (``twin.curriculum_until``)."""
-        size = (self.twin.num_envs,)
-        if self._slow_first is None:
-            return torch.randint(self.twin.num_scenarios, size, generator=self.generator)
-        part = joined(self.config, self.iteration / self.config.train.iterations, len(self._scenes))
-        count = max(1, round(part * len(self._slow_first)))
-        return self._slow_first[torch.randint(count, size, generator=self.generator)]
+        """(N,) numbers of scenarios, any."""
+        return torch.randint(self.twin.num_scenarios, (self.twin.num_envs,), generator=self.generator)
 
     @torch.no_grad()
     def _collect(self) -> RolloutSums:
@@ -178,25 +167,16 @@ class TwinTrainer:
                 if bool(late.any()):
                     twin.look()
                     after = self.critic(view.bodies[late], view.own[late], view.truth[late])
-                self._begin(ended, outcome)
+                twin.begin(ended, self._next_scenarios())
             else:
                 late, after = ended, None
             self._late = (late.clone(), after)
-            if self._failures:
-                self._failures.advance()
             twin.look()
             self._bootstrap(t)
         last = by_part(self.critic, *view, config=self.config)
         self._next_value[-1] = torch.where(self._ended[-1], self._next_value[-1], last)
         sums.samples += self._reward.numel()
         return sums
-
-    def _begin(self, ended: torch.Tensor, outcome: torch.Tensor) -> None:
-        """New episodes in the rows (N,) that ended with these outcomes (N,)."""
-        if self._failures:
-            self._failures.begin(ended, outcome, self._next_scenarios(), self.generator)
-        else:
-            self.twin.begin(ended, self._next_scenarios())
 
     def _bootstrap(self, t: int) -> None:
         """After a timeout the return goes on by the value of where it led to: as part of the reward, for the
@@ -265,7 +245,7 @@ class TwinTrainer:
         torch.nn.utils.clip_grad_norm_(self.critic.parameters(), config.max_grad_norm)
         self.optimiser.step()
         with torch.no_grad():
-            self.actor.log_std.clamp_(math.log(least_std(self.config, share)), 0.0)
+            self.actor.log_std.clamp_(math.log(self.config.policy.min_std), 0.0)
         return sums
 
     # --------------------------------------------------------------------------------------------- evaluation
@@ -302,7 +282,7 @@ class TwinTrainer:
             "recent": list(self.recent.rows),
             "returns": self._returns.clone(),
             "counters": {"iteration": self.iteration, "env_steps": self.env_steps},
-            "env": self.twin.capture() | (self._failures.capture() if self._failures else {}),
+            "env": self.twin.capture(),
         } | ({"anchor": _copied(self._anchor.actor)} if self._anchor else {})
 
     def load_state(self, state: Mapping[str, Any]) -> None:
@@ -316,8 +296,6 @@ class TwinTrainer:
         self._returns.copy_(state["returns"])
         self.iteration, self.env_steps = (int(state["counters"][n]) for n in ("iteration", "env_steps"))
         self.twin.restore(state["env"])
-        if self._failures:
-            self._failures.restore(state["env"])
         self._set_anchor()
         if self._anchor and "anchor" in state:
             self._anchor.actor.load_state_dict(state["anchor"])
@@ -325,20 +303,6 @@ class TwinTrainer:
 
 def _copied(net: torch.nn.Module) -> dict[str, torch.Tensor]:
     return {name: tensor.clone() for name, tensor in net.state_dict().items()}
-
-
-def least_std(config: LearningConfig, share: float) -> float:
-    """Floor under the deviation: ``policy.min_std``, falling to ``twin.last_std`` where that is set."""
-    last, until = config.twin.last_std, config.twin.explore_until
-    if last == 0 or share <= until:
-        return config.policy.min_std
-    return config.policy.min_std + (last - config.policy.min_std) * (share - until) / (1.0 - until)
-
-
-def joined(config: LearningConfig, share: float, scenes: int) -> float:
-    """Part of the scenarios, slow ones first, that a run deals out at this share of its iterations."""
-    slowest = 1.0 / scenes
-    return slowest + (1.0 - slowest) * min(1.0, share / config.twin.curriculum_until)
 
 
 def _refuse_what_the_twin_lacks(config: LearningConfig) -> None:
@@ -354,11 +318,6 @@ def _refuse_what_the_twin_lacks(config: LearningConfig) -> None:
         raise SettingError(
             f"policy.hold_steps={held}, episode.control_dt_s={dt_s}: the twin decides every {DECISION_S} s, "
             f"after {HOLD_STEPS} control steps"
-        )
-    if config.twin.last_std > config.policy.min_std:
-        raise SettingError(
-            f"twin.last_std={config.twin.last_std}: the floor falls, so at most "
-            f"policy.min_std={config.policy.min_std}"
         )
     samples = config.ppo.rollout_steps * config.train.num_envs
     if config.ppo.minibatches > samples:

@@ -36,13 +36,6 @@ class ScenarioBank:
     names: tuple[str, ...]
     """world_D_v by number"""
 
-    def slow_first(self) -> torch.Tensor:
-        """(B,) numbers of the scenarios, those with slower bodies first; worlds take turns."""
-        speed = self.path[..., 4].amax(dim=1) if self.path.shape[1] else torch.zeros(len(self.body))
-        turn = torch.arange(len(self.body)) - torch.searchsorted(self.origin, self.origin)
-        order = torch.argsort(turn, stable=True)
-        return order[torch.argsort(speed[order], stable=True)]
-
 
 def draw_bank(config: LearningConfig, scenes: tuple[Scene, ...], seed: int, count: int) -> ScenarioBank:
     """Episodes 0 .. count - 1 of ``seed`` for every pair of a world of ``twin.worlds`` and a scene (S, D, v),
