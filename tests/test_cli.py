@@ -496,6 +496,15 @@ def test_tree_shows_the_use_of_every_node(evaluation, capfd):
     assert code == 2 and "bt: is no run folder" in err and "uuv tree --controller bt" in err
 
 
+def test_without_a_preset_the_papers_learner_trains(capfd, monkeypatch):
+    asked = []
+    monkeypatch.setattr("uuvtai.learn.run.train", lambda request, *_: (asked.append(request) or {}, Path()))
+    assert uuv(capfd, "train")[0] == 0
+    assert [(request.preset, request.config) for request in asked] == [
+        ("paper", loader.load_training("paper"))
+    ]
+
+
 def test_an_existing_run_folder_is_never_overwritten(evaluation, capfd):
     folder, _, _ = evaluation
     before = (folder / "run.json").read_text()

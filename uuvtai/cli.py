@@ -89,7 +89,7 @@ def train_policy(
     ctx: typer.Context,
     scene: groups.TrainSceneGroup,
     output: groups.PlainOutputGroup,
-    preset: opt.TrainPreset = None,
+    preset: opt.TrainPreset = "paper",
     resume: opt.TrainResume = None,
     iterations: opt.Iterations = None,
     num_envs: opt.TrainEnvs = None,
@@ -105,7 +105,7 @@ def train_policy(
 
     if resume is None:
         new = {"iterations": iterations, "device": device, "run_dir": run_dir}
-        request = TrainRequest.typed(scene, preset or "best", num_envs, seed, **new)
+        request = TrainRequest.typed(scene, preset, num_envs, seed, **new)
     else:
         arguments.refuse_beside_resume(ctx, ("iterations", "device", "overrides"))
         request = TrainRequest(

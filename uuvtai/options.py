@@ -159,10 +159,10 @@ EvalResume = Annotated[Path | None, _resume("Run folder of an interrupted evalua
 # ------------------------------------------------------------------------------------------------------ train
 
 TrainPreset = Annotated[
-    str | None,
+    str,
     Argument(
         metavar="PRESET",
-        help=f"Training preset: {choices.names('train')}, or a YAML file \\[default: best].",
+        help=f"Training preset: {choices.names('train')}, or a YAML file.",
         autocompletion=choices.presets("train"),
     ),
 ]
