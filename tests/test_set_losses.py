@@ -6,7 +6,6 @@ import torch
 
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learn import side_by_side as pieces
-from uuvtai.learn.anchor import Anchor
 from uuvtai.learn.policy import log_prob
 from uuvtai.learn.ppo import surrogate_loss
 from uuvtai.learn.set_losses import CACHE_ROWS, SetLosses, by_part
@@ -37,25 +36,23 @@ def batch():
     return [bodies, drawn(N_OWN), drawn(LANES, N_TRUTH), drawn(3), drawn() - 3.0, drawn(), drawn()]
 
 
-def gradients(config, actor, critic, batch, anchor=None, held=0.0):
+def gradients(config, actor, critic, batch):
     for parameter in (*actor.parameters(), *critic.parameters()):
         parameter.grad = None
-    sums = SetLosses(config, actor, critic, anchor, held).backward(batch, torch.arange(len(batch[0])))
+    sums = SetLosses(config, actor, critic).backward(batch, torch.arange(len(batch[0])))
     return [p.grad for p in actor.parameters()], [p.grad for p in critic.parameters()], sums
 
 
 def test_pieces_add_up_to_the_gradient_of_the_whole(nets, batch):
     config, actor, critic = nets
-    anchor = Anchor(SetActor(N_BODY, N_OWN, config, torch.Generator().manual_seed(2)), 0.3, 0.5)
-    of_actor, of_critic, sums = gradients(config, actor, critic, batch, anchor, 0.3)
+    of_actor, of_critic, sums = gradients(config, actor, critic, batch)
     bodies, own, truth, action, before, advantage, target = batch
     mean, value = actor(bodies, own), critic(bodies, own, truth)
     surrogate = surrogate_loss(
         log_prob(action, mean, actor.log_std) - before, advantage, config.ppo.clip
     ).mean()
     error = (value - target).square().mean()
-    far = anchor.divergence(mean, actor.log_std, bodies, own).mean()
-    wanted = torch.autograd.grad(surrogate + 0.3 * far, list(actor.parameters()))
+    wanted = torch.autograd.grad(surrogate, list(actor.parameters()), retain_graph=True)
     for found, asked in zip(of_actor, wanted, strict=True):
         torch.testing.assert_close(found, asked, rtol=1e-3, atol=1e-5)
     wanted = torch.autograd.grad(config.ppo.value_weight * error, list(critic.parameters()))
@@ -67,7 +64,7 @@ def test_pieces_add_up_to_the_gradient_of_the_whole(nets, batch):
 def test_a_minibatch_is_the_rows_that_were_chosen(nets, batch):
     chosen = torch.randperm(ROWS, generator=torch.Generator().manual_seed(3))[:500]
     of_actor, of_critic, _ = gradients(*nets, [part[chosen] for part in batch])
-    SetLosses(*nets, None, 0.0).backward(batch, chosen)
+    SetLosses(*nets).backward(batch, chosen)
     for net, wanted in zip(nets[1:], (of_actor, of_critic), strict=True):
         assert all(torch.equal(p.grad, grad) for p, grad in zip(net.parameters(), wanted, strict=True))
 

@@ -18,7 +18,6 @@ from uuvtai.kernels.core.geometry import BOX, CYLINDER, FAR_M, NONE
 from uuvtai.kernels.core.noise import episode_key
 from uuvtai.kernels.core.signature import AnyTensor, Bundle, Const, FloatMatrix, FloatVector, IntVector
 from uuvtai.learn import checkpoint, twin_trainer, warm_start
-from uuvtai.learn.anchor import Anchor, gaussian_kl
 from uuvtai.learn.manifest import CheckpointError
 from uuvtai.learn.pilot import load_pilot
 from uuvtai.learn.run import TrainRequest, train
@@ -52,9 +51,7 @@ SMALL = {
     "twin.worlds": ["pool"],
     "train.iterations": 4,
     "twin.warm_start_waves": 0,
-    "twin.anchor": 0.0,
 }
-HELD = SMALL | {"twin.warm_start_waves": 1, "twin.anchor": 0.5, "twin.anchor_until": 1.0}
 
 
 @ti.kernel
@@ -428,22 +425,7 @@ def test_learning_goes_on_from_a_state_bit_for_bit(trainer, config, bank):
     assert theirs["train/std"] >= config.policy.min_std
 
 
-# ------------------------------------------------------------------------------------- warm start and anchor
-
-
-@pytest.fixture
-def held(bank, monkeypatch):
-    """Function: a trainer that is held to an actor that imitates nobody, before its first iteration."""
-
-    def moved(actor, *_):
-        with torch.no_grad():
-            for number, parameter in enumerate(actor.net.parameters()):
-                generator = torch.Generator().manual_seed(number)
-                parameter.add_(0.1 * torch.randn(parameter.shape, generator=generator))
-        return {}
-
-    monkeypatch.setattr(twin_trainer, "imitate", moved)
-    return lambda **changes: TwinTrainer(load_training("twin", overrides=HELD | changes), bank)
+# ------------------------------------------------------------------------------------- warm start
 
 
 def test_a_command_becomes_the_wish_with_its_velocity():
@@ -491,65 +473,10 @@ def test_the_tree_alone_drives_as_without_a_student(small):
     assert len(student.samples) == 2 and len(student.samples[0].wish) == small.N
 
 
-def test_the_divergence_is_that_of_the_distributions():
-    mean, other = torch.randn(50, 3), torch.randn(50, 3)
-    log_std, other_log_std = 0.3 * torch.randn(3), 0.3 * torch.randn(3)
-    ours, theirs = (
-        torch.distributions.Normal(m, s.exp()) for m, s in ((mean, log_std), (other, other_log_std))
-    )
-    expected = torch.distributions.kl_divergence(ours, theirs).sum(-1)
-    assert torch.allclose(gaussian_kl(mean, log_std, other, other_log_std), expected, atol=1e-5)
-    assert torch.allclose(gaussian_kl(mean, log_std, mean, log_std), torch.zeros(50))
-
-
-def test_the_anchor_holds_and_fades(held, config):
-    @torch.no_grad()
-    def gap(actor, other, view):
-        return float((actor(view.bodies, view.own) - other(view.bodies, view.own)).square().mean())
-
-    def moved(weight):
-        trainer = held(**{"twin.anchor": weight, "ppo.rollout_steps": 32})
-        trainer.iterate()
-        return gap(trainer.actor, trainer._anchor.actor, trainer.twin.view)
-
-    assert moved(1e4) < 0.5 * moved(1e-6)
-    anchor = Anchor(SetActor(BODY_WIDTH, EGO_COLUMNS, config, torch.Generator()), 0.4, 0.5)
-    assert [anchor.weight(share) for share in (0.0, 0.25, 0.5, 0.9)] == [0.4, 0.2, 0.0, 0.0]
-
-
-def test_a_saved_training_goes_on_with_its_anchor_bit_for_bit(held, tmp_path):
-    trainer, other = held(), held()
-    trainer.iterate()
-    saved = trainer.state(), trainer.config, trainer.observation_table
-    found = checkpoint.open_checkpoint(checkpoint.save(tmp_path / "checkpoints", 1, *saved))
-    assert list(found.model()) == ["policy"]
-    other.load_state(found.state(like=other.state()))
-    ours, theirs = trainer.iterate(), other.iterate()
-    same = [name for name in ours if not name.startswith("time/")]
-    assert {n: ours[n] for n in same} == {n: theirs[n] for n in same}
-    after, there = trainer.state(), other.state()
-    for part in ("policy", "critic", "anchor"):
-        assert all(torch.equal(tensor, there[part][name]) for name, tensor in after[part].items())
-    assert not torch.equal(after["anchor"]["log_std"], after["policy"]["log_std"])
-
-
-def test_without_an_anchor_none_is_kept(trainer):
-    assert "anchor" not in trainer.state()
-
-
-@pytest.mark.parametrize(
-    ("changes", "says"),
-    [({"twin.anchor": 0.5}, "anchor needs a policy"), ({"twin.anchor_until": 0.0}, "anchor_until")],
-)
-def test_an_anchor_without_a_meaning_is_refused(changes, says):
-    with pytest.raises(UserError, match=says):
-        load_training("twin", overrides=SMALL | changes)
-
-
 def test_what_clearly_pays_is_the_presets():
     twin, quick = load_training("twin").twin, load_training("quick").twin
-    assert twin.warm_start_waves > 0 and twin.anchor > 0
-    assert (quick.warm_start_waves, quick.anchor) == (0, 0), "it learns from nothing"
+    assert twin.warm_start_waves > 0
+    assert quick.warm_start_waves == 0, "it learns from nothing"
 
 
 # ------------------------------------------------------------------------------------------ in the simulator

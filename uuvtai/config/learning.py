@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 from typing import Annotated, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_validator
 
 from uuvtai.config import Config
 from uuvtai.config.section import Count, Fraction, NonNegative, Positive, PositiveCount, Section
@@ -195,16 +195,6 @@ class TwinConfig(Section):
     warm_start_waves: Annotated[int, Field(ge=0, le=1000)] = 0
     """waves of episodes in the simulator in which the policy first learns to imitate the behaviour tree
     (DAgger), world by world and scene by scene; 0 = none"""
-    anchor: NonNegative = 0.0
-    """weight of KL(policy || policy that it began as) in the loss"""
-    anchor_until: Annotated[float, Field(gt=0, le=1)] = 0.3
-    """share of the run over which that weight falls to 0, linearly"""
-
-    @model_validator(mode="after")
-    def _policy_to_hold_to(self):
-        if self.anchor > 0 and not self.warm_start_waves:
-            raise ValueError("anchor needs a policy to hold to: warm_start_waves=6; else anchor=0")
-        return self
 
 
 class TunerConfig(Section):

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import torch
 
 from uuvtai.config.learning import LearningConfig
-from uuvtai.learn.anchor import Anchor
 from uuvtai.learn.bfloat16 import in_bfloat16
 from uuvtai.learn.policy import log_prob
 from uuvtai.learn.ppo import approximate_kl, surrogate_loss
@@ -30,14 +29,10 @@ class Piece(NamedTuple):
 
 
 class SetLosses:
-    """Of one minibatch: clipped surrogate and anchor for the actor, value error for the critic."""
+    """Of one minibatch: clipped surrogate for the actor, value error for the critic."""
 
-    def __init__(
-        self, config: LearningConfig, actor: SetActor, critic: SetCritic, anchor: Anchor | None, held: float
-    ) -> None:
-        """``held``: the anchor's weight now."""
+    def __init__(self, config: LearningConfig, actor: SetActor, critic: SetCritic) -> None:
         self._config, self._actor, self._critic = config, actor, critic
-        self._anchor, self._held = anchor, held
 
     def backward(self, rows: list[torch.Tensor], index: torch.Tensor) -> torch.Tensor:
         """Fill the parameters' gradients; (4,) sums as in ``Piece``.
@@ -66,11 +61,8 @@ class SetLosses:
         with coarse(self._config):
             mean = self._actor(bodies, own)
         log_ratio = log_prob(action, mean.float(), self._actor.log_std) - before
-        policy_loss = loss = surrogate_loss(log_ratio, advantage, clip).sum() / count
-        if self._anchor and self._held > 0:
-            far = self._anchor.divergence(mean.float(), self._actor.log_std, bodies.float(), own)
-            loss = loss + self._held * far.sum() / count
-        gradients = torch.autograd.grad(loss, list(self._actor.parameters()))
+        policy_loss = surrogate_loss(log_ratio, advantage, clip).sum() / count
+        gradients = torch.autograd.grad(policy_loss, list(self._actor.parameters()))
         with torch.no_grad():
             kl = approximate_kl(log_ratio).sum() / count
             clipped = ((log_ratio.exp() - 1.0).abs() > clip).sum() / count

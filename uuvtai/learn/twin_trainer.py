@@ -12,7 +12,6 @@ import torch
 
 from uuvtai.config.learning import LearningConfig
 from uuvtai.errors import SettingError
-from uuvtai.learn.anchor import Anchor
 from uuvtai.learn.bfloat16 import in_bfloat16
 from uuvtai.learn.distributed import Processes
 from uuvtai.learn.optimiser import PlainAdam
@@ -75,7 +74,6 @@ class TwinTrainer:
         self.iteration = self.env_steps = 0
         self._returns = torch.zeros(config.train.num_envs)
         self._held_out: ScenarioBank | None = None
-        self._anchor: Anchor | None = None
         self._allocate(
             config.ppo.rollout_steps,
             config.train.num_envs,
@@ -101,14 +99,7 @@ class TwinTrainer:
         """Learn from the tree first, where ``twin.warm_start_waves`` says so; metrics."""
         if self.iteration > 0 or not self.config.twin.warm_start_waves:
             return {}
-        metrics = imitate(self.actor, self.config, self._scenes)
-        self._set_anchor()
-        return metrics
-
-    def _set_anchor(self) -> None:
-        """Remember the policy as it is."""
-        config = self.config.twin
-        self._anchor = Anchor(self.actor, config.anchor, config.anchor_until) if config.anchor > 0 else None
+        return imitate(self.actor, self.config, self._scenes)
 
     def iterate(self) -> dict[str, float]:
         """A rollout and what is learned from it; metrics by their names in metrics.jsonl."""
@@ -236,11 +227,8 @@ class TwinTrainer:
         """One step of both networks by the samples of ``index``; (policy loss, value loss, KL, share
         clipped)."""
         config = self.config.ppo
-        share = self.iteration / self.config.train.iterations
-        held = self._anchor.weight(share) if self._anchor else 0.0
         self.optimiser.zero_grad(set_to_none=True)
-        losses = SetLosses(self.config, self.actor, self.critic, self._anchor, held)
-        sums = losses.backward(rows, index)
+        sums = SetLosses(self.config, self.actor, self.critic).backward(rows, index)
         torch.nn.utils.clip_grad_norm_(self.actor.parameters(), config.max_grad_norm)
         torch.nn.utils.clip_grad_norm_(self.critic.parameters(), config.max_grad_norm)
         self.optimiser.step()
@@ -283,7 +271,7 @@ class TwinTrainer:
             "returns": self._returns.clone(),
             "counters": {"iteration": self.iteration, "env_steps": self.env_steps},
             "env": self.twin.capture(),
-        } | ({"anchor": _copied(self._anchor.actor)} if self._anchor else {})
+        }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Go on from what ``state`` gave."""
@@ -296,9 +284,6 @@ class TwinTrainer:
         self._returns.copy_(state["returns"])
         self.iteration, self.env_steps = (int(state["counters"][n]) for n in ("iteration", "env_steps"))
         self.twin.restore(state["env"])
-        self._set_anchor()
-        if self._anchor and "anchor" in state:
-            self._anchor.actor.load_state_dict(state["anchor"])
 
 
 def _copied(net: torch.nn.Module) -> dict[str, torch.Tensor]:
