@@ -7,7 +7,6 @@ import torch
 
 from uuvtai.config.learning import PolicyConfig, PpoConfig
 from uuvtai.learn import ppo as ppo_module
-from uuvtai.learn.normalise import combined
 from uuvtai.learn.policy import ActorCritic, log_prob
 from uuvtai.learn.ppo import Ppo, adapted_rate, approximate_kl, gae, surrogate_loss, value_loss
 from uuvtai.learn.rollout import Rollout, final_value
@@ -129,13 +128,8 @@ def make_policy(seed=0, **config):
     )
 
 
-def make_ppo(seed=0, reduce=None, gather=None, **config):
-    return Ppo(
-        make_policy(seed),
-        PpoConfig(**{"rollout_steps": T, "epochs": 2, "minibatches": 4, **config}),
-        reduce,
-        gather,
-    )
+def make_ppo(seed=0, **config):
+    return Ppo(make_policy(seed), PpoConfig(**{"rollout_steps": T, "epochs": 2, "minibatches": 4, **config}))
 
 
 def fill(rollout, policy, seed=0):
@@ -418,14 +412,13 @@ def test_a_rollout_of_nothing_but_nan_leaves_a_finite_policy():
 
 
 def test_a_gradient_that_is_not_finite_is_skipped_and_counted():
-    calls = []
+    calls, ppo = [], make_ppo(epochs=1)
 
-    def poison(tensors):
-        calls.append(len(tensors))
-        if len(calls) in (2, 3):
-            tensors[0].fill_(math.nan)
+    def poisoned(gradient):
+        calls.append(gradient)
+        return torch.full_like(gradient, math.nan) if len(calls) in (2, 3) else gradient
 
-    ppo = make_ppo(reduce=poison, epochs=1)
+    ppo.policy.log_std.register_hook(poisoned)
     rollout = fill(Rollout(T, N, N_IN), ppo.policy)
     metrics = ppo.update(rollout)
     assert metrics["train/skipped_updates"] == 2
@@ -452,42 +445,6 @@ def test_what_cannot_be_learned_from_is_refused():
         ppo.update(rollout)
     with pytest.raises(ValueError, match="generator"):
         make_ppo(shuffle=True).update(rollout)
-
-
-# ------------------------------------------------------------------------------------------ several processes
-
-
-def test_every_gradient_and_the_divergence_pass_through_the_hook():
-    seen = []
-    plain, hooked = (
-        make_ppo(),
-        make_ppo(reduce=lambda tensors: seen.append([t.shape for t in tensors]), gather=lambda own: own),
-    )
-    for ppo in (plain, hooked):
-        ppo.update(fill(Rollout(T, N, N_IN), ppo.policy))
-    assert torch.equal(weights(plain.policy), weights(hooked.policy))
-    shapes = [p.shape for p in hooked.policy.parameters()]
-    assert seen == [[*shapes, torch.Size([])]] * 8
-
-
-def test_the_hook_decides_what_is_stepped_along():
-    """Gradients are averaged before their norm is cut: a hook that zeroes them leaves the weights as they
-    are."""
-    ppo = make_ppo(reduce=lambda tensors: [t.zero_() for t in tensors], normalise_values=False)
-    before = weights(ppo.policy)
-    ppo.update(fill(Rollout(T, N, N_IN), ppo.policy))
-    assert ppo.updates == 8
-    assert torch.equal(weights(ppo.policy), before)
-
-
-def test_statistics_are_those_of_all_processes():
-    ppo = make_ppo(gather=lambda own: combined(own, own))
-    rollout = fill(Rollout(T, N, N_IN), ppo.policy)
-    ppo.observe(rollout.x)
-    assert float(ppo.policy.observation_norm.count) == 2 * T * N
-    ppo.update(rollout)
-    assert float(ppo.policy.observation_norm.count) == 4 * T * N
-    assert float(ppo.policy.value_norm.count) == 2 * T * N
 
 
 # ----------------------------------------------------------------------------------------------------- a task

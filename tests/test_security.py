@@ -191,7 +191,6 @@ OPENS = {
 PARSES = {"json.load", "json.loads", "np.load", "io.open", "os.open", "open", "torch.load"}
 OWN_JSON = {
     "capture.py",
-    "learn/distributed.py",
     "measure/sweep/plan.py",
     "native/reads.py",
 }

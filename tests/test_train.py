@@ -1,5 +1,5 @@
-"""The trainer: learns, goes on bit for bit from its state, neither spreads nor hides what is not finite, and
-is one with two processes."""
+"""The trainer: learns, goes on bit for bit from its state, and neither spreads nor hides what is not
+finite."""
 
 import math
 from pathlib import Path
@@ -8,9 +8,7 @@ import pytest
 import torch
 
 from tests.point_env import PointEnv
-from tests.test_distributed import two
 from uuvtai.config.learning import LearningConfig
-from uuvtai.learn.distributed import Processes
 from uuvtai.learn.guard import Guard, TrainingError
 from uuvtai.learn.packing import pack
 from uuvtai.learn.train import Trainer
@@ -208,73 +206,3 @@ def test_what_is_sound_clears_what_was_there():
     assert bad.tolist() == [True, False] and out.tolist() == [[1.0, 7.0], [2.0, 3.0]]
     assert guard.observation(torch.ones(2, 2), fill, out).tolist() == [False, False]
     assert out.tolist() == [[1.0, 1.0], [1.0, 1.0]] and guard.take() == {"non_finite/range": 1.0}
-
-
-# -------------------------------------------------------------------------------------------------- processes
-
-WHOLE = 16
-"""envs of the one process, half of them in each of the two"""
-
-
-class Part(PointEnv):
-    """Rows ``first``, ``first`` + 1, ... of the whole: the same scenarios, whatever seed the trainer asks
-    for."""
-
-    def __init__(self, first, num_envs):
-        super().__init__(num_envs)
-        self.first = first
-
-    def reset(self, seed=None):
-        _obs, info = super().reset(0)
-        self._episode += self.first
-        self._begin(torch.ones(self.num_envs, dtype=torch.bool))
-        return self._obs(), info | self._tell(info["outcome"], info["reward_terms"])
-
-    def _begin(self, rows, ahead=0):
-        super()._begin(rows, WHOLE if ahead else 0)
-
-
-def trained(first, num_envs, processes):
-    """Parameters and statistics after two iterations of these rows. Teacher batches and world model draw rows
-    at random: left out."""
-    config = config_of(
-        ppo={"rollout_steps": 16, "minibatches": 1}, distill={"steps": 0}, world_model={"enabled": False}
-    )
-    trainer = Trainer(Part(first, num_envs), config, processes)
-    trainer.generator.manual_seed(5)
-    act = trainer.policy.act
-
-    def act_as_part_of_the_whole(x, generator):
-        everyone = torch.zeros(WHOLE, x.shape[1])
-        everyone[first : first + num_envs] = x
-        step = act(everyone, generator)
-        return type(step)(*(tensor[first : first + num_envs] for tensor in step))
-
-    trainer.policy.act = act_as_part_of_the_whole
-    metrics = [trainer.iterate() for _ in range(2)][-1]
-    return {name: tensor.tolist() for name, tensor in trainer.policy.state_dict().items()}, comparable(
-        metrics
-    )
-
-
-def half(processes):
-    return trained(processes.rank * WHOLE // 2, WHOLE // 2, processes)
-
-
-def test_two_processes_train_one_policy_the_same_as_one_process_with_all_envs():
-    (first, metrics), (second, others) = two(half)
-    assert first == second, "parameters are identical on both ranks"
-    assert metrics == others
-    whole, expected = trained(0, WHOLE, Processes())
-    for name, values in whole.items():
-        assert torch.allclose(
-            torch.tensor(first[name]), torch.tensor(values), rtol=SUMMED_APART, atol=SUMMED_APART
-        ), name
-    for name in (
-        "rollout/episodes",
-        "rollout/ep_rew_mean",
-        "reward/progress",
-        "time/env_steps",
-        "distill/loss",
-    ):
-        assert metrics[name] == pytest.approx(expected[name], rel=SUMMED_APART), name

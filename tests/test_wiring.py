@@ -2,14 +2,12 @@
 sees them, samples, labels."""
 
 import copy
-from dataclasses import dataclass, field
 
 import pytest
 import torch
 
 from tests.scripted_env import JUMP, N_TARGET, ScriptedEnv
 from tests.test_train import config_of
-from uuvtai.learn.distributed import Processes
 from uuvtai.learn.train import Trainer
 
 STEPS, ITERATIONS = 16, 8
@@ -27,16 +25,16 @@ SCRIPT = [
 """of five envs; the tree's rollout are steps 1 to 16, the policy's first 17 to 32, its second 33 to 48"""
 
 
-@dataclass(frozen=True)
-class Watched(Processes):
-    """One process that writes down every list of gradients on its way to an optimiser."""
+def watch_gradients(ppo):
+    """A dict that has the gradients of its newest step by parameter, before their norm is cut."""
+    seen, step = {}, ppo._step
 
-    seen: list = field(default_factory=list)
+    def watched(*arguments):
+        seen.update({name: p.grad.clone() for name, p in ppo.policy.named_parameters()})
+        step(*arguments)
 
-    def average(self, tensors):
-        tensors = list(tensors)
-        self.seen.append([tensor.clone() for tensor in tensors])
-        super().average(tensors)
+    ppo._step = watched
+    return seen
 
 
 def trainer_of(script=SCRIPT, **sections):
@@ -56,7 +54,8 @@ def trainer_of(script=SCRIPT, **sections):
     }
     env = ScriptedEnv(script)
     merged = {name: own.get(name, {}) | sections.get(name, {}) for name in {**own, **sections}}
-    trainer = Trainer(env, config_of(**merged), Watched())
+    trainer = Trainer(env, config_of(**merged))
+    trainer.seen = watch_gradients(trainer.ppo)
     with torch.no_grad():  # or the residual and the uncertainty would both be near one
         trainer.world_model.decoder[-1].bias[N_TARGET:] += 1.0
         trainer.policy.critic[-1].weight.mul_(3.0)
@@ -115,21 +114,14 @@ def gradients(policy, rollout, distilled):
 def seen_by_the_optimiser(trainer):
     """The same gradients as they came to PPO's optimiser in the newest iteration, before their norm is
     cut."""
-    names = [name for name, _ in trainer.policy.named_parameters()]
-    (lists,) = [
-        tensors for tensors in trainer.processes.seen if len(tensors) == len(names) + 1
-    ]  # the divergence comes last
-    of = dict(zip(names, lists, strict=False))
-    return torch.cat(
-        [of["log_std"], *(tensor.flatten() for name, tensor in of.items() if name.startswith("actor."))]
-    )
+    of_actor = (tensor.flatten() for name, tensor in trainer.seen.items() if name.startswith("actor."))
+    return torch.cat([trainer.seen["log_std"], *of_actor])
 
 
 def learned_once(trainer, env):
     """(policy, world model, moments) that the second iteration began with and met."""
     trainer.iterate()
     before = copy.deepcopy(trainer.policy), copy.deepcopy(trainer.world_model)
-    trainer.processes.seen.clear()
     trainer.iterate()
     return *before, env.log[-STEPS:]
 

@@ -11,7 +11,7 @@ from scipy import stats
 
 from tests.reference import world_model as reference
 from uuvtai.config.learning import UncertaintyConfig, WorldModelConfig
-from uuvtai.learn.normalise import Moments, moments_of
+from uuvtai.learn.normalise import moments_of
 from uuvtai.learn.uncertainty import Uncertainty
 from uuvtai.learn.world_model import (
     LOG_VAR_BOUNDS,
@@ -299,24 +299,6 @@ def test_features_of_nan_are_zero():
     next_obs[0, 3] = math.nan
     found = model.features(obs, action, next_obs)
     assert found[0, 0] == 0.0 and found[1, 0] > 0.0
-
-
-def test_processes_share_gradients_and_statistics():
-    """Gradients set to zero by the reduction move nothing; moments doubled by the union count double."""
-
-    def to_zero(gradients):
-        for gradient in gradients:
-            gradient.zero_()
-
-    draws = generator()
-    model = WorldModel(N_OBS, SMALL, draws)
-    before = parameters(model).clone()
-    learner = WorldModelLearner(model, SMALL, to_zero, lambda m: Moments(m.mean, 2 * m.m2, 2 * m.count))
-    learner.update(*transitions(), draws)
-    assert torch.equal(parameters(model), before)
-    assert (
-        model.observation_norm.count.item() == model.change_norm.count.item() == 2 * SMALL.steps * SMALL.batch
-    )
 
 
 def test_too_narrow_an_observation_is_refused():

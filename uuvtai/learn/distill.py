@@ -9,7 +9,7 @@ batches lambda_t scales the learning rate instead.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
@@ -22,9 +22,6 @@ from uuvtai.learn.optimiser import PlainAdam
 MAX_WEIGHT_RATIO = 4.0
 """a sample counts at most this many times the mean signal, and at least its inverse, before the weights' mean
 is made one"""
-
-Reduce = Callable[[list[torch.Tensor]], None]
-"""average tensors over the processes, in place"""
 
 
 def imitation_error(mean: torch.Tensor, teacher_action: torch.Tensor) -> torch.Tensor:
@@ -73,10 +70,9 @@ def weights_of(kind: Weighting, uncertainty: torch.Tensor) -> torch.Tensor:
 class TeacherBatches:
     """Gradient steps on batches of (input, teacher action) beside those of PPO."""
 
-    def __init__(self, policy: nn.Module, config: DistillConfig, reduce: Reduce | None = None) -> None:
-        """``policy.distribution(x)`` gives the means; ``reduce`` averages the gradients over the
-        processes."""
-        self.policy, self.config, self.reduce = policy, config, reduce
+    def __init__(self, policy: nn.Module, config: DistillConfig) -> None:
+        """``policy.distribution(x)`` gives the means."""
+        self.policy, self.config = policy, config
         self.optimiser = PlainAdam(policy.parameters(), lr=config.learning_rate)
         self.skipped = 0
         """steps left out because the gradient was not finite"""
@@ -109,8 +105,6 @@ class TeacherBatches:
         mean = self.policy.distribution(x)[0]  # type: ignore[operator]
         distillation_loss(mean, teacher_action, weight).backward()
         gradients = [p.grad for p in self.policy.parameters() if p.grad is not None]
-        if self.reduce is not None:
-            self.reduce(gradients)
         if bool(torch.isfinite(torch.nn.utils.get_total_norm(gradients))):
             self.optimiser.step()
         else:

@@ -15,7 +15,6 @@ import torch
 from uuvtai.config.learning import LearningConfig
 from uuvtai.errors import SettingError
 from uuvtai.forecast_codes import COLUMNS, N_COLUMN
-from uuvtai.learn.distributed import Processes
 from uuvtai.learn.forecast_scores import scores_of
 from uuvtai.learn.mixture_net import TIMES_S, MixtureNet, mirrored, negative_log_likelihood
 from uuvtai.learn.optimiser import PlainAdam
@@ -46,7 +45,7 @@ class ForecastTrainer:
             raise SettingError(
                 "forecast.learned: a forecast is learnt beside the one by arcs and habits; leave it empty"
             )
-        self.config, self.processes = config, Processes()
+        self.config = config
         self.observation_table = (column_row(),)
         torch.set_flush_denormal(True)
         self.generator = torch.Generator().manual_seed(config.train.seed)

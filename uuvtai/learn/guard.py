@@ -4,7 +4,7 @@ iteration after iteration an error."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 
@@ -103,23 +103,12 @@ class Guard:
         )
 
 
-def guarded_step(
-    loss: torch.Tensor,
-    module: torch.nn.Module,
-    optimiser: torch.optim.Optimizer,
-    reduce: Callable[[list[torch.Tensor]], None] | None,
-) -> bool:
+def guarded_step(loss: torch.Tensor, module: torch.nn.Module, optimiser: torch.optim.Optimizer) -> bool:
     """One gradient step on ``loss`` (a scalar); False where the gradient is zero or not finite, and nothing
-    was changed.
-
-    ``reduce`` unites the gradients of several processes; it comes before the judgement, so that all of them
-    decide alike.
-    """
+    was changed."""
     optimiser.zero_grad(set_to_none=True)
     loss.backward()
     gradients = [p.grad for p in module.parameters() if p.grad is not None]
-    if reduce is not None:
-        reduce(gradients)
     sound = 0.0 < float(torch.nn.utils.get_total_norm(gradients)) < math.inf
     if sound:
         optimiser.step()

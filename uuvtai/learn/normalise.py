@@ -81,7 +81,7 @@ class RunningNorm(nn.Module):
         self.merge(moments_of(x))
 
     def merge(self, moments: Moments) -> None:
-        """Add samples whose moments are known, for example those of all processes together."""
+        """Add samples whose moments are known."""
         united = combined(self.moments, moments)
         self.mean.copy_(united.mean)
         self.m2.copy_(united.m2)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,14 +19,11 @@ from torch import nn
 from uuvtai.config.learning import PpoConfig
 from uuvtai.errors import SettingError
 from uuvtai.learn.bfloat16 import in_bfloat16
-from uuvtai.learn.distill import Reduce, imitation_error
-from uuvtai.learn.normalise import Moments, moments_of
+from uuvtai.learn.distill import imitation_error
+from uuvtai.learn.normalise import moments_of
 from uuvtai.learn.optimiser import PlainAdam
 from uuvtai.learn.policy import ActorCritic, entropy, log_prob
 from uuvtai.learn.rollout import Rollout
-
-Gather = Callable[[Moments], Moments]
-"""moments of the samples of all processes"""
 
 ADAM_EPS = 1e-5
 """as in most PPO implementations (Huang et al. 2022, detail 3)"""
@@ -125,16 +122,8 @@ _SUMS = ("policy_loss", "value_loss", "approx_kl", "clip_fraction", "distill", "
 class Ppo:
     """Adam on the clipped surrogate, the value error, the entropy and the distillation term of one policy."""
 
-    def __init__(
-        self,
-        policy: ActorCritic,
-        config: PpoConfig,
-        reduce: Reduce | None = None,
-        gather: Gather | None = None,
-    ) -> None:
-        """``reduce`` averages gradients over the processes in place, between backward and step; ``gather``
-        unites their moments."""
-        self.policy, self.config, self.reduce, self.gather = policy, config, reduce, gather
+    def __init__(self, policy: ActorCritic, config: PpoConfig) -> None:
+        self.policy, self.config = policy, config
         device = policy.log_std.device
         self.rate = torch.tensor(config.learning_rate, device=device)
         self.optimiser = PlainAdam(policy.parameters(), lr=self.rate, eps=ADAM_EPS, fused=True)
@@ -176,7 +165,7 @@ class Ppo:
     def observe(self, x: torch.Tensor) -> None:
         """Take inputs x (..., n_in) into the normaliser's statistics; before the first rollout, so that it
         does not begin unscaled."""
-        self.policy.observation_norm.merge(self._gathered(moments_of(x)))
+        self.policy.observation_norm.merge(moments_of(x))
 
     def state_dict(self) -> dict[str, Any]:
         """Adam's moments, the learning rate and the counters."""
@@ -218,7 +207,7 @@ class Ppo:
             "train/invalid_samples": float(valid.numel() - len(kept)),
         }
         if self.config.normalise_values:
-            self.policy.learn_returns(self._gathered(moments_of(kept[:, None])))
+            self.policy.learn_returns(moments_of(kept[:, None]))
         norm = self.policy.value_norm
         flat_valid = valid.flatten()
         zero_where_invalid = {
@@ -231,9 +220,7 @@ class Ppo:
         return Minibatch(
             normalised=self._normalise(rollout.flat("x")),
             prior=flat_valid.new_empty(len(flat_valid), 0) if prior is None else prior,
-            advantage=_standardised(
-                advantage, valid, self._gathered(moments_of(advantage[valid][:, None]))
-            ).flatten(),
+            advantage=_standardised(advantage, valid).flatten(),
             target=norm(returns.flatten()),
             value=norm(value.flatten()),
             valid=flat_valid.float(),
@@ -244,9 +231,6 @@ class Ppo:
         if self._normalised.shape != x.shape:
             self._normalised = torch.empty_like(x)
         return self.policy.observation_norm(x, out=self._normalised)
-
-    def _gathered(self, moments: Moments) -> Moments:
-        return moments if self.gather is None else self.gather(moments)
 
     def _minibatches(self, batch: Minibatch, generator: torch.Generator | None) -> Iterator[Minibatch]:
         """Blocks of neighbouring rows (all envs in a span of steps) as views, or random ones as copies."""
@@ -326,11 +310,8 @@ class Ppo:
         return loss
 
     def _step(self, kl: torch.Tensor, surrogate: bool) -> None:
-        """Unite the processes, adapt the rate, cut the gradient's norm, step; or skip all of it where the
-        gradient is not finite."""
+        """Adapt the rate, cut the gradient's norm, step; or nothing where the gradient is not finite."""
         parameters = [p for p in self.policy.parameters() if p.grad is not None]
-        if self.reduce is not None:
-            self.reduce([*(p.grad for p in parameters if p.grad is not None), kl])
         norm = torch.nn.utils.clip_grad_norm_(parameters, self.config.max_grad_norm)
         if not math.isfinite(float(norm)):
             self.skipped += 1
@@ -377,8 +358,9 @@ def _valid(rollout: Rollout) -> torch.Tensor:
     return torch.isfinite(total)
 
 
-def _standardised(advantage: torch.Tensor, valid: torch.Tensor, moments: Moments) -> torch.Tensor:
-    """Mean 0, deviation 1 by the moments of the valid samples (of all processes); the others become 0."""
+def _standardised(advantage: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
+    """Mean 0, deviation 1 by the moments of the valid samples; the others become 0."""
+    moments = moments_of(advantage[valid][:, None])
     std = (moments.m2 / moments.count.clamp(min=1.0)).sqrt()
     return torch.where(valid, (advantage - moments.mean.float()) / (std.float() + 1e-8), 0.0)
 

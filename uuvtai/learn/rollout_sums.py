@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 
@@ -37,10 +37,6 @@ class RolloutSums:
                 for size in ((n_outcome,), (), (), (n_term,), ())
             )
         )
-
-    def tensors(self) -> list[torch.Tensor]:
-        """All of them, to be added up over the processes."""
-        return [getattr(self, f.name) for f in fields(self)]
 
 
 class Recent:

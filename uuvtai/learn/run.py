@@ -3,7 +3,6 @@ how it all ends."""
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -85,19 +84,15 @@ def train(request: TrainRequest, watch: TrainWatch, evaluate: Evaluate) -> tuple
     ``train.evaluate_every`` iterations ``evaluate`` is asked.
 
     Everything that can be refused is refused before anything is written. An interrupt (SIGINT, SIGTERM) lets
-    the iteration end, saves and raises KeyboardInterrupt; a second one ends at once. Under torchrun rank 0
-    writes. Raises ConfigError, ValueError, MemoryError, RunFolderError, CheckpointError, TrainingError.
+    the iteration end, saves and raises KeyboardInterrupt; a second one ends at once. Raises ConfigError,
+    ValueError, MemoryError, RunFolderError, CheckpointError, TrainingError.
     """
-    from uuvtai.learn.distributed import is_writer
-
     if request.iterations is not None and request.iterations < 1:
         raise ConfigError(f"--iterations {request.iterations}: at least 1, for example --iterations 100")
     if request.resume is None:
         refuse_place(request.run_dir)
         return _train(request, None, watch, evaluate)
     _refuse_no_run(request.resume)
-    if not is_writer():
-        return _train(request, None, watch, evaluate)
     held = RunFolder.held(
         request.resume, "uuv train"
     )  # before anything is read: what another process writes meanwhile must not count
@@ -110,9 +105,8 @@ def train(request: TrainRequest, watch: TrainWatch, evaluate: Evaluate) -> tuple
 def _train(
     request: TrainRequest, folder: RunFolder | None, watch: TrainWatch, evaluate: Evaluate
 ) -> tuple[dict[str, Any], Path]:
-    """As ``train``; ``folder`` is the folder of the run to go on with, where this process writes."""
+    """As ``train``; ``folder`` is the folder of the run to go on with."""
     from uuvtai.learn.bfloat16 import in_bfloat16
-    from uuvtai.learn.distributed import claim_gpu
 
     found, config = _begin(request, watch)
     total = request.iterations or config.train.iterations
@@ -121,7 +115,6 @@ def _train(
             f"{request.resume}: has done {found.step} of {total} iterations; to go on give more: "
             f"--iterations {2 * found.step}"
         )
-    claim_gpu()
     watch.note(
         f"starting {config.train.num_envs} envs (sizes not used before compile their kernels first, about "
         "half a minute)"
@@ -144,7 +137,7 @@ def _train(
     device = env.device.type if env else "cpu"
     if config.ppo.bfloat16 and not in_bfloat16(config.ppo, device):
         watch.note("ppo.bfloat16: this CPU has no instructions for it (or torch is too old to tell): float32")
-    place = _folder(request, config, found, folder) if trainer.processes.writes else None
+    place = _folder(request, config, found, folder)
     run = _Run(trainer, config, place, watch, evaluate, total)
     status, code = "failed", 1
     try:
@@ -156,12 +149,10 @@ def _train(
         raise
     finally:
         run.close()
-        trainer.processes.close()
-        if place:
-            place.finish(status, code)
+        place.finish(status, code)
     if code:
         raise KeyboardInterrupt
-    return run.document(), place.path if place else Path()
+    return run.document(), place.path
 
 
 def _begin(request: TrainRequest, watch: TrainWatch) -> tuple[Checkpoint | None, LearningConfig]:
@@ -196,19 +187,13 @@ def _env(config: LearningConfig, device: str) -> VectorEnv:
 
 def _trainer(env: VectorEnv, config: LearningConfig, checkpoint: Checkpoint | None) -> Trainer:
     """A trainer that stands where the checkpoint does, or at the beginning."""
-    from uuvtai.learn.distributed import join_processes
     from uuvtai.learn.train import Trainer
 
     if checkpoint:
         checkpoint.check_table(env.observation_table, config)
-    trainer = Trainer(env, config, join_processes(env.device))
+    trainer = Trainer(env, config)
     if checkpoint:
-        own = trainer.state()
-        state = checkpoint.state(like=own)
-        if not trainer.processes.writes:
-            # the checkpoint holds rank 0's envs; other ranks begin new episodes
-            state |= {name: own[name] for name in ("env", "generator", "collector")}
-        trainer.load_state(state)
+        trainer.load_state(checkpoint.state(like=trainer.state()))
     return trainer
 
 
@@ -224,7 +209,7 @@ def _twin_trainer(config: LearningConfig, checkpoint: Checkpoint | None, device:
     """As ``_trainer``, in the kinematic twin."""
     from uuvtai.learn.twin_trainer import TwinTrainer
 
-    _refuse_many("twin.enabled: the twin trains", device)
+    _refuse_cuda("twin.enabled: the twin trains", device)
     return _continued(TwinTrainer(config), config, checkpoint)
 
 
@@ -232,7 +217,7 @@ def _tuner_trainer(config: LearningConfig, checkpoint: Checkpoint | None, device
     """As ``_trainer``, of the tree's numbers."""
     from uuvtai.learn.tuner_trainer import TunerTrainer
 
-    _refuse_many("tuner.enabled: it searches", device)
+    _refuse_cuda("tuner.enabled: it searches", device)
     return _continued(TunerTrainer(config), config, checkpoint)
 
 
@@ -240,13 +225,13 @@ def _forecast_trainer(config: LearningConfig, checkpoint: Checkpoint | None, dev
     """As ``_trainer``, of what moving bodies will do."""
     from uuvtai.learn.forecast_trainer import ForecastTrainer
 
-    _refuse_many("forecaster.enabled: it learns", device)
+    _refuse_cuda("forecaster.enabled: it learns", device)
     return _continued(ForecastTrainer(config), config, checkpoint)
 
 
-def _refuse_many(what: str, device: str) -> None:
-    if device == "cuda" or os.environ.get("WORLD_SIZE", "1") != "1":
-        raise ConfigError(f"{what} in one process on the CPU; leave out --device cuda and torchrun")
+def _refuse_cuda(what: str, device: str) -> None:
+    if device == "cuda":
+        raise ConfigError(f"{what} on the CPU; leave out --device cuda")
 
 
 def _folder(
@@ -261,14 +246,13 @@ def _folder(
 
 
 class _Run:
-    """The iterations of a run, and what is written about them. ``folder`` is None in processes that do not
-    write."""
+    """The iterations of a run, and what is written about them."""
 
     def __init__(
         self,
         trainer: AnyTrainer,
         config: LearningConfig,
-        folder: RunFolder | None,
+        folder: RunFolder,
         watch: TrainWatch,
         evaluate: Evaluate,
         total: int,
@@ -277,11 +261,10 @@ class _Run:
 
         self._trainer, self._config, self._folder = trainer, config, folder
         self._watch, self._evaluate, self._total = watch, evaluate, total
-        self._recorder = MetricsRecorder(folder.path, trainer.iteration) if folder else None
+        self._recorder = MetricsRecorder(folder.path, trainer.iteration)
         self._metrics: Metrics = {}
         self._saved = trainer.iteration if trainer.iteration else None
-        if folder:
-            watch.start(folder.path, config, trainer.iteration, total)
+        watch.start(folder.path, config, trainer.iteration, total)
 
     def go(self, pressed: threading.Event) -> bool:
         """Iterate to the end, or until somebody presses Ctrl-C: then save and return False."""
@@ -289,12 +272,11 @@ class _Run:
         while trainer.iteration < self._total and not is_stopped:
             self._metrics = trainer.iterate()
             # an interrupt that something has swallowed within the iteration was received all the same
-            is_stopped = trainer.processes.any(pressed.is_set() or signals.was_received())
-            if self._folder:
-                self._note_iteration(self._folder, is_stopped)
-        if self._folder and self._saved != trainer.iteration:
+            is_stopped = pressed.is_set() or signals.was_received()
+            self._note_iteration(self._folder, is_stopped)
+        if self._saved != trainer.iteration:
             self._save(self._folder)
-        if self._folder and is_stopped:
+        if is_stopped:
             self._watch.note(f"saved; go on with: uuv train --resume {self._folder.path}")
         return not is_stopped
 
@@ -304,7 +286,7 @@ class _Run:
 
         return {
             "schema": 1,
-            "run": str(self._folder.path) if self._folder else None,
+            "run": str(self._folder.path),
             "iterations": self._trainer.iteration,
             "env_steps": self._trainer.env_steps,
             "metrics": finite(self._metrics),
@@ -313,16 +295,14 @@ class _Run:
     def close(self) -> None:
         """Give everything back."""
         self._watch.stop()
-        if self._recorder:
-            self._recorder.close()
+        self._recorder.close()
 
     def _note_iteration(self, folder: RunFolder, is_stopped: bool) -> None:
         done, train = self._trainer.iteration, self._config.train
         is_evaluated = not is_stopped and train.evaluate_every > 0 and done % train.evaluate_every == 0
         if is_evaluated:
             self._metrics |= self._evaluate(self._trainer, self._config)
-        if self._recorder:
-            self._recorder.write(done, self._metrics)
+        self._recorder.write(done, self._metrics)
         self._watch.update(done, self._metrics, self._success_interval())
         if is_evaluated or done % train.checkpoint_every == 0:
             self._save(folder)

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -13,9 +12,7 @@ import torch
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learn.collect import N_FEATURES, Collector
 from uuvtai.learn.distill import TeacherBatches, check_weighting, weights_of
-from uuvtai.learn.distributed import Processes
 from uuvtai.learn.guard import PREFIX, Guard
-from uuvtai.learn.normalise import Moments, combined
 from uuvtai.learn.policy import ActorCritic
 from uuvtai.learn.ppo import Ppo
 from uuvtai.learn.rollout import Rollout
@@ -38,11 +35,10 @@ class Trainer:
     CPU, bit for bit.
     """
 
-    def __init__(self, env: VectorEnv, config: LearningConfig, processes: Processes | None = None) -> None:
-        """Resets ``env`` to this process's scenarios. ValueError for settings that do not fit each other."""
+    def __init__(self, env: VectorEnv, config: LearningConfig) -> None:
+        """Resets ``env``. ValueError for settings that do not fit each other."""
         check_weighting(config.distill.weighting, config.world_model.enabled)
         self.env, self.config, self.observation_table = env, config, env.observation_table
-        self.processes = processes or Processes(device=env.device)
         self.generator = torch.Generator().manual_seed(config.train.seed)
         n_in, device = env.num_obs + N_FEATURES, env.device
         self.policy = ActorCritic(n_in, config.policy, _columns(env, TEACHER_COLUMN), self.generator).to(
@@ -53,23 +49,19 @@ class Trainer:
         self.guard = Guard(
             [(c.name, c.slice) for c in env.observation_table], env.num_envs, config.train.patience, device
         )
-        self.ppo = Ppo(self.policy, config.ppo, self._reduce, self._united)
-        self.teacher_batches = TeacherBatches(self.policy, config.distill, self._reduce)
+        self.ppo = Ppo(self.policy, config.ppo)
+        self.teacher_batches = TeacherBatches(self.policy, config.distill)
         world = config.world_model
         self.world_model = (
             WorldModel(env.num_obs, world, self.generator).to(device) if world.enabled else None
         )
-        self.world_learner = self.world_model and WorldModelLearner(
-            self.world_model, world, self._reduce, self._united
-        )
+        self.world_learner = self.world_model and WorldModelLearner(self.world_model, world)
         self.collector = Collector(
             env, self.policy, self.world_model, self.rollout, self.guard, self.generator, world.as_features
         )
         self.recent = Recent(env.outcomes, env.reward_terms)
         self.iteration = self.env_steps = 0
-        if self.processes.rank:  # equal networks, different exploration
-            self.generator.manual_seed(self.processes.seed(config.train.seed))
-        self.collector.begin(*env.reset(self.processes.seed(config.train.seed)))
+        self.collector.begin(*env.reset(config.train.seed))
 
     def iterate(self) -> dict[str, float]:
         """One iteration; its metrics by their names in metrics.jsonl.
@@ -87,10 +79,7 @@ class Trainer:
         learn_s = time.perf_counter() - began
         self.iteration += 1
         self.env_steps += self._samples
-        self.processes.total(sums.tensors())
-        metrics = self.processes.mean_metrics(
-            metrics | self.guard.take() | self._times(learn_s)
-        ) | self.recent.add(sums)
+        metrics |= self.guard.take() | self._times(learn_s) | self.recent.add(sums)
         self._judge(metrics)
         return metrics | {"time/env_steps": float(self.env_steps)}
 
@@ -169,10 +158,8 @@ class Trainer:
         return self.world_learner.update(obs[:-1], self.rollout.action[:-1], obs[1:], self.generator, valid)
 
     def _strength(self, share: float) -> tuple[float, dict[str, float]]:
-        """lambda_t s_t, and both for the log. All processes scale by the mean of their uncertainties, or
-        their steps would differ."""
+        """lambda_t s_t, and both for the log."""
         mean = self.collector.uncertainty.nanmean().nan_to_num()[None]
-        self.processes.average([mean])
         self.uncertainty.update(mean)
         weight, scale = piecewise_linear(self.config.distill.schedule, share), self.uncertainty.scale
         return weight * scale, {
@@ -207,22 +194,8 @@ class Trainer:
 
     @property
     def _samples(self) -> int:
-        """Env-steps of one rollout, all processes together."""
-        return self.rollout.steps * self.collector.hold.steps * self.env.num_envs * self.processes.size
-
-    def _reduce(self, tensors: Iterable[torch.Tensor]) -> None:
-        self.processes.average(tensors)
-
-    def _united(self, moments: Moments) -> Moments:
-        """Moments of all processes' samples, merged in the order of ranks so that every process gets the same
-        bits."""
-        width = len(moments.mean)
-        rows = self.processes.gather(torch.cat([moments.mean, moments.m2, moments.count[None]]))
-        parts = [Moments(row[:width], row[width:-1], row[-1]) for row in rows]
-        united = parts[0]
-        for part in parts[1:]:
-            united = combined(united, part)
-        return united
+        """Env-steps of one rollout."""
+        return self.rollout.steps * self.collector.hold.steps * self.env.num_envs
 
 
 def _columns(env: VectorEnv, name: str) -> slice | None:

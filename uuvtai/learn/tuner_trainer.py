@@ -15,7 +15,6 @@ import numpy as np
 import torch
 
 from uuvtai.config.learning import LearningConfig, TunerScene
-from uuvtai.learn.distributed import Processes
 from uuvtai.learn.episode_waves import play_episodes
 from uuvtai.learn.number_search import NumberSearch
 from uuvtai.learn.rollout_sums import Recent, RolloutSums
@@ -35,7 +34,7 @@ class TunerTrainer:
 
     def __init__(self, config: LearningConfig, sims: Mapping[str, Sim] | None = None) -> None:
         """``sims``: simulators of worlds that are there already. Raises ConfigError."""
-        self.config, self.processes = config, Processes()
+        self.config = config
         self.observation_table = (tree_row(),)
         self._scenes = config.tuner.scenes
         self._part = [self._part_of(scene) for scene in self._scenes]

@@ -13,7 +13,6 @@ import torch
 from uuvtai.config.learning import LearningConfig
 from uuvtai.errors import SettingError
 from uuvtai.learn.bfloat16 import in_bfloat16
-from uuvtai.learn.distributed import Processes
 from uuvtai.learn.optimiser import PlainAdam
 from uuvtai.learn.policy import log_prob
 from uuvtai.learn.ppo import ADAM_EPS, adapted_rate, gae
@@ -52,7 +51,7 @@ class TwinTrainer:
         from uuvtai.twin.twin_world import Twin
 
         _refuse_what_the_twin_lacks(config)
-        self.config, self.processes = config, Processes()
+        self.config = config
         self.observation_table = SET_TABLE
         torch.set_flush_denormal(True)
         self.generator = torch.Generator().manual_seed(config.train.seed)

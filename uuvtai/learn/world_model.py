@@ -10,7 +10,7 @@ next observation plus beta
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import torch
@@ -38,9 +38,6 @@ MAX_DEVIATIONS = 100.0
 """a jump counts as at most this many running deviations; replanned routes reach about 50"""
 _OUT_GAIN = 0.01
 """of the decoder: at birth it says "as ever" with variance one"""
-
-Reduce = Callable[[list[Tensor]], None]
-Gather = Callable[[Moments], Moments]
 
 
 class Prediction(NamedTuple):
@@ -195,15 +192,8 @@ def mean_of(values: Iterable[Tensor]) -> float:
 class WorldModelLearner:
     """Adam on batches drawn from rollouts, with a guard against NaN."""
 
-    def __init__(
-        self,
-        world_model: WorldModel,
-        config: WorldModelConfig,
-        reduce: Reduce | None = None,
-        gather: Gather | None = None,
-    ) -> None:
-        """``reduce`` averages gradients over the processes in place; ``gather`` unites their moments."""
-        self.model, self.config, self.reduce, self.gather = world_model, config, reduce, gather
+    def __init__(self, world_model: WorldModel, config: WorldModelConfig) -> None:
+        self.model, self.config = world_model, config
         self.optimiser = PlainAdam(world_model.parameters(), lr=config.learning_rate, fused=True)
         self.skipped = 0
         """steps left out because the gradient was not finite, or zero for want of valid samples"""
@@ -265,8 +255,7 @@ class WorldModelLearner:
         little more."""
         obs = torch.cat([batch.obs[batch.valid] for batch in batches])
         following = torch.cat([batch.next_obs[batch.valid, :N_TARGET] for batch in batches])
-        moments = moments_of(obs), moments_of(following - obs[:, :N_TARGET])
-        self.model.observe(*(moments if self.gather is None else map(self.gather, moments)))
+        self.model.observe(moments_of(obs), moments_of(following - obs[:, :N_TARGET]))
 
     @torch.no_grad()
     def _calibration(self, batch: ModelBatch) -> dict[str, float]:
@@ -290,7 +279,7 @@ class WorldModelLearner:
 
     def _learn(self, batch: ModelBatch) -> Losses:
         losses = self.model.loss(*batch)
-        self.skipped += not guarded_step(losses.total, self.model, self.optimiser, self.reduce)
+        self.skipped += not guarded_step(losses.total, self.model, self.optimiser)
         return losses
 
 
