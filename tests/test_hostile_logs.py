@@ -23,7 +23,6 @@ from uuvtai.errors import UserError
 from uuvtai.files import FileError
 from uuvtai.logs import budget
 from uuvtai.logs.container import MAGIC, McapFile
-from uuvtai.logs.convert import convert
 from uuvtai.logs.log_errors import LogError
 from uuvtai.logs.log_export import export
 from uuvtai.logs.mcap_log import McapEpisodeLog
@@ -31,6 +30,7 @@ from uuvtai.logs.picture import picture
 from uuvtai.logs.reader import LogHead, info, read_messages
 from uuvtai.logs.recording import Recording, load_recording
 from uuvtai.logs.repair import repair
+from uuvtai.logs.rosbag import from_rosbag2
 from uuvtai.logs.video import frame_times, video
 
 N_STEP = 60
@@ -305,7 +305,7 @@ def test_a_pipe_is_not_waited_for(tmp_path, command):
         "info": info,
         "picture": lambda path: picture(path, tmp_path / "x.png"),
         "video": lambda path: video(path, tmp_path / "x.webm"),
-        "convert": lambda path: convert(path, tmp_path / "x.mcap"),
+        "convert": lambda path: from_rosbag2(path, tmp_path / "x.mcap"),
         "repair": repair,
         "export": lambda path: export(path, tmp_path / "x"),
     }
@@ -382,22 +382,6 @@ def test_a_log_cannot_plant_files_in_a_folder_that_is_there(tmp_path, capfd):
         ["A_2.csv", "a.csv", "metadata.json"],
     )
     assert run_cli("log", "export", tmp_path / "a.mcap", "--out", tmp_path / "again", "--format", "xls") == 2
-
-
-@pytest.mark.parametrize("command", ["picture", "video", "export", "repair", "convert"])
-def test_the_output_of_convert_is_called_by_its_name(log_path, tmp_path, command, capfd):
-    pytest.importorskip("mcap_protobuf", reason="needs the extra uuvtai[viz]")
-    convert(log_path, tmp_path / "a.protobuf.mcap")
-    out = tmp_path / {"picture": "out.png", "video": "out.webm"}.get(command, "out")
-    assert run_cli("log", command, tmp_path / "a.protobuf.mcap", "--out", out) == 2
-    answer = capfd.readouterr().err
-    assert (
-        "is the output of uuv log convert (protobuf); use the original: a.mcap" in answer
-        and len(answer.splitlines()) == 1
-    )
-    assert run_cli("log", "info", tmp_path / "a.protobuf.mcap") == 0
-    assert "output of uuv log convert (protobuf)" in capfd.readouterr().out
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.protobuf.mcap"]
 
 
 # ------------------------------------------------------------------------------------------ exported policies

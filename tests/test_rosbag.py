@@ -171,7 +171,7 @@ def test_the_command(recorded, tmp_path, capfd):
     assert run_cli("log", "convert", bag, "--from", "rosbag2", "--out", out) == 0
     assert f"{out}: {info(out)['messages']} messages\n" in capfd.readouterr().out
     for words, reason in (
-        (("--to", "ros"), "choose one of protobuf, rosbag2"),
+        (("--to", "ros"), "choose one of mcap, rosbag2"),
         (("--from", "bag"), "choose one of mcap, rosbag2"),
         (("--to", "rosbag2", "--from", "rosbag2"), "leave out --to"),
         (("--to", "rosbag2", "--out", bag), "is a new folder"),

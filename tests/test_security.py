@@ -146,7 +146,7 @@ def test_nothing_in_the_package_can_execute_what_it_reads():
                 )
     assert not found
     assert yaml_loads == ["_SafeLoader(text)"] and issubclass(_SafeLoader, yaml.SafeLoader)
-    assert {name for name, _ in imports} <= {"doctor.py", "convert.py", "__init__.py"}, (
+    assert {name for name, _ in imports} <= {"doctor.py", "__init__.py"}, (
         "modules are never imported by names from files"
     )
     loaders = [path.name for path in PACKAGE.rglob("*.py") if "module_from_spec" in path.read_text()]
@@ -195,7 +195,7 @@ OWN_JSON = {
     "native/reads.py",
 }
 """files whose JSON comes from this process or its siblings, not from a file"""
-BOUNDED_JSON = {"logs/reader.py", "logs/convert.py"}
+BOUNDED_JSON = {"logs/reader.py"}
 """files whose JSON are messages and attachments of a log, which ``logs/budget.py`` has counted before"""
 
 
@@ -831,7 +831,7 @@ COMMANDS = (
 def test_chunks_that_unfold(here, command, claimed, capfd):
     """200 MiB of zeros in 20 kB, with a modest, the true and an absurd size."""
     if command[1] == "convert":
-        pytest.importorskip("mcap_protobuf", reason="needs the extra uuvtai[viz]")
+        pytest.importorskip("rosbags", reason="needs the extra uuvtai[ros]")
     bomb = chunk_of(zstandard.ZstdCompressor().compress(bytes(200 << 20)), claimed)
     file = McapFile(here / "a.mcap")
     file.add_attachment("scenario.json", "application/json", json.dumps(episode.scenario()).encode())
@@ -959,7 +959,7 @@ def test_images_that_unfold(content, says):
 
 @pytest.mark.parametrize("text", TAGS[:3])
 def test_a_config_within_a_log_is_yaml_without_tags(here, text, capfd):
-    pytest.importorskip("mcap_protobuf", reason="needs the extra uuvtai[viz]")
+    pytest.importorskip("rosbags", reason="needs the extra uuvtai[ros]")
     log_with(here / "a.mcap", attachments=[("config.yaml", text.encode())])
     assert run_cli("log", "convert", here / "a.mcap") == 2
     assert "its config.yaml cannot be read" in capfd.readouterr().err

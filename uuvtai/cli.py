@@ -554,12 +554,12 @@ def log_repair(file: opt.LogFile, out: opt.RepairOut = None, force: opt.LogForce
 def log_convert(
     file: opt.LogFile,
     out: opt.ConvertOut = None,
-    to: opt.ConvertTo = "protobuf",
+    to: opt.ConvertTo = None,
     source: opt.ConvertFrom = "mcap",
     force: opt.LogForce = False,
 ) -> None:
-    """Write a log with protobuf messages and point clouds for Rerun, or as a ROS 2 bag; or a bag as a log."""
-    from uuvtai.logs.conversions import converted
+    """Write a log as a ROS 2 bag, or a bag as a log."""
+    from uuvtai.logs.rosbag import converted
 
     target, messages = converted(file, out, to, source, force)
     typer.echo(f"{target}: {messages} messages")

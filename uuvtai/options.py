@@ -520,15 +520,15 @@ ConvertOut = Annotated[
     Path | None,
     Option(
         "--out",
-        help="New file, or folder of a bag \\[default: NAME.protobuf.mcap, NAME_rosbag2, NAME.log.mcap].",
+        help="New file, or folder of a bag \\[default: NAME_rosbag2, NAME.log.mcap].",
     ),
 ]
 ConvertTo = Annotated[
-    str,
+    str | None,
     Option(
         "--to",
-        help="protobuf (Rerun), or rosbag2 (a ROS 2 bag).",
-        autocompletion=lambda: ["protobuf", "rosbag2"],
+        help="rosbag2 (a ROS 2 bag), or mcap (a log) \\[default: what --from is not].",
+        autocompletion=lambda: ["mcap", "rosbag2"],
     ),
 ]
 ConvertFrom = Annotated[

@@ -20,7 +20,7 @@ import numpy as np
 
 from uuvtai.files import refuse_output
 from uuvtai.logs.log_errors import LogError
-from uuvtai.logs.reader import info, original, read_head, read_messages
+from uuvtai.logs.reader import info, read_head, read_messages
 from uuvtai.logs.topics.camera_topics import logged_image
 from uuvtai.logs.topics.map_topics import grid_values
 
@@ -63,12 +63,7 @@ def export(path: Path, out_dir: Path, topics: Collection[str] | None = None, fmt
     if fmt not in FORMATS:
         raise LogError(f"--format {fmt}: choose one of {', '.join(FORMATS)}")
     _refuse_place(out_dir)
-    found = info(path)
-    if found["converted_from"]:
-        raise LogError(
-            f"{path}: is the output of uuv log convert (protobuf); use the original: {original(path)}"
-        )
-    known = [entry["topic"] for entry in found["topics"] if entry["messages"]]
+    known = [entry["topic"] for entry in info(path)["topics"] if entry["messages"]]
     if missing := [topic for topic in topics or () if topic not in known]:
         raise LogError(f"{path}: no messages on {', '.join(missing)}; it has {', '.join(known)}")
     wanted = list(dict.fromkeys(topics or known))

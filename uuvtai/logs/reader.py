@@ -74,8 +74,7 @@ class LogHead:
 
 
 def read_messages(path: Path, topics: Collection[str] | None = None) -> Iterator[LogMessage]:
-    """Messages in file order, decoded; all topics or these. Raises LogError, also for the output of ``uuv log
-    convert``."""
+    """Messages in file order, decoded; all topics or these. Raises LogError."""
     channels: dict[int, Channel] = {}
     for record in records(path):
         if isinstance(record, Channel):
@@ -85,7 +84,6 @@ def read_messages(path: Path, topics: Collection[str] | None = None) -> Iterator
             if channel is None:
                 raise _unreadable(path, f"a message of channel {record.channel_id}, which was never declared")
             if topics is None or channel.topic in topics:
-                refuse_converted(path, channel)
                 yield LogMessage(
                     channel.topic, record.log_time / 1e9, _decoded(path, channel.topic, record.data)
                 )
@@ -121,9 +119,6 @@ def json_attachment(head: LogHead, name: str) -> Any:
 def info(path: Path) -> dict[str, Any]:
     """What is in a log: topics with schema, messages and rate; duration, metadata, attachments, outcome.
     Raises LogError.
-
-    ``converted_from``: the log to use instead where this one is in protobuf, as ``uuv log convert`` writes
-    it; else None.
     """
     path = Path(path)
     schemas: dict[int, Schema] = {}
@@ -162,30 +157,7 @@ def info(path: Path) -> dict[str, Any]:
         "metadata": head.metadata,
         "attachments": {name: len(data) for name, data in head.attachments.items()},
         "outcome": result.get("outcome"),
-        "converted_from": next(
-            (original(path) for channel in channels.values() if channel.message_encoding == PROTOBUF), None
-        ),
     }
-
-
-PROTOBUF = "protobuf"
-"""message encoding of what ``uuv log convert`` writes"""
-
-
-def original(path: Path) -> str:
-    """Name of the log that a converted one was made of, as far as its own name tells."""
-    name = Path(path).name
-    stem = name.removesuffix(".mcap").removesuffix(".protobuf")
-    return f"{stem}.mcap" if name.endswith(".protobuf.mcap") else "a log that uuv eval --record wrote"
-
-
-def refuse_converted(path: Path, channel: Channel) -> None:
-    """Raise LogError for a channel that ``uuv log convert`` wrote: what is in it stands in the original
-    too."""
-    if channel.message_encoding == PROTOBUF:
-        raise LogError(
-            f"{path}: is the output of uuv log convert (protobuf); use the original: {original(path)}"
-        )
 
 
 # ---------------------------------------------------------------------------------------------------- records

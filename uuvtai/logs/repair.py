@@ -13,7 +13,7 @@ from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from uuvtai.files import refuse_output
 from uuvtai.logs.container import McapFile
 from uuvtai.logs.log_errors import LogError
-from uuvtai.logs.reader import DamageError, Scanner, opened, refuse_converted
+from uuvtai.logs.reader import DamageError, Scanner, opened
 
 
 @dataclass(frozen=True)
@@ -63,8 +63,6 @@ def _copied(path: Path, scanner: Scanner, out: Path) -> Repair:
     copy = _Copy(McapFile(out, ".repairing"))  # not .part: that may be the input
     try:
         for record in _recovered(scanner, damages):
-            if isinstance(record, Channel):
-                refuse_converted(path, record)
             copy.add(record)
         if not copy.messages:
             reason = damages.listed[0] if damages.listed else "it holds no messages"

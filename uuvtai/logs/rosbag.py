@@ -27,6 +27,23 @@ from uuvtai.logs.ros_write import SOURCES, WRITTEN, Setup, ros_messages
 _ODD = (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError, RecursionError)
 
 
+FORMATS = ("mcap", "rosbag2")
+
+
+def converted(file: Path, out: Path | None, to: str | None, source: str, force: bool) -> tuple[Path, int]:
+    """A log as a bag or a bag as a log: (what was written, how many messages). Raises LogError, FileError."""
+    for option, given in (("--to", to), ("--from", source)):
+        if given not in (*FORMATS, None):
+            raise LogError(f"{option} {given}: choose one of {', '.join(FORMATS)}")
+    if source == to:
+        raise LogError(f"--from {source} --to {to}: a log becomes a bag, and a bag a log; leave out --to")
+    if source == "rosbag2":
+        target = out or file.with_name(f"{file.stem}.log.mcap")
+        return target, from_rosbag2(file, target, force)
+    target = out or file.with_name(f"{file.stem}_rosbag2")
+    return target, to_rosbag2(file, target, force)
+
+
 def to_rosbag2(path: Path, out: Path, force: bool = False) -> int:
     """Write the log ``path`` as a bag, the new folder ``out``; how many messages. Raises LogError, and then
     nothing is left.

@@ -5,9 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import typer
-
-from uuvtai.endings import plain
 from uuvtai.show.screen import Screen
 from uuvtai.tables.table import Column, Table
 from uuvtai.tables.wording import number
@@ -26,8 +23,3 @@ def show_log(screen: Screen, found: dict[str, Any], file: Path) -> None:
     screen.line(
         f"duration {found['duration_s']:.2f} s, outcome {found['outcome'] or 'none: the log was cut off'}"
     )
-    if found["converted_from"]:
-        typer.echo(
-            "output of uuv log convert (protobuf); for every other command use "
-            f"{plain(found['converted_from'])}"
-        )
