@@ -567,20 +567,20 @@ def log_convert(
 
 @log_app.command("video", epilog="Example: uuv log video runs/first/logs/bt_seed0_episode0.mcap")
 def log_video(
-    file: opt.FilmLogs,
+    file: opt.LogFile,
     out: opt.VideoOut = None,
     speed: opt.VideoSpeed = 1.0,
     fps: opt.VideoFps = None,
     width: opt.VideoWidth = None,
     force: opt.LogForce = False,
 ) -> None:
-    """Render a top-down video of a recorded episode as WebM, MP4 or GIF; of several, a grid of tanks."""
+    """Render a top-down video of a recorded episode as WebM, MP4 or GIF."""
     from uuvtai.files import output_beside
-    from uuvtai.logs.films import film
+    from uuvtai.logs.video import video
 
-    target = output_beside(file, out, ".webm", force)
+    target = output_beside([file], out, ".webm", force)
     with counted(target.name, "frames") as drawn:
-        film(file, target, width, fps, speed, drawn)
+        video(file, target, width, fps, speed, drawn)
     typer.echo(str(target))
 
 

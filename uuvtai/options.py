@@ -510,7 +510,6 @@ IdentifyOut = Annotated[
 ]
 IdentifyForce = Annotated[bool, Option("--force", help="Replace files that are there.")]
 LogFiles = Annotated[list[Path], Argument(help="Logs of the same episode; trajectories are overlaid.")]
-FilmLogs = Annotated[list[Path], Argument(help="An .mcap file; several are shown at once, a tank each.")]
 LogForce = Annotated[bool, Option("--force", help="Replace the file that --out names.")]
 LogExportOut = Annotated[Path, Option("--out", help="New or empty folder for the exported files.")]
 Topics = Annotated[list[str] | None, Option("--topic", help="Only these topics (repeatable).")]

@@ -64,7 +64,7 @@ _LEGEND = (
     (MOVER, "true, moving"),
     (GREY, "true, resting"),
 )
-HOLD_S = 1.0
+_HOLD_S = 1.0
 """The last frame stays this long."""
 _DRAWN_PX = 1280
 """Narrower frames are drawn this wide and made smaller: the panel below the map needs the room."""
@@ -74,7 +74,7 @@ WIDTHS, FPS, SPEEDS = (320, 3840), (1.0, 60.0), (0.05, 100.0)
 """least and most"""
 SMALL: dict[str, Any] = {"width_px": 960, "speed": 2.0}
 """what a run folder holds, so that several fit a page: some 40 kB per second of the episode"""
-MOST_FRAMES = 100_000
+_MOST_FRAMES = 100_000
 _FEW_FRAMES, _FRAMES_PER_POSE = 1000, 10
 """a small file must not cost minutes: beyond so many frames a log has to hold something new for them (ours
 hold 50 poses a second)"""
@@ -103,16 +103,16 @@ def video(
     out = Path(out)
     suffix = checked_suffix(out, tuple(FORMATS), "video")
     width_px, fps = width_px or FORMATS[suffix][0], fps or FORMATS[suffix][1]
-    check_film(width_px, fps, speed)
+    _check_film(width_px, fps, speed)
     recording = load_recording(path)
     times = frame_times(recording, fps, speed)
     with drawing(Path(path)):
         artist = FrameArtist(recording, max(width_px, _DRAWN_PX), remark, methods)
         samples = [_sized(artist.frame(recording.duration_s * share), width_px) for share in (0.0, 0.5, 1.0)]
-    return filmed(out, _frames(artist, times, width_px, progress), fps, samples, artist.inks)
+    return _filmed(out, _frames(artist, times, width_px, progress), fps, samples, artist.inks)
 
 
-def filmed(
+def _filmed(
     out: Path, frames: Iterator[np.ndarray], fps: float, samples: Sequence[np.ndarray], inks: Sequence[Color]
 ) -> Path:
     """Write frames as the film that the name of ``out`` asks for, whole or not at all. Raises LogError."""
@@ -135,7 +135,7 @@ def filmed(
     return out
 
 
-def check_film(width_px: int, fps: float, speed: float) -> None:
+def _check_film(width_px: int, fps: float, speed: float) -> None:
     """Raise LogError for a width, a rate or a speed beyond what a film may have."""
     for name, value, (least, most) in (
         ("--width", width_px, WIDTHS),
@@ -150,9 +150,9 @@ def frame_times(recording: Recording, fps: float, speed: float) -> np.ndarray:
     """Moments [s] of the frames; the last one stays for a while. Raises LogError for more frames than anybody
     waits for."""
     n_frames = recording.duration_s * fps / speed
-    if n_frames > MOST_FRAMES:
+    if n_frames > _MOST_FRAMES:
         raise LogError(
-            f"{recording.path}: {n_frames:,.0f} frames, more than {MOST_FRAMES:,}; raise --speed or lower "
+            f"{recording.path}: {n_frames:,.0f} frames, more than {_MOST_FRAMES:,}; raise --speed or lower "
             "--fps"
         )
     poses = len(recording["/pose"].times)
@@ -162,7 +162,7 @@ def frame_times(recording: Recording, fps: float, speed: float) -> np.ndarray:
             "raise --speed or lower --fps"
         )
     times = np.arange(0.0, recording.duration_s, speed / fps)
-    return np.concatenate([times, np.full(1 + round(HOLD_S * fps), recording.duration_s)])
+    return np.concatenate([times, np.full(1 + round(_HOLD_S * fps), recording.duration_s)])
 
 
 def _frames(
