@@ -12,7 +12,7 @@ gc.disable()  # until all is imported and collected, which makes millions of obj
 BEGUN_FIRST = """
 docs cuda native tuned world replay cli aboard deploy training tracking report set_export security sonar
 examples log_alone pose signals identify telemetry resume_eval dynamics logs sweep
-media_formats link wheel fan_image explain hostile_logs echoes voronoi
+media_formats link wheel explain hostile_logs echoes voronoi
 """
 """files of tests that take long, longest first: a process takes whole files, and none shall work alone at the
 end"""

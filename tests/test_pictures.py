@@ -8,7 +8,6 @@ from tests.reference import logs as episode
 from uuvtai.closed_form import body_positions
 from uuvtai.logs import canvas as ink
 from uuvtai.logs.canvas import Canvas
-from uuvtai.logs.fan_strip import HEIGHT_PX
 from uuvtai.logs.log_errors import LogError
 from uuvtai.logs.mcap_log import McapEpisodeLog
 from uuvtai.logs.painting import map_canvas, paint_truth, paint_walls, paint_water
@@ -58,26 +57,6 @@ def around(image, pixel, reach=3):
 
 def has(pixels, color, tolerance=12):
     return bool((np.abs(pixels - np.array(color)).max(axis=1) <= tolerance).any())
-
-
-def test_a_picture_shows_what_the_sonar_heard_below_the_map_at_four_moments(folder, bt):
-    path = folder / "heard.mcap"
-    with McapEpisodeLog(path, episode.header("bt", 3), True) as log:
-        for snap in episode.snapshots(N_STEP):
-            log.write(snap)
-        log.close(episode.result(N_STEP, "success"))
-    recordings = [load_recording(file, PICTURE_TOPICS) for file in (bt, path)]
-    without, heard = (paint_picture([recording]).image for recording in recordings)
-    assert heard.shape == (without.shape[0] + HEIGHT_PX, 1600, 3) and recordings[1]["/sonar/image"].values
-    strip = heard[-HEIGHT_PX + 44 :]
-    width = (1600 - 62 - 44 - 3 * 16) // 4
-    for place in range(4):
-        fan = strip[:, 62 + place * (width + 16) :][:, :width]
-        assert (fan < 128).mean() > 0.1, "dark water in each of four fans"
-        assert (strip[:, 62 + place * (width + 16) - 12 : 62 + place * (width + 16) - 2] == 255).all()
-    both = paint_picture(recordings).image
-    assert both.shape == heard.shape, "of several logs, the first that has images"
-    picture(path, folder / "heard.svg")
 
 
 def test_picture_has_what_it_should_where_it_should(folder, bt, straight):
@@ -259,9 +238,7 @@ def test_a_frame_shows_the_moment(bt):
     ).all()  # independent of what was drawn before
 
 
-@pytest.mark.parametrize(
-    ("draw", "name"), [(picture, "out.png"), (picture, "out.svg"), (video, "out.webm"), (video, "out.gif")]
-)
+@pytest.mark.parametrize(("draw", "name"), [(picture, "out.png"), (video, "out.webm"), (video, "out.gif")])
 def test_missing_files_and_bad_places(folder, bt, tmp_path, draw, name):
     with pytest.raises(LogError, match="cannot open"):
         draw(tmp_path / "nowhere.mcap", tmp_path / name)

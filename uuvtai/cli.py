@@ -591,7 +591,7 @@ def log_picture(
     clearance: opt.WithClearance = False,
     force: opt.LogForce = False,
 ) -> None:
-    """Draw a recorded episode as PNG, PDF or SVG: occupancy, trajectories, goal."""
+    """Draw a recorded episode as PNG: occupancy, trajectories, goal."""
     from uuvtai.files import output_beside
     from uuvtai.logs.picture import picture
 

@@ -551,7 +551,7 @@ PictureOut = Annotated[
     Path | None,
     Option(
         "--out",
-        help="Its ending says the format: .png, .pdf or .svg \\[default: the first log's name, .png].",
+        help="A .png file \\[default: the first log's name, .png].",
     ),
 ]
 WithClearance = Annotated[bool, Option("--clearance", help="Colour the clearance field.")]

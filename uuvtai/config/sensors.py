@@ -39,8 +39,8 @@ class SonarConfig(Section):
     beam_width_deg: Annotated[float, Field(ge=0, le=30)] = 0.0
     """of a mechanical beam, horizontally: what is nearest within it returns"""
     image_bins: Annotated[int, Field(ge=0, le=2048)] = 0
-    """range bins of the intensity image that logs with depth images hold twice a second (``/sonar/image``);
-    0: none. Nothing decides by it unless there is a ``detector``"""
+    """of a detector: range bins of the intensity image, which logs with depth images hold twice a second
+    (``/sonar/image``)"""
     detector: Literal["none", "ca", "so"] = "none"
     """none: each beam reports the nearest range within its aperture, with the errors below. ca, so: what a
     CFAR detector finds first in the beam's row of the intensity image, cell averaging or smallest of; the

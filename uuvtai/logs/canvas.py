@@ -48,11 +48,7 @@ def method_inks(names: Sequence[str]) -> dict[str, Color]:
 
 
 class Canvas:
-    """An image with a map area in which one metre is ``scale`` pixels, y up.
-
-    All shapes come down to ``strip``, ``filled``, ``dot``, ``paste``, ``cells`` and ``text``;
-    ``vector.VectorCanvas`` draws these as paths.
-    """
+    """An image with a map area in which one metre is ``scale`` pixels, y up."""
 
     def __init__(
         self,
@@ -66,7 +62,7 @@ class Canvas:
         (x_m[0], y_m[1])."""
         self.size = size
         self.corner, self.scale, self.x_m, self.y_m = corner, scale, tuple(x_m), tuple(y_m)
-        self.begin()
+        self.image = np.full((size[1], size[0], 3), PAPER, np.uint8)
 
     def pixels(self, points: Any) -> np.ndarray:
         """World (n, 2 or more) to pixels (n, 2), float; only x and y count."""
@@ -77,12 +73,6 @@ class Canvas:
                 self.corner[1] + (self.y_m[1] - flat[:, 1]) * self.scale,
             ]
         )
-
-    # --------------------------------------------------------------------------------------------- what draws
-
-    def begin(self) -> None:
-        """Take a new sheet of paper."""
-        self.image = np.full((self.size[1], self.size[0], 3), PAPER, np.uint8)
 
     def strip(self, pixels: Any, color: Color, width: int = 2, closed: bool = False) -> None:
         """Polyline in pixels."""

@@ -4,7 +4,7 @@ coordinates."""
 from __future__ import annotations
 
 import math
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -12,24 +12,22 @@ from uuvtai.closed_form import body_positions
 from uuvtai.logs.canvas import DYNAMIC, FAINT, GREY, INK, MOVER, PAPER, STATIC, WATER, Canvas, Color
 from uuvtai.logs.topics.map_topics import Layer
 
-AnyCanvas = TypeVar("AnyCanvas", bound=Canvas)
-
 _MAX_MAP = 1000
 """[px] greatest height of the map"""
 _HULL_RADIUS_M = 0.17
 """half the height of the hull that ``Canvas.vehicle`` draws"""
 
 
-def map_canvas(
-    tank: dict[str, Any], width_px: int, margins: tuple[int, int, int, int], kind: type[AnyCanvas] = Canvas
-) -> AnyCanvas:
+def map_canvas(tank: dict[str, Any], width_px: int, margins: tuple[int, int, int, int]) -> Canvas:
     """A canvas that fits the tank between margins (left, right, top, bottom), with even sizes."""
     left, right, top, bottom = margins
     across, along = tank["x_m"][1] - tank["x_m"][0], tank["y_m"][1] - tank["y_m"][0]
     scale = min((width_px - left - right) / across, _MAX_MAP / along)
     height = top + math.ceil(along * scale) + bottom
     shift = 0.5 * (width_px - left - right - across * scale)
-    return kind((width_px, height + height % 2), (round(left + shift), top), scale, tank["x_m"], tank["y_m"])
+    return Canvas(
+        (width_px, height + height % 2), (round(left + shift), top), scale, tank["x_m"], tank["y_m"]
+    )
 
 
 def tank_outline(tank: dict[str, Any]) -> np.ndarray:

@@ -23,10 +23,8 @@ from uuvtai.logs.canvas import (
     Color,
     method_inks,
 )
-from uuvtai.logs.fan_strip import HEIGHT_PX, fans_of, paint_fan_marks, paint_fans
 from uuvtai.logs.log_errors import LogError, checked_suffix
 from uuvtai.logs.painting import (
-    AnyCanvas,
     map_canvas,
     mixed,
     paint_layers,
@@ -43,10 +41,6 @@ _ROW = 30
 """[px] per line of the legend"""
 
 
-FORMATS = (".png", ".pdf", ".svg")
-"""what a picture's name may end in"""
-
-
 def picture(
     paths: Path | Sequence[Path],
     out: Path,
@@ -56,30 +50,22 @@ def picture(
     remark: str = "",
     methods: Sequence[str] = (),
 ) -> Path:
-    """Draw logs of the same episode into one PNG, PDF or SVG, as the name of ``out`` ends: trajectories
-    overlaid, a colour per method.
+    """Draw logs of the same episode into one PNG: trajectories overlaid, a colour per method.
 
     ``clearance`` shows the distance to mapped obstacles as colours; ``obstacles`` the true bodies and their
     paths as thin lines; ``remark`` stands beside the title; ``methods``: all that are compared with each
-    other, in order, so that each keeps its colour. In PDF and SVG everything but the map is lines, shapes and
-    text. Raises LogError; the file appears whole or not at all.
+    other, in order, so that each keeps its colour. Raises LogError; the file appears whole or not at all.
     """
     out = Path(out)
-    suffix = checked_suffix(out, FORMATS, "picture")
+    checked_suffix(out, (".png",), "picture")
     found = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
     if not found:
         raise LogError("uuv log picture: give at least one log")
     recordings = [load_recording(path, PICTURE_TOPICS) for path in found]
     check_same_episode(recordings)
     with drawing(found[0]):
-        style = (clearance, obstacles, width_px, remark, methods)
-        if suffix == ".png":
-            content = png_bytes(paint_picture(recordings, *style).image)
-        else:
-            from uuvtai.logs.vector_graphics import VectorCanvas  # matplotlib, which takes a second
-
-            content = paint_picture(recordings, *style, VectorCanvas).document(suffix.lstrip("."))
-    return write_whole(content, out)
+        image = paint_picture(recordings, clearance, obstacles, width_px, remark, methods).image
+    return save_image(image, out)
 
 
 def check_same_episode(recordings: list[Recording]) -> None:
@@ -95,21 +81,11 @@ def check_same_episode(recordings: list[Recording]) -> None:
 
 
 def save_image(image: np.ndarray, out: Path) -> Path:
-    """Write a PNG atomically. Raises LogError."""
-    return write_whole(png_bytes(image), out)
-
-
-def png_bytes(image: np.ndarray) -> bytes:
-    """An image (height, width, 3), blue green red, as PNG."""
-    return cv2.imencode(".png", image)[1].tobytes()
-
-
-def write_whole(content: bytes, out: Path) -> Path:
-    """Write a picture atomically. Raises LogError."""
+    """Write an image (height, width, 3), blue green red, as PNG, atomically. Raises LogError."""
     part = out.with_name(f".{out.name}.{os.getpid()}.part")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        part.write_bytes(content)
+        part.write_bytes(cv2.imencode(".png", image)[1].tobytes())
         os.replace(part, out)
     except OSError as error:
         raise LogError(
@@ -128,13 +104,11 @@ def paint_picture(
     width_px: int = 1600,
     remark: str = "",
     methods: Sequence[str] = (),
-    kind: type[AnyCanvas] = Canvas,
-) -> AnyCanvas:
+) -> Canvas:
     """The picture on a canvas; the other arguments as of ``picture``."""
     tank = recordings[0].scenario["tank"]
-    heard, legend = fans_of(recordings), _BOTTOM + _ROW * max(len(recordings), 3)
-    side, strip = 92 if clearance else 0, HEIGHT_PX if heard else 0
-    canvas = map_canvas(tank, width_px, (_LEFT, _RIGHT + side, _TOP, legend + strip), kind)
+    side, legend = 92 if clearance else 0, _BOTTOM + _ROW * max(len(recordings), 3)
+    canvas = map_canvas(tank, width_px, (_LEFT, _RIGHT + side, _TOP, legend))
     inks = _inks(recordings, methods)
     paint_water(canvas, tank)
     if clearance:
@@ -146,9 +120,6 @@ def paint_picture(
     _paint_trajectories(canvas, recordings, inks)
     _paint_ends(canvas, recordings, inks)
     _paint_frame(canvas, recordings, inks, not clearance, remark)
-    if heard:
-        paint_fan_marks(canvas, heard)
-        paint_fans(canvas, heard, _LEFT, canvas.size[1] - strip, canvas.size[0] - _RIGHT)
     return canvas
 
 

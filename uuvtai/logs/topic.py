@@ -74,9 +74,9 @@ IMAGES = When(
     hertz=2.0,
 )
 SONAR_IMAGES = When(
-    "2 Hz, with `--depth-images`, where `sensors.sonar.image_bins` is not 0",
+    "2 Hz, with `--depth-images`, where `sensors.sonar.detector` is on",
     lambda moment, waited: (
-        waited and bool(moment["scan.fresh"]) and moment.header.config.sensors.sonar.image_bins > 0
+        waited and bool(moment["scan.fresh"]) and moment.header.config.sensors.sonar.detector != "none"
     ),
     ("scan.fresh",),
     hertz=2.0,

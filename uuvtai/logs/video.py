@@ -27,7 +27,6 @@ from uuvtai.logs.canvas import (
     bgr,
     method_inks,
 )
-from uuvtai.logs.fan_image import polar_picture
 from uuvtai.logs.log_errors import LogError, checked_suffix
 from uuvtai.logs.painting import (
     map_canvas,
@@ -46,8 +45,6 @@ _MARGINS = (52, 28, 84, 212)
 _PANEL = 160
 """[px] height of the panel below the map"""
 _ECHO, _GOOD = bgr("#0b7a75"), bgr("#2b8a3e")
-_FAN_GAP = 8
-"""[px] from the map's corner to the sonar's image"""
 _ECHO_BEAMS = 64
 """A scan of fewer beams is painted together with those before it."""
 _TRIGGER_COLORS = {
@@ -224,7 +221,6 @@ class FrameArtist:
         canvas.vehicle(pose, self._ink)
         self._paint_head(time_s)
         self._paint_panel(time_s, i)
-        self._paint_fan(time_s)
         return canvas.image
 
     def _background(self, time_s: float) -> np.ndarray:
@@ -264,16 +260,6 @@ class FrameArtist:
             beams += len(ranges)
             if beams >= _ECHO_BEAMS:
                 return
-
-    def _paint_fan(self, time_s: float) -> None:
-        """What the sonar's beams hear, if the log has it, in the upper right corner of the map."""
-        shown, scan = (self.recording[f"/sonar/{name}"].at(time_s) for name in ("image", "scan"))
-        if shown is None or scan is None or shown.shape[1] != len(scan[1]):
-            return
-        image, top = self._canvas.image, _MARGINS[2] + _FAN_GAP
-        fan = polar_picture(shown, scan[1], image.shape[0] // 4, paper=0)
-        height, width = fan.shape
-        image[top : top + height, -_MARGINS[1] - _FAN_GAP - width : -_MARGINS[1] - _FAN_GAP] = fan[:, :, None]
 
     def _paint_goal(self) -> None:
         canvas, goal, radius = (

@@ -1,5 +1,4 @@
-"""The intensity image of a multibeam, ping by ping: what ``logs/fan_image.py`` makes for logs, for every env
-at once, so that ranges can be detected in it (``cfar.py``).
+"""The intensity image of a multibeam, ping by ping, in which ranges are detected (``cfar.py``).
 
 Rays of one bearing and all elevations meet bodies, side walls, floor and surface; their power folds into
 range bins; random phases make speckle of it; beams hear all bearings by their pattern, and noise. Numbers are

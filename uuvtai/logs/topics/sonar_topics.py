@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import base64
 import json
-import math
 from typing import Any
 
 import cv2
 import numpy as np
 
-from uuvtai.config import SonarConfig
 from uuvtai.logs.encode import IDENTITY, numbers
-from uuvtai.logs.fan_image import echo_power, heard_image, shown_image
 from uuvtai.logs.moment import Moment
 from uuvtai.logs.schemas import (
     LASER_SCAN,
@@ -25,7 +22,7 @@ from uuvtai.logs.schemas import (
     record,
 )
 from uuvtai.logs.topic import NEW_SCAN, SONAR_IMAGES, Topic
-from uuvtai.logs.topics.camera_topics import logged_image
+from uuvtai.multibeam import SHOWN_DB, gain
 
 _THOUSANDTHS = [f"{i / 1000:g}" for i in range(1001)]
 """Intensities are printed to three digits; nothing is computed from them."""
@@ -44,7 +41,7 @@ _DOPPLER = record(
 
 
 _IMAGE = compressed_image(
-    "8-bit PNG of the power that each beam hears, simulated from the true scene: column 0 is the leftmost "
+    "8-bit PNG of the power that each beam hears, in which ranges are detected: column 0 is the leftmost "
     "beam, the last row the nearest range bin; 50 dB from black to white, gain follows range and absorption"
 )
 
@@ -91,24 +88,13 @@ def _read_scan(data: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray
 def _image(moment: Moment) -> bytes:
     """8-bit PNG."""
     sonar = moment.header.config.sensors.sonar
-    shown = shown_image(_heard(moment, sonar), sonar)
+    heard = np.asarray(moment["sonar_image.heard"], float)[: sonar.n_ray, : sonar.image_bins]
+    range_m = sonar.max_range_m * (np.arange(heard.shape[1]) + 0.5) / heard.shape[1]
+    level = 10.0 * np.log10(np.maximum(heard * gain(range_m, sonar), 1e-12))
+    grey = np.clip(255.0 * (level / SHOWN_DB + 1.0), 0, 255).astype(np.uint8)
+    shown = grey.T[::-1, ::-1].copy()  # left is left
     png = base64.b64encode(cv2.imencode(".png", shown)[1].tobytes()).decode()
     return f'{{"timestamp":{moment.stamp},"frame_id":"sonar","data":"{png}","format":"png"}}'.encode()
-
-
-def _heard(moment: Moment, sonar_cfg: SonarConfig) -> np.ndarray:
-    """(n_ray, n_bin) power that the beams hear: where ranges are detected in it, that of the ping; else made
-    for the log, with speckle that is a function of the episode and the step."""
-    detected_in = moment["sonar_image.heard"]
-    if sonar_cfg.detector != "none":
-        return np.asarray(detected_in, float)[: sonar_cfg.n_ray, : sonar_cfg.image_bins]
-    scenario = moment.header.scenario
-    w, x, y, z = (float(part) for part in moment["vehicle.quat_wb"])
-    yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    place = np.asarray(moment["vehicle.pos_w"], float)
-    bearing, power = echo_power(scenario, moment.time_s, place, yaw, sonar_cfg, sonar_cfg.image_bins)
-    random = np.random.default_rng((scenario["seed"], scenario["episode"], moment.step))
-    return heard_image(bearing, power, sonar_cfg, random)
 
 
 ROWS = (
@@ -134,14 +120,5 @@ ROWS = (
         _doppler,
         ("scan.ping_step", "scan.hit", "scan.doppler_m_s", "scan.ping_vel_b"),
     ),
-    Topic(
-        "/sonar/image",
-        SONAR_IMAGES,
-        _IMAGE,
-        _image,
-        ("vehicle.pos_w", "vehicle.quat_wb", "sonar_image.heard"),
-        logged_image,
-        in_picture=True,
-        on_request=True,
-    ),
+    Topic("/sonar/image", SONAR_IMAGES, _IMAGE, _image, ("sonar_image.heard",), on_request=True),
 )

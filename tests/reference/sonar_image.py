@@ -1,14 +1,9 @@
-"""The intensity image of a multibeam sonar, for logs: what its beams would hear of the true scene. Plain
-NumPy; nothing decides by it.
+"""What comes back to a multibeam sonar from each bearing and range.
 
-Every beam hears all that lies in its pattern. Across, that is a sinc of ``BEAM_DEG`` (a line array without
-shading: first side lobe 13 dB below the main one); upwards and downwards a sinc 3 dB down at the vertical
-half aperture, so that whatever lies at one range and bearing folds into one place, floor and surface
-included. A surface sends back Lambert's share of what meets it: power per solid angle cos(incidence) /
-range^2 (two-way spreading, range^-4, over an area that grows with range^2), less the absorption of fresh
-water. Scatterers are many per cell and their phases random, so amplitudes are Rayleigh distributed (speckle);
-neighbouring beams share scatterers as far as their patterns overlap. Patterns, losses and noise:
-``multibeam.py``.
+Upwards and downwards a beam is a sinc 3 dB down at the vertical half aperture, so that whatever lies at one
+range and bearing folds into one place, floor and surface included. A surface sends back Lambert's share of
+what meets it: power per solid angle cos(incidence) / range^2 (two-way spreading, range^-4, over an area that
+grows with range^2), less the absorption of fresh water.
 """
 
 from __future__ import annotations
@@ -20,17 +15,7 @@ import numpy as np
 
 from uuvtai.closed_form import body_positions
 from uuvtai.config import SonarConfig
-from uuvtai.multibeam import (
-    ABSORPTION_NP_M,
-    SHOWN_DB,
-    beam_pattern,
-    elevation_pattern,
-    elevations,
-    gain,
-    heard_bearings,
-    noise_power,
-    ray_sr,
-)
+from uuvtai.multibeam import ABSORPTION_NP_M, elevation_pattern, elevations, heard_bearings, ray_sr
 
 _WALL, _FLOOR, _SURFACE = -1, -2, -3
 
@@ -161,41 +146,3 @@ def _folded(bins: np.ndarray, surface: np.ndarray, power: np.ndarray, n_bin: int
         np.add.at(spread_out, (row, low), each)
         np.add.at(spread_out, (row, high + 1), -each)
     return np.maximum(np.cumsum(spread_out, 1)[:, :n_bin], 0.0)
-
-
-def heard_image(
-    bearing: np.ndarray, power: np.ndarray, sonar_cfg: SonarConfig, random: np.random.Generator
-) -> np.ndarray:
-    """(n_ray, n_bin) power that the beams hear in one ping: patterns, speckle, noise."""
-    beams = sonar_cfg.first_beam_rad + sonar_cfg.beam_step_rad * np.arange(sonar_cfg.n_ray)
-    pattern = beam_pattern(beams[:, None] - bearing[None])
-    phases = random.normal(size=(2, *power.shape))
-    field = pattern @ (np.sqrt(0.5 * power) * (phases[0] + 1j * phases[1]))
-    noise = random.normal(size=(2, *field.shape)) * math.sqrt(0.5 * noise_power(sonar_cfg))
-    return np.abs(field + noise[0] + 1j * noise[1]) ** 2
-
-
-def shown_image(heard: np.ndarray, sonar_cfg: SonarConfig) -> np.ndarray:
-    """(n_bin, n_ray) uint8, range upwards from the last row, left is left: gain follows range and absorption,
-    ``SHOWN_DB`` from black to white."""
-    range_m = sonar_cfg.max_range_m * (np.arange(heard.shape[1]) + 0.5) / heard.shape[1]
-    level = 10.0 * np.log10(np.maximum(heard * gain(range_m, sonar_cfg), 1e-12))
-    grey = np.clip(255.0 * (level / SHOWN_DB + 1.0), 0, 255).astype(np.uint8)
-    return grey.T[::-1, ::-1].copy()
-
-
-def polar_picture(shown: np.ndarray, bearing: np.ndarray, height_px: int, paper: int) -> np.ndarray:
-    """(height, width) uint8: ``shown_image`` as a fan seen from above, the vehicle at its lower tip (a ring:
-    in the middle), ``paper`` where no beam looks; ``bearing`` (n_ray,) [rad] of the beams from ahead."""
-    n_bin, n_ray = shown.shape
-    step = float(bearing[1] - bearing[0])
-    half = min(0.5 * n_ray * step, math.pi)
-    wide = 1.0 if half > 0.5 * math.pi else math.sin(half)
-    scale = (height_px - 1) / (1.0 - min(math.cos(half), 0.0))
-    up = 1.0 - np.arange(height_px)[:, None] / scale
-    right = (np.arange(2 * int(wide * scale) + 1) - int(wide * scale))[None, :] / scale
-    far, away = np.hypot(up, right), np.arctan2(-right, up)
-    row = n_bin - 1 - np.minimum((far * n_bin).astype(int), n_bin - 1)
-    beam = np.rint((away - bearing[0]) / step).astype(int) % round(2 * math.pi / step)
-    inside = (far <= 1.0) & (np.abs(away) <= half) & (beam < n_ray)
-    return np.where(inside, shown[row, n_ray - 1 - np.minimum(beam, n_ray - 1)], paper).astype(np.uint8)
