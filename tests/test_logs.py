@@ -3,14 +3,12 @@ files, export."""
 
 import base64
 import dataclasses
-import functools
 import hashlib
 import json
 import math
 import os
 import shutil
 import signal
-import struct
 import subprocess
 import sys
 import typing
@@ -19,10 +17,10 @@ from pathlib import Path
 import jsonschema
 import numpy as np
 import pytest
-import zstandard
 from mcap.reader import make_reader
-from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
+from mcap.records import Attachment, Chunk, Header, Message, Metadata
 from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.writer import CompressionType, IndexType, Writer
 
 from tests.reference import logs as episode
 from tests.reference.world import path_position
@@ -30,14 +28,13 @@ from uuvtai.closed_form import KIND_NAMES, body_positions
 from uuvtai.files import FileError
 from uuvtai.kernels.core import geometry, grid
 from uuvtai.loader import load_config
-from uuvtai.logs.container import CHUNK_MAX, CHUNK_MIN, McapFile
+from uuvtai.logs.container import McapFile
 from uuvtai.logs.log_errors import LogError
 from uuvtai.logs.log_export import export, file_name
 from uuvtai.logs.log_recorder import NO_POLICY
 from uuvtai.logs.mcap_log import McapEpisodeLog
 from uuvtai.logs.moment import Moment
 from uuvtai.logs.reader import info, read_head, read_messages
-from uuvtai.logs.recording import load_recording
 from uuvtai.logs.repair import repair
 from uuvtai.logs.topic_stream import SIGNS
 from uuvtai.logs.topics import TOPICS
@@ -229,9 +226,7 @@ def test_times_are_simulation_time_from_zero(log_path):
 def test_metadata_and_attachments_come_first_and_the_result_last(log_path):
     with log_path.open("rb") as file:
         kinds = [type(record) for record in StreamReader(file, emit_chunks=True).records]
-    data = kinds[: kinds.index(Chunk)]
-    assert [kind for kind in data if kind in (Metadata, Attachment)] == [Metadata, Attachment, Attachment]
-    assert data.index(Metadata) < min(data.index(Schema), data.index(Channel))
+    assert kinds[: kinds.index(Chunk)] == [Header, Metadata, Attachment, Attachment]
     behind = kinds[len(kinds) - kinds[::-1].index(Chunk) :]
     assert Metadata in behind and Attachment not in behind
     head = read_head(log_path)
@@ -251,13 +246,20 @@ def test_metadata_and_attachments_come_first_and_the_result_last(log_path):
     assert json.loads(head.attachments["scenario.json"]) == episode.scenario()
 
 
-def test_chunks_are_zstd_of_64_to_256_kib(log_path):
-    with log_path.open("rb") as file:
-        chunks = make_reader(file).get_summary().chunk_indexes
-    assert {chunk.compression for chunk in chunks} == {"zstd"}
-    assert len(chunks) > 10
-    assert all(CHUNK_MIN <= chunk.uncompressed_size <= CHUNK_MAX for chunk in chunks[:-1])
-    assert chunks[-1].uncompressed_size <= CHUNK_MAX
+def test_chunks_hold_a_hundredth_of_the_messages_or_one_step(log_path):
+    written = 0
+    for chunk in chunks_of(log_path):
+        stamps = [record.log_time for record in breakup_chunk(chunk) if isinstance(record, Message)]
+        written += len(stamps)
+        assert chunk.compression == "zstd" and (len(set(stamps)) == 1 or len(stamps) <= 0.01 * written)
+    assert written == len(messages(log_path))
+
+
+def chunks_of(path):
+    with path.open("rb") as file:
+        return [
+            record for record in StreamReader(file, emit_chunks=True).records if isinstance(record, Chunk)
+        ]
 
 
 def test_sonar_is_logged_as_sensed(log_path, snaps):
@@ -630,8 +632,8 @@ with McapEpisodeLog(Path(sys.argv[1]), episode.header()) as log:
 """
 
 
-@pytest.mark.parametrize(("maps", "kill_at"), [("none", 1500), ("none", 6001), ("maps", 3333)])
-def test_sigkill_loses_at_most_two_percent(tmp_path, maps, kill_at):
+@pytest.mark.parametrize(("maps", "kill_at"), [("none", 2001), ("none", 6001), ("maps", 3333)])
+def test_sigkill_loses_at_most_one_percent(tmp_path, maps, kill_at):
     path = tmp_path / "a.mcap"
     root = Path(__file__).parent.parent
     environment = {**os.environ, "PYTHONPATH": str(root)}
@@ -648,7 +650,7 @@ def test_sigkill_loses_at_most_two_percent(tmp_path, maps, kill_at):
     saved = repair(part)
     assert saved.path == tmp_path / "a.repaired.mcap"
     assert part.read_bytes() == before
-    assert saved.messages >= 0.98 * sent
+    assert saved.messages >= 0.99 * sent
     assert (
         len(messages(saved.path)) == saved.messages
     )  # the official reader agrees, with indexes and checksums
@@ -659,34 +661,33 @@ def test_sigkill_loses_at_most_two_percent(tmp_path, maps, kill_at):
 
 
 def test_a_file_cut_anywhere_gives_back_a_prefix(log_path, tmp_path):
-    """At least every chunk that is whole, and never anything that was not there."""
+    """Every chunk that is whole, and nothing else."""
     whole, data = log_path.read_bytes(), [m[4] for m in messages(log_path)]
     with log_path.open("rb") as file:
         ends = [
             (index.chunk_start_offset + index.chunk_length)
             for index in make_reader(file).get_summary().chunk_indexes
         ]
-    with log_path.open("rb") as file:
-        sizes = [
-            len(breakup_chunk(record))
-            for record in StreamReader(file, emit_chunks=True).records
-            if isinstance(record, Chunk)
-        ]
+    sizes = [
+        sum(isinstance(record, Message) for record in breakup_chunk(chunk)) for chunk in chunks_of(log_path)
+    ]
     recovered = []
     for i, cut in enumerate(np.linspace(ends[0], len(whole), 25).astype(int)):
         path = tmp_path / f"{i}.mcap"
         path.write_bytes(whole[:cut])
         saved = repair(path, tmp_path / f"{i}.out.mcap")
         assert [m[4] for m in messages(saved.path)] == data[: saved.messages]
-        assert saved.messages >= sum(size for size, end in zip(sizes, ends, strict=True) if end <= cut)
+        assert saved.messages == sum(size for size, end in zip(sizes, ends, strict=True) if end <= cut)
         assert saved.complete == (cut == len(whole))
         recovered.append(saved.messages)
     assert recovered == sorted(recovered) and recovered[-1] == len(data)
 
 
-def test_a_damaged_chunk_costs_only_itself(log_path, tmp_path):
+@pytest.mark.parametrize("number", [0, 4])
+def test_a_damaged_chunk_costs_only_itself(log_path, tmp_path, number):
+    """The first one too, which declares the channels: the summary repeats them."""
     with log_path.open("rb") as file:
-        index = make_reader(file).get_summary().chunk_indexes[4]
+        index = make_reader(file).get_summary().chunk_indexes[number]
     spoiled = bytearray(log_path.read_bytes())
     middle = index.chunk_start_offset + index.chunk_length // 2
     spoiled[middle : middle + 8] = b"\xff" * 8
@@ -731,7 +732,7 @@ def test_files_without_anything_in_them(tmp_path, content):
         info(tmp_path / "a.mcap")
     assert ("is not an MCAP file" in str(refused.value)) is not content.startswith(b"\x89MCAP0\r\n")
     assert ("uuv log repair" in str(refused.value)) is content.startswith(b"\x89MCAP0\r\n")
-    with pytest.raises(LogError, match="nothing can be recovered"):
+    with pytest.raises(LogError, match=r"nothing can be recovered|is not an MCAP file"):
         repair(tmp_path / "a.mcap", tmp_path / "out.mcap")
     assert [entry.name for entry in tmp_path.iterdir()] == ["a.mcap"]
 
@@ -746,10 +747,25 @@ def test_a_missing_file_is_named(tmp_path, tool):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_full_disk_leaves_nothing(tmp_path, snaps):
-    """/dev/full takes the part file's place."""
+@pytest.fixture
+def full_disk(monkeypatch):
+    """/dev/full takes the place of unfinished files."""
+    monkeypatch.setattr(
+        "uuvtai.logs.container.open_new", lambda _path: os.fdopen(os.open("/dev/full", 1), "wb")
+    )
+
+
+def test_a_planted_link_is_not_written_through(tmp_path, snaps):
+    (tmp_path / "mine").write_text("precious")
+    (tmp_path / "a.mcap.part").symlink_to(tmp_path / "mine")
+    with McapEpisodeLog(tmp_path / "a.mcap", episode.header()) as log:
+        log.write(snaps[0])
+        log.close(episode.result(0))
+    assert (tmp_path / "mine").read_text() == "precious" and info(tmp_path / "a.mcap")["messages"] > 0
+
+
+def test_a_full_disk_leaves_nothing(tmp_path, snaps, full_disk):
     path = tmp_path / "a.mcap"
-    (tmp_path / "a.mcap.part").symlink_to("/dev/full")
     with (
         pytest.raises(LogError, match=r"a\.mcap: cannot write the log \(No space left"),
         McapEpisodeLog(path, episode.header()) as log,
@@ -759,8 +775,7 @@ def test_a_full_disk_leaves_nothing(tmp_path, snaps):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_full_disk_during_repair_leaves_nothing(log_path, tmp_path):
-    (tmp_path / "b.mcap.repairing").symlink_to("/dev/full")
+def test_a_full_disk_during_repair_leaves_nothing(log_path, tmp_path, full_disk):
     with pytest.raises(LogError, match="cannot write the repaired log"):
         repair(log_path, tmp_path / "b.mcap")
     assert list(tmp_path.iterdir()) == []
@@ -772,82 +787,44 @@ def test_a_folder_that_cannot_be_made(tmp_path):
         McapEpisodeLog(tmp_path / "file" / "logs" / "a.mcap", episode.header())
 
 
-# ---------------------------------------------------------------------------------------------- hostile files
+# ---------------------------------------------------------------------------------------------- other writers
 
 
-def chunk_record(data, unpacked_size, compression=b"zstd"):
-    content = (
-        struct.pack("<QQQII", 0, 0, unpacked_size, 0, len(compression))
-        + compression
-        + struct.pack("<Q", len(data))
-        + data
-    )
-    return struct.pack("<BQ", 6, len(content)) + content
-
-
-@pytest.mark.parametrize("claimed", [1000, 1 << 40])
-def test_a_decompression_bomb_is_not_unpacked(tmp_path, claimed):
-    bomb = zstandard.ZstdCompressor().compress(bytes(200 << 20))
-    assert len(bomb) < 100_000
-    (tmp_path / "a.mcap").write_bytes(b"\x89MCAP0\r\n" + chunk_record(bomb, claimed))
-    with pytest.raises(LogError, match="unpack"):
-        info(tmp_path / "a.mcap")
-
-
-def test_a_record_longer_than_the_file_is_not_believed(tmp_path):
-    (tmp_path / "a.mcap").write_bytes(b"\x89MCAP0\r\n" + struct.pack("<BQ", 9, 1 << 60) + b"abc")
-    with pytest.raises(LogError, match="cut off"):
-        info(tmp_path / "a.mcap")
-
-
-def test_an_unknown_compression_is_named(tmp_path):
-    (tmp_path / "a.mcap").write_bytes(b"\x89MCAP0\r\n" + chunk_record(b"abc", 3, b"brot"))
-    with pytest.raises(LogError, match="brot"):
-        info(tmp_path / "a.mcap")
-
-
-def test_no_damage_ends_in_anything_but_a_clear_error(tmp_path):
-    """Random bytes in random places: every tool either works or raises LogError."""
+@pytest.mark.parametrize(
+    "words",
+    [
+        {"use_chunking": False},
+        {"compression": CompressionType.LZ4},
+        {"compression": CompressionType.NONE, "enable_data_crcs": True},
+        {"index_types": IndexType.NONE, "repeat_channels": False, "use_statistics": False},
+    ],
+    ids=str,
+)
+def test_records_of_other_writers_are_read(tmp_path, words):
+    """Small messages, and one of 24.9 MB, as a raw image of 3840 x 2160 pixels has."""
     path = tmp_path / "a.mcap"
-    with McapEpisodeLog(path, episode.header()) as log:
-        for snap in episode.snapshots(12):
-            log.write(snap)
-        log.close(episode.result(12))
-    whole, rng, failed = path.read_bytes(), np.random.default_rng(5), 0
-    for trial in range(120):
-        spoiled = bytearray(whole)
-        begin = int(rng.integers(8, len(whole))) if trial % 2 else int(rng.integers(8, 60_000) % len(whole))
-        spoiled[begin : begin + int(rng.integers(1, 12))] = rng.bytes(int(rng.integers(1, 12)))
-        path.write_bytes(spoiled)
-        for tool in (info, load_recording, functools.partial(repair, out=tmp_path / f"{trial}.mcap")):
-            try:
-                tool(path)
-            except LogError:
-                failed += 1
-    assert failed > 100
-
-
-def test_a_message_of_an_undeclared_channel(tmp_path):
-    file = McapFile(tmp_path / "a.mcap")
-    file._counts[9] = 0
-    file.add_message(9, 0, b"{}")
-    file.finish()
-    with pytest.raises(LogError, match="channel 9"):
-        list(read_messages(tmp_path / "a.mcap"))
-
-
-def test_records_of_other_writers_are_read(tmp_path):
-    """No chunks at all, as other tools may write."""
-    from mcap.writer import Writer
-
-    with (tmp_path / "a.mcap").open("wb") as file:
-        writer = Writer(file, use_chunking=False)
+    with path.open("wb") as file:
+        writer = Writer(file, **words)
         writer.start()
         schema = writer.register_schema("uuv.Safety", "jsonschema", b"{}")
         channel = writer.register_channel("/safety", "json", schema)
-        writer.add_message(channel, 5, b'{"clearance_m":1}', 5)
+        for i, size in enumerate((5, 24_900_000, 7)):
+            writer.add_message(channel, i, json.dumps({"x": "-" * size}).encode(), i)
         writer.finish()
-    assert info(tmp_path / "a.mcap")["messages"] == 1
+    assert [len(m.data["x"]) for m in read_messages(path)] == [5, 24_900_000, 7]
+    assert repair(path).complete
+
+
+def test_the_map_of_a_large_world_is_written_and_read(tmp_path):
+    """200 x 100 m: 11 MB a layer, and four of them in a step."""
+    file = McapFile(tmp_path / "a.mcap")
+    channels = [file.add_channel(f"/map/{i}", 0) for i in range(4)]
+    for step in range(2):
+        for channel in channels:
+            file.add_message(channel, step, json.dumps({"data": "A" * 10_700_000}).encode())
+        file.settle()
+    file.finish()
+    assert info(tmp_path / "a.mcap")["messages"] == 8 == sum(1 for _ in read_messages(tmp_path / "a.mcap"))
 
 
 # ----------------------------------------------------------------------------------------------------- export

@@ -81,28 +81,21 @@ def test_a_signal_whose_exception_was_swallowed_still_stops_a_training(tmp_path,
 _WITHIN_A_WRITE = """
 import os, signal, sys
 from pathlib import Path
+from mcap import writer
 from uuvtai import signals
 from uuvtai.logs import container
 
 signals.install()
 signals.engage()
-calls, make = [], container.zstandard.ZstdCompressor
+calls, compress = [], writer.zstandard.compress
 
-class Signalling:
-    def __init__(self, level):
-        self._inner = make(level=level).compressobj()
-    def compressobj(self):
-        return self
-    def compress(self, data):
-        return self._inner.compress(data)
-    def flush(self, mode):
-        packed = self._inner.flush(mode)
-        calls.append(mode)
-        if len(calls) == {call}:
-            os.kill(os.getpid(), signal.SIGINT)
-        return packed
+def signalling(data):
+    calls.append(len(data))
+    if len(calls) == {call}:
+        os.kill(os.getpid(), signal.SIGINT)
+    return compress(data)
 
-container.zstandard.ZstdCompressor = Signalling
+writer.zstandard.compress = signalling
 file = container.McapFile(Path("cut.mcap"))
 channel = file.add_channel("/numbers", 0)
 written = 0
@@ -117,9 +110,9 @@ except signals.Interrupted:
 """
 
 
-@pytest.mark.parametrize("call", [1, 2, 150])
+@pytest.mark.parametrize("call", [1, 150])
 def test_a_signal_within_a_write_loses_no_message(tmp_path, call):
-    """The first and second block of a chunk, and one of a later chunk."""
+    """The first chunk, and a later one."""
     process = started(tmp_path, program=_WITHIN_A_WRITE.format(call=call))
     out, err = process.communicate(timeout=60)
     found = repair(tmp_path / "cut.mcap.part")

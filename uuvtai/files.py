@@ -10,6 +10,7 @@ import os
 import re
 import stat
 from collections.abc import Iterable, Iterator, Sequence
+from io import BufferedReader
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -47,7 +48,7 @@ class FileError(UserError):
     """A file that is not read: what it is, why not, what to do."""
 
 
-def open_file(path: Path, limit: int = MAX_BYTES, folder: Path | None = None) -> BinaryIO:
+def open_file(path: Path, limit: int = MAX_BYTES, folder: Path | None = None) -> BufferedReader:
     """Open a regular file of at most ``limit`` bytes for reading; neither a FIFO nor a device is waited for.
 
     ``folder``: the file must lie below it, with no link among the names in between; without it a link counts

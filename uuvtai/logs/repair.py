@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import json
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
+from mcap.stream_reader import StreamReader
 
 from uuvtai.files import refuse_output
 from uuvtai.logs.container import McapFile
 from uuvtai.logs.log_errors import LogError
-from uuvtai.logs.reader import DamageError, Scanner, opened
+from uuvtai.logs.reader import DAMAGE, MAX_RECORD, opened, records
 
 
 @dataclass(frozen=True)
@@ -47,29 +49,29 @@ def repair(path: Path, out: Path | None = None, force: bool = False) -> Repair:
         if out is None
         else Path(out)
     )
-    with opened(path) as source:
-        refuse_output(out, [path], force)
-        try:
-            return _copied(path, Scanner(source, str(path)), out)
-        except OSError as error:
-            raise LogError(
-                f"{out}: cannot write the repaired log ({error.strerror}); choose another place with --out "
-                "FILE"
-            ) from error
+    declared = _declared(path)
+    refuse_output(out, [path], force)
+    try:
+        return _copied(path, declared, out)
+    except OSError as error:
+        raise LogError(
+            f"{out}: cannot write the repaired log ({error.strerror}); choose another place with --out FILE"
+        ) from error
 
 
-def _copied(path: Path, scanner: Scanner, out: Path) -> Repair:
-    damages = _Damages()
+def _copied(path: Path, declared: list[Any], out: Path) -> Repair:
+    damages: list[str] = []
     copy = _Copy(McapFile(out, ".repairing"))  # not .part: that may be the input
     try:
-        for record in _recovered(scanner, damages):
+        for record in itertools.chain(declared, records(path, damages=damages)):
             copy.add(record)
         if not copy.messages:
-            reason = damages.listed[0] if damages.listed else "it holds no messages"
+            reason = damages[0] if damages else "it holds no messages"
             raise LogError(
                 f"{path}: nothing can be recovered: {reason}; record the episode again with uuv eval --record"
             )
-        listed = damages.document()
+        more = len(damages) - MAX_DAMAGES
+        listed = damages[:MAX_DAMAGES] + ([f"and {more} more"] if more > 0 else [])
         if listed:
             copy.file.add_metadata(
                 "uuv.repair", {"messages": str(copy.messages), "damages": json.dumps(listed)}
@@ -81,36 +83,14 @@ def _copied(path: Path, scanner: Scanner, out: Path) -> Repair:
     return Repair(out, copy.messages, copy.last_ns / 1e9, not listed, tuple(listed))
 
 
-class _Damages:
-    """What was wrong, the first in words and the others counted."""
-
-    def __init__(self) -> None:
-        self.listed: list[str] = []
-        self._more = 0
-
-    def add(self, text: str) -> None:
-        if len(self.listed) < MAX_DAMAGES:
-            self.listed.append(text)
-        else:
-            self._more += 1
-
-    def document(self) -> list[str]:
-        return self.listed + ([f"and {self._more} more"] if self._more else [])
-
-
-def _recovered(scanner: Scanner, damages: _Damages) -> Iterator[Any]:
-    """Every record that can be read; what was wrong is added to ``damages``. Raises BudgetError."""
-    going = True
-    while going:
-        going = False
-        try:
-            yield from scanner.records()
-        except DamageError as damage:
-            damages.add(f"{damage.reason} (byte {scanner.at})")
-            yield from damage.records
-            going = damage.can_go_on or scanner.resume()
-    if not scanner.finished and not damages.listed:
-        damages.add(f"no end mark (byte {scanner.at})")
+def _declared(path: Path) -> list[Any]:
+    """Schemas and channels outside of chunks: the summary repeats those of the chunk that may be damaged."""
+    found: list[Any] = []
+    with opened(path) as file, contextlib.suppress(*DAMAGE):
+        for record in StreamReader(file, emit_chunks=True, record_size_limit=MAX_RECORD).records:
+            if isinstance(record, Schema | Channel):
+                found.append(record)
+    return found
 
 
 class _Copy:

@@ -16,10 +16,9 @@ from mcap.records import Attachment, Channel, Message, Metadata, Schema
 
 from uuvtai.files import refuse_output
 from uuvtai.loader import ConfigError, parsed_yaml
-from uuvtai.logs.budget import MAX_MESSAGE
 from uuvtai.logs.container import McapFile
 from uuvtai.logs.log_errors import LogError
-from uuvtai.logs.reader import LogHead, read_head, read_messages, records
+from uuvtai.logs.reader import MAX_RECORD, LogHead, read_head, read_messages, records
 from uuvtai.logs.ros_read import NAMES, READ, Reader
 from uuvtai.logs.ros_types import RosMessages
 from uuvtai.logs.ros_write import SOURCES, WRITTEN, Setup, ros_messages
@@ -257,7 +256,7 @@ class _Reading:
             self._made[channel.id] = self._log.add_channel(topic, self._known[title])
         reader = Reader(topic, self._setup, self._start_ns)
         data = reading.read(reader, self._ros.unpacked(record.data, schema.name))
-        if len(data) > MAX_MESSAGE:
+        if len(data) > MAX_RECORD:
             raise ValueError(f"{channel.topic}: {len(data):,} bytes, more than a log's message may have")
         self._log.add_message(self._made[channel.id], max(record.log_time - self._start_ns, 0), data)
         return True
