@@ -71,8 +71,7 @@ class TrainWatch(Protocol):
     def stop(self) -> None: ...
 
 
-_Alone = TypeVar("_Alone", "TwinTrainer", "TunerTrainer", "ForecastTrainer")
-"""trainers that one process has to itself"""
+_Trainer = TypeVar("_Trainer", "Trainer", "TwinTrainer", "TunerTrainer", "ForecastTrainer")
 AnyTrainer = Union["Trainer", "TwinTrainer", "TunerTrainer", "ForecastTrainer"]
 Evaluate = Callable[[AnyTrainer, LearningConfig], Metrics]
 """``eval/*`` of the policy as it is; training goes on as if nothing had been
@@ -132,7 +131,7 @@ def _train(
     elif config.twin.enabled:
         trainer = _twin_trainer(config, found, request.device)
     else:
-        trainer = _trainer(_env(config, request.device), config, found)
+        trainer = _trainer(config, found, request.device)
     env = getattr(trainer, "env", None)  # of those that learn in the simulator
     device = env.device.type if env else "cpu"
     if config.ppo.bfloat16 and not in_bfloat16(config.ppo, device):
@@ -185,19 +184,14 @@ def _env(config: LearningConfig, device: str) -> VectorEnv:
     return VectorEnv(sim, config.train.seed)
 
 
-def _trainer(env: VectorEnv, config: LearningConfig, checkpoint: Checkpoint | None) -> Trainer:
-    """A trainer that stands where the checkpoint does, or at the beginning."""
+def _trainer(config: LearningConfig, checkpoint: Checkpoint | None, device: str) -> Trainer:
+    """A trainer in the simulator that stands where the checkpoint does, or at the beginning."""
     from uuvtai.learn.train import Trainer
 
-    if checkpoint:
-        checkpoint.check_table(env.observation_table, config)
-    trainer = Trainer(env, config)
-    if checkpoint:
-        trainer.load_state(checkpoint.state(like=trainer.state()))
-    return trainer
+    return _continued(Trainer(_env(config, device), config), config, checkpoint)
 
 
-def _continued(trainer: _Alone, config: LearningConfig, checkpoint: Checkpoint | None) -> _Alone:
+def _continued(trainer: _Trainer, config: LearningConfig, checkpoint: Checkpoint | None) -> _Trainer:
     """A trainer that goes on from a checkpoint; as it is where there is none."""
     if checkpoint:
         checkpoint.check_table(trainer.observation_table, config)
@@ -273,9 +267,9 @@ class _Run:
             self._metrics = trainer.iterate()
             # an interrupt that something has swallowed within the iteration was received all the same
             is_stopped = pressed.is_set() or signals.was_received()
-            self._note_iteration(self._folder, is_stopped)
+            self._note_iteration(is_stopped)
         if self._saved != trainer.iteration:
-            self._save(self._folder)
+            self._save()
         if is_stopped:
             self._watch.note(f"saved; go on with: uuv train --resume {self._folder.path}")
         return not is_stopped
@@ -297,7 +291,7 @@ class _Run:
         self._watch.stop()
         self._recorder.close()
 
-    def _note_iteration(self, folder: RunFolder, is_stopped: bool) -> None:
+    def _note_iteration(self, is_stopped: bool) -> None:
         done, train = self._trainer.iteration, self._config.train
         is_evaluated = not is_stopped and train.evaluate_every > 0 and done % train.evaluate_every == 0
         if is_evaluated:
@@ -305,15 +299,15 @@ class _Run:
         self._recorder.write(done, self._metrics)
         self._watch.update(done, self._metrics, self._success_interval())
         if is_evaluated or done % train.checkpoint_every == 0:
-            self._save(folder)
+            self._save()
 
-    def _save(self, folder: RunFolder) -> None:
+    def _save(self) -> None:
         from uuvtai.learn import checkpoint
 
         trainer, table = self._trainer, self._trainer.observation_table
         score = self._metrics.get(SCORE)
         checkpoint.save(
-            folder.path / "checkpoints",
+            self._folder.path / "checkpoints",
             trainer.iteration,
             trainer.state(),
             self._config,
@@ -322,20 +316,20 @@ class _Run:
             score,
         )
         if self._config.forecaster.enabled:
-            self._export(folder)
+            self._export()
         if self._config.tuner.enabled:
-            self._write_stack(folder)
+            self._write_stack()
         self._saved = trainer.iteration
 
-    def _export(self, folder: RunFolder) -> None:
+    def _export(self) -> None:
         """The file that a stack forecasts with."""
         from uuvtai.learn.forecast_trainer import ForecastTrainer
         from uuvtai.mixture_weights import WEIGHTS
 
         assert isinstance(self._trainer, ForecastTrainer)
-        folder.write_bytes(WEIGHTS, self._trainer.exported())
+        self._folder.write_bytes(WEIGHTS, self._trainer.exported())
 
-    def _write_stack(self, folder: RunFolder) -> None:
+    def _write_stack(self) -> None:
         """The stack that drives with the tree's numbers as they are now, where ``--stack`` is taken."""
         from uuvtai.learn.tuned_pilot import tuned_sections
         from uuvtai.learn.tuner_trainer import TunerTrainer
@@ -344,7 +338,7 @@ class _Run:
         lines = [f"tree: {TRAINING_TREE}"]
         for section, factors in tuned_sections(self._trainer.centre).items():
             lines += [f"{section}:", *(f"  {name}: {value}" for name, value in factors.items())]
-        folder.write(STACK, "\n".join(lines) + "\n")
+        self._folder.write(STACK, "\n".join(lines) + "\n")
 
     def _success_interval(self) -> tuple[float, float] | None:
         """95 % interval of ``rollout/success_rate`` over the episodes that it is the mean of."""

@@ -1,1 +1,1 @@
-"""Episodes while they run: paced by the clock, served to viewers, steered by hand."""
+"""Episodes while they run: paced by the clock, served to viewers."""

@@ -19,7 +19,7 @@ _NEEDED = "foxglove.websocket"
 
 
 class LiveError(UserError, RuntimeError):
-    """Episodes cannot be shown live, or steered: what, where, why, what to type next."""
+    """Episodes cannot be shown live: what, where, why, what to type next."""
 
 
 class ViewerServer:
