@@ -31,8 +31,7 @@ from uuvtai.pilot import Mission, OnboardPilot
 from uuvtai.sim import Sim
 from uuvtai.sitl.instance import Instance
 from uuvtai.sitl.rows_of_water import WaterRows
-from uuvtai.sitl.serving import SitlPlan, SitlPort
-from uuvtai.sitl.simulated_operator import PLACE, PLACE_S, PLACED_S
+from uuvtai.sitl.serving import PLACE, PLACE_S, PLACED_S, SitlPlan, SitlPort
 from uuvtai.tree import read_tree
 
 THREADS = 1

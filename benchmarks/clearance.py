@@ -11,8 +11,8 @@ from benchmarks.common import Job, Row, seconds_per_call
 from tests.map_bits import put_layers
 from uuvtai import state
 from uuvtai.binding import bind
-from uuvtai.bounds import load_bounds
 from uuvtai.config import ClearanceConfig
+from uuvtai.initial import load_bounds
 from uuvtai.kernels.core.grid import outside_cells
 from uuvtai.kernels.core.lanes import LANES
 from uuvtai.kernels.planning import clearance

@@ -9,8 +9,8 @@ from tests import planning_maps as maps
 from tests.bundles import io_for
 from tests.reference.voronoi import clearance_of
 from uuvtai import state
-from uuvtai.bounds import load_bounds
 from uuvtai.config import Config
+from uuvtai.initial import load_bounds
 from uuvtai.kernels.planning.bundles import RouteIO, VoronoiIO
 
 N_ENV = 8

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from tests.bundles import io_for
 from tests.map_bits import put_layers
 from tests.reference.clearance import clearance_of, sites_of
-from uuvtai.bounds import load_bounds
 from uuvtai.config import ClearanceConfig, MappingConfig, TankConfig, VoronoiConfig
+from uuvtai.initial import load_bounds
 from uuvtai.kernels.core.grid import grid_shape, outside_cells
 from uuvtai.kernels.core.lanes import LANES
 from uuvtai.kernels.planning import clearance

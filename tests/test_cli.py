@@ -81,10 +81,6 @@ from uuvtai.show.screen import Screen
         (["simulate", "--seconds", "1", "--wrench", "1,2"], "give 6 finite numbers"),
         (["simulate", "--seconds", "1", "--wrench", "1,2,3,4,5,inf"], "give 6 finite numbers"),
         (["simulate", "--seconds", "1", "--dt", "0"], "dt"),
-        (
-            ["simulate", "--seconds", "1", "--attitude-hold", "ideel"],
-            "--attitude-hold ideel: use ideal, thrusters or none",
-        ),
         (["simulate", "--seconds", "1", "--vehicle", "bluerov9"], "did you mean"),
         (["profile", "--num-envs", "1,x"], "whole numbers"),
         (["profile", "--num-envs", "0"], "at least 1 env"),

@@ -80,7 +80,7 @@ def test_what_may_be_typed_stands_beside_every_option(words):
         for option in parameter.opts:
             if option in listed:
                 assert all(name in answer for name in preset_names(listed[option])), f"{words} {option}"
-            if option in ("--device", "--engine", "--budget", "--attitude-hold"):
+            if option in ("--device", "--engine", "--budget"):
                 assert "|" in parameter.metavar
 
 
@@ -95,7 +95,6 @@ def test_what_may_be_typed_stands_beside_every_option(words):
         (["profile", "--device", "cup"], "did you mean 'cpu'"),
         (["sweep", "--engine", "rai"], "--engine rai: use local or ray; did you mean 'ray'?"),
         (["reproduce", "--budget", "quik"], "did you mean 'quick'"),
-        (["simulate", "--seconds", "1", "--attitude-hold", "thruster"], "did you mean 'thrusters'"),
         (["presets", "show", "gauntlt"], "did you mean 'gauntlet' (world)?"),
         (["presets", "show", "curiculum"], "did you mean 'curriculum' (train)?"),
         (["presets", "show", "train/curiculum"], "did you mean 'curriculum'"),

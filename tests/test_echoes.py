@@ -6,8 +6,8 @@ import pytest
 from tests.bundles import io_for
 from tests.map_bits import get_map
 from tests.test_tracking import CONFIG, ELEVATION, FORECAST
-from uuvtai.bounds import load_bounds
 from uuvtai.config import DepthConfig, EpisodeConfig, MappingConfig, PoseConfig, TankConfig, VehicleConfig
+from uuvtai.initial import load_bounds
 from uuvtai.kernels.core.grid import grid_origin, grid_shape, outside_cells
 from uuvtai.kernels.perception import echoes, mapping, pose, tracking
 from uuvtai.kernels.perception.bundles import EchoesIO, MappingIO, PoseIO, TrackingIO

@@ -345,19 +345,6 @@ def test_fingerprint_tells_observations_apart(env):
     )
 
 
-def test_what_is_not_finite_is_told_by_column(env):
-    obs, _info = env.reset(seed=SEED)
-    assert env.not_finite() == {}
-    rollout, reward = obs.repeat(5, 1, 1), torch.zeros(5, N)
-    assert env.not_finite(rollout, reward) == {}
-    assert env.not_finite(rollout, torch.full((5, N), 3e38)) == {}, "a sum that overflows is no NaN"
-    rollout[2, 3, env.columns["depth"]] = torch.nan
-    rollout[4, :, env.columns["sector_ttc"].start + 5] = torch.inf
-    rollout[4, 0, env.columns["sector_ttc"].start + 6] = -torch.inf
-    reward[1, 1] = torch.nan
-    assert env.not_finite(rollout, reward) == {"depth": 1, "sector_ttc": N + 1, "reward": 1}
-
-
 def test_gradients_do_not_leak_into_the_simulator(env):
     env.reset(seed=SEED)
     action = full([0.1, 0, 0, 0]).requires_grad_()

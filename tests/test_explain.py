@@ -761,7 +761,7 @@ def test_bad_combinations_are_one_message(capfd, arguments, says):
 
 
 def test_the_table_is_printed_and_no_failure_is_said(capfd):
-    from uuvtai.show.cause_table import show_causes
+    from uuvtai.show.evaluation import show_causes
     from uuvtai.show.screen import Screen
 
     causes_found = table_of(

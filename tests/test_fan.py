@@ -9,7 +9,6 @@ from tests.bundles import io_for
 from tests.map_bits import get_map
 from tests.reference import scenes
 from tests.reference.sonar import body_hits, doppler_by_differences, wall_hits
-from uuvtai.bounds import load_bounds
 from uuvtai.config import (
     DepthConfig,
     EpisodeConfig,
@@ -19,6 +18,7 @@ from uuvtai.config import (
     TankConfig,
 )
 from uuvtai.errors import UserError
+from uuvtai.initial import load_bounds
 from uuvtai.kernels.core.beams import beam_bearing, beam_there, beam_towards
 from uuvtai.kernels.core.grid import grid_origin, grid_shape, outside_cells
 from uuvtai.kernels.core.signature import AnyTensor, Const

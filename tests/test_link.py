@@ -26,12 +26,11 @@ from tests.mavlink_vehicle import (
 from uuvtai.link import dialect, onboard_loop, orders
 from uuvtai.link.dialect import MavCodec
 from uuvtai.link.endpoint import LONGEST, Endpoint, LinkPlace, place_of
-from uuvtai.link.intake import Intake
+from uuvtai.link.intake import Intake, SourceClock
 from uuvtai.link.link_errors import LinkError
 from uuvtai.link.link_log import LinkLog
 from uuvtai.link.onboard_loop import OnboardLoop
 from uuvtai.link.sectors import ping_of, sectors_of
-from uuvtai.link.source_clock import SourceClock
 from uuvtai.logs.reader import read_messages
 from uuvtai.pilot import DvlReading, ImuReading, PositionFix, PressureReading, SonarPing
 

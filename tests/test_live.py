@@ -15,8 +15,7 @@ from websockets.sync.client import connect
 
 from tests.command import uuv
 from uuvtai.live import viewer_server
-from uuvtai.live.broadcast import Broadcast
-from uuvtai.live.real_time import RealTime
+from uuvtai.live.broadcast import Broadcast, RealTime
 from uuvtai.live.viewer_server import LiveError, ViewerServer
 from uuvtai.logs.log_recorder import EpisodeRecorder
 

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from tests.bundles import io_for
 from tests.map_bits import check_bits, get_map, put_map
 from tests.reference.mapping import MapOracle, rotation
-from uuvtai.bounds import load_bounds
 from uuvtai.config import DepthConfig, EpisodeConfig, MappingConfig, SonarConfig, TankConfig
+from uuvtai.initial import load_bounds
 from uuvtai.kernels.core.geometry import BOX, CYLINDER, NONE
 from uuvtai.kernels.core.grid import grid_origin, grid_shape, outside_cells
 from uuvtai.kernels.perception import mapping

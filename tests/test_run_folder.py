@@ -137,11 +137,12 @@ def test_of_two_processes_that_begin_in_one_folder_exactly_one_does(tmp_path):
 def test_a_run_is_held_from_its_first_file_to_its_end(tmp_path):
     folder = RunFolder(tmp_path / "run", load_config("pool"), [0])
     with pytest.raises(RunFolderError, match="another process is working in this folder"):
-        RunFolder.reopen(folder.path, {})
+        RunFolder.held(folder.path)
     with pytest.raises(RunFolderError, match="already there and not empty"):
         RunFolder(folder.path, load_config("pool"), [0])
     folder.finish("finished", 0)
-    again = RunFolder.reopen(folder.path, {"from": 1})
+    again = RunFolder.held(folder.path)
+    again.go_on({"from": 1})
     assert json.loads((folder.path / "run.json").read_text())["resumed"][0]["from"] == 1
     with pytest.raises(RunFolderError, match="another process"):
         RunFolder.held(folder.path)
@@ -153,13 +154,6 @@ def test_what_is_no_run_folder_is_left_as_it_is(tmp_path):
     with pytest.raises(RunFolderError, match="'uuv sweep' printed"):
         RunFolder.held(tmp_path, "uuv sweep")
     assert files_in(tmp_path) == ["mine.txt"]
-
-
-def test_a_folder_that_cannot_be_gone_on_with_is_let_go(tmp_path):
-    (tmp_path / "run.json").write_text("{")
-    for _ in range(2):
-        with pytest.raises(RunFolderError, match=r"run\.json: cannot be read"):
-            RunFolder.reopen(tmp_path, {})
 
 
 def test_an_evaluation_holds_its_folder(tmp_path, monkeypatch):

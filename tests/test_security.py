@@ -490,7 +490,7 @@ def with_link(here, name):
 @pytest.mark.parametrize(
     "open_it",
     [
-        lambda run: RunFolder.reopen(run, {}),
+        RunFolder.held,
         lambda run: train(TrainRequest(resume=run), Quiet(), evaluate_now),
         lambda run: resume_sweep(run, None, Quiet()),
         lambda run: resume_reproduction(run, Quiet()),
@@ -499,7 +499,7 @@ def with_link(here, name):
         lambda run: report([run, run], run.parent / "new.html", force=True),
     ],
     ids=[
-        "reopen",
+        "held",
         "train --resume",
         "sweep --resume",
         "reproduce --resume",
@@ -693,7 +693,7 @@ def test_a_record_cannot_name_a_tree_elsewhere(here, name):
 def test_the_record_of_a_run_is_read_without_trust(here, content):
     (here / "run.json").write_bytes(content)
     with pytest.raises(RunFolderError, match=r"run\.json: cannot be read"):
-        RunFolder.reopen(here, {})
+        RunFolder.held(here).go_on({})
 
 
 # ------------------------------------------------------------------------------------------ exported policies

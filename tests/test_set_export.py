@@ -17,9 +17,8 @@ from uuvtai.deploy import export as deploy
 from uuvtai.deploy import run_policy, run_set_policy, set_columns_text
 from uuvtai.deploy.golden import TOLERANCE
 from uuvtai.deploy.graph import missing_packages
-from uuvtai.deploy.set_golden import golden_rows
+from uuvtai.deploy.set_graph import golden_rows, kind_of, module_of, set_weights
 from uuvtai.deploy.set_spec import hull_rule_of
-from uuvtai.deploy.set_weights import kind_of, module_of, set_weights
 from uuvtai.forecast_codes import COLUMNS, N_COLUMN
 from uuvtai.learn import checkpoint, mixture_net, set_policy
 from uuvtai.learn.checkpoint import CheckpointError

@@ -9,8 +9,7 @@ from uuvtai.learn import side_by_side as pieces
 from uuvtai.learn.policy import log_prob
 from uuvtai.learn.ppo import surrogate_loss
 from uuvtai.learn.set_losses import CACHE_ROWS, SetLosses, by_part
-from uuvtai.learn.set_policy import SetActor, SetCritic
-from uuvtai.learn.set_pooling import MaxAndSum
+from uuvtai.learn.set_policy import MaxAndSum, SetActor, SetCritic
 from uuvtai.learn.side_by_side import side_by_side
 
 ROWS, LANES, N_BODY, N_OWN, N_TRUTH = CACHE_ROWS + 77, 3, 5, 7, 4

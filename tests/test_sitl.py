@@ -26,11 +26,10 @@ from uuvtai.loader import load_config
 from uuvtai.pilot import DvlReading, SonarPing
 from uuvtai.sitl import serving
 from uuvtai.sitl.fdm_reply import Motion, euler_of, reply_of
-from uuvtai.sitl.instance import Instance
+from uuvtai.sitl.instance import Instance, frame_of, turn_of
 from uuvtai.sitl.reported_sensors import ReportedSensors
 from uuvtai.sitl.rows_of_water import WaterRows
 from uuvtai.sitl.serving import SitlPlan, SitlPort
-from uuvtai.sitl.servo_frames import frame_of, turn_of
 
 NEUTRAL = (1500,) * 16
 GOLDEN_PACKET = bytes.fromhex(

@@ -10,8 +10,7 @@ from rich.console import Console
 
 from tests import report_samples as samples
 from uuvtai.measure.evaluate.paired import paired
-from uuvtai.show.cause_table import show_causes
-from uuvtai.show.evaluation import show_methods, show_pairs
+from uuvtai.show.evaluation import show_causes, show_methods, show_pairs
 from uuvtai.show.exports import show_export
 from uuvtai.show.health import show_checks
 from uuvtai.show.logs import show_log

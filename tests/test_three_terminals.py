@@ -13,19 +13,17 @@ import pytest
 from benchmarks.peers.stand_in_autopilot import StandIn
 from tests.mavlink_vehicle import FakeSub, WishfulPilot, link_config
 from uuvtai.link.endpoint import Endpoint, LinkPlace
-from uuvtai.link.flight_notes import DEAF_S, FlightNotes
 from uuvtai.link.flight_plan import FlightPlan
 from uuvtai.link.followed_endpoint import SILENT_S, FollowedEndpoint
 from uuvtai.link.link_errors import LinkError
 from uuvtai.link.link_log import LinkLog
-from uuvtai.link.onboard_loop import OnboardLoop
+from uuvtai.link.onboard_loop import DEAF_S, FlightNotes, OnboardLoop
 from uuvtai.link.safety import STOP, SafeAction, SafeDecision, SafetyLimits
 from uuvtai.pilot import ImuReading, Mission, PositionFix
 from uuvtai.sitl.instance import Instance
 from uuvtai.sitl.rows_of_water import WaterRows
-from uuvtai.sitl.serving import SitlPlan, SitlPort
+from uuvtai.sitl.serving import SimulatedOperator, SitlPlan, SitlPort
 from uuvtai.sitl.serving_notes import ServingNotes
-from uuvtai.sitl.simulated_operator import SimulatedOperator
 
 HERE = LinkPlace("127.0.0.1", 0, False)
 ROW = 2

@@ -143,7 +143,7 @@ def test_bad_iterations_in_a_row_are_an_error_that_names_them():
 def test_a_gradient_that_is_not_finite_changes_nothing_and_is_told():
     trainer = Trainer(PointEnv(), config_of(distill={"schedule": [[0, 0]]}, world_model={"enabled": False}))
     trainer.iterate()
-    trainer.ppo.reduce = lambda tensors: tensors[0].fill_(math.nan)
+    trainer.policy.actor[0].weight.register_hook(lambda gradient: gradient * math.nan)
     before = [p.clone() for p in trainer.policy.actor.parameters()]
     metrics = trainer.iterate()
     assert metrics["train/skipped_updates"] == 4

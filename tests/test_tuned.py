@@ -14,9 +14,8 @@ from uuvtai.kernels.core.signature import AnyTensor, In
 from uuvtai.kernels.teacher.trajectories import tuned
 from uuvtai.learn import checkpoint
 from uuvtai.learn.checkpoint import CheckpointError
-from uuvtai.learn.number_search import NumberSearch
+from uuvtai.learn.number_search import BEND_MEAN, NumberSearch, best_near, fitted
 from uuvtai.learn.pilot import load_pilot
-from uuvtai.learn.response_surface import BEND_MEAN, best_near, fitted
 from uuvtai.learn.tuned_pilot import TunedPilot, load_tuned, tuned_sections
 from uuvtai.learn.tuner_trainer import TunerTrainer
 from uuvtai.loader import load_config, load_training, with_stack

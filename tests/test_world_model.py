@@ -11,8 +11,8 @@ from scipy import stats
 
 from tests.reference import world_model as reference
 from uuvtai.config.learning import UncertaintyConfig, WorldModelConfig
+from uuvtai.learn.distill import Uncertainty
 from uuvtai.learn.normalise import moments_of
-from uuvtai.learn.uncertainty import Uncertainty
 from uuvtai.learn.world_model import (
     LOG_VAR_BOUNDS,
     N_TARGET,

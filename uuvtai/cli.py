@@ -126,13 +126,11 @@ def simulate(
     driver: groups.DriverGroup,
     output: groups.OutputGroup,
     vehicle: opt.SimulateVehicle = "bluerov2",
-    attitude_hold: opt.AttitudeHold = None,
     overrides: opt.Set = None,
 ) -> None:
     """Open-loop physics in open water, to validate a vehicle against theory or data; or, with --controller,
     one vehicle that is driven to a goal."""
-    hold = [f"vehicle.attitude_hold={attitude_hold}"] if attitude_hold else []
-    config = SceneOptions("open", "clean", vehicle, overrides=[*(overrides or []), *hold]).config()
+    config = SceneOptions("open", "clean", vehicle, overrides=overrides).config()
     from uuvtai.measure.simulate import simulate as run
     from uuvtai.show.simulation import show_simulation
 

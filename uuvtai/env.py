@@ -181,26 +181,6 @@ class VectorEnv:
         write_leaf(sim.io.teacher, info["leaf"])
         return self._obs, sim.reward, self._terminated, self._truncated, dict(info)
 
-    def not_finite(
-        self, obs: torch.Tensor | None = None, reward: torch.Tensor | None = None
-    ) -> dict[str, int]:
-        """How many values are NaN or infinite, by column of the observation and for 'reward'; empty = none
-        is.
-
-        ``obs`` (..., num_obs) and ``reward`` may be those of a whole rollout (default: the newest): one pass
-        over them, one wait.
-        """
-        values = self._obs if obs is None else obs
-        rewards = self.sim.reward if reward is None else reward
-        if bool(
-            torch.isfinite(values.sum() + rewards.sum())
-        ):  # whatever is not finite makes a sum so; large numbers may too
-            return {}
-        counts = (~torch.isfinite(values)).reshape(-1, self.num_obs).sum(dim=0)
-        found = {name: int(counts[place].sum()) for name, place in self.columns.items()}
-        found["reward"] = int((~torch.isfinite(rewards)).sum())
-        return {name: count for name, count in found.items() if count > 0}
-
     @property
     def node_names(self) -> tuple[str, ...]:
         """What the nodes of the behaviour tree are called, in the order of ``info["leaf"]``."""

@@ -9,12 +9,13 @@ import numpy as np
 
 from uuvtai import state
 from uuvtai.allocation import allocation_matrices
-from uuvtai.bounds import load_bounds
 from uuvtai.config import Config
+from uuvtai.kernels.core.bits import WORD
 from uuvtai.kernels.core.grid import outside_cells
 from uuvtai.scenario import load_fixed
 from uuvtai.stages import SimState
-from uuvtai.taichi_patches.memory import Put
+from uuvtai.state import GridMask
+from uuvtai.taichi_patches.memory import Put, put_by_kernel
 from uuvtai.tuned_numbers import configured_factors
 
 LENGTHENED = (
@@ -52,3 +53,12 @@ def fill_constants(s: SimState, config: Config, put: Put) -> None:
     wrench_of_thrust, thrust_of_wrench = allocation_matrices(config.vehicle)
     put(s.allocation.wrench_of_thrust, wrench_of_thrust.astype(np.float32))
     put(s.allocation.thrust_of_wrench, thrust_of_wrench.astype(np.float32))
+
+
+def load_bounds(mask: GridMask, outside: np.ndarray, put: Put = put_by_kernel) -> None:
+    """``outside``: booleans (n_row, n_col), True outside the tank (``kernels.grid.outside_cells``)."""
+    n_row, n_col = outside.shape
+    padded = np.zeros((n_row, -(-n_col // WORD) * WORD), dtype=bool)
+    padded[:, :n_col] = outside
+    put(mask.outside, outside.astype(np.int32))
+    put(mask.outside_bits, np.packbits(padded, axis=1, bitorder="little").view("<u8").astype(np.uint64))

@@ -193,14 +193,6 @@ TrainSensors = Annotated[
 
 SimulateSeconds = Annotated[float, Option("--seconds", help="Duration \\[s].")]
 SimulateVehicle = Annotated[str, _preset("--vehicle", "vehicle", f"Vehicle: {_VEHICLES}, or a YAML file.")]
-AttitudeHold = Annotated[
-    str | None,
-    choices.choice(
-        "--attitude-hold",
-        ("ideal", "thrusters", "none"),
-        "What holds roll and pitch \\[default: the vehicle's own].",
-    ),
-]
 Wrench = Annotated[str | None, Option("--wrench", help="Constant body wrench fx,fy,fz,mx,my,mz [N, N m].")]
 Command = Annotated[
     str | None, Option("--command", help="Body velocity command u,v,w,r \\[m/s, rad/s] for the inner loop.")

@@ -106,18 +106,6 @@ class RunFolder:
         self.write_json(_RECORD, self._record)
 
     @classmethod
-    def reopen(cls, path: Path, since: dict[str, Any]) -> RunFolder:
-        """Hold and go on with a run that ended or was killed; ``since`` says from where. Raises
-        RunFolderError."""
-        folder = cls.held(path)
-        try:
-            folder.go_on(since)
-        except BaseException:
-            folder.release()
-            raise
-        return folder
-
-    @classmethod
     def held(cls, path: Path, command: str = "uuv") -> RunFolder:
         """The folder of a run that ended or was killed, held, and nothing read or changed in it yet;
         ``go_on`` comes next.

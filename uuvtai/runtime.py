@@ -39,7 +39,7 @@ LOOP_PARTS = 16
 all"""
 
 
-def start_taichi(device: str = "cpu", precision: str = "f32", fast_math: bool = False) -> Runtime:
+def start_taichi(device: str = "cpu", precision: str = "f32") -> Runtime:
     """Start Taichi on ``device`` ('auto', 'cpu' or 'cuda'), or return the runtime that is already up.
 
     A second ``ti.init`` would destroy every field, so a process has one runtime; asking for another kind is
@@ -63,7 +63,7 @@ def start_taichi(device: str = "cpu", precision: str = "f32", fast_math: bool = 
         ti.init(
             arch=ti.cuda if wanted.device == "cuda" else ti.cpu,
             default_fp=wanted.real,
-            fast_math=fast_math,
+            fast_math=False,
             offline_cache=True,
             offline_cache_max_size_of_files=CACHE_BYTES,
             cfg_optimization=False,  # LLVM does that work again: half of the time to compile, equal results;

@@ -12,8 +12,8 @@ Z95 = 1.959963984540054
 """Two-sided 95 % quantile of the standard normal."""
 
 
-def wilson_interval(k: int, n: int, z: float = Z95) -> tuple[float, float] | None:
-    """Wilson score interval of k successes in n trials (Wilson 1927); None when there are no trials.
+def wilson_interval(k: int, n: int) -> tuple[float, float] | None:
+    """95 % Wilson score interval of k successes in n trials (Wilson 1927); None when there are no trials.
 
     Raises ValueError unless 0 <= k <= n.
     """
@@ -22,9 +22,9 @@ def wilson_interval(k: int, n: int, z: float = Z95) -> tuple[float, float] | Non
     if n == 0:
         return None
     p = k / n
-    scale = 1.0 / (1.0 + z * z / n)
-    centre = scale * (p + z * z / (2 * n))
-    half = scale * z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    scale = 1.0 / (1.0 + Z95 * Z95 / n)
+    centre = scale * (p + Z95 * Z95 / (2 * n))
+    half = scale * Z95 * math.sqrt(p * (1 - p) / n + Z95 * Z95 / (4 * n * n))
     # the bounds are exact at the ends; rounding must not leave 0.9999999 for 10/10
     return (0.0 if k == 0 else max(0.0, centre - half), 1.0 if k == n else min(1.0, centre + half))
 

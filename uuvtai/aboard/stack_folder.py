@@ -34,8 +34,8 @@ CHECKED_STEPS = 500
 _ROOT = Path(__file__).parents[1]
 _COPIED = (
     "pilot/carrying.py", "pilot/fed_pilot.py", "pilot/fed_sensors.py", "pilot/inbox.py", "pilot/mission.py",
-    "pilot/motion_watch.py", "pilot/own_motion.py", "pilot/pilot_numbers.py", "pilot/pose_history.py",
-    "pilot/sensor_messages.py", "plan_codes.py", "aboard/carried_stack.py", "aboard/stack_check.py",
+    "pilot/motion_watch.py", "pilot/own_motion.py", "pilot/pilot_numbers.py", "pilot/sensor_messages.py",
+    "plan_codes.py", "aboard/carried_stack.py", "aboard/stack_check.py",
 )  # fmt: skip
 """the frame around the kernels"""
 

@@ -13,7 +13,6 @@ from uuvtai.config.baselines import (
     PotentialFieldConfig,
     VelocityObstacleConfig,
 )
-from uuvtai.config.execution import RuntimeConfig
 from uuvtai.config.perception import (
     ElevationConfig,
     ForecastConfig,
@@ -34,7 +33,6 @@ from uuvtai.config.sensors import (
 )
 from uuvtai.config.task import EpisodeConfig, RewardConfig
 from uuvtai.config.teacher import TeacherConfig
-from uuvtai.config.traffic import TrafficConfig
 from uuvtai.config.tuned import FastConfig, SlowConfig
 from uuvtai.config.vehicle import ActuationConfig, DisturbanceConfig, Thruster, VehicleConfig
 from uuvtai.config.world import (
@@ -42,9 +40,17 @@ from uuvtai.config.world import (
     FixedObstacle,
     StaticObstacles,
     TankConfig,
+    TrafficConfig,
     Waypoint,
     WorldConfig,
 )
+
+
+class RuntimeConfig(Section):
+    """How kernels are launched."""
+
+    native: bool = True
+    """by machine code of their own, kept on disk, instead of by Taichi (CPU, Linux): ``docs/native.md``"""
 
 
 class Config(Section):

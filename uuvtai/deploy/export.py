@@ -25,9 +25,8 @@ from uuvtai.deploy.golden import Arrays, golden_of, npz_bytes
 from uuvtai.deploy.graph import INPUTS, ExportedModule, OneDecision, missing_packages, onnx_bytes
 from uuvtai.deploy.run_policy import FILES, GOLDEN, SPEC, WEIGHTS, PolicyError
 from uuvtai.deploy.set_card import set_card
-from uuvtai.deploy.set_golden import golden_rows
+from uuvtai.deploy.set_graph import golden_rows, kind_of, module_of, set_weights
 from uuvtai.deploy.set_spec import set_specification
-from uuvtai.deploy.set_weights import kind_of, module_of, set_weights
 from uuvtai.deploy.spec import ONNX, specification
 from uuvtai.deploy.weights import weights_of
 from uuvtai.errors import UserError

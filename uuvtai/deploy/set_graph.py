@@ -1,14 +1,19 @@
-"""A policy over a set of bodies and a learned forecast as torch modules that become ONNX graphs. Neither
-remembers anything."""
+"""A policy over a set of bodies and a learned forecast as torch modules that become ONNX graphs, their
+arrays, and what they say to made-up inputs. Neither remembers anything; no critic is among them."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor
 
+from uuvtai.deploy.golden import Arrays
 from uuvtai.deploy.graph import ExportedModule
 from uuvtai.forecast_codes import COLUMNS
+from uuvtai.learn.checkpoint import Checkpoint
 from uuvtai.learn.mixture_net import MixtureNet
+from uuvtai.learn.set_networks import actor_of, mixture_net_of
 from uuvtai.learn.set_policy import SetActor
 from uuvtai.twin.set_codes import BODY_WIDTH, EGO_COLUMNS, N_BODY
 
@@ -79,3 +84,67 @@ class OneForecast(ExportedModule):
         """Shapes as FORECAST_INPUTS says."""
         padding = columns.new_zeros(columns.shape[0], self.net.into.in_features - COLUMNS)
         return tuple(self.net(torch.cat([columns, padding], dim=1), speed))
+
+
+_ROWS, _SEED = 64, 7
+_THERE = 0
+
+
+def golden_rows(decision: ExportedModule) -> Arrays:
+    """``pair_<input>`` and ``pair_<output>`` of 64 rows; the first has no body at all."""
+    rng = torch.Generator().manual_seed(_SEED)
+    inputs = _forecast_rows(decision, rng) if isinstance(decision, OneForecast) else _set_rows(rng)
+    with torch.no_grad():
+        said = decision.eval()(*inputs)
+    named = zip((*decision.inputs, *decision.outputs), (*inputs, *said), strict=True)
+    return {f"pair_{name}": tensor.numpy() for name, tensor in named}
+
+
+def _forecast_rows(decision: ExportedModule, rng: torch.Generator) -> tuple[Tensor, ...]:
+    (columns, _), _ = decision.example()
+    speed = 0.1 + 1.9 * torch.rand(_ROWS, generator=rng)
+    told = 0.5 * torch.randn(_ROWS, columns.shape[1], generator=rng)
+    told[:, 0] = speed
+    return told, speed
+
+
+def _set_rows(rng: torch.Generator) -> tuple[Tensor, ...]:
+    """Of any number of bodies."""
+    bodies = torch.randn(_ROWS, N_BODY, BODY_WIDTH, generator=rng)
+    own = torch.randn(_ROWS, EGO_COLUMNS, generator=rng)
+    count = torch.randint(1, N_BODY + 1, (_ROWS,), generator=rng)
+    count[0] = 0
+    bodies *= (torch.arange(N_BODY) < count[:, None])[..., None]
+    bodies[..., _THERE] = (torch.arange(N_BODY) < count[:, None]).float()
+    return bodies, own
+
+
+def kind_of(checkpoint: Checkpoint) -> str | None:
+    """One of ``run_policy.KINDS``; None = a policy of one observation vector."""
+    config = checkpoint.config
+    if config.forecaster.enabled:
+        return "forecast"
+    return "set" if config.twin.enabled else None
+
+
+def module_of(checkpoint: Checkpoint, kind: str) -> ExportedModule:
+    """The networks of a checkpoint of this kind. Raises CheckpointError where they cannot drive."""
+    if kind == "forecast":
+        return OneForecast(mixture_net_of(checkpoint))
+    return OneWish(actor_of(checkpoint))
+
+
+def set_weights(decision: ExportedModule) -> dict[str, Tensor]:
+    """Arrays by name, on the host, contiguous."""
+    found = dict(_named(decision))
+    return {name: tensor.detach().float().cpu().contiguous().clone() for name, tensor in found.items()}
+
+
+def _named(decision: ExportedModule) -> Iterator[tuple[str, Tensor]]:
+    if isinstance(decision, OneForecast):
+        for name, tensor in decision.net.state_dict().items():
+            yield name, tensor[:, : decision.example()[0][0].shape[1]] if name == "into.weight" else tensor
+        return
+    assert isinstance(decision, OneWish)
+    for name, tensor in decision.actor.net.state_dict().items():
+        yield f"actor.{name}", tensor

@@ -6,11 +6,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from uuvtai.config import VehicleConfig
 from uuvtai.files import refuse_output
 from uuvtai.identify.ardusub_log import ENDINGS, read_ardusub
 from uuvtai.identify.drive_log import Drive, DriveError, read_drives
-from uuvtai.identify.identified import identified, vehicle_yaml
+from uuvtai.identify.identified import Identified, identified, vehicle_yaml
+from uuvtai.identify.motion_model import AXES
+from uuvtai.report.figures import Line, curves
+from uuvtai.report.ink import png
 
 
 def identify(
@@ -31,8 +36,6 @@ def identify(
         refuse_output(path, files, force)
     drives = [drive for file in files for drive in _drives(file, vehicle_cfg, truth)]
     found = identified(drives, vehicle_cfg, known)
-    from uuvtai.identify.prediction_figure import prediction_png
-
     picture_bytes = prediction_png(found)
     out.write_text(vehicle_yaml(found, base, files), encoding="utf-8")
     picture.write_bytes(picture_bytes)
@@ -45,3 +48,26 @@ def _drives(file: Path, vehicle_cfg: VehicleConfig, truth: bool) -> list[Drive]:
             raise DriveError(f"{file}: a log of ArduSub's holds no truth; leave --truth out")
         return read_ardusub(file, vehicle_cfg)
     return read_drives(file, truth)
+
+
+_SHOWN_S = 30.0
+
+
+def prediction_png(found: Identified) -> bytes:
+    """Measured speeds and those of the fitted vehicle, driven by the same rotor speeds, over the first half
+    minute. The prediction begins anew with each stretch of the fit."""
+    steps = found.measured.shape[1] - 1
+    count = max(1, round(_SHOWN_S / (steps * found.dt_s)))
+    time_s = np.arange(min(count, len(found.measured)) * steps) * found.dt_s
+    panels = []
+    for i, axis in enumerate(AXES):
+        measured, predicted = (
+            speeds[:count, :steps, i].ravel() for speeds in (found.measured, found.predicted)
+        )
+        seen = ~np.isnan(measured)
+        lines = [
+            Line("measured", time_s[seen].tolist(), measured[seen].tolist()),
+            Line("predicted", time_s.tolist(), predicted.tolist()),
+        ]
+        panels.append(curves(lines, f"{axis} [{'rad/s' if axis == 'yaw' else 'm/s'}]", "time [s]"))
+    return png(panels)

@@ -44,9 +44,7 @@ class Fit:
     """(4,) rms of what is left [m/s, rad/s]"""
 
 
-def fitted(
-    given: Stretches, vehicle_cfg: VehicleConfig, first: np.ndarray, free: np.ndarray, seed: int = 0
-) -> Fit:
+def fitted(given: Stretches, vehicle_cfg: VehicleConfig, first: np.ndarray, free: np.ndarray) -> Fit:
     """Fit the parameters ``free`` (17, bool), from ``first`` (17,) on; the others stay."""
     value, start = first.copy(), first_readings(given)
     noise = np.full(len(AXES), _NOISE)
@@ -82,7 +80,7 @@ def fitted(
     given = given.at_lag(value[LAG], vehicle_cfg)
     start = settled_starts(given, vehicle_cfg, value, start, noise)
     jacobian, own, rest = linearised(given, vehicle_cfg, value, start, free, noise)
-    low, high = _bootstrap(jacobian, own, rest, seed)
+    low, high = _bootstrap(jacobian, own, rest)
     apart = _left_open(given, vehicle_cfg, (value, start), noise, jacobian, own)
     low, high = low - apart, high + apart
     bounds = [value.copy(), value.copy()]
@@ -141,16 +139,14 @@ def _left_open(
     return np.abs(_solved(square.sum(axis=0), right.sum(axis=0)))
 
 
-def _bootstrap(
-    jacobian: np.ndarray, own: np.ndarray, rest: np.ndarray, seed: int
-) -> tuple[np.ndarray, np.ndarray]:
+def _bootstrap(jacobian: np.ndarray, own: np.ndarray, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(low, high) (k,) about the fit: one Gauss-Newton step for each draw of stretches, widened for the
     parameters that were spent."""
     square, right = _apart(jacobian, own, rest)
     count, size = right.shape
     if not size:
         return np.zeros(0), np.zeros(0)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     draws = np.empty((_DRAWS, size))
     for i in range(_DRAWS):
         weight = np.bincount(rng.integers(0, count, count), minlength=count).astype(float)

@@ -2,20 +2,21 @@
 model is unsure.
 
 The paper's term is lambda_t E ||mu(x) - a_BT||^2 with the squared norm over the four actions. It stands in
-the PPO loss, with lambda_t = lambda(share of the run) times the scale s_t of ``uncertainty``, and again in
+the PPO loss, with lambda_t = lambda(share of the run) times the scale s_t of ``Uncertainty``, and again in
 separate teacher batches with an Adam of their own. Adam forgets a constant factor of the loss, so in these
 batches lambda_t scales the learning rate instead.
 """
 
 from __future__ import annotations
 
+import bisect
 from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
-from uuvtai.config.learning import DistillConfig
+from uuvtai.config.learning import DistillConfig, UncertaintyConfig
 from uuvtai.errors import SettingError
 from uuvtai.learn.optimiser import PlainAdam
 
@@ -156,3 +157,58 @@ class LeafErrors:
         self._error.zero_()
         self._count.zero_()
         return metrics
+
+
+def piecewise_linear(points: Sequence[tuple[float, float]], fraction: float) -> float:
+    """Value at ``fraction`` of (fraction, value) ``points``: linear in between, constant outside.
+
+    Two points at the same fraction are a jump, and at the jump itself the later value holds. ValueError for
+    no points or points out of order.
+    """
+    places = [place for place, _ in points]
+    if not places or places != sorted(places):
+        raise ValueError(
+            "a schedule needs at least one (fraction, value) point, fractions not falling, got "
+            f"{list(points)}"
+        )
+    after = bisect.bisect_right(places, fraction)
+    if after == 0:
+        return float(points[0][1])
+    if after == len(points):
+        return float(points[-1][1])
+    (x0, y0), (x1, y1) = points[after - 1], points[after]
+    return y0 + (y1 - y0) * (fraction - x0) / (x1 - x0)
+
+
+class Uncertainty(nn.Module):
+    """Exponential moving average of the batch's uncertainty proxy and the distillation scale s_t.
+
+    sigma_bar <- (1 - rho) sigma_bar + rho sigma_t, s_t = clip(1 + alpha sigma_bar, 1, s_max). sigma_bar
+    begins at the first value that is seen, not at zero, which would take some 1 / rho iterations to wear off.
+    """
+
+    mean: Tensor
+    seen: Tensor
+
+    def __init__(self, config: UncertaintyConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.register_buffer("mean", torch.zeros((), dtype=torch.float64))
+        self.register_buffer("seen", torch.zeros((), dtype=torch.bool))
+
+    @torch.no_grad()
+    def update(self, sigma: Tensor) -> None:
+        """Take in the uncertainty of a batch, any shape; values that are not finite are left out, a batch of
+        none changes nothing."""
+        finite = torch.isfinite(sigma)
+        if not bool(finite.any()):
+            return
+        newest = sigma[finite].double().mean()
+        rho = self.config.ema
+        self.mean.copy_(torch.where(self.seen, (1.0 - rho) * self.mean + rho * newest, newest))
+        self.seen.fill_(True)
+
+    @property
+    def scale(self) -> float:
+        """s_t: factor of the distillation weight, in [1, max_scale]."""
+        return min(max(1.0 + self.config.gain * float(self.mean), 1.0), self.config.max_scale)

@@ -78,16 +78,6 @@ class MixtureNet(nn.Module):
             found |= {f"weight_{name}": layer.weight.T, f"bias_{name}": layer.bias}
         return {name: value.detach().contiguous().numpy().copy() for name, value in found.items()}
 
-    def take_weights(self, weights: dict[str, np.ndarray]) -> None:
-        """Become the network of a forecast's file."""
-        found = {name: torch.from_numpy(values) for name, values in weights.items()}
-        with torch.no_grad():
-            self.said.weight.copy_(found["weight_out"][:, :N_TOLD].T)
-            self.said.bias.copy_(found["bias_out"][:N_TOLD])
-            for name, layer in self._layers().items():
-                layer.weight.copy_(found[f"weight_{name}"].T)
-                layer.bias.copy_(found[f"bias_{name}"])
-
     def _layers(self) -> dict[str, nn.Linear]:
         """Those that are in the file as they are; the last one is padded there."""
         return {"in": self.into, "mid": self.middle, "spread": self.spread}

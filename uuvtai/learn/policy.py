@@ -61,14 +61,13 @@ class ActorCritic(nn.Module):
         config: PolicyConfig,
         teacher_slice: slice | None,
         generator: torch.Generator,
-        num_actions: int = NUM_ACTIONS,
     ) -> None:
         """``teacher_slice``: columns of x with the teacher's action; ValueError where a residual policy has
         none."""
         super().__init__()
-        if config.residual and (teacher_slice is None or len(range(n_in)[teacher_slice]) != num_actions):
+        if config.residual and (teacher_slice is None or len(range(n_in)[teacher_slice]) != NUM_ACTIONS):
             raise SettingError(
-                f"policy.residual adds to the teacher's {num_actions} commands, but the observation has no "
+                f"policy.residual adds to the teacher's {NUM_ACTIONS} commands, but the observation has no "
                 f"such columns (got {teacher_slice}): set features.teacher=true or policy.residual=false"
             )
         if config.initial_std < config.min_std:
@@ -78,13 +77,13 @@ class ActorCritic(nn.Module):
             )
         self.config, self.n_in, self.teacher_slice = config, n_in, teacher_slice
         self.actor = mlp(
-            (n_in, *config.hidden, num_actions),
+            (n_in, *config.hidden, NUM_ACTIONS),
             config.activation,
             generator,
             0.0 if config.residual else _MEAN_GAIN,
         )
         self.critic = mlp((n_in, *config.hidden, 1), config.activation, generator, _VALUE_GAIN)
-        self.log_std = nn.Parameter(torch.full((num_actions,), math.log(config.initial_std)))
+        self.log_std = nn.Parameter(torch.full((NUM_ACTIONS,), math.log(config.initial_std)))
         self.observation_norm = RunningNorm(n_in, config.clip_observation)
         self.value_norm = RunningNorm(1, math.inf)
 

@@ -22,7 +22,6 @@ class Rollout:
         num_envs: int,
         n_in: int,
         device: torch.device | str = "cpu",
-        num_actions: int = NUM_ACTIONS,
     ) -> None:
         """``steps`` = T, ``num_envs`` = N."""
         self.steps, self.num_envs, self.n_in = steps, num_envs, n_in
@@ -31,7 +30,7 @@ class Rollout:
             return torch.zeros(steps, num_envs, *more, dtype=dtype, device=device)
 
         self.x = zeros(n_in)
-        self.action, self.teacher_action = zeros(num_actions), zeros(num_actions)
+        self.action, self.teacher_action = zeros(NUM_ACTIONS), zeros(NUM_ACTIONS)
         self.log_prob, self.value, self.reward, self.next_value = zeros(), zeros(), zeros(), zeros()
         self.terminated, self.ended = zeros(dtype=torch.bool), zeros(dtype=torch.bool)
         self.leaf = zeros(dtype=torch.int32)

@@ -5,13 +5,13 @@ also sees the bodies' true future: it serves training alone, and no file that dr
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import nn
 
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learn.mlp import mlp
-from uuvtai.learn.set_pooling import MaxAndSum
 
 NUM_WISHES = 3
 """ahead, left, up: parts of the fastest velocity, in the mirrored world"""
@@ -82,3 +82,36 @@ class SetCritic(nn.Module):
         """(...,)."""
         there = torch.maximum(bodies[..., :1], truth[..., 2:3])
         return self.net(torch.cat([bodies, truth], dim=-1), own, there).squeeze(-1)
+
+
+class MaxAndSum(torch.autograd.Function):
+    """(highest, sum), both (rows, wide), over the bodies of relu(said) where ``mask`` is 1; 0 where no body
+    is there. Its gradient is its own: torch's, by the pieces, takes as long as all products of the policy.
+
+    ``said`` (bodies, rows, wide) is what an encoder says of each body, ``mask`` (bodies, rows) is 1 or 0 and
+    has no gradient. Bodies come first: what is next to each other in memory is then reduced together. Bodies
+    that are equally high share the gradient of the highest, as in ``torch.amax``.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, said: torch.Tensor, mask: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """As the class says."""
+        each = torch.relu(said).mul_(mask.to(said.dtype).unsqueeze(-1))
+        highest = each.amax(dim=0)
+        ctx.save_for_backward(each, highest)
+        return highest, _sum(each)
+
+    @staticmethod
+    def backward(ctx: Any, *to_outputs: torch.Tensor) -> tuple[torch.Tensor, None]:
+        """(gradient of ``said``, None)."""
+        to_highest, to_sum = to_outputs
+        each, highest = ctx.saved_tensors
+        is_highest = each.clone().eq_(highest)
+        to_each = is_highest.mul_(to_highest / _sum(is_highest)).add_(to_sum)
+        torch.ops.aten.threshold_backward.grad_input(to_each, each, 0, grad_input=to_each)
+        return to_each, None
+
+
+def _sum(each: torch.Tensor) -> torch.Tensor:
+    """Over the bodies. Torch adds up in float32 in any case, and twice as fast where it is told."""
+    return each.sum(dim=0, dtype=torch.float32).to(each.dtype)

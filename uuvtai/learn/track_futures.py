@@ -33,12 +33,6 @@ class TrackMoments(NamedTuple):
     """(n, 5) [m, m, -, -, m/s] place, unit course, speed of the track"""
     truth: torch.Tensor
     """(n, ANCHORS, 2) [m] where the body then was, in the track's frame"""
-    forecast: torch.Tensor
-    """(n, ANCHORS, 2) [m] where the stack's forecast by arcs and habits puts it"""
-    share: torch.Tensor
-    """(n, n_future) probabilities of the futures that the stack weighs"""
-    future: torch.Tensor
-    """(n, n_future, ANCHORS, 2) [m] their places"""
 
 
 def path_places(path: np.ndarray, time_s: np.ndarray) -> np.ndarray:
@@ -110,14 +104,10 @@ def _moments(sim: Sim, rows: np.ndarray, path: np.ndarray, now_s: float) -> Trac
     env, track = np.nonzero(there & np.isfinite(np.min(cost, -1)))
     chosen = frame[env, track]
     column = sim.rows(s.mixture.column, envs)[env, track]
-    samples = np.round(TIMES_S.numpy() / sim.config.tracking.forecast_dt_s).astype(int)
     parts = (
         column,
         chosen,
         _in_frame(bodies[env, body[env, track], 3:], chosen),
-        _in_frame(sim.rows(s.forecast.pos_w, envs)[env, track][:, samples], chosen),
-        sim.rows(s.futures.share, envs)[env, track],
-        _in_frame(sim.rows(s.futures.pos_w, envs)[env, track][:, :, samples], chosen),
     )
     return TrackMoments(*(torch.from_numpy(np.ascontiguousarray(part, np.float32)) for part in parts))
 

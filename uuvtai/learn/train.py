@@ -11,14 +11,12 @@ import torch
 
 from uuvtai.config.learning import LearningConfig
 from uuvtai.learn.collect import N_FEATURES, Collector
-from uuvtai.learn.distill import TeacherBatches, check_weighting, weights_of
+from uuvtai.learn.distill import TeacherBatches, Uncertainty, check_weighting, piecewise_linear, weights_of
 from uuvtai.learn.guard import PREFIX, Guard
 from uuvtai.learn.policy import ActorCritic
 from uuvtai.learn.ppo import Ppo
 from uuvtai.learn.rollout import Rollout
 from uuvtai.learn.rollout_sums import Recent
-from uuvtai.learn.schedule import piecewise_linear
-from uuvtai.learn.uncertainty import Uncertainty
 from uuvtai.learn.world_model import WorldModel, WorldModelLearner
 
 if TYPE_CHECKING:

@@ -1,9 +1,10 @@
-"""Running episodes as messages for viewers: the topics of the log, as they come."""
+"""Running episodes as messages for viewers: the topics of the log, as they come, no faster than the clock."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Protocol
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
 
 from uuvtai.logs.log_recorder import EpisodeReader, PolicyNote, Recordable, RecordedJob
 from uuvtai.logs.moment import EpisodeEnd, EpisodeHeader, Values
@@ -69,3 +70,47 @@ class Broadcast(EpisodeReader):
         return (
             LiveEpisode(self._viewers, self.header(sim, row, job), self._depth_images) if row == 0 else None
         )
+
+
+_FORGIVEN_S = 0.25
+"""who is later than this does not catch up: a viewer would see a jump"""
+
+
+class RealTime:
+    """Makes every control step take its time; an ``EpisodeObserver``."""
+
+    def __init__(
+        self,
+        dt_s: float,
+        rate: float = 1.0,
+        now: Callable[[], float] = time.perf_counter,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        """``rate``: seconds of the episode in one of the clock's; 0 = as fast as it goes."""
+        self._dt_s, self._period_s, self._now, self._sleep = dt_s, dt_s / rate if rate else 0.0, now, sleep
+        self._due_s = self._begun_s = now()
+        self._steps = 0
+
+    def begin(self, sim: Any, row: int, job: Any) -> None:
+        """An episode begins."""
+        self._due_s = self._begun_s = self._now()
+        self._steps = 0
+
+    def step(self, sim: Any) -> None:
+        """A control step has been done: wait until it is over."""
+        self._steps += 1
+        self._due_s += self._period_s
+        late = self._now() - self._due_s
+        if late < 0:
+            self._sleep(-late)
+        elif late > _FORGIVEN_S:
+            self._due_s += late
+
+    def end(self, sim: Any, row: int, result: Any) -> None:
+        """The episode is over."""
+
+    @property
+    def real_time_factor(self) -> float:
+        """Seconds of the episode in one of the clock's, since the episode began."""
+        spent = self._now() - self._begun_s
+        return self._steps * self._dt_s / spent if spent > 0 else 0.0

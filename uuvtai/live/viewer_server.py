@@ -25,7 +25,7 @@ class LiveError(UserError, RuntimeError):
 class ViewerServer:
     """Sends messages to whoever has subscribed to their topic. Use as a context: it ends with it."""
 
-    def __init__(self, host: str = "127.0.0.1", port: int = 8765, name: str = "uuvtai") -> None:
+    def __init__(self, host: str = "127.0.0.1", port: int = 8765) -> None:
         """``port`` 0: a free one, see ``port``. Raises LiveError."""
         _require_sdk()
         import foxglove
@@ -39,7 +39,7 @@ class ViewerServer:
         self._asked: set[str] = set()
         try:
             self._server = foxglove.start_server(
-                name=name,
+                name="uuvtai",
                 host=host,
                 port=port,
                 capabilities=[Capability.Time],

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from uuvtai.live.broadcast import Broadcast
-from uuvtai.live.real_time import RealTime
+from uuvtai.live.broadcast import Broadcast, RealTime
 from uuvtai.live.viewer_server import ViewerServer
 from uuvtai.loader import ConfigError
 from uuvtai.measure.episodes.methods import Method

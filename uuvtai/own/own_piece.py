@@ -14,7 +14,7 @@ import torch
 
 from uuvtai.env import NUM_ACTIONS
 from uuvtai.kernels.planning.features import placed_columns
-from uuvtai.own import onnx_policy
+from uuvtai.own import answers, onnx_policy
 from uuvtai.own.call_meter import CallMeter
 from uuvtai.own.own_driver import Marks, OwnCode, OwnDriver, asking_controller, asking_policy
 from uuvtai.own.piece_errors import PieceError
@@ -29,8 +29,8 @@ from uuvtai.own.piece_loading import (
     place_of,
 )
 from uuvtai.own.piece_spec import CONTROLLER, PLANNER, POLICY, PieceSpec
-from uuvtai.own.protocol import About, piece
-from uuvtai.own.route_source import RouteSource
+from uuvtai.own.protocol import About, Forecast, piece
+from uuvtai.rrt import PlanRequest
 from uuvtai.sim import Sim
 
 _USAGE = {
@@ -178,3 +178,33 @@ def _reset_of(inner: Any, found: Any) -> Callable[..., Any] | None:
     if inspect.isroutine(inner) and getattr(inner, "__name__", "") != FACTORY:
         own = getattr(sys.modules.get(inner.__module__), "reset", None) if inner is found else None
     return own if callable(own) else None
+
+
+class RouteSource:
+    """Calls ``plan(clearance, cell_m, start, goal, forecast)`` for one env after the other; ``row=`` too
+    where it has that parameter."""
+
+    def __init__(self, code: OwnCode, cell_m: float, forecast_dt_s: float) -> None:
+        self.code, self._cell_m, self._dt_s = code, cell_m, forecast_dt_s
+        self._wants_row = "row" in inspect.signature(code.act).parameters
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """New episodes begin in the rows (n_env,) where this is not 0."""
+        self.code.forget(mask)
+
+    def plan(self, asked: PlanRequest) -> np.ndarray | None:
+        """Corners (n >= 2, 2) [m] from start to goal; None = no way. PieceError for any other answer."""
+        forecast = Forecast(asked.body, asked.radius_m, self._dt_s)
+        more = {"row": asked.env} if self._wants_row else {}
+
+        def called(_given: None) -> object:
+            return self.code.act(
+                asked.clearance_m, self._cell_m, asked.start.copy(), asked.goal.copy(), forecast, **more
+            )
+
+        found = self.code.called(called, None, 1)
+        if found is None:
+            return None
+        n_row, n_col = asked.clearance_m.shape
+        size_m = n_col * self._cell_m, n_row * self._cell_m
+        return answers.waypoints(found, (asked.start, asked.goal), size_m, self.code.place)

@@ -1,5 +1,5 @@
 """What a controller of the user's is shown: rows of what the vehicle senses, remembers and decides, read when
-it is asked for. ``FIELDS`` is the whole of it; no truth is among them (``tests/test_own_view.py``)."""
+it is asked for. ``FIELDS`` is the whole of it; no truth is among them (``tests/test_own_pieces.py``)."""
 
 from __future__ import annotations
 

@@ -42,11 +42,6 @@ class Arrival:
     time_s: float | None
     """earliest arrival; None = not reachable within the horizon"""
 
-    @property
-    def reachable(self) -> bool:
-        """Whether there is a way at all."""
-        return self.time_s is not None
-
 
 def earliest_arrival(scenario: dict[str, Any], config: Config) -> Arrival:
     """Earliest arrival in a scenario (``describe_scenario``'s document) under the rules of ``config``: goal

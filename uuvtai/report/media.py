@@ -88,10 +88,11 @@ def _note(left_out: Sequence[str]) -> str:
     )
 
 
-def shared(sections: Sequence[PageSection], budget: int = MEDIA_BYTES) -> list[PageSection]:
+def shared(sections: Sequence[PageSection]) -> list[PageSection]:
     """The same sections with what the page's budget [bytes] holds: pictures of every run first, then videos,
     in the page's order."""
     kept: dict[int, Gallery] = {}
+    budget = MEDIA_BYTES
     galleries = [block for section in sections for block in section.blocks if isinstance(block, Gallery)]
     for gallery in sorted(
         galleries, key=lambda one: any(item.mime.startswith("video/") for item in one.items)

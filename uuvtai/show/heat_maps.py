@@ -25,9 +25,7 @@ _WIDTH = 7
 """of a cell at least: with it both maps of the paper's grid stand side by side in 120 columns"""
 
 
-def print_heat_maps(
-    document: dict[str, Any], console: Console, columns: str | None = None, is_whole: bool = False
-) -> None:
+def print_heat_maps(document: dict[str, Any], console: Console, is_whole: bool = False) -> None:
     """Print both heat maps of every method of a ``uuv sweep --json`` document. Raises ValueError like
     ``heatmap.pivot``.
 
@@ -36,9 +34,7 @@ def print_heat_maps(
     """
     cells = document["cells"]
     for method in dict.fromkeys(cell.get("method", "") for cell in cells):
-        chosen = pivot(
-            [cell for cell in cells if cell.get("method", "") == method], document["axes"], columns
-        )
+        chosen = pivot([cell for cell in cells if cell.get("method", "") == method], document["axes"])
         n = len(chosen.column_names)
         step = n if is_whole else max(1, (console.width - _row_width(chosen)) // _cell_width(chosen))
         for first in range(0, n, step):

@@ -115,7 +115,7 @@ def _packets(length: int) -> int:
     return -(-length // PACKET)
 
 
-def bytes_of(struct: type, sizes: dict[str, int], real_bytes: int = 4) -> int:
+def bytes_of(struct: type, sizes: dict[str, int]) -> int:
     """Memory that ``allocate`` would take [bytes], known before anything is allocated."""
     total = 0
     for declared in dataclasses.fields(struct):
@@ -125,7 +125,7 @@ def bytes_of(struct: type, sizes: dict[str, int], real_bytes: int = 4) -> int:
             shape = (*shape[:-1], PACKET * _packets(shape[-1]))
         count *= math.prod(shape)
         total += count * (
-            real_bytes if declared.metadata["dtype"] is REAL else _DTYPE_BYTES[declared.metadata["dtype"]]
+            4 if declared.metadata["dtype"] is REAL else _DTYPE_BYTES[declared.metadata["dtype"]]
         )
     return total
 

@@ -69,16 +69,16 @@ class HeatMap:
         return " · ".join(map(axis_name, self.row_axes))
 
 
-def pivot(cells: Iterable[Cell], axes: dict[str, list[Any]], columns: str | None = None) -> HeatMap:
-    """Lay cells out over ``axes`` (name -> values in order): ``columns`` across, every other axis down.
+def pivot(cells: Iterable[Cell], axes: dict[str, list[Any]]) -> HeatMap:
+    """Lay cells out over ``axes`` (name -> values in order): the speed of the moving obstacles across where
+    it varies, else the last axis that does, every other axis down.
 
-    Without ``columns``, the speed of the moving obstacles where it varies, else the last axis that does.
-    Raises ValueError for a column axis that is none, and for two cells in one place.
+    Raises ValueError for a sweep without an axis, and for two cells in one place.
     """
     named = {cell_name(name): list(values) for name, values in axes.items()}
-    across = cell_name(columns) if columns else _default_columns(named)
-    if across not in named:
-        raise SettingError(f"{columns!r} is no axis of this sweep; there are: {', '.join(named) or 'none'}")
+    if not named:
+        raise SettingError("this sweep has no axis")
+    across = _across(named)
     down = tuple(name for name in named if name != across)
     found = list(cells)
     rows = [tuple(cell.get(name) for name in down) for cell in found]
@@ -95,11 +95,11 @@ def varying(axes: dict[str, list[Any]]) -> list[str]:
     return [cell_name(name) for name, values in axes.items() if len(values) > 1]
 
 
-def _default_columns(axes: dict[str, list[Any]]) -> str:
+def _across(axes: dict[str, list[Any]]) -> str:
     several = varying(axes)
     if SPEED in several:
         return SPEED
-    return several[-1] if several else next(reversed(axes), "")
+    return several[-1] if several else next(reversed(axes))
 
 
 def _order(row: tuple[Any, ...], down: tuple[str, ...], axes: dict[str, list[Any]]) -> list[int]:

@@ -3,6 +3,8 @@ videos."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -160,7 +162,6 @@ def _compared(comparison: Comparison, folder: RunFolder) -> dict[str, Any]:
     from uuvtai.measure.evaluate.explained import explain
     from uuvtai.measure.evaluate.ledger import Ledger
     from uuvtai.measure.evaluate.method_run import play
-    from uuvtai.measure.evaluate.scenario_digest import scenarios_sha256
     from uuvtai.measure.evaluate.summary import document
 
     request = comparison.request
@@ -224,3 +225,22 @@ def _draw(comparison: Comparison, folder: Path, logs: list[dict[Job, Path]]) -> 
             if not target.exists():  # an evaluation that goes on may have drawn it before
                 comparison.watch.note(f"drawing {target.name}")
                 video(file, target, methods=names, **SMALL)
+
+
+_DIGITS = 3
+"""of a number: millimetres"""
+
+
+def scenarios_sha256(scenarios: list[dict[str, Any]]) -> str:
+    """Of ``closed_form.describe_scenario``'s documents, to the millimetre. On another processor a number may
+    round to the other side: equal digests prove equal scenarios, unequal ones do not prove the contrary."""
+    text = json.dumps(_rounded(scenarios), sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _rounded(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_rounded(inner) for inner in value]
+    return round(float(value), _DIGITS) + 0.0 if isinstance(value, float) else value
