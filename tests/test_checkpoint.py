@@ -2,7 +2,6 @@
 everything else."""
 
 import json
-import pickle
 import subprocess
 import sys
 import textwrap
@@ -142,103 +141,6 @@ def test_a_run_without_checkpoints(tmp_path):
 
 
 # --------------------------------------------------------------------------------------------------- refusals
-
-
-class Exploit:
-    """What a pickle may do when it is opened."""
-
-    def __reduce__(self):
-        return (pytest.fail, ("a pickle was opened",))
-
-
-def forged(path, name, content):
-    """Put other content in a file and its right size and sha256 in the manifest."""
-    (path / name).write_bytes(content)
-    entry = {"bytes": len(content), "sha256": manifest.sha256_of(path / name)}
-    rewritten(path, lambda document: document["files"].update({name: entry}))
-
-
-def relisted(path, name):
-    """List a file under another name."""
-    rewritten(path, lambda document: document["files"].update({name: document["files"]["model.safetensors"]}))
-
-
-def linked(file):
-    """Replace a file by a link to itself elsewhere."""
-    file.symlink_to(file.rename(file.parent.parent / "elsewhere"))
-
-
-def shorter(file) -> None:
-    file.write_bytes(file.read_bytes()[:-1])
-
-
-REFUSALS = {
-    "truncated": (lambda p: shorter(p / "model.safetensors"), "was cut off"),
-    "missing file": (lambda p: (p / "model.safetensors").unlink(), "model.safetensors: is missing"),
-    "missing manifest": (lambda p: (p / "manifest.json").unlink(), "manifest.json: is missing"),
-    "manifest cut off": (lambda p: (p / "manifest.json").write_text((p / "manifest.json").read_text()[:100]),
-    "cannot be read"),
-    "manifest is no JSON": (lambda p: (p / "manifest.json").write_bytes(b"\x80\x04\x95"), "cannot be read"),
-    "manifest nested without end": (lambda p: (p / "manifest.json").write_text("[" * 100_000),
-    "cannot be read"),
-    "manifest of something else": (lambda p: (p / "manifest.json").write_text('{"a": 1}'),
-    "is not a manifest"),
-    "huge manifest": (lambda p: (p / "manifest.json").write_bytes(b" " * (9 << 20)), "more than the "
-                                                                                     "8,388,608 that such a "
-                                                                                     "file may have"),
-    "other schema": (lambda p: rewritten(p, lambda d: d.update(schema=2)), "has schema 2, this uuvtai reads "
-                                                                           "1"),
-    "newer version": (lambda p: rewritten(p, lambda d: d.update(version="9.9.0")), "was written by uuvtai "
-                                                                                   "9.9.0"),
-    "no version": (lambda p: rewritten(p, lambda d: d.pop("version")), "was written by uuvtai None"),
-    "unknown key": (lambda p: rewritten(p, lambda d: d.update(run="rm")), "run: Extra inputs"),
-    "NaN": (lambda p: (p / "manifest.json").write_text((p / "manifest.json").read_text().replace('"step": 7',
-    '"step": NaN')), "NaN"),
-    "changed config": (lambda p: rewritten(p, lambda d: d["config"]["ppo"].update(gamma=0.5)), "sha256"),
-    "unknown config key": (lambda p: rewritten(p, lambda d: d["config"].update(extra=1)), "extra: Extra "
-                                                                                          "inputs"),
-    "path trick": (lambda p: relisted(p, "../../x"), "'../../x', which no"),
-    "absolute path": (lambda p: relisted(p, "/etc/passwd"), "no checkpoint has"),
-    "unlisted file": (lambda p: rewritten(p, lambda d: d["files"].pop("training.safetensors")),
-    "is not listed"),
-    "link": (lambda p: linked(p / "model.safetensors"), "is a link"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(("damage", "says"), REFUSALS.values(), ids=REFUSALS)
-def test_refused_before_anything_is_used(tmp_path, damage, says):
-    path = saved(tmp_path)
-    damage(path)
-    with pytest.raises(CheckpointError, match=says) as error:
-        checkpoint.open_checkpoint(path)
-    assert str(path) in str(error.value), "the message says where"
-
-
-@pytest.mark.parametrize("name", ["model.safetensors", "training.safetensors", "simulator.zst"])
-@pytest.mark.parametrize("place", [0, 9, -1])
-def test_a_flipped_bit_is_found(tmp_path, name, place):
-    path = saved(tmp_path)
-    content = bytearray((path / name).read_bytes())
-    content[place] ^= 4
-    (path / name).write_bytes(content)
-    with pytest.raises(CheckpointError, match=f"{name}: is damaged"):
-        checkpoint.open_checkpoint(path)
-
-
-def test_a_pickle_in_disguise_is_never_opened(tmp_path):
-    path = saved(tmp_path)
-    forged(path, "model.safetensors", pickle.dumps(Exploit()))
-    with pytest.raises(
-        CheckpointError, match=r"is not a safetensors file .* pickles and other formats are never opened"
-    ):
-        checkpoint.open_checkpoint(path).model()
-
-
-def test_a_manifest_that_names_tensors_that_are_not_there(tmp_path):
-    path = saved(tmp_path)
-    forged(path, "model.safetensors", safetensors_bytes({"other": torch.zeros(1)}))
-    with pytest.raises(CheckpointError, match="does not fit together"):
-        checkpoint.open_checkpoint(path).model()
 
 
 def test_a_file_that_changes_after_verification(tmp_path):

@@ -101,9 +101,7 @@ def test_explicit_elements_are_the_same_as_compact_ones():
         (xml('<Sequence _skipIf="x"><Hold/></Sequence>'), ("_skipIf", "scripts")),
         (xml('<Condition ID="Hold"/>'), ("Action",)),
         (xml('<SubTree ID="man"/>'), ("did you mean 'main'",)),
-        (xml('<SubTree ID="main"/>'), ("contains itself",)),
         (xml("<Sequence>text<Hold/></Sequence>"), ("text",)),
-        (xml("<Sequence>" + "<Hold/>" * 70 + "</Sequence>"), ("more than 64 nodes",)),
         (xml("<Inverter>" * 70 + "<Hold/>" + "</Inverter>" * 70), ("nested",)),
         ("<root><BehaviorTree ID='a'><Hold/></BehaviorTree></root>", ("BTCPP_format",)),
         ("<tree/>", ("outermost",)),
@@ -124,10 +122,8 @@ def test_explicit_elements_are_the_same_as_compact_ones():
             'ID="a"><Hold/></BehaviorTree></root>',
             ("twice",),
         ),
-        ('<!DOCTYPE r [<!ENTITY a "b">]>' + xml("<Hold/>"), ("DTD",)),
         ("<root", ("t.xml:1", "not well-formed")),
         ("", ("not well-formed",)),
-        ("<a>" + " " * (1 << 20), ("larger",)),
     ],
 )
 def test_bad_trees_are_refused_with_the_place_and_the_reason(text, words):
