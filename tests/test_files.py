@@ -39,15 +39,9 @@ def test_a_plain_file_is_read_with_and_without_its_folder(tmp_path):
 @pytest.mark.parametrize("kind", ["a pipe", "a device", "a folder", "a socket"])
 @pytest.mark.parametrize("through", ["itself", "a link"])
 def test_only_plain_files_are_read_and_none_is_waited_for(tmp_path, kind, through):
-    place = tmp_path / "x"
-    make = {
-        "a pipe": lambda: os.mkfifo(place),
-        "a device": lambda: None,
-        "a folder": place.mkdir,
-        "a socket": lambda: bound(place),
-    }
-    make[kind]()
-    place = Path("/dev/zero") if kind == "a device" else place
+    place = Path("/dev/zero") if kind == "a device" else tmp_path / "x"
+    if kind != "a device":
+        {"a pipe": os.mkfifo, "a folder": Path.mkdir, "a socket": bound}[kind](place)
     if through == "a link":
         (tmp_path / "link").symlink_to(place)
         place = tmp_path / "link"
@@ -197,11 +191,8 @@ def test_a_new_file_replaces_nothing(tmp_path):
 def test_what_is_changed_in_place_is_a_plain_file_of_its_own(tmp_path, kind):
     place = tmp_path / "x"
     (tmp_path / "victim").write_text("mine")
-    {
-        "pipe": lambda: os.mkfifo(place),
-        "folder": place.mkdir,
-        "second name": lambda: place.hardlink_to(tmp_path / "victim"),
-    }[kind]()
+    make = {"pipe": os.mkfifo, "folder": Path.mkdir}
+    make.get(kind, lambda _place: place.hardlink_to(tmp_path / "victim"))(place)
     for change in (lambda: open_to_append(place, tmp_path), lambda: truncate(place, 0, tmp_path)):
         with pytest.raises(FileError, match=r"is a pipe|second name|is no plain file"):
             change()
@@ -238,18 +229,13 @@ def test_an_input_is_no_output_by_whatever_name(tmp_path, name, force):
 
 
 @pytest.mark.parametrize("force", [False, True])
-@pytest.mark.parametrize("kind", ["link", "broken link", "folder", "pipe", "device"])
-def test_only_plain_files_are_replaced(tmp_path, kind, force):
-    out = tmp_path / "out"
+def test_only_plain_files_are_replaced(tmp_path, force):
     (tmp_path / "victim").write_text("mine")
-    make = {
-        "link": lambda: out.symlink_to(tmp_path / "victim"),
-        "broken link": lambda: out.symlink_to(tmp_path / "nothing"),
-        "folder": out.mkdir,
-        "pipe": lambda: os.mkfifo(out),
-        "device": lambda: None,
-    }
-    make[kind]()
-    with pytest.raises(UserError, match="is a "):
-        refuse_output(out if kind != "device" else type(out)("/dev/null"), [], force)
+    (tmp_path / "link").symlink_to(tmp_path / "victim")
+    (tmp_path / "broken link").symlink_to(tmp_path / "nothing")
+    (tmp_path / "folder").mkdir()
+    os.mkfifo(tmp_path / "pipe")
+    for out in ("link", "broken link", "folder", "pipe", "/dev/null"):
+        with pytest.raises(UserError, match="is a "):
+            refuse_output(tmp_path / out, [], force)
     assert (tmp_path / "victim").read_text() == "mine"
