@@ -1,6 +1,8 @@
 """Bundles for tests of single stages: made of the parts at hand, once for the same parts (a kernel is
 compiled anew for another bundle)."""
 
+import numpy as np
+
 from uuvtai.binding import bind
 
 _made = {}
@@ -16,3 +18,17 @@ def io_for(bundle, *parts):
             parts,
         )  # the parts stay alive: their identities are the key
     return _made[key][0]
+
+
+def clear(*structs):
+    """Zero in every field."""
+    for struct in structs:
+        for field in vars(struct).values():
+            field.fill(0)
+
+
+def put(struct, **fields):
+    """Values into fields by name, in their own types."""
+    for name, value in fields.items():
+        field = getattr(struct, name)
+        field.from_numpy(np.asarray(value).astype(field.to_numpy().dtype))

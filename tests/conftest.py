@@ -110,6 +110,12 @@ def small(taichi_runtime):
     return _built[0]
 
 
+@pytest.fixture
+def no_onnx(monkeypatch):
+    """As if the extra were not installed; ONNX takes seconds."""
+    monkeypatch.setattr("uuvtai.deploy.export.missing_packages", lambda: ["onnx"])
+
+
 @pytest.fixture(autouse=True)
 def forgetful(request):
     """No test sees what an earlier one left in the session's simulator."""

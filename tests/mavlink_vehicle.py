@@ -23,6 +23,12 @@ def link_config(**changes):
     return load_config("pool", "multibeam", overrides=given)
 
 
+def free_port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        return free.getsockname()[1]
+
+
 class WishfulPilot:
     """Takes messages, and wants what ``velocity`` says."""
 

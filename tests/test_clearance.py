@@ -65,19 +65,10 @@ class Stage:
         return self.launch(cfg, voronoi)
 
     def launch(self, cfg=CFG, voronoi=VORONOI):
-        clearance.compute_clearance(
-            io_for(
-                ClearanceIO,
-                self.clearance,
-                self.memory,
-                self.grid_map,
-                self.mask,
-                self.clock,
-                cfg,
-                MAP,
-                voronoi,
-            )
+        io = io_for(
+            ClearanceIO, self.clearance, self.memory, self.grid_map, self.mask, self.clock, cfg, MAP, voronoi
         )
+        clearance.compute_clearance(io)
         return tuple(
             f.to_numpy()
             for f in (self.clearance.clearance_m, self.clearance.site_row, self.clearance.site_col)

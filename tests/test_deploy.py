@@ -86,12 +86,6 @@ def exported(found, out, note=lambda _text: None, evaluations=()):
     return deploy.export(found, "mine", out, evaluations, note)
 
 
-@pytest.fixture
-def no_onnx(monkeypatch):
-    """As if the extra were not installed; ONNX takes seconds."""
-    monkeypatch.setattr(deploy, "missing_packages", lambda: ["onnx"])
-
-
 # -------------------------------------------------------------------------------------------------- agreement
 
 CASES = {
@@ -380,14 +374,18 @@ def test_evaluations_of_something_else_are_refused(tmp_path):
 # ---------------------------------------------------------------------------------------------------- command
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    """An exported policy."""
-    root = tmp_path_factory.mktemp("export")
+def without_graph(root):
+    """An exported folder; ONNX takes seconds."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(deploy, "missing_packages", lambda: ["onnx"])
         exported(saved(root / "run"), root / "out")
     return root / "out"
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """An exported policy."""
+    return without_graph(tmp_path_factory.mktemp("export"))
 
 
 @pytest.fixture

@@ -63,19 +63,10 @@ class Rig:
         depth.reset_depth(io_for(DepthIO, self.image, self.clock))
 
     def shoot(self, config=CLEAN, tank=TANK):
-        depth.cast_depth(
-            io_for(
-                DepthIO,
-                self.image,
-                self.ego,
-                self.vehicle,
-                self.world,
-                self.episode,
-                self.clock,
-                config,
-                tank,
-            )
+        io = io_for(
+            DepthIO, self.image, self.ego, self.vehicle, self.world, self.episode, self.clock, config, tank
         )
+        depth.cast_depth(io)
         return self.image.depth_m.to_numpy()
 
 

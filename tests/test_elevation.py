@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from tests.bundles import io_for
+from tests.bundles import clear, io_for, put
 from tests.reference import elevation as oracle
 from uuvtai.config import ElevationConfig, EpisodeConfig, SonarConfig, TankConfig, TrackingConfig
 from uuvtai.kernels.core.lanes import LANES
@@ -87,9 +87,7 @@ class Stage:
     def begin(self):
         """Every track moves, lies east of its env's vehicle, and may have any height; the vehicles are at (5,
         3, -0.8)."""
-        for struct in (self.tracks, self.clock, self.ego, self.scan):
-            for field in vars(struct).values():
-                field.fill(0)
+        clear(self.tracks, self.clock, self.ego, self.scan)
         self.forecast.above_w.fill(-9.0)
         self.forecast.below_w.fill(-9.0)
         self.clock.awake.fill(1)
@@ -103,16 +101,11 @@ class Stage:
         self.weigh(np.full((N_ENV, N_TRACK), BEGIN))
         return self
 
-    def put(self, struct, **fields):
-        for name, value in fields.items():
-            field = getattr(struct, name)
-            field.from_numpy(np.asarray(value).astype(field.to_numpy().dtype))
-
     def stand(self):
         """Bring vehicles and bodies to ``own`` and ``place``."""
-        self.put(self.tracks, state=np.concatenate([self.place, np.zeros((N_ENV, N_TRACK, 2))], 2))
-        self.put(self.ego, pos_w=self.own)
-        self.put(self.scan, ping_pos_w=self.own)
+        put(self.tracks, state=np.concatenate([self.place, np.zeros((N_ENV, N_TRACK, 2))], 2))
+        put(self.ego, pos_w=self.own)
+        put(self.scan, ping_pos_w=self.own)
 
     def weigh(self, what, dt=0.06):
         weigh(
@@ -175,7 +168,7 @@ def test_any_sequence_of_hits_and_misses_equals_the_oracle(stage):
     xy = rng.uniform(-0.9, 0.9, (N_ENV, N_TRACK)) * np.sqrt(xx * yy)
     cov = np.zeros((N_ENV, N_TRACK, 10))
     cov[..., 0], cov[..., 1], cov[..., 4] = xx, xy, yy
-    stage.put(stage.tracks, radius_m=radius, cov=cov)
+    put(stage.tracks, radius_m=radius, cov=cov)
     share, present = (
         np.broadcast_to(oracle.prior(CFG), (N_ENV, N_TRACK, LANES)).copy(),
         np.full((N_ENV, N_TRACK), 0.95),
@@ -267,7 +260,7 @@ def test_an_unsure_place_makes_a_miss_say_less(stage):
     """Tracks of equal bodies, one of them known to 2 cm and one to 60 cm."""
     cov = np.zeros((N_ENV, N_TRACK, 10))
     cov[:, 0, [0, 4]], cov[:, 1, [0, 4]] = 0.02**2, 0.6**2
-    stage.put(stage.tracks, cov=cov)
+    put(stage.tracks, cov=cov)
     stage.weigh(MISS, 0.3)
     level = stage.share[0, :2, near(-0.8)]
     assert level[0] < 0.3 * level[1] < 0.29 * oracle.prior(CFG)[0]
@@ -303,7 +296,7 @@ def test_free_water_equals_the_oracle(stage):
     stage.own[:, 2] = rng.uniform(-1.5, -0.1, N_ENV).astype(np.float32)
     stage.stand()
     stage.set_share(share)
-    stage.put(stage.tracks, radius_m=radius)
+    put(stage.tracks, radius_m=radius)
     above, below = stage.bound()
     kinds = set()
     for env, track in np.ndindex(N_ENV, N_TRACK):
@@ -338,8 +331,8 @@ def test_without_memory_every_body_is_level(stage):
     stage.set_share(share)
     moving, alive, awake = np.ones((N_ENV, N_TRACK)), np.ones((N_ENV, N_TRACK)), np.ones(N_ENV)
     moving[0, 1], alive[0, 2], awake[1] = 0, 0, 0
-    stage.put(stage.tracks, moving=moving, alive=alive)
-    stage.put(stage.clock, awake=awake)
+    put(stage.tracks, moving=moving, alive=alive)
+    put(stage.clock, awake=awake)
     above, below = stage.bound(FORGETFUL)
     np.testing.assert_allclose((above[awake == 1], below[awake == 1]), -0.8, atol=BOUND_TOLERANCE)
     np.testing.assert_array_equal((above[1], below[1]), -9.0)
@@ -360,7 +353,7 @@ def test_no_body_is_in_water_called_free(stage):
     rng = np.random.default_rng(8)
     half = rng.uniform(0.12, 0.25, (N_ENV, N_TRACK))
     z = rng.uniform(-1.4, -0.2, (N_ENV, N_TRACK))
-    stage.put(stage.tracks, radius_m=rng.uniform(0.15, 0.25, (N_ENV, N_TRACK)))
+    put(stage.tracks, radius_m=rng.uniform(0.15, 0.25, (N_ENV, N_TRACK)))
     away, begin, end = (
         rng.uniform(0.6, 1.2, (N_ENV, N_TRACK)),
         rng.uniform(-1.2, -0.4, N_ENV),
@@ -388,21 +381,21 @@ def test_no_body_is_in_water_called_free(stage):
 
 def scan_for(stage, range_m):
     """Every beam of every env returns at this range; tracks have been missed once."""
-    stage.put(
+    put(
         stage.scan,
         range_m=np.full((N_ENV, N_RAY), range_m),
         hit=np.full((N_ENV, N_RAY), range_m < SONAR.max_range_m),
     )
-    stage.put(stage.tracks, misses=np.ones((N_ENV, N_TRACK)), age=np.full((N_ENV, N_TRACK), 10))
+    put(stage.tracks, misses=np.ones((N_ENV, N_TRACK)), age=np.full((N_ENV, N_TRACK), 10))
     others = np.arange(N_TRACK) > 2  # three tracks are enough, apart from each other
     stage.place[:, :3] = np.array([5.0, 3.0]) + np.array([[1.0, 0.0], [0.0, 1.5], [-1.2, 0.0]])
-    stage.put(stage.tracks, alive=np.tile(~others, (N_ENV, 1)))
+    put(stage.tracks, alive=np.tile(~others, (N_ENV, 1)))
     stage.stand()
 
 
 def pruned(stage, count, cfg=CFG, dt=0.06):
     for k in range(1, count + 1):
-        stage.put(stage.scan, ping_step=np.full(N_ENV, 3 * k))
+        put(stage.scan, ping_step=np.full(N_ENV, 3 * k))
         prune(dt, stage.tracks, stage.scan, TRACKING, cfg, SONAR, TANK, RULES)
     return stage.tracks.alive.to_numpy()[:, :3]
 
@@ -436,10 +429,10 @@ def test_a_body_seen_through_is_kept_if_it_may_be_above_or_below(stage):
 
 def test_seen_bodies_are_weighed_and_resting_ones_are_not(stage):
     scan_for(stage, SONAR.max_range_m)
-    stage.put(stage.tracks, misses=np.zeros((N_ENV, N_TRACK)))
+    put(stage.tracks, misses=np.zeros((N_ENV, N_TRACK)))
     moving = np.ones((N_ENV, N_TRACK))
     moving[:, 1] = 0
-    stage.put(stage.tracks, moving=moving)
+    put(stage.tracks, moving=moving)
     assert pruned(stage, 1).all()
     assert stage.share[0, 0, near(-0.1)] < 0.01
     np.testing.assert_allclose(stage.share[0, 1], oracle.prior(CFG), atol=1e-6)
@@ -454,7 +447,7 @@ def test_memory_can_be_switched_off(stage):
     scan_for(stage, 0.5)
     assert pruned(stage, round(TRACKING.hidden_s / 0.06) - 1, FORGETFUL).all()
     np.testing.assert_allclose(stage.present[:, :3], 0.95)
-    stage.put(stage.scan, ping_step=np.full(N_ENV, round(TRACKING.hidden_s / RULES.control_dt_s) + 1))
+    put(stage.scan, ping_step=np.full(N_ENV, round(TRACKING.hidden_s / RULES.control_dt_s) + 1))
     prune(0.06, stage.tracks, stage.scan, TRACKING, FORGETFUL, SONAR, TANK, RULES)
     assert not stage.tracks.alive.to_numpy()[:, :3].any()
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.bundles import io_for
+from tests.bundles import clear, io_for
 from tests.reference import noise as noise_reference
 from uuvtai import state
 from uuvtai.config import EpisodeConfig, TankConfig, VehicleConfig
@@ -49,9 +49,7 @@ class Court:
         )
 
     def clean(self):
-        for struct in (self.referee, self.clock, self.vehicle, self.world, self.mission):
-            for field in vars(struct).values():
-                field.fill(0)
+        clear(self.referee, self.clock, self.vehicle, self.world, self.mission)
         self.clock.active.fill(1)
         self.clock.awake.fill(1)
         for env in range(N):
@@ -69,19 +67,10 @@ class Court:
         self.world.vel_w[env, slot], self.world.yaw[env, slot] = vel, yaw
 
     def judge(self):
-        episode.judge(
-            io_for(
-                EpisodeIO,
-                self.referee,
-                self.clock,
-                self.vehicle,
-                self.world,
-                self.mission,
-                VEHICLE,
-                TANK,
-                RULES,
-            )
+        io = io_for(
+            EpisodeIO, self.referee, self.clock, self.vehicle, self.world, self.mission, VEHICLE, TANK, RULES
         )
+        episode.judge(io)
         return {name: field.to_numpy() for name, field in vars(self.referee).items()}
 
 

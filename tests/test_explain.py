@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.command import Quiet
 from tests.reference import hull as hull_reference
 from tests.reference import sonar as sonar_reference
 from uuvtai.config import Config, TankConfig
@@ -672,13 +673,6 @@ def test_the_worst_are_recorded_with_picture_and_video(played, tmp_path):
     assert notes
 
 
-class _Silent:
-    def start(self, name, total): ...
-    def note(self, text): ...
-    def update(self, done, total, env_steps, left=None): ...
-    def stop(self): ...
-
-
 @pytest.fixture
 def request_of(small, tmp_path, monkeypatch):
     """A request for a short comparison that runs on the session's simulator."""
@@ -706,7 +700,7 @@ def request_of(small, tmp_path, monkeypatch):
 def test_a_comparison_carries_its_causes(request_of):
     from uuvtai.measure.evaluate.compare import compare
 
-    result, folder = compare(request_of(explain_record=1), _Silent())
+    result, folder = compare(request_of(explain_record=1), Quiet())
     method = result["methods"][0]
     failed = [d for d in method["episodes_detail"] if d["outcome"] != "success"]
     assert failed
@@ -725,7 +719,7 @@ def test_a_comparison_carries_its_causes(request_of):
 def test_without_explain_the_document_has_no_causes(request_of):
     from uuvtai.measure.evaluate.compare import compare
 
-    result, folder = compare(request_of(explain=False), _Silent())
+    result, folder = compare(request_of(explain=False), Quiet())
     assert not {"causes", "explain"} & set(result["methods"][0])
     assert not (folder / "eval/explain.json").exists()
 
@@ -739,7 +733,7 @@ def test_an_interrupted_explanation_leaves_the_results(request_of, monkeypatch):
     monkeypatch.setattr("uuvtai.measure.explain.failures.explain_failures", interrupted)
     request = request_of()
     with pytest.raises(KeyboardInterrupt):
-        compare(request, _Silent())
+        compare(request, Quiet())
     assert json.loads((request.run_dir / "eval/result.json").read_text())["methods"][0]["episodes"] == 6
     assert json.loads((request.run_dir / "run.json").read_text())["status"] == "interrupted"
 

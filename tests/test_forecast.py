@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.bundles import io_for
+from tests.bundles import clear, io_for, put
 from tests.reference import forecast as oracle
 from tests.reference import habits as habit_oracle
 from uuvtai.config import EpisodeConfig, ForecastConfig, TankConfig, TrackingConfig
@@ -53,9 +53,7 @@ class Stage:
 
     def begin(self, cfg=None):
         self.cfg = cfg or ForecastConfig()
-        for struct in (self.tracks, self.clock):
-            for field in vars(struct).values():
-                field.fill(0)
+        clear(self.tracks, self.clock)
         self.clock.awake.fill(1)
         self.clusters.fresh.fill(1)
         self.image.fresh.fill(0)
@@ -63,9 +61,7 @@ class Stage:
         return self
 
     def put(self, **fields):
-        for name, value in fields.items():
-            field = getattr(self.tracks, name)
-            field.from_numpy(np.asarray(value).astype(field.to_numpy().dtype))
+        put(self.tracks, **fields)
 
     def predict(self):
         forecast.forecast_tracks(

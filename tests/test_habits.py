@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from tests.bundles import io_for
+from tests.bundles import clear, io_for
 from tests.reference import habits as oracle
 from uuvtai.config import EpisodeConfig, ForecastConfig, TankConfig
 from uuvtai.kernels.core.lanes import LANES
@@ -39,9 +39,7 @@ class Stage:
         self.habits, self.forecast = allocate(HabitState, SIZES), allocate(ForecastState, SIZES)
 
     def begin(self):
-        for struct in (self.tracks, self.clock, self.clusters):
-            for field in vars(struct).values():
-                field.fill(0)
+        clear(self.tracks, self.clock, self.clusters)
         self.clock.awake.fill(1)
         self.clusters.fresh.fill(1)
         self.tracks.moving.fill(1)

@@ -29,7 +29,6 @@ from uuvtai.identify.motion_model import (
 from uuvtai.identify.rotor_lag import mean_wrench
 from uuvtai.identify.stretch_starts import first_readings, grown_starts
 from uuvtai.loader import load_config
-from uuvtai.logs.mcap_log import McapEpisodeLog
 
 DT_S, SECONDS = 0.02, 65.1
 NOISE = 0.004
@@ -341,12 +340,8 @@ def test_a_gap_parts_a_table(tmp_path):
 
 
 def test_our_logs_are_read_by_their_instruments_or_by_the_truth(tmp_path):
-    path = tmp_path / "a.mcap"
+    path = episode.record(tmp_path / "a.mcap", 20, maps=False)
     taken = list(episode.snapshots(20, maps=False))
-    with McapEpisodeLog(path, episode.header()) as log:
-        for snap in taken:
-            log.write(snap)
-        log.close(episode.result(20))
     (drive,), (exact,) = read_drives(path), read_drives(path, truth=True)
     assert exact.velocity.shape == (21, 4) and abs(exact.dt_s - episode.DT) < 1e-9
     true, rate, rpm = (np.array([s[f"vehicle.{name}"] for s in taken]) for name in ("vel_b", "rate_b", "rpm"))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.command import Quiet
 from tests.small_sim import SmallSim
 from tests.test_observation_only import compared
 from uuvtai.closed_form import describe_scenario, path_positions
@@ -151,20 +152,13 @@ def test_a_resumed_training_goes_on_bit_for_bit(config, made):
         assert torch.equal(value, other.state()["env"][name])
 
 
-class Silent:
-    """Nobody watches."""
-
-    def __getattr__(self, _name):
-        return lambda *_arguments: None
-
-
 def test_a_run_leaves_the_file_that_a_stack_forecasts_with(config, made, tmp_path):
     run = tmp_path / "run"
     request = TrainRequest(config=config, run_dir=run, iterations=2)
-    document, _ = train(request, Silent(), lambda *_arguments: {})
+    document, _ = train(request, Quiet(), lambda *_arguments: {})
     assert document["iterations"] == 2
     halfway = read_weights(str(run))
-    train(TrainRequest(resume=run), Silent(), lambda *_arguments: {})
+    train(TrainRequest(resume=run), Quiet(), lambda *_arguments: {})
     found = checkpoint.newest(run)
     assert found.step == 4
     net = MixtureNet(torch.Generator())
@@ -181,7 +175,7 @@ def test_what_cannot_be_learnt_is_refused(config, tmp_path):
     with pytest.raises(UserError, match="leave it empty"):
         ForecastTrainer(config.model_copy(update={"forecast": forecast}))
     with pytest.raises(ConfigError, match="it learns on the CPU"):
-        train(TrainRequest(config=config, run_dir=tmp_path / "run", device="cuda"), Silent(), lambda *_a: {})
+        train(TrainRequest(config=config, run_dir=tmp_path / "run", device="cuda"), Quiet(), lambda *_a: {})
 
 
 # ---------------------------------------------------------------------------------------------- the simulator

@@ -5,7 +5,6 @@ import dataclasses
 import json
 import math
 import re
-import socket
 import struct
 
 import numpy as np
@@ -20,6 +19,7 @@ from tests.mavlink_vehicle import (
     FakeSub,
     WishfulPilot,
     assert_within,
+    free_port,
     link_config,
     plan_of,
 )
@@ -631,12 +631,6 @@ BASE = ["pilot", "--mavlink", "udp:127.0.0.1:14550", "--start", "2,3,-0.8", "--g
 def test_what_makes_no_sense_is_refused(capfd, words, says):
     code, _out, err = uuv(capfd, *BASE, *words)
     assert code == 2 and says in err
-
-
-def free_port():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        return free.getsockname()[1]
 
 
 @pytest.mark.parametrize("words", [["--json"], []])

@@ -10,7 +10,6 @@ import copy
 import hashlib
 import json
 import math
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -22,6 +21,7 @@ from mcap.reader import make_reader
 from mcap.records import Attachment, Chunk, Metadata
 from mcap.stream_reader import StreamReader
 
+from tests.command import read_by_viewer
 from tests.reference import decision_alone, log_alone
 from tests.small_sim import SmallSim
 from uuvtai.loader import load_config, load_resolved
@@ -103,21 +103,8 @@ def long_log(logs, recordings):
 
 
 def test_the_viewers_own_reader_decodes_every_message_against_its_schema(recordings):
-    folder = Path(__file__).parent / "js"
-    node = shutil.which("node")
-    if node is None or not (folder / "node_modules").is_dir():
-        pytest.skip("needs node and `npm ci` in tests/js (bootstrap.py does it)")
     for path in [recordings["paper"][0], recordings["clean"][0]]:
-        done = subprocess.run(
-            [node, "read_log.mjs", str(path)],
-            cwd=folder,
-            capture_output=True,
-            text=True,
-            check=False,
-            timeout=120,
-        )
-        assert done.returncode == 0, done.stderr
-        found = json.loads(done.stdout)
+        found = read_by_viewer(path)
         with path.open("rb") as file:
             summary = make_reader(file).get_summary()
         assert summary and summary.statistics

@@ -7,7 +7,6 @@ import hashlib
 import json
 import math
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -22,6 +21,7 @@ from mcap.records import Attachment, Chunk, Header, Message, Metadata
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, IndexType, Writer
 
+from tests.command import read_by_viewer
 from tests.reference import logs as episode
 from tests.reference.world import path_position
 from uuvtai.closed_form import KIND_NAMES, body_positions
@@ -207,10 +207,7 @@ def test_rates(log_path):
 
 
 def test_the_final_step_shows_the_obstacles_even_off_their_rate(tmp_path):
-    with McapEpisodeLog(tmp_path / "a.mcap", episode.header()) as log:
-        for snap in episode.snapshots(13, maps=False):
-            log.write(snap)
-        log.close(episode.result(13))
+    episode.record(tmp_path / "a.mcap", 13, maps=False)
     times = [m.time_s for m in read_messages(tmp_path / "a.mcap", ["/obstacles/truth"])]
     assert times == pytest.approx([0.0, 0.1, 0.2, 0.26])
 
@@ -547,21 +544,7 @@ def test_schemas_keep_to_what_the_viewers_parse(log_path):
 
 
 def test_the_viewers_own_reader_decodes_everything(log_path):
-    """@mcap/core with its decompressor, ajv and the official Foxglove schemas."""
-    folder = Path(__file__).parent / "js"
-    node = shutil.which("node")
-    if node is None or not (folder / "node_modules").is_dir():
-        pytest.skip("needs node and `npm ci` in tests/js (bootstrap.py does it)")
-    done = subprocess.run(
-        [node, "read_log.mjs", str(log_path)],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-    )
-    assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
+    found = read_by_viewer(log_path)
     assert found["unlikeOfficial"] == []
     assert found["counts"] == {entry["topic"]: entry["messages"] for entry in info(log_path)["topics"]}
     assert found["metadata"] == ["uuv.run", "uuv.result"] and found["attachments"] == [

@@ -4,7 +4,7 @@ itself in float64."""
 import numpy as np
 import pytest
 
-from tests.bundles import io_for
+from tests.bundles import clear, io_for, put
 from tests.reference import elevation as weighing
 from tests.reference import look as oracle
 from tests.reference.depth import camera_position, camera_rays, z_depths
@@ -52,9 +52,7 @@ class Rig:
     def begin(self):
         """Nothing tracked, nothing but walls in view, everyone level at (5, 3, -0.8) and facing +x; a fresh
         image at step 0."""
-        for struct in (self.tracks, self.image, self.clock):
-            for field in vars(struct).values():
-                field.fill(0)
+        clear(self.tracks, self.image, self.clock)
         self.clock.awake.fill(1)
         self.image.fresh.fill(1)
         self.pos, self.rpy = np.tile(OWN, (N_ENV, 1)), np.zeros((N_ENV, 3))
@@ -100,16 +98,9 @@ class Rig:
             self.depth_m[env] = seen.reshape(CAMERA.rows, CAMERA.cols)
         used = self.radius > 0
         state = np.concatenate([self.place, np.zeros((N_ENV, N_TRACK, 2))], 2)
-        self.write(self.image, depth_m=self.depth_m, shot_pos_w=self.pos, shot_rpy=self.rpy)
-        self.write(
-            self.tracks, alive=used, moving=used, state=state, radius_m=self.radius, present=self.present
-        )
+        put(self.image, depth_m=self.depth_m, shot_pos_w=self.pos, shot_rpy=self.rpy)
+        put(self.tracks, alive=used, moving=used, state=state, radius_m=self.radius, present=self.present)
         self.tracks.height.from_numpy(self.share.astype(np.float32).reshape(N_ENV, N_TRACK, 1, LANES))
-
-    def write(self, struct, **fields):
-        for name, value in fields.items():
-            field = getattr(struct, name)
-            field.from_numpy(np.asarray(value).astype(field.to_numpy().dtype))
 
     def look(self):
         """(shares, presences) after the kernel."""
@@ -266,9 +257,9 @@ def test_only_fresh_images_of_moving_bodies_in_view_count(rig):
         )
     }
     flags["fresh"][0] = flags["moving"][1, 0] = flags["alive"][2, 0] = flags["awake"][7] = 0
-    rig.write(rig.image, fresh=flags["fresh"])
-    rig.write(rig.clock, awake=flags["awake"])
-    rig.write(rig.tracks, moving=flags["moving"], alive=flags["alive"] * (rig.radius > 0))
+    put(rig.image, fresh=flags["fresh"])
+    put(rig.clock, awake=flags["awake"])
+    put(rig.tracks, moving=flags["moving"], alive=flags["alive"] * (rig.radius > 0))
     share, present = rig.look()
     np.testing.assert_array_equal(share[:8, 0].astype(np.float32), np.tile(PRIOR.astype(np.float32), (8, 1)))
     np.testing.assert_array_equal(present[:8, 0].astype(np.float32), np.float32(0.9))
@@ -285,8 +276,8 @@ def test_a_track_is_looked_for_where_it_is_now(rig):
     rig.load()
     state = np.zeros((N_ENV, N_TRACK, 4))
     state[:2, 0] = [EYE_X + 1.5, 3.0, 0.0, 1.0]
-    rig.write(rig.tracks, state=state, scan_step=np.full(N_ENV, 10))
-    rig.write(rig.clock, step=np.where(np.arange(N_ENV) == 0, 30, 10))
+    put(rig.tracks, state=state, scan_step=np.full(N_ENV, 10))
+    put(rig.clock, step=np.where(np.arange(N_ENV) == 0, 30, 10))
     share, present = rig.look()
     assert mass(share[0, 0], -0.6, -0.4) > 0.8 and present[0, 0] == pytest.approx(0.9)
     assert present[1, 0] < 0.85

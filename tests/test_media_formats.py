@@ -10,7 +10,6 @@ from tests.reference import logs as episode
 from uuvtai.cli import main
 from uuvtai.errors import UserError
 from uuvtai.logs import canvas, film
-from uuvtai.logs.mcap_log import McapEpisodeLog
 from uuvtai.logs.picture import paint_picture, picture
 from uuvtai.logs.recording import PICTURE_TOPICS, load_recording
 from uuvtai.logs.video import FrameArtist, video
@@ -20,14 +19,6 @@ N_STEP = 60
 DURATION_S = N_STEP * episode.DT
 
 
-def record(path, controller, sway=1.0):
-    with McapEpisodeLog(path, episode.header(controller)) as log:
-        for snap in episode.snapshots(N_STEP, sway=sway):
-            log.write(snap)
-        log.close(episode.result(N_STEP))
-    return path
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("formats")
@@ -35,7 +26,11 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def logs(folder):
-    return [record(folder / "bt.mcap", "bt"), record(folder / "straight.mcap", "straight", -0.9)]
+    straight = episode.header("straight")
+    return [
+        episode.record(folder / "bt.mcap", N_STEP),
+        episode.record(folder / "straight.mcap", N_STEP, straight, sway=-0.9),
+    ]
 
 
 def code(color):
@@ -203,7 +198,7 @@ def test_a_video_draws_its_method_in_its_colour(folder, logs):
 
 
 def test_methods_of_a_user_keep_the_colour_that_they_have_beside_each_other(tmp_path):
-    path = record(tmp_path / "b.mcap", "second")
+    path = episode.record(tmp_path / "b.mcap", N_STEP, episode.header("second"))
     names = ["bt", "first", "second"]
     pixels = set(map(tuple, FrameArtist(load_recording(path), methods=names).frame(1.0).reshape(-1, 3)))
     assert tuple(canvas.method_inks(names)["second"]) in pixels

@@ -5,7 +5,7 @@ import pytest
 import torch
 from safetensors.numpy import save
 
-from tests.bundles import io_for
+from tests.bundles import clear, io_for
 from uuvtai import forecast_codes
 from uuvtai.config import Config
 from uuvtai.errors import UserError
@@ -51,9 +51,7 @@ class Stage:
         self.past, self.mixture = allocate(PastState, SIZES), allocate(MixtureState, SIZES)
 
     def begin(self):
-        for struct in (self.tracks, self.habits, self.forecast, self.futures, self.clock, self.clusters):
-            for field in vars(struct).values():
-                field.fill(0)
+        clear(self.tracks, self.habits, self.forecast, self.futures, self.clock, self.clusters)
         self.clock.awake.fill(1)
         self.clusters.fresh.fill(1)
         self.tracks.alive.fill(1)

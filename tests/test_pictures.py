@@ -21,14 +21,6 @@ CODEC_ERROR = 40
 """VP9 keeps colours of small details only so well (0 to 255)"""
 
 
-def record(path, controller="bt", sway=1.0, outcome="success", number=3):
-    with McapEpisodeLog(path, episode.header(controller, number)) as log:
-        for snap in episode.snapshots(N_STEP, sway=sway, outcome=outcome):
-            log.write(snap)
-        log.close(episode.result(N_STEP, outcome))
-    return path
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("pictures")
@@ -36,12 +28,13 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def bt(folder):
-    return record(folder / "bt.mcap")
+    return episode.record(folder / "bt.mcap", N_STEP)
 
 
 @pytest.fixture(scope="module")
 def straight(folder):
-    return record(folder / "straight.mcap", "straight", -0.9, "collision")
+    described = episode.header("straight")
+    return episode.record(folder / "straight.mcap", N_STEP, described, "collision", sway=-0.9)
 
 
 def place(world, width=1600, side=0):
@@ -105,7 +98,7 @@ def test_the_end_shows_the_outcome(bt, straight):
 
 
 def test_where_methods_go_the_same_way_both_are_seen(folder, bt):
-    twin = record(folder / "twin.mcap", "twin")
+    twin = episode.record(folder / "twin.mcap", N_STEP, episode.header("twin"))
     loaded = [load_recording(path, PICTURE_TOPICS) for path in (bt, twin)]
     image = paint_picture(loaded, obstacles=False).image
     path = loaded[0].positions
@@ -118,10 +111,7 @@ def test_where_methods_go_the_same_way_both_are_seen(folder, bt):
 def test_true_bodies_are_as_old_as_the_map(folder, bt):
     """The first method's map is drawn; another method that took longer does not move the bodies on."""
     longer = folder / "longer.mcap"
-    with McapEpisodeLog(longer, episode.header("straight")) as log:
-        for snap in episode.snapshots(2 * N_STEP, sway=-0.9):
-            log.write(snap)
-        log.close(episode.result(2 * N_STEP))
+    episode.record(longer, 2 * N_STEP, episode.header("straight"), sway=-0.9)
     first, second = (load_recording(path, PICTURE_TOPICS) for path in (bt, longer))
     body = episode.BODIES[4]
     then, later = (body_positions(body, np.array([recording.duration_s]))[0] for recording in (first, second))
@@ -155,7 +145,7 @@ def test_bodies_above_and_below_the_vehicle_are_dashed():
 
 
 def test_trajectories_of_other_episodes_are_not_overlaid(folder, bt):
-    other = record(folder / "other.mcap", number=4)
+    other = episode.record(folder / "other.mcap", N_STEP, episode.header(episode=4))
     with pytest.raises(LogError, match="another episode"):
         picture([bt, other], folder / "never.png")
     assert not (folder / "never.png").exists()
@@ -256,9 +246,6 @@ def test_a_log_without_poses_cannot_be_drawn(tmp_path):
 
 
 def test_a_log_without_maps_is_drawn_all_the_same(tmp_path):
-    with McapEpisodeLog(tmp_path / "a.mcap", episode.header()) as log:
-        for snap in episode.snapshots(20, maps=False):
-            log.write(snap)
-        log.close(episode.result(20))
+    episode.record(tmp_path / "a.mcap", 20, maps=False)
     assert cv2.imread(str(picture(tmp_path / "a.mcap", tmp_path / "a.png", clearance=True))) is not None
     assert FrameArtist(load_recording(tmp_path / "a.mcap")).frame(0.2).shape[1] == 1280

@@ -5,6 +5,7 @@ import math
 
 import pytest
 
+from tests.command import Quiet
 from tests.report_samples import robustness_sweep
 from uuvtai.loader import preset_names
 from uuvtai.measure.reproduce import claims, paper, paper_run, steps
@@ -285,14 +286,6 @@ def printed(arguments):
         row = {"num_envs": 1, "env_steps_per_s": {"step": 1.0, "step_inference": 1.0, "train": 1.0}}
         return {"paper_latency": [], "paper_density": [], "rows": [row], "real_time": None}
     return {}
-
-
-class Quiet:
-    def __init__(self):
-        self.answer = []
-
-    def note(self, text):
-        self.answer.append(text)
 
 
 @pytest.fixture(autouse=True)

@@ -12,7 +12,6 @@ from tests.reference import logs as episode
 from uuvtai.logs import ros_types, ros_write
 from uuvtai.logs.container import McapFile
 from uuvtai.logs.log_errors import LogError
-from uuvtai.logs.mcap_log import McapEpisodeLog
 from uuvtai.logs.reader import info, read_head, read_messages
 from uuvtai.logs.ros_write import WRITTEN
 from uuvtai.logs.rosbag import from_rosbag2, to_rosbag2
@@ -26,12 +25,7 @@ N_STEP = 30
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    path = tmp_path_factory.mktemp("logs") / "a.mcap"
-    with McapEpisodeLog(path, episode.header()) as log:
-        for snap in episode.snapshots(N_STEP):
-            log.write(snap)
-        log.close(episode.result(N_STEP))
-    return path
+    return episode.record(tmp_path_factory.mktemp("logs") / "a.mcap", N_STEP)
 
 
 @pytest.fixture(scope="module")

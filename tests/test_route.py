@@ -65,12 +65,8 @@ def follow():
 
 def load(env, corners):
     s, c = stage(), CONFIG
-    route.load_route(
-        io_for(RouteIO, s.route, s.clearance, s.clock, c.route, c.voronoi, c.mapping, maps.TANK),
-        np.array(corners, np.float32),
-        env,
-        codes.PLANNER_RRT,
-    )
+    io = io_for(RouteIO, s.route, s.clearance, s.clock, c.route, c.voronoi, c.mapping, maps.TANK)
+    route.load_route(io, np.array(corners, np.float32), env, codes.PLANNER_RRT)
     s.route.want_plan[env] = 1  # nobody loads a route that was not asked for
 
 

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from tests.command import Quiet
 from uuvtai import signals
 from uuvtai.errors import UserError
 from uuvtai.loader import load_config, load_resolved
@@ -168,10 +169,6 @@ def test_an_evaluation_holds_its_folder(tmp_path, monkeypatch):
     monkeypatch.setattr(compare, "_any_tree", lambda: None)
     monkeypatch.setattr("uuvtai.sim.Sim", lambda *_: SimpleNamespace(device=torch.device("cpu")))
 
-    class Watch:
-        def __getattr__(self, _name):
-            return lambda *_: None
-
     def scenarios(_sim, _jobs):
         with pytest.raises(RunFolderError, match="another process"):
             RunFolder.held(tmp_path / "run")
@@ -182,7 +179,7 @@ def test_an_evaluation_holds_its_folder(tmp_path, monkeypatch):
         load_config("pool"), "pool", "paper", ["oracle"], [77], 1, run_dir=tmp_path / "run"
     )
     with pytest.raises(LookupError, match="seen"):
-        compare.compare(request, Watch())
+        compare.compare(request, Quiet())
     RunFolder.held(tmp_path / "run").release()
 
 

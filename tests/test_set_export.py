@@ -12,6 +12,7 @@ import torch
 
 from tests.command import run_cli
 from tests.reference import hull_rule as reference
+from tests.test_deploy import resigned
 from uuvtai.config import TankConfig, VehicleConfig
 from uuvtai.deploy import export as deploy
 from uuvtai.deploy import run_policy, run_set_policy, set_columns_text
@@ -66,6 +67,12 @@ def saved(kind, folder, change=None):
     return checkpoint.newest(folder)
 
 
+def exported(kind, folder):
+    """(checkpoint, what was exported, into which folder)."""
+    found, out = saved(kind, folder / "run"), folder / "out"
+    return found, deploy.export(found, "mine", out, (), lambda _text: None), out
+
+
 @pytest.fixture(scope="module", params=run_policy.KINDS)
 def kind(request):
     return request.param
@@ -74,13 +81,11 @@ def kind(request):
 @pytest.fixture(scope="module")
 def whole(kind, tmp_path_factory):
     """(checkpoint, exported folder without a graph)."""
-    root = tmp_path_factory.mktemp(kind)
-    found = saved(kind, root / "run")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(deploy, "missing_packages", lambda: ["onnx"])
-        done = deploy.export(found, "mine", root / "out", (), lambda _text: None)
+        found, done, out = exported(kind, tmp_path_factory.mktemp(kind))
     assert [each.engine for each in done.agreements] == ["torch", "NumPy"] and done.agrees
-    return found, root / "out"
+    return found, out
 
 
 def test_a_folder_has_its_driver_and_checks_itself(kind, whole, capfd):
@@ -161,12 +166,12 @@ def test_no_critic_and_no_truth_is_exported(kind, whole):
 def test_the_graph_says_the_same(kind, tmp_path):
     if missing_packages():
         pytest.skip("needs the extra uuvtai[export]")
-    done = deploy.export(saved(kind, tmp_path / "run"), "mine", tmp_path / "out", (), lambda _text: None)
+    _, done, out = exported(kind, tmp_path)
     assert [each.engine for each in done.agreements] == ["torch", "NumPy", "ONNX Runtime"] and done.agrees
-    spec = run_policy.read_spec(tmp_path / "out")
-    policy = run_set_policy.load(tmp_path / "out")
+    spec = run_policy.read_spec(out)
+    policy = run_set_policy.load(out)
     assert set(spec["graph"]["inputs"]) == set(policy.inputs)
-    assert set(spec["graph"]["outputs"]) == set(policy.said(golden_inputs(tmp_path / "out", policy)))
+    assert set(spec["graph"]["outputs"]) == set(policy.said(golden_inputs(out, policy)))
     if kind == "forecast":
         return
     from uuvtai.deploy.onnx_session import session
@@ -175,7 +180,7 @@ def test_the_graph_says_the_same(kind, tmp_path):
     few = {name: rng.normal(size=(3, policy.widths[name])).astype(np.float32) for name in policy.inputs[1:]}
     few["bodies"] = rng.normal(size=(3, 2, BODY_WIDTH)).astype(np.float32)
     few["bodies"][..., 0] = 1.0
-    graph = session((tmp_path / "out" / "policy.onnx").read_bytes())
+    graph = session((out / "policy.onnx").read_bytes())
     (wish, *_) = graph.run(["mean_wish"], few)
     np.testing.assert_allclose(wish, policy.said(few)["mean_wish"], atol=1e-5)
 
@@ -190,9 +195,8 @@ def golden_inputs(folder, policy):
 
 def test_the_folder_commands_what_the_pilot_commands_in_the_simulator(small, tmp_path, no_onnx):
     """Columns that the pilot wrote, the wish, and the hull rule where each vehicle then is."""
-    found = saved("set", tmp_path / "run")
-    deploy.export(found, "mine", tmp_path / "out", (), lambda _text: None)
-    policy, pilot = run_set_policy.load(tmp_path / "out"), load_set_pilot(found, small.sim)
+    found, _, out = exported("set", tmp_path)
+    policy, pilot = run_set_policy.load(out), load_set_pilot(found, small.sim)
     small.begin(range(small.N), seed=5)
     pilot.reset(torch.ones(small.N))
     ways = small.sim.rows(small.sim.s.mission.goal_w) - small.sim.rows(small.sim.s.mission.start_w)
@@ -214,12 +218,6 @@ def test_the_folder_commands_what_the_pilot_commands_in_the_simulator(small, tmp
         assert np.abs(commands).max() > 0.1
         small.sim.step(torch.from_numpy(action))
         pilot.advance()
-
-
-@pytest.fixture
-def no_onnx(monkeypatch):
-    """As if the extra were not installed; ONNX takes seconds."""
-    monkeypatch.setattr(deploy, "missing_packages", lambda: ["onnx"])
 
 
 def test_the_hull_rule_is_that_of_the_oracle():
@@ -282,9 +280,8 @@ def test_words_and_constants_are_those_of_the_package():
 
 
 def test_a_forecast_is_that_of_its_network(tmp_path, no_onnx):
-    found = saved("forecast", tmp_path / "run")
-    deploy.export(found, "mine", tmp_path / "out", (), lambda _text: None)
-    forecast, net = run_set_policy.load(tmp_path / "out"), module_of(found, "forecast").net
+    found, _, out = exported("forecast", tmp_path)
+    forecast, net = run_set_policy.load(out), module_of(found, "forecast").net
     columns = torch.zeros(4, N_COLUMN)
     columns[:, :COLUMNS] = torch.randn(4, COLUMNS, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
@@ -293,7 +290,7 @@ def test_a_forecast_is_that_of_its_network(tmp_path, no_onnx):
         said = forecast.futures(columns[i, :COLUMNS].numpy(), 0.8)
         for own, theirs in zip(said, wanted, strict=True):
             np.testing.assert_allclose(own, theirs[i].numpy(), atol=1e-5)
-    assert "nll_pool: -3.25" in (tmp_path / "out" / "README.md").read_text()
+    assert "nll_pool: -3.25" in (out / "README.md").read_text()
 
 
 # -------------------------------------------------------------------------------------------------- bad input
@@ -317,9 +314,9 @@ def test_bad_columns_are_refused(change, says):
 
 
 def test_the_other_driver_is_named(tmp_path, no_onnx):
-    deploy.export(saved("set", tmp_path / "run"), "mine", tmp_path / "out", (), lambda _text: None)
+    *_, out = exported("set", tmp_path)
     with pytest.raises(run_policy.PolicyError, match="'set'; drive by run_set_policy"):
-        run_policy.load(tmp_path / "out")
+        run_policy.load(out)
 
 
 @pytest.mark.parametrize(
@@ -354,23 +351,15 @@ def test_networks_that_cannot_drive_are_not_exported(kind, change, tmp_path, no_
     assert not (tmp_path / "out").exists()
 
 
-def resigned(folder, name, content):
-    (folder / name).write_bytes(content)
-    spec = json.loads((folder / "policy_spec.json").read_text())
-    spec["files"][name] = run_policy.hashlib.sha256(content).hexdigest()
-    (folder / "policy_spec.json").write_text(json.dumps(spec))
-
-
 def test_other_weights_with_the_right_sha256_are_exit_3(kind, tmp_path, no_onnx, capfd):
-    found = saved(kind, tmp_path / "run")
-    deploy.export(found, "mine", tmp_path / "out", (), lambda _text: None)
+    found, _, out = exported(kind, tmp_path)
     weights = set_weights(module_of(found, kind_of(found)))
     changed = next(name for name in weights if name.endswith("bias"))
     weights[changed] += 1.0
     from safetensors.torch import save
 
-    resigned(tmp_path / "out", "policy.safetensors", save(weights))
-    assert run_cli("export", "--check", tmp_path / "out") == 3
+    resigned(out, "policy.safetensors", save(weights))
+    assert run_cli("export", "--check", out) == 3
     assert "DIFFERS" in capfd.readouterr().out
 
 
@@ -385,21 +374,19 @@ def test_other_weights_with_the_right_sha256_are_exit_3(kind, tmp_path, no_onnx,
     ],
 )
 def test_arrays_that_do_not_fit_the_specification(kind, change, tmp_path, no_onnx):
-    found = saved(kind, tmp_path / "run")
-    deploy.export(found, "mine", tmp_path / "out", (), lambda _text: None)
-    arrays = dict(run_policy.read_safetensors(tmp_path / "out" / "policy.safetensors"))
+    *_, out = exported(kind, tmp_path)
+    arrays = dict(run_policy.read_safetensors(out / "policy.safetensors"))
     change(arrays)
     with pytest.raises(run_policy.PolicyError, match="do not fit together"):
-        run_set_policy.made(run_policy.read_spec(tmp_path / "out"), arrays)
+        run_set_policy.made(run_policy.read_spec(out), arrays)
 
 
 @pytest.mark.parametrize("other", ["tree", 3, [], None])
 def test_a_kind_that_is_none_is_refused(other, tmp_path, no_onnx, capfd):
-    found = saved("set", tmp_path / "run")
-    deploy.export(found, "mine", tmp_path / "out", (), lambda _text: None)
-    spec = json.loads((tmp_path / "out" / "policy_spec.json").read_text()) | {"kind": other}
-    (tmp_path / "out" / "policy_spec.json").write_text(json.dumps(spec))
-    assert run_cli("export", "--check", tmp_path / "out") == 2
+    *_, out = exported("set", tmp_path)
+    spec = json.loads((out / "policy_spec.json").read_text()) | {"kind": other}
+    (out / "policy_spec.json").write_text(json.dumps(spec))
+    assert run_cli("export", "--check", out) == 2
     assert "not one of set, forecast" in capfd.readouterr().err
 
 
@@ -417,14 +404,11 @@ def test_a_kind_that_is_none_is_refused(other, tmp_path, no_onnx, capfd):
 def test_golden_pairs_are_read_without_trust(change, tmp_path, no_onnx, capfd):
     from uuvtai.deploy.golden import npz_bytes
 
-    found = saved("set", tmp_path / "run")
-    deploy.export(found, "mine", tmp_path / "out", (), lambda _text: None)
+    found, _, out = exported("set", tmp_path)
     golden = golden_rows(module_of(found, "set"))
-    assert (
-        max(run_set_policy.differences(run_set_policy.load(tmp_path / "out"), golden).values()) <= TOLERANCE
-    )
+    assert max(run_set_policy.differences(run_set_policy.load(out), golden).values()) <= TOLERANCE
     change(golden)
-    resigned(tmp_path / "out", "golden.npz", npz_bytes(golden))
-    assert run_cli("export", "--check", tmp_path / "out") in (2, 3)
-    assert run_set_policy.main([str(tmp_path / "out")]) in (1, 3)
+    resigned(out, "golden.npz", npz_bytes(golden))
+    assert run_cli("export", "--check", out) in (2, 3)
+    assert run_set_policy.main([str(out)]) in (1, 3)
     capfd.readouterr()

@@ -29,10 +29,14 @@ def started(folder, *arguments, program=None, environment=ENVIRONMENT):
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder, env=environment
     )
-    deadline = time.monotonic() + 60
-    while process.poll() is None and not catches(process.pid, signal.SIGTERM) and time.monotonic() < deadline:
-        time.sleep(0.001)
+    wait_for(lambda: process.poll() is not None or catches(process.pid, signal.SIGTERM), 60, every_s=0.001)
     return process
+
+
+def wait_for(is_so, patience_s, every_s=0.05):
+    deadline = time.monotonic() + patience_s
+    while not is_so() and time.monotonic() < deadline:
+        time.sleep(every_s)
 
 
 def catches(pid, number):
@@ -275,13 +279,7 @@ def test_nobody_is_told_by_a_library(tmp_path):
 def test_sigterm_ends_a_training_as_ctrl_c_does(tmp_path):
     process = started(tmp_path, *SmallSim.TRAIN, "--iterations", "5000", "--run-dir", "run")
     metrics = tmp_path / "run/metrics.jsonl"
-    deadline = time.monotonic() + 400
-    while (
-        process.poll() is None
-        and not (metrics.exists() and metrics.stat().st_size)
-        and time.monotonic() < deadline
-    ):
-        time.sleep(0.05)
+    wait_for(lambda: process.poll() is not None or (metrics.exists() and metrics.stat().st_size), 400)
     process.send_signal(signal.SIGTERM)
     code, err = ended(process, signal.SIGTERM)
     assert code == 143 and "saved; go on with: uuv train --resume run" in err
@@ -306,12 +304,7 @@ def test_the_workers_of_a_sweep_end_with_it(tmp_path):
     process = started(
         tmp_path, "sweep", *grid, "--run-dir", "run", "--device", "cpu", "--num-envs", SmallSim.OPTIONS[1]
     )
-    deadline = time.monotonic() + 120
-    while (
-        len(children := children_of(process.pid)) < 2 and time.monotonic() < deadline
-    ):  # a worker and a resource tracker
-        time.sleep(0.05)
-    assert len(children) >= 2
+    children = two_children_of(process)  # a worker and a resource tracker
     os.kill(process.pid, signal.SIGTERM)
     code, err = ended(process, signal.SIGTERM)
     assert code == 143 and "go on with: uuv sweep --resume run" in err
@@ -326,22 +319,28 @@ def test_ctrl_c_ends_what_compiles_side_by_side(tmp_path):
     process = subprocess.Popen(
         command, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=ENVIRONMENT, start_new_session=True
     )
-    deadline = time.monotonic() + 60
-    while len(children := children_of(process.pid)) < 2 and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert len(children) >= 2
+    children = two_children_of(process)
     os.killpg(process.pid, signal.SIGINT)
     code, err = ended(process, signal.SIGINT)
     assert code == 130 and err.splitlines()[-1] == "interrupted"
     assert not left_of(children)
 
 
-def left_of(children, patience_s=20.0):
-    """Those that have not ended by then."""
-    deadline = time.monotonic() + patience_s
-    while any(Path(f"/proc/{child}").exists() for child in children) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    return [child for child in children if Path(f"/proc/{child}").exists()]
+def left_of(children):
+    """Those that have not ended after a while."""
+
+    def left():
+        return [child for child in children if Path(f"/proc/{child}").exists()]
+
+    wait_for(lambda: not left(), 20)
+    return left()
+
+
+def two_children_of(process):
+    wait_for(lambda: len(children_of(process.pid)) >= 2, 120)
+    children = children_of(process.pid)
+    assert len(children) >= 2
+    return children
 
 
 def children_of(pid):

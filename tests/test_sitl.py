@@ -14,7 +14,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from tests.command import uuv
-from tests.mavlink_vehicle import START, link_config
+from tests.mavlink_vehicle import START, free_port, link_config
 from uuvtai import signals
 from uuvtai.errors import SettingError
 from uuvtai.link.dialect import MavCodec
@@ -500,12 +500,6 @@ def test_the_water_waits_for_the_clock(served, monkeypatch):
     port.instance.time_s = 50.0
     serving._pace(port, 1.0)
     assert len(slept) == 1 and port.paced_from_s == 50.0, "begun anew, or held up: nothing to catch up with"
-
-
-def free_port():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        return free.getsockname()[1]
 
 
 def test_an_interrupted_water_tells_what_happened(capfd, monkeypatch, small):

@@ -4,7 +4,7 @@ camera, and a float64 oracle."""
 import numpy as np
 import pytest
 
-from tests.bundles import io_for
+from tests.bundles import io_for, put
 from tests.reference import spotting as oracle
 from tests.reference.elevation import prior
 from tests.reference.scenes import BOX, CYLINDER, SPHERE, load, quaternions
@@ -145,32 +145,18 @@ class Rig:
             "vel_b": np.zeros((N_ENV, 3)),
         }
         load(scene, self.vehicle, self.world)
-        self.write(self.ego, pos_w=self.pos, rpy=self.rpy)
-        self.write(self.tracks, **self.memory)
-        self.write(self.scan, **self.scanned)
-        self.write(self.clock, awake=self.awake, step=np.full(N_ENV, self.step))
-
-    def write(self, struct, **fields):
-        for name, value in fields.items():
-            field = getattr(struct, name)
-            field.from_numpy(np.asarray(value).astype(field.to_numpy().dtype))
+        put(self.ego, pos_w=self.pos, rpy=self.rpy)
+        put(self.tracks, **self.memory)
+        put(self.scan, **self.scanned)
+        put(self.clock, awake=self.awake, step=np.full(N_ENV, self.step))
 
     def look(self):
         """Draw the image and follow what it shows; returns the memory afterwards."""
         self.load()
-        depth.cast_depth(
-            io_for(
-                DepthIO,
-                self.image,
-                self.ego,
-                self.vehicle,
-                self.world,
-                self.episode,
-                self.clock,
-                CAMERA,
-                TANK,
-            )
+        io = io_for(
+            DepthIO, self.image, self.ego, self.vehicle, self.world, self.episode, self.clock, CAMERA, TANK
         )
+        depth.cast_depth(io)
         return self.follow()
 
     def follow(self):
@@ -247,7 +233,7 @@ def test_columns_equal_the_oracle(rig):
             1, 8, (N_ENV, 1, CAMERA.cols)
         )
         pixels = np.minimum(pixels, CAMERA.max_range_m).astype(np.float32)
-        rig.write(rig.image, depth_m=pixels, fresh=np.ones(N_ENV), shot_pos_w=rig.pos, shot_rpy=rig.rpy)
+        put(rig.image, depth_m=pixels, fresh=np.ones(N_ENV), shot_pos_w=rig.pos, shot_rpy=rig.rpy)
         rig.follow()
         near, edge = rig.spots.column_m.to_numpy(), rig.spots.edge_m.to_numpy()
         for env in range(N_ENV):
@@ -591,7 +577,7 @@ def test_sleeping_rows_old_images_and_other_rows(rig):
         )
         fresh = np.ones(N_ENV)
         fresh[rows] = still == "asleep"
-        rig.write(rig.image, fresh=fresh)
+        put(rig.image, fresh=fresh)
         after, others = rig.follow(), np.delete(np.arange(N_ENV), rows)
         for name in before:
             np.testing.assert_array_equal(after[name][rows], before[name][rows], err_msg=name)

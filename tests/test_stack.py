@@ -5,18 +5,10 @@ import json
 
 import pytest
 
+from tests.command import Quiet
 from uuvtai.loader import STACK_SECTIONS, ConfigError, load_config, tree_of_stack, with_stack
 from uuvtai.measure.episodes.methods import trees_of
 from uuvtai.measure.evaluate.compare import Request, compare
-
-
-class Quiet:
-    """Hears nothing of how far a comparison is."""
-
-    def start(self, name, total): ...
-    def note(self, text): ...
-    def update(self, done, total, env_steps, left=None): ...
-    def stop(self): ...
 
 
 def test_a_stacks_name_is_a_controller_with_its_own_config_and_tree(tmp_path):

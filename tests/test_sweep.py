@@ -9,7 +9,7 @@ import time
 import pytest
 
 from tests import worker_work
-from tests.command import uuv
+from tests.command import Quiet, uuv
 from tests.report_samples import robustness_sweep
 from tests.small_sim import SmallSim
 from uuvtai.loader import ConfigError
@@ -23,26 +23,6 @@ from uuvtai.run_folder import RunFolderError
 from uuvtai.show.screen import Screen
 from uuvtai.show.sweeping import show_sweep
 from uuvtai.workers import EngineError
-
-
-class Quiet:
-    """Watches without a word."""
-
-    def __init__(self):
-        self.answer = []
-
-    def start(self, name, total, done=0):
-        self.total = total
-
-    def note(self, text):
-        self.answer.append(text)
-
-    def update(self, done, total, env_steps):
-        self.done = done
-
-    def stop(self):
-        pass
-
 
 # ------------------------------------------------------------------------------------------------------- grid
 

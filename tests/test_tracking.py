@@ -486,31 +486,22 @@ def test_slow_mover_recognised_within_a_second(paper):
     lab, drive = paper.begin(4), Drive(np.random.default_rng(7), speed=0.3)
     drive.pos, course = np.tile([8.0, 3.0], (N_ENV, 1)), 2 * np.pi * np.arange(N_ENV) / N_ENV
     vel = 0.2 * np.stack([np.cos(course), np.sin(course)], -1)[:, None]
-    for k in range(int(1.0 / PERIOD_S) + 1):
-        centre = np.array([11.0, 3.0]) + vel * k * PERIOD_S
-        body = lab.sense(
-            k * CONFIG.period_steps,
-            drive.pos,
-            drive.yaw,
-            drive.vel,
-            with_movers(no_bodies(), centre, vel, np.full((N_ENV, 1), 0.2)),
-        )
+
+    def sense(k):
+        circles = with_movers(no_bodies(), [11.0, 3.0] + vel * k * PERIOD_S, vel, np.full((N_ENV, 1), 0.2))
+        body = lab.sense(k * CONFIG.period_steps, drive.pos, drive.yaw, drive.vel, circles)
         drive.advance(PERIOD_S)
+        return body
+
+    first = int(1.0 / PERIOD_S) + 1
+    for k in range(first):
+        body = sense(k)
     owner = np.array([lab.read("beam_track")[env][body[env] == 0][0] for env in range(N_ENV)])
     moving = lab.read("moving")[np.arange(N_ENV), owner]
     crossing = np.abs(np.cos(course)) < 0.1
     assert moving[~crossing].all()
-    first = int(1.0 / PERIOD_S) + 1
     for k in range(first, first + int(0.6 / PERIOD_S)):
-        centre = np.array([11.0, 3.0]) + vel * k * PERIOD_S
-        lab.sense(
-            k * CONFIG.period_steps,
-            drive.pos,
-            drive.yaw,
-            drive.vel,
-            with_movers(no_bodies(), centre, vel, np.full((N_ENV, 1), 0.2)),
-        )
-        drive.advance(PERIOD_S)
+        sense(k)
     assert lab.read("moving")[np.arange(N_ENV), owner].all()
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from tests.bundles import io_for
+from tests.bundles import clear, io_for
 from tests.reference import habits as habit_oracle
 from uuvtai.config import Config
 from uuvtai.kernels.core.lanes import LANES
@@ -147,9 +147,7 @@ def rates_of(kind, way, dt, turn_rate=0.0, turn_var=0.0, turned=None):
     """[1/s] of bodies that swim along +x at 1.5 m/s and have gone straight for ``way`` [m] since a turn that
     was seen (``kind`` 2), or since they were met (1)."""
     tracks, habits = straight_bodies()
-    for struct in (tracks, habits):
-        for field in vars(struct).values():
-            field.fill(0)
+    clear(tracks, habits)
     state = np.stack([way, 0 * way, 0 * way + SPEED, 0 * way], 1)[:, None]
     tracks.state.from_numpy(state.astype(np.float32))
     tracks.turn_rate.fill(turn_rate)
@@ -213,9 +211,7 @@ def test_only_bodies_that_beams_pass_by_may_have_turned():
     """One third each: beams meet nothing where the body is expected, meet something nearer, have just met the
     body."""
     structs = [allocate(struct, SIZES) for struct in (TrackState, HabitState, ClusterState, SonarScan)]
-    for struct in structs:
-        for field in vars(struct).values():
-            field.fill(0)
+    clear(*structs)
     tracks, _, clusters, scan = structs
     kind = np.arange(N) % 3
     tracks.state.from_numpy(np.tile(np.array([3.0, 0.0, 1.5, 0.0], np.float32), (N, 1, 1)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 
 from uuvtai.closed_form import body_positions
 from uuvtai.config import Config, SensorsConfig, SonarConfig
+from uuvtai.logs.mcap_log import McapEpisodeLog
 from uuvtai.logs.moment import EpisodeHeader
 from uuvtai.logs.scenario_document import scenario_document
 from uuvtai.outcomes import OUTCOMES
@@ -355,3 +357,14 @@ def _quaternion(roll: float, pitch: float, yaw: float) -> np.ndarray:
         cr * cp * sy - sr * sp * cy,
     ]
     return np.array(values, np.float32)
+
+
+def record(
+    path: Path, n_step: int, described: EpisodeHeader | None = None, outcome: str = "success", **how: Any
+) -> Path:
+    """A log of an episode at that path; how the vehicle drives: see ``snapshots``."""
+    with McapEpisodeLog(path, described or header()) as log:
+        for snap in snapshots(n_step, outcome=outcome, **how):
+            log.write(snap)
+        log.close(result(n_step, outcome))
+    return path
