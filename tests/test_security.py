@@ -428,7 +428,7 @@ tensorboard tensorboard/events.out.tfevents.1 anything/else
 """
 """what a run folder may hold, and what a resumed run, a report or an evaluation writes or deletes there"""
 READERS_OF_A_RUN = {
-    "reopen": lambda run: RunFolder.reopen(run, {}),
+    "held": RunFolder.held,
     "train --resume": lambda run: train(TrainRequest(resume=run), Quiet(), evaluate_now),
     "sweep --resume": lambda run: resume_sweep(run, None, Quiet()),
     "reproduce --resume": lambda run: resume_reproduction(run, Quiet()),
@@ -581,7 +581,7 @@ def test_the_record_of_a_run(run, name):
             assert "\n" not in str(error) and len(str(error)) < 1000
     if name in UNUSABLE:
         with pytest.raises(RunFolderError, match=r"run\.json: cannot be read"):
-            RunFolder.reopen(run, {})
+            RunFolder.held(run).go_on({})
 
 
 def use_of(tree="bt", **node):
