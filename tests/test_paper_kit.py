@@ -11,7 +11,8 @@ import pytest
 
 from tests import report_samples as samples
 from tests.command import uuv
-from tests.test_pictures import record
+from tests.reference import logs as episode
+from tests.test_pictures import N_STEP
 from uuvtai.errors import UserError
 from uuvtai.loader import ConfigError
 from uuvtai.logs.log_errors import LogError
@@ -215,14 +216,15 @@ def test_no_text_in_a_csv_is_a_formula(value, answer):
 def test_logs_make_a_figure_of_the_ways(tmp_path):
     run = evaluated(tmp_path / "run")
     (run / "logs").mkdir()
-    record(run / "logs/bt_seed0_episode3.mcap")
-    record(run / "logs/straight_seed0_episode3.mcap", "straight", -0.9, "collision")
+    episode.record(run / "logs/bt_seed0_episode3.mcap", N_STEP)
+    straight = run / "logs/straight_seed0_episode3.mcap"
+    episode.record(straight, N_STEP, episode.header("straight"), "collision", sway=-0.9)
     (item,) = [item for item in items_of(run) if item.name.startswith("ways")]
     assert item.name == "ways_seed0_episode3" and "n = 1 episode; no intervals." in item.caption
     assert "bt: success after" in item.caption and "straight: collision after" in item.caption
     for width in (3.5, 7.16):
         assert len(sheets(item.panels, width)["pdf"]) > 4000
-    record(run / "logs/planner_seed0_episode3.mcap", "planner", number=4)
+    episode.record(run / "logs/planner_seed0_episode3.mcap", N_STEP, episode.header("planner", 4))
     with pytest.raises(LogError, match="is another episode"):
         items_of(run)
 
