@@ -77,7 +77,9 @@ def test_it_ends_when_its_pipe_closes():
 SLEEPER = """
 import os, sys, pathlib
 sys.stdin.buffer.read(8)
-pathlib.Path(os.environ["TOLD"]).write_text(str(os.getpid()))
+told = pathlib.Path(os.environ["TOLD"])
+told.with_suffix(".new").write_text(str(os.getpid()))
+told.with_suffix(".new").replace(told)
 sys.stdin.buffer.read()
 """
 ASKER = """
