@@ -1,4 +1,5 @@
-"""README's tables and the page of results, from the results in docs/data: ``python -m docs.render_results``.
+"""README's tables and the page of results, from the results in docs/data, and the table of safety rules:
+``python -m docs.render_results``.
 
 ``--check`` changes nothing and lists what differs. ``--keep RUN`` first takes in a finished run: of
 ``uuv reproduce``, or with ``--row NAME`` of the ``uuv eval --explain`` that the row's command gives.
@@ -15,6 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from uuvtai.link.safety import RULES
 from uuvtai.measure.reproduce.claims import pooled
 from uuvtai.measure.reproduce.markdown import results_page
 from uuvtai.measure.reproduce.steps import RETIRED_SEEDS
@@ -26,7 +28,7 @@ Document = dict[str, Any]
 
 ROOT = Path(__file__).resolve().parents[1]
 EVALUATIONS, REPRODUCTION = "docs/data/evaluations_90007.json", "docs/data/reproduce.json"
-README, RESULTS = "README.md", "docs/results.md"
+README, RESULTS, SAFETY = "README.md", "docs/results.md", "docs/safety.md"
 TABLE = re.compile(
     r"(?P<head><!-- table: (?P<name>\w+) -->\n)(?P<body>.*?)(?P<foot>^<!-- end -->)", re.M | re.S
 )
@@ -93,20 +95,39 @@ def _percent(method: Document, *outcomes: str) -> str:
     return f"{100 * pooled([method], *outcomes).rate:.1f}"
 
 
-TABLES: dict[str, Callable[[Document], str]] = {"measured": measured, "evaluations": evaluations}
+def safety_rules(document: Document) -> str:
+    """The table of ``uuv pilot``'s rules, as they are in the code."""
+    rows = []
+    for rule in RULES:
+        actions = (
+            action.name.lower().replace("_", " ") + (f" after {seconds:g} s" if seconds else "")
+            for seconds, action in rule.actions
+        )
+        rows.append(f"| {rule.name} | {rule.meaning} | {', '.join(actions)} | `-k {rule.case}` |")
+    return "\n".join(["| what | when | action | its test |", "| --- | --- | --- | --- |", *rows])
+
+
+TABLES: dict[str, Callable[[Document], str]] = {
+    "measured": measured,
+    "evaluations": evaluations,
+    "safety_rules": safety_rules,
+}
 
 
 # ------------------------------------------------------------------------------------------------------ pages
 
 
 def pages(root: Path = ROOT) -> dict[str, str]:
-    """What README and the page of results should say, by path."""
+    """What README, the page of results and the page of safety should say, by path."""
     shown, reproduced = (json.loads((root / name).read_text("utf-8")) for name in (EVALUATIONS, REPRODUCTION))
-    readme = TABLE.sub(
-        lambda found: f"{found['head']}{TABLES[found['name']](shown)}\n{found['foot']}",
-        (root / README).read_text("utf-8"),
+    readme, safety = (
+        TABLE.sub(
+            lambda found: f"{found['head']}{TABLES[found['name']](shown)}\n{found['foot']}",
+            (root / name).read_text("utf-8"),
+        )
+        for name in (README, SAFETY)
     )
-    return {README: readme, RESULTS: results_page(reproduced)}
+    return {README: readme, RESULTS: results_page(reproduced), SAFETY: safety}
 
 
 def differences(root: Path = ROOT) -> list[str]:

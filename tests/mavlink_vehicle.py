@@ -3,20 +3,26 @@ told. Beside it a ground station, and a pilot that wants what it is told to want
 
 import math
 import socket
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
+from uuvtai.link.endpoint import Endpoint, LinkPlace
 from uuvtai.link.flight_plan import FlightPlan
+from uuvtai.link.link_log import LinkLog
+from uuvtai.link.onboard_loop import OnboardLoop
 from uuvtai.link.safety import SafetyLimits
 from uuvtai.loader import load_config
 from uuvtai.pilot import KINDS, Mission, Tally
+from uuvtai.pilot.sensor_messages import NAMES
 
 START, GOAL = (2.0, 3.0, -0.8), (18.0, 3.0, -0.8)
 LIMITS = SafetyLimits(box_m=(0.0, 0.0, 20.0, 6.0), depth_m=(0.2, 1.4))
 
 
+@cache
 def link_config(**changes):
     """The pool seen by a fan without Doppler, its position estimated."""
     given = {"sensors.localization": "estimated"} | changes
@@ -38,6 +44,7 @@ class WishfulPilot:
 
     def feed(self, message):
         self.fed.append(message)
+        self.tallies[NAMES[type(message)]].used += 1
 
     def tick(self):
         return SimpleNamespace(
@@ -94,9 +101,13 @@ class FakeSub:
         }
         for name, message in told.items():
             if name not in self.silent:
-                self.send(message)
+                self.emit(name, message, self.out)
         if "operator" not in self.silent:
-            self.send(heartbeat(6, 8, 0, 0, 4, 3), self.operator)
+            self.emit("operator", heartbeat(6, 8, 0, 0, 4, 3), self.operator)
+
+    def emit(self, name, message, link):
+        """Send one of these; faults of a flight change it here."""
+        self.send(message, link)
 
     def listen(self):
         """Take in what was said and obey."""
@@ -108,11 +119,18 @@ class FakeSub:
             self.raw.append(data)
             for message in self.parser.parse_buffer(data) or []:
                 self.told.append(message)
-                if message.get_type() == "COMMAND_LONG" and message.command == 176:
-                    if int(message.param2) in self.modes:
-                        self.mode = int(message.param2)
-                elif message.get_type() == "COMMAND_LONG" and message.command == 400 and self.obeys:
-                    self.armed = message.param1 == 1
+                if message.get_type() == "COMMAND_LONG" and message.command in (176, 400):
+                    self.answer(message)
+
+    def answer(self, command):
+        """Do what is commanded, or not, and say which, as ArduSub does."""
+        is_mode = command.command == 176
+        granted = int(command.param2) in self.modes if is_mode else self.obeys
+        if granted and is_mode:
+            self.mode = int(command.param2)
+        elif granted:
+            self.armed = command.param1 == 1
+        self.send(mav.MAVLink_command_ack_message(command.command, 0 if granted else 4))
 
     def kinds(self):
         """Names of what it was told, those of commands with their number."""
@@ -128,6 +146,32 @@ class FakeSub:
 
     def close(self):
         self.socket.close()
+
+
+class Flight:
+    """A vehicle, a pilot and the loop between them, step by step, without a clock."""
+
+    def __init__(self, folder, arms=True, config=None, sub=FakeSub, **vehicle):
+        self.endpoint = Endpoint(LinkPlace("127.0.0.1", 0, False))
+        self.sub = sub(self.endpoint.port, **vehicle)
+        self.pilot, self.now_s = WishfulPilot(), 0.0
+        self.log = LinkLog(folder / "flight.mcap", {})
+        plan = plan_of(self.endpoint.place, self.log.path, arms)
+        self.loop = OnboardLoop(config or link_config(), self.pilot, plan, self.endpoint, self.log)
+
+    def run(self, seconds, before=lambda step: None, farewell="", dt=0.02, stalled=0.0):
+        for step in range(round(seconds / dt)):
+            before(step)
+            self.sub.speak(dt)
+            self.now_s += dt
+            self.loop.step(self.now_s, stalled, farewell)
+            self.sub.listen()
+        return self.loop.last
+
+    def close(self):
+        self.log.close()
+        self.endpoint.close()
+        self.sub.close()
 
 
 def assert_within(told, limits=LIMITS):

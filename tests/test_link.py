@@ -17,6 +17,7 @@ from tests.mavlink_vehicle import (
     LIMITS,
     START,
     FakeSub,
+    Flight,
     WishfulPilot,
     assert_within,
     free_port,
@@ -36,32 +37,6 @@ from uuvtai.pilot import DvlReading, ImuReading, PositionFix, PressureReading, S
 
 DT = 0.02
 CONFIG = link_config()
-
-
-class Flight:
-    """A vehicle, a pilot and the loop between them, step by step, without a clock."""
-
-    def __init__(self, folder, arms=True, config=CONFIG, **vehicle):
-        self.endpoint = Endpoint(LinkPlace("127.0.0.1", 0, False))
-        self.sub = FakeSub(self.endpoint.port, **vehicle)
-        self.pilot, self.now_s = WishfulPilot(), 0.0
-        self.log = LinkLog(folder / "flight.mcap", {})
-        plan = plan_of(self.endpoint.place, self.log.path, arms)
-        self.loop = OnboardLoop(config, self.pilot, plan, self.endpoint, self.log)
-
-    def run(self, seconds, before=lambda step: None, farewell="", dt=DT):
-        for step in range(round(seconds / dt)):
-            before(step)
-            self.sub.speak(dt)
-            self.now_s += dt
-            self.loop.step(self.now_s, farewell=farewell)
-            self.sub.listen()
-        return self.loop.last
-
-    def close(self):
-        self.log.close()
-        self.endpoint.close()
-        self.sub.close()
 
 
 @pytest.fixture
@@ -122,9 +97,10 @@ def test_sticks_push_harder_where_the_vehicle_lags():
     alone = orders.push_sticks(asked, None, 1, LIMITS).fields["x"]
     slow = orders.push_sticks(asked, (0.1, 0.0, 0.0, 0.0), 1, LIMITS).fields["x"]
     fast = orders.push_sticks(asked, (0.9, 0.0, 0.0, 0.0), 1, LIMITS).fields["x"]
-    assert alone == 180 and slow == 360 and fast < 0
+    most = round(orders.STICK * LIMITS.speed_m_s / orders.FULL_STICK[0])
+    assert (alone, slow, most) == (180, 300, 300) and fast < 0
     assert orders.push_sticks(asked, (math.nan,) * 4, 1, LIMITS).fields["x"] == alone
-    assert orders.push_sticks(asked, (-1e9,) * 4, 1, LIMITS).fields["x"] == orders.STICK
+    assert orders.push_sticks(asked, (-1e9,) * 4, 1, LIMITS).fields["x"] == most, "whatever is measured"
 
 
 # ---------------------------------------------------------------------------------------------------- meaning
@@ -353,7 +329,7 @@ def test_where_guided_is_refused_it_drives_by_sticks(flight):
     one.sub.silent.add("operator")
     one.run(4)
     last = one.sub.told[-1] if one.sub.told[-1].get_type() == "MANUAL_CONTROL" else one.sub.told[-2]
-    assert last.x < 0 and last.z == 500, "it brakes"
+    assert (last.x, last.y, last.z, last.r) == (0, 0, 500, 0), "it holds by itself"
     assert_within(one.sub.told)
 
 
@@ -654,12 +630,12 @@ def test_the_command_flies_and_tells(capfd, monkeypatch, tmp_path, words):
     assert (tmp_path / "a.mcap").exists()
 
 
-def test_arming_is_refused_and_nothing_is_opened(capfd, monkeypatch, tmp_path):
+def test_a_log_that_is_there_is_not_replaced(capfd, monkeypatch, tmp_path):
     monkeypatch.setattr(onboard_loop, "fly", lambda *_: pytest.fail("it flies"))
-    place = ["--mavlink", f"udp:127.0.0.1:{free_port()}", "--log", str(tmp_path / "a.mcap")]
-    code, _, err = uuv(capfd, *BASE[:1], *BASE[3:], *place, "--arm")
-    assert code == 2 and "--arm is refused" in err and "dry run" in err
-    assert list(tmp_path.iterdir()) == []
+    old = tmp_path / "a.mcap"
+    old.write_text("an older flight")
+    code, _, err = uuv(capfd, *BASE[:1], *BASE[3:], "--mavlink", "udp:127.0.0.1:14550", "--log", str(old))
+    assert code == 2 and "--force" in err and old.read_text() == "an older flight"
 
 
 def test_a_log_that_cannot_be_written_any_more_does_not_stop_the_flight(flight, monkeypatch):

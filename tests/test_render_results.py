@@ -7,7 +7,7 @@ import shutil
 import pytest
 
 from docs import render_results
-from docs.render_results import EVALUATIONS, README, REPRODUCTION, RESULTS, ROOT
+from docs.render_results import EVALUATIONS, README, REPRODUCTION, RESULTS, ROOT, SAFETY
 from tests.test_docs import fault
 
 
@@ -15,14 +15,14 @@ def test_the_pages_are_those_of_the_results(capsys):
     """Where this fails: ``python -m docs.render_results``."""
     assert render_results.differences() == []
     assert render_results.main(["--check"]) == 0
-    tables = render_results.TABLE.findall((ROOT / README).read_text())
+    tables = render_results.TABLE.findall((ROOT / README).read_text() + (ROOT / SAFETY).read_text())
     assert {name for _head, name, _body, _foot in tables} == set(render_results.TABLES)
 
 
 @pytest.fixture
 def copy(tmp_path, monkeypatch):
     """Pages and results in a folder of their own."""
-    for name in (README, RESULTS, EVALUATIONS, REPRODUCTION):
+    for name in (README, RESULTS, SAFETY, EVALUATIONS, REPRODUCTION):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / name, tmp_path / name)
     return tmp_path

@@ -151,6 +151,7 @@ class HomingPilot(WishfulPilot):
         self.goal, self.yaw = np.array(goal), 0.0
 
     def feed(self, message):
+        super().feed(message)
         if isinstance(message, PositionFix):
             self.pos_w = tuple(message.pos_w)
         elif isinstance(message, ImuReading):

@@ -400,8 +400,12 @@ def pilot_vehicle(
     from uuvtai.tree import read_tree
 
     config = scene.config()
-    found = fly(config, read_tree(controller, config.teacher.max_node), flight.plan(config), say)
+    found, failure = fly(config, read_tree(controller, config.teacher.max_node), flight.plan(config), say)
     output.show(found, lambda screen: show_flight(screen, found))
+    if failure is not None:
+        raise failure
+    if found["interrupted"]:
+        raise typer.Exit(signals.exit_code())
     if not found["safe"]:
         raise typer.Exit(GATE)
 

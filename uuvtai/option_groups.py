@@ -308,17 +308,15 @@ class FlightGroup:
     seconds: opt.PilotSeconds = None
     rate: opt.PilotRate = 1.0
     log: opt.PilotLog = None
+    force: opt.PilotForce = False
 
     def plan(self, config: Config) -> FlightPlan:
         """UsageError, LinkError."""
         from uuvtai.link.flight_plan import FlightPlan
 
-        if self.arm:
-            raise UsageError(
-                "--arm is refused for now: an audit found that Ctrl-C leaves an armed vehicle driving and "
-                "that old readings reach the thrusters (docs/safety.md); leave --arm out for a dry run"
-            )
         arguments.refuse_odd_rate(self.rate)
+        if self.log is not None and self.log.exists() and not self.force:
+            raise UsageError(f"--log {self.log}: is there already; give another name, or --force")
         return FlightPlan.typed(
             config,
             self.mavlink,

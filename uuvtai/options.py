@@ -254,7 +254,7 @@ Arm = Annotated[
     bool,
     Option(
         "--arm",
-        help="Arm and drive: refused for now (docs/safety.md).",
+        help="Arm and drive \\[default: a dry run].",
     ),
 ]
 FenceBox = Annotated[
@@ -278,6 +278,7 @@ PilotSeconds = Annotated[
     float | None, Option("--seconds", help="Give the vehicle back after so long \\[default: never].")
 ]
 PilotLog = Annotated[Path | None, Option("--log", help="MCAP to write \\[default: runs/pilot_TIME.mcap].")]
+PilotForce = Annotated[bool, Option("--force", help="Replace the log that --log names.")]
 PilotTree = Annotated[str, _tree("Who drives")]
 PilotRate = Annotated[
     float,

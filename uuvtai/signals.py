@@ -1,5 +1,5 @@
-"""SIGINT and SIGTERM, heard alike from the first line on: at once while there is nothing to lose, else by an
-exception that tidies up.
+"""SIGINT, SIGTERM and SIGHUP, heard alike from the first line on: at once while there is nothing to lose,
+else by an exception that tidies up.
 
 Standard library only, and little of it: the entry point imports this before anything else. Until ``engage``
 is called (a run folder, a file under way) a signal says "interrupted" and ends the process on the spot. From
@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from types import FrameType
     from typing import Any
 
-STOPPING = (signal.SIGINT, signal.SIGTERM)
+STOPPING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+"""Ctrl-C, a supervisor, a terminal that closes"""
 _AGAIN_S = 0.02
 _LOADERS = ("<frozen importlib._bootstrap>", "<frozen importlib._bootstrap_external>")
 _LINUX_FLAGS_AT, _RESET_HAND = 8 + 128, 0x80000000
@@ -50,7 +51,7 @@ def was_received() -> bool:
 
 
 def install() -> None:
-    """Hear both signals from now on, also where a library has set its own handlers meanwhile; one that is
+    """Hear these signals from now on, also where a library has set its own handlers meanwhile; one that is
     ignored stays so (nohup)."""
     for number in STOPPING:
         if signal.getsignal(number) != signal.SIG_IGN:
@@ -80,11 +81,13 @@ def never_within(file: str) -> None:
 
 class StopEvent:
     """Context in which the first signal sets ``event``, in place of what it does otherwise; the next one ends
-    at once, or interrupts. A signal that came before, and whose exception something has swallowed, counts."""
+    at once, or interrupts; unless ``is_last`` is false: then it changes nothing, for what is under way must
+    end well. A signal that came before, and whose exception something has swallowed, counts."""
 
-    def __init__(self) -> None:
+    def __init__(self, is_last: bool = True) -> None:
         import threading
 
+        self._is_last = is_last
         self.event = threading.Event()
         self._before: dict[signal.Signals, Any] = {}
         self._on_main_thread = threading.current_thread() is threading.main_thread()
@@ -93,8 +96,10 @@ class StopEvent:
     def __enter__(self) -> Event:
         """Listen."""
         if self._on_main_thread:
-            self._before = {number: signal.signal(number, self._note) for number in STOPPING}
-            end_at_second()
+            heard = [number for number in STOPPING if signal.getsignal(number) != signal.SIG_IGN]
+            self._before = {number: signal.signal(number, self._note) for number in heard}
+            if self._is_last:
+                end_at_second()
         if was_received():
             self.event.set()
         return self.event
@@ -108,7 +113,7 @@ class StopEvent:
         end_at_second()
 
     def _note(self, number: int, _frame: FrameType | None) -> None:
-        if self.event.is_set():
+        if self.event.is_set() and self._is_last:
             raise Interrupted
         if _installed:
             _received.append(number)

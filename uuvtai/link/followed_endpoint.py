@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from threading import Event
 
 from uuvtai.link.endpoint import Address, Endpoint, LinkPlace
 from uuvtai.link.link_errors import LinkError
@@ -59,10 +60,10 @@ class FollowedEndpoint(Endpoint):
         """[s] since the beginning."""
         return self._time_s + max(0.0, self._wall() - self._heard_s - self._patience_s)
 
-    def sleep(self, seconds: float) -> None:
-        """Until the vehicle's clock has come so far."""
+    def sleep(self, seconds: float, stop: Event | None = None) -> None:
+        """Until the vehicle's clock has come so far, or ``stop`` is set."""
         until_s = self.now() + seconds - 1e-6
-        while self.now() < until_s:
+        while self.now() < until_s and not (stop is not None and stop.is_set()):
             self._pause()
             self._take()
 

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
+from uuvtai.link.intake import Heard
 from uuvtai.link.orders import (
     ALT_HOLD,
+    ARM_DISARM,
+    DO_SET_MODE,
     GUIDED,
     MODE_NAMES,
     SURFACE,
@@ -19,15 +24,20 @@ ORDER_S = 0.1
 """between two velocities; ArduSub stops 3 s after the last"""
 REPEAT_S, REPEATS = 1.0, 5
 """a mode or the arming is asked for again so often, so many times"""
+STICKS_S = 1.0
+"""age of the operator's sticks that counts as none"""
+_ACK_S = 0.1
+"""a heartbeat that comes so long after a request was granted tells what came of it"""
 
 
 class Handover:
     """Takes the vehicle over, tells it what was decided, gives it back.
 
-    It begins when a decision is to drive: arm, then GUIDED, or else ALT_HOLD with sticks. A mode that is
-    neither ours nor what we asked for, or a disarmed vehicle, means that somebody else has it: ``lost`` says
-    so, and nothing is said any more. ``pretended``: nobody listens (a dry run), so every request counts as
-    granted.
+    It begins when a decision is to drive: arm, then GUIDED, or else ALT_HOLD with sticks. From the first
+    order on, a mode that nobody here asked for, a vehicle that disarms, or an operator at the sticks means
+    that somebody else has it: ``lost`` says so. Whatever ends it, ``orders`` stops the vehicle and asks for
+    ALT_HOLD until a heartbeat says that it left our mode; where somebody else chose the mode nothing is said.
+    ``pretended``: nobody listens (a dry run), so every request counts as granted.
     """
 
     def __init__(self, system: int, limits: SafetyLimits, pretended: bool) -> None:
@@ -35,57 +45,101 @@ class Handover:
         """whether a velocity has been asked for"""
         self.ended = False
         """whether the vehicle was given back, or never had; nothing is said any more"""
-        self.leaving = False
-        """whether it is to end, whatever was decided"""
         self.lost = ""
         self.mode = GUIDED
         """in which it is driven"""
         self._system, self._limits, self._pretended = system, limits, pretended
+        self._leaving = False
         self._asked: dict[str, tuple[float, int]] = {}
-        self._spoke_s = float("-inf")
+        """request -> (when it was asked for last, how often)"""
+        self._modes: set[int] = set()
+        """asked for"""
+        self._before = -1
+        """mode at the first order"""
+        self._took = self._was_armed = False
+        """whether it was ever in a mode that was asked for; armed"""
+        self._spoke_s = -math.inf
 
-    def watch(self, mode: int, is_armed: bool) -> None:
+    @property
+    def has_asked(self) -> bool:
+        """Whether anything was said that moves the vehicle, arms it or changes its mode."""
+        return bool(self._asked)
+
+    def watch(self, heard: Heard, now_s: float) -> None:
         """Look whether the vehicle still does what it was told."""
-        if self._pretended or not self.engaged or self.ended:
+        if self._pretended or self.ended or self.lost or not self.has_asked:
             return
-        ours = (self.mode, SURFACE) if "surface" in self._asked else (self.mode,)
-        if mode not in ours:
-            self.lost = f"the mode is {MODE_NAMES.get(mode, mode)} now"
-        elif not is_armed:
+        self._note_answers(heard)
+        self._took |= heard.mode in self._modes
+        self._was_armed |= heard.is_armed
+        if heard.mode not in self._modes and (self._took or heard.mode != self._before):
+            self.lost = f"the mode is {MODE_NAMES.get(heard.mode, heard.mode)} now"
+        elif self._was_armed and not heard.is_armed:
             self.lost = "it is disarmed"
+        elif self.mode == ALT_HOLD and now_s - heard.sticks_s <= STICKS_S:
+            self.lost = "the operator's sticks are heard"
+        elif now_s - heard.sticks_moved_s <= STICKS_S:
+            self.lost = "the operator moves the sticks"
+
+    def _note_answers(self, heard: Heard) -> None:
+        """What was granted, and is not so at the next heartbeat, was taken back by somebody."""
+        for command, what in ((DO_SET_MODE, f"mode {self.mode}"), (ARM_DISARM, "arm")):
+            asked_s, _ = self._asked.get(what, (math.inf, 0))
+            if asked_s <= heard.granted_s.get(command, -math.inf) <= heard.vehicle_s - _ACK_S:
+                self._took |= command == DO_SET_MODE
+                self._was_armed |= command == ARM_DISARM
 
     def orders(
-        self, decision: SafeDecision, now_s: float, mode: int, is_armed: bool, measured: Velocity | None
+        self, decision: SafeDecision, now_s: float, heard: Heard, measured: Velocity | None
     ) -> list[Order]:
-        """What to say in this step."""
+        """What to say in this step. ``measured``: velocity as it is now, NaN or None where it is not
+        known."""
         if self.ended:
             return []
-        if self.leaving or (decision.action == SafeAction.HAND_BACK and (self.engaged or self.lost)):
-            return self._give_back(now_s, mode)
+        grave = decision.action == SafeAction.HAND_BACK and (self.has_asked or bool(self.lost))
+        if self._leaving or grave or (decision.action == SafeAction.SURFACE and not self.engaged):
+            return self._leave(now_s, heard) if self.has_asked else []
         if decision.action == SafeAction.SURFACE:
-            return self._surface(now_s, mode)
-        if not self.engaged:
-            if decision.action != SafeAction.DRIVE:
-                return []
-            return self._take(now_s, mode, is_armed)
-        return self._velocity(decision.velocity, now_s, measured)
+            return self._surface(now_s, heard)
+        if self.engaged:
+            is_driving = decision.action == SafeAction.DRIVE
+            return self._velocity(decision.velocity, now_s, measured if is_driving else None)
+        return self._take(now_s, heard) if decision.action == SafeAction.DRIVE else []
 
-    def _take(self, now_s: float, mode: int, is_armed: bool) -> list[Order]:
+    def leave(self, now_s: float, heard: Heard) -> list[Order]:
+        """What to say from now on, whatever was decided: stop, and the mode that gives the vehicle back."""
+        self._leaving = True
+        if not self.has_asked:
+            self.ended = True
+        return [] if self.ended else self._leave(now_s, heard)
+
+    def last_words(self) -> list[Order]:
+        """Stop and hand back, for the case that nothing else works any more."""
+        stop = set_velocity(STOP, 0.0, self._system, self._limits)
+        return [stop, set_mode(ALT_HOLD, self._system)] if self.has_asked and not self.lost else []
+
+    def _take(self, now_s: float, heard: Heard) -> list[Order]:
+        if not self.has_asked:
+            self._before = heard.mode
         if self._pretended:
-            self.engaged = True
+            self.engaged, self._asked["arm"] = True, (now_s, 1)
             return [arm(self._system), set_mode(GUIDED, self._system)]
-        if not is_armed:
+        if now_s - heard.sticks_moved_s <= STICKS_S:  # the operator drives
+            return []
+        if not heard.is_armed:
             if (found := self._repeated("arm", now_s, arm(self._system))) is not None:
                 return found
             self.lost = "it does not arm"
             return []
-        if mode == self.mode:
-            self.engaged = True
+        if heard.mode == self.mode:
+            self._asked.setdefault("arm", (now_s, 0))
+            self._modes.add(self.mode)
+            self.engaged = self._took = True
             return []
-        if (
-            found := self._repeated(f"mode {self.mode}", now_s, set_mode(self.mode, self._system))
-        ) is not None:
-            return found
+        self._modes.add(self.mode)
+        asked = self._repeated(f"mode {self.mode}", now_s, set_mode(self.mode, self._system))
+        if asked is not None:
+            return asked
         if self.mode == GUIDED:
             self.mode = ALT_HOLD
         else:
@@ -100,34 +154,38 @@ class Handover:
             return [set_velocity(velocity, now_s, self._system, self._limits)]
         return [push_sticks(velocity, measured, self._system, self._limits)]
 
-    def _surface(self, now_s: float, mode: int) -> list[Order]:
-        if not self.engaged:
-            return []
-        if mode == SURFACE:
+    def _surface(self, now_s: float, heard: Heard) -> list[Order]:
+        if heard.mode == SURFACE:
             self.ended = True
             return []
+        self._modes.add(SURFACE)
         found = self._repeated("surface", now_s, set_mode(SURFACE, self._system))
-        if found is None or self._pretended:
-            self.ended = True
-        return [*(found or []), *self._velocity(STOP, now_s, None)]
+        if found is None:
+            self._leaving = True
+            return self._leave(now_s, heard)
+        self.ended = self._pretended
+        return [*found, *self._velocity(STOP, now_s, None)]
 
-    def _give_back(self, now_s: float, mode: int) -> list[Order]:
-        if not self._asked_for_anything or self.mode != GUIDED or (mode != GUIDED and not self._pretended):
+    def _leave(self, now_s: float, heard: Heard) -> list[Order]:
+        """Stop, then ALT_HOLD, until a heartbeat says that the vehicle has left our mode. A vehicle in a mode
+        that somebody else chose, or whose sticks the operator holds, is left alone."""
+        left = heard.mode != GUIDED and (self._took or heard.mode != self._before)
+        said_s, _ = self._asked.setdefault("back", (-math.inf, 0))
+        if self.lost and (left or self.mode == ALT_HOLD or not self._modes):
             self.ended = True
-            sticks = self.engaged and self.mode == ALT_HOLD and mode == ALT_HOLD
-            return [push_sticks(STOP, None, self._system, self._limits)] if sticks else []
+        elif heard.vehicle_s > said_s > -math.inf and (left or heard.mode == ALT_HOLD):
+            self.ended = True
+        if self.ended:
+            return []
+        if math.isinf(said_s):  # the stop comes first
+            self._spoke_s = -math.inf
         found = self._repeated("back", now_s, set_mode(ALT_HOLD, self._system))
-        if found is None or self._pretended:
-            self.ended = True
-        return found or []
-
-    @property
-    def _asked_for_anything(self) -> bool:
-        return bool(self._asked) or self.engaged
+        self.ended = found is None or self._pretended
+        return [] if found is None else [*self._velocity(STOP, now_s, None), *found]
 
     def _repeated(self, what: str, now_s: float, order: Order) -> list[Order] | None:
         """The order where it is due, nothing while waiting for an answer; None = asked for in vain."""
-        last_s, count = self._asked.get(what, (float("-inf"), 0))
+        last_s, count = self._asked.get(what, (-math.inf, 0))
         if now_s - last_s < REPEAT_S:
             return []
         if count >= REPEATS:

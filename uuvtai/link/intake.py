@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from uuvtai.config import Config
+from uuvtai.link.orders import ARM_DISARM, DO_SET_MODE
 from uuvtai.link.sectors import SECTORS, UNKNOWN_CM, ping_of
 from uuvtai.pilot import DvlReading, ImuReading, PositionFix, PressureReading, SensorMessage, SonarPing
 
@@ -46,8 +47,12 @@ class SourceClock:
 
 
 SUBMARINE, ARDUPILOT, GROUND_STATION = 12, 3, 6
-_AUTOPILOT = 1
+AUTOPILOT = 1
 _ARMED = 128
+COMPANION = 191
+"""MAV_COMP_ID_ONBOARD_COMPUTER: what we are"""
+_STICK_MOVED = 200
+"""of 1000"""
 _MOST_CLOCKS = 64
 _FRESH_S = 1.0
 """a source that was heard within this time is preferred to a lesser one"""
@@ -69,8 +74,20 @@ class Heard:
     battery_share: float | None = None
     rpy: tuple[float, float, float] = (math.nan, math.nan, math.nan)
     """of the newest attitude, world axes of ours"""
+    rpy_s: float = -math.inf
+    """when attitude and yaw rate were measured"""
     vel_b: tuple[float, float, float] | None = None
+    vel_b_s: float = -math.inf
     yaw_rate: float = 0.0
+    battery_s: float = -math.inf
+    sticks_s: float = -math.inf
+    """when the operator's own sticks came"""
+    sticks_moved_s: float = -math.inf
+    """and when they were off their middle"""
+    granted_s: dict[int, float] = field(default_factory=dict)
+    """command -> when the autopilot granted it"""
+    jumped: str = ""
+    """how the given position jumped; '' = it did not"""
     refused: Counter[str] = field(default_factory=Counter)
     """why messages were not used -> how many"""
 
@@ -107,6 +124,7 @@ class Intake:
             "DISTANCE_SENSOR": self._ranger,
             "SYS_STATUS": self._battery,
             "BATTERY_STATUS": self._battery,
+            "COMMAND_ACK": self._answer,
         }
         for name in ("SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3", "RAW_IMU", "HIGHRES_IMU"):
             self._takers[name] = self._acceleration
@@ -120,13 +138,15 @@ class Intake:
         if name == "HEARTBEAT":
             self._heartbeat(system, component, fields, come_s)
             return []
+        if name == "MANUAL_CONTROL" and system == self._operator and component != COMPANION:
+            self._sticks(fields, come_s)
         taker = self._takers.get(name)
         if taker is None or system != self._system:
             return []
         if not all(math.isfinite(value) for value in fields.values() if isinstance(value, float)):
-            return self._refuse(f"{name}: a number that is not finite")
+            return self.refuse(f"{name}: a number that is not finite")
         if not self._is_known(system, component, name):
-            return self._refuse("too many senders")
+            return self.refuse("too many senders")
         sent_s = _time_of(fields)
         clock = self._clocks[system, component, name]
         time_s = come_s if sent_s is None else clock.measured_s(sent_s, come_s)
@@ -145,16 +165,17 @@ class Intake:
             self._clocks[key] = SourceClock()
         return key in self._clocks
 
-    def _refuse(self, why: str) -> list[SensorMessage]:
+    def refuse(self, why: str) -> list[SensorMessage]:
+        """Count a message that is not used."""
         if why in self.heard.refused or len(self.heard.refused) < _MOST_CLOCKS:
             self.heard.refused[why] += 1
         return []
 
     def _heartbeat(self, system: int, component: int, fields: Fields, come_s: float) -> None:
         heard = self.heard
-        if system == self._system and component == _AUTOPILOT:
+        if system == self._system and component == AUTOPILOT:
             if fields["type"] != SUBMARINE or fields["autopilot"] != ARDUPILOT:
-                self._refuse("the vehicle is no submarine of ArduPilot's")
+                self.refuse("the vehicle is no submarine of ArduPilot's")
                 return
             heard.vehicle_s, heard.mode = come_s, int(fields["custom_mode"])
             heard.is_armed = bool(int(fields["base_mode"]) & _ARMED)
@@ -162,9 +183,21 @@ class Intake:
             if system == self._operator:
                 heard.operator_s = come_s
             else:
-                self._refuse(f"a ground station has the id {system}: --operator {system}")
-        elif fields["type"] == SUBMARINE and component == _AUTOPILOT:
-            self._refuse(f"a submarine has the id {system}: --system {system}")
+                self.refuse(f"a ground station has the id {system}: --operator {system}")
+        elif fields["type"] == SUBMARINE and component == AUTOPILOT:
+            self.refuse(f"a submarine has the id {system}: --system {system}")
+
+    def _sticks(self, fields: Fields, come_s: float) -> None:
+        """Sticks of the operator, which reach the vehicle as ours do."""
+        off = max(*(abs(int(fields[axis])) for axis in ("x", "y", "r")), abs(2 * int(fields["z"]) - 1000))
+        self.heard.sticks_s = come_s
+        if off > _STICK_MOVED:
+            self.heard.sticks_moved_s = come_s
+
+    def _answer(self, fields: Fields, time_s: float) -> list[SensorMessage]:
+        if fields["result"] == 0 and int(fields["command"]) in (DO_SET_MODE, ARM_DISARM):
+            self.heard.granted_s[int(fields["command"])] = time_s
+        return []
 
     # ------------------------------------------------------------------------------------------- instruments
 
@@ -175,6 +208,7 @@ class Intake:
         rpy = np.array([fields["roll"], -fields["pitch"], _wrapped(heading - fields["yaw"])])
         rate = np.array([fields["rollspeed"], -fields["pitchspeed"], -fields["yawspeed"]])
         self.heard.rpy, self.heard.yaw_rate = (float(rpy[0]), float(rpy[1]), float(rpy[2])), float(rate[2])
+        self.heard.rpy_s = time_s
         kept = self._force_b
         gravity = self._config.vehicle.gravity_m_s2
         roll, pitch = rpy[:2]
@@ -193,14 +227,14 @@ class Intake:
     def _vision_delta(self, fields: Fields, time_s: float) -> list[SensorMessage]:
         spent_s = float(fields["time_delta_usec"]) / 1e6
         if not 1e-3 <= spent_s <= 1.0 or fields["confidence"] <= 0.0:
-            return self._refuse("VISION_POSITION_DELTA: without a time or without confidence")
+            return self.refuse("VISION_POSITION_DELTA: without a time or without confidence")
         ahead, right, down = (float(value) / spent_s for value in fields["position_delta"])
         if not all(map(math.isfinite, (ahead, right, down))):
-            return self._refuse("VISION_POSITION_DELTA: a number that is not finite")
+            return self.refuse("VISION_POSITION_DELTA: a number that is not finite")
         return self._velocity(time_s, (ahead, -right, -down))
 
     def _velocity(self, time_s: float, vel_b: tuple[float, float, float]) -> list[SensorMessage]:
-        self.heard.vel_b = vel_b
+        self.heard.vel_b, self.heard.vel_b_s = vel_b, time_s
         return [DvlReading(time_s, np.array(vel_b))]
 
     def _local_position(self, fields: Fields, time_s: float) -> list[SensorMessage]:
@@ -235,7 +269,7 @@ class Intake:
 
     def _obstacles(self, fields: Fields, time_s: float) -> list[SensorMessage]:
         if fields["frame"] != 12:
-            return self._refuse("OBSTACLE_DISTANCE: not relative to the bow (frame 12, MAV_FRAME_BODY_FRD)")
+            return self.refuse("OBSTACLE_DISTANCE: not relative to the bow (frame 12, MAV_FRAME_BODY_FRD)")
         increment = float(fields.get("increment_f", 0.0)) or float(fields["increment"])
         distances = np.array(list(fields["distances"])[:SECTORS], dtype=int)
         return self._scan(time_s, distances, increment, float(fields.get("angle_offset", 0.0)), fields)
@@ -261,7 +295,7 @@ class Intake:
     ) -> list[SensorMessage]:
         sonar = self._config.sensors.sonar
         found = ping_of(sonar, time_s, distances, increment, offset, int(fields["max_distance"]))
-        return [found] if isinstance(found, SonarPing) else self._refuse(f"{fields['name']}: {found}")
+        return [found] if isinstance(found, SonarPing) else self.refuse(f"{fields['name']}: {found}")
 
     def _battery(self, fields: Fields, time_s: float) -> list[SensorMessage]:
         if fields["name"] == "SYS_STATUS":
@@ -271,6 +305,8 @@ class Intake:
         else:
             return []
         share = int(fields["battery_remaining"])
+        if 0 < volts < 65535 or 0 <= share <= 100:
+            self.heard.battery_s = time_s
         self.heard.battery_v = volts / 1e3 if 0 < volts < 65535 else self.heard.battery_v
         self.heard.battery_share = share / 100 if 0 <= share <= 100 else self.heard.battery_share
         return []

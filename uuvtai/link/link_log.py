@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from uuvtai.link.dialect import MavMessage
+from uuvtai.link.intake import Heard
 from uuvtai.link.orders import Order
 from uuvtai.link.safety import SafeDecision
 from uuvtai.logs.container import McapFile
@@ -81,23 +82,24 @@ class LinkLog:
     def decided(
         self,
         time_s: float,
-        command: PilotCommand,
+        command: PilotCommand | None,
         decision: SafeDecision,
-        mode: int,
-        is_armed: bool,
-        speed: float,
+        heard: Heard,
+        speed: float | None,
     ) -> None:
-        """What this step came to."""
-        wanted = {"velocity": _finite(command.velocity), "position": _finite(command.pos_w)}
-        self._write("/pilot/command", time_s, {**wanted, "leaf": command.leaf, "held": list(command.held)})
+        """What this step came to; without a command while the vehicle is given back."""
+        if command is not None:
+            wanted = {"velocity": _finite(command.velocity), "position": _finite(command.pos_w)}
+            self._write(
+                "/pilot/command", time_s, {**wanted, "leaf": command.leaf, "held": list(command.held)}
+            )
         done = {
             "action": decision.action.name,
             "asked": list(decision.velocity),
             "reasons": list(decision.reasons),
         }
-        self._write(
-            "/pilot/safety", time_s, {**done, "mode": mode, "armed": is_armed, "speed": _finite([speed])[0]}
-        )
+        state = {"mode": heard.mode, "armed": heard.is_armed, "speed": _finite([speed or 0.0])[0]}
+        self._write("/pilot/safety", time_s, done | state)
 
     def _write(self, topic: str, time_s: float, content: dict[str, Any]) -> None:
         if self.trouble:

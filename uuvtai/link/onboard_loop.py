@@ -9,18 +9,21 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from functools import partial
+from threading import Event
+from typing import Any, TypeVar
 
 from uuvtai.config import Config
-from uuvtai.link.dialect import MavCodec
+from uuvtai.link.dialect import MavCodec, MavMessage
 from uuvtai.link.endpoint import Address, Endpoint
 from uuvtai.link.flight_plan import FlightPlan
 from uuvtai.link.followed_endpoint import FollowedEndpoint
 from uuvtai.link.handover import Handover
-from uuvtai.link.intake import Intake
+from uuvtai.link.intake import AUTOPILOT, COMPANION, Intake
 from uuvtai.link.link_log import LinkLog
 from uuvtai.link.orders import ALT_HOLD, HARMLESS, MODE_NAMES, Order, ask_for, heartbeat
 from uuvtai.link.safety import (
+    LATE_WINDOW_S,
     STALL_S,
     STOP,
     SafeAction,
@@ -31,17 +34,21 @@ from uuvtai.link.safety import (
     decide,
 )
 from uuvtai.pilot import Mission, OnboardPilot, PilotCommand
-from uuvtai.pilot.sensor_messages import NAMES
+from uuvtai.pilot.sensor_messages import NAMES, SensorMessage
+from uuvtai.signals import StopEvent
 from uuvtai.sim import Sim
 from uuvtai.tree import FlatTree
 
-COMPONENT = 191
-"""MAV_COMP_ID_ONBOARD_COMPUTER"""
 _WANTED_HZ = {30: 50.0, 27: 50.0, 29: 10.0, 137: 10.0, 32: 20.0, 1: 2.0}
 """message id -> rate: ATTITUDE, RAW_IMU, SCALED_PRESSURE and 2, LOCAL_POSITION_NED, SYS_STATUS"""
 _GIVE_BACK_S = 6.0
-_REACHED = "goal reached"
-_FAREWELLS = (_REACHED, "time is up", "interrupted")
+FEEDBACK_AGE_S = 0.5
+"""a velocity that is older is not fed back to the sticks"""
+_LEAST_ASKED_M_S, _ANSWER = 0.15, 0.2
+"""a vehicle that is asked for so much, and has less than this share of it, does not answer"""
+_REACHED, _INTERRUPTED = "goal reached", "interrupted"
+_T = TypeVar("_T")
+_FAREWELLS = (_REACHED, "time is up", _INTERRUPTED)
 
 
 @dataclass
@@ -74,7 +81,7 @@ class OnboardLoop:
         self._now, self._sleep, self._note_to = now, sleep, note
         self._notes = FlightNotes(f"{plan.place.host}:{plan.place.port}")
         self._rate = plan.rate or 1.0
-        self._codec = MavCodec(plan.system, COMPONENT, plan.operator)
+        self._codec = MavCodec(plan.system, COMPANION, plan.operator)
         self._intake = Intake(config, plan.mission.start, plan.heading_rad, plan.system, plan.operator)
         self._handover = Handover(plan.system, plan.limits, pretended=not plan.arms)
         self._memory, self.tally = SafetyMemory(), FlightTally()
@@ -82,82 +89,167 @@ class OnboardLoop:
         if config.sensors.localization == "estimated":
             self._needed.remove("position")
         self._measured_s = dict.fromkeys(NAMES.values(), -math.inf)
+        """when what the pilot uses was measured; a scan counts when it is placed in the map"""
+        self._scan_s, self._scans = -math.inf, 0
+        """newest scan heard; scans that were placed"""
         self._vehicle: Address | None = endpoint.calls
+        self._speaker: Address | None = None
+        """where the autopilot's heartbeats come from"""
         self._asked_s = self._beat_s = -math.inf
         self._clock_jumps = endpoint.clock_jumps
-        self._lag_s = 0.0
-        """pilot's clock behind ours: what was lost in stalls"""
+        self._begun_s: float | None = None
+        self._lag_s = self._unanswered_s = 0.0
+        """pilot's clock behind ours: what was lost in stalls; how long the vehicle did not move as asked"""
+        self._stalls: list[tuple[float, float]] = []
         self.last = SafeDecision(SafeAction.HOLD, STOP, ("nothing was decided yet",))
+        self._is_leaving = False
+        self.failure: BaseException | None = None
+        """an error of this program that ended the flight, or came while it ended"""
 
-    def run(self) -> None:
-        """Until the goal is reached, the time is up, the vehicle was given back, or Ctrl-C; then it gives the
-        vehicle back."""
-        begun, dt = self._now(), self._config.episode.control_dt_s
-        due_s, farewell, until_s = 0.0, "", math.inf
-        while True:
-            now_s = (self._now() - begun) * self._rate
+    def run(self, stop: Event | None = None) -> None:
+        """Until the goal is reached, the time is up, the vehicle was given back or ``stop`` is set; whatever
+        ends it, an exception too (see ``failure``), the vehicle is stopped and given back."""
+        self._begun_s = self._now()
+        try:
+            reasons = self._drive(stop)
+        except KeyboardInterrupt:
+            reasons = (_INTERRUPTED,)
+        except BaseException as error:
+            self.failure, reasons = error, (f"{type(error).__name__}: {error}",)
+        if not self._handover.ended:
+            self._leave(reasons)
+
+    def _time_s(self) -> float:
+        return 0.0 if self._begun_s is None else (self._now() - self._begun_s) * self._rate
+
+    def _drive(self, stop: Event | None) -> tuple[str, ...]:
+        """Why it is over."""
+        due_s, dt = 0.0, self._config.episode.control_dt_s
+        while not (stop is not None and stop.is_set()):
+            now_s = self._time_s()
             stalled_s = max(0.0, now_s - due_s)
             if stalled_s > STALL_S:
                 self._lag_s, due_s = self._lag_s + stalled_s, now_s
-            try:
-                command = self.step(now_s, stalled_s, farewell)
-                if not farewell and (farewell := self._farewell(now_s, command)):
-                    until_s = now_s + _GIVE_BACK_S
-                if self._handover.ended or now_s >= until_s:
-                    return
-                due_s += dt
-                wait_s = due_s / self._rate - (self._now() - begun)
-                if wait_s > 0:
-                    self._sleep(wait_s)
-            except KeyboardInterrupt:
-                if farewell:
-                    raise
-                farewell, until_s = "interrupted", now_s + _GIVE_BACK_S
+            command = self.step(now_s, stalled_s)
+            if farewell := self._farewell(now_s, command):
+                return (farewell,)
+            if self._handover.ended or (
+                self.last.action == SafeAction.HAND_BACK and self._handover.has_asked
+            ):
+                return self.last.reasons
+            due_s += dt
+            if (wait_s := due_s / self._rate - (self._now() - (self._begun_s or 0.0))) > 0:
+                self._sleep(wait_s)
+        return (_INTERRUPTED,)
+
+    def _leave(self, reasons: tuple[str, ...]) -> None:
+        """Stop and hand back until the vehicle has left our mode; neither an error nor another Ctrl-C keeps
+        it from that."""
+        self.last, self._is_leaving = SafeDecision(SafeAction.HAND_BACK, STOP, reasons), True
+        until_s = time.monotonic() + _GIVE_BACK_S / min(self._rate, 1.0)
+        heard, dt = self._intake.heard, self._config.episode.control_dt_s
+        while not self._handover.ended and time.monotonic() < until_s:
+            now_s = self._tried(self._time_s) or 0.0
+            self._tried(self._hear, now_s)
+            orders = self._tried(self._handover.leave, now_s, heard)
+            for order in self._handover.last_words() if orders is None else orders:
+                self._tried(self._say, now_s, order)
+            self._tried(self._log.decided, now_s, None, self.last, heard, None)
+            if not self._handover.ended:
+                self._tried(self._sleep, dt if orders is not None else 10 * dt)
+        self.tally.actions[self.last.action.name] += 1
+        self.tally.reasons.update(reason.partition(":")[0] for reason in reasons)
+        self._tried(self.tell, "hand back: " + "; ".join(reasons))
+
+    def _tried(self, do: Callable[..., _T], *given: Any) -> _T | None:
+        """What ``do`` gives, None where it fails; the first failure is kept."""
+        try:
+            return do(*given)
+        except KeyboardInterrupt:
+            pass
+        except Exception as error:
+            self.failure = self.failure or error
+        return None
 
     def step(self, now_s: float, stalled_s: float = 0.0, farewell: str = "") -> PilotCommand:
         """One step: hear, think, decide, speak."""
         self._log.begin_step()
         self._hear(now_s)
         command = self._pilot.tick()
+        self._note_scan()
         view = self._view(now_s, stalled_s, command)
         decision, memory = decide(view, self._memory, self._plan.limits)
-        self._memory = memory if self._handover.engaged else SafetyMemory(memory.since_s)
+        self._memory = memory if self._handover.has_asked else SafetyMemory(memory.since_s)
+        heard, measured = self._intake.heard, self._measured(now_s)
         if farewell:
-            decision, self._handover.leaving = SafeDecision(SafeAction.HAND_BACK, STOP, (farewell,)), True
-        heard = self._intake.heard
-        for order in self._handover.orders(decision, now_s, heard.mode, heard.is_armed, self._measured()):
+            decision = SafeDecision(SafeAction.HAND_BACK, STOP, (farewell,))
+            said = self._handover.leave(now_s, heard)
+        else:
+            said = self._handover.orders(decision, now_s, heard, measured)
+        for order in said:
             self._say(now_s, order)
+        self._note_answer(decision, view)
         self._keep_in_touch(now_s)
         self._note(now_s, command, decision, view.speed_m_s)
         return command
 
     def _hear(self, now_s: float) -> None:
         datagrams = self._endpoint.receive()
+        come_s = max(now_s, self._time_s())  # what was received was there by now, not by ``now_s``
         if self._endpoint.clock_jumps != self._clock_jumps:
             self._clock_jumps = self._endpoint.clock_jumps
             self._intake.forget_clocks()
         for sender, datagram in datagrams:
             for message in self._codec.decode(datagram):
-                self.tally.heard[message.name] += 1
-                self._log.saw(now_s, message)
-                before = self._intake.heard.vehicle_s
-                told = self._intake.take(
-                    message.name, message.system, message.component, message.fields, now_s
-                )
-                if self._intake.heard.vehicle_s > before and (
-                    self._vehicle is None or now_s - before > self._plan.limits.vehicle_s
-                ):
-                    self._vehicle = self._endpoint.calls or sender
-                for reading in told:
-                    name = NAMES[type(reading)]
-                    self._measured_s[name] = max(self._measured_s[name], reading.time_s)
-                    self._pilot.feed(dataclasses.replace(reading, time_s=reading.time_s - self._lag_s))
-        self._handover.watch(self._intake.heard.mode, self._intake.heard.is_armed)
+                if self._is_leaving:
+                    self._tried(self._take, sender, message, come_s)
+                else:
+                    self._take(sender, message, come_s)
+        self._handover.watch(self._intake.heard, now_s)
+
+    def _take(self, sender: Address, message: MavMessage, come_s: float) -> None:
+        self.tally.heard[message.name] += 1
+        if not self._is_another(sender, message, come_s):
+            told = self._intake.take(message.name, message.system, message.component, message.fields, come_s)
+            for reading in () if self._is_leaving else told:
+                self._feed(reading)
+        self._log.saw(come_s, message)
+
+    def _is_another(self, sender: Address, message: MavMessage, come_s: float) -> bool:
+        """Whether somebody else than the vehicle speaks as its autopilot: what comes from another address
+        than its heartbeats, while those come, is not used."""
+        if (message.system, message.component) != (self._plan.system, AUTOPILOT):
+            return False
+        is_silent = come_s - self._intake.heard.vehicle_s > self._plan.limits.vehicle_s
+        if message.name == "HEARTBEAT" and (self._speaker is None or is_silent):
+            self._speaker = sender
+            self._vehicle = self._endpoint.calls or sender
+        if self._speaker in (None, sender):
+            return False
+        self._intake.refuse(f"a second sender speaks as system {self._plan.system}: {sender[0]}:{sender[1]}")
+        return True
+
+    def _feed(self, reading: SensorMessage) -> None:
+        name = NAMES[type(reading)]
+        if name == "sonar":
+            self._scan_s = max(self._scan_s, reading.time_s)
+        else:
+            self._measured_s[name] = max(self._measured_s[name], reading.time_s)
+        self._pilot.feed(dataclasses.replace(reading, time_s=reading.time_s - self._lag_s))
+
+    def _note_scan(self) -> None:
+        """A scan that the stack has used was placed in its map."""
+        if (used := self._pilot.tallies["sonar"].used) != self._scans:
+            self._scans, self._measured_s["sonar"] = used, self._scan_s
 
     def _view(self, now_s: float, stalled_s: float, command: PilotCommand) -> VehicleView:
-        heard = self._intake.heard
+        heard, limits = self._intake.heard, self._plan.limits
         surge, sway, heave, turn = (float(value) for value in command.velocity)
         x, y, z = (float(value) for value in command.pos_w)
+        self._stalls = [row for row in self._stalls if now_s - row[0] <= LATE_WINDOW_S]
+        if stalled_s > STALL_S:
+            self._stalls.append((now_s, stalled_s))
+        is_fresh = now_s - heard.vel_b_s <= limits.sensor_s["dvl"]
         return VehicleView(
             now_s=now_s,
             wanted=(surge, sway, heave, turn),
@@ -166,17 +258,35 @@ class OnboardLoop:
             operator_age_s=now_s - heard.operator_s,
             sensor_age_s={name: now_s - self._measured_s[name] for name in self._needed},
             pos_w=(x, y, z),
-            rpy=heard.rpy,
-            speed_m_s=math.hypot(*heard.vel_b) if heard.vel_b else 0.0,
+            rpy=heard.rpy if now_s - heard.rpy_s <= limits.sensor_s["imu"] else (math.nan,) * 3,
+            speed_m_s=math.hypot(*heard.vel_b) if heard.vel_b and is_fresh else None,
             battery_v=heard.battery_v,
             battery_share=heard.battery_share,
             stalled_s=stalled_s,
             lost_command=self._handover.lost,
+            late_s=sum(late_s for _, late_s in self._stalls),
+            battery_age_s=now_s - heard.battery_s,
+            unanswered_s=self._unanswered_s,
+            moved=heard.jumped,
         )
 
-    def _measured(self) -> Velocity | None:
-        heard = self._intake.heard
-        return (*heard.vel_b, heard.yaw_rate) if heard.vel_b else None
+    def _measured(self, now_s: float) -> Velocity | None:
+        """What may be fed back now; an axis that was not measured lately is NaN."""
+        heard, nan = self._intake.heard, math.nan
+        is_fresh = heard.vel_b is not None and now_s - heard.vel_b_s <= FEEDBACK_AGE_S
+        turn = heard.yaw_rate if now_s - heard.rpy_s <= FEEDBACK_AGE_S else nan
+        return (*(heard.vel_b if heard.vel_b and is_fresh else (nan, nan, nan)), turn)
+
+    def _note_answer(self, decision: SafeDecision, view: VehicleView) -> None:
+        """For how long the vehicle was asked to move and did not; while it is held nothing is known."""
+        asked_m_s = math.hypot(*decision.velocity[:2])
+        if not (self._plan.arms and self._handover.engaged) or decision.action != SafeAction.DRIVE:
+            return
+        moves = view.speed_m_s is None or view.speed_m_s >= _ANSWER * asked_m_s
+        if moves or asked_m_s < _LEAST_ASKED_M_S:
+            self._unanswered_s = 0.0
+        else:
+            self._unanswered_s += self._config.episode.control_dt_s
 
     def _say(self, now_s: float, order: Order) -> None:
         was_sent = False
@@ -202,17 +312,24 @@ class OnboardLoop:
                 for number, rate in _WANTED_HZ.items():
                     self._say(now_s, ask_for(number, rate, self._plan.system))
 
-    def _note(self, now_s: float, command: PilotCommand, decision: SafeDecision, speed: float) -> None:
+    def _note(self, now_s: float, command: PilotCommand, decision: SafeDecision, speed: float | None) -> None:
         heard, self.last = self._intake.heard, decision
         self.tally.steps += 1
         self.tally.actions[decision.action.name] += 1
         for reason in decision.reasons:
             self.tally.reasons[reason.partition(":")[0]] += 1
-        self._log.decided(now_s, command, decision, heard.mode, heard.is_armed, speed)
+        self._log.decided(now_s, command, decision, heard, speed)
         wrong = ", ".join(heard.refused)
         engaged, messages = self._handover.engaged, self.tally.heard.total()
         if text := self._notes.look(now_s, decision, engaged, messages, wrong):
+            self.tell(text)
+
+    def tell(self, text: str) -> None:
+        """A sentence for the operator; a terminal that is gone ends nothing."""
+        try:
             self._note_to(text)
+        except OSError:  # the terminal is gone
+            self._note_to = lambda text: None
 
     def _farewell(self, now_s: float, command: PilotCommand) -> str:
         goal, radius = self._plan.mission.goal, self._config.episode.goal_radius_m
@@ -232,7 +349,9 @@ class OnboardLoop:
             "steps": tally.steps,
             "ended": "; ".join(reasons) or "it was driving",
             "reached": reasons == [_REACHED],
-            "safe": not self._handover.engaged or bool(reasons and reasons[0] in _FAREWELLS),
+            "safe": self.failure is None
+            and (not self._handover.engaged or bool(reasons and reasons[0] in _FAREWELLS)),
+            "interrupted": _INTERRUPTED in reasons,
             "mode": MODE_NAMES.get(heard.mode, "none"),
             "driven_in": MODE_NAMES[self._handover.mode] if self._handover.engaged else "",
             "fallback": self._handover.mode == ALT_HOLD,
@@ -246,27 +365,32 @@ class OnboardLoop:
         }
 
 
-def fly(config: Config, tree: FlatTree, plan: FlightPlan, note: Callable[[str], None]) -> dict[str, Any]:
-    """The document of a flight. Raises LinkError, LogError."""
-    MavCodec(plan.system, COMPONENT)  # refused before a minute of compiling
+def fly(
+    config: Config, tree: FlatTree, plan: FlightPlan, note: Callable[[str], None]
+) -> tuple[dict[str, Any], BaseException | None]:
+    """The document of a flight, and the error of this program that ended it. Raises LinkError, LogError."""
+    MavCodec(plan.system, COMPANION)  # refused before a minute of compiling
     followed = FollowedEndpoint(plan.place, plan.system) if plan.rate == 0 else None
     with followed or Endpoint(plan.place) as endpoint:
         pilot = warmed(config, tree, plan.mission)
         about = {"dry_run": str(not plan.arms), "limits": str(plan.limits), "mission": str(plan.mission)}
-        log = LinkLog(plan.log, about)
-        clock = (followed.now, followed.sleep) if followed else (time.monotonic, time.sleep)
-        endpoint.forget()  # what came while kernels were compiled
-        loop = OnboardLoop(config, pilot, plan, endpoint, log, *clock, note)
-        what = (
-            "ARMS AND DRIVES the vehicle" if plan.arms else "dry run: no order that moves the vehicle is sent"
-        )
-        where = "speaks to" if plan.place.calls else "listens at"
-        note(f"{what}; {where} {plan.place.host}:{plan.place.port}; Ctrl-C gives the vehicle back")
-        try:
-            loop.run()
-        finally:
-            log.close()
-        return loop.document()
+        with StopEvent(is_last=False) as stop:
+            log = LinkLog(plan.log, about)
+            clock = (followed.now, partial(followed.sleep, stop=stop)) if followed else ()
+            endpoint.forget()  # what came while kernels were compiled
+            loop = OnboardLoop(config, pilot, plan, endpoint, log, *clock, note=note)
+            what = (
+                "ARMS AND DRIVES the vehicle"
+                if plan.arms
+                else "dry run: no order that moves the vehicle is sent"
+            )
+            where = "speaks to" if plan.place.calls else "listens at"
+            loop.tell(f"{what}; {where} {plan.place.host}:{plan.place.port}; Ctrl-C gives the vehicle back")
+            try:
+                loop.run(stop)
+            finally:
+                log.close()
+        return loop.document(), loop.failure
 
 
 def warmed(config: Config, tree: FlatTree, mission: Mission) -> OnboardPilot:

@@ -30,7 +30,7 @@ FULL_STICK = (1.0, 1.0, 0.6, 2.0)
 FEEDBACK = 1.5
 """of the missing velocity, added to the one asked for"""
 
-_DO_SET_MODE, _ARM_DISARM, _SET_MESSAGE_INTERVAL = 176, 400, 511
+DO_SET_MODE, ARM_DISARM, _SET_MESSAGE_INTERVAL = 176, 400, 511
 
 
 @dataclass(frozen=True)
@@ -63,13 +63,14 @@ def set_velocity(velocity: Velocity, now_s: float, system: int, limits: SafetyLi
 
 def push_sticks(velocity: Velocity, measured: Velocity | None, system: int, limits: SafetyLimits) -> Order:
     """The same for ALT_HOLD, where sticks are thrust ahead and sideways and rates up and round:
-    MANUAL_CONTROL. ``measured``: velocity as it is; None = unknown, so that nothing is fed back."""
+    MANUAL_CONTROL. ``measured``: velocity as it is, NaN or None = unknown, so that nothing is fed back. No
+    stick goes beyond what a limit of speed is taken to need, whatever is measured."""
     asked = bounded(velocity, limits)
-    now = asked if measured is None or not all(map(math.isfinite, measured)) else measured
-    shares = [
-        max(-1.0, min(1.0, (want + FEEDBACK * (want - has)) / full))
-        for want, has, full in zip(asked, now, FULL_STICK, strict=True)
-    ]
+    most = (limits.speed_m_s, limits.speed_m_s, limits.heave_m_s, limits.yaw_rate_rad_s)
+    shares = []
+    for want, has, full, cap in zip(asked, measured or asked, FULL_STICK, most, strict=True):
+        more = FEEDBACK * (want - has) if math.isfinite(has) else 0.0
+        shares.append(max(-1.0, -cap / full, min(1.0, cap / full, (want + more) / full)))
     surge, sway, heave, turn = (round(STICK * share) for share in shares)
     fields = {"target": system, "x": surge, "y": -sway, "z": 500 + heave // 2, "r": -turn, "buttons": 0}
     return Order("MANUAL_CONTROL", "MANUAL_CONTROL", fields, as_operator=True)
@@ -77,12 +78,12 @@ def push_sticks(velocity: Velocity, measured: Velocity | None, system: int, limi
 
 def set_mode(mode: int, system: int) -> Order:
     """One of ArduSub's modes."""
-    return _command("MAV_CMD_DO_SET_MODE", _DO_SET_MODE, system, 1.0, float(mode))
+    return _command("MAV_CMD_DO_SET_MODE", DO_SET_MODE, system, 1.0, float(mode))
 
 
 def arm(system: int) -> Order:
     """Arm, never by force."""
-    return _command("MAV_CMD_COMPONENT_ARM_DISARM", _ARM_DISARM, system, 1.0)
+    return _command("MAV_CMD_COMPONENT_ARM_DISARM", ARM_DISARM, system, 1.0)
 
 
 def ask_for(message_id: int, rate_hz: float, system: int) -> Order:

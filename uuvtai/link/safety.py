@@ -17,6 +17,10 @@ Velocity = tuple[float, float, float, float]
 STOP: Velocity = (0.0, 0.0, 0.0, 0.0)
 STALL_S = 0.25
 """a step that is later than this is a stall"""
+LATE_S, LATE_WINDOW_S = 0.5, 3.0
+"""so much lateness in so long is too much"""
+UNANSWERED_S = 4.0
+"""it was asked to move for so long, and did not"""
 
 
 class SafeAction(IntEnum):
@@ -55,6 +59,8 @@ class SafetyLimits:
     battery_v: float = 13.2
     """of the pack; a BlueROV2's has four cells"""
     battery_share: float = 0.2
+    battery_s: float = 10.0
+    """age of the battery's telemetry, once it has come"""
     tilt_rad: float = math.radians(45.0)
 
 
@@ -70,11 +76,12 @@ class VehicleView:
     vehicle_age_s: float
     operator_age_s: float
     sensor_age_s: Mapping[str, float]
-    """of the sensors that the pilot needs"""
+    """of the sensors that the pilot needs; of the sonar's newest scan that was placed in the map"""
     pos_w: tuple[float, float, float]
     rpy: tuple[float, float, float]
-    speed_m_s: float
-    """measured, over ground"""
+    """NaN: not known now"""
+    speed_m_s: float | None
+    """measured, over ground; None: not known now"""
     battery_v: float | None
     """None: nobody tells"""
     battery_share: float | None
@@ -83,6 +90,16 @@ class VehicleView:
     lost_command: str
     """why the vehicle no longer does what we say (somebody took over, it disarmed, a mode was refused); '' =
     it does, or was never asked"""
+    late_s: float = 0.0
+    """lateness of all stalls in the last LATE_WINDOW_S"""
+    battery_age_s: float = 0.0
+    """of its telemetry; infinite: none has come yet"""
+    unanswered_s: float = 0.0
+    """for how long it was asked to move and did not"""
+    moved: str = ""
+    """how the given position jumped; '' = it did not"""
+    misfit: str = ""
+    """how the scans disagree with the known walls; '' = they do not"""
 
 
 @dataclass(frozen=True)
@@ -119,6 +136,11 @@ class SafetyRule:
     meaning: str
     """when it is broken, for the page"""
 
+    @property
+    def case(self) -> str:
+        """What its cases in tests/test_safety.py are called."""
+        return self.name.replace(" ", "_")
+
 
 # -------------------------------------------------------------------------------------------------- the rules
 
@@ -152,6 +174,30 @@ def _stalled(view: VehicleView, limits: SafetyLimits) -> str:
     return f"this step came {view.stalled_s:.2f} s late" if not view.stalled_s <= STALL_S else ""
 
 
+def _slow(view: VehicleView, limits: SafetyLimits) -> str:
+    return f"{view.late_s:.2f} s late in {LATE_WINDOW_S:g} s" if not view.late_s <= LATE_S else ""
+
+
+def _battery_silent(view: VehicleView, limits: SafetyLimits) -> str:
+    if math.isinf(view.battery_age_s):  # nobody watches it: the waiting line says so
+        return ""
+    return _old("battery", view.battery_age_s, limits.battery_s)
+
+
+def _unanswered(view: VehicleView, limits: SafetyLimits) -> str:
+    if view.unanswered_s <= UNANSWERED_S:
+        return ""
+    return f"asked to move for {view.unanswered_s:.0f} s, and the measured speed stays near zero"
+
+
+def _position_jumped(view: VehicleView, limits: SafetyLimits) -> str:
+    return view.moved
+
+
+def _walls_misfit(view: VehicleView, limits: SafetyLimits) -> str:
+    return view.misfit
+
+
 def _battery_low(view: VehicleView, limits: SafetyLimits) -> str:
     if view.battery_v is not None and view.battery_v < limits.battery_v:
         return f"battery at {view.battery_v:.1f} V"
@@ -177,6 +223,8 @@ def _outside(view: VehicleView, limits: SafetyLimits) -> str:
 
 
 def _too_fast(view: VehicleView, limits: SafetyLimits) -> str:
+    if view.speed_m_s is None:  # navigation is lost then
+        return ""
     most = 1.5 * math.hypot(limits.speed_m_s, limits.heave_m_s) + 0.1
     return f"moving at {view.speed_m_s:.2f} m/s" if not view.speed_m_s <= most else ""
 
@@ -190,16 +238,27 @@ RULES = (
                "no heartbeat of the operator's ground station"),
     SafetyRule("navigation lost", _navigation_lost, ((0.0, _A.HOLD), (5.0, _A.HAND_BACK)),
                "attitude, velocity, depth or a needed position is missing or old"),
-    SafetyRule("sonar lost", _sonar_lost, ((0.0, _A.HOLD), (30.0, _A.SURFACE)), "no scan, or an old one"),
+    SafetyRule("position jumped", _position_jumped, ((0.0, _A.HAND_BACK),),
+               "the given position changed by more than the vehicle can move"),
+    SafetyRule("walls misfit", _walls_misfit, ((0.0, _A.HOLD), (5.0, _A.HAND_BACK)),
+               "the scans do not fit the known walls where the vehicle takes itself to be"),
+    SafetyRule("sonar lost", _sonar_lost, ((0.0, _A.HOLD), (30.0, _A.SURFACE)),
+               "no scan could be placed in the map, or the last one is old"),
     SafetyRule("pilot stops", _pilot_stops, ((0.0, _A.HOLD), (30.0, _A.SURFACE)),
                "the stack itself says that it cannot go on, or its command is not finite"),
-    SafetyRule("computer late", _stalled, ((0.0, _A.HOLD),), "the computer is late with a step"),
+    SafetyRule("computer late", _stalled, ((0.0, _A.HOLD),), f"a step comes more than {STALL_S:g} s late"),
+    SafetyRule("computer slow", _slow, ((0.0, _A.HOLD), (5.0, _A.HAND_BACK)),
+               f"such steps lose more than {LATE_S:g} s in {LATE_WINDOW_S:g} s"),
     SafetyRule("battery low", _battery_low, ((5.0, _A.SURFACE),), "voltage or charge below the limit"),
+    SafetyRule("battery silent", _battery_silent, ((0.0, _A.HOLD), (30.0, _A.HAND_BACK)),
+               "the battery's telemetry has ended"),
     SafetyRule("tilted", _tilted, ((0.0, _A.HOLD), (3.0, _A.HAND_BACK)), "the hull leans beyond the limit"),
     SafetyRule("outside the fence", _outside, ((0.0, _A.HOLD), (5.0, _A.HAND_BACK)),
                "outside the box or the depths"),
     SafetyRule("too fast", _too_fast, ((1.0, _A.HOLD), (6.0, _A.HAND_BACK)),
                "measured speed half as much again above the limit"),
+    SafetyRule("no answer", _unanswered, ((0.0, _A.HOLD), (5.0, _A.HAND_BACK)),
+               f"it was asked to move for {UNANSWERED_S:g} s and the measured speed stays near zero"),
 )  # fmt: skip
 
 

@@ -182,8 +182,7 @@ class FedSensors:
     def _pose_at(self, name: str, poses: PoseHistory, time_s: float) -> dict[str, np.ndarray] | None:
         found = poses.at(self._step_of(time_s))
         if found is None:
-            tally = self._inbox.tallies[name]
-            tally.used, tally.unplaced = tally.used - 1, tally.unplaced + 1
+            self._inbox.reject(name)
         return found
 
 

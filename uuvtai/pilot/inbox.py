@@ -40,6 +40,7 @@ class Inbox:
         self._shapes = shapes
         self._waiting: dict[str, list[SensorMessage]] = {name: [] for name in NAMES.values()}
         self._newest = dict.fromkeys(NAMES.values(), -math.inf)
+        self._used_s, self._used_before_s = dict(self._newest), -math.inf
 
     def feed(self, message: SensorMessage) -> None:
         """Take a message. TypeError for what is none, ValueError for arrays of the wrong shape; one with
@@ -76,11 +77,18 @@ class Inbox:
         tally.late += len(ready) - 1
         tally.used += 1
         self._newest[name] = best.time_s
+        self._used_before_s, self._used_s[name] = self._used_s[name], best.time_s
         return best
 
+    def reject(self, name: str) -> None:
+        """The message that was taken last could not be placed: it counts as never used."""
+        tally = self.tallies[name]
+        tally.used, tally.unplaced = tally.used - 1, tally.unplaced + 1
+        self._used_s[name] = self._used_before_s
+
     def age_s(self, name: str, now_s: float) -> float:
-        """How old the newest message taken is; infinite = there was none."""
-        return now_s - self._newest[name]
+        """How old the newest message used is; infinite = there was none."""
+        return now_s - self._used_s[name]
 
     def _check_shape(self, name: str, key: str, shape: tuple[int, ...]) -> None:
         wanted = self._shapes.get(f"{name}.{key}", () if name == "pressure" else (3,))

@@ -9,7 +9,8 @@ from uuvtai.tables.table import Column, Table
 
 _ACTIONS = (Column("action", left=True), Column("steps"), Column("share"))
 _ORDERS = (Column("order", left=True), Column("said"), Column("sent"))
-_SENSORS = (Column("sensor", left=True), *(Column(name) for name in ("fed", "used", "late", "bad")))
+_FATES = ("fed", "used", "late", "bad", "unplaced")
+_SENSORS = (Column("sensor", left=True), *(Column(name) for name in _FATES))
 
 
 def show_flight(screen: Screen, found: dict[str, Any]) -> None:
@@ -20,10 +21,7 @@ def show_flight(screen: Screen, found: dict[str, Any]) -> None:
     screen.table(Table(_ACTIONS, rows, title))
     counts = [[name, str(row["said"]), str(row["sent"])] for name, row in found["said"].items()]
     screen.table(Table(_ORDERS, counts, f"driven in {found['driven_in'] or 'no mode'}"))
-    sensors = [
-        [name, *(str(row[key]) for key in ("fed", "used", "late", "bad"))]
-        for name, row in found["sensors"].items()
-    ]
+    sensors = [[name, *(str(row[key]) for key in _FATES)] for name, row in found["sensors"].items()]
     screen.table(Table(_SENSORS, sensors, "messages"))
     for name, count in found["refused"].items():
         screen.line(f"not used, {count} times: {name}")

@@ -1,0 +1,74 @@
+"""Flights with one to three faults each: no order outside the limits, nothing that moves the vehicle while it is
+held, nothing old that drives it, and the operator obeyed at the next heartbeat."""
+
+import random
+
+import pytest
+
+from tests.flights import DT, moves, orders, violations
+from tests.mavlink_vehicle import Flight, link_config, plan_of
+from uuvtai.link import onboard_loop
+from uuvtai.link.onboard_loop import OnboardLoop
+from uuvtai.logs.reader import read_messages
+
+
+@pytest.mark.parametrize("first", range(0, 50, 10))
+def test_whatever_breaks_the_vehicle_is_safe(first):
+    assert [text for seed in range(first, first + 10) for text in violations(seed)] == []
+
+
+class Clock:
+    """Time passes only while somebody sleeps; the vehicle lives meanwhile."""
+
+    def __init__(self, flight, dt=DT):
+        self.flight, self.now_s, self.dt = flight, 1000.0, dt
+
+    def now(self):
+        return self.now_s
+
+    def sleep(self, seconds):
+        self.flight.sub.listen()
+        self.flight.sub.speak(self.dt)
+        self.now_s += seconds
+
+
+STAGES = [
+    "_pilot.tick", "_pilot.feed", "_intake.take", "_codec.decode", "_codec.encode", "_endpoint.receive",
+    "_endpoint.send", "_log.begin_step", "_log.saw", "_log.said", "_log.decided", "_handover.watch",
+    "_handover.orders", "_view", "_say", "_note", "_sleep", "_now",
+]  # fmt: skip
+NO_MORE = ("_codec.encode", "_endpoint.send", "_say")
+"""where one of these fails for ever nothing can be said at all"""
+
+
+@pytest.mark.parametrize("lasts", [False, True])
+@pytest.mark.parametrize("stage", STAGES)
+def test_an_error_of_ours_stops_the_vehicle_and_gives_it_back(tmp_path, monkeypatch, stage, lasts):
+    if lasts and stage in NO_MORE:
+        pytest.skip("nothing can be said")
+    flight = Flight(tmp_path)
+    clock, at = Clock(flight), random.Random(stage).uniform(2.0, 6.0)
+    plan = plan_of(flight.endpoint.place, flight.log.path)
+    loop = OnboardLoop(link_config(), flight.pilot, plan, flight.endpoint, flight.log, clock.now, clock.sleep)
+    owner, _, name = stage.rpartition(".")
+    broken = getattr(loop, owner) if owner else loop
+    works, raised = getattr(broken, name), []
+
+    def fails(*given, **more):
+        if clock.now_s - 1000.0 >= at and (lasts or not raised):
+            flight.sub.listen()
+            raised.append(len(flight.sub.told))
+            raise RuntimeError(f"{stage} has a bug")
+        return works(*given, **more)
+
+    monkeypatch.setattr(broken, name, fails)
+    monkeypatch.setattr(onboard_loop, "_GIVE_BACK_S", 0.3 if lasts else 6.0)
+    loop.run()
+    flight.sub.listen()
+    after = [message for message in flight.sub.told[raised[0] :] if orders(message)]
+    assert raised and isinstance(loop.failure, RuntimeError) and not loop.document()["safe"]
+    assert [message.get_type() for message in after[:2]] == ["SET_POSITION_TARGET_LOCAL_NED", "COMMAND_LONG"]
+    assert not any(moves(message) for message in after) and flight.sub.mode == 2
+    assert lasts or len(after) <= 2, "then it is silent"
+    flight.close()
+    assert list(read_messages(flight.log.path, ("/mavlink/said",)))
