@@ -16,19 +16,20 @@ SENSORS = {
     "OBSTACLE_DISTANCE": "sonar",
 }  # fmt: skip
 FAULTS = (
-    "dead", "late", "stuck", "nan", "foreign", "clock", "slow", "takes over", "disarms", "sticks", "link lost",
-    "operator silent", "battery ends",
+    "dead", "late", "stuck", "nan", "foreign", "clock", "slow", "takes over", "disarms", "sticks",
+    "link lost", "operator silent", "battery ends",
 )  # fmt: skip
 _SLACK_S = 2 * DT
 """between what the vehicle did and what a step can know of it"""
 
 
 class FaultySub(FakeSub):
-    """Faults are (kind, sensor, begin, end, size), times by the vehicle's clock."""
+    """Faults are (kind, sensor, begin, end, size), times by the vehicle's clock. It beats every ``beat_s``."""
 
-    def __init__(self, *given, faults=(), **more):
+    def __init__(self, *given, faults=(), beat_s=DT, **more):
         super().__init__(*given, **more)
         self.faults, self.waiting, self.kept = faults, [], {}
+        self.beat_s, self.next_beat_s, self.beats = beat_s, 0.0, []
         self.true_s = dict.fromkeys(SENSORS, -math.inf)
         """when the newest reading that can be used and was delivered was measured"""
         self.foreign = mav.MAVLink(None, srcSystem=self.system, srcComponent=14)
@@ -59,6 +60,11 @@ class FaultySub(FakeSub):
         ends = {"operator": "operator silent", "SYS_STATUS": "battery ends"}.get(name, "dead")
         if self.of("link lost") or self.of(ends, name if ends == "dead" else None):
             return
+        if name == "HEARTBEAT":
+            if self.time_s < self.next_beat_s:
+                return
+            self.next_beat_s = self.time_s + self.beat_s
+            self.beats.append((self.time_s, self.mode, self.armed))
         measured_s = self.time_s
         if self.of("stuck", name):
             message, measured_s = self.kept.setdefault(name, (message, self.time_s))
@@ -88,13 +94,16 @@ class FaultySub(FakeSub):
             self.true_s[name] = max(self.true_s[name], measured_s)
 
     def listen(self):
-        """Not while the link is lost."""
-        if not self.of("link lost"):
-            super().listen()
+        """What comes while the link is lost is lost too."""
+        told, state = len(self.told), (self.mode, self.armed)
+        super().listen()
+        if self.of("link lost"):
+            del self.told[told:]
+            self.mode, self.armed = state
 
 
 def drawn(seed):
-    """(modes of the vehicle, one to three faults)."""
+    """(modes of the vehicle, between its heartbeats [s], one to three faults)."""
     luck = random.Random(f"flights {seed}")
     faults = []
     for _ in range(luck.randint(1, 3)):
@@ -103,15 +112,15 @@ def drawn(seed):
         faults.append(
             (luck.choice(FAULTS), luck.choice(list(SENSORS)), begin, begin + luck.uniform(0.3, 9.0), size)
         )
-    return luck.choice(((2, 4, 9), (2, 4), (2, 9))), faults
+    return luck.choice(((2, 4, 9), (2, 4), (2, 9))), luck.choice((DT, 0.5, 1.0)), faults
 
 
-def violations(seed, folder=None):
+def violations(seed):
     """What a flight did that it must never do."""
-    modes, faults = drawn(seed)
+    modes, beat_s, faults = drawn(seed)
     with tempfile.TemporaryDirectory() as place:
         flight = Flight(
-            Path(folder or place), config=link_config(), sub=FaultySub, modes=modes, faults=faults
+            Path(place), config=link_config(), sub=FaultySub, modes=modes, faults=faults, beat_s=beat_s
         )
         flight.pilot.velocity = (0.4, 0.1, 0.1, 0.3)
         try:
@@ -121,16 +130,15 @@ def violations(seed, folder=None):
 
 
 def _watched(flight):
-    sub, wrong, taken_s, disarmed_s = flight.sub, [], math.inf, math.inf
+    sub, wrong, is_taken = flight.sub, [], False
     while sub.time_s < SECONDS:
-        if sub.of("takes over") and math.isinf(taken_s):
-            sub.mode, taken_s = 0, sub.time_s  # no mode that it had or was asked for
-        if sub.of("disarms") and sub.armed:
-            sub.armed, disarmed_s = False, min(disarmed_s, sub.time_s)
-        told, stalled = len(sub.told), 0.3 if sub.of("slow") else 0.0
-        before_armed = sub.armed
-        flight.run(DT, dt=DT, stalled=stalled)
-        wrong += _wrong(flight, sub.told[told:], taken_s, disarmed_s, before_armed)
+        if sub.of("takes over") and not is_taken:
+            sub.mode, is_taken = 0, True  # no mode that it had or was asked for
+        if sub.of("disarms"):
+            sub.armed = False
+        told = len(sub.told)
+        flight.run(DT, dt=DT, stalled=0.3 if sub.of("slow") else 0.0)
+        wrong += _wrong(flight, sub.told[told:])
     try:
         assert_within(sub.told)
     except AssertionError as error:
@@ -138,18 +146,20 @@ def _watched(flight):
     return wrong
 
 
-def _wrong(flight, told, taken_s, disarmed_s, was_armed):
+def _wrong(flight, told):
     """Of one step: ``told`` is what the vehicle was told in it."""
     sub, action = flight.sub, flight.loop.last.action.name
     moving = [message for message in told if moves(message)]
     found = []
     if action != "DRIVE" and moving:
         found.append(f"{sub.time_s:.2f} s: {action} moves it: {moving[0]}")
-    hears = not (sub.of("link lost") or sub.of("late", "HEARTBEAT"))
-    if sub.time_s > taken_s + _SLACK_S and sub.mode == 0 and hears and [m for m in told if orders(m)]:
+    heard = [beat for beat in sub.beats if beat[0] <= sub.time_s - _SLACK_S]
+    if any(mode == 0 for _, mode, _ in heard) and any(map(orders, told)):
         found.append(f"{sub.time_s:.2f} s: the operator has it and it is told {told[0]}")
-    if sub.time_s > disarmed_s + _SLACK_S and hears and (moving or [m for m in told if _arms(m)]):
-        found.append(f"{sub.time_s:.2f} s: disarmed by the operator and it is told {told[0]}")
+    was_armed = [is_armed for _, _, is_armed in heard]
+    if False in was_armed[was_armed.index(True) :] if True in was_armed else False:
+        if moving or any(map(arms, told)):
+            found.append(f"{sub.time_s:.2f} s: disarmed by the operator and it is told {told[0]}")
     if moving and sub.of("slow") is None:
         for name, sensor in SENSORS.items():
             age_s = sub.time_s - sub.true_s[name]
@@ -169,8 +179,9 @@ def moves(message):
 def orders(message):
     """Whether a message is an order at all."""
     kind = message.get_type()
-    return kind not in ("HEARTBEAT", "COMMAND_LONG") or kind == "COMMAND_LONG" and message.command != 511
+    return kind not in ("HEARTBEAT", "COMMAND_LONG") or (kind == "COMMAND_LONG" and message.command != 511)
 
 
-def _arms(message):
+def arms(message):
+    """Whether an order arms."""
     return message.get_type() == "COMMAND_LONG" and message.command == 400

@@ -1,5 +1,5 @@
-"""Flights with one to three faults each: no order outside the limits, nothing that moves the vehicle while it is
-held, nothing old that drives it, and the operator obeyed at the next heartbeat."""
+"""Flights with one to three faults each: no order outside the limits, nothing that moves the vehicle while
+it is held, nothing old that drives it, and the operator obeyed at the next heartbeat."""
 
 import random
 

@@ -29,7 +29,6 @@ from uuvtai.link.dialect import MavCodec
 from uuvtai.link.endpoint import LONGEST, Endpoint, LinkPlace, place_of
 from uuvtai.link.intake import Intake, SourceClock
 from uuvtai.link.link_errors import LinkError
-from uuvtai.link.link_log import LinkLog
 from uuvtai.link.onboard_loop import OnboardLoop
 from uuvtai.link.sectors import ping_of, sectors_of
 from uuvtai.logs.reader import read_messages
