@@ -3,6 +3,7 @@ here: DataFlash by a writer of its own, tlog by pymavlink."""
 
 import math
 import struct
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -29,19 +30,26 @@ FORMATS = {
     "XKF1": (6, "QBfff", "TimeUS,C,VN,VE,VD"),
     "EV": (7, "QB", "TimeUS,Id"),
 }
-CODES = {"Q": "Q", "N": "16s", "f": "f", "H": "H", "B": "B"}
+OLD = FORMATS | {
+    "IMU": (4, "Qfff", "TimeUS,GyrX,GyrY,GyrZ"),
+    "IMU2": (8, "Qfff", "TimeUS,GyrX,GyrY,GyrZ"),
+    "NKF1": (6, "Qfff", "TimeUS,VN,VE,VD"),
+    "NKF6": (9, "Qfff", "TimeUS,VN,VE,VD"),
+}
+"""before ArduSub 4.1: a message for each IMU and each core of EKF2"""
+CODES = {"I": "I", "~": "f", "Q": "Q", "N": "16s", "f": "f", "H": "H", "B": "B"}
 
 
-def dataflash(rows):
+def dataflash(rows, formats=FORMATS):
     """Bytes of a DataFlash log; rows of (name, values)."""
     out = b""
-    known = {"FMT": (128, "BBnNZ", "Type,Length,Name,Format,Columns"), **FORMATS}
+    known = {"FMT": (128, "BBnNZ", "Type,Length,Name,Format,Columns"), **formats}
     for name, (number, form, columns) in known.items():
         length = 89 if name == "FMT" else 3 + struct.calcsize("<" + "".join(CODES[c] for c in form))
         texts = (name.encode(), form.encode(), columns.encode())
         out += b"\xa3\x95\x80" + struct.pack("<BB4s16s64s", number, length, *texts)
     for name, values in rows:
-        number, form, _ = FORMATS[name]
+        number, form, _ = formats[name]
         layout = "<" + "".join(CODES[c] for c in form)
         out += b"\xa3\x95" + bytes([number]) + struct.pack(layout, *values)
     return out
@@ -67,16 +75,17 @@ def drive(velocity="VISO", hole=False, armed=(0.0, SECONDS)):
         for at_s, event in zip(armed, (10, 11), strict=True):
             if step == round(at_s / STEP_S):
                 yield "EV", (now, event)
-        yield "IMU", (now, 0, 0.01, 0.02, 0.03)
-        yield "IMU", (now, 1, 9.0, 9.0, 9.0)
+        old = velocity == "NKF1"
+        yield "IMU", (now, *[0][old:], 0.01, 0.02, 0.03)
+        yield ("IMU2" if old else "IMU"), (now, *[1][old:], 9.0, 9.0, 9.0)
         if step % 5 == 0:
             yield "RCOU", (now, *pulses(time_s))
             yield "ATT", (now, *map(math.degrees, (ROLL, PITCH, YAW)))
             if velocity == "VISO":
                 yield "VISO", (now, 0.1, 0.03, 0.02, 0.01, 100.0)
             else:
-                yield "XKF1", (now, 1, 9.0, 9.0, 9.0)
-                yield "XKF1", (now, 0, 0.3 * math.cos(YAW), 0.3 * math.sin(YAW), 0.0)
+                yield ("NKF6" if old else "XKF1"), (now, *[1][old:], 9.0, 9.0, 9.0)
+                yield velocity, (now, *[0][old:], 0.3 * math.cos(YAW), 0.3 * math.sin(YAW), 0.0)
 
 
 def read(tmp_path, content, name="drive.bin"):
@@ -109,8 +118,10 @@ def test_pulses_turn_the_motors_that_they_are_for(tmp_path):
     assert (np.abs(found.rpm[25]) > 0).sum() == 1
 
 
-def test_the_filters_velocity_where_there_is_no_dvl(tmp_path):
-    (found,) = read(tmp_path, dataflash(drive("XKF1")))
+@pytest.mark.parametrize(("velocity", "formats"), [("XKF1", FORMATS), ("NKF1", OLD)])
+def test_the_filters_velocity_where_there_is_no_dvl(velocity, formats, tmp_path):
+    (found,) = read(tmp_path, dataflash(drive(velocity), formats))
+    np.testing.assert_allclose(found.velocity[:, 3], -0.03, atol=1e-6)
     ahead, right, down = 0.3 * math.cos(PITCH), 0.3 * math.sin(ROLL) * math.sin(PITCH), 0.0
     down = 0.3 * math.cos(ROLL) * math.sin(PITCH)
     np.testing.assert_allclose(found.velocity[50, :3], [ahead, -right, -down], atol=1e-5)
@@ -124,6 +135,38 @@ def test_holes_and_what_was_not_armed_part_a_log(tmp_path):
     assert len(found.rpm) * STEP_S == pytest.approx(2.0, abs=0.1)
     with pytest.raises(DriveError, match="never armed"):
         read(tmp_path, dataflash(drive(armed=(2.0, 2.02))))
+
+
+def test_the_filter_that_steered_is_read(tmp_path):
+    """Both run, each with a velocity of its own; AHRS_EKF_TYPE says which one it was."""
+    formats = FORMATS | {"NKF1": (8, "QBfff", "TimeUS,C,VN,VE,VD")}
+    rows = []
+    for name, values in drive("XKF1"):
+        rows.append((name, values))
+        if name == "XKF1":
+            rows.append(("NKF1", (*values[:2], 0.0, 0.0, 0.5)))
+    slow, steered = ([("PARM", (0, b"AHRS_EKF_TYPE", kind)), *rows] for kind in (3.0, 2.0))
+    for made, down in (
+        (slow, 0.3 * math.cos(ROLL) * math.sin(PITCH)),
+        (steered, 0.5 * math.cos(ROLL) * math.cos(PITCH)),
+    ):
+        (found,) = read(tmp_path, dataflash(made, formats))
+        assert found.velocity[50, 2] == pytest.approx(-down, abs=1e-5)
+
+
+def test_a_hole_takes_no_memory_and_a_parameter_that_is_no_number_says_nothing(tmp_path):
+    """Two readings of each instrument eleven days apart: 48 million rows, none of them known."""
+    rows = [("PARM", (0, b"SERVO1_FUNCTION", math.nan))]
+    for name, values in drive():
+        if name != "EV":
+            rows.append(
+                (name, values if values[0] < 1e6 or name == "PARM" else (values[0] + 10**12, *values[1:]))
+            )
+    tracemalloc.start()
+    first, second = read(tmp_path, dataflash(rows))
+    assert tracemalloc.get_traced_memory()[1] < 20 << 20
+    tracemalloc.stop()
+    assert (len(first.rpm) + len(second.rpm)) * STEP_S == pytest.approx(SECONDS, abs=0.3)
 
 
 def tlog():
@@ -170,6 +213,14 @@ BAD = {
     "text.tlog": (b"no log at all" * 50, "holds no pulse widths"),
     "empty.tlog": (b"", "holds no pulse widths"),
     "short.bin": (dataflash(drive()), "stretches of 5 s"),
+    "form.bin": (
+        dataflash([], {"PARM": (1, "QN~", "TimeUS,Name,Value")}),
+        "is damaged (Exception: Unsupported format",
+    ),
+    "ancient.bin": (
+        dataflash([("RCOU", (0, 1500))], {"RCOU": (2, "IH", "TimeMS,Ch1")}),
+        "are of a firmware that is not read (TimeUS); give a log of ArduSub 3.5 or later",
+    ),
 }
 
 

@@ -13,7 +13,8 @@ import importlib.util
 import io
 import math
 import struct
-from collections.abc import Callable, Iterator
+from array import array
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ import numpy as np
 
 from uuvtai.config import VehicleConfig
 from uuvtai.files import open_file
-from uuvtai.identify.drive_log import Drive, DriveError, drives_of, up_axis
+from uuvtai.identify.drive_log import Drive, DriveError, drives_of, refuse_long, up_axis
 from uuvtai.identify.rotor_lag import thrust_of
 from uuvtai.link.dialect import EXTRA
 from uuvtai.link.motors import NEUTRAL_US, Motors
@@ -38,6 +39,8 @@ _CHANNELS = 16
 _STILL_N = 1e-6
 _FIRST_MOTOR = 33
 """SERVOn_FUNCTION of the first motor; 40 is the eighth"""
+_EKF2 = 2
+"""AHRS_EKF_TYPE that steers by NKF1"""
 _AUTOPILOT = 1
 """MAV_COMP_ID_AUTOPILOT1"""
 
@@ -46,28 +49,23 @@ _AUTOPILOT = 1
 class _Readings:
     """What one instrument said."""
 
-    time_s: list[float] = field(default_factory=list)
-    values: list[tuple[float, ...]] = field(default_factory=list)
+    time_s: Sequence[float] = field(default_factory=lambda: array("d"))
+    flat: Sequence[float] = field(default_factory=lambda: array("d"))
+
+    @property
+    def values(self) -> np.ndarray:
+        """(n, values)"""
+        return np.array(self.flat).reshape(len(self.time_s), -1)
 
     def add(self, time_s: float, *values: float) -> None:
         """A reading; one that is not finite, or does not come after the last one, is left out."""
         if all(map(math.isfinite, (time_s, *values))) and not (self.time_s and time_s <= self.time_s[-1]):
             self.time_s.append(time_s)
-            self.values.append(values)
+            self.flat.extend(values)
 
     def at(self, times: np.ndarray) -> np.ndarray:
         """(n, values) on straight lines between the readings."""
-        rows = np.array(self.values)
-        return np.stack([np.interp(times, self.time_s, column) for column in rows.T], axis=1)
-
-    def near(self, times: np.ndarray) -> np.ndarray:
-        """(n, values) each reading at the time next to it, NaN elsewhere."""
-        rows = np.array(self.values)
-        found = np.full((len(times), rows.shape[1]), np.nan)
-        place = np.rint((np.array(self.time_s) - times[0]) / STEP_S).astype(int)
-        inside = (place >= 0) & (place < len(times))
-        found[place[inside]] = rows[inside]
-        return found
+        return np.stack([np.interp(times, self.time_s, column) for column in self.values.T], axis=1)
 
 
 @dataclass
@@ -83,7 +81,9 @@ class _Heard:
     dvl: _Readings = field(default_factory=_Readings)
     """[m/s] ahead, right, down"""
     filtered: _Readings = field(default_factory=_Readings)
-    """[m/s] north, east, down"""
+    """[m/s] north, east, down, by EKF3"""
+    older: _Readings = field(default_factory=_Readings)
+    """the same by EKF2, before ArduSub 4.1"""
     armed: _Readings = field(default_factory=_Readings)
     behind_s: float = math.inf
     """the file's clock less ArduSub's, by the message that came soonest"""
@@ -97,13 +97,13 @@ def read_ardusub(path: Path, vehicle_cfg: VehicleConfig) -> list[Drive]:
         ("pulse widths (RCOU, SERVO_OUTPUT_RAW)", heard.pulse),
         ("attitude (ATT, ATTITUDE)", heard.angle),
         ("rates (IMU, ATTITUDE)", heard.rate),
-        ("velocity (VISO, XKF1, VISION_POSITION_DELTA, LOCAL_POSITION_NED)", _velocity(heard)),
+        ("velocity (VISO, XKF1, NKF1, VISION_POSITION_DELTA, LOCAL_POSITION_NED)", _velocity(heard)),
     ):
         if len(series.time_s) < 2:
             raise DriveError(
                 f"{path}: holds no {name}; log it (LOG_BITMASK) and drive again, with a DVL, or give a CSV"
             )
-    times = _times(heard)
+    times = _times(heard, path)
     if len(times) < 2:
         raise DriveError(f"{path}: was never armed while pulses and attitude were logged")
     grid = _LogTimes(times)
@@ -113,24 +113,28 @@ def read_ardusub(path: Path, vehicle_cfg: VehicleConfig) -> list[Drive]:
 
 
 def _velocity(heard: _Heard) -> _Readings:
-    return heard.dvl if len(heard.dvl.time_s) > 1 else heard.filtered
+    if len(heard.dvl.time_s) > 1:
+        return heard.dvl
+    flown = heard.parameters.get("AHRS_EKF_TYPE", 3.0)
+    return heard.older if len(heard.filtered.time_s) < 2 or flown == _EKF2 else heard.filtered
 
 
-def _times(heard: _Heard) -> np.ndarray:
-    """Every STEP_S while armed, without holes of the inputs."""
-    inputs = (heard.pulse, heard.angle, heard.rate)
-    begin = max(series.time_s[0] for series in inputs)
-    end = min(series.time_s[-1] for series in inputs)
-    times = np.arange(begin, end, STEP_S)
-    kept = np.ones(len(times), bool)
-    for series in inputs:
-        known = np.array(series.time_s)
-        for hole in np.flatnonzero(np.diff(known) > _HOLE_S):
-            kept &= (times <= known[hole]) | (times >= known[hole + 1])
+def _times(heard: _Heard, path: Path) -> np.ndarray:
+    """Every STEP_S while armed, without holes of the inputs. Raises DriveError."""
+    inputs = [np.array(series.time_s) for series in (heard.pulse, heard.angle, heard.rate)]
+    start, end = max(known[0] for known in inputs), min(known[-1] for known in inputs)
+    holes = [(known[i], known[i + 1]) for known in inputs for i in np.flatnonzero(np.diff(known) > _HOLE_S)]
+    spans, begin = [], start
+    for last, first in [*sorted(holes), (end, end)]:
+        if begin < min(last, end):
+            spans.append(np.ceil((np.array([begin, min(last, end)]) - start) / STEP_S))
+        begin = max(begin, first)
+    refuse_long(path, sum(int(last - first) for first, last in spans))
+    times = np.concatenate([np.empty(0), *(start + STEP_S * np.arange(*span) for span in spans)])
     if heard.armed.time_s:
         place = np.searchsorted(heard.armed.time_s, times, side="right") - 1
-        kept &= (place >= 0) & (np.array(heard.armed.values)[place, 0] > 0)
-    return times[kept]
+        times = times[(place >= 0) & (heard.armed.values[place, 0] > 0)]
+    return times
 
 
 def _rows(times: np.ndarray, grid: _LogTimes, heard: _Heard) -> np.ndarray:
@@ -139,7 +143,7 @@ def _rows(times: np.ndarray, grid: _LogTimes, heard: _Heard) -> np.ndarray:
     if _velocity(heard) is heard.dvl:
         velocity = grid.near(heard.dvl)
     else:
-        velocity = _to_body(grid.near(heard.filtered), angle)
+        velocity = _to_body(grid.near(_velocity(heard)), angle)
     turn = grid.near(heard.rate)[:, 2]
     up = up_axis(angle[:, 0], -angle[:, 1])
     flipped = [velocity[:, 0], -velocity[:, 1], -velocity[:, 2], -turn, rate[:, 0], -rate[:, 1]]
@@ -150,28 +154,35 @@ class _LogTimes:
     """Times of the rows on the whole grid that they are cut from."""
 
     def __init__(self, times: np.ndarray) -> None:
-        count = round((times[-1] - times[0]) / STEP_S) + 1
-        self.whole = times[0] + STEP_S * np.arange(count)
-        self.rows = np.rint((times - times[0]) / STEP_S).astype(int)
+        self.first, self.rows = times[0], np.rint((times - times[0]) / STEP_S).astype(int)
 
     def near(self, series: _Readings) -> np.ndarray:
-        """Readings at the rows next to them."""
-        return series.near(self.whole)[self.rows]
+        """(n, values) readings at the rows next to them, NaN elsewhere."""
+        values = series.values
+        found = np.full((len(self.rows), values.shape[1]), np.nan)
+        row, read, _ = self._placed(series)
+        found[row] = values[read]
+        return found
 
     def after(self, series: _Readings) -> np.ndarray:
         """(n,) [s] by how much later than its row each of them was read; 0 where there is none."""
+        found = np.zeros(len(self.rows))
+        row, _, late_s = self._placed(series)
+        found[row] = late_s
+        return found
+
+    def _placed(self, series: _Readings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rows, the readings (bool) next to them, by how much these are later [s]."""
         known = np.array(series.time_s)
-        place = np.rint((known - self.whole[0]) / STEP_S).astype(int)
-        inside = (place >= 0) & (place < len(self.whole))
-        found = np.zeros(len(self.whole))
-        found[place[inside]] = known[inside] - self.whole[place[inside]]
-        return found[self.rows]
+        place = np.rint((known - self.first) / STEP_S).astype(int)
+        row = np.minimum(np.searchsorted(self.rows, place), len(self.rows) - 1)
+        read = self.rows[row] == place
+        return row[read], read, (known - (self.first + STEP_S * place))[read]
 
 
 def _unwound(series: _Readings) -> _Readings:
     """Angles without jumps of a turn."""
-    rows = np.unwrap(np.array(series.values), axis=0)
-    return _Readings(series.time_s, [tuple(row) for row in rows.tolist()])
+    return _Readings(series.time_s, np.unwrap(series.values, axis=0).ravel())
 
 
 def _to_body(velocity: np.ndarray, angle: np.ndarray) -> np.ndarray:
@@ -188,7 +199,7 @@ def _asked(times: np.ndarray, heard: _Heard, vehicle_cfg: VehicleConfig) -> tupl
     """(n, thrusters) and (n, thrusters) [rpm] asked for. Between two messages thrust goes on a straight line:
     so it does in the mean over all moments at which a stick may have been pushed. Or it jumps halfway."""
     motors, known = Motors(vehicle_cfg), np.array(heard.pulse.time_s)
-    speeds = np.array([motors.rpm(_by_motor(np.array(row), heard.parameters)) for row in heard.pulse.values])
+    speeds = np.array([motors.rpm(_by_motor(row, heard.parameters)) for row in heard.pulse.values])
     thrust = thrust_of(speeds, vehicle_cfg)
     pushed = np.stack([np.interp(times, known, column) for column in thrust.T], axis=1)
     table = np.arange(-motors.most_rpm, motors.most_rpm + 1.0)
@@ -225,17 +236,23 @@ def _heard(path: Path) -> _Heard:
         raise DriveError(f"{path}: does not begin like a DataFlash log of ArduPilot's")
     if importlib.util.find_spec("pymavlink") is None:
         raise DriveError(f"{path}: is read by pymavlink, which is not here: pip install '{EXTRA}'")
-    heard, takers = _Heard(), _OF_BIN if is_bin else _OF_TLOG
+    heard, takers, kind = _Heard(), _OF_BIN if is_bin else _OF_TLOG, ""
     try:
         with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
             for count, message in enumerate(_messages(path, is_bin, list(takers))):
-                takers[message.get_type()](heard, message)
+                kind = message.get_type()
+                takers[kind](heard, message)
                 if count > _MOST_READINGS:
                     raise DriveError(f"{path}: holds more than {_MOST_READINGS} messages; cut it")
-    except (ValueError, TypeError, IndexError, KeyError, AttributeError, OverflowError, OSError) as error:
-        if isinstance(error, DriveError):
-            raise
-        raise DriveError(f"{path}: is damaged ({type(error).__name__}: {error})") from None
+    except (DriveError, MemoryError):
+        raise
+    except AttributeError as error:
+        raise DriveError(
+            f"{path}: its messages {kind} are of a firmware that is not read ({error}); give a log of "
+            "ArduSub 3.5 or later, or a CSV"
+        ) from None
+    except Exception as error:  # pymavlink raises this very class for a format that it does not know
+        raise DriveError(f"{path}: is damaged ({type(error).__name__}: {error}); give another log") from None
     if not is_bin:  # a DVL has a clock of its own: its readings count from when they came
         heard.dvl.time_s = [time_s - heard.behind_s for time_s in heard.dvl.time_s]
     return heard
@@ -264,13 +281,18 @@ def _vision(heard: _Heard, time_s: float, delta_s: float, moved: tuple[float, ..
 
 
 def _imu(heard: _Heard, m: Any) -> None:
-    if m.I == 0:
+    if getattr(m, "I", 0) == 0:  # ArduSub before 4.1 has messages IMU2 and IMU3 in its place
         heard.rate.add(m.TimeUS / 1e6, m.GyrX, m.GyrY, m.GyrZ)
 
 
-def _lane(heard: _Heard, m: Any) -> None:
-    if m.C == 0:
-        heard.filtered.add(m.TimeUS / 1e6, m.VN, m.VE, m.VD)
+def _lane(series: _Readings, m: Any) -> None:
+    if getattr(m, "C", 0) == 0:  # of the first core; before 4.1 NKF6 was that of the second
+        series.add(m.TimeUS / 1e6, m.VN, m.VE, m.VD)
+
+
+def _parameter(heard: _Heard, name: Any, value: float) -> None:
+    if math.isfinite(value):
+        heard.parameters[str(name)] = value
 
 
 def _event(heard: _Heard, m: Any) -> None:
@@ -281,7 +303,7 @@ def _event(heard: _Heard, m: Any) -> None:
 
 
 _OF_BIN: dict[str, Take] = {
-    "PARM": lambda heard, m: heard.parameters.update({str(m.Name): float(m.Value)}),
+    "PARM": lambda heard, m: _parameter(heard, m.Name, float(m.Value)),
     "RCOU": lambda heard, m: heard.pulse.add(
         m.TimeUS / 1e6, *(float(getattr(m, f"C{i}", 0)) for i in range(1, 15)), 0.0, 0.0
     ),
@@ -290,7 +312,8 @@ _OF_BIN: dict[str, Take] = {
     ),
     "IMU": _imu,
     "VISO": lambda heard, m: _vision(heard, m.TimeUS / 1e6, m.dt, (m.PosDX, m.PosDY, m.PosDZ), m.conf),
-    "XKF1": _lane,
+    "XKF1": lambda heard, m: _lane(heard.filtered, m),
+    "NKF1": lambda heard, m: _lane(heard.older, m),
     "EV": _event,
 }
 
@@ -313,7 +336,7 @@ def _beat(heard: _Heard, m: Any) -> None:
 
 
 _OF_TLOG: dict[str, Take] = {
-    "PARAM_VALUE": lambda heard, m: heard.parameters.update({str(m.param_id): float(m.param_value)}),
+    "PARAM_VALUE": lambda heard, m: _parameter(heard, m.param_id, float(m.param_value)),
     "SERVO_OUTPUT_RAW": _servos,
     "ATTITUDE": _attitude,
     "VISION_POSITION_DELTA": lambda heard, m: _vision(
