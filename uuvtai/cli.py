@@ -559,7 +559,9 @@ def log_convert(
     """Write a log as a ROS 2 bag, or a bag as a log."""
     from uuvtai.logs.rosbag import converted
 
-    target, messages = converted(file, out, to, source, force)
+    target, messages, left_out = converted(file, out, to, source, force)
+    for note in left_out:
+        say(f"{file}: {note}")
     typer.echo(f"{target}: {messages} messages")
 
 

@@ -18,7 +18,7 @@ from uuvtai.files import open_file
 from uuvtai.logs.reader import read_messages
 
 _MAX_CSV_BYTES = 256 << 20
-MAX_SAMPLES = 2_000_000
+MAX_SAMPLES = 1_000_000
 _GAP = 0.3
 """A step that differs from the usual one by more than this share parts a log in two."""
 _NEEDED = ("t", "u", "v", "w", "r")

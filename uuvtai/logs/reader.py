@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import lz4.frame
@@ -25,6 +26,8 @@ from uuvtai.logs.log_errors import LogError
 
 MAX_RECORD = 64 << 20
 """[bytes] of a record, and of what a chunk unpacks to: six times the map of a tank of 200 x 100 m"""
+ZSTD = b"\x28\xb5\x2f\xfd"
+"""what a frame of zstd begins with"""
 DAMAGE = (McapError, struct.error, ValueError, OverflowError, RuntimeError, zstandard.ZstdError)
 """what the package, zstandard and lz4 raise for bytes that are none of theirs"""
 
@@ -143,7 +146,13 @@ def records(path: Path, skip_chunks: bool = False, damages: list[str] | None = N
     """
     path = Path(path)
     with opened(path) as file:
-        if file.peek(len(MCAP0_MAGIC))[: len(MCAP0_MAGIC)] != MCAP0_MAGIC:
+        if (magic := file.peek(len(MCAP0_MAGIC))[: len(MCAP0_MAGIC)]) != MCAP0_MAGIC:
+            if magic.startswith(ZSTD):
+                plain = path.with_suffix("" if path.stem.endswith(".mcap") else ".mcap")
+                raise LogError(
+                    f"{path}: is compressed as a whole, which is not read; first: zstd -d {quote(str(path))} "
+                    f"-o {quote(str(plain))}"
+                )
             raise LogError(
                 f"{path}: is not an MCAP file (no magic bytes); give a log that uuv eval --record wrote"
             )

@@ -56,10 +56,9 @@ _ODOMETRY = record(
 _IMU = record(
     "uuv.Imu",
     "",
-    {"acceleration": THREE},
+    {"acceleration": THREE, "orientation": POSE["properties"]["orientation"]},
     timestamp=TIME,
     frame_id=STRING,
-    orientation=POSE["properties"]["orientation"],
     rates=THREE,
 )
 _PRESSURE = record("uuv.Pressure", timestamp=TIME, frame_id=STRING, pressure_pa=NUMBER, depth_m=NUMBER)
@@ -134,13 +133,17 @@ def _transform(reader: Reader, one: Any) -> dict[str, Any]:
 
 
 def _scan(reader: Reader, message: Any) -> bytes:
-    """No return (not finite, or beyond the range): maximum range with intensity 0, as in our logs."""
+    """REP 117: +inf is no return, as in our logs: maximum range with intensity 0. -inf is too near to
+    measure: a return at the least range. What else is no range (NaN, below the least, beyond the greatest)
+    says nothing: range 0 with intensity 0, so that no water counts as free."""
     ranges = np.asarray(message.ranges, np.float64)
     shine = np.asarray(message.intensities, np.float64)
     if len(shine) not in (0, len(ranges)):
         raise ValueError(f"{len(ranges)} ranges with {len(shine)} intensities")
-    hit = np.isfinite(ranges) & (ranges >= message.range_min) & (ranges <= message.range_max)
-    shine = np.where(hit, np.maximum(shine, 1e-3) if len(shine) else 1.0, 0.0)
+    near, none = np.isneginf(ranges), np.isposinf(ranges)
+    hit = near | ((ranges >= message.range_min) & (ranges <= message.range_max) & ~none)
+    shine = np.where(hit, np.fmax(shine, 1e-3) if len(shine) else 1.0, 0.0)
+    ranges = np.select([near, hit, none], [message.range_min, ranges, message.range_max], 0.0)
     last = message.angle_min + message.angle_increment * max(len(ranges) - 1, 0)
     return dumped(
         {
@@ -148,7 +151,7 @@ def _scan(reader: Reader, message: Any) -> bytes:
             "pose": _HERE,
             "start_angle": message.angle_min,
             "end_angle": last,
-            "ranges": np.where(hit, ranges, message.range_max).tolist(),
+            "ranges": ranges.tolist(),
             "intensities": shine.tolist(),
         }
     )
@@ -158,9 +161,12 @@ def _cloud(reader: Reader, message: Any) -> bytes:
     fields = [
         {"name": one.name, "offset": one.offset, "type": _TYPES[one.datatype]} for one in message.fields
     ]
-    if message.is_bigendian or len(message.data) != message.point_step * message.width * message.height:
-        raise ValueError("a point cloud that is big-endian, padded or cut off")
-    data = base64.b64encode(np.asarray(message.data, np.uint8).tobytes()).decode()
+    points, row = np.asarray(message.data, np.uint8), message.point_step * message.width
+    if row < message.row_step and len(points) == message.row_step * message.height:
+        points = points.reshape(message.height, -1)[:, :row]  # without what fills up the rows
+    if message.is_bigendian or points.size != row * message.height:
+        raise ValueError("a point cloud that is big-endian or cut off")
+    data = base64.b64encode(points.tobytes()).decode()
     head = reader.head(message.header)
     return dumped({**head, "pose": _HERE, "point_stride": message.point_step, "fields": fields, "data": data})
 
@@ -195,13 +201,14 @@ def _odometry(reader: Reader, message: Any) -> bytes:
 
 
 def _imu(reader: Reader, message: Any) -> bytes:
-    known = message.linear_acceleration_covariance[0] != -1
+    """What a covariance of -1 says is not measured is null."""
+    attitude, acceleration = message.orientation_covariance, message.linear_acceleration_covariance
     return dumped(
         {
             **reader.head(message.header),
-            "orientation": _turn(message.orientation),
+            "orientation": None if attitude[0] == -1 else _turn(message.orientation),
             "rates": _list(message.angular_velocity),
-            "acceleration": _list(message.linear_acceleration) if known else None,
+            "acceleration": None if acceleration[0] == -1 else _list(message.linear_acceleration),
         }
     )
 

@@ -9,6 +9,7 @@ import shutil
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import yaml
@@ -29,8 +30,11 @@ _ODD = (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticE
 FORMATS = ("mcap", "rosbag2")
 
 
-def converted(file: Path, out: Path | None, to: str | None, source: str, force: bool) -> tuple[Path, int]:
-    """A log as a bag or a bag as a log: (what was written, how many messages). Raises LogError, FileError."""
+def converted(
+    file: Path, out: Path | None, to: str | None, source: str, force: bool
+) -> tuple[Path, int, list[str]]:
+    """A log as a bag or a bag as a log: (what was written, how many messages, what was left out). Raises
+    LogError, FileError."""
     for option, given in (("--to", to), ("--from", source)):
         if given not in (*FORMATS, None):
             raise LogError(f"{option} {given}: choose one of {', '.join(FORMATS)}")
@@ -38,9 +42,9 @@ def converted(file: Path, out: Path | None, to: str | None, source: str, force: 
         raise LogError(f"--from {source} --to {to}: a log becomes a bag, and a bag a log; leave out --to")
     if source == "rosbag2":
         target = out or file.with_name(f"{file.stem}.log.mcap")
-        return target, from_rosbag2(file, target, force)
+        return target, *from_rosbag2(file, target, force)
     target = out or file.with_name(f"{file.stem}_rosbag2")
-    return target, to_rosbag2(file, target, force)
+    return target, to_rosbag2(file, target, force), []
 
 
 def to_rosbag2(path: Path, out: Path, force: bool = False) -> int:
@@ -66,10 +70,10 @@ def to_rosbag2(path: Path, out: Path, force: bool = False) -> int:
     return count
 
 
-def from_rosbag2(path: Path, out: Path, force: bool = False) -> int:
-    """Write the bag ``path``, a folder or its .mcap file, as the log ``out``; how many messages. Those
-    that are not in ``READ`` are left out. Raises LogError, and then nothing is left; FileError as
-    ``refuse_output``."""
+def from_rosbag2(path: Path, out: Path, force: bool = False) -> tuple[int, list[str]]:
+    """Write the bag ``path``, a folder or its .mcap file, as the log ``out``; how many messages, and which
+    were left out, for they are odd. Those that are not in ``READ`` are left out in silence. Raises LogError,
+    and then nothing is left; FileError as ``refuse_output``."""
     ros, file = RosMessages(), _bag_file(Path(path))
     out = Path(out)
     refuse_output(out, [file], force)
@@ -79,14 +83,19 @@ def from_rosbag2(path: Path, out: Path, force: bool = False) -> int:
         out.parent.mkdir(parents=True, exist_ok=True)
         log = McapFile(out)
         try:
-            count = _Reading(ros, setup, log).run(file, head)
+            reading = _Reading(ros, setup, log)
+            count = reading.run(file, head)
+            if not count and reading.odd:
+                raise ValueError(next(iter(reading.why.values())))
             if not count:
                 raise LogError(f"{file}: none of the messages that can be read; it needs {', '.join(READ)}")
             log.finish()
         except BaseException:
             log.discard()
             raise
-    return count
+    return count, [
+        f"{topic}: left out {n} odd, the first: {reading.why[topic]}" for topic, n in reading.odd.items()
+    ]
 
 
 @contextlib.contextmanager
@@ -116,15 +125,20 @@ def _bag_file(path: Path) -> Path:
     """The one .mcap of a bag."""
     if not path.is_dir():
         return path
-    found = sorted(entry for entry in path.iterdir() if entry.suffix in (".mcap", ".db3"))
+    found = sorted(entry for entry in path.iterdir() if {".mcap", ".db3"} & set(entry.suffixes))
     if len(found) == 1 and found[0].suffix == ".mcap":
         return found[0]
-    if any(entry.suffix == ".db3" for entry in found):
-        raise LogError(
-            f"{path}: is a bag in SQLite, and only MCAP is read; first: rosbags-convert --src {path} --dst "
-            "NEW --dst-storage mcap"
-        )
-    raise LogError(f"{path}: holds {len(found)} .mcap files; name the one to convert")
+    if not found:
+        raise LogError(f"{path}: holds 0 .mcap files; name the folder of a bag, or its file")
+    if any(".db3" in entry.suffixes for entry in found):
+        what = "is a bag in SQLite, and only MCAP is read"
+    elif any(entry.suffix != ".mcap" for entry in found):
+        what = f"holds {found[0].name}, which is compressed as a whole and not read"
+    else:
+        what = f"is a bag of {len(found)} parts, and one file is read at a time"
+    raise LogError(
+        f"{path}: {what}; first: rosbags-convert --src {quote(str(path))} --dst NEW --dst-storage mcap"
+    )
 
 
 # -------------------------------------------------------------------------------------------------- writing
@@ -219,6 +233,11 @@ class _Reading:
         self._made: dict[int, int] = {}
         self._known: dict[str, int] = {}
         self._start_ns: int | None = None
+        self._topics: set[str] = set()
+        self.odd: Counter[str] = Counter()
+        """messages of a topic that were left out"""
+        self.why: dict[str, str] = {}
+        """and what was wrong with the first"""
 
     def run(self, file: Path, head: LogHead) -> int:
         """All of it; how many messages."""
@@ -228,6 +247,7 @@ class _Reading:
                 self._log.add_metadata(name, entries)
         for name, data in head.attachments.items():
             self._log.add_attachment(name, "application/octet-stream", data)
+        self._topics = {record.topic for record in records(file) if isinstance(record, Channel)}
         for record in records(file):
             if isinstance(record, Schema):
                 self._schemas[record.id] = record
@@ -247,6 +267,8 @@ class _Reading:
         if self._start_ns is None:
             self._start_ns = record.log_time
         topic, reading = NAMES.get(channel.topic, channel.topic), READ[schema.name]
+        if topic in self._topics:  # the bag has it beside: names stay apart
+            topic = channel.topic
         if channel.id not in self._made:
             title = reading.schema["title"]
             if title not in self._known:
@@ -254,9 +276,14 @@ class _Reading:
                     title, "jsonschema", json.dumps(reading.schema).encode()
                 )
             self._made[channel.id] = self._log.add_channel(topic, self._known[title])
-        reader = Reader(topic, self._setup, self._start_ns)
-        data = reading.read(reader, self._ros.unpacked(record.data, schema.name))
-        if len(data) > MAX_RECORD:
-            raise ValueError(f"{channel.topic}: {len(data):,} bytes, more than a log's message may have")
+        try:
+            reader = Reader(topic, self._setup, self._start_ns)
+            data = reading.read(reader, self._ros.unpacked(record.data, schema.name))
+            if len(data) > MAX_RECORD:
+                raise ValueError(f"{len(data):,} bytes, more than a log's message may have")
+        except _ODD as error:
+            self.odd[channel.topic] += 1
+            self.why.setdefault(channel.topic, str(error).partition(": {")[0][:200])
+            return False
         self._log.add_message(self._made[channel.id], max(record.log_time - self._start_ns, 0), data)
         return True
