@@ -17,9 +17,9 @@ from mcap.records import Attachment, Channel, Message, Metadata, Schema
 
 from uuvtai.files import refuse_output
 from uuvtai.loader import ConfigError, parsed_yaml
-from uuvtai.logs.container import McapFile
+from uuvtai.logs.container import MAX_MESSAGE, McapFile
 from uuvtai.logs.log_errors import LogError
-from uuvtai.logs.reader import MAX_RECORD, LogHead, read_head, read_messages, records
+from uuvtai.logs.reader import LogHead, read_head, read_messages, records
 from uuvtai.logs.ros_read import NAMES, READ, Reader
 from uuvtai.logs.ros_types import RosMessages
 from uuvtai.logs.ros_write import SOURCES, WRITTEN, Setup, ros_messages
@@ -279,7 +279,7 @@ class _Reading:
         try:
             reader = Reader(topic, self._setup, self._start_ns)
             data = reading.read(reader, self._ros.unpacked(record.data, schema.name))
-            if len(data) > MAX_RECORD:
+            if len(data) > MAX_MESSAGE:
                 raise ValueError(f"{len(data):,} bytes, more than a log's message may have")
         except _ODD as error:
             self.odd[channel.topic] += 1
