@@ -165,11 +165,11 @@ def test_round_trip(recorded, back):
 # ------------------------------------------------------------------------------------------ bags of others
 
 
-def odometry(covariance=0.0):
+def odometry(covariance=0.0, turned=1):
     pose = ROS(
         "geometry_msgs/msg/Pose",
         position=ROS.vector(1, 2, -1, "Point"),
-        orientation=ROS.quaternion(1, 0, 0, 0),
+        orientation=ROS.quaternion(turned, 0, 0, 0),
     )
     part = "geometry_msgs/msg/PoseWithCovariance"
     twist = "geometry_msgs/msg/TwistWithCovariance"
@@ -262,6 +262,8 @@ def bag_of(path, *rows, pack=lambda data: data):
 ODD = {
     "a covariance that is no number": (odometry(NAN), "a number that is not finite"),
     "a covariance without end": (odometry(INF), "a number that is not finite"),
+    "an orientation of zeros": (odometry(turned=0), "an orientation that is none (0, 0, 0, 0)"),
+    "a place that is no number": (odometry(turned=NAN), "a number that is not finite"),
     "an attitude that is no number": (imu(NAN, False), "a number that is not finite"),
     "a map without cells": (grid(0, 0), "a map of 0 x 0 with 0 cells"),
     "a map above a hundred": (grid(2, 2, 101), "a map of 2 x 2 with 4 cells"),
@@ -283,13 +285,13 @@ def test_one_odd_message_is_left_out_and_named(odd, why, tmp_path, capfd):
 
 def test_what_is_only_unlike_ours_is_read(tmp_path):
     """Rows of points that are filled up, an attitude that is not measured, messages compressed one by one."""
-    rows = [("/points", cloud(filled=8)), ("/imu", imu(NAN, True))]
+    rows = [("/points", cloud(filled=8)), ("/imu", imu(NAN, True)), ("/imu", imu(0, False))]
     for name, pack in (("a.mcap", bytes), ("b.mcap", zstandard.ZstdCompressor().compress)):
         out = tmp_path / f"{name}.log"
-        assert from_rosbag2(bag_of(tmp_path / name, *rows, pack=pack), out) == (2, [])
-        (points,), (read,) = by_topic(out, "/points"), by_topic(out, "/imu")
+        assert from_rosbag2(bag_of(tmp_path / name, *rows, pack=pack), out) == (3, [])
+        (points,), (read, zeros) = by_topic(out, "/points"), by_topic(out, "/imu")
         assert base64.b64decode(points["data"]) == bytes(range(144)) and points["point_stride"] == 12
-        assert read["orientation"] is None and read["rates"] == [0.0, 0.0, 0.1]
+        assert read["orientation"] is None is zeros["orientation"] and read["rates"] == [0.0, 0.0, 0.1]
 
 
 RANGES = {

@@ -67,6 +67,8 @@ _TWIST_STAMPED = record("uuv.TwistStamped", timestamp=TIME, frame_id=STRING, lin
 
 NAMES = {"/scan": "/sonar/scan", "/map": "/map/static"}
 """ROS topic: the log's, where it is another"""
+_UNIT = 0.1
+"""by which the square of a quaternion's length may be off 1"""
 _TYPES = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}
 """PointField's codes: Foxglove's"""
 
@@ -107,6 +109,8 @@ def _list(value: Any) -> list[float]:
 
 
 def _turn(value: Any) -> dict[str, float]:
+    if abs(value.x**2 + value.y**2 + value.z**2 + value.w**2 - 1) > _UNIT:
+        raise ValueError(f"an orientation that is none ({value.x:g}, {value.y:g}, {value.z:g}, {value.w:g})")
     return {"x": value.x, "y": value.y, "z": value.z, "w": value.w}
 
 
@@ -201,14 +205,18 @@ def _odometry(reader: Reader, message: Any) -> bytes:
 
 
 def _imu(reader: Reader, message: Any) -> bytes:
-    """What a covariance of -1 says is not measured is null."""
-    attitude, acceleration = message.orientation_covariance, message.linear_acceleration_covariance
+    """What a covariance of -1, or an orientation of zeros, says is not measured is null."""
+    q, attitude, acceleration = (
+        message.orientation,
+        message.orientation_covariance[0],
+        message.linear_acceleration_covariance[0],
+    )
     return dumped(
         {
             **reader.head(message.header),
-            "orientation": None if attitude[0] == -1 else _turn(message.orientation),
+            "orientation": None if attitude == -1 or not any((q.x, q.y, q.z, q.w)) else _turn(q),
             "rates": _list(message.angular_velocity),
-            "acceleration": None if acceleration[0] == -1 else _list(message.linear_acceleration),
+            "acceleration": None if acceleration == -1 else _list(message.linear_acceleration),
         }
     )
 

@@ -283,7 +283,8 @@ class _Reading:
                 raise ValueError(f"{len(data):,} bytes, more than a log's message may have")
         except _ODD as error:
             self.odd[channel.topic] += 1
-            self.why.setdefault(channel.topic, str(error).partition(": {")[0][:200])
+            reason = str(error) if isinstance(error, ValueError) else repr(error)
+            self.why.setdefault(channel.topic, reason.partition(": {")[0][:200])
             return False
         self._log.add_message(self._made[channel.id], max(record.log_time - self._start_ns, 0), data)
         return True
