@@ -12,6 +12,7 @@ from uuvtai.config import Config
 from uuvtai.link.endpoint import LinkPlace, place_of
 from uuvtai.link.link_errors import LinkError
 from uuvtai.link.safety import SafetyLimits, outside_m
+from uuvtai.link.senders import Senders
 from uuvtai.pilot import Mission
 
 EDGE_M = 0.2
@@ -37,6 +38,8 @@ class FlightPlan:
     followed"""
     system: int = 1
     operator: int = 255
+    senders: Senders | None = None
+    """from whom what counts; None = the usual ones of ``system``"""
 
     @classmethod
     def typed(
@@ -57,6 +60,7 @@ class FlightPlan:
         log: Path | None,
         system: int,
         operator: int,
+        senders: Sequence[str] = (),
     ) -> FlightPlan:
         """Of what was typed. Raises LinkError."""
         tank, vehicle = config.world.tank, config.vehicle
@@ -97,6 +101,7 @@ class FlightPlan:
             rate,
             system,
             operator,
+            Senders.typed(senders, system),
         )
 
 

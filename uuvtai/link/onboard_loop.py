@@ -75,7 +75,9 @@ class OnboardLoop:
         self._notes = FlightNotes(f"{plan.place.host}:{plan.place.port}")
         self._rate = plan.rate or 1.0
         self._codec = MavCodec(plan.system, COMPONENT, plan.operator)
-        self._intake = Intake(config, plan.mission.start, plan.heading_rad, plan.system, plan.operator)
+        self._intake = Intake(
+            config, plan.mission.start, plan.heading_rad, plan.system, plan.operator, plan.senders
+        )
         self._handover = Handover(plan.system, plan.limits, pretended=not plan.arms)
         self._memory, self.tally = SafetyMemory(), FlightTally()
         self._needed = [name for name in NAMES.values() if name != "depth"]
