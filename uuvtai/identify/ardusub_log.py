@@ -14,6 +14,7 @@ import io
 import math
 import struct
 from array import array
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,10 +24,12 @@ import numpy as np
 
 from uuvtai.config import VehicleConfig
 from uuvtai.files import open_file
+from uuvtai.foreign_time import SourceClock, stamp_of
 from uuvtai.identify.drive_log import Drive, DriveError, drives_of, refuse_long, up_axis
 from uuvtai.identify.rotor_lag import thrust_of
 from uuvtai.link.dialect import EXTRA
 from uuvtai.link.motors import NEUTRAL_US, Motors
+from uuvtai.link.senders import AUTOPILOT, Senders
 
 ENDINGS = (".bin", ".tlog")
 STEP_S = 0.02
@@ -41,8 +44,9 @@ _FIRST_MOTOR = 33
 """SERVOn_FUNCTION of the first motor; 40 is the eighth"""
 _EKF2 = 2
 """AHRS_EKF_TYPE that steers by NKF1"""
-_AUTOPILOT = 1
-"""MAV_COMP_ID_AUTOPILOT1"""
+_MOST_NAMED = 8
+_OF_A_BIN = 0
+"""system of a DataFlash log, which is one vehicle's"""
 
 
 @dataclass
@@ -70,7 +74,7 @@ class _Readings:
 
 @dataclass
 class _Heard:
-    """A log's content."""
+    """What a log holds of one vehicle between two starts of its autopilot."""
 
     pulse: _Readings = field(default_factory=_Readings)
     """[us] of 16 channels"""
@@ -90,9 +94,36 @@ class _Heard:
     parameters: dict[str, float] = field(default_factory=dict)
 
 
-def read_ardusub(path: Path, vehicle_cfg: VehicleConfig) -> list[Drive]:
-    """The drives of a file while it was armed. Raises DriveError, SettingError."""
-    heard = _heard(path)
+def read_ardusub(
+    path: Path,
+    vehicle_cfg: VehicleConfig,
+    system: int | None = None,
+    note: Callable[[str], None] = lambda text: None,
+) -> list[Drive]:
+    """The drives of one vehicle of a file, while it was armed; a clock that falls begins a new one.
+    ``system``: its id where a .tlog holds several, None = whose motors it tells most of; ``note`` is told
+    what was chosen and left out. Raises DriveError, SettingError."""
+    drives: list[Drive] = []
+    wrong: list[tuple[int, DriveError]] = []
+    boots = _boots(path, system, note)
+    for heard in boots:
+        try:
+            drives += _drives(path, heard, vehicle_cfg)
+        except DriveError as error:
+            wrong.append((-len(heard.pulse.time_s), error))
+    if not drives:
+        raise min(wrong, key=lambda row: row[0])[1]
+    if len(boots) > 1:
+        note(
+            f"{path}: the autopilot's clock began anew {len(boots) - 1} times; its drives are kept apart: "
+            + ", ".join(f"{drive.dt_s * len(drive.rpm):.0f} s" for drive in drives)
+        )
+    for _, error in wrong:
+        note(f"left out, {error}")
+    return drives
+
+
+def _drives(path: Path, heard: _Heard, vehicle_cfg: VehicleConfig) -> list[Drive]:
     for name, series in (
         ("pulse widths (RCOU, SERVO_OUTPUT_RAW)", heard.pulse),
         ("attitude (ATT, ATTITUDE)", heard.angle),
@@ -182,7 +213,7 @@ class _LogTimes:
 
 def _unwound(series: _Readings) -> _Readings:
     """Angles without jumps of a turn."""
-    return _Readings(series.time_s, np.unwrap(series.values, axis=0).ravel())
+    return _Readings(series.time_s, np.unwrap(series.values, axis=0).ravel().tolist())
 
 
 def _to_body(velocity: np.ndarray, angle: np.ndarray) -> np.ndarray:
@@ -225,7 +256,8 @@ def _by_motor(pulse: np.ndarray, parameters: dict[str, float]) -> list[float]:
 # ----------------------------------------------------------------------------------------------------- files
 
 
-def _heard(path: Path) -> _Heard:
+def _boots(path: Path, system: int | None, note: Callable[[str], None]) -> list[_Heard]:
+    """What one vehicle of a file said, by starts of its autopilot. Raises DriveError."""
     try:
         with open_file(path, _MOST_BYTES) as file:
             head = file.read(len(_BIN_HEAD))
@@ -236,12 +268,15 @@ def _heard(path: Path) -> _Heard:
         raise DriveError(f"{path}: does not begin like a DataFlash log of ArduPilot's")
     if importlib.util.find_spec("pymavlink") is None:
         raise DriveError(f"{path}: is read by pymavlink, which is not here: pip install '{EXTRA}'")
-    heard, takers, kind = _Heard(), _OF_BIN if is_bin else _OF_TLOG, ""
+    found, kind = _Sorted(), ""
     try:
         with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
-            for count, message in enumerate(_messages(path, is_bin, list(takers))):
+            for count, message in enumerate(_messages(path, is_bin, list(_OF_BIN if is_bin else _OF_TLOG))):
                 kind = message.get_type()
-                takers[kind](heard, message)
+                if is_bin:
+                    found.take_bin(message, count)
+                else:
+                    found.take_tlog(message)
                 if count > _MOST_READINGS:
                     raise DriveError(f"{path}: holds more than {_MOST_READINGS} messages; cut it")
     except (DriveError, MemoryError):
@@ -253,9 +288,96 @@ def _heard(path: Path) -> _Heard:
         ) from None
     except Exception as error:  # pymavlink raises this very class for a format that it does not know
         raise DriveError(f"{path}: is damaged ({type(error).__name__}: {error}); give another log") from None
-    if not is_bin:  # a DVL has a clock of its own: its readings count from when they came
-        heard.dvl.time_s = [time_s - heard.behind_s for time_s in heard.dvl.time_s]
-    return heard
+    return found.of(path, _OF_A_BIN if is_bin else system, note)
+
+
+class _Sorted:
+    """A file's messages by vehicle, and by starts of its autopilot."""
+
+    def __init__(self) -> None:
+        self._boots: dict[int, list[_Heard]] = {}
+        self._clocks: dict[int, SourceClock] = {}
+        self._dvls: dict[tuple[int, int], tuple[SourceClock, _Heard]] = {}
+        """what DVLs said, by the file's clock"""
+        self._left_out: Counter[str] = Counter()
+
+    def take_bin(self, m: Any, count: int) -> None:
+        """The ``count``-th message of a DataFlash log."""
+        clock, heard = self._of(_OF_A_BIN)
+        clock.measured_s(m.TimeUS / 1e6, 1e-6 * count)
+        _OF_BIN[m.get_type()](self._anew(_OF_A_BIN, clock, heard), m, clock.sent_s)
+
+    def take_tlog(self, m: Any) -> None:
+        """A message that a ground station wrote down."""
+        name, system, component = m.get_type(), m.get_srcSystem(), m.get_srcComponent()
+        sent_s, wrap_s = stamp_of(vars(m))
+        if name == "VISION_POSITION_DELTA":
+            clock, heard = self._dvls.setdefault((system, component), (SourceClock(), _Heard()))
+            _OF_TLOG[name](heard, m, clock.measured_s(sent_s, m._timestamp, wrap_s))
+            return
+        if component != AUTOPILOT:
+            self._left_out[f"{name} of {system}/{component}"] += name != "HEARTBEAT"
+            return
+        clock, heard = self._of(system)
+        if math.isnan(clock.sent_s) and not hasattr(m, "time_boot_ms"):
+            if name == "PARAM_VALUE":
+                _OF_TLOG[name](heard, m, 0.0)
+            return  # a counter that has run over says nothing before the clock is known
+        clock.measured_s(sent_s, m._timestamp, wrap_s)
+        heard = self._anew(system, clock, heard)
+        heard.behind_s = min(heard.behind_s, m._timestamp - clock.sent_s)
+        _OF_TLOG[name](heard, m, clock.sent_s)
+
+    def _of(self, system: int) -> tuple[SourceClock, _Heard]:
+        boots = self._boots.setdefault(system, [_Heard()])
+        return self._clocks.setdefault(system, SourceClock()), boots[-1]
+
+    def _anew(self, system: int, clock: SourceClock, heard: _Heard) -> _Heard:
+        """``heard``, or another one where the clock has begun anew."""
+        if clock.restarts == len(self._boots[system]) - 1:
+            return heard
+        self._boots[system].append(_Heard(parameters=dict(heard.parameters)))
+        return self._boots[system][-1]
+
+    def of(self, path: Path, system: int | None, note: Callable[[str], None]) -> list[_Heard]:
+        """What one vehicle said. Raises DriveError."""
+        told = {one: sum(len(heard.pulse.time_s) for heard in boots) for one, boots in self._boots.items()}
+        driven = sorted(one for one, pulses in told.items() if pulses)
+        if system is not None and system != _OF_A_BIN and system not in driven:
+            names = ", ".join(map(str, driven)) or "none"
+            raise DriveError(f"{path}: no motors of --system {system} in it; it has those of {names}")
+        chosen = max(told, key=lambda one: told[one], default=_OF_A_BIN) if system is None else system
+        if len(driven) > 1:
+            names = ", ".join(map(str, driven))
+            note(f"{path}: holds vehicles {names}, of which {chosen} is read; --system names another")
+        boots = self._boots.get(chosen, [_Heard()])
+        senders, left_out = Senders(chosen), self._left_out
+        heard_dvls = {}
+        for sender, (_, heard) in self._dvls.items():
+            if senders.counts("VISION_POSITION_DELTA", *sender):
+                heard_dvls[sender] = heard.dvl
+            else:
+                left_out["VISION_POSITION_DELTA of {}/{}".format(*sender)] += len(heard.dvl.time_s)
+        best = max(heard_dvls, key=lambda sender: len(heard_dvls[sender].time_s), default=None)
+        for sender, series in heard_dvls.items():
+            if sender == best:
+                for boot in boots:
+                    boot.dvl = _of_boot(series, boot)
+            else:
+                left_out["VISION_POSITION_DELTA of {}/{}".format(*sender)] += len(series.time_s)
+        for what, count in (+left_out).most_common(_MOST_NAMED):
+            note(f"{path}: left out {count} {what}")
+        return boots
+
+
+def _of_boot(series: _Readings, boot: _Heard) -> _Readings:
+    """Readings by the file's clock as those of one start of the autopilot, by its clock."""
+    found = _Readings()
+    if boot.angle.time_s:
+        times = np.array(series.time_s) - boot.behind_s
+        kept = (times >= boot.angle.time_s[0] - _HOLE_S) & (times <= boot.angle.time_s[-1] + _HOLE_S)
+        found = _Readings(times[kept].tolist(), series.values[kept].ravel().tolist())
+    return found
 
 
 def _messages(path: Path, is_bin: bool, names: list[str]) -> Iterator[Any]:
@@ -272,7 +394,8 @@ def _messages(path: Path, is_bin: bool, names: list[str]) -> Iterator[Any]:
         (log.filehandle if is_bin else log.f).close()
 
 
-Take = Callable[[_Heard, Any], None]
+Take = Callable[[_Heard, Any, float], None]
+"""content, message, its time by the autopilot's clock (a DVL's: by the file's)"""
 
 
 def _vision(heard: _Heard, time_s: float, delta_s: float, moved: tuple[float, ...], sure: float) -> None:
@@ -280,14 +403,14 @@ def _vision(heard: _Heard, time_s: float, delta_s: float, moved: tuple[float, ..
         heard.dvl.add(time_s, *(value / delta_s for value in moved))
 
 
-def _imu(heard: _Heard, m: Any) -> None:
+def _imu(heard: _Heard, m: Any, time_s: float) -> None:
     if getattr(m, "I", 0) == 0:  # ArduSub before 4.1 has messages IMU2 and IMU3 in its place
-        heard.rate.add(m.TimeUS / 1e6, m.GyrX, m.GyrY, m.GyrZ)
+        heard.rate.add(time_s, m.GyrX, m.GyrY, m.GyrZ)
 
 
-def _lane(series: _Readings, m: Any) -> None:
+def _lane(series: _Readings, m: Any, time_s: float) -> None:
     if getattr(m, "C", 0) == 0:  # of the first core; before 4.1 NKF6 was that of the second
-        series.add(m.TimeUS / 1e6, m.VN, m.VE, m.VD)
+        series.add(time_s, m.VN, m.VE, m.VD)
 
 
 def _parameter(heard: _Heard, name: Any, value: float) -> None:
@@ -295,53 +418,51 @@ def _parameter(heard: _Heard, name: Any, value: float) -> None:
         heard.parameters[str(name)] = value
 
 
-def _event(heard: _Heard, m: Any) -> None:
+def _event(heard: _Heard, m: Any, time_s: float) -> None:
     if m.Id in (10, 11):  # LogEvent::ARMED, DISARMED
         if m.Id == 11 and not heard.armed.time_s:  # the log begins under way
             heard.armed.add(0.0, 1.0)
-        heard.armed.add(m.TimeUS / 1e6, float(m.Id == 10))
+        heard.armed.add(time_s, float(m.Id == 10))
 
 
 _OF_BIN: dict[str, Take] = {
-    "PARM": lambda heard, m: _parameter(heard, m.Name, float(m.Value)),
-    "RCOU": lambda heard, m: heard.pulse.add(
-        m.TimeUS / 1e6, *(float(getattr(m, f"C{i}", 0)) for i in range(1, 15)), 0.0, 0.0
+    "PARM": lambda heard, m, time_s: _parameter(heard, m.Name, float(m.Value)),
+    "RCOU": lambda heard, m, time_s: heard.pulse.add(
+        time_s, *(float(getattr(m, f"C{i}", 0)) for i in range(1, 15)), 0.0, 0.0
     ),
-    "ATT": lambda heard, m: heard.angle.add(
-        m.TimeUS / 1e6, *(math.radians(value) for value in (m.Roll, m.Pitch, m.Yaw))
+    "ATT": lambda heard, m, time_s: heard.angle.add(
+        time_s, *(math.radians(value) for value in (m.Roll, m.Pitch, m.Yaw))
     ),
     "IMU": _imu,
-    "VISO": lambda heard, m: _vision(heard, m.TimeUS / 1e6, m.dt, (m.PosDX, m.PosDY, m.PosDZ), m.conf),
-    "XKF1": lambda heard, m: _lane(heard.filtered, m),
-    "NKF1": lambda heard, m: _lane(heard.older, m),
+    "VISO": lambda heard, m, time_s: _vision(heard, time_s, m.dt, (m.PosDX, m.PosDY, m.PosDZ), m.conf),
+    "XKF1": lambda heard, m, time_s: _lane(heard.filtered, m, time_s),
+    "NKF1": lambda heard, m, time_s: _lane(heard.older, m, time_s),
     "EV": _event,
 }
 
 
-def _attitude(heard: _Heard, m: Any) -> None:
-    heard.behind_s = min(heard.behind_s, m._timestamp - m.time_boot_ms / 1e3)
-    heard.angle.add(m.time_boot_ms / 1e3, m.roll, m.pitch, m.yaw)
-    heard.rate.add(m.time_boot_ms / 1e3, m.rollspeed, m.pitchspeed, m.yawspeed)
+def _attitude(heard: _Heard, m: Any, time_s: float) -> None:
+    heard.angle.add(time_s, m.roll, m.pitch, m.yaw)
+    heard.rate.add(time_s, m.rollspeed, m.pitchspeed, m.yawspeed)
 
 
-def _servos(heard: _Heard, m: Any) -> None:
+def _servos(heard: _Heard, m: Any, time_s: float) -> None:
     if m.port == 0:
         widths = (float(getattr(m, f"servo{i}_raw", 0)) for i in range(1, 17))
-        heard.pulse.add(m.time_usec / 1e6, *widths)
+        heard.pulse.add(time_s, *widths)
 
 
-def _beat(heard: _Heard, m: Any) -> None:
-    if m.get_srcComponent() == _AUTOPILOT and heard.angle.time_s:
-        heard.armed.add(heard.angle.time_s[-1], float(bool(m.base_mode & 128)))
+def _beat(heard: _Heard, m: Any, time_s: float) -> None:
+    heard.armed.add(time_s, float(bool(m.base_mode & 128)))
 
 
 _OF_TLOG: dict[str, Take] = {
-    "PARAM_VALUE": lambda heard, m: _parameter(heard, m.param_id, float(m.param_value)),
+    "PARAM_VALUE": lambda heard, m, time_s: _parameter(heard, m.param_id, float(m.param_value)),
     "SERVO_OUTPUT_RAW": _servos,
     "ATTITUDE": _attitude,
-    "VISION_POSITION_DELTA": lambda heard, m: _vision(
-        heard, m._timestamp, m.time_delta_usec / 1e6, tuple(m.position_delta), m.confidence
+    "VISION_POSITION_DELTA": lambda heard, m, time_s: _vision(
+        heard, time_s, m.time_delta_usec / 1e6, tuple(m.position_delta), m.confidence
     ),
-    "LOCAL_POSITION_NED": lambda heard, m: heard.filtered.add(m.time_boot_ms / 1e3, m.vx, m.vy, m.vz),
+    "LOCAL_POSITION_NED": lambda heard, m, time_s: heard.filtered.add(time_s, m.vx, m.vy, m.vz),
     "HEARTBEAT": _beat,
 }

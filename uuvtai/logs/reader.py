@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
+import math
 import struct
 from collections import Counter
 from collections.abc import Collection, Iterator
@@ -92,18 +93,18 @@ def json_attachment(head: LogHead, name: str) -> Any:
 
 
 def info(path: Path) -> dict[str, Any]:
-    """What is in a log: topics with schema, messages and rate; duration, metadata, attachments, outcome.
-    Raises LogError.
+    """What is in a log: topics with schema, messages and rate; duration, metadata, attachments, outcome (None
+    = it was cut off, or ``is_eval`` says that it is none of uuv eval's). Raises LogError.
     """
     path = Path(path)
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
     counts: Counter[int] = Counter()
-    head, last = LogHead(), None
+    head, first, last = LogHead(), math.inf, -math.inf
     for record in records(path):
         if isinstance(record, Message):
             counts[record.channel_id] += 1
-            last = record.log_time if last is None else max(last, record.log_time)
+            first, last = min(first, record.log_time), max(last, record.log_time)
         elif isinstance(record, Schema):
             schemas[record.id] = record
         elif isinstance(record, Channel):
@@ -112,7 +113,7 @@ def info(path: Path) -> dict[str, Any]:
             head.metadata[record.name] = record.metadata
         elif isinstance(record, Attachment):
             head.attachments[record.name] = record.data
-    duration = (last or 0) / 1e9
+    duration = max(last - first, 0) / 1e9
     topics = [
         {
             "topic": channel.topic,
@@ -131,6 +132,7 @@ def info(path: Path) -> dict[str, Any]:
         "topics": topics,
         "metadata": head.metadata,
         "attachments": {name: len(data) for name, data in head.attachments.items()},
+        "is_eval": "uuv.run" in head.metadata,
         "outcome": result.get("outcome"),
     }
 

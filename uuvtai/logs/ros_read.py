@@ -82,22 +82,26 @@ class Reading:
 
 
 class Reader:
-    """Of one topic's messages; times count from ``start_ns``."""
+    """Of one message, logged at ``log_ns``; times count from the start of the bag's ``span_ns``."""
 
-    def __init__(self, topic: str, setup: Setup, start_ns: int) -> None:
-        self.topic, self.setup, self._start_ns = topic, setup, start_ns
+    def __init__(self, topic: str, setup: Setup, span_ns: tuple[int, int], log_ns: int) -> None:
+        self.topic, self.setup, self._span_ns, self._log_ns = topic, setup, span_ns, log_ns
+        self.is_foreign = False
+        """whether a stamp was of another clock than the bag's"""
 
     def head(self, header: Any) -> dict[str, Any]:
-        """timestamp and frame_id; stamps before the start of the bag count as its start."""
+        """timestamp and frame_id."""
         return {
             "timestamp": parsed_json(self.stamp(header), self.topic),
             "frame_id": FRAMES_BACK.get(header.frame_id, header.frame_id),
         }
 
     def stamp(self, header: Any) -> str:
-        """Time as a foxglove time."""
+        """Time as a foxglove time; of a stamp outside of the bag's span that of the log."""
         time_ns = header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
-        return time_text(max(time_ns - self._start_ns, 0))
+        if not self._span_ns[0] <= time_ns <= self._span_ns[1]:
+            time_ns, self.is_foreign = self._log_ns, True
+        return time_text(time_ns - self._span_ns[0])
 
 
 def _xyz(value: Any) -> dict[str, float]:

@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import shutil
+from array import array
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -71,9 +72,10 @@ def to_rosbag2(path: Path, out: Path, force: bool = False) -> int:
 
 
 def from_rosbag2(path: Path, out: Path, force: bool = False) -> tuple[int, list[str]]:
-    """Write the bag ``path``, a folder or its .mcap file, as the log ``out``; how many messages, and which
-    were left out, for they are odd. Those that are not in ``READ`` are left out in silence. Raises LogError,
-    and then nothing is left; FileError as ``refuse_output``."""
+    """Write the bag ``path``, a folder or its .mcap file, as the log ``out``; how many messages, and notes:
+    which were left out, for they are odd, and which are dated by the log, for their stamps are of another
+    clock. Those that are not in ``READ`` are left out in silence. Raises LogError, and then nothing is left;
+    FileError as ``refuse_output``."""
     ros, file = RosMessages(), _bag_file(Path(path))
     out = Path(out)
     refuse_output(out, [file], force)
@@ -94,7 +96,11 @@ def from_rosbag2(path: Path, out: Path, force: bool = False) -> tuple[int, list[
             log.discard()
             raise
     return count, [
-        f"{topic}: left out {n} odd, the first: {reading.why[topic]}" for topic, n in reading.odd.items()
+        *(f"{topic}: left out {n} odd, the first: {reading.why[topic]}" for topic, n in reading.odd.items()),
+        *(
+            f"{topic}: {n} with stamps of another clock than the bag's, dated by when they were logged"
+            for topic, n in (+reading.foreign).items()
+        ),
     ]
 
 
@@ -224,7 +230,7 @@ def _description(file: str, counts: Counter[str], duration_ns: int, start_ns: in
 
 
 class _Reading:
-    """A bag's messages on their way into a log; times count from its first message."""
+    """A bag's messages on their way into a log; times count from the earliest of those that are read."""
 
     def __init__(self, ros: RosMessages, setup: Setup, file: McapFile) -> None:
         self._ros, self._setup, self._log = ros, setup, file
@@ -232,12 +238,14 @@ class _Reading:
         self._channels: dict[int, Channel] = {}
         self._made: dict[int, int] = {}
         self._known: dict[str, int] = {}
-        self._start_ns: int | None = None
+        self._span_ns = 0, 0
         self._topics: set[str] = set()
         self.odd: Counter[str] = Counter()
         """messages of a topic that were left out"""
         self.why: dict[str, str] = {}
         """and what was wrong with the first"""
+        self.foreign: Counter[str] = Counter()
+        """messages of a topic that were dated by the log"""
 
     def run(self, file: Path, head: LogHead) -> int:
         """All of it; how many messages."""
@@ -247,26 +255,38 @@ class _Reading:
                 self._log.add_metadata(name, entries)
         for name, data in head.attachments.items():
             self._log.add_attachment(name, "application/octet-stream", data)
-        self._topics = {record.topic for record in records(file) if isinstance(record, Channel)}
+        times_ns = array("Q", self._look(file))
+        self._span_ns = (min(times_ns), max(times_ns)) if times_ns else (0, 0)
+        self._topics = {channel.topic for channel in self._channels.values()}
+        for record in records(file):
+            if isinstance(record, Message):
+                count += self._put(record)
+        return count
+
+    def _look(self, file: Path) -> Iterator[int]:
+        """Log times of the messages that are read; notes schemas and channels."""
         for record in records(file):
             if isinstance(record, Schema):
                 self._schemas[record.id] = record
             elif isinstance(record, Channel):
                 self._channels[record.id] = record
             elif isinstance(record, Message):
-                count += self._put(record)
+                if self._kind(record) in READ:
+                    yield record.log_time
             else:
                 assert isinstance(record, Attachment | Metadata)
-        return count
 
-    def _put(self, record: Message) -> bool:
+    def _kind(self, record: Message) -> str:
+        """Name of a message's schema, '' = it is none of ROS 2's."""
         channel = self._channels.get(record.channel_id)
         schema = None if channel is None else self._schemas.get(channel.schema_id)
-        if channel is None or schema is None or channel.message_encoding != "cdr" or schema.name not in READ:
+        return schema.name if channel and schema and channel.message_encoding == "cdr" else ""
+
+    def _put(self, record: Message) -> bool:
+        if (kind := self._kind(record)) not in READ:
             return False
-        if self._start_ns is None:
-            self._start_ns = record.log_time
-        topic, reading = NAMES.get(channel.topic, channel.topic), READ[schema.name]
+        channel = self._channels[record.channel_id]
+        topic, reading = NAMES.get(channel.topic, channel.topic), READ[kind]
         if topic in self._topics:  # the bag has it beside: names stay apart
             topic = channel.topic
         if channel.id not in self._made:
@@ -277,8 +297,8 @@ class _Reading:
                 )
             self._made[channel.id] = self._log.add_channel(topic, self._known[title])
         try:
-            reader = Reader(topic, self._setup, self._start_ns)
-            data = reading.read(reader, self._ros.unpacked(record.data, schema.name))
+            reader = Reader(topic, self._setup, self._span_ns, record.log_time)
+            data = reading.read(reader, self._ros.unpacked(record.data, kind))
             if len(data) > MAX_MESSAGE:
                 raise ValueError(f"{len(data):,} bytes, more than a log's message may have")
         except _ODD as error:
@@ -286,5 +306,6 @@ class _Reading:
             reason = str(error) if isinstance(error, ValueError) else repr(error)
             self.why.setdefault(channel.topic, reason.partition(": {")[0][:200])
             return False
-        self._log.add_message(self._made[channel.id], max(record.log_time - self._start_ns, 0), data)
+        self.foreign[channel.topic] += reader.is_foreign
+        self._log.add_message(self._made[channel.id], record.log_time - self._span_ns[0], data)
         return True
