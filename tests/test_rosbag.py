@@ -294,6 +294,75 @@ def test_what_is_only_unlike_ours_is_read(tmp_path):
         assert read["orientation"] is None is zeros["orientation"] and read["rates"] == [0.0, 0.0, 0.1]
 
 
+S = 10**9
+T0 = 10**18
+CLOCKS = {
+    # (topic, logged at, stamped) in the order of the file -> times in the log, stamps, what is said
+    "in order": ([("/a", T0, T0), ("/a", T0 + 3 * S, T0 + S)], [0, 3], [0, 1], {}),
+    "topic after topic": (
+        [("/a", T0 + 5 * S, T0 + 5 * S), ("/b", T0, T0), ("/b", T0 + 7 * S, T0 + 6 * S)],
+        [5, 0, 7],
+        [5, 0, 6],
+        {},
+    ),
+    "a clock of the device's own": (
+        [("/a", T0, 7 * S), ("/a", T0 + S, 8 * S), ("/b", T0 + 2 * S, T0 + S)],
+        [0, 1, 2],
+        [0, 1, 1],
+        {"/a": 2},
+    ),
+    "no stamp": ([("/a", T0, 0), ("/a", T0 + S, 0), ("/b", T0 + S, T0)], [0, 1, 1], [0, 1, 0], {"/a": 2}),
+    "from the future": ([("/a", T0, T0 + 99 * S), ("/a", T0 + S, T0 + S)], [0, 1], [0, 1], {"/a": 1}),
+    "measured before the first was logged": (
+        [("/a", T0, T0 - S // 9), ("/b", T0 + S, T0)],
+        [0, 1],
+        [0, 0],
+        {},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CLOCKS)
+def test_times_of_a_bag(name, tmp_path, capfd):
+    rows, times, stamps, said = CLOCKS[name]
+    file = McapFile(tmp_path / "a.mcap", profile="ros2")
+    schema = file.add_schema("sensor_msgs/msg/Imu", "ros2msg", ROS.definition("sensor_msgs/msg/Imu"))
+    channels = {topic: file.add_channel(topic, schema, "cdr") for topic in ("/a", "/b", "/text")}
+    file.add_message(
+        file.add_channel("/early", file.add_schema("x", "ros2msg", b""), "cdr"), T0 - 99 * S, b""
+    )
+    for topic, logged, stamped in rows:
+        message = imu(0.0, True)
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamped, S)
+        file.add_message(channels[topic], logged, ROS.packed(message))
+    file.finish()
+    assert run_cli("log", "convert", tmp_path / "a.mcap", "--from", "rosbag2") == 0
+    found = list(read_messages(tmp_path / "a.log.mcap"))
+    assert [message.time_s for message in found] == times
+    stamped = [message.data["timestamp"] for message in found]
+    assert [one["sec"] + one["nsec"] / S for one in stamped] == stamps
+    err = capfd.readouterr().err
+    assert err.count("dated by when they were logged") == len(said)
+    for topic, count in said.items():
+        assert f"{topic}: {count} with stamps of another clock than the bag's" in err
+
+
+@pytest.mark.parametrize("name", ["topic after topic", "in order"])
+def test_info_of_a_log_of_others(name, tmp_path, capfd):
+    rows, times, *_ = CLOCKS[name]
+    file = McapFile(tmp_path / "a.mcap")
+    channel = file.add_channel("/a", file.add_schema("x", "jsonschema", b"{}"))
+    for _, logged, _ in rows:
+        file.add_message(channel, logged, b"{}")
+    file.finish()
+    found = info(tmp_path / "a.mcap")
+    assert found["duration_s"] == max(times) and not found["is_eval"]
+    assert found["topics"][0]["rate_hz"] == pytest.approx(len(rows) / max(times), abs=1e-3)
+    assert run_cli("log", "info", tmp_path / "a.mcap") == 0
+    out = capfd.readouterr().out
+    assert f"duration {max(times):.2f} s, not a log of uuv eval" in out and "cut off" not in out
+
+
 RANGES = {
     3.0: (3.0, True),
     0.75: (0.75, True),

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from uuvtai.files import parsed_json
+from uuvtai.foreign_time import JUMP_S
 from uuvtai.logs.encode import dumped
 from uuvtai.logs.moment import time_text
 from uuvtai.logs.ros_types import FRAMES_BACK, SURFACE_PA
@@ -65,6 +66,7 @@ _PRESSURE = record("uuv.Pressure", timestamp=TIME, frame_id=STRING, pressure_pa=
 _TWIST = record("uuv.Twist", linear=THREE, angular=THREE)
 _TWIST_STAMPED = record("uuv.TwistStamped", timestamp=TIME, frame_id=STRING, linear=THREE, angular=THREE)
 
+_LATE_NS = round(1e9 * JUMP_S)
 NAMES = {"/scan": "/sonar/scan", "/map": "/map/static"}
 """ROS topic: the log's, where it is another"""
 _UNIT = 0.1
@@ -87,7 +89,7 @@ class Reader:
     def __init__(self, topic: str, setup: Setup, span_ns: tuple[int, int], log_ns: int) -> None:
         self.topic, self.setup, self._span_ns, self._log_ns = topic, setup, span_ns, log_ns
         self.is_foreign = False
-        """whether a stamp was of another clock than the bag's"""
+        """whether a stamp was of another clock than the bag's, not just late"""
 
     def head(self, header: Any) -> dict[str, Any]:
         """timestamp and frame_id."""
@@ -99,9 +101,11 @@ class Reader:
     def stamp(self, header: Any) -> str:
         """Time as a foxglove time; of a stamp outside of the bag's span that of the log."""
         time_ns = header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
-        if not self._span_ns[0] <= time_ns <= self._span_ns[1]:
-            time_ns, self.is_foreign = self._log_ns, True
-        return time_text(time_ns - self._span_ns[0])
+        start_ns, end_ns = self._span_ns
+        if not start_ns <= time_ns <= end_ns:
+            self.is_foreign |= max(start_ns - time_ns, time_ns - end_ns) > _LATE_NS
+            time_ns = self._log_ns
+        return time_text(time_ns - start_ns)
 
 
 def _xyz(value: Any) -> dict[str, float]:
