@@ -137,7 +137,7 @@ def taken(intake, name, come_s=0.0, system=1, component=1, **fields):
 
 def attitude(intake, yaw=0.0, come_s=0.0, **fields):
     given = {"roll": 0.1, "pitch": 0.2, "yaw": yaw, "rollspeed": 0.01, "pitchspeed": 0.02, "yawspeed": 0.03}
-    return taken(intake, "ATTITUDE", come_s, time_boot_ms=round(1e3 * come_s), **(given | fields))
+    return taken(intake, "ATTITUDE", come_s, **({"time_boot_ms": round(1e3 * come_s)} | given | fields))
 
 
 def test_axes_of_the_attitude():

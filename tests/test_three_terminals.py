@@ -88,6 +88,20 @@ def test_a_silent_vehicle_does_not_stop_the_dead_mans_time(followed):
     assert endpoint.now() - begun == pytest.approx(3.02)
 
 
+def test_a_late_datagram_does_not_set_its_clock_forward(followed):
+    endpoint, sub, _ = followed
+    sub.speak(3.0)
+    endpoint.receive()
+    begun = endpoint.now()
+    for _ in range(4):
+        sub.time_s -= 2.0
+        sub.speak(0.0)
+        sub.time_s += 2.0
+        sub.speak(0.02)
+        endpoint.receive()
+    assert endpoint.now() - begun == pytest.approx(0.08)
+
+
 def test_before_it_tells_its_time_heartbeats_alone_are_heard(followed):
     endpoint, sub, wall = followed
     sub.silent |= {"ATTITUDE"}

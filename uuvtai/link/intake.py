@@ -224,8 +224,7 @@ class Intake:
             if abs(time_s - self._depth[0]) < _FRESH_S:  # the autopilot's own height lags behind a climb
                 where[2] = -self._depth[1]
             found.append(PositionFix(time_s, where))
-        is_turned = abs(time_s - self.heard.rpy_s) < _FRESH_S
-        if is_turned and time_s - self._newest.get("VISION_POSITION_DELTA", -math.inf) > _FRESH_S:
+        if time_s - self._newest.get("VISION_POSITION_DELTA", -math.inf) > _FRESH_S:
             east, north, up = _turned(fields["vx"], fields["vy"], fields["vz"], turn)
             cos, sin = math.cos(yaw), math.sin(yaw)
             found += self._velocity(time_s, (cos * east + sin * north, cos * north - sin * east, up))
