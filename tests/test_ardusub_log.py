@@ -236,6 +236,11 @@ TLOGS = {
         [8.0, 7.6, 7.6],
         "began anew 2 times",
     ),
+    "another day, by a later clock": (
+        tlog(5.0) + tlog(500.0, written_s=T0 + 86400),
+        [8.0, 7.6],
+        "began anew 1 times",
+    ),
     "a reboot without a drive": (
         tlog(500.0) + tlog(2.0, written_s=T0 + 30, armed=False),
         [8.0],

@@ -24,7 +24,7 @@ import numpy as np
 
 from uuvtai.config import VehicleConfig
 from uuvtai.files import open_file
-from uuvtai.foreign_time import SourceClock, stamp_of
+from uuvtai.foreign_time import SEVERAL, SourceClock, stamp_of
 from uuvtai.identify.drive_log import Drive, DriveError, drives_of, refuse_long, up_axis
 from uuvtai.identify.rotor_lag import thrust_of
 from uuvtai.link.dialect import EXTRA
@@ -45,6 +45,8 @@ _FIRST_MOTOR = 33
 _EKF2 = 2
 """AHRS_EKF_TYPE that steers by NKF1"""
 _MOST_NAMED = 8
+_APART_S = 10.0
+"""the file's clock and ArduSub's that run apart by more belong to another start"""
 _OF_A_BIN = 0
 """system of a DataFlash log, which is one vehicle's"""
 
@@ -91,6 +93,8 @@ class _Heard:
     armed: _Readings = field(default_factory=_Readings)
     behind_s: float = math.inf
     """the file's clock less ArduSub's, by the message that came soonest"""
+    apart: int = 0
+    """messages in a row that say something else of this"""
     parameters: dict[str, float] = field(default_factory=dict)
 
 
@@ -305,7 +309,9 @@ class _Sorted:
         """The ``count``-th message of a DataFlash log."""
         clock, heard = self._of(_OF_A_BIN)
         clock.measured_s(m.TimeUS / 1e6, 1e-6 * count)
-        _OF_BIN[m.get_type()](self._anew(_OF_A_BIN, clock, heard), m, clock.sent_s)
+        if clock.restarts:
+            heard = self._anew(_OF_A_BIN, clock.sent_s, 1e-6 * count)
+        _OF_BIN[m.get_type()](heard, m, clock.sent_s)
 
     def take_tlog(self, m: Any) -> None:
         """A message that a ground station wrote down."""
@@ -324,20 +330,26 @@ class _Sorted:
                 _OF_TLOG[name](heard, m, 0.0)
             return  # a counter that has run over says nothing before the clock is known
         clock.measured_s(sent_s, m._timestamp, wrap_s)
-        heard = self._anew(system, clock, heard)
-        heard.behind_s = min(heard.behind_s, m._timestamp - clock.sent_s)
+        behind_s = m._timestamp - clock.sent_s
+        if hasattr(m, "time_boot_ms"):
+            heard.apart = heard.apart + 1 if _APART_S < abs(behind_s - heard.behind_s) < math.inf else 0
+        if clock.restarts or heard.apart >= SEVERAL:
+            heard = self._anew(system, clock.sent_s, m._timestamp)
+        if not heard.apart:
+            heard.behind_s = min(heard.behind_s, behind_s)
         _OF_TLOG[name](heard, m, clock.sent_s)
 
     def _of(self, system: int) -> tuple[SourceClock, _Heard]:
         boots = self._boots.setdefault(system, [_Heard()])
         return self._clocks.setdefault(system, SourceClock()), boots[-1]
 
-    def _anew(self, system: int, clock: SourceClock, heard: _Heard) -> _Heard:
-        """``heard``, or another one where the clock has begun anew."""
-        if clock.restarts == len(self._boots[system]) - 1:
-            return heard
-        self._boots[system].append(_Heard(parameters=dict(heard.parameters)))
-        return self._boots[system][-1]
+    def _anew(self, system: int, sent_s: float, come_s: float) -> _Heard:
+        """The content from here on, where the autopilot was started again; parameters stay."""
+        self._clocks[system] = SourceClock()
+        self._clocks[system].measured_s(sent_s, come_s)
+        boots = self._boots[system]
+        boots.append(_Heard(parameters=dict(boots[-1].parameters)))
+        return boots[-1]
 
     def of(self, path: Path, system: int | None, note: Callable[[str], None]) -> list[_Heard]:
         """What one vehicle said. Raises DriveError."""
