@@ -393,6 +393,17 @@ def test_a_late_attitude_replaces_no_newer_one_and_a_restart_counts_for_all_mess
     assert depth.time_s == 120.2
 
 
+def test_the_same_message_again_makes_nothing_younger():
+    intake = Intake(CONFIG, START, 0.0)
+    for k in range(10):
+        attitude(intake, come_s=1 + 0.02 * k)
+    for k in range(100):
+        assert attitude(intake, come_s=1.2 + 0.02 * k, time_boot_ms=1180) == []
+    assert intake.heard.rpy_s == pytest.approx(1.18)
+    assert dict(intake.heard.refused) == {"ATTITUDE: the same message again": 100}
+    assert attitude(intake, yaw=0.1, come_s=3.2, time_boot_ms=3200)[0].time_s == 3.2
+
+
 def test_a_battery_that_is_silent_is_known_to_be():
     """Not told: 0 V, 65535, -1. Of two tellers the lower one counts while it speaks."""
     intake = Intake(CONFIG, START, 0.0)

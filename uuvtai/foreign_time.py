@@ -40,9 +40,11 @@ class SourceClock:
         """the last message's time by the sender's clock, without overruns"""
         self.restarts = 0
         """how often the clock has begun anew"""
+        self.has_risen = False
+        """whether its stamps tell anything"""
         self._offset_s = math.nan
         self._newest_s = self._come_s = -math.inf
-        self._last_s, self._rises, self._still = -math.inf, False, 0
+        self._last_s, self._still = -math.inf, 0
         self._odd, self._odd_offset_s, self._odd_come_s = 0, math.nan, -math.inf
 
     def measured_s(self, sent_s: float | None, come_s: float, wrap_s: float = math.inf) -> float:
@@ -83,9 +85,9 @@ class SourceClock:
     def _stands_still(self, sent_s: float) -> bool:
         """Whether the clock tells nothing; one that has told more is believed a little longer."""
         is_up, self._last_s = sent_s > self._last_s, sent_s
-        self._rises = self._rises or is_up
+        self.has_risen = self.has_risen or is_up
         self._still = 0 if is_up else self._still + 1
-        return not is_up and (not self._rises or self._still >= SEVERAL)
+        return not is_up and (not self.has_risen or self._still >= SEVERAL)
 
     def _is_sure(self, offset: float, come_s: float) -> bool:
         """Whether the sender has now said several times in a row that its clock jumped by so much; what comes

@@ -89,6 +89,7 @@ class Intake:
         self._system, self._operator = system, operator
         self._senders = senders or Senders(system)
         self._clocks: dict[tuple[int, int, str], SourceClock] = {}
+        self._last: dict[tuple[int, int, str], Fields] = {}
         self._newest: dict[str, float] = {}
         self._force_b: tuple[float, np.ndarray] | None = None
         self._zero: dict[str, float] = {}
@@ -131,6 +132,9 @@ class Intake:
             return self._refuse("too many senders")
         clock = self._clocks.setdefault(key, SourceClock())
         sent_s, wrap_s = stamp_of(fields)
+        if sent_s and clock.has_risen and fields == self._last.get(key):
+            return self._refuse(f"{name}: the same message again")
+        self._last[key] = fields
         time_s = clock.measured_s(sent_s, come_s, wrap_s)
         if clock.restarts:
             self._forget(system, component)
