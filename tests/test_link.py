@@ -419,16 +419,16 @@ def test_a_battery_that_is_silent_is_known_to_be():
     for nothing in (0, 65535):
         status(1.0, nothing)
         pack(1.0, nothing)
-    assert heard.battery_v is None and heard.battery_heard_s == -math.inf
+    assert heard.battery_v is None and heard.battery_s == -math.inf
     status(2.0, 12000)
     pack(3.0, 8000, 8000)
-    assert (heard.battery_v, heard.battery_heard_s) == (12.0, 3.0)
+    assert (heard.battery_v, heard.battery_s) == (12.0, 3.0)
     status(4.0, 0)
-    assert (heard.battery_v, heard.battery_heard_s) == (12.0, 3.0)
+    assert (heard.battery_v, heard.battery_s) == (12.0, 3.0)
     pack(20.0, 8000, 8000)
-    assert (heard.battery_v, heard.battery_heard_s) == (16.0, 20.0)
+    assert (heard.battery_v, heard.battery_s) == (16.0, 20.0)
     status(21.0, 65535, share=40)
-    assert (heard.battery_share, heard.battery_heard_s) == (0.4, 21.0)
+    assert (heard.battery_share, heard.battery_s) == (0.4, 21.0)
 
 
 @pytest.mark.parametrize(
@@ -444,6 +444,7 @@ def test_a_position_that_jumps_is_noticed(step_m, step_s, jumps):
     found = taken(intake, "LOCAL_POSITION_NED", at_s, x=step_m, time_boot_ms=round(1e3 * at_s), **place)
     assert (intake.heard.position_jump_s, found == []) == ((at_s, True) if jumps else (-math.inf, False))
     assert ("LOCAL_POSITION_NED: the position jumped" in intake.heard.refused) == jumps
+    assert bool(intake.heard.jumped) == jumps
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,7 @@ class Heard:
     is_armed: bool = False
     battery_v: float | None = None
     battery_share: float | None = None
-    battery_heard_s: float = -math.inf
+    battery_s: float = -math.inf
     """when a voltage or a charge came last"""
     rpy: tuple[float, float, float] = (math.nan, math.nan, math.nan)
     """of the newest attitude, world axes of ours"""
@@ -59,6 +59,8 @@ class Heard:
     yaw_rate_s: float = -math.inf
     position_jump_s: float = -math.inf
     """when a position came last that no vehicle reaches from the one before"""
+    jumped: str = ""
+    """how it jumped; '' = it did not"""
     refused: Counter[str] = field(default_factory=Counter)
     """why messages were not used -> how many; at most ``MOST_KINDS`` reasons"""
 
@@ -123,17 +125,17 @@ class Intake:
         if taker is None:
             return []
         if not self._senders.counts(name, system, component):
-            who = f"{system}/{component}"
-            return self._refuse(f"{name} of {who} (heard by --sender {KIND_OF[name]}={who})")
+            who, kind = f"{system}/{component}", KIND_OF.get(name)
+            return self.refuse(f"{name} of {who}" + (f" (heard by --sender {kind}={who})" if kind else ""))
         if not all(math.isfinite(value) for value in fields.values() if isinstance(value, float)):
-            return self._refuse(f"{name}: a number that is not finite")
+            return self.refuse(f"{name}: a number that is not finite")
         key = system, component, name
         if key not in self._clocks and len(self._clocks) >= MOST_KINDS:
-            return self._refuse("too many senders")
+            return self.refuse("too many senders")
         clock = self._clocks.setdefault(key, SourceClock())
         sent_s, wrap_s = stamp_of(fields)
         if sent_s and clock.has_risen and fields == self._last.get(key):
-            return self._refuse(f"{name}: the same message again")
+            return self.refuse(f"{name}: the same message again")
         self._last[key] = fields
         time_s = clock.measured_s(sent_s, come_s, wrap_s)
         if clock.restarts:
@@ -151,7 +153,8 @@ class Intake:
         """A sender has begun anew, and with it all its clocks."""
         self._clocks = {key: clock for key, clock in self._clocks.items() if key[:2] != (system, component)}
 
-    def _refuse(self, why: str) -> list[SensorMessage]:
+    def refuse(self, why: str) -> list[SensorMessage]:
+        """Count a message that is not used."""
         if why in self.heard.refused or len(self.heard.refused) < MOST_KINDS:
             self.heard.refused[why] += 1
         return []
@@ -160,7 +163,7 @@ class Intake:
         heard = self.heard
         if system == self._system and component == AUTOPILOT:
             if fields["type"] != SUBMARINE or fields["autopilot"] != ARDUPILOT:
-                self._refuse("the vehicle is no submarine of ArduPilot's")
+                self.refuse("the vehicle is no submarine of ArduPilot's")
                 return
             heard.vehicle_s, heard.mode = come_s, int(fields["custom_mode"])
             heard.is_armed = bool(int(fields["base_mode"]) & _ARMED)
@@ -168,9 +171,9 @@ class Intake:
             if system == self._operator:
                 heard.operator_s = come_s
             else:
-                self._refuse(f"a ground station has the id {system}: --operator {system}")
+                self.refuse(f"a ground station has the id {system}: --operator {system}")
         elif fields["type"] == SUBMARINE and component == AUTOPILOT:
-            self._refuse(f"a submarine has the id {system}: --system {system}")
+            self.refuse(f"a submarine has the id {system}: --system {system}")
 
     # ------------------------------------------------------------------------------------------- instruments
 
@@ -202,10 +205,10 @@ class Intake:
     def _vision_delta(self, fields: Fields, time_s: float) -> list[SensorMessage]:
         spent_s = float(fields["time_delta_usec"]) / 1e6
         if not 1e-3 <= spent_s <= 1.0 or fields["confidence"] <= 0.0:
-            return self._refuse("VISION_POSITION_DELTA: without a time or without confidence")
+            return self.refuse("VISION_POSITION_DELTA: without a time or without confidence")
         ahead, right, down = (float(value) / spent_s for value in fields["position_delta"])
         if not all(map(math.isfinite, (ahead, right, down))):
-            return self._refuse("VISION_POSITION_DELTA: a number that is not finite")
+            return self.refuse("VISION_POSITION_DELTA: a number that is not finite")
         return self._velocity(time_s, (ahead, -right, -down))
 
     def _velocity(self, time_s: float, vel_b: tuple[float, float, float]) -> list[SensorMessage]:
@@ -219,7 +222,7 @@ class Intake:
         turn, yaw = self._heading, self.heard.rpy[2]
         place = np.array(_turned(fields["x"], fields["y"], fields["z"], turn))
         if self._has_jumped(time_s, place):
-            return self._refuse("LOCAL_POSITION_NED: the position jumped")
+            return self.refuse("LOCAL_POSITION_NED: the position jumped")
         if self._origin is None:
             self._origin = place
         found: list[SensorMessage] = []
@@ -239,9 +242,10 @@ class Intake:
         if time_s < last_s:
             return False
         self._place = time_s, place
-        moved, most = float(np.linalg.norm(place - last)), JUMP_M + _MOST_SPEED_M_S * (time_s - last_s)
-        if has_jumped := moved > most:
+        moved, spent_s = float(np.linalg.norm(place - last)), time_s - last_s
+        if has_jumped := moved > JUMP_M + _MOST_SPEED_M_S * spent_s:
             self.heard.position_jump_s = time_s
+            self.heard.jumped = f"the position moved {moved:.1f} m in {spent_s:.2f} s"
         return has_jumped
 
     def _pressure(self, fields: Fields, time_s: float) -> list[SensorMessage]:
@@ -257,7 +261,7 @@ class Intake:
 
     def _obstacles(self, fields: Fields, time_s: float) -> list[SensorMessage]:
         if fields["frame"] != 12:
-            return self._refuse("OBSTACLE_DISTANCE: not relative to the bow (frame 12, MAV_FRAME_BODY_FRD)")
+            return self.refuse("OBSTACLE_DISTANCE: not relative to the bow (frame 12, MAV_FRAME_BODY_FRD)")
         increment = float(fields.get("increment_f", 0.0)) or float(fields["increment"])
         distances = np.array(list(fields["distances"])[:SECTORS], dtype=int)
         return self._scan(time_s, distances, increment, float(fields.get("angle_offset", 0.0)), fields)
@@ -275,7 +279,7 @@ class Intake:
     ) -> list[SensorMessage]:
         span = int(fields.get("min_distance", 0)), int(fields["max_distance"])
         found = ping_of(self._config.sensors.sonar, time_s, distances, increment, offset, *span)
-        return [found] if isinstance(found, SonarPing) else self._refuse(f"{fields['name']}: {found}")
+        return [found] if isinstance(found, SonarPing) else self.refuse(f"{fields['name']}: {found}")
 
     def _battery(self, fields: Fields, time_s: float) -> list[SensorMessage]:
         if fields["name"] == "SYS_STATUS":
@@ -288,9 +292,9 @@ class Intake:
         if 0 < volts < 65535:
             self._volts[str(fields["name"])] = time_s, volts / 1e3
             told = [value for at_s, value in self._volts.values() if time_s - at_s <= _BATTERY_S]
-            heard.battery_v, heard.battery_heard_s = min(told), time_s
+            heard.battery_v, heard.battery_s = min(told), time_s
         if 0 <= share <= 100:
-            heard.battery_share, heard.battery_heard_s = share / 100, time_s
+            heard.battery_share, heard.battery_s = share / 100, time_s
         return []
 
 

@@ -55,7 +55,7 @@ class Senders:
         return cls(system, given)
 
     def counts(self, name: str, system: int, component: int) -> bool:
-        """Whether a message of this name counts from there."""
-        kind = KIND_OF[name]
+        """Whether a message of this name counts from there; one of no kind as what the autopilot says."""
+        kind = KIND_OF.get(name, "")
         usual = ((self.system, None), BLUEOS) if kind in _OF_OTHERS else ((self.system, AUTOPILOT),)
         return any(system == known and one in (None, component) for known, one in self.given.get(kind, usual))
